@@ -1,0 +1,1 @@
+"""Feature names and shapes, and helpers around LeRobot datasets."""

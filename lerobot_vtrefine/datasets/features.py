@@ -1,0 +1,157 @@
+"""Names, shapes and units of what reality and simulation hand over: the one table.
+
+Recorder, robot, environment and policy read it; nothing else spells these names. Shapes: ``...`` any leading
+dimensions (none for one frame, ``m`` environments), ``P`` = 4 pads, ``H, W`` depth image height and width.
+
+A *raw* observation is a dict of numpy arrays:
+
+===================  =================  =======  ==========================================================
+key                  shape              dtype    meaning
+===================  =================  =======  ==========================================================
+``state``            (..., 16)          float32  joint positions, rad and m, in the embodiment's order
+``tactile``          (..., P, 384)      uint8    raw pad counts, row-major 12 x 32
+``tactile_baseline`` (..., P, 384)      uint8    idle counts of the same taxels
+``depth_mm``         (..., H, W)        uint16   depth along the optical axis, mm; 0 = no return
+``camera_intrinsics`` (..., 4)          float32  fx, fy, cx, cy in pixels
+``camera_pose``      (..., 7)           float32  x y z in m, qw qx qy qz: optical frame (OpenCV) in the world
+``noise_level``      (..., 1)           float32  depth noise to add when the cloud is built; 0 on hardware
+===================  =================  =======  ==========================================================
+
+``noise_level`` may be missing (hardware); it then counts as 0.
+"""
+
+from collections.abc import Mapping
+from typing import Any, NamedTuple
+
+import numpy as np
+
+Array = np.ndarray[Any, np.dtype[Any]]
+
+PADS = ("left_arm_left_finger", "left_arm_right_finger", "right_arm_left_finger", "right_arm_right_finger")
+PAD_ROWS, PAD_COLS = 12, 32
+NUM_TAXELS = PAD_ROWS * PAD_COLS
+NUM_JOINTS = 16
+CAMERA = "front"
+
+OBS_PREFIX = "observation."
+STATE_KEY = "observation.state"
+ACTION_KEY = "action"
+TACTILE_KEYS = tuple(f"observation.tactile.{pad}" for pad in PADS)
+BASELINE_KEYS = tuple(f"observation.tactile_baseline.{pad}" for pad in PADS)
+DEPTH_KEY = f"observation.images.{CAMERA}_depth"
+INTRINSICS_KEY = f"observation.camera.{CAMERA}.intrinsics"
+CAMERA_POSE_KEY = f"observation.camera.{CAMERA}.pose"
+NOISE_LEVEL_KEY = f"observation.camera.{CAMERA}.noise_level"
+CLOUD_KEY = "observation.visuo_tactile"
+"""Built by the policy's preprocessor from the raw columns; never stored."""
+
+VISUAL_KEYS = (DEPTH_KEY, INTRINSICS_KEY, CAMERA_POSE_KEY)
+RAW_KEYS = (*TACTILE_KEYS, *BASELINE_KEYS, *VISUAL_KEYS, NOISE_LEVEL_KEY)
+"""Everything the cloud is built from (besides the joint positions) and that the preprocessor drops afterwards."""
+
+DEFAULT_NOISE_LEVEL = 3.0
+"""The paper's depth noise level in simulation (appendix, vision alignment, step iv)."""
+
+
+class Column(NamedTuple):
+    """One dataset column: where its values come from in the raw observation, and how it is stored."""
+
+    key: str
+    source: str
+    """Key of the raw observation."""
+    dtype: str
+    shape: tuple[int, ...]
+    pad: int | None = None
+    """Index along the raw observation's pad dimension."""
+
+    def value(self, raw: Mapping[str, Array]) -> Array:
+        """This column of a raw observation, shape (..., *shape) in the column's dtype."""
+        value = raw[self.source] if self.pad is None else raw[self.source][..., self.pad, :]
+        return np.ascontiguousarray(value, dtype=self.dtype)
+
+
+COLUMNS = (
+    Column(STATE_KEY, "state", "float32", (NUM_JOINTS,)),
+    *(Column(key, "tactile", "uint8", (NUM_TAXELS,), pad) for pad, key in enumerate(TACTILE_KEYS)),
+    *(Column(key, "tactile_baseline", "uint8", (NUM_TAXELS,), pad) for pad, key in enumerate(BASELINE_KEYS)),
+    Column(INTRINSICS_KEY, "camera_intrinsics", "float32", (4,)),
+    Column(CAMERA_POSE_KEY, "camera_pose", "float32", (7,)),
+    Column(NOISE_LEVEL_KEY, "noise_level", "float32", (1,)),
+)
+"""Every array column; the depth image comes on top because LeRobot stores it as an image."""
+
+TAXEL_INFO = {"array_shape": [PAD_ROWS, PAD_COLS], "unit": "adc_counts"}
+
+
+def dataset_features(
+    camera_height: int, camera_width: int, joint_names: tuple[str, ...] | list[str] | None = None
+) -> dict[str, dict[str, Any]]:
+    """Features for ``LeRobotDataset.create(..., use_videos=False)``.
+
+    ``use_videos=False`` because the depth image is kept exactly (TIFF, uint16 mm). Calibration is stored in
+    columns, not in ``info``: LeRobot refuses to merge datasets whose ``info`` differs. Array columns carry no
+    ``names``: LeRobot's recording code would rebuild such features and drop their ``info``.
+    """
+    if camera_height < 1 or camera_width < 1:
+        raise ValueError(f"camera size must be positive, got {camera_height} x {camera_width}")
+    features: dict[str, dict[str, Any]] = {}
+    for column in COLUMNS:
+        features[column.key] = {"dtype": column.dtype, "shape": column.shape}
+        if column.source in ("tactile", "tactile_baseline"):
+            features[column.key]["info"] = dict(TAXEL_INFO)
+    names = {"names": list(joint_names) if joint_names is not None else None}
+    features[STATE_KEY] |= names
+    features[DEPTH_KEY] = {
+        "dtype": "image",
+        "shape": (camera_height, camera_width, 1),
+        "names": ["height", "width", "channels"],
+        "info": {"is_depth_map": True},
+    }
+    features[ACTION_KEY] = {"dtype": "float32", "shape": (NUM_JOINTS,), **names}
+    return features
+
+
+def _columns_of(raw: Mapping[str, Array]) -> dict[str, Array]:
+    """All array columns of a raw observation; a missing noise level becomes 0."""
+    if "noise_level" not in raw:
+        raw = {**raw, "noise_level": np.zeros((*raw["state"].shape[:-1], 1), np.float32)}
+    missing = {column.source for column in COLUMNS} - set(raw)
+    if missing:
+        raise ValueError(f"raw observation lacks {', '.join(sorted(missing))}")
+    return {column.key: column.value(raw) for column in COLUMNS}
+
+
+def raw_to_frame(raw: Mapping[str, Array]) -> dict[str, Array]:
+    """One raw observation (no leading dimensions) as a frame for ``LeRobotDataset.add_frame``.
+
+    The caller adds ``action`` (16,) float32 and ``task``.
+    """
+    if raw["state"].shape != (NUM_JOINTS,):
+        raise ValueError(f"a frame needs state of shape ({NUM_JOINTS},), got {raw['state'].shape}")
+    return {**_columns_of(raw), DEPTH_KEY: np.ascontiguousarray(raw["depth_mm"], np.uint16)[..., None]}
+
+
+def raw_to_env_observation(raw: Mapping[str, Array]) -> dict[str, Array]:
+    """A raw observation (leading dimensions allowed) as an environment observation.
+
+    LeRobot's ``preprocess_observation`` turns its keys into the dataset's (``agent_pos`` becomes
+    ``observation.state``). Depth is float32 (..., 1, H, W) in mm, exactly what the dataset loader yields.
+    """
+    observation = {key.removeprefix(OBS_PREFIX): value for key, value in _columns_of(raw).items()}
+    observation["agent_pos"] = observation.pop("state")
+    observation[DEPTH_KEY.removeprefix(OBS_PREFIX)] = raw["depth_mm"].astype(np.float32)[..., None, :, :]
+    return observation
+
+
+def env_observation_shapes(camera_height: int, camera_width: int) -> dict[str, tuple[tuple[int, ...], str]]:
+    """Shape and dtype of every environment observation key, without leading dimensions."""
+    shapes = {column.key.removeprefix(OBS_PREFIX): (column.shape, column.dtype) for column in COLUMNS}
+    shapes["agent_pos"] = shapes.pop("state")
+    shapes[DEPTH_KEY.removeprefix(OBS_PREFIX)] = ((1, camera_height, camera_width), "float32")
+    return shapes
+
+
+def env_key_map() -> dict[str, str]:
+    """Environment observation key -> dataset key (LeRobot's ``features_map``, the action included)."""
+    keys = [*(column.key for column in COLUMNS if column.key != STATE_KEY), DEPTH_KEY]
+    return {"agent_pos": STATE_KEY, "action": ACTION_KEY, **{k.removeprefix(OBS_PREFIX): k for k in keys}}
