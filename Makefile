@@ -1,0 +1,37 @@
+.DEFAULT_GOAL := help
+.PHONY: help setup demo test test-slow check format bench clean-demo
+
+VENV := .venv/bin
+JOBS ?= 2
+ARGS ?=
+
+help: ## show this list
+	@awk -F ':.*## ' '/^[a-z-]+:.*## / {printf "  make %-11s %s\n", $$1, $$2}' Makefile
+
+setup: ## create .venv with pinned packages (automatic in every other target)
+	@sh scripts/setup_venv.sh
+
+demo: setup ## demonstrations, imitation, DPPO, evaluation, report: outputs/demo/report.html
+	@$(VENV)/vtrefine-demo $(ARGS)
+
+test: setup ## the test-suite, without slow, gpu and hardware tests
+	@OMP_NUM_THREADS=1 MKL_NUM_THREADS=1 $(VENV)/python -m pytest -q -n $(JOBS) --dist loadfile $(ARGS)
+
+test-slow: setup ## the tests marked slow
+	@$(VENV)/python -m pytest -m slow $(ARGS)
+
+check: setup ## format, lint, types, structure
+	@$(VENV)/ruff format --check --quiet .
+	@$(VENV)/ruff check --quiet .
+	@$(VENV)/ty check --quiet
+	@$(VENV)/python -m pytest -q tests/test_structure.py
+
+format: setup ## rewrite the sources in the project's format
+	@$(VENV)/ruff check --quiet --fix-only .
+	@$(VENV)/ruff format --quiet .
+
+bench: setup ## speed, as ratios measured in one run
+	@$(VENV)/vtrefine-bench $(ARGS)
+
+clean-demo: ## remove the demo's outputs, so that the next one starts afresh
+	@rm -rf outputs/demo

@@ -1,0 +1,1 @@
+"""Console entry points: thin wrappers that parse options and call the library."""

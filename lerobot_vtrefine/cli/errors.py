@@ -1,0 +1,50 @@
+"""One place that turns expected failures of a command into one clear line and an exit status."""
+
+import errno
+import functools
+import os
+import sys
+from collections.abc import Callable
+
+from draccus.utils import DraccusException
+
+DEBUG_VARIABLE = "VTREFINE_DEBUG"
+USAGE_STATUS = 2
+INTERRUPT_STATUS = 130
+
+EXPECTED = (ValueError, OSError, ImportError, DraccusException)
+
+
+def describe(error: BaseException) -> str:
+    """Return one line that tells a user what went wrong, without the traceback."""
+    if isinstance(error, OSError) and error.errno == errno.ENOSPC:
+        where = f" while writing {error.filename}" if error.filename else ""
+        return f"the disk is full{where}; free some space and run the command again"
+    if isinstance(error, OSError) and error.errno is not None and error.filename:
+        return f"{error.strerror}: {error.filename}"
+    message = " ".join(str(error).split())
+    return message or type(error).__name__
+
+
+def run_cli[**P](main: Callable[P, int | None]) -> Callable[P, int]:
+    """Wrap a console entry point so that expected errors end as ``error: ...`` with exit status 2.
+
+    ``ValueError``, ``OSError`` (missing files, full disk), ``ImportError`` (an extra is not installed) and
+    draccus' parsing errors are expected; anything else is a defect and keeps its traceback. Ctrl-C exits with
+    130. With ``VTREFINE_DEBUG=1`` in the environment every error keeps its traceback.
+    """
+
+    @functools.wraps(main)
+    def wrapper(*args: P.args, **kwargs: P.kwargs) -> int:
+        try:
+            return main(*args, **kwargs) or 0
+        except KeyboardInterrupt:
+            print("interrupted", file=sys.stderr)
+            return INTERRUPT_STATUS
+        except EXPECTED as error:
+            if os.environ.get(DEBUG_VARIABLE) == "1":
+                raise
+            print(f"error: {describe(error)}", file=sys.stderr)
+            return USAGE_STATUS
+
+    return wrapper
