@@ -1,0 +1,220 @@
+"""Countable rules of the code base: layers, sizes, typed signatures, nothing machine-specific."""
+
+import ast
+import re
+import shutil
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).parents[1]
+PACKAGE = ROOT / "lerobot_vtrefine"
+SOURCES = sorted(PACKAGE.rglob("*.py"))
+
+# A package imports only from its own layer's packages above it; those on one line do not import each other.
+LAYERS = (
+    ("tactile",),
+    ("embodiments",),
+    ("observation",),
+    ("datasets",),
+    ("drivers",),
+    ("robots", "teleoperators", "cameras"),
+    ("sim",),
+    ("envs",),
+    ("policies",),
+    ("finetune",),
+    ("diagnose",),
+    ("cli",),
+)
+RANK = {package: rank for rank, packages in enumerate(LAYERS) for package in packages}
+FORBIDDEN = {"sim": ("lerobot", "gymnasium"), "tactile": ("lerobot", "mujoco"), "embodiments": ("mujoco",)}
+FORBIDDEN_WITHIN = {"diagnose": ("policies", "finetune")}
+
+MAX_FILE_LINES = 400
+MAX_FUNCTION_LINES = 60
+LONG_FUNCTIONS_ALLOWED = ("lerobot_vtrefine/finetune/dppo.py",)  # the training loop reads best in one piece
+
+
+def tree_of(path: Path) -> ast.Module:
+    return ast.parse(path.read_text(encoding="utf-8"), filename=str(path))
+
+
+def imported_modules(tree: ast.AST) -> list[str]:
+    names = []
+    for node in ast.walk(tree):
+        if isinstance(node, ast.Import):
+            names += [alias.name for alias in node.names]
+        elif isinstance(node, ast.ImportFrom):
+            assert node.level == 0, "imports are absolute"
+            names.append(node.module or "")
+            names += [f"{node.module}.{alias.name}" for alias in node.names]
+    return names
+
+
+def layer_of(path: Path) -> str | None:
+    parts = path.relative_to(PACKAGE).parts
+    return parts[0] if len(parts) > 1 and not parts[0].startswith("_") else None
+
+
+def layer_violations(layer: str, modules: list[str]) -> list[str]:
+    """Names among ``modules`` that code of ``layer`` must not import."""
+    wrong = []
+    for module in modules:
+        top, _, rest = module.partition(".")
+        if top != "lerobot_vtrefine":
+            wrong += [module] if top in FORBIDDEN.get(layer, ()) else []
+            continue
+        target = rest.split(".")[0]
+        if target in RANK and target != layer and RANK[target] >= RANK[layer]:
+            wrong.append(module)
+        wrong += [module] if target in FORBIDDEN_WITHIN.get(layer, ()) else []
+    return wrong
+
+
+def functions_of(tree: ast.AST) -> list[ast.FunctionDef | ast.AsyncFunctionDef]:
+    return [node for node in ast.walk(tree) if isinstance(node, ast.FunctionDef | ast.AsyncFunctionDef)]
+
+
+def relative(path: Path) -> str:
+    return path.relative_to(ROOT).as_posix()
+
+
+def test_layer_rule_is_strict() -> None:
+    assert layer_violations("sim", ["lerobot_vtrefine.envs.config"])
+    assert layer_violations("sim", ["lerobot.policies"])
+    assert layer_violations("robots", ["lerobot_vtrefine.cameras"])
+    assert layer_violations("diagnose", ["lerobot_vtrefine.policies.vt_dp3"])
+    assert not layer_violations("sim", ["lerobot_vtrefine.tactile", "lerobot_vtrefine.sim.pairs", "mujoco"])
+
+
+def test_packages_import_only_from_layers_above() -> None:
+    wrong = {
+        relative(path): bad
+        for path in SOURCES
+        if (layer := layer_of(path)) and (bad := layer_violations(layer, imported_modules(tree_of(path))))
+    }
+    assert wrong == {}
+
+
+def test_every_package_has_a_layer() -> None:
+    unknown = {layer for path in SOURCES if (layer := layer_of(path)) and layer not in RANK}
+    assert unknown == set()
+
+
+def test_files_are_short() -> None:
+    lengths = {relative(path): len(path.read_text(encoding="utf-8").splitlines()) for path in SOURCES}
+    assert {path: lines for path, lines in lengths.items() if lines > MAX_FILE_LINES} == {}
+
+
+def test_functions_are_short() -> None:
+    long = {
+        f"{relative(path)}:{node.name}": node.end_lineno - node.lineno + 1
+        for path in SOURCES
+        if relative(path) not in LONG_FUNCTIONS_ALLOWED
+        for node in functions_of(tree_of(path))
+        if node.end_lineno is not None and node.end_lineno - node.lineno + 1 > MAX_FUNCTION_LINES
+    }
+    assert long == {}
+
+
+def untyped(node: ast.FunctionDef | ast.AsyncFunctionDef) -> list[str]:
+    arguments = [*node.args.posonlyargs, *node.args.args, *node.args.kwonlyargs]
+    arguments += [argument for argument in (node.args.vararg, node.args.kwarg) if argument]
+    missing = [a.arg for a in arguments if a.annotation is None and a.arg not in ("self", "cls")]
+    return missing + (["return"] if node.returns is None else [])
+
+
+def is_warp_kernel(node: ast.FunctionDef | ast.AsyncFunctionDef) -> bool:
+    """Warp kernels return nothing, and Warp functions infer what they return."""
+    return any(ast.unparse(decorator).startswith("wp.") for decorator in node.decorator_list)
+
+
+def test_signatures_are_typed() -> None:
+    missing = {
+        f"{relative(path)}:{node.name}": names
+        for path in SOURCES
+        for node in functions_of(tree_of(path))
+        if (names := untyped(node)) and not (is_warp_kernel(node) and names == ["return"])
+    }
+    assert missing == {}
+
+
+def test_library_does_not_print() -> None:
+    printing = [
+        f"{relative(path)}:{node.lineno}"
+        for path in SOURCES
+        if layer_of(path) != "cli"
+        for node in ast.walk(tree_of(path))
+        if isinstance(node, ast.Call) and isinstance(node.func, ast.Name) and node.func.id == "print"
+    ]
+    assert printing == []
+
+
+def test_no_bare_except_and_no_grab_bag_modules() -> None:
+    bare = [
+        f"{relative(path)}:{node.lineno}"
+        for path in SOURCES
+        for node in ast.walk(tree_of(path))
+        if isinstance(node, ast.ExceptHandler) and node.type is None
+    ]
+    assert bare == []
+    assert [relative(path) for path in SOURCES if path.stem in ("utils", "util", "helpers", "misc")] == []
+
+
+# Assembled from pieces, so that this file does not contain what it forbids.
+MACHINE_SPECIFIC = re.compile(
+    "|".join(
+        [
+            r"(?<![\w.])/" + r"(?:work|root|home|Users)/\w",
+            r"\bpypi\." + "org",
+            r"\bpython" + r"hosted\.",
+            r"download\.py" + "torch",
+            r"\bartifact" + "ory",
+            r"\bconda\.an" + "aconda",
+        ]
+    )
+)
+
+
+@pytest.mark.parametrize("text", ["/" + "home/me/x", "see /" + "work/x", "https://py" + "pi.org/simple"])
+def test_machine_specific_pattern_finds(text: str) -> None:
+    assert MACHINE_SPECIFIC.search(text)
+
+
+def tracked_text_files() -> list[Path]:
+    listing = subprocess.run(["git", "ls-files", "-z"], cwd=ROOT, capture_output=True, check=False)
+    if listing.returncode:
+        pytest.skip("not a git checkout")
+    paths = [ROOT / name for name in listing.stdout.decode().split("\0") if name]
+    return [path for path in paths if path.is_file() and b"\0" not in path.read_bytes()[:8192]]
+
+
+def test_nothing_machine_specific_is_tracked() -> None:
+    found = [
+        f"{relative(path)}:{number}"
+        for path in tracked_text_files()
+        for number, line in enumerate(path.read_text(encoding="utf-8", errors="replace").splitlines(), 1)
+        if MACHINE_SPECIFIC.search(line)
+    ]
+    assert found == []
+
+
+def test_nothing_large_is_tracked() -> None:
+    listing = subprocess.run(["git", "ls-files", "-z"], cwd=ROOT, capture_output=True, check=False)
+    if listing.returncode:
+        pytest.skip("not a git checkout")
+    paths = [ROOT / name for name in listing.stdout.decode().split("\0") if name]
+    assert [relative(path) for path in paths if path.is_file() and path.stat().st_size > 5_000_000] == []
+
+
+@pytest.mark.parametrize("arguments", [["format", "--check"], ["check"]])
+def test_ruff(arguments: list[str]) -> None:
+    ruff = shutil.which("ruff", path=str(Path(sys.executable).parent))
+    if ruff is None:
+        pytest.skip("ruff is not installed; pip install 'lerobot_policy_vtrefine[dev]'")
+    result = subprocess.run(
+        [ruff, *arguments, "--quiet", str(ROOT)], capture_output=True, text=True, check=False
+    )
+    assert result.returncode == 0, result.stdout
