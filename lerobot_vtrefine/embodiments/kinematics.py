@@ -1,0 +1,144 @@
+"""Kinematics of an embodiment's two arms, batched over any leading shape and differentiable.
+
+Shapes: `...` leading batch, A = 2 arms, K revolute joints per arm, J = A * (K + 2) joints.
+"""
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import numpy as np
+import torch
+from torch import Tensor
+
+if TYPE_CHECKING:
+    from lerobot_vtrefine.embodiments.embodiment import Embodiment
+
+# Step limits and damping of the inverse kinematics: small enough to converge from the home pose to any
+# reachable pose of the task in 30 steps, large enough to stay finite at a singularity.
+_IK_DAMPING = 1e-4
+_IK_MAX_STEP_RAD = 0.4
+
+
+@dataclass(frozen=True)
+class Hands:
+    """The chains of both arms, evaluated."""
+
+    position: Tensor
+    """(..., A, 3) origin of the last link [m]."""
+    rotation: Tensor
+    """(..., A, 3, 3) of the hand frame."""
+    axes: Tensor
+    """(..., A, K, 3) joint axes in the world frame."""
+    origins: Tensor
+    """(..., A, K, 3) points on the axes [m]."""
+
+    def offset(self, along_x_m: float) -> tuple[Tensor, Tensor]:
+        """Pose of the frame that lies `along_x_m` ahead of the hand frame."""
+        return self.position + along_x_m * self.rotation[..., 0], self.rotation
+
+
+def hands(embodiment: "Embodiment", q: Tensor) -> Hands:
+    """Run both chains for joint positions q (..., J)."""
+    arm_q = q.reshape(*q.shape[:-1], 2, embodiment.joints_per_arm)
+    columns = list(_base_rotation(embodiment, q).unbind(-1))
+    position = q.new_tensor([arm.base_pos_m for arm in embodiment.arms]).expand(*arm_q.shape[:-1], 3)
+    columns = [column.expand_as(position) for column in columns]
+    axes, origins = [], []
+    for index, joint in enumerate(embodiment.joints):
+        for axis, length in enumerate(joint.offset_m):
+            if length:
+                position = position + length * columns[axis]
+        axes.append(columns[joint.axis])
+        origins.append(position)
+        _turn(columns, joint.axis, arm_q[..., index, None])
+    return Hands(position, torch.stack(columns, -1), torch.stack(axes, -2), torch.stack(origins, -2))
+
+
+def pads(embodiment: "Embodiment", q: Tensor) -> tuple[Tensor, Tensor]:
+    """Poses of the pads' faces: (..., 4, 3) and (..., 4, 3, 3)."""
+    return _pads_of(embodiment, hands(embodiment, q), q)
+
+
+def pad_twists(embodiment: "Embodiment", q: Tensor, qd: Tensor) -> Tensor:
+    """Linear (at the pad's origin) and angular velocity of the pads, (..., 4, 6)."""
+    chain = hands(embodiment, q)
+    position, _ = _pads_of(embodiment, chain, q)
+    rates = qd.reshape(*qd.shape[:-1], 2, embodiment.joints_per_arm)
+    count = len(embodiment.joints)
+    spins = (chain.axes * rates[..., :count, None]).unsqueeze(-3)  # (..., A, 1, K, 3)
+    arms = position.unflatten(-2, (2, 2))  # (..., A, finger, 3)
+    arms_lever = arms.unsqueeze(-2) - chain.origins.unsqueeze(-3)
+    linear = torch.linalg.cross(spins.expand_as(arms_lever), arms_lever).sum(-2)
+    linear = linear + rates[..., count:, None] * chain.rotation[..., None, :, 1]
+    angular = spins.sum(-2).expand_as(linear)
+    return torch.cat([linear, angular], -1).flatten(-3, -2)
+
+
+def tcp_jacobian(embodiment: "Embodiment", q: Tensor) -> Tensor:
+    """(..., A, 6, K) of each TCP in its own arm's revolute joints."""
+    chain = hands(embodiment, q)
+    position, _ = chain.offset(embodiment.tcp_offset_m)
+    linear = torch.linalg.cross(chain.axes, position.unsqueeze(-2) - chain.origins)
+    return torch.cat([linear, chain.axes], -1).transpose(-1, -2)
+
+
+def solve_tcp(
+    embodiment: "Embodiment", position: Tensor, rotation: Tensor, initial: Tensor, iterations: int
+) -> Tensor:
+    """Damped least squares towards TCP poses; see `Embodiment.solve_tcp`."""
+    lower, upper = embodiment.limits(initial)
+    q = initial.clone()
+    count = len(embodiment.joints)
+    eye = _IK_DAMPING * torch.eye(count, dtype=q.dtype, device=q.device)
+    for _ in range(iterations):
+        now_position, now_rotation = embodiment.tcp_poses(q)
+        error = torch.cat([position - now_position, rotation_error(now_rotation, rotation)], -1)
+        jacobian = tcp_jacobian(embodiment, q)
+        transposed = jacobian.transpose(-1, -2)
+        step = torch.linalg.solve(transposed @ jacobian + eye, transposed @ error.unsqueeze(-1)).squeeze(-1)
+        largest = step.abs().amax(-1, keepdim=True)
+        step = step * (_IK_MAX_STEP_RAD / largest.clamp(min=_IK_MAX_STEP_RAD))
+        arms = q.unflatten(-1, (2, embodiment.joints_per_arm)).clone()
+        arms[..., :count] += step
+        q = torch.minimum(torch.maximum(arms.flatten(-2), lower), upper)
+    return q
+
+
+def rotation_error(current: Tensor, wanted: Tensor) -> Tensor:
+    """Rotation vector (..., 3) in the world frame that turns `current` towards `wanted`, both (..., 3, 3).
+
+    Half the sum of the columns' cross products: exact in direction, its length is the sine of the angle.
+    """
+    return 0.5 * torch.linalg.cross(current.transpose(-1, -2), wanted.transpose(-1, -2)).sum(-2)
+
+
+def _base_rotation(embodiment: "Embodiment", like: Tensor) -> Tensor:
+    yaw = np.array([arm.base_yaw_rad for arm in embodiment.arms])
+    rotation = np.zeros((2, 3, 3))
+    rotation[:, 0, 0] = rotation[:, 1, 1] = np.cos(yaw)
+    rotation[:, 1, 0], rotation[:, 0, 1] = np.sin(yaw), -np.sin(yaw)
+    rotation[:, 2, 2] = 1.0
+    return torch.as_tensor(rotation, dtype=like.dtype, device=like.device)
+
+
+def _turn(columns: list[Tensor], axis: int, angle: Tensor) -> None:
+    """Turn a frame, given by its columns, about one of its own axes, in place in the list."""
+    cos, sin = torch.cos(angle), torch.sin(angle)
+    first, second = (axis + 1) % 3, (axis + 2) % 3
+    u, v = columns[first], columns[second]
+    columns[first] = cos * u + sin * v
+    columns[second] = cos * v - sin * u
+
+
+def _pads_of(embodiment: "Embodiment", chain: Hands, q: Tensor) -> tuple[Tensor, Tensor]:
+    fingers = embodiment.fingers
+    centre, rotation = chain.offset(embodiment.tcp_offset_m)
+    slide = q.unflatten(-1, (2, embodiment.joints_per_arm))[..., -2:]
+    inward = q.new_tensor([-1.0, 1.0])  # the left finger's pad looks along -y of the hand
+    face = slide + fingers.face_offset_m * inward
+    x, y, z = rotation.unsqueeze(-4).unbind(-1)  # each (..., 1, A, 3)
+    x, y, z = (axis.squeeze(-3).unsqueeze(-2) for axis in (x, y, z))  # (..., A, 1, 3)
+    position = centre.unsqueeze(-2) + face.unsqueeze(-1) * y
+    sign = inward.unsqueeze(-1)
+    pad_axes = torch.stack([-x.expand_as(position), sign * z, sign * y], -1)
+    return position.flatten(-3, -2), pad_axes.flatten(-4, -3)
