@@ -47,7 +47,7 @@ CLOUD_KEY = "observation.visuo_tactile"
 
 VISUAL_KEYS = (DEPTH_KEY, INTRINSICS_KEY, CAMERA_POSE_KEY)
 RAW_KEYS = (*TACTILE_KEYS, *BASELINE_KEYS, *VISUAL_KEYS, NOISE_LEVEL_KEY)
-"""Everything the cloud is built from (besides the joint positions) and that the preprocessor drops afterwards."""
+"""What the cloud is built from besides the joint positions; the preprocessor drops it afterwards."""
 
 DEFAULT_NOISE_LEVEL = 3.0
 """The paper's depth noise level in simulation (appendix, vision alignment, step iv)."""
