@@ -1,0 +1,171 @@
+"""DPPO settings: ``paper`` holds the defaults, the other presets state only what differs.
+
+Choose with ``--dppo.type=paper|seed_literal|small``, then change single fields, e.g. ``--dppo.epochs=5``.
+"""
+
+import math
+from dataclasses import dataclass
+
+import draccus
+
+TIMEOUTS = ("terminal", "bootstrap")
+ENCODERS = ("trained", "frozen")
+
+
+@dataclass(frozen=True)
+class DppoConfig(draccus.ChoiceRegistry):
+    """Settings of the DPPO update (Ren et al. 2024), independent of environment and network."""
+
+    # Amount of data: iterations of one episode in each environment (per rank).
+    iterations: int = 200
+    num_envs: int = 1024
+    # Decisions per iteration; 0 means a whole episode. Shorter segments cut episodes, whose rest is
+    # bootstrapped.
+    decisions: int = 0
+
+    # Sampler of rollouts and deployment: "tail" (coarse frozen prefix, then the last steps), "ddim" or
+    # "ddpm".
+    sampler: str = "tail"
+    # Steps of "ddim", or of the tail proper.
+    sampler_steps: int = 10
+    # Coarse steps before the tail; they use the frozen base network.
+    prefix_steps: int = 5
+    # K': how many of the last steps are fine-tuned.
+    ft_denoising_steps: int = 10
+    # Stochasticity of the tuned steps in rollouts (1: DDPM posterior); deployment always uses 0.
+    eta: float = 1.0
+    # Floors of the standard deviation when sampling, and in the log-probability [normalised action units].
+    min_sampling_std: float = 0.01
+    min_log_prob_std: float = 0.1
+
+    # Discount and GAE parameter, per decision.
+    gamma: float = 0.999
+    gae_lambda: float = 0.95
+    # Advantage discount per denoising step before the last.
+    gamma_denoising: float = 0.99
+    # A time-out ends the episode with value zero ("terminal"; the critic must see the time), or keeps the
+    # value of the last state ("bootstrap").
+    timeout: str = "terminal"
+    reward_scaling: bool = True
+
+    # PPO clip range at the last tuned step and at the first; the exponent's rate between them.
+    # Log-probabilities are averaged over the executed slice: the range of a mean-action shift shrinks with
+    # sqrt(Ta * Da).
+    clip: float = 1e-3
+    clip_first: float = 1e-3
+    clip_rate: float = 3.0
+    # Stop the iteration's update when a minibatch's approximate KL divergence exceeds this.
+    target_kl: float = 1.0
+    # Penalty on the KL divergence to the frozen base network, per action element and tuned step.
+    kl_coef: float = 0.0
+    # Weight of the log-likelihood of chains sampled from the base network (behaviour cloning).
+    bc_coef: float = 0.0
+    # The critic has its own optimiser; this only matters for its gradient clipping.
+    value_coef: float = 0.5
+
+    epochs: int = 10
+    # Minibatches hold whole decisions: all their tuned steps together. The paper's rows / K'.
+    minibatch_decisions: int = 1024
+    # Decisions per backward pass; gradients accumulate over a minibatch. 0: the whole minibatch at once.
+    micro_batch_decisions: int = 0
+    # Iterations at the start in which only the critic learns.
+    critic_warmup: int = 2
+    actor_lr: float = 1e-5
+    actor_lr_final: float = 1e-6
+    critic_lr: float = 1e-3
+    critic_lr_final: float = 1e-3
+    # Actor updates over which its learning rate rises linearly.
+    lr_warmup: int = 10
+    weight_decay: float = 0.0
+    # Clip the gradient norm of actor and critic; 0 does not clip.
+    max_grad_norm: float = 0.0
+    # "trained": the observation encoder is fine-tuned too. "frozen": its features are computed once and kept.
+    encoder: str = "trained"
+    critic_width: int = 512
+    critic_blocks: int = 1
+
+    @classmethod
+    def default_choice_name(cls) -> str:
+        """The preset used without ``--dppo.type``."""
+        return "paper"
+
+    def __post_init__(self) -> None:
+        positive = (
+            "iterations",
+            "num_envs",
+            "ft_denoising_steps",
+            "epochs",
+            "minibatch_decisions",
+            "clip",
+            "clip_first",
+        )
+        for name in (*positive, "min_log_prob_std", "gamma", "actor_lr", "critic_lr"):
+            if getattr(self, name) <= 0:
+                raise ValueError(f"--dppo.{name} must be positive, got {getattr(self, name)}")
+        for name, choices in (("timeout", TIMEOUTS), ("encoder", ENCODERS)):
+            if getattr(self, name) not in choices:
+                raise ValueError(
+                    f"--dppo.{name} must be one of {', '.join(choices)}, got {getattr(self, name)!r}"
+                )
+
+    def clip_range(self, step: int) -> float:
+        """Clip range at tuned step 0 (noisiest) ... K'-1 (last), exponential in between."""
+        last = self.ft_denoising_steps - 1
+        if last == 0 or self.clip_rate == 0:  # the reference divides 0 by 0 here
+            return self.clip
+        share = math.expm1(self.clip_rate * step / last) / math.expm1(self.clip_rate)
+        return self.clip_first + (self.clip - self.clip_first) * share
+
+    def actor_lr_at(self, iteration: int) -> float:
+        """Actor learning rate: zero while the critic warms up, linear rise, cosine to the final value."""
+        update = iteration - self.critic_warmup
+        if update < 0:
+            return 0.0
+        if update < self.lr_warmup:
+            return self.actor_lr * (update + 1) / self.lr_warmup
+        progress = (update - self.lr_warmup) / max(1, self.iterations - self.critic_warmup - self.lr_warmup)
+        return _cosine(self.actor_lr, self.actor_lr_final, progress)
+
+    def critic_lr_at(self, iteration: int) -> float:
+        """Learning rate of the critic: cosine over all iterations."""
+        return _cosine(self.critic_lr, self.critic_lr_final, iteration / self.iterations)
+
+
+def _cosine(start: float, end: float, progress: float) -> float:
+    return end + 0.5 * (start - end) * (1 + math.cos(math.pi * min(progress, 1.0)))
+
+
+@DppoConfig.register_subclass("paper")
+@dataclass(frozen=True)
+class PaperDppo(DppoConfig):
+    """The paper's setting with the choices of our specification where the paper is silent."""
+
+
+@DppoConfig.register_subclass("seed_literal")
+@dataclass(frozen=True)
+class SeedLiteralDppo(DppoConfig):
+    """The paper's table taken literally: stable, and slow to improve."""
+
+    clip: float = 2e-4
+    clip_first: float = 2e-4
+
+
+@DppoConfig.register_subclass("small")
+@dataclass(frozen=True)
+class SmallDppo(DppoConfig):
+    """Minutes on two CPU cores: few environments, short episodes, a small network."""
+
+    iterations: int = 25
+    num_envs: int = 96
+    min_sampling_std: float = 0.1
+    reward_scaling: bool = False
+    clip: float = 0.02
+    clip_first: float = 0.02
+    epochs: int = 5
+    minibatch_decisions: int = 200
+    actor_lr: float = 2e-4
+    actor_lr_final: float = 2e-4
+    lr_warmup: int = 1
+    max_grad_norm: float = 1.0
+    encoder: str = "frozen"
+    critic_width: int = 256

@@ -1,0 +1,74 @@
+"""Data-parallel training under ``torchrun``: every rank owns its environments; sums cross ranks.
+
+Without ``torchrun`` everything here is a no-op on one rank.
+"""
+
+import os
+from collections.abc import Iterable
+
+import torch
+import torch.distributed as dist
+from torch import Tensor, nn
+
+
+def setup_ranks(device: torch.device) -> tuple[int, int]:
+    """Join the process group that ``torchrun`` announced. Returns (rank, number of ranks)."""
+    if "RANK" not in os.environ:
+        return 0, 1
+    if not dist.is_initialized():
+        dist.init_process_group("nccl" if device.type == "cuda" else "gloo")
+    return dist.get_rank(), dist.get_world_size()
+
+
+def leave_ranks() -> None:
+    """Leave the process group, if any."""
+    if dist.is_initialized():
+        dist.destroy_process_group()
+
+
+def num_ranks() -> int:
+    """Number of ranks (1 without ``torchrun``)."""
+    return dist.get_world_size() if dist.is_initialized() else 1
+
+
+def barrier() -> None:
+    """Wait for all ranks."""
+    if num_ranks() > 1:
+        dist.barrier()
+
+
+def sum_over_ranks(tensor: Tensor) -> Tensor:
+    """Sum a tensor over all ranks, in place."""
+    if num_ranks() > 1:
+        dist.all_reduce(tensor)
+    return tensor
+
+
+def max_over_ranks(value: int, device: torch.device) -> int:
+    """Largest value of an integer over all ranks."""
+    if num_ranks() == 1:
+        return value
+    tensor = torch.tensor(value, device=device)
+    dist.all_reduce(tensor, dist.ReduceOp.MAX)
+    return int(tensor)
+
+
+def sum_gradients(parameters: Iterable[nn.Parameter]) -> None:
+    """Replace every gradient by its sum over ranks, in one message."""
+    if num_ranks() == 1:
+        return
+    parameters = list(parameters)
+    for parameter in parameters:
+        if parameter.grad is None:  # an unused parameter must still take part in the sum
+            parameter.grad = torch.zeros_like(parameter)
+    flat = torch.cat([parameter.grad.flatten() for parameter in parameters])
+    dist.all_reduce(flat)
+    for parameter, part in zip(parameters, flat.split([p.numel() for p in parameters]), strict=True):
+        parameter.grad.copy_(part.view_as(parameter))
+
+
+def copy_from_first_rank(module: nn.Module) -> None:
+    """Give every rank the first rank's parameters and buffers."""
+    if num_ranks() > 1:
+        for tensor in module.state_dict().values():
+            dist.broadcast(tensor, src=0)

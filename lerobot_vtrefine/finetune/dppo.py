@@ -1,0 +1,384 @@
+"""Diffusion Policy Policy Optimization (Ren et al. 2024) in one file.
+
+Two nested decision processes: each decision t of the environment is a chain of denoising steps, of which
+the last K' (the tuned ones) form a Gaussian policy. Every tuned step of a decision shares the decision's
+advantage. What runs here, in order: ``collect`` episodes with the noisy sampler, values and advantages over
+decisions, ``update`` with PPO's clipped objective on (decision, tuned step) rows, ``evaluate`` with the
+deployment sampler.
+
+Differences from the reference implementation, all deliberate: K'=1 works; critic-only iterations really
+happen; values of final states are never mixed with those of the next episode; the observation is encoded
+once per decision, not once per denoising step; minibatches hold whole decisions and none is dropped;
+log-probabilities are stored while sampling; finished environments idle and their steps are left out of the
+batch.
+
+Shapes: E environments, S decisions, N valid decisions, K' tuned steps, H horizon, D action dimension.
+"""
+
+import math
+import time
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from lerobot_vtrefine.finetune.config import DppoConfig
+from lerobot_vtrefine.finetune.critic import Critic, explained_variance
+from lerobot_vtrefine.finetune.distributed import max_over_ranks, num_ranks, sum_gradients, sum_over_ranks
+from lerobot_vtrefine.finetune.gae import RewardScaler, generalised_advantages
+from lerobot_vtrefine.finetune.protocols import (
+    Agent,
+    DecisionEnv,
+    Observation,
+    concatenate,
+    execute,
+    latest,
+    predictor,
+    select,
+)
+from lerobot_vtrefine.policies.vt_dp3.diffusion import denoise_prefix, sample_chain, slice_log_prob
+
+Metrics = dict[str, float]
+
+TRAINING_SEEDS = 1_000_000
+"""First environment seed of training episodes; smaller seeds are free for evaluation."""
+
+
+@dataclass
+class TrainState:
+    """Everything that changes during training, apart from the actor's weights."""
+
+    critic: Critic
+    actor_optimizer: torch.optim.AdamW
+    critic_optimizer: torch.optim.AdamW
+    reward_scaler: RewardScaler
+    generator: torch.Generator
+    iteration: int = 0
+    env_steps: int = 0
+
+    @classmethod
+    def create(
+        cls, agent: Agent, cfg: DppoConfig, privileged_dim: int, seed: int, rank: int = 0
+    ) -> "TrainState":
+        """Fresh state on the actor's device; ranks differ only in their exploration noise."""
+        device = next(agent.actor.parameters()).device
+        with torch.random.fork_rng(devices=[]):
+            torch.manual_seed(seed)
+            critic = Critic(privileged_dim, cfg.critic_width, cfg.critic_blocks).to(device)
+        adamw = {"weight_decay": cfg.weight_decay, "fused": device.type == "cuda"}
+        return cls(
+            critic,
+            torch.optim.AdamW(agent.trained_parameters(), lr=cfg.actor_lr, **adamw),
+            torch.optim.AdamW(critic.parameters(), lr=cfg.critic_lr, **adamw),
+            RewardScaler(),
+            torch.Generator(device).manual_seed(seed + 7919 * rank),
+        )
+
+
+@dataclass
+class Rollout:
+    """One segment of experience. Flat tensors hold the N valid decisions; grids are (S, E)."""
+
+    obs: Observation  # (N, ...) policy input, or {"cond": (N, C)} with a frozen encoder
+    latents: Tensor  # (N, K'+1, H, D)
+    log_probs: Tensor  # (N, K') under the sampling policy
+    step: Tensor  # (N,) decision index
+    env: Tensor  # (N,) environment index
+    privileged: Tensor  # (S+1, E, P)
+    reward: Tensor
+    terminated: Tensor
+    truncated: Tensor
+    active: Tensor
+    success: Tensor  # (E,)
+    info: dict[str, Tensor]  # (E,) episode metrics
+
+
+@torch.no_grad()
+def collect(
+    env: DecisionEnv, agent: Agent, cfg: DppoConfig, generator: torch.Generator, seeds: Sequence[int]
+) -> Rollout:
+    """One episode (or its first ``cfg.decisions`` decisions) in every environment, with exploration noise."""
+    obs, privileged = env.reset(seeds)
+    device, running = privileged.device, torch.ones(env.num_envs, dtype=torch.bool, device=privileged.device)
+    success = torch.zeros_like(running)
+    kept, chains, index, states, transitions, active = [], [], [], [privileged], [], []
+    info: dict[str, Tensor] = {}
+    for step in range(cfg.decisions or env.max_decisions):
+        ids = running.nonzero().squeeze(1)
+        obs = select(obs, ids)
+        cond, cond_base = agent.conditions(obs)
+        noise = torch.randn((len(ids), *agent.action_shape), generator=generator, device=device)
+        latent = denoise_prefix(agent.process, predictor(agent.base, cond_base), noise, agent.num_tuned)
+        chain = sample_chain(
+            agent.process,
+            predictor(agent.actor, cond),
+            latent,
+            num_tuned=agent.num_tuned,
+            executed=agent.executed,
+            eta=cfg.eta,
+            min_sampling_std=cfg.min_sampling_std,
+            min_log_prob_std=cfg.min_log_prob_std,
+            generator=generator,
+        )
+        transition = execute(env, chain.latents[:, -1, agent.executed], ids)
+        kept.append({"cond": cond} if agent.frozen_encoder else obs)
+        chains.append(chain)
+        index.append(torch.stack([torch.full_like(ids, step), ids]))
+        active.append(running)
+        transitions.append(transition)
+        states.append(transition.privileged)
+        info = latest(info, transition.info, running)
+        success = success | (transition.info["success"] & running)
+        running = running & ~transition.terminated & ~transition.truncated
+        obs = transition.obs
+        if not running.any():
+            break
+    step_index, env_index = torch.cat(index, dim=1)
+    return Rollout(
+        obs=concatenate(kept),
+        latents=torch.cat([chain.latents for chain in chains]),
+        log_probs=torch.cat([chain.log_probs for chain in chains]),
+        step=step_index,
+        env=env_index,
+        privileged=torch.stack(states),
+        reward=torch.stack([t.reward * a for t, a in zip(transitions, active, strict=True)]),
+        terminated=torch.stack([t.terminated for t in transitions]),
+        truncated=torch.stack([t.truncated for t in transitions]),
+        active=torch.stack(active),
+        success=success,
+        info=info,
+    )
+
+
+@torch.no_grad()
+def decision_advantages(rollout: Rollout, state: TrainState, cfg: DppoConfig) -> tuple[Tensor, Tensor]:
+    """Normalised advantages and value targets (N,) of the valid decisions."""
+    reward = state.reward_scaler(rollout.reward, rollout.active) if cfg.reward_scaling else rollout.reward
+    timeout_is_end = cfg.timeout == "terminal"
+    advantages, targets = generalised_advantages(
+        reward,
+        state.critic(rollout.privileged),
+        rollout.terminated | (rollout.truncated & timeout_is_end),
+        rollout.truncated,
+        rollout.active,
+        gamma=cfg.gamma,
+        gae_lambda=cfg.gae_lambda,
+    )
+    advantages, targets = advantages[rollout.step, rollout.env], targets[rollout.step, rollout.env]
+    moments = torch.stack([torch.ones_like(advantages), advantages, advantages**2]).double().sum(1)
+    count, total, squares = sum_over_ranks(moments).tolist()
+    mean = total / count
+    std = max(squares / count - mean**2, 0.0) ** 0.5
+    return (advantages - mean) / (std + 1e-8), targets
+
+
+@dataclass
+class Regulariser:
+    """What the frozen base network would do in the visited decisions, for the optional KL and BC terms."""
+
+    means: Tensor | None = None  # (N, K', H, D) base means at the stored latents
+    latents: Tensor | None = None  # (N, K'+1, H, D) chains sampled from the base
+
+    @classmethod
+    @torch.no_grad()
+    def of(cls, rollout: Rollout, agent: Agent, cfg: DppoConfig, generator: torch.Generator) -> "Regulariser":
+        """Computed once per iteration, and only what a non-zero coefficient needs."""
+        if not (cfg.kl_coef or cfg.bc_coef):
+            return cls()
+        means, chains = [], []
+        for ids in torch.arange(len(rollout.latents)).split(cfg.minibatch_decisions):
+            obs = select(rollout.obs, ids)
+            cond = obs["cond"] if agent.frozen_encoder else agent.base.encode(obs)
+            if cfg.kl_coef:
+                means.append(_reverse_steps(agent, agent.base, rollout.latents[ids], cond, cfg.eta)[0])
+            if cfg.bc_coef:
+                noise = torch.randn((len(ids), *agent.action_shape), generator=generator, device=cond.device)
+                base = predictor(agent.base, cond)
+                latent = denoise_prefix(agent.process, base, noise, agent.num_tuned)
+                chains.append(
+                    sample_chain(
+                        agent.process,
+                        base,
+                        latent,
+                        num_tuned=agent.num_tuned,
+                        executed=agent.executed,
+                        eta=cfg.eta,
+                        min_sampling_std=cfg.min_sampling_std,
+                        min_log_prob_std=cfg.min_log_prob_std,
+                        generator=generator,
+                    ).latents
+                )
+        return cls(torch.cat(means) if means else None, torch.cat(chains) if chains else None)
+
+
+def _reverse_steps(
+    agent: Agent, module: torch.nn.Module, latents: Tensor, cond: Tensor, eta: float
+) -> tuple[Tensor, Tensor]:
+    """Means (B, K', H, D) and stds (B, K', 1, 1) of all tuned steps of B decisions, in one network call."""
+    batch, steps = latents.shape[0], agent.num_tuned
+    positions = torch.arange(
+        agent.process.num_steps - steps, agent.process.num_steps, device=latents.device
+    ).repeat(batch)
+    rows = latents[:, :-1].flatten(0, 1)
+    eps = module.denoiser(rows, agent.process.times(positions), cond.repeat_interleave(steps, dim=0))
+    mean, std = agent.process.posterior(rows, eps, positions, eta)
+    return mean.unflatten(0, (batch, steps)), std.unflatten(0, (batch, steps))
+
+
+def chain_log_probs(
+    agent: Agent, latents: Tensor, cond: Tensor, cfg: DppoConfig
+) -> tuple[Tensor, Tensor, Tensor]:
+    """Log-probabilities (B, K') of stored chains under the current actor, with means and floored stds."""
+    mean, std = _reverse_steps(agent, agent.actor, latents, cond, cfg.eta)
+    std = std.clamp(min=cfg.min_log_prob_std)
+    rows = slice_log_prob(latents[:, 1:].flatten(0, 1), mean.flatten(0, 1), std.flatten(0, 1), agent.executed)
+    return rows.view(latents.shape[0], agent.num_tuned), mean, std
+
+
+def policy_loss(log_ratio: Tensor, advantages: Tensor, cfg: DppoConfig) -> Tensor:
+    """PPO's clipped loss per row. log_ratio (B, K'), advantages (B,) -> (B, K')."""
+    steps = range(cfg.ft_denoising_steps)
+    clip = log_ratio.new_tensor([cfg.clip_range(step) for step in steps])
+    discount = log_ratio.new_tensor(
+        [cfg.gamma_denoising ** (cfg.ft_denoising_steps - 1 - step) for step in steps]
+    )
+    advantages = advantages.unsqueeze(1) * discount
+    ratio = log_ratio.exp()
+    clipped = ratio.clamp(1 - clip, 1 + clip)
+    return torch.maximum(-advantages * ratio, -advantages * clipped)
+
+
+def update(rollout: Rollout, agent: Agent, state: TrainState, cfg: DppoConfig) -> Metrics:
+    """All epochs over one segment. Critic-only during the first ``cfg.critic_warmup`` iterations."""
+    advantages, targets = decision_advantages(rollout, state, cfg)
+    privileged = rollout.privileged[rollout.step, rollout.env]
+    train_actor = state.iteration >= cfg.critic_warmup
+    regulariser = Regulariser.of(rollout, agent, cfg, state.generator) if train_actor else Regulariser()
+    state.actor_optimizer.param_groups[0]["lr"] = cfg.actor_lr_at(state.iteration)
+    state.critic_optimizer.param_groups[0]["lr"] = cfg.critic_lr_at(state.iteration)
+    actor_parameters, critic_parameters = agent.trained_parameters(), list(state.critic.parameters())
+    clip = advantages.new_tensor([cfg.clip_range(step) for step in range(cfg.ft_denoising_steps)])
+    num_valid = len(advantages)
+    # Ranks own different numbers of decisions: the same number of minibatches everywhere, of unequal sizes.
+    num_minibatches = math.ceil(max_over_ranks(num_valid, advantages.device) / cfg.minibatch_decisions)
+    history: list[list[float]] = []
+    initial_log_ratio, stopped = 0.0, False
+
+    for _ in range(cfg.epochs):
+        order = torch.randperm(num_valid, generator=state.generator, device=advantages.device)
+        for minibatch in order.tensor_split(num_minibatches):
+            # Sums over ranks, divided by the number of decisions in the minibatches of all ranks.
+            size = float(sum_over_ranks(torch.tensor(float(len(minibatch)), device=advantages.device)))
+            rows = size * cfg.ft_denoising_steps
+            sums = torch.zeros(5, dtype=torch.float64, device=advantages.device)
+            state.actor_optimizer.zero_grad(set_to_none=True)
+            state.critic_optimizer.zero_grad(set_to_none=True)
+            for ids in minibatch.split(cfg.micro_batch_decisions or max(len(minibatch), 1)):
+                value_error = (state.critic(privileged[ids]) - targets[ids]) ** 2
+                (cfg.value_coef * 0.5 * value_error.sum() / size).backward()
+                sums[0] += value_error.detach().sum() / size
+                if not train_actor:
+                    continue
+                obs = select(rollout.obs, ids)
+                cond = obs["cond"] if agent.frozen_encoder else agent.actor.encode(obs)
+                log_probs, mean, std = chain_log_probs(agent, rollout.latents[ids], cond, cfg)
+                log_ratio = log_probs - rollout.log_probs[ids]
+                loss = policy_loss(log_ratio, advantages[ids], cfg).sum() / rows
+                sums[1] += loss.detach()
+                if regulariser.means is not None:
+                    shift = ((mean - regulariser.means[ids]) / std)[:, :, agent.executed]
+                    loss = loss + cfg.kl_coef * 0.5 * (shift**2).mean(dim=(2, 3)).sum() / rows
+                if regulariser.latents is not None:
+                    base_log_probs, _, _ = chain_log_probs(agent, regulariser.latents[ids], cond, cfg)
+                    loss = loss - cfg.bc_coef * base_log_probs.sum() / rows
+                loss.backward()
+                with torch.no_grad():
+                    sums[2] += (log_ratio.exp() - 1 - log_ratio).sum() / rows  # Schulman's k3 estimator
+                    sums[3] += (log_ratio.expm1().abs() > clip).double().sum() / rows
+                    sums[4] += log_ratio.abs().sum() / rows
+            value_loss, loss_value, approx_kl, clip_fraction, log_ratio_size = sum_over_ranks(sums).tolist()
+            if not math.isfinite(value_loss + loss_value):
+                raise FloatingPointError(
+                    f"loss is not finite in iteration {state.iteration}: lower --dppo.actor_lr"
+                )
+            if train_actor and not history:
+                initial_log_ratio = log_ratio_size  # zero up to rounding, or the stored chains are wrong
+            if train_actor and approx_kl > cfg.target_kl:
+                stopped = True
+                break
+            sum_gradients(critic_parameters)
+            _clip_gradients(critic_parameters, cfg.max_grad_norm)
+            state.critic_optimizer.step()
+            grad_norm = 0.0
+            if train_actor:
+                sum_gradients(actor_parameters)
+                grad_norm = _clip_gradients(actor_parameters, cfg.max_grad_norm)
+                state.actor_optimizer.step()
+            history.append([value_loss, loss_value, approx_kl, clip_fraction, grad_norm])
+        if stopped:
+            break
+
+    averages = torch.tensor(history or [[0.0] * 5], dtype=torch.float64).mean(0).tolist()
+    names = ("value_loss", "policy_loss", "approx_kl", "clip_fraction", "grad_norm")
+    with torch.no_grad():
+        explained = explained_variance(state.critic(privileged), targets)
+    return dict(zip(names, averages, strict=True)) | {
+        "explained_variance": explained,
+        "initial_log_ratio": initial_log_ratio,
+        "updates": float(len(history)),
+        "stopped_early": float(stopped),
+        "actor_lr": cfg.actor_lr_at(state.iteration),
+    }
+
+
+def _clip_gradients(parameters: list[torch.nn.Parameter], max_norm: float) -> float:
+    """Gradient norm; clipped to ``max_norm`` if that is positive."""
+    return float(torch.nn.utils.clip_grad_norm_(parameters, max_norm or math.inf))
+
+
+def rollout_metrics(rollout: Rollout) -> Metrics:
+    """Averages over the environments of all ranks."""
+    values = {
+        "success": rollout.success.float(),
+        "return": rollout.reward.sum(0),
+        "decisions": rollout.active.sum(0),
+    }
+    values |= {key: value for key, value in rollout.info.items() if key != "success"}
+    sums = torch.stack(
+        [value.double().sum() for value in values.values()] + [rollout.active.new_tensor(0.0).double()]
+    )
+    sums[-1] = rollout.active.shape[1]
+    *totals, count = sum_over_ranks(sums).tolist()
+    return {key: total / count for key, total in zip(values, totals, strict=True)}
+
+
+def train(
+    env: DecisionEnv,
+    agent: Agent,
+    state: TrainState,
+    cfg: DppoConfig,
+    *,
+    seed: int,
+    rank: int = 0,
+    after_iteration: Callable[[TrainState, Metrics], None],
+) -> None:
+    """Run the iterations that remain; ``after_iteration`` logs, evaluates and saves."""
+    while state.iteration < cfg.iterations:
+        started = time.perf_counter()
+        first = TRAINING_SEEDS + seed + (state.iteration * num_ranks() + rank) * env.num_envs
+        rollout = collect(env, agent, cfg, state.generator, range(first, first + env.num_envs))
+        collected = time.perf_counter()
+        state.critic.update_moments(rollout.privileged[:-1][rollout.active])
+        metrics = rollout_metrics(rollout) | update(rollout, agent, state, cfg)
+        decisions = sum_over_ranks(rollout.active.sum().double()).item()
+        state.iteration += 1
+        state.env_steps += int(decisions) * (agent.executed.stop - agent.executed.start)
+        seconds = time.perf_counter() - started
+        metrics |= {
+            "env_steps": float(state.env_steps),
+            "steps_per_s": decisions * (agent.executed.stop - agent.executed.start) / seconds,
+            "rollout_s": collected - started,
+            "update_s": seconds - (collected - started),
+        }
+        after_iteration(state, metrics)

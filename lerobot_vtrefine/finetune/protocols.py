@@ -1,0 +1,122 @@
+"""What DPPO needs from a network and from an environment, and nothing more.
+
+Shapes: ``n`` environments, ``H`` horizon of a predicted chunk, ``Ta`` executed actions of it, ``D`` action
+dimension, ``C`` condition, ``P`` privileged state.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import NamedTuple, Protocol
+
+import torch
+from torch import Tensor, nn
+
+from lerobot_vtrefine.policies.vt_dp3.diffusion import DiffusionProcess, PredictNoise
+
+Observation = dict[str, Tensor]
+"""A preprocessed policy batch; every tensor starts with the environment axis."""
+
+
+class Actor(Protocol):
+    """A diffusion policy's network: an ``nn.Module`` with two stages."""
+
+    denoiser: nn.Module
+    """``(x (B, H, D), t (B,) long, cond (B, C)) -> eps (B, H, D)``."""
+
+    def encode(self, obs: Observation) -> Tensor:
+        """Condition (B, C) of an observation: once per decision."""
+        ...
+
+
+@dataclass
+class Agent:
+    """A diffusion policy being fine-tuned.
+
+    ``base`` denoises down to the last ``num_tuned`` steps and stays frozen; ``actor`` does these steps.
+    ``executed`` is the part of the horizon that reaches the environment. ``frozen_encoder``: the actor's
+    encoder is not trained and is the base's, so conditions are computed once and kept.
+    """
+
+    actor: nn.Module
+    base: nn.Module
+    process: DiffusionProcess
+    num_tuned: int
+    action_shape: tuple[int, int]  # (H, D)
+    executed: slice
+    frozen_encoder: bool
+
+    def trained_parameters(self) -> list[nn.Parameter]:
+        """What the actor's optimiser owns."""
+        module = self.actor.denoiser if self.frozen_encoder else self.actor
+        return [parameter for parameter in module.parameters() if parameter.requires_grad]
+
+    def conditions(self, obs: Observation) -> tuple[Tensor, Tensor]:
+        """Conditions (B, C) for the actor and for the base."""
+        cond = self.actor.encode(obs)
+        return cond, (cond if self.frozen_encoder else self.base.encode(obs))
+
+
+def predictor(module: nn.Module, cond: Tensor) -> PredictNoise:
+    """Bind a condition to a module's denoiser."""
+    return lambda x, t: module.denoiser(x, t, cond)
+
+
+class Transition(NamedTuple):
+    """What executing one chunk in every environment returned.
+
+    Environments that had finished before are left alone: their entries hold anything finite. ``privileged``
+    of an environment that finishes in this chunk is its final state (there is no automatic reset).
+    """
+
+    obs: Observation
+    privileged: Tensor  # (n, P)
+    reward: Tensor  # (n,) sum over the chunk
+    terminated: Tensor  # (n,) bool: the task ended (success or failure)
+    truncated: Tensor  # (n,) bool: the time was over
+    info: dict[str, Tensor]  # "success" (n,) bool, further (n,) metrics of the episode so far
+
+
+class DecisionEnv(Protocol):
+    """Environments that take one action chunk per decision and pause once finished, until the next reset."""
+
+    num_envs: int
+    max_decisions: int
+    """Decisions in the longest possible episode."""
+
+    def reset(self, seeds: Sequence[int]) -> tuple[Observation, Tensor]:
+        """Start all environments, each from its own seed. Returns observation and privileged state (n, P)."""
+        ...
+
+    def step_chunk(self, actions: Tensor) -> Transition:
+        """Execute (n, Ta, D) normalised actions, as the policy predicts them."""
+        ...
+
+
+def no_gradient(module: nn.Module) -> nn.Module:
+    """Freeze a module in place."""
+    module.requires_grad_(False)
+    return module.eval()
+
+
+def select(obs: Observation, index: Tensor) -> Observation:
+    """Rows of an observation."""
+    return {key: value[index] for key, value in obs.items()}
+
+
+def concatenate(parts: list[Observation]) -> Observation:
+    """Join observations along the first axis."""
+    return {key: torch.cat([part[key] for part in parts]) for key in parts[0]}
+
+
+def execute(env: DecisionEnv, chunks: Tensor, ids: Tensor) -> Transition:
+    """Step the running environments; the others receive zeros, which they ignore."""
+    actions = chunks.new_zeros((env.num_envs, *chunks.shape[1:]))
+    actions[ids] = chunks
+    return env.step_chunk(actions)
+
+
+def latest(info: dict[str, Tensor], news: dict[str, Tensor], running: Tensor) -> dict[str, Tensor]:
+    """Episode metrics, frozen where an environment has already finished."""
+    return {
+        key: torch.where(running, value.float(), info.get(key, value.float())) for key, value in news.items()
+    }
