@@ -1,0 +1,57 @@
+"""Four tactile pads drawn as labelled heat maps, and the text beside a video frame (PIL and numpy only)."""
+
+from functools import cache
+
+import numpy as np
+from numpy.typing import NDArray
+from PIL import Image, ImageDraw
+
+Frame = NDArray[np.uint8]
+
+PAD_LABELS = ("L arm, L finger", "L arm, R finger", "R arm, L finger", "R arm, R finger")
+FULL_SCALE_COUNTS = 160  # counts above the idle level that get the brightest colour
+_TAXEL_PX = 6
+_TEXT_PX = 14
+_GAP_PX = 6
+_BACKGROUND = (24, 26, 32)
+_INK = (226, 228, 232)
+_GOOD = (96, 214, 132)
+
+
+def panel_size(rows: int, cols: int) -> tuple[int, int]:
+    """Return (height, width) in pixels of the panel for four pads of `rows` x `cols` taxels."""
+    return 4 * (
+        rows * _TAXEL_PX + _TEXT_PX + _GAP_PX
+    ) + 2 * _TEXT_PX + _GAP_PX, cols * _TAXEL_PX + 2 * _GAP_PX
+
+
+def pad_panel(counts: NDArray, baseline: NDArray, rows: int, cols: int, status: str, success: bool) -> Frame:
+    """Draw `counts` - `baseline`, both (4, rows * cols) uint8, below each other with a status line above.
+
+    Row 0 of a pad is drawn at the top and column 0, the fingertip, on the left. Returns uint8 (H, W, 3).
+    """
+    height, width = panel_size(rows, cols)
+    image = Image.new("RGB", (width, height), _BACKGROUND)
+    draw = ImageDraw.Draw(image)
+    draw.text((_GAP_PX, _GAP_PX // 2), status, fill=_INK)
+    draw.text((_GAP_PX, _GAP_PX // 2 + _TEXT_PX), "SUCCESS" if success else "", fill=_GOOD)
+    top = 2 * _TEXT_PX + _GAP_PX
+    for label, reading, idle in zip(PAD_LABELS, counts, baseline, strict=True):
+        above = np.clip(reading.astype(float) - idle, 0, None)
+        draw.text((_GAP_PX, top), f"{label}   sum {above.sum():.0f}", fill=_INK)
+        image.paste(Image.fromarray(_heat_map(above.reshape(rows, cols))), (_GAP_PX, top + _TEXT_PX))
+        top += rows * _TAXEL_PX + _TEXT_PX + _GAP_PX
+    return np.asarray(image)
+
+
+def _heat_map(above: NDArray) -> Frame:
+    level = np.clip(above / FULL_SCALE_COUNTS, 0, 1) ** 0.5  # light touch must be visible too
+    colours = _viridis()[(255 * level).astype(np.uint8)]
+    return colours.repeat(_TAXEL_PX, axis=0).repeat(_TAXEL_PX, axis=1)
+
+
+@cache
+def _viridis() -> Frame:
+    from matplotlib import colormaps  # slow to import, needed for videos only
+
+    return (255 * colormaps["viridis"](np.linspace(0, 1, 256))[:, :3]).astype(np.uint8)

@@ -1,0 +1,156 @@
+"""Video frames of one environment: the scene beside its four tactile pads.
+
+The scene is drawn with OpenGL where that works, and else from the depth camera's rays as a shaded image, so
+that videos exist on any machine.
+"""
+
+import logging
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Literal
+
+import numpy as np
+from numpy.typing import NDArray
+from PIL import Image
+
+from lerobot_vtrefine.sim.pad_panel import Frame, pad_panel, panel_size
+
+if TYPE_CHECKING:
+    from lerobot_vtrefine.sim.simulation import InsertionSim
+
+log = logging.getLogger(__name__)
+
+GL_HELP = "install EGL (Debian: apt install libegl1 libgl1-mesa-dri) and start with MUJOCO_GL=egl"
+_PAD_SHAPE = (12, 32)
+_BACKGROUND = (24, 26, 32)
+
+
+@dataclass(frozen=True)
+class CameraView:
+    """A free camera: looks at `lookat_m` (world) from `distance_m`, angles in degrees as in MuJoCo."""
+
+    lookat_m: tuple[float, float, float] = (0.0, 0.0, 0.11)
+    distance_m: float = 0.62
+    azimuth_deg: float = 0.0
+    elevation_deg: float = -18.0
+
+
+class VideoRenderer:
+    """Draws environment `env` of `sim`.
+
+    `backend` "auto" takes OpenGL when it works; "gl" raises RuntimeError with the fix when it does not;
+    "rays" draws the depth image.
+    """
+
+    def __init__(
+        self,
+        sim: "InsertionSim",
+        env: int = 0,
+        view: CameraView | None = None,
+        width: int = 480,
+        backend: Literal["auto", "gl", "rays"] = "auto",
+    ) -> None:
+        self._sim = sim
+        self._env = env
+        self._size = (panel_size(*_PAD_SHAPE)[0], width)
+        self._scene = _make_scene(sim, env, view or CameraView(), self._size, backend)
+
+    def frame(self) -> Frame:
+        """Return the current frame, uint8 (H, W, 3); H and W are even, as video encoders want."""
+        ids = np.array([self._env])
+        raw = self._sim.observe(ids)
+        scene = (
+            self._scene.draw()
+            if self._scene
+            else shaded_depth(raw["depth_mm"][0], self._sim.camera_intrinsics)
+        )
+        success = bool(self._sim.metrics(ids)["success"][0])
+        status = f"step {int(self._sim.steps[self._env]):3d}"
+        panel = pad_panel(raw["tactile"][0], raw["tactile_baseline"][0], *_PAD_SHAPE, status, success)
+        joined = np.concatenate([_fit(scene, self._size), panel], axis=1)
+        return np.ascontiguousarray(joined[: joined.shape[0] // 2 * 2, : joined.shape[1] // 2 * 2])
+
+    def close(self) -> None:
+        """Free the OpenGL context; later frames raise."""
+        if self._scene:
+            self._scene.close()
+
+
+class _GlScene:
+    """The scene through `mujoco.Renderer`."""
+
+    def __init__(self, sim: "InsertionSim", env: int, view: CameraView, size: tuple[int, int]) -> None:
+        import mujoco
+
+        self._sim, self._env = sim, env
+        model, _ = sim.mj_data(env)
+        # The off-screen buffer must hold the frame; enlarging it in the model costs memory only here.
+        model.vis.global_.offheight = max(model.vis.global_.offheight, size[0])
+        model.vis.global_.offwidth = max(model.vis.global_.offwidth, size[1])
+        self._renderer = mujoco.Renderer(model, *size)
+        self._camera = mujoco.MjvCamera()
+        self._camera.type = mujoco.mjtCamera.mjCAMERA_FREE
+        self._camera.lookat = view.lookat_m
+        self._camera.distance = view.distance_m
+        self._camera.azimuth, self._camera.elevation = view.azimuth_deg, view.elevation_deg
+
+    def draw(self) -> Frame:
+        _, data = self._sim.mj_data(self._env)
+        self._renderer.update_scene(data, self._camera)
+        return self._renderer.render()
+
+    def close(self) -> None:
+        self._renderer.close()
+
+
+def _make_scene(
+    sim: "InsertionSim", env: int, view: CameraView, size: tuple[int, int], backend: str
+) -> _GlScene | None:
+    if backend not in ("auto", "gl", "rays"):
+        raise ValueError(f"backend must be auto, gl or rays, not {backend!r}")
+    if backend == "rays":
+        return None
+    try:
+        return _GlScene(sim, env, view, size)
+    except (
+        Exception
+    ) as error:  # OpenGL libraries fail with AttributeError, ImportError, FatalError, RuntimeError, ...
+        message = f"no OpenGL to draw the scene with ({type(error).__name__}): {GL_HELP}"
+        if backend == "gl":
+            raise RuntimeError(message) from error
+        log.warning("%s; drawing the depth image instead", message)
+        return None
+
+
+def shaded_depth(depth_mm: NDArray[np.uint16], intrinsics: NDArray) -> Frame:
+    """Shade a depth image (H, W) [mm, 0 = nothing] as if lit from the camera's upper left; uint8 (H, W, 3).
+
+    `intrinsics` is (4,) fx, fy, cx, cy [px]. Surfaces are tinted by height in the image and darken with
+    distance.
+    """
+    depth = depth_mm.astype(float).reshape(depth_mm.shape[:2])
+    hit = depth > 0
+    if not hit.any():
+        return np.full((*depth.shape, 3), _BACKGROUND, np.uint8)
+    fx, fy, cx, cy = np.asarray(intrinsics, float)
+    rows, cols = np.indices(depth.shape)
+    points = np.stack([(cols - cx) / fx * depth, (rows - cy) / fy * depth, depth], axis=-1)
+    normal = np.cross(np.gradient(points, axis=1), np.gradient(points, axis=0))
+    normal /= np.linalg.norm(normal, axis=-1, keepdims=True) + 1e-9
+    light = np.array([-0.4, -0.6, -0.7]) / np.linalg.norm([0.4, 0.6, 0.7])
+    near, far = np.percentile(depth[hit], (2, 98))
+    fade = 1.0 - 0.4 * np.clip((depth - near) / max(far - near, 1.0), 0, 1)
+    shade = (0.35 + 0.65 * np.abs(normal @ light)) * fade
+    image = shade[..., None] * np.array([214, 210, 200])
+    return np.where(hit[..., None], image, _BACKGROUND).clip(0, 255).astype(np.uint8)
+
+
+def _fit(frame: Frame, size: tuple[int, int]) -> Frame:
+    """Scale into (height, width), keeping the aspect ratio, on a dark ground."""
+    height, width = size
+    if frame.shape[:2] == size:
+        return frame
+    scale = min(height / frame.shape[0], width / frame.shape[1])
+    shape = (max(1, round(frame.shape[1] * scale)), max(1, round(frame.shape[0] * scale)))
+    canvas = Image.new("RGB", (width, height), _BACKGROUND)
+    canvas.paste(Image.fromarray(frame).resize(shape), ((width - shape[0]) // 2, (height - shape[1]) // 2))
+    return np.asarray(canvas)

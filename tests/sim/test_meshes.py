@@ -1,0 +1,235 @@
+"""Pairs from meshes: one clear line per fault, the cache, the measured fit, sliding in under physics."""
+
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+
+import mujoco
+import numpy as np
+import pytest
+
+from lerobot_vtrefine.sim import meshes
+from lerobot_vtrefine.sim.meshes import MeshPair, load_mesh_pair, mesh_ids
+
+trimesh = pytest.importorskip("trimesh", reason="needs the assets extra")
+pytest.importorskip("coacd", reason="needs the assets extra")
+
+AUTOMATE = Path(__file__).parents[3] / "shared" / "data" / "automate"
+RING_HOLE_M, POST_M, RING_BOTTOM_M, RING_TOP_M, POST_TOP_M = 0.0125, 0.0105, 0.020, 0.035, 0.050
+PLAY_M = RING_HOLE_M - POST_M
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Path]:
+    """A folder with a ring (plug) over a post with a foot (socket), in millimetres; a cache of its own."""
+    folder = tmp_path_factory.mktemp("meshes")
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setenv("XDG_CACHE_HOME", str(folder / "cache"))
+        _write_ring(folder / "ring_plug.obj")
+        _write_post(folder / "ring_socket.obj")
+        yield folder
+
+
+@pytest.fixture(scope="module")
+def ring(folder: Path) -> MeshPair:
+    return load_mesh_pair("automate/ring", folder, scale="unit", progress=False)
+
+
+def _write_ring(path: Path) -> None:
+    ring = trimesh.creation.annulus(RING_HOLE_M, 0.022, RING_TOP_M - RING_BOTTOM_M, sections=24)
+    ring.apply_translation([0, 0, (RING_TOP_M + RING_BOTTOM_M) / 2])
+    ring.apply_scale(1000)
+    ring.export(path)
+
+
+def _write_post(path: Path) -> None:
+    """A stepped solid of revolution: a post that stands on a wide foot, which stops the ring."""
+    profile = [
+        (0, 0),
+        (0.02, 0),
+        (0.02, RING_BOTTOM_M),
+        (POST_M, RING_BOTTOM_M),
+        (POST_M, POST_TOP_M),
+        (0, POST_TOP_M),
+    ]
+    post = trimesh.creation.revolve(1000 * np.array(profile), sections=24)
+    post.export(path)
+
+
+def test_ring_over_post_is_measured_from_its_pieces(ring: MeshPair) -> None:
+    assert len(ring.plug.pieces) > 3  # one piece would close the hole
+    assert ring.fit.travel_m == pytest.approx(POST_TOP_M - RING_BOTTOM_M, abs=3e-3)
+    assert 0.3 * PLAY_M < ring.fit.play_m < PLAY_M + 5e-4
+    assert ring.fit.has_stop == 1
+    assert ring.fit.slack_m < 2e-3
+    np.testing.assert_allclose(ring.plug.bounds_m[:, 2], [RING_BOTTOM_M, RING_TOP_M], atol=1e-6)
+
+
+def test_pieces_keep_the_volume(ring: MeshPair) -> None:
+    for part in (ring.plug, ring.socket):
+        whole = trimesh.Trimesh(part.vertices, part.faces).volume
+        pieces = sum(trimesh.Trimesh(hull.vertices, hull.faces).volume for hull in part.pieces)
+        assert pieces == pytest.approx(whole, rel=0.15)
+
+
+def test_plug_that_leaves_downwards_is_turned_over(folder: Path) -> None:
+    for role in ("plug", "socket"):
+        mesh = trimesh.load(folder / f"ring_{role}.obj", force="mesh")
+        mesh.apply_transform(trimesh.transformations.rotation_matrix(np.pi, [1, 0, 0]))
+        mesh.export(folder / f"down_{role}.obj")
+    pair = load_mesh_pair("automate/down", folder, scale="unit", progress=False)
+    assert pair.fit.exit_sign == 1
+    assert pair.plug.bounds_m[0, 2] == pytest.approx(RING_BOTTOM_M, abs=1e-6)
+    assert trimesh.Trimesh(pair.plug.vertices, pair.plug.faces).volume > 0
+
+
+def test_second_load_reads_the_cache(folder: Path, ring: MeshPair, monkeypatch: pytest.MonkeyPatch) -> None:
+    def fail(*_: object) -> None:
+        raise AssertionError("decomposed again")
+
+    monkeypatch.setattr(meshes, "_decompose", fail)
+    monkeypatch.setattr(meshes, "measure_fit", fail)
+    again = load_mesh_pair("automate/ring", folder, scale="unit", progress=False)
+    assert again.fit == ring.fit
+    for first, second in zip(ring.plug.pieces, again.plug.pieces, strict=True):
+        np.testing.assert_array_equal(first.vertices, second.vertices)
+
+
+def test_damaged_cache_is_made_again(folder: Path, ring: MeshPair) -> None:
+    for path in meshes.cache_dir().glob("fit-*.npz"):
+        path.write_bytes(b"broken")
+    assert load_mesh_pair("automate/ring", folder, scale="unit", progress=False).fit == ring.fit
+
+
+def test_changed_file_is_decomposed_again(folder: Path, ring: MeshPair) -> None:
+    before = len(list(meshes.cache_dir().glob("coacd-*.npz")))
+    path = folder / "other_plug.obj"
+    path.write_text((folder / "ring_plug.obj").read_text() + "# edited\n")
+    (folder / "other_socket.obj").write_bytes((folder / "ring_socket.obj").read_bytes())
+    load_mesh_pair("automate/other", folder, scale="unit", progress=False)
+    assert len(list(meshes.cache_dir().glob("coacd-*.npz"))) == before + 1
+
+
+def test_ring_slides_over_the_post_and_not_through_it(ring: MeshPair) -> None:
+    assert _push_in(ring, offset_m=0.4 * PLAY_M) < 2e-3
+    assert _push_in(ring, offset_m=PLAY_M + 6e-3) > 0.8 * ring.fit.travel_m
+
+
+def test_missing_folder_names_the_files(tmp_path: Path) -> None:
+    with pytest.raises(FileNotFoundError, match=r"no folder .*gone.*ID_plug\.obj") as error:
+        load_mesh_pair("automate/00186", tmp_path / "gone")
+    assert "\n" not in str(error.value)
+
+
+def test_no_folder_given_says_so() -> None:
+    with pytest.raises(ValueError, match="automate/00186 needs mesh_dir"):
+        load_mesh_pair("automate/00186", None)
+
+
+def test_unknown_id_lists_what_is_there(folder: Path) -> None:
+    with pytest.raises(FileNotFoundError, match=r"automate/99999: no 99999_plug\.obj .*ring"):
+        load_mesh_pair("automate/99999", folder)
+
+
+def test_leaky_mesh_names_the_file_and_the_fix(tmp_path: Path) -> None:
+    mesh = trimesh.creation.box([20, 20, 20])
+    mesh.update_faces(np.arange(len(mesh.faces)) > 0)
+    for role in ("plug", "socket"):
+        mesh.export(tmp_path / f"leaky_{role}.obj")
+    with pytest.raises(ValueError, match=r"leaky_plug\.obj: the surface is not watertight; close its holes"):
+        load_mesh_pair("automate/leaky", tmp_path, scale="unit", progress=False)
+
+
+def test_inside_out_mesh_is_refused(tmp_path: Path) -> None:
+    mesh = trimesh.creation.box([20, 20, 20])
+    mesh.invert()
+    for role in ("plug", "socket"):
+        mesh.export(tmp_path / f"inverted_{role}.obj")
+    with pytest.raises(ValueError, match=r"inverted_plug\.obj: the faces point inwards"):
+        load_mesh_pair("automate/inverted", tmp_path, scale="unit", progress=False)
+
+
+def test_file_that_is_no_mesh_is_refused(tmp_path: Path) -> None:
+    for role in ("plug", "socket"):
+        (tmp_path / f"text_{role}.obj").write_text("hello\n")
+    with pytest.raises(ValueError, match=r"text_plug\.obj: .*mesh"):
+        load_mesh_pair("automate/text", tmp_path, scale="unit", progress=False)
+
+
+def test_scale_that_no_hand_can_hold_is_refused(folder: Path) -> None:
+    with pytest.raises(ValueError, match=r"ring_plug\.obj: 880\.0 mm long after scaling.*mesh_scale"):
+        load_mesh_pair("automate/ring", folder, scale=20.0, progress=False)
+
+
+@pytest.mark.parametrize(
+    ("scale", "message"), [("flexitac", "knows only 00007"), ("big", "flexitac, unit or a factor")]
+)
+def test_bad_scale_lists_the_choices(folder: Path, scale: str, message: str) -> None:
+    with pytest.raises(ValueError, match=message):
+        load_mesh_pair("automate/ring", folder, scale=scale, progress=False)
+
+
+def test_overlapping_parts_are_refused(tmp_path: Path, folder: Path) -> None:
+    (tmp_path / "solid_socket.obj").write_bytes((folder / "ring_socket.obj").read_bytes())
+    (tmp_path / "solid_plug.obj").write_bytes((folder / "ring_socket.obj").read_bytes())
+    with pytest.raises(ValueError, match="overlap in the assembled pose"):
+        load_mesh_pair("automate/solid", tmp_path, scale="unit", progress=False)
+
+
+def test_missing_extra_says_what_to_install(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(sys.modules, "trimesh", None)
+    with pytest.raises(ImportError, match=r"need trimesh: pip install 'lerobot_policy_vtrefine\[assets\]'"):
+        load_mesh_pair("automate/ring", folder, scale="unit", progress=False)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("mesh_id", sorted(meshes.FLEXITAC_SCALES))
+def test_automate_pair_slides_in(mesh_id: str) -> None:
+    if not AUTOMATE.is_dir() or mesh_id not in mesh_ids(AUTOMATE):
+        pytest.skip("the AutoMate meshes are not beside this checkout (../shared/data/automate)")
+    pair = load_mesh_pair(f"automate/{mesh_id}", AUTOMATE)
+    assert _push_in(pair, offset_m=0.0) < 3e-3
+
+
+def _push_in(pair: MeshPair, offset_m: float) -> float:
+    """Push the plug from above its socket at 4 cm/s, compliant sideways; returns the height left over [m]."""
+    spec = mujoco.MjSpec()
+    spec.option.timestep, spec.option.integrator = 0.0025, mujoco.mjtIntegrator.mjINT_IMPLICITFAST
+    spec.option.cone, spec.option.impratio, spec.option.gravity = (
+        mujoco.mjtCone.mjCONE_ELLIPTIC,
+        10,
+        (0, 0, 0),
+    )
+    for role, part in (("socket", pair.socket), ("plug", pair.plug)):
+        body = spec.worldbody.add_body(name=role)
+        if role == "plug":
+            for axis, stiffness in (("x", 300.0), ("y", 300.0), ("z", 600.0)):
+                body.add_joint(
+                    name=axis,
+                    type=mujoco.mjtJoint.mjJNT_SLIDE,
+                    axis=[float(axis == other) for other in "xyz"],
+                    stiffness=[stiffness, 0, 0] if axis != "z" else [0, 0, 0],
+                    damping=[10.0, 0, 0],
+                    armature=0.2,
+                )
+            spec.add_actuator(
+                name="push", trntype=mujoco.mjtTrn.mjTRN_JOINT, target="z", gainprm=[600, *[0] * 9],
+                biastype=mujoco.mjtBias.mjBIAS_AFFINE, biasprm=[0, -600, *[0] * 8],
+            )  # fmt: skip
+        for index, hull in enumerate(part.pieces):
+            mesh = spec.add_mesh(name=f"{role}{index}", uservert=hull.vertices.astype(np.float32).ravel())
+            body.add_geom(
+                type=mujoco.mjtGeom.mjGEOM_MESH,
+                meshname=mesh.name,
+                solref=[0.005, 1],
+                friction=[0.3, 0.005, 1e-4],
+            )
+    model = spec.compile()
+    data = mujoco.MjData(model)
+    start = pair.fit.travel_m + 0.003
+    data.qpos[:] = offset_m, 0, start
+    model.qpos_spring[:2] = offset_m, 0
+    for step in range(int((start / 0.04 + 0.5) / model.opt.timestep)):
+        data.ctrl[0] = max(0.0, start - 0.04 * step * model.opt.timestep)
+        mujoco.mj_step(model, data)
+    return float(data.qpos[2])
