@@ -48,8 +48,8 @@ class MeshFit:
 
 
 def measure_fit(plug: list[Array], socket: list[Array]) -> MeshFit:
-    """Measure the fit of convex pieces [(V, 3) m, assembled at the identity]; ValueError when they do not
-    fit.""" probe = _OverlapProbe(plug, socket)
+    """Measure the fit of convex pieces [(V, 3) m, assembled at the identity]; ValueError if they do not fit."""
+    probe = _OverlapProbe(plug, socket)
     if probe.overlap(np.zeros(3)) > 2 * _OVERLAP_M + 2e-4:
         raise ValueError(
             "the two meshes overlap in the assembled pose (identity); check the files' frame and mesh_scale"

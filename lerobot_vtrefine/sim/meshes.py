@@ -1,5 +1,4 @@
-"""Plug-socket pairs from a user's folder of meshes (`automate/ID`): load, check, cut into convex pieces,
-cache.
+"""Plug-socket pairs from a user's folder of meshes (`automate/ID`): load, check, decompose, cache.
 
 A folder holds `{ID}_plug.obj` and `{ID}_socket.obj`, drawn in one frame: with both bodies at the identity
 the pair is assembled. Each concave mesh becomes convex pieces (CoACD) once; the pieces lie in the user's
@@ -244,8 +243,8 @@ def _scaled(part: MeshPart, factors: Array, path: Path) -> MeshPart:
     low, high = EXTENT_RANGE_M
     if not low <= largest <= high:
         raise ValueError(
-            f"{path}: {1e3 * largest:.1f} mm long after scaling, outside {1e3 * low:.0f}-{1e3 * high:.0f} mm; "
-            "set mesh_scale"
+            f"{path}: {1e3 * largest:.1f} mm long after scaling, outside {1e3 * low:.0f}-"
+            f"{1e3 * high:.0f} mm; set mesh_scale"
         )
     return scaled
 
