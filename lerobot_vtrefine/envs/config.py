@@ -1,0 +1,147 @@
+"""LeRobot environment type ``vtrefine``: everything that ``--env.*`` can set. Imports no simulator."""
+
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Any
+
+import gymnasium as gym
+from lerobot.configs import FeatureType, PolicyFeature
+from lerobot.envs.configs import EnvConfig
+
+from lerobot_vtrefine.datasets.features import ACTION_KEY, NUM_JOINTS, env_key_map, env_observation_shapes
+from lerobot_vtrefine.envs.schedule import ReadSchedule
+from lerobot_vtrefine.sim.config import (
+    BACKENDS,
+    GRASPED_CAMERA,
+    TABLE_CAMERA,
+    RandomizationConfig,
+    SceneConfig,
+    TaskConfig,
+)
+
+VECTORIZATIONS = ("native", "gym")
+ABLATIONS = ("none", "touch", "vision")
+SHORTCUTS = ("pair", "clearance_m", "start", "mesh_dir")
+"""Fields of ``scene`` that have a flag of their own."""
+
+
+@EnvConfig.register_subclass("vtrefine")
+@dataclass
+class VtRefineEnvConfig(EnvConfig):
+    """Bimanual insertion with four tactile pads and a depth camera, simulated in MuJoCo.
+
+    ``pair``, ``clearance_m``, ``start``, ``mesh_dir`` and ``episode_steps`` are short for the fields of ``scene``
+    and ``rules`` with these names, and win over them.
+    """
+
+    task: str = "insert the plug into the socket"
+    """Natural-language task: stored in datasets, shown to policies."""
+    fps: int = int(TaskConfig.control_hz)
+    """Control steps, and so observations and actions, per second."""
+    pair: str | None = None
+    """round, square, hexagon, d_shape, cross, key or automate/ID."""
+    clearance_m: float | None = None
+    """Diametral clearance of procedural pairs [m]."""
+    start: str | None = None
+    """table (both parts stand on the table) or grasped (both are in hand)."""
+    mesh_dir: Path | None = None
+    """Folder of meshes for automate/ID."""
+    episode_steps: int | None = None
+    """Control steps until the time-out."""
+    scene: SceneConfig = field(default_factory=SceneConfig)
+    """What stands in the scene: camera, frictions, servo gains, time step."""
+    rules: TaskConfig = field(default_factory=TaskConfig)
+    """Start ranges, success, limits on force and in-hand shift, command rates."""
+    randomization: RandomizationConfig = field(default_factory=RandomizationConfig)
+    """Ranges of what differs between episodes."""
+    sensor_model: str = "default"
+    """default, paper, or the path of a sensor_model.json."""
+    backend: str = "batch"
+    """single, batch (threads) or warp."""
+    num_threads: int = 0
+    """Threads of the batch backend; 0 uses all cores."""
+    vectorization: str = "native"
+    """native: one batched simulation. gym: one simulation per environment, sync or async by --eval.use_async_envs."""
+    read_every: int = 1
+    """Read the sensors for a policy that decides every ``read_every`` steps (its n_action_steps) ..."""
+    read_window: int = 1
+    """... from the last ``read_window`` frames (its n_obs_steps); other steps repeat the last sensor frame."""
+    ablate: str = "none"
+    """none, or touch or vision, replaced by its mean over ``ablate_dataset``."""
+    ablate_dataset: Path | None = None
+    """Root of the LeRobot dataset whose mean frame the ablation shows."""
+    metrics_path: Path | None = None
+    """JSON-lines file that gets one row per finished episode (seed, success, in-hand shift, peak force, ...)."""
+    features: dict[str, PolicyFeature] = field(default_factory=dict)
+    features_map: dict[str, str] = field(default_factory=env_key_map)
+
+    def __post_init__(self) -> None:
+        _check_choice("vectorization", self.vectorization, VECTORIZATIONS)
+        _check_choice("ablate", self.ablate, ABLATIONS)
+        _check_choice("backend", self.backend, BACKENDS)
+        if self.ablate != "none" and self.ablate_dataset is None:
+            raise ValueError(
+                f"--env.ablate={self.ablate} needs --env.ablate_dataset, the dataset the policy was trained on"
+            )
+        if self.rules.control_hz != TaskConfig.control_hz:
+            raise ValueError("set the control rate with --env.fps, not with --env.rules.control_hz")
+        self.features = policy_features(*self.camera_size)
+        _ = self.task_config, self.read_schedule  # their own checks, now rather than in a worker process
+
+    @property
+    def scene_config(self) -> SceneConfig:
+        """The scene with the shortcuts put in."""
+        given = {name: getattr(self, name) for name in SHORTCUTS if getattr(self, name) is not None}
+        return replace(self.scene, **given)
+
+    @property
+    def task_config(self) -> TaskConfig:
+        """The rules at this control rate and episode length."""
+        steps = self.episode_steps if self.episode_steps is not None else self.rules.episode_steps
+        return replace(self.rules, control_hz=float(self.fps), episode_steps=steps)
+
+    @property
+    def camera_size(self) -> tuple[int, int]:
+        """Height and width of the depth image in pixels."""
+        scene = self.scene_config
+        camera = scene.camera or {"grasped": GRASPED_CAMERA, "table": TABLE_CAMERA}[scene.start]
+        return camera.height, camera.width
+
+    @property
+    def max_episode_steps(self) -> int:
+        """Control steps until the time-out."""
+        return self.task_config.steps_of(self.scene_config.start)
+
+    @property
+    def read_schedule(self) -> ReadSchedule:
+        """Which control steps have their sensors read."""
+        return ReadSchedule(self.read_every, self.read_window)
+
+    @property
+    def gym_kwargs(self) -> dict[str, Any]:
+        """Unused: environments are built by ``create_envs``."""
+        return {}
+
+    def create_envs(
+        self, n_envs: int, use_async_envs: bool = False
+    ) -> dict[str, dict[int, gym.vector.VectorEnv]]:
+        """LeRobot's factory: ``{"vtrefine": {0: vector environment}}``."""
+        from lerobot_vtrefine.envs.factory import make_vector_env
+
+        return {self.type: {0: make_vector_env(self, n_envs, use_async_envs)}}
+
+
+def policy_features(camera_height: int, camera_width: int) -> dict[str, PolicyFeature]:
+    """LeRobot features under environment keys; depth is declared (H, W, 1) as LeRobot expects images."""
+    features = {ACTION_KEY: PolicyFeature(type=FeatureType.ACTION, shape=(NUM_JOINTS,))}
+    for key, (shape, _) in env_observation_shapes(camera_height, camera_width).items():
+        if key.startswith("images."):
+            features[key] = PolicyFeature(type=FeatureType.VISUAL, shape=(camera_height, camera_width, 1))
+        else:
+            features[key] = PolicyFeature(type=FeatureType.STATE, shape=shape)
+    return features
+
+
+def _check_choice(name: str, value: str, choices: tuple[str, ...]) -> None:
+    if value not in choices:
+        raise ValueError(f"--env.{name}={value} is unknown; choose from {', '.join(choices)}")

@@ -1,0 +1,51 @@
+"""Per-episode metrics as JSON lines, readable after a stock ``lerobot-eval``."""
+
+import json
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+
+def episode_rows(
+    seeds: np.ndarray, steps: np.ndarray, metrics: dict[str, np.ndarray]
+) -> list[dict[str, Any]]:
+    """One plain dict per finished episode: seed, steps and every metric (arrays of length m)."""
+    columns = {"seed": seeds, "steps": steps, **metrics}
+    rows = zip(*(np.asarray(column).tolist() for column in columns.values()), strict=True)
+    return [dict(zip(columns, map(_plain, row), strict=True)) for row in rows]
+
+
+def _plain(value: Any) -> Any:
+    """NaN (not measured, e.g. time to success of a failure) becomes null: JSON has no NaN."""
+    return None if isinstance(value, float) and not np.isfinite(value) else value
+
+
+class EpisodeLog:
+    """Appends one line per finished episode; several processes may share the file (O_APPEND)."""
+
+    def __init__(self, path: Path) -> None:
+        self.path = Path(path)
+        self.path.parent.mkdir(parents=True, exist_ok=True)
+
+    def append(self, rows: list[dict[str, Any]]) -> None:
+        """Write ``rows``, one JSON object a line, in one write."""
+        text = "".join(json.dumps(row) + "\n" for row in rows)
+        with self.path.open("a", encoding="utf-8") as file:
+            file.write(text)
+
+
+def read_episode_log(path: Path, first_seed: int, num_episodes: int) -> list[dict[str, Any]]:
+    """The rows of seeds ``first_seed .. first_seed + num_episodes - 1``, by seed; the latest run of a seed counts.
+
+    ``lerobot-eval`` fills its last batch with surplus episodes, which this drops.
+
+    Raises:
+        FileNotFoundError: if there is no file at ``path``.
+    """
+    if not Path(path).is_file():
+        raise FileNotFoundError(f"no episode metrics at {path}; evaluate with --env.metrics_path={path}")
+    rows = [json.loads(line) for line in Path(path).read_text(encoding="utf-8").splitlines() if line]
+    by_seed = {row["seed"]: row for row in rows}
+    wanted = range(first_seed, first_seed + num_episodes)
+    return [by_seed[seed] for seed in wanted if seed in by_seed]

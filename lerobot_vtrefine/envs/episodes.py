@@ -1,0 +1,151 @@
+"""Episodes of a batched simulation: raw frames at the steps that read them, masks, metrics. No Gymnasium here.
+
+``n`` environments, ``m`` of them addressed by ``ids``; arrays are numpy.
+"""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from lerobot_vtrefine.envs.episode_log import EpisodeLog, episode_rows
+
+if TYPE_CHECKING:
+    from lerobot_vtrefine.sim.simulation import InsertionSim
+
+Array = np.ndarray[Any, np.dtype[Any]]
+Raw = dict[str, Array]
+
+
+@dataclass
+class Transition:
+    """One control step of all ``n`` environments; finished ones repeat their flags with reward 0."""
+
+    reward: Array
+    """(n,) float64"""
+    terminated: Array
+    """(n,) bool"""
+    truncated: Array
+    """(n,) bool"""
+    success: Array
+    """(n,) bool: seated and held, latched until the next reset"""
+    finished: Array
+    """Ids whose episode ended in this very step."""
+
+
+class Episodes:
+    """Steps the unfinished environments of a simulation and keeps their latest raw frames.
+
+    Args:
+        sim: The simulation; its reset of one environment is a pure function of the seed.
+        ablate: Applied to every raw frame that is read (identity by default).
+        log: Where a row per finished episode goes, if anywhere.
+    """
+
+    def __init__(
+        self,
+        sim: "InsertionSim",
+        ablate: Callable[[Raw], Raw] | None = None,
+        log: EpisodeLog | None = None,
+    ) -> None:
+        self.sim = sim
+        self.num_envs = sim.num_envs
+        self.ids = np.arange(self.num_envs)
+        self.seeds = np.zeros(self.num_envs, np.int64)
+        self.steps = np.zeros(self.num_envs, np.int64)
+        self.done = np.ones(self.num_envs, bool)
+        self.raw: Raw = {}
+        self.metrics: dict[str, Array] = {}
+        self._ablate = ablate
+        self._log = log
+        self.terminated, self.truncated, self.success = np.zeros((3, self.num_envs), bool)
+
+    @property
+    def active(self) -> Array:
+        """Ids of the environments whose episode still runs."""
+        return np.flatnonzero(~self.done)
+
+    def reset(self, ids: Array, seeds: Array) -> None:
+        """Start new episodes in ``ids`` (m,) from ``seeds`` (m,) and read their first frames."""
+        if len(ids) == 0:
+            return
+        self.sim.reset(ids, seeds)
+        self.seeds[ids] = seeds
+        self.steps[ids] = 0
+        self.done[ids] = False
+        for flag in (self.terminated, self.truncated, self.success):
+            flag[ids] = False
+        self.read(ids)
+
+    def step(self, actions: Array, reads: Callable[[Array], Array] | bool = True) -> Transition:
+        """One control step of the unfinished environments.
+
+        Args:
+            actions: (n, 16) absolute joint targets in rad and m; rows of finished environments are ignored.
+            reads: Whether to read the sensors afterwards, or a function of the step counts (m,) -> (m,) bool.
+                Unread environments keep their last sensor frame; their joint positions are always fresh.
+        """
+        ids = self.active
+        reward = np.zeros(self.num_envs)
+        finished = ids[:0]
+        if len(ids):
+            result = self.sim.step(np.asarray(actions, np.float64)[ids], ids)
+            self.steps[ids] += 1
+            reward[ids] = result.reward
+            self.terminated[ids], self.truncated[ids] = result.terminated, result.truncated
+            self.success[ids] = result.success
+            finished = ids[self.terminated[ids] | self.truncated[ids]]
+            self.done[finished] = True
+            self._refresh(ids, reads)
+            self._collect(finished)
+        flags = (self.terminated.copy(), self.truncated.copy(), self.success.copy())
+        return Transition(reward, *flags, finished)
+
+    def read(self, ids: Array) -> Raw:
+        """Read the sensors of ``ids`` now -> their raw frames (m, ...), also kept in ``raw``."""
+        frames = self._frames(ids)
+        if not self.raw:
+            self.raw = {
+                key: np.zeros((self.num_envs, *value.shape[1:]), value.dtype) for key, value in frames.items()
+            }
+        for key, value in frames.items():
+            self.raw[key][ids] = value
+        return frames
+
+    def _frames(self, ids: Array) -> Raw:
+        frames = dict(self.sim.observe(ids))
+        count = len(ids)
+        frames["camera_intrinsics"] = np.broadcast_to(
+            np.asarray(self.sim.camera_intrinsics, np.float32), (count, 4)
+        )
+        frames["camera_pose"] = np.asarray(self.sim.camera_pose, np.float32)[ids]
+        frames["noise_level"] = np.full((count, 1), self.sim.noise_level, np.float32)
+        return frames if self._ablate is None else self._ablate(frames)
+
+    def _refresh(self, ids: Array, reads: Callable[[Array], Array] | bool) -> None:
+        read = reads(self.steps[ids]) if callable(reads) else np.full(len(ids), reads)
+        if read.any():
+            self.read(ids[read])
+        if not read.all():
+            unread = ids[~read]
+            self.raw["state"][unread] = self.sim.joint_state(unread)
+
+    def _collect(self, finished: Array) -> None:
+        """Keep (and log) the metrics of episodes that just ended."""
+        if len(finished) == 0:
+            return
+        for name, values in self.sim.metrics(finished).items():
+            values = np.asarray(values)
+            if name not in self.metrics:
+                self.metrics[name] = np.zeros(self.num_envs, values.dtype)
+            self.metrics[name] = self.metrics[name].astype(np.result_type(self.metrics[name], values))
+            self.metrics[name][finished] = values
+        if self._log is not None:
+            self._log.append(self.rows(finished))
+
+    def rows(self, ids: Array) -> list[dict[str, Any]]:
+        """Seed, steps and metrics of finished episodes ``ids`` as plain dicts."""
+        return episode_rows(
+            self.seeds[ids], self.steps[ids], {name: values[ids] for name, values in self.metrics.items()}
+        )

@@ -1,0 +1,62 @@
+"""From the configuration to running environments; the simulator is imported here, on first use."""
+
+from functools import partial
+from typing import TYPE_CHECKING
+
+import gymnasium as gym
+from gymnasium.vector import AutoresetMode
+from lerobot.envs.utils import _LazyAsyncVectorEnv, freeze_after_episode_end
+
+from lerobot_vtrefine.envs.ablation import make_ablation
+from lerobot_vtrefine.envs.config import VtRefineEnvConfig
+from lerobot_vtrefine.envs.episode_log import EpisodeLog
+from lerobot_vtrefine.envs.episodes import Episodes
+
+if TYPE_CHECKING:
+    from lerobot_vtrefine.sim.simulation import InsertionSim
+
+
+def make_simulation(config: VtRefineEnvConfig, num_envs: int) -> "InsertionSim":
+    """The simulation of ``num_envs`` worlds that ``config`` describes.
+
+    Raises:
+        ValueError: for zero environments, an unknown pair, clearance, start or backend.
+        FileNotFoundError: if the mesh folder or the sensor model file is missing.
+    """
+    if num_envs < 1:
+        raise ValueError(f"need at least one environment, got {num_envs} (--eval.batch_size)")
+    from lerobot_vtrefine.sim.simulation import InsertionSim
+
+    return InsertionSim(
+        config.scene_config,
+        config.task_config,
+        config.sensor_model,
+        num_envs,
+        backend=config.backend,
+        num_threads=config.num_threads,
+        randomization=config.randomization,
+    )
+
+
+def make_episodes(config: VtRefineEnvConfig, num_envs: int) -> Episodes:
+    """The simulation with ablation and metrics log as configured."""
+    ablation = make_ablation(config.ablate, config.ablate_dataset)
+    log = EpisodeLog(config.metrics_path) if config.metrics_path is not None else None
+    return Episodes(make_simulation(config, num_envs), ablation, log)
+
+
+def make_vector_env(config: VtRefineEnvConfig, num_envs: int, use_async: bool) -> gym.vector.VectorEnv:
+    """The native batched environment, or Gymnasium's sync or async one around single environments."""
+    from lerobot_vtrefine.envs.single_env import VtRefineEnv
+    from lerobot_vtrefine.envs.vector_env import VtRefineVectorEnv
+
+    if config.vectorization == "native":
+        return VtRefineVectorEnv(config, num_envs)
+    make_one = partial(VtRefineEnv, config)
+    if use_async and num_envs > 1:
+        env = VtRefineEnv(config)
+        return _LazyAsyncVectorEnv(
+            [make_one] * num_envs, env.observation_space, env.action_space, env.metadata
+        )
+    frozen = freeze_after_episode_end(make_one)
+    return gym.vector.SyncVectorEnv([frozen] * num_envs, autoreset_mode=AutoresetMode.NEXT_STEP)

@@ -1,0 +1,51 @@
+"""One environment for Gymnasium's own sync and async vectorisation: the batched one with one world."""
+
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+
+from lerobot_vtrefine.envs.config import VtRefineEnvConfig
+from lerobot_vtrefine.envs.episodes import Array
+from lerobot_vtrefine.envs.vector_env import Observation, VtRefineVectorEnv
+
+
+class VtRefineEnv(gym.Env[Observation, Array]):
+    """One insertion episode at a time; observations as in ``VtRefineVectorEnv`` without the leading dimension."""
+
+    def __init__(self, config: VtRefineEnvConfig) -> None:
+        self._batch = VtRefineVectorEnv(config, num_envs=1)
+        self.metadata = self._batch.metadata
+        self.render_mode = self._batch.render_mode
+        self.observation_space = self._batch.single_observation_space
+        self.action_space = self._batch.single_action_space
+        self.task = config.task
+        self.task_description = config.task
+        self._max_episode_steps = config.max_episode_steps
+
+    def reset(
+        self, *, seed: int | None = None, options: dict[str, Any] | None = None
+    ) -> tuple[Observation, dict[str, Any]]:
+        """Start the episode of ``seed``; without one, of a seed drawn from the environment's generator."""
+        super().reset(seed=seed)
+        drawn = int(self.np_random.integers(2**31)) if seed is None else seed
+        observation, _ = self._batch.reset(seed=[drawn])
+        return _first(observation), {"is_success": False}
+
+    def step(self, action: Array) -> tuple[Observation, float, bool, bool, dict[str, Any]]:
+        """One control step with absolute joint targets (16,) in rad and m."""
+        observation, reward, terminated, truncated, info = self._batch.step(np.asarray(action)[None])
+        flags = {"is_success": bool(info["is_success"][0])}
+        return _first(observation), float(reward[0]), bool(terminated[0]), bool(truncated[0]), flags
+
+    def render(self) -> Array:
+        """uint8 (H, W, 3): the scene beside its four pads."""
+        return self._batch.render_env(0)
+
+    def close(self) -> None:
+        """Release the simulation."""
+        self._batch.close_extras()
+
+
+def _first(observation: Observation) -> Observation:
+    return {key: value[0] for key, value in observation.items()}

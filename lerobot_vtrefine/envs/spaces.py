@@ -1,0 +1,27 @@
+"""Gymnasium spaces of the environment, from the one table of features and the embodiment."""
+
+import numpy as np
+from gymnasium import spaces
+
+from lerobot_vtrefine.datasets.features import env_observation_shapes
+from lerobot_vtrefine.embodiments import get_embodiment
+from lerobot_vtrefine.envs.config import VtRefineEnvConfig
+
+
+def action_space() -> spaces.Box:
+    """Absolute joint targets (16,) within the joint limits, rad and m."""
+    robot = get_embodiment("aloha")
+    return spaces.Box(robot.lower.astype(np.float32), robot.upper.astype(np.float32), dtype=np.float32)
+
+
+def observation_space(config: VtRefineEnvConfig) -> spaces.Dict:
+    """One environment's raw observation: joints, pad counts, depth, camera."""
+    height, width = config.camera_size
+    shapes = env_observation_shapes(height, width)
+    return spaces.Dict({key: _box(shape, np.dtype(dtype)) for key, (shape, dtype) in shapes.items()})
+
+
+def _box(shape: tuple[int, ...], dtype: np.dtype) -> spaces.Box:
+    if dtype == np.uint8:
+        return spaces.Box(0, 255, shape, np.uint8)
+    return spaces.Box(-np.inf, np.inf, shape, np.float32)

@@ -1,0 +1,159 @@
+"""The natively batched Gymnasium environment: one simulation object steps every world."""
+
+from collections.abc import Callable, Iterator, Sequence
+from typing import Any, SupportsIndex, overload
+
+import gymnasium as gym
+import numpy as np
+from gymnasium.vector import AutoresetMode
+from gymnasium.vector.utils import batch_space
+
+from lerobot_vtrefine.datasets.features import raw_to_env_observation
+from lerobot_vtrefine.envs.config import VtRefineEnvConfig
+from lerobot_vtrefine.envs.episodes import Array, Episodes, Transition
+from lerobot_vtrefine.envs.factory import make_episodes
+from lerobot_vtrefine.envs.rendering import FrameSource
+from lerobot_vtrefine.envs.spaces import action_space, observation_space
+
+Observation = dict[str, Array]
+SEED_LIMIT = 2**31
+
+
+class VtRefineVectorEnv(gym.vector.VectorEnv[Observation, Array, Array]):
+    """``num_envs`` insertion episodes stepped together.
+
+    - ``reset(seed=[...])``: each episode is a pure function of its seed; ``options={"reset_mask": (n,) bool}``
+      restarts only those environments.
+    - There is no autoreset: a finished environment costs nothing, repeats its last observation and flags with
+      reward 0, and waits for a reset. This is what ``lerobot-eval`` needs.
+    - ``info["is_success"]`` is (n,) bool; ``info["final_info"]`` appears in steps in which an episode ends and
+      holds the same plus the metrics of finished episodes.
+    - Observations are those of ``datasets.features.env_observation_shapes`` with a leading ``n``.
+    """
+
+    def __init__(self, config: VtRefineEnvConfig, num_envs: int) -> None:
+        self.config = config
+        self.num_envs = num_envs
+        self.metadata = {
+            "render_modes": ["rgb_array"],
+            "render_fps": config.fps,
+            "autoreset_mode": AutoresetMode.DISABLED,
+        }
+        self.render_mode = "rgb_array"
+        self.single_observation_space = observation_space(config)
+        self.single_action_space = action_space()
+        self.observation_space = batch_space(self.single_observation_space, num_envs)
+        self.action_space = batch_space(self.single_action_space, num_envs)
+        self._schedule = config.read_schedule
+        self._episodes: Episodes | None = None
+        self._frames: FrameSource | None = None
+
+    @property
+    def episodes(self) -> Episodes:
+        """The running simulation; built on first use and again after ``close``."""
+        if self._episodes is None:
+            self._episodes = make_episodes(self.config, self.num_envs)
+        return self._episodes
+
+    def reset(
+        self, *, seed: int | Sequence[int | None] | None = None, options: dict[str, Any] | None = None
+    ) -> tuple[Observation, dict[str, Any]]:
+        """Start new episodes, in all environments or in ``options["reset_mask"]``."""
+        mask = np.asarray((options or {}).get("reset_mask", np.ones(self.num_envs, bool)))
+        if mask.shape != (self.num_envs,) or mask.dtype != np.bool_:
+            raise ValueError(f"reset_mask must be a bool array of shape ({self.num_envs},), got {mask.shape}")
+        if self._episodes is None and not mask.all():
+            raise ValueError("the first reset must restart every environment")
+        ids = np.flatnonzero(mask)
+        self.episodes.reset(ids, self._seeds(seed)[ids])
+        return self._observation(), {"is_success": np.zeros(self.num_envs, bool)}
+
+    def step(self, actions: Array) -> tuple[Observation, Array, Array, Array, dict[str, Any]]:
+        """One control step with absolute joint targets (n, 16) in rad and m."""
+        if np.shape(actions) != (self.num_envs, *self.single_action_space.shape):
+            raise ValueError(
+                f"actions must have shape ({self.num_envs}, {self.single_action_space.shape[0]}),"
+                f" got {np.shape(actions)}"
+            )
+        if not self.episodes.raw:
+            raise gym.error.ResetNeeded("call reset() before step()")
+        result = self.episodes.step(actions, self._schedule.reads)
+        return self._observation(), result.reward, result.terminated, result.truncated, self._info(result)
+
+    def call(self, name: str, *args: Any, **kwargs: Any) -> Sequence[Any]:
+        """Gymnasium's per-environment call; ``render`` gives frames lazily, so a slice renders only itself."""
+        if name == "render":
+            return LazyFrames(self.render_env, self.num_envs)
+        return self.get_attr(name)
+
+    def get_attr(self, name: str) -> tuple[Any, ...]:
+        """One value per environment of ``task``, ``task_description``, ``_max_episode_steps``, ..."""
+        values = {
+            "task": self.config.task,
+            "task_description": self.config.task,
+            "_max_episode_steps": self.config.max_episode_steps,
+        }
+        value = values[name] if name in values else getattr(self, name)
+        return (value,) * self.num_envs
+
+    def render(self) -> tuple[Array, ...]:
+        """A uint8 (H, W, 3) frame of every environment: the scene beside its four pads."""
+        return tuple(self.render_env(index) for index in range(self.num_envs))
+
+    def render_env(self, index: int) -> Array:
+        """The frame of one environment."""
+        if self._frames is None:
+            self._frames = FrameSource(self.episodes.sim)
+        return self._frames.frame(index)
+
+    def close_extras(self, **kwargs: Any) -> None:
+        """Release simulation and renderers; a later reset builds them again."""
+        if self._frames is not None:
+            self._frames.close()
+        self._frames = None
+        self._episodes = None
+        self.closed = False
+
+    def _seeds(self, seed: int | Sequence[int | None] | None) -> Array:
+        if seed is None or isinstance(seed, int | np.integer):
+            if seed is None:
+                return self.np_random.integers(SEED_LIMIT, size=self.num_envs)
+            self._np_random, self._np_random_seed = gym.utils.seeding.np_random(int(seed))
+            return int(seed) + np.arange(self.num_envs)
+        if len(seed) != self.num_envs:
+            raise ValueError(f"got {len(seed)} seeds for {self.num_envs} environments")
+        drawn = self.np_random.integers(SEED_LIMIT, size=self.num_envs)
+        return np.array([d if s is None else s for s, d in zip(seed, drawn, strict=True)], np.int64)
+
+    def _observation(self) -> Observation:
+        return raw_to_env_observation(self.episodes.raw)
+
+    def _info(self, result: Transition) -> dict[str, Any]:
+        info: dict[str, Any] = {"is_success": result.success}
+        if len(result.finished):
+            info["final_info"] = {**self.episodes.metrics, "is_success": result.success.copy()}
+            info["_final_info"] = np.isin(np.arange(self.num_envs), result.finished)
+        return info
+
+
+class LazyFrames(Sequence[Array]):
+    """Frames rendered when indexed: ``lerobot-eval`` asks for all environments and keeps the first few."""
+
+    def __init__(self, render: Callable[[int], Array], count: int) -> None:
+        self._render = render
+        self._indices = range(count)
+
+    def __len__(self) -> int:
+        return len(self._indices)
+
+    @overload
+    def __getitem__(self, index: SupportsIndex) -> Array: ...
+    @overload
+    def __getitem__(self, index: slice) -> tuple[Array, ...]: ...
+    def __getitem__(self, index: SupportsIndex | slice) -> Array | tuple[Array, ...]:
+        if isinstance(index, slice):
+            return tuple(self._render(i) for i in self._indices[index])
+        return self._render(self._indices[index])
+
+    def __iter__(self) -> Iterator[Array]:
+        return (self._render(index) for index in self._indices)
