@@ -4,9 +4,6 @@ Importing this package registers its policy, environment and processor steps wit
 simulator, Warp, serial port or plotting library is imported here.
 """
 
-from importlib.metadata import PackageNotFoundError, version
+from lerobot_vtrefine import envs
 
-try:
-    __version__ = version("lerobot_policy_vtrefine")
-except PackageNotFoundError:  # running from a source tree that was never installed
-    __version__ = "0.0.0"
+__all__ = ["envs"]

@@ -1,0 +1,1 @@
+"""A chain of commands that can be interrupted and continued."""

@@ -1,0 +1,236 @@
+"""The demo's recipe: every number it uses, and the command lines that they make."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+from lerobot_vtrefine.cli.pipeline.stages import Stage
+
+REPO_ID = "local/vtrefine_demo"
+POLICIES = ("pretrain", "finetune")
+ABLATIONS = ("touch", "vision")
+
+# Environment seeds of demonstrations, fine-tuning and evaluation never overlap.
+SEED_STRIDE = 10_000_000
+TRAIN_SEED_OFFSET = 1_000_000
+EVAL_SEED_OFFSET = 9_000_000
+
+QUICK = (
+    "--num_demos=4",
+    "--demo_envs=4",
+    "--pretrain_steps=20",
+    "--pretrain_batch=16",
+    "--eval_episodes=8",
+    "--eval_envs=8",
+    "--ablation_episodes=8",
+    "--finetune_iterations=2",
+    "--finetune_envs=8",
+)
+
+
+@dataclass(frozen=True)
+class DemoConfig:
+    """Numbers of the demo. ``env``, ``degradation``, ``policy`` and ``dppo`` are passed on as flags."""
+
+    output_dir: Path = Path("outputs/demo")
+    """Folder of the dataset, the checkpoints, results.json and report.html."""
+    seed: int = 0
+    """Seed of the whole run; runs of different seeds share no episode."""
+    modalities: str = "visuo_tactile"
+    """What the policy sees: visuo_tactile or visual."""
+    num_demos: int = 60
+    """Successful demonstrations that are kept."""
+    demo_envs: int = 32
+    """Simulations that record side by side."""
+    pretrain_steps: int = 2000
+    """Gradient steps of imitation learning."""
+    pretrain_batch: int = 128
+    """Windows in a batch of imitation learning."""
+    eval_episodes: int = 200
+    """Episodes behind each of the two headline success rates."""
+    eval_envs: int = 50
+    """Simulations that evaluate side by side."""
+    ablation_episodes: int = 100
+    """Episodes of each test-time ablation; 0 skips them."""
+    finetune_iterations: int = 25
+    """DPPO iterations of one episode in every environment."""
+    finetune_envs: int = 96
+    """Simulations that DPPO collects from."""
+    env: dict[str, Any] = field(
+        default_factory=lambda: {
+            "pair": "round",
+            "clearance_m": 0.002,
+            "start": "grasped",
+            "read_every": 8,
+            "read_window": 2,
+        }
+    )
+    """Flags of the environment, ``--env.KEY=VALUE``."""
+    degradation: dict[str, Any] = field(
+        default_factory=lambda: {"lateral_std_m": 0.001, "tilt_std_rad": 0.026}
+    )
+    """Flags of the expert's imperfections, ``--degradation.KEY=VALUE``."""
+    policy: dict[str, Any] = field(default_factory=lambda: {"preset": "small", "n_action_steps": 8})
+    """Flags of the policy, ``--policy.KEY=VALUE``."""
+    dppo: dict[str, Any] = field(default_factory=lambda: {"type": "small"})
+    """Flags of DPPO, ``--dppo.KEY=VALUE``."""
+
+    def __post_init__(self) -> None:
+        for name in ("num_demos", "pretrain_steps", "eval_episodes", "eval_envs", "finetune_iterations"):
+            if getattr(self, name) < 1:
+                raise ValueError(f"--{name} must be at least 1, got {getattr(self, name)}")
+        if self.modalities not in ("visuo_tactile", "visual"):
+            raise ValueError(f"--modalities={self.modalities}: choose from visuo_tactile, visual")
+        if self.seed < 0:
+            raise ValueError(f"--seed must not be negative, got {self.seed}")
+
+    @property
+    def dataset_dir(self) -> Path:
+        """Root of the recorded dataset."""
+        return self.output_dir / "dataset"
+
+    def checkpoint(self, policy: str) -> Path:
+        """Folder of the ``pretrain`` or ``finetune`` policy, as ``--policy.path`` takes it."""
+        return self.output_dir / policy / "checkpoints" / "last" / "pretrained_model"
+
+    def evaluation_dir(self, policy: str, ablation: str = "none") -> Path:
+        """Folder of an evaluation's eval_info.json, episodes.jsonl and videos."""
+        return self.output_dir / ("eval_" + policy + ("" if ablation == "none" else f"_no_{ablation}"))
+
+    @property
+    def eval_seed(self) -> int:
+        """First environment seed of every evaluation."""
+        return self.seed * SEED_STRIDE + EVAL_SEED_OFFSET
+
+    def ablations(self) -> list[tuple[str, str]]:
+        """Pairs (policy, modality replaced by its mean); only modalities that the policy has."""
+        if self.ablation_episodes < 1:
+            return []
+        modalities = ABLATIONS if self.modalities == "visuo_tactile" else ("vision",)
+        return [(policy, modality) for policy in POLICIES for modality in modalities]
+
+
+def flags(prefix: str, values: Mapping[str, Any]) -> list[str]:
+    """``--prefix.key=value`` for every entry; nested mappings become dotted keys."""
+    result = []
+    for key, value in values.items():
+        if isinstance(value, Mapping):
+            result += flags(f"{prefix}.{key}", value)
+        else:
+            text = str(value).lower() if isinstance(value, bool) else str(value)
+            result.append(f"--{prefix}.{key}={text}")
+    return result
+
+
+def record_stage(config: DemoConfig) -> Stage:
+    """Scripted, imperfect demonstrations -> LeRobot dataset."""
+    command = [
+        "vtrefine-record-demos",
+        f"--root={config.dataset_dir}",
+        f"--repo_id={REPO_ID}",
+        f"--num_episodes={config.num_demos}",
+        f"--num_envs={config.demo_envs}",
+        f"--seed={config.seed * SEED_STRIDE}",
+        *flags("env", {"type": "vtrefine"} | recording_env(config)),
+        *flags("degradation", config.degradation),
+    ]
+    product = config.dataset_dir / "meta" / "info.json"
+    return Stage("record", "Record demonstrations", tuple(command), config.dataset_dir, product)
+
+
+def recording_env(config: DemoConfig) -> dict[str, Any]:
+    """The environment's flags without the read schedule: a recording holds every frame."""
+    return {key: value for key, value in config.env.items() if not key.startswith("read_")}
+
+
+def pretrain_stage(config: DemoConfig) -> Stage:
+    """Imitation learning with LeRobot's own trainer."""
+    command = [
+        "lerobot-train",
+        f"--dataset.repo_id={REPO_ID}",
+        f"--dataset.root={config.dataset_dir}",
+        *flags("policy", {"type": "vt_dp3"} | config.policy),
+        f"--policy.modalities={config.modalities}",
+        "--policy.device=cpu",
+        "--policy.push_to_hub=false",
+        f"--output_dir={config.output_dir / 'pretrain'}",
+        f"--steps={config.pretrain_steps}",
+        f"--save_freq={config.pretrain_steps}",
+        f"--batch_size={config.pretrain_batch}",
+        "--num_workers=0",
+        "--log_freq=100",
+        "--env_eval_freq=0",
+        f"--seed={config.seed}",
+    ]
+    product = config.checkpoint("pretrain") / "model.safetensors"
+    return Stage(
+        "pretrain",
+        "Imitation learning (lerobot-train)",
+        tuple(command),
+        config.output_dir / "pretrain",
+        product,
+        ("record",),
+    )
+
+
+def evaluation_stage(config: DemoConfig, policy: str, ablation: str = "none") -> Stage:
+    """LeRobot's own evaluation on unseen seeds, optionally with one sense replaced by its mean."""
+    output = config.evaluation_dir(policy, ablation)
+    episodes = config.eval_episodes if ablation == "none" else config.ablation_episodes
+    command = [
+        "lerobot-eval",
+        f"--policy.path={config.checkpoint(policy)}",
+        "--policy.device=cpu",
+        *flags("env", {"type": "vtrefine"} | config.env),
+        f"--env.metrics_path={output / 'episodes.jsonl'}",
+        f"--eval.n_episodes={episodes}",
+        f"--eval.batch_size={min(config.eval_envs, episodes)}",
+        f"--seed={config.eval_seed}",
+        f"--output_dir={output}",
+    ]
+    title = {"pretrain": "Evaluate imitation", "finetune": "Evaluate DPPO"}[policy]
+    needs = [policy]
+    if ablation != "none":
+        command += [f"--env.ablate={ablation}", f"--env.ablate_dataset={config.dataset_dir}"]
+        title += f" without {ablation}"
+        needs.append("record")
+    return Stage(output.name, title, tuple(command), output, output / "eval_info.json", tuple(needs))
+
+
+def finetune_stage(config: DemoConfig) -> Stage:
+    """DPPO from the pre-trained checkpoint."""
+    command = [
+        "vtrefine-finetune",
+        f"--policy.path={config.checkpoint('pretrain')}",
+        "--policy.device=cpu",
+        *flags("env", {"type": "vtrefine"} | config.env),
+        *flags("dppo", config.dppo),
+        f"--dppo.iterations={config.finetune_iterations}",
+        f"--dppo.num_envs={config.finetune_envs}",
+        f"--seed={config.seed * SEED_STRIDE + TRAIN_SEED_OFFSET}",
+        f"--output_dir={config.output_dir / 'finetune'}",
+        "--resume=true",
+    ]
+    product = config.checkpoint("finetune") / "model.safetensors"
+    return Stage(
+        "finetune",
+        "DPPO fine-tuning",
+        tuple(command),
+        config.output_dir / "finetune",
+        product,
+        ("pretrain",),
+        resumable=True,
+    )
+
+
+def demo_stages(config: DemoConfig) -> list[Stage]:
+    """All stages in the order in which they run."""
+    return [
+        record_stage(config),
+        pretrain_stage(config),
+        evaluation_stage(config, "pretrain"),
+        finetune_stage(config),
+        evaluation_stage(config, "finetune"),
+        *(evaluation_stage(config, policy, modality) for policy, modality in config.ablations()),
+    ]

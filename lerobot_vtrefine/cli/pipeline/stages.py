@@ -1,0 +1,187 @@
+"""Stages of a pipeline: commands with stamps, so that a restarted run continues where it was."""
+
+import contextlib
+import hashlib
+import json
+import os
+import shlex
+import shutil
+import signal
+import subprocess
+import sys
+import time
+from dataclasses import asdict, dataclass
+from pathlib import Path
+
+from lerobot_vtrefine.cli.pipeline.progress import LiveLine, parse_progress, read_tail
+
+POLL_S = 0.25
+STOP_TIMEOUT_S = 10.0
+
+
+@dataclass(frozen=True)
+class Stage:
+    """One command of a pipeline.
+
+    Args:
+        name: identifier, also of the log and the stamp.
+        title: what a person reads.
+        command: the command line, exactly as a user would type it.
+        output: folder that the command fills; removed before a fresh start.
+        product: file that a finished stage leaves.
+        needs: names of the stages whose products it reads; when one of them changes, this one runs again.
+        resumable: the command itself continues from what an interrupted run left in ``output``.
+    """
+
+    name: str
+    title: str
+    command: tuple[str, ...]
+    output: Path
+    product: Path
+    needs: tuple[str, ...] = ()
+    resumable: bool = False
+
+    @property
+    def line(self) -> str:
+        """The command as one shell line."""
+        return shlex.join(self.command)
+
+
+@dataclass(frozen=True)
+class StageRecord:
+    """What a finished stage leaves in its stamp: ``seconds`` of wall time, and the key of what it did."""
+
+    name: str
+    title: str
+    command: str
+    seconds: float
+    key: str
+
+
+def stage_keys(stages: list[Stage]) -> dict[str, str]:
+    """Fingerprint of each stage: its command and the fingerprints of the stages it needs."""
+    keys: dict[str, str] = {}
+    for stage in stages:
+        parts = [stage.line, *(keys[name] for name in stage.needs)]
+        keys[stage.name] = hashlib.sha256("\n".join(parts).encode()).hexdigest()[:16]
+    return keys
+
+
+class StageRunner:
+    """Runs stages in order below ``directory``, skipping those whose stamp says that they are done."""
+
+    def __init__(self, directory: Path, stages: list[Stage], line: LiveLine | None = None) -> None:
+        self.directory = directory
+        self.stages = stages
+        self.keys = stage_keys(stages)
+        self.line = line or LiveLine()
+
+    def run(self) -> list[StageRecord]:
+        """Run what is not done yet; return a record of every stage.
+
+        Raises:
+            ChildProcessError: a command failed; the message names its log and quotes its last line.
+        """
+        return [self._run_stage(number, stage) for number, stage in enumerate(self.stages, 1)]
+
+    def _run_stage(self, number: int, stage: Stage) -> StageRecord:
+        label = f"[{number}/{len(self.stages)}] {stage.title}"
+        record = self._finished(stage)
+        if record is not None:
+            self.line.finish(label, f"done before, {record.seconds:.0f} s")
+            return record
+        self._prepare(stage)
+        seconds = self._execute(stage, label)
+        record = StageRecord(stage.name, stage.title, stage.line, round(seconds, 1), self.keys[stage.name])
+        self._stamp(stage).write_text(json.dumps(asdict(record), indent=2), encoding="utf-8")
+        self.line.finish(label, f"{seconds:.0f} s")
+        return record
+
+    def _prepare(self, stage: Stage) -> None:
+        """Remove what an earlier run left, unless the command continues from exactly that."""
+        stamp, started = self._stamp(stage), self._stamp(stage).with_suffix(".started")
+        stamp.unlink(missing_ok=True)
+        key = self.keys[stage.name]
+        same = started.is_file() and started.read_text(encoding="utf-8") == key
+        if not (stage.resumable and same):
+            shutil.rmtree(stage.output, ignore_errors=True)
+        started.parent.mkdir(parents=True, exist_ok=True)
+        started.write_text(key, encoding="utf-8")
+
+    def _finished(self, stage: Stage) -> StageRecord | None:
+        stamp = self._stamp(stage)
+        if not (stamp.is_file() and stage.product.exists()):
+            return None
+        record = StageRecord(**json.loads(stamp.read_text(encoding="utf-8")))
+        return record if record.key == self.keys[stage.name] else None
+
+    def _stamp(self, stage: Stage) -> Path:
+        return self.directory / "stages" / f"{stage.name}.json"
+
+    def log_path(self, stage: Stage) -> Path:
+        """Where everything goes that the stage's command prints."""
+        return self.directory / "logs" / f"{stage.name}.log"
+
+    def _execute(self, stage: Stage, label: str) -> float:
+        log = self.log_path(stage)
+        log.parent.mkdir(parents=True, exist_ok=True)
+        started = time.monotonic()
+        with log.open("wb") as file:
+            file.write(f"$ {stage.line}\n".encode())
+            file.flush()
+            child = subprocess.Popen(
+                [find_command(stage.command[0]), *stage.command[1:]],
+                stdin=subprocess.DEVNULL,
+                stdout=file,
+                stderr=subprocess.STDOUT,
+                env=child_environment(),
+                start_new_session=True,
+            )
+            try:
+                while child.poll() is None:
+                    self.line.show(label, parse_progress(read_tail(log)), time.monotonic() - started)
+                    time.sleep(POLL_S)
+            except BaseException:
+                stop(child)
+                raise
+        if child.returncode:
+            self.line.finish(label, "failed")
+            raise ChildProcessError(failure_message(stage, child.returncode, log))
+        if not stage.product.exists():
+            raise ChildProcessError(f"stage {stage.name} wrote no {stage.product}; see {log}")
+        return time.monotonic() - started
+
+
+def find_command(name: str) -> str:
+    """Path of a console script: beside the running interpreter, else on the path.
+
+    Raises:
+        FileNotFoundError: it is in neither place.
+    """
+    beside = str(Path(sys.executable).parent)
+    found = shutil.which(name, path=beside) or shutil.which(name)
+    if found is None:
+        raise FileNotFoundError(f"command {name} not found; is this project installed? (make setup)")
+    return found
+
+
+def child_environment() -> dict[str, str]:
+    """Environment of the stages: nothing is fetched from the Hub, logs hold one bar update per second."""
+    quiet = {"HF_HUB_OFFLINE": "1", "TQDM_MININTERVAL": "1", "PYTHONUNBUFFERED": "1"}
+    return quiet | dict(os.environ)
+
+
+def stop(child: subprocess.Popen[bytes]) -> None:
+    """Ask a child and its workers to end as Ctrl-C does, and end them if they do not."""
+    for number in (signal.SIGINT, signal.SIGKILL):
+        with contextlib.suppress(ProcessLookupError):
+            os.killpg(child.pid, number)
+        with contextlib.suppress(subprocess.TimeoutExpired):
+            child.wait(STOP_TIMEOUT_S)
+
+
+def failure_message(stage: Stage, status: int, log: Path) -> str:
+    """One line about a failed stage, with the last line that its command printed."""
+    lines = [line.strip() for line in read_tail(log).replace("\r", "\n").splitlines() if line.strip()]
+    last = lines[-1] if lines else "no output"
+    return f"stage {stage.name} failed with status {status}: {last} (all output in {log})"

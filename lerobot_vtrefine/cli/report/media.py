@@ -1,0 +1,78 @@
+"""Pictures and videos as data URIs, so that the page needs no other file."""
+
+import base64
+import io
+from pathlib import Path
+
+import av
+import numpy as np
+import pyarrow.parquet as pq
+from matplotlib import colormaps
+from PIL import Image
+
+from lerobot_vtrefine.datasets.features import BASELINE_KEYS, PAD_COLS, PAD_ROWS, PADS, TACTILE_KEYS, Array
+
+MIME = {".mp4": "video/mp4", ".webm": "video/webm", ".png": "image/png", ".gif": "image/gif"}
+
+
+def data_uri(path: Path) -> str:
+    """The file at ``path`` as a ``data:`` URI.
+
+    Raises:
+        ValueError: the suffix is not one that a browser shows.
+    """
+    if path.suffix not in MIME:
+        raise ValueError(f"cannot embed {path}: suffix is not one of {', '.join(MIME)}")
+    return encode(path.read_bytes(), MIME[path.suffix])
+
+
+def encode(content: bytes, mime: str) -> str:
+    """Bytes as a ``data:`` URI."""
+    return f"data:{mime};base64,{base64.b64encode(content).decode('ascii')}"
+
+
+def heat_map(values: Array, maximum: float) -> str:
+    """A (rows, columns) array from 0 to ``maximum`` as a PNG data URI, one pixel per taxel."""
+    shades = colormaps["magma"](np.clip(values / max(maximum, 1e-9), 0, 1), bytes=True)[..., :3]
+    buffer = io.BytesIO()
+    Image.fromarray(shades).save(buffer, "PNG")
+    return encode(buffer.getvalue(), "image/png")
+
+
+def strongest_contact(dataset_root: Path) -> dict[str, Array]:
+    """Counts above the baseline of the frame with the strongest contact in a dataset's first data file.
+
+    Returns:
+        Pad name -> (12, 32) int array.
+
+    Raises:
+        FileNotFoundError: there is no data file below ``dataset_root``.
+    """
+    files = sorted((dataset_root / "data").rglob("*.parquet"))
+    if not files:
+        raise FileNotFoundError(f"no recorded frames below {dataset_root / 'data'}")
+    table = pq.read_table(files[0], columns=[*TACTILE_KEYS, *BASELINE_KEYS])
+    counts = {
+        key: np.stack(table[key].to_numpy(zero_copy_only=False)).astype(int) for key in table.column_names
+    }
+    pressed = [
+        np.abs(counts[key] - counts[idle]) for key, idle in zip(TACTILE_KEYS, BASELINE_KEYS, strict=True)
+    ]
+    frame = int(np.argmax(sum(values.sum(axis=1) for values in pressed)))
+    return {pad: values[frame].reshape(PAD_ROWS, PAD_COLS) for pad, values in zip(PADS, pressed, strict=True)}
+
+
+def write_gif(video: Path, target: Path, width: int, every: int) -> None:
+    """A small looping GIF of ``video``, ``width`` pixels wide, with every ``every``-th frame."""
+    with av.open(str(video)) as container:
+        stream = container.streams.video[0]
+        rate = float(stream.average_rate or 10)
+        frames = [
+            frame.to_image() for index, frame in enumerate(container.decode(stream)) if index % every == 0
+        ]
+    height = round(frames[0].height * width / frames[0].width)
+    small = [frame.resize((width, height), Image.Resampling.LANCZOS) for frame in frames]
+    palette = small[len(small) // 2].quantize(128)
+    images = [frame.quantize(palette=palette, dither=Image.Dither.NONE) for frame in small]
+    duration = [round(1000 * every / rate)] * (len(images) - 1) + [1500]
+    images[0].save(target, save_all=True, append_images=images[1:], duration=duration, loop=0, optimize=True)

@@ -1,0 +1,111 @@
+"""``results.json``: what the evaluations of a pipeline measured, with intervals, seeds and seconds."""
+
+import json
+import os
+import platform
+from collections import Counter
+from collections.abc import Sequence
+from dataclasses import asdict
+from importlib.metadata import version
+from pathlib import Path
+from typing import Any
+
+from lerobot_vtrefine.cli.pipeline.demo_config import DemoConfig
+from lerobot_vtrefine.cli.pipeline.stages import StageRecord
+from lerobot_vtrefine.cli.report.statistics import proportion, quantiles
+from lerobot_vtrefine.envs.episode_log import read_episode_log
+
+# Measurements of every episode, and those that only a success has.
+METRICS = ("in_hand_shift_m", "rim_slide_m", "peak_force_n")
+SUCCESS_METRICS = ("time_to_success_s", *METRICS)
+CLEAR_LIFT = 0.2
+
+
+def load_evaluation(directory: Path, first_seed: int) -> dict[str, Any]:
+    """One evaluation as ``lerobot-eval`` and the environment's episode log left it.
+
+    Returns:
+        ``success``, ``episodes``, ``rate``, ``ci95``, ``eval_seconds``, ``seeds``, ``metrics`` (quantiles
+        over all episodes and over successes; SI units), ``failures`` (count by reason) and ``videos``
+        (``[{"path", "seed", "success"}]``).
+    """
+    info = json.loads((directory / "eval_info.json").read_text(encoding="utf-8"))
+    task = info["per_task"][0]["metrics"]
+    successes = [bool(value) for value in task["successes"]]
+    rows = read_episode_log(directory / "episodes.jsonl", first_seed, len(successes))
+    videos = [
+        {"path": path, "seed": first_seed + index, "success": successes[index]}
+        for index, path in enumerate(task.get("video_paths", []))
+    ]
+    return proportion(sum(successes), len(successes)) | {
+        "eval_seconds": round(info["overall"]["eval_s"], 1),
+        "seeds": [first_seed + index for index in range(len(successes))],
+        "metrics": summarise(rows),
+        "failures": dict(Counter(row["failure"] or "time-out" for row in rows if not row["success"])),
+        "videos": videos,
+    }
+
+
+def summarise(rows: Sequence[dict[str, Any]]) -> dict[str, Any]:
+    """Quantiles of every measurement over all episodes and over the successful ones."""
+    good = [row for row in rows if row["success"]]
+    return {
+        "all": {name: quantiles([row.get(name) for row in rows]) for name in METRICS},
+        "successes": {name: quantiles([row.get(name) for row in good]) for name in SUCCESS_METRICS},
+    }
+
+
+def collect_results(config: DemoConfig, records: Sequence[StageRecord]) -> dict[str, Any]:
+    """Everything of ``results.json``; ``pretrain`` and ``finetune`` first."""
+    seconds = {record.name: record.seconds for record in records}
+    policies = {
+        policy: load_evaluation(config.evaluation_dir(policy), config.eval_seed)
+        | {"seconds": seconds[policy], "modalities": config.modalities}
+        for policy in ("pretrain", "finetune")
+    }
+    ablations: dict[str, dict[str, Any]] = {}
+    for policy, modality in config.ablations():
+        evaluation = load_evaluation(config.evaluation_dir(policy, modality), config.eval_seed)
+        evaluation.pop("videos")
+        ablations.setdefault(policy, {})[modality] = evaluation
+    return {
+        "summary": verdict(policies["pretrain"], policies["finetune"]),
+        **policies,
+        "ablations": ablations,
+        "seconds": seconds | {"total": round(sum(seconds.values()), 1)},
+        "stages": [asdict(record) for record in records],
+        "config": json.loads(json.dumps(asdict(config), default=str)),
+        "machine": machine(),
+    }
+
+
+def verdict(before: dict[str, Any], after: dict[str, Any]) -> str:
+    """What was achieved, in plain words, also when it is little."""
+    change = after["rate"] - before["rate"]
+    if after["ci95"][0] > before["ci95"][1]:
+        words = "DPPO clearly improved" if change >= CLEAR_LIFT else "DPPO improved"
+        overlap = "the 95 % intervals do not overlap"
+    elif after["ci95"][1] < before["ci95"][0]:
+        words, overlap = "DPPO made worse", "the 95 % intervals do not overlap"
+    else:
+        words, overlap = "DPPO did not clearly change", "the 95 % intervals overlap"
+    rates = f"success went from {percent(before)} to {percent(after)}"
+    return f"{words} the imitation-learned policy: {rates}; {overlap}."
+
+
+def percent(evaluation: dict[str, Any]) -> str:
+    """For example ``36 % [29, 42] (71 of 200 episodes)``."""
+    low, high = evaluation["ci95"]
+    counts = f"{evaluation['success']} of {evaluation['episodes']} episodes"
+    return f"{100 * evaluation['rate']:.0f} % [{100 * low:.0f}, {100 * high:.0f}] ({counts})"
+
+
+def machine() -> dict[str, Any]:
+    """Where the numbers were measured."""
+    packages = ("lerobot_policy_vtrefine", "lerobot", "torch", "mujoco", "warp-lang")
+    return {
+        "python": platform.python_version(),
+        "system": f"{platform.system()} {platform.machine()}",
+        "cores": len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count(),
+        "packages": {name: version(name) for name in packages},
+    }
