@@ -1,0 +1,202 @@
+"""Configuration of the ``vt_dp3`` policy: a visuo-tactile 3D diffusion policy (paper appendix, "Pre-
+Train").
+"""
+
+from dataclasses import dataclass, field, replace
+from typing import Any
+
+from lerobot.configs import FeatureType, NormalizationMode, PreTrainedConfig
+from lerobot.optim import AdamWConfig
+from lerobot.optim.schedulers import CosineAnnealingWithWarmupSchedulerConfig
+
+from lerobot_vtrefine.datasets import fast_reader
+from lerobot_vtrefine.datasets.features import (
+    ACTION_KEY,
+    BASELINE_KEYS,
+    STATE_KEY,
+    TACTILE_KEYS,
+    VISUAL_KEYS,
+)
+from lerobot_vtrefine.observation import MODALITIES, VisuoTactileConfig
+from lerobot_vtrefine.policies.vt_dp3.denoisers import DENOISERS
+from lerobot_vtrefine.policies.vt_dp3.diffusion import step_grid
+
+PRESETS: dict[str, dict[str, Any]] = {
+    "paper": {
+        "point_dims": (64, 128, 256, 512),
+        "denoiser": "unet",
+        "down_dims": (512, 1024, 2048),
+        "time_dim": 128,
+        "noise_draws": 1,
+        "optimizer_lr": 1e-4,
+        "scheduler_warmup_steps": 500,
+        "observation": {"num_visual_points": 512, "pixel_stride": 1, "pool_rows": 1, "pool_cols": 1},
+    },
+    "small": {
+        "point_dims": (32, 64, 128),
+        "denoiser": "mlp",
+        "down_dims": (256, 256, 256),
+        "time_dim": 64,
+        "noise_draws": 4,
+        "optimizer_lr": 1e-3,
+        "scheduler_warmup_steps": 50,
+        "observation": {"num_visual_points": 256, "pixel_stride": 1, "pool_rows": 2, "pool_cols": 4},
+    },
+}
+"""What ``preset`` fills in. ``small`` trains on two CPU cores in minutes."""
+
+
+@PreTrainedConfig.register_subclass("vt_dp3")
+@dataclass
+class VtDp3Config(PreTrainedConfig):
+    """Settings of ``--policy.type=vt_dp3``.
+
+    Fields that are empty or 0 take the preset's value; the saved configuration is always explicit.
+    """
+
+    preset: str = "paper"
+    """``paper``, or ``small`` for a CPU."""
+    modalities: str = "visuo_tactile"
+    """``visuo_tactile``, ``visual`` (the paper's baseline) or ``tactile``: which points enter the cloud."""
+
+    n_obs_steps: int = 2
+    horizon: int = 16
+    n_action_steps: int = 8
+    """Executed actions per decision; a chunk starts at the current observation."""
+
+    observation: VisuoTactileConfig = field(default_factory=VisuoTactileConfig)
+    point_dims: tuple[int, ...] = ()
+    """Widths of the point encoder's shared layers."""
+    point_features: int = 64
+    denoiser: str = ""
+    """``unet`` (paper) or ``mlp``."""
+    down_dims: tuple[int, ...] = ()
+    """U-Net: channels per stage. MLP: one entry per residual block, all the same width."""
+    kernel_size: int = 5
+    time_dim: int = 0
+
+    num_train_timesteps: int = 100
+    noise_draws: int = 0
+    """Noise samples per encoded observation in one training step; more than 1 spares the encoder."""
+    sampler: str = "ddim"
+    """``ddim``, ``ddpm``, or ``tail``: ``prefix_steps`` coarse steps, then the last
+    ``num_inference_steps``.
+    """
+    num_inference_steps: int = 10
+    prefix_steps: int = 0
+    clip_sample_range: float = 1.0
+    """Predicted clean actions are clamped to this, in normalised units."""
+
+    ft_denoising_steps: int = 0
+    """K': the last denoising steps that DPPO has tuned; the others use the frozen pre-trained network."""
+    ft_freeze_encoder: bool = False
+    """The tuned and the frozen network share one encoder."""
+
+    use_ema: bool = True
+    """Keep an exponential moving average of the weights and use it for inference."""
+    ema_power: float = 0.75
+    ema_max_decay: float = 0.9999
+
+    normalization_mapping: dict[str, NormalizationMode] = field(
+        default_factory=lambda: {
+            "STATE": NormalizationMode.MIN_MAX,
+            "ACTION": NormalizationMode.MIN_MAX,
+            "VISUAL": NormalizationMode.IDENTITY,
+        }
+    )
+    optimizer_lr: float = 0.0
+    optimizer_betas: tuple[float, float] = (0.95, 0.999)
+    optimizer_weight_decay: float = 1e-6
+    optimizer_grad_clip_norm: float = 10.0
+    scheduler_warmup_steps: int = 0
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if self.preset not in PRESETS:
+            raise ValueError(f"unknown policy.preset {self.preset!r}; choose one of {', '.join(PRESETS)}")
+        values = dict(PRESETS[self.preset])
+        points = values.pop("observation")
+        unset = {name: value for name, value in points.items() if not getattr(self.observation, name)}
+        self.observation = replace(self.observation, **unset)
+        for name, value in values.items():
+            setattr(self, name, getattr(self, name) or value)
+        self.down_dims, self.point_dims = tuple(self.down_dims), tuple(self.point_dims)
+        self._validate()
+        fast_reader.install()
+
+    def _validate(self) -> None:
+        self.observation.validate()
+        if self.modalities not in MODALITIES:
+            raise ValueError(
+                f"unknown policy.modalities {self.modalities!r}; choose one of {', '.join(MODALITIES)}"
+            )
+        if self.denoiser not in DENOISERS:
+            raise ValueError(
+                f"unknown policy.denoiser {self.denoiser!r}; choose one of {', '.join(DENOISERS)}"
+            )
+        if not 1 <= self.n_action_steps <= self.horizon:
+            raise ValueError(f"policy.n_action_steps={self.n_action_steps} must be within 1..{self.horizon}")
+        if self.denoiser == "unet" and self.horizon % 2 ** (len(self.down_dims) - 1):
+            raise ValueError(
+                f"policy.horizon={self.horizon} must be divisible by {2 ** (len(self.down_dims) - 1)} "
+                f"for {len(self.down_dims)} U-Net stages"
+            )
+        if self.denoiser == "mlp" and len(set(self.down_dims)) > 1:
+            raise ValueError(f"policy.down_dims must be one repeated width for the mlp, got {self.down_dims}")
+        if not 0 <= self.ft_denoising_steps <= len(self.timesteps):
+            raise ValueError(
+                f"policy.ft_denoising_steps={self.ft_denoising_steps} must be within 0..{len(self.timesteps)}"
+            )
+
+    @property
+    def timesteps(self) -> tuple[int, ...]:
+        """Training steps visited at inference."""
+        return step_grid(self.sampler, self.num_train_timesteps, self.num_inference_steps, self.prefix_steps)
+
+    @property
+    def observation_delta_indices(self) -> list[int]:
+        """The last ``n_obs_steps`` frames."""
+        return list(range(1 - self.n_obs_steps, 1))
+
+    @property
+    def action_delta_indices(self) -> list[int]:
+        """Chunks start at the current observation, so what DPPO scores is exactly what is executed."""
+        return list(range(self.horizon))
+
+    @property
+    def reward_delta_indices(self) -> None:
+        """No rewards."""
+        return
+
+    def get_optimizer_preset(self) -> AdamWConfig:
+        """AdamW as in DP3."""
+        return AdamWConfig(
+            lr=self.optimizer_lr,
+            betas=self.optimizer_betas,
+            weight_decay=self.optimizer_weight_decay,
+            grad_clip_norm=self.optimizer_grad_clip_norm,
+        )
+
+    def get_scheduler_preset(self) -> CosineAnnealingWithWarmupSchedulerConfig:
+        """Linear warm-up, then cosine to zero over the run's steps."""
+        return CosineAnnealingWithWarmupSchedulerConfig(num_warmup_steps=self.scheduler_warmup_steps)
+
+    @property
+    def required_keys(self) -> tuple[str, ...]:
+        """Observation columns that the chosen modalities need."""
+        tactile = () if self.modalities == "visual" else (*TACTILE_KEYS, *BASELINE_KEYS)
+        visual = () if self.modalities == "tactile" else VISUAL_KEYS
+        return (STATE_KEY, *tactile, *visual)
+
+    def validate_features(self) -> None:
+        """Raises: ValueError naming the columns that a dataset or environment lacks for this policy."""
+        missing = [key for key in self.required_keys if key not in (self.input_features or {})]
+        if missing:
+            shown = ", ".join(missing[:3]) + (f" and {len(missing) - 3} more" if len(missing) > 3 else "")
+            raise ValueError(
+                f"vt_dp3 with policy.modalities={self.modalities} needs columns that the data lacks: "
+                f"{shown}; record with vtrefine-record-demos or a tactile robot, or choose other modalities"
+            )
+        action = (self.output_features or {}).get(ACTION_KEY)
+        if action is None or action.type is not FeatureType.ACTION or len(action.shape) != 1:
+            raise ValueError(f"vt_dp3 needs a vector feature '{ACTION_KEY}', got {action}")

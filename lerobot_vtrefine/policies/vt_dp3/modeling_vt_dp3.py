@@ -1,0 +1,238 @@
+"""The ``vt_dp3`` policy: visuo-tactile point clouds to action chunks by diffusion.
+
+Shapes: ``B`` batch, ``To`` observation steps, ``N`` points, ``H`` horizon, ``Ta`` executed actions, ``D``
+action dimension, ``C`` condition. All actions in here are normalised; the postprocessor turns them into joint
+targets.
+"""
+
+from collections import deque
+from copy import deepcopy
+from pathlib import Path
+from typing import Any
+
+import torch
+from lerobot.policies import PreTrainedPolicy
+from torch import Tensor, nn
+from torch.nn import functional
+
+from lerobot_vtrefine.datasets.features import ACTION_KEY, CLOUD_KEY, STATE_KEY
+from lerobot_vtrefine.policies.vt_dp3.configuration_vt_dp3 import VtDp3Config
+from lerobot_vtrefine.policies.vt_dp3.denoisers import MLPDenoiser, UNetDenoiser
+from lerobot_vtrefine.policies.vt_dp3.diffusion import DiffusionProcess, PredictNoise, deploy
+from lerobot_vtrefine.policies.vt_dp3.ema import Ema
+from lerobot_vtrefine.policies.vt_dp3.point_encoder import ObservationEncoder, PointEncoder
+from lerobot_vtrefine.policies.vt_dp3.processor_vt_dp3 import widen_narrow_ranges
+
+Batch = dict[str, Tensor]
+
+
+class VtDp3Model(nn.Module):
+    """Observation encoder and noise predictor."""
+
+    def __init__(self, config: VtDp3Config, state_dim: int, action_dim: int) -> None:
+        super().__init__()
+        view = config.observation
+        points = PointEncoder(config.point_dims, config.point_features, view.center_m, view.scale_m)
+        self.encoder = ObservationEncoder(points, config.point_features, state_dim, config.n_obs_steps)
+        cond_dim = self.encoder.cond_dim
+        if config.denoiser == "unet":
+            self.denoiser: nn.Module = UNetDenoiser(
+                action_dim, cond_dim, config.down_dims, config.kernel_size, config.time_dim
+            )
+        else:
+            self.denoiser = MLPDenoiser(
+                action_dim,
+                config.horizon,
+                cond_dim,
+                config.down_dims[0],
+                len(config.down_dims),
+                config.time_dim,
+            )
+
+    def encode(self, batch: Batch) -> Tensor:
+        """Cloud (B, To, N, 5) and normalised state (B, To, Ds) of a processed batch -> condition (B, C)."""
+        return self.encoder(batch[CLOUD_KEY], batch[STATE_KEY])
+
+    def predictor(self, cond: Tensor) -> PredictNoise:
+        """The noise predictor with its condition bound."""
+        return lambda x, t: self.denoiser(x, t, cond)
+
+
+class VtDp3Policy(PreTrainedPolicy):
+    """LeRobot policy around ``VtDp3Model``.
+
+    ``model`` is what acts: the moving average while behaviour cloning trains ``online``, or the network that
+    DPPO tunes. ``base`` is None, or the frozen pre-trained network that does the denoising steps before the
+    last ``config.ft_denoising_steps``.
+    """
+
+    config_class = VtDp3Config
+    name = "vt_dp3"
+
+    def __init__(
+        self, config: VtDp3Config, dataset_stats: dict[str, Any] | None = None, dataset_meta: Any = None
+    ) -> None:
+        if not isinstance(config, VtDp3Config):
+            found = getattr(config, "type", type(config).__name__)
+            raise ValueError(f"the checkpoint holds a policy of type '{found}', expected 'vt_dp3'")
+        super().__init__(config)
+        config.validate_features()
+        if dataset_stats:
+            # The trainer hands this very dict to the normaliser, also with --policy.path, and offers no other
+            # hook.
+            widen_narrow_ranges(dataset_stats)
+        self.config: VtDp3Config = config
+        state, action = config.input_features[STATE_KEY], config.output_features[ACTION_KEY]
+        self.model = VtDp3Model(config, state.shape[0], action.shape[0])
+        self.base: VtDp3Model | None = None
+        self.online: VtDp3Model | None = None
+        self.ema: Ema | None = None
+        if config.ft_denoising_steps:
+            self._attach_base()
+        elif config.use_ema:
+            self.online = deepcopy(self.model)
+            self.model.requires_grad_(False)
+            self.ema = Ema(config.ema_power, config.ema_max_decay)
+        self.reset()
+
+    @classmethod
+    def from_pretrained(cls, pretrained_name_or_path: str | Path, **kwargs: Any) -> "VtDp3Policy":
+        """Load a checkpoint. Raises: FileNotFoundError if the folder holds no policy, ValueError on its
+        type.
+        """
+        path = Path(pretrained_name_or_path)
+        if path.is_dir() and not (path / "config.json").is_file():
+            raise FileNotFoundError(f"{path} holds no policy; give the checkpoint's pretrained_model folder")
+        return super().from_pretrained(pretrained_name_or_path, **kwargs)
+
+    @property
+    def process(self) -> DiffusionProcess:
+        """The diffusion process that deployment and DPPO use."""
+        config = self.config
+        return DiffusionProcess(config.num_train_timesteps, config.timesteps, config.clip_sample_range)
+
+    @property
+    def action_dim(self) -> int:
+        """D."""
+        return self.config.output_features[ACTION_KEY].shape[0]
+
+    # Training
+
+    def get_optim_params(self) -> Any:
+        """Parameters that behaviour cloning trains."""
+        return (self.online or self.model).parameters()
+
+    def forward(self, batch: Batch, reduction: str = "mean") -> tuple[Tensor, dict[str, float]]:
+        """Noise-prediction loss of a processed training batch; ``action`` (B, H, D) starts at the current
+        frame.
+
+        Actions past the episode's end repeat the last target: with absolute targets that means "hold still".
+        ``reduction="none"`` returns one loss per sample (B,).
+        """
+        if self.config.ft_denoising_steps:
+            raise ValueError(
+                "a fine-tuned vt_dp3 cannot be trained by behaviour cloning; use the pre-trained checkpoint"
+            )
+        model = self.online or self.model
+        draws = self.config.noise_draws if self.training else 1
+        cond = model.encode(batch).repeat_interleave(draws, dim=0)
+        clean = batch[ACTION_KEY].repeat_interleave(draws, dim=0)
+        noise = torch.randn_like(clean)
+        t = torch.randint(self.config.num_train_timesteps, (len(clean),), device=clean.device)
+        predicted = model.denoiser(self.process.add_noise(clean, noise, t), t, cond)
+        error = functional.mse_loss(predicted, noise, reduction="none").mean(dim=(1, 2))
+        loss = error.view(-1, draws).mean(dim=1)
+        return (loss if reduction == "none" else loss.mean()), {}
+
+    def update(self) -> None:
+        """Called by the trainer after every optimiser step: move the average."""
+        if self.ema is not None and self.online is not None:
+            self.ema.update(self.model, self.online)
+
+    def prepare_finetuning(
+        self,
+        sampler: str,
+        num_inference_steps: int,
+        prefix_steps: int,
+        ft_denoising_steps: int,
+        freeze_encoder: bool = False,
+    ) -> None:
+        """Turn a pre-trained policy into one whose last ``ft_denoising_steps`` denoising steps are trainable.
+
+        The tuned network starts from the averaged weights, a frozen copy does the earlier steps, and the
+        average is dropped: what is tuned is what acts. Raises: ValueError if the policy is fine-tuned
+        already.
+        """
+        if self.config.ft_denoising_steps:
+            raise ValueError("this checkpoint is fine-tuned already; use the pre-trained one, or resume")
+        config = self.config
+        config.sampler, config.num_inference_steps = sampler, num_inference_steps
+        config.prefix_steps, config.ft_denoising_steps = prefix_steps, ft_denoising_steps
+        config.ft_freeze_encoder = freeze_encoder
+        if not 1 <= ft_denoising_steps <= len(config.timesteps):
+            raise ValueError(f"{ft_denoising_steps=} must be within 1..{len(config.timesteps)}")
+        self.online, self.ema = None, None
+        self._attach_base()
+
+    def _attach_base(self) -> None:
+        """Freeze a copy of ``model`` as ``base``; both share the encoder if that is not tuned."""
+        self.model.requires_grad_(True)
+        self.base = deepcopy(self.model).requires_grad_(False)
+        if self.config.ft_freeze_encoder:
+            self.model.encoder.requires_grad_(False)
+            self.base.encoder = self.model.encoder
+
+    # Acting
+
+    def reset(self) -> None:
+        """Forget observations and planned actions: call it at the start of episodes."""
+        self._frames: deque[Batch] = deque(maxlen=self.config.n_obs_steps)
+        self._planned: deque[Tensor] = deque()
+
+    def _observe(self, batch: Batch) -> None:
+        """Append processed frames (B, ...) to the history; the first one fills it."""
+        frame = {CLOUD_KEY: batch[CLOUD_KEY], STATE_KEY: batch[STATE_KEY]}
+        missing = self.config.n_obs_steps - len(self._frames)
+        self._frames.extend([frame] * (missing if len(self._frames) == 0 else 1))
+
+    @torch.no_grad()
+    def predict_action_chunk(self, batch: Batch, noise: Tensor | None = None, **kwargs: Any) -> Tensor:
+        """Actions (B, Ta, D) from now on.
+
+        ``batch`` holds stacked frames (B, To, ...), or single frames (B, ...) that join the history.
+        ``noise`` (B, H, D) is the sampler's standard normal start; drawn if not given.
+        """
+        if batch[STATE_KEY].ndim == 2:
+            self._observe(batch)
+            batch = self._window()
+        return self.sample_actions(batch, noise)[:, : self.config.n_action_steps]
+
+    @torch.no_grad()
+    def select_action(self, batch: Batch, noise: Tensor | None = None, **kwargs: Any) -> Tensor:
+        """The next action (B, D) for single frames (B, ...); encodes and samples once per chunk."""
+        self._observe(batch)
+        if not self._planned:
+            chunk = self.sample_actions(self._window(), noise)[:, : self.config.n_action_steps]
+            self._planned.extend(chunk.unbind(dim=1))
+        return self._planned.popleft()
+
+    def _window(self) -> Batch:
+        return {key: torch.stack([frame[key] for frame in self._frames], dim=1) for key in self._frames[0]}
+
+    @torch.no_grad()
+    def sample_actions(self, batch: Batch, noise: Tensor | None = None) -> Tensor:
+        """The whole horizon (B, H, D) from stacked frames (B, To, ...): deterministic given ``noise``."""
+        cond = self.model.encode(batch)
+        shape = (len(cond), self.config.horizon, self.action_dim)
+        if noise is None:
+            noise = torch.randn(shape, device=cond.device, dtype=cond.dtype)
+        base: PredictNoise | None = None
+        if self.base is not None:
+            base = self.base.predictor(cond if self.config.ft_freeze_encoder else self.base.encode(batch))
+        return deploy(
+            self.process,
+            self.model.predictor(cond),
+            noise,
+            num_tuned=self.config.ft_denoising_steps,
+            predict_noise_base=base,
+        )

@@ -1,0 +1,166 @@
+"""Pre- and postprocessing of ``vt_dp3``: raw readings to cloud and normalised state, actions to joint
+targets.
+
+The same pipeline, saved with the checkpoint, serves training batches (B, To, ...), environment frames (B,
+...) and robot frames; so all of them see the same cloud.
+"""
+
+from dataclasses import asdict, dataclass, field
+from typing import Any
+
+import torch
+from lerobot.configs import FeatureType, PipelineFeatureType, PolicyFeature
+from lerobot.processor import (
+    AddBatchDimensionProcessorStep,
+    DeviceProcessorStep,
+    NormalizerProcessorStep,
+    ObservationProcessorStep,
+    PolicyAction,
+    PolicyProcessorPipeline,
+    ProcessorStepRegistry,
+    RenameObservationsProcessorStep,
+    UnnormalizerProcessorStep,
+)
+from lerobot.processor.factory import make_policy_processor_pipelines
+from torch import Tensor
+
+from lerobot_vtrefine.datasets.features import (
+    ACTION_KEY,
+    BASELINE_KEYS,
+    CAMERA_POSE_KEY,
+    CLOUD_KEY,
+    DEPTH_KEY,
+    INTRINSICS_KEY,
+    NOISE_LEVEL_KEY,
+    RAW_KEYS,
+    STATE_KEY,
+    TACTILE_KEYS,
+)
+from lerobot_vtrefine.observation import VisuoTactileConfig, build_visuo_tactile, num_points
+from lerobot_vtrefine.observation.visuo_tactile import POINT_CHANNELS
+from lerobot_vtrefine.policies.vt_dp3.configuration_vt_dp3 import VtDp3Config
+
+MIN_RANGE = 0.02
+"""Smallest range [rad or m] that min-max normalisation stretches to [-1, 1]."""
+
+Stats = dict[str, dict[str, Any]]
+Pipelines = tuple[
+    PolicyProcessorPipeline[dict[str, Any], dict[str, Any]],
+    PolicyProcessorPipeline[PolicyAction, PolicyAction],
+]
+
+
+def widen_narrow_ranges(stats: Stats) -> None:
+    """Give joints that hardly moved in the data a range of ``MIN_RANGE`` around their middle, in place.
+
+    Without it a joint that stayed within 1e-6 rad would turn the servo's noise into huge inputs. Idempotent.
+    """
+    for key in (STATE_KEY, ACTION_KEY):
+        if key not in stats or "min" not in stats[key]:
+            continue
+        low, high = torch.as_tensor(stats[key]["min"]), torch.as_tensor(stats[key]["max"])
+        middle, half = (low + high) / 2, (high - low) / 2
+        narrow = half < MIN_RANGE / 2
+        stats[key]["min"] = torch.where(narrow, middle - MIN_RANGE / 2, low).numpy()
+        stats[key]["max"] = torch.where(narrow, middle + MIN_RANGE / 2, high).numpy()
+
+
+@ProcessorStepRegistry.register("vt_visuo_tactile")
+@dataclass
+class VisuoTactileProcessorStep(ObservationProcessorStep):
+    """Replaces the raw tactile, depth and camera columns by ``observation.visuo_tactile`` (..., N, 5).
+
+    Leading dimensions are those of ``observation.state`` (..., 16), which must still be in rad and m here.
+    Depth noise is drawn from torch's global generator, so LeRobot's seed makes it repeatable.
+    """
+
+    observation_config: VisuoTactileConfig = field(default_factory=VisuoTactileConfig)
+    modalities: str = "visuo_tactile"
+
+    def __post_init__(self) -> None:
+        if isinstance(self.observation_config, dict):  # as loaded from a saved pipeline
+            values = {k: tuple(v) if isinstance(v, list) else v for k, v in self.observation_config.items()}
+            self.observation_config = VisuoTactileConfig(**values)
+        self.observation_config.validate()
+
+    def observation(self, observation: dict[str, Any]) -> dict[str, Any]:
+        """Build the cloud and drop what it was built from; masks (``*_is_pad``) stay untouched."""
+        cloud = self._cloud(observation)
+        kept = {key: value for key, value in observation.items() if key not in RAW_KEYS}
+        return {**kept, CLOUD_KEY: cloud}
+
+    def _cloud(self, observation: dict[str, Any]) -> Tensor:
+        state = _require(observation, STATE_KEY)
+        lead = state.shape[:-1]
+        tactile = baseline = depth = intrinsics = pose = None
+        if self.modalities != "visual":
+            tactile, baseline = (
+                _pads(observation, TACTILE_KEYS, lead),
+                _pads(observation, BASELINE_KEYS, lead),
+            )
+        if self.modalities != "tactile":
+            depth = _require(observation, DEPTH_KEY)
+            intrinsics, pose = _require(observation, INTRINSICS_KEY), _require(observation, CAMERA_POSE_KEY)
+        return build_visuo_tactile(
+            state,
+            tactile,
+            baseline,
+            depth,
+            intrinsics,
+            pose,
+            self.observation_config,
+            noise_level=observation.get(NOISE_LEVEL_KEY),
+        )
+
+    def get_config(self) -> dict[str, Any]:
+        """Saved with the checkpoint."""
+        return {"observation_config": asdict(self.observation_config), "modalities": self.modalities}
+
+    def transform_features(
+        self, features: dict[PipelineFeatureType, dict[str, PolicyFeature]]
+    ) -> dict[PipelineFeatureType, dict[str, PolicyFeature]]:
+        """The raw columns' features become the cloud's."""
+        observations = features.get(PipelineFeatureType.OBSERVATION, {})
+        kept = {key: value for key, value in observations.items() if key not in RAW_KEYS}
+        points = num_points(self.observation_config, self.modalities)
+        kept[CLOUD_KEY] = PolicyFeature(type=FeatureType.STATE, shape=(points, POINT_CHANNELS))
+        return {**features, PipelineFeatureType.OBSERVATION: kept}
+
+
+def _require(observation: dict[str, Any], key: str) -> Tensor:
+    if key not in observation:
+        raise ValueError(f"the observation lacks '{key}', which vt_dp3 builds its point cloud from")
+    return torch.as_tensor(observation[key])
+
+
+def _pads(observation: dict[str, Any], keys: tuple[str, ...], lead: torch.Size) -> Tensor:
+    """Counts of all pads, (*lead, P, 384)."""
+    return torch.stack([_require(observation, key).reshape(*lead, -1) for key in keys], dim=-2)
+
+
+def make_vt_dp3_pre_post_processors(
+    config: VtDp3Config, dataset_stats: Stats | None = None, dataset_meta: Any = None
+) -> Pipelines:
+    """Pre- and postprocessor; only joint positions and actions are normalised (min-max to [-1, 1])."""
+    if dataset_stats:
+        widen_narrow_ranges(dataset_stats)
+        dataset_stats = {key: dataset_stats[key] for key in (STATE_KEY, ACTION_KEY) if key in dataset_stats}
+    normalizer = NormalizerProcessorStep(
+        features={**(config.input_features or {}), **(config.output_features or {})},
+        norm_map=config.normalization_mapping,
+        stats=dataset_stats,
+        normalize_observation_keys={STATE_KEY},
+    )
+    unnormalizer = UnnormalizerProcessorStep(
+        features=config.output_features or {}, norm_map=config.normalization_mapping, stats=dataset_stats
+    )
+    return make_policy_processor_pipelines(
+        input_steps=[
+            RenameObservationsProcessorStep(rename_map={}),
+            AddBatchDimensionProcessorStep(),
+            DeviceProcessorStep(device=config.device),
+            VisuoTactileProcessorStep(config.observation, config.modalities),
+            normalizer,
+        ],
+        output_steps=[unnormalizer, DeviceProcessorStep(device="cpu")],
+    )
