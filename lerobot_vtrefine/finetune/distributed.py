@@ -11,13 +11,10 @@ import torch.distributed as dist
 from torch import Tensor, nn
 
 
-def setup_ranks(device: torch.device) -> tuple[int, int]:
-    """Join the process group that ``torchrun`` announced. Returns (rank, number of ranks)."""
-    if "RANK" not in os.environ:
-        return 0, 1
-    if not dist.is_initialized():
+def join_ranks(device: torch.device) -> None:
+    """Join the process group that ``torchrun`` announced, if it did."""
+    if "RANK" in os.environ and not dist.is_initialized():
         dist.init_process_group("nccl" if device.type == "cuda" else "gloo")
-    return dist.get_rank(), dist.get_world_size()
 
 
 def leave_ranks() -> None:
@@ -29,6 +26,11 @@ def leave_ranks() -> None:
 def num_ranks() -> int:
     """Number of ranks (1 without ``torchrun``)."""
     return dist.get_world_size() if dist.is_initialized() else 1
+
+
+def rank_index() -> int:
+    """This process's rank (0 without ``torchrun``)."""
+    return dist.get_rank() if dist.is_initialized() else 0
 
 
 def barrier() -> None:
@@ -72,3 +74,22 @@ def copy_from_first_rank(module: nn.Module) -> None:
     if num_ranks() > 1:
         for tensor in module.state_dict().values():
             dist.broadcast(tensor, src=0)
+
+
+def mean_over_ranks(columns: dict[str, Tensor]) -> dict[str, float]:
+    """Average each column over its finite entries on all ranks; columns may exist on some ranks only."""
+    sums = {}
+    for key, values in columns.items():
+        finite = values.double()[values.double().isfinite()]
+        sums[key] = (float(finite.sum()), finite.numel())
+    gathered = [sums]
+    if num_ranks() > 1:
+        gathered = [{}] * num_ranks()
+        dist.all_gather_object(gathered, sums)
+    means = {}
+    for key in dict.fromkeys(key for part in gathered for key in part):
+        parts = [part[key] for part in gathered if key in part]
+        count = sum(number for _, number in parts)
+        if count:
+            means[key] = sum(total for total, _ in parts) / count
+    return means

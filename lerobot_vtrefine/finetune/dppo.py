@@ -25,7 +25,14 @@ from torch import Tensor
 
 from lerobot_vtrefine.finetune.config import DppoConfig
 from lerobot_vtrefine.finetune.critic import Critic, explained_variance
-from lerobot_vtrefine.finetune.distributed import max_over_ranks, num_ranks, sum_gradients, sum_over_ranks
+from lerobot_vtrefine.finetune.distributed import (
+    max_over_ranks,
+    mean_over_ranks,
+    num_ranks,
+    rank_index,
+    sum_gradients,
+    sum_over_ranks,
+)
 from lerobot_vtrefine.finetune.gae import RewardScaler, generalised_advantages
 from lerobot_vtrefine.finetune.protocols import (
     Agent,
@@ -36,6 +43,7 @@ from lerobot_vtrefine.finetune.protocols import (
     latest,
     predictor,
     select,
+    start,
 )
 from lerobot_vtrefine.policies.vt_dp3.diffusion import denoise_prefix, sample_chain, slice_log_prob
 
@@ -58,11 +66,9 @@ class TrainState:
     env_steps: int = 0
 
     @classmethod
-    def create(
-        cls, agent: Agent, cfg: DppoConfig, privileged_dim: int, seed: int, rank: int = 0
-    ) -> "TrainState":
+    def create(cls, agent: Agent, cfg: DppoConfig, privileged_dim: int, seed: int) -> "TrainState":
         """Fresh state on the actor's device; ranks differ only in their exploration noise."""
-        device = next(agent.actor.parameters()).device
+        device = agent.device
         with torch.random.fork_rng(devices=[]):
             torch.manual_seed(seed)
             critic = Critic(privileged_dim, cfg.critic_width, cfg.critic_blocks).to(device)
@@ -72,7 +78,7 @@ class TrainState:
             torch.optim.AdamW(agent.trained_parameters(), lr=cfg.actor_lr, **adamw),
             torch.optim.AdamW(critic.parameters(), lr=cfg.critic_lr, **adamw),
             RewardScaler(),
-            torch.Generator(device).manual_seed(seed + 7919 * rank),
+            torch.Generator(device).manual_seed(seed + 7919 * rank_index()),
         )
 
 
@@ -99,8 +105,9 @@ def collect(
     env: DecisionEnv, agent: Agent, cfg: DppoConfig, generator: torch.Generator, seeds: Sequence[int]
 ) -> Rollout:
     """One episode (or its first ``cfg.decisions`` decisions) in every environment, with exploration noise."""
-    obs, privileged = env.reset(seeds)
-    device, running = privileged.device, torch.ones(env.num_envs, dtype=torch.bool, device=privileged.device)
+    device = agent.device
+    obs, privileged = start(env, seeds, device)
+    running = torch.ones(env.num_envs, dtype=torch.bool, device=device)
     success = torch.zeros_like(running)
     kept, chains, index, states, transitions, active = [], [], [], [privileged], [], []
     info: dict[str, Tensor] = {}
@@ -339,18 +346,8 @@ def _clip_gradients(parameters: list[torch.nn.Parameter], max_norm: float) -> fl
 
 def rollout_metrics(rollout: Rollout) -> Metrics:
     """Averages over the environments of all ranks."""
-    values = {
-        "success": rollout.success.float(),
-        "return": rollout.reward.sum(0),
-        "decisions": rollout.active.sum(0),
-    }
-    values |= {key: value for key, value in rollout.info.items() if key != "success"}
-    sums = torch.stack(
-        [value.double().sum() for value in values.values()] + [rollout.active.new_tensor(0.0).double()]
-    )
-    sums[-1] = rollout.active.shape[1]
-    *totals, count = sum_over_ranks(sums).tolist()
-    return {key: total / count for key, total in zip(values, totals, strict=True)}
+    columns = {"return": rollout.reward.sum(0), "decisions": rollout.active.sum(0), **rollout.info}
+    return mean_over_ranks(columns | {"success": rollout.success})
 
 
 def train(
@@ -360,25 +357,25 @@ def train(
     cfg: DppoConfig,
     *,
     seed: int,
-    rank: int = 0,
     after_iteration: Callable[[TrainState, Metrics], None],
 ) -> None:
     """Run the iterations that remain; ``after_iteration`` logs, evaluates and saves."""
+    chunk = agent.executed.stop - agent.executed.start
     while state.iteration < cfg.iterations:
         started = time.perf_counter()
-        first = TRAINING_SEEDS + seed + (state.iteration * num_ranks() + rank) * env.num_envs
+        first = TRAINING_SEEDS + seed + (state.iteration * num_ranks() + rank_index()) * env.num_envs
         rollout = collect(env, agent, cfg, state.generator, range(first, first + env.num_envs))
         collected = time.perf_counter()
         state.critic.update_moments(rollout.privileged[:-1][rollout.active])
         metrics = rollout_metrics(rollout) | update(rollout, agent, state, cfg)
         decisions = sum_over_ranks(rollout.active.sum().double()).item()
         state.iteration += 1
-        state.env_steps += int(decisions) * (agent.executed.stop - agent.executed.start)
+        state.env_steps += int(decisions) * chunk
         seconds = time.perf_counter() - started
         metrics |= {
             "env_steps": float(state.env_steps),
-            "steps_per_s": decisions * (agent.executed.stop - agent.executed.start) / seconds,
+            "steps_per_s": decisions * chunk / seconds,
+            "seconds": seconds,
             "rollout_s": collected - started,
-            "update_s": seconds - (collected - started),
         }
         after_iteration(state, metrics)

@@ -1,9 +1,19 @@
 """Evaluation with the deployment sampler, on seeds that training never uses."""
 
 import torch
+from torch import Tensor
 
-from lerobot_vtrefine.finetune.distributed import sum_over_ranks
-from lerobot_vtrefine.finetune.protocols import Agent, DecisionEnv, execute, latest, predictor, select
+from lerobot_vtrefine.finetune.distributed import mean_over_ranks, num_ranks, rank_index
+from lerobot_vtrefine.finetune.protocols import (
+    Agent,
+    DecisionEnv,
+    Observation,
+    execute,
+    latest,
+    predictor,
+    select,
+    start,
+)
 from lerobot_vtrefine.policies.vt_dp3.diffusion import deploy
 
 EVALUATION_SEEDS = 500_000
@@ -14,39 +24,41 @@ EVALUATION_SEEDS = 500_000
 def evaluate(
     env: DecisionEnv, agent: Agent, num_episodes: int, first_seed: int = EVALUATION_SEEDS
 ) -> dict[str, float]:
-    """Success and return of the deployment sampler over at least ``num_episodes`` held-out seeds per rank."""
-    sums: dict[str, float] = {}
-    episodes = 0
-    while episodes < num_episodes:
-        seeds = range(first_seed + episodes, first_seed + episodes + env.num_envs)
-        obs, privileged = env.reset(list(seeds))
-        generator = torch.Generator(privileged.device).manual_seed(seeds.start)
-        running = torch.ones(env.num_envs, dtype=torch.bool, device=privileged.device)
-        total, info = torch.zeros(env.num_envs, device=privileged.device), {}
+    """Mean success, return and episode metrics of the deployment sampler, as ``eval_<name>``.
+
+    At least ``num_episodes`` held-out seeds over all ranks; each rank has its own.
+    """
+    device, batches = agent.device, -(-num_episodes // (env.num_envs * num_ranks()))
+    columns: dict[str, list[Tensor]] = {}
+    for batch in range(batches):
+        first = first_seed + (batch * num_ranks() + rank_index()) * env.num_envs
+        obs, _ = start(env, range(first, first + env.num_envs), device)
+        generator = torch.Generator(device).manual_seed(first)
+        running = torch.ones(env.num_envs, dtype=torch.bool, device=device)
+        total, info = torch.zeros(env.num_envs, device=device), {}
         for _ in range(env.max_decisions):
             ids = running.nonzero().squeeze(1)
-            cond, cond_base = agent.conditions(select(obs, ids))
-            noise = torch.randn(
-                (len(ids), *agent.action_shape), generator=generator, device=privileged.device
-            )
-            actions = deploy(
-                agent.process,
-                predictor(agent.actor, cond),
-                noise,
-                num_tuned=agent.num_tuned,
-                predict_noise_base=predictor(agent.base, cond_base),
-            )
-            obs, _, reward, terminated, truncated, news = execute(env, actions[:, agent.executed], ids)
+            chunks = _deployed_chunks(agent, select(obs, ids), generator)
+            obs, _, reward, terminated, truncated, news = execute(env, chunks, ids)
             total += reward * running
             info = latest(info, news, running)
             running = running & ~terminated & ~truncated
             if not running.any():
                 break
-        for key, value in {"return": total, **info}.items():
-            sums[key] = sums.get(key, 0.0) + float(value.sum())
-        episodes += env.num_envs
-    totals = torch.tensor([*sums.values(), float(episodes)], dtype=torch.float64, device=total.device)
-    *values, count = sum_over_ranks(totals).tolist()
-    return {f"eval_{key}": value / count for key, value in zip(sums, values, strict=True)} | {
-        "eval_episodes": count
-    }
+        for key, values in {"return": total, **info}.items():
+            columns.setdefault(f"eval_{key}", []).append(values)
+    return mean_over_ranks({key: torch.cat(parts) for key, parts in columns.items()})
+
+
+def _deployed_chunks(agent: Agent, obs: Observation, generator: torch.Generator) -> Tensor:
+    """Executed actions (B, Ta, D) of the deployment sampler."""
+    cond, cond_base = agent.conditions(obs)
+    noise = torch.randn((len(cond), *agent.action_shape), generator=generator, device=cond.device)
+    chunks = deploy(
+        agent.process,
+        predictor(agent.actor, cond),
+        noise,
+        num_tuned=agent.num_tuned,
+        predict_noise_base=predictor(agent.base, cond_base),
+    )
+    return chunks[:, agent.executed]

@@ -45,6 +45,11 @@ class Agent:
     executed: slice
     frozen_encoder: bool
 
+    @property
+    def device(self) -> torch.device:
+        """Where the networks are."""
+        return next(self.actor.parameters()).device
+
     def trained_parameters(self) -> list[nn.Parameter]:
         """What the actor's optimiser owns."""
         module = self.actor.denoiser if self.frozen_encoder else self.actor
@@ -82,6 +87,8 @@ class DecisionEnv(Protocol):
     num_envs: int
     max_decisions: int
     """Decisions in the longest possible episode."""
+    privileged_dim: int
+    """P."""
 
     def reset(self, seeds: Sequence[int]) -> tuple[Observation, Tensor]:
         """Start all environments, each from its own seed. Returns observation and privileged state (n, P)."""
@@ -108,15 +115,29 @@ def concatenate(parts: list[Observation]) -> Observation:
     return {key: torch.cat([part[key] for part in parts]) for key in parts[0]}
 
 
+def start(env: DecisionEnv, seeds: Sequence[int], device: torch.device) -> tuple[Observation, Tensor]:
+    """Reset all environments; everything on the policy's device."""
+    obs, privileged = env.reset(seeds)
+    return {key: value.to(device) for key, value in obs.items()}, privileged.to(device)
+
+
 def execute(env: DecisionEnv, chunks: Tensor, ids: Tensor) -> Transition:
-    """Step the running environments; the others receive zeros, which they ignore."""
+    """Step environments ``ids`` with chunks (len(ids), Ta, D); the others receive ignored zeros."""
     actions = chunks.new_zeros((env.num_envs, *chunks.shape[1:]))
     actions[ids] = chunks
-    return env.step_chunk(actions)
+    obs, privileged, reward, terminated, truncated, info = env.step_chunk(actions)
+    device = chunks.device
+    return Transition(
+        {key: value.to(device) for key, value in obs.items()},
+        privileged.to(device),
+        reward.to(device, torch.float32),
+        terminated.to(device),
+        truncated.to(device),
+        {key: value.to(device) for key, value in info.items()},
+    )
 
 
 def latest(info: dict[str, Tensor], news: dict[str, Tensor], running: Tensor) -> dict[str, Tensor]:
-    """Episode metrics, frozen where an environment has already finished."""
-    return {
-        key: torch.where(running, value.float(), info.get(key, value.float())) for key, value in news.items()
-    }
+    """Episode metrics (n,), kept as they were where an environment had already finished."""
+    values = {key: value.to(torch.float32) for key, value in news.items()}
+    return {key: torch.where(running, value, info.get(key, value)) for key, value in values.items()}

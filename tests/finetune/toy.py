@@ -80,6 +80,7 @@ class BlindPeg:
     """
 
     HALF_SLOT, ESTIMATE_STD, DEPTH = 0.03, 0.06, 0.1
+    privileged_dim = 4
     CHUNK, ACTION_DIM, STEP_X, STEP_Z = 4, 2, 0.012, 0.05
 
     def __init__(self, num_envs: int, *, feel: bool, max_decisions: int = 12) -> None:

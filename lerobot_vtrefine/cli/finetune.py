@@ -1,0 +1,22 @@
+"""``vtrefine-finetune``: DPPO fine-tuning of a ``vt_dp3`` checkpoint in simulation."""
+
+from lerobot.configs import parser
+from lerobot.utils.import_utils import register_third_party_plugins
+from lerobot.utils.utils import init_logging
+
+from lerobot_vtrefine.cli.errors import run_cli
+from lerobot_vtrefine.finetune.pipeline import FinetunePipelineConfig, run
+
+
+@parser.wrap()
+def finetune(cfg: FinetunePipelineConfig) -> None:
+    """Parse the command line as LeRobot's commands do, and run."""
+    run(cfg)
+
+
+@run_cli
+def main() -> None:
+    """Console entry point."""
+    init_logging()
+    register_third_party_plugins()
+    finetune()

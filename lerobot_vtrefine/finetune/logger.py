@@ -1,0 +1,80 @@
+"""Training records: ``progress.csv`` and ``curves.png`` in the output folder, optionally Weights & Biases."""
+
+import csv
+import logging
+from pathlib import Path
+from typing import Any
+
+from lerobot.configs.default import WandBConfig
+
+from lerobot_vtrefine.finetune.plots import draw_curves
+
+CSV_NAME = "progress.csv"
+CURVES_NAME = "curves.png"
+
+
+def read_progress(output_dir: Path) -> list[dict[str, float]]:
+    """Rows of a run's ``progress.csv``; empty cells are left out."""
+    path = output_dir / CSV_NAME
+    if not path.is_file():
+        return []
+    with path.open(newline="") as file:
+        return [{key: float(value) for key, value in row.items() if value} for row in csv.DictReader(file)]
+
+
+class ProgressLog:
+    """One row of metrics per iteration.
+
+    Resuming at an iteration drops the rows of later ones, which will be run again.
+    """
+
+    def __init__(self, output_dir: Path, iteration: int, wandb_run: Any | None) -> None:
+        self.output_dir = output_dir
+        self.rows = [row for row in read_progress(output_dir) if row["iteration"] <= iteration]
+        self._wandb_run = wandb_run
+
+    def add(self, iteration: int, metrics: dict[str, float]) -> None:
+        """Append a row and rewrite the files."""
+        self.rows.append({"iteration": iteration, **metrics})
+        columns = list(dict.fromkeys(key for row in self.rows for key in row))
+        partial = self.output_dir / f"{CSV_NAME}.partial"
+        with partial.open("w", newline="") as file:
+            writer = csv.DictWriter(file, columns)
+            writer.writeheader()
+            writer.writerows(self.rows)
+        partial.replace(self.output_dir / CSV_NAME)
+        if self._wandb_run is not None:
+            self._wandb_run.log(metrics, step=iteration)
+
+    def draw(self) -> None:
+        """Draw the learning curves so far."""
+        draw_curves(self.rows, self.output_dir / CURVES_NAME)
+
+
+def start_wandb(
+    cfg: WandBConfig, output_dir: Path, job_name: str, settings: dict[str, Any], resume: bool
+) -> Any:
+    """A Weights & Biases run, or None if it is not enabled.
+
+    The run's id is kept beside the checkpoints, so that a resumed run continues its curves.
+    """
+    if not cfg.enable:
+        return None
+    import wandb
+
+    id_file = output_dir / "wandb_run_id"
+    known = id_file.read_text().strip() if resume and id_file.is_file() else None
+    run = wandb.init(
+        id=cfg.run_id or known,
+        project=cfg.project,
+        entity=cfg.entity,
+        name=job_name,
+        notes=cfg.notes,
+        dir=output_dir,
+        config=settings,
+        resume="allow",
+        mode=cfg.mode,
+    )
+    id_file.write_text(run.id)
+    logging.info("logging to Weights & Biases as %s", run.id)
+    return run

@@ -1,0 +1,196 @@
+"""``vtrefine-finetune``: connects DPPO to a ``vt_dp3`` checkpoint, an environment and an output folder."""
+
+import logging
+from dataclasses import asdict, dataclass, field
+from pathlib import Path
+from typing import Any
+
+import torch
+from lerobot.configs import PreTrainedConfig, parser
+from lerobot.configs.default import EvalConfig, WandBConfig
+from lerobot.envs import EnvConfig
+from lerobot.policies import make_pre_post_processors
+from lerobot.utils.constants import ACTION, PRETRAINED_MODEL_DIR
+from lerobot.utils.random_utils import set_seed
+from tqdm import tqdm
+from tqdm.contrib.logging import logging_redirect_tqdm
+
+from lerobot_vtrefine.envs.config import VtRefineEnvConfig
+from lerobot_vtrefine.envs.decisions import make_decision_env
+from lerobot_vtrefine.finetune.checkpoint import (
+    Saveable,
+    last_checkpoint,
+    load_training_state,
+    save_checkpoint,
+)
+from lerobot_vtrefine.finetune.config import DppoConfig, PaperDppo
+from lerobot_vtrefine.finetune.distributed import join_ranks, leave_ranks, rank_index
+from lerobot_vtrefine.finetune.dppo import Metrics, TrainState, train
+from lerobot_vtrefine.finetune.evaluation import evaluate
+from lerobot_vtrefine.finetune.logger import ProgressLog, start_wandb
+from lerobot_vtrefine.finetune.protocols import Agent, DecisionEnv
+from lerobot_vtrefine.policies.vt_dp3.configuration_vt_dp3 import VtDp3Config
+from lerobot_vtrefine.policies.vt_dp3.modeling_vt_dp3 import VtDp3Policy
+
+SHOWN = (
+    "success",
+    "eval_success",
+    "return",
+    "approx_kl",
+    "clip_fraction",
+    "explained_variance",
+    "steps_per_s",
+)
+
+
+@dataclass
+class FinetunePipelineConfig:
+    """Settings of ``vtrefine-finetune``; ``--policy.path`` names the checkpoint to start from."""
+
+    env: EnvConfig
+    policy: PreTrainedConfig | None = None
+    dppo: DppoConfig = field(default_factory=PaperDppo)
+    output_dir: Path = Path("outputs/finetune")
+    job_name: str = "dppo"
+    seed: int = 0
+    # Continue from the last checkpoint in output_dir; start if there is none.
+    resume: bool = False
+    # Evaluate the deployed sampler on eval.n_episodes held-out seeds every so many iterations; 0: never.
+    eval_freq: int = 10
+    # Write a checkpoint every so many iterations, and after the last.
+    save_freq: int = 10
+    eval: EvalConfig = field(default_factory=EvalConfig)
+    wandb: WandBConfig = field(default_factory=WandBConfig)
+
+    @classmethod
+    def __get_path_fields__(cls) -> list[str]:
+        """Lets LeRobot's parser take ``--policy.path``."""
+        return ["policy"]
+
+
+def start_path(cfg: FinetunePipelineConfig) -> tuple[Path, Path | None]:
+    """The policy to load and, when resuming, the checkpoint it belongs to.
+
+    Raises:
+        ValueError: no policy was named. FileExistsError: output_dir holds a run that was not asked to resume.
+    """
+    checkpoint = last_checkpoint(cfg.output_dir)
+    if checkpoint is not None:
+        if not cfg.resume:
+            raise FileExistsError(f"{cfg.output_dir} holds a run: add --resume=true or change --output_dir")
+        return checkpoint / PRETRAINED_MODEL_DIR, checkpoint
+    path = parser.get_path_arg("policy")
+    if path is None:
+        raise ValueError("name the checkpoint to fine-tune with --policy.path=.../pretrained_model")
+    return Path(path), None
+
+
+def load_policy(path: Path) -> VtDp3Policy:
+    """Load a ``vt_dp3`` checkpoint, with ``--policy.*`` overrides from the command line.
+
+    Raises: ValueError for a checkpoint of another policy type.
+    """
+    overrides = parser.get_yaml_overrides("policy") + (parser.get_cli_overrides("policy") or [])
+    config = PreTrainedConfig.from_pretrained(path, cli_overrides=overrides)
+    if not isinstance(config, VtDp3Config):
+        raise ValueError(f"{path} is a {config.type} policy; vtrefine-finetune needs vt_dp3")
+    return VtDp3Policy.from_pretrained(path, config=config)
+
+
+def make_agent(policy: VtDp3Policy, dppo: DppoConfig) -> Agent:
+    """Make a policy ready for DPPO: the tuned and the frozen network, and the sampler of both stages."""
+    policy.prepare_finetuning(
+        sampler=dppo.sampler,
+        num_inference_steps=dppo.sampler_steps,
+        prefix_steps=dppo.prefix_steps,
+        ft_denoising_steps=dppo.ft_denoising_steps,
+        freeze_encoder=dppo.encoder == "frozen",
+    )
+    config = policy.config
+    return Agent(
+        actor=policy.model,
+        base=policy.base_model,
+        process=policy.process,
+        num_tuned=config.ft_denoising_steps,
+        action_shape=(config.horizon, config.output_features[ACTION].shape[0]),
+        executed=slice(0, config.n_action_steps),
+        frozen_encoder=config.ft_freeze_encoder,
+    )
+
+
+def make_env_for(
+    cfg: FinetunePipelineConfig, policy: VtDp3Policy, processors: tuple[Any, Any]
+) -> DecisionEnv:
+    """The environments of this rank. Raises: ValueError for another environment type."""
+    if not isinstance(cfg.env, VtRefineEnvConfig):
+        raise ValueError(f"vtrefine-finetune needs --env.type=vtrefine, got {cfg.env.type}")
+    config = policy.config
+    return make_decision_env(
+        cfg.env, cfg.dppo.num_envs, *processors, config.n_obs_steps, config.n_action_steps
+    )
+
+
+class Recorder:
+    """What happens after each iteration: evaluation, records, checkpoint, progress bar."""
+
+    def __init__(
+        self, cfg: FinetunePipelineConfig, env: DecisionEnv, agent: Agent, saveable: Saveable
+    ) -> None:
+        self.cfg, self.env, self.agent, self.saveable = cfg, env, agent, saveable
+        self.log: ProgressLog | None = None
+        self.bar: tqdm | None = None
+
+    def start(self, state: TrainState) -> None:
+        """Open the records (first rank), and evaluate the policy that training starts from."""
+        cfg = self.cfg
+        if rank_index() == 0:
+            settings = {"dppo": asdict(cfg.dppo), "env": asdict(cfg.env), "seed": cfg.seed}
+            run = start_wandb(cfg.wandb, cfg.output_dir, cfg.job_name, settings, cfg.resume)
+            self.log = ProgressLog(cfg.output_dir, state.iteration, run)
+            self.bar = tqdm(total=cfg.dppo.iterations, initial=state.iteration, desc="DPPO", unit="it")
+        if state.iteration == 0 and cfg.eval_freq:
+            self._record(0, evaluate(self.env, self.agent, cfg.eval.n_episodes))
+
+    def __call__(self, state: TrainState, metrics: Metrics) -> None:
+        """Callback of ``dppo.train``."""
+        cfg, iteration, last = self.cfg, state.iteration, self.cfg.dppo.iterations
+        if cfg.eval_freq and (iteration % cfg.eval_freq == 0 or iteration == last):
+            metrics |= evaluate(self.env, self.agent, cfg.eval.n_episodes)
+        self._record(iteration, metrics)
+        if iteration == last or (cfg.save_freq and iteration % cfg.save_freq == 0):
+            save_checkpoint(cfg.output_dir, self.saveable, state, last)
+            if self.log is not None:
+                self.log.draw()
+        if self.bar is not None:
+            self.bar.update()
+            if iteration == last:
+                self.bar.close()
+
+    def _record(self, iteration: int, metrics: Metrics) -> None:
+        if self.log is None:
+            return
+        self.log.add(iteration, metrics)
+        shown = ", ".join(f"{key} {metrics[key]:.3g}" for key in SHOWN if key in metrics)
+        logging.info("iteration %d: %s", iteration, shown)
+
+
+def run(cfg: FinetunePipelineConfig) -> None:
+    """Fine-tune; the result is ``output_dir/checkpoints/last/pretrained_model``."""
+    path, checkpoint = start_path(cfg)
+    policy = load_policy(path)
+    device = torch.device(policy.config.device)
+    join_ranks(device)
+    set_seed(cfg.seed + rank_index())
+    cfg.output_dir.mkdir(parents=True, exist_ok=True)
+    overrides = {"device_processor": {"device": str(device)}}
+    processors = make_pre_post_processors(policy.config, str(path), preprocessor_overrides=overrides)
+    agent = make_agent(policy, cfg.dppo)
+    env = make_env_for(cfg, policy, processors)
+    state = TrainState.create(agent, cfg.dppo, env.privileged_dim, cfg.seed)
+    recorder = Recorder(cfg, env, agent, Saveable(policy, *processors))
+    with logging_redirect_tqdm():
+        if checkpoint is not None:
+            load_training_state(checkpoint, state)
+        recorder.start(state)
+        train(env, agent, state, cfg.dppo, seed=cfg.seed, after_iteration=recorder)
+    leave_ranks()
