@@ -1,0 +1,249 @@
+"""Simulated pads of many environments: poses in, raw counts out, with each environment's state kept here."""
+
+import dataclasses
+from collections.abc import Sequence
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import torch
+
+from lerobot_vtrefine.tactile.geometry import BodyGeometry
+from lerobot_vtrefine.tactile.layout import PadLayout
+from lerobot_vtrefine.tactile.model import SensorModel
+from lerobot_vtrefine.tactile.stages.base import Frame, Stage, State
+from lerobot_vtrefine.tactile.stages.contact import ContactStage
+
+if TYPE_CHECKING:
+    from lerobot_vtrefine.tactile.contact_query import ContactQuery
+
+ArrayLike = np.ndarray | torch.Tensor
+
+
+class PadSensors:
+    """The pads of `num_envs` environments, all touching the same list of bodies.
+
+    Shape legend: m environments named by `ids`, P pads, B bodies, N = rows * cols taxels, row-major.
+
+    Args:
+        layout: taxels of every pad.
+        bodies: geometry of the B bodies, each in its own frame.
+        model: the sensor model.
+        device: torch device on which everything is computed.
+        seed: used for environments until `reset` gives them their own.
+    """
+
+    def __init__(
+        self,
+        layout: PadLayout,
+        bodies: Sequence[BodyGeometry],
+        num_envs: int,
+        num_pads: int = 4,
+        model: SensorModel | None = None,
+        device: str = "cpu",
+        seed: int = 0,
+    ) -> None:
+        if num_envs < 1 or num_pads < 1:
+            raise ValueError(f"need at least one environment and one pad, got {num_envs} and {num_pads}")
+        self.layout, self.bodies = layout, list(bodies)
+        self.num_envs, self.num_pads = num_envs, num_pads
+        self.model = model or SensorModel.default()
+        self.device = torch.device(device)
+        self._time_s = torch.zeros(num_envs, dtype=torch.float64, device=self.device)
+        self._stiffness_scale = torch.ones(num_envs, device=self.device)
+        self._gain_scale = torch.ones(num_envs, device=self.device)
+        self._parameters: dict[tuple[str, str], torch.Tensor] = {}
+        self._state: dict[str, State] = {}
+        self._query: ContactQuery | None = None
+        self.baseline = np.zeros((num_envs, num_pads, layout.num_taxels), dtype=np.uint8)
+        """Counts of the untouched taxels (num_envs, P, N)."""
+        self.reset(np.arange(num_envs), seed)
+
+    def reset(self, ids: np.ndarray, seed: int | np.ndarray | np.random.Generator = 0) -> None:
+        """Start new episodes: clear the stages' memory and draw each sensor's own traits.
+
+        Args:
+            ids: (m,) environments.
+            seed: one per environment (m,), a generator to draw them from, or one number, to which the ids are added.
+                An environment's readings depend only on its own seed and inputs.
+        """
+        ids = np.atleast_1d(np.asarray(ids, dtype=np.int64))
+        if isinstance(seed, np.random.Generator):
+            seeds = seed.integers(0, 2**31, len(ids))
+        else:
+            seeds = np.asarray(seed, dtype=np.int64)
+            seeds = seeds + ids if seeds.ndim == 0 else seeds
+        self._time_s[torch.from_numpy(ids)] = 0.0
+        for stage in self.model.stages:
+            initial = stage.initial(self.layout, self.num_pads)
+            for env, env_seed in zip(ids, seeds, strict=True):
+                rng = np.random.default_rng([int(env_seed), stage.rank])
+                self._assign(
+                    stage.name, int(env), {**initial, **stage.traits(self.layout, self.num_pads, rng)}
+                )
+        self._update_baseline(ids)
+
+    def _assign(self, name: str, env: int, values: dict[str, np.ndarray]) -> None:
+        state = self._state.setdefault(name, {})
+        for key, value in values.items():
+            tensor = torch.from_numpy(np.ascontiguousarray(value)).to(self.device)
+            if key not in state or state[key].shape[1:] != tensor.shape:
+                state[key] = torch.zeros(
+                    (self.num_envs, *tensor.shape), dtype=tensor.dtype, device=self.device
+                )
+            state[key][env] = tensor
+
+    def randomize(
+        self,
+        ids: np.ndarray,
+        stiffness_scale: ArrayLike | float | None = None,
+        gain_scale: ArrayLike | float | None = None,
+        parameters: dict[str, ArrayLike] | None = None,
+    ) -> None:
+        """Give environments their own parameters; what is None stays.
+
+        Args:
+            ids: (m,) environments.
+            stiffness_scale, gain_scale: factors on the contact's stiffness and on counts per newton, (m,) or one.
+            parameters: "stage.parameter" -> values (m,), as `SensorModel.ranges` names them.
+        """
+        index = torch.as_tensor(np.atleast_1d(ids), dtype=torch.long, device=self.device)
+        for own, values in ((self._stiffness_scale, stiffness_scale), (self._gain_scale, gain_scale)):
+            if values is not None:
+                values = torch.as_tensor(values, dtype=torch.float32, device=self.device)
+                if not bool((values > 0).all()):
+                    raise ValueError("stiffness_scale and gain_scale must be positive")
+                own[index] = values
+        for name, values in (parameters or {}).items():
+            self._own_parameter(name)[index] = torch.as_tensor(
+                values, dtype=torch.float32, device=self.device
+            )
+        self._update_baseline(np.atleast_1d(ids))
+
+    def _own_parameter(self, name: str) -> torch.Tensor:
+        valid = self.model.ranges()
+        if name not in valid:
+            raise ValueError(f"unknown parameter {name!r}; valid: {', '.join(sorted(valid))}")
+        stage_name, parameter = name.split(".")
+        key = (stage_name, parameter)
+        if key not in self._parameters:
+            default = getattr(self.model.find(stage_name), parameter)
+            if not isinstance(default, int | float):
+                raise ValueError(
+                    f"parameter {name!r} is not a number in this model, so it cannot be randomised"
+                )
+            self._parameters[key] = torch.full((self.num_envs,), float(default), device=self.device)
+        return self._parameters[key]
+
+    def _specialised(self, stage: Stage, index: torch.Tensor) -> Stage:
+        """The stage with each environment's own parameters, shaped (m, 1, 1, 1)."""
+        own: dict[str, Any] = {
+            parameter: values[index].view(-1, 1, 1, 1)
+            for (name, parameter), values in self._parameters.items()
+            if name == stage.name
+        }
+        return dataclasses.replace(stage, **own) if own else stage
+
+    def _contact_stage(self, index: torch.Tensor) -> ContactStage:
+        stage = self._specialised(self.model.contact, index)
+        return stage.scaled(self._stiffness_scale[index].view(-1, 1, 1, 1))
+
+    def _frame(self, index: torch.Tensor, dt_s: float) -> Frame:
+        contact = self.model.contact
+        return Frame(
+            layout=self.layout,
+            dt_s=dt_s,
+            time_s=self._time_s[index].float().view(-1, 1, 1, 1),
+            stiffness_n_per_m=self._contact_stage(index).stiffness(self.layout),
+            load_conserving=contact.load_conserving,
+        )
+
+    def _run(
+        self, stages: Sequence[Stage], x: torch.Tensor, index: torch.Tensor, frame: Frame
+    ) -> torch.Tensor:
+        everyone = len(index) == self.num_envs and bool(
+            (index == torch.arange(self.num_envs, device=self.device)).all()
+        )
+        for stage in stages:
+            state = self._state.get(stage.name, {})
+            mine = state if everyone else {key: value[index] for key, value in state.items()}
+            x, new = self._specialised(stage, index).step(x, mine, frame)
+            if everyone:
+                self._state[stage.name] = new
+                continue
+            for key, value in new.items():
+                if value is not mine[key]:
+                    state[key][index] = value
+        return x
+
+    def _update_baseline(self, ids: np.ndarray) -> None:
+        index = torch.as_tensor(ids, dtype=torch.long, device=self.device)
+        x = torch.zeros((len(ids), self.num_pads, self.layout.rows, self.layout.cols), device=self.device)
+        frame = self._frame(index, 0.0)
+        for stage in self.model.force_stages:
+            if not (stage.has_state or stage.stochastic):
+                state = {key: value[index] for key, value in self._state.get(stage.name, {}).items()}
+                x, _ = self._specialised(stage, index).step(x, state, frame)
+        self.baseline[ids] = x.flatten(2).clamp(0, 255).round().to(torch.uint8).cpu().numpy()
+
+    def _tensor(self, array: ArrayLike) -> torch.Tensor:
+        return torch.as_tensor(array, device=self.device).to(torch.float32)
+
+    def _contact_forces(self, index: torch.Tensor, poses: Sequence[ArrayLike], frame: Frame) -> torch.Tensor:
+        contact = self._contact_stage(index)
+        if self._query is None:
+            from lerobot_vtrefine.tactile.contact_query import ContactQuery  # warp is slow to import
+
+            self._query = ContactQuery(self.layout, self.bodies, str(self.device))
+        depth, rate = self._query(contact.query, *(self._tensor(pose) for pose in poses))
+        depth = self._run(self.model.depth_stages, depth, index, frame)
+        return contact.force(depth, rate, self.layout)
+
+    def forces(
+        self,
+        ids: np.ndarray,
+        pad_pos: ArrayLike,
+        pad_rot: ArrayLike,
+        pad_vel: ArrayLike,
+        body_pos: ArrayLike,
+        body_rot: ArrayLike,
+        body_vel: ArrayLike,
+        dt_s: float,
+        load: ArrayLike | None = None,
+    ) -> ArrayLike:
+        """Contact force per taxel before mechanics and readout: (m, P, N) float32 [N]; arguments as in `counts`."""
+        index = torch.as_tensor(np.atleast_1d(ids), dtype=torch.long, device=self.device)
+        poses = (pad_pos, pad_rot, pad_vel, body_pos, body_rot, body_vel)
+        force = self._contact_forces(index, poses, self._frame(index, dt_s)).flatten(2)
+        return force if isinstance(pad_pos, torch.Tensor) else force.cpu().numpy()
+
+    def counts(
+        self,
+        ids: np.ndarray,
+        pad_pos: ArrayLike,
+        pad_rot: ArrayLike,
+        pad_vel: ArrayLike,
+        body_pos: ArrayLike,
+        body_rot: ArrayLike,
+        body_vel: ArrayLike,
+        dt_s: float,
+        load: ArrayLike | None = None,
+    ) -> ArrayLike:
+        """Raw counts (m, P, N) uint8 of the named environments; advances their state by one frame of `dt_s`.
+
+        Args:
+            ids: (m,) environments, without repetition.
+            pad_pos, pad_rot: pad frames in the world, (m, P, 3) [m] and (m, P, 3, 3).
+            pad_vel: (m, P, 6) velocity of the pad's origin [m/s], then angular velocity [rad/s], in the world.
+            body_pos, body_rot, body_vel: the same for the bodies' frames, (m, B, ...).
+            dt_s: time since the previous frame [s].
+            load: (m, P, 3) the solver's normal force on each pad [N] and its centre x, y in the pad frame [m].
+
+        Returns numpy for numpy poses, a tensor on `device` for tensors.
+        """
+        index = torch.as_tensor(np.atleast_1d(ids), dtype=torch.long, device=self.device)
+        frame = self._frame(index, dt_s)
+        force = self._contact_forces(index, (pad_pos, pad_rot, pad_vel, body_pos, body_rot, body_vel), frame)
+        counts = self._run(self.model.force_stages, force, index, frame)
+        self._time_s[index] += dt_s
+        counts = counts.flatten(2).clamp(0.0, 255.0).to(torch.uint8)
+        return counts if isinstance(pad_pos, torch.Tensor) else counts.cpu().numpy()

@@ -1,0 +1,6 @@
+"""Stages of the sensor model, by domain; importing this package registers them all."""
+
+from lerobot_vtrefine.tactile.stages import contact, readout
+from lerobot_vtrefine.tactile.stages.base import STAGES, Frame, Stage, register, stage_class
+
+__all__ = ["STAGES", "Frame", "Stage", "contact", "readout", "register", "stage_class"]

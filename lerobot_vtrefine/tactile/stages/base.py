@@ -1,0 +1,120 @@
+"""What a stage of the sensor model is, and the registry of their names.
+
+A stage maps a batch of pad images (..., R, C) to another. It is a frozen dataclass of parameters in SI units with one
+pure function `step`; memory between frames is passed in and out explicitly. Parameters may be tensors that broadcast
+against (..., R, C), which is how each environment gets its own value.
+"""
+
+from collections.abc import Callable
+from dataclasses import dataclass, field, fields
+from typing import Any, ClassVar
+
+import numpy as np
+import torch
+
+from lerobot_vtrefine.tactile.layout import PadLayout
+
+State = dict[str, torch.Tensor]
+Traits = dict[str, np.ndarray]
+
+DOMAINS = ("depth", "contact", "force", "gain", "counts")
+"""What a stage reads and writes, in the order in which a model lists them: depth [m] to depth, depth to force [N],
+force to force, force to counts, counts to counts."""
+
+
+@dataclass(frozen=True)
+class Frame:
+    """What a stage may know about the frame that it processes."""
+
+    layout: PadLayout
+    dt_s: float = 0.0
+    """Time since the previous frame [s]."""
+    time_s: torch.Tensor | float = 0.0
+    """Session time, broadcastable to (..., R, C) [s]."""
+    stiffness_n_per_m: torch.Tensor | float = 0.0
+    """One taxel's stiffness in the contact stage [N/m]."""
+    load_conserving: bool = False
+    """Whether the taxels' sum is a measured or solved load, which mechanics must not change."""
+
+
+def parameter(default: float, unit: str, low: float, high: float, minimum: float | None = 0.0) -> Any:
+    """Dataclass field of a stage's parameter.
+
+    Args:
+        unit: SI unit, "1" for none.
+        low, high: range for randomisation.
+        minimum: smallest valid value; None if any finite number is valid.
+    """
+    return field(default=default, metadata={"unit": unit, "range": (low, high), "minimum": minimum})
+
+
+@dataclass(frozen=True)
+class Stage:
+    """Base of all stages; subclasses set the class variables and override `step`."""
+
+    name: ClassVar[str] = ""
+    domain: ClassVar[str] = ""
+    rank: ClassVar[int] = 0
+    """Canonical place among the stages; decides where `SensorModel.with_stage` puts a stage."""
+    has_state: ClassVar[bool] = False
+    """Whether `step` needs its own previous state, so that frames must be processed in order."""
+    stochastic: ClassVar[bool] = False
+
+    def __post_init__(self) -> None:
+        for item in fields(self):
+            value, minimum = getattr(self, item.name), item.metadata.get("minimum")
+            if "unit" not in item.metadata or isinstance(value, torch.Tensor):
+                continue
+            for number in value if isinstance(value, tuple) else (value,):
+                if not isinstance(number, int | float) or not np.isfinite(number):
+                    raise ValueError(f"{self.name}.{item.name} must be a finite number, got {number!r}")
+                if minimum is not None and number < minimum:
+                    raise ValueError(f"{self.name}.{item.name} must be at least {minimum:g}, got {number:g}")
+
+    def traits(self, layout: PadLayout, pads: int, rng: np.random.Generator) -> Traits:
+        """What differs between specimens of the sensor, drawn once per episode of one environment: name -> (P, ...)."""
+        return {}
+
+    def initial(self, layout: PadLayout, pads: int) -> Traits:
+        """State of one untouched environment: name -> (P, ...)."""
+        return {}
+
+    def step(self, x: torch.Tensor, state: State, frame: Frame) -> tuple[torch.Tensor, State]:
+        """Process one frame of a batch: x (..., R, C), state tensors with the same leading dimensions.
+
+        Returns the result (..., R, C) and the new state (traits are returned unchanged). Neither input is modified.
+        """
+        raise NotImplementedError
+
+
+STAGES: dict[str, type[Stage]] = {}
+
+
+def register(cls: type[Stage]) -> type[Stage]:
+    """Class decorator: make a stage known by its name."""
+    if cls.domain not in DOMAINS:
+        raise ValueError(f"stage {cls.__name__}: domain must be one of {', '.join(DOMAINS)}")
+    STAGES[cls.name] = cls
+    return cls
+
+
+def stage_class(name: str) -> type[Stage]:
+    """Look a stage up by name; ValueError lists the valid names."""
+    if name not in STAGES:
+        raise ValueError(f"unknown stage {name!r}; valid names: {', '.join(sorted(STAGES))}")
+    return STAGES[name]
+
+
+def as_tuple(value: Any) -> Any:
+    """Nested lists as nested tuples, so that stages stay hashable and comparable."""
+    return tuple(as_tuple(item) for item in value) if isinstance(value, list | tuple | np.ndarray) else value
+
+
+def taxel_map(values: Any, like: torch.Tensor) -> torch.Tensor:
+    """A number or nested (R, C) sequence as a tensor that broadcasts against `like` (..., R, C)."""
+    if isinstance(values, torch.Tensor):
+        return values
+    return torch.as_tensor(np.asarray(values, dtype=np.float32), device=like.device).to(like.dtype)
+
+
+StageFactory = Callable[..., Stage]

@@ -1,0 +1,100 @@
+"""Contact laws: from the depth of every taxel, and the solver's load, to force per taxel."""
+
+from dataclasses import dataclass, fields, replace
+from typing import ClassVar
+
+import torch
+
+from lerobot_vtrefine.tactile.layout import PadLayout
+from lerobot_vtrefine.tactile.stages.base import Stage, parameter, register
+
+
+@dataclass(frozen=True)
+class ContactStage(Stage):
+    """Base of the contact laws: pure functions of depth [m] and rate [m/s], (..., R, C) both."""
+
+    domain: ClassVar[str] = "contact"
+    rank: ClassVar[int] = 20
+    query: ClassVar[str] = "closest"
+    """What depth means: "closest" (penetration into the nearest surface) or "column" (height along the normal)."""
+    load_conserving: ClassVar[bool] = False
+    """Whether the forces are solved to add up to the load."""
+    scalable: ClassVar[tuple[str, ...]] = ("k_n", "k_d")
+    """Parameters that a scale of the stiffness multiplies."""
+
+    def stiffness(self, layout: PadLayout) -> torch.Tensor | float:
+        """One taxel's stiffness [N/m]."""
+        raise NotImplementedError
+
+    def scaled(self, factor: torch.Tensor) -> "ContactStage":
+        """With its stiffness and damping multiplied by a factor that broadcasts against (..., R, C)."""
+        own = {item.name: getattr(self, item.name) for item in fields(self) if item.name in self.scalable}
+        return replace(self, **{name: value * factor for name, value in own.items()})
+
+    def force(self, depth: torch.Tensor, rate: torch.Tensor, layout: PadLayout) -> torch.Tensor:
+        """Normal force per taxel for a prescribed depth: (..., R, C) [N]."""
+        raise NotImplementedError
+
+
+@register
+@dataclass(frozen=True)
+class KelvinVoigt(ContactStage):
+    """The paper's model (eq. of "Penalty contact model"): f = max(0, k_n d + k_d d') where d > 0.
+
+    k_n [N/m] and k_d [N s/m] per taxel.
+    """
+
+    name: ClassVar[str] = "kelvin_voigt"
+    k_n: float = parameter(800.0, "N/m", 200.0, 3200.0)
+    k_d: float = parameter(2.4, "N*s/m", 0.0, 10.0)
+
+    def stiffness(self, layout: PadLayout) -> torch.Tensor | float:
+        return self.k_n
+
+    def force(self, depth: torch.Tensor, rate: torch.Tensor, layout: PadLayout) -> torch.Tensor:
+        return (self.k_n * depth + self.k_d * rate).clamp(min=0.0) * (depth > 0)
+
+
+@register
+@dataclass(frozen=True)
+class TacSL(ContactStage):
+    """TacSL's released penalty model: f = k_n d without damping; k_n [N/m] per taxel."""
+
+    name: ClassVar[str] = "tacsl"
+    k_n: float = parameter(800.0, "N/m", 200.0, 3200.0)
+
+    def stiffness(self, layout: PadLayout) -> torch.Tensor | float:
+        return self.k_n
+
+    def force(self, depth: torch.Tensor, rate: torch.Tensor, layout: PadLayout) -> torch.Tensor:
+        return self.k_n * depth.clamp(min=0.0)
+
+
+@register
+@dataclass(frozen=True)
+class Depth(ContactStage):
+    """Penetration itself, as MuJoCo's tactile sensor reports it: the "force" is the depth in metres."""
+
+    name: ClassVar[str] = "depth"
+
+    def stiffness(self, layout: PadLayout) -> torch.Tensor | float:
+        return 1.0
+
+    def force(self, depth: torch.Tensor, rate: torch.Tensor, layout: PadLayout) -> torch.Tensor:
+        return depth.clamp(min=0.0)
+
+
+@register
+@dataclass(frozen=True)
+class FlexitacIsaacSim(ContactStage):
+    """The released FlexiTac simulator's law, clamp(5000 d, 0, 10) / 10: a dimensionless reading in [0, 1]."""
+
+    name: ClassVar[str] = "flexitac_isaacsim"
+    k_n: float = parameter(5000.0, "N/m", 1000.0, 10000.0)
+    limit_n: float = parameter(10.0, "N", 5.0, 20.0, minimum=1e-9)
+
+    def stiffness(self, layout: PadLayout) -> torch.Tensor | float:
+        return self.k_n / self.limit_n
+
+    def force(self, depth: torch.Tensor, rate: torch.Tensor, layout: PadLayout) -> torch.Tensor:
+        return torch.minimum(self.k_n * depth.clamp(min=0.0), torch.as_tensor(self.limit_n)) / self.limit_n

@@ -1,0 +1,227 @@
+"""Readout stages: force to conductance, the row's shared divider, and 8-bit counts on an idle level."""
+
+from dataclasses import dataclass, field
+from typing import Any, ClassVar
+
+import numpy as np
+import torch
+
+from lerobot_vtrefine.tactile.layout import PadLayout
+from lerobot_vtrefine.tactile.noise import noise_frames
+from lerobot_vtrefine.tactile.stages.base import (
+    Frame,
+    Stage,
+    State,
+    Traits,
+    as_tuple,
+    parameter,
+    register,
+    taxel_map,
+)
+
+
+@register
+@dataclass(frozen=True)
+class Gain(Stage):
+    """Reading of a lone taxel before any sharing: counts = counts_per_n * f (conductance is proportional to force)."""
+
+    name: ClassVar[str] = "gain"
+    domain: ClassVar[str] = "gain"
+    rank: ClassVar[int] = 40
+    counts_per_n: float = parameter(600.0, "counts/N", 300.0, 1000.0)
+
+    def step(self, x: torch.Tensor, state: State, frame: Frame) -> tuple[torch.Tensor, State]:
+        return x * self.counts_per_n, state
+
+
+@register
+@dataclass(frozen=True)
+class TaxelGainSpread(Stage):
+    """Each taxel has its own gain: `map` (R, C) factors, or log-normal with deviation `sigma`, drawn per episode."""
+
+    name: ClassVar[str] = "taxel_gain_spread"
+    domain: ClassVar[str] = "counts"
+    rank: ClassVar[int] = 50
+    sigma: float = parameter(0.1, "1", 0.0, 0.3)
+    map: tuple[tuple[float, ...], ...] | None = None
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        object.__setattr__(self, "map", as_tuple(self.map))
+
+    def traits(self, layout: PadLayout, pads: int, rng: np.random.Generator) -> Traits:
+        if self.map is not None:
+            return {}
+        return {"deviate": rng.standard_normal((pads, layout.rows, layout.cols)).astype(np.float32)}
+
+    def step(self, x: torch.Tensor, state: State, frame: Frame) -> tuple[torch.Tensor, State]:
+        if self.map is not None:
+            return x * taxel_map(self.map, x), state
+        if "deviate" not in state:
+            return x, state
+        return x * torch.exp(self.sigma * state["deviate"]), state
+
+
+@register
+@dataclass(frozen=True)
+class DeadTaxels(Stage):
+    """Taxels that no longer answer: those in `taxels` ((r, c) pairs), whole `rows` and `cols`, and each further one
+    with `probability`, drawn per episode."""
+
+    name: ClassVar[str] = "dead_taxels"
+    domain: ClassVar[str] = "counts"
+    rank: ClassVar[int] = 52
+    taxels: tuple[tuple[int, int], ...] = ()
+    rows: tuple[int, ...] = ()
+    cols: tuple[int, ...] = ()
+    probability: float = parameter(0.0, "1", 0.0, 0.02)
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        for name in ("taxels", "rows", "cols"):
+            object.__setattr__(self, name, as_tuple(getattr(self, name)))
+
+    def alive(self, layout: PadLayout) -> np.ndarray:
+        """1 for every taxel that answers, (R, C); ValueError when a listed one is not on the pad."""
+        mask = np.ones((layout.rows, layout.cols), dtype=np.float32)
+        for row, col in [*self.taxels, *((r, 0) for r in self.rows), *((0, c) for c in self.cols)]:
+            if not (0 <= row < layout.rows and 0 <= col < layout.cols):
+                raise ValueError(f"dead_taxels: ({row}, {col}) is not on a {layout.rows} x {layout.cols} pad")
+        for row, col in self.taxels:
+            mask[row, col] = 0.0
+        mask[list(self.rows)] = 0.0
+        mask[:, list(self.cols)] = 0.0
+        return mask
+
+    def traits(self, layout: PadLayout, pads: int, rng: np.random.Generator) -> Traits:
+        return {"draw": rng.random((pads, layout.rows, layout.cols)).astype(np.float32)}
+
+    def step(self, x: torch.Tensor, state: State, frame: Frame) -> tuple[torch.Tensor, State]:
+        x = x * taxel_map(self.alive(frame.layout), x)
+        return (x * (state["draw"] >= self.probability) if "draw" in state else x), state
+
+
+@register
+@dataclass(frozen=True)
+class Saturation(Stage):
+    """The reading levels off at `knee_counts`: knee * tanh(s / knee), slope 1 at zero."""
+
+    name: ClassVar[str] = "saturation"
+    domain: ClassVar[str] = "counts"
+    rank: ClassVar[int] = 54
+    knee_counts: float = parameter(200.0, "counts", 120.0, 400.0, minimum=1e-6)
+
+    def step(self, x: torch.Tensor, state: State, frame: Frame) -> tuple[torch.Tensor, State]:
+        return self.knee_counts * torch.tanh(x / self.knee_counts), state
+
+
+@register
+@dataclass(frozen=True)
+class RowSharing(Stage):
+    """The row's voltage divider: s_rc / (1 + k * sum_j s_rj), the sum over the whole row with the taxel itself.
+
+    While one column is driven high the others are held low, so a row's taxels load each other. With a plain
+    resistor as pull-down and no amplifier k is 1/255 per count; boards with a stiffer front end have less.
+    """
+
+    name: ClassVar[str] = "row_sharing"
+    domain: ClassVar[str] = "counts"
+    rank: ClassVar[int] = 56
+    conductance_per_count: float = parameter(4e-4, "1/counts", 0.0, 2e-3)
+
+    def step(self, x: torch.Tensor, state: State, frame: Frame) -> tuple[torch.Tensor, State]:
+        return x / (1.0 + self.conductance_per_count * x.sum(dim=-1, keepdim=True)), state
+
+
+@register
+@dataclass(frozen=True)
+class Crosstalk(Stage):
+    """Additive leakage: every taxel gets the fraction `row` of each other reading in its row, `col` of its column."""
+
+    name: ClassVar[str] = "crosstalk"
+    domain: ClassVar[str] = "counts"
+    rank: ClassVar[int] = 58
+    row: float = parameter(0.005, "1", 0.0, 0.02)
+    col: float = parameter(0.005, "1", 0.0, 0.02)
+
+    def step(self, x: torch.Tensor, state: State, frame: Frame) -> tuple[torch.Tensor, State]:
+        along_row = x.sum(dim=-1, keepdim=True) - x
+        along_col = x.sum(dim=-2, keepdim=True) - x
+        return x + self.row * along_row + self.col * along_col, state
+
+
+@register
+@dataclass(frozen=True)
+class Idle(Stage):
+    """Reading of an untouched taxel, added: `level_counts` (a number or (R, C)), spread uniformly by +-`spread_counts`
+    between taxels, drawn per episode."""
+
+    name: ClassVar[str] = "idle"
+    domain: ClassVar[str] = "counts"
+    rank: ClassVar[int] = 60
+    level_counts: Any = field(default=25.0, metadata={"range": (15.0, 35.0)})
+    spread_counts: float = parameter(15.0, "counts", 0.0, 15.0)
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        object.__setattr__(self, "level_counts", as_tuple(self.level_counts))
+
+    def traits(self, layout: PadLayout, pads: int, rng: np.random.Generator) -> Traits:
+        return {"deviate": rng.uniform(-1.0, 1.0, (pads, layout.rows, layout.cols)).astype(np.float32)}
+
+    def step(self, x: torch.Tensor, state: State, frame: Frame) -> tuple[torch.Tensor, State]:
+        x = x + taxel_map(self.level_counts, x)
+        return (x + self.spread_counts * state["deviate"] if "deviate" in state else x), state
+
+
+@register
+@dataclass(frozen=True)
+class BaselineDrift(Stage):
+    """The idle level moves with session time: counts += rate_counts_per_s * t."""
+
+    name: ClassVar[str] = "baseline_drift"
+    domain: ClassVar[str] = "counts"
+    rank: ClassVar[int] = 62
+    rate_counts_per_s: float = parameter(0.0, "counts/s", -3e-3, 3e-3, minimum=None)
+
+    def step(self, x: torch.Tensor, state: State, frame: Frame) -> tuple[torch.Tensor, State]:
+        return x + self.rate_counts_per_s * frame.time_s, state
+
+
+@register
+@dataclass(frozen=True)
+class Noise(Stage):
+    """White Gaussian noise of `sigma_counts` per taxel and frame; a function of the episode's seed and the frame's number."""
+
+    name: ClassVar[str] = "noise"
+    domain: ClassVar[str] = "counts"
+    rank: ClassVar[int] = 80
+    stochastic: ClassVar[bool] = True
+    sigma_counts: float = parameter(1.0, "counts", 0.5, 2.0)
+
+    def traits(self, layout: PadLayout, pads: int, rng: np.random.Generator) -> Traits:
+        return {"seed": rng.integers(0, 2**62, pads, dtype=np.int64)}
+
+    def initial(self, layout: PadLayout, pads: int) -> Traits:
+        return {"frame": np.zeros(pads, dtype=np.int64)}
+
+    def step(self, x: torch.Tensor, state: State, frame: Frame) -> tuple[torch.Tensor, State]:
+        noise = noise_frames(state["seed"], state["frame"], x.shape[-2] * x.shape[-1]).view(x.shape)
+        return x + self.sigma_counts * noise, {**state, "frame": state["frame"] + 1}
+
+
+@register
+@dataclass(frozen=True)
+class Quantisation(Stage):
+    """The converter: rounded to `step_counts` and clipped to [0, full_scale_counts]."""
+
+    name: ClassVar[str] = "quantisation"
+    domain: ClassVar[str] = "counts"
+    rank: ClassVar[int] = 82
+    step_counts: float = parameter(1.0, "counts", 1.0, 4.0, minimum=1e-6)
+    full_scale_counts: float = parameter(255.0, "counts", 255.0, 255.0, minimum=1.0)
+
+    def step(self, x: torch.Tensor, state: State, frame: Frame) -> tuple[torch.Tensor, State]:
+        return (torch.round(x / self.step_counts) * self.step_counts).clamp(
+            0.0, self.full_scale_counts
+        ), state
