@@ -1,0 +1,320 @@
+"""One FlexiTac board: a reader thread that keeps the latest frame, every recent frame, and its own health."""
+
+import logging
+import threading
+import time
+from collections import deque
+from dataclasses import dataclass
+from enum import StrEnum
+
+import numpy as np
+import serial
+from numpy.typing import NDArray
+
+from lerobot_vtrefine.drivers.ascii import AsciiFramer
+from lerobot_vtrefine.drivers.config import PadConfig
+from lerobot_vtrefine.drivers.frames import PadFrame
+from lerobot_vtrefine.drivers.framing import BinaryFramer, Framed
+from lerobot_vtrefine.drivers.identify import SAMPLE_BYTES, StreamKind, explain_stream
+from lerobot_vtrefine.drivers.ports import PortError, latency_advice, open_port
+
+logger = logging.getLogger(__name__)
+
+HISTORY_FRAMES = 1000
+"""Frames kept for every-frame access: 10 s at 100 frames/s."""
+
+READ_TIMEOUT_S = 0.05
+"""How long the thread waits for bytes before it looks whether it should stop."""
+
+SILENCE_S = 0.0015
+"""A line on which nothing came for this long was silent (at 2 Mbaud: the time of 300 bytes)."""
+
+COALESCE_S = 0.001
+"""Pause after the first byte of a burst, so that a frame costs one or two wake-ups instead of one per USB
+packet."""
+
+RETRY_S = 0.25
+"""Pause between attempts to reopen a lost port."""
+
+RATE_WINDOW_S = 2.0
+"""Time over which the frame rate is measured."""
+
+
+class Status(StrEnum):
+    """What a board is doing."""
+
+    DISCONNECTED = "disconnected"
+    SILENT = "silent"
+    UNFRAMED = "unframed"
+    STALE = "stale"
+    STREAMING = "streaming"
+
+
+@dataclass(frozen=True)
+class PadHealth:
+    """State of one board at one moment.
+
+    Attributes:
+        status: See Status; only STREAMING means that the latest frame is fresh.
+        rate_hz: Frames handed out per second, over the last two seconds [Hz].
+        age_s: Age of the latest frame; infinite before the first [s].
+        frames: Frames handed out since the start.
+        discarded_bytes: Bytes received that belong to no frame handed out.
+        locks_lost: How often frame boundaries were lost.
+        reconnects: How often the port was reopened.
+        advice: What to do, empty when nothing is wrong; names the port.
+    """
+
+    status: Status
+    rate_hz: float
+    age_s: float
+    frames: int
+    discarded_bytes: int
+    locks_lost: int
+    reconnects: int
+    advice: str
+
+
+class PadReader:
+    """Reads one board in its own thread from `start` to `stop`; all methods are thread-safe."""
+
+    def __init__(self, config: PadConfig, name: str = "pad") -> None:
+        self.config = config
+        self.name = name
+        self._framer = (BinaryFramer if config.protocol == "binary" else AsciiFramer)(config.board_shape)
+        self._history: deque[PadFrame] = deque(maxlen=HISTORY_FRAMES)
+        self._marks: deque[tuple[int, float]] = deque()  # (stream position, time) after each read
+        self._sample: deque[bytes] = deque()
+        self._sampled = 0
+        self._seq = 0
+        self._reconnects = 0
+        self._last_bytes_s = -np.inf
+        self._port_error: str | None = "not started"
+        self._changed = threading.Condition()
+        self._stop = threading.Event()
+        self._thread: threading.Thread | None = None
+
+    # --- life cycle -------------------------------------------------------------------------------
+
+    def start(self) -> None:
+        """Opens the port and starts reading.
+
+        Raises:
+            PortError: the port cannot be opened.
+        """
+        if self._thread is not None:
+            return
+        device = open_port(self.config.port, self.config.baud, READ_TIMEOUT_S)
+        if advice := latency_advice(self.config.port):
+            logger.warning("%s: %s", self.name, advice)
+        self._port_error = None
+        self._stop.clear()
+        self._framer.reset()
+        self._thread = threading.Thread(
+            target=self._run, args=(device,), name=f"pad-{self.name}", daemon=True
+        )
+        self._thread.start()
+
+    def connect(self, timeout_s: float = 5.0) -> PadFrame:
+        """Starts, and waits for the first frame (a board restarts for about 2 s when its port is opened).
+
+        Raises:
+            PortError: no frame came; the message says why and names the fix.
+        """
+        self.start()
+        frame = self.wait_after(-1, timeout_s)
+        if frame is None:
+            advice = (
+                self.health().advice or f"{self.name}: {self.config.port}: no frame within {timeout_s:g} s"
+            )
+            self.stop()
+            raise PortError(advice)
+        return frame
+
+    def stop(self) -> None:
+        """Stops reading and closes the port; the frames read so far stay accessible."""
+        self._stop.set()
+        if self._thread is not None:
+            self._thread.join()
+            self._thread = None
+            self._port_error = "stopped"
+
+    def __enter__(self) -> "PadReader":
+        self.connect()
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.stop()
+
+    # --- frames -----------------------------------------------------------------------------------
+
+    def latest(self) -> PadFrame | None:
+        """The newest frame, however old (see `PadFrame.arrival_s` and `health`); None before the first."""
+        with self._changed:
+            return self._history[-1] if self._history else None
+
+    def frames_after(self, seq: int) -> list[PadFrame]:
+        """Every kept frame newer than sequence number `seq`, oldest first (the last 1000 are kept)."""
+        with self._changed:
+            newer: list[PadFrame] = []
+            for frame in reversed(self._history):
+                if frame.seq <= seq:
+                    break
+                newer.append(frame)
+        return newer[::-1]
+
+    def wait_after(self, seq: int, timeout_s: float) -> PadFrame | None:
+        """Waits for a frame newer than `seq`; returns the newest, or None after the timeout."""
+        with self._changed:
+            arrived = self._changed.wait_for(lambda: self._seq - 1 > seq and bool(self._history), timeout_s)
+            return self._history[-1] if arrived else None
+
+    def idle_counts(self, frames: int = 30, timeout_s: float = 5.0) -> NDArray[np.uint8]:
+        """Idle counts, uint8 (pad rows, cols): the median of new frames. The pad must not be touched.
+
+        Raises:
+            PortError: the frames did not come in time.
+        """
+        seen = self._seq - 1
+        deadline = time.monotonic() + timeout_s
+        while len(taken := self.frames_after(seen)) < frames:
+            if (
+                self.wait_after(taken[-1].seq if taken else seen, max(0.0, deadline - time.monotonic()))
+                is None
+            ):
+                raise PortError(
+                    self.health().advice or f"{self.name}: {self.config.port}: frames stopped coming"
+                )
+        return np.median(np.stack([f.counts for f in taken]), axis=0).astype(np.uint8)
+
+    # --- health -----------------------------------------------------------------------------------
+
+    def health(self) -> PadHealth:
+        """State right now."""
+        now = time.monotonic()
+        with self._changed:
+            newest = self._history[-1] if self._history else None
+            rate_hz = sum(now - f.arrival_s <= RATE_WINDOW_S for f in self._history) / RATE_WINDOW_S
+            stats = self._framer.stats
+            age_s = now - newest.arrival_s if newest else np.inf
+            status = self._status(now, age_s)
+            per_frame = self.config.board_shape.period if self.config.protocol == "binary" else 0
+            discarded = max(0, stats.bytes_in - stats.frames_out * per_frame - self._framer.buffered)
+            return PadHealth(
+                status=status,
+                rate_hz=rate_hz,
+                age_s=float(age_s),
+                frames=self._seq,
+                discarded_bytes=discarded if per_frame else 0,
+                locks_lost=stats.locks_lost,
+                reconnects=self._reconnects,
+                advice=self._advice(status),
+            )
+
+    def _status(self, now: float, age_s: float) -> Status:
+        if self._port_error is not None:
+            return Status.DISCONNECTED
+        if age_s <= self.config.stale_after_s:
+            return Status.STREAMING
+        if now - self._last_bytes_s > self.config.stale_after_s:
+            return Status.STALE if self._history else Status.SILENT
+        return Status.UNFRAMED
+
+    def _advice(self, status: Status) -> str:
+        where = f"{self.name} ({self.config.port})"
+        if status is Status.STREAMING:
+            return ""
+        if status is Status.DISCONNECTED:
+            return f"{where}: {self._port_error}"
+        if status is Status.STALE:
+            return f"{where}: the board stopped sending; unplug it and plug it in again"
+        wanted = StreamKind(self.config.protocol, self.config.board_shape)
+        return f"{where}: {explain_stream(b''.join(self._sample), wanted, self.config.baud)}"
+
+    # --- the thread -------------------------------------------------------------------------------
+
+    def _run(self, device: serial.Serial | None) -> None:
+        while not self._stop.is_set():
+            if device is None:
+                device = self._reopen()
+                continue
+            try:
+                self._pump(device)
+            except (
+                serial.SerialException,
+                OSError,
+                TypeError,
+            ) as error:  # TypeError: pyserial, device gone mid-read
+                logger.warning("%s (%s): lost the port: %s", self.name, self.config.port, error)
+                self._lose_port("unplugged? it is read again as soon as it is back")
+            device.close()
+            device = None
+
+    def _lose_port(self, why: str) -> None:
+        with self._changed:
+            self._port_error = why
+            self._framer.reset()
+            self._marks.clear()
+            self._sample.clear()
+            self._sampled = 0
+
+    def _reopen(self) -> serial.Serial | None:
+        if self._stop.wait(RETRY_S):
+            return None
+        try:
+            device = open_port(self.config.port, self.config.baud, READ_TIMEOUT_S)
+        except PortError as error:
+            self._port_error = str(error)
+            return None
+        with self._changed:
+            self._port_error = None
+            self._reconnects += 1
+        logger.info("%s (%s): connected again", self.name, self.config.port)
+        return device
+
+    def _pump(self, device: serial.Serial) -> None:
+        """Reads until told to stop; raises when the port goes away."""
+        silent_since: float | None = None
+        while not self._stop.is_set():
+            after_silence = False
+            if not (pending := device.in_waiting):
+                silent_since = silent_since if silent_since is not None else time.monotonic()
+                first = device.read(1)
+                if not first:
+                    continue
+                after_silence = time.monotonic() - silent_since >= SILENCE_S
+                time.sleep(COALESCE_S)
+                data = first + device.read(device.in_waiting)
+            else:
+                data = device.read(pending)
+            silent_since = None
+            self._take(data, after_silence, then_quiet=not device.in_waiting)
+
+    def _take(self, data: bytes, after_silence: bool, then_quiet: bool) -> None:
+        now = time.monotonic()
+        self._last_bytes_s = now
+        self._keep_sample(data)
+        framed = self._framer.feed(data, after_silence=after_silence, then_quiet=then_quiet)
+        self._marks.append((self._framer.stats.bytes_in, now))
+        if framed:
+            self._publish(framed)
+        while len(self._marks) > HISTORY_FRAMES:
+            self._marks.popleft()
+
+    def _keep_sample(self, data: bytes) -> None:
+        self._sample.append(data)
+        self._sampled += len(data)
+        while self._sampled - len(self._sample[0]) >= SAMPLE_BYTES:
+            self._sampled -= len(self._sample.popleft())
+
+    def _publish(self, framed: list[Framed]) -> None:
+        config = self.config
+        with self._changed:
+            for end, payload in framed:
+                while len(self._marks) > 1 and self._marks[0][0] < end:
+                    self._marks.popleft()
+                raw = np.frombuffer(payload, np.uint8).reshape(config.rows, config.cols)
+                frame = PadFrame(self._seq, self._marks[0][1], raw, config.orientation.apply(raw))
+                self._history.append(frame)
+                self._seq += 1
+            self._changed.notify_all()

@@ -1,0 +1,190 @@
+"""FlexiTac boards on real pseudo-terminals, with the faults that hardware has. Linux and macOS.
+
+Readers open the emulator's port through pyserial like any other. A board that is not read overruns its
+buffer and loses bytes, as a UART does.
+"""
+
+import contextlib
+import logging
+import os
+import threading
+import time
+import tty
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from lerobot_vtrefine.drivers.frames import MARKER, FrameShape
+from lerobot_vtrefine.drivers.sources import Source
+
+logger = logging.getLogger(__name__)
+
+
+@dataclass(frozen=True)
+class Faults:
+    """Faults of one emulated board.
+
+    Attributes:
+        loss: Probability that a byte is lost, each on its own, 0..1.
+        burst_loss: Probability per frame that 2..62 bytes in a row are lost (a USB packet), 0..1.
+        stall_every_s: Time between stalls; 0 for none [s].
+        stall_s: Length of a stall, in which nothing is sent [s].
+        unplug_at_s: Time after the start at which the port vanishes; 0 for never [s].
+        replug_after_s: Time after which it is back [s].
+    """
+
+    loss: float = 0.0
+    burst_loss: float = 0.0
+    stall_every_s: float = 0.0
+    stall_s: float = 1.0
+    unplug_at_s: float = 0.0
+    replug_after_s: float = 1.0
+
+    def __post_init__(self) -> None:
+        for name in ("loss", "burst_loss"):
+            if not 0.0 <= getattr(self, name) <= 1.0:
+                raise ValueError(f"{name}={getattr(self, name)} must lie within 0 .. 1")
+        for name in ("stall_every_s", "stall_s", "unplug_at_s", "replug_after_s"):
+            if getattr(self, name) < 0.0:
+                raise ValueError(f"{name}={getattr(self, name)} must not be negative")
+
+    def apply(self, data: bytes, rng: np.random.Generator) -> bytes:
+        """The bytes of one frame that survive."""
+        if self.burst_loss and rng.random() < self.burst_loss:
+            length, start = int(rng.integers(2, 63)), int(rng.integers(0, len(data)))
+            data = data[:start] + data[start + length :]
+        if not self.loss:
+            return data
+        octets = np.frombuffer(data, np.uint8)
+        return octets[rng.random(len(octets)) >= self.loss].tobytes()
+
+
+def encode_binary(counts: np.ndarray) -> bytes:
+    """One frame of the binary firmware."""
+    return MARKER + counts.astype(np.uint8).tobytes()
+
+
+def encode_ascii(counts: np.ndarray) -> bytes:
+    """One frame of the legacy ASCII firmware."""
+    rows = "".join("".join(f"{value} " for value in row) + "\r\n" for row in counts.tolist())
+    return (rows + "\r\n").encode()
+
+
+ENCODERS: dict[str, Callable[[np.ndarray], bytes]] = {"binary": encode_binary, "ascii": encode_ascii}
+
+
+class PadEmulator:
+    """One board: a thread that writes frames to a pseudo-terminal, which `link` names across replugging."""
+
+    def __init__(
+        self,
+        source: Source,
+        shape: FrameShape,
+        link: Path,
+        *,
+        rate_hz: float = 100.0,
+        protocol: str = "binary",
+        faults: Faults | None = None,
+        seed: int = 0,
+    ) -> None:
+        if rate_hz <= 0:
+            raise ValueError(f"rate_hz={rate_hz} must be positive")
+        if protocol not in ENCODERS:
+            raise ValueError(f"protocol {protocol!r} does not exist; choose from {', '.join(ENCODERS)}")
+        self.source = source
+        self.shape = shape
+        self.link = link
+        self.faults = faults or Faults()
+        self.sent = 0
+        self.overruns = 0
+        self._encode = ENCODERS[protocol]
+        self._period_s = 1.0 / rate_hz
+        self._rng = np.random.default_rng(seed)
+        self._fds: tuple[int, int] | None = None
+        self._guard = threading.Lock()
+        self._stalled_until = 0.0
+        self._stop = threading.Event()
+        self._thread: threading.Thread | None = None
+
+    @property
+    def port(self) -> str:
+        """What a reader opens; stays the same across replugging."""
+        return str(self.link)
+
+    def start(self) -> "PadEmulator":
+        """Plugs the board in and starts sending."""
+        self.plug()
+        self._stop.clear()
+        self._thread = threading.Thread(target=self._run, name=f"emulator-{self.link.name}", daemon=True)
+        self._thread.start()
+        return self
+
+    def stop(self) -> None:
+        """Stops sending and removes the port."""
+        self._stop.set()
+        if self._thread is not None:
+            self._thread.join()
+            self._thread = None
+        self.unplug()
+
+    def __enter__(self) -> "PadEmulator":
+        return self.start()
+
+    def __exit__(self, *_: object) -> None:
+        self.stop()
+
+    def plug(self) -> None:
+        """Makes the port appear; does nothing where it is there."""
+        with self._guard:
+            if self._fds is not None:
+                return
+            master, slave = os.openpty()
+            tty.setraw(slave)
+            os.set_blocking(master, False)
+            self._fds = master, slave
+            self.link.parent.mkdir(parents=True, exist_ok=True)
+            self.link.unlink(missing_ok=True)
+            self.link.symlink_to(os.ttyname(slave))
+
+    def unplug(self) -> None:
+        """Makes the port vanish, open or not; does nothing where it is not there."""
+        with self._guard:
+            if self._fds is None:
+                return
+            self.link.unlink(missing_ok=True)
+            for fd in self._fds:
+                os.close(fd)
+            self._fds = None
+
+    def stall(self, seconds: float) -> None:
+        """Sends nothing for a while from now on."""
+        self._stalled_until = time.monotonic() + seconds
+
+    def _run(self) -> None:
+        started = due = time.monotonic()
+        while not self._stop.is_set():
+            self._scheduled_faults(time.monotonic() - started)
+            if time.monotonic() >= self._stalled_until:
+                self._send(self.faults.apply(self._encode(self.source(self.sent)), self._rng))
+                self.sent += 1
+            due = max(due + self._period_s, time.monotonic() - 10 * self._period_s)
+            time.sleep(max(0.0, due - time.monotonic()))
+
+    def _scheduled_faults(self, elapsed_s: float) -> None:
+        faults = self.faults
+        if faults.unplug_at_s:
+            gone = faults.unplug_at_s <= elapsed_s < faults.unplug_at_s + faults.replug_after_s
+            (self.unplug if gone else self.plug)()
+        if faults.stall_every_s and elapsed_s % faults.stall_every_s < self._period_s < elapsed_s:
+            self.stall(faults.stall_s)
+
+    def _send(self, data: bytes) -> None:
+        with self._guard:
+            if self._fds is None:
+                return
+            written = 0
+            with contextlib.suppress(BlockingIOError):
+                written = os.write(self._fds[0], data)
+            self.overruns += written < len(data)
