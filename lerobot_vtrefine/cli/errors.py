@@ -22,8 +22,15 @@ def describe(error: BaseException) -> str:
         return f"the disk is full{where}; free some space and run the command again"
     if isinstance(error, OSError) and error.errno is not None and error.filename:
         return f"{error.strerror}: {error.filename}"
+    if isinstance(error, DraccusException) and isinstance(error.__cause__, ValueError) and _is_wrapper(error):
+        return describe(error.__cause__)
     message = " ".join(str(error).split())
     return message or type(error).__name__
+
+
+def _is_wrapper(error: DraccusException) -> bool:
+    """Whether the message only says that a configuration class refused its values; its cause says why."""
+    return "Couldn't instantiate class" in str(error)
 
 
 def run_cli[**P](main: Callable[P, int | None]) -> Callable[P, int]:

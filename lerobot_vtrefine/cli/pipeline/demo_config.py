@@ -29,6 +29,26 @@ QUICK = (
 )
 
 
+def default_env() -> dict[str, Any]:
+    """The demo's task; sensors are read only where a policy with chunks of 8 reads them."""
+    return {"pair": "round", "clearance_m": 0.002, "start": "grasped", "read_every": 8, "read_window": 2}
+
+
+def default_degradation() -> dict[str, Any]:
+    """The expert's imperfections: they leave imitation room for improvement."""
+    return {"lateral_std_m": 0.001, "tilt_std_rad": 0.026}
+
+
+def default_policy() -> dict[str, Any]:
+    """A network that trains in minutes on a CPU."""
+    return {"preset": "small", "n_action_steps": 8}
+
+
+def default_dppo() -> dict[str, Any]:
+    """DPPO in minutes on two cores."""
+    return {"type": "small"}
+
+
 @dataclass(frozen=True)
 class DemoConfig:
     """Numbers of the demo. ``env``, ``degradation``, ``policy`` and ``dppo`` are passed on as flags."""
@@ -57,23 +77,13 @@ class DemoConfig:
     """DPPO iterations of one episode in every environment."""
     finetune_envs: int = 96
     """Simulations that DPPO collects from."""
-    env: dict[str, Any] = field(
-        default_factory=lambda: {
-            "pair": "round",
-            "clearance_m": 0.002,
-            "start": "grasped",
-            "read_every": 8,
-            "read_window": 2,
-        }
-    )
+    env: dict[str, Any] = field(default_factory=default_env)
     """Flags of the environment, ``--env.KEY=VALUE``."""
-    degradation: dict[str, Any] = field(
-        default_factory=lambda: {"lateral_std_m": 0.001, "tilt_std_rad": 0.026}
-    )
+    degradation: dict[str, Any] = field(default_factory=default_degradation)
     """Flags of the expert's imperfections, ``--degradation.KEY=VALUE``."""
-    policy: dict[str, Any] = field(default_factory=lambda: {"preset": "small", "n_action_steps": 8})
+    policy: dict[str, Any] = field(default_factory=default_policy)
     """Flags of the policy, ``--policy.KEY=VALUE``."""
-    dppo: dict[str, Any] = field(default_factory=lambda: {"type": "small"})
+    dppo: dict[str, Any] = field(default_factory=default_dppo)
     """Flags of DPPO, ``--dppo.KEY=VALUE``."""
 
     def __post_init__(self) -> None:

@@ -1,0 +1,141 @@
+"""The demo: its command lines, results.json and report, with stand-ins for the commands that take minutes."""
+
+import json
+import re
+import sys
+from dataclasses import replace
+from itertools import pairwise
+from pathlib import Path
+
+import pytest
+from PIL import Image
+from scipy.stats import binomtest
+
+from lerobot_vtrefine.cli import demo
+from lerobot_vtrefine.cli.pipeline import stages
+from lerobot_vtrefine.cli.pipeline.demo_config import DemoConfig, demo_stages, flags
+from lerobot_vtrefine.cli.report.charts import Bar, Series, bar_chart, line_chart
+from lerobot_vtrefine.cli.report.results import verdict
+from lerobot_vtrefine.cli.report.statistics import proportion, quantiles, wilson_interval
+
+FAKES = Path(__file__).with_name("fake_commands.py")
+
+
+@pytest.fixture
+def fake_commands(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def find(name: str) -> str:
+        script = tmp_path / "bin" / name
+        script.parent.mkdir(exist_ok=True)
+        script.write_text(f'#!/bin/sh\nexec "{sys.executable}" "{FAKES}" {name} "$@"\n')
+        script.chmod(0o755)
+        return str(script)
+
+    monkeypatch.setattr(stages, "find_command", find)
+
+
+@pytest.mark.usefixtures("fake_commands")
+def test_demo_end_to_end(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    config = demo.parse_config(["--quick", f"--output_dir={tmp_path / 'demo'}"])
+    page = demo.run_demo(config).read_text(encoding="utf-8")
+    results = json.loads((config.output_dir / "results.json").read_text())
+    assert results["pretrain"]["success"] == 2
+    assert results["pretrain"]["episodes"] == 8
+    assert results["finetune"]["rate"] == 0.75
+    assert results["finetune"]["ci95"] == [0.4093, 0.9285]
+    assert results["pretrain"]["seeds"] == results["finetune"]["seeds"] == list(range(9_000_000, 9_000_008))
+    assert results["finetune"]["failures"] == {"dropped": 2}
+    assert set(results["ablations"]["finetune"]) == {"touch", "vision"}
+    assert set(results["seconds"]) >= {"record", "pretrain", "finetune", "eval_finetune", "total"}
+    assert results["summary"] in capsys.readouterr().out
+
+    body = re.sub(r"<style>.*?</style>|<[^>]+>", "", page.split("<body>")[1], flags=re.DOTALL).strip()
+    assert body.startswith(results["summary"])
+    assert re.search(r"""(src|href)=["'](?!data:)""", page) is None, "the page needs another file"
+    assert page.count("data:video/mp4;base64,") == 6
+    assert page.count("data:image/png;base64,") == 4
+    for record in results["stages"]:
+        assert record["command"].replace("'", "&#39;") in page
+    with Image.open(config.output_dir / "demo.gif") as gif:
+        assert (gif.width, gif.n_frames) == (demo.GIF_WIDTH, 5)
+
+
+@pytest.mark.usefixtures("fake_commands")
+def test_restart_continues(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    config = demo.parse_config(["--quick", "--ablation_episodes=0", f"--output_dir={tmp_path / 'demo'}"])
+    demo.run_demo(config)
+    capsys.readouterr()
+    demo.run_demo(replace(config, finetune_iterations=3))
+    lines = [line for line in capsys.readouterr().err.splitlines() if line.startswith("[")]
+    assert ["done before" in line for line in lines] == [True, True, True, False, False]
+
+
+def test_commands_are_those_of_users() -> None:
+    names = [stage.command[0] for stage in demo_stages(DemoConfig())]
+    assert names[:5] == [
+        "vtrefine-record-demos",
+        "lerobot-train",
+        "lerobot-eval",
+        "vtrefine-finetune",
+        "lerobot-eval",
+    ]
+    assert names[5:] == ["lerobot-eval"] * 4
+    visual = demo_stages(DemoConfig(modalities="visual"))
+    assert [stage.name for stage in visual[5:]] == ["eval_pretrain_no_vision", "eval_finetune_no_vision"]
+
+
+def test_episodes_are_never_shared() -> None:
+    """Evaluation seeds are unseen, within a run and between runs of different seeds."""
+    starts = []
+    for seed in range(3):
+        config = DemoConfig(seed=seed)
+        text = [stage.line for stage in demo_stages(config)]
+        starts += [int(re.findall(r" --seed=(\d+)", text[index])[0]) for index in (0, 3, 2)]
+    assert starts == sorted(starts)
+    assert min(b - a for a, b in pairwise(starts)) >= 1_000_000
+
+
+def test_headline_numbers_meet_the_promise() -> None:
+    assert DemoConfig().eval_episodes >= 200
+
+
+def test_flags() -> None:
+    values = {"pair": "round", "limits": {"force_n": 20.0}, "video": True}
+    assert flags("env", values) == ["--env.pair=round", "--env.limits.force_n=20.0", "--env.video=true"]
+
+
+@pytest.mark.parametrize(
+    ("before", "after", "words"),
+    [
+        (70, 140, "DPPO clearly improved"),
+        (70, 100, "DPPO improved"),
+        (70, 75, "DPPO did not clearly change"),
+        (140, 70, "DPPO made worse"),
+    ],
+)
+def test_verdict_says_what_happened(before: int, after: int, words: str) -> None:
+    text = verdict(proportion(before, 200), proportion(after, 200))
+    assert text.startswith(words)
+    assert f"({before} of 200 episodes)" in text
+    assert ("do not overlap" in text) == (words != "DPPO did not clearly change")
+
+
+def test_wilson_interval() -> None:
+    expected = binomtest(71, 200).proportion_ci(method="wilson")
+    assert wilson_interval(71, 200) == pytest.approx((expected.low, expected.high))
+    assert wilson_interval(0, 10)[0] == 0.0
+    assert wilson_interval(10, 10)[1] == 1.0
+    with pytest.raises(ValueError, match="trials > 0"):
+        wilson_interval(0, 0)
+
+
+def test_quantiles_skip_what_was_not_measured() -> None:
+    assert quantiles([None, 1.0, 3.0]) == {"median": 2.0, "p90": 2.8, "n": 2}
+    assert quantiles([None]) is None
+
+
+def test_charts_place_values() -> None:
+    chart = bar_chart([Bar("x", 1.0, 0.0, 1.0)], "y")
+    assert 'y="12.0"' in chart  # a rate of 1 touches the top
+    line = line_chart([Series("s", [(0, 0.0), (10, 1.0)])], "x", "y")
+    assert 'points="46.0,224.0 626.0,12.0"' in line
+    assert line_chart([Series("s", [])], "x", "y") == ""

@@ -1,0 +1,73 @@
+"""Expected failures of a command become one line and an exit status."""
+
+import errno
+
+import draccus
+import pytest
+
+from lerobot_vtrefine.cli.errors import run_cli
+from lerobot_vtrefine.cli.pipeline.demo_config import DemoConfig
+
+
+def failing(error: BaseException):
+    @run_cli
+    def main() -> None:
+        raise error
+
+    return main
+
+
+def test_success_is_zero() -> None:
+    assert run_cli(lambda: None)() == 0
+    assert run_cli(lambda: 3)() == 3
+
+
+@pytest.mark.parametrize(
+    ("error", "line"),
+    [
+        (ValueError("clearance_m must be\npositive"), "error: clearance_m must be positive"),
+        (FileNotFoundError(errno.ENOENT, "No such file", "x.json"), "error: No such file: x.json"),
+        (FileNotFoundError("no folder meshes"), "error: no folder meshes"),
+        (
+            OSError(errno.ENOSPC, "No space left on device", "data.parquet"),
+            "error: the disk is full while writing data.parquet; free some space and run the command again",
+        ),
+        (ImportError("pip install coacd"), "error: pip install coacd"),
+        (ValueError(), "error: ValueError"),
+    ],
+)
+def test_expected_error_is_one_line(error: Exception, line: str, capsys: pytest.CaptureFixture[str]) -> None:
+    assert failing(error)() == 2
+    assert capsys.readouterr().err == line + "\n"
+
+
+def test_interrupt(capsys: pytest.CaptureFixture[str]) -> None:
+    assert failing(KeyboardInterrupt())() == 130
+    assert capsys.readouterr().err == "interrupted\n"
+
+
+def test_defects_and_debug_keep_the_traceback(monkeypatch: pytest.MonkeyPatch) -> None:
+    with pytest.raises(RuntimeError):
+        failing(RuntimeError("a defect"))()
+    monkeypatch.setenv("VTREFINE_DEBUG", "1")
+    with pytest.raises(ValueError, match="bad value"):
+        failing(ValueError("bad value"))()
+
+
+@pytest.mark.parametrize(
+    ("flag", "message"),
+    [
+        ("--num_demos=0", "--num_demos must be at least 1, got 0"),
+        ("--modalities=smell", "choose from visuo_tactile, visual"),
+        ("--num_demos=many", "Couldn't parse 'many' into an int"),
+    ],
+)
+def test_wrong_flag_names_itself(flag: str, message: str, capsys: pytest.CaptureFixture[str]) -> None:
+    @run_cli
+    def main() -> None:
+        draccus.parse(DemoConfig, args=[flag])
+
+    assert main() == 2
+    error = capsys.readouterr().err
+    assert message in error
+    assert error.count("\n") == 1

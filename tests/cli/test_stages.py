@@ -1,0 +1,115 @@
+"""Stages run once, again when what they depend on changes, and say why they failed."""
+
+import io
+import sys
+from pathlib import Path
+
+import pytest
+from tqdm import tqdm
+
+from lerobot_vtrefine.cli.pipeline.progress import LiveLine, Progress, parse_progress, read_tail
+from lerobot_vtrefine.cli.pipeline.stages import Stage, StageRunner, find_command, stage_keys
+
+WRITE = "import pathlib, sys; p = pathlib.Path(sys.argv[1]); p.parent.mkdir(exist_ok=True); p.open('a').write('x')"
+
+
+def stage(folder: Path, name: str, *extra: str, code: str = WRITE, **options) -> Stage:
+    product = folder / name / "product"
+    return Stage(name, name, ("python", "-c", code, str(product), *extra), product.parent, product, **options)
+
+
+def run(folder: Path, *stages: Stage) -> str:
+    stream = io.StringIO()
+    StageRunner(folder, list(stages), LiveLine(stream)).run()
+    return stream.getvalue()
+
+
+def test_finished_stages_are_skipped(tmp_path: Path) -> None:
+    chain = (stage(tmp_path, "a"), stage(tmp_path, "b", needs=("a",)))
+    assert "done before" not in run(tmp_path, *chain)
+    assert run(tmp_path, *chain).count("done before") == 2
+    assert (tmp_path / "a" / "product").read_text() == "x"
+
+
+def test_changed_command_reruns_it_and_what_needs_it(tmp_path: Path) -> None:
+    def chain(option: str) -> tuple[Stage, ...]:
+        first = stage(tmp_path, "a", option)
+        return first, stage(tmp_path, "b", needs=("a",)), stage(tmp_path, "c")
+
+    run(tmp_path, *chain("1"))
+    text = run(tmp_path, *chain("2"))
+    assert text.count("done before") == 1
+    assert text.splitlines()[2].startswith("[3/3] c")
+    assert "done before" in text.splitlines()[2]
+
+
+def test_missing_product_reruns(tmp_path: Path) -> None:
+    only = stage(tmp_path, "a")
+    run(tmp_path, only)
+    only.product.unlink()
+    assert "done before" not in run(tmp_path, only)
+
+
+def test_failure_names_the_log_and_the_last_line(tmp_path: Path) -> None:
+    broken = stage(tmp_path, "a", code="import sys; print('start'); sys.exit('no such pair')")
+    with pytest.raises(ChildProcessError, match=r"stage a failed with status 1: no such pair .*a\.log"):
+        run(tmp_path, broken)
+    silent = stage(tmp_path, "b", code="pass")
+    with pytest.raises(ChildProcessError, match="wrote no"):
+        run(tmp_path, silent)
+
+
+@pytest.mark.parametrize(("resumable", "left"), [(True, "xx"), (False, "x")])
+def test_interrupted_stage_continues_only_if_it_can(tmp_path: Path, resumable: bool, left: str) -> None:
+    """The first run writes part of its output and fails; the second has the same command."""
+    flag = tmp_path / "second"
+    code = f"{WRITE}; p.parent.joinpath('done').touch(); sys.exit(not pathlib.Path({str(flag)!r}).exists())"
+    only = stage(tmp_path, "a", code=code, resumable=resumable)
+    with pytest.raises(ChildProcessError):
+        run(tmp_path, only)
+    flag.touch()
+    run(tmp_path, only)
+    assert only.product.read_text() == left
+
+
+def test_keys_follow_commands_and_needs(tmp_path: Path) -> None:
+    one = stage_keys([stage(tmp_path, "a", "1"), stage(tmp_path, "b", needs=("a",)), stage(tmp_path, "c")])
+    two = stage_keys([stage(tmp_path, "a", "2"), stage(tmp_path, "b", needs=("a",)), stage(tmp_path, "c")])
+    assert one["a"] != two["a"]
+    assert one["b"] != two["b"]
+    assert one["c"] == two["c"]
+
+
+def test_unknown_command_is_named() -> None:
+    with pytest.raises(FileNotFoundError, match="vtrefine-nothing not found"):
+        find_command("vtrefine-nothing")
+    assert Path(find_command("python")).parent == Path(sys.executable).parent
+
+
+def test_progress_of_a_real_bar() -> None:
+    stream = io.StringIO()
+    with tqdm(total=200, desc="Training", file=stream, mininterval=0, miniters=1) as bar:
+        bar.set_postfix(loss=0.25)
+        bar.update(50)
+        text = stream.getvalue()
+    assert parse_progress(text) == Progress(50, 200, "loss=0.25")
+    assert parse_progress("loading [1/2] weights") is None
+
+
+def test_tail_reads_only_the_end(tmp_path: Path) -> None:
+    path = tmp_path / "log"
+    assert read_tail(path) == ""
+    path.write_bytes(b"a" * 100 + "é".encode())
+    assert read_tail(path, 4) == "aaé"
+
+
+def test_terminal_line_is_rewritten() -> None:
+    stream = io.StringIO()
+    line = LiveLine(stream)
+    line.show("train", Progress(1, 4, "loss=1"), 59.0)
+    assert stream.getvalue() == ""  # a log file gets one line a minute
+    line.show("train", Progress(1, 4, "loss=1"), 61.0)
+    assert "1/4  25 %  loss=1" in stream.getvalue()
+    line.live = True
+    line.show("train", None, 62.0)
+    assert stream.getvalue().endswith("\x1b[2Ktrain" + " " * 38 + "1:02")
