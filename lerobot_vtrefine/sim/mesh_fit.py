@@ -48,7 +48,7 @@ class MeshFit:
 
 
 def measure_fit(plug: list[Array], socket: list[Array]) -> MeshFit:
-    """Measure the fit of convex pieces [(V, 3) m, assembled at the identity]; ValueError if they do not fit."""
+    """Measure the fit of convex pieces [(V, 3) m, assembled at the identity]; ValueError if they cannot."""
     probe = _OverlapProbe(plug, socket)
     if probe.overlap(np.zeros(3)) > 2 * _OVERLAP_M + 2e-4:
         raise ValueError(

@@ -128,10 +128,15 @@ def load_mesh_pair(
     settings = decomposition or Decomposition()
     if factors.swap:
         paths = {"plug": paths["socket"], "socket": paths["plug"]}
-    parts = {}
-    for role in tqdm(ROLES, desc=f"{name}: convex pieces", disable=not progress, leave=False):
-        part = _load_part(paths[role], settings)
-        parts[role] = _scaled(part, np.asarray(getattr(factors, role)), paths[role])
+    missing = [
+        role for role in ROLES if not (cache_dir() / f"{_pieces_key(paths[role], settings)}.npz").exists()
+    ]
+    for role in tqdm(missing, desc=f"{name}: convex pieces", disable=not (progress and missing), leave=False):
+        _load_part(paths[role], settings)
+    parts = {role: _load_part(paths[role], settings) for role in ROLES}
+    parts = {
+        role: _scaled(part, np.asarray(getattr(factors, role)), paths[role]) for role, part in parts.items()
+    }
     key = _digest(*(array for part in parts.values() for hull in part.pieces for array in (hull.vertices,)))
     fit = MeshFit(
         **_cached(
@@ -218,6 +223,11 @@ def _load_part(path: Path, settings: Decomposition) -> MeshPart:
     arrays = _cached(f"coacd-{key}", lambda: _decompose(vertices, faces, settings))
     hulls = (Hull(arrays[f"vertices_{i}"], arrays[f"faces_{i}"]) for i in range(len(arrays) // 2))
     return MeshPart(vertices, faces, tuple(hulls))
+
+
+def _pieces_key(path: Path, settings: Decomposition) -> str:
+    content = np.frombuffer(path.read_bytes(), np.uint8)
+    return f"coacd-{_digest(content, np.frombuffer(repr(settings).encode(), np.uint8))}"
 
 
 def _decompose(vertices: Array, faces: Triangles, settings: Decomposition) -> dict[str, NDArray[Any]]:

@@ -1,0 +1,292 @@
+"""A scripted expert that knows where everything is: it picks both parts, aligns them in the air and inserts.
+
+Hands move along smooth paths from phase to phase. Where a part is in hand, the goal is a pose of the part:
+how the hand holds it is measured, so that slip is corrected. Errors come from `Degradation` only.
+
+Shapes: m environments; hands and parts are ordered left, right: the left hand takes the socket, the right
+the plug.
+"""
+
+from dataclasses import dataclass
+from enum import IntEnum
+from typing import TYPE_CHECKING
+
+import numpy as np
+from numpy.typing import NDArray
+
+from lerobot_vtrefine.sim.demonstrations import Degradation, EpisodeErrors
+from lerobot_vtrefine.sim.ik import hand_poses, solve_hands
+from lerobot_vtrefine.sim.poses import Poses, rotation_vector
+from lerobot_vtrefine.sim.starts import ideal_hand
+
+if TYPE_CHECKING:
+    from lerobot_vtrefine.sim.simulation import InsertionSim
+
+Array = NDArray[np.float64]
+Ids = NDArray[np.int64]
+
+LEFT, RIGHT = 0, 1
+
+
+class Phase(IntEnum):
+    """What the expert does; start=grasped begins with ALIGN."""
+
+    REACH = 0
+    APPROACH = 1
+    CLOSE = 2
+    LIFT = 3
+    CARRY = 4
+    ALIGN = 5
+    INSERT = 6
+    HOLD = 7
+
+
+@dataclass(frozen=True)
+class Pace:
+    """How one phase is timed."""
+
+    speed_m_s: float
+    """Mean speed of the hand that has the longer way."""
+    shortest_s: float
+    settle_m: float = np.inf
+    """The phase ends when the hands (ALIGN: the plug) are this close to the goal ..."""
+    patience_s: float = 0.0
+    """... or this long after they should have arrived."""
+
+
+PACES = {
+    Phase.REACH: Pace(0.25, 1.0, 0.006, 0.5),
+    Phase.APPROACH: Pace(0.12, 0.6, 0.003, 0.6),
+    Phase.CLOSE: Pace(0.10, 0.7),
+    Phase.LIFT: Pace(0.12, 0.8, 0.006, 0.4),
+    Phase.CARRY: Pace(0.12, 0.6, 0.003, 0.5),
+    Phase.ALIGN: Pace(0.04, 0.7, 2e-4, 1.0),
+    Phase.INSERT: Pace(0.03, 0.5),
+    Phase.HOLD: Pace(0.03, 0.5, 0.0, np.inf),
+}
+RETREAT_M = 0.09  # hands come to a part from this far behind it
+CARRY_M = 0.040  # the plug is carried this high above the mouth
+STANDOFF_M = 0.006  # and aligned this high above it
+PRESS_M = 0.008  # a blocked plug is pushed as if it should be this much lower: a few newtons
+BOTTOM_M = 0.0005  # a seated plug is pushed this far beyond its seat
+TURN_M_PER_RAD = 0.1  # a turn takes as long as this way
+INTEGRAL_GAIN = 0.4
+INTEGRAL_LIMIT_RAD = 0.08
+
+
+@dataclass(frozen=True)
+class View:
+    """What the expert knows of m environments."""
+
+    q: Array
+    """(m, J) joint positions."""
+    hands: Poses
+    """(m, 2) TCPs."""
+    parts: Poses
+    """(m, 2) socket, plug."""
+
+    def __getitem__(self, rows: Ids) -> "View":
+        return View(self.q[rows], self.hands[rows], self.parts[rows])
+
+
+class ScriptedExpert:
+    """Joint targets for any set of environments of one simulation.
+
+    An environment's actions are a function of its own states and its episode's seed, so that an episode does
+    not depend on how many run beside it.
+    """
+
+    def __init__(self, sim: "InsertionSim", degradation: Degradation | None = None) -> None:
+        self._sim = sim
+        self._robot = sim.scene.embodiment
+        self._pair = sim.scene.pair
+        self._hz = sim.task.control_hz
+        self._from_table = sim.scene.config.start == "table"
+        self._grasp, self._grip_m = _grasps(sim)
+        self._stations = _stations(sim)
+        count = sim.num_envs
+        self._errors = EpisodeErrors(degradation or Degradation(), count, self._hz)
+        self.phase = np.zeros(count, np.int64)
+        self._step = np.zeros(count, np.int64)
+        self._phase_step = np.zeros(count)  # control steps at the episode's pace
+        self._duration = np.ones(count)  # of the phase, in control steps
+        self._target = np.zeros((count, self._robot.num_joints))
+        self._correction = np.zeros((count, self._robot.num_joints))
+        self._opening = np.zeros((count, 2))
+        self._start = Poses.identity(count, 2)  # hands wanted when the phase began
+        self._wanted = Poses.identity(count, 2)  # hands wanted now
+        self._goal = Poses.identity(count, 2)  # hands wanted when the phase ends
+        self._held = Poses.identity(count, 2)  # hands in their parts' frames when the phase began
+        self._socket = Poses.identity(count)  # where it was when the phase began
+
+    def reset(self, ids: Ids, seeds: Ids | None = None) -> None:
+        """Start new episodes of environments `ids` (m,) after the simulation was reset; seeds default to its
+        own.""" ids = np.asarray(ids)
+        self._errors.draw(ids, np.asarray(self._sim.seeds[ids] if seeds is None else seeds))
+        view = self._observe(ids)
+        self._step[ids] = 0
+        self._target[ids] = view.q
+        # What the servos lack now, they lack everywhere near.
+        self._correction[ids] = 0.0 if self._from_table else self._sim.joint_targets(ids) - view.q
+        self._wanted.assign(ids, view.hands)
+        self._opening[ids] = self._robot.fingers.travel_m if self._from_table else self._grip_m
+        self._enter(ids, Phase.REACH if self._from_table else Phase.ALIGN, view)
+
+    def act(self, ids: Ids) -> Array:
+        """Return absolute joint targets (m, J) for the next control step of environments `ids` (m,)."""
+        ids = np.asarray(ids)
+        view = self._observe(ids)
+        self._advance(ids, view)
+        moving = ~self._errors.paused(ids, self._step[ids])
+        self._phase_step[ids] += moving * self._errors.pace[ids]
+        wanted = self._plan(ids, view)
+        self._wanted.assign(ids[moving], wanted[moving])
+        self._correct(ids, view)
+        wanted = self._wanted[ids]
+        target, _, _ = solve_hands(self._robot, wanted.position, wanted.rotation, self._target[ids])
+        fingers = _arms(target)[..., -2:]
+        fingers[...] = self._opening[ids][..., None] * [1.0, -1.0]
+        self._target[ids] = target
+        self._step[ids] += 1
+        corrected = target + self._correction[ids]
+        _arms(corrected)[..., -2:] = fingers
+        return np.clip(corrected, self._robot.lower, self._robot.upper)
+
+    def _observe(self, ids: Ids) -> View:
+        q = np.asarray(self._sim.joint_state(ids), float)
+        plug, socket = self._sim.part_poses(ids)
+        return View(
+            q, Poses(*hand_poses(self._robot, q)), Poses.from_quaternions(np.stack([socket, plug], 1))
+        )
+
+    def _advance(self, ids: Ids, view: View) -> None:
+        """Move environments whose phase is over to the next one, one phase at most."""
+        phases = self.phase[ids]
+        late_s = (self._phase_step[ids] - self._duration[ids]) / self._hz
+        miss = _distance(view.hands, self._goal[ids])
+        aligning = phases == Phase.ALIGN
+        miss[aligning] = self._misalignment(ids[aligning], view[aligning])
+        for phase, pace in PACES.items():
+            over = (late_s >= 0) & ((miss < pace.settle_m) | (late_s >= pace.patience_s)) & (phases == phase)
+            chosen = np.flatnonzero(over)
+            if len(chosen):
+                self._enter(ids[chosen], Phase(phase + 1), view[chosen])
+
+    def _enter(self, ids: Ids, phase: Phase, view: View) -> None:
+        self.phase[ids] = phase
+        self._phase_step[ids] = 0
+        self._start.assign(ids, self._wanted[ids])
+        self._held.assign(ids, view.parts.inverse() @ view.hands)
+        self._socket.assign(ids, view.parts[:, LEFT])
+        if phase == Phase.CLOSE:
+            self._opening[ids] = self._grip_m
+        self._goal.assign(ids, self._destination(ids, phase, view))
+        way = _distance(self._start[ids], self._goal[ids])
+        if phase == Phase.INSERT:
+            way = np.full(len(ids), STANDOFF_M + self._pair.travel_m)
+        pace = PACES[phase]
+        self._duration[ids] = self._hz * np.maximum(way / pace.speed_m_s, pace.shortest_s)
+
+    def _destination(self, ids: Ids, phase: Phase, view: View) -> Poses:
+        """Hand poses (m, 2) in which a phase should end, as known at its beginning."""
+        if phase in (Phase.REACH, Phase.APPROACH):
+            along, across = np.moveaxis(self._errors.grasp_m[ids], -1, 0)
+            back = RETREAT_M if phase == Phase.REACH else 0.0
+            offset = np.stack([along - back, np.zeros_like(along), across], -1)
+            return view.parts @ self._grasp @ Poses.from_vectors(offset, np.zeros(3))
+        if phase == Phase.LIFT:
+            raised = view.parts.position.copy()
+            raised[..., 2] = self._stations.position[:, 2]
+            return Poses(raised, view.parts.rotation) @ self._held[ids]
+        if phase == Phase.CARRY:
+            return self._stations @ self._held[ids]
+        goal = self._wanted[ids]
+        if phase == Phase.ALIGN:
+            goal.position[:, RIGHT] = self._aligned(ids, view).position
+        return goal
+
+    def _plan(self, ids: Ids, view: View) -> Poses:
+        """Hand poses (m, 2) wanted in this control step."""
+        phases, goal = self.phase[ids], self._goal[ids]
+        share = np.clip(self._phase_step[ids] / self._duration[ids], 0, 1)
+        aligning, inserting = phases == Phase.ALIGN, phases >= Phase.INSERT
+        if aligning.any():
+            live = self._aligned(ids[aligning], view[aligning])
+            goal.position[aligning, RIGHT], goal.rotation[aligning, RIGHT] = live.position, live.rotation
+        smooth = share * share * (3 - 2 * share)
+        wanted = self._start[ids].towards(goal, np.repeat(smooth[:, None], 2, 1))
+        if inserting.any():
+            share = np.where(phases == Phase.HOLD, 1.0, share)[inserting]
+            down = self._inserted(ids[inserting], view[inserting], share)
+            wanted.position[inserting, RIGHT], wanted.rotation[inserting, RIGHT] = (
+                down.position,
+                down.rotation,
+            )
+        return wanted
+
+    def _aligned(self, ids: Ids, view: View) -> Poses:
+        """Right hand (m,) that holds the plug above the mouth, from where both parts are now."""
+        held = view.parts[:, RIGHT].inverse() @ view.hands[:, RIGHT]
+        return (
+            self._aim(ids, view.parts[:, LEFT], np.full(len(ids), self._pair.mouth_z_m + STANDOFF_M)) @ held
+        )
+
+    def _inserted(self, ids: Ids, view: View, share: Array) -> Poses:
+        """Right hand (m,) a share of the way down; where the parts stood when the descent began: no
+        feedback.""" top, bottom = self._pair.mouth_z_m + STANDOFF_M, self._pair.seated_z_m - BOTTOM_M
+        reached = (self._socket[ids].inverse() @ view.parts[:, RIGHT]).position[:, 2]
+        height = np.maximum(top + share * (bottom - top), reached - PRESS_M)
+        return self._aim(ids, self._socket[ids], height) @ self._held[ids][:, RIGHT]
+
+    def _aim(self, ids: Ids, socket: Poses, height_m: Array) -> Poses:
+        """Plug poses (m,) at a height over where the sockets are believed to be."""
+        lateral = self._errors.lateral_m[ids] + self._errors.tremor_m(ids, self._step[ids])
+        position = np.concatenate([lateral, height_m[:, None]], 1)
+        return socket @ Poses.from_vectors(position, self._errors.tilt_rad[ids])
+
+    def _misalignment(self, ids: Ids, view: View) -> Array:
+        """How far the plugs are from where they are believed to be aligned (m,) [m]."""
+        height = np.full(len(ids), self._pair.mouth_z_m + STANDOFF_M)
+        error = self._aim(ids, view.parts[:, LEFT], height).inverse() @ view.parts[:, RIGHT]
+        lateral = np.hypot(error.position[:, 0], error.position[:, 1])
+        tilt = np.linalg.norm(rotation_vector(error.rotation), axis=-1)
+        return np.maximum(lateral, 0.02 * tilt)
+
+    def _correct(self, ids: Ids, view: View) -> None:
+        """Integrate what the servos lack, while hands stand free; against a contact it would wind up."""
+        phases = self.phase[ids]
+        free = (phases != Phase.CLOSE) & (phases < Phase.INSERT)
+        arrived = free & (self._phase_step[ids] >= self._duration[ids])
+        rows = ids[arrived]
+        self._correction[rows] += INTEGRAL_GAIN * (self._target[rows] - view.q[arrived])
+        self._correction[rows] = self._correction[rows].clip(-INTEGRAL_LIMIT_RAD, INTEGRAL_LIMIT_RAD)
+
+
+def _grasps(sim: "InsertionSim") -> tuple[Poses, Array]:
+    """Hands in their parts' frames (2,), and the openings commanded to hold them (2,) [m]."""
+    pair, grasped = sim.scene.pair, sim.task.grasped
+    left = ideal_hand(pair.socket, np.pi / 2, grasped.left_pitch_rad)
+    right = ideal_hand(pair.plug, -np.pi / 2, grasped.right_pitch_rad)
+    hands = Poses(np.stack([left[0], right[0]]), np.stack([left[1], right[1]]))
+    width = np.array([pair.socket.grip.half_size_m[0], pair.plug.grip.half_size_m[0]])
+    return hands, np.maximum(width + sim.scene.embodiment.fingers.face_offset_m - grasped.squeeze_m, 0.0)
+
+
+def _stations(sim: "InsertionSim") -> Poses:
+    """Where parts are brought before they are aligned (2,): the socket where it stays, the plug above it."""
+    mouth = np.asarray(sim.task.grasped.mouth_m)
+    socket = mouth - np.array([0.0, 0.0, sim.scene.pair.mouth_z_m])
+    plug = mouth + np.array([0.0, 0.0, CARRY_M])
+    return Poses.from_vectors(np.stack([socket, plug]), np.zeros((2, 3)))
+
+
+def _distance(start: Poses, goal: Poses) -> Array:
+    """Longer way of both hands (m,) [m], turns counted as ways."""
+    way = np.linalg.norm(goal.position - start.position, axis=-1)
+    turn = np.linalg.norm(rotation_vector(np.swapaxes(start.rotation, -1, -2) @ goal.rotation), axis=-1)
+    return np.maximum(way, TURN_M_PER_RAD * turn).max(-1)
+
+
+def _arms(q: Array) -> Array:
+    """View joint positions (m, J) as (m, 2, J / 2)."""
+    return q.reshape(len(q), 2, -1)

@@ -1,0 +1,52 @@
+"""Mesh pairs as the scene's parts: convex pieces to collide, the exact surface to touch, a place to grip."""
+
+from pathlib import Path
+
+import numpy as np
+
+from lerobot_vtrefine.sim.meshes import MeshPair, MeshPart, load_mesh_pair
+from lerobot_vtrefine.sim.pairs import Grip, Part, PartPair
+from lerobot_vtrefine.tactile.geometry import ConvexHull, TriangleMesh
+
+MIN_GRIP_M = 0.020  # a free stretch shorter than this is not worth gripping
+MAX_GRIP_M = 0.040
+
+
+def load_mesh_parts(name: str, mesh_dir: Path | None, scale: str | float = "flexitac") -> PartPair:
+    """Load `automate/ID` from a folder of meshes; errors as in `load_mesh_pair`."""
+    return make_parts(load_mesh_pair(name, mesh_dir, scale))
+
+
+def make_parts(pair: MeshPair) -> PartPair:
+    """Turn a mesh pair into the scene's parts; both frames coincide when the pair is assembled."""
+    (_, plug_top), (socket_bottom, socket_top) = _height(pair.plug), _height(pair.socket)
+    plug_bottom = _height(pair.plug)[0]
+    above, below = plug_top - socket_top, plug_bottom - socket_bottom
+    plug_span = (socket_top, plug_top) if above >= MIN_GRIP_M else (plug_bottom, plug_top)
+    socket_span = (socket_bottom, plug_bottom) if below >= MIN_GRIP_M else (socket_bottom, socket_top)
+    plug_middle = plug_span[1] - min(MAX_GRIP_M, plug_span[1] - plug_span[0]) / 2
+    socket_middle = socket_span[0] + min(MAX_GRIP_M, socket_span[1] - socket_span[0]) / 2
+    return PartPair(
+        pair.name,
+        _part(pair.plug, plug_middle, plug_span),
+        _part(pair.socket, socket_middle, socket_span),
+        seated_z_m=0.0,
+        travel_m=pair.fit.travel_m,
+    )
+
+
+def _part(part: MeshPart, middle_z_m: float, span_m: tuple[float, float]) -> Part:
+    half_z = min(middle_z_m - span_m[0], span_m[1] - middle_z_m)
+    gripped = part.vertices[np.abs(part.vertices[:, 2] - middle_z_m) <= half_z + 1e-6]
+    low, high = gripped[:, :2].min(0), gripped[:, :2].max(0)
+    centre, half = (low + high) / 2, (high - low) / 2
+    grip = Grip((float(centre[0]), float(centre[1]), middle_z_m), (float(half[0]), float(half[1]), half_z))
+    pieces = tuple(ConvexHull(hull.vertices, hull.faces) for hull in part.pieces)
+    return Part(
+        pieces, grip, rest_height_m=-_height(part)[0], surface=TriangleMesh(part.vertices, part.faces)
+    )
+
+
+def _height(part: MeshPart) -> tuple[float, float]:
+    """Lowest and highest z."""
+    return float(part.bounds_m[0, 2]), float(part.bounds_m[1, 2])
