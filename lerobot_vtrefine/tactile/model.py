@@ -6,6 +6,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+import lerobot_vtrefine.tactile.stages  # noqa: F401  registers every stage
 from lerobot_vtrefine.tactile.stages.base import DOMAINS, STAGES, Stage, stage_class
 from lerobot_vtrefine.tactile.stages.contact import ContactStage, KelvinVoigt
 from lerobot_vtrefine.tactile.stages.readout import Gain, Idle, Noise, Quantisation, RowSharing

@@ -152,7 +152,7 @@ class PadSensors:
         return Frame(
             layout=self.layout,
             dt_s=dt_s,
-            time_s=self._time_s[index].float().view(-1, 1, 1, 1),
+            time_s=self._time_s[index].view(-1, 1, 1, 1),
             stiffness_n_per_m=self._contact_stage(index).stiffness(self.layout),
             load_conserving=contact.load_conserving,
         )
@@ -194,7 +194,9 @@ class PadSensors:
             from lerobot_vtrefine.tactile.contact_query import ContactQuery  # warp is slow to import
 
             self._query = ContactQuery(self.layout, self.bodies, str(self.device))
-        depth, rate = self._query(contact.query, *(self._tensor(pose) for pose in poses))
+        # A face that is moved needs the gap where it does not touch yet, which only the column query gives.
+        mode = "column" if self.model.depth_stages else contact.query
+        depth, rate = self._query(mode, *(self._tensor(pose) for pose in poses))
         depth = self._run(self.model.depth_stages, depth, index, frame)
         return contact.force(depth, rate, self.layout)
 

@@ -1,6 +1,17 @@
 """Stages of the sensor model, by domain; importing this package registers them all."""
 
-from lerobot_vtrefine.tactile.stages import contact, readout
+from lerobot_vtrefine.tactile.stages import contact, host, mechanics, readout, surface
 from lerobot_vtrefine.tactile.stages.base import STAGES, Frame, Stage, register, stage_class
 
-__all__ = ["STAGES", "Frame", "Stage", "contact", "readout", "register", "stage_class"]
+__all__ = [
+    "STAGES",
+    "Frame",
+    "Stage",
+    "contact",
+    "host",
+    "mechanics",
+    "readout",
+    "register",
+    "stage_class",
+    "surface",
+]

@@ -5,8 +5,7 @@ pure function `step`; memory between frames is passed in and out explicitly. Par
 against (..., R, C), which is how each environment gets its own value.
 """
 
-from collections.abc import Callable
-from dataclasses import dataclass, field, fields
+from dataclasses import dataclass, field, fields, replace
 from typing import Any, ClassVar
 
 import numpy as np
@@ -86,6 +85,28 @@ class Stage:
         """
         raise NotImplementedError
 
+    def sequence(self, x: torch.Tensor, times_s: torch.Tensor, frame: Frame) -> torch.Tensor:
+        """Process a recording: x (T, ..., R, C) at times (T,) [s], starting untouched and without traits.
+
+        The same as calling `step` frame by frame.
+        """
+        if not self.has_state:
+            shape = (-1,) + (1,) * (x.ndim - 1)
+            return self.step(x, {}, replace(frame, time_s=times_s.view(shape)))[0]
+        one = self.initial(frame.layout, 1)
+        lead = x.shape[1:-2]
+        state = {
+            key: torch.from_numpy(value[0]).to(x.device).expand(*lead, *value.shape[1:])
+            for key, value in one.items()
+        }
+        outputs, previous = [], times_s[0]
+        for value, time_s in zip(x, times_s, strict=True):
+            moment = replace(frame, time_s=time_s, dt_s=float(time_s - previous))
+            value, state = self.step(value, state, moment)
+            outputs.append(value)
+            previous = time_s
+        return torch.stack(outputs)
+
 
 STAGES: dict[str, type[Stage]] = {}
 
@@ -115,6 +136,3 @@ def taxel_map(values: Any, like: torch.Tensor) -> torch.Tensor:
     if isinstance(values, torch.Tensor):
         return values
     return torch.as_tensor(np.asarray(values, dtype=np.float32), device=like.device).to(like.dtype)
-
-
-StageFactory = Callable[..., Stage]

@@ -185,7 +185,7 @@ class BaselineDrift(Stage):
     rate_counts_per_s: float = parameter(0.0, "counts/s", -3e-3, 3e-3, minimum=None)
 
     def step(self, x: torch.Tensor, state: State, frame: Frame) -> tuple[torch.Tensor, State]:
-        return x + self.rate_counts_per_s * frame.time_s, state
+        return x + (self.rate_counts_per_s * torch.as_tensor(frame.time_s)).to(x), state
 
 
 @register

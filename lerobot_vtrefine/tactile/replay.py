@@ -1,0 +1,109 @@
+"""Run a sensor model over a recorded press, with the code that the simulator runs."""
+
+from collections.abc import Collection
+
+import numpy as np
+import torch
+
+from lerobot_vtrefine.tactile.geometry import BodyGeometry
+from lerobot_vtrefine.tactile.layout import PadLayout
+from lerobot_vtrefine.tactile.model import SensorModel
+from lerobot_vtrefine.tactile.stages.base import Frame
+
+ArrayLike = np.ndarray | torch.Tensor
+
+
+def column_heights(
+    layout: PadLayout, body: BodyGeometry, position_m: np.ndarray, rotation: np.ndarray, device: str = "cpu"
+) -> np.ndarray:
+    """How far a body lies below the undeformed face at every taxel, along -z: (T, R, C) [m].
+
+    Negative where there is a gap, -1 where no part of the body stands over the taxel.
+
+    Args:
+        position_m, rotation: pose of the body's frame in the pad frame, (T, 3) and (T, 3, 3).
+    """
+    from lerobot_vtrefine.tactile.contact_query import ContactQuery  # warp is slow to import
+
+    frames = len(position_m)
+    query = ContactQuery(layout, [body], device)
+    still = torch.zeros((frames, 1, 6))
+    heights, _ = query(
+        "column",
+        torch.zeros((frames, 1, 3)),
+        torch.eye(3).expand(frames, 1, 3, 3),
+        still,
+        torch.as_tensor(position_m, dtype=torch.float32)[:, None],
+        torch.as_tensor(rotation, dtype=torch.float32)[:, None],
+        still,
+    )
+    return heights[:, 0].cpu().numpy().copy()
+
+
+def finite_rate(times_s: torch.Tensor, depth_m: torch.Tensor) -> torch.Tensor:
+    """Central differences of depth (T, ..., R, C) over time (T,) [m/s]; frames with equal times share their rate."""
+    if len(times_s) < 2:
+        return torch.zeros_like(depth_m)
+    times = times_s.to(depth_m.dtype)
+    step = (times[1:] - times[:-1]).clamp(min=1e-9).view(-1, *(1,) * (depth_m.ndim - 1))
+    slope = (depth_m[1:] - depth_m[:-1]) / step
+    return torch.cat([slope[:1], 0.5 * (slope[1:] + slope[:-1]), slope[-1:]])
+
+
+def replay(
+    model: SensorModel,
+    times_s: ArrayLike,
+    depth_m: ArrayLike | None = None,
+    rate_m_s: ArrayLike | None = None,
+    *,
+    force_n: ArrayLike | None = None,
+    layout: PadLayout | None = None,
+    start_s: float = 0.0,
+    skip: Collection[str] = ("noise", "quantisation"),
+    device: str = "cpu",
+) -> torch.Tensor:
+    """Readings that the model predicts for one trial, or for several with the same times: (T, ..., R, C) float32 counts.
+
+    Give either the depth of every taxel (contract: column height), or force per taxel, which then replaces the contact
+    model and everything before it.
+
+    Args:
+        times_s: (T,) non-decreasing, from the trial's start [s].
+        depth_m: (T, ..., R, C) signed depth; -1 where there is no body.
+        rate_m_s: its rate; central differences by default.
+        force_n: (T, ..., R, C) force per taxel [N].
+        start_s: session time of the trial's first frame, for drift [s].
+        skip: stages left out; by default those that only add noise to a prediction.
+
+    Raises:
+        ValueError: neither or both of depth and force, or shapes that disagree.
+    """
+    if (depth_m is None) == (force_n is None):
+        raise ValueError("replay needs exactly one of depth_m and force_n")
+    times = torch.as_tensor(np.asarray(times_s), dtype=torch.float64, device=device)
+    x = torch.as_tensor(depth_m if force_n is None else force_n, device=device).to(torch.float32)
+    if x.ndim < 3 or len(x) != len(times):
+        raise ValueError(
+            f"replay needs arrays (T, ..., R, C) with T = {len(times)} times, got {tuple(x.shape)}"
+        )
+    layout = layout or PadLayout(x.shape[-2], x.shape[-1])
+    if (layout.rows, layout.cols) != tuple(x.shape[-2:]):
+        raise ValueError(f"replay got {tuple(x.shape[-2:])} taxels for a {layout.rows} x {layout.cols} pad")
+    contact = model.contact
+    frame = Frame(
+        layout=layout, stiffness_n_per_m=contact.stiffness(layout), load_conserving=force_n is not None
+    )
+    if force_n is None:
+        rate = (
+            finite_rate(times, x)
+            if rate_m_s is None
+            else torch.as_tensor(rate_m_s, device=device).to(x.dtype)
+        )
+        for stage in model.depth_stages:
+            x = stage.sequence(x, times, frame) if stage.name not in skip else x
+        x = contact.force(x, rate, layout)
+    for stage in model.force_stages:
+        if stage.name not in skip and not stage.stochastic:
+            session = times + start_s if stage.name == "baseline_drift" else times
+            x = stage.sequence(x, session, frame)
+    return x

@@ -1,0 +1,125 @@
+"""Stages of sampling and transport: when a reading was taken, and how long the host repeats it."""
+
+from dataclasses import dataclass
+from typing import ClassVar
+
+import numpy as np
+import torch
+
+from lerobot_vtrefine.tactile.layout import PadLayout
+from lerobot_vtrefine.tactile.stages.base import Frame, Stage, State, Traits, parameter, register
+
+HISTORY_FRAMES = 16
+"""Frames that a delay remembers while simulating; replay has no such limit."""
+
+
+def delayed_sequence(x: torch.Tensor, times_s: torch.Tensor, delay_s: torch.Tensor) -> torch.Tensor:
+    """x (T, ..., R, C) as it was `delay_s` (R,) earlier, linear between frames, held before the first."""
+    if len(times_s) < 2:
+        return x
+    wanted = times_s[:, None] - delay_s[None].to(times_s)
+    after = torch.searchsorted(times_s, wanted.contiguous(), right=True).clamp(1, len(times_s) - 1)
+    span = (times_s[after] - times_s[after - 1]).clamp(min=1e-12)
+    weight = ((wanted - times_s[after - 1]) / span).clamp(0.0, 1.0).to(x.dtype)
+    middle = (1,) * (x.ndim - 3)
+    rows = torch.arange(x.shape[-2], device=x.device)
+    by_row = x.movedim(-2, 1)
+    weight = weight.view(*weight.shape, *middle, 1)
+    earlier, later = by_row[after - 1, rows], by_row[after, rows]
+    return (earlier + weight * (later - earlier)).movedim(1, -2)
+
+
+@dataclass(frozen=True)
+class Delay(Stage):
+    """Base: every row is read `delay_s` (rows,) before the frame's time; linear between frames."""
+
+    domain: ClassVar[str] = "counts"
+    has_state: ClassVar[bool] = True
+
+    def delay_s(self, rows: int, like: torch.Tensor) -> torch.Tensor:
+        """Delay of each row, (..., R, 1) [s]."""
+        raise NotImplementedError
+
+    def initial(self, layout: PadLayout, pads: int) -> Traits:
+        return {
+            "history": np.zeros((pads, HISTORY_FRAMES, layout.rows, layout.cols), dtype=np.float32),
+            "age_s": np.zeros((pads, HISTORY_FRAMES), dtype=np.float32),
+            "frames": np.zeros(pads, dtype=np.int64),
+        }
+
+    def step(self, x: torch.Tensor, state: State, frame: Frame) -> tuple[torch.Tensor, State]:
+        delay = self.delay_s(x.shape[-2], x)
+        # The oldest remembered frame is HISTORY_FRAMES - 1 steps old: a longer delay would silently be cut.
+        if frame.dt_s > 0.0 and float(delay.max()) > (HISTORY_FRAMES - 1) * frame.dt_s:
+            raise ValueError(
+                f"{self.name}: {float(delay.max()):g} s exceeds {HISTORY_FRAMES - 1} frames of {frame.dt_s:g} s"
+            )
+        first = (state["frames"] == 0)[..., None, None, None]
+        past = torch.where(first, x.unsqueeze(-3), state["history"][..., :-1, :, :])
+        history = torch.cat([x.unsqueeze(-3), past], dim=-3)
+        age = torch.cat(
+            [torch.zeros_like(state["age_s"][..., :1]), state["age_s"][..., :-1] + frame.dt_s], dim=-1
+        )
+        value = x
+        for k in range(HISTORY_FRAMES - 1):
+            begin, end = age[..., k, None, None], age[..., k + 1, None, None]
+            weight = ((delay - begin) / (end - begin).clamp(min=1e-9)).clamp(0.0, 1.0)
+            value = value + weight * (history[..., k + 1, :, :] - history[..., k, :, :])
+        return value, {"history": history, "age_s": age, "frames": state["frames"] + 1}
+
+    def sequence(self, x: torch.Tensor, times_s: torch.Tensor, frame: Frame) -> torch.Tensor:
+        delay = self.delay_s(x.shape[-2], x).reshape(-1)
+        return delayed_sequence(x, times_s, delay.expand(x.shape[-2]) if len(delay) == 1 else delay)
+
+
+@register
+@dataclass(frozen=True)
+class Latency(Delay):
+    """Readings are `tau_s` old when the host stamps them."""
+
+    name: ClassVar[str] = "latency"
+    rank: ClassVar[int] = 70
+    tau_s: float = parameter(0.01, "s", 0.0, 0.05)
+
+    def delay_s(self, rows: int, like: torch.Tensor) -> torch.Tensor:
+        return torch.as_tensor(self.tau_s, dtype=like.dtype, device=like.device).reshape(
+            -1, *(1,) * (like.ndim - 1)
+        )
+
+
+@register
+@dataclass(frozen=True)
+class ScanSkew(Delay):
+    """Rows are read one after the other: row r is sampled skew_s * r / (R - 1) before the frame's time."""
+
+    name: ClassVar[str] = "scan_skew"
+    rank: ClassVar[int] = 72
+    skew_s: float = parameter(0.008, "s", 0.0, 0.043, minimum=None)
+
+    def delay_s(self, rows: int, like: torch.Tensor) -> torch.Tensor:
+        share = torch.arange(rows, dtype=like.dtype, device=like.device)[:, None] / max(rows - 1, 1)
+        return self.skew_s * share
+
+
+@register
+@dataclass(frozen=True)
+class SampleAndHold(Stage):
+    """A new reading reaches the host every `period_s` of episode time; between, the last one is repeated."""
+
+    name: ClassVar[str] = "sample_and_hold"
+    domain: ClassVar[str] = "counts"
+    rank: ClassVar[int] = 90
+    has_state: ClassVar[bool] = True
+    period_s: float = parameter(0.043, "s", 0.01, 0.1, minimum=1e-6)
+
+    def initial(self, layout: PadLayout, pads: int) -> Traits:
+        return {
+            "held": np.zeros((pads, layout.rows, layout.cols), dtype=np.float32),
+            "slot": np.full((pads, 1, 1), -1, dtype=np.int64),
+        }
+
+    def step(self, x: torch.Tensor, state: State, frame: Frame) -> tuple[torch.Tensor, State]:
+        time_s = torch.as_tensor(frame.time_s, dtype=torch.float64, device=x.device)
+        slot = torch.floor(time_s / self.period_s + 1e-6).to(torch.int64).expand(state["slot"].shape).clone()
+        held = torch.where(slot != state["slot"], x, state["held"])
+        return held, {"held": held, "slot": slot}

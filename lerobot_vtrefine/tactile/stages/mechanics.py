@@ -1,0 +1,147 @@
+"""Stages that act on force: what the layers between the face and the electrodes do to it."""
+
+import math
+from dataclasses import dataclass, field
+from typing import Any, ClassVar
+
+import numpy as np
+import torch
+
+from lerobot_vtrefine.tactile.layout import PadLayout
+from lerobot_vtrefine.tactile.stages.base import Frame, Stage, State, Traits, as_tuple, parameter, register
+
+REFERENCE_DEPTH_M = 1e-3
+"""Depth at which a non-linear stiffness equals the linear one [m]."""
+
+
+@register
+@dataclass(frozen=True)
+class NonlinearStiffness(Stage):
+    """Hardening (exponent > 1) or softening: f_ref (f / f_ref)^exponent with f_ref = stiffness * 1 mm.
+
+    For a linear contact law this is k d_ref (d / d_ref)^exponent. Where the taxels' sum is the load itself, the sum is
+    kept and only its distribution changes.
+    """
+
+    name: ClassVar[str] = "nonlinear_stiffness"
+    domain: ClassVar[str] = "force"
+    rank: ClassVar[int] = 30
+    exponent: float = parameter(1.0, "1", 0.8, 1.6, minimum=1e-3)
+
+    def step(self, x: torch.Tensor, state: State, frame: Frame) -> tuple[torch.Tensor, State]:
+        reference = frame.stiffness_n_per_m * REFERENCE_DEPTH_M
+        bent = reference * (x.clamp(min=0.0) / reference) ** self.exponent
+        if not frame.load_conserving:
+            return bent, state
+        before, after = (image.sum(dim=(-2, -1), keepdim=True) for image in (x, bent))
+        return bent * torch.where(after > 0, before / after.clamp(min=1e-30), torch.ones_like(after)), state
+
+
+def spreading_matrix(count: int, sigma_taxels: torch.Tensor) -> torch.Tensor:
+    """Gaussian weights (..., count, count) with mirrored ends: doubly stochastic, so that sums and flat fields are kept.
+
+    Args:
+        sigma_taxels: (..., 1, 1) standard deviation in taxels.
+    """
+    index = torch.arange(count, device=sigma_taxels.device, dtype=sigma_taxels.dtype)
+    images = torch.stack([index, -1 - index, 2 * count - 1 - index])
+    distance = index[:, None, None] - images[None]
+    weights = torch.exp(-0.5 * (distance / sigma_taxels.clamp(min=1e-6).unsqueeze(-1)) ** 2).sum(dim=-2)
+    return weights / weights.sum(dim=-1, keepdim=True)
+
+
+@register
+@dataclass(frozen=True)
+class MechanicalSpreading(Stage):
+    """The cover layer spreads force over neighbours: a Gaussian of `sigma_m`, mirrored at the edges; keeps the sum."""
+
+    name: ClassVar[str] = "mechanical_spreading"
+    domain: ClassVar[str] = "force"
+    rank: ClassVar[int] = 32
+    sigma_m: float = parameter(1.0e-3, "m", 0.0, 3.0e-3)
+
+    def step(self, x: torch.Tensor, state: State, frame: Frame) -> tuple[torch.Tensor, State]:
+        sigma = torch.as_tensor(self.sigma_m, dtype=x.dtype, device=x.device) / frame.layout.pitch_m
+        sigma = sigma.view(1, 1) if sigma.ndim == 0 else sigma
+        rows, cols = x.shape[-2:]
+        return spreading_matrix(rows, sigma) @ x @ spreading_matrix(cols, sigma).transpose(-1, -2), state
+
+
+def _paired(stage: str, tau_s: Any, fraction: Any) -> list[tuple[Any, Any]]:
+    taus = tau_s if isinstance(tau_s, tuple) else (tau_s,)
+    fractions = fraction if isinstance(fraction, tuple) else (fraction,)
+    if len(taus) != len(fractions):
+        raise ValueError(
+            f"{stage}: tau_s and fraction need the same number of branches, got {taus} and {fractions}"
+        )
+    return list(zip(taus, fractions, strict=True))
+
+
+@register
+@dataclass(frozen=True)
+class ViscoelasticRelaxation(Stage):
+    """Prony series: f - sum_j fraction_j * (f low-passed with tau_j); a held load decays to 1 - sum(fraction).
+
+    `tau_s` and `fraction` are numbers or equally long lists. Exact for a force that is linear between frames.
+    """
+
+    name: ClassVar[str] = "viscoelastic_relaxation"
+    domain: ClassVar[str] = "force"
+    rank: ClassVar[int] = 34
+    has_state: ClassVar[bool] = True
+    tau_s: Any = field(default=1.0, metadata={"unit": "s", "range": (0.3, 3.0), "minimum": 1e-6})
+    fraction: Any = field(default=0.15, metadata={"unit": "1", "range": (0.0, 0.3), "minimum": None})
+
+    def __post_init__(self) -> None:
+        for name in ("tau_s", "fraction"):
+            object.__setattr__(self, name, as_tuple(getattr(self, name)))
+        super().__post_init__()
+        _paired(self.name, self.tau_s, self.fraction)
+
+    def initial(self, layout: PadLayout, pads: int) -> Traits:
+        names = [
+            "previous",
+            *(f"slow_{j}" for j in range(len(_paired(self.name, self.tau_s, self.fraction)))),
+        ]
+        return {name: np.zeros((pads, layout.rows, layout.cols), dtype=np.float32) for name in names}
+
+    def step(self, x: torch.Tensor, state: State, frame: Frame) -> tuple[torch.Tensor, State]:
+        previous, dt_s = state["previous"], frame.dt_s
+        new, relaxed = {**state, "previous": x}, x
+        for j, (tau_s, fraction) in enumerate(_paired(self.name, self.tau_s, self.fraction)):
+            slow = state[f"slow_{j}"]
+            if dt_s > 0.0:
+                decay = (
+                    torch.exp(-dt_s / tau_s) if isinstance(tau_s, torch.Tensor) else math.exp(-dt_s / tau_s)
+                )
+                ramp = 1.0 - (1.0 - decay) * (tau_s / dt_s)
+                slow = decay * slow + (1.0 - decay) * previous + ramp * (x - previous)
+            new[f"slow_{j}"] = slow
+            relaxed = relaxed - fraction * slow
+        return relaxed, new
+
+
+@register
+@dataclass(frozen=True)
+class Hysteresis(Stage):
+    """Rate-free loop: (1 - fraction) f + fraction * play(f).
+
+    The play operator follows the depth f / stiffness with a dead band of full width `width_m`, so that loading and
+    unloading at the same depth differ by fraction * width_m * stiffness. Without contact it returns to zero.
+    """
+
+    name: ClassVar[str] = "hysteresis"
+    domain: ClassVar[str] = "force"
+    rank: ClassVar[int] = 36
+    has_state: ClassVar[bool] = True
+    fraction: float = parameter(0.15, "1", 0.0, 0.3)
+    width_m: float = parameter(2e-4, "m", 5e-5, 5e-4)
+
+    def initial(self, layout: PadLayout, pads: int) -> Traits:
+        return {"play": np.zeros((pads, layout.rows, layout.cols), dtype=np.float32)}
+
+    def step(self, x: torch.Tensor, state: State, frame: Frame) -> tuple[torch.Tensor, State]:
+        half_width = 0.5 * self.width_m * frame.stiffness_n_per_m
+        play = torch.maximum(torch.minimum(state["play"], x + half_width), x - half_width).clamp(min=0.0)
+        play = play * (x > 0)
+        return (1.0 - self.fraction) * x + self.fraction * play, {**state, "play": play}
