@@ -1,4 +1,4 @@
-"""Test-time ablation: touch or vision replaced by its mean over a dataset, to see whether a policy needs it."""
+"""Test-time ablation: touch or vision replaced by its mean over a dataset; does a policy need it?"""
 
 from collections.abc import Callable, Sequence
 from pathlib import Path
@@ -38,8 +38,8 @@ def mean_frame(root: Path, keys: Sequence[str]) -> dict[str, Array]:
 def make_ablation(ablate: str, dataset: Path | None) -> Callable[[Raw], Raw] | None:
     """A function that replaces the ablated part of raw frames (m, ...), or None for ``none``.
 
-    Touch: the pads' counts become the mean counts per taxel; baselines stay. Vision: the depth image becomes the
-    mean depth per pixel.
+    Touch: the pads' counts become the mean counts per taxel; baselines stay. Vision: the depth image becomes
+    the mean depth per pixel.
     """
     if ablate == "none" or dataset is None:
         return None

@@ -30,8 +30,8 @@ SHORTCUTS = ("pair", "clearance_m", "start", "mesh_dir")
 class VtRefineEnvConfig(EnvConfig):
     """Bimanual insertion with four tactile pads and a depth camera, simulated in MuJoCo.
 
-    ``pair``, ``clearance_m``, ``start``, ``mesh_dir`` and ``episode_steps`` are short for the fields of ``scene``
-    and ``rules`` with these names, and win over them.
+    ``pair``, ``clearance_m``, ``start``, ``mesh_dir`` and ``episode_steps`` are short for the fields of
+    ``scene`` and ``rules`` with these names, and win over them.
     """
 
     task: str = "insert the plug into the socket"
@@ -61,17 +61,17 @@ class VtRefineEnvConfig(EnvConfig):
     num_threads: int = 0
     """Threads of the batch backend; 0 uses all cores."""
     vectorization: str = "native"
-    """native: one batched simulation. gym: one simulation per environment, sync or async by --eval.use_async_envs."""
+    """native: one batched simulation. gym: one per environment, sync or async by --eval.use_async_envs."""
     read_every: int = 1
     """Read the sensors for a policy that decides every ``read_every`` steps (its n_action_steps) ..."""
     read_window: int = 1
-    """... from the last ``read_window`` frames (its n_obs_steps); other steps repeat the last sensor frame."""
+    """... from the last ``read_window`` frames (its n_obs_steps); other steps repeat the last one read."""
     ablate: str = "none"
     """none, or touch or vision, replaced by its mean over ``ablate_dataset``."""
     ablate_dataset: Path | None = None
     """Root of the LeRobot dataset whose mean frame the ablation shows."""
     metrics_path: Path | None = None
-    """JSON-lines file that gets one row per finished episode (seed, success, in-hand shift, peak force, ...)."""
+    """JSON-lines file; every finished episode appends seed, success, in-hand shift, peak force, ..."""
     features: dict[str, PolicyFeature] = field(default_factory=dict)
     features_map: dict[str, str] = field(default_factory=env_key_map)
 
@@ -81,7 +81,7 @@ class VtRefineEnvConfig(EnvConfig):
         _check_choice("backend", self.backend, BACKENDS)
         if self.ablate != "none" and self.ablate_dataset is None:
             raise ValueError(
-                f"--env.ablate={self.ablate} needs --env.ablate_dataset, the dataset the policy was trained on"
+                f"--env.ablate={self.ablate} needs --env.ablate_dataset, the policy's training data"
             )
         if self.rules.control_hz != TaskConfig.control_hz:
             raise ValueError("set the control rate with --env.fps, not with --env.rules.control_hz")

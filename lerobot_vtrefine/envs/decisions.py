@@ -21,7 +21,7 @@ Batch = dict[str, Tensor]
 
 
 class Decision(NamedTuple):
-    """What executing one chunk in every environment returned; finished environments repeat their last values."""
+    """What one chunk in every environment led to; finished environments repeat their last values."""
 
     obs: Batch
     """The policy's preprocessed batch, every tensor (n, To, ...)."""
@@ -34,15 +34,15 @@ class Decision(NamedTuple):
     truncated: Tensor
     """(n,) bool: the time was over."""
     info: dict[str, Tensor]
-    """``success`` (n,) bool, ``steps`` (n,) control steps of the episode, and its metrics so far, each (n,)."""
+    """(n,) each: ``success``, ``steps`` (of the episode) and the episode's metrics so far."""
 
 
 class LeRobotDecisionEnv:
     """Batched decisions over ``Episodes`` through a policy's own LeRobot processors.
 
-    A chunk runs its actions in all unfinished environments; sensors are read only after the last ``n_obs_steps``
-    of them, the frames that the next decision sees. Environments that finish are skipped from then on (also by
-    the preprocessor) until they are reset.
+    A chunk runs its actions in all unfinished environments; sensors are read only after the last
+    ``n_obs_steps`` of them, the frames that the next decision sees. Environments that finish are skipped from
+    then on (also by the preprocessor) until they are reset.
 
     Args:
         episodes: The running simulation.
@@ -70,10 +70,10 @@ class LeRobotDecisionEnv:
         self._batch: Batch = {}
 
     def reset(self, seeds: Sequence[int], ids: Array | None = None) -> tuple[Batch, Tensor]:
-        """Start episodes in ``ids`` (all by default) -> (batch of all (n, To, ...), privileged (n, P) float32).
+        """Start episodes in ``ids`` (default all) -> (batch of all (n, To, ...), privileged (n, P)).
 
-        Each episode is a pure function of its seed in ``seeds`` (m,). The first frame fills the whole window, as
-        LeRobot's observation queues do.
+        Each episode is a pure function of its seed in ``seeds`` (m,). The first frame fills the whole window,
+        as LeRobot's observation queues do.
         """
         ids = self.episodes.ids if ids is None else np.asarray(ids)
         if len(seeds) != len(ids):

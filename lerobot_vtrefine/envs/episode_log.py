@@ -36,7 +36,7 @@ class EpisodeLog:
 
 
 def read_episode_log(path: Path, first_seed: int, num_episodes: int) -> list[dict[str, Any]]:
-    """The rows of seeds ``first_seed .. first_seed + num_episodes - 1``, by seed; the latest run of a seed counts.
+    """The rows of seeds ``first_seed .. first_seed + num_episodes - 1``, the latest run of each.
 
     ``lerobot-eval`` fills its last batch with surplus episodes, which this drops.
 

@@ -1,7 +1,8 @@
 """Episode statistics of wide array columns in one pass.
 
-LeRobot builds one 5000-bin histogram per taxel: 0.4 s for a 25-frame episode with four pads, most of the time of
-recording. ``fast_episode_stats`` lends its writer the exact vectorised equivalent while demonstrations are saved.
+LeRobot builds one 5000-bin histogram per taxel: 0.4 s for a 25-frame episode with four pads, most of the time
+of recording. ``fast_episode_stats`` lends its writer the exact vectorised equivalent while demonstrations are
+saved.
 """
 
 from collections.abc import Iterator
@@ -35,7 +36,7 @@ def column_stats(values: Array) -> dict[str, Array]:
 
 
 def episode_stats(episode: dict[str, Any], features: dict[str, Any], *args: Any, **kwargs: Any) -> Stats:
-    """As LeRobot's ``compute_episode_stats``: wide numeric columns here, everything else (images) by LeRobot."""
+    """As LeRobot's ``compute_episode_stats``: wide numeric columns here, the rest by LeRobot."""
     wide = {
         key: value
         for key, value in episode.items()
@@ -49,7 +50,7 @@ def episode_stats(episode: dict[str, Any], features: dict[str, Any], *args: Any,
 
 @contextmanager
 def fast_episode_stats() -> Iterator[None]:
-    """Let LeRobot's dataset writer use ``episode_stats``; without that hook in this LeRobot, change nothing."""
+    """Let LeRobot's dataset writer use ``episode_stats``; where it has no such hook, change nothing."""
     original = getattr(dataset_writer, "compute_episode_stats", None)
     if original is not compute_stats.compute_episode_stats:
         yield

@@ -1,4 +1,4 @@
-"""Episodes of a batched simulation: raw frames at the steps that read them, masks, metrics. No Gymnasium here.
+"""Episodes of a batched simulation: raw frames at the steps that read them, masks, metrics.
 
 ``n`` environments, ``m`` of them addressed by ``ids``; arrays are numpy.
 """

@@ -11,7 +11,7 @@ from lerobot_vtrefine.envs.vector_env import Observation, VtRefineVectorEnv
 
 
 class VtRefineEnv(gym.Env[Observation, Array]):
-    """One insertion episode at a time; observations as in ``VtRefineVectorEnv`` without the leading dimension."""
+    """One insertion episode at a time; observations of ``VtRefineVectorEnv`` without the leading ``n``."""
 
     def __init__(self, config: VtRefineEnvConfig) -> None:
         self._batch = VtRefineVectorEnv(config, num_envs=1)

@@ -22,11 +22,13 @@ SEED_LIMIT = 2**31
 class VtRefineVectorEnv(gym.vector.VectorEnv[Observation, Array, Array]):
     """``num_envs`` insertion episodes stepped together.
 
-    - ``reset(seed=[...])``: each episode is a pure function of its seed; ``options={"reset_mask": (n,) bool}``
+    - ``reset(seed=[...])``: each episode is a pure function of its seed; ``options={"reset_mask": (n,)
+    bool}``
       restarts only those environments.
     - There is no autoreset: a finished environment costs nothing, repeats its last observation and flags with
       reward 0, and waits for a reset. This is what ``lerobot-eval`` needs.
-    - ``info["is_success"]`` is (n,) bool; ``info["final_info"]`` appears in steps in which an episode ends and
+    - ``info["is_success"]`` is (n,) bool; ``info["final_info"]`` appears in steps in which an episode ends
+    and
       holds the same plus the metrics of finished episodes.
     - Observations are those of ``datasets.features.env_observation_shapes`` with a leading ``n``.
     """
@@ -81,7 +83,7 @@ class VtRefineVectorEnv(gym.vector.VectorEnv[Observation, Array, Array]):
         return self._observation(), result.reward, result.terminated, result.truncated, self._info(result)
 
     def call(self, name: str, *args: Any, **kwargs: Any) -> Sequence[Any]:
-        """Gymnasium's per-environment call; ``render`` gives frames lazily, so a slice renders only itself."""
+        """Gymnasium's per-environment call; ``render`` is lazy, so that a slice renders only itself."""
         if name == "render":
             return LazyFrames(self.render_env, self.num_envs)
         return self.get_attr(name)
@@ -126,12 +128,15 @@ class VtRefineVectorEnv(gym.vector.VectorEnv[Observation, Array, Array]):
         return np.array([d if s is None else s for s, d in zip(seed, drawn, strict=True)], np.int64)
 
     def _observation(self) -> Observation:
-        return raw_to_env_observation(self.episodes.raw)
+        # Copies: the raw frames change in place, and callers keep observations.
+        observation = raw_to_env_observation(self.episodes.raw)
+        return {key: np.array(value) for key, value in observation.items()}
 
     def _info(self, result: Transition) -> dict[str, Any]:
         info: dict[str, Any] = {"is_success": result.success}
         if len(result.finished):
-            info["final_info"] = {**self.episodes.metrics, "is_success": result.success.copy()}
+            metrics = {name: values.copy() for name, values in self.episodes.metrics.items()}
+            info["final_info"] = {**metrics, "is_success": result.success.copy()}
             info["_final_info"] = np.isin(np.arange(self.num_envs), result.finished)
         return info
 

@@ -1,4 +1,4 @@
-"""A stand-in for the simulation: joints go where they are told, an episode succeeds after a seed-dependent time."""
+"""A stand-in for the simulation: joints go where they are told, success comes after a seed-dependent time."""
 
 from dataclasses import dataclass
 
@@ -16,7 +16,7 @@ class FakeResult:
 
 
 class FakeSim:
-    """Interface of ``InsertionSim``; episode ``seed`` succeeds after ``3 + seed % 5`` steps, odd seeds never do."""
+    """As ``InsertionSim``; the episode of ``seed`` succeeds after ``3 + seed % 5`` steps, odd seeds never do."""
 
     noise_level = 3.0
 

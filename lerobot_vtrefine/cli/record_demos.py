@@ -1,0 +1,134 @@
+"""``vtrefine-record-demos``: the scripted expert's episodes as a LeRobotDataset v3.
+
+``vtrefine-record-demos --config_path=configs/env/round_grasped.yaml --root=outputs/demos --num_episodes=60``
+"""
+
+import logging
+from dataclasses import asdict, dataclass, field
+from pathlib import Path
+from typing import Any
+
+import datasets
+from lerobot.configs import parser
+from lerobot.configs.default import EvalConfig
+from lerobot.envs.configs import EnvConfig
+from lerobot.utils.utils import init_logging
+from tqdm import tqdm
+
+from lerobot_vtrefine.cli.errors import run_cli
+from lerobot_vtrefine.datasets.features import dataset_features
+from lerobot_vtrefine.embodiments import get_embodiment
+from lerobot_vtrefine.envs import VtRefineEnvConfig
+from lerobot_vtrefine.envs.demo_dataset import DemoDataset
+from lerobot_vtrefine.envs.demo_workers import demonstration_stream
+from lerobot_vtrefine.sim.demonstrations import Degradation
+
+HOPELESS_ATTEMPTS = 100
+"""Attempts without a single success after which recording gives up."""
+
+
+@dataclass
+class RecordDemosConfig:
+    """Flags of ``vtrefine-record-demos``."""
+
+    root: Path
+    """Folder of the dataset; an interrupted recording in it is continued."""
+    repo_id: str = "local/vtrefine_demos"
+    """LeRobot's name of the dataset."""
+    num_episodes: int = 50
+    """Episodes that the dataset shall hold."""
+    seed: int = 0
+    """Seed of the first attempt; attempt i has seed + i."""
+    num_envs: int = 16
+    """Episodes simulated at once, per process."""
+    num_workers: int = 0
+    """Simulation processes beside the one that writes; 0 simulates in this one."""
+    include_failures: bool = False
+    """Keep failed episodes too."""
+    env: EnvConfig = field(default_factory=VtRefineEnvConfig)
+    degradation: Degradation = field(default_factory=Degradation)
+    """Errors of the expert; all zero is the clean one."""
+    eval: EvalConfig = field(default_factory=EvalConfig)
+    """Unused; lets files of configs/env serve this command too."""
+
+    def __post_init__(self) -> None:
+        for name, lowest in (("num_episodes", 1), ("num_envs", 1), ("num_workers", 0), ("seed", 0)):
+            if getattr(self, name) < lowest:
+                raise ValueError(f"--{name} must be at least {lowest}, got {getattr(self, name)}")
+        if not isinstance(self.env, VtRefineEnvConfig):
+            raise ValueError(f"--env.type={self.env.type} has no scripted expert; use --env.type=vtrefine")
+
+    def settings(self) -> dict[str, Any]:
+        """What determines the episodes."""
+        env = self.env
+        assert isinstance(env, VtRefineEnvConfig)
+        return {
+            "scene": _plain(asdict(env.scene_config)),
+            "rules": asdict(env.task_config),
+            "randomization": asdict(env.randomization),
+            "sensor_model": env.sensor_model,
+            "task": env.task,
+            "degradation": asdict(self.degradation),
+            "seed": self.seed,
+            "include_failures": self.include_failures,
+        }
+
+
+def record(config: RecordDemosConfig) -> None:
+    """Simulate and save until the dataset holds ``num_episodes`` episodes.
+
+    Raises:
+        ValueError: if the first ``HOPELESS_ATTEMPTS`` attempts all fail.
+        OSError: if the disk is full.
+    """
+    env = config.env
+    assert isinstance(env, VtRefineEnvConfig)
+    features = dataset_features(*env.camera_size, get_embodiment(env.scene_config.embodiment).joint_names)
+    with DemoDataset(
+        config.root, config.repo_id, env.fps, features, env.task, config.settings(), config.seed
+    ) as demos:
+        if demos.num_episodes >= config.num_episodes:
+            logging.info("%s already holds %d episodes", config.root, demos.num_episodes)
+            return
+        workers = demonstration_stream(
+            env, config.degradation, config.num_envs, demos.next_seed, config.num_workers
+        )
+        progress = tqdm(total=config.num_episodes, initial=demos.num_episodes, unit="episode")
+        with workers as stream, progress:
+            for demonstration in stream:
+                seed = demonstration.row["seed"]
+                if demonstration.row["success"] or config.include_failures:
+                    demos.append(demonstration)
+                    progress.update()
+                else:
+                    demos.skip(seed)
+                attempts = seed + 1 - config.seed
+                progress.set_postfix_str(f"{demos.num_episodes} of {attempts} attempts")
+                if demos.num_episodes >= config.num_episodes:
+                    return
+                if demos.num_episodes == 0 and attempts >= HOPELESS_ATTEMPTS:
+                    raise ValueError(
+                        f"none of {attempts} attempts succeeded; use smaller --degradation.* errors,"
+                        " a larger --env.clearance_m, or --include_failures=true"
+                    )
+
+
+def _plain(values: dict[str, Any]) -> dict[str, Any]:
+    return {key: str(value) if isinstance(value, Path) else value for key, value in values.items()}
+
+
+@parser.wrap()
+def _main(config: RecordDemosConfig) -> None:
+    record(config)
+
+
+@run_cli
+def main() -> None:
+    """Console entry point."""
+    init_logging()
+    datasets.disable_progress_bars()
+    _main()
+
+
+if __name__ == "__main__":
+    raise SystemExit(main())

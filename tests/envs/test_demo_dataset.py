@@ -1,0 +1,177 @@
+import errno
+import json
+import shutil
+from pathlib import Path
+
+import numpy as np
+import pytest
+from lerobot.datasets import LeRobotDataset
+
+from lerobot_vtrefine.datasets.features import (
+    ACTION_KEY,
+    DEPTH_KEY,
+    STATE_KEY,
+    TACTILE_KEYS,
+    dataset_features,
+)
+from lerobot_vtrefine.envs import demo_dataset
+from lerobot_vtrefine.envs.demo_dataset import DemoDataset
+from lerobot_vtrefine.envs.demonstrations import Demonstration
+
+HEIGHT, WIDTH = 6, 8
+
+
+def demonstration(seed: int, steps: int = 3) -> Demonstration:
+    rng = np.random.default_rng(seed)
+    raw = {
+        "state": rng.normal(size=(steps, 16)).astype(np.float32),
+        "tactile": rng.integers(0, 255, (steps, 4, 384), np.uint8),
+        "tactile_baseline": np.zeros((steps, 4, 384), np.uint8),
+        "depth_mm": rng.integers(0, 60000, (steps, HEIGHT, WIDTH)).astype(np.uint16),
+        "camera_intrinsics": np.ones((steps, 4), np.float32),
+        "camera_pose": np.ones((steps, 7), np.float32),
+        "noise_level": np.full((steps, 1), 3, np.float32),
+    }
+    actions = rng.normal(size=(steps, 16)).astype(np.float32)
+    return Demonstration(raw, actions, {"seed": seed, "steps": steps, "success": True})
+
+
+def open_recording(root: Path, **changes) -> DemoDataset:
+    settings = {"pair": "round", **changes}
+    return DemoDataset(
+        root, "local/demo", 10, dataset_features(HEIGHT, WIDTH), "insert", settings, first_seed=0
+    )
+
+
+def read(root: Path) -> LeRobotDataset:
+    return LeRobotDataset("local/demo", root=root)
+
+
+@pytest.fixture
+def small_commits(monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.setattr(demo_dataset, "COMMIT_EVERY", 2)
+
+
+def test_frames_come_back_exactly_across_commits(tmp_path, small_commits):
+    root = tmp_path / "demo"
+    with open_recording(root) as demos:
+        for seed in range(5):
+            demos.append(demonstration(seed))
+    dataset = read(root)
+    assert dataset.num_episodes == 5
+    assert dataset.num_frames == 15
+    for seed in range(5):
+        for step in range(3):
+            item, wanted = dataset[seed * 3 + step], demonstration(seed)
+            assert np.array_equal(item[ACTION_KEY], wanted.actions[step])
+            assert np.array_equal(item[STATE_KEY], wanted.raw["state"][step])
+            assert np.array_equal(item[TACTILE_KEYS[2]], wanted.raw["tactile"][step, 2])
+            assert np.array_equal(item[DEPTH_KEY][0], wanted.raw["depth_mm"][step])
+            assert item["episode_index"] == seed
+    assert sorted(path.name for path in (root / "meta").iterdir()) == [
+        "episodes",
+        "info.json",
+        "recording.json",
+        "stats.json",
+        "tasks.parquet",
+    ]
+
+
+def test_continuing_gives_the_same_dataset_as_one_go(tmp_path):
+    with open_recording(tmp_path / "once") as demos:
+        for seed in range(4):
+            demos.append(demonstration(seed))
+    for part in (range(2), range(2, 4)):
+        with open_recording(tmp_path / "twice") as demos:
+            assert demos.num_episodes == demos.next_seed == part.start
+            for seed in part:
+                demos.append(demonstration(seed))
+    once, twice = read(tmp_path / "once"), read(tmp_path / "twice")
+    assert len(once) == len(twice) == 12
+    for index in range(12):
+        for key, value in once[index].items():
+            assert np.array_equal(value, twice[index][key]), key
+    for key, stats in once.meta.stats.items():
+        assert stats["mean"] == pytest.approx(twice.meta.stats[key]["mean"], rel=1e-5), key
+
+
+def test_seeds_are_kept_beside_the_dataset_and_never_in_info(tmp_path):
+    with open_recording(tmp_path / "demo") as demos:
+        demos.append(demonstration(0))
+        demos.skip(1)
+        demos.append(demonstration(2))
+        demos.skip(3)
+    ledger = json.loads((tmp_path / "demo/meta/recording.json").read_text())
+    assert [row["seed"] for row in ledger["episodes"]] == [0, 2]
+    assert open_recording(tmp_path / "demo").next_seed == 4
+    assert "seed" not in (tmp_path / "demo/meta/info.json").read_text()
+
+
+@pytest.mark.parametrize(
+    "where", ["lerobot.datasets.dataset_writer.write_image", "pyarrow.parquet.ParquetWriter.write_table"]
+)
+def test_full_disk_keeps_what_was_committed(tmp_path, small_commits, monkeypatch, where):
+    root = tmp_path / "demo"
+    recording = open_recording(root)
+    with pytest.raises(OSError, match="4 episodes saved .* stay readable"), recording as demos:
+        for seed in range(5):
+            demos.append(demonstration(seed))
+
+        def full(*args, **kwargs):
+            raise OSError(errno.ENOSPC, "No space left on device")
+
+        with monkeypatch.context() as broken:
+            broken.setattr(where, full)
+            broken.setattr(demo_dataset, "IMAGE_WRITER_THREADS", 0)
+            demos._dataset.writer.stop_image_writer()
+            demos.append(demonstration(5))
+    assert read(root).num_episodes == 4
+    assert len([read(root)[index] for index in range(12)]) == 12
+    with open_recording(root) as demos:
+        assert demos.next_seed == 4
+        demos.append(demonstration(4))
+    assert read(root).num_episodes == 5
+    assert np.array_equal(read(root)[14][ACTION_KEY], demonstration(4).actions[2])
+
+
+def test_a_killed_recording_continues_from_its_last_commit(tmp_path, small_commits):
+    root = tmp_path / "demo"
+    demos = open_recording(root)
+    for seed in range(3):
+        demos.append(demonstration(seed))
+    shutil.copytree(root, tmp_path / "killed")  # the disk as a power failure leaves it
+    with open_recording(tmp_path / "killed") as again:
+        assert again.next_seed == 2
+        again.append(demonstration(2))
+    assert read(tmp_path / "killed").num_episodes == 3
+    demos.rollback()
+
+
+def test_interrupt_while_simulating_keeps_every_saved_episode(tmp_path):
+    with pytest.raises(KeyboardInterrupt), open_recording(tmp_path / "demo") as demos:
+        for seed in range(3):
+            demos.append(demonstration(seed))
+        raise KeyboardInterrupt
+    assert read(tmp_path / "demo").num_episodes == 3
+
+
+def test_full_disk_before_the_first_commit_leaves_nothing(tmp_path, monkeypatch):
+    def full(*args, **kwargs):
+        raise OSError(errno.ENOSPC, "No space left on device")
+
+    monkeypatch.setattr(LeRobotDataset, "save_episode", full)
+    with pytest.raises(OSError, match="disk is full"), open_recording(tmp_path / "demo") as demos:
+        demos.append(demonstration(0))
+    assert not (tmp_path / "demo").exists()
+
+
+def test_other_settings_and_foreign_folders_are_refused(tmp_path):
+    with open_recording(tmp_path / "demo") as demos:
+        demos.append(demonstration(0))
+    with pytest.raises(ValueError, match="other settings \\(pair\\)"):
+        open_recording(tmp_path / "demo", pair="square")
+    (tmp_path / "notes").mkdir()
+    (tmp_path / "notes" / "x.txt").write_text("mine")
+    with pytest.raises(FileExistsError, match="--root"):
+        open_recording(tmp_path / "notes")
+    assert (tmp_path / "notes" / "x.txt").read_text() == "mine"

@@ -1,0 +1,192 @@
+import numpy as np
+import pytest
+import torch
+from fake_sim import FakeSim
+from lerobot.envs.utils import preprocess_observation
+
+from lerobot_vtrefine.datasets.features import DEPTH_KEY, STATE_KEY, TACTILE_KEYS
+from lerobot_vtrefine.envs import VtRefineEnvConfig
+from lerobot_vtrefine.envs.episode_log import EpisodeLog, read_episode_log
+from lerobot_vtrefine.envs.episodes import Episodes
+from lerobot_vtrefine.envs.schedule import ReadSchedule
+from lerobot_vtrefine.envs.vector_env import LazyFrames, VtRefineVectorEnv
+
+
+@pytest.fixture
+def make_env(monkeypatch: pytest.MonkeyPatch):
+    def make(num_envs: int, log: EpisodeLog | None = None, **settings) -> VtRefineVectorEnv:
+        monkeypatch.setattr(
+            "lerobot_vtrefine.envs.vector_env.make_episodes",
+            lambda config, n: Episodes(FakeSim(n), log=log),
+        )
+        return VtRefineVectorEnv(VtRefineEnvConfig(start="grasped", **settings), num_envs)
+
+    return make
+
+
+def hold(env: VtRefineVectorEnv) -> np.ndarray:
+    return np.zeros((env.num_envs, 16), np.float32)
+
+
+def test_reset_is_a_function_of_each_seed(make_env):
+    env = make_env(3)
+    first, _ = env.reset(seed=[7, 4, 9])
+    again, _ = env.reset(seed=[4, 9, 7])
+    for key, value in first.items():
+        assert np.array_equal(value[[1, 2, 0]], again[key]), key
+
+
+def test_reset_without_seeds_draws_different_ones(make_env):
+    env = make_env(4)
+    env.reset(seed=3)
+    assert env.episodes.seeds.tolist() == [3, 4, 5, 6]
+    env.reset()
+    drawn = env.episodes.seeds.tolist()
+    assert len(set(drawn)) == 4
+    env.reset(seed=3)
+    env.reset()
+    assert env.episodes.seeds.tolist() == drawn
+
+
+def test_masked_reset_leaves_the_others_alone(make_env):
+    env = make_env(3)
+    env.reset(seed=[0, 2, 4])
+    for _ in range(2):
+        env.step(hold(env))
+    env.reset(seed=[8, 8, 8], options={"reset_mask": np.array([False, True, False])})
+    assert env.episodes.seeds.tolist() == [0, 8, 4]
+    assert env.episodes.steps.tolist() == [2, 0, 2]
+
+
+def test_finished_environments_are_not_stepped_and_repeat_their_flags(make_env):
+    env = make_env(2)
+    env.reset(seed=[0, 1])  # the first succeeds at step 3, the second runs out of time at step 10
+    history = [env.step(hold(env)) for _ in range(12)]
+    sim = env.episodes.sim
+    assert [ids.tolist() for ids in sim.stepped] == [[0, 1]] * 3 + [[1]] * 7
+    rewards = np.array([step[1] for step in history])
+    assert rewards.sum(0).tolist() == [1.0, 0.0]
+    assert rewards[2, 0] == 1.0
+    assert [bool(step[2][0]) for step in history] == [False] * 2 + [True] * 10
+    assert [bool(step[3][1]) for step in history] == [False] * 9 + [True] * 3
+    assert np.array_equal(history[2][0]["agent_pos"][0], history[-1][0]["agent_pos"][0])
+
+
+def test_info_follows_lerobots_format(make_env):
+    env = make_env(2)
+    _, info = env.reset(seed=[0, 1])
+    assert info["is_success"].tolist() == [False, False]
+    infos = [env.step(hold(env))[4] for _ in range(10)]
+    assert ["final_info" in info for info in infos] == [False] * 2 + [True] + [False] * 6 + [True]
+    assert infos[2]["final_info"]["is_success"].tolist() == [True, False]
+    assert infos[2]["_final_info"].tolist() == [True, False]
+    assert infos[9]["is_success"].tolist() == [True, False]
+    assert infos[2]["final_info"]["in_hand_shift_m"][0] == 1e-3
+
+
+def test_observations_fit_the_space_and_the_dataset_keys(make_env, monkeypatch):
+    env = make_env(2)
+    monkeypatch.setattr("fake_sim.HEIGHT", 60)
+    monkeypatch.setattr("fake_sim.WIDTH", 80)
+    observation, _ = env.reset(seed=[0, 1])
+    assert set(observation) == set(env.observation_space.spaces)
+    for key, space in env.observation_space.spaces.items():
+        assert observation[key].shape == space.shape, key
+        assert observation[key].dtype == space.dtype, key
+    features = {env.config.features_map[key]: ft for key, ft in env.config.features.items()}
+    batch = preprocess_observation(observation)
+    assert set(batch) == set(features) - {"action"}
+    assert batch[STATE_KEY].shape == (2, 16)
+    assert batch[TACTILE_KEYS[0]].shape == (2, 384)
+    assert batch[DEPTH_KEY].shape == (2, 1, 60, 80)
+    assert all(value.dtype == torch.float32 for value in batch.values())
+
+
+@pytest.mark.parametrize(
+    ("every", "window", "read"), [(1, 1, range(17)), (8, 2, [0, 7, 8, 15, 16]), (4, 1, [0, 4, 8, 12, 16])]
+)
+def test_read_schedule(every: int, window: int, read):
+    assert np.flatnonzero(ReadSchedule(every, window).reads(np.arange(17))).tolist() == list(read)
+
+
+def test_read_schedule_rejects_a_window_longer_than_its_period():
+    with pytest.raises(ValueError, match="read_window"):
+        VtRefineEnvConfig(read_every=2, read_window=3)
+
+
+def test_unread_steps_keep_the_last_frame_but_show_fresh_joints(make_env):
+    env = make_env(1, read_every=8, read_window=2)
+    env.reset(seed=[1])
+    sim = env.episodes.sim
+    stamps, joints = [], []
+    for step in range(9):
+        observation, *_ = env.step(np.full((1, 16), step, np.float32))
+        stamps.append(int(observation["tactile.left_arm_left_finger"][0, 0]))
+        joints.append(float(observation["agent_pos"][0, 0]))
+    assert stamps == [1] * 6 + [8, 9, 9]
+    assert joints == list(range(9))
+    assert len(sim.observed) == 3  # reset, steps 7 and 8
+
+
+def test_metrics_log_has_a_row_per_episode(make_env, tmp_path):
+    path = tmp_path / "deep" / "episodes.jsonl"
+    env = make_env(4, log=EpisodeLog(path))
+    for start in (0, 4):
+        env.reset(seed=list(range(start, start + 4)))
+        for _ in range(10):
+            env.step(hold(env))
+    rows = read_episode_log(path, first_seed=0, num_episodes=6)  # seeds 6 and 7 filled the last batch
+    assert [row["seed"] for row in rows] == list(range(6))
+    assert [row["success"] for row in rows] == [True, False] * 3
+    assert rows[2]["steps"] == 5
+    assert rows[2]["time_to_success_s"] == pytest.approx(0.5)
+    assert rows[1]["time_to_success_s"] is None
+
+
+def test_missing_metrics_log_names_the_flag(tmp_path):
+    with pytest.raises(FileNotFoundError, match="--env.metrics_path"):
+        read_episode_log(tmp_path / "none.jsonl", 0, 1)
+
+
+def test_calls_that_lerobot_eval_makes(make_env):
+    env = make_env(3)
+    assert env.call("_max_episode_steps") == (40, 40, 40)
+    assert env.call("task_description") == (env.config.task,) * 3
+    assert env.unwrapped.metadata["render_fps"] == 10
+    with pytest.raises(AttributeError):
+        env.get_attr("nonsense")
+
+
+def test_lazy_frames_render_only_what_is_taken():
+    rendered = []
+
+    def render(index: int) -> np.ndarray:
+        rendered.append(index)
+        return np.full((2, 2, 3), index, np.uint8)
+
+    frames = LazyFrames(render, 64)
+    assert np.stack(frames[:2]).shape == (2, 2, 2, 3)
+    assert rendered == [0, 1]
+    assert len(frames) == 64
+    assert frames[-1][0, 0, 0] == 63
+
+
+def test_environment_can_be_reset_after_close(make_env):
+    env = make_env(1)
+    env.reset(seed=[0])
+    env.close()
+    env.reset(seed=[2])
+    assert env.episodes.seeds.tolist() == [2]
+
+
+def test_bad_calls_are_named(make_env):
+    env = make_env(2)
+    with pytest.raises(Exception, match="reset"):
+        env.step(hold(env))
+    with pytest.raises(ValueError, match="2 seeds"):
+        make_env(3).reset(seed=[1, 2])
+    env.reset(seed=[0, 1])
+    with pytest.raises(ValueError, match=r"\(2, 16\)"):
+        env.step(np.zeros((2, 14)))
+    with pytest.raises(ValueError, match="reset_mask"):
+        env.reset(options={"reset_mask": np.ones(3, bool)})
