@@ -12,11 +12,17 @@ from lerobot_vtrefine.tactile.layout import PadLayout
 from lerobot_vtrefine.tactile.model import SensorModel
 from lerobot_vtrefine.tactile.stages.base import Frame, Stage, State
 from lerobot_vtrefine.tactile.stages.contact import ContactStage
+from lerobot_vtrefine.tactile.stages.readout import Gain
 
 if TYPE_CHECKING:
     from lerobot_vtrefine.tactile.contact_query import ContactQuery
 
 ArrayLike = np.ndarray | torch.Tensor
+
+
+def _per_env(values: torch.Tensor) -> torch.Tensor:
+    """(m,) so that it broadcasts against (m, P, R, C)."""
+    return values.view(-1, 1, 1, 1)
 
 
 class PadSensors:
@@ -92,6 +98,29 @@ class PadSensors:
                 )
             state[key][env] = tensor
 
+    def get_state(self, env: int) -> dict[str, Any]:
+        """Everything that one environment's next readings depend on, apart from its poses; a deep copy."""
+        stages = {name: {key: value[env].clone() for key, value in state.items()} for name, state in self._state.items()}
+        scalars = {"time_s": self._time_s, "stiffness_scale": self._stiffness_scale, "gain_scale": self._gain_scale}
+        return {
+            "stages": stages,
+            "parameters": {key: float(values[env]) for key, values in self._parameters.items()},
+            "baseline": self.baseline[env].copy(),
+            **{name: float(values[env]) for name, values in scalars.items()},
+        }
+
+    def set_state(self, env: int, state: dict[str, Any]) -> None:
+        """Inverse of `get_state`, for any environment of a `PadSensors` with the same layout and model."""
+        for name, values in state["stages"].items():
+            for key, value in values.items():
+                self._state[name][key][env] = value
+        for (stage, parameter), value in state["parameters"].items():
+            self._own_parameter(f"{stage}.{parameter}")[env] = value
+        self._time_s[env] = state["time_s"]
+        self._stiffness_scale[env] = state["stiffness_scale"]
+        self._gain_scale[env] = state["gain_scale"]
+        self.baseline[env] = state["baseline"]
+
     def randomize(
         self,
         ids: np.ndarray,
@@ -137,22 +166,24 @@ class PadSensors:
     def _specialised(self, stage: Stage, index: torch.Tensor) -> Stage:
         """The stage with each environment's own parameters, shaped (m, 1, 1, 1)."""
         own: dict[str, Any] = {
-            parameter: values[index].view(-1, 1, 1, 1)
+            parameter: _per_env(values[index])
             for (name, parameter), values in self._parameters.items()
             if name == stage.name
         }
+        if isinstance(stage, Gain):
+            own["counts_per_n"] = own.get("counts_per_n", stage.counts_per_n) * _per_env(self._gain_scale[index])
         return dataclasses.replace(stage, **own) if own else stage
 
     def _contact_stage(self, index: torch.Tensor) -> ContactStage:
         stage = self._specialised(self.model.contact, index)
-        return stage.scaled(self._stiffness_scale[index].view(-1, 1, 1, 1))
+        return stage.scaled(_per_env(self._stiffness_scale[index]))
 
     def _frame(self, index: torch.Tensor, dt_s: float) -> Frame:
         contact = self.model.contact
         return Frame(
             layout=self.layout,
             dt_s=dt_s,
-            time_s=self._time_s[index].view(-1, 1, 1, 1),
+            time_s=_per_env(self._time_s[index]),
             stiffness_n_per_m=self._contact_stage(index).stiffness(self.layout),
             load_conserving=contact.load_conserving,
         )

@@ -182,6 +182,7 @@ class BaselineDrift(Stage):
     name: ClassVar[str] = "baseline_drift"
     domain: ClassVar[str] = "counts"
     rank: ClassVar[int] = 62
+    has_state: ClassVar[bool] = True  # The clock advances with the frames, so none may be left out.
     rate_counts_per_s: float = parameter(0.0, "counts/s", -3e-3, 3e-3, minimum=None)
 
     def step(self, x: torch.Tensor, state: State, frame: Frame) -> tuple[torch.Tensor, State]:
