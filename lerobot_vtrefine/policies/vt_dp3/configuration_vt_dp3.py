@@ -149,6 +149,16 @@ class VtDp3Config(PreTrainedConfig):
             )
 
     @property
+    def state_dim(self) -> int:
+        """Joint positions per frame; known once the features are."""
+        return (self.input_features or {})[STATE_KEY].shape[0]
+
+    @property
+    def action_dim(self) -> int:
+        """Joint targets per action; known once the features are."""
+        return (self.output_features or {})[ACTION_KEY].shape[0]
+
+    @property
     def timesteps(self) -> tuple[int, ...]:
         """Training steps visited at inference."""
         return step_grid(self.sampler, self.num_train_timesteps, self.num_inference_steps, self.prefix_steps)

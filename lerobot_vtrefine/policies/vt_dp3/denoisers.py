@@ -16,6 +16,8 @@ DENOISERS = ("unet", "mlp")
 class TimeEmbedding(nn.Module):
     """Diffusion step -> features: (B,) -> (B, dim); sinusoids, then a two-layer MLP."""
 
+    rates: Tensor
+
     def __init__(self, dim: int) -> None:
         super().__init__()
         rates = torch.exp(torch.arange(dim // 2) * (-math.log(1e4) / (dim // 2 - 1)))

@@ -26,6 +26,7 @@ class Ema(nn.Module):
     @torch.no_grad()
     def update(self, average: nn.Module, trained: nn.Module) -> None:
         """average <- decay * average + (1 - decay) * trained, in place."""
-        old, new = list(average.parameters()), list(trained.parameters())
+        old: list[torch.Tensor] = list(average.parameters())
+        new: list[torch.Tensor] = list(trained.parameters())
         torch._foreach_lerp_(old, new, 1 - self.decay)
         self.step += 1

@@ -66,8 +66,8 @@ class VtDp3Policy(PreTrainedPolicy):
     last ``config.ft_denoising_steps``.
     """
 
-    config_class = VtDp3Config
-    name = "vt_dp3"
+    config_class = VtDp3Config  # ty: ignore[invalid-assignment]
+    name = "vt_dp3"  # ty: ignore[invalid-assignment]
 
     def __init__(
         self, config: VtDp3Config, dataset_stats: dict[str, Any] | None = None, dataset_meta: Any = None
@@ -82,8 +82,7 @@ class VtDp3Policy(PreTrainedPolicy):
             # hook.
             widen_narrow_ranges(dataset_stats)
         self.config: VtDp3Config = config
-        state, action = config.input_features[STATE_KEY], config.output_features[ACTION_KEY]
-        self.model = VtDp3Model(config, state.shape[0], action.shape[0])
+        self.model = VtDp3Model(config, config.state_dim, config.action_dim)
         self.base: VtDp3Model | None = None
         self.online: VtDp3Model | None = None
         self.ema: Ema | None = None
@@ -110,11 +109,6 @@ class VtDp3Policy(PreTrainedPolicy):
         """The diffusion process that deployment and DPPO use."""
         config = self.config
         return DiffusionProcess(config.num_train_timesteps, config.timesteps, config.clip_sample_range)
-
-    @property
-    def action_dim(self) -> int:
-        """D."""
-        return self.config.output_features[ACTION_KEY].shape[0]
 
     # Training
 
@@ -223,7 +217,7 @@ class VtDp3Policy(PreTrainedPolicy):
     def sample_actions(self, batch: Batch, noise: Tensor | None = None) -> Tensor:
         """The whole horizon (B, H, D) from stacked frames (B, To, ...): deterministic given ``noise``."""
         cond = self.model.encode(batch)
-        shape = (len(cond), self.config.horizon, self.action_dim)
+        shape = (len(cond), self.config.horizon, self.config.action_dim)
         if noise is None:
             noise = torch.randn(shape, device=cond.device, dtype=cond.dtype)
         base: PredictNoise | None = None

@@ -15,6 +15,9 @@ class PointEncoder(nn.Module):
     Every hidden Linear is followed by LayerNorm and ReLU, the last one by nothing.
     """
 
+    offset: Tensor
+    inverse_scale: Tensor
+
     def __init__(
         self, dims: tuple[int, ...], out_dim: int, center_m: tuple[float, float, float], scale_m: float
     ) -> None:

@@ -5,6 +5,7 @@ The same pipeline, saved with the checkpoint, serves training batches (B, To, ..
 ...) and robot frames; so all of them see the same cloud.
 """
 
+from collections.abc import Sequence
 from dataclasses import asdict, dataclass, field
 from typing import Any
 
@@ -79,8 +80,7 @@ class VisuoTactileProcessorStep(ObservationProcessorStep):
 
     def __post_init__(self) -> None:
         if isinstance(self.observation_config, dict):  # as loaded from a saved pipeline
-            values = {k: tuple(v) if isinstance(v, list) else v for k, v in self.observation_config.items()}
-            self.observation_config = VisuoTactileConfig(**values)
+            self.observation_config = _loaded_config(self.observation_config)
         self.observation_config.validate()
 
     def observation(self, observation: dict[str, Any]) -> dict[str, Any]:
@@ -127,13 +127,19 @@ class VisuoTactileProcessorStep(ObservationProcessorStep):
         return {**features, PipelineFeatureType.OBSERVATION: kept}
 
 
+def _loaded_config(values: dict[str, Any]) -> VisuoTactileConfig:
+    """The configuration from its JSON form, where tuples have become lists."""
+    fields: dict[str, Any] = {k: tuple(v) if isinstance(v, list) else v for k, v in values.items()}
+    return VisuoTactileConfig(**fields)
+
+
 def _require(observation: dict[str, Any], key: str) -> Tensor:
     if key not in observation:
         raise ValueError(f"the observation lacks '{key}', which vt_dp3 builds its point cloud from")
     return torch.as_tensor(observation[key])
 
 
-def _pads(observation: dict[str, Any], keys: tuple[str, ...], lead: torch.Size) -> Tensor:
+def _pads(observation: dict[str, Any], keys: tuple[str, ...], lead: Sequence[int]) -> Tensor:
     """Counts of all pads, (*lead, P, 384)."""
     return torch.stack([_require(observation, key).reshape(*lead, -1) for key in keys], dim=-2)
 
@@ -145,20 +151,21 @@ def make_vt_dp3_pre_post_processors(
     if dataset_stats:
         widen_narrow_ranges(dataset_stats)
         dataset_stats = {key: dataset_stats[key] for key in (STATE_KEY, ACTION_KEY) if key in dataset_stats}
+    norm_map = {FeatureType(kind): mode for kind, mode in config.normalization_mapping.items()}
     normalizer = NormalizerProcessorStep(
         features={**(config.input_features or {}), **(config.output_features or {})},
-        norm_map=config.normalization_mapping,
+        norm_map=norm_map,
         stats=dataset_stats,
         normalize_observation_keys={STATE_KEY},
     )
     unnormalizer = UnnormalizerProcessorStep(
-        features=config.output_features or {}, norm_map=config.normalization_mapping, stats=dataset_stats
+        features=config.output_features or {}, norm_map=norm_map, stats=dataset_stats
     )
     return make_policy_processor_pipelines(
         input_steps=[
             RenameObservationsProcessorStep(rename_map={}),
             AddBatchDimensionProcessorStep(),
-            DeviceProcessorStep(device=config.device),
+            DeviceProcessorStep(device=config.device or "cpu"),
             VisuoTactileProcessorStep(config.observation, config.modalities),
             normalizer,
         ],
