@@ -10,6 +10,8 @@ import draccus
 
 TIMEOUTS = ("terminal", "bootstrap")
 ENCODERS = ("trained", "frozen")
+MIN_LOG_PROB_STD = 0.055
+"""Where a Gaussian's peak density reaches the upper end of diffusion.LOG_PROB_RANGE."""
 
 
 @dataclass(frozen=True)
@@ -99,9 +101,14 @@ class DppoConfig(draccus.ChoiceRegistry):
             "clip",
             "clip_first",
         )
-        for name in (*positive, "min_log_prob_std", "gamma", "actor_lr", "critic_lr"):
+        for name in (*positive, "gamma", "actor_lr", "critic_lr"):
             if getattr(self, name) <= 0:
                 raise ValueError(f"--dppo.{name} must be positive, got {getattr(self, name)}")
+        if self.min_log_prob_std < MIN_LOG_PROB_STD:
+            raise ValueError(
+                f"--dppo.min_log_prob_std must be at least {MIN_LOG_PROB_STD}, got {self.min_log_prob_std}: "
+                "below it the clamp of log-probabilities removes the gradient"
+            )
         for name, choices in (("timeout", TIMEOUTS), ("encoder", ENCODERS)):
             if getattr(self, name) not in choices:
                 raise ValueError(

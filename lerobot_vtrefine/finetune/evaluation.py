@@ -26,8 +26,16 @@ def evaluate(
 ) -> dict[str, float]:
     """Mean success, return and episode metrics of the deployment sampler, as ``eval_<name>``.
 
-    At least ``num_episodes`` held-out seeds over all ranks; each rank has its own.
+    At least ``num_episodes`` held-out seeds over all ranks; each rank has its own. Repeatable, and without
+    effect on training: torch's global generator (sensor noise in preprocessors) is seeded here and then
+    restored.
     """
+    with torch.random.fork_rng():
+        torch.manual_seed(first_seed)
+        return _evaluate(env, agent, num_episodes, first_seed)
+
+
+def _evaluate(env: DecisionEnv, agent: Agent, num_episodes: int, first_seed: int) -> dict[str, float]:
     device, batches = agent.device, -(-num_episodes // (env.num_envs * num_ranks()))
     columns: dict[str, list[Tensor]] = {}
     for batch in range(batches):

@@ -10,7 +10,7 @@ from lerobot.configs import PreTrainedConfig, parser
 from lerobot.configs.default import EvalConfig, WandBConfig
 from lerobot.envs import EnvConfig
 from lerobot.policies import make_pre_post_processors
-from lerobot.utils.constants import ACTION, PRETRAINED_MODEL_DIR
+from lerobot.utils.constants import PRETRAINED_MODEL_DIR
 from lerobot.utils.random_utils import set_seed
 from tqdm import tqdm
 from tqdm.contrib.logging import logging_redirect_tqdm
@@ -98,21 +98,26 @@ def load_policy(path: Path) -> VtDp3Policy:
 
 
 def make_agent(policy: VtDp3Policy, dppo: DppoConfig) -> Agent:
-    """Make a policy ready for DPPO: the tuned and the frozen network, and the sampler of both stages."""
-    policy.prepare_finetuning(
-        sampler=dppo.sampler,
-        num_inference_steps=dppo.sampler_steps,
-        prefix_steps=dppo.prefix_steps,
-        ft_denoising_steps=dppo.ft_denoising_steps,
-        freeze_encoder=dppo.encoder == "frozen",
-    )
+    """The tuned and the frozen network of a policy, and the sampler of rollouts and deployment.
+
+    A pre-trained policy is made ready for DPPO first; a checkpoint of a DPPO run is so already.
+    """
+    if not policy.config.ft_denoising_steps:
+        policy.prepare_finetuning(
+            sampler=dppo.sampler,
+            num_inference_steps=dppo.sampler_steps,
+            prefix_steps=dppo.prefix_steps,
+            ft_denoising_steps=dppo.ft_denoising_steps,
+            freeze_encoder=dppo.encoder == "frozen",
+        )
+    policy.eval()
     config = policy.config
     return Agent(
         actor=policy.model,
-        base=policy.base_model,
+        base=policy.base,
         process=policy.process,
         num_tuned=config.ft_denoising_steps,
-        action_shape=(config.horizon, config.output_features[ACTION].shape[0]),
+        action_shape=(config.horizon, policy.action_dim),
         executed=slice(0, config.n_action_steps),
         frozen_encoder=config.ft_freeze_encoder,
     )
@@ -178,6 +183,10 @@ def run(cfg: FinetunePipelineConfig) -> None:
     """Fine-tune; the result is ``output_dir/checkpoints/last/pretrained_model``."""
     path, checkpoint = start_path(cfg)
     policy = load_policy(path)
+    if checkpoint is None and policy.config.ft_denoising_steps:
+        raise ValueError(
+            f"{path} is fine-tuned already; start from the pre-trained checkpoint, or --resume=true"
+        )
     device = torch.device(policy.config.device)
     join_ranks(device)
     set_seed(cfg.seed + rank_index())

@@ -1,4 +1,4 @@
-"""Small problems for DPPO: a network, behaviour cloning, and the blind peg (a miniature of the paper's task)."""
+"""Small problems for DPPO: a network, behaviour cloning, and a blind peg (the paper's task in miniature)."""
 
 from collections.abc import Sequence
 
@@ -42,7 +42,9 @@ class ToyActor(nn.Module):
         return self.encoder(obs["state"])
 
 
-def make_agent(actor: ToyActor, cfg: DppoConfig, action_shape: tuple[int, int], num_train_steps: int = 100) -> Agent:
+def make_agent(
+    actor: ToyActor, cfg: DppoConfig, action_shape: tuple[int, int], num_train_steps: int = 100
+) -> Agent:
     grid = step_grid(cfg.sampler, num_train_steps, cfg.sampler_steps, cfg.prefix_steps)
     base = ToyActor(actor.encoder[0].in_features, *action_shape, actor.denoiser.net[0].out_features)
     base.load_state_dict(actor.state_dict())
@@ -51,11 +53,15 @@ def make_agent(actor: ToyActor, cfg: DppoConfig, action_shape: tuple[int, int], 
     if frozen:
         base.encoder = actor.encoder
     no_gradient(base)
-    return Agent(actor, base, process, cfg.ft_denoising_steps, action_shape, slice(0, action_shape[0]), frozen)
+    return Agent(
+        actor, base, process, cfg.ft_denoising_steps, action_shape, slice(0, action_shape[0]), frozen
+    )
 
 
-def clone_behaviour(actor: ToyActor, states: Tensor, chunks: Tensor, steps: int, seed: int, num_train_steps: int = 100) -> None:
-    """Train the actor to predict noise on (states (N, S), chunks (N, H, D))."""
+def clone_behaviour(
+    actor: ToyActor, states: Tensor, chunks: Tensor, steps: int, seed: int, num_train_steps: int = 100
+) -> None:
+    """Train the actor to predict noise on states (N, S) and chunks (N, H, D)."""
     generator = torch.Generator().manual_seed(seed)
     process = DiffusionProcess(num_train_steps, (0,))
     optimizer = torch.optim.AdamW(actor.parameters(), lr=1e-3, weight_decay=1e-6)
@@ -75,7 +81,7 @@ def clone_behaviour(actor: ToyActor, states: Tensor, chunks: Tensor, steps: int,
 class BlindPeg:
     """A peg over a slot whose position is only estimated; the rim can be felt, its side tells where to go.
 
-    The peg starts above the estimate. Inside the slot it can descend to the goal; outside it rests on the rim,
+    The peg starts above the estimate. Inside the slot it descends to the goal; outside it rests on the rim,
     and the contact channel then tells on which side of the slot it is (``feel``), or nothing.
     """
 
@@ -114,7 +120,10 @@ class BlindPeg:
             x = torch.where(self.z < 0, x.clamp(walls[:, 0], walls[:, 1]), x)
             z = self.z + self.STEP_Z * action[:, 1]
             blocked = (z < 0) & ~inside
-            self.x, self.z = torch.where(moving, x, self.x), torch.where(moving, torch.where(blocked, 0.0, z), self.z)
+            self.x, self.z = (
+                torch.where(moving, x, self.x),
+                torch.where(moving, torch.where(blocked, 0.0, z), self.z),
+            )
             self.contact = torch.where(moving, blocked * (self.slot - self.x).sign(), self.contact)
             reached |= moving & (self.z < -self.DEPTH)
         self.decision = self.decision + (~self.done)

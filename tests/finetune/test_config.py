@@ -1,0 +1,64 @@
+import math
+from dataclasses import dataclass, field
+
+import draccus
+import pytest
+
+from lerobot_vtrefine.finetune.config import DppoConfig, PaperDppo, SeedLiteralDppo, SmallDppo
+
+
+@dataclass
+class Holder:
+    dppo: DppoConfig = field(default_factory=PaperDppo)
+
+
+def test_presets_are_chosen_by_type_and_single_fields_changed():
+    assert draccus.parse(Holder, args=["--dppo.epochs=3"]).dppo == PaperDppo(epochs=3)
+    cfg = draccus.parse(Holder, args=["--dppo.type=small", "--dppo.epochs=3"]).dppo
+    assert isinstance(cfg, SmallDppo)
+    assert cfg.epochs == 3
+    assert cfg.clip == SmallDppo().clip
+
+
+def test_seed_literal_differs_from_paper_only_in_the_clip_range():
+    paper, literal = vars(PaperDppo()), vars(SeedLiteralDppo())
+    assert {key for key in paper if paper[key] != literal[key]} == {"clip", "clip_first"}
+    assert literal["clip"] == 2e-4
+
+
+def test_one_tuned_step_has_a_finite_clip_range():
+    """The reference computes 0/0 for K'=1."""
+    assert PaperDppo(ft_denoising_steps=1, clip=0.01, clip_first=0.001).clip_range(0) == 0.01
+
+
+def test_clip_range_grows_exponentially_to_the_last_step():
+    cfg = PaperDppo(ft_denoising_steps=5, clip=0.01, clip_first=0.001, clip_rate=3.0)
+    ranges = [cfg.clip_range(step) for step in range(5)]
+    assert ranges[0] == pytest.approx(0.001)
+    assert ranges[-1] == pytest.approx(0.01)
+    middle = 0.001 + 0.009 * (math.exp(1.5) - 1) / (math.exp(3) - 1)
+    assert ranges[2] == pytest.approx(middle)
+    assert PaperDppo(clip_rate=0.0).clip_range(3) == PaperDppo().clip
+
+
+def test_actor_learning_rate_waits_rises_and_decays_over_this_run():
+    cfg = PaperDppo(iterations=100, critic_warmup=2, lr_warmup=10, actor_lr=1e-5, actor_lr_final=1e-6)
+    rates = [cfg.actor_lr_at(iteration) for iteration in range(101)]
+    assert rates[:2] == [0.0, 0.0]
+    assert rates[2] == pytest.approx(1e-6)
+    assert max(rates) == rates[12] == pytest.approx(1e-5)
+    assert rates[100] == pytest.approx(1e-6)
+
+
+@pytest.mark.parametrize(
+    ("change", "words"),
+    [
+        ({"timeout": "ignore"}, "--dppo.timeout must be one of terminal, bootstrap"),
+        ({"encoder": "half"}, "--dppo.encoder must be one of trained, frozen"),
+        ({"num_envs": 0}, "--dppo.num_envs must be positive"),
+        ({"min_log_prob_std": 0.05}, "--dppo.min_log_prob_std must be at least 0.055"),
+    ],
+)
+def test_bad_values_name_the_flag(change, words):
+    with pytest.raises(ValueError, match=words):
+        PaperDppo(**change)

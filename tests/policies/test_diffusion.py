@@ -1,0 +1,179 @@
+import math
+
+import numpy as np
+import pytest
+import torch
+
+from lerobot_vtrefine.policies.vt_dp3.diffusion import (
+    DiffusionProcess,
+    denoise_prefix,
+    deploy,
+    sample_chain,
+    slice_log_prob,
+    squaredcos_alpha_bar,
+    step_grid,
+)
+
+GRIDS = {
+    "ddpm": step_grid("ddpm", 100, 100),
+    "ddim": step_grid("ddim", 100, 5),
+    "tail": step_grid("tail", 100, 10, 5),
+}
+
+
+def numpy_alpha_bar(steps: int) -> np.ndarray:
+    """The squared-cosine schedule, written again."""
+
+    def share(t: float) -> float:
+        return math.cos((t + 0.008) / 1.008 * math.pi / 2) ** 2
+
+    betas = [min(1 - share((i + 1) / steps) / share(i / steps), 0.999) for i in range(steps)]
+    return np.cumprod(1 - np.array(betas))
+
+
+def oracle(process: DiffusionProcess, clean: torch.Tensor):
+    """Predicts exactly the noise that separates x from ``clean``."""
+    alpha_bar = squaredcos_alpha_bar(process.num_train_steps)
+
+    def predict(x: torch.Tensor, t: torch.Tensor) -> torch.Tensor:
+        share = alpha_bar[t].view(-1, 1, 1).to(x)
+        return (x - share.sqrt() * clean) / (1 - share).sqrt()
+
+    return predict
+
+
+def test_schedule_is_squared_cosine():
+    alpha_bar = squaredcos_alpha_bar(100)
+    np.testing.assert_allclose(alpha_bar.numpy(), numpy_alpha_bar(100), rtol=1e-12)
+    assert alpha_bar[0] > 0.999
+    assert alpha_bar[-1] < 1e-3
+
+
+def test_grids():
+    assert GRIDS["ddpm"] == tuple(range(99, -1, -1))
+    assert GRIDS["ddim"] == (80, 60, 40, 20, 0)
+    assert GRIDS["tail"] == (99, 81, 63, 45, 27, 9, 8, 7, 6, 5, 4, 3, 2, 1, 0)
+    assert step_grid("tail", 20, 4, 0) == (3, 2, 1, 0)
+    assert step_grid("ddim", 100, 1) == (0,)
+
+
+@pytest.mark.parametrize(
+    ("arguments", "words"),
+    [
+        (("karras", 100, 10), "ddpm, ddim, tail"),
+        (("ddim", 100, 0), "1..100"),
+        (("tail", 100, 10, 91), "0..90"),
+    ],
+)
+def test_bad_grids_say_what_is_possible(arguments, words):
+    with pytest.raises(ValueError, match=words):
+        step_grid(*arguments)
+
+
+def test_full_stochasticity_on_the_full_grid_is_ddpm():
+    """eta=1 reproduces the two-coefficient DDPM posterior, computed independently in NumPy."""
+    process = DiffusionProcess(100, GRIDS["ddpm"])
+    rng = np.random.default_rng(0)
+    x, eps = rng.normal(size=(2, 100, 4, 3))
+    mean, std = process.posterior(torch.tensor(x), torch.tensor(eps), torch.arange(100), eta=1.0)
+    alpha_bar = numpy_alpha_bar(100)
+    for position, t in enumerate(range(99, -1, -1)):
+        before = alpha_bar[t - 1] if t else 1.0
+        beta = 1 - alpha_bar[t] / before
+        clean = np.clip(
+            (x[position] - np.sqrt(1 - alpha_bar[t]) * eps[position]) / np.sqrt(alpha_bar[t]), -1, 1
+        )
+        on_clean = beta * np.sqrt(before) / (1 - alpha_bar[t])
+        on_x = (1 - before) * np.sqrt(1 - beta) / (1 - alpha_bar[t])
+        np.testing.assert_allclose(mean[position], on_clean * clean + on_x * x[position], atol=1e-9)
+        expected = np.sqrt(beta * (1 - before) / (1 - alpha_bar[t]))
+        np.testing.assert_allclose(std[position].item(), expected, atol=1e-9)
+
+
+def test_ddim_standard_deviations():
+    process = DiffusionProcess(100, GRIDS["ddim"])
+    x = torch.zeros(5, 1, 1, dtype=torch.float64)
+    _, std = process.posterior(x, x, torch.arange(5), eta=1.0)
+    np.testing.assert_allclose(std.flatten(), [0.738, 0.514, 0.295, 0.025, 0.0], atol=5e-4)
+
+
+@pytest.mark.parametrize("grid", GRIDS)
+def test_a_perfect_denoiser_recovers_the_action(grid):
+    process = DiffusionProcess(100, GRIDS[grid])
+    clean = torch.rand(6, 4, 3, dtype=torch.float64) * 2 - 1
+    result = deploy(process, oracle(process, clean), torch.randn_like(clean))
+    torch.testing.assert_close(result, clean, atol=1e-9, rtol=0)
+
+
+def test_deployment_is_deterministic_and_uses_the_base_first():
+    process = DiffusionProcess(100, GRIDS["tail"])
+    seen: dict[str, list[int]] = {"base": [], "tuned": []}
+
+    def recording(name):
+        def predict(x, t):
+            seen[name].append(int(t[0]))
+            return x
+
+        return predict
+
+    noise = torch.randn(2, 4, 3)
+    first = deploy(process, recording("tuned"), noise, num_tuned=10, predict_noise_base=recording("base"))
+    assert seen == {"base": [99, 81, 63, 45, 27], "tuned": list(range(9, -1, -1))}
+    again = deploy(process, recording("tuned"), noise, num_tuned=10, predict_noise_base=recording("base"))
+    assert torch.equal(first, again)
+    assert first.abs().max() <= 1
+
+
+def test_chain_noise_is_floored_and_clipped():
+    """With a perfect denoiser each latent is mean + max(sigma, floor) * noise, |noise| <= 3."""
+    process = DiffusionProcess(100, GRIDS["tail"])
+    clean = torch.zeros(4000, 1, 1)
+    predict = oracle(process, clean)
+    start = denoise_prefix(process, predict, torch.randn_like(clean), num_tuned=10)
+    chain = sample_chain(
+        process,
+        predict,
+        start,
+        num_tuned=10,
+        executed=slice(0, 1),
+        eta=1.0,
+        min_sampling_std=0.05,
+        min_log_prob_std=0.1,
+        generator=torch.Generator().manual_seed(0),
+    )
+    assert chain.latents.shape == (4000, 11, 1, 1)
+    assert chain.log_probs.shape == (4000, 10)
+    assert torch.equal(chain.latents[:, 0], start)
+    for step in range(10):
+        x = chain.latents[:, step]
+        mean, std = process.step(predict, x, 5 + step, eta=1.0)
+        noise = (chain.latents[:, step + 1] - mean) / std.clamp(min=0.05)
+        assert noise.abs().max() <= 3 + 1e-4
+        assert abs(noise.std() - 1) < 0.05
+        density = torch.distributions.Normal(mean, std.clamp(min=0.1)).log_prob(chain.latents[:, step + 1])
+        torch.testing.assert_close(chain.log_probs[:, step], density.clamp(-5, 2).flatten())
+
+
+def test_log_prob_against_numpy_and_its_clamp():
+    rng = np.random.default_rng(1)
+    latent, mean = rng.normal(size=(2, 3, 5, 2))
+    std = np.full((3, 1, 1), 0.7)
+    mean[0, 0, 0] = latent[0, 0, 0] + 20 * 0.7  # density below the clamp
+    result = slice_log_prob(*(torch.tensor(a) for a in (latent, mean, std)), slice(0, 4))
+    density = -0.5 * ((latent - mean) / std) ** 2 - np.log(std) - 0.5 * np.log(2 * np.pi)
+    np.testing.assert_allclose(result, np.clip(density[:, :4], -5, 2).mean((1, 2)), rtol=1e-12)
+
+
+def test_gradient_reaches_only_the_executed_slice():
+    mean = torch.randn(2, 8, 3, requires_grad=True)
+    slice_log_prob(torch.zeros(2, 8, 3), mean, 3 * torch.ones(2, 1, 1), slice(1, 5)).sum().backward()
+    assert (mean.grad[:, 1:5] != 0).all()
+    assert (mean.grad[:, :1] == 0).all()
+    assert (mean.grad[:, 5:] == 0).all()
+
+
+def test_forward_process_has_unit_variance():
+    process = DiffusionProcess(100, GRIDS["ddim"])
+    clean = torch.randn(20_000, 1, 1)
+    noisy = process.add_noise(clean, torch.randn_like(clean), torch.randint(100, (20_000,)))
+    assert abs(noisy.std() - 1) < 0.03
