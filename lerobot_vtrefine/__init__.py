@@ -5,5 +5,6 @@ simulator, Warp, serial port or plotting library is imported here.
 """
 
 from lerobot_vtrefine import envs
+from lerobot_vtrefine.policies import vt_dp3
 
-__all__ = ["envs"]
+__all__ = ["envs", "vt_dp3"]

@@ -10,7 +10,10 @@ from tqdm import tqdm
 from lerobot_vtrefine.cli.pipeline.progress import LiveLine, Progress, parse_progress, read_tail
 from lerobot_vtrefine.cli.pipeline.stages import Stage, StageRunner, find_command, stage_keys
 
-WRITE = "import pathlib, sys; p = pathlib.Path(sys.argv[1]); p.parent.mkdir(exist_ok=True); p.open('a').write('x')"
+WRITE = (
+    "import pathlib, sys; p = pathlib.Path(sys.argv[1]); "
+    "p.parent.mkdir(exist_ok=True); p.open('a').write('x')"
+)
 
 
 def stage(folder: Path, name: str, *extra: str, code: str = WRITE, **options) -> Stage:

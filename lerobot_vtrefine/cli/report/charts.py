@@ -5,7 +5,7 @@ from dataclasses import dataclass
 from html import escape
 
 WIDTH, HEIGHT = 640, 260
-LEFT, RIGHT, TOP, BOTTOM = 46, 14, 12, 36
+LEFT, RIGHT, TOP, BOTTOM = 46, 14, 24, 36
 
 
 @dataclass(frozen=True)
@@ -58,18 +58,17 @@ def bar_chart(bars: Sequence[Bar], y_title: str) -> str:
         top, low, high = _height(bar.rate), _height(bar.low), _height(bar.high)
         box = f'x="{middle - half:.1f}" y="{top:.1f}" width="{2 * half:.1f}" height="{_height(0) - top:.1f}"'
         caps = f"M{middle:.1f} {low:.1f}V{high:.1f}m-6 0h12M{middle - 6:.1f} {low:.1f}h12"
-        value = f'x="{middle + half + 4:.1f}" y="{top + 4:.1f}"'
         parts += [
             f'<rect class="bar {bar.style}" {box} rx="3"/>',
             f'<path class="whisker" d="{caps}"/>',
-            f'<text class="value" {value}>{100 * bar.rate:.0f} %</text>',
+            _label(middle, high - 6, f"{100 * bar.rate:.0f} %", "value"),
             _label(middle, HEIGHT - BOTTOM + 18, bar.label),
         ]
     return _svg(parts, y_title)
 
 
-def _label(x: float, y: float, text: str) -> str:
-    return f'<text class="tick" x="{x:.1f}" y="{y:.1f}" text-anchor="middle">{escape(text)}</text>'
+def _label(x: float, y: float, text: str, style: str = "tick") -> str:
+    return f'<text class="{style}" x="{x:.1f}" y="{y:.1f}" text-anchor="middle">{escape(text)}</text>'
 
 
 def _height(rate: float) -> float:
