@@ -238,8 +238,9 @@ def test_regularisation_keeps_the_actor_near_the_base(term, encoder):
 
     distances = {}
     for weight in (0.0, 1.0):
-        changes = {"critic_warmup": 0, "epochs": 10, "actor_lr": 5e-3, "num_envs": 16, "encoder": encoder}
-        cfg = small_config(**changes, **{term: weight})
+        sampler = {"sampler": "ddim", "sampler_steps": 5, "ft_denoising_steps": 5, "encoder": encoder}
+        learning = {"critic_warmup": 0, "epochs": 10, "actor_lr": 5e-3, "num_envs": 16}
+        cfg = small_config(**sampler, **learning, **{term: weight})
         env, agent, state = problem(cfg)
         with torch.no_grad():
             agent.actor.denoiser.net[-1].bias += 0.3
