@@ -1,0 +1,90 @@
+"""Worlds one after the other with plain `mj_step`: the reference that other backends are compared with."""
+
+import copy
+
+import mujoco
+import numpy as np
+
+from lerobot_vtrefine.sim.backends.base import BAD_STATE_WARNINGS, Array, Backend, Trace
+
+_STATE = mujoco.mjtState.mjSTATE_INTEGRATION
+
+
+class SingleBackend(Backend):
+    """One MjModel and MjData per world, no threads."""
+
+    def __init__(self, model: mujoco.MjModel, num_envs: int) -> None:
+        self.num_envs = num_envs
+        self._models = [copy.copy(model) for _ in range(num_envs)]
+        self._data = [mujoco.MjData(item) for item in self._models]
+
+    def read(self, ids: Array) -> tuple[Array, Array]:
+        """See `Backend.read`."""
+        return np.stack([self._data[i].qpos for i in ids]), np.stack([self._data[i].qvel for i in ids])
+
+    def write(self, ids: Array, qpos: Array, qvel: Array) -> None:
+        """See `Backend.write`."""
+        for row, i in enumerate(ids):
+            mujoco.mj_resetData(self._models[i], self._data[i])
+            self._data[i].qpos[:], self._data[i].qvel[:] = qpos[row], qvel[row]
+
+    def advance(self, ids: Array, controls: Array) -> Trace:
+        """See `Backend.advance`."""
+        model = self._models[0]
+        steps = controls.shape[1]
+        qpos = np.empty((len(ids), steps, model.nq))
+        sensors = np.empty((len(ids), steps, model.nsensordata))
+        for row, i in enumerate(ids):
+            data = self._data[i]
+            for step in range(steps):
+                data.ctrl[:] = controls[row, step]
+                mujoco.mj_step(self._models[i], data)
+                qpos[row, step], sensors[row, step] = data.qpos, data.sensordata
+        return Trace(qpos, sensors)
+
+    def cast(self, ids: Array, origins: Array, directions: Array) -> Array:
+        """See `Backend.cast`."""
+        distances = np.empty(directions.shape[:2])
+        geom = np.zeros(1, np.int32)
+        for row, i in enumerate(ids):
+            scratch = self._copy(i)
+            mujoco.mj_kinematics(self._models[i], scratch)
+            # mj_multiRay misses geoms of the arms; mj_ray does not.
+            for column, direction in enumerate(directions[row]):
+                distances[row, column] = mujoco.mj_ray(
+                    self._models[i], scratch, origins[row], direction, None, 1, -1, geom
+                )
+        return distances
+
+    def set_fields(self, ids: Array, fields: dict[str, Array]) -> None:
+        """See `Backend.set_fields`."""
+        for row, i in enumerate(ids):
+            for name, values in fields.items():
+                getattr(self._models[i], name)[...] = values[row]
+            mujoco.mj_setConst(self._models[i], mujoco.MjData(self._models[i]))
+
+    def diverged(self, ids: Array) -> Array:
+        """See `Backend.diverged`."""
+        return np.array([any(self._data[i].warning[w].number for w in BAD_STATE_WARNINGS) for i in ids], bool)
+
+    def get_row(self, env: int) -> Array:
+        """See `Backend.get_row`."""
+        row = np.empty(mujoco.mj_stateSize(self._models[env], _STATE))
+        mujoco.mj_getState(self._models[env], self._data[env], row, _STATE)
+        return row
+
+    def set_row(self, env: int, row: Array) -> None:
+        """See `Backend.set_row`."""
+        mujoco.mj_setState(self._models[env], self._data[env], row, _STATE)
+
+    def instance(self, env: int) -> tuple[mujoco.MjModel, mujoco.MjData]:
+        """See `Backend.instance`."""
+        data = self._copy(env)
+        mujoco.mj_forward(self._models[env], data)
+        return self._models[env], data
+
+    def _copy(self, env: int) -> mujoco.MjData:
+        """A scratch copy, because deriving quantities in place would disturb the next step's warm start."""
+        scratch = mujoco.MjData(self._models[env])
+        mujoco.mj_setState(self._models[env], scratch, self.get_row(env), _STATE)
+        return scratch

@@ -1,0 +1,232 @@
+"""Every setting of the simulation, as frozen dataclasses; imports no simulator."""
+
+from dataclasses import dataclass, field
+from pathlib import Path
+
+PROCEDURAL_PAIRS = ("round", "square", "hexagon", "d_shape", "cross", "key")
+MESH_PAIR_PREFIX = "automate/"
+STARTS = ("table", "grasped")
+BACKENDS = ("single", "batch", "warp")
+
+
+@dataclass(frozen=True)
+class CameraConfig:
+    """One depth camera; a ray grid, no lens."""
+
+    width: int
+    height: int
+    fov_y_rad: float
+    """Vertical field of view."""
+    position_m: tuple[float, float, float]
+    target_m: tuple[float, float, float]
+    """Point that lies on the optical axis."""
+
+    def __post_init__(self) -> None:
+        if self.width < 1 or self.height < 1:
+            raise ValueError(f"camera needs at least one pixel, got {self.width} x {self.height}")
+        if not 0.0 < self.fov_y_rad < 3.0:
+            raise ValueError(f"camera.fov_y_rad must lie between 0 and 3 rad, got {self.fov_y_rad}")
+
+
+# grasped: a narrow region of interest around the insertion, so that most pixels show parts and hands. table: the
+# picking areas of both arms and the insertion above them.
+GRASPED_CAMERA = CameraConfig(80, 60, 0.384, (-0.44, 0.0, 0.42), (0.0, 0.0, 0.145))
+TABLE_CAMERA = CameraConfig(160, 120, 0.56, (-0.46, 0.0, 0.46), (0.0, 0.0, 0.09))
+
+
+@dataclass(frozen=True)
+class SceneConfig:
+    """What stands in the scene and how it is simulated."""
+
+    pair: str = "round"
+    """Procedural pair, or automate/ID for meshes from `mesh_dir`."""
+    clearance_m: float = 0.002
+    """Diametral clearance of procedural pairs; mesh pairs have their own."""
+    negative_control_m: float = 0.0
+    """Above 0 the hole is this much *smaller* than the plug (diametral): a check that must never succeed."""
+    start: str = "table"
+    """table: both parts stand on the table. grasped: both are in hand."""
+    embodiment: str = "aloha"
+    mesh_dir: Path | None = None
+    """Folder with {ID}_plug.obj and {ID}_socket.obj, for automate/ID."""
+    timestep_s: float = 0.0025
+    """Physics step; at clearances of 1 mm and below use 0.002 or less."""
+    camera: CameraConfig | None = None
+    """By default the camera that suits `start`."""
+    servo_gain_scale: float = 1.0
+    """Factor on the arms' servo stiffness; damping follows with its square root."""
+    gravity_compensation: bool = True
+    """The arms' servos carry the arms' own weight, as integral action does on the real ones."""
+    pad_friction: float = 1.0
+    part_friction: float = 0.3
+    """Plug against socket and both against the table."""
+    part_density: float = 1000.0
+    """[kg/m^3]; parts never weigh less than 40 g, below which contacts turn soft."""
+    pad_time_constant_s: float = 0.01
+    """Contact time constant of the pads: about 0.6 mm compression at 20 N."""
+
+    def __post_init__(self) -> None:
+        _check_choice("start", self.start, STARTS)
+        if not 0.0 < self.timestep_s <= 0.005:
+            raise ValueError(f"timestep_s must lie in (0, 0.005] s, got {self.timestep_s}")
+        if not self.clearance_m > 0.0:
+            raise ValueError(f"clearance_m must be above 0, got {self.clearance_m}")
+        if self.negative_control_m < 0.0:
+            raise ValueError(f"negative_control_m must not be negative, got {self.negative_control_m}")
+        for name in (
+            "servo_gain_scale",
+            "pad_friction",
+            "part_friction",
+            "part_density",
+            "pad_time_constant_s",
+        ):
+            if not getattr(self, name) > 0.0:
+                raise ValueError(f"{name} must be above 0, got {getattr(self, name)}")
+
+    @property
+    def hole_clearance_m(self) -> float:
+        """Diametral clearance of the hole as built: negative in the negative control."""
+        return -self.negative_control_m if self.negative_control_m else self.clearance_m
+
+
+@dataclass(frozen=True)
+class TableStart:
+    """Where the parts stand when an episode starts on the table."""
+
+    socket_centre_m: tuple[float, float] = (0.0, -0.06)
+    plug_centre_m: tuple[float, float] = (0.0, 0.065)
+    square_m: float = 0.03
+    """Side of the square in which each part's axis lies."""
+    yaw_rad: float = 0.15
+    """Half range of each part's yaw."""
+
+
+@dataclass(frozen=True)
+class GraspedStart:
+    """How hands and parts stand when an episode starts in hand. Half ranges of uniform distributions."""
+
+    mouth_m: tuple[float, float, float] = (0.0, 0.0, 0.14)
+    """Nominal place of the socket's mouth."""
+    plug_height_m: float = 0.017
+    """Nominal height of the plug's tip above the mouth."""
+    hand_xy_m: float = 0.004
+    """Each hand's displacement from its nominal place."""
+    hand_z_m: float = 0.002
+    hand_yaw_rad: float = 0.03
+    slip_m: float = 0.002
+    """In-hand offset of each part along both axes of the pads."""
+    slip_rad: float = 0.052
+    """In-hand rotation of each part about the pads' normal."""
+    left_pitch_rad: float = 0.45
+    """How far the left hand points down."""
+    right_pitch_rad: float = 0.2
+    """How far the right hand points down; with 0.45 even a perfect expert loses one insertion in six."""
+    squeeze_m: float = 0.010
+    """Grippers' commands close by this much more than the part's width, per finger: about 20 N per pad."""
+    settle_s: float = 0.25
+
+
+@dataclass(frozen=True)
+class SuccessConfig:
+    """When the plug counts as inserted."""
+
+    depth_slack_m: float = 0.002
+    """How far the plug may be short of fully seated."""
+    lateral_m: float = 0.004
+    tilt_rad: float = 0.2007
+    mouth_height_m: float = 0.07
+    """The mouth must be at least this high above the table: inserted in air."""
+    hold_s: float = 1.0
+
+
+@dataclass(frozen=True)
+class LimitsConfig:
+    """What ends an episode in failure."""
+
+    in_hand_shift_m: float = 0.005
+    """Largest movement of a part in its hand since the grasp."""
+    contact_force_n: float = 60.0
+    """Largest force between plug and socket, averaged over `force_window_s`."""
+    force_window_s: float = 0.01
+    drop_s: float = 0.3
+    """A lifted part that its hand has not held for this long counts as dropped."""
+
+
+@dataclass(frozen=True)
+class TaskConfig:
+    """Control, start, success, limits and length of an episode."""
+
+    control_hz: float = 10.0
+    episode_steps: int | None = None
+    """Control steps until the time-out; by default 240 from the table, 40 in hand."""
+    joint_rate: float = 1.0
+    """Largest commanded speed of a revolute joint [rad/s]."""
+    finger_rate: float = 0.15
+    """Largest commanded speed of a finger [m/s]."""
+    table: TableStart = field(default_factory=TableStart)
+    grasped: GraspedStart = field(default_factory=GraspedStart)
+    success: SuccessConfig = field(default_factory=SuccessConfig)
+    limits: LimitsConfig = field(default_factory=LimitsConfig)
+
+    def __post_init__(self) -> None:
+        if not 1.0 <= self.control_hz <= 100.0:
+            raise ValueError(f"control_hz must lie between 1 and 100 Hz, got {self.control_hz}")
+        if self.episode_steps is not None and self.episode_steps < 1:
+            raise ValueError(f"episode_steps must be at least 1, got {self.episode_steps}")
+        for name in ("joint_rate", "finger_rate"):
+            if not getattr(self, name) > 0.0:
+                raise ValueError(f"{name} must be above 0, got {getattr(self, name)}")
+
+    @property
+    def control_dt_s(self) -> float:
+        """Length of a control step."""
+        return 1.0 / self.control_hz
+
+    def steps_of(self, start: str) -> int:
+        """Control steps of an episode from this start."""
+        return self.episode_steps or {"table": 240, "grasped": 40}[start]
+
+
+@dataclass(frozen=True)
+class RandomizationConfig:
+    """Differences between worlds, drawn anew at every reset from the episode's seed; off by default.
+
+    Ranges are (lowest, highest); None keeps the nominal value.
+    """
+
+    clearance_m: tuple[float, float] | None = None
+    """Diametral clearance of procedural pairs."""
+    pad_friction: tuple[float, float] | None = None
+    part_friction: tuple[float, float] | None = None
+    part_mass_scale: tuple[float, float] | None = None
+    pad_stiffness_scale: tuple[float, float] | None = None
+    """Factor on the pads' stiffness, in the contact and in the sensor model alike."""
+    sensor_gain_scale: tuple[float, float] | None = None
+    camera_position_m: float = 0.0
+    """Half range of the camera's displacement along each axis."""
+    camera_rotation_rad: float = 0.0
+    """Half range of its rotation about each of its axes."""
+
+    def __post_init__(self) -> None:
+        for name in RANGES:
+            bounds = getattr(self, name)
+            if bounds is not None and not 0.0 < bounds[0] <= bounds[1]:
+                raise ValueError(f"randomization.{name} needs 0 < lowest <= highest, got {bounds}")
+        for name in ("camera_position_m", "camera_rotation_rad"):
+            if getattr(self, name) < 0.0:
+                raise ValueError(f"randomization.{name} must not be negative, got {getattr(self, name)}")
+
+
+RANGES = (
+    "clearance_m",
+    "pad_friction",
+    "part_friction",
+    "part_mass_scale",
+    "pad_stiffness_scale",
+    "sensor_gain_scale",
+)
+
+
+def _check_choice(flag: str, value: str, choices: tuple[str, ...]) -> None:
+    if value not in choices:
+        raise ValueError(f"unknown {flag} {value!r}: use one of {', '.join(choices)}")

@@ -1,0 +1,212 @@
+"""What the task remembers of each world's episode, and how one control step changes it.
+
+Shapes: N worlds, m of them addressed; hands are ordered left (socket), right (plug).
+"""
+
+from dataclasses import dataclass, fields
+
+import numpy as np
+
+from lerobot_vtrefine.sim import task
+from lerobot_vtrefine.sim.config import LimitsConfig, SuccessConfig, TaskConfig
+from lerobot_vtrefine.sim.pairs import PartPair
+
+Array = np.ndarray
+
+GRASP_SETTLE_STEPS = 3
+"""Control steps that a part must have been held before its place in the hand becomes the reference."""
+LIFT_M = 0.01
+"""A part this much above its resting height has been lifted."""
+WORKSPACE_M = (0.35, 0.4, 0.6)
+"""A part outside |x|, |y|, z of this box, or below the table, is lost."""
+
+
+@dataclass
+class EpisodeState:
+    """One row per world; rows are copied as a whole by snapshots."""
+
+    seed: Array
+    steps: Array
+    """Control steps done."""
+    command: Array
+    """(N, nu) servo command at the end of the last control step."""
+    hold_steps: Array
+    """Control steps for which the plug has been seated without interruption."""
+    held_steps: Array
+    """(N, hand) control steps for which the part has been held without interruption."""
+    unheld_steps: Array
+    """(N, hand) control steps for which a lifted part has not been held."""
+    grasped: Array
+    """(N, hand) whether `reference` holds."""
+    reference: Array
+    """(N, hand, 2, 3) grip points in the hand's frame at the grasp."""
+    shift: Array
+    """(N, hand) displacement since the grasp [m]."""
+    largest_shift: Array
+    """(N, hand) largest so far."""
+    force_tail: Array
+    """(N, w - 1, 3) last contact forces, for the moving average."""
+    part_force: Array
+    """(N, 3) force of the plug on the socket at the last substep, world frame [N]."""
+    pad_force: Array
+    """(N, 4) normal force on each pad at the last substep [N]."""
+    pad_load: Array
+    """(N, 4, 3) normal force [N] and its centre x, y in the pad's frame [m]."""
+    step_force: Array
+    """(N,) peak of the averaged contact force in the last control step [N]."""
+    peak_force: Array
+    """(N,) the same over the episode."""
+    rim_slide: Array
+    tip: Array
+    """(N, 3) plug's origin in the socket's frame."""
+    failure: Array
+    """Index into `task.FAILURES`."""
+    success: Array
+    done: Array
+    success_step: Array
+    """Control step at which success was reached, -1 before."""
+
+    @classmethod
+    def empty(cls, num_envs: int, num_servos: int, window: int) -> "EpisodeState":
+        """All zeros for `num_envs` worlds and a force window of `window` samples."""
+        n = num_envs
+        shapes: dict[str, tuple[tuple[int, ...], type]] = {
+            "seed": ((n,), np.int64),
+            "steps": ((n,), np.int64),
+            "command": ((n, num_servos), float),
+            "hold_steps": ((n,), np.int64),
+            "held_steps": ((n, 2), np.int64),
+            "unheld_steps": ((n, 2), np.int64),
+            "grasped": ((n, 2), bool),
+            "reference": ((n, 2, 2, 3), float),
+            "shift": ((n, 2), float),
+            "largest_shift": ((n, 2), float),
+            "force_tail": ((n, window - 1, 3), float),
+            "part_force": ((n, 3), float),
+            "pad_force": ((n, 4), float),
+            "pad_load": ((n, 4, 3), float),
+            "step_force": ((n,), float),
+            "peak_force": ((n,), float),
+            "rim_slide": ((n,), float),
+            "tip": ((n, 3), float),
+            "failure": ((n,), np.int64),
+            "success": ((n,), bool),
+            "done": ((n,), bool),
+            "success_step": ((n,), np.int64),
+        }
+        return cls(**{name: np.zeros(shape, kind) for name, (shape, kind) in shapes.items()})
+
+    def clear(self, ids: Array) -> None:
+        """Zero the rows of `ids`."""
+        for item in fields(self):
+            getattr(self, item.name)[ids] = 0
+        self.success_step[ids] = -1
+
+    def row(self, env: int) -> dict[str, Array]:
+        """A copy of one world's row."""
+        return {item.name: getattr(self, item.name)[env].copy() for item in fields(self)}
+
+    def set_row(self, env: int, row: dict[str, Array]) -> None:
+        """Write back a row taken by `row`."""
+        for name, value in row.items():
+            getattr(self, name)[env] = value
+
+
+@dataclass(frozen=True)
+class Measured:
+    """What one control step of m worlds showed."""
+
+    insertion: task.Insertion
+    grip_points: Array
+    """(m, hand, 2, 3) [m]"""
+    part_heights: Array
+    """(m, hand) height of each part's origin above its resting height [m]."""
+    part_positions: Array
+    """(m, hand, 3)"""
+    tips: Array
+    """(m, S, 3) plug's origin in the socket's frame at samples within the step, the last one at its end."""
+    touching: Array
+    """(m, S) whether the parts touched at each of these samples."""
+    part_forces: Array
+    """(m, K, 3) at every substep [N]."""
+    pad_load: Array
+    """(m, 4, 3)"""
+    diverged: Array
+    """(m,)"""
+
+
+def update(state: EpisodeState, ids: Array, seen: Measured, pair: PartPair, config: TaskConfig) -> Array:
+    """Advance the episodes of `ids` by one control step.
+
+    Returns:
+        (m,) reward: 1 in the step in which success is reached, else 0.
+    """
+    state.steps[ids] += 1
+    _update_forces(state, ids, seen)
+    tips = np.concatenate([state.tip[ids][:, None], seen.tips], 1)
+    state.rim_slide[ids] += task.rim_slide(tips, seen.touching, pair.mouth_z_m)
+    state.tip[ids] = seen.tips[:, -1]
+    _update_grasp(state, ids, seen)
+    fresh = _update_success(state, ids, seen, config.success, config.control_dt_s)
+    _update_failure(state, ids, seen, config.limits, config.control_dt_s)
+    state.done[ids] |= state.success[ids] | (state.failure[ids] != task.NO_FAILURE)
+    return (fresh & (state.failure[ids] == task.NO_FAILURE)).astype(np.float64)
+
+
+def _update_forces(state: EpisodeState, ids: Array, seen: Measured) -> None:
+    peak, state.force_tail[ids] = task.windowed_peak(seen.part_forces, state.force_tail[ids])
+    state.step_force[ids] = peak
+    state.peak_force[ids] = np.maximum(state.peak_force[ids], peak)
+    state.part_force[ids] = seen.part_forces[:, -1]
+    state.pad_load[ids], state.pad_force[ids] = seen.pad_load, seen.pad_load[..., 0]
+
+
+def _update_grasp(state: EpisodeState, ids: Array, seen: Measured) -> None:
+    """Take the reference once a part has been held long enough; a part set down again loses it."""
+    pressed = state.pad_force[ids].reshape(-1, 2, 2) > task.HELD_FORCE_N
+    held, lifted = pressed.all(-1), seen.part_heights > LIFT_M
+    state.held_steps[ids] = np.where(held, state.held_steps[ids] + 1, 0)
+    state.unheld_steps[ids] = np.where(held | ~lifted, 0, state.unheld_steps[ids] + 1)
+    grasped = state.grasped[ids]
+    starts = ~grasped & (state.held_steps[ids] >= GRASP_SETTLE_STEPS)
+    state.reference[ids] = np.where(starts[..., None, None], seen.grip_points, state.reference[ids])
+    set_down = grasped & ~held & ~lifted
+    grasped = (grasped | starts) & ~set_down
+    state.grasped[ids] = grasped
+    shift = np.where(grasped, task.in_hand_shift(seen.grip_points, state.reference[ids]), 0.0)
+    state.shift[ids] = shift
+    state.largest_shift[ids] = np.maximum(state.largest_shift[ids], shift)
+
+
+def _update_success(
+    state: EpisodeState, ids: Array, seen: Measured, config: SuccessConfig, dt_s: float
+) -> Array:
+    seated = task.is_seated(seen.insertion, config)
+    state.hold_steps[ids] = np.where(seated, state.hold_steps[ids] + 1, 0)
+    needed = max(1, round(config.hold_s / dt_s))
+    fresh = (state.hold_steps[ids] >= needed) & ~state.done[ids]
+    state.success[ids] |= fresh
+    state.success_step[ids] = np.where(fresh, state.steps[ids], state.success_step[ids])
+    return fresh
+
+
+def _update_failure(
+    state: EpisodeState, ids: Array, seen: Measured, config: LimitsConfig, dt_s: float
+) -> None:
+    position = seen.part_positions
+    lost = (np.abs(position[..., 0]) > WORKSPACE_M[0]) | (np.abs(position[..., 1]) > WORKSPACE_M[1])
+    lost |= (position[..., 2] > WORKSPACE_M[2]) | (seen.part_heights < -0.02)
+    dropped = state.unheld_steps[ids] * dt_s >= config.drop_s
+    causes = (
+        (task.SHIFTED, (state.shift[ids] > config.in_hand_shift_m).any(1)),
+        (task.FORCED, state.step_force[ids] > config.contact_force_n),
+        (task.DROPPED, (dropped | lost).any(1)),
+        (task.UNSTABLE, seen.diverged),
+    )
+    failure = state.failure[ids]
+    for code, happened in causes:
+        failure = np.where((failure == task.NO_FAILURE) & happened & ~state.done[ids], code, failure)
+    state.failure[ids] = failure
+    failed = failure != task.NO_FAILURE
+    state.success[ids] &= ~failed
+    state.success_step[ids] = np.where(failed, -1, state.success_step[ids])

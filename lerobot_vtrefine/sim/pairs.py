@@ -1,0 +1,104 @@
+"""Plug-socket pairs: what the scene, the task, the expert and the touch sensors need to know about one.
+
+Frames: the plug's origin is its tip, the socket's the centre of its mouth, z along the insertion axis, up. A seated plug
+stands at (0, 0, `seated_z_m`) of the socket's frame. Mesh pairs have both frames coincide when assembled
+(`seated_z_m` = 0).
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from lerobot_vtrefine.sim.config import MESH_PAIR_PREFIX, PROCEDURAL_PAIRS, SceneConfig
+from lerobot_vtrefine.sim.profiles import Primitive, make_profile, offset_outline, wall_boxes
+from lerobot_vtrefine.tactile.geometry import Box, TriangleMesh
+
+HOLE_DEPTH_M = 0.025
+PEG_SURPLUS_M = (
+    0.002  # the peg is longer than the hole, so that it seats on the base and the handle misses the rim
+)
+WALL_M = 0.006
+HANDLE_M = (0.034, 0.034, 0.040)
+BASE_M = (0.044, 0.044, 0.050)
+
+
+@dataclass(frozen=True)
+class Grip:
+    """The block that a hand takes hold of, axis-aligned in the part's frame; pads close along x."""
+
+    centre_m: tuple[float, float, float]
+    half_size_m: tuple[float, float, float]
+
+
+@dataclass(frozen=True)
+class Part:
+    """One rigid part."""
+
+    pieces: tuple[Primitive, ...]
+    """Convex pieces: collision, mass and looks."""
+    grip: Grip
+    rest_height_m: float
+    """Height of the part's origin above the table when it stands upright."""
+    surface: TriangleMesh | None = None
+    """Exact surface for touch, where the pieces only approximate it."""
+
+
+@dataclass(frozen=True)
+class PartPair:
+    """A plug and the socket it belongs into."""
+
+    name: str
+    plug: Part
+    socket: Part
+    seated_z_m: float
+    """z of the plug's origin in the socket's frame when fully seated."""
+    travel_m: float
+    """Way from first entry to fully seated."""
+
+    @property
+    def mouth_z_m(self) -> float:
+        """z of the plug's origin in the socket's frame at first entry."""
+        return self.seated_z_m + self.travel_m
+
+
+def load_pair(config: SceneConfig) -> PartPair:
+    """The pair that a scene asks for.
+
+    Raises:
+        ValueError: unknown pair, or a clearance that does not suit the plug.
+        FileNotFoundError: missing folder or meshes of automate/ID.
+    """
+    if config.pair.startswith(MESH_PAIR_PREFIX):
+        from lerobot_vtrefine.sim.mesh_pairs import load_mesh_parts  # trimesh and CoACD are optional
+
+        return load_mesh_parts(config.pair, config.mesh_dir)
+    if config.pair not in PROCEDURAL_PAIRS:
+        choices = f"{', '.join(PROCEDURAL_PAIRS)} or {MESH_PAIR_PREFIX}ID"
+        raise ValueError(f"unknown pair {config.pair!r}: use one of {choices}")
+    return procedural_pair(config.pair, config.hole_clearance_m)
+
+
+def procedural_pair(name: str, clearance_m: float) -> PartPair:
+    """Plug and socket built from primitives; a negative clearance makes the hole smaller than the plug."""
+    peg_length = HOLE_DEPTH_M + PEG_SURPLUS_M
+    profile = make_profile(name, peg_length)
+    if abs(clearance_m) >= profile.smallest_width_m:
+        raise ValueError(
+            f"clearance_m = {clearance_m} exceeds the {name} plug, which is {profile.smallest_width_m:.4f} m wide"
+        )
+    handle_z = peg_length + HANDLE_M[2] / 2
+    handle = Box(_half(HANDLE_M), (0.0, 0.0, handle_z))
+    plug = Part((*profile.pieces, handle), Grip((0.0, 0.0, handle_z), _half(HANDLE_M)), rest_height_m=0.0)
+    outline = offset_outline(profile.outline, clearance_m / 2)
+    walls = wall_boxes(outline, WALL_M, -HOLE_DEPTH_M, 0.0)
+    base_z = -HOLE_DEPTH_M - BASE_M[2] / 2
+    base = Box(_half(BASE_M), (0.0, 0.0, base_z))
+    # The hand takes the base at its upper edge: on the table the lower edge leaves no room for a pitched hand.
+    grip = Grip((0.0, 0.0, -0.040), (BASE_M[0] / 2, BASE_M[1] / 2, 0.015))
+    socket = Part((base, *walls), grip, rest_height_m=HOLE_DEPTH_M + BASE_M[2])
+    return PartPair(name, plug, socket, seated_z_m=-HOLE_DEPTH_M, travel_m=HOLE_DEPTH_M)
+
+
+def _half(size: tuple[float, float, float]) -> tuple[float, float, float]:
+    x, y, z = np.asarray(size) / 2
+    return float(x), float(y), float(z)

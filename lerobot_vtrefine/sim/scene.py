@@ -1,0 +1,211 @@
+"""The whole scene from one configuration: MjSpec, compiled model, and where everything lies in it."""
+
+from dataclasses import dataclass
+
+import mujoco
+import numpy as np
+
+from lerobot_vtrefine.embodiments import Embodiment, get_embodiment
+from lerobot_vtrefine.sim.arms import LEFT_HAND, PLUG, RIGHT_HAND, SOCKET, TABLE, add_arm
+from lerobot_vtrefine.sim.camera import Camera, make_camera
+from lerobot_vtrefine.sim.config import SceneConfig
+from lerobot_vtrefine.sim.looks import PLUG_COLOUR, SOCKET_COLOUR, Rgba, add_looks
+from lerobot_vtrefine.sim.pairs import Part, PartPair, load_pair
+from lerobot_vtrefine.sim.profiles import Primitive
+from lerobot_vtrefine.sim.rotations import matrix_to_quat
+from lerobot_vtrefine.tactile.geometry import Box, Cylinder
+
+__all__ = ["Scene", "SceneConfig", "build_scene"]
+
+TABLE_SIZE_M = (0.9, 1.4, 0.04)
+MIN_PART_MASS_KG = 0.04
+_CONTACT_DATA = 1 | 2 | 4 | 16  # found, force, torque, position of mjtConDataField
+_NETFORCE = 3
+_CONTACT_SIZE = 10
+
+
+@dataclass(frozen=True)
+class Addresses:
+    """Where the task's quantities lie in MuJoCo's flat arrays."""
+
+    qpos: np.ndarray
+    """(J,) joints in the embodiment's order."""
+    dof: np.ndarray
+    """(J,)"""
+    plug_qpos: slice
+    """7 numbers: position, quaternion (w, x, y, z)."""
+    socket_qpos: slice
+    plug_dof: slice
+    """6 numbers: linear velocity in the world frame, angular velocity in the body's."""
+    socket_dof: slice
+    part_contact: slice
+    """Contact sensor, force of the plug on the socket: found, force, torque, position; world frame."""
+    pad_contacts: np.ndarray
+    """(4, 10) the same per pad, force of the pad on whatever touches it."""
+    part_geoms: np.ndarray
+    pad_geoms: np.ndarray
+    """(4,) in the order of the pads."""
+
+
+@dataclass(frozen=True)
+class Scene:
+    """A compiled scene."""
+
+    config: SceneConfig
+    spec: mujoco.MjSpec
+    model: mujoco.MjModel
+    embodiment: Embodiment
+    pair: PartPair
+    camera: Camera
+    addresses: Addresses
+
+    @property
+    def plug_body(self) -> int:
+        """Body id of the plug."""
+        return self.model.body("plug").id
+
+    @property
+    def socket_body(self) -> int:
+        """Body id of the socket."""
+        return self.model.body("socket").id
+
+
+def build_scene(config: SceneConfig) -> Scene:
+    """Build and compile the scene.
+
+    Raises:
+        ValueError: unknown pair, start or embodiment, or a clearance that does not suit the plug.
+        FileNotFoundError: missing meshes of automate/ID.
+    """
+    embodiment = get_embodiment(config.embodiment)
+    pair = load_pair(config)
+    camera = make_camera(config)
+    spec = mujoco.MjSpec()
+    _set_options(spec, config)
+    add_looks(spec)
+    _add_table(spec, config)
+    for arm in embodiment.arms:
+        add_arm(spec, embodiment, arm, config)
+    # The right hand holds the plug and the left the socket, but either may brush against any hand.
+    _add_part(spec, "plug", pair.plug, config, PLUG, TABLE | SOCKET | LEFT_HAND | RIGHT_HAND, PLUG_COLOUR)
+    _add_part(spec, "socket", pair.socket, config, SOCKET, TABLE | LEFT_HAND | RIGHT_HAND, SOCKET_COLOUR)
+    _add_camera(spec, camera)
+    _add_sensors(spec, embodiment)
+    model = spec.compile()
+    return Scene(config, spec, model, embodiment, pair, camera, _addresses(model, embodiment))
+
+
+def _set_options(spec: mujoco.MjSpec, config: SceneConfig) -> None:
+    spec.modelname = f"bimanual insertion: {config.pair}"
+    spec.compiler.degree = False
+    spec.option.timestep = config.timestep_s
+    spec.option.integrator = mujoco.mjtIntegrator.mjINT_IMPLICITFAST
+    spec.option.cone = mujoco.mjtCone.mjCONE_ELLIPTIC
+    spec.option.impratio = 10.0
+    # Solver iterations stay at their defaults: fewer make this scene explode.
+
+
+def _add_table(spec: mujoco.MjSpec, config: SceneConfig) -> None:
+    half = np.asarray(TABLE_SIZE_M) / 2
+    table = spec.worldbody.add_geom(
+        name="table", type=mujoco.mjtGeom.mjGEOM_BOX, size=half, pos=[0, 0, -half[2]], material="table"
+    )
+    table.contype, table.conaffinity = TABLE, 0
+    table.friction = [config.part_friction, 0.005, 0.0001]
+    floor = spec.worldbody.add_geom(
+        name="floor", type=mujoco.mjtGeom.mjGEOM_PLANE, size=[3, 3, 0.1], pos=[0, 0, -0.75], material="floor"
+    )
+    floor.contype = floor.conaffinity = 0
+    floor.group = 1
+
+
+def _add_part(
+    spec: mujoco.MjSpec, name: str, part: Part, config: SceneConfig, own: int, others: int, rgba: Rgba
+) -> None:
+    body = spec.worldbody.add_body(name=name)
+    body.add_freejoint(name=name)
+    for index, piece in enumerate(part.pieces):
+        geom = _add_piece(spec, body, f"{name}_{index}", piece)
+        geom.rgba = rgba if index else _shade(rgba, 0.85)
+        geom.contype, geom.conaffinity = own, others
+        geom.condim = 4
+        geom.friction = [config.part_friction, 0.002, 0.0001]
+        geom.solref = [2 * config.timestep_s, 1.0]
+        geom.density = config.part_density
+    _raise_mass(spec, body)
+
+
+def _add_piece(spec: mujoco.MjSpec, body: mujoco.MjsBody, name: str, piece: Primitive) -> mujoco.MjsGeom:
+    if isinstance(piece, Box):
+        return body.add_geom(
+            name=name, type=mujoco.mjtGeom.mjGEOM_BOX, size=piece.half_size, pos=piece.pos, quat=piece.quat
+        )
+    if isinstance(piece, Cylinder):
+        size = [piece.radius, piece.half_height, 0]
+        return body.add_geom(
+            name=name, type=mujoco.mjtGeom.mjGEOM_CYLINDER, size=size, pos=piece.pos, quat=piece.quat
+        )
+    spec.add_mesh(name=name, uservert=piece.vertices.ravel(), userface=piece.faces.ravel())
+    return body.add_geom(name=name, type=mujoco.mjtGeom.mjGEOM_MESH, meshname=name)
+
+
+def _raise_mass(spec: mujoco.MjSpec, body: mujoco.MjsBody) -> None:
+    """Scale the part's density so that it weighs at least what contacts need to stay stiff."""
+    mass = spec.copy().compile().body(body.name).mass[0]
+    if mass < MIN_PART_MASS_KG:
+        for geom in body.geoms:
+            geom.density *= MIN_PART_MASS_KG / mass
+
+
+def _shade(rgba: Rgba, factor: float) -> Rgba:
+    return (rgba[0] * factor, rgba[1] * factor, rgba[2] * factor, rgba[3])
+
+
+def _add_camera(spec: mujoco.MjSpec, camera: Camera) -> None:
+    flip = np.diag([1.0, -1.0, -1.0])  # MuJoCo's cameras look along -z with y up
+    rotation = camera.rotation @ flip
+    spec.worldbody.add_camera(
+        name="front",
+        pos=camera.position_m,
+        quat=matrix_to_quat(rotation),
+        fovy=float(np.rad2deg(2 * np.arctan(camera.height / 2 / camera.fy))),
+        resolution=[camera.width, camera.height],
+    )
+
+
+def _add_sensors(spec: mujoco.MjSpec, embodiment: Embodiment) -> None:
+    parts = _contact_sensor(spec, "part_contact")
+    parts.objtype, parts.objname = mujoco.mjtObj.mjOBJ_BODY, "plug"
+    parts.reftype, parts.refname = mujoco.mjtObj.mjOBJ_BODY, "socket"
+    for pad in embodiment.pad_names:
+        sensor = _contact_sensor(spec, pad)
+        sensor.objtype, sensor.objname = mujoco.mjtObj.mjOBJ_GEOM, pad
+
+
+def _contact_sensor(spec: mujoco.MjSpec, name: str) -> mujoco.MjsSensor:
+    sensor = spec.add_sensor(name=name, type=mujoco.mjtSensor.mjSENS_CONTACT)
+    sensor.intprm[:3] = [_CONTACT_DATA, _NETFORCE, 1]
+    return sensor
+
+
+def _addresses(model: mujoco.MjModel, embodiment: Embodiment) -> Addresses:
+    def joint(name: str) -> tuple[int, int]:
+        item = model.joint(name)
+        return int(item.qposadr[0]), int(item.dofadr[0])
+
+    joints = np.array([joint(name) for name in embodiment.joint_names])
+    (plug_qpos, plug_dof), (socket_qpos, socket_dof) = joint("plug"), joint("socket")
+    bodies = (model.body("plug").id, model.body("socket").id)
+    contact = [int(model.sensor(name).adr[0]) for name in ("part_contact", *embodiment.pad_names)]
+    return Addresses(
+        qpos=joints[:, 0],
+        dof=joints[:, 1],
+        plug_qpos=slice(plug_qpos, plug_qpos + 7),
+        socket_qpos=slice(socket_qpos, socket_qpos + 7),
+        plug_dof=slice(plug_dof, plug_dof + 6),
+        socket_dof=slice(socket_dof, socket_dof + 6),
+        part_contact=slice(contact[0], contact[0] + _CONTACT_SIZE),
+        pad_contacts=np.asarray(contact[1:])[:, None] + np.arange(_CONTACT_SIZE),
+        part_geoms=np.flatnonzero(np.isin(model.geom_bodyid, bodies)),
+        pad_geoms=np.array([model.geom(name).id for name in embodiment.pad_names]),
+    )

@@ -1,0 +1,138 @@
+"""From the state of worlds to what the robot's sensors would give: joint positions, raw pad counts, depth.
+
+Shapes: m worlds, 4 pads, B = 2 bodies (plug, socket).
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+
+from lerobot_vtrefine.embodiments import Embodiment
+from lerobot_vtrefine.sim.pairs import Part
+from lerobot_vtrefine.sim.rotations import quat_to_matrix, turn, turn_back
+from lerobot_vtrefine.sim.scene import Scene
+from lerobot_vtrefine.tactile import BodyGeometry, PadLayout, PadSensors, SensorModel, layout_from_mesh
+
+Array = np.ndarray
+
+
+@dataclass(frozen=True)
+class Kinematics:
+    """Poses of m worlds, from their positions and velocities."""
+
+    joints: Array
+    """(m, J)"""
+    joint_velocities: Array
+    hand_position: Array
+    """(m, 2, 3) TCPs."""
+    hand_rotation: Array
+    plug: tuple[Array, Array]
+    """Position (m, 3) and rotation (m, 3, 3)."""
+    socket: tuple[Array, Array]
+    plug_velocity: Array
+    """(m, 6) linear velocity of the origin, then angular, world frame."""
+    socket_velocity: Array
+
+
+def read_kinematics(scene: Scene, qpos: Array, qvel: Array) -> Kinematics:
+    """Poses for positions (m, nq) and velocities (m, nv)."""
+    at = scene.addresses
+    joints = qpos[:, at.qpos]
+    position, rotation = scene.embodiment.tcp_poses(torch.from_numpy(joints))
+    plug, socket = part_pose(qpos[:, at.plug_qpos]), part_pose(qpos[:, at.socket_qpos])
+    return Kinematics(
+        joints=joints,
+        joint_velocities=qvel[:, at.dof],
+        hand_position=position.numpy(),
+        hand_rotation=rotation.numpy(),
+        plug=plug,
+        socket=socket,
+        plug_velocity=_twist(qvel[:, at.plug_dof], plug[1]),
+        socket_velocity=_twist(qvel[:, at.socket_dof], socket[1]),
+    )
+
+
+def part_pose(pose: Array) -> tuple[Array, Array]:
+    """(..., 7) position and quaternion -> position (..., 3) and rotation (..., 3, 3)."""
+    return pose[..., :3], quat_to_matrix(pose[..., 3:])
+
+
+def pad_loads(embodiment: Embodiment, joints: Array, contacts: Array) -> Array:
+    """Contact sensors' wrenches as loads on the pads.
+
+    Args:
+        joints: (m, J).
+        contacts: (m, 4, 10) found, force of the pad on its counterpart, torque, centre; world frame.
+
+    Returns:
+        (m, 4, 3): normal force pressing on the pad [N], its centre's x and y in the pad's frame [m].
+    """
+    position, rotation = (item.numpy() for item in embodiment.pad_poses(torch.from_numpy(joints)))
+    force = turn_back(rotation, contacts[..., 1:4])[..., 2]
+    centre = turn_back(rotation, contacts[..., 7:10] - position)[..., :2]
+    touched = contacts[..., 0] > 0
+    load = np.concatenate([np.maximum(force, 0.0)[..., None], centre], -1)
+    return np.where(touched[..., None], load, 0.0)
+
+
+class Pads:
+    """The four pads of every world."""
+
+    def __init__(self, scene: Scene, model: SensorModel, num_envs: int, control_dt_s: float) -> None:
+        self._embodiment, self._dt_s = scene.embodiment, control_dt_s
+        bodies = [_touch_geometry(scene.pair.plug), _touch_geometry(scene.pair.socket)]
+        self.layout = pad_layout(scene.embodiment)
+        self.sensors = PadSensors(self.layout, bodies, num_envs, num_pads=4, model=model)
+        self._remembers = model.has_state
+        self._last = np.zeros((num_envs, 4, self.layout.num_taxels), np.uint8)
+
+    def reset(self, ids: Array, seeds: Array, stiffness_scale: Array, gain_scale: Array) -> None:
+        """Start new episodes: sensor traits and noise follow the seeds (m,)."""
+        self.sensors.reset(ids, seeds)
+        self.sensors.randomize(ids, stiffness_scale=stiffness_scale, gain_scale=gain_scale)
+
+    def advance(self, ids: Array, seen: Kinematics, load: Array) -> None:
+        """Let one control step pass; needed only by models with memory."""
+        if self._remembers:
+            self._last[ids] = self._read(ids, seen, load)
+
+    def counts(self, ids: Array, seen: Kinematics, load: Array) -> Array:
+        """Raw counts (m, 4, 384) uint8 at the worlds' present state."""
+        return self._last[ids] if self._remembers else self._read(ids, seen, load)
+
+    def _read(self, ids: Array, seen: Kinematics, load: Array) -> Array:
+        joints, rates = torch.from_numpy(seen.joints), torch.from_numpy(seen.joint_velocities)
+        position, rotation = self._embodiment.pad_poses(joints)
+        velocity = self._embodiment.pad_twists(joints, rates)
+        counts = self.sensors.counts(
+            ids,
+            position.numpy(),
+            rotation.numpy(),
+            velocity.numpy(),
+            np.stack([seen.plug[0], seen.socket[0]], 1),
+            np.stack([seen.plug[1], seen.socket[1]], 1),
+            np.stack([seen.plug_velocity, seen.socket_velocity], 1),
+            self._dt_s,
+            load,
+        )
+        return np.asarray(counts)
+
+
+def pad_layout(embodiment: Embodiment) -> PadLayout:
+    """The taxels, found on the pad's own surface as in the paper's appendix."""
+    length, width, thickness = embodiment.fingers.pad_size_m
+    signs = np.array([(x, y, z) for x in (-1, 1) for y in (-1, 1) for z in (-1, 1)])
+    vertices = signs * np.array([length, width, thickness]) / 2
+    faces = [(0, 1, 3), (0, 3, 2), (4, 6, 7), (4, 7, 5), (0, 4, 5), (0, 5, 1)]
+    faces += [(2, 3, 7), (2, 7, 6), (0, 2, 6), (0, 6, 4), (1, 5, 7), (1, 7, 3)]
+    return layout_from_mesh(vertices, np.array(faces), outward=np.array([0.0, 0.0, 1.0]))
+
+
+def _touch_geometry(part: Part) -> BodyGeometry:
+    return BodyGeometry([part.surface] if part.surface is not None else list(part.pieces))
+
+
+def _twist(velocity: Array, rotation: Array) -> Array:
+    """A free joint's velocity has its angular part in the body's frame: bring it to the world's."""
+    return np.concatenate([velocity[:, :3], turn(rotation, velocity[:, 3:])], -1)

@@ -1,0 +1,357 @@
+"""Bimanual insertion in many worlds: reset by seed, step by joint targets, observe raw sensor data.
+
+Shapes: N worlds, m of them addressed by sorted ids; J = 16 joints; H x W depth pixels; 4 pads of 384 taxels.
+"""
+
+from dataclasses import dataclass
+from typing import Any
+
+import mujoco
+import numpy as np
+
+from lerobot_vtrefine.sim import sensing, starts, task
+from lerobot_vtrefine.sim.backends import Trace, get_backend
+from lerobot_vtrefine.sim.camera import depth_to_millimetres
+from lerobot_vtrefine.sim.config import RANGES, RandomizationConfig, SceneConfig, TaskConfig
+from lerobot_vtrefine.sim.episode import EpisodeState, Measured, update
+from lerobot_vtrefine.sim.privileged import Privileged, describe
+from lerobot_vtrefine.sim.randomization import Randomizer, WorldParameters
+from lerobot_vtrefine.sim.rotations import matrix_to_quat
+from lerobot_vtrefine.sim.scene import Scene, build_scene
+from lerobot_vtrefine.sim.sensing import Kinematics
+from lerobot_vtrefine.sim.task import FAILURES
+from lerobot_vtrefine.tactile import SensorModel
+
+__all__ = ["FAILURES", "InsertionSim", "StepResult"]
+
+Array = np.ndarray
+
+NOISE_LEVEL = 3.0
+"""Standard deviation of the depth noise that training adds to simulated clouds, in the paper's unit."""
+_START_STREAM = 0
+_SAMPLE_S = 0.025
+"""Sliding on the rim is sampled this often."""
+_MAX_CACHED_STARTS = 4096
+
+
+@dataclass(frozen=True)
+class StepResult:
+    """Outcome of one control step, (m,) each."""
+
+    reward: Array
+    """1 in the step in which success is reached, else 0."""
+    terminated: Array
+    truncated: Array
+    success: Array
+
+
+class InsertionSim:
+    """N independent worlds of one scene.
+
+    Args:
+        scene_config: what stands in the scene.
+        task_config: control, start, success, limits.
+        sensor: "default", "paper", the path of a sensor_model.json, or a model.
+        num_envs: N.
+        backend: "single" or "batch".
+        num_threads: of the batch backend; 0 uses all cores.
+        randomization: differences between worlds.
+
+    Raises:
+        ValueError: zero worlds, or a setting that makes no sense.
+        FileNotFoundError: missing meshes or sensor model.
+    """
+
+    def __init__(
+        self,
+        scene_config: SceneConfig | None = None,
+        task_config: TaskConfig | None = None,
+        sensor: str | SensorModel = "default",
+        num_envs: int = 1,
+        backend: str = "batch",
+        num_threads: int = 0,
+        randomization: RandomizationConfig | None = None,
+    ) -> None:
+        if num_envs < 1:
+            raise ValueError(f"num_envs must be at least 1, got {num_envs}")
+        self.config = task_config or TaskConfig()
+        self.scene: Scene = build_scene(scene_config or SceneConfig())
+        self.num_envs = num_envs
+        self.noise_level = NOISE_LEVEL
+        self._substeps = _substeps(self.scene.config, self.config)
+        self._backend = get_backend(backend, self.scene.model, num_envs, num_threads)
+        self._randomizer = Randomizer(self.scene, randomization or RandomizationConfig())
+        model = SensorModel.named(sensor) if isinstance(sensor, str) else sensor
+        self._pads = sensing.Pads(self.scene, model, num_envs, self.config.control_dt_s)
+        window = max(1, round(self.config.limits.force_window_s / self.scene.config.timestep_s))
+        self._episode = EpisodeState.empty(num_envs, self.scene.model.nu, window)
+        self._rates = task.rate_limits(self.scene.embodiment, self.config)
+        self._rays = self.scene.camera.directions()
+        everyone = self._randomizer.draw(np.zeros(num_envs, np.int64))
+        self._parameters = dict(everyone.values)
+        self._camera_position, self._camera_rotation = everyone.camera_position, everyone.camera_rotation
+        self._settled: dict[int, tuple[Array, Array]] = {}
+
+    @property
+    def embodiment(self) -> Any:
+        """The robot."""
+        return self.scene.embodiment
+
+    @property
+    def episode_steps(self) -> int:
+        """Control steps until the time-out."""
+        return self.config.steps_of(self.scene.config.start)
+
+    @property
+    def seeds(self) -> Array:
+        """(N,) seed of every world's present episode."""
+        return self._episode.seed
+
+    @property
+    def steps(self) -> Array:
+        """(N,) control steps done in every world's present episode."""
+        return self._episode.steps
+
+    @property
+    def camera_intrinsics(self) -> Array:
+        """(4,) float32 fx, fy, cx, cy [pixels]."""
+        return self.scene.camera.intrinsics
+
+    @property
+    def camera_pose(self) -> Array:
+        """(N, 7) float32 position [m] and quaternion (w, x, y, z) of the OpenCV optical frame in the world."""
+        quat = matrix_to_quat(self._camera_rotation)
+        return np.concatenate([self._camera_position, quat], 1).astype(np.float32)
+
+    def reset(self, ids: Array, seeds: Array) -> None:
+        """Start new episodes in worlds `ids` (m,); each is a pure function of its seed (m,)."""
+        ids = self._checked(ids)
+        seeds = np.broadcast_to(np.asarray(seeds, np.int64), ids.shape)
+        drawn = self._randomizer.draw(seeds)
+        self._apply(ids, drawn)
+        state = self._episode
+        state.clear(ids)
+        state.seed[ids] = seeds
+        self._settle(ids, seeds)
+        scale = drawn.values["pad_stiffness_scale"], drawn.values["sensor_gain_scale"]
+        self._pads.reset(ids, seeds, *scale)
+        seen = self._seen(ids)
+        measured = self._grip_points(seen)
+        in_hand = self.scene.config.start == "grasped"
+        state.grasped[ids] = in_hand
+        state.reference[ids] = measured
+        state.tip[ids] = task.insertion(self.scene.pair, seen.plug, seen.socket).position_m
+        self._pads.advance(ids, seen, state.pad_load[ids])
+
+    def step(self, action: Array, ids: Array | None = None) -> StepResult:
+        """One control step of worlds `ids` (m,), all by default.
+
+        Args:
+            action: (m, J) absolute joint targets [rad, m]. They are clamped to the joint limits and to the rate
+                limits, and approached linearly over the control step.
+        """
+        ids = self._checked(ids)
+        action = np.asarray(action, float)
+        if action.shape != (len(ids), self.scene.embodiment.num_joints) or not np.isfinite(action).all():
+            raise ValueError(
+                f"action must be finite, of shape {(len(ids), self.scene.embodiment.num_joints)}, got {action.shape}"
+            )
+        state = self._episode
+        before = state.command[ids]
+        wanted = task.servo_commands(self.scene.embodiment, action)
+        after = np.clip(wanted, before - self._rates, before + self._rates)
+        trace = self._backend.advance(ids, task.ramp(before, after, self._substeps))
+        state.command[ids] = after
+        seen = self._seen(ids)
+        reward = update(state, ids, self._measure(ids, seen, trace), self.scene.pair, self.config)
+        self._pads.advance(ids, seen, state.pad_load[ids])
+        terminated = state.done[ids]
+        truncated = ~terminated & (state.steps[ids] >= self.episode_steps)
+        return StepResult(reward, terminated, truncated, state.success[ids])
+
+    def observe(self, ids: Array | None = None) -> dict[str, Array]:
+        """What the sensors give now: `state` (m, 16) float32 [rad, m]; `tactile` and `tactile_baseline` (m, 4, 384)
+        uint8 counts; `depth_mm` (m, H, W) uint16, 0 where nothing lies within 2 m."""
+        ids = self._checked(ids)
+        seen = self._seen(ids)
+        return {
+            "state": seen.joints.astype(np.float32),
+            "tactile": self._pads.counts(ids, seen, self._episode.pad_load[ids]),
+            "tactile_baseline": self._pads.sensors.baseline[ids],
+            "depth_mm": self.depth_mm(ids),
+        }
+
+    def joint_state(self, ids: Array | None = None) -> Array:
+        """The `state` part of `observe` alone: (m, 16) float32."""
+        qpos, _ = self._backend.read(self._checked(ids))
+        return qpos[:, self.scene.addresses.qpos].astype(np.float32)
+
+    def depth_mm(self, ids: Array | None = None) -> Array:
+        """Depth images (m, H, W) uint16 [mm]."""
+        ids = self._checked(ids)
+        directions = self._rays @ np.swapaxes(self._camera_rotation[ids], -1, -2)
+        depth = self._backend.cast(ids, self._camera_position[ids], directions)
+        shape = (len(ids), self.scene.camera.height, self.scene.camera.width)
+        return depth_to_millimetres(depth).reshape(shape)
+
+    def command_targets(self, ids: Array | None = None) -> Array:
+        """Joint targets (m, J) that the servos hold at the end of the last control step."""
+        return task.joint_targets(self.scene.embodiment, self._episode.command[self._checked(ids)])
+
+    def part_poses(self, ids: Array | None = None) -> tuple[Array, Array]:
+        """Poses (m, 7) of plug and socket: position [m], quaternion (w, x, y, z)."""
+        qpos, _ = self._backend.read(self._checked(ids))
+        return qpos[:, self.scene.addresses.plug_qpos], qpos[:, self.scene.addresses.socket_qpos]
+
+    def insertion(self, ids: Array | None = None) -> task.Insertion:
+        """Where each plug is with respect to its socket."""
+        seen = self._seen(self._checked(ids))
+        return task.insertion(self.scene.pair, seen.plug, seen.socket)
+
+    def privileged(self, ids: Array | None = None) -> Array:
+        """State for a critic, (m, P) float32, columns named by `privileged_names`."""
+        ids = self._checked(ids)
+        return self._describe(ids).vector
+
+    @property
+    def privileged_names(self) -> tuple[str, ...]:
+        """(P,) names."""
+        return self._describe(np.arange(1)).names
+
+    def metrics(self, ids: Array | None = None) -> dict[str, Array]:
+        """How the episodes went so far, (m,) each; `failure` indexes `FAILURES`, times are NaN without success."""
+        ids = self._checked(ids)
+        state = self._episode
+        steps = np.where(state.success[ids], state.success_step[ids], np.nan)
+        return {
+            "success": state.success[ids],
+            "failure": state.failure[ids],
+            "in_hand_shift_m": state.largest_shift[ids].max(1),
+            "rim_slide_m": state.rim_slide[ids],
+            "peak_force_n": state.peak_force[ids],
+            "time_to_success_s": steps * self.config.control_dt_s,
+            "depth_m": self.insertion(ids).depth_m,
+        }
+
+    def get_state(self, env: int) -> dict[str, Any]:
+        """Everything that world `env`'s future depends on."""
+        return {
+            "row": self._backend.get_row(env),
+            "episode": self._episode.row(env),
+            "parameters": {name: values[env] for name, values in self._parameters.items()},
+            "camera": (self._camera_position[env].copy(), self._camera_rotation[env].copy()),
+            "pads": self._pads.get_state(env),
+        }
+
+    def set_state(self, env: int, state: dict[str, Any]) -> None:
+        """Continue world `env` from a state taken by `get_state`."""
+        values = {name: np.atleast_1d(value) for name, value in state["parameters"].items()}
+        position, rotation = state["camera"]
+        self._apply(np.array([env]), WorldParameters(values, position[None], rotation[None]))
+        self._backend.set_row(env, state["row"])
+        self._episode.set_row(env, state["episode"])
+        self._pads.set_state(env, state["pads"])
+
+    def mj_data(self, env: int) -> tuple[mujoco.MjModel, mujoco.MjData]:
+        """Model and data of one world with derived quantities, for rendering; not live."""
+        return self._backend.instance(env)
+
+    def _checked(self, ids: Array | None) -> Array:
+        if ids is None:
+            return np.arange(self.num_envs)
+        ids = np.atleast_1d(np.asarray(ids, np.int64))
+        if len(ids) and (ids[0] < 0 or ids[-1] >= self.num_envs or (np.diff(ids) <= 0).any()):
+            raise ValueError(f"ids must be sorted, unique and below {self.num_envs}, got {ids}")
+        return ids
+
+    def _apply(self, ids: Array, drawn: WorldParameters) -> None:
+        for name in RANGES:
+            self._parameters[name][ids] = drawn.values[name]
+        self._camera_position[ids], self._camera_rotation[ids] = drawn.camera_position, drawn.camera_rotation
+        if self._randomizer.changes_physics:
+            self._backend.set_fields(ids, self._randomizer.model_fields(drawn))
+
+    def _settle(self, ids: Array, seeds: Array) -> None:
+        """Bring worlds to their starts and to rest, or back to where an earlier reset with this seed left them."""
+        missing = np.array([int(seed) not in self._settled for seed in seeds], bool)
+        fresh = self._settle_physically(ids[missing], seeds[missing]) if missing.any() else {}
+        for env, seed in zip(ids, seeds, strict=True):
+            row, command, load = fresh[int(env)] if int(env) in fresh else self._settled[int(seed)]
+            self._backend.set_row(int(env), row)
+            self._episode.command[env], self._episode.pad_load[env] = command, load
+            self._episode.pad_force[env] = load[:, 0]
+            if len(self._settled) < _MAX_CACHED_STARTS:
+                self._settled[int(seed)] = (row, command, load)
+
+    def _settle_physically(self, ids: Array, seeds: Array) -> dict[int, tuple[Array, Array, Array]]:
+        start = self._start(seeds)
+        at, model = self.scene.addresses, self.scene.model
+        qpos = np.zeros((len(ids), model.nq))
+        qpos[:, at.qpos], qpos[:, at.plug_qpos], qpos[:, at.socket_qpos] = (
+            start.joints,
+            start.plug,
+            start.socket,
+        )
+        self._backend.write(ids, qpos, np.zeros((len(ids), model.nv)))
+        command = task.servo_commands(self.scene.embodiment, start.targets)
+        substeps = round(start.settle_s / self.scene.config.timestep_s)
+        trace = self._backend.advance(ids, np.repeat(command[:, None], substeps, 1))
+        load = self._pad_load(trace)
+        return {
+            int(env): (self._backend.get_row(int(env)), command[row], load[row])
+            for row, env in enumerate(ids)
+        }
+
+    def _start(self, seeds: Array) -> starts.Start:
+        pair, robot = self.scene.pair, self.scene.embodiment
+        if self.scene.config.start == "table":
+            draws = starts.uniform_draws(seeds, _START_STREAM, starts.TABLE_DRAWS)
+            return starts.start_on_table(self.config.table, pair, robot, draws)
+        draws = starts.uniform_draws(seeds, _START_STREAM, starts.GRASPED_DRAWS)
+        return starts.start_in_hand(self.config.grasped, pair, robot, draws)
+
+    def _seen(self, ids: Array) -> Kinematics:
+        return sensing.read_kinematics(self.scene, *self._backend.read(ids))
+
+    def _grip_points(self, seen: Kinematics) -> Array:
+        grips = self.scene.pair.socket.grip, self.scene.pair.plug.grip
+        return task.grip_points(grips, (seen.socket, seen.plug), (seen.hand_position, seen.hand_rotation))
+
+    def _pad_load(self, trace: Trace) -> Array:
+        at = self.scene.addresses
+        joints, contacts = trace.qpos[:, -1][:, at.qpos], trace.sensors[:, -1][:, at.pad_contacts]
+        return sensing.pad_loads(self.scene.embodiment, joints, contacts)
+
+    def _measure(self, ids: Array, seen: Kinematics, trace: Trace) -> Measured:
+        at, pair = self.scene.addresses, self.scene.pair
+        contact = trace.sensors[:, :, at.part_contact]
+        stride = max(1, round(_SAMPLE_S / self.scene.config.timestep_s))
+        samples = trace.qpos[:, stride - 1 :: stride]
+        plug, socket = sensing.part_pose(samples[..., at.plug_qpos]), samples[..., at.socket_qpos]
+        position, rotation = sensing.part_pose(socket)
+        tips = np.einsum("...ji,...j->...i", rotation, plug[0] - position)
+        rest = np.array([pair.socket.rest_height_m, pair.plug.rest_height_m])
+        positions = np.stack([seen.socket[0], seen.plug[0]], 1)
+        return Measured(
+            insertion=task.insertion(pair, seen.plug, seen.socket),
+            grip_points=self._grip_points(seen),
+            part_heights=positions[..., 2] - rest,
+            part_positions=positions,
+            tips=tips,
+            touching=contact[:, stride - 1 :: stride, 0] > 0,
+            part_forces=contact[..., 1:4],
+            pad_load=self._pad_load(trace),
+            diverged=self._backend.diverged(ids),
+        )
+
+    def _describe(self, ids: Array) -> Privileged:
+        return describe(self.scene, self.config, self._episode, ids, self._seen(ids), self._parameters)
+
+
+def _substeps(scene: SceneConfig, config: TaskConfig) -> int:
+    substeps = config.control_dt_s / scene.timestep_s
+    if abs(substeps - round(substeps)) > 1e-6:
+        raise ValueError(
+            f"control_hz = {config.control_hz} is not a whole number of physics steps of {scene.timestep_s} s"
+        )
+    return round(substeps)

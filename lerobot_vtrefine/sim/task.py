@@ -1,0 +1,148 @@
+"""The task as pure functions on arrays: servo commands, insertion geometry, success, in-hand shift, forces.
+
+Shapes: m worlds. Poses are (position (m, 3) [m], rotation (m, 3, 3)) in the world frame. Hands are ordered left, right;
+the left hand holds the socket, the right one the plug.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from lerobot_vtrefine.embodiments import Embodiment
+from lerobot_vtrefine.sim.config import SuccessConfig, TaskConfig
+from lerobot_vtrefine.sim.pairs import Grip, PartPair
+from lerobot_vtrefine.sim.rotations import turn, turn_back
+
+__all__ = ["FAILURES", "TaskConfig"]
+
+Array = np.ndarray
+Pose = tuple[Array, Array]
+
+FAILURES = ("none", "in_hand_shift", "contact_force", "dropped", "unstable")
+NO_FAILURE, SHIFTED, FORCED, DROPPED, UNSTABLE = range(5)
+
+HELD_FORCE_N = 1.0
+"""A part is held while both pads of its hand press at least this hard."""
+RIM_DEPTH_M = 0.003
+"""Contact at less depth than this is contact with the rim."""
+
+
+@dataclass(frozen=True)
+class Insertion:
+    """Where the plug is with respect to its socket; (m,) or (m, 3) arrays."""
+
+    position_m: Array
+    """(m, 3) of the plug's origin in the socket's frame."""
+    rotation: Array
+    """(m, 3, 3)"""
+    depth_m: Array
+    """(m,) how far the plug has entered, negative above the mouth."""
+    remaining_m: Array
+    """(m,) way left to fully seated."""
+    lateral_m: Array
+    tilt_rad: Array
+    mouth_height_m: Array
+
+
+def servo_commands(embodiment: Embodiment, targets: Array) -> Array:
+    """Joint targets (m, J) -> servo commands (m, nu): clamped to the limits, one opening per gripper."""
+    clamped = np.clip(targets, embodiment.lower, embodiment.upper)
+    arms = clamped.reshape(len(targets), 2, embodiment.joints_per_arm)
+    opening = (arms[..., -2:-1] - arms[..., -1:]) / 2
+    return np.concatenate([arms[..., :-2], opening], -1).reshape(len(targets), -1)
+
+
+def joint_targets(embodiment: Embodiment, commands: Array) -> Array:
+    """Servo commands (m, nu) -> joint targets (m, J), the inverse of `servo_commands`."""
+    arms = commands.reshape(len(commands), 2, -1)
+    return np.concatenate([arms, -arms[..., -1:]], -1).reshape(len(commands), embodiment.num_joints)
+
+
+def rate_limits(embodiment: Embodiment, config: TaskConfig) -> Array:
+    """Largest change of each servo command in one control step (nu,)."""
+    arm = [config.joint_rate] * len(embodiment.joints) + [config.finger_rate]
+    return np.array(arm * 2) * config.control_dt_s
+
+
+def ramp(start: Array, stop: Array, substeps: int) -> Array:
+    """Linear interpolation of commands (m, nu) -> (m, substeps, nu), the last one being `stop`."""
+    weight = (np.arange(substeps) + 1.0) / substeps
+    return start[:, None] + weight[None, :, None] * (stop - start)[:, None]
+
+
+def insertion(pair: PartPair, plug: Pose, socket: Pose) -> Insertion:
+    """Pose of the plug in the socket's frame and what follows from it."""
+    position = turn_back(socket[1], plug[0] - socket[0])
+    rotation = np.swapaxes(socket[1], -1, -2) @ plug[1]
+    mouth_height = socket[0][:, 2] + pair.mouth_z_m * socket[1][:, 2, 2]
+    return Insertion(
+        position_m=position,
+        rotation=rotation,
+        depth_m=pair.mouth_z_m - position[:, 2],
+        remaining_m=position[:, 2] - pair.seated_z_m,
+        lateral_m=np.hypot(position[:, 0], position[:, 1]),
+        tilt_rad=np.arccos(np.clip(rotation[:, 2, 2], -1.0, 1.0)),
+        mouth_height_m=mouth_height,
+    )
+
+
+def is_seated(state: Insertion, config: SuccessConfig) -> Array:
+    """(m,) whether the plug is in, straight, and high enough above the table."""
+    return (
+        (state.remaining_m <= config.depth_slack_m)
+        & (state.lateral_m < config.lateral_m)
+        & (state.tilt_rad < config.tilt_rad)
+        & (state.mouth_height_m > config.mouth_height_m)
+    )
+
+
+def grip_points(grips: tuple[Grip, Grip], parts: tuple[Pose, Pose], hands: Pose) -> Array:
+    """Both ends of each gripped block in its hand's frame: (m, hand, end, 3) [m].
+
+    Two points per part, so that a part that turns in the hand counts as shifted too.
+    """
+    hand_position, hand_rotation = hands
+    points = []
+    for index, (grip, (position, rotation)) in enumerate(zip(grips, parts, strict=True)):
+        ends = np.asarray(grip.centre_m) + np.outer([-1.0, 1.0], [0.0, 0.0, grip.half_size_m[2]])
+        world = position[:, None] + turn(rotation[:, None], ends)
+        points.append(turn_back(hand_rotation[:, index, None], world - hand_position[:, index, None]))
+    return np.stack(points, 1)
+
+
+def in_hand_shift(points: Array, reference: Array) -> Array:
+    """Largest displacement of a part's grip points since the grasp: (m, hand) [m]."""
+    return np.linalg.norm(points - reference, axis=-1).max(-1)
+
+
+def windowed_peak(forces: Array, tail: Array) -> tuple[Array, Array]:
+    """Largest moving average of a force over one control step.
+
+    Args:
+        forces: (m, K, 3) of this step [N].
+        tail: (m, w - 1, 3), the last forces of the step before, for a window of w samples.
+
+    Returns:
+        Magnitudes (m,) [N] and the new tail.
+    """
+    window = tail.shape[1] + 1
+    series = np.concatenate([tail, forces], 1)
+    total = np.cumsum(np.concatenate([np.zeros_like(series[:, :1]), series], 1), 1)
+    means = (total[:, window:] - total[:, :-window]) / window
+    return np.linalg.norm(means, axis=-1).max(1), series[:, series.shape[1] - window + 1 :]
+
+
+def rim_slide(tips: Array, touching: Array, mouth_z_m: float) -> Array:
+    """Way that the plug slid on the socket's rim.
+
+    Args:
+        tips: (m, S + 1, 3) plug origins in the socket's frame at successive samples [m].
+        touching: (m, S) whether the parts touched in between.
+        mouth_z_m: height of first entry in the same frame.
+
+    Returns:
+        (m,) lateral way [m], counted only while the plug has not entered.
+    """
+    way = np.linalg.norm(np.diff(tips[..., :2], axis=1), axis=-1)
+    outside = mouth_z_m - tips[:, 1:, 2] < RIM_DEPTH_M
+    return (way * (touching & outside)).sum(1)
