@@ -41,9 +41,14 @@ def load_evaluation(directory: Path, first_seed: int) -> dict[str, Any]:
         "eval_seconds": round(info["overall"]["eval_s"], 1),
         "seeds": [first_seed + index for index in range(len(successes))],
         "metrics": summarise(rows),
-        "failures": dict(Counter(row["failure"] or "time-out" for row in rows if not row["success"])),
+        "failures": dict(Counter(failure_name(row) for row in rows if not row["success"])),
         "videos": videos,
     }
+
+
+def failure_name(row: dict[str, Any]) -> str:
+    """Why an episode failed; the simulation names no reason when the time ran out."""
+    return "time-out" if row["failure"] in (None, "", "none") else row["failure"].replace("_", " ")
 
 
 def summarise(rows: Sequence[dict[str, Any]]) -> dict[str, Any]:
