@@ -60,6 +60,22 @@ def contact_source(
     return frame
 
 
+def press_in_turn_source(
+    shape: FrameShape, board: int, boards: int, press_frames: int, seed: int = 0
+) -> Source:
+    """One of several pads that are pressed in turn, each for half of its turn of 2 * press_frames frames."""
+    idle = noise_source(shape, seed)
+    rows, cols = np.mgrid[: shape.rows, : shape.cols]
+    blob = 150.0 * np.exp(-((rows - shape.rows / 2) ** 2 + (cols - shape.cols / 2) ** 2) / (2 * 2.0**2))
+
+    def frame(number: int) -> NDArray[np.uint8]:
+        turn, within = divmod(number, 2 * press_frames)
+        pressed = turn > 0 and (turn - 1) % boards == board and within < press_frames
+        return np.clip(idle(number) + np.rint(blob * pressed), 0, 255).astype(np.uint8)
+
+    return frame
+
+
 def recording_source(path: Path, shape: FrameShape) -> Source:
     """Plays frames of a file in a loop: .npy, or .npz with one uint8 array of (T, R, C) or (T, R*C).
 

@@ -1,0 +1,113 @@
+"""`vtrefine-find-pads`: press a pad, name it; writes the YAML file that robot configurations read."""
+
+import argparse
+from collections.abc import Sequence
+from contextlib import ExitStack
+from pathlib import Path
+
+from lerobot_vtrefine.cli.errors import run_cli
+from lerobot_vtrefine.datasets.features import PADS
+from lerobot_vtrefine.drivers.config import PadConfig
+from lerobot_vtrefine.drivers.discovery import (
+    FoundBoard,
+    open_board,
+    probe_port,
+    wait_for_press,
+    wait_for_release,
+)
+from lerobot_vtrefine.drivers.pads_file import save_pads
+from lerobot_vtrefine.drivers.ports import PortError, stable_path, stable_ports
+
+
+def parse_arguments(arguments: Sequence[str] | None) -> argparse.Namespace:
+    """Command line of `vtrefine-find-pads`."""
+    parser = argparse.ArgumentParser(
+        prog="vtrefine-find-pads",
+        description="Find out which FlexiTac pad is on which serial port: the command asks for one pad after "
+        "the other, you press it, and the answer is written with stable USB paths.",
+        epilog="Try it without hardware: vtrefine-pad-emulator --folder /tmp/pads --source press & "
+        "vtrefine-find-pads --ports /tmp/pads/*",
+    )
+    parser.add_argument(
+        "--output", type=Path, default=Path("pads.yaml"), help="file to write (default %(default)s)"
+    )
+    parser.add_argument(
+        "--names", nargs="+", default=list(PADS), metavar="NAME", help="pads to ask for, in this order"
+    )
+    parser.add_argument(
+        "--ports",
+        nargs="+",
+        metavar="PORT",
+        help="ports to look at (default: every USB serial port of this machine)",
+    )
+    parser.add_argument(
+        "--timeout", type=float, default=60.0, help="seconds to wait for each press (%(default)s)"
+    )
+    parser.add_argument("--list", action="store_true", help="only list the ports and what they send")
+    return parser.parse_args(arguments)
+
+
+@run_cli
+def main(arguments: Sequence[str] | None = None) -> None:
+    """Entry point of `vtrefine-find-pads`."""
+    options = parse_arguments(arguments)
+    if len(set(options.names)) < len(options.names):
+        raise ValueError(f"--names must differ from each other, got {' '.join(options.names)}")
+    ports = options.ports or stable_ports()
+    if not ports:
+        raise PortError("no serial port found; plug in the boards, or name ports with --ports")
+    with ExitStack() as stack:
+        boards = find_boards(ports, stack, only_list=options.list)
+        if options.list:
+            return
+        pads = ask(boards, options.names, options.timeout)
+    save_pads(pads, options.output)
+    print(f"wrote {options.output}: use it with --robot.pads_file={options.output}")
+
+
+def find_boards(ports: Sequence[str], stack: ExitStack, *, only_list: bool) -> list[FoundBoard]:
+    """Probes ports and starts readers on those that stream."""
+    boards: list[FoundBoard] = []
+    failures: list[str] = []
+    print("leave every pad untouched for a moment")
+    for port in ports:
+        try:
+            kind = probe_port(port)
+        except PortError as error:
+            failures.append(str(error))
+            print(f"  {error}")
+            continue
+        print(f"  {port}: {kind}")
+        if only_list:
+            continue
+        board = open_board(stable_path(port), kind)
+        stack.callback(board.reader.stop)
+        boards.append(board)
+        for problem in board.problems:
+            print(f"  {port}: {problem}")
+    if not boards and not only_list:
+        raise PortError(
+            failures[0] if len(failures) == 1 else f"no board streams on {', '.join(ports)}; see above"
+        )
+    return boards
+
+
+def ask(boards: list[FoundBoard], names: Sequence[str], timeout_s: float) -> dict[str, PadConfig]:
+    """Asks for one press per name; returns the configuration of each named pad."""
+    if len(names) > len(boards):
+        raise PortError(
+            f"{len(names)} pads asked for ({', '.join(names)}), but only {len(boards)} boards stream; "
+            "plug in the others, or name fewer with --names"
+        )
+    named: dict[str, PadConfig] = {}
+    free = list(boards)
+    for name in names:
+        print(f"press {name} ... ", end="", flush=True)
+        board = wait_for_press(free, timeout_s)
+        if board is None:
+            raise PortError(f"no press seen for {name} within {timeout_s:g} s; press one pad alone, firmly")
+        print(f"{board.config.port}; let go")
+        wait_for_release(boards, timeout_s)
+        named[name] = board.config
+        free.remove(board)
+    return named

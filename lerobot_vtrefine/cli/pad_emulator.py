@@ -1,0 +1,131 @@
+"""`vtrefine-pad-emulator`: FlexiTac boards on pseudo-terminals, to try everything without hardware."""
+
+import argparse
+import time
+from collections.abc import Sequence
+from contextlib import ExitStack
+from pathlib import Path
+
+from lerobot_vtrefine.cli.errors import run_cli
+from lerobot_vtrefine.datasets.features import PADS
+from lerobot_vtrefine.drivers.emulator import ENCODERS, Faults, PadEmulator
+from lerobot_vtrefine.drivers.frames import FrameShape
+from lerobot_vtrefine.drivers.sources import (
+    Source,
+    contact_source,
+    noise_source,
+    pattern_source,
+    press_in_turn_source,
+    recording_source,
+    with_markers,
+)
+
+SOURCES = ("contact", "noise", "press", "pattern", "recording")
+
+
+def parse_arguments(arguments: Sequence[str] | None) -> argparse.Namespace:
+    """Command line of `vtrefine-pad-emulator`."""
+    parser = argparse.ArgumentParser(
+        prog="vtrefine-pad-emulator",
+        description="Emulate FlexiTac boards on pseudo-terminals. Prints their ports; runs until Ctrl-C.",
+    )
+    add = parser.add_argument
+    add(
+        "--folder",
+        type=Path,
+        default=Path("outputs/pads"),
+        help="where the ports appear (default %(default)s)",
+    )
+    add("--boards", type=int, default=len(PADS), help="number of boards (%(default)s)")
+    add("--shape", default="12x32", help="rows x columns that the boards send (%(default)s)")
+    add("--protocol", choices=tuple(ENCODERS), default="binary", help="firmware variant (%(default)s)")
+    add("--rate", type=float, default=100.0, help="frames per second (%(default)s)")
+    add(
+        "--source",
+        choices=SOURCES,
+        default="contact",
+        help="what the pads feel: contact = a wandering fingertip; press = one pad after another is pressed "
+        "for 2 s; pattern = frames with a checksum; recording = a file (%(default)s)",
+    )
+    add(
+        "--recording",
+        type=Path,
+        help="uint8 frames, .npy or .npz, (T, R, C) or (T, R*C); implies --source recording",
+    )
+    add("--seconds", type=float, default=0.0, help="stop after this time; 0 = run until Ctrl-C (%(default)s)")
+    add("--seed", type=int, default=0, help="seed of noise and faults (%(default)s)")
+    faults = parser.add_argument_group("faults")
+    add = faults.add_argument
+    add("--loss", type=float, default=0.0, help="probability that a byte is lost")
+    add(
+        "--burst-loss",
+        type=float,
+        default=0.0,
+        help="probability per frame that 2..62 bytes in a row are lost",
+    )
+    add("--stall-every", type=float, default=0.0, help="seconds between stalls")
+    add("--stall", type=float, default=1.0, help="length of a stall in seconds (%(default)s)")
+    add("--unplug-at", type=float, default=0.0, help="seconds after the start at which the ports vanish")
+    add("--replug-after", type=float, default=1.0, help="seconds until they are back (%(default)s)")
+    add("--markers", type=int, nargs="+", default=[], metavar="TAXEL", help="taxels that read AA 55 for ever")
+    return parser.parse_args(arguments)
+
+
+def parse_shape(text: str) -> FrameShape:
+    """`12x32` as a shape."""
+    rows, _, cols = text.partition("x")
+    if not (rows.isdigit() and cols.isdigit()):
+        raise ValueError(f"--shape={text} is not rows x columns, such as 12x32 or 16x32")
+    return FrameShape(int(rows), int(cols))
+
+
+def make_source(options: argparse.Namespace, shape: FrameShape, board: int) -> Source:
+    """What board number `board` feels."""
+    seed = options.seed + board
+    if options.recording is not None or options.source == "recording":
+        if options.recording is None:
+            raise ValueError("--source=recording needs --recording=FILE")
+        source = recording_source(options.recording, shape)
+    elif options.source == "pattern":
+        source = pattern_source(shape, time.monotonic_ns, seed)
+    elif options.source == "press":
+        source = press_in_turn_source(shape, board, options.boards, round(2 * options.rate), seed)
+    else:
+        source = (contact_source if options.source == "contact" else noise_source)(shape, seed)
+    for taxel in options.markers:
+        if not 0 <= taxel < shape.taxels - 1:
+            raise ValueError(f"--markers: taxel {taxel} is not within 0 .. {shape.taxels - 2}")
+    return with_markers(source, tuple(options.markers)) if options.markers else source
+
+
+@run_cli
+def main(arguments: Sequence[str] | None = None) -> None:
+    """Entry point of `vtrefine-pad-emulator`."""
+    options = parse_arguments(arguments)
+    shape = parse_shape(options.shape)
+    faults = Faults(
+        loss=options.loss,
+        burst_loss=options.burst_loss,
+        stall_every_s=options.stall_every,
+        stall_s=options.stall,
+        unplug_at_s=options.unplug_at,
+        replug_after_s=options.replug_after,
+    )
+    if options.boards < 1:
+        raise ValueError(f"--boards={options.boards} must be at least 1")
+    names = PADS if options.boards <= len(PADS) else tuple(f"pad_{i}" for i in range(options.boards))
+    with ExitStack() as stack:
+        for board, name in enumerate(names[: options.boards]):
+            emulator = PadEmulator(
+                make_source(options, shape, board),
+                shape,
+                options.folder / name,
+                rate_hz=options.rate,
+                protocol=options.protocol,
+                faults=faults,
+                seed=options.seed + board,
+            )
+            print(stack.enter_context(emulator).port, flush=True)
+        started = time.monotonic()
+        while not options.seconds or time.monotonic() - started < options.seconds:
+            time.sleep(0.1)

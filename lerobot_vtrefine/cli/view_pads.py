@@ -1,0 +1,148 @@
+"""`vtrefine-view-pads`: boards live in the terminal or in rerun, without a robot."""
+
+import argparse
+import sys
+import time
+from collections.abc import Sequence
+from contextlib import ExitStack
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from lerobot_vtrefine.cli.errors import run_cli
+from lerobot_vtrefine.drivers.board import PadReader, Status
+from lerobot_vtrefine.drivers.config import PadConfig
+from lerobot_vtrefine.drivers.pads_file import check_distinct_ports, load_pads
+
+FULL_SCALE = 120.0
+"""Counts above idle that are drawn in the brightest colour."""
+
+_VIRIDIS = np.array(
+    [[68, 1, 84], [65, 68, 135], [42, 120, 142], [34, 168, 132], [122, 209, 81], [253, 231, 37]], float
+)
+_HOME, _CLEAR, _RESET, _SHOW, _HIDE = "\x1b[H", "\x1b[2J", "\x1b[0m", "\x1b[?25h", "\x1b[?25l"
+
+
+def parse_arguments(arguments: Sequence[str] | None) -> argparse.Namespace:
+    """Command line of `vtrefine-view-pads`."""
+    parser = argparse.ArgumentParser(
+        prog="vtrefine-view-pads",
+        description="Show FlexiTac pads live, row 0 at the top, column 0 at the left.",
+    )
+    add = parser.add_argument
+    add("--pads-file", type=Path, help="file written by vtrefine-find-pads")
+    add("--ports", nargs="+", default=[], metavar="PORT", help="ports to show instead of a pads file")
+    add("--rows", type=int, default=12, help="rows that the boards on --ports send (%(default)s)")
+    add("--cols", type=int, default=32, help="columns that the boards on --ports send (%(default)s)")
+    add("--hz", type=float, default=15.0, help="pictures per second (%(default)s)")
+    add("--seconds", type=float, default=0.0, help="stop after this time; 0 = until Ctrl-C (%(default)s)")
+    add("--rerun", action="store_true", help="show in the rerun viewer instead of the terminal")
+    return parser.parse_args(arguments)
+
+
+def colours(counts: NDArray[np.uint8], idle: NDArray[np.uint8]) -> NDArray[np.uint8]:
+    """RGB, uint8 (R, C, 3), of counts above idle, both uint8 (R, C)."""
+    level = np.clip((counts.astype(float) - idle) / FULL_SCALE, 0.0, 1.0) * (len(_VIRIDIS) - 1)
+    below = np.minimum(level.astype(int), len(_VIRIDIS) - 2)
+    share = (level - below)[..., None]
+    return (_VIRIDIS[below] * (1 - share) + _VIRIDIS[below + 1] * share).astype(np.uint8)
+
+
+def draw(counts: NDArray[np.uint8], idle: NDArray[np.uint8]) -> list[str]:
+    """Terminal lines of one pad, two rows a line."""
+    rgb = colours(counts, idle)
+    if len(rgb) % 2:
+        rgb = np.concatenate([rgb, np.zeros_like(rgb[:1])])
+    lines = []
+    for upper, lower in zip(rgb[::2], rgb[1::2], strict=True):
+        cells = (
+            f"\x1b[38;2;{a[0]};{a[1]};{a[2]}m\x1b[48;2;{b[0]};{b[1]};{b[2]}m▀"
+            for a, b in zip(upper.tolist(), lower.tolist(), strict=True)
+        )
+        lines.append("".join(cells) + _RESET)
+    return lines
+
+
+def status_line(reader: PadReader) -> str:
+    """Name, frame rate and age, or what is wrong."""
+    health = reader.health()
+    if health.status is not Status.STREAMING:
+        return f"{reader.name}: {health.status.value.upper()}: {health.advice}"
+    lost = f", {health.locks_lost} breaks in the stream" if health.locks_lost else ""
+    return f"{reader.name}: {health.rate_hz:.0f} frames/s, {1000 * health.age_s:.0f} ms old{lost}"
+
+
+def chosen_pads(options: argparse.Namespace) -> dict[str, PadConfig]:
+    """The pads to show.
+
+    Raises:
+        ValueError: neither or both of --pads-file and --ports are given.
+    """
+    if bool(options.ports) == (options.pads_file is not None):
+        raise ValueError("give either --pads-file=FILE (vtrefine-find-pads writes it) or --ports PORT ...")
+    if options.pads_file is not None:
+        return load_pads(options.pads_file)
+    pads = {Path(port).name: PadConfig(port, options.rows, options.cols) for port in options.ports}
+    check_distinct_ports(pads, "--ports")
+    return pads
+
+
+@run_cli
+def main(arguments: Sequence[str] | None = None) -> None:
+    """Entry point of `vtrefine-view-pads`."""
+    options = parse_arguments(arguments)
+    if options.hz <= 0:
+        raise ValueError(f"--hz={options.hz} must be positive")
+    with ExitStack() as stack:
+        readers = [PadReader(config, name) for name, config in chosen_pads(options).items()]
+        for reader in readers:
+            reader.connect()
+            stack.callback(reader.stop)
+        print("leave the pads untouched for a moment", file=sys.stderr)
+        idle = {reader.name: reader.idle_counts() for reader in readers}
+        show = rerun_view() if options.rerun else terminal_view(stack)
+        started = time.monotonic()
+        while not options.seconds or time.monotonic() - started < options.seconds:
+            show(readers, idle)
+            time.sleep(1.0 / options.hz)
+
+
+def terminal_view(stack: ExitStack) -> Any:
+    """A function that draws all pads in place."""
+    sys.stdout.write(_CLEAR + _HIDE)
+    stack.callback(sys.stdout.write, _SHOW + "\n")
+
+    def show(readers: list[PadReader], idle: dict[str, NDArray[np.uint8]]) -> None:
+        lines = []
+        for reader in readers:
+            lines.append(status_line(reader))
+            frame = reader.latest()
+            lines += draw(frame.counts, idle[reader.name]) if frame is not None else []
+        sys.stdout.write(_HOME + "".join(f"{line}\x1b[K\n" for line in lines))
+        sys.stdout.flush()
+
+    return show
+
+
+def rerun_view() -> Any:
+    """A function that sends all pads to the rerun viewer.
+
+    Raises:
+        ImportError: rerun is not installed.
+    """
+    try:
+        import rerun as rr
+    except ImportError as error:
+        raise ImportError("--rerun needs the rerun viewer: pip install 'lerobot[viz]'") from error
+    rr.init("vtrefine-view-pads", spawn=True)
+
+    def show(readers: list[PadReader], idle: dict[str, NDArray[np.uint8]]) -> None:
+        for reader in readers:
+            frame = reader.latest()
+            if frame is not None:
+                rr.log(f"pads/{reader.name}", rr.Image(colours(frame.counts, idle[reader.name])))
+            rr.log(f"health/{reader.name}", rr.TextLog(status_line(reader)))
+
+    return show

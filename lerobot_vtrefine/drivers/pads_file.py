@@ -1,0 +1,81 @@
+"""The pads file: which pad is on which port. `vtrefine-find-pads` writes it, robot configurations read it."""
+
+from dataclasses import asdict, fields
+from pathlib import Path
+from typing import Any
+
+import yaml
+
+from lerobot_vtrefine.drivers.config import PadConfig
+
+_HEADER = "# FlexiTac pads by name, from vtrefine-find-pads. Ports name USB sockets: do not swap cables.\n"
+
+
+def save_pads(pads: dict[str, PadConfig], path: Path) -> None:
+    """Writes the pads file; only what differs from the defaults."""
+    defaults = asdict(PadConfig(port="-"))
+    entries = {
+        name: {key: value for key, value in asdict(pad).items() if key == "port" or value != defaults[key]}
+        for name, pad in pads.items()
+    }
+    path.parent.mkdir(parents=True, exist_ok=True)
+    path.write_text(_HEADER + yaml.safe_dump({"pads": entries}, sort_keys=False), encoding="utf-8")
+
+
+def load_pads(path: Path) -> dict[str, PadConfig]:
+    """Reads the pads file.
+
+    Raises:
+        FileNotFoundError: no such file.
+        ValueError: not a pads file; the message names the pad and the key, and lists valid keys.
+    """
+    if not path.is_file():
+        raise FileNotFoundError(
+            f"pads file {path} does not exist; write it with: vtrefine-find-pads --output {path}"
+        )
+    try:
+        content = yaml.safe_load(path.read_text(encoding="utf-8"))
+    except yaml.YAMLError as error:
+        raise ValueError(f"pads file {path} is not valid YAML: {error}") from error
+    entries = content.get("pads") if isinstance(content, dict) else None
+    if not isinstance(entries, dict) or not entries:
+        raise ValueError(
+            f"pads file {path} has no 'pads:' section with entries like 'left_pad: {{port: /dev/...}}'"
+        )
+    return decode_pads(entries, f"pads file {path}")
+
+
+def decode_pads(entries: dict[str, Any], where: str) -> dict[str, PadConfig]:
+    """Pad configurations of plain dictionaries; `where` starts error messages.
+
+    Raises:
+        ValueError: an entry is not a mapping, has an unknown key or a wrong value.
+    """
+    known = [field.name for field in fields(PadConfig)]
+    pads: dict[str, PadConfig] = {}
+    for name, entry in entries.items():
+        if isinstance(entry, PadConfig):
+            pads[name] = entry
+            continue
+        if not isinstance(entry, dict) or "port" not in entry:
+            raise ValueError(f"{where}: pad {name!r} needs a port: {{port: /dev/serial/by-path/...}}")
+        unknown = sorted(set(entry) - set(known))
+        if unknown:
+            raise ValueError(
+                f"{where}: pad {name!r} has unknown {', '.join(unknown)}; known: {', '.join(known)}"
+            )
+        try:
+            pads[name] = PadConfig(**entry)
+        except (TypeError, ValueError) as error:
+            raise ValueError(f"{where}: pad {name!r}: {error}") from error
+    check_distinct_ports(pads, where)
+    return pads
+
+
+def check_distinct_ports(pads: dict[str, PadConfig], where: str) -> None:
+    """Raises ValueError where two pads claim one port."""
+    owners: dict[str, str] = {}
+    for name, pad in pads.items():
+        other = owners.setdefault(str(Path(pad.port).resolve()), name)
+        if other != name:
+            raise ValueError(f"{where}: pads {other!r} and {name!r} are both on {pad.port}")
