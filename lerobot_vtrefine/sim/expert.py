@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 from lerobot_vtrefine.sim.demonstrations import Degradation, EpisodeErrors
 from lerobot_vtrefine.sim.ik import hand_poses, solve_hands
 from lerobot_vtrefine.sim.poses import Poses, rotation_vector
+from lerobot_vtrefine.sim.servo_model import ServoModel
 from lerobot_vtrefine.sim.starts import ideal_hand
 
 if TYPE_CHECKING:
@@ -70,8 +71,6 @@ STANDOFF_M = 0.006  # and aligned this high above it
 PRESS_M = 0.008  # a blocked plug is pushed as if it should be this much lower: a few newtons
 BOTTOM_M = 0.0005  # a seated plug is pushed this far beyond its seat
 TURN_M_PER_RAD = 0.1  # a turn takes as long as this way
-INTEGRAL_GAIN = 0.4
-INTEGRAL_LIMIT_RAD = 0.08
 
 
 @dataclass(frozen=True)
@@ -100,7 +99,7 @@ class ScriptedExpert:
         self._sim = sim
         self._robot = sim.scene.embodiment
         self._pair = sim.scene.pair
-        self._hz = sim.task.control_hz
+        self._hz = sim.config.control_hz
         self._from_table = sim.scene.config.start == "table"
         self._grasp, self._grip_m = _grasps(sim)
         self._stations = _stations(sim)
@@ -111,7 +110,7 @@ class ScriptedExpert:
         self._phase_step = np.zeros(count)  # control steps at the episode's pace
         self._duration = np.ones(count)  # of the phase, in control steps
         self._target = np.zeros((count, self._robot.num_joints))
-        self._correction = np.zeros((count, self._robot.num_joints))
+        self._servos = ServoModel(sim)
         self._opening = np.zeros((count, 2))
         self._start = Poses.identity(count, 2)  # hands wanted when the phase began
         self._wanted = Poses.identity(count, 2)  # hands wanted now
@@ -120,14 +119,13 @@ class ScriptedExpert:
         self._socket = Poses.identity(count)  # where it was when the phase began
 
     def reset(self, ids: Ids, seeds: Ids | None = None) -> None:
-        """Start new episodes of environments `ids` (m,) after the simulation was reset; seeds default to its
-        own.""" ids = np.asarray(ids)
+        """Start new episodes of environments `ids` (m,) after the simulation was reset, by its seeds."""
+        ids = np.asarray(ids)
         self._errors.draw(ids, np.asarray(self._sim.seeds[ids] if seeds is None else seeds))
         view = self._observe(ids)
         self._step[ids] = 0
         self._target[ids] = view.q
-        # What the servos lack now, they lack everywhere near.
-        self._correction[ids] = 0.0 if self._from_table else self._sim.joint_targets(ids) - view.q
+        self._servos.reset(ids, view.q, self._sim.command_targets(ids))
         self._wanted.assign(ids, view.hands)
         self._opening[ids] = self._robot.fingers.travel_m if self._from_table else self._grip_m
         self._enter(ids, Phase.REACH if self._from_table else Phase.ALIGN, view)
@@ -141,16 +139,17 @@ class ScriptedExpert:
         self._phase_step[ids] += moving * self._errors.pace[ids]
         wanted = self._plan(ids, view)
         self._wanted.assign(ids[moving], wanted[moving])
-        self._correct(ids, view)
         wanted = self._wanted[ids]
         target, _, _ = solve_hands(self._robot, wanted.position, wanted.rotation, self._target[ids])
-        fingers = _arms(target)[..., -2:]
-        fingers[...] = self._opening[ids][..., None] * [1.0, -1.0]
+        # Servos that press against a contact lack something else than those that move freely.
+        phases = self.phase[ids]
+        self._servos.learn(ids, view.q, (phases != Phase.CLOSE) & (phases < Phase.INSERT))
+        command = self._servos.command(ids, self._target[ids], target)
+        for q in (target, command):
+            _arms(q)[..., -2:] = self._opening[ids][..., None] * [1.0, -1.0]
         self._target[ids] = target
         self._step[ids] += 1
-        corrected = target + self._correction[ids]
-        _arms(corrected)[..., -2:] = fingers
-        return np.clip(corrected, self._robot.lower, self._robot.upper)
+        return np.clip(command, self._robot.lower, self._robot.upper)
 
     def _observe(self, ids: Ids) -> View:
         q = np.asarray(self._sim.joint_state(ids), float)
@@ -232,8 +231,8 @@ class ScriptedExpert:
         )
 
     def _inserted(self, ids: Ids, view: View, share: Array) -> Poses:
-        """Right hand (m,) a share of the way down; where the parts stood when the descent began: no
-        feedback.""" top, bottom = self._pair.mouth_z_m + STANDOFF_M, self._pair.seated_z_m - BOTTOM_M
+        """Right hand (m,) a share of the way down from where the parts stood when it began: no feedback."""
+        top, bottom = self._pair.mouth_z_m + STANDOFF_M, self._pair.seated_z_m - BOTTOM_M
         reached = (self._socket[ids].inverse() @ view.parts[:, RIGHT]).position[:, 2]
         height = np.maximum(top + share * (bottom - top), reached - PRESS_M)
         return self._aim(ids, self._socket[ids], height) @ self._held[ids][:, RIGHT]
@@ -252,19 +251,10 @@ class ScriptedExpert:
         tilt = np.linalg.norm(rotation_vector(error.rotation), axis=-1)
         return np.maximum(lateral, 0.02 * tilt)
 
-    def _correct(self, ids: Ids, view: View) -> None:
-        """Integrate what the servos lack, while hands stand free; against a contact it would wind up."""
-        phases = self.phase[ids]
-        free = (phases != Phase.CLOSE) & (phases < Phase.INSERT)
-        arrived = free & (self._phase_step[ids] >= self._duration[ids])
-        rows = ids[arrived]
-        self._correction[rows] += INTEGRAL_GAIN * (self._target[rows] - view.q[arrived])
-        self._correction[rows] = self._correction[rows].clip(-INTEGRAL_LIMIT_RAD, INTEGRAL_LIMIT_RAD)
-
 
 def _grasps(sim: "InsertionSim") -> tuple[Poses, Array]:
     """Hands in their parts' frames (2,), and the openings commanded to hold them (2,) [m]."""
-    pair, grasped = sim.scene.pair, sim.task.grasped
+    pair, grasped = sim.scene.pair, sim.config.grasped
     left = ideal_hand(pair.socket, np.pi / 2, grasped.left_pitch_rad)
     right = ideal_hand(pair.plug, -np.pi / 2, grasped.right_pitch_rad)
     hands = Poses(np.stack([left[0], right[0]]), np.stack([left[1], right[1]]))
@@ -274,7 +264,7 @@ def _grasps(sim: "InsertionSim") -> tuple[Poses, Array]:
 
 def _stations(sim: "InsertionSim") -> Poses:
     """Where parts are brought before they are aligned (2,): the socket where it stays, the plug above it."""
-    mouth = np.asarray(sim.task.grasped.mouth_m)
+    mouth = np.asarray(sim.config.grasped.mouth_m)
     socket = mouth - np.array([0.0, 0.0, sim.scene.pair.mouth_z_m])
     plug = mouth + np.array([0.0, 0.0, CARRY_M])
     return Poses.from_vectors(np.stack([socket, plug]), np.zeros((2, 3)))
