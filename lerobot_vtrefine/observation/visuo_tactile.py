@@ -56,17 +56,14 @@ class VisuoTactileConfig:
     """s_max_fixed of the two-stage rule (3D-ViTac's value)."""
     normalization: str = "two_stage"
     """``two_stage`` (paper) or ``fixed``."""
+    scale_m: float = 0.1
+    """The encoder's one unit of length for x, y and z: small enough that millimetres matter to it."""
 
     @property
     def center_m(self) -> tuple[float, float, float]:
         """Centre of the workspace box: the encoder's origin."""
         x, y, z = ((low + high) / 2 for low, high in zip(self.crop_min_m, self.crop_max_m, strict=True))
         return x, y, z
-
-    @property
-    def scale_m(self) -> float:
-        """Half the longest edge of the workspace box: the encoder's one unit of length for x, y and z."""
-        return max(high - low for low, high in zip(self.crop_min_m, self.crop_max_m, strict=True)) / 2
 
     def validate(self) -> None:
         """Raises: ValueError naming the field that is wrong."""
@@ -81,6 +78,8 @@ class VisuoTactileConfig:
                 f"observation.pool_rows={self.pool_rows} must divide {layout.rows} and "
                 f"observation.pool_cols={self.pool_cols} must divide {layout.cols}"
             )
+        if self.scale_m <= 0:
+            raise ValueError(f"observation.scale_m must be positive, got {self.scale_m}")
         if not 0 < self.threshold_counts <= self.full_scale_counts:
             raise ValueError("observation.threshold_counts must be within 0..observation.full_scale_counts")
         if self.normalization not in RULES:
