@@ -96,14 +96,14 @@ def record(config: RecordDemosConfig) -> None:
         progress = tqdm(total=config.num_episodes, initial=demos.num_episodes, unit="episode")
         with workers as stream, progress:
             for demonstration in stream:
-                seed = demonstration.row["seed"]
-                if demonstration.row["success"] or config.include_failures:
+                kept = demonstration.row["success"] or config.include_failures
+                if kept:
                     demos.append(demonstration)
-                    progress.update()
                 else:
-                    demos.skip(seed)
-                attempts = seed + 1 - config.seed
-                progress.set_postfix_str(f"{demos.num_episodes} of {attempts} attempts")
+                    demos.skip(demonstration.row["seed"])
+                attempts = demos.next_seed - config.seed
+                progress.set_postfix_str(f"{attempts} attempts", refresh=False)
+                progress.update(int(kept))
                 if demos.num_episodes >= config.num_episodes:
                     return
                 if demos.num_episodes == 0 and attempts >= HOPELESS_ATTEMPTS:

@@ -69,6 +69,11 @@ class LeRobotDecisionEnv:
         self._history: dict[str, Array] = {}
         self._batch: Batch = {}
 
+    @property
+    def privileged_dim(self) -> int:
+        """P."""
+        return len(self.episodes.sim.privileged_names)
+
     def reset(self, seeds: Sequence[int], ids: Array | None = None) -> tuple[Batch, Tensor]:
         """Start episodes in ``ids`` (default all) -> (batch of all (n, To, ...), privileged (n, P)).
 
@@ -115,13 +120,8 @@ class LeRobotDecisionEnv:
 
     def _info(self) -> dict[str, Tensor]:
         metrics = self.episodes.sim.metrics(self.episodes.ids)
-        numeric = {
-            name: np.array(values)
-            for name, values in metrics.items()
-            if np.asarray(values).dtype.kind in "bif" and np.isfinite(values).all()
-        }
-        columns = {**numeric, "steps": self.episodes.steps.copy(), "success": self.episodes.success.copy()}
-        return {name: torch.from_numpy(values) for name, values in columns.items()}
+        columns = {**metrics, "steps": self.episodes.steps, "success": self.episodes.success}
+        return {name: torch.from_numpy(np.array(values)) for name, values in columns.items()}
 
     def _push(self, ids: Array) -> None:
         """Shift the newest frames of ``ids`` into the observation window."""

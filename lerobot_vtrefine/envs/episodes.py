@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from lerobot_vtrefine.envs.episode_log import EpisodeLog, episode_rows
+from lerobot_vtrefine.sim.task import FAILURES
 
 if TYPE_CHECKING:
     from lerobot_vtrefine.sim.simulation import InsertionSim
@@ -145,7 +146,9 @@ class Episodes:
             self._log.append(self.rows(finished))
 
     def rows(self, ids: Array) -> list[dict[str, Any]]:
-        """Seed, steps and metrics of finished episodes ``ids`` as plain dicts."""
-        return episode_rows(
-            self.seeds[ids], self.steps[ids], {name: values[ids] for name, values in self.metrics.items()}
-        )
+        """Seed, steps, metrics and the reason of failure of finished episodes ``ids`` as plain dicts."""
+        if len(ids) == 0:
+            return []
+        metrics = {name: values[ids] for name, values in self.metrics.items()}
+        reasons = np.where(self.truncated[ids], "time_out", np.array(FAILURES)[metrics["failure"]])
+        return episode_rows(self.seeds[ids], self.steps[ids], {**metrics, "failure": reasons})

@@ -19,6 +19,7 @@ class FakeSim:
     """As ``InsertionSim``; the episode of ``seed`` succeeds after ``3 + seed % 5`` steps, odd seeds never do."""
 
     noise_level = 3.0
+    privileged_names = ("time", "seed")
 
     def __init__(self, num_envs: int, episode_steps: int = 10) -> None:
         self.num_envs = num_envs
@@ -64,6 +65,7 @@ class FakeSim:
         success = self.seeds[ids] % 2 == 0
         return {
             "success": success,
+            "failure": np.zeros(len(ids), np.int64),
             "in_hand_shift_m": np.full(len(ids), 1e-3),
             "time_to_success_s": np.where(success, self.time[ids] * 0.1, np.nan),
         }

@@ -138,6 +138,7 @@ def test_metrics_log_has_a_row_per_episode(make_env, tmp_path):
     rows = read_episode_log(path, first_seed=0, num_episodes=6)  # seeds 6 and 7 filled the last batch
     assert [row["seed"] for row in rows] == list(range(6))
     assert [row["success"] for row in rows] == [True, False] * 3
+    assert [row["failure"] for row in rows] == ["none", "time_out"] * 3
     assert rows[2]["steps"] == 5
     assert rows[2]["time_to_success_s"] == pytest.approx(0.5)
     assert rows[1]["time_to_success_s"] is None

@@ -1,0 +1,86 @@
+import os
+import subprocess
+import sys
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+
+TINY_ENV = (
+    "--env.type=vtrefine",
+    "--env.start=grasped",
+    "--env.episode_steps=30",
+    "--env.num_threads=1",
+    "--env.scene.camera={width: 16, height: 12, fov_y_rad: 0.384, position_m: [-0.44, 0.0, 0.42], target_m: [0.0, 0.0, 0.145]}",
+)
+"""Flags of a task that is quick to simulate."""
+
+Lerobot = Callable[..., subprocess.Popen[str]]
+
+
+def lerobot(command: str, *arguments: str, cache: Path) -> subprocess.Popen[str]:
+    """Start a stock LeRobot command offline, in a process of its own."""
+    environment = {
+        **os.environ,
+        "HF_HUB_OFFLINE": "1",
+        "HF_HOME": str(cache),
+        "OMP_NUM_THREADS": "1",
+        "CUDA_VISIBLE_DEVICES": "",
+    }
+    program = Path(sys.executable).with_name(f"lerobot-{command}")
+    return subprocess.Popen(
+        [str(program), *arguments],
+        env=environment,
+        stdout=subprocess.PIPE,
+        stderr=subprocess.STDOUT,
+        text=True,
+    )
+
+
+def finish(process: subprocess.Popen[str]) -> str:
+    """Output of a command that must succeed."""
+    output, _ = process.communicate(timeout=240)
+    assert process.returncode == 0, output[-3000:]
+    return output
+
+
+def record(root: Path, *arguments: str) -> int:
+    """Run ``vtrefine-record-demos`` in this process -> its exit status."""
+    from lerobot_vtrefine.cli import record_demos
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(sys, "argv", ["vtrefine-record-demos", f"--root={root}", *TINY_ENV, *arguments])
+        return record_demos.main()
+
+
+@pytest.fixture(scope="session")
+def demos(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A small recorded dataset; tests copy it before they change it."""
+    root = tmp_path_factory.mktemp("recorded") / "demos"
+    assert record(root, "--num_episodes=3", "--num_envs=4", "--seed=5") == 0
+    return root
+
+
+@pytest.fixture(scope="session")
+def checkpoint(demos: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A policy that stock ``lerobot-train`` trained for two steps on ``demos``."""
+    out = tmp_path_factory.mktemp("trained") / "run"
+    finish(
+        lerobot(
+            "train",
+            "--policy.type=vt_dp3",
+            "--policy.preset=small",
+            "--policy.device=cpu",
+            "--policy.push_to_hub=false",
+            "--dataset.repo_id=local/vtrefine_demos",
+            f"--dataset.root={demos}",
+            f"--output_dir={out}",
+            "--steps=2",
+            "--save_freq=2",
+            "--batch_size=4",
+            "--num_workers=0",
+            "--wandb.enable=false",
+            cache=out.parent / "hf",
+        )
+    )
+    return out / "checkpoints" / "last" / "pretrained_model"

@@ -1,0 +1,81 @@
+import json
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+from conftest import TINY_ENV
+
+from lerobot_vtrefine.envs.episode_log import read_episode_log
+
+
+@pytest.fixture
+def evaluate(checkpoint: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    """Run stock ``lerobot-eval`` in this process -> (its result, our metrics)."""
+    from lerobot.scripts import lerobot_eval
+
+    def run(name: str, *arguments: str) -> tuple[dict, list[dict]]:
+        out = tmp_path / name
+        flags = (
+            f"--policy.path={checkpoint}",
+            "--policy.device=cpu",
+            "--eval.n_episodes=2",
+            "--eval.batch_size=2",
+            "--seed=40",
+            f"--output_dir={out}",
+            f"--env.metrics_path={out}/episodes.jsonl",
+            *TINY_ENV,
+            "--env.episode_steps=5",
+            *arguments,
+        )
+        monkeypatch.setattr(sys, "argv", ["lerobot-eval", *flags])
+        monkeypatch.setenv("HF_HUB_OFFLINE", "1")
+        lerobot_eval.main()
+        info = json.loads((out / "eval_info.json").read_text())
+        return info, read_episode_log(out / "episodes.jsonl", 40, 2)
+
+    return run
+
+
+@pytest.mark.parametrize(
+    "flags",
+    [
+        ("--env.vectorization=native",),
+        ("--env.vectorization=gym", "--eval.use_async_envs=false"),
+        ("--env.vectorization=gym", "--eval.use_async_envs=true"),
+    ],
+    ids=["native", "sync", "async"],
+)
+def test_lerobot_eval_runs(evaluate, flags, tmp_path):
+    info, rows = evaluate("run", *flags)
+    assert info["overall"]["n_episodes"] == 2
+    assert [row["seed"] for row in rows] == [40, 41]
+    assert all(row["steps"] == 5 and row["failure"] == "time_out" for row in rows)
+    assert all(row["in_hand_shift_m"] >= 0 and row["peak_force_n"] >= 0 for row in rows)
+    videos = sorted((tmp_path / "run" / "videos").rglob("*.mp4"))
+    assert len(videos) == 2
+    assert all(video.stat().st_size > 0 for video in videos)
+
+
+def test_all_vectorisations_play_the_same_episodes(evaluate):
+    rows = {
+        name: evaluate(name, *flags)[1]
+        for name, flags in {
+            "native": ("--env.vectorization=native",),
+            "gym": ("--env.vectorization=gym", "--eval.use_async_envs=false"),
+        }.items()
+    }
+    for native, gym in zip(rows["native"], rows["gym"], strict=True):
+        assert native["in_hand_shift_m"] == pytest.approx(gym["in_hand_shift_m"], rel=1e-3, abs=1e-6)
+
+
+def test_surplus_episodes_of_the_last_batch_are_dropped(evaluate):
+    _, rows = evaluate("three", "--eval.n_episodes=3")
+    assert [row["seed"] for row in rows] == [40, 41]
+
+
+@pytest.mark.parametrize("part", ["touch", "vision"])
+def test_ablated_evaluation(evaluate, demos, part):
+    info, rows = evaluate(part, f"--env.ablate={part}", f"--env.ablate_dataset={demos}")
+    assert info["overall"]["n_episodes"] == len(rows) == 2
+    assert np.isfinite([row["in_hand_shift_m"] for row in rows]).all()

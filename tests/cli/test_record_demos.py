@@ -1,0 +1,149 @@
+import errno
+import json
+import shutil
+from pathlib import Path
+
+import numpy as np
+import pytest
+from conftest import finish, lerobot, record
+from lerobot.datasets import LeRobotDataset
+
+from lerobot_vtrefine.datasets.features import ACTION_KEY, DEPTH_KEY, NOISE_LEVEL_KEY, STATE_KEY, TACTILE_KEYS
+
+
+def read(root: Path) -> LeRobotDataset:
+    return LeRobotDataset("local/vtrefine_demos", root=root)
+
+
+def rows(root: Path) -> list[dict]:
+    return json.loads((root / "meta" / "recording.json").read_text())["episodes"]
+
+
+def same(left: Path, right: Path) -> None:
+    first, second = read(left), read(right)
+    assert len(first) == len(second)
+    for index in range(0, len(first), 7):
+        for key, value in first[index].items():
+            assert np.array_equal(value, second[index][key]), (index, key)
+
+
+def test_dataset_holds_successful_raw_episodes(demos: Path):
+    dataset = read(demos)
+    assert dataset.num_episodes == 3
+    assert dataset.fps == 10
+    assert [row["success"] for row in rows(demos)] == [True] * 3
+    assert [row["steps"] for row in rows(demos)] == dataset.meta.episodes["length"]
+    item = dataset[len(dataset) - 1]
+    assert item[STATE_KEY].shape == item[ACTION_KEY].shape == (16,)
+    assert item[DEPTH_KEY].shape == (1, 12, 16)
+    assert item[NOISE_LEVEL_KEY].item() == 3.0
+    assert max(int(item[key].max()) for key in TACTILE_KEYS) > 0
+    assert 0.1 < float(item[DEPTH_KEY].max()) / 1000 < 2
+
+
+def test_more_workers_give_the_same_dataset(demos: Path, tmp_path: Path):
+    again = tmp_path / "workers"
+    assert record(again, "--num_episodes=3", "--num_envs=1", "--num_workers=2", "--seed=5") == 0
+    same(demos, again)
+
+
+def test_rerun_continues_to_the_requested_number(demos: Path, tmp_path: Path):
+    root = tmp_path / "grown"
+    assert record(root, "--num_episodes=1", "--num_envs=4", "--seed=5") == 0
+    assert read(root).num_episodes == 1
+    assert record(root, "--num_episodes=3", "--num_envs=2", "--seed=5") == 0
+    same(demos, root)
+    assert rows(root) == rows(demos)
+    assert record(root, "--num_episodes=3", "--seed=5") == 0  # nothing left to do
+    assert rows(root) == rows(demos)
+
+
+def test_failures_are_kept_on_request(tmp_path: Path):
+    root = tmp_path / "all"
+    far_off = ("--degradation.lateral_std_m=0.05", "--include_failures=true")
+    assert record(root, "--num_episodes=2", "--num_envs=2", *far_off) == 0
+    assert [row["success"] for row in rows(root)] == [False, False]
+    assert [row["seed"] for row in rows(root)] == [0, 1]
+    assert all(row["failure"] != "none" for row in rows(root))
+
+
+def test_stock_tools_accept_the_dataset(demos: Path, tmp_path: Path):
+    shutil.copytree(demos, tmp_path / "copy")
+    delete = lerobot(
+        "edit-dataset",
+        "--repo_id=local/vtrefine_demos",
+        f"--root={demos}",
+        "--new_repo_id=local/fewer",
+        f"--new_root={tmp_path / 'fewer'}",
+        "--operation.type=delete_episodes",
+        "--operation.episode_indices=[1]",
+        cache=tmp_path / "hf1",
+    )
+    merge = lerobot(
+        "edit-dataset",
+        "--new_repo_id=local/merged",
+        f"--new_root={tmp_path / 'merged'}",
+        "--operation.type=merge",
+        "--operation.repo_ids=['local/vtrefine_demos', 'local/copy']",
+        f"--operation.roots=['{demos}', '{tmp_path / 'copy'}']",
+        cache=tmp_path / "hf2",
+    )
+    view = lerobot(
+        "dataset-viz",
+        "--repo-id=local/vtrefine_demos",
+        f"--root={demos}",
+        "--episode-index=0",
+        "--num-workers=0",
+        "--save=1",
+        f"--output-dir={tmp_path / 'viz'}",
+        cache=tmp_path / "hf3",
+    )
+    for process in (delete, merge, view):
+        finish(process)
+    whole, fewer, merged = read(demos), read(tmp_path / "fewer"), read(tmp_path / "merged")
+    assert (fewer.num_episodes, merged.num_episodes) == (2, 6)
+    assert len(merged) == 2 * len(whole)
+    start = whole.meta.episodes["dataset_from_index"][2]
+    for key in (ACTION_KEY, DEPTH_KEY, *TACTILE_KEYS):
+        assert np.array_equal(whole[start][key], fewer[whole.meta.episodes["length"][0]][key]), key
+        assert np.array_equal(whole[start][key], merged[len(whole) + start][key]), key
+    assert list((tmp_path / "viz").glob("*.rrd"))
+
+
+@pytest.mark.parametrize(
+    ("flags", "message"),
+    [
+        (["--num_episodes=0"], "--num_episodes must be at least 1"),
+        (["--num_envs=0"], "--num_envs must be at least 1"),
+        (["--env.pair=star"], "round, square, hexagon"),
+        (["--env.clearance_m=-1"], "clearance_m"),
+        (["--env.pair=automate/00186", "--env.mesh_dir=nowhere"], "nowhere"),
+        (["--degradation.lateral_std_m=-1"], "lateral_std_m"),
+    ],
+)
+def test_bad_flags_end_in_one_line(flags, message, tmp_path, capsys):
+    assert record(tmp_path / "x", *flags) == 2
+    last = capsys.readouterr().err.strip().splitlines()[-1]
+    assert last.startswith("error:")
+    assert message in last
+    assert not (tmp_path / "x").exists()
+
+
+def test_other_settings_are_refused(demos: Path, tmp_path, capsys):
+    shutil.copytree(demos, tmp_path / "copy")
+    assert record(tmp_path / "copy", "--num_episodes=4", "--seed=5", "--degradation.lateral_std_m=0.001") == 2
+    assert "other settings (degradation)" in capsys.readouterr().err
+    same(demos, tmp_path / "copy")
+
+
+def test_full_disk_is_one_line_and_keeps_the_episodes(demos: Path, tmp_path, capsys, monkeypatch):
+    root = tmp_path / "copy"
+    shutil.copytree(demos, root)
+
+    def full(*args: object, **kwargs: object) -> None:
+        raise OSError(errno.ENOSPC, "No space left on device")
+
+    monkeypatch.setattr("pyarrow.parquet.ParquetWriter.write_table", full)
+    assert record(root, "--num_episodes=4", "--num_envs=1", "--seed=5") == 2
+    assert "disk is full: the 3 episodes saved" in capsys.readouterr().err
+    same(demos, root)

@@ -1,0 +1,112 @@
+from pathlib import Path
+
+import draccus
+import pytest
+import yaml
+from lerobot.configs import FeatureType
+from lerobot.configs.eval import EvalPipelineConfig
+from lerobot.envs.configs import EnvConfig
+from lerobot.envs.factory import make_env
+from lerobot.envs.utils import env_to_policy_features
+
+from lerobot_vtrefine.datasets.features import DEPTH_KEY, TACTILE_KEYS
+from lerobot_vtrefine.envs import VtRefineEnvConfig
+
+ENV_FILES = sorted((Path(__file__).parents[2] / "configs" / "env").glob("*.yaml"))
+
+
+def parse(*arguments: str) -> VtRefineEnvConfig:
+    return draccus.parse(EvalPipelineConfig, args=["--env.type=vtrefine", *arguments]).env
+
+
+def test_type_is_registered():
+    assert "vtrefine" in EnvConfig.get_known_choices()
+    assert VtRefineEnvConfig().type == "vtrefine"
+
+
+def test_flags_reach_every_level():
+    config = parse(
+        "--env.pair=square",
+        "--env.clearance_m=0.001",
+        "--env.start=grasped",
+        "--env.fps=20",
+        "--env.episode_steps=30",
+        "--env.rules.limits.contact_force_n=25",
+        "--env.scene.pad_friction=0.8",
+        "--env.randomization.pad_friction=[0.5,1.0]",
+    )
+    assert (config.scene_config.pair, config.scene_config.clearance_m) == ("square", 0.001)
+    assert config.scene_config.pad_friction == 0.8
+    assert config.task_config.control_hz == 20.0
+    assert config.task_config.limits.contact_force_n == 25
+    assert config.max_episode_steps == 30
+    assert config.randomization.pad_friction == (0.5, 1.0)
+
+
+def test_episode_length_follows_the_start():
+    assert VtRefineEnvConfig(start="table").max_episode_steps == 240
+    assert VtRefineEnvConfig(start="grasped").max_episode_steps == 40
+
+
+def test_policy_features_have_the_datasets_keys_and_shapes():
+    config = VtRefineEnvConfig(start="grasped")
+    features = env_to_policy_features(config)
+    height, width = config.camera_size
+    assert features[DEPTH_KEY].shape == (1, height, width)
+    assert features[DEPTH_KEY].type is FeatureType.VISUAL
+    assert features[TACTILE_KEYS[0]].shape == (384,)
+    assert features["action"].shape == (16,)
+
+
+@pytest.mark.parametrize("path", ENV_FILES, ids=lambda path: path.stem)
+def test_environment_files_parse_and_hold_only_env_and_eval(path: Path):
+    assert set(yaml.safe_load(path.read_text())) <= {"env", "eval"}
+    config = draccus.parse(EvalPipelineConfig, config_path=path, args=[])
+    assert isinstance(config.env, VtRefineEnvConfig)
+    assert config.env.scene_config.start == config.env.start
+
+
+def test_there_are_environment_files():
+    assert len(ENV_FILES) >= 3
+
+
+@pytest.mark.parametrize(
+    ("settings", "message"),
+    [
+        ({"start": "floor"}, "start"),
+        ({"clearance_m": 0.0}, "clearance_m"),
+        ({"episode_steps": 0}, "episode_steps"),
+        ({"vectorization": "magic"}, "native, gym"),
+        ({"backend": "gpu"}, "single, batch, warp"),
+        ({"ablate": "smell"}, "none, touch, vision"),
+        ({"ablate": "touch"}, "--env.ablate_dataset"),
+        ({"fps": 0}, "control_hz|fps"),
+    ],
+)
+def test_bad_settings_are_named_at_once(settings, message):
+    with pytest.raises(ValueError, match=message):
+        VtRefineEnvConfig(**settings)
+
+
+def test_control_rate_has_one_flag():
+    with pytest.raises(Exception, match="--env.fps"):
+        parse("--env.rules.control_hz=20")
+
+
+def test_unknown_pair_and_missing_meshes_are_one_line(tmp_path):
+    for settings, message in (
+        ({"pair": "star"}, "round, square, hexagon"),
+        ({"pair": "automate/00186"}, "mesh_dir"),
+        ({"pair": "automate/00186", "mesh_dir": tmp_path / "none"}, "none"),
+        ({"clearance_m": 0.2}, "clearance"),
+        ({"sensor_model": str(tmp_path / "model.json")}, "model.json"),
+    ):
+        envs = make_env(VtRefineEnvConfig(start="grasped", **settings), n_envs=1)
+        with pytest.raises((ValueError, OSError), match=message) as caught:
+            envs["vtrefine"][0].reset(seed=[0])
+        assert "\n" not in str(caught.value)
+
+
+def test_zero_environments_are_refused():
+    with pytest.raises(ValueError, match="at least 1"):
+        make_env(VtRefineEnvConfig(), n_envs=0)
