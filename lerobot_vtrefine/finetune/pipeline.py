@@ -10,7 +10,7 @@ from lerobot.configs import PreTrainedConfig, parser
 from lerobot.configs.default import EvalConfig, WandBConfig
 from lerobot.envs import EnvConfig
 from lerobot.policies import make_pre_post_processors
-from lerobot.utils.constants import PRETRAINED_MODEL_DIR
+from lerobot.utils.constants import ACTION, PRETRAINED_MODEL_DIR
 from lerobot.utils.random_utils import set_seed
 from tqdm import tqdm
 from tqdm.contrib.logging import logging_redirect_tqdm
@@ -26,7 +26,7 @@ from lerobot_vtrefine.finetune.checkpoint import (
 from lerobot_vtrefine.finetune.config import DppoConfig, PaperDppo
 from lerobot_vtrefine.finetune.distributed import join_ranks, leave_ranks, rank_index
 from lerobot_vtrefine.finetune.dppo import Metrics, TrainState, train
-from lerobot_vtrefine.finetune.evaluation import evaluate
+from lerobot_vtrefine.finetune.evaluation import EVALUATION_SEEDS, evaluate
 from lerobot_vtrefine.finetune.logger import ProgressLog, start_wandb
 from lerobot_vtrefine.finetune.protocols import Agent, DecisionEnv
 from lerobot_vtrefine.policies.vt_dp3.configuration_vt_dp3 import VtDp3Config
@@ -117,7 +117,7 @@ def make_agent(policy: VtDp3Policy, dppo: DppoConfig) -> Agent:
         base=policy.base,
         process=policy.process,
         num_tuned=config.ft_denoising_steps,
-        action_shape=(config.horizon, policy.action_dim),
+        action_shape=(config.horizon, config.output_features[ACTION].shape[0]),
         executed=slice(0, config.n_action_steps),
         frozen_encoder=config.ft_freeze_encoder,
     )
@@ -154,13 +154,13 @@ class Recorder:
             self.log = ProgressLog(cfg.output_dir, state.iteration, run)
             self.bar = tqdm(total=cfg.dppo.iterations, initial=state.iteration, desc="DPPO", unit="it")
         if state.iteration == 0 and cfg.eval_freq:
-            self._record(0, evaluate(self.env, self.agent, cfg.eval.n_episodes))
+            self._record(0, evaluate(self.env, self.agent, cfg.eval.n_episodes, EVALUATION_SEEDS))
 
     def __call__(self, state: TrainState, metrics: Metrics) -> None:
         """Callback of ``dppo.train``."""
         cfg, iteration, last = self.cfg, state.iteration, self.cfg.dppo.iterations
         if cfg.eval_freq and (iteration % cfg.eval_freq == 0 or iteration == last):
-            metrics |= evaluate(self.env, self.agent, cfg.eval.n_episodes)
+            metrics |= evaluate(self.env, self.agent, cfg.eval.n_episodes, EVALUATION_SEEDS)
         self._record(iteration, metrics)
         if iteration == last or (cfg.save_freq and iteration % cfg.save_freq == 0):
             save_checkpoint(cfg.output_dir, self.saveable, state, last)

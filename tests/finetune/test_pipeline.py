@@ -1,0 +1,168 @@
+"""``vtrefine-finetune`` on a tiny policy without a simulator: files, exact resumption, bad input."""
+
+import shutil
+from pathlib import Path
+
+import pytest
+import torch
+from lerobot.common.train_utils import update_last_checkpoint
+from lerobot.configs import PreTrainedConfig
+from safetensors.torch import load_file
+from tiny_policy import ReachEnv, save_tiny_checkpoint
+
+from lerobot_vtrefine.cli.finetune import main
+from lerobot_vtrefine.finetune import pipeline
+from lerobot_vtrefine.finetune.logger import read_progress
+from lerobot_vtrefine.policies.vt_dp3.modeling_vt_dp3 import VtDp3Policy
+
+SMALL = [
+    "--env.type=vtrefine",
+    "--eval.n_episodes=8",
+    "--eval_freq=2",
+    "--save_freq=1",
+    "--dppo.type=small",
+    "--dppo.num_envs=6",
+    "--dppo.epochs=2",
+    "--dppo.minibatch_decisions=6",
+    "--dppo.critic_width=16",
+    "--dppo.critic_warmup=1",
+]
+
+
+@pytest.fixture
+def finetune(tmp_path, monkeypatch):
+    """Runs the command with a checkpoint to start from; returns its exit status."""
+    start = save_tiny_checkpoint(tmp_path / "start")
+    monkeypatch.setattr(pipeline, "make_decision_env", lambda env, num_envs, *rest: ReachEnv(num_envs))
+
+    def run(output_dir: Path, *arguments: str, policy: Path = start, iterations: int = 4) -> int:
+        named = [f"--policy.path={policy}", f"--output_dir={output_dir}", f"--dppo.iterations={iterations}"]
+        monkeypatch.setattr("sys.argv", ["vtrefine-finetune", *named, *SMALL, *arguments])
+        return main()
+
+    return run
+
+
+def tensors(output_dir: Path, step: str) -> dict[str, torch.Tensor]:
+    return load_file(output_dir / "checkpoints" / step / "pretrained_model" / "model.safetensors")
+
+
+@pytest.mark.parametrize("encoder", ["frozen", "trained"])
+def test_resumed_run_equals_the_uninterrupted_one(finetune, tmp_path, encoder):
+    whole, resumed = tmp_path / "whole", tmp_path / "resumed"
+    changes = (
+        f"--dppo.encoder={encoder}",
+        "--dppo.reward_scaling=true",
+        "--dppo.kl_coef=0.1",
+        "--dppo.bc_coef=0.1",
+    )
+    assert finetune(whole, *changes) == 0
+    shutil.copytree(whole, resumed, symlinks=True)
+    for later in ("000003", "000004"):  # as if it had been interrupted after the second iteration
+        shutil.rmtree(resumed / "checkpoints" / later)
+    update_last_checkpoint(resumed / "checkpoints" / "000002")
+    assert finetune(resumed, "--resume=true", *changes) == 0
+
+    expected, found = tensors(whole, "000004"), tensors(resumed, "000004")
+    assert expected.keys() == found.keys()
+    assert all(torch.equal(expected[key], found[key]) for key in expected)
+    assert not all(torch.equal(expected[key], value) for key, value in tensors(whole, "000002").items())
+    state = [
+        torch.load(run / "checkpoints" / "000004" / "training_state" / "dppo_state.pt", weights_only=True)
+        for run in (whole, resumed)
+    ]
+    torch.testing.assert_close(*state, rtol=0, atol=0)
+    clock = {"seconds", "rollout_s", "steps_per_s"}
+    rows = [
+        [{key: value for key, value in row.items() if key not in clock} for row in read_progress(run)]
+        for run in (whole, resumed)
+    ]
+    assert rows[0] == rows[1]
+
+
+def test_records_and_checkpoint(finetune, tmp_path):
+    output = tmp_path / "run"
+    assert finetune(output, iterations=2) == 0
+    rows = read_progress(output)
+    assert [row["iteration"] for row in rows] == [0, 1, 2]
+    assert {"success", "return", "approx_kl", "clip_fraction", "explained_variance", "steps_per_s"} <= rows[
+        1
+    ].keys()
+    assert {"eval_success", "eval_return", "eval_error"} <= rows[2].keys()
+    assert "eval_success" not in rows[1]
+    assert (output / "curves.png").stat().st_size > 10_000
+
+    path = output / "checkpoints" / "last" / "pretrained_model"
+    policy = VtDp3Policy.from_pretrained(path, config=PreTrainedConfig.from_pretrained(path)).eval()
+    assert policy.config.ft_denoising_steps == 10
+    assert policy.config.sampler == "tail"
+    assert (path / "policy_preprocessor.json").is_file()
+    assert (path / "policy_postprocessor.json").is_file()
+
+
+def test_reloaded_checkpoint_deploys_what_was_evaluated(finetune, tmp_path):
+    """The last evaluation of the run is repeated by the policy's own inference from the files."""
+    output = tmp_path / "run"
+    assert finetune(output, "--dppo.encoder=trained", iterations=2) == 0
+    path = output / "checkpoints" / "last" / "pretrained_model"
+    policy = VtDp3Policy.from_pretrained(path, config=PreTrainedConfig.from_pretrained(path)).eval()
+    env, first = ReachEnv(6), pipeline.EVALUATION_SEEDS
+    success = []
+    torch.manual_seed(first)
+    for batch in range(2):
+        seed = first + 6 * batch
+        obs, _ = env.reset(range(seed, seed + 6))
+        running, reached = torch.ones(6, dtype=torch.bool), torch.zeros(6, dtype=torch.bool)
+        generator = torch.Generator().manual_seed(seed)
+        while running.any():
+            noise = torch.randn(int(running.sum()), 8, 16, generator=generator)
+            actions = torch.zeros(6, 4, 16)
+            actions[running] = policy.predict_action_chunk(
+                {k: v[running] for k, v in obs.items()}, noise=noise
+            )
+            obs, _, reward, terminated, truncated, _ = env.step_chunk(actions)
+            reached |= reward > 0
+            running &= ~terminated & ~truncated
+        success.append(reached)
+    assert read_progress(output)[-1]["eval_success"] == pytest.approx(
+        float(torch.cat(success).float().mean())
+    )
+
+
+def test_an_existing_run_is_not_overwritten(finetune, tmp_path, capsys):
+    output = tmp_path / "run"
+    assert finetune(output, iterations=1) == 0
+    assert finetune(output, iterations=1) == 2
+    assert "--resume=true" in capsys.readouterr().err
+
+
+def test_a_finished_run_resumes_to_nothing(finetune, tmp_path):
+    output = tmp_path / "run"
+    assert finetune(output, iterations=1) == 0
+    before = (output / "progress.csv").read_text()
+    assert finetune(output, "--resume=true", iterations=1) == 0
+    assert (output / "progress.csv").read_text() == before
+
+
+def test_bad_input_is_one_clear_line(finetune, tmp_path, capsys):
+    def complaint(*arguments: str, **options) -> str:
+        assert finetune(tmp_path / "bad", *arguments, **options) == 2
+        return capsys.readouterr().err.strip().splitlines()[-1]
+
+    assert "--dppo.num_envs must be positive" in complaint("--dppo.num_envs=0")
+    assert "within" in complaint("--dppo.sampler_steps=5", "--dppo.ft_denoising_steps=40")
+    assert "ddpm, ddim, tail" in complaint("--dppo.sampler=euler")
+    missing = tmp_path / "nowhere"
+    assert str(missing) in complaint(policy=missing)
+    assert finetune(tmp_path / "run", iterations=1) == 0
+    tuned = tmp_path / "run" / "checkpoints" / "last" / "pretrained_model"
+    assert "fine-tuned already" in complaint(policy=tuned)
+
+
+def test_policy_of_another_type_is_refused(finetune, tmp_path, capsys):
+    from lerobot.policies.act.configuration_act import ACTConfig
+
+    other = tmp_path / "act"
+    ACTConfig(device="cpu").save_pretrained(other)
+    assert finetune(tmp_path / "run", policy=other) == 2
+    assert "is a act policy; vtrefine-finetune needs vt_dp3" in capsys.readouterr().err
