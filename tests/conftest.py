@@ -1,0 +1,68 @@
+"""Fixtures that several packages' tests share."""
+
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+TINY_CAMERA = (24, 32)
+"""Height and width of the tiny dataset's depth images."""
+
+
+def random_raw(rng: np.random.Generator, noise_level: float) -> dict[str, Any]:
+    """One raw observation with a box on a table, pads under random load, and joints near the home pose."""
+    from lerobot_vtrefine.embodiments import get_embodiment
+
+    height, width = TINY_CAMERA
+    depth = np.full((height, width), 750, np.uint16)
+    depth[6:18, 8:24] = rng.integers(450, 650)
+    return {
+        "state": (get_embodiment("aloha").home + rng.normal(0, 0.02, 16)).astype(np.float32),
+        "tactile": rng.integers(0, 90, (4, 384), dtype=np.uint8),
+        "tactile_baseline": rng.integers(0, 9, (4, 384), dtype=np.uint8),
+        "depth_mm": depth,
+        "camera_intrinsics": np.array([40, 40, (width - 1) / 2, (height - 1) / 2], np.float32),
+        "camera_pose": np.array([0, 0, 0.75, 0, 1, 0, 0], np.float32),
+        "noise_level": np.array([noise_level], np.float32),
+    }
+
+
+def write_tiny_dataset(root: Path, episodes: int, frames: int, seed: int, noise_level: float = 3.0) -> None:
+    """A LeRobot dataset written through the feature table."""
+    from lerobot.datasets.lerobot_dataset import LeRobotDataset
+
+    from lerobot_vtrefine.datasets.features import dataset_features, raw_to_frame
+    from lerobot_vtrefine.embodiments import get_embodiment
+
+    features = dataset_features(*TINY_CAMERA, get_embodiment("aloha").joint_names)
+    dataset = LeRobotDataset.create("local/tiny", fps=10, root=root, features=features, use_videos=False)
+    rng = np.random.default_rng(seed)
+    for _ in range(episodes):
+        for _ in range(frames):
+            raw = random_raw(rng, noise_level)
+            action = raw["state"] + rng.normal(0, 0.01, 16).astype(np.float32)
+            dataset.add_frame({**raw_to_frame(raw), "action": action, "task": "insert"})
+        dataset.save_episode()
+    dataset.finalize()
+
+
+@pytest.fixture(scope="session")
+def tiny_dataset(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Root of a dataset of 3 episodes of 12 frames; do not write to it."""
+    root = tmp_path_factory.mktemp("tiny") / "dataset"
+    write_tiny_dataset(root, episodes=3, frames=12, seed=0)
+    return root
+
+
+@pytest.fixture(scope="session")
+def write_dataset() -> Callable[..., None]:
+    """``write_tiny_dataset``, for tests that need their own."""
+    return write_tiny_dataset
+
+
+@pytest.fixture(scope="session")
+def make_raw() -> Callable[[np.random.Generator, float], dict[str, Any]]:
+    """``random_raw``, for tests that need raw observations."""
+    return random_raw

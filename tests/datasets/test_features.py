@@ -1,0 +1,69 @@
+"""The feature table: one raw frame through dataset and environment gives the same tensors."""
+
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from lerobot.datasets.lerobot_dataset import LeRobotDataset
+from lerobot.envs.utils import preprocess_observation
+
+from lerobot_vtrefine.datasets.features import (
+    DEPTH_KEY,
+    NOISE_LEVEL_KEY,
+    RAW_KEYS,
+    STATE_KEY,
+    TACTILE_KEYS,
+    dataset_features,
+    env_key_map,
+    env_observation_shapes,
+    raw_to_env_observation,
+    raw_to_frame,
+)
+
+MakeRaw = Callable[[np.random.Generator, float], dict[str, Any]]
+
+
+def test_dataset_and_environment_hand_over_the_same_values(tiny_dataset: Path, make_raw: MakeRaw) -> None:
+    item = LeRobotDataset("local/tiny", root=tiny_dataset)[0]
+    raw = make_raw(np.random.default_rng(0), 3.0)  # what the fixture wrote first
+    batch = preprocess_observation(raw_to_env_observation({key: value[None] for key, value in raw.items()}))
+    assert set(batch) == {STATE_KEY, *RAW_KEYS}
+    for key, value in batch.items():
+        stored = item[key].float().reshape(value.shape)
+        assert torch.equal(stored, value), key
+    assert item[DEPTH_KEY].shape == (1, 24, 32)
+    assert item[TACTILE_KEYS[2]].tolist() == raw["tactile"][2].tolist()
+
+
+def test_dataset_keeps_units_and_array_shapes(tiny_dataset: Path) -> None:
+    features = LeRobotDataset("local/tiny", root=tiny_dataset).meta.features
+    assert features[TACTILE_KEYS[0]]["info"] == {"array_shape": [12, 32], "unit": "adc_counts"}
+    assert features[DEPTH_KEY]["info"]["depth_unit"] == "mm"
+
+
+def test_environment_spaces_match_the_observation(make_raw: MakeRaw) -> None:
+    observation = raw_to_env_observation(make_raw(np.random.default_rng(0), 3.0))
+    shapes = env_observation_shapes(24, 32)
+    assert set(shapes) == set(observation)
+    for key, (shape, dtype) in shapes.items():
+        assert observation[key].shape == shape
+        assert observation[key].dtype == dtype
+    assert set(env_key_map()) == {*shapes, "action"}
+
+
+def test_hardware_needs_no_noise_level(make_raw: MakeRaw) -> None:
+    raw = make_raw(np.random.default_rng(0), 3.0)
+    del raw["noise_level"]
+    assert raw_to_frame(raw)[NOISE_LEVEL_KEY].tolist() == [0.0]
+
+
+def test_what_is_missing_is_named(make_raw: MakeRaw) -> None:
+    raw = make_raw(np.random.default_rng(0), 3.0)
+    del raw["tactile"]
+    with pytest.raises(ValueError, match="lacks tactile"):
+        raw_to_frame(raw)
+    with pytest.raises(ValueError, match="camera size"):
+        dataset_features(0, 32)
