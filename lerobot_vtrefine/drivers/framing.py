@@ -83,6 +83,7 @@ class BinaryFramer:
         self._chains: dict[int, _Chain] = {}  # phase (position modulo period) -> chain
         self._lock: _Chain | None = None
         self._next = 0  # stream position of the oldest frame not handed out, while locked
+        self._delivered = 0  # stream position right after the last frame handed out
         self._cautious_until = 0
         self._burst: int | None = None  # where the bytes since the last silence begin
         self._exact_bursts = 0
@@ -214,7 +215,8 @@ class BinaryFramer:
     def _lock_on(self, chain: _Chain) -> None:
         self._lock = chain
         self._was_locked = True
-        behind = max(0, self._base - chain.first + self._period - 1) // self._period
+        oldest = max(self._base, self._delivered)
+        behind = max(0, oldest - chain.first + self._period - 1) // self._period
         self._next = chain.first + behind * self._period
         self._cautious_until = self._scan + CAUTIOUS_FRAMES * self._period
 
@@ -246,14 +248,17 @@ class BinaryFramer:
 
     def _take(self, position: int) -> Framed:
         start = position - self._base + len(MARKER)
-        self._next = position + self._period
+        self._next = self._delivered = position + self._period
         return Framed(self._next, bytes(self._buf[start : start + self.shape.taxels]))
 
     def _exact_burst(self) -> list[Framed]:
         """A frame proven complete by silence before it and nothing after it."""
         end = self._base + len(self._buf)
         start = self._burst
-        if start is None or end - start != self._period:
+        if start is None or end - start < self._period:
+            return []
+        self._burst = None
+        if end - start > self._period or start < self._delivered:
             return []
         chain = self._chains.get(start % self._period)
         if chain is None or chain.last != start:
