@@ -117,6 +117,7 @@ class ScriptedExpert:
         self._goal = Poses.identity(count, 2)  # hands wanted when the phase ends
         self._held = Poses.identity(count, 2)  # hands in their parts' frames when the phase began
         self._socket = Poses.identity(count)  # where it was when the phase began
+        self._top_m = np.zeros(count)  # height of the plug over the socket when the phase began
 
     def reset(self, ids: Ids, seeds: Ids | None = None) -> None:
         """Start new episodes of environments `ids` (m,) after the simulation was reset, by its seeds."""
@@ -177,12 +178,13 @@ class ScriptedExpert:
         self._start.assign(ids, self._wanted[ids])
         self._held.assign(ids, view.parts.inverse() @ view.hands)
         self._socket.assign(ids, view.parts[:, LEFT])
+        self._top_m[ids] = (view.parts[:, LEFT].inverse() @ view.parts[:, RIGHT]).position[:, 2]
         if phase == Phase.CLOSE:
             self._opening[ids] = self._grip_m
         self._goal.assign(ids, self._destination(ids, phase, view))
         way = _distance(self._start[ids], self._goal[ids])
         if phase == Phase.INSERT:
-            way = np.full(len(ids), STANDOFF_M + self._pair.travel_m)
+            way = self._top_m[ids] - self._pair.seated_z_m
         pace = PACES[phase]
         self._duration[ids] = self._hz * np.maximum(way / pace.speed_m_s, pace.shortest_s)
 
@@ -215,8 +217,9 @@ class ScriptedExpert:
         smooth = share * share * (3 - 2 * share)
         wanted = self._start[ids].towards(goal, np.repeat(smooth[:, None], 2, 1))
         if inserting.any():
-            share = np.where(phases == Phase.HOLD, 1.0, share)[inserting]
-            down = self._inserted(ids[inserting], view[inserting], share)
+            down = self._inserted(
+                ids[inserting], view[inserting], np.where(phases == Phase.HOLD, 1.0, smooth)[inserting]
+            )
             wanted.position[inserting, RIGHT], wanted.rotation[inserting, RIGHT] = (
                 down.position,
                 down.rotation,
@@ -232,9 +235,9 @@ class ScriptedExpert:
 
     def _inserted(self, ids: Ids, view: View, share: Array) -> Poses:
         """Right hand (m,) a share of the way down from where the parts stood when it began: no feedback."""
-        top, bottom = self._pair.mouth_z_m + STANDOFF_M, self._pair.seated_z_m - BOTTOM_M
+        bottom = self._pair.seated_z_m - BOTTOM_M
         reached = (self._socket[ids].inverse() @ view.parts[:, RIGHT]).position[:, 2]
-        height = np.maximum(top + share * (bottom - top), reached - PRESS_M)
+        height = np.maximum(self._top_m[ids] + share * (bottom - self._top_m[ids]), reached - PRESS_M)
         return self._aim(ids, self._socket[ids], height) @ self._held[ids][:, RIGHT]
 
     def _aim(self, ids: Ids, socket: Poses, height_m: Array) -> Poses:
