@@ -4,6 +4,7 @@ Shapes: m worlds, 4 pads, B = 2 bodies (plug, socket).
 """
 
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 import torch
@@ -100,6 +101,15 @@ class Pads:
     def counts(self, ids: Array, seen: Kinematics, load: Array) -> Array:
         """Raw counts (m, 4, 384) uint8 at the worlds' present state."""
         return self._last[ids] if self._remembers else self._read(ids, seen, load)
+
+    def get_state(self, env: int) -> dict[str, Any]:
+        """Everything that world `env`'s readings depend on."""
+        return {"sensors": self.sensors.get_state(env), "last": self._last[env].copy()}
+
+    def set_state(self, env: int, state: dict[str, Any]) -> None:
+        """Continue from a state taken by `get_state`."""
+        self.sensors.set_state(env, state["sensors"])
+        self._last[env] = state["last"]
 
     def _read(self, ids: Array, seen: Kinematics, load: Array) -> Array:
         joints, rates = torch.from_numpy(seen.joints), torch.from_numpy(seen.joint_velocities)

@@ -13,6 +13,7 @@ from lerobot_vtrefine.sim import sensing, starts, task
 from lerobot_vtrefine.sim.backends import Trace, get_backend
 from lerobot_vtrefine.sim.camera import depth_to_millimetres
 from lerobot_vtrefine.sim.config import RANGES, RandomizationConfig, SceneConfig, TaskConfig
+from lerobot_vtrefine.sim.depth import DepthCamera
 from lerobot_vtrefine.sim.episode import EpisodeState, Measured, update
 from lerobot_vtrefine.sim.privileged import Privileged, describe
 from lerobot_vtrefine.sim.randomization import Randomizer, WorldParameters
@@ -86,10 +87,9 @@ class InsertionSim:
         window = max(1, round(self.config.limits.force_window_s / self.scene.config.timestep_s))
         self._episode = EpisodeState.empty(num_envs, self.scene.model.nu, window)
         self._rates = task.rate_limits(self.scene.embodiment, self.config)
-        self._rays = self.scene.camera.directions()
         everyone = self._randomizer.draw(np.zeros(num_envs, np.int64))
         self._parameters = dict(everyone.values)
-        self._camera_position, self._camera_rotation = everyone.camera_position, everyone.camera_rotation
+        self._depth = DepthCamera(self.scene.model, self.scene.camera, num_envs)
         self._settled: dict[int, tuple[Array, Array]] = {}
 
     @property
@@ -120,8 +120,8 @@ class InsertionSim:
     @property
     def camera_pose(self) -> Array:
         """(N, 7) float32 position [m] and quaternion (w, x, y, z) of the OpenCV optical frame in the world."""
-        quat = matrix_to_quat(self._camera_rotation)
-        return np.concatenate([self._camera_position, quat], 1).astype(np.float32)
+        quat = matrix_to_quat(self._depth.rotation)
+        return np.concatenate([self._depth.position, quat], 1).astype(np.float32)
 
     def reset(self, ids: Array, seeds: Array) -> None:
         """Start new episodes in worlds `ids` (m,); each is a pure function of its seed (m,)."""
@@ -189,10 +189,7 @@ class InsertionSim:
     def depth_mm(self, ids: Array | None = None) -> Array:
         """Depth images (m, H, W) uint16 [mm]."""
         ids = self._checked(ids)
-        directions = self._rays @ np.swapaxes(self._camera_rotation[ids], -1, -2)
-        depth = self._backend.cast(ids, self._camera_position[ids], directions)
-        shape = (len(ids), self.scene.camera.height, self.scene.camera.width)
-        return depth_to_millimetres(depth).reshape(shape)
+        return depth_to_millimetres(self._depth.render(ids, *self._backend.geom_poses(ids)))
 
     def command_targets(self, ids: Array | None = None) -> Array:
         """Joint targets (m, J) that the servos hold at the end of the last control step."""
@@ -239,7 +236,7 @@ class InsertionSim:
             "row": self._backend.get_row(env),
             "episode": self._episode.row(env),
             "parameters": {name: values[env] for name, values in self._parameters.items()},
-            "camera": (self._camera_position[env].copy(), self._camera_rotation[env].copy()),
+            "camera": (self._depth.position[env].copy(), self._depth.rotation[env].copy()),
             "pads": self._pads.get_state(env),
         }
 
@@ -267,9 +264,12 @@ class InsertionSim:
     def _apply(self, ids: Array, drawn: WorldParameters) -> None:
         for name in RANGES:
             self._parameters[name][ids] = drawn.values[name]
-        self._camera_position[ids], self._camera_rotation[ids] = drawn.camera_position, drawn.camera_rotation
+        self._depth.set_cameras(ids, drawn.camera_position, drawn.camera_rotation)
         if self._randomizer.changes_physics:
-            self._backend.set_fields(ids, self._randomizer.model_fields(drawn))
+            fields = self._randomizer.model_fields(drawn)
+            self._backend.set_fields(ids, fields)
+            if "geom_size" in fields:
+                self._depth.set_shapes(ids, fields["geom_size"], fields["geom_aabb"])
 
     def _settle(self, ids: Array, seeds: Array) -> None:
         """Bring worlds to their starts and to rest, or back to where an earlier reset with this seed left them."""

@@ -40,11 +40,8 @@ class Backend(ABC):
         """Step worlds once per row of `controls` (m, K, nu)."""
 
     @abstractmethod
-    def cast(self, ids: Array, origins: Array, directions: Array) -> Array:
-        """Distances (m, R) along rays in units of their direction's length, -1 for a miss.
-
-        `origins` (m, 3) [m] and `directions` (m, R, 3), in the world frame.
-        """
+    def geom_poses(self, ids: Array) -> tuple[Array, Array]:
+        """World positions (m, G, 3) and rotations (m, G, 3, 3) of all geoms at the present state."""
 
     @abstractmethod
     def set_fields(self, ids: Array, fields: dict[str, Array]) -> None:

@@ -6,9 +6,6 @@ from mujoco.batch import Batch
 
 from lerobot_vtrefine.sim.backends.base import BAD_STATE_WARNINGS, Array, Backend, Trace
 
-# Rays travel as (m, R, 3) float64 arrays: cast this many at a time to keep memory flat.
-_MAX_RAYS = 2_000_000
-
 
 class BatchBackend(Backend):
     """`mujoco.batch`: bit-identical to stepping each world alone, at any number of threads."""
@@ -17,7 +14,10 @@ class BatchBackend(Backend):
         self.num_envs = num_envs
         self._batch = Batch(model, nsim=num_envs, nthread=num_threads)
         self._qpos, self._qvel = self._batch.bind("qpos"), self._batch.bind("qvel")
-        self._all = np.arange(num_envs, dtype=np.int32)
+        (
+            self._batch.bind("geom_xpos"),
+            self._batch.bind("geom_xmat"),
+        )  # a field bound later would read zero at first
 
     def read(self, ids: Array) -> tuple[Array, Array]:
         """See `Backend.read`."""
@@ -36,15 +36,12 @@ class BatchBackend(Backend):
         )
         return Trace(out["qpos"], out["sensordata"])
 
-    def cast(self, ids: Array, origins: Array, directions: Array) -> Array:
-        """See `Backend.cast`."""
-        size = max(1, _MAX_RAYS // directions.shape[1])
-        parts = []
-        for start in range(0, len(ids), size):
-            part = slice(start, start + size)
-            distance, _ = self._batch.ray(origins[part, None], directions[part], ids=self._subset(ids[part]))
-            parts.append(distance)
-        return np.concatenate(parts) if parts else np.zeros((0, directions.shape[1]))
+    def geom_poses(self, ids: Array) -> tuple[Array, Array]:
+        """See `Backend.geom_poses`."""
+        # After stepping, derived fields lag the state by one substep.
+        self._batch.forward(self._subset(ids), stage=mujoco.mjtStage.mjSTAGE_POS.value)
+        rotation = self._batch.bind("geom_xmat")[ids]
+        return self._batch.bind("geom_xpos")[ids], rotation.reshape(len(ids), -1, 3, 3)
 
     def set_fields(self, ids: Array, fields: dict[str, Array]) -> None:
         """See `Backend.set_fields`."""

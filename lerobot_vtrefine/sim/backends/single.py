@@ -42,19 +42,14 @@ class SingleBackend(Backend):
                 qpos[row, step], sensors[row, step] = data.qpos, data.sensordata
         return Trace(qpos, sensors)
 
-    def cast(self, ids: Array, origins: Array, directions: Array) -> Array:
-        """See `Backend.cast`."""
-        distances = np.empty(directions.shape[:2])
-        geom = np.zeros(1, np.int32)
-        for row, i in enumerate(ids):
+    def geom_poses(self, ids: Array) -> tuple[Array, Array]:
+        """See `Backend.geom_poses`."""
+        poses = []
+        for i in ids:
             scratch = self._copy(i)
             mujoco.mj_kinematics(self._models[i], scratch)
-            # mj_multiRay misses geoms of the arms; mj_ray does not.
-            for column, direction in enumerate(directions[row]):
-                distances[row, column] = mujoco.mj_ray(
-                    self._models[i], scratch, origins[row], direction, None, 1, -1, geom
-                )
-        return distances
+            poses.append((scratch.geom_xpos, scratch.geom_xmat.reshape(-1, 3, 3)))
+        return np.stack([pose[0] for pose in poses]), np.stack([pose[1] for pose in poses])
 
     def set_fields(self, ids: Array, fields: dict[str, Array]) -> None:
         """See `Backend.set_fields`."""

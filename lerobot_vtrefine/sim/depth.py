@@ -1,0 +1,144 @@
+"""The depth camera of all worlds: exact ray depths, computed only where a geom can be.
+
+Static geoms are rendered once per camera pose; each frame adds the moving ones. Equal to casting a ray through every
+pixel's centre with `mj_ray`, but some 30 times cheaper, and the same code for every backend.
+"""
+
+from typing import Any
+
+import mujoco
+import numpy as np
+import warp as wp
+from scipy.spatial import ConvexHull
+
+from lerobot_vtrefine.sim.camera import Camera
+from lerobot_vtrefine.sim.depth_kernels import MISS, ivec4, project, raster
+from lerobot_vtrefine.tactile.contact_query import start_warp
+
+Array = np.ndarray
+
+
+class DepthCamera:
+    """Depth images of N worlds.
+
+    Shapes: m worlds of `ids`, G geoms of the model, H x W pixels.
+    """
+
+    def __init__(self, model: mujoco.MjModel, camera: Camera, num_envs: int, device: str = "cpu") -> None:
+        start_warp()
+        self._camera, self._device = camera, device
+        self._intrinsics = wp.vec4(camera.fx, camera.fy, camera.cx, camera.cy)
+        moving = model.body_weldid[model.geom_bodyid] != 0
+        self._moving = _Solids(model, np.flatnonzero(moving), device)
+        self._static = _Solids(model, np.flatnonzero(~moving), device)
+        self.position = np.tile(camera.position_m, (num_envs, 1))
+        """(N, 3) cameras' positions [m]."""
+        self.rotation = np.tile(camera.rotation, (num_envs, 1, 1))
+        """(N, 3, 3) optical frames."""
+        self._size = np.tile(model.geom_size.astype(np.float32), (1, 1, 1))
+        self._bounds = np.tile(model.geom_aabb.astype(np.float32), (1, 1, 1))
+        data = mujoco.MjData(model)
+        mujoco.mj_kinematics(model, data)
+        self._static_poses = data.geom_xpos[None].copy(), data.geom_xmat.reshape(1, -1, 3, 3).copy()
+        self._nominal_background = self._static_depth(np.zeros(1, int))
+        self._background: Array | None = None
+
+    def set_cameras(self, ids: Array, position: Array, rotation: Array) -> None:
+        """Move the cameras of worlds `ids` to (m, 3) [m] and (m, 3, 3)."""
+        if np.array_equal(position, self.position[ids]) and np.array_equal(rotation, self.rotation[ids]):
+            return
+        self.position[ids], self.rotation[ids] = position, rotation
+        if self._background is None:
+            self._background = np.repeat(self._nominal_background, len(self.position), 0)
+        self._background[ids] = self._static_depth(ids)
+
+    def set_shapes(self, ids: Array, size: Array, bounds: Array) -> None:
+        """Give worlds their own geom sizes (m, G, 3) and bounding boxes (m, G, 6)."""
+        if len(self._size) == 1:
+            self._size = np.repeat(self._size, len(self.position), 0)
+            self._bounds = np.repeat(self._bounds, len(self.position), 0)
+        self._size[ids], self._bounds[ids] = size, bounds
+
+    def render(self, ids: Array, geom_position: Array, geom_rotation: Array) -> Array:
+        """z-depth (m, H, W) float32 [m], -1 for a miss.
+
+        Args:
+            ids: (m,) worlds.
+            geom_position, geom_rotation: (m, G, 3) [m] and (m, G, 3, 3), world frame.
+        """
+        if self._background is None:
+            depth = np.repeat(self._nominal_background, len(ids), 0)
+        else:
+            depth = self._background[ids]
+        self._draw(self._moving, ids, geom_position, geom_rotation, depth)
+        return np.where(depth < float(MISS), depth, np.float32(-1.0))
+
+    def _static_depth(self, ids: Array) -> Array:
+        depth = np.full((len(ids), self._camera.height, self._camera.width), float(MISS), np.float32)
+        position, rotation = (np.repeat(item, len(ids), 0) for item in self._static_poses)
+        self._draw(self._static, ids, position, rotation, depth)
+        return depth
+
+    def _draw(self, solids: "_Solids", ids: Array, position: Array, rotation: Array, depth: Array) -> None:
+        """Draw solids into `depth` (m, H, W), in place."""
+        select, device = solids.geoms, self._device
+        to_camera = np.swapaxes(self.rotation[ids], -1, -2)
+        offset = position[:, select] - self.position[ids][:, None]
+        local = offset @ np.swapaxes(to_camera, -1, -2)
+        turned = to_camera[:, None] @ rotation[:, select]
+        pos, rot = _upload(local, wp.vec3, device), _upload(turned, wp.mat33, device)
+        rows = slice(None) if len(self._size) == 1 else ids
+        size = _upload(self._size[rows][:, select], wp.vec3, device)
+        bounds = self._bounds[rows][:, select]
+        centre, half = _upload(bounds[..., :3], wp.vec3, device), _upload(bounds[..., 3:], wp.vec3, device)
+        shared, count = int(len(self._size) == 1), len(ids)
+        cover = wp.empty((count, len(select)), dtype=ivec4, device=device)
+        height, width = self._camera.height, self._camera.width
+        inputs: list[Any] = [
+            solids.kind,
+            centre,
+            half,
+            shared,
+            pos,
+            rot,
+            self._intrinsics,
+            height,
+            width,
+            cover,
+        ]
+        wp.launch(project, (count, len(select)), inputs, device=device, record_tape=False)
+        out = wp.array(depth, dtype=float, device=device, copy=False)
+        inputs = [solids.kind, size, shared, pos, rot, cover, solids.planes, solids.plane_range]
+        inputs += [self._intrinsics, width, out]
+        wp.launch(raster, (count, height), inputs, device=device, record_tape=False)
+        if device != "cpu":
+            depth[:] = out.numpy()
+
+
+class _Solids:
+    """Geoms of a model as the kernels take them."""
+
+    def __init__(self, model: mujoco.MjModel, geoms: Array, device: str) -> None:
+        self.geoms = geoms
+        self.kind = wp.array(model.geom_type[geoms].astype(np.int32), dtype=int, device=device)
+        planes, ranges = [np.zeros((0, 4))], []
+        for geom in geoms:
+            own = _hull_planes(model, int(geom))
+            ranges.append((sum(map(len, planes)), len(own)))
+            planes.append(own)
+        self.planes = wp.array(np.concatenate(planes).astype(np.float32), dtype=wp.vec4, device=device)
+        self.plane_range = wp.array(np.array(ranges, np.int32).reshape(-1, 2), dtype=wp.vec2i, device=device)
+
+
+def _hull_planes(model: mujoco.MjModel, geom: int) -> Array:
+    """Half-spaces (F, 4) of a convex mesh geom in its own frame; none for other kinds."""
+    if model.geom_type[geom] != mujoco.mjtGeom.mjGEOM_MESH:
+        return np.zeros((0, 4))
+    mesh = int(model.geom_dataid[geom])
+    start, count = model.mesh_vertadr[mesh], model.mesh_vertnum[mesh]
+    equations = ConvexHull(model.mesh_vert[start : start + count].astype(float)).equations
+    return np.unique(equations.round(7), axis=0)
+
+
+def _upload(array: Array, dtype: Any, device: str) -> wp.array:
+    return wp.array(np.ascontiguousarray(array, np.float32), dtype=dtype, device=device, copy=device != "cpu")
