@@ -35,7 +35,8 @@ def fake_commands(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
 
 @pytest.mark.usefixtures("fake_commands")
 def test_demo_end_to_end(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    config = demo.parse_config(["--quick", f"--output_dir={tmp_path / 'demo'}"])
+    arguments = ["--quick", "--ablation_episodes=8", f"--output_dir={tmp_path / 'demo'}"]
+    config = demo.parse_config(arguments)
     page = demo.run_demo(config).read_text(encoding="utf-8")
     results = json.loads((config.output_dir / "results.json").read_text())
     assert results["pretrain"]["success"] == 2
@@ -61,7 +62,7 @@ def test_demo_end_to_end(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> 
 
 @pytest.mark.usefixtures("fake_commands")
 def test_restart_continues(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    config = demo.parse_config(["--quick", "--ablation_episodes=0", f"--output_dir={tmp_path / 'demo'}"])
+    config = demo.parse_config(["--quick", f"--output_dir={tmp_path / 'demo'}"])
     demo.run_demo(config)
     capsys.readouterr()
     demo.run_demo(replace(config, finetune_iterations=3))

@@ -23,7 +23,7 @@ QUICK = (
     "--pretrain_batch=16",
     "--eval_episodes=8",
     "--eval_envs=8",
-    "--ablation_episodes=8",
+    "--ablation_episodes=0",
     "--finetune_iterations=2",
     "--finetune_envs=8",
 )
@@ -146,7 +146,9 @@ def record_stage(config: DemoConfig) -> Stage:
         *flags("degradation", config.degradation),
     ]
     product = config.dataset_dir / "meta" / "info.json"
-    return Stage("record", "Record demonstrations", tuple(command), config.dataset_dir, product)
+    return Stage(
+        "record", "Record demonstrations", tuple(command), config.dataset_dir, product, resumable=True
+    )
 
 
 def recording_env(config: DemoConfig) -> dict[str, Any]:
