@@ -58,9 +58,9 @@ def explain_stream(sample: bytes, wanted: StreamKind, baud: int) -> str:
             f"set rows: {kind.shape.rows}, cols: {kind.shape.cols}, protocol: {kind.protocol}"
         )
     if sample.count(MARKER) >= len(sample) // (2 * KNOWN_SHAPES[0].period):
-        period = wanted.shape.period if wanted.shape else 0
+        apart = f"{wanted.shape.period} bytes apart" if wanted.shape else "as any known frame has them"
         return (
-            f"frame markers come, but not {period} bytes apart and alone: bytes are being lost, or a "
+            f"frame markers come, but not {apart} and alone: bytes are being lost, or a "
             "motionless pattern imitates the marker; touch the pad, then check the cable"
         )
     other = STREAM_BAUD if baud != STREAM_BAUD else DIAGNOSTIC_BAUD

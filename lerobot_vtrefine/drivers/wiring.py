@@ -45,6 +45,18 @@ def cyclic_block(rows: tuple[int, ...], total: int) -> int | None:
     return ends[0] if len(ends) == 1 else None
 
 
+def scanned_from(dead: tuple[int, ...]) -> int | None:
+    """First channel of a 12-row firmware that leaves exactly these rows dead; None where no channel does.
+
+    Row r reads channel (r + first) mod 16, and the pad is on channels 4..15.
+    """
+    for first in range(CHANNELS):
+        channels = [(row + first) % CHANNELS for row in range(PAD_ROWS)]
+        if tuple(row for row, channel in enumerate(channels) if channel < PAD_CHANNEL) == dead:
+            return first
+    return None
+
+
 def seam_row(pressed: NDArray[np.uint8], idle: NDArray[np.uint8]) -> int | None:
     """Row at which the pad begins, from presses that moved over the pad; None where they do not tell.
 
@@ -92,8 +104,8 @@ def _row_problems(dead: tuple[int, ...], total: int, offset: int | None) -> list
     unconnected = CHANNELS - PAD_ROWS
     if total == CHANNELS and len(dead) == unconnected and offset is not None:
         return []  # a 12-row pad on 16-row firmware: as it should be, the offset says where it begins
-    if total == PAD_ROWS and offset is not None and len(dead) <= unconnected:
-        channel = (PAD_CHANNEL - offset) % CHANNELS
+    channel = scanned_from(dead) if total == PAD_ROWS else None
+    if channel is not None:
         return [
             f"rows {_listed(dead)} are dead: the firmware scans from multiplexer channel {channel} instead "
             f"of {PAD_CHANNEL}; flash it with MUX_CHANNEL_OFFSET {PAD_CHANNEL}, or check these rows' contacts"

@@ -1,0 +1,153 @@
+"""Finding pads by pressing them, the pads file, and the three commands."""
+
+import io
+from contextlib import ExitStack, redirect_stdout
+from pathlib import Path
+
+import pytest
+from boards import PAD, emulated, pressable_source
+
+from lerobot_vtrefine.cli.find_pads import main as find_pads
+from lerobot_vtrefine.cli.pad_emulator import main as pad_emulator
+from lerobot_vtrefine.cli.view_pads import main as view_pads
+from lerobot_vtrefine.drivers.config import PadConfig
+from lerobot_vtrefine.drivers.discovery import open_board, probe_port, wait_for_press
+from lerobot_vtrefine.drivers.frames import FrameShape
+from lerobot_vtrefine.drivers.pads_file import load_pads, save_pads
+from lerobot_vtrefine.drivers.ports import PortError
+from lerobot_vtrefine.drivers.sources import noise_source
+
+
+class Operator(io.StringIO):
+    """Reads what the command asks for, and presses that pad until told to let go."""
+
+    def __init__(self, where: dict[str, str]) -> None:
+        super().__init__()
+        self.where = where
+        self.pressing = ""
+
+    def write(self, text: str) -> int:
+        for name, port in self.where.items():
+            if f"press {name} " in text:
+                self.pressing = port
+        if "let go" in text:
+            self.pressing = ""
+        return super().write(text)
+
+
+def test_find_pads_writes_what_the_robot_reads(tmp_path: Path) -> None:
+    output = tmp_path / "rig" / "pads.yaml"
+    operator = Operator({"thumb": "port1", "index": "port0"})
+    with ExitStack() as stack:
+        ports = []
+        for seed, name in enumerate(("port0", "port1")):
+            source = pressable_source(PAD, lambda name=name: operator.pressing == name, seed)
+            ports.append(stack.enter_context(emulated(tmp_path, name, source=source)).port)
+        stack.enter_context(redirect_stdout(operator))
+        status = find_pads(["--ports", *ports, "--names", "thumb", "index", "--output", str(output)])
+    assert status == 0, operator.getvalue()
+    assert {name: Path(pad.port).name for name, pad in load_pads(output).items()} == operator.where
+
+
+def test_pad_on_sixteen_row_firmware_gets_its_offset(tmp_path: Path) -> None:
+    shape = FrameShape(16, 32)
+    idle = noise_source(shape, seed=3)
+
+    def source(number: int) -> object:
+        counts = idle(number)
+        counts[:4] = 0
+        return counts
+
+    with emulated(tmp_path, shape=shape, source=source) as board:
+        found = open_board(board.port, probe_port(board.port))
+        found.reader.stop()
+    assert found.config == PadConfig(board.port, rows=16, pad_rows=12, row_offset=4)
+    assert found.idle.shape == (12, 32)
+
+
+def test_two_pads_pressed_together_are_no_answer(tmp_path: Path) -> None:
+    with ExitStack() as stack:
+        held = False
+        boards = []
+        for seed in (0, 1):
+            source = pressable_source(PAD, lambda: held, seed)
+            port = stack.enter_context(emulated(tmp_path, f"p{seed}", source=source)).port
+            boards.append(open_board(port, probe_port(port)))
+            stack.callback(boards[-1].reader.stop)
+        held = True
+        assert wait_for_press(boards, timeout_s=1.0) is None
+
+
+def test_probe_explains_silent_and_foreign_ports(tmp_path: Path) -> None:
+    board = emulated(tmp_path, "silent")
+    board.stall(60.0)
+    with board, pytest.raises(PortError, match="no data"):
+        probe_port(board.port, timeout_s=0.5)
+
+
+def test_pads_file_round_trip_keeps_only_what_differs(tmp_path: Path) -> None:
+    path = tmp_path / "pads.yaml"
+    pads = {"a": PadConfig("/dev/x"), "b": PadConfig("/dev/y", rows=16, pad_rows=12, row_offset=4)}
+    save_pads(pads, path)
+    assert load_pads(path) == pads
+    assert "baud" not in path.read_text()
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("", "no 'pads:' section"),
+        ("pads: {a: {rows: 12}}", "'a' needs a port"),
+        ("pads: {a: {port: x, row: 12}}", "unknown row; known: port, rows"),
+        ("pads: {a: {port: x, row_offset: 40}}", "'a': row_offset=40"),
+        ("pads: {a: {port: x}, b: {port: x}}", "'a' and 'b' are both on x"),
+        ("pads: [", "not valid YAML"),
+    ],
+)
+def test_bad_pads_files_are_explained(tmp_path: Path, text: str, message: str) -> None:
+    path = tmp_path / "pads.yaml"
+    path.write_text(text)
+    with pytest.raises(ValueError, match=message):
+        load_pads(path)
+    with pytest.raises(FileNotFoundError, match="vtrefine-find-pads"):
+        load_pads(tmp_path / "other.yaml")
+
+
+def test_view_pads_draws_and_names_the_rate(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    with emulated(tmp_path, "thumb") as board:
+        assert view_pads(["--ports", board.port, "--seconds", "0.5"]) == 0
+    shown = capsys.readouterr().out
+    assert "thumb: " in shown
+    assert "frames/s" in shown
+    assert shown.count("▀") >= 6 * 32
+
+
+def test_emulator_command_prints_its_ports(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    folder = tmp_path / "boards"
+    assert pad_emulator(["--folder", str(folder), "--boards", "2", "--seconds", "0.2", "--loss", "0.01"]) == 0
+    assert capsys.readouterr().out.split() == [
+        str(folder / "left_arm_left_finger"),
+        str(folder / "left_arm_right_finger"),
+    ]
+    assert not list(folder.iterdir())
+
+
+@pytest.mark.parametrize(
+    ("command", "arguments", "message"),
+    [
+        (pad_emulator, ["--shape", "12"], "--shape=12 is not rows x columns"),
+        (pad_emulator, ["--recording", "nowhere.npy"], "nowhere.npy does not exist"),
+        (pad_emulator, ["--markers", "999"], "taxel 999"),
+        (pad_emulator, ["--loss", "2"], "loss=2.0 must lie within 0 .. 1"),
+        (find_pads, ["--ports", "/nowhere/pty"], "/nowhere/pty does not exist"),
+        (find_pads, ["--ports", "x", "--names", "a", "a"], "must differ"),
+        (view_pads, [], "give either --pads-file"),
+    ],
+)
+def test_bad_usage_is_one_line_and_status_2(
+    command: object, arguments: list[str], message: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert command(arguments) == 2
+    error = capsys.readouterr().err.strip()
+    assert message in error
+    assert "\n" not in error
