@@ -93,8 +93,8 @@ def record(config: RecordDemosConfig) -> None:
         workers = demonstration_stream(
             env, config.degradation, config.num_envs, demos.next_seed, config.num_workers
         )
-        progress = tqdm(total=config.num_episodes, initial=demos.num_episodes, unit="episode")
-        with workers as stream, progress:
+        bar = {"total": config.num_episodes, "initial": demos.num_episodes, "unit": "episode"}
+        with workers as stream, tqdm(**bar) as progress:
             for demonstration in stream:
                 kept = demonstration.row["success"] or config.include_failures
                 if kept:

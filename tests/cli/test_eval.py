@@ -50,7 +50,7 @@ def test_lerobot_eval_runs(evaluate, flags, tmp_path):
     info, rows = evaluate("run", *flags)
     assert info["overall"]["n_episodes"] == 2
     assert [row["seed"] for row in rows] == [40, 41]
-    assert all(row["steps"] == 5 and row["failure"] == "time_out" for row in rows)
+    assert all(0 < row["steps"] <= 5 and row["failure"] != "none" for row in rows)
     assert all(row["in_hand_shift_m"] >= 0 and row["peak_force_n"] >= 0 for row in rows)
     videos = sorted((tmp_path / "run" / "videos").rglob("*.mp4"))
     assert len(videos) == 2
