@@ -22,6 +22,7 @@ log = logging.getLogger(__name__)
 GL_HELP = "install EGL (Debian: apt install libegl1 libgl1-mesa-dri) and start with MUJOCO_GL=egl"
 _PAD_SHAPE = (12, 32)
 _BACKGROUND = (24, 26, 32)
+_SHADOW_PX, _SAMPLES = 1024, 2
 
 
 @dataclass(frozen=True)
@@ -29,8 +30,8 @@ class CameraView:
     """A free camera: looks at `lookat_m` (world) from `distance_m`, angles in degrees as in MuJoCo."""
 
     lookat_m: tuple[float, float, float] = (0.0, 0.0, 0.11)
-    distance_m: float = 0.62
-    azimuth_deg: float = 0.0
+    distance_m: float = 0.54
+    azimuth_deg: float = 180.0  # left arm on the left
     elevation_deg: float = -18.0
 
 
@@ -57,7 +58,9 @@ class VideoRenderer:
     def frame(self) -> Frame:
         """Return the current frame, uint8 (H, W, 3); H and W are even, as video encoders want."""
         ids = np.array([self._env])
+        before = self._sim.get_state(self._env)
         raw = self._sim.observe(ids)
+        self._sim.set_state(self._env, before)  # looking draws sensor noise: nothing may depend on it
         scene = (
             self._scene.draw()
             if self._scene
@@ -86,7 +89,10 @@ class _GlScene:
         # The off-screen buffer must hold the frame; enlarging it in the model costs memory only here.
         model.vis.global_.offheight = max(model.vis.global_.offheight, size[0])
         model.vis.global_.offwidth = max(model.vis.global_.offwidth, size[1])
+        # Without a GPU, reflections and fine shadows cost five times the rest of the picture.
+        model.vis.quality.shadowsize, model.vis.quality.offsamples = _SHADOW_PX, _SAMPLES
         self._renderer = mujoco.Renderer(model, *size)
+        self._renderer.scene.flags[mujoco.mjtRndFlag.mjRND_REFLECTION] = False
         self._camera = mujoco.MjvCamera()
         self._camera.type = mujoco.mjtCamera.mjCAMERA_FREE
         self._camera.lookat = view.lookat_m
