@@ -70,6 +70,8 @@ class VtRefineEnvConfig(EnvConfig):
     """none, or touch or vision, replaced by its mean over ``ablate_dataset``."""
     ablate_dataset: Path | None = None
     """Root of the LeRobot dataset whose mean frame the ablation shows."""
+    video_episodes: int = 10
+    """Episodes that evaluation videos show; the other videos stay black, which costs no rendering."""
     metrics_path: Path | None = None
     """JSON-lines file; every finished episode appends seed, success, in-hand shift, peak force, ..."""
     features: dict[str, PolicyFeature] = field(default_factory=dict)

@@ -52,11 +52,9 @@ def make_vector_env(config: VtRefineEnvConfig, num_envs: int, use_async: bool) -
 
     if config.vectorization == "native":
         return VtRefineVectorEnv(config, num_envs)
-    make_one = partial(VtRefineEnv, config)
+    makers = [partial(VtRefineEnv, config, position, num_envs) for position in range(num_envs)]
     if use_async and num_envs > 1:
         env = VtRefineEnv(config)
-        return _LazyAsyncVectorEnv(
-            [make_one] * num_envs, env.observation_space, env.action_space, env.metadata
-        )
-    frozen = freeze_after_episode_end(make_one)
-    return gym.vector.SyncVectorEnv([frozen] * num_envs, autoreset_mode=AutoresetMode.NEXT_STEP)
+        return _LazyAsyncVectorEnv(makers, env.observation_space, env.action_space, env.metadata)
+    frozen = [freeze_after_episode_end(make) for make in makers]
+    return gym.vector.SyncVectorEnv(frozen, autoreset_mode=AutoresetMode.NEXT_STEP)

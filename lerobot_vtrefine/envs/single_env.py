@@ -13,8 +13,9 @@ from lerobot_vtrefine.envs.vector_env import Observation, VtRefineVectorEnv
 class VtRefineEnv(gym.Env[Observation, Array]):
     """One insertion episode at a time; observations of ``VtRefineVectorEnv`` without the leading ``n``."""
 
-    def __init__(self, config: VtRefineEnvConfig) -> None:
-        self._batch = VtRefineVectorEnv(config, num_envs=1)
+    def __init__(self, config: VtRefineEnvConfig, position: int = 0, total: int = 1) -> None:
+        """``position`` and ``total``: which of the environments that play together this one is."""
+        self._batch = VtRefineVectorEnv(config, 1, position, total)
         self.metadata = self._batch.metadata
         self.render_mode = self._batch.render_mode
         self.observation_space = self._batch.single_observation_space

@@ -33,7 +33,10 @@ class VtRefineVectorEnv(gym.vector.VectorEnv[Observation, Array, Array]):
     - Observations are those of ``datasets.features.env_observation_shapes`` with a leading ``n``.
     """
 
-    def __init__(self, config: VtRefineEnvConfig, num_envs: int) -> None:
+    def __init__(
+        self, config: VtRefineEnvConfig, num_envs: int, position: int = 0, total: int | None = None
+    ) -> None:
+        """``position`` and ``total``: where these environments stand among all that play together."""
         self.config = config
         self.num_envs = num_envs
         self.metadata = {
@@ -47,6 +50,8 @@ class VtRefineVectorEnv(gym.vector.VectorEnv[Observation, Array, Array]):
         self.observation_space = batch_space(self.single_observation_space, num_envs)
         self.action_space = batch_space(self.single_action_space, num_envs)
         self._schedule = config.read_schedule
+        self._stride = num_envs if total is None else total
+        self._first_episode = position - self._stride
         self._episodes: Episodes | None = None
         self._frames: FrameSource | None = None
 
@@ -67,6 +72,7 @@ class VtRefineVectorEnv(gym.vector.VectorEnv[Observation, Array, Array]):
         if self._episodes is None and not mask.all():
             raise ValueError("the first reset must restart every environment")
         ids = np.flatnonzero(mask)
+        self._first_episode += self._stride if mask.all() else 0
         self.episodes.reset(ids, self._seeds(seed)[ids])
         return self._observation(), {"is_success": np.zeros(self.num_envs, bool)}
 
@@ -103,10 +109,11 @@ class VtRefineVectorEnv(gym.vector.VectorEnv[Observation, Array, Array]):
         return tuple(self.render_env(index) for index in range(self.num_envs))
 
     def render_env(self, index: int) -> Array:
-        """The frame of one environment."""
+        """The frame of one environment: black once ``video_episodes`` episodes were shown."""
         if self._frames is None:
-            self._frames = FrameSource(self.episodes.sim)
-        return self._frames.frame(index)
+            self._frames = FrameSource(self.episodes)
+        shown = self._first_episode + index < self.config.video_episodes
+        return self._frames.frame(index) if shown else self._frames.blank()
 
     def close_extras(self, **kwargs: Any) -> None:
         """Release simulation and renderers; a later reset builds them again."""

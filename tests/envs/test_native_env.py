@@ -191,3 +191,38 @@ def test_bad_calls_are_named(make_env):
         env.step(np.zeros((2, 14)))
     with pytest.raises(ValueError, match="reset_mask"):
         env.reset(options={"reset_mask": np.ones(3, bool)})
+
+
+class FakeRenderer:
+    drawn: list[int] = []  # noqa: RUF012
+
+    def __init__(self, sim: FakeSim, env: int) -> None:
+        self.env = env
+
+    def frame(self) -> np.ndarray:
+        self.drawn.append(self.env)
+        return np.full((4, 6, 3), 10 + self.env, np.uint8)
+
+    def close(self) -> None: ...
+
+
+def test_videos_show_the_first_episodes_and_draw_only_what_moved(make_env, monkeypatch):
+    monkeypatch.setattr("lerobot_vtrefine.sim.render.VideoRenderer", FakeRenderer)
+    monkeypatch.setattr(FakeRenderer, "drawn", [])
+    env = make_env(2, video_episodes=3)
+    env.reset(seed=[0, 1])
+    for _ in range(5):
+        env.step(hold(env))
+        frames = np.stack(env.call("render")[:2])
+    assert frames[:, 0, 0, 0].tolist() == [10, 11]
+    assert FakeRenderer.drawn == [0, 1] * 3 + [1] * 2  # the first episode ended at step 3
+    env.reset(seed=[2, 3])
+    frames = np.stack(env.call("render")[:2])  # episodes 2 and 3, of which the first 3 are shown
+    assert frames[:, 0, 0, 0].tolist() == [10, 0]
+
+
+def test_no_video_starts_no_renderer(make_env, monkeypatch):
+    monkeypatch.setattr("lerobot_vtrefine.sim.render.VideoRenderer", None)
+    env = make_env(2, video_episodes=0)
+    env.reset(seed=[0, 1])
+    assert np.stack(env.call("render")[:2]).max() == 0
