@@ -1,10 +1,10 @@
 """ALOHA: two ViperX-300s arms that face each other across the table, FlexiTac pads on four flat fingers.
 
-Sources: link offsets, axes and limits are the ViperX-300s's, on which Interbotix's URDF, gym-aloha and MuJoCo Menagerie
-agree; servo gains, friction, armature, masses and inertias are Menagerie's identified values; bases, finger slides and
-pads are those of the FlexiTac simulation that the paper's authors released. The gripper's stiffness is chosen
-so that a command 10 mm below the part's width presses with 20 N per pad: the authors' 31 real episodes hold parts with
-commands 6 to 8.5 mm below the measured opening.
+Sources: link offsets, axes and limits are the ViperX-300s's, on which Interbotix's URDF, gym-aloha and MuJoCo
+Menagerie agree; servo gains, friction, armature, masses and inertias are Menagerie's identified values;
+bases, finger slides and pads are those of the FlexiTac simulation that the paper's authors released. The
+gripper's stiffness is chosen so that a command 10 mm below the part's width presses with 20 N per pad: the
+authors' 31 real episodes hold parts with commands 6 to 8.5 mm below the measured opening.
 """
 
 import math

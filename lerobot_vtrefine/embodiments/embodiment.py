@@ -3,12 +3,13 @@
 Conventions, shared by every embodiment:
 
 - World frame: origin at the centre of the table's top, z up. SI units, radians.
-- Joints, state and actions: per arm (left, then right) the revolute joints from the base on, then `left_finger` and
-  `right_finger`. One servo drives both fingers, right = -left.
-- Hand frame of an arm (after the last revolute joint): +x towards the fingertips, fingers slide along y, the left
-  finger at y > 0.
-- Pad frame: origin at the centre of the undeformed face, +x along increasing column, +y along increasing row, +z out of
-  the face. Column 0 lies at the fingertip; rows of opposing pads are mirrored: (r, c) faces (R-1-r, c).
+- Joints, state and actions: per arm (left, then right) the revolute joints from the base on, then
+  `left_finger` and `right_finger`. One servo drives both fingers, right = -left.
+- Hand frame of an arm (after the last revolute joint): +x towards the fingertips, fingers slide along y, the
+  left finger at y > 0.
+- Pad frame: origin at the centre of the undeformed face, +x along increasing column, +y along increasing row,
+  +z out of the face. Column 0 lies at the fingertip; rows of opposing pads are mirrored: (r, c) faces (R-1-r,
+  c).
 - TCP: midway between the pads, axes of the hand frame.
 """
 
@@ -162,7 +163,8 @@ class Embodiment:
             qd: joint velocities (..., J) [rad/s, m/s].
 
         Returns:
-            (..., 4, 6): linear velocity of the pad's origin [m/s], then angular velocity [rad/s], in the world frame.
+            (..., 4, 6): linear velocity of the pad's origin [m/s], then angular velocity [rad/s], in the
+            world frame.
         """
         return kinematics.pad_twists(self, q, qd)
 
@@ -187,8 +189,8 @@ class Embodiment:
             iterations: fixed number of steps, so that the result is a function of the arguments only.
 
         Returns:
-            Joint positions (..., J) within the limits. A pose out of reach gives the closest that the steps found;
-            check with `tcp_poses`.
+            Joint positions (..., J) within the limits. A pose out of reach gives the closest that the steps
+            found; check with `tcp_poses`.
         """
         return kinematics.solve_tcp(self, position, rotation, initial, iterations)
 

@@ -36,7 +36,9 @@ class Camera:
         return matrix_to_quat(self.rotation)
 
     def directions(self) -> np.ndarray:
-        """Ray of every pixel's centre in the optical frame (H * W, 3), scaled to z = 1: distances are z-depths."""
+        """Ray of every pixel's centre in the optical frame (H * W, 3), scaled to z = 1: distances are
+        z-depths.
+        """
         u, v = np.meshgrid(np.arange(self.width), np.arange(self.height))
         rays = np.stack([(u - self.cx) / self.fx, (v - self.cy) / self.fy, np.ones(u.shape)], -1)
         return rays.reshape(-1, 3)

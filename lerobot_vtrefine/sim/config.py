@@ -28,8 +28,8 @@ class CameraConfig:
             raise ValueError(f"camera.fov_y_rad must lie between 0 and 3 rad, got {self.fov_y_rad}")
 
 
-# grasped: a narrow region of interest around the insertion, so that most pixels show parts and hands. table: the
-# picking areas of both arms and the insertion above them.
+# grasped: a narrow region of interest around the insertion, so that most pixels show parts and hands. table:
+# the picking areas of both arms and the insertion above them.
 GRASPED_CAMERA = CameraConfig(80, 60, 0.384, (-0.44, 0.0, 0.42), (0.0, 0.0, 0.145))
 TABLE_CAMERA = CameraConfig(160, 120, 0.56, (-0.46, 0.0, 0.46), (0.0, 0.0, 0.09))
 
@@ -145,8 +145,9 @@ class LimitsConfig:
 
     in_hand_shift_m: float = 0.005
     """Largest movement of a part in its hand since the grasp."""
-    contact_force_n: float = 60.0
-    """Largest force between plug and socket, averaged over `force_window_s`."""
+    contact_force_n: float = 20.0
+    """Largest force between plug and socket, averaged over `force_window_s`: the clean expert stays below 2 N,
+    demonstrations that land on the rim below 8 N, and pushing on reaches 30 N."""
     force_window_s: float = 0.01
     drop_s: float = 0.3
     """A lifted part that its hand has not held for this long counts as dropped."""

@@ -1,7 +1,7 @@
 """The depth camera of all worlds: exact ray depths, computed only where a geom can be.
 
-Static geoms are rendered once per camera pose; each frame adds the moving ones. Equal to casting a ray through every
-pixel's centre with `mj_ray`, but some 30 times cheaper, and the same code for every backend.
+Static geoms are rendered once per camera pose; each frame adds the moving ones. Equal to casting a ray
+through every pixel's centre with `mj_ray`, but some 30 times cheaper, and the same code for every backend.
 """
 
 from typing import Any

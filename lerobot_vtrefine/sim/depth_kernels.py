@@ -1,8 +1,8 @@
 """Warp kernels of the depth camera; one source for CPU and CUDA.
 
-Shape legend: m worlds, G geoms, F planes, H x W pixels; float32, metres, everything in the camera's optical frame.
-`project` finds the pixels that a geom can cover, `raster` intersects only those. Solids are convex, so that a ray meets
-them in one interval; a capsule is three of them.
+Shape legend: m worlds, G geoms, F planes, H x W pixels; float32, metres, everything in the camera's optical
+frame. `project` finds the pixels that a geom can cover, `raster` intersects only those. Solids are convex, so
+that a ray meets them in one interval; a capsule is three of them.
 """
 
 import warp as wp
@@ -147,7 +147,7 @@ def project(
     own = wp.where(shared == 1, 0, world)
     low_u, low_v, high_u, high_v = float(MISS), float(MISS), float(-MISS), float(-MISS)
     whole = kind[geom] == PLANE
-    behind = int(0)
+    behind = int(0)  # noqa: UP018, RUF046 (a bare literal would be a constant to warp)
     for corner in range(8):
         sign = wp.vec3(
             wp.where((corner & 1) == 1, 1.0, -1.0),

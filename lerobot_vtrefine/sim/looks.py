@@ -44,12 +44,10 @@ def add_looks(spec: mujoco.MjSpec) -> None:
     )
     table.textures[mujoco.mjtTextureRole.mjTEXROLE_RGB] = "table"
     spec.add_material(name="floor", rgba=[0.45, 0.47, 0.50, 1.0])
-    key = dict(type=mujoco.mjtLightType.mjLIGHT_DIRECTIONAL, castshadow=True)
-    spec.worldbody.add_light(pos=[-0.8, -0.4, 1.6], dir=[0.5, 0.25, -1.0], diffuse=[0.55, 0.53, 0.50], **key)
+    kind = mujoco.mjtLightType.mjLIGHT_DIRECTIONAL
     spec.worldbody.add_light(
-        pos=[0.8, 0.6, 1.4],
-        dir=[-0.5, -0.4, -1.0],
-        diffuse=[0.22, 0.24, 0.28],
-        castshadow=False,
-        type=mujoco.mjtLightType.mjLIGHT_DIRECTIONAL,
+        pos=[-0.3, -0.2, 1.0], dir=[0.3, 0.2, -1.0], diffuse=[0.5, 0.48, 0.45], castshadow=True, type=kind
+    )
+    spec.worldbody.add_light(
+        pos=[0.8, 0.6, 1.4], dir=[-0.5, -0.4, -1.0], diffuse=[0.25, 0.27, 0.3], castshadow=False, type=kind
     )

@@ -1,8 +1,8 @@
 """Plug-socket pairs: what the scene, the task, the expert and the touch sensors need to know about one.
 
-Frames: the plug's origin is its tip, the socket's the centre of its mouth, z along the insertion axis, up. A seated plug
-stands at (0, 0, `seated_z_m`) of the socket's frame. Mesh pairs have both frames coincide when assembled
-(`seated_z_m` = 0).
+Frames: the plug's origin is its tip, the socket's the centre of its mouth, z along the insertion axis, up. A
+seated plug stands at (0, 0, `seated_z_m`) of the socket's frame. Mesh pairs have both frames coincide when
+assembled (`seated_z_m` = 0).
 """
 
 from dataclasses import dataclass
@@ -84,7 +84,8 @@ def procedural_pair(name: str, clearance_m: float) -> PartPair:
     profile = make_profile(name, peg_length)
     if abs(clearance_m) >= profile.smallest_width_m:
         raise ValueError(
-            f"clearance_m = {clearance_m} exceeds the {name} plug, which is {profile.smallest_width_m:.4f} m wide"
+            f"clearance_m = {clearance_m} is too large for the {name} plug: it must be below "
+            f"{profile.smallest_width_m:.4f} m, the plug's smallest width"
         )
     handle_z = peg_length + HANDLE_M[2] / 2
     handle = Box(_half(HANDLE_M), (0.0, 0.0, handle_z))
@@ -93,7 +94,8 @@ def procedural_pair(name: str, clearance_m: float) -> PartPair:
     walls = wall_boxes(outline, WALL_M, -HOLE_DEPTH_M, 0.0)
     base_z = -HOLE_DEPTH_M - BASE_M[2] / 2
     base = Box(_half(BASE_M), (0.0, 0.0, base_z))
-    # The hand takes the base at its upper edge: on the table the lower edge leaves no room for a pitched hand.
+    # The hand takes the base at its upper edge: on the table the lower edge leaves no room for a pitched
+    # hand.
     grip = Grip((0.0, 0.0, -0.040), (BASE_M[0] / 2, BASE_M[1] / 2, 0.015))
     socket = Part((base, *walls), grip, rest_height_m=HOLE_DEPTH_M + BASE_M[2])
     return PartPair(name, plug, socket, seated_z_m=-HOLE_DEPTH_M, travel_m=HOLE_DEPTH_M)

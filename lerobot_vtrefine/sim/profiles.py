@@ -1,7 +1,8 @@
 """Cross-sections of the procedural pairs: the plug's solid pieces and the outline of the hole that fits it.
 
-Outlines are counter-clockwise polygons (V, 2) [m] tangent to the plug from outside; arcs become polygons whose inscribed
-circle is the plug's, so that offsetting every edge by half the clearance gives the clearance everywhere.
+Outlines are counter-clockwise polygons (V, 2) [m] tangent to the plug from outside; arcs become polygons
+whose inscribed circle is the plug's, so that offsetting every edge by half the clearance gives the clearance
+everywhere.
 """
 
 from dataclasses import dataclass

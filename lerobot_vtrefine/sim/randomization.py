@@ -16,7 +16,8 @@ Array = np.ndarray
 
 _STREAM = 1
 CLEARANCE_LEVELS = 9
-# All that a hole's size changes in a compiled model; the constants derived from them are recomputed per world.
+# All that a hole's size changes in a compiled model; the constants derived from them are recomputed per
+# world.
 GEOMETRY_FIELDS = (
     "geom_pos",
     "geom_size",

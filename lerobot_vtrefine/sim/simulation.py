@@ -147,15 +147,14 @@ class InsertionSim:
         """One control step of worlds `ids` (m,), all by default.
 
         Args:
-            action: (m, J) absolute joint targets [rad, m]. They are clamped to the joint limits and to the rate
-                limits, and approached linearly over the control step.
+            action: (m, J) absolute joint targets [rad, m]. They are clamped to the joint limits and to the
+                rate limits, and approached linearly over the control step.
         """
         ids = self._checked(ids)
         action = np.asarray(action, float)
-        if action.shape != (len(ids), self.scene.embodiment.num_joints) or not np.isfinite(action).all():
-            raise ValueError(
-                f"action must be finite, of shape {(len(ids), self.scene.embodiment.num_joints)}, got {action.shape}"
-            )
+        shape = len(ids), self.scene.embodiment.num_joints
+        if action.shape != shape or not np.isfinite(action).all():
+            raise ValueError(f"action must be finite, of shape {shape}, got shape {action.shape}")
         state = self._episode
         before = state.command[ids]
         wanted = task.servo_commands(self.scene.embodiment, action)
@@ -170,8 +169,12 @@ class InsertionSim:
         return StepResult(reward, terminated, truncated, state.success[ids])
 
     def observe(self, ids: Array | None = None) -> dict[str, Array]:
-        """What the sensors give now: `state` (m, 16) float32 [rad, m]; `tactile` and `tactile_baseline` (m, 4, 384)
-        uint8 counts; `depth_mm` (m, H, W) uint16, 0 where nothing lies within 2 m."""
+        """What the sensors give now, as the hardware would.
+
+        Returns:
+            `state` (m, J) float32 [rad, m]; `tactile` and `tactile_baseline` (m, 4, 384) uint8 counts;
+            `depth_mm` (m, H, W) uint16, 0 where nothing lies within 2 m.
+        """
         ids = self._checked(ids)
         seen = self._seen(ids)
         return {
@@ -216,7 +219,9 @@ class InsertionSim:
         return self._describe(np.arange(1)).names
 
     def metrics(self, ids: Array | None = None) -> dict[str, Array]:
-        """How the episodes went so far, (m,) each; `failure` indexes `FAILURES`, times are NaN without success."""
+        """How the episodes went so far, (m,) each; `failure` indexes `FAILURES`, times are NaN without
+        success.
+        """
         ids = self._checked(ids)
         state = self._episode
         steps = np.where(state.success[ids], state.success_step[ids], np.nan)
@@ -272,7 +277,9 @@ class InsertionSim:
                 self._depth.set_shapes(ids, fields["geom_size"], fields["geom_aabb"])
 
     def _settle(self, ids: Array, seeds: Array) -> None:
-        """Bring worlds to their starts and to rest, or back to where an earlier reset with this seed left them."""
+        """Bring worlds to their starts and to rest, or back to where an earlier reset with this seed left
+        them.
+        """
         missing = np.array([int(seed) not in self._settled for seed in seeds], bool)
         fresh = self._settle_physically(ids[missing], seeds[missing]) if missing.any() else {}
         for env, seed in zip(ids, seeds, strict=True):

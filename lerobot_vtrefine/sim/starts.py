@@ -59,12 +59,11 @@ def start_on_table(config: TableStart, pair: PartPair, embodiment: Embodiment, d
 def start_in_hand(config: GraspedStart, pair: PartPair, embodiment: Embodiment, draws: Array) -> Start:
     """Both parts in hand, the plug above the mouth. `draws`: (m, GRASPED_DRAWS), seven for each hand.
 
-    Each hand stands displaced and turned about the vertical from where it would hold its part ideally; the part stands
-    displaced along both axes of the pads and turned about their normal from where its hand expects it (slip).
+    Each hand stands displaced and turned about the vertical from where it would hold its part ideally; the
+    part stands displaced along both axes of the pads and turned about their normal from where its hand
+    expects it (slip).
     """
-    mouth = np.asarray(config.mouth_m)
-    plug_at = mouth + (0.0, 0.0, config.plug_height_m)
-    socket_at = mouth - (0.0, 0.0, pair.mouth_z_m)
+    plug_at, socket_at = _ideal_places(config, pair)
     left = _hand_and_part(config, pair.socket, socket_at, np.pi / 2, config.left_pitch_rad, draws[:, :7])
     right = _hand_and_part(config, pair.plug, plug_at, -np.pi / 2, config.right_pitch_rad, draws[:, 7:])
     position = np.stack([left[0], right[0]], 1)
@@ -79,7 +78,9 @@ def start_in_hand(config: GraspedStart, pair: PartPair, embodiment: Embodiment, 
 
 
 def solve_hands(embodiment: Embodiment, position: Array, rotation: Array, initial: Array) -> Array:
-    """Joint positions (m, J) that bring both TCPs to (m, 2, 3) and (m, 2, 3, 3), starting from `initial` (J,) nearby."""
+    """Joint positions (m, J) that bring both TCPs to (m, 2, 3) and (m, 2, 3, 3), starting from `initial` (J,)
+    nearby.
+    """
     start = torch.as_tensor(np.tile(initial, (len(position), 1)))
     return embodiment.solve_tcp(
         torch.as_tensor(position), torch.as_tensor(rotation), start, iterations=8
@@ -112,10 +113,16 @@ def _hand_and_part(
     return position, rotation, np.concatenate([origin, matrix_to_quat(part_rotation)], 1)
 
 
+def _ideal_places(config: GraspedStart, pair: PartPair) -> tuple[Array, Array]:
+    """Origins (3,) of plug and socket when the plug stands upright above the mouth."""
+    mouth, up = np.asarray(config.mouth_m), np.array([0.0, 0.0, 1.0])
+    socket_at = mouth - pair.mouth_z_m * up
+    return mouth + config.plug_height_m * up, socket_at
+
+
 def _nominal_joints(config: GraspedStart, pair: PartPair, embodiment: Embodiment) -> Array:
     """Joint positions of the ideal start, found from home: what the jittered ones are solved from."""
-    socket_at = np.asarray(config.mouth_m) - (0.0, 0.0, pair.mouth_z_m)
-    plug_at = np.asarray(config.mouth_m) + (0.0, 0.0, config.plug_height_m)
+    plug_at, socket_at = _ideal_places(config, pair)
     left = ideal_hand(pair.socket, np.pi / 2, config.left_pitch_rad)
     right = ideal_hand(pair.plug, -np.pi / 2, config.right_pitch_rad)
     position = torch.as_tensor(np.stack([socket_at + left[0], plug_at + right[0]]))

@@ -1,7 +1,7 @@
 """The task as pure functions on arrays: servo commands, insertion geometry, success, in-hand shift, forces.
 
-Shapes: m worlds. Poses are (position (m, 3) [m], rotation (m, 3, 3)) in the world frame. Hands are ordered left, right;
-the left hand holds the socket, the right one the plug.
+Shapes: m worlds. Poses are (position (m, 3) [m], rotation (m, 3, 3)) in the world frame. Hands are ordered
+left, right; the left hand holds the socket, the right one the plug.
 """
 
 from dataclasses import dataclass

@@ -33,7 +33,9 @@ class Backend(ABC):
 
     @abstractmethod
     def write(self, ids: Array, qpos: Array, qvel: Array) -> None:
-        """Restart worlds at time 0 from positions (m, nq) and velocities (m, nv); forgets all else of their state."""
+        """Restart worlds at time 0 from positions (m, nq) and velocities (m, nv); forgets all else of their
+        state.
+        """
 
     @abstractmethod
     def advance(self, ids: Array, controls: Array) -> Trace:
