@@ -1,0 +1,106 @@
+"""Presets, explicit saving, wrong values, and the shipped configuration files."""
+
+from pathlib import Path
+from typing import Any
+
+import draccus
+import pytest
+from lerobot.configs import FeatureType, PolicyFeature, PreTrainedConfig
+from lerobot.configs.train import TrainPipelineConfig
+
+from lerobot_vtrefine.datasets.features import DEPTH_KEY, STATE_KEY, TACTILE_KEYS, dataset_features
+from lerobot_vtrefine.observation import VisuoTactileConfig
+from lerobot_vtrefine.policies.vt_dp3 import VtDp3Config
+
+CONFIGS = sorted((Path(__file__).parents[2] / "configs" / "policy").glob("*.yaml"))
+
+
+def test_paper_preset_is_the_papers_network() -> None:
+    config = VtDp3Config(device="cpu")
+    assert config.point_dims == (64, 128, 256, 512)
+    assert config.down_dims == (512, 1024, 2048)
+    assert (config.horizon, config.n_obs_steps, config.n_action_steps) == (16, 2, 8)
+    assert (config.num_train_timesteps, config.kernel_size) == (100, 5)
+    assert config.observation.pool_rows == config.observation.pool_cols == 1
+
+
+def test_preset_fills_only_what_was_not_set() -> None:
+    view = VisuoTactileConfig(num_visual_points=99)
+    config = VtDp3Config(device="cpu", preset="small", optimizer_lr=5e-4, observation=view)
+    assert config.optimizer_lr == 5e-4
+    assert config.observation.num_visual_points == 99
+    assert config.observation.pool_cols == 4
+    assert config.denoiser == "mlp"
+
+
+def test_saved_configuration_is_explicit_and_survives(tmp_path: Path) -> None:
+    config = VtDp3Config(device="cpu", preset="small", down_dims=(64, 64), modalities="visual")
+    config.save_pretrained(tmp_path)
+    loaded = PreTrainedConfig.from_pretrained(tmp_path, cli_overrides=["--preset=paper"])
+    assert isinstance(loaded, VtDp3Config)
+    assert loaded.preset == "paper"
+    loaded.preset = "small"  # nothing else may have changed: every value was saved
+    assert loaded == config
+
+
+def test_chunks_start_at_the_current_observation() -> None:
+    config = VtDp3Config(device="cpu", preset="small")
+    assert config.observation_delta_indices == [-1, 0]
+    assert config.action_delta_indices == list(range(16))
+
+
+@pytest.mark.parametrize(
+    ("values", "message"),
+    [
+        ({"preset": "huge"}, "choose one of paper, small"),
+        ({"modalities": "sound"}, "choose one of visuo_tactile, visual, tactile"),
+        ({"denoiser": "rnn"}, "choose one of unet, mlp"),
+        ({"horizon": 15}, "divisible by 4"),
+        ({"n_action_steps": 17}, "within 1..16"),
+        ({"preset": "small", "down_dims": (64, 32)}, "one repeated width"),
+        ({"sampler": "euler"}, "choose one of"),
+        ({"ft_denoising_steps": 11}, "within 0..10"),
+    ],
+)
+def test_wrong_values_name_the_choices(values: dict[str, Any], message: str) -> None:
+    with pytest.raises(ValueError, match=message):
+        VtDp3Config(device="cpu", **values)
+
+
+def policy_features(*without: str) -> dict[str, PolicyFeature]:
+    """The dataset's input features, less some."""
+    return {
+        key: PolicyFeature(FeatureType.STATE, tuple(feature["shape"]))
+        for key, feature in dataset_features(24, 32).items()
+        if key.startswith("observation") and key not in without
+    }
+
+
+def test_data_without_the_needed_columns_is_refused_in_one_line() -> None:
+    action = {"action": PolicyFeature(FeatureType.ACTION, (16,))}
+    config = VtDp3Config(device="cpu", input_features=policy_features(), output_features=action)
+    config.validate_features()
+    config.input_features = policy_features(*TACTILE_KEYS)
+    with pytest.raises(ValueError, match="and 1 more; record with") as error:
+        config.validate_features()
+    assert "\n" not in str(error.value)
+    config.modalities = "visual"
+    config.validate_features()
+    config.input_features = {STATE_KEY: policy_features()[STATE_KEY]}
+    with pytest.raises(ValueError, match=DEPTH_KEY):
+        config.validate_features()
+    config.input_features, config.output_features = policy_features(), {}
+    with pytest.raises(ValueError, match="vector feature 'action'"):
+        config.validate_features()
+
+
+@pytest.mark.parametrize("path", CONFIGS, ids=lambda path: path.stem)
+def test_shipped_files_parse(path: Path) -> None:
+    config = draccus.parse(TrainPipelineConfig, path, args=["--dataset.repo_id=local/tiny"])
+    assert isinstance(config.policy, VtDp3Config)
+    assert config.policy.preset == ("small" if "small" in path.stem else "paper")
+    assert config.policy.modalities == ("visual" if "visual" in path.stem else "visuo_tactile")
+
+
+def test_there_are_shipped_files() -> None:
+    assert [path.stem for path in CONFIGS] == ["vt_dp3_paper", "vt_dp3_small", "vt_dp3_visual"]

@@ -1,0 +1,180 @@
+"""The policy: training step, moving average, acting, fine-tuned checkpoints."""
+
+import json
+from copy import deepcopy
+from pathlib import Path
+from typing import Any
+
+import pytest
+import torch
+from lerobot.configs import FeatureType, PolicyFeature
+
+from lerobot_vtrefine.datasets.features import ACTION_KEY, CLOUD_KEY, STATE_KEY, dataset_features
+from lerobot_vtrefine.policies.vt_dp3 import VtDp3Config
+from lerobot_vtrefine.policies.vt_dp3.modeling_vt_dp3 import VtDp3Policy
+
+Batch = dict[str, torch.Tensor]
+
+
+def make_policy(**values: Any) -> VtDp3Policy:
+    """A tiny policy with a fixed seed."""
+    torch.manual_seed(0)
+    features = {
+        key: PolicyFeature(FeatureType.STATE, tuple(feature["shape"]))
+        for key, feature in dataset_features(24, 32).items()
+        if key.startswith("observation")
+    }
+    tiny: dict[str, Any] = {"preset": "small", "point_dims": (8, 16), "down_dims": (32, 32), **values}
+    action = {ACTION_KEY: PolicyFeature(FeatureType.ACTION, (16,))}
+    config = VtDp3Config(device="cpu", input_features=features, output_features=action, **tiny)
+    return VtDp3Policy(config).eval()
+
+
+def make_batch(size: int = 3, seed: int = 0) -> Batch:
+    """A processed training batch."""
+    generator = torch.Generator().manual_seed(seed)
+    return {
+        CLOUD_KEY: torch.randn(size, 2, 20, 5, generator=generator),
+        STATE_KEY: torch.rand(size, 2, 16, generator=generator) * 2 - 1,
+        ACTION_KEY: torch.rand(size, 16, 16, generator=generator) * 2 - 1,
+    }
+
+
+def frame(batch: Batch, step: int) -> Batch:
+    """One frame of a batch, as evaluation hands it over."""
+    return {key: batch[key][:, step] for key in (CLOUD_KEY, STATE_KEY)}
+
+
+def train(policy: VtDp3Policy, steps: int, learning_rate: float = 3e-3) -> list[float]:
+    """Steps of behaviour cloning on one batch, the way LeRobot's trainer does them."""
+    policy.train()
+    optimizer = torch.optim.AdamW(policy.get_optim_params(), lr=learning_rate)
+    losses = []
+    for _ in range(steps):
+        loss, _ = policy(make_batch())
+        loss.backward()
+        optimizer.step()
+        optimizer.zero_grad()
+        policy.update()
+        losses.append(loss.item())
+    policy.eval()
+    return losses
+
+
+def test_training_learns_and_the_average_that_acts_follows() -> None:
+    policy = make_policy()
+    before = deepcopy(policy.model.state_dict())
+    losses = train(policy, 400)
+    assert sum(losses[-20:]) < 0.5 * sum(losses[:20])
+    batch = make_batch()
+    noise = torch.randn(3, 16, 16)
+    chunk = policy.sample_actions(batch, noise)
+    error = (chunk - batch[ACTION_KEY]).square().mean()
+    policy.model.load_state_dict(before)
+    untrained = (policy.sample_actions(batch, noise) - batch[ACTION_KEY]).square().mean()
+    assert error < 0.3 * untrained
+
+
+def test_only_the_trained_network_gets_gradients() -> None:
+    policy = make_policy().train()
+    loss, _ = policy(make_batch())
+    loss.backward()
+    assert all(parameter.grad is None for parameter in policy.model.parameters())
+    assert policy.online is not None
+    assert all(parameter.grad is not None for parameter in policy.online.parameters())
+
+
+def test_loss_per_sample_averages_to_the_loss() -> None:
+    policy = make_policy(noise_draws=3).train()
+    torch.manual_seed(5)
+    mean, _ = policy(make_batch())
+    torch.manual_seed(5)
+    each, _ = policy(make_batch(), reduction="none")
+    assert each.shape == (3,)
+    assert torch.allclose(each.mean(), mean)
+
+
+def test_select_action_samples_once_per_chunk_from_the_last_two_frames() -> None:
+    policy, batch = make_policy(), make_batch()
+    noise = torch.randn(3, 16, 16)
+    policy.reset()
+    actions = [policy.select_action(frame(batch, 0), noise=noise)]
+    first = {key: value[:, [0, 0]] for key, value in batch.items() if key != ACTION_KEY}
+    actions += [policy.select_action(frame(batch, 1), noise=noise) for _ in range(7)]
+    assert torch.allclose(torch.stack(actions, 1), policy.sample_actions(first, noise)[:, :8], atol=1e-6)
+    policy.select_action(frame(batch, 1))
+    policy.reset()
+    policy.select_action(frame(batch, 0), noise=noise)
+    for _ in range(6):
+        policy.select_action(frame(make_batch(seed=9), 0))
+    policy.select_action(frame(batch, 0))
+    action = policy.select_action(frame(batch, 1), noise=noise)
+    assert torch.allclose(action, policy.sample_actions(batch, noise)[:, 0], atol=1e-6)
+
+
+def test_predict_action_chunk_takes_windows_and_frames() -> None:
+    policy, batch = make_policy(), make_batch()
+    noise = torch.randn(3, 16, 16)
+    from_window = policy.predict_action_chunk(batch, noise=noise)
+    assert from_window.shape == (3, 8, 16)
+    policy.predict_action_chunk(frame(batch, 0))
+    assert torch.allclose(policy.predict_action_chunk(frame(batch, 1), noise=noise), from_window, atol=1e-6)
+
+
+def test_checkpoint_keeps_actions_average_and_its_age(tmp_path: Path) -> None:
+    policy = make_policy()
+    train(policy, 5)
+    policy.save_pretrained(tmp_path)
+    loaded = VtDp3Policy.from_pretrained(tmp_path, strict=True)
+    for key, value in policy.state_dict().items():
+        assert torch.equal(value, loaded.state_dict()[key]), key
+    assert loaded.ema is not None
+    assert int(loaded.ema.step) == 5
+    noise = torch.randn(3, 16, 16)
+    assert torch.equal(policy.sample_actions(make_batch(), noise), loaded.sample_actions(make_batch(), noise))
+
+
+@pytest.mark.parametrize("freeze_encoder", [False, True])
+def test_fine_tuning_tunes_the_last_steps_and_keeps_the_base(tmp_path: Path, freeze_encoder: bool) -> None:
+    policy = make_policy()
+    train(policy, 5)
+    noise, batch = torch.randn(3, 16, 16), make_batch()
+    policy.prepare_finetuning("tail", 4, 3, 4, freeze_encoder=freeze_encoder)
+    assert policy.online is None
+    assert policy.base is not None
+    assert len(policy.process.timesteps) == 7
+    before = policy.sample_actions(batch, noise)
+    trained = [parameter for parameter in policy.model.parameters() if parameter.requires_grad]
+    assert len(trained) == len(list((policy.model.denoiser if freeze_encoder else policy.model).parameters()))
+    with torch.no_grad():
+        for parameter in trained:
+            parameter += 0.05
+    after = policy.sample_actions(batch, noise)
+    assert not torch.allclose(before, after)
+    policy.save_pretrained(tmp_path)
+    loaded = VtDp3Policy.from_pretrained(tmp_path)
+    assert torch.equal(after, loaded.sample_actions(batch, noise))
+    assert loaded.base is not None
+    assert (loaded.base.encoder is loaded.model.encoder) is freeze_encoder
+    assert not any(parameter.requires_grad for parameter in loaded.base.denoiser.parameters())
+    with pytest.raises(ValueError, match="fine-tuned already"):
+        loaded.prepare_finetuning("tail", 4, 3, 4)
+    with pytest.raises(ValueError, match="use the pre-trained checkpoint"):
+        loaded(batch)
+
+
+def test_paper_preset_trains_and_acts() -> None:
+    policy = make_policy(preset="paper", point_dims=(8, 16), down_dims=(16, 32, 64))
+    loss, _ = policy.train()(make_batch())
+    loss.backward()
+    assert torch.isfinite(loss)
+    assert policy.predict_action_chunk(make_batch()).shape == (3, 8, 16)
+
+
+def test_other_checkpoints_are_refused_in_one_line(tmp_path: Path) -> None:
+    (tmp_path / "config.json").write_text(json.dumps({"type": "act", "device": "cpu"}))
+    with pytest.raises(ValueError, match="type 'act', expected 'vt_dp3'"):
+        VtDp3Policy.from_pretrained(tmp_path)
+    (tmp_path / "empty").mkdir()
+    with pytest.raises(FileNotFoundError, match="pretrained_model folder"):
+        VtDp3Policy.from_pretrained(tmp_path / "empty")

@@ -1,0 +1,88 @@
+"""Point encoder and denoisers: exact gradients, invariances, shapes."""
+
+import pytest
+import torch
+from torch import nn
+
+from lerobot_vtrefine.policies.vt_dp3.denoisers import MLPDenoiser, UNetDenoiser
+from lerobot_vtrefine.policies.vt_dp3.ema import Ema
+from lerobot_vtrefine.policies.vt_dp3.point_encoder import ObservationEncoder, PointEncoder
+
+
+def encoder() -> PointEncoder:
+    """A small encoder with a fixed seed."""
+    torch.manual_seed(0)
+    return PointEncoder((8, 16, 24), 6, center_m=(0.1, 0.0, 0.2), scale_m=0.1)
+
+
+def test_gradients_through_the_winners_are_those_of_the_plain_network() -> None:
+    points, cloud = encoder(), torch.randn(4, 50, 5)
+    target = torch.randn(4, 6)
+    fast = (points(cloud) - target).square().sum()
+    fast_gradients = torch.autograd.grad(fast, list(points.parameters()))
+    scaled = (cloud - points.offset) * points.inverse_scale
+    plain = (points.project(points.last(points.hidden(scaled)).amax(dim=1)) - target).square().sum()
+    plain_gradients = torch.autograd.grad(plain, list(points.parameters()))
+    assert torch.allclose(fast, plain, rtol=1e-5)
+    for one, other in zip(fast_gradients, plain_gradients, strict=True):
+        assert torch.allclose(one, other, rtol=1e-4, atol=1e-5)
+    with torch.no_grad():
+        assert torch.allclose(points(cloud), points.project(points.last(points.hidden(scaled)).amax(1)))
+
+
+def test_encoder_ignores_the_order_and_repetition_of_points() -> None:
+    points, cloud = encoder().eval(), torch.randn(2, 30, 5)
+    with torch.no_grad():
+        feature = points(cloud)
+        assert torch.allclose(feature, points(cloud[:, torch.randperm(30)]), atol=1e-6)
+        assert torch.allclose(feature, points(torch.cat([cloud, cloud[:, :7]], dim=1)), atol=1e-6)
+
+
+def test_one_metric_scale_for_all_axes() -> None:
+    points = encoder()
+    assert points.inverse_scale.tolist() == pytest.approx([10, 10, 10, 1, 1])
+    assert points.offset.tolist() == pytest.approx([0.1, 0.0, 0.2, 0, 0])
+
+
+def test_condition_keeps_frames_apart() -> None:
+    encode = ObservationEncoder(encoder(), 6, state_dim=3, n_obs_steps=2)
+    cloud, state = torch.randn(2, 2, 20, 5), torch.randn(2, 2, 3)
+    cond = encode(cloud, state)
+    assert cond.shape == (2, encode.cond_dim) == (2, 2 * (6 + 64))
+    swapped = encode(cloud.flip(1), state.flip(1))
+    assert torch.allclose(cond.view(2, 2, -1).flip(1), swapped.view(2, 2, -1), atol=1e-6)
+
+
+@pytest.mark.parametrize(
+    "denoiser",
+    [UNetDenoiser(5, 12, (16, 32, 64), 5, 16), MLPDenoiser(5, 16, 12, 32, 2, 16)],
+    ids=["unet", "mlp"],
+)
+def test_denoisers_depend_on_all_inputs(denoiser: nn.Module) -> None:
+    x, t, cond = torch.randn(3, 16, 5), torch.tensor([0, 50, 99]), torch.randn(3, 12)
+    with torch.no_grad():
+        eps = denoiser(x, t, cond)
+        assert eps.shape == x.shape
+        for other in (denoiser(x + 1, t, cond), denoiser(x, t + 1, cond), denoiser(x, t, cond + 1)):
+            assert (other - eps).abs().flatten(1).amax(1).min() > 1e-4
+        assert torch.allclose(denoiser(x[1:2], t[1:2], cond[1:2]), eps[1:2], atol=1e-5)
+
+
+def test_unet_of_the_paper_has_the_size_that_was_counted() -> None:
+    with torch.device("meta"):
+        unet = UNetDenoiser(14, 256, (512, 1024, 2048), 5, 128)
+    millions = sum(parameter.numel() for parameter in unet.parameters()) / 1e6
+    assert millions == pytest.approx(255.1, abs=0.5)  # DPPO's code with a single-Linear FiLM
+
+
+def test_average_follows_the_power_schedule() -> None:
+    average, trained = nn.Linear(1, 1, bias=False), nn.Linear(1, 1, bias=False)
+    ema = Ema(power=0.75, max_decay=0.9)
+    expected = 0.0
+    for step in range(40):
+        trained.weight.data.fill_(float(step))
+        decay = min(0.9, 1 - (1 + step) ** -0.75)
+        expected = decay * expected + (1 - decay) * step
+        ema.update(average, trained)
+        assert average.weight.item() == pytest.approx(expected, rel=1e-5)
+    assert ema.decay == 0.9
