@@ -17,6 +17,7 @@ PARTS = {
     "tactile": "lerobot_vtrefine.tactile.benchmark",
     "envs": "lerobot_vtrefine.envs.benchmark",
     "finetune": "lerobot_vtrefine.finetune.benchmark",
+    "drivers": "lerobot_vtrefine.drivers.benchmark",
 }
 
 
@@ -25,7 +26,7 @@ class BenchConfig:
     """What to measure and where to write it."""
 
     parts: tuple[str, ...] = tuple(PARTS)
-    """Parts to measure, of tactile, envs, finetune."""
+    """Parts to measure, of tactile, envs, finetune, drivers."""
     json: Path | None = None
     """File for the rows as JSON, beside the table."""
 

@@ -32,7 +32,7 @@ def test_rows_are_printed_and_written(
 def test_unknown_part(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
     monkeypatch.setattr(sys, "argv", ["vtrefine-bench", "--parts=[physics]"])
     assert bench.main() == 2
-    assert "unknown physics; choose from tactile, envs, finetune" in capsys.readouterr().err
+    assert "unknown physics; choose from tactile, envs, finetune, drivers" in capsys.readouterr().err
 
 
 def test_absent_module_is_none(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -22,6 +22,8 @@ MEASUREMENTS = (
     ("time_to_success_s", "time to success", "s", 1.0),
 )
 VIDEOS_PER_POLICY = 3
+# Columns of the fine-tuning log, with the style of their line.
+CURVES = (("success", "rollouts", "a"), ("eval_success", "evaluations on the way", "b"))
 
 
 def render_page(results: dict[str, Any], dataset_root: Path, curve_csv: Path) -> str:
@@ -79,23 +81,29 @@ def read_curve(path: Path) -> list[dict[str, float]]:
 
 
 def curve_chart(rows: list[dict[str, float]]) -> str:
-    """Success of DPPO's rollouts over its iterations."""
-    points = [(row["iteration"], row["success"]) for row in rows if "success" in row]
-    return line_chart([Series("training rollouts", points, "b")], "DPPO iteration", "success in training")
+    """Success of DPPO's rollouts, and of its evaluations on the way, over its iterations."""
+    lines = [
+        Series(label, [(row["iteration"], row[column]) for row in rows if column in row], style)
+        for column, label, style in CURVES
+    ]
+    return line_chart(lines, "DPPO iteration", "success while fine-tuning")
 
 
 def measurement_rows(results: dict[str, Any]) -> list[dict[str, Any]]:
-    """Table rows: a measurement's median and 90th percentile among each policy's successes."""
+    """Median and 90th percentile of each measurement, in each policy's successes and in all episodes."""
     rows = []
     for key, title, unit, scale in MEASUREMENTS:
         cells = []
         for policy in NAMES:
-            value = results[policy]["metrics"]["successes"][key]
-            cells.append(
-                "none" if value is None else f"{scale * value['median']:.1f} ({scale * value['p90']:.1f})"
-            )
+            metrics = results[policy]["metrics"]
+            cells += [cell(metrics[group].get(key), scale) for group in ("successes", "all")]
         rows.append({"title": f"{title} [{unit}]", "cells": cells})
     return rows
+
+
+def cell(value: dict[str, float] | None, scale: float) -> str:
+    """For example ``2.5 (4.1)``; a dash where nothing was measured."""
+    return "–" if value is None else f"{scale * value['median']:.1f} ({scale * value['p90']:.1f})"
 
 
 def choose_videos(results: dict[str, Any], policy: str) -> list[dict[str, Any]]:
