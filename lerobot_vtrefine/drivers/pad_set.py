@@ -1,0 +1,101 @@
+"""The pads of one robot: connected together, read together, watched together."""
+
+import logging
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from lerobot_vtrefine.drivers.board import PadReader, Status
+from lerobot_vtrefine.drivers.config import PadConfig
+from lerobot_vtrefine.drivers.pads_file import check_distinct_ports
+from lerobot_vtrefine.drivers.ports import PortError
+
+logger = logging.getLogger(__name__)
+
+CONNECT_TIMEOUT_S = 8.0
+"""Boards restart for about 2 s when their port is opened."""
+
+NEVER_S = 1e6
+"""Age reported for a pad that has never sent a frame; finite, so that datasets keep finite statistics [s]."""
+
+
+@dataclass(frozen=True)
+class PadReading:
+    """One pad at one moment.
+
+    Attributes:
+        counts: Latest frame, uint8 (pad rows, cols); the last one before a stall as long as nothing newer
+            comes.
+        age_s: Time since its last byte was read [s].
+        stale: Older than the pad's `stale_after_s`.
+    """
+
+    counts: NDArray[np.uint8]
+    age_s: float
+    stale: bool
+
+
+class PadSet:
+    """Readers of all pads of one robot, by name."""
+
+    def __init__(self, pads: dict[str, PadConfig]) -> None:
+        if not pads:
+            raise ValueError("no pads configured; vtrefine-find-pads writes a pads file")
+        check_distinct_ports(pads, "pads")
+        self.configs = pads
+        self.baselines: dict[str, NDArray[np.uint8]] = {}
+        self._readers = {name: PadReader(config, name) for name, config in pads.items()}
+        self._stale: set[str] = set()
+        self._connected = False
+
+    @property
+    def is_connected(self) -> bool:
+        """Whether `connect` succeeded; it stays so when a pad is unplugged, whose frames are then stale."""
+        return self._connected
+
+    def connect(self) -> None:
+        """Starts all boards at once and takes the pads' idle counts; no pad may be touched meanwhile.
+
+        Raises:
+            PortError: a pad cannot be read; every pad is released again.
+        """
+        try:
+            for reader in self._readers.values():
+                reader.start()
+            for reader in self._readers.values():
+                reader.connect(CONNECT_TIMEOUT_S)
+            self.measure_baselines()
+        except PortError:
+            self.disconnect()
+            raise
+        self._connected = True
+
+    def measure_baselines(self) -> None:
+        """Takes the idle counts anew: the median of 30 frames; no pad may be touched."""
+        self.baselines = {name: reader.idle_counts() for name, reader in self._readers.items()}
+
+    def disconnect(self) -> None:
+        """Stops all boards."""
+        for reader in self._readers.values():
+            reader.stop()
+        self._connected = False
+
+    def read(self) -> dict[str, PadReading]:
+        """Latest frame of every pad, at once; tells the operator when a pad stalls or comes back."""
+        return {name: self._read_one(name, reader) for name, reader in self._readers.items()}
+
+    def _read_one(self, name: str, reader: PadReader) -> PadReading:
+        health = reader.health()
+        stale = health.status is not Status.STREAMING
+        if stale and name not in self._stale:
+            logger.error(
+                "pad %s is %s, its frames are marked stale: %s", name, health.status.value, health.advice
+            )
+            self._stale.add(name)
+        elif not stale and name in self._stale:
+            logger.warning("pad %s is back", name)
+            self._stale.discard(name)
+        frame = reader.latest()
+        counts = np.zeros(self.configs[name].pad_shape, np.uint8) if frame is None else frame.counts
+        return PadReading(counts, min(health.age_s, NEVER_S), stale)
