@@ -1,0 +1,141 @@
+"""Video frames: both ways to draw the scene, pads beside it, and no trace left in the episode."""
+
+import sys
+
+import numpy as np
+import pytest
+
+from lerobot_vtrefine.sim import headless, render
+from lerobot_vtrefine.sim.config import SceneConfig
+from lerobot_vtrefine.sim.pad_panel import pad_panel, panel_size
+from lerobot_vtrefine.sim.render import VideoRenderer, shaded_depth
+from lerobot_vtrefine.sim.simulation import InsertionSim
+
+
+@pytest.fixture(scope="module")
+def sim() -> InsertionSim:
+    sim = InsertionSim(SceneConfig(start="grasped"), num_envs=2, num_threads=1)
+    sim.reset(np.arange(2), np.arange(2))
+    return sim
+
+
+def test_ray_frame_shows_scene_and_pads(sim: InsertionSim) -> None:
+    frame = VideoRenderer(sim, 1, backend="rays").frame()
+    assert frame.dtype == np.uint8
+    assert frame.shape[0] % 2 == 0
+    assert frame.shape[1] % 2 == 0
+    scene, panel = frame[:, :480], frame[:, 480:]
+    assert scene.std() > 10
+    assert panel.std() > 10
+
+
+def test_gl_frame_shows_the_scene(sim: InsertionSim) -> None:
+    try:
+        renderer = VideoRenderer(sim, 0, backend="gl")
+    except RuntimeError as error:
+        assert "MUJOCO_GL=egl" in str(error)  # noqa: PT017
+        pytest.skip(f"no OpenGL on this machine: {error}")
+    frame = renderer.frame()
+    assert frame.shape == VideoRenderer(sim, 0, backend="rays").frame().shape
+    assert frame[:, :480].std() > 20
+    assert np.abs(frame[:, :480].astype(int) - np.roll(frame[:, :480], 40, axis=1)).mean() > 1
+    renderer.close()
+
+
+def test_looking_changes_nothing() -> None:
+    readings = []
+    for look in (False, True):
+        sim = InsertionSim(SceneConfig(start="grasped"), num_envs=1, num_threads=1)
+        sim.reset(np.arange(1), np.arange(1))
+        renderer = VideoRenderer(sim, 0, backend="rays")
+        for _ in range(3):
+            sim.step(sim.command_targets(), np.arange(1))
+            if look:
+                renderer.frame()
+        readings.append(sim.observe())
+    for key, value in readings[0].items():
+        np.testing.assert_array_equal(value, readings[1][key], err_msg=key)
+
+
+def test_without_opengl_the_error_names_the_fix(sim: InsertionSim, monkeypatch: pytest.MonkeyPatch) -> None:
+    import mujoco
+
+    def broken(*_: object) -> None:
+        raise AttributeError("'NoneType' object has no attribute 'eglQueryString'")
+
+    monkeypatch.setattr(mujoco, "Renderer", broken)
+    with pytest.raises(RuntimeError, match=r"no OpenGL .*install EGL .*MUJOCO_GL=egl") as error:
+        VideoRenderer(sim, 0, backend="gl")
+    assert "\n" not in str(error.value)
+
+
+def test_without_opengl_videos_still_come(
+    sim: InsertionSim, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    monkeypatch.setattr(render, "_GlScene", _raise)
+    frame = VideoRenderer(sim, 0).frame()
+    assert "drawing the depth image instead" in caplog.text
+    np.testing.assert_array_equal(frame, VideoRenderer(sim, 0, backend="rays").frame())
+
+
+def _raise(*_: object) -> None:
+    raise RuntimeError("no display")
+
+
+def test_unknown_backend_lists_the_choices(sim: InsertionSim) -> None:
+    with pytest.raises(ValueError, match="auto, gl or rays"):
+        VideoRenderer(sim, 0, backend="vulkan")  # ty: ignore[invalid-argument-type]
+
+
+def test_panel_brightens_where_a_pad_is_pressed() -> None:
+    idle = np.full((4, 384), 20, np.uint8)
+    pressed = idle.copy()
+    pressed[2, :32] = 180  # row 0 of the third pad
+    before, after = (pad_panel(counts, idle, 12, 32, "step 3", success=False) for counts in (idle, pressed))
+    rows, cols = np.nonzero(np.abs(after.astype(int) - before).sum(-1) > 60)
+    height, width = panel_size(12, 32)
+    assert before.shape == (height, width, 3)
+    # Inside the third quarter: its label and the band of its first row.
+    assert height * 0.5 < rows.min() < rows.max() < height * 0.7
+    assert np.ptp(cols) > 0.8 * width
+
+
+def test_panel_tells_success() -> None:
+    idle = np.zeros((4, 384), np.uint8)
+    no, yes = (pad_panel(idle, idle, 12, 32, "step 3", success) for success in (False, True))
+    assert (no != yes).any()
+
+
+def test_shading_tells_surfaces_apart_and_leaves_holes_dark() -> None:
+    depth = np.full((40, 60), 500, np.uint16)
+    depth[10:20, 20:30] = 400
+    depth[:3] = 0
+    image = shaded_depth(depth, np.array([80.0, 80.0, 30.0, 20.0]))
+    assert image.shape == (40, 60, 3)
+    np.testing.assert_array_equal(image[0], np.broadcast_to((24, 26, 32), (60, 3)))
+    assert int(image[15, 25, 0]) > int(image[30, 25, 0]) + 10
+
+
+@pytest.mark.parametrize(
+    ("environment", "has_egl", "expected"),
+    [
+        ({}, True, "egl"),
+        ({}, False, None),
+        ({"DISPLAY": ":0"}, True, None),
+        ({"MUJOCO_GL": "osmesa"}, True, "osmesa"),
+    ],
+)
+def test_headless_choice(
+    monkeypatch: pytest.MonkeyPatch, environment: dict[str, str], has_egl: bool, expected: str | None
+) -> None:
+    for name in ("MUJOCO_GL", "DISPLAY", "WAYLAND_DISPLAY"):
+        monkeypatch.delenv(name, raising=False)
+    for name, value in environment.items():
+        monkeypatch.setenv(name, value)
+    monkeypatch.setattr(sys, "platform", "linux")
+    monkeypatch.setattr(headless, "_has_egl", lambda: has_egl)
+    headless.prefer_headless_gl()
+    import os
+
+    assert os.environ.get("MUJOCO_GL") == expected
+    monkeypatch.delenv("MUJOCO_GL", raising=False)
