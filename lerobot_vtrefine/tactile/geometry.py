@@ -49,6 +49,11 @@ class Box:
         """Half-lengths of the bounding box in the primitive's frame (3,) [m]."""
         return np.asarray(self.half_size, dtype=float)
 
+    def planes(self) -> np.ndarray:
+        """Its six faces as planes (6, 4): outward normal and offset, in the primitive's frame."""
+        normals = np.concatenate([np.eye(3), -np.eye(3)])
+        return np.column_stack([normals, np.tile(self.extent(), 2)])
+
 
 @dataclass(frozen=True)
 class Cylinder:
@@ -195,63 +200,3 @@ class BodyGeometry:
     def __post_init__(self) -> None:
         if not self.primitives:
             raise ValueError("BodyGeometry needs at least one primitive")
-
-
-@dataclass(frozen=True, eq=False)
-class PackedBodies:
-    """Bodies as flat arrays for the kernels; primitive k of body b has body_start[b] <= k < body_start[b + 1]."""
-
-    body_start: np.ndarray
-    """(B + 1,) int32."""
-    kind: np.ndarray
-    """(K,) int32, the primitives' `kind`."""
-    position: np.ndarray
-    """(K, 3) origin in the body frame: the centre of the primitive's bounding box [m]."""
-    rotation: np.ndarray
-    """(K, 3, 3) primitive frame to body frame."""
-    extent: np.ndarray
-    """(K, 3) half-lengths of the bounding box in the primitive frame [m]."""
-    plane_start: np.ndarray
-    """(K + 1,) int32 into `planes`."""
-    planes: np.ndarray
-    """(Q, 4) normal and offset, in the primitive frame."""
-    meshes: dict[int, TriangleMesh]
-    """Primitive index -> mesh."""
-
-
-def _pack_one(primitive: Primitive) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-    if isinstance(primitive, ConvexHull | TriangleMesh):
-        low, high = primitive.vertices.min(axis=0), primitive.vertices.max(axis=0)
-        centre = (low + high) / 2
-        planes = np.zeros((0, 4))
-        if isinstance(primitive, ConvexHull):
-            planes = primitive.planes()
-            planes[:, 3] -= planes[:, :3] @ centre
-        return centre, np.eye(3), (high - low) / 2, planes
-    return (
-        np.asarray(primitive.pos, dtype=float),
-        quaternion_matrix(primitive.quat),
-        primitive.extent(),
-        np.zeros((0, 4)),
-    )
-
-
-def pack_bodies(bodies: list[BodyGeometry]) -> PackedBodies:
-    """Flatten bodies into arrays (float32 geometry)."""
-    if not bodies:
-        raise ValueError("at least one body is needed")
-    primitives = [primitive for body in bodies for primitive in body.primitives]
-    packed = [_pack_one(primitive) for primitive in primitives]
-    planes = np.concatenate([np.zeros((0, 4)), *[item[3] for item in packed]])
-    return PackedBodies(
-        body_start=np.cumsum([0] + [len(body.primitives) for body in bodies]).astype(np.int32),
-        kind=np.array([primitive.kind for primitive in primitives], dtype=np.int32),
-        position=np.array([item[0] for item in packed], dtype=np.float32),
-        rotation=np.array([item[1] for item in packed], dtype=np.float32),
-        extent=np.array([item[2] for item in packed], dtype=np.float32),
-        plane_start=np.cumsum([0] + [len(item[3]) for item in packed]).astype(np.int32),
-        planes=planes.astype(np.float32),
-        meshes={
-            k: primitive for k, primitive in enumerate(primitives) if isinstance(primitive, TriangleMesh)
-        },
-    )

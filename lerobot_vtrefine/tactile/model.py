@@ -8,7 +8,7 @@ from typing import Any
 
 import lerobot_vtrefine.tactile.stages  # noqa: F401  registers every stage
 from lerobot_vtrefine.tactile.stages.base import DOMAINS, STAGES, Stage, stage_class
-from lerobot_vtrefine.tactile.stages.contact import ContactStage, KelvinVoigt
+from lerobot_vtrefine.tactile.stages.contact import Consistent, ContactStage, KelvinVoigt
 from lerobot_vtrefine.tactile.stages.readout import Gain, Idle, Noise, Quantisation, RowSharing
 
 SCHEMA = "vtrefine/sensor-model@1"
@@ -44,11 +44,11 @@ class SensorModel:
 
     @classmethod
     def default(cls) -> "SensorModel":
-        """The simulator's model: contact, gain, the row's divider, idle level, noise, 8-bit converter.
+        """The simulator's model: load-consistent contact, gain, the row's divider, idle level, noise, 8-bit converter.
 
-        20 N spread over 100 taxels reads about 85 counts above an idle level of 10 to 40.
+        20 N spread over 100 taxels reads about 75 counts above an idle level of 10 to 40.
         """
-        return cls((KelvinVoigt(), Gain(), RowSharing(), Idle(), Noise(), Quantisation()))
+        return cls((Consistent(), Gain(), RowSharing(), Idle(), Noise(), Quantisation()))
 
     @classmethod
     def paper(cls) -> "SensorModel":

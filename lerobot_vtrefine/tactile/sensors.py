@@ -15,7 +15,7 @@ from lerobot_vtrefine.tactile.stages.contact import ContactStage
 from lerobot_vtrefine.tactile.stages.readout import Gain
 
 if TYPE_CHECKING:
-    from lerobot_vtrefine.tactile.contact_query import ContactQuery
+    from lerobot_vtrefine.tactile.engine import ContactEngine
 
 ArrayLike = np.ndarray | torch.Tensor
 
@@ -59,7 +59,7 @@ class PadSensors:
         self._gain_scale = torch.ones(num_envs, device=self.device)
         self._parameters: dict[tuple[str, str], torch.Tensor] = {}
         self._state: dict[str, State] = {}
-        self._query: ContactQuery | None = None
+        self._engines: dict[bool, ContactEngine] = {}
         self.baseline = np.zeros((num_envs, num_pads, layout.num_taxels), dtype=np.uint8)
         """Counts of the untouched taxels (num_envs, P, N)."""
         self.reset(np.arange(num_envs), seed)
@@ -100,8 +100,15 @@ class PadSensors:
 
     def get_state(self, env: int) -> dict[str, Any]:
         """Everything that one environment's next readings depend on, apart from its poses; a deep copy."""
-        stages = {name: {key: value[env].clone() for key, value in state.items()} for name, state in self._state.items()}
-        scalars = {"time_s": self._time_s, "stiffness_scale": self._stiffness_scale, "gain_scale": self._gain_scale}
+        stages = {
+            name: {key: value[env].clone() for key, value in state.items()}
+            for name, state in self._state.items()
+        }
+        scalars = {
+            "time_s": self._time_s,
+            "stiffness_scale": self._stiffness_scale,
+            "gain_scale": self._gain_scale,
+        }
         return {
             "stages": stages,
             "parameters": {key: float(values[env]) for key, values in self._parameters.items()},
@@ -171,21 +178,23 @@ class PadSensors:
             if name == stage.name
         }
         if isinstance(stage, Gain):
-            own["counts_per_n"] = own.get("counts_per_n", stage.counts_per_n) * _per_env(self._gain_scale[index])
+            own["counts_per_n"] = own.get("counts_per_n", stage.counts_per_n) * _per_env(
+                self._gain_scale[index]
+            )
         return dataclasses.replace(stage, **own) if own else stage
 
     def _contact_stage(self, index: torch.Tensor) -> ContactStage:
         stage = self._specialised(self.model.contact, index)
         return stage.scaled(_per_env(self._stiffness_scale[index]))
 
-    def _frame(self, index: torch.Tensor, dt_s: float) -> Frame:
+    def _frame(self, index: torch.Tensor, dt_s: float, load: ArrayLike | None = None) -> Frame:
         contact = self.model.contact
         return Frame(
             layout=self.layout,
             dt_s=dt_s,
             time_s=_per_env(self._time_s[index]),
             stiffness_n_per_m=self._contact_stage(index).stiffness(self.layout),
-            load_conserving=contact.load_conserving,
+            load_conserving=contact.load_conserving and load is not None,
         )
 
     def _run(
@@ -219,17 +228,19 @@ class PadSensors:
     def _tensor(self, array: ArrayLike) -> torch.Tensor:
         return torch.as_tensor(array, device=self.device).to(torch.float32)
 
-    def _contact_forces(self, index: torch.Tensor, poses: Sequence[ArrayLike], frame: Frame) -> torch.Tensor:
+    def _contact_forces(
+        self, index: torch.Tensor, poses: Sequence[ArrayLike], load: ArrayLike | None, frame: Frame
+    ) -> torch.Tensor:
         contact = self._contact_stage(index)
-        if self._query is None:
-            from lerobot_vtrefine.tactile.contact_query import ContactQuery  # warp is slow to import
+        solved = contact.load_conserving and load is not None
+        if solved not in self._engines:
+            from lerobot_vtrefine.tactile.engine import ContactEngine  # warp is slow to import
 
-            self._query = ContactQuery(self.layout, self.bodies, str(self.device))
-        # A face that is moved needs the gap where it does not touch yet, which only the column query gives.
-        mode = "column" if self.model.depth_stages else contact.query
-        depth, rate = self._query(mode, *(self._tensor(pose) for pose in poses))
-        depth = self._run(self.model.depth_stages, depth, index, frame)
-        return contact.force(depth, rate, self.layout)
+            self._engines[solved] = ContactEngine(
+                self.layout, self.bodies, self.model, solved, str(self.device)
+            )
+        loads = None if load is None else self._tensor(load)
+        return self._engines[solved](contact, [self._tensor(pose) for pose in poses], loads, frame)
 
     def forces(
         self,
@@ -246,7 +257,7 @@ class PadSensors:
         """Contact force per taxel before mechanics and readout: (m, P, N) float32 [N]; arguments as in `counts`."""
         index = torch.as_tensor(np.atleast_1d(ids), dtype=torch.long, device=self.device)
         poses = (pad_pos, pad_rot, pad_vel, body_pos, body_rot, body_vel)
-        force = self._contact_forces(index, poses, self._frame(index, dt_s)).flatten(2)
+        force = self._contact_forces(index, poses, load, self._frame(index, dt_s, load)).flatten(2)
         return force if isinstance(pad_pos, torch.Tensor) else force.cpu().numpy()
 
     def counts(
@@ -274,8 +285,9 @@ class PadSensors:
         Returns numpy for numpy poses, a tensor on `device` for tensors.
         """
         index = torch.as_tensor(np.atleast_1d(ids), dtype=torch.long, device=self.device)
-        frame = self._frame(index, dt_s)
-        force = self._contact_forces(index, (pad_pos, pad_rot, pad_vel, body_pos, body_rot, body_vel), frame)
+        frame = self._frame(index, dt_s, load)
+        poses = (pad_pos, pad_rot, pad_vel, body_pos, body_rot, body_vel)
+        force = self._contact_forces(index, poses, load, frame)
         counts = self._run(self.model.force_stages, force, index, frame)
         self._time_s[index] += dt_s
         counts = counts.flatten(2).clamp(0.0, 255.0).to(torch.uint8)

@@ -19,6 +19,8 @@ class ContactStage(Stage):
     """What depth means: "closest" (penetration into the nearest surface) or "column" (height along the normal)."""
     load_conserving: ClassVar[bool] = False
     """Whether the forces are solved to add up to the load."""
+    subdivision: ClassVar[int] = 1
+    """Lattice points per taxel and direction when forces are solved for a load."""
     scalable: ClassVar[tuple[str, ...]] = ("k_n", "k_d")
     """Parameters that a scale of the stiffness multiplies."""
 
@@ -45,8 +47,8 @@ class KelvinVoigt(ContactStage):
     """
 
     name: ClassVar[str] = "kelvin_voigt"
-    k_n: float = parameter(800.0, "N/m", 200.0, 3200.0)
-    k_d: float = parameter(2.4, "N*s/m", 0.0, 10.0)
+    k_n: float = parameter(400.0, "N/m", 100.0, 1600.0)
+    k_d: float = parameter(1.2, "N*s/m", 0.0, 5.0)
 
     def stiffness(self, layout: PadLayout) -> torch.Tensor | float:
         return self.k_n
@@ -61,7 +63,7 @@ class TacSL(ContactStage):
     """TacSL's released penalty model: f = k_n d without damping; k_n [N/m] per taxel."""
 
     name: ClassVar[str] = "tacsl"
-    k_n: float = parameter(800.0, "N/m", 200.0, 3200.0)
+    k_n: float = parameter(400.0, "N/m", 100.0, 1600.0)
 
     def stiffness(self, layout: PadLayout) -> torch.Tensor | float:
         return self.k_n
@@ -98,3 +100,29 @@ class FlexitacIsaacSim(ContactStage):
 
     def force(self, depth: torch.Tensor, rate: torch.Tensor, layout: PadLayout) -> torch.Tensor:
         return torch.minimum(self.k_n * depth.clamp(min=0.0), torch.as_tensor(self.limit_n)) / self.limit_n
+
+
+@register
+@dataclass(frozen=True)
+class Consistent(ContactStage):
+    """Elastic foundation whose taxels add up to the physics solver's force on the pad, and balance at its centre.
+
+    Column heights along the pad's normal, a Winkler foundation with offset and two tilts solved for the load, pressure
+    averaged over 2 x 2 points per taxel. Without a load (replay of prescribed depths) it is the plain Winkler foundation.
+    """
+
+    name: ClassVar[str] = "consistent"
+    query: ClassVar[str] = "column"
+    load_conserving: ClassVar[bool] = True
+    scalable: ClassVar[tuple[str, ...]] = ("foundation_n_per_m3",)
+    subdivision: ClassVar[int] = 2
+    foundation_n_per_m3: float = parameter(2e8, "N/m^3", 5e7, 8e8, minimum=1.0)
+    """Stiffness of the layer per area: about elastic modulus / thickness (0.5 MPa / 2.5 mm)."""
+    damping_s: float = parameter(3e-3, "s", 0.0, 1e-2)
+    """Viscous over elastic stiffness (the paper's k_d / k_n): parts of the face that are being pressed in carry more."""
+
+    def stiffness(self, layout: PadLayout) -> torch.Tensor | float:
+        return self.foundation_n_per_m3 * layout.taxel_area_m2
+
+    def force(self, depth: torch.Tensor, rate: torch.Tensor, layout: PadLayout) -> torch.Tensor:
+        return self.stiffness(layout) * (depth + self.damping_s * rate).clamp(min=0.0) * (depth > 0)

@@ -28,7 +28,7 @@ class Gain(Stage):
     name: ClassVar[str] = "gain"
     domain: ClassVar[str] = "gain"
     rank: ClassVar[int] = 40
-    counts_per_n: float = parameter(600.0, "counts/N", 300.0, 1000.0)
+    counts_per_n: float = parameter(500.0, "counts/N", 250.0, 1000.0)
 
     def step(self, x: torch.Tensor, state: State, frame: Frame) -> tuple[torch.Tensor, State]:
         return x * self.counts_per_n, state

@@ -1,0 +1,288 @@
+"""Warp kernel of the load-consistent elastic foundation (Winkler): heights and load in, taxel forces out.
+
+Each pad is one thread. Its face gives way by u = max(0, z + delta + a x + b y) at every lattice point, where z is the
+column height plus the viscous lead tau * rate and (x, y) the centre of the point's taxel, in taxel pitches. The three
+unknowns are solved so that the forces k u add up to the load and balance at its centre: the minimum of a convex,
+piecewise quadratic function, found by Newton's method.
+"""
+
+import warp as wp
+
+from lerobot_vtrefine.tactile.kernels import coordinate, ivec4
+
+wp.set_module_options({"enable_backward": False})
+
+MAX_TILT = wp.constant(0.2)
+"""Limit of the two slopes; only reached when the load's centre lies outside what the body can press on."""
+NEWTON_STEPS = wp.constant(14)
+NEAR = wp.constant(1.0e-2)
+"""How close to the load the search for the offset comes before Newton's method takes over."""
+TOLERANCE = wp.constant(2.0e-6)
+
+mat33d = wp.types.matrix(shape=(3, 3), dtype=wp.float64)
+
+
+@wp.struct
+class Pad:
+    """One pad's lattice, rows and columns `area` of which may be in contact."""
+
+    rows: int
+    cols: int
+    subdivision: int
+    damping_s: float
+    area: ivec4
+
+
+@wp.struct
+class Balance:
+    """Sums over the points in contact for one trial of (delta, a, b)."""
+
+    squares: wp.float64
+    sums: wp.vec3d
+    hessian: mat33d
+
+
+@wp.func
+def balance(
+    pad: Pad, stride: int, depth: wp.array(dtype=float), rate: wp.array(dtype=float), trial: wp.vec3d
+) -> Balance:
+    """Sums of u (1, x, y) and of (1, x, y)^T (1, x, y) over the points in contact, of every `stride`-th row and column."""
+    result = Balance()
+    taxel_rows = pad.rows / pad.subdivision
+    taxel_cols = pad.cols / pad.subdivision
+    a = wp.float32(trial[1])
+    for row in range(pad.area[0], pad.area[1], stride):
+        y = coordinate(row / pad.subdivision, 1.0, taxel_rows)
+        base = wp.float32(trial[0] + trial[2] * wp.float64(y))
+        # One row in single precision, rows in double: fast, and exact enough for 1e-6 of the load.
+        n = float(0.0)
+        sx = float(0.0)
+        sxx = float(0.0)
+        su = float(0.0)
+        sux = float(0.0)
+        suu = float(0.0)
+        start = row * pad.cols
+        for col in range(pad.area[2], pad.area[3], stride):
+            x = coordinate(col / pad.subdivision, 1.0, taxel_cols)
+            u = depth[start + col] + pad.damping_s * rate[start + col] + base + a * x
+            # Heights of -1 m mark points without a body, whatever their rate holds.
+            if u > 0.0 and depth[start + col] > -0.5:
+                n += 1.0
+                sx += x
+                sxx += x * x
+                su += u
+                sux += u * x
+                suu += u * u
+        if n > 0.0:
+            yd = wp.float64(y)
+            nd = wp.float64(n)
+            sxd = wp.float64(sx)
+            sud = wp.float64(su)
+            result.squares += wp.float64(suu)
+            result.sums += wp.vec3d(sud, wp.float64(sux), sud * yd)
+            result.hessian += mat33d(
+                nd, sxd, nd * yd, sxd, wp.float64(sxx), sxd * yd, nd * yd, sxd * yd, nd * yd * yd
+            )
+    return result
+
+
+@wp.func
+def offset_for_sum(
+    pad: Pad,
+    stride: int,
+    depth: wp.array(dtype=float),
+    rate: wp.array(dtype=float),
+    tilted: wp.vec3d,
+    total: wp.float64,
+) -> wp.vec3d:
+    """(delta, a, b) with the tilts of `tilted` and delta such that the u add up to about `total`.
+
+    Newton from the side where more points are in contact descends monotonically and ends after finitely many steps;
+    its first step leads to that side from anywhere.
+    """
+    trial = tilted
+    for step in range(32):
+        here = balance(pad, stride, depth, rate, trial)
+        if here.hessian[0, 0] < wp.float64(1.0):
+            trial[0] = trial[0] + wp.float64(1.0e-3)
+        else:
+            change = (total - here.sums[0]) / here.hessian[0, 0]
+            trial[0] = trial[0] + change
+            if wp.abs(change) * here.hessian[0, 0] <= wp.float64(NEAR) * total:
+                break
+    return trial
+
+
+@wp.func
+def newton_step(h: mat33d, g: wp.vec3d) -> wp.vec3d:
+    """-(h + small diagonal)^-1 g by Cholesky; the diagonal keeps points on one line, or one point, solvable."""
+    small = wp.float64(1.0e-9)
+    l00 = wp.sqrt(h[0, 0] + wp.float64(1.0e-30))
+    l10 = h[1, 0] / l00
+    l20 = h[2, 0] / l00
+    l11 = wp.sqrt(wp.max(h[1, 1] - l10 * l10, small * (h[1, 1] + h[0, 0])))
+    l21 = (h[2, 1] - l20 * l10) / l11
+    l22 = wp.sqrt(wp.max(h[2, 2] - l20 * l20 - l21 * l21, small * (h[2, 2] + h[0, 0])))
+    y0 = -g[0] / l00
+    y1 = (-g[1] - l10 * y0) / l11
+    y2 = (-g[2] - l20 * y0 - l21 * y1) / l22
+    x2 = y2 / l22
+    x1 = (y1 - l21 * x2) / l11
+    x0 = (y0 - l10 * x1 - l20 * x2) / l00
+    return wp.vec3d(x0, x1, x2)
+
+
+@wp.func
+def limited(trial: wp.vec3d, limit: wp.float64) -> wp.vec3d:
+    return wp.vec3d(trial[0], wp.clamp(trial[1], -limit, limit), wp.clamp(trial[2], -limit, limit))
+
+
+@wp.func
+def solve_balance(
+    pad: Pad,
+    stride: int,
+    depth: wp.array(dtype=float),
+    rate: wp.array(dtype=float),
+    start: wp.vec3d,
+    target: wp.vec3d,
+    limit: wp.float64,
+) -> wp.vec3d:
+    """(delta, a, b) whose sums meet the target; damped Newton steps on the convex merit sum u^2 / 2 - target . trial."""
+    trial = start
+    here = balance(pad, stride, depth, rate, trial)
+    for _ in range(NEWTON_STEPS):
+        g = here.sums - target
+        worst = wp.max(wp.abs(g[0]), wp.max(wp.abs(g[1]), wp.abs(g[2])))
+        if worst <= wp.float64(TOLERANCE) * target[0]:
+            break
+        step = newton_step(here.hessian, g)
+        merit = wp.float64(0.5) * here.squares - wp.dot(target, trial)
+        scale = wp.float64(1.0)
+        accepted = int(0)
+        for _halving in range(8):
+            if accepted == 0:
+                candidate = limited(trial + scale * step, limit)
+                there = balance(pad, stride, depth, rate, candidate)
+                gain = wp.float64(0.5) * there.squares - wp.dot(target, candidate) - merit
+                if gain <= wp.float64(1.0e-4) * wp.min(wp.dot(g, candidate - trial), wp.float64(0.0)):
+                    trial = candidate
+                    here = there
+                    accepted = 1
+                scale = scale * wp.float64(0.5)
+        if accepted == 0:
+            break
+    return trial
+
+
+@wp.func
+def spread_load(rows: int, cols: int, pitch: float, load: wp.vec3, force: wp.array(dtype=float)):
+    """Where no body stands over the lattice, share the load among the four taxels next to its centre."""
+    x = wp.clamp(load[1] / pitch + 0.5 * float(cols - 1), 0.0, float(cols - 1))
+    y = wp.clamp(load[2] / pitch + 0.5 * float(rows - 1), 0.0, float(rows - 1))
+    col = wp.min(wp.int32(x), wp.max(cols - 2, 0))
+    row = wp.min(wp.int32(y), wp.max(rows - 2, 0))
+    wx = x - float(col)
+    wy = y - float(row)
+    next_col = wp.min(col + 1, cols - 1)
+    next_row = wp.min(row + 1, rows - 1)
+    force[row * cols + col] += load[0] * (1.0 - wx) * (1.0 - wy)
+    force[row * cols + next_col] += load[0] * wx * (1.0 - wy)
+    force[next_row * cols + col] += load[0] * (1.0 - wx) * wy
+    force[next_row * cols + next_col] += load[0] * wx * wy
+
+
+@wp.func
+def write_forces(
+    pad: Pad,
+    stiffness: float,
+    depth: wp.array(dtype=float),
+    rate: wp.array(dtype=float),
+    answer: wp.vec3d,
+    total: wp.float64,
+    force: wp.array(dtype=float),
+):
+    """Forces of a solution, times what single precision left between their sum and the load."""
+    here = balance(pad, 1, depth, rate, answer)
+    factor = stiffness * wp.float32(total / here.sums[0])
+    taxel_rows = pad.rows / pad.subdivision
+    taxel_cols = pad.cols / pad.subdivision
+    a = wp.float32(answer[1])
+    for row in range(pad.area[0], pad.area[1]):
+        y = coordinate(row / pad.subdivision, 1.0, taxel_rows)
+        base = wp.float32(answer[0] + answer[2] * wp.float64(y))
+        start = row * pad.cols
+        out = (row / pad.subdivision) * taxel_cols
+        for col in range(pad.area[2], pad.area[3]):
+            x = coordinate(col / pad.subdivision, 1.0, taxel_cols)
+            u = depth[start + col] + pad.damping_s * rate[start + col] + base + a * x
+            if u > 0.0 and depth[start + col] > -0.5:
+                force[out + col / pad.subdivision] += factor * u
+
+
+@wp.kernel
+def solve_foundation(
+    rows: int,
+    cols: int,
+    subdivision: int,
+    pitch: float,
+    damping_s: float,
+    stiffness: wp.array(dtype=float),
+    load: wp.array(dtype=wp.vec3, ndim=2),
+    window: wp.array(dtype=ivec4, ndim=3),
+    depth: wp.array(dtype=float, ndim=3),
+    rate: wp.array(dtype=float, ndim=3),
+    force: wp.array(dtype=float, ndim=3),
+    solution: wp.array(dtype=wp.vec3, ndim=2),
+):
+    """Forces [N] on rows x cols taxels from heights on the lattice that is finer by `subdivision`.
+
+    `stiffness` is that of one lattice point, per environment [N/m]; `window` holds the lattice areas of the primitives
+    in reach; `force` must come in as zero; `solution` gets (delta [m], slope x, slope y).
+    """
+    env, side = wp.tid()
+    solution[env, side] = wp.vec3(0.0, 0.0, 0.0)
+    push = load[env, side]
+    if push[0] <= 0.0:
+        return
+    pad = Pad()
+    pad.rows = rows * subdivision
+    pad.cols = cols * subdivision
+    pad.subdivision = subdivision
+    pad.damping_s = damping_s
+    area = ivec4(pad.rows, 0, pad.cols, 0)
+    for k in range(window.shape[2]):
+        other = window[env, side, k]
+        if other[0] < other[1]:
+            area = ivec4(
+                wp.min(area[0], other[0]),
+                wp.max(area[1], other[1]),
+                wp.min(area[2], other[2]),
+                wp.max(area[3], other[3]),
+            )
+    pad.area = area
+    heights = depth[env, side]
+    rates = rate[env, side]
+    highest = float(-1.0)
+    for row in range(area[0], area[1]):
+        for col in range(area[2], area[3]):
+            highest = wp.max(highest, heights[row * pad.cols + col])
+    if highest <= -0.5:
+        spread_load(rows, cols, pitch, push, force[env, side])
+        return
+    total = wp.float64(push[0]) / wp.float64(stiffness[env])
+    scale = wp.float64(1.0) / wp.float64(pitch)
+    target = wp.vec3d(total, total * wp.float64(push[1]) * scale, total * wp.float64(push[2]) * scale)
+    limit = wp.float64(MAX_TILT * pitch)
+    zero = wp.float64(0.0)
+    answer = wp.vec3d(wp.float64(1.0e-3 - highest), zero, zero)
+    if subdivision > 1:
+        # Every taxel's first point alone leads close to the answer at a fraction of the cost.
+        share = wp.float64(1.0) / wp.float64(subdivision * subdivision)
+        answer = offset_for_sum(pad, subdivision, heights, rates, answer, total * share)
+        answer = solve_balance(pad, subdivision, heights, rates, answer, target * share, limit)
+    answer = offset_for_sum(pad, 1, heights, rates, answer, total)
+    answer = solve_balance(pad, 1, heights, rates, answer, target, limit)
+    write_forces(pad, stiffness[env], heights, rates, answer, total, force[env, side])
+    solution[env, side] = wp.vec3(
+        wp.float32(answer[0]), wp.float32(answer[1] * scale), wp.float32(answer[2] * scale)
+    )
