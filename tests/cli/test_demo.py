@@ -35,7 +35,7 @@ def fake_commands(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
 
 @pytest.mark.usefixtures("fake_commands")
 def test_demo_end_to_end(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    arguments = ["--quick", "--ablation_episodes=8", f"--output_dir={tmp_path / 'demo'}"]
+    arguments = ["--quick", "--videos=3", "--ablation_episodes=8", f"--output_dir={tmp_path / 'demo'}"]
     config = demo.parse_config(arguments)
     page = demo.run_demo(config).read_text(encoding="utf-8")
     results = json.loads((config.output_dir / "results.json").read_text())

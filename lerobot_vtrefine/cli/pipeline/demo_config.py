@@ -23,6 +23,7 @@ QUICK = (
     "--pretrain_batch=16",
     "--eval_episodes=8",
     "--eval_envs=8",
+    "--videos=1",
     "--ablation_episodes=0",
     "--finetune_iterations=2",
     "--finetune_envs=8",
@@ -36,7 +37,13 @@ def default_env() -> dict[str, Any]:
 
 def default_degradation() -> dict[str, Any]:
     """The expert's imperfections: they leave imitation room for improvement."""
-    return {"lateral_std_m": 0.001, "tilt_std_rad": 0.026}
+    return {
+        "lateral_std_m": 0.0008,
+        "tilt_std_rad": 0.0175,
+        "tremor_std_m": 0.0002,
+        "pause_probability": 0.02,
+        "pace_std": 0.1,
+    }
 
 
 def default_policy() -> dict[str, Any]:
@@ -73,6 +80,8 @@ class DemoConfig:
     """Simulations that evaluate side by side."""
     ablation_episodes: int = 100
     """Episodes of each test-time ablation; 0 skips them."""
+    videos: int = 6
+    """Episodes of each headline evaluation that are drawn; drawing without a GPU is slow."""
     finetune_iterations: int = 25
     """DPPO iterations of one episode in every environment."""
     finetune_envs: int = 96
@@ -196,6 +205,7 @@ def evaluation_stage(config: DemoConfig, policy: str, ablation: str = "none") ->
         "--policy.device=cpu",
         *flags("env", {"type": "vtrefine"} | config.env),
         f"--env.metrics_path={output / 'episodes.jsonl'}",
+        f"--env.video_episodes={config.videos if ablation == 'none' else 0}",
         f"--eval.n_episodes={episodes}",
         f"--eval.batch_size={min(config.eval_envs, episodes)}",
         f"--seed={config.eval_seed}",

@@ -21,13 +21,14 @@ SUCCESS_METRICS = ("time_to_success_s", *METRICS)
 CLEAR_LIFT = 0.2
 
 
-def load_evaluation(directory: Path, first_seed: int) -> dict[str, Any]:
+def load_evaluation(directory: Path, first_seed: int, num_videos: int = 0) -> dict[str, Any]:
     """One evaluation as ``lerobot-eval`` and the environment's episode log left it.
 
     Returns:
         ``success``, ``episodes``, ``rate``, ``ci95``, ``eval_seconds``, ``seeds``, ``metrics`` (quantiles
         over all episodes and over successes; SI units), ``failures`` (count by reason) and ``videos``
-        (``[{"path", "seed", "success"}]``).
+        (``[{"path", "seed", "success"}]``, the first ``num_videos``: ``lerobot-eval`` writes ten, the
+        environment draws fewer).
     """
     info = json.loads((directory / "eval_info.json").read_text(encoding="utf-8"))
     task = info["per_task"][0]["metrics"]
@@ -35,7 +36,7 @@ def load_evaluation(directory: Path, first_seed: int) -> dict[str, Any]:
     rows = read_episode_log(directory / "episodes.jsonl", first_seed, len(successes))
     videos = [
         {"path": path, "seed": first_seed + index, "success": successes[index]}
-        for index, path in enumerate(task.get("video_paths", []))
+        for index, path in enumerate(task.get("video_paths", [])[:num_videos])
     ]
     return proportion(sum(successes), len(successes)) | {
         "eval_seconds": round(info["overall"]["eval_s"], 1),
@@ -64,7 +65,7 @@ def collect_results(config: DemoConfig, records: Sequence[StageRecord]) -> dict[
     """Everything of ``results.json``; ``pretrain`` and ``finetune`` first."""
     seconds = {record.name: record.seconds for record in records}
     policies = {
-        policy: load_evaluation(config.evaluation_dir(policy), config.eval_seed)
+        policy: load_evaluation(config.evaluation_dir(policy), config.eval_seed, config.videos)
         | {"seconds": seconds[policy], "modalities": config.modalities}
         for policy in ("pretrain", "finetune")
     }
