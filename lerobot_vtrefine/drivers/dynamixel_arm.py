@@ -1,0 +1,285 @@
+"""One Interbotix arm on LeRobot's Dynamixel bus: joints in radians, both fingers in metres.
+
+Joint angle = (position - 2048) * 2 pi / 4096, the convention of Interbotix's own driver, after the motor's
+homing offset. The gripper's servo drives both fingers at once; a finger's travel is proportional to the
+servo's angle between the two calibrated ends (ALOHA's own 31 recorded episodes lie on such a line, 29.4
+mm/rad).
+"""
+
+import contextlib
+import logging
+import math
+import time
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+import serial
+from lerobot.motors import Motor, MotorCalibration, MotorNormMode
+from lerobot.motors.dynamixel import DynamixelMotorsBus, OperatingMode
+from numpy.typing import NDArray
+
+from lerobot_vtrefine.drivers.ports import PortError, explain_open_error
+
+logger = logging.getLogger(__name__)
+
+Floats = NDArray[np.float64]
+
+COUNTS_PER_TURN = 4096
+CENTRE = COUNTS_PER_TURN // 2
+GRIPPER = "gripper"
+NO_SECONDARY_ID = 255
+
+RETRIES = 2
+"""Repeated tries of a bus transaction: single packets do get lost."""
+
+MOVE_RATE_HZ = 50.0
+
+_X540_MA = 2.69
+"""Milliamperes per count of current registers (ROBOTIS e-Manual, XM430 and XM540)."""
+
+
+@dataclass(frozen=True)
+class ArmModel:
+    """Motors of one arm.
+
+    Attributes:
+        motors: (name, id, model) of the driven motors, base to gripper.
+        shadows: (name, id, model, followed motor) of motors that share a joint with another one.
+    """
+
+    motors: tuple[tuple[str, int, str], ...]
+    shadows: tuple[tuple[str, int, str, str], ...]
+
+    @property
+    def joints(self) -> tuple[str, ...]:
+        """Motors but the gripper."""
+        return tuple(name for name, _, _ in self.motors if name != GRIPPER)
+
+    def bus_motors(self) -> dict[str, Motor]:
+        """All motors as LeRobot's bus wants them."""
+        everything = [*self.motors, *((name, number, model) for name, number, model, _ in self.shadows)]
+        return {name: Motor(number, model, MotorNormMode.DEGREES) for name, number, model in everything}
+
+
+VIPERX_300S = ArmModel(
+    motors=(
+        ("waist", 1, "xm540-w270"),
+        ("shoulder", 2, "xm540-w270"),
+        ("elbow", 4, "xm540-w270"),
+        ("forearm_roll", 6, "xm540-w270"),
+        ("wrist_angle", 7, "xm540-w270"),
+        ("wrist_rotate", 8, "xm430-w350"),
+        (GRIPPER, 9, "xm430-w350"),
+    ),
+    shadows=(("shoulder_shadow", 3, "xm540-w270", "shoulder"), ("elbow_shadow", 5, "xm540-w270", "elbow")),
+)
+"""ALOHA's follower (motor map of LeRobot's former viperx robot)."""
+
+WIDOWX_250S = ArmModel(
+    motors=(
+        ("waist", 1, "xm430-w350"),
+        ("shoulder", 2, "xm430-w350"),
+        ("elbow", 4, "xm430-w350"),
+        ("forearm_roll", 6, "xm430-w350"),
+        ("wrist_angle", 7, "xm430-w350"),
+        ("wrist_rotate", 8, "xl430-w250"),
+        (GRIPPER, 9, "xc430-w150"),
+    ),
+    shadows=(("shoulder_shadow", 3, "xm430-w350", "shoulder"), ("elbow_shadow", 5, "xm430-w350", "elbow")),
+)
+"""ALOHA's leader (motor map of LeRobot's former widowx teleoperator)."""
+
+
+def counts_to_rad(counts: Floats) -> Floats:
+    """Joint angles of motor positions."""
+    return (counts - CENTRE) * (2 * math.pi / COUNTS_PER_TURN)
+
+
+def rad_to_counts(angles: Floats) -> Floats:
+    """Motor positions of joint angles, rounded."""
+    return np.rint(angles * (COUNTS_PER_TURN / (2 * math.pi)) + CENTRE)
+
+
+class DynamixelArm:
+    """One arm, eight values: six joints [rad], left finger >= 0 and right finger <= 0 [m]."""
+
+    def __init__(self, name: str, port: str, model: ArmModel, travel_m: float) -> None:
+        self.name = name
+        self.model = model
+        self.travel_m = travel_m
+        self.calibration: dict[str, MotorCalibration] = {}
+        self.bus = DynamixelMotorsBus(port, model.bus_motors())
+        self._names = [motor for motor, _, _ in model.motors]
+
+    @property
+    def port(self) -> str:
+        """Serial port."""
+        return self.bus.port
+
+    @property
+    def is_connected(self) -> bool:
+        """Whether the port is open."""
+        return self.bus.is_connected
+
+    # --- connection ---------------------------------------------------------------------------------
+
+    def connect(self) -> None:
+        """Opens the port and checks that every motor answers and is of the right model.
+
+        Raises:
+            PortError: the message names the port, the motors and the fix.
+        """
+        try:
+            self.bus.connect()
+        except RuntimeError as error:
+            self.bus.port_handler.closePort()
+            raise PortError(self._missing_motors()) from error
+        except (ConnectionError, serial.SerialException, OSError) as error:
+            cause = error.__cause__ if isinstance(error.__cause__, Exception) else error
+            message = explain_open_error(self.port, self.bus.default_baudrate, cause)
+            raise PortError(f"{self.name} arm: {message}") from error
+
+    def _missing_motors(self) -> str:
+        expected = {motor.id: name for name, motor in self.bus.motors.items()}
+        found: dict[int, int] = {}
+        with contextlib.suppress(Exception):  # the SDK raises bare exceptions; less is said then
+            self.bus.port_handler.openPort()
+            found = self.bus.broadcast_ping(num_retry=1) or {}
+            self.bus.port_handler.closePort()
+        where = f"{self.name} arm on {self.port}"
+        if not found:
+            return (
+                f"{where}: no motor answers at {self.bus.default_baudrate} baud: switch on the arm's power, "
+                "and check that this is its port, and the motors' baud rate (lerobot-setup-motors sets it)"
+            )
+        missing = [f"{name} (id {number})" for number, name in expected.items() if number not in found]
+        if missing:
+            return f"{where}: {', '.join(missing)} do not answer: check the cable before the first of them"
+        model = self.model.motors[0][2]
+        return f"{where}: these are not the motors of a {model} arm: are leader and follower swapped?"
+
+    def disconnect(self, *, torque_off: bool) -> None:
+        """Closes the port; torque goes off before where wanted."""
+        if self.is_connected:
+            self.bus.disconnect(disable_torque=torque_off)
+
+    # --- calibration --------------------------------------------------------------------------------
+
+    @property
+    def is_calibrated(self) -> bool:
+        """Whether a calibration is loaded and the motors hold its homing offsets."""
+        if set(self.calibration) != set(self._names):
+            return False
+        offsets = self.bus.sync_read("Homing_Offset", self._names, normalize=False, num_retry=RETRIES)
+        return all(offsets[name] == self.calibration[name].homing_offset for name in self._names)
+
+    def calibrate(
+        self, ask: Callable[[str], str], lower: Floats, upper: Floats
+    ) -> dict[str, MotorCalibration]:
+        """Finds the joints' zero and the gripper's two ends, by hand, with torque off; writes them to the
+        motors.
+
+        Args:
+            ask: Shows a text, returns what the operator typed.
+            lower: Lower joint limits (6,) [rad]; `upper` the upper ones.
+            upper: See lower.
+        """
+        self.bus.disable_torque(num_retry=RETRIES)
+        joints = list(self.model.joints)
+        answer = ask(
+            f"{self.name} arm: hold it in its zero pose (upper arm upright, forearm level, gripper straight) "
+            "and press ENTER; or type k and ENTER to keep the zeros as assembled: "
+        )
+        self._write_offsets(dict.fromkeys(self._names, 0))
+        offsets = dict.fromkeys(self._names, 0)
+        if answer.strip().lower() != "k":
+            offsets |= {name: CENTRE - count for name, count in self._counts(joints).items()}
+        ask(f"{self.name} arm: close the gripper fully and press ENTER: ")
+        closed = self._counts([GRIPPER])[GRIPPER]
+        ask(f"{self.name} arm: open the gripper fully and press ENTER: ")
+        opened = self._counts([GRIPPER])[GRIPPER]
+        if abs(opened - closed) < COUNTS_PER_TURN // 40:
+            moved = f"{closed} to {opened} counts"
+            raise ValueError(f"{self.name} arm: the gripper hardly moved ({moved}); calibrate again")
+        low = np.clip(rad_to_counts(lower), 0, COUNTS_PER_TURN - 1).astype(int)
+        high = np.clip(rad_to_counts(upper), 0, COUNTS_PER_TURN - 1).astype(int)
+        ranges = {name: (int(a), int(b)) for name, a, b in zip(joints, low, high, strict=True)}
+        ranges[GRIPPER] = (closed, opened)
+        ids = {name: self.bus.motors[name].id for name in self._names}
+        self.calibration = {n: MotorCalibration(ids[n], 0, offsets[n], *ranges[n]) for n in self._names}
+        self.write_calibration()
+        return self.calibration
+
+    def write_calibration(self) -> None:
+        """Writes the loaded calibration's homing offsets to the motors; torque must be off."""
+        self._write_offsets({name: entry.homing_offset for name, entry in self.calibration.items()})
+
+    def _write_offsets(self, offsets: dict[str, int]) -> None:
+        followed = {name: motor for name, _, _, motor in self.model.shadows}
+        for name, offset in offsets.items():
+            self.bus.write("Homing_Offset", name, offset, normalize=False, num_retry=RETRIES)
+        for shadow, motor in followed.items():
+            self.bus.write("Homing_Offset", shadow, offsets[motor], normalize=False, num_retry=RETRIES)
+
+    # --- set-up -------------------------------------------------------------------------------------
+
+    def configure(self, gripper_current_ma: float | None) -> None:
+        """Sets shadows, modes and limits with torque off.
+
+        Joints are held by the motors themselves within the calibrated limits (position mode). The gripper's
+        force is limited by its current.
+
+        Args:
+            gripper_current_ma: Current limit of the gripper's motor [mA]; None for a leader, which is never
+                driven.
+        """
+        bus = self.bus
+        bus.disable_torque(num_retry=RETRIES)
+        for shadow, _, _, motor in self.model.shadows:
+            bus.write("Secondary_ID", shadow, bus.motors[motor].id, num_retry=RETRIES)
+        bus.configure_motors()
+        if gripper_current_ma is None:
+            return
+        for name in self.model.joints:
+            bus.write("Operating_Mode", name, OperatingMode.POSITION.value, num_retry=RETRIES)
+            limits = self.calibration[name]
+            bus.write("Min_Position_Limit", name, limits.range_min, num_retry=RETRIES)
+            bus.write("Max_Position_Limit", name, limits.range_max, num_retry=RETRIES)
+        bus.write("Operating_Mode", GRIPPER, OperatingMode.CURRENT_POSITION.value, num_retry=RETRIES)
+        bus.write("Goal_Current", GRIPPER, round(gripper_current_ma / _X540_MA), num_retry=RETRIES)
+
+    def hold(self) -> None:
+        """Switches torque on where the arm is: goals become the present positions first, nothing jumps."""
+        self.write(self.read())
+        self.bus.enable_torque(self._names, num_retry=RETRIES)
+
+    def move_to(self, target: Floats, seconds: float) -> None:
+        """Moves slowly along a straight line in joint space, (8,) [rad, m]."""
+        start = self.read()
+        steps = max(1, round(seconds * MOVE_RATE_HZ))
+        for step in range(1, steps + 1):
+            self.write(start + (target - start) * (step / steps))
+            time.sleep(1.0 / MOVE_RATE_HZ)
+
+    # --- state and targets --------------------------------------------------------------------------
+
+    def read(self) -> Floats:
+        """Measured state (8,): six joints [rad], left and right finger [m]."""
+        counts = self._counts(self._names)
+        joints = counts_to_rad(np.array([counts[name] for name in self.model.joints], float))
+        ends = self.calibration[GRIPPER]
+        share = (counts[GRIPPER] - ends.range_min) / (ends.range_max - ends.range_min)
+        return np.array([*joints, share * self.travel_m, -share * self.travel_m])
+
+    def write(self, target: Floats) -> None:
+        """Sends targets (8,); the gripper follows the left finger, the right one mirrors it."""
+        ends = self.calibration[GRIPPER]
+        gripper = ends.range_min + target[6] / self.travel_m * (ends.range_max - ends.range_min)
+        goals = dict(zip(self.model.joints, rad_to_counts(target[:6]).astype(int).tolist(), strict=True))
+        goals[GRIPPER] = round(float(gripper))
+        self.bus.sync_write("Goal_Position", goals, normalize=False, num_retry=RETRIES)
+
+    def _counts(self, names: list[str]) -> dict[str, int]:
+        read = self.bus.sync_read("Present_Position", names, normalize=False, num_retry=RETRIES)
+        return {name: int(value) for name, value in read.items()}

@@ -1,0 +1,6 @@
+"""LeRobot robots with FlexiTac pads. Importing this package registers their configurations."""
+
+from lerobot_vtrefine.robots.config_aloha_tactile_follower import AlohaTactileFollowerConfig
+from lerobot_vtrefine.robots.config_tactile import TactileConfig
+
+__all__ = ["AlohaTactileFollowerConfig", "TactileConfig"]

@@ -1,0 +1,238 @@
+"""ALOHA's followers with FlexiTac pads: 16-D state and action in the paper's order, four pads, cameras."""
+
+import contextlib
+import logging
+from functools import cached_property
+from typing import Any
+
+import numpy as np
+from lerobot.cameras.utils import make_cameras_from_configs
+from lerobot.lerobot_types import RobotAction, RobotObservation
+from lerobot.robots.robot import Robot
+from lerobot.utils.decorators import check_if_already_connected, check_if_not_connected
+
+from lerobot_vtrefine.datasets import arrays
+from lerobot_vtrefine.datasets.features import PAD_COLS, PAD_ROWS, PADS
+from lerobot_vtrefine.drivers.dynamixel_arm import VIPERX_300S, DynamixelArm, Floats
+from lerobot_vtrefine.drivers.pad_set import PadSet
+from lerobot_vtrefine.embodiments import get_embodiment
+from lerobot_vtrefine.robots.config_aloha_tactile_follower import AlohaTactileFollowerConfig
+from lerobot_vtrefine.robots.pad_features import (
+    camera_features,
+    camera_observation,
+    configured_pads,
+    pad_features,
+)
+from lerobot_vtrefine.robots.pad_reading import pad_observation
+
+logger = logging.getLogger(__name__)
+
+PER_ARM = 8
+"""Values of one arm: six joints, two fingers."""
+
+FINGERS = slice(6, 8)
+
+REST_RAD = (0.0, -1.80, 1.55, 0.0, -1.57, 0.0)
+"""Folded pose in which a ViperX-300s lies on its own base without torque (Interbotix's sleep pose)."""
+
+
+class AlohaTactileFollower(Robot):
+    """Two ViperX-300s arms; keys `<joint>.pos` [rad], fingers [m], and `tactile.<pad>` raw counts."""
+
+    config_class = AlohaTactileFollowerConfig
+    name = "aloha_tactile_follower"
+
+    def __init__(self, config: AlohaTactileFollowerConfig) -> None:
+        super().__init__(config)
+        arrays.install()
+        self.config = config
+        self.body = get_embodiment("aloha")
+        travel_m = self.body.fingers.travel_m
+        ports = {"left": config.left_port, "right": config.right_port}
+        self.arms = {name: DynamixelArm(name, port, VIPERX_300S, travel_m) for name, port in ports.items()}
+        self.pads = PadSet(aloha_pads(config))
+        self.cameras = make_cameras_from_configs(config.cameras)
+        self._give_calibration()
+
+    # --- features -----------------------------------------------------------------------------------
+
+    @cached_property
+    def observation_features(self) -> dict[str, Any]:
+        """16 joints, cameras, pads, camera models."""
+        return {
+            **self.action_features,
+            **self._camera_features,
+            **pad_features(self.pads.configs),
+            **camera_features(self.config.camera_models),
+        }
+
+    @cached_property
+    def action_features(self) -> dict[str, Any]:
+        """16 joint targets in the paper's order."""
+        return {f"{joint}.pos": float for joint in self.body.joint_names}
+
+    @property
+    def _camera_features(self) -> dict[str, tuple[int, int, int]]:
+        features: dict[str, tuple[int, int, int]] = {}
+        for name, camera in self.config.cameras.items():
+            height, width = camera.height or 0, camera.width or 0
+            if getattr(camera, "use_rgb", True):
+                features[name] = (height, width, 3)
+            if getattr(camera, "use_depth", False):
+                features[f"{name}_depth"] = (height, width, 1)
+        return features
+
+    # --- connection ---------------------------------------------------------------------------------
+
+    @property
+    def is_connected(self) -> bool:
+        """Whether arms, pads and cameras are connected."""
+        arms = all(arm.is_connected for arm in self.arms.values())
+        return arms and self.pads.is_connected and all(c.is_connected for c in self.cameras.values())
+
+    @check_if_already_connected
+    def connect(self, calibrate: bool = True) -> None:
+        """Connects everything, calibrates where needed, and holds the arms where they are.
+
+        Raises:
+            PortError: a port cannot be used; the message names it and the fix. Nothing stays connected.
+        """
+        try:
+            self.pads.connect()
+            for arm in self.arms.values():
+                arm.connect()
+            if calibrate and not self.is_calibrated:
+                self.calibrate()
+            for camera in self.cameras.values():
+                camera.connect()
+            self.configure()
+        except BaseException:
+            self._release()
+            raise
+        logger.info("%s connected", self)
+
+    def configure(self) -> None:
+        """Sets modes and limits, then holds the arms where they are.
+
+        Raises:
+            ValueError: the arms are not calibrated.
+        """
+        if not self.is_calibrated:
+            command = f"lerobot-calibrate --robot.type={self.name} ..."
+            raise ValueError(f"{self.name} {self.id} is not calibrated; run: {command}")
+        for arm in self.arms.values():
+            arm.configure(self.config.gripper_current_ma)
+            arm.hold()
+
+    def disconnect(self) -> None:
+        """Moves the arms to rest, switches torque off, releases everything, also after failures."""
+        if self.config.rest_on_disconnect:
+            for arm in self.arms.values():
+                with contextlib.suppress(ConnectionError, OSError):  # an arm that is gone cannot be moved
+                    if arm.is_connected:
+                        arm.move_to(np.array([*REST_RAD, *arm.read()[FINGERS]]), self.config.rest_s)
+        self._release()
+
+    def _release(self) -> None:
+        for arm in self.arms.values():
+            try:
+                arm.disconnect(torque_off=True)
+            except (ConnectionError, OSError) as error:
+                logger.error("%s arm (%s): torque may still be on: %s", arm.name, arm.port, error)
+                arm.bus.port_handler.closePort()
+        self.pads.disconnect()
+        for camera in self.cameras.values():
+            if camera.is_connected:
+                camera.disconnect()
+
+    # --- calibration --------------------------------------------------------------------------------
+
+    @property
+    def is_calibrated(self) -> bool:
+        """Whether both arms are."""
+        return all(arm.is_calibrated for arm in self.arms.values())
+
+    def calibrate(self) -> None:
+        """Calibrates both arms by hand, or writes the calibration file's values to the motors."""
+        if self.calibration and not self._asked_anew():
+            for arm in self.arms.values():
+                arm.bus.disable_torque()
+                arm.write_calibration()
+            return
+        lower, upper = self.body.lower, self.body.upper
+        for arm in self.arms.values():
+            arm.calibrate(input, lower[:6], upper[:6])
+        self.calibration = {
+            f"{name}_{motor}": entry
+            for name, arm in self.arms.items()
+            for motor, entry in arm.calibration.items()
+        }
+        self._save_calibration()
+        logger.info("calibration saved to %s", self.calibration_fpath)
+
+    def _asked_anew(self) -> bool:
+        text = f"Press ENTER to use the calibration of {self.id}, or type c and ENTER to calibrate anew: "
+        return input(text).strip().lower() == "c"
+
+    def _give_calibration(self) -> None:
+        for name, arm in self.arms.items():
+            prefix = f"{name}_"
+            entries = self.calibration.items()
+            arm.calibration = {k.removeprefix(prefix): v for k, v in entries if k.startswith(prefix)}
+
+    # --- observation and action ---------------------------------------------------------------------
+
+    @check_if_not_connected
+    def get_observation(self) -> RobotObservation:
+        """Joints and pads at one moment, then images."""
+        state = np.concatenate([arm.read() for arm in self.arms.values()])
+        values: RobotObservation = dict(zip(self.action_features, map(float, state), strict=True))
+        values |= pad_observation(self.pads)
+        for name, camera in self.cameras.items():
+            if getattr(camera, "use_rgb", True):
+                values[name] = camera.read_latest()
+            if getattr(camera, "use_depth", False):
+                values[f"{name}_depth"] = camera.read_latest_depth()  # ty: ignore[missing-attribute]
+        return values | camera_observation(self.config.camera_models, self.cameras)
+
+    @check_if_not_connected
+    def send_action(self, action: RobotAction) -> RobotAction:
+        """Sends joint targets, cut to the joints' limits and to `max_step_rad` from where the joints are.
+
+        Returns:
+            The targets sent; each right finger mirrors its left finger.
+        """
+        wanted = np.array([action[key] for key in self.action_features], float)
+        sent = []
+        for index, arm in enumerate(self.arms.values()):
+            part = slice(index * PER_ARM, (index + 1) * PER_ARM)
+            target = np.clip(wanted[part], self.body.lower[part], self.body.upper[part])
+            sent.append(limit_step(target, arm.read(), self.config.max_step_rad))
+            arm.write(sent[-1])
+        return dict(zip(self.action_features, map(float, np.concatenate(sent)), strict=True))
+
+
+def limit_step(target: Floats, present: Floats, max_step_rad: float) -> Floats:
+    """Targets (8,) with joints at most one step from the present ones; the right finger mirrors the left."""
+    limited = present + np.clip(target - present, -max_step_rad, max_step_rad)
+    limited[FINGERS] = target[6], -target[6]
+    return limited
+
+
+def aloha_pads(config: AlohaTactileFollowerConfig) -> dict[str, Any]:
+    """The four pads in the paper's order.
+
+    Raises:
+        ValueError: pads are missing, unknown, or not 12 x 32.
+    """
+    pads = configured_pads(config.pads, config.pads_file)
+    if set(pads) != set(PADS):
+        raise ValueError(
+            f"{AlohaTactileFollower.name} needs the pads {', '.join(PADS)}; got {', '.join(pads)}"
+        )
+    wrong = [f"{name} {pad.pad_shape}" for name, pad in pads.items() if pad.pad_shape != (PAD_ROWS, PAD_COLS)]
+    if wrong:
+        raise ValueError(
+            f"pads must be {PAD_ROWS} x {PAD_COLS} (set pad_rows, row_offset): {', '.join(wrong)}"
+        )
+    return {name: pads[name] for name in PADS}

@@ -1,0 +1,141 @@
+"""The `tactile` robot: any registered LeRobot robot plus FlexiTac pads, by composition."""
+
+from functools import cached_property
+from typing import Any
+
+import draccus
+from lerobot.lerobot_types import RobotAction, RobotObservation
+from lerobot.robots.config import RobotConfig
+from lerobot.robots.robot import Robot
+from lerobot.robots.utils import make_robot_from_config
+from lerobot.utils.decorators import check_if_already_connected, check_if_not_connected
+
+from lerobot_vtrefine.datasets import arrays
+from lerobot_vtrefine.drivers.pad_set import PadSet
+from lerobot_vtrefine.robots.config_tactile import TactileConfig
+from lerobot_vtrefine.robots.pad_features import (
+    camera_features,
+    camera_observation,
+    configured_pads,
+    pad_features,
+)
+from lerobot_vtrefine.robots.pad_reading import pad_observation
+
+
+class Tactile(Robot):
+    """Observations and actions of the base robot, plus `tactile.<pad>` arrays of raw counts."""
+
+    config_class = TactileConfig
+    name = "tactile"
+
+    def __init__(self, config: TactileConfig) -> None:
+        super().__init__(config)
+        arrays.install()
+        self.config = config
+        self.base = make_robot_from_config(base_config(config))
+        self.pads = PadSet(configured_pads(config.pads, config.pads_file))
+        self.robot_type = f"{self.name}_{self.base.name}"
+
+    @property
+    def cameras(self) -> dict[str, Any]:
+        """The base robot's cameras."""
+        return getattr(self.base, "cameras", {})
+
+    @cached_property
+    def observation_features(self) -> dict[str, Any]:
+        """The base robot's, the pads' and the camera models'."""
+        own = pad_features(self.pads.configs) | camera_features(self.config.camera_models)
+        clashing = sorted(set(own) & set(self.base.observation_features))
+        if clashing:
+            raise ValueError(f"the base robot already has {', '.join(clashing)}; choose other pad names")
+        return {**self.base.observation_features, **own}
+
+    @property
+    def action_features(self) -> dict[str, Any]:
+        """The base robot's."""
+        return self.base.action_features
+
+    @property
+    def is_connected(self) -> bool:
+        """Whether robot and pads are connected."""
+        return self.base.is_connected and self.pads.is_connected
+
+    @check_if_already_connected
+    def connect(self, calibrate: bool = True) -> None:
+        """Connects the pads, which must not be touched meanwhile, then the robot.
+
+        Raises:
+            PortError: a pad cannot be read; the message names port and fix.
+        """
+        self.pads.connect()
+        try:
+            self.base.connect(calibrate)
+        except BaseException:
+            self.pads.disconnect()
+            raise
+
+    @property
+    def is_calibrated(self) -> bool:
+        """Whether the base robot is; pads calibrate themselves when connecting."""
+        return self.base.is_calibrated
+
+    def calibrate(self) -> None:
+        """Calibrates the base robot, and takes the pads' idle counts anew."""
+        self.base.calibrate()
+        if self.pads.is_connected:
+            self.pads.measure_baselines()
+
+    def configure(self) -> None:
+        """Configures the base robot."""
+        self.base.configure()
+
+    def setup_motors(self) -> None:
+        """Sets up the base robot's motors.
+
+        Raises:
+            NotImplementedError: the base robot has no motor set-up.
+        """
+        setup = getattr(self.base, "setup_motors", None)
+        if setup is None:
+            raise NotImplementedError(f"{self.base.name} has no motor set-up")
+        setup()
+
+    @check_if_not_connected
+    def get_observation(self) -> RobotObservation:
+        """Pads first, at one moment with the joints; images, which take longest to fetch, after them."""
+        values = pad_observation(self.pads)
+        values |= self.base.get_observation()
+        return values | camera_observation(self.config.camera_models, self.cameras)
+
+    @check_if_not_connected
+    def send_action(self, action: RobotAction) -> RobotAction:
+        """Forwards to the base robot."""
+        return self.base.send_action(action)
+
+    def disconnect(self) -> None:
+        """Disconnects the robot, then the pads, also after a failure in between."""
+        try:
+            if self.base.is_connected:
+                self.base.disconnect()
+        finally:
+            self.pads.disconnect()
+
+
+def base_config(config: TactileConfig) -> RobotConfig:
+    """Configuration of the base robot; it inherits `id` and `calibration_dir` where it gives none.
+
+    Raises:
+        ValueError: no type, an unknown type, or a wrong field.
+    """
+    known = ", ".join(sorted(set(RobotConfig.get_known_choices()) - {Tactile.name}))
+    kind = config.base.get("type")
+    if kind not in RobotConfig.get_known_choices() or kind == Tactile.name:
+        raise ValueError(
+            f"--robot.base needs the type of the robot that carries the pads: one of {known}; got {kind!r}"
+        )
+    inherited = {"id": config.id, "calibration_dir": config.calibration_dir and str(config.calibration_dir)}
+    fields = {key: value for key, value in inherited.items() if value is not None} | config.base
+    try:
+        return draccus.decode(RobotConfig, fields)
+    except (draccus.utils.DraccusException, TypeError) as error:
+        raise ValueError(f"--robot.base of type {kind}: {error}") from error
