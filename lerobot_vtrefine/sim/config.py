@@ -146,8 +146,8 @@ class LimitsConfig:
     in_hand_shift_m: float = 0.005
     """Largest movement of a part in its hand since the grasp."""
     contact_force_n: float = 20.0
-    """Largest force between plug and socket, averaged over `force_window_s`: the clean expert stays below 2 N,
-    demonstrations that land on the rim below 8 N, and pushing on reaches 30 N."""
+    """Largest force between plug and socket, averaged over `force_window_s`: the clean expert stays below
+    2 N, demonstrations that land on the rim below 8 N, and pushing on reaches 30 N."""
     force_window_s: float = 0.01
     drop_s: float = 0.3
     """A lifted part that its hand has not held for this long counts as dropped."""

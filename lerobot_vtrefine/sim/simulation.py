@@ -119,7 +119,7 @@ class InsertionSim:
 
     @property
     def camera_pose(self) -> Array:
-        """(N, 7) float32 position [m] and quaternion (w, x, y, z) of the OpenCV optical frame in the world."""
+        """(N, 7) float32 position [m] and quaternion (w, x, y, z) of the optical frame in the world."""
         quat = matrix_to_quat(self._depth.rotation)
         return np.concatenate([self._depth.position, quat], 1).astype(np.float32)
 

@@ -55,7 +55,8 @@ class SingleBackend(Backend):
         """See `Backend.set_fields`."""
         for row, i in enumerate(ids):
             for name, values in fields.items():
-                getattr(self._models[i], name)[...] = values[row]
+                # Bounding volumes of bodies are a prefix of the model's array.
+                getattr(self._models[i], name)[: len(values[row])] = values[row]
             mujoco.mj_setConst(self._models[i], mujoco.MjData(self._models[i]))
 
     def diverged(self, ids: Array) -> Array:
