@@ -85,7 +85,7 @@ def record(config: RecordDemosConfig) -> None:
     assert isinstance(env, VtRefineEnvConfig)
     features = dataset_features(*env.camera_size, get_embodiment(env.scene_config.embodiment).joint_names)
     with DemoDataset(
-        config.root, config.repo_id, env.fps, features, env.task, config.settings(), config.seed
+        config.root, config.repo_id, env.fps, features, env.task or "", config.settings(), config.seed
     ) as demos:
         if demos.num_episodes >= config.num_episodes:
             logging.info("%s already holds %d episodes", config.root, demos.num_episodes)

@@ -4,7 +4,6 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
-import gymnasium as gym
 from lerobot.configs import FeatureType, PolicyFeature
 from lerobot.envs.configs import EnvConfig
 
@@ -34,7 +33,7 @@ class VtRefineEnvConfig(EnvConfig):
     ``scene`` and ``rules`` with these names, and win over them.
     """
 
-    task: str = "insert the plug into the socket"
+    task: str | None = "insert the plug into the socket"
     """Natural-language task: stored in datasets, shown to policies."""
     fps: int = int(TaskConfig.control_hz)
     """Control steps, and so observations and actions, per second."""
@@ -124,9 +123,7 @@ class VtRefineEnvConfig(EnvConfig):
         """Unused: environments are built by ``create_envs``."""
         return {}
 
-    def create_envs(
-        self, n_envs: int, use_async_envs: bool = False
-    ) -> dict[str, dict[int, gym.vector.VectorEnv]]:
+    def create_envs(self, n_envs: int, use_async_envs: bool = False) -> dict[str, dict[int, Any]]:
         """LeRobot's factory: ``{"vtrefine": {0: vector environment}}``."""
         from lerobot_vtrefine.envs.factory import make_vector_env
 

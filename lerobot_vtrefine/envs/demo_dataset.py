@@ -55,7 +55,7 @@ class DemoDataset:
     ) -> None:
         self.root = Path(root)
         self._task = task
-        self._create = {"repo_id": repo_id, "fps": fps, "features": features}
+        self._repo_id, self._fps, self._features = repo_id, fps, features
         self._ledger: dict[str, Any] = {
             "settings": json.loads(json.dumps(settings)),
             "next_seed": first_seed,
@@ -164,17 +164,18 @@ class DemoDataset:
             for summary in SUMMARIES:
                 shutil.copyfile(self.root / summary, _copy_of(self.root / summary))
             self._dataset = LeRobotDataset.resume(
-                self._create["repo_id"], root=self.root, image_writer_threads=IMAGE_WRITER_THREADS
+                self._repo_id, root=self.root, image_writer_threads=IMAGE_WRITER_THREADS
             )
             return self._dataset
         if self.root.is_dir():
             self.root.rmdir()
         self._dataset = LeRobotDataset.create(
+            self._repo_id,
+            self._fps,
+            self._features,
             root=self.root,
             use_videos=False,
-            robot_type="aloha",
             image_writer_threads=IMAGE_WRITER_THREADS,
-            **self._create,
         )
         (self.root / LEDGER).write_text(json.dumps(self._ledger), encoding="utf-8")
         return self._dataset

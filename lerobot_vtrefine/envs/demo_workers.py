@@ -3,7 +3,7 @@
 import itertools
 import multiprocessing as mp
 import queue
-from collections.abc import Iterator
+from collections.abc import Generator, Iterator, Sequence
 from contextlib import contextmanager
 from multiprocessing.process import BaseProcess
 from typing import Any
@@ -20,7 +20,7 @@ POLL_S = 1.0
 @contextmanager
 def demonstration_stream(
     config: VtRefineEnvConfig, degradation: Degradation, num_envs: int, first_seed: int, num_workers: int
-) -> Iterator[Iterator[Demonstration]]:
+) -> Generator[Iterator[Demonstration]]:
     """Expert episodes of ``first_seed``, ``first_seed + 1``, ... without end, whatever ``num_workers``.
 
     With 0 workers this process simulates; otherwise worker ``w`` of ``W`` simulates every W-th seed from
@@ -63,7 +63,7 @@ def _simulate(
         out.put(error)
 
 
-def _round_robin(queues: list[Any], processes: list[BaseProcess]) -> Iterator[Demonstration]:
+def _round_robin(queues: list[Any], processes: Sequence[BaseProcess]) -> Iterator[Demonstration]:
     for worker in itertools.cycle(range(len(queues))):
         item = _next(queues[worker], processes[worker])
         if isinstance(item, Exception):

@@ -5,7 +5,7 @@ of recording. ``fast_episode_stats`` lends its writer the exact vectorised equiv
 saved.
 """
 
-from collections.abc import Iterator
+from collections.abc import Generator
 from contextlib import contextmanager
 from typing import Any
 
@@ -49,7 +49,7 @@ def episode_stats(episode: dict[str, Any], features: dict[str, Any], *args: Any,
 
 
 @contextmanager
-def fast_episode_stats() -> Iterator[None]:
+def fast_episode_stats() -> Generator[None]:
     """Let LeRobot's dataset writer use ``episode_stats``; where it has no such hook, change nothing."""
     original = getattr(dataset_writer, "compute_episode_stats", None)
     if original is not compute_stats.compute_episode_stats:

@@ -1,5 +1,6 @@
 """From the configuration to running environments; the simulator is imported here, on first use."""
 
+from collections.abc import Callable
 from functools import partial
 from typing import TYPE_CHECKING
 
@@ -45,16 +46,21 @@ def make_episodes(config: VtRefineEnvConfig, num_envs: int) -> Episodes:
     return Episodes(make_simulation(config, num_envs), ablation, log)
 
 
-def make_vector_env(config: VtRefineEnvConfig, num_envs: int, use_async: bool) -> gym.vector.VectorEnv:
+def make_vector_env(
+    config: VtRefineEnvConfig, num_envs: int, use_async: bool
+) -> gym.vector.VectorEnv | _LazyAsyncVectorEnv:
     """The native batched environment, or Gymnasium's sync or async one around single environments."""
     from lerobot_vtrefine.envs.single_env import VtRefineEnv
     from lerobot_vtrefine.envs.vector_env import VtRefineVectorEnv
 
     if config.vectorization == "native":
         return VtRefineVectorEnv(config, num_envs)
-    makers = [partial(VtRefineEnv, config, position, num_envs) for position in range(num_envs)]
+    makers: list[Callable[[], gym.Env]] = [
+        partial(VtRefineEnv, config, position, num_envs) for position in range(num_envs)
+    ]
     if use_async and num_envs > 1:
         env = VtRefineEnv(config)
+        # LeRobot's own stand-in for a vector env: worker processes start at the first reset.
         return _LazyAsyncVectorEnv(makers, env.observation_space, env.action_space, env.metadata)
     frozen = [freeze_after_episode_end(make) for make in makers]
     return gym.vector.SyncVectorEnv(frozen, autoreset_mode=AutoresetMode.NEXT_STEP)

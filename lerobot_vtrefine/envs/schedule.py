@@ -20,7 +20,8 @@ class ReadSchedule:
     def __post_init__(self) -> None:
         if not 1 <= self.window <= self.every:
             raise ValueError(
-                f"read_window must lie in 1..read_every, got read_window={self.window}, read_every={self.every}"
+                f"read_window must lie in 1..read_every: got read_window={self.window},"
+                f" read_every={self.every}"
             )
 
     def reads(self, steps: np.ndarray) -> np.ndarray:

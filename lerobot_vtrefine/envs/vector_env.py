@@ -5,10 +5,11 @@ from typing import Any, SupportsIndex, overload
 
 import gymnasium as gym
 import numpy as np
+from gymnasium.utils.seeding import np_random
 from gymnasium.vector import AutoresetMode
 from gymnasium.vector.utils import batch_space
 
-from lerobot_vtrefine.datasets.features import raw_to_env_observation
+from lerobot_vtrefine.datasets.features import NUM_JOINTS, raw_to_env_observation
 from lerobot_vtrefine.envs.config import VtRefineEnvConfig
 from lerobot_vtrefine.envs.episodes import Array, Episodes, Transition
 from lerobot_vtrefine.envs.factory import make_episodes
@@ -78,10 +79,9 @@ class VtRefineVectorEnv(gym.vector.VectorEnv[Observation, Array, Array]):
 
     def step(self, actions: Array) -> tuple[Observation, Array, Array, Array, dict[str, Any]]:
         """One control step with absolute joint targets (n, 16) in rad and m."""
-        if np.shape(actions) != (self.num_envs, *self.single_action_space.shape):
+        if np.shape(actions) != (self.num_envs, NUM_JOINTS):
             raise ValueError(
-                f"actions must have shape ({self.num_envs}, {self.single_action_space.shape[0]}),"
-                f" got {np.shape(actions)}"
+                f"actions must have shape ({self.num_envs}, {NUM_JOINTS}), got {np.shape(actions)}"
             )
         if not self.episodes.raw:
             raise gym.error.ResetNeeded("call reset() before step()")
@@ -127,7 +127,7 @@ class VtRefineVectorEnv(gym.vector.VectorEnv[Observation, Array, Array]):
         if seed is None or isinstance(seed, int | np.integer):
             if seed is None:
                 return self.np_random.integers(SEED_LIMIT, size=self.num_envs)
-            self._np_random, self._np_random_seed = gym.utils.seeding.np_random(int(seed))
+            self._np_random, self._np_random_seed = np_random(int(seed))
             return int(seed) + np.arange(self.num_envs)
         if len(seed) != self.num_envs:
             raise ValueError(f"got {len(seed)} seeds for {self.num_envs} environments")

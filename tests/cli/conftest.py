@@ -11,7 +11,8 @@ TINY_ENV = (
     "--env.start=grasped",
     "--env.episode_steps=30",
     "--env.num_threads=1",
-    "--env.scene.camera={width: 16, height: 12, fov_y_rad: 0.384, position_m: [-0.44, 0.0, 0.42], target_m: [0.0, 0.0, 0.145]}",
+    "--env.scene.camera={width: 16, height: 12, fov_y_rad: 0.384, position_m: [-0.44, 0.0, 0.42],"
+    " target_m: [0.0, 0.0, 0.145]}",
 )
 """Flags of a task that is quick to simulate."""
 

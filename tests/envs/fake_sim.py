@@ -16,7 +16,7 @@ class FakeResult:
 
 
 class FakeSim:
-    """As ``InsertionSim``; the episode of ``seed`` succeeds after ``3 + seed % 5`` steps, odd seeds never do."""
+    """As ``InsertionSim``; even seeds succeed after ``3 + seed % 5`` steps, odd ones never."""
 
     noise_level = 3.0
     privileged_names = ("time", "seed")

@@ -47,6 +47,10 @@ def read(root: Path) -> LeRobotDataset:
     return LeRobotDataset("local/demo", root=root)
 
 
+def raise_full(*args, **kwargs):
+    raise OSError(errno.ENOSPC, "No space left on device")
+
+
 @pytest.fixture
 def small_commits(monkeypatch: pytest.MonkeyPatch):
     monkeypatch.setattr(demo_dataset, "COMMIT_EVERY", 2)
@@ -112,19 +116,17 @@ def test_seeds_are_kept_beside_the_dataset_and_never_in_info(tmp_path):
 )
 def test_full_disk_keeps_what_was_committed(tmp_path, small_commits, monkeypatch, where):
     root = tmp_path / "demo"
-    recording = open_recording(root)
-    with pytest.raises(OSError, match="4 episodes saved .* stay readable"), recording as demos:
-        for seed in range(5):
-            demos.append(demonstration(seed))
+    monkeypatch.setattr(demo_dataset, "IMAGE_WRITER_THREADS", 0)
 
-        def full(*args, **kwargs):
-            raise OSError(errno.ENOSPC, "No space left on device")
-
-        with monkeypatch.context() as broken:
-            broken.setattr(where, full)
-            broken.setattr(demo_dataset, "IMAGE_WRITER_THREADS", 0)
-            demos._dataset.writer.stop_image_writer()
+    def record() -> None:
+        with open_recording(root) as demos, monkeypatch.context() as broken:
+            for seed in range(5):
+                demos.append(demonstration(seed))
+            broken.setattr(where, raise_full)
             demos.append(demonstration(5))
+
+    with pytest.raises(OSError, match=r"4 episodes saved .* stay readable"):
+        record()
     assert read(root).num_episodes == 4
     assert len([read(root)[index] for index in range(12)]) == 12
     with open_recording(root) as demos:
@@ -148,18 +150,19 @@ def test_a_killed_recording_continues_from_its_last_commit(tmp_path, small_commi
 
 
 def test_interrupt_while_simulating_keeps_every_saved_episode(tmp_path):
-    with pytest.raises(KeyboardInterrupt), open_recording(tmp_path / "demo") as demos:
-        for seed in range(3):
-            demos.append(demonstration(seed))
-        raise KeyboardInterrupt
+    def record() -> None:
+        with open_recording(tmp_path / "demo") as demos:
+            for seed in range(3):
+                demos.append(demonstration(seed))
+            raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        record()
     assert read(tmp_path / "demo").num_episodes == 3
 
 
 def test_full_disk_before_the_first_commit_leaves_nothing(tmp_path, monkeypatch):
-    def full(*args, **kwargs):
-        raise OSError(errno.ENOSPC, "No space left on device")
-
-    monkeypatch.setattr(LeRobotDataset, "save_episode", full)
+    monkeypatch.setattr(LeRobotDataset, "save_episode", raise_full)
     with pytest.raises(OSError, match="disk is full"), open_recording(tmp_path / "demo") as demos:
         demos.append(demonstration(0))
     assert not (tmp_path / "demo").exists()

@@ -145,7 +145,7 @@ def test_metrics_log_has_a_row_per_episode(make_env, tmp_path):
 
 
 def test_missing_metrics_log_names_the_flag(tmp_path):
-    with pytest.raises(FileNotFoundError, match="--env.metrics_path"):
+    with pytest.raises(FileNotFoundError, match="metrics_path"):
         read_episode_log(tmp_path / "none.jsonl", 0, 1)
 
 
