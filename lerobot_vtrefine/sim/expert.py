@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
+from lerobot_vtrefine.embodiments import Fingers
 from lerobot_vtrefine.sim.demonstrations import Degradation, EpisodeErrors
 from lerobot_vtrefine.sim.ik import hand_poses, solve_hands
 from lerobot_vtrefine.sim.poses import Poses, rotation_vector
@@ -70,6 +71,7 @@ CARRY_M = 0.040  # the plug is carried this high above the mouth
 STANDOFF_M = 0.006  # and aligned this high above it
 PRESS_M = 0.008  # a blocked plug is pushed as if it should be this much lower: a few newtons
 BOTTOM_M = 0.0005  # a seated plug is pushed this far beyond its seat
+TABLE_GAP_M = 0.003  # between fingertips and table
 TURN_M_PER_RAD = 0.1  # a turn takes as long as this way
 
 
@@ -257,12 +259,25 @@ class ScriptedExpert:
 
 def _grasps(sim: "InsertionSim") -> tuple[Poses, Array]:
     """Hands in their parts' frames (2,), and the openings commanded to hold them (2,) [m]."""
-    pair, grasped = sim.scene.pair, sim.config.grasped
-    left = ideal_hand(pair.socket, np.pi / 2, grasped.left_pitch_rad)
-    right = ideal_hand(pair.plug, -np.pi / 2, grasped.right_pitch_rad)
+    pair, grasped, fingers = sim.scene.pair, sim.config.grasped, sim.scene.embodiment.fingers
+    pitches = [grasped.left_pitch_rad, grasped.right_pitch_rad]
+    if sim.scene.config.start == "table":
+        heights = [part.rest_height_m + part.grip.centre_m[2] for part in (pair.socket, pair.plug)]
+        pitches = [_pitch_above_table(fingers, *item) for item in zip(pitches, heights, strict=True)]
+    left = ideal_hand(pair.socket, np.pi / 2, pitches[LEFT])
+    right = ideal_hand(pair.plug, -np.pi / 2, pitches[RIGHT])
     hands = Poses(np.stack([left[0], right[0]]), np.stack([left[1], right[1]]))
     width = np.array([pair.socket.grip.half_size_m[0], pair.plug.grip.half_size_m[0]])
-    return hands, np.maximum(width + sim.scene.embodiment.fingers.face_offset_m - grasped.squeeze_m, 0.0)
+    return hands, np.maximum(width + fingers.face_offset_m - grasped.squeeze_m, 0.0)
+
+
+def _pitch_above_table(fingers: Fingers, pitch_rad: float, height_m: float) -> float:
+    """Largest pitch up to `pitch_rad` at which fingertips of a hand at `height_m` stay above the table."""
+    length, width, _ = fingers.pad_size_m
+    pitches = np.linspace(pitch_rad, 0.0, 50)
+    lowest = height_m - (length * np.sin(pitches) + width * np.cos(pitches)) / 2
+    clear = np.flatnonzero(lowest >= TABLE_GAP_M)
+    return float(pitches[clear[0]] if len(clear) else 0.0)
 
 
 def _stations(sim: "InsertionSim") -> Poses:
