@@ -1,4 +1,5 @@
-"""The tactile sensor as mathematics: pad layout, contact geometry, and the sensor model from contact to raw counts.
+"""The tactile sensor as mathematics: pad layout, contact geometry, and the sensor model from contact to raw
+counts.
 
 Importing it does not import warp; the first use of `PadSensors` does.
 """

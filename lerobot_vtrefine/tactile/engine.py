@@ -1,4 +1,5 @@
-"""From poses to force per taxel: geometry query, the model's depth stages, and its contact law. Imports warp."""
+"""From poses to force per taxel: geometry query, the model's depth stages, and its contact law. Imports
+warp."""
 
 from collections.abc import Sequence
 
@@ -35,7 +36,8 @@ class ContactEngine:
     def __call__(
         self, contact: ContactStage, poses: Sequence[torch.Tensor], load: torch.Tensor | None, frame: Frame
     ) -> torch.Tensor:
-        """Force per taxel (m, P, R, C) [N] for `contact` with its parameters' values; poses as `ContactQuery` takes them."""
+        """Force per taxel (m, P, R, C) [N] for `contact` with its parameters' values; poses as
+        `ContactQuery` takes them."""
         depth, rate = self._query(self._mode, *poses, load=load if self._solver else None)
         on_lattice = Frame(layout=self._lattice, dt_s=frame.dt_s, time_s=frame.time_s)
         for stage in self._depth_stages:

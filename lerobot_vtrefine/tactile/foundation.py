@@ -37,11 +37,13 @@ class FoundationSolver:
         damping_s: float,
         window: wp.array,
     ) -> tuple[torch.Tensor, torch.Tensor]:
-        """Taxel forces (m, P, R, C) [N] and the face's (delta [m], slope x, slope y) (m, P, 3); reused buffers.
+        """Taxel forces (m, P, R, C) [N] and the face's (delta [m], slope x, slope y) (m, P, 3); reused
+        buffers.
 
         Args:
             height, rate: (m, P, R*s, C*s) column heights [m] and their rates [m/s] on the finer lattice.
-            load: (m, P, 3) normal force [N] and its centre x, y [m]. Forces add up to it, and balance at its centre when
+            load: (m, P, 3) normal force [N] and its centre x, y [m]. Forces add up to it, and balance at its
+                centre when
                 the body can be pressed on around it.
             stiffness_n_per_m: (m,) stiffness of one whole taxel.
             damping_s: viscous lead, the ratio of damping to stiffness [s].

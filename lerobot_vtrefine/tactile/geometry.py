@@ -152,7 +152,8 @@ class TriangleMesh:
 
 @dataclass(frozen=True, eq=False)
 class ConvexHull:
-    """Convex solid given by a closed triangle mesh: vertices (V, 3) [m], faces (F, 3), in the body's frame."""
+    """Convex solid given by a closed triangle mesh: vertices (V, 3) [m], faces (F, 3), in the body's
+    frame."""
 
     vertices: np.ndarray
     faces: np.ndarray

@@ -2,10 +2,14 @@
 
 Shape legend: m environments, P pads, B bodies, K primitives, Q planes, N lattice points; float32 [m, m/s].
 
-`prepare` brings every primitive into reach of a pad and reduces convex ones to the few planes that matter there, as
-functions affine in the lattice's x and y; `query_primitives` evaluates them; `raster_meshes` projects triangles on the
+`prepare` brings every primitive into reach of a pad and reduces convex ones to the few planes that matter
+there, as
+functions affine in the lattice's x and y; `query_primitives` evaluates them; `raster_meshes` projects
+triangles on the
 lattice and `resolve_meshes` turns the winners into depths.
 """
+
+# ruff: noqa: UP018, RUF046  (in kernels, float(0.0) and wp.int32(...) declare variables that loops may change)
 
 import warp as wp
 
@@ -24,6 +28,68 @@ TRIANGLE_BITS = wp.constant(24)
 
 ivec2 = wp.types.vector(length=2, dtype=wp.int32)
 ivec4 = wp.types.vector(length=4, dtype=wp.int32)
+
+
+@wp.struct
+class Lattice:
+    """What is asked: CLOSEST or COLUMN on rows x cols points, and the block of them that one thread fills."""
+
+    mode: int
+    rows: int
+    cols: int
+    pitch: float
+    reach: float
+    block_rows: int
+    block_cols: int
+    skip_unloaded: int
+
+
+@wp.struct
+class Poses:
+    """Poses and velocities of pads (m, P) and bodies (m, B), and the load on each pad."""
+
+    pad_pos: wp.array(dtype=wp.vec3, ndim=2)
+    pad_rot: wp.array(dtype=wp.mat33, ndim=2)
+    pad_vel: wp.array(dtype=wp.spatial_vector, ndim=2)
+    body_pos: wp.array(dtype=wp.vec3, ndim=2)
+    body_rot: wp.array(dtype=wp.mat33, ndim=2)
+    body_vel: wp.array(dtype=wp.spatial_vector, ndim=2)
+    load: wp.array(dtype=wp.vec3, ndim=2)
+
+
+@wp.struct
+class Bodies:
+    """`packing.PackedBodies` on the device, and the meshes' handles per primitive."""
+
+    owner: wp.array(dtype=int)
+    kind: wp.array(dtype=int)
+    position: wp.array(dtype=wp.vec3)
+    rotation: wp.array(dtype=wp.mat33)
+    extent: wp.array(dtype=wp.vec3)
+    plane_start: wp.array(dtype=int)
+    planes: wp.array(dtype=wp.vec4)
+    corners: wp.array(dtype=wp.vec3)
+    triangle_owner: wp.array(dtype=int)
+    cluster_start: wp.array(dtype=int)
+    cluster_owner: wp.array(dtype=int)
+    cluster_centre: wp.array(dtype=wp.vec3)
+    cluster_half: wp.array(dtype=wp.vec3)
+    mesh: wp.array(dtype=wp.uint64)
+
+
+@wp.struct
+class Views:
+    """Every pad as each primitive sees it (m, P, K), and the convex primitives' planes that matter there (m,
+    P, Q)."""
+
+    origin: wp.array(dtype=wp.vec3, ndim=3)
+    axes: wp.array(dtype=wp.mat33, ndim=3)
+    linear: wp.array(dtype=wp.vec3, ndim=3)
+    angular: wp.array(dtype=wp.vec3, ndim=3)
+    window: wp.array(dtype=ivec4, ndim=3)
+    counts: wp.array(dtype=ivec2, ndim=3)
+    forms: wp.array(dtype=wp.vec4, ndim=3)
+    rates: wp.array(dtype=wp.vec4, ndim=3)
 
 
 @wp.func
@@ -51,7 +117,8 @@ def sphere_closest(p: wp.vec3, extent: wp.vec3) -> wp.vec4:
 
 @wp.func
 def cylinder_column(p: wp.vec3, e: wp.vec3, extent: wp.vec3) -> wp.vec4:
-    """Where the line p + s e enters a cylinder: (s, normal there); s = FAR_M where it misses or lies behind p."""
+    """Where the line p + s e enters a cylinder: (s, normal there); s = FAR_M where it misses or lies behind
+    p."""
     enter = float(-FAR_M)
     leave = float(FAR_M)
     normal = wp.vec3(0.0, 0.0, 0.0)
@@ -88,7 +155,8 @@ def cylinder_column(p: wp.vec3, e: wp.vec3, extent: wp.vec3) -> wp.vec4:
 
 @wp.func
 def sphere_column(p: wp.vec3, e: wp.vec3, extent: wp.vec3) -> wp.vec4:
-    """Where the line p + s e enters a sphere: (s, normal there); s = FAR_M where it misses or lies behind p."""
+    """Where the line p + s e enters a sphere: (s, normal there); s = FAR_M where it misses or lies behind
+    p."""
     b = wp.dot(p, e)
     across = p - b * e
     disc = extent[0] * extent[0] - wp.dot(across, across)
@@ -115,12 +183,14 @@ def end_index(x: float, pitch: float, count: int) -> int:
 
 @wp.func
 def coordinate(index: int, pitch: float, count: int) -> float:
+    """Position of a lattice index, from the lattice's centre."""
     return (float(index) - 0.5 * float(count - 1)) * pitch
 
 
 @wp.func
 def plane_form(mode: int, plane: wp.vec4, origin: wp.vec3, ex: wp.vec3, ey: wp.vec3, ez: wp.vec3) -> wp.vec4:
-    """A plane as (c0, cx, cy, slope): gap (CLOSEST) or s where a column crosses it (COLUMN) = c0 + cx x + cy y."""
+    """A plane as (c0, cx, cy, slope): gap (CLOSEST) or s where a column crosses it (COLUMN) = c0 + cx x + cy
+    y."""
     n = wp.vec3(plane[0], plane[1], plane[2])
     form = wp.vec4(plane[3] - wp.dot(n, origin), -wp.dot(n, ex), -wp.dot(n, ey), wp.dot(n, ez))
     if mode == COLUMN:
@@ -144,114 +214,65 @@ def highest(form: wp.vec4, box: wp.vec4) -> float:
 
 
 @wp.func
-def rate_form(
-    mode: int,
-    n: wp.vec3,
-    slope: float,
-    ex: wp.vec3,
-    ey: wp.vec3,
-    ez: wp.vec3,
-    linear: wp.vec3,
-    angular: wp.vec3,
-) -> wp.vec4:
+def column(matrix: wp.mat33, k: int) -> wp.vec3:
+    """Column k of a matrix."""
+    return wp.vec3(matrix[0, k], matrix[1, k], matrix[2, k])
+
+
+@wp.func
+def rate_form(mode: int, n: wp.vec3, axes: wp.mat33, linear: wp.vec3, angular: wp.vec3) -> wp.vec4:
     """Rate of depth at a surface with normal n, as (r0, rx, ry, rs) for x, y and s."""
-    turned = wp.cross(n, angular)
     factor = float(-1.0)
     if mode == COLUMN:
-        factor = -1.0 / -wp.min(slope, STEEPEST)
-    return factor * wp.vec4(wp.dot(n, linear), wp.dot(turned, ex), wp.dot(turned, ey), wp.dot(turned, ez))
+        factor = 1.0 / wp.min(wp.dot(n, column(axes, 2)), STEEPEST)
+    turned = wp.transpose(axes) * wp.cross(n, angular)
+    return factor * wp.vec4(wp.dot(n, linear), turned[0], turned[1], turned[2])
 
 
-@wp.kernel
-def prepare(
-    mode: int,
-    rows: int,
-    cols: int,
-    pitch: float,
-    reach: float,
-    skip_unloaded: int,
-    load: wp.array(dtype=wp.vec3, ndim=2),
-    pad_pos: wp.array(dtype=wp.vec3, ndim=2),
-    pad_rot: wp.array(dtype=wp.mat33, ndim=2),
-    pad_vel: wp.array(dtype=wp.spatial_vector, ndim=2),
-    body_pos: wp.array(dtype=wp.vec3, ndim=2),
-    body_rot: wp.array(dtype=wp.mat33, ndim=2),
-    body_vel: wp.array(dtype=wp.spatial_vector, ndim=2),
-    owner: wp.array(dtype=int),
-    position: wp.array(dtype=wp.vec3),
-    rotation: wp.array(dtype=wp.mat33),
-    extent: wp.array(dtype=wp.vec3),
-    plane_start: wp.array(dtype=int),
-    planes: wp.array(dtype=wp.vec4),
-    origin_out: wp.array(dtype=wp.vec3, ndim=3),
-    axes_out: wp.array(dtype=wp.mat33, ndim=3),
-    linear_out: wp.array(dtype=wp.vec3, ndim=3),
-    angular_out: wp.array(dtype=wp.vec3, ndim=3),
-    window: wp.array(dtype=ivec4, ndim=3),
-    counts: wp.array(dtype=ivec2, ndim=3),
-    forms: wp.array(dtype=wp.vec4, ndim=3),
-    rates: wp.array(dtype=wp.vec4, ndim=3),
-):
-    """Pad frame and relative velocity in each primitive's frame, its lattice window, and its planes that matter."""
-    env, pad, k = wp.tid()
-    window[env, pad, k] = ivec4(0, 0, 0, 0)
-    if skip_unloaded != 0:
-        if load[env, pad][0] <= 0.0:
-            return
-    body = owner[k]
-    to_body = wp.transpose(body_rot[env, body])
-    from_body = pad_pos[env, pad] - body_pos[env, body]
-    to_primitive = wp.transpose(rotation[k])
-    origin = to_primitive * (to_body * from_body - position[k])
-    half = extent[k]
-    to_frame = to_primitive * to_body
-    axes = to_frame * pad_rot[env, pad]
-    ez = wp.vec3(axes[0, 2], axes[1, 2], axes[2, 2])
-    above = -wp.dot(origin, ez)
-    thickness = wp.dot(wp.abs(ez), half)
-    margin = float(0.0)
-    if mode == COLUMN:
-        margin = reach
-    if above - thickness > margin or above + thickness < 0.0:
-        return
-    ex = wp.vec3(axes[0, 0], axes[1, 0], axes[2, 0])
-    ey = wp.vec3(axes[0, 1], axes[1, 1], axes[2, 1])
-    centre_x = -wp.dot(origin, ex)
-    centre_y = -wp.dot(origin, ey)
-    radius_x = wp.dot(wp.abs(ex), half)
-    radius_y = wp.dot(wp.abs(ey), half)
-    row0 = first_index(centre_y - radius_y, pitch, rows)
-    row1 = end_index(centre_y + radius_y, pitch, rows)
-    col0 = first_index(centre_x - radius_x, pitch, cols)
-    col1 = end_index(centre_x + radius_x, pitch, cols)
-    if row0 >= row1 or col0 >= col1:
-        return
-    body_angular = wp.spatial_bottom(body_vel[env, body])
-    pad_linear = wp.spatial_top(pad_vel[env, pad]) - wp.spatial_top(body_vel[env, body])
-    linear = to_frame * (pad_linear - wp.cross(body_angular, from_body))
-    angular = to_frame * (wp.spatial_bottom(pad_vel[env, pad]) - body_angular)
-    window[env, pad, k] = ivec4(row0, row1, col0, col1)
-    origin_out[env, pad, k] = origin
-    axes_out[env, pad, k] = axes
-    linear_out[env, pad, k] = linear
-    angular_out[env, pad, k] = angular
-    first = plane_start[k]
-    last = plane_start[k + 1]
-    if first == last:
-        return
-    box = wp.vec4(
-        coordinate(col0, pitch, cols),
-        coordinate(col1 - 1, pitch, cols),
-        coordinate(row0, pitch, rows),
-        coordinate(row1 - 1, pitch, rows),
+@wp.func
+def lattice_window(lattice: Lattice, origin: wp.vec3, axes: wp.mat33, half: wp.vec3) -> ivec4:
+    """Rows and columns (begin, end, begin, end) over which a bounding box stands; empty when out of reach."""
+    centre = -(wp.transpose(axes) * origin)
+    magnitude = wp.transpose(wp.matrix_from_rows(wp.abs(axes[0]), wp.abs(axes[1]), wp.abs(axes[2])))
+    radius = magnitude * half
+    margin = lattice.reach * float(lattice.mode)
+    if centre[2] - radius[2] > margin or centre[2] + radius[2] < 0.0:
+        return ivec4(0, 0, 0, 0)
+    area = ivec4(
+        first_index(centre[1] - radius[1], lattice.pitch, lattice.rows),
+        end_index(centre[1] + radius[1], lattice.pitch, lattice.rows),
+        first_index(centre[0] - radius[0], lattice.pitch, lattice.cols),
+        end_index(centre[0] + radius[0], lattice.pitch, lattice.cols),
     )
-    # Bounds over the window: only planes that can decide the entry (the gap), or cut it off, are kept.
+    if area[0] >= area[1] or area[2] >= area[3]:
+        return ivec4(0, 0, 0, 0)
+    return area
+
+
+@wp.func
+def keep_planes(lattice: Lattice, bodies: Bodies, views: Views, env: int, pad: int, k: int) -> None:
+    """Store the planes of a convex primitive that can decide the entry (the gap) in its window, or cut it
+    off."""
+    area = views.window[env, pad, k]
+    box = wp.vec4(
+        coordinate(area[2], lattice.pitch, lattice.cols),
+        coordinate(area[3] - 1, lattice.pitch, lattice.cols),
+        coordinate(area[0], lattice.pitch, lattice.rows),
+        coordinate(area[1] - 1, lattice.pitch, lattice.rows),
+    )
+    origin = views.origin[env, pad, k]
+    axes = views.axes[env, pad, k]
+    ex = column(axes, 0)
+    ey = column(axes, 1)
+    ez = column(axes, 2)
+    first = bodies.plane_start[k]
+    last = bodies.plane_start[k + 1]
     enter_low = float(-FAR_M)
     enter_high = float(-FAR_M)
     gap_high = float(FAR_M)
     for q in range(first, last):
-        form = plane_form(mode, planes[q], origin, ex, ey, ez)
-        if mode == CLOSEST:
+        form = plane_form(lattice.mode, bodies.planes[q], origin, ex, ey, ez)
+        if lattice.mode == CLOSEST:
             gap_high = wp.min(gap_high, highest(form, box))
         elif form[3] < 0.0:
             enter_low = wp.max(enter_low, lowest(form, box))
@@ -259,17 +280,50 @@ def prepare(
     enters = int(0)
     leaves = int(0)
     for q in range(first, last):
-        form = plane_form(mode, planes[q], origin, ex, ey, ez)
-        n = wp.vec3(planes[q][0], planes[q][1], planes[q][2])
+        plane = bodies.planes[q]
+        form = plane_form(lattice.mode, plane, origin, ex, ey, ez)
         keep = lowest(form, box) <= gap_high
-        if mode == COLUMN:
+        if lattice.mode == COLUMN:
             keep = form[3] < 0.0 and highest(form, box) >= enter_low
         if keep:
-            forms[env, pad, first + enters] = form
-            rates[env, pad, first + enters] = rate_form(mode, n, form[3], ex, ey, ez, linear, angular)
+            n = wp.vec3(plane[0], plane[1], plane[2])
+            views.forms[env, pad, first + enters] = form
+            views.rates[env, pad, first + enters] = rate_form(
+                lattice.mode, n, axes, views.linear[env, pad, k], views.angular[env, pad, k]
+            )
             enters += 1
-        elif mode == COLUMN and form[3] > 0.0:
-            if lowest(form, box) < wp.max(enter_high, 0.0):
-                leaves += 1
-                forms[env, pad, last - leaves] = form
-    counts[env, pad, k] = ivec2(enters, leaves)
+        elif lattice.mode == COLUMN and form[3] > 0.0 and lowest(form, box) < wp.max(enter_high, 0.0):
+            leaves += 1
+            views.forms[env, pad, last - leaves] = form
+    views.counts[env, pad, k] = ivec2(enters, leaves)
+
+
+@wp.kernel
+def prepare(lattice: Lattice, poses: Poses, bodies: Bodies, views: Views) -> None:
+    """Pad frame and relative velocity in each primitive's frame, its lattice window, and its planes that
+    matter."""
+    env, pad, k = wp.tid()
+    views.window[env, pad, k] = ivec4(0, 0, 0, 0)
+    if lattice.skip_unloaded != 0 and poses.load[env, pad][0] <= 0.0:
+        return
+    body = bodies.owner[k]
+    to_body = wp.transpose(poses.body_rot[env, body])
+    from_body = poses.pad_pos[env, pad] - poses.body_pos[env, body]
+    to_primitive = wp.transpose(bodies.rotation[k])
+    to_frame = to_primitive * to_body
+    origin = to_primitive * (to_body * from_body - bodies.position[k])
+    axes = to_frame * poses.pad_rot[env, pad]
+    area = lattice_window(lattice, origin, axes, bodies.extent[k])
+    if area[0] >= area[1]:
+        return
+    body_velocity = poses.body_vel[env, body]
+    pad_velocity = poses.pad_vel[env, pad]
+    turning = wp.spatial_bottom(body_velocity)
+    linear = wp.spatial_top(pad_velocity) - wp.spatial_top(body_velocity) - wp.cross(turning, from_body)
+    views.window[env, pad, k] = area
+    views.origin[env, pad, k] = origin
+    views.axes[env, pad, k] = axes
+    views.linear[env, pad, k] = to_frame * linear
+    views.angular[env, pad, k] = to_frame * (wp.spatial_bottom(pad_velocity) - turning)
+    if bodies.plane_start[k] < bodies.plane_start[k + 1]:
+        keep_planes(lattice, bodies, views, env, pad, k)

@@ -6,6 +6,8 @@ unknowns are solved so that the forces k u add up to the load and balance at its
 piecewise quadratic function, found by Newton's method.
 """
 
+# ruff: noqa: UP018, RUF046  (in kernels, float(0.0) and wp.int32(...) declare variables that loops may change)
+
 import warp as wp
 
 from lerobot_vtrefine.tactile.kernels import coordinate, ivec4
@@ -101,7 +103,7 @@ def offset_for_sum(
     its first step leads to that side from anywhere.
     """
     trial = tilted
-    for step in range(32):
+    for _step in range(32):
         here = balance(pad, stride, depth, rate, trial)
         if here.hessian[0, 0] < wp.float64(1.0):
             trial[0] = trial[0] + wp.float64(1.0e-3)
@@ -134,6 +136,7 @@ def newton_step(h: mat33d, g: wp.vec3d) -> wp.vec3d:
 
 @wp.func
 def limited(trial: wp.vec3d, limit: wp.float64) -> wp.vec3d:
+    """The trial with both tilts within +-limit."""
     return wp.vec3d(trial[0], wp.clamp(trial[1], -limit, limit), wp.clamp(trial[2], -limit, limit))
 
 
@@ -175,7 +178,7 @@ def solve_balance(
 
 
 @wp.func
-def spread_load(rows: int, cols: int, pitch: float, load: wp.vec3, force: wp.array(dtype=float)):
+def spread_load(rows: int, cols: int, pitch: float, load: wp.vec3, force: wp.array(dtype=float)) -> None:
     """Where no body stands over the lattice, share the load among the four taxels next to its centre."""
     x = wp.clamp(load[1] / pitch + 0.5 * float(cols - 1), 0.0, float(cols - 1))
     y = wp.clamp(load[2] / pitch + 0.5 * float(rows - 1), 0.0, float(rows - 1))
@@ -200,7 +203,7 @@ def write_forces(
     answer: wp.vec3d,
     total: wp.float64,
     force: wp.array(dtype=float),
-):
+) -> None:
     """Forces of a solution, times what single precision left between their sum and the load."""
     here = balance(pad, 1, depth, rate, answer)
     factor = stiffness * wp.float32(total / here.sums[0])
@@ -219,10 +222,36 @@ def write_forces(
                 force[out + col / pad.subdivision] += factor * u
 
 
+@wp.func
+def contact_area(rows: int, cols: int, window: wp.array(dtype=ivec4)) -> ivec4:
+    """Smallest block of the lattice that holds all primitives' areas; empty (begin >= end) when there are none."""
+    area = ivec4(rows, 0, cols, 0)
+    for k in range(window.shape[0]):
+        other = window[k]
+        if other[0] < other[1]:
+            area = ivec4(
+                wp.min(area[0], other[0]),
+                wp.max(area[1], other[1]),
+                wp.min(area[2], other[2]),
+                wp.max(area[3], other[3]),
+            )
+    return area
+
+
+@wp.func
+def highest_point(pad: Pad, depth: wp.array(dtype=float)) -> float:
+    """Largest height in the pad's area; -1 m when no body stands over it."""
+    best = float(-1.0)
+    for row in range(pad.area[0], pad.area[1]):
+        for col in range(pad.area[2], pad.area[3]):
+            best = wp.max(best, depth[row * pad.cols + col])
+    return best
+
+
 @wp.kernel
 def solve_foundation(
-    rows: int,
-    cols: int,
+    pad_rows: int,
+    pad_cols: int,
     subdivision: int,
     pitch: float,
     damping_s: float,
@@ -233,8 +262,8 @@ def solve_foundation(
     rate: wp.array(dtype=float, ndim=3),
     force: wp.array(dtype=float, ndim=3),
     solution: wp.array(dtype=wp.vec3, ndim=2),
-):
-    """Forces [N] on rows x cols taxels from heights on the lattice that is finer by `subdivision`.
+) -> None:
+    """Forces [N] on pad_rows x pad_cols taxels from heights on the lattice that is finer by `subdivision`.
 
     `stiffness` is that of one lattice point, per environment [N/m]; `window` holds the lattice areas of the primitives
     in reach; `force` must come in as zero; `solution` gets (delta [m], slope x, slope y).
@@ -245,36 +274,22 @@ def solve_foundation(
     if push[0] <= 0.0:
         return
     pad = Pad()
-    pad.rows = rows * subdivision
-    pad.cols = cols * subdivision
+    pad.rows = pad_rows * subdivision
+    pad.cols = pad_cols * subdivision
     pad.subdivision = subdivision
     pad.damping_s = damping_s
-    area = ivec4(pad.rows, 0, pad.cols, 0)
-    for k in range(window.shape[2]):
-        other = window[env, side, k]
-        if other[0] < other[1]:
-            area = ivec4(
-                wp.min(area[0], other[0]),
-                wp.max(area[1], other[1]),
-                wp.min(area[2], other[2]),
-                wp.max(area[3], other[3]),
-            )
-    pad.area = area
+    pad.area = contact_area(pad.rows, pad.cols, window[env, side])
     heights = depth[env, side]
     rates = rate[env, side]
-    highest = float(-1.0)
-    for row in range(area[0], area[1]):
-        for col in range(area[2], area[3]):
-            highest = wp.max(highest, heights[row * pad.cols + col])
-    if highest <= -0.5:
-        spread_load(rows, cols, pitch, push, force[env, side])
+    top = highest_point(pad, heights)
+    if top <= -0.5:
+        spread_load(pad_rows, pad_cols, pitch, push, force[env, side])
         return
     total = wp.float64(push[0]) / wp.float64(stiffness[env])
     scale = wp.float64(1.0) / wp.float64(pitch)
     target = wp.vec3d(total, total * wp.float64(push[1]) * scale, total * wp.float64(push[2]) * scale)
     limit = wp.float64(MAX_TILT * pitch)
-    zero = wp.float64(0.0)
-    answer = wp.vec3d(wp.float64(1.0e-3 - highest), zero, zero)
+    answer = wp.vec3d(wp.float64(1.0e-3 - top), wp.float64(0.0), wp.float64(0.0))
     if subdivision > 1:
         # Every taxel's first point alone leads close to the answer at a fraction of the cost.
         share = wp.float64(1.0) / wp.float64(subdivision * subdivision)
@@ -283,6 +298,5 @@ def solve_foundation(
     answer = offset_for_sum(pad, 1, heights, rates, answer, total)
     answer = solve_balance(pad, 1, heights, rates, answer, target, limit)
     write_forces(pad, stiffness[env], heights, rates, answer, total, force[env, side])
-    solution[env, side] = wp.vec3(
-        wp.float32(answer[0]), wp.float32(answer[1] * scale), wp.float32(answer[2] * scale)
-    )
+    slopes = wp.vec3d(answer[0], answer[1] * scale, answer[2] * scale)
+    solution[env, side] = wp.vec3(slopes)

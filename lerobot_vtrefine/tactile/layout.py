@@ -12,7 +12,8 @@ FLATNESS_TOLERANCE_M = 5e-5
 class PadLayout:
     """A lattice of rows x cols taxels on a flat face.
 
-    The pad frame has its origin at the centre of the undeformed face, +x along increasing column, +y along increasing
+    The pad frame has its origin at the centre of the undeformed face, +x along increasing column, +y along
+    increasing
     row and +z outward. Taxel (r, c) sits at ((c - (C-1)/2) pitch, (r - (R-1)/2) pitch, 0).
     """
 
@@ -65,7 +66,8 @@ class PadLayout:
 def _ray_hits(
     origins: np.ndarray, direction: np.ndarray, triangles: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Nearest hit of parallel rays on triangles (Moeller-Trumbore): distance (N,), inf where none, and triangle (N,)."""
+    """Nearest hit of parallel rays on triangles (Moeller-Trumbore): distance (N,), inf where none, and
+    triangle (N,)."""
     a, edge1, edge2 = triangles[:, 0], triangles[:, 1] - triangles[:, 0], triangles[:, 2] - triangles[:, 0]
     p = np.cross(direction, edge2)
     det = np.einsum("fi,fi->f", edge1, p)
@@ -83,7 +85,8 @@ def _ray_hits(
 
 
 def _face_axes(size: np.ndarray, rows: int, cols: int, outward: np.ndarray) -> np.ndarray:
-    """Pad axes (3, 3, columns x, y, z) in the mesh frame: z outward, columns along the longer side when cols >= rows."""
+    """Pad axes (3, 3, columns x, y, z) in the mesh frame: z outward, columns along the longer side when cols
+    >= rows."""
     thickness = int(np.argmin(size))
     sides = [axis for axis in range(3) if axis != thickness]
     longer = max(sides, key=lambda axis: size[axis])
@@ -95,7 +98,8 @@ def _face_axes(size: np.ndarray, rows: int, cols: int, outward: np.ndarray) -> n
 def _outward_normal(
     vertices: np.ndarray, faces: np.ndarray, axis: int, outward: np.ndarray | None
 ) -> np.ndarray:
-    """The unit normal of the sensing face: the caller's side of the thickness axis, else the side with more flat area."""
+    """The unit normal of the sensing face: the caller's side of the thickness axis, else the side with more
+    flat area."""
     unit = np.eye(3)[axis]
     if outward is not None:
         along = float(np.asarray(outward, dtype=float) @ unit)
@@ -121,7 +125,8 @@ def layout_from_mesh(
 ) -> PadLayout:
     """Find the taxels on a pad's mesh as in the paper's appendix ("Sampling Tactile Points").
 
-    The shortest bounding-box axis is the thickness; a centred lattice of spacing `pitch_m` is laid on the face with at
+    The shortest bounding-box axis is the thickness; a centred lattice of spacing `pitch_m` is laid on the
+    face with at
     least `margin_m` to its edges, and rays along the inward normal put every taxel on the mesh.
 
     Args:
@@ -152,17 +157,19 @@ def layout_from_mesh(
     needed = (np.array([cols, rows]) - 1) * pitch_m + 2 * margin_m
     available = np.abs(axes[:, :2].T @ (high - low))
     if (available + 1e-9 < needed).any():
+        face, need = (" x ".join(f"{side * 1e3:.1f}" for side in size) for size in (available, needed))
         raise ValueError(
-            f"pad mesh face is {available[0] * 1e3:.1f} x {available[1] * 1e3:.1f} mm, but {rows} x {cols} taxels at "
-            f"{pitch_m * 1e3:g} mm with {margin_m * 1e3:g} mm margin need {needed[0] * 1e3:.1f} x {needed[1] * 1e3:.1f} mm"
+            f"pad mesh face is {face} mm, but {rows} x {cols} taxels at {pitch_m * 1e3:g} mm with "
+            f"{margin_m * 1e3:g} mm margin need {need} mm"
         )
     face_centre = (low + high) / 2 + normal * (high - low)[axis] / 2
     starts = layout.positions() @ axes.T + face_centre + normal * (high - low)[axis]
     distance, _ = _ray_hits(starts, -normal, vertices[faces])
     if not np.isfinite(distance).all() or np.ptp(distance) > FLATNESS_TOLERANCE_M:
+        missing = int((~np.isfinite(distance)).sum())
         raise ValueError(
-            f"pad mesh has no flat face under the {rows} x {cols} lattice: "
-            f"{int((~np.isfinite(distance)).sum())} taxels miss it, the others vary in height; flatten the sensing side"
+            f"pad mesh has no flat face under the {rows} x {cols} lattice: {missing} taxels miss it, the others "
+            "vary in height; flatten the sensing side"
         )
     position = face_centre + normal * ((high - low)[axis] - float(distance.mean()))
     return PadLayout(

@@ -19,7 +19,8 @@ NAMED = ("default", "paper")
 class SensorModel:
     """Stages in the order in which they act; exactly one contact stage and one gain.
 
-    Raises ValueError when a stage repeats or the domains are out of order (depth, contact, force, gain, counts).
+    Raises ValueError when a stage repeats or the domains are out of order (depth, contact, force, gain,
+    counts).
     """
 
     stages: tuple[Stage, ...]
@@ -44,7 +45,8 @@ class SensorModel:
 
     @classmethod
     def default(cls) -> "SensorModel":
-        """The simulator's model: load-consistent contact, gain, the row's divider, idle level, noise, 8-bit converter.
+        """The simulator's model: load-consistent contact, gain, the row's divider, idle level, noise, 8-bit
+        converter.
 
         20 N spread over 100 taxels reads about 75 counts above an idle level of 10 to 40.
         """
@@ -52,7 +54,8 @@ class SensorModel:
 
     @classmethod
     def paper(cls) -> "SensorModel":
-        """The paper's model with its printed constants (k_n = 1, k_d = 3e-3), rescaled so that 1 mm fills 8 bits."""
+        """The paper's model with its printed constants (k_n = 1, k_d = 3e-3), rescaled so that 1 mm fills 8
+        bits."""
         return cls((KelvinVoigt(k_n=1.0, k_d=3e-3), Gain(counts_per_n=255e3), Quantisation()))
 
     @classmethod
@@ -92,7 +95,8 @@ class SensorModel:
         return next((stage for stage in self.stages if stage.name == name), None)
 
     def with_stage(self, stage: Stage) -> "SensorModel":
-        """With the stage put at its canonical place, or in place of the one of the same name (or domain, if unique)."""
+        """With the stage put at its canonical place, or in place of the one of the same name (or domain, if
+        unique)."""
         for index, present in enumerate(self.stages):
             unique = stage.domain == present.domain and stage.domain in ("contact", "gain")
             if present.name == stage.name or unique:
@@ -122,7 +126,8 @@ class SensorModel:
 
     @classmethod
     def from_dict(cls, data: dict[str, Any]) -> "SensorModel":
-        """Inverse of `to_dict`; ValueError names the stage or parameter that is unknown, and the valid ones."""
+        """Inverse of `to_dict`; ValueError names the stage or parameter that is unknown, and the valid
+        ones."""
         if (
             not isinstance(data, dict)
             or data.get("schema") != SCHEMA

@@ -20,7 +20,8 @@ def _table(device: str) -> torch.Tensor:
 def noise_frames(seed: torch.Tensor, frame: torch.Tensor, count: int) -> torch.Tensor:
     """Standard normal numbers (..., count) for int64 seeds and frame numbers (...), equal on every device.
 
-    Each frame is a window, at a hashed position, of one fixed table of 2^20 numbers: a gather instead of a generator.
+    Each frame is a window, at a hashed position, of one fixed table of 2^20 numbers: a gather instead of a
+    generator.
     """
     mixed = (seed + frame * _MULTIPLIER) * _MIX
     mixed = mixed ^ ((mixed >> 29) & 0x7FFFFFFFF)

@@ -1,6 +1,7 @@
 """Bodies as the flat arrays that the kernels read."""
 
 from dataclasses import dataclass
+from itertools import pairwise
 
 import numpy as np
 
@@ -19,7 +20,8 @@ MAX_TRIANGLES = 1 << 24
 
 @dataclass(frozen=True, eq=False)
 class PackedBodies:
-    """K primitives, Q planes, T triangles in C clusters; a primitive's frame has its origin at its bounding box's centre."""
+    """K primitives, Q planes, T triangles in C clusters; a primitive's frame has its origin at its bounding
+    box's centre."""
 
     num_bodies: int
     owner: np.ndarray
@@ -51,7 +53,8 @@ class PackedBodies:
 
 
 def split_clusters(centroids: np.ndarray, size: int) -> list[np.ndarray]:
-    """Indices of points (T, 3) in spatially compact groups of at most `size`, by halving along the longest side."""
+    """Indices of points (T, 3) in spatially compact groups of at most `size`, by halving along the longest
+    side."""
     groups, pending = [], [np.arange(len(centroids))]
     while pending:
         group = pending.pop()
@@ -100,7 +103,7 @@ def _pack_triangles(primitives: list[Primitive]) -> dict[str, np.ndarray]:
         )
     boxes = [
         (soup[a:b].reshape(-1, 3).min(axis=0), soup[a:b].reshape(-1, 3).max(axis=0))
-        for a, b in zip(starts[:-1], starts[1:], strict=True)
+        for a, b in pairwise(starts)
     ]
     low, high = (np.array([box[side] for box in boxes]).reshape(-1, 3) for side in (0, 1))
     return {

@@ -41,7 +41,8 @@ def column_heights(
 
 
 def finite_rate(times_s: torch.Tensor, depth_m: torch.Tensor) -> torch.Tensor:
-    """Central differences of depth (T, ..., R, C) over time (T,) [m/s]; frames with equal times share their rate."""
+    """Central differences of depth (T, ..., R, C) over time (T,) [m/s]; frames with equal times share their
+    rate."""
     if len(times_s) < 2:
         return torch.zeros_like(depth_m)
     times = times_s.to(depth_m.dtype)
@@ -62,9 +63,11 @@ def replay(
     skip: Collection[str] = ("noise", "quantisation"),
     device: str = "cpu",
 ) -> torch.Tensor:
-    """Readings that the model predicts for one trial, or for several with the same times: (T, ..., R, C) float32 counts.
+    """Readings that the model predicts for one trial, or for several with the same times: (T, ..., R, C)
+    float32 counts.
 
-    Give either the depth of every taxel (contract: column height), or force per taxel, which then replaces the contact
+    Give either the depth of every taxel (contract: column height), or force per taxel, which then replaces
+    the contact
     model and everything before it.
 
     Args:

@@ -69,7 +69,8 @@ class PadSensors:
 
         Args:
             ids: (m,) environments.
-            seed: one per environment (m,), a generator to draw them from, or one number, to which the ids are added.
+            seed: one per environment (m,), a generator to draw them from, or one number, to which the ids
+                are added.
                 An environment's readings depend only on its own seed and inputs.
         """
         ids = np.atleast_1d(np.asarray(ids, dtype=np.int64))
@@ -139,7 +140,8 @@ class PadSensors:
 
         Args:
             ids: (m,) environments.
-            stiffness_scale, gain_scale: factors on the contact's stiffness and on counts per newton, (m,) or one.
+            stiffness_scale, gain_scale: factors on the contact's stiffness and on counts per newton, (m,) or
+                one.
             parameters: "stage.parameter" -> values (m,), as `SensorModel.ranges` names them.
         """
         index = torch.as_tensor(np.atleast_1d(ids), dtype=torch.long, device=self.device)
@@ -254,7 +256,8 @@ class PadSensors:
         dt_s: float,
         load: ArrayLike | None = None,
     ) -> ArrayLike:
-        """Contact force per taxel before mechanics and readout: (m, P, N) float32 [N]; arguments as in `counts`."""
+        """Contact force per taxel before mechanics and readout: (m, P, N) float32 [N]; arguments as in
+        `counts`."""
         index = torch.as_tensor(np.atleast_1d(ids), dtype=torch.long, device=self.device)
         poses = (pad_pos, pad_rot, pad_vel, body_pos, body_rot, body_vel)
         force = self._contact_forces(index, poses, load, self._frame(index, dt_s, load)).flatten(2)
@@ -277,10 +280,12 @@ class PadSensors:
         Args:
             ids: (m,) environments, without repetition.
             pad_pos, pad_rot: pad frames in the world, (m, P, 3) [m] and (m, P, 3, 3).
-            pad_vel: (m, P, 6) velocity of the pad's origin [m/s], then angular velocity [rad/s], in the world.
+            pad_vel: (m, P, 6) velocity of the pad's origin [m/s], then angular velocity [rad/s], in the
+                world.
             body_pos, body_rot, body_vel: the same for the bodies' frames, (m, B, ...).
             dt_s: time since the previous frame [s].
-            load: (m, P, 3) the solver's normal force on each pad [N] and its centre x, y in the pad frame [m].
+            load: (m, P, 3) the solver's normal force on each pad [N] and its centre x, y in the pad frame
+                [m].
 
         Returns numpy for numpy poses, a tensor on `device` for tensors.
         """

@@ -1,7 +1,9 @@
 """What a stage of the sensor model is, and the registry of their names.
 
-A stage maps a batch of pad images (..., R, C) to another. It is a frozen dataclass of parameters in SI units with one
-pure function `step`; memory between frames is passed in and out explicitly. Parameters may be tensors that broadcast
+A stage maps a batch of pad images (..., R, C) to another. It is a frozen dataclass of parameters in SI units
+with one
+pure function `step`; memory between frames is passed in and out explicitly. Parameters may be tensors that
+broadcast
 against (..., R, C), which is how each environment gets its own value.
 """
 
@@ -17,7 +19,8 @@ State = dict[str, torch.Tensor]
 Traits = dict[str, np.ndarray]
 
 DOMAINS = ("depth", "contact", "force", "gain", "counts")
-"""What a stage reads and writes, in the order in which a model lists them: depth [m] to depth, depth to force [N],
+"""What a stage reads and writes, in the order in which a model lists them: depth [m] to depth, depth to
+force [N],
 force to force, force to counts, counts to counts."""
 
 
@@ -71,7 +74,8 @@ class Stage:
                     raise ValueError(f"{self.name}.{item.name} must be at least {minimum:g}, got {number:g}")
 
     def traits(self, layout: PadLayout, pads: int, rng: np.random.Generator) -> Traits:
-        """What differs between specimens of the sensor, drawn once per episode of one environment: name -> (P, ...)."""
+        """What differs between specimens of the sensor, drawn once per episode of one environment: name ->
+        (P, ...)."""
         return {}
 
     def initial(self, layout: PadLayout, pads: int) -> Traits:
@@ -81,7 +85,8 @@ class Stage:
     def step(self, x: torch.Tensor, state: State, frame: Frame) -> tuple[torch.Tensor, State]:
         """Process one frame of a batch: x (..., R, C), state tensors with the same leading dimensions.
 
-        Returns the result (..., R, C) and the new state (traits are returned unchanged). Neither input is modified.
+        Returns the result (..., R, C) and the new state (traits are returned unchanged). Neither input is
+        modified.
         """
         raise NotImplementedError
 

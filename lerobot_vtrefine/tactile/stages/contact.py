@@ -1,7 +1,7 @@
 """Contact laws: from the depth of every taxel, and the solver's load, to force per taxel."""
 
 from dataclasses import dataclass, fields, replace
-from typing import ClassVar
+from typing import ClassVar, override
 
 import torch
 
@@ -16,7 +16,8 @@ class ContactStage(Stage):
     domain: ClassVar[str] = "contact"
     rank: ClassVar[int] = 20
     query: ClassVar[str] = "closest"
-    """What depth means: "closest" (penetration into the nearest surface) or "column" (height along the normal)."""
+    """What depth means: "closest" (penetration into the nearest surface) or "column" (height along the
+    normal)."""
     load_conserving: ClassVar[bool] = False
     """Whether the forces are solved to add up to the load."""
     subdivision: ClassVar[int] = 1
@@ -50,9 +51,11 @@ class KelvinVoigt(ContactStage):
     k_n: float = parameter(400.0, "N/m", 100.0, 1600.0)
     k_d: float = parameter(1.2, "N*s/m", 0.0, 5.0)
 
+    @override
     def stiffness(self, layout: PadLayout) -> torch.Tensor | float:
         return self.k_n
 
+    @override
     def force(self, depth: torch.Tensor, rate: torch.Tensor, layout: PadLayout) -> torch.Tensor:
         return (self.k_n * depth + self.k_d * rate).clamp(min=0.0) * (depth > 0)
 
@@ -65,9 +68,11 @@ class TacSL(ContactStage):
     name: ClassVar[str] = "tacsl"
     k_n: float = parameter(400.0, "N/m", 100.0, 1600.0)
 
+    @override
     def stiffness(self, layout: PadLayout) -> torch.Tensor | float:
         return self.k_n
 
+    @override
     def force(self, depth: torch.Tensor, rate: torch.Tensor, layout: PadLayout) -> torch.Tensor:
         return self.k_n * depth.clamp(min=0.0)
 
@@ -79,9 +84,11 @@ class Depth(ContactStage):
 
     name: ClassVar[str] = "depth"
 
+    @override
     def stiffness(self, layout: PadLayout) -> torch.Tensor | float:
         return 1.0
 
+    @override
     def force(self, depth: torch.Tensor, rate: torch.Tensor, layout: PadLayout) -> torch.Tensor:
         return depth.clamp(min=0.0)
 
@@ -95,9 +102,11 @@ class FlexitacIsaacSim(ContactStage):
     k_n: float = parameter(5000.0, "N/m", 1000.0, 10000.0)
     limit_n: float = parameter(10.0, "N", 5.0, 20.0, minimum=1e-9)
 
+    @override
     def stiffness(self, layout: PadLayout) -> torch.Tensor | float:
         return self.k_n / self.limit_n
 
+    @override
     def force(self, depth: torch.Tensor, rate: torch.Tensor, layout: PadLayout) -> torch.Tensor:
         return torch.minimum(self.k_n * depth.clamp(min=0.0), torch.as_tensor(self.limit_n)) / self.limit_n
 
@@ -105,10 +114,13 @@ class FlexitacIsaacSim(ContactStage):
 @register
 @dataclass(frozen=True)
 class Consistent(ContactStage):
-    """Elastic foundation whose taxels add up to the physics solver's force on the pad, and balance at its centre.
+    """Elastic foundation whose taxels add up to the physics solver's force on the pad, and balance at its
+    centre.
 
-    Column heights along the pad's normal, a Winkler foundation with offset and two tilts solved for the load, pressure
-    averaged over 2 x 2 points per taxel. Without a load (replay of prescribed depths) it is the plain Winkler foundation.
+    Column heights along the pad's normal, a Winkler foundation with offset and two tilts solved for the
+    load, pressure
+    averaged over 2 x 2 points per taxel. Without a load (replay of prescribed depths) it is the plain
+    Winkler foundation.
     """
 
     name: ClassVar[str] = "consistent"
@@ -119,10 +131,13 @@ class Consistent(ContactStage):
     foundation_n_per_m3: float = parameter(2e8, "N/m^3", 5e7, 8e8, minimum=1.0)
     """Stiffness of the layer per area: about elastic modulus / thickness (0.5 MPa / 2.5 mm)."""
     damping_s: float = parameter(3e-3, "s", 0.0, 1e-2)
-    """Viscous over elastic stiffness (the paper's k_d / k_n): parts of the face that are being pressed in carry more."""
+    """Viscous over elastic stiffness (the paper's k_d / k_n): parts of the face that are being pressed in
+    carry more."""
 
+    @override
     def stiffness(self, layout: PadLayout) -> torch.Tensor | float:
         return self.foundation_n_per_m3 * layout.taxel_area_m2
 
+    @override
     def force(self, depth: torch.Tensor, rate: torch.Tensor, layout: PadLayout) -> torch.Tensor:
         return self.stiffness(layout) * (depth + self.damping_s * rate).clamp(min=0.0) * (depth > 0)

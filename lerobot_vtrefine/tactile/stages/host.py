@@ -1,7 +1,7 @@
 """Stages of sampling and transport: when a reading was taken, and how long the host repeats it."""
 
 from dataclasses import dataclass
-from typing import ClassVar
+from typing import ClassVar, override
 
 import numpy as np
 import torch
@@ -40,6 +40,7 @@ class Delay(Stage):
         """Delay of each row, (..., R, 1) [s]."""
         raise NotImplementedError
 
+    @override
     def initial(self, layout: PadLayout, pads: int) -> Traits:
         return {
             "history": np.zeros((pads, HISTORY_FRAMES, layout.rows, layout.cols), dtype=np.float32),
@@ -47,13 +48,13 @@ class Delay(Stage):
             "frames": np.zeros(pads, dtype=np.int64),
         }
 
+    @override
     def step(self, x: torch.Tensor, state: State, frame: Frame) -> tuple[torch.Tensor, State]:
         delay = self.delay_s(x.shape[-2], x)
         # The oldest remembered frame is HISTORY_FRAMES - 1 steps old: a longer delay would silently be cut.
         if frame.dt_s > 0.0 and float(delay.max()) > (HISTORY_FRAMES - 1) * frame.dt_s:
-            raise ValueError(
-                f"{self.name}: {float(delay.max()):g} s exceeds {HISTORY_FRAMES - 1} frames of {frame.dt_s:g} s"
-            )
+            limit = f"{HISTORY_FRAMES - 1} frames of {frame.dt_s:g} s"
+            raise ValueError(f"{self.name}: a delay of {float(delay.max()):g} s exceeds {limit}")
         first = (state["frames"] == 0)[..., None, None, None]
         past = torch.where(first, x.unsqueeze(-3), state["history"][..., :-1, :, :])
         history = torch.cat([x.unsqueeze(-3), past], dim=-3)
@@ -67,6 +68,7 @@ class Delay(Stage):
             value = value + weight * (history[..., k + 1, :, :] - history[..., k, :, :])
         return value, {"history": history, "age_s": age, "frames": state["frames"] + 1}
 
+    @override
     def sequence(self, x: torch.Tensor, times_s: torch.Tensor, frame: Frame) -> torch.Tensor:
         delay = self.delay_s(x.shape[-2], x).reshape(-1)
         return delayed_sequence(x, times_s, delay.expand(x.shape[-2]) if len(delay) == 1 else delay)
@@ -81,6 +83,7 @@ class Latency(Delay):
     rank: ClassVar[int] = 70
     tau_s: float = parameter(0.01, "s", 0.0, 0.05)
 
+    @override
     def delay_s(self, rows: int, like: torch.Tensor) -> torch.Tensor:
         return torch.as_tensor(self.tau_s, dtype=like.dtype, device=like.device).reshape(
             -1, *(1,) * (like.ndim - 1)
@@ -96,6 +99,7 @@ class ScanSkew(Delay):
     rank: ClassVar[int] = 72
     skew_s: float = parameter(0.008, "s", 0.0, 0.043, minimum=None)
 
+    @override
     def delay_s(self, rows: int, like: torch.Tensor) -> torch.Tensor:
         share = torch.arange(rows, dtype=like.dtype, device=like.device)[:, None] / max(rows - 1, 1)
         return self.skew_s * share
@@ -112,12 +116,14 @@ class SampleAndHold(Stage):
     has_state: ClassVar[bool] = True
     period_s: float = parameter(0.043, "s", 0.01, 0.1, minimum=1e-6)
 
+    @override
     def initial(self, layout: PadLayout, pads: int) -> Traits:
         return {
             "held": np.zeros((pads, layout.rows, layout.cols), dtype=np.float32),
             "slot": np.full((pads, 1, 1), -1, dtype=np.int64),
         }
 
+    @override
     def step(self, x: torch.Tensor, state: State, frame: Frame) -> tuple[torch.Tensor, State]:
         time_s = torch.as_tensor(frame.time_s, dtype=torch.float64, device=x.device)
         slot = torch.floor(time_s / self.period_s + 1e-6).to(torch.int64).expand(state["slot"].shape).clone()

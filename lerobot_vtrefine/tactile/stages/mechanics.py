@@ -2,7 +2,7 @@
 
 import math
 from dataclasses import dataclass, field
-from typing import Any, ClassVar
+from typing import Any, ClassVar, override
 
 import numpy as np
 import torch
@@ -19,7 +19,8 @@ REFERENCE_DEPTH_M = 1e-3
 class NonlinearStiffness(Stage):
     """Hardening (exponent > 1) or softening: f_ref (f / f_ref)^exponent with f_ref = stiffness * 1 mm.
 
-    For a linear contact law this is k d_ref (d / d_ref)^exponent. Where the taxels' sum is the load itself, the sum is
+    For a linear contact law this is k d_ref (d / d_ref)^exponent. Where the taxels' sum is the load itself,
+    the sum is
     kept and only its distribution changes.
     """
 
@@ -28,6 +29,7 @@ class NonlinearStiffness(Stage):
     rank: ClassVar[int] = 30
     exponent: float = parameter(1.0, "1", 0.8, 1.6, minimum=1e-3)
 
+    @override
     def step(self, x: torch.Tensor, state: State, frame: Frame) -> tuple[torch.Tensor, State]:
         reference = frame.stiffness_n_per_m * REFERENCE_DEPTH_M
         bent = reference * (x.clamp(min=0.0) / reference) ** self.exponent
@@ -38,7 +40,8 @@ class NonlinearStiffness(Stage):
 
 
 def spreading_matrix(count: int, sigma_taxels: torch.Tensor) -> torch.Tensor:
-    """Gaussian weights (..., count, count) with mirrored ends: doubly stochastic, so that sums and flat fields are kept.
+    """Gaussian weights (..., count, count) with mirrored ends: doubly stochastic, so that sums and flat
+    fields are kept.
 
     Args:
         sigma_taxels: (..., 1, 1) standard deviation in taxels.
@@ -53,13 +56,15 @@ def spreading_matrix(count: int, sigma_taxels: torch.Tensor) -> torch.Tensor:
 @register
 @dataclass(frozen=True)
 class MechanicalSpreading(Stage):
-    """The cover layer spreads force over neighbours: a Gaussian of `sigma_m`, mirrored at the edges; keeps the sum."""
+    """The cover layer spreads force over neighbours: a Gaussian of `sigma_m`, mirrored at the edges; keeps
+    the sum."""
 
     name: ClassVar[str] = "mechanical_spreading"
     domain: ClassVar[str] = "force"
     rank: ClassVar[int] = 32
     sigma_m: float = parameter(1.0e-3, "m", 0.0, 3.0e-3)
 
+    @override
     def step(self, x: torch.Tensor, state: State, frame: Frame) -> tuple[torch.Tensor, State]:
         sigma = torch.as_tensor(self.sigma_m, dtype=x.dtype, device=x.device) / frame.layout.pitch_m
         sigma = sigma.view(1, 1) if sigma.ndim == 0 else sigma
@@ -80,7 +85,8 @@ def _paired(stage: str, tau_s: Any, fraction: Any) -> list[tuple[Any, Any]]:
 @register
 @dataclass(frozen=True)
 class ViscoelasticRelaxation(Stage):
-    """Prony series: f - sum_j fraction_j * (f low-passed with tau_j); a held load decays to 1 - sum(fraction).
+    """Prony series: f - sum_j fraction_j * (f low-passed with tau_j); a held load decays to 1 -
+    sum(fraction).
 
     `tau_s` and `fraction` are numbers or equally long lists. Exact for a force that is linear between frames.
     """
@@ -98,6 +104,7 @@ class ViscoelasticRelaxation(Stage):
         super().__post_init__()
         _paired(self.name, self.tau_s, self.fraction)
 
+    @override
     def initial(self, layout: PadLayout, pads: int) -> Traits:
         names = [
             "previous",
@@ -105,6 +112,7 @@ class ViscoelasticRelaxation(Stage):
         ]
         return {name: np.zeros((pads, layout.rows, layout.cols), dtype=np.float32) for name in names}
 
+    @override
     def step(self, x: torch.Tensor, state: State, frame: Frame) -> tuple[torch.Tensor, State]:
         previous, dt_s = state["previous"], frame.dt_s
         new, relaxed = {**state, "previous": x}, x
@@ -126,7 +134,8 @@ class ViscoelasticRelaxation(Stage):
 class Hysteresis(Stage):
     """Rate-free loop: (1 - fraction) f + fraction * play(f).
 
-    The play operator follows the depth f / stiffness with a dead band of full width `width_m`, so that loading and
+    The play operator follows the depth f / stiffness with a dead band of full width `width_m`, so that
+    loading and
     unloading at the same depth differ by fraction * width_m * stiffness. Without contact it returns to zero.
     """
 
@@ -137,9 +146,11 @@ class Hysteresis(Stage):
     fraction: float = parameter(0.15, "1", 0.0, 0.3)
     width_m: float = parameter(2e-4, "m", 5e-5, 5e-4)
 
+    @override
     def initial(self, layout: PadLayout, pads: int) -> Traits:
         return {"play": np.zeros((pads, layout.rows, layout.cols), dtype=np.float32)}
 
+    @override
     def step(self, x: torch.Tensor, state: State, frame: Frame) -> tuple[torch.Tensor, State]:
         half_width = 0.5 * self.width_m * frame.stiffness_n_per_m
         play = torch.maximum(torch.minimum(state["play"], x + half_width), x - half_width).clamp(min=0.0)

@@ -1,7 +1,7 @@
 """Readout stages: force to conductance, the row's shared divider, and 8-bit counts on an idle level."""
 
 from dataclasses import dataclass, field
-from typing import Any, ClassVar
+from typing import Any, ClassVar, override
 
 import numpy as np
 import torch
@@ -23,13 +23,15 @@ from lerobot_vtrefine.tactile.stages.base import (
 @register
 @dataclass(frozen=True)
 class Gain(Stage):
-    """Reading of a lone taxel before any sharing: counts = counts_per_n * f (conductance is proportional to force)."""
+    """Reading of a lone taxel before any sharing: counts = counts_per_n * f (conductance is proportional to
+    force)."""
 
     name: ClassVar[str] = "gain"
     domain: ClassVar[str] = "gain"
     rank: ClassVar[int] = 40
     counts_per_n: float = parameter(500.0, "counts/N", 250.0, 1000.0)
 
+    @override
     def step(self, x: torch.Tensor, state: State, frame: Frame) -> tuple[torch.Tensor, State]:
         return x * self.counts_per_n, state
 
@@ -37,7 +39,8 @@ class Gain(Stage):
 @register
 @dataclass(frozen=True)
 class TaxelGainSpread(Stage):
-    """Each taxel has its own gain: `map` (R, C) factors, or log-normal with deviation `sigma`, drawn per episode."""
+    """Each taxel has its own gain: `map` (R, C) factors, or log-normal with deviation `sigma`, drawn per
+    episode."""
 
     name: ClassVar[str] = "taxel_gain_spread"
     domain: ClassVar[str] = "counts"
@@ -49,11 +52,13 @@ class TaxelGainSpread(Stage):
         super().__post_init__()
         object.__setattr__(self, "map", as_tuple(self.map))
 
+    @override
     def traits(self, layout: PadLayout, pads: int, rng: np.random.Generator) -> Traits:
         if self.map is not None:
             return {}
         return {"deviate": rng.standard_normal((pads, layout.rows, layout.cols)).astype(np.float32)}
 
+    @override
     def step(self, x: torch.Tensor, state: State, frame: Frame) -> tuple[torch.Tensor, State]:
         if self.map is not None:
             return x * taxel_map(self.map, x), state
@@ -65,7 +70,8 @@ class TaxelGainSpread(Stage):
 @register
 @dataclass(frozen=True)
 class DeadTaxels(Stage):
-    """Taxels that no longer answer: those in `taxels` ((r, c) pairs), whole `rows` and `cols`, and each further one
+    """Taxels that no longer answer: those in `taxels` ((r, c) pairs), whole `rows` and `cols`, and each
+    further one
     with `probability`, drawn per episode."""
 
     name: ClassVar[str] = "dead_taxels"
@@ -93,9 +99,11 @@ class DeadTaxels(Stage):
         mask[:, list(self.cols)] = 0.0
         return mask
 
+    @override
     def traits(self, layout: PadLayout, pads: int, rng: np.random.Generator) -> Traits:
         return {"draw": rng.random((pads, layout.rows, layout.cols)).astype(np.float32)}
 
+    @override
     def step(self, x: torch.Tensor, state: State, frame: Frame) -> tuple[torch.Tensor, State]:
         x = x * taxel_map(self.alive(frame.layout), x)
         return (x * (state["draw"] >= self.probability) if "draw" in state else x), state
@@ -111,6 +119,7 @@ class Saturation(Stage):
     rank: ClassVar[int] = 54
     knee_counts: float = parameter(200.0, "counts", 120.0, 400.0, minimum=1e-6)
 
+    @override
     def step(self, x: torch.Tensor, state: State, frame: Frame) -> tuple[torch.Tensor, State]:
         return self.knee_counts * torch.tanh(x / self.knee_counts), state
 
@@ -118,7 +127,8 @@ class Saturation(Stage):
 @register
 @dataclass(frozen=True)
 class RowSharing(Stage):
-    """The row's voltage divider: s_rc / (1 + k * sum_j s_rj), the sum over the whole row with the taxel itself.
+    """The row's voltage divider: s_rc / (1 + k * sum_j s_rj), the sum over the whole row with the taxel
+    itself.
 
     While one column is driven high the others are held low, so a row's taxels load each other. With a plain
     resistor as pull-down and no amplifier k is 1/255 per count; boards with a stiffer front end have less.
@@ -129,6 +139,7 @@ class RowSharing(Stage):
     rank: ClassVar[int] = 56
     conductance_per_count: float = parameter(4e-4, "1/counts", 0.0, 2e-3)
 
+    @override
     def step(self, x: torch.Tensor, state: State, frame: Frame) -> tuple[torch.Tensor, State]:
         return x / (1.0 + self.conductance_per_count * x.sum(dim=-1, keepdim=True)), state
 
@@ -136,7 +147,8 @@ class RowSharing(Stage):
 @register
 @dataclass(frozen=True)
 class Crosstalk(Stage):
-    """Additive leakage: every taxel gets the fraction `row` of each other reading in its row, `col` of its column."""
+    """Additive leakage: every taxel gets the fraction `row` of each other reading in its row, `col` of its
+    column."""
 
     name: ClassVar[str] = "crosstalk"
     domain: ClassVar[str] = "counts"
@@ -144,6 +156,7 @@ class Crosstalk(Stage):
     row: float = parameter(0.005, "1", 0.0, 0.02)
     col: float = parameter(0.005, "1", 0.0, 0.02)
 
+    @override
     def step(self, x: torch.Tensor, state: State, frame: Frame) -> tuple[torch.Tensor, State]:
         along_row = x.sum(dim=-1, keepdim=True) - x
         along_col = x.sum(dim=-2, keepdim=True) - x
@@ -153,7 +166,8 @@ class Crosstalk(Stage):
 @register
 @dataclass(frozen=True)
 class Idle(Stage):
-    """Reading of an untouched taxel, added: `level_counts` (a number or (R, C)), spread uniformly by +-`spread_counts`
+    """Reading of an untouched taxel, added: `level_counts` (a number or (R, C)), spread uniformly by
+    +-`spread_counts`
     between taxels, drawn per episode."""
 
     name: ClassVar[str] = "idle"
@@ -166,9 +180,11 @@ class Idle(Stage):
         super().__post_init__()
         object.__setattr__(self, "level_counts", as_tuple(self.level_counts))
 
+    @override
     def traits(self, layout: PadLayout, pads: int, rng: np.random.Generator) -> Traits:
         return {"deviate": rng.uniform(-1.0, 1.0, (pads, layout.rows, layout.cols)).astype(np.float32)}
 
+    @override
     def step(self, x: torch.Tensor, state: State, frame: Frame) -> tuple[torch.Tensor, State]:
         x = x + taxel_map(self.level_counts, x)
         return (x + self.spread_counts * state["deviate"] if "deviate" in state else x), state
@@ -185,6 +201,7 @@ class BaselineDrift(Stage):
     has_state: ClassVar[bool] = True  # The clock advances with the frames, so none may be left out.
     rate_counts_per_s: float = parameter(0.0, "counts/s", -3e-3, 3e-3, minimum=None)
 
+    @override
     def step(self, x: torch.Tensor, state: State, frame: Frame) -> tuple[torch.Tensor, State]:
         return x + (self.rate_counts_per_s * torch.as_tensor(frame.time_s)).to(x), state
 
@@ -192,7 +209,8 @@ class BaselineDrift(Stage):
 @register
 @dataclass(frozen=True)
 class Noise(Stage):
-    """White Gaussian noise of `sigma_counts` per taxel and frame; a function of the episode's seed and the frame's number."""
+    """White Gaussian noise of `sigma_counts` per taxel and frame; a function of the episode's seed and the
+    frame's number."""
 
     name: ClassVar[str] = "noise"
     domain: ClassVar[str] = "counts"
@@ -200,12 +218,15 @@ class Noise(Stage):
     stochastic: ClassVar[bool] = True
     sigma_counts: float = parameter(1.0, "counts", 0.5, 2.0)
 
+    @override
     def traits(self, layout: PadLayout, pads: int, rng: np.random.Generator) -> Traits:
         return {"seed": rng.integers(0, 2**62, pads, dtype=np.int64)}
 
+    @override
     def initial(self, layout: PadLayout, pads: int) -> Traits:
         return {"frame": np.zeros(pads, dtype=np.int64)}
 
+    @override
     def step(self, x: torch.Tensor, state: State, frame: Frame) -> tuple[torch.Tensor, State]:
         noise = noise_frames(state["seed"], state["frame"], x.shape[-2] * x.shape[-1]).view(x.shape)
         return x + self.sigma_counts * noise, {**state, "frame": state["frame"] + 1}
@@ -222,6 +243,7 @@ class Quantisation(Stage):
     step_counts: float = parameter(1.0, "counts", 1.0, 4.0, minimum=1e-6)
     full_scale_counts: float = parameter(255.0, "counts", 255.0, 255.0, minimum=1.0)
 
+    @override
     def step(self, x: torch.Tensor, state: State, frame: Frame) -> tuple[torch.Tensor, State]:
         return (torch.round(x / self.step_counts) * self.step_counts).clamp(
             0.0, self.full_scale_counts

@@ -1,10 +1,11 @@
 """Stages that act on depth, before the contact law: where the pad's face really is.
 
-A contact stage that is solved for a given load absorbs both: a pad pressed with 5 N carries 5 N wherever its face is.
+A contact stage that is solved for a given load absorbs both: a pad pressed with 5 N carries 5 N wherever its
+face is.
 """
 
 from dataclasses import dataclass
-from typing import ClassVar
+from typing import ClassVar, override
 
 import torch
 
@@ -21,6 +22,7 @@ class ContactOffset(Stage):
     rank: ClassVar[int] = 10
     offset_m: float = parameter(0.0, "m", -2e-4, 2e-4, minimum=None)
 
+    @override
     def step(self, x: torch.Tensor, state: State, frame: Frame) -> tuple[torch.Tensor, State]:
         return x - self.offset_m, state
 
@@ -28,7 +30,8 @@ class ContactOffset(Stage):
 @register
 @dataclass(frozen=True)
 class PadTilt(Stage):
-    """The pad is turned about its +x and +y by small angles, which lifts the taxel at (x, y): d + y tilt_x - x tilt_y."""
+    """The pad is turned about its +x and +y by small angles, which lifts the taxel at (x, y): d + y tilt_x -
+    x tilt_y."""
 
     name: ClassVar[str] = "pad_tilt"
     domain: ClassVar[str] = "depth"
@@ -36,6 +39,7 @@ class PadTilt(Stage):
     tilt_x_rad: float = parameter(0.0, "rad", -0.02, 0.02, minimum=None)
     tilt_y_rad: float = parameter(0.0, "rad", -0.02, 0.02, minimum=None)
 
+    @override
     def step(self, x: torch.Tensor, state: State, frame: Frame) -> tuple[torch.Tensor, State]:
         columns_m, rows_m = (taxel_map(axis, x) for axis in frame.layout.axes_m())
         return x + self.tilt_x_rad * rows_m[:, None] - self.tilt_y_rad * columns_m[None, :], state
