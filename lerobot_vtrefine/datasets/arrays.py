@@ -1,161 +1,117 @@
-"""Carries array features of robots through LeRobot's stock recording code: the one module that extends it.
+"""Array features through LeRobot's stock recording commands.
 
-LeRobot 0.6.1's datasets hold any array, but the code between robot and dataset passes only float scalars
-(merged into `observation.state`) and images. `install` replaces the two functions that decide this by ones
-that also know `ArraySpec`, and leave every other feature to LeRobot's own. Robots with arrays call it when
-they are made; commands with other robots stay untouched. Stored datasets are plain LeRobot datasets, and
-readers need none of this.
+LeRobot 0.6.1's recorder accepts float scalars and (H, W, 1 | 3) images only; its datasets accept any array.
+Two functions stand between them. ``install`` wraps both in every loaded LeRobot module, so that a robot may
+declare
 
-Arrays are stored flat, one 1-D column each: two-dimensional columns break `lerobot-edit-dataset`. They carry
-no `names`: LeRobot would rebuild such features and drop their `info`.
+    observation_features = {"tactile.left_arm_left_finger": ArraySpec((384,), "uint8", info), ...}
+
+and ``lerobot-record``, ``--resume``, ``lerobot-rollout`` and ``lerobot-edit-dataset`` carry the columns.
+Robots call ``install`` when they are made: commands with other robots stay untouched. Reading needs no
+plugin. Declare arrays 1-D and give their real shape in ``info``: LeRobot can neither delete nor merge
+episodes with 2-D columns.
 """
 
-import functools
-import inspect
-import logging
 import sys
-from collections.abc import Callable
-from typing import Any, Self
+from collections.abc import Callable, Mapping
+from typing import Any
 
 import numpy as np
 
-from lerobot_vtrefine.datasets.lerobot_version import FIRST_SUPPORTED, FIRST_UNSUPPORTED, is_supported
+from lerobot_vtrefine.datasets.lerobot_version import is_supported, lerobot_version
 
-logger = logging.getLogger(__name__)
-
+PATCHED = ("hw_to_dataset_features", "build_dataset_frame")
 Features = dict[str, dict[str, Any]]
-
-SIGNATURES = {
-    "hw_to_dataset_features": ("hw_features", "prefix", "use_video"),
-    "build_dataset_frame": ("ds_features", "values", "prefix"),
-}
-"""Functions of `lerobot.utils.feature_utils` that are replaced, and the parameters they must have."""
+_originals: dict[str, Callable[..., Any]] = {}
+_wrappers: dict[str, Callable[..., Any]] = {}
 
 
 class ArraySpec(tuple[int, ...]):
-    """Declares an array in a robot's `observation_features`; the observation's value is a 1-D array.
+    """Shape of an array feature, with its dtype and the ``info`` that is stored beside it.
 
-    It is the tuple of the array's shape, as LeRobot expects of anything that is not a float.
-
-    Attributes:
-        dtype: numpy dtype name of the stored column.
-        info: Static facts kept with the feature, such as the two-dimensional shape and the unit. LeRobot
-            refuses to merge datasets whose info differs: keep what varies between sessions in columns of its
-            own.
+    A tuple, because LeRobot's rollout keeps only features that are tuples or joint positions.
     """
 
     dtype: str
-    info: dict[str, Any]
+    info: dict[str, Any] | None
 
-    def __new__(cls, shape: tuple[int, ...], dtype: str, info: dict[str, Any] | None = None) -> Self:
-        """Raises ValueError unless the shape is one-dimensional."""
-        if len(shape) != 1:
-            raise ValueError(f"arrays are stored flat: shape must be one-dimensional, got {tuple(shape)}")
+    def __new__(
+        cls, shape: tuple[int, ...], dtype: str = "float32", info: Mapping[str, Any] | None = None
+    ) -> "ArraySpec":
+        """Raises: ValueError for shapes that LeRobot cannot edit, TypeError for unknown dtypes."""
+        if len(shape) != 1 or shape[0] < 1:
+            raise ValueError(f"array features must be 1-D (put the real shape into info), got {shape}")
         spec = super().__new__(cls, shape)
-        spec.dtype = np.dtype(dtype).name
-        spec.info = dict(info or {})
+        spec.dtype, spec.info = str(np.dtype(dtype)), dict(info) if info else None
         return spec
 
-    def __getnewargs__(self) -> tuple[tuple[int, ...], str, dict[str, Any]]:
-        return tuple(self), self.dtype, self.info
-
     def feature(self) -> dict[str, Any]:
-        """The dataset feature."""
-        return {"dtype": self.dtype, "shape": tuple(self)} | ({"info": dict(self.info)} if self.info else {})
+        """The dataset feature; without ``names``, which would make LeRobot drop ``info``."""
+        feature: dict[str, Any] = {"dtype": self.dtype, "shape": tuple(self)}
+        return feature | ({"info": self.info} if self.info else {})
 
 
-def array_features(hw_features: dict[str, Any], prefix: str) -> Features:
-    """Dataset features of the arrays among a robot's features."""
-    return {f"{prefix}.{key}": v.feature() for key, v in hw_features.items() if isinstance(v, ArraySpec)}
+def _hw_to_dataset_features(
+    hw_features: Mapping[str, Any], prefix: str, use_video: bool = True
+) -> dict[str, dict[str, Any]]:
+    """LeRobot's function for everything that is not an array, plus one column per array."""
+    arrays = {key: spec for key, spec in hw_features.items() if isinstance(spec, ArraySpec)}
+    others = {key: spec for key, spec in hw_features.items() if key not in arrays}
+    features: Features = _originals["hw_to_dataset_features"](others, prefix, use_video)
+    return features | {f"{prefix}.{key}": spec.feature() for key, spec in arrays.items()}
 
 
-def is_array_feature(feature: dict[str, Any]) -> bool:
-    """Whether a dataset feature is an array of ours: numeric, 1-D, without names."""
-    numeric = feature["dtype"] not in ("image", "video", "string", "language")
-    return numeric and len(feature["shape"]) == 1 and not feature.get("names")
-
-
-def array_frame(ds_features: Features, values: dict[str, Any], prefix: str) -> dict[str, Any]:
-    """One frame of the array features.
-
-    Raises:
-        ValueError: a value is missing or has another size; the message names the feature.
-    """
-    frame: dict[str, Any] = {}
-    for key, feature in ds_features.items():
-        name = key.removeprefix(f"{prefix}.")
-        if name not in values:
-            raise ValueError(f"the robot's observation lacks {name!r}, which the dataset stores as {key!r}")
-        value = np.asarray(values[name])
-        if value.shape != tuple(feature["shape"]):
-            raise ValueError(
-                f"{name!r} has shape {value.shape}, the dataset stores {tuple(feature['shape'])}"
-            )
-        frame[key] = value.astype(feature["dtype"], copy=False)
+def _build_dataset_frame(
+    ds_features: Mapping[str, dict[str, Any]], values: Mapping[str, Any], prefix: str
+) -> dict[str, Any]:
+    """LeRobot's function for everything that is not an array, plus the arrays in their declared dtype."""
+    arrays = {key: feature for key, feature in ds_features.items() if _is_array(key, feature, prefix)}
+    others = {key: feature for key, feature in ds_features.items() if key not in arrays}
+    frame: dict[str, Any] = _originals["build_dataset_frame"](others, values, prefix)
+    for key, feature in arrays.items():
+        value = np.asarray(values[key.removeprefix(f"{prefix}.")])
+        if value.dtype.kind != np.dtype(feature["dtype"]).kind:
+            raise ValueError(f"{key} must be {feature['dtype']}, the robot returned {value.dtype}")
+        frame[key] = value.astype(feature["dtype"], copy=False).reshape(tuple(feature["shape"]))
     return frame
 
 
-def install() -> None:
-    """Makes LeRobot's recording code carry `ArraySpec` features; does nothing when done before.
-
-    Raises:
-        ImportError: this LeRobot is none that the extension was made for.
-    """
-    from lerobot.utils import feature_utils
-
-    if getattr(feature_utils.hw_to_dataset_features, "carries_arrays", False):
-        return
-    check_lerobot(feature_utils)
-    for name, wrap in (("hw_to_dataset_features", _with_features), ("build_dataset_frame", _with_frame)):
-        original = getattr(feature_utils, name)
-        _rebind(name, original, wrap(original))
+def _is_array(key: str, feature: Mapping[str, Any], prefix: str) -> bool:
+    """Columns that ``ArraySpec.feature`` made: under the prefix, numeric, and without names."""
+    numeric = feature["dtype"] not in ("image", "video", "string", "language")
+    return key.startswith(f"{prefix}.") and numeric and feature.get("names") is None
 
 
-def check_lerobot(feature_utils: Any) -> None:
-    """Raises ImportError unless this LeRobot has the version and the functions that `install` knows."""
-    first, last = (".".join(map(str, v)) for v in (FIRST_SUPPORTED, FIRST_UNSUPPORTED))
-    if not is_supported():
-        raise ImportError(
-            f"recording pads needs LeRobot >= {first}, < {last}: pip install 'lerobot>={first},<{last}'"
-        )
-    for name, parameters in SIGNATURES.items():
-        function = getattr(feature_utils, name, None)
-        if function is None or tuple(inspect.signature(function).parameters) != parameters:
-            raise ImportError(
-                f"recording pads cannot extend this LeRobot, whose {name} has changed; "
-                f"use a release >= {first}, < {last}"
-            )
-
-
-def _rebind(name: str, original: Callable[..., Any], replacement: Callable[..., Any]) -> None:
-    """Replaces a function in every loaded LeRobot module that has imported it."""
+def _rebind(replacements: Mapping[Callable[..., Any], Callable[..., Any]]) -> int:
+    """Replace functions wherever a loaded LeRobot module holds them; returns how many bindings changed."""
+    changed = 0
     for module_name, module in list(sys.modules.items()):
-        if module_name.split(".")[0] == "lerobot" and getattr(module, name, None) is original:
-            setattr(module, name, replacement)
-            logger.debug("%s.%s carries arrays", module_name, name)
+        if not module_name.startswith("lerobot."):
+            continue
+        for name in PATCHED:
+            current = vars(module).get(name)
+            if current is not None and current in replacements:
+                setattr(module, name, replacements[current])
+                changed += 1
+    return changed
 
 
-def _with_features(original: Callable[..., Features]) -> Callable[..., Features]:
-    @functools.wraps(original)
-    def hw_to_dataset_features(hw_features: dict[str, Any], prefix: str, use_video: bool = True) -> Features:
-        others = {key: value for key, value in hw_features.items() if not isinstance(value, ArraySpec)}
-        return original(others, prefix, use_video) | array_features(hw_features, prefix)
+def install() -> None:
+    """Let stock recording carry ``ArraySpec`` features; idempotent, also picks up modules loaded since.
 
-    hw_to_dataset_features.__dict__["carries_arrays"] = True
-    return hw_to_dataset_features
+    Raises: RuntimeError on a LeRobot version whose recorder was not tested with this.
+    """
+    if not is_supported():
+        found = ".".join(map(str, lerobot_version()))
+        raise RuntimeError(f"recording arrays needs lerobot >=0.6.1,<0.7, found {found}")
+    import lerobot.utils.feature_utils as source
+
+    if not _originals:
+        _originals.update({name: getattr(source, name) for name in PATCHED})
+        _wrappers.update(zip(PATCHED, (_hw_to_dataset_features, _build_dataset_frame), strict=True))
+    _rebind({_originals[name]: _wrappers[name] for name in PATCHED})
 
 
-def _with_frame(original: Callable[..., dict[str, Any]]) -> Callable[..., dict[str, Any]]:
-    from lerobot.utils.constants import DEFAULT_FEATURES
-
-    @functools.wraps(original)
-    def build_dataset_frame(ds_features: Features, values: dict[str, Any], prefix: str) -> dict[str, Any]:
-        arrays = {
-            key: feature
-            for key, feature in ds_features.items()
-            if key.startswith(f"{prefix}.") and key not in DEFAULT_FEATURES and is_array_feature(feature)
-        }
-        others = {key: feature for key, feature in ds_features.items() if key not in arrays}
-        return original(others, values, prefix) | array_frame(arrays, values, prefix)
-
-    return build_dataset_frame
+def uninstall() -> None:
+    """Restore LeRobot's own functions."""
+    _rebind({_wrappers[name]: _originals[name] for name in _originals})
