@@ -22,10 +22,18 @@ register_third_party_plugins()
 from lerobot.configs.policies import PreTrainedConfig
 from lerobot.envs.configs import EnvConfig
 from lerobot.processor import ProcessorStepRegistry
+from lerobot.robots import RobotConfig
+from lerobot.teleoperators import TeleoperatorConfig
+from lerobot.cameras import CameraConfig
 print(json.dumps({
     "policies": list(PreTrainedConfig.get_known_choices()),
     "envs": list(EnvConfig.get_known_choices()),
     "steps": ProcessorStepRegistry.list(),
+    "devices": [
+        config.__module__
+        for base in (RobotConfig, TeleoperatorConfig, CameraConfig)
+        for config in base.get_known_choices().values()
+    ],
 }))
 """
 
@@ -56,6 +64,8 @@ def test_lerobot_discovers_every_type() -> None:
     assert "vt_dp3" in found["policies"]
     assert "vtrefine" in found["envs"]
     assert [step for step in found["steps"] if step.startswith("vt_")] != []
+    ours = {module.split(".")[1] for module in found["devices"] if module.startswith("lerobot_vtrefine.")}
+    assert ours == {"robots", "teleoperators", "cameras"}
 
 
 def test_distribution_name_keeps_underscores() -> None:
