@@ -6,7 +6,6 @@ servo's angle between the two calibrated ends (ALOHA's own 31 recorded episodes 
 mm/rad).
 """
 
-import contextlib
 import logging
 import math
 import time
@@ -131,33 +130,34 @@ class DynamixelArm:
             PortError: the message names the port, the motors and the fix.
         """
         try:
-            self.bus.connect()
-        except RuntimeError as error:
-            self.bus.port_handler.closePort()
-            raise PortError(self._missing_motors()) from error
+            self.bus.connect(handshake=False)
         except (ConnectionError, serial.SerialException, OSError) as error:
             cause = error.__cause__ if isinstance(error.__cause__, Exception) else error
             message = explain_open_error(self.port, self.bus.default_baudrate, cause)
             raise PortError(f"{self.name} arm: {message}") from error
-
-    def _missing_motors(self) -> str:
-        expected = {motor.id: name for name, motor in self.bus.motors.items()}
-        found: dict[int, int] = {}
-        with contextlib.suppress(Exception):  # the SDK raises bare exceptions; less is said then
-            self.bus.port_handler.openPort()
-            found = self.bus.broadcast_ping(num_retry=1) or {}
+        problem = self._motor_problem()
+        if problem:
             self.bus.port_handler.closePort()
-        where = f"{self.name} arm on {self.port}"
-        if not found:
+            raise PortError(f"{self.name} arm on {self.port}: {problem}")
+
+    def _motor_problem(self) -> str:
+        """What is wrong with the motors on the bus; empty when all answer and are of the right model."""
+        models = {name: self.bus.ping(motor.id, num_retry=RETRIES) for name, motor in self.bus.motors.items()}
+        if all(model is None for model in models.values()):
             return (
-                f"{where}: no motor answers at {self.bus.default_baudrate} baud: switch on the arm's power, "
-                "and check that this is its port, and the motors' baud rate (lerobot-setup-motors sets it)"
+                f"no motor answers at {self.bus.default_baudrate} baud: switch on the arm's power, and check "
+                "that this is its port, and the motors' baud rate (lerobot-setup-motors sets it)"
             )
-        missing = [f"{name} (id {number})" for number, name in expected.items() if number not in found]
+        missing = [
+            f"{name} (id {self.bus.motors[name].id})" for name, model in models.items() if model is None
+        ]
         if missing:
-            return f"{where}: {', '.join(missing)} do not answer: check the cable before the first of them"
-        model = self.model.motors[0][2]
-        return f"{where}: these are not the motors of a {model} arm: are leader and follower swapped?"
+            return f"{', '.join(missing)} do not answer: check the cable before the first of them"
+        expected = {name: self.bus.model_number_table[motor.model] for name, motor in self.bus.motors.items()}
+        if models != expected:
+            arm = self.model.motors[0][2]
+            return f"these are not the motors of a {arm} arm: are leader and follower swapped?"
+        return ""
 
     def disconnect(self, *, torque_off: bool) -> None:
         """Closes the port; torque goes off before where wanted."""

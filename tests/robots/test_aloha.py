@@ -1,0 +1,204 @@
+"""ALOHA's follower and leader on emulated motors and boards, through LeRobot's own Dynamixel bus."""
+
+import logging
+from collections.abc import Generator
+from pathlib import Path
+
+import numpy as np
+import pytest
+from rig import GRIPPER_ENDS, Rig, allow_slow_answers, aloha_rig
+
+from lerobot_vtrefine.datasets.features import NUM_JOINTS, PADS, TAXEL_INFO
+from lerobot_vtrefine.drivers.dynamixel_arm import VIPERX_300S, WIDOWX_250S
+from lerobot_vtrefine.drivers.ports import PortError
+from lerobot_vtrefine.drivers.sources import check_pattern
+from lerobot_vtrefine.robots import AlohaTactileFollowerConfig
+from lerobot_vtrefine.robots.aloha_tactile_follower import REST_RAD, AlohaTactileFollower, limit_step
+from lerobot_vtrefine.teleoperators import AlohaLeaderConfig
+from lerobot_vtrefine.teleoperators.aloha_leader import AlohaLeader
+
+SECONDARY_ID, CURRENT_MODE, OPERATING_MODE, GOAL_CURRENT = 12, 5, 11, 102
+
+
+@pytest.fixture
+def rig(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Generator[Rig]:
+    allow_slow_answers(monkeypatch)
+    with aloha_rig(tmp_path) as built:
+        yield built
+
+
+def follower_config(rig: Rig, **changes: object) -> AlohaTactileFollowerConfig:
+    settings = {
+        "id": "follower",
+        "calibration_dir": rig.folder / "calibration",
+        "pads_file": rig.pads_file,
+        "rest_s": 0.1,
+        **rig.ports("follower"),
+    }
+    return AlohaTactileFollowerConfig(**(settings | changes))
+
+
+@pytest.fixture
+def follower(rig: Rig) -> Generator[AlohaTactileFollower]:
+    robot = AlohaTactileFollower(follower_config(rig))
+    robot.connect()
+    yield robot
+    if robot.is_connected:
+        robot.disconnect()
+
+
+def test_observation_matches_its_features(follower: AlohaTactileFollower) -> None:
+    observation = follower.get_observation()
+    features = follower.observation_features
+    assert list(observation) == list(features) or set(observation) == set(features)
+    joints = [key for key, kind in features.items() if kind is float]
+    assert joints == [f"{name}.pos" for name in follower.body.joint_names]
+    for pad in PADS:
+        assert features[f"tactile.{pad}"].feature() == {"dtype": "uint8", "shape": (384,), "info": TAXEL_INFO}
+        assert check_pattern(observation[f"tactile.{pad}"]) is not None
+        assert observation[f"tactile_baseline.{pad}"].shape == (384,)
+    assert (observation["tactile_age"] < 0.2).all()
+
+
+def test_connect_sets_motors_up_and_holds_still(follower: AlohaTactileFollower, rig: Rig) -> None:
+    for side in ("left", "right"):
+        assert rig.motor("follower", side, 3).memory[SECONDARY_ID] == 2
+        assert rig.motor("follower", side, 5).memory[SECONDARY_ID] == 4
+        assert rig.motor("follower", side, 9).memory[OPERATING_MODE] == CURRENT_MODE
+        assert rig.motor("follower", side, 9).load(GOAL_CURRENT, 2) == round(400 / 2.69)
+        for motor_id in (1, 2, 4, 6, 7, 8, 9, 3, 5):
+            motor = rig.motor("follower", side, motor_id)
+            assert motor.torque, motor_id
+            assert motor.shaft == 2048
+
+
+def test_targets_arrive_in_counts_and_shadows_follow(follower: AlohaTactileFollower, rig: Rig) -> None:
+    action = dict.fromkeys(follower.action_features, 0.0)
+    action |= {"left_waist.pos": 0.1, "left_shoulder.pos": -0.2, "right_left_finger.pos": 0.042}
+    sent = follower.send_action(action)
+    assert sent["right_right_finger.pos"] == -0.042
+    assert sent["left_waist.pos"] == pytest.approx(0.1)
+    follower.get_observation()
+    state = follower.get_observation()
+    for key, value in sent.items():
+        assert state[key] == pytest.approx(value, abs=1e-3 if "finger" in key else np.pi / 4096)
+    assert rig.motor("follower", "left", 2).read(132, 4) == rig.motor("follower", "left", 3).read(132, 4)
+    assert round(rig.motor("follower", "right", 9).shaft) == GRIPPER_ENDS[VIPERX_300S][1]
+
+
+def test_far_targets_are_cut_to_a_step_and_to_the_limits(follower: AlohaTactileFollower) -> None:
+    far = dict.fromkeys(follower.action_features, 9.0)
+    sent = follower.send_action(far)
+    assert sent["left_waist.pos"] == pytest.approx(0.5, abs=1e-3)
+    assert sent["left_left_finger.pos"] == pytest.approx(follower.body.fingers.travel_m)
+    assert sent["left_right_finger.pos"] == -sent["left_left_finger.pos"]
+
+
+def test_step_limit_leaves_near_targets_alone() -> None:
+    present = np.zeros(8)
+    target = np.array([0.1, -0.1, 0.0, 0.2, -0.5, 0.5, 0.03, -0.01])
+    limited = limit_step(target, present, 0.5)
+    assert limited[:7].tolist() == target[:7].tolist()
+    assert limited[7] == -0.03
+
+
+def test_disconnect_rests_the_arms_then_switches_torque_off(follower: AlohaTactileFollower, rig: Rig) -> None:
+    follower.disconnect()
+    assert not follower.is_connected
+    for side in ("left", "right"):
+        motors = [rig.motor("follower", side, number) for number in (1, 2, 4, 6, 7, 8)]
+        assert not any(motor.torque for motor in motors)
+        angles = [(motor.shaft - 2048) * 2 * np.pi / 4096 for motor in motors]
+        assert angles == pytest.approx(REST_RAD, abs=2e-3)
+
+
+def test_stalled_pad_is_told_once_and_its_age_grows(
+    follower: AlohaTactileFollower, rig: Rig, caplog: pytest.LogCaptureFixture
+) -> None:
+    import time
+
+    rig.boards[PADS[1]].unplug()
+    with caplog.at_level(logging.ERROR):
+        time.sleep(0.5)
+        ages = follower.get_observation()["tactile_age"]
+        follower.get_observation()
+    assert ages[1] > 0.3 > ages[0]
+    told = [record.getMessage() for record in caplog.records if "marked stale" in record.getMessage()]
+    assert len(told) == 1
+    assert PADS[1] in told[0]
+    assert follower.is_connected
+
+
+def test_calibration_by_hand_is_saved_and_used(rig: Rig, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The left arm hangs 100 counts off its zero; both grippers are closed at 1500 and opened to 2500."""
+    robot = AlohaTactileFollower(follower_config(rig, id="fresh"))
+    for number in (1, 2, 4, 6, 7, 8):
+        rig.motor("follower", "left", number).shaft = 2148.0
+
+    def operator(text: str) -> str:
+        side = text.split()[0]
+        if "gripper fully" in text:
+            rig.motor("follower", side, 9).shaft = 1500.0 if "close" in text else 2500.0
+        return "k" if side == "right" else ""
+
+    monkeypatch.setattr("builtins.input", operator)
+    robot.connect()
+    state = robot.get_observation()
+    again = AlohaTactileFollower(follower_config(rig, id="fresh"))
+    robot.disconnect()
+    assert state["left_waist.pos"] == pytest.approx(0.0, abs=1e-9)
+    assert state["left_left_finger.pos"] == pytest.approx(robot.body.fingers.travel_m)
+    assert again.calibration["left_waist"].homing_offset == -100
+    assert again.calibration["right_waist"].homing_offset == 0
+    assert again.calibration["right_gripper"].range_max == 2500
+
+
+def test_leader_gives_the_followers_action(rig: Rig) -> None:
+    settings = {"id": "leader", "calibration_dir": rig.folder / "calibration", **rig.ports("leader")}
+    leader = AlohaLeader(AlohaLeaderConfig(**settings))
+    leader.connect()
+    rig.motor("leader", "right", 1).shaft = 2048 + 1024
+    rig.motor("leader", "left", 9).shaft = GRIPPER_ENDS[WIDOWX_250S][1]
+    action = leader.get_action()
+    torque = [m.torque for side in ("left", "right") for m in rig.buses[f"leader_{side}"].motors.values()]
+    leader.disconnect()
+    assert len(action) == NUM_JOINTS
+    assert action["right_waist.pos"] == pytest.approx(np.pi / 2)
+    assert action["left_left_finger.pos"] == pytest.approx(leader.body.fingers.travel_m)
+    assert action["left_right_finger.pos"] == -action["left_left_finger.pos"]
+    assert not any(torque)
+
+
+def connect_error(rig: Rig, **changes: object) -> str:
+    robot = AlohaTactileFollower(follower_config(rig, **changes))
+    with pytest.raises(PortError) as caught:
+        robot.connect()
+    assert not robot.is_connected
+    assert not robot.pads.is_connected
+    return str(caught.value)
+
+
+def test_errors_name_port_and_fix(rig: Rig) -> None:
+    missing = str(rig.folder / "nowhere")
+    assert f"left arm: {missing} does not exist" in connect_error(rig, left_port=missing)
+    swapped = rig.ports("leader")["left_port"]
+    assert "leader and follower swapped" in connect_error(rig, left_port=swapped)
+    del rig.buses["follower_right"].motors[7]
+    message = connect_error(rig)
+    assert "wrist_angle (id 7)" in message
+    assert rig.ports("follower")["right_port"] in message
+    rig.buses["follower_right"].motors.clear()
+    assert "no motor answers at 1000000 baud" in connect_error(rig)
+
+
+def test_wrong_pads_are_refused(rig: Rig) -> None:
+    with pytest.raises(ValueError, match="needs the pads left_arm_left_finger"):
+        AlohaTactileFollower(follower_config(rig, pads_file=None, pads={"thumb": rig_pad(rig)}))
+    with pytest.raises(ValueError, match="give the pads either by"):
+        AlohaTactileFollower(follower_config(rig, pads_file=None))
+
+
+def rig_pad(rig: Rig) -> object:
+    from lerobot_vtrefine.drivers.config import PadConfig
+
+    return PadConfig(rig.boards[PADS[0]].port)
