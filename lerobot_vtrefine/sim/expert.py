@@ -72,6 +72,7 @@ STANDOFF_M = 0.006  # and aligned this high above it
 PRESS_M = 0.008  # a blocked plug is pushed as if it should be this much lower: a few newtons
 BOTTOM_M = 0.0005  # a seated plug is pushed this far beyond its seat
 TABLE_GAP_M = 0.003  # between fingertips and table
+FLATTEST_RAD = 0.1  # a flatter hand would touch the table with its palm
 TURN_M_PER_RAD = 0.1  # a turn takes as long as this way
 
 
@@ -86,7 +87,7 @@ class View:
     parts: Poses
     """(m, 2) socket, plug."""
 
-    def __getitem__(self, rows: Ids) -> "View":
+    def __getitem__(self, rows: NDArray) -> "View":
         return View(self.q[rows], self.hands[rows], self.parts[rows])
 
 
@@ -261,23 +262,29 @@ def _grasps(sim: "InsertionSim") -> tuple[Poses, Array]:
     """Hands in their parts' frames (2,), and the openings commanded to hold them (2,) [m]."""
     pair, grasped, fingers = sim.scene.pair, sim.config.grasped, sim.scene.embodiment.fingers
     pitches = [grasped.left_pitch_rad, grasped.right_pitch_rad]
+    raised = [0.0, 0.0]
     if sim.scene.config.start == "table":
         heights = [part.rest_height_m + part.grip.centre_m[2] for part in (pair.socket, pair.plug)]
-        pitches = [_pitch_above_table(fingers, *item) for item in zip(pitches, heights, strict=True)]
+        above = [_above_table(fingers, *item) for item in zip(pitches, heights, strict=True)]
+        pitches, raised = [pitch for pitch, _ in above], [way for _, way in above]
     left = ideal_hand(pair.socket, np.pi / 2, pitches[LEFT])
     right = ideal_hand(pair.plug, -np.pi / 2, pitches[RIGHT])
     hands = Poses(np.stack([left[0], right[0]]), np.stack([left[1], right[1]]))
+    hands.position[:, 2] += raised
     width = np.array([pair.socket.grip.half_size_m[0], pair.plug.grip.half_size_m[0]])
     return hands, np.maximum(width + fingers.face_offset_m - grasped.squeeze_m, 0.0)
 
 
-def _pitch_above_table(fingers: Fingers, pitch_rad: float, height_m: float) -> float:
-    """Largest pitch up to `pitch_rad` at which fingertips of a hand at `height_m` stay above the table."""
+def _above_table(fingers: Fingers, pitch_rad: float, height_m: float) -> tuple[float, float]:
+    """Largest pitch up to `pitch_rad` at which the fingertips of a hand at `height_m` stay above the table.
+
+    Where even the flattest hand is too low, the second number says how much higher it must grip [m].
+    """
     length, width, _ = fingers.pad_size_m
-    pitches = np.linspace(pitch_rad, 0.0, 50)
-    lowest = height_m - (length * np.sin(pitches) + width * np.cos(pitches)) / 2
-    clear = np.flatnonzero(lowest >= TABLE_GAP_M)
-    return float(pitches[clear[0]] if len(clear) else 0.0)
+    pitches = np.linspace(pitch_rad, min(pitch_rad, FLATTEST_RAD), 50)
+    gaps = height_m - (length * np.sin(pitches) + width * np.cos(pitches)) / 2 - TABLE_GAP_M
+    chosen = int(np.argmax(gaps >= 0)) if gaps[-1] >= 0 else -1
+    return float(pitches[chosen]), max(0.0, -float(gaps[chosen]))
 
 
 def _stations(sim: "InsertionSim") -> Poses:

@@ -42,9 +42,10 @@ class MeshFit:
         """Return the fields as 0-d arrays (the cache's format)."""
         return {name: np.asarray(value) for name, value in asdict(self).items()}
 
-    def __post_init__(self) -> None:
-        for name, value in asdict(self).items():
-            object.__setattr__(self, name, float(value))
+    @classmethod
+    def from_arrays(cls, arrays: dict[str, NDArray[Any]]) -> "MeshFit":
+        """Inverse of `arrays`."""
+        return cls(**{name: float(value) for name, value in arrays.items()})
 
 
 def measure_fit(plug: list[Array], socket: list[Array]) -> MeshFit:

@@ -14,6 +14,8 @@ import importlib
 import os
 import re
 import tempfile
+import zipfile
+import zlib
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -138,14 +140,13 @@ def load_mesh_pair(
         role: _scaled(part, np.asarray(getattr(factors, role)), paths[role]) for role, part in parts.items()
     }
     key = _digest(*(array for part in parts.values() for hull in part.pieces for array in (hull.vertices,)))
-    fit = MeshFit(
-        **_cached(
-            f"fit-{key}", lambda: measure_fit(_pieces(parts["plug"]), _pieces(parts["socket"])).arrays()
-        )
+    plug, socket = parts["plug"], parts["socket"]
+    fit = MeshFit.from_arrays(
+        _cached(f"fit-{key}", lambda: measure_fit(_pieces(plug), _pieces(socket)).arrays())
     )
     if fit.exit_sign < 0:  # turn both parts over, so that the plug always leaves upwards
-        parts = {role: _turned_over(part) for role, part in parts.items()}
-    return MeshPair(f"{PREFIX}{mesh_id}", parts["plug"], parts["socket"], replace(fit, exit_sign=1.0))
+        plug, socket = _turned_over(plug), _turned_over(socket)
+    return MeshPair(f"{PREFIX}{mesh_id}", plug, socket, replace(fit, exit_sign=1.0))
 
 
 def part_scales(mesh_id: str, scale: str | float) -> MeshScale:
@@ -163,7 +164,7 @@ def part_scales(mesh_id: str, scale: str | float) -> MeshScale:
         raise ValueError(f"mesh_scale must be flexitac, unit or a factor, not {scale!r}") from None
     if not factor > 0:
         raise ValueError(f"mesh_scale must be above 0, not {factor}")
-    return MeshScale((factor,) * 3, (factor,) * 3)
+    return MeshScale((factor, factor, factor), (factor, factor, factor))
 
 
 def cache_dir() -> Path:
@@ -276,11 +277,11 @@ def _cached(key: str, compute: Callable[[], dict[str, NDArray[Any]]]) -> dict[st
     try:
         with np.load(path) as stored:
             return {name: stored[name] for name in stored.files}
-    except (OSError, ValueError, EOFError, KeyError):
+    except (OSError, ValueError, EOFError, zipfile.BadZipFile, zlib.error):
         arrays = compute()
     path.parent.mkdir(parents=True, exist_ok=True)
     with tempfile.NamedTemporaryFile(dir=path.parent, suffix=".tmp", delete=False) as file:
-        np.savez_compressed(file, **arrays)
+        np.savez_compressed(file, **arrays)  # ty: ignore[invalid-argument-type] (allow_pickle is no array)
     Path(file.name).replace(path)  # atomic: parallel workers never read half a file
     return arrays
 

@@ -1,8 +1,8 @@
 """What joint targets to command so that the servos reach the wanted positions in time.
 
 A position servo with stiffness k and damping d lags behind its command, and dry friction holds it back:
-tau dq/dt = command - load - friction sign(dq/dt) - q with tau = d / k; load and friction as offsets [rad]. The load is
-learnt from how the joint moved in the last control step.
+tau dq/dt = command - load - friction sign(dq/dt) - q with tau = d / k; load and friction as offsets [rad].
+The load is learnt from how the joint moved in the last control step.
 """
 
 from typing import TYPE_CHECKING
@@ -22,7 +22,7 @@ CREEP_RAD_S = 0.004  # below this speed a joint may as well stick: friction tell
 
 
 class ServoModel:
-    """First-order model of every joint's servo, one load per environment and joint. m environments, J joints."""
+    """First-order model of every joint's servo, one load per environment (m) and joint (J)."""
 
     def __init__(self, sim: "InsertionSim") -> None:
         robot, scale = sim.scene.embodiment, sim.scene.config.servo_gain_scale
@@ -46,7 +46,7 @@ class ServoModel:
         self._load[ids] = load.clip(-LOAD_LIMIT_RAD, LOAD_LIMIT_RAD)
 
     def learn(self, ids: NDArray[np.int64], q: Array, trusted: NDArray[np.bool_]) -> None:
-        """Compare where joints went with where the model says they should, for the environments that are trusted."""
+        """Compare where joints went with where the model says they should, in trusted environments."""
         before, command, decay = self._before[ids], self._command[ids], self._decay
         # Response to a command that moves linearly from `before` to `command` within the period.
         free = decay * self._q[ids] + command - decay * before

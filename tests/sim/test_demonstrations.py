@@ -51,4 +51,4 @@ def test_tremor_is_slow() -> None:
 )
 def test_nonsense_is_refused_by_name(field: str, value: float) -> None:
     with pytest.raises(ValueError, match=f"degradation.{field} must be"):
-        Degradation(**{field: value})
+        Degradation(**{field: value})  # ty: ignore[invalid-argument-type]

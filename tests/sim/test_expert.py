@@ -1,15 +1,21 @@
 """The scripted expert: inserts within every limit, corrects slip, and fails like a person when degraded."""
 
+from pathlib import Path
+from typing import Any
+
 import numpy as np
 import pytest
 
+from lerobot_vtrefine.embodiments import get_embodiment
 from lerobot_vtrefine.sim.config import PROCEDURAL_PAIRS, SceneConfig, TaskConfig
 from lerobot_vtrefine.sim.demonstrations import Degradation
-from lerobot_vtrefine.sim.expert import Phase, ScriptedExpert
+from lerobot_vtrefine.sim.expert import Phase, ScriptedExpert, _above_table
 from lerobot_vtrefine.sim.simulation import InsertionSim
 
+AUTOMATE = Path(__file__).parents[3] / "shared" / "data" / "automate"
 
-def _sim(pair: str, start: str, num_envs: int, clearance_m: float = 0.002, **scene: float) -> InsertionSim:
+
+def _sim(pair: str, start: str, num_envs: int, clearance_m: float = 0.002, **scene: Any) -> InsertionSim:
     timestep_s = 0.0025 if clearance_m >= 0.002 else 0.002
     config = SceneConfig(pair=pair, start=start, clearance_m=clearance_m, timestep_s=timestep_s, **scene)
     return InsertionSim(config, num_envs=num_envs, num_threads=1)
@@ -117,6 +123,28 @@ def test_pauses_and_pace_change_the_time_not_the_way() -> None:
 def test_negative_control_never_succeeds() -> None:
     metrics, _ = _episodes(_sim("round", "grasped", 3, negative_control_m=0.0006))
     assert not metrics["success"].any()
+
+
+@pytest.mark.parametrize(
+    ("height_m", "pitch_rad", "raised_m"),
+    [(0.047, 0.45, 0.0), (0.022, 0.18, 0.0), (0.010, 0.1, 0.0093)],
+    ids=["high", "low: flatter", "too low: gripped higher"],
+)
+def test_hands_keep_clear_of_the_table(height_m: float, pitch_rad: float, raised_m: float) -> None:
+    pitch, raised = _above_table(get_embodiment("aloha").fingers, 0.45, height_m)
+    assert pitch == pytest.approx(pitch_rad, abs=0.01)
+    assert raised == pytest.approx(raised_m, abs=5e-4)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("start", ["grasped", "table"])
+@pytest.mark.parametrize("mesh_id", ["00007", "00081", "00186", "00446"])
+def test_solves_mesh_pairs(mesh_id: str, start: str) -> None:
+    if not AUTOMATE.is_dir():
+        pytest.skip("the AutoMate meshes are not beside this checkout (../shared/data/automate)")
+    config = SceneConfig(pair=f"automate/{mesh_id}", start=start, mesh_dir=AUTOMATE)
+    metrics, _ = _episodes(InsertionSim(config, TaskConfig(episode_steps=140), num_envs=3))
+    assert metrics["success"].sum() >= 2
 
 
 @pytest.mark.slow
