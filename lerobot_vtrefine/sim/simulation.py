@@ -46,6 +46,17 @@ class StepResult:
     success: Array
 
 
+@dataclass(frozen=True)
+class _Rest:
+    """A world that has come to rest at its start."""
+
+    row: Array
+    command: Array
+    """(nu,)"""
+    pad_load: Array
+    """(4, 3)"""
+
+
 class InsertionSim:
     """N independent worlds of one scene.
 
@@ -90,7 +101,7 @@ class InsertionSim:
         everyone = self._randomizer.draw(np.zeros(num_envs, np.int64))
         self._parameters = dict(everyone.values)
         self._depth = DepthCamera(self.scene.model, self.scene.camera, num_envs)
-        self._settled: dict[int, tuple[Array, Array]] = {}
+        self._settled: dict[int, _Rest] = {}
 
     @property
     def embodiment(self) -> Any:
@@ -283,14 +294,14 @@ class InsertionSim:
         missing = np.array([int(seed) not in self._settled for seed in seeds], bool)
         fresh = self._settle_physically(ids[missing], seeds[missing]) if missing.any() else {}
         for env, seed in zip(ids, seeds, strict=True):
-            row, command, load = fresh[int(env)] if int(env) in fresh else self._settled[int(seed)]
-            self._backend.set_row(int(env), row)
-            self._episode.command[env], self._episode.pad_load[env] = command, load
-            self._episode.pad_force[env] = load[:, 0]
+            rest = fresh.get(int(env)) or self._settled[int(seed)]
+            self._backend.set_row(int(env), rest.row)
+            self._episode.command[env], self._episode.pad_load[env] = rest.command, rest.pad_load
+            self._episode.pad_force[env] = rest.pad_load[:, 0]
             if len(self._settled) < _MAX_CACHED_STARTS:
-                self._settled[int(seed)] = (row, command, load)
+                self._settled[int(seed)] = rest
 
-    def _settle_physically(self, ids: Array, seeds: Array) -> dict[int, tuple[Array, Array, Array]]:
+    def _settle_physically(self, ids: Array, seeds: Array) -> dict[int, _Rest]:
         start = self._start(seeds)
         at, model = self.scene.addresses, self.scene.model
         qpos = np.zeros((len(ids), model.nq))
@@ -305,7 +316,7 @@ class InsertionSim:
         trace = self._backend.advance(ids, np.repeat(command[:, None], substeps, 1))
         load = self._pad_load(trace)
         return {
-            int(env): (self._backend.get_row(int(env)), command[row], load[row])
+            int(env): _Rest(self._backend.get_row(int(env)), command[row], load[row])
             for row, env in enumerate(ids)
         }
 

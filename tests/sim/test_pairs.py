@@ -86,5 +86,5 @@ def test_bad_pairs_and_clearances_are_named():
         SceneConfig(clearance_m=-0.001)
     with pytest.raises(ValueError, match=r"clearance_m = 0.03 is too large for the round plug"):
         build_scene(SceneConfig(clearance_m=0.03))
-    with pytest.raises(ValueError, match="clearance_m = 0.006 is too large for the key plug"):
+    with pytest.raises(ValueError, match=r"clearance_m = 0.006 is too large for the key plug"):
         build_scene(SceneConfig(pair="key", clearance_m=0.006))
