@@ -215,6 +215,8 @@ def disk_is_full(error: BaseException | None, folder: Path) -> bool:
     """Whether a full disk caused ``error``; LeRobot's image writer hides errors, so the disk is asked."""
     if isinstance(error, OSError) and error.errno == errno.ENOSPC:
         return True
+    while not folder.exists():
+        folder = folder.parent
     status = os.statvfs(folder)
     return status.f_bavail * status.f_frsize < 2**20
 

@@ -2,9 +2,12 @@
 
 import itertools
 import multiprocessing as mp
+import os
 import queue
+import signal
 from collections.abc import Generator, Iterator, Sequence
 from contextlib import contextmanager
+from dataclasses import replace
 from multiprocessing.process import BaseProcess
 from typing import Any
 
@@ -29,6 +32,8 @@ def demonstration_stream(
     if num_workers == 0:
         yield expert_episodes(config, degradation, num_envs, itertools.count(first_seed))
         return
+    threads = config.num_threads or max(1, (os.cpu_count() or 1) // num_workers)
+    config = replace(config, num_threads=threads)
     context = mp.get_context("spawn")
     queues = [context.Queue(AHEAD) for _ in range(num_workers)]
     processes = [
@@ -54,6 +59,7 @@ def _simulate(
     config: VtRefineEnvConfig, degradation: Degradation, num_envs: int, first_seed: int, stride: int, out: Any
 ) -> None:
     """Body of a worker process; an error travels to the reader."""
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C is the parent's to handle
     try:
         for demonstration in expert_episodes(
             config, degradation, num_envs, itertools.count(first_seed, stride)

@@ -61,6 +61,7 @@ class VtRefineVectorEnv(gym.vector.VectorEnv[Observation, Array, Array]):
         """The running simulation; built on first use and again after ``close``."""
         if self._episodes is None:
             self._episodes = make_episodes(self.config, self.num_envs)
+            self.closed = False
         return self._episodes
 
     def reset(
@@ -121,7 +122,6 @@ class VtRefineVectorEnv(gym.vector.VectorEnv[Observation, Array, Array]):
             self._frames.close()
         self._frames = None
         self._episodes = None
-        self.closed = False
 
     def _seeds(self, seed: int | Sequence[int | None] | None) -> Array:
         if seed is None or isinstance(seed, int | np.integer):

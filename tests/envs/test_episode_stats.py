@@ -1,0 +1,42 @@
+import numpy as np
+import pytest
+from lerobot.datasets import compute_stats, dataset_writer
+
+from lerobot_vtrefine.envs.episode_stats import episode_stats, fast_episode_stats
+
+FEATURES = {name: {"dtype": "float32"} for name in ("counts", "state", "timestamp")}
+
+
+def test_statistics_agree_with_lerobots():
+    rng = np.random.default_rng(0)
+    episode = {
+        "counts": rng.integers(0, 255, (40, 24)).astype(np.uint8),
+        "state": rng.normal(size=(40, 16)).astype(np.float32),
+        "timestamp": np.arange(40, dtype=np.float32),
+    }
+    ours, theirs = episode_stats(episode, FEATURES), compute_stats.compute_episode_stats(episode, FEATURES)
+    assert list(ours) == list(theirs)
+    for key, stats in theirs.items():
+        assert set(ours[key]) == set(stats)
+        bin_width = np.ptp(episode[key]) / 5000  # the resolution of LeRobot's quantiles
+        for name, value in stats.items():
+            assert ours[key][name].shape == value.shape, (key, name)
+            assert ours[key][name] == pytest.approx(value, abs=2 * bin_width, rel=1e-5), (key, name)
+
+
+def test_single_frame_episodes_fall_back_to_lerobot():
+    episode = {"state": np.ones((1, 16), np.float32)}
+    assert episode_stats(episode, FEATURES)["state"]["count"].tolist() == [1]
+
+
+def test_the_writer_gets_its_own_function_back():
+    original = dataset_writer.compute_episode_stats
+    with fast_episode_stats():
+        assert dataset_writer.compute_episode_stats is episode_stats
+    assert dataset_writer.compute_episode_stats is original
+
+
+def test_an_unknown_writer_is_left_alone(monkeypatch):
+    monkeypatch.setattr(dataset_writer, "compute_episode_stats", len)
+    with fast_episode_stats():
+        assert dataset_writer.compute_episode_stats is len
