@@ -49,6 +49,8 @@ class SceneConfig:
     embodiment: str = "aloha"
     mesh_dir: Path | None = None
     """Folder with {ID}_plug.obj and {ID}_socket.obj, for automate/ID."""
+    mesh_scale: str = "flexitac"
+    """flexitac (that setup's factors for its five pairs), unit, or one factor for both parts."""
     timestep_s: float = 0.0025
     """Physics step; at clearances of 1 mm and below use 0.002 or less."""
     camera: CameraConfig | None = None
@@ -159,7 +161,7 @@ class TaskConfig:
 
     control_hz: float = 10.0
     episode_steps: int | None = None
-    """Control steps until the time-out; by default 240 from the table, 40 in hand."""
+    """Control steps until the time-out; by default 240 from the table, 48 in hand."""
     joint_rate: float = 1.0
     """Largest commanded speed of a revolute joint [rad/s]."""
     finger_rate: float = 0.15
@@ -185,7 +187,7 @@ class TaskConfig:
 
     def steps_of(self, start: str) -> int:
         """Control steps of an episode from this start."""
-        return self.episode_steps or {"table": 240, "grasped": 40}[start]
+        return self.episode_steps or {"table": 240, "grasped": 48}[start]
 
 
 @dataclass(frozen=True)

@@ -15,6 +15,7 @@ CFG = SmallDppo(
     minibatch_decisions=400,
     actor_lr=3e-4,
     actor_lr_final=3e-4,
+    min_sampling_std=0.1,
     clip=0.01,
     clip_first=0.01,
     encoder="trained",

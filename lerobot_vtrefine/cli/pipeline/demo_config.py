@@ -41,7 +41,6 @@ def default_degradation() -> dict[str, Any]:
         "lateral_std_m": 0.0008,
         "tilt_std_rad": 0.0175,
         "tremor_std_m": 0.0002,
-        "pause_probability": 0.02,
         "pace_std": 0.1,
     }
 
@@ -66,11 +65,11 @@ class DemoConfig:
     """Seed of the whole run; runs of different seeds share no episode."""
     modalities: str = "visuo_tactile"
     """What the policy sees: visuo_tactile or visual."""
-    num_demos: int = 60
+    num_demos: int = 80
     """Successful demonstrations that are kept."""
     demo_envs: int = 32
     """Simulations that record side by side."""
-    pretrain_steps: int = 2000
+    pretrain_steps: int = 1000
     """Gradient steps of imitation learning."""
     pretrain_batch: int = 128
     """Windows in a batch of imitation learning."""
@@ -82,7 +81,7 @@ class DemoConfig:
     """Episodes of each test-time ablation; 0 skips them."""
     videos: int = 6
     """Episodes of each headline evaluation that are drawn; drawing without a GPU is slow."""
-    finetune_iterations: int = 25
+    finetune_iterations: int = 30
     """DPPO iterations of one episode in every environment."""
     finetune_envs: int = 96
     """Simulations that DPPO collects from."""
