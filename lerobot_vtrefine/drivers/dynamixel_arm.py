@@ -109,6 +109,7 @@ class DynamixelArm:
         self.travel_m = travel_m
         self.calibration: dict[str, MotorCalibration] = {}
         self.bus = DynamixelMotorsBus(port, model.bus_motors())
+        self.holding = False
         self._names = [motor for motor, _, _ in model.motors]
 
     @property
@@ -163,6 +164,7 @@ class DynamixelArm:
         """Closes the port; torque goes off before where wanted."""
         if self.is_connected:
             self.bus.disconnect(disable_torque=torque_off)
+        self.holding = False
 
     # --- calibration --------------------------------------------------------------------------------
 
@@ -253,6 +255,7 @@ class DynamixelArm:
         """Switches torque on where the arm is: goals become the present positions first, nothing jumps."""
         self.write(self.read())
         self.bus.enable_torque(self._names, num_retry=RETRIES)
+        self.holding = True
 
     def move_to(self, target: Floats, seconds: float) -> None:
         """Moves slowly along a straight line in joint space, (8,) [rad, m]."""
@@ -266,19 +269,24 @@ class DynamixelArm:
 
     def read(self) -> Floats:
         """Measured state (8,): six joints [rad], left and right finger [m]."""
+        ends = self._gripper_ends()
         counts = self._counts(self._names)
         joints = counts_to_rad(np.array([counts[name] for name in self.model.joints], float))
-        ends = self.calibration[GRIPPER]
         share = (counts[GRIPPER] - ends.range_min) / (ends.range_max - ends.range_min)
         return np.array([*joints, share * self.travel_m, -share * self.travel_m])
 
     def write(self, target: Floats) -> None:
         """Sends targets (8,); the gripper follows the left finger, the right one mirrors it."""
-        ends = self.calibration[GRIPPER]
+        ends = self._gripper_ends()
         gripper = ends.range_min + target[6] / self.travel_m * (ends.range_max - ends.range_min)
         goals = dict(zip(self.model.joints, rad_to_counts(target[:6]).astype(int).tolist(), strict=True))
         goals[GRIPPER] = round(float(gripper))
         self.bus.sync_write("Goal_Position", goals, normalize=False, num_retry=RETRIES)
+
+    def _gripper_ends(self) -> MotorCalibration:
+        if GRIPPER not in self.calibration:
+            raise ValueError(f"{self.name} arm ({self.port}) is not calibrated; run lerobot-calibrate")
+        return self.calibration[GRIPPER]
 
     def _counts(self, names: list[str]) -> dict[str, int]:
         read = self.bus.sync_read("Present_Position", names, normalize=False, num_retry=RETRIES)

@@ -92,7 +92,7 @@ class AlohaTactileFollower(Robot):
 
     @check_if_already_connected
     def connect(self, calibrate: bool = True) -> None:
-        """Connects everything, calibrates where needed, and holds the arms where they are.
+        """Connects everything, calibrates where needed, and holds calibrated arms where they are.
 
         Raises:
             PortError: a port cannot be used; the message names it and the fix. Nothing stays connected.
@@ -105,21 +105,17 @@ class AlohaTactileFollower(Robot):
                 self.calibrate()
             for camera in self.cameras.values():
                 camera.connect()
-            self.configure()
+            if self.is_calibrated:
+                self.configure()
+            else:
+                logger.warning("%s is not calibrated: torque stays off; run lerobot-calibrate", self)
         except BaseException:
             self._release()
             raise
         logger.info("%s connected", self)
 
     def configure(self) -> None:
-        """Sets modes and limits, then holds the arms where they are.
-
-        Raises:
-            ValueError: the arms are not calibrated.
-        """
-        if not self.is_calibrated:
-            command = f"lerobot-calibrate --robot.type={self.name} ..."
-            raise ValueError(f"{self.name} {self.id} is not calibrated; run: {command}")
+        """Sets modes and limits, then holds the arms where they are; they must be calibrated."""
         for arm in self.arms.values():
             arm.configure(self.config.gripper_current_ma)
             arm.hold()
@@ -129,7 +125,7 @@ class AlohaTactileFollower(Robot):
         if self.config.rest_on_disconnect:
             for arm in self.arms.values():
                 with contextlib.suppress(ConnectionError, OSError):  # an arm that is gone cannot be moved
-                    if arm.is_connected:
+                    if arm.is_connected and arm.holding:
                         arm.move_to(np.array([*REST_RAD, *arm.read()[FINGERS]]), self.config.rest_s)
         self._release()
 
