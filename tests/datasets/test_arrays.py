@@ -159,7 +159,7 @@ def test_stock_recorder_carries_and_resumes_arrays(tmp_path: Path, monkeypatch: 
     counts = [int(stored[index]["observation.tactile.pad"].unique().item()) for index in range(len(stored))]
     start = stored.meta.episodes[1]["dataset_from_index"]
     assert counts[:start] == list(range(counts[0], counts[0] + start))
-    assert first["observation.state"].tolist() == [0.5]
+    assert first["observation.state"].item() == 0.5
 
 
 def test_install_reaches_every_binding_and_uninstall_restores_them() -> None:

@@ -1,0 +1,161 @@
+"""LeRobot's own commands on a tiny dataset: train, resume, start from a checkpoint, two processes, edit."""
+
+import json
+import os
+import subprocess
+import sys
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+from lerobot.datasets.lerobot_dataset import LeRobotDataset
+from safetensors import safe_open
+
+from lerobot_vtrefine.policies.vt_dp3.modeling_vt_dp3 import VtDp3Policy
+
+BIN = Path(sys.executable).parent
+TINY = (
+    "--policy.type=vt_dp3",
+    "--policy.preset=small",
+    "--policy.point_dims=[8,16]",
+    "--policy.down_dims=[32,32]",
+    "--policy.observation.num_visual_points=16",
+    "--policy.device=cpu",
+    "--policy.push_to_hub=false",
+)
+RUN = ("--batch_size=4", "--num_workers=0", "--log_freq=2", "--wandb.enable=false")
+
+
+def command(*arguments: object, fails: bool = False) -> str:
+    """Run one of LeRobot's commands offline on one thread; returns what it printed."""
+    environment = os.environ | {"HF_HUB_OFFLINE": "1", "OMP_NUM_THREADS": "1", "WANDB_MODE": "disabled"}
+    words = [str(BIN / str(arguments[0])), *map(str, arguments[1:])]
+    done = subprocess.run(
+        words, env=environment, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True, check=False
+    )
+    assert (done.returncode != 0) is fails, done.stdout[-3000:]
+    return done.stdout
+
+
+def data(root: Path) -> tuple[str, str]:
+    """Flags that name a local dataset."""
+    return "--dataset.repo_id=local/tiny", f"--dataset.root={root}"
+
+
+@pytest.fixture(scope="module")
+def trained(tiny_dataset: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Output folder of ten steps of ``lerobot-train``."""
+    output = tmp_path_factory.mktemp("run") / "bc"
+    command(
+        "lerobot-train",
+        *TINY,
+        *RUN,
+        *data(tiny_dataset),
+        f"--output_dir={output}",
+        "--steps=10",
+        "--save_freq=10",
+    )
+    return output
+
+
+def average_steps(checkpoint: Path) -> int:
+    """How often the moving average in a checkpoint was updated."""
+    with safe_open(checkpoint / "pretrained_model" / "model.safetensors", framework="pt") as tensors:
+        return int(tensors.get_tensor("ema.step"))
+
+
+def test_training_writes_a_checkpoint_that_loads(trained: Path) -> None:
+    policy = VtDp3Policy.from_pretrained(trained / "checkpoints" / "last" / "pretrained_model", strict=True)
+    assert policy.config.point_dims == (8, 16)
+    assert policy.config.observation.pool_rows == 2
+    assert average_steps(trained / "checkpoints" / "000010") == 10
+
+
+def test_training_resumes_where_it_stopped(trained: Path) -> None:
+    config = trained / "checkpoints" / "last" / "pretrained_model" / "train_config.json"
+    printed = command(
+        "lerobot-train", f"--config_path={config}", "--resume=true", "--steps=14", "--save_freq=14"
+    )
+    assert "step:12" in printed
+    assert average_steps(trained / "checkpoints" / "000014") == 14
+
+
+def test_training_starts_from_a_checkpoint_on_another_dataset(
+    trained: Path, tmp_path: Path, write_dataset: Callable[..., None]
+) -> None:
+    write_dataset(tmp_path / "other", episodes=1, frames=8, seed=7)
+    command(
+        "lerobot-train",
+        f"--policy.path={trained / 'checkpoints' / '000010' / 'pretrained_model'}",
+        "--policy.push_to_hub=false",
+        *RUN,
+        *data(tmp_path / "other"),
+        f"--output_dir={tmp_path / 'run'}",
+        "--steps=4",
+        "--save_freq=4",
+    )
+    saved = tmp_path / "run" / "checkpoints" / "000004" / "pretrained_model"
+    assert json.loads((saved / "config.json").read_text())["down_dims"] == [32, 32]
+    assert average_steps(saved.parent) == 14
+
+
+@pytest.mark.slow
+def test_two_processes_train_one_policy(tiny_dataset: Path, tmp_path: Path) -> None:
+    printed = command(
+        "torchrun",
+        "--standalone",
+        "--nproc_per_node=2",
+        "--no-python",
+        str(BIN / "lerobot-train"),
+        *TINY,
+        *RUN,
+        *data(tiny_dataset),
+        f"--output_dir={tmp_path / 'run'}",
+        "--steps=4",
+        "--save_freq=4",
+    )
+    assert "4 x 2 = 8" in printed
+    assert average_steps(tmp_path / "run" / "checkpoints" / "000004") == 4
+
+
+def test_training_without_pads_says_what_is_missing(tiny_dataset: Path, tmp_path: Path) -> None:
+    from lerobot.datasets import remove_feature
+
+    from lerobot_vtrefine.datasets.features import TACTILE_KEYS
+
+    tiny = LeRobotDataset("local/tiny", root=tiny_dataset)
+    remove_feature(tiny, list(TACTILE_KEYS), output_dir=tmp_path / "blind", repo_id="local/tiny")
+    run = (*RUN, *data(tmp_path / "blind"), f"--output_dir={tmp_path / 'run'}", "--steps=2")
+    printed = command("lerobot-train", *TINY, *run, fails=True)
+    message = "needs columns that the data lacks: observation.tactile.left_arm_left_finger"
+    assert message in printed.strip().splitlines()[-1]
+
+
+def test_episodes_are_deleted_and_merged(tiny_dataset: Path, tmp_path: Path) -> None:
+    command(
+        "lerobot-edit-dataset",
+        "--repo_id=local/tiny",
+        f"--root={tiny_dataset}",
+        "--new_repo_id=local/less",
+        f"--new_root={tmp_path / 'less'}",
+        "--operation.type=delete_episodes",
+        "--operation.episode_indices=[1]",
+    )
+    command(
+        "lerobot-edit-dataset",
+        "--new_repo_id=local/more",
+        f"--new_root={tmp_path / 'more'}",
+        "--operation.type=merge",
+        "--operation.repo_ids=['local/tiny', 'local/less']",
+        f"--operation.roots=['{tiny_dataset}', '{tmp_path / 'less'}']",
+    )
+    tiny = LeRobotDataset("local/tiny", root=tiny_dataset)
+    more = LeRobotDataset("local/more", root=tmp_path / "more")
+    assert more.meta.total_episodes == 5
+    assert more.meta.features == tiny.meta.features
+    key = "observation.tactile.right_arm_left_finger"
+    for row, source in ((0, 0), (35, 35), (36, 0), (48, 24), (59, 35)):
+        assert more[row][key].tolist() == tiny[source][key].tolist()
+        assert more[row]["observation.images.front_depth"].equal(
+            tiny[source]["observation.images.front_depth"]
+        )
