@@ -28,6 +28,9 @@ class Critic(nn.Module):
     """
 
     CLIP = 10.0
+    count: Tensor
+    total: Tensor
+    squares: Tensor
 
     def __init__(self, privileged_dim: int, width: int, num_blocks: int) -> None:
         super().__init__()
@@ -53,7 +56,7 @@ class Critic(nn.Module):
         mean = self.total / count
         std = (self.squares / count - mean**2).clamp(min=0).sqrt()
         scale = torch.where(std > 1e-6, 1 / std.clamp(min=1e-6), 0.0)  # constant channels say nothing
-        states = ((states - mean) * scale).clamp(-self.CLIP, self.CLIP).to(self.net[0].weight.dtype)
+        states = ((states - mean) * scale).clamp(-self.CLIP, self.CLIP).to(next(self.parameters()).dtype)
         return self.net(states).squeeze(-1)
 
 

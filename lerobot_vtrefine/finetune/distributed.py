@@ -60,20 +60,12 @@ def sum_gradients(parameters: Iterable[nn.Parameter]) -> None:
     if num_ranks() == 1:
         return
     parameters = list(parameters)
-    for parameter in parameters:
-        if parameter.grad is None:  # an unused parameter must still take part in the sum
-            parameter.grad = torch.zeros_like(parameter)
-    flat = torch.cat([parameter.grad.flatten() for parameter in parameters])
+    # An unused parameter has no gradient, but must still take part in the sum.
+    gradients = [torch.zeros_like(p) if p.grad is None else p.grad for p in parameters]
+    flat = torch.cat([gradient.flatten() for gradient in gradients])
     dist.all_reduce(flat)
     for parameter, part in zip(parameters, flat.split([p.numel() for p in parameters]), strict=True):
-        parameter.grad.copy_(part.view_as(parameter))
-
-
-def copy_from_first_rank(module: nn.Module) -> None:
-    """Give every rank the first rank's parameters and buffers."""
-    if num_ranks() > 1:
-        for tensor in module.state_dict().values():
-            dist.broadcast(tensor, src=0)
+        parameter.grad = part.view_as(parameter)
 
 
 def mean_over_ranks(columns: dict[str, Tensor]) -> dict[str, float]:

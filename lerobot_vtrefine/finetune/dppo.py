@@ -19,6 +19,7 @@ import math
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from functools import partial
 
 import torch
 from torch import Tensor
@@ -35,6 +36,7 @@ from lerobot_vtrefine.finetune.distributed import (
 )
 from lerobot_vtrefine.finetune.gae import RewardScaler, generalised_advantages
 from lerobot_vtrefine.finetune.protocols import (
+    Actor,
     Agent,
     DecisionEnv,
     Observation,
@@ -72,11 +74,11 @@ class TrainState:
         with torch.random.fork_rng(devices=[]):
             torch.manual_seed(seed)
             critic = Critic(privileged_dim, cfg.critic_width, cfg.critic_blocks).to(device)
-        adamw = {"weight_decay": cfg.weight_decay, "fused": device.type == "cuda"}
+        adamw = partial(torch.optim.AdamW, weight_decay=cfg.weight_decay, fused=device.type == "cuda")
         return cls(
             critic,
-            torch.optim.AdamW(agent.trained_parameters(), lr=cfg.actor_lr, **adamw),
-            torch.optim.AdamW(critic.parameters(), lr=cfg.critic_lr, **adamw),
+            adamw(agent.trained_parameters(), lr=cfg.actor_lr),
+            adamw(critic.parameters(), lr=cfg.critic_lr),
             RewardScaler(),
             torch.Generator(device).manual_seed(seed + 7919 * rank_index()),
         )
@@ -220,7 +222,7 @@ class Regulariser:
 
 
 def _reverse_steps(
-    agent: Agent, module: torch.nn.Module, latents: Tensor, cond: Tensor, eta: float
+    agent: Agent, network: Actor, latents: Tensor, cond: Tensor, eta: float
 ) -> tuple[Tensor, Tensor]:
     """Means (B, K', H, D) and stds (B, K', 1, 1) of all tuned steps of B decisions, in one network call."""
     batch, steps = latents.shape[0], agent.num_tuned
@@ -228,7 +230,7 @@ def _reverse_steps(
         agent.process.num_steps - steps, agent.process.num_steps, device=latents.device
     ).repeat(batch)
     rows = latents[:, :-1].flatten(0, 1)
-    eps = module.denoiser(rows, agent.process.times(positions), cond.repeat_interleave(steps, dim=0))
+    eps = network.denoiser(rows, agent.process.times(positions), cond.repeat_interleave(steps, dim=0))
     mean, std = agent.process.posterior(rows, eps, positions, eta)
     return mean.unflatten(0, (batch, steps)), std.unflatten(0, (batch, steps))
 

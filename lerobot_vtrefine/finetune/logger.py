@@ -73,7 +73,7 @@ def start_wandb(
         dir=output_dir,
         config=settings,
         resume="allow",
-        mode=cfg.mode,
+        mode=cfg.mode,  # ty: ignore[invalid-argument-type]  LeRobot's config says str
     )
     id_file.write_text(run.id)
     logging.info("logging to Weights & Biases as %s", run.id)

@@ -5,12 +5,13 @@ from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any
 
+import draccus
 import torch
 from lerobot.configs import PreTrainedConfig, parser
 from lerobot.configs.default import EvalConfig, WandBConfig
 from lerobot.envs import EnvConfig
 from lerobot.policies import make_pre_post_processors
-from lerobot.utils.constants import ACTION, PRETRAINED_MODEL_DIR
+from lerobot.utils.constants import PRETRAINED_MODEL_DIR
 from lerobot.utils.random_utils import set_seed
 from tqdm import tqdm
 from tqdm.contrib.logging import logging_redirect_tqdm
@@ -32,6 +33,7 @@ from lerobot_vtrefine.finetune.protocols import Agent, DecisionEnv
 from lerobot_vtrefine.policies.vt_dp3.configuration_vt_dp3 import VtDp3Config
 from lerobot_vtrefine.policies.vt_dp3.modeling_vt_dp3 import VtDp3Policy
 
+CONFIG_NAME = "finetune_config.json"
 SHOWN = (
     "success",
     "eval_success",
@@ -112,12 +114,14 @@ def make_agent(policy: VtDp3Policy, dppo: DppoConfig) -> Agent:
         )
     policy.eval()
     config = policy.config
+    if policy.base is None:
+        raise ValueError("the policy has no frozen base network")
     return Agent(
         actor=policy.model,
         base=policy.base,
         process=policy.process,
         num_tuned=config.ft_denoising_steps,
-        action_shape=(config.horizon, config.output_features[ACTION].shape[0]),
+        action_shape=(config.horizon, config.action_dim),
         executed=slice(0, config.n_action_steps),
         frozen_encoder=config.ft_freeze_encoder,
     )
@@ -179,6 +183,14 @@ class Recorder:
         logging.info("iteration %d: %s", iteration, shown)
 
 
+def save_config(cfg: FinetunePipelineConfig) -> None:
+    """Write all settings to the output folder; ``--config_path`` reads them again."""
+    cfg.output_dir.mkdir(parents=True, exist_ok=True)
+    if rank_index() == 0:
+        with draccus.config_type("json"), (cfg.output_dir / CONFIG_NAME).open("w") as file:
+            draccus.dump(cfg, file, indent=2)
+
+
 def run(cfg: FinetunePipelineConfig) -> None:
     """Fine-tune; the result is ``output_dir/checkpoints/last/pretrained_model``."""
     path, checkpoint = start_path(cfg)
@@ -187,10 +199,10 @@ def run(cfg: FinetunePipelineConfig) -> None:
         raise ValueError(
             f"{path} is fine-tuned already; start from the pre-trained checkpoint, or --resume=true"
         )
-    device = torch.device(policy.config.device)
+    device = torch.device(policy.config.device or "cpu")
     join_ranks(device)
     set_seed(cfg.seed + rank_index())
-    cfg.output_dir.mkdir(parents=True, exist_ok=True)
+    save_config(cfg)
     overrides = {"device_processor": {"device": str(device)}}
     processors = make_pre_post_processors(policy.config, str(path), preprocessor_overrides=overrides)
     agent = make_agent(policy, cfg.dppo)

@@ -4,7 +4,7 @@ Shapes: ``n`` environments, ``H`` horizon of a predicted chunk, ``Ta`` executed 
 dimension, ``C`` condition, ``P`` privileged state.
 """
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from typing import NamedTuple, Protocol
 
@@ -23,8 +23,12 @@ class Actor(Protocol):
     denoiser: nn.Module
     """``(x (B, H, D), t (B,) long, cond (B, C)) -> eps (B, H, D)``."""
 
-    def encode(self, obs: Observation) -> Tensor:
+    def encode(self, batch: Observation, /) -> Tensor:
         """Condition (B, C) of an observation: once per decision."""
+        ...
+
+    def parameters(self) -> Iterator[nn.Parameter]:
+        """As of ``nn.Module``."""
         ...
 
 
@@ -37,8 +41,8 @@ class Agent:
     encoder is not trained and is the base's, so conditions are computed once and kept.
     """
 
-    actor: nn.Module
-    base: nn.Module
+    actor: Actor
+    base: Actor
     process: DiffusionProcess
     num_tuned: int
     action_shape: tuple[int, int]  # (H, D)
@@ -52,8 +56,8 @@ class Agent:
 
     def trained_parameters(self) -> list[nn.Parameter]:
         """What the actor's optimiser owns."""
-        module = self.actor.denoiser if self.frozen_encoder else self.actor
-        return [parameter for parameter in module.parameters() if parameter.requires_grad]
+        parameters = self.actor.denoiser.parameters() if self.frozen_encoder else self.actor.parameters()
+        return [parameter for parameter in parameters if parameter.requires_grad]
 
     def conditions(self, obs: Observation) -> tuple[Tensor, Tensor]:
         """Conditions (B, C) for the actor and for the base."""
@@ -61,9 +65,9 @@ class Agent:
         return cond, (cond if self.frozen_encoder else self.base.encode(obs))
 
 
-def predictor(module: nn.Module, cond: Tensor) -> PredictNoise:
-    """Bind a condition to a module's denoiser."""
-    return lambda x, t: module.denoiser(x, t, cond)
+def predictor(network: Actor, cond: Tensor) -> PredictNoise:
+    """Bind a condition to a network's denoiser."""
+    return lambda x, t: network.denoiser(x, t, cond)
 
 
 class Transition(NamedTuple):
@@ -84,18 +88,29 @@ class Transition(NamedTuple):
 class DecisionEnv(Protocol):
     """Environments that take one action chunk per decision and pause once finished, until the next reset."""
 
-    num_envs: int
-    max_decisions: int
-    """Decisions in the longest possible episode."""
-    privileged_dim: int
-    """P."""
+    @property
+    def num_envs(self) -> int:
+        """n."""
+        ...
+
+    @property
+    def max_decisions(self) -> int:
+        """Decisions in the longest possible episode."""
+        ...
+
+    @property
+    def privileged_dim(self) -> int:
+        """P."""
+        ...
 
     def reset(self, seeds: Sequence[int]) -> tuple[Observation, Tensor]:
         """Start all environments, each from its own seed. Returns observation and privileged state (n, P)."""
         ...
 
-    def step_chunk(self, actions: Tensor) -> Transition:
-        """Execute (n, Ta, D) normalised actions, as the policy predicts them."""
+    def step_chunk(
+        self, actions: Tensor
+    ) -> tuple[Observation, Tensor, Tensor, Tensor, Tensor, dict[str, Tensor]]:
+        """Execute (n, Ta, D) normalised actions, as the policy predicts them; a ``Transition``."""
         ...
 
 

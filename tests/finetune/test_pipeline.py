@@ -1,5 +1,6 @@
 """``vtrefine-finetune`` on a tiny policy without a simulator: files, exact resumption, bad input."""
 
+import json
 import shutil
 from pathlib import Path
 
@@ -134,6 +135,18 @@ def test_an_existing_run_is_not_overwritten(finetune, tmp_path, capsys):
     assert finetune(output, iterations=1) == 0
     assert finetune(output, iterations=1) == 2
     assert "--resume=true" in capsys.readouterr().err
+
+
+def test_settings_are_saved_and_can_be_read_again(finetune, tmp_path):
+    first, second = tmp_path / "first", tmp_path / "second"
+    assert finetune(first, "--env.clearance_m=0.001", iterations=1) == 0
+    assert finetune(second, f"--config_path={first / 'finetune_config.json'}", iterations=1) == 0
+    saved = [json.loads((run / "finetune_config.json").read_text()) for run in (first, second)]
+    assert saved[1].pop("output_dir") == str(second)
+    assert saved[0].pop("output_dir") == str(first)
+    assert saved[0] == saved[1]
+    assert saved[1]["env"]["clearance_m"] == 0.001
+    assert saved[1]["dppo"]["epochs"] == 2
 
 
 def test_a_finished_run_resumes_to_nothing(finetune, tmp_path):
