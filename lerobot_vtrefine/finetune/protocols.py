@@ -114,7 +114,7 @@ class DecisionEnv(Protocol):
         ...
 
 
-def no_gradient(module: nn.Module) -> nn.Module:
+def no_gradient[M: nn.Module](module: M) -> M:
     """Freeze a module in place."""
     module.requires_grad_(False)
     return module.eval()

@@ -1,0 +1,145 @@
+"""Cost of the DPPO update against a plain loop; rows for ``vtrefine-bench``.
+
+The plain loop is the common way to write the update: rows are (decision, denoising step) pairs in random
+order, and each row encodes its observation again and asks the critic again. Both do the same optimiser
+steps on the same number of rows.
+"""
+
+import time
+from collections.abc import Callable
+from copy import deepcopy
+from dataclasses import replace
+
+import torch
+from lerobot.configs import FeatureType, PolicyFeature
+from torch import Tensor
+
+from lerobot_vtrefine.datasets.features import ACTION_KEY, CLOUD_KEY, NUM_JOINTS, STATE_KEY
+from lerobot_vtrefine.finetune.config import SmallDppo
+from lerobot_vtrefine.finetune.dppo import (
+    Rollout,
+    TrainState,
+    chain_log_probs,
+    decision_advantages,
+    policy_loss,
+    update,
+)
+from lerobot_vtrefine.finetune.protocols import Agent, no_gradient, select
+from lerobot_vtrefine.observation import num_points
+from lerobot_vtrefine.policies.vt_dp3.configuration_vt_dp3 import VtDp3Config
+from lerobot_vtrefine.policies.vt_dp3.diffusion import DiffusionProcess, slice_log_prob, step_grid
+from lerobot_vtrefine.policies.vt_dp3.modeling_vt_dp3 import VtDp3Model
+
+DECISIONS = 64
+PRIVILEGED = 60
+ROUNDS = 3
+
+Row = tuple[str, float, str]
+
+
+def run() -> list[Row]:
+    """(what, ratio, explanation) with the encoder trained and with it frozen; policy preset ``small``."""
+    return [_row("trained"), _row("frozen")]
+
+
+def _row(encoder: str) -> Row:
+    cfg = SmallDppo(encoder=encoder, epochs=1, minibatch_decisions=DECISIONS // 2, critic_warmup=0)
+    agent = _agent(cfg)
+    state = TrainState.create(agent, cfg, PRIVILEGED, seed=0)
+    rollout = _rollout(agent, cfg)
+    ours, plain = [], []
+    for _ in range(ROUNDS + 1):  # by turns; the first round warms up
+        ours.append(_seconds(lambda: update(_for_update(rollout, agent), agent, state, cfg)))
+        plain.append(_seconds(lambda: _plain_update(rollout, agent, state, cfg)))
+    times = [1e3 * min(part[1:]) / DECISIONS for part in (ours, plain)]
+    explanation = f"{times[0]:.2f} ms per decision and epoch against {times[1]:.2f} ms (CPU time)"
+    return f"DPPO update, plain loop / ours, encoder {encoder}", times[1] / times[0], explanation
+
+
+def _seconds(function: Callable[[], object]) -> float:
+    started = time.process_time()
+    function()
+    return time.process_time() - started
+
+
+def _agent(cfg: SmallDppo) -> Agent:
+    config = VtDp3Config(preset="small", device="cpu")
+    config.input_features = {STATE_KEY: PolicyFeature(FeatureType.STATE, (NUM_JOINTS,))}
+    config.output_features = {ACTION_KEY: PolicyFeature(FeatureType.ACTION, (NUM_JOINTS,))}
+    torch.manual_seed(0)
+    actor = VtDp3Model(config, NUM_JOINTS, NUM_JOINTS)
+    actor.encoder.requires_grad_(cfg.encoder == "trained")
+    grid = step_grid(cfg.sampler, config.num_train_timesteps, cfg.sampler_steps, cfg.prefix_steps)
+    return Agent(
+        actor=actor,
+        base=no_gradient(deepcopy(actor)),
+        process=DiffusionProcess(config.num_train_timesteps, grid),
+        num_tuned=cfg.ft_denoising_steps,
+        action_shape=(config.horizon, NUM_JOINTS),
+        executed=slice(0, config.n_action_steps),
+        frozen_encoder=cfg.encoder == "frozen",
+    )
+
+
+@torch.no_grad()
+def _rollout(agent: Agent, cfg: SmallDppo) -> Rollout:
+    """One random decision in each of ``DECISIONS`` environments, with raw observations."""
+    config = VtDp3Config(preset="small", device="cpu")
+    points = num_points(config.observation)
+    obs = {
+        STATE_KEY: torch.randn(DECISIONS, config.n_obs_steps, NUM_JOINTS),
+        CLOUD_KEY: torch.rand(DECISIONS, config.n_obs_steps, points, 5),
+    }
+    latents = 0.5 * torch.randn(DECISIONS, cfg.ft_denoising_steps + 1, *agent.action_shape)
+    log_probs, _, _ = chain_log_probs(agent, latents, agent.actor.encode(obs), cfg)
+    once = torch.ones(1, DECISIONS, dtype=torch.bool)
+    return Rollout(
+        obs=obs,
+        latents=latents,
+        log_probs=log_probs,
+        step=torch.zeros(DECISIONS, dtype=torch.long),
+        env=torch.arange(DECISIONS),
+        privileged=torch.randn(2, DECISIONS, PRIVILEGED),
+        reward=torch.rand(1, DECISIONS),
+        terminated=once,
+        truncated=~once,
+        active=once,
+        success=once[0],
+        info={},
+    )
+
+
+@torch.no_grad()
+def _for_update(rollout: Rollout, agent: Agent) -> Rollout:
+    """What the update reads: with a frozen encoder, the conditions that were computed while sampling."""
+    if not agent.frozen_encoder:
+        return rollout
+    return replace(rollout, obs={"cond": agent.actor.encode(rollout.obs)})
+
+
+def _plain_update(rollout: Rollout, agent: Agent, state: TrainState, cfg: SmallDppo) -> None:
+    """One epoch over shuffled (decision, denoising step) rows."""
+    advantages, targets = decision_advantages(rollout, state, cfg)
+    steps, process = cfg.ft_denoising_steps, agent.process
+    first = process.num_steps - steps
+    for rows in torch.randperm(DECISIONS * steps).split(cfg.minibatch_decisions * steps):
+        ids, step = rows // steps, rows % steps
+        cond = agent.actor.encode(select(rollout.obs, ids))
+        latent = rollout.latents[ids, step]
+        eps = agent.actor.denoiser(latent, process.times(first + step), cond)
+        mean, std = process.posterior(latent, eps, first + step, cfg.eta)
+        following = rollout.latents[ids, step + 1]
+        log_prob = slice_log_prob(following, mean, std.clamp(min=cfg.min_log_prob_std), agent.executed)
+        loss = _row_loss(log_prob - rollout.log_probs[ids, step], advantages[ids], step, cfg)
+        values = state.critic(rollout.privileged[0, ids])
+        state.actor_optimizer.zero_grad()
+        state.critic_optimizer.zero_grad()
+        (loss + cfg.value_coef * 0.5 * (values - targets[ids]).square().mean()).backward()
+        state.actor_optimizer.step()
+        state.critic_optimizer.step()
+
+
+def _row_loss(log_ratio: Tensor, advantages: Tensor, step: Tensor, cfg: SmallDppo) -> Tensor:
+    """The clipped loss of single rows: that of whole decisions, picked at each row's step."""
+    every = policy_loss(log_ratio.unsqueeze(1).expand(-1, cfg.ft_denoising_steps), advantages, cfg)
+    return every.gather(1, step.unsqueeze(1)).mean()
