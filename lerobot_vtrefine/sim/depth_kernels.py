@@ -147,7 +147,7 @@ def project(
     own = wp.where(shared == 1, 0, world)
     low_u, low_v, high_u, high_v = float(MISS), float(MISS), float(-MISS), float(-MISS)
     whole = kind[geom] == PLANE
-    behind = int(0)  # noqa: UP018, RUF046 (a bare literal would be a constant to warp)
+    behind = int(0)  # a bare literal would be a constant to warp
     for corner in range(8):
         sign = wp.vec3(
             wp.where((corner & 1) == 1, 1.0, -1.0),

@@ -162,7 +162,10 @@ def _update_forces(state: EpisodeState, ids: Array, seen: Measured) -> None:
 
 
 def _update_grasp(state: EpisodeState, ids: Array, seen: Measured) -> None:
-    """Take the reference once a part has been held long enough; a part set down again loses it."""
+    """Take each part's reference once its own hand has held it long enough; a part set down again loses it.
+
+    From then on the shift counts, also while the part is being lifted: starts in hand begin with a reference.
+    """
     pressed = state.pad_force[ids].reshape(-1, 2, 2) > task.HELD_FORCE_N
     held, lifted = pressed.all(-1), seen.part_heights > LIFT_M
     state.held_steps[ids] = np.where(held, state.held_steps[ids] + 1, 0)

@@ -71,7 +71,7 @@ def load_pair(config: SceneConfig) -> PartPair:
     if config.pair.startswith(MESH_PAIR_PREFIX):
         from lerobot_vtrefine.sim.mesh_pairs import load_mesh_parts  # trimesh and CoACD are optional
 
-        return load_mesh_parts(config.pair, config.mesh_dir)
+        return load_mesh_parts(config.pair, config.mesh_dir, config.mesh_scale)
     if config.pair not in PROCEDURAL_PAIRS:
         choices = f"{', '.join(PROCEDURAL_PAIRS)} or {MESH_PAIR_PREFIX}ID"
         raise ValueError(f"unknown pair {config.pair!r}: use one of {choices}")
