@@ -90,8 +90,8 @@ def boards_of(
 
 
 def allow_slow_answers(patch: pytest.MonkeyPatch) -> None:
-    """Emulated motors share this machine's processors with everything else; the SDK waits 34 ms by default."""
-    patch.setattr("dynamixel_sdk.port_handler.LATENCY_TIMER", 250)
+    """Emulated motors share this machine's processors with everything else; the SDK waits 34 ms."""
+    patch.setattr("dynamixel_sdk.port_handler.LATENCY_TIMER", 120)
 
 
 @contextmanager
