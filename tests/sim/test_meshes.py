@@ -9,7 +9,9 @@ import numpy as np
 import pytest
 
 from lerobot_vtrefine.sim import meshes
+from lerobot_vtrefine.sim.config import SceneConfig
 from lerobot_vtrefine.sim.meshes import MeshPair, load_mesh_pair, mesh_ids
+from lerobot_vtrefine.sim.scene import build_scene
 
 trimesh = pytest.importorskip("trimesh", reason="needs the assets extra")
 pytest.importorskip("coacd", reason="needs the assets extra")
@@ -114,6 +116,20 @@ def test_changed_file_is_decomposed_again(folder: Path, ring: MeshPair) -> None:
 def test_ring_slides_over_the_post_and_not_through_it(ring: MeshPair) -> None:
     assert _push_in(ring, offset_m=0.4 * PLAY_M) < 2e-3
     assert _push_in(ring, offset_m=PLAY_M + 6e-3) > 0.8 * ring.fit.travel_m
+
+
+def test_scene_is_built_with_grips_clear_of_each_other(folder: Path, ring: MeshPair) -> None:
+    scene = build_scene(SceneConfig(pair="automate/ring", mesh_dir=folder, mesh_scale="unit"))
+    pieces = [len(part.pieces) for part in (ring.plug, ring.socket)]
+    assert len(scene.addresses.part_geoms) == sum(pieces)
+    plug, socket = scene.pair.plug, scene.pair.socket
+    # The foot is held below the seated ring; the ring, which nowhere stands above the post, by its height.
+    assert socket.grip.centre_m[2] + socket.grip.half_size_m[2] <= RING_BOTTOM_M + 1e-6
+    assert plug.grip.centre_m[2] == pytest.approx((RING_BOTTOM_M + RING_TOP_M) / 2, abs=1e-4)
+    assert plug.grip.half_size_m[0] == pytest.approx(0.022, abs=5e-4)
+    assert socket.grip.half_size_m[0] == pytest.approx(0.020, abs=5e-4)
+    assert plug.rest_height_m == pytest.approx(-RING_BOTTOM_M, abs=1e-6)
+    assert scene.pair.mouth_z_m == ring.fit.travel_m
 
 
 def test_missing_folder_names_the_files(tmp_path: Path) -> None:
