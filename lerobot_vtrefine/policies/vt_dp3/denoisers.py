@@ -134,8 +134,9 @@ class ResidualBlock(nn.Module):
 class MLPDenoiser(nn.Module):
     """FiLM residual MLP over the flattened chunk: an order of magnitude cheaper than the U-Net on a CPU.
 
-    The output adds the noisy input times a gain that depends on the diffusion step alone: at high noise eps is
-    almost x, and without the gain every one of the H * D values would have to pass through ``width`` features.
+    The output adds the noisy input times a gain that depends on the diffusion step alone: at high noise eps
+    is almost x, and without the gain every one of the H * D values would have to pass through ``width``
+    features.
     """
 
     def __init__(
