@@ -8,7 +8,6 @@ from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any
 
-import datasets
 from lerobot.configs import parser
 from lerobot.configs.default import EvalConfig
 from lerobot.envs.configs import EnvConfig
@@ -126,7 +125,6 @@ def _main(config: RecordDemosConfig) -> None:
 def main() -> None:
     """Console entry point."""
     init_logging()
-    datasets.disable_progress_bars()
     _main()
 
 

@@ -14,6 +14,7 @@ from pathlib import Path
 from types import TracebackType
 from typing import Any, Self
 
+from lerobot.datasets.io_utils import SuppressProgressBars
 from lerobot.datasets.lerobot_dataset import LeRobotDataset
 
 from lerobot_vtrefine.datasets.features import ACTION_KEY, raw_to_frame
@@ -89,7 +90,7 @@ class DemoDataset:
         for step, action in enumerate(demonstration.actions):
             raw = {key: value[step] for key, value in demonstration.raw.items()}
             dataset.add_frame({**raw_to_frame(raw), ACTION_KEY: action, "task": self._task})
-        with fast_episode_stats():
+        with fast_episode_stats(), SuppressProgressBars():
             dataset.save_episode()
         row = {"episode_index": self.num_episodes, **demonstration.row}
         self._ledger["episodes"].append(row)

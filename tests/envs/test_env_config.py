@@ -11,6 +11,7 @@ from lerobot.envs.utils import env_to_policy_features
 
 from lerobot_vtrefine.datasets.features import DEPTH_KEY, TACTILE_KEYS
 from lerobot_vtrefine.envs import VtRefineEnvConfig
+from lerobot_vtrefine.sim.config import TaskConfig
 
 ENV_FILES = sorted((Path(__file__).parents[2] / "configs" / "env").glob("*.yaml"))
 
@@ -44,8 +45,10 @@ def test_flags_reach_every_level():
 
 
 def test_episode_length_follows_the_start():
-    assert VtRefineEnvConfig(start="table").max_episode_steps == 240
-    assert VtRefineEnvConfig(start="grasped").max_episode_steps == 40
+    table, grasped = (VtRefineEnvConfig(start=start).max_episode_steps for start in ("table", "grasped"))
+    assert table == 240
+    assert grasped == TaskConfig().steps_of("grasped") < table
+    assert VtRefineEnvConfig(start="table", episode_steps=7).max_episode_steps == 7
 
 
 def test_policy_features_have_the_datasets_keys_and_shapes():
@@ -89,8 +92,8 @@ def test_bad_settings_are_named_at_once(settings, message):
 
 
 def test_control_rate_has_one_flag():
-    with pytest.raises(Exception, match="fps"):
-        parse("--env.rules.control_hz=20")
+    with pytest.raises(ValueError, match="fps"):
+        VtRefineEnvConfig(rules=TaskConfig(control_hz=20.0))
 
 
 def test_unknown_pair_and_missing_meshes_are_one_line(tmp_path):

@@ -18,7 +18,7 @@ def test_statistics_agree_with_lerobots():
     assert list(ours) == list(theirs)
     for key, stats in theirs.items():
         assert set(ours[key]) == set(stats)
-        bin_width = np.ptp(episode[key]) / 5000  # the resolution of LeRobot's quantiles
+        bin_width = float(np.ptp(episode[key])) / 5000  # the resolution of LeRobot's quantiles
         for name, value in stats.items():
             assert ours[key][name].shape == value.shape, (key, name)
             assert ours[key][name] == pytest.approx(value, abs=2 * bin_width, rel=1e-5), (key, name)

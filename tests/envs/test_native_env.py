@@ -150,7 +150,7 @@ def test_missing_metrics_log_names_the_flag(tmp_path):
 
 
 def test_calls_that_lerobot_eval_makes(make_env):
-    env = make_env(3)
+    env = make_env(3, episode_steps=40)
     assert env.call("_max_episode_steps") == (40, 40, 40)
     assert env.call("task_description") == (env.config.task,) * 3
     assert env.unwrapped.metadata["render_fps"] == 10
