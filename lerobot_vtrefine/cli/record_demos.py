@@ -125,6 +125,7 @@ def _main(config: RecordDemosConfig) -> None:
 def main() -> None:
     """Console entry point."""
     init_logging()
+    logging.getLogger("PIL").setLevel(logging.INFO)  # or it reports every tag of every depth image
     _main()
 
 

@@ -19,11 +19,11 @@ from lerobot.datasets.lerobot_dataset import LeRobotDataset
 
 from lerobot_vtrefine.datasets.features import ACTION_KEY, raw_to_frame
 from lerobot_vtrefine.envs.demonstrations import Demonstration
-from lerobot_vtrefine.envs.episode_stats import fast_episode_stats
+from lerobot_vtrefine.envs.fast_saving import fast_saving
 
 LEDGER = Path("meta") / "recording.json"
 SUMMARIES = (Path("meta") / "info.json", Path("meta") / "stats.json")
-COMMIT_EVERY = 10
+COMMIT_EVERY = 20
 IMAGE_WRITER_THREADS = 2
 
 
@@ -90,7 +90,7 @@ class DemoDataset:
         for step, action in enumerate(demonstration.actions):
             raw = {key: value[step] for key, value in demonstration.raw.items()}
             dataset.add_frame({**raw_to_frame(raw), ACTION_KEY: action, "task": self._task})
-        with fast_episode_stats(), SuppressProgressBars():
+        with fast_saving(), SuppressProgressBars():
             dataset.save_episode()
         row = {"episode_index": self.num_episodes, **demonstration.row}
         self._ledger["episodes"].append(row)

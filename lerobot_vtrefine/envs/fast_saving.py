@@ -1,16 +1,18 @@
-"""Episode statistics of wide array columns in one pass.
+"""Two steps of LeRobot's episode saving in one pass each: statistics of wide columns, embedding of images.
 
-LeRobot builds one 5000-bin histogram per taxel: 0.4 s for a 25-frame episode with four pads, most of the time
-of recording. ``fast_episode_stats`` lends its writer the exact vectorised equivalent while demonstrations are
-saved.
+LeRobot builds one 5000-bin histogram per taxel and embeds images frame by frame: 0.5 s for a 25-frame episode
+with four pads, most of the time of recording. ``fast_saving`` lends its writer equivalents while demonstrations
+are saved.
 """
 
-from collections.abc import Generator
+from collections.abc import Callable, Generator
 from contextlib import contextmanager
 from typing import Any
 
+import datasets
 import numpy as np
-from lerobot.datasets import compute_stats, dataset_writer
+from datasets.table import embed_table_storage
+from lerobot.datasets import compute_stats, dataset_writer, io_utils
 
 from lerobot_vtrefine.envs.episodes import Array
 
@@ -48,15 +50,26 @@ def episode_stats(episode: dict[str, Any], features: dict[str, Any], *args: Any,
     return {key: stats[key] for key in episode if key in stats}
 
 
+def embed_images(dataset: datasets.Dataset) -> datasets.Dataset:
+    """As LeRobot's function of this name: put the bytes of image files into the table, all frames at once."""
+    arrow = dataset.with_format("arrow").map(embed_table_storage, batched=True, batch_size=None)
+    return arrow.with_format(**dataset.format)
+
+
 @contextmanager
-def fast_episode_stats() -> Generator[None]:
-    """Let LeRobot's dataset writer use ``episode_stats``; where it has no such hook, change nothing."""
-    original = getattr(dataset_writer, "compute_episode_stats", None)
-    if original is not compute_stats.compute_episode_stats:
-        yield
-        return
-    dataset_writer.compute_episode_stats = episode_stats  # ty: ignore[invalid-assignment]
+def fast_saving() -> Generator[None]:
+    """Let LeRobot's dataset writer use the functions above; a writer that has other ones keeps them."""
+    lent = [
+        ("compute_episode_stats", compute_stats.compute_episode_stats, episode_stats),
+        ("embed_images", io_utils.embed_images, embed_images),
+    ]
+    replaced: list[tuple[str, Callable[..., Any]]] = []
     try:
+        for name, original, ours in lent:
+            if getattr(dataset_writer, name, None) is original:
+                setattr(dataset_writer, name, ours)
+                replaced.append((name, original))
         yield
     finally:
-        dataset_writer.compute_episode_stats = original
+        for name, original in replaced:
+            setattr(dataset_writer, name, original)

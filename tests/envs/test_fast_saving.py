@@ -1,8 +1,10 @@
+import datasets
 import numpy as np
 import pytest
-from lerobot.datasets import compute_stats, dataset_writer
+from lerobot.datasets import compute_stats, dataset_writer, io_utils
+from PIL import Image
 
-from lerobot_vtrefine.envs.episode_stats import episode_stats, fast_episode_stats
+from lerobot_vtrefine.envs.fast_saving import embed_images, episode_stats, fast_saving
 
 FEATURES = {name: {"dtype": "float32"} for name in ("counts", "state", "timestamp")}
 
@@ -29,14 +31,28 @@ def test_single_frame_episodes_fall_back_to_lerobot():
     assert episode_stats(episode, FEATURES)["state"]["count"].tolist() == [1]
 
 
-def test_the_writer_gets_its_own_function_back():
-    original = dataset_writer.compute_episode_stats
-    with fast_episode_stats():
+def test_images_are_embedded_as_lerobot_does(tmp_path):
+    depth = np.random.default_rng(0).integers(0, 60000, (5, 6, 8)).astype(np.uint16)
+    paths = [tmp_path / f"{index}.tiff" for index in range(5)]
+    for image, path in zip(depth, paths, strict=True):
+        Image.fromarray(image).save(path)
+    table = datasets.Dataset.from_dict({"image": [str(path) for path in paths], "index": list(range(5))})
+    table = table.cast_column("image", datasets.Image())
+    theirs, ours = io_utils.embed_images(table), embed_images(table)
+    assert ours.with_format("arrow")[:].equals(theirs.with_format("arrow")[:])
+    assert ours.format == theirs.format
+
+
+def test_the_writer_gets_its_own_functions_back():
+    originals = (dataset_writer.compute_episode_stats, dataset_writer.embed_images)
+    with fast_saving():
         assert dataset_writer.compute_episode_stats is episode_stats
-    assert dataset_writer.compute_episode_stats is original
+        assert dataset_writer.embed_images is embed_images
+    assert (dataset_writer.compute_episode_stats, dataset_writer.embed_images) == originals
 
 
 def test_an_unknown_writer_is_left_alone(monkeypatch):
     monkeypatch.setattr(dataset_writer, "compute_episode_stats", len)
-    with fast_episode_stats():
+    with fast_saving():
         assert dataset_writer.compute_episode_stats is len
+    assert dataset_writer.compute_episode_stats is len
