@@ -163,7 +163,7 @@ class DemoDataset:
             return self._dataset
         if self._ledger["episodes"]:
             for summary in SUMMARIES:
-                shutil.copyfile(self.root / summary, _copy_of(self.root / summary))
+                _keep_copy(self.root / summary)
             self._dataset = LeRobotDataset.resume(
                 self._repo_id, root=self.root, image_writer_threads=IMAGE_WRITER_THREADS
             )
@@ -220,6 +220,17 @@ def disk_is_full(error: BaseException | None, folder: Path) -> bool:
         folder = folder.parent
     status = os.statvfs(folder)
     return status.f_bavail * status.f_frsize < 2**20
+
+
+def _keep_copy(path: Path) -> None:
+    """Copy a summary beside itself, whole or not at all: a truncated copy would later replace the good file."""
+    part = path.with_name(f"{path.name}.part")
+    try:
+        shutil.copyfile(path, part)
+    except OSError:
+        part.unlink(missing_ok=True)
+        raise
+    part.replace(_copy_of(path))
 
 
 def _copy_of(path: Path) -> Path:

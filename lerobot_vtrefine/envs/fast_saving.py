@@ -1,8 +1,8 @@
 """Two steps of LeRobot's episode saving in one pass each: statistics of wide columns, embedding of images.
 
-LeRobot builds one 5000-bin histogram per taxel and embeds images frame by frame: 0.5 s for a 25-frame episode
-with four pads, most of the time of recording. ``fast_saving`` lends its writer equivalents while demonstrations
-are saved.
+LeRobot builds one 5000-bin histogram per taxel and embeds images frame by frame: 0.5 s for a 25-frame
+episode with four pads, most of the time of recording. ``fast_saving`` lends its writer equivalents while
+demonstrations are saved.
 """
 
 from collections.abc import Callable, Generator
