@@ -223,7 +223,7 @@ def disk_is_full(error: BaseException | None, folder: Path) -> bool:
 
 
 def _keep_copy(path: Path) -> None:
-    """Copy a summary beside itself, whole or not at all: a truncated copy would later replace the good file."""
+    """Copy a summary beside itself, whole or not at all: a rollback puts the copy in place of the file."""
     part = path.with_name(f"{path.name}.part")
     try:
         shutil.copyfile(path, part)

@@ -140,6 +140,10 @@ class SuccessConfig:
     """The mouth must be at least this high above the table: inserted in air."""
     hold_s: float = 1.0
 
+    def hold_steps(self, control_dt_s: float) -> int:
+        """Consecutive observations that must find the plug seated: n steps apart lie n + 1 observations."""
+        return round(self.hold_s / control_dt_s) + 1
+
 
 @dataclass(frozen=True)
 class LimitsConfig:

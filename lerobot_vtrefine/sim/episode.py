@@ -186,8 +186,7 @@ def _update_success(
 ) -> Array:
     seated = task.is_seated(seen.insertion, config)
     state.hold_steps[ids] = np.where(seated, state.hold_steps[ids] + 1, 0)
-    needed = max(1, round(config.hold_s / dt_s))
-    fresh = (state.hold_steps[ids] >= needed) & ~state.done[ids]
+    fresh = (state.hold_steps[ids] >= config.hold_steps(dt_s)) & ~state.done[ids]
     state.success[ids] |= fresh
     state.success_step[ids] = np.where(fresh, state.steps[ids], state.success_step[ids])
     return fresh

@@ -64,7 +64,7 @@ def describe(
         rotation = seen.hand_rotation[:, hand]
         columns[f"{name}_in_hand"] = turn_back(rotation, part[0] - seen.hand_position[:, hand])
         columns[f"{name}_in_hand_rotation"] = _two_columns(np.swapaxes(rotation, -1, -2) @ part[1])
-    limits, hold_steps = config.limits, config.success.hold_s / config.control_dt_s
+    limits, hold_steps = config.limits, config.success.hold_steps(config.control_dt_s)
     columns |= {
         "mouth_height": insertion.mouth_height_m[:, None],
         "contact_force": turn_back(seen.socket[1], episode.part_force[ids]),

@@ -136,6 +136,28 @@ def test_full_disk_keeps_what_was_committed(tmp_path, small_commits, monkeypatch
     assert np.array_equal(read(root)[14][ACTION_KEY], demonstration(4).actions[2])
 
 
+def test_full_disk_while_setting_copies_aside_keeps_what_was_committed(tmp_path, monkeypatch):
+    root = tmp_path / "demo"
+    with open_recording(root) as demos:
+        demos.append(demonstration(0))
+
+    def truncate(source: Path, target: Path) -> None:
+        Path(target).write_bytes(b"")
+        raise_full()
+
+    def continue_recording() -> None:
+        with open_recording(root) as demos:
+            demos.append(demonstration(1))
+
+    with monkeypatch.context() as broken:
+        broken.setattr(demo_dataset.shutil, "copyfile", truncate)
+        with pytest.raises(OSError, match=r"1 episodes saved .* stay readable"):
+            continue_recording()
+    assert read(root).num_episodes == 1
+    continue_recording()
+    assert read(root).num_episodes == 2
+
+
 def test_a_killed_recording_continues_from_its_last_commit(tmp_path, small_commits):
     root = tmp_path / "demo"
     demos = open_recording(root)

@@ -61,6 +61,7 @@ class BatchBackend(Backend):
     def set_row(self, env: int, row: Array) -> None:
         """See `Backend.set_row`."""
         self._batch.state[env] = row
+        self._batch.warning[env] = 0  # else a world that once diverged would count as diverged for ever
 
     def instance(self, env: int) -> tuple[mujoco.MjModel, mujoco.MjData]:
         """See `Backend.instance`."""

@@ -72,6 +72,8 @@ class SingleBackend(Backend):
     def set_row(self, env: int, row: Array) -> None:
         """See `Backend.set_row`."""
         mujoco.mj_setState(self._models[env], self._data[env], row, _STATE)
+        for warning in self._data[env].warning:
+            warning.number = 0
 
     def instance(self, env: int) -> tuple[mujoco.MjModel, mujoco.MjData]:
         """See `Backend.instance`."""
