@@ -45,8 +45,8 @@ def make_ablation(ablate: str, dataset: Path | None) -> Callable[[Raw], Raw] | N
     """A function that replaces the ablated part of raw frames (m, ...), or None for ``none``.
 
     Touch: the counts above the idle level become their mean per taxel, on top of each frame's own baseline;
-    idle levels differ between pads, so mean raw counts would read as pressure. Vision: the depth image becomes
-    the mean depth per pixel.
+    idle levels differ between pads, so mean raw counts would read as pressure. Vision: the depth image
+    becomes the mean depth per pixel.
     """
     if ablate == "none" or dataset is None:
         return None
