@@ -114,7 +114,7 @@ def test_larger_errors_succeed_less_often() -> None:
 
 def test_pauses_and_pace_change_the_time_not_the_way() -> None:
     clean, actions = _episodes(_sim("round", "grasped", 2))
-    slow, paused = _episodes(_sim("round", "grasped", 2), Degradation(pause_probability=0.1, pause_steps=3))
+    slow, paused = _episodes(_sim("round", "grasped", 2), Degradation(pause_probability=0.05, pause_steps=3))
     assert slow["success"].all()
     assert len(paused) > len(actions)
     assert (slow["time_to_success_s"] >= clean["time_to_success_s"]).all()
