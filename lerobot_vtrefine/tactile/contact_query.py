@@ -12,14 +12,22 @@ from lerobot_vtrefine.tactile.geometry import BodyGeometry, TriangleMesh
 from lerobot_vtrefine.tactile.layout import PadLayout
 from lerobot_vtrefine.tactile.packing import PackedBodies, pack_bodies
 
-REACH_M = 0.005
+REACH_M = 0.003
 """How far from the face, either way, a body's surface is looked for [m]."""
 
 MODES = {"closest": 0, "column": 1}
 NOTHING_M = {"closest": 0.0, "column": -1.0}
 UPLOADED = (
     *("owner", "kind", "position", "rotation", "extent", "plane_start", "planes"),
-    *("corners", "triangle_owner", "cluster_start", "cluster_owner", "cluster_centre", "cluster_half"),
+    *(
+        "corners",
+        "normals",
+        "triangle_owner",
+        "cluster_start",
+        "cluster_owner",
+        "cluster_centre",
+        "cluster_half",
+    ),
 )
 POSES = {
     **{"pad_pos": wp.vec3, "pad_rot": wp.mat33, "pad_vel": wp.spatial_vector},
@@ -49,15 +57,21 @@ class ContactQuery:
         layout: the pad's taxels; `subdivision` refines the lattice by that factor in both directions.
         bodies: geometry of the B bodies.
         device: torch device, "cpu" or "cuda[:i]".
+        reach_m: how far from the face surfaces are looked for.
     """
 
     def __init__(
-        self, layout: PadLayout, bodies: list[BodyGeometry], device: str = "cpu", subdivision: int = 1
+        self,
+        layout: PadLayout,
+        bodies: list[BodyGeometry],
+        device: str = "cpu",
+        subdivision: int = 1,
+        reach_m: float = REACH_M,
     ) -> None:
         start_warp()
         self.device = str(torch.device(device))
         self.rows, self.cols = layout.rows * subdivision, layout.cols * subdivision
-        self.pitch_m = layout.pitch_m / subdivision
+        self.pitch_m, self.reach_m = layout.pitch_m / subdivision, reach_m
         # A CUDA thread takes one taxel; a CPU thread a whole pad, which lets it skip what is out of reach.
         self._block = (1, 1) if self.device.startswith("cuda") else (self.rows, self.cols)
         self.num_bodies = len(bodies)
@@ -115,7 +129,7 @@ class ContactQuery:
     def _lattice(self, mode: str, skip_unloaded: bool) -> Any:
         lattice = kernels.Lattice()
         lattice.mode, lattice.rows, lattice.cols = MODES[mode], self.rows, self.cols
-        lattice.pitch, lattice.reach = self.pitch_m, REACH_M
+        lattice.pitch, lattice.reach = self.pitch_m, self.reach_m
         lattice.block_rows, lattice.block_cols = self._block
         lattice.skip_unloaded = int(skip_unloaded)
         return lattice

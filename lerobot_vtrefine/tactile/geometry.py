@@ -165,9 +165,11 @@ class ConvexHull:
             faces = faces[:, ::-1].copy()
         object.__setattr__(self, "vertices", vertices)
         object.__setattr__(self, "faces", faces)
-        planes = self.planes()
-        size = np.ptp(vertices, axis=0).max()
-        if (vertices @ planes[:, :3].T - planes[:, 3]).max() > 1e-3 * size:
+        corners = vertices[faces]
+        normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+        normals /= np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-30)
+        beyond = (vertices @ normals.T).max(axis=0) - np.einsum("fi,fi->f", corners[:, 0], normals)
+        if beyond.max() > 1e-3 * np.ptp(vertices, axis=0).max():
             raise ValueError(
                 "ConvexHull: the mesh is not convex; use TriangleMesh or decompose it into convex pieces"
             )

@@ -9,8 +9,6 @@ triangles on the
 lattice and `resolve_meshes` turns the winners into depths.
 """
 
-# ruff: noqa: UP018, RUF046  (in kernels, float(0.0) and wp.int32(...) declare variables that loops may change)
-
 import warp as wp
 
 wp.set_module_options({"enable_backward": False})
@@ -69,6 +67,7 @@ class Bodies:
     plane_start: wp.array(dtype=int)
     planes: wp.array(dtype=wp.vec4)
     corners: wp.array(dtype=wp.vec3)
+    normals: wp.array(dtype=wp.vec3)
     triangle_owner: wp.array(dtype=int)
     cluster_start: wp.array(dtype=int)
     cluster_owner: wp.array(dtype=int)

@@ -1,12 +1,10 @@
 """Warp kernel of the load-consistent elastic foundation (Winkler): heights and load in, taxel forces out.
 
-Each pad is one thread. Its face gives way by u = max(0, z + delta + a x + b y) at every lattice point, where z is the
-column height plus the viscous lead tau * rate and (x, y) the centre of the point's taxel, in taxel pitches. The three
-unknowns are solved so that the forces k u add up to the load and balance at its centre: the minimum of a convex,
-piecewise quadratic function, found by Newton's method.
+Each pad is one thread. Its face gives way by u = max(0, z + delta + a x + b y) at every lattice point, where
+z is the column height plus the viscous lead tau * rate and (x, y) the centre of the point's taxel, in taxel
+pitches. The three unknowns are solved so that the forces k u add up to the load and balance at its centre: a
+minimum of a convex, piecewise quadratic function, found by Newton's method.
 """
-
-# ruff: noqa: UP018, RUF046  (in kernels, float(0.0) and wp.int32(...) declare variables that loops may change)
 
 import warp as wp
 
@@ -14,13 +12,15 @@ from lerobot_vtrefine.tactile.kernels import coordinate, ivec4
 
 wp.set_module_options({"enable_backward": False})
 
-MAX_TILT = wp.constant(0.2)
+MAX_TILT = wp.constant(1.0)
 """Limit of the two slopes; only reached when the load's centre lies outside what the body can press on."""
 NEWTON_STEPS = wp.constant(14)
+MAX_LEAD_M = wp.constant(0.05)
 NEAR = wp.constant(1.0e-2)
 """How close to the load the search for the offset comes before Newton's method takes over."""
 TOLERANCE = wp.constant(2.0e-6)
 
+vec6 = wp.types.vector(length=6, dtype=wp.float32)
 mat33d = wp.types.matrix(shape=(3, 3), dtype=wp.float64)
 
 
@@ -45,46 +45,81 @@ class Balance:
 
 
 @wp.func
-def balance(
-    pad: Pad, stride: int, depth: wp.array(dtype=float), rate: wp.array(dtype=float), trial: wp.vec3d
-) -> Balance:
-    """Sums of u (1, x, y) and of (1, x, y)^T (1, x, y) over the points in contact, of every `stride`-th row and column."""
-    result = Balance()
+def row_sums(
+    pad: Pad, stride: int, row: int, base: float, a: float, taxel_cols: int, height: wp.array(dtype=float)
+) -> vec6:
+    """(n, x, x^2, u, u x, u^2) summed over one row's points in contact.
+
+    In single precision, while rows are added in double: fast, and exact enough for 1e-6 of the load.
+    """
+    n = float(0.0)
+    sx = float(0.0)
+    sxx = float(0.0)
+    su = float(0.0)
+    sux = float(0.0)
+    suu = float(0.0)
+    half = 0.5 * float(taxel_cols - 1)
+    for col in range(pad.area[2] / pad.subdivision, pad.area[3] / pad.subdivision):
+        x = float(col) - half
+        offset = base + a * x
+        start = row * pad.cols + col * pad.subdivision
+        u = wp.max(height[start] + offset, 0.0)
+        count = wp.where(u > 0.0, 1.0, 0.0)
+        squares = u * u
+        # A taxel's points are summed first: shorter chains of dependent additions.
+        for index in range(start + stride, start + pad.subdivision, stride):
+            other = wp.max(height[index] + offset, 0.0)
+            count += wp.where(other > 0.0, 1.0, 0.0)
+            u += other
+            squares += other * other
+        n += count
+        sx += count * x
+        sxx += count * x * x
+        su += u
+        sux += u * x
+        suu += squares
+    return vec6(n, sx, sxx, su, sux, suu)
+
+
+@wp.func
+def balance(pad: Pad, stride: int, height: wp.array(dtype=float), trial: wp.vec3d) -> Balance:
+    """Sums of u (1, x, y) and (1, x, y)^T (1, x, y) over every `stride`-th row and column."""
+    n = wp.float64(0.0)
+    sx = wp.float64(0.0)
+    sy = wp.float64(0.0)
+    sxx = wp.float64(0.0)
+    sxy = wp.float64(0.0)
+    syy = wp.float64(0.0)
+    su = wp.float64(0.0)
+    sux = wp.float64(0.0)
+    suy = wp.float64(0.0)
+    suu = wp.float64(0.0)
     taxel_rows = pad.rows / pad.subdivision
     taxel_cols = pad.cols / pad.subdivision
     a = wp.float32(trial[1])
     for row in range(pad.area[0], pad.area[1], stride):
         y = coordinate(row / pad.subdivision, 1.0, taxel_rows)
         base = wp.float32(trial[0] + trial[2] * wp.float64(y))
-        # One row in single precision, rows in double: fast, and exact enough for 1e-6 of the load.
-        n = float(0.0)
-        sx = float(0.0)
-        sxx = float(0.0)
-        su = float(0.0)
-        sux = float(0.0)
-        suu = float(0.0)
-        start = row * pad.cols
-        for col in range(pad.area[2], pad.area[3], stride):
-            x = coordinate(col / pad.subdivision, 1.0, taxel_cols)
-            u = depth[start + col] + pad.damping_s * rate[start + col] + base + a * x
-            # Heights of -1 m mark points without a body, whatever their rate holds.
-            if u > 0.0 and depth[start + col] > -0.5:
-                n += 1.0
-                sx += x
-                sxx += x * x
-                su += u
-                sux += u * x
-                suu += u * u
-        if n > 0.0:
+        sums = row_sums(pad, stride, row, base, a, taxel_cols, height)
+        if sums[0] > 0.0:
             yd = wp.float64(y)
-            nd = wp.float64(n)
-            sxd = wp.float64(sx)
-            sud = wp.float64(su)
-            result.squares += wp.float64(suu)
-            result.sums += wp.vec3d(sud, wp.float64(sux), sud * yd)
-            result.hessian += mat33d(
-                nd, sxd, nd * yd, sxd, wp.float64(sxx), sxd * yd, nd * yd, sxd * yd, nd * yd * yd
-            )
+            nd = wp.float64(sums[0])
+            xd = wp.float64(sums[1])
+            ud = wp.float64(sums[3])
+            n += nd
+            sx += xd
+            sy += nd * yd
+            sxx += wp.float64(sums[2])
+            sxy += xd * yd
+            syy += nd * yd * yd
+            su += ud
+            sux += wp.float64(sums[4])
+            suy += ud * yd
+            suu += wp.float64(sums[5])
+    result = Balance()
+    result.squares = suu
+    result.sums = wp.vec3d(su, sux, suy)
+    result.hessian = mat33d(n, sx, sy, sx, sxx, sxy, sy, sxy, syy)
     return result
 
 
@@ -92,19 +127,18 @@ def balance(
 def offset_for_sum(
     pad: Pad,
     stride: int,
-    depth: wp.array(dtype=float),
-    rate: wp.array(dtype=float),
+    height: wp.array(dtype=float),
     tilted: wp.vec3d,
     total: wp.float64,
 ) -> wp.vec3d:
     """(delta, a, b) with the tilts of `tilted` and delta such that the u add up to about `total`.
 
-    Newton from the side where more points are in contact descends monotonically and ends after finitely many steps;
-    its first step leads to that side from anywhere.
+    Newton from the side where more points are in contact descends monotonically and ends after finitely many
+    steps; its first step leads to that side from anywhere.
     """
     trial = tilted
     for _step in range(32):
-        here = balance(pad, stride, depth, rate, trial)
+        here = balance(pad, stride, height, trial)
         if here.hessian[0, 0] < wp.float64(1.0):
             trial[0] = trial[0] + wp.float64(1.0e-3)
         else:
@@ -117,7 +151,8 @@ def offset_for_sum(
 
 @wp.func
 def newton_step(h: mat33d, g: wp.vec3d) -> wp.vec3d:
-    """-(h + small diagonal)^-1 g by Cholesky; the diagonal keeps points on one line, or one point, solvable."""
+    """-(h + small diagonal)^-1 g by Cholesky; the diagonal keeps points on one line, or one point,
+    solvable."""
     small = wp.float64(1.0e-9)
     l00 = wp.sqrt(h[0, 0] + wp.float64(1.0e-30))
     l10 = h[1, 0] / l00
@@ -144,15 +179,19 @@ def limited(trial: wp.vec3d, limit: wp.float64) -> wp.vec3d:
 def solve_balance(
     pad: Pad,
     stride: int,
-    depth: wp.array(dtype=float),
-    rate: wp.array(dtype=float),
+    height: wp.array(dtype=float),
     start: wp.vec3d,
     target: wp.vec3d,
     limit: wp.float64,
 ) -> wp.vec3d:
-    """(delta, a, b) whose sums meet the target; damped Newton steps on the convex merit sum u^2 / 2 - target . trial."""
+    """(delta, a, b) whose sums meet the target; damped Newton steps on the convex merit sum u^2 / 2 - target
+    . trial."""
     trial = start
-    here = balance(pad, stride, depth, rate, trial)
+    here = balance(pad, stride, height, trial)
+    if here.sums[0] < wp.float64(0.1) * target[0]:
+        # Too little in contact for a first step that means something.
+        trial = offset_for_sum(pad, stride, height, trial, target[0])
+        here = balance(pad, stride, height, trial)
     for _ in range(NEWTON_STEPS):
         g = here.sums - target
         worst = wp.max(wp.abs(g[0]), wp.max(wp.abs(g[1]), wp.abs(g[2])))
@@ -165,7 +204,7 @@ def solve_balance(
         for _halving in range(8):
             if accepted == 0:
                 candidate = limited(trial + scale * step, limit)
-                there = balance(pad, stride, depth, rate, candidate)
+                there = balance(pad, stride, height, candidate)
                 gain = wp.float64(0.5) * there.squares - wp.dot(target, candidate) - merit
                 if gain <= wp.float64(1.0e-4) * wp.min(wp.dot(g, candidate - trial), wp.float64(0.0)):
                     trial = candidate
@@ -174,6 +213,8 @@ def solve_balance(
                 scale = scale * wp.float64(0.5)
         if accepted == 0:
             break
+    if here.sums[0] < wp.float64(0.9) * target[0]:
+        trial = offset_for_sum(pad, stride, height, trial, target[0])
     return trial
 
 
@@ -198,33 +239,38 @@ def spread_load(rows: int, cols: int, pitch: float, load: wp.vec3, force: wp.arr
 def write_forces(
     pad: Pad,
     stiffness: float,
-    depth: wp.array(dtype=float),
-    rate: wp.array(dtype=float),
+    height: wp.array(dtype=float),
     answer: wp.vec3d,
     total: wp.float64,
     force: wp.array(dtype=float),
 ) -> None:
-    """Forces of a solution, times what single precision left between their sum and the load."""
-    here = balance(pad, 1, depth, rate, answer)
-    factor = stiffness * wp.float32(total / here.sums[0])
-    taxel_rows = pad.rows / pad.subdivision
-    taxel_cols = pad.cols / pad.subdivision
+    """Forces of a solution, scaled by what was left between their sum and the load."""
+    rows = pad.rows / pad.subdivision
+    cols = pad.cols / pad.subdivision
     a = wp.float32(answer[1])
-    for row in range(pad.area[0], pad.area[1]):
-        y = coordinate(row / pad.subdivision, 1.0, taxel_rows)
-        base = wp.float32(answer[0] + answer[2] * wp.float64(y))
-        start = row * pad.cols
-        out = (row / pad.subdivision) * taxel_cols
-        for col in range(pad.area[2], pad.area[3]):
-            x = coordinate(col / pad.subdivision, 1.0, taxel_cols)
-            u = depth[start + col] + pad.damping_s * rate[start + col] + base + a * x
-            if u > 0.0 and depth[start + col] > -0.5:
-                force[out + col / pad.subdivision] += factor * u
+    whole = wp.float64(0.0)
+    for row in range(pad.area[0] / pad.subdivision, pad.area[1] / pad.subdivision):
+        base = wp.float32(answer[0] + answer[2] * wp.float64(coordinate(row, 1.0, rows)))
+        row_sum = float(0.0)
+        for col in range(pad.area[2] / pad.subdivision, pad.area[3] / pad.subdivision):
+            offset = base + a * coordinate(col, 1.0, cols)
+            taxel_sum = float(0.0)
+            for line in range(pad.subdivision):
+                start = (row * pad.subdivision + line) * pad.cols + col * pad.subdivision
+                for index in range(start, start + pad.subdivision):
+                    taxel_sum += wp.max(height[index] + offset, 0.0)
+            force[row * cols + col] = stiffness * taxel_sum
+            row_sum += taxel_sum
+        whole += wp.float64(row_sum)
+    factor = wp.float32(total / whole)
+    for row in range(pad.area[0] / pad.subdivision, pad.area[1] / pad.subdivision):
+        for col in range(pad.area[2] / pad.subdivision, pad.area[3] / pad.subdivision):
+            force[row * cols + col] *= factor
 
 
 @wp.func
-def contact_area(rows: int, cols: int, window: wp.array(dtype=ivec4)) -> ivec4:
-    """Smallest block of the lattice that holds all primitives' areas; empty (begin >= end) when there are none."""
+def contact_area(rows: int, cols: int, subdivision: int, window: wp.array(dtype=ivec4)) -> ivec4:
+    """Smallest block of whole taxels that holds all primitives' areas; empty (begin >= end) without any."""
     area = ivec4(rows, 0, cols, 0)
     for k in range(window.shape[0]):
         other = window[k]
@@ -235,16 +281,25 @@ def contact_area(rows: int, cols: int, window: wp.array(dtype=ivec4)) -> ivec4:
                 wp.min(area[2], other[2]),
                 wp.max(area[3], other[3]),
             )
-    return area
+    return ivec4(
+        area[0] / subdivision * subdivision,
+        (area[1] + subdivision - 1) / subdivision * subdivision,
+        area[2] / subdivision * subdivision,
+        (area[3] + subdivision - 1) / subdivision * subdivision,
+    )
 
 
 @wp.func
-def highest_point(pad: Pad, depth: wp.array(dtype=float)) -> float:
-    """Largest height in the pad's area; -1 m when no body stands over it."""
+def add_lead(pad: Pad, depth: wp.array(dtype=float), rate: wp.array(dtype=float)) -> float:
+    """Put height plus viscous lead in place of the rates; returns the largest, -1 m without a body."""
     best = float(-1.0)
     for row in range(pad.area[0], pad.area[1]):
-        for col in range(pad.area[2], pad.area[3]):
-            best = wp.max(best, depth[row * pad.cols + col])
+        for index in range(row * pad.cols + pad.area[2], row * pad.cols + pad.area[3]):
+            height = depth[index]
+            if height > -0.5:
+                height += wp.clamp(pad.damping_s * rate[index], -MAX_LEAD_M, MAX_LEAD_M)
+            rate[index] = height
+            best = wp.max(best, height)
     return best
 
 
@@ -265,8 +320,9 @@ def solve_foundation(
 ) -> None:
     """Forces [N] on pad_rows x pad_cols taxels from heights on the lattice that is finer by `subdivision`.
 
-    `stiffness` is that of one lattice point, per environment [N/m]; `window` holds the lattice areas of the primitives
-    in reach; `force` must come in as zero; `solution` gets (delta [m], slope x, slope y).
+    `stiffness` is that of one lattice point, per environment [N/m]; `window` holds the lattice areas of the
+    primitives in reach; `rate` is overwritten; `force` must come in as zero; `solution` gets
+    (delta [m], slope x, slope y).
     """
     env, side = wp.tid()
     solution[env, side] = wp.vec3(0.0, 0.0, 0.0)
@@ -278,10 +334,9 @@ def solve_foundation(
     pad.cols = pad_cols * subdivision
     pad.subdivision = subdivision
     pad.damping_s = damping_s
-    pad.area = contact_area(pad.rows, pad.cols, window[env, side])
-    heights = depth[env, side]
-    rates = rate[env, side]
-    top = highest_point(pad, heights)
+    pad.area = contact_area(pad.rows, pad.cols, subdivision, window[env, side])
+    heights = rate[env, side]
+    top = add_lead(pad, depth[env, side], heights)
     if top <= -0.5:
         spread_load(pad_rows, pad_cols, pitch, push, force[env, side])
         return
@@ -293,10 +348,9 @@ def solve_foundation(
     if subdivision > 1:
         # Every taxel's first point alone leads close to the answer at a fraction of the cost.
         share = wp.float64(1.0) / wp.float64(subdivision * subdivision)
-        answer = offset_for_sum(pad, subdivision, heights, rates, answer, total * share)
-        answer = solve_balance(pad, subdivision, heights, rates, answer, target * share, limit)
-    answer = offset_for_sum(pad, 1, heights, rates, answer, total)
-    answer = solve_balance(pad, 1, heights, rates, answer, target, limit)
-    write_forces(pad, stiffness[env], heights, rates, answer, total, force[env, side])
+        answer = offset_for_sum(pad, subdivision, heights, answer, total * share)
+        answer = solve_balance(pad, subdivision, heights, answer, target * share, limit)
+    answer = solve_balance(pad, 1, heights, answer, target, limit)
+    write_forces(pad, stiffness[env], heights, answer, total, force[env, side])
     slopes = wp.vec3d(answer[0], answer[1] * scale, answer[2] * scale)
     solution[env, side] = wp.vec3(slopes)

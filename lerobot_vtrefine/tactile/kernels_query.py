@@ -86,6 +86,29 @@ def eval_rate(form: wp.vec4, x: float, y: float, s: float) -> float:
 
 
 @wp.func
+def query_face(
+    lattice: Lattice,
+    area: ivec4,
+    form: wp.vec4,
+    speed: wp.vec4,
+    depth: wp.array(dtype=float),
+    rate: wp.array(dtype=float),
+) -> None:
+    """Column heights where a single plane decides: the usual case of a part held flat."""
+    for row in range(area[0], area[1]):
+        y = coordinate(row, lattice.pitch, lattice.rows)
+        base = form[0] + form[2] * y
+        speed_base = speed[0] + speed[2] * y
+        for col in range(area[2], area[3]):
+            x = coordinate(col, lattice.pitch, lattice.cols)
+            value = wp.min(-base - form[1] * x, lattice.reach)
+            index = row * lattice.cols + col
+            if value > depth[index] and value >= -lattice.reach:
+                depth[index] = value
+                rate[index] = speed_base + speed[1] * x - speed[3] * value
+
+
+@wp.func
 def query_convex(
     lattice: Lattice,
     bodies: Bodies,
@@ -103,6 +126,9 @@ def query_convex(
     kept = views.counts[env, pad, k]
     forms = views.forms[env, pad]
     rates = views.rates[env, pad]
+    if lattice.mode == COLUMN and kept[0] == 1 and kept[1] == 0:
+        query_face(lattice, area, forms[first], rates[first], depth, rate)
+        return
     for row in range(area[0], area[1]):
         y = coordinate(row, lattice.pitch, lattice.rows)
         for col in range(area[2], area[3]):
@@ -227,30 +253,31 @@ def in_reach(lattice: Lattice, middle: wp.vec3, half: wp.vec3, axes: wp.mat33) -
 def raster_triangle(
     lattice: Lattice, a: wp.vec3, b: wp.vec3, c: wp.vec3, t: int, keys: wp.array(dtype=wp.int64)
 ) -> None:
-    """Offer triangle t, corners in the pad's frame, to the lattice points under it if it faces the pad."""
-    double_area = (b[0] - a[0]) * (c[1] - a[1]) - (c[0] - a[0]) * (b[1] - a[1])
-    # Outward winding: a triangle that faces the pad runs clockwise seen from above it.
-    if double_area > -1.0e-18:
-        return
+    """Offer triangle t, which faces the pad, corners in the pad's frame, to the lattice points under it."""
     row0 = first_index(wp.min(a[1], wp.min(b[1], c[1])), lattice.pitch, lattice.rows)
     row1 = end_index(wp.max(a[1], wp.max(b[1], c[1])), lattice.pitch, lattice.rows)
     col0 = first_index(wp.min(a[0], wp.min(b[0], c[0])), lattice.pitch, lattice.cols)
     col1 = end_index(wp.max(a[0], wp.max(b[0], c[0])), lattice.pitch, lattice.cols)
+    if row0 >= row1 or col0 >= col1:
+        return
+    double_area = (b[0] - a[0]) * (c[1] - a[1]) - (c[0] - a[0]) * (b[1] - a[1])
+    if double_area > -1.0e-18:
+        return
+    inverse = 1.0 / double_area
     for row in range(row0, row1):
         y = coordinate(row, lattice.pitch, lattice.rows)
         for col in range(col0, col1):
             x = coordinate(col, lattice.pitch, lattice.cols)
-            wa = ((b[0] - x) * (c[1] - y) - (c[0] - x) * (b[1] - y)) / double_area
-            wb = ((c[0] - x) * (a[1] - y) - (a[0] - x) * (c[1] - y)) / double_area
+            wa = ((b[0] - x) * (c[1] - y) - (c[0] - x) * (b[1] - y)) * inverse
+            wb = ((c[0] - x) * (a[1] - y) - (a[0] - x) * (c[1] - y)) * inverse
             wc = 1.0 - wa - wb
             # The slack closes the seam between neighbours, which rounding would otherwise leave open.
             if wa >= -1.0e-5 and wb >= -1.0e-5 and wc >= -1.0e-5:
                 s = wa * a[2] + wb * b[2] + wc * c[2]
                 if wp.abs(s) <= lattice.reach:
                     steps = wp.int64((lattice.reach - s) * KEY_STEPS_PER_M) + wp.int64(1)
-                    wp.atomic_max(
-                        keys, row * lattice.cols + col, (steps << wp.int64(TRIANGLE_BITS)) | wp.int64(t)
-                    )
+                    key = (steps << wp.int64(TRIANGLE_BITS)) | wp.int64(t)
+                    wp.atomic_max(keys, row * lattice.cols + col, key)
 
 
 @wp.kernel
@@ -279,7 +306,10 @@ def raster_meshes(
         if not in_reach(lattice, bodies.cluster_centre[c] - origin, bodies.cluster_half[c], axes):
             continue
         to_pad = wp.transpose(axes)
+        ez = column(axes, 2)
         for t in range(bodies.cluster_start[c], bodies.cluster_start[c + 1]):
+            if wp.dot(bodies.normals[t], ez) >= 0.0:
+                continue
             raster_triangle(
                 lattice,
                 to_pad * (bodies.corners[3 * t] - origin),
@@ -291,21 +321,33 @@ def raster_meshes(
 
 
 @wp.func
-def triangle_depth(mode: int, bodies: Bodies, t: int, p: wp.vec3, ez: wp.vec3, mesh: wp.uint64) -> wp.vec4:
-    """Depth and outward normal at p, which stands under triangle t: height along ez, or distance to the
-    surface."""
-    corner = bodies.corners[3 * t]
-    n = wp.normalize(wp.cross(bodies.corners[3 * t + 1] - corner, bodies.corners[3 * t + 2] - corner))
-    value = -wp.dot(n, corner - p) / wp.dot(n, ez)
-    if mode == CLOSEST and value > 0.0:
-        # Inside a closed surface, the nearest point is no farther than the one along the normal.
-        query = wp.mesh_query_point_no_sign(mesh, p, 1.01 * value + 1.0e-6)
-        if query.result:
-            outward = wp.mesh_eval_position(mesh, query.face, query.u, query.v) - p
-            value = wp.length(outward)
-            if value > 1.0e-6:
-                n = outward / value
-    return wp.vec4(value, n[0], n[1], n[2])
+def closest_on_mesh(mesh: wp.uint64, p: wp.vec3, height: float, normal: wp.vec3) -> wp.vec4:
+    """Distance and outward normal from p inside a closed surface `height` away along the pad's normal."""
+    # The nearest point is no farther than the one along the normal.
+    query = wp.mesh_query_point_no_sign(mesh, p, 1.01 * height + 1.0e-6)
+    if query.result:
+        outward = wp.mesh_eval_position(mesh, query.face, query.u, query.v) - p
+        distance = wp.length(outward)
+        if distance > 1.0e-6:
+            return wp.vec4(distance, outward[0] / distance, outward[1] / distance, outward[2] / distance)
+        return wp.vec4(distance, normal[0], normal[1], normal[2])
+    return wp.vec4(height, normal[0], normal[1], normal[2])
+
+
+@wp.func
+def mesh_area(bodies: Bodies, window: wp.array(dtype=ivec4)) -> ivec4:
+    """Smallest block of the lattice that holds all meshes' areas."""
+    area = ivec4(1000000, 0, 1000000, 0)
+    for k in range(bodies.kind.shape[0]):
+        other = window[k]
+        if bodies.kind[k] == 4 and other[0] < other[1]:
+            area = ivec4(
+                wp.min(area[0], other[0]),
+                wp.max(area[1], other[1]),
+                wp.min(area[2], other[2]),
+                wp.max(area[3], other[3]),
+            )
+    return area
 
 
 @wp.kernel
@@ -317,10 +359,13 @@ def resolve_meshes(
     depth: wp.array(dtype=float, ndim=3),
     rate: wp.array(dtype=float, ndim=3),
 ) -> None:
-    """Depth and rate of the winning triangles; in CLOSEST mode the exact distance to the surface. Clears the
-    keys."""
+    """Depth and rate of the winning triangles; in CLOSEST mode the distance to the mesh. Clears the keys."""
     env, pad, block = wp.tid()
-    mine = block_of(lattice, block)
+    mine = overlap(block_of(lattice, block), mesh_area(bodies, views.window[env, pad]))
+    k = int(-1)
+    axes = wp.identity(n=3, dtype=float)
+    linear = wp.vec3(0.0, 0.0, 0.0)
+    angular = wp.vec3(0.0, 0.0, 0.0)
     for row in range(mine[0], mine[1]):
         for col in range(mine[2], mine[3]):
             index = row * lattice.cols + col
@@ -329,17 +374,23 @@ def resolve_meshes(
                 continue
             keys[env, pad, index] = wp.int64(0)
             t = wp.int32(key & ((wp.int64(1) << wp.int64(TRIANGLE_BITS)) - wp.int64(1)))
-            k = bodies.triangle_owner[t]
-            axes = views.axes[env, pad, k]
-            ex = column(axes, 0)
-            ey = column(axes, 1)
-            ez = column(axes, 2)
+            height = float((key >> wp.int64(TRIANGLE_BITS)) - wp.int64(1)) / KEY_STEPS_PER_M - lattice.reach
+            if height <= depth[env, pad, index]:
+                continue
+            if bodies.triangle_owner[t] != k:
+                k = bodies.triangle_owner[t]
+                axes = views.axes[env, pad, k]
+                linear = views.linear[env, pad, k]
+                angular = views.angular[env, pad, k]
             x = coordinate(col, lattice.pitch, lattice.cols)
             y = coordinate(row, lattice.pitch, lattice.rows)
-            p = views.origin[env, pad, k] + x * ex + y * ey
-            hit = triangle_depth(lattice.mode, bodies, t, p, ez, bodies.mesh[k])
+            n = bodies.normals[t]
+            hit = wp.vec4(height, n[0], n[1], n[2])
+            if lattice.mode == CLOSEST:
+                p = views.origin[env, pad, k] + x * column(axes, 0) + y * column(axes, 1)
+                hit = closest_on_mesh(bodies.mesh[k], p, height, n)
             if hit[0] > depth[env, pad, index]:
                 depth[env, pad, index] = hit[0]
                 n = wp.vec3(hit[1], hit[2], hit[3])
-                form = rate_form(lattice.mode, n, axes, views.linear[env, pad, k], views.angular[env, pad, k])
+                form = rate_form(lattice.mode, n, axes, linear, angular)
                 rate[env, pad, index] = eval_rate(form, x, y, -hit[0] * float(lattice.mode))

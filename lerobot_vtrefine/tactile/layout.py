@@ -168,8 +168,8 @@ def layout_from_mesh(
     if not np.isfinite(distance).all() or np.ptp(distance) > FLATNESS_TOLERANCE_M:
         missing = int((~np.isfinite(distance)).sum())
         raise ValueError(
-            f"pad mesh has no flat face under the {rows} x {cols} lattice: {missing} taxels miss it, the others "
-            "vary in height; flatten the sensing side"
+            f"pad mesh has no flat face under the {rows} x {cols} lattice: {missing} taxels miss it, the "
+            "others vary in height; flatten the sensing side"
         )
     position = face_centre + normal * ((high - low)[axis] - float(distance.mean()))
     return PadLayout(

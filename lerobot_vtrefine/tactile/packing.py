@@ -40,6 +40,8 @@ class PackedBodies:
     """(Q, 4) outward normal and offset, in the primitive frame."""
     corners: np.ndarray
     """(3 T, 3) triangles' corners in the primitive frame, cluster after cluster [m]."""
+    normals: np.ndarray
+    """(T, 3) triangles' outward unit normals."""
     triangle_owner: np.ndarray
     """(T,) int32 primitive of each triangle."""
     cluster_start: np.ndarray
@@ -85,6 +87,12 @@ def _planes(primitive: Primitive) -> np.ndarray:
     return np.zeros((0, 4))
 
 
+def _unit_normals(triangles: np.ndarray) -> np.ndarray:
+    """(T, 3) of triangles (T, 3, 3)."""
+    normals = np.cross(triangles[:, 1] - triangles[:, 0], triangles[:, 2] - triangles[:, 0])
+    return normals / np.maximum(np.linalg.norm(normals, axis=-1, keepdims=True), 1e-30)
+
+
 def _pack_triangles(primitives: list[Primitive]) -> dict[str, np.ndarray]:
     corners, owners, starts, cluster_owner = [np.zeros((0, 3, 3))], [np.zeros(0, int)], [0], []
     for k, primitive in enumerate(primitives):
@@ -108,6 +116,7 @@ def _pack_triangles(primitives: list[Primitive]) -> dict[str, np.ndarray]:
     low, high = (np.array([box[side] for box in boxes]).reshape(-1, 3) for side in (0, 1))
     return {
         "corners": soup.reshape(-1, 3).astype(np.float32),
+        "normals": _unit_normals(soup).astype(np.float32),
         "triangle_owner": np.concatenate(owners).astype(np.int32),
         "cluster_start": np.array(starts, dtype=np.int32),
         "cluster_owner": np.array(cluster_owner, dtype=np.int32),

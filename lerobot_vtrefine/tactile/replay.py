@@ -12,6 +12,11 @@ from lerobot_vtrefine.tactile.stages.base import Frame
 
 ArrayLike = np.ndarray | torch.Tensor
 
+NO_BODY_M = -0.5
+"""Depths below this mark taxels without a body over them [m]."""
+REPLAY_REACH_M = 0.05
+"""Gaps and depths in recordings are known this far from the face [m]."""
+
 
 def column_heights(
     layout: PadLayout, body: BodyGeometry, position_m: np.ndarray, rotation: np.ndarray, device: str = "cpu"
@@ -26,7 +31,7 @@ def column_heights(
     from lerobot_vtrefine.tactile.contact_query import ContactQuery  # warp is slow to import
 
     frames = len(position_m)
-    query = ContactQuery(layout, [body], device)
+    query = ContactQuery(layout, [body], device, reach_m=REPLAY_REACH_M)
     still = torch.zeros((frames, 1, 6))
     heights, _ = query(
         "column",
@@ -41,13 +46,18 @@ def column_heights(
 
 
 def finite_rate(times_s: torch.Tensor, depth_m: torch.Tensor) -> torch.Tensor:
-    """Central differences of depth (T, ..., R, C) over time (T,) [m/s]; frames with equal times share their
-    rate."""
+    """Central differences of depth (T, ..., R, C) over time (T,) [m/s]; steps without duration count as rest.
+
+    Between a frame with a body over the taxel and one without (-1 m), only the penetration changes.
+    """
     if len(times_s) < 2:
         return torch.zeros_like(depth_m)
     times = times_s.to(depth_m.dtype)
-    step = (times[1:] - times[:-1]).clamp(min=1e-9).view(-1, *(1,) * (depth_m.ndim - 1))
-    slope = (depth_m[1:] - depth_m[:-1]) / step
+    step = (times[1:] - times[:-1]).view(-1, *(1,) * (depth_m.ndim - 1))
+    later, earlier = depth_m[1:], depth_m[:-1]
+    known = (later > NO_BODY_M) & (earlier > NO_BODY_M)
+    change = torch.where(known, later - earlier, later.clamp(min=0.0) - earlier.clamp(min=0.0))
+    slope = torch.where(step > 0, change / step.clamp(min=1e-9), torch.zeros_like(change))
     return torch.cat([slope[:1], 0.5 * (slope[1:] + slope[:-1]), slope[-1:]])
 
 

@@ -242,7 +242,8 @@ class PadSensors:
                 self.layout, self.bodies, self.model, solved, str(self.device)
             )
         loads = None if load is None else self._tensor(load)
-        return self._engines[solved](contact, [self._tensor(pose) for pose in poses], loads, frame)
+        # The engine reuses its buffers, while callers and stages with memory may keep what they get.
+        return self._engines[solved](contact, [self._tensor(pose) for pose in poses], loads, frame).clone()
 
     def forces(
         self,

@@ -101,7 +101,7 @@ class Stage:
         one = self.initial(frame.layout, 1)
         lead = x.shape[1:-2]
         state = {
-            key: torch.from_numpy(value[0]).to(x.device).expand(*lead, *value.shape[1:])
+            key: torch.as_tensor(value[0], device=x.device).expand((*lead, *value.shape[1:]))
             for key, value in one.items()
         }
         outputs, previous = [], times_s[0]
