@@ -1,6 +1,7 @@
 #!/bin/sh
 # Create .venv with the pinned packages and this project in editable form. Does nothing when it is up to date.
-# Finds uv if present, else python3.12 / python3.13 on the path, else pyenv's versions directory.
+# Finds what uv finds if uv is present, else python3.12 / python3.13 on the path, else pyenv's versions directory;
+# only when none is installed, uv may download an interpreter.
 set -eu
 cd "$(dirname "$0")/.."
 
@@ -16,6 +17,13 @@ usable() {
     "$1" -c 'import sys, venv, ensurepip; sys.exit(not (3, 12) <= sys.version_info[:2] < (3, 14))' >/dev/null 2>&1
 }
 
+# True when the existing environment has a supported version and something can install into it; one made by uv needs
+# neither pip nor ensurepip.
+reusable() {
+    "$PYTHON" -c 'import sys; sys.exit(not (3, 12) <= sys.version_info[:2] < (3, 14))' >/dev/null 2>&1 || return 1
+    command -v uv >/dev/null 2>&1 || [ -x "$VENV/bin/uv" ] || usable "$PYTHON"
+}
+
 find_python() {
     for candidate in python3.12 python3.13 python3 python \
         "${PYENV_ROOT:-$HOME/.pyenv}"/versions/3.12*/bin/python \
@@ -28,17 +36,24 @@ find_python() {
     return 1
 }
 
-create_venv() {
+uv_venv() {
     rm -rf "$VENV"
-    if command -v uv >/dev/null 2>&1 && uv venv --quiet --python '>=3.12,<3.14' "$VENV" 2>/dev/null; then
+    command -v uv >/dev/null 2>&1 && uv venv --quiet --python '>=3.12,<3.14' "$@" "$VENV" 2>/dev/null
+}
+
+# A download of an interpreter may hang where only the package registry can be reached: it comes last.
+create_venv() {
+    if uv_venv --no-python-downloads; then
         return 0
     fi
-    if ! base=$(find_python); then
+    rm -rf "$VENV"
+    if base=$(find_python); then
+        say "Creating $VENV with $base"
+        "$base" -m venv "$VENV"
+    elif ! uv_venv; then
         say "error: no Python 3.12 or 3.13 with the venv module found; install one, e.g. 'apt-get install python3.12-venv', 'pyenv install 3.12' or uv"
         exit 2
     fi
-    say "Creating $VENV with $base"
-    "$base" -m venv "$VENV"
 }
 
 # uv from the path, else the pinned one from inside the environment: several times faster than pip.
@@ -68,7 +83,7 @@ wanted="$(cat pyproject.toml constraints.txt scripts/setup_venv.sh | cksum) $(pw
 if [ -x "$PYTHON" ] && [ "$(cat "$STAMP" 2>/dev/null)" = "$wanted" ]; then
     exit 0
 fi
-usable "$PYTHON" || create_venv
+reusable || create_venv
 started=$(date +%s)
 install
 printf '%s\n' "$wanted" >"$STAMP"

@@ -17,6 +17,21 @@ case "$1 $2" in
     "-m pip") echo "$*" >>"$FAKE_LOG" ;;
 esac
 """
+# Pretends to be uv: notes each call; makes an environment only where the test says that it can.
+FAKE_UV = """#!/bin/sh
+echo "uv $*" >>"$FAKE_LOG"
+[ "$1" = venv ] || exit 0
+case "$*" in
+    *--no-python-downloads*) [ -e "$HOME/uv_finds" ] || exit 1 ;;
+    *) [ -e "$HOME/uv_downloads" ] || exit 1 ;;
+esac
+for last; do :; done
+mkdir -p "$last/bin" && cp "$HOME/fake_python" "$last/bin/python"
+"""
+# An environment by uv on a Debian interpreter: neither venv nor ensurepip can be imported.
+WITHOUT_ENSUREPIP = """#!/bin/sh
+case "$*" in *ensurepip*) exit 1 ;; esac
+"""
 BROKEN_SHIM = "#!/bin/sh\necho 'pyenv: python3.12: command not found' >&2\nexit 127\n"
 
 
@@ -87,6 +102,48 @@ def test_broken_environment_is_made_anew(checkout: Path) -> None:
     result = run(checkout)
     assert result.returncode == 0, result.stderr
     assert "Creating .venv" in result.stderr
+
+
+def with_uv(checkout: Path, *abilities: str) -> None:
+    executable(checkout / "tools" / "uv", FAKE_UV)
+    executable(checkout / "fake_python", WITHOUT_ENSUREPIP)
+    for ability in abilities:
+        (checkout / ability).touch()
+
+
+def venv_calls(checkout: Path) -> list[bool]:
+    """For each environment asked of uv, whether a download was allowed."""
+    calls = [line for line in (checkout / "log").read_text().splitlines() if line.startswith("uv venv")]
+    return ["--no-python-downloads" not in call for call in calls]
+
+
+def test_uv_uses_what_is_installed(checkout: Path) -> None:
+    with_uv(checkout, "uv_finds")
+    assert run(checkout).returncode == 0
+    assert venv_calls(checkout) == [False]
+
+
+def test_installed_interpreter_comes_before_a_download(checkout: Path) -> None:
+    with_uv(checkout, "uv_downloads")
+    executable(checkout / "tools" / "python3.13", FAKE_PYTHON)
+    assert "Creating .venv with" in run(checkout).stderr
+    assert venv_calls(checkout) == [False]
+
+
+def test_download_is_the_last_resort(checkout: Path) -> None:
+    with_uv(checkout, "uv_downloads")
+    assert run(checkout).returncode == 0
+    assert venv_calls(checkout) == [False, True]
+
+
+def test_environment_of_uv_survives_new_pins(checkout: Path) -> None:
+    with_uv(checkout, "uv_finds")
+    run(checkout)
+    (checkout / ".venv" / "mine").touch()
+    with (checkout / "constraints.txt").open("a") as file:
+        file.write("# a new pin\n")
+    assert "Installing" in run(checkout).stderr
+    assert (checkout / ".venv" / "mine").exists()
 
 
 def test_script_is_posix() -> None:
