@@ -1,8 +1,9 @@
 """The diffusion process of ``vt_dp3``: schedule, step grids, one posterior formula, and samplers.
 
-Used by behaviour cloning (``add_noise``), by deployment (``deploy``) and by DPPO (``sample_chain``), so that all
-three mean the same process. Shapes: ``B`` batch, ``H`` horizon, ``D`` action dimension, ``K`` denoising steps of
-the grid, ``K'`` fine-tuned (last) steps. Positions count along the sampling direction: position 0 is the noisiest.
+Used by behaviour cloning (``add_noise``), by deployment (``deploy``) and by DPPO (``sample_chain``), so that
+all three mean the same process. Shapes: ``B`` batch, ``H`` horizon, ``D`` action dimension, ``K`` denoising
+steps of the grid, ``K'`` fine-tuned (last) steps. Positions count along the sampling direction: position 0 is
+the noisiest.
 
 Sources: Ho et al. 2020 (DDPM), Song et al. 2021 (DDIM eq. 12, 16), Nichol & Dhariwal 2021 (squared-cosine
 schedule), Ren et al. 2024 (DPPO, appendix on noise floors).
@@ -17,7 +18,7 @@ import torch
 from torch import Tensor
 
 SAMPLERS = ("ddpm", "ddim", "tail")
-"""``ddpm``: every training step; ``ddim``: evenly spaced steps; ``tail``: coarse prefix, then the last steps."""
+"""``ddpm``: every training step; ``ddim``: evenly spaced; ``tail``: coarse prefix, then the last steps."""
 
 NOISE_CLIP = 3.0  # DPPO's randn_clip_value: one sample never moves a latent by more than 3 sigma
 LOG_PROB_RANGE = (-5.0, 2.0)  # DPPO clamps each element's log-probability before averaging
@@ -80,7 +81,7 @@ class DiffusionProcess:
         return len(self.timesteps)
 
     def _tables(self, like: Tensor) -> Tensor:
-        """(T + 3K,): alpha_bar, then per position alpha_bar, alpha_bar of the next position, and sigma at eta=1."""
+        """(T + 3K,): alpha_bar, then per position alpha_bar, the next position's, and sigma at eta=1."""
         key = (like.device, like.dtype)
         if key not in self._cache:
             alpha_bar = squaredcos_alpha_bar(self.num_train_steps)
@@ -102,8 +103,9 @@ class DiffusionProcess:
     def posterior(self, x: Tensor, eps: Tensor, positions: Tensor, eta: float) -> tuple[Tensor, Tensor]:
         """Mean (B, H, D) and standard deviation (B, 1, 1) of the next latent.
 
-        DDIM eq. 12 with stochasticity ``eta``; with eta=1 on the ``ddpm`` grid it is the DDPM posterior. The noise
-        is recomputed from the clamped clean action, so the mean stays consistent where the clamp is active.
+        DDIM eq. 12 with stochasticity ``eta``; with eta=1 on the ``ddpm`` grid it is the DDPM posterior. The
+        noise is recomputed from the clamped clean action, so the mean stays consistent where the clamp is
+        active.
         """
         tables, num_steps = self._tables(x), self.num_steps
         here, after, sigma = tables[self.num_train_steps :].view(3, num_steps)[:, positions].view(3, -1, 1, 1)
@@ -158,7 +160,8 @@ def sample_chain(
     """Sample the last ``num_tuned`` steps with exploration noise.
 
     latent (B, H, D) is what ``denoise_prefix`` returned. Each step draws
-    mean + max(sigma, min_sampling_std) * clip(N(0, 1), ±3); its log-probability uses max(sigma, min_log_prob_std).
+    mean + max(sigma, min_sampling_std) * clip(N(0, 1), ±3); its log-probability uses
+    max(sigma, min_log_prob_std).
     """
     latents, log_probs = [latent], []
     for position in range(process.num_steps - num_tuned, process.num_steps):
