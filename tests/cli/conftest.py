@@ -9,7 +9,6 @@ import pytest
 TINY_ENV = (
     "--env.type=vtrefine",
     "--env.start=grasped",
-    "--env.episode_steps=30",
     "--env.num_threads=1",
     "--env.scene.camera={width: 16, height: 12, fov_y_rad: 0.384, position_m: [-0.44, 0.0, 0.42],"
     " target_m: [0.0, 0.0, 0.145]}",
