@@ -2,6 +2,8 @@
 
 import io
 import sys
+import time
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -51,6 +53,36 @@ def test_missing_product_reruns(tmp_path: Path) -> None:
     run(tmp_path, only)
     only.product.unlink()
     assert "done before" not in run(tmp_path, only)
+
+
+def test_repeated_stage_repeats_what_needs_it(tmp_path: Path) -> None:
+    """Even if the run that repeats it ends before it reaches them."""
+    first, third = stage(tmp_path, "a"), stage(tmp_path, "c", needs=("b",))
+    chain = (first, stage(tmp_path, "b", needs=("a",)), third, stage(tmp_path, "d"))
+    run(tmp_path, *chain)
+    first.product.unlink()
+    broken = replace(chain[1], output=tmp_path / "elsewhere", product=tmp_path / "elsewhere" / "product")
+    with pytest.raises(ChildProcessError, match="wrote no"):
+        run(tmp_path, first, broken, third)
+    ends = [line.split(maxsplit=2)[2] for line in run(tmp_path, *chain).splitlines()]
+    assert ["done before" in end for end in ends] == [True, False, False, True]
+
+
+def test_seconds_count_interrupted_runs(tmp_path: Path) -> None:
+    flag = tmp_path / "second"
+    code = f"import time; time.sleep(0.6); {WRITE}; sys.exit(not pathlib.Path({str(flag)!r}).exists())"
+    for name, resumable in (("a", True), ("b", False)):
+        flag.unlink(missing_ok=True)
+        only = stage(tmp_path, name, code=code, resumable=resumable)
+        with pytest.raises(ChildProcessError):
+            run(tmp_path, only)
+        interrupted = float((tmp_path / "stages" / f"{name}.started").read_text().splitlines()[1])
+        assert interrupted >= 0.6
+        flag.touch()
+        started = time.monotonic()
+        (record,) = StageRunner(tmp_path, [only], LiveLine(io.StringIO())).run()
+        last = time.monotonic() - started
+        assert record.seconds == pytest.approx(last + (interrupted if resumable else 0.0), abs=0.3)
 
 
 def test_failure_names_the_log_and_the_last_line(tmp_path: Path) -> None:

@@ -49,7 +49,10 @@ class Stage:
 
 @dataclass(frozen=True)
 class StageRecord:
-    """What a finished stage leaves in its stamp: ``seconds`` of wall time, and the key of what it did."""
+    """What a finished stage leaves in its stamp.
+
+    ``seconds`` is the wall time of all processes that it took, ``key`` the fingerprint of what it did.
+    """
 
     name: str
     title: str
@@ -90,23 +93,55 @@ class StageRunner:
         if record is not None:
             self.line.finish(label, f"done before, {record.seconds:.0f} s")
             return record
-        self._prepare(stage)
-        seconds = self._execute(stage, label)
+        earlier, started = self._prepare(stage), time.monotonic()
+        try:
+            self._execute(stage, label)
+        finally:
+            seconds = earlier + time.monotonic() - started
+            self._note_start(stage, seconds)
         record = StageRecord(stage.name, stage.title, stage.line, round(seconds, 1), self.keys[stage.name])
         self._stamp(stage).write_text(json.dumps(asdict(record), indent=2), encoding="utf-8")
         self.line.finish(label, f"{seconds:.0f} s")
         return record
 
-    def _prepare(self, stage: Stage) -> None:
-        """Remove what an earlier run left, unless the command continues from exactly that."""
-        stamp, started = self._stamp(stage), self._stamp(stage).with_suffix(".started")
-        stamp.unlink(missing_ok=True)
-        key = self.keys[stage.name]
-        same = started.is_file() and started.read_text(encoding="utf-8") == key
-        if not (stage.resumable and same):
+    def _prepare(self, stage: Stage) -> float:
+        """Remove what an earlier run left, unless the command continues from exactly that.
+
+        Returns: seconds that interrupted runs have spent on what is continued. Stages that need this one lose
+        their stamps, so that they run again even if this process ends before it reaches them.
+        """
+        for later in self._dependants(stage):
+            self._stamp(later).unlink(missing_ok=True)
+            self._start_note(later).unlink(missing_ok=True)
+        self._stamp(stage).unlink(missing_ok=True)
+        seconds = self._seconds_spent(stage) if stage.resumable else None
+        if seconds is None:
             shutil.rmtree(stage.output, ignore_errors=True)
-        started.parent.mkdir(parents=True, exist_ok=True)
-        started.write_text(key, encoding="utf-8")
+        self._note_start(stage, seconds or 0.0)
+        return seconds or 0.0
+
+    def _dependants(self, stage: Stage) -> list[Stage]:
+        """The stages that need this one, directly or through others."""
+        changed = {stage.name}
+        for later in self.stages:
+            if changed.intersection(later.needs):
+                changed.add(later.name)
+        return [later for later in self.stages if later.name in changed and later is not stage]
+
+    def _start_note(self, stage: Stage) -> Path:
+        """Two lines about a run that may have been interrupted: the stage's key, and seconds spent on it."""
+        return self._stamp(stage).with_suffix(".started")
+
+    def _note_start(self, stage: Stage, seconds: float) -> None:
+        note = self._start_note(stage)
+        note.parent.mkdir(parents=True, exist_ok=True)
+        note.write_text(f"{self.keys[stage.name]}\n{seconds:.1f}", encoding="utf-8")
+
+    def _seconds_spent(self, stage: Stage) -> float | None:
+        """Seconds that earlier runs of the very same stage took; None if there was none."""
+        note = self._start_note(stage)
+        key, _, seconds = (note.read_text(encoding="utf-8") if note.is_file() else "").partition("\n")
+        return float(seconds or 0.0) if key == self.keys[stage.name] else None
 
     def _finished(self, stage: Stage) -> StageRecord | None:
         stamp = self._stamp(stage)
@@ -122,7 +157,7 @@ class StageRunner:
         """Where everything goes that the stage's command prints."""
         return self.directory / "logs" / f"{stage.name}.log"
 
-    def _execute(self, stage: Stage, label: str) -> float:
+    def _execute(self, stage: Stage, label: str) -> None:
         log = self.log_path(stage)
         log.parent.mkdir(parents=True, exist_ok=True)
         started = time.monotonic()
@@ -149,7 +184,6 @@ class StageRunner:
             raise ChildProcessError(failure_message(stage, child.returncode, log))
         if not stage.product.exists():
             raise ChildProcessError(f"stage {stage.name} wrote no {stage.product}; see {log}")
-        return time.monotonic() - started
 
 
 def find_command(name: str) -> str:
@@ -182,6 +216,10 @@ def stop(child: subprocess.Popen[bytes]) -> None:
 
 def failure_message(stage: Stage, status: int, log: Path) -> str:
     """One line about a failed stage, with the last line that its command printed."""
+    return f"stage {stage.name} failed with status {status}: {last_line(log)} (all output in {log})"
+
+
+def last_line(log: Path) -> str:
+    """The last line with anything on it, or "no output"."""
     lines = [line.strip() for line in read_tail(log).replace("\r", "\n").splitlines() if line.strip()]
-    last = lines[-1] if lines else "no output"
-    return f"stage {stage.name} failed with status {status}: {last} (all output in {log})"
+    return lines[-1] if lines else "no output"
