@@ -52,12 +52,21 @@ class FoundationSolver:
         envs, pads = height.shape[:2]
         force, solution = self._buffers(envs, pads)
         force.zero_()
+        solution.zero_()
+        lanes = 32 if self.device.startswith("cuda") else 1
         stiffness = (stiffness_n_per_m.to(torch.float32) / self.subdivision**2).contiguous()
         wp.launch(
             kernels_foundation.solve_foundation,
-            dim=(envs, pads),
+            dim=(envs, pads, lanes),
             inputs=[
-                *(self.layout.rows, self.layout.cols, self.subdivision, self.layout.pitch_m, damping_s),
+                *(
+                    self.layout.rows,
+                    self.layout.cols,
+                    self.subdivision,
+                    lanes,
+                    self.layout.pitch_m,
+                    damping_s,
+                ),
                 wp.from_torch(stiffness),
                 wp.from_torch(load.to(torch.float32).contiguous(), dtype=wp.vec3),
                 window,

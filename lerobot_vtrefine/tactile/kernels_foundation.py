@@ -1,9 +1,10 @@
 """Warp kernel of the load-consistent elastic foundation (Winkler): heights and load in, taxel forces out.
 
-Each pad is one thread. Its face gives way by u = max(0, z + delta + a x + b y) at every lattice point, where
-z is the column height plus the viscous lead tau * rate and (x, y) the centre of the point's taxel, in taxel
-pitches. The three unknowns are solved so that the forces k u add up to the load and balance at its centre: a
-minimum of a convex, piecewise quadratic function, found by Newton's method.
+Each pad is one thread on CPU and one warp of 32 lanes on CUDA, which share out its columns. Its face gives
+way by u = max(0, z + delta + a x + b y) at every lattice point, where z is the column height plus the viscous
+lead tau * rate and (x, y) the centre of the point's taxel, in taxel pitches. The three unknowns are solved so
+that the forces k u add up to the load and balance at its centre: the minimum of a convex, piecewise quadratic
+function, found by Newton's method.
 """
 
 import warp as wp
@@ -33,6 +34,8 @@ class Pad:
     subdivision: int
     damping_s: float
     area: ivec4
+    lane: int
+    lanes: int
 
 
 @wp.struct
@@ -42,6 +45,34 @@ class Balance:
     squares: wp.float64
     sums: wp.vec3d
     hessian: mat33d
+
+
+@wp.func_native("""
+#if defined(__CUDA_ARCH__)
+for (int step = 16; step > 0; step >>= 1) x += __shfl_xor_sync(0xffffffffu, x, step);
+#endif
+return x;
+""")
+def add_lanes(x: wp.float64) -> wp.float64:
+    """Sum over the lanes of a pad, the same bits in each."""
+    ...
+
+
+@wp.func_native("""
+#if defined(__CUDA_ARCH__)
+for (int step = 16; step > 0; step >>= 1) x = fmaxf(x, __shfl_xor_sync(0xffffffffu, x, step));
+#endif
+return x;
+""")
+def max_lanes(x: wp.float32) -> wp.float32:
+    """Maximum over the lanes of a pad."""
+    ...
+
+
+@wp.func
+def first_column(pad: Pad) -> int:
+    """First of the taxel columns that this lane sums; the others follow at steps of `lanes`."""
+    return pad.area[2] / pad.subdivision + pad.lane
 
 
 @wp.func
@@ -59,7 +90,7 @@ def row_sums(
     sux = float(0.0)
     suu = float(0.0)
     half = 0.5 * float(taxel_cols - 1)
-    for col in range(pad.area[2] / pad.subdivision, pad.area[3] / pad.subdivision):
+    for col in range(first_column(pad), pad.area[3] / pad.subdivision, pad.lanes):
         x = float(col) - half
         offset = base + a * x
         start = row * pad.cols + col * pad.subdivision
@@ -117,9 +148,13 @@ def balance(pad: Pad, stride: int, height: wp.array(dtype=float), trial: wp.vec3
             suy += ud * yd
             suu += wp.float64(sums[5])
     result = Balance()
-    result.squares = suu
-    result.sums = wp.vec3d(su, sux, suy)
-    result.hessian = mat33d(n, sx, sy, sx, sxx, sxy, sy, sxy, syy)
+    result.squares = add_lanes(suu)
+    result.sums = wp.vec3d(add_lanes(su), add_lanes(sux), add_lanes(suy))
+    n = add_lanes(n)
+    sx = add_lanes(sx)
+    sy = add_lanes(sy)
+    sxy = add_lanes(sxy)
+    result.hessian = mat33d(n, sx, sy, sx, add_lanes(sxx), sxy, sy, sxy, add_lanes(syy))
     return result
 
 
@@ -252,7 +287,7 @@ def write_forces(
     for row in range(pad.area[0] / pad.subdivision, pad.area[1] / pad.subdivision):
         base = wp.float32(answer[0] + answer[2] * wp.float64(coordinate(row, 1.0, rows)))
         row_sum = float(0.0)
-        for col in range(pad.area[2] / pad.subdivision, pad.area[3] / pad.subdivision):
+        for col in range(first_column(pad), pad.area[3] / pad.subdivision, pad.lanes):
             offset = base + a * coordinate(col, 1.0, cols)
             taxel_sum = float(0.0)
             for line in range(pad.subdivision):
@@ -262,9 +297,9 @@ def write_forces(
             force[row * cols + col] = stiffness * taxel_sum
             row_sum += taxel_sum
         whole += wp.float64(row_sum)
-    factor = wp.float32(total / whole)
+    factor = wp.float32(total / add_lanes(whole))
     for row in range(pad.area[0] / pad.subdivision, pad.area[1] / pad.subdivision):
-        for col in range(pad.area[2] / pad.subdivision, pad.area[3] / pad.subdivision):
+        for col in range(first_column(pad), pad.area[3] / pad.subdivision, pad.lanes):
             force[row * cols + col] *= factor
 
 
@@ -294,13 +329,15 @@ def add_lead(pad: Pad, depth: wp.array(dtype=float), rate: wp.array(dtype=float)
     """Put height plus viscous lead in place of the rates; returns the largest, -1 m without a body."""
     best = float(-1.0)
     for row in range(pad.area[0], pad.area[1]):
-        for index in range(row * pad.cols + pad.area[2], row * pad.cols + pad.area[3]):
-            height = depth[index]
-            if height > -0.5:
-                height += wp.clamp(pad.damping_s * rate[index], -MAX_LEAD_M, MAX_LEAD_M)
-            rate[index] = height
-            best = wp.max(best, height)
-    return best
+        for col in range(first_column(pad), pad.area[3] / pad.subdivision, pad.lanes):
+            start = row * pad.cols + col * pad.subdivision
+            for index in range(start, start + pad.subdivision):
+                height = depth[index]
+                if height > -0.5:
+                    height += wp.clamp(pad.damping_s * rate[index], -MAX_LEAD_M, MAX_LEAD_M)
+                rate[index] = height
+                best = wp.max(best, height)
+    return max_lanes(best)
 
 
 @wp.kernel
@@ -308,6 +345,7 @@ def solve_foundation(
     pad_rows: int,
     pad_cols: int,
     subdivision: int,
+    lanes: int,
     pitch: float,
     damping_s: float,
     stiffness: wp.array(dtype=float),
@@ -321,11 +359,10 @@ def solve_foundation(
     """Forces [N] on pad_rows x pad_cols taxels from heights on the lattice that is finer by `subdivision`.
 
     `stiffness` is that of one lattice point, per environment [N/m]; `window` holds the lattice areas of the
-    primitives in reach; `rate` is overwritten; `force` must come in as zero; `solution` gets
-    (delta [m], slope x, slope y).
+    primitives in reach; `rate` is overwritten; `force` and `solution`, which
+    gets (delta [m], slope x, slope y), must come in as zero.
     """
-    env, side = wp.tid()
-    solution[env, side] = wp.vec3(0.0, 0.0, 0.0)
+    env, side, lane = wp.tid()
     push = load[env, side]
     if push[0] <= 0.0:
         return
@@ -334,11 +371,14 @@ def solve_foundation(
     pad.cols = pad_cols * subdivision
     pad.subdivision = subdivision
     pad.damping_s = damping_s
+    pad.lane = lane
+    pad.lanes = lanes
     pad.area = contact_area(pad.rows, pad.cols, subdivision, window[env, side])
     heights = rate[env, side]
     top = add_lead(pad, depth[env, side], heights)
     if top <= -0.5:
-        spread_load(pad_rows, pad_cols, pitch, push, force[env, side])
+        if lane == 0:
+            spread_load(pad_rows, pad_cols, pitch, push, force[env, side])
         return
     total = wp.float64(push[0]) / wp.float64(stiffness[env])
     scale = wp.float64(1.0) / wp.float64(pitch)
@@ -352,5 +392,5 @@ def solve_foundation(
         answer = solve_balance(pad, subdivision, heights, answer, target * share, limit)
     answer = solve_balance(pad, 1, heights, answer, target, limit)
     write_forces(pad, stiffness[env], heights, answer, total, force[env, side])
-    slopes = wp.vec3d(answer[0], answer[1] * scale, answer[2] * scale)
-    solution[env, side] = wp.vec3(slopes)
+    if lane == 0:
+        solution[env, side] = wp.vec3(wp.vec3d(answer[0], answer[1] * scale, answer[2] * scale))

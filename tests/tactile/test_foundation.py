@@ -51,7 +51,7 @@ def centre_of(force: np.ndarray) -> np.ndarray:
 
 @pytest.mark.parametrize("penetration", [0.0, 5e-4, -5e-5])
 def test_sphere_is_the_exact_winkler_solution(penetration: float) -> None:
-    """The peak taxel within 1 %, whatever the solver's penetration, even a gap; 2 % off the lattice's symmetry."""
+    """The peak taxel within 1 % (2 % off the symmetry), whatever the solver's penetration, even a gap."""
     radius, load = 0.01, 5.0
     # Force of a sphere pressed delta deep into a Winkler foundation: k pi (R delta^2 - delta^3 / 3).
     delta = brentq(lambda d: MODULUS * np.pi * (radius * d**2 - d**3 / 3) - load, 0, 0.005)
