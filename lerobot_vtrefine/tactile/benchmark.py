@@ -8,6 +8,7 @@ import importlib
 import time
 from collections.abc import Callable
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 import torch
@@ -16,23 +17,16 @@ import warp as wp
 from lerobot_vtrefine.tactile.contact_query import start_warp
 from lerobot_vtrefine.tactile.engine import ContactEngine
 from lerobot_vtrefine.tactile.geometry import BodyGeometry, Box, Primitive, TriangleMesh
+from lerobot_vtrefine.tactile.kernels_benchmark import three_ray_query
 from lerobot_vtrefine.tactile.layout import PadLayout
 from lerobot_vtrefine.tactile.model import SensorModel
 from lerobot_vtrefine.tactile.stages.base import STAGES, Frame
+from lerobot_vtrefine.tactile.stages.contact import ContactStage
 
 NUM_ENVS, NUM_PADS = 64, 4
 PRESS_M = 2e-4
 LOAD_N = 5.0
 OUTER_M = 0.012
-
-
-@wp.kernel
-def three_ray_query(mesh: wp.uint64, points: wp.array(dtype=wp.vec3), depth: wp.array(dtype=float)) -> None:
-    """Penetration by a closest-point query per taxel, its sign by the vote of three rays."""
-    i = wp.tid()
-    query = wp.mesh_query_point(mesh, points[i], 0.2)
-    if query.result and query.sign < 0.0:
-        depth[i] = wp.length(wp.mesh_eval_position(mesh, query.face, query.u, query.v) - points[i])
 
 
 def ring_mesh(segments: int = 60) -> TriangleMesh:
@@ -86,6 +80,8 @@ def best_seconds(call: Callable[[], object], repeats: int = 20, budget_s: float 
 def model_rate(scene: Scene, law: str, device: str = "cpu") -> float:
     """Taxels per second of a contact stage by name."""
     contact = STAGES[law]()
+    if not isinstance(contact, ContactStage):
+        raise ValueError(f"{law!r} is not a contact stage")
     model = SensorModel.default().with_stage(contact)
     layout = PadLayout()
     engine = ContactEngine(layout, [BodyGeometry([scene.body])], model, contact.load_conserving, device)
@@ -120,7 +116,7 @@ def three_ray_rate(scene: Scene, device: str = "cpu") -> float:
 
 def _mujoco_seconds(mesh: TriangleMesh, sensor: bool) -> float:
     # By name, so that the sensor model itself never comes to depend on a simulator.
-    mujoco = importlib.import_module("mujoco")
+    mujoco: Any = importlib.import_module("mujoco")
     vertices, faces = (" ".join(f"{v:.7g}" for v in array.ravel()) for array in (mesh.vertices, mesh.faces))
     # The sensor reads the plate in the plane x = 0 of the geom; the far sdf geom makes the mesh's octree.
     xml = f"""<mujoco><asset><mesh name="taxels" builtin="plate" params="32 12" scale=".032 .012 .0015"/>
@@ -147,12 +143,13 @@ def run(device: str = "cpu", num_envs: int = NUM_ENVS) -> list[tuple[str, float,
     threads = torch.get_num_threads()
     torch.set_num_threads(1)
     try:
-        ring = make_scene(ring_mesh(), OUTER_M * np.cos(np.pi / 60), num_envs, device)
+        mesh = ring_mesh()
+        ring = make_scene(mesh, OUTER_M * np.cos(np.pi / 60), num_envs, device)
         box = make_scene(Box((0.017, 0.02, 0.017)), 0.017, num_envs, device)
         rates = {law: model_rate(ring, law, device) for law in ("kelvin_voigt", "consistent")}
         boxes = {law: model_rate(box, law, device) for law in ("kelvin_voigt", "consistent")}
         peers = {
-            "MuJoCo's C tactile sensor": mujoco_rate(ring.body),
+            "MuJoCo's C tactile sensor": mujoco_rate(mesh),
             "a three-ray mesh query": three_ray_rate(ring, device),
         }
     finally:

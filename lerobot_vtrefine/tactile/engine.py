@@ -44,8 +44,13 @@ class ContactEngine:
             depth, _ = stage.step(depth, {}, on_lattice)
         if self._solver is None or load is None:
             return contact.force(depth, rate, self.layout)
-        stiffness = torch.as_tensor(contact.stiffness(self.layout), device=depth.device).to(depth.dtype)
         window = self._query.window(*load.shape[:2])
-        return self._solver(
-            depth, rate, load, stiffness.reshape(-1).expand(len(depth)), float(contact.damping_s), window
-        )[0]
+        stiffness, lead = (
+            self._per_env(value, depth) for value in (contact.stiffness(self.layout), contact.lead_s())
+        )
+        return self._solver(depth, rate, load, stiffness, lead, window)[0]
+
+    @staticmethod
+    def _per_env(value: torch.Tensor | float, like: torch.Tensor) -> torch.Tensor:
+        """A number, or one per environment (m, 1, 1, 1), as (m,)."""
+        return torch.as_tensor(value, device=like.device).to(like.dtype).reshape(-1).expand(len(like))

@@ -34,7 +34,7 @@ class FoundationSolver:
         rate: torch.Tensor,
         load: torch.Tensor,
         stiffness_n_per_m: torch.Tensor,
-        damping_s: float,
+        damping_s: torch.Tensor,
         window: wp.array,
     ) -> tuple[torch.Tensor, torch.Tensor]:
         """Taxel forces (m, P, R, C) [N] and the face's (delta [m], slope x, slope y) (m, P, 3); reused
@@ -46,7 +46,7 @@ class FoundationSolver:
                 centre when
                 the body can be pressed on around it.
             stiffness_n_per_m: (m,) stiffness of one whole taxel.
-            damping_s: viscous lead, the ratio of damping to stiffness [s].
+            damping_s: (m,) viscous lead, the ratio of damping to stiffness [s].
             window: (m, P, K) lattice areas in which bodies were found, as `ContactQuery.window` gives them.
         """
         envs, pads = height.shape[:2]
@@ -65,9 +65,9 @@ class FoundationSolver:
                     self.subdivision,
                     lanes,
                     self.layout.pitch_m,
-                    damping_s,
                 ),
                 wp.from_torch(stiffness),
+                wp.from_torch(damping_s.to(torch.float32).contiguous()),
                 wp.from_torch(load.to(torch.float32).contiguous(), dtype=wp.vec3),
                 window,
                 wp.from_torch(height.reshape(envs, pads, -1).contiguous()),

@@ -347,8 +347,8 @@ def solve_foundation(
     subdivision: int,
     lanes: int,
     pitch: float,
-    damping_s: float,
     stiffness: wp.array(dtype=float),
+    damping_s: wp.array(dtype=float),
     load: wp.array(dtype=wp.vec3, ndim=2),
     window: wp.array(dtype=ivec4, ndim=3),
     depth: wp.array(dtype=float, ndim=3),
@@ -358,9 +358,9 @@ def solve_foundation(
 ) -> None:
     """Forces [N] on pad_rows x pad_cols taxels from heights on the lattice that is finer by `subdivision`.
 
-    `stiffness` is that of one lattice point, per environment [N/m]; `window` holds the lattice areas of the
-    primitives in reach; `rate` is overwritten; `force` and `solution`, which
-    gets (delta [m], slope x, slope y), must come in as zero.
+    Per environment: `stiffness` of one lattice point [N/m] and `damping_s`. `window` holds the lattice areas of
+    the primitives in reach; `rate` is overwritten; `force` and `solution`, which gets (delta [m], slope x,
+    slope y), must come in as zero.
     """
     env, side, lane = wp.tid()
     push = load[env, side]
@@ -370,7 +370,7 @@ def solve_foundation(
     pad.rows = pad_rows * subdivision
     pad.cols = pad_cols * subdivision
     pad.subdivision = subdivision
-    pad.damping_s = damping_s
+    pad.damping_s = damping_s[env]
     pad.lane = lane
     pad.lanes = lanes
     pad.area = contact_area(pad.rows, pad.cols, subdivision, window[env, side])

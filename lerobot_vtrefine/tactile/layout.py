@@ -114,6 +114,16 @@ def _outward_normal(
     return unit if up >= down * (1 - 1e-9) else -unit
 
 
+def _require_flat(distance: np.ndarray, layout: PadLayout) -> None:
+    if np.isfinite(distance).all() and np.ptp(distance) <= FLATNESS_TOLERANCE_M:
+        return
+    missing = int((~np.isfinite(distance)).sum())
+    raise ValueError(
+        f"pad mesh has no flat face under the {layout.rows} x {layout.cols} lattice: {missing} taxels miss "
+        "it, the others vary in height; flatten the sensing side"
+    )
+
+
 def layout_from_mesh(
     vertices: np.ndarray,
     faces: np.ndarray,
@@ -165,12 +175,7 @@ def layout_from_mesh(
     face_centre = (low + high) / 2 + normal * (high - low)[axis] / 2
     starts = layout.positions() @ axes.T + face_centre + normal * (high - low)[axis]
     distance, _ = _ray_hits(starts, -normal, vertices[faces])
-    if not np.isfinite(distance).all() or np.ptp(distance) > FLATNESS_TOLERANCE_M:
-        missing = int((~np.isfinite(distance)).sum())
-        raise ValueError(
-            f"pad mesh has no flat face under the {rows} x {cols} lattice: {missing} taxels miss it, the "
-            "others vary in height; flatten the sensing side"
-        )
+    _require_flat(distance, layout)
     position = face_centre + normal * ((high - low)[axis] - float(distance.mean()))
     return PadLayout(
         rows, cols, pitch_m, tuple(position.tolist()), tuple(tuple(row) for row in axes.tolist())

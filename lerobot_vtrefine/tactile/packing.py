@@ -57,7 +57,8 @@ class PackedBodies:
 def split_clusters(centroids: np.ndarray, size: int) -> list[np.ndarray]:
     """Indices of points (T, 3) in spatially compact groups of at most `size`, by halving along the longest
     side."""
-    groups, pending = [], [np.arange(len(centroids))]
+    groups: list[np.ndarray] = []
+    pending: list[np.ndarray] = [np.arange(len(centroids))]
     while pending:
         group = pending.pop()
         if len(group) <= size:

@@ -172,7 +172,7 @@ class PadSensors:
             self._parameters[key] = torch.full((self.num_envs,), float(default), device=self.device)
         return self._parameters[key]
 
-    def _specialised(self, stage: Stage, index: torch.Tensor) -> Stage:
+    def _specialised[StageType: Stage](self, stage: StageType, index: torch.Tensor) -> StageType:
         """The stage with each environment's own parameters, shaped (m, 1, 1, 1)."""
         own: dict[str, Any] = {
             parameter: _per_env(values[index])

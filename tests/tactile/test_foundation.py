@@ -83,7 +83,7 @@ def test_delta_of_a_sphere() -> None:
         *(torch.from_numpy(item)[:, None] for item in (height, rate)),
         torch.tensor([[[load, 0.0, 0.0]]]),
         stiffness,
-        0.0,
+        torch.zeros(1),
         query.window(1, 1),
     )
     assert np.isclose(float(solution[0, 0, 0]) + 3e-4, delta, rtol=0.01)

@@ -94,7 +94,12 @@ def test_reset_repeats_an_episode_exactly() -> None:
 
 def test_snapshot_continues_exactly() -> None:
     sensors, other = (PadSensors(LAYOUT, BODIES, 3, model=STATEFUL, seed=seed) for seed in (0, 1))
-    sensors.randomize([1], stiffness_scale=1.5, gain_scale=0.7, parameters={"noise.sigma_counts": [0.3]})
+    sensors.randomize(
+        [1],
+        stiffness_scale=1.5,
+        gain_scale=0.7,
+        parameters={"noise.sigma_counts": [0.3], "consistent.damping_s": [0.0]},
+    )
     sensors.counts([1], **scene(1, 0))
     other.set_state(2, sensors.get_state(1))
     for frame in (1, 2):

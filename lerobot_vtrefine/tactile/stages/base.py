@@ -116,7 +116,7 @@ class Stage:
 STAGES: dict[str, type[Stage]] = {}
 
 
-def register(cls: type[Stage]) -> type[Stage]:
+def register[StageType: Stage](cls: type[StageType]) -> type[StageType]:
     """Class decorator: make a stage known by its name."""
     if cls.domain not in DOMAINS:
         raise ValueError(f"stage {cls.__name__}: domain must be one of {', '.join(DOMAINS)}")

@@ -29,6 +29,10 @@ class ContactStage(Stage):
         """One taxel's stiffness [N/m]."""
         raise NotImplementedError
 
+    def lead_s(self) -> torch.Tensor | float:
+        """Damping over stiffness, by which a solved foundation weighs rates [s]."""
+        return 0.0
+
     def scaled(self, factor: torch.Tensor) -> "ContactStage":
         """With its stiffness and damping multiplied by a factor that broadcasts against (..., R, C)."""
         own = {item.name: getattr(self, item.name) for item in fields(self) if item.name in self.scalable}
@@ -137,6 +141,10 @@ class Consistent(ContactStage):
     @override
     def stiffness(self, layout: PadLayout) -> torch.Tensor | float:
         return self.foundation_n_per_m3 * layout.taxel_area_m2
+
+    @override
+    def lead_s(self) -> torch.Tensor | float:
+        return self.damping_s
 
     @override
     def force(self, depth: torch.Tensor, rate: torch.Tensor, layout: PadLayout) -> torch.Tensor:

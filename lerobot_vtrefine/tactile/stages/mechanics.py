@@ -119,9 +119,8 @@ class ViscoelasticRelaxation(Stage):
         for j, (tau_s, fraction) in enumerate(_paired(self.name, self.tau_s, self.fraction)):
             slow = state[f"slow_{j}"]
             if dt_s > 0.0:
-                decay = (
-                    torch.exp(-dt_s / tau_s) if isinstance(tau_s, torch.Tensor) else math.exp(-dt_s / tau_s)
-                )
+                ratio = -dt_s / tau_s
+                decay = torch.exp(ratio) if isinstance(ratio, torch.Tensor) else math.exp(ratio)
                 ramp = 1.0 - (1.0 - decay) * (tau_s / dt_s)
                 slow = decay * slow + (1.0 - decay) * previous + ramp * (x - previous)
             new[f"slow_{j}"] = slow
