@@ -358,8 +358,8 @@ def solve_foundation(
 ) -> None:
     """Forces [N] on pad_rows x pad_cols taxels from heights on the lattice that is finer by `subdivision`.
 
-    Per environment: `stiffness` of one lattice point [N/m] and `damping_s`. `window` holds the lattice areas of
-    the primitives in reach; `rate` is overwritten; `force` and `solution`, which gets (delta [m], slope x,
+    Per environment: `stiffness` of one lattice point [N/m] and `damping_s`. `window` holds the lattice areas
+    of the primitives in reach; `rate` is overwritten; `force` and `solution`, which gets (delta [m], slope x,
     slope y), must come in as zero.
     """
     env, side, lane = wp.tid()
