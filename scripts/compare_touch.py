@@ -4,7 +4,7 @@
     .venv/bin/python scripts/compare_touch.py --seeds 0 1 2
 
 Every run is one ``vtrefine-demo``; flags that this script does not know are passed on to it, for example
-``--env='{pair: square, clearance_m: 0.001, start: grasped, read_every: 8, read_window: 2}'``. Interrupted and
+``--env='{pair: square, clearance_m: 0.001, start: grasped}'``. Interrupted and
 started again, it continues. The comparison is printed and saved as ``comparison.json`` and ``comparison.md``.
 """
 

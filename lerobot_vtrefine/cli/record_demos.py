@@ -37,7 +37,7 @@ class RecordDemosConfig:
     num_episodes: int = 50
     """Episodes that the dataset shall hold."""
     seed: int = 0
-    """Seed of the first attempt; attempt i has seed + i."""
+    """Seed of the first attempt; attempt i has seed + i, so recordings need seeds far apart to differ."""
     num_envs: int = 16
     """Episodes simulated at once, per process."""
     num_workers: int = 0

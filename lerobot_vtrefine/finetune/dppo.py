@@ -52,7 +52,11 @@ from lerobot_vtrefine.policies.vt_dp3.diffusion import denoise_prefix, sample_ch
 Metrics = dict[str, float]
 
 TRAINING_SEEDS = 1_000_000
-"""First environment seed of training episodes; smaller seeds are free for evaluation."""
+"""Training episode i of a run, counted over iterations and ranks, has seed TRAINING_SEEDS + seed + i.
+
+Runs share no episode when their seeds differ by more than their episodes (the demo's differ by 10 000 000).
+Smaller seeds, and those past the last episode, are free for demonstrations and evaluation.
+"""
 
 
 @dataclass

@@ -13,10 +13,12 @@ from scipy.stats import binomtest
 
 from lerobot_vtrefine.cli import demo
 from lerobot_vtrefine.cli.pipeline import stages
-from lerobot_vtrefine.cli.pipeline.demo_config import DemoConfig, demo_stages, flags
+from lerobot_vtrefine.cli.pipeline.demo_config import LARGEST_SEED, DemoConfig, demo_stages, flags
 from lerobot_vtrefine.cli.report.charts import Bar, Series, bar_chart, line_chart
 from lerobot_vtrefine.cli.report.results import verdict
 from lerobot_vtrefine.cli.report.statistics import proportion, quantiles, wilson_interval
+from lerobot_vtrefine.finetune.dppo import TRAINING_SEEDS
+from lerobot_vtrefine.finetune.evaluation import EVALUATION_SEEDS
 
 FAKES = Path(__file__).with_name("fake_commands.py")
 
@@ -43,7 +45,7 @@ def test_demo_end_to_end(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> 
     assert results["pretrain"]["episodes"] == 8
     assert results["finetune"]["rate"] == 0.75
     assert results["finetune"]["ci95"] == [0.4093, 0.9285]
-    assert results["pretrain"]["seeds"] == results["finetune"]["seeds"] == list(range(9_000_000, 9_000_008))
+    assert results["pretrain"]["seeds"] == results["finetune"]["seeds"] == list(range(8_000_000, 8_000_008))
     assert results["finetune"]["failures"] == {"dropped": 2}
     assert set(results["ablations"]["finetune"]) == {"touch", "vision"}
     assert set(results["seconds"]) >= {"record", "pretrain", "finetune", "eval_finetune", "total"}
@@ -85,14 +87,61 @@ def test_commands_are_those_of_users() -> None:
 
 
 def test_episodes_are_never_shared() -> None:
-    """Evaluation seeds are unseen, within a run and between runs of different seeds."""
-    starts = []
-    for seed in range(3):
-        config = DemoConfig(seed=seed)
+    """Evaluation seeds are unseen, within a run and between runs of different seeds; NumPy takes them all."""
+    ranges = []
+    for seed in (0, 1, 2, LARGEST_SEED):
+        config = DemoConfig(seed=seed, finetune_iterations=1000, finetune_envs=6000)
         text = [stage.line for stage in demo_stages(config)]
-        starts += [int(re.findall(r" --seed=(\d+)", text[index])[0]) for index in (0, 3, 2)]
-    assert starts == sorted(starts)
-    assert min(b - a for a, b in pairwise(starts)) >= 1_000_000
+        record, train, evaluate = (int(re.findall(r" --seed=(\d+)", text[index])[0]) for index in (0, 3, 2))
+        train += TRAINING_SEEDS
+        ranges += [
+            (record, record + EVALUATION_SEEDS),
+            (train, train + config.finetune_iterations * config.finetune_envs),
+            (evaluate, evaluate + config.eval_episodes),
+        ]
+    assert all(end <= start for (_, end), (start, _) in pairwise(ranges))
+    assert ranges[-1][1] < 2**32
+
+
+def test_sensors_are_read_where_the_policy_reads_them() -> None:
+    config = DemoConfig(policy={"preset": "small", "n_action_steps": 4, "n_obs_steps": 3})
+    for stage in demo_stages(config):
+        reads = [part for part in stage.command if part.startswith("--env.read_")]
+        expected = ["--env.read_every=4", "--env.read_window=3"]
+        assert reads == ([] if stage.name in ("record", "pretrain") else expected)
+
+
+@pytest.mark.parametrize(
+    ("flag", "message"),
+    [
+        ("--finetune_envs=0", "--finetune_envs must be at least 1, got 0"),
+        ("--pretrain_batch=0", "--pretrain_batch must be at least 1, got 0"),
+        ("--ablation_episodes=-1", "--ablation_episodes must be at least 0, got -1"),
+        ("--videos=-1", "--videos must be at least 0, got -1"),
+        ("--seed=429", "--seed must lie in 0..428, got 429"),
+        ("--finetune_envs=1000000", "--finetune_iterations times --finetune_envs must not exceed 6000000"),
+        ("--dppo={tpye: small}", "--dppo: The fields `tpye` are not valid"),
+        ("--dppo={type: smal}", "--dppo: Couldn't find a choice class for 'smal'"),
+        ("--policy={n_action_step: 8}", "--policy: The fields `n_action_step` are not valid"),
+        ("--policy={n_action_steps: 99}", "--policy: policy.n_action_steps=99 must be within"),
+        ("--env={clearance_m: -1}", "--env: clearance_m must be above 0, got -1.0"),
+        ("--env={read_every: 3, read_window: 2}", "use --env.read_every=8 --env.read_window=2"),
+        ("--degradation={lateral_std_m: -1}", "--degradation: degradation.lateral_std_m must be"),
+    ],
+)
+def test_bad_values_are_refused_at_once(
+    flag: str,
+    message: str,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    monkeypatch.setattr(sys, "argv", ["vtrefine-demo", f"--output_dir={tmp_path / 'demo'}", flag])
+    monkeypatch.setattr(demo, "run_demo", lambda config: pytest.fail("started"))
+    assert demo.main() == 2
+    error = capsys.readouterr().err
+    assert message in error
+    assert error.count("\n") == 1
 
 
 def test_headline_numbers_meet_the_promise() -> None:

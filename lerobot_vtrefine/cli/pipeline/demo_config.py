@@ -5,16 +5,40 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
+from lerobot_vtrefine.cli.pipeline.child_configs import (
+    parse_degradation,
+    parse_dppo,
+    parse_env,
+    parse_policy,
+)
 from lerobot_vtrefine.cli.pipeline.stages import Stage
+from lerobot_vtrefine.finetune.dppo import TRAINING_SEEDS
+from lerobot_vtrefine.finetune.pipeline import check_read_schedule
 
 REPO_ID = "local/vtrefine_demo"
 POLICIES = ("pretrain", "finetune")
 ABLATIONS = ("touch", "vision")
 
-# Environment seeds of demonstrations, fine-tuning and evaluation never overlap.
+# Environment seeds of demonstrations, fine-tuning and evaluation never overlap. The evaluation's played no
+# part in choosing the recipe below.
 SEED_STRIDE = 10_000_000
 TRAIN_SEED_OFFSET = 1_000_000
-EVAL_SEED_OFFSET = 9_000_000
+EVAL_SEED_OFFSET = 8_000_000
+LARGEST_SEED = 2**32 // SEED_STRIDE - 1  # NumPy's generators take seeds below 2**32
+TRAIN_SEEDS = EVAL_SEED_OFFSET - TRAIN_SEED_OFFSET - TRAINING_SEEDS
+
+LOWEST = {
+    "num_demos": 1,
+    "demo_envs": 1,
+    "pretrain_steps": 1,
+    "pretrain_batch": 1,
+    "eval_episodes": 1,
+    "eval_envs": 1,
+    "ablation_episodes": 0,
+    "videos": 0,
+    "finetune_iterations": 1,
+    "finetune_envs": 1,
+}
 
 QUICK = (
     "--num_demos=4",
@@ -31,8 +55,8 @@ QUICK = (
 
 
 def default_env() -> dict[str, Any]:
-    """The demo's task; sensors are read only where a policy with chunks of 8 reads them."""
-    return {"pair": "round", "clearance_m": 0.002, "start": "grasped", "read_every": 8, "read_window": 2}
+    """The demo's task."""
+    return {"pair": "round", "clearance_m": 0.002, "start": "grasped"}
 
 
 def default_degradation() -> dict[str, Any]:
@@ -86,7 +110,7 @@ class DemoConfig:
     finetune_envs: int = 96
     """Simulations that DPPO collects from."""
     env: dict[str, Any] = field(default_factory=default_env)
-    """Flags of the environment, ``--env.KEY=VALUE``."""
+    """Flags of the environment, ``--env.KEY=VALUE``; its read schedule follows the policy."""
     degradation: dict[str, Any] = field(default_factory=default_degradation)
     """Flags of the expert's imperfections, ``--degradation.KEY=VALUE``."""
     policy: dict[str, Any] = field(default_factory=default_policy)
@@ -95,13 +119,21 @@ class DemoConfig:
     """Flags of DPPO, ``--dppo.KEY=VALUE``."""
 
     def __post_init__(self) -> None:
-        for name in ("num_demos", "pretrain_steps", "eval_episodes", "eval_envs", "finetune_iterations"):
-            if getattr(self, name) < 1:
-                raise ValueError(f"--{name} must be at least 1, got {getattr(self, name)}")
+        for name, lowest in LOWEST.items():
+            if getattr(self, name) < lowest:
+                raise ValueError(f"--{name} must be at least {lowest}, got {getattr(self, name)}")
         if self.modalities not in ("visuo_tactile", "visual"):
             raise ValueError(f"--modalities={self.modalities}: choose from visuo_tactile, visual")
-        if self.seed < 0:
-            raise ValueError(f"--seed must not be negative, got {self.seed}")
+        if not 0 <= self.seed <= LARGEST_SEED:
+            raise ValueError(f"--seed must lie in 0..{LARGEST_SEED}, got {self.seed}")
+        if self.finetune_iterations * self.finetune_envs > TRAIN_SEEDS:
+            raise ValueError(
+                f"--finetune_iterations times --finetune_envs must not exceed {TRAIN_SEEDS}:"
+                " training would reach the seeds of the evaluation"
+            )
+        parse_degradation(self.degradation)
+        parse_dppo(self.dppo | {"iterations": self.finetune_iterations, "num_envs": self.finetune_envs})
+        check_read_schedule(parse_env(acting_env(self)), parse_policy(self.policy))
 
     @property
     def dataset_dir(self) -> Path:
@@ -164,6 +196,15 @@ def recording_env(config: DemoConfig) -> dict[str, Any]:
     return {key: value for key, value in config.env.items() if not key.startswith("read_")}
 
 
+def acting_env(config: DemoConfig) -> dict[str, Any]:
+    """The environment's flags where the policy acts: sensors are read only where it reads them."""
+    policy = parse_policy(config.policy)
+    chunk = policy.n_action_steps
+    derived = {"read_every": chunk, "read_window": min(chunk, policy.n_obs_steps)}
+    given = {key: config.env[key] for key in derived if key in config.env}
+    return recording_env(config) | derived | given
+
+
 def pretrain_stage(config: DemoConfig) -> Stage:
     """Imitation learning with LeRobot's own trainer."""
     command = [
@@ -202,7 +243,7 @@ def evaluation_stage(config: DemoConfig, policy: str, ablation: str = "none") ->
         "lerobot-eval",
         f"--policy.path={config.checkpoint(policy)}",
         "--policy.device=cpu",
-        *flags("env", {"type": "vtrefine"} | config.env),
+        *flags("env", {"type": "vtrefine"} | acting_env(config)),
         f"--env.metrics_path={output / 'episodes.jsonl'}",
         f"--env.video_episodes={config.videos if ablation == 'none' else 0}",
         f"--eval.n_episodes={episodes}",
@@ -225,7 +266,7 @@ def finetune_stage(config: DemoConfig) -> Stage:
         "vtrefine-finetune",
         f"--policy.path={config.checkpoint('pretrain')}",
         "--policy.device=cpu",
-        *flags("env", {"type": "vtrefine"} | config.env),
+        *flags("env", {"type": "vtrefine"} | acting_env(config)),
         *flags("dppo", config.dppo),
         f"--dppo.iterations={config.finetune_iterations}",
         f"--dppo.num_envs={config.finetune_envs}",
