@@ -163,15 +163,15 @@ class SmallDppo(DppoConfig):
     """Minutes on two CPU cores: few environments, short episodes, a small network."""
 
     iterations: int = 30
-    num_envs: int = 96
+    num_envs: int = 128
     min_sampling_std: float = 0.05
     reward_scaling: bool = False
     clip: float = 0.02
     clip_first: float = 0.02
     epochs: int = 5
-    minibatch_decisions: int = 200
-    actor_lr: float = 2e-4
-    actor_lr_final: float = 2e-5
+    minibatch_decisions: int = 300
+    actor_lr: float = 1e-4
+    actor_lr_final: float = 1e-5
     lr_warmup: int = 1
     max_grad_norm: float = 1.0
     critic_width: int = 256

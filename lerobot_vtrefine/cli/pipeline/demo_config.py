@@ -107,7 +107,7 @@ class DemoConfig:
     """Episodes of each headline evaluation that are drawn; drawing without a GPU is slow."""
     finetune_iterations: int = 30
     """DPPO iterations of one episode in every environment."""
-    finetune_envs: int = 96
+    finetune_envs: int = 128
     """Simulations that DPPO collects from."""
     env: dict[str, Any] = field(default_factory=default_env)
     """Flags of the environment, ``--env.KEY=VALUE``; its read schedule follows the policy."""
