@@ -307,7 +307,8 @@ def update(rollout: Rollout, agent: Agent, state: TrainState, cfg: DppoConfig) -
                     loss = loss - cfg.bc_coef * base_log_probs.sum() / rows
                 loss.backward()
                 with torch.no_grad():
-                    sums[2] += (log_ratio.exp() - 1 - log_ratio).sum() / rows  # Schulman's k3 estimator
+                    exact = log_ratio.double()  # in float32, 1e-4's square is lost in exp's rounding
+                    sums[2] += (exact.expm1() - exact).sum() / rows  # Schulman's k3 estimator
                     sums[3] += (log_ratio.expm1().abs() > clip).double().sum() / rows
                     sums[4] += log_ratio.abs().sum() / rows
             value_loss, loss_value, approx_kl, clip_fraction, log_ratio_size = sum_over_ranks(sums).tolist()

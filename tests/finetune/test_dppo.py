@@ -217,11 +217,15 @@ def test_time_outs_use_the_final_state_or_nothing(timeout):
 
 
 def test_early_stop_at_the_kl_limit():
-    cfg = small_config(critic_warmup=0, target_kl=1e-9, epochs=5)
-    env, agent, state = problem(cfg)
-    metrics = update(rollout_of(cfg, env, agent, state), agent, state, cfg)
-    assert metrics["stopped_early"] == 1
-    assert 1 <= metrics["updates"] < 5
+    """The first minibatch meets the old policy itself; the second one that has moved by a step."""
+    metrics = []
+    for limit in (1.0, 1e-15):
+        cfg = small_config(critic_warmup=0, target_kl=limit, epochs=5)
+        env, agent, state = problem(cfg)
+        metrics.append(update(rollout_of(cfg, env, agent, state), agent, state, cfg))
+    assert [m["stopped_early"] for m in metrics] == [0, 1]
+    assert metrics[0]["updates"] >= 5  # at least one minibatch an epoch
+    assert metrics[1]["updates"] == 1
 
 
 @pytest.mark.parametrize("term", ["kl_coef", "bc_coef"])
