@@ -1,0 +1,1 @@
+"""What the simulation gets wrong: recordings, residuals, candidate causes, verdict and the extended model."""

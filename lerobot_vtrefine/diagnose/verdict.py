@@ -1,0 +1,258 @@
+"""The verdict of a diagnosis, as the public file ``verdict.json`` holds it (contract §3).
+
+The dataclasses refuse what the contract does not allow, so that no other program has to: numbers that are not
+finite, unknown names, a status that its causes contradict.
+"""
+
+import json
+import math
+import os
+from collections.abc import Iterator, Mapping
+from dataclasses import asdict, dataclass, field
+from pathlib import Path
+from typing import Any, Literal, get_args
+
+SCHEMA = "vtrefine/verdict@1"
+
+Status = Literal["adequate", "explained", "ambiguous", "unexplained", "invalid_data"]
+Role = Literal["cause", "symptom"]
+
+SENSOR_CAUSES = (
+    "nonlinear_stiffness",
+    "saturation",
+    "viscoelastic_relaxation",
+    "hysteresis",
+    "taxel_gain_spread",
+    "dead_taxels",
+    "row_sharing",
+    "crosstalk",
+    "mechanical_spreading",
+    "baseline_drift",
+    "latency",
+    "scan_skew",
+    "sample_and_hold",
+    "contact_offset",
+    "pad_tilt",
+)
+ROBOT_CAUSES = (
+    "encoder_offset",
+    "backlash",
+    "control_latency",
+    "joint_friction",
+    "gravity_sag",
+    "gripper_compliance",
+)
+SCENE_CAUSES = ("camera_extrinsics", "depth_scale", "object_mass", "object_friction", "clearance")
+CAUSES = SENSOR_CAUSES + ROBOT_CAUSES + SCENE_CAUSES
+"""Every name that a verdict may give (contract §4)."""
+
+
+@dataclass(frozen=True)
+class Parameter:
+    """A fitted parameter: a number, or nested lists (maps, taxel indices), in ``unit`` ("1" if it has none).
+
+    ``ci95`` comes from resampling whole recordings; None where an interval makes no sense (indices) or could
+    not be had.
+    """
+
+    value: float | list[Any]
+    ci95: tuple[float, float] | list[Any] | None
+    unit: str
+
+    def __post_init__(self) -> None:
+        ci95 = self.ci95
+        scalar = isinstance(self.value, (int, float))
+        if ci95 is not None and scalar and not (len(ci95) == 2 and ci95[0] <= ci95[1]):
+            raise ValueError(f"ci95 must be (low, high) with low <= high, got {ci95}")
+
+
+@dataclass(frozen=True)
+class Cause:
+    """One name with its evidence: family-wise adjusted p, and what its removal loses on held-out trials.
+
+    A ``symptom`` was found together with structure that no known cause accounts for: its name may be false.
+    """
+
+    name: str
+    role: Role
+    params: Mapping[str, Parameter]
+    p_value: float | None
+    heldout_gain: float | None
+
+    def __post_init__(self) -> None:
+        _check_names("cause", (self.name,))
+        _check_choice("role", self.role, get_args(Role))
+        if self.p_value is not None and not 0.0 <= self.p_value <= 1.0:
+            raise ValueError(f"p_value of {self.name} must lie in [0, 1], got {self.p_value}")
+
+
+@dataclass(frozen=True)
+class Unknown:
+    """Whether repeatable structure is left that no cause accounts for, and what it correlates with."""
+
+    alarm: bool
+    clue: str | None = None
+
+
+@dataclass(frozen=True)
+class Heldout:
+    """Errors on trials that no fit and no choice has seen; ``gain`` = 1 − extended² / baseline²."""
+
+    metric: str
+    baseline: float
+    extended: float
+    noise_floor: float | None
+    gain: float
+    gain_ci95: tuple[float, float] | None
+    trials: tuple[str, ...]
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "trials", tuple(self.trials))
+
+
+@dataclass(frozen=True)
+class DataIssue:
+    """What was wrong with a recording, and what was done: "set aside", "kept" or "repaired: ...".
+
+    ``trial`` is the file's name, or None for what concerns the whole set.
+    """
+
+    trial: str | None
+    problem: str
+    action: str
+
+
+@dataclass(frozen=True)
+class Verdict:
+    """Everything in ``verdict.json``. ``heldout`` is None when nothing could be fitted (``invalid_data``).
+
+    ``next_experiment`` is a JSON object (a protocol that the rig can run, with what it decides) or None.
+    """
+
+    status: Status
+    causes: tuple[Cause, ...] = ()
+    ambiguous_with: tuple[tuple[str, ...], ...] = ()
+    unknown: Unknown = field(default_factory=lambda: Unknown(alarm=False))
+    heldout: Heldout | None = None
+    minimum_detectable: Mapping[str, float] = field(default_factory=dict)
+    next_experiment: Mapping[str, Any] | None = None
+    data_issues: tuple[DataIssue, ...] = ()
+
+    def __post_init__(self) -> None:
+        by_gain = sorted(self.causes, key=lambda cause: -(cause.heldout_gain or 0.0))
+        object.__setattr__(self, "causes", tuple(by_gain))
+        object.__setattr__(self, "ambiguous_with", tuple(tuple(names) for names in self.ambiguous_with))
+        object.__setattr__(self, "data_issues", tuple(self.data_issues))
+        _check_choice("status", self.status, get_args(Status))
+        for names in self.ambiguous_with:
+            _check_names("ambiguous_with", names)
+        _check_names("minimum_detectable", tuple(self.minimum_detectable))
+        _check_consistent(self)
+        for where, number in _numbers("", asdict(self)):
+            if not math.isfinite(number):
+                raise ValueError(f"verdict holds {number} at {where}; JSON knows no such number, use None")
+
+    def to_dict(self) -> dict[str, Any]:
+        """JSON-ready form with the contract's keys in the contract's order."""
+        return {"schema": SCHEMA, **asdict(self)}
+
+    @classmethod
+    def from_dict(cls, data: Mapping[str, Any]) -> "Verdict":
+        """Inverse of `to_dict`; ValueError says what is missing or wrong."""
+        if not isinstance(data, Mapping) or data.get("schema") != SCHEMA:
+            raise ValueError(f'verdict must hold "schema": "{SCHEMA}"')
+        values = {key: value for key, value in data.items() if key != "schema"}
+        try:
+            values["causes"] = tuple(_cause_from_dict(item) for item in values["causes"])
+            values["unknown"] = Unknown(**values["unknown"])
+            values["data_issues"] = tuple(DataIssue(**item) for item in values["data_issues"])
+            if values["heldout"] is not None:
+                values["heldout"] = Heldout(**_with_tuple(values["heldout"], "gain_ci95"))
+            return cls(**values)
+        except (KeyError, TypeError) as error:
+            raise ValueError(f"verdict is malformed: {error}") from error
+
+
+def write_verdict(verdict: Verdict, path: str | Path) -> None:
+    """Write verdict.json, whole or not at all."""
+    text = json.dumps(verdict.to_dict(), indent=2, allow_nan=False, default=_plain)
+    write_atomically(path, text + "\n")
+
+
+def read_verdict(path: str | Path) -> Verdict:
+    """Read verdict.json; ValueError names the file and what is wrong with it."""
+    try:
+        return Verdict.from_dict(json.loads(Path(path).read_text()))
+    except ValueError as error:
+        raise ValueError(f"{path}: {error}") from error
+
+
+def write_atomically(path: str | Path, text: str) -> None:
+    """Write a text file so that a reader sees the old content or the new, never a part."""
+    path = Path(path)
+    partial = path.with_name(f".{path.name}.partial")
+    partial.write_text(text)
+    os.replace(partial, path)  # noqa: PTH105  atomic on one file system, and says so
+
+
+def _plain(value: Any) -> Any:
+    """NumPy's scalars and arrays as JSON's."""
+    if hasattr(value, "tolist"):
+        return value.tolist()
+    raise TypeError(f"verdict.json cannot hold {type(value).__name__}")
+
+
+def _cause_from_dict(item: Mapping[str, Any]) -> Cause:
+    params = {name: Parameter(**_with_tuple(value, "ci95")) for name, value in item["params"].items()}
+    rest: dict[str, Any] = {key: value for key, value in item.items() if key != "params"}
+    return Cause(params=params, **rest)
+
+
+def _with_tuple(item: Mapping[str, Any], key: str) -> dict[str, Any]:
+    """JSON's list of two numbers back as the tuple that was written."""
+    value = item[key]
+    is_interval = isinstance(value, list) and len(value) == 2 and not isinstance(value[0], list)
+    return {**item, key: tuple(value) if is_interval else value}
+
+
+def _check_choice(name: str, value: str, choices: tuple[str, ...]) -> None:
+    if value not in choices:
+        raise ValueError(f"{name} {value!r} is unknown; choose from {', '.join(choices)}")
+
+
+def _check_names(where: str, names: tuple[str, ...]) -> None:
+    for name in names:
+        if name not in CAUSES:
+            raise ValueError(f"{where} {name!r} is not a cause; valid: {', '.join(CAUSES)}")
+
+
+def _check_consistent(verdict: Verdict) -> None:
+    """A status must not contradict the rest (contract §3)."""
+    roles = {cause.role for cause in verdict.causes}
+    wrong = {
+        "adequate": bool(verdict.causes or verdict.ambiguous_with or verdict.unknown.alarm),
+        "explained": not verdict.causes or bool(verdict.ambiguous_with or verdict.unknown.alarm),
+        "ambiguous": not verdict.ambiguous_with or verdict.next_experiment is None,
+        "unexplained": not verdict.unknown.alarm or "cause" in roles,
+        "invalid_data": bool(verdict.causes) or not verdict.data_issues,
+    }[verdict.status]
+    if wrong:
+        raise ValueError(
+            f"status {verdict.status!r} contradicts the verdict: causes "
+            f"{[(cause.name, cause.role) for cause in verdict.causes]}, ambiguous_with "
+            f"{list(verdict.ambiguous_with)}, alarm {verdict.unknown.alarm}, next_experiment "
+            f"{'given' if verdict.next_experiment is not None else 'missing'}, "
+            f"{len(verdict.data_issues)} data issues"
+        )
+
+
+def _numbers(where: str, value: Any) -> Iterator[tuple[str, float]]:
+    """Every number in nested containers with its place."""
+    if isinstance(value, Mapping):
+        for key, item in value.items():
+            yield from _numbers(f"{where}.{key}" if where else str(key), item)
+    elif isinstance(value, (list, tuple)):
+        for index, item in enumerate(value):
+            yield from _numbers(f"{where}[{index}]", item)
+    elif isinstance(value, (int, float)):
+        yield where, float(value)
