@@ -1,0 +1,72 @@
+"""What an engine hands to the report beside its verdict: evidence per candidate, traces, residual summaries."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import numpy as np
+
+
+@dataclass(frozen=True)
+class Evidence:
+    """One candidate cause and what became of it; candidates that were rejected are listed too.
+
+    ``p_adjusted`` is controlled over the family of candidates. ``heldout_gain`` is the part of the mean squared
+    error on held-out recordings that the candidate takes away. ``decision`` is one of DECISIONS, ``reason`` one
+    sentence for people.
+    """
+
+    name: str
+    p_value: float | None
+    p_adjusted: float | None
+    heldout_gain: float | None
+    decision: str
+    reason: str
+
+    def __post_init__(self) -> None:
+        if self.decision not in DECISIONS:
+            raise ValueError(f"decision {self.decision!r} is unknown; choose from {', '.join(DECISIONS)}")
+
+
+DECISIONS = ("accepted", "symptom", "tie", "rejected", "not identifiable")
+
+
+@dataclass(frozen=True)
+class Trace:
+    """A held-out trial as it was measured, simulated (baseline) and simulated by the extended model.
+
+    Attributes:
+        time_s: (N,) from the trial's start [s].
+        channels: names of the K channels that answer most, for example "taxel (5, 14)" or a joint.
+        measured, simulated, extended: (N, K) in the diagnosis' unit.
+        drive: what drove the trial, name with unit suffix -> (N,), for example "depth_m" or "force_n".
+    """
+
+    file: str
+    condition: str
+    time_s: np.ndarray
+    channels: tuple[str, ...]
+    measured: np.ndarray
+    simulated: np.ndarray
+    extended: np.ndarray
+    drive: Mapping[str, np.ndarray]
+
+
+@dataclass(frozen=True)
+class ResidualView:
+    """Mean of measured − predicted against one axis, over held-out trials, before and after the extension.
+
+    Attributes:
+        axis: "load", "rate", "history", "position", "time", ...; ``unit`` is the axis' unit.
+        x: (B,) centres of the bins.
+        before, after: (B,) mean residual; ``before_ci95``, ``after_ci95`` (B, 2) by resampling trials.
+        count: (B,) readings in each bin.
+    """
+
+    axis: str
+    unit: str
+    x: np.ndarray
+    before: np.ndarray
+    after: np.ndarray
+    before_ci95: np.ndarray | None
+    after_ci95: np.ndarray | None
+    count: np.ndarray
