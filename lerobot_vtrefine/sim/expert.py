@@ -56,20 +56,28 @@ class Pace:
     """... or this long after they should have arrived."""
 
 
+READY_M = 2e-4  # a plug this close to its aim may enter
 PACES = {
     Phase.REACH: Pace(0.25, 1.0, 0.006, 0.5),
     Phase.APPROACH: Pace(0.12, 0.6, 0.003, 0.6),
     Phase.CLOSE: Pace(0.10, 0.7),
     Phase.LIFT: Pace(0.12, 0.8, 0.006, 0.4),
     Phase.CARRY: Pace(0.12, 0.6, 0.003, 0.5),
-    Phase.ALIGN: Pace(0.04, 0.7, 2e-4, 1.0),
-    Phase.INSERT: Pace(0.03, 0.5),
+    Phase.ALIGN: Pace(0.04, 0.7, 8e-4, 0.5),
+    Phase.INSERT: Pace(0.036, 0.5),
     Phase.HOLD: Pace(0.03, 0.5, 0.0, np.inf),
 }
 RETREAT_M = 0.09  # hands come to a part from this far behind it
 CARRY_M = 0.040  # the plug is carried this high above the mouth
-STANDOFF_M = 0.006  # and aligned this high above it
+STANDOFF_M = 0.009  # and brought over it at this height
+CLOSING_M_S = (
+    0.012  # speed of the last way to the mouth: steady, since friction's direction then stays the same
+)
+HOVER_M = 0.0012  # a plug that the descent has pushed off its aim waits here, at most so long
+HOVER_S = 1.5
+ENTRY_M = 0.0006  # below this height over the mouth nothing is corrected any more
 PRESS_M = 0.008  # a blocked plug is pushed as if it should be this much lower: a few newtons
+SLOWDOWN = 0.35  # before the seat: largest share of the way left in one control step
 BOTTOM_M = 0.0005  # a seated plug is pushed this far beyond its seat
 TABLE_GAP_M = 0.003  # between fingertips and table
 FLATTEST_RAD = 0.1  # a flatter hand would touch the table with its palm
@@ -86,6 +94,11 @@ class View:
     """(m, 2) TCPs."""
     parts: Poses
     """(m, 2) socket, plug."""
+
+    @property
+    def height_m(self) -> Array:
+        """(m,) plugs' origins over their sockets'."""
+        return (self.parts[:, LEFT].inverse() @ self.parts[:, RIGHT]).position[:, 2]
 
     def __getitem__(self, rows: NDArray) -> "View":
         return View(self.q[rows], self.hands[rows], self.parts[rows])
@@ -118,9 +131,10 @@ class ScriptedExpert:
         self._start = Poses.identity(count, 2)  # hands wanted when the phase began
         self._wanted = Poses.identity(count, 2)  # hands wanted now
         self._goal = Poses.identity(count, 2)  # hands wanted when the phase ends
-        self._held = Poses.identity(count, 2)  # hands in their parts' frames when the phase began
-        self._socket = Poses.identity(count)  # where it was when the phase began
-        self._top_m = np.zeros(count)  # height of the plug over the socket when the phase began
+        self._held = Poses.identity(count, 2)  # hands in their parts' frames, likewise
+        self._socket = Poses.identity(count)  # where it was when the phase began, or the plug entered
+        self._height_m = np.zeros(count)  # wanted height of the plug over the socket, while inserting
+        self._entered = np.zeros(count, bool)
 
     def reset(self, ids: Ids, seeds: Ids | None = None) -> None:
         """Start new episodes of environments `ids` (m,) after the simulation was reset, by its seeds."""
@@ -141,13 +155,13 @@ class ScriptedExpert:
         self._advance(ids, view)
         moving = ~self._errors.paused(ids, self._step[ids])
         self._phase_step[ids] += moving * self._errors.pace[ids]
+        self._descend(ids, view, moving)
         wanted = self._plan(ids, view)
         self._wanted.assign(ids[moving], wanted[moving])
         wanted = self._wanted[ids]
         target, _, _ = solve_hands(self._robot, wanted.position, wanted.rotation, self._target[ids])
         # Servos that press against a contact lack something else than those that move freely.
-        phases = self.phase[ids]
-        self._servos.learn(ids, view.q, (phases != Phase.CLOSE) & (phases < Phase.INSERT))
+        self._servos.learn(ids, view.q, (self.phase[ids] != Phase.CLOSE) & ~self._entered[ids])
         command = self._servos.command(ids, self._target[ids], target)
         for q in (target, command):
             _arms(q)[..., -2:] = self._opening[ids][..., None] * [1.0, -1.0]
@@ -169,6 +183,8 @@ class ScriptedExpert:
         miss = _distance(view.hands, self._goal[ids])
         aligning = phases == Phase.ALIGN
         miss[aligning] = self._misalignment(ids[aligning], view[aligning])
+        lowered = self._height_m[ids] <= self._pair.seated_z_m
+        late_s[phases == Phase.INSERT] = np.where(lowered, 0.0, -1.0)[phases == Phase.INSERT]
         for phase, pace in PACES.items():
             over = (late_s >= 0) & ((miss < pace.settle_m) | (late_s >= pace.patience_s)) & (phases == phase)
             chosen = np.flatnonzero(over)
@@ -181,13 +197,15 @@ class ScriptedExpert:
         self._start.assign(ids, self._wanted[ids])
         self._held.assign(ids, view.parts.inverse() @ view.hands)
         self._socket.assign(ids, view.parts[:, LEFT])
-        self._top_m[ids] = (view.parts[:, LEFT].inverse() @ view.parts[:, RIGHT]).position[:, 2]
+        self._entered[ids] = phase > Phase.INSERT
+        if phase == Phase.INSERT:
+            self._height_m[ids] = self._pair.mouth_z_m + STANDOFF_M
         if phase == Phase.CLOSE:
             self._opening[ids] = self._grip_m
         self._goal.assign(ids, self._destination(ids, phase, view))
         way = _distance(self._start[ids], self._goal[ids])
         if phase == Phase.INSERT:
-            way = self._top_m[ids] - self._pair.seated_z_m
+            way = self._height_m[ids] - self._pair.seated_z_m
         pace = PACES[phase]
         self._duration[ids] = self._hz * np.maximum(way / pace.speed_m_s, pace.shortest_s)
 
@@ -220,9 +238,7 @@ class ScriptedExpert:
         smooth = share * share * (3 - 2 * share)
         wanted = self._start[ids].towards(goal, np.repeat(smooth[:, None], 2, 1))
         if inserting.any():
-            down = self._inserted(
-                ids[inserting], view[inserting], np.where(phases == Phase.HOLD, 1.0, smooth)[inserting]
-            )
+            down = self._inserted(ids[inserting], view[inserting])
             wanted.position[inserting, RIGHT], wanted.rotation[inserting, RIGHT] = (
                 down.position,
                 down.rotation,
@@ -236,12 +252,26 @@ class ScriptedExpert:
             self._aim(ids, view.parts[:, LEFT], np.full(len(ids), self._pair.mouth_z_m + STANDOFF_M)) @ held
         )
 
-    def _inserted(self, ids: Ids, view: View, share: Array) -> Poses:
-        """Right hand (m,) a share of the way down from where the parts stood when it began: no feedback."""
-        bottom = self._pair.seated_z_m - BOTTOM_M
-        reached = (self._socket[ids].inverse() @ view.parts[:, RIGHT]).position[:, 2]
-        height = np.maximum(self._top_m[ids] + share * (bottom - self._top_m[ids]), reached - PRESS_M)
+    def _inserted(self, ids: Ids, view: View) -> Poses:
+        """Right hand (m,) on the way down: corrected until the plug enters, then straight on."""
+        free = ~self._entered[ids]
+        self._held.assign(ids[free], view.parts[free].inverse() @ view.hands[free])
+        self._socket.assign(ids[free], view.parts[free, LEFT])
+        height = np.maximum(self._height_m[ids], view.height_m - PRESS_M)
         return self._aim(ids, self._socket[ids], height) @ self._held[ids][:, RIGHT]
+
+    def _descend(self, ids: Ids, view: View, moving: NDArray[np.bool_]) -> None:
+        """Lower the wanted height of the plugs that are being inserted, gently at either end."""
+        mouth, bottom = self._pair.mouth_z_m, self._pair.seated_z_m - BOTTOM_M
+        self._entered[ids] |= (self.phase[ids] >= Phase.INSERT) & (view.height_m < mouth + ENTRY_M)
+        elapsed_s = self._phase_step[ids] / self._hz
+        speed = np.where(self._entered[ids], PACES[Phase.INSERT].speed_m_s, CLOSING_M_S)
+        height = self._height_m[ids]
+        way = np.minimum(speed / self._hz, SLOWDOWN * (height - bottom) + BOTTOM_M)
+        height = np.maximum(height - way * moving * self._errors.pace[ids], bottom)
+        late_s = elapsed_s - self._duration[ids] / self._hz
+        wait = ~self._entered[ids] & (self._misalignment(ids, view) > READY_M) & (late_s < HOVER_S)
+        self._height_m[ids] = np.where(wait, np.maximum(height, mouth + HOVER_M), height)
 
     def _aim(self, ids: Ids, socket: Poses, height_m: Array) -> Poses:
         """Plug poses (m,) at a height over where the sockets are believed to be."""
