@@ -1,4 +1,4 @@
-"""What an engine hands to the report beside its verdict: evidence per candidate, traces, residual summaries."""
+"""What an engine hands to the report beside its verdict: evidence per candidate, traces, residuals."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -10,9 +10,9 @@ import numpy as np
 class Evidence:
     """One candidate cause and what became of it; candidates that were rejected are listed too.
 
-    ``p_adjusted`` is controlled over the family of candidates. ``heldout_gain`` is the part of the mean squared
-    error on held-out recordings that the candidate takes away. ``decision`` is one of DECISIONS, ``reason`` one
-    sentence for people.
+    ``p_adjusted`` is controlled over the family of candidates. ``heldout_gain`` is the part of the mean
+    squared error on held-out recordings that the candidate takes away. ``decision`` is one of DECISIONS,
+    ``reason`` one sentence for people.
     """
 
     name: str
