@@ -4,15 +4,19 @@
     .venv/bin/python scripts/compare_touch.py --seeds 0 1 2
 
 Every run is one ``vtrefine-demo``; flags that this script does not know are passed on to it, for example
-``--env='{pair: square, clearance_m: 0.001, start: grasped}'``. Interrupted and
-started again, it continues. The comparison is printed and saved as ``comparison.json`` and ``comparison.md``.
+``--env='{pair: square, clearance_m: 0.001, start: grasped}'``. On a machine with many cores ``--jobs`` runs
+several side by side, each on cores of its own. Interrupted and started again, it continues. The comparison
+is printed and saved as ``comparison.json`` and ``comparison.md``.
 """
 
 import argparse
 import json
+import os
 import shutil
 import subprocess
 import sys
+import time
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -24,18 +28,64 @@ MODALITIES = ("visuo_tactile", "visual")
 POLICIES = {"pretrain": "imitation", "finetune": "after DPPO"}
 
 
-def run_demo(output: Path, modalities: str, seed: int, extra: list[str]) -> dict:
-    """One pipeline; finished stages are not repeated. Returns its results."""
-    command = [
-        shutil.which("vtrefine-demo", path=str(Path(sys.executable).parent)) or "vtrefine-demo",
-        f"--modalities={modalities}",
-        f"--seed={seed}",
-        f"--output_dir={output}",
-        *extra,
-    ]
-    print(f"\n== {modalities}, seed {seed}", flush=True)
-    subprocess.run(command, check=True)
-    return json.loads((output / "results.json").read_text(encoding="utf-8"))
+POLL_S = 0.5
+
+Run = tuple[str, int]
+"""Modality and seed."""
+
+
+def demo_command(folder: Path, run: Run, extra: list[str]) -> list[str]:
+    """The command line of one pipeline."""
+    modality, seed = run
+    command = shutil.which("vtrefine-demo", path=str(Path(sys.executable).parent)) or "vtrefine-demo"
+    return [command, f"--modalities={modality}", f"--seed={seed}", f"--output_dir={folder}", *extra]
+
+
+def run_all(commands: dict[Path, list[str]], jobs: int) -> None:
+    """Run the pipelines, ``jobs`` side by side; finished stages are not repeated.
+
+    Side by side, each prints to ``FOLDER.log`` and keeps to its own share of the cores.
+
+    Raises:
+        subprocess.CalledProcessError: a pipeline failed; the others are stopped.
+    """
+    if jobs == 1:
+        for folder, command in commands.items():
+            print(f"\n== {folder.name}", flush=True)
+            subprocess.run(command, check=True)
+        return
+    free, waiting, running = core_shares(jobs), list(commands), {}
+    try:
+        while waiting or running:
+            while waiting and free:
+                folder, cores = waiting.pop(0), free.pop(0)
+                print(f"== {folder.name}: progress in {folder}.log", flush=True)
+                running[folder] = (start(commands[folder], folder, cores), cores)
+            for folder in [name for name, (child, _) in running.items() if child.poll() is not None]:
+                child, cores = running.pop(folder)
+                free.append(cores)
+                if child.returncode:
+                    raise subprocess.CalledProcessError(child.returncode, commands[folder])
+                print(f"== {folder.name}: done", flush=True)
+            time.sleep(POLL_S)
+    finally:
+        for child, _ in running.values():
+            child.terminate()
+
+
+def core_shares(jobs: int) -> list[list[int]]:
+    """The cores that this process may use, dealt out to ``jobs`` runs; empty where it cannot choose."""
+    cores = sorted(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else []
+    share = len(cores) // jobs
+    return [cores[job * share : (job + 1) * share] for job in range(jobs)]
+
+
+def start(command: list[str], folder: Path, cores: list[int]) -> subprocess.Popen:
+    """One pipeline in the background, on the given cores if there are any."""
+    folder.parent.mkdir(parents=True, exist_ok=True)
+    pin = partial(os.sched_setaffinity, 0, cores) if cores else None
+    with Path(f"{folder}.log").open("wb") as log:
+        return subprocess.Popen(command, stdout=log, stderr=subprocess.STDOUT, preexec_fn=pin)
 
 
 def mean_interval(values: list[float]) -> tuple[float, float, float]:
@@ -94,14 +144,19 @@ def main() -> None:
     )
     parser.add_argument("--seeds", type=int, nargs="+", default=[0, 1, 2])
     parser.add_argument("--output_dir", type=Path, default=Path("outputs/compare_touch"))
+    parser.add_argument("--jobs", type=int, default=1, help="pipelines side by side (default 1)")
     options, extra = parser.parse_known_args()
-    results = {
-        modality: {
-            seed: run_demo(options.output_dir / f"{modality}_{seed}", modality, seed, extra)
-            for seed in options.seeds
-        }
+    if options.jobs < 1:
+        parser.error(f"--jobs must be at least 1, got {options.jobs}")
+    folders = {
+        (modality, seed): options.output_dir / f"{modality}_{seed}"
+        for seed in options.seeds
         for modality in MODALITIES
     }
+    run_all({folder: demo_command(folder, run, extra) for run, folder in folders.items()}, options.jobs)
+    results: dict[str, dict[int, dict]] = {modality: {} for modality in MODALITIES}
+    for (modality, seed), folder in folders.items():
+        results[modality][seed] = json.loads((folder / "results.json").read_text(encoding="utf-8"))
     comparison = compare(results)
     text = as_text(comparison)
     (options.output_dir / "comparison.json").write_text(

@@ -2,6 +2,7 @@
 
 import importlib.util
 import json
+import subprocess
 import sys
 from pathlib import Path
 from types import ModuleType
@@ -43,21 +44,61 @@ def test_noise_is_called_noise(script: ModuleType) -> None:
     assert "makes no difference that these seeds can show" in text
 
 
+FAKE_DEMO = """#!{python}
+import json, os, sys
+from pathlib import Path
+flags = dict(flag.removeprefix("--").split("=") for flag in sys.argv[1:])
+if flags["seed"] == flags.get("fail"):
+    sys.exit(3)
+folder = Path(flags["output_dir"])
+folder.mkdir(parents=True)
+rate = 80 if flags["modalities"] == "visual" else 60
+run = dict(success=rate, episodes=100, rate=rate / 100)
+cores = sorted(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else []
+results = dict(pretrain=run, finetune=run, flags=flags, cores=cores)
+(folder / "results.json").write_text(json.dumps(results))
+"""
+
+
+@pytest.fixture
+def fake_demo(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    folder = tmp_path / "bin"
+    folder.mkdir()
+    command = folder / "vtrefine-demo"
+    command.write_text(FAKE_DEMO.format(python=sys.executable))
+    command.chmod(0o755)
+    monkeypatch.setattr(sys, "executable", str(folder / "python"))
+
+
+@pytest.mark.parametrize("jobs", [1, 2])
 def test_passes_flags_on_and_saves(
-    script: ModuleType, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    script: ModuleType, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, fake_demo: None, jobs: int
 ) -> None:
-    calls = []
-
-    def fake(output: Path, modalities: str, seed: int, extra: list[str]) -> dict:
-        calls.append((output.name, extra))
-        output.mkdir(parents=True)
-        return run_of(20, 80 if modalities == "visual" else 60)
-
-    monkeypatch.setattr(script, "run_demo", fake)
-    arguments = ["compare_touch.py", "--seeds", "3", "4", f"--output_dir={tmp_path}", "--num_demos=9"]
-    monkeypatch.setattr(sys, "argv", arguments)
+    out = tmp_path / "out"
+    arguments = ["--seeds", "3", "4", f"--output_dir={out}", "--num_demos=9", f"--jobs={jobs}"]
+    monkeypatch.setattr(sys, "argv", ["compare_touch.py", *arguments])
     script.main()
-    assert calls[0] == ("visuo_tactile_3", ["--num_demos=9"])
-    assert [name for name, _ in calls] == ["visuo_tactile_3", "visuo_tactile_4", "visual_3", "visual_4"]
-    assert json.loads((tmp_path / "comparison.json").read_text())["finetune"]["visual"]["rate"] == 0.8
-    assert "touch costs" in (tmp_path / "comparison.md").read_text()
+    runs = [json.loads(path.read_text()) for path in sorted(out.glob("*/results.json"))]
+    assert [(run["flags"]["modalities"], run["flags"]["seed"]) for run in runs] == [
+        ("visual", "3"),
+        ("visual", "4"),
+        ("visuo_tactile", "3"),
+        ("visuo_tactile", "4"),
+    ]
+    assert all(run["flags"]["num_demos"] == "9" for run in runs)
+    shares = script.core_shares(jobs)
+    assert jobs == 1 or not shares[0] or all(run["cores"] in shares for run in runs)
+    assert json.loads((out / "comparison.json").read_text())["finetune"]["visual"]["rate"] == 0.8
+    assert "touch costs" in (out / "comparison.md").read_text()
+
+
+@pytest.mark.parametrize("jobs", [1, 2])
+def test_a_failed_run_ends_the_comparison(
+    script: ModuleType, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, fake_demo: None, jobs: int
+) -> None:
+    out = tmp_path / "out"
+    arguments = ["--seeds", "3", "4", f"--output_dir={out}", "--fail=4", f"--jobs={jobs}"]
+    monkeypatch.setattr(sys, "argv", ["compare_touch.py", *arguments])
+    with pytest.raises(subprocess.CalledProcessError, match="status 3"):
+        script.main()
+    assert not (out / "comparison.json").exists()

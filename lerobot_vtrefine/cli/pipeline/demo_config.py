@@ -89,6 +89,8 @@ class DemoConfig:
     """Seed of the whole run; runs of different seeds share no episode."""
     modalities: str = "visuo_tactile"
     """What the policy sees: visuo_tactile or visual."""
+    device: str = "cpu"
+    """Where the networks run, cpu or cuda; the simulation stays on CPU threads."""
     num_demos: int = 80
     """Successful demonstrations that are kept."""
     demo_envs: int = 32
@@ -213,7 +215,7 @@ def pretrain_stage(config: DemoConfig) -> Stage:
         f"--dataset.root={config.dataset_dir}",
         *flags("policy", {"type": "vt_dp3"} | config.policy),
         f"--policy.modalities={config.modalities}",
-        "--policy.device=cpu",
+        f"--policy.device={config.device}",
         "--policy.push_to_hub=false",
         f"--output_dir={config.output_dir / 'pretrain'}",
         f"--steps={config.pretrain_steps}",
@@ -242,7 +244,7 @@ def evaluation_stage(config: DemoConfig, policy: str, ablation: str = "none") ->
     command = [
         "lerobot-eval",
         f"--policy.path={config.checkpoint(policy)}",
-        "--policy.device=cpu",
+        f"--policy.device={config.device}",
         *flags("env", {"type": "vtrefine"} | acting_env(config)),
         f"--env.metrics_path={output / 'episodes.jsonl'}",
         f"--env.video_episodes={config.videos if ablation == 'none' else 0}",
@@ -265,7 +267,7 @@ def finetune_stage(config: DemoConfig) -> Stage:
     command = [
         "vtrefine-finetune",
         f"--policy.path={config.checkpoint('pretrain')}",
-        "--policy.device=cpu",
+        f"--policy.device={config.device}",
         *flags("env", {"type": "vtrefine"} | acting_env(config)),
         *flags("dppo", config.dppo),
         f"--dppo.iterations={config.finetune_iterations}",

@@ -1,5 +1,7 @@
 """Worlds on a pool of CPU threads, by `mujoco.batch`."""
 
+import os
+
 import mujoco
 import numpy as np
 from mujoco.batch import Batch
@@ -7,12 +9,17 @@ from mujoco.batch import Batch
 from lerobot_vtrefine.sim.backends.base import BAD_STATE_WARNINGS, Array, Backend, Trace
 
 
+def usable_cores() -> int:
+    """Cores that this process may run on: fewer than the machine's where it was pinned."""
+    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+
+
 class BatchBackend(Backend):
     """`mujoco.batch`: bit-identical to stepping each world alone, at any number of threads."""
 
     def __init__(self, model: mujoco.MjModel, num_envs: int, num_threads: int = 0) -> None:
         self.num_envs = num_envs
-        self._batch = Batch(model, nsim=num_envs, nthread=num_threads)
+        self._batch = Batch(model, nsim=num_envs, nthread=num_threads or usable_cores())
         self._qpos, self._qvel = self._batch.bind("qpos"), self._batch.bind("qvel")
         (
             self._batch.bind("geom_xpos"),
