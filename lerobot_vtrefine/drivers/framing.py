@@ -15,7 +15,8 @@ hands one out only when everything that can be checked agrees:
   lock: this catches a loss that swallowed the marker itself and put a payload's `AA 55` in its place.
 * **Bursts.** Where the caller can tell that the line was silent, then brought exactly R*C+2 bytes that begin
   with a marker, and nothing more is pending, no byte is missing: such a frame is handed out at once (no wait
-  for the next marker), and it settles which of several recurring chains is the firmware's.
+  for the next marker), and it settles which of several recurring chains is the firmware's. The same holds for
+  a few whole frames in a row, which a reader finds that was woken late.
 
 Residual risk, which no reader of this protocol can remove: bytes altered (not lost) on the line; a loss of
 exactly a multiple of R*C+2 bytes within one frame, which splices two frames; losses that coincide with
@@ -38,6 +39,9 @@ pattern."""
 
 CAUTIOUS_FRAMES = 64
 """Frames for which one more marker is asked for, after an `AA 55` inside a payload or a lost lock."""
+
+MAX_BURST = 4
+"""Frames in a burst beyond which silence before it is too long ago to vouch for its end."""
 
 MAX_HELD = 16
 """Frames held back in doubt; beyond this the lock is given up."""
@@ -252,16 +256,14 @@ class BinaryFramer:
         return Framed(self._next, bytes(self._buf[start : start + self.shape.taxels]))
 
     def _exact_burst(self) -> list[Framed]:
-        """A frame proven complete by silence before it and nothing after it."""
+        """Frames proven complete by silence before them and nothing after them."""
         end = self._base + len(self._buf)
-        start = self._burst
-        if start is None or end - start < self._period:
+        start, period = self._burst, self._period
+        if start is None or end - start < period:
             return []
         self._burst = None
-        if end - start > self._period or start < self._delivered:
-            return []
-        chain = self._chains.get(start % self._period)
-        if chain is None or chain.last != start:
+        chain = self._burst_chain(start, end)
+        if chain is None:
             return []
         self._exact_bursts += 1
         if not self._was_locked and max(self._exact_bursts, chain.count) < LOCK_MARKERS:
@@ -271,13 +273,31 @@ class BinaryFramer:
             return []
         if self._lock is None:
             self._lock_on(chain)
-            self._next = start
+            self._next = max(start, self._delivered)
         out: list[Framed] = []
-        while self._next < start:  # frames before this one, held back for one more marker or in doubt
-            doubtful = self._contested(self._next + self._period)
+        while self._next < start:  # frames before this burst, held back for one more marker or in doubt
+            doubtful = self._contested(self._next + period)
             framed = self._take(self._next)
             out += [] if doubtful else [framed]
-        return [*out, self._take(start)]
+        while self._next < end:
+            out.append(self._take(self._next))
+        return out
+
+    def _burst_chain(self, start: int, end: int) -> _Chain | None:
+        """The chain whose markers begin every frame of a burst; None where the burst is no whole frames.
+
+        A reader that was woken late finds several frames at once. They must hold no other `AA 55`: unlike one
+        frame alone, they could be a damaged frame, made up to length by the beginning of a further one.
+        """
+        frames, rest = divmod(end - start, self._period)
+        aligned = self._delivered <= start or (self._delivered - start) % self._period == 0
+        chain = self._chains.get(start % self._period)
+        if rest or frames > MAX_BURST or not aligned or chain is None:
+            return None
+        if chain.first > start or chain.last != end - self._period:
+            return None
+        others = (c for c in self._chains.values() if c is not chain)
+        return None if frames > 1 and any(c.last > start for c in others) else chain
 
     def _trim(self) -> None:
         """Drops bytes that can no longer be part of a frame to hand out."""

@@ -152,6 +152,53 @@ def test_losses_stay_within_an_intact_burst_at_one_percent() -> None:
     assert intact - LOCK_MARKERS <= len(received) <= intact
 
 
+def grouped(frames: list[bytes], rng: random.Random) -> list[bytes]:
+    """Bursts of one to three frames, as a reader finds them that is woken late now and then."""
+    bursts, at = [], 0
+    while at < len(frames):
+        size = rng.choice([1, 1, 2, 3])
+        bursts.append(b"".join(frames[at : at + size]))
+        at += size
+    return bursts
+
+
+def test_frames_that_a_late_reader_finds_together_come_out_at_once() -> None:
+    sent = random_payloads(PAD, 40, REST, seed=15)
+    framer = BinaryFramer(PAD)
+    held = 0
+    received: list[bytes] = []
+    for burst in grouped([encode([payload]) for payload in sent], random.Random(2)):
+        received += feed_in_bursts(framer, [burst])
+        held += len(received) >= LOCK_MARKERS and framer.buffered > 0
+    assert received == sent[-len(received) :]
+    assert len(received) >= len(sent) - LOCK_MARKERS
+    assert held == 0
+
+
+@pytest.mark.parametrize("alphabet", [REST, ANY], ids=["rest", "any"])
+@pytest.mark.parametrize("loss", [0.0005, 0.002])
+def test_losses_in_late_bursts_corrupt_no_frame(alphabet: range, loss: float) -> None:
+    rng = random.Random(16)
+    sent = random_payloads(PAD, 400, alphabet, seed=17)
+    lossy = [lose_bytes(encode([payload]), loss, rng) for payload in sent]
+    received = feed_in_bursts(BinaryFramer(PAD), grouped(lossy, rng))
+    assert not_sent(received, sent) == 0
+    assert len(received) >= 0.3 * sum(len(frame) == PAD.period for frame in lossy)
+
+
+def test_a_damaged_frame_made_up_to_length_by_the_next_is_withheld() -> None:
+    """Two frames' length after a silence, but ten bytes are missing and ten belong to the third frame."""
+    sent = random_payloads(PAD, 12, REST, seed=18)
+    frames = [encode([payload]) for payload in sent]
+    framer = BinaryFramer(PAD)
+    received = feed_in_bursts(framer, frames[:6])
+    damaged = frames[6] + frames[7][:100] + frames[7][110:] + frames[8][:10]
+    received += feed_in_bursts(framer, [damaged])
+    received += [f.payload for f in framer.feed(frames[8][10:])] + feed_in_bursts(framer, frames[9:])
+    assert not_sent(received, sent) == 0
+    assert sent[7] not in received
+
+
 adversarial = st.lists(
     st.one_of(st.binary(max_size=40), st.just(MARKER * 12), st.just(b"\xaa"), st.just(MARKER + bytes(20))),
     max_size=60,
