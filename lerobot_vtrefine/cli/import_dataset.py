@@ -1,0 +1,110 @@
+"""``vtrefine-import``: datasets of others as LeRobotDatasets with this project's features.
+
+``vtrefine-import --source=aloha_31_episodes.npz --root=outputs/aloha`` (the paper authors' npz)
+``vtrefine-import --source=FOLDER --root=outputs/pads --pads='{primary: left_arm_left_finger}'`` (LeFlexiTac)
+"""
+
+import logging
+from dataclasses import dataclass, field
+from pathlib import Path
+
+from lerobot.configs import parser
+from lerobot.utils.utils import init_logging
+
+from lerobot_vtrefine.cli.errors import run_cli
+from lerobot_vtrefine.datasets.importers.aloha_npz import read_aloha_npz
+from lerobot_vtrefine.datasets.importers.joint_episodes import write_dataset, write_recording_set
+from lerobot_vtrefine.datasets.importers.leflexitac import import_leflexitac, is_leflexitac
+from lerobot_vtrefine.embodiments import get_embodiment
+
+FORMATS = "the paper authors' .npz of commands and positions, or a LeRobot v3 folder with LeFlexiTac's pads"
+
+
+@dataclass
+class ImportConfig:
+    """Flags of ``vtrefine-import``."""
+
+    source: Path
+    """File or folder to import; its format is recognised."""
+    root: Path
+    """Folder of the new LeRobotDataset; must not exist."""
+    repo_id: str = "local/imported"
+    """LeRobot's name of the new dataset (npz only; a folder's dataset has no name of its own)."""
+    fps: int = 10
+    """Frames per second of the npz, which does not say; 10 follows from its fastest motion."""
+    task: str = "insert the plug into the socket"
+    """Natural-language task of every frame of the npz."""
+    recording_dir: Path | None = None
+    """Also write the npz as a recording set for ``vtrefine-diagnose`` into this new folder."""
+    pads: dict[str, str] = field(default_factory=dict)
+    """New names of a folder's pads, e.g. '{primary: left_arm_left_finger}'; others keep theirs."""
+
+    def __post_init__(self) -> None:
+        if self.fps < 1:
+            raise ValueError(f"--fps must be at least 1, got {self.fps}")
+        if self.recording_dir is not None and self.recording_dir == self.root:
+            raise ValueError("--recording_dir and --root must be two folders")
+
+
+def import_dataset(config: ImportConfig) -> str:
+    """Import and return one line about the result.
+
+    Raises:
+        ValueError: the source is of no known format, or not a valid one.
+        FileExistsError: there is something where the result shall be.
+    """
+    if not config.source.exists():
+        raise FileNotFoundError(f"--source={config.source} does not exist")
+    if config.source.suffix == ".npz" and config.source.is_file():
+        return _import_npz(config)
+    if config.source.is_dir() and is_leflexitac(config.source):
+        return _import_folder(config)
+    raise ValueError(f"--source={config.source} is of no format that can be imported: {FORMATS}")
+
+
+def _import_npz(config: ImportConfig) -> str:
+    if config.pads:
+        raise ValueError("--pads has no meaning here: the npz holds no pads")
+    episodes = read_aloha_npz(config.source)
+    joints = get_embodiment("aloha").joint_names
+    if config.recording_dir is not None and config.recording_dir.exists():
+        raise FileExistsError(f"{config.recording_dir} exists; choose another --recording_dir or remove it")
+    write_dataset(episodes, joints, config.root, config.repo_id, config.fps, config.task)
+    if config.recording_dir is not None:
+        write_recording_set(episodes, joints, config.recording_dir, config.fps)
+    frames = sum(len(episode.command) for episode in episodes)
+    return f"{len(episodes)} episodes, {frames} frames, no touch -> {config.root}"
+
+
+def _import_folder(config: ImportConfig) -> str:
+    if config.recording_dir is not None:
+        raise ValueError(
+            "--recording_dir is for the npz only; vtrefine-diagnose reads the new dataset itself"
+        )
+    summary = import_leflexitac(config.source, config.root, config.pads)
+    lines = [f"{summary.episodes} episodes, {summary.frames} frames -> {config.root}"]
+    if summary.normalised:
+        unsure = sum(summary.ambiguous.values())
+        lines.append(
+            f"raw counts recovered for {', '.join(summary.normalised)} (scale unsure in {unsure} frames)"
+        )
+    if summary.above_idle:
+        lines.append(f"{', '.join(summary.above_idle)}: counts above an idle level that was not kept")
+    return "; ".join(lines)
+
+
+@parser.wrap()
+def _main(config: ImportConfig) -> None:
+    print(import_dataset(config))
+
+
+@run_cli
+def main() -> None:
+    """Console entry point."""
+    init_logging()
+    logging.getLogger("PIL").setLevel(logging.INFO)
+    _main()
+
+
+if __name__ == "__main__":
+    raise SystemExit(main())

@@ -1,0 +1,1 @@
+"""Datasets of others as LeRobotDatasets with this project's features."""

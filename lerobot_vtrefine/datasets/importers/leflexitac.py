@@ -1,0 +1,285 @@
+"""LeFlexiTac datasets (LeRobot v3 with 2-D float pads) as datasets of raw counts.
+
+LeFlexiTac stores ``observation.tactile.<name>`` float32 (R, C): in its present version normalised per frame,
+with threshold, scale and baseline under ``tactile_sensors`` of ``meta/info.json``; in earlier versions counts
+above baseline (and threshold), which it did not keep. State, action, images and videos are taken over as they
+are.
+"""
+
+import json
+import shutil
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pyarrow as pa
+import pyarrow.parquet as pq
+from tqdm import tqdm
+
+from lerobot_vtrefine.datasets.features import Array
+from lerobot_vtrefine.datasets.importers.flexitac_counts import HostRule, UnknownRuleError, recover_counts
+from lerobot_vtrefine.datasets.importers.new_folder import new_folder
+
+PREFIX = "observation.tactile."
+BASELINE_PREFIX = "observation.tactile_baseline."
+DRIVER_DEFAULTS = {"threshold": 25.0, "noise_scale": 30.0}
+"""What the host software uses when a dataset does not say."""
+
+Stats = dict[str, dict[str, Array]]
+
+
+@dataclass(frozen=True)
+class PadColumn:
+    """One pad of the source and what it becomes."""
+
+    source: str
+    """Feature key in the source."""
+    pad: str
+    shape: tuple[int, int]
+    rule: HostRule | None
+    """None: counts above an idle level that was not kept."""
+
+    def features(self) -> dict[str, dict[str, Any]]:
+        """Features of raw counts and idle counts."""
+        info = {"array_shape": list(self.shape), "unit": "adc_counts"}
+        feature = {"dtype": "uint8", "shape": (int(np.prod(self.shape)),), "info": info}
+        return {f"{PREFIX}{self.pad}": feature, f"{BASELINE_PREFIX}{self.pad}": feature}
+
+
+@dataclass
+class ImportSummary:
+    """What an import found."""
+
+    episodes: int
+    frames: int
+    normalised: tuple[str, ...]
+    """Pads whose raw counts were recovered from normalised readings."""
+    above_idle: tuple[str, ...]
+    """Pads that were stored as counts above an unknown idle level: their baseline is 0."""
+    ambiguous: dict[str, int] = field(default_factory=dict)
+    """Frames per pad that more than one scale fits."""
+
+
+def is_leflexitac(root: Path) -> bool:
+    """Whether a folder is a LeRobot dataset with 2-D float pads."""
+    path = root / "meta" / "info.json"
+    if not path.is_file():
+        return False
+    try:
+        features = json.loads(path.read_text(encoding="utf-8")).get("features", {})
+    except (ValueError, AttributeError):
+        return False
+    return any(_is_pad(key, feature) for key, feature in features.items())
+
+
+def import_leflexitac(source: Path, root: Path, pads: Mapping[str, str]) -> ImportSummary:
+    """Convert the dataset at ``source``; ``root`` appears when complete.
+
+    Args:
+        pads: new name of each sensor that shall not keep its own.
+
+    Raises:
+        ValueError: another format or version, an unknown sensor in ``pads``, or readings that do not follow
+            the rule of ``info.json``.
+        FileExistsError: there is something at ``root``.
+    """
+    from lerobot.datasets.compute_stats import aggregate_stats, compute_episode_stats
+    from lerobot.datasets.io_utils import load_stats, write_stats
+
+    info = _read_info(source)
+    columns = _pad_columns(source, info, pads)
+    features = _new_features(info, columns)
+    above_idle = tuple(column.pad for column in columns if column.rule is None)
+    summary = ImportSummary(
+        episodes=info["total_episodes"],
+        frames=info["total_frames"],
+        normalised=tuple(column.pad for column in columns if column.rule is not None),
+        above_idle=above_idle,
+    )
+    episode_stats: dict[int, Stats] = {}
+    with new_folder(root) as work:
+        with tqdm(total=info["total_frames"], unit="frame", desc="import") as progress:
+            for path in sorted((source / "data").rglob("*.parquet")):
+                table = pq.read_table(path)
+                arrays = _counts(table, columns, summary)
+                _write_data(table, arrays, features, work / path.relative_to(source))
+                for episode, rows in _episodes(table):
+                    parts: dict[str, Any] = {key: values[rows] for key, values in arrays.items()}
+                    episode_stats[episode] = compute_episode_stats(parts, features)
+                progress.update(len(table))
+        _write_episode_rows(source, work, columns, episode_stats)
+        old = {column.source for column in columns}
+        stats = {key: value for key, value in (load_stats(source) or {}).items() if key not in old}
+        write_stats(stats | aggregate_stats(list(episode_stats.values())), work)
+        _copy_rest(source, work)
+        kept = {key: value for key, value in info.items() if key != "tactile_sensors"}
+        _write_json(work / "meta" / "info.json", {**kept, "features": features})
+        provenance = {"format": "leflexitac", "tactile_sensors": info.get("tactile_sensors", {})}
+        _write_json(work / "meta" / "import.json", {**provenance, "ambiguous_frames": summary.ambiguous})
+    return summary
+
+
+def _is_pad(key: str, feature: Mapping[str, Any]) -> bool:
+    shape = feature.get("shape", ())
+    return key.startswith(PREFIX) and len(shape) == 2 and feature.get("dtype") == "float32"
+
+
+def _read_info(source: Path) -> dict[str, Any]:
+    path = source / "meta" / "info.json"
+    try:
+        info = json.loads(path.read_text(encoding="utf-8"))
+    except ValueError as error:
+        raise ValueError(f"{path} is no JSON: {error}") from error
+    version = info.get("codebase_version")
+    if version != "v3.0":
+        raise ValueError(
+            f"{path}: dataset version {version} is not v3.0; convert it first with"
+            " python -m lerobot.scripts.convert_dataset_v21_to_v30"
+        )
+    return info
+
+
+def _pad_columns(source: Path, info: dict[str, Any], pads: Mapping[str, str]) -> list[PadColumn]:
+    found = {
+        key.removeprefix(PREFIX): tuple(feature["shape"])
+        for key, feature in info["features"].items()
+        if _is_pad(key, feature)
+    }
+    unknown = sorted(set(pads) - set(found))
+    if unknown:
+        raise ValueError(f"--pads names {unknown[0]!r}, but {source} has the pads {', '.join(sorted(found))}")
+    names = [pads.get(name, name) for name in found]
+    if len(set(names)) < len(names):
+        raise ValueError(f"--pads gives two pads the same name: {', '.join(sorted(names))}")
+    largest = _largest_readings(source, list(found))
+    sensors = info.get("tactile_sensors") or {}
+    return [
+        PadColumn(
+            f"{PREFIX}{name}",
+            pads.get(name, name),
+            shape,
+            _host_rule(sensors.get(name), shape, largest[name]),
+        )
+        for name, shape in found.items()
+    ]
+
+
+def _host_rule(sensor: Mapping[str, Any] | None, shape: tuple[int, int], largest: float) -> HostRule | None:
+    """The rule behind a pad's readings; None for counts, which exceed 1."""
+    if largest > 1.0 + 1e-6:
+        return None
+    given = {name: value for name, value in (sensor or {}).items() if value is not None}
+    baseline = np.asarray(given.get("baseline", 0.0), float)
+    if baseline.shape not in ((), shape):
+        raise ValueError(f"meta/info.json: a pad's baseline is {baseline.shape}, its frames are {shape}")
+    threshold, scale = (float(given.get(name, default)) for name, default in DRIVER_DEFAULTS.items())
+    return HostRule(threshold, scale, np.broadcast_to(baseline, shape))
+
+
+def _largest_readings(source: Path, names: list[str]) -> dict[str, float]:
+    largest = dict.fromkeys(names, 0.0)
+    files = sorted((source / "data").rglob("*.parquet"))
+    if not files:
+        raise ValueError(f"{source} has no data files below {source / 'data'}")
+    for path in files:
+        table = pq.read_table(path, columns=[f"{PREFIX}{name}" for name in names])
+        for name in names:
+            values = _flat(table[f"{PREFIX}{name}"])
+            if not np.isfinite(values).all() or (len(values) and values.min() < 0):
+                raise ValueError(f"{path}, column {PREFIX}{name}: readings must be finite and not negative")
+            largest[name] = max(largest[name], float(values.max(initial=0.0)))
+    return largest
+
+
+def _flat(column: pa.ChunkedArray) -> Array:
+    """All numbers of a nested list column, in order."""
+    parts = []
+    for chunk in column.chunks:
+        values = chunk.storage if isinstance(chunk, pa.ExtensionArray) else chunk
+        while pa.types.is_nested(values.type):
+            values = values.flatten()
+        parts.append(values.to_numpy(zero_copy_only=False))
+    return np.concatenate(parts) if parts else np.zeros(0, np.float32)
+
+
+def _counts(table: pa.Table, columns: list[PadColumn], summary: ImportSummary) -> dict[str, Array]:
+    """New columns (N, R*C) uint8 of a data file."""
+    arrays = {}
+    for column in columns:
+        frames = _flat(table[column.source]).reshape(len(table), *column.shape)
+        if column.rule is None:
+            counts, idle = np.rint(frames).clip(0, 255).astype(np.uint8), np.zeros(column.shape, np.uint8)
+        else:
+            try:
+                found = recover_counts(frames, column.rule)
+            except UnknownRuleError as error:
+                raise ValueError(f"{column.source}: {error}, which meta/info.json gives") from error
+            counts, idle = found.counts, np.rint(column.rule.baseline).clip(0, 255).astype(np.uint8)
+            summary.ambiguous[column.pad] = summary.ambiguous.get(column.pad, 0) + found.ambiguous
+        arrays[f"{PREFIX}{column.pad}"] = counts.reshape(len(table), -1)
+        arrays[f"{BASELINE_PREFIX}{column.pad}"] = np.tile(idle.reshape(1, -1), (len(table), 1))
+    return arrays
+
+
+def _new_features(info: dict[str, Any], columns: list[PadColumn]) -> dict[str, dict[str, Any]]:
+    old = {column.source for column in columns}
+    features = {key: dict(feature) for key, feature in info["features"].items() if key not in old}
+    for column in columns:
+        features |= column.features()
+    return features
+
+
+def _write_data(
+    table: pa.Table, arrays: dict[str, Array], features: dict[str, dict[str, Any]], path: Path
+) -> None:
+    from lerobot.datasets.feature_utils import get_hf_features_from_features
+
+    schema = get_hf_features_from_features(
+        {key: {**feature, "shape": tuple(feature["shape"])} for key, feature in features.items()}
+    ).arrow_schema
+    data = {name: table[name] for name in table.column_names}
+    for key, values in arrays.items():
+        data[key] = pa.FixedSizeListArray.from_arrays(pa.array(values.ravel()), values.shape[1])
+    path.parent.mkdir(parents=True, exist_ok=True)
+    pq.write_table(pa.table([data[name] for name in schema.names], names=schema.names).cast(schema), path)
+
+
+def _episodes(table: pa.Table) -> Iterator[tuple[int, slice]]:
+    """Episode index and rows of every episode in a data file."""
+    index = table["episode_index"].to_numpy()
+    starts = np.flatnonzero(np.diff(index, prepend=-1))
+    for start, stop in zip(starts, [*starts[1:], len(index)], strict=True):
+        yield int(index[start]), slice(int(start), int(stop))
+
+
+def _write_episode_rows(
+    source: Path, work: Path, columns: list[PadColumn], episode_stats: dict[int, Stats]
+) -> None:
+    """The episodes' metadata, with the statistics of the new columns in place of the old ones'."""
+    old = tuple(f"stats/{column.source}/" for column in columns)
+    for path in sorted((source / "meta" / "episodes").rglob("*.parquet")):
+        table = pq.read_table(path)
+        table = table.select([name for name in table.column_names if not name.startswith(old)])
+        rows = [episode_stats[int(index)] for index in table["episode_index"].to_pylist()]
+        for key in rows[0]:
+            for name in rows[0][key]:
+                values = [np.atleast_1d(row[key][name]).tolist() for row in rows]
+                table = table.append_column(f"stats/{key}/{name}", pa.array(values))
+        target = work / path.relative_to(source)
+        target.parent.mkdir(parents=True, exist_ok=True)
+        pq.write_table(table, target)
+
+
+def _copy_rest(source: Path, work: Path) -> None:
+    """Everything that was not rewritten: videos, tasks, and whatever else lies there."""
+    for path in sorted(source.rglob("*")):
+        target = work / path.relative_to(source)
+        if path.is_file() and not target.exists() and path != source / "meta" / "info.json":
+            target.parent.mkdir(parents=True, exist_ok=True)
+            shutil.copyfile(path, target)
+
+
+def _write_json(path: Path, content: dict[str, Any]) -> None:
+    path.write_text(json.dumps(content, indent=4) + "\n", encoding="utf-8")
