@@ -1,0 +1,26 @@
+"""What a sensor model predicts for a recorded press: the one path of diagnosis, prediction and report."""
+
+import numpy as np
+
+from lerobot_vtrefine.diagnose.indenters import trial_forces, trial_heights
+from lerobot_vtrefine.diagnose.recordings import Trial
+from lerobot_vtrefine.tactile.layout import PadLayout
+from lerobot_vtrefine.tactile.model import SensorModel
+from lerobot_vtrefine.tactile.replay import replay
+from lerobot_vtrefine.tactile.stages.readout import Quantisation
+
+
+def predict_trial(model: SensorModel, trial: Trial, layout: PadLayout) -> np.ndarray:
+    """Expected readings of a trial, idle level included, clipped to the converter's range: (N, R*C) counts.
+
+    Reads the trial's motion (or load, where it has no `depth_m`) and never its `raw`. Noise and rounding are
+    left out: the mean is what predicts best.
+    """
+    if trial.depth_m is None:
+        drive = {"force_n": trial_forces(trial, layout)}
+    else:
+        drive = {"depth_m": trial_heights(trial, layout)}
+    predicted = replay(model, trial.time_s, **drive, layout=layout, start_s=trial.start_s)
+    converter = model.find("quantisation")
+    limit = converter.full_scale_counts if isinstance(converter, Quantisation) else np.inf
+    return predicted.numpy().astype(float).reshape(len(trial.time_s), -1).clip(0.0, limit)
