@@ -10,6 +10,7 @@ from lerobot_vtrefine.datasets.features import PADS
 from lerobot_vtrefine.drivers.config import PadConfig
 from lerobot_vtrefine.drivers.discovery import (
     FoundBoard,
+    first_row,
     open_board,
     probe_port,
     wait_for_press,
@@ -17,6 +18,9 @@ from lerobot_vtrefine.drivers.discovery import (
 )
 from lerobot_vtrefine.drivers.pads_file import save_pads
 from lerobot_vtrefine.drivers.ports import PortError, stable_path, stable_ports
+
+SLIDE_S = 5.0
+"""How long a finger slides over a pad [s]."""
 
 
 def parse_arguments(arguments: Sequence[str] | None) -> argparse.Namespace:
@@ -43,6 +47,11 @@ def parse_arguments(arguments: Sequence[str] | None) -> argparse.Namespace:
     parser.add_argument(
         "--timeout", type=float, default=60.0, help="seconds to wait for each press (%(default)s)"
     )
+    parser.add_argument(
+        "--check-rows",
+        action="store_true",
+        help="after each press, slide a finger over the pad's rows: tells rows that arrive shifted",
+    )
     parser.add_argument("--list", action="store_true", help="only list the ports and what they send")
     return parser.parse_args(arguments)
 
@@ -60,7 +69,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
         boards = find_boards(ports, stack, only_list=options.list)
         if options.list:
             return
-        pads = ask(boards, options.names, options.timeout)
+        pads = ask(boards, options.names, options.timeout, check_rows=options.check_rows)
     save_pads(pads, options.output)
     print(f"wrote {options.output}: use it with --robot.pads_file={options.output}")
 
@@ -92,8 +101,14 @@ def find_boards(ports: Sequence[str], stack: ExitStack, *, only_list: bool) -> l
     return boards
 
 
-def ask(boards: list[FoundBoard], names: Sequence[str], timeout_s: float) -> dict[str, PadConfig]:
-    """Asks for one press per name; returns the configuration of each named pad."""
+def ask(
+    boards: list[FoundBoard], names: Sequence[str], timeout_s: float, *, check_rows: bool = False
+) -> dict[str, PadConfig]:
+    """Asks for one press per name; returns the configuration of each named pad.
+
+    Raises:
+        PortError: too few boards, or no press in time.
+    """
     if len(names) > len(boards):
         raise PortError(
             f"{len(names)} pads asked for ({', '.join(names)}), but only {len(boards)} boards stream; "
@@ -110,4 +125,21 @@ def ask(boards: list[FoundBoard], names: Sequence[str], timeout_s: float) -> dic
         wait_for_release(boards, timeout_s)
         named[name] = board.config
         free.remove(board)
+        if check_rows:
+            check_first_row(name, board)
     return named
+
+
+def check_first_row(name: str, board: FoundBoard) -> None:
+    """Asks for a finger to slide over all rows, and corrects the pad's row offset where rows are shifted."""
+    print(f"slide one finger over all rows of {name}, slowly, for {SLIDE_S:g} s ... ", end="", flush=True)
+    first = first_row(board, SLIDE_S)
+    if first is None:
+        print("not enough rows were touched to tell; row order is not checked")
+    elif first == 0:
+        print("rows are in order")
+    elif board.config.pad_shape[0] < board.config.rows:
+        print(f"rows arrive shifted by {first}, though dead rows told where the pad begins: check the cable")
+    else:
+        board.config.row_offset = first
+        print(f"rows arrive shifted by {first}: row_offset is {first}")

@@ -1,6 +1,8 @@
 """`vtrefine-pad-emulator`: FlexiTac boards on pseudo-terminals, to try everything without hardware."""
 
 import argparse
+import signal
+import threading
 import time
 from collections.abc import Sequence
 from contextlib import ExitStack
@@ -115,6 +117,9 @@ def main(arguments: Sequence[str] | None = None) -> None:
         raise ValueError(f"--boards={options.boards} must be at least 1")
     names = PADS if options.boards <= len(PADS) else tuple(f"pad_{i}" for i in range(options.boards))
     with ExitStack() as stack:
+        if threading.current_thread() is threading.main_thread():  # a killed emulator removes its ports, too
+            before = signal.signal(signal.SIGTERM, signal.default_int_handler)
+            stack.callback(signal.signal, signal.SIGTERM, before)
         for board, name in enumerate(names[: options.boards]):
             emulator = PadEmulator(
                 make_source(options, shape, board),

@@ -11,7 +11,7 @@ from lerobot_vtrefine.drivers.config import PadConfig
 from lerobot_vtrefine.drivers.frames import DIAGNOSTIC_BAUD, STREAM_BAUD
 from lerobot_vtrefine.drivers.identify import SAMPLE_BYTES, StreamKind, explain_stream, identify_stream
 from lerobot_vtrefine.drivers.ports import PortError, open_port
-from lerobot_vtrefine.drivers.wiring import CHANNELS, PAD_ROWS, inspect_wiring
+from lerobot_vtrefine.drivers.wiring import CHANNELS, PAD_ROWS, inspect_wiring, seam_row
 
 PRESS_COUNTS = 30
 """A pad is pressed when a taxel rises this far above its idle counts."""
@@ -21,6 +21,9 @@ CLEAR_LEAD = 2.0
 
 SUSTAINED_S = 0.3
 """A press must last this long [s]."""
+
+RECENT_FRAMES = 9
+"""Frames whose median may lower a board's idle counts."""
 
 
 def probe_port(port: str, timeout_s: float = 3.0) -> StreamKind:
@@ -68,10 +71,18 @@ class FoundBoard:
         return self.reader.config
 
     def rise(self) -> float:
-        """How far the latest frame's strongest taxel is above its idle counts; 0 where the frame is stale."""
+        """How far the latest frame's strongest taxel is above its idle counts; 0 where the frame is stale.
+
+        Idle counts follow the readings down: a pad that was touched while they were taken reads less once it
+        is let go, and would otherwise never seem pressed again.
+        """
         frame = self.reader.latest()
         if frame is None or time.monotonic() - frame.arrival_s > self.config.stale_after_s:
             return 0.0
+        recent = self.reader.frames_after(frame.seq - RECENT_FRAMES)
+        if len(recent) >= RECENT_FRAMES:
+            usual = np.median(np.stack([one.counts for one in recent]), axis=0)
+            self.idle = np.minimum(self.idle, usual.astype(np.uint8))
         return float((frame.counts.astype(int) - self.idle).max())
 
 
@@ -130,3 +141,24 @@ def _pressed(boards: list[FoundBoard]) -> FoundBoard | None:
         return None
     runner_up = rises[1][0] if len(rises) > 1 else 0.0
     return boards[rises[0][1]] if rises[0][0] >= CLEAR_LEAD * runner_up else None
+
+
+def first_row(board: FoundBoard, seconds: float) -> int | None:
+    """Row at which the pad begins on its board, while a finger moves over all of its rows.
+
+    Args:
+        board: A board that is being read.
+        seconds: How long the finger moves [s].
+
+    Returns:
+        0 where rows are in order; otherwise the `row_offset` that puts them in order. None where the finger
+        did not touch enough rows to tell.
+    """
+    frame = board.reader.latest()
+    before = -1 if frame is None else frame.seq
+    deadline = time.monotonic() + seconds
+    while (left := deadline - time.monotonic()) > 0:
+        time.sleep(min(left, 0.02))
+        board.rise()  # lets the idle counts follow
+    moved = board.reader.frames_after(before)
+    return seam_row(np.stack([one.counts for one in moved]), board.idle) if moved else None

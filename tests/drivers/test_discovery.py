@@ -1,12 +1,17 @@
 """Finding pads by pressing them, the pads file, and the three commands."""
 
 import io
+import os
+import signal
+import threading
 from contextlib import ExitStack, redirect_stdout
 from pathlib import Path
 
+import numpy as np
 import pytest
 from boards import PAD, emulated, pressable_source
 
+from lerobot_vtrefine.cli import find_pads as find_pads_module
 from lerobot_vtrefine.cli.find_pads import main as find_pads
 from lerobot_vtrefine.cli.pad_emulator import main as pad_emulator
 from lerobot_vtrefine.cli.view_pads import main as view_pads
@@ -15,7 +20,7 @@ from lerobot_vtrefine.drivers.discovery import open_board, probe_port, wait_for_
 from lerobot_vtrefine.drivers.frames import FrameShape
 from lerobot_vtrefine.drivers.pads_file import load_pads, save_pads
 from lerobot_vtrefine.drivers.ports import PortError
-from lerobot_vtrefine.drivers.sources import noise_source
+from lerobot_vtrefine.drivers.sources import contact_source, noise_source
 
 
 class Operator(io.StringIO):
@@ -47,6 +52,42 @@ def test_find_pads_writes_what_the_robot_reads(tmp_path: Path) -> None:
         status = find_pads(["--ports", *ports, "--names", "thumb", "index", "--output", str(output)])
     assert status == 0, operator.getvalue()
     assert {name: Path(pad.port).name for name, pad in load_pads(output).items()} == operator.where
+
+
+def test_pad_touched_while_its_idle_counts_were_taken_is_still_found(tmp_path: Path) -> None:
+    touched = [True]
+    source = pressable_source(PAD, lambda: touched[0])
+    with emulated(tmp_path, source=source) as board:
+        found = open_board(board.port, probe_port(board.port))
+        try:
+            touched[0] = False
+            assert wait_for_press([found], timeout_s=0.5) is None
+            touched[0] = True
+            assert wait_for_press([found], timeout_s=10.0) is found
+        finally:
+            found.reader.stop()
+
+
+@pytest.mark.parametrize("shift", [0, 5])
+def test_rows_that_arrive_shifted_are_put_in_order(
+    tmp_path: Path, shift: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(find_pads_module, "SLIDE_S", 2.0)
+    operator = Operator({"thumb": "port0"})
+    idle, sliding = noise_source(PAD, seed=0), contact_source(PAD, seed=0, period_frames=100)
+
+    def source(number: int) -> np.ndarray:
+        slides = "slide one finger" in operator.getvalue()
+        return np.roll((sliding if slides else pressed)(number), shift, axis=0)
+
+    def pressed(number: int) -> np.ndarray:
+        return idle(number) + np.uint8(100 * (operator.pressing == "port0"))
+
+    output = tmp_path / "pads.yaml"
+    with emulated(tmp_path, "port0", source=source) as board, redirect_stdout(operator):
+        arguments = ["--ports", board.port, "--names", "thumb", "--check-rows", "--output", str(output)]
+        assert find_pads(arguments) == 0
+    assert load_pads(output)["thumb"].row_offset == shift
 
 
 def test_pad_on_sixteen_row_firmware_gets_its_offset(tmp_path: Path) -> None:
@@ -129,6 +170,14 @@ def test_emulator_command_prints_its_ports(tmp_path: Path, capsys: pytest.Captur
         str(folder / "left_arm_left_finger"),
         str(folder / "left_arm_right_finger"),
     ]
+    assert not list(folder.iterdir())
+
+
+def test_terminated_emulator_removes_its_ports(tmp_path: Path) -> None:
+    folder = tmp_path / "boards"
+    killer = threading.Timer(1.0, os.kill, (os.getpid(), signal.SIGTERM))
+    killer.start()
+    assert pad_emulator(["--folder", str(folder), "--boards", "1", "--seconds", "30"]) == 130
     assert not list(folder.iterdir())
 
 
