@@ -95,6 +95,24 @@ def build_scene(config: SceneConfig) -> Scene:
     return Scene(config, spec, model, embodiment, pair, camera, _addresses(model, embodiment))
 
 
+def build_arms(config: SceneConfig) -> tuple[mujoco.MjModel, Embodiment, np.ndarray]:
+    """Both arms above the table, without parts, camera and sensors.
+
+    Returns:
+        The model, the embodiment, and where its joints (J,) lie in qpos.
+    """
+    embodiment = get_embodiment(config.embodiment)
+    spec = mujoco.MjSpec()
+    _set_options(spec, config)
+    add_looks(spec)
+    _add_table(spec, config)
+    for arm in embodiment.arms:
+        add_arm(spec, embodiment, arm, config)
+    model = spec.compile()
+    joints = np.array([int(model.joint(name).qposadr[0]) for name in embodiment.joint_names])
+    return model, embodiment, joints
+
+
 def _set_options(spec: mujoco.MjSpec, config: SceneConfig) -> None:
     spec.modelname = f"bimanual insertion: {config.pair}"
     spec.compiler.degree = False

@@ -1,0 +1,196 @@
+"""Recorded joint commands through the simulated twin: its arms alone, or the whole scene with its parts.
+
+Shapes: E episodes of T frames, J joints, P pads. Frame t of an episode is what the sensors give when command
+t is issued; the command acts until frame t + 1.
+"""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+import torch
+
+from lerobot_vtrefine.embodiments import Embodiment
+from lerobot_vtrefine.sim import task
+from lerobot_vtrefine.sim.backends import get_backend
+from lerobot_vtrefine.sim.backends.base import ramp
+from lerobot_vtrefine.sim.config import SceneConfig
+from lerobot_vtrefine.sim.pairs import Part, PartPair
+from lerobot_vtrefine.sim.rotations import about_axis, matrix_to_quat
+from lerobot_vtrefine.sim.scene import build_arms
+from lerobot_vtrefine.sim.simulation import InsertionSim
+from lerobot_vtrefine.sim.starts import HAND_RETREAT_M, Start
+
+Array = np.ndarray
+
+HOLDS = ("zero_order", "linear")
+"""How a command is approached: at once (as motors get it), or linearly over the frame (as `InsertionSim`)."""
+HOLDING_LACK_M = 0.002
+"""A gripper holds something while its fingers stay this far short of a closing command."""
+_SETTLE_S = 0.1
+
+
+@dataclass(frozen=True)
+class SceneReplay:
+    """What the twin's sensors gave during one episode."""
+
+    position: Array
+    """(T, J) [rad, m]"""
+    counts: Array
+    """(T, P, R*C) uint8 raw counts."""
+    baseline: Array
+    """(P, R*C) uint8 idle counts."""
+    success: bool
+    """Whether the plug was seated and held."""
+
+
+def replay_commands(
+    commands: Sequence[Array],
+    starts: Array,
+    dt_s: float,
+    config: SceneConfig | None = None,
+    *,
+    hold: str = "zero_order",
+    fields: Mapping[str, Array] | None = None,
+    num_threads: int = 0,
+) -> list[Array]:
+    """Joint positions of the twin's arms, without parts, under recorded commands.
+
+    Args:
+        commands: E arrays (T, J) of joint targets [rad, m]; clamped to the limits, one opening per gripper.
+        starts: (E, J) joint positions at the first frames; the arms start at rest.
+        dt_s: time between frames.
+        config: servo gains, gravity compensation and time step; the latter is shortened to divide `dt_s`.
+        hold: see `HOLDS`.
+        fields: MjModel fields of each episode's own, (E, ...): other gains, frictions, dampings.
+        num_threads: 0 uses all cores.
+
+    Returns:
+        E arrays (T, J); the first frame is the start.
+
+    Raises:
+        ValueError: shapes that disagree, or an unknown `hold`.
+    """
+    if hold not in HOLDS:
+        raise ValueError(f"unknown hold {hold!r}: use one of {', '.join(HOLDS)}")
+    if not dt_s > 0.0:
+        raise ValueError(f"the time between frames must be above 0, got {dt_s}")
+    config = config or SceneConfig()
+    substeps = int(np.ceil(dt_s / config.timestep_s - 1e-6))
+    model, embodiment, joints = build_arms(replace(config, timestep_s=dt_s / substeps))
+    lengths = _checked_lengths(commands, starts, embodiment)
+    backend = get_backend("batch", model, len(lengths), num_threads)
+    ids = np.arange(len(lengths))
+    if fields:
+        backend.set_fields(ids, dict(fields))
+    qpos = np.zeros((len(ids), model.nq))
+    qpos[:, joints] = np.clip(starts, embodiment.lower, embodiment.upper)
+    backend.write(ids, qpos, np.zeros((len(ids), model.nv)))
+    padded = np.stack([_padded(item, max(lengths)) for item in commands])
+    servo = np.stack([task.servo_commands(embodiment, frame) for frame in padded.swapaxes(0, 1)])
+    positions, before = [qpos[:, joints]], servo[0]
+    for command in servo[:-1]:
+        controls = ramp(before, command, substeps) if hold == "linear" else _held(command, substeps)
+        positions.append(backend.advance(ids, controls).qpos[:, -1][:, joints])
+        before = command
+    stacked = np.stack(positions, 1)
+    return [stacked[episode, :length] for episode, length in enumerate(lengths)]
+
+
+def replay_scene(sim: InsertionSim, commands: Array, seed: int) -> SceneReplay:
+    """One episode in world 0 of a simulation, with parts and pads.
+
+    The simulation's own clamps, rates and ramps act on the commands, as in its recordings: an episode that it
+    recorded comes out the same, counts included.
+
+    Args:
+        commands: (T, J) [rad, m].
+        seed: of the episode; decides the start, the pads' idle levels and noise.
+    """
+    world = np.zeros(1, np.int64)
+    sim.reset(world, np.array([seed]))
+    frames = []
+    for command in commands:
+        frames.append(sim.observe(world))
+        sim.step(command[None], world)
+    return SceneReplay(
+        position=np.concatenate([frame["state"] for frame in frames]),
+        counts=np.concatenate([frame["tactile"] for frame in frames]),
+        baseline=frames[0]["tactile_baseline"][0],
+        success=bool(sim.metrics(world)["success"][0]),
+    )
+
+
+def grasp_start(embodiment: Embodiment, pair: PartPair, command: Array, position: Array) -> Start | None:
+    """A start from the table with the parts where the recorded grippers closed on them.
+
+    Parts stand upright, turned as their hand is at the moment of the grasp; how high and how far forward in
+    the hand a part was held is taken as ideal, because joints do not tell.
+
+    Args:
+        command, position: (T, J) of one episode [rad, m].
+
+    Returns:
+        None when a gripper never holds anything.
+    """
+    poses = []
+    for index, (part, yaw) in enumerate(((pair.socket, np.pi / 2), (pair.plug, -np.pi / 2))):
+        moment = grasp_frame(embodiment, command, position, index)
+        if moment is None:
+            return None
+        poses.append(_standing_pose(embodiment, part, yaw, position[moment], index))
+    first = np.clip(position[:1], embodiment.lower, embodiment.upper).astype(float)
+    return Start(first, first, plug=poses[1][None], socket=poses[0][None], settle_s=_SETTLE_S)
+
+
+def grasp_frame(embodiment: Embodiment, command: Array, position: Array, arm: int) -> int | None:
+    """First frame at which a gripper has closed on what it then holds the longest; None if it never holds."""
+    finger = embodiment.joints_per_arm * (arm + 1) - 2
+    lack = position[:, finger] - command[:, finger]
+    holding = lack > HOLDING_LACK_M
+    edges = np.flatnonzero(np.diff(np.concatenate([[0], holding.astype(int), [0]])))
+    if not len(edges):
+        return None
+    begins, ends = edges[::2], edges[1::2]
+    longest = int(np.argmax(ends - begins))
+    begin, end = int(begins[longest]), int(ends[longest])
+    width = float(np.median(position[begin:end, finger]))
+    closed = np.flatnonzero(position[begin:end, finger] < width + 1e-3)
+    return begin + int(closed[0])
+
+
+def _standing_pose(embodiment: Embodiment, part: Part, nominal_yaw: float, joints: Array, arm: int) -> Array:
+    """Pose (7,) of an upright part on the table, held ideally by a hand at these joints (J,)."""
+    tcp, rotation = (
+        item.numpy() for item in embodiment.tcp_poses(torch.as_tensor(joints, dtype=torch.float64))
+    )
+    forward = rotation[arm][:, 0]
+    hand_yaw = float(np.arctan2(forward[1], forward[0]))
+    turned = about_axis(2, hand_yaw - nominal_yaw)
+    ahead = np.array([np.cos(hand_yaw), np.sin(hand_yaw), 0.0])
+    origin = tcp[arm] + HAND_RETREAT_M * ahead - turned @ np.asarray(part.grip.centre_m)
+    return np.concatenate([origin[:2], [part.rest_height_m], matrix_to_quat(turned)])
+
+
+def _checked_lengths(commands: Sequence[Array], starts: Array, embodiment: Embodiment) -> list[int]:
+    if not len(commands) or np.shape(starts) != (len(commands), embodiment.num_joints):
+        raise ValueError(
+            f"{len(commands)} episodes need starts of shape ({len(commands)}, {embodiment.num_joints}),"
+            f" got {np.shape(starts)}"
+        )
+    for episode, item in enumerate(commands):
+        if item.ndim != 2 or item.shape[1] != embodiment.num_joints or not len(item):
+            raise ValueError(
+                f"episode {episode}: commands must be (T, {embodiment.num_joints}), got {item.shape}"
+            )
+        if not np.isfinite(item).all():
+            raise ValueError(f"episode {episode}: commands must be finite")
+    return [len(item) for item in commands]
+
+
+def _padded(values: Array, length: int) -> Array:
+    return np.concatenate([values, np.repeat(values[-1:], length - len(values), 0)])
+
+
+def _held(command: Array, substeps: int) -> Array:
+    return np.repeat(command[:, None], substeps, 1)
