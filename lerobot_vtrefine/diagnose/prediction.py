@@ -16,11 +16,9 @@ def predict_trial(model: SensorModel, trial: Trial, layout: PadLayout) -> np.nda
     Reads the trial's motion (or load, where it has no `depth_m`) and never its `raw`. Noise and rounding are
     left out: the mean is what predicts best.
     """
-    if trial.depth_m is None:
-        drive = {"force_n": trial_forces(trial, layout)}
-    else:
-        drive = {"depth_m": trial_heights(trial, layout)}
-    predicted = replay(model, trial.time_s, **drive, layout=layout, start_s=trial.start_s)
+    depth = None if trial.depth_m is None else trial_heights(trial, layout)
+    force = trial_forces(trial, layout) if depth is None else None
+    predicted = replay(model, trial.time_s, depth, force_n=force, layout=layout, start_s=trial.start_s)
     converter = model.find("quantisation")
     limit = converter.full_scale_counts if isinstance(converter, Quantisation) else np.inf
     return predicted.numpy().astype(float).reshape(len(trial.time_s), -1).clip(0.0, limit)

@@ -21,18 +21,22 @@ class NonlinearStiffness(Stage):
 
     For a linear contact law this is k d_ref (d / d_ref)^exponent. Where the taxels' sum is the load itself,
     the sum is
-    kept and only its distribution changes.
+    kept and only its distribution changes. With `share` below 1 only that part of the force follows the power
+    law, as in
+    k (d + c d^3).
     """
 
     name: ClassVar[str] = "nonlinear_stiffness"
     domain: ClassVar[str] = "force"
     rank: ClassVar[int] = 30
     exponent: float = parameter(1.0, "1", 0.8, 1.6, minimum=1e-3)
+    share: float = parameter(1.0, "1", 1.0, 1.0)
 
     @override
     def step(self, x: torch.Tensor, state: State, frame: Frame) -> tuple[torch.Tensor, State]:
         reference = frame.stiffness_n_per_m * REFERENCE_DEPTH_M
         bent = reference * (x.clamp(min=0.0) / reference) ** self.exponent
+        bent = x.clamp(min=0.0) + self.share * (bent - x.clamp(min=0.0))
         if not frame.load_conserving:
             return bent, state
         before, after = (image.sum(dim=(-2, -1), keepdim=True) for image in (x, bent))
@@ -72,14 +76,13 @@ class MechanicalSpreading(Stage):
         return spreading_matrix(rows, sigma) @ x @ spreading_matrix(cols, sigma).transpose(-1, -2), state
 
 
-def _paired(stage: str, tau_s: Any, fraction: Any) -> list[tuple[Any, Any]]:
-    taus = tau_s if isinstance(tau_s, tuple) else (tau_s,)
-    fractions = fraction if isinstance(fraction, tuple) else (fraction,)
-    if len(taus) != len(fractions):
-        raise ValueError(
-            f"{stage}: tau_s and fraction need the same number of branches, got {taus} and {fractions}"
-        )
-    return list(zip(taus, fractions, strict=True))
+def _paired(stage: str, first: Any, second: Any, names: str = "tau_s and fraction") -> list[tuple[Any, Any]]:
+    """Numbers or equally long lists of them, branch by branch."""
+    firsts = first if isinstance(first, tuple) else (first,)
+    seconds = second if isinstance(second, tuple) else (second,)
+    if len(firsts) != len(seconds):
+        raise ValueError(f"{stage}: {names} need the same number of branches, got {firsts} and {seconds}")
+    return list(zip(firsts, seconds, strict=True))
 
 
 @register
@@ -131,27 +134,43 @@ class ViscoelasticRelaxation(Stage):
 @register
 @dataclass(frozen=True)
 class Hysteresis(Stage):
-    """Rate-free loop: (1 - fraction) f + fraction * play(f).
+    """Rate-free loop: f + sum_j fraction_j * (play_j(f) - f).
 
-    The play operator follows the depth f / stiffness with a dead band of full width `width_m`, so that
-    loading and
+    A play operator follows the depth f / stiffness with a dead band of full width `width_m`, so that loading
+    and
     unloading at the same depth differ by fraction * width_m * stiffness. Without contact it returns to zero.
+    `fraction` and `width_m` are numbers or equally long lists (several operators make loops of any shape).
     """
 
     name: ClassVar[str] = "hysteresis"
     domain: ClassVar[str] = "force"
     rank: ClassVar[int] = 36
     has_state: ClassVar[bool] = True
-    fraction: float = parameter(0.15, "1", 0.0, 0.3)
-    width_m: float = parameter(2e-4, "m", 5e-5, 5e-4)
+    fraction: Any = field(default=0.15, metadata={"unit": "1", "range": (0.0, 0.3), "minimum": 0.0})
+    width_m: Any = field(default=2e-4, metadata={"unit": "m", "range": (5e-5, 5e-4), "minimum": 0.0})
+
+    def __post_init__(self) -> None:
+        for name in ("fraction", "width_m"):
+            object.__setattr__(self, name, as_tuple(getattr(self, name)))
+        super().__post_init__()
+        self._operators()
+
+    def _operators(self) -> list[tuple[str, Any, Any]]:
+        """State's name, fraction and width of every play operator."""
+        pairs = _paired(self.name, self.fraction, self.width_m, "fraction and width_m")
+        return [(f"play_{j}" if j else "play", fraction, width) for j, (fraction, width) in enumerate(pairs)]
 
     @override
     def initial(self, layout: PadLayout, pads: int) -> Traits:
-        return {"play": np.zeros((pads, layout.rows, layout.cols), dtype=np.float32)}
+        shape = (pads, layout.rows, layout.cols)
+        return {name: np.zeros(shape, dtype=np.float32) for name, _, _ in self._operators()}
 
     @override
     def step(self, x: torch.Tensor, state: State, frame: Frame) -> tuple[torch.Tensor, State]:
-        half_width = 0.5 * self.width_m * frame.stiffness_n_per_m
-        play = torch.maximum(torch.minimum(state["play"], x + half_width), x - half_width).clamp(min=0.0)
-        play = play * (x > 0)
-        return (1.0 - self.fraction) * x + self.fraction * play, {**state, "play": play}
+        new, looped = dict(state), x
+        for name, fraction, width_m in self._operators():
+            half_width = 0.5 * width_m * frame.stiffness_n_per_m
+            play = torch.maximum(torch.minimum(state[name], x + half_width), x - half_width).clamp(min=0.0)
+            new[name] = play * (x > 0)
+            looped = looped + fraction * (new[name] - x)
+        return looped, new

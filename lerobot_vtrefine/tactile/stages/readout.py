@@ -112,16 +112,30 @@ class DeadTaxels(Stage):
 @register
 @dataclass(frozen=True)
 class Saturation(Stage):
-    """The reading levels off at `knee_counts`: knee * tanh(s / knee), slope 1 at zero."""
+    """The reading levels off at `knee_counts`: knee * tanh(s / knee), slope 1 at zero.
+
+    With a `sharpness` n it is s / (1 + (s / knee)^n)^(1/n) instead: n = 1 bends from the start, as a divider
+    does, a large n
+    cuts off.
+    """
 
     name: ClassVar[str] = "saturation"
     domain: ClassVar[str] = "counts"
     rank: ClassVar[int] = 54
     knee_counts: float = parameter(200.0, "counts", 120.0, 400.0, minimum=1e-6)
+    sharpness: float | None = None
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if self.sharpness is not None and not self.sharpness > 0:
+            raise ValueError(f"saturation.sharpness must be positive, got {self.sharpness}")
 
     @override
     def step(self, x: torch.Tensor, state: State, frame: Frame) -> tuple[torch.Tensor, State]:
-        return self.knee_counts * torch.tanh(x / self.knee_counts), state
+        if self.sharpness is None:
+            return self.knee_counts * torch.tanh(x / self.knee_counts), state
+        share = (x.clamp(min=0.0) / self.knee_counts) ** self.sharpness
+        return x / (1.0 + share) ** (1.0 / self.sharpness), state
 
 
 @register
@@ -132,16 +146,19 @@ class RowSharing(Stage):
 
     While one column is driven high the others are held low, so a row's taxels load each other. With a plain
     resistor as pull-down and no amplifier k is 1/255 per count; boards with a stiffer front end have less.
+    `own` is the weight with which a taxel loads itself: 0 leaves only the others.
     """
 
     name: ClassVar[str] = "row_sharing"
     domain: ClassVar[str] = "counts"
     rank: ClassVar[int] = 56
     conductance_per_count: float = parameter(4e-4, "1/counts", 0.0, 2e-3)
+    own: float = parameter(1.0, "1", 1.0, 1.0)
 
     @override
     def step(self, x: torch.Tensor, state: State, frame: Frame) -> tuple[torch.Tensor, State]:
-        return x / (1.0 + self.conductance_per_count * x.sum(dim=-1, keepdim=True)), state
+        load = x.sum(dim=-1, keepdim=True) - (1.0 - self.own) * x
+        return x / (1.0 + self.conductance_per_count * load), state
 
 
 @register
