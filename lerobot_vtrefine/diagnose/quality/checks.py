@@ -1,0 +1,65 @@
+"""All checks in their order."""
+
+from lerobot_vtrefine.diagnose.quality.edits import Check, apply
+from lerobot_vtrefine.diagnose.quality.frames import (
+    check_clock,
+    check_length,
+    check_numbers,
+    check_optional,
+    check_repeats,
+)
+from lerobot_vtrefine.diagnose.quality.joints import check_encoders, check_joint_order
+from lerobot_vtrefine.diagnose.quality.response import check_answers, check_start, check_stuck
+from lerobot_vtrefine.diagnose.quality.units import check_scales, check_units
+from lerobot_vtrefine.diagnose.quality.wiring import check_wiring
+from lerobot_vtrefine.diagnose.recordings import RecordingSet
+from lerobot_vtrefine.diagnose.verdict import DataIssue
+
+MIN_TRIALS = 4
+"""Fewer leave none for choosing beside those that are held out."""
+MIN_PART = 1 / 3
+"""If less than this part of a set is sound, the rest is not trusted either."""
+
+# Each check sees what the ones before it left: first frames and times, then what the pad says. Frames without
+# numbers are dropped after the clock was checked, which would take them for lost ones; all other checks need
+# numbers.
+FRAME_CHECKS: tuple[Check, ...] = (
+    check_repeats,
+    check_units,
+    check_clock,
+    check_optional,
+    check_numbers,
+    check_length,
+)
+PAD_CHECKS: tuple[Check, ...] = (check_scales, check_stuck, check_wiring, check_start, check_answers)
+ROBOT_CHECKS: tuple[Check, ...] = (check_encoders, check_joint_order)
+
+
+def check_quality(recordings: RecordingSet) -> tuple[RecordingSet, list[DataIssue]]:
+    """Set aside or repair what is broken.
+
+    Returns:
+        The set without the trials set aside and with the repaired ones, and an entry for everything found.
+        Ask `too_little` whether what is left can be judged.
+    """
+    issues: list[DataIssue] = []
+    miswired = False
+    for check in FRAME_CHECKS + (PAD_CHECKS if recordings.kind == "pad" else ROBOT_CHECKS):
+        if not recordings.trials or (check is check_answers and miswired):
+            continue  # lines in the wrong place would all look dead
+        recordings, found = apply(recordings, list(check(recordings)))
+        miswired |= check is check_wiring and any(issue.trial is None for issue in found)
+        issues += found
+    return recordings, issues
+
+
+def too_little(checked: RecordingSet, recorded: RecordingSet) -> DataIssue | None:
+    """Why what quality control left of a set is no basis for a verdict, or None if it is one."""
+    left, total = len(checked.trials), len(recorded.trials)
+    if left < MIN_TRIALS:
+        return DataIssue(
+            None, f"{left} sound trials of {total}; at least {MIN_TRIALS} are needed", "no verdict"
+        )
+    if left < MIN_PART * total:
+        return DataIssue(None, f"only {left} of {total} trials are sound", "no verdict")
+    return None

@@ -1,0 +1,64 @@
+"""What every check returns, and how it changes a recording set."""
+
+import dataclasses
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from lerobot_vtrefine.diagnose.recordings import RecordingSet
+from lerobot_vtrefine.diagnose.verdict import DataIssue
+
+SET_ASIDE = "set aside"
+KEPT = "kept"
+MINORITY = 0.5
+"""A fault of fewer trials than this part of the set is theirs; of more, it is a property of the rig."""
+
+
+@dataclass(frozen=True)
+class Finding:
+    """A fault of trial ``index`` (None: of the whole set) and what becomes of it.
+
+    ``trial`` takes the old one's place after a repair; without it, ``action`` says whether the old one stays.
+    """
+
+    index: int | None
+    problem: str
+    action: str
+    trial: Any = None
+
+
+Check = Callable[[RecordingSet], Iterable[Finding]]
+
+
+def apply(recordings: RecordingSet, findings: Iterable[Finding]) -> tuple[RecordingSet, list[DataIssue]]:
+    """The set without what was set aside and with what was repaired, and the list of it."""
+    trials = dict(enumerate(recordings.trials))
+    issues = []
+    for finding in findings:
+        file = None if finding.index is None else recordings.trials[finding.index].file
+        issues.append(DataIssue(file, finding.problem, finding.action))
+        if finding.index is None:
+            continue
+        if finding.action == SET_ASIDE:
+            trials.pop(finding.index, None)
+        elif finding.trial is not None and finding.index in trials:
+            trials[finding.index] = finding.trial
+    return dataclasses.replace(recordings, trials=tuple(trials.values())), issues
+
+
+def columns(trial: Any) -> dict[str, np.ndarray]:
+    """The trial's columns, an entry per frame: name -> (N,) or (N, K)."""
+    found = {item.name: getattr(trial, item.name) for item in dataclasses.fields(trial)}
+    return {name: value for name, value in found.items() if isinstance(value, np.ndarray)}
+
+
+def take(trial: Any, frames: np.ndarray) -> Any:
+    """The trial with only these frames: a mask (N,) or indices."""
+    return dataclasses.replace(trial, **{name: value[frames] for name, value in columns(trial).items()})
+
+
+def plural(count: int, noun: str) -> str:
+    """ "1 frame", "2 frames"."""
+    return f"{count} {noun}" if count == 1 else f"{count} {noun}s"

@@ -1,0 +1,67 @@
+"""Checks of robot recordings: encoders that stick, or that belong to another joint."""
+
+from collections.abc import Iterator
+
+import numpy as np
+from scipy.optimize import linear_sum_assignment
+
+from lerobot_vtrefine.diagnose.quality.edits import KEPT, MINORITY, SET_ASIDE, Finding
+from lerobot_vtrefine.diagnose.recordings import RecordingSet, RobotTrial
+
+MOVES = 0.1
+"""A joint moves in a trial if its command's range is this part of its largest range in the set."""
+STILL = 1e-3
+"""An encoder sticks if its range is below this part of the command's."""
+WRONG, BETTER = 0.5, 0.4
+"""1 − correlation with the own command that is suspicious, and what part of it another order must leave."""
+
+
+def check_encoders(recordings: RecordingSet) -> Iterator[Finding]:
+    """Encoders that do not move with their command although the command moves."""
+    command = np.array([np.ptp(trial.command, axis=0) for trial in recordings.trials])
+    position = np.array([np.ptp(trial.position, axis=0) for trial in recordings.trials])
+    moves = command > np.maximum(MOVES * command.max(axis=0), 1e-9)
+    stuck = moves & (position < STILL * command)
+    always = stuck.sum(axis=0) > MINORITY * np.maximum(moves.sum(axis=0), 1)
+    for joint in np.flatnonzero(always):
+        problem = (
+            f"position of {recordings.joints[joint]} stays constant in most trials while its command moves"
+        )
+        yield Finding(None, problem, f"{KEPT}: nothing can be said about this joint")
+    for index in np.flatnonzero((stuck & ~always).any(axis=1)):
+        names = [recordings.joints[joint] for joint in np.flatnonzero(stuck[index] & ~always)]
+        yield Finding(int(index), f"position stays constant: {', '.join(names)}", SET_ASIDE)
+
+
+def check_joint_order(recordings: RecordingSet) -> Iterator[Finding]:
+    """Positions that follow another joint's command better than their own."""
+    found = {
+        index: names
+        for index, trial in enumerate(recordings.trials)
+        if (names := _exchanged(trial, recordings))
+    }
+    if len(found) > MINORITY * len(recordings.trials):
+        problem = f"positions of {found[min(found)]} are exchanged in most trials"
+        yield Finding(None, problem, f"{KEPT}: check the order of the joints")
+        return
+    for index, names in found.items():
+        yield Finding(index, f"positions of {names} are exchanged", SET_ASIDE)
+
+
+def _exchanged(trial: RobotTrial, recordings: RecordingSet) -> str | None:
+    """Names of joints whose encoders are exchanged in a trial, or None."""
+    command, position = trial.command, trial.position
+    joints = np.flatnonzero((np.ptp(command, axis=0) > 1e-3) & (np.ptp(position, axis=0) > 1e-6))
+    if len(joints) < 2:
+        return None
+    normal = [values[:, joints] - values[:, joints].mean(axis=0) for values in (position, command)]
+    normal = [values / np.linalg.norm(values, axis=0) for values in normal]
+    cost = 1.0 - normal[0].T @ normal[1]
+    _, order = linear_sum_assignment(cost)
+    moved = np.flatnonzero(order != np.arange(len(joints)))
+    if len(moved) == 0:
+        return None
+    own, other = np.diag(cost)[moved].mean(), cost[moved, order[moved]].mean()
+    if own < WRONG or other > BETTER * own:
+        return None
+    return " and ".join(recordings.joints[joint] for joint in joints[moved])
