@@ -16,6 +16,7 @@ from lerobot_vtrefine.sim.config import (
     RandomizationConfig,
     SceneConfig,
     TaskConfig,
+    WarpConfig,
 )
 
 VECTORIZATIONS = ("native", "gym")
@@ -59,6 +60,8 @@ class VtRefineEnvConfig(EnvConfig):
     """single, batch (threads) or warp."""
     num_threads: int = 0
     """Threads of the batch backend; 0 uses all cores."""
+    warp: WarpConfig = field(default_factory=WarpConfig)
+    """Device and buffers of the warp backend."""
     vectorization: str = "native"
     """native: one batched simulation. gym: one per environment, sync or async by --eval.use_async_envs."""
     read_every: int = 1

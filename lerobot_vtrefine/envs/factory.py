@@ -36,6 +36,7 @@ def make_simulation(config: VtRefineEnvConfig, num_envs: int) -> "InsertionSim":
         backend=config.backend,
         num_threads=config.num_threads,
         randomization=config.randomization,
+        warp=config.warp,
     )
 
 

@@ -1,5 +1,6 @@
 """Every setting of the simulation, as frozen dataclasses; imports no simulator."""
 
+import re
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -192,6 +193,25 @@ class TaskConfig:
     def steps_of(self, start: str) -> int:
         """Control steps of an episode from this start."""
         return self.episode_steps or {"table": 240, "grasped": 48}[start]
+
+
+@dataclass(frozen=True)
+class WarpConfig:
+    """The warp backend: where it runs, and the fixed room that it sets aside. Too little is an error."""
+
+    device: str = "auto"
+    """auto (a CUDA GPU where there is one), cpu, cuda or cuda:i."""
+    contacts_per_world: int = 64
+    """Contacts, and pairs of geoms close to each other, on average over the worlds."""
+    rows_per_world: int = 256
+    """Rows of constraints in any one world: a contact takes 4."""
+
+    def __post_init__(self) -> None:
+        if not re.fullmatch(r"auto|cpu|cuda(:\d+)?", self.device):
+            raise ValueError(f"warp.device must be auto, cpu, cuda or cuda:0, not {self.device!r}")
+        for name in ("contacts_per_world", "rows_per_world"):
+            if getattr(self, name) < 1:
+                raise ValueError(f"warp.{name} must be at least 1, got {getattr(self, name)}")
 
 
 @dataclass(frozen=True)

@@ -8,10 +8,11 @@ from typing import Any
 
 import mujoco
 import numpy as np
+import torch
 import warp as wp
 from scipy.spatial import ConvexHull
 
-from lerobot_vtrefine.sim.camera import Camera
+from lerobot_vtrefine.sim.camera import Camera, depth_to_millimetres
 from lerobot_vtrefine.sim.depth_kernels import MISS, ivec4, project, raster
 from lerobot_vtrefine.tactile.contact_query import start_warp
 
@@ -41,7 +42,7 @@ class DepthCamera:
         mujoco.mj_kinematics(model, data)
         self._static_poses = data.geom_xpos[None].copy(), data.geom_xmat.reshape(1, -1, 3, 3).copy()
         self._nominal_background = self._static_depth(np.zeros(1, int))
-        self._background: Array | None = None
+        self._background: torch.Tensor | None = None
 
     def set_cameras(self, ids: Array, position: Array, rotation: Array) -> None:
         """Move the cameras of worlds `ids` to (m, 3) [m] and (m, 3, 3)."""
@@ -49,8 +50,8 @@ class DepthCamera:
             return
         self.position[ids], self.rotation[ids] = position, rotation
         if self._background is None:
-            self._background = np.repeat(self._nominal_background, len(self.position), 0)
-        self._background[ids] = self._static_depth(ids)
+            self._background = self._nominal_background.repeat(len(self.position), 1, 1)
+        self._background[self._index(ids)] = self._static_depth(ids)
 
     def set_shapes(self, ids: Array, size: Array, bounds: Array) -> None:
         """Give worlds their own geom sizes (m, G, 3) and bounding boxes (m, G, 6)."""
@@ -59,37 +60,67 @@ class DepthCamera:
             self._bounds = np.repeat(self._bounds, len(self.position), 0)
         self._size[ids], self._bounds[ids] = size, bounds
 
-    def render(self, ids: Array, geom_position: Array, geom_rotation: Array) -> Array:
+    def render(
+        self, ids: Array, geom_position: Array | torch.Tensor, geom_rotation: Array | torch.Tensor
+    ) -> Array:
         """z-depth (m, H, W) float32 [m], -1 for a miss.
 
         Args:
             ids: (m,) worlds.
             geom_position, geom_rotation: (m, G, 3) [m] and (m, G, 3, 3), world frame.
         """
-        if self._background is None:
-            depth = np.repeat(self._nominal_background, len(ids), 0)
-        else:
-            depth = self._background[ids]
-        self._draw(self._moving, ids, geom_position, geom_rotation, depth)
-        return np.where(depth < float(MISS), depth, np.float32(-1.0))
+        depth = self._render(ids, geom_position, geom_rotation)
+        return torch.where(depth < float(MISS), depth, -1.0).cpu().numpy()
 
-    def _static_depth(self, ids: Array) -> Array:
-        depth = np.full((len(ids), self._camera.height, self._camera.width), float(MISS), np.float32)
+    def render_mm(
+        self, ids: Array, geom_position: Array | torch.Tensor, geom_rotation: Array | torch.Tensor
+    ) -> Array:
+        """The same as uint16 millimetres, 0 where nothing lies within 2 m."""
+        depth = self._render(ids, geom_position, geom_rotation)
+        return depth_to_millimetres(depth).cpu().numpy().view(np.uint16)
+
+    def _render(
+        self, ids: Array, geom_position: Array | torch.Tensor, geom_rotation: Array | torch.Tensor
+    ) -> torch.Tensor:
+        """z-depth (m, H, W) float32 [m] on the device, MISS for a miss."""
+        if self._background is None:
+            depth = self._nominal_background.repeat(len(ids), 1, 1)
+        else:
+            depth = self._background[self._index(ids)]
+        self._draw(self._moving, ids, geom_position, geom_rotation, depth)
+        return depth
+
+    def _index(self, ids: Array) -> torch.Tensor:
+        return torch.as_tensor(ids, dtype=torch.int64, device=self._device)
+
+    def _static_depth(self, ids: Array) -> torch.Tensor:
+        shape = (len(ids), self._camera.height, self._camera.width)
+        depth = torch.full(shape, float(MISS), dtype=torch.float32, device=self._device)
         position, rotation = (np.repeat(item, len(ids), 0) for item in self._static_poses)
         self._draw(self._static, ids, position, rotation, depth)
         return depth
 
-    def _draw(self, solids: "_Solids", ids: Array, position: Array, rotation: Array, depth: Array) -> None:
+    def _draw(
+        self,
+        solids: "_Solids",
+        ids: Array,
+        position: Array | torch.Tensor,
+        rotation: Array | torch.Tensor,
+        depth: torch.Tensor,
+    ) -> None:
         """Draw solids into `depth` (m, H, W), in place."""
         select, device = solids.geoms, self._device
-        to_camera = np.swapaxes(self.rotation[ids], -1, -2)
-        offset = position[:, select] - self.position[ids][:, None]
-        local = offset @ np.swapaxes(to_camera, -1, -2)
-        turned = to_camera[:, None] @ rotation[:, select]
-        pos, rot = _upload(local, wp.vec3, device), _upload(turned, wp.mat33, device)
+        position, rotation = (torch.as_tensor(item, device=device) for item in (position, rotation))
+        here, axes = (torch.as_tensor(item[ids]).to(position) for item in (self.position, self.rotation))
+        local = (position[:, select] - here[:, None]) @ axes
+        turned = axes.transpose(-1, -2)[:, None] @ rotation[:, select]
+        pos, rot = (
+            wp.from_torch(item.to(torch.float32).contiguous(), dtype=dtype)
+            for item, dtype in ((local, wp.vec3), (turned, wp.mat33))
+        )
         rows = slice(None) if len(self._size) == 1 else ids
-        size = _upload(self._size[rows][:, select], wp.vec3, device)
-        bounds = self._bounds[rows][:, select]
+        size = _upload(self._size[rows][:, solids.numbers], wp.vec3, device)
+        bounds = self._bounds[rows][:, solids.numbers]
         centre, half = _upload(bounds[..., :3], wp.vec3, device), _upload(bounds[..., 3:], wp.vec3, device)
         shared, count = int(len(self._size) == 1), len(ids)
         cover = wp.empty((count, len(select)), dtype=ivec4, device=device)
@@ -107,19 +138,17 @@ class DepthCamera:
             cover,
         ]
         wp.launch(project, (count, len(select)), inputs, device=device, record_tape=False)
-        out = wp.array(depth, dtype=float, device=device, copy=False)
         inputs = [solids.kind, size, shared, pos, rot, cover, solids.planes, solids.plane_range]
-        inputs += [self._intrinsics, width, out]
+        inputs += [self._intrinsics, width, wp.from_torch(depth)]
         wp.launch(raster, (count, height), inputs, device=device, record_tape=False)
-        if device != "cpu":
-            depth[:] = out.numpy()
 
 
 class _Solids:
     """Geoms of a model as the kernels take them."""
 
     def __init__(self, model: mujoco.MjModel, geoms: Array, device: str) -> None:
-        self.geoms = geoms
+        self.geoms = torch.as_tensor(geoms, device=device)
+        self.numbers = geoms
         self.kind = wp.array(model.geom_type[geoms].astype(np.int32), dtype=int, device=device)
         planes, ranges = [np.zeros((0, 4))], []
         for geom in geoms:

@@ -4,7 +4,7 @@ Shapes: m worlds, 4 pads, B = 2 bodies (plug, socket).
 """
 
 from dataclasses import dataclass
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import torch
@@ -14,6 +14,9 @@ from lerobot_vtrefine.sim.pairs import Part
 from lerobot_vtrefine.sim.rotations import quat_to_matrix, turn, turn_back
 from lerobot_vtrefine.sim.scene import Scene
 from lerobot_vtrefine.tactile import BodyGeometry, PadLayout, PadSensors, SensorModel, layout_from_mesh
+
+if TYPE_CHECKING:
+    from lerobot_vtrefine.sim.touch import Touch
 
 Array = np.ndarray
 
@@ -80,11 +83,13 @@ def pad_loads(embodiment: Embodiment, joints: Array, contacts: Array) -> Array:
 class Pads:
     """The four pads of every world."""
 
-    def __init__(self, scene: Scene, model: SensorModel, num_envs: int, control_dt_s: float) -> None:
-        self._embodiment, self._dt_s = scene.embodiment, control_dt_s
+    def __init__(
+        self, scene: Scene, model: SensorModel, num_envs: int, control_dt_s: float, device: str = "cpu"
+    ) -> None:
+        self._dt_s = control_dt_s
         bodies = [_touch_geometry(scene.pair.plug), _touch_geometry(scene.pair.socket)]
         self.layout = pad_layout(scene.embodiment)
-        self.sensors = PadSensors(self.layout, bodies, num_envs, num_pads=4, model=model)
+        self.sensors = PadSensors(self.layout, bodies, num_envs, num_pads=4, model=model, device=device)
         self._remembers = model.has_state
         self._last = np.zeros((num_envs, 4, self.layout.num_taxels), np.uint8)
 
@@ -93,14 +98,14 @@ class Pads:
         self.sensors.reset(ids, seeds)
         self.sensors.randomize(ids, stiffness_scale=stiffness_scale, gain_scale=gain_scale)
 
-    def advance(self, ids: Array, seen: Kinematics, load: Array) -> None:
+    def advance(self, ids: Array, touch: "Touch") -> None:
         """Let one control step pass; needed only by models with memory."""
         if self._remembers:
-            self._last[ids] = self._read(ids, seen, load)
+            self._last[ids] = self._read(ids, touch)
 
-    def counts(self, ids: Array, seen: Kinematics, load: Array) -> Array:
+    def counts(self, ids: Array, touch: "Touch") -> Array:
         """Raw counts (m, 4, 384) uint8 at the worlds' present state."""
-        return self._last[ids] if self._remembers else self._read(ids, seen, load)
+        return self._last[ids] if self._remembers else self._read(ids, touch)
 
     def get_state(self, env: int) -> dict[str, Any]:
         """Everything that world `env`'s readings depend on."""
@@ -111,22 +116,9 @@ class Pads:
         self.sensors.set_state(env, state["sensors"])
         self._last[env] = state["last"]
 
-    def _read(self, ids: Array, seen: Kinematics, load: Array) -> Array:
-        joints, rates = torch.from_numpy(seen.joints), torch.from_numpy(seen.joint_velocities)
-        position, rotation = self._embodiment.pad_poses(joints)
-        velocity = self._embodiment.pad_twists(joints, rates)
-        counts = self.sensors.counts(
-            ids,
-            position.numpy(),
-            rotation.numpy(),
-            velocity.numpy(),
-            np.stack([seen.plug[0], seen.socket[0]], 1),
-            np.stack([seen.plug[1], seen.socket[1]], 1),
-            np.stack([seen.plug_velocity, seen.socket_velocity], 1),
-            self._dt_s,
-            load,
-        )
-        return np.asarray(counts)
+    def _read(self, ids: Array, touch: "Touch") -> Array:
+        counts = self.sensors.counts(ids, *touch.poses, self._dt_s, touch.load)
+        return counts.cpu().numpy() if isinstance(counts, torch.Tensor) else counts
 
 
 def pad_layout(embodiment: Embodiment) -> PadLayout:

@@ -11,8 +11,7 @@ import numpy as np
 
 from lerobot_vtrefine.sim import sensing, starts, task
 from lerobot_vtrefine.sim.backends import Trace, get_backend
-from lerobot_vtrefine.sim.camera import depth_to_millimetres
-from lerobot_vtrefine.sim.config import RANGES, RandomizationConfig, SceneConfig, TaskConfig
+from lerobot_vtrefine.sim.config import RANGES, RandomizationConfig, SceneConfig, TaskConfig, WarpConfig
 from lerobot_vtrefine.sim.depth import DepthCamera
 from lerobot_vtrefine.sim.episode import EpisodeState, Measured, update
 from lerobot_vtrefine.sim.privileged import Privileged, describe
@@ -21,6 +20,7 @@ from lerobot_vtrefine.sim.rotations import matrix_to_quat
 from lerobot_vtrefine.sim.scene import Scene, build_scene
 from lerobot_vtrefine.sim.sensing import Kinematics
 from lerobot_vtrefine.sim.task import FAILURES
+from lerobot_vtrefine.sim.touch import Touch, touch_source
 from lerobot_vtrefine.tactile import SensorModel
 
 __all__ = ["FAILURES", "InsertionSim", "StepResult"]
@@ -65,9 +65,10 @@ class InsertionSim:
         task_config: control, start, success, limits.
         sensor: "default", "paper", the path of a sensor_model.json, or a model.
         num_envs: N.
-        backend: "single" or "batch".
+        backend: "single", "batch" or "warp".
         num_threads: of the batch backend; 0 uses all cores.
         randomization: differences between worlds.
+        warp: device and buffers of the warp backend.
 
     Raises:
         ValueError: zero worlds, or a setting that makes no sense.
@@ -83,6 +84,7 @@ class InsertionSim:
         backend: str = "batch",
         num_threads: int = 0,
         randomization: RandomizationConfig | None = None,
+        warp: WarpConfig | None = None,
     ) -> None:
         if num_envs < 1:
             raise ValueError(f"num_envs must be at least 1, got {num_envs}")
@@ -91,16 +93,18 @@ class InsertionSim:
         self.num_envs = num_envs
         self.noise_level = NOISE_LEVEL
         self._substeps = _substeps(self.scene.config, self.config)
-        self._backend = get_backend(backend, self.scene.model, num_envs, num_threads)
+        self._backend = get_backend(backend, self.scene.model, num_envs, num_threads, warp)
+        self._touch = touch_source(self.scene, self._backend)
         self._randomizer = Randomizer(self.scene, randomization or RandomizationConfig())
         model = SensorModel.named(sensor) if isinstance(sensor, str) else sensor
-        self._pads = sensing.Pads(self.scene, model, num_envs, self.config.control_dt_s)
+        device = self._backend.device
+        self._pads = sensing.Pads(self.scene, model, num_envs, self.config.control_dt_s, device)
         window = max(1, round(self.config.limits.force_window_s / self.scene.config.timestep_s))
         self._episode = EpisodeState.empty(num_envs, self.scene.model.nu, window)
         self._rates = task.rate_limits(self.scene.embodiment, self.config)
         everyone = self._randomizer.draw(np.zeros(num_envs, np.int64))
         self._parameters = dict(everyone.values)
-        self._depth = DepthCamera(self.scene.model, self.scene.camera, num_envs)
+        self._depth = DepthCamera(self.scene.model, self.scene.camera, num_envs, device)
         self._settled: dict[int, _Rest] = {}
 
     @property
@@ -134,8 +138,10 @@ class InsertionSim:
         quat = matrix_to_quat(self._depth.rotation)
         return np.concatenate([self._depth.position, quat], 1).astype(np.float32)
 
-    def reset(self, ids: Array, seeds: Array) -> None:
-        """Start new episodes in worlds `ids` (m,); each is a pure function of its seed (m,)."""
+    def reset(self, ids: Array, seeds: Array, start: starts.Start | None = None) -> None:
+        """Start new episodes in worlds `ids` (m,); each is a pure function of its seed (m,), and of `start`
+        where one is given in place of the seed's.
+        """
         ids = self._checked(ids)
         seeds = np.broadcast_to(np.asarray(seeds, np.int64), ids.shape)
         drawn = self._randomizer.draw(seeds)
@@ -143,7 +149,7 @@ class InsertionSim:
         state = self._episode
         state.clear(ids)
         state.seed[ids] = seeds
-        self._settle(ids, seeds)
+        self._settle(ids, seeds, start)
         scale = drawn.values["pad_stiffness_scale"], drawn.values["sensor_gain_scale"]
         self._pads.reset(ids, seeds, *scale)
         seen = self._seen(ids)
@@ -152,7 +158,7 @@ class InsertionSim:
         state.grasped[ids] = in_hand
         state.reference[ids] = measured
         state.tip[ids] = task.insertion(self.scene.pair, seen.plug, seen.socket).position_m
-        self._pads.advance(ids, seen, state.pad_load[ids])
+        self._pads.advance(ids, self._touch_at(ids, seen))
 
     def step(self, action: Array, ids: Array | None = None) -> StepResult:
         """One control step of worlds `ids` (m,), all by default.
@@ -170,11 +176,11 @@ class InsertionSim:
         before = state.command[ids]
         wanted = task.servo_commands(self.scene.embodiment, action)
         after = np.clip(wanted, before - self._rates, before + self._rates)
-        trace = self._backend.advance(ids, task.ramp(before, after, self._substeps))
+        trace = self._backend.advance_linearly(ids, before, after, self._substeps)
         state.command[ids] = after
         seen = self._seen(ids)
         reward = update(state, ids, self._measure(ids, seen, trace), self.scene.pair, self.config)
-        self._pads.advance(ids, seen, state.pad_load[ids])
+        self._pads.advance(ids, self._touch_at(ids, seen))
         terminated = state.done[ids]
         truncated = ~terminated & (state.steps[ids] >= self.episode_steps)
         return StepResult(reward, terminated, truncated, state.success[ids])
@@ -190,7 +196,7 @@ class InsertionSim:
         seen = self._seen(ids)
         return {
             "state": seen.joints.astype(np.float32),
-            "tactile": self._pads.counts(ids, seen, self._episode.pad_load[ids]),
+            "tactile": self._pads.counts(ids, self._touch_at(ids, seen)),
             "tactile_baseline": self._pads.sensors.baseline[ids],
             "depth_mm": self.depth_mm(ids),
         }
@@ -203,7 +209,7 @@ class InsertionSim:
     def depth_mm(self, ids: Array | None = None) -> Array:
         """Depth images (m, H, W) uint16 [mm]."""
         ids = self._checked(ids)
-        return depth_to_millimetres(self._depth.render(ids, *self._backend.geom_poses(ids)))
+        return self._depth.render_mm(ids, *self._backend.geom_poses(ids))
 
     def command_targets(self, ids: Array | None = None) -> Array:
         """Joint targets (m, J) that the servos hold at the end of the last control step."""
@@ -249,7 +255,7 @@ class InsertionSim:
     def get_state(self, env: int) -> dict[str, Any]:
         """Everything that world `env`'s future depends on."""
         return {
-            "row": self._backend.get_row(env),
+            "row": self._backend.get_rows(np.array([env]))[0],
             "episode": self._episode.row(env),
             "parameters": {name: values[env] for name, values in self._parameters.items()},
             "camera": (self._depth.position[env].copy(), self._depth.rotation[env].copy()),
@@ -261,7 +267,7 @@ class InsertionSim:
         values = {name: np.atleast_1d(value) for name, value in state["parameters"].items()}
         position, rotation = state["camera"]
         self._apply(np.array([env]), WorldParameters(values, position[None], rotation[None]))
-        self._backend.set_row(env, state["row"])
+        self._backend.set_rows(np.array([env]), state["row"][None])
         self._episode.set_row(env, state["episode"])
         self._pads.set_state(env, state["pads"])
 
@@ -287,17 +293,20 @@ class InsertionSim:
             if "geom_size" in fields:
                 self._depth.set_shapes(ids, fields["geom_size"], fields["geom_aabb"])
 
-    def _settle(self, ids: Array, seeds: Array) -> None:
+    def _settle(self, ids: Array, seeds: Array, start: starts.Start | None) -> None:
         """Bring worlds to their starts and to rest, or back to where an earlier reset with this seed left
         them.
         """
         missing = np.array([int(seed) not in self._settled for seed in seeds], bool)
         fresh = self._settle_physically(ids[missing], seeds[missing]) if missing.any() else {}
-        for env, seed in zip(ids, seeds, strict=True):
-            rest = fresh.get(int(env)) or self._settled[int(seed)]
-            self._backend.set_row(int(env), rest.row)
-            self._episode.command[env], self._episode.pad_load[env] = rest.command, rest.pad_load
-            self._episode.pad_force[env] = rest.pad_load[:, 0]
+        rests = [
+            fresh.get(int(env)) or self._settled[int(seed)] for env, seed in zip(ids, seeds, strict=True)
+        ]
+        self._backend.set_rows(ids, np.stack([rest.row for rest in rests]))
+        self._episode.command[ids] = [rest.command for rest in rests]
+        self._episode.pad_load[ids] = [rest.pad_load for rest in rests]
+        self._episode.pad_force[ids] = self._episode.pad_load[ids][..., 0]
+        for seed, rest in zip(seeds, rests, strict=True):
             if len(self._settled) < _MAX_CACHED_STARTS:
                 self._settled[int(seed)] = rest
 
@@ -315,10 +324,8 @@ class InsertionSim:
         substeps = round(start.settle_s / self.scene.config.timestep_s)
         trace = self._backend.advance(ids, np.repeat(command[:, None], substeps, 1))
         load = self._pad_load(trace)
-        return {
-            int(env): _Rest(self._backend.get_row(int(env)), command[row], load[row])
-            for row, env in enumerate(ids)
-        }
+        rows = self._backend.get_rows(ids)
+        return {int(env): _Rest(rows[i], command[i], load[i]) for i, env in enumerate(ids)}
 
     def _start(self, seeds: Array) -> starts.Start:
         pair, robot = self.scene.pair, self.scene.embodiment
@@ -330,6 +337,9 @@ class InsertionSim:
 
     def _seen(self, ids: Array) -> Kinematics:
         return sensing.read_kinematics(self.scene, *self._backend.read(ids))
+
+    def _touch_at(self, ids: Array, seen: Kinematics) -> Touch:
+        return self._touch(ids, seen, self._episode.pad_load[ids])
 
     def _grip_points(self, seen: Kinematics) -> Array:
         grips = self.scene.pair.socket.grip, self.scene.pair.plug.grip

@@ -64,12 +64,6 @@ def rate_limits(embodiment: Embodiment, config: TaskConfig) -> Array:
     return np.array(arm * 2) * config.control_dt_s
 
 
-def ramp(start: Array, stop: Array, substeps: int) -> Array:
-    """Linear interpolation of commands (m, nu) -> (m, substeps, nu), the last one being `stop`."""
-    weight = (np.arange(substeps) + 1.0) / substeps
-    return start[:, None] + weight[None, :, None] * (stop - start)[:, None]
-
-
 def insertion(pair: PartPair, plug: Pose, socket: Pose) -> Insertion:
     """Pose of the plug in the socket's frame and what follows from it."""
     position = turn_back(socket[1], plug[0] - socket[0])

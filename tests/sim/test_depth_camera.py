@@ -1,6 +1,7 @@
 import mujoco
 import numpy as np
 import pytest
+import torch
 
 from lerobot_vtrefine.sim.camera import depth_to_millimetres, make_camera
 from lerobot_vtrefine.sim.config import CameraConfig, RandomizationConfig, SceneConfig
@@ -15,9 +16,8 @@ def cast(sim, env, pixels):
     mujoco.mju_quat2Mat(matrix, quat)
     rays = sim.scene.camera.directions()[pixels] @ matrix.reshape(3, 3).T
     geom = np.zeros(1, np.int32)
-    return depth_to_millimetres(
-        np.array([mujoco.mj_ray(model, data, position, ray, None, 1, -1, geom) for ray in rays])
-    )
+    depth = np.array([mujoco.mj_ray(model, data, position, ray, None, 1, -1, geom) for ray in rays])
+    return depth_to_millimetres(torch.from_numpy(depth)).numpy()
 
 
 @pytest.mark.parametrize(("pair", "start"), [("round", "grasped"), ("d_shape", "table"), ("key", "grasped")])
@@ -76,7 +76,7 @@ def test_camera_geometry_follows_opencv():
 
 
 def test_depth_outside_its_range_is_zero():
-    depth = np.array([-1.0, 0.0004, 0.0006, 0.5, 1.9999, 2.5])
+    depth = torch.tensor([-1.0, 0.0004, 0.0006, 0.5, 1.9999, 2.5])
     np.testing.assert_array_equal(depth_to_millimetres(depth), [0, 0, 1, 500, 2000, 0])
 
 

@@ -9,6 +9,7 @@ from lerobot_vtrefine.sim.config import (
     SceneConfig,
     SuccessConfig,
     TaskConfig,
+    WarpConfig,
 )
 from lerobot_vtrefine.sim.simulation import FAILURES, InsertionSim
 
@@ -232,7 +233,8 @@ def test_success_must_be_held():
     ("make", "message"),
     [
         (lambda: insertion_sim(0), "num_envs must be at least 1"),
-        (lambda: insertion_sim(1, backend="warp"), "backend 'warp' is not available"),
+        (lambda: WarpConfig(device="gpu"), "warp.device must be auto, cpu, cuda or cuda:0, not 'gpu'"),
+        (lambda: WarpConfig(rows_per_world=0), "warp.rows_per_world must be at least 1"),
         (lambda: insertion_sim(1, backend="cuda"), "unknown backend 'cuda': use one of single, batch, warp"),
         (lambda: SceneConfig(start="floor"), "unknown start 'floor': use one of table, grasped"),
         (lambda: insertion_sim(1, rules=TaskConfig(control_hz=30)), "whole number of physics steps"),

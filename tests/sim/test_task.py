@@ -3,6 +3,7 @@ import pytest
 
 from lerobot_vtrefine.embodiments import get_embodiment
 from lerobot_vtrefine.sim import task
+from lerobot_vtrefine.sim.backends.base import ramp
 from lerobot_vtrefine.sim.config import SuccessConfig, TaskConfig
 from lerobot_vtrefine.sim.pairs import Grip, procedural_pair
 from lerobot_vtrefine.sim.rotations import about_axis, matrix_to_quat, quat_to_matrix
@@ -33,7 +34,7 @@ def test_unequal_fingers_are_driven_by_their_mean_opening():
 
 
 def test_ramp_ends_at_its_target_in_equal_steps():
-    path = task.ramp(np.zeros((1, 2)), np.array([[1.0, -2.0]]), 4)
+    path = ramp(np.zeros((1, 2)), np.array([[1.0, -2.0]]), 4)
     np.testing.assert_allclose(path[0], [[0.25, -0.5], [0.5, -1.0], [0.75, -1.5], [1.0, -2.0]])
 
 

@@ -1,25 +1,35 @@
 """Physics backends behind one interface."""
 
+import importlib.util
+
 import mujoco
 
 from lerobot_vtrefine.sim.backends.base import Backend, Trace
 from lerobot_vtrefine.sim.backends.batch import BatchBackend
 from lerobot_vtrefine.sim.backends.single import SingleBackend
-from lerobot_vtrefine.sim.config import BACKENDS
+from lerobot_vtrefine.sim.config import BACKENDS, WarpConfig
 
 __all__ = ["Backend", "Trace", "get_backend"]
 
+INSTALL = "pip install 'lerobot_policy_vtrefine[gpu]'"
 
-def get_backend(name: str, model: mujoco.MjModel, num_envs: int, num_threads: int = 0) -> Backend:
-    """Create `num_envs` worlds of `model`.
+
+def get_backend(
+    name: str, model: mujoco.MjModel, num_envs: int, num_threads: int = 0, warp: WarpConfig | None = None
+) -> Backend:
+    """Create `num_envs` worlds of `model`; `num_threads` is batch's, `warp` is warp's.
 
     Raises:
-        ValueError: unknown backend, or one that is not built in.
+        ValueError: unknown backend, one that is not installed, or no GPU where one is asked for.
     """
     if name == "single":
         return SingleBackend(model, num_envs)
     if name == "batch":
         return BatchBackend(model, num_envs, num_threads)
     if name == "warp":
-        raise ValueError("backend 'warp' is not available in this version: use single or batch")
+        if importlib.util.find_spec("mujoco_warp") is None:
+            raise ValueError(f"backend 'warp' needs mujoco_warp: {INSTALL}, or use single or batch")
+        from lerobot_vtrefine.sim.backends.warp import WarpBackend  # seconds to import
+
+        return WarpBackend(model, num_envs, warp or WarpConfig())
     raise ValueError(f"unknown backend {name!r}: use one of {', '.join(BACKENDS)}")

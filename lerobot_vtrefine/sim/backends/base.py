@@ -4,12 +4,21 @@ Shapes: N worlds of which m are addressed by sorted ids, K substeps, nq position
 """
 
 from abc import ABC, abstractmethod
+from collections.abc import Callable
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
 import mujoco
 import numpy as np
+import torch
+
+if TYPE_CHECKING:
+    from lerobot_vtrefine.sim.scene import Scene
 
 Array = np.ndarray
+Tensor = torch.Tensor
+TouchReader = Callable[[Array], tuple[tuple[Tensor, Tensor, Tensor, Tensor, Tensor, Tensor], Tensor]]
+"""ids (m,) -> positions, rotations, velocities of pads, the same of parts, and the pads' loads (m, 4, 3)."""
 
 
 @dataclass(frozen=True)
@@ -26,6 +35,8 @@ class Backend(ABC):
     """N worlds of one model, each with its own state and, where asked, its own model fields."""
 
     num_envs: int
+    device: str = "cpu"
+    """Torch device on which sensors are computed."""
 
     @abstractmethod
     def read(self, ids: Array) -> tuple[Array, Array]:
@@ -41,9 +52,21 @@ class Backend(ABC):
     def advance(self, ids: Array, controls: Array) -> Trace:
         """Step worlds once per row of `controls` (m, K, nu)."""
 
+    def advance_linearly(self, ids: Array, start: Array, stop: Array, substeps: int) -> Trace:
+        """Step worlds with commands that move linearly from `start` to `stop` (m, nu), which the last one
+        is.
+        """
+        return self.advance(ids, ramp(start, stop, substeps))
+
     @abstractmethod
-    def geom_poses(self, ids: Array) -> tuple[Array, Array]:
-        """World positions (m, G, 3) and rotations (m, G, 3, 3) of all geoms at the present state."""
+    def geom_poses(self, ids: Array) -> tuple[Array, Array] | tuple[Tensor, Tensor]:
+        """World positions (m, G, 3) and rotations (m, G, 3, 3) of all geoms at the present state; tensors on
+        `device` where the worlds live there.
+        """
+
+    def touch_reader(self, scene: "Scene") -> TouchReader | None:
+        """What reads poses and loads on `device`, where the worlds live there; None: the host has them."""
+        return None
 
     @abstractmethod
     def set_fields(self, ids: Array, fields: dict[str, Array]) -> None:
@@ -54,16 +77,22 @@ class Backend(ABC):
         """(m,) whether MuJoCo has given up on a world since it was last written."""
 
     @abstractmethod
-    def get_row(self, env: int) -> Array:
-        """The complete integration state of one world."""
+    def get_rows(self, ids: Array) -> Array:
+        """The complete integration states of worlds, (m, S)."""
 
     @abstractmethod
-    def set_row(self, env: int, row: Array) -> None:
-        """Restore a state taken by `get_row`."""
+    def set_rows(self, ids: Array, rows: Array) -> None:
+        """Restore states (m, S) taken by `get_rows`."""
 
     @abstractmethod
     def instance(self, env: int) -> tuple[mujoco.MjModel, mujoco.MjData]:
         """Model and data of one world with all derived quantities, for rendering; not live."""
+
+
+def ramp(start: Array, stop: Array, substeps: int) -> Array:
+    """Linear interpolation of commands (m, nu) -> (m, substeps, nu), the last one being `stop`."""
+    weight = (np.arange(substeps) + 1.0) / substeps
+    return start[:, None] + weight[None, :, None] * (stop - start)[:, None]
 
 
 BAD_STATE_WARNINGS = (

@@ -61,14 +61,14 @@ class BatchBackend(Backend):
         numbers = self._batch.warning[ids][:, [int(w) for w in BAD_STATE_WARNINGS], 1]
         return (numbers > 0).any(1)
 
-    def get_row(self, env: int) -> Array:
-        """See `Backend.get_row`."""
-        return self._batch.state[env].copy()
+    def get_rows(self, ids: Array) -> Array:
+        """See `Backend.get_rows`."""
+        return self._batch.state[ids].copy()
 
-    def set_row(self, env: int, row: Array) -> None:
-        """See `Backend.set_row`."""
-        self._batch.state[env] = row
-        self._batch.warning[env] = 0  # else a world that once diverged would count as diverged for ever
+    def set_rows(self, ids: Array, rows: Array) -> None:
+        """See `Backend.set_rows`."""
+        self._batch.state[ids] = rows
+        self._batch.warning[ids] = 0  # else a world that once diverged would count as diverged for ever
 
     def instance(self, env: int) -> tuple[mujoco.MjModel, mujoco.MjData]:
         """See `Backend.instance`."""

@@ -46,7 +46,7 @@ class SingleBackend(Backend):
         """See `Backend.geom_poses`."""
         poses = []
         for i in ids:
-            scratch = self._copy(i)
+            scratch = self._copy(int(i))
             mujoco.mj_kinematics(self._models[i], scratch)
             poses.append((scratch.geom_xpos, scratch.geom_xmat.reshape(-1, 3, 3)))
         return np.stack([pose[0] for pose in poses]), np.stack([pose[1] for pose in poses])
@@ -63,17 +63,19 @@ class SingleBackend(Backend):
         """See `Backend.diverged`."""
         return np.array([any(self._data[i].warning[w].number for w in BAD_STATE_WARNINGS) for i in ids], bool)
 
-    def get_row(self, env: int) -> Array:
-        """See `Backend.get_row`."""
-        row = np.empty(mujoco.mj_stateSize(self._models[env], _STATE))
-        mujoco.mj_getState(self._models[env], self._data[env], row, _STATE)
-        return row
+    def get_rows(self, ids: Array) -> Array:
+        """See `Backend.get_rows`."""
+        rows = np.empty((len(ids), mujoco.mj_stateSize(self._models[0], _STATE)))
+        for row, i in zip(rows, ids, strict=True):
+            mujoco.mj_getState(self._models[i], self._data[i], row, _STATE)
+        return rows
 
-    def set_row(self, env: int, row: Array) -> None:
-        """See `Backend.set_row`."""
-        mujoco.mj_setState(self._models[env], self._data[env], row, _STATE)
-        for warning in self._data[env].warning:
-            warning.number = 0
+    def set_rows(self, ids: Array, rows: Array) -> None:
+        """See `Backend.set_rows`."""
+        for row, i in zip(rows, ids, strict=True):
+            mujoco.mj_setState(self._models[i], self._data[i], row, _STATE)
+            for warning in self._data[i].warning:
+                warning.number = 0
 
     def instance(self, env: int) -> tuple[mujoco.MjModel, mujoco.MjData]:
         """See `Backend.instance`."""
@@ -84,5 +86,5 @@ class SingleBackend(Backend):
     def _copy(self, env: int) -> mujoco.MjData:
         """A scratch copy, because deriving quantities in place would disturb the next step's warm start."""
         scratch = mujoco.MjData(self._models[env])
-        mujoco.mj_setState(self._models[env], scratch, self.get_row(env), _STATE)
+        mujoco.mj_setState(self._models[env], scratch, self.get_rows(np.array([env]))[0], _STATE)
         return scratch

@@ -1,0 +1,198 @@
+"""Worlds of one model on mujoco_warp: step, and nothing else. Imports warp and mujoco_warp.
+
+Shapes: N worlds, K substeps, nq positions, nv velocities, nu servos, ns sensor readings.
+"""
+
+import copy
+
+import mujoco
+import mujoco_warp as mjw
+import numpy as np
+import torch
+import warp as wp
+
+from lerobot_vtrefine.sim.backends import warp_kernels as kernels
+from lerobot_vtrefine.sim.config import WarpConfig
+from lerobot_vtrefine.tactile.contact_query import start_warp
+
+CONTACTS, ROWS = "contacts_per_world", "rows_per_world"
+OVERFLOWS = {
+    mjw.OverflowType.NEFC: ("constraint rows", ROWS),
+    mjw.OverflowType.NJMAX_NNZ: ("entries of the constraint Jacobian", ROWS),
+    mjw.OverflowType.BROADPHASE: ("pairs of geoms that may touch", CONTACTS),
+    mjw.OverflowType.NARROWPHASE: ("contacts", CONTACTS),
+    mjw.OverflowType.CCD: ("contacts of convex shapes", CONTACTS),
+    mjw.OverflowType.CONTACT_MATCH: ("contacts of one contact sensor", None),
+    mjw.OverflowType.EPA_HORIZON: ("edges while measuring a penetration", None),
+}
+"""Buffers that can be too small -> what they hold and the setting that sizes them."""
+
+
+def choose_device(name: str) -> str:
+    """Torch device for `WarpConfig.device`.
+
+    Raises:
+        ValueError: a GPU is asked for and there is none.
+    """
+    start_warp()
+    if name == "auto":
+        return "cuda:0" if wp.is_cuda_available() else "cpu"
+    if name != "cpu" and not wp.is_cuda_available():
+        raise ValueError(f"warp.device = {name!r}: no CUDA GPU with a driver here; use cpu or auto")
+    return str(wp.get_device(name).alias)
+
+
+class WarpWorlds:
+    """N worlds; every array is a torch view of mujoco_warp's own memory.
+
+    Args:
+        model: compiled scene.
+        num_envs: N.
+        config: device and sizes of the buffers.
+    """
+
+    def __init__(self, model: mujoco.MjModel, num_envs: int, config: WarpConfig) -> None:
+        self.device = choose_device(config.device)
+        self.num_envs, self._config = num_envs, config
+        with wp.ScopedDevice(self.device):
+            self.model = mjw.put_model(_with_primitive_boxes(model))
+            _set_options(self.model, config)
+            self.data = mjw.make_data(
+                model, num_envs, nconmax=config.contacts_per_world, njmax=config.rows_per_world
+            )
+        data = self.data
+        self.qpos, self.qvel = wp.to_torch(data.qpos), wp.to_torch(data.qvel)
+        self.warmstart, self.time = wp.to_torch(data.qacc_warmstart), wp.to_torch(data.time)
+        self.sensors, self.overflow = wp.to_torch(data.sensordata), wp.to_torch(data.overflow)
+        self._diverged = wp.zeros(num_envs, dtype=int, device=self.device)
+        self.diverged = wp.to_torch(self._diverged)
+        self._widths = (model.nq, model.nsensordata, model.nu)
+        self._graph: wp.Graph | None = None
+        self._capture = _can_capture(self.device)
+        self._reserve(1)
+
+    def _reserve(self, substeps: int) -> None:
+        """Room for the trace and the commands of so many substeps."""
+        positions, readings, servos = self._widths
+        shape = (self.num_envs, substeps)
+        self._trace = kernels.Trace()
+        self._trace.cursor = wp.zeros(1, dtype=int, device=self.device)
+        self._trace.qpos = wp.zeros((*shape, positions), dtype=float, device=self.device)
+        self._trace.sensors = wp.zeros((*shape, readings), dtype=float, device=self.device)
+        self.controls = wp.zeros((*shape, servos), dtype=float, device=self.device)
+        self._room, self._graph = substeps, None
+
+    def reserve(self, substeps: int) -> None:
+        """Make room for `substeps` where there is less."""
+        if substeps > self._room:
+            self._reserve(substeps)
+
+    def run(self, substeps: int) -> tuple[torch.Tensor, torch.Tensor]:
+        """Step all worlds with `controls`.
+
+        Returns:
+            Views of positions (N, K, nq) and readings (N, K, ns), valid until the next call.
+        """
+        self._trace.cursor.zero_()
+        self.overflow.zero_()
+        with wp.ScopedDevice(self.device):
+            for _ in range(substeps):
+                self._substep()
+        trace = self._trace
+        return wp.to_torch(trace.qpos)[:, :substeps], wp.to_torch(trace.sensors)[:, :substeps]
+
+    def _substep(self) -> None:
+        if self._graph is not None:
+            wp.capture_launch(self._graph)
+            return
+        self._launch_substep()
+        if self._capture:
+            # Every kernel is loaded by now, which could not happen during the capture.
+            with wp.ScopedCapture(force_module_load=False) as capture:
+                self._launch_substep()
+            self._graph = capture.graph
+
+    def _launch_substep(self) -> None:
+        data, trace = self.data, self._trace
+        positions, readings, servos = self._widths
+        wp.launch(kernels.give_controls, (self.num_envs, servos), [trace.cursor, self.controls], [data.ctrl])
+        mjw.step(self.model, data)
+        wp.launch(kernels.record, (self.num_envs, positions + readings), [data.qpos, data.sensordata, trace])
+        state = [data.qpos, data.qvel, data.qacc_warmstart]
+        wp.launch(kernels.guard, self.num_envs, [self.model.qpos0, *state, self._diverged, trace.cursor])
+
+    def check_overflow(self, flags: int) -> None:
+        """Raise for a bit set of `mjw.OverflowType`.
+
+        Raises:
+            RuntimeError: a buffer was too small, so that contacts were lost.
+        """
+        for flag, (what, setting) in OVERFLOWS.items():
+            if flags & int(flag):
+                size = f" (now {getattr(self._config, setting)})" if setting else ""
+                remedy = (
+                    f"raise warp.{setting}{size}" if setting else "use --env.backend=batch for this scene"
+                )
+                raise RuntimeError(f"mujoco_warp ran out of room for {what}, contacts were lost: {remedy}")
+
+    def index(self, ids: np.ndarray) -> torch.Tensor:
+        """World numbers (m,) int32 on the device."""
+        return torch.as_tensor(np.ascontiguousarray(ids, np.int32), device=self.device)
+
+    def set_field(self, name: str, ids: torch.Tensor, values: torch.Tensor) -> None:
+        """Give worlds their own values (m, ...) of a model field; call `derive` afterwards."""
+        view = wp.to_torch(self._own_field(name))
+        view[ids] = values.to(view).reshape(len(ids), *view.shape[1:])
+
+    def derive(self) -> None:
+        """Recompute the constants that follow from model fields."""
+        with wp.ScopedDevice(self.device):
+            for name in DERIVED:
+                self._own_field(name)
+            mjw.set_const(self.model, self.data, restore=False)
+
+    def _own_field(self, name: str) -> wp.array:
+        """A model field with one row per world."""
+        shared = getattr(self.model, name)
+        if len(shared) == self.num_envs and shared.strides[0] != 0:
+            return shared
+        with wp.ScopedDevice(self.device):
+            own = wp.from_torch(
+                wp.to_torch(shared)[:1].repeat(self.num_envs, *[1] * (wp.to_torch(shared).ndim - 1)),
+                dtype=shared.dtype,
+            )
+        setattr(self.model, name, own)
+        self._graph = None
+        return own
+
+    def kinematics(self) -> None:
+        """Bring poses and velocities of bodies and geoms up to the present state."""
+        with wp.ScopedDevice(self.device):
+            mjw.kinematics(self.model, self.data)
+            mjw.com_pos(self.model, self.data)
+            mjw.com_vel(self.model, self.data)
+
+
+DERIVED = ("body_subtreemass", "body_invweight0", "dof_invweight0", "geom_aabb", "geom_rbound")
+"""Fields that `mjw.set_const` writes and that may differ between worlds."""
+
+
+def _with_primitive_boxes(model: mujoco.MjModel) -> mujoco.MjModel:
+    """A copy that makes mujoco_warp collide boxes as MuJoCo does: up to 8 contacts instead of 4.
+
+    With 4 the contacts' centre, and so the pads' reading, lies up to 6 mm elsewhere. mujoco_warp uses the
+    flag for nothing else.
+    """
+    own = copy.copy(model)
+    own.opt.disableflags |= int(mujoco.mjtDisableBit.mjDSBL_NATIVECCD)
+    return own
+
+
+def _set_options(model: mjw.Model, config: WarpConfig) -> None:
+    model.opt.warn_overflow = 0  # the flags are read after every call; printing would stall a GPU
+    model.opt.graph_conditional = wp.is_conditional_graph_supported()
+
+
+def _can_capture(device: str) -> bool:
+    """Whether substeps can become a CUDA graph: allocations inside one need the memory pool."""
+    return wp.get_device(device).is_cuda and wp.is_mempool_enabled(device)
