@@ -1,7 +1,7 @@
 """Read a recording set: a folder with `recording.json` and a Parquet file per trial (contract §1)."""
 
 import json
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -72,8 +72,11 @@ class RecordingSet:
     """Trial or RobotTrial, by kind."""
 
 
-def read_recording_set(path: str | Path) -> RecordingSet:
+def read_recording_set(path: str | Path, *, measured: bool = True) -> RecordingSet:
     """Read and check a folder as in contract §1.
+
+    Without `measured`, what a prediction must not see is not even opened: `raw` comes out with no columns (N,
+    0), and every row of `position` repeats the first.
 
     Raises ValueError (FileNotFoundError for a missing folder or file): one line that names file, trial,
     column and problem. Values are not judged here, see `quality`.
@@ -95,11 +98,13 @@ def read_recording_set(path: str | Path) -> RecordingSet:
     default = header.get("object")
     trials: list[Trial | RobotTrial] = []
     for index, entry in enumerate(header["trials"]):
-        table = _Table(folder, header_path, index, entry)
+        table = _Table(folder, header_path, index, entry, without=() if measured else ("raw",))
         if header["kind"] == "pad":
-            trials.append(_pad_trial(table, entry.get("object", default), rows * cols))
+            trials.append(_pad_trial(table, entry.get("object", default), rows * cols if measured else 0))
         else:
-            trials.append(_robot_trial(table, len(joints)))
+            trial = _robot_trial(table, len(joints))
+            first = np.repeat(trial.position[:1], len(trial.position), axis=0)
+            trials.append(trial if measured else replace(trial, position=first))
     return RecordingSet(folder, header["kind"], rows, cols, pitch_m, unit, full_scale, joints, tuple(trials))
 
 
@@ -196,14 +201,23 @@ def check_object(where: str, spec: Any, folder: Path) -> dict[str, Any]:
 class _Table:
     """One trial's Parquet file, with errors that say where the problem is."""
 
-    def __init__(self, folder: Path, header_path: Path, index: int, entry: dict[str, Any]) -> None:
+    def __init__(
+        self,
+        folder: Path,
+        header_path: Path,
+        index: int,
+        entry: dict[str, Any],
+        without: tuple[str, ...] = (),
+    ) -> None:
         self.folder, self.entry, self.index = folder, entry, index
         self.file = folder / entry["file"]
         self.where = f"{self.file}: trial {index}"
         if not self.file.is_file():
             raise FileNotFoundError(f"{self.file}: no such file (trial {index} of {header_path})")
         try:
-            self.table = pq.read_table(self.file, memory_map=False)
+            names = pq.read_schema(self.file).names
+            kept = [name for name in names if name not in without] if without else None
+            self.table = pq.read_table(self.file, columns=kept, memory_map=False)
         except (pa.ArrowInvalid, pa.ArrowException, OSError) as error:
             raise ValueError(
                 f"{self.where}: not a readable Parquet file ({str(error).splitlines()[0]})"
@@ -300,7 +314,7 @@ def _pad_trial(table: _Table, spec: Any, taxels: int) -> Trial:
         tilt_y_rad=zeros if tilt_y is None else tilt_y,
         force_n=force,
         temperature_c=table.optional("temperature_c"),
-        raw=table.rows("raw", taxels),
+        raw=table.rows("raw", taxels) if taxels else np.zeros((len(zeros), 0)),
     )
 
 

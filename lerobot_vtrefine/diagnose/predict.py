@@ -1,0 +1,87 @@
+"""What a saved model predicts for recordings whose readings it has not seen (``vtrefine-predict``)."""
+
+import json
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pyarrow as pa
+import pyarrow.parquet as pq
+
+from lerobot_vtrefine.diagnose.prediction import predict_trial
+from lerobot_vtrefine.diagnose.recordings import RecordingSet, RobotTrial, Trial
+from lerobot_vtrefine.diagnose.robot import model as robot_model
+from lerobot_vtrefine.tactile import model as sensor_model
+from lerobot_vtrefine.tactile.layout import PadLayout
+
+Predict = Callable[[Any], np.ndarray]
+"""From a trial to its prediction, a row per frame."""
+
+
+def load_predictor(path: str | Path, recordings: RecordingSet) -> Predict:
+    """The model in a file, applied to trials of this set.
+
+    Raises:
+        ValueError: the file is no model, or one of the other kind (pad, robot); names the file.
+    """
+    try:
+        data = json.loads(Path(path).read_text(encoding="utf-8"))
+    except ValueError as error:
+        raise ValueError(f"{path}: not valid JSON ({error})") from error
+    schema = data.get("schema") if isinstance(data, dict) else None
+    wanted = {"pad": sensor_model.SCHEMA, "robot": robot_model.SCHEMA}[recordings.kind]
+    if schema != wanted:
+        raise ValueError(f'{path}: {recordings.kind} recordings need a model of "{wanted}", not {schema!r}')
+    if recordings.kind == "robot":
+        robot = robot_model.RobotModel.load(path)
+        return lambda trial: robot_model.predict_positions(robot, trial)
+    sensor = sensor_model.SensorModel.load(path)
+    layout = PadLayout(recordings.rows, recordings.cols, recordings.pitch_m)
+    return lambda trial: predict_trial(sensor, trial, layout)
+
+
+def sound_frames(trial: Trial | RobotTrial) -> np.ndarray:
+    """Frames that a model can be run through: finite inputs, each later than all before it (N,) bool."""
+    if isinstance(trial, RobotTrial):
+        inputs = [trial.time_s, trial.command]
+    else:
+        drive = trial.force_n if trial.depth_m is None else trial.depth_m
+        inputs = [trial.time_s, trial.x_m, trial.y_m, trial.tilt_x_rad, trial.tilt_y_rad]
+        inputs += [] if drive is None else [drive]
+    finite = np.all([np.isfinite(values.reshape(len(values), -1)).all(axis=1) for values in inputs], axis=0)
+    latest = np.maximum.accumulate(np.where(finite, trial.time_s, -np.inf))
+    return finite & (trial.time_s > np.concatenate([[-np.inf], latest[:-1]]))
+
+
+def predict_frames(trial: Trial | RobotTrial, predict: Predict) -> np.ndarray:
+    """A prediction for every recorded frame (N, K), also for repeated and broken ones.
+
+    The model runs through the sound frames; the others take over the one before them.
+
+    Raises:
+        ValueError: the trial has no sound frame; names the trial and the columns.
+    """
+    sound = sound_frames(trial)
+    if not sound.any():
+        columns = "command" if isinstance(trial, RobotTrial) else "depth_m or force_n"
+        raise ValueError(f"{trial.file}: columns time_s and {columns}: no frame has numbers in all of them")
+    shared = {
+        name: value[sound]
+        for name, value in vars(trial).items()
+        if isinstance(value, np.ndarray) and len(value) == len(sound)
+    }
+    values = predict(type(trial)(**{**vars(trial), **shared}))
+    before = np.maximum(np.cumsum(sound) - 1, 0)
+    return values[before]
+
+
+def write_prediction(
+    path: Path, recordings: RecordingSet, trial: Trial | RobotTrial, values: np.ndarray
+) -> None:
+    """A Parquet file with ``time_s`` and the predicted ``raw`` (pads) or ``position`` (robots)."""
+    name = "position" if recordings.kind == "robot" else "raw"
+    flat = pa.array(values.ravel(), type=pa.float64())
+    rows = pa.FixedSizeListArray.from_arrays(flat, values.shape[1]).cast(pa.list_(pa.float64()))
+    path.parent.mkdir(parents=True, exist_ok=True)
+    pq.write_table(pa.table({"time_s": trial.time_s, name: rows}), path)
