@@ -16,13 +16,9 @@ from lerobot_vtrefine.datasets.features import PAD_COLS, PAD_ROWS, PADS
 from lerobot_vtrefine.drivers.dynamixel_arm import VIPERX_300S, DynamixelArm, Floats
 from lerobot_vtrefine.drivers.pad_set import PadSet
 from lerobot_vtrefine.embodiments import get_embodiment
+from lerobot_vtrefine.robots.camera_models import CameraModels
 from lerobot_vtrefine.robots.config_aloha_tactile_follower import AlohaTactileFollowerConfig
-from lerobot_vtrefine.robots.pad_features import (
-    camera_features,
-    camera_observation,
-    configured_pads,
-    pad_features,
-)
+from lerobot_vtrefine.robots.pad_features import configured_pads, pad_features
 from lerobot_vtrefine.robots.pad_reading import pad_observation
 
 logger = logging.getLogger(__name__)
@@ -52,6 +48,7 @@ class AlohaTactileFollower(Robot):
         self.arms = {name: DynamixelArm(name, port, VIPERX_300S, travel_m) for name, port in ports.items()}
         self.pads = PadSet(aloha_pads(config))
         self.cameras = make_cameras_from_configs(config.cameras)
+        self._camera_models = CameraModels(config.camera_models, self.cameras)
         self._give_calibration()
 
     # --- features -----------------------------------------------------------------------------------
@@ -63,7 +60,7 @@ class AlohaTactileFollower(Robot):
             **self.action_features,
             **self._camera_features,
             **pad_features(self.pads.configs),
-            **camera_features(self.config.camera_models),
+            **self._camera_models.features,
         }
 
     @cached_property
@@ -75,7 +72,9 @@ class AlohaTactileFollower(Robot):
     def _camera_features(self) -> dict[str, tuple[int, int, int]]:
         features: dict[str, tuple[int, int, int]] = {}
         for name, camera in self.config.cameras.items():
-            height, width = camera.height or 0, camera.width or 0
+            if not (camera.height and camera.width):
+                raise ValueError(f"camera {name} needs its size: width, height and fps in --robot.cameras")
+            height, width = camera.height, camera.width
             if getattr(camera, "use_rgb", True):
                 features[name] = (height, width, 3)
             if getattr(camera, "use_depth", False):
@@ -105,6 +104,7 @@ class AlohaTactileFollower(Robot):
                 self.calibrate()
             for camera in self.cameras.values():
                 camera.connect()
+            self._camera_models.connected()
             if self.is_calibrated:
                 self.configure()
             else:
@@ -189,7 +189,7 @@ class AlohaTactileFollower(Robot):
                 values[name] = camera.read_latest()
             if getattr(camera, "use_depth", False):
                 values[f"{name}_depth"] = camera.read_latest_depth()  # ty: ignore[missing-attribute]
-        return values | camera_observation(self.config.camera_models, self.cameras)
+        return self._camera_models.observe(values)
 
     @check_if_not_connected
     def send_action(self, action: RobotAction) -> RobotAction:

@@ -7,7 +7,7 @@ from lerobot.cameras.configs import CameraConfig
 from lerobot.robots.config import RobotConfig
 
 from lerobot_vtrefine.drivers.config import PadConfig
-from lerobot_vtrefine.robots.pad_features import CameraModel
+from lerobot_vtrefine.robots.camera_models import CameraModel
 
 
 @RobotConfig.register_subclass("aloha_tactile_follower")

@@ -12,13 +12,9 @@ from lerobot.utils.decorators import check_if_already_connected, check_if_not_co
 
 from lerobot_vtrefine.datasets import arrays
 from lerobot_vtrefine.drivers.pad_set import PadSet
+from lerobot_vtrefine.robots.camera_models import CameraModels
 from lerobot_vtrefine.robots.config_tactile import TactileConfig
-from lerobot_vtrefine.robots.pad_features import (
-    camera_features,
-    camera_observation,
-    configured_pads,
-    pad_features,
-)
+from lerobot_vtrefine.robots.pad_features import configured_pads, pad_features
 from lerobot_vtrefine.robots.pad_reading import pad_observation
 
 
@@ -34,6 +30,7 @@ class Tactile(Robot):
         self.config = config
         self.base = make_robot_from_config(base_config(config))
         self.pads = PadSet(configured_pads(config.pads, config.pads_file))
+        self._camera_models = CameraModels(config.camera_models, self.cameras)
         self.robot_type = f"{self.name}_{self.base.name}"
 
     @property
@@ -44,7 +41,7 @@ class Tactile(Robot):
     @cached_property
     def observation_features(self) -> dict[str, Any]:
         """The base robot's, the pads' and the camera models'."""
-        own = pad_features(self.pads.configs) | camera_features(self.config.camera_models)
+        own = pad_features(self.pads.configs) | self._camera_models.features
         clashing = sorted(set(own) & set(self.base.observation_features))
         if clashing:
             raise ValueError(f"the base robot already has {', '.join(clashing)}; choose other pad names")
@@ -70,8 +67,9 @@ class Tactile(Robot):
         self.pads.connect()
         try:
             self.base.connect(calibrate)
+            self._camera_models.connected()
         except BaseException:
-            self.pads.disconnect()
+            self.disconnect()
             raise
 
     @property
@@ -105,7 +103,7 @@ class Tactile(Robot):
         """Pads first, at one moment with the joints; images, which take longest to fetch, after them."""
         values = pad_observation(self.pads)
         values |= self.base.get_observation()
-        return values | camera_observation(self.config.camera_models, self.cameras)
+        return self._camera_models.observe(values)
 
     @check_if_not_connected
     def send_action(self, action: RobotAction) -> RobotAction:

@@ -27,6 +27,13 @@ class StubArmConfig(RobotConfig):
     port: str = "none"
 
 
+class StubCamera:
+    """Somebody else's depth camera, which does not know its intrinsics."""
+
+    use_depth = True
+    config = None
+
+
 class StubArm(Robot):
     """A robot of somebody else's, with one joint."""
 
@@ -38,6 +45,7 @@ class StubArm(Robot):
     def __init__(self, config: StubArmConfig) -> None:
         super().__init__(config)
         self.position = 0.25
+        self.cameras = {"top": StubCamera()}
 
     @property
     def action_features(self) -> dict[str, Any]:

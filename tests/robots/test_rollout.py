@@ -1,0 +1,112 @@
+"""From emulated hardware to a policy that moves it, by LeRobot's own commands: record, train, roll out."""
+
+import signal
+from collections.abc import Generator
+from pathlib import Path
+
+import numpy as np
+import pytest
+from commands import dataset_flags, flags, follower_flags, leader_flags, run_command
+from lerobot.datasets.lerobot_dataset import LeRobotDataset
+from realsense import INTRINSICS, FakeDepthCamera, camera_flag, plug_in
+from rig import Rig, allow_slow_answers, aloha_rig
+
+from lerobot_vtrefine.datasets.features import (
+    CAMERA_POSE_KEY,
+    DEPTH_KEY,
+    INTRINSICS_KEY,
+    STATE_KEY,
+    TACTILE_KEYS,
+)
+from lerobot_vtrefine.drivers.sources import check_pattern
+from lerobot_vtrefine.robots.aloha_tactile_follower import AlohaTactileFollower
+
+FPS = 15
+POSE = [0.0, 0.0, 0.75, 0.0, 1.0, 0.0, 0.0]
+CAMERA = FakeDepthCamera()
+
+
+@pytest.fixture
+def rig(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Generator[Rig]:
+    allow_slow_answers(monkeypatch)
+    plug_in(monkeypatch, CAMERA)
+    handlers = {number: signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM)}
+    with aloha_rig(tmp_path) as built:
+        yield built
+    for number, handler in handlers.items():  # lerobot-rollout sets its own
+        signal.signal(number, handler)
+
+
+def robot_flags(rig: Rig) -> list[str]:
+    camera = flags(robot__cameras=camera_flag(CAMERA), robot__camera_models=f"{{front: {{pose: {POSE}}}}}")
+    return [*follower_flags(rig), *camera]
+
+
+def record(rig: Rig, root: Path, patch: pytest.MonkeyPatch) -> LeRobotDataset:
+    for number in (1, 6):
+        rig.motor("leader", "left", number).shaft = 2048 + 100
+    command = [*robot_flags(rig), *leader_flags(rig), *dataset_flags(root, 1, 2.0, FPS)]
+    run_command(patch, "record", command)
+    return LeRobotDataset("local/emulated", root=root)
+
+
+def train(root: Path, output: Path, patch: pytest.MonkeyPatch) -> Path:
+    run = flags(
+        dataset__repo_id="local/emulated",
+        dataset__root=root,
+        policy__type="vt_dp3",
+        policy__preset="small",
+        policy__point_dims="[8,16]",
+        policy__down_dims="[32,32]",
+        policy__n_action_steps=4,
+        policy__observation__num_visual_points=16,
+        policy__device="cpu",
+        policy__push_to_hub="false",
+        output_dir=output,
+        batch_size=4,
+        num_workers=0,
+        steps=20,
+        save_freq=20,
+        wandb__enable="false",
+    )
+    run_command(patch, "train", run)
+    return output / "checkpoints" / "last" / "pretrained_model"
+
+
+def test_record_train_and_roll_out_on_the_same_robot(
+    rig: Rig, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("HF_HUB_OFFLINE", "1")
+    dataset = record(rig, tmp_path / "dataset", monkeypatch)
+    frame = dataset[len(dataset) // 2]
+    assert frame[INTRINSICS_KEY].tolist() == list(INTRINSICS.values())
+    assert frame[CAMERA_POSE_KEY].tolist() == POSE
+    assert frame[DEPTH_KEY].shape == (1, 24, 32)
+    assert frame[DEPTH_KEY][0, 1:, 0].tolist() == list(range(1, 24))  # millimetres, exactly
+    assert all(check_pattern(frame[key].numpy().astype(np.uint8)) is not None for key in TACTILE_KEYS)
+    checkpoint = train(tmp_path / "dataset", tmp_path / "run", monkeypatch)
+
+    sent: list[dict[str, float]] = []
+    original = AlohaTactileFollower.send_action
+
+    def noting(robot: AlohaTactileFollower, action: dict[str, float]) -> dict[str, float]:
+        sent.append(original(robot, action))
+        return sent[-1]
+
+    monkeypatch.setattr(AlohaTactileFollower, "send_action", noting)
+    arguments = flags(
+        policy__path=checkpoint,
+        policy__device="cpu",
+        strategy__type="base",
+        duration=2,
+        fps=FPS,
+        task="insert the plug",
+        return_to_initial_position="false",
+    )
+    run_command(monkeypatch, "rollout", [*robot_flags(rig), *arguments])
+    assert len(sent) >= 8
+    moved = np.array([list(action.values()) for action in sent])
+    assert list(sent[0]) == [f"{name}" for name in dataset.meta.features[STATE_KEY]["names"]]
+    assert np.isfinite(moved).all()
+    assert 0 <= moved[:, 0].max() <= 0.2  # the waist was moved by 0.153 rad while recording
+    assert not any(rig.motor("follower", side, 1).torque for side in ("left", "right"))
