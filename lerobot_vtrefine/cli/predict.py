@@ -1,0 +1,72 @@
+"""``vtrefine-predict``: what a model predicts for recordings, without looking at their readings.
+
+``vtrefine-predict --recording=DIR --sensor_model=OUT/sensor_model.json --output_dir=PREDICTED``
+"""
+
+from collections.abc import Sequence
+from pathlib import Path
+
+from tqdm import tqdm
+
+from lerobot_vtrefine.cli.arguments import OneLineParser
+from lerobot_vtrefine.cli.errors import run_cli
+from lerobot_vtrefine.cli.outputs import staged
+
+DESCRIPTION = """\
+Replay each trial's motion through a saved model and write what it predicts.
+
+Pads: the trial's motion (or load) goes through the simulator's own sensor code; the trial's raw
+readings are never opened, and may be absent. Robots: its commands go through the servo model; of
+its positions only the first is used."""
+EPILOG = """\
+Result: a Parquet file of each trial's name, with time_s and the predicted raw (or position), a row
+per recorded frame. Noise and rounding are left out: the mean is what predicts best.
+
+example:
+  vtrefine-diagnose --recording=presses --output_dir=diagnosis
+  vtrefine-predict --recording=other_presses --sensor_model=diagnosis/sensor_model.json \\
+      --output_dir=predicted"""
+
+
+def make_parser() -> OneLineParser:
+    """Command line of ``vtrefine-predict``."""
+    parser = OneLineParser("vtrefine-predict", DESCRIPTION, EPILOG)
+    parser.add_argument(
+        "--recording", type=Path, required=True, metavar="DIR", help="folder with recording.json"
+    )
+    parser.add_argument(
+        "--sensor_model",
+        type=Path,
+        required=True,
+        metavar="FILE",
+        help="sensor_model.json or baseline_model.json of a diagnosis, or any sensor model",
+    )
+    parser.add_argument(
+        "--output_dir", type=Path, required=True, metavar="DIR", help="folder for the predictions"
+    )
+    parser.add_argument("--overwrite", action="store_true", help="replace predictions that are there already")
+    return parser
+
+
+@run_cli
+def main(arguments: Sequence[str] | None = None) -> None:
+    """Console entry point."""
+    options = make_parser().parse_args(arguments)
+    if options.output_dir.resolve() == options.recording.resolve():
+        raise ValueError("--output_dir is the folder of the recordings, which predictions would replace")
+    from lerobot_vtrefine.diagnose.predict import load_predictor, predict_frames, write_prediction
+    from lerobot_vtrefine.diagnose.recordings import read_recording_set
+
+    recordings = read_recording_set(options.recording, measured=False)
+    predict = load_predictor(options.sensor_model, recordings)
+    names = [trial.file for trial in recordings.trials]
+    if outside := [name for name in names if ".." in Path(name).parts or Path(name).is_absolute()]:
+        raise ValueError(f"{options.recording}: trial file {outside[0]} lies outside of the folder")
+    with staged(options.output_dir, names, overwrite=options.overwrite) as folder:
+        for trial in tqdm(recordings.trials, desc="predict", unit="trial"):
+            write_prediction(folder / trial.file, recordings, trial, predict_frames(trial, predict))
+    print(f"wrote {len(names)} predictions to {options.output_dir}")
+
+
+if __name__ == "__main__":
+    raise SystemExit(main())
