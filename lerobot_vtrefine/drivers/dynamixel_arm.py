@@ -27,12 +27,14 @@ Floats = NDArray[np.float64]
 COUNTS_PER_TURN = 4096
 CENTRE = COUNTS_PER_TURN // 2
 GRIPPER = "gripper"
-NO_SECONDARY_ID = 255
 
 RETRIES = 2
 """Repeated tries of a bus transaction: single packets do get lost."""
 
 MOVE_RATE_HZ = 50.0
+
+FULL_PWM = 885
+"""Full voltage in PWM registers (ROBOTIS e-Manual, X series)."""
 
 _X540_MA = 2.69
 """Milliamperes per count of current registers (ROBOTIS e-Manual, XM430 and XM540)."""
@@ -147,7 +149,7 @@ class DynamixelArm:
         if all(model is None for model in models.values()):
             return (
                 f"no motor answers at {self.bus.default_baudrate} baud: switch on the arm's power, and check "
-                "that this is its port, and the motors' baud rate (lerobot-setup-motors sets it)"
+                "that this is its port, and the motors' ids and baud rate (lerobot-setup-motors sets them)"
             )
         missing = [
             f"{name} (id {self.bus.motors[name].id})" for name, model in models.items() if model is None
@@ -226,28 +228,44 @@ class DynamixelArm:
 
     # --- set-up -------------------------------------------------------------------------------------
 
-    def configure(self, gripper_current_ma: float | None) -> None:
-        """Sets shadows, modes and limits with torque off.
-
-        Joints are held by the motors themselves within the calibrated limits (position mode). The gripper's
-        force is limited by its current.
+    def setup_motors(self, ask: Callable[[str], str]) -> None:
+        """Gives every motor its id and baud rate, from the last one on; each must be alone on the bus meanwhile.
 
         Args:
-            gripper_current_ma: Current limit of the gripper's motor [mA]; None for a leader, which is never
-                driven.
+            ask: Shows a text, returns what the operator typed.
+        """
+        for name in reversed(self.bus.motors):
+            ask(f"{self.name} arm: connect motor {name} alone, and press ENTER: ")
+            self.bus.setup_motor(name)
+            logger.info("%s arm: %s has id %d", self.name, name, self.bus.motors[name].id)
+        self.disconnect(torque_off=False)
+
+    def set_up(self) -> None:
+        """Switches torque off and sets what leader and follower share: shadows, and answers without delay."""
+        self.bus.disable_torque(num_retry=RETRIES)
+        for shadow, _, _, motor in self.model.shadows:
+            self.bus.write("Secondary_ID", shadow, self.bus.motors[motor].id, num_retry=RETRIES)
+        self.bus.configure_motors()
+
+    def configure(self, gripper_current_ma: float, torque_limit: float) -> None:
+        """Sets shadows, modes and limits of a driven arm, with torque off.
+
+        Joints are held by the motors themselves within the calibrated limits (position mode), with a torque
+        that their PWM limit bounds. The gripper's force is limited by its current.
+
+        Args:
+            gripper_current_ma: Current limit of the gripper's motor [mA].
+            torque_limit: Largest share of the joints' full torque, above 0, at most 1.
         """
         bus = self.bus
-        bus.disable_torque(num_retry=RETRIES)
-        for shadow, _, _, motor in self.model.shadows:
-            bus.write("Secondary_ID", shadow, bus.motors[motor].id, num_retry=RETRIES)
-        bus.configure_motors()
-        if gripper_current_ma is None:
-            return
+        self.set_up()
         for name in self.model.joints:
             bus.write("Operating_Mode", name, OperatingMode.POSITION.value, num_retry=RETRIES)
             limits = self.calibration[name]
             bus.write("Min_Position_Limit", name, limits.range_min, num_retry=RETRIES)
             bus.write("Max_Position_Limit", name, limits.range_max, num_retry=RETRIES)
+        for name in (*self.model.joints, *(shadow for shadow, *_ in self.model.shadows)):
+            bus.write("PWM_Limit", name, round(FULL_PWM * torque_limit), num_retry=RETRIES)
         bus.write("Operating_Mode", GRIPPER, OperatingMode.CURRENT_POSITION.value, num_retry=RETRIES)
         bus.write("Goal_Current", GRIPPER, round(gripper_current_ma / _X540_MA), num_retry=RETRIES)
 

@@ -208,7 +208,13 @@ class DynamixelEmulator:
             if motor.memory[_SECONDARY_ID] == motor_id and motor.motor_id != motor_id:
                 motor.write(address, data)
         motor = self.motors.get(motor_id)
-        return motor.write(address, data) if motor is not None else 0
+        if motor is None:
+            return 0
+        error = motor.write(address, data)
+        if address == _ID and not error:
+            motor.motor_id = data[0]
+            self.motors[motor.motor_id] = self.motors.pop(motor_id)
+        return error
 
     def _listed(self, ids: bytes) -> list[tuple[int, EmulatedMotor]]:
         return [(motor.motor_id, motor) for motor in self._listed_motors(list(ids))]

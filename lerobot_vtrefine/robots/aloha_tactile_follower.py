@@ -13,7 +13,8 @@ from lerobot.utils.decorators import check_if_already_connected, check_if_not_co
 
 from lerobot_vtrefine.datasets import arrays
 from lerobot_vtrefine.datasets.features import PAD_COLS, PAD_ROWS, PADS
-from lerobot_vtrefine.drivers.dynamixel_arm import VIPERX_300S, DynamixelArm, Floats
+from lerobot_vtrefine.drivers.arm_pair import ArmPair
+from lerobot_vtrefine.drivers.dynamixel_arm import VIPERX_300S, Floats
 from lerobot_vtrefine.drivers.pad_set import PadSet
 from lerobot_vtrefine.embodiments import get_embodiment
 from lerobot_vtrefine.robots.camera_models import CameraModels
@@ -44,12 +45,11 @@ class AlohaTactileFollower(Robot):
         self.config = config
         self.body = get_embodiment("aloha")
         travel_m = self.body.fingers.travel_m
-        ports = {"left": config.left_port, "right": config.right_port}
-        self.arms = {name: DynamixelArm(name, port, VIPERX_300S, travel_m) for name, port in ports.items()}
+        self.pair = ArmPair(config.left_port, config.right_port, VIPERX_300S, travel_m)
+        self.pair.calibration = self.calibration
         self.pads = PadSet(aloha_pads(config))
         self.cameras = make_cameras_from_configs(config.cameras)
         self._camera_models = CameraModels(config.camera_models, self.cameras)
-        self._give_calibration()
 
     # --- features -----------------------------------------------------------------------------------
 
@@ -86,8 +86,8 @@ class AlohaTactileFollower(Robot):
     @property
     def is_connected(self) -> bool:
         """Whether arms, pads and cameras are connected."""
-        arms = all(arm.is_connected for arm in self.arms.values())
-        return arms and self.pads.is_connected and all(c.is_connected for c in self.cameras.values())
+        cameras = all(camera.is_connected for camera in self.cameras.values())
+        return self.pair.is_connected and self.pads.is_connected and cameras
 
     @check_if_already_connected
     def connect(self, calibrate: bool = True) -> None:
@@ -98,8 +98,7 @@ class AlohaTactileFollower(Robot):
         """
         try:
             self.pads.connect()
-            for arm in self.arms.values():
-                arm.connect()
+            self.pair.connect()
             if calibrate and not self.is_calibrated:
                 self.calibrate()
             for camera in self.cameras.values():
@@ -116,26 +115,21 @@ class AlohaTactileFollower(Robot):
 
     def configure(self) -> None:
         """Sets modes and limits, then holds the arms where they are; they must be calibrated."""
-        for arm in self.arms.values():
-            arm.configure(self.config.gripper_current_ma)
+        for arm in self.pair.arms.values():
+            arm.configure(self.config.gripper_current_ma, self.config.torque_limit)
             arm.hold()
 
     def disconnect(self) -> None:
         """Moves the arms to rest, switches torque off, releases everything, also after failures."""
         if self.config.rest_on_disconnect:
-            for arm in self.arms.values():
+            for arm in self.pair.arms.values():
                 with contextlib.suppress(ConnectionError, OSError):  # an arm that is gone cannot be moved
                     if arm.is_connected and arm.holding:
                         arm.move_to(np.array([*REST_RAD, *arm.read()[FINGERS]]), self.config.rest_s)
         self._release()
 
     def _release(self) -> None:
-        for arm in self.arms.values():
-            try:
-                arm.disconnect(torque_off=True)
-            except (ConnectionError, OSError) as error:
-                logger.error("%s arm (%s): torque may still be on: %s", arm.name, arm.port, error)
-                arm.bus.port_handler.closePort()
+        self.pair.release(torque_off=True)
         self.pads.disconnect()
         for camera in self.cameras.values():
             if camera.is_connected:
@@ -146,43 +140,32 @@ class AlohaTactileFollower(Robot):
     @property
     def is_calibrated(self) -> bool:
         """Whether both arms are."""
-        return all(arm.is_calibrated for arm in self.arms.values())
+        return self.pair.is_calibrated
 
     def calibrate(self) -> None:
         """Calibrates both arms by hand, or writes the calibration file's values to the motors."""
         if self.calibration and not self._asked_anew():
-            for arm in self.arms.values():
-                arm.bus.disable_torque()
-                arm.write_calibration()
+            self.pair.write_calibration()
             return
-        lower, upper = self.body.lower, self.body.upper
-        for arm in self.arms.values():
-            arm.calibrate(input, lower[:6], upper[:6])
-        self.calibration = {
-            f"{name}_{motor}": entry
-            for name, arm in self.arms.items()
-            for motor, entry in arm.calibration.items()
-        }
+        self.pair.calibrate(input, self.body.lower[:6], self.body.upper[:6])
+        self.calibration = self.pair.calibration
         self._save_calibration()
         logger.info("calibration saved to %s", self.calibration_fpath)
+
+    def setup_motors(self) -> None:
+        """Gives new motors their ids and baud rates, for `lerobot-setup-motors`."""
+        self.pair.setup_motors(input)
 
     def _asked_anew(self) -> bool:
         text = f"Press ENTER to use the calibration of {self.id}, or type c and ENTER to calibrate anew: "
         return input(text).strip().lower() == "c"
-
-    def _give_calibration(self) -> None:
-        for name, arm in self.arms.items():
-            prefix = f"{name}_"
-            entries = self.calibration.items()
-            arm.calibration = {k.removeprefix(prefix): v for k, v in entries if k.startswith(prefix)}
 
     # --- observation and action ---------------------------------------------------------------------
 
     @check_if_not_connected
     def get_observation(self) -> RobotObservation:
         """Joints and pads at one moment, then images."""
-        state = np.concatenate([arm.read() for arm in self.arms.values()])
-        values: RobotObservation = dict(zip(self.action_features, map(float, state), strict=True))
+        values: RobotObservation = dict(zip(self.action_features, map(float, self.pair.read()), strict=True))
         values |= pad_observation(self.pads)
         for name, camera in self.cameras.items():
             if getattr(camera, "use_rgb", True):
@@ -200,7 +183,7 @@ class AlohaTactileFollower(Robot):
         """
         wanted = np.array([action[key] for key in self.action_features], float)
         sent = []
-        for index, arm in enumerate(self.arms.values()):
+        for index, arm in enumerate(self.pair.arms.values()):
             part = slice(index * PER_ARM, (index + 1) * PER_ARM)
             target = np.clip(wanted[part], self.body.lower[part], self.body.upper[part])
             sent.append(limit_step(target, arm.read(), self.config.max_step_rad))

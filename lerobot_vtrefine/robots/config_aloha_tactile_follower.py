@@ -23,6 +23,7 @@ class AlohaTactileFollowerConfig(RobotConfig):
         cameras: LeRobot cameras by name; the policy's depth camera is called `front`, with use_depth.
         camera_models: Intrinsics and poses of depth cameras, kept in the dataset.
         gripper_current_ma: Current limit of the grippers, which limits their force [mA].
+        torque_limit: Largest share of the arm joints' full torque (their PWM limit), 0..1.
         max_step_rad: Largest distance of a joint target from where the joint is; farther targets are cut off.
         rest_on_disconnect: Move to the rest pose before torque goes off; the arms drop otherwise.
         rest_s: Time for that [s].
@@ -35,14 +36,15 @@ class AlohaTactileFollowerConfig(RobotConfig):
     cameras: dict[str, CameraConfig] = field(default_factory=dict)
     camera_models: dict[str, CameraModel] = field(default_factory=dict)
     gripper_current_ma: float = 400.0
+    torque_limit: float = 1.0
     max_step_rad: float = 0.5
     rest_on_disconnect: bool = True
     rest_s: float = 3.0
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        if self.left_port == self.right_port:
-            raise ValueError(f"left_port and right_port are both {self.left_port}")
         for name in ("gripper_current_ma", "max_step_rad", "rest_s"):
             if not getattr(self, name) > 0:
                 raise ValueError(f"{name}={getattr(self, name)} must be positive")
+        if not 0 < self.torque_limit <= 1:
+            raise ValueError(f"torque_limit={self.torque_limit} must lie within 0 .. 1, and above 0")

@@ -17,7 +17,3 @@ class AlohaLeaderConfig(TeleoperatorConfig):
 
     left_port: str
     right_port: str
-
-    def __post_init__(self) -> None:
-        if self.left_port == self.right_port:
-            raise ValueError(f"left_port and right_port are both {self.left_port}")

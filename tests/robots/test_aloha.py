@@ -6,10 +6,12 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from lerobot.motors.dynamixel.tables import MODEL_NUMBER_TABLE
 from rig import GRIPPER_ENDS, Rig, allow_slow_answers, aloha_rig
 
 from lerobot_vtrefine.datasets.features import NUM_JOINTS, PADS, TAXEL_INFO
-from lerobot_vtrefine.drivers.dynamixel_arm import VIPERX_300S, WIDOWX_250S
+from lerobot_vtrefine.drivers.dynamixel_arm import VIPERX_300S, WIDOWX_250S, ArmModel, DynamixelArm
+from lerobot_vtrefine.drivers.dynamixel_emulator import EmulatedMotor
 from lerobot_vtrefine.drivers.ports import PortError
 from lerobot_vtrefine.drivers.sources import check_pattern
 from lerobot_vtrefine.robots import AlohaTactileFollowerConfig
@@ -17,7 +19,7 @@ from lerobot_vtrefine.robots.aloha_tactile_follower import REST_RAD, AlohaTactil
 from lerobot_vtrefine.teleoperators import AlohaLeaderConfig
 from lerobot_vtrefine.teleoperators.aloha_leader import AlohaLeader
 
-SECONDARY_ID, CURRENT_MODE, OPERATING_MODE, GOAL_CURRENT = 12, 5, 11, 102
+SECONDARY_ID, CURRENT_MODE, OPERATING_MODE, GOAL_CURRENT, PWM_LIMIT = 12, 5, 11, 102, 36
 
 
 @pytest.fixture
@@ -167,6 +169,50 @@ def test_leader_gives_the_followers_action(rig: Rig) -> None:
     assert action["left_left_finger.pos"] == pytest.approx(leader.body.fingers.travel_m)
     assert action["left_right_finger.pos"] == -action["left_left_finger.pos"]
     assert not any(torque)
+
+
+def test_torque_limit_reaches_every_joint_motor(rig: Rig) -> None:
+    robot = AlohaTactileFollower(follower_config(rig, torque_limit=0.4))
+    robot.connect()
+    robot.disconnect()
+    limits = {number: rig.motor("follower", "right", number).load(PWM_LIMIT, 2) for number in range(1, 10)}
+    assert limits == dict.fromkeys(range(1, 9), round(0.4 * 885)) | {
+        9: 0
+    }  # the gripper's limit is its current
+    with pytest.raises(ValueError, match="torque_limit=0"):
+        follower_config(rig, torque_limit=0)
+
+
+def test_one_port_for_both_arms_is_refused(rig: Rig) -> None:
+    port = rig.ports("leader")["left_port"]
+    with pytest.raises(ValueError, match=f"left_port and right_port are both {port}"):
+        AlohaLeader(AlohaLeaderConfig(id="leader", left_port=port, right_port=port))
+
+
+def test_new_motors_get_their_ids_one_by_one(rig: Rig, monkeypatch: pytest.MonkeyPatch) -> None:
+    """As they come from the factory: all have id 1, and one at a time is on the bus."""
+    bus = rig.buses["leader_left"]
+    bus.motors.clear()
+    few = ArmModel(WIDOWX_250S.motors[1:2] + WIDOWX_250S.motors[5:6], WIDOWX_250S.shadows[:1])
+    arm = DynamixelArm("left", bus.port, few, 0.04)
+    one_rate = {model: {1_000_000: 3} for model in ("xm430-w350", "xl430-w250")}  # a scan takes 4 s a rate
+    monkeypatch.setattr(arm.bus, "model_baudrate_table", one_rate)
+    asked: list[str] = []
+    done: list[EmulatedMotor] = []
+
+    def operator(text: str) -> str:
+        asked.append(text)
+        done.extend(bus.motors.values())
+        bus.motors.clear()
+        name = next(name for name in arm.bus.motors if f"motor {name} alone" in text)
+        bus.motors[1] = EmulatedMotor(1, MODEL_NUMBER_TABLE[arm.bus.motors[name].model])
+        return ""
+
+    arm.setup_motors(operator)
+    done.extend(bus.motors.values())
+    assert len(asked) == 3
+    assert sorted(motor.motor_id for motor in done) == [2, 3, 8]
+    assert not arm.is_connected
 
 
 def connect_error(rig: Rig, **changes: object) -> str:
