@@ -100,8 +100,7 @@ def row_divider(pad: Pad, size: float, rng: Draw) -> Effect:
 def row_circuit(pad: Pad, size: float, rng: Draw) -> Effect:
     """The whole circuit: raw = V G_rc / (sum_j G_rj + G_pd), every taxel conducting a little when untouched.
 
-    G = G_0 + a f with a chosen so that a lone taxel's slope is the pad's gain: raw = V (g0 + s) / ... in units
-    where G_pd = V, an amplifier's V standing for the board's stiffness.
+    G = G_0 + a f, with a chosen so that a lone taxel's slope is the pad's gain; in units where G_pd = V.
     """
     supply = 9.0 * pad.peak * min(pad.rig.cols, 5) ** 0.5 / size
     leak = pad.rig.full_scale * 0.02 * np.ones(len(pad.idle))

@@ -1,4 +1,4 @@
-"""Causes between the indenter and the electrodes: the first form of each is the contract's, the rest are not."""
+"""Causes between the indenter and the electrodes: the first form of each is the contract's, no other is."""
 
 import numpy as np
 from scipy.signal import lfilter

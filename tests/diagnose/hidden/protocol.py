@@ -130,4 +130,9 @@ def monotone(rig: Rig, rng: np.random.Generator) -> list[Motion]:
     return [pen.motion("monotone", 0)] * rig.conditions
 
 
-PROTOCOLS = {"standard": standard, "monotone": monotone}
+def monotone_and_more(rig: Rig, rng: np.random.Generator) -> list[Motion]:
+    """The same press again and again, then a long hold, new speeds, depths and sites."""
+    return [*monotone(rig, rng), *(draw(kind, rig, rng) for kind in ("hold", "sites", "unloads", "slide"))]
+
+
+PROTOCOLS = {"standard": standard, "monotone": monotone, "monotone_and_more": monotone_and_more}

@@ -8,13 +8,13 @@ import numpy as np
 from hidden.rig import Rig
 
 STAGES = ("surface", "law", "force", "counts", "additive", "frame", "when", "hold")
-"""Where an effect acts, in the order of physics: where the face is [m], the elastic law [m -> N], force in the
-layers [N], readings above idle [counts], additions to them, additions per frame, the sampling time and the host's grid [s]."""
+"""Where an effect acts: where the face is [m], the elastic law [m -> N], force in the layers [N], readings
+above idle [counts], additions to them, additions per frame, the sampling time and the host's grid [s]."""
 
 
 @dataclass(frozen=True)
 class Pad:
-    """One specimen: stiffness [N/m], damping [N s/m] and gain [counts/N] per taxel, idle level (N,) [counts]."""
+    """One specimen: stiffness [N/m], damping [N s/m], gain [counts/N]; idle levels (N,) [counts]."""
 
     rig: Rig
     k_n: float
@@ -46,7 +46,6 @@ class Scene:
     temperature_c: np.ndarray
     rng: np.random.Generator
     """Chance within this trial."""
-    site: np.ndarray = field(default_factory=lambda: np.zeros(2))
 
     @property
     def dt(self) -> float:

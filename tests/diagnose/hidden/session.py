@@ -173,7 +173,7 @@ def labels(
     starts = order0 * (rig.duration_s + 10.0) + np.cumsum(rig.duration_s + rng.uniform(4.0, 15.0, len(pairs)))
     return [
         {
-            "condition": c,
+            "motion": c,
             "replicate": r,
             "order": int(order + order0),
             "start_s": float(round(starts[order] - rig.duration_s, 3)),
@@ -183,6 +183,16 @@ def labels(
         }
         for (c, r), order in zip(pairs, orders, strict=True)
     ]
+
+
+def name_conditions(places: list[dict], motions: list[Motion]) -> None:
+    """Trials driven by the same motion are one condition, its replicates counted."""
+    first = [next(j for j, other in enumerate(motions) if other is motion) for motion in motions]
+    seen: dict[int, int] = {}
+    for place in places:
+        condition = first[place["motion"]]
+        place["condition"], place["replicate"] = condition, seen.get(condition, 0)
+        seen[condition] = seen.get(condition, 0) + 1
 
 
 def run_session(spec: Spec, seed: int, locked: int = 0) -> tuple[Session, Session]:
@@ -201,9 +211,10 @@ def run_session(spec: Spec, seed: int, locked: int = 0) -> tuple[Session, Sessio
     ):
         session = Session(spec, rig, pad, effects)
         places = labels(len(motions), repeats, rig, noise, before, phase, rng)
+        name_conditions(places, motions)
         before = len(places)
         session.recordings = [
-            record(pad, effects, noise, motions[label["condition"]], label, (seed, part, i))
+            record(pad, effects, noise, motions[label["motion"]], label, (seed, part, i))
             for i, label in enumerate(places)
         ]
         sessions.append(session)
