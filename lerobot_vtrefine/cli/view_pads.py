@@ -15,13 +15,8 @@ from lerobot_vtrefine.cli.errors import run_cli
 from lerobot_vtrefine.drivers.board import PadReader, Status
 from lerobot_vtrefine.drivers.config import PadConfig
 from lerobot_vtrefine.drivers.pads_file import check_distinct_ports, load_pads
+from lerobot_vtrefine.drivers.picture import colours
 
-FULL_SCALE = 120.0
-"""Counts above idle that are drawn in the brightest colour."""
-
-_VIRIDIS = np.array(
-    [[68, 1, 84], [65, 68, 135], [42, 120, 142], [34, 168, 132], [122, 209, 81], [253, 231, 37]], float
-)
 _HOME, _CLEAR, _RESET, _SHOW, _HIDE = "\x1b[H", "\x1b[2J", "\x1b[0m", "\x1b[?25h", "\x1b[?25l"
 
 
@@ -39,20 +34,13 @@ def parse_arguments(arguments: Sequence[str] | None) -> argparse.Namespace:
     add("--hz", type=float, default=15.0, help="pictures per second (%(default)s)")
     add("--seconds", type=float, default=0.0, help="stop after this time; 0 = until Ctrl-C (%(default)s)")
     add("--rerun", action="store_true", help="show in the rerun viewer instead of the terminal")
+    add("--save", type=Path, metavar="FILE", help="write a rerun file (.rrd) instead of showing anything")
     return parser.parse_args(arguments)
 
 
-def colours(counts: NDArray[np.uint8], idle: NDArray[np.uint8]) -> NDArray[np.uint8]:
-    """RGB, uint8 (R, C, 3), of counts above idle, both uint8 (R, C)."""
-    level = np.clip((counts.astype(float) - idle) / FULL_SCALE, 0.0, 1.0) * (len(_VIRIDIS) - 1)
-    below = np.minimum(level.astype(int), len(_VIRIDIS) - 2)
-    share = (level - below)[..., None]
-    return (_VIRIDIS[below] * (1 - share) + _VIRIDIS[below + 1] * share).astype(np.uint8)
-
-
-def draw(counts: NDArray[np.uint8], idle: NDArray[np.uint8]) -> list[str]:
-    """Terminal lines of one pad, two rows a line."""
-    rgb = colours(counts, idle)
+def draw(counts: NDArray[np.uint8], idle: NDArray[np.uint8], *, stale: bool) -> list[str]:
+    """Terminal lines of one pad, two rows a line; grey while its frame is stale."""
+    rgb = colours(counts, idle, stale=stale)
     if len(rgb) % 2:
         rgb = np.concatenate([rgb, np.zeros_like(rgb[:1])])
     lines = []
@@ -102,7 +90,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
             stack.callback(reader.stop)
         print("leave the pads untouched for a moment", file=sys.stderr)
         idle = {reader.name: reader.idle_counts() for reader in readers}
-        show = rerun_view() if options.rerun else terminal_view(stack)
+        show = rerun_view(options.save, stack) if options.rerun or options.save else terminal_view(stack)
         started = time.monotonic()
         while not options.seconds or time.monotonic() - started < options.seconds:
             show(readers, idle)
@@ -119,15 +107,16 @@ def terminal_view(stack: ExitStack) -> Any:
         for reader in readers:
             lines.append(status_line(reader))
             frame = reader.latest()
-            lines += draw(frame.counts, idle[reader.name]) if frame is not None else []
+            stale = reader.health().status is not Status.STREAMING
+            lines += draw(frame.counts, idle[reader.name], stale=stale) if frame is not None else []
         sys.stdout.write(_HOME + "".join(f"{line}\x1b[K\n" for line in lines))
         sys.stdout.flush()
 
     return show
 
 
-def rerun_view() -> Any:
-    """A function that sends all pads to the rerun viewer.
+def rerun_view(save: Path | None, stack: ExitStack) -> Any:
+    """A function that sends all pads to the rerun viewer, or to a file.
 
     Raises:
         ImportError: rerun is not installed.
@@ -135,14 +124,20 @@ def rerun_view() -> Any:
     try:
         import rerun as rr
     except ImportError as error:
-        raise ImportError("--rerun needs the rerun viewer: pip install 'lerobot[viz]'") from error
-    rr.init("vtrefine-view-pads", spawn=True)
+        raise ImportError("--rerun and --save need rerun: pip install 'lerobot[viz]'") from error
+    rr.init("vtrefine-view-pads", spawn=save is None)
+    if save is not None:
+        save.parent.mkdir(parents=True, exist_ok=True)
+        rr.save(save)
+    stack.callback(rr.rerun_shutdown)
 
     def show(readers: list[PadReader], idle: dict[str, NDArray[np.uint8]]) -> None:
         for reader in readers:
             frame = reader.latest()
             if frame is not None:
-                rr.log(f"pads/{reader.name}", rr.Image(colours(frame.counts, idle[reader.name])))
+                stale = reader.health().status is not Status.STREAMING
+                picture = colours(frame.counts, idle[reader.name], stale=stale)
+                rr.log(f"pads/{reader.name}", rr.Image(picture))
             rr.log(f"health/{reader.name}", rr.TextLog(status_line(reader)))
 
     return show

@@ -229,7 +229,7 @@ class DynamixelArm:
     # --- set-up -------------------------------------------------------------------------------------
 
     def setup_motors(self, ask: Callable[[str], str]) -> None:
-        """Gives every motor its id and baud rate, from the last one on; each must be alone on the bus meanwhile.
+        """Gives every motor its id and baud rate, the last one first; each must be alone on the bus.
 
         Args:
             ask: Shows a text, returns what the operator typed.

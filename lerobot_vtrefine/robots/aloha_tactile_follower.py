@@ -17,6 +17,7 @@ from lerobot_vtrefine.drivers.arm_pair import ArmPair
 from lerobot_vtrefine.drivers.dynamixel_arm import VIPERX_300S, Floats
 from lerobot_vtrefine.drivers.pad_set import PadSet
 from lerobot_vtrefine.embodiments import get_embodiment
+from lerobot_vtrefine.robots import live_view
 from lerobot_vtrefine.robots.camera_models import CameraModels
 from lerobot_vtrefine.robots.config_aloha_tactile_follower import AlohaTactileFollowerConfig
 from lerobot_vtrefine.robots.pad_features import configured_pads, pad_features
@@ -48,6 +49,7 @@ class AlohaTactileFollower(Robot):
         self.pair = ArmPair(config.left_port, config.right_port, VIPERX_300S, travel_m)
         self.pair.calibration = self.calibration
         self.pads = PadSet(aloha_pads(config))
+        live_view.install(self.pads.configs)
         self.cameras = make_cameras_from_configs(config.cameras)
         self._camera_models = CameraModels(config.camera_models, self.cameras)
 

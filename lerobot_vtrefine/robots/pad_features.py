@@ -9,6 +9,12 @@ from lerobot_vtrefine.datasets.arrays import ArraySpec
 from lerobot_vtrefine.drivers.config import PadConfig
 from lerobot_vtrefine.drivers.pads_file import load_pads
 
+TACTILE = "tactile"
+"""Counts of a pad are `tactile.<pad>`."""
+
+BASELINE = "tactile_baseline"
+"""Idle counts of a pad are `tactile_baseline.<pad>`."""
+
 PAD_AGE = "tactile_age"
 """Age of every pad's frame [s], in the order of the pads; beyond the pad's `stale_after_s` it is stale."""
 
@@ -32,7 +38,7 @@ def configured_pads(pads: dict[str, PadConfig], pads_file: Path | None) -> dict[
 def pad_features(pads: dict[str, PadConfig]) -> dict[str, ArraySpec]:
     """Features of the pads' counts, idle counts and ages."""
     features: dict[str, ArraySpec] = {}
-    for kind in ("tactile", "tactile_baseline"):
+    for kind in (TACTILE, BASELINE):
         for name, pad in pads.items():
             info = {"array_shape": list(pad.pad_shape), "unit": "adc_counts"}
             features[f"{kind}.{name}"] = ArraySpec((int(np.prod(pad.pad_shape)),), "uint8", info)

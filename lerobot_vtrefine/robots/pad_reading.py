@@ -3,16 +3,15 @@
 import numpy as np
 
 from lerobot_vtrefine.drivers.pad_set import PadSet
-from lerobot_vtrefine.robots.pad_features import PAD_AGE, Observation
+from lerobot_vtrefine.robots.pad_features import BASELINE, PAD_AGE, TACTILE, Observation
 
 
 def pad_observation(pads: PadSet) -> Observation:
     """Counts and idle counts, flat uint8, of all pads, and their frames' ages, float32 (P,) [s]."""
     readings = pads.read()
     values: Observation = {
-        f"tactile.{name}": np.ascontiguousarray(reading.counts).reshape(-1)
-        for name, reading in readings.items()
+        f"{TACTILE}.{name}": np.array(reading.counts).reshape(-1) for name, reading in readings.items()
     }
-    values |= {f"tactile_baseline.{name}": pads.baselines[name].reshape(-1) for name in readings}
+    values |= {f"{BASELINE}.{name}": pads.baselines[name].reshape(-1) for name in readings}
     values[PAD_AGE] = np.array([reading.age_s for reading in readings.values()], np.float32)
     return values

@@ -12,6 +12,7 @@ from lerobot.utils.decorators import check_if_already_connected, check_if_not_co
 
 from lerobot_vtrefine.datasets import arrays
 from lerobot_vtrefine.drivers.pad_set import PadSet
+from lerobot_vtrefine.robots import live_view
 from lerobot_vtrefine.robots.camera_models import CameraModels
 from lerobot_vtrefine.robots.config_tactile import TactileConfig
 from lerobot_vtrefine.robots.pad_features import configured_pads, pad_features
@@ -30,6 +31,7 @@ class Tactile(Robot):
         self.config = config
         self.base = make_robot_from_config(base_config(config))
         self.pads = PadSet(configured_pads(config.pads, config.pads_file))
+        live_view.install(self.pads.configs)
         self._camera_models = CameraModels(config.camera_models, self.cameras)
         self.robot_type = f"{self.name}_{self.base.name}"
 
