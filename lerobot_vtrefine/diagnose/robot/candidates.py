@@ -1,0 +1,116 @@
+"""What may be wrong with a joint: named causes, each in one or several forms, and decoys that no cause names.
+
+Adding a cause is one entry here, its parameter in `fitting.PARAMETERS` and its effect in `servo.simulate`.
+"""
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from lerobot_vtrefine.diagnose.robot import gravity
+from lerobot_vtrefine.diagnose.robot.fitting import INDEX, SAG, Point, Problem, frame_s
+
+Array = np.ndarray
+
+LATENCY = "control_latency"
+FRICTION = "joint_friction"
+DECOY = "unknown"
+
+
+@dataclass(frozen=True)
+class Candidate:
+    """One form of one cause: which parameters it frees, and where a fit of them begins."""
+
+    cause: str
+    """A name of contract §4, or DECOY."""
+    parameters: tuple[str, ...]
+    form: str | None = None
+    """Shape of the joint's sag, where that is what is fitted."""
+    starts: tuple[float, ...] = (1.0,)
+    """Multiples of the joint's typical error."""
+    clue: str = ""
+    """What a decoy would mean."""
+
+    @property
+    def label(self) -> str:
+        """Cause and form."""
+        detail = self.form or "+".join(self.parameters)
+        return f"{self.cause}:{detail}"
+
+    def applicable(self, problem: Problem) -> Array:
+        """(J,) bool: joints on which these trials could show it at all."""
+        moved = moving(problem)
+        if self.cause == "encoder_offset":
+            return np.ones_like(moved)
+        if self.parameters == ("bend",):
+            load = problem.batch.load
+            if load is None:
+                return np.zeros_like(moved)
+            loaded = np.ptp(load, axis=(0, 1)) > 0
+            return loaded & np.array([gravity.is_gripper(name) for name in problem.names])
+        if self.form is not None:
+            terms = problem.shapes[self.form][problem.batch.valid]
+            power = np.square(terms).sum((0, 2))
+            shows = power > 1e-6 * len(terms)
+            return shows if self.form == "drift" else shows & moved
+        return moved
+
+    def starting(self, problem: Problem, point: Point, joints: Array, multiple: float) -> Point:
+        """Where to begin on those joints."""
+        if self.form is not None:
+            forms = tuple(self.form if joint in joints else form for joint, form in enumerate(point.forms))
+            point = replace(point, forms=forms)
+            for name in SAG:
+                point = point.with_values(name, 0.0, joints)
+            return point
+        for name in self.parameters:
+            start = 0.0 if name in ("offset", "bend") else multiple * problem.scale[joints]
+            point = point.with_values(name, start, joints)
+        return point
+
+    def freed(self, free: Array, joints: Array) -> Array:
+        """The free parameters with its own added on those joints."""
+        free = free.copy()
+        for name in self.parameters:
+            free[joints, INDEX[name]] = True
+        return free
+
+    def clashes(self, free: Array) -> Array:
+        """(J,) joints where its parameters are in use already."""
+        return free[:, [INDEX[name] for name in self.parameters]].any(1)
+
+
+CANDIDATES = (
+    Candidate("encoder_offset", ("offset",)),
+    Candidate("backlash", ("play",), starts=(0.5, 2.0)),
+    Candidate("backlash", ("loose",), starts=(1.0,)),
+    Candidate(FRICTION, ("friction",), starts=(0.5,)),
+    *(Candidate("gravity_sag", SAG[:1], form) for form in gravity.ONE_TERM_FORMS),
+    Candidate("gravity_sag", SAG, gravity.FREE_FORM),
+    Candidate("gripper_compliance", ("bend",)),
+    Candidate(DECOY, SAG[:1], "gain", clue="the position's scale: error grows with position"),
+    Candidate(DECOY, SAG[:1], "square", clue="error grows with the square of the position"),
+    Candidate(DECOY, SAG[:2], "drift", clue="session time: the zero wanders"),
+    Candidate(DECOY, SAG[:2], "gain_drift", clue="position x session time: the scale wanders (warming up?)"),
+)
+"""Everything that is fitted joint by joint; the commands' delay, common to all joints, is handled apart."""
+
+
+def moving(problem: Problem) -> Array:
+    """(J,) bool: joints that are commanded to move by more than their encoder can tell."""
+    return np.ptp(problem.batch.command, axis=(0, 1)) > 4 * resolution(problem)
+
+
+def resolution(problem: Problem) -> Array:
+    """(J,) smallest step between different readings: the encoder's, or nearly zero."""
+    steps = np.empty(problem.batch.joints)
+    for joint in range(problem.batch.joints):
+        values = np.unique(problem.batch.position[..., joint][problem.batch.valid].round(9))
+        steps[joint] = np.median(np.diff(values)) if 1 < len(values) < 0.25 * problem.batch.valid.sum() else 0
+    return np.maximum(steps, 1e-9)
+
+
+def delay_starts(problem: Problem) -> tuple[float, ...]:
+    """Delays to begin a fit from [s]."""
+    frame = frame_s(problem.batch)
+    return (0.5 * frame, 1.5 * frame, 4 * frame)

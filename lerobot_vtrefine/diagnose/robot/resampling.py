@@ -1,0 +1,131 @@
+"""Fits to other choices of the same trials by one Newton step: cross-validation, bootstrap.
+
+At the end of a fit the trials' gradients cancel. Reweighting the trials moves the optimum by the reweighted
+curvature's inverse times the reweighted gradient, to first order.
+"""
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from lerobot_vtrefine.diagnose.robot.fitting import (
+    INDEX,
+    PARAMETERS,
+    POSITIVE,
+    TAU_BOUND_S,
+    Fit,
+    Point,
+    Problem,
+    derivatives,
+)
+
+Array = np.ndarray
+
+FOLDS = 5
+BOOTSTRAP = 2000
+_RIDGE = 1e-7
+
+
+@dataclass(frozen=True)
+class Curvature:
+    """Per joint and trial: curvature (T, p, p), gradient (T, p) of the squared error; the delay is last."""
+
+    fit: Fit
+    normal: tuple[Array, ...]
+    slope: tuple[Array, ...]
+    weight: Array
+    """(J,) that makes the joints' errors comparable where they share the delay."""
+
+    @classmethod
+    def at(cls, problem: Problem, fit: Fit) -> "Curvature":
+        """At the end of a fit."""
+        derivative = derivatives(problem, fit)
+        normal, slope = [], []
+        for joint in range(problem.batch.joints):
+            jacobian = derivative.columns[joint]
+            if derivative.tau is not None:
+                jacobian = np.concatenate([jacobian, derivative.tau[..., joint, None]], -1)
+            by_trial = jacobian.transpose(1, 0, 2)
+            normal.append(by_trial.transpose(0, 2, 1) @ by_trial)
+            slope.append(np.einsum("tnp,nt->tp", by_trial, fit.residual[..., joint]))
+        return cls(fit, tuple(normal), tuple(slope), 1.0 / problem.scale**2)
+
+    def moved(self, weights: Array) -> Point:
+        """Where the fit would end if every trial counted `weights` (T,) times."""
+        theta = self.fit.point.theta.copy()
+        tau = self.fit.point.tau_s
+        if self.fit.tau_free:
+            tau += self._shared(weights, theta)
+        else:
+            for joint in np.flatnonzero(self.fit.free.any(1)):
+                normal = np.tensordot(weights, self.normal[joint], 1)
+                theta[joint, self.fit.free[joint]] += _solve(normal, weights @ self.slope[joint])
+        for name in POSITIVE:
+            theta[:, INDEX[name]] = theta[:, INDEX[name]].clip(min=0.0)
+        theta[:, :2] = theta[:, :2].clip(self.fit.point.theta[:, :2] - 1.0, self.fit.point.theta[:, :2] + 1.0)
+        return replace(self.fit.point, theta=theta, tau_s=float(np.clip(tau, 0.0, TAU_BOUND_S)))
+
+    def _shared(self, weights: Array, theta: Array) -> float:
+        """Moves all joints' parameters and returns the step of the delay (Schur complement)."""
+        top, bottom, solved = 0.0, 1e-12, []
+        for joint in range(len(theta)):
+            normal = self.weight[joint] * np.tensordot(weights, self.normal[joint], 1)
+            slope = self.weight[joint] * (weights @ self.slope[joint])
+            own, cross = normal[:-1, :-1], normal[:-1, -1]
+            if len(cross):
+                local, coupled = _solve(own, slope[:-1]), _solve(own, cross)
+                top += slope[-1] - cross @ local
+                bottom += normal[-1, -1] - cross @ coupled
+                solved.append((joint, local, coupled))
+            else:
+                top, bottom = top + slope[-1], bottom + normal[-1, -1]
+        step = top / bottom
+        for joint, local, coupled in solved:
+            theta[joint, self.fit.free[joint]] += local - coupled * step
+        return float(step)
+
+
+def folds_of(conditions: tuple[str, ...], seed: int) -> Array:
+    """Fold (T,) of every trial: trials of one condition stay together."""
+    names = sorted(set(conditions))
+    shuffled = np.random.default_rng(seed).permutation(len(names))
+    count = min(FOLDS, len(names))
+    fold = {names[name]: place % count for place, name in enumerate(shuffled)}
+    return np.array([fold[condition] for condition in conditions])
+
+
+def cross_validated(problem: Problem, fit: Fit, folds: Array) -> Array:
+    """Mean squared error (T, J) of every trial under a fit to the other folds."""
+    if len(set(folds)) < 2:
+        return fit.mse
+    curvature = Curvature.at(problem, fit)
+    mse = np.empty_like(fit.mse)
+    for fold in np.unique(folds):
+        held = np.flatnonzero(folds == fold)
+        part = problem.subset(held)
+        point = curvature.moved((folds != fold).astype(float))
+        left = part.residual(part.predict(point))
+        mse[held] = (left**2).sum(0) / np.maximum(part.batch.frames, 1)[:, None]
+    return mse
+
+
+def bootstrap(problem: Problem, fit: Fit, seed: int) -> tuple[Array, Array]:
+    """Parameters (B, J, P) and delays (B,) under trials drawn with replacement."""
+    curvature = Curvature.at(problem, fit)
+    rng = np.random.default_rng(seed)
+    trials = problem.batch.trials
+    theta = np.empty((BOOTSTRAP, *fit.point.theta.shape))
+    tau = np.empty(BOOTSTRAP)
+    for draw in range(BOOTSTRAP):
+        weights = np.bincount(rng.integers(0, trials, trials), minlength=trials).astype(float)
+        point = curvature.moved(weights)
+        theta[draw], tau[draw] = point.theta, point.tau_s
+    assert theta.shape[2] == len(PARAMETERS)
+    return theta, tau
+
+
+def _solve(normal: Array, slope: Array) -> Array:
+    diagonal = np.diag(normal)
+    scale = 1 / np.sqrt(np.where(diagonal > 0, diagonal, 1.0))
+    matrix = normal * scale[:, None] * scale + _RIDGE * np.eye(len(normal))
+    return scale * np.linalg.solve(matrix, scale * slope)

@@ -1,0 +1,368 @@
+"""Which causes act on which joints: forward by held-out evidence, then backward."""
+
+from collections.abc import Callable
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+
+from lerobot_vtrefine.diagnose.robot import flips
+from lerobot_vtrefine.diagnose.robot.candidates import (
+    CANDIDATES,
+    DECOY,
+    FRICTION,
+    LATENCY,
+    Candidate,
+    delay_starts,
+    resolution,
+)
+from lerobot_vtrefine.diagnose.robot.fitting import INDEX, Fit, Problem, first_point, fit, servo_only
+from lerobot_vtrefine.diagnose.robot.gravity import FREE_FORM, is_sliding
+from lerobot_vtrefine.diagnose.robot.resampling import cross_validated, folds_of
+
+Array = np.ndarray
+
+ALPHA = 0.02
+"""Chance that clean trials yield any name, over all causes and joints."""
+LEAST_GAIN = 0.01
+"""Smallest part of a joint's squared error that is worth a name."""
+LEAST_EFFECT_RAD, LEAST_EFFECT_M = 1e-4, 1e-5
+"""Smallest change of the prediction (root mean square) that is worth a name."""
+MAX_ROUNDS = 4
+_FREE_FORM_GAIN = 0.03
+_DECOY_LEAD = 0.05
+
+
+@dataclass(frozen=True)
+class Tried:
+    """A candidate fitted on top of what was accepted, with its evidence."""
+
+    candidate: Candidate | None
+    """None: the commands' delay."""
+    fit: Fit
+    held_out: Array
+    """(T, J) squared error under fits without the trial's fold."""
+    improvement: Array
+    """(T, J) relative: (before - after) / (before + after), in [-1, 1]."""
+    gain: Array
+    """(J,) part of the held-out squared error that it takes away."""
+    eligible: Array
+    """(J,) where it could be accepted, were it significant."""
+    p_alone: Array | None = None
+    p_adjusted: Array | None = None
+
+    @property
+    def cause(self) -> str:
+        """Its name."""
+        return LATENCY if self.candidate is None else self.candidate.cause
+
+    @property
+    def accepted(self) -> Array:
+        """(J,) significant and worth it."""
+        if self.p_adjusted is None:
+            return np.zeros_like(self.eligible)
+        return self.eligible & (self.p_adjusted < ALPHA)
+
+
+@dataclass(frozen=True)
+class Selection:
+    """What was accepted, and all that was tried."""
+
+    problem: Problem
+    baseline: Fit
+    baseline_held_out: Array
+    fit: Fit
+    held_out: Array
+    chosen: dict[int, tuple[Candidate, ...]]
+    """Joint -> candidates accepted there."""
+    delayed: bool
+    p_values: dict[tuple[str, int], float]
+    """(cause, joint) -> adjusted p when it was accepted; joint -1: the delay."""
+    first_round: tuple[Tried, ...] = field(repr=False)
+    """Every candidate alone on the baseline."""
+
+    def causes(self) -> dict[str, tuple[int, ...]]:
+        """Named cause -> joints that it acts on."""
+        out: dict[str, list[int]] = {}
+        for joint, candidates in self.chosen.items():
+            for candidate in candidates:
+                out.setdefault(candidate.cause, []).append(joint)
+        if self.delayed:
+            out[LATENCY] = list(range(self.problem.batch.joints))
+        return {name: tuple(sorted(joints)) for name, joints in out.items()}
+
+
+class Selector:
+    """State of one selection."""
+
+    def __init__(self, problem: Problem, seed: int, progress: Callable[[str], None]) -> None:
+        self.problem, self.seed, self.progress = problem, seed, progress
+        self.folds = folds_of(problem.batch.conditions, seed)
+        progress("robot: fitting every joint's servo")
+        free = servo_only(problem)
+        self.baseline = fit(problem, first_point(problem), free)
+        self.now = self.baseline
+        self.held_out = cross_validated(problem, self.now, self.folds)
+        self.baseline_held_out = self.held_out
+        self.chosen: dict[int, tuple[Candidate, ...]] = {}
+        self.delayed = False
+        self.p_values: dict[tuple[str, int], float] = {}
+        sliding = np.array([is_sliding(name) for name in problem.names])
+        self.least_effect = np.maximum(
+            np.where(sliding, LEAST_EFFECT_M, LEAST_EFFECT_RAD), 0.25 * resolution(problem)
+        )
+
+    def run(self) -> Selection:
+        """Forward rounds, then backward."""
+        first: tuple[Tried, ...] = ()
+        for number in range(MAX_ROUNDS):
+            self.progress(f"robot: trying causes, round {number + 1}")
+            tried = self.try_all(None if number == 0 else self._open())
+            first = first or tried
+            if not self._accept(tried):
+                break
+        self.progress("robot: dropping what is not needed")
+        self._prefer_single(first)
+        self._drop_needless()
+        return Selection(
+            self.problem,
+            self.baseline,
+            self.baseline_held_out,
+            self.now,
+            self.held_out,
+            self.chosen,
+            self.delayed,
+            self.p_values,
+            first,
+        )
+
+    def try_all(self, joints: Array | None) -> tuple[Tried, ...]:
+        """Every candidate on top of what is accepted, on all joints or some, with family-wise p."""
+        tried: list[Tried] = []
+        for candidate in CANDIDATES:
+            allowed = joints
+            if candidate.cause == FRICTION:
+                # Slow to simulate, and to first order the same as play: only where play helps at all.
+                helped = [item.gain > LEAST_GAIN / 2 for item in tried if item.cause == "backlash"]
+                allowed = np.any([np.zeros(self.problem.batch.joints), *helped], axis=0)
+                allowed = allowed if joints is None else allowed & joints
+            item = self.attempt(candidate, allowed)
+            tried += [] if item is None else [item]
+        if not self.delayed:
+            tried.append(self._attempt_delay())
+        return self._with_p(tried)
+
+    def attempt(self, candidate: Candidate, joints: Array | None = None) -> Tried | None:
+        """Fit one candidate on all joints that allow it; None where none does."""
+        allowed = candidate.applicable(self.problem) & ~candidate.clashes(self.now.free)
+        if joints is not None:
+            allowed &= joints
+        index = np.flatnonzero(allowed)
+        if not len(index):
+            return None
+        free = candidate.freed(self.now.free, index)
+        own = replace(self.now, free=free)
+        fits = [
+            fit(
+                self.problem,
+                candidate.starting(self.problem, own.point, index, multiple),
+                free,
+                iterations=12,
+            )
+            for multiple in candidate.starts
+        ]
+        best = fits[0]
+        for other in fits[1:]:
+            better = other.total < best.total
+            best = merged(best, other, better)
+        # Joints that it is not tried on keep what they have.
+        best = merged(self.now, best, allowed, free=np.where(allowed[:, None], free, self.now.free))
+        return self._judged(candidate, best, allowed)
+
+    def _attempt_delay(self) -> Tried:
+        fits = []
+        for start in delay_starts(self.problem):
+            point = replace(self.now.point, tau_s=start)
+            fits.append(fit(self.problem, point, self.now.free, tau_free=True, iterations=12))
+        best = min(fits, key=lambda item: float((item.total / self.baseline.total.clip(1e-300)).sum()))
+        return self._judged(None, best, np.ones(self.problem.batch.joints, dtype=bool))
+
+    def _judged(self, candidate: Candidate | None, best: Fit, allowed: Array) -> Tried:
+        held_out = cross_validated(self.problem, best, self.folds)
+        change = np.where(allowed, self.held_out - held_out, 0.0)
+        improvement = change / np.maximum(self.held_out + held_out, 1e-300)
+        before = self.held_out.mean(0)
+        gain = change.mean(0) / np.maximum(before, 1e-300)
+        valid = self.problem.batch.valid.sum()
+        effect = np.sqrt(np.square(best.residual - self.now.residual).sum((0, 1)) / valid)
+        eligible = allowed & (gain > LEAST_GAIN) & (effect > self.least_effect)
+        return Tried(candidate, best, held_out, improvement, gain, eligible)
+
+    def _with_p(self, tried: list[Tried]) -> tuple[Tried, ...]:
+        """Adjusted over all candidates and joints; the delay is one hypothesis about all joints together."""
+        columns = [
+            item.improvement if item.candidate else item.improvement.mean(1, keepdims=True) for item in tried
+        ]
+        alone, adjusted = flips.one_sided(np.concatenate(columns, 1), self.seed)
+        out, place = [], 0
+        for item, column in zip(tried, columns, strict=True):
+            part = slice(place, place + column.shape[1])
+            place = part.stop
+            out.append(
+                replace(
+                    item,
+                    p_alone=np.broadcast_to(alone[part], item.gain.shape),
+                    p_adjusted=np.broadcast_to(adjusted[part], item.gain.shape),
+                )
+            )
+        return tuple(out)
+
+    def _accept(self, tried: tuple[Tried, ...]) -> bool:
+        """Accept the delay if it explains more than the joints' own causes, else those; False if nothing."""
+        best = best_per_joint(tried, self.held_out)
+        delay = next((item for item in tried if item.candidate is None), None)
+        before = np.log(self.held_out.mean(0).clip(1e-300))
+        if delay is not None and delay.accepted.any():
+            by_delay = (before - np.log(delay.held_out.mean(0).clip(1e-300))).sum()
+            own = sum(
+                before[joint] - np.log(item.held_out.mean(0)[joint].clip(1e-300))
+                for joint, item in best.items()
+            )
+            if by_delay > own:
+                self._take(delay, np.arange(self.problem.batch.joints))
+                return True
+        for joint, item in best.items():
+            self._take(item, np.array([joint]))
+        if best:
+            self._refit()
+        return bool(best)
+
+    def _take(self, item: Tried, joints: Array) -> None:
+        mask = np.zeros(self.problem.batch.joints, dtype=bool)
+        mask[joints] = True
+        assert item.p_adjusted is not None
+        if item.candidate is None:
+            self.now, self.held_out, self.delayed = item.fit, item.held_out, True
+            self.p_values[LATENCY, -1] = float(item.p_adjusted.min())
+            return
+        self.now = merged(
+            self.now, item.fit, mask, free=np.where(mask[:, None], item.fit.free, self.now.free)
+        )
+        self.held_out = np.where(mask, item.held_out, self.held_out)
+        for joint in joints:
+            self.chosen[int(joint)] = (*self.chosen.get(int(joint), ()), item.candidate)
+            self.p_values[item.cause, int(joint)] = float(item.p_adjusted[joint])
+
+    def _refit(self) -> None:
+        self.now = fit(self.problem, self.now.point, self.now.free, self.delayed)
+        self.held_out = cross_validated(self.problem, self.now, self.folds)
+
+    def _open(self) -> Array:
+        """(J,) joints on which more may be found: all, since the delay couples them."""
+        return np.ones(self.problem.batch.joints, dtype=bool)
+
+    def _prefer_single(self, first: tuple[Tried, ...]) -> None:
+        """Where one cause alone does as well as several, it is the one."""
+        changed = False
+        for joint, several in list(self.chosen.items()):
+            if len(several) < 2 or self.delayed:
+                continue
+            singles = [item for item in first if item.candidate and item.accepted[joint]]
+            singles = [item for item in singles if item.cause != DECOY]
+            if not singles:
+                continue
+            one = min(singles, key=lambda item: item.held_out.mean(0)[joint])
+            if one.held_out.mean(0)[joint] <= 1.02 * self.held_out.mean(0)[joint]:
+                self._replace(joint, one)
+                changed = True
+        if changed:
+            self._refit()
+
+    def _replace(self, joint: int, item: Tried) -> None:
+        for candidate in self.chosen[joint]:
+            self.p_values.pop((candidate.cause, joint), None)
+        mask = np.zeros(self.problem.batch.joints, dtype=bool)
+        mask[joint] = True
+        self.chosen[joint] = ()
+        self._take(item, np.array([joint]))
+
+    def _drop_needless(self) -> None:
+        """Take away what costs less than `LEAST_GAIN` of a joint's held-out error, one at a time."""
+        for joint in list(self.chosen):
+            for candidate in list(self.chosen[joint]):
+                if self.loss_without(candidate, joint) < LEAST_GAIN:
+                    self._remove(candidate, joint)
+        if self.delayed and self.loss_without_delay() < LEAST_GAIN:
+            self._remove_delay()
+
+    def without(self, candidate: Candidate, joint: int) -> tuple[Fit, Array]:
+        """Refit and held-out error with one candidate taken from one joint."""
+        free = self.now.free.copy()
+        point = self.now.point
+        for name in candidate.parameters:
+            free[joint, INDEX[name]] = False
+            point = point.with_values(name, 0.0, np.array([joint]))
+        fitted = fit(self.problem, point, free, self.delayed, iterations=8)
+        return fitted, cross_validated(self.problem, fitted, self.folds)
+
+    def loss_without(self, candidate: Candidate, joint: int) -> float:
+        """Part of the joint's held-out error that comes back."""
+        _, held_out = self.without(candidate, joint)
+        return float(1 - self.held_out.mean(0)[joint] / max(held_out.mean(0)[joint], 1e-300))
+
+    def loss_without_delay(self) -> float:
+        """The same for the delay, averaged over joints."""
+        _, held_out = self._without_delay()
+        return float((1 - self.held_out.mean(0) / held_out.mean(0).clip(1e-300)).mean())
+
+    def _without_delay(self) -> tuple[Fit, Array]:
+        fitted = fit(self.problem, replace(self.now.point, tau_s=0.0), self.now.free, iterations=8)
+        return fitted, cross_validated(self.problem, fitted, self.folds)
+
+    def _remove(self, candidate: Candidate, joint: int) -> None:
+        self.now, self.held_out = self.without(candidate, joint)
+        self.chosen[joint] = tuple(item for item in self.chosen[joint] if item != candidate)
+        self.p_values.pop((candidate.cause, joint), None)
+        if not self.chosen[joint]:
+            del self.chosen[joint]
+
+    def _remove_delay(self) -> None:
+        self.now, self.held_out = self._without_delay()
+        self.delayed = False
+        self.p_values.pop((LATENCY, -1), None)
+
+
+def best_per_joint(tried: tuple[Tried, ...], before: Array) -> dict[int, Tried]:
+    """Joint -> the accepted candidate with the least held-out error.
+
+    A decoy must beat every name clearly, and a shape of many terms one of a single term.
+    """
+    out: dict[int, Tried] = {}
+    for joint in range(before.shape[1]):
+        able = [item for item in tried if item.candidate and item.accepted[joint]]
+        if able:
+            out[joint] = min(able, key=lambda item: _handicapped(item, joint))
+    return out
+
+
+def _handicapped(item: Tried, joint: int) -> float:
+    error = float(item.held_out.mean(0)[joint])
+    if item.cause == DECOY:
+        return error * (1 + _DECOY_LEAD)
+    if item.candidate is not None and item.candidate.form == FREE_FORM:
+        return error * (1 + _FREE_FORM_GAIN)
+    return error
+
+
+def merged(one: Fit, other: Fit, take_other: Array, free: Array | None = None) -> Fit:
+    """Joints of the one fit, except where those of the other are taken."""
+    theta = np.where(take_other[:, None], other.point.theta, one.point.theta)
+    forms = tuple(
+        b if take else a for a, b, take in zip(one.point.forms, other.point.forms, take_other, strict=True)
+    )
+    return Fit(
+        point=replace(one.point, theta=theta, forms=forms),
+        free=other.free if free is None else free,
+        tau_free=one.tau_free,
+        mse=np.where(take_other, other.mse, one.mse),
+        residual=np.where(take_other, other.residual, one.residual),
+    )
