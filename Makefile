@@ -1,12 +1,12 @@
 .DEFAULT_GOAL := help
-.PHONY: help setup demo test test-slow check format bench clean-demo
+.PHONY: help setup demo test test-slow check format bench bench-diagnose clean-demo
 
 VENV := .venv/bin
 JOBS ?= 2
 ARGS ?=
 
 help: ## show this list
-	@awk -F ':.*## ' '/^[a-z-]+:.*## / {printf "  make %-11s %s\n", $$1, $$2}' Makefile
+	@awk -F ':.*## ' '/^[a-z-]+:.*## / {printf "  make %-14s %s\n", $$1, $$2}' Makefile
 
 setup: ## create .venv with pinned packages (automatic in every other target)
 	@sh scripts/setup_venv.sh
@@ -32,6 +32,9 @@ format: setup ## rewrite the sources in the project's format
 
 bench: setup ## speed, as ratios measured in one run
 	@$(VENV)/vtrefine-bench $(ARGS)
+
+bench-diagnose: setup ## vtrefine-diagnose on recordings with known causes: the table and its bars
+	@$(VENV)/python scripts/bench_diagnose.py $(ARGS)
 
 clean-demo: ## remove the demo's outputs, so that the next one starts afresh
 	@rm -rf outputs/demo
