@@ -11,15 +11,14 @@ from lerobot.lerobot_types import RobotAction, RobotObservation
 from lerobot.robots.robot import Robot
 from lerobot.utils.decorators import check_if_already_connected, check_if_not_connected
 
-from lerobot_vtrefine.datasets import arrays
 from lerobot_vtrefine.datasets.features import PAD_COLS, PAD_ROWS, PADS
 from lerobot_vtrefine.drivers.arm_pair import ArmPair
 from lerobot_vtrefine.drivers.dynamixel_arm import VIPERX_300S, Floats
 from lerobot_vtrefine.drivers.pad_set import PadSet
 from lerobot_vtrefine.embodiments import get_embodiment
-from lerobot_vtrefine.robots import live_view
 from lerobot_vtrefine.robots.camera_models import CameraModels
 from lerobot_vtrefine.robots.config_aloha_tactile_follower import AlohaTactileFollowerConfig
+from lerobot_vtrefine.robots.extensions import extend_lerobot
 from lerobot_vtrefine.robots.pad_features import configured_pads, pad_features
 from lerobot_vtrefine.robots.pad_reading import pad_observation
 
@@ -42,14 +41,13 @@ class AlohaTactileFollower(Robot):
 
     def __init__(self, config: AlohaTactileFollowerConfig) -> None:
         super().__init__(config)
-        arrays.install()
         self.config = config
         self.body = get_embodiment("aloha")
         travel_m = self.body.fingers.travel_m
         self.pair = ArmPair(config.left_port, config.right_port, VIPERX_300S, travel_m)
         self.pair.calibration = self.calibration
         self.pads = PadSet(aloha_pads(config))
-        live_view.install(self.pads.configs)
+        extend_lerobot(self.pads.configs)
         self.cameras = make_cameras_from_configs(config.cameras)
         self._camera_models = CameraModels(config.camera_models, self.cameras)
 

@@ -10,11 +10,10 @@ from lerobot.robots.robot import Robot
 from lerobot.robots.utils import make_robot_from_config
 from lerobot.utils.decorators import check_if_already_connected, check_if_not_connected
 
-from lerobot_vtrefine.datasets import arrays
 from lerobot_vtrefine.drivers.pad_set import PadSet
-from lerobot_vtrefine.robots import live_view
 from lerobot_vtrefine.robots.camera_models import CameraModels
 from lerobot_vtrefine.robots.config_tactile import TactileConfig
+from lerobot_vtrefine.robots.extensions import extend_lerobot
 from lerobot_vtrefine.robots.pad_features import configured_pads, pad_features
 from lerobot_vtrefine.robots.pad_reading import pad_observation
 
@@ -27,11 +26,10 @@ class Tactile(Robot):
 
     def __init__(self, config: TactileConfig) -> None:
         super().__init__(config)
-        arrays.install()
         self.config = config
         self.base = make_robot_from_config(base_config(config))
         self.pads = PadSet(configured_pads(config.pads, config.pads_file))
-        live_view.install(self.pads.configs)
+        extend_lerobot(self.pads.configs)
         self._camera_models = CameraModels(config.camera_models, self.cameras)
         self.robot_type = f"{self.name}_{self.base.name}"
 

@@ -117,6 +117,21 @@ def test_failing_pad_leaves_nothing_connected(boards: dict[str, PadEmulator], tm
     tactile_robot(boards, tmp_path).connect()  # the thumb's port is free again
 
 
+def test_making_a_robot_extends_the_stock_commands(boards: dict[str, PadEmulator], tmp_path: Path) -> None:
+    from lerobot.datasets.lerobot_dataset import LeRobotDataset
+    from lerobot.utils import feature_utils, visualization_utils
+
+    from lerobot_vtrefine.datasets import arrays, card
+    from lerobot_vtrefine.robots import live_view
+
+    for part in (arrays, card, live_view):
+        part.uninstall()
+    before = feature_utils.build_dataset_frame, visualization_utils.log_rerun_data, LeRobotDataset.push_to_hub
+    tactile_robot(boards, tmp_path)
+    after = feature_utils.build_dataset_frame, visualization_utils.log_rerun_data, LeRobotDataset.push_to_hub
+    assert not set(before) & set(after)
+
+
 @pytest.mark.parametrize(
     ("base", "message"),
     [

@@ -1,0 +1,18 @@
+"""What a robot with pads needs of LeRobot's stock commands; robots call it when they are made."""
+
+from collections.abc import Mapping
+
+from lerobot_vtrefine.datasets import arrays, card
+from lerobot_vtrefine.drivers.config import PadConfig
+from lerobot_vtrefine.robots import live_view
+
+
+def extend_lerobot(pads: Mapping[str, PadConfig]) -> None:
+    """Lets stock commands record array columns, describe them on dataset cards, and show pads as pictures.
+
+    Raises:
+        RuntimeError: a LeRobot version whose recorder was not tested with array columns.
+    """
+    arrays.install()
+    card.install()
+    live_view.install(pads)
