@@ -7,6 +7,7 @@ t is issued; the command acts until frame t + 1.
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
+import mujoco
 import numpy as np
 import torch
 
@@ -25,8 +26,10 @@ Array = np.ndarray
 
 HOLDS = ("zero_order", "linear")
 """How a command is approached: at once (as motors get it), or linearly over the frame (as `InsertionSim`)."""
-HOLDING_LACK_M = 0.002
-"""A gripper holds something while its fingers stay this far short of a closing command."""
+CLOSING_M = 0.005
+"""A gripper whose fingers move less than this in an episode never closes."""
+CLOSED_M = 0.001
+"""Fingers this close to where they stay have closed."""
 _SETTLE_S = 0.1
 
 
@@ -54,7 +57,9 @@ def replay_commands(
     fields: Mapping[str, Array] | None = None,
     num_threads: int = 0,
 ) -> list[Array]:
-    """Joint positions of the twin's arms, without parts, under recorded commands.
+    """Joint positions of the twin's arms under recorded commands, without parts and contacts.
+
+    Nothing touches: what the servos do alone is seen, and grippers close on nothing.
 
     Args:
         commands: E arrays (T, J) of joint targets [rad, m]; clamped to the limits, one opening per gripper.
@@ -78,6 +83,7 @@ def replay_commands(
     config = config or SceneConfig()
     substeps = int(np.ceil(dt_s / config.timestep_s - 1e-6))
     model, embodiment, joints = build_arms(replace(config, timestep_s=dt_s / substeps))
+    model.opt.disableflags |= int(mujoco.mjtDisableBit.mjDSBL_CONTACT)
     lengths = _checked_lengths(commands, starts, embodiment)
     backend = get_backend("batch", model, len(lengths), num_threads)
     ids = np.arange(len(lengths))
@@ -97,7 +103,7 @@ def replay_commands(
     return [stacked[episode, :length] for episode, length in enumerate(lengths)]
 
 
-def replay_scene(sim: InsertionSim, commands: Array, seed: int) -> SceneReplay:
+def replay_scene(sim: InsertionSim, commands: Array, seed: int, start: Start | None = None) -> SceneReplay:
     """One episode in world 0 of a simulation, with parts and pads.
 
     The simulation's own clamps, rates and ramps act on the commands, as in its recordings: an episode that it
@@ -105,10 +111,11 @@ def replay_scene(sim: InsertionSim, commands: Array, seed: int) -> SceneReplay:
 
     Args:
         commands: (T, J) [rad, m].
-        seed: of the episode; decides the start, the pads' idle levels and noise.
+        seed: of the episode; decides the start (unless given), the pads' idle levels and noise.
+        start: one world's state to start from.
     """
     world = np.zeros(1, np.int64)
-    sim.reset(world, np.array([seed]))
+    sim.reset(world, np.array([seed]), start)
     frames = []
     for command in commands:
         frames.append(sim.observe(world))
@@ -121,42 +128,44 @@ def replay_scene(sim: InsertionSim, commands: Array, seed: int) -> SceneReplay:
     )
 
 
-def grasp_start(embodiment: Embodiment, pair: PartPair, command: Array, position: Array) -> Start | None:
+def grasp_start(embodiment: Embodiment, pair: PartPair, position: Array) -> Start | None:
     """A start from the table with the parts where the recorded grippers closed on them.
 
     Parts stand upright, turned as their hand is at the moment of the grasp; how high and how far forward in
     the hand a part was held is taken as ideal, because joints do not tell.
 
     Args:
-        command, position: (T, J) of one episode [rad, m].
+        position: (T, J) of one episode [rad, m].
 
     Returns:
-        None when a gripper never holds anything.
+        None when a gripper never closes.
     """
     poses = []
-    for index, (part, yaw) in enumerate(((pair.socket, np.pi / 2), (pair.plug, -np.pi / 2))):
-        moment = grasp_frame(embodiment, command, position, index)
+    for arm, (part, yaw) in enumerate(((pair.socket, np.pi / 2), (pair.plug, -np.pi / 2))):
+        moment = grasp_frame(embodiment, position, arm)
         if moment is None:
             return None
-        poses.append(_standing_pose(embodiment, part, yaw, position[moment], index))
+        poses.append(_standing_pose(embodiment, part, yaw, position[moment], arm))
     first = np.clip(position[:1], embodiment.lower, embodiment.upper).astype(float)
     return Start(first, first, plug=poses[1][None], socket=poses[0][None], settle_s=_SETTLE_S)
 
 
-def grasp_frame(embodiment: Embodiment, command: Array, position: Array, arm: int) -> int | None:
-    """First frame at which a gripper has closed on what it then holds the longest; None if it never holds."""
-    finger = embodiment.joints_per_arm * (arm + 1) - 2
-    lack = position[:, finger] - command[:, finger]
-    holding = lack > HOLDING_LACK_M
-    edges = np.flatnonzero(np.diff(np.concatenate([[0], holding.astype(int), [0]])))
-    if not len(edges):
+def grasp_frame(embodiment: Embodiment, position: Array, arm: int) -> int | None:
+    """First frame at which a gripper has closed as far as it then stays the longest; None if it never does.
+
+    Args:
+        position: (T, J) of one episode.
+    """
+    opening = position[:, embodiment.joints_per_arm * (arm + 1) - 2]
+    low, high = float(opening.min()), float(opening.max())
+    if high - low < CLOSING_M:
         return None
+    closed = opening < (low + high) / 2
+    edges = np.flatnonzero(np.diff(closed, prepend=False, append=False))
     begins, ends = edges[::2], edges[1::2]
     longest = int(np.argmax(ends - begins))
-    begin, end = int(begins[longest]), int(ends[longest])
-    width = float(np.median(position[begin:end, finger]))
-    closed = np.flatnonzero(position[begin:end, finger] < width + 1e-3)
-    return begin + int(closed[0])
+    run = opening[begins[longest] : ends[longest]]
+    return int(begins[longest]) + int(np.argmax(run < np.median(run) + CLOSED_M))
 
 
 def _standing_pose(embodiment: Embodiment, part: Part, nominal_yaw: float, joints: Array, arm: int) -> Array:

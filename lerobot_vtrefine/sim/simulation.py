@@ -46,17 +46,6 @@ class StepResult:
     success: Array
 
 
-@dataclass(frozen=True)
-class _Rest:
-    """A world that has come to rest at its start."""
-
-    row: Array
-    command: Array
-    """(nu,)"""
-    pad_load: Array
-    """(4, 3)"""
-
-
 class InsertionSim:
     """N independent worlds of one scene.
 
@@ -92,7 +81,8 @@ class InsertionSim:
         self.scene: Scene = build_scene(scene_config or SceneConfig())
         self.num_envs = num_envs
         self.noise_level = NOISE_LEVEL
-        self._substeps = _substeps(self.scene.config, self.config)
+        self.substeps = _substeps(self.scene.config, self.config)
+        """Physics steps per control step."""
         self._backend = get_backend(backend, self.scene.model, num_envs, num_threads, warp)
         self._touch = touch_source(self.scene, self._backend)
         self._randomizer = Randomizer(self.scene, randomization or RandomizationConfig())
@@ -111,6 +101,11 @@ class InsertionSim:
     def embodiment(self) -> Any:
         """The robot."""
         return self.scene.embodiment
+
+    @property
+    def device(self) -> str:
+        """Torch device on which sensors are computed."""
+        return self._backend.device
 
     @property
     def episode_steps(self) -> int:
@@ -158,7 +153,7 @@ class InsertionSim:
         state.grasped[ids] = in_hand
         state.reference[ids] = measured
         state.tip[ids] = task.insertion(self.scene.pair, seen.plug, seen.socket).position_m
-        self._pads.advance(ids, self._touch_at(ids, seen))
+        self._remember(ids)
 
     def step(self, action: Array, ids: Array | None = None) -> StepResult:
         """One control step of worlds `ids` (m,), all by default.
@@ -176,11 +171,11 @@ class InsertionSim:
         before = state.command[ids]
         wanted = task.servo_commands(self.scene.embodiment, action)
         after = np.clip(wanted, before - self._rates, before + self._rates)
-        trace = self._backend.advance_linearly(ids, before, after, self._substeps)
+        trace = self._backend.advance_linearly(ids, before, after, self.substeps)
         state.command[ids] = after
         seen = self._seen(ids)
         reward = update(state, ids, self._measure(ids, seen, trace), self.scene.pair, self.config)
-        self._pads.advance(ids, self._touch_at(ids, seen))
+        self._remember(ids)
         terminated = state.done[ids]
         truncated = ~terminated & (state.steps[ids] >= self.episode_steps)
         return StepResult(reward, terminated, truncated, state.success[ids])
@@ -193,10 +188,9 @@ class InsertionSim:
             `depth_mm` (m, H, W) uint16, 0 where nothing lies within 2 m.
         """
         ids = self._checked(ids)
-        seen = self._seen(ids)
         return {
-            "state": seen.joints.astype(np.float32),
-            "tactile": self._pads.counts(ids, self._touch_at(ids, seen)),
+            "state": self.joint_state(ids),
+            "tactile": self.tactile(ids),
             "tactile_baseline": self._pads.sensors.baseline[ids],
             "depth_mm": self.depth_mm(ids),
         }
@@ -205,6 +199,16 @@ class InsertionSim:
         """The `state` part of `observe` alone: (m, 16) float32."""
         qpos, _ = self._backend.read(self._checked(ids))
         return qpos[:, self.scene.addresses.qpos].astype(np.float32)
+
+    def tactile(self, ids: Array | None = None) -> Array:
+        """The `tactile` part of `observe` alone: (m, 4, 384) uint8 counts."""
+        ids = self._checked(ids)
+        return self._pads.counts(ids, self._touch_at(ids))
+
+    def hold(self) -> None:
+        """Let the physics of one control step pass under the present commands, and nothing else."""
+        command = self._episode.command
+        self._backend.advance_linearly(np.arange(self.num_envs), command, command, self.substeps)
 
     def depth_mm(self, ids: Array | None = None) -> Array:
         """Depth images (m, H, W) uint16 [mm]."""
@@ -293,62 +297,19 @@ class InsertionSim:
             if "geom_size" in fields:
                 self._depth.set_shapes(ids, fields["geom_size"], fields["geom_aabb"])
 
-    def _settle(self, ids: Array, seeds: Array, start: starts.Start | None) -> None:
-        """Bring worlds to their starts and to rest, or back to where an earlier reset with this seed left
-        them.
-        """
-        missing = np.array([int(seed) not in self._settled for seed in seeds], bool)
-        fresh = self._settle_physically(ids[missing], seeds[missing]) if missing.any() else {}
-        rests = [
-            fresh.get(int(env)) or self._settled[int(seed)] for env, seed in zip(ids, seeds, strict=True)
-        ]
-        self._backend.set_rows(ids, np.stack([rest.row for rest in rests]))
-        self._episode.command[ids] = [rest.command for rest in rests]
-        self._episode.pad_load[ids] = [rest.pad_load for rest in rests]
-        self._episode.pad_force[ids] = self._episode.pad_load[ids][..., 0]
-        for seed, rest in zip(seeds, rests, strict=True):
-            if len(self._settled) < _MAX_CACHED_STARTS:
-                self._settled[int(seed)] = rest
-
-    def _settle_physically(self, ids: Array, seeds: Array) -> dict[int, _Rest]:
-        start = self._start(seeds)
-        at, model = self.scene.addresses, self.scene.model
-        qpos = np.zeros((len(ids), model.nq))
-        qpos[:, at.qpos], qpos[:, at.plug_qpos], qpos[:, at.socket_qpos] = (
-            start.joints,
-            start.plug,
-            start.socket,
-        )
-        self._backend.write(ids, qpos, np.zeros((len(ids), model.nv)))
-        command = task.servo_commands(self.scene.embodiment, start.targets)
-        substeps = round(start.settle_s / self.scene.config.timestep_s)
-        trace = self._backend.advance(ids, np.repeat(command[:, None], substeps, 1))
-        load = self._pad_load(trace)
-        rows = self._backend.get_rows(ids)
-        return {int(env): _Rest(rows[i], command[i], load[i]) for i, env in enumerate(ids)}
-
-    def _start(self, seeds: Array) -> starts.Start:
-        pair, robot = self.scene.pair, self.scene.embodiment
-        if self.scene.config.start == "table":
-            draws = starts.uniform_draws(seeds, _START_STREAM, starts.TABLE_DRAWS)
-            return starts.start_on_table(self.config.table, pair, robot, draws)
-        draws = starts.uniform_draws(seeds, _START_STREAM, starts.GRASPED_DRAWS)
-        return starts.start_in_hand(self.config.grasped, pair, robot, draws)
-
     def _seen(self, ids: Array) -> Kinematics:
         return sensing.read_kinematics(self.scene, *self._backend.read(ids))
 
-    def _touch_at(self, ids: Array, seen: Kinematics) -> Touch:
-        return self._touch(ids, seen, self._episode.pad_load[ids])
+    def _touch_at(self, ids: Array) -> Touch:
+        return self._touch(ids, lambda: self._seen(ids), self._episode.pad_load[ids])
+
+    def _remember(self, ids: Array) -> None:
+        if self._pads.remembers:
+            self._pads.advance(ids, self._touch_at(ids))
 
     def _grip_points(self, seen: Kinematics) -> Array:
         grips = self.scene.pair.socket.grip, self.scene.pair.plug.grip
         return task.grip_points(grips, (seen.socket, seen.plug), (seen.hand_position, seen.hand_rotation))
-
-    def _pad_load(self, trace: Trace) -> Array:
-        at = self.scene.addresses
-        joints, contacts = trace.qpos[:, -1][:, at.qpos], trace.sensors[:, -1][:, at.pad_contacts]
-        return sensing.pad_loads(self.scene.embodiment, joints, contacts)
 
     def _measure(self, ids: Array, seen: Kinematics, trace: Trace) -> Measured:
         at, pair = self.scene.addresses, self.scene.pair

@@ -1,0 +1,1 @@
+"""Recorded episodes replayed in the simulated twin, and what both sides measured."""

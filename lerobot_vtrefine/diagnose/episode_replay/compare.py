@@ -1,0 +1,227 @@
+"""Replay episodes of a dataset in its twin and compare what both sides measured."""
+
+import json
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from tqdm import tqdm
+
+from lerobot_vtrefine.datasets.episodes import EpisodeFolder, RecordedEpisode
+from lerobot_vtrefine.datasets.features import PADS, Array
+from lerobot_vtrefine.diagnose.episode_replay.touch import PadTouch, compare_pad
+from lerobot_vtrefine.diagnose.episode_replay.tracking import JointTracking, joint_tracking
+from lerobot_vtrefine.diagnose.episode_replay.twin import recorded_seeds, recorded_settings, recorded_twin
+from lerobot_vtrefine.embodiments import get_embodiment
+from lerobot_vtrefine.envs.config import VtRefineEnvConfig
+
+HOLD_WORDS = {"zero_order": "held over the frame", "linear": "approached linearly"}
+DENSITIES = ("reading_density", "count_density")
+
+PARTS = ("auto", "none", "recorded", "grasp")
+"""none: arms alone. recorded: starts from the seeds that a simulated dataset kept. grasp: parts stand where
+the recorded grippers closed on them. auto: recorded where there are seeds, grasp where there is touch, else
+none."""
+
+
+@dataclass(frozen=True)
+class EpisodePair:
+    """One episode, recorded and replayed."""
+
+    recorded: RecordedEpisode
+    position: Array
+    """(T, J) of the twin."""
+    counts: dict[str, Array]
+    """Pad -> (T, K) of the twin; empty for arms alone."""
+    baselines: dict[str, Array]
+    """Pad -> (K,)."""
+    success: bool | None
+    """Whether the twin's plug was seated and held; None for arms alone."""
+
+
+@dataclass(frozen=True)
+class Comparison:
+    """Everything that the report shows."""
+
+    root: Path
+    fps: float
+    parts: str
+    twin: str
+    """The twin in words."""
+    tracking: list[JointTracking]
+    touch: list[PadTouch]
+    pairs: list[EpisodePair]
+    skipped: dict[int, str]
+    """Episodes that could not be replayed, and why."""
+
+    def summary(self) -> dict[str, Any]:
+        """All numbers as plain values for ``replay.json``."""
+        return {
+            "schema": "vtrefine/replay@1",
+            "dataset": self.root.name,
+            "fps": self.fps,
+            "parts": self.parts,
+            "twin": self.twin,
+            "episodes": [pair.recorded.index for pair in self.pairs],
+            "skipped": {str(index): reason for index, reason in self.skipped.items()},
+            "success": [pair.success for pair in self.pairs],
+            "tracking": [asdict(row) for row in self.tracking],
+            "touch": [_plain(pad) for pad in self.touch],
+        }
+
+
+def compare_episodes(
+    folder: EpisodeFolder,
+    episodes: Sequence[int] | None = None,
+    parts: str = "auto",
+    hold: str = "zero_order",
+    env: VtRefineEnvConfig | None = None,
+) -> Comparison:
+    """Replay and compare; all episodes by default.
+
+    Args:
+        hold: how the arms alone approach a command; the scene with parts always ramps linearly.
+        env: the twin; by default the recorded one of a simulated dataset, else the default environment.
+
+    Raises:
+        ValueError: the twin is another robot than the dataset's, unknown episodes, or parts that the dataset
+            cannot place.
+    """
+    ledger = recorded_settings(folder.root)
+    parts = _choose_parts(parts, ledger, folder)
+    own = env is None and ledger is not None
+    config = recorded_twin(ledger["settings"], folder.fps) if env is None and ledger is not None else env
+    config = config or VtRefineEnvConfig()
+    _require_same_robot(folder, config)
+    recorded = folder.read(episodes)
+    if parts == "none":
+        pairs, skipped = _replay_arms(folder, recorded, config, hold), {}
+    else:
+        pairs, skipped = _replay_scenes(folder, recorded, config, parts, ledger)
+    return Comparison(
+        root=folder.root,
+        fps=folder.fps,
+        parts=parts,
+        twin=_describe(config, parts, hold, own),
+        tracking=joint_tracking(
+            get_embodiment(config.scene_config.embodiment).joint_names,
+            [pair.recorded.action for pair in pairs],
+            [pair.recorded.state for pair in pairs],
+            [pair.position for pair in pairs],
+            1.0 / folder.fps,
+        ),
+        touch=_compare_touch(pairs),
+        pairs=pairs,
+        skipped=skipped,
+    )
+
+
+def write_summary(comparison: Comparison, path: Path) -> None:
+    """Write ``replay.json``."""
+    path.write_text(json.dumps(comparison.summary(), indent=2) + "\n", encoding="utf-8")
+
+
+def _choose_parts(parts: str, ledger: dict[str, Any] | None, folder: EpisodeFolder) -> str:
+    if parts not in PARTS:
+        raise ValueError(f"unknown --parts={parts}; choose from {', '.join(PARTS)}")
+    if parts == "recorded" and ledger is None:
+        raise ValueError(f"--parts=recorded needs seeds, but {folder.root} was not simulated by this project")
+    if parts != "auto":
+        return parts
+    if ledger is not None:
+        return "recorded"
+    return "grasp" if folder.pads else "none"
+
+
+def _require_same_robot(folder: EpisodeFolder, config: VtRefineEnvConfig) -> None:
+    robot = get_embodiment(config.scene_config.embodiment)
+    if folder.num_joints != robot.num_joints:
+        raise ValueError(
+            f"{folder.root} has {folder.num_joints} joints, the twin {robot.name} has {robot.num_joints}:"
+            " episodes of another robot cannot be replayed in it"
+        )
+    plain = [name.removesuffix(".pos") for name in folder.joints]
+    if plain and plain != list(robot.joint_names):
+        first = next(i for i, name in enumerate(plain) if name != robot.joint_names[i])
+        raise ValueError(
+            f"{folder.root}: joint {first} is {plain[first]}, in the twin {robot.joint_names[first]}:"
+            " the orders must agree"
+        )
+
+
+def _replay_arms(
+    folder: EpisodeFolder, recorded: list[RecordedEpisode], config: VtRefineEnvConfig, hold: str
+) -> list[EpisodePair]:
+    from lerobot_vtrefine.sim.command_replay import replay_commands  # MuJoCo takes seconds to import
+
+    commands, starts = [item.action for item in recorded], np.stack([item.state[0] for item in recorded])
+    positions = replay_commands(commands, starts, 1.0 / folder.fps, config.scene_config, hold=hold)
+    return [EpisodePair(*pair, {}, {}, None) for pair in zip(recorded, positions, strict=True)]
+
+
+def _replay_scenes(
+    folder: EpisodeFolder,
+    recorded: list[RecordedEpisode],
+    config: VtRefineEnvConfig,
+    parts: str,
+    ledger: dict[str, Any] | None,
+) -> tuple[list[EpisodePair], dict[int, str]]:
+    from lerobot_vtrefine.envs.factory import make_simulation
+    from lerobot_vtrefine.sim.command_replay import grasp_start, replay_scene
+
+    if parts == "grasp":
+        config = replace(config, start="table")
+    if round(folder.fps) != config.fps:
+        raise ValueError(f"{folder.root} has {folder.fps:g} frames/s, the twin --env.fps={config.fps}")
+    sim = make_simulation(config, 1)
+    seeds = recorded_seeds(ledger) if ledger is not None and parts == "recorded" else {}
+    pairs, skipped = [], {}
+    for episode in tqdm(recorded, unit="episode", desc="replay"):
+        start = None
+        if parts == "grasp":
+            start = grasp_start(sim.embodiment, sim.scene.pair, episode.state)
+            if start is None:
+                skipped[episode.index] = "a gripper never closes"
+                continue
+        replayed = replay_scene(sim, episode.action, seeds.get(episode.index, episode.index), start)
+        counts = {pad: replayed.counts[:, i] for i, pad in enumerate(PADS)}
+        baselines = {pad: replayed.baseline[i] for i, pad in enumerate(PADS)}
+        pairs.append(EpisodePair(episode, replayed.position, counts, baselines, replayed.success))
+    if not pairs:
+        raise ValueError(f"none of {len(recorded)} episodes can be replayed: {next(iter(skipped.values()))}")
+    return pairs, skipped
+
+
+def _compare_touch(pairs: list[EpisodePair]) -> list[PadTouch]:
+    rows = []
+    for pad in PADS:
+        both = [pair for pair in pairs if pad in pair.recorded.counts and pad in pair.counts]
+        both = [pair for pair in both if pair.recorded.counts[pad].shape == pair.counts[pad].shape]
+        if not both:
+            continue
+        recorded = np.concatenate([pair.recorded.counts[pad] for pair in both])
+        twin = np.concatenate([pair.counts[pad] for pair in both])
+        idle = [
+            np.concatenate([np.tile(side[pad], (len(pair.position), 1)) for pair, side in sides])
+            for sides in (
+                [(pair, pair.recorded.baselines) for pair in both],
+                [(pair, pair.baselines) for pair in both],
+            )
+        ]
+        rows.append(compare_pad(pad, recorded, twin, (idle[0], idle[1])))
+    return rows
+
+
+def _plain(pad: PadTouch) -> dict[str, Any]:
+    densities = {name: [side.tolist() for side in getattr(pad, name)] for name in DENSITIES}
+    return {**asdict(pad), **densities}
+
+
+def _describe(config: VtRefineEnvConfig, parts: str, hold: str, own: bool) -> str:
+    if parts == "none":
+        return f"{config.scene_config.embodiment}, arms alone without contacts, commands {HOLD_WORDS[hold]}"
+    scene = config.scene_config
+    origin = "the settings of the recording" if own else "--env"
+    return f"{scene.embodiment} with pair {scene.pair}, sensor model {config.sensor_model}, from {origin}"

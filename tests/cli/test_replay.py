@@ -1,0 +1,140 @@
+"""``vtrefine-replay`` on datasets with and without touch; bad input ends in one line."""
+
+import json
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from lerobot_vtrefine.cli.record_demos import RecordDemosConfig, record
+from lerobot_vtrefine.cli.replay import ReplayConfig, SourceConfig, describe, replay
+from lerobot_vtrefine.datasets.importers.joint_episodes import JointEpisode, write_dataset
+from lerobot_vtrefine.embodiments import get_embodiment
+from lerobot_vtrefine.envs import VtRefineEnvConfig
+
+ROBOT = get_embodiment("aloha")
+
+
+@pytest.fixture(scope="module")
+def demos(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    root = tmp_path_factory.mktemp("replay") / "demos"
+    env = VtRefineEnvConfig(start="grasped", pair="square", episode_steps=12)
+    record(RecordDemosConfig(root=root, num_episodes=2, num_envs=2, seed=3, env=env, include_failures=True))
+    return root
+
+
+@pytest.fixture(scope="module")
+def joints_only(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    root = tmp_path_factory.mktemp("replay") / "joints"
+    rng = np.random.default_rng(0)
+    episodes = []
+    for frames in (25, 18):
+        command = ROBOT.home + rng.normal(0, 0.01, (frames, 16)).cumsum(0)
+        command[:, [6, 7, 14, 15]] = ROBOT.home[[6, 7, 14, 15]]
+        episodes.append(JointEpisode(command.astype(np.float32), command.astype(np.float32)))
+    write_dataset(episodes, ROBOT.joint_names, root, "local/joints", 10, "move")
+    return root
+
+
+def test_a_simulated_recording_is_reproduced_touch_included(demos: Path, tmp_path: Path) -> None:
+    comparison = replay(ReplayConfig(tmp_path / "out", SourceConfig(demos)))
+    assert comparison.parts == "recorded"
+    assert [pad.identical_frames for pad in comparison.touch] == [24] * 4
+    assert all(pad.touched[0] > 0 for pad in comparison.touch)
+    assert max(row.peak for row in comparison.tracking) == 0.0
+    summary = json.loads((tmp_path / "out" / "replay.json").read_text())
+    assert summary["schema"] == "vtrefine/replay@1"
+    assert "24 of 24 frames identical" in "\n".join(describe(comparison))
+
+
+def test_another_sensor_model_shows(demos: Path, tmp_path: Path) -> None:
+    env = VtRefineEnvConfig(start="grasped", pair="square", sensor_model="paper")
+    comparison = replay(ReplayConfig(tmp_path / "out", SourceConfig(demos), episodes=[1], env=env))
+    assert len(comparison.pairs) == 1
+    assert all(pad.identical_frames == 0 for pad in comparison.touch)
+    assert max(row.peak for row in comparison.tracking) == 0.0  # the motion is the same
+
+
+def test_tracking_alone(joints_only: Path, tmp_path: Path) -> None:
+    comparison = replay(ReplayConfig(tmp_path / "out", SourceConfig(joints_only)))
+    assert (comparison.parts, comparison.touch) == ("none", [])
+    assert [len(pair.position) for pair in comparison.pairs] == [25, 18]
+    waist = comparison.tracking[0]
+    assert 0 < waist.rmse < 0.05  # the twin's servo lags behind a recording without lag
+    assert waist.recorded_lag_s == 0.0
+    assert (tmp_path / "out" / "report.html").stat().st_size > 50_000
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"episodes": [5]}, "has episodes 0 to 1, episode 5 was asked for"),
+        ({"parts": "recorded"}, "--parts=recorded needs seeds"),
+        ({"parts": "grasp"}, "none of 2 episodes can be replayed: a gripper never closes"),
+        ({"env": VtRefineEnvConfig(fps=20), "parts": "grasp"}, "10 frames/s, the twin --env.fps=20"),
+    ],
+)
+def test_what_cannot_be_replayed(joints_only: Path, tmp_path: Path, change: dict, message: str) -> None:
+    with pytest.raises(ValueError, match=message):
+        replay(ReplayConfig(tmp_path / "out", SourceConfig(joints_only), **change))
+    assert not (tmp_path / "out").exists()
+
+
+def test_another_robot_and_another_order_are_refused(tmp_path: Path) -> None:
+    rng = np.random.default_rng(0)
+    values = rng.normal(0, 1, (4, 6)).astype(np.float32)
+    write_dataset(
+        [JointEpisode(values, values)], [f"j{i}" for i in range(6)], tmp_path / "six", "local/six", 10, "x"
+    )
+    with pytest.raises(ValueError, match="6 joints, the twin aloha has 16"):
+        replay(ReplayConfig(tmp_path / "out", SourceConfig(tmp_path / "six")))
+    values = rng.normal(0, 1, (4, 16)).astype(np.float32)
+    names = ROBOT.joint_names[::-1]
+    write_dataset([JointEpisode(values, values)], names, tmp_path / "other", "local/other", 10, "x")
+    with pytest.raises(ValueError, match="joint 0 is right_right_finger, in the twin left_waist"):
+        replay(ReplayConfig(tmp_path / "out", SourceConfig(tmp_path / "other")))
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        ({"dataset": SourceConfig()}, "say what to replay"),
+        ({"parts": "some"}, "unknown --parts=some"),
+        ({"episodes": []}, "--episodes is empty"),
+    ],
+)
+def test_wrong_flags(arguments: dict, message: str, tmp_path: Path) -> None:
+    with pytest.raises(ValueError, match=message):
+        ReplayConfig(**{"output_dir": tmp_path, "dataset": SourceConfig(tmp_path), **arguments})
+
+
+def damage(root: Path, name: str, change: Callable[[str], str]) -> None:
+    path = root / "meta" / name
+    path.write_text(change(path.read_text()))
+
+
+def test_broken_folders(joints_only: Path, tmp_path: Path) -> None:
+    import shutil
+
+    with pytest.raises(FileNotFoundError, match="holds no LeRobot dataset"):
+        replay(ReplayConfig(tmp_path / "out", SourceConfig(tmp_path)))
+    copy = tmp_path / "copy"
+    shutil.copytree(joints_only, copy)
+    data = next((copy / "data").rglob("*.parquet"))
+    data.write_bytes(data.read_bytes()[:200])
+    with pytest.raises(ValueError, match=r"file-000\.parquet cannot be read"):
+        replay(ReplayConfig(tmp_path / "out", SourceConfig(copy)))
+    data.unlink()
+    with pytest.raises(ValueError, match="data files lack episode 0"):
+        replay(ReplayConfig(tmp_path / "out", SourceConfig(copy)))
+    damage(copy, "info.json", lambda text: text.replace('"v3.0"', '"v2.1"'))
+    with pytest.raises(ValueError, match=r"version v2\.1 is not v3\.0"):
+        replay(ReplayConfig(tmp_path / "out", SourceConfig(copy)))
+
+
+def test_reports_are_not_overwritten(joints_only: Path, tmp_path: Path) -> None:
+    (tmp_path / "report.html").write_text("mine")
+    with pytest.raises(FileExistsError, match=r"report\.html exists"):
+        replay(ReplayConfig(tmp_path, SourceConfig(joints_only)))
+    assert (tmp_path / "report.html").read_text() == "mine"
