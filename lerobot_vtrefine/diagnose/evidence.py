@@ -7,7 +7,7 @@ from typing import Any, Protocol
 
 import numpy as np
 
-from lerobot_vtrefine.diagnose.verdict import Cause, DataIssue, Heldout, Parameter, Status, Unknown
+from lerobot_vtrefine.diagnose.verdict import Cause, DataIssue, Heldout, Parameter, Unknown
 
 
 @dataclass(frozen=True)
@@ -78,7 +78,7 @@ class ResidualView:
 
 @dataclass(frozen=True)
 class TrialError:
-    """Root mean squared error of one held-out trial, before and after the extension, in the diagnosis' unit."""
+    """Root mean squared error of a held-out trial before and after the extension, in the diagnosis' unit."""
 
     file: str
     condition: str
@@ -98,7 +98,8 @@ class Diagnosis(Protocol):
     """What every engine returns, for pads and for robots alike; the report and the command read only this.
 
     Attributes:
-        status, causes, ambiguous_with, unknown, heldout, minimum_detectable, next_experiment: as in `Verdict`.
+        status, causes, ambiguous_with, unknown, heldout: as in `Verdict`, and so are minimum_detectable and
+            next_experiment.
         issues: problems of the data that the engine met beyond quality control.
         baseline_model, extended_model: what ``vtrefine-predict`` loads.
         baseline_params: the refitted parameters of the baseline, name -> value with interval.
@@ -109,7 +110,7 @@ class Diagnosis(Protocol):
     """
 
     @property
-    def status(self) -> Status: ...  # noqa: D102
+    def status(self) -> str: ...  # noqa: D102
     @property
     def causes(self) -> tuple[Cause, ...]: ...  # noqa: D102
     @property

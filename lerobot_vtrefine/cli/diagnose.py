@@ -1,0 +1,183 @@
+"""``vtrefine-diagnose``: what the simulation gets wrong, why, the repaired model, and the measured gain.
+
+``vtrefine-diagnose --recording=DIR --output_dir=OUT``
+"""
+
+import argparse
+from collections.abc import Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, cast
+
+from tqdm import tqdm
+
+from lerobot_vtrefine.cli.arguments import OneLineParser
+from lerobot_vtrefine.cli.errors import run_cli
+from lerobot_vtrefine.cli.outputs import staged
+
+if TYPE_CHECKING:
+    from lerobot_vtrefine.diagnose.evidence import Diagnosis, Savable
+    from lerobot_vtrefine.diagnose.recordings import RecordingSet
+    from lerobot_vtrefine.diagnose.verdict import DataIssue, Status, Verdict
+
+FILES = ("baseline_model.json", "sensor_model.json", "report.html", "verdict.json")
+"""What a run leaves in the output folder; the verdict last, so that it stands for a whole run."""
+DESCRIPTION = """\
+Compare measured recordings with the simulation, name what the simulation gets wrong, extend its model
+by that and measure the gain on recordings that no fit and no choice has seen.
+
+Give a recording set (a folder with recording.json and a Parquet file per trial), or a LeRobot dataset
+of a robot's commands and positions, an episode being a trial."""
+EPILOG = """\
+Results in the output folder:
+  verdict.json         status (adequate, explained, ambiguous, unexplained, invalid_data), causes with
+                       parameters and intervals, held-out gain, what could not have been seen, data issues
+  sensor_model.json    the extended model; load it with vtrefine-predict --sensor_model=FILE, and pads' models
+                       with --env.sensor_model=FILE in lerobot-eval and vtrefine-finetune
+  baseline_model.json  the simulation's own model, refitted, for comparison
+  report.html          all of it for reading, on one page that needs no network
+
+The exit status is 0 whatever the verdict, and 2 when the input cannot be read; one line then says which
+file, trial and column is wrong.
+
+examples:
+  vtrefine-diagnose --recording=presses --output_dir=diagnosis
+  vtrefine-diagnose --dataset.root=outputs/aloha --output_dir=diagnosis"""
+
+
+def make_parser() -> OneLineParser:
+    """Command line of ``vtrefine-diagnose``."""
+    parser = OneLineParser("vtrefine-diagnose", DESCRIPTION, EPILOG)
+    parser.add_argument("--recording", type=Path, metavar="DIR", help="folder with recording.json")
+    parser.add_argument(
+        "--dataset.repo_id", dest="repo_id", metavar="NAME", help="LeRobot dataset, by its name"
+    )
+    parser.add_argument(
+        "--dataset.root", dest="root", type=Path, metavar="DIR", help="LeRobot dataset, by its folder"
+    )
+    parser.add_argument(
+        "--output_dir", type=Path, required=True, metavar="DIR", help="folder for the results"
+    )
+    parser.add_argument(
+        "--seed", type=int, default=0, help="of resampling and of what is held out (default %(default)s)"
+    )
+    parser.add_argument("--overwrite", action="store_true", help="replace results that are there already")
+    return parser
+
+
+@run_cli
+def main(arguments: Sequence[str] | None = None) -> None:
+    """Console entry point."""
+    options = make_parser().parse_args(arguments)
+    check(options)
+    with staged(options.output_dir, FILES, overwrite=options.overwrite) as folder:
+        verdict, unit = run(read(options), folder, options.seed)
+    summarise(verdict, unit, options.output_dir)
+
+
+def check(options: argparse.Namespace) -> None:
+    """ValueError unless exactly one source of recordings is given, and a seed that generators take."""
+    dataset = options.repo_id is not None or options.root is not None
+    if (options.recording is not None) == dataset:
+        raise ValueError("give either --recording=DIR, or --dataset.root and/or --dataset.repo_id")
+    if options.seed < 0:
+        raise ValueError(f"--seed must be at least 0, got {options.seed}")
+
+
+def read(options: argparse.Namespace) -> "RecordingSet":
+    """The recordings that the options name; ValueError or FileNotFoundError say what is wrong with them."""
+    if options.recording is not None:
+        from lerobot_vtrefine.diagnose.recordings import read_recording_set
+
+        return read_recording_set(options.recording)
+    from lerobot_vtrefine.diagnose.robot.dataset import read_dataset
+
+    return read_dataset(options.repo_id, options.root)
+
+
+def run(recordings: "RecordingSet", folder: Path, seed: int) -> tuple["Verdict", str]:
+    """Quality control, diagnosis, and all result files into ``folder``; the verdict and its unit of error."""
+    from lerobot_vtrefine.diagnose.quality import check_quality, too_little
+    from lerobot_vtrefine.diagnose.report import render_report
+    from lerobot_vtrefine.diagnose.verdict import write_verdict
+
+    sound, issues = check_quality(recordings)
+    hopeless = too_little(sound, recordings)
+    if hopeless is None:
+        diagnosis = diagnose(sound, seed)
+        issues += diagnosis.issues
+        models: tuple[Savable, Savable] = (diagnosis.baseline_model, diagnosis.extended_model)
+    else:
+        diagnosis = None
+        issues.append(hopeless)
+        models = (unfitted_model(recordings),) * 2
+    verdict = make_verdict(diagnosis, issues)
+    for model, name in zip(models, FILES[:2], strict=True):
+        model.save(folder / name)
+    page = render_report(verdict, diagnosis, recordings, len(sound.trials), seed)
+    (folder / "report.html").write_text(page, encoding="utf-8")
+    write_verdict(verdict, folder / "verdict.json")
+    return verdict, diagnosis.unit if diagnosis is not None else "counts"
+
+
+def diagnose(recordings: "RecordingSet", seed: int) -> "Diagnosis":
+    """Run the engine for this kind of recordings, with a progress bar."""
+    with tqdm(total=100, bar_format="{desc:<44} {percentage:3.0f} % |{bar}| {elapsed}") as bar:
+
+        def progress(doing: str, done: float) -> None:
+            bar.set_description_str(doing, refresh=False)
+            bar.update(100.0 * min(done, 1.0) - bar.n)
+
+        if recordings.kind == "pad":
+            from lerobot_vtrefine.diagnose.pad_engine import diagnose_pad
+
+            return diagnose_pad(recordings, seed=seed, progress=progress)
+        from lerobot_vtrefine.diagnose.robot.engine import diagnose_robot
+
+        return diagnose_robot(recordings, seed=seed, progress=progress)
+
+
+def make_verdict(diagnosis: "Diagnosis | None", issues: Sequence["DataIssue"]) -> "Verdict":
+    """The verdict of a diagnosis, or ``invalid_data`` without one."""
+    from lerobot_vtrefine.diagnose.verdict import Verdict
+
+    if diagnosis is None:
+        return Verdict("invalid_data", data_issues=tuple(issues))
+    return Verdict(
+        cast("Status", diagnosis.status),
+        diagnosis.causes,
+        diagnosis.ambiguous_with,
+        diagnosis.unknown,
+        diagnosis.heldout,
+        diagnosis.minimum_detectable,
+        diagnosis.next_experiment,
+        tuple(issues),
+    )
+
+
+def unfitted_model(recordings: "RecordingSet") -> "Savable":
+    """What the simulation assumes before anything is fitted, for data that allow no fit."""
+    if recordings.kind == "robot":
+        from lerobot_vtrefine.diagnose.robot.model import RobotModel
+
+        return RobotModel.default(recordings.joints)
+    from lerobot_vtrefine.tactile.model import SensorModel
+    from lerobot_vtrefine.tactile.stages.contact import KelvinVoigt
+    from lerobot_vtrefine.tactile.stages.readout import Gain, Idle, Quantisation
+
+    converter = Quantisation(full_scale_counts=recordings.full_scale)
+    return SensorModel((KelvinVoigt(), Gain(), Idle(spread_counts=0.0), converter))
+
+
+def summarise(verdict: "Verdict", unit: str, output_dir: Path) -> None:
+    """The verdict and where to read about it, in a few lines."""
+    from lerobot_vtrefine.diagnose.report.words import headline
+
+    print(f"{verdict.status}: {headline(verdict, unit)}")
+    if verdict.data_issues:
+        aside = sum(issue.action == "set aside" for issue in verdict.data_issues)
+        print(f"data issues: {len(verdict.data_issues)}, {aside} recordings set aside")
+    print(f"read {output_dir / 'report.html'}")
+
+
+if __name__ == "__main__":
+    raise SystemExit(main())

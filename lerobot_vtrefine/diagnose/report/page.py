@@ -1,0 +1,218 @@
+"""``report.html``: one self-contained page about a diagnosis."""
+
+import json
+from collections.abc import Mapping, Sequence
+from pathlib import PurePath
+from typing import Any
+
+import numpy as np
+from jinja2 import Environment, PackageLoader, StrictUndefined
+
+from lerobot_vtrefine.diagnose.evidence import Diagnosis, Evidence, Trace
+from lerobot_vtrefine.diagnose.recordings import RecordingSet
+from lerobot_vtrefine.diagnose.report.figures import (
+    error_figure,
+    map_image,
+    residual_figure,
+    trace_figure,
+    trial_figure,
+)
+from lerobot_vtrefine.diagnose.report.numbers import interval, nested, p_text, percent, quantity
+from lerobot_vtrefine.diagnose.report.words import MEANINGS, doubts, headline, title
+from lerobot_vtrefine.diagnose.verdict import Parameter, Verdict
+
+SHOWN_TRACES = 4
+"""Trials drawn at once; the others are folded away."""
+DECISIONS = {
+    "accepted": "found",
+    "symptom": "symptom",
+    "tie": "tied",
+    "rejected": "not found",
+    "not identifiable": "cannot be told here",
+}
+
+
+def render_report(
+    verdict: Verdict, diagnosis: Diagnosis | None, recordings: RecordingSet, sound: int, seed: int
+) -> str:
+    """The page as HTML text.
+
+    Args:
+        diagnosis: None when the data allowed none (``invalid_data``).
+        recordings: as they were read, before quality control.
+        sound: number of trials that passed it.
+    """
+    environment = Environment(
+        loader=PackageLoader("lerobot_vtrefine.diagnose.report", "."),
+        autoescape=True,
+        undefined=StrictUndefined,
+        trim_blocks=True,
+        lstrip_blocks=True,
+    )
+    unit = diagnosis.unit if diagnosis is not None else "counts"
+    return environment.get_template("report.html").render(
+        headline=headline(verdict, unit),
+        verdict=verdict,
+        meanings=MEANINGS,
+        title=title,
+        doubts=doubts(verdict, len(recordings.trials), sound),
+        facts=_facts(verdict, recordings, sound, seed),
+        next_experiment=_experiment(verdict.next_experiment),
+        detectable=[
+            {
+                "title": title(name),
+                "what": MEANINGS[name].parameter,
+                "size": quantity(size, MEANINGS[name].unit),
+            }
+            for name, size in verdict.minimum_detectable.items()
+        ],
+        **(_nothing() if diagnosis is None else _findings(verdict, diagnosis, unit)),
+    )
+
+
+def _nothing() -> dict[str, Any]:
+    names = (
+        "error_chart",
+        "trial_chart",
+        "traces",
+        "more_traces",
+        "residuals",
+        "evidence",
+        "parameters",
+        "maps",
+    )
+    return dict.fromkeys(names, ())
+
+
+def _findings(verdict: Verdict, diagnosis: Diagnosis, unit: str) -> dict[str, Any]:
+    traces = [{"caption": text, "figure": trace_figure(t, unit)} for t, text in _ordered(diagnosis.traces)]
+    groups = [(title(cause.name), cause.params) for cause in verdict.causes]
+    groups.append(("baseline, refitted", diagnosis.baseline_params))
+    return {
+        "error_chart": error_figure(verdict.heldout, unit) if verdict.heldout else "",
+        "trial_chart": trial_figure(diagnosis.trial_errors, unit) if diagnosis.trial_errors else "",
+        "traces": traces[:SHOWN_TRACES],
+        "more_traces": traces[SHOWN_TRACES:],
+        "residuals": [residual_figure(view, unit) for view in diagnosis.residuals],
+        "evidence": [_evidence_row(item) for item in _by_decision(diagnosis.evidence)],
+        "parameters": [
+            _parameter_row(group, name, p) for group, params in groups for name, p in params.items()
+        ],
+        "maps": _maps(diagnosis.maps, unit),
+    }
+
+
+def _facts(verdict: Verdict, recordings: RecordingSet, sound: int, seed: int) -> list[tuple[str, str]]:
+    """Short facts about the data, title and text."""
+    conditions = len({trial.condition for trial in recordings.trials})
+    if recordings.kind == "pad":
+        what = (
+            f"pad of {recordings.rows} × {recordings.cols} taxels, {quantity(recordings.pitch_m, 'm')} apart"
+        )
+    else:
+        what = f"robot with {len(recordings.joints)} joints"
+    seconds = sum(float(np.ptp(t.time_s[np.isfinite(t.time_s)])) for t in recordings.trials if len(t.time_s))
+    facts = [
+        (
+            "recordings",
+            f"{len(recordings.trials)} in {conditions} conditions, {seconds:.0f} s in all; {sound} sound",
+        ),
+        ("what", f"{what}, from {PurePath(recordings.path).name}"),
+    ]
+    if verdict.heldout is not None:
+        facts.append(
+            ("held out", f"{len(verdict.heldout.trials)} recordings that no fit and no choice has seen")
+        )
+    return [*facts, ("seed", str(seed))]
+
+
+def _ordered(traces: Sequence[Trace]) -> list[tuple[Trace, str]]:
+    """Traces with captions: the typical one and the worst first, so that nobody sees only the best."""
+
+    def error(trace: Trace) -> float:
+        return float(np.sqrt(np.nanmean((trace.measured - trace.extended) ** 2)))
+
+    ranked = sorted(traces, key=error)
+    if len(ranked) < 3:
+        return [(trace, _caption(trace, "")) for trace in ranked]
+    middle = ranked.pop(len(ranked) // 2)
+    worst, best = ranked.pop(), ranked.pop(0)
+    special = [(middle, "typical"), (worst, "the worst predicted"), (best, "the best predicted")]
+    return [(trace, _caption(trace, text)) for trace, text in [*special, *((trace, "") for trace in ranked)]]
+
+
+def _caption(trace: Trace, remark: str) -> str:
+    parts = [PurePath(trace.file).stem, f"condition {trace.condition}", remark]
+    return ", ".join(part for part in parts if part)
+
+
+def _by_decision(evidence: Sequence[Evidence]) -> list[Evidence]:
+    """Found ones first, each group by what it gains on held-out recordings."""
+    order = list(DECISIONS)
+    return sorted(evidence, key=lambda item: (order.index(item.decision), -(item.heldout_gain or 0.0)))
+
+
+def _evidence_row(item: Evidence) -> dict[str, Any]:
+    gain = item.heldout_gain
+    return {
+        "title": title(item.name),
+        "name": item.name,
+        "p": p_text(item.p_value),
+        "p_adjusted": p_text(item.p_adjusted),
+        "gain": "–" if gain is None else percent(gain),
+        "bar": 0.0 if gain is None else 100.0 * min(max(gain, 0.0), 1.0),
+        "decision": DECISIONS[item.decision],
+        "style": item.decision.replace(" ", "-"),
+        "reason": item.reason,
+    }
+
+
+def _parameter_row(group: str, name: str, parameter: Parameter) -> dict[str, Any]:
+    row = {"group": group, "name": name, "image": "", "interval": "", "value": ""}
+    value = parameter.value
+    if isinstance(value, (int, float)):
+        ci95 = parameter.ci95 if parameter.ci95 is None else [float(end) for end in parameter.ci95]
+        row["value"], row["interval"] = interval(float(value), ci95, parameter.unit)
+        return row
+    array = _number_map(value)
+    if array is None or min(array.shape) < 2 or name == "taxels":
+        return row | {"value": nested(value)}
+    low, high = float(array.min()), float(array.max())
+    span = max(high - 1.0, 1.0 - low, 1e-9)
+    return row | {
+        "value": f"{low:.3g} to {high:.3g}, median {np.median(array):.3g}",
+        "image": map_image(array - 1.0, span, diverging=True),
+    }
+
+
+def _number_map(value: Any) -> np.ndarray | None:
+    """Nested lists as an (R, C) array, or None if they are none."""
+    try:
+        array = np.asarray(value, dtype=float)
+    except (ValueError, TypeError):
+        return None
+    return array if array.ndim == 2 else None
+
+
+def _maps(maps: Mapping[str, np.ndarray], unit: str) -> list[dict[str, str]]:
+    """Heat maps; those whose titles start alike ("rms residual before", "... after") share a scale."""
+    shown = []
+    for name, values in maps.items():
+        family = name.rsplit(" ", 1)[0]
+        alike = [other for key, other in maps.items() if key.rsplit(" ", 1)[0] == family]
+        top = max(float(np.nanmax(np.abs(other))) for other in alike)
+        caption = f"{name}: up to {quantity(float(np.nanmax(values)), unit)}"
+        shown.append({"caption": caption, "image": map_image(np.abs(values), top)})
+    return shown
+
+
+def _experiment(protocol: Mapping[str, Any] | None) -> dict[str, Any] | None:
+    """What to record next: a text for people, and the protocol for the rig."""
+    if protocol is None:
+        return None
+    rest = {key: value for key, value in protocol.items() if key not in ("text", "decides")}
+    return {
+        "text": protocol.get("text", ""),
+        "decides": [title(name) if name in MEANINGS else str(name) for name in protocol.get("decides", ())],
+        "protocol": json.dumps(rest, indent=2, default=str) if rest else "",
+    }

@@ -1,0 +1,182 @@
+"""The verdict in plain words."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+from lerobot_vtrefine.diagnose.report.numbers import digits, percent, quantity, scale_of
+from lerobot_vtrefine.diagnose.verdict import Verdict
+
+
+@dataclass(frozen=True)
+class Meaning:
+    """A cause for people: its title, what it is, and the unit of its main parameter (contract §5)."""
+
+    title: str
+    what: str
+    parameter: str
+    unit: str
+
+
+MEANINGS = {
+    "nonlinear_stiffness": Meaning(
+        "non-linear stiffness",
+        "The cover gets harder, or softer, the deeper it is pressed.",
+        "exponent − 1",
+        "1",
+    ),
+    "saturation": Meaning(
+        "saturation", "High readings level off before the converter's full scale.", "knee", "counts"
+    ),
+    "viscoelastic_relaxation": Meaning(
+        "viscoelastic relaxation",
+        "Under a held load the reading creeps, and after it a rest remains.",
+        "fraction",
+        "1",
+    ),
+    "hysteresis": Meaning(
+        "hysteresis",
+        "At the same depth the pad reads differently while it is loaded and unloaded.",
+        "fraction",
+        "1",
+    ),
+    "taxel_gain_spread": Meaning(
+        "taxel gain spread", "Every taxel has a sensitivity of its own.", "spread", "1"
+    ),
+    "dead_taxels": Meaning("dead taxels", "Some taxels never answer.", "taxels", "1"),
+    "row_sharing": Meaning(
+        "row sharing",
+        "The readout's voltage divider: a taxel's reading falls as others of its row are pressed.",
+        "conductance",
+        "1/counts",
+    ),
+    "crosstalk": Meaning(
+        "crosstalk", "A reading leaks into the others of its row and column.", "fraction", "1"
+    ),
+    "mechanical_spreading": Meaning(
+        "mechanical spreading", "The cover spreads a press over neighbouring taxels.", "sigma", "m"
+    ),
+    "baseline_drift": Meaning(
+        "baseline drift", "The idle level moves during the session.", "rate", "counts/s"
+    ),
+    "latency": Meaning("latency", "Readings reach the host late.", "delay", "s"),
+    "scan_skew": Meaning(
+        "scan skew", "Rows are read one after the other, not at once.", "first to last row", "s"
+    ),
+    "sample_and_hold": Meaning(
+        "sample and hold", "The host repeats old frames until a new one is there.", "period", "s"
+    ),
+    "contact_offset": Meaning(
+        "contact offset", "The pad's face lies deeper, or higher, than assumed.", "offset", "m"
+    ),
+    "pad_tilt": Meaning("pad tilt", "The pad's face is not parallel to the assumed one.", "tilt", "rad"),
+    "encoder_offset": Meaning("encoder offset", "A joint's encoder is off by a constant.", "offset", "rad"),
+    "backlash": Meaning(
+        "backlash", "A joint has play: after a reversal it first does not follow.", "width", "rad"
+    ),
+    "control_latency": Meaning("control latency", "Commands take effect late.", "delay", "s"),
+    "joint_friction": Meaning("joint friction", "Dry friction holds a joint back.", "friction", "N*m"),
+    "gravity_sag": Meaning(
+        "gravity sag", "The arm's weight pulls joints away from their command.", "sag", "rad"
+    ),
+    "gripper_compliance": Meaning(
+        "gripper compliance",
+        "The gripper gives way under load, or is blocked by what it holds.",
+        "compliance",
+        "m/N",
+    ),
+    "camera_extrinsics": Meaning(
+        "camera extrinsics", "The camera does not stand where the simulation puts it.", "displacement", "m"
+    ),
+    "depth_scale": Meaning(
+        "depth scale", "The depth camera's distances are off by a factor.", "factor − 1", "1"
+    ),
+    "object_mass": Meaning("object mass", "The object weighs more, or less, than simulated.", "mass", "kg"),
+    "object_friction": Meaning(
+        "object friction", "The object slides more, or less, easily than simulated.", "coefficient", "1"
+    ),
+    "clearance": Meaning("clearance", "The socket is tighter, or wider, than simulated.", "clearance", "m"),
+}
+
+
+def title(name: str) -> str:
+    """A cause's name for people."""
+    return MEANINGS[name].title
+
+
+def listing(items: Sequence[str], last: str = "and") -> str:
+    """ "a", "a and b", "a, b and c"."""
+    items = list(items)
+    if len(items) < 2:
+        return "".join(items)
+    return f"{', '.join(items[:-1])} {last} {items[-1]}"
+
+
+def headline(verdict: Verdict, unit: str) -> str:
+    """The first sentence of the report."""
+    names = listing([title(cause.name) for cause in verdict.causes])
+    pairs = listing([listing([title(name) for name in group], "or") for group in verdict.ambiguous_with])
+    if verdict.status == "invalid_data":
+        return "These recordings allow no verdict: too little of them is sound."
+    if verdict.status == "adequate":
+        fitted = "stiffness, damping and gain" if unit == "counts" else "servo constants"
+        return f"The simulation is adequate: once its {fitted} are refitted, nothing significant is left."
+    if verdict.status == "explained":
+        return f"The simulation lacks {names}. {repaired(verdict, unit)}"
+    if verdict.status == "ambiguous":
+        sure = [title(c.name) for c in verdict.causes if not any(c.name in g for g in verdict.ambiguous_with)]
+        beside = f" It surely lacks {listing(sure)}." if sure else ""
+        return f"The simulation is wrong, but these recordings cannot tell whether it lacks {pairs}.{beside}"
+    clue = f" It goes with {verdict.unknown.clue}." if verdict.unknown.clue else ""
+    symptoms = f" What looks like {names} may be a symptom of it." if names else ""
+    return f"The simulation is wrong in a way that no known cause explains.{clue}{symptoms}"
+
+
+def repaired(verdict: Verdict, unit: str) -> str:
+    """What the extension gains on held-out recordings, in one sentence."""
+    held = verdict.heldout
+    if held is None:
+        return ""
+    factor, name = scale_of(held.baseline, unit)
+    change = f"from {digits(held.baseline * factor)} to {digits(held.extended * factor)} {name}"
+    interval = ""
+    if held.gain_ci95 is not None:
+        interval = f" (95 % interval {percent(held.gain_ci95[0])} to {percent(held.gain_ci95[1])})"
+    floor = ""
+    if held.noise_floor is not None:
+        floor = f" Noise alone is {quantity(held.noise_floor, unit)}."
+    added = "it" if len(verdict.causes) == 1 else "these"
+    return (
+        f"With {added} added, its error on recordings that it had never seen falls {change}; "
+        f"{percent(held.gain)} of the squared error is gone{interval}.{floor}"
+    )
+
+
+def doubts(verdict: Verdict, recorded: int, checked: int) -> list[str]:
+    """What a sceptic should hold against this verdict, judging by its own numbers."""
+    found = []
+    held = verdict.heldout
+    if checked < recorded:
+        found.append(f"Set aside: {recorded - checked} of {recorded} recordings, see Data below.")
+    if held is None:
+        return found
+    if len(held.trials) < 6:
+        found.append(
+            f"Only {len(held.trials)} recordings were held out, so the interval of the gain is rough."
+        )
+    if held.gain_ci95 is not None and held.gain_ci95[0] <= 0 and verdict.causes:
+        found.append("The interval of the gain includes zero: the repair may not help on other recordings.")
+    if held.noise_floor is not None and held.noise_floor > 0:
+        excess = (held.extended**2 - held.noise_floor**2) / max(held.baseline**2, 1e-30)
+        if excess > 0.1:
+            found.append(
+                f"{percent(excess)} of the baseline's squared error is neither repaired nor noise: the form "
+                "of the repair is not right, or recordings differ in ways that the model does not know."
+            )
+        elif excess < -0.02:
+            found.append("The error is below the estimated noise floor, so that floor is estimated too high.")
+    weak = [title(c.name) for c in verdict.causes if c.p_value is None or c.p_value > 0.01]
+    if weak:
+        found.append(f"The evidence for {listing(weak)} is thin (p above 0.01, or none).")
+    if verdict.unknown.alarm and verdict.causes:
+        found.append("The names given are symptoms: an unknown effect often borrows a known one's name.")
+    return found

@@ -1,0 +1,225 @@
+"""report.html: complete, self-contained and well-formed; looked at in a browser where there is one."""
+
+import re
+import shutil
+import subprocess
+from html.parser import HTMLParser
+
+import numpy as np
+import pytest
+from fake_diagnosis import pad_diagnosis, robot_diagnosis
+from pad_sets import make_robot_set, make_set, write_set
+from PIL import Image
+
+from lerobot_vtrefine.cli.diagnose import make_verdict
+from lerobot_vtrefine.diagnose.recordings import read_recording_set
+from lerobot_vtrefine.diagnose.report import render_report
+from lerobot_vtrefine.diagnose.report.axes import ticks
+from lerobot_vtrefine.diagnose.report.numbers import digits, interval, quantity
+from lerobot_vtrefine.diagnose.report.words import MEANINGS
+from lerobot_vtrefine.diagnose.verdict import CAUSES, DataIssue, Unknown
+
+ISSUE = DataIssue("trial_0003.parquet", "starts loaded", "set aside")
+BROWSERS = ("chromium", "chromium-browser", "google-chrome", "chrome")
+VOID = {"meta", "br", "img", "link", "input", "hr", "rect", "path", "circle", "polyline", "polygon"}
+
+
+@pytest.fixture(scope="module")
+def pad_set(tmp_path_factory):
+    return read_recording_set(write_set(tmp_path_factory.mktemp("pad") / "presses", *make_set()))
+
+
+@pytest.fixture(scope="module")
+def robot_set(tmp_path_factory):
+    return read_recording_set(write_set(tmp_path_factory.mktemp("robot") / "moves", *make_robot_set()))
+
+
+def page(diagnosis, recordings, issues=(ISSUE,)):
+    return render_report(
+        make_verdict(diagnosis, issues), diagnosis, recordings, len(recordings.trials) - 1, 0
+    )
+
+
+def text_of(html):
+    body = re.sub(r"<style>.*?</style>", "", html, flags=re.DOTALL)
+    return " ".join(re.sub(r"<[^>]+>", " ", body).split())
+
+
+class Balance(HTMLParser):
+    """Collects open tags; every closing one must match the last."""
+
+    def __init__(self):
+        super().__init__()
+        self.open, self.wrong = [], []
+
+    def handle_starttag(self, tag, attrs):
+        if tag not in VOID:
+            self.open.append(tag)
+
+    def handle_startendtag(self, tag, attrs):
+        pass
+
+    def handle_endtag(self, tag):
+        if not self.open or self.open.pop() != tag:
+            self.wrong.append((tag, self.getpos()))
+
+
+@pytest.mark.parametrize("kind", ["pad", "robot", "invalid"])
+def test_page_is_well_formed_and_needs_no_network(kind, pad_set, robot_set):
+    html = {
+        "pad": lambda: page(pad_diagnosis(), pad_set),
+        "robot": lambda: page(robot_diagnosis(), robot_set),
+        "invalid": lambda: page(None, pad_set),
+    }[kind]()
+    balance = Balance()
+    balance.feed(html)
+    assert balance.wrong == []
+    assert balance.open == []
+    assert not re.findall(r"(?:https?:)?//[a-z]", html)
+    assert not re.findall(r"<(?:link|script|iframe)\b", html)
+    sources = re.findall(r'(?:src|href)="([^"]*)"', html)
+    assert all(source.startswith("data:image/png;base64,") for source in sources)
+    assert "nan" not in re.sub(r"base64,[^\"]*", "", html).lower()
+
+
+def test_first_line_is_the_verdict_in_plain_words(pad_set, robot_set):
+    explained = text_of(page(pad_diagnosis(), pad_set))
+    assert explained.index("The simulation lacks taxel gain spread and hysteresis.") < 60
+    assert "falls from 4.1 to 2.4 counts; 66 % of the squared error is gone" in explained
+    assert "(95 % interval 61 % to 70 %). Noise alone is 2.3 counts." in explained
+
+    ambiguous = text_of(page(robot_diagnosis(), robot_set))
+    assert (
+        "cannot tell whether it lacks backlash or control latency. It surely lacks gravity sag." in ambiguous
+    )
+    adequate = pad_diagnosis(status="adequate", causes=())
+    assert "The simulation is adequate" in text_of(page(adequate, pad_set))[:120]
+    assert "allow no verdict" in text_of(page(None, pad_set))[:120]
+
+
+def test_unknown_cause_demotes_names_to_symptoms(pad_set):
+    symptoms = tuple(
+        type(c)(c.name, "symptom", c.params, c.p_value, c.heldout_gain) for c in pad_diagnosis().causes
+    )
+    unknown = pad_diagnosis(
+        status="unexplained", causes=symptoms, unknown=Unknown(True, "load × session time")
+    )
+    text = text_of(page(unknown, pad_set))
+    assert "wrong in a way that no known cause explains. It goes with load × session time." in text[:200]
+    assert "What looks wrong" in text
+    assert "a symptom: the name may be borrowed" in text
+
+
+def test_everything_found_and_not_found_is_there(pad_set):
+    text = text_of(page(pad_diagnosis(), pad_set))
+    for words in (
+        "trial_0003.parquet starts loaded set aside",
+        "crosstalk crosstalk 0.4 0.99 0.1 % not found no more than chance gives",
+        "baseline drift baseline_drift – – – cannot be told here",
+        "hysteresis width_m 0.21 mm 0.18 to 0.24 mm",
+        "baseline, refitted k_n 380 N/m 371 to 390 N/m",
+        "latency delay 6 ms",
+        "contact offset offset 30 µm",
+        "the worst predicted",
+        "2 more held-out recordings",
+        "Set aside: 1 of 8 recordings",
+    ):
+        assert words in text, words
+    svg_titles = re.findall(r'aria-label="mean residual against (\w+)"', page(pad_diagnosis(), pad_set))
+    assert svg_titles == ["load", "rate", "history", "position", "time"]
+
+
+def test_next_experiment_is_a_protocol(robot_set):
+    html = page(robot_diagnosis(), robot_set)
+    assert "Move each joint to and fro at two speeds" in html
+    assert "&#34;speeds_rad_s&#34;" in html
+
+
+def test_text_from_files_is_escaped(pad_set):
+    html = page(pad_diagnosis(), pad_set, [DataIssue("<script>alert(1)</script>.parquet", "a & b", "kept")])
+    assert "<script" not in html
+    assert "a &amp; b" in html
+
+
+def test_sceptic_sees_weak_evidence(pad_set):
+    base = pad_diagnosis()
+    weak = type(base.heldout)("rmse", 4.1, 4.0, 2.3, 0.05, (-0.02, 0.1), base.heldout.trials[:3])
+    text = text_of(page(pad_diagnosis(heldout=weak), pad_set))
+    assert "interval of the gain includes zero" in text
+    assert "Only 3 recordings were held out" in text
+    assert "neither repaired nor noise" in text
+
+
+def test_empty_findings_do_not_break_the_page(pad_set):
+    bare = pad_diagnosis(
+        status="adequate",
+        causes=(),
+        traces=(),
+        residuals=(),
+        trial_errors=(),
+        maps={},
+        evidence=(),
+        heldout=None,
+    )
+    assert "The simulation is adequate" in page(bare, pad_set)
+
+
+def test_every_cause_has_words():
+    assert set(MEANINGS) == set(CAUSES)
+
+
+@pytest.mark.parametrize(
+    ("shown", "expected"),
+    [
+        (quantity(0.0021, "m"), "2.1 mm"),
+        (quantity(3e-5, "m"), "30 µm"),
+        (quantity(0.05, "s"), "50 ms"),
+        (quantity(1.5, "s"), "1.5 s"),
+        (quantity(0.0, "m"), "0 mm"),
+        (quantity(4e-4, "1/counts"), "0.0004 1/counts"),
+        (digits(-0.5), "−0.5"),
+        (digits(12345.6), "12346"),
+        (digits(2e-7), "2.00e-7"),
+        (interval(0.05, (0.045, 0.056), "s"), ("50 ms", "45 to 56 ms")),
+        (ticks(-0.3, 1.05, 4), [0.0, 0.5, 1.0]),
+    ],
+)
+def test_numbers_read_well(shown, expected):
+    assert shown == expected
+
+
+@pytest.mark.parametrize("kind", ["pad", "robot"])
+def test_screenshot(kind, pad_set, robot_set, tmp_path):
+    browser = next((path for name in BROWSERS if (path := shutil.which(name))), None)
+    if browser is None:
+        pytest.skip(f"no browser for a screenshot: none of {', '.join(BROWSERS)} is installed")
+    html = page(pad_diagnosis(), pad_set) if kind == "pad" else page(robot_diagnosis(), robot_set)
+    (tmp_path / "report.html").write_text(html, encoding="utf-8")
+    picture = tmp_path / "report.png"
+    command = [
+        browser,
+        "--headless",
+        "--no-sandbox",
+        "--disable-gpu",
+        "--hide-scrollbars",
+        f"--screenshot={picture}",
+    ]
+    command += [f"--user-data-dir={tmp_path / 'profile'}", "--window-size=1200,2400"]
+    try:
+        subprocess.run(
+            [*command, (tmp_path / "report.html").as_uri()], capture_output=True, timeout=120, check=False
+        )
+    except subprocess.TimeoutExpired:
+        pytest.skip("the browser did not start within two minutes")
+    if not picture.is_file():
+        pytest.skip("the browser does not run headless here")
+    pixels = np.asarray(Image.open(picture).convert("RGB")).astype(int)
+    assert pixels.shape == (2400, 1200, 3)
+    background = pixels[5, 5]
+    drawn = np.abs(pixels - background).sum(axis=2) > 40
+    assert drawn[20:200].mean() > 0.02  # the verdict's text
+    orange = (np.abs(pixels - [0xD9, 0x63, 0x2A]).sum(axis=2) < 60).sum(axis=1)
+    assert orange[:600].sum() > 500  # the bar of the extended model
+    assert orange[900:].sum() > 500  # its curves
+    assert not drawn[:, :20].any()  # nothing runs out of the page on the left ...
+    assert not drawn[:, -20:].any()  # ... or on the right
