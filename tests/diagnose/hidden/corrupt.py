@@ -102,7 +102,7 @@ def mirrored_rows(path: Path) -> None:
 
 def not_a_number(path: Path) -> None:
     def edit(data: dict[str, np.ndarray]) -> None:
-        data["raw"][40:45, 2] = np.nan
+        data["raw"][40:45, data["raw"].shape[1] // 3] = np.nan
 
     change(path, edit)
 
