@@ -10,6 +10,7 @@ from pathlib import Path
 
 from lerobot_vtrefine.cli.errors import run_cli
 from lerobot_vtrefine.datasets.features import PADS
+from lerobot_vtrefine.drivers.diagnostic_emulator import DiagnosticEmulator
 from lerobot_vtrefine.drivers.emulator import ENCODERS, Faults, PadEmulator
 from lerobot_vtrefine.drivers.frames import FrameShape
 from lerobot_vtrefine.drivers.sources import (
@@ -40,7 +41,12 @@ def parse_arguments(arguments: Sequence[str] | None) -> argparse.Namespace:
     )
     add("--boards", type=int, default=len(PADS), help="number of boards (%(default)s)")
     add("--shape", default="12x32", help="rows x columns that the boards send (%(default)s)")
-    add("--protocol", choices=tuple(ENCODERS), default="binary", help="firmware variant (%(default)s)")
+    add(
+        "--protocol",
+        choices=(*ENCODERS, "diagnostic"),
+        default="binary",
+        help="firmware variant (%(default)s)",
+    )
     add("--rate", type=float, default=100.0, help="frames per second (%(default)s)")
     add(
         "--source",
@@ -100,6 +106,24 @@ def make_source(options: argparse.Namespace, shape: FrameShape, board: int) -> S
     return with_markers(source, tuple(options.markers)) if options.markers else source
 
 
+def make_board(
+    options: argparse.Namespace, shape: FrameShape, faults: Faults, board: int, name: str
+) -> PadEmulator | DiagnosticEmulator:
+    """Board number `board`, not started."""
+    source, link = make_source(options, shape, board), options.folder / name
+    if options.protocol == "diagnostic":
+        return DiagnosticEmulator(source, link)
+    return PadEmulator(
+        source,
+        shape,
+        link,
+        rate_hz=options.rate,
+        protocol=options.protocol,
+        faults=faults,
+        seed=options.seed + board,
+    )
+
+
 @run_cli
 def main(arguments: Sequence[str] | None = None) -> None:
     """Entry point of `vtrefine-pad-emulator`."""
@@ -121,15 +145,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
             before = signal.signal(signal.SIGTERM, signal.default_int_handler)
             stack.callback(signal.signal, signal.SIGTERM, before)
         for board, name in enumerate(names[: options.boards]):
-            emulator = PadEmulator(
-                make_source(options, shape, board),
-                shape,
-                options.folder / name,
-                rate_hz=options.rate,
-                protocol=options.protocol,
-                faults=faults,
-                seed=options.seed + board,
-            )
+            emulator = make_board(options, shape, faults, board, name)
             print(stack.enter_context(emulator).port, flush=True)
         started = time.monotonic()
         while not options.seconds or time.monotonic() - started < options.seconds:

@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 from lerobot_vtrefine.cli.errors import run_cli
 from lerobot_vtrefine.drivers.board import PadReader, Status
 from lerobot_vtrefine.drivers.config import PadConfig
+from lerobot_vtrefine.drivers.diagnostic import DiagnosticReader
 from lerobot_vtrefine.drivers.pads_file import check_distinct_ports, load_pads
 from lerobot_vtrefine.drivers.picture import colours
 
@@ -35,6 +36,10 @@ def parse_arguments(arguments: Sequence[str] | None) -> argparse.Namespace:
     add("--seconds", type=float, default=0.0, help="stop after this time; 0 = until Ctrl-C (%(default)s)")
     add("--rerun", action="store_true", help="show in the rerun viewer instead of the terminal")
     add("--save", type=Path, metavar="FILE", help="write a rerun file (.rrd) instead of showing anything")
+    group = parser.add_argument_group("a board with the diagnostic text firmware")
+    group.add_argument("--diagnostic", metavar="PORT", help="show readings of one taxel, once a second")
+    group.add_argument("--channel", type=int, default=4, help="multiplexer channel, 0..15 (%(default)s)")
+    group.add_argument("--column", type=int, default=0, help="column, 0..31 (%(default)s)")
     return parser.parse_args(arguments)
 
 
@@ -83,6 +88,9 @@ def main(arguments: Sequence[str] | None = None) -> None:
     options = parse_arguments(arguments)
     if options.hz <= 0:
         raise ValueError(f"--hz={options.hz} must be positive")
+    if options.diagnostic:
+        view_taxel(options.diagnostic, options.channel, options.column, options.seconds)
+        return
     with ExitStack() as stack:
         readers = [PadReader(config, name) for name, config in chosen_pads(options).items()]
         for reader in readers:
@@ -95,6 +103,21 @@ def main(arguments: Sequence[str] | None = None) -> None:
         while not options.seconds or time.monotonic() - started < options.seconds:
             show(readers, idle)
             time.sleep(1.0 / options.hz)
+
+
+def view_taxel(port: str, channel: int, column: int, seconds: float) -> None:
+    """Prints readings of one taxel of a board with the diagnostic firmware; 0 seconds: until Ctrl-C."""
+    with DiagnosticReader(port) as board:
+        started = time.monotonic()
+        while True:
+            sample = board.measure(channel, column)
+            print(
+                f"channel {sample.mux}, column {sample.col}: {sample.raw8} counts "
+                f"(10-bit {sample.raw10_mean}, {sample.raw10_min} to {sample.raw10_max})",
+                flush=True,
+            )
+            if seconds and time.monotonic() - started >= seconds:
+                return
 
 
 def terminal_view(stack: ExitStack) -> Any:

@@ -41,7 +41,10 @@ def probe_port(port: str, timeout_s: float = 3.0) -> StreamKind:
     if kind is None:
         raise PortError(f"{port}: {explain_stream(sample, StreamKind('any', None), STREAM_BAUD)}")
     if kind.shape is None:
-        raise PortError(f"{port}: the board runs the diagnostic text firmware; flash the streaming firmware")
+        raise PortError(
+            f"{port}: the board runs the diagnostic text firmware; flash the streaming firmware "
+            f"(or look at single taxels: vtrefine-view-pads --diagnostic {port})"
+        )
     return kind
 
 

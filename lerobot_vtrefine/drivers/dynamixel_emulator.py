@@ -10,9 +10,10 @@ import os
 import select
 import threading
 import time
-import tty
 from dataclasses import dataclass, field
 from pathlib import Path
+
+from lerobot_vtrefine.drivers.terminal import Terminal, plug_in, pull_out
 
 logger = logging.getLogger(__name__)
 
@@ -115,7 +116,7 @@ class DynamixelEmulator:
         self.motors = {motor.motor_id: motor for motor in motors}
         self.link = link
         self.bad_packets = 0
-        self._fds: tuple[int, int] | None = None
+        self._fds: Terminal | None = None
         self._buffer = bytearray()
         self._stop = threading.Event()
         self._thread: threading.Thread | None = None
@@ -126,10 +127,7 @@ class DynamixelEmulator:
         return str(self.link)
 
     def __enter__(self) -> "DynamixelEmulator":
-        self._fds = os.openpty()
-        tty.setraw(self._fds[1])
-        self.link.parent.mkdir(parents=True, exist_ok=True)
-        self.link.symlink_to(os.ttyname(self._fds[1]))
+        self._fds = plug_in(self.link)
         self._stop.clear()
         self._thread = threading.Thread(target=self._run, name=f"motors-{self.link.name}", daemon=True)
         self._thread.start()
@@ -139,10 +137,9 @@ class DynamixelEmulator:
         self._stop.set()
         if self._thread is not None:
             self._thread.join()
-        self.link.unlink(missing_ok=True)
-        for fd in self._fds or ():
-            os.close(fd)
-        self._fds = None
+        if self._fds is not None:
+            pull_out(self.link, self._fds)
+            self._fds = None
 
     def _run(self) -> None:
         assert self._fds is not None

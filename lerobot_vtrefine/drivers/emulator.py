@@ -9,7 +9,6 @@ import logging
 import os
 import threading
 import time
-import tty
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
@@ -18,6 +17,7 @@ import numpy as np
 
 from lerobot_vtrefine.drivers.frames import MARKER, FrameShape
 from lerobot_vtrefine.drivers.sources import Source
+from lerobot_vtrefine.drivers.terminal import Terminal, plug_in, pull_out
 
 logger = logging.getLogger(__name__)
 
@@ -102,7 +102,7 @@ class PadEmulator:
         self._encode = ENCODERS[protocol]
         self._period_s = 1.0 / rate_hz
         self._rng = np.random.default_rng(seed)
-        self._fds: tuple[int, int] | None = None
+        self._fds: Terminal | None = None
         self._guard = threading.Lock()
         self._stalled_until = 0.0
         self._stop = threading.Event()
@@ -140,22 +140,15 @@ class PadEmulator:
         with self._guard:
             if self._fds is not None:
                 return
-            master, slave = os.openpty()
-            tty.setraw(slave)
-            os.set_blocking(master, False)
-            self._fds = master, slave
-            self.link.parent.mkdir(parents=True, exist_ok=True)
-            self.link.unlink(missing_ok=True)
-            self.link.symlink_to(os.ttyname(slave))
+            self._fds = plug_in(self.link)
+            os.set_blocking(self._fds[0], False)
 
     def unplug(self) -> None:
         """Makes the port vanish, open or not; does nothing where it is not there."""
         with self._guard:
             if self._fds is None:
                 return
-            self.link.unlink(missing_ok=True)
-            for fd in self._fds:
-                os.close(fd)
+            pull_out(self.link, self._fds)
             self._fds = None
 
     def stall(self, seconds: float) -> None:
