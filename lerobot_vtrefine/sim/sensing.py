@@ -90,7 +90,8 @@ class Pads:
         bodies = [_touch_geometry(scene.pair.plug), _touch_geometry(scene.pair.socket)]
         self.layout = pad_layout(scene.embodiment)
         self.sensors = PadSensors(self.layout, bodies, num_envs, num_pads=4, model=model, device=device)
-        self._remembers = model.has_state
+        self.remembers = model.has_state
+        """Whether readings depend on earlier ones, so that every control step must `advance`."""
         self._last = np.zeros((num_envs, 4, self.layout.num_taxels), np.uint8)
 
     def reset(self, ids: Array, seeds: Array, stiffness_scale: Array, gain_scale: Array) -> None:
@@ -99,13 +100,12 @@ class Pads:
         self.sensors.randomize(ids, stiffness_scale=stiffness_scale, gain_scale=gain_scale)
 
     def advance(self, ids: Array, touch: "Touch") -> None:
-        """Let one control step pass; needed only by models with memory."""
-        if self._remembers:
-            self._last[ids] = self._read(ids, touch)
+        """Let one control step pass, for models that remember."""
+        self._last[ids] = self._read(ids, touch)
 
     def counts(self, ids: Array, touch: "Touch") -> Array:
         """Raw counts (m, 4, 384) uint8 at the worlds' present state."""
-        return self._last[ids] if self._remembers else self._read(ids, touch)
+        return self._last[ids] if self.remembers else self._read(ids, touch)
 
     def get_state(self, env: int) -> dict[str, Any]:
         """Everything that world `env`'s readings depend on."""

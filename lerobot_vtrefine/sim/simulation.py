@@ -19,6 +19,7 @@ from lerobot_vtrefine.sim.randomization import Randomizer, WorldParameters
 from lerobot_vtrefine.sim.rotations import matrix_to_quat
 from lerobot_vtrefine.sim.scene import Scene, build_scene
 from lerobot_vtrefine.sim.sensing import Kinematics
+from lerobot_vtrefine.sim.settling import Settler
 from lerobot_vtrefine.sim.task import FAILURES
 from lerobot_vtrefine.sim.touch import Touch, touch_source
 from lerobot_vtrefine.tactile import SensorModel
@@ -29,10 +30,8 @@ Array = np.ndarray
 
 NOISE_LEVEL = 3.0
 """Standard deviation of the depth noise that training adds to simulated clouds, in the paper's unit."""
-_START_STREAM = 0
 _SAMPLE_S = 0.025
 """Sliding on the rim is sampled this often."""
-_MAX_CACHED_STARTS = 4096
 
 
 @dataclass(frozen=True)
@@ -95,7 +94,7 @@ class InsertionSim:
         everyone = self._randomizer.draw(np.zeros(num_envs, np.int64))
         self._parameters = dict(everyone.values)
         self._depth = DepthCamera(self.scene.model, self.scene.camera, num_envs, device)
-        self._settled: dict[int, _Rest] = {}
+        self._settler = Settler(self.scene, self.config, self._backend)
 
     @property
     def embodiment(self) -> Any:
@@ -144,7 +143,8 @@ class InsertionSim:
         state = self._episode
         state.clear(ids)
         state.seed[ids] = seeds
-        self._settle(ids, seeds, start)
+        state.command[ids], state.pad_load[ids] = self._settler.settle(ids, seeds, start)
+        state.pad_force[ids] = state.pad_load[ids][..., 0]
         scale = drawn.values["pad_stiffness_scale"], drawn.values["sensor_gain_scale"]
         self._pads.reset(ids, seeds, *scale)
         seen = self._seen(ids)
@@ -329,7 +329,7 @@ class InsertionSim:
             tips=tips,
             touching=contact[:, stride - 1 :: stride, 0] > 0,
             part_forces=contact[..., 1:4],
-            pad_load=self._pad_load(trace),
+            pad_load=self._settler.pad_load(trace),
             diverged=self._backend.diverged(ids),
         )
 

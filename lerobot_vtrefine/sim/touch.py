@@ -31,8 +31,8 @@ class Touch:
     """(m, 4, 3) normal force [N], its centre's x and y in the pad's frame [m]."""
 
 
-TouchSource = Callable[[Array, Kinematics, Array], Touch]
-"""ids (m,), their kinematics and loads (m, 4, 3) on the host -> Touch."""
+TouchSource = Callable[[Array, Callable[[], Kinematics], Array], Touch]
+"""ids (m,), what gives their kinematics on the host where these are needed, and their loads (m, 4, 3)."""
 
 
 def touch_source(scene: Scene, backend: Backend) -> TouchSource:
@@ -40,11 +40,12 @@ def touch_source(scene: Scene, backend: Backend) -> TouchSource:
     reader = backend.touch_reader(scene)
     if reader is None:
         return partial(touch_from_host, scene.embodiment)
-    return lambda ids, _seen, _load: Touch(*reader(ids))
+    return lambda ids, _see, _load: Touch(*reader(ids))
 
 
-def touch_from_host(embodiment: Embodiment, _ids: Array, seen: Kinematics, load: Array) -> Touch:
+def touch_from_host(embodiment: Embodiment, _ids: Array, see: Callable[[], Kinematics], load: Array) -> Touch:
     """`Touch` by the embodiment's forward kinematics."""
+    seen = see()
     joints, rates = torch.from_numpy(seen.joints), torch.from_numpy(seen.joint_velocities)
     position, rotation = embodiment.pad_poses(joints)
     poses = (

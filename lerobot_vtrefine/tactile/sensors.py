@@ -82,22 +82,21 @@ class PadSensors:
         self._time_s[torch.from_numpy(ids)] = 0.0
         for stage in self.model.stages:
             initial = stage.initial(self.layout, self.num_pads)
-            for env, env_seed in zip(ids, seeds, strict=True):
-                rng = np.random.default_rng([int(env_seed), stage.rank])
-                self._assign(
-                    stage.name, int(env), {**initial, **stage.traits(self.layout, self.num_pads, rng)}
-                )
+            rngs = [np.random.default_rng([int(env_seed), stage.rank]) for env_seed in seeds]
+            drawn = [{**initial, **stage.traits(self.layout, self.num_pads, rng)} for rng in rngs]
+            self._assign(stage.name, ids, drawn)
         self._update_baseline(ids)
 
-    def _assign(self, name: str, env: int, values: dict[str, np.ndarray]) -> None:
+    def _assign(self, name: str, ids: np.ndarray, drawn: list[dict[str, np.ndarray]]) -> None:
+        """Write a stage's state into environments `ids` (m,), in one upload per entry."""
         state = self._state.setdefault(name, {})
-        for key, value in values.items():
-            tensor = torch.from_numpy(np.ascontiguousarray(value)).to(self.device)
-            if key not in state or state[key].shape[1:] != tensor.shape:
+        for key in drawn[0] if drawn else ():
+            tensor = torch.from_numpy(np.stack([values[key] for values in drawn])).to(self.device)
+            if key not in state or state[key].shape[1:] != tensor.shape[1:]:
                 state[key] = torch.zeros(
-                    (self.num_envs, *tensor.shape), dtype=tensor.dtype, device=self.device
+                    (self.num_envs, *tensor.shape[1:]), dtype=tensor.dtype, device=self.device
                 )
-            state[key][env] = tensor
+            state[key][torch.from_numpy(ids).to(self.device)] = tensor
 
     def get_state(self, env: int) -> dict[str, Any]:
         """Everything that one environment's next readings depend on, apart from its poses; a deep copy."""

@@ -190,7 +190,8 @@ def _with_primitive_boxes(model: mujoco.MjModel) -> mujoco.MjModel:
 
 def _set_options(model: mjw.Model, config: WarpConfig) -> None:
     model.opt.warn_overflow = 0  # the flags are read after every call; printing would stall a GPU
-    model.opt.graph_conditional = wp.is_conditional_graph_supported()
+    if wp.get_device().is_cuda:
+        model.opt.graph_conditional = wp.is_conditional_graph_supported()
 
 
 def _can_capture(device: str) -> bool:

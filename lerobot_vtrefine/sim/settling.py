@@ -1,0 +1,87 @@
+"""Brings worlds to where their episodes start, at rest; a start that was settled once is not settled again.
+
+Shapes: m worlds, nu servos, 4 pads.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from lerobot_vtrefine.sim import sensing, starts, task
+from lerobot_vtrefine.sim.backends import Backend, Trace
+from lerobot_vtrefine.sim.config import TaskConfig
+from lerobot_vtrefine.sim.scene import Scene
+
+Array = np.ndarray
+
+_START_STREAM = 0
+_MAX_CACHED_STARTS = 4096
+
+
+@dataclass(frozen=True)
+class _Rest:
+    """A world that has come to rest at its start."""
+
+    row: Array
+    command: Array
+    """(nu,)"""
+    pad_load: Array
+    """(4, 3)"""
+
+
+class Settler:
+    """Starts of one scene on one backend."""
+
+    def __init__(self, scene: Scene, config: TaskConfig, backend: Backend) -> None:
+        self._scene, self._config, self._backend = scene, config, backend
+        self._settled: dict[int, _Rest] = {}
+
+    def settle(self, ids: Array, seeds: Array, start: starts.Start | None = None) -> tuple[Array, Array]:
+        """Bring worlds `ids` to their seeds' starts and to rest, or back to where an earlier call with the
+        same seed left them; to `start` where one is given.
+
+        Returns:
+            Servo commands (m, nu), and loads on the pads (m, 4, 3) as `sensing.pad_loads` gives them.
+        """
+        rests = self._rests(ids, seeds) if start is None else self._settle_physically(ids, start)
+        if len(rests):
+            self._backend.set_rows(ids, np.stack([rest.row for rest in rests]))
+        command = np.reshape([rest.command for rest in rests], (len(ids), -1))
+        return command, np.reshape([rest.pad_load for rest in rests], (len(ids), 4, 3))
+
+    def _rests(self, ids: Array, seeds: Array) -> list[_Rest]:
+        known = [self._settled.get(int(seed)) for seed in seeds]
+        missing = np.array([rest is None for rest in known], bool)
+        settled = self._settle_physically(ids[missing], self._start(seeds[missing])) if missing.any() else []
+        fresh = iter(settled)
+        rests = [next(fresh) if rest is None else rest for rest in known]
+        for seed, rest in zip(seeds, rests, strict=True):
+            if len(self._settled) < _MAX_CACHED_STARTS:
+                self._settled[int(seed)] = rest
+        return rests
+
+    def _settle_physically(self, ids: Array, start: starts.Start) -> list[_Rest]:
+        at, model = self._scene.addresses, self._scene.model
+        qpos = np.zeros((len(ids), model.nq))
+        qpos[:, at.qpos] = start.joints
+        qpos[:, at.plug_qpos], qpos[:, at.socket_qpos] = start.plug, start.socket
+        self._backend.write(ids, qpos, np.zeros((len(ids), model.nv)))
+        command = task.servo_commands(self._scene.embodiment, start.targets)
+        substeps = round(start.settle_s / self._scene.config.timestep_s)
+        load = self.pad_load(self._backend.advance_linearly(ids, command, command, substeps))
+        rows = self._backend.get_rows(ids)
+        return [_Rest(*parts) for parts in zip(rows, command, load, strict=True)]
+
+    def pad_load(self, trace: Trace) -> Array:
+        """Loads on the pads (m, 4, 3) at the end of a trace."""
+        at = self._scene.addresses
+        joints, contacts = trace.qpos[:, -1][:, at.qpos], trace.sensors[:, -1][:, at.pad_contacts]
+        return sensing.pad_loads(self._scene.embodiment, joints, contacts)
+
+    def _start(self, seeds: Array) -> starts.Start:
+        pair, robot = self._scene.pair, self._scene.embodiment
+        if self._scene.config.start == "table":
+            draws = starts.uniform_draws(seeds, _START_STREAM, starts.TABLE_DRAWS)
+            return starts.start_on_table(self._config.table, pair, robot, draws)
+        draws = starts.uniform_draws(seeds, _START_STREAM, starts.GRASPED_DRAWS)
+        return starts.start_in_hand(self._config.grasped, pair, robot, draws)
