@@ -13,6 +13,7 @@ import numpy as np
 import torch
 
 from lerobot_vtrefine.diagnose.presses import Press
+from lerobot_vtrefine.diagnose.refinement import needs_refinement
 from lerobot_vtrefine.tactile.stages.base import Frame, Stage
 from lerobot_vtrefine.tactile.stages.contact import ContactStage
 from lerobot_vtrefine.tactile.stages.host import Latency, SampleAndHold, ScanSkew
@@ -29,16 +30,18 @@ def run_stages(stages: Sequence[Stage], presses: Sequence[Press], cache: "Prefix
 
     With a cache, work that earlier stages did for the same parameters is not repeated.
     """
+    fine = needs_refinement(tuple(stages))
+    presses = [press.fine for press in presses] if fine else presses
     contact = next(stage for stage in stages if isinstance(stage, ContactStage))
     stiffness = float(contact.stiffness(presses[0].layout)) if presses else 1.0
-    start, images = cache.lookup(stages) if cache is not None else (0, None)
+    start, images = cache.lookup(stages, fine) if cache is not None else (0, None)
     if images is None:
         images = [press.drive for press in presses]
     for index in range(start, len(stages)):
         images = _apply(stages[index], images, presses, stiffness)
         if cache is not None:
             cache.store(index, images)
-    return [image[:, press.scored] for image, press in zip(images, presses, strict=True)]
+    return [image[:: press.substeps, press.scored] for image, press in zip(images, presses, strict=True)]
 
 
 class Prefix:
@@ -49,9 +52,9 @@ class Prefix:
         self.images: list[Images] = []
         self.frozen = False
 
-    def lookup(self, stages: Sequence[Stage]) -> tuple[int, Images | None]:
-        """Number of leading stages already done, and their images."""
-        keys = [_key(stage) for stage in stages]
+    def lookup(self, stages: Sequence[Stage], fine: bool) -> tuple[int, Images | None]:
+        """Number of leading stages already done at that fineness, and their images."""
+        keys = [(fine, _key(stage)) for stage in stages]
         same = 0
         while same < min(len(keys), len(self.keys)) and keys[same] == self.keys[same]:
             same += 1

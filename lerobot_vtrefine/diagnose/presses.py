@@ -1,12 +1,14 @@
 """Recorded presses as the engine works on them: cropped to the taxels that answer, above their idle level."""
 
 from dataclasses import dataclass, field, replace
+from functools import cached_property
 
 import numpy as np
 import torch
 
 from lerobot_vtrefine.diagnose.indenters import trial_forces, trial_heights
 from lerobot_vtrefine.diagnose.recordings import RecordingSet, Trial
+from lerobot_vtrefine.diagnose.refinement import refined, refined_times, substeps
 from lerobot_vtrefine.tactile.layout import PadLayout
 from lerobot_vtrefine.tactile.replay import finite_rate
 
@@ -68,16 +70,25 @@ class Press:
     """Idle level of the scored taxels (n,) counts."""
     touching: np.ndarray
     """Frames with the indenter on the pad (T,) bool."""
+    substeps: int = 1
+    """Frames of the drive per frame of the readings."""
 
-    @property
+    @cached_property
     def time_s(self) -> np.ndarray:
-        """(T,) from the trial's start [s]."""
-        return self.trial.time_s
+        """Times of the drive's frames, from the trial's start [s]."""
+        return refined_times(self.trial.time_s, self.substeps)
 
     @property
     def session_s(self) -> np.ndarray:
-        """(T,) session time [s]."""
-        return self.trial.time_s + self.trial.start_s
+        """Session time of the drive's frames [s]."""
+        return self.time_s + self.trial.start_s
+
+    @cached_property
+    def fine(self) -> "Press":
+        """The same press with its drive known between the frames."""
+        count = substeps(self.trial.time_s)
+        drive, rate = refined(self.drive, count), refined(self.rate, count)
+        return replace(self, drive=drive, rate=rate, substeps=count)
 
     @property
     def taxels(self) -> np.ndarray:
@@ -265,6 +276,12 @@ def _press(trial: Trial, motion: _Motion, layout: PadLayout, idle: np.ndarray, l
         level,
         motion.touching,
     )
+
+
+def synthetic_press(trial: Trial, like: PressSet) -> Press:
+    """A press that was not recorded, as if with the readings in the trial's `raw`."""
+    motion = _motion(trial, like.layout, like.loaded)
+    return _press(trial, motion, like.layout, np.zeros_like(like.idle.level), like.loaded)
 
 
 def _nearest(trial: Trial, layout: PadLayout) -> np.ndarray:

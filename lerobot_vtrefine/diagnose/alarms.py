@@ -1,0 +1,129 @@
+"""Three independent alarms for structure that no named cause accounts for."""
+
+from collections import defaultdict
+from collections.abc import Sequence
+from dataclasses import dataclass
+from itertools import combinations
+
+import numpy as np
+
+from lerobot_vtrefine.diagnose.fitting import Fit
+from lerobot_vtrefine.diagnose.presses import PressSet
+from lerobot_vtrefine.diagnose.weights import TrialWeights
+
+REPEATABLE_P, REPEATABLE_SHARE = 0.01, 0.15
+MIN_RMS_COUNTS = 0.4
+"""Repeatable residual below this may be the converter's rounding."""
+FLIPS = 4999
+LINE_RATIO = 12.0
+
+
+@dataclass(frozen=True)
+class Alarm:
+    """One alarm: whether it fired, how much of the residual it concerns, and what it points to."""
+
+    name: str
+    fired: bool
+    share: float
+    p_value: float
+    clue: str
+
+
+def cleaned(fitted: Fit, presses: PressSet, weights: Sequence[TrialWeights]) -> list[np.ndarray]:
+    """Residuals (T, n) without every recording's own gain and first touch [counts]."""
+    result = []
+    for weight, residual in zip(weights, fitted.residuals(presses), strict=True):
+        white = weight.whiten(residual)
+        size = weight.coupling @ (weight.nuisance.T @ white)
+        # Undo whitening of the nuisance part: its directions were whitened the same way.
+        unit = (weight.nuisance @ size).reshape(residual.shape)
+        plain = np.empty_like(unit)
+        plain[0] = unit[0]
+        root = np.sqrt(1.0 - weight.rho**2)
+        for t in range(1, len(unit)):
+            plain[t] = weight.rho * plain[t - 1] + root * unit[t]
+        result.append(residual - plain * weight.sigma)
+    return result
+
+
+def replicate_alarm(presses: PressSet, residuals: Sequence[np.ndarray], seed: int) -> Alarm | None:
+    """Products of residuals between replicates estimate what repeats; None without replicates."""
+    groups: dict[str, list[int]] = defaultdict(list)
+    for index, name in enumerate(presses.conditions):
+        groups[name].append(index)
+    pairs, products, powers, sizes = [], [], [], []
+    for members in groups.values():
+        for i, j in combinations(members, 2):
+            both = _aligned(presses, residuals, i, j)
+            if both is None:
+                continue
+            pairs.append((i, j))
+            products.append(float((both[0] * both[1]).sum()))
+            powers.append(0.5 * float((both[0] ** 2 + both[1] ** 2).sum()))
+            sizes.append(both[0].size)
+    if len(pairs) < 2:
+        return None
+    seen, power = float(np.sum(products)), max(float(np.sum(powers)), 1e-12)
+    rng = np.random.default_rng([seed, 9])
+    signs = rng.integers(0, 2, (FLIPS, len(presses.presses))) * 2.0 - 1.0
+    first, second = np.array(pairs).T
+    flipped = (signs[:, first] * signs[:, second]) @ np.array(products)
+    p_value = float((1 + (flipped >= seen - 1e-9 * abs(seen)).sum()) / (1 + FLIPS))
+    share = seen / power
+    rms = np.sqrt(max(seen, 0.0) / max(sum(sizes), 1))
+    fired = (
+        p_value < max(REPEATABLE_P, 1.5 * 2.0 ** -len(groups))
+        and share > REPEATABLE_SHARE
+        and rms > MIN_RMS_COUNTS
+    )
+    text = f"{100 * share:.0f} % of the residual repeats between recordings of the same command"
+    return Alarm("replicates", bool(fired), share, p_value, text)
+
+
+def _aligned(
+    presses: PressSet, residuals: Sequence[np.ndarray], i: int, j: int
+) -> tuple[np.ndarray, np.ndarray] | None:
+    """Residuals of two recordings at their common taxels and the first one's times."""
+    one, two = presses.presses[i], presses.presses[j]
+    common, left, right = np.intersect1d(one.taxels, two.taxels, return_indices=True)
+    if not len(common):
+        return None
+    time_s = one.trial.time_s
+    other = residuals[j][:, right]
+    step = np.clip(np.searchsorted(two.trial.time_s, time_s), 1, len(other) - 1)
+    nearer = np.abs(two.trial.time_s[step - 1] - time_s) < np.abs(two.trial.time_s[step] - time_s)
+    index = np.where(nearer, step - 1, step)
+    return residuals[i][:, left], other[index]
+
+
+def line_alarm(presses: PressSet, residuals: Sequence[np.ndarray]) -> Alarm | None:
+    """A sharp line in the residual's spectrum that stands out in most recordings."""
+    spans = [float(press.trial.time_s[-1] - press.trial.time_s[0]) for press in presses.presses]
+    span = float(np.median(spans))
+    frame_s = float(np.median(np.concatenate([np.diff(press.trial.time_s) for press in presses.presses])))
+    if frame_s <= 0 or span < 32 * frame_s:
+        return None
+    frequencies = np.arange(2, int(0.5 * span / frame_s)) / span
+    total = np.zeros(len(frequencies))
+    used = 0
+    for press, residual in zip(presses.presses, residuals, strict=True):
+        time_s = press.trial.time_s
+        window = np.hanning(len(time_s))[:, None]
+        kernel = np.exp(-2j * np.pi * frequencies[:, None] * time_s[None, :])
+        power = (np.abs(kernel @ (window * (residual - residual.mean(axis=0)))) ** 2).mean(axis=1)
+        local = _local_median(power)
+        total += power / np.maximum(local, 1e-12)
+        used += 1
+    ratio = total / max(used, 1)
+    best = int(np.argmax(ratio))
+    fired = bool(ratio[best] > LINE_RATIO)
+    text = f"a line at {frequencies[best]:.2f} Hz in the residual (or its alias from a faster one)"
+    return Alarm("spectrum", fired, float(ratio[best]), 1e-4 if fired else 1.0, text)
+
+
+def _local_median(power: np.ndarray, half: int = 10) -> np.ndarray:
+    padded = np.pad(power, half, mode="reflect") if len(power) > half else power
+    if len(power) <= half:
+        return np.full(len(power), float(np.median(power)))
+    windows = np.lib.stride_tricks.sliding_window_view(padded, 2 * half + 1)
+    return np.median(windows, axis=1)

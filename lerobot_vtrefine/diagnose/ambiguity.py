@@ -1,0 +1,44 @@
+"""Rivals: causes that explain the recordings as well as the ones that were named."""
+
+from dataclasses import dataclass
+from typing import Any
+
+from lerobot_vtrefine.diagnose.crossvalidation import paired_p
+from lerobot_vtrefine.diagnose.experiments import next_experiment
+from lerobot_vtrefine.diagnose.fitting import Fit
+from lerobot_vtrefine.diagnose.noise import Noise
+from lerobot_vtrefine.diagnose.selection import MAPS, Search, add, all_probes, scored, take_away
+
+TIE_P = 0.1
+
+
+@dataclass(frozen=True)
+class Rivals:
+    """Groups of names that the recordings cannot tell apart, and the experiment that would."""
+
+    groups: tuple[tuple[str, ...], ...] = ()
+    experiment: dict[str, Any] | None = None
+
+
+def find_ambiguities(search: Search, fitted: Fit, noise: Noise) -> Rivals:
+    """Try every rival in place of every named cause; ties are those whose paired scores are not worse."""
+    full = scored(search, fitted)
+    groups: list[tuple[str, ...]] = []
+    experiment = None
+    for name in fitted.model.families:
+        rivals = sorted(search.rivals.get(name, set()) - set(fitted.model.families) - set(MAPS))
+        if not rivals or name in MAPS:
+            continue
+        slim = take_away(search, fitted, name)
+        probes = all_probes(search, slim)
+        tied = []
+        for rival in rivals:
+            other = add(search, slim, rival, probes)
+            if paired_p(full.better_by(scored(search, other)), search.seed) > TIE_P:
+                tied.append((rival, other))
+        if tied:
+            groups.append((name, *(rival for rival, _ in tied)))
+            if experiment is None:
+                names = (name, tied[0][0])
+                experiment = next_experiment(fitted.model, tied[0][1].model, search.presses, noise, names)
+    return Rivals(tuple(groups), experiment)

@@ -1,0 +1,123 @@
+"""The refitted baseline, and the noise that is left: where every comparison starts from."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from lerobot_vtrefine.diagnose.candidates.base import Setting
+from lerobot_vtrefine.diagnose.composite import NOMINAL_K_N, Composite, stiffness_from_load
+from lerobot_vtrefine.diagnose.fitting import Fit, fit, predict
+from lerobot_vtrefine.diagnose.noise import Noise, fit_frame_noise, fit_repeatability
+from lerobot_vtrefine.diagnose.presses import PressSet
+from lerobot_vtrefine.diagnose.weights import TrialWeights, build_weights
+
+START_DAMPING_S = 3e-3
+OFFSET_STEP_M = 5e-6
+
+
+@dataclass(frozen=True)
+class Baseline:
+    """A fit, the noise around it and the weights that follow from both."""
+
+    fitted: Fit
+    noise: Noise
+    weights: tuple[TrialWeights, ...]
+
+
+def describe(presses: PressSet) -> Setting:
+    """What candidates may know; the largest signal is not known before the first fit."""
+    steps = np.concatenate([np.diff(press.time_s) for press in presses.presses])
+    spans = [float(press.time_s[-1] - press.time_s[0]) for press in presses.presses]
+    starts = [press.trial.start_s for press in presses.presses]
+    touched = np.zeros((presses.layout.rows, presses.layout.cols), dtype=bool)
+    depth = 0.0
+    for press in presses.presses:
+        touched[press.layout.lines, press.layout.columns] |= (press.drive > 0).any(axis=0)
+        depth = max(depth, float(press.drive.max()))
+    positive = steps[steps > 0]
+    return Setting(
+        layout=presses.layout,
+        top_counts=presses.full_scale,
+        full_scale=presses.full_scale,
+        frame_s=float(np.median(positive)) if len(positive) else 0.01,
+        duration_s=float(np.median(spans)),
+        session_s=float(np.ptp(starts)),
+        top_depth_m=_reach(depth, presses.loaded),
+        loaded=presses.loaded,
+        touched_rows=int(touched.any(axis=1).sum()),
+        touched_cols=int(touched.any(axis=0).sum()),
+        rest_session_s=presses.idle.session_s,
+    )
+
+
+def _reach(top: float, loaded: bool) -> float:
+    """Deepest press [m]; the load over the nominal stiffness where depth is not known."""
+    return max(top / NOMINAL_K_N if loaded else top, 1e-6)
+
+
+def first_guess(presses: PressSet, setting: Setting) -> Composite:
+    """Proportional to depth (or load), by least squares."""
+    top, bottom = 0.0, 0.0
+    for press in presses.presses:
+        depth = np.maximum(press.drive[:, press.scored], 0.0)
+        top, bottom = top + float((depth * press.signal).sum()), bottom + float((depth**2).sum())
+    gain = top / bottom if bottom > 0 and top > 0 else presses.full_scale / setting.top_depth_m
+    return Composite(setting, np.array([np.log(gain), 0.0 if setting.loaded else START_DAMPING_S]))
+
+
+def offset_tangents(
+    model: Composite, presses: PressSet, signals: Sequence[np.ndarray]
+) -> list[np.ndarray] | None:
+    """Change of the signal per metre of contact offset (T, n) per recording; None when driven by load."""
+    if presses.loaded:
+        return None
+    shifted = replace(
+        presses, presses=tuple(replace(p, drive=p.drive - OFFSET_STEP_M) for p in presses.presses)
+    )
+    return [(a - b) / OFFSET_STEP_M for a, b in zip(predict(model, shifted), signals, strict=True)]
+
+
+def recording_deviations(fitted: Fit, presses: PressSet, noise: Noise) -> tuple[np.ndarray, np.ndarray]:
+    """Every recording's own relative gain and first touch, by least squares: (K,), (K,) [m]."""
+    offsets = offset_tangents(fitted.model, presses, fitted.signals)
+    gains, touches = [], []
+    for index, (press, signal) in enumerate(zip(presses.presses, fitted.signals, strict=True)):
+        sigma = noise.sigma(signal)
+        columns = [signal] if offsets is None else [signal, offsets[index]]
+        matrix = np.stack([(column / sigma).ravel() for column in columns], axis=1)
+        target = ((press.signal - signal) / sigma).ravel()
+        solution = np.linalg.lstsq(matrix, target, rcond=1e-6)[0]
+        gains.append(float(solution[0]))
+        touches.append(float(solution[1]) if len(solution) > 1 else 0.0)
+    return np.array(gains), np.array(touches)
+
+
+def weigh(
+    fitted: Fit, presses: PressSet, noise: Noise | None = None
+) -> tuple[Noise, tuple[TrialWeights, ...]]:
+    """Noise of a fit (within recordings unless given; between recordings always), and the weights."""
+    if noise is None:
+        noise = fit_frame_noise(presses, fitted.residuals(presses), fitted.signals)
+    gains, touches = recording_deviations(fitted, presses, noise)
+    noise = fit_repeatability(noise, gains, touches, presses.conditions)
+    tangents = offset_tangents(fitted.model, presses, fitted.signals)
+    return noise, tuple(build_weights(noise, fitted.signals, tangents))
+
+
+def fit_baseline(presses: PressSet) -> Baseline:
+    """Refit gain, stiffness and damping, then the noise, then both again with the right weights."""
+    setting = describe(presses)
+    guess = first_guess(presses, setting)
+    rough = Noise(1.0, 0.0, 0.0, 0.01, 1e-5)
+    weights = build_weights(rough, [np.zeros_like(p.signal) for p in presses.presses], None)
+    fitted = fit(guess, presses, weights)
+    k_n = stiffness_from_load(presses, fitted.model)
+    top = max((float(np.max(signal)) for signal in fitted.signals if signal.size), default=1.0)
+    setting = replace(setting, top_counts=max(top, 1.0))
+    model = replace(fitted.model, setting=setting, k_n=k_n or NOMINAL_K_N)
+    fitted = replace(fitted, model=model)
+    noise, weights = weigh(fitted, presses)
+    fitted = fit(fitted.model, presses, weights)
+    noise, weights = weigh(fitted, presses)
+    return Baseline(fit(fitted.model, presses, weights), noise, tuple(weights))

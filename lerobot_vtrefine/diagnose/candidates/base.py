@@ -1,0 +1,88 @@
+"""What a candidate cause is: a family of simulator stages with parameters, starting points and a null."""
+
+from collections.abc import Callable
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from lerobot_vtrefine.diagnose.presses import PressSet
+from lerobot_vtrefine.tactile.layout import PadLayout
+from lerobot_vtrefine.tactile.stages.base import Stage
+
+
+@dataclass(frozen=True)
+class Setting:
+    """What a candidate may know about the recordings and the fitted baseline."""
+
+    layout: PadLayout
+    top_counts: float
+    """Signal that the baseline predicts at most."""
+    full_scale: float
+    frame_s: float
+    """Median time between frames [s]."""
+    duration_s: float
+    """Median length of a recording [s]."""
+    session_s: float
+    """Span of the session [s]; 0 if it was not recorded."""
+    top_depth_m: float
+    loaded: bool
+    """Driven by the load: nothing before the force can be fitted."""
+    touched_rows: int
+    touched_cols: int
+    rest_session_s: float
+    """Mean session time of the frames that the idle map rests on [s]."""
+
+
+@dataclass(frozen=True)
+class Value:
+    """One fitted coordinate of a form and its bounds."""
+
+    name: str
+    low: float
+    high: float
+    step: float
+    """Step of finite differences; 0 for a coordinate that is searched, not descended along."""
+
+
+Stages = tuple[Stage, ...]
+
+
+@dataclass(frozen=True)
+class Form:
+    """One functional form of a cause.
+
+    Attributes:
+        family: name of the cause (contract §4).
+        label: what form this is, for people.
+        values: fitted coordinates; coordinate vectors elsewhere follow their order.
+        build: coordinates and setting to stages.
+        report: coordinates and setting to the public parameters: name -> (value, unit).
+        probes: coordinates near the null, one row per guess of what the effect may look like.
+        amplitude: index of the coordinate that is the effect's size (0 is no effect), along which probes are
+            stretched; None if probes are taken as they are.
+        signed: whether the effect may go either way; otherwise screening is one-sided.
+    """
+
+    family: str
+    label: str
+    values: tuple[Value, ...]
+    build: Callable[[np.ndarray, Setting], Stages]
+    report: Callable[[np.ndarray, Setting], dict[str, tuple[float, str]]]
+    probes: Callable[[Setting], list[list[float]]]
+    amplitude: int | None = 0
+    signed: bool = False
+    possible: Callable[[Setting], bool] = field(default=lambda setting: True)
+    search: Callable[[PressSet, float], list[list[float]]] | None = None
+    """Starting points taken from the recordings and the frame time, instead of stretched probes."""
+    screened: bool = True
+    """Whether its probes take part in screening; fallbacks are only fitted where their family is named."""
+
+    @property
+    def low(self) -> np.ndarray:
+        """Lower bounds (p,)."""
+        return np.array([value.low for value in self.values])
+
+    @property
+    def high(self) -> np.ndarray:
+        """Upper bounds (p,)."""
+        return np.array([value.high for value in self.values])

@@ -1,0 +1,55 @@
+"""hysteresis: loading and unloading differ at the same depth, whatever the speed."""
+
+import numpy as np
+
+from lerobot_vtrefine.diagnose.candidates.base import Form, Setting, Value
+from lerobot_vtrefine.tactile.stages.base import Stage
+from lerobot_vtrefine.tactile.stages.mechanics import Hysteresis
+
+WIDE = 4.0
+"""Widest play over the deepest press: beyond, the operator never moves."""
+
+
+def _one(values: np.ndarray, setting: Setting) -> tuple[Stage, ...]:
+    return (Hysteresis(float(values[0]), float(np.exp(values[1]) * setting.top_depth_m)),)
+
+
+def _several(values: np.ndarray, setting: Setting) -> tuple[Stage, ...]:
+    widths = tuple(float(share * setting.top_depth_m) for share in SEVERAL_WIDTHS)
+    return (Hysteresis(tuple(float(value) for value in values), widths),)
+
+
+def _report_several(values: np.ndarray, setting: Setting) -> dict[str, tuple[float, str]]:
+    total = max(float(values.sum()), 1e-9)
+    mean = float((values * np.array(SEVERAL_WIDTHS)).sum()) / total * setting.top_depth_m
+    return {"fraction": (float(values.sum()), "1"), "width_m": (mean, "m")}
+
+
+SEVERAL_WIDTHS = (0.1, 0.3, 0.9, 1.8)
+
+FORMS = (
+    Form(
+        "hysteresis",
+        "one play operator",
+        (
+            Value("fraction", 0.0, 0.9, 2e-3),
+            Value("log_width", float(np.log(0.03)), float(np.log(WIDE)), 1e-2),
+        ),
+        _one,
+        lambda v, s: {
+            "fraction": (float(v[0]), "1"),
+            "width_m": (float(np.exp(v[1]) * s.top_depth_m), "m"),
+        },
+        lambda s: [[0.05, float(np.log(share))] for share in (0.1, 0.25, 0.5, 1.0, 1.8)],
+    ),
+    Form(
+        "hysteresis",
+        "four play operators",
+        tuple(Value(f"fraction_{j}", 0.0, 0.6, 2e-3) for j in range(len(SEVERAL_WIDTHS))),
+        _several,
+        _report_several,
+        lambda s: [[0.03] * len(SEVERAL_WIDTHS)],
+        amplitude=None,
+        screened=False,
+    ),
+)

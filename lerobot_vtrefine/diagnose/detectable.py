@@ -1,0 +1,95 @@
+"""The smallest effect that these recordings would have shown, for every cause that was not found."""
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from lerobot_vtrefine.diagnose.candidates import CATALOGUE
+from lerobot_vtrefine.diagnose.candidates.base import Form
+from lerobot_vtrefine.diagnose.fitting import predict
+from lerobot_vtrefine.diagnose.screening import Scorer
+
+MARGIN = 3.2 + 0.85
+"""Standard errors that an effect must stand out by to pass the screening in four cases of five."""
+DOUBLINGS = 12
+MAIN = {
+    "nonlinear_stiffness": "exponent",
+    "saturation": "knee_counts",
+    "viscoelastic_relaxation": "fraction",
+    "hysteresis": "fraction",
+    "row_sharing": "conductance_per_count",
+    "crosstalk": "row",
+    "mechanical_spreading": "sigma_m",
+    "baseline_drift": "rate_counts_per_s",
+    "latency": "tau_s",
+    "scan_skew": "skew_s",
+    "sample_and_hold": "period_s",
+    "contact_offset": "offset_m",
+    "pad_tilt": "tilt_x_rad",
+}
+"""Parameter in which the smallest effect is given."""
+NULL = {"nonlinear_stiffness": 1.0}
+"""Value that means no effect, where it is not 0; an exponent's excess is given."""
+
+
+def minimum_detectable(scorer: Scorer) -> dict[str, float]:
+    """Size of each cause's main parameter from which on it would be seen; causes never seen are left out."""
+    setting = scorer.fitted.model.setting
+    found: dict[str, float] = {}
+    for form in CATALOGUE:
+        if not form.screened or not form.possible(setting) or form.family in scorer.fitted.model.families:
+            continue
+        for guess in form.probes(setting):
+            size = _smallest(form, np.asarray(guess, dtype=float), scorer)
+            if size is None:
+                continue
+            value = _public(form, size, scorer)
+            better = max if form.family == "saturation" else min
+            held = found.get(form.family)
+            found[form.family] = value if held is None else better(held, value)
+    return found
+
+
+def _public(form: Form, values: np.ndarray, scorer: Scorer) -> float:
+    report = form.report(values, scorer.fitted.model.setting)
+    name = MAIN[form.family]
+    value = report[name][0]
+    if value == 0.0 and form.family in ("crosstalk", "pad_tilt"):
+        value = max((abs(item[0]) for item in report.values()), default=0.0)
+    return float(abs(value - NULL.get(form.family, 0.0)))
+
+
+def _smallest(form: Form, guess: np.ndarray, scorer: Scorer) -> np.ndarray | None:
+    """Injected sizes from far too small to large, doubling; the first that stands out, interpolated."""
+    grow = _growing(form)
+    seen: tuple[float, float] | None = None
+    for power in np.arange(-DOUBLINGS // 2, DOUBLINGS):
+        factor = 2.0 ** float(power)
+        values = guess.copy()
+        values[grow] = guess[grow] * factor
+        if (values > form.high).any() or (values < form.low).any():
+            continue
+        strength = _strength(form, values, scorer)
+        if strength >= MARGIN:
+            if seen is not None and strength > seen[1]:
+                share = (MARGIN - seen[1]) / (strength - seen[1])
+                factor = seen[0] + share * (factor - seen[0])
+            values[grow] = guess[grow] * factor
+            return values
+        seen = (factor, strength)
+    return None
+
+
+def _growing(form: Form) -> np.ndarray:
+    """Coordinates that make the effect larger."""
+    return np.array([form.amplitude]) if form.amplitude is not None else np.arange(len(form.values))
+
+
+def _strength(form: Form, values: np.ndarray, scorer: Scorer) -> float:
+    """Injected effect's score over the scatter of the recordings' scores."""
+    fitted, presses = scorer.fitted, scorer.presses
+    moved = predict(fitted.model.plus(form, values), presses)
+    change: Sequence[np.ndarray] = [a - b for a, b in zip(moved, fitted.signals, strict=True)]
+    scores, information = scorer.score(change)
+    scatter = float(np.sqrt(np.sum((scores - scores.mean()) ** 2)))
+    return float(information.sum()) / max(scatter, 1e-12)

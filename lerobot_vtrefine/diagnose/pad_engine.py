@@ -1,0 +1,197 @@
+"""From recordings of a pad to a verdict: refit, screen, rank, question, and say how sure.
+
+`diagnose_pad` is the whole procedure; everything it calls works on arrays and is tested on its own.
+"""
+
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+
+from lerobot_vtrefine.diagnose.ambiguity import find_ambiguities
+from lerobot_vtrefine.diagnose.baseline import Baseline, fit_baseline
+from lerobot_vtrefine.diagnose.composite import Composite, sensor_model
+from lerobot_vtrefine.diagnose.detectable import minimum_detectable
+from lerobot_vtrefine.diagnose.evaluation import (
+    foretell,
+    heldout,
+    noise_floor,
+    residual_maps,
+    residual_views,
+    traces,
+)
+from lerobot_vtrefine.diagnose.evidence import Evidence, ResidualView, Trace
+from lerobot_vtrefine.diagnose.fitting import Fit, predict, tangents
+from lerobot_vtrefine.diagnose.intervals import baseline_parameters, resampled_values
+from lerobot_vtrefine.diagnose.locking import lock
+from lerobot_vtrefine.diagnose.naming import evidence_table, named_causes
+from lerobot_vtrefine.diagnose.presses import PressSet, prepare, usable
+from lerobot_vtrefine.diagnose.recordings import RecordingSet, Trial
+from lerobot_vtrefine.diagnose.screening import Scorer
+from lerobot_vtrefine.diagnose.selection import Search, forward, start_search
+from lerobot_vtrefine.diagnose.unknowns import Suspicion, look_for_unknowns
+from lerobot_vtrefine.diagnose.verdict import Cause, DataIssue, Heldout, Parameter, Unknown
+from lerobot_vtrefine.tactile.model import SensorModel
+
+MIN_RECORDINGS = 2
+FEW_RECORDINGS = 8
+Tell = Callable[[str, float], None]
+
+
+@dataclass(frozen=True)
+class PadDiagnosis:
+    """What was found on a pad: the verdict's fields (contract §3), both models, and what the report draws.
+
+    Attributes:
+        status, causes, ambiguous_with, unknown, heldout, minimum_detectable, next_experiment: as
+            in `Verdict`.
+        issues: what the engine itself had to say about the recordings.
+        baseline_model, extended_model: None only if the status is `invalid_data`.
+        baseline_params: k_n, k_d and gain as refitted.
+        evidence: one row per candidate examined.
+        traces, residuals, maps: on held-out recordings; arrays in `unit`.
+        alarms: name of every alarm for unknown causes -> (whether it fired, share, p-value, clue).
+    """
+
+    status: str
+    causes: tuple[Cause, ...] = ()
+    ambiguous_with: tuple[tuple[str, ...], ...] = ()
+    unknown: Unknown = field(default_factory=lambda: Unknown(alarm=False))
+    heldout: Heldout | None = None
+    minimum_detectable: dict[str, float] = field(default_factory=dict)
+    next_experiment: dict[str, Any] | None = None
+    issues: tuple[DataIssue, ...] = ()
+    baseline_model: SensorModel | None = None
+    extended_model: SensorModel | None = None
+    baseline_params: dict[str, Parameter] = field(default_factory=dict)
+    evidence: tuple[Evidence, ...] = ()
+    traces: tuple[Trace, ...] = ()
+    residuals: tuple[ResidualView, ...] = ()
+    maps: dict[str, np.ndarray] = field(default_factory=dict)
+    alarms: dict[str, tuple[bool, float, float, str]] = field(default_factory=dict)
+    unit: str = "counts"
+
+
+def diagnose_pad(recordings: RecordingSet, seed: int = 0, progress: Tell | None = None) -> PadDiagnosis:
+    """Find what the paper's model gets wrong about these recordings, name it, extend the model, measure it.
+
+    Args:
+        seed: decides which recordings are locked, and every resampling.
+        progress: called with a few words and the fraction done.
+
+    Raises ValueError when an indenter's mesh cannot be used.
+    """
+    tell: Tell = progress or (lambda text, share: None)
+    trials, issues = _usable_trials(recordings)
+    if len(trials) < MIN_RECORDINGS:
+        issues.append(DataIssue(None, f"{len(trials)} usable recordings", "nothing was fitted"))
+        return PadDiagnosis("invalid_data", issues=tuple(issues))
+    locked = lock([trial.condition for trial in trials], seed)
+    learn = [index for index in range(len(trials)) if index not in set(locked)]
+    tell("heights of the indenter", 0.02)
+    everyone = prepare(recordings, trials, learn)
+    if not any((press.drive > 0).any() for press in everyone.subset(learn).presses):
+        issues.append(DataIssue(None, "the indenter never touches the pad", "nothing was fitted"))
+        return PadDiagnosis("invalid_data", issues=tuple(issues))
+    if len(trials) < FEW_RECORDINGS:
+        text = (
+            f"only {len(trials)} recordings: most effects cannot reach significance, see minimum_detectable"
+        )
+        issues.append(DataIssue(None, text, "kept"))
+    if not locked:
+        # A number must be given; it is then not a held-out one, and the data issue says so.
+        issues.append(DataIssue(None, "too few recordings to lock any", "errors are those of the fit"))
+    return _diagnose(everyone, learn, locked or learn, seed, tell, issues)
+
+
+def _usable_trials(recordings: RecordingSet) -> tuple[list[Trial], list[DataIssue]]:
+    trials, issues = [], []
+    for trial in recordings.trials:
+        clean = usable(trial)
+        if clean is None:
+            issues.append(DataIssue(trial.file, "too few frames hold numbers", "set aside"))
+        else:
+            trials.append(clean)
+    if any(trial.depth_m is None for trial in trials) and any(trial.depth_m is not None for trial in trials):
+        kept = [trial for trial in trials if trial.depth_m is not None]
+        for trial in trials:
+            if trial.depth_m is None:
+                issues.append(DataIssue(trial.file, "driven by load, while others give depth", "set aside"))
+        trials = kept
+    return trials, issues
+
+
+def _diagnose(
+    everyone: PressSet, learn: list[int], locked: list[int], seed: int, tell: Tell, issues: list[DataIssue]
+) -> PadDiagnosis:
+    discovery = everyone.subset(learn)
+    tell("refitting stiffness, damping and gain", 0.05)
+    baseline = fit_baseline(discovery)
+    search = start_search(baseline, discovery, seed)
+    fitted = forward(search, baseline.fitted, lambda text, share: tell(text, 0.1 + 0.5 * share))
+    tell("rival explanations", 0.62)
+    rivals = find_ambiguities(search, fitted, baseline.noise)
+    tell("structure that no cause explains", 0.75)
+    suspicion = look_for_unknowns(search, fitted, baseline)
+    tell("held-out recordings", 0.85)
+    return _conclude(everyone, locked, baseline, search, fitted, rivals, suspicion, seed, issues)
+
+
+def _conclude(
+    everyone: PressSet,
+    locked: list[int],
+    baseline: Baseline,
+    search: Search,
+    fitted: Fit,
+    rivals: Any,
+    suspicion: Suspicion,
+    seed: int,
+    issues: list[DataIssue],
+) -> PadDiagnosis:
+    names = fitted.model.families
+    plain, extended = _models(baseline.fitted.model, fitted.model, everyone)
+    held_set = everyone.subset(locked)
+    foretold = foretell(held_set, plain, extended)
+    floor = noise_floor(everyone, locked, baseline.noise, predict(fitted.model, held_set))
+    status = _status(names, rivals.groups, suspicion)
+    role = "symptom" if status == "unexplained" else "cause"
+    draws = resampled_values(fitted, seed)
+    smallest = _smallest(search, fitted)
+    return PadDiagnosis(
+        status=status,
+        causes=named_causes(search, fitted, draws, role, held_set, seed),
+        ambiguous_with=rivals.groups if status == "ambiguous" else (),
+        unknown=Unknown(suspicion.alarm, suspicion.clue),
+        heldout=heldout(foretold, floor, seed),
+        minimum_detectable=smallest,
+        next_experiment=rivals.experiment if status == "ambiguous" else None,
+        issues=tuple(issues),
+        baseline_model=plain,
+        extended_model=extended,
+        baseline_params=baseline_parameters(baseline.fitted, resampled_values(baseline.fitted, seed)),
+        evidence=evidence_table(search, fitted, role, rivals.groups),
+        traces=traces(foretold),
+        residuals=residual_views(foretold, seed),
+        maps=residual_maps(foretold, everyone),
+        alarms={a.name: (a.fired, a.share, a.p_value, a.clue) for a in suspicion.alarms},
+    )
+
+
+def _status(names: tuple[str, ...], groups: tuple[tuple[str, ...], ...], suspicion: Suspicion) -> str:
+    if suspicion.alarm:
+        return "unexplained"
+    if groups:
+        return "ambiguous"
+    return "explained" if names else "adequate"
+
+
+def _models(baseline: Composite, extended: Composite, presses: PressSet) -> tuple[SensorModel, SensorModel]:
+    plain, rich = (sensor_model(model, presses.idle, presses.step_counts) for model in (baseline, extended))
+    return plain, rich
+
+
+def _smallest(search: Search, fitted: Fit) -> dict[str, float]:
+    """Smallest effects that would have been seen; only of causes that were not found."""
+    _, columns = tangents(fitted.model, search.presses, fitted.model.free)
+    return minimum_detectable(Scorer(fitted, search.presses, search.weights, columns))

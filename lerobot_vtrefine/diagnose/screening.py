@@ -1,0 +1,194 @@
+"""Which causes could be there: effective scores of whole recordings, tested by flipping their signs.
+
+A score is the inner product of a candidate's tangent, cleared of what the present model's parameters can do,
+with the residual (Hemerik, Goeman & Finos 2020). Under the null it is as often positive as negative in every
+recording, whatever the noise inside it looks like; all candidates are judged together by the smallest p
+(Westfall & Young 1993).
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from lerobot_vtrefine.diagnose.candidates.base import Form
+from lerobot_vtrefine.diagnose.fitting import Fit, predict
+from lerobot_vtrefine.diagnose.presses import PressSet
+from lerobot_vtrefine.diagnose.weights import TrialWeights
+
+FLIPS = 9999
+ALPHA = 0.02
+
+
+@dataclass(frozen=True)
+class Probe:
+    """A guess of an effect near its null, with the scores that recordings give it.
+
+    Attributes:
+        scores: (K,) effective score of every recording.
+        information: (K,) effective information: the score that the probe itself would give.
+        permuted: p-value that was found otherwise (by permuting the session's order), in place of flips.
+    """
+
+    name: str
+    form: Form | None
+    values: np.ndarray
+    scores: np.ndarray
+    information: np.ndarray
+    one_sided: bool
+    permuted: float | None = None
+
+    @property
+    def size(self) -> float:
+        """Estimated size in units of the probe."""
+        total = float(self.information.sum())
+        return float(self.scores.sum()) / total if total > 0 else 0.0
+
+    @property
+    def explained(self) -> float:
+        """Decrease of the loss that the tangent promises."""
+        total = float(self.information.sum())
+        gain = float(self.scores.sum()) ** 2 / total if total > 0 else 0.0
+        return 0.0 if self.one_sided and self.scores.sum() < 0 else gain
+
+
+@dataclass(frozen=True)
+class Screened:
+    """A candidate's best probe with its p-value and the one adjusted over all candidates."""
+
+    probe: Probe
+    p_value: float
+    p_adjusted: float
+
+
+def effective(
+    fitted: Fit,
+    presses: PressSet,
+    weights: Sequence[TrialWeights],
+    change: Sequence[np.ndarray],
+    tangent_columns: Sequence[Sequence[np.ndarray]],
+) -> tuple[np.ndarray, np.ndarray]:
+    """Scores and information (K,) of a change (T, n), cleared of the model's own tangents."""
+    grams = []
+    for k, (press, weight) in enumerate(zip(presses.presses, weights, strict=True)):
+        vectors = [weight.whiten(column[k]) for column in tangent_columns]
+        vectors += [weight.whiten(change[k]), weight.whiten(press.signal - fitted.signals[k])]
+        grams.append(weight.gram(np.stack(vectors, axis=1)))
+    return cleared(np.array(grams))
+
+
+def cleared(grams: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """From inner products of (own tangents..., change, residual) to effective scores and information (K,)."""
+    total = grams.sum(axis=0)
+    own = slice(0, total.shape[0] - 2)
+    scale = np.sqrt(np.diag(total)[own].clip(min=1e-30))
+    block = total[own, own] / np.outer(scale, scale)
+    along = np.linalg.lstsq(block, total[own, -2] / scale, rcond=1e-9)[0] / scale
+    scores = grams[:, -2, -1] - grams[:, own, -1] @ along
+    information = (
+        grams[:, -2, -2]
+        - 2 * grams[:, own, -2] @ along
+        + np.einsum("i,kij,j->k", along, grams[:, own, own], along)
+    )
+    return scores, np.maximum(information, 0.0)
+
+
+class Scorer:
+    """Scores any change of the expected signals against one fitted model."""
+
+    def __init__(
+        self,
+        fitted: Fit,
+        presses: PressSet,
+        weights: Sequence[TrialWeights],
+        columns: Sequence[Sequence[np.ndarray]],
+    ) -> None:
+        self.fitted, self.presses, self.weights = fitted, presses, weights
+        self._fixed = []
+        for k, (press, weight) in enumerate(zip(presses.presses, weights, strict=True)):
+            vectors = [weight.whiten(column[k]) for column in columns]
+            vectors.append(weight.whiten(press.signal - fitted.signals[k]))
+            self._fixed.append(np.stack(vectors, axis=1))
+
+    def grams(self, changes: Sequence[Sequence[np.ndarray]]) -> np.ndarray:
+        """Inner products of (own tangents, changes..., residual): (K, q, q)."""
+        grams = []
+        for k, (fixed, weight) in enumerate(zip(self._fixed, self.weights, strict=True)):
+            vectors = np.stack([weight.whiten(change[k]) for change in changes], axis=1)
+            grams.append(weight.gram(np.concatenate([fixed[:, :-1], vectors, fixed[:, -1:]], axis=1)))
+        return np.array(grams)
+
+    def score(self, change: Sequence[np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
+        """Effective scores and information (K,) of a change (T, n) per recording."""
+        return cleared(self.grams([change]))
+
+
+def probe_form(form: Form, scorer: Scorer) -> list[Probe]:
+    """Scores of all probes of a form."""
+    fitted, presses = scorer.fitted, scorer.presses
+    setting = fitted.model.setting
+    probes = []
+    for guess in form.probes(setting):
+        values = np.asarray(guess, dtype=float)
+        moved = predict(fitted.model.plus(form, values), presses)
+        change = [a - b for a, b in zip(moved, fitted.signals, strict=True)]
+        scores, information = scorer.score(change)
+        probes.append(Probe(form.family, form, values, scores, information, not form.signed))
+    return probes
+
+
+def flip_signs(count: int, seed: int) -> np.ndarray:
+    """(FLIPS + 1, K) signs, the first row without flips."""
+    rng = np.random.default_rng([seed, 1])
+    signs = rng.integers(0, 2, (FLIPS + 1, count)) * 2.0 - 1.0
+    signs[0] = 1.0
+    return signs
+
+
+def flip_statistics(probes: Sequence[Probe], signs: np.ndarray) -> np.ndarray:
+    """Standardised sums of scores under every flip: (FLIPS + 1, number of probes); larger is stronger."""
+    columns = []
+    for probe in probes:
+        norm = np.sqrt(float((probe.scores**2).sum()))
+        values = signs @ probe.scores / norm if norm > 0 else np.zeros(len(signs))
+        columns.append(values if probe.one_sided else np.abs(values))
+    return np.stack(columns, axis=1)
+
+
+def tail_shares(statistics: np.ndarray) -> np.ndarray:
+    """p-value of every entry within its own column (share of entries at least as large), same shape."""
+    count = len(statistics)
+    shares = np.empty_like(statistics)
+    for j in range(statistics.shape[1]):
+        column = np.round(statistics[:, j], 9)
+        ordered = np.sort(column)
+        shares[:, j] = (count - np.searchsorted(ordered, column, side="left")) / count
+    return shares
+
+
+def screen(probes: Sequence[Probe], count: int, seed: int) -> dict[str, Screened]:
+    """The best probe of every name with its family-wise adjusted p-value."""
+    flipped = [probe for probe in probes if probe.permuted is None]
+    if not flipped:
+        return {}
+    shares = tail_shares(flip_statistics(flipped, flip_signs(count, seed)))
+    smallest = np.sort(shares.min(axis=1))
+    names = {probe.name for probe in probes}
+    extra = len(names) - len({probe.name for probe in flipped})
+    best: dict[str, Screened] = {}
+    for index, probe in enumerate(flipped):
+        p_value = float(shares[0, index])
+        adjusted = float(np.searchsorted(smallest, p_value, side="right")) / len(smallest)
+        _keep(best, Screened(probe, p_value, min(1.0, adjusted * (1 + 0.1 * extra))))
+    for probe in probes:
+        if probe.permuted is not None:
+            # Another reference distribution: Bonferroni over a handful of effectively independent names.
+            _keep(best, Screened(probe, probe.permuted, min(1.0, 5.0 * probe.permuted)))
+    return best
+
+
+def _keep(best: dict[str, Screened], found: Screened) -> None:
+    held = best.get(found.probe.name)
+    rank = (found.p_adjusted, -found.probe.explained)
+    if held is None or rank < (held.p_adjusted, -held.probe.explained):
+        best[found.probe.name] = found

@@ -1,0 +1,255 @@
+"""From survivors of the screening to a model: refit, rank on recordings left out, add, swap, take away."""
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+
+from lerobot_vtrefine.diagnose.baseline import Baseline, weigh
+from lerobot_vtrefine.diagnose.candidates import CATALOGUE
+from lerobot_vtrefine.diagnose.candidates.base import Form
+from lerobot_vtrefine.diagnose.composite import Composite
+from lerobot_vtrefine.diagnose.crossvalidation import Score, cross_validate, folds_of, paired_p
+from lerobot_vtrefine.diagnose.fitting import Fit, fit, predict, tangents
+from lerobot_vtrefine.diagnose.maps import find_dead, map_evidence, with_map
+from lerobot_vtrefine.diagnose.presses import PressSet
+from lerobot_vtrefine.diagnose.screening import ALPHA, Probe, Scorer, Screened, probe_form, screen
+from lerobot_vtrefine.diagnose.weights import TrialWeights
+
+MAX_CAUSES = 4
+MIN_GAIN = 0.01
+"""Part of the mean squared error on recordings left out that a cause must take away."""
+REFITTED = 6
+"""Survivors that are refitted in a round."""
+MAPS = ("taxel_gain_spread", "dead_taxels")
+
+
+@dataclass(frozen=True)
+class Step:
+    """One candidate's fit beside (or in place of) what the model already holds."""
+
+    name: str
+    fitted: Fit
+    score: Score
+    gain: float
+    """Part of the previous model's squared error that is gone, on recordings left out."""
+    logs: np.ndarray
+    """Gain in log score of every recording (K,)."""
+
+
+@dataclass
+class Search:
+    """Discovery recordings, the present weights, and what the search has found so far."""
+
+    presses: PressSet
+    seed: int
+    weights: tuple[TrialWeights, ...]
+    folds: list[list[int]]
+    screened: dict[str, Screened] = field(default_factory=dict)
+    """First screening of every candidate, against the baseline."""
+    tried: dict[str, float] = field(default_factory=dict)
+    """Best gain on recordings left out that each candidate reached when it was refitted."""
+    rivals: dict[str, set[str]] = field(default_factory=dict)
+    """Survivors beside which each accepted cause was chosen."""
+    p_adjusted: dict[str, float] = field(default_factory=dict)
+
+
+def start_search(baseline: Baseline, presses: PressSet, seed: int) -> Search:
+    """A search with the baseline's weights."""
+    return Search(presses, seed, baseline.weights, folds_of(presses, seed))
+
+
+def forms_of(family: str, fitted: Fit) -> list[Form]:
+    """Forms of a family that can show in these recordings."""
+    return [form for form in CATALOGUE if form.family == family and form.possible(fitted.model.setting)]
+
+
+def all_probes(search: Search, fitted: Fit) -> list[Probe]:
+    """Probes of every candidate that the model does not hold yet."""
+    _, columns = tangents(fitted.model, search.presses, fitted.model.free)
+    scorer = Scorer(fitted, search.presses, search.weights, columns)
+    probes: list[Probe] = []
+    for form in CATALOGUE:
+        usable = form.screened and form.possible(fitted.model.setting)
+        if usable and form.family not in fitted.model.families:
+            probes += probe_form(form, scorer)
+    return probes
+
+
+def refit(search: Search, fitted: Fit, form: Form, probes: Sequence[Probe]) -> Fit:
+    """Best fit of the model with a form added, over its starting points."""
+    best: Fit | None = None
+    for values in starting_points(search, fitted, form, probes):
+        found = settle(search, fitted.model.plus(form, values))
+        if best is None or found.loss < best.loss:
+            best = found
+    assert best is not None
+    return best
+
+
+def starting_points(search: Search, fitted: Fit, form: Form, probes: Sequence[Probe]) -> list[np.ndarray]:
+    """Where descents start: the two most promising probes, stretched to the size that the scores suggest."""
+    setting = fitted.model.setting
+    if form.search is not None:
+        points = form.search(search.presses, setting.frame_s)
+        losses = [_loss(search, fitted.model.plus(form, np.asarray(point, dtype=float))) for point in points]
+        return [np.asarray(points[int(np.argmin(losses))], dtype=float)]
+    own = sorted((p for p in probes if p.form is form), key=lambda p: -p.explained)[:2]
+    if not own:
+        return [
+            np.clip(np.asarray(guess, dtype=float), form.low, form.high) for guess in form.probes(setting)
+        ]
+    points = []
+    for probe in own:
+        values = probe.values.copy()
+        if form.amplitude is not None:
+            values[form.amplitude] *= probe.size
+        elif form.signed:
+            values = values * probe.size
+        points.append(np.clip(values, form.low, form.high))
+    return points
+
+
+def _loss(search: Search, model: Composite) -> float:
+    from lerobot_vtrefine.diagnose.fitting import losses_of
+
+    return float(losses_of(predict(model, search.presses), search.presses, search.weights).sum())
+
+
+def settle(search: Search, model: Composite) -> Fit:
+    """Fit a model's coordinates; if it holds a map of gains, in turns with the map."""
+    fitted = fit(model, search.presses, search.weights)
+    if model.gain_map is None:
+        return fitted
+    for _ in range(2):
+        fitted = fit(with_map(fitted, search.presses, search.weights), search.presses, search.weights, 4)
+    return fitted
+
+
+def add(search: Search, fitted: Fit, name: str, probes: Sequence[Probe]) -> Fit:
+    """The best fit with a cause of that name added; of its forms the one that foretells best."""
+    if name == "taxel_gain_spread":
+        return settle(search, with_map(fitted, search.presses, search.weights))
+    if name == "dead_taxels":
+        return settle(search, replace(fitted.model, dead=find_dead(fitted, search.presses)))
+    best: tuple[Fit, Score] | None = None
+    for form in forms_of(name, fitted):
+        found = refit(search, fitted, form, probes)
+        score = scored(search, found)
+        if best is None or _clearly_better(score, best[1], search.seed):
+            best = found, score
+    assert best is not None
+    return best[0]
+
+
+def _clearly_better(score: Score, than: Score, seed: int) -> bool:
+    """Whether a richer form pays: a percent less error, in most recordings."""
+    return score.gain_over(than) > MIN_GAIN and paired_p(score.better_by(than), seed) < 0.05
+
+
+def scored(search: Search, fitted: Fit) -> Score:
+    """Errors on recordings left out."""
+    return cross_validate(fitted, search.presses, search.weights, search.folds)
+
+
+def take_away(search: Search, fitted: Fit, name: str) -> Fit:
+    """The best fit without one of the model's causes."""
+    return settle(search, fitted.model.minus(name))
+
+
+def reweigh(search: Search, fitted: Fit) -> Fit:
+    """Noise and weights anew around a better model, and the model's fit with them."""
+    _, weights = weigh(fitted, search.presses)
+    search.weights = tuple(weights)
+    return settle(search, fitted.model)
+
+
+def gain_spread_probe(search: Search, fitted: Fit) -> Probe:
+    """Products between recordings of what they say about every taxel's gain, as one vector of flips.
+
+    The statistic is quadratic in the signs, so the probe carries its own permutation p-value.
+    """
+    evidence = map_evidence(fitted, search.presses, search.weights)
+    total = evidence.information.sum(axis=0)
+    known = total > 0
+    unit = np.where(known, evidence.scores / np.sqrt(np.where(known, total, 1.0)), 0.0)
+    products = unit @ unit.T
+    np.fill_diagonal(products, 0.0)
+    rng = np.random.default_rng([search.seed, 4])
+    signs = rng.integers(0, 2, (9999, len(products))) * 2.0 - 1.0
+    seen = float(products.sum())
+    flipped = np.einsum("bi,ij,bj->b", signs, products, signs)
+    p_value = float((1 + (flipped >= seen - 1e-9 * abs(seen)).sum()) / 10000.0)
+    size = np.array([max(seen, 0.0)])
+    return Probe("taxel_gain_spread", None, np.zeros(0), size, np.maximum(size, 1e-12), True, p_value)
+
+
+def map_probes(search: Search, fitted: Fit) -> list[Probe]:
+    """Probes of gains and dead taxels that the model does not hold yet."""
+    found = []
+    if search.presses.layout.num_taxels < 2:
+        return found
+    if "taxel_gain_spread" not in fitted.model.families:
+        found.append(gain_spread_probe(search, fitted))
+    if "dead_taxels" not in fitted.model.families and find_dead(fitted, search.presses):
+        # Answers that fail by a factor of eight at many times their error need no permutation.
+        size = np.array([1e9])
+        found.append(Probe("dead_taxels", None, np.zeros(0), size, size, True, 1e-4))
+    return found
+
+
+def survivors(found: dict[str, Screened]) -> list[Screened]:
+    """Candidates that pass the screening, the most promising first."""
+    passed = [item for item in found.values() if item.p_adjusted <= ALPHA]
+    return sorted(passed, key=lambda item: -item.probe.explained)
+
+
+def forward(search: Search, fitted: Fit, tell: Callable[[str, float], None]) -> Fit:
+    """Add causes one by one while one takes away at least MIN_GAIN on recordings left out."""
+    for number in range(MAX_CAUSES):
+        probes = [*all_probes(search, fitted), *map_probes(search, fitted)]
+        found = screen(probes, len(search.weights), search.seed)
+        if not number:
+            search.screened = found
+        steps = rank(search, fitted, survivors(found)[:REFITTED], probes)
+        tell(f"step {number + 1}: {len(steps)} candidates refitted", (number + 1) / (MAX_CAUSES + 1))
+        if not steps:
+            break
+        best = steps[0]
+        search.rivals[best.name] = {item.probe.name for item in survivors(found)} - {best.name}
+        search.p_adjusted[best.name] = found[best.name].p_adjusted
+        fitted = reweigh(search, best.fitted)
+        fitted = backward(search, fitted)
+    return fitted
+
+
+def rank(search: Search, fitted: Fit, candidates: Sequence[Screened], probes: Sequence[Probe]) -> list[Step]:
+    """Refits of the candidates that foretell recordings left out better than the model does, best first."""
+    base = scored(search, fitted)
+    steps = []
+    for item in candidates:
+        name = item.probe.name
+        found = add(search, fitted, name, probes)
+        score = scored(search, found)
+        gain, logs = score.gain_over(base), score.better_by(base)
+        search.tried[name] = max(gain, search.tried.get(name, -np.inf))
+        if gain > MIN_GAIN and logs.sum() > 0:
+            steps.append(Step(name, found, score, gain, logs))
+        if name == "dead_taxels" and steps and steps[-1].name == name:
+            return [steps[-1]]
+    return sorted(steps, key=lambda step: -float(step.logs.sum()))
+
+
+def backward(search: Search, fitted: Fit) -> Fit:
+    """Drop causes whose removal costs less than MIN_GAIN."""
+    while len(fitted.model.families) > 1:
+        full = scored(search, fitted)
+        costs = []
+        for name in fitted.model.families:
+            slim = take_away(search, fitted, name)
+            costs.append((full.gain_over(scored(search, slim)), name, slim))
+        cost, _, slim = min(costs, key=lambda item: item[0])
+        if cost >= MIN_GAIN:
+            break
+        fitted = slim
+    return fitted

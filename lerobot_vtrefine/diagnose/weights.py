@@ -1,0 +1,63 @@
+"""Inner products of residuals that discount noise with memory and each recording's own gain and touch."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from lerobot_vtrefine.diagnose.noise import Noise
+
+
+@dataclass(frozen=True)
+class TrialWeights:
+    """Metric of one recording's residuals (T, n): white after division and differencing, except along
+    `nuisance` directions that recordings are known to differ in."""
+
+    sigma: np.ndarray
+    rho: float
+    nuisance: np.ndarray
+    """Whitened directions (T*n, q), scaled so that a unit is one standard deviation between recordings."""
+    coupling: np.ndarray
+    """(1 + Z'Z)^-1 of the nuisance directions Z, (q, q)."""
+
+    def whiten(self, image: np.ndarray) -> np.ndarray:
+        """(T, n) counts to a vector (T*n,) of unit variance within the recording."""
+        return whiten(image, self.sigma, self.rho)
+
+    def gram(self, columns: np.ndarray) -> np.ndarray:
+        """All inner products of whitened columns (T*n, p) in the full metric: (p, p)."""
+        plain = columns.T @ columns
+        if not self.nuisance.shape[1]:
+            return plain
+        along = self.nuisance.T @ columns
+        return plain - along.T @ self.coupling @ along
+
+
+def whiten(image: np.ndarray, sigma: np.ndarray, rho: float) -> np.ndarray:
+    """Divide by sigma and take out AR(1) memory: (T, n) to (T*n,)."""
+    unit = image / sigma
+    white = unit.copy()
+    white[1:] -= rho * unit[:-1]
+    white[1:] /= np.sqrt(1.0 - rho**2)
+    return white.ravel()
+
+
+def build_weights(
+    noise: Noise, signals: Sequence[np.ndarray], offset_tangents: Sequence[np.ndarray] | None
+) -> list[TrialWeights]:
+    """Weights of every recording.
+
+    Args:
+        signals: expected signals (T, n), which are also the direction of a recording's own gain.
+        offset_tangents: change of the signal per metre of first touch (T, n); None where depth is not known.
+    """
+    weights = []
+    for index, signal in enumerate(signals):
+        sigma = noise.sigma(signal)
+        directions = [whiten(signal * noise.gain, sigma, noise.rho)]
+        if offset_tangents is not None:
+            directions.append(whiten(offset_tangents[index] * noise.offset_m, sigma, noise.rho))
+        nuisance = np.stack(directions, axis=1)
+        coupling = np.linalg.inv(np.eye(nuisance.shape[1]) + nuisance.T @ nuisance)
+        weights.append(TrialWeights(sigma, noise.rho, nuisance, coupling))
+    return weights
