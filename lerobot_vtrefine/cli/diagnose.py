@@ -105,14 +105,13 @@ def run(recordings: "RecordingSet", folder: Path, seed: int) -> tuple["Verdict",
     if hopeless is None:
         diagnosis = diagnose(sound, seed)
         issues += diagnosis.issues
-        models: tuple[Savable, Savable] = (diagnosis.baseline_model, diagnosis.extended_model)
+        models = (diagnosis.baseline_model, diagnosis.extended_model)
     else:
-        diagnosis = None
+        diagnosis, models = None, (None, None)
         issues.append(hopeless)
-        models = (unfitted_model(recordings),) * 2
     verdict = make_verdict(diagnosis, issues)
     for model, name in zip(models, FILES[:2], strict=True):
-        model.save(folder / name)
+        (model or unfitted_model(recordings)).save(folder / name)
     page = render_report(verdict, diagnosis, recordings, len(sound.trials), seed)
     (folder / "report.html").write_text(page, encoding="utf-8")
     write_verdict(verdict, folder / "verdict.json")

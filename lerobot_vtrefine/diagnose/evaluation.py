@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from lerobot_vtrefine.diagnose.evidence import ResidualView, Trace
+from lerobot_vtrefine.diagnose.evidence import ResidualView, Trace, TrialError
 from lerobot_vtrefine.diagnose.noise import Noise
 from lerobot_vtrefine.diagnose.prediction import predict_trial
 from lerobot_vtrefine.diagnose.presses import Press, PressSet
@@ -116,6 +116,19 @@ def traces(foretold: Sequence[Foretold]) -> tuple[Trace, ...]:
             )
         )
     return tuple(found)
+
+
+def trial_errors(foretold: Sequence[Foretold]) -> tuple[TrialError, ...]:
+    """Root mean squared error of every held-out recording, of both models."""
+    return tuple(
+        TrialError(
+            f.press.trial.file,
+            f.press.trial.condition,
+            float(np.sqrt(np.mean((f.measured - f.simulated) ** 2))),
+            float(np.sqrt(np.mean((f.measured - f.extended) ** 2))),
+        )
+        for f in foretold
+    )
 
 
 def residual_views(foretold: Sequence[Foretold], seed: int) -> tuple[ResidualView, ...]:

@@ -101,7 +101,7 @@ class Diagnosis(Protocol):
         status, causes, ambiguous_with, unknown, heldout: as in `Verdict`, and so are minimum_detectable and
             next_experiment.
         issues: problems of the data that the engine met beyond quality control.
-        baseline_model, extended_model: what ``vtrefine-predict`` loads.
+        baseline_model, extended_model: what ``vtrefine-predict`` loads; None for ``invalid_data``.
         baseline_params: the refitted parameters of the baseline, name -> value with interval.
         evidence: every candidate that was examined, rejected ones too.
         traces, residuals, trial_errors: about held-out trials only.
@@ -126,9 +126,9 @@ class Diagnosis(Protocol):
     @property
     def issues(self) -> tuple[DataIssue, ...]: ...  # noqa: D102
     @property
-    def baseline_model(self) -> Savable: ...  # noqa: D102
+    def baseline_model(self) -> Savable | None: ...  # noqa: D102
     @property
-    def extended_model(self) -> Savable: ...  # noqa: D102
+    def extended_model(self) -> Savable | None: ...  # noqa: D102
     @property
     def baseline_params(self) -> Mapping[str, Parameter]: ...  # noqa: D102
     @property

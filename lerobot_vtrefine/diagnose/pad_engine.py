@@ -20,8 +20,9 @@ from lerobot_vtrefine.diagnose.evaluation import (
     residual_maps,
     residual_views,
     traces,
+    trial_errors,
 )
-from lerobot_vtrefine.diagnose.evidence import Evidence, ResidualView, Trace
+from lerobot_vtrefine.diagnose.evidence import Evidence, ResidualView, Trace, TrialError
 from lerobot_vtrefine.diagnose.fitting import Fit, predict, tangents
 from lerobot_vtrefine.diagnose.intervals import baseline_parameters, resampled_values
 from lerobot_vtrefine.diagnose.locking import lock
@@ -50,7 +51,7 @@ class PadDiagnosis:
         baseline_model, extended_model: None only if the status is `invalid_data`.
         baseline_params: k_n, k_d and gain as refitted.
         evidence: one row per candidate examined.
-        traces, residuals, maps: on held-out recordings; arrays in `unit`.
+        traces, residuals, trial_errors, maps: on held-out recordings; arrays in `unit`.
         alarms: name of every alarm for unknown causes -> (whether it fired, share, p-value, clue).
     """
 
@@ -68,6 +69,7 @@ class PadDiagnosis:
     evidence: tuple[Evidence, ...] = ()
     traces: tuple[Trace, ...] = ()
     residuals: tuple[ResidualView, ...] = ()
+    trial_errors: tuple[TrialError, ...] = ()
     maps: dict[str, np.ndarray] = field(default_factory=dict)
     alarms: dict[str, tuple[bool, float, float, str]] = field(default_factory=dict)
     unit: str = "counts"
@@ -173,6 +175,7 @@ def _conclude(
         evidence=evidence_table(search, fitted, role, rivals.groups),
         traces=traces(foretold),
         residuals=residual_views(foretold, seed),
+        trial_errors=trial_errors(foretold),
         maps=residual_maps(foretold, everyone),
         alarms={a.name: (a.fired, a.share, a.p_value, a.clue) for a in suspicion.alarms},
     )
