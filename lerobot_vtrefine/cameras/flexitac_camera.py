@@ -22,7 +22,7 @@ class FlexitacCamera(Camera):
         super().__init__(config)
         self.config = config
         self.use_rgb, self.use_depth = config.use_rgb, config.use_depth
-        self._reader = PadReader(config.pad, "flexitac camera")
+        self._reader = PadReader(config, "flexitac camera")
         self._connected = False
         self._consumed = -1
 

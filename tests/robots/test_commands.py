@@ -12,7 +12,7 @@ from lerobot.datasets.lerobot_dataset import LeRobotDataset
 from rig import Rig, allow_slow_answers, aloha_rig
 
 from lerobot_vtrefine.datasets.features import ACTION_KEY, PADS, STATE_KEY, TACTILE_KEYS
-from lerobot_vtrefine.drivers import pad_set
+from lerobot_vtrefine.drivers import arm_pair, pad_set
 from lerobot_vtrefine.drivers.sources import check_pattern
 
 FPS = 15
@@ -72,12 +72,12 @@ def test_thirty_frames_a_second_miss_no_frame(
 ) -> None:
     """Needs a machine that is not busy: robot, recorder, four boards and four buses share its processors."""
     root = tmp_path / "dataset"
-    command = [*follower_flags(rig), *leader_flags(rig), *dataset_flags(root, 1, 10.0, 30)]
+    command = [*follower_flags(rig), *leader_flags(rig), *dataset_flags(root, 1, 20.0, 30)]
     run_command(monkeypatch, "record", command)
     dataset = opened(root)
-    assert len(dataset) >= 298
+    assert len(dataset) >= 598
     for key in TACTILE_KEYS:
-        assert len(set(frame_numbers(dataset, key))) >= 295
+        assert len(set(frame_numbers(dataset, key))) >= 595
     assert np.percentile(column(dataset, AGE_KEY), 99) < 0.05
 
 
@@ -106,6 +106,41 @@ def test_pad_unplugged_while_recording_is_marked_and_the_episode_stays_readable(
     assert np.median(ages[:, 0]) < 0.2
     frame_numbers(opened(root), TACTILE_KEYS[2])
     assert any(PADS[2] in message and "marked stale" in message for message in told)
+
+
+def test_arm_lost_in_the_second_episode_leaves_the_first_readable(
+    rig: Rig, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    from lerobot_vtrefine.robots.aloha_tactile_follower import AlohaTactileFollower
+
+    told: list[str] = []
+    monkeypatch.setattr(arm_pair.logger, "error", lambda text, *values: told.append(text % values))
+    saved: list[int] = []
+    save, look = LeRobotDataset.save_episode, AlohaTactileFollower.get_observation
+
+    def saving(dataset: LeRobotDataset, *args: object, **kwargs: object) -> None:
+        save(dataset, *args, **kwargs)
+        saved.append(len(dataset))
+
+    def looking(robot: AlohaTactileFollower) -> dict[str, object]:
+        if saved:  # the first episode is saved: the arm's cable comes off
+            rig.buses["follower_right"].motors.clear()
+        return look(robot)
+
+    monkeypatch.setattr(LeRobotDataset, "save_episode", saving)
+    monkeypatch.setattr(AlohaTactileFollower, "get_observation", looking)
+    root = tmp_path / "dataset"
+    command = [*follower_flags(rig), *leader_flags(rig), *dataset_flags(root, 2, 0.6, FPS)]
+    with pytest.raises(ConnectionError):
+        run_command(monkeypatch, "record", command)
+    dataset = opened(root)
+    assert dataset.meta.total_episodes == 1
+    assert len(dataset) == saved[0]
+    for key in TACTILE_KEYS:
+        frame_numbers(dataset, key)
+    assert "right arm" in told[0]
+    assert "torque may still be on" in told[0]
+    assert not any(rig.motor("follower", "left", number).torque for number in (1, 2, 9))
 
 
 def test_teleoperate_then_replay_then_calibrate(

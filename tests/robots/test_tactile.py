@@ -167,6 +167,16 @@ def test_pad_as_depth_camera_is_exact(boards: dict[str, PadEmulator]) -> None:
     assert (config.height, config.width, config.use_rgb) == (12, 32, False)
 
 
+def test_depth_camera_takes_a_pads_settings() -> None:
+    settings = {"type": "flexitac", "port": "x", "rows": 16, "pad_rows": 12, "row_offset": 4}
+    config = draccus.decode(CameraConfig, settings | {"protocol": "ascii", "stale_after_s": 0.5})
+    assert isinstance(config, FlexitacCameraConfig)
+    assert (config.height, config.width, config.fps) == (12, 32, 100)
+    assert (config.protocol, config.stale_after_s) == ("ascii", 0.5)
+    with pytest.raises(ValueError, match="row_offset=16"):
+        FlexitacCameraConfig(port="x", row_offset=16)
+
+
 def test_depth_camera_refuses_what_it_is_not() -> None:
     for wrong in ({"use_rgb": True}, {"width": 640, "height": 480}):
         with pytest.raises(ValueError, match="flexitac camera"):
