@@ -4,7 +4,7 @@ import argparse
 import signal
 import threading
 import time
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from contextlib import ExitStack
 from pathlib import Path
 
@@ -59,6 +59,12 @@ def parse_arguments(arguments: Sequence[str] | None) -> argparse.Namespace:
         "--recording",
         type=Path,
         help="uint8 frames, .npy or .npz, (T, R, C) or (T, R*C); implies --source recording",
+    )
+    add(
+        "--arms",
+        type=Path,
+        metavar="FOLDER",
+        help="also emulate ALOHA's four arms there; the leaders wave, and LeRobot's flags are printed",
     )
     add("--seconds", type=float, default=0.0, help="stop after this time; 0 = run until Ctrl-C (%(default)s)")
     add("--seed", type=int, default=0, help="seed of noise and faults (%(default)s)")
@@ -124,6 +130,15 @@ def make_board(
     )
 
 
+def start_arms(folder: Path, stack: ExitStack) -> Callable[[float], None]:
+    """Starts ALOHA's arms and prints their flags; returns what moves the leaders, given the time [s]."""
+    from lerobot_vtrefine.drivers.aloha_emulator import AlohaEmulator  # imports LeRobot's motors
+
+    arms = stack.enter_context(AlohaEmulator(folder))
+    print(*arms.flags(), sep="\n", flush=True)
+    return arms.wave
+
+
 @run_cli
 def main(arguments: Sequence[str] | None = None) -> None:
     """Entry point of `vtrefine-pad-emulator`."""
@@ -147,6 +162,9 @@ def main(arguments: Sequence[str] | None = None) -> None:
         for board, name in enumerate(names[: options.boards]):
             emulator = make_board(options, shape, faults, board, name)
             print(stack.enter_context(emulator).port, flush=True)
+        wave = start_arms(options.arms, stack) if options.arms else None
         started = time.monotonic()
         while not options.seconds or time.monotonic() - started < options.seconds:
-            time.sleep(0.1)
+            time.sleep(0.02 if wave else 0.1)
+            if wave is not None:
+                wave(time.monotonic() - started)

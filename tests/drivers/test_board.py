@@ -1,11 +1,14 @@
 """The reader thread on real pseudo-terminals: every frame, in order, in time, through faults."""
 
+import errno
 import os
+import threading
 import time
 from pathlib import Path
 
 import numpy as np
 import pytest
+import serial
 from boards import PAD, emulated, numbers_of, reading, wait_until
 
 from lerobot_vtrefine.drivers.board import PadReader, Status
@@ -14,6 +17,7 @@ from lerobot_vtrefine.drivers.emulator import Faults
 from lerobot_vtrefine.drivers.frames import FrameShape
 from lerobot_vtrefine.drivers.ports import PortError
 from lerobot_vtrefine.drivers.sources import check_pattern, noise_source, pattern_source, with_markers
+from lerobot_vtrefine.drivers.terminal import plug_in, pull_out
 
 
 def test_every_frame_arrives_once_in_order_with_its_time(tmp_path: Path) -> None:
@@ -147,6 +151,41 @@ def test_errors_name_port_and_fix(tmp_path: Path) -> None:
         board.stall(60.0)
         time.sleep(0.1)
         assert "no data" in connect_error(PadConfig(board.port, rows=16))
+
+
+def test_wrong_baud_rate_is_recognised(tmp_path: Path) -> None:
+    """At a wrong baud rate a UART makes other bytes of the stream."""
+    link = tmp_path / "garbled"
+    terminal = plug_in(link)
+    done = threading.Event()
+    noise = np.random.default_rng(0).integers(0, 255, 300, dtype=np.uint8).tobytes().replace(b"\xaa", b"\xab")
+
+    def send() -> None:
+        while not done.wait(0.01):
+            os.write(terminal[0], noise)
+
+    sender = threading.Thread(target=send)
+    sender.start()
+    try:
+        message = connect_error(PadConfig(str(link), baud=115_200))
+    finally:
+        done.set()
+        sender.join()
+        pull_out(link, terminal)
+    assert str(link) in message
+    assert "wrong baud rate (115200; try 2000000)" in message
+
+
+def test_missing_permission_names_the_group_command(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    port = tmp_path / "ttyUSB0"
+    port.touch()
+
+    def refuse(*_: object, **__: object) -> None:
+        raise serial.SerialException(errno.EACCES, f"could not open port {port}: Permission denied")
+
+    monkeypatch.setattr(serial, "Serial", refuse)
+    message = connect_error(PadConfig(str(port)))
+    assert f"no permission for {port}; run: sudo usermod -aG" in message
 
 
 def test_ascii_board_read_as_binary_is_recognised(tmp_path: Path) -> None:

@@ -7,9 +7,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 from lerobot.motors.dynamixel.tables import MODEL_NUMBER_TABLE
-from rig import GRIPPER_ENDS, Rig, allow_slow_answers, aloha_rig
+from rig import Rig, allow_slow_answers, aloha_rig
 
 from lerobot_vtrefine.datasets.features import NUM_JOINTS, PADS, TAXEL_INFO
+from lerobot_vtrefine.drivers.aloha_emulator import GRIPPER_ENDS
 from lerobot_vtrefine.drivers.dynamixel_arm import VIPERX_300S, WIDOWX_250S, ArmModel, DynamixelArm
 from lerobot_vtrefine.drivers.dynamixel_emulator import EmulatedMotor
 from lerobot_vtrefine.drivers.ports import PortError
