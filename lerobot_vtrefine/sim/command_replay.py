@@ -97,7 +97,7 @@ def replay_commands(
     positions, before = [qpos[:, joints]], servo[0]
     for command in servo[:-1]:
         controls = ramp(before, command, substeps) if hold == "linear" else _held(command, substeps)
-        positions.append(backend.advance(ids, controls).qpos[:, -1][:, joints])
+        positions.append(np.asarray(backend.advance(ids, controls).qpos)[:, -1, joints])
         before = command
     stacked = np.stack(positions, 1)
     return [stacked[episode, :length] for episode, length in enumerate(lengths)]

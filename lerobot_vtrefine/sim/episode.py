@@ -9,7 +9,7 @@ import numpy as np
 
 from lerobot_vtrefine.sim import task
 from lerobot_vtrefine.sim.config import LimitsConfig, SuccessConfig, TaskConfig
-from lerobot_vtrefine.sim.pairs import PartPair
+from lerobot_vtrefine.sim.substeps import Substeps
 
 Array = np.ndarray
 
@@ -123,19 +123,14 @@ class Measured:
     """(m, hand) height of each part's origin above its resting height [m]."""
     part_positions: Array
     """(m, hand, 3)"""
-    tips: Array
-    """(m, S, 3) plug's origin in the socket's frame at samples within the step, the last one at its end."""
-    touching: Array
-    """(m, S) whether the parts touched at each of these samples."""
-    part_forces: Array
-    """(m, K, 3) at every substep [N]."""
+    substeps: Substeps
     pad_load: Array
     """(m, 4, 3)"""
     diverged: Array
     """(m,)"""
 
 
-def update(state: EpisodeState, ids: Array, seen: Measured, pair: PartPair, config: TaskConfig) -> Array:
+def update(state: EpisodeState, ids: Array, seen: Measured, config: TaskConfig) -> Array:
     """Advance the episodes of `ids` by one control step.
 
     Returns:
@@ -143,9 +138,8 @@ def update(state: EpisodeState, ids: Array, seen: Measured, pair: PartPair, conf
     """
     state.steps[ids] += 1
     _update_forces(state, ids, seen)
-    tips = np.concatenate([state.tip[ids][:, None], seen.tips], 1)
-    state.rim_slide[ids] += task.rim_slide(tips, seen.touching, pair.mouth_z_m)
-    state.tip[ids] = seen.tips[:, -1]
+    state.rim_slide[ids] += seen.substeps.rim_slide
+    state.tip[ids] = seen.substeps.tip
     _update_grasp(state, ids, seen)
     fresh = _update_success(state, ids, seen, config.success, config.control_dt_s)
     _update_failure(state, ids, seen, config.limits, config.control_dt_s)
@@ -154,10 +148,10 @@ def update(state: EpisodeState, ids: Array, seen: Measured, pair: PartPair, conf
 
 
 def _update_forces(state: EpisodeState, ids: Array, seen: Measured) -> None:
-    peak, state.force_tail[ids] = task.windowed_peak(seen.part_forces, state.force_tail[ids])
-    state.step_force[ids] = peak
+    peak = seen.substeps.force_peak
+    state.force_tail[ids], state.step_force[ids] = seen.substeps.force_tail, peak
     state.peak_force[ids] = np.maximum(state.peak_force[ids], peak)
-    state.part_force[ids] = seen.part_forces[:, -1]
+    state.part_force[ids] = seen.substeps.force
     state.pad_load[ids], state.pad_force[ids] = seen.pad_load, seen.pad_load[..., 0]
 
 

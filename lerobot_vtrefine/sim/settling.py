@@ -7,10 +7,11 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from lerobot_vtrefine.sim import sensing, starts, task
-from lerobot_vtrefine.sim.backends import Backend, Trace
+from lerobot_vtrefine.sim import starts, task
+from lerobot_vtrefine.sim.backends import Backend
 from lerobot_vtrefine.sim.config import TaskConfig
 from lerobot_vtrefine.sim.scene import Scene
+from lerobot_vtrefine.sim.touch import TouchSource
 
 Array = np.ndarray
 
@@ -32,8 +33,9 @@ class _Rest:
 class Settler:
     """Starts of one scene on one backend."""
 
-    def __init__(self, scene: Scene, config: TaskConfig, backend: Backend) -> None:
+    def __init__(self, scene: Scene, config: TaskConfig, backend: Backend, touch: TouchSource) -> None:
         self._scene, self._config, self._backend = scene, config, backend
+        self._touch = touch
         self._settled: dict[int, _Rest] = {}
 
     def settle(self, ids: Array, seeds: Array, start: starts.Start | None = None) -> tuple[Array, Array]:
@@ -41,7 +43,7 @@ class Settler:
         same seed left them; to `start` where one is given.
 
         Returns:
-            Servo commands (m, nu), and loads on the pads (m, 4, 3) as `sensing.pad_loads` gives them.
+            Servo commands (m, nu), and loads on the pads (m, 4, 3) see `Touch.load`.
         """
         rests = self._rests(ids, seeds) if start is None else self._settle_physically(ids, start)
         if len(rests):
@@ -68,15 +70,9 @@ class Settler:
         self._backend.write(ids, qpos, np.zeros((len(ids), model.nv)))
         command = task.servo_commands(self._scene.embodiment, start.targets)
         substeps = round(start.settle_s / self._scene.config.timestep_s)
-        load = self.pad_load(self._backend.advance_linearly(ids, command, command, substeps))
+        load = self._touch.load(ids, self._backend.advance_linearly(ids, command, command, substeps))
         rows = self._backend.get_rows(ids)
         return [_Rest(*parts) for parts in zip(rows, command, load, strict=True)]
-
-    def pad_load(self, trace: Trace) -> Array:
-        """Loads on the pads (m, 4, 3) at the end of a trace."""
-        at = self._scene.addresses
-        joints, contacts = trace.qpos[:, -1][:, at.qpos], trace.sensors[:, -1][:, at.pad_contacts]
-        return sensing.pad_loads(self._scene.embodiment, joints, contacts)
 
     def _start(self, seeds: Array) -> starts.Start:
         pair, robot = self._scene.pair, self._scene.embodiment

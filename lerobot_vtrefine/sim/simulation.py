@@ -20,6 +20,7 @@ from lerobot_vtrefine.sim.rotations import matrix_to_quat
 from lerobot_vtrefine.sim.scene import Scene, build_scene
 from lerobot_vtrefine.sim.sensing import Kinematics
 from lerobot_vtrefine.sim.settling import Settler
+from lerobot_vtrefine.sim.substeps import summarise
 from lerobot_vtrefine.sim.task import FAILURES
 from lerobot_vtrefine.sim.touch import Touch, touch_source
 from lerobot_vtrefine.tactile import SensorModel
@@ -30,8 +31,6 @@ Array = np.ndarray
 
 NOISE_LEVEL = 3.0
 """Standard deviation of the depth noise that training adds to simulated clouds, in the paper's unit."""
-_SAMPLE_S = 0.025
-"""Sliding on the rim is sampled this often."""
 
 
 @dataclass(frozen=True)
@@ -94,7 +93,7 @@ class InsertionSim:
         everyone = self._randomizer.draw(np.zeros(num_envs, np.int64))
         self._parameters = dict(everyone.values)
         self._depth = DepthCamera(self.scene.model, self.scene.camera, num_envs, device)
-        self._settler = Settler(self.scene, self.config, self._backend)
+        self._settler = Settler(self.scene, self.config, self._backend, self._touch)
 
     @property
     def embodiment(self) -> Any:
@@ -174,7 +173,7 @@ class InsertionSim:
         trace = self._backend.advance_linearly(ids, before, after, self.substeps)
         state.command[ids] = after
         seen = self._seen(ids)
-        reward = update(state, ids, self._measure(ids, seen, trace), self.scene.pair, self.config)
+        reward = update(state, ids, self._measure(ids, seen, trace), self.config)
         self._remember(ids)
         terminated = state.done[ids]
         truncated = ~terminated & (state.steps[ids] >= self.episode_steps)
@@ -312,13 +311,8 @@ class InsertionSim:
         return task.grip_points(grips, (seen.socket, seen.plug), (seen.hand_position, seen.hand_rotation))
 
     def _measure(self, ids: Array, seen: Kinematics, trace: Trace) -> Measured:
-        at, pair = self.scene.addresses, self.scene.pair
-        contact = trace.sensors[:, :, at.part_contact]
-        stride = max(1, round(_SAMPLE_S / self.scene.config.timestep_s))
-        samples = trace.qpos[:, stride - 1 :: stride]
-        plug, socket = sensing.part_pose(samples[..., at.plug_qpos]), samples[..., at.socket_qpos]
-        position, rotation = sensing.part_pose(socket)
-        tips = np.einsum("...ji,...j->...i", rotation, plug[0] - position)
+        scene, pair, state = self.scene, self.scene.pair, self._episode
+        before = state.tip[ids], state.force_tail[ids]
         rest = np.array([pair.socket.rest_height_m, pair.plug.rest_height_m])
         positions = np.stack([seen.socket[0], seen.plug[0]], 1)
         return Measured(
@@ -326,10 +320,8 @@ class InsertionSim:
             grip_points=self._grip_points(seen),
             part_heights=positions[..., 2] - rest,
             part_positions=positions,
-            tips=tips,
-            touching=contact[:, stride - 1 :: stride, 0] > 0,
-            part_forces=contact[..., 1:4],
-            pad_load=self._settler.pad_load(trace),
+            substeps=summarise(trace, scene.addresses, scene.config.timestep_s, *before, pair.mouth_z_m),
+            pad_load=self._touch.load(ids, trace),
             diverged=self._backend.diverged(ids),
         )
 

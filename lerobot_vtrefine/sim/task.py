@@ -23,8 +23,6 @@ NO_FAILURE, SHIFTED, FORCED, DROPPED, UNSTABLE = range(5)
 
 HELD_FORCE_N = 1.0
 """A part is held while both pads of its hand press at least this hard."""
-RIM_DEPTH_M = 0.003
-"""Contact at less depth than this is contact with the rim."""
 
 
 @dataclass(frozen=True)
@@ -107,36 +105,3 @@ def grip_points(grips: tuple[Grip, Grip], parts: tuple[Pose, Pose], hands: Pose)
 def in_hand_shift(points: Array, reference: Array) -> Array:
     """Largest displacement of a part's grip points since the grasp: (m, hand) [m]."""
     return np.linalg.norm(points - reference, axis=-1).max(-1)
-
-
-def windowed_peak(forces: Array, tail: Array) -> tuple[Array, Array]:
-    """Largest moving average of a force over one control step.
-
-    Args:
-        forces: (m, K, 3) of this step [N].
-        tail: (m, w - 1, 3), the last forces of the step before, for a window of w samples.
-
-    Returns:
-        Magnitudes (m,) [N] and the new tail.
-    """
-    window = tail.shape[1] + 1
-    series = np.concatenate([tail, forces], 1)
-    total = np.cumsum(np.concatenate([np.zeros_like(series[:, :1]), series], 1), 1)
-    means = (total[:, window:] - total[:, :-window]) / window
-    return np.linalg.norm(means, axis=-1).max(1), series[:, series.shape[1] - window + 1 :]
-
-
-def rim_slide(tips: Array, touching: Array, mouth_z_m: float) -> Array:
-    """Way that the plug slid on the socket's rim.
-
-    Args:
-        tips: (m, S + 1, 3) plug origins in the socket's frame at successive samples [m].
-        touching: (m, S) whether the parts touched in between.
-        mouth_z_m: height of first entry in the same frame.
-
-    Returns:
-        (m,) lateral way [m], counted only while the plug has not entered.
-    """
-    way = np.linalg.norm(np.diff(tips[..., :2], axis=1), axis=-1)
-    outside = mouth_z_m - tips[:, 1:, 2] < RIM_DEPTH_M
-    return (way * (touching & outside)).sum(1)

@@ -3,17 +3,17 @@
 Shapes: m worlds, 4 pads, B = 2 bodies (plug, socket).
 """
 
+from abc import ABC, abstractmethod
 from collections.abc import Callable
 from dataclasses import dataclass
-from functools import partial
 
 import numpy as np
 import torch
 
-from lerobot_vtrefine.embodiments import Embodiment
-from lerobot_vtrefine.sim.backends import Backend
+from lerobot_vtrefine.sim.backends import Backend, Trace
+from lerobot_vtrefine.sim.backends.base import TouchReader
 from lerobot_vtrefine.sim.scene import Scene
-from lerobot_vtrefine.sim.sensing import Kinematics
+from lerobot_vtrefine.sim.sensing import Kinematics, pad_loads
 
 Array = np.ndarray
 ArrayLike = np.ndarray | torch.Tensor
@@ -31,29 +31,61 @@ class Touch:
     """(m, 4, 3) normal force [N], its centre's x and y in the pad's frame [m]."""
 
 
-TouchSource = Callable[[Array, Callable[[], Kinematics], Array], Touch]
-"""ids (m,), what gives their kinematics on the host where these are needed, and their loads (m, 4, 3)."""
+class TouchSource(ABC):
+    """Where a `Touch` comes from."""
+
+    @abstractmethod
+    def load(self, ids: Array, trace: Trace) -> Array:
+        """Loads on the pads (m, 4, 3) on the host, at the end of a trace that has just been made."""
+
+    @abstractmethod
+    def __call__(self, ids: Array, see: Callable[[], Kinematics], load: Array) -> Touch:
+        """At the present state; `see` gives the worlds' kinematics, `load` is what `load` gave."""
+
+
+class HostTouch(TouchSource):
+    """By the embodiment's forward kinematics."""
+
+    def __init__(self, scene: Scene) -> None:
+        self._robot, self._at = scene.embodiment, scene.addresses
+
+    def load(self, ids: Array, trace: Trace) -> Array:
+        """See `TouchSource.load`."""
+        joints, contacts = trace.qpos[:, -1][:, self._at.qpos], trace.sensors[:, -1][:, self._at.pad_contacts]
+        return pad_loads(self._robot, np.asarray(joints), np.asarray(contacts))
+
+    def __call__(self, ids: Array, see: Callable[[], Kinematics], load: Array) -> Touch:
+        """See `TouchSource.__call__`."""
+        seen = see()
+        joints, rates = torch.from_numpy(seen.joints), torch.from_numpy(seen.joint_velocities)
+        position, rotation = self._robot.pad_poses(joints)
+        poses = (
+            position.numpy(),
+            rotation.numpy(),
+            self._robot.pad_twists(joints, rates).numpy(),
+            np.stack([seen.plug[0], seen.socket[0]], 1),
+            np.stack([seen.plug[1], seen.socket[1]], 1),
+            np.stack([seen.plug_velocity, seen.socket_velocity], 1),
+        )
+        return Touch(poses, load)
+
+
+class DeviceTouch(TouchSource):
+    """By the worlds' own device, without asking the host."""
+
+    def __init__(self, reader: TouchReader) -> None:
+        self._reader = reader
+
+    def load(self, ids: Array, trace: Trace) -> Array:
+        """See `TouchSource.load`."""
+        return self._reader(ids)[1].cpu().numpy().astype(float)
+
+    def __call__(self, ids: Array, see: Callable[[], Kinematics], load: Array) -> Touch:
+        """See `TouchSource.__call__`."""
+        return Touch(*self._reader(ids))
 
 
 def touch_source(scene: Scene, backend: Backend) -> TouchSource:
-    """How to come by a `Touch`: on the worlds' own device where they have one, else from host arrays."""
+    """The one that suits a backend."""
     reader = backend.touch_reader(scene)
-    if reader is None:
-        return partial(touch_from_host, scene.embodiment)
-    return lambda ids, _see, _load: Touch(*reader(ids))
-
-
-def touch_from_host(embodiment: Embodiment, _ids: Array, see: Callable[[], Kinematics], load: Array) -> Touch:
-    """`Touch` by the embodiment's forward kinematics."""
-    seen = see()
-    joints, rates = torch.from_numpy(seen.joints), torch.from_numpy(seen.joint_velocities)
-    position, rotation = embodiment.pad_poses(joints)
-    poses = (
-        position.numpy(),
-        rotation.numpy(),
-        embodiment.pad_twists(joints, rates).numpy(),
-        np.stack([seen.plug[0], seen.socket[0]], 1),
-        np.stack([seen.plug[1], seen.socket[1]], 1),
-        np.stack([seen.plug_velocity, seen.socket_velocity], 1),
-    )
-    return Touch(poses, load)
+    return HostTouch(scene) if reader is None else DeviceTouch(reader)

@@ -1,8 +1,9 @@
 import numpy as np
 import pytest
+import torch
 
 from lerobot_vtrefine.embodiments import get_embodiment
-from lerobot_vtrefine.sim import task
+from lerobot_vtrefine.sim import substeps, task
 from lerobot_vtrefine.sim.backends.base import ramp
 from lerobot_vtrefine.sim.config import SuccessConfig, TaskConfig
 from lerobot_vtrefine.sim.pairs import Grip, procedural_pair
@@ -97,9 +98,9 @@ def test_shift_counts_slip_and_rotation_in_the_hand_but_not_motion_with_it():
 def test_windowed_peak_equals_a_plain_moving_average_over_step_borders():
     rng = np.random.default_rng(3)
     forces = rng.normal(size=(2, 12, 3))
-    tail = np.zeros((2, 3, 3))
-    first, tail = task.windowed_peak(forces[:, :6], tail)
-    second, tail = task.windowed_peak(forces[:, 6:], tail)
+    tail = torch.zeros(2, 3, 3, dtype=torch.float64)
+    first, tail = substeps.windowed_peak(torch.from_numpy(forces[:, :6]), tail)
+    second, tail = substeps.windowed_peak(torch.from_numpy(forces[:, 6:]), tail)
     padded = np.concatenate([np.zeros((2, 3, 3)), forces], 1)
     means = np.stack([padded[:, k : k + 4].mean(1) for k in range(12)], 1)
     norms = np.linalg.norm(means, axis=-1)
@@ -109,10 +110,18 @@ def test_windowed_peak_equals_a_plain_moving_average_over_step_borders():
 
 
 def test_rim_slide_counts_lateral_way_on_the_rim_only():
-    tips = np.array([[[0, 0, 0.001], [0.002, 0, 0.0], [0.002, 0.001, -0.001], [0.0, 0.001, -0.010]]], float)
-    touching = np.array([[True, True, True]])
-    assert task.rim_slide(tips, touching, 0.0)[0] == pytest.approx(0.003)
-    assert task.rim_slide(tips, ~touching, 0.0)[0] == 0.0
+    tips = torch.tensor([[[0, 0, 0.001], [0.002, 0, 0.0], [0.002, 0.001, -0.001], [0.0, 0.001, -0.010]]])
+    touching = torch.tensor([[True, True, True]])
+    assert substeps.rim_slide(tips, touching, 0.0)[0] == pytest.approx(0.003)
+    assert substeps.rim_slide(tips, ~touching, 0.0)[0] == 0.0
+
+
+def test_turning_back_by_quaternions_is_the_inverse_rotation():
+    rng = np.random.default_rng(5)
+    quat, vector = rng.normal(size=(6, 4)), rng.normal(size=(6, 3))
+    quat /= np.linalg.norm(quat, axis=1, keepdims=True)
+    back = substeps.turn_back(torch.from_numpy(quat), torch.from_numpy(vector)).numpy()
+    np.testing.assert_allclose(np.einsum("nij,nj->ni", quat_to_matrix(quat), back), vector, atol=1e-12)
 
 
 def test_rotations_agree_with_each_other():

@@ -23,11 +23,11 @@ TouchReader = Callable[[Array], tuple[tuple[Tensor, Tensor, Tensor, Tensor, Tens
 
 @dataclass(frozen=True)
 class Trace:
-    """What happened during the substeps of one call."""
+    """What happened during the substeps of one call; on the worlds' device, valid until the next call."""
 
-    qpos: Array
+    qpos: Array | Tensor
     """(m, K, nq) after each substep."""
-    sensors: Array
+    sensors: Array | Tensor
     """(m, K, ns) sensor readings, each one of the state before the substep (as MuJoCo leaves them)."""
 
 

@@ -49,6 +49,7 @@ class WarpBackend(Backend):
         worlds.qpos[index], worlds.qvel[index] = self._tensor(qpos), self._tensor(qvel)
         for rest in (worlds.warmstart, worlds.sensors, worlds.time, worlds.diverged):
             rest[index] = 0
+        worlds.moved()
 
     def advance(self, ids: Array, controls: Array) -> Trace:
         """See `Backend.advance`."""
@@ -72,10 +73,9 @@ class WarpBackend(Backend):
         index = self.index(ids)
         flags = self.worlds.overflow[index].cpu().numpy()
         self.worlds.check_overflow(int(np.bitwise_or.reduce(flags, initial=0)))
-        trace = Trace(*(part[index].cpu().numpy() for part in (qpos, sensors)))
         if kept is not None:
             self._put_rows(others, kept)
-        return trace
+        return Trace(qpos[index], sensors[index])
 
     def geom_poses(self, ids: Array) -> tuple[torch.Tensor, torch.Tensor]:
         """See `Backend.geom_poses`: on the worlds' device."""
@@ -124,6 +124,7 @@ class WarpBackend(Backend):
             width = part[0].numel()
             part[index] = rows[:, first : first + width].reshape(len(ids), *part.shape[1:]).to(part)
             first += width
+        self.worlds.moved()
 
     def _state(self) -> tuple[torch.Tensor, ...]:
         # Readings belong to the state: the pads' loads are taken from them after the step.

@@ -69,6 +69,7 @@ class WarpWorlds:
         self._widths = (model.nq, model.nsensordata, model.nu)
         self._graph: wp.Graph | None = None
         self._capture = _can_capture(self.device)
+        self._posed = False
         self._reserve(1)
 
     def _reserve(self, substeps: int) -> None:
@@ -93,6 +94,7 @@ class WarpWorlds:
         Returns:
             Views of positions (N, K, nq) and readings (N, K, ns), valid until the next call.
         """
+        self.moved()
         self._trace.cursor.zero_()
         self.overflow.zero_()
         with wp.ScopedDevice(self.device):
@@ -146,6 +148,7 @@ class WarpWorlds:
 
     def derive(self) -> None:
         """Recompute the constants that follow from model fields."""
+        self.moved()
         with wp.ScopedDevice(self.device):
             for name in DERIVED:
                 self._own_field(name)
@@ -165,8 +168,15 @@ class WarpWorlds:
         self._graph = None
         return own
 
+    def moved(self) -> None:
+        """Say that the state was changed from outside, so that poses must be computed anew."""
+        self._posed = False
+
     def kinematics(self) -> None:
         """Bring poses and velocities of bodies and geoms up to the present state."""
+        if self._posed:
+            return
+        self._posed = True
         with wp.ScopedDevice(self.device):
             mjw.kinematics(self.model, self.data)
             mjw.com_pos(self.model, self.data)
