@@ -125,12 +125,12 @@ def stretched(pad: Pad, size: float, rng: Draw) -> Effect:
 
 
 def play(d: np.ndarray, half: float | np.ndarray) -> np.ndarray:
-    """Play operator of half width `half`, started at rest, along time."""
+    """Play operator of half width `half`, along time; forgets what it knew where there is no contact."""
     out, now = np.empty_like(d), np.zeros_like(d[0])
     for i, value in enumerate(d):
-        now = np.minimum(np.maximum(now, value - half), value + half)
+        now = np.where(value > 0, np.minimum(np.maximum(now, value - half), value + half), 0.0)
         out[i] = now
-    return np.maximum(out, 0.0)
+    return out
 
 
 def play_loop(pad: Pad, size: float, rng: Draw) -> Effect:

@@ -36,15 +36,16 @@ class Motion:
 
 
 class Pen:
-    """Draws a motion: lift, travel, press, hold."""
+    """Draws a motion: lift, travel, press, hold; no move is shorter than two frames and a half."""
 
-    def __init__(self, x_m: float, y_m: float) -> None:
+    def __init__(self, x_m: float, y_m: float, rate_hz: float) -> None:
+        self.shortest_s = 2.5 / rate_hz
         self.now = [x_m, y_m, CLEAR_M]
         self.times, self.points = [0.0, IDLE_S], [list(self.now), list(self.now)]
 
     def go(self, seconds: float, depth: float | None = None, xy: tuple[float, float] | None = None) -> None:
         self.now = [*(xy or self.now[:2]), self.now[2] if depth is None else depth]
-        self.times.append(self.times[-1] + max(seconds, 0.02))
+        self.times.append(self.times[-1] + max(seconds, self.shortest_s))
         self.points.append(list(self.now))
 
     def motion(self, kind: str, indenter: int) -> Motion:
@@ -65,7 +66,7 @@ def press(pen: Pen, depth: float, ramp_s: float, hold_s: float, speed_back: floa
 
 def draw(kind: str, rig: Rig, rng: np.random.Generator) -> Motion:
     """One condition of a kind, filling the rig's duration."""
-    pen = Pen(*site(rig, rng))
+    pen = Pen(*site(rig, rng), rig.rate_hz)
     depth = rig.reach_m * rng.uniform(0.45, 1.0)
     ramp = float(np.exp(rng.uniform(np.log(0.12), np.log(1.6))))
     end = rig.duration_s - 0.6
@@ -123,7 +124,7 @@ def standard(rig: Rig, rng: np.random.Generator, conditions: int | None = None) 
 
 def monotone(rig: Rig, rng: np.random.Generator) -> list[Motion]:
     """The same press, one speed, one depth, one site, in every recording."""
-    pen = Pen(*(0.25 * np.array(site(rig, rng))))
+    pen = Pen(*(0.25 * np.array(site(rig, rng))), rig.rate_hz)
     while pen.times[-1] + 2.2 < rig.duration_s:
         press(pen, 0.8 * rig.reach_m, 0.6, 0.3)
         pen.go(0.4)
