@@ -55,7 +55,8 @@ class Batch:
     def subset(self, trials: Array | Sequence[int]) -> "Batch":
         """Only the trials of those indices."""
         index = np.asarray(trials, dtype=np.int64)
-        length = int(self.valid[:, index].any(1).nonzero()[0].max()) + 1 if len(index) else 0
+        used = np.any(self.valid[:, index], axis=1)
+        length = int(np.flatnonzero(used).max()) + 1 if len(index) else 0
         cut = {
             name: getattr(self, name)[:length, index] for name in ("time_s", "command", "position", "valid")
         }

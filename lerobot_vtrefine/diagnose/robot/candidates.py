@@ -77,7 +77,7 @@ class Candidate:
 
     def clashes(self, free: Array) -> Array:
         """(J,) joints where its parameters are in use already."""
-        return free[:, [INDEX[name] for name in self.parameters]].any(1)
+        return np.any(free[:, [INDEX[name] for name in self.parameters]], axis=1)
 
 
 CANDIDATES = (

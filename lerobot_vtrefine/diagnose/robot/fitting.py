@@ -86,7 +86,7 @@ class Problem:
     def predict(self, point: Point, joint: Array | None = None, theta: Array | None = None) -> Array:
         """Positions (N, T, C) of columns: joints (C,) under parameters (C, P); by default all joints."""
         joint = np.arange(self.batch.joints) if joint is None else joint
-        theta = point.theta if theta is None else theta
+        theta = point.theta[joint] if theta is None else theta
         columns = Columns(
             joint=joint,
             omega=np.exp(theta[:, INDEX["log_omega"]]),
@@ -161,9 +161,20 @@ def servo_only(problem: Problem) -> Array:
     return free
 
 
-def evaluate(problem: Problem, point: Point, free: Array, tau_free: bool = False) -> Fit:
-    """A fit that stays where it starts."""
-    left = problem.residual(problem.predict(point))
+def evaluate(
+    problem: Problem,
+    point: Point,
+    free: Array,
+    tau_free: bool = False,
+    known: Fit | None = None,
+    joints: Array | None = None,
+) -> Fit:
+    """A fit that stays where it starts; only some joints differ from a known one if both are given."""
+    if known is None or joints is None:
+        left = problem.residual(problem.predict(point))
+    else:
+        left = known.residual.copy()
+        left[..., joints] = problem.residual(problem.predict(point, joints), joints)
     mse = (left**2).sum(0) / np.maximum(problem.batch.frames, 1)[:, None]
     return Fit(point, free, tau_free, mse, left)
 
@@ -174,7 +185,7 @@ def fit(
     """Minimise every joint's squared error over its free parameters, and over the delay if it is free."""
     fitter = _Fitter(problem, free, tau_free)
     now = evaluate(problem, _bounded(problem, start, free), free, tau_free)
-    for _ in range(iterations):
+    for _ in range(iterations if free.any() or tau_free else 0):
         now, done = fitter.step(now)
         if done:
             break
@@ -188,12 +199,14 @@ class _Fitter:
         self.problem, self.free, self.tau_free = problem, free, tau_free
         self.damping = np.full(len(free), 1e-3)
         self.weight = 1.0 / problem.scale**2
-        self.settled = ~free.any(1)
+        self.settled: Array = ~np.any(free, axis=1)
 
     def step(self, now: Fit) -> tuple[Fit, bool]:
         """One damped step; joints that it does not improve keep their values and try a shorter one next."""
         derivative = derivatives(self.problem, replace(now, free=now.free & ~self.settled[:, None]))
-        then = evaluate(self.problem, self._propose(now, derivative), self.free, self.tau_free)
+        open_joints = None if self.tau_free else np.flatnonzero(~self.settled)
+        proposed = self._propose(now, derivative)
+        then = evaluate(self.problem, proposed, self.free, self.tau_free, now, open_joints)
         before, after = (now.residual**2).sum((0, 1)), (then.residual**2).sum((0, 1))
         if self.tau_free:
             before, after = (np.full(len(before), (x * self.weight).sum()) for x in (before, after))

@@ -94,18 +94,22 @@ def folds_of(conditions: tuple[str, ...], seed: int) -> Array:
     return np.array([fold[condition] for condition in conditions])
 
 
-def cross_validated(problem: Problem, fit: Fit, folds: Array) -> Array:
-    """Mean squared error (T, J) of every trial under a fit to the other folds."""
+def cross_validated(problem: Problem, fit: Fit, folds: Array, known: Array | None = None) -> Array:
+    """Mean squared error (T, J) of every trial under a fit to the other folds.
+
+    Joints without free parameters keep the errors that are `known`.
+    """
     if len(set(folds)) < 2:
         return fit.mse
     curvature = Curvature.at(problem, fit)
-    mse = np.empty_like(fit.mse)
+    mse = fit.mse.copy() if known is None else known.copy()
+    joints = np.flatnonzero(np.any(fit.free, axis=1) | fit.tau_free)
     for fold in np.unique(folds):
         held = np.flatnonzero(folds == fold)
         part = problem.subset(held)
         point = curvature.moved((folds != fold).astype(float))
-        left = part.residual(part.predict(point))
-        mse[held] = (left**2).sum(0) / np.maximum(part.batch.frames, 1)[:, None]
+        left = part.residual(part.predict(point, joints), joints)
+        mse[np.ix_(held, joints)] = (left**2).sum(0) / np.maximum(part.batch.frames, 1)[:, None]
     return mse
 
 

@@ -159,7 +159,8 @@ class Selector:
         index = np.flatnonzero(allowed)
         if not len(index):
             return None
-        free = candidate.freed(self.now.free, index)
+        # Joints that it is not tried on rest; with a free delay they would not, and the delay is kept for now.
+        free = candidate.freed(self.now.free, index) & allowed[:, None]
         own = replace(self.now, free=free)
         fits = [
             fit(
@@ -175,8 +176,9 @@ class Selector:
             better = other.total < best.total
             best = merged(best, other, better)
         # Joints that it is not tried on keep what they have.
+        held_out = cross_validated(self.problem, best, self.folds, self.held_out)
         best = merged(self.now, best, allowed, free=np.where(allowed[:, None], free, self.now.free))
-        return self._judged(candidate, best, allowed)
+        return self._judged(candidate, best, allowed, held_out)
 
     def _attempt_delay(self) -> Tried:
         fits = []
@@ -184,10 +186,10 @@ class Selector:
             point = replace(self.now.point, tau_s=start)
             fits.append(fit(self.problem, point, self.now.free, tau_free=True, iterations=12))
         best = min(fits, key=lambda item: float((item.total / self.baseline.total.clip(1e-300)).sum()))
-        return self._judged(None, best, np.ones(self.problem.batch.joints, dtype=bool))
-
-    def _judged(self, candidate: Candidate | None, best: Fit, allowed: Array) -> Tried:
         held_out = cross_validated(self.problem, best, self.folds)
+        return self._judged(None, best, np.ones(self.problem.batch.joints, dtype=bool), held_out)
+
+    def _judged(self, candidate: Candidate | None, best: Fit, allowed: Array, held_out: Array) -> Tried:
         change = np.where(allowed, self.held_out - held_out, 0.0)
         improvement = change / np.maximum(self.held_out + held_out, 1e-300)
         before = self.held_out.mean(0)

@@ -6,13 +6,13 @@ what a load bends). The servo follows:
     q'' = omega^2 (r - friction sign(q') - q) - 2 zeta omega q'          (friction as servo error, [rad])
 
 and the encoder reads q + offset, possibly through play of its own (`loose`). Without friction every step is
-exact, whatever the frames' spacing and the delay; with friction the step is split into `SUBSTEPS`.
+exact, whatever the frames' spacing and the delay; with friction, so are the stops between them.
 
 Shapes: N frames, T trials, C columns. A column is one joint under one set of parameters: columns repeat
 joints when several sets are tried at once.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -20,7 +20,9 @@ from lerobot_vtrefine.diagnose.robot.batch import Batch
 
 Array = np.ndarray
 
-SUBSTEPS = 8
+MAX_PARTS = 4
+_TURN_RAD = 1.5
+"""A joint with friction is followed in steps of at most this phase, so that it stops at most once in each."""
 _CRITICAL = 1e-6
 _DT_DIGITS = 6
 
@@ -47,16 +49,22 @@ class Columns:
     push: Array | None = None
     """(N, T, C) added to the target."""
 
+    def only(self, kind: Array) -> "Columns":
+        """The servo's parameters of some columns."""
+        names = ("joint", "omega", "zeta", "offset", "play", "loose", "friction")
+        return replace(self, **{name: getattr(self, name)[kind] for name in names}, push=None)
+
 
 def simulate(batch: Batch, columns: Columns) -> Array:
     """Encoder readings (N, T, C) that follow from the commands and the first position alone."""
     start = batch.first_position[:, columns.joint] - columns.offset
     target = _play(batch.command[:, :, columns.joint], columns.play, start, columns.push)
     start = np.clip(target[0], start - columns.loose / 2, start + columns.loose / 2)
-    if (columns.friction > 0).any():
-        q = _with_friction(batch.time_s, target, start, columns)
-    else:
-        q = _linear(batch.time_s, target, start, columns)
+    dry = columns.friction > 0
+    q = np.empty_like(target)
+    for kind, follow in ((~dry, _linear), (dry, _with_friction)):
+        if kind.any():
+            q[..., kind] = follow(batch.time_s, target[..., kind], start[:, kind], columns.only(kind))
     if (columns.loose > 0).any():
         first = batch.first_position[:, columns.joint] - columns.offset
         q = _dragged(q, columns.loose, first)
@@ -156,51 +164,71 @@ def _add(out: Array, row: Array, trial: Array, values: Array) -> None:
         np.add.at(out, (row[again], trial[again]), values[again])
 
 
-def _delayed_mean(time_s: Array, target: Array, tau_s: float) -> Array:
-    """Mean of the delayed target over every substep, (N-1, SUBSTEPS, T, C)."""
-    count, trials = time_s.shape
-    fractions = np.linspace(0, 1, SUBSTEPS + 1)
-    out = np.empty((count - 1, SUBSTEPS, *target.shape[1:]))
-    for trial in range(trials):
-        t = time_s[:, trial]
-        dt = np.diff(t)
-        integral = np.concatenate(
-            [np.zeros((1, target.shape[2])), np.cumsum(target[:-1, trial] * dt[:, None], 0)]
-        )
-        query = (t[:-1, None] + dt[:, None] * fractions) - tau_s
-        index = np.clip(np.searchsorted(t, query, side="right") - 1, 0, count - 1)
-        value = integral[index] + (query - t[index])[..., None] * target[index, trial]
-        h = np.maximum(dt / SUBSTEPS, 1e-12)[:, None, None]
-        out[:, :, trial] = np.diff(value, axis=1) / h
-    return out
-
-
 def _with_friction(time_s: Array, target: Array, start: Array, columns: Columns) -> Array:
-    dt = np.diff(time_s, axis=0)
-    unique, inverse = np.unique(dt.round(_DT_DIGITS), return_inverse=True)
-    inverse = inverse.reshape(dt.shape)
-    a11, a12, a21, a22 = transition(unique[:, None] / SUBSTEPS, columns.omega, columns.zeta)
-    late = _delayed_mean(time_s, target, columns.tau_s) if columns.tau_s > 0 else None
-    out = np.empty_like(target)
-    q, v = start, np.zeros_like(start)
-    out[0] = q
-    friction = columns.friction
-    for k in range(len(dt)):
+    """Between changes of the target the motion is linear until the joint stops; stops are found exactly."""
+    grid, held, frame = _grid(time_s, columns)
+    step_s = np.diff(grid, axis=0)
+    unique, inverse = np.unique(step_s.round(_DT_DIGITS), return_inverse=True)
+    inverse = inverse.reshape(step_s.shape)
+    a11, a12, a21, a22 = transition(unique[:, None], columns.omega, columns.zeta)
+    trials = np.arange(time_s.shape[1])
+    path = np.empty((len(grid), *start.shape))
+    q, v = start.copy(), np.zeros_like(start)
+    path[0] = q
+    friction = np.broadcast_to(columns.friction, q.shape)
+    for k in range(len(step_s)):
         step = inverse[k]
-        m11, m12, m21, m22 = a11[step], a12[step], a21[step], a22[step]
-        for part in range(SUBSTEPS):
-            r = target[k] if late is None else late[k, part]
-            pull = r - q
-            # At rest the friction takes up what the servo pulls, as far as it can.
-            sign = np.sign(np.where(v == 0, pull, v))
-            stuck = (v == 0) & (np.abs(pull) <= friction)
-            error = -(pull - friction * sign)
-            moved, speed = q - error + m11 * error + m12 * v, m21 * error + m22 * v
-            # It never reverses a motion: where it would, the joint stops for the rest of the step.
-            turned = speed * sign < 0
-            until_stop = v * v / np.maximum(np.abs(v) + np.abs(speed), 1e-12) * np.sign(v)
-            stopped = q + 0.5 * until_stop * dt[k][:, None] / SUBSTEPS
-            q = np.where(stuck, q, np.where(turned, stopped, moved))
-            v = np.where(turned | stuck, 0.0, speed)
-        out[k + 1] = q
-    return out
+        r = target[held[k], trials]
+        pull = r - q
+        sign = np.sign(np.where(v == 0, pull, v))
+        stuck = (v == 0) & (np.abs(pull) <= friction)
+        error = friction * sign - pull
+        moved = q - error + a11[step] * error + a12[step] * v
+        speed = a21[step] * error + a22[step] * v
+        turned = (speed * sign < 0) & ~stuck
+        if turned.any():
+            where = np.nonzero(turned)
+            part = (step_s[k][where[0]], r[where], q[where], v[where], error[where])
+            moved[where], speed[where] = _through_stop(*part, columns, where[1])
+        q, v = np.where(stuck, q, moved), np.where(stuck, 0.0, speed)
+        path[k + 1] = q
+    return np.take_along_axis(path, frame[..., None], 0)
+
+
+def _through_stop(
+    h: Array, r: Array, q: Array, v: Array, error: Array, columns: Columns, column: Array
+) -> tuple[Array, Array]:
+    """State after time h of joints that come to a stop before it, and then stick or turn back."""
+    omega, zeta, friction = columns.omega[column], columns.zeta[column], columns.friction[column]
+    decay, beat = zeta * omega, omega**2 * (1 - zeta**2)
+    root = np.maximum(np.sqrt(np.abs(beat)), _CRITICAL * omega)
+    rising, falling = np.abs(v) * root, np.sign(v) * (omega**2 * error + decay * v)
+    ratio = np.clip(rising / np.where(falling > 0, falling, np.inf), 0.0, 1 - 1e-12)
+    stop = np.where(beat > 0, np.arctan2(rising, falling), np.arctanh(ratio)) / root
+    stop = np.clip(stop, 0.0, h)
+    a11, a12, _, _ = transition(stop, omega, zeta)
+    rest = q - error + a11 * error + a12 * v
+    pull = r - rest
+    back = friction * np.sign(pull) - pull
+    a11, _, a21, _ = transition(h - stop, omega, zeta)
+    sticks = np.abs(pull) <= friction
+    return np.where(sticks, rest, rest - back + a11 * back), np.where(sticks, 0.0, a21 * back)
+
+
+def _grid(time_s: Array, columns: Columns) -> tuple[Array, Array, Array]:
+    """Times (M, T) between which nothing changes and no joint turns twice; the target's row in force at each;
+    where the frames are."""
+    count, trials = time_s.shape
+    dt = np.diff(time_s, axis=0)
+    typical = np.median(dt[dt > 0]) if (dt > 0).any() else 1.0
+    parts = int(np.clip(np.ceil(columns.omega.max() * typical / _TURN_RAD), 1, MAX_PARTS))
+    inner = [time_s[:-1] + dt * part / parts for part in range(1, parts)]
+    arrival = time_s[1:] + max(columns.tau_s, 0.0)
+    late = [np.minimum(arrival, time_s[-1])] if columns.tau_s > 0 else []
+    grid = np.sort(np.concatenate([time_s, *inner, *late]), axis=0)
+    held = np.empty(grid.shape, dtype=np.int64)
+    frame = np.empty(time_s.shape, dtype=np.int64)
+    for trial in range(trials):
+        held[:, trial] = np.searchsorted(arrival[:, trial], grid[:, trial] + 1e-12, side="right")
+        frame[:, trial] = np.searchsorted(grid[:, trial], time_s[:, trial], side="left")
+    return grid, held.clip(0, count - 1), frame

@@ -1,0 +1,69 @@
+"""A LeRobot dataset as robot recordings: one episode is one trial."""
+
+import os
+from pathlib import Path
+
+from huggingface_hub.constants import HF_HOME
+
+from lerobot_vtrefine.datasets.episodes import EpisodeFolder, open_episodes
+from lerobot_vtrefine.diagnose.recordings import RecordingSet, RobotTrial
+from lerobot_vtrefine.embodiments import ALOHA
+
+PAUSE_S = 20.0
+"""Taken between episodes: datasets do not note when an episode was recorded."""
+
+
+def dataset_root(repo_id: str | None, root: str | Path | None) -> Path:
+    """Where a dataset lies on this machine; nothing is downloaded.
+
+    Raises ValueError if neither is given, FileNotFoundError where the dataset is not there.
+    """
+    if root is None and repo_id is None:
+        raise ValueError("give --dataset.root or --dataset.repo_id")
+    home = Path(os.environ.get("HF_LEROBOT_HOME", Path(HF_HOME) / "lerobot"))
+    found = Path(root) if root is not None else home / str(repo_id)
+    if not (found / "meta" / "info.json").is_file():
+        hint = "" if root is not None else "; datasets are not downloaded here, give --dataset.root"
+        raise FileNotFoundError(f"{found} holds no LeRobot dataset (no meta/info.json){hint}")
+    return found
+
+
+def read_dataset(repo_id: str | None = None, root: str | Path | None = None) -> RecordingSet:
+    """Actions and joint positions of every episode, as a set of kind "robot".
+
+    Joints without names are ALOHA's if there are as many, else numbered. Episodes follow one another with
+    `PAUSE_S` between them.
+
+    Raises:
+        FileNotFoundError: no dataset there.
+        ValueError: it lacks `action` or `observation.state`, or their shapes differ; names the file.
+    """
+    folder = open_episodes(dataset_root(repo_id, root))
+    names = joint_names(folder)
+    trials, start_s = [], 0.0
+    for episode in folder.read():
+        time_s = episode.time_s.astype(float) - float(episode.time_s[0])
+        trials.append(
+            RobotTrial(
+                file=f"episode_{episode.index:06d}",
+                condition=f"episode {episode.index}",
+                replicate=0,
+                order=episode.index,
+                start_s=start_s,
+                time_s=time_s,
+                command=episode.action,
+                position=episode.state,
+                load=None,
+            )
+        )
+        start_s += float(time_s[-1]) + PAUSE_S
+    return RecordingSet(folder.root, "robot", 0, 0, 0.0, "rad", 0.0, names, tuple(trials))
+
+
+def joint_names(folder: EpisodeFolder) -> tuple[str, ...]:
+    """Names of the columns of state and action."""
+    if folder.joints:
+        return tuple(name.removesuffix(".pos") for name in folder.joints)
+    if folder.num_joints == ALOHA.num_joints:
+        return ALOHA.joint_names
+    return tuple(f"joint_{index}" for index in range(folder.num_joints))

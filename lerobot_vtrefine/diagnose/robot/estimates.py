@@ -1,0 +1,131 @@
+"""Parameters as the verdict gives them: names and units of contract §5, intervals by resampling trials."""
+
+from itertools import pairwise
+
+import numpy as np
+
+from lerobot_vtrefine.diagnose.robot.candidates import FRICTION, LATENCY
+from lerobot_vtrefine.diagnose.robot.fitting import INDEX, SAG, Problem
+from lerobot_vtrefine.diagnose.robot.friction_load import friction_in_load
+from lerobot_vtrefine.diagnose.robot.gravity import full_reach, is_sliding
+from lerobot_vtrefine.diagnose.robot.resampling import bootstrap
+from lerobot_vtrefine.diagnose.robot.selection import Selection
+from lerobot_vtrefine.diagnose.verdict import Parameter
+from lerobot_vtrefine.embodiments import ALOHA
+
+Array = np.ndarray
+
+
+class Estimates:
+    """Fitted values of a selection with their resampled spread."""
+
+    def __init__(self, selection: Selection, seed: int) -> None:
+        self.selection, self.seed = selection, seed
+        self.theta, self.tau = bootstrap(selection.problem, selection.fit, seed)
+
+    def of(self, cause: str, joints: tuple[int, ...]) -> dict[str, Parameter]:
+        """The cause's parameters on those joints."""
+        if cause == LATENCY:
+            value = self.selection.fit.point.tau_s
+            return {"tau_s": Parameter(value, _interval(self.tau, value), "s")}
+        if cause == "gripper_compliance":
+            return {"m_per_n": self._compliance(joints)}
+        out: dict[str, Parameter] = {}
+        for joint in joints:
+            name = self.selection.problem.names[joint]
+            if cause == FRICTION:
+                key, parameter = self._friction(joint, name)
+                out[key] = parameter
+            else:
+                unit = "m" if is_sliding(name) else "rad"
+                out[f"{name}_{unit}"] = self._length(cause, joint, unit)
+        return out
+
+    def baseline(self, theta: Array) -> dict[str, Parameter]:
+        """Frequency and damping of every joint of a fit (J, P), without intervals."""
+        out: dict[str, Parameter] = {}
+        for joint, name in enumerate(self.selection.problem.names):
+            out[f"{name}.natural_frequency"] = Parameter(float(np.exp(theta[joint, 0])), None, "rad/s")
+            out[f"{name}.damping_ratio"] = Parameter(float(np.exp(theta[joint, 1])), None, "1")
+        return out
+
+    def _length(self, cause: str, joint: int, unit: str) -> Parameter:
+        now = self.selection.fit.point.theta[joint]
+        drawn = self.theta[:, joint]
+        if cause == "gravity_sag":
+            form = self.selection.fit.point.forms[joint]
+            columns = [INDEX[name] for name in SAG]
+            value = full_reach(form, now[columns])
+            spread = np.array([full_reach(form, terms) for terms in drawn[:, columns]])
+        else:
+            names = ("play", "loose") if cause == "backlash" else ("offset",)
+            columns = [INDEX[name] for name in names]
+            value, spread = float(now[columns].sum()), drawn[:, columns].sum(1)
+        return Parameter(value, _interval(spread, value), unit)
+
+    def _friction(self, joint: int, name: str) -> tuple[str, Parameter]:
+        """In Nm where loads or the robot's known servo gains give the scale; else as the servo's error."""
+        problem = self.selection.problem
+        sliding = is_sliding(name)
+        if problem.batch.load is not None:
+            seen = friction_in_load(problem, self.selection.fit, joint, self.seed)
+            if seen.seen:
+                unit = "N" if sliding else "Nm"
+                return f"{name}_{unit.lower()}", Parameter(seen.torque, seen.ci95, unit)
+        column = INDEX["friction"]
+        value = float(self.selection.fit.point.theta[joint, column])
+        low, high = _interval(self.theta[:, joint, column], value)
+        stiffness = _stiffness(name)
+        if stiffness is None:
+            unit = "m" if sliding else "rad"
+            return f"{name}_{unit}", Parameter(value, (low, high), f"{unit} of servo error")
+        unit = "N" if sliding else "Nm"
+        scaled = (low * stiffness, high * stiffness)
+        return f"{name}_{unit.lower()}", Parameter(value * stiffness, scaled, unit)
+
+    def _compliance(self, joints: tuple[int, ...]) -> Parameter:
+        """One number for all grippers: their mean, each weighted by how well it is known; fingers that move
+        the other way have loads of the other sign or not, so sizes are averaged."""
+        column = INDEX["bend"]
+        index = list(joints)
+        value = self.selection.fit.point.theta[index, column]
+        drawn = self.theta[:, index, column]
+        weight = 1 / drawn.var(0).clip(1e-300)
+        sign = np.sign(value)
+        mean = float((weight * np.abs(value)).sum() / weight.sum())
+        spread = (drawn * sign * weight).sum(1) / weight.sum()
+        overall = 1.0 if (sign >= 0).any() else -1.0
+        low, high = _interval(spread, mean)
+        if overall < 0:
+            low, high = -high, -low
+        return Parameter(overall * mean, (low, high), "m/N")
+
+
+def _stiffness(name: str) -> float | None:
+    """Servo gain [Nm/rad, N/m] of a joint that is named as ALOHA's."""
+    plain = name.removesuffix(".pos")
+    if plain not in ALOHA.joint_names:
+        return None
+    if is_sliding(plain):
+        return ALOHA.fingers.stiffness
+    return next(joint.stiffness for joint in ALOHA.joints if plain.endswith(joint.name))
+
+
+def _interval(drawn: Array, value: float) -> tuple[float, float]:
+    low, high = np.percentile(drawn, [2.5, 97.5])
+    return float(min(low, value)), float(max(high, value))
+
+
+def repeatability(problem: Problem, residual: Array) -> float | None:
+    """Root mean square error that no model could undo: half the squared difference of repeated trials; None
+    without repeated commands."""
+    batch = problem.batch
+    found = []
+    for condition in set(batch.conditions):
+        trials = [index for index, name in enumerate(batch.conditions) if name == condition]
+        for a, b in pairwise(trials):
+            valid = batch.valid[:, a] & batch.valid[:, b]
+            same = np.abs(batch.command[valid][:, a] - batch.command[valid][:, b])
+            if valid.sum() > 1 and same.max() < 1e-6:
+                found.append(0.5 * np.square(residual[valid, a] - residual[valid, b]).mean())
+    return float(np.sqrt(np.mean(found))) if found else None

@@ -1,0 +1,69 @@
+"""Dry friction as measured loads show it: torque that changes sign with the motion."""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from lerobot_vtrefine.diagnose.robot import flips
+from lerobot_vtrefine.diagnose.robot.fitting import Fit, Problem
+
+Array = np.ndarray
+
+_ALPHA = 0.02
+_LEAST_SHARE = 0.05
+_CREEP = 0.05
+"""Speeds below this part of the typical one say little about direction."""
+
+
+@dataclass(frozen=True)
+class LoadFriction:
+    """Friction in units of load, and whether the trials agree on it."""
+
+    torque: float
+    ci95: tuple[float, float]
+    p_value: float
+    share: float
+    """Part of the load's variance, after inertia, damping and gravity, that it explains."""
+
+    @property
+    def seen(self) -> bool:
+        """Whether there is friction."""
+        return self.p_value < _ALPHA and self.share > _LEAST_SHARE and self.torque > 0
+
+
+def friction_in_load(problem: Problem, fitted: Fit, joint: int, seed: int) -> LoadFriction:
+    """Regress a joint's load on inertia, damping, gravity and the motion's direction, trial by trial.
+
+    Raises ValueError without loads.
+    """
+    batch = problem.batch
+    if batch.load is None:
+        raise ValueError("the trials have no loads")
+    q = batch.position[..., joint] - fitted.residual[..., joint]
+    blocks, scores, power = [], [], []
+    for trial in range(batch.trials):
+        valid = batch.valid[:, trial]
+        t, x = batch.time_s[valid, trial], q[valid, trial]
+        if len(t) < 8:
+            continue
+        speed = np.gradient(x, t)
+        blocks.append((t, x, speed, np.gradient(speed, t), batch.load[valid, trial, joint]))
+    typical = np.sqrt(np.mean(np.concatenate([block[2] for block in blocks]) ** 2)) + 1e-12
+    direction = [np.tanh(block[2] / (_CREEP * typical)) for block in blocks]
+    known = [np.stack([np.ones_like(x), np.cos(x), np.sin(x), v, a], 1) for _, x, v, a, _ in blocks]
+    stacked, sign = np.concatenate(known), np.concatenate(direction)
+    load = np.concatenate([block[4] for block in blocks])
+    clear = sign - stacked @ np.linalg.lstsq(stacked, sign, rcond=None)[0]
+    left = load - stacked @ np.linalg.lstsq(stacked, load, rcond=None)[0]
+    ends = np.cumsum([len(block[0]) for block in blocks])
+    for part, rest in zip(np.split(clear, ends[:-1]), np.split(left, ends[:-1]), strict=True):
+        scores.append(part @ rest)
+        power.append(part @ part)
+    scores, power = np.array(scores), np.array(power)
+    torque = float(scores.sum() / max(power.sum(), 1e-12))
+    share = float(scores.sum() ** 2 / max(power.sum() * (left @ left), 1e-30))
+    p_value = float(flips.one_sided(scores[:, None], seed)[0][0])
+    draws = np.random.default_rng(seed).integers(0, len(scores), (1000, len(scores)))
+    spread = scores[draws].sum(1) / power[draws].sum(1).clip(1e-12)
+    low, high = np.percentile(spread, [2.5, 97.5])
+    return LoadFriction(torque, (float(low), float(high)), p_value, share)

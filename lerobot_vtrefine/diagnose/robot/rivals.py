@@ -1,0 +1,174 @@
+"""What else would explain the trials as well: causes that these data cannot tell apart."""
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from lerobot_vtrefine.diagnose.robot import flips
+from lerobot_vtrefine.diagnose.robot.candidates import (
+    CANDIDATES,
+    DECOY,
+    FRICTION,
+    LATENCY,
+    Candidate,
+    delay_starts,
+)
+from lerobot_vtrefine.diagnose.robot.fitting import INDEX, Fit, Problem, fit
+from lerobot_vtrefine.diagnose.robot.friction_load import friction_in_load
+from lerobot_vtrefine.diagnose.robot.resampling import cross_validated, folds_of
+from lerobot_vtrefine.diagnose.robot.selection import Selection, merged
+
+Array = np.ndarray
+
+TIE_P = 0.1
+"""Above this, trials do not prefer one of two models."""
+TIE_LEAD = 0.03
+"""Two models whose held-out squared errors differ by less are not told apart, however surely they differ."""
+SHARE_OF_GAIN = 0.9
+_ITERATIONS = 10
+
+
+@dataclass(frozen=True)
+class Rival:
+    """Another name for what a cause explains on some joints."""
+
+    cause: str
+    rival: str
+    joints: tuple[int, ...]
+    p_value: float
+    """That the cause's lead over the rival is an accident."""
+    lead: float
+    """Part of the rival's held-out squared error that the cause does without."""
+    fit: Fit
+    held_out: Array
+    candidate: Candidate | None
+
+
+def find_rivals(selection: Selection, seed: int) -> tuple[Rival, ...]:
+    """All causes that tie with an accepted one on the joints where it was accepted."""
+    found = []
+    for cause, joints in selection.causes().items():
+        if cause == DECOY:
+            continue
+        index = np.array(joints)
+        bare = without_cause(selection, cause, index)
+        folds = folds_of(selection.problem.batch.conditions, seed)
+        without = cross_validated(selection.problem, bare, folds)
+        for name, candidates in _alternatives(selection, cause, index).items():
+            tries = [_swapped(selection, bare, candidate, index, folds) for candidate in candidates]
+            best = min(tries, key=lambda item: float(item[1][:, index].mean(0).sum()))
+            rival = _compared(selection, cause, name, index, without, *best, seed)
+            found += [rival] if rival else []
+    return tuple(found)
+
+
+def settle_by_load(
+    selection: Selection, rivals: tuple[Rival, ...], seed: int
+) -> tuple[Rival | None, list[Rival]]:
+    """Let measured loads decide between play and friction: only friction takes torque to overcome.
+
+    Returns the rival that takes the cause's place (None: the cause stays) and the ties that remain.
+    """
+    if selection.problem.batch.load is None:
+        return None, list(rivals)
+    winner, left = None, []
+    for rival in rivals:
+        if {rival.cause, rival.rival} != {"backlash", FRICTION}:
+            left.append(rival)
+            continue
+        seen = [
+            friction_in_load(selection.problem, selection.fit, joint, seed).seen for joint in rival.joints
+        ]
+        if any(seen) != (rival.cause == FRICTION):
+            winner = rival
+    return winner, left
+
+
+def without_cause(selection: Selection, cause: str, joints: Array) -> Fit:
+    """Refit without a cause."""
+    now = selection.fit
+    if cause == LATENCY:
+        return fit(selection.problem, replace(now.point, tau_s=0.0), now.free, iterations=_ITERATIONS)
+    free, point = now.free.copy(), now.point
+    for joint in joints:
+        for candidate in selection.chosen[int(joint)]:
+            if candidate.cause == cause:
+                for name in candidate.parameters:
+                    free[joint, INDEX[name]] = False
+                    point = point.with_values(name, 0.0, np.array([joint]))
+    return fit(selection.problem, point, free, selection.delayed, iterations=_ITERATIONS)
+
+
+def _alternatives(selection: Selection, cause: str, joints: Array) -> dict[str, list[Candidate | None]]:
+    """Other names that are not in use on those joints, with their forms."""
+    used = {candidate.cause for joint in joints for candidate in selection.chosen.get(int(joint), ())}
+    out: dict[str, list[Candidate | None]] = {}
+    for candidate in CANDIDATES:
+        if candidate.cause in (cause, DECOY) or candidate.cause in used:
+            continue
+        if np.all(candidate.applicable(selection.problem)[joints]):
+            out.setdefault(candidate.cause, []).append(candidate)
+    if cause != LATENCY and not selection.delayed:
+        out[LATENCY] = [None]
+    return out
+
+
+def _swapped(
+    selection: Selection, bare: Fit, candidate: Candidate | None, joints: Array, folds: Array
+) -> tuple[Fit, Array, Candidate | None]:
+    problem = selection.problem
+    if candidate is None:
+        start = replace(bare.point, tau_s=delay_starts(problem)[0])
+        fitted = fit(problem, start, bare.free, True, iterations=_ITERATIONS)
+        return fitted, cross_validated(problem, fitted, folds), candidate
+    free = candidate.freed(bare.free, joints)
+    fitted = bare
+    for multiple in candidate.starts:
+        point = candidate.starting(problem, bare.point, joints, multiple)
+        again = fit(problem, point, free, bare.tau_free, iterations=_ITERATIONS)
+        better = again.total < fitted.total
+        fitted = again if fitted is bare or bare.tau_free else merged(fitted, again, better, free)
+    return fitted, cross_validated(problem, fitted, folds), candidate
+
+
+def _compared(
+    selection: Selection,
+    cause: str,
+    name: str,
+    joints: Array,
+    without: Array,
+    fitted: Fit,
+    held_out: Array,
+    candidate: Candidate | None,
+    seed: int,
+) -> Rival | None:
+    # A delay moves all joints; whatever else is compared concerns its own.
+    where = np.arange(without.shape[1]) if LATENCY in (cause, name) else joints
+    now, other, none = selection.held_out[:, where], held_out[:, where], without[:, where]
+    scale = none.mean(0)
+    gain_now = float((1 - now.mean(0) / scale).sum())
+    gain_other = float((1 - other.mean(0) / scale).sum())
+    preference = ((other - now) / np.maximum(other + now, 1e-300)).mean(1, keepdims=True)
+    p_value = float(flips.one_sided(preference, seed)[0][0])
+    lead = float(1 - (now.mean(0) / other.mean(0).clip(1e-300)).mean())
+    tied = p_value > TIE_P or lead < TIE_LEAD
+    if not tied or gain_other < SHARE_OF_GAIN * gain_now:
+        return None
+    return Rival(cause, name, tuple(int(j) for j in joints), p_value, lead, fitted, held_out, candidate)
+
+
+def adopt(selection: Selection, rival: Rival) -> Selection:
+    """The selection with the rival in the cause's place."""
+    chosen = dict(selection.chosen)
+    p_values = dict(selection.p_values)
+    for joint in rival.joints:
+        kept = tuple(item for item in chosen.get(joint, ()) if item.cause != rival.cause)
+        chosen[joint] = (*kept, rival.candidate) if rival.candidate else kept
+        p_value = p_values.pop((rival.cause, joint), 1.0)
+        p_values[rival.rival, joint] = p_value
+    return replace(selection, fit=rival.fit, held_out=rival.held_out, chosen=chosen, p_values=p_values)
+
+
+def joint_names(problem: Problem, joints: tuple[int, ...]) -> str:
+    """For sentences."""
+    return ", ".join(problem.names[joint] for joint in joints)

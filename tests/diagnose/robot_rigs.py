@@ -1,0 +1,242 @@
+"""Robot recordings with known faults, made without any code of the engine: Euler steps of 1 ms.
+
+Commands are held between frames; a frame is recorded before its own command acts.
+"""
+
+import json
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import numpy as np
+import pyarrow as pa
+import pyarrow.parquet as pq
+
+ALOHA_JOINTS = [
+    f"{arm}_{name}"
+    for arm in ("left", "right")
+    for name in (
+        "waist",
+        "shoulder",
+        "elbow",
+        "forearm_roll",
+        "wrist_angle",
+        "wrist_rotate",
+        "left_finger",
+        "right_finger",
+    )
+]
+
+
+@dataclass
+class Rig:
+    """What is wrong with the robot, joint name -> size; SI units."""
+
+    joints: tuple[str, ...] = ("shoulder", "elbow", "wrist_flex", "gripper")
+    rate_hz: float = 30.0
+    seconds: float = 8.0
+    conditions: int = 12
+    replicates: int = 2
+    motion: str = "mixed"
+    """mixed: smooth moves, steps and holds at several speeds; slow: one slow sine."""
+    offset: dict = field(default_factory=dict)
+    backlash: dict = field(default_factory=dict)
+    latency_s: float = 0.0
+    friction: dict = field(default_factory=dict)
+    """As servo error [rad]."""
+    sag: dict = field(default_factory=dict)
+    sag_shape: str = "link"
+    """link: cosine of the summed pitch; own: cosine of the joint's own angle; stretch: two links."""
+    compliance: dict = field(default_factory=dict)
+    """Joint -> m per N; loads come with it."""
+    stiffness: dict = field(default_factory=dict)
+    """Joint -> Nm/rad: makes a load column of the servo's torque."""
+    unknown: dict = field(default_factory=dict)
+    noise: float = 1.0
+    nasty: float = 0.0
+    jitter: float = 0.0
+    quantum: float = 2 * np.pi / 4096
+
+
+def smooth_moves(rng, t, span, centre):
+    """Minimum-jerk moves between random places at random speeds, with holds and a few steps."""
+    out, now, k = np.empty(len(t)), centre + span * rng.uniform(-1, 1), 0
+    dt = np.median(np.diff(t))
+    while k < len(t):
+        goal = centre + span * rng.uniform(-1, 1)
+        if rng.random() < 0.2:
+            goal = now + 0.15 * span * rng.choice([-1, 1])
+        frames = max(1, round(rng.choice([0.08, 0.5, 1.0, 2.0]) / dt))
+        hold = max(1, round(rng.uniform(0.1, 0.7) / dt))
+        s = np.linspace(0, 1, frames + 1)[1:]
+        path = now + (goal - now) * (10 * s**3 - 15 * s**4 + 6 * s**5)
+        piece = np.concatenate([path, np.full(hold, goal)])[: len(t) - k]
+        out[k : k + len(piece)] = piece
+        k, now = k + len(piece), goal
+    return out
+
+
+def play(x, state, width):
+    return min(max(state, x - width / 2), x + width / 2)
+
+
+def pitch_of(joints, q, index):
+    """Summed pitch of the arm up to a joint; q is (..., joints)."""
+    side = joints[index].split("_")[0] if joints[index].startswith(("left", "right")) else ""
+    words = ("shoulder", "elbow", "wrist_angle", "wrist_flex")
+    total = 0.0
+    for k in range(index + 1):
+        if joints[k].startswith(side) and any(word in joints[k] for word in words):
+            total = total + q[..., k]
+    return total
+
+
+def column(rig, sizes):
+    return np.array([sizes.get(name, 0.0) for name in rig.joints])
+
+
+class Robot:
+    """One robot's constants, drawn once per set."""
+
+    def __init__(self, rig, rng):
+        self.rig = rig
+        self.omega = rng.uniform(12, 30, len(rig.joints))
+        self.zeta = rng.uniform(0.6, 1.2, len(rig.joints))
+
+    def sag_of(self, u):
+        rig = self.rig
+        out = np.zeros_like(u)
+        for name, size in rig.sag.items():
+            k = rig.joints.index(name)
+            first = pitch_of(rig.joints, u, k)
+            if rig.sag_shape == "own":
+                out[..., k] = size * np.cos(u[..., k])
+            elif rig.sag_shape == "stretch":
+                out[..., k] = size * (0.6 * np.cos(first) + 0.4 * np.cos(first + u[..., k + 1]))
+            else:
+                out[..., k] = size * np.cos(first)
+        return out
+
+    def target_of(self, slack, bend_load, session_s, now, v, u):
+        target = slack + self.sag_of(slack) - bend_load
+        for kind, size in self.rig.unknown.items():
+            if kind == "gain_drift":
+                target = target + size * session_s / 600 * slack
+            elif kind == "gain":
+                target = target * (1 + size)
+            elif kind == "ripple":
+                target = target + size * np.sin(2 * np.pi * 1.7 * now)[:, None]
+            elif kind == "coupling":
+                target = target + size * np.roll(u, 1, axis=1)
+            elif kind == "coriolis":
+                target = target + size * np.roll(v, 1, axis=1) ** 2
+        return target
+
+    def run(self, t, command, load_n, session_s):
+        """Encoder readings and servo torques (T, N, J) at t (T, N); session_s (T, 1)."""
+        rig = self.rig
+        half, bend = column(rig, rig.backlash) / 2, column(rig, rig.compliance)
+        dry = self.omega**2 * column(rig, rig.friction)
+        trials, frames = t.shape
+        q = command[:, 0] + self.sag_of(command[:, 0])
+        v, slack = np.zeros_like(q), command[:, 0].copy()
+        out, torque = np.empty_like(command), np.zeros_like(command)
+        everyone = np.arange(trials)
+        steps = max(1, round(np.median(np.diff(t)) / 1e-3))
+        for k in range(frames):
+            out[:, k], torque[:, k] = q, slack + self.sag_of(slack) - q
+            if k + 1 == frames:
+                break
+            h = (t[:, k + 1] - t[:, k]) / steps
+            for step in range(steps):
+                now = t[:, k] + step * h
+                row = k
+                if rig.latency_s:
+                    row = np.maximum((t[:, : k + 1] <= (now - rig.latency_s + 1e-9)[:, None]).sum(1) - 1, 0)
+                u = command[everyone, row]
+                slack = np.clip(slack, u - half, u + half)
+                target = self.target_of(slack, bend * load_n[:, k], session_s, now, v, u)
+                force = self.omega**2 * (target - q) - 2 * self.zeta * self.omega * v
+                stuck = (v == 0) & (np.abs(force) <= dry)
+                a = np.where(stuck, 0.0, force - dry * np.sign(np.where(v != 0, v, force)))
+                new = v + a * h[:, None]
+                v = np.where((new * v < 0) & (dry > 0), 0.0, new)
+                q = q + v * h[:, None]
+        return out, torque
+
+
+def frames_of(rig, rng):
+    t = np.arange(0, rig.seconds, 1 / rig.rate_hz)
+    if rig.jitter:
+        t[1:] += rng.uniform(-rig.jitter, rig.jitter, len(t) - 1) / rig.rate_hz
+    return t
+
+
+def commands_of(rig, rng, t):
+    columns = []
+    for k, name in enumerate(rig.joints):
+        if "right_finger" in name:
+            columns.append(-columns[-1])
+            continue
+        slide = any(word in name for word in ("finger", "gripper"))
+        span, centre = (0.018, 0.022) if slide else (0.6, 0.1 * (k % 3))
+        if rig.motion == "slow":
+            columns.append(centre + span * np.sin(2 * np.pi * 0.1 * t + k))
+        else:
+            columns.append(smooth_moves(rng, t, span, centre))
+    return np.stack(columns, 1)
+
+
+def measured(rig, rng, q):
+    """Noise of an encoder, and of robots that are not the same twice."""
+    slide = np.array([any(word in name for word in ("finger", "gripper")) for name in rig.joints])
+    unit = np.where(slide, 2e-5, 4e-4) * rig.noise
+    red = np.zeros_like(q)
+    for k in range(1, len(q)):
+        red[k] = 0.9 * red[k - 1] + np.sqrt(1 - 0.81) * rng.normal(size=q.shape[1])
+    q = q + unit * (rng.normal(size=q.shape) + red)
+    q = q + unit * rng.normal(size=q.shape[1]) * (1 + 3 * rig.nasty)
+    q = q * (1 + 0.002 * rig.nasty * rng.normal(size=q.shape[1]))
+    quantum = np.where(slide, rig.quantum * 0.02, rig.quantum)
+    return np.round(q / quantum) * quantum
+
+
+def loads_of(rig, rng, t, c):
+    load = np.zeros((len(t), len(rig.joints)))
+    for name in rig.compliance:
+        grasp = (np.sin(2 * np.pi * t / rig.seconds + c) > 0.2) * rng.uniform(5, 25)
+        load[:, rig.joints.index(name)] = np.convolve(grasp, np.ones(9) / 9, "same")
+    return load
+
+
+def make_set(rig, folder, seed):
+    """Write a recording set; returns its folder."""
+    rng = np.random.default_rng(seed)
+    folder = Path(folder)
+    folder.mkdir(parents=True, exist_ok=True)
+    robot = Robot(rig, rng)
+    plan = [(c, r) for c in range(rig.conditions) for r in range(rig.replicates)]
+    order = rng.permutation(len(plan))
+    times = [frames_of(rig, rng) for _ in range(rig.conditions)]
+    moves = [commands_of(rig, rng, t) for t in times]
+    t = np.stack([times[c] for c, _ in plan])
+    u = np.stack([moves[c] for c, _ in plan])
+    load = np.stack([loads_of(rig, rng, times[c], c) for c, _ in plan])
+    session = 30.0 * order[:, None]
+    q, torque = robot.run(t, u, load, session)
+    for name, k_nm in rig.stiffness.items():
+        k = rig.joints.index(name)
+        load[..., k] = k_nm * torque[..., k] * (1 + 0.02 * rng.normal(size=t.shape))
+    q = q + column(rig, rig.offset)
+    entries = []
+    for place, (c, r) in enumerate(plan):
+        values = {"command": u[place], "position": measured(rig, rng, q[place])}
+        if rig.compliance or rig.stiffness:
+            values["load"] = load[place]
+        columns = {"time_s": pa.array(t[place])} | {k: pa.array(x.tolist()) for k, x in values.items()}
+        file = f"trial_{place:04d}.parquet"
+        pq.write_table(pa.table(columns), folder / file)
+        at = {"order": int(order[place]), "start_s": float(session[place, 0])}
+        entries.append({"file": file, "condition": f"c{c:02d}", "replicate": r, **at})
+    header = {"schema": "vtrefine/recording-set@1", "kind": "robot", "joints": list(rig.joints)}
+    (folder / "recording.json").write_text(json.dumps({**header, "trials": entries}))
+    return folder
