@@ -18,6 +18,7 @@ from lerobot_vtrefine.sim.config import (
     TaskConfig,
     WarpConfig,
 )
+from lerobot_vtrefine.sim.reality import Reality, load_reality
 
 VECTORIZATIONS = ("native", "gym")
 ABLATIONS = ("none", "touch", "vision")
@@ -56,6 +57,8 @@ class VtRefineEnvConfig(EnvConfig):
     """Ranges of what differs between episodes."""
     sensor_model: str = "default"
     """default, paper, or the path of a sensor_model.json."""
+    reality: Path | None = None
+    """JSON file of hidden physics: the environment then stands in for reality (sim/reality.py)."""
     backend: str = "batch"
     """single, batch (threads) or warp."""
     num_threads: int = 0
@@ -89,14 +92,23 @@ class VtRefineEnvConfig(EnvConfig):
             )
         if self.rules.control_hz != TaskConfig.control_hz:
             raise ValueError("set the control rate with --env.fps, not with --env.rules.control_hz")
+        if self.hidden.sensor_model is not None and self.sensor_model != "default":
+            raise ValueError(
+                f"{self.reality} holds a sensor model: drop --env.sensor_model={self.sensor_model}"
+            )
         self.features = policy_features(*self.camera_size)
         _ = self.task_config, self.read_schedule  # their own checks, now rather than in a worker process
 
     @property
     def scene_config(self) -> SceneConfig:
-        """The scene with the shortcuts put in."""
+        """The scene with the shortcuts put in, as it really is."""
         given = {name: getattr(self, name) for name in SHORTCUTS if getattr(self, name) is not None}
-        return replace(self.scene, **given)
+        return self.hidden.applied(replace(self.scene, **given))
+
+    @property
+    def hidden(self) -> Reality:
+        """What differs from the simulation that everybody knows: nothing without ``reality``."""
+        return Reality() if self.reality is None else load_reality(self.reality)
 
     @property
     def task_config(self) -> TaskConfig:

@@ -31,12 +31,13 @@ def make_simulation(config: VtRefineEnvConfig, num_envs: int) -> "InsertionSim":
     return InsertionSim(
         config.scene_config,
         config.task_config,
-        config.sensor_model,
+        config.hidden.sensor_model or config.sensor_model,
         num_envs,
         backend=config.backend,
         num_threads=config.num_threads,
         randomization=config.randomization,
         warp=config.warp,
+        robot_faults=config.hidden.robot,
     )
 
 

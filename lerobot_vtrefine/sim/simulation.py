@@ -13,9 +13,11 @@ from lerobot_vtrefine.sim import sensing, starts, task
 from lerobot_vtrefine.sim.backends import Trace, get_backend
 from lerobot_vtrefine.sim.config import RANGES, RandomizationConfig, SceneConfig, TaskConfig, WarpConfig
 from lerobot_vtrefine.sim.depth import DepthCamera
+from lerobot_vtrefine.sim.drive import make_drive
 from lerobot_vtrefine.sim.episode import EpisodeState, Measured, update
 from lerobot_vtrefine.sim.privileged import Privileged, describe
 from lerobot_vtrefine.sim.randomization import Randomizer, WorldParameters
+from lerobot_vtrefine.sim.reality import RobotFaults
 from lerobot_vtrefine.sim.rotations import matrix_to_quat
 from lerobot_vtrefine.sim.scene import Scene, build_scene
 from lerobot_vtrefine.sim.sensing import Kinematics
@@ -56,6 +58,7 @@ class InsertionSim:
         num_threads: of the batch backend; 0 uses all cores.
         randomization: differences between worlds.
         warp: device and buffers of the warp backend.
+        robot_faults: what the arms do that commands and readings do not tell.
 
     Raises:
         ValueError: zero worlds, or a setting that makes no sense.
@@ -72,6 +75,7 @@ class InsertionSim:
         num_threads: int = 0,
         randomization: RandomizationConfig | None = None,
         warp: WarpConfig | None = None,
+        robot_faults: RobotFaults | None = None,
     ) -> None:
         if num_envs < 1:
             raise ValueError(f"num_envs must be at least 1, got {num_envs}")
@@ -94,6 +98,9 @@ class InsertionSim:
         self._parameters = dict(everyone.values)
         self._depth = DepthCamera(self.scene.model, self.scene.camera, num_envs, device)
         self._settler = Settler(self.scene, self.config, self._backend, self._touch)
+        self._drive = make_drive(
+            self._backend, self.scene.embodiment, self.substeps, self.config, robot_faults
+        )
 
     @property
     def embodiment(self) -> Any:
@@ -142,7 +149,8 @@ class InsertionSim:
         state = self._episode
         state.clear(ids)
         state.seed[ids] = seeds
-        state.command[ids], state.pad_load[ids] = self._settler.settle(ids, seeds, start)
+        command, state.pad_load[ids] = self._settler.settle(ids, seeds, start)
+        state.command[ids] = self._drive.reset(ids, command)
         state.pad_force[ids] = state.pad_load[ids][..., 0]
         scale = drawn.values["pad_stiffness_scale"], drawn.values["sensor_gain_scale"]
         self._pads.reset(ids, seeds, *scale)
@@ -170,7 +178,7 @@ class InsertionSim:
         before = state.command[ids]
         wanted = task.servo_commands(self.scene.embodiment, action)
         after = np.clip(wanted, before - self._rates, before + self._rates)
-        trace = self._backend.advance_linearly(ids, before, after, self.substeps)
+        trace = self._drive.advance(ids, before, after)
         state.command[ids] = after
         seen = self._seen(ids)
         reward = update(state, ids, self._measure(ids, seen, trace), self.config)
@@ -197,7 +205,7 @@ class InsertionSim:
     def joint_state(self, ids: Array | None = None) -> Array:
         """The `state` part of `observe` alone: (m, 16) float32."""
         qpos, _ = self._backend.read(self._checked(ids))
-        return qpos[:, self.scene.addresses.qpos].astype(np.float32)
+        return self._drive.readings(qpos[:, self.scene.addresses.qpos]).astype(np.float32)
 
     def tactile(self, ids: Array | None = None) -> Array:
         """The `tactile` part of `observe` alone: (m, 4, 384) uint8 counts."""
@@ -263,6 +271,7 @@ class InsertionSim:
             "parameters": {name: values[env] for name, values in self._parameters.items()},
             "camera": (self._depth.position[env].copy(), self._depth.rotation[env].copy()),
             "pads": self._pads.get_state(env),
+            "drive": self._drive.get_state(env),
         }
 
     def set_state(self, env: int, state: dict[str, Any]) -> None:
@@ -273,6 +282,7 @@ class InsertionSim:
         self._backend.set_rows(np.array([env]), state["row"][None])
         self._episode.set_row(env, state["episode"])
         self._pads.set_state(env, state["pads"])
+        self._drive.set_state(env, state["drive"])
 
     def mj_data(self, env: int) -> tuple[mujoco.MjModel, mujoco.MjData]:
         """Model and data of one world with derived quantities, for rendering; not live."""

@@ -1,0 +1,138 @@
+"""From the controller's commands to the servos': directly, or with a robot's faults in between.
+
+Shapes: N worlds of which m are addressed by ids, nu servos, J joints.
+"""
+
+import copy
+from collections.abc import Mapping
+from typing import Any, override
+
+import numpy as np
+import torch
+
+from lerobot_vtrefine.embodiments import Embodiment
+from lerobot_vtrefine.sim import task
+from lerobot_vtrefine.sim.backends import Backend, Trace
+from lerobot_vtrefine.sim.config import TaskConfig
+from lerobot_vtrefine.sim.reality import RobotFaults
+
+Array = np.ndarray
+
+
+class Drive:
+    """Commands reach the servos as they are."""
+
+    def __init__(self, backend: Backend, substeps: int) -> None:
+        self._backend, self._substeps = backend, substeps
+
+    def reset(self, ids: Array, command: Array) -> Array:
+        """Start episodes with the servos at rest at `command` (m, nu); returns what the controller sees."""
+        return command
+
+    def advance(self, ids: Array, before: Array, after: Array) -> Trace:
+        """One control step, in which the controller's command moves linearly (m, nu)."""
+        return self._backend.advance_linearly(ids, before, after, self._substeps)
+
+    def readings(self, joints: Array) -> Array:
+        """What encoders say about joint positions (m, J)."""
+        return joints
+
+    def get_state(self, env: int) -> Any:
+        """What world `env` remembers."""
+        return None
+
+    def set_state(self, env: int, state: Any) -> None:
+        """Continue from a state taken by `get_state`."""
+
+
+class FaultyDrive(Drive):
+    """Commands arrive late, through play, and in coordinates that the encoders shift.
+
+    Raises:
+        ValueError: a joint's name that no arm has.
+    """
+
+    def __init__(
+        self,
+        backend: Backend,
+        robot: Embodiment,
+        substeps: int,
+        control_dt_s: float,
+        faults: RobotFaults,
+    ) -> None:
+        super().__init__(backend, substeps)
+        self._half_play = 0.5 * servo_values(robot, faults.backlash_rad)
+        self._offset = servo_values(robot, faults.encoder_offset_rad)
+        self._joint_offset = task.joint_targets(robot, self._offset[None])[0]
+        delay = round(faults.control_latency_s / control_dt_s * substeps)
+        self._whole, self._rest = divmod(delay, substeps)
+        # Newest first: where the controller's commands, as the servos see them, end in each control step.
+        self._history = np.zeros((backend.num_envs, self._whole + 3, len(self._offset)))
+        self._servo = np.zeros((backend.num_envs, len(self._offset)))
+
+    @override
+    def reset(self, ids: Array, command: Array) -> Array:
+        self._history[ids] = command[:, None]
+        self._servo[ids] = command
+        return command + self._offset
+
+    @override
+    def advance(self, ids: Array, before: Array, after: Array) -> Trace:
+        history = np.concatenate([(after - self._offset)[:, None], self._history[ids, :-1]], axis=1)
+        self._history[ids] = history
+        traces = []
+        for target, substeps in self._pieces(history):
+            start = self._servo[ids]
+            stop = start.clip(target - self._half_play, target + self._half_play)
+            traces.append(_copied(self._backend.advance_linearly(ids, start, stop, substeps)))
+            self._servo[ids] = stop
+        return Trace(_joined([trace.qpos for trace in traces]), _joined([trace.sensors for trace in traces]))
+
+    def _pieces(self, history: Array) -> list[tuple[Array, int]]:
+        """Stretches of substeps with the command (m, nu) at their end: a late one turns within the step."""
+        new, middle = history[:, self._whole], history[:, self._whole + 1]
+        last = self._substeps - self._rest
+        pieces = [(middle, self._rest), (middle + last / self._substeps * (new - middle), last)]
+        return [piece for piece in pieces if piece[1] > 0]
+
+    @override
+    def readings(self, joints: Array) -> Array:
+        return joints + self._joint_offset
+
+    @override
+    def get_state(self, env: int) -> Any:
+        return self._history[env].copy(), self._servo[env].copy()
+
+    @override
+    def set_state(self, env: int, state: Any) -> None:
+        self._history[env], self._servo[env] = state
+
+
+def _copied(trace: Trace) -> Trace:
+    """A trace is valid until the backend's next call only."""
+    return Trace(copy.deepcopy(trace.qpos), copy.deepcopy(trace.sensors))
+
+
+def _joined(parts: list[Any]) -> Any:
+    """One stretch of substeps after the other (m, K, n), where they lie."""
+    return torch.cat(parts, 1) if isinstance(parts[0], torch.Tensor) else np.concatenate(parts, 1)
+
+
+def make_drive(
+    backend: Backend, robot: Embodiment, substeps: int, config: TaskConfig, faults: RobotFaults | None
+) -> Drive:
+    """The drive with these faults; a plain one without any."""
+    if faults is None or faults == RobotFaults():
+        return Drive(backend, substeps)
+    return FaultyDrive(backend, robot, substeps, config.control_dt_s, faults)
+
+
+def servo_values(robot: Embodiment, values: Mapping[str, float]) -> Array:
+    """Values by joint name as an array over servos (nu,), zero where none is given; arms' joints only."""
+    per_arm = robot.joints_per_arm
+    names = [name for k, name in enumerate(robot.joint_names) if k % per_arm != per_arm - 1]
+    valid = [name for k, name in enumerate(names) if k % (per_arm - 1) != per_arm - 2]
+    for name in values:
+        if name not in valid:
+            raise ValueError(f"reality: no arm has a joint {name!r}; valid: {', '.join(valid)}")
+    return np.array([float(values.get(name, 0.0)) for name in names])
