@@ -10,7 +10,8 @@ import warp as wp
 from lerobot_vtrefine.tactile import kernels, kernels_query
 from lerobot_vtrefine.tactile.geometry import BodyGeometry, TriangleMesh
 from lerobot_vtrefine.tactile.layout import PadLayout
-from lerobot_vtrefine.tactile.packing import PackedBodies, pack_bodies
+from lerobot_vtrefine.tactile.mesh_grid import add_grids
+from lerobot_vtrefine.tactile.packing import pack_bodies
 
 REACH_M = 0.003
 """How far from the face, either way, a body's surface is looked for [m]."""
@@ -19,15 +20,8 @@ MODES = {"closest": 0, "column": 1}
 NOTHING_M = {"closest": 0.0, "column": -1.0}
 UPLOADED = (
     *("owner", "kind", "position", "rotation", "extent", "plane_start", "planes"),
-    *(
-        "corners",
-        "normals",
-        "triangle_owner",
-        "cluster_start",
-        "cluster_owner",
-        "cluster_centre",
-        "cluster_half",
-    ),
+    *("corners", "normals", "edge_normals", "corner_normals"),
+    *("cluster_start", "cluster_range", "cluster_centre", "cluster_half"),
 )
 POSES = {
     **{"pad_pos": wp.vec3, "pad_rot": wp.mat33, "pad_vel": wp.spatial_vector},
@@ -46,7 +40,6 @@ def start_warp() -> None:
 @dataclass(eq=False)
 class _Buffers:
     views: Any
-    keys: wp.array
     depth: wp.array
     rate: wp.array
 
@@ -71,39 +64,24 @@ class ContactQuery:
     ) -> None:
         start_warp()
         self.device = str(torch.device(device))
+        self.lanes = 32 if self.device.startswith("cuda") else 1
         self.rows, self.cols = layout.rows * subdivision, layout.cols * subdivision
-        self.pitch_m, self.reach_m = layout.pitch_m / subdivision, reach_m
-        # A CUDA thread takes a few taxels of a row; a CPU thread a whole pad, skipping what is out of reach.
-        short = next(width for width in (8, 4, 2, 1) if self.cols % width == 0)
-        self._block = (1, short) if self.device.startswith("cuda") else (self.rows, self.cols)
+        self.subdivision, self.pitch_m, self.reach_m = subdivision, layout.pitch_m / subdivision, reach_m
         self.num_bodies = len(bodies)
-        packed = pack_bodies(bodies)
-        self._num_primitives, self._num_planes = len(packed.kind), len(packed.planes)
-        self._num_clusters = len(packed.cluster_owner)
-        self._bodies = kernels.Bodies()
+        self._packed = pack_bodies(bodies)
+        self._num_primitives, self._num_planes = len(self._packed.kind), len(self._packed.planes)
+        self.bodies = kernels.Bodies()
         for name in UPLOADED:
-            setattr(self._bodies, name, self._upload(getattr(packed, name)))
-        self._meshes = self._build_meshes(packed)
-        ids = [self._meshes[k].id if k in self._meshes else 0 for k in range(self._num_primitives)]
-        self._bodies.mesh = wp.array(np.array(ids, dtype=np.uint64), dtype=wp.uint64, device=self.device)
+            setattr(self.bodies, name, self._upload(getattr(self._packed, name)))
+        self._has_grids = not (self._packed.kind == TriangleMesh.kind).any()
         self._scratch: dict[tuple[int, int], _Buffers] = {}
         self._wrapped: tuple[Any, Any] = (None, None)
 
     def _upload(self, array: np.ndarray) -> wp.array:
         if array.dtype == np.int32:
-            return wp.array(array, dtype=int, device=self.device)
+            return wp.array(array, dtype=wp.vec2i if array.ndim == 2 else int, device=self.device)
         types = {(3,): wp.vec3, (4,): wp.vec4, (3, 3): wp.mat33}
         return wp.array(array, dtype=types[array.shape[1:]], device=self.device)
-
-    def _build_meshes(self, packed: PackedBodies) -> dict[int, wp.Mesh]:
-        meshes = {}
-        for k in np.flatnonzero(packed.kind == TriangleMesh.kind):
-            corners = packed.corners.reshape(-1, 3, 3)[packed.triangle_owner == k].reshape(-1, 3)
-            meshes[int(k)] = wp.Mesh(
-                points=wp.array(corners, dtype=wp.vec3, device=self.device),
-                indices=wp.array(np.arange(len(corners), dtype=np.int32), dtype=int, device=self.device),
-            )
-        return meshes
 
     def _buffers(self, envs: int, pads: int) -> _Buffers:
         if (envs, pads) not in self._scratch:
@@ -123,7 +101,6 @@ class ContactQuery:
             views.rates = wp.zeros(planes, dtype=wp.vec4, device=self.device)
             self._scratch[envs, pads] = _Buffers(
                 views=views,
-                keys=wp.zeros(taxels if self._meshes else (1, 1, 1), dtype=wp.int64, device=self.device),
                 depth=wp.zeros(taxels, dtype=float, device=self.device),
                 rate=wp.zeros(taxels, dtype=float, device=self.device),
             )
@@ -132,8 +109,7 @@ class ContactQuery:
     def _lattice(self, mode: str, skip_unloaded: bool) -> Any:
         lattice = kernels.Lattice()
         lattice.mode, lattice.rows, lattice.cols = MODES[mode], self.rows, self.cols
-        lattice.pitch, lattice.reach = self.pitch_m, self.reach_m
-        lattice.block_rows, lattice.block_cols = self._block
+        lattice.subdivision, lattice.pitch, lattice.reach = self.subdivision, self.pitch_m, self.reach_m
         lattice.skip_unloaded = int(skip_unloaded)
         return lattice
 
@@ -178,29 +154,33 @@ class ContactQuery:
             body_vel: (m, B, 6).
             load: (m, P, 3); if given, pads whose first component is not positive are skipped.
         """
+        lattice, views = self.prepare(mode, (pad_pos, pad_rot, pad_vel, body_pos, body_rot, body_vel), load)
         envs, pads = pad_pos.shape[:2]
         buffers = self._buffers(envs, pads)
-        poses = self._poses((pad_pos, pad_rot, pad_vel, body_pos, body_rot, body_vel), load)
-        common = [self._lattice(mode, load is not None), self._bodies, buffers.views]
-        self._launch(kernels.prepare, (envs, pads, self._num_primitives), [common[0], poses, *common[1:]])
         buffers.depth.fill_(NOTHING_M[mode])
-        blocks = (self.rows // self._block[0]) * (self.cols // self._block[1])
-        result = [buffers.depth, buffers.rate]
-        self._launch(kernels_query.query_primitives, (envs, pads, blocks), [*common, *result])
-        if self._meshes:
-            per_thread = 1 if self.device.startswith("cuda") else self._num_clusters
-            parts = -(-self._num_clusters // per_thread)
-            self._launch(
-                kernels_query.raster_meshes, (envs, pads, parts), [*common, per_thread, buffers.keys]
-            )
-            self._launch(kernels_query.resolve_meshes, (envs, pads, blocks), [*common, buffers.keys, *result])
-        depth, rate = (wp.to_torch(array).view(envs, pads, self.rows, self.cols) for array in result)
-        return depth, rate
+        inputs = [lattice, self.lanes, self.bodies, views, buffers.depth, buffers.rate]
+        self.launch(kernels_query.query, (envs, pads, self.lanes), inputs)
+        shape = (envs, pads, self.rows, self.cols)
+        return wp.to_torch(buffers.depth).view(shape), wp.to_torch(buffers.rate).view(shape)
+
+    def prepare(
+        self, mode: str, poses: tuple[torch.Tensor, ...], load: torch.Tensor | None = None
+    ) -> tuple[Any, Any]:
+        """The lattice to ask and every primitive as each pad sees it, for poses and load as in `__call__`."""
+        if mode == "closest" and not self._has_grids:
+            add_grids(self.bodies, self._packed, self.reach_m, self.device)
+            self._has_grids = True
+        envs, pads = poses[0].shape[:2]
+        lattice, views = self._lattice(mode, load is not None), self._buffers(envs, pads).views
+        inputs = [lattice, self._poses(poses, load), self.bodies, views]
+        self.launch(kernels.prepare, (envs, pads, self._num_primitives), inputs)
+        return lattice, views
 
     def window(self, envs: int, pads: int) -> wp.array:
         """Lattice areas (row begin, end, column begin, end) of the primitives in reach at the last call: (m,
         P, K)."""
         return self._scratch[envs, pads].views.window
 
-    def _launch(self, kernel: wp.Kernel, dim: tuple[int, ...], inputs: list[Any]) -> None:
+    def launch(self, kernel: wp.Kernel, dim: tuple[int, ...], inputs: list[Any]) -> None:
+        """Launch a kernel on this query's device."""
         wp.launch(kernel, dim=dim, inputs=inputs, device=self.device, record_tape=False)

@@ -1,81 +1,132 @@
-"""Solves the elastic foundation of many pads for the physics solver's loads. Imports warp."""
+"""Launches the contact models, load-consistent foundation and penalties, for many pads at once.
 
+Imports warp.
+"""
+
+from typing import Any
+
+import numpy as np
 import torch
 import warp as wp
 
-from lerobot_vtrefine.tactile import kernels_foundation
-from lerobot_vtrefine.tactile.contact_query import start_warp
+from lerobot_vtrefine.tactile import kernels_press
+from lerobot_vtrefine.tactile.contact_query import ContactQuery, start_warp
 from lerobot_vtrefine.tactile.layout import PadLayout
 
+Poses = tuple[torch.Tensor, ...]
+PerEnv = torch.Tensor | float
+"""A number for all environments, or one each: m elements of any shape."""
 
-class FoundationSolver:
-    """Load-consistent Winkler foundation of pads with one layout; keeps its buffers between calls.
+
+class ContactSolver:
+    """Forces of pads with one layout from the poses of bodies; keeps its buffers between calls.
 
     Args:
-        subdivision: lattice points per taxel and direction, over which pressure is averaged.
+        query: the bodies and the lattice. With a subdivision above 1, pressure is averaged over that many
+            lattice points per taxel and direction.
     """
 
-    def __init__(self, layout: PadLayout, device: str = "cpu", subdivision: int = 2) -> None:
+    def __init__(self, layout: PadLayout, query: ContactQuery) -> None:
         start_warp()
-        self.layout, self.subdivision, self.device = layout, subdivision, str(torch.device(device))
-        self._scratch: dict[tuple[int, int], tuple[wp.array, wp.array]] = {}
+        self.layout, self.query, self.device = layout, query, query.device
+        offsets = np.arange(query.cols) // query.subdivision - (layout.cols - 1) / 2
+        self._taxel_x = wp.array(offsets.astype(np.float32), dtype=float, device=self.device)
+        self._forces: dict[tuple[int, int], tuple[wp.array, wp.array]] = {}
+        self._scratch: dict[int, wp.array] = {}
+        self._constants: dict[tuple[float, int], wp.array] = {}
 
-    def _buffers(self, envs: int, pads: int) -> tuple[wp.array, wp.array]:
-        if (envs, pads) not in self._scratch:
-            self._scratch[envs, pads] = (
-                wp.zeros((envs, pads, self.layout.num_taxels), dtype=float, device=self.device),
-                wp.zeros((envs, pads), dtype=wp.vec3, device=self.device),
-            )
-        return self._scratch[envs, pads]
-
-    def __call__(
+    def foundation(
         self,
-        height: torch.Tensor,
-        rate: torch.Tensor,
+        poses: Poses,
         load: torch.Tensor,
-        stiffness_n_per_m: torch.Tensor,
-        damping_s: torch.Tensor,
-        window: wp.array,
+        stiffness_n_per_m: PerEnv,
+        damping_s: PerEnv,
+        heights: tuple[torch.Tensor, torch.Tensor] | None = None,
     ) -> tuple[torch.Tensor, torch.Tensor]:
         """Taxel forces (m, P, R, C) [N] and the face's (delta [m], slope x, slope y) (m, P, 3); reused
         buffers.
 
         Args:
-            height, rate: (m, P, R*s, C*s) column heights [m] and their rates [m/s] on the finer lattice.
+            poses: as `ContactQuery` takes them.
             load: (m, P, 3) normal force [N] and its centre x, y [m]. Forces add up to it, and balance at its
-                centre when
-                the body can be pressed on around it.
-            stiffness_n_per_m: (m,) stiffness of one whole taxel.
-            damping_s: (m,) viscous lead, the ratio of damping to stiffness [s].
-            window: (m, P, K) lattice areas in which bodies were found, as `ContactQuery.window` gives them.
+                centre when the body can be pressed on around it.
+            stiffness_n_per_m: stiffness of one whole taxel.
+            damping_s: viscous lead, the ratio of damping to stiffness [s].
+            heights: column heights and their rates (m, P, R s, C s) [m, m/s] that the same poses gave and
+                something changed since; by default they are looked up.
         """
-        envs, pads = height.shape[:2]
-        force, solution = self._buffers(envs, pads)
-        force.zero_()
-        solution.zero_()
-        lanes = 32 if self.device.startswith("cuda") else 1
-        stiffness = (stiffness_n_per_m.to(torch.float32) / self.subdivision**2).contiguous()
-        wp.launch(
-            kernels_foundation.solve_foundation,
-            dim=(envs, pads, lanes),
-            inputs=[
-                *(
-                    self.layout.rows,
-                    self.layout.cols,
-                    self.subdivision,
-                    lanes,
-                    self.layout.pitch_m,
-                ),
-                wp.from_torch(stiffness),
-                wp.from_torch(damping_s.to(torch.float32).contiguous()),
-                wp.from_torch(load.to(torch.float32).contiguous(), dtype=wp.vec3),
-                window,
-                wp.from_torch(height.reshape(envs, pads, -1).contiguous()),
-                wp.from_torch(rate.reshape(envs, pads, -1).contiguous()),
-            ],
-            outputs=[force, solution],
-            device=self.device,
-            record_tape=False,
+        envs, pads = load.shape[:2]
+        lattice, views = self.query.prepare("column", poses, load)
+        foundation = kernels_press.Foundation()
+        foundation.stiffness = self._own(stiffness_n_per_m / self.query.subdivision**2, envs)
+        foundation.damping_s, foundation.taxel_x = self._own(damping_s, envs), self._taxel_x
+        force, solution = self._results(envs, pads)
+        loads = wp.from_torch(load.to(self.device, torch.float32).contiguous(), dtype=wp.vec3)
+        if heights is None:
+            scratch = [self._buffer(0, envs, pads), self._buffer(1, envs, pads)]
+        else:
+            scratch = [wp.from_torch(item.reshape(envs * pads, -1).contiguous()) for item in heights]
+        work = self._work(heights is not None)
+        inputs = [lattice, work, int(heights is not None), foundation, self.query.bodies, views, loads]
+        self._launch(kernels_press.press, envs, pads, [*inputs, *scratch, force, solution])
+        return wp.to_torch(force).view(envs, pads, self.layout.rows, self.layout.cols), wp.to_torch(solution)
+
+    def penalty(
+        self,
+        mode: str,
+        poses: Poses,
+        stiffness_n_per_m: PerEnv,
+        damping_n_s_per_m: PerEnv,
+        ceiling_n: PerEnv,
+    ) -> torch.Tensor:
+        """min(max(0, stiffness d + damping d'), ceiling) where d > 0: (m, P, R, C) [N]; a reused buffer.
+
+        Args:
+            mode: what d means, as in `ContactQuery`.
+            stiffness_n_per_m, damping_n_s_per_m, ceiling_n: of one taxel.
+        """
+        envs, pads = poses[0].shape[:2]
+        lattice, views = self.query.prepare(mode, poses)
+        penalty = kernels_press.Penalty()
+        penalty.stiffness, penalty.damping = (
+            self._own(stiffness_n_per_m, envs),
+            self._own(damping_n_s_per_m, envs),
         )
-        shape = (envs, pads, self.layout.rows, self.layout.cols)
-        return wp.to_torch(force).view(shape), wp.to_torch(solution)
+        penalty.ceiling = self._own(ceiling_n, envs)
+        force, _ = self._results(envs, pads)
+        inputs = [lattice, self._work(False), penalty, self.query.bodies, views]
+        self._launch(kernels_press.penalise, envs, pads, [*inputs, self._buffer(1, envs, pads), force])
+        return wp.to_torch(force).view(envs, pads, self.layout.rows, self.layout.cols)
+
+    def _own(self, values: PerEnv, envs: int) -> wp.array:
+        if isinstance(values, torch.Tensor):
+            values = values.to(self.device, torch.float32).reshape(-1).expand(envs)
+            return wp.from_torch(values.contiguous())
+        if (values, envs) not in self._constants:
+            self._constants[values, envs] = wp.full(envs, values, dtype=float, device=self.device)
+        return self._constants[values, envs]
+
+    def _results(self, envs: int, pads: int) -> tuple[wp.array, wp.array]:
+        if (envs, pads) not in self._forces:
+            self._forces[envs, pads] = (
+                wp.zeros((envs, pads, self.layout.num_taxels), dtype=float, device=self.device),
+                wp.zeros((envs, pads), dtype=wp.vec3, device=self.device),
+            )
+        return self._forces[envs, pads]
+
+    def _buffer(self, number: int, envs: int, pads: int) -> wp.array:
+        """Scratch: on CPU one lattice for all pads, on CUDA one each."""
+        count = envs * pads if self.query.lanes > 1 else 1
+        if number not in self._scratch or len(self._scratch[number]) < count:
+            shape = (count, self.query.rows * self.query.cols)
+            self._scratch[number] = wp.zeros(shape, dtype=float, device=self.device)
+        return self._scratch[number]
+
+    def _work(self, own_buffers: bool) -> Any:
+        work = kernels_press.Work()
+        work.lanes = self.query.lanes
+        work.own_buffers = int(own_buffers or self.query.lanes > 1)
+        return work
+
+    def _launch(self, kernel: wp.Kernel, envs: int, pads: int, inputs: list[Any]) -> None:
+        self.query.launch(kernel, (envs, pads, self.query.lanes), inputs)

@@ -3,10 +3,7 @@
 Shape legend: m environments, P pads, B bodies, K primitives, Q planes, N lattice points; float32 [m, m/s].
 
 `prepare` brings every primitive into reach of a pad and reduces convex ones to the few planes that matter
-there, as
-functions affine in the lattice's x and y; `query_primitives` evaluates them; `raster_meshes` projects
-triangles on the
-lattice and `resolve_meshes` turns the winners into depths.
+there, as functions affine in the lattice's x and y; `kernels_query` evaluates them, a pad at a time.
 """
 
 import warp as wp
@@ -21,8 +18,7 @@ FAR_M = wp.constant(1.0e3)
 PARALLEL = wp.constant(1.0e-7)
 STEEPEST = wp.constant(-0.2)
 """A column's rate divides by the surface normal's slope; steeper walls than this count as this steep."""
-KEY_STEPS_PER_M = wp.constant(1.0e9)
-TRIANGLE_BITS = wp.constant(24)
+MESH = wp.constant(4)
 
 ivec2 = wp.types.vector(length=2, dtype=wp.int32)
 ivec4 = wp.types.vector(length=4, dtype=wp.int32)
@@ -30,16 +26,24 @@ ivec4 = wp.types.vector(length=4, dtype=wp.int32)
 
 @wp.struct
 class Lattice:
-    """What is asked: CLOSEST or COLUMN on rows x cols points, and the block of them that one thread fills."""
+    """What is asked: CLOSEST or COLUMN on rows x cols points, `subdivision` per taxel and direction."""
 
     mode: int
     rows: int
     cols: int
+    subdivision: int
     pitch: float
     reach: float
-    block_rows: int
-    block_cols: int
     skip_unloaded: int
+
+
+@wp.struct
+class Share:
+    """Which lattice columns a thread owns: `width` neighbouring ones of every `width * lanes`."""
+
+    lane: int
+    lanes: int
+    width: int
 
 
 @wp.struct
@@ -56,8 +60,18 @@ class Poses:
 
 
 @wp.struct
+class Grid:
+    """A mesh's cells: the first one's place in `cells`, their number per axis, lowest corner, 1 / size."""
+
+    first: int
+    count: wp.vec3i
+    low: wp.vec3
+    inverse: float
+
+
+@wp.struct
 class Bodies:
-    """`packing.PackedBodies` on the device, and the meshes' handles per primitive."""
+    """`packing.PackedBodies` on the device, and the meshes' grids (`mesh_grid`)."""
 
     owner: wp.array(dtype=int)
     kind: wp.array(dtype=int)
@@ -68,12 +82,15 @@ class Bodies:
     planes: wp.array(dtype=wp.vec4)
     corners: wp.array(dtype=wp.vec3)
     normals: wp.array(dtype=wp.vec3)
-    triangle_owner: wp.array(dtype=int)
+    edge_normals: wp.array(dtype=wp.vec3)
+    corner_normals: wp.array(dtype=wp.vec3)
     cluster_start: wp.array(dtype=int)
-    cluster_owner: wp.array(dtype=int)
+    cluster_range: wp.array(dtype=wp.vec2i)
     cluster_centre: wp.array(dtype=wp.vec3)
     cluster_half: wp.array(dtype=wp.vec3)
-    mesh: wp.array(dtype=wp.uint64)
+    grids: wp.array(dtype=Grid)
+    cells: wp.array(dtype=wp.vec2i)
+    candidates: wp.array(dtype=int)
 
 
 @wp.struct
@@ -226,6 +243,29 @@ def rate_form(mode: int, n: wp.vec3, axes: wp.mat33, linear: wp.vec3, angular: w
         factor = 1.0 / wp.min(wp.dot(n, column(axes, 2)), STEEPEST)
     turned = wp.transpose(axes) * wp.cross(n, angular)
     return factor * wp.vec4(wp.dot(n, linear), turned[0], turned[1], turned[2])
+
+
+@wp.func
+def eval_rate(form: wp.vec4, x: float, y: float, s: float) -> float:
+    """Rate of depth at (x, y) and s along the pad's normal."""
+    return form[0] + form[1] * x + form[2] * y + form[3] * s
+
+
+@wp.func
+def own_first(share: Share, begin: int) -> int:
+    """A column that this thread owns, at or a little before the first one from `begin` on."""
+    if share.lanes == 1:
+        return begin
+    span = share.width * share.lanes
+    return begin / span * span + share.lane * share.width
+
+
+@wp.func
+def own_next(share: Share, col: int) -> int:
+    """The next column that this thread owns."""
+    if share.lanes == 1 or (col + 1) % share.width != 0:
+        return col + 1
+    return col + 1 + (share.lanes - 1) * share.width
 
 
 @wp.func

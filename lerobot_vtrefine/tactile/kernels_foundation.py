@@ -1,15 +1,18 @@
-"""Warp kernel of the load-consistent elastic foundation (Winkler): heights and load in, taxel forces out.
+"""Device functions of the load-consistent elastic foundation (Winkler): heights, load in; taxel forces out.
 
 Each pad is one thread on CPU and one warp of 32 lanes on CUDA, which share out its columns. Its face gives
 way by u = max(0, z + delta + a x + b y) at every lattice point, where z is the column height plus the viscous
 lead tau * rate and (x, y) the centre of the point's taxel, in taxel pitches. The three unknowns are solved so
 that the forces k u add up to the load and balance at its centre: the minimum of a convex, piecewise quadratic
 function, found by Newton's method.
+
+The loops over points are in `kernels_packs`.
 """
 
 import warp as wp
 
-from lerobot_vtrefine.tactile.kernels import coordinate, ivec4
+from lerobot_vtrefine.tactile.kernels import Share, ivec4
+from lerobot_vtrefine.tactile.kernels_packs import add_forces, add_lanes, raw_sums
 
 wp.set_module_options({"enable_backward": False})
 
@@ -19,23 +22,25 @@ NEWTON_STEPS = wp.constant(14)
 MAX_LEAD_M = wp.constant(0.05)
 NEAR = wp.constant(1.0e-2)
 """How close to the load the search for the offset comes before Newton's method takes over."""
-TOLERANCE = wp.constant(2.0e-6)
+START_M = wp.constant(5.0e-4)
+"""How deep the search begins: about what a firm grasp presses."""
+TOLERANCE = wp.constant(1.0e-5)
+"""Of the balance, in shares of the load (and taxel pitches); the sum itself is then made exact by scaling."""
+NOISE = wp.constant(1.0e-6)
+"""Relative rounding of sums in single precision, which no step can be asked to beat."""
 
-vec6 = wp.types.vector(length=6, dtype=wp.float32)
 mat33d = wp.types.matrix(shape=(3, 3), dtype=wp.float64)
 
 
 @wp.struct
 class Pad:
-    """One pad's lattice, rows and columns `area` of which may be in contact."""
+    """One pad's lattice, rows and columns `area` of which may be in contact, and this thread's part of it."""
 
     rows: int
     cols: int
     subdivision: int
-    damping_s: float
     area: ivec4
-    lane: int
-    lanes: int
+    share: Share
 
 
 @wp.struct
@@ -47,124 +52,30 @@ class Balance:
     hessian: mat33d
 
 
-@wp.func_native("""
-#if defined(__CUDA_ARCH__)
-for (int step = 16; step > 0; step >>= 1) x += __shfl_xor_sync(0xffffffffu, x, step);
-#endif
-return x;
-""")
-def add_lanes(x: wp.float64) -> wp.float64:
-    """Sum over the lanes of a pad, the same bits in each."""
-    ...
-
-
-@wp.func_native("""
-#if defined(__CUDA_ARCH__)
-for (int step = 16; step > 0; step >>= 1) x = fmaxf(x, __shfl_xor_sync(0xffffffffu, x, step));
-#endif
-return x;
-""")
-def max_lanes(x: wp.float32) -> wp.float32:
-    """Maximum over the lanes of a pad."""
-    ...
-
-
 @wp.func
-def first_column(pad: Pad) -> int:
-    """First of the taxel columns that this lane sums; the others follow at steps of `lanes`."""
-    return pad.area[2] / pad.subdivision + pad.lane
-
-
-@wp.func
-def row_sums(
-    pad: Pad, stride: int, row: int, base: float, a: float, taxel_cols: int, height: wp.array(dtype=float)
-) -> vec6:
-    """(n, x, x^2, u, u x, u^2) summed over one row's points in contact.
-
-    In single precision, while rows are added in double: fast, and exact enough for 1e-6 of the load.
-    """
-    n = float(0.0)
-    sx = float(0.0)
-    sxx = float(0.0)
-    su = float(0.0)
-    sux = float(0.0)
-    suu = float(0.0)
-    half = 0.5 * float(taxel_cols - 1)
-    for col in range(first_column(pad), pad.area[3] / pad.subdivision, pad.lanes):
-        x = float(col) - half
-        offset = base + a * x
-        start = row * pad.cols + col * pad.subdivision
-        u = wp.max(height[start] + offset, 0.0)
-        count = wp.where(u > 0.0, 1.0, 0.0)
-        squares = u * u
-        # A taxel's points are summed first: shorter chains of dependent additions.
-        for index in range(start + stride, start + pad.subdivision, stride):
-            other = wp.max(height[index] + offset, 0.0)
-            count += wp.where(other > 0.0, 1.0, 0.0)
-            u += other
-            squares += other * other
-        n += count
-        sx += count * x
-        sxx += count * x * x
-        su += u
-        sux += u * x
-        suu += squares
-    return vec6(n, sx, sxx, su, sux, suu)
-
-
-@wp.func
-def balance(pad: Pad, stride: int, height: wp.array(dtype=float), trial: wp.vec3d) -> Balance:
-    """Sums of u (1, x, y) and (1, x, y)^T (1, x, y) over every `stride`-th row and column."""
-    n = wp.float64(0.0)
-    sx = wp.float64(0.0)
-    sy = wp.float64(0.0)
-    sxx = wp.float64(0.0)
-    sxy = wp.float64(0.0)
-    syy = wp.float64(0.0)
-    su = wp.float64(0.0)
-    sux = wp.float64(0.0)
-    suy = wp.float64(0.0)
-    suu = wp.float64(0.0)
-    taxel_rows = pad.rows / pad.subdivision
-    taxel_cols = pad.cols / pad.subdivision
-    a = wp.float32(trial[1])
-    for row in range(pad.area[0], pad.area[1], stride):
-        y = coordinate(row / pad.subdivision, 1.0, taxel_rows)
-        base = wp.float32(trial[0] + trial[2] * wp.float64(y))
-        sums = row_sums(pad, stride, row, base, a, taxel_cols, height)
-        if sums[0] > 0.0:
-            yd = wp.float64(y)
-            nd = wp.float64(sums[0])
-            xd = wp.float64(sums[1])
-            ud = wp.float64(sums[3])
-            n += nd
-            sx += xd
-            sy += nd * yd
-            sxx += wp.float64(sums[2])
-            sxy += xd * yd
-            syy += nd * yd * yd
-            su += ud
-            sux += wp.float64(sums[4])
-            suy += ud * yd
-            suu += wp.float64(sums[5])
+def balance(
+    pad: Pad, taxel_x: wp.array(dtype=float), lead: wp.array(dtype=float), trial: wp.vec3d
+) -> Balance:
+    """Sums of u (1, x, y) and (1, x, y)^T (1, x, y)."""
+    middle = 0.5 * float(pad.rows / pad.subdivision - 1)
+    own = raw_sums(pad.share, pad.area, pad.cols, middle, wp.vec3(trial), taxel_x, lead)
+    if pad.share.lanes > 1:
+        for i in range(10):
+            own[i] = add_lanes(own[i])
+    n = wp.float64(own[0])
+    x = wp.float64(own[1])
+    y = wp.float64(own[2])
+    xy = wp.float64(own[4])
     result = Balance()
-    result.squares = add_lanes(suu)
-    result.sums = wp.vec3d(add_lanes(su), add_lanes(sux), add_lanes(suy))
-    n = add_lanes(n)
-    sx = add_lanes(sx)
-    sy = add_lanes(sy)
-    sxy = add_lanes(sxy)
-    result.hessian = mat33d(n, sx, sy, sx, add_lanes(sxx), sxy, sy, sxy, add_lanes(syy))
+    result.squares = wp.float64(own[9])
+    result.sums = wp.vec3d(wp.float64(own[6]), wp.float64(own[7]), wp.float64(own[8]))
+    result.hessian = mat33d(n, x, y, x, wp.float64(own[3]), xy, y, xy, wp.float64(own[5]))
     return result
 
 
 @wp.func
 def offset_for_sum(
-    pad: Pad,
-    stride: int,
-    height: wp.array(dtype=float),
-    tilted: wp.vec3d,
-    total: wp.float64,
+    pad: Pad, taxel_x: wp.array(dtype=float), lead: wp.array(dtype=float), tilted: wp.vec3d, total: wp.float64
 ) -> wp.vec3d:
     """(delta, a, b) with the tilts of `tilted` and delta such that the u add up to about `total`.
 
@@ -173,7 +84,7 @@ def offset_for_sum(
     """
     trial = tilted
     for _step in range(32):
-        here = balance(pad, stride, height, trial)
+        here = balance(pad, taxel_x, lead, trial)
         if here.hessian[0, 0] < wp.float64(1.0):
             trial[0] = trial[0] + wp.float64(1.0e-3)
         else:
@@ -213,8 +124,8 @@ def limited(trial: wp.vec3d, limit: wp.float64) -> wp.vec3d:
 @wp.func
 def solve_balance(
     pad: Pad,
-    stride: int,
-    height: wp.array(dtype=float),
+    taxel_x: wp.array(dtype=float),
+    lead: wp.array(dtype=float),
     start: wp.vec3d,
     target: wp.vec3d,
     limit: wp.float64,
@@ -222,11 +133,11 @@ def solve_balance(
     """(delta, a, b) whose sums meet the target; damped Newton steps on the convex merit sum u^2 / 2 - target
     . trial."""
     trial = start
-    here = balance(pad, stride, height, trial)
+    here = balance(pad, taxel_x, lead, trial)
     if here.sums[0] < wp.float64(0.1) * target[0]:
         # Too little in contact for a first step that means something.
-        trial = offset_for_sum(pad, stride, height, trial, target[0])
-        here = balance(pad, stride, height, trial)
+        trial = offset_for_sum(pad, taxel_x, lead, trial, target[0])
+        here = balance(pad, taxel_x, lead, trial)
     for _ in range(NEWTON_STEPS):
         g = here.sums - target
         worst = wp.max(wp.abs(g[0]), wp.max(wp.abs(g[1]), wp.abs(g[2])))
@@ -234,14 +145,16 @@ def solve_balance(
             break
         step = newton_step(here.hessian, g)
         merit = wp.float64(0.5) * here.squares - wp.dot(target, trial)
+        slack = wp.float64(NOISE) * (here.squares + wp.abs(wp.dot(target, trial)))
         scale = wp.float64(1.0)
         accepted = int(0)
         for _halving in range(8):
             if accepted == 0:
                 candidate = limited(trial + scale * step, limit)
-                there = balance(pad, stride, height, candidate)
+                there = balance(pad, taxel_x, lead, candidate)
                 gain = wp.float64(0.5) * there.squares - wp.dot(target, candidate) - merit
-                if gain <= wp.float64(1.0e-4) * wp.min(wp.dot(g, candidate - trial), wp.float64(0.0)):
+                bound = wp.float64(1.0e-4) * wp.min(wp.dot(g, candidate - trial), wp.float64(0.0))
+                if gain <= bound + slack:
                     trial = candidate
                     here = there
                     accepted = 1
@@ -249,7 +162,7 @@ def solve_balance(
         if accepted == 0:
             break
     if here.sums[0] < wp.float64(0.9) * target[0]:
-        trial = offset_for_sum(pad, stride, height, trial, target[0])
+        trial = offset_for_sum(pad, taxel_x, lead, trial, target[0])
     return trial
 
 
@@ -274,38 +187,30 @@ def spread_load(rows: int, cols: int, pitch: float, load: wp.vec3, force: wp.arr
 def write_forces(
     pad: Pad,
     stiffness: float,
-    height: wp.array(dtype=float),
+    taxel_x: wp.array(dtype=float),
+    lead: wp.array(dtype=float),
     answer: wp.vec3d,
     total: wp.float64,
     force: wp.array(dtype=float),
 ) -> None:
     """Forces of a solution, scaled by what was left between their sum and the load."""
-    rows = pad.rows / pad.subdivision
     cols = pad.cols / pad.subdivision
-    a = wp.float32(answer[1])
-    whole = wp.float64(0.0)
+    middle = 0.5 * float(pad.rows / pad.subdivision - 1)
+    own = add_forces(pad.share, pad.area, pad.cols, middle, stiffness, wp.vec3(answer), taxel_x, lead, force)
+    factor = wp.float32(total) / add_lanes(own)
     for row in range(pad.area[0] / pad.subdivision, pad.area[1] / pad.subdivision):
-        base = wp.float32(answer[0] + answer[2] * wp.float64(coordinate(row, 1.0, rows)))
-        row_sum = float(0.0)
-        for col in range(first_column(pad), pad.area[3] / pad.subdivision, pad.lanes):
-            offset = base + a * coordinate(col, 1.0, cols)
-            taxel_sum = float(0.0)
-            for line in range(pad.subdivision):
-                start = (row * pad.subdivision + line) * pad.cols + col * pad.subdivision
-                for index in range(start, start + pad.subdivision):
-                    taxel_sum += wp.max(height[index] + offset, 0.0)
-            force[row * cols + col] = stiffness * taxel_sum
-            row_sum += taxel_sum
-        whole += wp.float64(row_sum)
-    factor = wp.float32(total / add_lanes(whole))
-    for row in range(pad.area[0] / pad.subdivision, pad.area[1] / pad.subdivision):
-        for col in range(first_column(pad), pad.area[3] / pad.subdivision, pad.lanes):
+        for col in range(
+            pad.area[2] / pad.subdivision / pad.share.lanes * pad.share.lanes + pad.share.lane,
+            pad.area[3] / pad.subdivision,
+            pad.share.lanes,
+        ):
             force[row * cols + col] *= factor
 
 
 @wp.func
 def contact_area(rows: int, cols: int, subdivision: int, window: wp.array(dtype=ivec4)) -> ivec4:
-    """Smallest block of whole taxels that holds all primitives' areas; empty (begin >= end) without any."""
+    """Smallest block of whole taxels, and of whole packs of columns, that holds all primitives' areas; empty
+    (begin >= end) without any."""
     area = ivec4(rows, 0, cols, 0)
     for k in range(window.shape[0]):
         other = window[k]
@@ -316,81 +221,30 @@ def contact_area(rows: int, cols: int, subdivision: int, window: wp.array(dtype=
                 wp.min(area[2], other[2]),
                 wp.max(area[3], other[3]),
             )
+    step = subdivision
+    if cols % 8 == 0 and 8 % subdivision == 0:
+        step = 8
     return ivec4(
         area[0] / subdivision * subdivision,
         (area[1] + subdivision - 1) / subdivision * subdivision,
-        area[2] / subdivision * subdivision,
-        (area[3] + subdivision - 1) / subdivision * subdivision,
+        area[2] / step * step,
+        (area[3] + step - 1) / step * step,
     )
 
 
 @wp.func
-def add_lead(pad: Pad, depth: wp.array(dtype=float), rate: wp.array(dtype=float)) -> float:
-    """Put height plus viscous lead in place of the rates; returns the largest, -1 m without a body."""
-    best = float(-1.0)
-    for row in range(pad.area[0], pad.area[1]):
-        for col in range(first_column(pad), pad.area[3] / pad.subdivision, pad.lanes):
-            start = row * pad.cols + col * pad.subdivision
-            for index in range(start, start + pad.subdivision):
-                height = depth[index]
-                if height > -0.5:
-                    height += wp.clamp(pad.damping_s * rate[index], -MAX_LEAD_M, MAX_LEAD_M)
-                rate[index] = height
-                best = wp.max(best, height)
-    return max_lanes(best)
-
-
-@wp.kernel
-def solve_foundation(
-    pad_rows: int,
-    pad_cols: int,
-    subdivision: int,
-    lanes: int,
+def solve_pad(
+    pad: Pad,
     pitch: float,
-    stiffness: wp.array(dtype=float),
-    damping_s: wp.array(dtype=float),
-    load: wp.array(dtype=wp.vec3, ndim=2),
-    window: wp.array(dtype=ivec4, ndim=3),
-    depth: wp.array(dtype=float, ndim=3),
-    rate: wp.array(dtype=float, ndim=3),
-    force: wp.array(dtype=float, ndim=3),
-    solution: wp.array(dtype=wp.vec3, ndim=2),
-) -> None:
-    """Forces [N] on pad_rows x pad_cols taxels from heights on the lattice that is finer by `subdivision`.
-
-    Per environment: `stiffness` of one lattice point [N/m] and `damping_s`. `window` holds the lattice areas
-    of the primitives in reach; `rate` is overwritten; `force` and `solution`, which gets (delta [m], slope x,
-    slope y), must come in as zero.
-    """
-    env, side, lane = wp.tid()
-    push = load[env, side]
-    if push[0] <= 0.0:
-        return
-    pad = Pad()
-    pad.rows = pad_rows * subdivision
-    pad.cols = pad_cols * subdivision
-    pad.subdivision = subdivision
-    pad.damping_s = damping_s[env]
-    pad.lane = lane
-    pad.lanes = lanes
-    pad.area = contact_area(pad.rows, pad.cols, subdivision, window[env, side])
-    heights = rate[env, side]
-    top = add_lead(pad, depth[env, side], heights)
-    if top <= -0.5:
-        if lane == 0:
-            spread_load(pad_rows, pad_cols, pitch, push, force[env, side])
-        return
-    total = wp.float64(push[0]) / wp.float64(stiffness[env])
+    stiffness: float,
+    push: wp.vec3,
+    top: float,
+    taxel_x: wp.array(dtype=float),
+    lead: wp.array(dtype=float),
+) -> wp.vec3d:
+    """(delta, a, b) of one pad under the load `push` for leads of which the largest is `top`."""
+    total = wp.float64(push[0]) / wp.float64(stiffness)
     scale = wp.float64(1.0) / wp.float64(pitch)
     target = wp.vec3d(total, total * wp.float64(push[1]) * scale, total * wp.float64(push[2]) * scale)
-    limit = wp.float64(MAX_TILT * pitch)
-    answer = wp.vec3d(wp.float64(1.0e-3 - top), wp.float64(0.0), wp.float64(0.0))
-    if subdivision > 1:
-        # Every taxel's first point alone leads close to the answer at a fraction of the cost.
-        share = wp.float64(1.0) / wp.float64(subdivision * subdivision)
-        answer = offset_for_sum(pad, subdivision, heights, answer, total * share)
-        answer = solve_balance(pad, subdivision, heights, answer, target * share, limit)
-    answer = solve_balance(pad, 1, heights, answer, target, limit)
-    write_forces(pad, stiffness[env], heights, answer, total, force[env, side])
-    if lane == 0:
-        solution[env, side] = wp.vec3(wp.vec3d(answer[0], answer[1] * scale, answer[2] * scale))
+    start = wp.vec3d(wp.float64(START_M - top), wp.float64(0.0), wp.float64(0.0))
+    return solve_balance(pad, taxel_x, lead, start, target, wp.float64(MAX_TILT * pitch))

@@ -1,32 +1,43 @@
-"""Warp kernels that evaluate prepared primitives and meshes on the lattice. Shapes and terms as in
-`kernels`."""
+"""Device functions that evaluate prepared primitives and meshes on a pad's lattice, and a kernel of these
+alone. Shapes and terms as in `kernels`.
+
+Each pad is one thread on CPU and `lanes` threads of a warp on CUDA, which own whole columns of taxels: no two
+ever touch the same lattice point, so that nothing needs to be atomic or depends on their order.
+"""
 
 import warp as wp
 
 from lerobot_vtrefine.tactile.kernels import (
-    CLOSEST,
     COLUMN,
     FAR_M,
-    KEY_STEPS_PER_M,
+    MESH,
     NO_BODY_M,
-    TRIANGLE_BITS,
     Bodies,
     Lattice,
+    Share,
     Views,
     column,
     coordinate,
     cylinder_closest,
     cylinder_column,
     end_index,
+    eval_rate,
     first_index,
     ivec2,
     ivec4,
+    own_first,
+    own_next,
     rate_form,
     sphere_closest,
     sphere_column,
 )
+from lerobot_vtrefine.tactile.kernels_grid import query_grid
 
 wp.set_module_options({"enable_backward": False})
+
+SEAM = wp.constant(1.0e-5)
+"""Share of a triangle's size by which it is widened: closes the seam between neighbours, which rounding would
+otherwise leave open."""
 
 
 @wp.func
@@ -79,120 +90,137 @@ def least_gap(first: int, kept: ivec2, x: float, y: float, forms: wp.array(dtype
     return wp.vec2(value, float(best))
 
 
-@wp.func
-def eval_rate(form: wp.vec4, x: float, y: float, s: float) -> float:
-    """Rate of depth at (x, y) and s along the pad's normal."""
-    return form[0] + form[1] * x + form[2] * y + form[3] * s
+@wp.func_native("""
+float* heights = height.data + row;
+float* rates = rate.data + row;
+int c = begin;
+#if defined(__CUDA_ARCH__)
+int span = share.width * share.lanes;
+c = begin / span * span + share.lane * share.width;
+#else
+typedef float pack __attribute__((ext_vector_type(8)));
+pack index = {0.f, 1.f, 2.f, 3.f, 4.f, 5.f, 6.f, 7.f};
+for (; c + 8 <= end; c += 8) {
+    pack x = (index + ((float)c - middle)) * pitch, h = plane[0] + plane[1] * x, old, oldrate;
+    h = __builtin_elementwise_min(__builtin_elementwise_max(h, (pack)bounds[1]), (pack)bounds[2]);
+    __builtin_memcpy(&old, heights + c, sizeof(pack));
+    __builtin_memcpy(&oldrate, rates + c, sizeof(pack));
+    auto wins = (h > old) & (h >= bounds[0]) & (h <= bounds[3]);
+    pack r = speed[0] + speed[1] * x - speed[2] * h;
+    h = wins ? h : old;
+    r = wins ? r : oldrate;
+    __builtin_memcpy(heights + c, &h, sizeof(pack));
+    __builtin_memcpy(rates + c, &r, sizeof(pack));
+}
+#endif
+while (c < end) {
+    float x = ((float)c - middle) * pitch;
+    float h = plane[0] + plane[1] * x;
+    h = h < bounds[1] ? bounds[1] : h;
+    h = h > bounds[2] ? bounds[2] : h;
+    if (c >= begin && h > heights[c] && h >= bounds[0] && h <= bounds[3]) {
+        heights[c] = h;
+        rates[c] = speed[0] + speed[1] * x - speed[2] * h;
+    }
+    c += 1;
+    if (share.lanes > 1 && c % share.width == 0) c += (share.lanes - 1) * share.width;
+}
+""")
+def raise_span(
+    share: Share,
+    height: wp.array(dtype=float),
+    rate: wp.array(dtype=float),
+    row: int,
+    begin: int,
+    end: int,
+    middle: float,
+    pitch: float,
+    plane: wp.vec2,
+    bounds: wp.vec4,
+    speed: wp.vec3,
+) -> None:
+    """Raise one row's columns begin..end to a plane: height plane . (1, x), rate speed . (1, x, -height).
+
+    `row` is the row's place in the arrays, `bounds` the lowest height that counts, the two between which the
+    plane's is held, and the highest that counts.
+    """
+    ...
 
 
 @wp.func
 def query_face(
     lattice: Lattice,
+    share: Share,
+    low: float,
     area: ivec4,
     form: wp.vec4,
     speed: wp.vec4,
-    depth: wp.array(dtype=float),
+    height: wp.array(dtype=float),
     rate: wp.array(dtype=float),
 ) -> None:
     """Column heights where a single plane decides: the usual case of a part held flat."""
+    middle = 0.5 * float(lattice.cols - 1)
+    bounds = wp.vec4(-low, -FAR_M, lattice.reach, FAR_M)
     for row in range(area[0], area[1]):
         y = coordinate(row, lattice.pitch, lattice.rows)
-        base = form[0] + form[2] * y
-        speed_base = speed[0] + speed[2] * y
-        for col in range(area[2], area[3]):
-            x = coordinate(col, lattice.pitch, lattice.cols)
-            value = wp.min(-base - form[1] * x, lattice.reach)
-            index = row * lattice.cols + col
-            if value > depth[index] and value >= -lattice.reach:
-                depth[index] = value
-                rate[index] = speed_base + speed[1] * x - speed[3] * value
+        plane = wp.vec2(-form[0] - form[2] * y, -form[1])
+        along = wp.vec3(speed[0] + speed[2] * y, speed[1], speed[3])
+        start = row * lattice.cols
+        raise_span(share, height, rate, start, area[2], area[3], middle, lattice.pitch, plane, bounds, along)
 
 
 @wp.func
-def query_convex(
+def query_solid(
     lattice: Lattice,
+    share: Share,
+    low: float,
     bodies: Bodies,
     views: Views,
     env: int,
     pad: int,
     k: int,
-    area: ivec4,
-    depth: wp.array(dtype=float),
+    height: wp.array(dtype=float),
     rate: wp.array(dtype=float),
 ) -> None:
-    """Raise depth and rate on the rows area[0:2] and columns area[2:4] to those of convex primitive k."""
+    """Raise depths and rates to those of primitive k: convex with kept planes, cylinder or sphere."""
+    area = views.window[env, pad, k]
     first = bodies.plane_start[k]
     last = bodies.plane_start[k + 1]
     kept = views.counts[env, pad, k]
     forms = views.forms[env, pad]
     rates = views.rates[env, pad]
-    if lattice.mode == COLUMN and kept[0] == 1 and kept[1] == 0:
-        query_face(lattice, area, forms[first], rates[first], depth, rate)
-        return
-    for row in range(area[0], area[1]):
-        y = coordinate(row, lattice.pitch, lattice.rows)
-        for col in range(area[2], area[3]):
-            x = coordinate(col, lattice.pitch, lattice.cols)
-            found = wp.vec2(0.0, 0.0)
-            if lattice.mode == COLUMN:
-                found = column_entry(first, last, kept, x, y, forms)
-            else:
-                found = least_gap(first, kept, x, y, forms)
-            index = row * lattice.cols + col
-            if found[0] > depth[index] and found[0] >= -lattice.reach:
-                value = wp.min(found[0], lattice.reach)
-                depth[index] = value
-                rate[index] = eval_rate(rates[wp.int32(found[1])], x, y, -value * float(lattice.mode))
-
-
-@wp.func
-def query_curved(
-    lattice: Lattice,
-    bodies: Bodies,
-    views: Views,
-    env: int,
-    pad: int,
-    k: int,
-    area: ivec4,
-    depth: wp.array(dtype=float),
-    rate: wp.array(dtype=float),
-) -> None:
-    """The same for a cylinder or sphere."""
-    kind = bodies.kind[k]
-    extent = bodies.extent[k]
-    origin = views.origin[env, pad, k]
     axes = views.axes[env, pad, k]
+    origin = views.origin[env, pad, k]
     linear = views.linear[env, pad, k]
     angular = views.angular[env, pad, k]
-    ex = column(axes, 0)
-    ey = column(axes, 1)
-    ez = column(axes, 2)
+    kind = bodies.kind[k]
+    extent = bodies.extent[k]
     for row in range(area[0], area[1]):
         y = coordinate(row, lattice.pitch, lattice.rows)
-        for col in range(area[2], area[3]):
+        along = origin + y * column(axes, 1)
+        col = own_first(share, area[2])
+        while col < area[3]:
             x = coordinate(col, lattice.pitch, lattice.cols)
-            hit = curved(lattice.mode, kind, origin + x * ex + y * ey, ez, extent)
             index = row * lattice.cols + col
-            if hit[0] > depth[index] and hit[0] >= -lattice.reach:
+            value = float(0.0)
+            form = wp.vec4(0.0, 0.0, 0.0, 0.0)
+            if first < last:
+                found = wp.vec2(0.0, 0.0)
+                if lattice.mode == COLUMN:
+                    found = column_entry(first, last, kept, x, y, forms)
+                else:
+                    found = least_gap(first, kept, x, y, forms)
+                value = wp.min(found[0], lattice.reach)
+                form = rates[wp.int32(found[1])]
+            else:
+                hit = curved(lattice.mode, kind, along + x * column(axes, 0), column(axes, 2), extent)
                 value = wp.min(hit[0], lattice.reach)
-                depth[index] = value
-                form = rate_form(lattice.mode, wp.vec3(hit[1], hit[2], hit[3]), axes, linear, angular)
+                if value > height[index]:
+                    form = rate_form(lattice.mode, wp.vec3(hit[1], hit[2], hit[3]), axes, linear, angular)
+            if col >= area[2] and value > height[index] and value >= -low:
+                height[index] = value
                 rate[index] = eval_rate(form, x, y, -value * float(lattice.mode))
-
-
-@wp.func
-def block_of(lattice: Lattice, block: int) -> ivec4:
-    """Rows and columns (begin, end, begin, end) that a thread fills."""
-    per_row = lattice.cols / lattice.block_cols
-    row = (block / per_row) * lattice.block_rows
-    col = (block % per_row) * lattice.block_cols
-    return ivec4(row, row + lattice.block_rows, col, col + lattice.block_cols)
-
-
-@wp.func
-def overlap(a: ivec4, b: ivec4) -> ivec4:
-    """Common rows and columns of two blocks (begin, end, begin, end)."""
-    return ivec4(wp.max(a[0], b[0]), wp.min(a[1], b[1]), wp.max(a[2], b[2]), wp.min(a[3], b[3]))
+            col = own_next(share, col)
 
 
 @wp.func
@@ -201,196 +229,172 @@ def misses(x: float, radius: float, pitch: float, count: int) -> bool:
     return first_index(x - radius, pitch, count) >= end_index(x + radius, pitch, count)
 
 
-@wp.kernel
-def query_primitives(
-    lattice: Lattice,
-    bodies: Bodies,
-    views: Views,
-    depth: wp.array(dtype=float, ndim=3),
-    rate: wp.array(dtype=float, ndim=3),
-) -> None:
-    """Penetration (CLOSEST) or signed column height (COLUMN) of every lattice point, and its rate [m, m/s].
-
-    Depth must come in holding "nothing there"; a thread fills a block of the lattice: the whole pad on CPU,
-    one taxel
-    on CUDA.
-    """
-    env, pad, block = wp.tid()
-    mine = block_of(lattice, block)
-    for k in range(bodies.kind.shape[0]):
-        full = views.window[env, pad, k]
-        area = ivec4(
-            wp.max(mine[0], full[0]),
-            wp.min(mine[1], full[1]),
-            wp.max(mine[2], full[2]),
-            wp.min(mine[3], full[3]),
-        )
-        if area[0] >= area[1] or area[2] >= area[3] or bodies.kind[k] == 4:
-            continue
-        if bodies.plane_start[k] < bodies.plane_start[k + 1]:
-            query_convex(lattice, bodies, views, env, pad, k, area, depth[env, pad], rate[env, pad])
-        else:
-            query_curved(lattice, bodies, views, env, pad, k, area, depth[env, pad], rate[env, pad])
-
-
 @wp.func
-def in_reach(lattice: Lattice, middle: wp.vec3, half: wp.vec3, axes: wp.mat33) -> bool:
+def in_reach(lattice: Lattice, low: float, middle: wp.vec3, half: wp.vec3, axes: wp.mat33) -> bool:
     """Whether a box of half-lengths `half` around `middle` (from the pad's origin) can stand over a lattice
-    point."""
-    ex = column(axes, 0)
-    ey = column(axes, 1)
+    point, between `low` above the face and the reach below it."""
     ez = column(axes, 2)
     above = wp.dot(middle, ez)
     thickness = wp.dot(wp.abs(ez), half)
-    if above - thickness > lattice.reach or above + thickness < -lattice.reach:
+    if above - thickness > low or above + thickness < -lattice.reach:
         return False
+    ex = column(axes, 0)
     if misses(wp.dot(middle, ex), wp.dot(wp.abs(ex), half), lattice.pitch, lattice.cols):
         return False
+    ey = column(axes, 1)
     return not misses(wp.dot(middle, ey), wp.dot(wp.abs(ey), half), lattice.pitch, lattice.rows)
 
 
 @wp.func
+def edge_bounds(bounds: wp.vec2, at_zero: float, slope: float) -> wp.vec2:
+    """The part of [bounds[0], bounds[1]] in which at_zero + slope x >= -SEAM; empty as (FAR_M, -FAR_M)."""
+    if wp.abs(slope) < 1.0e-9:
+        if at_zero < -SEAM:
+            return wp.vec2(FAR_M, -FAR_M)
+        return bounds
+    x = (-SEAM - at_zero) / slope
+    if slope > 0.0:
+        return wp.vec2(wp.max(bounds[0], x), bounds[1])
+    return wp.vec2(bounds[0], wp.min(bounds[1], x))
+
+
+@wp.func
 def raster_triangle(
-    lattice: Lattice, a: wp.vec3, b: wp.vec3, c: wp.vec3, t: int, keys: wp.array(dtype=wp.int64)
+    lattice: Lattice,
+    share: Share,
+    low: float,
+    a: wp.vec3,
+    b: wp.vec3,
+    c: wp.vec3,
+    speed: wp.vec4,
+    height: wp.array(dtype=float),
+    rate: wp.array(dtype=float),
 ) -> None:
-    """Offer triangle t, which faces the pad, corners in the pad's frame, to the lattice points under it."""
+    """Raise the lattice points under a triangle that faces the pad, corners in the pad's frame."""
+    lowest = wp.min(a[2], wp.min(b[2], c[2]))
     row0 = first_index(wp.min(a[1], wp.min(b[1], c[1])), lattice.pitch, lattice.rows)
     row1 = end_index(wp.max(a[1], wp.max(b[1], c[1])), lattice.pitch, lattice.rows)
-    col0 = first_index(wp.min(a[0], wp.min(b[0], c[0])), lattice.pitch, lattice.cols)
-    col1 = end_index(wp.max(a[0], wp.max(b[0], c[0])), lattice.pitch, lattice.cols)
-    if row0 >= row1 or col0 >= col1:
-        return
     double_area = (b[0] - a[0]) * (c[1] - a[1]) - (c[0] - a[0]) * (b[1] - a[1])
-    if double_area > -1.0e-18:
+    if row0 >= row1 or lowest > low or double_area > -1.0e-18:
         return
     inverse = 1.0 / double_area
+    # Barycentric weights of a and b as functions affine in x and y.
+    wa = wp.vec2((b[1] - c[1]) * inverse, (c[0] - b[0]) * inverse)
+    wb = wp.vec2((c[1] - a[1]) * inverse, (a[0] - c[0]) * inverse)
+    middle = 0.5 * float(lattice.cols - 1)
+    highest = wp.max(a[2], wp.max(b[2], c[2]))
+    bounds = wp.vec4(-low, -highest, -lowest, lattice.reach)
     for row in range(row0, row1):
         y = coordinate(row, lattice.pitch, lattice.rows)
-        for col in range(col0, col1):
-            x = coordinate(col, lattice.pitch, lattice.cols)
-            wa = ((b[0] - x) * (c[1] - y) - (c[0] - x) * (b[1] - y)) * inverse
-            wb = ((c[0] - x) * (a[1] - y) - (a[0] - x) * (c[1] - y)) * inverse
-            wc = 1.0 - wa - wb
-            # The slack closes the seam between neighbours, which rounding would otherwise leave open.
-            if wa >= -1.0e-5 and wb >= -1.0e-5 and wc >= -1.0e-5:
-                s = wa * a[2] + wb * b[2] + wc * c[2]
-                if wp.abs(s) <= lattice.reach:
-                    steps = wp.int64((lattice.reach - s) * KEY_STEPS_PER_M) + wp.int64(1)
-                    key = (steps << wp.int64(TRIANGLE_BITS)) | wp.int64(t)
-                    wp.atomic_max(keys, row * lattice.cols + col, key)
+        at_a = -wa[0] * c[0] + wa[1] * (y - c[1])
+        at_b = -wb[0] * c[0] + wb[1] * (y - c[1])
+        inside = edge_bounds(wp.vec2(-FAR_M, FAR_M), at_a, wa[0])
+        inside = edge_bounds(inside, at_b, wb[0])
+        inside = edge_bounds(inside, 1.0 - at_a - at_b, -wa[0] - wb[0])
+        if inside[0] <= inside[1]:
+            begin = first_index(inside[0], lattice.pitch, lattice.cols)
+            end = end_index(inside[1], lattice.pitch, lattice.cols)
+            # Heights are -z, so that weights enter with the corners' differences to c.
+            plane = wp.vec2(
+                -c[2] - at_a * (a[2] - c[2]) - at_b * (b[2] - c[2]),
+                -wa[0] * (a[2] - c[2]) - wb[0] * (b[2] - c[2]),
+            )
+            along = wp.vec3(speed[0] + speed[2] * y, speed[1], speed[3])
+            start = row * lattice.cols
+            raise_span(share, height, rate, start, begin, end, middle, lattice.pitch, plane, bounds, along)
 
 
-@wp.kernel
-def raster_meshes(
+@wp.func
+def raster_mesh(
     lattice: Lattice,
+    share: Share,
+    low: float,
     bodies: Bodies,
     views: Views,
-    clusters_per_thread: int,
-    keys: wp.array(dtype=wp.int64, ndim=3),
+    env: int,
+    pad: int,
+    k: int,
+    height: wp.array(dtype=float),
+    rate: wp.array(dtype=float),
 ) -> None:
-    """Project the triangles that face the pad onto the lattice; the lowest over each point wins its key.
+    """Project the triangles of mesh k that face the pad onto the lattice."""
+    axes = views.axes[env, pad, k]
+    origin = views.origin[env, pad, k]
+    to_pad = wp.transpose(axes)
+    ez = column(axes, 2)
+    for c in range(bodies.cluster_range[k][0], bodies.cluster_range[k][1]):
+        if in_reach(lattice, low, bodies.cluster_centre[c] - origin, bodies.cluster_half[c], axes):
+            for t in range(bodies.cluster_start[c], bodies.cluster_start[c + 1]):
+                normal = bodies.normals[t]
+                if wp.dot(normal, ez) < 0.0:
+                    speed = rate_form(
+                        COLUMN, normal, axes, views.linear[env, pad, k], views.angular[env, pad, k]
+                    )
+                    raster_triangle(
+                        lattice,
+                        share,
+                        low,
+                        to_pad * (bodies.corners[3 * t] - origin),
+                        to_pad * (bodies.corners[3 * t + 1] - origin),
+                        to_pad * (bodies.corners[3 * t + 2] - origin),
+                        speed,
+                        height,
+                        rate,
+                    )
 
-    A key holds the height in nanometres above -reach, then the triangle's number: one integer maximum, so
-    that the
-    result does not depend on the order of threads.
+
+@wp.func
+def fill_pad(
+    lattice: Lattice,
+    share: Share,
+    low: float,
+    bodies: Bodies,
+    views: Views,
+    env: int,
+    pad: int,
+    height: wp.array(dtype=float),
+    rate: wp.array(dtype=float),
+) -> None:
+    """Raise one pad's penetrations (CLOSEST) or column heights (COLUMN), and their rates, to those of all
+    bodies.
+
+    Heights must come in holding "nothing there"; those below -low are left out.
     """
-    env, pad, part = wp.tid()
-    count = bodies.cluster_owner.shape[0]
-    for c in range(part * clusters_per_thread, wp.min((part + 1) * clusters_per_thread, count)):
-        k = bodies.cluster_owner[c]
-        area = views.window[env, pad, k]
-        if area[0] >= area[1]:
-            continue
-        axes = views.axes[env, pad, k]
-        origin = views.origin[env, pad, k]
-        if not in_reach(lattice, bodies.cluster_centre[c] - origin, bodies.cluster_half[c], axes):
-            continue
-        to_pad = wp.transpose(axes)
-        ez = column(axes, 2)
-        for t in range(bodies.cluster_start[c], bodies.cluster_start[c + 1]):
-            if wp.dot(bodies.normals[t], ez) >= 0.0:
-                continue
-            raster_triangle(
-                lattice,
-                to_pad * (bodies.corners[3 * t] - origin),
-                to_pad * (bodies.corners[3 * t + 1] - origin),
-                to_pad * (bodies.corners[3 * t + 2] - origin),
-                t,
-                keys[env, pad],
-            )
-
-
-@wp.func
-def closest_on_mesh(mesh: wp.uint64, p: wp.vec3, height: float, normal: wp.vec3) -> wp.vec4:
-    """Distance and outward normal from p inside a closed surface `height` away along the pad's normal."""
-    # The nearest point is no farther than the one along the normal.
-    query = wp.mesh_query_point_no_sign(mesh, p, 1.01 * height + 1.0e-6)
-    if query.result:
-        outward = wp.mesh_eval_position(mesh, query.face, query.u, query.v) - p
-        distance = wp.length(outward)
-        if distance > 1.0e-6:
-            return wp.vec4(distance, outward[0] / distance, outward[1] / distance, outward[2] / distance)
-        return wp.vec4(distance, normal[0], normal[1], normal[2])
-    return wp.vec4(height, normal[0], normal[1], normal[2])
-
-
-@wp.func
-def mesh_area(bodies: Bodies, window: wp.array(dtype=ivec4)) -> ivec4:
-    """Smallest block of the lattice that holds all meshes' areas."""
-    area = ivec4(1000000, 0, 1000000, 0)
     for k in range(bodies.kind.shape[0]):
-        other = window[k]
-        if bodies.kind[k] == 4 and other[0] < other[1]:
-            area = ivec4(
-                wp.min(area[0], other[0]),
-                wp.max(area[1], other[1]),
-                wp.min(area[2], other[2]),
-                wp.max(area[3], other[3]),
-            )
-    return area
+        area = views.window[env, pad, k]
+        if area[0] < area[1]:
+            kept = views.counts[env, pad, k]
+            first = bodies.plane_start[k]
+            if bodies.kind[k] == MESH:
+                if lattice.mode == COLUMN:
+                    raster_mesh(lattice, share, low, bodies, views, env, pad, k, height, rate)
+                else:
+                    query_grid(lattice, share, bodies, views, env, pad, k, height, rate)
+            elif (
+                lattice.mode == COLUMN and kept[0] == 1 and kept[1] == 0 and first < bodies.plane_start[k + 1]
+            ):
+                form = views.forms[env, pad, first]
+                query_face(lattice, share, low, area, form, views.rates[env, pad, first], height, rate)
+            else:
+                query_solid(lattice, share, low, bodies, views, env, pad, k, height, rate)
 
 
 @wp.kernel
-def resolve_meshes(
+def query(
     lattice: Lattice,
+    lanes: int,
     bodies: Bodies,
     views: Views,
-    keys: wp.array(dtype=wp.int64, ndim=3),
-    depth: wp.array(dtype=float, ndim=3),
+    height: wp.array(dtype=float, ndim=3),
     rate: wp.array(dtype=float, ndim=3),
 ) -> None:
-    """Depth and rate of the winning triangles; in CLOSEST mode the distance to the mesh. Clears the keys."""
-    env, pad, block = wp.tid()
-    mine = overlap(block_of(lattice, block), mesh_area(bodies, views.window[env, pad]))
-    k = int(-1)
-    axes = wp.identity(n=3, dtype=float)
-    linear = wp.vec3(0.0, 0.0, 0.0)
-    angular = wp.vec3(0.0, 0.0, 0.0)
-    for row in range(mine[0], mine[1]):
-        for col in range(mine[2], mine[3]):
-            index = row * lattice.cols + col
-            key = keys[env, pad, index]
-            if key == wp.int64(0):
-                continue
-            keys[env, pad, index] = wp.int64(0)
-            t = wp.int32(key & ((wp.int64(1) << wp.int64(TRIANGLE_BITS)) - wp.int64(1)))
-            height = float((key >> wp.int64(TRIANGLE_BITS)) - wp.int64(1)) / KEY_STEPS_PER_M - lattice.reach
-            if height <= depth[env, pad, index]:
-                continue
-            if bodies.triangle_owner[t] != k:
-                k = bodies.triangle_owner[t]
-                axes = views.axes[env, pad, k]
-                linear = views.linear[env, pad, k]
-                angular = views.angular[env, pad, k]
-            x = coordinate(col, lattice.pitch, lattice.cols)
-            y = coordinate(row, lattice.pitch, lattice.rows)
-            n = bodies.normals[t]
-            hit = wp.vec4(height, n[0], n[1], n[2])
-            if lattice.mode == CLOSEST:
-                p = views.origin[env, pad, k] + x * column(axes, 0) + y * column(axes, 1)
-                hit = closest_on_mesh(bodies.mesh[k], p, height, n)
-            if hit[0] > depth[env, pad, index]:
-                depth[env, pad, index] = hit[0]
-                n = wp.vec3(hit[1], hit[2], hit[3])
-                form = rate_form(lattice.mode, n, axes, linear, angular)
-                rate[env, pad, index] = eval_rate(form, x, y, -hit[0] * float(lattice.mode))
+    """Penetration (CLOSEST) or signed column height (COLUMN) of every lattice point, and its rate [m, m/s].
+
+    Heights must come in holding "nothing there".
+    """
+    env, pad, lane = wp.tid()
+    share = Share()
+    share.lane = lane
+    share.lanes = lanes
+    share.width = lattice.subdivision
+    fill_pad(lattice, share, lattice.reach, bodies, views, env, pad, height[env, pad], rate[env, pad])

@@ -15,7 +15,6 @@ from lerobot_vtrefine.tactile.geometry import (
 )
 
 TRIANGLES_PER_CLUSTER = 16
-MAX_TRIANGLES = 1 << 24
 
 
 @dataclass(frozen=True, eq=False)
@@ -42,12 +41,14 @@ class PackedBodies:
     """(3 T, 3) triangles' corners in the primitive frame, cluster after cluster [m]."""
     normals: np.ndarray
     """(T, 3) triangles' outward unit normals."""
-    triangle_owner: np.ndarray
-    """(T,) int32 primitive of each triangle."""
+    edge_normals: np.ndarray
+    """(3 T, 3) directions halfway between the two faces at the edge opposite to each corner."""
+    corner_normals: np.ndarray
+    """(3 T, 3) at each corner the mean of its faces' normals, weighted by their angles there."""
     cluster_start: np.ndarray
     """(C + 1,) int32 into the triangles."""
-    cluster_owner: np.ndarray
-    """(C,) int32 primitive of each cluster."""
+    cluster_range: np.ndarray
+    """(K, 2) int32 clusters (begin, end) of each primitive."""
     cluster_centre: np.ndarray
     """(C, 3) centre of its bounding box [m]."""
     cluster_half: np.ndarray
@@ -94,33 +95,67 @@ def _unit_normals(triangles: np.ndarray) -> np.ndarray:
     return normals / np.maximum(np.linalg.norm(normals, axis=-1, keepdims=True), 1e-30)
 
 
+def _edge_normals(faces: np.ndarray, normals: np.ndarray) -> np.ndarray:
+    """(F, 3, 3): for each corner of a closed mesh's faces, its own and the neighbour's normal across the edge
+    opposite, added."""
+    ends = np.stack([faces[:, [1, 2]], faces[:, [2, 0]], faces[:, [0, 1]]], axis=1).reshape(-1, 2)
+    count = int(faces.max()) + 1
+    own, opposite = ends[:, 0] * count + ends[:, 1], ends[:, 1] * count + ends[:, 0]
+    order = np.argsort(own)
+    neighbour = order[np.searchsorted(own, opposite, sorter=order)] // 3
+    return normals[:, None] + normals[neighbour].reshape(-1, 3, 3)
+
+
+def _corner_normals(triangles: np.ndarray, faces: np.ndarray, normals: np.ndarray) -> np.ndarray:
+    """(F, 3, 3): the angle-weighted normal at every corner's vertex."""
+    total = np.zeros((int(faces.max()) + 1, 3))
+    for corner in range(3):
+        u, v = (triangles[:, (corner + step) % 3] - triangles[:, corner] for step in (1, 2))
+        cosine = (u * v).sum(-1) / np.maximum(np.linalg.norm(u, axis=-1) * np.linalg.norm(v, axis=-1), 1e-30)
+        np.add.at(total, faces[:, corner], np.arccos(np.clip(cosine, -1, 1))[:, None] * normals)
+    return total[faces]
+
+
+def _pack_mesh(mesh: TriangleMesh) -> tuple[list[int], dict[str, np.ndarray]]:
+    """Sizes of a mesh's clusters, and its triangles' arrays (T, ...) cluster after cluster."""
+    triangles = mesh.vertices[mesh.faces] - _frame(mesh)[0]
+    normals = _unit_normals(triangles)
+    groups = split_clusters(triangles.mean(axis=1), TRIANGLES_PER_CLUSTER)
+    order = np.concatenate(groups)
+    arrays = {
+        "corners": triangles,
+        "normals": normals,
+        "edge_normals": _edge_normals(mesh.faces, normals),
+        "corner_normals": _corner_normals(triangles, mesh.faces, normals),
+    }
+    return [len(group) for group in groups], {name: array[order] for name, array in arrays.items()}
+
+
 def _pack_triangles(primitives: list[Primitive]) -> dict[str, np.ndarray]:
-    corners, owners, starts, cluster_owner = [np.zeros((0, 3, 3))], [np.zeros(0, int)], [0], []
-    for k, primitive in enumerate(primitives):
-        if not isinstance(primitive, TriangleMesh):
-            continue
-        triangles = primitive.vertices[primitive.faces] - _frame(primitive)[0]
-        groups = split_clusters(triangles.mean(axis=1), TRIANGLES_PER_CLUSTER)
-        corners.append(triangles[np.concatenate(groups)])
-        owners.append(np.full(len(triangles), k))
-        starts += (starts[-1] + np.cumsum([len(group) for group in groups])).tolist()
-        cluster_owner += [k] * len(groups)
-    soup = np.concatenate(corners)
-    if len(soup) >= MAX_TRIANGLES:
-        raise ValueError(
-            f"bodies hold {len(soup)} triangles, more than the {MAX_TRIANGLES} that fit; simplify the meshes"
-        )
-    boxes = [
-        (soup[a:b].reshape(-1, 3).min(axis=0), soup[a:b].reshape(-1, 3).max(axis=0))
-        for a, b in pairwise(starts)
-    ]
-    low, high = (np.array([box[side] for box in boxes]).reshape(-1, 3) for side in (0, 1))
+    soup: dict[str, list[np.ndarray]] = {
+        name: [np.zeros((0, 3))] for name in ("corners", "normals", "edge_normals", "corner_normals")
+    }
+    sizes: list[int] = []
+    ranges = []
+    for primitive in primitives:
+        begin = len(sizes)
+        if isinstance(primitive, TriangleMesh):
+            own, arrays = _pack_mesh(primitive)
+            sizes += own
+            for name, array in arrays.items():
+                soup[name].append(array.reshape(-1, 3))
+        ranges.append((begin, len(sizes)))
+    starts = np.concatenate([[0], np.cumsum(sizes, dtype=int)])
+    flat = {name: np.concatenate(arrays).astype(np.float32) for name, arrays in soup.items()}
+    pieces = [flat["corners"][3 * a : 3 * b] for a, b in pairwise(starts.tolist())]
+    low, high = (
+        np.array([side(piece) for piece in pieces]).reshape(-1, 3)
+        for side in (lambda piece: piece.min(axis=0), lambda piece: piece.max(axis=0))
+    )
     return {
-        "corners": soup.reshape(-1, 3).astype(np.float32),
-        "normals": _unit_normals(soup).astype(np.float32),
-        "triangle_owner": np.concatenate(owners).astype(np.int32),
-        "cluster_start": np.array(starts, dtype=np.int32),
-        "cluster_owner": np.array(cluster_owner, dtype=np.int32),
+        **flat,
+        "cluster_start": starts.astype(np.int32),
+        "cluster_range": np.array(ranges, dtype=np.int32),
         "cluster_centre": ((low + high) / 2).astype(np.float32),
         "cluster_half": ((high - low) / 2 + 1e-7).astype(np.float32),
     }

@@ -9,7 +9,7 @@ from touch_shapes import hexagon, random_rotation, ring_mesh, single_query
 
 from lerobot_vtrefine.tactile import BodyGeometry, Box, Cylinder, PadLayout, PadSensors, SensorModel, Sphere
 from lerobot_vtrefine.tactile.contact_query import ContactQuery
-from lerobot_vtrefine.tactile.foundation import FoundationSolver
+from lerobot_vtrefine.tactile.foundation import ContactSolver
 from lerobot_vtrefine.tactile.geometry import Primitive
 from lerobot_vtrefine.tactile.stages.contact import Consistent
 
@@ -76,16 +76,11 @@ def test_delta_of_a_sphere() -> None:
     radius, load = 0.01, 5.0
     delta = brentq(lambda d: MODULUS * np.pi * (radius * d**2 - d**3 / 3) - load, 0, 0.005)
     query = ContactQuery(LAYOUT, [BodyGeometry([Sphere(radius)])], subdivision=2)
-    height, rate = single_query(query, "column", np.array([[0, 0, radius - 3e-4]]), np.eye(3)[None])
-    solver = FoundationSolver(LAYOUT)
+    still, eye = torch.zeros((1, 1, 6)), torch.eye(3)[None, None]
+    poses = (torch.zeros((1, 1, 3)), eye, still, torch.tensor([[[0, 0, radius - 3e-4]]]), eye, still)
     stiffness = torch.tensor([MODULUS * LAYOUT.taxel_area_m2])
-    _, solution = solver(
-        *(torch.from_numpy(item)[:, None] for item in (height, rate)),
-        torch.tensor([[[load, 0.0, 0.0]]]),
-        stiffness,
-        torch.zeros(1),
-        query.window(1, 1),
-    )
+    load = torch.tensor([[[load, 0.0, 0.0]]])
+    _, solution = ContactSolver(LAYOUT, query).foundation(poses, load, stiffness, torch.zeros(1))
     assert np.isclose(float(solution[0, 0, 0]) + 3e-4, delta, rtol=0.01)
     assert np.allclose(solution[0, 0, 1:], 0, atol=1e-5)
 

@@ -29,6 +29,14 @@ class ContactStage(Stage):
         """One taxel's stiffness [N/m]."""
         raise NotImplementedError
 
+    def damping(self, layout: PadLayout) -> torch.Tensor | float:
+        """One taxel's damping [N s/m]."""
+        return 0.0
+
+    def ceiling(self) -> torch.Tensor | float:
+        """What a taxel's force never exceeds [N]."""
+        return float("inf")
+
     def lead_s(self) -> torch.Tensor | float:
         """Damping over stiffness, by which a solved foundation weighs rates [s]."""
         return 0.0
@@ -39,8 +47,9 @@ class ContactStage(Stage):
         return replace(self, **{name: value * factor for name, value in own.items()})
 
     def force(self, depth: torch.Tensor, rate: torch.Tensor, layout: PadLayout) -> torch.Tensor:
-        """Normal force per taxel for a prescribed depth: (..., R, C) [N]."""
-        raise NotImplementedError
+        """Normal force per taxel for a prescribed depth: (..., R, C) [N]; zero where it is not positive."""
+        push = self.stiffness(layout) * depth + self.damping(layout) * rate
+        return torch.minimum(push.clamp(min=0.0), torch.as_tensor(self.ceiling())) * (depth > 0)
 
 
 @register
@@ -60,8 +69,8 @@ class KelvinVoigt(ContactStage):
         return self.k_n
 
     @override
-    def force(self, depth: torch.Tensor, rate: torch.Tensor, layout: PadLayout) -> torch.Tensor:
-        return (self.k_n * depth + self.k_d * rate).clamp(min=0.0) * (depth > 0)
+    def damping(self, layout: PadLayout) -> torch.Tensor | float:
+        return self.k_d
 
 
 @register
@@ -76,10 +85,6 @@ class TacSL(ContactStage):
     def stiffness(self, layout: PadLayout) -> torch.Tensor | float:
         return self.k_n
 
-    @override
-    def force(self, depth: torch.Tensor, rate: torch.Tensor, layout: PadLayout) -> torch.Tensor:
-        return self.k_n * depth.clamp(min=0.0)
-
 
 @register
 @dataclass(frozen=True)
@@ -91,10 +96,6 @@ class Depth(ContactStage):
     @override
     def stiffness(self, layout: PadLayout) -> torch.Tensor | float:
         return 1.0
-
-    @override
-    def force(self, depth: torch.Tensor, rate: torch.Tensor, layout: PadLayout) -> torch.Tensor:
-        return depth.clamp(min=0.0)
 
 
 @register
@@ -111,8 +112,8 @@ class FlexitacIsaacSim(ContactStage):
         return self.k_n / self.limit_n
 
     @override
-    def force(self, depth: torch.Tensor, rate: torch.Tensor, layout: PadLayout) -> torch.Tensor:
-        return torch.minimum(self.k_n * depth.clamp(min=0.0), torch.as_tensor(self.limit_n)) / self.limit_n
+    def ceiling(self) -> torch.Tensor | float:
+        return 1.0
 
 
 @register
