@@ -23,6 +23,9 @@ from lerobot_vtrefine.drivers.sources import (
     with_markers,
 )
 
+TURN_S = 4.0
+"""With --source=press each pad is pressed for half of this time, one after the other [s]."""
+
 SOURCES = ("contact", "noise", "press", "pattern", "recording")
 
 
@@ -53,7 +56,7 @@ def parse_arguments(arguments: Sequence[str] | None) -> argparse.Namespace:
         choices=SOURCES,
         default="contact",
         help="what the pads feel: contact = a wandering fingertip; press = one pad after another is pressed "
-        "for 2 s; pattern = frames with a checksum; recording = a file (%(default)s)",
+        "for 2 s while all are read; pattern = frames with a checksum; recording = a file (%(default)s)",
     )
     add(
         "--recording",
@@ -93,8 +96,27 @@ def parse_shape(text: str) -> FrameShape:
     return FrameShape(int(rows), int(cols))
 
 
-def make_source(options: argparse.Namespace, shape: FrameShape, board: int) -> Source:
-    """What board number `board` feels."""
+class Turns:
+    """Whose turn it is to be pressed: turns of `TURN_S` since all boards are being read, 0 before."""
+
+    def __init__(self) -> None:
+        self.boards: list[PadEmulator] = []
+        self._started_s: float | None = None
+
+    def __call__(self) -> float:
+        """Turns since the start."""
+        now = time.monotonic()
+        if not all(board.is_read for board in self.boards):
+            self._started_s = None
+            return 0.0
+        self._started_s = now if self._started_s is None else self._started_s
+        return (now - self._started_s) / TURN_S
+
+
+def make_source(
+    options: argparse.Namespace, shape: FrameShape, board: int, turn: Callable[[], float]
+) -> Source:
+    """What board number `board` feels; `turn` tells whose turn it is where pads are pressed in turn."""
     seed = options.seed + board
     if options.recording is not None or options.source == "recording":
         if options.recording is None:
@@ -103,7 +125,7 @@ def make_source(options: argparse.Namespace, shape: FrameShape, board: int) -> S
     elif options.source == "pattern":
         source = pattern_source(shape, time.monotonic_ns, seed)
     elif options.source == "press":
-        source = press_in_turn_source(shape, board, options.boards, round(2 * options.rate), seed)
+        source = press_in_turn_source(shape, board, options.boards, turn, seed)
     else:
         source = (contact_source if options.source == "contact" else noise_source)(shape, seed)
     for taxel in options.markers:
@@ -113,13 +135,13 @@ def make_source(options: argparse.Namespace, shape: FrameShape, board: int) -> S
 
 
 def make_board(
-    options: argparse.Namespace, shape: FrameShape, faults: Faults, board: int, name: str
+    options: argparse.Namespace, shape: FrameShape, faults: Faults, board: int, name: str, turns: Turns
 ) -> PadEmulator | DiagnosticEmulator:
     """Board number `board`, not started."""
-    source, link = make_source(options, shape, board), options.folder / name
+    source, link = make_source(options, shape, board, turns), options.folder / name
     if options.protocol == "diagnostic":
         return DiagnosticEmulator(source, link)
-    return PadEmulator(
+    emulator = PadEmulator(
         source,
         shape,
         link,
@@ -128,6 +150,8 @@ def make_board(
         faults=faults,
         seed=options.seed + board,
     )
+    turns.boards.append(emulator)
+    return emulator
 
 
 def start_arms(folder: Path, stack: ExitStack) -> Callable[[float], None]:
@@ -155,12 +179,13 @@ def main(arguments: Sequence[str] | None = None) -> None:
     if options.boards < 1:
         raise ValueError(f"--boards={options.boards} must be at least 1")
     names = PADS if options.boards <= len(PADS) else tuple(f"pad_{i}" for i in range(options.boards))
+    turns = Turns()
     with ExitStack() as stack:
         if threading.current_thread() is threading.main_thread():  # a killed emulator removes its ports, too
             before = signal.signal(signal.SIGTERM, signal.default_int_handler)
             stack.callback(signal.signal, signal.SIGTERM, before)
         for board, name in enumerate(names[: options.boards]):
-            emulator = make_board(options, shape, faults, board, name)
+            emulator = make_board(options, shape, faults, board, name, turns)
             print(stack.enter_context(emulator).port, flush=True)
         wave = start_arms(options.arms, stack) if options.arms else None
         started = time.monotonic()

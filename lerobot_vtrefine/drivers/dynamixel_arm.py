@@ -112,6 +112,7 @@ class DynamixelArm:
         self.calibration: dict[str, MotorCalibration] = {}
         self.bus = DynamixelMotorsBus(port, model.bus_motors())
         self.holding = False
+        self._last: tuple[float, Floats] = (-math.inf, np.zeros(8))
         self._names = [motor for motor, _, _ in model.motors]
 
     @property
@@ -291,7 +292,14 @@ class DynamixelArm:
         counts = self._counts(self._names)
         joints = counts_to_rad(np.array([counts[name] for name in self.model.joints], float))
         share = (counts[GRIPPER] - ends.range_min) / (ends.range_max - ends.range_min)
-        return np.array([*joints, share * self.travel_m, -share * self.travel_m])
+        state = np.array([*joints, share * self.travel_m, -share * self.travel_m])
+        self._last = time.monotonic(), state
+        return state
+
+    def recent(self, max_age_s: float) -> Floats:
+        """The state as it was last read (8,), read anew where that is longer ago than `max_age_s`."""
+        read_s, state = self._last
+        return state if time.monotonic() - read_s <= max_age_s else self.read()
 
     def write(self, target: Floats) -> None:
         """Sends targets (8,); the gripper follows the left finger, the right one mirrors it."""

@@ -30,14 +30,24 @@ _TORQUE_ENABLE, _GOAL_POSITION, _PRESENT_POSITION = 64, 116, 132
 _NO_SECONDARY = 255
 
 
+def _crc_table() -> tuple[int, ...]:
+    table = []
+    for octet in range(256):
+        crc = octet << 8
+        for _ in range(8):
+            crc = (crc << 1) ^ 0x8005 if crc & 0x8000 else crc << 1
+        table.append(crc & 0xFFFF)
+    return tuple(table)
+
+
+_CRC_TABLE = _crc_table()
+
+
 def crc16(data: bytes) -> int:
     """CRC-16 of protocol 2.0 (polynomial 0x8005, initial value 0)."""
     crc = 0
     for octet in data:
-        crc ^= octet << 8
-        for _ in range(8):
-            crc = (crc << 1) ^ 0x8005 if crc & 0x8000 else crc << 1
-        crc &= 0xFFFF
+        crc = (crc << 8 & 0xFFFF) ^ _CRC_TABLE[crc >> 8 ^ octet]
     return crc
 
 

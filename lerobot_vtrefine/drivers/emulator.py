@@ -21,6 +21,9 @@ from lerobot_vtrefine.drivers.terminal import Terminal, plug_in, pull_out
 
 logger = logging.getLogger(__name__)
 
+READ_WITHIN_S = 1.0
+"""A board is being read if a frame was taken within this time; a busy reader pauses now and then [s]."""
+
 
 @dataclass(frozen=True)
 class Faults:
@@ -104,6 +107,7 @@ class PadEmulator:
         self._rng = np.random.default_rng(seed)
         self._fds: Terminal | None = None
         self._guard = threading.Lock()
+        self._read_s = -np.inf
         self._stalled_until = 0.0
         self._stop = threading.Event()
         self._thread: threading.Thread | None = None
@@ -112,6 +116,11 @@ class PadEmulator:
     def port(self) -> str:
         """What a reader opens; stays the same across replugging."""
         return str(self.link)
+
+    @property
+    def is_read(self) -> bool:
+        """Whether somebody reads the board: what it sends is taken, not only piled up."""
+        return time.monotonic() - self._read_s < READ_WITHIN_S
 
     def start(self) -> "PadEmulator":
         """Plugs the board in and starts sending."""
@@ -180,4 +189,7 @@ class PadEmulator:
             written = 0
             with contextlib.suppress(BlockingIOError):
                 written = os.write(self._fds[0], data)
-            self.overruns += written < len(data)
+            if written == len(data):
+                self._read_s = time.monotonic()
+            else:
+                self.overruns += 1

@@ -61,16 +61,25 @@ def contact_source(
 
 
 def press_in_turn_source(
-    shape: FrameShape, board: int, boards: int, press_frames: int, seed: int = 0
+    shape: FrameShape, board: int, boards: int, turn: Callable[[], float], seed: int = 0
 ) -> Source:
-    """One of several pads that are pressed in turn, each for half of its turn of 2 * press_frames frames."""
+    """One of several pads that are pressed one after the other.
+
+    Args:
+        shape: Board shape.
+        board: Number of this board, from 0.
+        boards: How many there are.
+        turn: Turns since the start. Nothing is pressed in the first one; then one pad after the other is,
+            in the first half of its turn.
+        seed: Seed of idle counts and noise.
+    """
     idle = noise_source(shape, seed)
     rows, cols = np.mgrid[: shape.rows, : shape.cols]
     blob = 150.0 * np.exp(-((rows - shape.rows / 2) ** 2 + (cols - shape.cols / 2) ** 2) / (2 * 2.0**2))
 
     def frame(number: int) -> NDArray[np.uint8]:
-        turn, within = divmod(number, 2 * press_frames)
-        pressed = turn > 0 and (turn - 1) % boards == board and within < press_frames
+        whole, part = divmod(turn(), 1.0)
+        pressed = whole >= 1 and (int(whole) - 1) % boards == board and part < 0.5
         return np.clip(idle(number) + np.rint(blob * pressed), 0, 255).astype(np.uint8)
 
     return frame

@@ -9,10 +9,11 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from boards import PAD, emulated, pressable_source
+from boards import PAD, emulated, pressable_source, reading, wait_until
 
 from lerobot_vtrefine.cli import find_pads as find_pads_module
 from lerobot_vtrefine.cli.find_pads import main as find_pads
+from lerobot_vtrefine.cli.pad_emulator import Turns
 from lerobot_vtrefine.cli.pad_emulator import main as pad_emulator
 from lerobot_vtrefine.cli.view_pads import main as view_pads
 from lerobot_vtrefine.drivers.config import PadConfig
@@ -171,6 +172,19 @@ def test_emulator_command_prints_its_ports(tmp_path: Path, capsys: pytest.Captur
         str(folder / "left_arm_right_finger"),
     ]
     assert not list(folder.iterdir())
+
+
+def test_presses_begin_when_all_boards_are_read(tmp_path: Path) -> None:
+    turns = Turns()
+    with emulated(tmp_path, "a") as first, emulated(tmp_path, "b") as second:
+        turns.boards += [first, second]
+        with reading(PadConfig(first.port)):
+            wait_until(lambda: not second.is_read)
+            assert first.is_read
+            assert turns() == 0
+            with reading(PadConfig(second.port)):
+                wait_until(lambda: turns() > 0.05)
+        wait_until(lambda: turns() == 0)
 
 
 def test_terminated_emulator_removes_its_ports(tmp_path: Path) -> None:

@@ -49,10 +49,14 @@ def test_contact_rises_and_falls() -> None:
 
 
 def test_pads_are_pressed_in_turn_never_together() -> None:
-    sources = [press_in_turn_source(PAD, board, 3, press_frames=4) for board in range(3)]
-    pressed = np.array([[source(n).max() > 100 for source in sources] for n in range(8 * 4)])
-    assert pressed.sum(axis=1).max() == 1
-    assert list(pressed.argmax(axis=1)[[8, 16, 24]]) == [0, 1, 2]
+    turn = [0.0]
+    sources = [press_in_turn_source(PAD, board, 3, lambda: turn[0]) for board in range(3)]
+    pressed = []
+    for step in range(32):
+        turn[0] = step / 8
+        pressed.append([source(step).max() > 100 for source in sources])
+    assert np.sum(pressed, axis=1).tolist() == 8 * [0] + 3 * [1, 1, 1, 1, 0, 0, 0, 0]
+    assert np.argmax(pressed, axis=1)[[8, 16, 24]].tolist() == [0, 1, 2]
 
 
 def test_markers_are_put_where_asked() -> None:
