@@ -15,7 +15,9 @@ REPEATABLE_P, REPEATABLE_SHARE = 0.01, 0.15
 MIN_RMS_COUNTS = 0.4
 """Repeatable residual below this may be the converter's rounding."""
 FLIPS = 4999
-LINE_RATIO = 12.0
+LINE_RATIO = 8.0
+LINE_FROM = 8
+"""Slowest line looked for, in periods per recording."""
 
 
 @dataclass(frozen=True)
@@ -97,26 +99,23 @@ def _aligned(
 
 
 def line_alarm(presses: PressSet, residuals: Sequence[np.ndarray]) -> Alarm | None:
-    """A sharp line in the residual's spectrum that stands out in most recordings."""
-    spans = [float(press.trial.time_s[-1] - press.trial.time_s[0]) for press in presses.presses]
-    span = float(np.median(spans))
-    frame_s = float(np.median(np.concatenate([np.diff(press.trial.time_s) for press in presses.presses])))
-    if frame_s <= 0 or span < 32 * frame_s:
+    """A sharp line in the residual's spectrum, taxels added up with their signs, in most recordings."""
+    trials = [press.trial for press in presses.presses]
+    span = float(np.median([trial.time_s[-1] - trial.time_s[0] for trial in trials]))
+    frame_s = float(np.median(np.concatenate([np.diff(trial.time_s) for trial in trials])))
+    if frame_s <= 0 or span < 64 * frame_s:
         return None
-    frequencies = np.arange(2, int(0.5 * span / frame_s)) / span
-    total = np.zeros(len(frequencies))
-    used = 0
-    for press, residual in zip(presses.presses, residuals, strict=True):
-        time_s = press.trial.time_s
-        window = np.hanning(len(time_s))[:, None]
-        kernel = np.exp(-2j * np.pi * frequencies[:, None] * time_s[None, :])
-        power = (np.abs(kernel @ (window * (residual - residual.mean(axis=0)))) ** 2).mean(axis=1)
-        local = _local_median(power)
-        total += power / np.maximum(local, 1e-12)
-        used += 1
-    ratio = total / max(used, 1)
+    frequencies = np.arange(LINE_FROM, int(0.5 * span / frame_s) + 1) / span
+    ratios = []
+    for trial, residual in zip(trials, residuals, strict=True):
+        window = np.hanning(len(trial.time_s) + 2)[1:-1]
+        common = window * (residual - residual.mean(axis=0)).sum(axis=1)
+        power = np.abs(np.exp(-2j * np.pi * frequencies[:, None] * trial.time_s[None, :]) @ common) ** 2
+        ratios.append(power / np.maximum(_local_median(power), 1e-12))
+    # Medians over recordings: one recording with a spike is not a line.
+    ratio = np.median(ratios, axis=0)
     best = int(np.argmax(ratio))
-    fired = bool(ratio[best] > LINE_RATIO)
+    fired = bool(ratio[best] > LINE_RATIO and len(ratios) >= 3)
     text = f"a line at {frequencies[best]:.2f} Hz in the residual (or its alias from a faster one)"
     return Alarm("spectrum", fired, float(ratio[best]), 1e-4 if fired else 1.0, text)
 

@@ -5,7 +5,13 @@ import torch
 
 from lerobot_vtrefine.diagnose.indenters import trial_forces, trial_heights
 from lerobot_vtrefine.diagnose.recordings import Trial
-from lerobot_vtrefine.diagnose.refinement import needs_refinement, refined, refined_times, substeps
+from lerobot_vtrefine.diagnose.refinement import (
+    needs_refinement,
+    refined,
+    refined_motion,
+    refined_times,
+    substeps,
+)
 from lerobot_vtrefine.tactile.layout import PadLayout
 from lerobot_vtrefine.tactile.model import SensorModel
 from lerobot_vtrefine.tactile.replay import finite_rate, replay
@@ -24,8 +30,8 @@ def predict_trial(model: SensorModel, trial: Trial, layout: PadLayout) -> np.nda
         force = refined(trial_forces(trial, layout), count)
     else:
         heights = trial_heights(trial, layout)
-        rate = refined(finite_rate(torch.as_tensor(trial.time_s), torch.as_tensor(heights)).numpy(), count)
-        depth = refined(heights, count)
+        rate = finite_rate(torch.as_tensor(trial.time_s), torch.as_tensor(heights)).numpy()
+        depth, rate = refined_motion(heights, rate, trial.time_s, count)
     times = refined_times(trial.time_s, count)
     fine = replay(model, times, depth, rate, force_n=force, layout=layout, start_s=trial.start_s)
     predicted = fine[::count]

@@ -8,7 +8,7 @@ import torch
 
 from lerobot_vtrefine.diagnose.indenters import trial_forces, trial_heights
 from lerobot_vtrefine.diagnose.recordings import RecordingSet, Trial
-from lerobot_vtrefine.diagnose.refinement import refined, refined_times, substeps
+from lerobot_vtrefine.diagnose.refinement import refined, refined_motion, refined_times, substeps
 from lerobot_vtrefine.tactile.layout import PadLayout
 from lerobot_vtrefine.tactile.replay import finite_rate
 
@@ -87,7 +87,10 @@ class Press:
     def fine(self) -> "Press":
         """The same press with its drive known between the frames."""
         count = substeps(self.trial.time_s)
-        drive, rate = refined(self.drive, count), refined(self.rate, count)
+        if self.loaded:
+            drive, rate = refined(self.drive, count), refined(self.rate, count)
+        else:
+            drive, rate = refined_motion(self.drive, self.rate, self.trial.time_s, count)
         return replace(self, drive=drive, rate=rate, substeps=count)
 
     @property

@@ -6,9 +6,9 @@ from lerobot_vtrefine.tactile.replay import NO_BODY_M
 from lerobot_vtrefine.tactile.stages.base import Stage
 from lerobot_vtrefine.tactile.stages.host import Delay, SampleAndHold
 
-FINE_S = 0.01
+FINE_S = 0.005
 """Time between refined frames [s]: motion is close to straight for that long."""
-MAX_SUBSTEPS = 5
+MAX_SUBSTEPS = 10
 
 
 def needs_refinement(stages: tuple[Stage, ...]) -> bool:
@@ -31,15 +31,45 @@ def refined_times(time_s: np.ndarray, count: int) -> np.ndarray:
     return np.interp(index, np.arange(len(time_s)), time_s)
 
 
-def refined(images: np.ndarray, count: int) -> np.ndarray:
-    """Images (N, ...) in between, linear; the nearest frame's where only one has a body over the taxel."""
-    frames = len(images)
+def refined_motion(
+    heights: np.ndarray, rate: np.ndarray, time_s: np.ndarray, count: int
+) -> tuple[np.ndarray, np.ndarray]:
+    """Heights (N, ...) and their rate in between: cubic through both (Hermite), which bends as motion does.
+
+    Next to a frame without a body over the taxel (-1) the nearest frame counts.
+    """
+    frames = len(heights)
     if count == 1 or frames < 2:
-        return images
+        return heights, rate
     index = np.arange((frames - 1) * count + 1)
     before = np.minimum(index // count, frames - 2)
-    weight = ((index - before * count) / count).reshape(-1, *(1,) * (images.ndim - 1))
-    early, late = images[before], images[before + 1]
-    smooth = early + weight * (late - early)
+    shape = (-1, *(1,) * (heights.ndim - 1))
+    s = ((index - before * count) / count).reshape(shape)
+    step = np.maximum(np.diff(time_s), 0.0)[before].reshape(shape)
+    early, late, start, end = (
+        heights[before],
+        heights[before + 1],
+        rate[before] * step,
+        rate[before + 1] * step,
+    )
+    rise = late - early
+    bend = start + end - 2.0 * rise
+    smooth = early + s * (start + s * (3.0 * rise - 2.0 * start - end + s * bend))
+    slope = start + s * (2.0 * (3.0 * rise - 2.0 * start - end) + 3.0 * s * bend)
     known = (early > NO_BODY_M) & (late > NO_BODY_M)
-    return np.where(known, smooth, np.where(weight < 0.5, early, late))
+    moving = known & (step > 0)
+    held = np.where(s < 0.5, rate[before], rate[before + 1])
+    return (
+        np.where(known, smooth, np.where(s < 0.5, early, late)),
+        np.where(moving, slope / np.maximum(step, 1e-12), held),
+    )
+
+
+def refined(images: np.ndarray, count: int) -> np.ndarray:
+    """Images (N, ...) in between, linear."""
+    if count == 1 or len(images) < 2:
+        return images
+    index = np.arange((len(images) - 1) * count + 1)
+    before = np.minimum(index // count, len(images) - 2)
+    weight = ((index - before * count) / count).reshape(-1, *(1,) * (images.ndim - 1))
+    return images[before] + weight * (images[before + 1] - images[before])
