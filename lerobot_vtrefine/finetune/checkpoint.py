@@ -82,6 +82,7 @@ def load_training_state(checkpoint: Path, state: TrainState) -> None:
     state.actor_optimizer.load_state_dict(saved["actor_optimizer"])
     state.critic_optimizer.load_state_dict(saved["critic_optimizer"])
     state.reward_scaler.load_state_dict(saved["reward_scaler"])
+    state.rollback.load_state_dict(saved["rollback"], state.generator.device)
     state.iteration, state.env_steps = saved["iteration"], saved["env_steps"]
     own = saved["ranks"][rank_index()]
     state.generator.set_state(own["generator"])
@@ -94,6 +95,7 @@ def _state_dict(state: TrainState) -> dict[str, Any]:
         "actor_optimizer": state.actor_optimizer.state_dict(),
         "critic_optimizer": state.critic_optimizer.state_dict(),
         "reward_scaler": state.reward_scaler.state_dict(),
+        "rollback": state.rollback.state_dict(),
         "iteration": state.iteration,
         "env_steps": state.env_steps,
     }

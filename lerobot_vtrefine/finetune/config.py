@@ -81,6 +81,9 @@ class DppoConfig(draccus.ChoiceRegistry):
     weight_decay: float = 0.0
     # Clip the gradient norm of actor and critic; 0 does not clip.
     max_grad_norm: float = 0.0
+    # Return to the best weights, at half the learning rate, when the success rate falls by this much below
+    # the best (means over two iterations); 0: never.
+    rollback_drop: float = 0.0
     # "trained": the observation encoder is fine-tuned too. "frozen": its features are computed once and kept.
     encoder: str = "trained"
     critic_width: int = 512
@@ -109,6 +112,8 @@ class DppoConfig(draccus.ChoiceRegistry):
                 f"--dppo.min_log_prob_std must be at least {MIN_LOG_PROB_STD}, got {self.min_log_prob_std}: "
                 "below it the clamp of log-probabilities removes the gradient"
             )
+        if not 0.0 <= self.rollback_drop < 1.0:
+            raise ValueError(f"--dppo.rollback_drop must lie in [0, 1), got {self.rollback_drop}")
         for name, choices in (("timeout", TIMEOUTS), ("encoder", ENCODERS)):
             if getattr(self, name) not in choices:
                 raise ValueError(
@@ -173,5 +178,6 @@ class SmallDppo(DppoConfig):
     actor_lr: float = 1e-4
     actor_lr_final: float = 1e-5
     lr_warmup: int = 1
+    rollback_drop: float = 0.15
     max_grad_norm: float = 1.0
     critic_width: int = 256

@@ -47,6 +47,7 @@ from lerobot_vtrefine.finetune.protocols import (
     select,
     start,
 )
+from lerobot_vtrefine.finetune.rollback import Rollback
 from lerobot_vtrefine.policies.vt_dp3.diffusion import denoise_prefix, sample_chain, slice_log_prob
 
 Metrics = dict[str, float]
@@ -68,6 +69,7 @@ class TrainState:
     critic_optimizer: torch.optim.AdamW
     reward_scaler: RewardScaler
     generator: torch.Generator
+    rollback: Rollback
     iteration: int = 0
     env_steps: int = 0
 
@@ -85,6 +87,7 @@ class TrainState:
             adamw(critic.parameters(), lr=cfg.critic_lr),
             RewardScaler(),
             torch.Generator(device).manual_seed(seed + 7919 * rank_index()),
+            Rollback(cfg.rollback_drop),
         )
 
 
@@ -262,13 +265,16 @@ def policy_loss(log_ratio: Tensor, advantages: Tensor, cfg: DppoConfig) -> Tenso
     return torch.maximum(-advantages * ratio, -advantages * clipped)
 
 
-def update(rollout: Rollout, agent: Agent, state: TrainState, cfg: DppoConfig) -> Metrics:
+def update(
+    rollout: Rollout, agent: Agent, state: TrainState, cfg: DppoConfig, critic_only: bool = False
+) -> Metrics:
     """All epochs over one segment. Critic-only during the first ``cfg.critic_warmup`` iterations."""
     advantages, targets = decision_advantages(rollout, state, cfg)
     privileged = rollout.privileged[rollout.step, rollout.env]
-    train_actor = state.iteration >= cfg.critic_warmup
+    train_actor = state.iteration >= cfg.critic_warmup and not critic_only
+    actor_lr = cfg.actor_lr_at(state.iteration) * state.rollback.lr_scale
     regulariser = Regulariser.of(rollout, agent, cfg, state.generator) if train_actor else Regulariser()
-    state.actor_optimizer.param_groups[0]["lr"] = cfg.actor_lr_at(state.iteration)
+    state.actor_optimizer.param_groups[0]["lr"] = actor_lr
     state.critic_optimizer.param_groups[0]["lr"] = cfg.critic_lr_at(state.iteration)
     actor_parameters, critic_parameters = agent.trained_parameters(), list(state.critic.parameters())
     clip = advantages.new_tensor([cfg.clip_range(step) for step in range(cfg.ft_denoising_steps)])
@@ -342,7 +348,7 @@ def update(rollout: Rollout, agent: Agent, state: TrainState, cfg: DppoConfig) -
         "initial_log_ratio": initial_log_ratio,
         "updates": float(len(history)),
         "stopped_early": float(stopped),
-        "actor_lr": cfg.actor_lr_at(state.iteration),
+        "actor_lr": actor_lr,
     }
 
 
@@ -374,7 +380,9 @@ def train(
         rollout = collect(env, agent, cfg, state.generator, range(first, first + env.num_envs))
         collected = time.perf_counter()
         state.critic.update_moments(rollout.privileged[:-1][rollout.active])
-        metrics = rollout_metrics(rollout) | update(rollout, agent, state, cfg)
+        metrics = rollout_metrics(rollout)
+        returned = state.rollback.watch(metrics["success"], agent.trained_parameters(), state.actor_optimizer)
+        metrics |= update(rollout, agent, state, cfg, critic_only=returned) | {"rolled_back": float(returned)}
         decisions = sum_over_ranks(rollout.active.sum().double()).item()
         state.iteration += 1
         state.env_steps += int(decisions) * chunk
