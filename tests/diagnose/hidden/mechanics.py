@@ -147,7 +147,8 @@ def many_plays(pad: Pad, size: float, rng: Draw) -> Effect:
     widths, w = np.array([0.4, 1.0, 2.0, 3.5]) * 1e-4, 0.08 * size
 
     def apply(scene: Scene, f: np.ndarray) -> np.ndarray:
-        held = sum(pad.k_n * play(f / pad.k_n, width / 2) for width in widths)
+        half = np.repeat(widths / 2, f.shape[1])
+        held = pad.k_n * play(np.tile(f / pad.k_n, 4), half).reshape(len(f), 4, -1).sum(axis=1)
         return np.where(f > 0, (1 - 4 * w) * f + w * held, 0.0)
 
     return Effect("hysteresis", "prandtl_ishlinskii", "force", apply)
@@ -169,11 +170,11 @@ def bouc_wen(pad: Pad, size: float, rng: Draw) -> Effect:
 
 
 def preisach(pad: Pad, size: float, rng: Draw) -> Effect:
-    """Forty relays, with thresholds spread over the loads that occur."""
+    """Twenty relays, with thresholds spread over the loads that occur."""
     top = pad.peak / pad.gain
-    up = rng.uniform(0.08, 1.0, 40) * top
-    down = up - rng.uniform(0.05, 0.4, 40) * top
-    share = 0.12 * size * top / 40
+    up = rng.uniform(0.08, 1.0, 20) * top
+    down = up - rng.uniform(0.05, 0.4, 20) * top
+    share = 0.12 * size * top / 20
 
     def apply(scene: Scene, f: np.ndarray) -> np.ndarray:
         state = np.zeros((len(up), f.shape[1]), dtype=bool)
@@ -181,7 +182,7 @@ def preisach(pad: Pad, size: float, rng: Draw) -> Effect:
         for i, value in enumerate(f):
             state = (state | (value > up[:, None])) & (value > np.maximum(down, 0.0)[:, None])
             out[i] = state.sum(axis=0)
-        return np.where(f > 0, f + share * (out - 20 * f / top), 0.0).clip(min=0.0)
+        return np.where(f > 0, f + share * (out - 10 * f / top), 0.0).clip(min=0.0)
 
     return Effect("hysteresis", "preisach", "force", apply)
 

@@ -72,7 +72,7 @@ def draw(kind: str, rig: Rig, rng: np.random.Generator) -> Motion:
     end = rig.duration_s - 0.6
     if kind == "hold":
         press(pen, depth, ramp, max(0.5, rng.uniform(0.45, 0.6) * end - ramp))
-    while pen.times[-1] + 2 * ramp < end:
+    while pen.times[-1] + 2 * ramp + 0.8 < end:
         scale = rng.uniform(0.5, 1.0)
         if kind in ("cycles", "hold"):
             press(pen, depth * scale, ramp, rng.uniform(0.1, 0.6))

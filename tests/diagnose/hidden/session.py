@@ -200,7 +200,9 @@ def run_session(spec: Spec, seed: int, locked: int = 0) -> tuple[Session, Sessio
     rig = spec.make_rig()
     rng = np.random.default_rng((7919, seed))
     pad = specimen(rig, rng)
-    effects = [FORMS[family][form](pad, size, rng) for family, form, size in spec.effects]
+    # Chance of their own, so that the same seed makes the same presses whatever is hidden in them.
+    chance = np.random.default_rng((7919, seed, 1))
+    effects = [FORMS[family][form](pad, size, chance) for family, form, size in spec.effects]
     noise = NOISES[spec.noise]
     sessions, before, phase = [], 0, rng.uniform(0, 2 * np.pi)
     for part, (motions, repeats) in enumerate(
