@@ -1,6 +1,7 @@
 """`vtrefine-find-pads`: press a pad, name it; writes the YAML file that robot configurations read."""
 
 import argparse
+import sys
 from collections.abc import Sequence
 from contextlib import ExitStack
 from pathlib import Path
@@ -143,3 +144,7 @@ def check_first_row(name: str, board: FoundBoard) -> None:
     else:
         board.config.row_offset = first
         print(f"rows arrive shifted by {first}: row_offset is {first}")
+
+
+if __name__ == "__main__":
+    sys.exit(main())

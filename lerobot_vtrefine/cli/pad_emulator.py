@@ -1,6 +1,7 @@
 """`vtrefine-pad-emulator`: FlexiTac boards on pseudo-terminals, to try everything without hardware."""
 
 import argparse
+import sys
 import signal
 import threading
 import time
@@ -193,3 +194,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
             time.sleep(0.02 if wave else 0.1)
             if wave is not None:
                 wave(time.monotonic() - started)
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -164,3 +164,7 @@ def rerun_view(save: Path | None, stack: ExitStack) -> Any:
             rr.log(f"health/{reader.name}", rr.TextLog(status_line(reader)))
 
     return show
+
+
+if __name__ == "__main__":
+    sys.exit(main())

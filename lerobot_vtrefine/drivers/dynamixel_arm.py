@@ -18,7 +18,7 @@ from lerobot.motors import Motor, MotorCalibration, MotorNormMode
 from lerobot.motors.dynamixel import DynamixelMotorsBus, OperatingMode
 from numpy.typing import NDArray
 
-from lerobot_vtrefine.drivers.ports import PortError, explain_open_error
+from lerobot_vtrefine.drivers.ports import PortError, ask_for_low_latency, explain_open_error, latency_advice
 
 logger = logging.getLogger(__name__)
 
@@ -139,6 +139,9 @@ class DynamixelArm:
             cause = error.__cause__ if isinstance(error.__cause__, Exception) else error
             message = explain_open_error(self.port, self.bus.default_baudrate, cause)
             raise PortError(f"{self.name} arm: {message}") from error
+        ask_for_low_latency(self.bus.port_handler.ser)
+        if advice := latency_advice(self.port):  # a control period waits for several answers
+            logger.warning("%s arm: %s", self.name, advice)
         problem = self._motor_problem()
         if problem:
             self.bus.port_handler.closePort()

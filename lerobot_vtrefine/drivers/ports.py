@@ -31,12 +31,12 @@ def open_port(port: str, baud: int, timeout_s: float) -> serial.Serial:
         device = serial.Serial(port, baud, timeout=timeout_s, exclusive=True)
     except (serial.SerialException, OSError, ValueError) as error:
         raise PortError(explain_open_error(port, baud, error)) from error
-    _ask_for_low_latency(device)
+    ask_for_low_latency(device)
     device.reset_input_buffer()
     return device
 
 
-def _ask_for_low_latency(device: serial.Serial) -> None:
+def ask_for_low_latency(device: serial.Serial) -> None:
     """Sets an FTDI adapter's timer to 1 ms where the driver allows it (else see `latency_advice`)."""
     try:
         device.set_low_latency_mode(True)

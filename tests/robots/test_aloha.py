@@ -6,10 +6,12 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import serial
 from lerobot.motors.dynamixel.tables import MODEL_NUMBER_TABLE
 from rig import Rig, allow_slow_answers, aloha_rig
 
 from lerobot_vtrefine.datasets.features import NUM_JOINTS, PADS, TAXEL_INFO
+from lerobot_vtrefine.drivers import dynamixel_arm
 from lerobot_vtrefine.drivers.aloha_emulator import GRIPPER_ENDS
 from lerobot_vtrefine.drivers.dynamixel_arm import VIPERX_300S, WIDOWX_250S, ArmModel, DynamixelArm
 from lerobot_vtrefine.drivers.dynamixel_emulator import EmulatedMotor
@@ -214,6 +216,21 @@ def test_new_motors_get_their_ids_one_by_one(rig: Rig, monkeypatch: pytest.Monke
     assert len(asked) == 3
     assert sorted(motor.motor_id for motor in done) == [2, 3, 8]
     assert not arm.is_connected
+
+
+def test_arms_ask_their_adapters_not_to_wait(rig: Rig, monkeypatch: pytest.MonkeyPatch) -> None:
+    """An FTDI adapter holds an answer back for 16 ms otherwise, four times per control period."""
+    asked: list[str] = []
+    monkeypatch.setattr(serial.Serial, "set_low_latency_mode", lambda device, on: asked.append(device.port))
+    monkeypatch.setattr(dynamixel_arm, "latency_advice", lambda port: f"{port}: echo 1")
+    warned: list[str] = []
+    monkeypatch.setattr(dynamixel_arm.logger, "warning", lambda text, *values: warned.append(text % values))
+    port = rig.ports("leader")["left_port"]
+    arm = DynamixelArm("left", port, WIDOWX_250S, 0.04)
+    arm.connect()
+    arm.disconnect(torque_off=False)
+    assert asked == [port]
+    assert warned == [f"left arm: {port}: echo 1"]
 
 
 def connect_error(rig: Rig, **changes: object) -> str:
