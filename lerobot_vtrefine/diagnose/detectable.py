@@ -1,17 +1,14 @@
 """The smallest effect that these recordings would have shown, for every cause that was not found."""
 
-from collections.abc import Sequence
-
 import numpy as np
 
 from lerobot_vtrefine.diagnose.candidates import CATALOGUE
 from lerobot_vtrefine.diagnose.candidates.base import Form
-from lerobot_vtrefine.diagnose.fitting import predict
 from lerobot_vtrefine.diagnose.screening import Scorer
 
 MARGIN = 3.2 + 0.85
 """Standard errors that an effect must stand out by to pass the screening in four cases of five."""
-DOUBLINGS = 12
+CORRECTIONS = 3
 MAIN = {
     "nonlinear_stiffness": "exponent",
     "saturation": "knee_counts",
@@ -60,24 +57,22 @@ def _public(form: Form, values: np.ndarray, scorer: Scorer) -> float:
 
 
 def _smallest(form: Form, guess: np.ndarray, scorer: Scorer) -> np.ndarray | None:
-    """Injected sizes from far too small to large, doubling; the first that stands out, interpolated."""
+    """Injected sizes, corrected in proportion, until one just stands out; None if none can."""
     grow = _growing(form)
-    seen: tuple[float, float] | None = None
-    for power in np.arange(-DOUBLINGS // 2, DOUBLINGS):
-        factor = 2.0 ** float(power)
-        values = guess.copy()
-        values[grow] = guess[grow] * factor
-        if (values > form.high).any() or (values < form.low).any():
-            continue
+    values, best = guess.copy(), None
+    for _ in range(CORRECTIONS):
         strength = _strength(form, values, scorer)
         if strength >= MARGIN:
-            if seen is not None and strength > seen[1]:
-                share = (MARGIN - seen[1]) / (strength - seen[1])
-                factor = seen[0] + share * (factor - seen[0])
-            values[grow] = guess[grow] * factor
-            return values
-        seen = (factor, strength)
-    return None
+            best = values
+        if 0.9 <= strength / MARGIN <= 1.3:
+            break
+        factor = float(np.clip(MARGIN * 1.1 / max(strength, 1e-6), 0.02, 50.0))
+        values = values.copy()
+        values[grow] *= factor
+        if (values > form.high).any() or (values < form.low).any():
+            values = np.clip(values, form.low, form.high)
+            return values if _strength(form, values, scorer) >= MARGIN else best
+    return best
 
 
 def _growing(form: Form) -> np.ndarray:
@@ -87,9 +82,6 @@ def _growing(form: Form) -> np.ndarray:
 
 def _strength(form: Form, values: np.ndarray, scorer: Scorer) -> float:
     """Injected effect's score over the scatter of the recordings' scores."""
-    fitted, presses = scorer.fitted, scorer.presses
-    moved = predict(fitted.model.plus(form, values), presses)
-    change: Sequence[np.ndarray] = [a - b for a, b in zip(moved, fitted.signals, strict=True)]
-    scores, information = scorer.score(change)
+    scores, information = scorer.score(scorer.change(form, values))
     scatter = float(np.sqrt(np.sum((scores - scores.mean()) ** 2)))
     return float(information.sum()) / max(scatter, 1e-12)

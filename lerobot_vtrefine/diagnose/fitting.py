@@ -6,7 +6,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from lerobot_vtrefine.diagnose.composite import Composite
-from lerobot_vtrefine.diagnose.forward import Prefix, run_stages
+from lerobot_vtrefine.diagnose.forward import Bench, Prefix, run_stages
 from lerobot_vtrefine.diagnose.presses import PressSet
 from lerobot_vtrefine.diagnose.weights import TrialWeights
 
@@ -42,7 +42,15 @@ class Fit:
 
 def predict(model: Composite, presses: PressSet, cache: Prefix | None = None) -> list[np.ndarray]:
     """Expected signals above idle of every recording's scored taxels (T, n)."""
-    return run_stages(model.stages(), presses.presses, cache)
+    return run_stages(model.stages(), bench_of(presses), cache)
+
+
+def bench_of(presses: PressSet) -> Bench:
+    """The set's presses grouped for running models; kept with the set."""
+    kept = presses.__dict__.get("_bench")
+    if kept is None:
+        kept = presses.__dict__["_bench"] = Bench(presses.presses, presses.idle.level)
+    return kept
 
 
 def losses_of(

@@ -6,14 +6,17 @@ Stages without memory run as they are, on whole recordings. Those with memory ha
 
 import math
 from collections.abc import Callable, Sequence
-from dataclasses import replace
+from dataclasses import dataclass
+from functools import cached_property
+from itertools import pairwise
 from typing import Any
 
 import numpy as np
 import torch
 
-from lerobot_vtrefine.diagnose.presses import Press
+from lerobot_vtrefine.diagnose.presses import CropLayout, Press
 from lerobot_vtrefine.diagnose.refinement import needs_refinement
+from lerobot_vtrefine.tactile.layout import PadLayout
 from lerobot_vtrefine.tactile.stages.base import Frame, Stage
 from lerobot_vtrefine.tactile.stages.contact import ContactStage
 from lerobot_vtrefine.tactile.stages.host import Latency, SampleAndHold, ScanSkew
@@ -21,27 +24,99 @@ from lerobot_vtrefine.tactile.stages.mechanics import Hysteresis, ViscoelasticRe
 from lerobot_vtrefine.tactile.stages.readout import BaselineDrift, DeadTaxels, Quantisation, TaxelGainSpread
 
 Images = list[np.ndarray]
-"""Per press (T, r, c)."""
+"""Per group (T, r, c)."""
 MAX_EXPONENT = 200.0
 
 
-def run_stages(stages: Sequence[Stage], presses: Sequence[Press], cache: "Prefix | None" = None) -> Images:
+@dataclass(frozen=True)
+class Group:
+    """Presses that share a window of the pad, one after the other along time: arrays (sum of T, r, c)."""
+
+    layout: CropLayout
+    members: tuple[int, ...]
+    """Their numbers among all presses."""
+    bounds: tuple[slice, ...]
+    """Where each of them is."""
+    drive: np.ndarray
+    rate: np.ndarray
+    time_s: np.ndarray
+    session_s: np.ndarray
+    idle: np.ndarray
+    """(r, c) idle level [counts]."""
+    loaded: bool
+
+
+def group_presses(presses: Sequence[Press], idle: np.ndarray) -> list[Group]:
+    """Presses by window; work without memory is done for a whole group at once."""
+    by_window: dict[CropLayout, list[int]] = {}
+    for index, press in enumerate(presses):
+        by_window.setdefault(press.layout, []).append(index)
+    groups = []
+    for layout, members in by_window.items():
+        own = [presses[index] for index in members]
+        ends = np.cumsum([len(press.drive) for press in own]).tolist()
+        bounds = tuple(slice(e - len(press.drive), e) for e, press in zip(ends, own, strict=True))
+        groups.append(
+            Group(
+                layout,
+                tuple(members),
+                bounds,
+                np.concatenate([press.drive for press in own]),
+                np.concatenate([press.rate for press in own]),
+                np.concatenate([press.time_s for press in own]),
+                np.concatenate([press.session_s for press in own]),
+                layout.cut(idle),
+                own[0].loaded,
+            )
+        )
+    return groups
+
+
+class Bench:
+    """Presses ready to be run through models, as recorded and refined; built once per set."""
+
+    def __init__(self, presses: Sequence[Press], idle: np.ndarray) -> None:
+        self.presses, self._idle = presses, idle
+
+    @cached_property
+    def coarse(self) -> list[Group]:
+        """Frame by frame."""
+        return group_presses(self.presses, self._idle)
+
+    @cached_property
+    def fine(self) -> list[Group]:
+        """With frames in between."""
+        return group_presses([press.fine for press in self.presses], self._idle)
+
+    def scatter(self, groups: Sequence[Group], images: Images, fine: bool) -> list[np.ndarray]:
+        """From images per group to (T, n) per press, of its scored taxels."""
+        result: list[np.ndarray] = [np.empty(0)] * len(self.presses)
+        for group, image in zip(groups, images, strict=True):
+            for index, bound in zip(group.members, group.bounds, strict=True):
+                press = self.presses[index].fine if fine else self.presses[index]
+                result[index] = image[bound][:: press.substeps, press.scored]
+        return result
+
+
+def run_stages(stages: Sequence[Stage], bench: Bench, cache: "Prefix | None" = None) -> list[np.ndarray]:
     """Counts above idle that the stages predict for every press: (T, n) of its scored taxels.
 
     With a cache, work that earlier stages did for the same parameters is not repeated.
     """
+    if not bench.presses:
+        return []
     fine = needs_refinement(tuple(stages))
-    presses = [press.fine for press in presses] if fine else presses
+    groups = bench.fine if fine else bench.coarse
     contact = next(stage for stage in stages if isinstance(stage, ContactStage))
-    stiffness = float(contact.stiffness(presses[0].layout)) if presses else 1.0
+    stiffness = float(contact.stiffness(groups[0].layout))
     start, images = cache.lookup(stages, fine) if cache is not None else (0, None)
     if images is None:
-        images = [press.drive for press in presses]
+        images = [group.drive for group in groups]
     for index in range(start, len(stages)):
-        images = _apply(stages[index], images, presses, stiffness)
+        images = _apply(stages[index], images, groups, stiffness)
         if cache is not None:
             cache.store(index, images)
-    return [image[:: press.substeps, press.scored] for image, press in zip(images, presses, strict=True)]
+    return bench.scatter(groups, images, fine)
 
 
 class Prefix:
@@ -75,33 +150,40 @@ def _key(stage: Stage) -> Any:
     return stage
 
 
-def _apply(stage: Stage, images: Images, presses: Sequence[Press], stiffness: float) -> Images:
-    if isinstance(stage, ContactStage):
-        if presses and presses[0].loaded:
-            return images
-        pairs = zip(images, presses, strict=True)
-        return [_contact(stage, image, press) for image, press in pairs]
-    if stage.domain == "depth" and presses and presses[0].loaded:
+def _apply(stage: Stage, images: Images, groups: Sequence[Group], stiffness: float) -> Images:
+    if groups[0].loaded and (isinstance(stage, ContactStage) or stage.domain == "depth"):
         return images
-    together = TOGETHER.get(type(stage))
-    if together is not None:
-        return together(stage, images, presses, stiffness)
-    return [_one(stage, image, press, stiffness) for image, press in zip(images, presses, strict=True)]
+    if isinstance(stage, Hysteresis):
+        return _hysteresis(stage, images, groups, stiffness)
+    return [_one(stage, image, group, stiffness) for image, group in zip(images, groups, strict=True)]
 
 
-def _contact(stage: ContactStage, heights: np.ndarray, press: Press) -> np.ndarray:
-    return stage.force(torch.from_numpy(heights), torch.from_numpy(press.rate), press.layout).numpy()
-
-
-def _one(stage: Stage, image: np.ndarray, press: Press, stiffness: float) -> np.ndarray:
+def _one(stage: Stage, image: np.ndarray, group: Group, stiffness: float) -> np.ndarray:
+    if isinstance(stage, ContactStage):
+        return stage.force(torch.from_numpy(image), torch.from_numpy(group.rate), group.layout).numpy()
+    whole = WHOLE.get(type(stage))
+    if whole is not None:
+        return whole(stage, image, group)
     special = SEQUENCES.get(type(stage))
-    if special is not None:
-        return special(stage, image, press)
-    frame = Frame(press.layout, stiffness_n_per_m=stiffness, load_conserving=press.loaded)
-    x = torch.from_numpy(image)
-    if stage.has_state:
-        return stage.sequence(x, torch.from_numpy(press.time_s), frame).numpy()
-    return stage.step(x, {}, replace(frame, time_s=torch.from_numpy(press.time_s).view(-1, 1, 1)))[0].numpy()
+    if special is None and not stage.has_state:
+        frame = Frame(
+            group.layout,
+            time_s=torch.from_numpy(group.time_s).view(-1, 1, 1),
+            stiffness_n_per_m=stiffness,
+            load_conserving=group.loaded,
+        )
+        return stage.step(torch.from_numpy(image), {}, frame)[0].numpy()
+    pieces = []
+    for bound in group.bounds:
+        time_s = group.time_s[bound]
+        if special is not None:
+            pieces.append(special(stage, image[bound], time_s, group.layout))
+        else:
+            frame = Frame(group.layout, stiffness_n_per_m=stiffness, load_conserving=group.loaded)
+            pieces.append(
+                stage.sequence(torch.from_numpy(image[bound]), torch.from_numpy(time_s), frame).numpy()
+            )
+    return np.concatenate(pieces)
 
 
 def low_passed(x: np.ndarray, time_s: np.ndarray, tau_s: float) -> np.ndarray:
@@ -124,12 +206,14 @@ def low_passed(x: np.ndarray, time_s: np.ndarray, tau_s: float) -> np.ndarray:
     return slow
 
 
-def _relaxation(stage: ViscoelasticRelaxation, image: np.ndarray, press: Press) -> np.ndarray:
+def _relaxation(
+    stage: ViscoelasticRelaxation, image: np.ndarray, time_s: np.ndarray, layout: CropLayout
+) -> np.ndarray:
     taus = stage.tau_s if isinstance(stage.tau_s, tuple) else (stage.tau_s,)
     fractions = stage.fraction if isinstance(stage.fraction, tuple) else (stage.fraction,)
     relaxed = image.copy()
     for tau_s, fraction in zip(taus, fractions, strict=True):
-        relaxed -= fraction * low_passed(image, press.time_s, tau_s)
+        relaxed -= fraction * low_passed(image, time_s, tau_s)
     return relaxed
 
 
@@ -144,49 +228,40 @@ def delayed(x: np.ndarray, time_s: np.ndarray, delay_s: float) -> np.ndarray:
     return x[after - 1] + weight * (x[after] - x[after - 1])
 
 
-def _latency(stage: Latency, image: np.ndarray, press: Press) -> np.ndarray:
-    return delayed(image, press.time_s, float(stage.tau_s))
+def _latency(stage: Latency, image: np.ndarray, time_s: np.ndarray, layout: CropLayout) -> np.ndarray:
+    return delayed(image, time_s, float(stage.tau_s))
 
 
-def _scan_skew(stage: ScanSkew, image: np.ndarray, press: Press) -> np.ndarray:
-    rows = press.layout.full_rows
-    share = [(press.layout.row0 + row) / max(rows - 1, 1) for row in range(image.shape[1])]
-    late = [delayed(image[:, row], press.time_s, stage.skew_s * s) for row, s in enumerate(share)]
+def _scan_skew(stage: ScanSkew, image: np.ndarray, time_s: np.ndarray, layout: CropLayout) -> np.ndarray:
+    rows = layout.full_rows
+    share = [(layout.row0 + row) / max(rows - 1, 1) for row in range(image.shape[1])]
+    late = [delayed(image[:, row], time_s, stage.skew_s * s) for row, s in enumerate(share)]
     return np.stack(late, axis=1)
 
 
-def _hold(stage: SampleAndHold, image: np.ndarray, press: Press) -> np.ndarray:
-    slot = np.floor(press.time_s / stage.period_s + 1e-6).astype(np.int64)
+def _hold(stage: SampleAndHold, image: np.ndarray, time_s: np.ndarray, layout: CropLayout) -> np.ndarray:
+    slot = np.floor(time_s / stage.period_s + 1e-6).astype(np.int64)
     new = np.concatenate([[True], slot[1:] != slot[:-1]])
     return image[np.maximum.accumulate(np.where(new, np.arange(len(slot)), 0))]
 
 
-def _drift(stage: BaselineDrift, image: np.ndarray, press: Press) -> np.ndarray:
-    return image + (stage.rate_counts_per_s * press.session_s)[:, None, None]
+def _drift(stage: BaselineDrift, image: np.ndarray, group: Group) -> np.ndarray:
+    return image + (stage.rate_counts_per_s * group.session_s)[:, None, None]
 
 
-def _gain_map(stage: TaxelGainSpread, image: np.ndarray, press: Press) -> np.ndarray:
-    return image if stage.map is None else image * press.layout.cut(np.asarray(stage.map))
+def _gain_map(stage: TaxelGainSpread, image: np.ndarray, group: Group) -> np.ndarray:
+    return image if stage.map is None else image * group.layout.cut(np.asarray(stage.map))
 
 
-def _dead(stage: DeadTaxels, image: np.ndarray, press: Press) -> np.ndarray:
-    layout = press.layout
-    whole = replace_layout(layout)
+def _dead(stage: DeadTaxels, image: np.ndarray, group: Group) -> np.ndarray:
+    layout = group.layout
+    whole = PadLayout(layout.full_rows, layout.full_cols, layout.pitch_m)
     return image * layout.cut(stage.alive(whole).astype(float))
 
 
-def replace_layout(layout: Any) -> Any:
-    """The whole pad of a window."""
-    from lerobot_vtrefine.tactile.layout import PadLayout
-
-    return PadLayout(layout.full_rows, layout.full_cols, layout.pitch_m)
-
-
-def _convert(stage: Quantisation, image: np.ndarray, press: Press) -> np.ndarray:
+def _convert(stage: Quantisation, image: np.ndarray, group: Group) -> np.ndarray:
     """Clipping alone: rounding is not differentiable, and the mean over noise is not rounded."""
-    level = np.zeros(press.scored.shape)
-    level[press.scored] = press.idle
-    return image.clip(-level, np.maximum(stage.full_scale_counts - level, 0.0))
+    return image.clip(-group.idle, np.maximum(stage.full_scale_counts - group.idle, 0.0))
 
 
 def play(x: np.ndarray, half_width: float) -> np.ndarray:
@@ -203,39 +278,40 @@ def play(x: np.ndarray, half_width: float) -> np.ndarray:
     return out
 
 
-def _hysteresis(stage: Hysteresis, images: Images, presses: Sequence[Press], stiffness: float) -> Images:
+def _hysteresis(stage: Hysteresis, images: Images, groups: Sequence[Group], stiffness: float) -> Images:
     """All presses side by side, padded to the longest: the loop runs over frames once."""
-    touched = [(image > 0).any(axis=0) for image in images]
-    length = max(len(image) for image in images)
-    joined = np.zeros((length, sum(int(mask.sum()) for mask in touched)))
-    begin = 0
-    for image, mask in zip(images, touched, strict=True):
-        width = int(mask.sum())
-        joined[: len(image), begin : begin + width] = image[:, mask]
-        begin += width
+    pieces = [image[bound] for image, group in zip(images, groups, strict=True) for bound in group.bounds]
+    touched = [(piece > 0).any(axis=0) for piece in pieces]
+    widths_taken = [int(mask.sum()) for mask in touched]
+    joined = np.zeros((max(len(piece) for piece in pieces), sum(widths_taken)))
+    starts = np.concatenate([[0], np.cumsum(widths_taken)]).tolist()
+    for piece, mask, begin, end in zip(pieces, touched, starts[:-1], starts[1:], strict=True):
+        joined[: len(piece), begin:end] = piece[:, mask]
     widths = stage.width_m if isinstance(stage.width_m, tuple) else (stage.width_m,)
     fractions = stage.fraction if isinstance(stage.fraction, tuple) else (stage.fraction,)
     held = (1.0 - math.fsum(fractions)) * joined
     for width_m, fraction in zip(widths, fractions, strict=True):
         held += fraction * play(joined, 0.5 * width_m * stiffness)
-    outputs, begin = [], 0
-    for image, mask in zip(images, touched, strict=True):
-        width = int(mask.sum())
-        out = image * (1.0 - math.fsum(fractions))
-        out[:, mask] = held[: len(image), begin : begin + width]
+    outputs = []
+    for piece, mask, begin, end in zip(pieces, touched, starts[:-1], starts[1:], strict=True):
+        out = np.zeros_like(piece)
+        out[:, mask] = held[: len(piece), begin:end]
         outputs.append(out)
-        begin += width
-    return outputs
+    counts = np.cumsum([0, *(len(group.bounds) for group in groups)]).tolist()
+    return [np.concatenate(outputs[i:j]) for i, j in pairwise(counts)]
 
 
-SEQUENCES: dict[type, Callable[[Any, np.ndarray, Press], np.ndarray]] = {
+SEQUENCES: dict[type, Callable[[Any, np.ndarray, np.ndarray, CropLayout], np.ndarray]] = {
     ViscoelasticRelaxation: _relaxation,
     Latency: _latency,
     ScanSkew: _scan_skew,
     SampleAndHold: _hold,
+}
+"""Stages with memory: (stage, image of one press, its times, window)."""
+WHOLE: dict[type, Callable[[Any, np.ndarray, Group], np.ndarray]] = {
     BaselineDrift: _drift,
     TaxelGainSpread: _gain_map,
     DeadTaxels: _dead,
     Quantisation: _convert,
 }
-TOGETHER: dict[type, Callable[[Any, Images, Sequence[Press], float], Images]] = {Hysteresis: _hysteresis}
+"""Stages that need to know the whole pad or the session: (stage, image of a group, group)."""

@@ -13,6 +13,7 @@ import numpy as np
 
 from lerobot_vtrefine.diagnose.candidates.base import Form
 from lerobot_vtrefine.diagnose.fitting import Fit, predict
+from lerobot_vtrefine.diagnose.forward import Prefix
 from lerobot_vtrefine.diagnose.presses import PressSet
 from lerobot_vtrefine.diagnose.weights import TrialWeights
 
@@ -61,22 +62,6 @@ class Screened:
     p_adjusted: float
 
 
-def effective(
-    fitted: Fit,
-    presses: PressSet,
-    weights: Sequence[TrialWeights],
-    change: Sequence[np.ndarray],
-    tangent_columns: Sequence[Sequence[np.ndarray]],
-) -> tuple[np.ndarray, np.ndarray]:
-    """Scores and information (K,) of a change (T, n), cleared of the model's own tangents."""
-    grams = []
-    for k, (press, weight) in enumerate(zip(presses.presses, weights, strict=True)):
-        vectors = [weight.whiten(column[k]) for column in tangent_columns]
-        vectors += [weight.whiten(change[k]), weight.whiten(press.signal - fitted.signals[k])]
-        grams.append(weight.gram(np.stack(vectors, axis=1)))
-    return cleared(np.array(grams))
-
-
 def cleared(grams: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """From inner products of (own tangents..., change, residual) to effective scores and information (K,)."""
     total = grams.sum(axis=0)
@@ -104,11 +89,19 @@ class Scorer:
         columns: Sequence[Sequence[np.ndarray]],
     ) -> None:
         self.fitted, self.presses, self.weights = fitted, presses, weights
+        self._prefix = Prefix()
+        predict(fitted.model, presses, self._prefix)
+        self._prefix.frozen = True
         self._fixed = []
         for k, (press, weight) in enumerate(zip(presses.presses, weights, strict=True)):
             vectors = [weight.whiten(column[k]) for column in columns]
             vectors.append(weight.whiten(press.signal - fitted.signals[k]))
             self._fixed.append(np.stack(vectors, axis=1))
+
+    def change(self, form: Form, values: np.ndarray) -> list[np.ndarray]:
+        """What adding a form does to the expected signals: (T, n) per recording."""
+        moved = predict(self.fitted.model.plus(form, values), self.presses, self._prefix)
+        return [a - b for a, b in zip(moved, self.fitted.signals, strict=True)]
 
     def grams(self, changes: Sequence[Sequence[np.ndarray]]) -> np.ndarray:
         """Inner products of (own tangents, changes..., residual): (K, q, q)."""
@@ -125,14 +118,10 @@ class Scorer:
 
 def probe_form(form: Form, scorer: Scorer) -> list[Probe]:
     """Scores of all probes of a form."""
-    fitted, presses = scorer.fitted, scorer.presses
-    setting = fitted.model.setting
     probes = []
-    for guess in form.probes(setting):
+    for guess in form.probes(scorer.fitted.model.setting):
         values = np.asarray(guess, dtype=float)
-        moved = predict(fitted.model.plus(form, values), presses)
-        change = [a - b for a, b in zip(moved, fitted.signals, strict=True)]
-        scores, information = scorer.score(change)
+        scores, information = scorer.score(scorer.change(form, values))
         probes.append(Probe(form.family, form, values, scores, information, not form.signed))
     return probes
 
