@@ -1,0 +1,86 @@
+"""``report.html`` and ``calibration.json`` of a calibration."""
+
+from typing import Any
+
+from jinja2 import Environment, PackageLoader, StrictUndefined
+
+from lerobot_vtrefine.diagnose.calibration import figures
+from lerobot_vtrefine.diagnose.calibration.fit import Calibration
+from lerobot_vtrefine.diagnose.episode_replay.figures import data_uri
+from lerobot_vtrefine.diagnose.report.numbers import interval
+
+SCHEMA = "vtrefine/calibration@1"
+WORDS = {
+    "k_n": "stiffness per taxel",
+    "k_d": "damping per taxel",
+    "gain": "reading per force",
+    "knee_counts": "saturation: where readings level off",
+    "idle_mean": "idle level, mean over taxels",
+    "noise_sigma": "noise of one reading at rest",
+}
+
+
+def summary(calibration: Calibration, source: str) -> dict[str, Any]:
+    """All numbers as plain values."""
+    found = calibration.excitation
+    return {
+        "schema": SCHEMA,
+        "recording": source,
+        "parameters": {
+            name: {"value": item.value, "ci95": list(item.ci95) if item.ci95 else None, "unit": item.unit}
+            for name, item in calibration.parameters.items()
+        },
+        "explained": calibration.explained,
+        "rms_counts": calibration.rms_counts,
+        "saturation_p": calibration.saturation_p,
+        "recordings": found.recordings,
+        "speeds_m_s": list(found.speeds_m_s),
+        "peaks": found.peaks.tolist(),
+        "remarks": remarks(calibration),
+        "data_issues": [[issue.trial, issue.problem, issue.action] for issue in calibration.issues],
+    }
+
+
+def remarks(calibration: Calibration) -> list[str]:
+    """What a user should know about the result, in sentences."""
+    said = []
+    k_d = calibration.parameters.get("k_d")
+    value, bounds = (k_d.value, k_d.ci95) if k_d is not None else (None, None)
+    if bounds is not None and value == 0.0:
+        said.append(
+            "k_d ended at 0: readings come later than the motion, as with a latency; vtrefine-diagnose tells."
+        )
+    elif bounds is not None and isinstance(value, float) and bounds[1] - bounds[0] > value:
+        said.append("k_d is uncertain by half its value or more: record faster presses to know it better.")
+    if calibration.rms_counts > 2.0 * calibration.noise_counts:
+        said.append(
+            f"The fit misses by {calibration.rms_counts:.1f} counts RMS, with noise of"
+            f" {calibration.noise_counts:.1f}: something else is at work; vtrefine-diagnose names it."
+        )
+    return said
+
+
+def render_page(calibration: Calibration, source: str) -> str:
+    """The page as HTML text; figures are embedded."""
+    environment = Environment(
+        loader=PackageLoader("lerobot_vtrefine.diagnose.calibration", "."),
+        autoescape=True,
+        undefined=StrictUndefined,
+        trim_blocks=True,
+        lstrip_blocks=True,
+    )
+    rows = [
+        (name, WORDS.get(name, name.replace("_", " ")), *interval(item.value, item.ci95, item.unit))
+        for name, item in calibration.parameters.items()
+        if isinstance(item.value, float)
+    ]
+    return environment.get_template("page.html").render(
+        source=source,
+        calibration=calibration,
+        rows=rows,
+        remarks=remarks(calibration),
+        stages=[stage.name for stage in calibration.model.stages],
+        curves=data_uri(figures.response_curves(calibration)),
+        draws=data_uri(figures.resampled(calibration)) if calibration.draws else None,
+        presses=data_uri(figures.presses_over_time(calibration)),
+    )
