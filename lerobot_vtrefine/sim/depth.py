@@ -15,6 +15,7 @@ from scipy.spatial import ConvexHull
 from lerobot_vtrefine.sim.camera import Camera, depth_to_millimetres
 from lerobot_vtrefine.sim.depth_kernels import MISS, ivec4, project, raster
 from lerobot_vtrefine.tactile.contact_query import start_warp
+from lerobot_vtrefine.tactile.workers import Workers
 
 Array = np.ndarray
 
@@ -25,8 +26,16 @@ class DepthCamera:
     Shapes: m worlds of `ids`, G geoms of the model, H x W pixels.
     """
 
-    def __init__(self, model: mujoco.MjModel, camera: Camera, num_envs: int, device: str = "cpu") -> None:
+    def __init__(
+        self,
+        model: mujoco.MjModel,
+        camera: Camera,
+        num_envs: int,
+        device: str = "cpu",
+        num_threads: int = 1,
+    ) -> None:
         start_warp()
+        self._workers = Workers(num_threads if device == "cpu" else 1)
         self._camera, self._device = camera, device
         self._intrinsics = wp.vec4(camera.fx, camera.fy, camera.cx, camera.cy)
         moving = model.body_weldid[model.geom_bodyid] != 0
@@ -140,7 +149,11 @@ class DepthCamera:
         wp.launch(project, (count, len(select)), inputs, device=device, record_tape=False)
         inputs = [solids.kind, size, shared, pos, rot, cover, solids.planes, solids.plane_range]
         inputs += [self._intrinsics, width, wp.from_torch(depth)]
-        wp.launch(raster, (count, height), inputs, device=device, record_tape=False)
+
+        def part(worker: int, begin: int, end: int) -> None:
+            wp.launch(raster, (end - begin, height), [begin, *inputs], device=device, record_tape=False)
+
+        self._workers.split(count, part)
 
 
 class _Solids:

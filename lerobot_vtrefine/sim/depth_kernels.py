@@ -177,6 +177,7 @@ def project(
 
 @wp.kernel
 def raster(
+    first_world: int,
     kind: wp.array(dtype=int),
     size: wp.array(dtype=wp.vec3, ndim=2),
     shared: int,
@@ -189,8 +190,9 @@ def raster(
     width: int,
     depth: wp.array(dtype=float, ndim=3),
 ) -> None:
-    """Lower `depth` [m] to the nearest geom of each pixel; one thread per image row."""
-    world, row = wp.tid()
+    """Lower `depth` [m] to the nearest geom of each pixel, from `first_world` on; a thread per image row."""
+    nth, row = wp.tid()
+    world = first_world + nth
     own = wp.where(shared == 1, 0, world)
     for geom in range(kind.shape[0]):
         rect = cover[world, geom]

@@ -13,7 +13,14 @@ from lerobot_vtrefine.embodiments import Embodiment
 from lerobot_vtrefine.sim.pairs import Part
 from lerobot_vtrefine.sim.rotations import quat_to_matrix, turn, turn_back
 from lerobot_vtrefine.sim.scene import Scene
-from lerobot_vtrefine.tactile import BodyGeometry, PadLayout, PadSensors, SensorModel, layout_from_mesh
+from lerobot_vtrefine.tactile import (
+    BodyGeometry,
+    PadLayout,
+    PadSensors,
+    Poses,
+    SensorModel,
+    layout_from_mesh,
+)
 
 if TYPE_CHECKING:
     from lerobot_vtrefine.sim.touch import Touch
@@ -84,12 +91,20 @@ class Pads:
     """The four pads of every world."""
 
     def __init__(
-        self, scene: Scene, model: SensorModel, num_envs: int, control_dt_s: float, device: str = "cpu"
+        self,
+        scene: Scene,
+        model: SensorModel,
+        num_envs: int,
+        control_dt_s: float,
+        device: str = "cpu",
+        num_threads: int = 1,
     ) -> None:
         self._dt_s = control_dt_s
         bodies = [_touch_geometry(scene.pair.plug), _touch_geometry(scene.pair.socket)]
         self.layout = pad_layout(scene.embodiment)
-        self.sensors = PadSensors(self.layout, bodies, num_envs, num_pads=4, model=model, device=device)
+        self.sensors = PadSensors(
+            self.layout, bodies, num_envs, 4, model=model, device=device, num_threads=num_threads
+        )
         self.remembers = model.has_state
         """Whether readings depend on earlier ones, so that every control step must `advance`."""
         self._last = np.zeros((num_envs, 4, self.layout.num_taxels), np.uint8)
@@ -117,7 +132,7 @@ class Pads:
         self._last[env] = state["last"]
 
     def _read(self, ids: Array, touch: "Touch") -> Array:
-        counts = self.sensors.counts(ids, *touch.poses, self._dt_s, touch.load)
+        counts = self.sensors.counts(ids, Poses(*touch.poses), self._dt_s, touch.load)
         return counts.cpu().numpy() if isinstance(counts, torch.Tensor) else counts
 
 

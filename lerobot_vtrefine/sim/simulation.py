@@ -11,6 +11,7 @@ import numpy as np
 
 from lerobot_vtrefine.sim import sensing, starts, task
 from lerobot_vtrefine.sim.backends import Trace, get_backend
+from lerobot_vtrefine.sim.backends.batch import usable_cores
 from lerobot_vtrefine.sim.config import RANGES, RandomizationConfig, SceneConfig, TaskConfig, WarpConfig
 from lerobot_vtrefine.sim.depth import DepthCamera
 from lerobot_vtrefine.sim.drive import make_drive
@@ -90,13 +91,14 @@ class InsertionSim:
         self._randomizer = Randomizer(self.scene, randomization or RandomizationConfig())
         model = SensorModel.named(sensor) if isinstance(sensor, str) else sensor
         device = self._backend.device
-        self._pads = sensing.Pads(self.scene, model, num_envs, self.config.control_dt_s, device)
+        threads = (num_threads or usable_cores()) if backend == "batch" else 1
+        self._pads = sensing.Pads(self.scene, model, num_envs, self.config.control_dt_s, device, threads)
         window = max(1, round(self.config.limits.force_window_s / self.scene.config.timestep_s))
         self._episode = EpisodeState.empty(num_envs, self.scene.model.nu, window)
         self._rates = task.rate_limits(self.scene.embodiment, self.config)
         everyone = self._randomizer.draw(np.zeros(num_envs, np.int64))
         self._parameters = dict(everyone.values)
-        self._depth = DepthCamera(self.scene.model, self.scene.camera, num_envs, device)
+        self._depth = DepthCamera(self.scene.model, self.scene.camera, num_envs, device, threads)
         self._settler = Settler(self.scene, self.config, self._backend, self._touch)
         self._drive = make_drive(
             self._backend, self.scene.embodiment, self.substeps, self.config, robot_faults

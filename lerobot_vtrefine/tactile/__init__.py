@@ -7,6 +7,7 @@ Importing it does not import warp; the first use of `PadSensors` does.
 from lerobot_vtrefine.tactile.geometry import BodyGeometry, Box, ConvexHull, Cylinder, Sphere, TriangleMesh
 from lerobot_vtrefine.tactile.layout import PadLayout, layout_from_mesh
 from lerobot_vtrefine.tactile.model import SensorModel
+from lerobot_vtrefine.tactile.poses import Poses
 from lerobot_vtrefine.tactile.sensors import PadSensors
 
 __all__ = [
@@ -16,6 +17,7 @@ __all__ = [
     "Cylinder",
     "PadLayout",
     "PadSensors",
+    "Poses",
     "SensorModel",
     "Sphere",
     "TriangleMesh",

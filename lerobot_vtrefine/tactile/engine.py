@@ -22,12 +22,18 @@ class ContactEngine:
     """
 
     def __init__(
-        self, layout: PadLayout, bodies: Sequence[BodyGeometry], model: SensorModel, solved: bool, device: str
+        self,
+        layout: PadLayout,
+        bodies: Sequence[BodyGeometry],
+        model: SensorModel,
+        solved: bool,
+        device: str,
+        num_threads: int = 1,
     ) -> None:
         self.layout, self._depth_stages, self._solved = layout, model.depth_stages, solved
         subdivision = model.contact.subdivision if solved else 1
         self._query = ContactQuery(layout, list(bodies), device, subdivision)
-        self._solver = ContactSolver(layout, self._query)
+        self._solver = ContactSolver(layout, self._query, num_threads)
         # A face that is moved needs the gap where it does not touch yet, which only the column query gives.
         self._mode = "column" if model.depth_stages else model.contact.query
         pitch_m = layout.pitch_m / subdivision

@@ -12,6 +12,7 @@ import warp as wp
 from lerobot_vtrefine.tactile import kernels_press
 from lerobot_vtrefine.tactile.contact_query import ContactQuery, start_warp
 from lerobot_vtrefine.tactile.layout import PadLayout
+from lerobot_vtrefine.tactile.workers import Workers
 
 Poses = tuple[torch.Tensor, ...]
 PerEnv = torch.Tensor | float
@@ -24,10 +25,14 @@ class ContactSolver:
     Args:
         query: the bodies and the lattice. With a subdivision above 1, pressure is averaged over that many
             lattice points per taxel and direction.
+        num_threads: that share the environments on CPU; results do not depend on it.
     """
 
-    def __init__(self, layout: PadLayout, query: ContactQuery) -> None:
+    def __init__(self, layout: PadLayout, query: ContactQuery, num_threads: int = 1) -> None:
         start_warp()
+        self._workers = Workers(num_threads if query.lanes == 1 else 1)
+        # Loaded here, before threads could do so at once.
+        wp.load_module(kernels_press, device=query.device)
         self.layout, self.query, self.device = layout, query, query.device
         offsets = np.arange(query.cols) // query.subdivision - (layout.cols - 1) / 2
         self._taxel_x = wp.array(offsets.astype(np.float32), dtype=float, device=self.device)
@@ -66,9 +71,9 @@ class ContactSolver:
             scratch = [self._buffer(0, envs, pads), self._buffer(1, envs, pads)]
         else:
             scratch = [wp.from_torch(item.reshape(envs * pads, -1).contiguous()) for item in heights]
-        work = self._work(heights is not None)
-        inputs = [lattice, work, int(heights is not None), foundation, self.query.bodies, views, loads]
-        self._launch(kernels_press.press, envs, pads, [*inputs, *scratch, force, solution])
+        own = heights is not None
+        inputs = [lattice, int(own), foundation, self.query.bodies, views, loads, *scratch, force, solution]
+        self._launch(kernels_press.press, (envs, pads), own, inputs)
         return wp.to_torch(force).view(envs, pads, self.layout.rows, self.layout.cols), wp.to_torch(solution)
 
     def penalty(
@@ -94,8 +99,8 @@ class ContactSolver:
         )
         penalty.ceiling = self._own(ceiling_n, envs)
         force, _ = self._results(envs, pads)
-        inputs = [lattice, self._work(False), penalty, self.query.bodies, views]
-        self._launch(kernels_press.penalise, envs, pads, [*inputs, self._buffer(1, envs, pads), force])
+        inputs = [lattice, penalty, self.query.bodies, views, self._buffer(1, envs, pads), force]
+        self._launch(kernels_press.penalise, (envs, pads), False, inputs)
         return wp.to_torch(force).view(envs, pads, self.layout.rows, self.layout.cols)
 
     def _own(self, values: PerEnv, envs: int) -> wp.array:
@@ -115,18 +120,21 @@ class ContactSolver:
         return self._forces[envs, pads]
 
     def _buffer(self, number: int, envs: int, pads: int) -> wp.array:
-        """Scratch: on CPU one lattice for all pads, on CUDA one each."""
-        count = envs * pads if self.query.lanes > 1 else 1
+        """Scratch: on CPU one lattice for each thread, on CUDA for each pad."""
+        count = envs * pads if self.query.lanes > 1 else self._workers.num_threads
         if number not in self._scratch or len(self._scratch[number]) < count:
             shape = (count, self.query.rows * self.query.cols)
             self._scratch[number] = wp.zeros(shape, dtype=float, device=self.device)
         return self._scratch[number]
 
-    def _work(self, own_buffers: bool) -> Any:
-        work = kernels_press.Work()
-        work.lanes = self.query.lanes
-        work.own_buffers = int(own_buffers or self.query.lanes > 1)
-        return work
+    def _launch(self, kernel: wp.Kernel, size: tuple[int, int], own_buffers: bool, inputs: list[Any]) -> None:
+        """Launch on all environments and pads; the kernel's second argument, its share of them, is added."""
 
-    def _launch(self, kernel: wp.Kernel, envs: int, pads: int, inputs: list[Any]) -> None:
-        self.query.launch(kernel, (envs, pads, self.query.lanes), inputs)
+        def part(worker: int, begin: int, end: int) -> None:
+            work = kernels_press.Work()
+            work.lanes, work.first_env = self.query.lanes, begin
+            work.own_buffers = int(own_buffers or self.query.lanes > 1)
+            work.buffer = 0 if work.own_buffers else worker
+            self.query.launch(kernel, (end - begin, size[1], work.lanes), [inputs[0], work, *inputs[1:]])
+
+        self._workers.split(size[0], part)

@@ -57,6 +57,14 @@ class Foundation:
 
 
 @wp.struct
+class Settled:
+    """The highest height plus lead under a pad (NO_BODY_M: nothing), and the face there: (delta, a, b)."""
+
+    top: float
+    face: wp.vec3d
+
+
+@wp.struct
 class Penalty:
     """Per environment f = min(max(0, stiffness d + damping d'), ceiling) where d > 0 [N/m, N s/m, N]."""
 
@@ -66,12 +74,12 @@ class Penalty:
 
 
 @wp.func
-def make_share(lattice: Lattice, lane: int, lanes: int) -> Share:
-    """The part of the lattice that a thread owns."""
+def make_share(width: int, lane: int, lanes: int) -> Share:
+    """The columns that a thread owns, `width` neighbouring ones at a time."""
     share = Share()
     share.lane = lane
     share.lanes = lanes
-    share.width = lattice.subdivision
+    share.width = width
     return share
 
 
@@ -88,6 +96,63 @@ def fastest_lead(
             turning = wp.length(views.angular[env, pad, k])
             speed = wp.max(speed, wp.length(views.linear[env, pad, k]) + turning * (size + lattice.reach))
     return wp.min(damping_s * speed / -STEEPEST, MAX_LEAD_M)
+
+
+@wp.func
+def left_out_matters(
+    lattice: Lattice,
+    bodies: Bodies,
+    views: Views,
+    env: int,
+    side: int,
+    low: float,
+    lead: float,
+    found: Settled,
+) -> int:
+    """1 where a face could have come down to surfaces more than `low` above it, which were left out."""
+    rows = wp.float64(lattice.rows / lattice.subdivision) * wp.float64(0.5)
+    cols = wp.float64(lattice.cols / lattice.subdivision) * wp.float64(0.5)
+    deepest = found.face[0] + wp.abs(found.face[1]) * cols + wp.abs(found.face[2]) * rows
+    return int(wp.float32(deepest) + fastest_lead(lattice, bodies, views, env, side, lead) > low)
+
+
+@wp.func
+def settle(
+    lattice: Lattice,
+    pad: Pad,
+    filled: int,
+    foundation: Foundation,
+    bodies: Bodies,
+    views: Views,
+    env: int,
+    side: int,
+    push: wp.vec3,
+    heights: wp.array(dtype=float),
+    leads: wp.array(dtype=float),
+) -> Settled:
+    """Where one pad's face comes to rest under `push`; fills the scratch with heights (and plus lead)."""
+    damping_s = foundation.damping_s[env]
+    pitch = lattice.pitch * float(lattice.subdivision)
+    low = float(lattice.reach)
+    if filled == 0:
+        low = wp.min(SHALLOW_M, lattice.reach)
+    found = Settled()
+    searching = int(1)
+    while searching == 1:
+        if filled == 0:
+            fill_area(pad.share, pad.area, lattice.cols, NO_BODY_M, heights)
+            fill_pad(lattice, pad.share, low, bodies, views, env, side, heights, leads)
+        top = max_lanes(add_lead(pad.share, pad.area, lattice.cols, damping_s, MAX_LEAD_M, heights, leads))
+        found.top = top
+        searching = int(low < lattice.reach)
+        if top > 0.5 * NO_BODY_M:
+            found.face = solve_pad(
+                pad, pitch, foundation.stiffness[env], push, top, foundation.taxel_x, leads
+            )
+            if searching == 1:
+                searching = left_out_matters(lattice, bodies, views, env, side, low, damping_s, found)
+        low = lattice.reach
+    return found
 
 
 @wp.kernel
@@ -111,62 +176,33 @@ def press(
     """
     row, side, lane = wp.tid()
     env = work.first_env + row
-    share = make_share(lattice, lane, work.lanes)
+    out = force[env, side]
+    whole = ivec4(0, lattice.rows / lattice.subdivision, 0, lattice.cols / lattice.subdivision)
+    fill_area(make_share(1, lane, work.lanes), whole, whole[3], 0.0, out)
+    push = load[env, side]
+    if push[0] <= 0.0:
+        return
     pad = Pad()
     pad.rows = lattice.rows
     pad.cols = lattice.cols
     pad.subdivision = lattice.subdivision
-    pad.share = share
-    out = force[env, side]
-    taxels = Share()
-    taxels.lane = lane
-    taxels.lanes = work.lanes
-    taxels.width = 1
-    whole = ivec4(0, lattice.rows / lattice.subdivision, 0, lattice.cols / lattice.subdivision)
-    fill_area(taxels, whole, whole[3], 0.0, out)
-    push = load[env, side]
-    if push[0] <= 0.0:
-        return
+    pad.share = make_share(lattice.subdivision, lane, work.lanes)
     pad.area = contact_area(lattice.rows, lattice.cols, lattice.subdivision, views.window[env, side])
     slot = work.buffer + work.own_buffers * (env * load.shape[1] + side)
-    heights = height[slot]
     leads = rate[slot]
-    damping_s = foundation.damping_s[env]
-    stiffness = foundation.stiffness[env]
+    found = settle(lattice, pad, filled, foundation, bodies, views, env, side, push, height[slot], leads)
     pitch = lattice.pitch * float(lattice.subdivision)
-    scale = wp.float64(1.0) / wp.float64(pitch)
-    low = float(lattice.reach)
-    if filled == 0:
-        low = wp.min(SHALLOW_M, lattice.reach)
-    top = float(NO_BODY_M)
-    answer = wp.vec3d()
-    done = int(0)
-    while done == 0:
-        if filled == 0:
-            fill_area(share, pad.area, lattice.cols, NO_BODY_M, heights)
-            fill_pad(lattice, share, low, bodies, views, env, side, heights, leads)
-        top = max_lanes(add_lead(share, pad.area, lattice.cols, damping_s, MAX_LEAD_M, heights, leads))
-        if top > 0.5 * NO_BODY_M:
-            answer = solve_pad(pad, pitch, stiffness, push, top, foundation.taxel_x, leads)
-        if low >= lattice.reach:
-            done = 1
-        elif top > 0.5 * NO_BODY_M:
-            # Whatever was left out lies below -low: can the face have come down to it anywhere?
-            rows = 0.5 * float(lattice.rows / lattice.subdivision)
-            cols = 0.5 * float(lattice.cols / lattice.subdivision)
-            deepest = answer[0] + wp.abs(answer[1]) * wp.float64(cols) + wp.abs(answer[2]) * wp.float64(rows)
-            if wp.float32(deepest) + fastest_lead(lattice, bodies, views, env, side, damping_s) <= low:
-                done = 1
-        low = lattice.reach
-    if top <= 0.5 * NO_BODY_M:
+    if found.top <= 0.5 * NO_BODY_M:
         if lane == 0:
             spread_load(whole[1], whole[3], pitch, push, out)
             solution[env, side] = wp.vec3()
         return
+    stiffness = foundation.stiffness[env]
     total = wp.float64(push[0]) / wp.float64(stiffness)
-    write_forces(pad, stiffness, foundation.taxel_x, leads, answer, total, out)
+    write_forces(pad, stiffness, foundation.taxel_x, leads, found.face, total, out)
     if lane == 0:
-        solution[env, side] = wp.vec3(wp.vec3d(answer[0], answer[1] * scale, answer[2] * scale))
+        scale = wp.float64(1.0) / wp.float64(pitch)
+        solution[env, side] = wp.vec3(wp.vec3d(found.face[0], found.face[1] * scale, found.face[2] * scale))
 
 
 @wp.kernel
@@ -182,7 +218,7 @@ def penalise(
     """Forces [N] on all taxels by a penalty on depth and its rate; `rate` is scratch."""
     row, side, lane = wp.tid()
     env = work.first_env + row
-    share = make_share(lattice, lane, work.lanes)
+    share = make_share(lattice.subdivision, lane, work.lanes)
     depth = force[env, side]
     rates = rate[work.buffer + work.own_buffers * (env * force.shape[1] + side)]
     # Gaps carry no force: only what lies below the face is looked at.

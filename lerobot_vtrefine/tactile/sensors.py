@@ -10,14 +10,13 @@ import torch
 from lerobot_vtrefine.tactile.geometry import BodyGeometry
 from lerobot_vtrefine.tactile.layout import PadLayout
 from lerobot_vtrefine.tactile.model import SensorModel
+from lerobot_vtrefine.tactile.poses import ArrayLike, Poses
 from lerobot_vtrefine.tactile.stages.base import Frame, Stage, State
 from lerobot_vtrefine.tactile.stages.contact import ContactStage
 from lerobot_vtrefine.tactile.stages.readout import Gain
 
 if TYPE_CHECKING:
     from lerobot_vtrefine.tactile.engine import ContactEngine
-
-ArrayLike = np.ndarray | torch.Tensor
 
 
 def _per_env(values: torch.Tensor) -> torch.Tensor:
@@ -36,6 +35,7 @@ class PadSensors:
         model: the sensor model.
         device: torch device on which everything is computed.
         seed: used for environments until `reset` gives them their own.
+        num_threads: that share the contact's work on CPU; results do not depend on it.
     """
 
     def __init__(
@@ -47,13 +47,14 @@ class PadSensors:
         model: SensorModel | None = None,
         device: str = "cpu",
         seed: int = 0,
+        num_threads: int = 1,
     ) -> None:
         if num_envs < 1 or num_pads < 1:
             raise ValueError(f"need at least one environment and one pad, got {num_envs} and {num_pads}")
         self.layout, self.bodies = layout, list(bodies)
         self.num_envs, self.num_pads = num_envs, num_pads
         self.model = model or SensorModel.default()
-        self.device = torch.device(device)
+        self.device, self._num_threads = torch.device(device), num_threads
         self._time_s = torch.zeros(num_envs, dtype=torch.float64, device=self.device)
         self._stiffness_scale = torch.ones(num_envs, device=self.device)
         self._gain_scale = torch.ones(num_envs, device=self.device)
@@ -230,7 +231,7 @@ class PadSensors:
         return torch.as_tensor(array, device=self.device).to(torch.float32)
 
     def _contact_forces(
-        self, index: torch.Tensor, poses: Sequence[ArrayLike], load: ArrayLike | None, frame: Frame
+        self, index: torch.Tensor, poses: Poses, load: ArrayLike | None, frame: Frame
     ) -> torch.Tensor:
         contact = self._contact_stage(index)
         solved = contact.load_conserving and load is not None
@@ -238,51 +239,24 @@ class PadSensors:
             from lerobot_vtrefine.tactile.engine import ContactEngine  # warp is slow to import
 
             self._engines[solved] = ContactEngine(
-                self.layout, self.bodies, self.model, solved, str(self.device)
+                self.layout, self.bodies, self.model, solved, str(self.device), self._num_threads
             )
         loads = None if load is None else self._tensor(load)
         # The engine reuses its buffers, while callers and stages with memory may keep what they get.
         return self._engines[solved](contact, [self._tensor(pose) for pose in poses], loads, frame).clone()
 
-    def forces(
-        self,
-        ids: np.ndarray,
-        pad_pos: ArrayLike,
-        pad_rot: ArrayLike,
-        pad_vel: ArrayLike,
-        body_pos: ArrayLike,
-        body_rot: ArrayLike,
-        body_vel: ArrayLike,
-        dt_s: float,
-        load: ArrayLike | None = None,
-    ) -> ArrayLike:
+    def forces(self, ids: np.ndarray, poses: Poses, dt_s: float, load: ArrayLike | None = None) -> ArrayLike:
         """Contact force per taxel before mechanics and readout: (m, P, N) float32 [N]; arguments as in
         `counts`."""
         index = torch.as_tensor(np.atleast_1d(ids), dtype=torch.long, device=self.device)
-        poses = (pad_pos, pad_rot, pad_vel, body_pos, body_rot, body_vel)
         force = self._contact_forces(index, poses, load, self._frame(index, dt_s, load)).flatten(2)
-        return force if isinstance(pad_pos, torch.Tensor) else force.cpu().numpy()
+        return force if isinstance(poses.pad_pos, torch.Tensor) else force.cpu().numpy()
 
-    def counts(
-        self,
-        ids: np.ndarray,
-        pad_pos: ArrayLike,
-        pad_rot: ArrayLike,
-        pad_vel: ArrayLike,
-        body_pos: ArrayLike,
-        body_rot: ArrayLike,
-        body_vel: ArrayLike,
-        dt_s: float,
-        load: ArrayLike | None = None,
-    ) -> ArrayLike:
+    def counts(self, ids: np.ndarray, poses: Poses, dt_s: float, load: ArrayLike | None = None) -> ArrayLike:
         """Raw counts (m, P, N) uint8 of the named environments; advances their state by one frame of `dt_s`.
 
         Args:
             ids: (m,) environments, without repetition.
-            pad_pos, pad_rot: pad frames in the world, (m, P, 3) [m] and (m, P, 3, 3).
-            pad_vel: (m, P, 6) velocity of the pad's origin [m/s], then angular velocity [rad/s], in the
-                world.
-            body_pos, body_rot, body_vel: the same for the bodies' frames, (m, B, ...).
             dt_s: time since the previous frame [s].
             load: (m, P, 3) the solver's normal force on each pad [N] and its centre x, y in the pad frame
                 [m].
@@ -291,9 +265,8 @@ class PadSensors:
         """
         index = torch.as_tensor(np.atleast_1d(ids), dtype=torch.long, device=self.device)
         frame = self._frame(index, dt_s, load)
-        poses = (pad_pos, pad_rot, pad_vel, body_pos, body_rot, body_vel)
         force = self._contact_forces(index, poses, load, frame)
         counts = self._run(self.model.force_stages, force, index, frame)
         self._time_s[index] += dt_s
         counts = counts.flatten(2).clamp(0.0, 255.0).to(torch.uint8)
-        return counts if isinstance(pad_pos, torch.Tensor) else counts.cpu().numpy()
+        return counts if isinstance(poses.pad_pos, torch.Tensor) else counts.cpu().numpy()

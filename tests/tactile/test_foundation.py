@@ -7,7 +7,16 @@ from scipy.integrate import dblquad
 from scipy.optimize import brentq
 from touch_shapes import hexagon, random_rotation, ring_mesh, single_query
 
-from lerobot_vtrefine.tactile import BodyGeometry, Box, Cylinder, PadLayout, PadSensors, SensorModel, Sphere
+from lerobot_vtrefine.tactile import (
+    BodyGeometry,
+    Box,
+    Cylinder,
+    PadLayout,
+    PadSensors,
+    Poses,
+    SensorModel,
+    Sphere,
+)
 from lerobot_vtrefine.tactile.contact_query import ContactQuery
 from lerobot_vtrefine.tactile.foundation import ContactSolver
 from lerobot_vtrefine.tactile.geometry import Primitive
@@ -29,17 +38,15 @@ def press(
     count, number = position.shape[:2]
     sensors = PadSensors(LAYOUT, [BodyGeometry(body) for body in bodies], count, num_pads=1, model=MODEL)
     eye = np.broadcast_to(np.eye(3), (count, 1, 3, 3))
-    forces = sensors.forces(
-        np.arange(count),
+    poses = Poses(
         np.zeros((count, 1, 3)),
         eye,
         np.zeros((count, 1, 6)),
         position,
         np.broadcast_to(np.eye(3), (count, number, 3, 3)) if rotation is None else rotation,
         np.zeros((count, number, 6)) if velocity is None else velocity,
-        0.1,
-        load[:, None],
     )
+    forces = sensors.forces(np.arange(count), poses, 0.1, load[:, None])
     return np.asarray(forces).reshape(count, LAYOUT.rows, LAYOUT.cols).astype(float)
 
 

@@ -2,12 +2,13 @@
 
 import subprocess
 import sys
+from typing import Any
 
 import numpy as np
 import pytest
 import torch
 
-from lerobot_vtrefine.tactile import BodyGeometry, Box, PadLayout, PadSensors, SensorModel, Sphere
+from lerobot_vtrefine.tactile import BodyGeometry, Box, PadLayout, PadSensors, Poses, SensorModel, Sphere
 from lerobot_vtrefine.tactile.stages.base import STAGES
 from lerobot_vtrefine.tactile.stages.contact import Depth, FlexitacIsaacSim, KelvinVoigt, TacSL
 from lerobot_vtrefine.tactile.stages.host import Latency, SampleAndHold
@@ -34,7 +35,7 @@ def everything() -> SensorModel:
     return model
 
 
-def scene(count: int, seed: int = 0) -> dict[str, np.ndarray]:
+def scene(count: int, seed: int = 0) -> dict[str, Any]:
     """Random grasps of `count` environments: arguments of `PadSensors.counts` after `ids`."""
     rng = np.random.default_rng(seed)
     eye = np.eye(3)
@@ -44,20 +45,20 @@ def scene(count: int, seed: int = 0) -> dict[str, np.ndarray]:
     body[:, :, 2] -= rng.uniform(0, 4e-4, (count, 2))
     load = np.zeros((count, 4, 3))
     load[..., 0] = rng.uniform(5, 20, (count, 4))
-    return {
-        "pad_pos": rng.normal(0, 1e-4, (count, 4, 3)),
-        "pad_rot": np.broadcast_to(eye, (count, 4, 3, 3)),
-        "pad_vel": rng.normal(0, 0.01, (count, 4, 6)),
-        "body_pos": body,
-        "body_rot": np.broadcast_to(eye, (count, 2, 3, 3)),
-        "body_vel": np.zeros((count, 2, 6)),
-        "dt_s": 0.1,
-        "load": load,
-    }
+    poses = Poses(
+        pad_pos=rng.normal(0, 1e-4, (count, 4, 3)),
+        pad_rot=np.broadcast_to(eye, (count, 4, 3, 3)),
+        pad_vel=rng.normal(0, 0.01, (count, 4, 6)),
+        body_pos=body,
+        body_rot=np.broadcast_to(eye, (count, 2, 3, 3)),
+        body_vel=np.zeros((count, 2, 6)),
+    )
+    return {"poses": poses, "dt_s": 0.1, "load": load}
 
 
-def part(arguments: dict[str, np.ndarray], ids: list[int]) -> dict[str, np.ndarray]:
-    return {key: value[ids] if isinstance(value, np.ndarray) else value for key, value in arguments.items()}
+def part(arguments: dict[str, Any], ids: list[int]) -> dict[str, Any]:
+    poses = Poses(*(pose[ids] for pose in arguments["poses"]))
+    return {"poses": poses, "dt_s": arguments["dt_s"], "load": arguments["load"][ids]}
 
 
 @pytest.mark.parametrize(
@@ -110,12 +111,8 @@ def test_snapshot_continues_exactly() -> None:
 def test_firm_grasp_reads_plausible_counts() -> None:
     """20 N on about 100 taxels: 60 to 150 counts in all, over an idle level of 10 to 40."""
     sensors = PadSensors(LAYOUT, [BodyGeometry([Box((0.009, 0.02, 0.017))])], 1, num_pads=1)
-    arguments = scene(1)
-    arguments = {
-        key: value[:, :1] if isinstance(value, np.ndarray) else value for key, value in arguments.items()
-    }
-    arguments["load"] = np.array([[[20.0, 0.0, 0.0]]])
-    arguments["pad_pos"] = np.zeros((1, 1, 3))
+    poses = Poses(*(pose[:, :1] for pose in scene(1)["poses"]))._replace(pad_pos=np.zeros((1, 1, 3)))
+    arguments = {"poses": poses, "dt_s": 0.1, "load": np.array([[[20.0, 0.0, 0.0]]])}
     counts = sensors.counts([0], **arguments)[0, 0]
     force = sensors.forces([0], **arguments)[0, 0]
     assert 90 <= (force > 0).sum() <= 120
@@ -142,8 +139,8 @@ def test_parameters_per_environment_change_only_theirs() -> None:
 
 def test_penalty_models_follow_their_formulas() -> None:
     arguments = scene(1)
-    arguments["pad_vel"] = np.zeros((1, 4, 6))
-    arguments["body_vel"] = np.array([[[0, 0, -0.01, 0, 0, 0], [0, 0, 0.01, 0, 0, 0]]])
+    moving = np.array([[[0, 0, -0.01, 0, 0, 0], [0, 0, 0.01, 0, 0, 0]]])
+    arguments["poses"] = arguments["poses"]._replace(pad_vel=np.zeros((1, 4, 6)), body_vel=moving)
     force = {}
     for law in (Depth(), TacSL(k_n=300.0), KelvinVoigt(k_n=300.0, k_d=2.0), FlexitacIsaacSim()):
         sensors = PadSensors(LAYOUT, BODIES, 1, model=SensorModel.default().with_stage(law))
@@ -162,8 +159,8 @@ def test_penalty_models_follow_their_formulas() -> None:
 def test_tensors_in_tensors_out() -> None:
     sensors, other = (PadSensors(LAYOUT, BODIES, 2) for _ in range(2))
     arguments = scene(2)
-    tensors = {key: torch.as_tensor(value) for key, value in arguments.items() if key != "dt_s"}
-    counts = sensors.counts([0, 1], **tensors, dt_s=0.1)
+    tensors = Poses(*(torch.as_tensor(pose) for pose in arguments["poses"]))
+    counts = sensors.counts([0, 1], tensors, 0.1, torch.as_tensor(arguments["load"]))
     assert isinstance(counts, torch.Tensor)
     assert counts.dtype == torch.uint8
     assert np.array_equal(counts.numpy(), other.counts([0, 1], **arguments))
@@ -177,6 +174,14 @@ def test_importing_costs_no_warp() -> None:
 def test_zero_environments_are_refused() -> None:
     with pytest.raises(ValueError, match=r"at least one environment"):
         PadSensors(LAYOUT, BODIES, 0)
+
+
+@pytest.mark.parametrize("law", ["consistent", "kelvin_voigt"])
+def test_threads_change_nothing(law: str) -> None:
+    model = SensorModel.default().with_stage(STAGES[law]())
+    alone, shared = (PadSensors(LAYOUT, BODIES, 7, model=model, num_threads=count) for count in (1, 3))
+    assert np.array_equal(alone.counts(np.arange(7), **scene(7)), shared.counts(np.arange(7), **scene(7)))
+    assert np.array_equal(alone.counts([4], **scene(1)), shared.counts([4], **scene(1)))
 
 
 @pytest.mark.gpu

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 import torch
 
-from lerobot_vtrefine.tactile import BodyGeometry, Box, PadLayout, PadSensors, SensorModel, Sphere
+from lerobot_vtrefine.tactile import BodyGeometry, Box, PadLayout, PadSensors, Poses, SensorModel, Sphere
 from lerobot_vtrefine.tactile.replay import column_heights, finite_rate, replay
 from lerobot_vtrefine.tactile.stages.contact import KelvinVoigt
 from lerobot_vtrefine.tactile.stages.host import Latency, SampleAndHold
@@ -38,12 +38,14 @@ def test_replaying_a_simulated_press_gives_the_simulated_counts() -> None:
     simulated = [
         sensors.counts(
             [0],
-            np.zeros((1, 1, 3)),
-            eye,
-            np.zeros((1, 1, 6)),
-            np.array([[[0, 0, 0.01 - d]]]),
-            eye,
-            np.array([[[0, 0, -v, 0, 0, 0]]]),
+            Poses(
+                np.zeros((1, 1, 3)),
+                eye,
+                np.zeros((1, 1, 6)),
+                np.array([[[0, 0, 0.01 - d]]]),
+                eye,
+                np.array([[[0, 0, -v, 0, 0, 0]]]),
+            ),
             0.02,
         )[0, 0]
         for d, v in zip(depth, velocity, strict=True)
