@@ -1,7 +1,6 @@
 """`vtrefine-find-pads`: press a pad, name it; writes the YAML file that robot configurations read."""
 
 import argparse
-import sys
 from collections.abc import Sequence
 from contextlib import ExitStack
 from pathlib import Path
@@ -147,4 +146,4 @@ def check_first_row(name: str, board: FoundBoard) -> None:
 
 
 if __name__ == "__main__":
-    sys.exit(main())
+    raise SystemExit(main())

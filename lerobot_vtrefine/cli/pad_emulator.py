@@ -1,7 +1,6 @@
 """`vtrefine-pad-emulator`: FlexiTac boards on pseudo-terminals, to try everything without hardware."""
 
 import argparse
-import sys
 import signal
 import threading
 import time
@@ -197,4 +196,4 @@ def main(arguments: Sequence[str] | None = None) -> None:
 
 
 if __name__ == "__main__":
-    sys.exit(main())
+    raise SystemExit(main())

@@ -167,4 +167,4 @@ def rerun_view(save: Path | None, stack: ExitStack) -> Any:
 
 
 if __name__ == "__main__":
-    sys.exit(main())
+    raise SystemExit(main())

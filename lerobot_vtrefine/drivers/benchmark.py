@@ -2,11 +2,12 @@
 
 The emulator runs in its own process and sends test-pattern frames, which carry their number, send time and
 checksum: every frame received is checked for itself. `python -m lerobot_vtrefine.drivers.benchmark 60`
-    measures for a minute.
+measures each part for a minute and says how busy the machine was.
 """
 
 import importlib.util
 import logging
+import os
 import subprocess
 import sys
 import tempfile
@@ -36,10 +37,17 @@ SAMPLE_S = 0.0073
 CONTROL_S = 1 / 30
 """Time between looks in the processor-time measurement: a robot's control period."""
 
-START_TIMEOUT_S = 120.0
-"""The emulator's process imports the whole package first, which takes long on a busy machine."""
+START_TIMEOUT_S = 60.0
+"""Starting Python takes long on a busy machine."""
 
-_EMULATOR = "import sys; from lerobot_vtrefine.cli.pad_emulator import main; sys.exit(main())"
+_EMULATOR = """
+import sys, types
+package = types.ModuleType("lerobot_vtrefine")  # the real one would import LeRobot and PyTorch first
+package.__path__ = [sys.argv.pop(1)]
+sys.modules["lerobot_vtrefine"] = package
+from lerobot_vtrefine.cli.pad_emulator import main
+sys.exit(main())
+"""
 
 
 @dataclass(frozen=True)
@@ -77,7 +85,7 @@ def emulator(boards: int, loss: float = 0.0) -> Generator[list[str]]:
     with tempfile.TemporaryDirectory() as folder:
         flags = ["--folder", folder, "--boards", str(boards), "--source", "pattern", "--loss", str(loss)]
         process = subprocess.Popen(
-            [sys.executable, "-c", _EMULATOR, *flags],
+            [sys.executable, "-c", _EMULATOR, str(Path(__file__).parents[1]), *flags],
             stdout=subprocess.PIPE,
             stderr=subprocess.PIPE,
             text=True,
@@ -203,6 +211,14 @@ def lossy_row(port: str, seconds: float, reference: bool, loss: str) -> Row:
     return f"pads: corrupt frames, {loss} of bytes lost", float(ours.corrupt), text
 
 
-if __name__ == "__main__":
-    for name, value, explanation in run(float(sys.argv[1]) if len(sys.argv) > 1 else SHORT_S):
+def main(seconds: float) -> None:
+    """Writes the rows and the machine's load to standard output."""
+    before = os.getloadavg()[0]
+    for name, value, explanation in run(seconds):
         sys.stdout.write(f"{name}: {value:.3g} ({explanation})\n")
+    load = f"{before:.1f} before, {os.getloadavg()[0]:.1f} after"
+    sys.stdout.write(f"load average of {os.cpu_count()} processors: {load}\n")
+
+
+if __name__ == "__main__":
+    main(float(sys.argv[1]) if len(sys.argv) > 1 else SHORT_S)
