@@ -201,10 +201,10 @@ class WarpConfig:
 
     device: str = "auto"
     """auto (a CUDA GPU where there is one), cpu, cuda or cuda:i."""
-    contacts_per_world: int = 64
+    contacts_per_world: int = 96
     """Contacts, and pairs of geoms close to each other, on average over the worlds."""
-    rows_per_world: int = 256
-    """Rows of constraints in any one world: a contact takes 4."""
+    rows_per_world: int = 384
+    """Rows of constraints in any one world: 4 per contact, of which a round plug on the rim makes 84."""
 
     def __post_init__(self) -> None:
         if not re.fullmatch(r"auto|cpu|cuda(:\d+)?", self.device):

@@ -71,7 +71,8 @@ class WarpBackend(Backend):
         kept = self._rows(others) if len(others) else None
         qpos, sensors = self.worlds.run(substeps)
         index = self.index(ids)
-        flags = self.worlds.overflow[index].cpu().numpy()
+        # A world that has blown up may ask for any number of rows; that it failed is said elsewhere.
+        flags = torch.where(self.worlds.diverged[index] > 0, 0, self.worlds.overflow[index]).cpu().numpy()
         self.worlds.check_overflow(int(np.bitwise_or.reduce(flags, initial=0)))
         if kept is not None:
             self._put_rows(others, kept)

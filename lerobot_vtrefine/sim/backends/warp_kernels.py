@@ -101,7 +101,7 @@ def guard(
     diverged: wp.array(dtype=int),
     cursor: wp.array(dtype=int),
 ) -> None:
-    """Put worlds whose state has blown up back to the model's pose, as MuJoCo does, and say so; next
+    """Put worlds whose state has blown up back to the model's pose, as MuJoCo does, and say so; begins a
     substep.
     """
     world = wp.tid()

@@ -95,11 +95,12 @@ class WarpWorlds:
             Views of positions (N, K, nq) and readings (N, K, ns), valid until the next call.
         """
         self.moved()
-        self._trace.cursor.zero_()
+        self._trace.cursor.fill_(-1)
         self.overflow.zero_()
         with wp.ScopedDevice(self.device):
             for _ in range(substeps):
                 self._substep()
+            self._guard()
         trace = self._trace
         return wp.to_torch(trace.qpos)[:, :substeps], wp.to_torch(trace.sensors)[:, :substeps]
 
@@ -117,11 +118,17 @@ class WarpWorlds:
     def _launch_substep(self) -> None:
         data, trace = self.data, self._trace
         positions, readings, servos = self._widths
-        wp.launch(kernels.give_controls, (self.num_envs, servos), [trace.cursor, self.controls], [data.ctrl])
+        self._guard()
+        commands = [trace.cursor, self.controls]
+        wp.launch(kernels.give_controls, (self.num_envs, servos), commands, [data.ctrl])
         mjw.step(self.model, data)
-        wp.launch(kernels.record, (self.num_envs, positions + readings), [data.qpos, data.sensordata, trace])
-        state = [data.qpos, data.qvel, data.qacc_warmstart]
-        wp.launch(kernels.guard, self.num_envs, [self.model.qpos0, *state, self._diverged, trace.cursor])
+        kept = [data.qpos, data.sensordata, trace]
+        wp.launch(kernels.record, (self.num_envs, positions + readings), kept)
+
+    def _guard(self) -> None:
+        data = self.data
+        state = [self.model.qpos0, data.qpos, data.qvel, data.qacc_warmstart]
+        wp.launch(kernels.guard, self.num_envs, [*state, self._diverged, self._trace.cursor])
 
     def check_overflow(self, flags: int) -> None:
         """Raise for a bit set of `mjw.OverflowType`.
