@@ -1,0 +1,111 @@
+"""The engine's fast forward path equals what users' predictions are made with."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from lerobot_vtrefine.diagnose.baseline import describe
+from lerobot_vtrefine.diagnose.candidates import CATALOGUE
+from lerobot_vtrefine.diagnose.candidates.base import Form
+from lerobot_vtrefine.diagnose.composite import Composite, sensor_model
+from lerobot_vtrefine.diagnose.fitting import predict
+from lerobot_vtrefine.diagnose.forward import delayed, low_passed, play
+from lerobot_vtrefine.diagnose.prediction import predict_trial
+from lerobot_vtrefine.diagnose.presses import PressSet, prepare
+from lerobot_vtrefine.diagnose.recordings import RecordingSet, Trial
+from lerobot_vtrefine.tactile.model import SensorModel
+
+
+def trial(number: int, rng: np.random.Generator, frames: int = 60) -> Trial:
+    """A press at a random site with uneven frame times."""
+    time_s = np.cumsum(rng.uniform(0.02, 0.06, frames)) - 0.02
+    depth = 6e-4 * np.sin(np.linspace(0, 7, frames)) * np.linspace(0.4, 1, frames) - 5e-5
+    zero = np.zeros(frames)
+    return Trial(
+        f"t{number}.parquet",
+        f"c{number}",
+        0,
+        number,
+        20.0 * number,
+        {"shape": "sphere", "radius_m": 0.01},
+        time_s,
+        zero + rng.uniform(-3e-3, 3e-3),
+        zero + rng.uniform(-1e-3, 1e-3) + np.linspace(0, 2e-3, frames),
+        depth,
+        zero,
+        zero,
+        None,
+        None,
+        20.0 + rng.normal(0, 0.5, (frames, 40)),
+    )
+
+
+def presses(rows: int = 5, cols: int = 8) -> PressSet:
+    rng = np.random.default_rng(3)
+    trials = [trial(number, rng, 60 + 7 * number) for number in range(3)]
+    recordings = RecordingSet(Path(), "pad", rows, cols, 0.002, "adc_counts", 255.0, (), tuple(trials))
+    return prepare(recordings, trials, [0, 1, 2])
+
+
+def assert_same(model: Composite, held: PressSet) -> None:
+    """To float32's accuracy, at the scored taxels."""
+    for press, signal in zip(held.presses, predict(model, held), strict=True):
+        full = predict_trial(sensor_model(model, held.idle, 1.0), press.trial, held.layout)
+        assert np.allclose(signal + press.idle, full[:, press.taxels], atol=3e-3)
+
+
+def composite(held: PressSet) -> Composite:
+    return Composite(describe(held), np.array([np.log(4e5), 3e-3]))
+
+
+@pytest.mark.parametrize("form", CATALOGUE, ids=lambda form: f"{form.family}-{form.label}")
+def test_every_form_predicts_as_the_simulator_does(form: Form) -> None:
+    held = presses()
+    model = composite(held)
+    strong = np.array(form.probes(model.setting)[0], dtype=float)
+    if form.amplitude is not None:
+        strong[form.amplitude] *= 4.0
+    plain, moved = predict(model, held), predict(model.plus(form, strong), held)
+    assert max(np.abs(a - b).max() for a, b in zip(plain, moved, strict=True)) > 1e-3
+    assert_same(model.plus(form, strong), held)
+
+
+def test_all_forms_at_once_and_maps() -> None:
+    held = presses()
+    model = composite(held)
+    for form in {form.family: form for form in CATALOGUE}.values():
+        model = model.plus(form, np.array(form.probes(model.setting)[0], dtype=float))
+    gains = np.exp(np.random.default_rng(0).normal(0, 0.2, (5, 8)))
+    assert_same(Composite(model.setting, model.values, model.forms, gains, 0.2, ((2, 3),)), held)
+
+
+def test_the_saved_model_predicts_the_same(tmp_path: Path) -> None:
+    held = presses()
+    form = next(form for form in CATALOGUE if form.family == "baseline_drift")
+    model = sensor_model(composite(held).plus(form, np.array([30.0])), held.idle, 1.0)
+    model.save(tmp_path / "sensor_model.json")
+    press = held.presses[1]
+    again = predict_trial(SensorModel.load(tmp_path / "sensor_model.json"), press.trial, held.layout)
+    assert np.array_equal(again, predict_trial(model, press.trial, held.layout))
+
+
+def test_low_pass_of_a_ramp_is_exact_over_any_length() -> None:
+    time_s = np.concatenate([np.linspace(0, 1, 11), np.linspace(1.5, 400, 90)])
+    tau_s = 0.25
+    exact = time_s - tau_s * (1 - np.exp(-time_s / tau_s))
+    assert np.allclose(low_passed(time_s[:, None], time_s, tau_s)[:, 0], exact, atol=1e-9)
+
+
+def test_delay_of_a_ramp_is_a_shift() -> None:
+    time_s = np.linspace(0, 1, 21)
+    late = delayed(time_s[:, None], time_s, 0.13)[:, 0]
+    assert np.allclose(late, np.maximum(time_s - 0.13, 0))
+
+
+def test_play_follows_behind_by_half_its_width() -> None:
+    up_down = np.concatenate([np.linspace(0, 1, 11), np.linspace(0.95, 0.5, 10)])[:, None]
+    out = play(up_down, 0.2)[:, 0]
+    assert out[10] == pytest.approx(0.8)  # loading: behind by 0.2
+    assert out[14] == pytest.approx(0.8)  # inside the dead band
+    assert out[-1] == pytest.approx(0.7)  # unloading: above by 0.2
