@@ -14,6 +14,7 @@ from lerobot_vtrefine.tactile.stages.readout import (
     DeadTaxels,
     Gain,
     Idle,
+    Noise,
     Quantisation,
     TaxelGainSpread,
 )
@@ -99,13 +100,20 @@ class Composite:
         return tuple(sorted(stages, key=lambda stage: stage.rank))
 
 
-def sensor_model(composite: Composite, idle: IdleMap, step_counts: float) -> SensorModel:
-    """The model as users load it: with the idle map, and the converter that clips (and rounds)."""
+def sensor_model(
+    composite: Composite, idle: IdleMap, step_counts: float, noise_counts: float = 0.0
+) -> SensorModel:
+    """The model as users load it: with the idle map, and the converter that clips (and rounds).
+
+    `noise_counts` is what simulations add; predictions leave it out.
+    """
     stages = [stage for stage in composite.stages() if not isinstance(stage, Idle | Quantisation)]
     drift = next((stage for stage in stages if isinstance(stage, BaselineDrift)), None)
     level = idle.level - (drift.rate_counts_per_s * idle.session_s if drift is not None else 0.0)
     # Plain floats: the file is JSON.
     stages.append(Idle([[float(v) for v in row] for row in level], 0.0))
+    if noise_counts > 0.0:
+        stages.append(Noise(noise_counts))
     stages.append(Quantisation(step_counts or 1e-3, composite.setting.full_scale))
     return SensorModel(tuple(sorted((_plain(stage) for stage in stages), key=lambda stage: stage.rank)))
 

@@ -11,7 +11,7 @@ import numpy as np
 
 from lerobot_vtrefine.diagnose.ambiguity import find_ambiguities
 from lerobot_vtrefine.diagnose.baseline import Baseline, fit_baseline
-from lerobot_vtrefine.diagnose.composite import Composite, sensor_model
+from lerobot_vtrefine.diagnose.composite import sensor_model
 from lerobot_vtrefine.diagnose.detectable import minimum_detectable
 from lerobot_vtrefine.diagnose.evaluation import (
     foretell,
@@ -152,7 +152,10 @@ def _conclude(
     issues: list[DataIssue],
 ) -> PadDiagnosis:
     names = fitted.model.families
-    plain, extended = _models(baseline.fitted.model, fitted.model, everyone)
+    plain, extended = (
+        sensor_model(model, everyone.idle, everyone.step_counts, baseline.noise.floor)
+        for model in (baseline.fitted.model, fitted.model)
+    )
     held_set = everyone.subset(locked)
     foretold = foretell(held_set, plain, extended)
     floor = noise_floor(everyone, locked, baseline.noise, predict(fitted.model, held_set))
@@ -187,11 +190,6 @@ def _status(names: tuple[str, ...], groups: tuple[tuple[str, ...], ...], suspici
     if groups:
         return "ambiguous"
     return "explained" if names else "adequate"
-
-
-def _models(baseline: Composite, extended: Composite, presses: PressSet) -> tuple[SensorModel, SensorModel]:
-    plain, rich = (sensor_model(model, presses.idle, presses.step_counts) for model in (baseline, extended))
-    return plain, rich
 
 
 def _smallest(search: Search, fitted: Fit) -> dict[str, float]:

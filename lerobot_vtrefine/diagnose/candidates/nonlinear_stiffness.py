@@ -3,7 +3,6 @@
 from lerobot_vtrefine.diagnose.candidates.base import Form, Value
 from lerobot_vtrefine.tactile.stages.mechanics import NonlinearStiffness
 
-
 FORMS = (
     Form(
         "nonlinear_stiffness",

@@ -11,7 +11,7 @@ MAX_FRAMES = 12.0
 
 
 def repeated_share(presses: PressSet) -> float:
-    """Share of frames that repeat the one before, reading for reading, while the indenter moves on the pad."""
+    """Share of frames on the pad that repeat the one before, reading for reading."""
     same, moves = 0, 0
     for press in presses.presses:
         repeats, moving = _repeats(press.signal), press.touching[1:] & (np.diff(press.time_s) > 0)
