@@ -116,14 +116,17 @@ def replay_scene(sim: InsertionSim, commands: Array, seed: int, start: Start | N
     """
     world = np.zeros(1, np.int64)
     sim.reset(world, np.array([seed]), start)
-    frames = []
-    for command in commands:
-        frames.append(sim.observe(world))
+    first = sim.observe(world)
+    positions, counts = [first["state"]], [first["tactile"]]
+    for command in commands[:-1]:
         sim.step(command[None], world)
+        positions.append(sim.joint_state(world))
+        counts.append(sim.tactile(world))
+    sim.step(commands[-1:], world)
     return SceneReplay(
-        position=np.concatenate([frame["state"] for frame in frames]),
-        counts=np.concatenate([frame["tactile"] for frame in frames]),
-        baseline=frames[0]["tactile_baseline"][0],
+        position=np.concatenate(positions),
+        counts=np.concatenate(counts),
+        baseline=first["tactile_baseline"][0],
         success=bool(sim.metrics(world)["success"][0]),
     )
 

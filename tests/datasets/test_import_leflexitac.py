@@ -180,3 +180,32 @@ def test_wrong_sources_are_refused(tmp_path: Path) -> None:
     info.write_text(info.read_text().replace('"v3.0"', '"v2.1"'))
     with pytest.raises(ValueError, match=r"version v2\.1 is not v3\.0; convert it first"):
         import_dataset(ImportConfig(source, tmp_path / "ours"))
+
+
+def test_damaged_sources_are_refused_in_one_line(tmp_path: Path) -> None:
+    counts = np.random.default_rng(9).integers(0, 90, (6, *SHAPE)).astype(np.float32)
+    source, out = tmp_path / "le", tmp_path / "ours"
+    write_source(source, {"primary": counts}, None)
+    info = source / "meta" / "info.json"
+    sound = info.read_text()
+
+    def refuse(message: str) -> None:
+        with pytest.raises(ValueError, match=message) as refused:
+            import_dataset(ImportConfig(source, out))
+        assert "\n" not in str(refused.value)
+        assert not out.exists()
+
+    info.write_text(sound.replace('"total_frames"', '"frames"'))
+    refuse("lacks 'total_frames'")
+    info.write_text(sound.replace("[12, 32]", "[16, 32]").replace("12,", "16,"))
+    refuse(r"frames are not of shape \(16, 32\)")
+    info.write_text("{")
+    with pytest.raises(ValueError, match="no format that can be imported"):
+        import_dataset(ImportConfig(source, out))
+    info.write_text(sound)
+    data = next((source / "data").rglob("*.parquet"))
+    whole = data.read_bytes()
+    data.write_bytes(whole[: len(whole) // 2])
+    refuse(r"file-000\.parquet cannot be read")
+    data.unlink()
+    refuse("no data files")

@@ -132,6 +132,9 @@ def _read_info(source: Path) -> dict[str, Any]:
         info = json.loads(path.read_text(encoding="utf-8"))
     except ValueError as error:
         raise ValueError(f"{path} is no JSON: {error}") from error
+    missing = [key for key in ("features", "total_episodes", "total_frames") if key not in info]
+    if missing:
+        raise ValueError(f"{path} lacks {missing[0]!r}: it is no complete description of a dataset")
     version = info.get("codebase_version")
     if version != "v3.0":
         raise ValueError(
@@ -153,7 +156,7 @@ def _pad_columns(source: Path, info: dict[str, Any], pads: Mapping[str, str]) ->
     names = [pads.get(name, name) for name in found]
     if len(set(names)) < len(names):
         raise ValueError(f"--pads gives two pads the same name: {', '.join(sorted(names))}")
-    largest = _largest_readings(source, list(found))
+    largest = _largest_readings(source, found)
     sensors = info.get("tactile_sensors") or {}
     return [
         PadColumn(
@@ -178,19 +181,29 @@ def _host_rule(sensor: Mapping[str, Any] | None, shape: tuple[int, int], largest
     return HostRule(threshold, scale, np.broadcast_to(baseline, shape))
 
 
-def _largest_readings(source: Path, names: list[str]) -> dict[str, float]:
-    largest = dict.fromkeys(names, 0.0)
+def _largest_readings(source: Path, shapes: Mapping[str, tuple[int, int]]) -> dict[str, float]:
+    """Largest reading of every pad, whose frames have these shapes."""
+    largest = dict.fromkeys(shapes, 0.0)
     files = sorted((source / "data").rglob("*.parquet"))
     if not files:
         raise ValueError(f"{source} has no data files below {source / 'data'}")
     for path in files:
-        table = pq.read_table(path, columns=[f"{PREFIX}{name}" for name in names])
-        for name in names:
+        table = _read_columns(path, [f"{PREFIX}{name}" for name in shapes])
+        for name, shape in shapes.items():
             values = _flat(table[f"{PREFIX}{name}"])
+            if len(values) != len(table) * int(np.prod(shape)):
+                raise ValueError(f"{path}, column {PREFIX}{name}: frames are not of shape {shape}")
             if not np.isfinite(values).all() or (len(values) and values.min() < 0):
                 raise ValueError(f"{path}, column {PREFIX}{name}: readings must be finite and not negative")
             largest[name] = max(largest[name], float(values.max(initial=0.0)))
     return largest
+
+
+def _read_columns(path: Path, columns: list[str]) -> pa.Table:
+    try:
+        return pq.read_table(path, columns=columns)
+    except (pa.ArrowException, OSError) as error:
+        raise ValueError(f"{path} cannot be read: {str(error).splitlines()[0]}") from error
 
 
 def _flat(column: pa.ChunkedArray) -> Array:
@@ -262,7 +275,13 @@ def _write_episode_rows(
     for path in sorted((source / "meta" / "episodes").rglob("*.parquet")):
         table = pq.read_table(path)
         table = table.select([name for name in table.column_names if not name.startswith(old)])
-        rows = [episode_stats[int(index)] for index in table["episode_index"].to_pylist()]
+        listed = [int(index) for index in table["episode_index"].to_pylist()]
+        absent = sorted(set(listed) - set(episode_stats))
+        if absent:
+            raise ValueError(
+                f"{path} lists episode {absent[0]}, which the data files lack; is the copy complete?"
+            )
+        rows = [episode_stats[index] for index in listed]
         for key in rows[0]:
             for name in rows[0][key]:
                 values = [np.atleast_1d(row[key][name]).tolist() for row in rows]
