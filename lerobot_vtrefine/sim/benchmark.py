@@ -3,6 +3,7 @@
 Needs neither LeRobot nor Gymnasium.
 """
 
+import gc
 import resource
 import time
 from collections.abc import Callable, Iterator, Sequence
@@ -33,9 +34,9 @@ class WorldsRow:
     physics_s: float
     """The substeps of a control step."""
     tactile_s: float
-    """Raw counts of all pads, with kinematics."""
+    """Raw counts of all pads, on the host."""
     depth_s: float
-    """Depth images of all worlds."""
+    """Depth images of all worlds, on the host."""
     reset_s: float
     """New episodes in all worlds, settled."""
     start_s: float
@@ -51,9 +52,12 @@ class WorldsRow:
 
 
 def measure_worlds(
-    device: str, worlds: Sequence[int] = WORLDS, steps: int = STEPS, scene: SceneConfig | None = None
+    warp: WarpConfig,
+    worlds: Sequence[int] = WORLDS,
+    steps: int = STEPS,
+    scene: SceneConfig | None = None,
 ) -> Iterator[WorldsRow]:
-    """A row per number of worlds.
+    """A row per number of worlds, on `warp.device`.
 
     Raises:
         ValueError: no such device, or not one step.
@@ -61,7 +65,7 @@ def measure_worlds(
     if steps < 2:
         raise ValueError(f"steps must be at least 2, got {steps}")
     for count in worlds:
-        yield _measure(device, count, steps, scene or SceneConfig(start="grasped"))
+        yield _measure(warp, count, steps, scene or SceneConfig(start="grasped"))
 
 
 def table(rows: Sequence[WorldsRow]) -> str:
@@ -90,10 +94,13 @@ COLUMNS: tuple[tuple[str, str, Callable[[WorldsRow], float]], ...] = (
 )
 
 
-def _measure(device: str, count: int, steps: int, scene: SceneConfig) -> WorldsRow:
+def _measure(warp: WarpConfig, count: int, steps: int, scene: SceneConfig) -> WorldsRow:
+    device = warp.device
+    gc.collect()
+    torch.cuda.empty_cache()  # nothing without a GPU
     before, ids = _memory_gib(device), np.arange(count)
     start = time.perf_counter()
-    sim = InsertionSim(scene, num_envs=count, backend="warp", warp=WarpConfig(device=device))
+    sim = InsertionSim(scene, num_envs=count, backend="warp", warp=warp)
     sim.reset(ids, ids)
     observation = sim.observe()
     started = time.perf_counter() - start

@@ -205,6 +205,8 @@ class WarpConfig:
     """Contacts, and pairs of geoms close to each other, on average over the worlds."""
     rows_per_world: int = 384
     """Rows of constraints in any one world: 4 per contact, of which a round plug on the rim makes 84."""
+    graph: bool = True
+    """Record a substep as a CUDA graph, where the GPU and its driver can."""
 
     def __post_init__(self) -> None:
         if not re.fullmatch(r"auto|cpu|cuda(:\d+)?", self.device):

@@ -68,7 +68,7 @@ class WarpWorlds:
         self.diverged = wp.to_torch(self._diverged)
         self._widths = (model.nq, model.nsensordata, model.nu)
         self._graph: wp.Graph | None = None
-        self._capture = _can_capture(self.device)
+        self._capture = config.graph and _can_capture(self.device)
         self._posed = False
         self._reserve(1)
 
