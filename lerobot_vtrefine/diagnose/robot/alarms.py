@@ -5,6 +5,7 @@ that the model does not know (time, other joints, a load, ...); it rings at one 
 """
 
 from dataclasses import dataclass
+from itertools import combinations
 
 import numpy as np
 
@@ -20,7 +21,7 @@ Array = np.ndarray
 ALPHA = 0.01
 _REPEATS = 0.3
 _FOLLOWS, _FOLLOWS_IF_OWNED = 0.1, 0.4
-"""Least part of what is left that must follow a descriptor; more where an accepted cause may be off in form."""
+"""Least part of what is left that must follow a descriptor; more where an accepted form may be off."""
 _LINE = 0.1
 _OF_BASELINE = 0.02
 _OWNED = {
@@ -44,18 +45,21 @@ class Alarm:
 
 
 def raise_alarms(selection: Selection, seed: int) -> tuple[Alarm, ...]:
-    """All alarms, the strongest first; a decoy that was accepted is one."""
+    """All alarms: grippers that are stopped, then the strongest first; a decoy that was accepted is one."""
     found = [
         Alarm(joint, candidate.clue, 1.0, selection.p_values.get((DECOY, joint), 0.0))
         for joint, candidates in selection.chosen.items()
         for candidate in candidates
         if candidate.cause == DECOY
     ]
-    found += _stopped(selection)
     found += _repeating(selection, seed)
     found += _following(selection, seed)
     found += _ringing(selection)
-    return tuple(sorted(found, key=lambda alarm: -alarm.share))
+    found.sort(key=lambda alarm: -alarm.share)
+    # What stands still explains whatever else is odd about it.
+    stopped = _stopped(selection)
+    still = {alarm.joint for alarm in stopped}
+    return (*stopped, *(alarm for alarm in found if alarm.joint not in still))
 
 
 def _matters(selection: Selection, joint: int, share: float) -> bool:
@@ -71,12 +75,12 @@ def _least(selection: Selection, joint: int) -> float:
 
 
 def _repeating(selection: Selection, seed: int) -> list[Alarm]:
-    """Residuals of trials of one condition, multiplied frame by frame: noise cancels, what repeats does not."""
+    """Residuals of trials of one condition, multiplied frame by frame: noise cancels, causes do not."""
     batch, left = selection.problem.batch, selection.fit.residual
     rows = []
     for condition in sorted(set(batch.conditions)):
         trials = [index for index, name in enumerate(batch.conditions) if name == condition]
-        pairs = [(a, b) for place, a in enumerate(trials) for b in trials[place + 1 :] if _alike(batch, a, b)]
+        pairs = [pair for pair in combinations(trials, 2) if _alike(batch, *pair)]
         if pairs:
             products = [
                 _mean(left[:, a] * left[:, b], batch.valid[:, a] & batch.valid[:, b]) for a, b in pairs
@@ -219,7 +223,7 @@ def _stopped(selection: Selection) -> list[Alarm]:
             continue
         share = _stopped_share(selection, joint)
         if share is not None and _matters(selection, joint, share):
-            clue = f"{name} stands still while its command goes on: it closes on something"
+            clue = "stands still while its command goes on: it closes on something"
             found.append(Alarm(joint, clue, share, 0.0))
     return found
 

@@ -86,6 +86,7 @@ CANDIDATES = (
     Candidate("backlash", ("loose",), starts=(1.0,)),
     Candidate(FRICTION, ("friction",), starts=(0.5,)),
     *(Candidate("gravity_sag", SAG[:1], form) for form in gravity.ONE_TERM_FORMS),
+    Candidate("gravity_sag", SAG[:2], gravity.TWO_TERM_FORM),
     Candidate("gravity_sag", SAG, gravity.FREE_FORM),
     Candidate("gripper_compliance", ("bend",)),
     Candidate(DECOY, SAG[:1], "gain", clue="the position's scale: error grows with position"),

@@ -3,8 +3,8 @@
 import numpy as np
 
 from lerobot_vtrefine.diagnose.robot.candidates import CANDIDATES, DECOY, LATENCY, Candidate
-from lerobot_vtrefine.diagnose.robot.fitting import INDEX, Problem, derivatives, evaluate
-from lerobot_vtrefine.diagnose.robot.gravity import FREE_FORM, is_sliding
+from lerobot_vtrefine.diagnose.robot.fitting import INDEX, derivatives, evaluate
+from lerobot_vtrefine.diagnose.robot.gravity import FREE_FORM, TWO_TERM_FORM, is_sliding
 from lerobot_vtrefine.diagnose.robot.selection import LEAST_GAIN, Selection
 
 Array = np.ndarray
@@ -18,21 +18,26 @@ _UNSEEN = 0.05
 def minimum_detectable(selection: Selection) -> dict[str, float]:
     """Cause -> size [rad, s, m/N] that the worst joint would still have shown; causes that no joint can show
     are left out. Slides do not count where angles do."""
+    own = derivatives(selection.problem, selection.fit).columns
     out: dict[str, float] = {}
     for candidate in CANDIDATES:
-        if candidate.cause == DECOY or candidate.form == FREE_FORM or candidate.parameters == ("loose",):
+        if (
+            candidate.cause == DECOY
+            or candidate.form in (FREE_FORM, TWO_TERM_FORM)
+            or candidate.parameters == ("loose",)
+        ):
             continue
-        sizes = _sizes(selection, candidate)
+        sizes = _sizes(selection, candidate, own)
         if len(sizes):
             worst = float(np.max(sizes))
             out[candidate.cause] = min(out.get(candidate.cause, np.inf), worst)
-    delay = _delay(selection)
+    delay = _delay(selection, own)
     if delay is not None:
         out[LATENCY] = delay
     return out
 
 
-def _sizes(selection: Selection, candidate: Candidate) -> Array:
+def _sizes(selection: Selection, candidate: Candidate, own: dict[int, Array]) -> Array:
     problem = selection.problem
     allowed = candidate.applicable(problem)
     angles = np.array([not is_sliding(name) for name in problem.names])
@@ -42,7 +47,7 @@ def _sizes(selection: Selection, candidate: Candidate) -> Array:
     if not len(joints):
         return np.zeros(0)
     change = _change(selection, candidate, joints)
-    found = [_smallest(selection, joint, change[..., place]) for place, joint in enumerate(joints)]
+    found = [_smallest(selection, joint, change[..., k], own[joint]) for k, joint in enumerate(joints)]
     return np.array([size for size in found if size is not None])
 
 
@@ -61,10 +66,10 @@ def _change(selection: Selection, candidate: Candidate, joints: Array) -> Array:
     return np.where(problem.batch.valid[..., None], moved, 0.0) / step
 
 
-def _smallest(selection: Selection, joint: int, change: Array) -> float | None:
+def _smallest(selection: Selection, joint: int, change: Array, own: Array) -> float | None:
     """Size at which a change (N, T) of one joint is sure to be seen and worth a name; None if none is."""
-    problem, fitted = selection.problem, selection.fit
-    cleared, kept = _cleared(problem, selection, joint, change)
+    fitted = selection.fit
+    cleared, kept = _cleared(change, own)
     if kept < _UNSEEN:
         return None
     left = fitted.residual[..., joint]
@@ -74,9 +79,9 @@ def _smallest(selection: Selection, joint: int, change: Array) -> float | None:
     return float(max(_SURE * error, worth))
 
 
-def _cleared(problem: Problem, selection: Selection, joint: int, change: Array) -> tuple[Array, float]:
-    """A change without what the joint's own free parameters can do, and how much of its power this is."""
-    own = derivatives(problem, selection.fit).columns[joint].reshape(change.size, -1)
+def _cleared(change: Array, own: Array) -> tuple[Array, float]:
+    """A change without what the joint's own free parameters (N, T, p) can do, and how much of it is left."""
+    own = own.reshape(change.size, -1)
     flat = change.reshape(-1)
     power = flat @ flat
     if power <= 0:
@@ -87,16 +92,16 @@ def _cleared(problem: Problem, selection: Selection, joint: int, change: Array) 
     return flat.reshape(change.shape), float(flat @ flat / power)
 
 
-def _delay(selection: Selection) -> float | None:
+def _delay(selection: Selection, own: dict[int, Array]) -> float | None:
     """Joints together: their information about the common delay adds up."""
     problem, fitted = selection.problem, selection.fit
-    later = evaluate(problem, fitted.point, fitted.free, True)
+    later = evaluate(problem, fitted.point, np.zeros_like(fitted.free), True)
     derivative = derivatives(problem, later)
     assert derivative.tau is not None
     weight = 1 / fitted.total.clip(1e-300)
     scores, power, kept = 0.0, 0.0, []
     for joint in range(problem.batch.joints):
-        cleared, part = _cleared(problem, selection, joint, derivative.tau[..., joint])
+        cleared, part = _cleared(derivative.tau[..., joint], own[joint])
         kept.append(part)
         scores = scores + weight[joint] * (cleared * fitted.residual[..., joint]).sum(0)
         power = power + weight[joint] * np.square(cleared).sum(0)

@@ -34,6 +34,7 @@ Array = np.ndarray
 Progress = Callable[[str, float], None]
 
 _DRAWS = 2000
+_CLUES = 4
 
 
 @dataclass(frozen=True)
@@ -237,11 +238,14 @@ def _unknown(selection: Selection, alarms: tuple[Alarm, ...]) -> Unknown:
     if not alarms:
         return Unknown(alarm=False)
     told: dict[str, list[str]] = {}
+    heard: set[int] = set()
     for alarm in alarms:
-        told.setdefault(alarm.clue, []).append(selection.problem.names[alarm.joint])
-    return Unknown(
-        True, "; ".join(f"{', '.join(dict.fromkeys(names))}: {clue}" for clue, names in told.items())
-    )
+        if alarm.joint not in heard:
+            told.setdefault(alarm.clue, []).append(selection.problem.names[alarm.joint])
+        heard.add(alarm.joint)
+    clues = [f"{', '.join(names)}: {clue}" for clue, names in told.items()]
+    more = "" if len(clues) <= _CLUES else f"; and {len(clues) - _CLUES} more"
+    return Unknown(True, "; ".join(clues[:_CLUES]) + more)
 
 
 def _next(

@@ -48,9 +48,9 @@ def for_rivals(selection: Selection, rivals: Sequence[Rival]) -> dict[str, Any]:
         protocol["columns"] = ["load"]
         text += " Record the servos' torque or current as `load`: friction takes torque, play takes none."
     elif "gripper_compliance" in decides:
-        text += " Close the gripper on nothing in half of the trials and on a stiff block in the others."
+        text += " Close it on nothing in half of the trials and on a stiff block in the others."
     elif gaps[best] < _TELLING:
-        text += " Joint commands and encoders alone hardly tell these apart: measure the joint from outside as well."
+        text += " Commands and encoders alone hardly tell these apart: measure the joint from outside too."
     return {"decides": decides, "text": text, "protocol": protocol}
 
 
@@ -77,7 +77,7 @@ def for_little_data(selection: Selection, detectable: dict[str, float]) -> dict[
     problem = selection.problem
     trials = problem.batch.trials
     if trials < ENOUGH_TRIALS - 2:
-        text = f"{trials} trials are too few to judge by: record at least 12, six commands twice, in random order."
+        text = f"{trials} trials are too few to judge by: record six commands twice each, in random order."
         return {"decides": [], "text": text, "protocol": {"command": "steps", "trials": 12}}
     delay = detectable.get(LATENCY)
     if delay is None or delay > 2 * frame_s(problem.batch):

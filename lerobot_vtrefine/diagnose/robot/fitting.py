@@ -28,6 +28,7 @@ _START_OMEGA = (4.0, 10.0, 25.0, 60.0)
 _START_ZETA = (0.4, 1.0, 2.0)
 _ITERATIONS = 20
 _TOLERANCE = 1e-5
+_RIDGE = 3e-3
 _SHORTEST = 1e5
 """Damping beyond which a joint has nowhere better to go."""
 
@@ -139,6 +140,19 @@ class Fit:
         return self.mse.mean(0)
 
 
+def ridge(problem: Problem, free: Array) -> Array:
+    """(J, P) weights of squared parameters that are added to the squared error.
+
+    Sags of several terms nearly cancel in the postures that are seen; where these do not tell, terms stay
+    small.
+    """
+    out = np.zeros(free.shape)
+    columns = [INDEX[name] for name in SAG]
+    several = free[:, columns].sum(1) > 1
+    out[np.ix_(several, columns)] = _RIDGE * problem.batch.valid.sum()
+    return out
+
+
 def first_point(problem: Problem) -> Point:
     """The best of a few plain servos per joint."""
     count = problem.batch.joints
@@ -180,16 +194,32 @@ def evaluate(
 
 
 def fit(
-    problem: Problem, start: Point, free: Array, tau_free: bool = False, iterations: int = _ITERATIONS
+    problem: Problem,
+    start: Point,
+    free: Array,
+    tau_free: bool = False,
+    iterations: int = _ITERATIONS,
+    known: Fit | None = None,
 ) -> Fit:
-    """Minimise every joint's squared error over its free parameters, and over the delay if it is free."""
+    """Minimise every joint's squared error over its free parameters, and over the delay if it is free.
+
+    Joints without free parameters must be as in `known`, if that is given: they are not simulated again.
+    """
     fitter = _Fitter(problem, free, tau_free)
-    now = evaluate(problem, _bounded(problem, start, free), free, tau_free)
+    moving = None if tau_free else np.flatnonzero(np.any(free, axis=1))
+    now = evaluate(problem, _bounded(problem, start, free), free, tau_free, known, moving)
     for _ in range(iterations if free.any() or tau_free else 0):
         now, done = fitter.step(now)
         if done:
             break
     return now
+
+
+def refit(problem: Problem, known: Fit, point: Point, free: Array, joints: Array, iterations: int) -> Fit:
+    """Fit some joints anew from a point that differs from `known` only there; the delay stays."""
+    mask = np.isin(np.arange(len(free)), joints)
+    fitted = fit(problem, point, free & mask[:, None], iterations=iterations, known=known)
+    return replace(fitted, free=np.where(mask[:, None], free, known.free), tau_free=known.tau_free)
 
 
 class _Fitter:
@@ -199,6 +229,7 @@ class _Fitter:
         self.problem, self.free, self.tau_free = problem, free, tau_free
         self.damping = np.full(len(free), 1e-3)
         self.weight = 1.0 / problem.scale**2
+        self.ridge = ridge(problem, free)
         self.settled: Array = ~np.any(free, axis=1)
 
     def step(self, now: Fit) -> tuple[Fit, bool]:
@@ -207,7 +238,7 @@ class _Fitter:
         open_joints = None if self.tau_free else np.flatnonzero(~self.settled)
         proposed = self._propose(now, derivative)
         then = evaluate(self.problem, proposed, self.free, self.tau_free, now, open_joints)
-        before, after = (now.residual**2).sum((0, 1)), (then.residual**2).sum((0, 1))
+        before, after = self._cost(now), self._cost(then)
         if self.tau_free:
             before, after = (np.full(len(before), (x * self.weight).sum()) for x in (before, after))
         better = (after < before) & ~self.settled
@@ -218,13 +249,24 @@ class _Fitter:
             return then, bool(self.settled.all())
         return _merged(now, then, better, self.tau_free), bool(self.settled.all())
 
+    def _cost(self, item: Fit) -> Array:
+        return (item.residual**2).sum((0, 1)) + (self.ridge * item.point.theta**2).sum(1)
+
+    def _normal(self, now: Fit, derivative: "Derivatives", joint: int) -> tuple[Array, Array]:
+        """Normal equations of one joint, ridge included."""
+        normal, slope = derivative.normal(joint, now.residual, with_tau=self.tau_free)
+        own = np.flatnonzero(self.free[joint])
+        normal[range(len(own)), range(len(own))] += self.ridge[joint, own]
+        slope[: len(own)] -= self.ridge[joint, own] * now.point.theta[joint, own]
+        return normal, slope
+
     def _propose(self, now: Fit, derivative: "Derivatives") -> Point:
         theta, tau = now.point.theta.copy(), now.point.tau_s
         if self.tau_free:
             tau += self._tau_step(now, derivative, theta)
         else:
             for joint in np.flatnonzero(~self.settled):
-                normal, slope = derivative.normal(joint, now.residual)
+                normal, slope = self._normal(now, derivative, joint)
                 theta[joint, self.free[joint]] += _solve(normal, slope, self.damping[joint])
         return _bounded(self.problem, replace(now.point, theta=theta, tau_s=tau), self.free)
 
@@ -234,7 +276,7 @@ class _Fitter:
         ends = np.cumsum(sizes)
         normal, slope = np.zeros((ends[-1] + 1,) * 2), np.zeros(ends[-1] + 1)
         for joint, end in enumerate(ends):
-            block, right = derivative.normal(joint, now.residual, with_tau=True)
+            block, right = self._normal(now, derivative, joint)
             index = [*range(end - sizes[joint], end), ends[-1]]
             normal[np.ix_(index, index)] += self.weight[joint] * block
             slope[index] += self.weight[joint] * right

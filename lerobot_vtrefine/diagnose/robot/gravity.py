@@ -18,9 +18,11 @@ Array = np.ndarray
 TERMS = 4
 ONE_TERM_FORMS = ("mass", "reach", "link", "own")
 """Shapes with one free number: link masses, TCP alone, own link alone, own angle alone."""
+TWO_TERM_FORM = "arm"
+"""Own link and the later ones, each with a mass of its own."""
 FREE_FORM = "free"
 """Sines and cosines of the pitch of the own and the next link: any zero angle, any mass distribution."""
-FORMS = (*ONE_TERM_FORMS, FREE_FORM)
+FORMS = (*ONE_TERM_FORMS, TWO_TERM_FORM, FREE_FORM)
 DECOY_FORMS = ("gain", "square", "drift", "gain_drift")
 """Shapes that are no cause's: proportional to position, to its square, to session time, to both."""
 
@@ -85,6 +87,10 @@ def shapes(joints: tuple[str, ...], command: Array) -> dict[str, Array]:
             out["reach"][:, :, joint, 0] = _level_sum(later, chain.links[place:])
             out["link"][:, :, joint, 0] = np.cos(pitch[:, :, place])
             out["own"][:, :, joint, 0] = np.cos(command[:, :, joint])
+            links = chain.links[place:]
+            out[TWO_TERM_FORM][:, :, joint, 0] = _level_sum(later[..., :1], links[:1])
+            if len(links) > 1:
+                out[TWO_TERM_FORM][:, :, joint, 1] = _level_sum(later[..., 1:], links[1:])
             for term in range(min(2, later.shape[-1])):
                 out[FREE_FORM][:, :, joint, 2 * term] = np.cos(later[:, :, term])
                 out[FREE_FORM][:, :, joint, 2 * term + 1] = np.sin(later[:, :, term])
@@ -119,7 +125,7 @@ def decoys(command: Array, session_s: Array, known: Array) -> dict[str, Array]:
 def full_reach(form: str, terms: Array) -> float:
     """Size [rad] at full horizontal reach of a sag with those terms (K,); droop is positive."""
     if form != FREE_FORM:
-        return float(terms[0])
+        return float(np.sum(terms))
     first, second = np.hypot(terms[0], terms[1]), np.hypot(terms[2], terms[3])
     leading = terms[:2] if first >= second else terms[2:]
     # Pitch is positive downwards, so a droop is mostly a positive cosine (or sine, for a link that stands).

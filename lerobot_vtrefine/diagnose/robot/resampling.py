@@ -17,12 +17,13 @@ from lerobot_vtrefine.diagnose.robot.fitting import (
     Point,
     Problem,
     derivatives,
+    ridge,
 )
 
 Array = np.ndarray
 
 FOLDS = 5
-BOOTSTRAP = 2000
+BOOTSTRAP = 1000
 _RIDGE = 1e-7
 
 
@@ -33,6 +34,8 @@ class Curvature:
     fit: Fit
     normal: tuple[Array, ...]
     slope: tuple[Array, ...]
+    ridge: Array
+    """(J, P), see `fitting.ridge`."""
     weight: Array
     """(J,) that makes the joints' errors comparable where they share the delay."""
 
@@ -48,7 +51,7 @@ class Curvature:
             by_trial = jacobian.transpose(1, 0, 2)
             normal.append(by_trial.transpose(0, 2, 1) @ by_trial)
             slope.append(np.einsum("tnp,nt->tp", by_trial, fit.residual[..., joint]))
-        return cls(fit, tuple(normal), tuple(slope), 1.0 / problem.scale**2)
+        return cls(fit, tuple(normal), tuple(slope), ridge(problem, fit.free), 1.0 / problem.scale**2)
 
     def moved(self, weights: Array) -> Point:
         """Where the fit would end if every trial counted `weights` (T,) times."""
@@ -58,19 +61,27 @@ class Curvature:
             tau += self._shared(weights, theta)
         else:
             for joint in np.flatnonzero(self.fit.free.any(1)):
-                normal = np.tensordot(weights, self.normal[joint], 1)
-                theta[joint, self.fit.free[joint]] += _solve(normal, weights @ self.slope[joint])
+                normal, slope = self._reweighted(joint, weights)
+                theta[joint, self.fit.free[joint]] += _solve(normal, slope)
         for name in POSITIVE:
             theta[:, INDEX[name]] = theta[:, INDEX[name]].clip(min=0.0)
         theta[:, :2] = theta[:, :2].clip(self.fit.point.theta[:, :2] - 1.0, self.fit.point.theta[:, :2] + 1.0)
         return replace(self.fit.point, theta=theta, tau_s=float(np.clip(tau, 0.0, TAU_BOUND_S)))
 
+    def _reweighted(self, joint: int, weights: Array) -> tuple[Array, Array]:
+        normal = np.tensordot(weights, self.normal[joint], 1)
+        slope = weights @ self.slope[joint]
+        own = np.flatnonzero(self.fit.free[joint])
+        share = weights.mean()
+        normal[range(len(own)), range(len(own))] += share * self.ridge[joint, own]
+        slope[: len(own)] -= share * self.ridge[joint, own] * self.fit.point.theta[joint, own]
+        return normal, slope
+
     def _shared(self, weights: Array, theta: Array) -> float:
         """Moves all joints' parameters and returns the step of the delay (Schur complement)."""
         top, bottom, solved = 0.0, 1e-12, []
         for joint in range(len(theta)):
-            normal = self.weight[joint] * np.tensordot(weights, self.normal[joint], 1)
-            slope = self.weight[joint] * (weights @ self.slope[joint])
+            normal, slope = (self.weight[joint] * item for item in self._reweighted(joint, weights))
             own, cross = normal[:-1, :-1], normal[:-1, -1]
             if len(cross):
                 local, coupled = _solve(own, slope[:-1]), _solve(own, cross)
@@ -94,22 +105,28 @@ def folds_of(conditions: tuple[str, ...], seed: int) -> Array:
     return np.array([fold[condition] for condition in conditions])
 
 
-def cross_validated(problem: Problem, fit: Fit, folds: Array, known: Array | None = None) -> Array:
+def cross_validated(
+    problem: Problem, fit: Fit, folds: Array, known: Array | None = None, joints: Array | None = None
+) -> Array:
     """Mean squared error (T, J) of every trial under a fit to the other folds.
 
-    Joints without free parameters keep the errors that are `known`.
+    Joints without free parameters, and all but `joints` if they are given, keep the errors that are `known`;
+    the delay is then kept too.
     """
+    if joints is not None:
+        mask = np.isin(np.arange(len(fit.free)), joints)
+        fit = replace(fit, free=fit.free & mask[:, None], tau_free=False)
     if len(set(folds)) < 2:
         return fit.mse
     curvature = Curvature.at(problem, fit)
     mse = fit.mse.copy() if known is None else known.copy()
-    joints = np.flatnonzero(np.any(fit.free, axis=1) | fit.tau_free)
+    own = np.flatnonzero(np.any(fit.free, axis=1) | fit.tau_free)
     for fold in np.unique(folds):
         held = np.flatnonzero(folds == fold)
         part = problem.subset(held)
         point = curvature.moved((folds != fold).astype(float))
-        left = part.residual(part.predict(point, joints), joints)
-        mse[np.ix_(held, joints)] = (left**2).sum(0) / np.maximum(part.batch.frames, 1)[:, None]
+        left = part.residual(part.predict(point, own), own)
+        mse[np.ix_(held, own)] = (left**2).sum(0) / np.maximum(part.batch.frames, 1)[:, None]
     return mse
 
 

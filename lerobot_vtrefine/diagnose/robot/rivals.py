@@ -13,7 +13,7 @@ from lerobot_vtrefine.diagnose.robot.candidates import (
     Candidate,
     delay_starts,
 )
-from lerobot_vtrefine.diagnose.robot.fitting import INDEX, Fit, Problem, fit
+from lerobot_vtrefine.diagnose.robot.fitting import INDEX, Fit, Problem, fit, refit
 from lerobot_vtrefine.diagnose.robot.friction_load import friction_in_load
 from lerobot_vtrefine.diagnose.robot.resampling import cross_validated, folds_of
 from lerobot_vtrefine.diagnose.robot.selection import Selection, merged
@@ -53,7 +53,8 @@ def find_rivals(selection: Selection, seed: int) -> tuple[Rival, ...]:
         index = np.array(joints)
         bare = without_cause(selection, cause, index)
         folds = folds_of(selection.problem.batch.conditions, seed)
-        without = cross_validated(selection.problem, bare, folds)
+        own = None if cause == LATENCY else index
+        without = cross_validated(selection.problem, bare, folds, selection.held_out, own)
         for name, candidates in _alternatives(selection, cause, index).items():
             tries = [_swapped(selection, bare, candidate, index, folds) for candidate in candidates]
             best = min(tries, key=lambda item: float(item[1][:, index].mean(0).sum()))
@@ -96,7 +97,7 @@ def without_cause(selection: Selection, cause: str, joints: Array) -> Fit:
                 for name in candidate.parameters:
                     free[joint, INDEX[name]] = False
                     point = point.with_values(name, 0.0, np.array([joint]))
-    return fit(selection.problem, point, free, selection.delayed, iterations=_ITERATIONS)
+    return refit(selection.problem, now, point, free, joints, _ITERATIONS)
 
 
 def _alternatives(selection: Selection, cause: str, joints: Array) -> dict[str, list[Candidate | None]]:
@@ -125,10 +126,9 @@ def _swapped(
     fitted = bare
     for multiple in candidate.starts:
         point = candidate.starting(problem, bare.point, joints, multiple)
-        again = fit(problem, point, free, bare.tau_free, iterations=_ITERATIONS)
-        better = again.total < fitted.total
-        fitted = again if fitted is bare or bare.tau_free else merged(fitted, again, better, free)
-    return fitted, cross_validated(problem, fitted, folds), candidate
+        again = refit(problem, bare, point, free, joints, _ITERATIONS)
+        fitted = again if fitted is bare else merged(fitted, again, again.total < fitted.total, free)
+    return fitted, cross_validated(problem, fitted, folds, selection.held_out, joints), candidate
 
 
 def _compared(

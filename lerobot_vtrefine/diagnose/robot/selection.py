@@ -15,8 +15,17 @@ from lerobot_vtrefine.diagnose.robot.candidates import (
     delay_starts,
     resolution,
 )
-from lerobot_vtrefine.diagnose.robot.fitting import INDEX, Fit, Problem, first_point, fit, servo_only
-from lerobot_vtrefine.diagnose.robot.gravity import FREE_FORM, is_sliding
+from lerobot_vtrefine.diagnose.robot.fitting import (
+    INDEX,
+    SAG,
+    Fit,
+    Problem,
+    first_point,
+    fit,
+    refit,
+    servo_only,
+)
+from lerobot_vtrefine.diagnose.robot.gravity import FREE_FORM, TWO_TERM_FORM, full_reach, is_sliding
 from lerobot_vtrefine.diagnose.robot.resampling import cross_validated, folds_of
 
 Array = np.ndarray
@@ -28,8 +37,11 @@ LEAST_GAIN = 0.01
 LEAST_EFFECT_RAD, LEAST_EFFECT_M = 1e-4, 1e-5
 """Smallest change of the prediction (root mean square) that is worth a name."""
 MAX_ROUNDS = 4
-_FREE_FORM_GAIN = 0.03
+_FORM_LEAD = {TWO_TERM_FORM: 0.02, FREE_FORM: 0.05}
+"""By how much forms with more terms must beat those with one."""
 _DECOY_LEAD = 0.05
+_EXTRAPOLATION = (4.0, 8.0)
+"""Largest size of a cause over the largest error seen: of several that may cancel, and of one alone."""
 
 
 @dataclass(frozen=True)
@@ -105,6 +117,8 @@ class Selector:
         self.baseline_held_out = self.held_out
         self.chosen: dict[int, tuple[Candidate, ...]] = {}
         self.delayed = False
+        self.changed = np.ones(problem.batch.joints, dtype=bool)
+        """Joints on which the last round accepted something: only there can the next one find more."""
         self.p_values: dict[tuple[str, int], float] = {}
         sliding = np.array([is_sliding(name) for name in problem.names])
         self.least_effect = np.maximum(
@@ -116,7 +130,7 @@ class Selector:
         first: tuple[Tried, ...] = ()
         for number in range(MAX_ROUNDS):
             self.progress(f"robot: trying causes, round {number + 1}")
-            tried = self.try_all(None if number == 0 else self._open())
+            tried = self.try_all(self.changed)
             first = first or tried
             if not self._accept(tried):
                 break
@@ -135,8 +149,8 @@ class Selector:
             first,
         )
 
-    def try_all(self, joints: Array | None) -> tuple[Tried, ...]:
-        """Every candidate on top of what is accepted, on all joints or some, with family-wise p."""
+    def try_all(self, joints: Array) -> tuple[Tried, ...]:
+        """Every candidate on top of what is accepted, on some joints, with family-wise p."""
         tried: list[Tried] = []
         for candidate in CANDIDATES:
             allowed = joints
@@ -144,33 +158,23 @@ class Selector:
                 # Slow to simulate, and to first order the same as play: only where play helps at all.
                 helped = [item.gain > LEAST_GAIN / 2 for item in tried if item.cause == "backlash"]
                 allowed = np.any([np.zeros(self.problem.batch.joints), *helped], axis=0)
-                allowed = allowed if joints is None else allowed & joints
+                allowed = allowed & joints
             item = self.attempt(candidate, allowed)
             tried += [] if item is None else [item]
         if not self.delayed:
             tried.append(self._attempt_delay())
         return self._with_p(tried)
 
-    def attempt(self, candidate: Candidate, joints: Array | None = None) -> Tried | None:
-        """Fit one candidate on all joints that allow it; None where none does."""
-        allowed = candidate.applicable(self.problem) & ~candidate.clashes(self.now.free)
-        if joints is not None:
-            allowed &= joints
+    def attempt(self, candidate: Candidate, joints: Array) -> Tried | None:
+        """Fit one candidate on those of the joints that allow it; None where none does."""
+        allowed = joints & candidate.applicable(self.problem) & ~candidate.clashes(self.now.free)
         index = np.flatnonzero(allowed)
         if not len(index):
             return None
-        # Joints that it is not tried on rest; with a free delay they would not, and the delay is kept for now.
+        # Joints that it is not tried on rest, and so does the delay for now.
         free = candidate.freed(self.now.free, index) & allowed[:, None]
-        own = replace(self.now, free=free)
-        fits = [
-            fit(
-                self.problem,
-                candidate.starting(self.problem, own.point, index, multiple),
-                free,
-                iterations=12,
-            )
-            for multiple in candidate.starts
-        ]
+        starts = [candidate.starting(self.problem, self.now.point, index, m) for m in candidate.starts]
+        fits = [fit(self.problem, start, free, iterations=12, known=self.now) for start in starts]
         best = fits[0]
         for other in fits[1:]:
             better = other.total < best.total
@@ -182,7 +186,7 @@ class Selector:
 
     def _attempt_delay(self) -> Tried:
         fits = []
-        for start in delay_starts(self.problem):
+        for start in delay_starts(self.problem)[: None if self.changed.all() else 1]:
             point = replace(self.now.point, tau_s=start)
             fits.append(fit(self.problem, point, self.now.free, tau_free=True, iterations=12))
         best = min(fits, key=lambda item: float((item.total / self.baseline.total.clip(1e-300)).sum()))
@@ -197,7 +201,25 @@ class Selector:
         valid = self.problem.batch.valid.sum()
         effect = np.sqrt(np.square(best.residual - self.now.residual).sum((0, 1)) / valid)
         eligible = allowed & (gain > LEAST_GAIN) & (effect > self.least_effect)
+        if candidate is not None:
+            eligible &= self._plausible(best, candidate)
         return Tried(candidate, best, held_out, improvement, gain, eligible)
+
+    def _plausible(self, best: Fit, candidate: Candidate) -> Array:
+        """(J,) whether no cause is credited with many times the error that it is to explain.
+
+        An offset and a sag, or a sag's own terms, may nearly cancel in the postures seen; their sizes then
+        tell nothing.
+        """
+        left = np.abs(self.baseline.residual)[self.problem.batch.valid]
+        largest = np.quantile(left, 0.995, axis=0)
+        sag = best.point.theta[:, [INDEX[name] for name in SAG]]
+        several = np.count_nonzero(sag, axis=1) + (best.point.value("offset") != 0) > 1
+        limit = np.where(several, *_EXTRAPOLATION) * largest
+        reach = [abs(full_reach(form, row)) for form, row in zip(best.point.forms, sag, strict=True)]
+        if candidate.cause == DECOY:
+            return np.ones(len(limit), dtype=bool)
+        return (np.array(reach) <= limit) & (np.abs(best.point.value("offset")) <= limit)
 
     def _with_p(self, tried: list[Tried]) -> tuple[Tried, ...]:
         """Adjusted over all candidates and joints; the delay is one hypothesis about all joints together."""
@@ -231,7 +253,9 @@ class Selector:
             )
             if by_delay > own:
                 self._take(delay, np.arange(self.problem.batch.joints))
+                self.changed = np.ones_like(self.changed)
                 return True
+        self.changed = np.isin(np.arange(len(self.changed)), list(best))
         for joint, item in best.items():
             self._take(item, np.array([joint]))
         if best:
@@ -257,10 +281,6 @@ class Selector:
     def _refit(self) -> None:
         self.now = fit(self.problem, self.now.point, self.now.free, self.delayed)
         self.held_out = cross_validated(self.problem, self.now, self.folds)
-
-    def _open(self) -> Array:
-        """(J,) joints on which more may be found: all, since the delay couples them."""
-        return np.ones(self.problem.batch.joints, dtype=bool)
 
     def _prefer_single(self, first: tuple[Tried, ...]) -> None:
         """Where one cause alone does as well as several, it is the one."""
@@ -295,6 +315,8 @@ class Selector:
                     self._remove(candidate, joint)
         if self.delayed and self.loss_without_delay() < LEAST_GAIN:
             self._remove_delay()
+        elif self.delayed:
+            self._refit()
 
     def without(self, candidate: Candidate, joint: int) -> tuple[Fit, Array]:
         """Refit and held-out error with one candidate taken from one joint."""
@@ -303,8 +325,9 @@ class Selector:
         for name in candidate.parameters:
             free[joint, INDEX[name]] = False
             point = point.with_values(name, 0.0, np.array([joint]))
-        fitted = fit(self.problem, point, free, self.delayed, iterations=8)
-        return fitted, cross_validated(self.problem, fitted, self.folds)
+        joints = np.array([joint])
+        fitted = refit(self.problem, self.now, point, free, joints, iterations=8)
+        return fitted, cross_validated(self.problem, fitted, self.folds, self.held_out, joints)
 
     def loss_without(self, candidate: Candidate, joint: int) -> float:
         """Part of the joint's held-out error that comes back."""
@@ -350,8 +373,9 @@ def _handicapped(item: Tried, joint: int) -> float:
     error = float(item.held_out.mean(0)[joint])
     if item.cause == DECOY:
         return error * (1 + _DECOY_LEAD)
-    if item.candidate is not None and item.candidate.form == FREE_FORM:
-        return error * (1 + _FREE_FORM_GAIN)
+    form = item.candidate.form if item.candidate is not None else None
+    if form in _FORM_LEAD:
+        return error * (1 + _FORM_LEAD[form])
     return error
 
 
