@@ -6,7 +6,7 @@ from collections.abc import Callable
 import numpy as np
 from lerobot.motors import MotorCalibration
 
-from lerobot_vtrefine.drivers.dynamixel_arm import ArmModel, DynamixelArm, Floats
+from lerobot_vtrefine.drivers.dynamixel_arm import RETRIES, ArmModel, DynamixelArm, Floats
 
 logger = logging.getLogger(__name__)
 
@@ -66,7 +66,7 @@ class ArmPair:
     def write_calibration(self) -> None:
         """Writes the loaded calibration to the motors, with torque off."""
         for arm in self.arms.values():
-            arm.bus.disable_torque()
+            arm.bus.disable_torque(num_retry=RETRIES)
             arm.write_calibration()
 
     def setup_motors(self, ask: Ask) -> None:

@@ -28,8 +28,11 @@ COUNTS_PER_TURN = 4096
 CENTRE = COUNTS_PER_TURN // 2
 GRIPPER = "gripper"
 
-RETRIES = 2
-"""Repeated tries of a bus transaction: single packets do get lost."""
+RETRIES = 4
+"""Repeated tries of a bus transaction: single packets do get lost, and a busy machine answers late."""
+
+PING_RETRIES = 2
+"""Repeated tries to reach a motor that may not be there."""
 
 MOVE_RATE_HZ = 50.0
 
@@ -149,7 +152,9 @@ class DynamixelArm:
 
     def _motor_problem(self) -> str:
         """What is wrong with the motors on the bus; empty when all answer and are of the right model."""
-        models = {name: self.bus.ping(motor.id, num_retry=RETRIES) for name, motor in self.bus.motors.items()}
+        models = {
+            name: self.bus.ping(motor.id, num_retry=PING_RETRIES) for name, motor in self.bus.motors.items()
+        }
         if all(model is None for model in models.values()):
             return (
                 f"no motor answers at {self.bus.default_baudrate} baud: switch on the arm's power, and check "
@@ -249,7 +254,8 @@ class DynamixelArm:
         self.bus.disable_torque(num_retry=RETRIES)
         for shadow, _, _, motor in self.model.shadows:
             self.bus.write("Secondary_ID", shadow, self.bus.motors[motor].id, num_retry=RETRIES)
-        self.bus.configure_motors()
+        for motor in self.bus.motors:  # LeRobot's configure_motors never tries again
+            self.bus.write("Return_Delay_Time", motor, 0, num_retry=RETRIES)
 
     def configure(self, gripper_current_ma: float, torque_limit: float) -> None:
         """Sets shadows, modes and limits of a driven arm, with torque off.
