@@ -18,9 +18,14 @@ OFFSET_STEP_M = 5e-6
 
 @dataclass(frozen=True)
 class Baseline:
-    """A fit, the noise around it and the weights that follow from both."""
+    """A fit, the noise around it and the weights that follow from both.
+
+    `plain` is the unweighted least-squares fit: the baseline that foretells plain readings best, and so the
+    one that an extension is measured against.
+    """
 
     fitted: Fit
+    plain: Fit
     noise: Noise
     weights: tuple[TrialWeights, ...]
 
@@ -105,13 +110,20 @@ def weigh(
     return noise, tuple(build_weights(noise, fitted.signals, tangents))
 
 
+def plain_weights(presses: PressSet) -> list[TrialWeights]:
+    """Every recording counts alike, every reading in it alike: what the plain mean squared error measures."""
+    weights = []
+    for press in presses.presses:
+        sigma = np.full(press.signal.shape, np.sqrt(press.signal.size))
+        weights.append(TrialWeights(sigma, 0.0, np.zeros((press.signal.size, 0)), np.zeros((0, 0))))
+    return weights
+
+
 def fit_baseline(presses: PressSet) -> Baseline:
     """Refit gain, stiffness and damping, then the noise, then both again with the right weights."""
     setting = describe(presses)
     guess = first_guess(presses, setting)
-    rough = Noise(1.0, 0.0, 0.0, 0.01, 1e-5)
-    weights = build_weights(rough, [np.zeros_like(p.signal) for p in presses.presses], None)
-    fitted = fit(guess, presses, weights)
+    fitted = plain = fit(guess, presses, plain_weights(presses))
     k_n = stiffness_from_load(presses, fitted.model)
     top = max((float(np.max(signal)) for signal in fitted.signals if signal.size), default=1.0)
     setting = replace(setting, top_counts=max(top, 1.0))
@@ -120,4 +132,5 @@ def fit_baseline(presses: PressSet) -> Baseline:
     noise, weights = weigh(fitted, presses)
     fitted = fit(fitted.model, presses, weights)
     noise, weights = weigh(fitted, presses)
-    return Baseline(fit(fitted.model, presses, weights), noise, tuple(weights))
+    plain = fit(replace(plain.model, setting=setting, k_n=model.k_n), presses, plain_weights(presses), 2)
+    return Baseline(fit(fitted.model, presses, weights), plain, noise, tuple(weights))

@@ -4,13 +4,14 @@ from collections.abc import Sequence
 
 import numpy as np
 
+from lerobot_vtrefine.diagnose.baseline import plain_weights
 from lerobot_vtrefine.diagnose.candidates import CATALOGUE
 from lerobot_vtrefine.diagnose.evidence import Evidence
 from lerobot_vtrefine.diagnose.fitting import Fit, predict, squared_errors
 from lerobot_vtrefine.diagnose.intervals import form_parameters, map_parameters
 from lerobot_vtrefine.diagnose.presses import PressSet
 from lerobot_vtrefine.diagnose.screening import ALPHA
-from lerobot_vtrefine.diagnose.selection import MAPS, MIN_GAIN, Search, take_away
+from lerobot_vtrefine.diagnose.selection import MAPS, MIN_GAIN, Search, settle
 from lerobot_vtrefine.diagnose.verdict import Cause, Parameter
 
 
@@ -21,7 +22,7 @@ def named_causes(
     full = float(squared_errors(predict(fitted.model, locked), locked).mean())
     causes = []
     for name in fitted.model.families:
-        slim = take_away(search, fitted, name)
+        slim = settle(search, fitted.model.minus(name), plain_weights(search.presses))
         without = float(squared_errors(predict(slim.model, locked), locked).mean())
         causes.append(
             Cause(

@@ -154,7 +154,7 @@ def _conclude(
     names = fitted.model.families
     plain, extended = (
         sensor_model(model, everyone.idle, everyone.step_counts, baseline.noise.floor)
-        for model in (baseline.fitted.model, fitted.model)
+        for model in (baseline.plain.model, fitted.model if names else baseline.plain.model)
     )
     held_set = everyone.subset(locked)
     foretold = foretell(held_set, plain, extended)
@@ -174,7 +174,7 @@ def _conclude(
         issues=tuple(issues),
         baseline_model=plain,
         extended_model=extended,
-        baseline_params=baseline_parameters(baseline.fitted, resampled_values(baseline.fitted, seed)),
+        baseline_params=baseline_parameters(baseline.plain, resampled_values(baseline.plain, seed)),
         evidence=evidence_table(search, fitted, role, rivals.groups),
         traces=traces(foretold),
         residuals=residual_views(foretold, seed),

@@ -19,6 +19,8 @@ from lerobot_vtrefine.diagnose.weights import TrialWeights
 MAX_CAUSES = 4
 MIN_GAIN = 0.01
 """Part of the mean squared error on recordings left out that a cause must take away."""
+AGREEMENT_P = 0.05
+"""Chance that recordings left out are foretold better as often, if there were nothing (sign flips)."""
 REFITTED = 6
 """Survivors that are refitted in a round."""
 MAPS = ("taxel_gain_spread", "dead_taxels")
@@ -116,13 +118,14 @@ def _loss(search: Search, model: Composite) -> float:
     return float(losses_of(predict(model, search.presses), search.presses, search.weights).sum())
 
 
-def settle(search: Search, model: Composite) -> Fit:
+def settle(search: Search, model: Composite, weights: Sequence[TrialWeights] | None = None) -> Fit:
     """Fit a model's coordinates; if it holds a map of gains, in turns with the map."""
-    fitted = fit(model, search.presses, search.weights)
+    weights = search.weights if weights is None else weights
+    fitted = fit(model, search.presses, weights)
     if model.gain_map is None:
         return fitted
     for _ in range(2):
-        fitted = fit(with_map(fitted, search.presses, search.weights), search.presses, search.weights, 4)
+        fitted = fit(with_map(fitted, search.presses, search.weights), search.presses, weights, 4)
     return fitted
 
 
@@ -233,7 +236,8 @@ def rank(search: Search, fitted: Fit, candidates: Sequence[Screened], probes: Se
         score = scored(search, found)
         gain, logs = score.gain_over(base), score.better_by(base)
         search.tried[name] = max(gain, search.tried.get(name, -np.inf))
-        if gain > MIN_GAIN and logs.sum() > 0:
+        agreed = name == "dead_taxels" or paired_p(logs, search.seed) < AGREEMENT_P
+        if gain > MIN_GAIN and logs.sum() > 0 and agreed:
             steps.append(Step(name, found, score, gain, logs))
         if name == "dead_taxels" and steps and steps[-1].name == name:
             return [steps[-1]]
