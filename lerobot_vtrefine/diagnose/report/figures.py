@@ -19,6 +19,7 @@ LEFT, RIGHT = 58.0, 14.0
 CHANNELS = 2
 """Channels drawn per trial: the first ones of a trace."""
 CHANNEL_HEIGHT, DRIVE_HEIGHT = 120.0, 46.0
+SHOWN_TRIALS = 24
 DRIVE_TITLES = {"depth_m": "depth", "force_n": "force", "command": "command", "x_m": "x", "y_m": "y"}
 DRIVE_UNITS = {"m": "m", "n": "N", "rad": "rad", "s": "s"}
 
@@ -96,8 +97,8 @@ def error_figure(heldout: Heldout, unit: str) -> str:
 
 
 def trial_figure(errors: Sequence[TrialError], unit: str) -> str:
-    """Error of every held-out trial, from simulated to extended."""
-    ordered = sorted(errors, key=lambda error: -error.extended)
+    """Errors of held-out trials, from simulated to extended; the worst predicted ones of many."""
+    ordered = sorted(errors, key=lambda error: -error.extended)[:SHOWN_TRIALS]
     factor, name = scale_of(max(max(e.baseline, e.extended) for e in ordered), unit)
     numbers = np.array([[e.baseline, e.extended] for e in ordered]) * factor
     height = 22.0 * len(ordered)

@@ -126,7 +126,7 @@ def headline(verdict: Verdict, unit: str) -> str:
         sure = [title(c.name) for c in verdict.causes if not any(c.name in g for g in verdict.ambiguous_with)]
         beside = f" It surely lacks {listing(sure)}." if sure else ""
         return f"The simulation is wrong, but these recordings cannot tell whether it lacks {pairs}.{beside}"
-    clue = f" It goes with {verdict.unknown.clue}." if verdict.unknown.clue else ""
+    clue = f" What is known of it: {verdict.unknown.clue}." if verdict.unknown.clue else ""
     symptoms = f" What looks like {names} may be a symptom of it." if names else ""
     return f"The simulation is wrong in a way that no known cause explains.{clue}{symptoms}"
 
