@@ -8,7 +8,6 @@ closed meshes.
 import warp as wp
 
 from lerobot_vtrefine.tactile.kernels import (
-    CLOSEST,
     Bodies,
     Grid,
     Lattice,
@@ -16,10 +15,8 @@ from lerobot_vtrefine.tactile.kernels import (
     Views,
     column,
     coordinate,
-    eval_rate,
     own_first,
     own_next,
-    rate_form,
 )
 
 wp.set_module_options({"enable_backward": False})
@@ -215,15 +212,18 @@ def query_grid(
     """Raise penetrations and rates to those of mesh k; deeper than the reach counts as the reach, at rest."""
     area = views.window[env, pad, k]
     axes = views.axes[env, pad, k]
+    ex = column(axes, 0)
+    ey = column(axes, 1)
     origin = views.origin[env, pad, k]
+    linear = views.linear[env, pad, k]
+    angular = views.angular[env, pad, k]
     grid = bodies.grids[k]
     for row in range(area[0], area[1]):
-        y = coordinate(row, lattice.pitch, lattice.rows)
-        along = origin + y * column(axes, 1)
+        from_middle = coordinate(row, lattice.pitch, lattice.rows) * ey
         col = own_first(share, area[2])
         while col < area[3]:
-            x = coordinate(col, lattice.pitch, lattice.cols)
-            p = along + x * column(axes, 0)
+            lever = from_middle + coordinate(col, lattice.pitch, lattice.cols) * ex
+            p = origin + lever
             cell = cell_of(grid, bodies.cells, p)
             index = row * lattice.cols + col
             if col >= area[2] and cell[0] < 0:
@@ -236,13 +236,7 @@ def query_grid(
                 if value > depth[index] and wp.dot(found.toward, normal) > 0.0:
                     if found.distance > TINY_M:
                         normal = found.toward
-                    form = rate_form(
-                        CLOSEST,
-                        wp.normalize(normal),
-                        axes,
-                        views.linear[env, pad, k],
-                        views.angular[env, pad, k],
-                    )
+                    speed = wp.dot(normal, linear + wp.cross(angular, lever))
                     depth[index] = value
-                    rate[index] = eval_rate(form, x, y, 0.0)
+                    rate[index] = -speed / wp.length(normal)
             col = own_next(share, col)
