@@ -11,6 +11,7 @@ import json
 import multiprocessing
 import os
 import sys
+from contextlib import ExitStack
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -18,6 +19,7 @@ from typing import Any
 os.environ.setdefault("OMP_NUM_THREADS", "1")
 os.environ.setdefault("MKL_NUM_THREADS", "1")
 
+import numpy as np
 from tqdm import tqdm
 
 ROOT = Path(__file__).parents[1]
@@ -56,7 +58,9 @@ def chosen(args: argparse.Namespace) -> list[Any]:
         make, count = cases.GROUPS[name]
         count = args.per_cell or (max(1, count // QUICK_DIVISOR) if args.quick else count)
         found += make(count, first)
-    return [case for case in found if not args.only or args.only in case.name]
+    found = [case for case in found if not args.only or args.only in case.name]
+    # In a fixed random order, so that an interrupted run's table is a fair sample of the whole.
+    return [found[i] for i in np.random.default_rng(0).permutation(len(found))]
 
 
 def run(output_dir: Path, task: tuple[Any, bool]) -> dict[str, Any]:
@@ -81,9 +85,11 @@ def main() -> None:
     tasks = list(zip(wanted, naive, strict=True))
     if args.table:
         tasks = [task for task in tasks if (args.output_dir / f"{task[0].name}.json").exists()]
-    context = multiprocessing.get_context("spawn")
-    with context.Pool(args.jobs) as pool:
-        results = pool.imap_unordered(partial(run, args.output_dir), tasks)
+    with ExitStack() as stack:
+        pool = None
+        if args.jobs > 1 and not args.table:
+            pool = stack.enter_context(multiprocessing.get_context("spawn").Pool(args.jobs))
+        results = (pool.imap_unordered if pool else map)(partial(run, args.output_dir), tasks)
         rows = list(tqdm(results, total=len(tasks), unit="set", disable=args.table))
     if not rows:
         sys.exit(f"{args.output_dir}: no results yet; run without --table")
