@@ -105,8 +105,11 @@ def test_unknown_cause_demotes_names_to_symptoms(pad_set):
         status="unexplained", causes=symptoms, unknown=Unknown(True, "load × session time")
     )
     text = text_of(page(unknown, pad_set))
-    assert "wrong in a way that no known cause explains. It goes with load × session time." in text[:200]
+    assert (
+        "wrong in a way that no known cause explains. What is known of it: load × session time." in text[:240]
+    )
     assert "What looks wrong" in text
+    assert "vary one thing at a time" in text
     assert "a symptom: the name may be borrowed" in text
 
 

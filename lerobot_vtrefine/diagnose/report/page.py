@@ -11,6 +11,7 @@ from jinja2 import Environment, PackageLoader, StrictUndefined
 from lerobot_vtrefine.diagnose.evidence import Diagnosis, Evidence, Trace
 from lerobot_vtrefine.diagnose.recordings import RecordingSet
 from lerobot_vtrefine.diagnose.report.figures import (
+    SHOWN_TRIALS,
     error_figure,
     map_image,
     residual_figure,
@@ -74,6 +75,7 @@ def _nothing() -> dict[str, Any]:
     names = (
         "error_chart",
         "trial_chart",
+        "trial_note",
         "traces",
         "more_traces",
         "residuals",
@@ -91,6 +93,7 @@ def _findings(verdict: Verdict, diagnosis: Diagnosis, unit: str) -> dict[str, An
     return {
         "error_chart": error_figure(verdict.heldout, unit) if verdict.heldout else "",
         "trial_chart": trial_figure(diagnosis.trial_errors, unit) if diagnosis.trial_errors else "",
+        "trial_note": _trial_note(len(diagnosis.trial_errors)),
         "traces": traces[:SHOWN_TRACES],
         "more_traces": traces[SHOWN_TRACES:],
         "residuals": [residual_figure(view, unit) for view in diagnosis.residuals],
@@ -100,6 +103,10 @@ def _findings(verdict: Verdict, diagnosis: Diagnosis, unit: str) -> dict[str, An
         ],
         "maps": _maps(diagnosis.maps, unit),
     }
+
+
+def _trial_note(count: int) -> str:
+    return f"; the {SHOWN_TRIALS} worst predicted of {count}" if count > SHOWN_TRIALS else ""
 
 
 def _facts(verdict: Verdict, recordings: RecordingSet, sound: int, seed: int) -> list[tuple[str, str]]:
