@@ -6,9 +6,11 @@ All on one scene in one process and one CPU thread. Imports warp and MuJoCo.
 import os
 import subprocess
 import sys
+from collections.abc import Callable, Iterator
 
 import numpy as np
 import torch
+import warp as wp
 
 from lerobot_vtrefine.tactile.benchmark_peers import mujoco_rate, mujoco_warp_rate, three_ray_rate
 from lerobot_vtrefine.tactile.benchmark_scene import (
@@ -21,7 +23,7 @@ from lerobot_vtrefine.tactile.benchmark_scene import (
     ring_mesh,
 )
 from lerobot_vtrefine.tactile.engine import ContactEngine
-from lerobot_vtrefine.tactile.geometry import BodyGeometry, Box
+from lerobot_vtrefine.tactile.geometry import BodyGeometry, Box, TriangleMesh
 from lerobot_vtrefine.tactile.layout import PadLayout
 from lerobot_vtrefine.tactile.model import SensorModel
 from lerobot_vtrefine.tactile.stages.base import STAGES, Frame
@@ -47,11 +49,11 @@ sensors = PadSensors(PadLayout(), [BodyGeometry([Box((0.01, 0.01, 0.01))])], 1, 
 sensors.counts([0], poses, 0.1, np.array([[[5.0, 0, 0]]]))
 print(time.process_time() - imported)
 """
-"""Prints the processor seconds from its own imports to the first reading: warp, and kernels from its cache."""
+"""Prints the processor seconds from its imports to the first reading: warp, and kernels from its cache."""
 
 
-def model_rate(scene: Scene, law: str, device: str = "cpu") -> float:
-    """Taxels per second of a contact stage by name."""
+def model_call(scene: Scene, law: str, device: str) -> Callable[[], object]:
+    """Computes the forces of a contact stage, by name, on a scene."""
     contact = STAGES[law]()
     if not isinstance(contact, ContactStage):
         raise ValueError(f"{law!r} is not a contact stage")
@@ -59,16 +61,31 @@ def model_rate(scene: Scene, law: str, device: str = "cpu") -> float:
     layout = PadLayout()
     engine = ContactEngine(layout, [BodyGeometry([scene.body])], model, contact.load_conserving, device)
     frame = Frame(layout=layout)
+    return lambda: engine(contact, scene.poses, scene.load, frame)
 
-    calls = 1 if device == "cpu" else CALLS_PER_WAIT
+
+def model_rate(scene: Scene, law: str) -> float:
+    """Taxels per second of a contact stage on one CPU thread."""
+    return scene.num_taxels / best_seconds(model_call(scene, law, "cpu"))
+
+
+def cuda_rate(scene: Scene, law: str, captured: bool) -> float:
+    """The same on the present CUDA device, launches queued, or captured in a graph as a simulator's are."""
+    call = model_call(scene, law, "cuda")
+    call()
+    if captured:
+        with wp.ScopedCapture("cuda") as capture:
+            call()
 
     def run() -> None:
-        for _ in range(calls):
-            engine(contact, scene.poses, scene.load, frame)
-        if device != "cpu":
-            torch.cuda.synchronize()
+        for _ in range(CALLS_PER_WAIT):
+            if captured:
+                wp.capture_launch(capture.graph)
+            else:
+                call()
+        wp.synchronize_device("cuda")
 
-    return scene.load.shape[0] * NUM_PADS * layout.num_taxels * calls / best_seconds(run, device != "cpu")
+    return scene.num_taxels * CALLS_PER_WAIT / best_seconds(run, on_gpu=True)
 
 
 def body_scenes(num_envs: int, device: str) -> dict[str, Scene]:
@@ -120,15 +137,14 @@ def start_row() -> Row:
     return f"tactile start: {START_S:g} s / its time", START_S / seconds[-1], text
 
 
-def run_cuda(num_envs: int = CUDA_ENVS) -> list[Row]:
-    """Rows (name, 1e9 taxels per second, explanation) on the present CUDA device."""
-    rows = []
+def run_cuda(num_envs: int = CUDA_ENVS) -> Iterator[Row]:
+    """Rows (name, 1e9 taxels per second, explanation) on the present CUDA device, as they are measured."""
     for where, scene in body_scenes(num_envs, "cuda").items():
-        for law in LAWS:
-            rate = model_rate(scene, law, "cuda")
-            text = f"G taxels/s, {num_envs} environments of {NUM_PADS} pads pressed on {where}"
-            rows.append((f"tactile {law} on CUDA, {where}", rate / 1e9, text))
-        if where == "a ring":
+        for captured in (False, True):
+            for law in LAWS:
+                how = "one graph launch each" if captured else "launches queued"
+                text = f"G taxels/s, {num_envs} environments of {NUM_PADS} pads pressed on {where}, {how}"
+                yield f"tactile {law} on CUDA, {where}", cuda_rate(scene, law, captured) / 1e9, text
+        if isinstance(scene.body, TriangleMesh):
             rate = three_ray_rate(scene, "cuda")
-            rows.append(("a three-ray mesh query on CUDA", rate / 1e9, "G taxels/s, the same scene"))
-    return rows
+            yield "a three-ray mesh query on CUDA", rate / 1e9, f"G taxels/s, {where} too"

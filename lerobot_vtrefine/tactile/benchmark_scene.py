@@ -8,6 +8,7 @@ import numpy as np
 import torch
 
 from lerobot_vtrefine.tactile.geometry import Primitive, TriangleMesh
+from lerobot_vtrefine.tactile.layout import PadLayout
 
 NUM_ENVS, NUM_PADS = 64, 4
 PRESS_M = 2e-4
@@ -37,6 +38,11 @@ class Scene:
     body: Primitive
     poses: list[torch.Tensor]
     load: torch.Tensor
+
+    @property
+    def num_taxels(self) -> int:
+        """Taxels of all environments."""
+        return self.load.shape[0] * NUM_PADS * PadLayout().num_taxels
 
 
 def make_scene(body: Primitive, lowest_m: float, num_envs: int, device: str) -> Scene:
