@@ -12,6 +12,7 @@ interrupted and started again, it continues. Results: ``comparison.json`` and ``
 
 import argparse
 import json
+import os
 import subprocess
 import sys
 from dataclasses import dataclass
@@ -138,8 +139,8 @@ def imitation_stages(budget: Budget) -> list[Stage]:
 def diagnosis_stages(budget: Budget, name: str) -> list[Stage]:
     """Presses of a hidden pad, and what diagnosis makes of them."""
     folder, output = budget.output_dir / folder_name(name), budget.diagnosis(name)
-    script = Path(__file__).with_name("press_reality.py")
-    press = ("python", str(script), f"--reality={folder / 'reality.json'}", f"--trials={budget.presses}")
+    script = os.path.relpath(Path(__file__).with_name("press_reality.py"))  # what a user would type
+    press = ("python", script, f"--reality={folder / 'reality.json'}", f"--trials={budget.presses}")
     press = (*press, f"--output_dir={folder / 'presses'}")
     diagnose = ("vtrefine-diagnose", f"--recording={folder / 'presses'}", f"--output_dir={output}")
     pressed, product = f"press_{folder.name}", folder / "presses" / "recording.json"
