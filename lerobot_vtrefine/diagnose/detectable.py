@@ -64,7 +64,7 @@ def _smallest(form: Form, guess: np.ndarray, scorer: Scorer) -> np.ndarray | Non
         strength = _strength(form, values, scorer)
         if strength >= MARGIN:
             best = values
-        if 0.9 <= strength / MARGIN <= 1.3:
+        if 1.0 <= strength / MARGIN <= 1.25:
             break
         factor = float(np.clip(MARGIN * 1.1 / max(strength, 1e-6), 0.02, 50.0))
         values = values.copy()
