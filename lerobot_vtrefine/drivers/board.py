@@ -30,8 +30,8 @@ SILENCE_S = 0.0015
 """A line on which nothing came for this long was silent (at 2 Mbaud: the time of 300 bytes)."""
 
 COALESCE_S = 0.001
-"""Pause after the first byte of a burst, so that a frame costs one or two wake-ups instead of one per USB
-packet."""
+"""Pause after the first bytes of a burst that are no whole frame, so that a frame costs one or two wake-ups
+instead of one per USB packet."""
 
 RETRY_S = 0.25
 """Pause between attempts to reopen a lost port."""
@@ -283,12 +283,18 @@ class PadReader:
                 if not first:
                     continue
                 after_silence = time.monotonic() - silent_since >= SILENCE_S
-                time.sleep(COALESCE_S)
                 data = first + device.read(device.in_waiting)
+                if not self._whole(data):
+                    time.sleep(COALESCE_S)
+                    data += device.read(device.in_waiting)
             else:
                 data = device.read(pending)
             silent_since = None
             self._take(data, after_silence, then_quiet=not device.in_waiting)
+
+    def _whole(self, data: bytes) -> bool:
+        """Whether a burst may be complete, so that there is nothing to wait for."""
+        return self.config.protocol == "binary" and len(data) % self.config.board_shape.period == 0
 
     def _take(self, data: bytes, after_silence: bool, then_quiet: bool) -> None:
         now = time.monotonic()
