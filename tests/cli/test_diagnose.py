@@ -97,6 +97,26 @@ def test_robot_sets(tmp_path, engine):
     assert "backlash or control latency" in (tmp_path / "out" / "report.html").read_text()
 
 
+def test_lerobot_datasets(tmp_path, engine, write_dataset):
+    engine["answer"] = robot_diagnosis()
+    write_dataset(tmp_path / "dataset", 5, 20, 0)
+    arguments = [f"--dataset.root={tmp_path / 'dataset'}", f"--output_dir={tmp_path / 'out'}"]
+    assert diagnose.main(arguments) == 0
+    assert engine["recordings"].kind == "robot"
+    assert [len(trial.time_s) for trial in engine["recordings"].trials] == [20] * 5
+
+
+def test_too_few_robot_trials_leave_an_unfitted_model(tmp_path, engine):
+    folder = write_set(tmp_path / "set", *make_robot_set(trials=3))
+    assert run(folder, tmp_path / "out") == 0
+    assert read_verdict(tmp_path / "out" / "verdict.json").status == "invalid_data"
+    model = tmp_path / "out" / "sensor_model.json"
+    assert (
+        predict.main([f"--recording={folder}", f"--sensor_model={model}", f"--output_dir={tmp_path / 'p'}"])
+        == 0
+    )
+
+
 def test_earlier_results_are_replaced_only_when_told(tmp_path, engine, capsys):
     folder = write_set(tmp_path / "set", *make_set())
     (tmp_path / "out").mkdir()
