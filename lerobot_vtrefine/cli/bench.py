@@ -22,11 +22,18 @@ PARTS = {
     "drivers": "lerobot_vtrefine.drivers.benchmark",
 }
 
+SHORTENED: dict[str, dict[str, float]] = {"drivers": {"seconds": 2.0}}
+"""Arguments of run() that keep a part within the limit; with --full it gets its own defaults."""
+
 CHILD = """
 import importlib, json, pathlib, sys
-rows = [(name, float(ratio), text) for name, ratio, text in importlib.import_module(sys.argv[1]).run()]
+found = importlib.import_module(sys.argv[1]).run(**json.loads(sys.argv[3]))
+rows = [(name, float(ratio), text) for name, ratio, text in found]
 pathlib.Path(sys.argv[2]).write_text(json.dumps(rows), encoding="utf-8")
 """
+
+PLOT_DIR = Path("outputs/bench")
+SWITCHES = ("--full", "--plot")
 
 
 @dataclass(frozen=True)
@@ -36,7 +43,18 @@ class BenchConfig:
     parts: tuple[str, ...] = tuple(PARTS)
     """Parts to measure, of tactile, envs, finetune, drivers."""
     limit_s: float = 60.0
-    """Seconds that a part may take; a slower one is left out."""
+    """Seconds that a part may take; a slower one is left out. No limit with --full."""
+    full: bool = False
+    """Measure at full length what is otherwise shortened to stay within the limit."""
+    plot: bool = False
+    """Instead, draw the contact models' pressure images beside the exact ones, and a table of errors and
+    speeds, into outputs/bench."""
+    device: str | None = None
+    """Instead, measure worlds of the warp backend on cuda or cpu; on cuda the contact models, too."""
+    worlds: str = "1,64,1024,4096"
+    """Numbers of worlds for --device."""
+    steps: int = 40
+    """Control steps measured for each number of worlds."""
     json: Path | None = None
     """File for the rows as JSON, beside the table."""
 
@@ -46,6 +64,17 @@ class BenchConfig:
             raise ValueError(f"--parts: unknown {', '.join(unknown)}; choose from {', '.join(PARTS)}")
         if not self.limit_s > 0:
             raise ValueError(f"--limit_s must be above 0, got {self.limit_s}")
+        if self.plot and self.device is not None:
+            raise ValueError("--plot and --device are two different things to do; give one")
+        _ = self.world_counts
+
+    @property
+    def world_counts(self) -> tuple[int, ...]:
+        """`worlds` as numbers; ValueError for anything else."""
+        counts = self.worlds.strip("[]() ").split(",")
+        if not all(count.strip().isdigit() and int(count) > 0 for count in counts):
+            raise ValueError(f"--worlds must be numbers such as 1,64,1024, got {self.worlds!r}")
+        return tuple(int(count) for count in counts)
 
 
 @dataclass(frozen=True)
@@ -58,24 +87,25 @@ class Row:
     explanation: str
 
 
-def measure(parts: Iterable[str], limit_s: float) -> list[Row]:
+def measure(parts: Iterable[str], limit_s: float, full: bool = False) -> list[Row]:
     """Measure the parts one after the other, each in a process of its own.
 
-    A part without a benchmark, one that fails and one that takes longer than ``limit_s`` seconds are each
+    With ``full`` there is no limit, and parts are as long as they are meant to be. A part without a
+    benchmark, one that fails and one that takes longer than ``limit_s`` seconds are each
     named on one line; the others are measured all the same.
     """
     rows = []
     for part in parts:
         print(f"measuring {part} ...", file=sys.stderr, flush=True)
         try:
-            rows += measure_part(part, limit_s)
+            rows += measure_part(part, None if full else limit_s, {} if full else SHORTENED.get(part, {}))
         except (ChildProcessError, TimeoutError, ModuleNotFoundError) as error:
             print(f"{part}: {error}", file=sys.stderr, flush=True)
     return rows
 
 
-def measure_part(part: str, limit_s: float) -> list[Row]:
-    """The rows of one part.
+def measure_part(part: str, limit_s: float | None, arguments: dict[str, float]) -> list[Row]:
+    """The rows of one part, whose run() gets `arguments`.
 
     Raises:
         ModuleNotFoundError: it has no benchmark.
@@ -88,7 +118,7 @@ def measure_part(part: str, limit_s: float) -> list[Row]:
         result, log = Path(folder) / "rows.json", Path(folder) / "log"
         with log.open("wb") as file:
             child = subprocess.Popen(
-                [sys.executable, "-c", CHILD, PARTS[part], str(result)],
+                [sys.executable, "-c", CHILD, PARTS[part], str(result), json.dumps(arguments)],
                 stdin=subprocess.DEVNULL,
                 stdout=file,
                 stderr=subprocess.STDOUT,
@@ -112,13 +142,52 @@ def table(rows: Sequence[Row]) -> str:
     return "\n".join(f"{row.name:<{width}}  {row.ratio:8.2f}  {row.explanation}" for row in rows)
 
 
+def measure_device(config: BenchConfig, device: str) -> list[Row]:
+    """Prints a table of the warp backend's worlds; returns the contact models' rows, which need CUDA."""
+    from lerobot_vtrefine.sim.benchmark import measure_worlds
+    from lerobot_vtrefine.sim.benchmark import table as worlds_table
+    from lerobot_vtrefine.sim.config import WarpConfig
+    from lerobot_vtrefine.tactile.benchmark import run_cuda
+
+    worlds = []
+    for row in measure_worlds(WarpConfig(device=device), config.world_counts, config.steps):
+        print(f"{row.worlds} worlds: {row.worlds / row.step_s:.4g} steps/s", file=sys.stderr, flush=True)
+        worlds.append(row)
+    print(worlds_table(worlds))
+    return [Row("tactile", *row) for row in run_cuda()] if device.startswith("cuda") else []
+
+
+def plot(folder: Path) -> str:
+    """Draws `tactile.png` in the folder; returns the table beside it as Markdown, also written there."""
+    from lerobot_vtrefine.cli.bench_picture import draw, measure_cases
+    from lerobot_vtrefine.cli.bench_picture import table as models_table
+    from lerobot_vtrefine.tactile.benchmark import measure_rates
+
+    cases = measure_cases()
+    draw(cases, folder / "tactile.png")
+    text = models_table(cases, measure_rates())
+    (folder / "tactile.md").write_text(text + "\n", encoding="utf-8")
+    print(f"{folder / 'tactile.png'} and {folder / 'tactile.md'} written", file=sys.stderr, flush=True)
+    return text
+
+
 @run_cli
 def main() -> int:
     """Console entry point; the exit status is 1 when nothing could be measured."""
-    config = draccus.parse(BenchConfig)
-    rows = measure(config.parts, config.limit_s)
-    print(table(rows))
+    arguments = [f"{item}=true" if item in SWITCHES else item for item in sys.argv[1:]]
+    config = draccus.parse(BenchConfig, args=arguments)
+    if config.plot:
+        print(plot(PLOT_DIR))
+        return 0
+    if config.device is not None:
+        rows = measure_device(config, config.device)
+        print(table(rows))
+        found = True
+    else:
+        rows = measure(config.parts, config.limit_s, config.full)
+        print(table(rows))
+        found = bool(rows)
     if config.json is not None:
         config.json.parent.mkdir(parents=True, exist_ok=True)
         config.json.write_text(json.dumps([asdict(row) for row in rows], indent=2) + "\n", encoding="utf-8")
-    return 0 if rows else 1
+    return 0 if found else 1

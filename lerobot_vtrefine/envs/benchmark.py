@@ -3,6 +3,7 @@
 import multiprocessing as mp
 import resource
 import statistics
+import sys
 import time
 
 import mujoco.batch
@@ -24,7 +25,7 @@ Row = tuple[str, float, str]
 def run() -> list[Row]:
     """(what, ratio, explanation) for every read schedule, and GiB for memory."""
     rows = [_speed_row(every, window) for every, window in ((8, 2), (1, 1))]
-    return [*rows, _memory_row()]
+    return [*rows, _tactile_row(), _memory_row()]
 
 
 def _speed_row(every: int, window: int) -> Row:
@@ -60,6 +61,24 @@ def _ratio(env: VtRefineVectorEnv, batch: mujoco.batch.Batch, seed: int) -> floa
     return (time.perf_counter() - start) / whole
 
 
+def _tactile_row() -> Row:
+    """Seconds of reading all pads over seconds of whole steps, by turns."""
+    env = VtRefineVectorEnv(VtRefineEnvConfig(start="grasped"), NUM_ENVS)
+    shares = []
+    for seed in range(ROUNDS + 1):
+        env.reset(seed=seed * NUM_ENVS)
+        hold = env.episodes.sim.command_targets()
+        start = time.perf_counter()
+        for _ in range(STEPS):
+            env.step(hold)
+        middle = time.perf_counter()
+        for _ in range(STEPS):
+            env.episodes.sim.tactile()
+        shares.append((time.perf_counter() - middle) / (middle - start))
+    explanation = f"{NUM_ENVS} environments, everything read at every step; target below 0.15"
+    return "tactile's share of an environment step", statistics.median(shares[1:]), explanation
+
+
 def _memory_row() -> Row:
     """Peak resident memory of a fresh process that steps ``MEMORY_ENVS`` environments."""
     context = mp.get_context("spawn")
@@ -80,4 +99,5 @@ def _step_many() -> tuple[float, float]:
 
 
 def _peak_gib() -> float:
-    return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * 1024 / GIB
+    unit = 1 if sys.platform == "darwin" else 1024  # macOS counts bytes, Linux KiB
+    return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * unit / GIB

@@ -58,6 +58,59 @@ def test_nothing_measured_is_a_failure(monkeypatch: pytest.MonkeyPatch) -> None:
     assert bench.main() == 1
 
 
+@pytest.mark.usefixtures("fake_parts")
+def test_parts_are_shortened_unless_full(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    (tmp_path / "long_bench.py").write_text('def run(seconds=9.0): return [("length", seconds, "")]')
+    monkeypatch.setitem(bench.PARTS, "long", "long_bench")
+    monkeypatch.setitem(bench.SHORTENED, "long", {"seconds": 1.0})
+    assert [row.ratio for row in bench.measure(["long"], 60.0)] == [1.0]
+    assert [row.ratio for row in bench.measure(["long"], 0.001, full=True)] == [9.0]
+
+
+@pytest.mark.parametrize(
+    ("flags", "message"),
+    [
+        (["--worlds=1,many"], "--worlds must be numbers such as 1,64,1024, got '1,many'"),
+        (["--plot", "--device=cpu"], "--plot and --device are two different things"),
+        (["--device=tpu"], "warp.device must be auto, cpu, cuda or cuda:0, not 'tpu'"),
+        (["--limit_s=0"], "--limit_s must be above 0"),
+    ],
+)
+def test_bad_values_are_one_line(
+    flags: list[str], message: str, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setattr(sys, "argv", ["vtrefine-bench", *flags])
+    assert bench.main() == 2
+    said = capsys.readouterr().err.strip().splitlines()
+    assert len(said) == 1
+    assert message in said[0]
+
+
+def test_device_prints_a_row_per_number_of_worlds(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    flags = ["--device=cpu", "--worlds=1", "--steps=2"]
+    monkeypatch.setattr(sys, "argv", ["vtrefine-bench", *flags])
+    assert bench.main() == 0
+    lines = capsys.readouterr().out.strip().splitlines()
+    assert lines[0].split()[0] == "worlds"
+    assert lines[1].split()[0] == "1"
+
+
+def test_plot_writes_a_picture_and_a_table(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    rates = {"kelvin_voigt": 2e8, "consistent": 5e7, "a peer": 1.6e7}
+    monkeypatch.setattr("lerobot_vtrefine.tactile.benchmark.measure_rates", lambda: rates)
+    monkeypatch.setattr(bench, "PLOT_DIR", tmp_path / "bench")
+    monkeypatch.setattr(sys, "argv", ["vtrefine-bench", "--plot"])
+    assert bench.main() == 0
+    assert (tmp_path / "bench" / "tactile.png").read_bytes().startswith(b"\x89PNG")
+    table = capsys.readouterr().out
+    assert "| a peer | | | 16.0 |" in table
+    assert (tmp_path / "bench" / "tactile.md").read_text().strip() == table.strip()
+
+
 def test_unknown_part(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
     monkeypatch.setattr(sys, "argv", ["vtrefine-bench", "--parts=[physics]"])
     assert bench.main() == 2
