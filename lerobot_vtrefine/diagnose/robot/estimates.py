@@ -6,7 +6,7 @@ import numpy as np
 
 from lerobot_vtrefine.diagnose.robot.candidates import FRICTION, LATENCY
 from lerobot_vtrefine.diagnose.robot.fitting import INDEX, SAG, Problem
-from lerobot_vtrefine.diagnose.robot.friction_load import friction_in_load
+from lerobot_vtrefine.diagnose.robot.friction_load import friction_in_load, stiffness_in_load
 from lerobot_vtrefine.diagnose.robot.gravity import full_reach, is_sliding
 from lerobot_vtrefine.diagnose.robot.resampling import bootstrap
 from lerobot_vtrefine.diagnose.robot.selection import Selection
@@ -67,15 +67,16 @@ class Estimates:
         """In Nm where loads or the robot's known servo gains give the scale; else as the servo's error."""
         problem = self.selection.problem
         sliding = is_sliding(name)
-        if problem.batch.load is not None:
+        column = INDEX["friction"]
+        value = float(self.selection.fit.point.theta[joint, column])
+        low, high = _interval(self.theta[:, joint, column], value)
+        stiffness = stiffness_in_load(problem, self.selection.fit, joint)
+        if stiffness is None and problem.batch.load is not None:
             seen = friction_in_load(problem, self.selection.fit, joint, self.seed)
             if seen.seen:
                 unit = "N" if sliding else "Nm"
                 return f"{name}_{unit.lower()}", Parameter(seen.torque, seen.ci95, unit)
-        column = INDEX["friction"]
-        value = float(self.selection.fit.point.theta[joint, column])
-        low, high = _interval(self.theta[:, joint, column], value)
-        stiffness = _stiffness(name)
+        stiffness = stiffness or _stiffness(name)
         if stiffness is None:
             unit = "m" if sliding else "rad"
             return f"{name}_{unit}", Parameter(value, (low, high), f"{unit} of servo error")

@@ -11,6 +11,7 @@ Array = np.ndarray
 
 _ALPHA = 0.02
 _LEAST_SHARE = 0.05
+_SERVO_SHARE = 0.7
 _CREEP = 0.05
 """Speeds below this part of the typical one say little about direction."""
 
@@ -29,6 +30,33 @@ class LoadFriction:
     def seen(self) -> bool:
         """Whether there is friction."""
         return self.p_value < _ALPHA and self.share > _LEAST_SHARE and self.torque > 0
+
+
+def stiffness_in_load(problem: Problem, fitted: Fit, joint: int) -> float | None:
+    """Load per unit of servo error [Nm/rad, N/m]: what turns a fitted friction into torque.
+
+    None unless the load is mostly the servo's own pull, as far as the model knows it.
+    """
+    batch = problem.batch
+    if batch.load is None:
+        return None
+    q = batch.position[..., joint] - fitted.residual[..., joint]
+    y = batch.load[..., joint][batch.valid]
+    y = y - y.mean()
+    best, slope = 0.0, 0.0
+    # A frame's load may have been read before or after its command was sent.
+    for before in (0, 1):
+        pull = []
+        for trial in range(batch.trials):
+            t = batch.time_s[:, trial]
+            row = np.searchsorted(t, t - fitted.point.tau_s, side="right") - 1 - before
+            pull.append(batch.command[row.clip(0), trial, joint] - q[:, trial])
+        x = np.stack(pull, 1)[batch.valid]
+        x = x - x.mean()
+        explained = (x @ y) * abs(x @ y) / max((x @ x) * (y @ y), 1e-300)
+        if explained > best:
+            best, slope = float(explained), float(x @ y / (x @ x))
+    return slope if best > _SERVO_SHARE else None
 
 
 def friction_in_load(problem: Problem, fitted: Fit, joint: int, seed: int) -> LoadFriction:

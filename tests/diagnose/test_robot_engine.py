@@ -1,0 +1,122 @@
+"""Robots with hidden faults: each must be found by name and size, and nothing where there is nothing."""
+
+import dataclasses
+
+import numpy as np
+import pytest
+from robot_rigs import Rig, make_set
+
+from lerobot_vtrefine.diagnose.recordings import read_recording_set
+from lerobot_vtrefine.diagnose.robot.engine import diagnose_robot
+from lerobot_vtrefine.diagnose.robot.model import predict_positions
+
+SMALL = {
+    "joints": ("shoulder", "elbow"),
+    "rate_hz": 20.0,
+    "seconds": 5.0,
+    "conditions": 8,
+    "replicates": 2,
+    "jitter": 0.1,
+}
+
+
+def diagnose(tmp_path, seed=0, **faults):
+    recordings = read_recording_set(make_set(Rig(**{**SMALL, **faults}), tmp_path, seed))
+    return diagnose_robot(recordings, seed=0), recordings
+
+
+CASES = {
+    "encoder_offset": ({"offset": {"elbow": -0.015}}, "elbow_rad", -0.015),
+    "backlash": ({"backlash": {"shoulder": 0.03}}, "shoulder_rad", 0.03),
+    "control_latency": ({"latency_s": 0.07}, "tau_s", 0.07),
+    "gravity_sag": ({"sag": {"shoulder": 0.02}}, "shoulder_rad", 0.02),
+    "joint_friction": ({"friction": {"elbow": 0.012}, "stiffness": {"elbow": 100.0}}, "elbow_nm", 1.2),
+    "gripper_compliance": (
+        {"compliance": {"gripper": 2e-4}, "joints": ("elbow", "gripper")},
+        "m_per_n",
+        2e-4,
+    ),
+}
+
+
+@pytest.mark.parametrize("name", CASES)
+def test_single_cause_is_named_and_measured(tmp_path, name) -> None:
+    faults, parameter, value = CASES[name]
+    found, recordings = diagnose(tmp_path, **faults)
+    assert found.status == "explained", (found.status, found.ambiguous_with, found.unknown)
+    assert [cause.name for cause in found.causes] == [name]
+    cause = found.causes[0]
+    assert set(cause.params) == {parameter}
+    assert cause.params[parameter].value == pytest.approx(value, rel=0.15)
+    low, high = cause.params[parameter].ci95
+    assert low <= cause.params[parameter].value <= high
+    assert cause.p_value < 0.02
+    assert found.heldout is not None
+    # What is left is what no model could undo.
+    assert found.heldout.extended < 1.15 * found.heldout.noise_floor < found.heldout.baseline
+    check_prediction(found, recordings)
+
+
+def check_prediction(found, recordings) -> None:
+    """The saved model reaches the held-out error that the verdict claims."""
+    locked = [trial for trial in recordings.trials if trial.file in found.heldout.trials]
+    errors = [np.square(predict_positions(found.extended_model, t) - t.position).mean() for t in locked]
+    assert np.sqrt(np.mean(errors)) == pytest.approx(found.heldout.extended, rel=1e-6)
+
+
+def test_nothing_is_found_where_nothing_is(tmp_path) -> None:
+    found, _ = diagnose(tmp_path)
+    assert found.status == "adequate"
+    assert found.causes == ()
+    assert found.heldout.extended == found.heldout.baseline
+    assert 0 < found.minimum_detectable["backlash"] < 0.01
+    assert 0 < found.minimum_detectable["control_latency"] < 0.02
+    assert {item.name for item in found.evidence} >= {"backlash", "gripper_compliance"}
+
+
+def test_two_causes_on_two_joints(tmp_path) -> None:
+    found, _ = diagnose(tmp_path, offset={"shoulder": 0.02}, backlash={"elbow": 0.03})
+    assert found.status == "explained"
+    assert {cause.name for cause in found.causes} == {"encoder_offset", "backlash"}
+
+
+@pytest.mark.parametrize(
+    ("unknown", "word"), [({"gain_drift": 0.06}, "session"), ({"ripple": 0.005}, "rings|repeats")]
+)
+def test_what_no_name_covers_raises_the_alarm(tmp_path, unknown, word) -> None:
+    found, _ = diagnose(tmp_path, unknown=unknown)
+    assert found.status == "unexplained"
+    assert found.unknown.alarm
+    assert any(piece in found.unknown.clue for piece in word.split("|"))
+    assert all(cause.role == "symptom" for cause in found.causes)
+
+
+def test_slow_motion_does_not_yield_a_wrong_name(tmp_path) -> None:
+    found, _ = diagnose(tmp_path, friction={"elbow": 0.01}, motion="slow")
+    named = {cause.name for cause in found.causes} | {name for tie in found.ambiguous_with for name in tie}
+    assert "joint_friction" in named
+    assert named <= {"joint_friction", "backlash"}
+    if found.status == "ambiguous":
+        assert set(found.next_experiment["decides"]) == {"joint_friction", "backlash"}
+
+
+def test_a_blocked_gripper_is_not_given_a_wrong_name(tmp_path) -> None:
+    recordings = read_recording_set(
+        make_set(Rig(**{**SMALL, "joints": ("elbow", "gripper"), "rate_hz": 10.0}), tmp_path, 1)
+    )
+    trials = []
+    for trial in recordings.trials:
+        # Whatever is commanded below 20 mm, the jaw stands on a block of 20 mm.
+        position = trial.position.copy()
+        position[:, 1] = np.maximum(position[:, 1], 0.02)
+        trials.append(dataclasses.replace(trial, position=position))
+    found = diagnose_robot(dataclasses.replace(recordings, trials=tuple(trials)))
+    assert found.status == "unexplained"
+    assert "closes on something" in found.unknown.clue
+    assert "load" in found.next_experiment["text"]
+
+
+def test_few_trials_and_one_joint(tmp_path) -> None:
+    found, _ = diagnose(tmp_path, joints=("joint_1",), conditions=2, replicates=1)
+    assert found.status == "adequate"
+    assert found.next_experiment is not None
