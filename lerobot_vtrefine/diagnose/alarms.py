@@ -6,6 +6,7 @@ from dataclasses import dataclass
 from itertools import combinations
 
 import numpy as np
+from scipy.stats import norm
 
 from lerobot_vtrefine.diagnose.fitting import Fit
 from lerobot_vtrefine.diagnose.presses import PressSet
@@ -15,6 +16,7 @@ REPEATABLE_P, REPEATABLE_SHARE = 0.01, 0.15
 MIN_RMS_COUNTS = 0.4
 """Repeatable residual below this may be the converter's rounding."""
 FLIPS = 4999
+PAIR_CORRELATION, PAIR_DEVIATIONS, MIN_STRANGERS = 0.2, 6.0, 30
 LINE_RATIO = 8.0
 LINE_FROM = 8
 """Slowest line looked for, in periods per recording."""
@@ -80,6 +82,44 @@ def replicate_alarm(presses: PressSet, residuals: Sequence[np.ndarray], seed: in
     )
     text = f"{100 * share:.0f} % of the residual repeats between recordings of the same command"
     return Alarm("replicates", bool(fired), share, p_value, text)
+
+
+def pair_alarm(presses: PressSet, residuals: Sequence[np.ndarray]) -> Alarm | None:
+    """Correlations between replicates of one command, against those between strangers: what repeats in only a
+    few conditions (a slide, say) drowns in the sum over all.
+
+    None without enough replicates and strangers.
+    """
+    names = presses.conditions
+    alike: dict[str, list[float]] = defaultdict(list)
+    strangers = []
+    for i, j in combinations(range(len(names)), 2):
+        both = _aligned(presses, residuals, i, j)
+        if both is None:
+            continue
+        power = np.sqrt(float((both[0] ** 2).sum()) * float((both[1] ** 2).sum()))
+        value = float((both[0] * both[1]).sum()) / power if power > 0 else 0.0
+        if names[i] == names[j]:
+            alike[names[i]].append(value)
+        else:
+            strangers.append(value)
+    if not alike or len(strangers) < MIN_STRANGERS:
+        return None
+    spread = max(float(np.std(strangers)), 1e-6)
+    best = max(alike, key=lambda name: float(np.mean(alike[name])))
+    seen = float(np.mean(alike[best]))
+    rms = np.sqrt(max(seen, 0.0)) * np.sqrt(np.mean([np.mean(r**2) for r in residuals]))
+    far = (seen - float(np.mean(strangers))) / spread
+    fired = far > PAIR_DEVIATIONS and seen > PAIR_CORRELATION and rms > MIN_RMS_COUNTS
+    text = f"{100 * seen:.0f} % of the residual of condition {best} repeats between its recordings"
+    return Alarm("one condition", bool(fired), seen, float(norm.sf(far)), text + _motion_of(presses, best))
+
+
+def _motion_of(presses: PressSet, condition: str) -> str:
+    """What is special about a condition's motion."""
+    trial = next(press.trial for press in presses.presses if press.trial.condition == condition)
+    slid = float(np.hypot(np.ptp(trial.x_m), np.ptp(trial.y_m)))
+    return ", in which the indenter slides" if slid > 0.5 * presses.layout.pitch_m else ""
 
 
 def _aligned(

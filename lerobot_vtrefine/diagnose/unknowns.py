@@ -5,7 +5,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from lerobot_vtrefine.diagnose.alarms import Alarm, cleaned, line_alarm, replicate_alarm
+from lerobot_vtrefine.diagnose.alarms import Alarm, cleaned, line_alarm, pair_alarm, replicate_alarm
 from lerobot_vtrefine.diagnose.descriptors import DESCRIPTORS, Descriptor
 from lerobot_vtrefine.diagnose.fitting import Fit, tangents
 from lerobot_vtrefine.diagnose.presses import PressSet
@@ -43,6 +43,7 @@ def look_for_unknowns(search: Search, fitted: Fit) -> Suspicion:
     families = set(fitted.model.families)
     strangers = [item for item in generic if not families & set(item.descriptor.owners)]
     alarms = [replicate_alarm(search.presses, residuals, search.seed), line_alarm(search.presses, residuals)]
+    alarms.append(pair_alarm(search.presses, residuals))
     alarms.append(_descriptor_alarm(strangers, generic))
     known = tuple(alarm for alarm in alarms if alarm is not None)
     fired = [alarm for alarm in known if alarm.fired]
