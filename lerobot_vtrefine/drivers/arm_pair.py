@@ -2,6 +2,7 @@
 
 import logging
 from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
 
 import numpy as np
 from lerobot.motors import MotorCalibration
@@ -22,6 +23,7 @@ class ArmPair:
         if left_port == right_port:
             raise ValueError(f"left_port and right_port are both {left_port}")
         ports = {"left": left_port, "right": right_port}
+        self._readers = ThreadPoolExecutor(len(ports), thread_name_prefix="arm")
         self.arms = {name: DynamixelArm(name, port, model, travel_m) for name, port in ports.items()}
 
     @property
@@ -75,8 +77,8 @@ class ArmPair:
             arm.setup_motors(ask)
 
     def read(self) -> Floats:
-        """Measured state (16,) [rad, fingers m]."""
-        return np.concatenate([arm.read() for arm in self.arms.values()])
+        """Measured state (16,) [rad, fingers m]; both arms at once, each waits for its own bus."""
+        return np.concatenate(list(self._readers.map(DynamixelArm.read, self.arms.values())))
 
     def release(self, *, torque_off: bool) -> None:
         """Closes both ports, also after failures, which are logged."""

@@ -1,5 +1,7 @@
 """An emulated ALOHA rig: four boards, four buses of motors, all on pseudo-terminals."""
 
+import subprocess
+import sys
 import time
 from collections.abc import Generator
 from contextlib import ExitStack, contextmanager
@@ -70,3 +72,20 @@ def aloha_rig(folder: Path) -> Generator[Rig]:
         rig = Rig(folder, boards, arms.buses)
         save_pads({name: PadConfig(board.port) for name, board in boards.items()}, rig.pads_file)
         yield rig
+
+
+@contextmanager
+def emulated_elsewhere(folder: Path) -> Generator[list[str]]:
+    """Boards with test patterns and arms with waving leaders in another process; what LeRobot's flags are."""
+    words = ["--folder", str(folder / "pads"), "--source", "pattern", "--arms", str(folder / "arms")]
+    command = [sys.executable, "-m", "lerobot_vtrefine.cli.pad_emulator", *words]
+    with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as process:
+        assert process.stdout is not None
+        try:
+            lines = [process.stdout.readline().split() for _ in range(len(PADS) + 4)]
+            ports, flags = lines[: len(PADS)], [flag for line in lines[len(PADS) :] for flag in line]
+            pads_file = folder / "pads.yaml"
+            save_pads({Path(port).name: PadConfig(port) for (port,) in ports}, pads_file)
+            yield [*flags, f"--robot.pads_file={pads_file}"]
+        finally:
+            process.terminate()

@@ -1,5 +1,6 @@
 """LeRobot's stock commands with emulated boards and motors: what pads sent is what the dataset holds."""
 
+import os
 import threading
 from collections.abc import Generator
 from pathlib import Path
@@ -9,7 +10,7 @@ import pytest
 from commands import dataset_flags, follower_flags, leader_flags, run_command
 from lerobot.datasets.dataset_tools import delete_episodes, merge_datasets
 from lerobot.datasets.lerobot_dataset import LeRobotDataset
-from rig import Rig, allow_slow_answers, aloha_rig
+from rig import Rig, allow_slow_answers, aloha_rig, emulated_elsewhere
 
 from lerobot_vtrefine.datasets.features import ACTION_KEY, PADS, STATE_KEY, TACTILE_KEYS
 from lerobot_vtrefine.drivers import arm_pair, pad_set
@@ -67,18 +68,21 @@ def test_record_resume_delete_merge_keep_pads_exact(
 
 
 @pytest.mark.slow
-def test_thirty_frames_a_second_miss_no_frame(
-    rig: Rig, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """Needs a machine that is not busy: robot, recorder, four boards and four buses share its processors."""
+def test_thirty_frames_a_second_miss_no_frame(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Boards at 100 frames/s and arms in a process of their own, as hardware is; needs an idle machine."""
+    allow_slow_answers(monkeypatch)
     root = tmp_path / "dataset"
-    command = [*follower_flags(rig), *leader_flags(rig), *dataset_flags(root, 1, 20.0, 30)]
-    run_command(monkeypatch, "record", command)
+    with emulated_elsewhere(tmp_path) as command:
+        run_command(monkeypatch, "record", [*command, *dataset_flags(root, 1, 20.0, 30)])
     dataset = opened(root)
+    ages = column(dataset, AGE_KEY)
+    numbers = [frame_numbers(dataset, key) for key in TACTILE_KEYS]
+    fresh = [len(set(one)) for one in numbers]
+    print(f"{len(dataset)} frames, fresh {fresh}, age p50 {1e3 * np.median(ages):.1f} ms", end=" ")
+    print(f"p99 {1e3 * np.percentile(ages, 99):.1f} ms, load {os.getloadavg()[0]:.1f}")
     assert len(dataset) >= 598
-    for key in TACTILE_KEYS:
-        assert len(set(frame_numbers(dataset, key))) >= 595
-    assert np.percentile(column(dataset, AGE_KEY), 99) < 0.05
+    assert min(fresh) >= 595
+    assert np.percentile(ages, 99) < 0.05
 
 
 def test_pad_unplugged_while_recording_is_marked_and_the_episode_stays_readable(
