@@ -205,13 +205,15 @@ class WarpConfig:
     """Contacts, and pairs of geoms close to each other, on average over the worlds."""
     rows_per_world: int = 384
     """Rows of constraints in any one world: 4 per contact, of which a round plug on the rim makes 84."""
+    solver_iterations: int = 10
+    """Newton steps of the constraint solver at most: mostly one or two do, but worlds wait for each other."""
     graph: bool = True
     """Record a substep as a CUDA graph, where the GPU and its driver can."""
 
     def __post_init__(self) -> None:
         if not re.fullmatch(r"auto|cpu|cuda(:\d+)?", self.device):
             raise ValueError(f"warp.device must be auto, cpu, cuda or cuda:0, not {self.device!r}")
-        for name in ("contacts_per_world", "rows_per_world"):
+        for name in ("contacts_per_world", "rows_per_world", "solver_iterations"):
             if getattr(self, name) < 1:
                 raise ValueError(f"warp.{name} must be at least 1, got {getattr(self, name)}")
 

@@ -14,6 +14,7 @@ from scipy.spatial import ConvexHull
 
 from lerobot_vtrefine.sim.camera import Camera, depth_to_millimetres
 from lerobot_vtrefine.sim.depth_kernels import MISS, ivec4, project, raster
+from lerobot_vtrefine.sim.host import to_host
 from lerobot_vtrefine.tactile.contact_query import start_warp
 from lerobot_vtrefine.tactile.workers import Workers
 
@@ -79,14 +80,14 @@ class DepthCamera:
             geom_position, geom_rotation: (m, G, 3) [m] and (m, G, 3, 3), world frame.
         """
         depth = self._render(ids, geom_position, geom_rotation)
-        return torch.where(depth < float(MISS), depth, -1.0).cpu().numpy()
+        return to_host(torch.where(depth < float(MISS), depth, -1.0))
 
     def render_mm(
         self, ids: Array, geom_position: Array | torch.Tensor, geom_rotation: Array | torch.Tensor
     ) -> Array:
         """The same as uint16 millimetres, 0 where nothing lies within 2 m."""
         depth = self._render(ids, geom_position, geom_rotation)
-        return depth_to_millimetres(depth).cpu().numpy().view(np.uint16)
+        return to_host(depth_to_millimetres(depth)).view(np.uint16)
 
     def _render(
         self, ids: Array, geom_position: Array | torch.Tensor, geom_rotation: Array | torch.Tensor

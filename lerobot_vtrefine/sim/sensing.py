@@ -10,6 +10,7 @@ import numpy as np
 import torch
 
 from lerobot_vtrefine.embodiments import Embodiment
+from lerobot_vtrefine.sim.host import to_host
 from lerobot_vtrefine.sim.pairs import Part
 from lerobot_vtrefine.sim.rotations import quat_to_matrix, turn, turn_back
 from lerobot_vtrefine.sim.scene import Scene
@@ -133,7 +134,7 @@ class Pads:
 
     def _read(self, ids: Array, touch: "Touch") -> Array:
         counts = self.sensors.counts(ids, Poses(*touch.poses), self._dt_s, touch.load)
-        return counts.cpu().numpy() if isinstance(counts, torch.Tensor) else counts
+        return to_host(counts) if isinstance(counts, torch.Tensor) else counts
 
 
 def pad_layout(embodiment: Embodiment) -> PadLayout:

@@ -9,6 +9,7 @@ import numpy as np
 import torch
 
 from lerobot_vtrefine.sim.backends import Trace
+from lerobot_vtrefine.sim.host import to_host
 from lerobot_vtrefine.sim.scene import Addresses
 
 Array = np.ndarray
@@ -59,7 +60,7 @@ def summarise(
     peak, new_tail = windowed_peak(forces, torch.as_tensor(tail).to(forces))
     slide = rim_slide(torch.cat([start[:, None], tips], 1), touching, mouth_z_m)
     parts = (peak, new_tail, forces[:, -1], tips[:, -1], slide)
-    together = torch.cat([part.reshape(len(part), -1) for part in parts], 1).cpu().numpy().astype(float)
+    together = to_host(torch.cat([part.reshape(len(part), -1) for part in parts], 1)).astype(float)
     edges = np.cumsum([part[0].numel() for part in parts])[:-1]
     pieces = np.split(together, edges, 1)
     return Substeps(*(piece.reshape(part.shape) for piece, part in zip(pieces, parts, strict=True)))

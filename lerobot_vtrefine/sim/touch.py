@@ -12,6 +12,7 @@ import torch
 
 from lerobot_vtrefine.sim.backends import Backend, Trace
 from lerobot_vtrefine.sim.backends.base import TouchReader
+from lerobot_vtrefine.sim.host import to_host
 from lerobot_vtrefine.sim.scene import Scene
 from lerobot_vtrefine.sim.sensing import Kinematics, pad_loads
 
@@ -78,7 +79,7 @@ class DeviceTouch(TouchSource):
 
     def load(self, ids: Array, trace: Trace) -> Array:
         """See `TouchSource.load`."""
-        return self._reader(ids)[1].cpu().numpy().astype(float)
+        return to_host(self._reader(ids)[1]).astype(float)
 
     def __call__(self, ids: Array, see: Callable[[], Kinematics], load: Array) -> Touch:
         """See `TouchSource.__call__`."""

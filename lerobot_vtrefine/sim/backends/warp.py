@@ -15,6 +15,7 @@ from lerobot_vtrefine.sim.backends import warp_kernels as kernels
 from lerobot_vtrefine.sim.backends.base import Array, Backend, TouchReader, Trace
 from lerobot_vtrefine.sim.backends.warp_worlds import WarpWorlds
 from lerobot_vtrefine.sim.config import WarpConfig
+from lerobot_vtrefine.sim.host import to_host
 
 if TYPE_CHECKING:
     from lerobot_vtrefine.sim.scene import Scene
@@ -40,7 +41,7 @@ class WarpBackend(Backend):
     def read(self, ids: Array) -> tuple[Array, Array]:
         """See `Backend.read`."""
         index = self.index(ids)
-        both = torch.cat([self.worlds.qpos[index], self.worlds.qvel[index]], 1).cpu().numpy().astype(float)
+        both = to_host(torch.cat([self.worlds.qpos[index], self.worlds.qvel[index]], 1)).astype(float)
         return both[:, : self._model.nq], both[:, self._model.nq :]
 
     def write(self, ids: Array, qpos: Array, qvel: Array) -> None:
@@ -72,7 +73,7 @@ class WarpBackend(Backend):
         qpos, sensors = self.worlds.run(substeps)
         index = self.index(ids)
         # A world that has blown up may ask for any number of rows; that it failed is said elsewhere.
-        flags = torch.where(self.worlds.diverged[index] > 0, 0, self.worlds.overflow[index]).cpu().numpy()
+        flags = to_host(torch.where(self.worlds.diverged[index] > 0, 0, self.worlds.overflow[index]))
         self.worlds.check_overflow(int(np.bitwise_or.reduce(flags, initial=0)))
         if kept is not None:
             self._put_rows(others, kept)
@@ -104,11 +105,11 @@ class WarpBackend(Backend):
 
     def diverged(self, ids: Array) -> Array:
         """See `Backend.diverged`."""
-        return self.worlds.diverged[self.index(ids)].cpu().numpy() > 0
+        return to_host(self.worlds.diverged[self.index(ids)]) > 0
 
     def get_rows(self, ids: Array) -> Array:
         """See `Backend.get_rows`."""
-        return self._rows(ids).cpu().numpy()
+        return to_host(self._rows(ids))
 
     def set_rows(self, ids: Array, rows: Array) -> None:
         """See `Backend.set_rows`."""

@@ -4,6 +4,7 @@ Shapes: N worlds, K substeps, nq positions, nv velocities, nu servos, ns sensor 
 """
 
 import copy
+from collections.abc import Callable
 
 import mujoco
 import mujoco_warp as mjw
@@ -22,10 +23,14 @@ OVERFLOWS = {
     mjw.OverflowType.BROADPHASE: ("pairs of geoms that may touch", CONTACTS),
     mjw.OverflowType.NARROWPHASE: ("contacts", CONTACTS),
     mjw.OverflowType.CCD: ("contacts of convex shapes", CONTACTS),
-    mjw.OverflowType.CONTACT_MATCH: ("contacts of one contact sensor", None),
+    mjw.OverflowType.CONTACT_MATCH: ("contacts of one contact sensor", ROWS),
     mjw.OverflowType.EPA_HORIZON: ("edges while measuring a penetration", None),
 }
 """Buffers that can be too small -> what they hold and the setting that sizes them."""
+
+
+LEAST_ROWS = 3
+"""Rows of constraints that a contact takes at least: no contact sensor can match more contacts than fit."""
 
 
 def choose_device(name: str) -> str:
@@ -68,6 +73,8 @@ class WarpWorlds:
         self.diverged = wp.to_torch(self._diverged)
         self._widths = (model.nq, model.nsensordata, model.nu)
         self._graph: wp.Graph | None = None
+        self._pose_graph: wp.Graph | None = None
+        self._everyone = torch.arange(num_envs, dtype=torch.int32, device=self.device)
         self._capture = config.graph and _can_capture(self.device)
         self._posed = False
         self._reserve(1)
@@ -105,15 +112,20 @@ class WarpWorlds:
         return wp.to_torch(trace.qpos)[:, :substeps], wp.to_torch(trace.sensors)[:, :substeps]
 
     def _substep(self) -> None:
-        if self._graph is not None:
-            wp.capture_launch(self._graph)
-            return
-        self._launch_substep()
-        if self._capture:
-            # Every kernel is loaded by now, which could not happen during the capture.
-            with wp.ScopedCapture(force_module_load=False) as capture:
-                self._launch_substep()
-            self._graph = capture.graph
+        self._graph = self._launch(self._launch_substep, self._graph)
+
+    def _launch(self, launches: Callable[[], None], graph: wp.Graph | None) -> wp.Graph | None:
+        """Launch kernels, by their graph where there is one; returns the graph for the next time."""
+        if graph is not None:
+            wp.capture_launch(graph)
+            return graph
+        launches()
+        if not self._capture:
+            return None
+        # Every kernel is loaded by now, which could not happen during the capture.
+        with wp.ScopedCapture(force_module_load=False) as capture:
+            launches()
+        return capture.graph
 
     def _launch_substep(self) -> None:
         data, trace = self.data, self._trace
@@ -145,7 +157,9 @@ class WarpWorlds:
                 raise RuntimeError(f"mujoco_warp ran out of room for {what}, contacts were lost: {remedy}")
 
     def index(self, ids: np.ndarray) -> torch.Tensor:
-        """World numbers (m,) int32 on the device."""
+        """World numbers (m,), sorted, int32 on the device."""
+        if len(ids) == self.num_envs:
+            return self._everyone
         return torch.as_tensor(np.ascontiguousarray(ids, np.int32), device=self.device)
 
     def set_field(self, name: str, ids: torch.Tensor, values: torch.Tensor) -> None:
@@ -172,7 +186,7 @@ class WarpWorlds:
                 dtype=shared.dtype,
             )
         setattr(self.model, name, own)
-        self._graph = None
+        self._graph = self._pose_graph = None
         return own
 
     def moved(self) -> None:
@@ -185,9 +199,12 @@ class WarpWorlds:
             return
         self._posed = True
         with wp.ScopedDevice(self.device):
-            mjw.kinematics(self.model, self.data)
-            mjw.com_pos(self.model, self.data)
-            mjw.com_vel(self.model, self.data)
+            self._pose_graph = self._launch(self._launch_kinematics, self._pose_graph)
+
+    def _launch_kinematics(self) -> None:
+        mjw.kinematics(self.model, self.data)
+        mjw.com_pos(self.model, self.data)
+        mjw.com_vel(self.model, self.data)
 
 
 DERIVED = ("body_subtreemass", "body_invweight0", "dof_invweight0", "geom_aabb", "geom_rbound")
@@ -207,6 +224,8 @@ def _with_primitive_boxes(model: mujoco.MjModel) -> mujoco.MjModel:
 
 def _set_options(model: mjw.Model, config: WarpConfig) -> None:
     model.opt.warn_overflow = 0  # the flags are read after every call; printing would stall a GPU
+    model.opt.contact_sensor_maxmatch = config.rows_per_world // LEAST_ROWS
+    model.opt.iterations = min(model.opt.iterations, config.solver_iterations)
     if wp.get_device().is_cuda:
         model.opt.graph_conditional = wp.is_conditional_graph_supported()
 
