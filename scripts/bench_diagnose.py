@@ -37,7 +37,9 @@ def arguments() -> argparse.Namespace:
     parser.add_argument("--groups", default=",".join(cases.GROUPS), help="comma-separated: %(default)s")
     parser.add_argument("--per_cell", type=int, help="sets per cell in place of each group's own count")
     parser.add_argument("--quick", action="store_true", help="about a fifth of the sets")
-    parser.add_argument("--tune", action="store_true", help="seeds from 0 instead of 1000")
+    parser.add_argument(
+        "--first_seed", type=int, default=cases.REPORT_SEED, help="0 to tune; default %(default)s"
+    )
     parser.add_argument(
         "--naive_every", type=int, default=12, help="run the naive analysts on every n-th set"
     )
@@ -50,14 +52,13 @@ def arguments() -> argparse.Namespace:
 
 def chosen(args: argparse.Namespace) -> list[Any]:
     """The sets of this run."""
-    first = cases.TUNE_SEED if args.tune else cases.REPORT_SEED
     found = []
     for name in args.groups.split(","):
         if name not in cases.GROUPS:
             sys.exit(f"--groups: unknown group {name!r}; valid: {', '.join(cases.GROUPS)}")
         make, count = cases.GROUPS[name]
         count = args.per_cell or (max(1, count // QUICK_DIVISOR) if args.quick else count)
-        found += make(count, first)
+        found += make(count, args.first_seed)
     found = [case for case in found if not args.only or args.only in case.name]
     # In a fixed random order, so that an interrupted run's table is a fair sample of the whole.
     return [found[i] for i in np.random.default_rng(0).permutation(len(found))]
