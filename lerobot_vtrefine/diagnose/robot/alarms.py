@@ -23,6 +23,8 @@ _REPEATS = 0.3
 _FOLLOWS, _FOLLOWS_IF_OWNED = 0.1, 0.4
 """Least part of what is left that must follow a descriptor; more where an accepted form may be off."""
 _LINE = 0.1
+FEW_TRIALS = 8
+_HELPS = 0.25
 _OF_BASELINE = 0.02
 _OWNED = {
     "speed": {"backlash", "joint_friction", LATENCY},
@@ -56,10 +58,27 @@ def raise_alarms(selection: Selection, seed: int) -> tuple[Alarm, ...]:
     found += _following(selection, seed)
     found += _ringing(selection)
     found.sort(key=lambda alarm: -alarm.share)
+    found += [] if found or selection.causes() else _too_few(selection)
     # What stands still explains whatever else is odd about it.
     stopped = _stopped(selection)
     still = {alarm.joint for alarm in stopped}
     return (*stopped, *(alarm for alarm in found if alarm.joint not in still))
+
+
+def _too_few(selection: Selection) -> list[Alarm]:
+    """Something helps on trials left out, but with so few trials nothing can be significant."""
+    if not 2 <= selection.problem.batch.trials < FEW_TRIALS:
+        return []
+    gains = {item.cause: item.gain for item in selection.first_round if item.cause != DECOY}
+    out = []
+    for joint in range(selection.problem.batch.joints):
+        names = sorted(
+            (name for name in gains if gains[name][joint] > _HELPS), key=lambda n: -gains[n][joint]
+        )
+        if names and _matters(selection, joint, gains[names[0]][joint]):
+            clue = f"the trials are too few to say which of these it is: {', '.join(names[:3])}"
+            out.append(Alarm(joint, clue, float(gains[names[0]][joint]), 1.0))
+    return out
 
 
 def _matters(selection: Selection, joint: int, share: float) -> bool:

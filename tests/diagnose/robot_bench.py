@@ -1,0 +1,165 @@
+"""Robots with hidden faults by the hundred: how often the verdict is right, per kind of fault.
+
+    python tests/diagnose/robot_bench.py --jobs=8 --seeds=1000-1024 --output=robot_bench.jsonl
+
+Rules were tuned on seeds below 100; report others. One line per set goes to the output, the table to stdout.
+"""
+
+import argparse
+import json
+import tempfile
+import time
+from concurrent.futures import ProcessPoolExecutor, as_completed
+from pathlib import Path
+
+import numpy as np
+from robot_rigs import Rig, make_set
+
+from lerobot_vtrefine.diagnose.recordings import read_recording_set
+from lerobot_vtrefine.diagnose.robot.engine import diagnose_robot
+
+TABLE = ("shoulder", "elbow", "wrist_flex", "gripper")
+ARM = ("left_waist", "left_shoulder", "left_elbow", "left_wrist_angle")
+UNKNOWNS = ("gain", "gain_drift", "ripple", "coupling", "coriolis")
+KINDS = (
+    "clean",
+    "nasty",
+    "encoder_offset",
+    "backlash",
+    "control_latency",
+    "joint_friction",
+    "joint_friction+load",
+    "gravity_sag",
+    "gravity_sag+form",
+    "gripper_compliance",
+    "two causes",
+    "unknown",
+    "slow",
+)
+
+
+def case(kind, seed):
+    """A rig and the names that are true of it."""
+    rng = np.random.default_rng([seed, KINDS.index(kind)])
+    joints = TABLE if rng.random() < 0.6 else ARM
+    pitch = [name for name in joints if name not in ("gripper", "left_waist")]
+    one, other = rng.permutation(pitch)[:2]
+    sign = rng.choice([-1, 1])
+    rig = Rig(
+        joints=joints,
+        rate_hz=float(rng.choice([20, 30, 50])),
+        seconds=6.0,
+        conditions=10,
+        jitter=float(rng.choice([0, 0.1])),
+        noise=float(rng.uniform(0.5, 2)),
+        nasty=1.0 if kind == "nasty" else 0.0,
+        motion="slow" if kind == "slow" else "mixed",
+    )
+    size = {
+        "encoder_offset": sign * rng.uniform(0.005, 0.03),
+        "backlash": rng.uniform(0.006, 0.04),
+        "joint_friction": rng.uniform(0.004, 0.02),
+        "gravity_sag": sign * rng.uniform(0.006, 0.03),
+        "control_latency": rng.uniform(0.01, 0.12),
+    }
+    names = {kind.split("+")[0]} & {*size, "gripper_compliance"}
+    if kind == "two causes":
+        names = {str(name) for name in rng.permutation(list(size))[:2]}
+    if kind == "slow":
+        names = {str(rng.choice(["backlash", "joint_friction", "control_latency"]))}
+    places = dict(zip(sorted(names), (one, other), strict=False))
+    for name in names:
+        add(rig, name, str(places[name]), size)
+    if kind.endswith("load"):
+        rig.stiffness = {str(one): rng.uniform(20, 200)}
+    if kind == "gravity_sag+form":
+        rig.joints, rig.sag, rig.sag_shape = ARM, {"left_shoulder": size["gravity_sag"]}, "stretch"
+    if kind == "gripper_compliance":
+        rig.joints, rig.compliance = TABLE, {"gripper": rng.uniform(4e-5, 3e-4)}
+    if kind == "unknown":
+        strength = {"gain": 0.03 * sign, "gain_drift": 0.06, "ripple": 0.004, "coupling": 0.03}
+        which = UNKNOWNS[seed % len(UNKNOWNS)]
+        rig.unknown = {which: strength.get(which, 0.015) * rng.uniform(0.7, 1.3)}
+    return rig, names
+
+
+def add(rig, name, joint, size):
+    if name == "control_latency":
+        rig.latency_s = float(size[name])
+    elif name != "gripper_compliance":
+        field = {"encoder_offset": "offset", "joint_friction": "friction", "gravity_sag": "sag"}.get(
+            name, name
+        )
+        getattr(rig, field)[joint] = float(size[name])
+
+
+def run(kind, seed):
+    rig, names = case(kind, seed)
+    with tempfile.TemporaryDirectory() as folder:
+        recordings = read_recording_set(make_set(rig, folder, seed))
+    begun = time.process_time()
+    found = diagnose_robot(recordings, seed=0)
+    held = found.heldout
+    return {
+        "kind": kind,
+        "seed": seed,
+        "truth": sorted(names),
+        "unknown": list(rig.unknown),
+        "status": found.status,
+        "found": sorted(cause.name for cause in found.causes),
+        "ambiguous": found.ambiguous_with,
+        "clue": found.unknown.clue,
+        "rmse": [held.baseline, held.extended, held.noise_floor],
+        "cpu_s": round(time.process_time() - begun, 2),
+        "params": {f"{c.name}.{k}": (p.value, p.ci95) for c in found.causes for k, p in c.params.items()},
+        "sizes": {"latency": rig.latency_s, **rig.offset, **rig.backlash, **rig.friction, **rig.sag},
+    }
+
+
+def grade(row):
+    """exact, in the set (tie that holds the truth), flagged (alarm), missed or wrong."""
+    truth, found = set(row["truth"]), set(row["found"])
+    tied = found | {name for names in row["ambiguous"] for name in names}
+    if row["status"] == "unexplained":
+        return "exact" if row["unknown"] else "flagged"
+    if row["unknown"]:
+        return "wrong" if found else "missed"
+    if row["status"] != "ambiguous" and found == truth:
+        return "exact"
+    if row["status"] == "ambiguous" and truth <= tied:
+        return "in the set"
+    return "wrong" if found - truth else "missed"
+
+
+def table(rows):
+    grades = ("exact", "in the set", "flagged", "missed", "wrong")
+    lines = [f"{'kind':22}" + "".join(f"{name:>12}" for name in (*grades, "sets", "cpu s"))]
+    for kind in KINDS:
+        mine = [row for row in rows if row["kind"] == kind]
+        if mine:
+            counts = [sum(grade(row) == name for row in mine) for name in grades]
+            cpu = float(np.median([row["cpu_s"] for row in mine]))
+            lines.append(f"{kind:22}" + "".join(f"{n:12}" for n in (*counts, len(mine))) + f"{cpu:12.1f}")
+    return "\n".join(lines)
+
+
+def main():
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("--jobs", type=int, default=1)
+    parser.add_argument("--seeds", default="0-9")
+    parser.add_argument("--kinds", default=",".join(KINDS))
+    parser.add_argument("--output", type=Path, default=Path("robot_bench.jsonl"))
+    options = parser.parse_args()
+    low, _, high = options.seeds.partition("-")
+    work = [(kind, s) for s in range(int(low), int(high or low) + 1) for kind in options.kinds.split(",")]
+    rows = []
+    with ProcessPoolExecutor(options.jobs) as pool, options.output.open("a") as out:
+        for job in as_completed([pool.submit(run, *item) for item in work]):
+            rows.append(job.result())
+            out.write(json.dumps(rows[-1], default=float) + "\n")
+            out.flush()
+    print(table(rows))
+
+
+if __name__ == "__main__":
+    main()
