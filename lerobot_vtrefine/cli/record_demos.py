@@ -3,8 +3,9 @@
 ``vtrefine-record-demos --config_path=configs/env/round_grasped.yaml --root=outputs/demos --num_episodes=60``
 """
 
+import hashlib
 import logging
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -58,11 +59,15 @@ class RecordDemosConfig:
             raise ValueError(f"--env.type={self.env.type} has no scripted expert; use --env.type=vtrefine")
 
     def settings(self) -> dict[str, Any]:
-        """What determines the episodes."""
+        """What determines the episodes; of a reality's hidden physics only a fingerprint."""
         env = self.env
         assert isinstance(env, VtRefineEnvConfig)
-        return {
-            "scene": _plain(asdict(env.scene_config)),
+        known = replace(env, reality=None)
+        hidden = (
+            {} if env.reality is None else {"reality": hashlib.sha256(env.reality.read_bytes()).hexdigest()}
+        )
+        return hidden | {
+            "scene": _plain(asdict(known.scene_config)),
             "rules": asdict(env.task_config),
             "randomization": asdict(env.randomization),
             "sensor_model": env.sensor_model,
