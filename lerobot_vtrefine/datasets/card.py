@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from lerobot_vtrefine.datasets.features import ACTION_KEY, STATE_KEY
+from lerobot_vtrefine.datasets.features import ACTION_KEY, STATE_KEY, TAXEL_INFO
 from lerobot_vtrefine.datasets.lerobot_version import is_supported
 
 if TYPE_CHECKING:
@@ -102,10 +102,16 @@ def _layout(features: Features) -> str:
 
 def _calibration(features: Features, stats: Stats) -> str:
     lines = ["### Units and calibration", ""]
-    lines.append(
-        "Counts are what the board sent: 8-bit readings of a voltage divider, monotonic in pressure but not "
-        "linear, and not newtons. Nothing was filtered, clipped or normalised."
-    )
+    units = {(features[PAD_PREFIX + name].get("info") or {}).get("unit") for name in pad_names(features)}
+    if units == {TAXEL_INFO["unit"]}:
+        lines.append(
+            "Counts are what a board sends: 8-bit readings of a voltage divider, monotonic in pressure but "
+            "not linear, and not newtons. Nothing was filtered, clipped or normalised."
+        )
+    else:
+        lines.append(
+            "Values are not raw counts of a board; the table above names their unit where it is known."
+        )
     if any(key.startswith(BASELINE_PREFIX) for key in features):
         lines.append(
             f"`{BASELINE_PREFIX}<pad>` holds the idle counts of the same taxels, measured on untouched pads "

@@ -59,6 +59,15 @@ def test_idle_counts_on_the_card_are_those_of_the_data(tiny_dataset: Path) -> No
     assert f"{np.median(means):.0f} ({means.min():.0f} to {means.max():.0f})" in row
 
 
+def test_normalised_values_are_not_called_counts(tiny_dataset: Path) -> None:
+    meta = LeRobotDataset("local/tiny", root=tiny_dataset).meta
+    assert "Counts are what a board sends" in card.describe(meta)
+    meta.features[TACTILE_KEYS[1]]["info"] = {"array_shape": [12, 32], "unit": "share of the frame's maximum"}
+    text = card.describe(meta)
+    assert "Counts are what a board sends" not in text
+    assert "| share of the frame's maximum |" in text
+
+
 def test_datasets_without_pads_keep_the_stock_card(
     tiny_dataset: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
