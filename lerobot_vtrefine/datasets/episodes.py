@@ -83,8 +83,16 @@ class EpisodeFolder:
         table = table.sort_by("frame_index")
         pads = {pad: _matrix(table[f"{TACTILE_PREFIX}{pad}"]) for pad in self.pads}
         idle = {pad: _matrix(table[f"{BASELINE_PREFIX}{pad}"])[0] for pad in self.pads}
-        state, action = (_matrix(table[key]).astype(np.float64) for key in (STATE_KEY, ACTION_KEY))
+        state, action = (self._numbers(index, key, table[key]) for key in (STATE_KEY, ACTION_KEY))
         return RecordedEpisode(index, table["timestamp"].to_numpy(), state, action, pads, idle)
+
+    def _numbers(self, index: int, key: str, column: pa.ChunkedArray) -> Array:
+        values = _matrix(column).astype(np.float64)
+        if not np.isfinite(values).all():
+            frame, joint = np.argwhere(~np.isfinite(values))[0]
+            name = self.joints[joint] if self.joints else f"joint {joint}"
+            raise ValueError(f"{self.root}: episode {index}, frame {frame}: {key} {name} is not a number")
+        return values
 
 
 def open_episodes(root: Path) -> EpisodeFolder:

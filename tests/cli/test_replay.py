@@ -138,3 +138,38 @@ def test_reports_are_not_overwritten(joints_only: Path, tmp_path: Path) -> None:
     with pytest.raises(FileExistsError, match=r"report\.html exists"):
         replay(ReplayConfig(tmp_path, SourceConfig(joints_only)))
     assert (tmp_path / "report.html").read_text() == "mine"
+
+
+def test_notes_of_other_recordings_are_refused(demos: Path, tmp_path: Path) -> None:
+    import shutil
+
+    copy = tmp_path / "copy"
+    shutil.copytree(demos, copy)
+    whole = json.loads((copy / "meta" / "recording.json").read_text())
+
+    def refuse(content: object, message: str) -> None:
+        (copy / "meta" / "recording.json").write_text(json.dumps(content))
+        with pytest.raises(ValueError, match=message):
+            replay(ReplayConfig(tmp_path / "out", SourceConfig(copy)))
+
+    refuse({**whole, "episodes": whole["episodes"][:1]}, "notes 1 episodes, the dataset has 2: it was edited")
+    edited = ReplayConfig(tmp_path / "arms", SourceConfig(copy), parts="none")
+    assert replay(edited).touch == []  # the arms alone need no starts
+    refuse({"episodes": []}, "is no note of vtrefine-record-demos")
+    refuse([1, 2], "is no note of vtrefine-record-demos")
+    other = {**whole["settings"], "scene": {**whole["settings"]["scene"], "gravity_m_s2": 3.7}}
+    refuse({**whole, "settings": other}, "written by another version")
+    del other["rules"]
+    refuse({**whole, "settings": other}, "lacks the setting 'rules'")
+
+
+def test_positions_that_are_no_numbers_are_refused(tmp_path: Path) -> None:
+    values = np.tile(ROBOT.home, (5, 1)).astype(np.float32)
+    broken = values.copy()
+    broken[3, 2] = np.nan
+    for name, command, position in (("a", broken, values), ("b", values, broken)):
+        write_dataset(
+            [JointEpisode(command, position)], ROBOT.joint_names, tmp_path / name, "local/x", 10, "x"
+        )
+        with pytest.raises(ValueError, match=r"episode 0, frame 3: .* left_elbow is not a number"):
+            replay(ReplayConfig(tmp_path / "out", SourceConfig(tmp_path / name)))

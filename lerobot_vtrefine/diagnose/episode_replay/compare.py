@@ -13,7 +13,7 @@ from lerobot_vtrefine.datasets.episodes import EpisodeFolder, RecordedEpisode
 from lerobot_vtrefine.datasets.features import PADS, Array
 from lerobot_vtrefine.diagnose.episode_replay.touch import PadTouch, compare_pad
 from lerobot_vtrefine.diagnose.episode_replay.tracking import JointTracking, joint_tracking
-from lerobot_vtrefine.diagnose.episode_replay.twin import recorded_seeds, recorded_settings, recorded_twin
+from lerobot_vtrefine.diagnose.episode_replay.twin import read_ledger, recorded_seeds, recorded_twin
 from lerobot_vtrefine.embodiments import get_embodiment
 from lerobot_vtrefine.envs.config import VtRefineEnvConfig
 
@@ -89,10 +89,10 @@ def compare_episodes(
         ValueError: the twin is another robot than the dataset's, unknown episodes, or parts that the dataset
             cannot place.
     """
-    ledger = recorded_settings(folder.root)
+    ledger = read_ledger(folder)
     parts = _choose_parts(parts, ledger, folder)
     own = env is None and ledger is not None
-    config = recorded_twin(ledger["settings"], folder.fps) if env is None and ledger is not None else env
+    config = recorded_twin(ledger, folder.fps) if env is None and ledger is not None else env
     config = config or VtRefineEnvConfig()
     _require_same_robot(folder, config)
     recorded = folder.read(episodes)
@@ -176,7 +176,7 @@ def _replay_scenes(
     if round(folder.fps) != config.fps:
         raise ValueError(f"{folder.root} has {folder.fps:g} frames/s, the twin --env.fps={config.fps}")
     sim = make_simulation(config, 1)
-    seeds = recorded_seeds(ledger) if ledger is not None and parts == "recorded" else {}
+    seeds = recorded_seeds(ledger, folder) if ledger is not None and parts == "recorded" else {}
     pairs, skipped = [], {}
     for episode in tqdm(recorded, unit="episode", desc="replay"):
         start = None
@@ -185,7 +185,8 @@ def _replay_scenes(
             if start is None:
                 skipped[episode.index] = "a gripper never closes"
                 continue
-        replayed = replay_scene(sim, episode.action, seeds.get(episode.index, episode.index), start)
+        seed = seeds[episode.index] if seeds else episode.index
+        replayed = replay_scene(sim, episode.action, seed, start)
         counts = {pad: replayed.counts[:, i] for i, pad in enumerate(PADS)}
         baselines = {pad: replayed.baseline[i] for i, pad in enumerate(PADS)}
         pairs.append(EpisodePair(episode, replayed.position, counts, baselines, replayed.success))
