@@ -60,6 +60,7 @@ class PadSet:
         Raises:
             PortError: a pad cannot be read; every pad is released again.
         """
+        logger.info("connecting %d pads, which takes a few seconds: do not touch them", len(self._readers))
         try:
             for reader in self._readers.values():
                 reader.start()
@@ -70,6 +71,7 @@ class PadSet:
             self.disconnect()
             raise
         self._connected = True
+        logger.info("pads are connected and their idle counts taken")
 
     def measure_baselines(self) -> None:
         """Takes the idle counts anew: the median of 30 frames; no pad may be touched."""
