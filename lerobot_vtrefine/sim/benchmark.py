@@ -71,11 +71,15 @@ def measure_worlds(
 def table(rows: Sequence[WorldsRow]) -> str:
     """Aligned text for people: milliseconds, thousands and millions per second."""
     lines = [[f"{title} {unit}".strip() for title, unit, _ in COLUMNS]]
-    lines += [[f"{value(row):.5g}" for *_, value in COLUMNS] for row in rows]
+    lines += [[_cell(value(row)) for *_, value in COLUMNS] for row in rows]
     widths = [max(map(len, column)) for column in zip(*lines, strict=True)]
     return "\n".join(
         "  ".join(cell.rjust(width) for cell, width in zip(line, widths, strict=True)) for line in lines
     )
+
+
+def _cell(value: float) -> str:
+    return "-" if np.isnan(value) else f"{value:.4g}"
 
 
 COLUMNS: tuple[tuple[str, str, Callable[[WorldsRow], float]], ...] = (
