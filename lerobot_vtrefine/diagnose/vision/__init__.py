@@ -1,0 +1,1 @@
+"""What depth images say about the camera: its pose and the scale of its depths, against the twin's arms."""
