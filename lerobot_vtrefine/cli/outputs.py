@@ -23,6 +23,7 @@ def staged(output_dir: Path, names: Sequence[str], *, overwrite: bool) -> Genera
         raise FileExistsError(
             f"{output_dir / present[0]} exists; choose another --output_dir or add --overwrite to replace it"
         )
+    created = not output_dir.exists()
     output_dir.mkdir(parents=True, exist_ok=True)
     folder = Path(tempfile.mkdtemp(prefix=".partial-", dir=output_dir))
     try:
@@ -32,3 +33,5 @@ def staged(output_dir: Path, names: Sequence[str], *, overwrite: bool) -> Genera
             os.replace(folder / name, output_dir / name)  # noqa: PTH105  atomic on one file system, and says so
     finally:
         shutil.rmtree(folder, ignore_errors=True)
+        if created and not any(output_dir.iterdir()):
+            output_dir.rmdir()

@@ -13,14 +13,18 @@ from lerobot.envs.configs import EnvConfig
 from lerobot.utils.utils import init_logging
 
 from lerobot_vtrefine.cli.errors import run_cli
+from lerobot_vtrefine.cli.outputs import staged
 from lerobot_vtrefine.datasets.episodes import EpisodeFolder, open_episodes
 from lerobot_vtrefine.diagnose.episode_replay.compare import (
+    HOLDS,
     PARTS,
     Comparison,
     compare_episodes,
     write_summary,
 )
 from lerobot_vtrefine.envs import VtRefineEnvConfig
+
+FILES = ("replay.json", "report.html")
 
 
 @dataclass
@@ -38,7 +42,7 @@ class ReplayConfig:
     """Flags of ``vtrefine-replay``."""
 
     output_dir: Path
-    """Folder for report.html and replay.json."""
+    """Folder for replay.json and report.html."""
     dataset: SourceConfig = field(default_factory=SourceConfig)
     episodes: list[int] | None = None
     """Episodes to replay, e.g. '[0, 3]'; all by default."""
@@ -49,12 +53,16 @@ class ReplayConfig:
     """How arms alone approach a command: zero_order or linear."""
     env: EnvConfig | None = None
     """The twin (--env.type=vtrefine ...); by default what a simulated dataset was recorded in."""
+    overwrite: bool = False
+    """Replace results that are there already."""
     eval: EvalConfig = field(default_factory=EvalConfig)
     """Unused; lets files of configs/env serve this command too."""
 
     def __post_init__(self) -> None:
         if self.dataset.root is None and self.dataset.repo_id is None:
             raise ValueError("say what to replay: --dataset.root=FOLDER, or --dataset.repo_id=NAME")
+        if self.hold not in HOLDS:
+            raise ValueError(f"unknown --hold={self.hold}; choose from {', '.join(HOLDS)}")
         if self.parts not in PARTS:
             raise ValueError(f"unknown --parts={self.parts}; choose from {', '.join(PARTS)}")
         if self.episodes is not None and not self.episodes:
@@ -72,16 +80,13 @@ def replay(config: ReplayConfig) -> Comparison:
     """
     from lerobot_vtrefine.diagnose.episode_replay.page import render_page
 
-    report = config.output_dir / "report.html"
-    if report.exists():
-        raise FileExistsError(f"{report} exists; choose another --output_dir or remove it")
     env = config.env if isinstance(config.env, VtRefineEnvConfig) else None
-    comparison = compare_episodes(
-        _folder(config.dataset), config.episodes, parts=config.parts, hold=config.hold, env=env
-    )
-    config.output_dir.mkdir(parents=True, exist_ok=True)
-    write_summary(comparison, config.output_dir / "replay.json")
-    report.write_text(render_page(comparison), encoding="utf-8")
+    with staged(config.output_dir, FILES, overwrite=config.overwrite) as folder:
+        comparison = compare_episodes(
+            _folder(config.dataset), config.episodes, parts=config.parts, hold=config.hold, env=env
+        )
+        write_summary(comparison, folder / FILES[0])
+        (folder / FILES[1]).write_text(render_page(comparison), encoding="utf-8")
     return comparison
 
 
@@ -112,7 +117,7 @@ def describe(comparison: Comparison) -> list[str]:
 @parser.wrap()
 def _main(config: ReplayConfig) -> None:
     print("\n".join(describe(replay(config))))
-    print(f"-> {config.output_dir / 'report.html'}")
+    print(f"-> {config.output_dir / FILES[1]}")
 
 
 @run_cli

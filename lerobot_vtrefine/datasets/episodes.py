@@ -109,19 +109,20 @@ def open_episodes(root: Path) -> EpisodeFolder:
         info: dict[str, Any] = json.loads(path.read_text(encoding="utf-8"))
         features, version = info["features"], info["codebase_version"]
         fps, episodes = float(info["fps"]), int(info["total_episodes"])
-    except (ValueError, KeyError, TypeError) as error:
+        shapes = {key: tuple(feature["shape"]) for key, feature in features.items()}
+    except (ValueError, KeyError, TypeError, AttributeError) as error:
         raise ValueError(f"{path} is no description of a LeRobot dataset: {error!r}") from error
     if version != "v3.0":
         raise ValueError(f"{path}: dataset version {version} is not v3.0; convert it with LeRobot first")
     for key in (STATE_KEY, ACTION_KEY):
         if key not in features:
             raise ValueError(f"{path}: the dataset has no {key}")
-    shapes = [tuple(features[key]["shape"]) for key in (STATE_KEY, ACTION_KEY)]
-    if len(shapes[0]) != 1 or shapes[0] != shapes[1]:
-        raise ValueError(f"{path}: {STATE_KEY} is {shapes[0]}, {ACTION_KEY} is {shapes[1]}: they must match")
+    state, action = shapes[STATE_KEY], shapes[ACTION_KEY]
+    if len(state) != 1 or state != action:
+        raise ValueError(f"{path}: {STATE_KEY} is {state}, {ACTION_KEY} is {action}: they must match")
     names = features[STATE_KEY].get("names")
     joints = tuple(map(str, names)) if isinstance(names, list) else ()
-    return EpisodeFolder(root, fps, joints, shapes[0][0], _pads(features), episodes)
+    return EpisodeFolder(root, fps, joints, state[0], _pads(features), episodes)
 
 
 def _pads(features: dict[str, Any]) -> tuple[str, ...]:

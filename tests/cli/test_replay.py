@@ -101,6 +101,7 @@ def test_another_robot_and_another_order_are_refused(tmp_path: Path) -> None:
     [
         ({"dataset": SourceConfig()}, "say what to replay"),
         ({"parts": "some"}, "unknown --parts=some"),
+        ({"hold": "spline"}, "unknown --hold=spline; choose from zero_order, linear"),
         ({"episodes": []}, "--episodes is empty"),
     ],
 )
@@ -128,6 +129,10 @@ def test_broken_folders(joints_only: Path, tmp_path: Path) -> None:
     data.unlink()
     with pytest.raises(ValueError, match="data files lack episode 0"):
         replay(ReplayConfig(tmp_path / "out", SourceConfig(copy)))
+    damage(copy, "info.json", lambda text: text.replace('"features"', '"columns"'))
+    with pytest.raises(ValueError, match=r"no description of a LeRobot dataset: KeyError\('features'\)"):
+        replay(ReplayConfig(tmp_path / "out", SourceConfig(copy)))
+    damage(copy, "info.json", lambda text: text.replace('"columns"', '"features"'))
     damage(copy, "info.json", lambda text: text.replace('"v3.0"', '"v2.1"'))
     with pytest.raises(ValueError, match=r"version v2\.1 is not v3\.0"):
         replay(ReplayConfig(tmp_path / "out", SourceConfig(copy)))
@@ -137,7 +142,9 @@ def test_reports_are_not_overwritten(joints_only: Path, tmp_path: Path) -> None:
     (tmp_path / "report.html").write_text("mine")
     with pytest.raises(FileExistsError, match=r"report\.html exists"):
         replay(ReplayConfig(tmp_path, SourceConfig(joints_only)))
-    assert (tmp_path / "report.html").read_text() == "mine"
+    assert [path.read_text() for path in tmp_path.iterdir()] == ["mine"]
+    replay(ReplayConfig(tmp_path, SourceConfig(joints_only), overwrite=True))
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["replay.json", "report.html"]
 
 
 def test_notes_of_other_recordings_are_refused(demos: Path, tmp_path: Path) -> None:

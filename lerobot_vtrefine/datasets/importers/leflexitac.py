@@ -68,10 +68,10 @@ def is_leflexitac(root: Path) -> bool:
     if not path.is_file():
         return False
     try:
-        features = json.loads(path.read_text(encoding="utf-8")).get("features", {})
-    except (ValueError, AttributeError):
+        features = json.loads(path.read_text(encoding="utf-8"))["features"]
+        return any(_is_pad(key, feature) for key, feature in features.items())
+    except (ValueError, KeyError, TypeError, AttributeError):  # some other JSON
         return False
-    return any(_is_pad(key, feature) for key, feature in features.items())
 
 
 def import_leflexitac(source: Path, root: Path, pads: Mapping[str, str]) -> ImportSummary:

@@ -17,7 +17,7 @@ from lerobot_vtrefine.diagnose.episode_replay.twin import read_ledger, recorded_
 from lerobot_vtrefine.embodiments import get_embodiment
 from lerobot_vtrefine.envs.config import VtRefineEnvConfig
 
-HOLD_WORDS = {"zero_order": "held over the frame", "linear": "approached linearly"}
+HOLDS = {"zero_order": "held over the frame", "linear": "approached linearly"}
 DENSITIES = ("reading_density", "count_density")
 
 PARTS = ("auto", "none", "recorded", "grasp")
@@ -222,7 +222,7 @@ def _plain(pad: PadTouch) -> dict[str, Any]:
 
 def _describe(config: VtRefineEnvConfig, parts: str, hold: str, own: bool) -> str:
     if parts == "none":
-        return f"{config.scene_config.embodiment}, arms alone without contacts, commands {HOLD_WORDS[hold]}"
+        return f"{config.scene_config.embodiment}, arms alone without contacts, commands {HOLDS[hold]}"
     scene = config.scene_config
     origin = "the settings of the recording" if own else "--env"
     return f"{scene.embodiment} with pair {scene.pair}, sensor model {config.sensor_model}, from {origin}"

@@ -69,9 +69,8 @@ def recorded_seeds(ledger: Mapping[str, Any], folder: EpisodeFolder) -> dict[int
     seeds = _seeds(ledger)
     if sorted(seeds) != list(range(folder.num_episodes)):
         raise ValueError(
-            f"{folder.root / LEDGER} notes {len(seeds)} episodes, the dataset has"
-            f" {folder.num_episodes}: it was edited"
-            " since, so the starts are not known; use --parts=none or --parts=grasp"
+            f"{folder.root / LEDGER} notes {len(seeds)} episodes, the dataset has {folder.num_episodes}:"
+            " it was edited since, so the starts are not known; use --parts=none or --parts=grasp"
         )
     return seeds
 
