@@ -295,7 +295,7 @@ def _hysteresis(stage: Hysteresis, images: Images, groups: Sequence[Group], stif
     outputs = []
     for piece, mask, begin, end in zip(pieces, touched, starts[:-1], starts[1:], strict=True):
         out = np.zeros_like(piece)
-        out[:, mask] = held[: len(piece), begin:end]
+        out[:, mask] = np.maximum(held[: len(piece), begin:end], 0.0)
         outputs.append(out)
     counts = np.cumsum([0, *(len(group.bounds) for group in groups)]).tolist()
     return [np.concatenate(outputs[i:j]) for i, j in pairwise(counts)]

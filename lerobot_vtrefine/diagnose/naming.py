@@ -89,5 +89,5 @@ def _why_rejected(adjusted: float | None, gain: float | None) -> str:
     if gain is None:
         return "passed the screening, but others explained more and left nothing for it"
     if gain <= MIN_GAIN:
-        return "takes away less than one percent of the error on recordings left out"
+        return "takes away too little of the error on recordings left out"
     return "another cause explains the same better"

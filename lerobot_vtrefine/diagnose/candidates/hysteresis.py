@@ -1,4 +1,4 @@
-"""hysteresis: loading and unloading differ at the same depth, whatever the speed."""
+"""hysteresis: loading and unloading differ at the same depth, whatever the speed, either way."""
 
 import numpy as np
 
@@ -20,8 +20,8 @@ def _several(values: np.ndarray, setting: Setting) -> tuple[Stage, ...]:
 
 
 def _report_several(values: np.ndarray, setting: Setting) -> dict[str, tuple[float, str]]:
-    total = max(float(values.sum()), 1e-9)
-    mean = float((values * np.array(SEVERAL_WIDTHS)).sum()) / total * setting.top_depth_m
+    weight = np.abs(values) + 1e-9
+    mean = float((weight * np.array(SEVERAL_WIDTHS)).sum() / weight.sum()) * setting.top_depth_m
     return {"fraction": (float(values.sum()), "1"), "width_m": (mean, "m")}
 
 
@@ -32,7 +32,7 @@ FORMS = (
         "hysteresis",
         "one play operator",
         (
-            Value("fraction", 0.0, 0.9, 2e-3),
+            Value("fraction", -0.9, 0.9, 2e-3),
             Value("log_width", float(np.log(0.03)), float(np.log(WIDE)), 1e-2),
         ),
         _one,
@@ -41,15 +41,17 @@ FORMS = (
             "width_m": (float(np.exp(v[1]) * s.top_depth_m), "m"),
         },
         lambda s: [[0.05, float(np.log(share))] for share in (0.1, 0.25, 0.5, 1.0, 1.8)],
+        signed=True,
     ),
     Form(
         "hysteresis",
         "four play operators",
-        tuple(Value(f"fraction_{j}", 0.0, 0.6, 2e-3) for j in range(len(SEVERAL_WIDTHS))),
+        tuple(Value(f"fraction_{j}", -0.6, 0.6, 2e-3) for j in range(len(SEVERAL_WIDTHS))),
         _several,
         _report_several,
         lambda s: [[0.03] * len(SEVERAL_WIDTHS)],
         amplitude=None,
+        signed=True,
         screened=False,
     ),
 )

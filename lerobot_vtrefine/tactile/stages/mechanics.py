@@ -139,14 +139,16 @@ class Hysteresis(Stage):
     A play operator follows the depth f / stiffness with a dead band of full width `width_m`, so that loading
     and
     unloading at the same depth differ by fraction * width_m * stiffness. Without contact it returns to zero.
-    `fraction` and `width_m` are numbers or equally long lists (several operators make loops of any shape).
+    `fraction` and `width_m` are numbers or equally long lists (several operators make loops of any shape). A
+    positive
+    fraction reads less while loading, a negative one more, as a cover that dissipates energy does.
     """
 
     name: ClassVar[str] = "hysteresis"
     domain: ClassVar[str] = "force"
     rank: ClassVar[int] = 36
     has_state: ClassVar[bool] = True
-    fraction: Any = field(default=0.15, metadata={"unit": "1", "range": (0.0, 0.3), "minimum": 0.0})
+    fraction: Any = field(default=0.15, metadata={"unit": "1", "range": (0.0, 0.3), "minimum": None})
     width_m: Any = field(default=2e-4, metadata={"unit": "m", "range": (5e-5, 5e-4), "minimum": 0.0})
 
     def __post_init__(self) -> None:
@@ -173,4 +175,4 @@ class Hysteresis(Stage):
             play = torch.maximum(torch.minimum(state[name], x + half_width), x - half_width).clamp(min=0.0)
             new[name] = play * (x > 0)
             looped = looped + fraction * (new[name] - x)
-        return looped, new
+        return looped.clamp(min=0.0), new
