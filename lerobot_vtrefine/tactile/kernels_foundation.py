@@ -16,7 +16,7 @@ from lerobot_vtrefine.tactile.kernels_packs import add_forces, add_lanes, raw_su
 
 wp.set_module_options({"enable_backward": False})
 
-MAX_TILT = wp.constant(1.0)
+MAX_TILT = wp.constant(3.0)
 """Limit of the two slopes; only reached when the load's centre lies outside what the body can press on."""
 NEWTON_STEPS = wp.constant(14)
 MAX_LEAD_M = wp.constant(0.05)
