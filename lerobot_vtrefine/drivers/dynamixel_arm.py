@@ -34,6 +34,9 @@ RETRIES = 4
 PING_RETRIES = 2
 """Repeated tries to reach a motor that may not be there."""
 
+ANSWER_WAIT_S = 0.002
+"""How long one look for an answer waits: without waiting, the SDK keeps a processor busy until it comes [s]."""
+
 MOVE_RATE_HZ = 50.0
 
 FULL_PWM = 885
@@ -142,6 +145,7 @@ class DynamixelArm:
             cause = error.__cause__ if isinstance(error.__cause__, Exception) else error
             message = explain_open_error(self.port, self.bus.default_baudrate, cause)
             raise PortError(f"{self.name} arm: {message}") from error
+        self.bus.port_handler.ser.timeout = ANSWER_WAIT_S
         ask_for_low_latency(self.bus.port_handler.ser)
         if advice := latency_advice(self.port):  # a control period waits for several answers
             logger.warning("%s arm: %s", self.name, advice)

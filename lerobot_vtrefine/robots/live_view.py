@@ -36,7 +36,7 @@ def drawable(observation: Observation, pads: Mapping[str, PadConfig]) -> dict[st
     plain = {key.removeprefix(OBSERVATION): value for key, value in observation.items()}
     ages = np.atleast_1d(plain.get(PAD_AGE, np.zeros(len(pads))))
     shown = {key: value for key, value in plain.items() if not key.startswith((*CONSTANT, f"{BASELINE}."))}
-    for (name, pad), age_s in zip(pads.items(), ages, strict=True):
+    for (name, pad), age_s in zip(pads.items(), ages, strict=False):
         key = f"{TACTILE}.{name}"
         if key not in plain:
             continue
