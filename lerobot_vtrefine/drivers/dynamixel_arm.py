@@ -35,7 +35,7 @@ PING_RETRIES = 2
 """Repeated tries to reach a motor that may not be there."""
 
 ANSWER_WAIT_S = 0.002
-"""How long one look for an answer waits: without waiting, the SDK keeps a processor busy until it comes [s]."""
+"""How long one look for an answer waits; without, the SDK keeps a processor busy until it comes [s]."""
 
 MOVE_RATE_HZ = 50.0
 
