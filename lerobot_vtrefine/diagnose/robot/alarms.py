@@ -19,7 +19,10 @@ from lerobot_vtrefine.diagnose.robot.selection import LEAST_EFFECT_RAD, Selectio
 Array = np.ndarray
 
 ALPHA = 0.01
-_REPEATS = 0.3
+_REPEATS, _REPEATS_ALL = 0.3, 0.6
+"""Least part of what is left that must repeat; where it is this much, and in every condition, the conditions
+need not be enough for a small p."""
+_LEAST_CONDITIONS = 4
 _FOLLOWS, _FOLLOWS_IF_OWNED = 0.1, 0.4
 """Least part of what is left that must follow a descriptor; more where an accepted form may be off."""
 _LINE = 0.1
@@ -105,14 +108,16 @@ def _repeating(selection: Selection, seed: int) -> list[Alarm]:
                 _mean(left[:, a] * left[:, b], batch.valid[:, a] & batch.valid[:, b]) for a, b in pairs
             ]
             rows.append(np.mean(products, 0))
-    if len(rows) < 5:
+    if len(rows) < _LEAST_CONDITIONS:
         return []
     _, adjusted = flips.one_sided(np.array(rows), seed)
     share = np.mean(rows, 0) / selection.fit.total.clip(1e-300)
     return [
         Alarm(joint, "what is left repeats when the command is repeated", float(share[joint]), float(p))
         for joint, p in enumerate(adjusted)
-        if p < ALPHA and share[joint] > _REPEATS and _matters(selection, joint, share[joint])
+        if (p < ALPHA or (share[joint] > _REPEATS_ALL and np.min(rows, 0)[joint] > 0))
+        and share[joint] > _REPEATS
+        and _matters(selection, joint, share[joint])
     ]
 
 

@@ -81,10 +81,14 @@ def diagnose_robot(
     whole = Problem.of(recordings.joints, make_batch(recordings.trials))
     problem = whole.subset(np.array(open_trials))
     selection = Selector(problem, seed, _steps(tell)).run()
-    tell("robot: looking for other explanations", 0.6)
-    selection, rivals = _settled(selection, seed)
-    tell("robot: looking for what is left", 0.75)
+    tell("robot: looking for what is left", 0.6)
     alarms = raise_alarms(selection, seed)
+    rivals: tuple[Rival, ...] = ()
+    # Ties do not matter where something else is wrong, unless loads may settle them.
+    if not alarms or problem.batch.load is not None:
+        tell("robot: looking for other explanations", 0.7)
+        selection, rivals = _settled(selection, seed)
+        alarms = raise_alarms(selection, seed)
     selection = _named_only(selection)
     tell("robot: intervals, and what could have been seen", 0.85)
     return _report(selection, rivals, alarms, whole, np.array(locked, dtype=int), seed)
@@ -105,10 +109,10 @@ def _steps(tell: Progress) -> Callable[[str], None]:
 def _settled(selection: Selection, seed: int) -> tuple[Selection, tuple[Rival, ...]]:
     """Ties, after loads have settled those that they can."""
     rivals = find_rivals(selection, seed)
-    winner, left = settle_by_load(selection, rivals, seed)
-    if winner is not None:
+    winners, left = settle_by_load(selection, rivals, seed)
+    for winner in winners:
         selection = adopt(selection, winner)
-        left = [item for item in left if item.cause != winner.cause]
+        left = [item for item in left if item.cause != winner.cause or item.joints != winner.joints]
     return selection, tuple(left)
 
 
@@ -159,7 +163,7 @@ def _report(
         for name, joints in selection.causes().items()
     )
     detectable = minimum_detectable(selection)
-    ambiguous = () if alarms else tuple((item.cause, item.rival) for item in rivals)
+    ambiguous = () if alarms else tuple(dict.fromkeys((item.cause, item.rival) for item in rivals))
     status = _status(causes, ambiguous, alarms)
     return RobotDiagnosis(
         status=status,

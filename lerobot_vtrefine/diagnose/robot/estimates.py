@@ -3,6 +3,7 @@
 from itertools import pairwise
 
 import numpy as np
+from scipy.stats import t as student_t
 
 from lerobot_vtrefine.diagnose.robot.candidates import FRICTION, LATENCY
 from lerobot_vtrefine.diagnose.robot.fitting import INDEX, SAG, Problem
@@ -21,13 +22,14 @@ class Estimates:
 
     def __init__(self, selection: Selection, seed: int) -> None:
         self.selection, self.seed = selection, seed
+        self.trials = selection.problem.batch.trials
         self.theta, self.tau = bootstrap(selection.problem, selection.fit, seed)
 
     def of(self, cause: str, joints: tuple[int, ...]) -> dict[str, Parameter]:
         """The cause's parameters on those joints."""
         if cause == LATENCY:
             value = self.selection.fit.point.tau_s
-            return {"tau_s": Parameter(value, _interval(self.tau, value), "s")}
+            return {"tau_s": Parameter(value, _interval(self.tau, value, self.trials), "s")}
         if cause == "gripper_compliance":
             return {"m_per_n": self._compliance(joints)}
         out: dict[str, Parameter] = {}
@@ -61,7 +63,7 @@ class Estimates:
             names = ("play", "loose") if cause == "backlash" else ("offset",)
             columns = [INDEX[name] for name in names]
             value, spread = float(now[columns].sum()), drawn[:, columns].sum(1)
-        return Parameter(value, _interval(spread, value), unit)
+        return Parameter(value, _interval(spread, value, self.trials), unit)
 
     def _friction(self, joint: int, name: str) -> tuple[str, Parameter]:
         """In Nm where loads or the robot's known servo gains give the scale; else as the servo's error."""
@@ -69,7 +71,7 @@ class Estimates:
         sliding = is_sliding(name)
         column = INDEX["friction"]
         value = float(self.selection.fit.point.theta[joint, column])
-        low, high = _interval(self.theta[:, joint, column], value)
+        low, high = _interval(self.theta[:, joint, column], value, self.trials)
         stiffness = stiffness_in_load(problem, self.selection.fit, joint)
         if stiffness is None and problem.batch.load is not None:
             seen = friction_in_load(problem, self.selection.fit, joint, self.seed)
@@ -96,7 +98,7 @@ class Estimates:
         mean = float((weight * np.abs(value)).sum() / weight.sum())
         spread = (drawn * sign * weight).sum(1) / weight.sum()
         overall = 1.0 if (sign >= 0).any() else -1.0
-        low, high = _interval(spread, mean)
+        low, high = _interval(spread, mean, self.trials)
         if overall < 0:
             low, high = -high, -low
         return Parameter(overall * mean, (low, high), "m/N")
@@ -112,9 +114,11 @@ def _stiffness(name: str) -> float | None:
     return next(joint.stiffness for joint in ALOHA.joints if plain.endswith(joint.name))
 
 
-def _interval(drawn: Array, value: float) -> tuple[float, float]:
+def _interval(drawn: Array, value: float, trials: int) -> tuple[float, float]:
+    """95 % interval of resampled values, widened by what resampling few trials leaves out (Student's t)."""
     low, high = np.percentile(drawn, [2.5, 97.5])
-    return float(min(low, value)), float(max(high, value))
+    wider = student_t.ppf(0.975, max(trials - 1, 1)) / 1.96 * np.sqrt(trials / max(trials - 1, 1))
+    return float(value - wider * max(value - low, 0.0)), float(value + wider * max(high - value, 0.0))
 
 
 def repeatability(problem: Problem, residual: Array) -> float | None:

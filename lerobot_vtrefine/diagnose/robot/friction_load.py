@@ -37,26 +37,59 @@ def stiffness_in_load(problem: Problem, fitted: Fit, joint: int) -> float | None
 
     None unless the load is mostly the servo's own pull, as far as the model knows it.
     """
-    batch = problem.batch
-    if batch.load is None:
+    if problem.batch.load is None:
         return None
-    q = batch.position[..., joint] - fitted.residual[..., joint]
-    y = batch.load[..., joint][batch.valid]
-    y = y - y.mean()
-    best, slope = 0.0, 0.0
+    left, total, slope = _explained(problem, fitted, joint)
+    share = 1 - left.sum() / max(total.sum(), 1e-300)
+    return slope if share > _SERVO_SHARE and slope > 0 else None
+
+
+def load_prefers(problem: Problem, one: Fit, other: Fit, joint: int, seed: int) -> int:
+    """Whose servo pull the measured load resembles: 1 the one's, -1 the other's, 0 if trials disagree."""
+    left_one, total, _ = _explained(problem, one, joint)
+    left_other, _, _ = _explained(problem, other, joint)
+    lead = ((left_other - left_one) / (left_other + left_one).clip(1e-300))[:, None]
+    if min(left_one.sum(), left_other.sum()) > (1 - _LEAST_SHARE) * total.sum():
+        return 0
+    if flips.one_sided(lead, seed)[0][0] < _ALPHA:
+        return 1
+    return -1 if flips.one_sided(-lead, seed)[0][0] < _ALPHA else 0
+
+
+def _explained(problem: Problem, fitted: Fit, joint: int) -> tuple[Array, Array, float]:
+    """Squared load (T,) that a model's servo pull leaves, all of it, and the load per unit of pull."""
+    batch = problem.batch
+    assert batch.load is not None
+    q = np.where(batch.valid, batch.position[..., joint] - fitted.residual[..., joint], 0.0)
+    width = float(fitted.point.value("play")[joint])
+    target = pull_target(batch.command[..., joint], width, q[0])
+    best: tuple[Array, Array, float] | None = None
     # A frame's load may have been read before or after its command was sent.
     for before in (0, 1):
-        pull = []
+        pull, load = np.zeros_like(q), np.zeros_like(q)
         for trial in range(batch.trials):
             t = batch.time_s[:, trial]
             row = np.searchsorted(t, t - fitted.point.tau_s, side="right") - 1 - before
-            pull.append(batch.command[row.clip(0), trial, joint] - q[:, trial])
-        x = np.stack(pull, 1)[batch.valid]
-        x = x - x.mean()
-        explained = (x @ y) * abs(x @ y) / max((x @ x) * (y @ y), 1e-300)
-        if explained > best:
-            best, slope = float(explained), float(x @ y / (x @ x))
-    return slope if best > _SERVO_SHARE else None
+            pull[:, trial] = target[row.clip(0), trial] - q[:, trial]
+        pull = np.where(batch.valid, pull - pull[batch.valid].mean(), 0.0)
+        load = batch.load[..., joint]
+        load = np.where(batch.valid, load - load[batch.valid].mean(), 0.0)
+        slope = float((pull * load).sum() / max((pull * pull).sum(), 1e-300))
+        left = np.square(load - slope * pull).sum(0)
+        if best is None or left.sum() < best[0].sum():
+            best = left, np.square(load).sum(0), slope
+    assert best is not None
+    return best
+
+
+def pull_target(command: Array, width: float, start: Array) -> Array:
+    """What the servo pulls towards: commands (N, T) through play of that width."""
+    out = np.empty_like(command)
+    state = start
+    for k, row in enumerate(command):
+        state = np.clip(state, row - width / 2, row + width / 2)
+        out[k] = state
+    return out
 
 
 def friction_in_load(problem: Problem, fitted: Fit, joint: int, seed: int) -> LoadFriction:

@@ -14,7 +14,7 @@ from lerobot_vtrefine.diagnose.robot.candidates import (
     delay_starts,
 )
 from lerobot_vtrefine.diagnose.robot.fitting import INDEX, Fit, Problem, fit, refit
-from lerobot_vtrefine.diagnose.robot.friction_load import friction_in_load
+from lerobot_vtrefine.diagnose.robot.friction_load import load_prefers
 from lerobot_vtrefine.diagnose.robot.resampling import cross_validated, folds_of
 from lerobot_vtrefine.diagnose.robot.selection import Selection, merged
 
@@ -50,39 +50,44 @@ def find_rivals(selection: Selection, seed: int) -> tuple[Rival, ...]:
     for cause, joints in selection.causes().items():
         if cause == DECOY:
             continue
-        index = np.array(joints)
-        bare = without_cause(selection, cause, index)
-        folds = folds_of(selection.problem.batch.conditions, seed)
-        own = None if cause == LATENCY else index
-        without = cross_validated(selection.problem, bare, folds, selection.held_out, own)
-        for name, candidates in _alternatives(selection, cause, index).items():
-            tries = [_swapped(selection, bare, candidate, index, folds) for candidate in candidates]
-            best = min(tries, key=lambda item: float(item[1][:, index].mean(0).sum()))
-            rival = _compared(selection, cause, name, index, without, *best, seed)
-            found += [rival] if rival else []
+        for index in [np.array(joints)] if cause == LATENCY else [np.array([joint]) for joint in joints]:
+            found += _rivals_on(selection, cause, index, seed)
     return tuple(found)
+
+
+def _rivals_on(selection: Selection, cause: str, joints: Array, seed: int) -> list[Rival]:
+    problem = selection.problem
+    folds = folds_of(problem.batch.conditions, seed)
+    bare = without_cause(selection, cause, joints)
+    own = None if cause == LATENCY else joints
+    without = cross_validated(problem, bare, folds, selection.held_out, own)
+    found = []
+    for name, candidates in _alternatives(selection, cause, joints).items():
+        tries = [_swapped(selection, bare, candidate, joints, folds) for candidate in candidates]
+        best = min(tries, key=lambda item: float(item[1][:, joints].mean(0).sum()))
+        rival = _compared(selection, cause, name, joints, without, *best, seed)
+        found += [rival] if rival else []
+    return found
 
 
 def settle_by_load(
     selection: Selection, rivals: tuple[Rival, ...], seed: int
-) -> tuple[Rival | None, list[Rival]]:
-    """Let measured loads decide between play and friction: only friction takes torque to overcome.
+) -> tuple[list[Rival], list[Rival]]:
+    """Let measured loads decide between play and friction: the servo pulls against friction only.
 
-    Returns the rival that takes the cause's place (None: the cause stays) and the ties that remain.
+    Returns the rivals that take their cause's place, and the ties that remain.
     """
-    if selection.problem.batch.load is None:
-        return None, list(rivals)
-    winner, left = None, []
+    winners, left = [], []
     for rival in rivals:
-        if {rival.cause, rival.rival} != {"backlash", FRICTION}:
+        friction = {rival.cause, rival.rival} == {"backlash", FRICTION}
+        lead = 0.0
+        if friction and selection.problem.batch.load is not None:
+            lead = load_prefers(selection.problem, rival.fit, selection.fit, rival.joints[0], seed)
+        if lead > 0:
+            winners.append(rival)
+        elif lead == 0:
             left.append(rival)
-            continue
-        seen = [
-            friction_in_load(selection.problem, selection.fit, joint, seed).seen for joint in rival.joints
-        ]
-        if any(seen) != (rival.cause == FRICTION):
-            winner = rival
-    return winner, left
+    return winners, left
 
 
 def without_cause(selection: Selection, cause: str, joints: Array) -> Fit:
@@ -166,7 +171,14 @@ def adopt(selection: Selection, rival: Rival) -> Selection:
         chosen[joint] = (*kept, rival.candidate) if rival.candidate else kept
         p_value = p_values.pop((rival.cause, joint), 1.0)
         p_values[rival.rival, joint] = p_value
-    return replace(selection, fit=rival.fit, held_out=rival.held_out, chosen=chosen, p_values=p_values)
+    mask = np.isin(np.arange(selection.problem.batch.joints), rival.joints)
+    if LATENCY in (rival.cause, rival.rival):
+        mask[:] = True
+    fitted = merged(
+        selection.fit, rival.fit, mask, np.where(mask[:, None], rival.fit.free, selection.fit.free)
+    )
+    held_out = np.where(mask, rival.held_out, selection.held_out)
+    return replace(selection, fit=fitted, held_out=held_out, chosen=chosen, p_values=p_values)
 
 
 def joint_names(problem: Problem, joints: tuple[int, ...]) -> str:

@@ -25,54 +25,19 @@ from lerobot_vtrefine.diagnose.robot.fitting import (
     refit,
     servo_only,
 )
-from lerobot_vtrefine.diagnose.robot.gravity import FREE_FORM, TWO_TERM_FORM, full_reach, is_sliding
+from lerobot_vtrefine.diagnose.robot.gravity import full_reach, is_sliding
 from lerobot_vtrefine.diagnose.robot.resampling import cross_validated, folds_of
+from lerobot_vtrefine.diagnose.robot.tried import Tried, best_per_joint
 
 Array = np.ndarray
 
-ALPHA = 0.02
-"""Chance that clean trials yield any name, over all causes and joints."""
 LEAST_GAIN = 0.01
 """Smallest part of a joint's squared error that is worth a name."""
 LEAST_EFFECT_RAD, LEAST_EFFECT_M = 1e-4, 1e-5
 """Smallest change of the prediction (root mean square) that is worth a name."""
 MAX_ROUNDS = 4
-_FORM_LEAD = {TWO_TERM_FORM: 0.02, FREE_FORM: 0.05}
-"""By how much forms with more terms must beat those with one."""
-_DECOY_LEAD = 0.05
 _EXTRAPOLATION = (4.0, 8.0)
 """Largest size of a cause over the largest error seen: of several that may cancel, and of one alone."""
-
-
-@dataclass(frozen=True)
-class Tried:
-    """A candidate fitted on top of what was accepted, with its evidence."""
-
-    candidate: Candidate | None
-    """None: the commands' delay."""
-    fit: Fit
-    held_out: Array
-    """(T, J) squared error under fits without the trial's fold."""
-    improvement: Array
-    """(T, J) relative: (before - after) / (before + after), in [-1, 1]."""
-    gain: Array
-    """(J,) part of the held-out squared error that it takes away."""
-    eligible: Array
-    """(J,) where it could be accepted, were it significant."""
-    p_alone: Array | None = None
-    p_adjusted: Array | None = None
-
-    @property
-    def cause(self) -> str:
-        """Its name."""
-        return LATENCY if self.candidate is None else self.candidate.cause
-
-    @property
-    def accepted(self) -> Array:
-        """(J,) significant and worth it."""
-        if self.p_adjusted is None:
-            return np.zeros_like(self.eligible)
-        return self.eligible & (self.p_adjusted < ALPHA)
 
 
 @dataclass(frozen=True)
@@ -242,7 +207,7 @@ class Selector:
 
     def _accept(self, tried: tuple[Tried, ...]) -> bool:
         """Accept the delay if it explains more than the joints' own causes, else those; False if nothing."""
-        best = best_per_joint(tried, self.held_out)
+        best = best_per_joint(tried, self.held_out, self.seed)
         delay = next((item for item in tried if item.candidate is None), None)
         before = np.log(self.held_out.mean(0).clip(1e-300))
         if delay is not None and delay.accepted.any():
@@ -354,29 +319,6 @@ class Selector:
         self.now, self.held_out = self._without_delay()
         self.delayed = False
         self.p_values.pop((LATENCY, -1), None)
-
-
-def best_per_joint(tried: tuple[Tried, ...], before: Array) -> dict[int, Tried]:
-    """Joint -> the accepted candidate with the least held-out error.
-
-    A decoy must beat every name clearly, and a shape of many terms one of a single term.
-    """
-    out: dict[int, Tried] = {}
-    for joint in range(before.shape[1]):
-        able = [item for item in tried if item.candidate and item.accepted[joint]]
-        if able:
-            out[joint] = min(able, key=lambda item: _handicapped(item, joint))
-    return out
-
-
-def _handicapped(item: Tried, joint: int) -> float:
-    error = float(item.held_out.mean(0)[joint])
-    if item.cause == DECOY:
-        return error * (1 + _DECOY_LEAD)
-    form = item.candidate.form if item.candidate is not None else None
-    if form in _FORM_LEAD:
-        return error * (1 + _FORM_LEAD[form])
-    return error
 
 
 def merged(one: Fit, other: Fit, take_other: Array, free: Array | None = None) -> Fit:
