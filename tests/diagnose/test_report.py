@@ -3,6 +3,7 @@
 import re
 import shutil
 import subprocess
+from dataclasses import replace
 from html.parser import HTMLParser
 
 import numpy as np
@@ -151,6 +152,11 @@ def test_sceptic_sees_weak_evidence(pad_set):
     assert "interval of the gain includes zero" in text
     assert "Only 3 recordings were held out" in text
     assert "neither repaired nor noise" in text
+
+
+def test_evidence_may_be_about_something_without_a_name(pad_set):
+    nameless = replace(pad_diagnosis().evidence[0], name="(no name)")
+    assert "(no name)" in text_of(page(pad_diagnosis(evidence=(nameless,)), pad_set))
 
 
 def test_empty_findings_do_not_break_the_page(pad_set):

@@ -163,7 +163,7 @@ def _evidence_row(item: Evidence) -> dict[str, Any]:
     gain = item.heldout_gain
     return {
         "title": title(item.name),
-        "name": item.name,
+        "name": item.name if item.name in MEANINGS else "",
         "p": p_text(item.p_value),
         "p_adjusted": p_text(item.p_adjusted),
         "gain": "–" if gain is None else percent(gain),
@@ -220,6 +220,6 @@ def _experiment(protocol: Mapping[str, Any] | None) -> dict[str, Any] | None:
     rest = {key: value for key, value in protocol.items() if key not in ("text", "decides")}
     return {
         "text": protocol.get("text", ""),
-        "decides": [title(name) if name in MEANINGS else str(name) for name in protocol.get("decides", ())],
+        "decides": [title(str(name)) for name in protocol.get("decides", ())],
         "protocol": json.dumps(rest, indent=2, default=str) if rest else "",
     }

@@ -99,8 +99,8 @@ MEANINGS = {
 
 
 def title(name: str) -> str:
-    """A cause's name for people."""
-    return MEANINGS[name].title
+    """A cause's name for people; evidence may be about something that no list of causes holds."""
+    return MEANINGS[name].title if name in MEANINGS else name.replace("_", " ")
 
 
 def listing(items: Sequence[str], last: str = "and") -> str:
