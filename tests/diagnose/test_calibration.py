@@ -133,6 +133,21 @@ def test_static_model_has_no_damping(tmp_path: Path) -> None:
     assert getattr(calibration.model.contact, "k_d", None) == 0.0
 
 
+def test_the_simulation_loads_the_model_of_a_pad_of_another_shape(tmp_path: Path) -> None:
+    from lerobot_vtrefine.diagnose.calibration.page import remarks
+    from lerobot_vtrefine.sim.config import SceneConfig
+    from lerobot_vtrefine.sim.simulation import InsertionSim
+
+    calibration = calibrate(recorded(tmp_path / "set", 10, rig="4x4", changes=(("drive", "both"),)), Wanted())
+    assert "The pad has 4 x 4 taxels" in " ".join(remarks(calibration))
+    sim = InsertionSim(SceneConfig(start="grasped"), sensor=calibration.model)
+    sim.reset(np.zeros(1, np.int64), np.array([0]))
+    seen = sim.observe()["tactile_baseline"]
+    level = calibration.presses.idle.level
+    assert float(seen.mean()) == pytest.approx(level.mean(), abs=1.5)
+    assert float(seen.std()) == pytest.approx(level.std(), rel=0.2)
+
+
 def test_the_simulation_loads_the_model(tmp_path: Path) -> None:
     from lerobot_vtrefine.sim.config import SceneConfig
     from lerobot_vtrefine.sim.simulation import InsertionSim
@@ -144,7 +159,7 @@ def test_the_simulation_loads_the_model(tmp_path: Path) -> None:
     sim = InsertionSim(SceneConfig(start="grasped"), sensor=str(path))
     sim.reset(np.zeros(1, np.int64), np.array([0]))
     seen = sim.observe()
-    idle = calibration.parameters["idle_mean"].value
+    idle = calibration.presses.idle.level.mean()
     assert abs(float(seen["tactile_baseline"].mean()) - idle) < 1.0
     above = seen["tactile"].astype(int) - seen["tactile_baseline"].astype(int)
     assert (above[0].max(axis=1) > 20).all()  # all four pads hold a part

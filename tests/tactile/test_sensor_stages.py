@@ -192,6 +192,12 @@ def test_idle_drift_and_quantisation() -> None:
     assert once(Quantisation(step_counts=4.0), values).tolist() == [[0, 0, 0, 255, 255]]
 
 
+def test_maps_of_another_pad_are_refused() -> None:
+    assert (once(Idle(level_counts=[[7.0]]), torch.zeros(2, 6, 10)) == 7).all()
+    with pytest.raises(ValueError, match="a map of 4 x 4 taxels, but the pad has 6 x 10"):
+        once(Idle(level_counts=np.zeros((4, 4))), torch.zeros(2, 6, 10))
+
+
 def test_noise_is_white_and_a_function_of_seed_and_frame() -> None:
     stage, x = Noise(sigma_counts=2.0), torch.zeros(3, 12, 32)
     state = {"seed": torch.tensor([1, 2, 1]), "frame": torch.tensor([0, 0, 0])}

@@ -22,8 +22,10 @@ from lerobot_vtrefine.diagnose.presses import PressSet, prepare, usable
 from lerobot_vtrefine.diagnose.quality import check_quality
 from lerobot_vtrefine.diagnose.recordings import RecordingSet
 from lerobot_vtrefine.diagnose.verdict import DataIssue, Parameter
+from lerobot_vtrefine.tactile.layout import PadLayout
 from lerobot_vtrefine.tactile.model import SensorModel
 from lerobot_vtrefine.tactile.stages.contact import Consistent, ContactStage
+from lerobot_vtrefine.tactile.stages.readout import Idle
 from lerobot_vtrefine.tactile.stages.readout import Noise as NoiseStage
 
 CONTACTS = ("kelvin_voigt", "consistent")
@@ -255,8 +257,22 @@ def _sensor(model: Composite, presses: PressSet, noise: float, wanted: Wanted) -
     if wanted.static:
         model = model.at(np.array([model.values[0], 0.0, *model.values[2:]]))
     sensor = sensor_model(model, presses.idle, presses.step_counts)
-    sensor = sensor.with_stage(NoiseStage(round(float(noise), 4)))
+    sensor = sensor.with_stage(NoiseStage(round(float(noise), 4))).with_stage(_idle(presses))
     return sensor.with_stage(_contact(sensor.contact, presses, wanted))
+
+
+def fits_the_simulation(presses: PressSet) -> bool:
+    """Whether the idle map can be laid over the simulator's pads: one value, or their lattice."""
+    shape = presses.layout.rows, presses.layout.cols
+    return shape in ((1, 1), (PadLayout.rows, PadLayout.cols))
+
+
+def _idle(presses: PressSet) -> Idle:
+    """The idle map; of a pad of another shape its mean and spread (uniform, of the same deviation)."""
+    level = presses.idle.level
+    if fits_the_simulation(presses):
+        return Idle(level.tolist(), 0.0)
+    return Idle(float(level.mean()), float(np.sqrt(3.0) * level.std()))
 
 
 def _contact(contact: ContactStage, presses: PressSet, wanted: Wanted) -> ContactStage:

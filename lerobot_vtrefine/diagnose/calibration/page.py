@@ -5,11 +5,13 @@ from typing import Any
 from jinja2 import Environment, PackageLoader, StrictUndefined
 
 from lerobot_vtrefine.diagnose.calibration import figures
-from lerobot_vtrefine.diagnose.calibration.fit import Calibration
+from lerobot_vtrefine.diagnose.calibration.fit import Calibration, fits_the_simulation
 from lerobot_vtrefine.diagnose.episode_replay.figures import data_uri
 from lerobot_vtrefine.diagnose.report.numbers import interval
 
 SCHEMA = "vtrefine/calibration@1"
+SIMULATED_FULL_SCALE = 255.0
+"""Where the simulator's pads stop [counts]."""
 WORDS = {
     "k_n": "stiffness per taxel",
     "k_d": "damping per taxel",
@@ -56,6 +58,17 @@ def remarks(calibration: Calibration) -> list[str]:
         said.append(
             f"The fit misses by {calibration.rms_counts:.1f} counts RMS, with noise of"
             f" {calibration.noise_counts:.1f}: something else is at work; vtrefine-diagnose names it."
+        )
+    if not fits_the_simulation(calibration.presses):
+        layout = calibration.presses.layout
+        said.append(
+            f"The pad has {layout.rows} x {layout.cols} taxels, other than the simulator's: the model"
+            " carries the idle level's mean and spread instead of its map."
+        )
+    if calibration.presses.full_scale != SIMULATED_FULL_SCALE:
+        said.append(
+            f"Readings go up to {calibration.presses.full_scale:g} here, the simulator's pads stop at"
+            f" {SIMULATED_FULL_SCALE:g}."
         )
     return said
 

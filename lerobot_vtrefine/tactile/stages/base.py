@@ -137,7 +137,14 @@ def as_tuple(value: Any) -> Any:
 
 
 def taxel_map(values: Any, like: torch.Tensor) -> torch.Tensor:
-    """A number or nested (R, C) sequence as a tensor that broadcasts against `like` (..., R, C)."""
+    """A number or nested (R, C) sequence as a tensor that broadcasts against `like` (..., R, C).
+
+    Raises ValueError for a map of another pad.
+    """
     if isinstance(values, torch.Tensor):
         return values
-    return torch.as_tensor(np.asarray(values, dtype=np.float32), device=like.device).to(like.dtype)
+    array = np.asarray(values, dtype=np.float32)
+    if array.ndim == 2 and array.shape not in ((1, 1), tuple(like.shape[-2:])):
+        made, pad = (" x ".join(map(str, shape)) for shape in (array.shape, like.shape[-2:]))
+        raise ValueError(f"the sensor model holds a map of {made} taxels, but the pad has {pad}")
+    return torch.as_tensor(array, device=like.device).to(like.dtype)
