@@ -13,8 +13,8 @@ from lerobot_vtrefine.diagnose.presses import PressSet
 from lerobot_vtrefine.diagnose.weights import TrialWeights
 
 REPEATABLE_P, REPEATABLE_SHARE = 0.01, 0.15
-MIN_RMS_COUNTS = 0.4
-"""Repeatable residual below this may be the converter's rounding."""
+MIN_RMS = 0.4 / 255.0
+"""Repeatable residual below this part of full scale may be the converter's rounding."""
 FLIPS = 4999
 PAIR_CORRELATION, PAIR_DEVIATIONS, MIN_STRANGERS = 0.2, 6.0, 30
 LINE_RATIO = 8.0
@@ -78,7 +78,7 @@ def replicate_alarm(presses: PressSet, residuals: Sequence[np.ndarray], seed: in
     fired = (
         p_value < max(REPEATABLE_P, 1.5 * 2.0 ** -len(groups))
         and share > REPEATABLE_SHARE
-        and rms > MIN_RMS_COUNTS
+        and rms > MIN_RMS * presses.full_scale
     )
     text = f"{100 * share:.0f} % of the residual repeats between recordings of the same command"
     return Alarm("replicates", bool(fired), share, p_value, text)
@@ -110,7 +110,7 @@ def pair_alarm(presses: PressSet, residuals: Sequence[np.ndarray]) -> Alarm | No
     seen = float(np.mean(alike[best]))
     rms = np.sqrt(max(seen, 0.0)) * np.sqrt(np.mean([np.mean(r**2) for r in residuals]))
     far = (seen - float(np.mean(strangers))) / spread
-    fired = far > PAIR_DEVIATIONS and seen > PAIR_CORRELATION and rms > MIN_RMS_COUNTS
+    fired = far > PAIR_DEVIATIONS and seen > PAIR_CORRELATION and rms > MIN_RMS * presses.full_scale
     text = f"{100 * seen:.0f} % of the residual of condition {best} repeats between its recordings"
     return Alarm("one condition", bool(fired), seen, float(norm.sf(far)), text + _motion_of(presses, best))
 
@@ -146,16 +146,21 @@ def line_alarm(presses: PressSet, residuals: Sequence[np.ndarray]) -> Alarm | No
     if frame_s <= 0 or span < 64 * frame_s:
         return None
     frequencies = np.arange(LINE_FROM, int(0.5 * span / frame_s) + 1) / span
-    ratios = []
-    for trial, residual in zip(trials, residuals, strict=True):
+    ratios, motions = [], []
+    for press, trial, residual in zip(presses.presses, trials, residuals, strict=True):
         window = np.hanning(len(trial.time_s) + 2)[1:-1]
         common = window * (residual - residual.mean(axis=0)).sum(axis=1)
-        power = np.abs(np.exp(-2j * np.pi * frequencies[:, None] * trial.time_s[None, :]) @ common) ** 2
+        kernel = np.exp(-2j * np.pi * frequencies[:, None] * trial.time_s[None, :])
+        power = np.abs(kernel @ common) ** 2
         ratios.append(power / np.maximum(_local_median(power), 1e-12))
+        drive = (press.drive * (press.drive > 0)).sum(axis=(1, 2))
+        moves = np.abs(kernel @ (window * (drive - drive.mean()))) ** 2
+        motions.append(moves / np.maximum(_local_median(moves), 1e-30))
     # Medians over recordings: one recording with a spike is not a line.
-    ratio = np.median(ratios, axis=0)
+    ratio, motion = np.median(ratios, axis=0), np.median(motions, axis=0)
     best = int(np.argmax(ratio))
-    fired = bool(ratio[best] > LINE_RATIO and len(ratios) >= 3)
+    # Presses that come at regular intervals have lines of their own, and so has any misfit to them.
+    fired = bool(ratio[best] > LINE_RATIO and len(ratios) >= 3 and motion[best] < 0.5 * LINE_RATIO)
     text = f"a line at {frequencies[best]:.2f} Hz in the residual (or its alias from a faster one)"
     return Alarm("spectrum", fired, float(ratio[best]), 1e-4 if fired else 1.0, text)
 

@@ -3,7 +3,7 @@
 from dataclasses import dataclass
 from typing import Any
 
-from lerobot_vtrefine.diagnose.crossvalidation import paired_p
+from lerobot_vtrefine.diagnose.crossvalidation import agree
 from lerobot_vtrefine.diagnose.experiments import next_experiment
 from lerobot_vtrefine.diagnose.fitting import Fit
 from lerobot_vtrefine.diagnose.noise import Noise
@@ -34,7 +34,7 @@ def find_ambiguities(search: Search, fitted: Fit, noise: Noise) -> Rivals:
         tied = []
         for rival in rivals:
             other = add(search, slim, rival, probes)
-            if paired_p(full.better_by(scored(search, other)), search.seed) > TIE_P:
+            if not agree(full.better_by(scored(search, other)), search.seed, TIE_P):
                 tied.append((rival, other))
         if tied:
             groups.append((name, *(rival for rival, _ in tied)))

@@ -126,7 +126,7 @@ def fit_baseline(presses: PressSet) -> Baseline:
     fitted = plain = fit(guess, presses, plain_weights(presses))
     k_n = stiffness_from_load(presses, fitted.model)
     top = max((float(np.max(signal)) for signal in fitted.signals if signal.size), default=1.0)
-    setting = replace(setting, top_counts=max(top, 1.0))
+    setting = replace(setting, top_counts=max(top, presses.full_scale / 255.0))
     model = replace(fitted.model, setting=setting, k_n=k_n or NOMINAL_K_N)
     fitted = replace(fitted, model=model)
     noise, weights = weigh(fitted, presses)

@@ -60,6 +60,11 @@ def cross_validate(
     return Score(losses, squares)
 
 
+def agree(differences: np.ndarray, seed: int, level: float) -> bool:
+    """Whether paired differences (K,) are positive at that level, or all are where K is too small for it."""
+    return paired_p(differences, seed) <= max(level, 1.05 * 2.0 ** -len(differences) + 1e-3)
+
+
 def paired_p(differences: np.ndarray, seed: int, flips: int = 4999) -> float:
     """One-sided sign-flip p-value that paired differences (K,) are positive on average."""
     rng = np.random.default_rng([seed, 3])

@@ -47,13 +47,15 @@ def heldout(foretold: Sequence[Foretold], floor: float | None, seed: int) -> Hel
     rng = np.random.default_rng([seed, 7])
     picks = rng.integers(0, len(before), (RESAMPLES, len(before)))
     gains = 1.0 - after[picks].sum(axis=1) / np.maximum(before[picks].sum(axis=1), 1e-12)
+    if before.mean() < 1e-12:
+        gains = np.zeros(RESAMPLES)
     low, high = np.percentile(gains, (2.5, 97.5))
     return Heldout(
         metric="rmse",
         baseline=float(np.sqrt(before.mean())),
         extended=float(np.sqrt(after.mean())),
         noise_floor=floor,
-        gain=float(1.0 - after.mean() / max(float(before.mean()), 1e-12)),
+        gain=float(1.0 - after.mean() / before.mean()) if before.mean() >= 1e-12 else 0.0,
         gain_ci95=(float(low), float(high)),
         trials=tuple(f.press.trial.file for f in foretold),
     )

@@ -11,7 +11,7 @@ from lerobot_vtrefine.diagnose.fitting import Fit, predict, squared_errors
 from lerobot_vtrefine.diagnose.intervals import form_parameters, map_parameters
 from lerobot_vtrefine.diagnose.presses import PressSet
 from lerobot_vtrefine.diagnose.screening import ALPHA
-from lerobot_vtrefine.diagnose.selection import MAPS, MIN_GAIN, Search, settle
+from lerobot_vtrefine.diagnose.selection import EXTRA_GAIN, MAPS, Search, settle
 from lerobot_vtrefine.diagnose.verdict import Cause, Parameter
 
 
@@ -88,6 +88,6 @@ def _why_rejected(adjusted: float | None, gain: float | None) -> str:
         return "recordings do not agree on its sign more than chance allows"
     if gain is None:
         return "passed the screening, but others explained more and left nothing for it"
-    if gain <= MIN_GAIN:
+    if gain <= EXTRA_GAIN:
         return "takes away too little of the error on recordings left out"
     return "another cause explains the same better"

@@ -15,7 +15,8 @@ DEFAULT_GAIN = 0.01
 DEFAULT_OFFSET_M = 1e-5
 """Repeatability of a recording's first touch, where replicates do not tell (10 um) [m]."""
 MAX_GAIN, MAX_OFFSET_M = 0.05, 6e-5
-MIN_SIGMA = 0.05
+MIN_SIGMA = 2e-4
+"""Least noise, in parts of full scale."""
 QUANTISATION_VARIANCE = 1.0 / 12.0
 MAX_RHO = 0.95
 TRIM = 0.9
@@ -54,11 +55,13 @@ def fit_frame_noise(
     if not len(square):
         return Noise(1.0, 0.0, 0.0, DEFAULT_GAIN, DEFAULT_OFFSET_M)
     low, high = _strata(square, size)
-    floor2 = max(low, (QUANTISATION_VARIANCE if presses.step_counts else 0.0), MIN_SIGMA**2)
+    floor2 = max(
+        low, (QUANTISATION_VARIANCE if presses.step_counts else 0.0), (MIN_SIGMA * presses.full_scale) ** 2
+    )
     top = np.quantile(size, 0.9) if size.any() else 0.0
     loaded = size > 0.5 * top
     mean_square = float(np.mean(size[loaded] ** 2)) if loaded.any() else 0.0
-    growth2 = max(high - floor2, 0.0) / mean_square if mean_square > 1.0 else 0.0
+    growth2 = max(high - floor2, 0.0) / mean_square if mean_square > floor2 else 0.0
     return Noise(
         float(np.sqrt(floor2)), float(min(np.sqrt(growth2), 0.1)), rho, DEFAULT_GAIN, DEFAULT_OFFSET_M
     )

@@ -167,9 +167,10 @@ def prepare(recordings: RecordingSet, trials: list[Trial], learn: list[int]) -> 
     layout = PadLayout(recordings.rows, recordings.cols, recordings.pitch_m)
     loaded = any(trial.depth_m is None for trial in trials)
     motions = [_motion(trial, layout, loaded) for trial in trials]
+    count = min(1.0, recordings.full_scale / 255.0)
     idle = idle_map([trials[i] for i in learn], [motions[i] for i in learn], layout)
     presses = tuple(
-        _press(trial, motion, layout, idle.level, loaded)
+        _press(trial, motion, layout, idle.level, loaded, count)
         for trial, motion in zip(trials, motions, strict=True)
     )
     return PressSet(layout, recordings.full_scale, idle, presses, loaded, _lattice(trials))
@@ -226,14 +227,20 @@ def idle_map(trials: list[Trial], motions: list[_Motion], layout: PadLayout) -> 
 
 
 def _idle_by_taxel(trials: list[Trial], motions: list[_Motion]) -> np.ndarray:
+    """Means of each taxel's own free frames; where it has none, what a straight line leaves at no depth."""
     raw = np.concatenate([trial.raw for trial in trials])
-    pressed = np.concatenate([motion.drive.reshape(len(motion.drive), -1) > 0 for motion in motions])
-    free = ~pressed
+    drives = np.concatenate([motion.drive.reshape(len(motion.drive), -1) for motion in motions])
+    depth = np.maximum(drives, 0.0)
+    free = depth == 0
     mean = np.where(free, raw, 0.0).sum(axis=0) / np.maximum(free.sum(axis=0), 1)
-    return np.where(free.sum(axis=0) >= 3, mean, np.quantile(raw, 0.02, axis=0))
+    off_depth, off_raw = depth - depth.mean(axis=0), raw - raw.mean(axis=0)
+    power = float((off_depth**2).sum())
+    slope = float((off_depth * off_raw).sum()) / power if power > 0 else 0.0
+    left = np.maximum(raw.mean(axis=0) - slope * depth.mean(axis=0), 0.0)
+    return np.where(free.sum(axis=0) >= 3, mean, left)
 
 
-def _answering(trial: Trial, motion: _Motion) -> np.ndarray:
+def _answering(trial: Trial, motion: _Motion, count: float) -> np.ndarray:
     """Taxels whose smoothed reading moves by over a count (and more than noise) from rest: (R*C,) bool."""
     frames = len(trial.raw)
     rest = _rest(trial, motion)[1]
@@ -244,13 +251,15 @@ def _answering(trial: Trial, motion: _Motion) -> np.ndarray:
     smooth = (total[window:] - total[:-window]) / window
     spread = np.diff(trial.raw, axis=0).std(axis=0) / np.sqrt(2.0) if frames > 2 else 0.0
     spread = np.maximum(spread, base.std(axis=0) if rest.sum() >= 5 else 0.0)
-    return np.abs(smooth).max(axis=0) > 1.0 + 4.0 * spread / np.sqrt(min(window, 4))
+    return np.abs(smooth).max(axis=0) > count + 4.0 * spread / np.sqrt(min(window, 4))
 
 
-def _press(trial: Trial, motion: _Motion, layout: PadLayout, idle: np.ndarray, loaded: bool) -> Press:
+def _press(
+    trial: Trial, motion: _Motion, layout: PadLayout, idle: np.ndarray, loaded: bool, count: float
+) -> Press:
     shape = (layout.rows, layout.cols)
     pressed = (motion.drive > 0).any(axis=0)
-    scored = pressed | _answering(trial, motion).reshape(shape)
+    scored = pressed | _answering(trial, motion, count).reshape(shape)
     if not scored.any():
         scored = np.ones(shape, dtype=bool) if layout.num_taxels <= 16 else _nearest(trial, layout)
     rows, cols = np.flatnonzero(scored.any(axis=1)), np.flatnonzero(scored.any(axis=0))
@@ -284,7 +293,7 @@ def _press(trial: Trial, motion: _Motion, layout: PadLayout, idle: np.ndarray, l
 def synthetic_press(trial: Trial, like: PressSet) -> Press:
     """A press that was not recorded, as if with the readings in the trial's `raw`."""
     motion = _motion(trial, like.layout, like.loaded)
-    return _press(trial, motion, like.layout, np.zeros_like(like.idle.level), like.loaded)
+    return _press(trial, motion, like.layout, np.zeros_like(like.idle.level), like.loaded, 1.0)
 
 
 def _nearest(trial: Trial, layout: PadLayout) -> np.ndarray:

@@ -10,6 +10,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
+from scipy.stats import norm
 
 from lerobot_vtrefine.diagnose.candidates.base import Form
 from lerobot_vtrefine.diagnose.fitting import Fit, predict
@@ -19,6 +20,10 @@ from lerobot_vtrefine.diagnose.weights import TrialWeights
 
 FLIPS = 9999
 ALPHA = 0.02
+FEW = 10
+"""With fewer recordings than this, signs alone cannot reach significance: size counts as well."""
+DOUBT = 2.0
+"""Factor by which scores may stray more than the fitted noise says, where their size counts."""
 
 
 @dataclass(frozen=True)
@@ -168,12 +173,19 @@ def screen(probes: Sequence[Probe], count: int, seed: int) -> dict[str, Screened
     for index, probe in enumerate(flipped):
         p_value = float(shares[0, index])
         adjusted = float(np.searchsorted(smallest, p_value, side="right")) / len(smallest)
+        if count < FEW and p_value <= 2.5 * 2.0 ** (1 - count):
+            adjusted = min(adjusted, len(names) * size_p(probe))
         _keep(best, Screened(probe, p_value, min(1.0, adjusted * (1 + 0.1 * extra))))
     for probe in probes:
         if probe.permuted is not None:
             # Another reference distribution: Bonferroni over a handful of effectively independent names.
             _keep(best, Screened(probe, probe.permuted, min(1.0, 5.0 * probe.permuted)))
     return best
+
+
+def size_p(probe: Probe) -> float:
+    """p-value from the scores' size against the noise, with a wide margin for what the noise model misses."""
+    return float(2.0 * norm.sf(np.sqrt(max(probe.explained, 0.0)) / DOUBT))
 
 
 def _keep(best: dict[str, Screened], found: Screened) -> None:

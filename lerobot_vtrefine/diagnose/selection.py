@@ -9,7 +9,7 @@ from lerobot_vtrefine.diagnose.baseline import Baseline, weigh
 from lerobot_vtrefine.diagnose.candidates import CATALOGUE
 from lerobot_vtrefine.diagnose.candidates.base import Form
 from lerobot_vtrefine.diagnose.composite import Composite
-from lerobot_vtrefine.diagnose.crossvalidation import Score, cross_validate, folds_of, paired_p
+from lerobot_vtrefine.diagnose.crossvalidation import Score, agree, cross_validate, folds_of
 from lerobot_vtrefine.diagnose.fitting import Fit, fit, predict, tangents
 from lerobot_vtrefine.diagnose.maps import find_dead, map_evidence, with_map
 from lerobot_vtrefine.diagnose.presses import PressSet
@@ -149,7 +149,7 @@ def add(search: Search, fitted: Fit, name: str, probes: Sequence[Probe]) -> Fit:
 
 def _clearly_better(score: Score, than: Score, seed: int) -> bool:
     """Whether a richer form pays: a percent less error, in most recordings."""
-    return score.gain_over(than) > MIN_GAIN and paired_p(score.better_by(than), seed) < 0.05
+    return score.gain_over(than) > MIN_GAIN and agree(score.better_by(than), seed, AGREEMENT_P)
 
 
 def scored(search: Search, fitted: Fit) -> Score:
@@ -239,7 +239,7 @@ def rank(search: Search, fitted: Fit, candidates: Sequence[Screened], probes: Se
         score = scored(search, found)
         gain, logs = score.gain_over(base), score.better_by(base)
         search.tried[name] = max(gain, search.tried.get(name, -np.inf))
-        agreed = name == "dead_taxels" or paired_p(logs, search.seed) < AGREEMENT_P
+        agreed = name == "dead_taxels" or agree(logs, search.seed, AGREEMENT_P)
         if gain > needed and logs.sum() > 0 and agreed:
             steps.append(Step(name, found, score, gain, logs))
         if name == "dead_taxels" and steps and steps[-1].name == name:
