@@ -16,7 +16,7 @@ from lerobot_vtrefine.cli.diagnose import make_verdict
 from lerobot_vtrefine.diagnose.recordings import read_recording_set
 from lerobot_vtrefine.diagnose.report import render_report
 from lerobot_vtrefine.diagnose.report.axes import ticks
-from lerobot_vtrefine.diagnose.report.numbers import digits, interval, quantity
+from lerobot_vtrefine.diagnose.report.numbers import digits, interval, percent, quantity
 from lerobot_vtrefine.diagnose.report.words import MEANINGS
 from lerobot_vtrefine.diagnose.verdict import CAUSES, DataIssue, Unknown
 
@@ -121,7 +121,7 @@ def test_everything_found_and_not_found_is_there(pad_set):
         "crosstalk crosstalk 0.4 0.99 0.1 % not found no more than chance gives",
         "baseline drift baseline_drift – – – cannot be told here",
         "hysteresis width_m 0.21 mm 0.18 to 0.24 mm",
-        "baseline, refitted k_n 380 N/m 371 to 390 N/m",
+        "baseline k_n 380 N/m 371 to 390 N/m",
         "latency delay 6 ms",
         "contact offset offset 30 µm",
         "the worst predicted",
@@ -187,6 +187,8 @@ def test_every_cause_has_words():
         (quantity(0.0, "m"), "0 mm"),
         (quantity(4e-4, "1/counts"), "0.0004 1/counts"),
         (digits(-0.5), "−0.5"),
+        (percent(-1e-5), "0.0 %"),
+        (percent(-0.0123), "−1.2 %"),
         (digits(12345.6), "12346"),
         (digits(2e-7), "2.00e-7"),
         (interval(0.05, (0.045, 0.056), "s"), ("50 ms", "45 to 56 ms")),

@@ -53,7 +53,7 @@ def interval(value: float, ci95: Sequence[float] | None, unit: str) -> tuple[str
 
 def percent(part: float) -> str:
     """For example "66 %"; one digit more below ten."""
-    number = 100.0 * part
+    number = round(100.0 * part, 1) + 0.0  # no minus before a zero
     text = f"{number:.1f}" if abs(number) < 10 else f"{number:.0f}"
     return text.replace("-", "−") + " %"
 

@@ -81,6 +81,7 @@ def _nothing() -> dict[str, Any]:
         "residuals",
         "evidence",
         "parameters",
+        "baseline",
         "maps",
     )
     return dict.fromkeys(names, ())
@@ -89,7 +90,6 @@ def _nothing() -> dict[str, Any]:
 def _findings(verdict: Verdict, diagnosis: Diagnosis, unit: str) -> dict[str, Any]:
     traces = [{"caption": text, "figure": trace_figure(t, unit)} for t, text in _ordered(diagnosis.traces)]
     groups = [(title(cause.name), cause.params) for cause in verdict.causes]
-    groups.append(("baseline, refitted", diagnosis.baseline_params))
     return {
         "error_chart": error_figure(verdict.heldout, unit) if verdict.heldout else "",
         "trial_chart": trial_figure(diagnosis.trial_errors, unit) if diagnosis.trial_errors else "",
@@ -98,9 +98,8 @@ def _findings(verdict: Verdict, diagnosis: Diagnosis, unit: str) -> dict[str, An
         "more_traces": traces[SHOWN_TRACES:],
         "residuals": [residual_figure(view, unit) for view in diagnosis.residuals],
         "evidence": [_evidence_row(item) for item in _by_decision(diagnosis.evidence)],
-        "parameters": [
-            _parameter_row(group, name, p) for group, params in groups for name, p in params.items()
-        ],
+        "parameters": [_parameter_row(of, name, p) for of, params in groups for name, p in params.items()],
+        "baseline": [_parameter_row("baseline", name, p) for name, p in diagnosis.baseline_params.items()],
         "maps": _maps(diagnosis.maps, unit),
     }
 

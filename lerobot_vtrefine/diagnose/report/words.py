@@ -98,6 +98,10 @@ MEANINGS = {
 }
 
 
+LONGEST_CLUE = 110
+"""Longer clues are told below the headline only."""
+
+
 def title(name: str) -> str:
     """A cause's name for people; evidence may be about something that no list of causes holds."""
     return MEANINGS[name].title if name in MEANINGS else name.replace("_", " ")
@@ -126,7 +130,8 @@ def headline(verdict: Verdict, unit: str) -> str:
         sure = [title(c.name) for c in verdict.causes if not any(c.name in g for g in verdict.ambiguous_with)]
         beside = f" It surely lacks {listing(sure)}." if sure else ""
         return f"The simulation is wrong, but these recordings cannot tell whether it lacks {pairs}.{beside}"
-    clue = f" What is known of it: {verdict.unknown.clue}." if verdict.unknown.clue else ""
+    clue = verdict.unknown.clue or ""
+    clue = f" What is known of it: {clue}." if 0 < len(clue) <= LONGEST_CLUE else ""
     symptoms = f" What looks like {names} may be a symptom of it." if names else ""
     return f"The simulation is wrong in a way that no known cause explains.{clue}{symptoms}"
 
