@@ -83,8 +83,10 @@ class PadSensors:
         self._time_s[torch.from_numpy(ids)] = 0.0
         for stage in self.model.stages:
             initial = stage.initial(self.layout, self.num_pads)
-            rngs = [np.random.default_rng([int(env_seed), stage.rank]) for env_seed in seeds]
-            drawn = [{**initial, **stage.traits(self.layout, self.num_pads, rng)} for rng in rngs]
+            drawn = [initial] * len(seeds)
+            if type(stage).traits is not Stage.traits:  # a generator costs more than what it draws
+                rngs = [np.random.default_rng([int(env_seed), stage.rank]) for env_seed in seeds]
+                drawn = [{**initial, **stage.traits(self.layout, self.num_pads, rng)} for rng in rngs]
             self._assign(stage.name, ids, drawn)
         self._update_baseline(ids)
 
