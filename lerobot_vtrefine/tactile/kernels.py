@@ -253,7 +253,7 @@ def eval_rate(form: wp.vec4, x: float, y: float, s: float) -> float:
 
 @wp.func
 def own_first(share: Share, begin: int) -> int:
-    """A column that this thread owns, at or a little before the first one from `begin` on."""
+    """First column of a group that this thread owns, a little before `begin` or after it."""
     if share.lanes == 1:
         return begin
     span = share.width * share.lanes
@@ -261,11 +261,11 @@ def own_first(share: Share, begin: int) -> int:
 
 
 @wp.func
-def own_next(share: Share, col: int) -> int:
-    """The next column that this thread owns."""
-    if share.lanes == 1 or (col + 1) % share.width != 0:
-        return col + 1
-    return col + 1 + (share.lanes - 1) * share.width
+def own_width(share: Share, begin: int, end: int) -> int:
+    """How many neighbouring columns this thread takes at a time: alone, all of them."""
+    if share.lanes == 1:
+        return end - begin
+    return share.width
 
 
 @wp.func

@@ -12,7 +12,7 @@ The loops over points are in `kernels_packs`.
 import warp as wp
 
 from lerobot_vtrefine.tactile.kernels import Share, ivec4
-from lerobot_vtrefine.tactile.kernels_packs import add_forces, add_lanes, raw_sums
+from lerobot_vtrefine.tactile.kernels_packs import add_all_lanes, add_forces, add_lanes, raw_sums
 
 wp.set_module_options({"enable_backward": False})
 
@@ -59,9 +59,7 @@ def balance(
     """Sums of u (1, x, y) and (1, x, y)^T (1, x, y)."""
     middle = 0.5 * float(pad.rows / pad.subdivision - 1)
     own = raw_sums(pad.share, pad.area, pad.cols, middle, wp.vec3(trial), taxel_x, lead)
-    if pad.share.lanes > 1:
-        for i in range(10):
-            own[i] = add_lanes(own[i])
+    own = add_all_lanes(own)
     n = wp.float64(own[0])
     x = wp.float64(own[1])
     y = wp.float64(own[2])

@@ -16,7 +16,7 @@ from lerobot_vtrefine.tactile.kernels import (
     column,
     coordinate,
     own_first,
-    own_next,
+    own_width,
 )
 
 wp.set_module_options({"enable_backward": False})
@@ -218,25 +218,25 @@ def query_grid(
     linear = views.linear[env, pad, k]
     angular = views.angular[env, pad, k]
     grid = bodies.grids[k]
+    width = own_width(share, area[2], area[3])
     for row in range(area[0], area[1]):
         from_middle = coordinate(row, lattice.pitch, lattice.rows) * ey
-        col = own_first(share, area[2])
-        while col < area[3]:
-            lever = from_middle + coordinate(col, lattice.pitch, lattice.cols) * ex
-            p = origin + lever
-            cell = cell_of(grid, bodies.cells, p)
-            index = row * lattice.cols + col
-            if col >= area[2] and cell[0] < 0:
-                depth[index] = lattice.reach
-                rate[index] = 0.0
-            elif col >= area[2] and cell[1] > cell[0]:
-                found = nearest_of(bodies.corners, bodies.normals, cell[0], cell[1], bodies.candidates, p)
-                normal = outward_normal(found, bodies.normals, bodies.edge_normals, bodies.corner_normals)
-                value = wp.min(found.distance, lattice.reach)
-                if value > depth[index] and wp.dot(found.toward, normal) > 0.0:
-                    if found.distance > TINY_M:
-                        normal = found.toward
-                    speed = wp.dot(normal, linear + wp.cross(angular, lever))
-                    depth[index] = value
-                    rate[index] = -speed / wp.length(normal)
-            col = own_next(share, col)
+        for group in range(own_first(share, area[2]), area[3], width * share.lanes):
+            for col in range(wp.max(group, area[2]), wp.min(group + width, area[3])):
+                lever = from_middle + coordinate(col, lattice.pitch, lattice.cols) * ex
+                p = origin + lever
+                cell = cell_of(grid, bodies.cells, p)
+                index = row * lattice.cols + col
+                if cell[0] < 0:
+                    depth[index] = lattice.reach
+                    rate[index] = 0.0
+                elif cell[1] > cell[0]:
+                    found = nearest_of(bodies.corners, bodies.normals, cell[0], cell[1], bodies.candidates, p)
+                    normal = outward_normal(found, bodies.normals, bodies.edge_normals, bodies.corner_normals)
+                    value = wp.min(found.distance, lattice.reach)
+                    if value > depth[index] and wp.dot(found.toward, normal) > 0.0:
+                        if found.distance > TINY_M:
+                            normal = found.toward
+                        speed = wp.dot(normal, linear + wp.cross(angular, lever))
+                        depth[index] = value
+                        rate[index] = -speed / wp.length(normal)

@@ -14,9 +14,10 @@ vec10 = wp.types.vector(length=10, dtype=wp.float32)
 PACKS = """
 #if defined(__CUDA_ARCH__)
 typedef float pack;
-#define SPAN (share.width * share.lanes)
-#define FOR_COLUMNS for (int c = area[2] / SPAN * SPAN + share.lane * share.width; c < area[3]; \\
-    c += (c + 1) % share.width ? 1 : 1 + SPAN - share.width) if (c >= area[2])
+const int span = share.width * share.lanes;
+const int own = area[2] / span * span + share.lane * share.width;
+#define FOR_COLUMNS for (int g = own; g < area[3]; g += span) for (int c = g; c < g + share.width; ++c) \\
+    if (c >= area[2] && c < area[3])
 #define LOAD(to, from) to = (from)[c]
 #define STORE(to, from) (to)[c] = from
 #else
@@ -40,6 +41,18 @@ return x;
 """)
 def add_lanes(x: wp.float32) -> wp.float32:
     """Sum over the lanes of a pad, the same bits in each."""
+    ...
+
+
+@wp.func_native("""
+#if defined(__CUDA_ARCH__)
+for (int step = 16; step > 0; step >>= 1)
+    for (int i = 0; i < 10; ++i) x[i] += __shfl_xor_sync(0xffffffffu, x[i], step);
+#endif
+return x;
+""")
+def add_all_lanes(x: vec10) -> vec10:
+    """Ten sums over the lanes of a pad at once, the same bits in each lane."""
     ...
 
 

@@ -26,7 +26,7 @@ from lerobot_vtrefine.tactile.kernels import (
     ivec2,
     ivec4,
     own_first,
-    own_next,
+    own_width,
     rate_form,
     sphere_closest,
     sphere_column,
@@ -195,32 +195,32 @@ def query_solid(
     angular = views.angular[env, pad, k]
     kind = bodies.kind[k]
     extent = bodies.extent[k]
+    width = own_width(share, area[2], area[3])
     for row in range(area[0], area[1]):
         y = coordinate(row, lattice.pitch, lattice.rows)
         along = origin + y * column(axes, 1)
-        col = own_first(share, area[2])
-        while col < area[3]:
-            x = coordinate(col, lattice.pitch, lattice.cols)
-            index = row * lattice.cols + col
-            value = float(0.0)
-            form = wp.vec4(0.0, 0.0, 0.0, 0.0)
-            if first < last:
-                found = wp.vec2(0.0, 0.0)
-                if lattice.mode == COLUMN:
-                    found = column_entry(first, last, kept, x, y, forms)
+        for group in range(own_first(share, area[2]), area[3], width * share.lanes):
+            for col in range(wp.max(group, area[2]), wp.min(group + width, area[3])):
+                x = coordinate(col, lattice.pitch, lattice.cols)
+                index = row * lattice.cols + col
+                value = float(0.0)
+                form = wp.vec4(0.0, 0.0, 0.0, 0.0)
+                if first < last:
+                    found = wp.vec2(0.0, 0.0)
+                    if lattice.mode == COLUMN:
+                        found = column_entry(first, last, kept, x, y, forms)
+                    else:
+                        found = least_gap(first, kept, x, y, forms)
+                    value = wp.min(found[0], lattice.reach)
+                    form = rates[wp.int32(found[1])]
                 else:
-                    found = least_gap(first, kept, x, y, forms)
-                value = wp.min(found[0], lattice.reach)
-                form = rates[wp.int32(found[1])]
-            else:
-                hit = curved(lattice.mode, kind, along + x * column(axes, 0), column(axes, 2), extent)
-                value = wp.min(hit[0], lattice.reach)
-                if value > height[index]:
-                    form = rate_form(lattice.mode, wp.vec3(hit[1], hit[2], hit[3]), axes, linear, angular)
-            if col >= area[2] and value > height[index] and value >= -low:
-                height[index] = value
-                rate[index] = eval_rate(form, x, y, -value * float(lattice.mode))
-            col = own_next(share, col)
+                    hit = curved(lattice.mode, kind, along + x * column(axes, 0), column(axes, 2), extent)
+                    value = wp.min(hit[0], lattice.reach)
+                    if value > height[index]:
+                        form = rate_form(lattice.mode, wp.vec3(hit[1], hit[2], hit[3]), axes, linear, angular)
+                if value > height[index] and value >= -low:
+                    height[index] = value
+                    rate[index] = eval_rate(form, x, y, -value * float(lattice.mode))
 
 
 @wp.func
