@@ -33,7 +33,8 @@ def minimum_detectable(scorer: Scorer) -> dict[str, float]:
     """Size of each cause's main parameter from which on it would be seen; causes never seen are left out."""
     setting = scorer.fitted.model.setting
     found: dict[str, float] = {}
-    for form in CATALOGUE:
+    plain = {form.family: form for form in reversed(CATALOGUE)}
+    for form in plain.values():
         if not form.screened or not form.possible(setting) or form.family in scorer.fitted.model.families:
             continue
         for guess in form.probes(setting):

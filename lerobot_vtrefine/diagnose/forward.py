@@ -246,7 +246,10 @@ def _hold(stage: SampleAndHold, image: np.ndarray, time_s: np.ndarray, layout: C
 
 
 def _drift(stage: BaselineDrift, image: np.ndarray, group: Group) -> np.ndarray:
-    return image + (stage.rate_counts_per_s * group.session_s)[:, None, None]
+    moved = stage.rate_counts_per_s * group.session_s
+    if stage.knots_s:
+        moved = moved + np.interp(group.session_s, stage.knots_s, stage.knot_counts)
+    return image + moved[:, None, None]
 
 
 def _gain_map(stage: TaxelGainSpread, image: np.ndarray, group: Group) -> np.ndarray:

@@ -16,6 +16,23 @@ def _linear(values: np.ndarray, setting: Setting) -> tuple[Stage, ...]:
     return (Idle(-rate * setting.rest_session_s, 0.0), BaselineDrift(rate))
 
 
+KNOTS = 6
+
+
+def _knots(setting: Setting) -> np.ndarray:
+    return setting.session_start_s + np.linspace(0.0, setting.session_s + setting.duration_s, KNOTS)
+
+
+def _curve(values: np.ndarray, setting: Setting) -> tuple[Stage, ...]:
+    knots = tuple(float(knot) for knot in _knots(setting))
+    return (BaselineDrift(0.0, knots, tuple(float(value) for value in values)),)
+
+
+def _report_curve(values: np.ndarray, setting: Setting) -> dict[str, tuple[float, str]]:
+    """The mean rate."""
+    return {"rate_counts_per_s": (float(np.polyfit(_knots(setting), values, 1)[0]), "counts/s")}
+
+
 FORMS = (
     Form(
         "baseline_drift",
@@ -25,5 +42,18 @@ FORMS = (
         lambda v, s: {"rate_counts_per_s": (float(v[0]) * UNIT, "counts/s")},
         lambda s: [[1.0]],
         signed=True,
+    ),
+    Form(
+        "baseline_drift",
+        "curve over session time",
+        tuple(Value(f"counts_{j}", -1e3, 1e3, 1e-2) for j in range(KNOTS)),
+        _curve,
+        _report_curve,
+        lambda s: [
+            (0.5 * np.cos(np.pi * order * np.arange(KNOTS) / (KNOTS - 1))).tolist() for order in (1, 2, 3)
+        ],
+        amplitude=None,
+        signed=True,
+        possible=lambda s: s.session_s > 2.0 * s.duration_s,
     ),
 )

@@ -1,6 +1,7 @@
 """Readout stages: force to conductance, the row's shared divider, and 8-bit counts on an idle level."""
 
 from dataclasses import dataclass, field
+from itertools import pairwise
 from typing import Any, ClassVar, override
 
 import numpy as np
@@ -210,17 +211,36 @@ class Idle(Stage):
 @register
 @dataclass(frozen=True)
 class BaselineDrift(Stage):
-    """The idle level moves with session time: counts += rate_counts_per_s * t."""
+    """The idle level moves with session time: counts += rate_counts_per_s * t.
+
+    `knots_s` and `knot_counts`, equally long, add a curve that is straight between its knots and level beyond
+    them.
+    """
 
     name: ClassVar[str] = "baseline_drift"
     domain: ClassVar[str] = "counts"
     rank: ClassVar[int] = 62
     has_state: ClassVar[bool] = True  # The clock advances with the frames, so none may be left out.
     rate_counts_per_s: float = parameter(0.0, "counts/s", -3e-3, 3e-3, minimum=None)
+    knots_s: tuple[float, ...] = ()
+    knot_counts: tuple[float, ...] = ()
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        for name in ("knots_s", "knot_counts"):
+            object.__setattr__(self, name, as_tuple(getattr(self, name)))
+        rising = all(later > earlier for earlier, later in pairwise(self.knots_s))
+        if len(self.knots_s) != len(self.knot_counts) or not rising:
+            raise ValueError("baseline_drift: knots_s must rise and knot_counts be as many")
 
     @override
     def step(self, x: torch.Tensor, state: State, frame: Frame) -> tuple[torch.Tensor, State]:
-        return x + (self.rate_counts_per_s * torch.as_tensor(frame.time_s)).to(x), state
+        time_s = torch.as_tensor(frame.time_s)
+        moved = self.rate_counts_per_s * time_s + (self.knot_counts[0] if self.knot_counts else 0.0)
+        knots = zip(pairwise(self.knots_s), pairwise(self.knot_counts), strict=True)
+        for (begin, end), (first, last) in knots:
+            moved = moved + (last - first) / (end - begin) * (time_s - begin).clamp(0.0, end - begin)
+        return x + moved.to(x), state
 
 
 @register
