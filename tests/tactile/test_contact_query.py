@@ -112,6 +112,31 @@ def test_a_concave_mesh_is_exact_in_both_modes() -> None:
     assert touched > 30
 
 
+def winding_number(corners: np.ndarray, points: np.ndarray) -> np.ndarray:
+    """How often triangles (F, 3, 3) go round points (N,), by solid angles: 1 inside, 0 outside."""
+    a, b, c = (corners[None, :, i] - points[:, None] for i in range(3))
+    la, lb, lc = (np.linalg.norm(item, axis=-1) for item in (a, b, c))
+    volume = np.einsum("nfi,nfi->nf", a, np.cross(b, c))
+    scale = la * lb * lc + (a * b).sum(-1) * lc + (b * c).sum(-1) * la + (c * a).sum(-1) * lb
+    return np.arctan2(volume, scale).sum(1) / (2 * np.pi)
+
+
+def test_a_mesh_is_felt_wherever_a_taxel_is_inside_and_nowhere_else() -> None:
+    """Whole pads in and around a ring: sign and depth at edges, in the bore and deeper than the reach."""
+    mesh, thick = ring_mesh(), TriangleMesh(*box_mesh((0.012, 0.011, 0.01)))
+    rng = np.random.default_rng(11)
+    for shape in (mesh, thick):
+        query = ContactQuery(LAYOUT, [BodyGeometry([shape])])
+        rotation = np.stack([random_rotation(rng) for _ in range(12)])
+        position = rng.uniform(-6e-3, 6e-3, (12, 3))
+        depths, _ = single_query(query, "closest", position, rotation)
+        for p, r, depth in zip(position, rotation, depths.reshape(12, -1), strict=True):
+            points = taxels_in_body(p, r)
+            inside = winding_number(shape.vertices[shape.faces], points) > 0.5
+            expected = np.where(inside, np.minimum(closest_distance(shape, points), REACH_M), 0)
+            assert np.abs(depth - expected).max() < 2e-6
+
+
 def lowest_crossing(corners: np.ndarray, points: np.ndarray, normal: np.ndarray) -> np.ndarray:
     """Height (N,) of the lowest crossing within reach of lines through points with those facing the pad."""
     u, v = corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]
