@@ -22,8 +22,8 @@ Array = np.ndarray
 
 TIE_P = 0.1
 """Above this, trials do not prefer one of two models."""
-TIE_LEAD = 0.03
-"""Two models whose held-out squared errors differ by less are not told apart, however surely they differ."""
+TIE_LEAD, SURE_P = 0.03, 0.01
+"""Where two models' held-out squared errors differ by less, trials must prefer one of them more surely."""
 SHARE_OF_GAIN = 0.9
 _ITERATIONS = 10
 
@@ -156,7 +156,7 @@ def _compared(
     preference = ((other - now) / np.maximum(other + now, 1e-300)).mean(1, keepdims=True)
     p_value = float(flips.one_sided(preference, seed)[0][0])
     lead = float(1 - (now.mean(0) / other.mean(0).clip(1e-300)).mean())
-    tied = p_value > TIE_P or lead < TIE_LEAD
+    tied = p_value > (SURE_P if lead < TIE_LEAD else TIE_P)
     if not tied or gain_other < SHARE_OF_GAIN * gain_now:
         return None
     return Rival(cause, name, tuple(int(j) for j in joints), p_value, lead, fitted, held_out, candidate)
