@@ -146,8 +146,21 @@ class Prefix:
 
 def _key(stage: Stage) -> Any:
     if isinstance(stage, TaxelGainSpread):
-        return stage.name, id(stage.map)
+        return stage.name, _Same(stage.map)
     return stage
+
+
+@dataclass(frozen=True, eq=False)
+class _Same:
+    """Equal only to the very same object, kept alive: the address of one that is gone may be used again."""
+
+    value: Any
+
+    def __eq__(self, other: object) -> bool:
+        return isinstance(other, _Same) and self.value is other.value
+
+    def __hash__(self) -> int:
+        return id(self.value)
 
 
 def _apply(stage: Stage, images: Images, groups: Sequence[Group], stiffness: float) -> Images:
