@@ -38,7 +38,13 @@ def periods(presses: PressSet, frame_s: float) -> list[list[float]]:
         new = slots[:, 1:] != slots[:, :-1]
         error += (new & repeats).sum(axis=1) + (~new & fresh).sum(axis=1)
     best = np.flatnonzero(error <= error.min() + 0.5)
-    return [[float(grid[best].mean())], [float(grid[int(np.argmin(error))])], *plain]
+    spacing = grid[1] / grid[0]
+    low, high = float(grid[best].min() / spacing), float(grid[best].max() * spacing)
+    # Periods that repeat the same frames differ in when, between them, the readings were taken.
+    alike = [[float(period)] for period in np.linspace(low, high, 9)]
+    whole = [[round(low, digits)] for digits in (2, 3) if low <= round(low, digits) <= high]
+    whole += [[round(high, digits)] for digits in (2, 3) if low <= round(high, digits) <= high]
+    return [*alike, *whole, *plain]
 
 
 FORMS = (
