@@ -342,7 +342,7 @@ def parse() -> tuple[argparse.Namespace, Budget]:
         ("envs", 128),
         ("eval_episodes", 200),
         ("eval_envs", 50),
-        ("presses", 32),
+        ("presses", 16),
     ):
         parser.add_argument(f"--{name}", type=int, default=default, help=f"default {default}")
     parser.add_argument("--lane", help=argparse.SUPPRESS)

@@ -131,7 +131,7 @@ def main() -> None:
     )
     parser.add_argument("--reality", type=Path, required=True, help="file for --env.reality")
     parser.add_argument("--output_dir", type=Path, required=True)
-    parser.add_argument("--trials", type=int, default=32, help="recordings, two of every motion (default 32)")
+    parser.add_argument("--trials", type=int, default=16, help="recordings, two of every motion (default 16)")
     parser.add_argument("--seed", type=int, default=0)
     options = parser.parse_args()
     record(options.reality, options.output_dir, options.trials, options.seed)
