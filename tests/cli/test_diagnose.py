@@ -134,7 +134,7 @@ def test_a_failing_run_leaves_nothing_behind(tmp_path, engine, monkeypatch):
 
     monkeypatch.setattr(diagnose, "diagnose", broken)
     assert run(write_set(tmp_path / "set", *make_set()), tmp_path / "out") == 2
-    assert list((tmp_path / "out").iterdir()) == []
+    assert not (tmp_path / "out").exists()
 
 
 @pytest.mark.parametrize(
