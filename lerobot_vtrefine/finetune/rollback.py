@@ -5,6 +5,7 @@ stays there. Not part of DPPO as published; off in the presets that reproduce it
 """
 
 import copy
+from collections.abc import Sequence
 from typing import Any
 
 import torch
@@ -33,7 +34,7 @@ class Rollback:
         self.optimizer: dict[str, Any] = {}
 
     @torch.no_grad()
-    def watch(self, success: float, parameters: list[Tensor], optimizer: torch.optim.Optimizer) -> bool:
+    def watch(self, success: float, parameters: Sequence[Tensor], optimizer: torch.optim.Optimizer) -> bool:
         """Note the success of the weights that were just tried; True if it returned to the best ones.
 
         After a return the experience just collected belongs to other weights and must not be learnt from.
