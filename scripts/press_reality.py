@@ -1,6 +1,7 @@
 #!/usr/bin/env python
 """A rig that presses the pad of a stand-in reality: recordings as a user would make them, in contract format.
 
+    .venv/bin/python scripts/press_reality.py --output_dir=presses                           # an example
     .venv/bin/python scripts/press_reality.py --reality=reality.json --output_dir=presses
 
 A sphere and a square punch press, hold, let go in part and slide over the whole pad at several speeds, each
@@ -22,7 +23,8 @@ from lerobot_vtrefine.sim.reality import load_reality
 from lerobot_vtrefine.tactile.layout import PadLayout
 from lerobot_vtrefine.tactile.model import SensorModel
 from lerobot_vtrefine.tactile.replay import replay
-from lerobot_vtrefine.tactile.stages.readout import Idle, Noise, Quantisation
+from lerobot_vtrefine.tactile.stages.contact import KelvinVoigt
+from lerobot_vtrefine.tactile.stages.readout import Gain, Idle, Noise, Quantisation, RowSharing
 
 LAYOUT = PadLayout(12, 32, 0.002)
 FPS, FINER = 20, 6
@@ -31,6 +33,12 @@ REPLICATES = 2
 OBJECTS = ({"shape": "sphere", "radius_m": 0.01}, {"shape": "flat", "size_m": [0.011, 0.011]})
 SHALLOW_M, DEEP_M = 4e-4, 8e-4
 GAIN_ERROR, HEIGHT_ERROR_M = 0.01, 1e-5
+
+
+EXAMPLE = SensorModel(
+    (KelvinVoigt(400.0, 1.2), Gain(500.0), Idle(25.0, 10.0), Noise(1.0), Quantisation())
+).with_stage(RowSharing(3e-3))
+"""The pad that is pressed where none is given: the taxels of a row load each other's readout."""
 
 
 def motion(rng: np.random.Generator, slides: bool) -> dict[str, np.ndarray]:
@@ -92,9 +100,9 @@ def this_pad(model: SensorModel, rng: np.random.Generator) -> SensorModel:
     return model.with_stage(Idle((idle_map(model) + spread * rng.uniform(-1, 1, (12, 32))).tolist(), 0.0))
 
 
-def record(reality: Path, output_dir: Path, trials: int, seed: int) -> None:
+def record(reality: Path | None, output_dir: Path, trials: int, seed: int) -> None:
     """Write the recording set."""
-    hidden = load_reality(reality).sensor_model
+    hidden = load_reality(reality).sensor_model if reality else EXAMPLE
     if hidden is None:
         raise ValueError(f"{reality}: has no sensor model, so presses tell nothing")
     rng = np.random.default_rng(seed)
@@ -129,7 +137,9 @@ def main() -> None:
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
-    parser.add_argument("--reality", type=Path, required=True, help="file for --env.reality")
+    parser.add_argument(
+        "--reality", type=Path, help="file for --env.reality (default: an example with row sharing)"
+    )
     parser.add_argument("--output_dir", type=Path, required=True)
     parser.add_argument("--trials", type=int, default=16, help="recordings, two of every motion (default 16)")
     parser.add_argument("--seed", type=int, default=0)
