@@ -19,7 +19,6 @@ from hidden.writer import truth_of, write_session
 def diagnose_folder(path: Path, seed: int = 0) -> tuple[dict[str, Any], Any]:
     """What `vtrefine-diagnose` would write to verdict.json, and the extended model."""
     from lerobot_vtrefine.diagnose.pad_engine import diagnose_pad
-
     from lerobot_vtrefine.diagnose.quality import check_quality
     from lerobot_vtrefine.diagnose.recordings import read_recording_set
 
