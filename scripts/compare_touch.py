@@ -1,12 +1,12 @@
 #!/usr/bin/env python
 """Does touch pay? Train visuo-tactile and visual-only policies the same way on several seeds and compare.
 
-    .venv/bin/python scripts/compare_touch.py --seeds 0 1 2
+    .venv/bin/python scripts/compare_touch.py --seeds 0 1 2 --settings demo tight occluded slip short_chunk
 
-Every run is one ``vtrefine-demo``; flags that this script does not know are passed on to it, for example
-``--env='{pair: square, clearance_m: 0.001, start: grasped}'``. On a machine with many cores ``--jobs`` runs
-several side by side, each on cores of its own. Interrupted and started again, it continues. The comparison
-is printed and saved as ``comparison.json`` and ``comparison.md``.
+Every run is one ``vtrefine-demo`` in one of the settings below; flags that this script does not know are
+passed on to it, after the setting's, for example ``--num_demos=40``. On a machine with many cores ``--jobs``
+runs several side by side, each on cores of its own. Interrupted and started again, it continues. The
+comparison is printed and saved as ``comparison.json`` and ``comparison.md``.
 """
 
 import argparse
@@ -18,27 +18,55 @@ import sys
 import time
 from functools import partial
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from scipy.stats import t as student_t
 
+from lerobot_vtrefine.cli.pipeline.demo_config import default_env, default_policy
 from lerobot_vtrefine.cli.report.statistics import proportion
 
 MODALITIES = ("visuo_tactile", "visual")
 POLICIES = {"pretrain": "imitation", "finetune": "after DPPO"}
 
 
+FROM_ABOVE = {
+    "width": 80,
+    "height": 60,
+    "fov_y_rad": 0.384,
+    "position_m": [-0.05, 0.0, 0.6],
+    "target_m": [0.0, 0.0, 0.145],
+}
+"""A camera from which the plug hides the hole."""
+
+SETTINGS: dict[str, dict[str, dict[str, Any]]] = {
+    "demo": {},
+    "tight": {"env": {"clearance_m": 0.001, "scene": {"timestep_s": 0.002}}},
+    "occluded": {"env": {"scene": {"camera": FROM_ABOVE}}},
+    "slip": {"env": {"rules": {"grasped": {"slip_m": 0.004, "slip_rad": 0.1}}}},
+    "short_chunk": {"policy": {"n_action_steps": 4}},
+}
+"""What differs from the demo: half the clearance, a hidden hole, twice the slip in the hand, or decisions
+twice as often."""
+
 POLL_S = 0.5
 
-Run = tuple[str, int]
-"""Modality and seed."""
+Run = tuple[str, str, int]
+"""Setting, modality and seed."""
+
+
+def setting_flags(setting: str) -> list[str]:
+    """The demo's flags that make a setting."""
+    defaults = {"env": default_env(), "policy": default_policy()}
+    return [f"--{name}={json.dumps(defaults[name] | change)}" for name, change in SETTINGS[setting].items()]
 
 
 def demo_command(folder: Path, run: Run, extra: list[str]) -> list[str]:
     """The command line of one pipeline."""
-    modality, seed = run
+    setting, modality, seed = run
     command = shutil.which("vtrefine-demo", path=str(Path(sys.executable).parent)) or "vtrefine-demo"
-    return [command, f"--modalities={modality}", f"--seed={seed}", f"--output_dir={folder}", *extra]
+    own = [f"--modalities={modality}", f"--seed={seed}", f"--output_dir={folder}"]
+    return [command, *own, *setting_flags(setting), *extra]
 
 
 def run_all(commands: dict[Path, list[str]], jobs: int) -> None:
@@ -113,17 +141,29 @@ def compare(results: dict[str, dict[int, dict]]) -> dict:
     return comparison
 
 
-def as_text(comparison: dict) -> str:
-    """The comparison as a Markdown table and one sentence."""
-    lines = ["| policy | visuo-tactile | visual only | difference (per seed) |", "|---|---|---|---|"]
-    for policy, title in POLICIES.items():
-        rows = comparison[policy]
-        cells = [rate_text(rows[modality]) for modality in MODALITIES]
-        gain = rows["touch_minus_visual"]
-        lines.append(f"| {title} | {' | '.join(cells)} | {interval_text(gain['mean'], gain['ci95'])} |")
-    low, high = comparison["finetune"]["touch_minus_visual"]["ci95"]
-    words = "pays" if low > 0 else "costs" if high < 0 else "makes no difference that these seeds can show"
-    return "\n".join([*lines, "", f"After DPPO, touch {words}."])
+def as_text(comparisons: dict[str, dict]) -> str:
+    """The comparisons as a Markdown table, and one sentence per setting."""
+    lines = [
+        "| setting | policy | visuo-tactile | visual only | difference (per seed) |",
+        "|---|---|---|---|---|",
+    ]
+    words = []
+    for setting, comparison in comparisons.items():
+        for policy, title in POLICIES.items():
+            rows = comparison[policy]
+            cells = [rate_text(rows[modality]) for modality in MODALITIES]
+            cells.append(
+                interval_text(rows["touch_minus_visual"]["mean"], rows["touch_minus_visual"]["ci95"])
+            )
+            lines.append(f"| {' | '.join([setting, title, *cells])} |")
+        words.append(f"{setting}: after DPPO, touch {verdict(comparison['finetune'])}.")
+    return "\n".join([*lines, "", *words])
+
+
+def verdict(rows: dict) -> str:
+    """What the interval of the difference allows to say."""
+    low, high = rows["touch_minus_visual"]["ci95"]
+    return "pays" if low > 0 else "costs" if high < 0 else "makes no difference that these seeds can show"
 
 
 def rate_text(row: dict) -> str:
@@ -143,27 +183,36 @@ def main() -> None:
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
     parser.add_argument("--seeds", type=int, nargs="+", default=[0, 1, 2])
+    parser.add_argument("--settings", nargs="+", choices=list(SETTINGS), default=["demo"])
     parser.add_argument("--output_dir", type=Path, default=Path("outputs/compare_touch"))
     parser.add_argument("--jobs", type=int, default=1, help="pipelines side by side (default 1)")
     options, extra = parser.parse_known_args()
     if options.jobs < 1:
         parser.error(f"--jobs must be at least 1, got {options.jobs}")
     folders = {
-        (modality, seed): options.output_dir / f"{modality}_{seed}"
+        (setting, modality, seed): options.output_dir / setting / f"{modality}_{seed}"
+        for setting in options.settings
         for seed in options.seeds
         for modality in MODALITIES
     }
     run_all({folder: demo_command(folder, run, extra) for run, folder in folders.items()}, options.jobs)
-    results: dict[str, dict[int, dict]] = {modality: {} for modality in MODALITIES}
-    for (modality, seed), folder in folders.items():
-        results[modality][seed] = json.loads((folder / "results.json").read_text(encoding="utf-8"))
-    comparison = compare(results)
-    text = as_text(comparison)
+    comparisons = {setting: compare(results_of(folders, setting)) for setting in options.settings}
+    text = as_text(comparisons)
     (options.output_dir / "comparison.json").write_text(
-        json.dumps(comparison, indent=2) + "\n", encoding="utf-8"
+        json.dumps(comparisons, indent=2) + "\n", encoding="utf-8"
     )
     (options.output_dir / "comparison.md").write_text(text + "\n", encoding="utf-8")
     print(f"\n{text}")
+
+
+def results_of(folders: dict[Run, Path], setting: str) -> dict[str, dict[int, dict]]:
+    """Results of the pipelines of one setting, by modality and seed."""
+    results: dict[str, dict[int, dict]] = {modality: {} for modality in MODALITIES}
+    for (name, modality, seed), folder in folders.items():
+        if name == setting:
+            content = (folder / "results.json").read_text(encoding="utf-8")
+            results[modality][seed] = json.loads(content)
+    return results
 
 
 if __name__ == "__main__":

@@ -9,6 +9,8 @@ from types import ModuleType
 
 import pytest
 
+from lerobot_vtrefine.cli.pipeline.demo_config import DemoConfig
+
 SCRIPT = Path(__file__).parents[2] / "scripts" / "compare_touch.py"
 
 
@@ -34,20 +36,20 @@ def test_pools_and_pairs(script: ModuleType) -> None:
     assert comparison["finetune"]["visuo_tactile"]["success"] == 243
     assert comparison["finetune"]["visuo_tactile"]["episodes"] == 300
     assert comparison["finetune"]["touch_minus_visual"] == {"mean": 0.3, "ci95": [0.3, 0.3]}
-    assert "touch pays" in script.as_text(comparison)
+    assert "touch pays" in script.as_text({"demo": comparison})
 
 
 def test_noise_is_called_noise(script: ModuleType) -> None:
     touch = {0: run_of(20, 90), 1: run_of(20, 40), 2: run_of(20, 60)}
     sight = {0: run_of(20, 50), 1: run_of(20, 60), 2: run_of(20, 55)}
-    text = script.as_text(script.compare({"visuo_tactile": touch, "visual": sight}))
+    text = script.as_text({"demo": script.compare({"visuo_tactile": touch, "visual": sight})})
     assert "makes no difference that these seeds can show" in text
 
 
 FAKE_DEMO = """#!{python}
 import json, os, sys
 from pathlib import Path
-flags = dict(flag.removeprefix("--").split("=") for flag in sys.argv[1:])
+flags = dict(flag.removeprefix("--").split("=", 1) for flag in sys.argv[1:])
 if flags["seed"] == flags.get("fail"):
     sys.exit(3)
 folder = Path(flags["output_dir"])
@@ -78,7 +80,7 @@ def test_passes_flags_on_and_saves(
     arguments = ["--seeds", "3", "4", f"--output_dir={out}", "--num_demos=9", f"--jobs={jobs}"]
     monkeypatch.setattr(sys, "argv", ["compare_touch.py", *arguments])
     script.main()
-    runs = [json.loads(path.read_text()) for path in sorted(out.glob("*/results.json"))]
+    runs = [json.loads(path.read_text()) for path in sorted(out.glob("demo/*/results.json"))]
     assert [(run["flags"]["modalities"], run["flags"]["seed"]) for run in runs] == [
         ("visual", "3"),
         ("visual", "4"),
@@ -88,7 +90,7 @@ def test_passes_flags_on_and_saves(
     assert all(run["flags"]["num_demos"] == "9" for run in runs)
     shares = script.core_shares(jobs)
     assert jobs == 1 or not shares[0] or all(run["cores"] in shares for run in runs)
-    assert json.loads((out / "comparison.json").read_text())["finetune"]["visual"]["rate"] == 0.8
+    assert json.loads((out / "comparison.json").read_text())["demo"]["finetune"]["visual"]["rate"] == 0.8
     assert "touch costs" in (out / "comparison.md").read_text()
 
 
@@ -102,3 +104,28 @@ def test_a_failed_run_ends_the_comparison(
     with pytest.raises(subprocess.CalledProcessError, match="status 3"):
         script.main()
     assert not (out / "comparison.json").exists()
+
+
+def test_every_setting_is_a_task_that_the_demo_accepts(script: ModuleType) -> None:
+    for setting in script.SETTINGS:
+        changes = {
+            name: json.loads(flag.split("=", 1)[1])
+            for name, flag in zip(script.SETTINGS[setting], script.setting_flags(setting), strict=True)
+        }
+        config = DemoConfig(**changes)  # parses the environment's and the policy's flags
+        assert config.env["pair"] == "round"
+        assert config.policy["preset"] == "small"
+    assert script.setting_flags("demo") == []
+
+
+def test_settings_are_compared_one_by_one(
+    script: ModuleType, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, fake_demo: None
+) -> None:
+    out = tmp_path / "out"
+    arguments = ["--seeds", "0", "--settings", "slip", "short_chunk", f"--output_dir={out}"]
+    monkeypatch.setattr(sys, "argv", ["compare_touch.py", *arguments])
+    script.main()
+    assert set(json.loads((out / "comparison.json").read_text())) == {"slip", "short_chunk"}
+    flags = json.loads((out / "slip" / "visual_0" / "results.json").read_text())["flags"]
+    assert json.loads(flags["env"])["rules"] == {"grasped": {"slip_m": 0.004, "slip_rad": 0.1}}
+    assert "| short_chunk | after DPPO |" in (out / "comparison.md").read_text()
