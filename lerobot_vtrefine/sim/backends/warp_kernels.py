@@ -6,6 +6,8 @@ parts, m worlds addressed by `ids`.
 
 import warp as wp
 
+from lerobot_vtrefine.tactile.kernels import Poses
+
 wp.set_module_options({"enable_backward": False})
 
 WORST = wp.constant(1.0e10)
@@ -31,19 +33,6 @@ class Touching:
     pad_turn: wp.array(dtype=wp.mat33)
     pad_sensor: wp.array(dtype=int)
     part_body: wp.array(dtype=int)
-
-
-@wp.struct
-class Frames:
-    """Poses and velocities of pads (m, P) and parts (m, B), and the load on each pad."""
-
-    pad_pos: wp.array(dtype=wp.vec3, ndim=2)
-    pad_rot: wp.array(dtype=wp.mat33, ndim=2)
-    pad_vel: wp.array(dtype=wp.spatial_vector, ndim=2)
-    part_pos: wp.array(dtype=wp.vec3, ndim=2)
-    part_rot: wp.array(dtype=wp.mat33, ndim=2)
-    part_vel: wp.array(dtype=wp.spatial_vector, ndim=2)
-    load: wp.array(dtype=wp.vec3, ndim=2)
 
 
 @wp.kernel
@@ -134,7 +123,7 @@ def pad_frames(
     subtree_com: wp.array(dtype=wp.vec3, ndim=2),
     body_rootid: wp.array(dtype=int),
     sensors: wp.array(dtype=float, ndim=2),
-    frames: Frames,
+    poses: Poses,
 ) -> None:
     """Pose and velocity of every pad's face, and the solver's load on it: force along the normal [N] and its
     centre's x and y [m] in the pad's frame, zeros where nothing touches.
@@ -146,9 +135,9 @@ def pad_frames(
     geom_rot = geom_xmat[world, geom]
     position = geom_xpos[world, geom] + geom_rot * touching.pad_offset[pad]
     rotation = geom_rot * touching.pad_turn[pad]
-    frames.pad_pos[row, pad] = position
-    frames.pad_rot[row, pad] = rotation
-    frames.pad_vel[row, pad] = velocity_at(cvel[world, body], position, subtree_com[world, body_rootid[body]])
+    poses.pad_pos[row, pad] = position
+    poses.pad_rot[row, pad] = rotation
+    poses.pad_vel[row, pad] = velocity_at(cvel[world, body], position, subtree_com[world, body_rootid[body]])
     first = touching.pad_sensor[pad]
     load = wp.vec3(0.0, 0.0, 0.0)
     if sensors[world, first] > 0.0:
@@ -157,7 +146,7 @@ def pad_frames(
         back = wp.transpose(rotation)
         local = back * (centre - position)
         load = wp.vec3(wp.max((back * force)[2], 0.0), local[0], local[1])
-    frames.load[row, pad] = load
+    poses.load[row, pad] = load
 
 
 @wp.kernel
@@ -169,15 +158,15 @@ def part_frames(
     cvel: wp.array(dtype=wp.spatial_vector, ndim=2),
     subtree_com: wp.array(dtype=wp.vec3, ndim=2),
     body_rootid: wp.array(dtype=int),
-    frames: Frames,
+    poses: Poses,
 ) -> None:
     """Pose and velocity of every part's frame."""
     row, part = wp.tid()
     world = ids[row]
     body = touching.part_body[part]
     position = xpos[world, body]
-    frames.part_pos[row, part] = position
-    frames.part_rot[row, part] = xmat[world, body]
-    frames.part_vel[row, part] = velocity_at(
+    poses.body_pos[row, part] = position
+    poses.body_rot[row, part] = xmat[world, body]
+    poses.body_vel[row, part] = velocity_at(
         cvel[world, body], position, subtree_com[world, body_rootid[body]]
     )

@@ -10,12 +10,13 @@ import warp as wp
 from lerobot_vtrefine.sim.backends import warp_kernels as kernels
 from lerobot_vtrefine.sim.backends.base import Array, Tensor
 from lerobot_vtrefine.sim.backends.warp_worlds import WarpWorlds
+from lerobot_vtrefine.tactile.kernels import Poses
 
 if TYPE_CHECKING:
     from lerobot_vtrefine.sim.scene import Scene
 
 PADS = {"pad_pos": wp.vec3, "pad_rot": wp.mat33, "pad_vel": wp.spatial_vector, "load": wp.vec3}
-PARTS = {"part_pos": wp.vec3, "part_rot": wp.mat33, "part_vel": wp.spatial_vector}
+PARTS = {"body_pos": wp.vec3, "body_rot": wp.mat33, "body_vel": wp.spatial_vector}
 
 
 class WarpTouch:
@@ -33,7 +34,7 @@ class WarpTouch:
         self._touching.part_body = self._numbers(np.array([scene.plug_body, scene.socket_body]))
         self._touching.pad_offset = wp.array(offset.astype(np.float32), dtype=wp.vec3, device=self._device)
         self._touching.pad_turn = wp.array(turn.astype(np.float32), dtype=wp.mat33, device=self._device)
-        self._frames: dict[int, kernels.Frames] = {}
+        self._frames: dict[int, Poses] = {}
 
     def __call__(self, ids: Array) -> tuple[tuple[Tensor, Tensor, Tensor, Tensor, Tensor, Tensor], Tensor]:
         """See `base.TouchReader`."""
@@ -45,16 +46,16 @@ class WarpTouch:
         pads = [index, self._touching, *where, frames]
         wp.launch(kernels.pad_frames, (len(ids), self._counts["load"]), pads, device=self._device)
         parts = [index, self._touching, data.xpos, data.xmat, *motion, frames]
-        wp.launch(kernels.part_frames, (len(ids), self._counts["part_pos"]), parts, device=self._device)
+        wp.launch(kernels.part_frames, (len(ids), self._counts["body_pos"]), parts, device=self._device)
         poses = (
             *(wp.to_torch(pose) for pose in (frames.pad_pos, frames.pad_rot, frames.pad_vel)),
-            *(wp.to_torch(pose) for pose in (frames.part_pos, frames.part_rot, frames.part_vel)),
+            *(wp.to_torch(pose) for pose in (frames.body_pos, frames.body_rot, frames.body_vel)),
         )
         return poses, wp.to_torch(frames.load)
 
-    def _frames_for(self, count: int) -> kernels.Frames:
+    def _frames_for(self, count: int) -> Poses:
         if count not in self._frames:
-            frames = kernels.Frames()
+            frames = Poses()
             for name, dtype in (PADS | PARTS).items():
                 shape = (count, self._counts[name])
                 setattr(frames, name, wp.zeros(shape, dtype=dtype, device=self._device))
