@@ -12,6 +12,7 @@ from lerobot.configs import parser
 from lerobot.utils.utils import init_logging
 
 from lerobot_vtrefine.cli.errors import run_cli
+from lerobot_vtrefine.datasets.features import JOINT_SUFFIX
 from lerobot_vtrefine.datasets.importers.aloha_npz import read_aloha_npz
 from lerobot_vtrefine.datasets.importers.joint_episodes import write_dataset, write_recording_set
 from lerobot_vtrefine.datasets.importers.leflexitac import import_leflexitac, is_leflexitac
@@ -69,7 +70,10 @@ def _import_npz(config: ImportConfig) -> str:
     joints = get_embodiment("aloha").joint_names
     if config.recording_dir is not None and config.recording_dir.exists():
         raise FileExistsError(f"{config.recording_dir} exists; choose another --recording_dir or remove it")
-    write_dataset(episodes, joints, config.root, config.repo_id, config.fps, config.task)
+    names = [
+        f"{joint}{JOINT_SUFFIX}" for joint in joints
+    ]  # as robots record them: lerobot-replay reads these
+    write_dataset(episodes, names, config.root, config.repo_id, config.fps, config.task)
     if config.recording_dir is not None:
         write_recording_set(episodes, joints, config.recording_dir, config.fps)
     frames = sum(len(episode.command) for episode in episodes)

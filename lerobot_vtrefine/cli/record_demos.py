@@ -87,9 +87,17 @@ def record(config: RecordDemosConfig) -> None:
     """
     env = config.env
     assert isinstance(env, VtRefineEnvConfig)
-    features = dataset_features(*env.camera_size, get_embodiment(env.scene_config.embodiment).joint_names)
+    robot = get_embodiment(env.scene_config.embodiment)
+    features = dataset_features(*env.camera_size, robot.joint_names)
     with DemoDataset(
-        config.root, config.repo_id, env.fps, features, env.task or "", config.settings(), config.seed
+        config.root,
+        config.repo_id,
+        env.fps,
+        features,
+        robot.robot_type,
+        env.task or "",
+        config.settings(),
+        config.seed,
     ) as demos:
         if demos.num_episodes >= config.num_episodes:
             logging.info("%s already holds %d episodes", config.root, demos.num_episodes)

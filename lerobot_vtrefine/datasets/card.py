@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from lerobot_vtrefine.datasets.features import ACTION_KEY, STATE_KEY, TAXEL_INFO
+from lerobot_vtrefine.datasets.features import ACTION_KEY, AGE_KEY, NOISE_LEVEL_KEY, STATE_KEY, TAXEL_INFO
 from lerobot_vtrefine.datasets.lerobot_version import is_supported
 
 if TYPE_CHECKING:
@@ -23,7 +23,6 @@ logger = logging.getLogger(__name__)
 TAGS = ("tactile", "flexitac")
 PAD_PREFIX = "observation.tactile."
 BASELINE_PREFIX = "observation.tactile_baseline."
-AGE_KEY = "observation.tactile_age"
 CAMERA_PREFIX = "observation.camera."
 PITCH_MM = 2.0
 """Distance of neighbouring taxels of a FlexiTac pad."""
@@ -54,13 +53,21 @@ def describe(meta: "LeRobotDatasetMetadata") -> str:
 
 
 def _summary(meta: "LeRobotDatasetMetadata") -> str:
-    robot = f", recorded on `{meta.robot_type}`" if meta.robot_type else ""
+    robot = f", of the robot `{meta.robot_type}`" if meta.robot_type else ""
     tasks = "; ".join(map(str, meta.tasks.index)) if meta.tasks is not None else ""
     return (
         f"{meta.total_episodes} episodes, {meta.total_frames} frames at {meta.fps} frames/s, with "
-        f"{len(pad_names(meta.features))} FlexiTac tactile pads{robot}. Tasks: {tasks}.\n\n"
+        f"{len(pad_names(meta.features))} FlexiTac tactile pads{robot}. Tasks: {tasks}.{_simulated(meta)}\n\n"
         "It loads with LeRobot alone; the plugin `lerobot_vtrefine` trains visuo-tactile policies on it."
     )
+
+
+def _simulated(meta: "LeRobotDatasetMetadata") -> str:
+    """What tells simulated frames: real depth has its own noise, so only theirs asks for more."""
+    noise = (meta.stats or {}).get(NOISE_LEVEL_KEY, {}).get("max")
+    if noise is None or not float(np.max(noise)) > 0:
+        return ""
+    return f" Frames whose `{NOISE_LEVEL_KEY}` is above 0 are simulated."
 
 
 def _pads(features: Features, stats: Stats) -> str:

@@ -15,9 +15,12 @@ key                  shape              dtype    meaning
 ``camera_intrinsics`` (..., 4)          float32  fx, fy, cx, cy in pixels
 ``camera_pose``      (..., 7)           float32  x y z in m, qw qx qy qz: optical frame (OpenCV) in the world
 ``noise_level``      (..., 1)           float32  depth noise to add when the cloud is built; 0 on hardware
+``tactile_age``      (..., P)           float32  age of the pads' frames in s; 0 in simulation
 ===================  =================  =======  ==========================================================
 
-``noise_level`` may be missing (hardware); it then counts as 0.
+``noise_level`` (hardware) and ``tactile_age`` (simulation) may be missing; they then count as 0.
+
+Datasets of both kinds have the same columns, joint names and robot type, because LeRobot merges only such.
 """
 
 from collections.abc import Mapping
@@ -31,6 +34,8 @@ PADS = ("left_arm_left_finger", "left_arm_right_finger", "right_arm_left_finger"
 PAD_ROWS, PAD_COLS = 12, 32
 NUM_TAXELS = PAD_ROWS * PAD_COLS
 NUM_JOINTS = 16
+JOINT_SUFFIX = ".pos"
+"""LeRobot's robots call the position of a joint so; recorded and simulated datasets do, too."""
 CAMERA = "front"
 
 OBS_PREFIX = "observation."
@@ -42,12 +47,13 @@ DEPTH_KEY = f"observation.images.{CAMERA}_depth"
 INTRINSICS_KEY = f"observation.camera.{CAMERA}.intrinsics"
 CAMERA_POSE_KEY = f"observation.camera.{CAMERA}.pose"
 NOISE_LEVEL_KEY = f"observation.camera.{CAMERA}.noise_level"
+AGE_KEY = "observation.tactile_age"
 CLOUD_KEY = "observation.visuo_tactile"
 """Built by the policy's preprocessor from the raw columns; never stored."""
 
 VISUAL_KEYS = (DEPTH_KEY, INTRINSICS_KEY, CAMERA_POSE_KEY)
-RAW_KEYS = (*TACTILE_KEYS, *BASELINE_KEYS, *VISUAL_KEYS, NOISE_LEVEL_KEY)
-"""What the cloud is built from besides the joint positions; the preprocessor drops it afterwards."""
+RAW_KEYS = (*TACTILE_KEYS, *BASELINE_KEYS, AGE_KEY, *VISUAL_KEYS, NOISE_LEVEL_KEY)
+"""What comes with the joint positions, to build the cloud from; the preprocessor drops it afterwards."""
 
 DEFAULT_NOISE_LEVEL = 3.0
 """The paper's depth noise level in simulation (appendix, vision alignment, step iv)."""
@@ -74,11 +80,15 @@ COLUMNS = (
     Column(STATE_KEY, "state", "float32", (NUM_JOINTS,)),
     *(Column(key, "tactile", "uint8", (NUM_TAXELS,), pad) for pad, key in enumerate(TACTILE_KEYS)),
     *(Column(key, "tactile_baseline", "uint8", (NUM_TAXELS,), pad) for pad, key in enumerate(BASELINE_KEYS)),
+    Column(AGE_KEY, "tactile_age", "float32", (len(PADS),)),
     Column(INTRINSICS_KEY, "camera_intrinsics", "float32", (4,)),
     Column(CAMERA_POSE_KEY, "camera_pose", "float32", (7,)),
     Column(NOISE_LEVEL_KEY, "noise_level", "float32", (1,)),
 )
 """Every array column; the depth image comes on top because LeRobot stores it as an image."""
+
+MAY_BE_MISSING = {"noise_level": 1, "tactile_age": len(PADS)}
+"""Sources that count as 0 where they are missing, and their widths."""
 
 TAXEL_INFO = {"array_shape": [PAD_ROWS, PAD_COLS], "unit": "adc_counts"}
 
@@ -99,7 +109,8 @@ def dataset_features(
         features[column.key] = {"dtype": column.dtype, "shape": column.shape}
         if column.source in ("tactile", "tactile_baseline"):
             features[column.key]["info"] = dict(TAXEL_INFO)
-    names = {"names": list(joint_names) if joint_names is not None else None}
+    suffixed = [f"{name}{JOINT_SUFFIX}" for name in joint_names] if joint_names is not None else None
+    names = {"names": suffixed}
     features[STATE_KEY] |= names
     features[DEPTH_KEY] = {
         "dtype": "image",
@@ -112,9 +123,10 @@ def dataset_features(
 
 
 def _columns_of(raw: Mapping[str, Array]) -> dict[str, Array]:
-    """All array columns of a raw observation; a missing noise level becomes 0."""
-    if "noise_level" not in raw:
-        raw = {**raw, "noise_level": np.zeros((*raw["state"].shape[:-1], 1), np.float32)}
+    """All array columns of a raw observation; what may be missing becomes 0."""
+    lead = raw["state"].shape[:-1] if "state" in raw else ()
+    absent = {key: width for key, width in MAY_BE_MISSING.items() if key not in raw}
+    raw = {**raw, **{key: np.zeros((*lead, width), np.float32) for key, width in absent.items()}}
     missing = {column.source for column in COLUMNS} - set(raw)
     if missing:
         raise ValueError(f"raw observation lacks {', '.join(sorted(missing))}")

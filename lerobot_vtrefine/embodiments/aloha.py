@@ -123,6 +123,7 @@ FINGERS = Fingers(
 
 ALOHA = Embodiment(
     name="aloha",
+    robot_type="aloha_tactile_follower",
     arms=(
         Arm("left", (-0.005, -0.525, 0.02), math.pi / 2),
         Arm("right", (0.005, 0.525, 0.02), -math.pi / 2),

@@ -92,6 +92,8 @@ class Embodiment:
     """A bimanual robot with two equal arms, two sliding fingers each, and a pad on every finger."""
 
     name: str
+    robot_type: str
+    """What LeRobot calls this robot: recorded and simulated datasets must say the same to be merged."""
     arms: tuple[Arm, Arm]
     joints: tuple[Joint, ...]
     """Revolute joints of one arm."""

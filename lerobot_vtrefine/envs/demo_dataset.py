@@ -35,6 +35,7 @@ class DemoDataset:
         repo_id: LeRobot's name for it.
         fps: Control rate [Hz].
         features: From ``datasets.features.dataset_features``.
+        robot_type: LeRobot's name of the robot that the data fits.
         task: Natural-language task of every frame.
         settings: What determines the episodes (JSON values); continuing with other settings is refused.
         first_seed: Seed of the first attempt.
@@ -50,12 +51,14 @@ class DemoDataset:
         repo_id: str,
         fps: int,
         features: dict[str, Any],
+        robot_type: str,
         task: str,
         settings: dict[str, Any],
         first_seed: int,
     ) -> None:
         self.root = Path(root)
         self._task = task
+        self._robot_type = robot_type
         self._repo_id, self._fps, self._features = repo_id, fps, features
         self._ledger: dict[str, Any] = {
             "settings": json.loads(json.dumps(settings)),
@@ -88,8 +91,10 @@ class DemoDataset:
         self._saving = True
         dataset = self._open()
         for step, action in enumerate(demonstration.actions):
-            raw = {key: value[step] for key, value in demonstration.raw.items()}
-            dataset.add_frame({**raw_to_frame(raw), ACTION_KEY: action, "task": self._task})
+            frame = raw_to_frame({key: value[step] for key, value in demonstration.raw.items()})
+            # A recording that was begun before a column existed is continued without it.
+            known = {key: value for key, value in frame.items() if key in dataset.features}
+            dataset.add_frame({**known, ACTION_KEY: action, "task": self._task})
         with fast_saving(), SuppressProgressBars():
             dataset.save_episode()
         row = {"episode_index": self.num_episodes, **demonstration.row}
@@ -175,6 +180,7 @@ class DemoDataset:
             self._fps,
             self._features,
             root=self.root,
+            robot_type=self._robot_type,
             use_videos=False,
             image_writer_threads=IMAGE_WRITER_THREADS,
         )

@@ -11,7 +11,7 @@ from lerobot.lerobot_types import RobotAction, RobotObservation
 from lerobot.robots.robot import Robot
 from lerobot.utils.decorators import check_if_already_connected, check_if_not_connected
 
-from lerobot_vtrefine.datasets.features import PAD_COLS, PAD_ROWS, PADS
+from lerobot_vtrefine.datasets.features import JOINT_SUFFIX, PAD_COLS, PAD_ROWS, PADS
 from lerobot_vtrefine.drivers.arm_pair import ArmPair
 from lerobot_vtrefine.drivers.dynamixel_arm import VIPERX_300S, Floats
 from lerobot_vtrefine.drivers.pad_set import PadSet
@@ -70,7 +70,7 @@ class AlohaTactileFollower(Robot):
     @cached_property
     def action_features(self) -> dict[str, Any]:
         """16 joint targets in the paper's order."""
-        return {f"{joint}.pos": float for joint in self.body.joint_names}
+        return {f"{joint}{JOINT_SUFFIX}": float for joint in self.body.joint_names}
 
     @property
     def _camera_features(self) -> dict[str, tuple[int, int, int]]:

@@ -9,6 +9,7 @@ from lerobot.lerobot_types import RobotAction
 from lerobot.teleoperators.teleoperator import Teleoperator
 from lerobot.utils.decorators import check_if_already_connected, check_if_not_connected
 
+from lerobot_vtrefine.datasets.features import JOINT_SUFFIX
 from lerobot_vtrefine.drivers.arm_pair import ArmPair
 from lerobot_vtrefine.drivers.dynamixel_arm import WIDOWX_250S
 from lerobot_vtrefine.embodiments import get_embodiment
@@ -34,7 +35,7 @@ class AlohaLeader(Teleoperator):
     @cached_property
     def action_features(self) -> dict[str, Any]:
         """16 joint targets in the paper's order."""
-        return {f"{joint}.pos": float for joint in self.body.joint_names}
+        return {f"{joint}{JOINT_SUFFIX}": float for joint in self.body.joint_names}
 
     @property
     def feedback_features(self) -> dict[str, Any]:

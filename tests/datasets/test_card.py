@@ -47,7 +47,8 @@ def test_push_and_pull_lose_nothing_and_the_card_describes_the_pads(
     assert "reshape(12, 32)" in text
     assert "0, 0, 0.75, 0, 1, 0, 0" in text  # the camera's pose
     assert "40, 40, 15.5, 11.5" in text  # its intrinsics
-    assert "`left_waist`" in text
+    assert "`left_waist.pos`" in text
+    assert "noise_level` is above 0 are simulated" in text
     assert "3 episodes, 36 frames at 10 frames/s" in text
 
 

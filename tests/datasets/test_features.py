@@ -11,6 +11,7 @@ from lerobot.datasets.lerobot_dataset import LeRobotDataset
 from lerobot.envs.utils import preprocess_observation
 
 from lerobot_vtrefine.datasets.features import (
+    AGE_KEY,
     DEPTH_KEY,
     NOISE_LEVEL_KEY,
     RAW_KEYS,
@@ -54,10 +55,13 @@ def test_environment_spaces_match_the_observation(make_raw: MakeRaw) -> None:
     assert set(env_key_map()) == {*shapes, "action"}
 
 
-def test_hardware_needs_no_noise_level(make_raw: MakeRaw) -> None:
+def test_hardware_needs_no_noise_level_and_simulation_no_age(make_raw: MakeRaw) -> None:
     raw = make_raw(np.random.default_rng(0), 3.0)
+    assert raw_to_frame(raw)[AGE_KEY].tolist() == [0.0] * 4
+    raw["tactile_age"] = np.array([0.1, 0.2, 0.3, 0.4])
     del raw["noise_level"]
     assert raw_to_frame(raw)[NOISE_LEVEL_KEY].tolist() == [0.0]
+    assert raw_to_frame(raw)[AGE_KEY].tolist() == raw["tactile_age"].astype(np.float32).tolist()
 
 
 def test_what_is_missing_is_named(make_raw: MakeRaw) -> None:

@@ -37,7 +37,7 @@ def test_values_arrive_unchanged_in_both_outputs(tmp_path: Path) -> None:
 
     dataset = LeRobotDataset("local/x", root=root)
     assert (dataset.num_episodes, dataset.num_frames, dataset.fps) == (2, 7, 20)
-    assert dataset.meta.features["action"]["names"] == list(JOINTS)
+    assert dataset.meta.features["action"]["names"] == [f"{joint}.pos" for joint in JOINTS]
     items = [dataset[i] for i in range(7)]
     np.testing.assert_array_equal(np.stack([item["action"] for item in items]), content["command"])
     np.testing.assert_array_equal(

@@ -56,3 +56,27 @@ def dataset_flags(root: Path, episodes: int, seconds: float, fps: int) -> list[s
         dataset__push_to_hub="false",
         play_sounds="false",
     )
+
+
+def train(patch: pytest.MonkeyPatch, root: Path, output: Path, steps: int) -> Path:
+    """Trains a tiny policy; returns its folder."""
+    run = flags(
+        dataset__repo_id="local/emulated",
+        dataset__root=root,
+        policy__type="vt_dp3",
+        policy__preset="small",
+        policy__point_dims="[8,16]",
+        policy__down_dims="[32,32]",
+        policy__n_action_steps=4,
+        policy__observation__num_visual_points=16,
+        policy__device="cpu",
+        policy__push_to_hub="false",
+        output_dir=output,
+        batch_size=4,
+        num_workers=0,
+        steps=steps,
+        save_freq=steps,
+        wandb__enable="false",
+    )
+    run_command(patch, "train", run)
+    return output / "checkpoints" / "last" / "pretrained_model"

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from commands import dataset_flags, flags, follower_flags, leader_flags, run_command
+from commands import dataset_flags, flags, follower_flags, leader_flags, run_command, train
 from lerobot.datasets.lerobot_dataset import LeRobotDataset
 from realsense import INTRINSICS, FakeDepthCamera, camera_flag, plug_in
 from rig import Rig, allow_slow_answers, aloha_rig
@@ -50,29 +50,6 @@ def record(rig: Rig, root: Path, patch: pytest.MonkeyPatch) -> LeRobotDataset:
     return LeRobotDataset("local/emulated", root=root)
 
 
-def train(root: Path, output: Path, patch: pytest.MonkeyPatch) -> Path:
-    run = flags(
-        dataset__repo_id="local/emulated",
-        dataset__root=root,
-        policy__type="vt_dp3",
-        policy__preset="small",
-        policy__point_dims="[8,16]",
-        policy__down_dims="[32,32]",
-        policy__n_action_steps=4,
-        policy__observation__num_visual_points=16,
-        policy__device="cpu",
-        policy__push_to_hub="false",
-        output_dir=output,
-        batch_size=4,
-        num_workers=0,
-        steps=20,
-        save_freq=20,
-        wandb__enable="false",
-    )
-    run_command(patch, "train", run)
-    return output / "checkpoints" / "last" / "pretrained_model"
-
-
 def test_record_train_and_roll_out_on_the_same_robot(
     rig: Rig, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -84,7 +61,7 @@ def test_record_train_and_roll_out_on_the_same_robot(
     assert frame[DEPTH_KEY].shape == (1, 24, 32)
     assert frame[DEPTH_KEY][0, 1:, 0].tolist() == list(range(1, 24))  # millimetres, exactly
     assert all(check_pattern(frame[key].numpy().astype(np.uint8)) is not None for key in TACTILE_KEYS)
-    checkpoint = train(tmp_path / "dataset", tmp_path / "run", monkeypatch)
+    checkpoint = train(monkeypatch, tmp_path / "dataset", tmp_path / "run", steps=20)
 
     sent: list[dict[str, float]] = []
     original = AlohaTactileFollower.send_action

@@ -10,7 +10,7 @@ import numpy as np
 from tqdm import tqdm
 
 from lerobot_vtrefine.datasets.episodes import EpisodeFolder, RecordedEpisode
-from lerobot_vtrefine.datasets.features import PADS, Array
+from lerobot_vtrefine.datasets.features import JOINT_SUFFIX, PADS, Array
 from lerobot_vtrefine.diagnose.episode_replay.touch import PadTouch, compare_pad
 from lerobot_vtrefine.diagnose.episode_replay.tracking import JointTracking, joint_tracking
 from lerobot_vtrefine.diagnose.episode_replay.twin import read_ledger, recorded_seeds, recorded_twin
@@ -142,7 +142,7 @@ def _require_same_robot(folder: EpisodeFolder, config: VtRefineEnvConfig) -> Non
             f"{folder.root} has {folder.num_joints} joints, the twin {robot.name} has {robot.num_joints}:"
             " episodes of another robot cannot be replayed in it"
         )
-    plain = [name.removesuffix(".pos") for name in folder.joints]
+    plain = [name.removesuffix(JOINT_SUFFIX) for name in folder.joints]
     if plain and plain != list(robot.joint_names):
         first = next(i for i, name in enumerate(plain) if name != robot.joint_names[i])
         raise ValueError(
