@@ -17,6 +17,8 @@ from lerobot_vtrefine.drivers.config import PadConfig
 from lerobot_vtrefine.drivers.diagnostic import DiagnosticReader
 from lerobot_vtrefine.drivers.pads_file import check_distinct_ports, load_pads
 from lerobot_vtrefine.drivers.picture import colours
+from lerobot_vtrefine.drivers.ports import PortError
+from lerobot_vtrefine.drivers.serial_reader import RETRY_S
 
 _HOME, _CLEAR, _RESET, _SHOW, _HIDE = "\x1b[H", "\x1b[2J", "\x1b[0m", "\x1b[?25h", "\x1b[?25l"
 
@@ -109,13 +111,21 @@ def view_taxel(port: str, channel: int, column: int, seconds: float) -> None:
     """Prints readings of one taxel of a board with the diagnostic firmware; 0 seconds: until Ctrl-C."""
     with DiagnosticReader(port) as board:
         started = time.monotonic()
+        trouble = ""
         while True:
-            sample = board.measure(channel, column)
-            print(
-                f"channel {sample.mux}, column {sample.col}: {sample.raw8} counts "
-                f"(10-bit {sample.raw10_mean}, {sample.raw10_min} to {sample.raw10_max})",
-                flush=True,
-            )
+            try:
+                sample = board.measure(channel, column)
+                trouble = ""
+                print(
+                    f"channel {sample.mux}, column {sample.col}: {sample.raw8} counts "
+                    f"(10-bit {sample.raw10_mean}, {sample.raw10_min} to {sample.raw10_max})",
+                    flush=True,
+                )
+            except PortError as error:  # unplugged, say: it is read again when it is back
+                if str(error) != trouble:
+                    trouble = str(error)
+                    print(trouble, file=sys.stderr, flush=True)
+                time.sleep(RETRY_S)
             if seconds and time.monotonic() - started >= seconds:
                 return
 

@@ -1,7 +1,5 @@
 """One FlexiTac board: a reader thread that keeps the latest frame, every recent frame, and its own health."""
 
-import logging
-import threading
 import time
 from collections import deque
 from dataclasses import dataclass
@@ -16,9 +14,8 @@ from lerobot_vtrefine.drivers.config import PadConfig
 from lerobot_vtrefine.drivers.frames import PadFrame
 from lerobot_vtrefine.drivers.framing import BinaryFramer, Framed
 from lerobot_vtrefine.drivers.identify import SAMPLE_BYTES, StreamKind, explain_stream
-from lerobot_vtrefine.drivers.ports import PortError, latency_advice, open_port
-
-logger = logging.getLogger(__name__)
+from lerobot_vtrefine.drivers.ports import PortError
+from lerobot_vtrefine.drivers.serial_reader import SerialReader
 
 HISTORY_FRAMES = 1000
 """Frames kept for every-frame access: 10 s at 100 frames/s."""
@@ -32,9 +29,6 @@ SILENCE_S = 0.0015
 COALESCE_S = 0.001
 """Pause after the first bytes of a burst that are no whole frame, so that a frame costs one or two wake-ups
 instead of one per USB packet."""
-
-RETRY_S = 0.25
-"""Pause between attempts to reopen a lost port."""
 
 RATE_WINDOW_S = 2.0
 """Time over which the frame rate is measured."""
@@ -75,76 +69,37 @@ class PadHealth:
     advice: str
 
 
-class PadReader:
+class PadReader(SerialReader):
     """Reads one board in its own thread from `start` to `stop`; all methods are thread-safe."""
 
     def __init__(self, config: PadConfig, name: str = "pad") -> None:
+        super().__init__(config.port, config.baud, name, READ_TIMEOUT_S)
         self.config = config
-        self.name = name
         self._framer = (BinaryFramer if config.protocol == "binary" else AsciiFramer)(config.board_shape)
         self._history: deque[PadFrame] = deque(maxlen=HISTORY_FRAMES)
         self._marks: deque[tuple[int, float]] = deque()  # (stream position, time) after each read
         self._sample: deque[bytes] = deque()
         self._sampled = 0
         self._seq = 0
-        self._reconnects = 0
         self._last_bytes_s = -np.inf
-        self._port_error: str | None = "not started"
-        self._changed = threading.Condition()
-        self._stop = threading.Event()
-        self._thread: threading.Thread | None = None
-
-    # --- life cycle -------------------------------------------------------------------------------
-
-    def start(self) -> None:
-        """Opens the port and starts reading.
-
-        Raises:
-            PortError: the port cannot be opened.
-        """
-        if self._thread is not None:
-            return
-        device = open_port(self.config.port, self.config.baud, READ_TIMEOUT_S)
-        if advice := latency_advice(self.config.port):
-            logger.warning("%s: %s", self.name, advice)
-        self._port_error = None
-        self._stop.clear()
-        self._framer.reset()
-        self._thread = threading.Thread(
-            target=self._run, args=(device,), name=f"pad-{self.name}", daemon=True
-        )
-        self._thread.start()
 
     def connect(self, timeout_s: float = 5.0) -> PadFrame:
-        """Starts, and waits for the first frame (a board restarts for about 2 s when its port is opened).
+        """Starts, and waits for a new frame (a board restarts for about 2 s when its port is opened).
 
         Raises:
             PortError: no frame came; the message says why and names the fix.
         """
-        self.start()
-        frame = self.wait_after(-1, timeout_s)
-        if frame is None:
-            advice = (
-                self.health().advice or f"{self.name}: {self.config.port}: no frame within {timeout_s:g} s"
-            )
+        seen = self._seq - 1
+        try:
+            self.start()
+            frame = self.wait_after(seen, timeout_s)
+            if frame is None:
+                missing = f"{self.name}: {self.port}: no frame within {timeout_s:g} s"
+                raise PortError(self.health().advice or missing)
+        except BaseException:
             self.stop()
-            raise PortError(advice)
+            raise
         return frame
-
-    def stop(self) -> None:
-        """Stops reading and closes the port; the frames read so far stay accessible."""
-        self._stop.set()
-        if self._thread is not None:
-            self._thread.join()
-            self._thread = None
-            self._port_error = "stopped"
-
-    def __enter__(self) -> "PadReader":
-        self.connect()
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        self.stop()
 
     # --- frames -----------------------------------------------------------------------------------
 
@@ -233,47 +188,13 @@ class PadReader:
 
     # --- the thread -------------------------------------------------------------------------------
 
-    def _run(self, device: serial.Serial | None) -> None:
-        while not self._stop.is_set():
-            if device is None:
-                device = self._reopen()
-                continue
-            try:
-                self._pump(device)
-            except (
-                serial.SerialException,
-                OSError,
-                TypeError,
-            ) as error:  # TypeError: pyserial, device gone mid-read
-                logger.warning("%s (%s): lost the port: %s", self.name, self.config.port, error)
-                self._lose_port("unplugged? it is read again as soon as it is back")
-            device.close()
-            device = None
-
-    def _lose_port(self, why: str) -> None:
-        with self._changed:
-            self._port_error = why
-            self._framer.reset()
-            self._marks.clear()
-            self._sample.clear()
-            self._sampled = 0
-
-    def _reopen(self) -> serial.Serial | None:
-        if self._stop.wait(RETRY_S):
-            return None
-        try:
-            device = open_port(self.config.port, self.config.baud, READ_TIMEOUT_S)
-        except PortError as error:
-            self._port_error = str(error)
-            return None
-        with self._changed:
-            self._port_error = None
-            self._reconnects += 1
-        logger.info("%s (%s): connected again", self.name, self.config.port)
-        return device
+    def _begin(self) -> None:
+        self._framer.reset()
+        self._marks.clear()
+        self._sample.clear()
+        self._sampled = 0
 
     def _pump(self, device: serial.Serial) -> None:
-        """Reads until told to stop; raises when the port goes away."""
         silent_since: float | None = None
         while not self._stop.is_set():
             after_silence = False
@@ -298,14 +219,15 @@ class PadReader:
 
     def _take(self, data: bytes, after_silence: bool, then_quiet: bool) -> None:
         now = time.monotonic()
-        self._last_bytes_s = now
-        self._keep_sample(data)
-        framed = self._framer.feed(data, after_silence=after_silence, then_quiet=then_quiet)
-        self._marks.append((self._framer.stats.bytes_in, now))
-        if framed:
-            self._publish(framed)
-        while len(self._marks) > HISTORY_FRAMES:
-            self._marks.popleft()
+        with self._changed:
+            self._last_bytes_s = now
+            self._keep_sample(data)
+            framed = self._framer.feed(data, after_silence=after_silence, then_quiet=then_quiet)
+            self._marks.append((self._framer.stats.bytes_in, now))
+            if framed:
+                self._publish(framed)
+            while len(self._marks) > HISTORY_FRAMES:
+                self._marks.popleft()
 
     def _keep_sample(self, data: bytes) -> None:
         self._sample.append(data)
@@ -315,12 +237,11 @@ class PadReader:
 
     def _publish(self, framed: list[Framed]) -> None:
         config = self.config
-        with self._changed:
-            for end, payload in framed:
-                while len(self._marks) > 1 and self._marks[0][0] < end:
-                    self._marks.popleft()
-                raw = np.frombuffer(payload, np.uint8).reshape(config.rows, config.cols)
-                frame = PadFrame(self._seq, self._marks[0][1], raw, config.orientation.apply(raw))
-                self._history.append(frame)
-                self._seq += 1
-            self._changed.notify_all()
+        for end, payload in framed:
+            while len(self._marks) > 1 and self._marks[0][0] < end:
+                self._marks.popleft()
+            raw = np.frombuffer(payload, np.uint8).reshape(config.rows, config.cols)
+            frame = PadFrame(self._seq, self._marks[0][1], raw, config.orientation.apply(raw))
+            self._history.append(frame)
+            self._seq += 1
+        self._changed.notify_all()

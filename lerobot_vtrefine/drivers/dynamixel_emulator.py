@@ -5,17 +5,11 @@ write are emulated, with secondary ids (shadow motors), EEPROM that is locked wh
 positions that move to their goal at a limited speed.
 """
 
-import logging
-import os
-import select
-import threading
 import time
 from dataclasses import dataclass, field
 from pathlib import Path
 
-from lerobot_vtrefine.drivers.terminal import Terminal, plug_in, pull_out
-
-logger = logging.getLogger(__name__)
+from lerobot_vtrefine.drivers.emulated_port import EmulatedPort
 
 HEADER = b"\xff\xff\xfd\x00"
 BROADCAST_ID = 0xFE
@@ -119,49 +113,21 @@ class EmulatedMotor:
             self.shaft += max(-reach, min(reach, way))
 
 
-class DynamixelEmulator:
+class DynamixelEmulator(EmulatedPort):
     """A bus of motors on a pseudo-terminal that `link` names."""
 
     def __init__(self, motors: list[EmulatedMotor], link: Path) -> None:
+        super().__init__(link)
         self.motors = {motor.motor_id: motor for motor in motors}
-        self.link = link
         self.bad_packets = 0
-        self._fds: Terminal | None = None
         self._buffer = bytearray()
-        self._stop = threading.Event()
-        self._thread: threading.Thread | None = None
-
-    @property
-    def port(self) -> str:
-        """What a driver opens."""
-        return str(self.link)
-
-    def __enter__(self) -> "DynamixelEmulator":
-        self._fds = plug_in(self.link)
-        self._stop.clear()
-        self._thread = threading.Thread(target=self._run, name=f"motors-{self.link.name}", daemon=True)
-        self._thread.start()
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        self._stop.set()
-        if self._thread is not None:
-            self._thread.join()
-        if self._fds is not None:
-            pull_out(self.link, self._fds)
-            self._fds = None
 
     def _run(self) -> None:
-        assert self._fds is not None
-        master = self._fds[0]
         while not self._stop.is_set():
-            if not select.select([master], [], [], 0.05)[0]:
-                continue
-            self._buffer += os.read(master, 4096)
+            self._buffer += self._receive(wait_s=0.05)
             while (found := self._next_packet()) is not None:
-                answer = self.answer(*found)
-                if answer:
-                    os.write(master, answer)
+                if answer := self.answer(*found):
+                    self._transmit(answer)
 
     def _next_packet(self) -> tuple[int, int, bytes] | None:
         """(id, instruction, parameters) of the next whole packet; drops broken ones."""

@@ -4,10 +4,6 @@ Readers open the emulator's port through pyserial like any other. A board that i
 buffer and loses bytes, as a UART does.
 """
 
-import contextlib
-import logging
-import os
-import threading
 import time
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -15,11 +11,9 @@ from pathlib import Path
 
 import numpy as np
 
+from lerobot_vtrefine.drivers.emulated_port import EmulatedPort
 from lerobot_vtrefine.drivers.frames import MARKER, FrameShape
 from lerobot_vtrefine.drivers.sources import Source
-from lerobot_vtrefine.drivers.terminal import Terminal, plug_in, pull_out
-
-logger = logging.getLogger(__name__)
 
 READ_WITHIN_S = 1.0
 """A board is being read if a frame was taken within this time; a busy reader pauses now and then [s]."""
@@ -78,7 +72,7 @@ def encode_ascii(counts: np.ndarray) -> bytes:
 ENCODERS: dict[str, Callable[[np.ndarray], bytes]] = {"binary": encode_binary, "ascii": encode_ascii}
 
 
-class PadEmulator:
+class PadEmulator(EmulatedPort):
     """One board: a thread that writes frames to a pseudo-terminal, which `link` names across replugging."""
 
     def __init__(
@@ -92,73 +86,26 @@ class PadEmulator:
         faults: Faults | None = None,
         seed: int = 0,
     ) -> None:
+        super().__init__(link)
         if rate_hz <= 0:
             raise ValueError(f"rate_hz={rate_hz} must be positive")
         if protocol not in ENCODERS:
             raise ValueError(f"protocol {protocol!r} does not exist; choose from {', '.join(ENCODERS)}")
         self.source = source
         self.shape = shape
-        self.link = link
         self.faults = faults or Faults()
         self.sent = 0
         self.overruns = 0
         self._encode = ENCODERS[protocol]
         self._period_s = 1.0 / rate_hz
         self._rng = np.random.default_rng(seed)
-        self._fds: Terminal | None = None
-        self._guard = threading.Lock()
         self._read_s = -np.inf
         self._stalled_until = 0.0
-        self._stop = threading.Event()
-        self._thread: threading.Thread | None = None
-
-    @property
-    def port(self) -> str:
-        """What a reader opens; stays the same across replugging."""
-        return str(self.link)
 
     @property
     def is_read(self) -> bool:
         """Whether somebody reads the board: what it sends is taken, not only piled up."""
         return time.monotonic() - self._read_s < READ_WITHIN_S
-
-    def start(self) -> "PadEmulator":
-        """Plugs the board in and starts sending."""
-        self.plug()
-        self._stop.clear()
-        self._thread = threading.Thread(target=self._run, name=f"emulator-{self.link.name}", daemon=True)
-        self._thread.start()
-        return self
-
-    def stop(self) -> None:
-        """Stops sending and removes the port."""
-        self._stop.set()
-        if self._thread is not None:
-            self._thread.join()
-            self._thread = None
-        self.unplug()
-
-    def __enter__(self) -> "PadEmulator":
-        return self.start()
-
-    def __exit__(self, *_: object) -> None:
-        self.stop()
-
-    def plug(self) -> None:
-        """Makes the port appear; does nothing where it is there."""
-        with self._guard:
-            if self._fds is not None:
-                return
-            self._fds = plug_in(self.link)
-            os.set_blocking(self._fds[0], False)
-
-    def unplug(self) -> None:
-        """Makes the port vanish, open or not; does nothing where it is not there."""
-        with self._guard:
-            if self._fds is None:
-                return
-            pull_out(self.link, self._fds)
-            self._fds = None
 
     def stall(self, seconds: float) -> None:
         """Sends nothing for a while from now on."""
@@ -183,13 +130,7 @@ class PadEmulator:
             self.stall(faults.stall_s)
 
     def _send(self, data: bytes) -> None:
-        with self._guard:
-            if self._fds is None:
-                return
-            written = 0
-            with contextlib.suppress(BlockingIOError):
-                written = os.write(self._fds[0], data)
-            if written == len(data):
-                self._read_s = time.monotonic()
-            else:
-                self.overruns += 1
+        if self._transmit(data):
+            self._read_s = time.monotonic()
+        elif self._terminal is not None:
+            self.overruns += 1

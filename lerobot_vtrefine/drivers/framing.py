@@ -110,10 +110,11 @@ class BinaryFramer:
         return len(self._buf)
 
     def reset(self) -> None:
-        """Forgets the stream (after a reconnection); statistics stay."""
+        """Forgets the stream (after a reconnection); statistics stay, and stream positions go on."""
         stats = self.stats
         self.__init__(self.shape)
         self.stats = stats
+        self._base = self._scan = self._next = self._delivered = stats.bytes_in
 
     def feed(self, data: bytes, *, after_silence: bool = False, then_quiet: bool = False) -> list[Framed]:
         """Takes the next bytes of the stream and returns the payloads that became certain, oldest first.

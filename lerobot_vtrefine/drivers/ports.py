@@ -6,6 +6,11 @@ from pathlib import Path
 
 import serial
 
+try:
+    from termios import error as _TerminalError  # noqa: N812
+except ImportError:  # Windows has no termios, and so no such errors
+    _TerminalError = OSError
+
 FTDI_LATENCY_MS = 1
 """What the latency timer of an FTDI adapter should be; its default of 16 ms delays the last bytes of every
 frame."""
@@ -15,6 +20,10 @@ STABLE_FOLDERS = ("by-path", "by-id")
 (CH340)."""
 
 FALLBACK_PATTERNS = ("ttyUSB*", "ttyACM*", "tty.usbserial*", "tty.usbmodem*")
+
+LOST: tuple[type[Exception], ...] = (serial.SerialException, OSError, _TerminalError, TypeError)
+"""What pyserial raises where a device goes away: TypeError in the middle of a read, and termios errors, which
+are no OSError, from flushing."""
 
 
 class PortError(ConnectionError):
@@ -31,8 +40,12 @@ def open_port(port: str, baud: int, timeout_s: float) -> serial.Serial:
         device = serial.Serial(port, baud, timeout=timeout_s, exclusive=True)
     except (serial.SerialException, OSError, ValueError) as error:
         raise PortError(explain_open_error(port, baud, error)) from error
-    ask_for_low_latency(device)
-    device.reset_input_buffer()
+    try:
+        ask_for_low_latency(device)
+        device.reset_input_buffer()
+    except LOST as error:
+        device.close()
+        raise PortError(explain_open_error(port, baud, error)) from error
     return device
 
 

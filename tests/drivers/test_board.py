@@ -2,6 +2,7 @@
 
 import errno
 import os
+import termios
 import threading
 import time
 from pathlib import Path
@@ -11,6 +12,7 @@ import pytest
 import serial
 from boards import PAD, emulated, numbers_of, reading, wait_until
 
+from lerobot_vtrefine.drivers import ports, serial_reader
 from lerobot_vtrefine.drivers.board import PadReader, Status
 from lerobot_vtrefine.drivers.config import PadConfig
 from lerobot_vtrefine.drivers.emulator import Faults
@@ -90,8 +92,76 @@ def test_unplugged_board_is_reported_and_read_again_when_back(tmp_path: Path) ->
             os.close(fd)
         assert after is not None
         assert reader.health().reconnects == 1
-        wait_until(lambda: reader.health().status is Status.STREAMING)
+        wait_until(lambda: reader.health().frames > after.seq + 50)
+        assert reader.health().status is Status.STREAMING
         assert None not in numbers_of(reader)
+        assert_stamped_when_sent(reader, after.seq)
+
+
+def assert_stamped_when_sent(reader: PadReader, after: int) -> None:
+    frames = reader.frames_after(after)
+    ages_s = [frame.arrival_s - check_pattern(frame.raw)[1] / 1e9 for frame in frames]
+    assert min(ages_s) > 0
+    assert np.median(ages_s) < 0.02
+
+
+def test_restarted_reader_waits_for_a_new_frame_and_stamps_it(tmp_path: Path) -> None:
+    with emulated(tmp_path) as board, reading(PadConfig(board.port)) as reader:
+        wait_until(lambda: reader.health().frames >= 30)
+        reader.stop()
+        before = reader.latest().seq
+        first = reader.connect(timeout_s=20.0)
+        assert first.seq > before
+        wait_until(lambda: reader.health().frames > first.seq + 50)
+        assert_stamped_when_sent(reader, first.seq)
+
+
+def test_port_that_vanishes_while_it_is_opened_is_tried_again(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The flush right after opening raises a termios error then, which is no OSError."""
+    flush, closed = serial.Serial.reset_input_buffer, []
+    close = serial.Serial.close
+
+    def vanish(device: serial.Serial) -> None:
+        raise termios.error(errno.EIO, "Input/output error")
+
+    def closing(device: serial.Serial) -> None:
+        closed.append(device.port)
+        close(device)
+
+    with emulated(tmp_path) as board, reading(PadConfig(board.port)) as reader:
+        board.unplug()
+        wait_until(lambda: reader.health().status is Status.DISCONNECTED)
+        monkeypatch.setattr(serial.Serial, "reset_input_buffer", vanish)
+        monkeypatch.setattr(serial.Serial, "close", closing)
+        board.plug()
+        wait_until(lambda: "cannot be opened" in reader.health().advice)
+        assert closed
+        monkeypatch.setattr(serial.Serial, "reset_input_buffer", flush)
+        wait_until(lambda: reader.health().status is Status.STREAMING)
+
+
+def test_reader_stopped_while_it_reopens_leaves_no_port_open(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    entered, go_on = threading.Event(), threading.Event()
+    opened: list[serial.Serial] = []
+
+    def slow(*arguments: object) -> serial.Serial:
+        entered.set()
+        assert go_on.wait(20.0)
+        opened.append(ports.open_port(*arguments))
+        return opened[-1]
+
+    with emulated(tmp_path) as board, reading(PadConfig(board.port)) as reader:
+        monkeypatch.setattr(serial_reader, "open_port", slow)
+        board.unplug()
+        board.plug()
+        assert entered.wait(20.0)
+        threading.Timer(0.2, go_on.set).start()
+        reader.stop()
+    assert [device.is_open for device in opened] == [False]
 
 
 @pytest.mark.parametrize("shape", [FrameShape(16, 32), FrameShape(32, 32), FrameShape(16, 16)], ids=str)

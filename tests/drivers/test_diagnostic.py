@@ -1,11 +1,14 @@
 """The diagnostic text firmware: its reader on an emulated board, through a real serial port."""
 
+import os
+import threading
+import time
 from collections.abc import Generator
 from pathlib import Path
 
 import numpy as np
 import pytest
-from boards import emulated
+from boards import emulated, wait_until
 
 from lerobot_vtrefine.cli.view_pads import main as view_pads
 from lerobot_vtrefine.drivers.diagnostic import DiagnosticReader
@@ -45,11 +48,44 @@ def test_a_streaming_board_is_recognised(tmp_path: Path) -> None:
         DiagnosticReader(streaming.port).connect(timeout_s=0.5)
 
 
-def test_a_lost_board_is_told(board: DiagnosticEmulator) -> None:
+def test_unplugged_board_is_told_and_read_again_when_back(board: DiagnosticEmulator) -> None:
     with DiagnosticReader(board.port) as reader:
-        board.__exit__()
-        with pytest.raises(PortError, match="unplugged"):
-            reader.measure(4, 0)
+        reader.measure(9, 17)
+        board.unplug()
+        with pytest.raises(PortError, match=f"{board.port}.*unplugged"):
+            reader.measure(9, 17)
+        with pytest.raises(PortError, match=board.port):
+            reader.send("m", 4)
+        blocker = os.openpty()  # takes the freed terminal: the board comes back under another one
+        board.plug()
+        wait_until(lambda: reader.latest().mux == 0)  # it restarted
+        assert reader.measure(9, 17).raw8 == COUNTS[5, 17]
+        for fd in blocker:
+            os.close(fd)
+    with pytest.raises(PortError, match="stopped"):
+        reader.send("h")
+
+
+def test_viewer_goes_on_when_the_board_is_back(
+    board: DiagnosticEmulator, capfd: pytest.CaptureFixture[str]
+) -> None:
+    told: list[str] = []
+
+    def replug() -> None:
+        board.unplug()
+        deadline = time.monotonic() + 10.0
+        while "unplugged" not in "".join(told) and time.monotonic() < deadline:
+            time.sleep(0.02)
+            told.append(capfd.readouterr().err)
+        board.plug()
+
+    changer = threading.Timer(0.3, replug)
+    changer.start()
+    arguments = ["--diagnostic", board.port, "--channel", "5", "--column", "3", "--seconds", "2.5"]
+    assert view_pads(arguments) == 0
+    changer.join()
+    assert "unplugged" in "".join(told)
+    assert "channel 5, column 3: 35 counts" in capfd.readouterr().out
 
 
 def test_discovery_points_to_the_viewer(board: DiagnosticEmulator) -> None:
