@@ -1,10 +1,10 @@
 """LeRobot plugin for visuo-tactile policy learning with simulation fine-tuning (VT-Refine).
 
 Importing this package registers its policy, environment, processor steps, robots, teleoperators and cameras
-with LeRobot. It stays light: no simulator, Warp, serial port or plotting library is imported here.
+with LeRobot. It stays light: neither LeRobot nor PyTorch is imported before something needs them, and no
+simulator, Warp, serial port or plotting library at all.
 """
 
-from lerobot_vtrefine import cameras, envs, robots, teleoperators
-from lerobot_vtrefine.policies import vt_dp3
+from lerobot_vtrefine.registration import register_or_wait
 
-__all__ = ["cameras", "envs", "robots", "teleoperators", "vt_dp3"]
+register_or_wait()

@@ -1,0 +1,144 @@
+"""Importing the package loads neither LeRobot nor PyTorch, and registers all types once LeRobot is there."""
+
+import importlib.util
+import json
+import os
+import subprocess
+import sys
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from lerobot_vtrefine import registration
+
+# Each case runs in a child of one process that has loaded what makes LeRobot slow to import, but not LeRobot.
+FIRST_IMPORTS = """
+import json, os, sys
+import deepdiff, pandas, torch._dynamo, torchvision
+
+def found(first):
+    import importlib, importlib.util
+    if first == "by path":
+        from lerobot.configs.parser import load_plugin
+        load_plugin("lerobot_vtrefine")
+    else:
+        import lerobot_vtrefine
+        assert importlib.util.find_spec("lerobot") is not None and "lerobot" not in sys.modules
+        importlib.import_module(first)
+    import lerobot
+    assert not any(type(finder).__name__ == "RegisterWithLeRobot" for finder in sys.meta_path)
+    from lerobot.cameras import CameraConfig
+    from lerobot.configs.policies import PreTrainedConfig
+    from lerobot.envs.configs import EnvConfig
+    from lerobot.processor import ProcessorStepRegistry
+    from lerobot.robots import RobotConfig
+    from lerobot.teleoperators import TeleoperatorConfig
+    kinds = (CameraConfig, PreTrainedConfig, EnvConfig, RobotConfig, TeleoperatorConfig)
+    ours = lambda choices: [key for key, value in choices.items() if "vtrefine" in value.__module__]
+    types = {kind.__name__: ours(kind.get_known_choices()) for kind in kinds}
+    return types | {"steps": [name for name in ProcessorStepRegistry.list() if name.startswith("vt_")],
+                    "version": lerobot.__version__}
+
+answers = []
+for first in json.loads(sys.argv[1]):
+    read, write = os.pipe()
+    if not os.fork():
+        os.write(write, json.dumps(found(first)).encode())
+        os._exit(0)
+    os.close(write)
+    with os.fdopen(read) as pipe:
+        answers.append(json.loads(pipe.read() or "null"))
+    os.wait()
+print(json.dumps(answers))
+"""
+
+CASES = (
+    "by path",  # --policy.discover_packages_path=lerobot_vtrefine, LeRobot first
+    "lerobot.processor",
+    "lerobot.scripts.lerobot_train",
+    "lerobot.scripts.lerobot_eval",
+    "lerobot_vtrefine.cameras.config_flexitac_camera",
+    "lerobot_vtrefine.envs.config",
+    "lerobot_vtrefine.robots.config_aloha_tactile_follower",
+    "lerobot_vtrefine.policies.vt_dp3.processor_vt_dp3",
+    "lerobot_vtrefine.policies.vt_dp3.modeling_vt_dp3",
+    "lerobot_vtrefine.envs.demo_dataset",
+)
+
+EXPECTED = {
+    "CameraConfig": {"flexitac"},
+    "PreTrainedConfig": {"vt_dp3"},
+    "EnvConfig": {"vtrefine"},
+    "RobotConfig": {"tactile", "aloha_tactile_follower"},
+    "TeleoperatorConfig": {"aloha_leader"},
+    "steps": {"vt_visuo_tactile"},
+}
+
+LIGHT = """
+import json, sys
+import lerobot_vtrefine
+print(json.dumps([name for name in ("lerobot", "torch", "numpy", "draccus") if name in sys.modules]))
+"""
+
+
+def answer(code: str, *arguments: Any) -> Any:
+    """What a fresh interpreter prints as JSON in its last line."""
+    command = [sys.executable, "-c", code, *map(json.dumps, arguments)]
+    environment = os.environ | {"HF_HUB_OFFLINE": "1", "OMP_NUM_THREADS": "1"}
+    result = subprocess.run(command, capture_output=True, text=True, env=environment, check=False)
+    assert result.returncode == 0, result.stderr[-2000:]
+    return json.loads(result.stdout.strip().splitlines()[-1])
+
+
+@pytest.fixture(scope="module")
+def answers() -> dict[str, Any]:
+    return dict(zip(CASES, answer(FIRST_IMPORTS, CASES), strict=True))
+
+
+def test_import_alone_loads_nothing() -> None:
+    assert answer(LIGHT) == []
+
+
+@pytest.mark.parametrize("case", CASES)
+def test_every_type_is_registered_whatever_is_imported_first(answers: dict[str, Any], case: str) -> None:
+    found = answers[case]
+    assert found is not None, "the import failed"
+    assert found.pop("version")
+    assert {key: set(values) for key, values in found.items()} == EXPECTED
+
+
+def test_a_failing_registration_is_seen_and_tried_again(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    """The import of LeRobot then fails as the package's own import would, now and at the next attempt."""
+    (tmp_path / "lerobot").mkdir()
+    (tmp_path / "lerobot" / "__init__.py").write_text("loaded = True")
+    finder = registration.RegisterWithLeRobot()
+    monkeypatch.setattr(sys, "meta_path", [finder, *sys.meta_path])
+
+    def load() -> None:
+        spec = finder.find_spec("lerobot", [str(tmp_path)])
+        assert spec is not None
+        assert spec.loader is not None
+        module = importlib.util.module_from_spec(spec)
+        spec.loader.exec_module(module)
+        assert module.loaded
+
+    def fail() -> None:
+        raise ImportError("half installed")
+
+    monkeypatch.setattr(registration, "register", fail)
+    for _ in range(2):
+        with pytest.raises(ImportError, match="half installed"):
+            load()
+        assert finder in sys.meta_path
+    monkeypatch.setattr(registration, "register", lambda: None)
+    load()
+    assert finder not in sys.meta_path
+
+
+def test_other_modules_are_none_of_its_business() -> None:
+    finder = registration.RegisterWithLeRobot()
+    assert finder.find_spec("lerobot.configs", None) is None
+    assert finder.find_spec("json", None) is None
