@@ -2,6 +2,7 @@
 
 import os
 import threading
+import time
 from collections.abc import Generator
 from pathlib import Path
 
@@ -69,20 +70,49 @@ def test_record_resume_delete_merge_keep_pads_exact(
 
 @pytest.mark.slow
 def test_thirty_frames_a_second_miss_no_frame(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Boards at 100 frames/s and arms in a process of their own, as hardware is; needs an idle machine."""
+    """Boards at 100 frames/s and arms in a process of their own, as hardware is; needs an idle machine.
+
+    LeRobot's loop sleeps for what is left of each period, and the system wakes it about 0.1 ms late: in 20 s
+    two or three periods fewer than 600 begin. None of those that begin is missed: each becomes one frame of
+    the dataset, with counts that each pad sent since the frame before.
+    """
     allow_slow_answers(monkeypatch)
-    root = tmp_path / "dataset"
+    root, seconds, period_s = tmp_path / "dataset", 20.0, 1 / 30
+    began = note_observations(monkeypatch)
     with emulated_elsewhere(tmp_path) as command:
-        run_command(monkeypatch, "record", [*command, *dataset_flags(root, 1, 20.0, 30)])
+        run_command(monkeypatch, "record", [*command, *dataset_flags(root, 1, seconds, 30)])
     dataset = opened(root)
     ages = column(dataset, AGE_KEY)
-    numbers = [frame_numbers(dataset, key) for key in TACTILE_KEYS]
-    fresh = [len(set(one)) for one in numbers]
-    print(f"{len(dataset)} frames, fresh {fresh}, age p50 {1e3 * np.median(ages):.1f} ms", end=" ")
-    print(f"p99 {1e3 * np.percentile(ages, 99):.1f} ms, load {os.getloadavg()[0]:.1f}")
-    assert len(dataset) >= 596
-    assert min(fresh) >= 590
-    assert np.percentile(ages, 99) < 0.05
+    fresh = [len(set(frame_numbers(dataset, key))) for key in TACTILE_KEYS]
+    gaps_s, lasted_s = np.diff(began), began[-1] - began[0]
+    late_s = gaps_s - period_s
+    print(f"{len(dataset)} frames of {len(began)} periods, fresh {fresh}, age p50", end=" ")
+    print(
+        f"{1e3 * np.median(ages):.1f} ms p99 {1e3 * np.percentile(ages, 99):.1f} ms, periods late by", end=" "
+    )
+    print(f"median {1e3 * np.median(late_s):.3f} mean {1e3 * late_s.mean():.3f}", end=" ")
+    print(f"max {1e3 * late_s.max():.1f} ms, load {os.getloadavg()[0]:.1f}")
+    assert len(dataset) == len(began)
+    assert fresh == [len(dataset)] * len(PADS)
+    assert gaps_s.max() < 1.5 * period_s
+    assert lasted_s < seconds <= lasted_s + 1.5 * period_s
+    assert len(dataset) >= seconds / (period_s + 3e-4)
+    assert np.percentile(ages, 99) < 0.025
+
+
+def note_observations(patch: pytest.MonkeyPatch) -> list[float]:
+    """When the robot was asked for each observation [s]."""
+    from lerobot_vtrefine.robots.aloha_tactile_follower import AlohaTactileFollower
+
+    began: list[float] = []
+    original = AlohaTactileFollower.get_observation
+
+    def noting(robot: AlohaTactileFollower) -> dict[str, object]:
+        began.append(time.perf_counter())
+        return original(robot)
+
+    patch.setattr(AlohaTactileFollower, "get_observation", noting)
+    return began
 
 
 def test_pad_unplugged_while_recording_is_marked_and_the_episode_stays_readable(
