@@ -13,6 +13,8 @@ import torch
 import warp as wp
 
 from lerobot_vtrefine.sim.backends import warp_kernels as kernels
+from lerobot_vtrefine.sim.backends.warp_memory import Arena, Recording, Tally
+from lerobot_vtrefine.sim.backends.warp_step import WarpStep
 from lerobot_vtrefine.sim.config import WarpConfig
 from lerobot_vtrefine.tactile.contact_query import start_warp
 
@@ -65,6 +67,7 @@ class WarpWorlds:
             self.data = mjw.make_data(
                 model, num_envs, nconmax=config.contacts_per_world, njmax=config.rows_per_world
             )
+            self.step = WarpStep(model, self.model, self.data, wp.get_device().is_cuda)
         data = self.data
         self.qpos, self.qvel = wp.to_torch(data.qpos), wp.to_torch(data.qvel)
         self.warmstart, self.time = wp.to_torch(data.qacc_warmstart), wp.to_torch(data.time)
@@ -72,8 +75,8 @@ class WarpWorlds:
         self._diverged = wp.zeros(num_envs, dtype=int, device=self.device)
         self.diverged = wp.to_torch(self._diverged)
         self._widths = (model.nq, model.nsensordata, model.nu)
-        self._graph: wp.Graph | None = None
-        self._pose_graph: wp.Graph | None = None
+        self._graph: Recording | None = None
+        self._pose_graph: Recording | None = None
         self._everyone = torch.arange(num_envs, dtype=torch.int32, device=self.device)
         self._capture = config.graph and _can_capture(self.device)
         self._posed = False
@@ -114,18 +117,22 @@ class WarpWorlds:
     def _substep(self) -> None:
         self._graph = self._launch(self._launch_substep, self._graph)
 
-    def _launch(self, launches: Callable[[], None], graph: wp.Graph | None) -> wp.Graph | None:
+    def _launch(self, launches: Callable[[], None], recorded: Recording | None) -> Recording | None:
         """Launch kernels, by their graph where there is one; returns the graph for the next time."""
-        if graph is not None:
-            wp.capture_launch(graph)
-            return graph
-        launches()
+        if recorded is not None:
+            wp.capture_launch(recorded.graph)
+            return recorded
         if not self._capture:
-            return None
-        # Every kernel is loaded by now, which could not happen during the capture.
-        with wp.ScopedCapture(force_module_load=False) as capture:
             launches()
-        return capture.graph
+            return None
+        tally = Tally(wp.get_device())
+        with wp.ScopedAllocator(self.device, tally):
+            launches()
+        arena = Arena(tally.total, wp.get_device())
+        # Every kernel is loaded by now, which could not happen during the capture.
+        with wp.ScopedAllocator(self.device, arena), wp.ScopedCapture(force_module_load=False) as capture:
+            launches()
+        return Recording(capture.graph, arena)
 
     def _launch_substep(self) -> None:
         data, trace = self.data, self._trace
@@ -133,7 +140,7 @@ class WarpWorlds:
         self._guard()
         commands = [trace.cursor, self.controls]
         wp.launch(kernels.give_controls, (self.num_envs, servos), commands, [data.ctrl])
-        mjw.step(self.model, data)
+        self.step()
         kept = [data.qpos, data.sensordata, trace]
         wp.launch(kernels.record, (self.num_envs, positions + readings), kept)
 

@@ -1,0 +1,186 @@
+"""One physics step on mujoco_warp, in an order that suits a GPU. Imports warp and mujoco_warp.
+
+The same functions in the same roles as `mujoco_warp.step`, so the same physics, but
+- what does not depend on contacts (inertia, bias forces, servos) runs beside the search for contacts, on a
+  stream of its own: a step of a thousand worlds is some ninety small kernels, which wait for each other
+  longer than they work;
+- pairs of geoms that a face of a box separates are dropped before the general convex collision;
+- contact sensors are summed contact by contact, and nothing is computed that this package does not read
+  (cameras, lights, energies, other sensors).
+"""
+
+import dataclasses
+from collections.abc import Generator
+from contextlib import contextmanager
+
+import mujoco
+import mujoco_warp as mjw
+import numpy as np
+import warp as wp
+from mujoco_warp._src import collision_driver, forward, smooth
+
+from lerobot_vtrefine.sim.backends import warp_contact_kernels as kernels
+
+NET_FORCE = 3
+DATA = 1 | 2 | 4 | 16
+"""found, force, torque, position of mjtConDataField."""
+
+
+class WarpStep:
+    """Steps all worlds of `data` by one substep.
+
+    Args:
+        host: the model as MuJoCo has it.
+        model, data: the same on the device.
+        concurrent: whether to use two streams; only a GPU has them.
+
+    Raises:
+        ValueError: sensors other than net forces of contacts between geoms and bodies.
+    """
+
+    def __init__(self, host: mujoco.MjModel, model: mjw.Model, data: mjw.Data, concurrent: bool) -> None:
+        self._model, self._data = model, data
+        self.beside, self.prune, self.sums = concurrent, True, True
+        self._side = wp.Stream(wp.get_device()) if concurrent else None
+        own, other = _sides(host)
+        self._own, self._other = wp.array(own, dtype=int), wp.array(other, dtype=int)
+        self._addresses = wp.array(host.sensor_adr.astype(np.int32), dtype=int)
+        shape = (data.nworld, host.nsensor)
+        self._sums = kernels.Sums()
+        for name, dtype in SUMS.items():
+            setattr(self._sums, name, wp.zeros(shape, dtype=dtype))
+        self._derivative = wp.zeros((data.nworld, model.nC), dtype=float)
+        self._left = _pairs(collision_driver.create_collision_context(data.naconmax), wp.zeros(1, dtype=int))
+
+    def __call__(self) -> None:
+        """Launch the step's kernels on the present device."""
+        model, data = self._model, self._data
+        mjw.kinematics(model, data)
+        mjw.com_pos(model, data)
+        mjw.tendon(model, data)
+        with self._on_the_side():
+            self._smooth()
+        self._collide()
+        mjw.make_constraint(model, data)
+        self._join()
+        mjw.solve(model, data)
+        self._read_contacts()
+        self._integrate()
+
+    @contextmanager
+    def _on_the_side(self) -> Generator[None]:
+        if self._side is None or not self.beside:
+            yield
+            return
+        with wp.ScopedStream(self._side, sync_enter=True):
+            yield
+
+    def _join(self) -> None:
+        if self._side is not None and self.beside:
+            wp.wait_stream(self._side)
+
+    def _smooth(self) -> None:
+        """Everything that contacts do not enter."""
+        model, data = self._model, self._data
+        mjw.crb(model, data)
+        smooth.tendon_armature(model, data)
+        mjw.transmission(model, data)
+        mjw.fwd_velocity(model, data)
+        mjw.fwd_actuation(model, data)
+        mjw.fwd_acceleration(model, data, factorize=True)
+        mjw.deriv_smooth_vel(model, data, self._derivative)
+        free = [model.body_dofadr, model.M_rownnz, model.M_rowadr, model.body_freeadr, data.M]
+        count = (data.nworld, model.body_freeadr.size)
+        wp.launch(forward._implicit_free_body_reset_m, count, free, [self._derivative])
+
+    def _collide(self) -> None:
+        """Contacts, as `mujoco_warp.collision` finds them."""
+        model, data = self._model, self._data
+        if not self.prune:
+            mjw.collision(model, data)
+            return
+        context = collision_driver.create_collision_context(data.naconmax)
+        data.ncollision.zero_()
+        data.nacon.zero_()
+        mjw.nxn_broadphase(model, data, context)
+        left = self._left
+        left.count.zero_()
+        given = [_shapes(model), data.geom_xpos, data.geom_xmat, _pairs(context, data.ncollision), left]
+        wp.launch(kernels.drop_separated, data.naconmax, given)
+        kept = dataclasses.replace(context, collision_pair=left.geoms, collision_pairid=left.ids)
+        kept = dataclasses.replace(kept, collision_worldid=left.world)
+        collision_driver._narrowphase(model, dataclasses.replace(data, ncollision=left.count), kept)
+
+    def _read_contacts(self) -> None:
+        """Contact sensors, as `mujoco_warp.sensor_acc` reads them."""
+        data, contacts = self._data, kernels.Contacts()
+        if not self.sums:
+            data.sensordata.zero_()
+            mjw.sensor_acc(self._model, data, skip_rne_postconstraint=True)
+            return
+        for name, field in CONTACTS.items():
+            setattr(contacts, name, getattr(data.contact, field))
+        contacts.force, contacts.count = data.efc.force, data.nacon
+        wp.launch(kernels.add_forces, data.naconmax, [contacts, self._own, self._other, self._sums])
+        dim = (data.nworld, self._addresses.size)
+        wp.launch(kernels.finish_forces, dim, [self._sums, self._addresses, data.sensordata])
+
+    def _integrate(self) -> None:
+        """`mujoco_warp.implicit` with the derivative that `_smooth` has prepared."""
+        model, data = self._model, self._data
+        factor, diagonal = wp.empty_like(data.qLD), wp.empty((data.nworld, model.nv), dtype=float)
+        qacc = wp.empty((data.nworld, model.nv), dtype=float)
+        smooth.factor_solve_i(model, data, self._derivative, factor, diagonal, qacc, data.efc.Ma)
+        forward.implicit_free_body(model, data, data.efc.Ma, qacc, solve=True)
+        forward._advance(model, data, qacc)
+
+
+SUMS = {"found": float, "weight": float, "force": wp.vec3, "torque": wp.vec3, "pos": wp.vec3}
+CONTACTS = {
+    "kind": "type",
+    "world": "worldid",
+    "geoms": "geom",
+    "frame": "frame",
+    "pos": "pos",
+    "dim": "dim",
+    "row": "efc_address",
+}
+"""Fields of `kernels.Contacts` by their names in mujoco_warp."""
+
+
+def _pairs(context: collision_driver.CollisionContext, count: wp.array) -> kernels.Pairs:
+    pairs = kernels.Pairs()
+    pairs.geoms, pairs.ids = context.collision_pair, context.collision_pairid
+    pairs.world, pairs.count = context.collision_worldid, count
+    return pairs
+
+
+def _shapes(model: mjw.Model) -> kernels.Shapes:
+    shapes = kernels.Shapes()
+    shapes.kind, shapes.size, shapes.margin = model.geom_type, model.geom_size, model.geom_margin
+    shapes.mesh, shapes.vertices = model.geom_dataid, model.mesh_vert
+    shapes.mesh_first, shapes.mesh_count = model.mesh_vertadr, model.mesh_vertnum
+    return shapes
+
+
+def _sides(model: mujoco.MjModel) -> tuple[np.ndarray, np.ndarray]:
+    """Which geoms the two sides of each contact sensor are: (S, G) int32 of 0 and 1 each."""
+    own, other = np.zeros((2, model.nsensor, model.ngeom), np.int32)
+    for sensor in range(model.nsensor):
+        spec = tuple(model.sensor_intprm[sensor][:3])
+        if model.sensor_type[sensor] != mujoco.mjtSensor.mjSENS_CONTACT or spec != (DATA, NET_FORCE, 1):
+            raise ValueError(f"sensor {model.sensor(sensor).name!r} is no net force of contacts")
+        own[sensor] = _geoms(model, model.sensor_objtype[sensor], model.sensor_objid[sensor])
+        other[sensor] = _geoms(model, model.sensor_reftype[sensor], model.sensor_refid[sensor])
+    return own, other
+
+
+def _geoms(model: mujoco.MjModel, kind: int, number: int) -> np.ndarray:
+    """Which geoms (G,) an object is; all for none."""
+    if kind == mujoco.mjtObj.mjOBJ_UNKNOWN:
+        return np.ones(model.ngeom, bool)
+    if kind == mujoco.mjtObj.mjOBJ_GEOM:
+        return np.arange(model.ngeom) == number
+    if kind == mujoco.mjtObj.mjOBJ_BODY:
+        return model.geom_bodyid == number
+    raise ValueError(f"contact sensors between {mujoco.mjtObj(kind).name} are not supported")
