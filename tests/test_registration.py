@@ -81,6 +81,26 @@ import lerobot_vtrefine
 print(json.dumps([name for name in ("lerobot", "torch", "numpy", "draccus") if name in sys.modules]))
 """
 
+HELP = """
+import contextlib, importlib, io, json, sys
+for module in json.loads(sys.argv[1]):
+    sys.argv = [module, "--help"]
+    with contextlib.suppress(SystemExit), contextlib.redirect_stdout(io.StringIO()) as shown:
+        importlib.import_module(f"lerobot_vtrefine.cli.{module}").main()
+    assert "usage:" in shown.getvalue(), module
+print(json.dumps([name for name in ("lerobot", "torch", "mujoco", "warp") if name in sys.modules]))
+"""
+SHORT_COMMANDS = (
+    "demo",
+    "bench",
+    "calibrate",
+    "diagnose",
+    "find_pads",
+    "pad_emulator",
+    "predict",
+    "view_pads",
+)  # the others parse LeRobot's own settings
+
 
 def answer(code: str, *arguments: Any) -> Any:
     """What a fresh interpreter prints as JSON in its last line."""
@@ -98,6 +118,10 @@ def answers() -> dict[str, Any]:
 
 def test_import_alone_loads_nothing() -> None:
     assert answer(LIGHT) == []
+
+
+def test_help_of_short_commands_loads_neither_lerobot_nor_torch() -> None:
+    assert answer(HELP, SHORT_COMMANDS) == []
 
 
 @pytest.mark.parametrize("case", CASES)

@@ -48,16 +48,10 @@ from lerobot_vtrefine.finetune.protocols import (
     start,
 )
 from lerobot_vtrefine.finetune.rollback import Rollback
+from lerobot_vtrefine.finetune.seeds import TRAINING_SEEDS
 from lerobot_vtrefine.policies.vt_dp3.diffusion import denoise_prefix, sample_chain, slice_log_prob
 
 Metrics = dict[str, float]
-
-TRAINING_SEEDS = 1_000_000
-"""Training episode i of a run, counted over iterations and ranks, has seed TRAINING_SEEDS + seed + i.
-
-Runs share no episode when their seeds differ by more than their episodes (the demo's differ by 10 000 000).
-Smaller seeds, and those past the last episode, are free for demonstrations and evaluation.
-"""
 
 
 @dataclass

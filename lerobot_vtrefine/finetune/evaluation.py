@@ -14,10 +14,8 @@ from lerobot_vtrefine.finetune.protocols import (
     select,
     start,
 )
+from lerobot_vtrefine.finetune.seeds import EVALUATION_SEEDS
 from lerobot_vtrefine.policies.vt_dp3.diffusion import deploy
-
-EVALUATION_SEEDS = 500_000
-"""First seed of the evaluations during training (``lerobot-eval`` counts up from its own --seed)."""
 
 
 @torch.no_grad()

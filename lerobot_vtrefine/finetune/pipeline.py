@@ -28,7 +28,7 @@ from lerobot_vtrefine.finetune.checkpoint import (
 from lerobot_vtrefine.finetune.config import DppoConfig, PaperDppo
 from lerobot_vtrefine.finetune.distributed import join_ranks, leave_ranks, rank_index
 from lerobot_vtrefine.finetune.dppo import Metrics, TrainState, train
-from lerobot_vtrefine.finetune.evaluation import EVALUATION_SEEDS, evaluate
+from lerobot_vtrefine.finetune.evaluation import evaluate
 from lerobot_vtrefine.finetune.logger import ProgressLog, start_wandb
 from lerobot_vtrefine.finetune.protocols import Agent, DecisionEnv
 from lerobot_vtrefine.policies.vt_dp3.configuration_vt_dp3 import VtDp3Config
@@ -182,13 +182,13 @@ class Recorder:
             self.log = ProgressLog(cfg.output_dir, state.iteration, run)
             self.bar = tqdm(total=cfg.dppo.iterations, initial=state.iteration, desc="DPPO", unit="it")
         if state.iteration == 0 and cfg.eval_freq:
-            self._record(0, evaluate(self.env, self.agent, cfg.eval.n_episodes, EVALUATION_SEEDS))
+            self._record(0, evaluate(self.env, self.agent, cfg.eval.n_episodes))
 
     def __call__(self, state: TrainState, metrics: Metrics) -> None:
         """Callback of ``dppo.train``."""
         cfg, iteration, last = self.cfg, state.iteration, self.cfg.dppo.iterations
         if cfg.eval_freq and (iteration % cfg.eval_freq == 0 or iteration == last):
-            metrics |= evaluate(self.env, self.agent, cfg.eval.n_episodes, EVALUATION_SEEDS)
+            metrics |= evaluate(self.env, self.agent, cfg.eval.n_episodes)
         self._record(iteration, metrics)
         if iteration == last or (cfg.save_freq and iteration % cfg.save_freq == 0):
             save_checkpoint(cfg.output_dir, self.saveable, state, last)

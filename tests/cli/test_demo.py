@@ -17,8 +17,7 @@ from lerobot_vtrefine.cli.pipeline.demo_config import LARGEST_SEED, DemoConfig, 
 from lerobot_vtrefine.cli.report.charts import Bar, Series, bar_chart, line_chart
 from lerobot_vtrefine.cli.report.results import verdict
 from lerobot_vtrefine.cli.report.statistics import proportion, quantiles, wilson_interval
-from lerobot_vtrefine.finetune.dppo import TRAINING_SEEDS
-from lerobot_vtrefine.finetune.evaluation import EVALUATION_SEEDS
+from lerobot_vtrefine.finetune.seeds import EVALUATION_SEEDS, TRAINING_SEEDS
 
 FAKES = Path(__file__).with_name("fake_commands.py")
 

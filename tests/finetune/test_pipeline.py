@@ -14,6 +14,7 @@ from tiny_policy import ReachEnv, save_tiny_checkpoint
 from lerobot_vtrefine.cli.finetune import main
 from lerobot_vtrefine.finetune import pipeline
 from lerobot_vtrefine.finetune.logger import read_progress
+from lerobot_vtrefine.finetune.seeds import EVALUATION_SEEDS
 from lerobot_vtrefine.policies.vt_dp3.modeling_vt_dp3 import VtDp3Policy
 
 SMALL = [
@@ -107,7 +108,7 @@ def test_reloaded_checkpoint_deploys_what_was_evaluated(finetune, tmp_path):
     assert finetune(output, "--dppo.encoder=trained", iterations=2) == 0
     path = output / "checkpoints" / "last" / "pretrained_model"
     policy = VtDp3Policy.from_pretrained(path, config=PreTrainedConfig.from_pretrained(path)).eval()
-    env, first = ReachEnv(6), pipeline.EVALUATION_SEEDS
+    env, first = ReachEnv(6), EVALUATION_SEEDS
     success = []
     torch.manual_seed(first)
     for batch in range(2):

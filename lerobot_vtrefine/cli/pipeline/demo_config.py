@@ -5,15 +5,8 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-from lerobot_vtrefine.cli.pipeline.child_configs import (
-    parse_degradation,
-    parse_dppo,
-    parse_env,
-    parse_policy,
-)
 from lerobot_vtrefine.cli.pipeline.stages import Stage
-from lerobot_vtrefine.finetune.dppo import TRAINING_SEEDS
-from lerobot_vtrefine.finetune.pipeline import check_read_schedule
+from lerobot_vtrefine.finetune.seeds import TRAINING_SEEDS
 
 REPO_ID = "local/vtrefine_demo"
 POLICIES = ("pretrain", "finetune")
@@ -133,9 +126,18 @@ class DemoConfig:
                 f"--finetune_iterations times --finetune_envs must not exceed {TRAIN_SEEDS}:"
                 " training would reach the seeds of the evaluation"
             )
-        parse_degradation(self.degradation)
-        parse_dppo(self.dppo | {"iterations": self.finetune_iterations, "num_envs": self.finetune_envs})
-        check_read_schedule(parse_env(acting_env(self)), parse_policy(self.policy))
+        self._check_children()
+
+    def _check_children(self) -> None:
+        """Parse what the stages will parse. Imports LeRobot, which ``--help`` can do without."""
+        from lerobot_vtrefine.cli.pipeline import child_configs
+        from lerobot_vtrefine.finetune.pipeline import check_read_schedule
+
+        child_configs.parse_degradation(self.degradation)
+        numbers = {"iterations": self.finetune_iterations, "num_envs": self.finetune_envs}
+        child_configs.parse_dppo(self.dppo | numbers)
+        env, policy = child_configs.parse_env(acting_env(self)), child_configs.parse_policy(self.policy)
+        check_read_schedule(env, policy)
 
     @property
     def dataset_dir(self) -> Path:
@@ -200,6 +202,8 @@ def recording_env(config: DemoConfig) -> dict[str, Any]:
 
 def acting_env(config: DemoConfig) -> dict[str, Any]:
     """The environment's flags where the policy acts: sensors are read only where it reads them."""
+    from lerobot_vtrefine.cli.pipeline.child_configs import parse_policy
+
     policy = parse_policy(config.policy)
     chunk = policy.n_action_steps
     derived = {"read_every": chunk, "read_window": min(chunk, policy.n_obs_steps)}
