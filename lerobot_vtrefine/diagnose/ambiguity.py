@@ -34,7 +34,10 @@ def find_ambiguities(search: Search, fitted: Fit, noise: Noise) -> Rivals:
         tied = []
         for rival in rivals:
             other = add(search, slim, rival, probes)
-            if not agree(full.better_by(scored(search, other)), search.seed, TIE_P):
+            score = scored(search, other)
+            # Weights forgive much that plain errors do not, where a model is far off: both must be as good.
+            worse = (full.better_by(score), score.squares - full.squares)
+            if not any(agree(differences, search.seed, TIE_P) for differences in worse):
                 tied.append((rival, other))
         if tied:
             groups.append((name, *(rival for rival, _ in tied)))

@@ -7,13 +7,16 @@ import numpy as np
 
 from lerobot_vtrefine.diagnose.candidates.base import Setting
 from lerobot_vtrefine.diagnose.composite import NOMINAL_K_N, Composite, stiffness_from_load
-from lerobot_vtrefine.diagnose.fitting import Fit, fit, predict
+from lerobot_vtrefine.diagnose.fitting import Fit, fit, predict, rest
 from lerobot_vtrefine.diagnose.noise import Noise, fit_frame_noise, fit_repeatability
 from lerobot_vtrefine.diagnose.presses import PressSet
 from lerobot_vtrefine.diagnose.weights import TrialWeights, build_weights
 
 START_DAMPING_S = 3e-3
 OFFSET_STEP_M = 5e-6
+PLAUSIBLE_LOG_GAIN = 0.7
+"""A weighted fit that moves the gain's logarithm further than this explains presses away as noise: readings
+that are very late, say, leave the baseline so wrong that its weights mislead."""
 
 
 @dataclass(frozen=True)
@@ -78,9 +81,7 @@ def offset_tangents(
     """Change of the signal per metre of contact offset (T, n) per recording; None when driven by load."""
     if presses.loaded:
         return None
-    shifted = replace(
-        presses, presses=tuple(replace(p, drive=p.drive - OFFSET_STEP_M) for p in presses.presses)
-    )
+    shifted = replace(presses, presses=tuple(press.sunk(OFFSET_STEP_M) for press in presses.presses))
     return [(a - b) / OFFSET_STEP_M for a, b in zip(predict(model, shifted), signals, strict=True)]
 
 
@@ -127,11 +128,17 @@ def fit_baseline(presses: PressSet) -> Baseline:
     fitted = plain = fit(guess, presses, plain_weights(presses))
     k_n = stiffness_from_load(presses, fitted.model)
     top = max((float(np.max(signal)) for signal in fitted.signals if signal.size), default=1.0)
-    setting = replace(setting, top_counts=max(top, presses.full_scale / 255.0))
+    gain = float(plain.model.values[0])
+    setting = replace(setting, top_counts=max(top, presses.full_scale / 255.0), log_gain=gain)
     model = replace(fitted.model, setting=setting, k_n=k_n or NOMINAL_K_N)
     fitted = replace(fitted, model=model)
     noise, weights = weigh(fitted, presses)
-    fitted = fit(fitted.model, presses, weights)
-    noise, weights = weigh(fitted, presses)
+    refitted = fit(fitted.model, presses, weights)
+    if abs(refitted.model.values[0] - fitted.model.values[0]) < PLAUSIBLE_LOG_GAIN:
+        fitted = refitted
+        noise, weights = weigh(fitted, presses)
     plain = fit(replace(plain.model, setting=setting, k_n=model.k_n), presses, plain_weights(presses), 2)
-    return Baseline(fit(fitted.model, presses, weights), plain, noise, tuple(weights))
+    refitted = fit(fitted.model, presses, weights)
+    if abs(refitted.model.values[0] - plain.model.values[0]) >= PLAUSIBLE_LOG_GAIN:
+        refitted = rest(plain.model, presses, weights)
+    return Baseline(refitted, plain, noise, tuple(weights))

@@ -21,6 +21,8 @@ from lerobot_vtrefine.tactile.stages.readout import (
 
 BASE = (Value("log_gain", -60.0, 60.0, 1e-3), Value("damping_s", 0.0, 0.5, 2e-4))
 """Baseline's coordinates: log of counts per metre (or per newton when driven by load), and k_d / k_n."""
+GAIN_RANGE = 1.5
+"""How far a fit may move the logarithm of the plain baseline's gain."""
 NOMINAL_K_N = 400.0
 """Stiffness where no load cell tells it [N/m]; then only gain * k_n matters."""
 
@@ -49,7 +51,18 @@ class Composite:
     @property
     def coordinates(self) -> tuple[Value, ...]:
         """All fitted coordinates, with bounds."""
-        return (*BASE, *(value for form in self.forms for value in form.values))
+        return (*self._base, *(value for form in self.forms for value in form.values))
+
+    @property
+    def _base(self) -> tuple[Value, Value]:
+        """The baseline's coordinates: no extension turns the gain into something else altogether.
+
+        Weights forgive a recording its own gain, and so would forgive a model that predicts next to nothing.
+        """
+        middle = self.setting.log_gain
+        if middle is None:
+            return BASE
+        return replace(BASE[0], low=middle - GAIN_RANGE, high=middle + GAIN_RANGE), BASE[1]
 
     @property
     def free(self) -> np.ndarray:

@@ -133,6 +133,13 @@ def bounded_step(model: Composite, gram: np.ndarray, free: np.ndarray, damping: 
     return values
 
 
+def rest(model: Composite, presses: PressSet, weights: Sequence[TrialWeights]) -> Fit:
+    """A model as it stands, with its losses and tangents under these weights."""
+    signals, columns = tangents(model, presses, model.free)
+    grams = grams_of(presses, weights, signals, columns)
+    return Fit(model, grams[:, -1, -1].copy(), grams, tuple(signals))
+
+
 def fit(
     model: Composite,
     presses: PressSet,

@@ -20,6 +20,8 @@ MIN_SIGMA = 2e-4
 QUANTISATION_VARIANCE = 1.0 / 12.0
 MAX_RHO = 0.95
 TRIM = 0.9
+MIN_REST_FRAMES = 100
+"""Frames at rest that memory is taken from; with fewer, frames just after a release count as well."""
 
 
 @dataclass(frozen=True)
@@ -84,10 +86,16 @@ def _strata(square: np.ndarray, size: np.ndarray) -> tuple[float, float]:
 
 
 def _memory(presses: PressSet, residuals: Sequence[np.ndarray]) -> float:
-    """Lag-one correlation in frames without contact, corrected for the mean taken from short stretches."""
+    """Lag-one correlation in frames at rest, where late readings have died away.
+
+    Corrected for the mean being taken from short stretches.
+    """
     product, power, count = 0.0, 0.0, 0
-    for press, residual in zip(presses.presses, residuals, strict=True):
-        frames = np.flatnonzero(~press.touching)
+    rests = [press.resting for press in presses.presses]
+    if sum(int(rest.sum()) for rest in rests) < MIN_REST_FRAMES:
+        rests = [~press.touching for press in presses.presses]
+    for rest, residual in zip(rests, residuals, strict=True):
+        frames = np.flatnonzero(rest)
         if not len(frames):
             continue
         for run in np.split(frames, np.flatnonzero(np.diff(frames) > 1) + 1):

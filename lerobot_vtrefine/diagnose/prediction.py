@@ -1,20 +1,12 @@
 """What a sensor model predicts for a recorded press: the one path of diagnosis, prediction and report."""
 
 import numpy as np
-import torch
 
-from lerobot_vtrefine.diagnose.indenters import trial_forces, trial_heights
 from lerobot_vtrefine.diagnose.recordings import Trial
-from lerobot_vtrefine.diagnose.refinement import (
-    needs_refinement,
-    refined,
-    refined_motion,
-    refined_times,
-    substeps,
-)
+from lerobot_vtrefine.diagnose.refinement import instants, instants_of, motion
 from lerobot_vtrefine.tactile.layout import PadLayout
 from lerobot_vtrefine.tactile.model import SensorModel
-from lerobot_vtrefine.tactile.replay import finite_rate, replay
+from lerobot_vtrefine.tactile.replay import replay
 from lerobot_vtrefine.tactile.stages.readout import Quantisation
 
 
@@ -24,17 +16,13 @@ def predict_trial(model: SensorModel, trial: Trial, layout: PadLayout) -> np.nda
     Reads the trial's motion (or load, where it has no `depth_m`) and never its `raw`. Noise and rounding are
     left out: the mean is what predicts best.
     """
-    count = substeps(trial.time_s) if needs_refinement(model.stages) else 1
-    depth, force, rate = None, None, None
+    times, frames = instants_of(trial, layout, instants(tuple(model.stages)))
+    drive, rate = motion(trial, layout, times)
     if trial.depth_m is None:
-        force = refined(trial_forces(trial, layout), count)
+        fine = replay(model, times, force_n=drive, layout=layout, start_s=trial.start_s)
     else:
-        heights = trial_heights(trial, layout)
-        rate = finite_rate(torch.as_tensor(trial.time_s), torch.as_tensor(heights)).numpy()
-        depth, rate = refined_motion(heights, rate, trial.time_s, count)
-    times = refined_times(trial.time_s, count)
-    fine = replay(model, times, depth, rate, force_n=force, layout=layout, start_s=trial.start_s)
-    predicted = fine[::count]
+        fine = replay(model, times, drive, rate, layout=layout, start_s=trial.start_s)
     converter = model.find("quantisation")
     limit = converter.full_scale_counts if isinstance(converter, Quantisation) else np.inf
-    return predicted.numpy().astype(float).reshape(len(trial.time_s), -1).clip(0.0, limit)
+    predicted = fine[frames].numpy().astype(float)
+    return predicted.reshape(len(trial.time_s), -1).clip(0.0, limit)

@@ -1,16 +1,13 @@
 """Recorded presses as the engine works on them: cropped to the taxels that answer, above their idle level."""
 
 from dataclasses import dataclass, field, replace
-from functools import cached_property
 
 import numpy as np
-import torch
 
-from lerobot_vtrefine.diagnose.indenters import trial_forces, trial_heights
+from lerobot_vtrefine.diagnose.indenters import trial_forces
 from lerobot_vtrefine.diagnose.recordings import RecordingSet, Trial
-from lerobot_vtrefine.diagnose.refinement import refined, refined_motion, refined_times, substeps
+from lerobot_vtrefine.diagnose.refinement import Kind, instants_of, motion
 from lerobot_vtrefine.tactile.layout import PadLayout
-from lerobot_vtrefine.tactile.replay import finite_rate
 
 MARGIN_TAXELS = 2
 """Untouched taxels kept around those that answer, so that spreading does not see the crop's edge."""
@@ -52,6 +49,20 @@ class CropLayout(PadLayout):
 
 
 @dataclass(frozen=True)
+class Course:
+    """A press as models are run through it: its drive at instants, some of which are the recorded frames."""
+
+    time_s: np.ndarray
+    """From the trial's start (G,) [s]."""
+    drive: np.ndarray
+    """Column heights [m] or force per taxel [N] (G, r, c)."""
+    rate: np.ndarray
+    """Rate of the heights (G, r, c) [m/s]."""
+    frames: np.ndarray
+    """Numbers of the recorded frames (T,)."""
+
+
+@dataclass(frozen=True)
 class Press:
     """One trial, cropped. Arrays (T, r, c) belong to the window, (T, n) to its n scored taxels."""
 
@@ -70,28 +81,41 @@ class Press:
     """Idle level of the scored taxels (n,) counts."""
     touching: np.ndarray
     """Frames with the indenter on the pad (T,) bool."""
-    substeps: int = 1
-    """Frames of the drive per frame of the readings."""
-
-    @cached_property
-    def time_s(self) -> np.ndarray:
-        """Times of the drive's frames, from the trial's start [s]."""
-        return refined_times(self.trial.time_s, self.substeps)
+    resting: np.ndarray
+    """Frames before the first touch or well after a release (T,) bool."""
+    sunk_m: float = 0.0
+    """How far the face was lowered from where the recording has it [m]."""
 
     @property
-    def session_s(self) -> np.ndarray:
-        """Session time of the drive's frames [s]."""
-        return self.time_s + self.trial.start_s
+    def time_s(self) -> np.ndarray:
+        """Times of the frames, from the trial's start [s]."""
+        return self.trial.time_s
 
-    @cached_property
-    def fine(self) -> "Press":
-        """The same press with its drive known between the frames."""
-        count = substeps(self.trial.time_s)
+    def course(self, kind: Kind) -> Course:
+        """The drive at a model's instants; kept with the press."""
+        kept = self.__dict__.setdefault("_courses", {})
+        if kind not in kept:
+            kept[kind] = self._course(kind)
+        return kept[kind]
+
+    def _course(self, kind: Kind) -> Course:
+        if kind == "frames":
+            return Course(self.time_s, self.drive, self.rate, np.arange(len(self.time_s)))
+        whole = PadLayout(self.layout.full_rows, self.layout.full_cols, self.layout.pitch_m)
+        # Shares of a load need the whole pad; heights do not.
+        layout = whole if self.loaded else self.layout
+        times, frames = instants_of(self.trial, layout, kind)
+        drive, rate = motion(self.trial, layout, times)
         if self.loaded:
-            drive, rate = refined(self.drive, count), refined(self.rate, count)
-        else:
-            drive, rate = refined_motion(self.drive, self.rate, self.trial.time_s, count)
-        return replace(self, drive=drive, rate=rate, substeps=count)
+            drive, rate = self.layout.cut(drive), self.layout.cut(rate)
+        return Course(times, drive - self.sunk_m, rate, frames)
+
+    def sunk(self, by_m: float) -> "Press":
+        """The same press with the face lowered."""
+        lower = replace(self, drive=self.drive - by_m, sunk_m=self.sunk_m + by_m)
+        kept = {k: replace(c, drive=c.drive - by_m) for k, c in self.__dict__.get("_courses", {}).items()}
+        lower.__dict__["_courses"] = kept
+        return lower
 
     @property
     def taxels(self) -> np.ndarray:
@@ -188,8 +212,7 @@ def _motion(trial: Trial, layout: PadLayout, loaded: bool) -> _Motion:
         threshold = 0.01 * max(float(np.max(load)), 1e-9)
         touching = load > threshold
         return _Motion(force, np.zeros_like(force), touching, touching)
-    heights = trial_heights(trial, layout)
-    rate = finite_rate(torch.as_tensor(trial.time_s), torch.as_tensor(heights)).numpy()
+    heights, rate = motion(trial, layout, trial.time_s)
     top = heights.reshape(len(heights), -1).max(axis=1)
     return _Motion(heights, rate, top > 0, top > -CLEAR_M)
 
@@ -287,6 +310,7 @@ def _press(
         raw - level,
         level,
         motion.touching,
+        np.logical_or(*_rest(trial, motion)),
     )
 
 

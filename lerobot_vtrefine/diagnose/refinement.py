@@ -1,23 +1,48 @@
-"""Motion between the frames of a recording, for stages that sample it there (delays, held readings)."""
+"""Motion between the frames of a recording, for stages whose readings depend on it (delays, memory).
+
+Frames are far apart beside the corners of a motion. Positions are joined by Akima's curve (J. ACM 17, 1970),
+which keeps straight stretches straight up to the frame before a corner; heights follow from positions.
+"""
+
+from dataclasses import replace
+from typing import Literal
 
 import numpy as np
+from scipy.interpolate import Akima1DInterpolator
 
+from lerobot_vtrefine.diagnose.indenters import trial_forces, trial_heights
+from lerobot_vtrefine.diagnose.recordings import Trial
+from lerobot_vtrefine.tactile.layout import PadLayout
 from lerobot_vtrefine.tactile.replay import NO_BODY_M
 from lerobot_vtrefine.tactile.stages.base import Stage
-from lerobot_vtrefine.tactile.stages.host import Delay, SampleAndHold
+from lerobot_vtrefine.tactile.stages.host import SampleAndHold
+from lerobot_vtrefine.tactile.stages.readout import BaselineDrift
 
 FINE_S = 0.005
 """Time between refined frames [s]: motion is close to straight for that long."""
 MAX_SUBSTEPS = 10
+BEND = 0.003
+"""Part of the deepest press by which depths may bend between two neighbouring instants."""
+RATE_S = 2e-4
+"""Half the time over which rates are taken [s]."""
+MOTION = ("x_m", "y_m", "depth_m", "tilt_x_rad", "tilt_y_rad", "force_n")
+
+Kind = Literal["frames", "bent", "even"]
+"""Instants of a model's run: the recorded frames; more where depths bend in between; all equally fine."""
 
 
-def needs_refinement(stages: tuple[Stage, ...]) -> bool:
-    """Whether a model reads the pad between frames: readings bend at a touch, so motion is interpolated."""
-    return any(isinstance(stage, Delay | SampleAndHold) for stage in stages)
+def instants(stages: tuple[Stage, ...]) -> Kind:
+    """What a model needs: one without memory knows frames only, a held reading is taken at any time."""
+    if any(isinstance(stage, SampleAndHold) for stage in stages):
+        return "even"
+    memory = (
+        stage.has_state and not stage.stochastic for stage in stages if stage.name != BaselineDrift.name
+    )
+    return "bent" if any(memory) else "frames"
 
 
 def substeps(time_s: np.ndarray) -> int:
-    """Refined frames per recorded one."""
+    """Refined frames per recorded one, at most."""
     steps = np.diff(time_s)
     steps = steps[steps > 0]
     if not len(steps):
@@ -25,51 +50,70 @@ def substeps(time_s: np.ndarray) -> int:
     return int(np.clip(round(float(np.median(steps)) / FINE_S), 1, MAX_SUBSTEPS))
 
 
-def refined_times(time_s: np.ndarray, count: int) -> np.ndarray:
-    """Times (N,) with count - 1 more between each two: ((N - 1) * count + 1,)."""
-    index = np.arange((len(time_s) - 1) * count + 1) / count
-    return np.interp(index, np.arange(len(time_s)), time_s)
+def divided(time_s: np.ndarray, counts: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Times with interval k of (N,) cut into counts[k] (N-1,) equal parts, and the numbers of the (N,)."""
+    frames = np.concatenate([[0], np.cumsum(counts)])
+    index = np.arange(frames[-1] + 1)
+    return np.interp(index, frames, time_s), frames
 
 
-def refined_motion(
-    heights: np.ndarray, rate: np.ndarray, time_s: np.ndarray, count: int
-) -> tuple[np.ndarray, np.ndarray]:
-    """Heights (N, ...) and their rate in between: cubic through both (Hermite), which bends as motion does.
+def resampled(trial: Trial, times: np.ndarray) -> Trial:
+    """The motion at other times (T,) within the recording; without readings."""
+    if times is trial.time_s:
+        return trial
+    known, first = np.unique(trial.time_s, return_index=True)
+    names = [name for name in MOTION if getattr(trial, name) is not None]
+    values = np.stack([getattr(trial, name)[first] for name in names], axis=1)
+    if len(known) < 4:
+        found = np.stack([np.interp(times, known, column) for column in values.T], axis=1)
+    else:
+        found = Akima1DInterpolator(known, values)(np.clip(times, known[0], known[-1]))
+    return replace(
+        trial,
+        time_s=times,
+        temperature_c=None,
+        raw=np.zeros((len(times), 0)),
+        **dict(zip(names, found.T, strict=True)),
+    )
 
-    Next to a frame without a body over the taxel (-1) the nearest frame counts.
+
+def motion(trial: Trial, layout: PadLayout, times: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Column heights [m] and their rate [m/s] at times (T,): (T, R, C) each; or force per taxel [N] and zero.
+
+    A taxel's rate belongs to the body over it: where that begins or ends, the rate is one-sided.
     """
-    frames = len(heights)
-    if count == 1 or frames < 2:
-        return heights, rate
-    index = np.arange((frames - 1) * count + 1)
-    before = np.minimum(index // count, frames - 2)
-    shape = (-1, *(1,) * (heights.ndim - 1))
-    s = ((index - before * count) / count).reshape(shape)
-    step = np.maximum(np.diff(time_s), 0.0)[before].reshape(shape)
-    early, late, start, end = (
-        heights[before],
-        heights[before + 1],
-        rate[before] * step,
-        rate[before + 1] * step,
-    )
-    rise = late - early
-    bend = start + end - 2.0 * rise
-    smooth = early + s * (start + s * (3.0 * rise - 2.0 * start - end + s * bend))
-    slope = start + s * (2.0 * (3.0 * rise - 2.0 * start - end) + 3.0 * s * bend)
-    known = (early > NO_BODY_M) & (late > NO_BODY_M)
-    moving = known & (step > 0)
-    held = np.where(s < 0.5, rate[before], rate[before + 1])
-    return (
-        np.where(known, smooth, np.where(s < 0.5, early, late)),
-        np.where(moving, slope / np.maximum(step, 1e-12), held),
-    )
+    if trial.depth_m is None:
+        force = trial_forces(resampled(trial, times), layout)
+        return force, np.zeros_like(force)
+    here = trial_heights(resampled(trial, times), layout)
+    begin, end = float(trial.time_s[0]), float(trial.time_s[-1])
+    earlier, later = np.maximum(times - RATE_S, begin), np.minimum(times + RATE_S, end)
+    low = trial_heights(resampled(trial, earlier), layout)
+    high = trial_heights(resampled(trial, later), layout)
+    before, after = low > NO_BODY_M, high > NO_BODY_M
+    rise = np.where(after, high, here) - np.where(before, low, here)
+    span = np.where(after, (later - times)[:, None, None], 0.0)
+    span = span + np.where(before, (times - earlier)[:, None, None], 0.0)
+    known = (here > NO_BODY_M) & (span > 0)
+    return here, np.where(known, rise / np.where(known, span, 1.0), 0.0)
 
 
-def refined(images: np.ndarray, count: int) -> np.ndarray:
-    """Images (N, ...) in between, linear."""
-    if count == 1 or len(images) < 2:
-        return images
-    index = np.arange((len(images) - 1) * count + 1)
-    before = np.minimum(index // count, len(images) - 2)
-    weight = ((index - before * count) / count).reshape(-1, *(1,) * (images.ndim - 1))
-    return images[before] + weight * (images[before + 1] - images[before])
+def instants_of(trial: Trial, layout: PadLayout, kind: Kind) -> tuple[np.ndarray, np.ndarray]:
+    """Times (T,) at which a model of that kind is run, and which of them are the recorded frames (N,)."""
+    intervals = len(trial.time_s) - 1
+    count = substeps(trial.time_s)
+    if kind == "frames" or count == 1 or intervals < 1:
+        return trial.time_s, np.arange(intervals + 1)
+    even = np.full(intervals, count)
+    if kind == "even":
+        return divided(trial.time_s, even)
+    fine, frames = divided(trial.time_s, even)
+    refined = resampled(trial, fine)
+    images = trial_forces(refined, layout) if trial.depth_m is None else trial_heights(refined, layout)
+    depths = np.maximum(images, 0.0).reshape(len(fine), -1)
+    share = (np.arange(count) / count)[None, :, None]
+    start, stop = depths[frames[:-1], None], depths[frames[1:], None]
+    bend = np.abs(depths[:-1].reshape(intervals, count, -1) - start - share * (stop - start)).max(axis=(1, 2))
+    allowed = BEND * max(float(depths.max()), 1e-12)
+    # Halving the steps of a smooth curve quarters how far it bends away from its chords.
+    return divided(trial.time_s, np.clip(np.ceil(np.sqrt(bend / allowed)), 1, count).astype(int))

@@ -10,7 +10,7 @@ from lerobot_vtrefine.diagnose.candidates import CATALOGUE
 from lerobot_vtrefine.diagnose.candidates.base import Form
 from lerobot_vtrefine.diagnose.composite import Composite, sensor_model
 from lerobot_vtrefine.diagnose.fitting import predict
-from lerobot_vtrefine.diagnose.forward import delayed, low_passed, play
+from lerobot_vtrefine.diagnose.memory_stages import delayed, low_passed, play
 from lerobot_vtrefine.diagnose.prediction import predict_trial
 from lerobot_vtrefine.diagnose.presses import PressSet, prepare
 from lerobot_vtrefine.diagnose.recordings import RecordingSet, Trial

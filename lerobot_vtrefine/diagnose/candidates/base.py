@@ -33,6 +33,8 @@ class Setting:
     touched_cols: int
     rest_session_s: float
     """Mean session time of the frames that the idle map rests on [s]."""
+    log_gain: float | None = None
+    """Logarithm of the plain baseline's counts per metre (or newton); None before it is fitted."""
 
 
 @dataclass(frozen=True)

@@ -1,0 +1,115 @@
+"""Fast equals, on sheets, of the stages with memory or delay."""
+
+import math
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+
+from lerobot_vtrefine.diagnose.fields import Context, Field, by_press
+from lerobot_vtrefine.tactile.stages.host import Latency, SampleAndHold, ScanSkew
+from lerobot_vtrefine.tactile.stages.mechanics import Hysteresis, ViscoelasticRelaxation
+
+MAX_EXPONENT = 200.0
+
+
+def low_passed(x: np.ndarray, time_s: np.ndarray, tau_s: float) -> np.ndarray:
+    """x (T, ...) through one pole of `tau_s`, from rest at zero, exact for a signal linear between frames."""
+    dt = np.diff(time_s)
+    decay = np.exp(-dt / tau_s)
+    ramp = 1.0 - np.where(dt > 0, (1.0 - decay) * tau_s / np.maximum(dt, 1e-12), 1.0)
+    shape = (-1, *(1,) * (x.ndim - 1))
+    push = (1.0 - decay).reshape(shape) * x[:-1] + ramp.reshape(shape) * (x[1:] - x[:-1])
+    slow = np.zeros_like(x)
+    begin = 0
+    while begin < len(dt):
+        # Growing exponentials instead of a recursion, in pieces short enough not to overflow.
+        reach = np.searchsorted(time_s, time_s[begin] + MAX_EXPONENT * tau_s, side="right") - 1
+        end = min(max(int(reach), begin + 1), len(dt))
+        ages = np.minimum((time_s[begin + 1 : end + 1] - time_s[begin]) / tau_s, 600.0)
+        grow = np.exp(ages).reshape(shape)
+        slow[begin + 1 : end + 1] = (slow[begin] + np.cumsum(grow * push[begin:end], axis=0)) / grow
+        begin = end
+    return slow
+
+
+def _relaxation(stage: ViscoelasticRelaxation, field: Field, context: Context) -> Field:
+    taus = stage.tau_s if isinstance(stage.tau_s, tuple) else (stage.tau_s,)
+    fractions = stage.fraction if isinstance(stage.fraction, tuple) else (stage.fraction,)
+
+    def work(x: np.ndarray, time_s: np.ndarray, rows: np.ndarray) -> np.ndarray:
+        relaxed = x.copy()
+        for tau_s, fraction in zip(taus, fractions, strict=True):
+            relaxed -= fraction * low_passed(x, time_s, tau_s)
+        return relaxed
+
+    return by_press(field, context.sheet, work)
+
+
+def delayed(x: np.ndarray, time_s: np.ndarray, delay_s: float) -> np.ndarray:
+    """x (T, ...) as it was `delay_s` earlier, linear between frames, held before the first."""
+    if len(time_s) < 2:
+        return x
+    wanted = time_s - delay_s
+    after = np.searchsorted(time_s, wanted, side="right").clip(1, len(time_s) - 1)
+    span = np.maximum(time_s[after] - time_s[after - 1], 1e-12)
+    weight = ((wanted - time_s[after - 1]) / span).clip(0.0, 1.0).reshape(-1, *(1,) * (x.ndim - 1))
+    earlier = x[after - 1]
+    return earlier + weight * (x[after] - earlier)
+
+
+def _latency(stage: Latency, field: Field, context: Context) -> Field:
+    return by_press(field, context.sheet, lambda x, time_s, rows: delayed(x, time_s, float(stage.tau_s)))
+
+
+def _scan_skew(stage: ScanSkew, field: Field, context: Context) -> Field:
+    last = max(context.sheet.layout.rows - 1, 1)
+
+    def work(x: np.ndarray, time_s: np.ndarray, rows: np.ndarray) -> np.ndarray:
+        out = np.empty_like(x)
+        for row in np.unique(rows):
+            out[:, rows == row] = delayed(x[:, rows == row], time_s, stage.skew_s * float(row) / last)
+        return out
+
+    return by_press(field, context.sheet, work)
+
+
+def _hold(stage: SampleAndHold, field: Field, context: Context) -> Field:
+    def work(x: np.ndarray, time_s: np.ndarray, rows: np.ndarray) -> np.ndarray:
+        slot = np.floor(time_s / stage.period_s + 1e-6).astype(np.int64)
+        new = np.concatenate([[True], slot[1:] != slot[:-1]])
+        return x[np.maximum.accumulate(np.where(new, np.arange(len(slot)), 0))]
+
+    return by_press(field, context.sheet, work)
+
+
+def play(x: np.ndarray, half_width: float | np.ndarray) -> np.ndarray:
+    """Play operator on columns of x (T, n) with reset at zero, as in the hysteresis stage: (T, n)."""
+    touched = x > 0
+    upper = np.where(touched, x + half_width, 0.0)
+    out = np.where(touched, np.maximum(x - half_width, 0.0), 0.0)
+    state = np.zeros(x.shape[1])
+    for high, line in zip(upper, out, strict=True):
+        np.minimum(state, high, out=state)
+        np.maximum(state, line, out=line)
+        state = line.copy()
+    return out
+
+
+def _hysteresis(stage: Hysteresis, field: Field, context: Context) -> Field:
+    widths = stage.width_m if isinstance(stage.width_m, tuple) else (stage.width_m,)
+    fractions = stage.fraction if isinstance(stage.fraction, tuple) else (stage.fraction,)
+    held = (1.0 - math.fsum(fractions)) * field.values
+    for width_m, fraction in zip(widths, fractions, strict=True):
+        held += fraction * play(field.values, 0.5 * width_m * context.stiffness)
+    return Field(np.maximum(held, 0.0), field.columns)
+
+
+MEMORY: dict[type, Callable[[Any, Field, Context], Field]] = {
+    ViscoelasticRelaxation: _relaxation,
+    Hysteresis: _hysteresis,
+    Latency: _latency,
+    ScanSkew: _scan_skew,
+    SampleAndHold: _hold,
+}
+"""Stage -> its equal."""
