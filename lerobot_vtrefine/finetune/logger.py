@@ -50,31 +50,47 @@ class ProgressLog:
         """Draw the learning curves so far."""
         draw_curves(self.rows, self.output_dir / CURVES_NAME)
 
+    def close(self) -> None:
+        """Hand everything over to Weights & Biases."""
+        if self._wandb_run is not None:
+            self._wandb_run.finish()
+
 
 def start_wandb(
     cfg: WandBConfig, output_dir: Path, job_name: str, settings: dict[str, Any], resume: bool
 ) -> Any:
     """A Weights & Biases run, or None if it is not enabled.
 
-    The run's id is kept beside the checkpoints, so that a resumed run continues its curves.
+    The run's id is kept beside the checkpoints, so that a resumed run continues its curves. Curves and
+    settings are logged; checkpoints stay on disk.
+
+    Raises: ValueError if wandb refuses (no login, no connection), ImportError if it is not installed.
     """
     if not cfg.enable:
         return None
-    import wandb
+    try:
+        import wandb
+    except ImportError as error:
+        raise ImportError("--wandb.enable=true needs the package wandb: pip install wandb") from error
 
     id_file = output_dir / "wandb_run_id"
     known = id_file.read_text().strip() if resume and id_file.is_file() else None
-    run = wandb.init(
-        id=cfg.run_id or known,
-        project=cfg.project,
-        entity=cfg.entity,
-        name=job_name,
-        notes=cfg.notes,
-        dir=output_dir,
-        config=settings,
-        resume="allow",
-        mode=cfg.mode,  # ty: ignore[invalid-argument-type]  LeRobot's config says str
-    )
+    try:
+        run = wandb.init(
+            id=cfg.run_id or known,
+            project=cfg.project,
+            entity=cfg.entity,
+            name=job_name,
+            notes=cfg.notes,
+            tags=["policy:vt_dp3", "dppo", f"seed:{settings['seed']}"] if cfg.add_tags else None,
+            dir=output_dir,
+            config=settings,
+            resume="allow",
+            mode=cfg.mode,  # ty: ignore[invalid-argument-type]  LeRobot's config says str
+        )
+    except (wandb.Error, ValueError) as error:
+        reason = str(error).strip().splitlines()[0].rstrip(".")
+        raise ValueError(f"Weights & Biases: {reason}; --wandb.mode=offline logs without it") from error
     id_file.write_text(run.id)
     logging.info("logging to Weights & Biases as %s", run.id)
     return run

@@ -199,6 +199,11 @@ class Recorder:
             if iteration == last:
                 self.bar.close()
 
+    def close(self) -> None:
+        """Called when training has ended."""
+        if self.log is not None:
+            self.log.close()
+
     def _record(self, iteration: int, metrics: Metrics) -> None:
         if self.log is None:
             return
@@ -238,4 +243,5 @@ def run(cfg: FinetunePipelineConfig) -> None:
             load_training_state(checkpoint, state)
         recorder.start(state)
         train(env, agent, state, cfg.dppo, seed=cfg.seed, after_iteration=recorder)
+    recorder.close()
     leave_ranks()
