@@ -15,6 +15,7 @@ from lerobot_vtrefine.sim.config import (
     TABLE_CAMERA,
     RandomizationConfig,
     SceneConfig,
+    ShearConfig,
     TaskConfig,
     WarpConfig,
 )
@@ -57,6 +58,8 @@ class VtRefineEnvConfig(EnvConfig):
     """Ranges of what differs between episodes."""
     sensor_model: str = "default"
     """default, paper, or the path of a sensor_model.json."""
+    shear: ShearConfig = field(default_factory=ShearConfig)
+    """Tangential force per taxel, as ``info["shear"]``: off unless ``--env.shear.on=true``."""
     reality: Path | None = None
     """JSON file of hidden physics: the environment then stands in for reality (sim/reality.py)."""
     backend: str = "batch"

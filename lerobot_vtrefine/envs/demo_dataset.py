@@ -91,10 +91,8 @@ class DemoDataset:
         self._saving = True
         dataset = self._open()
         for step, action in enumerate(demonstration.actions):
-            frame = raw_to_frame({key: value[step] for key, value in demonstration.raw.items()})
-            # A recording that was begun before a column existed is continued without it.
-            known = {key: value for key, value in frame.items() if key in dataset.features}
-            dataset.add_frame({**known, ACTION_KEY: action, "task": self._task})
+            raw = {key: value[step] for key, value in demonstration.raw.items()}
+            dataset.add_frame({**raw_to_frame(raw), ACTION_KEY: action, "task": self._task})
         with fast_saving(), SuppressProgressBars():
             dataset.save_episode()
         row = {"episode_index": self.num_episodes, **demonstration.row}

@@ -38,6 +38,7 @@ def make_simulation(config: VtRefineEnvConfig, num_envs: int) -> "InsertionSim":
         randomization=config.randomization,
         warp=config.warp,
         robot_faults=config.hidden.robot,
+        shear=config.shear,
     )
 
 

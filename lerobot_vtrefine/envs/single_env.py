@@ -30,14 +30,14 @@ class VtRefineEnv(gym.Env[Observation, Array]):
         """Start the episode of ``seed``; without one, of a seed drawn from the environment's generator."""
         super().reset(seed=seed)
         drawn = int(self.np_random.integers(2**31)) if seed is None else seed
-        observation, _ = self._batch.reset(seed=[drawn])
-        return _first(observation), {"is_success": False}
+        observation, info = self._batch.reset(seed=[drawn])
+        return _first(observation), {"is_success": False, **_shear(info)}
 
     def step(self, action: Array) -> tuple[Observation, float, bool, bool, dict[str, Any]]:
         """One control step with absolute joint targets (16,) in rad and m."""
         observation, reward, terminated, truncated, info = self._batch.step(np.asarray(action)[None])
-        flags = {"is_success": bool(info["is_success"][0])}
-        return _first(observation), float(reward[0]), bool(terminated[0]), bool(truncated[0]), flags
+        told = {"is_success": bool(info["is_success"][0]), **_shear(info)}
+        return _first(observation), float(reward[0]), bool(terminated[0]), bool(truncated[0]), told
 
     def render(self) -> Array:
         """uint8 (H, W, 3): the scene beside its four pads."""
@@ -46,6 +46,10 @@ class VtRefineEnv(gym.Env[Observation, Array]):
     def close(self) -> None:
         """Release the simulation."""
         self._batch.close_extras()
+
+
+def _shear(info: dict[str, Any]) -> Observation:
+    return _first({key: value for key, value in info.items() if key == "shear"})
 
 
 def _first(observation: Observation) -> Observation:

@@ -31,6 +31,8 @@ class VtRefineVectorEnv(gym.vector.VectorEnv[Observation, Array, Array]):
     - ``info["is_success"]`` is (n,) bool; ``info["final_info"]`` appears in steps in which an episode ends
     and
       holds the same plus the metrics of finished episodes.
+    - With ``--env.shear.on=true``, ``info["shear"]`` is (n, 4, 384, 2) float32: tangential force per taxel
+      [N], of every control step.
     - Observations are those of ``datasets.features.env_observation_shapes`` with a leading ``n``.
     """
 
@@ -76,7 +78,7 @@ class VtRefineVectorEnv(gym.vector.VectorEnv[Observation, Array, Array]):
         ids = np.flatnonzero(mask)
         self._first_episode += self._stride if mask.all() else 0
         self.episodes.reset(ids, self._seeds(seed)[ids])
-        return self._observation(), {"is_success": np.zeros(self.num_envs, bool)}
+        return self._observation(), {"is_success": np.zeros(self.num_envs, bool), **self._shear()}
 
     def step(self, actions: Array) -> tuple[Observation, Array, Array, Array, dict[str, Any]]:
         """One control step with absolute joint targets (n, 16) in rad and m."""
@@ -139,8 +141,11 @@ class VtRefineVectorEnv(gym.vector.VectorEnv[Observation, Array, Array]):
         observation = raw_to_env_observation(self.episodes.raw)
         return {key: np.array(value) for key, value in observation.items()}
 
+    def _shear(self) -> dict[str, Array]:
+        return {"shear": self.episodes.sim.shear()} if self.config.shear.on else {}
+
     def _info(self, result: Transition) -> dict[str, Any]:
-        info: dict[str, Any] = {"is_success": result.success}
+        info: dict[str, Any] = {"is_success": result.success, **self._shear()}
         if len(result.finished):
             metrics = {name: values.copy() for name, values in self.episodes.metrics.items()}
             info["final_info"] = {**metrics, "is_success": result.success.copy()}

@@ -131,7 +131,9 @@ def replay_scene(sim: InsertionSim, commands: Array, seed: int, start: Start | N
     )
 
 
-def grasp_start(embodiment: Embodiment, pair: PartPair, position: Array) -> Start | None:
+def grasp_start(
+    embodiment: Embodiment, pair: PartPair, position: Array, table_height_m: float
+) -> Start | None:
     """A start from the table with the parts where the recorded grippers closed on them.
 
     Parts stand upright, turned as their hand is at the moment of the grasp; how high and how far forward in
@@ -139,6 +141,7 @@ def grasp_start(embodiment: Embodiment, pair: PartPair, position: Array) -> Star
 
     Args:
         position: (T, J) of one episode [rad, m].
+        table_height_m: of the table on which the parts stand.
 
     Returns:
         None when a gripper never closes.
@@ -148,7 +151,8 @@ def grasp_start(embodiment: Embodiment, pair: PartPair, position: Array) -> Star
         moment = grasp_frame(embodiment, position, arm)
         if moment is None:
             return None
-        poses.append(_standing_pose(embodiment, part, yaw, position[moment], arm))
+        pose = _standing_pose(embodiment, part, yaw, position[moment], arm)
+        poses.append(pose + np.eye(7)[2] * table_height_m)
     first = np.clip(position[:1], embodiment.lower, embodiment.upper).astype(float)
     return Start(first, first, plug=poses[1][None], socket=poses[0][None], settle_s=_SETTLE_S)
 
@@ -172,7 +176,7 @@ def grasp_frame(embodiment: Embodiment, position: Array, arm: int) -> int | None
 
 
 def _standing_pose(embodiment: Embodiment, part: Part, nominal_yaw: float, joints: Array, arm: int) -> Array:
-    """Pose (7,) of an upright part on the table, held ideally by a hand at these joints (J,)."""
+    """Pose (7,) of an upright part on a table at height 0, held ideally by a hand at these joints (J,)."""
     tcp, rotation = (
         item.numpy() for item in embodiment.tcp_poses(torch.as_tensor(joints, dtype=torch.float64))
     )

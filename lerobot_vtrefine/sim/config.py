@@ -7,6 +7,7 @@ from pathlib import Path
 PROCEDURAL_PAIRS = ("round", "square", "hexagon", "d_shape", "cross", "key")
 MESH_PAIR_PREFIX = "automate/"
 STARTS = ("table", "grasped")
+MAX_TABLE_HEIGHT_M = 0.2
 BACKENDS = ("single", "batch", "warp")
 
 
@@ -48,6 +49,9 @@ class SceneConfig:
     start: str = "table"
     """table: both parts stand on the table. grasped: both are in hand."""
     embodiment: str = "aloha"
+    table_height_m: float = 0.0
+    """Height of the table's top in the world, in which the arms' bases have fixed places. A lab's arms may
+    stand higher or lower beside their table: `vtrefine-replay` estimates it from recorded episodes."""
     mesh_dir: Path | None = None
     """Folder with {ID}_plug.obj and {ID}_socket.obj, for automate/ID."""
     mesh_scale: str = "flexitac"
@@ -74,6 +78,11 @@ class SceneConfig:
             raise ValueError(f"timestep_s must lie in (0, 0.005] s, got {self.timestep_s}")
         if not self.clearance_m > 0.0:
             raise ValueError(f"clearance_m must be above 0, got {self.clearance_m}")
+        if not abs(self.table_height_m) <= MAX_TABLE_HEIGHT_M:
+            raise ValueError(
+                f"table_height_m must lie within -{MAX_TABLE_HEIGHT_M} .. {MAX_TABLE_HEIGHT_M} m,"
+                f" got {self.table_height_m}"
+            )
         if self.negative_control_m < 0.0:
             raise ValueError(f"negative_control_m must not be negative, got {self.negative_control_m}")
         for name in (
@@ -193,6 +202,21 @@ class TaskConfig:
     def steps_of(self, start: str) -> int:
         """Control steps of an episode from this start."""
         return self.episode_steps or {"table": 240, "grasped": 48}[start]
+
+
+@dataclass(frozen=True)
+class ShearConfig:
+    """Tangential force per taxel, a channel of its own: FlexiTac measures pressure only, so no policy of this
+    package reads it. Its friction is the scene's `pad_friction`, or what randomisation made of it.
+    """
+
+    on: bool = False
+    stiffness_n_per_m: float = 400.0
+    """Tangential stiffness of the skin under one taxel."""
+
+    def __post_init__(self) -> None:
+        if not self.stiffness_n_per_m > 0.0:
+            raise ValueError(f"shear.stiffness_n_per_m must be above 0, got {self.stiffness_n_per_m}")
 
 
 @dataclass(frozen=True)

@@ -8,6 +8,7 @@ from dataclasses import dataclass, fields
 import numpy as np
 
 from lerobot_vtrefine.sim import task
+from lerobot_vtrefine.sim.backends.base import LOAD_SIZE
 from lerobot_vtrefine.sim.config import LimitsConfig, SuccessConfig, TaskConfig
 from lerobot_vtrefine.sim.substeps import Substeps
 
@@ -51,7 +52,7 @@ class EpisodeState:
     pad_force: Array
     """(N, 4) normal force on each pad at the last substep [N]."""
     pad_load: Array
-    """(N, 4, 3) normal force [N] and its centre x, y in the pad's frame [m]."""
+    """(N, 4, LOAD_SIZE) what the solver says of each pad."""
     step_force: Array
     """(N,) peak of the averaged contact force in the last control step [N]."""
     peak_force: Array
@@ -84,7 +85,7 @@ class EpisodeState:
             "force_tail": ((n, window - 1, 3), float),
             "part_force": ((n, 3), float),
             "pad_force": ((n, 4), float),
-            "pad_load": ((n, 4, 3), float),
+            "pad_load": ((n, 4, LOAD_SIZE), float),
             "step_force": ((n,), float),
             "peak_force": ((n,), float),
             "rim_slide": ((n,), float),
@@ -125,7 +126,7 @@ class Measured:
     """(m, hand, 3)"""
     substeps: Substeps
     pad_load: Array
-    """(m, 4, 3)"""
+    """(m, 4, LOAD_SIZE)"""
     diverged: Array
     """(m,)"""
 

@@ -48,7 +48,7 @@ def describe(
     `time_left` and `hold` are fractions; `shift` and `force` fractions of the limits that end the episode.
     """
     m = len(ids)
-    insertion = task.insertion(scene.pair, seen.plug, seen.socket)
+    insertion = task.insertion(scene.pair, seen.plug, seen.socket, scene.config.table_height_m)
     relative = turn_back(seen.socket[1], seen.plug_velocity[:, :3] - seen.socket_velocity[:, :3])
     spin = turn_back(seen.socket[1], seen.plug_velocity[:, 3:] - seen.socket_velocity[:, 3:])
     columns = {

@@ -125,8 +125,9 @@ def _set_options(spec: mujoco.MjSpec, config: SceneConfig) -> None:
 
 def _add_table(spec: mujoco.MjSpec, config: SceneConfig) -> None:
     half = np.asarray(TABLE_SIZE_M) / 2
+    middle = [0, 0, config.table_height_m - half[2]]
     table = spec.worldbody.add_geom(
-        name="table", type=mujoco.mjtGeom.mjGEOM_BOX, size=half, pos=[0, 0, -half[2]], material="table"
+        name="table", type=mujoco.mjtGeom.mjGEOM_BOX, size=half, pos=middle, material="table"
     )
     table.contype, table.conaffinity = TABLE, 0
     table.friction = [config.part_friction, 0.005, 0.0001]

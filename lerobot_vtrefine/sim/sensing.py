@@ -10,6 +10,7 @@ import numpy as np
 import torch
 
 from lerobot_vtrefine.embodiments import Embodiment
+from lerobot_vtrefine.sim.config import ShearConfig
 from lerobot_vtrefine.sim.host import to_host
 from lerobot_vtrefine.sim.pairs import Part
 from lerobot_vtrefine.sim.rotations import quat_to_matrix, turn, turn_back
@@ -22,11 +23,15 @@ from lerobot_vtrefine.tactile import (
     SensorModel,
     layout_from_mesh,
 )
+from lerobot_vtrefine.tactile.shear import Shear, ShearSensors
 
 if TYPE_CHECKING:
     from lerobot_vtrefine.sim.touch import Touch
 
 Array = np.ndarray
+
+HELD = (1, 1, 0, 0)
+"""What each pad holds, of (plug, socket): the left hand the socket, the right one the plug."""
 
 
 @dataclass(frozen=True)
@@ -78,13 +83,14 @@ def pad_loads(embodiment: Embodiment, joints: Array, contacts: Array) -> Array:
         contacts: (m, 4, 10) found, force of the pad on its counterpart, torque, centre; world frame.
 
     Returns:
-        (m, 4, 3): normal force pressing on the pad [N], its centre's x and y in the pad's frame [m].
+        (m, 4, LOAD_SIZE): normal force pressing on the pad [N], its centre's x and y [m], the tangential
+        force on the pad along x and y [N]; in the pad's frame, zeros where nothing touches.
     """
     position, rotation = (item.numpy() for item in embodiment.pad_poses(torch.from_numpy(joints)))
-    force = turn_back(rotation, contacts[..., 1:4])[..., 2]
+    force = turn_back(rotation, contacts[..., 1:4])
     centre = turn_back(rotation, contacts[..., 7:10] - position)[..., :2]
     touched = contacts[..., 0] > 0
-    load = np.concatenate([np.maximum(force, 0.0)[..., None], centre], -1)
+    load = np.concatenate([np.maximum(force[..., 2:], 0.0), centre, -force[..., :2]], -1)
     return np.where(touched[..., None], load, 0.0)
 
 
@@ -99,6 +105,7 @@ class Pads:
         control_dt_s: float,
         device: str = "cpu",
         num_threads: int = 1,
+        shear: ShearConfig | None = None,
     ) -> None:
         self._dt_s = control_dt_s
         bodies = [_touch_geometry(scene.pair.plug), _touch_geometry(scene.pair.socket)]
@@ -106,31 +113,62 @@ class Pads:
         self.sensors = PadSensors(
             self.layout, bodies, num_envs, 4, model=model, device=device, num_threads=num_threads
         )
-        self.remembers = model.has_state
-        """Whether readings depend on earlier ones, so that every control step must `advance`."""
+        self._shear = None
+        if shear is not None and shear.on:
+            skin = Shear(scene.config.pad_friction, shear.stiffness_n_per_m)
+            self._shear = ShearSensors(self.layout, num_envs, HELD, skin, device)
+        self._in_order = model.has_state
         self._last = np.zeros((num_envs, 4, self.layout.num_taxels), np.uint8)
 
-    def reset(self, ids: Array, seeds: Array, stiffness_scale: Array, gain_scale: Array) -> None:
-        """Start new episodes: sensor traits and noise follow the seeds (m,)."""
+    @property
+    def remembers(self) -> bool:
+        """Whether readings depend on earlier ones, so that every control step must `advance`."""
+        return self._in_order or self._shear is not None
+
+    def reset(self, ids: Array, seeds: Array, drawn: dict[str, Array]) -> None:
+        """Start new episodes: sensor traits and noise follow the seeds (m,); `drawn` holds the worlds'
+        parameters by the names of `RandomizationConfig`.
+        """
         self.sensors.reset(ids, seeds)
-        self.sensors.randomize(ids, stiffness_scale=stiffness_scale, gain_scale=gain_scale)
+        stiffness, gain = drawn["pad_stiffness_scale"], drawn["sensor_gain_scale"]
+        self.sensors.randomize(ids, stiffness_scale=stiffness, gain_scale=gain)
+        if self._shear is not None:
+            self._shear.reset(ids, drawn["pad_friction"])
 
     def advance(self, ids: Array, touch: "Touch") -> None:
-        """Let one control step pass, for models that remember."""
-        self._last[ids] = self._read(ids, touch)
+        """Let one control step pass, for readings that remember."""
+        if self._shear is not None:
+            poses = Poses(*touch.poses)
+            normal = self.sensors.forces(ids, poses, self._dt_s, touch.load)
+            self._shear.advance(ids, normal, poses, self._dt_s, touch.pull)
+        if self._in_order:
+            self._last[ids] = self._read(ids, touch)
 
     def counts(self, ids: Array, touch: "Touch") -> Array:
         """Raw counts (m, 4, 384) uint8 at the worlds' present state."""
-        return self._last[ids] if self.remembers else self._read(ids, touch)
+        return self._last[ids] if self._in_order else self._read(ids, touch)
+
+    def shear(self, ids: Array) -> Array:
+        """Tangential force per taxel (m, 4, 384, 2) float32 [N] as of the last control step.
+
+        Raises:
+            ValueError: shear is off.
+        """
+        if self._shear is None:
+            raise ValueError("shear is off: switch it on with --env.shear.on=true or ShearConfig(on=True)")
+        return to_host(self._shear.forces(ids).flatten(2, 3))
 
     def get_state(self, env: int) -> dict[str, Any]:
         """Everything that world `env`'s readings depend on."""
-        return {"sensors": self.sensors.get_state(env), "last": self._last[env].copy()}
+        state = {"sensors": self.sensors.get_state(env), "last": self._last[env].copy()}
+        return state if self._shear is None else {**state, "shear": self._shear.get_state(env)}
 
     def set_state(self, env: int, state: dict[str, Any]) -> None:
         """Continue from a state taken by `get_state`."""
         self.sensors.set_state(env, state["sensors"])
         self._last[env] = state["last"]
+        if self._shear is not None:
+            self._shear.set_state(env, state["shear"])
 
     def _read(self, ids: Array, touch: "Touch") -> Array:
         counts = self.sensors.counts(ids, Poses(*touch.poses), self._dt_s, touch.load)

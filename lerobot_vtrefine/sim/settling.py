@@ -9,6 +9,7 @@ import numpy as np
 
 from lerobot_vtrefine.sim import starts, task
 from lerobot_vtrefine.sim.backends import Backend
+from lerobot_vtrefine.sim.backends.base import LOAD_SIZE
 from lerobot_vtrefine.sim.config import TaskConfig
 from lerobot_vtrefine.sim.scene import Scene
 from lerobot_vtrefine.sim.touch import TouchSource
@@ -27,7 +28,7 @@ class _Rest:
     command: Array
     """(nu,)"""
     pad_load: Array
-    """(4, 3)"""
+    """(4, LOAD_SIZE)"""
 
 
 class Settler:
@@ -43,13 +44,13 @@ class Settler:
         same seed left them; to `start` where one is given.
 
         Returns:
-            Servo commands (m, nu), and loads on the pads (m, 4, 3) see `Touch.load`.
+            Servo commands (m, nu), and loads on the pads (m, 4, LOAD_SIZE).
         """
         rests = self._rests(ids, seeds) if start is None else self._settle_physically(ids, start)
         if len(rests):
             self._backend.set_rows(ids, np.stack([rest.row for rest in rests]))
         command = np.reshape([rest.command for rest in rests], (len(ids), -1))
-        return command, np.reshape([rest.pad_load for rest in rests], (len(ids), 4, 3))
+        return command, np.reshape([rest.pad_load for rest in rests], (len(ids), 4, LOAD_SIZE))
 
     def _rests(self, ids: Array, seeds: Array) -> list[_Rest]:
         known = [self._settled.get(int(seed)) for seed in seeds]
@@ -78,6 +79,7 @@ class Settler:
         pair, robot = self._scene.pair, self._scene.embodiment
         if self._scene.config.start == "table":
             draws = starts.uniform_draws(seeds, _START_STREAM, starts.TABLE_DRAWS)
-            return starts.start_on_table(self._config.table, pair, robot, draws)
+            table_m = self._scene.config.table_height_m
+            return starts.start_on_table(self._config.table, pair, robot, table_m, draws)
         draws = starts.uniform_draws(seeds, _START_STREAM, starts.GRASPED_DRAWS)
         return starts.start_in_hand(self._config.grasped, pair, robot, draws)

@@ -12,7 +12,14 @@ import numpy as np
 from lerobot_vtrefine.sim import sensing, starts, task
 from lerobot_vtrefine.sim.backends import Trace, get_backend
 from lerobot_vtrefine.sim.backends.batch import usable_cores
-from lerobot_vtrefine.sim.config import RANGES, RandomizationConfig, SceneConfig, TaskConfig, WarpConfig
+from lerobot_vtrefine.sim.config import (
+    RANGES,
+    RandomizationConfig,
+    SceneConfig,
+    ShearConfig,
+    TaskConfig,
+    WarpConfig,
+)
 from lerobot_vtrefine.sim.depth import DepthCamera
 from lerobot_vtrefine.sim.drive import make_drive
 from lerobot_vtrefine.sim.episode import EpisodeState, Measured, update
@@ -60,6 +67,7 @@ class InsertionSim:
         randomization: differences between worlds.
         warp: device and buffers of the warp backend.
         robot_faults: what the arms do that commands and readings do not tell.
+        shear: whether `shear` gives tangential forces, and the skin that they strain.
 
     Raises:
         ValueError: zero worlds, or a setting that makes no sense.
@@ -77,6 +85,7 @@ class InsertionSim:
         randomization: RandomizationConfig | None = None,
         warp: WarpConfig | None = None,
         robot_faults: RobotFaults | None = None,
+        shear: ShearConfig | None = None,
     ) -> None:
         if num_envs < 1:
             raise ValueError(f"num_envs must be at least 1, got {num_envs}")
@@ -92,7 +101,9 @@ class InsertionSim:
         model = SensorModel.named(sensor) if isinstance(sensor, str) else sensor
         device = self._backend.device
         threads = (num_threads or usable_cores()) if backend == "batch" else 1
-        self._pads = sensing.Pads(self.scene, model, num_envs, self.config.control_dt_s, device, threads)
+        self._pads = sensing.Pads(
+            self.scene, model, num_envs, self.config.control_dt_s, device, threads, shear
+        )
         window = max(1, round(self.config.limits.force_window_s / self.scene.config.timestep_s))
         self._episode = EpisodeState.empty(num_envs, self.scene.model.nu, window)
         self._rates = task.rate_limits(self.scene.embodiment, self.config)
@@ -154,14 +165,13 @@ class InsertionSim:
         command, state.pad_load[ids] = self._settler.settle(ids, seeds, start)
         state.command[ids] = self._drive.reset(ids, command)
         state.pad_force[ids] = state.pad_load[ids][..., 0]
-        scale = drawn.values["pad_stiffness_scale"], drawn.values["sensor_gain_scale"]
-        self._pads.reset(ids, seeds, *scale)
+        self._pads.reset(ids, seeds, drawn.values)
         seen = self._seen(ids)
         measured = self._grip_points(seen)
         in_hand = self.scene.config.start == "grasped"
         state.grasped[ids] = in_hand
         state.reference[ids] = measured
-        state.tip[ids] = task.insertion(self.scene.pair, seen.plug, seen.socket).position_m
+        state.tip[ids] = self._insertion(seen).position_m
         self._remember(ids)
 
     def step(self, action: Array, ids: Array | None = None) -> StepResult:
@@ -214,6 +224,18 @@ class InsertionSim:
         ids = self._checked(ids)
         return self._pads.counts(ids, self._touch_at(ids))
 
+    def shear(self, ids: Array | None = None) -> Array:
+        """Tangential forces on the taxels at the end of the last control step, (m, 4, 384, 2) float32 [N]:
+        along x and y of the pad's frame.
+
+        They add up to the solver's tangential force on that pad, and none exceeds friction times the
+        taxel's normal force. Both hold for the `consistent` contact model; others do not conserve the load.
+
+        Raises:
+            ValueError: shear is off.
+        """
+        return self._pads.shear(self._checked(ids))
+
     def hold(self) -> None:
         """Let the physics of one control step pass under the present commands, and nothing else."""
         command = self._episode.command
@@ -236,7 +258,7 @@ class InsertionSim:
     def insertion(self, ids: Array | None = None) -> task.Insertion:
         """Where each plug is with respect to its socket."""
         seen = self._seen(self._checked(ids))
-        return task.insertion(self.scene.pair, seen.plug, seen.socket)
+        return self._insertion(seen)
 
     def privileged(self, ids: Array | None = None) -> Array:
         """State for a critic, (m, P) float32, columns named by `privileged_names`."""
@@ -318,6 +340,9 @@ class InsertionSim:
         if self._pads.remembers:
             self._pads.advance(ids, self._touch_at(ids))
 
+    def _insertion(self, seen: Kinematics) -> task.Insertion:
+        return task.insertion(self.scene.pair, seen.plug, seen.socket, self.scene.config.table_height_m)
+
     def _grip_points(self, seen: Kinematics) -> Array:
         grips = self.scene.pair.socket.grip, self.scene.pair.plug.grip
         return task.grip_points(grips, (seen.socket, seen.plug), (seen.hand_position, seen.hand_rotation))
@@ -325,10 +350,10 @@ class InsertionSim:
     def _measure(self, ids: Array, seen: Kinematics, trace: Trace) -> Measured:
         scene, pair, state = self.scene, self.scene.pair, self._episode
         before = state.tip[ids], state.force_tail[ids]
-        rest = np.array([pair.socket.rest_height_m, pair.plug.rest_height_m])
+        rest = np.array([pair.socket.rest_height_m, pair.plug.rest_height_m]) + scene.config.table_height_m
         positions = np.stack([seen.socket[0], seen.plug[0]], 1)
         return Measured(
-            insertion=task.insertion(pair, seen.plug, seen.socket),
+            insertion=self._insertion(seen),
             grip_points=self._grip_points(seen),
             part_heights=positions[..., 2] - rest,
             part_positions=positions,

@@ -41,7 +41,9 @@ def uniform_draws(seeds: Array, stream: int, count: int) -> Array:
     return np.reshape(rows, (len(seeds), count))
 
 
-def start_on_table(config: TableStart, pair: PartPair, embodiment: Embodiment, draws: Array) -> Start:
+def start_on_table(
+    config: TableStart, pair: PartPair, embodiment: Embodiment, table_height_m: float, draws: Array
+) -> Start:
     """Both parts stand upright in their squares, both arms at home. `draws`: (m, TABLE_DRAWS)."""
     poses = []
     for part, centre, own in (
@@ -49,7 +51,7 @@ def start_on_table(config: TableStart, pair: PartPair, embodiment: Embodiment, d
         (pair.socket, config.socket_centre_m, draws[:, 3:6]),
     ):
         xy = np.asarray(centre) + config.square_m / 2 * own[:, :2]
-        height = np.full((len(draws), 1), part.rest_height_m)
+        height = np.full((len(draws), 1), table_height_m + part.rest_height_m)
         quat = matrix_to_quat(about_axis(2, config.yaw_rad * own[:, 2]))
         poses.append(np.concatenate([xy, height, quat], 1))
     home = np.tile(embodiment.home, (len(draws), 1))

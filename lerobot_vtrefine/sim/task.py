@@ -40,6 +40,7 @@ class Insertion:
     lateral_m: Array
     tilt_rad: Array
     mouth_height_m: Array
+    """Above the table."""
 
 
 def servo_commands(embodiment: Embodiment, targets: Array) -> Array:
@@ -62,11 +63,11 @@ def rate_limits(embodiment: Embodiment, config: TaskConfig) -> Array:
     return np.array(arm * 2) * config.control_dt_s
 
 
-def insertion(pair: PartPair, plug: Pose, socket: Pose) -> Insertion:
+def insertion(pair: PartPair, plug: Pose, socket: Pose, table_height_m: float) -> Insertion:
     """Pose of the plug in the socket's frame and what follows from it."""
     position = turn_back(socket[1], plug[0] - socket[0])
     rotation = np.swapaxes(socket[1], -1, -2) @ plug[1]
-    mouth_height = socket[0][:, 2] + pair.mouth_z_m * socket[1][:, 2, 2]
+    mouth_height = socket[0][:, 2] + pair.mouth_z_m * socket[1][:, 2, 2] - table_height_m
     return Insertion(
         position_m=position,
         rotation=rotation,

@@ -30,6 +30,8 @@ class Touch:
     """
     load: ArrayLike
     """(m, 4, 3) normal force [N], its centre's x and y in the pad's frame [m]."""
+    pull: ArrayLike
+    """(m, 4, 2) tangential force on the pad, in its frame [N]: what `Pads` shares out as shear."""
 
 
 class TouchSource(ABC):
@@ -37,7 +39,7 @@ class TouchSource(ABC):
 
     @abstractmethod
     def load(self, ids: Array, trace: Trace) -> Array:
-        """Loads on the pads (m, 4, 3) on the host, at the end of a trace that has just been made."""
+        """Loads on the pads (m, 4, LOAD_SIZE) on the host, at the end of a trace that has just been made."""
 
     @abstractmethod
     def __call__(self, ids: Array, see: Callable[[], Kinematics], load: Array) -> Touch:
@@ -68,7 +70,7 @@ class HostTouch(TouchSource):
             np.stack([seen.plug[1], seen.socket[1]], 1),
             np.stack([seen.plug_velocity, seen.socket_velocity], 1),
         )
-        return Touch(poses, load)
+        return Touch(poses, load[..., :3], load[..., 3:])
 
 
 class DeviceTouch(TouchSource):
@@ -79,7 +81,7 @@ class DeviceTouch(TouchSource):
 
     def load(self, ids: Array, trace: Trace) -> Array:
         """See `TouchSource.load`."""
-        return to_host(self._reader(ids)[1]).astype(float)
+        return to_host(torch.cat(self._reader(ids)[1:], -1)).astype(float)
 
     def __call__(self, ids: Array, see: Callable[[], Kinematics], load: Array) -> Touch:
         """See `TouchSource.__call__`."""

@@ -3,17 +3,20 @@
 FlexiTac measures pressure only, so this is no part of the counts: it is a channel of its own, for sensors
 that measure shear and for whoever wants to see slip.
 
-Shapes: m environments, P pads, R x C taxels; x, y in the pad's frame.
+Shapes: m environments of n, P pads, B bodies, R x C taxels; x, y in the pad's frame, forces on the pad.
 """
 
-from dataclasses import dataclass
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
 
 import torch
 
 from lerobot_vtrefine.tactile.layout import PadLayout
-from lerobot_vtrefine.tactile.poses import Poses
+from lerobot_vtrefine.tactile.poses import ArrayLike, Poses
 
-NEWTON_STEPS = 30
+NEWTON_STEPS = 50
+ENOUGH_N = 1e-9
+"""Forces that add up to their total this well are good enough."""
 FULL_SLIP = 1 - 1e-5
 """Share of the friction limit above which a pad counts as slipping as a whole."""
 
@@ -25,15 +28,16 @@ class Shear:
     Raises ValueError unless both parameters are positive.
     """
 
-    friction: float = 1.0
-    """Coulomb's coefficient, as the solver has it for the pads."""
-    stiffness_n_per_m: float = 400.0
+    friction: float | torch.Tensor
+    """Coulomb's coefficient, as the solver has it for the pads; one, or one per environment (m, 1, 1, 1)."""
+    stiffness_n_per_m: float
     """Tangential stiffness of one taxel."""
 
     def __post_init__(self) -> None:
         for name in ("friction", "stiffness_n_per_m"):
-            if not getattr(self, name) > 0:
-                raise ValueError(f"shear.{name} must be positive, got {getattr(self, name)}")
+            value = getattr(self, name)
+            if not bool(torch.as_tensor(value > 0).all()):
+                raise ValueError(f"shear.{name} must be positive, got {value}")
 
     def step(
         self, normal: torch.Tensor, strain: torch.Tensor, motion: torch.Tensor, total: torch.Tensor
@@ -62,78 +66,141 @@ class Shear:
         """What must be added to every taxel's trial force for the capped forces to add up: (m, P, 1, 1, 2).
 
         Newton's method on a monotone function; a stuck taxel gives way in all directions, a slipping one
-        only across its force.
+        only across its force. Steps that leave more missing are halved.
         """
-        common = torch.zeros_like(total)
-        eye = torch.eye(2, dtype=trial.dtype, device=trial.device)
+        loaded = (limit > 0).to(trial.dtype)
+        count = loaded.sum((-3, -2), keepdim=True).clamp(min=1.0)
+        best = trial_common = (total - (loaded * trial).sum((-3, -2), keepdim=True)) / count
+        step, least = torch.zeros_like(best), torch.full_like(best[..., :1], torch.inf)
         for _ in range(NEWTON_STEPS):
-            wanted = trial + common
-            size = wanted.norm(dim=-1, keepdim=True).clamp(min=1e-12)
+            wanted = trial + trial_common
             missing = total - _capped(wanted, limit).sum((-3, -2), keepdim=True)
-            along = (wanted / size)[..., :, None] * (wanted / size)[..., None, :]
-            give = torch.where(
-                (size <= limit)[..., None], eye.expand_as(along), (limit / size)[..., None] * (eye - along)
-            )
-            slope = give.sum((-4, -3), keepdim=True)
-            step = torch.linalg.solve(slope + 1e-3 * eye, missing[..., None])[..., 0]
-            # Where nearly all slip the slope vanishes: steps no longer than the way so far.
-            longest = (missing.norm(dim=-1) + common.norm(dim=-1))[..., None]
-            common = common + _capped(step, longest)
-        return common
+            size = missing.norm(dim=-1, keepdim=True)
+            better = size < least
+            best, least = torch.where(better, trial_common, best), torch.minimum(least, size)
+            if least.numel() == 0 or float(least.max()) < ENOUGH_N:
+                break
+            step = torch.where(better, _solve(_slope(wanted, limit), missing), 0.5 * step)
+            trial_common = best + step
+        return best
 
 
 class ShearSensors:
-    """Shear of the pads of `num_envs` environments, with each environment's memory kept here."""
+    """Shear of the pads of n environments, with each environment's memory kept here.
+
+    Args:
+        layout: taxels of every pad.
+        num_envs: n.
+        held: for each of the P pads, which of the B bodies it holds; that body's motion over the pad strains
+            the skin.
+        model: friction and stiffness.
+        device: torch device on which everything is computed.
+    """
 
     def __init__(
-        self, layout: PadLayout, num_envs: int, num_pads: int = 4, model: Shear | None = None
+        self, layout: PadLayout, num_envs: int, held: Sequence[int], model: Shear, device: str = "cpu"
     ) -> None:
-        self.model = model or Shear()
-        columns, rows = (torch.as_tensor(axis, dtype=torch.float64) for axis in layout.axes_m())
+        self.model, self._held, self._device = model, list(held), device
+        columns, rows = (
+            torch.as_tensor(axis, dtype=torch.float64, device=device) for axis in layout.axes_m()
+        )
         self._place = torch.stack(torch.meshgrid(columns, rows, indexing="xy"), -1)
-        self._strain = torch.zeros((num_envs, num_pads, layout.rows, layout.cols, 2), dtype=torch.float64)
+        shape = (num_envs, len(self._held), layout.rows, layout.cols, 2)
+        self._strain = torch.zeros(shape, dtype=torch.float64, device=device)
+        self._force = torch.zeros(shape, dtype=torch.float32, device=device)
+        self._friction = torch.ones(num_envs, dtype=torch.float64, device=device) * model.friction
 
-    def reset(self, ids: torch.Tensor) -> None:
-        """Forget what environments `ids` (m,) had felt."""
-        self._strain[ids] = 0.0
+    def reset(self, ids: ArrayLike, friction: ArrayLike | None = None) -> None:
+        """Forget what environments `ids` (m,) had felt, and give them their own friction (m,)."""
+        index = self._index(ids)
+        self._strain[index], self._force[index] = 0.0, 0.0
+        if friction is not None:
+            self._friction[index] = torch.as_tensor(friction, dtype=torch.float64, device=self._device)
 
-    def forces(
-        self,
-        ids: torch.Tensor,
-        normal: torch.Tensor,
-        poses: Poses,
-        dt_s: float,
-        total: torch.Tensor,
-        body: int = 0,
+    def advance(
+        self, ids: ArrayLike, normal: ArrayLike, poses: Poses, dt_s: float, total: ArrayLike
     ) -> torch.Tensor:
-        """Tangential force per taxel on the pad, in its frame: (m, P, R, C, 2) [N]; advances one frame.
+        """One frame of environments `ids` (m,).
 
         Args:
+            ids: (m,) without repetition.
             normal: (m, P, R * C) normal forces, as `PadSensors.forces` gives them [N].
             poses: as for `PadSensors`.
+            dt_s: time since the previous frame [s].
             total: (m, P, 2) the solver's tangential force on each pad [N].
-            body: which body the pads hold; its motion over the pads strains the skin.
+
+        Returns:
+            Tangential force per taxel on the pad, in its frame: (m, P, R, C, 2) float32 [N].
         """
-        strain = self._strain[ids]
-        image = torch.as_tensor(normal, dtype=torch.float64).reshape(strain.shape[:-1])
-        motion = dt_s * slip_velocity(self._place, poses, body)
-        wanted = torch.as_tensor(total, dtype=torch.float64)
-        force, self._strain[ids] = self.model.step(image, strain, motion, wanted)
-        return force
+        index = self._index(ids)
+        strain = self._strain[index]
+        motion = dt_s * slip_velocity(self._place, Poses(*map(self._tensor, poses)), self._held)
+        model = replace(self.model, friction=self._friction[index].view(-1, 1, 1, 1))
+        image = self._tensor(normal).reshape(strain.shape[:-1])
+        force, self._strain[index] = model.step(image, strain, motion, self._tensor(total))
+        self._force[index] = force.to(torch.float32)
+        return self._force[index]
+
+    def forces(self, ids: ArrayLike) -> torch.Tensor:
+        """What the last frame gave: (m, P, R, C, 2) float32 [N], zeros after a reset."""
+        return self._force[self._index(ids)]
+
+    def get_state(self, env: int) -> dict[str, torch.Tensor]:
+        """Everything that one environment's next readings depend on, apart from its poses and forces."""
+        parts = {"strain": self._strain, "force": self._force, "friction": self._friction}
+        return {name: part[env].clone() for name, part in parts.items()}
+
+    def set_state(self, env: int, state: dict[str, torch.Tensor]) -> None:
+        """Inverse of `get_state`."""
+        self._strain[env], self._force[env] = state["strain"], state["force"]
+        self._friction[env] = state["friction"]
+
+    def _index(self, ids: ArrayLike) -> torch.Tensor:
+        return torch.as_tensor(ids, dtype=torch.long, device=self._device)
+
+    def _tensor(self, array: ArrayLike) -> torch.Tensor:
+        return torch.as_tensor(array, dtype=torch.float64, device=self._device)
 
 
-def slip_velocity(place: torch.Tensor, poses: Poses, body: int) -> torch.Tensor:
-    """Velocity of a body over points `place` (R, C, 2) of every pad, in its plane: (m, P, R, C, 2) [m/s]."""
-    given = (torch.as_tensor(item, dtype=torch.float64) for item in poses)
-    pad_pos, pad_rot, pad_vel, body_pos, _, body_vel = given
-    to_pad = pad_pos - body_pos[:, body, None]
-    turning = body_vel[:, body, None, 3:].expand_as(to_pad)
-    linear = body_vel[:, body, None, :3] + torch.linalg.cross(turning, to_pad) - pad_vel[..., :3]
+def slip_velocity(place: torch.Tensor, poses: Poses, held: Sequence[int]) -> torch.Tensor:
+    """Velocity of the body that each pad holds over points `place` (R, C, 2) of the pad, in its plane.
+
+    Args:
+        place: points in the pads' frames [m].
+        poses: float64 tensors.
+        held: (P,) bodies.
+
+    Returns:
+        (m, P, R, C, 2) [m/s].
+    """
+    pad_pos, pad_rot, pad_vel, body_pos, _, body_vel = (torch.as_tensor(item) for item in poses)
+    chosen = torch.as_tensor(held, device=body_pos.device)
+    body_pos, body_vel = body_pos[:, chosen], body_vel[:, chosen]
+    turning = body_vel[..., 3:]
+    linear = body_vel[..., :3] + torch.linalg.cross(turning, pad_pos - body_pos) - pad_vel[..., :3]
     back = pad_rot.transpose(-1, -2)
     sliding = (back @ linear[..., None])[..., :2, 0]
     spin = (back @ (turning - pad_vel[..., 3:])[..., None])[..., 2, 0]
     lever = torch.stack([-place[..., 1], place[..., 0]], -1)
     return sliding[..., None, None, :] + spin[..., None, None, None] * lever
+
+
+def _slope(wanted: torch.Tensor, limit: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
+    """Derivative of the sum of capped forces: xx, xy, yy of a symmetric matrix, each (m, P, 1, 1, 1)."""
+    size = wanted.norm(dim=-1, keepdim=True).clamp(min=1e-12)
+    x, y = (wanted / size).split(1, dim=-1)
+    stuck, give = size <= limit, limit / size
+    parts = (torch.where(stuck, 1.0, give * y * y), torch.where(stuck, 0.0, -give * x * y))
+    parts += (torch.where(stuck, 1.0, give * x * x),)
+    xx, xy, yy = (part.sum((-3, -2), keepdim=True) for part in parts)
+    return xx + 1e-3, xy, yy + 1e-3
+
+
+def _solve(slope: tuple[torch.Tensor, torch.Tensor, torch.Tensor], right: torch.Tensor) -> torch.Tensor:
+    """Solution (..., 2) of 2 x 2 systems with a positive definite matrix."""
+    xx, xy, yy = slope
+    x, y = right.split(1, dim=-1)
+    return torch.cat([yy * x - xy * y, xx * y - xy * x], -1) / (xx * yy - xy * xy)
 
 
 def _capped(vectors: torch.Tensor, limit: torch.Tensor) -> torch.Tensor:

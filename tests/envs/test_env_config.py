@@ -35,6 +35,8 @@ def test_flags_reach_every_level():
         "--env.rules.limits.contact_force_n=25",
         "--env.scene.pad_friction=0.8",
         "--env.randomization.pad_friction=[0.5,1.0]",
+        "--env.shear.on=true",
+        "--env.shear.stiffness_n_per_m=250",
     )
     assert (config.scene_config.pair, config.scene_config.clearance_m) == ("square", 0.001)
     assert config.scene_config.pad_friction == 0.8
@@ -42,6 +44,8 @@ def test_flags_reach_every_level():
     assert config.task_config.limits.contact_force_n == 25
     assert config.max_episode_steps == 30
     assert config.randomization.pad_friction == (0.5, 1.0)
+    assert (config.shear.on, config.shear.stiffness_n_per_m) == (True, 250.0)
+    assert not VtRefineEnvConfig().shear.on
 
 
 def test_episode_length_follows_the_start():

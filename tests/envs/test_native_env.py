@@ -9,7 +9,9 @@ from lerobot_vtrefine.envs import VtRefineEnvConfig
 from lerobot_vtrefine.envs.episode_log import EpisodeLog, read_episode_log
 from lerobot_vtrefine.envs.episodes import Episodes
 from lerobot_vtrefine.envs.schedule import ReadSchedule
+from lerobot_vtrefine.envs.single_env import VtRefineEnv
 from lerobot_vtrefine.envs.vector_env import LazyFrames, VtRefineVectorEnv
+from lerobot_vtrefine.sim.config import ShearConfig
 
 
 @pytest.fixture
@@ -226,3 +228,18 @@ def test_no_video_starts_no_renderer(make_env, monkeypatch):
     env = make_env(2, video_episodes=0)
     env.reset(seed=[0, 1])
     assert np.stack(env.call("render")[:2]).max() == 0
+
+
+def test_shear_is_part_of_info_when_switched_on():
+    """In the batched environment and in a single one, at reset and at every step; not otherwise."""
+    config = VtRefineEnvConfig(start="grasped", shear=ShearConfig(on=True), num_threads=1)
+    batch, single = VtRefineVectorEnv(config, 2), VtRefineEnv(config)
+    told = [batch.reset(seed=[3, 4])[1], single.reset(seed=4)[1]]
+    action = batch.episodes.sim.command_targets().astype(np.float32)
+    told += [batch.step(action)[-1], single.step(action[1])[-1]]
+    for several, one in ((told[0], told[1]), (told[2], told[3])):
+        assert several["shear"].shape == (2, 4, 384, 2)
+        assert several["shear"].dtype == np.float32
+        np.testing.assert_array_equal(several["shear"][1], one["shear"])
+        assert np.abs(one["shear"]).max() > 1e-3
+    assert "shear" not in VtRefineEnv(VtRefineEnvConfig(start="grasped", num_threads=1)).reset(seed=4)[1]

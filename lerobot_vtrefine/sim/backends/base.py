@@ -17,8 +17,14 @@ if TYPE_CHECKING:
 
 Array = np.ndarray
 Tensor = torch.Tensor
-TouchReader = Callable[[Array], tuple[tuple[Tensor, Tensor, Tensor, Tensor, Tensor, Tensor], Tensor]]
-"""ids (m,) -> positions, rotations, velocities of pads, the same of parts, and the pads' loads (m, 4, 3)."""
+LOAD_SIZE = 5
+"""What the solver says of a pad: normal force [N], its centre's x and y [m], tangential force on the pad
+along x and y [N], in the pad's frame.
+"""
+TouchReader = Callable[[Array], tuple[tuple[Tensor, Tensor, Tensor, Tensor, Tensor, Tensor], Tensor, Tensor]]
+"""ids (m,) -> positions, rotations, velocities of pads, the same of parts, and the two parts of the pads'
+loads: normal forces and centres (m, 4, 3), tangential forces (m, 4, 2).
+"""
 
 
 @dataclass(frozen=True)

@@ -124,9 +124,10 @@ def pad_frames(
     body_rootid: wp.array(dtype=int),
     sensors: wp.array(dtype=float, ndim=2),
     poses: Poses,
+    pull: wp.array(dtype=wp.vec2, ndim=2),
 ) -> None:
     """Pose and velocity of every pad's face, and the solver's load on it: force along the normal [N] and its
-    centre's x and y [m] in the pad's frame, zeros where nothing touches.
+    centre's x and y [m] in the pad's frame, and the tangential force `pull` [N]; zeros where nothing touches.
     """
     row, pad = wp.tid()
     world = ids[row]
@@ -139,14 +140,18 @@ def pad_frames(
     poses.pad_rot[row, pad] = rotation
     poses.pad_vel[row, pad] = velocity_at(cvel[world, body], position, subtree_com[world, body_rootid[body]])
     first = touching.pad_sensor[pad]
-    load = wp.vec3(0.0, 0.0, 0.0)
+    load = wp.vec3()
+    tangential = wp.vec2()
     if sensors[world, first] > 0.0:
         force = wp.vec3(sensors[world, first + 1], sensors[world, first + 2], sensors[world, first + 3])
         centre = wp.vec3(sensors[world, first + 7], sensors[world, first + 8], sensors[world, first + 9])
         back = wp.transpose(rotation)
         local = back * (centre - position)
-        load = wp.vec3(wp.max((back * force)[2], 0.0), local[0], local[1])
+        pressed = back * force
+        load = wp.vec3(wp.max(pressed[2], 0.0), local[0], local[1])
+        tangential = wp.vec2(-pressed[0], -pressed[1])  # the sensor has the pad's force on what it touches
     poses.load[row, pad] = load
+    pull[row, pad] = tangential
 
 
 @wp.kernel

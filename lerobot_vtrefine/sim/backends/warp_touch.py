@@ -34,16 +34,18 @@ class WarpTouch:
         self._touching.part_body = self._numbers(np.array([scene.plug_body, scene.socket_body]))
         self._touching.pad_offset = wp.array(offset.astype(np.float32), dtype=wp.vec3, device=self._device)
         self._touching.pad_turn = wp.array(turn.astype(np.float32), dtype=wp.mat33, device=self._device)
-        self._frames: dict[int, Poses] = {}
+        self._frames: dict[int, tuple[Poses, wp.array]] = {}
 
-    def __call__(self, ids: Array) -> tuple[tuple[Tensor, Tensor, Tensor, Tensor, Tensor, Tensor], Tensor]:
+    def __call__(
+        self, ids: Array
+    ) -> tuple[tuple[Tensor, Tensor, Tensor, Tensor, Tensor, Tensor], Tensor, Tensor]:
         """See `base.TouchReader`."""
-        worlds, frames = self._worlds, self._frames_for(len(ids))
+        worlds, (frames, pull) = self._worlds, self._frames_for(len(ids))
         worlds.kinematics()
         data, index = worlds.data, wp.from_torch(worlds.index(ids))
         motion = [data.cvel, data.subtree_com, worlds.model.body_rootid]
         where = [data.geom_xpos, data.geom_xmat, *motion, data.sensordata]
-        pads = [index, self._touching, *where, frames]
+        pads = [index, self._touching, *where, frames, pull]
         wp.launch(kernels.pad_frames, (len(ids), self._counts["load"]), pads, device=self._device)
         parts = [index, self._touching, data.xpos, data.xmat, *motion, frames]
         wp.launch(kernels.part_frames, (len(ids), self._counts["body_pos"]), parts, device=self._device)
@@ -51,15 +53,16 @@ class WarpTouch:
             *(wp.to_torch(pose) for pose in (frames.pad_pos, frames.pad_rot, frames.pad_vel)),
             *(wp.to_torch(pose) for pose in (frames.body_pos, frames.body_rot, frames.body_vel)),
         )
-        return poses, wp.to_torch(frames.load)
+        return poses, wp.to_torch(frames.load), wp.to_torch(pull)
 
-    def _frames_for(self, count: int) -> Poses:
+    def _frames_for(self, count: int) -> tuple[Poses, wp.array]:
         if count not in self._frames:
             frames = Poses()
             for name, dtype in (PADS | PARTS).items():
                 shape = (count, self._counts[name])
                 setattr(frames, name, wp.zeros(shape, dtype=dtype, device=self._device))
-            self._frames = {count: frames}
+            pull = wp.zeros((count, self._counts["load"]), dtype=wp.vec2, device=self._device)
+            self._frames = {count: (frames, pull)}
         return self._frames[count]
 
     def _numbers(self, values: Array) -> wp.array:

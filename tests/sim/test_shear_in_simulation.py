@@ -1,0 +1,117 @@
+"""Shear as the simulation gives it, against mechanics: weights, the solver's own forces, friction."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from lerobot_vtrefine.sim.config import RandomizationConfig, SceneConfig, ShearConfig, TaskConfig
+from lerobot_vtrefine.sim.sensing import HELD
+from lerobot_vtrefine.sim.simulation import InsertionSim
+from lerobot_vtrefine.tactile import Poses
+
+SCENE = SceneConfig(start="grasped")
+ON = ShearConfig(on=True)
+TWO = np.arange(2)
+
+
+def make(backend="batch", scene=SCENE, num_envs=2, shear=ON, **kwargs):
+    return InsertionSim(scene, TaskConfig(), num_envs=num_envs, backend=backend, shear=shear, **kwargs)
+
+
+@pytest.fixture(scope="module")
+def sim():
+    return make()
+
+
+def normal_forces(sim, ids=TWO):
+    touch = sim._touch_at(ids)
+    return sim._pads.sensors.forces(ids, Poses(*touch.poses), 0.1, touch.load)
+
+
+@pytest.mark.parametrize("backend", ["single", "batch"])
+def test_taxels_add_up_to_the_solvers_force_and_respect_friction(backend):
+    """While the hands move and squeeze, and with the skin remembering what was before."""
+    sim = make(backend, randomization=RandomizationConfig(pad_friction=(0.6, 1.4)))
+    sim.reset(TWO, TWO + 3)
+    rng = np.random.default_rng(0)
+    for _ in range(4):
+        sim.step(sim.command_targets() + rng.normal(0.0, 0.01, (2, 16)))
+        shear, solver = sim.shear(), sim._episode.pad_load[..., 3:]
+        assert np.abs(solver).max() > 0.1
+        np.testing.assert_allclose(shear.sum(2), solver, atol=2e-4)
+        limit = sim._parameters["pad_friction"][:, None, None] * normal_forces(sim)
+        assert (np.linalg.norm(shear, axis=-1) <= limit + 1e-5).all()
+        # Forces are shared by how much each taxel gives way, not by how hard it is pressed.
+        assert (np.linalg.norm(shear, axis=-1) > 1e-4)[limit > 0.01].any()
+
+
+def test_a_part_at_rest_hangs_on_its_two_pads(sim):
+    """The pads of a hand together carry the part's weight, and the force on them points down."""
+    sim.reset(TWO, TWO)
+    for _ in range(3):
+        sim.step(sim.command_targets())
+    shear, normal = sim.shear().sum(2), normal_forces(sim).sum(-1)
+    on_pad = np.concatenate([shear, -normal[..., None]], -1)
+    force = (sim._touch_at(TWO).poses[1] @ on_pad[..., None])[..., 0]
+    mass = sim.scene.model.body_mass[[sim.scene.plug_body, sim.scene.socket_body]]
+    for part, weight in enumerate(9.81 * mass):
+        carried = force[:, np.array(HELD) == part].sum(1)
+        np.testing.assert_allclose(carried, np.tile([0.0, 0.0, -weight], (2, 1)), atol=0.02 * weight + 2e-3)
+    assert np.abs(shear).max() > 0.1
+
+
+def test_nothing_is_felt_without_load():
+    """Empty hands above the table."""
+    sim = make(scene=replace(SCENE, start="table"), num_envs=1)
+    sim.reset(np.arange(1), np.arange(1))
+    sim.step(sim.command_targets())
+    assert sim._episode.pad_load.max() == 0
+    assert np.abs(sim.shear()).max() == 0
+
+
+def test_opening_a_hand_clears_the_skin_that_is_no_longer_pressed(sim):
+    sim.reset(TWO, TWO)
+    target = sim.command_targets()
+    target[0, [6, 7]] = [0.042, -0.042]
+    for _ in range(6):
+        sim.step(target)
+    shear = sim.shear()
+    assert np.abs(shear[0, :2]).max() == 0
+    assert np.abs(shear[0, 2:]).max() > 1e-3
+    assert np.abs(shear[1, :2]).max() > 1e-3
+
+
+def test_a_reset_forgets_only_its_own_worlds(sim):
+    sim.reset(TWO, TWO)
+    start = sim.shear()
+    for _ in range(3):
+        sim.step(sim.command_targets() + 0.02)
+    before = sim.shear()
+    assert np.abs(before - start).max(axis=(1, 2, 3)).min() > 1e-3
+    sim.reset(np.array([1]), np.array([1]))
+    np.testing.assert_array_equal(sim.shear()[0], before[0])
+    np.testing.assert_array_equal(sim.shear()[1], start[1])
+
+
+def test_a_world_feels_the_same_after_being_restored_elsewhere(sim):
+    sim.reset(TWO, TWO)
+    sim.step(sim.command_targets() + 0.02)
+    stored = sim.get_state(0)
+    action = sim.command_targets() + 0.01
+    sim.step(action)
+    felt = sim.shear()[0]
+    sim.set_state(1, stored)
+    sim.step(action[[0]], np.array([1]))
+    np.testing.assert_array_equal(sim.shear()[1], felt)
+
+
+def test_shear_is_off_unless_asked_for():
+    sim = make(shear=None, num_envs=1)
+    sim.reset(np.arange(1), np.arange(1))
+    assert not sim._pads.remembers
+    assert "shear" not in sim.get_state(0)["pads"]
+    with pytest.raises(ValueError, match=r"shear is off: switch it on with --env\.shear\.on=true"):
+        sim.shear()
+    with pytest.raises(ValueError, match=r"shear\.stiffness_n_per_m must be above 0, got 0"):
+        ShearConfig(on=True, stiffness_n_per_m=0.0)
