@@ -111,6 +111,7 @@ def describe(comparison: Comparison) -> list[str]:
     for pad in comparison.touch:
         overlap = "feels nothing" if pad.overlap is None else f"overlap {pad.overlap:.3f}"
         lines.append(f"  {pad.pad:<24} {overlap}, {pad.identical_frames} of {pad.frames} frames identical")
+    lines += [f"note: {remark}" for remark in comparison.remarks]
     return lines
 
 

@@ -2,16 +2,26 @@
 
 import json
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
+import torch
 
 from lerobot_vtrefine.cli.record_demos import RecordDemosConfig, record
 from lerobot_vtrefine.cli.replay import ReplayConfig, SourceConfig, describe, replay
 from lerobot_vtrefine.datasets.importers.joint_episodes import JointEpisode, write_dataset
+from lerobot_vtrefine.diagnose.episode_replay.reach import (
+    describe_reach,
+    hand_reaches,
+    lowest_edges,
+    part_top_m,
+)
 from lerobot_vtrefine.embodiments import get_embodiment
 from lerobot_vtrefine.envs import VtRefineEnvConfig
+from lerobot_vtrefine.sim.config import SceneConfig
+from lerobot_vtrefine.sim.pairs import load_pair
 
 ROBOT = get_embodiment("aloha")
 
@@ -180,3 +190,69 @@ def test_positions_that_are_no_numbers_are_refused(tmp_path: Path) -> None:
         )
         with pytest.raises(ValueError, match=r"episode 0, frame 3: .* left_elbow is not a number"):
             replay(ReplayConfig(tmp_path / "out", SourceConfig(tmp_path / name)))
+
+
+def test_hands_that_never_reach_the_twins_table_are_reported(tmp_path: Path) -> None:
+    """Recorded beside a table 45 mm higher than the twin's: the same hands pick parts that stand higher."""
+    raised = VtRefineEnvConfig(start="table", episode_steps=70, scene=SceneConfig(table_height_m=0.045))
+    record(
+        RecordDemosConfig(
+            root=tmp_path / "demos", num_episodes=1, num_envs=1, seed=11, env=raised, include_failures=True
+        )
+    )
+    (tmp_path / "demos" / "meta" / "recording.json").unlink()  # nothing tells what the scene was
+    source, flat = SourceConfig(tmp_path / "demos"), VtRefineEnvConfig(start="table", episode_steps=70)
+    comparison = replay(ReplayConfig(tmp_path / "flat", source, parts="grasp", env=flat))
+    assert min(row.lowest_m for row in comparison.reach) == pytest.approx(0.05, abs=0.006)
+    told = "\n".join(describe(comparison))
+    assert "note: no finger ever came closer than 5" in told
+    wanted = float(told.split("table_height_m=")[1].split()[0])
+    assert "to the twin&#39;s table" in (tmp_path / "flat" / "report.html").read_text()
+    fitting = replace(flat, scene=SceneConfig(table_height_m=wanted))
+    again = replay(ReplayConfig(tmp_path / "again", source, parts="grasp", env=fitting))
+    assert again.remarks == []
+    assert [row.held for row in again.reach] == [1, 1]
+    over = [
+        after.over_part_m - before.over_part_m
+        for before, after in zip(comparison.reach, again.reach, strict=True)
+    ]
+    assert over == pytest.approx([wanted] * 2, abs=1e-3)
+    assert json.loads((tmp_path / "again" / "replay.json").read_text())["remarks"] == []
+    alone = replay(ReplayConfig(tmp_path / "alone", source, parts="none"))
+    assert f"--env.scene.table_height_m={wanted:.3f} is the highest" in "\n".join(alone.remarks)
+
+
+def test_hands_that_hold_nothing_in_the_twin_are_counted() -> None:
+    """Two episodes: the left hand closes 30 mm above the table; the twin's pads feel something in one."""
+    closing = np.tile(ROBOT.home, (30, 1))
+    closing[10:, 6], closing[10:, 7] = 0.02, -0.02
+    touch = np.zeros((2, 30, 4))
+    touch[1, 12:, :2] = 50.0
+    height = float(lowest_edges(ROBOT, closing)[0, 0])
+    rows = hand_reaches(ROBOT, [closing, closing], height - 0.03, (0.04, 0.08), list(touch), fps=10)
+    assert [(row.arm, row.episodes, row.held) for row in rows] == [("left", 2, 1)]
+    assert rows[0].over_part_m == pytest.approx(0.01)
+    told = describe_reach(rows, height - 0.03)
+    assert told[0].startswith(
+        "the twin's left hand holds its part in 1 of 2 episodes: when its gripper closes"
+    )
+    assert f"table_height_m={height:.3f}" in told[1]
+
+
+def test_lowest_edges_are_pad_corners() -> None:
+    joints = ROBOT.home + np.random.default_rng(0).normal(0, 0.2, (5, 16))
+    position, rotation = (item.numpy() for item in ROBOT.pad_poses(torch.as_tensor(joints)))
+    length, width, _ = ROBOT.fingers.pad_size_m
+    corners = np.array([[x * length / 2, y * width / 2, 0] for x in (-1, 1) for y in (-1, 1)])
+    heights = (position[..., None, :] + corners @ np.swapaxes(rotation, -1, -2))[..., 2]
+    assert lowest_edges(ROBOT, joints) == pytest.approx(heights.reshape(5, 2, 8).min(-1))
+
+
+def test_upper_end_of_parts() -> None:
+    pair = load_pair(SceneConfig())
+    assert part_top_m(pair.plug) == pytest.approx(pair.plug.grip.centre_m[2] + pair.plug.grip.half_size_m[2])
+    assert part_top_m(pair.socket) == pytest.approx(pair.socket.rest_height_m + pair.mouth_z_m)
+
+
+def test_no_remark_where_the_twin_is_the_recordings_own(demos: Path, tmp_path: Path) -> None:
+    assert replay(ReplayConfig(tmp_path / "out", SourceConfig(demos))).remarks == []

@@ -40,10 +40,10 @@ def demonstration(seed: int, steps: int = 3) -> Demonstration:
 FEATURES = dataset_features(HEIGHT, WIDTH)
 
 
-def open_recording(root: Path, features: dict | None = None, **changes) -> DemoDataset:
+def open_recording(root: Path, **changes) -> DemoDataset:
     settings = {"pair": "round", **changes}
     return DemoDataset(
-        root, "local/demo", 10, features or FEATURES, "some_robot", "insert", settings, first_seed=0
+        root, "local/demo", 10, FEATURES, "some_robot", "insert", settings, first_seed=0
     )
 
 
@@ -206,16 +206,8 @@ def test_other_settings_and_foreign_folders_are_refused(tmp_path):
     assert (tmp_path / "notes" / "x.txt").read_text() == "mine"
 
 
-def test_recording_begun_before_a_column_existed_is_continued_without_it(tmp_path):
-    old = {key: feature for key, feature in FEATURES.items() if key != AGE_KEY}
-    with open_recording(tmp_path / "demo", old) as demos:
-        demos.append(demonstration(0))
+def test_robot_type_and_pad_ages_are_written(tmp_path):
     with open_recording(tmp_path / "demo") as demos:
-        demos.append(demonstration(1))
-    dataset = read(tmp_path / "demo")
-    assert dataset.meta.total_episodes == 2
-    assert AGE_KEY not in dataset.meta.features
-    with open_recording(tmp_path / "new") as demos:
         demos.append(demonstration(0))
-    assert read(tmp_path / "new")[2][AGE_KEY].tolist() == [0, 0, 0, 0]
-    assert read(tmp_path / "new").meta.robot_type == "some_robot"
+    assert read(tmp_path / "demo")[2][AGE_KEY].tolist() == [0, 0, 0, 0]
+    assert read(tmp_path / "demo").meta.robot_type == "some_robot"

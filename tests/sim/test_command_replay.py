@@ -109,7 +109,7 @@ def test_grasps_tell_where_the_parts_stood() -> None:
     sim.reset(WORLD, np.array([11]))
     plug, socket = (pose[0] for pose in sim.part_poses())
     episode = expert_episode(sim, seed=11, steps=70)
-    start = grasp_start(ROBOT, sim.scene.pair, episode["state"])
+    start = grasp_start(ROBOT, sim.scene.pair, episode["state"], 0.0)
     assert start is not None
     for found, true in ((start.plug[0], plug), (start.socket[0], socket)):
         assert np.abs(found[:2] - true[:2]).max() < 0.006

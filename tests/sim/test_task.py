@@ -51,7 +51,7 @@ def test_insertion_is_measured_in_the_sockets_frame():
     socket = np.array([[0.1, -0.2, 0.15]]), tilted
     local = np.array([0.001, 0.002, -0.020])
     plug = socket[0] + (tilted[0] @ local)[None], tilted @ about_axis(1, 0.1)
-    state = task.insertion(PAIR, plug, socket)
+    state = task.insertion(PAIR, plug, socket, 0.0)
     np.testing.assert_allclose(state.position_m[0], local)
     assert state.depth_m[0] == pytest.approx(0.020)
     assert state.remaining_m[0] == pytest.approx(0.005)
@@ -73,7 +73,7 @@ def test_insertion_is_measured_in_the_sockets_frame():
 def test_seated_needs_depth_alignment_and_air(offset, tilt, height, expected):
     socket = upright(0, 0, height)
     plug = socket[0] + np.array([offset]), about_axis(1, tilt)[None]
-    assert bool(task.is_seated(task.insertion(PAIR, plug, socket), SuccessConfig())[0]) is expected
+    assert bool(task.is_seated(task.insertion(PAIR, plug, socket, 0.0), SuccessConfig())[0]) is expected
 
 
 def test_shift_counts_slip_and_rotation_in_the_hand_but_not_motion_with_it():

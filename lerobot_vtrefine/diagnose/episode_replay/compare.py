@@ -11,6 +11,13 @@ from tqdm import tqdm
 
 from lerobot_vtrefine.datasets.episodes import EpisodeFolder, RecordedEpisode
 from lerobot_vtrefine.datasets.features import JOINT_SUFFIX, PADS, Array
+from lerobot_vtrefine.diagnose.episode_replay.reach import (
+    HandReach,
+    describe_reach,
+    hand_reaches,
+    pad_sums,
+    part_top_m,
+)
 from lerobot_vtrefine.diagnose.episode_replay.touch import PadTouch, compare_pad
 from lerobot_vtrefine.diagnose.episode_replay.tracking import JointTracking, joint_tracking
 from lerobot_vtrefine.diagnose.episode_replay.twin import read_ledger, recorded_seeds, recorded_twin
@@ -55,6 +62,10 @@ class Comparison:
     pairs: list[EpisodePair]
     skipped: dict[int, str]
     """Episodes that could not be replayed, and why."""
+    reach: list[HandReach]
+    """How low the recorded hands came, and whether the twin's hold their parts."""
+    remarks: list[str]
+    """What these say about the twin's table."""
 
     def summary(self) -> dict[str, Any]:
         """All numbers as plain values for ``replay.json``."""
@@ -69,6 +80,8 @@ class Comparison:
             "success": [pair.success for pair in self.pairs],
             "tracking": [asdict(row) for row in self.tracking],
             "touch": [_plain(pad) for pad in self.touch],
+            "reach": [asdict(row) for row in self.reach],
+            "remarks": self.remarks,
         }
 
 
@@ -100,6 +113,7 @@ def compare_episodes(
         pairs, skipped = _replay_arms(folder, recorded, config, hold), {}
     else:
         pairs, skipped = _replay_scenes(folder, recorded, config, parts, ledger)
+    reach = _reach(pairs, config, folder.fps, own)
     return Comparison(
         root=folder.root,
         fps=folder.fps,
@@ -115,6 +129,8 @@ def compare_episodes(
         touch=_compare_touch(pairs),
         pairs=pairs,
         skipped=skipped,
+        reach=reach,
+        remarks=[] if own else describe_reach(reach, config.scene_config.table_height_m),
     )
 
 
@@ -151,6 +167,20 @@ def _require_same_robot(folder: EpisodeFolder, config: VtRefineEnvConfig) -> Non
         )
 
 
+def _reach(pairs: list[EpisodePair], config: VtRefineEnvConfig, fps: float, own: bool) -> list[HandReach]:
+    """Heights of the recorded hands over the twin's table; with parts, also whether the twin holds them."""
+    robot, scene = get_embodiment(config.scene_config.embodiment), config.scene_config
+    states = [pair.recorded.state for pair in pairs]
+    if own or not pairs[0].counts:
+        return hand_reaches(robot, states, scene.table_height_m)
+    from lerobot_vtrefine.sim.pairs import load_pair
+
+    parts = load_pair(scene)
+    tops = part_top_m(parts.socket), part_top_m(parts.plug)
+    touches = [pad_sums({pad: pair.counts[pad] for pad in PADS}, pair.baselines) for pair in pairs]
+    return hand_reaches(robot, states, scene.table_height_m, tops, touches, fps)
+
+
 def _replay_arms(
     folder: EpisodeFolder, recorded: list[RecordedEpisode], config: VtRefineEnvConfig, hold: str
 ) -> list[EpisodePair]:
@@ -181,7 +211,9 @@ def _replay_scenes(
     for episode in tqdm(recorded, unit="episode", desc="replay"):
         start = None
         if parts == "grasp":
-            start = grasp_start(sim.embodiment, sim.scene.pair, episode.state)
+            start = grasp_start(
+                sim.embodiment, sim.scene.pair, episode.state, config.scene_config.table_height_m
+            )
             if start is None:
                 skipped[episode.index] = "a gripper never closes"
                 continue
