@@ -7,9 +7,11 @@ from lerobot_vtrefine.diagnose.crossvalidation import agree
 from lerobot_vtrefine.diagnose.experiments import next_experiment
 from lerobot_vtrefine.diagnose.fitting import Fit
 from lerobot_vtrefine.diagnose.noise import Noise
-from lerobot_vtrefine.diagnose.selection import MAPS, Search, add, all_probes, scored, take_away
+from lerobot_vtrefine.diagnose.selection import MAPS, Search, add, all_probes, elaborate, scored, take_away
 
 TIE_P = 0.1
+NEARLY = 0.6
+"""Part of the named cause's gain that a rival's plain form must reach for its other forms to be tried."""
 
 
 @dataclass(frozen=True)
@@ -30,11 +32,12 @@ def find_ambiguities(search: Search, fitted: Fit, noise: Noise) -> Rivals:
         if not rivals or name in MAPS:
             continue
         slim = take_away(search, fitted, name)
-        probes = all_probes(search, slim)
+        probes, less = all_probes(search, slim), scored(search, slim)
         tied = []
         for rival in rivals:
-            other = add(search, slim, rival, probes)
-            score = scored(search, other)
+            other, score = add(search, slim, rival, probes)
+            if score.gain_over(less) > NEARLY * full.gain_over(less):
+                other, score = elaborate(search, slim, rival, probes, (other, score))
             # Weights forgive much that plain errors do not, where a model is far off: both must be as good.
             worse = (full.better_by(score), score.squares - full.squares)
             if not any(agree(differences, search.seed, TIE_P) for differences in worse):

@@ -22,6 +22,16 @@ class Field:
         block = sheet.blocks[press]
         return slice(*np.searchsorted(self.columns, (block.start, block.stop)).tolist())
 
+    def at_frames(self, sheet: Sheet) -> "Field":
+        """At the recorded frames only, as `sheet.recorded` has them."""
+        if sheet.recorded is sheet:
+            return self
+        out = np.zeros((max(len(frames) for frames in sheet.frames), len(self.columns)))
+        for press, frames in enumerate(sheet.frames):
+            part = self.within(sheet, press)
+            out[: len(frames), part] = self.values[frames, part]
+        return Field(out, self.columns)
+
     def spread(self, columns: np.ndarray) -> "Field":
         """At other columns, zero where these have none."""
         if columns is self.columns:

@@ -6,6 +6,7 @@ is not listed runs its own code, press by press.
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from itertools import pairwise
 from typing import Any
 
 import numpy as np
@@ -16,7 +17,7 @@ from lerobot_vtrefine.diagnose.memory_stages import MEMORY
 from lerobot_vtrefine.diagnose.momentary_stages import MIXING, SEPARATE
 from lerobot_vtrefine.diagnose.presses import Press
 from lerobot_vtrefine.diagnose.refinement import Kind, instants
-from lerobot_vtrefine.diagnose.sheets import Sheet, build_sheet
+from lerobot_vtrefine.diagnose.sheets import Sheet, build_sheets
 from lerobot_vtrefine.tactile.stages.base import Frame, Stage
 from lerobot_vtrefine.tactile.stages.contact import ContactStage
 from lerobot_vtrefine.tactile.stages.mechanics import NonlinearStiffness
@@ -30,13 +31,41 @@ class Bench:
 
     def __init__(self, presses: Sequence[Press], idle: np.ndarray) -> None:
         self.presses, self._idle = presses, idle
-        self._sheets: dict[Kind, Sheet] = {}
+        self._sheets: dict[Kind, list[Sheet]] = {}
 
-    def sheet(self, kind: Kind) -> Sheet:
+    def sheets(self, kind: Kind) -> list[Sheet]:
         """The presses at a model's instants."""
         if kind not in self._sheets:
-            self._sheets[kind] = build_sheet(self.presses, self._idle, kind)
+            self._sheets[kind] = build_sheets(self.presses, self._idle, kind)
         return self._sheets[kind]
+
+
+@dataclass(frozen=True)
+class Plan:
+    """What a model's stages need of the fields between them.
+
+    Attributes:
+        mixed: per stage, whether a later one may mix a taxel with its neighbours.
+        remembered: per stage, whether a later one has memory, so that all instants count.
+    """
+
+    stages: Sequence[Stage]
+    kind: Kind
+    mixed: tuple[bool, ...]
+    remembered: tuple[bool, ...]
+
+    @classmethod
+    def of(cls, stages: Sequence[Stage]) -> "Plan":
+        """The plan of a model."""
+        rests = [tuple(stages[index + 1 :]) for index in range(len(stages))]
+        remembered = tuple(instants(rest) != "frames" for rest in rests)
+        return cls(stages, instants(tuple(stages)), tuple(mixes(rest) for rest in rests), remembered)
+
+    @property
+    def keys(self) -> list[Any]:
+        """What a stage's field depends on, beside the stages before it."""
+        steps = zip(self.stages, self.mixed, self.remembered, strict=True)
+        return [(self.kind, mixed, remembered, _key(stage)) for stage, mixed, remembered in steps]
 
 
 def run_stages(stages: Sequence[Stage], bench: Bench, cache: "Prefix | None" = None) -> list[np.ndarray]:
@@ -46,22 +75,37 @@ def run_stages(stages: Sequence[Stage], bench: Bench, cache: "Prefix | None" = N
     """
     if not bench.presses:
         return []
-    kind = instants(tuple(stages))
-    sheet = bench.sheet(kind)
-    contact = next(stage for stage in stages if isinstance(stage, ContactStage))
-    context = Context(sheet, float(contact.stiffness(sheet.layout)))
-    start, field = cache.lookup(stages, kind) if cache is not None else (0, None)
-    if field is None:
-        field = Field(sheet.drive, np.arange(len(sheet.taxels)), sheet.rate)
-        if sheet.loaded or not any(stage.domain == "depth" for stage in stages):
-            field = Field(sheet.drive[:, sheet.touched], sheet.touched, sheet.rate[:, sheet.touched])
+    plan = Plan.of(stages)
+    sheets = bench.sheets(plan.kind)
+    start, fields = cache.lookup(plan) if cache is not None else (0, None)
+    if fields is None:
+        fields = [_begin(stages, sheet) for sheet in sheets]
     for index in range(start, len(stages)):
-        # What nothing mixes with others any more is needed at scored taxels only.
-        wanted = None if mixes(stages[index + 1 :]) else sheet.all_scored
-        field = _apply(stages[index], field, context, wanted)
+        fields = [_step(plan, index, field, sheet) for field, sheet in zip(fields, sheets, strict=True)]
         if cache is not None:
-            cache.store(index, field)
-    return _scatter(field, sheet)
+            cache.store(index, fields)
+    found: list[np.ndarray] = [np.empty(0)] * len(bench.presses)
+    for field, sheet in zip(fields, sheets, strict=True):
+        _scatter(field, sheet.recorded, found)
+    return found
+
+
+def _begin(stages: Sequence[Stage], sheet: Sheet) -> Field:
+    if sheet.loaded or not any(stage.domain == "depth" for stage in stages):
+        return Field(sheet.drive[:, sheet.touched], sheet.touched, sheet.rate[:, sheet.touched])
+    return Field(sheet.drive, np.arange(len(sheet.taxels)), sheet.rate)
+
+
+def _step(plan: Plan, index: int, field: Field, sheet: Sheet) -> Field:
+    """Stage number `index`; once no later one has memory, only recorded frames are kept."""
+    stages = plan.stages
+    contact = next(stage for stage in stages if isinstance(stage, ContactStage))
+    before = plan.remembered[index - 1] if index else True
+    # What nothing mixes with others any more is needed at scored taxels only.
+    wanted = None if plan.mixed[index] else sheet.all_scored
+    place = sheet if before else sheet.recorded
+    field = _apply(stages[index], field, Context(place, float(contact.stiffness(sheet.layout)), wanted))
+    return field.at_frames(place) if before and not plan.remembered[index] else field
 
 
 def mixes(stages: Sequence[Stage]) -> bool:
@@ -70,14 +114,12 @@ def mixes(stages: Sequence[Stage]) -> bool:
     return any(not isinstance(stage, own) and not isinstance(stage, ContactStage) for stage in stages)
 
 
-def _scatter(field: Field, sheet: Sheet) -> list[np.ndarray]:
-    """(T, n) per press, of its scored taxels at the recorded frames."""
+def _scatter(field: Field, sheet: Sheet, found: list[np.ndarray]) -> None:
+    """(T, n) of each press's scored taxels into its place among all presses."""
     full = field.spread(sheet.all_scored)
     ends = np.cumsum([0, *(len(columns) for columns in sheet.scored)]).tolist()
-    return [
-        np.ascontiguousarray(full.values[frames, begin:end])
-        for frames, begin, end in zip(sheet.frames, ends[:-1], ends[1:], strict=True)
-    ]
+    for member, frames, (begin, end) in zip(sheet.members, sheet.frames, pairwise(ends), strict=True):
+        found[member] = np.ascontiguousarray(full.values[: len(frames), begin:end])
 
 
 class Prefix:
@@ -85,13 +127,12 @@ class Prefix:
 
     def __init__(self) -> None:
         self.keys: list[Any] = []
-        self.fields: list[Field] = []
+        self.fields: list[list[Field]] = []
         self.frozen = False
 
-    def lookup(self, stages: Sequence[Stage], kind: Kind) -> tuple[int, Field | None]:
-        """Number of leading stages already done at those instants, and their field."""
-        later = [mixes(stages[index + 1 :]) for index in range(len(stages))]
-        keys = [(kind, mixed, _key(stage)) for stage, mixed in zip(stages, later, strict=True)]
+    def lookup(self, plan: Plan) -> tuple[int, list[Field] | None]:
+        """Number of leading stages already done at those instants, and their fields."""
+        keys = plan.keys
         same = 0
         while same < min(len(keys), len(self.keys)) and keys[same] == self.keys[same]:
             same += 1
@@ -100,10 +141,10 @@ class Prefix:
             self.fields = self.fields[:same]
         return same, (self.fields[same - 1] if same else None)
 
-    def store(self, index: int, field: Field) -> None:
-        """Keep the field after stage `index`, unless frozen."""
+    def store(self, index: int, fields: list[Field]) -> None:
+        """Keep the fields after stage `index`, unless frozen."""
         if not self.frozen:
-            self.fields[index:] = [field]
+            self.fields[index:] = [fields]
 
 
 def _key(stage: Stage) -> Any:
@@ -125,13 +166,12 @@ class _Same:
         return id(self.value)
 
 
-def _apply(stage: Stage, field: Field, context: Context, wanted: np.ndarray | None) -> Field:
+def _apply(stage: Stage, field: Field, context: Context) -> Field:
     sheet = context.sheet
     if sheet.loaded and (isinstance(stage, ContactStage) or stage.domain == "depth"):
         return field
     if isinstance(stage, ContactStage):
         return _contact(stage, field, sheet)
-    context = Context(sheet, context.stiffness, wanted)
     fast = FAST.get(type(stage))
     if fast is None or (sheet.loaded and isinstance(stage, NonlinearStiffness)):
         return _own(stage, field, context)

@@ -21,7 +21,7 @@ from lerobot_vtrefine.tactile.stages.readout import BaselineDrift
 FINE_S = 0.005
 """Time between refined frames [s]: motion is close to straight for that long."""
 MAX_SUBSTEPS = 10
-BEND = 0.003
+BEND = 0.005
 """Part of the deepest press by which depths may bend between two neighbouring instants."""
 RATE_S = 2e-4
 """Half the time over which rates are taken [s]."""

@@ -23,6 +23,9 @@ AGREEMENT_P = 0.05
 """Chance that recordings left out are foretold better as often, if there were nothing (sign flips)."""
 EXTRA_GAIN = 0.025
 """The same for causes beside the first: a little is also gained by patching up the first one's form."""
+SCOUTING_STEPS = 2
+PROMISING = 0.5
+"""Part of the best candidate's gain that a plain form must reach for its family's other forms to be tried."""
 REFITTED = 6
 """Survivors that are refitted in a round."""
 MAPS = ("taxel_gain_spread", "dead_taxels")
@@ -82,13 +85,13 @@ def all_probes(search: Search, fitted: Fit) -> list[Probe]:
 
 def refit(search: Search, fitted: Fit, form: Form, probes: Sequence[Probe]) -> Fit:
     """Best fit of the model with a form added, over its starting points."""
-    best: Fit | None = None
-    for values in starting_points(search, fitted, form, probes):
-        found = settle(search, fitted.model.plus(form, values))
-        if best is None or found.loss < best.loss:
-            best = found
-    assert best is not None
-    return best
+    points = starting_points(search, fitted, form, probes)
+    models = [fitted.model.plus(form, values) for values in points]
+    if len(models) > 1:
+        # A few steps tell which start leads further down.
+        tried = [fit(model, search.presses, search.weights, SCOUTING_STEPS) for model in models]
+        models = [min(tried, key=lambda found: found.loss).model]
+    return settle(search, models[0])
 
 
 def starting_points(search: Search, fitted: Fit, form: Form, probes: Sequence[Probe]) -> list[np.ndarray]:
@@ -131,20 +134,28 @@ def settle(search: Search, model: Composite, weights: Sequence[TrialWeights] | N
     return fitted
 
 
-def add(search: Search, fitted: Fit, name: str, probes: Sequence[Probe]) -> Fit:
-    """The best fit with a cause of that name added; of its forms the one that foretells best."""
+def add(search: Search, fitted: Fit, name: str, probes: Sequence[Probe]) -> tuple[Fit, Score]:
+    """The best fit with a cause added in its plain form, and its errors on recordings left out."""
     if name == "taxel_gain_spread":
-        return settle(search, with_map(fitted, search.presses, search.weights))
-    if name == "dead_taxels":
-        return settle(search, replace(fitted.model, dead=find_dead(fitted, search.presses)))
-    best: tuple[Fit, Score] | None = None
-    for form in forms_of(name, fitted):
+        found = settle(search, with_map(fitted, search.presses, search.weights))
+    elif name == "dead_taxels":
+        found = settle(search, replace(fitted.model, dead=find_dead(fitted, search.presses)))
+    else:
+        found = refit(search, fitted, forms_of(name, fitted)[0], probes)
+    return found, scored(search, found)
+
+
+def elaborate(
+    search: Search, fitted: Fit, name: str, probes: Sequence[Probe], plain: tuple[Fit, Score]
+) -> tuple[Fit, Score]:
+    """The same with another form of the cause, where one foretells clearly better."""
+    best = plain
+    for form in forms_of(name, fitted)[1:] if name not in MAPS else []:
         found = refit(search, fitted, form, probes)
         score = scored(search, found)
-        if best is None or _clearly_better(score, best[1], search.seed):
+        if _clearly_better(score, best[1], search.seed):
             best = found, score
-    assert best is not None
-    return best[0]
+    return best
 
 
 def _clearly_better(score: Score, than: Score, seed: int) -> bool:
@@ -229,21 +240,35 @@ def forward(search: Search, fitted: Fit, tell: Callable[[str, float], None]) -> 
 
 
 def rank(search: Search, fitted: Fit, candidates: Sequence[Screened], probes: Sequence[Probe]) -> list[Step]:
-    """Refits of the candidates that foretell recordings left out better than the model does, best first."""
+    """Refits of the candidates that foretell recordings left out better than the model does, best first.
+
+    Every candidate is refitted in its plain form; other forms are tried of those that come near the best.
+    """
     base = scored(search, fitted)
     needed = EXTRA_GAIN if fitted.model.families else MIN_GAIN
+    plain = {}
+    for item in candidates:
+        name = item.probe.name
+        plain[name] = add(search, fitted, name, probes)
+        if name == "dead_taxels" and plain[name][1].gain_over(base) > needed:
+            # Taxels without an answer disturb whatever else is fitted.
+            plain = {name: plain[name]}
+            break
+    gains = {name: score.gain_over(base) for name, (_, score) in plain.items()}
+    worth = PROMISING * max([0.0, *gains.values()])
     steps = []
     for item in candidates:
         name = item.probe.name
-        found = add(search, fitted, name, probes)
-        score = scored(search, found)
+        if name not in plain:
+            continue
+        found, score = plain[name]
+        if gains[name] >= worth or item.probe.form not in (None, *forms_of(name, fitted)[:1]):
+            found, score = elaborate(search, fitted, name, probes, plain[name])
         gain, logs = score.gain_over(base), score.better_by(base)
         search.tried[name] = max(gain, search.tried.get(name, -np.inf))
         agreed = name == "dead_taxels" or agree(logs, search.seed, AGREEMENT_P)
         if gain > needed and logs.sum() > 0 and agreed:
             steps.append(Step(name, found, score, gain, logs))
-        if name == "dead_taxels" and steps and steps[-1].name == name:
-            return [steps[-1]]
     return sorted(steps, key=lambda step: -float(step.logs.sum()))
 
 

@@ -1,7 +1,7 @@
 """All presses side by side, a column per taxel that may answer: what models are run on while fitting."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from itertools import pairwise
 
@@ -11,6 +11,8 @@ from lerobot_vtrefine.diagnose.presses import MARGIN_TAXELS, Press
 from lerobot_vtrefine.diagnose.refinement import Kind
 from lerobot_vtrefine.tactile.layout import PadLayout
 
+LONG = 1.3
+"""Presses with this many times the usual number of instants are kept apart from the others."""
 FAR_M = -1.0
 """Height that pads the columns of shorter recordings [m]: nothing touches there."""
 
@@ -20,6 +22,8 @@ class Sheet:
     """Presses at a model's instants. Arrays (G, M): a line per instant, a column per press and taxel."""
 
     layout: PadLayout
+    members: tuple[int, ...]
+    """Numbers of the presses (K)."""
     blocks: tuple[slice, ...]
     """Columns of every press (K)."""
     taxels: np.ndarray
@@ -55,6 +59,16 @@ class Sheet:
         return np.flatnonzero((self.drive > 0).any(axis=0))
 
     @cached_property
+    def recorded(self) -> "Sheet":
+        """The same columns at the recorded frames only, for what comes after the last memory."""
+        if all(len(time_s) == len(frames) for time_s, frames in zip(self.times_s, self.frames, strict=True)):
+            return self
+        times_s = tuple(time_s[frames] for time_s, frames in zip(self.times_s, self.frames, strict=True))
+        sheet = replace(self, times_s=times_s, frames=tuple(np.arange(len(time_s)) for time_s in times_s))
+        sheet.__dict__["all_scored"] = self.all_scored
+        return sheet
+
+    @cached_property
     def all_scored(self) -> np.ndarray:
         """Numbers of all scored columns."""
         return np.sort(np.concatenate(self.scored))
@@ -74,8 +88,16 @@ def near(mask: np.ndarray) -> np.ndarray:
     return wide
 
 
-def build_sheet(presses: Sequence[Press], idle: np.ndarray, kind: Kind) -> Sheet:
-    """The presses at the instants of a kind; `idle` (R, C) [counts]."""
+def build_sheets(presses: Sequence[Press], idle: np.ndarray, kind: Kind) -> list[Sheet]:
+    """The presses at the instants of a kind, those of many instants apart; `idle` (R, C) [counts]."""
+    lengths = np.array([len(press.course(kind).time_s) for press in presses])
+    long = lengths > LONG * np.median(lengths)
+    groups = [np.flatnonzero(~long).tolist(), np.flatnonzero(long).tolist()]
+    return [_build(presses, members, idle, kind) for members in groups if members]
+
+
+def _build(everyone: Sequence[Press], members: list[int], idle: np.ndarray, kind: Kind) -> Sheet:
+    presses = [everyone[index] for index in members]
     courses = [press.course(kind) for press in presses]
     masks = [near(press.scored | (press.drive > 0).any(axis=0)) for press in presses]
     ends = np.cumsum([0, *(int(mask.sum()) for mask in masks)]).tolist()
@@ -95,6 +117,7 @@ def build_sheet(presses: Sequence[Press], idle: np.ndarray, kind: Kind) -> Sheet
     first = presses[0].layout
     return Sheet(
         PadLayout(first.full_rows, first.full_cols, first.pitch_m),
+        tuple(members),
         tuple(slice(begin, end) for begin, end in pairwise(ends)),
         taxels,
         drive,
