@@ -12,6 +12,7 @@ from safetensors.torch import load_file
 from tiny_policy import ReachEnv, save_tiny_checkpoint
 
 from lerobot_vtrefine.cli.finetune import main
+from lerobot_vtrefine.envs.decisions import make_decision_env
 from lerobot_vtrefine.finetune import pipeline
 from lerobot_vtrefine.finetune.logger import read_progress
 from lerobot_vtrefine.finetune.seeds import EVALUATION_SEEDS
@@ -171,6 +172,22 @@ def test_bad_input_is_one_clear_line(finetune, tmp_path, capsys):
     assert finetune(tmp_path / "run", iterations=1) == 0
     tuned = tmp_path / "run" / "checkpoints" / "last" / "pretrained_model"
     assert "fine-tuned already" in complaint(policy=tuned)
+
+
+@pytest.mark.parametrize(
+    ("flags", "words"),
+    [
+        (["--env.pair=star"], "round, square, hexagon"),
+        (["--env.clearance_m=0"], "clearance_m must be above 0"),
+        (["--env.clearance_m=0.05"], "too large for the round plug"),
+        (["--env.pair=automate/00186", "--env.mesh_dir=nowhere"], "nowhere"),
+        (["--env.type=aloha"], "--env.type=vtrefine"),
+    ],
+)
+def test_bad_tasks_are_one_clear_line(finetune, tmp_path, capsys, monkeypatch, flags, words):
+    monkeypatch.setattr(pipeline, "make_decision_env", make_decision_env)
+    assert finetune(tmp_path / "bad", *flags) == 2
+    assert words in capsys.readouterr().err.strip().splitlines()[-1]
 
 
 def test_policy_of_another_type_is_refused(finetune, tmp_path, capsys):
