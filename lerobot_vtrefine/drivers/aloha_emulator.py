@@ -69,8 +69,10 @@ class AlohaEmulator:
         for who, model in ARMS.items():
             path = self.calibration_dir / f"{who}.json"
             path.write_text(json.dumps(arm_calibration(model)), encoding="utf-8")
-        for bus in self.buses.values():
-            self._stack.enter_context(bus)
+        with ExitStack() as stack:
+            for bus in self.buses.values():
+                stack.enter_context(bus)
+            self._stack = stack.pop_all()
         return self
 
     def __exit__(self, *_: object) -> None:

@@ -8,6 +8,7 @@ import numpy as np
 from lerobot.motors import MotorCalibration
 
 from lerobot_vtrefine.drivers.dynamixel_arm import RETRIES, ArmModel, DynamixelArm, Floats
+from lerobot_vtrefine.drivers.ports import PortError
 
 logger = logging.getLogger(__name__)
 
@@ -23,7 +24,7 @@ class ArmPair:
         if left_port == right_port:
             raise ValueError(f"left_port and right_port are both {left_port}")
         ports = {"left": left_port, "right": right_port}
-        self._readers = ThreadPoolExecutor(len(ports), thread_name_prefix="arm")
+        self._readers: ThreadPoolExecutor | None = None
         self.arms = {name: DynamixelArm(name, port, model, travel_m) for name, port in ports.items()}
 
     @property
@@ -55,10 +56,15 @@ class ArmPair:
         """Opens both ports and checks the motors.
 
         Raises:
-            PortError: a port cannot be used; the message names it and the fix. The other one may be open.
+            PortError: a port cannot be used; the message names it and the fix. Neither stays open.
         """
-        for arm in self.arms.values():
-            arm.connect()
+        try:
+            for arm in self.arms.values():
+                arm.connect()
+        except BaseException:
+            self.release(torque_off=False)
+            raise
+        self._readers = ThreadPoolExecutor(len(self.arms), thread_name_prefix="arm")
 
     def calibrate(self, ask: Ask, lower: Floats, upper: Floats) -> None:
         """Calibrates both arms by hand; `lower` and `upper` are the joint limits of one arm (6,) [rad]."""
@@ -77,15 +83,22 @@ class ArmPair:
             arm.setup_motors(ask)
 
     def read(self) -> Floats:
-        """Measured state (16,) [rad, fingers m]; both arms at once, each waits for its own bus."""
+        """Measured state (16,) [rad, fingers m]; both arms at once, each waits for its own bus.
+
+        Raises:
+            PortError: an arm does not answer, or is not connected.
+        """
+        if self._readers is None:
+            raise PortError(f"the arms on {' and '.join(arm.port for arm in self.arms.values())} are closed")
         return np.concatenate(list(self._readers.map(DynamixelArm.read, self.arms.values())))
 
     def release(self, *, torque_off: bool) -> None:
         """Closes both ports, also after failures, which are logged."""
+        if self._readers is not None:
+            self._readers.shutdown()  # where one arm failed, the other may still be reading
+            self._readers = None
         for arm in self.arms.values():
             try:
                 arm.disconnect(torque_off=torque_off)
-            except (ConnectionError, OSError) as error:
-                warning = "torque may still be on: " if torque_off else ""
-                logger.error("%s arm (%s): %s%s", arm.name, arm.port, warning, error)
-                arm.bus.port_handler.closePort()
+            except PortError as error:
+                logger.error("%s", error)

@@ -1,6 +1,7 @@
 """Finds boards among serial ports, and tells which one is being pressed."""
 
 import time
+from contextlib import ExitStack
 from dataclasses import dataclass
 
 import numpy as np
@@ -97,20 +98,21 @@ def open_board(port: str, kind: StreamKind) -> FoundBoard:
     """
     assert kind.shape is not None
     base = PadConfig(port=port, rows=kind.shape.rows, cols=kind.shape.cols, protocol=kind.protocol)
-    reader = PadReader(base, port)
-    reader.connect()
-    reader.idle_counts()
-    report = inspect_wiring(np.stack([frame.raw for frame in reader.frames_after(-1)]))
-    if (
-        kind.shape.rows == CHANNELS
-        and report.row_offset is not None
-        and len(report.dead_rows) == CHANNELS - PAD_ROWS
-    ):
-        reader.stop()
-        base.pad_rows, base.row_offset = PAD_ROWS, report.row_offset
-        reader = PadReader(base, port)
-        reader.connect()
-    return FoundBoard(reader, reader.idle_counts(), report.problems)
+    with ExitStack() as stack:
+        reader = stack.enter_context(PadReader(base, port))
+        reader.idle_counts()
+        report = inspect_wiring(np.stack([frame.raw for frame in reader.frames_after(-1)]))
+        if (
+            kind.shape.rows == CHANNELS
+            and report.row_offset is not None
+            and len(report.dead_rows) == CHANNELS - PAD_ROWS
+        ):
+            stack.close()
+            base.pad_rows, base.row_offset = PAD_ROWS, report.row_offset
+            reader = stack.enter_context(PadReader(base, port))
+        board = FoundBoard(reader, reader.idle_counts(), report.problems)
+        stack.pop_all()  # it stays open
+        return board
 
 
 def wait_for_press(boards: list[FoundBoard], timeout_s: float) -> FoundBoard | None:

@@ -9,16 +9,22 @@ mm/rad).
 import logging
 import math
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Generator
+from contextlib import contextmanager
 from dataclasses import dataclass
 
 import numpy as np
-import serial
 from lerobot.motors import Motor, MotorCalibration, MotorNormMode
 from lerobot.motors.dynamixel import DynamixelMotorsBus, OperatingMode
 from numpy.typing import NDArray
 
-from lerobot_vtrefine.drivers.ports import PortError, ask_for_low_latency, explain_open_error, latency_advice
+from lerobot_vtrefine.drivers.ports import (
+    GONE,
+    PortError,
+    ask_for_low_latency,
+    explain_open_error,
+    latency_advice,
+)
 
 logger = logging.getLogger(__name__)
 
@@ -140,25 +146,59 @@ class DynamixelArm:
             PortError: the message names the port, the motors and the fix.
         """
         try:
+            self._open()
+            if advice := latency_advice(self.port):  # a control period waits for several answers
+                logger.warning("%s arm: %s", self.name, advice)
+            with self._talking():
+                problem = self._motor_problem()
+            if problem:
+                raise PortError(f"{self.name} arm on {self.port}: {problem}")
+        except BaseException:
+            self._close()
+            raise
+
+    def _open(self) -> None:
+        """Opens the port, for this program alone."""
+        try:
             self.bus.connect(handshake=False)
-        except (ConnectionError, serial.SerialException, OSError) as error:
+            device = self.bus.port_handler.ser
+            device.exclusive = True  # the SDK would share it, and two programs take each other's answers
+            device.timeout = ANSWER_WAIT_S
+        except GONE as error:
             cause = error.__cause__ if isinstance(error.__cause__, Exception) else error
             message = explain_open_error(self.port, self.bus.default_baudrate, cause)
             raise PortError(f"{self.name} arm: {message}") from error
-        self.bus.port_handler.ser.timeout = ANSWER_WAIT_S
-        ask_for_low_latency(self.bus.port_handler.ser)
-        if advice := latency_advice(self.port):  # a control period waits for several answers
-            logger.warning("%s arm: %s", self.name, advice)
-        problem = self._motor_problem()
-        if problem:
-            self.bus.port_handler.closePort()
-            raise PortError(f"{self.name} arm on {self.port}: {problem}")
+        ask_for_low_latency(device)
+
+    @contextmanager
+    def _talking(self) -> Generator[None]:
+        """Errors of the bus as one that names arm and port.
+
+        LeRobot raises RuntimeError where a motor answers with an error, an overload say.
+        """
+        try:
+            yield
+        except (*GONE, RuntimeError) as error:
+            if isinstance(error, PortError):
+                raise
+            raise PortError(f"{self.name} arm ({self.port}): {error}") from error
 
     def _motor_problem(self) -> str:
         """What is wrong with the motors on the bus; empty when all answer and are of the right model."""
-        models = {
-            name: self.bus.ping(motor.id, num_retry=PING_RETRIES) for name, motor in self.bus.motors.items()
-        }
+        models: dict[str, int | None] = {}
+        alerting = []
+        for name, motor in self.bus.motors.items():
+            try:
+                models[name] = self.bus.ping(motor.id, num_retry=PING_RETRIES, raise_on_error=True)
+            except ConnectionError:
+                models[name] = None
+            except RuntimeError:  # it answers, with its alert bit set
+                alerting.append(f"{name} (id {motor.id})")
+        if alerting:
+            return (
+                f"{', '.join(alerting)} report a hardware error (overload, heat or voltage): free the arm, "
+                "then switch its power off and on"
+            )
         if all(model is None for model in models.values()):
             return (
                 f"no motor answers at {self.bus.default_baudrate} baud: switch on the arm's power, and check "
@@ -176,10 +216,36 @@ class DynamixelArm:
         return ""
 
     def disconnect(self, *, torque_off: bool) -> None:
-        """Closes the port; torque goes off before where wanted."""
+        """Closes the port; torque goes off before where wanted.
+
+        Raises:
+            PortError: torque may still be on; the message names the motors. The port is closed.
+        """
+        try:
+            if torque_off and self.is_connected:
+                self._torque_off()
+        finally:
+            self._close()
+            self.holding = False
+
+    def _torque_off(self) -> None:
+        """Switches off motor by motor: one that does not answer must not keep the others driven."""
+        failed: dict[str, Exception] = {}
+        for motor in self.bus.motors:
+            self.bus.port_handler.is_using = False  # an interrupted read leaves it set
+            try:
+                self.bus.disable_torque(motor, num_retry=RETRIES)
+            except (*GONE, RuntimeError) as error:
+                failed[motor] = error
+        if failed:
+            why = str(next(iter(failed.values()))).strip()
+            where = f"{self.name} arm ({self.port})"
+            raise PortError(f"{where}: torque may still be on in {', '.join(failed)}: {why}")
+
+    def _close(self) -> None:
+        self.bus.port_handler.is_using = False  # or the SDK calls the port busy for ever after an error
         if self.is_connected:
-            self.bus.disconnect(disable_torque=torque_off)
-        self.holding = False
+            self.bus.port_handler.closePort()
 
     # --- calibration --------------------------------------------------------------------------------
 
@@ -255,11 +321,12 @@ class DynamixelArm:
 
     def set_up(self) -> None:
         """Switches torque off and sets what leader and follower share: shadows, and answers without delay."""
-        self.bus.disable_torque(num_retry=RETRIES)
-        for shadow, _, _, motor in self.model.shadows:
-            self.bus.write("Secondary_ID", shadow, self.bus.motors[motor].id, num_retry=RETRIES)
-        for motor in self.bus.motors:  # LeRobot's configure_motors never tries again
-            self.bus.write("Return_Delay_Time", motor, 0, num_retry=RETRIES)
+        with self._talking():
+            self.bus.disable_torque(num_retry=RETRIES)
+            for shadow, _, _, motor in self.model.shadows:
+                self.bus.write("Secondary_ID", shadow, self.bus.motors[motor].id, num_retry=RETRIES)
+            for motor in self.bus.motors:  # LeRobot's configure_motors never tries again
+                self.bus.write("Return_Delay_Time", motor, 0, num_retry=RETRIES)
 
     def configure(self, gripper_current_ma: float, torque_limit: float) -> None:
         """Sets shadows, modes and limits of a driven arm, with torque off.
@@ -271,8 +338,12 @@ class DynamixelArm:
             gripper_current_ma: Current limit of the gripper's motor [mA].
             torque_limit: Largest share of the joints' full torque, above 0, at most 1.
         """
-        bus = self.bus
         self.set_up()
+        with self._talking():
+            self._set_modes_and_limits(gripper_current_ma, torque_limit)
+
+    def _set_modes_and_limits(self, gripper_current_ma: float, torque_limit: float) -> None:
+        bus = self.bus
         for name in self.model.joints:
             bus.write("Operating_Mode", name, OperatingMode.POSITION.value, num_retry=RETRIES)
             limits = self.calibration[name]
@@ -286,7 +357,8 @@ class DynamixelArm:
     def hold(self) -> None:
         """Switches torque on where the arm is: goals become the present positions first, nothing jumps."""
         self.write(self.read())
-        self.bus.enable_torque(self._names, num_retry=RETRIES)
+        with self._talking():
+            self.bus.enable_torque(self._names, num_retry=RETRIES)
         self.holding = True
 
     def move_to(self, target: Floats, seconds: float) -> None:
@@ -320,7 +392,8 @@ class DynamixelArm:
         gripper = ends.range_min + target[6] / self.travel_m * (ends.range_max - ends.range_min)
         goals = dict(zip(self.model.joints, rad_to_counts(target[:6]).astype(int).tolist(), strict=True))
         goals[GRIPPER] = round(float(gripper))
-        self.bus.sync_write("Goal_Position", goals, normalize=False, num_retry=RETRIES)
+        with self._talking():
+            self.bus.sync_write("Goal_Position", goals, normalize=False, num_retry=RETRIES)
 
     def _gripper_ends(self) -> MotorCalibration:
         if GRIPPER not in self.calibration:
@@ -328,5 +401,6 @@ class DynamixelArm:
         return self.calibration[GRIPPER]
 
     def _counts(self, names: list[str]) -> dict[str, int]:
-        read = self.bus.sync_read("Present_Position", names, normalize=False, num_retry=RETRIES)
+        with self._talking():
+            read = self.bus.sync_read("Present_Position", names, normalize=False, num_retry=RETRIES)
         return {name: int(value) for name, value in read.items()}

@@ -18,6 +18,9 @@ PING, READ, WRITE, STATUS, SYNC_READ, SYNC_WRITE = 0x01, 0x02, 0x03, 0x55, 0x82,
 ERROR_ACCESS = 0x07
 """Status error: the register is read-only or locked."""
 
+ALERT = 0x80
+"""Bit of every status error of a motor that shut down, after an overload say."""
+
 _EEPROM_END = 64
 _MODEL, _ID, _SECONDARY_ID, _HOMING_OFFSET = 0, 7, 12, 20
 _TORQUE_ENABLE, _GOAL_POSITION, _PRESENT_POSITION = 64, 116, 132
@@ -61,12 +64,14 @@ class EmulatedMotor:
         model_number: As in the control table's first register.
         shaft: Position of the shaft before the homing offset [counts, 4096 per turn].
         speed: How fast the shaft follows its goal [counts/s].
+        alert: Whether the motor shut down: it answers, obeys, and stays without torque.
     """
 
     motor_id: int
     model_number: int
     shaft: float = 2048.0
     speed: float = 8000.0
+    alert: bool = False
     memory: bytearray = field(default_factory=lambda: bytearray(256))
     moved_at_s: float = field(default_factory=time.monotonic)
 
@@ -87,7 +92,7 @@ class EmulatedMotor:
     @property
     def torque(self) -> bool:
         """Whether the motor is driven."""
-        return bool(self.memory[_TORQUE_ENABLE])
+        return bool(self.memory[_TORQUE_ENABLE]) and not self.alert
 
     def read(self, address: int, length: int) -> bytes:
         """Registers, after the shaft moved on."""
@@ -196,7 +201,9 @@ class DynamixelEmulator(EmulatedPort):
         return [self.motors[motor_id] for motor_id in ids if motor_id in self.motors]
 
     def _status(self, motor_id: int, error: int, parameters: bytes) -> bytes:
-        return packet(motor_id, STATUS, bytes([error]) + parameters)
+        motor = self.motors.get(motor_id)
+        alert = ALERT if motor is not None and motor.alert else 0
+        return packet(motor_id, STATUS, bytes([error | alert]) + parameters)
 
 
 def _two_words(parameters: bytes) -> tuple[int, int]:

@@ -9,7 +9,6 @@ from numpy.typing import NDArray
 from lerobot_vtrefine.drivers.board import PadReader, Status
 from lerobot_vtrefine.drivers.config import PadConfig
 from lerobot_vtrefine.drivers.pads_file import check_distinct_ports
-from lerobot_vtrefine.drivers.ports import PortError
 
 logger = logging.getLogger(__name__)
 
@@ -67,7 +66,7 @@ class PadSet:
             for reader in self._readers.values():
                 reader.connect(CONNECT_TIMEOUT_S)
             self.measure_baselines()
-        except PortError:
+        except BaseException:
             self.disconnect()
             raise
         self._connected = True

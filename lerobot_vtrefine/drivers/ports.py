@@ -21,9 +21,11 @@ STABLE_FOLDERS = ("by-path", "by-id")
 
 FALLBACK_PATTERNS = ("ttyUSB*", "ttyACM*", "tty.usbserial*", "tty.usbmodem*")
 
-LOST: tuple[type[Exception], ...] = (serial.SerialException, OSError, _TerminalError, TypeError)
-"""What pyserial raises where a device goes away: TypeError in the middle of a read, and termios errors, which
-are no OSError, from flushing."""
+GONE: tuple[type[Exception], ...] = (serial.SerialException, OSError, _TerminalError)
+"""What a port raises whose device goes away; flushing raises termios errors, which are no OSError."""
+
+LOST: tuple[type[Exception], ...] = (*GONE, TypeError)
+"""The same of pyserial alone: TypeError in the middle of a read."""
 
 
 class PortError(ConnectionError):

@@ -4,6 +4,7 @@ A source maps a frame number to counts, uint8 (R, C); it is deterministic in its
 """
 
 import struct
+import zipfile
 import zlib
 from collections.abc import Callable
 from pathlib import Path
@@ -90,14 +91,19 @@ def recording_source(path: Path, shape: FrameShape) -> Source:
 
     Raises:
         FileNotFoundError: no such file.
-        ValueError: the file holds no such array; the message lists what it holds.
+        ValueError: the file cannot be read, or holds no such array; the message lists what it holds.
     """
     if not path.is_file():
         raise FileNotFoundError(f"recording {path} does not exist; give a .npy or .npz file of uint8 frames")
-    loaded = np.load(path)
-    arrays = (
-        {"array": loaded} if isinstance(loaded, np.ndarray) else {key: loaded[key] for key in loaded.files}
-    )
+    try:
+        loaded = np.load(path)
+        if isinstance(loaded, np.ndarray):
+            arrays = {"array": loaded}
+        else:
+            with loaded:
+                arrays = {key: loaded[key] for key in loaded.files}
+    except (ValueError, EOFError, zipfile.BadZipFile) as error:
+        raise ValueError(f"recording {path} cannot be read as .npy or .npz: {error}") from error
     for array in arrays.values():
         if array.dtype == np.uint8 and array.ndim in (2, 3) and array[0].size == shape.taxels:
             frames = array.reshape(len(array), shape.rows, shape.cols)

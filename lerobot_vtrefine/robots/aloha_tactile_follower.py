@@ -15,6 +15,7 @@ from lerobot_vtrefine.datasets.features import JOINT_SUFFIX, PAD_COLS, PAD_ROWS,
 from lerobot_vtrefine.drivers.arm_pair import ArmPair
 from lerobot_vtrefine.drivers.dynamixel_arm import VIPERX_300S, Floats
 from lerobot_vtrefine.drivers.pad_set import PadSet
+from lerobot_vtrefine.drivers.ports import PortError
 from lerobot_vtrefine.embodiments import get_embodiment
 from lerobot_vtrefine.robots.camera_models import CameraModels
 from lerobot_vtrefine.robots.config_aloha_tactile_follower import AlohaTactileFollowerConfig
@@ -125,19 +126,25 @@ class AlohaTactileFollower(Robot):
 
     def disconnect(self) -> None:
         """Moves the arms to rest, switches torque off, releases everything, also after failures."""
-        if self.config.rest_on_disconnect:
-            for arm in self.pair.arms.values():
-                with contextlib.suppress(ConnectionError, OSError):  # an arm that is gone cannot be moved
-                    if arm.is_connected and arm.holding:
-                        arm.move_to(np.array([*REST_RAD, *arm.read()[FINGERS]]), self.config.rest_s)
-        self._release()
+        try:
+            if self.config.rest_on_disconnect:
+                self._rest()
+        finally:
+            self._release()
+
+    def _rest(self) -> None:
+        for arm in self.pair.arms.values():
+            with contextlib.suppress(PortError):  # an arm that is gone cannot be moved
+                if arm.is_connected and arm.holding:
+                    arm.move_to(np.array([*REST_RAD, *arm.read()[FINGERS]]), self.config.rest_s)
 
     def _release(self) -> None:
-        self.pair.release(torque_off=True)
-        self.pads.disconnect()
-        for camera in self.cameras.values():
-            if camera.is_connected:
-                camera.disconnect()
+        with contextlib.ExitStack() as stack:  # the arms first, and everything whatever fails
+            for camera in self.cameras.values():
+                if camera.is_connected:
+                    stack.callback(camera.disconnect)
+            stack.callback(self.pads.disconnect)
+            stack.callback(self.pair.release, torque_off=True)
 
     # --- calibration --------------------------------------------------------------------------------
 
@@ -184,8 +191,14 @@ class AlohaTactileFollower(Robot):
 
         Returns:
             The targets sent; each right finger mirrors its left finger.
+
+        Raises:
+            ValueError: a target is not a number; nothing is sent.
         """
         wanted = np.array([action[key] for key in self.action_features], float)
+        if not np.isfinite(wanted).all():
+            wrong = [key for key in self.action_features if not np.isfinite(action[key])]
+            raise ValueError(f"the action's {', '.join(wrong)} must be finite: nothing was sent to the arms")
         sent = []
         for index, arm in enumerate(self.pair.arms.values()):
             part = slice(index * PER_ARM, (index + 1) * PER_ARM)

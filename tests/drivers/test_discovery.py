@@ -16,6 +16,7 @@ from lerobot_vtrefine.cli.find_pads import main as find_pads
 from lerobot_vtrefine.cli.pad_emulator import Turns
 from lerobot_vtrefine.cli.pad_emulator import main as pad_emulator
 from lerobot_vtrefine.cli.view_pads import main as view_pads
+from lerobot_vtrefine.drivers.board import PadReader
 from lerobot_vtrefine.drivers.config import PadConfig
 from lerobot_vtrefine.drivers.discovery import open_board, probe_port, wait_for_press
 from lerobot_vtrefine.drivers.frames import FrameShape
@@ -105,6 +106,24 @@ def test_pad_on_sixteen_row_firmware_gets_its_offset(tmp_path: Path) -> None:
         found.reader.stop()
     assert found.config == PadConfig(board.port, rows=16, pad_rows=12, row_offset=4)
     assert found.idle.shape == (12, 32)
+
+
+def test_board_that_stalls_while_it_is_opened_is_let_go(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    before = set(threading.enumerate())
+    with emulated(tmp_path) as board:
+        running = set(threading.enumerate())
+        kind = probe_port(board.port)
+
+        def stalled(reader: PadReader, *_: object, **__: object) -> None:
+            raise PortError(f"{reader.port}: frames stopped coming")
+
+        monkeypatch.setattr(PadReader, "idle_counts", stalled)
+        with pytest.raises(PortError, match="frames stopped coming"):
+            open_board(board.port, kind)
+        assert set(threading.enumerate()) == running
+    assert set(threading.enumerate()) == before
 
 
 def test_two_pads_pressed_together_are_no_answer(tmp_path: Path) -> None:

@@ -43,6 +43,18 @@ def test_recording_plays_in_a_loop(tmp_path: Path, suffix: str) -> None:
         recording_source(path, FrameShape(16, 32))
 
 
+@pytest.mark.parametrize("name", ["cut.npz", "cut.npy", "text.npy"])
+def test_broken_recordings_are_named(tmp_path: Path, name: str) -> None:
+    path = tmp_path / name
+    if name == "text.npy":
+        path.write_text("counts")
+    else:
+        (np.savez if name.endswith("npz") else np.save)(path, np.zeros((9, 384), np.uint8))
+        path.write_bytes(path.read_bytes()[:300])
+    with pytest.raises(ValueError, match=f"recording {path} cannot be read"):
+        recording_source(path, PAD)
+
+
 def test_contact_rises_and_falls() -> None:
     source = contact_source(PAD, period_frames=100)
     assert source(50).max() > 120 > 45 >= source(0).max()

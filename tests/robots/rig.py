@@ -17,7 +17,10 @@ from lerobot_vtrefine.drivers.dynamixel_emulator import DynamixelEmulator, Emula
 from lerobot_vtrefine.drivers.emulator import PadEmulator
 from lerobot_vtrefine.drivers.frames import FrameShape
 from lerobot_vtrefine.drivers.pads_file import save_pads
+from lerobot_vtrefine.drivers.ports import PortError
 from lerobot_vtrefine.drivers.sources import pattern_source
+from lerobot_vtrefine.robots import AlohaTactileFollowerConfig
+from lerobot_vtrefine.robots.aloha_tactile_follower import AlohaTactileFollower
 
 PAD = FrameShape(12, 32)
 
@@ -89,3 +92,23 @@ def emulated_elsewhere(folder: Path) -> Generator[list[str]]:
             yield [*flags, f"--robot.pads_file={pads_file}"]
         finally:
             process.terminate()
+
+
+def follower_config(rig: Rig, **changes: object) -> AlohaTactileFollowerConfig:
+    settings = {
+        "id": "follower",
+        "calibration_dir": rig.folder / "calibration",
+        "pads_file": rig.pads_file,
+        "rest_s": 0.1,
+        **rig.ports("follower"),
+    }
+    return AlohaTactileFollowerConfig(**(settings | changes))
+
+
+def connect_error(rig: Rig, **changes: object) -> str:
+    robot = AlohaTactileFollower(follower_config(rig, **changes))
+    with pytest.raises(PortError) as caught:
+        robot.connect()
+    assert not robot.is_connected
+    assert not robot.pads.is_connected
+    return str(caught.value)

@@ -8,16 +8,14 @@ import numpy as np
 import pytest
 import serial
 from lerobot.motors.dynamixel.tables import MODEL_NUMBER_TABLE
-from rig import Rig, allow_slow_answers, aloha_rig
+from rig import Rig, allow_slow_answers, aloha_rig, connect_error, follower_config
 
 from lerobot_vtrefine.datasets.features import NUM_JOINTS, PADS, TAXEL_INFO
 from lerobot_vtrefine.drivers import dynamixel_arm
 from lerobot_vtrefine.drivers.aloha_emulator import GRIPPER_ENDS
 from lerobot_vtrefine.drivers.dynamixel_arm import VIPERX_300S, WIDOWX_250S, ArmModel, DynamixelArm
 from lerobot_vtrefine.drivers.dynamixel_emulator import EmulatedMotor
-from lerobot_vtrefine.drivers.ports import PortError
 from lerobot_vtrefine.drivers.sources import check_pattern
-from lerobot_vtrefine.robots import AlohaTactileFollowerConfig
 from lerobot_vtrefine.robots.aloha_tactile_follower import REST_RAD, AlohaTactileFollower, limit_step
 from lerobot_vtrefine.teleoperators import AlohaLeaderConfig
 from lerobot_vtrefine.teleoperators.aloha_leader import AlohaLeader
@@ -30,17 +28,6 @@ def rig(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Generator[Rig]:
     allow_slow_answers(monkeypatch)
     with aloha_rig(tmp_path) as built:
         yield built
-
-
-def follower_config(rig: Rig, **changes: object) -> AlohaTactileFollowerConfig:
-    settings = {
-        "id": "follower",
-        "calibration_dir": rig.folder / "calibration",
-        "pads_file": rig.pads_file,
-        "rest_s": 0.1,
-        **rig.ports("follower"),
-    }
-    return AlohaTactileFollowerConfig(**(settings | changes))
 
 
 @pytest.fixture
@@ -231,15 +218,6 @@ def test_arms_ask_their_adapters_not_to_wait(rig: Rig, monkeypatch: pytest.Monke
     arm.disconnect(torque_off=False)
     assert asked == [port]
     assert warned == [f"left arm: {port}: echo 1"]
-
-
-def connect_error(rig: Rig, **changes: object) -> str:
-    robot = AlohaTactileFollower(follower_config(rig, **changes))
-    with pytest.raises(PortError) as caught:
-        robot.connect()
-    assert not robot.is_connected
-    assert not robot.pads.is_connected
-    return str(caught.value)
 
 
 def test_errors_name_port_and_fix(rig: Rig) -> None:

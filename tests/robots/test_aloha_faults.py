@@ -1,0 +1,132 @@
+"""ALOHA's arms when something breaks: nothing stays driven, open or running, and the error names the arm."""
+
+import threading
+from collections.abc import Generator
+from pathlib import Path
+
+import numpy as np
+import pytest
+from rig import Rig, allow_slow_answers, aloha_rig, connect_error, follower_config
+
+from lerobot_vtrefine.drivers.board import PadReader
+from lerobot_vtrefine.drivers.dynamixel_arm import WIDOWX_250S, DynamixelArm
+from lerobot_vtrefine.drivers.ports import PortError
+from lerobot_vtrefine.robots.aloha_tactile_follower import AlohaTactileFollower
+
+
+@pytest.fixture
+def rig(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Generator[Rig]:
+    allow_slow_answers(monkeypatch)
+    with aloha_rig(tmp_path) as built:
+        yield built
+
+
+@pytest.fixture
+def follower(rig: Rig) -> Generator[AlohaTactileFollower]:
+    robot = AlohaTactileFollower(follower_config(rig))
+    robot.connect()
+    yield robot
+    if robot.is_connected:
+        robot.disconnect()
+
+
+def test_an_arm_in_use_is_busy(rig: Rig) -> None:
+    port = rig.ports("leader")["left_port"]
+    first, second = (DynamixelArm("left", port, WIDOWX_250S, 0.04) for _ in range(2))
+    first.connect()
+    with pytest.raises(PortError, match=f"left arm: {port} is busy"):
+        second.connect()
+    assert not second.is_connected
+    first.disconnect(torque_off=False)
+    second.connect()
+    second.disconnect(torque_off=False)
+
+
+def test_a_motor_that_shut_down_is_named(rig: Rig) -> None:
+    rig.motor("follower", "right", 9).alert = True
+    message = connect_error(rig)
+    assert rig.ports("follower")["right_port"] in message
+    assert "gripper (id 9) report a hardware error" in message
+
+
+def test_a_motor_that_shut_down_or_is_lost_keeps_no_other_driven(
+    follower: AlohaTactileFollower, rig: Rig, caplog: pytest.LogCaptureFixture
+) -> None:
+    rig.motor("follower", "left", 9).alert = True
+    del rig.buses["follower_left"].motors[1]
+    follower.disconnect()
+    assert not follower.is_connected
+    assert not follower.pads.is_connected
+    for side in ("left", "right"):
+        driven = [number for number, motor in rig.buses[f"follower_{side}"].motors.items() if motor.torque]
+        assert driven == []
+    told = [
+        record.getMessage() for record in caplog.records if "torque may still be on" in record.getMessage()
+    ]
+    assert len(told) == 1
+    assert "left arm" in told[0]
+    assert "still be on in waist, gripper" in told[0]
+
+
+def test_unplugged_arm_is_named_and_everything_else_is_released(
+    follower: AlohaTactileFollower, rig: Rig, caplog: pytest.LogCaptureFixture
+) -> None:
+    rig.buses["follower_left"].unplug()
+    with pytest.raises(PortError, match=f"left arm .{rig.ports('follower')['left_port']}"):
+        follower.get_observation()
+    with pytest.raises(PortError, match="left arm"):
+        follower.send_action(dict.fromkeys(follower.action_features, 0.0))
+    follower.disconnect()
+    assert not follower.is_connected
+    assert not follower.pads.is_connected
+    assert not any(motor.torque for motor in rig.buses["follower_right"].motors.values())
+    assert "left arm" in caplog.text
+    rig.buses["follower_left"].plug()
+    follower.connect()  # plugged in again, it works again
+    assert len(follower.get_observation()) == len(follower.observation_features)
+
+
+def test_interrupted_rest_still_switches_torque_off(
+    follower: AlohaTactileFollower, rig: Rig, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def interrupted(*_: object) -> None:
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(DynamixelArm, "move_to", interrupted)
+    with pytest.raises(KeyboardInterrupt):
+        follower.disconnect()
+    assert not follower.pads.is_connected
+    for side in ("left", "right"):
+        assert not any(motor.torque for motor in rig.buses[f"follower_{side}"].motors.values())
+
+
+@pytest.mark.parametrize("value", [np.nan, np.inf])
+def test_an_action_that_is_no_number_is_refused(
+    follower: AlohaTactileFollower, rig: Rig, value: float
+) -> None:
+    action = dict.fromkeys(follower.action_features, 0.1) | {"right_waist.pos": value}
+    with pytest.raises(ValueError, match=r"right_waist\.pos must be finite: nothing was sent"):
+        follower.send_action(action)
+    assert rig.motor("follower", "left", 1).shaft == 2048
+
+
+def test_failed_connect_leaves_no_port_open(rig: Rig, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Neither ports nor threads, wherever it fails; the same devices connect afterwards."""
+    before = set(threading.enumerate())
+    rig.buses["follower_right"].motors[9].alert = True
+    connect_error(rig)
+    rig.buses["follower_right"].motors[9].alert = False
+
+    def broken(*_: object, **__: object) -> None:
+        raise KeyboardInterrupt
+
+    robot = AlohaTactileFollower(follower_config(rig))
+    for where in (PadReader, DynamixelArm):
+        with monkeypatch.context() as patch:
+            patch.setattr(where, "idle_counts" if where is PadReader else "hold", broken)
+            with pytest.raises(KeyboardInterrupt):
+                robot.connect()
+        assert set(threading.enumerate()) <= before
+    robot.connect()
+    robot.disconnect()
+    assert set(threading.enumerate()) <= before
