@@ -7,7 +7,7 @@ import numpy as np
 import torch
 import warp as wp
 
-from lerobot_vtrefine.tactile import kernels, kernels_query
+from lerobot_vtrefine.tactile import kernels, kernels_query, kernels_surface
 from lerobot_vtrefine.tactile.geometry import BodyGeometry, TriangleMesh
 from lerobot_vtrefine.tactile.layout import PadLayout
 from lerobot_vtrefine.tactile.mesh_grid import add_grids
@@ -15,6 +15,11 @@ from lerobot_vtrefine.tactile.packing import pack_bodies
 
 REACH_M = 0.003
 """How far from the face, either way, a body's surface is looked for [m]."""
+
+CUDA_BLOCK = 64
+"""Threads of a block: few, as the memory that a block may have for its pads is limited."""
+CPU_BLOCK = 256
+"""warp's default, which means nothing there."""
 
 MODES = {"closest": 0, "column": 1}
 NOTHING_M = {"closest": 0.0, "column": -1.0}
@@ -65,6 +70,7 @@ class ContactQuery:
         start_warp()
         self.device = str(torch.device(device))
         self.lanes = 32 if self.device.startswith("cuda") else 1
+        self.block_dim = CUDA_BLOCK if self.lanes > 1 else CPU_BLOCK
         self.rows, self.cols = layout.rows * subdivision, layout.cols * subdivision
         self.subdivision, self.pitch_m, self.reach_m = subdivision, layout.pitch_m / subdivision, reach_m
         self.num_bodies = len(bodies)
@@ -76,6 +82,7 @@ class ContactQuery:
         self._has_grids = not (self._packed.kind == TriangleMesh.kind).any()
         self._scratch: dict[tuple[int, int], _Buffers] = {}
         self._wrapped: tuple[Any, Any] = (None, None)
+        self._room: wp.array | None = None
 
     def _upload(self, array: np.ndarray) -> wp.array:
         if array.dtype == np.int32:
@@ -158,7 +165,8 @@ class ContactQuery:
         envs, pads = pad_pos.shape[:2]
         buffers = self._buffers(envs, pads)
         buffers.depth.fill_(NOTHING_M[mode])
-        inputs = [lattice, self.lanes, self.bodies, views, buffers.depth, buffers.rate]
+        room = self.room(envs * pads, kernels_surface.TAXEL_POINTS)
+        inputs = [lattice, self.bodies, views, room, buffers.depth, buffers.rate]
         self.launch(kernels_query.query, (envs, pads, self.lanes), inputs)
         shape = (envs, pads, self.rows, self.cols)
         return wp.to_torch(buffers.depth).view(shape), wp.to_torch(buffers.rate).view(shape)
@@ -181,6 +189,17 @@ class ContactQuery:
         P, K)."""
         return self._scratch[envs, pads].views.window
 
+    def room(self, pads: int, points: int) -> wp.array:
+        """Scratch for `pads` lattices on CUDA, where a multiprocessor's memory has not the `points` that one
+        needs."""
+        needed = self.rows * ((self.cols + 7) // 8 | 1) * 8
+        shape = (pads, 2 * needed) if self.lanes > 1 and needed > points else (1, 1)
+        if self._room is None or self._room.shape < shape:
+            self._room = wp.zeros(shape, dtype=float, device=self.device)
+        return self._room
+
     def launch(self, kernel: wp.Kernel, dim: tuple[int, ...], inputs: list[Any]) -> None:
         """Launch a kernel on this query's device."""
-        wp.launch(kernel, dim=dim, inputs=inputs, device=self.device, record_tape=False)
+        wp.launch(
+            kernel, dim=dim, inputs=inputs, device=self.device, block_dim=self.block_dim, record_tape=False
+        )

@@ -9,12 +9,13 @@ import numpy as np
 import torch
 import warp as wp
 
-from lerobot_vtrefine.tactile import kernels_press
+from lerobot_vtrefine.tactile import kernels_press, kernels_surface
 from lerobot_vtrefine.tactile.contact_query import ContactQuery, start_warp
 from lerobot_vtrefine.tactile.layout import PadLayout
 from lerobot_vtrefine.tactile.workers import Workers
 
 Poses = tuple[torch.Tensor, ...]
+PENALTIES = {"closest": kernels_press.penalise_closest, "column": kernels_press.penalise_columns}
 PerEnv = torch.Tensor | float
 """A number for all environments, or one each: m elements of any shape."""
 
@@ -32,7 +33,7 @@ class ContactSolver:
         start_warp()
         self._workers = Workers(num_threads if query.lanes == 1 else 1)
         # Loaded here, before threads could do so at once.
-        wp.load_module(kernels_press, device=query.device)
+        wp.load_module(kernels_press, device=query.device, block_dim=query.block_dim)
         self.layout, self.query, self.device = layout, query, query.device
         offsets = np.arange(query.cols) // query.subdivision - (layout.cols - 1) / 2
         self._taxel_x = wp.array(offsets.astype(np.float32), dtype=float, device=self.device)
@@ -68,11 +69,13 @@ class ContactSolver:
         force, solution = self._results(envs, pads)
         loads = wp.from_torch(load.to(self.device, torch.float32).contiguous(), dtype=wp.vec3)
         if heights is None:
-            scratch = [self._buffer(0, envs, pads), self._buffer(1, envs, pads)]
+            scratch = [self._buffer(0), self._buffer(1)]
         else:
             scratch = [wp.from_torch(item.reshape(envs * pads, -1).contiguous()) for item in heights]
         own = heights is not None
-        inputs = [lattice, int(own), foundation, self.query.bodies, views, loads, *scratch, force, solution]
+        room = self.query.room(envs * pads, kernels_surface.LATTICE_POINTS)
+        inputs = [lattice, int(own), foundation, self.query.bodies, views]
+        inputs += [loads, *scratch, room, force, solution]
         self._launch(kernels_press.press, (envs, pads), own, inputs)
         return wp.to_torch(force).view(envs, pads, self.layout.rows, self.layout.cols), wp.to_torch(solution)
 
@@ -90,6 +93,10 @@ class ContactSolver:
             mode: what d means, as in `ContactQuery`.
             stiffness_n_per_m, damping_n_s_per_m, ceiling_n: of one taxel.
         """
+        if self.query.subdivision != 1:
+            raise ValueError(
+                f"a penalty acts on whole taxels, not on a subdivision of {self.query.subdivision}"
+            )
         envs, pads = poses[0].shape[:2]
         lattice, views = self.query.prepare(mode, poses)
         penalty = kernels_press.Penalty()
@@ -99,8 +106,9 @@ class ContactSolver:
         )
         penalty.ceiling = self._own(ceiling_n, envs)
         force, _ = self._results(envs, pads)
-        inputs = [lattice, penalty, self.query.bodies, views, self._buffer(1, envs, pads), force]
-        self._launch(kernels_press.penalise, (envs, pads), False, inputs)
+        room = self.query.room(envs * pads, kernels_surface.TAXEL_POINTS)
+        inputs = [lattice, penalty, self.query.bodies, views, self._buffer(1), room, force]
+        self._launch(PENALTIES[mode], (envs, pads), False, inputs)
         return wp.to_torch(force).view(envs, pads, self.layout.rows, self.layout.cols)
 
     def _own(self, values: PerEnv, envs: int) -> wp.array:
@@ -119,11 +127,10 @@ class ContactSolver:
             )
         return self._forces[envs, pads]
 
-    def _buffer(self, number: int, envs: int, pads: int) -> wp.array:
-        """Scratch: on CPU one lattice for each thread, on CUDA for each pad."""
-        count = envs * pads if self.query.lanes > 1 else self._workers.num_threads
-        if number not in self._scratch or len(self._scratch[number]) < count:
-            shape = (count, self.query.rows * self.query.cols)
+    def _buffer(self, number: int) -> wp.array:
+        """Scratch on CPU, one lattice for each thread."""
+        if number not in self._scratch:
+            shape = (self._workers.num_threads, self.query.rows * self.query.cols)
             self._scratch[number] = wp.zeros(shape, dtype=float, device=self.device)
         return self._scratch[number]
 
@@ -132,9 +139,9 @@ class ContactSolver:
 
         def part(worker: int, begin: int, end: int) -> None:
             work = kernels_press.Work()
-            work.lanes, work.first_env = self.query.lanes, begin
-            work.own_buffers = int(own_buffers or self.query.lanes > 1)
-            work.buffer = 0 if work.own_buffers else worker
-            self.query.launch(kernel, (end - begin, size[1], work.lanes), [inputs[0], work, *inputs[1:]])
+            work.first_env, work.own_buffers = begin, int(own_buffers)
+            work.buffer = 0 if own_buffers else worker
+            dim = (end - begin, size[1], self.query.lanes)
+            self.query.launch(kernel, dim, [inputs[0], work, *inputs[1:]])
 
         self._workers.split(size[0], part)

@@ -38,15 +38,6 @@ class Lattice:
 
 
 @wp.struct
-class Share:
-    """Which lattice columns a thread owns: `width` neighbouring ones of every `width * lanes`."""
-
-    lane: int
-    lanes: int
-    width: int
-
-
-@wp.struct
 class Poses:
     """Poses and velocities of pads (m, P) and bodies (m, B), and the load on each pad."""
 
@@ -249,23 +240,6 @@ def rate_form(mode: int, n: wp.vec3, axes: wp.mat33, linear: wp.vec3, angular: w
 def eval_rate(form: wp.vec4, x: float, y: float, s: float) -> float:
     """Rate of depth at (x, y) and s along the pad's normal."""
     return form[0] + form[1] * x + form[2] * y + form[3] * s
-
-
-@wp.func
-def own_first(share: Share, begin: int) -> int:
-    """First column of a group that this thread owns, a little before `begin` or after it."""
-    if share.lanes == 1:
-        return begin
-    span = share.width * share.lanes
-    return begin / span * span + share.lane * share.width
-
-
-@wp.func
-def own_width(share: Share, begin: int, end: int) -> int:
-    """How many neighbouring columns this thread takes at a time: alone, all of them."""
-    if share.lanes == 1:
-        return end - begin
-    return share.width
 
 
 @wp.func

@@ -11,14 +11,24 @@ The loops over points are in `kernels_packs`.
 
 import warp as wp
 
-from lerobot_vtrefine.tactile.kernels import Share, ivec4
-from lerobot_vtrefine.tactile.kernels_packs import add_all_lanes, add_forces, add_lanes, raw_sums
+from lerobot_vtrefine.tactile.kernels import ivec4
+from lerobot_vtrefine.tactile.kernels_lanes import Share, add_lanes, lanes
+from lerobot_vtrefine.tactile.kernels_packs import (
+    add_all_lanes,
+    add_forces,
+    clear,
+    raw_sums,
+    scale_forces,
+    vec10,
+)
 
 wp.set_module_options({"enable_backward": False})
 
 MAX_TILT = wp.constant(3.0)
 """Limit of the two slopes; only reached when the load's centre lies outside what the body can press on."""
 NEWTON_STEPS = wp.constant(14)
+HALVINGS = wp.constant(8)
+OFFSET_STEPS = wp.constant(32)
 MAX_LEAD_M = wp.constant(0.05)
 NEAR = wp.constant(1.0e-2)
 """How close to the load the search for the offset comes before Newton's method takes over."""
@@ -29,87 +39,88 @@ TOLERANCE = wp.constant(1.0e-5)
 NOISE = wp.constant(1.0e-6)
 """Relative rounding of sums in single precision, which no step can be asked to beat."""
 
-mat33d = wp.types.matrix(shape=(3, 3), dtype=wp.float64)
+FIRST = wp.constant(0)
+"""The start is looked at: is enough in contact there for a first step that means something?"""
+AGAIN = wp.constant(1)
+"""What the search for an offset led to is looked at, and taken."""
+LINE = wp.constant(2)
+"""A step of Newton's method is looked at, and taken if it helps, else halved."""
+OFFSET = wp.constant(3)
+"""The offset alone is moved, until about the load is carried."""
+LAST = wp.constant(4)
+"""As OFFSET, after which nothing follows."""
+DONE = wp.constant(5)
 
 
 @wp.struct
 class Pad:
-    """One pad's lattice, rows and columns `area` of which may be in contact, and this thread's part of it."""
+    """One pad's taxels, the lattice's rows and columns `area` that may be in contact, the length `stride` of
+    a row of heights, and this thread's part of it."""
 
-    rows: int
-    cols: int
-    subdivision: int
+    taxel_rows: int
+    taxel_cols: int
     area: ivec4
+    stride: int
     share: Share
 
 
-@wp.struct
-class Balance:
-    """Sums over the points in contact for one trial of (delta, a, b)."""
-
-    squares: wp.float64
-    sums: wp.vec3d
-    hessian: mat33d
+@wp.func
+def balance(pad: Pad, taxel_x: wp.array(dtype=float), lead: wp.array(dtype=float), trial: wp.vec3d) -> vec10:
+    """(n, x, y, x^2, x y, y^2, u, u x, u y, u^2) summed over all points in contact for one trial of (delta,
+    a, b)."""
+    middle = 0.5 * float(pad.taxel_rows - 1)
+    return add_all_lanes(raw_sums(pad.share, pad.area, pad.stride, middle, wp.vec3(trial), taxel_x, lead))
 
 
 @wp.func
-def balance(
-    pad: Pad, taxel_x: wp.array(dtype=float), lead: wp.array(dtype=float), trial: wp.vec3d
-) -> Balance:
-    """Sums of u (1, x, y) and (1, x, y)^T (1, x, y)."""
-    middle = 0.5 * float(pad.rows / pad.subdivision - 1)
-    own = raw_sums(pad.share, pad.area, pad.cols, middle, wp.vec3(trial), taxel_x, lead)
-    own = add_all_lanes(own)
-    n = wp.float64(own[0])
-    x = wp.float64(own[1])
-    y = wp.float64(own[2])
-    xy = wp.float64(own[4])
-    result = Balance()
-    result.squares = wp.float64(own[9])
-    result.sums = wp.vec3d(wp.float64(own[6]), wp.float64(own[7]), wp.float64(own[8]))
-    result.hessian = mat33d(n, x, y, x, wp.float64(own[3]), xy, y, xy, wp.float64(own[5]))
-    return result
+def excess(sums: vec10, target: wp.vec3d) -> wp.vec3d:
+    """Sums of u (1, x, y), less the target."""
+    return wp.vec3d(wp.float64(sums[6]), wp.float64(sums[7]), wp.float64(sums[8])) - target
 
 
 @wp.func
-def offset_for_sum(
-    pad: Pad, taxel_x: wp.array(dtype=float), lead: wp.array(dtype=float), tilted: wp.vec3d, total: wp.float64
-) -> wp.vec3d:
-    """(delta, a, b) with the tilts of `tilted` and delta such that the u add up to about `total`.
+def merit(sums: vec10, target: wp.vec3d, trial: wp.vec3d) -> wp.float64:
+    """The convex function whose gradient is the excess."""
+    return wp.float64(0.5) * wp.float64(sums[9]) - wp.dot(target, trial)
+
+
+@wp.func
+def offset_step(sums: vec10, total: wp.float64) -> wp.vec2d:
+    """By how much delta changes so that the u add up to about `total`, and (1 or 0) whether that is reached.
 
     Newton from the side where more points are in contact descends monotonically and ends after finitely many
     steps; its first step leads to that side from anywhere.
     """
-    trial = tilted
-    for _step in range(32):
-        here = balance(pad, taxel_x, lead, trial)
-        if here.hessian[0, 0] < wp.float64(1.0):
-            trial[0] = trial[0] + wp.float64(1.0e-3)
-        else:
-            change = (total - here.sums[0]) / here.hessian[0, 0]
-            trial[0] = trial[0] + change
-            if wp.abs(change) * here.hessian[0, 0] <= wp.float64(NEAR) * total:
-                break
-    return trial
+    count = wp.float64(sums[0])
+    if count < wp.float64(1.0):
+        return wp.vec2d(wp.float64(1.0e-3), wp.float64(0.0))
+    missing = total - wp.float64(sums[6])
+    if wp.abs(missing) <= wp.float64(NEAR) * total:
+        return wp.vec2d(missing / count, wp.float64(1.0))
+    return wp.vec2d(missing / count, wp.float64(0.0))
 
 
 @wp.func
-def newton_step(h: mat33d, g: wp.vec3d) -> wp.vec3d:
-    """-(h + small diagonal)^-1 g by Cholesky; the diagonal keeps points on one line, or one point,
-    solvable."""
+def newton_step(sums: vec10, g: wp.vec3d) -> wp.vec3d:
+    """-(h + small diagonal)^-1 g for the second derivatives h, by Cholesky; the diagonal keeps points on one
+    line, or one point, solvable."""
     small = wp.float64(1.0e-9)
-    l00 = wp.sqrt(h[0, 0] + wp.float64(1.0e-30))
-    l10 = h[1, 0] / l00
-    l20 = h[2, 0] / l00
-    l11 = wp.sqrt(wp.max(h[1, 1] - l10 * l10, small * (h[1, 1] + h[0, 0])))
-    l21 = (h[2, 1] - l20 * l10) / l11
-    l22 = wp.sqrt(wp.max(h[2, 2] - l20 * l20 - l21 * l21, small * (h[2, 2] + h[0, 0])))
-    y0 = -g[0] / l00
-    y1 = (-g[1] - l10 * y0) / l11
-    y2 = (-g[2] - l20 * y0 - l21 * y1) / l22
-    x2 = y2 / l22
-    x1 = (y1 - l21 * x2) / l11
-    x0 = (y0 - l10 * x1 - l20 * x2) / l00
+    one = wp.float64(1.0)
+    n = wp.float64(sums[0])
+    xx = wp.float64(sums[3])
+    yy = wp.float64(sums[5])
+    r0 = one / wp.sqrt(n + wp.float64(1.0e-30))
+    l10 = wp.float64(sums[1]) * r0
+    l20 = wp.float64(sums[2]) * r0
+    r1 = one / wp.sqrt(wp.max(xx - l10 * l10, small * (xx + n)))
+    l21 = (wp.float64(sums[4]) - l20 * l10) * r1
+    r2 = one / wp.sqrt(wp.max(yy - l20 * l20 - l21 * l21, small * (yy + n)))
+    y0 = -g[0] * r0
+    y1 = (-g[1] - l10 * y0) * r1
+    y2 = (-g[2] - l20 * y0 - l21 * y1) * r2
+    x2 = y2 * r2
+    x1 = (y1 - l21 * x2) * r1
+    x0 = (y0 - l10 * x1 - l20 * x2) * r0
     return wp.vec3d(x0, x1, x2)
 
 
@@ -117,6 +128,15 @@ def newton_step(h: mat33d, g: wp.vec3d) -> wp.vec3d:
 def limited(trial: wp.vec3d, limit: wp.float64) -> wp.vec3d:
     """The trial with both tilts within +-limit."""
     return wp.vec3d(trial[0], wp.clamp(trial[1], -limit, limit), wp.clamp(trial[2], -limit, limit))
+
+
+@wp.func
+def helps(there: vec10, here: vec10, target: wp.vec3d, point: wp.vec3d, trial: wp.vec3d) -> bool:
+    """Whether a step from `trial` (sums `here`) to `point` lowers the merit as much as can be expected."""
+    gain = merit(there, target, point) - merit(here, target, trial)
+    slope = wp.min(wp.dot(excess(here, target), point - trial), wp.float64(0.0))
+    slack = wp.float64(here[9]) + wp.abs(wp.dot(target, trial))
+    return gain <= wp.float64(1.0e-4) * slope + wp.float64(NOISE) * slack
 
 
 @wp.func
@@ -129,38 +149,55 @@ def solve_balance(
     limit: wp.float64,
 ) -> wp.vec3d:
     """(delta, a, b) whose sums meet the target; damped Newton steps on the convex merit sum u^2 / 2 - target
-    . trial."""
+    . trial.
+
+    All looks at a trial go through one place, as the code for it is long.
+    """
+    point = start
     trial = start
-    here = balance(pad, taxel_x, lead, trial)
-    if here.sums[0] < wp.float64(0.1) * target[0]:
-        # Too little in contact for a first step that means something.
-        trial = offset_for_sum(pad, taxel_x, lead, trial, target[0])
-        here = balance(pad, taxel_x, lead, trial)
-    for _ in range(NEWTON_STEPS):
-        g = here.sums - target
-        worst = wp.max(wp.abs(g[0]), wp.max(wp.abs(g[1]), wp.abs(g[2])))
-        if worst <= wp.float64(TOLERANCE) * target[0]:
-            break
-        step = newton_step(here.hessian, g)
-        merit = wp.float64(0.5) * here.squares - wp.dot(target, trial)
-        slack = wp.float64(NOISE) * (here.squares + wp.abs(wp.dot(target, trial)))
-        scale = wp.float64(1.0)
-        accepted = int(0)
-        for _halving in range(8):
-            if accepted == 0:
-                candidate = limited(trial + scale * step, limit)
-                there = balance(pad, taxel_x, lead, candidate)
-                gain = wp.float64(0.5) * there.squares - wp.dot(target, candidate) - merit
-                bound = wp.float64(1.0e-4) * wp.min(wp.dot(g, candidate - trial), wp.float64(0.0))
-                if gain <= bound + slack:
-                    trial = candidate
-                    here = there
-                    accepted = 1
+    step = wp.vec3d()
+    here = vec10()
+    scale = wp.float64(1.0)
+    phase = int(FIRST)
+    moves = int(0)
+    looks = int(0)
+    while phase != DONE:
+        there = balance(pad, taxel_x, lead, point)
+        looks += 1
+        if phase == FIRST and wp.float64(there[6]) < wp.float64(0.1) * target[0]:
+            phase = OFFSET
+            looks = 1
+        if phase >= OFFSET:
+            change = offset_step(there, target[0])
+            point[0] = point[0] + change[0]
+            if change[1] > wp.float64(0.5) or looks >= OFFSET_STEPS:
+                if phase == LAST:
+                    trial = point
+                phase = wp.where(phase == LAST, DONE, AGAIN)
+        else:
+            stuck = False
+            taken = True
+            if phase == LINE:
+                taken = helps(there, here, target, point, trial)
+            if taken:
+                trial = point
+                here = there
+                g = excess(here, target)
+                worst = wp.max(wp.abs(g[0]), wp.max(wp.abs(g[1]), wp.abs(g[2])))
+                stuck = worst <= wp.float64(TOLERANCE) * target[0] or moves >= NEWTON_STEPS
+                step = newton_step(here, g)
+                scale = wp.float64(1.0)
+                moves += 1
+                looks = 0
+            else:
                 scale = scale * wp.float64(0.5)
-        if accepted == 0:
-            break
-    if here.sums[0] < wp.float64(0.9) * target[0]:
-        trial = offset_for_sum(pad, taxel_x, lead, trial, target[0])
+                stuck = looks >= HALVINGS
+            phase = LINE
+            point = limited(trial + scale * step, limit)
+            if stuck:
+                point = trial
+                looks = 0
+                phase = wp.where(wp.float64(here[6]) < wp.float64(0.9) * target[0], LAST, DONE)
     return trial
 
 
@@ -184,49 +221,32 @@ def spread_load(rows: int, cols: int, pitch: float, load: wp.vec3, force: wp.arr
 @wp.func
 def write_forces(
     pad: Pad,
-    stiffness: float,
     taxel_x: wp.array(dtype=float),
     lead: wp.array(dtype=float),
     answer: wp.vec3d,
-    total: wp.float64,
+    total: float,
     force: wp.array(dtype=float),
 ) -> None:
-    """Forces of a solution, scaled by what was left between their sum and the load."""
-    cols = pad.cols / pad.subdivision
-    middle = 0.5 * float(pad.rows / pad.subdivision - 1)
-    own = add_forces(pad.share, pad.area, pad.cols, middle, stiffness, wp.vec3(answer), taxel_x, lead, force)
-    factor = wp.float32(total) / add_lanes(own)
-    for row in range(pad.area[0] / pad.subdivision, pad.area[1] / pad.subdivision):
-        for col in range(
-            pad.area[2] / pad.subdivision / pad.share.lanes * pad.share.lanes + pad.share.lane,
-            pad.area[3] / pad.subdivision,
-            pad.share.lanes,
-        ):
-            force[row * cols + col] *= factor
-
-
-@wp.func
-def contact_area(rows: int, cols: int, subdivision: int, window: wp.array(dtype=ivec4)) -> ivec4:
-    """Smallest block of whole taxels, and of whole packs of columns, that holds all primitives' areas; empty
-    (begin >= end) without any."""
-    area = ivec4(rows, 0, cols, 0)
-    for k in range(window.shape[0]):
-        other = window[k]
-        if other[0] < other[1]:
-            area = ivec4(
-                wp.min(area[0], other[0]),
-                wp.max(area[1], other[1]),
-                wp.min(area[2], other[2]),
-                wp.max(area[3], other[3]),
-            )
-    step = subdivision
-    if cols % 8 == 0 and 8 % subdivision == 0:
-        step = 8
-    return ivec4(
-        area[0] / subdivision * subdivision,
-        (area[1] + subdivision - 1) / subdivision * subdivision,
-        area[2] / step * step,
-        (area[3] + step - 1) / step * step,
+    """Forces of a solution on all taxels, scaled so that their sum is `total` [N] exactly."""
+    middle = 0.5 * float(pad.taxel_rows - 1)
+    face = wp.vec3(answer)
+    cols = pad.taxel_cols
+    if lanes() == 1:
+        clear(pad.share, pad.taxel_rows * cols, force)
+    own = add_forces(pad.share, pad.area, pad.stride, cols, middle, face, taxel_x, lead, force)
+    factor = total / add_lanes(own)
+    scale_forces(
+        pad.share,
+        pad.area,
+        pad.stride,
+        pad.taxel_rows,
+        cols,
+        middle,
+        factor,
+        face,
+        taxel_x,
+        lead,
+        force,
     )
 
 

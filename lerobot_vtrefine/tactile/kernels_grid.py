@@ -11,13 +11,19 @@ from lerobot_vtrefine.tactile.kernels import (
     Bodies,
     Grid,
     Lattice,
-    Share,
     Views,
     column,
     coordinate,
-    own_first,
-    own_width,
 )
+from lerobot_vtrefine.tactile.kernels_lanes import (
+    Share,
+    lanes,
+    make_queue,
+    pop_queue,
+    push_queue,
+    sync_lanes,
+)
+from lerobot_vtrefine.tactile.kernels_surface import height_at, put_point
 
 wp.set_module_options({"enable_backward": False})
 
@@ -198,9 +204,123 @@ def cell_of(grid: Grid, cells: wp.array(dtype=wp.vec2i), p: wp.vec3) -> wp.vec2i
 
 
 @wp.func
+def lever_at(lattice: Lattice, views: Views, env: int, pad: int, k: int, row: int, col: int) -> wp.vec3:
+    """From the pad's origin to a lattice point, in primitive k's frame [m]."""
+    axes = views.axes[env, pad, k]
+    x = coordinate(col, lattice.pitch, lattice.cols)
+    y = coordinate(row, lattice.pitch, lattice.rows)
+    return x * column(axes, 0) + y * column(axes, 1)
+
+
+@wp.func
+def deepen(
+    reach: float,
+    bodies: Bodies,
+    views: Views,
+    env: int,
+    pad: int,
+    k: int,
+    index: int,
+    lever: wp.vec3,
+    cell: wp.vec2i,
+    depth: wp.array(dtype=float),
+    rate: wp.array(dtype=float),
+) -> None:
+    """Raise one point's penetration and rate to those of mesh k, whose candidates there are `cell`."""
+    p = views.origin[env, pad, k] + lever
+    found = nearest_of(bodies.corners, bodies.normals, cell[0], cell[1], bodies.candidates, p)
+    normal = outward_normal(found, bodies.normals, bodies.edge_normals, bodies.corner_normals)
+    value = wp.min(found.distance, reach)
+    if value > height_at(depth, index) and wp.dot(found.toward, normal) > 0.0:
+        if found.distance > TINY_M:
+            normal = found.toward
+        speed = wp.dot(normal, views.linear[env, pad, k] + wp.cross(views.angular[env, pad, k], lever))
+        put_point(depth, rate, index, value, -speed / wp.length(normal))
+
+
+@wp.func
+def query_rows(
+    lattice: Lattice,
+    stride: int,
+    bodies: Bodies,
+    views: Views,
+    env: int,
+    pad: int,
+    k: int,
+    depth: wp.array(dtype=float),
+    rate: wp.array(dtype=float),
+) -> None:
+    """`query_grid` by one thread."""
+    area = views.window[env, pad, k]
+    origin = views.origin[env, pad, k]
+    grid = bodies.grids[k]
+    for row in range(area[0], area[1]):
+        for col in range(area[2], area[3]):
+            lever = lever_at(lattice, views, env, pad, k, row, col)
+            cell = cell_of(grid, bodies.cells, origin + lever)
+            index = row * stride + col
+            if cell[0] < 0:
+                put_point(depth, rate, index, lattice.reach, 0.0)
+            elif cell[1] > cell[0]:
+                deepen(lattice.reach, bodies, views, env, pad, k, index, lever, cell, depth, rate)
+
+
+@wp.func
+def query_queued(
+    lattice: Lattice,
+    share: Share,
+    stride: int,
+    bodies: Bodies,
+    views: Views,
+    env: int,
+    pad: int,
+    k: int,
+    depth: wp.array(dtype=float),
+    rate: wp.array(dtype=float),
+) -> None:
+    """`query_grid` by many lanes: points near the surface, which take long, wait until there are enough."""
+    area = views.window[env, pad, k]
+    origin = views.origin[env, pad, k]
+    grid = bodies.grids[k]
+    width = area[3] - area[2]
+    number = width * (area[1] - area[0])
+    queue = make_queue()
+    queued = int(0)
+    base = int(0)
+    sync_lanes()
+    while base < number or queued > 0:
+        if base < number:
+            i = base + share.lane
+            near = False
+            if i < number:
+                row = area[0] + i / width
+                col = area[2] + i % width
+                lever = lever_at(lattice, views, env, pad, k, row, col)
+                cell = cell_of(grid, bodies.cells, origin + lever)
+                near = cell[1] > cell[0]
+                if cell[0] < 0:
+                    put_point(depth, rate, row * stride + col, lattice.reach, 0.0)
+            queued = push_queue(queue, queued, share.lane, near, i)
+            base += lanes()
+        if queued >= lanes() or base >= number:
+            if share.lane < queued:
+                i = queue[share.lane]
+                row = area[0] + i / width
+                col = area[2] + i % width
+                lever = lever_at(lattice, views, env, pad, k, row, col)
+                cell = cell_of(grid, bodies.cells, origin + lever)
+                deepen(
+                    lattice.reach, bodies, views, env, pad, k, row * stride + col, lever, cell, depth, rate
+                )
+            queued = pop_queue(queue, queued, share.lane)
+    sync_lanes()
+
+
+@wp.func
 def query_grid(
     lattice: Lattice,
     share: Share,
+    stride: int,
     bodies: Bodies,
     views: Views,
     env: int,
@@ -210,33 +330,7 @@ def query_grid(
     rate: wp.array(dtype=float),
 ) -> None:
     """Raise penetrations and rates to those of mesh k; deeper than the reach counts as the reach, at rest."""
-    area = views.window[env, pad, k]
-    axes = views.axes[env, pad, k]
-    ex = column(axes, 0)
-    ey = column(axes, 1)
-    origin = views.origin[env, pad, k]
-    linear = views.linear[env, pad, k]
-    angular = views.angular[env, pad, k]
-    grid = bodies.grids[k]
-    width = own_width(share, area[2], area[3])
-    for row in range(area[0], area[1]):
-        from_middle = coordinate(row, lattice.pitch, lattice.rows) * ey
-        for group in range(own_first(share, area[2]), area[3], width * share.lanes):
-            for col in range(wp.max(group, area[2]), wp.min(group + width, area[3])):
-                lever = from_middle + coordinate(col, lattice.pitch, lattice.cols) * ex
-                p = origin + lever
-                cell = cell_of(grid, bodies.cells, p)
-                index = row * lattice.cols + col
-                if cell[0] < 0:
-                    depth[index] = lattice.reach
-                    rate[index] = 0.0
-                elif cell[1] > cell[0]:
-                    found = nearest_of(bodies.corners, bodies.normals, cell[0], cell[1], bodies.candidates, p)
-                    normal = outward_normal(found, bodies.normals, bodies.edge_normals, bodies.corner_normals)
-                    value = wp.min(found.distance, lattice.reach)
-                    if value > depth[index] and wp.dot(found.toward, normal) > 0.0:
-                        if found.distance > TINY_M:
-                            normal = found.toward
-                        speed = wp.dot(normal, linear + wp.cross(angular, lever))
-                        depth[index] = value
-                        rate[index] = -speed / wp.length(normal)
+    if lanes() == 1:
+        query_rows(lattice, stride, bodies, views, env, pad, k, depth, rate)
+    else:
+        query_queued(lattice, share, stride, bodies, views, env, pad, k, depth, rate)
