@@ -1,0 +1,112 @@
+"""Kernels around mujoco_warp's step: pairs that are dropped have no contact, forces add up as MuJoCo's do."""
+
+import mujoco
+import numpy as np
+import pytest
+import warp as wp
+
+from lerobot_vtrefine.sim.config import GraspedStart, SceneConfig, TaskConfig, WarpConfig
+from lerobot_vtrefine.sim.expert import ScriptedExpert
+from lerobot_vtrefine.sim.simulation import InsertionSim
+
+mjw = pytest.importorskip("mujoco_warp")
+pytestmark = pytest.mark.timeout(900)  # whichever test comes first compiles everything
+
+HEXAGON = [(np.cos(a), np.sin(a), z) for a in np.arange(6) * np.pi / 3 for z in (-2.0, 2.0)]
+
+
+def shapes_near_a_wall(rng, worlds):
+    """A cylinder or a hexagonal prism beside a wall, turned and moved at random, in many worlds.
+
+    Returns:
+        Signed distances (worlds, 2) [m] by MuJoCo, and whether each pair is left (worlds, 2).
+    """
+    from lerobot_vtrefine.sim.backends import warp_contact_kernels as kernels
+    from lerobot_vtrefine.sim.backends.warp_step import _shapes
+
+    spec = mujoco.MjSpec()
+    spec.add_mesh(name="hexagon", uservert=0.01 * np.ravel(HEXAGON))
+    spec.worldbody.add_geom(name="wall", type=mujoco.mjtGeom.mjGEOM_BOX, size=[0.003, 0.006, 0.012])
+    parts = {"cylinder": {"size": [0.01, 0.02, 0]}, "mesh": {"meshname": "hexagon"}}
+    for name, options in parts.items():
+        body = spec.worldbody.add_body(name=name)
+        body.add_freejoint()
+        kind = getattr(mujoco.mjtGeom, f"mjGEOM_{name.upper()}")
+        body.add_geom(name=name, type=kind, **options)
+    model = spec.compile()
+    data, wall = mujoco.MjData(model), model.geom("wall").id
+    others = [model.geom(name).id for name in parts]
+    away, pos, rot = np.empty((worlds, 2)), [], []
+    for world in range(worlds):
+        data.qpos[:] = np.concatenate([[*rng.normal(0, 0.012, 3), *rng.normal(0, 1, 4)] for _ in parts])
+        mujoco.mj_kinematics(model, data)
+        mujoco.mj_comPos(model, data)
+        away[world] = [mujoco.mj_geomDistance(model, data, wall, other, 1.0, None) for other in others]
+        pos.append(data.geom_xpos.copy())
+        rot.append(data.geom_xmat.reshape(-1, 3, 3).copy())
+    with wp.ScopedDevice("cpu"):
+        pairs = [(others[0], wall), (wall, others[1])] * worlds
+        given, left = kernels.Pairs(), kernels.Pairs()
+        given.geoms, given.ids = wp.array(pairs, dtype=wp.vec2i), wp.zeros(2 * worlds, dtype=wp.vec2i)
+        given.world = wp.array(np.repeat(np.arange(worlds), 2), dtype=int)
+        given.count, left.count = wp.array([2 * worlds], dtype=int), wp.zeros(1, dtype=int)
+        left.geoms, left.ids = wp.zeros(2 * worlds, dtype=wp.vec2i), wp.zeros(2 * worlds, dtype=wp.vec2i)
+        left.world = wp.zeros(2 * worlds, dtype=int)
+        poses = [wp.array(pos, dtype=wp.vec3), wp.array(rot, dtype=wp.mat33)]
+        inputs = [_shapes(mjw.put_model(model)), *poses, given, left]
+        wp.launch(kernels.drop_separated, 2 * worlds, inputs)
+    count = left.count.numpy()[0]
+    kept = np.zeros((worlds, 2), bool)
+    kept[left.world.numpy()[:count], (left.geoms.numpy()[:count, 0] == wall).astype(int)] = True
+    assert kept.sum() == count
+    return away, kept
+
+
+def test_dropped_pairs_do_not_touch_and_most_that_do_not_touch_are_dropped():
+    away, kept = shapes_near_a_wall(np.random.default_rng(0), 400)
+    touching = away < 0
+    assert touching.any(0).all()
+    assert kept[touching].all()
+    assert kept[away > 0.001].mean() < 0.5
+    assert kept[away > 0.01].mean() < 0.2
+
+
+def test_a_step_is_mujoco_warps_own_step():
+    """With the plug in the hole: same contacts, state and readings, from half of the pairs."""
+    scene = SceneConfig(start="grasped", timestep_s=0.004)
+    task = TaskConfig(grasped=GraspedStart(plug_height_m=0.006))
+    ids = np.arange(3)
+    truth = InsertionSim(scene, task, num_envs=3, backend="single")
+    truth.reset(ids, ids)
+    expert = ScriptedExpert(truth)
+    expert.reset(ids)
+    while not (truth._episode.part_force != 0).any(1).all():
+        truth.step(expert.act(ids))
+    sim = InsertionSim(scene, task, num_envs=3, backend="warp", warp=WarpConfig(device="cpu"))
+    worlds = sim._backend.worlds
+    found = []
+    for step in (lambda: mjw.step(worlds.model, worlds.data), worlds.step):
+        sim._backend.write(ids, *truth._backend.read(ids))
+        worlds.data.ctrl.assign(truth._episode.command)
+        with wp.ScopedDevice("cpu"):
+            for _ in range(4):
+                step()
+        data = worlds.data
+        found.append([item.numpy() for item in (data.qpos, data.qvel, data.sensordata, data.nacon)])
+    (qpos, qvel, readings, contacts), (own_qpos, own_qvel, own_readings, own_contacts) = found
+    np.testing.assert_array_equal(own_contacts, contacts)
+    np.testing.assert_allclose(own_qpos, qpos, atol=1e-7)
+    np.testing.assert_allclose(own_qvel, qvel, atol=1e-6)
+    assert (readings[:, ::10] > 0).all()  # every sensor has found something
+    assert worlds.step._left.count.numpy()[0] < 0.5 * data.ncollision.numpy()[0]
+    np.testing.assert_allclose(own_readings, readings, rtol=1e-5, atol=1e-5)
+
+
+def test_other_sensors_are_refused():
+    from lerobot_vtrefine.sim.backends.warp_step import _sides
+
+    spec = mujoco.MjSpec()
+    spec.worldbody.add_geom(name="ball", size=[0.1, 0, 0])
+    spec.add_sensor(name="clock", type=mujoco.mjtSensor.mjSENS_CLOCK)
+    with pytest.raises(ValueError, match="sensor 'clock' is no net force of contacts"):
+        _sides(spec.compile())
