@@ -88,10 +88,13 @@ def _import_folder(config: ImportConfig) -> str:
     summary = import_leflexitac(config.source, config.root, config.pads)
     lines = [f"{summary.episodes} episodes, {summary.frames} frames -> {config.root}"]
     if summary.normalised:
-        unsure = sum(summary.ambiguous.values())
-        lines.append(
-            f"raw counts recovered for {', '.join(summary.normalised)} (scale unsure in {unsure} frames)"
-        )
+        lines.append(f"raw counts recovered for {', '.join(summary.normalised)}")
+        lines += [
+            f"{pad}: exact but for {len(frames)} frames, which more than one scale fits: their contact may"
+            " have been stronger (meta/import.json lists them)"
+            for pad, frames in summary.ambiguous.items()
+            if frames
+        ]
     if summary.above_idle:
         lines.append(f"{', '.join(summary.above_idle)}: counts above an idle level that was not kept")
     return "; ".join(lines)

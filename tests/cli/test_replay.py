@@ -227,6 +227,7 @@ def test_hands_that_hold_nothing_in_the_twin_are_counted() -> None:
     closing = np.tile(ROBOT.home, (30, 1))
     closing[10:, 6], closing[10:, 7] = 0.02, -0.02
     touch = np.zeros((2, 30, 4))
+    touch[:, :, :] = 4.0  # noise
     touch[1, 12:, :2] = 50.0
     height = float(lowest_edges(ROBOT, closing)[0, 0])
     rows = hand_reaches(ROBOT, [closing, closing], height - 0.03, (0.04, 0.08), list(touch), fps=10)

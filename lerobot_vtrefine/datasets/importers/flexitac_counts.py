@@ -1,8 +1,9 @@
 """Raw counts out of readings that the FlexiTac host software has normalised frame by frame.
 
 With baseline b, threshold T and scale S the host computes s = clip(raw - b - T, 0, 100) and stores s / S
-where the frame's largest s is below T, else s / max(s). The division by the frame's maximum loses the scale,
-but raw is whole: few scales put every taxel of the frame on a whole number, and usually exactly one does.
+where the frame's largest s is below T, else s / (max(s) + 1e-6). Dividing by the frame's maximum loses the
+scale, but raw is whole: few scales put every taxel of the frame on a whole number, and usually exactly one
+does. The true scale is always among them, so a frame that one scale fits is exact; the others are listed.
 """
 
 from dataclasses import dataclass
@@ -37,8 +38,9 @@ class RawCounts:
 
     counts: Array
     """(T, R, C) uint8; taxels that the host took for untouched rest at the baseline."""
-    ambiguous: int
-    """Frames that more than one scale fits: they have the smallest one, their contact may be stronger."""
+    ambiguous: tuple[int, ...]
+    """Frames that more than one scale fits: they have the smallest one, their contact may be stronger. All
+    others are exact."""
 
 
 def recover_counts(frames: Array, rule: HostRule) -> RawCounts:
@@ -49,7 +51,7 @@ def recover_counts(frames: Array, rule: HostRule) -> RawCounts:
     """
     idle = np.rint(rule.baseline)
     counts = np.tile(idle, (len(frames), 1, 1))
-    ambiguous = 0
+    ambiguous = []
     for number, frame in enumerate(frames):
         pressed = frame > 0
         if not pressed.any():
@@ -59,10 +61,11 @@ def recover_counts(frames: Array, rule: HostRule) -> RawCounts:
             raise UnknownRuleError(
                 f"frame {number} does not follow threshold {rule.threshold:g} and scale {rule.noise_scale:g}"
             )
-        ambiguous += len(scales) > 1
+        if len(scales) > 1:
+            ambiguous.append(number)
         above = frame[pressed] * scales[0] + rule.baseline[pressed] + rule.threshold
         counts[number][pressed] = np.rint(above)
-    return RawCounts(counts.clip(0, 255).astype(np.uint8), ambiguous)
+    return RawCounts(counts.clip(0, 255).astype(np.uint8), tuple(ambiguous))
 
 
 def _fitting_scales(values: Array, baseline: Array, rule: HostRule) -> Array:

@@ -2,8 +2,9 @@
 
 LeFlexiTac stores ``observation.tactile.<name>`` float32 (R, C): in its present version normalised per frame,
 with threshold, scale and baseline under ``tactile_sensors`` of ``meta/info.json``; in earlier versions counts
-above baseline (and threshold), which it did not keep. State, action, images and videos are taken over as they
-are.
+above baseline (and threshold), which it did not keep; a single pad was ``observation.tactile`` there.
+Resuming a recording overwrites the baseline: in the sessions before, counts above idle are right and idle
+counts are not. State, action, images and videos are taken over as they are.
 """
 
 import json
@@ -23,6 +24,8 @@ from lerobot_vtrefine.datasets.importers.flexitac_counts import HostRule, Unknow
 from lerobot_vtrefine.datasets.importers.new_folder import new_folder
 
 PREFIX = "observation.tactile."
+ONLY_PAD = "primary"
+"""LeFlexiTac's name of a single pad, whose column had none in earlier versions."""
 BASELINE_PREFIX = "observation.tactile_baseline."
 DRIVER_DEFAULTS = {"threshold": 25.0, "noise_scale": 30.0}
 """What the host software uses when a dataset does not say."""
@@ -40,6 +43,7 @@ class PadColumn:
     shape: tuple[int, int]
     rule: HostRule | None
     """None: counts above an idle level that was not kept."""
+    idle_known: bool
 
     def features(self) -> dict[str, dict[str, Any]]:
         """Features of raw counts and idle counts."""
@@ -57,9 +61,9 @@ class ImportSummary:
     normalised: tuple[str, ...]
     """Pads whose raw counts were recovered from normalised readings."""
     above_idle: tuple[str, ...]
-    """Pads that were stored as counts above an unknown idle level: their baseline is 0."""
-    ambiguous: dict[str, int] = field(default_factory=dict)
-    """Frames per pad that more than one scale fits."""
+    """Pads whose idle level was not kept: they have counts above it, and a baseline of 0."""
+    ambiguous: dict[str, list[int]] = field(default_factory=dict)
+    """Frames (their ``index``) per pad that more than one scale fits; all others are exact."""
 
 
 def is_leflexitac(root: Path) -> bool:
@@ -91,7 +95,7 @@ def import_leflexitac(source: Path, root: Path, pads: Mapping[str, str]) -> Impo
     info = _read_info(source)
     columns = _pad_columns(source, info, pads)
     features = _new_features(info, columns)
-    above_idle = tuple(column.pad for column in columns if column.rule is None)
+    above_idle = tuple(column.pad for column in columns if not column.idle_known)
     summary = ImportSummary(
         episodes=info["total_episodes"],
         frames=info["total_frames"],
@@ -123,7 +127,8 @@ def import_leflexitac(source: Path, root: Path, pads: Mapping[str, str]) -> Impo
 
 def _is_pad(key: str, feature: Mapping[str, Any]) -> bool:
     shape = feature.get("shape", ())
-    return key.startswith(PREFIX) and len(shape) == 2 and feature.get("dtype") == "float32"
+    named = key == PREFIX.removesuffix(".") or key.startswith(PREFIX)
+    return named and len(shape) == 2 and feature.get("dtype") == "float32"
 
 
 def _read_info(source: Path) -> dict[str, Any]:
@@ -145,57 +150,52 @@ def _read_info(source: Path) -> dict[str, Any]:
 
 
 def _pad_columns(source: Path, info: dict[str, Any], pads: Mapping[str, str]) -> list[PadColumn]:
-    found = {
-        key.removeprefix(PREFIX): tuple(feature["shape"])
-        for key, feature in info["features"].items()
-        if _is_pad(key, feature)
-    }
+    keys = [key for key, feature in info["features"].items() if _is_pad(key, feature)]
+    sources = {key[len(PREFIX) :] or ONLY_PAD: key for key in keys}
+    found = {name: tuple(info["features"][key]["shape"]) for name, key in sources.items()}
     unknown = sorted(set(pads) - set(found))
     if unknown:
         raise ValueError(f"--pads names {unknown[0]!r}, but {source} has the pads {', '.join(sorted(found))}")
     names = [pads.get(name, name) for name in found]
     if len(set(names)) < len(names):
         raise ValueError(f"--pads gives two pads the same name: {', '.join(sorted(names))}")
-    largest = _largest_readings(source, found)
+    largest = _largest_readings(source, {sources[name]: shape for name, shape in found.items()})
     sensors = info.get("tactile_sensors") or {}
-    return [
-        PadColumn(
-            f"{PREFIX}{name}",
-            pads.get(name, name),
-            shape,
-            _host_rule(sensors.get(name), shape, largest[name]),
-        )
-        for name, shape in found.items()
-    ]
+    columns = []
+    for name, shape in found.items():
+        sensor = {key: value for key, value in (sensors.get(name) or {}).items() if value is not None}
+        rule = _host_rule(sensor, shape, largest[sources[name]])
+        known = rule is not None and "baseline" in sensor
+        columns.append(PadColumn(sources[name], pads.get(name, name), shape, rule, known))
+    return columns
 
 
-def _host_rule(sensor: Mapping[str, Any] | None, shape: tuple[int, int], largest: float) -> HostRule | None:
+def _host_rule(sensor: Mapping[str, Any], shape: tuple[int, int], largest: float) -> HostRule | None:
     """The rule behind a pad's readings; None for counts, which exceed 1."""
     if largest > 1.0 + 1e-6:
         return None
-    given = {name: value for name, value in (sensor or {}).items() if value is not None}
-    baseline = np.asarray(given.get("baseline", 0.0), float)
+    baseline = np.asarray(sensor.get("baseline", 0.0), float)
     if baseline.shape not in ((), shape):
         raise ValueError(f"meta/info.json: a pad's baseline is {baseline.shape}, its frames are {shape}")
-    threshold, scale = (float(given.get(name, default)) for name, default in DRIVER_DEFAULTS.items())
+    threshold, scale = (float(sensor.get(name, default)) for name, default in DRIVER_DEFAULTS.items())
     return HostRule(threshold, scale, np.broadcast_to(baseline, shape))
 
 
 def _largest_readings(source: Path, shapes: Mapping[str, tuple[int, int]]) -> dict[str, float]:
-    """Largest reading of every pad, whose frames have these shapes."""
+    """Largest reading of every pad column, whose frames have these shapes."""
     largest = dict.fromkeys(shapes, 0.0)
     files = sorted((source / "data").rglob("*.parquet"))
     if not files:
         raise ValueError(f"{source} has no data files below {source / 'data'}")
     for path in files:
-        table = _read_columns(path, [f"{PREFIX}{name}" for name in shapes])
-        for name, shape in shapes.items():
-            values = _flat(table[f"{PREFIX}{name}"])
+        table = _read_columns(path, list(shapes))
+        for key, shape in shapes.items():
+            values = _flat(table[key])
             if len(values) != len(table) * int(np.prod(shape)):
-                raise ValueError(f"{path}, column {PREFIX}{name}: frames are not of shape {shape}")
+                raise ValueError(f"{path}, column {key}: frames are not of shape {shape}")
             if not np.isfinite(values).all() or (len(values) and values.min() < 0):
-                raise ValueError(f"{path}, column {PREFIX}{name}: readings must be finite and not negative")
-            largest[name] = max(largest[name], float(values.max(initial=0.0)))
+                raise ValueError(f"{path}, column {key}: readings must be finite and not negative")
+            largest[key] = max(largest[key], float(values.max(initial=0.0)))
     return largest
 
 
@@ -228,9 +228,13 @@ def _counts(table: pa.Table, columns: list[PadColumn], summary: ImportSummary) -
             try:
                 found = recover_counts(frames, column.rule)
             except UnknownRuleError as error:
-                raise ValueError(f"{column.source}: {error}, which meta/info.json gives") from error
+                raise ValueError(
+                    f"{column.source}: {error}, which meta/info.json gives: was the recording resumed, which"
+                    " overwrites the baseline of the sessions before?"
+                ) from error
             counts, idle = found.counts, np.rint(column.rule.baseline).clip(0, 255).astype(np.uint8)
-            summary.ambiguous[column.pad] = summary.ambiguous.get(column.pad, 0) + found.ambiguous
+            index = table["index"].to_numpy()
+            summary.ambiguous.setdefault(column.pad, []).extend(index[list(found.ambiguous)].tolist())
         arrays[f"{PREFIX}{column.pad}"] = counts.reshape(len(table), -1)
         arrays[f"{BASELINE_PREFIX}{column.pad}"] = np.tile(idle.reshape(1, -1), (len(table), 1))
     return arrays

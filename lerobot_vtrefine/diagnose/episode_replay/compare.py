@@ -15,7 +15,7 @@ from lerobot_vtrefine.diagnose.episode_replay.reach import (
     HandReach,
     describe_reach,
     hand_reaches,
-    pad_sums,
+    pad_peaks,
     part_top_m,
 )
 from lerobot_vtrefine.diagnose.episode_replay.touch import PadTouch, compare_pad
@@ -177,7 +177,7 @@ def _reach(pairs: list[EpisodePair], config: VtRefineEnvConfig, fps: float, own:
 
     parts = load_pair(scene)
     tops = part_top_m(parts.socket), part_top_m(parts.plug)
-    touches = [pad_sums({pad: pair.counts[pad] for pad in PADS}, pair.baselines) for pair in pairs]
+    touches = [pad_peaks({pad: pair.counts[pad] for pad in PADS}, pair.baselines) for pair in pairs]
     return hand_reaches(robot, states, scene.table_height_m, tops, touches, fps)
 
 

@@ -15,6 +15,7 @@ from lerobot_vtrefine.datasets.features import Array
 from lerobot_vtrefine.diagnose.episode_replay.touch import pressed
 from lerobot_vtrefine.embodiments import Embodiment
 from lerobot_vtrefine.embodiments.embodiment import ARM_NAMES
+from lerobot_vtrefine.observation.visuo_tactile import VisuoTactileConfig
 from lerobot_vtrefine.tactile.geometry import Box, Cylinder, quaternion_matrix
 
 if TYPE_CHECKING:
@@ -66,8 +67,8 @@ def hand_reaches(
         states: Recorded positions (T, J) of every episode.
         table_height_m: Of the twin's table.
         part_tops_m: Upper ends of the parts that the left and the right hand grip, above the twin's table.
-        touches: Sums of the twin's counts above idle (T, 4 pads) of every episode, where it was replayed with
-            parts.
+        touches: Largest counts above idle of the twin's pads (T, 4) of every episode, where it was replayed
+            with parts.
         fps: Frames per second.
     """
     from lerobot_vtrefine.sim.command_replay import grasp_frame  # MuJoCo takes seconds to import
@@ -107,15 +108,16 @@ def part_top_m(part: "Part") -> float:
     return part.rest_height_m + max(tops)
 
 
-def pad_sums(counts: dict[str, Array], baselines: dict[str, Array]) -> Array:
-    """Counts above idle level and noise floor, summed per pad: (T, pads)."""
-    sums = [pressed(counts[pad], np.tile(baselines[pad], (len(counts[pad]), 1))).sum(1) for pad in counts]
-    return np.stack(sums, 1)
+def pad_peaks(counts: dict[str, Array], baselines: dict[str, Array]) -> Array:
+    """Each pad's largest count above idle level and noise floor: (T, pads)."""
+    peaks = [pressed(counts[pad], np.tile(baselines[pad], (len(counts[pad]), 1))).max(1) for pad in counts]
+    return np.stack(peaks, 1)
 
 
 def _holds(touch: Array, arm: int) -> bool:
-    """Whether both pads of a hand feel something in most frames of (T, 4)."""
-    return bool((np.median(touch[:, 2 * arm : 2 * arm + 2], axis=0) > 0).all())
+    """Whether both pads of a hand feel something in most frames of (T, 4), by the paper's threshold."""
+    felt = np.median(touch[:, 2 * arm : 2 * arm + 2], axis=0) >= VisuoTactileConfig().threshold_counts
+    return bool(felt.all())
 
 
 def describe_reach(rows: Sequence[HandReach], table_height_m: float) -> list[str]:
