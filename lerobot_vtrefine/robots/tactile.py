@@ -31,7 +31,8 @@ class Tactile(Robot):
         self.pads = PadSet(configured_pads(config.pads, config.pads_file))
         extend_lerobot(self.pads.configs)
         self._camera_models = CameraModels(config.camera_models, self.cameras)
-        self.robot_type = f"{self.name}_{self.base.name}"
+        # LeRobot stores the name with a dataset, and asks for the type when a recording is resumed.
+        self.name = self.robot_type = f"{Tactile.name}_{self.base.name}"
 
     @property
     def cameras(self) -> dict[str, Any]:

@@ -246,6 +246,17 @@ def test_wrong_baud_rate_is_recognised(tmp_path: Path) -> None:
     assert "wrong baud rate (115200; try 2000000)" in message
 
 
+def test_slow_latency_timer_is_told_when_reading_starts(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    monkeypatch.setattr(serial_reader, "latency_advice", lambda port: f"{port}: echo 1")
+    with emulated(tmp_path) as board, reading(PadConfig(board.port), "thumb"):
+        pass
+    assert [record.getMessage() for record in caplog.records if record.levelname == "WARNING"] == [
+        f"thumb: {board.port}: echo 1"
+    ]
+
+
 def test_missing_permission_names_the_group_command(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     port = tmp_path / "ttyUSB0"
     port.touch()

@@ -16,6 +16,7 @@ from lerobot_vtrefine.cli.find_pads import main as find_pads
 from lerobot_vtrefine.cli.pad_emulator import Turns
 from lerobot_vtrefine.cli.pad_emulator import main as pad_emulator
 from lerobot_vtrefine.cli.view_pads import main as view_pads
+from lerobot_vtrefine.drivers import ports
 from lerobot_vtrefine.drivers.board import PadReader
 from lerobot_vtrefine.drivers.config import PadConfig
 from lerobot_vtrefine.drivers.discovery import open_board, probe_port, wait_for_press
@@ -46,14 +47,30 @@ def test_find_pads_writes_what_the_robot_reads(tmp_path: Path) -> None:
     output = tmp_path / "rig" / "pads.yaml"
     operator = Operator({"thumb": "port1", "index": "port0"})
     with ExitStack() as stack:
-        ports = []
+        opened = []
         for seed, name in enumerate(("port0", "port1")):
             source = pressable_source(PAD, lambda name=name: operator.pressing == name, seed)
-            ports.append(stack.enter_context(emulated(tmp_path, name, source=source)).port)
+            opened.append(stack.enter_context(emulated(tmp_path, name, source=source)).port)
         stack.enter_context(redirect_stdout(operator))
-        status = find_pads(["--ports", *ports, "--names", "thumb", "index", "--output", str(output)])
+        status = find_pads(["--ports", *opened, "--names", "thumb", "index", "--output", str(output)])
     assert status == 0, operator.getvalue()
     assert {name: Path(pad.port).name for name, pad in load_pads(output).items()} == operator.where
+
+
+def test_pads_file_names_usb_sockets(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Found as /dev/ttyUSB0, written as the path of the socket, which survives replugging and rebooting."""
+    dev = tmp_path / "dev"
+    by_path = dev / "serial" / "by-path"
+    by_path.mkdir(parents=True)
+    monkeypatch.setattr(find_pads_module, "stable_ports", lambda: ports.stable_ports(dev))
+    monkeypatch.setattr(find_pads_module, "stable_path", lambda port: ports.stable_path(port, dev))
+    operator, output = Operator({"thumb": "ttyUSB0"}), tmp_path / "pads.yaml"
+    source = pressable_source(PAD, lambda: operator.pressing == "ttyUSB0")
+    with emulated(dev, "ttyUSB0", source=source) as board, redirect_stdout(operator):
+        (by_path / "pci-usb-0:2:1.0").symlink_to(board.port)
+        for chosen in ([], ["--ports", board.port]):
+            assert find_pads([*chosen, "--names", "thumb", "--output", str(output)]) == 0, operator.getvalue()
+            assert load_pads(output) == {"thumb": PadConfig(str(by_path / "pci-usb-0:2:1.0"))}
 
 
 def test_pad_touched_while_its_idle_counts_were_taken_is_still_found(tmp_path: Path) -> None:

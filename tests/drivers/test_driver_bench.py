@@ -1,0 +1,35 @@
+"""The driver's own benchmark: it runs, and on an idle machine the bars are met."""
+
+import numpy as np
+import pytest
+
+from lerobot_vtrefine.drivers import benchmark
+
+
+def test_every_frame_of_four_boards_in_another_process() -> None:
+    with benchmark.emulator(4) as ports:
+        tallies = benchmark.read_ours(ports, 1.0, benchmark.CONTROL_S)
+    assert len(tallies) == 4
+    for tally in tallies:
+        assert tally.frames > 20
+        assert (tally.missing, tally.corrupt) == (0, 0)
+
+
+@pytest.mark.slow
+def test_bars_on_an_idle_machine() -> None:
+    seconds = 20.0
+    with benchmark.emulator(1) as (port,):
+        (clean,) = benchmark.read_ours([port], seconds, benchmark.SAMPLE_S)
+    with benchmark.emulator(1, loss=0.01) as (port,):
+        (lossy,) = benchmark.read_ours([port], seconds, benchmark.SAMPLE_S)
+    with benchmark.emulator(4) as ports:
+        four = benchmark.read_ours(ports, seconds, benchmark.CONTROL_S)
+    print(clean.age(), lossy.frames, four[0].cpu_share, end=" ")
+    assert (clean.missing, clean.corrupt) == (0, 0)
+    assert clean.frames >= 99 * seconds
+    assert np.median(clean.ages_ms) <= 10
+    assert np.percentile(clean.ages_ms, 99) <= 25
+    assert lossy.frames > 0
+    assert lossy.corrupt == 0
+    assert [(one.missing, one.corrupt) for one in four] == [(0, 0)] * 4
+    assert four[0].cpu_share <= 0.15
