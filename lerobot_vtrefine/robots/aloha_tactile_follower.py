@@ -55,6 +55,7 @@ class AlohaTactileFollower(Robot):
         extend_lerobot(self.pads.configs)
         self.cameras = make_cameras_from_configs(config.cameras)
         self._camera_models = CameraModels(config.camera_models, self.cameras)
+        self._connected = False
 
     # --- features -----------------------------------------------------------------------------------
 
@@ -90,9 +91,11 @@ class AlohaTactileFollower(Robot):
 
     @property
     def is_connected(self) -> bool:
-        """Whether arms, pads and cameras are connected."""
-        cameras = all(camera.is_connected for camera in self.cameras.values())
-        return self.pair.is_connected and self.pads.is_connected and cameras
+        """Whether `connect` succeeded; it stays so when something is lost.
+
+        LeRobot's commands disconnect only what is connected: arms must be released, too, where a camera died.
+        """
+        return self._connected
 
     @check_if_already_connected
     def connect(self, calibrate: bool = True) -> None:
@@ -116,6 +119,7 @@ class AlohaTactileFollower(Robot):
         except BaseException:
             self._release()
             raise
+        self._connected = True
         logger.info("%s connected", self)
 
     def configure(self) -> None:
@@ -139,6 +143,7 @@ class AlohaTactileFollower(Robot):
                     arm.move_to(np.array([*REST_RAD, *arm.read()[FINGERS]]), self.config.rest_s)
 
     def _release(self) -> None:
+        self._connected = False
         with contextlib.ExitStack() as stack:  # the arms first, and everything whatever fails
             for camera in self.cameras.values():
                 if camera.is_connected:

@@ -4,8 +4,12 @@ import threading
 from collections.abc import Generator
 from pathlib import Path
 
+import draccus
 import numpy as np
 import pytest
+import yaml
+from lerobot.cameras.configs import CameraConfig
+from realsense import FakeDepthCamera, camera_flag, plug_in
 from rig import Rig, allow_slow_answers, aloha_rig, connect_error, follower_config
 
 from lerobot_vtrefine.drivers.board import PadReader
@@ -84,6 +88,24 @@ def test_unplugged_arm_is_named_and_everything_else_is_released(
     rig.buses["follower_left"].plug()
     follower.connect()  # plugged in again, it works again
     assert len(follower.get_observation()) == len(follower.observation_features)
+
+
+def test_arms_are_released_though_a_camera_died(rig: Rig, monkeypatch: pytest.MonkeyPatch) -> None:
+    """LeRobot's commands call `disconnect` where the robot says that it is connected."""
+    plug_in(monkeypatch, FakeDepthCamera())
+    cameras = yaml.safe_load(camera_flag(FakeDepthCamera()))
+    config = {name: draccus.decode(CameraConfig, camera) for name, camera in cameras.items()}
+    robot = AlohaTactileFollower(follower_config(rig, cameras=config))
+    robot.connect()
+    assert robot.get_observation()["front_depth"].shape == (24, 32, 1)
+    robot.cameras["front"].disconnect()
+    with pytest.raises(ConnectionError):
+        robot.get_observation()
+    assert robot.is_connected
+    robot.disconnect()
+    for side in ("left", "right"):
+        assert not any(motor.torque for motor in rig.buses[f"follower_{side}"].motors.values())
+    assert not robot.is_connected
 
 
 def test_interrupted_rest_still_switches_torque_off(

@@ -1,5 +1,6 @@
 """Recorded and simulated demonstrations in one dataset, as the paper's co-training needs them."""
 
+from collections.abc import Generator
 from pathlib import Path
 
 import numpy as np
@@ -7,7 +8,7 @@ import pytest
 from commands import dataset_flags, flags, follower_flags, leader_flags, run_command, train
 from lerobot.datasets.lerobot_dataset import LeRobotDataset
 from realsense import FakeDepthCamera, camera_flag, plug_in
-from rig import allow_slow_answers, aloha_rig
+from rig import Rig, allow_slow_answers, aloha_rig
 
 from lerobot_vtrefine.cli.record_demos import RecordDemosConfig
 from lerobot_vtrefine.cli.record_demos import record as simulate
@@ -29,13 +30,18 @@ CAMERA = FakeDepthCamera()
 POSE = "{front: {pose: [0.0, 0.0, 0.75, 0.0, 1.0, 0.0, 0.0]}}"
 
 
-def record_on_hardware(folder: Path, root: Path, patch: pytest.MonkeyPatch) -> LeRobotDataset:
-    allow_slow_answers(patch)
-    plug_in(patch, CAMERA)
-    with aloha_rig(folder) as rig:
-        camera = flags(robot__cameras=camera_flag(CAMERA), robot__camera_models=POSE)
-        command = [*follower_flags(rig), *camera, *leader_flags(rig), *dataset_flags(root, 1, 1.5, FPS)]
-        run_command(patch, "record", command)
+@pytest.fixture
+def rig(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Generator[Rig]:
+    allow_slow_answers(monkeypatch)
+    plug_in(monkeypatch, CAMERA)
+    with aloha_rig(tmp_path / "rig") as built:
+        yield built
+
+
+def record_on_hardware(rig: Rig, root: Path, patch: pytest.MonkeyPatch) -> LeRobotDataset:
+    camera = flags(robot__cameras=camera_flag(CAMERA), robot__camera_models=POSE)
+    command = [*follower_flags(rig), *camera, *leader_flags(rig), *dataset_flags(root, 1, 1.5, FPS)]
+    run_command(patch, "record", command)
     return LeRobotDataset("local/recorded", root=root)
 
 
@@ -53,10 +59,10 @@ def column(dataset: LeRobotDataset, key: str) -> np.ndarray:
 
 
 def test_recorded_and_simulated_demonstrations_merge_and_train(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    rig: Rig, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setenv("HF_HUB_OFFLINE", "1")
-    real = record_on_hardware(tmp_path / "rig", tmp_path / "real", monkeypatch)
+    real = record_on_hardware(rig, tmp_path / "real", monkeypatch)
     simulated = record_in_simulation(tmp_path / "simulated")
     merge = flags(
         operation__type="merge",
@@ -76,6 +82,24 @@ def test_recorded_and_simulated_demonstrations_merge_and_train(
     )
     checkpoint = train(monkeypatch, tmp_path / "both", tmp_path / "run", steps=3)
     assert (checkpoint / "model.safetensors").is_file()
+    replay_on_hardware(rig, simulated, monkeypatch)
+
+
+def replay_on_hardware(rig: Rig, simulated: LeRobotDataset, patch: pytest.MonkeyPatch) -> None:
+    """What was simulated moves the arms, by LeRobot's own command."""
+    sent: list[dict[str, float]] = []
+    send = AlohaTactileFollower.send_action
+
+    def noting(robot: AlohaTactileFollower, action: dict[str, float]) -> dict[str, float]:
+        sent.append(send(robot, action))
+        return sent[-1]
+
+    patch.setattr(AlohaTactileFollower, "send_action", noting)
+    episode = flags(dataset__repo_id="local/simulated", dataset__root=simulated.root, dataset__episode=0)
+    run_command(patch, "replay", [*follower_flags(rig), *episode, "--play_sounds=false"])
+    wanted = column(simulated, ACTION_KEY)
+    assert len(sent) == len(wanted)
+    assert list(sent[-1].values()) == pytest.approx(wanted[-1].tolist(), abs=1e-3)
 
 
 def test_the_simulated_robot_is_called_as_the_recorded_one() -> None:

@@ -36,31 +36,32 @@ def koch_arm(who: str, folder: Path) -> DynamixelEmulator:
 
 
 @pytest.fixture
-def command(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Generator[list[str]]:
+def ports(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Generator[dict[str, str]]:
+    """Ports of both arms and two boards; the leader is turned by an eighth of a turn."""
     allow_slow_answers(monkeypatch)
     monkeypatch.setattr("builtins.input", lambda text: "")  # use the calibration files
     with ExitStack() as stack:
-        ports = {who: stack.enter_context(koch_arm(who, tmp_path)) for who in MODELS}
+        arms = {who: stack.enter_context(koch_arm(who, tmp_path)) for who in MODELS}
         boards = stack.enter_context(boards_of(tmp_path, ("thumb", "index")))
-        ports["leader"].motors[1].shaft = 2048 + 512  # an eighth of a turn
-        pads = ", ".join(f"{name}: {{port: {board.port}}}" for name, board in boards.items())
-        yield flags(
-            robot__type="tactile",
-            robot__id="follower",
-            robot__calibration_dir=tmp_path / "calibration",
-            robot__base=f"{{type: koch_follower, port: {ports['follower'].port}}}",
-            robot__pads=f"{{{pads}}}",
-            teleop__type="koch_leader",
-            teleop__id="leader",
-            teleop__calibration_dir=tmp_path / "calibration",
-            teleop__port=ports["leader"].port,
-        )
+        arms["leader"].motors[1].shaft = 2048 + 512
+        yield {name: device.port for name, device in {**arms, **boards}.items()}
+
+
+def device_flags(kind: str, port: str, folder: Path, **more: object) -> list[str]:
+    common = {"id": kind.split("_")[1], "calibration_dir": folder / "calibration"}
+    option = "teleop" if kind.endswith("leader") else "robot"
+    settings = {"type": kind, **common, **({"port": port} if port else {}), **more}
+    return flags(**{f"{option}__{name}": value for name, value in settings.items()})
 
 
 def test_record_any_robot_with_pads(
-    command: list[str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    ports: dict[str, str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     root = tmp_path / "dataset"
+    base = f"{{type: koch_follower, port: {ports['follower']}}}"
+    pads = f"{{thumb: {{port: {ports['thumb']}}}, index: {{port: {ports['index']}}}}}"
+    robot = device_flags("tactile_follower", "", tmp_path, type="tactile", base=base, pads=pads)
+    command = [*robot, *device_flags("koch_leader", ports["leader"], tmp_path)]
     run_command(monkeypatch, "record", [*command, *dataset_flags(root, 1, 1.0, FPS)])
     run_command(monkeypatch, "record", [*command, *dataset_flags(root, 1, 1.0, FPS), "--resume=true"])
     dataset = LeRobotDataset("local/emulated", root=root)
@@ -69,8 +70,26 @@ def test_record_any_robot_with_pads(
     assert dataset.meta.robot_type == "tactile_koch_follower"
     assert dataset.meta.features["observation.state"]["names"] == [f"{joint}.pos" for joint in JOINTS]
     for pad in ("thumb", "index"):
-        counts = [dataset[index][f"observation.tactile.{pad}"].numpy() for index in range(len(dataset))]
-        assert None not in [check_pattern(frame.astype(np.uint8)) for frame in counts]
+        assert_exact(dataset, f"observation.tactile.{pad}")
     assert dataset[0]["observation.tactile_age"].shape == (2,)
     assert dataset[len(dataset) - 1]["action"][0] == pytest.approx(25.0, abs=0.1)
     assert dataset[len(dataset) - 1]["observation.state"][0] == pytest.approx(25.0, abs=0.1)
+
+
+def test_record_a_pad_as_the_camera_of_a_robot_that_knows_no_pads(
+    ports: dict[str, str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    root = tmp_path / "dataset"
+    cameras = f"{{thumb: {{type: flexitac, port: {ports['thumb']}}}}}"
+    robot = device_flags("koch_follower", ports["follower"], tmp_path, cameras=cameras)
+    command = [*robot, *device_flags("koch_leader", ports["leader"], tmp_path)]
+    run_command(monkeypatch, "record", [*command, *dataset_flags(root, 1, 1.0, FPS)])
+    dataset = LeRobotDataset("local/emulated", root=root)
+    assert len(dataset) >= 3
+    assert dataset.meta.robot_type == "koch_follower"
+    assert_exact(dataset, "observation.images.thumb_depth")
+
+
+def assert_exact(dataset: LeRobotDataset, key: str) -> None:
+    frames = [dataset[index][key].numpy().reshape(-1) for index in range(len(dataset))]
+    assert None not in [check_pattern(frame.astype(np.uint8)) for frame in frames]
