@@ -7,7 +7,7 @@ import numpy as np
 import torch
 import warp as wp
 
-from lerobot_vtrefine.tactile import kernels, kernels_query, kernels_surface
+from lerobot_vtrefine.tactile import kernels, kernels_lanes, kernels_query, kernels_surface
 from lerobot_vtrefine.tactile.geometry import BodyGeometry, TriangleMesh
 from lerobot_vtrefine.tactile.layout import PadLayout
 from lerobot_vtrefine.tactile.mesh_grid import add_grids
@@ -16,8 +16,6 @@ from lerobot_vtrefine.tactile.packing import pack_bodies
 REACH_M = 0.003
 """How far from the face, either way, a body's surface is looked for [m]."""
 
-CUDA_BLOCK = 64
-"""Threads of a block: few, as the memory that a block may have for its pads is limited."""
 CPU_BLOCK = 256
 """warp's default, which means nothing there."""
 
@@ -70,7 +68,7 @@ class ContactQuery:
         start_warp()
         self.device = str(torch.device(device))
         self.lanes = 32 if self.device.startswith("cuda") else 1
-        self.block_dim = CUDA_BLOCK if self.lanes > 1 else CPU_BLOCK
+        self.block_dim = kernels_lanes.BLOCK if self.lanes > 1 else CPU_BLOCK
         self.rows, self.cols = layout.rows * subdivision, layout.cols * subdivision
         self.subdivision, self.pitch_m, self.reach_m = subdivision, layout.pitch_m / subdivision, reach_m
         self.num_bodies = len(bodies)

@@ -311,6 +311,20 @@ def keep_planes(lattice: Lattice, bodies: Bodies, views: Views, env: int, pad: i
     views.counts[env, pad, k] = ivec2(enters, leaves)
 
 
+@wp.func
+def far_away(
+    lattice: Lattice, bodies: Bodies, k: int, from_body: wp.vec3, body_rot: wp.mat33, pad_rot: wp.mat33
+) -> bool:
+    """Whether the ball around a primitive is out of reach: what most of many are spared the rest by."""
+    radius = wp.length(bodies.extent[k])
+    centre = wp.transpose(pad_rot) * (body_rot * bodies.position[k] - from_body)
+    if centre[2] - radius > lattice.reach * float(lattice.mode) or centre[2] + radius < 0.0:
+        return True
+    side = radius + 0.5 * lattice.pitch * float(lattice.cols)
+    end = radius + 0.5 * lattice.pitch * float(lattice.rows)
+    return wp.abs(centre[0]) > side or wp.abs(centre[1]) > end
+
+
 @wp.kernel
 def prepare(lattice: Lattice, poses: Poses, bodies: Bodies, views: Views) -> None:
     """Pad frame and relative velocity in each primitive's frame, its lattice window, and its planes that
@@ -320,8 +334,10 @@ def prepare(lattice: Lattice, poses: Poses, bodies: Bodies, views: Views) -> Non
     if lattice.skip_unloaded != 0 and poses.load[env, pad][0] <= 0.0:
         return
     body = bodies.owner[k]
-    to_body = wp.transpose(poses.body_rot[env, body])
     from_body = poses.pad_pos[env, pad] - poses.body_pos[env, body]
+    if far_away(lattice, bodies, k, from_body, poses.body_rot[env, body], poses.pad_rot[env, pad]):
+        return
+    to_body = wp.transpose(poses.body_rot[env, body])
     to_primitive = wp.transpose(bodies.rotation[k])
     to_frame = to_primitive * to_body
     origin = to_primitive * (to_body * from_body - bodies.position[k])

@@ -7,6 +7,9 @@ import warp as wp
 
 wp.set_module_options({"enable_backward": False})
 
+BLOCK = 64
+"""Threads of a block on CUDA: few, as the memory that a block may have for its pads is limited."""
+
 
 @wp.struct
 class Share:

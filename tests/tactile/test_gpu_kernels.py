@@ -80,11 +80,15 @@ def answers(device: str, layout: PadLayout, shape: list[Primitive]) -> dict[str,
 @pytest.mark.parametrize("size", sorted(LAYOUTS))
 @pytest.mark.parametrize("name", sorted(SHAPES))
 def test_gpu_agrees_with_cpu(name: str, size: str) -> None:
-    """But for points on the very edge of a body, which rounding may put on either side."""
+    """But for points that rounding may put on either side: of a body's edge, or of the line between two
+    facets, which move otherwise."""
     truth, found = (answers(device, LAYOUTS[size], SHAPES[name]) for device in ("cpu", "cuda"))
     for what, expected in truth.items():
-        error = np.abs(found[what] - expected)
-        assert (error <= 1e-5 * np.abs(expected).max() + 1e-6).mean() > 0.9995, what
+        error = np.abs(found[what] - expected) / np.abs(expected).max()
+        # The foundation is solved to 1e-5 of the load.
+        solved = what.startswith(("foundation", "given"))
+        moving = "rate" in what or "penalty" in what
+        assert (error <= (1e-4 if solved else 1e-5)).mean() > (0.99 if moving else 0.9995), what
 
 
 def test_two_runs_and_a_graph_give_the_same_bits() -> None:
