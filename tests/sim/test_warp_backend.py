@@ -210,7 +210,8 @@ def test_the_same_episode_on_a_gpu(pair, graph):
     for sim in (gpu, single):
         sim.reset(EVERYONE, EVERYONE)
         sim.step(sim.command_targets() + 0.01)
-    np.testing.assert_allclose(state(gpu)[:, :30], state(single)[:, :30], atol=1e-5)
+    # A GPU adds up contacts in another order: parts in the hand turn by 4e-5 rad more or less on an H200.
+    np.testing.assert_allclose(state(gpu)[:, :30], state(single)[:, :30], atol=1e-4)
     ours, truth = gpu.observe(), single.observe()
     assert np.abs(ours["tactile"].astype(int) - truth["tactile"]).max() <= 1
     assert (np.abs(ours["depth_mm"].astype(int) - truth["depth_mm"]) > 1).mean() < 1e-3

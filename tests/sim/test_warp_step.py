@@ -12,6 +12,7 @@ from lerobot_vtrefine.sim.simulation import InsertionSim
 mjw = pytest.importorskip("mujoco_warp")
 pytestmark = pytest.mark.timeout(900)  # whichever test comes first compiles everything
 
+WORLDS = np.arange(3)
 HEXAGON = [(np.cos(a), np.sin(a), z) for a in np.arange(6) * np.pi / 3 for z in (-2.0, 2.0)]
 
 
@@ -71,35 +72,66 @@ def test_dropped_pairs_do_not_touch_and_most_that_do_not_touch_are_dropped():
     assert kept[away > 0.01].mean() < 0.2
 
 
-def test_a_step_is_mujoco_warps_own_step():
-    """With the plug in the hole: same contacts, state and readings, from half of the pairs."""
+@pytest.fixture(scope="module")
+def touching():
+    """The plug touching the socket in three worlds: on plain MuJoCo, and a simulation on mujoco_warp."""
     scene = SceneConfig(start="grasped", timestep_s=0.004)
     task = TaskConfig(grasped=GraspedStart(plug_height_m=0.006))
-    ids = np.arange(3)
     truth = InsertionSim(scene, task, num_envs=3, backend="single")
-    truth.reset(ids, ids)
+    truth.reset(WORLDS, WORLDS)
     expert = ScriptedExpert(truth)
-    expert.reset(ids)
+    expert.reset(WORLDS)
     while not (truth._episode.part_force != 0).any(1).all():
-        truth.step(expert.act(ids))
+        truth.step(expert.act(WORLDS))
     sim = InsertionSim(scene, task, num_envs=3, backend="warp", warp=WarpConfig(device="cpu"))
-    worlds = sim._backend.worlds
-    found = []
+    return truth, sim
+
+
+def test_a_step_is_mujoco_warps_own_step(touching):
+    """Same contacts, iterations, state and readings, from half of the pairs."""
+    truth, sim = touching
+    worlds, found = sim._backend.worlds, []
     for step in (lambda: mjw.step(worlds.model, worlds.data), worlds.step):
-        sim._backend.write(ids, *truth._backend.read(ids))
+        sim._backend.write(WORLDS, *truth._backend.read(WORLDS))
         worlds.data.ctrl.assign(truth._episode.command)
         with wp.ScopedDevice("cpu"):
             for _ in range(4):
                 step()
         data = worlds.data
-        found.append([item.numpy() for item in (data.qpos, data.qvel, data.sensordata, data.nacon)])
-    (qpos, qvel, readings, contacts), (own_qpos, own_qvel, own_readings, own_contacts) = found
-    np.testing.assert_array_equal(own_contacts, contacts)
+        counts = data.nacon.numpy(), data.solver_niter.numpy()
+        found.append([*counts, *(item.numpy() for item in (data.qpos, data.qvel, data.sensordata))])
+    (*counts, qpos, qvel, readings), (*own_counts, own_qpos, own_qvel, own_readings) = found
+    np.testing.assert_array_equal(own_counts[0], counts[0])
+    np.testing.assert_array_equal(own_counts[1], counts[1])
     np.testing.assert_allclose(own_qpos, qpos, atol=1e-7)
     np.testing.assert_allclose(own_qvel, qvel, atol=1e-6)
     assert (readings[:, ::10] > 0).all()  # every sensor has found something
     assert worlds.step._left.count.numpy()[0] < 0.5 * data.ncollision.numpy()[0]
     np.testing.assert_allclose(own_readings, readings, rtol=1e-5, atol=1e-5)
+
+
+def test_the_hessian_is_mujoco_warps_own_with_sliding_contacts(touching):
+    from mujoco_warp._src import solver
+
+    from lerobot_vtrefine.sim.backends import warp_solve
+
+    truth, sim = touching
+    model, data = sim._backend.worlds.model, sim._backend.worlds.data
+    qpos, qvel = truth._backend.read(WORLDS)
+    sim._backend.write(WORLDS, qpos, qvel + np.random.default_rng(0).normal(0, 0.05, qvel.shape))
+    data.ctrl.assign(truth._episode.command)
+    hessians = []
+    with wp.ScopedDevice("cpu"):
+        mjw.step(model, data)
+        for direction in (solver._update_gradient, warp_solve._direction):
+            context = solver._create_solver_context(model, data, inplace_cholesky=True)
+            data.qacc.zero_()
+            solver.init_context(model, data, context, grad=False)
+            direction(model, data, context)
+            hessians.append(np.triu(context.h.numpy()))
+    rows = data.efc.state.numpy()[0, : data.nefc.numpy()[0]]
+    assert (rows == mujoco.mjtConstraintState.mjCNSTRSTATE_CONE).sum() > 8
+    np.testing.assert_allclose(hessians[1], hessians[0], rtol=1e-5, atol=1e-5 * np.abs(hessians[0]).max())
 
 
 def test_other_sensors_are_refused():

@@ -4,11 +4,13 @@ Arrays from CUDA's pool would put a node for every allocation and every release 
 in a physics step, each of which takes its turn; an arena is one block that exists beforehand.
 """
 
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import warp as wp
 
 ALIGNMENT = 256
+Chunk = wp.types.matrix(shape=(8, 8), dtype=wp.float32)
 
 
 def padded(size: int) -> int:
@@ -17,15 +19,20 @@ def padded(size: int) -> int:
 
 
 class Tally:
-    """An allocator that passes everything on and adds up the bytes."""
+    """An allocator that passes everything on and adds up the bytes, from each `rewind` on."""
 
     def __init__(self, device: wp.Device) -> None:
         self._inner = device.get_allocator()
-        self.total = 0
+        self._used = self.most = 0
+
+    def rewind(self) -> None:
+        """Count anew; `most` remembers."""
+        self._used = 0
 
     def allocate(self, size_in_bytes: int) -> int:
         """See `warp.Allocator`."""
-        self.total += padded(size_in_bytes)
+        self._used += padded(size_in_bytes)
+        self.most = max(self.most, self._used)
         return self._inner.allocate(size_in_bytes)
 
     def deallocate(self, ptr: int, size_in_bytes: int) -> None:
@@ -42,8 +49,9 @@ class Arena:
     """
 
     def __init__(self, size: int, device: wp.Device) -> None:
-        self._block = wp.empty(max(size, ALIGNMENT), dtype=wp.uint8, device=device)
-        self._used = 0
+        # In large elements: warp counts them with 32 bits, and thousands of worlds take gigabytes.
+        self._block = wp.empty(padded(size) // ALIGNMENT + 1, dtype=Chunk, device=device)
+        self._size, self._used = padded(size), 0
 
     def rewind(self) -> None:
         """Give out the same memory again: arrays from before must no longer be in use."""
@@ -57,8 +65,8 @@ class Arena:
         """
         start = self._used
         self._used += padded(size_in_bytes)
-        if self._used > self._block.size:
-            raise RuntimeError(f"the arena of {self._block.size} bytes is too small")
+        if self._used > self._size:
+            raise RuntimeError(f"the arena of {self._size} bytes is too small")
         return self._block.ptr + start
 
     def deallocate(self, ptr: int, size_in_bytes: int) -> None:
@@ -71,3 +79,23 @@ class Recording:
 
     graph: wp.Graph
     arena: Arena
+
+    def launch(self) -> None:
+        """Do all of the work again."""
+        wp.capture_launch(self.graph)
+
+
+def record(work: Callable[[], None], times: int, device: wp.Device) -> Recording:
+    """Do some work so many times, and record that. Its temporary arrays must not outlive one time."""
+    tally = Tally(device)
+    with wp.ScopedAllocator(device, tally):
+        for _ in range(times):
+            tally.rewind()
+            work()
+    arena = Arena(tally.most, device)
+    # Every kernel is loaded by now, which could not happen during the capture.
+    with wp.ScopedAllocator(device, arena), wp.ScopedCapture(device, force_module_load=False) as capture:
+        for _ in range(times):
+            arena.rewind()
+            work()
+    return Recording(capture.graph, arena)

@@ -20,6 +20,7 @@ import warp as wp
 from mujoco_warp._src import collision_driver, forward, smooth
 
 from lerobot_vtrefine.sim.backends import warp_contact_kernels as kernels
+from lerobot_vtrefine.sim.backends.warp_solve import solve
 
 NET_FORCE = 3
 DATA = 1 | 2 | 4 | 16
@@ -63,7 +64,7 @@ class WarpStep:
         self._collide()
         mjw.make_constraint(model, data)
         self._join()
-        mjw.solve(model, data)
+        solve(model, data)
         self._read_contacts()
         self._integrate()
 

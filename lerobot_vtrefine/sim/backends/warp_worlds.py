@@ -13,7 +13,7 @@ import torch
 import warp as wp
 
 from lerobot_vtrefine.sim.backends import warp_kernels as kernels
-from lerobot_vtrefine.sim.backends.warp_memory import Arena, Recording, Tally
+from lerobot_vtrefine.sim.backends.warp_memory import Recording, record
 from lerobot_vtrefine.sim.backends.warp_step import WarpStep
 from lerobot_vtrefine.sim.config import WarpConfig
 from lerobot_vtrefine.tactile.contact_query import start_warp
@@ -75,8 +75,7 @@ class WarpWorlds:
         self._diverged = wp.zeros(num_envs, dtype=int, device=self.device)
         self.diverged = wp.to_torch(self._diverged)
         self._widths = (model.nq, model.nsensordata, model.nu)
-        self._graph: Recording | None = None
-        self._pose_graph: Recording | None = None
+        self._recorded: dict[tuple[str, int], Recording] = {}
         self._everyone = torch.arange(num_envs, dtype=torch.int32, device=self.device)
         self._capture = config.graph and _can_capture(self.device)
         self._posed = False
@@ -91,7 +90,8 @@ class WarpWorlds:
         self._trace.qpos = wp.zeros((*shape, positions), dtype=float, device=self.device)
         self._trace.sensors = wp.zeros((*shape, readings), dtype=float, device=self.device)
         self.controls = wp.zeros((*shape, servos), dtype=float, device=self.device)
-        self._room, self._graph = substeps, None
+        self._room = substeps
+        self._recorded.clear()
 
     def reserve(self, substeps: int) -> None:
         """Make room for `substeps` where there is less."""
@@ -108,33 +108,22 @@ class WarpWorlds:
         self._trace.cursor.fill_(-1)
         self.overflow.zero_()
         with wp.ScopedDevice(self.device):
-            for _ in range(substeps):
-                self._substep()
+            self._do("substep", self._substep, substeps)
             self._guard()
         trace = self._trace
         return wp.to_torch(trace.qpos)[:, :substeps], wp.to_torch(trace.sensors)[:, :substeps]
 
-    def _substep(self) -> None:
-        self._graph = self._launch(self._launch_substep, self._graph)
-
-    def _launch(self, launches: Callable[[], None], recorded: Recording | None) -> Recording | None:
-        """Launch kernels, by their graph where there is one; returns the graph for the next time."""
-        if recorded is not None:
-            wp.capture_launch(recorded.graph)
-            return recorded
+    def _do(self, what: str, work: Callable[[], None], times: int) -> None:
+        """Do some work so many times, by its graph where there can be one."""
         if not self._capture:
-            launches()
-            return None
-        tally = Tally(wp.get_device())
-        with wp.ScopedAllocator(self.device, tally):
-            launches()
-        arena = Arena(tally.total, wp.get_device())
-        # Every kernel is loaded by now, which could not happen during the capture.
-        with wp.ScopedAllocator(self.device, arena), wp.ScopedCapture(force_module_load=False) as capture:
-            launches()
-        return Recording(capture.graph, arena)
+            for _ in range(times):
+                work()
+        elif (what, times) in self._recorded:
+            self._recorded[what, times].launch()
+        else:
+            self._recorded[what, times] = record(work, times, wp.get_device())
 
-    def _launch_substep(self) -> None:
+    def _substep(self) -> None:
         data, trace = self.data, self._trace
         positions, readings, servos = self._widths
         self._guard()
@@ -193,7 +182,7 @@ class WarpWorlds:
                 dtype=shared.dtype,
             )
         setattr(self.model, name, own)
-        self._graph = self._pose_graph = None
+        self._recorded.clear()
         return own
 
     def moved(self) -> None:
@@ -206,9 +195,9 @@ class WarpWorlds:
             return
         self._posed = True
         with wp.ScopedDevice(self.device):
-            self._pose_graph = self._launch(self._launch_kinematics, self._pose_graph)
+            self._do("kinematics", self._kinematics, 1)
 
-    def _launch_kinematics(self) -> None:
+    def _kinematics(self) -> None:
         mjw.kinematics(self.model, self.data)
         mjw.com_pos(self.model, self.data)
         mjw.com_vel(self.model, self.data)
@@ -233,6 +222,7 @@ def _set_options(model: mjw.Model, config: WarpConfig) -> None:
     model.opt.warn_overflow = 0  # the flags are read after every call; printing would stall a GPU
     model.opt.contact_sensor_maxmatch = config.rows_per_world // LEAST_ROWS
     model.opt.iterations = min(model.opt.iterations, config.solver_iterations)
+    model.opt.run_qacc_smooth = False  # Newton's method starts from the last step's accelerations anyway
     if wp.get_device().is_cuda:
         model.opt.graph_conditional = wp.is_conditional_graph_supported()
 

@@ -1,0 +1,75 @@
+"""mujoco_warp's Newton solver, with the cones' curvature summed world by world. Imports warp and mujoco_warp.
+
+mujoco_warp sums it contact by contact, where most contacts stick and contribute nothing; at a thousand worlds
+that is the largest part of a physics step. All else is `mujoco_warp.solve`.
+"""
+
+import mujoco_warp as mjw
+import warp as wp
+from mujoco_warp._src import solver
+
+from lerobot_vtrefine.sim.backends import warp_solve_kernels as kernels
+
+
+def solve(model: mjw.Model, data: mjw.Data) -> None:
+    """Constraint forces and accelerations, as `mujoco_warp.solve` finds them by Newton's method for elliptic
+    cones and a dense Jacobian.
+    """
+    context = solver._create_solver_context(model, data, inplace_cholesky=True)
+    begin = solver._solve_init_dof(True, False, model.opt.run_qacc_smooth)
+    start = [data.nefc, data.qacc_warmstart, data.qacc_smooth]
+    wp.launch(begin, (data.nworld, model.nv), start, [data.qacc, data.qfrc_constraint])
+    solver.init_context(model, data, context, grad=False)
+    _direction(model, data, context)
+    unsolved = wp.full(1, data.nworld, dtype=int)
+    if model.opt.graph_conditional:
+        wp.capture_while(unsolved, _iterate, model=model, data=data, context=context, unsolved=unsolved)
+    else:
+        for _ in range(model.opt.iterations):
+            _iterate(model, data, context, unsolved)
+
+
+def _iterate(model: mjw.Model, data: mjw.Data, context: solver.SolverContext, unsolved: wp.array) -> None:
+    """One step along the direction, and the next direction."""
+    solver._linesearch(model, data, context)
+    solver._update_constraint(model, data, context)
+    _direction(model, data, context)
+    progress = [context.grad_dot, context.newton_decrement, context.improvement, context.alpha, context.done]
+    limits = [model.opt.tolerance, model.opt.iterations, context.inertia_scale]
+    result = [data.solver_niter, data.overflow, unsolved, context.done]
+    wp.launch(solver._solve_done(0), data.nworld, [*limits, *progress], result)
+
+
+def _direction(model: mjw.Model, data: mjw.Data, context: solver.SolverContext) -> None:
+    """Newton's direction at the present accelerations."""
+    worlds, done = data.nworld, context.done
+    cleared = [context.grad_dot, context.newton_decrement, context.grad_scale, context.search_unchanged]
+    clear = solver._update_gradient_zero_grad_dot(False)
+    wp.launch(clear, worlds, [data.nefc, context.alpha, done], cleared)
+    forces = [data.qfrc_smooth, data.qfrc_constraint, data.efc.Ma, data.nefc, done]
+    gradient = solver._update_gradient_grad(False, False)
+    wp.launch(gradient, (worlds, model.nv), forces, [context.grad, context.grad_dot])
+    size = (model.nv_pad, solver.types.TILE_SIZE_JTDAJ_DENSE, data.njmax, model.M_colind.shape[0])
+    quadratic = [model.M_colind, model.M_hinit_i, data.nefc, data.M]
+    quadratic += [data.efc.J, data.efc.D, data.efc.state, done]
+    hessian = solver._update_gradient_JTDAJ_dense_tiled(*size)
+    block = model.block_dim.update_gradient_JTDAJ_dense
+    wp.launch_tiled(hessian, dim=worlds, inputs=quadratic, outputs=[context.h], block_dim=block)
+    sliding = [model.dof_tri_row, model.dof_tri_col, done, _rows(data, context), _cones(model, data)]
+    wp.launch(kernels.add_curvature, (worlds, model.dof_tri_row.size), sliding, [context.h])
+    solver._cholesky_factorize_solve(model, data, context)
+
+
+def _rows(data: mjw.Data, context: solver.SolverContext) -> kernels.Rows:
+    rows = kernels.Rows()
+    rows.first, rows.count = data.ne, data.nefc
+    rows.contact, rows.state, rows.stiffness = data.efc.id, data.efc.state, data.efc.D
+    rows.residual, rows.jacobian = context.Jaref, data.efc.J
+    return rows
+
+
+def _cones(model: mjw.Model, data: mjw.Data) -> kernels.Cones:
+    cones = kernels.Cones()
+    cones.row, cones.dim, cones.friction = data.contact.efc_address, data.contact.dim, data.contact.friction
+    cones.ratio = model.opt.impratio_invsqrt
+    return cones
