@@ -78,6 +78,7 @@ def _agent(cfg: SmallDppo) -> Agent:
         action_shape=(config.horizon, NUM_JOINTS),
         executed=slice(0, config.n_action_steps),
         frozen_encoder=cfg.encoder == "frozen",
+        deploy_eta=cfg.deploy_eta,
     )
 
 

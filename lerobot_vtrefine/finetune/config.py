@@ -34,7 +34,7 @@ class DppoConfig(draccus.ChoiceRegistry):
     prefix_steps: int = 5
     # K': how many of the last steps are fine-tuned.
     ft_denoising_steps: int = 10
-    # Stochasticity of the tuned steps in rollouts (1: DDPM posterior); deployment always uses 0.
+    # Stochasticity of the tuned steps in rollouts (1: DDPM posterior).
     eta: float = 1.0
     # Floors of the standard deviation when sampling, and in the log-probability [normalised action units].
     min_sampling_std: float = 0.01
@@ -81,9 +81,9 @@ class DppoConfig(draccus.ChoiceRegistry):
     weight_decay: float = 0.0
     # Clip the gradient norm of actor and critic; 0 does not clip.
     max_grad_norm: float = 0.0
-    # Return to the best weights, at half the learning rate, when the success rate falls by this much below
-    # the best (means over two iterations); 0: never.
-    rollback_drop: float = 0.0
+    # Return to the best weights, at half the learning rate, when the success rate has fallen below the best
+    # by this many standard errors (two iterations each); 0: never.
+    rollback_sigmas: float = 0.0
     # "trained": the observation encoder is fine-tuned too. "frozen": its features are computed once and kept.
     encoder: str = "trained"
     critic_width: int = 512
@@ -112,13 +112,22 @@ class DppoConfig(draccus.ChoiceRegistry):
                 f"--dppo.min_log_prob_std must be at least {MIN_LOG_PROB_STD}, got {self.min_log_prob_std}: "
                 "below it the clamp of log-probabilities removes the gradient"
             )
-        if not 0.0 <= self.rollback_drop < 1.0:
-            raise ValueError(f"--dppo.rollback_drop must lie in [0, 1), got {self.rollback_drop}")
+        if self.rollback_sigmas < 0:
+            raise ValueError(f"--dppo.rollback_sigmas must not be negative, got {self.rollback_sigmas}")
         for name, choices in (("timeout", TIMEOUTS), ("encoder", ENCODERS)):
             if getattr(self, name) not in choices:
                 raise ValueError(
                     f"--dppo.{name} must be one of {', '.join(choices)}, got {getattr(self, name)!r}"
                 )
+
+    @property
+    def deploy_eta(self) -> float:
+        """Stochasticity of the tuned steps in deployment, as in the reference's evaluation.
+
+        The steps of the DDPM chain keep their posterior's noise, without the exploration floor; DDIM's keep
+        none, since its few long steps would leave too much of it.
+        """
+        return 0.0 if self.sampler == "ddim" else self.eta
 
     def clip_range(self, step: int) -> float:
         """Clip range at tuned step 0 (noisiest) ... K'-1 (last), exponential in between."""
@@ -178,6 +187,6 @@ class SmallDppo(DppoConfig):
     actor_lr: float = 1e-4
     actor_lr_final: float = 1e-5
     lr_warmup: int = 1
-    rollback_drop: float = 0.15
+    rollback_sigmas: float = 3.5
     max_grad_norm: float = 1.0
     critic_width: int = 256

@@ -81,7 +81,7 @@ class TrainState:
             adamw(critic.parameters(), lr=cfg.critic_lr),
             RewardScaler(),
             torch.Generator(device).manual_seed(seed + 7919 * rank_index()),
-            Rollback(cfg.rollback_drop),
+            Rollback(cfg.rollback_sigmas),
         )
 
 
@@ -375,7 +375,12 @@ def train(
         collected = time.perf_counter()
         state.critic.update_moments(rollout.privileged[:-1][rollout.active])
         metrics = rollout_metrics(rollout)
-        returned = state.rollback.watch(metrics["success"], agent.trained_parameters(), state.actor_optimizer)
+        returned = state.rollback.watch(
+            metrics["success"],
+            env.num_envs * num_ranks(),
+            agent.trained_parameters(),
+            state.actor_optimizer,
+        )
         metrics |= update(rollout, agent, state, cfg, critic_only=returned) | {"rolled_back": float(returned)}
         decisions = sum_over_ranks(rollout.active.sum().double()).item()
         state.iteration += 1

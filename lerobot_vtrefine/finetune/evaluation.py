@@ -66,5 +66,7 @@ def _deployed_chunks(agent: Agent, obs: Observation, generator: torch.Generator)
         noise,
         num_tuned=agent.num_tuned,
         predict_noise_base=predictor(agent.base, cond_base),
+        eta=agent.deploy_eta,
+        generator=generator,
     )
     return chunks[:, agent.executed]

@@ -114,6 +114,7 @@ def make_agent(policy: VtDp3Policy, dppo: DppoConfig) -> Agent:
             num_inference_steps=dppo.sampler_steps,
             prefix_steps=dppo.prefix_steps,
             ft_denoising_steps=dppo.ft_denoising_steps,
+            eta=dppo.deploy_eta,
             freeze_encoder=dppo.encoder == "frozen",
         )
     policy.eval()
@@ -128,6 +129,7 @@ def make_agent(policy: VtDp3Policy, dppo: DppoConfig) -> Agent:
         action_shape=(config.horizon, config.action_dim),
         executed=slice(0, config.n_action_steps),
         frozen_encoder=config.ft_freeze_encoder,
+        deploy_eta=config.ft_eta,
     )
 
 

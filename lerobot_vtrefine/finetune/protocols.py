@@ -38,7 +38,8 @@ class Agent:
 
     ``base`` denoises down to the last ``num_tuned`` steps and stays frozen; ``actor`` does these steps.
     ``executed`` is the part of the horizon that reaches the environment. ``frozen_encoder``: the actor's
-    encoder is not trained and is the base's, so conditions are computed once and kept.
+    encoder is not trained and is the base's, so conditions are computed once and kept. ``deploy_eta``:
+    stochasticity of the tuned steps in deployment, which has no exploration noise.
     """
 
     actor: Actor
@@ -48,6 +49,7 @@ class Agent:
     action_shape: tuple[int, int]  # (H, D)
     executed: slice
     frozen_encoder: bool
+    deploy_eta: float
 
     @property
     def device(self) -> torch.device:

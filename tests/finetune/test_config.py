@@ -41,6 +41,13 @@ def test_clip_range_grows_exponentially_to_the_last_step():
     assert PaperDppo(clip_rate=0.0).clip_range(3) == PaperDppo().clip
 
 
+@pytest.mark.parametrize(
+    ("sampler", "eta", "deployed"), [("tail", 1.0, 1.0), ("ddpm", 0.5, 0.5), ("ddim", 1.0, 0.0)]
+)
+def test_deployment_keeps_the_noise_of_the_chain_but_not_ddims(sampler, eta, deployed):
+    assert SmallDppo(sampler=sampler, eta=eta).deploy_eta == deployed
+
+
 def test_actor_learning_rate_waits_rises_and_decays_over_this_run():
     cfg = PaperDppo(iterations=100, critic_warmup=2, lr_warmup=10, actor_lr=1e-5, actor_lr_final=1e-6)
     rates = [cfg.actor_lr_at(iteration) for iteration in range(101)]

@@ -263,12 +263,12 @@ def test_evaluation_is_repeatable_and_leaves_training_alone():
     cfg = small_config()
     env, agent, state = problem(cfg)
     before, noise = state.generator.get_state(), torch.random.get_rng_state()
-    first = evaluate(env, agent, 20)
-    assert first == evaluate(env, agent, 20)
+    first = evaluate(env, agent, 120)
+    assert first == evaluate(env, agent, 120)
     assert first["eval_success"] == first["eval_return"]
     assert torch.equal(state.generator.get_state(), before)
     assert torch.equal(torch.random.get_rng_state(), noise)
-    assert evaluate(env, agent, 20, first_seed=7) != first
+    assert evaluate(env, agent, 120, first_seed=7) != first
 
 
 def test_segments_can_be_shorter_than_episodes():

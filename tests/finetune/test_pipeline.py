@@ -99,6 +99,7 @@ def test_records_and_checkpoint(finetune, tmp_path):
     policy = VtDp3Policy.from_pretrained(path, config=PreTrainedConfig.from_pretrained(path)).eval()
     assert policy.config.ft_denoising_steps == 10
     assert policy.config.sampler == "tail"
+    assert policy.config.ft_eta == 1.0
     assert (path / "policy_preprocessor.json").is_file()
     assert (path / "policy_postprocessor.json").is_file()
 
@@ -120,9 +121,8 @@ def test_reloaded_checkpoint_deploys_what_was_evaluated(finetune, tmp_path):
         while running.any():
             noise = torch.randn(int(running.sum()), 8, 16, generator=generator)
             actions = torch.zeros(6, 4, 16)
-            actions[running] = policy.predict_action_chunk(
-                {k: v[running] for k, v in obs.items()}, noise=noise
-            )
+            frames = {key: value[running] for key, value in obs.items()}
+            actions[running] = policy.sample_actions(frames, noise, generator)[:, :4]
             obs, _, reward, terminated, truncated, _ = env.step_chunk(actions)
             reached |= reward > 0
             running &= ~terminated & ~truncated

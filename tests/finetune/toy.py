@@ -53,9 +53,9 @@ def make_agent(
     if frozen:
         base.encoder = actor.encoder
     no_gradient(base)
-    return Agent(
-        actor, base, process, cfg.ft_denoising_steps, action_shape, slice(0, action_shape[0]), frozen
-    )
+    executed = slice(0, action_shape[0])
+    tuned = cfg.ft_denoising_steps
+    return Agent(actor, base, process, tuned, action_shape, executed, frozen, cfg.deploy_eta)
 
 
 def clone_behaviour(

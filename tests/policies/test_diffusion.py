@@ -124,6 +124,34 @@ def test_deployment_is_deterministic_and_uses_the_base_first():
     assert first.abs().max() <= 1
 
 
+def test_deployment_of_a_tuned_chain_keeps_the_posterior_noise_but_in_the_last_step():
+    """Each tuned latent is mean + eta * sigma * noise; nothing is random before and after them."""
+    process = DiffusionProcess(100, GRIDS["tail"])
+    clean = torch.zeros(4000, 1, 1)
+    entered: list[torch.Tensor] = []
+
+    def predict(x, t):
+        entered.append(x)
+        return oracle(process, clean)(x, t)
+
+    start = torch.randn_like(clean)
+    result = deploy(
+        process, predict, start, num_tuned=10, eta=1.0, generator=torch.Generator().manual_seed(3)
+    )
+    latents = [*entered[5:], result]
+    assert torch.equal(latents[0], denoise_prefix(process, oracle(process, clean), start, num_tuned=10))
+    for step in range(10):
+        mean, std = process.step(oracle(process, clean), latents[step], 5 + step, eta=1.0)
+        shift = latents[step + 1] - mean
+        assert abs(shift.std() - std[0]) < 0.05 * std[0] + 1e-9
+        assert shift.abs().max() <= 3 * std[0] + 1e-6
+    assert torch.equal(result, mean)
+    state = torch.random.get_rng_state()
+    again = deploy(process, predict, start, num_tuned=10, eta=1.0, generator=torch.Generator().manual_seed(3))
+    assert torch.equal(result, again)
+    assert torch.equal(torch.random.get_rng_state(), state)
+
+
 def test_chain_noise_is_floored_and_clipped():
     """With a perfect denoiser each latent is mean + max(sigma, floor) * noise, |noise| <= 3."""
     process = DiffusionProcess(100, GRIDS["tail"])

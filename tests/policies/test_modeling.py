@@ -139,7 +139,7 @@ def test_fine_tuning_tunes_the_last_steps_and_keeps_the_base(tmp_path: Path, fre
     policy = make_policy()
     train(policy, 5)
     noise, batch = torch.randn(3, 16, 16), make_batch()
-    policy.prepare_finetuning("tail", 4, 3, 4, freeze_encoder=freeze_encoder)
+    policy.prepare_finetuning("tail", 4, 3, 4, eta=0.0, freeze_encoder=freeze_encoder)
     assert policy.online is None
     assert policy.base is not None
     assert len(policy.process.timesteps) == 7
@@ -158,7 +158,7 @@ def test_fine_tuning_tunes_the_last_steps_and_keeps_the_base(tmp_path: Path, fre
     assert (loaded.base.encoder is loaded.model.encoder) is freeze_encoder
     assert not any(parameter.requires_grad for parameter in loaded.base.denoiser.parameters())
     with pytest.raises(ValueError, match="fine-tuned already"):
-        loaded.prepare_finetuning("tail", 4, 3, 4)
+        loaded.prepare_finetuning("tail", 4, 3, 4, eta=0.0)
     with pytest.raises(ValueError, match="use the pre-trained checkpoint"):
         loaded(batch)
 

@@ -89,6 +89,11 @@ class VtDp3Config(PreTrainedConfig):
 
     ft_denoising_steps: int = 0
     """K': the last denoising steps that DPPO has tuned; the others use the frozen pre-trained network."""
+    ft_eta: float = 0.0
+    """Stochasticity of the tuned steps when acting: 0 none, 1 the diffusion posterior's, as they were tuned.
+
+    Set by fine-tuning; the last step is noise-free in either case.
+    """
     ft_freeze_encoder: bool = False
     """The tuned and the frozen network share one encoder."""
 
@@ -143,6 +148,8 @@ class VtDp3Config(PreTrainedConfig):
             )
         if self.denoiser == "mlp" and len(set(self.down_dims)) > 1:
             raise ValueError(f"policy.down_dims must be one repeated width for the mlp, got {self.down_dims}")
+        if not 0.0 <= self.ft_eta <= 1.0:
+            raise ValueError(f"policy.ft_eta must lie in [0, 1], got {self.ft_eta}")
         if not 0 <= self.ft_denoising_steps <= len(self.timesteps):
             raise ValueError(
                 f"policy.ft_denoising_steps={self.ft_denoising_steps} must be within 0..{len(self.timesteps)}"

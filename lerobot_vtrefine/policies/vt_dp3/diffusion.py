@@ -166,8 +166,7 @@ def sample_chain(
     latents, log_probs = [latent], []
     for position in range(process.num_steps - num_tuned, process.num_steps):
         mean, std = process.step(predict_noise, latent, position, eta)
-        noise = torch.randn(mean.shape, generator=generator, device=mean.device, dtype=mean.dtype)
-        latent = mean + std.clamp(min=min_sampling_std) * noise.clamp(-NOISE_CLIP, NOISE_CLIP)
+        latent = mean + std.clamp(min=min_sampling_std) * _clipped_noise(mean, generator)
         log_probs.append(slice_log_prob(latent, mean, std.clamp(min=min_log_prob_std), executed))
         latents.append(latent)
     return Chain(torch.stack(latents, dim=1), torch.stack(log_probs, dim=1))
@@ -177,7 +176,7 @@ def sample_chain(
 def denoise_prefix(
     process: DiffusionProcess, predict_noise: PredictNoise, noise: Tensor, num_tuned: int
 ) -> Tensor:
-    """Deterministic (eta=0) denoising from pure noise (B, H, D) to the first tuned step.
+    """Noise-free (eta=0) denoising from pure noise (B, H, D) to the first tuned step.
 
     The same in DPPO rollouts and in deployment, so the tuned steps meet the latents they were trained on.
     """
@@ -195,14 +194,25 @@ def deploy(
     *,
     num_tuned: int = 0,
     predict_noise_base: PredictNoise | None = None,
+    eta: float = 0.0,
+    generator: torch.Generator | None = None,
 ) -> Tensor:
-    """The deployment sampler: the same grid as in training, eta=0, no noise added; returns actions (B, H, D).
+    """The deployment sampler: training's grid without its exploration noise; returns actions (B, H, D).
 
-    The result is a deterministic function of the initial ``noise`` (B, H, D), a standard normal draw. With
-    ``num_tuned`` > 0 the steps before the last ``num_tuned`` use ``predict_noise_base`` (the frozen network).
+    ``noise`` (B, H, D) is the standard normal start. With ``num_tuned`` > 0 the steps before the last
+    ``num_tuned`` use ``predict_noise_base`` (the frozen network), and the others have stochasticity ``eta``:
+    at 0 the result is a deterministic function of ``noise``; at 1 they keep the posterior's own noise, which
+    is zero in the last step. The reference evaluates its DDPM policies so, and its DDIM policies with 0.
     """
     base = predict_noise if predict_noise_base is None else predict_noise_base
     latent = denoise_prefix(process, base, noise, num_tuned)
     for position in range(process.num_steps - num_tuned, process.num_steps):
-        latent, _ = process.step(predict_noise, latent, position, eta=0.0)
+        latent, std = process.step(predict_noise, latent, position, eta)
+        if eta > 0:
+            latent = latent + std * _clipped_noise(latent, generator)
     return latent
+
+
+def _clipped_noise(like: Tensor, generator: torch.Generator | None) -> Tensor:
+    noise = torch.randn(like.shape, generator=generator, device=like.device, dtype=like.dtype)
+    return noise.clamp(-NOISE_CLIP, NOISE_CLIP)

@@ -149,10 +149,12 @@ class VtDp3Policy(PreTrainedPolicy):
         num_inference_steps: int,
         prefix_steps: int,
         ft_denoising_steps: int,
+        eta: float,
         freeze_encoder: bool = False,
     ) -> None:
         """Turn a pre-trained policy into one whose last ``ft_denoising_steps`` denoising steps are trainable.
 
+        ``eta``: stochasticity of these steps when the policy acts.
         The tuned network starts from the averaged weights, a frozen copy does the earlier steps, and the
         average is dropped: what is tuned is what acts. Raises: ValueError if the policy is fine-tuned
         already.
@@ -162,6 +164,7 @@ class VtDp3Policy(PreTrainedPolicy):
         config = self.config
         config.sampler, config.num_inference_steps = sampler, num_inference_steps
         config.prefix_steps, config.ft_denoising_steps = prefix_steps, ft_denoising_steps
+        config.ft_eta = eta
         config.ft_freeze_encoder = freeze_encoder
         if not 1 <= ft_denoising_steps <= len(config.timesteps):
             raise ValueError(f"{ft_denoising_steps=} must be within 1..{len(config.timesteps)}")
@@ -214,12 +217,18 @@ class VtDp3Policy(PreTrainedPolicy):
         return {key: torch.stack([frame[key] for frame in self._frames], dim=1) for key in self._frames[0]}
 
     @torch.no_grad()
-    def sample_actions(self, batch: Batch, noise: Tensor | None = None) -> Tensor:
-        """The whole horizon (B, H, D) from stacked frames (B, To, ...): deterministic given ``noise``."""
+    def sample_actions(
+        self, batch: Batch, noise: Tensor | None = None, generator: torch.Generator | None = None
+    ) -> Tensor:
+        """The whole horizon (B, H, D) from stacked frames (B, To, ...).
+
+        ``noise`` (B, H, D) is the sampler's standard normal start. It, and the noise of the tuned steps
+        (``config.ft_eta``), are drawn from ``generator``, or torch's global one.
+        """
         cond = self.model.encode(batch)
         shape = (len(cond), self.config.horizon, self.config.action_dim)
         if noise is None:
-            noise = torch.randn(shape, device=cond.device, dtype=cond.dtype)
+            noise = torch.randn(shape, generator=generator, device=cond.device, dtype=cond.dtype)
         base: PredictNoise | None = None
         if self.base is not None:
             base = self.base.predictor(cond if self.config.ft_freeze_encoder else self.base.encode(batch))
@@ -229,4 +238,6 @@ class VtDp3Policy(PreTrainedPolicy):
             noise,
             num_tuned=self.config.ft_denoising_steps,
             predict_noise_base=base,
+            eta=self.config.ft_eta,
+            generator=generator,
         )
