@@ -4,6 +4,7 @@ Static geoms are rendered once per camera pose; each frame adds the moving ones.
 through every pixel's centre with `mj_ray`, but some 30 times cheaper, and the same code for every backend.
 """
 
+from collections.abc import Callable
 from typing import Any
 
 import mujoco
@@ -14,7 +15,7 @@ from scipy.spatial import ConvexHull
 
 from lerobot_vtrefine.sim.camera import Camera, depth_to_millimetres
 from lerobot_vtrefine.sim.depth_kernels import MISS, ivec4, project, raster
-from lerobot_vtrefine.sim.host import to_host
+from lerobot_vtrefine.sim.host import start_copy, to_host
 from lerobot_vtrefine.tactile.contact_query import start_warp
 from lerobot_vtrefine.tactile.workers import Workers
 
@@ -42,6 +43,8 @@ class DepthCamera:
         moving = model.body_weldid[model.geom_bodyid] != 0
         self._moving = _Solids(model, np.flatnonzero(moving), device)
         self._static = _Solids(model, np.flatnonzero(~moving), device)
+        self._uploaded: dict[Any, Any] = {}
+        """What all worlds' cameras and shapes are on the device: an upload would wait for the device."""
         self.position = np.tile(camera.position_m, (num_envs, 1))
         """(N, 3) cameras' positions [m]."""
         self.rotation = np.tile(camera.rotation, (num_envs, 1, 1))
@@ -59,6 +62,7 @@ class DepthCamera:
         if np.array_equal(position, self.position[ids]) and np.array_equal(rotation, self.rotation[ids]):
             return
         self.position[ids], self.rotation[ids] = position, rotation
+        self._uploaded.clear()
         if self._background is None:
             self._background = self._nominal_background.repeat(len(self.position), 1, 1)
         self._background[self._index(ids)] = self._static_depth(ids)
@@ -69,6 +73,7 @@ class DepthCamera:
             self._size = np.repeat(self._size, len(self.position), 0)
             self._bounds = np.repeat(self._bounds, len(self.position), 0)
         self._size[ids], self._bounds[ids] = size, bounds
+        self._uploaded.clear()
 
     def render(
         self, ids: Array, geom_position: Array | torch.Tensor, geom_rotation: Array | torch.Tensor
@@ -82,12 +87,13 @@ class DepthCamera:
         depth = self._render(ids, geom_position, geom_rotation)
         return to_host(torch.where(depth < float(MISS), depth, -1.0))
 
-    def render_mm(
+    def start_mm(
         self, ids: Array, geom_position: Array | torch.Tensor, geom_rotation: Array | torch.Tensor
-    ) -> Array:
-        """The same as uint16 millimetres, 0 where nothing lies within 2 m."""
+    ) -> Callable[[], Array]:
+        """Begin the same as uint16 millimetres, 0 where nothing lies within 2 m; what is returned waits."""
         depth = self._render(ids, geom_position, geom_rotation)
-        return to_host(depth_to_millimetres(depth)).view(np.uint16)
+        copied = start_copy(depth_to_millimetres(depth))
+        return lambda: copied().view(np.uint16)
 
     def _render(
         self, ids: Array, geom_position: Array | torch.Tensor, geom_rotation: Array | torch.Tensor
@@ -95,10 +101,37 @@ class DepthCamera:
         """z-depth (m, H, W) float32 [m] on the device, MISS for a miss."""
         if self._background is None:
             depth = self._nominal_background.repeat(len(ids), 1, 1)
+        elif len(ids) == len(self._background):
+            depth = self._background.clone()
         else:
             depth = self._background[self._index(ids)]
         self._draw(self._moving, ids, geom_position, geom_rotation, depth)
         return depth
+
+    def _cameras(self, ids: Array, dtype: torch.dtype) -> tuple[torch.Tensor, ...]:
+        """Positions (m, 3) and rotations (m, 3, 3) of the cameras on the device."""
+        if dtype not in self._uploaded:
+            both = self.position, self.rotation
+            self._uploaded[dtype] = tuple(
+                torch.as_tensor(item, device=self._device).to(dtype) for item in both
+            )
+        if len(ids) == len(self.position):
+            return self._uploaded[dtype]
+        index = self._index(ids)
+        return tuple(item[index] for item in self._uploaded[dtype])
+
+    def _shapes(self, solids: "_Solids", ids: Array) -> tuple[wp.array, wp.array, wp.array]:
+        """Sizes, centres and half sizes of bounding boxes, (m or 1, geoms) each."""
+        shared, everyone = len(self._size) == 1, len(ids) == len(self.position)
+        if (shared or everyone) and solids in self._uploaded:
+            return self._uploaded[solids]
+        rows = slice(None) if shared else ids
+        size, bounds = self._size[rows][:, solids.numbers], self._bounds[rows][:, solids.numbers]
+        parts = (size, bounds[..., :3], bounds[..., 3:])
+        arrays = tuple(_upload(part, wp.vec3, self._device) for part in parts)
+        if shared or everyone:
+            self._uploaded[solids] = arrays
+        return arrays
 
     def _index(self, ids: Array) -> torch.Tensor:
         return torch.as_tensor(ids, dtype=torch.int64, device=self._device)
@@ -121,17 +154,14 @@ class DepthCamera:
         """Draw solids into `depth` (m, H, W), in place."""
         select, device = solids.geoms, self._device
         position, rotation = (torch.as_tensor(item, device=device) for item in (position, rotation))
-        here, axes = (torch.as_tensor(item[ids]).to(position) for item in (self.position, self.rotation))
+        here, axes = self._cameras(ids, position.dtype)
         local = (position[:, select] - here[:, None]) @ axes
         turned = axes.transpose(-1, -2)[:, None] @ rotation[:, select]
         pos, rot = (
             wp.from_torch(item.to(torch.float32).contiguous(), dtype=dtype)
             for item, dtype in ((local, wp.vec3), (turned, wp.mat33))
         )
-        rows = slice(None) if len(self._size) == 1 else ids
-        size = _upload(self._size[rows][:, solids.numbers], wp.vec3, device)
-        bounds = self._bounds[rows][:, solids.numbers]
-        centre, half = _upload(bounds[..., :3], wp.vec3, device), _upload(bounds[..., 3:], wp.vec3, device)
+        size, centre, half = self._shapes(solids, ids)
         shared, count = int(len(self._size) == 1), len(ids)
         cover = wp.empty((count, len(select)), dtype=ivec4, device=device)
         height, width = self._camera.height, self._camera.width

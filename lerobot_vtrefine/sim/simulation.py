@@ -3,11 +3,13 @@
 Shapes: N worlds, m of them addressed by sorted ids; J = 16 joints; H x W depth pixels; 4 pads of 384 taxels.
 """
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
 import mujoco
 import numpy as np
+import torch
 
 from lerobot_vtrefine.sim import sensing, starts, task
 from lerobot_vtrefine.sim.backends import Trace, get_backend
@@ -30,7 +32,7 @@ from lerobot_vtrefine.sim.rotations import matrix_to_quat
 from lerobot_vtrefine.sim.scene import Scene, build_scene
 from lerobot_vtrefine.sim.sensing import Kinematics
 from lerobot_vtrefine.sim.settling import Settler
-from lerobot_vtrefine.sim.substeps import summarise
+from lerobot_vtrefine.sim.substeps import start_summary
 from lerobot_vtrefine.sim.task import FAILURES
 from lerobot_vtrefine.sim.touch import Touch, touch_source
 from lerobot_vtrefine.tactile import SensorModel
@@ -110,6 +112,9 @@ class InsertionSim:
         everyone = self._randomizer.draw(np.zeros(num_envs, np.int64))
         self._parameters = dict(everyone.values)
         self._depth = DepthCamera(self.scene.model, self.scene.camera, num_envs, device, threads)
+        self._coming: tuple[Array, Callable[[], Array]] | None = None
+        """Depth images on their way, and of which worlds."""
+        self._images_read = False
         self._settler = Settler(self.scene, self.config, self._backend, self._touch)
         self._drive = make_drive(
             self._backend, self.scene.embodiment, self.substeps, self.config, robot_faults
@@ -155,7 +160,7 @@ class InsertionSim:
         """Start new episodes in worlds `ids` (m,); each is a pure function of its seed (m,), and of `start`
         where one is given in place of the seed's.
         """
-        ids = self._checked(ids)
+        ids, self._coming = self._checked(ids), None
         seeds = np.broadcast_to(np.asarray(seeds, np.int64), ids.shape)
         drawn = self._randomizer.draw(seeds)
         self._apply(ids, drawn)
@@ -190,10 +195,10 @@ class InsertionSim:
         before = state.command[ids]
         wanted = task.servo_commands(self.scene.embodiment, action)
         after = np.clip(wanted, before - self._rates, before + self._rates)
+        earlier = [torch.as_tensor(item[ids], device=self.device) for item in (state.tip, state.force_tail)]
         trace = self._drive.advance(ids, before, after)
         state.command[ids] = after
-        seen = self._seen(ids)
-        reward = update(state, ids, self._measure(ids, seen, trace), self.config)
+        reward = update(state, ids, self._start_measuring(ids, trace, earlier)(), self.config)
         self._remember(ids)
         terminated = state.done[ids]
         truncated = ~terminated & (state.steps[ids] >= self.episode_steps)
@@ -239,12 +244,17 @@ class InsertionSim:
     def hold(self) -> None:
         """Let the physics of one control step pass under the present commands, and nothing else."""
         command = self._episode.command
-        self._backend.advance_linearly(np.arange(self.num_envs), command, command, self.substeps)
+        everyone, self._coming = np.arange(self.num_envs), None
+        self._backend.advance_linearly(everyone, command, command, self.substeps)
+        self._backend.diverged(everyone)  # waits for it
 
     def depth_mm(self, ids: Array | None = None) -> Array:
         """Depth images (m, H, W) uint16 [mm]."""
         ids = self._checked(ids)
-        return self._depth.render_mm(ids, *self._backend.geom_poses(ids))
+        coming, self._coming, self._images_read = self._coming, None, True
+        if coming is not None and np.array_equal(coming[0], ids):
+            return coming[1]()
+        return self._depth.start_mm(ids, *self._backend.geom_poses(ids))()
 
     def command_targets(self, ids: Array | None = None) -> Array:
         """Joint targets (m, J) that the servos hold at the end of the last control step."""
@@ -302,6 +312,7 @@ class InsertionSim:
         """Continue world `env` from a state taken by `get_state`."""
         values = {name: np.atleast_1d(value) for name, value in state["parameters"].items()}
         position, rotation = state["camera"]
+        self._coming = None
         self._apply(np.array([env]), WorldParameters(values, position[None], rotation[None]))
         self._backend.set_rows(np.array([env]), state["row"][None])
         self._episode.set_row(env, state["episode"])
@@ -347,20 +358,33 @@ class InsertionSim:
         grips = self.scene.pair.socket.grip, self.scene.pair.plug.grip
         return task.grip_points(grips, (seen.socket, seen.plug), (seen.hand_position, seen.hand_rotation))
 
-    def _measure(self, ids: Array, seen: Kinematics, trace: Trace) -> Measured:
-        scene, pair, state = self.scene, self.scene.pair, self._episode
-        before = state.tip[ids], state.force_tail[ids]
-        rest = np.array([pair.socket.rest_height_m, pair.plug.rest_height_m]) + scene.config.table_height_m
-        positions = np.stack([seen.socket[0], seen.plug[0]], 1)
-        return Measured(
-            insertion=self._insertion(seen),
-            grip_points=self._grip_points(seen),
-            part_heights=positions[..., 2] - rest,
-            part_positions=positions,
-            substeps=summarise(trace, scene.addresses, scene.config.timestep_s, *before, pair.mouth_z_m),
-            pad_load=self._touch.load(ids, trace),
-            diverged=self._backend.diverged(ids),
-        )
+    def _start_measuring(
+        self, ids: Array, trace: Trace, earlier: list[torch.Tensor]
+    ) -> Callable[[], Measured]:
+        """Ask for all that follows from a trace before waiting for any of it: a GPU then never idles."""
+        scene, pair = self.scene, self.scene.pair
+        summary = start_summary(trace, scene.addresses, scene.config.timestep_s, *earlier, pair.mouth_z_m)
+        load, state = self._touch.start_load(ids, trace), self._backend.start_read(ids)
+        self._coming = None
+        if self._images_read and self.device != "cpu":  # as after the last step: most likely they will be now
+            self._coming = ids, self._depth.start_mm(ids, *self._backend.geom_poses(ids))
+        self._images_read = False
+
+        def wait() -> Measured:
+            seen = sensing.read_kinematics(scene, *state())
+            rest = np.array([pair.socket.rest_height_m, pair.plug.rest_height_m])
+            positions = np.stack([seen.socket[0], seen.plug[0]], 1)
+            return Measured(
+                insertion=self._insertion(seen),
+                grip_points=self._grip_points(seen),
+                part_heights=positions[..., 2] - rest - scene.config.table_height_m,
+                part_positions=positions,
+                substeps=summary(),
+                pad_load=load(),
+                diverged=self._backend.diverged(ids),
+            )
+
+        return wait
 
     def _describe(self, ids: Array) -> Privileged:
         return describe(self.scene, self.config, self._episode, ids, self._seen(ids), self._parameters)

@@ -3,13 +3,14 @@
 Shapes: m worlds, K substeps, S samples among them, w samples of the force window.
 """
 
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
 import torch
 
 from lerobot_vtrefine.sim.backends import Trace
-from lerobot_vtrefine.sim.host import to_host
+from lerobot_vtrefine.sim.host import start_copy
 from lerobot_vtrefine.sim.scene import Addresses
 
 Array = np.ndarray
@@ -37,16 +38,16 @@ class Substeps:
     """(m,) way that the plug slid on the socket's rim [m]."""
 
 
-def summarise(
-    trace: Trace, at: Addresses, timestep_s: float, tip: Array, tail: Array, mouth_z_m: float
-) -> Substeps:
-    """Summarise a trace.
+def start_summary(
+    trace: Trace, at: Addresses, timestep_s: float, tip: Tensor, tail: Tensor, mouth_z_m: float
+) -> Callable[[], Substeps]:
+    """Begin to summarise a trace; what is returned waits for it.
 
     Args:
         trace: K substeps.
         at: where things lie in it.
         timestep_s: length of a substep.
-        tip: (m, 3) plug's origin in the socket's frame before the first substep [m].
+        tip: (m, 3) plug's origin in the socket's frame before the first substep [m], where the trace lies.
         tail: (m, w - 1, 3) contact forces before the first substep [N].
         mouth_z_m: height of first entry in the socket's frame.
     """
@@ -55,15 +56,19 @@ def summarise(
     samples, touching = qpos[:, stride - 1 :: stride], contact[:, stride - 1 :: stride, 0] > 0
     plug, socket = samples[..., at.plug_qpos], samples[..., at.socket_qpos]
     tips = turn_back(socket[..., 3:], plug[..., :3] - socket[..., :3])
-    start = torch.as_tensor(tip).to(tips)
+    start = tip.to(tips)
     forces = contact[..., 1:4]
-    peak, new_tail = windowed_peak(forces, torch.as_tensor(tail).to(forces))
+    peak, new_tail = windowed_peak(forces, tail.to(forces))
     slide = rim_slide(torch.cat([start[:, None], tips], 1), touching, mouth_z_m)
     parts = (peak, new_tail, forces[:, -1], tips[:, -1], slide)
-    together = to_host(torch.cat([part.reshape(len(part), -1) for part in parts], 1)).astype(float)
-    edges = np.cumsum([part[0].numel() for part in parts])[:-1]
-    pieces = np.split(together, edges, 1)
-    return Substeps(*(piece.reshape(part.shape) for piece, part in zip(pieces, parts, strict=True)))
+    copied = start_copy(torch.cat([part.reshape(len(part), -1) for part in parts], 1))
+
+    def wait() -> Substeps:
+        edges = np.cumsum([part[0].numel() for part in parts])[:-1]
+        pieces = np.split(copied().astype(float), edges, 1)
+        return Substeps(*(piece.reshape(part.shape) for piece, part in zip(pieces, parts, strict=True)))
+
+    return wait
 
 
 def turn_back(quat: Tensor, vector: Tensor) -> Tensor:

@@ -12,7 +12,7 @@ import torch
 
 from lerobot_vtrefine.sim.backends import Backend, Trace
 from lerobot_vtrefine.sim.backends.base import TouchReader
-from lerobot_vtrefine.sim.host import to_host
+from lerobot_vtrefine.sim.host import start_copy
 from lerobot_vtrefine.sim.scene import Scene
 from lerobot_vtrefine.sim.sensing import Kinematics, pad_loads
 
@@ -38,8 +38,14 @@ class TouchSource(ABC):
     """Where a `Touch` comes from."""
 
     @abstractmethod
+    def start_load(self, ids: Array, trace: Trace) -> Callable[[], Array]:
+        """Begin to read the loads on the pads at the end of a trace that has just been made; what is returned
+        waits for them, (m, 4, LOAD_SIZE) on the host.
+        """
+
     def load(self, ids: Array, trace: Trace) -> Array:
-        """Loads on the pads (m, 4, LOAD_SIZE) on the host, at the end of a trace that has just been made."""
+        """The same at once."""
+        return self.start_load(ids, trace)()
 
     @abstractmethod
     def __call__(self, ids: Array, see: Callable[[], Kinematics], load: Array) -> Touch:
@@ -52,10 +58,10 @@ class HostTouch(TouchSource):
     def __init__(self, scene: Scene) -> None:
         self._robot, self._at = scene.embodiment, scene.addresses
 
-    def load(self, ids: Array, trace: Trace) -> Array:
-        """See `TouchSource.load`."""
+    def start_load(self, ids: Array, trace: Trace) -> Callable[[], Array]:
+        """See `TouchSource.start_load`."""
         joints, contacts = trace.qpos[:, -1][:, self._at.qpos], trace.sensors[:, -1][:, self._at.pad_contacts]
-        return pad_loads(self._robot, np.asarray(joints), np.asarray(contacts))
+        return lambda: pad_loads(self._robot, np.asarray(joints), np.asarray(contacts))
 
     def __call__(self, ids: Array, see: Callable[[], Kinematics], load: Array) -> Touch:
         """See `TouchSource.__call__`."""
@@ -79,9 +85,10 @@ class DeviceTouch(TouchSource):
     def __init__(self, reader: TouchReader) -> None:
         self._reader = reader
 
-    def load(self, ids: Array, trace: Trace) -> Array:
-        """See `TouchSource.load`."""
-        return to_host(torch.cat(self._reader(ids)[1:], -1)).astype(float)
+    def start_load(self, ids: Array, trace: Trace) -> Callable[[], Array]:
+        """See `TouchSource.start_load`."""
+        copied = start_copy(torch.cat(self._reader(ids)[1:], -1))
+        return lambda: copied().astype(float)
 
     def __call__(self, ids: Array, see: Callable[[], Kinematics], load: Array) -> Touch:
         """See `TouchSource.__call__`."""

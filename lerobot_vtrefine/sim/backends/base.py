@@ -48,6 +48,11 @@ class Backend(ABC):
     def read(self, ids: Array) -> tuple[Array, Array]:
         """Copies of positions (m, nq) and velocities (m, nv)."""
 
+    def start_read(self, ids: Array) -> Callable[[], tuple[Array, Array]]:
+        """Begin `read`, where it takes its time; what is returned waits for it."""
+        state = self.read(ids)
+        return lambda: state
+
     @abstractmethod
     def write(self, ids: Array, qpos: Array, qvel: Array) -> None:
         """Restart worlds at time 0 from positions (m, nq) and velocities (m, nv); forgets all else of their

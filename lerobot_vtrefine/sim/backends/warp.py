@@ -4,6 +4,7 @@ A call for some worlds steps all of them and puts the others back: on a GPU that
 """
 
 import copy
+from collections.abc import Callable
 from typing import TYPE_CHECKING
 
 import mujoco
@@ -15,7 +16,7 @@ from lerobot_vtrefine.sim.backends import warp_kernels as kernels
 from lerobot_vtrefine.sim.backends.base import Array, Backend, TouchReader, Trace
 from lerobot_vtrefine.sim.backends.warp_worlds import WarpWorlds
 from lerobot_vtrefine.sim.config import WarpConfig
-from lerobot_vtrefine.sim.host import to_host
+from lerobot_vtrefine.sim.host import start_copy, to_host
 
 if TYPE_CHECKING:
     from lerobot_vtrefine.sim.scene import Scene
@@ -29,7 +30,7 @@ class WarpBackend(Backend):
 
     Raises:
         ValueError: a GPU is asked for and there is none.
-        RuntimeError: by `advance`, when a buffer was too small for the contacts.
+        RuntimeError: by what reads the worlds after `advance`, when a buffer was too small for the contacts.
     """
 
     def __init__(self, model: mujoco.MjModel, num_envs: int, config: WarpConfig) -> None:
@@ -37,16 +38,28 @@ class WarpBackend(Backend):
         self.worlds = WarpWorlds(model, num_envs, config)
         self.device = self.worlds.device
         self._model, self._fields = model, dict[str, Array]()
+        self._flags: Callable[[], Array] | None = None
+        self._diverged: tuple[Array, Callable[[], Array]] | None = None
 
     def read(self, ids: Array) -> tuple[Array, Array]:
         """See `Backend.read`."""
+        return self.start_read(ids)()
+
+    def start_read(self, ids: Array) -> Callable[[], tuple[Array, Array]]:
+        """See `Backend.start_read`."""
         index = self.index(ids)
-        both = to_host(torch.cat([self.worlds.qpos[index], self.worlds.qvel[index]], 1)).astype(float)
-        return both[:, : self._model.nq], both[:, self._model.nq :]
+        copied = start_copy(torch.cat([self.worlds.qpos[index], self.worlds.qvel[index]], 1))
+
+        def wait() -> tuple[Array, Array]:
+            self._check_overflow()
+            both = copied().astype(float)
+            return both[:, : self._model.nq], both[:, self._model.nq :]
+
+        return wait
 
     def write(self, ids: Array, qpos: Array, qvel: Array) -> None:
         """See `Backend.write`."""
-        index, worlds = self.index(ids), self.worlds
+        index, worlds, self._diverged = self.index(ids), self.worlds, None
         worlds.qpos[index], worlds.qvel[index] = self._tensor(qpos), self._tensor(qvel)
         for rest in (worlds.warmstart, worlds.sensors, worlds.time, worlds.diverged):
             rest[index] = 0
@@ -68,16 +81,26 @@ class WarpBackend(Backend):
         return self._run(ids, substeps)
 
     def _run(self, ids: Array, substeps: int) -> Trace:
+        self._check_overflow()
         others = np.setdiff1d(np.arange(self.num_envs), ids, assume_unique=True)
         kept = self._rows(others) if len(others) else None
         qpos, sensors = self.worlds.run(substeps)
         index = self.index(ids)
         # A world that has blown up may ask for any number of rows; that it failed is said elsewhere.
-        flags = to_host(torch.where(self.worlds.diverged[index] > 0, 0, self.worlds.overflow[index]))
-        self.worlds.check_overflow(int(np.bitwise_or.reduce(flags, initial=0)))
+        diverged = self.worlds.diverged[index]
+        self._flags = start_copy(torch.where(diverged > 0, 0, self.worlds.overflow[index]))
+        self._diverged = ids, start_copy(diverged)
         if kept is not None:
             self._put_rows(others, kept)
         return Trace(qpos[index], sensors[index])
+
+    def _check_overflow(self) -> None:
+        """Raise what the last `advance` has to say; later than there, so that the host need not wait for it
+        before it gives the GPU more to do.
+        """
+        if self._flags is not None:
+            flags, self._flags = self._flags(), None
+            self.worlds.check_overflow(int(np.bitwise_or.reduce(flags, initial=0)))
 
     def geom_poses(self, ids: Array) -> tuple[torch.Tensor, torch.Tensor]:
         """See `Backend.geom_poses`: on the worlds' device."""
@@ -105,15 +128,20 @@ class WarpBackend(Backend):
 
     def diverged(self, ids: Array) -> Array:
         """See `Backend.diverged`."""
+        self._check_overflow()
+        if self._diverged is not None and np.array_equal(ids, self._diverged[0]):
+            return self._diverged[1]() > 0
         return to_host(self.worlds.diverged[self.index(ids)]) > 0
 
     def get_rows(self, ids: Array) -> Array:
         """See `Backend.get_rows`."""
+        self._check_overflow()
         return to_host(self._rows(ids))
 
     def set_rows(self, ids: Array, rows: Array) -> None:
         """See `Backend.set_rows`."""
         self._put_rows(ids, self._tensor(rows))
+        self._diverged = None
         self.worlds.diverged[self.index(ids)] = 0
 
     def _rows(self, ids: Array) -> torch.Tensor:
