@@ -8,8 +8,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from commands import dataset_flags, follower_flags, leader_flags, run_command
-from lerobot.datasets.dataset_tools import delete_episodes, merge_datasets
+from commands import dataset_flags, flags, follower_flags, leader_flags, run_command
 from lerobot.datasets.lerobot_dataset import LeRobotDataset
 from rig import Rig, allow_slow_answers, aloha_rig, emulated_elsewhere
 
@@ -59,8 +58,19 @@ def test_record_resume_delete_merge_keep_pads_exact(
         assert numbers == sorted(numbers)
     assert column(dataset, AGE_KEY).shape == (len(dataset), len(PADS))
 
-    kept = delete_episodes(dataset, [0], output_dir=tmp_path / "kept", repo_id="local/kept")
-    merged = merge_datasets([kept, dataset], "local/merged", output_dir=tmp_path / "merged")
+    kept, both = tmp_path / "kept", tmp_path / "merged"
+    which = flags(repo_id="local/emulated", root=root, new_repo_id="local/kept", new_root=kept)
+    delete = flags(operation__type="delete_episodes", operation__episode_indices="[0]")
+    run_command(monkeypatch, "edit_dataset", [*which, *delete])
+    merge = flags(
+        operation__type="merge",
+        operation__repo_ids="[local/kept, local/emulated]",
+        operation__roots=f"[{kept}, {root}]",
+        new_repo_id="local/merged",
+        new_root=both,
+    )
+    run_command(monkeypatch, "edit_dataset", merge)
+    merged = opened(both)
     assert merged.meta.total_episodes == 5
     key = TACTILE_KEYS[0]
     expected = frame_numbers(dataset, key)
