@@ -41,11 +41,7 @@ def cleaned(fitted: Fit, presses: PressSet, weights: Sequence[TrialWeights]) -> 
         size = weight.coupling @ (weight.nuisance.T @ white)
         # Undo whitening of the nuisance part: its directions were whitened the same way.
         unit = (weight.nuisance @ size).reshape(residual.shape)
-        plain = np.empty_like(unit)
-        plain[0] = unit[0]
-        root = np.sqrt(1.0 - weight.rho**2)
-        for t in range(1, len(unit)):
-            plain[t] = weight.rho * plain[t - 1] + root * unit[t]
+        plain = weight.memory.coloured(unit)
         result.append(residual - plain * weight.sigma)
     return result
 

@@ -11,9 +11,14 @@ from lerobot_vtrefine.diagnose.fitting import Fit, fit, predict, rest
 from lerobot_vtrefine.diagnose.noise import Noise, fit_frame_noise, fit_repeatability
 from lerobot_vtrefine.diagnose.presses import PressSet
 from lerobot_vtrefine.diagnose.weights import TrialWeights, build_weights
+from lerobot_vtrefine.diagnose.whitening import Whitener
 
 START_DAMPING_S = 3e-3
 OFFSET_STEP_M = 5e-6
+TOUCH_M = 4e-5
+"""How well a recording's first touch is known [m]: two deviations of a good rig's repeatability."""
+JUMP_DAMPING_S = 3e-3
+"""Damping that readings at the touch are made allowance for, at least: k_d over k_n [s]."""
 PLAUSIBLE_LOG_GAIN = 0.7
 """A weighted fit that moves the gain's logarithm further than this explains presses away as noise: readings
 that are very late, say, leave the baseline so wrong that its weights mislead."""
@@ -85,6 +90,24 @@ def offset_tangents(
     return [(a - b) / OFFSET_STEP_M for a, b in zip(predict(model, shifted), signals, strict=True)]
 
 
+def touch_doubts(model: Composite, presses: PressSet) -> list[np.ndarray] | None:
+    """Deviation of readings (T, n) [counts] that may or may not be touched yet; None when driven by load.
+
+    Damping makes a reading jump at the touch. A recording's first touch is known to some micrometres only,
+    and whether a frame falls before or after the jump cannot be had from a linear change.
+    """
+    if presses.loaded:
+        return None
+    values = model.values.copy()
+    values[1] = max(float(values[1]), JUMP_DAMPING_S)
+    jumpy = model.at(values)
+    early, here, late = (
+        predict(jumpy, replace(presses, presses=tuple(press.sunk(by) for press in presses.presses)))
+        for by in (-TOUCH_M, 0.0, TOUCH_M)
+    )
+    return [0.5 * np.abs(a - 2.0 * s + b) for a, s, b in zip(early, here, late, strict=True)]
+
+
 def recording_deviations(fitted: Fit, presses: PressSet, noise: Noise) -> tuple[np.ndarray, np.ndarray]:
     """Every recording's own relative gain and first touch, by least squares: (K,), (K,) [m]."""
     offsets = offset_tangents(fitted.model, presses, fitted.signals)
@@ -109,7 +132,7 @@ def weigh(
     gains, touches = recording_deviations(fitted, presses, noise)
     noise = fit_repeatability(noise, gains, touches, presses.conditions)
     tangents = offset_tangents(fitted.model, presses, fitted.signals)
-    return noise, tuple(build_weights(noise, fitted.signals, tangents))
+    return noise, tuple(build_weights(noise, fitted.signals, tangents, touch_doubts(fitted.model, presses)))
 
 
 def plain_weights(presses: PressSet) -> list[TrialWeights]:
@@ -117,7 +140,7 @@ def plain_weights(presses: PressSet) -> list[TrialWeights]:
     weights = []
     for press in presses.presses:
         sigma = np.full(press.signal.shape, np.sqrt(press.signal.size))
-        weights.append(TrialWeights(sigma, 0.0, np.zeros((press.signal.size, 0)), np.zeros((0, 0))))
+        weights.append(TrialWeights(sigma, Whitener(0.0), np.zeros((press.signal.size, 0)), np.zeros((0, 0))))
     return weights
 
 

@@ -73,8 +73,12 @@ class Composite:
 
     def own(self, index: int) -> np.ndarray:
         """Coordinates of form number `index`."""
+        return self.values[self.place(index)]
+
+    def place(self, index: int) -> slice:
+        """Where form number `index` has its coordinates."""
         begin = len(BASE) + sum(len(form.values) for form in self.forms[:index])
-        return self.values[begin : begin + len(self.forms[index].values)]
+        return slice(begin, begin + len(self.forms[index].values))
 
     def at(self, values: np.ndarray) -> "Composite":
         """The same model elsewhere."""

@@ -116,6 +116,14 @@ def _solve(gram: np.ndarray, movable: np.ndarray, damping: float) -> np.ndarray:
     return step
 
 
+def free_step(model: Composite, gram: np.ndarray, held: Sequence[int] = ()) -> np.ndarray:
+    """Change of all coordinates (p,) in one Gauss-Newton step without bounds."""
+    step = np.zeros(len(model.values))
+    free = np.setdiff1d(model.free, np.array(held, dtype=int))
+    step[free] = _solve(gram, np.diag(gram)[:-1] > 0, 1e-9)
+    return step
+
+
 def bounded_step(model: Composite, gram: np.ndarray, free: np.ndarray, damping: float) -> np.ndarray:
     """New coordinates after one Gauss-Newton step; those that a bound stops stay there."""
     low = np.array([value.low for value in model.coordinates])[free]
@@ -145,9 +153,13 @@ def fit(
     presses: PressSet,
     weights: Sequence[TrialWeights],
     max_steps: int = MAX_STEPS,
+    held: Sequence[int] = (),
 ) -> Fit:
-    """Least-squares coordinates near those of `model` (Levenberg-Marquardt within bounds)."""
-    free = model.free
+    """Least-squares coordinates near those of `model` (Levenberg-Marquardt within bounds).
+
+    Coordinates numbered in `held` stay; the fit's inner products are then those of the others alone.
+    """
+    free = np.setdiff1d(model.free, np.array(held, dtype=int))
     damping = 1e-3
     signals, columns = tangents(model, presses, free)
     grams = grams_of(presses, weights, signals, columns)

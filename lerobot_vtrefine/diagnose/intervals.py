@@ -1,41 +1,74 @@
-"""Confidence intervals of parameters by resampling whole recordings."""
+"""Confidence intervals of parameters: every motion's recordings left out in turn (a jackknife of clusters).
 
-from collections.abc import Sequence
+Replicates of one motion share what the model gets wrong about that motion, so the motion, not the recording,
+is what varies independently. The spread of the estimates without each of them covers noise, repeatability and
+misfit alike (Bell & McCaffrey 2002); Student's factor has the degrees of freedom that the contributions show.
+"""
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
 
 import numpy as np
 from scipy import stats
 
-from lerobot_vtrefine.diagnose.fitting import Fit, bounded_step
+from lerobot_vtrefine.diagnose.candidates.base import Form, Setting
+from lerobot_vtrefine.diagnose.fitting import Fit, free_step
 from lerobot_vtrefine.diagnose.maps import map_evidence, solve_map
 from lerobot_vtrefine.diagnose.presses import PressSet
+from lerobot_vtrefine.diagnose.twins import DAMPING, walk
 from lerobot_vtrefine.diagnose.verdict import Parameter
 from lerobot_vtrefine.diagnose.weights import TrialWeights
 
-DRAWS = 600
 LEVEL = (2.5, 97.5)
+MIN_MOTIONS = 4
+"""With fewer motions than this, recordings are left out one by one."""
+MIN_FREEDOM = 2.0
 DIGITS = 6
 
 
-def resampled_values(fitted: Fit, seed: int) -> np.ndarray:
-    """Coordinates under resampled recordings (DRAWS, p), one Gauss-Newton step each.
+@dataclass(frozen=True)
+class LeftOut:
+    """A fit's coordinates (p,), and what they become without each motion (G, p)."""
 
-    Draws are spread by Student's factor: with few recordings a plain bootstrap is too sure.
+    values: np.ndarray
+    without: np.ndarray
+
+    def interval(self, of: Callable[[np.ndarray], float]) -> tuple[float, float]:
+        """95 % interval of a function of the coordinates."""
+        best = of(self.values)
+        moved = np.array([of(values) for values in self.without]) - best
+        count, power = len(moved), moved**2
+        total = float(power.sum())
+        if count < 2 or not np.isfinite(total) or total <= 0:
+            return best, best
+        error = float(np.sqrt((count - 1) / count * total))
+        # A normal deviate's fourth moment is 3: one motion that carries everything leaves 2 degrees.
+        freedom = float(np.clip(3.0 * total**2 / (power**2).sum() - 1.0, MIN_FREEDOM, count - 1))
+        half = error * float(stats.t.ppf(0.975, freedom))
+        return float(best - half), float(best + half)
+
+
+def motions_of(presses: PressSet) -> list[list[int]]:
+    """Numbers of the recordings of every motion; single recordings where there are too few motions."""
+    names = presses.conditions
+    if len(set(names)) < MIN_MOTIONS:
+        return [[index] for index in range(len(names))]
+    return [[k for k, name in enumerate(names) if name == unit] for unit in sorted(set(names))]
+
+
+def leave_out(fitted: Fit, presses: PressSet, held: Sequence[int] = ()) -> LeftOut:
+    """Coordinates without each motion, one Gauss-Newton step each.
+
+    Bounds are lifted here: a coordinate that rests on its bound is no better known for that, nor is what
+    trades off against it. `held` coordinates are taken as known.
     """
-    count = len(fitted.grams)
-    rng = np.random.default_rng([seed, 5])
-    free = fitted.model.free
-    shares = rng.multinomial(count, np.full(count, 1.0 / count), DRAWS)
-    draws = np.array([_step(fitted, share, free) for share in shares])
-    freedom = max(count - len(free), 2)
-    widen = np.sqrt(count / freedom) * float(stats.t.ppf(0.975, freedom)) / 1.96
-    low = np.array([value.low for value in fitted.model.coordinates])
-    high = np.array([value.high for value in fitted.model.coordinates])
-    return np.clip(fitted.model.values + widen * (draws - fitted.model.values), low, high)
-
-
-def _step(fitted: Fit, share: np.ndarray, free: np.ndarray) -> np.ndarray:
-    gram = np.tensordot(share.astype(float), fitted.grams, axes=1)
-    return bounded_step(fitted.model, gram, free, 1e-6)
+    total = fitted.grams.sum(axis=0)
+    everyone = free_step(fitted.model, total, held)
+    steps = [
+        free_step(fitted.model, total - fitted.grams[motion].sum(axis=0), held) - everyone
+        for motion in motions_of(presses)
+    ]
+    return LeftOut(fitted.model.values, fitted.model.values + np.array(steps))
 
 
 def interval(values: np.ndarray) -> tuple[float, float]:
@@ -44,30 +77,75 @@ def interval(values: np.ndarray) -> tuple[float, float]:
     return float(low), float(high)
 
 
-def form_parameters(fitted: Fit, index: int, draws: np.ndarray) -> dict[str, Parameter]:
+def form_parameters(
+    fitted: Fit, index: int, left_out: LeftOut, presses: PressSet, weights: Sequence[TrialWeights]
+) -> dict[str, Parameter]:
     """Public parameters of form number `index` with intervals."""
     model, form = fitted.model, fitted.model.forms[index]
-    begin = 2 + sum(len(other.values) for other in model.forms[:index])
-    own = slice(begin, begin + len(form.values))
+    own = model.place(index)
     best = form.report(model.own(index), model.setting)
-    spread = [form.report(draw[own], model.setting) for draw in draws]
+    if form.range is not None:
+        ranges = form.range(model.own(index), presses)
+        return {name: Parameter(float(v), ranges[name], unit) for name, (v, unit) in best.items()}
+    reporters = {name: _reporter(form, model.setting, name, own) for name in best}
+    if form.twin is not None and not model.setting.loaded:
+        bounds = _along_damping(fitted, presses, weights, own.start + form.twin, reporters)
+    else:
+        bounds = {name: left_out.interval(reporter) for name, reporter in reporters.items()}
     return {
-        name: Parameter(float(value), interval(np.array([draw[name][0] for draw in spread])), unit)
+        name: Parameter(float(value), _possible(form, model.setting, name, bounds[name]), unit)
         for name, (value, unit) in best.items()
     }
 
 
-def baseline_parameters(fitted: Fit, draws: np.ndarray) -> dict[str, Parameter]:
+def _along_damping(
+    fitted: Fit,
+    presses: PressSet,
+    weights: Sequence[TrialWeights],
+    coordinate: int,
+    reporters: Mapping[str, Callable[[np.ndarray], float]],
+) -> dict[str, tuple[float, float]]:
+    """Intervals that span what other dampings would say, and what is not known at each of them."""
+    found = walk(fitted, presses, weights, coordinate)
+    left_out = leave_out(found.best, presses, (DAMPING,))
+    alike = found.alike(motions_of(presses))
+    bounds = {}
+    for name, of in reporters.items():
+        best, values = of(fitted.model.values), [of(other.model.values) for other in alike]
+        low, high = left_out.interval(of)
+        half = 0.5 * (high - low)
+        bounds[name] = (
+            best - float(np.hypot(half, max(best - min(values), 0.0))),
+            best + float(np.hypot(half, max(max(values) - best, 0.0))),
+        )
+    return bounds
+
+
+def _reporter(form: Form, setting: Setting, name: str, own: slice) -> Callable[[np.ndarray], float]:
+    return lambda values: float(form.report(values[own], setting)[name][0])
+
+
+def _possible(form: Form, setting: Setting, name: str, bounds: tuple[float, float]) -> tuple[float, float]:
+    """An interval within what the form's bounds allow, where these bound the parameter at all."""
+    ends = sorted(float(form.report(values, setting)[name][0]) for values in (form.low, form.high))
+    if not ends[0] <= bounds[0] <= bounds[1] <= ends[1] and ends[0] < ends[1]:
+        return max(bounds[0], ends[0]), min(bounds[1], ends[1])
+    return bounds
+
+
+def baseline_parameters(fitted: Fit, presses: PressSet) -> dict[str, Parameter]:
     """k_n, k_d and gain with intervals; where no load was measured, k_n is nominal and has none."""
-    model = fitted.model
-    gain = np.exp(draws[:, 0])
+    model, left_out = fitted.model, leave_out(fitted, presses)
+    gain = float(np.exp(model.values[0]))
     if model.setting.loaded:
-        return {"gain": Parameter(float(np.exp(model.values[0])), interval(gain), "counts/N")}
+        return {"gain": Parameter(gain, left_out.interval(lambda v: float(np.exp(v[0]))), "counts/N")}
     k_n = model.k_n
+    low, high = left_out.interval(lambda v: k_n * float(v[1]))
+    gains = left_out.interval(lambda v: float(np.exp(v[0])) / k_n)
     return {
         "k_n": Parameter(k_n, None, "N/m"),
-        "k_d": Parameter(k_n * float(model.values[1]), interval(k_n * draws[:, 1]), "N*s/m"),
-        "gain": Parameter(float(np.exp(model.values[0])) / k_n, interval(gain / k_n), "counts/N"),
+        "k_d": Parameter(k_n * float(model.values[1]), (max(low, 0.0), high), "N*s/m"),
+        "gain": Parameter(gain / k_n, gains, "counts/N"),
     }
 
 

@@ -2,13 +2,11 @@
 
 from collections.abc import Sequence
 
-import numpy as np
-
 from lerobot_vtrefine.diagnose.baseline import plain_weights
 from lerobot_vtrefine.diagnose.candidates import CATALOGUE
 from lerobot_vtrefine.diagnose.evidence import Evidence
 from lerobot_vtrefine.diagnose.fitting import Fit, predict, squared_errors
-from lerobot_vtrefine.diagnose.intervals import form_parameters, map_parameters
+from lerobot_vtrefine.diagnose.intervals import LeftOut, form_parameters, map_parameters
 from lerobot_vtrefine.diagnose.presses import PressSet
 from lerobot_vtrefine.diagnose.screening import ALPHA
 from lerobot_vtrefine.diagnose.selection import EXTRA_GAIN, MAPS, Search, settle
@@ -16,7 +14,7 @@ from lerobot_vtrefine.diagnose.verdict import Cause, Parameter
 
 
 def named_causes(
-    search: Search, fitted: Fit, draws: np.ndarray, role: str, locked: PressSet, seed: int
+    search: Search, fitted: Fit, left_out: LeftOut, role: str, locked: PressSet, seed: int
 ) -> tuple[Cause, ...]:
     """The model's causes with parameters, evidence, and what each gains on held-out recordings."""
     full = float(squared_errors(predict(fitted.model, locked), locked).mean())
@@ -28,7 +26,7 @@ def named_causes(
             Cause(
                 name,
                 "symptom" if role == "symptom" else "cause",
-                _parameters(search, fitted, name, draws, seed),
+                _parameters(search, fitted, name, left_out, seed),
                 search.p_adjusted.get(name),
                 1.0 - full / without if without > 0 else 0.0,
             )
@@ -36,13 +34,13 @@ def named_causes(
     return tuple(causes)
 
 
-def _parameters(search: Search, fitted: Fit, name: str, draws: np.ndarray, seed: int) -> dict[str, Parameter]:
+def _parameters(search: Search, fitted: Fit, name: str, left_out: LeftOut, seed: int) -> dict[str, Parameter]:
     if name == "taxel_gain_spread":
         return map_parameters(fitted, search.presses, search.weights, seed)
     if name == "dead_taxels":
         return {"taxels": Parameter([list(taxel) for taxel in fitted.model.dead], None, "1")}
     index = [form.family for form in fitted.model.forms].index(name)
-    return form_parameters(fitted, index, draws)
+    return form_parameters(fitted, index, left_out, search.presses, search.weights)
 
 
 def evidence_table(

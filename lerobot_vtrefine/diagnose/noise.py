@@ -7,8 +7,10 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
+from scipy.optimize import nnls
 
 from lerobot_vtrefine.diagnose.presses import PressSet
+from lerobot_vtrefine.diagnose.whitening import Whitener
 
 DEFAULT_GAIN = 0.01
 """Repeatability of a recording's gain, where replicates do not tell (notes: 1 %)."""
@@ -18,22 +20,35 @@ MAX_GAIN, MAX_OFFSET_M = 0.05, 6e-5
 MIN_SIGMA = 2e-4
 """Least noise, in parts of full scale."""
 QUANTISATION_VARIANCE = 1.0 / 12.0
-MAX_RHO = 0.95
 TRIM = 0.9
+RHO_GRID = 1.0 - np.geomspace(0.7, 0.03, 16)
+DEFAULT_RHO = 0.3
+MAX_LAG = 40
+"""Longest differences that memory is taken from, in frames."""
+MIN_PAIRS, MIN_LAGS = 50, 3
 MIN_REST_FRAMES = 100
 """Frames at rest that memory is taken from; with fewer, frames just after a release count as well."""
 
 
 @dataclass(frozen=True)
 class Noise:
-    """Standard deviation sqrt(floor^2 + (growth * s)^2) counts at signal s, AR(1) `rho` between frames;
-    recordings differ in gain (relative deviation `gain`) and first touch (`offset_m`)."""
+    """Standard deviation sqrt(floor^2 + (growth * s)^2) counts at signal s.
+
+    Part `slow` of its square wanders with AR(1) `rho` between frames; recordings differ in gain (relative
+    deviation `gain`) and first touch (`offset_m`).
+    """
 
     floor: float
     growth: float
     rho: float
     gain: float
     offset_m: float
+    slow: float = 1.0
+
+    @property
+    def memory(self) -> Whitener:
+        """The filter that takes the memory out."""
+        return Whitener(self.rho, self.slow)
 
     def sigma(self, signal: np.ndarray) -> np.ndarray:
         """Deviation of one reading with that expected signal, same shape [counts]."""
@@ -48,10 +63,10 @@ def fit_frame_noise(
     Level and growth come from differences between frames, which slow misfit does not touch; memory comes
     from frames without contact.
     """
-    rho = _memory(presses, residuals)
+    rho, slow = _memory(presses, residuals)
     squares, sizes = [], []
     for residual, signal in zip(residuals, signals, strict=True):
-        squares.append((0.5 / (1.0 - rho) * np.diff(residual, axis=0) ** 2).ravel())
+        squares.append((0.5 / (1.0 - slow * rho) * np.diff(residual, axis=0) ** 2).ravel())
         sizes.append((0.5 * (signal[1:] + signal[:-1])).ravel())
     square, size = np.concatenate(squares), np.abs(np.concatenate(sizes))
     if not len(square):
@@ -65,7 +80,7 @@ def fit_frame_noise(
     mean_square = float(np.mean(size[loaded] ** 2)) if loaded.any() else 0.0
     growth2 = max(high - floor2, 0.0) / mean_square if mean_square > floor2 else 0.0
     return Noise(
-        float(np.sqrt(floor2)), float(min(np.sqrt(growth2), 0.1)), rho, DEFAULT_GAIN, DEFAULT_OFFSET_M
+        float(np.sqrt(floor2)), float(min(np.sqrt(growth2), 0.1)), rho, DEFAULT_GAIN, DEFAULT_OFFSET_M, slow
     )
 
 
@@ -85,31 +100,35 @@ def _strata(square: np.ndarray, size: np.ndarray) -> tuple[float, float]:
     return _trimmed_mean(square[quiet]), _trimmed_mean(square[size > 0.5 * top])
 
 
-def _memory(presses: PressSet, residuals: Sequence[np.ndarray]) -> float:
-    """Lag-one correlation in frames at rest, where late readings have died away.
+def _memory(presses: PressSet, residuals: Sequence[np.ndarray]) -> tuple[float, float]:
+    """Memory of the slow part of the noise, and its share of the variance, in frames at rest.
 
-    Corrected for the mean being taken from short stretches.
+    From the mean square of differences over 1, 2, ... frames (the variogram), which short stretches do not
+    bias; at rest late readings have died away.
     """
-    product, power, count = 0.0, 0.0, 0
     rests = [press.resting for press in presses.presses]
     if sum(int(rest.sum()) for rest in rests) < MIN_REST_FRAMES:
         rests = [~press.touching for press in presses.presses]
+    sums, counts = np.zeros(MAX_LAG), np.zeros(MAX_LAG)
     for rest, residual in zip(rests, residuals, strict=True):
         frames = np.flatnonzero(rest)
-        if not len(frames):
-            continue
         for run in np.split(frames, np.flatnonzero(np.diff(frames) > 1) + 1):
-            if len(run) < 8:
-                continue
-            quiet = residual[run] - residual[run].mean(axis=0)
-            product += float((quiet[1:] * quiet[:-1]).sum()) / (len(run) - 1) * len(run)
-            power += float((quiet**2).sum())
-            count += quiet.size
-    if count < 50 or power <= 0:
-        return 0.3
-    length = max(count / max(sum(press.signal.shape[1] for press in presses.presses), 1), 8.0)
-    rho = product / power
-    return float(np.clip(rho + (1.0 + 3.0 * rho) / length, 0.0, MAX_RHO))
+            for lag in range(1, min(MAX_LAG, len(run) - 1) + 1):
+                change = residual[run[lag:]] - residual[run[:-lag]]
+                sums[lag - 1] += 0.5 * float((change**2).sum())
+                counts[lag - 1] += change.size
+    known = counts >= MIN_PAIRS
+    if known.sum() < MIN_LAGS:
+        return DEFAULT_RHO, 1.0
+    lags, weight = 1.0 + np.flatnonzero(known), np.sqrt(counts[known])
+    half_square = sums[known] / counts[known]
+    best = (np.inf, DEFAULT_RHO, 1.0)
+    for rho in RHO_GRID:
+        columns = np.stack([np.ones(len(lags)), 1.0 - rho**lags], axis=1)
+        (white, wander), left = nnls(columns * weight[:, None], half_square * weight)
+        if left < best[0] and white + wander > 0:
+            best = (left, float(rho), float(wander / (white + wander)))
+    return best[1], best[2]
 
 
 def fit_repeatability(noise: Noise, gains: np.ndarray, offsets_m: np.ndarray, conditions: list[str]) -> Noise:

@@ -24,7 +24,7 @@ from lerobot_vtrefine.diagnose.evaluation import (
 )
 from lerobot_vtrefine.diagnose.evidence import Evidence, ResidualView, Trace, TrialError
 from lerobot_vtrefine.diagnose.fitting import Fit, predict, tangents
-from lerobot_vtrefine.diagnose.intervals import baseline_parameters, resampled_values
+from lerobot_vtrefine.diagnose.intervals import baseline_parameters, leave_out
 from lerobot_vtrefine.diagnose.locking import lock
 from lerobot_vtrefine.diagnose.naming import evidence_table, named_causes
 from lerobot_vtrefine.diagnose.presses import PressSet, prepare, usable
@@ -161,11 +161,10 @@ def _conclude(
     floor = noise_floor(everyone, locked, baseline.noise, predict(fitted.model, held_set))
     status = _status(names, rivals.groups, suspicion)
     role = "symptom" if status == "unexplained" else "cause"
-    draws = resampled_values(fitted, seed)
     smallest = _smallest(search, fitted)
     return PadDiagnosis(
         status=status,
-        causes=named_causes(search, fitted, draws, role, held_set, seed),
+        causes=named_causes(search, fitted, leave_out(fitted, search.presses), role, held_set, seed),
         ambiguous_with=rivals.groups if status == "ambiguous" else (),
         unknown=Unknown(suspicion.alarm, suspicion.clue),
         heldout=heldout(foretold, floor, seed),
@@ -174,7 +173,7 @@ def _conclude(
         issues=tuple(issues),
         baseline_model=plain,
         extended_model=extended,
-        baseline_params=baseline_parameters(baseline.plain, resampled_values(baseline.plain, seed)),
+        baseline_params=baseline_parameters(baseline.plain, search.presses),
         evidence=evidence_table(search, fitted, role, rivals.groups),
         traces=traces(foretold),
         residuals=residual_views(foretold, seed),

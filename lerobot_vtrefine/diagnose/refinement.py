@@ -21,8 +21,12 @@ from lerobot_vtrefine.tactile.stages.readout import BaselineDrift
 FINE_S = 0.005
 """Time between refined frames [s]: motion is close to straight for that long."""
 MAX_SUBSTEPS = 10
-BEND = 0.005
-"""Part of the deepest press by which depths may bend between two neighbouring instants."""
+BEND = 0.004
+"""Part of the deepest press by which what is pressed may bend between two neighbouring instants."""
+JUMP = 4.0
+"""Bends that many times as large as allowed are taken for jumps, which only short steps describe."""
+LEAD_S = 3e-3
+"""Damping over stiffness of a typical pad, which makes readings jump when a moving indenter touches [s]."""
 RATE_S = 2e-4
 """Half the time over which rates are taken [s]."""
 MOTION = ("x_m", "y_m", "depth_m", "tilt_x_rad", "tilt_y_rad", "force_n")
@@ -108,12 +112,12 @@ def instants_of(trial: Trial, layout: PadLayout, kind: Kind) -> tuple[np.ndarray
     if kind == "even":
         return divided(trial.time_s, even)
     fine, frames = divided(trial.time_s, even)
-    refined = resampled(trial, fine)
-    images = trial_forces(refined, layout) if trial.depth_m is None else trial_heights(refined, layout)
-    depths = np.maximum(images, 0.0).reshape(len(fine), -1)
+    drive, rate = motion(trial, layout, fine)
+    depths = (np.maximum(drive + LEAD_S * rate, 0.0) * (drive > 0)).reshape(len(fine), -1)
     share = (np.arange(count) / count)[None, :, None]
     start, stop = depths[frames[:-1], None], depths[frames[1:], None]
     bend = np.abs(depths[:-1].reshape(intervals, count, -1) - start - share * (stop - start)).max(axis=(1, 2))
     allowed = BEND * max(float(depths.max()), 1e-12)
     # Halving the steps of a smooth curve quarters how far it bends away from its chords.
-    return divided(trial.time_s, np.clip(np.ceil(np.sqrt(bend / allowed)), 1, count).astype(int))
+    counts = np.clip(np.ceil(np.sqrt(bend / allowed)), 1, count)
+    return divided(trial.time_s, np.where(bend > JUMP * allowed, count, counts).astype(int))

@@ -14,6 +14,7 @@ from lerobot_vtrefine.diagnose.fitting import Fit, fit, predict, tangents
 from lerobot_vtrefine.diagnose.maps import find_dead, map_evidence, with_map
 from lerobot_vtrefine.diagnose.presses import PressSet
 from lerobot_vtrefine.diagnose.screening import ALPHA, Probe, Scorer, Screened, probe_form, screen
+from lerobot_vtrefine.diagnose.twins import walk
 from lerobot_vtrefine.diagnose.weights import TrialWeights
 
 MAX_CAUSES = 4
@@ -236,6 +237,32 @@ def forward(search: Search, fitted: Fit, tell: Callable[[str, float], None]) -> 
         search.p_adjusted[best.name] = found[best.name].p_adjusted
         fitted = reweigh(search, best.fitted)
         fitted = backward(search, fitted)
+    return untwine(search, simplify(search, fitted))
+
+
+def untwine(search: Search, fitted: Fit) -> Fit:
+    """The best fit along the trade-off of a delay against the damping, which descents cut short."""
+    for index, form in enumerate(fitted.model.forms):
+        if form.twin is not None and not fitted.model.setting.loaded:
+            coordinate = fitted.model.place(index).start + form.twin
+            best = walk(fitted, search.presses, search.weights, coordinate).best
+            found = settle(search, best.model)
+            fitted = found if found.loss < fitted.loss else fitted
+    return fitted
+
+
+def simplify(search: Search, fitted: Fit) -> Fit:
+    """Plain forms again where they do: a rich form may have stood in for a cause that was found after it."""
+    for form in fitted.model.forms:
+        plain = forms_of(form.family, fitted)[0]
+        if form is plain:
+            continue
+        slim = take_away(search, fitted, form.family)
+        _, columns = tangents(slim.model, search.presses, slim.model.free)
+        probes = probe_form(plain, Scorer(slim, search.presses, search.weights, columns))
+        found = refit(search, slim, plain, probes)
+        if not _clearly_better(scored(search, fitted), scored(search, found), search.seed):
+            fitted = reweigh(search, found)
     return fitted
 
 

@@ -6,6 +6,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from lerobot_vtrefine.diagnose.noise import Noise
+from lerobot_vtrefine.diagnose.whitening import Whitener
 
 
 @dataclass(frozen=True)
@@ -14,7 +15,7 @@ class TrialWeights:
     `nuisance` directions that recordings are known to differ in."""
 
     sigma: np.ndarray
-    rho: float
+    memory: Whitener
     nuisance: np.ndarray
     """Whitened directions (T*n, q), scaled so that a unit is one standard deviation between recordings."""
     coupling: np.ndarray
@@ -22,7 +23,7 @@ class TrialWeights:
 
     def whiten(self, image: np.ndarray) -> np.ndarray:
         """(T, n) counts to a vector (T*n,) of unit variance within the recording."""
-        return whiten(image, self.sigma, self.rho)
+        return whiten(image, self.sigma, self.memory)
 
     def gram(self, columns: np.ndarray) -> np.ndarray:
         """All inner products of whitened columns (T*n, p) in the full metric: (p, p)."""
@@ -33,31 +34,33 @@ class TrialWeights:
         return plain - along.T @ self.coupling @ along
 
 
-def whiten(image: np.ndarray, sigma: np.ndarray, rho: float) -> np.ndarray:
-    """Divide by sigma and take out AR(1) memory: (T, n) to (T*n,)."""
-    unit = image / sigma
-    white = unit.copy()
-    white[1:] -= rho * unit[:-1]
-    white[1:] /= np.sqrt(1.0 - rho**2)
-    return white.ravel()
+def whiten(image: np.ndarray, sigma: np.ndarray, memory: Whitener) -> np.ndarray:
+    """Divide by sigma and take out memory: (T, n) to (T*n,)."""
+    return memory.white(image / sigma).ravel()
 
 
 def build_weights(
-    noise: Noise, signals: Sequence[np.ndarray], offset_tangents: Sequence[np.ndarray] | None
+    noise: Noise,
+    signals: Sequence[np.ndarray],
+    offset_tangents: Sequence[np.ndarray] | None,
+    doubts: Sequence[np.ndarray] | None = None,
 ) -> list[TrialWeights]:
     """Weights of every recording.
 
     Args:
         signals: expected signals (T, n), which are also the direction of a recording's own gain.
         offset_tangents: change of the signal per metre of first touch (T, n); None where depth is not known.
+        doubts: deviation of single readings beyond noise (T, n) [counts], if any.
     """
     weights = []
     for index, signal in enumerate(signals):
         sigma = noise.sigma(signal)
-        directions = [whiten(signal * noise.gain, sigma, noise.rho)]
+        if doubts is not None:
+            sigma = np.hypot(sigma, doubts[index])
+        directions = [whiten(signal * noise.gain, sigma, noise.memory)]
         if offset_tangents is not None:
-            directions.append(whiten(offset_tangents[index] * noise.offset_m, sigma, noise.rho))
+            directions.append(whiten(offset_tangents[index] * noise.offset_m, sigma, noise.memory))
         nuisance = np.stack(directions, axis=1)
         coupling = np.linalg.inv(np.eye(nuisance.shape[1]) + nuisance.T @ nuisance)
-        weights.append(TrialWeights(sigma, noise.rho, nuisance, coupling))
+        weights.append(TrialWeights(sigma, noise.memory, nuisance, coupling))
     return weights

@@ -78,6 +78,10 @@ class Form:
     possible: Callable[[Setting], bool] = field(default=lambda setting: True)
     search: Callable[[PressSet, float], list[list[float]]] | None = None
     """Starting points taken from the recordings and the frame time, instead of stretched probes."""
+    range: Callable[[np.ndarray, PressSet], dict[str, tuple[float, float]]] | None = None
+    """Intervals of parameters that no descent can tell: coordinates and recordings to name -> ends."""
+    twin: int | None = None
+    """Number of the coordinate that trades off against the baseline's damping, if one does."""
     screened: bool = True
     """Whether its probes take part in screening; fallbacks are only fitted where their family is named."""
 

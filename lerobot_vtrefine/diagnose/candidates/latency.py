@@ -11,5 +11,6 @@ FORMS = (
         lambda v, s: (Latency(float(v[0])),),
         lambda v, s: {"tau_s": (float(v[0]), "s")},
         lambda s: [[0.5 * s.frame_s], [2.0 * s.frame_s]],
+        twin=0,
     ),
 )

@@ -26,10 +26,19 @@ def _repeats(signal: np.ndarray) -> np.ndarray:
 
 def periods(presses: PressSet, frame_s: float) -> list[list[float]]:
     """Periods whose pattern of new readings fits the recorded one best, and whole numbers of frames [s]."""
-    grid = frame_s * np.exp(np.linspace(np.log(1.05), np.log(MAX_FRAMES), 1500))
     plain = [[count * frame_s * 1.0001] for count in (2.0, 3.0, 4.0, 5.0)]
     if repeated_share(presses) < 0.05:
         return plain
+    low, high = alike(presses, frame_s * np.exp(np.linspace(np.log(1.05), np.log(MAX_FRAMES), 1500)))
+    # Periods that repeat the same frames differ in when, between them, the readings were taken.
+    inside = [[float(period)] for period in np.linspace(low, high, 9)]
+    whole = [[round(low, digits)] for digits in (2, 3) if low <= round(low, digits) <= high]
+    whole += [[round(high, digits)] for digits in (2, 3) if low <= round(high, digits) <= high]
+    return [*inside, *whole, *plain]
+
+
+def alike(presses: PressSet, grid: np.ndarray) -> tuple[float, float]:
+    """Ends of the periods, of a rising grid, whose pattern of new readings fits the recorded one best [s]."""
     error = np.zeros(len(grid))
     for press in presses.presses:
         repeats = _repeats(press.signal) & press.touching[1:]
@@ -39,12 +48,14 @@ def periods(presses: PressSet, frame_s: float) -> list[list[float]]:
         error += (new & repeats).sum(axis=1) + (~new & fresh).sum(axis=1)
     best = np.flatnonzero(error <= error.min() + 0.5)
     spacing = grid[1] / grid[0]
-    low, high = float(grid[best].min() / spacing), float(grid[best].max() * spacing)
-    # Periods that repeat the same frames differ in when, between them, the readings were taken.
-    alike = [[float(period)] for period in np.linspace(low, high, 9)]
-    whole = [[round(low, digits)] for digits in (2, 3) if low <= round(low, digits) <= high]
-    whole += [[round(high, digits)] for digits in (2, 3) if low <= round(high, digits) <= high]
-    return [*alike, *whole, *plain]
+    return float(grid[best].min() / spacing), float(grid[best].max() * spacing)
+
+
+def undecided(values: np.ndarray, presses: PressSet) -> dict[str, tuple[float, float]]:
+    """Periods that repeat the same frames as the best one does: nothing recorded tells them apart."""
+    best = float(values[0])
+    low, high = alike(presses, best * np.exp(np.linspace(-0.05, 0.05, 2001)))
+    return {"period_s": (min(low, best), max(high, best))}
 
 
 FORMS = (
@@ -57,5 +68,6 @@ FORMS = (
         lambda s: [[2.0001 * s.frame_s], [3.0001 * s.frame_s], [5.0001 * s.frame_s]],
         amplitude=None,
         search=periods,
+        range=undecided,
     ),
 )
