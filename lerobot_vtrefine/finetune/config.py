@@ -28,9 +28,9 @@ class DppoConfig(draccus.ChoiceRegistry):
     # Sampler of rollouts and deployment: "tail" (coarse frozen prefix, then the last steps), "ddim" or
     # "ddpm".
     sampler: str = "tail"
-    # Steps of "ddim", or of the tail proper.
+    # Steps of "ddim", or of the tail proper ("ddpm" takes all).
     sampler_steps: int = 10
-    # Coarse steps before the tail; they use the frozen base network.
+    # Coarse steps before the tail ("tail" only); they use the frozen base network.
     prefix_steps: int = 5
     # K': how many of the last steps are fine-tuned.
     ft_denoising_steps: int = 10
@@ -107,6 +107,8 @@ class DppoConfig(draccus.ChoiceRegistry):
         for name in (*positive, "gamma", "actor_lr", "critic_lr"):
             if getattr(self, name) <= 0:
                 raise ValueError(f"--dppo.{name} must be positive, got {getattr(self, name)}")
+        if not 0.0 <= self.eta <= 1.0:
+            raise ValueError(f"--dppo.eta must lie in [0, 1], got {self.eta}")
         if self.min_log_prob_std < MIN_LOG_PROB_STD:
             raise ValueError(
                 f"--dppo.min_log_prob_std must be at least {MIN_LOG_PROB_STD}, got {self.min_log_prob_std}: "
@@ -159,7 +161,7 @@ def _cosine(start: float, end: float, progress: float) -> float:
 @DppoConfig.register_subclass("paper")
 @dataclass(frozen=True)
 class PaperDppo(DppoConfig):
-    """The paper's setting with the choices of our specification where the paper is silent."""
+    """The paper's setting, with this project's choices where the paper is silent."""
 
 
 @DppoConfig.register_subclass("seed_literal")

@@ -11,6 +11,12 @@ import torch.distributed as dist
 from torch import Tensor, nn
 
 
+def claim_gpu() -> None:
+    """Make this process's own GPU the current one; before anything is moved to "cuda"."""
+    if "LOCAL_RANK" in os.environ and torch.cuda.is_available():
+        torch.cuda.set_device(int(os.environ["LOCAL_RANK"]) % torch.cuda.device_count())
+
+
 def join_ranks(device: torch.device) -> None:
     """Join the process group that ``torchrun`` announced, if it did."""
     if "RANK" in os.environ and not dist.is_initialized():

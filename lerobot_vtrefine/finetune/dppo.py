@@ -3,8 +3,8 @@
 Two nested decision processes: each decision t of the environment is a chain of denoising steps, of which
 the last K' (the tuned ones) form a Gaussian policy. Every tuned step of a decision shares the decision's
 advantage. What runs here, in order: ``collect`` episodes with the noisy sampler, values and advantages over
-decisions, ``update`` with PPO's clipped objective on (decision, tuned step) rows, ``evaluate`` with the
-deployment sampler.
+decisions, ``update`` with PPO's clipped objective on (decision, tuned step) rows. Evaluation, with the
+deployment sampler, lies in ``evaluation.py``.
 
 Differences from the reference implementation, all deliberate: K'=1 works; critic-only iterations really
 happen; values of final states are never mixed with those of the next episode; the observation is encoded

@@ -26,7 +26,7 @@ from lerobot_vtrefine.finetune.checkpoint import (
     save_checkpoint,
 )
 from lerobot_vtrefine.finetune.config import DppoConfig, PaperDppo
-from lerobot_vtrefine.finetune.distributed import join_ranks, leave_ranks, rank_index
+from lerobot_vtrefine.finetune.distributed import claim_gpu, join_ranks, leave_ranks, rank_index
 from lerobot_vtrefine.finetune.dppo import Metrics, TrainState, train
 from lerobot_vtrefine.finetune.evaluation import evaluate
 from lerobot_vtrefine.finetune.logger import ProgressLog, start_wandb
@@ -66,6 +66,7 @@ class FinetunePipelineConfig:
     save_freq: int = 10
     # Only eval.n_episodes counts; the other fields let files of configs/env serve this command too.
     eval: EvalConfig = field(default_factory=EvalConfig)
+    # Curves and settings only: no artifacts are uploaded, so disable_artifact changes nothing.
     wandb: WandBConfig = field(default_factory=WandBConfig)
 
     @classmethod
@@ -176,7 +177,11 @@ class Recorder:
         self.bar: tqdm | None = None
 
     def start(self, state: TrainState) -> None:
-        """Open the records (first rank), and evaluate the policy that training starts from."""
+        """Open the records (first rank), and evaluate the policy that training starts from.
+
+        That is the pre-trained network behind the sampler of fine-tuning; ``lerobot-eval`` of the pre-trained
+        checkpoint uses the sampler that it was saved with.
+        """
         cfg = self.cfg
         if rank_index() == 0:
             settings = {"dppo": asdict(cfg.dppo), "env": asdict(cfg.env), "seed": cfg.seed}
@@ -225,6 +230,7 @@ def save_config(cfg: FinetunePipelineConfig) -> None:
 def run(cfg: FinetunePipelineConfig) -> None:
     """Fine-tune; the result is ``output_dir/checkpoints/last/pretrained_model``."""
     path, checkpoint = start_path(cfg)
+    claim_gpu()
     policy = load_policy(path)
     if checkpoint is None and policy.config.ft_denoising_steps:
         raise ValueError(

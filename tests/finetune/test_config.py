@@ -63,6 +63,7 @@ def test_actor_learning_rate_waits_rises_and_decays_over_this_run():
         ({"timeout": "ignore"}, "--dppo.timeout must be one of terminal, bootstrap"),
         ({"encoder": "half"}, "--dppo.encoder must be one of trained, frozen"),
         ({"num_envs": 0}, "--dppo.num_envs must be positive"),
+        ({"eta": 1.5}, r"--dppo.eta must lie in \[0, 1\]"),
         ({"min_log_prob_std": 0.05}, "--dppo.min_log_prob_std must be at least 0.055"),
     ],
 )

@@ -7,8 +7,10 @@ import sys
 from pathlib import Path
 
 import pytest
+import torch
 from tiny_policy import save_tiny_checkpoint
 
+from lerobot_vtrefine.finetune.distributed import claim_gpu
 from lerobot_vtrefine.finetune.logger import read_progress
 
 
@@ -54,3 +56,19 @@ def test_one_run_is_recorded(ranks):
     rows = read_progress(ranks[1])
     assert [row["iteration"] for row in rows] == [0, 1, 2]
     assert (ranks[1] / "checkpoints" / "last" / "pretrained_model" / "model.safetensors").is_file()
+
+
+@pytest.mark.parametrize(
+    ("local_rank", "gpus", "expected"), [("3", 4, [3]), ("3", 2, [1]), (None, 4, []), ("0", 0, [])]
+)
+def test_each_rank_takes_its_own_gpu(monkeypatch, local_rank, gpus, expected):
+    """Without this every rank would work on the first GPU, which NCCL refuses."""
+    taken = []
+    monkeypatch.setattr(torch.cuda, "is_available", lambda: gpus > 0)
+    monkeypatch.setattr(torch.cuda, "device_count", lambda: gpus)
+    monkeypatch.setattr(torch.cuda, "set_device", taken.append)
+    monkeypatch.delenv("LOCAL_RANK", raising=False)
+    if local_rank is not None:
+        monkeypatch.setenv("LOCAL_RANK", local_rank)
+    claim_gpu()
+    assert taken == expected
