@@ -31,6 +31,8 @@ OVERFLOWS = {
 """Buffers that can be too small -> what they hold and the setting that sizes them."""
 
 
+LONGEST = 40
+"""Substeps in one graph: those of a control step. Launches of their own would leave gaps between them."""
 LEAST_ROWS = 3
 """Rows of constraints that a contact takes at least: no contact sensor can match more contacts than fit."""
 
@@ -114,14 +116,16 @@ class WarpWorlds:
         return wp.to_torch(trace.qpos)[:, :substeps], wp.to_torch(trace.sensors)[:, :substeps]
 
     def _do(self, what: str, work: Callable[[], None], times: int) -> None:
-        """Do some work so many times, by its graph where there can be one."""
+        """Do some work so many times, by graphs where there can be any."""
         if not self._capture:
             for _ in range(times):
                 work()
-        elif (what, times) in self._recorded:
-            self._recorded[what, times].launch()
-        else:
-            self._recorded[what, times] = record(work, times, wp.get_device())
+            return
+        for count in [LONGEST] * (times // LONGEST) + [times % LONGEST]:
+            if (what, count) in self._recorded:
+                self._recorded[what, count].launch()
+            elif count:
+                self._recorded[what, count] = record(work, count, wp.get_device())
 
     def _substep(self) -> None:
         data, trace = self.data, self._trace
