@@ -192,15 +192,17 @@ def refine(
 
 
 @wp.func
-def cell_of(grid: Grid, cells: wp.array(dtype=wp.vec2i), p: wp.vec3) -> wp.vec2i:
-    """Range of the candidates at p; empty outside of the grid."""
-    at = (p - grid.low) * grid.inverse
+def cell_of(grid: Grid, cells: wp.array(dtype=wp.vec2i), at: wp.vec3) -> wp.vec2i:
+    """Range of the candidates at a point, given in cells from the grid's lowest corner; empty outside of
+    it."""
     i = wp.int32(wp.floor(at[0]))
     j = wp.int32(wp.floor(at[1]))
     k = wp.int32(wp.floor(at[2]))
     if i < 0 or j < 0 or k < 0 or i >= grid.count[0] or j >= grid.count[1] or k >= grid.count[2]:
         return wp.vec2i(0, 0)
-    return cells[grid.first + (i * grid.count[1] + j) * grid.count[2] + k]
+    # Blocks of 2 x 2 x 2 cells lie together (`mesh_grid.in_blocks`), so that neighbours share a cache line.
+    block = ((i >> 1) * (grid.count[1] >> 1) + (j >> 1)) * (grid.count[2] >> 1) + (k >> 1)
+    return cells[grid.first + 8 * block + 4 * (i & 1) + 2 * (j & 1) + (k & 1)]
 
 
 @wp.func
@@ -252,16 +254,22 @@ def query_rows(
 ) -> None:
     """`query_grid` by one thread."""
     area = views.window[env, pad, k]
-    origin = views.origin[env, pad, k]
+    axes = views.axes[env, pad, k]
     grid = bodies.grids[k]
+    ex = column(axes, 0)
+    ey = column(axes, 1)
+    origin = (views.origin[env, pad, k] - grid.low) * grid.inverse
     for row in range(area[0], area[1]):
+        from_middle = coordinate(row, lattice.pitch, lattice.rows) * ey
+        start = origin + grid.inverse * from_middle
         for col in range(area[2], area[3]):
-            lever = lever_at(lattice, views, env, pad, k, row, col)
-            cell = cell_of(grid, bodies.cells, origin + lever)
+            x = coordinate(col, lattice.pitch, lattice.cols)
+            cell = cell_of(grid, bodies.cells, start + (x * grid.inverse) * ex)
             index = row * stride + col
             if cell[0] < 0:
                 put_point(depth, rate, index, lattice.reach, 0.0)
             elif cell[1] > cell[0]:
+                lever = from_middle + x * ex
                 deepen(lattice.reach, bodies, views, env, pad, k, index, lever, cell, depth, rate)
 
 
@@ -296,7 +304,7 @@ def query_queued(
                 row = area[0] + i / width
                 col = area[2] + i % width
                 lever = lever_at(lattice, views, env, pad, k, row, col)
-                cell = cell_of(grid, bodies.cells, origin + lever)
+                cell = cell_of(grid, bodies.cells, (origin + lever - grid.low) * grid.inverse)
                 near = cell[1] > cell[0]
                 if cell[0] < 0:
                     put_point(depth, rate, row * stride + col, lattice.reach, 0.0)
@@ -308,7 +316,7 @@ def query_queued(
                 row = area[0] + i / width
                 col = area[2] + i % width
                 lever = lever_at(lattice, views, env, pad, k, row, col)
-                cell = cell_of(grid, bodies.cells, origin + lever)
+                cell = cell_of(grid, bodies.cells, (origin + lever - grid.low) * grid.inverse)
                 deepen(
                     lattice.reach, bodies, views, env, pad, k, row * stride + col, lever, cell, depth, rate
                 )

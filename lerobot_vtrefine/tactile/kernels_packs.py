@@ -117,8 +117,8 @@ def penalties(
     rate: wp.array(dtype=float),
     force: wp.array(dtype=float),
 ) -> None:
-    """Forces min(max(0, stiffness d + damping d'), ceiling) of the `area` with positive depths d; 0 in the
-    rest of the `whole` pad (on CPU, area is all of it, and force may be where the heights are)."""
+    """Forces min(max(0, stiffness d + damping d'), ceiling) of the `area` with positive depths d; on CUDA 0
+    in the rest of the `whole` pad, on CPU it must be there (force may be where the heights are)."""
     ...
 
 

@@ -223,14 +223,15 @@ def penalise_pad(
     share = make_share(lattice.subdivision, lane)
     out = force[env, side]
     whole = ivec4(0, lattice.rows, 0, lattice.cols)
-    area = whole
-    if lanes() > 1:
-        area = contact_area(share, lattice.rows, lattice.cols, 1, views.window[env, side])
+    area = contact_area(share, lattice.rows, lattice.cols, 1, views.window[env, side])
     stride = row_length(lattice.cols, area)
     depth = taxel_room(area, stride, out, room[wp.min(env * force.shape[1] + side, room.shape[0] - 1)])
     rates = rate[work.buffer]
     # Gaps carry no force: only what lies below the face is looked at.
-    fill_area(share, area, stride, 0.0, depth)
+    if lanes() == 1:
+        fill_area(share, whole, stride, 0.0, depth)
+    else:
+        fill_area(share, area, stride, 0.0, depth)
     if mode == COLUMN:
         fill_columns(lattice, share, stride, 0.0, bodies, views, env, side, depth, rates)
     else:

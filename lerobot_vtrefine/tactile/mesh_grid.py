@@ -40,7 +40,7 @@ def build_grid(
     """
     extent = 2 * (np.asarray(half, dtype=float) + MARGIN_M)
     size = max(FINEST_M, float(np.prod(extent) / MOST_CELLS) ** (1 / 3))
-    levels = max(0, int(math.log2(extent.max() / size)) - 1)
+    levels = max(1, int(math.log2(extent.max() / size)) - 1)
     base = np.ceil(extent / (size * 2**levels)).astype(int)
     low = -base * size * 2**levels / 2
     begin, end = triangles
@@ -84,6 +84,12 @@ def _refine(
     return ranges.astype(np.int32), kept.numpy()
 
 
+def in_blocks(cells: np.ndarray, grid: MeshGrid) -> np.ndarray:
+    """Cells (x-major, as the grid's own) in the order of `kernels_grid.cell_of`: 2 x 2 x 2 together."""
+    x, y, z = (count // 2 for count in grid.count)
+    return cells.reshape(x, 2, y, 2, z, 2, 2).transpose(0, 2, 4, 1, 3, 5, 6).reshape(-1, 2)
+
+
 def add_grids(bodies: kernels.Bodies, packed: PackedBodies, reach_m: float, device: str) -> None:
     """Give the meshes among the bodies their grids, in place."""
     grids: list[Any] = []
@@ -98,7 +104,9 @@ def add_grids(bodies: kernels.Bodies, packed: PackedBodies, reach_m: float, devi
             grid.first = sum(map(len, cells))
             grid.count, grid.low = wp.vec3i(*built.count), wp.vec3(*built.low.tolist())
             grid.inverse = 1 / built.size_m
-            cells.append(np.where(built.cells[:, 1:] > 0, built.cells + offset, built.cells))
+            cells.append(
+                in_blocks(np.where(built.cells[:, 1:] > 0, built.cells + offset, built.cells), built)
+            )
             items.append(built.candidates)
         grids.append(grid)
     bodies.grids = wp.array(grids, dtype=kernels.Grid, device=device)
