@@ -27,10 +27,11 @@ from lerobot_vtrefine.diagnose.fitting import Fit, predict, tangents
 from lerobot_vtrefine.diagnose.intervals import baseline_parameters, leave_out
 from lerobot_vtrefine.diagnose.locking import lock
 from lerobot_vtrefine.diagnose.naming import evidence_table, named_causes
+from lerobot_vtrefine.diagnose.pairs import reconsider
 from lerobot_vtrefine.diagnose.presses import PressSet, prepare, usable
 from lerobot_vtrefine.diagnose.recordings import RecordingSet, Trial
 from lerobot_vtrefine.diagnose.screening import Scorer
-from lerobot_vtrefine.diagnose.selection import Search, forward, start_search
+from lerobot_vtrefine.diagnose.selection import Search, forward, polish, start_search
 from lerobot_vtrefine.diagnose.unknowns import Suspicion, look_for_unknowns
 from lerobot_vtrefine.diagnose.verdict import Cause, DataIssue, Heldout, Parameter, Unknown
 from lerobot_vtrefine.tactile.model import SensorModel
@@ -132,6 +133,7 @@ def _diagnose(
     baseline = fit_baseline(discovery)
     search = start_search(baseline, discovery, seed)
     fitted = forward(search, baseline.fitted, lambda text, share: tell(text, 0.1 + 0.5 * share))
+    fitted = polish(search, reconsider(search, fitted))
     tell("rival explanations", 0.62)
     rivals = find_ambiguities(search, fitted, baseline.noise)
     tell("structure that no cause explains", 0.75)

@@ -154,14 +154,14 @@ def elaborate(
     for form in forms_of(name, fitted)[1:] if name not in MAPS else []:
         found = refit(search, fitted, form, probes)
         score = scored(search, found)
-        if _clearly_better(score, best[1], search.seed):
+        if clearly_better(score, best[1], search.seed):
             best = found, score
     return best
 
 
-def _clearly_better(score: Score, than: Score, seed: int) -> bool:
-    """Whether a richer form pays: a percent less error, in most recordings."""
-    return score.gain_over(than) > MIN_GAIN and agree(score.better_by(than), seed, AGREEMENT_P)
+def clearly_better(score: Score, than: Score, seed: int, needed: float = MIN_GAIN) -> bool:
+    """Whether a richer model pays: a percent (or what is needed) less error, in most recordings."""
+    return score.gain_over(than) > needed and agree(score.better_by(than), seed, AGREEMENT_P)
 
 
 def scored(search: Search, fitted: Fit) -> Score:
@@ -237,6 +237,11 @@ def forward(search: Search, fitted: Fit, tell: Callable[[str, float], None]) -> 
         search.p_adjusted[best.name] = found[best.name].p_adjusted
         fitted = reweigh(search, best.fitted)
         fitted = backward(search, fitted)
+    return fitted
+
+
+def polish(search: Search, fitted: Fit) -> Fit:
+    """The same causes in forms as plain as they may be, at their best parameters."""
     return untwine(search, simplify(search, fitted))
 
 
@@ -261,7 +266,7 @@ def simplify(search: Search, fitted: Fit) -> Fit:
         _, columns = tangents(slim.model, search.presses, slim.model.free)
         probes = probe_form(plain, Scorer(slim, search.presses, search.weights, columns))
         found = refit(search, slim, plain, probes)
-        if not _clearly_better(scored(search, fitted), scored(search, found), search.seed):
+        if not clearly_better(scored(search, fitted), scored(search, found), search.seed):
             fitted = reweigh(search, found)
     return fitted
 
