@@ -26,11 +26,13 @@ GIB = 2.0**30
 
 @dataclass(frozen=True)
 class WorldsRow:
-    """One number of worlds; times are medians per control step of all worlds [s]."""
+    """One number of worlds; times are medians per control step of all worlds [s], but for `mean_s`."""
 
     worlds: int
     step_s: float
     """One whole control step: commands in, task rules, state, pads and depth image out on the host."""
+    mean_s: float
+    """The same, averaged over the episode, of which a plug in its hole is the slowest part."""
     physics_s: float
     """The substeps of a control step."""
     tactile_s: float
@@ -86,6 +88,7 @@ COLUMNS: tuple[tuple[str, str, Callable[[WorldsRow], float]], ...] = (
     ("worlds", "", lambda row: row.worlds),
     ("step", "[ms]", lambda row: 1e3 * row.step_s),
     ("env steps", "[k/s]", lambda row: 1e-3 * row.worlds / row.step_s),
+    ("mean step", "[ms]", lambda row: 1e3 * row.mean_s),
     ("physics", "[ms]", lambda row: 1e3 * row.physics_s),
     ("physics steps", "[M/s]", lambda row: 1e-6 * row.worlds * row.substeps / row.physics_s),
     ("tactile", "[ms]", lambda row: 1e3 * row.tactile_s),
@@ -123,6 +126,7 @@ def _measure(warp: WarpConfig, count: int, steps: int, scene: SceneConfig) -> Wo
     return WorldsRow(
         worlds=count,
         step_s=float(np.median(times[1:])),
+        mean_s=float(np.mean(times[1:])),
         reset_s=reset_s,
         start_s=started,
         memory_gib=memory,
