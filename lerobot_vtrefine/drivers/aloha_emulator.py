@@ -7,7 +7,7 @@ from pathlib import Path
 
 from lerobot.motors.dynamixel.tables import MODEL_NUMBER_TABLE
 
-from lerobot_vtrefine.drivers.dynamixel_arm import GRIPPER, VIPERX_300S, WIDOWX_250S, ArmModel
+from lerobot_vtrefine.drivers.arm_models import GRIPPER, VIPERX_300S, WIDOWX_250S, ArmModel
 from lerobot_vtrefine.drivers.dynamixel_emulator import DynamixelEmulator, EmulatedMotor
 
 ARMS = {"follower": VIPERX_300S, "leader": WIDOWX_250S}

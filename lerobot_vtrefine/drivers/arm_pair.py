@@ -7,7 +7,8 @@ from concurrent.futures import ThreadPoolExecutor
 import numpy as np
 from lerobot.motors import MotorCalibration
 
-from lerobot_vtrefine.drivers.dynamixel_arm import RETRIES, ArmModel, DynamixelArm, Floats
+from lerobot_vtrefine.drivers.arm_models import ArmModel
+from lerobot_vtrefine.drivers.dynamixel_arm import RETRIES, DynamixelArm, Floats
 from lerobot_vtrefine.drivers.ports import PortError
 
 logger = logging.getLogger(__name__)

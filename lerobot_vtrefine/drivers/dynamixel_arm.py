@@ -11,13 +11,13 @@ import math
 import time
 from collections.abc import Callable, Generator
 from contextlib import contextmanager
-from dataclasses import dataclass
 
 import numpy as np
-from lerobot.motors import Motor, MotorCalibration, MotorNormMode
+from lerobot.motors import MotorCalibration
 from lerobot.motors.dynamixel import DynamixelMotorsBus, OperatingMode
 from numpy.typing import NDArray
 
+from lerobot_vtrefine.drivers.arm_models import GRIPPER, ArmModel
 from lerobot_vtrefine.drivers.ports import (
     GONE,
     PortError,
@@ -32,7 +32,6 @@ Floats = NDArray[np.float64]
 
 COUNTS_PER_TURN = 4096
 CENTRE = COUNTS_PER_TURN // 2
-GRIPPER = "gripper"
 
 RETRIES = 4
 """Repeated tries of a bus transaction: single packets do get lost, and a busy machine answers late."""
@@ -50,58 +49,6 @@ FULL_PWM = 885
 
 _X540_MA = 2.69
 """Milliamperes per count of current registers (ROBOTIS e-Manual, XM430 and XM540)."""
-
-
-@dataclass(frozen=True)
-class ArmModel:
-    """Motors of one arm.
-
-    Attributes:
-        motors: (name, id, model) of the driven motors, base to gripper.
-        shadows: (name, id, model, followed motor) of motors that share a joint with another one.
-    """
-
-    motors: tuple[tuple[str, int, str], ...]
-    shadows: tuple[tuple[str, int, str, str], ...]
-
-    @property
-    def joints(self) -> tuple[str, ...]:
-        """Motors but the gripper."""
-        return tuple(name for name, _, _ in self.motors if name != GRIPPER)
-
-    def bus_motors(self) -> dict[str, Motor]:
-        """All motors as LeRobot's bus wants them."""
-        everything = [*self.motors, *((name, number, model) for name, number, model, _ in self.shadows)]
-        return {name: Motor(number, model, MotorNormMode.DEGREES) for name, number, model in everything}
-
-
-VIPERX_300S = ArmModel(
-    motors=(
-        ("waist", 1, "xm540-w270"),
-        ("shoulder", 2, "xm540-w270"),
-        ("elbow", 4, "xm540-w270"),
-        ("forearm_roll", 6, "xm540-w270"),
-        ("wrist_angle", 7, "xm540-w270"),
-        ("wrist_rotate", 8, "xm430-w350"),
-        (GRIPPER, 9, "xm430-w350"),
-    ),
-    shadows=(("shoulder_shadow", 3, "xm540-w270", "shoulder"), ("elbow_shadow", 5, "xm540-w270", "elbow")),
-)
-"""ALOHA's follower (motor map of LeRobot's former viperx robot)."""
-
-WIDOWX_250S = ArmModel(
-    motors=(
-        ("waist", 1, "xm430-w350"),
-        ("shoulder", 2, "xm430-w350"),
-        ("elbow", 4, "xm430-w350"),
-        ("forearm_roll", 6, "xm430-w350"),
-        ("wrist_angle", 7, "xm430-w350"),
-        ("wrist_rotate", 8, "xl430-w250"),
-        (GRIPPER, 9, "xc430-w150"),
-    ),
-    shadows=(("shoulder_shadow", 3, "xm430-w350", "shoulder"), ("elbow_shadow", 5, "xm430-w350", "elbow")),
-)
-"""ALOHA's leader (motor map of LeRobot's former widowx teleoperator)."""
 
 
 def counts_to_rad(counts: Floats) -> Floats:

@@ -12,8 +12,9 @@ from lerobot.robots.robot import Robot
 from lerobot.utils.decorators import check_if_already_connected, check_if_not_connected
 
 from lerobot_vtrefine.datasets.features import JOINT_SUFFIX, PAD_COLS, PAD_ROWS, PADS
+from lerobot_vtrefine.drivers.arm_models import VIPERX_300S
 from lerobot_vtrefine.drivers.arm_pair import ArmPair
-from lerobot_vtrefine.drivers.dynamixel_arm import VIPERX_300S, Floats
+from lerobot_vtrefine.drivers.dynamixel_arm import Floats
 from lerobot_vtrefine.drivers.pad_set import PadSet
 from lerobot_vtrefine.drivers.ports import PortError
 from lerobot_vtrefine.embodiments import get_embodiment

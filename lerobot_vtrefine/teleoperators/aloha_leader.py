@@ -10,8 +10,8 @@ from lerobot.teleoperators.teleoperator import Teleoperator
 from lerobot.utils.decorators import check_if_already_connected, check_if_not_connected
 
 from lerobot_vtrefine.datasets.features import JOINT_SUFFIX
+from lerobot_vtrefine.drivers.arm_models import WIDOWX_250S
 from lerobot_vtrefine.drivers.arm_pair import ArmPair
-from lerobot_vtrefine.drivers.dynamixel_arm import WIDOWX_250S
 from lerobot_vtrefine.embodiments import get_embodiment
 from lerobot_vtrefine.teleoperators.config_aloha_leader import AlohaLeaderConfig
 

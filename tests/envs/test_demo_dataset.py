@@ -42,9 +42,7 @@ FEATURES = dataset_features(HEIGHT, WIDTH)
 
 def open_recording(root: Path, **changes) -> DemoDataset:
     settings = {"pair": "round", **changes}
-    return DemoDataset(
-        root, "local/demo", 10, FEATURES, "some_robot", "insert", settings, first_seed=0
-    )
+    return DemoDataset(root, "local/demo", 10, FEATURES, "some_robot", "insert", settings, first_seed=0)
 
 
 def read(root: Path) -> LeRobotDataset:

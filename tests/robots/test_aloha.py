@@ -13,7 +13,8 @@ from rig import Rig, allow_slow_answers, aloha_rig, connect_error, follower_conf
 from lerobot_vtrefine.datasets.features import NUM_JOINTS, PADS, TAXEL_INFO
 from lerobot_vtrefine.drivers import dynamixel_arm
 from lerobot_vtrefine.drivers.aloha_emulator import GRIPPER_ENDS
-from lerobot_vtrefine.drivers.dynamixel_arm import VIPERX_300S, WIDOWX_250S, ArmModel, DynamixelArm
+from lerobot_vtrefine.drivers.arm_models import VIPERX_300S, WIDOWX_250S, ArmModel
+from lerobot_vtrefine.drivers.dynamixel_arm import DynamixelArm
 from lerobot_vtrefine.drivers.dynamixel_emulator import EmulatedMotor
 from lerobot_vtrefine.drivers.sources import check_pattern
 from lerobot_vtrefine.robots.aloha_tactile_follower import REST_RAD, AlohaTactileFollower, limit_step

@@ -12,8 +12,9 @@ from lerobot.cameras.configs import CameraConfig
 from realsense import FakeDepthCamera, camera_flag, plug_in
 from rig import Rig, allow_slow_answers, aloha_rig, connect_error, follower_config
 
+from lerobot_vtrefine.drivers.arm_models import WIDOWX_250S
 from lerobot_vtrefine.drivers.board import PadReader
-from lerobot_vtrefine.drivers.dynamixel_arm import WIDOWX_250S, DynamixelArm
+from lerobot_vtrefine.drivers.dynamixel_arm import DynamixelArm
 from lerobot_vtrefine.drivers.ports import PortError
 from lerobot_vtrefine.robots.aloha_tactile_follower import AlohaTactileFollower
 
