@@ -1,10 +1,13 @@
 """Kernels around mujoco_warp's step: pairs that are dropped have no contact, forces add up as MuJoCo's do."""
 
+import importlib.metadata
+
 import mujoco
 import numpy as np
 import pytest
 import warp as wp
 
+from lerobot_vtrefine.sim.backends import get_backend
 from lerobot_vtrefine.sim.config import GraspedStart, SceneConfig, TaskConfig, WarpConfig
 from lerobot_vtrefine.sim.expert import ScriptedExpert
 from lerobot_vtrefine.sim.simulation import InsertionSim
@@ -142,3 +145,9 @@ def test_other_sensors_are_refused():
     spec.add_sensor(name="clock", type=mujoco.mjtSensor.mjSENS_CLOCK)
     with pytest.raises(ValueError, match="sensor 'clock' is no net force of contacts"):
         _sides(spec.compile())
+
+
+def test_another_release_of_mujoco_warp_is_said_in_one_line(monkeypatch):
+    monkeypatch.setattr(importlib.metadata, "version", lambda name: "4.1.0")
+    with pytest.raises(ValueError, match=r"knows mujoco_warp 4\.0\.x, not 4\.1\.0: pip install"):
+        get_backend("warp", mujoco.MjSpec().compile(), 1)

@@ -1,6 +1,8 @@
 """Physics backends behind one interface."""
 
+import importlib.metadata
 import importlib.util
+from contextlib import suppress
 
 import mujoco
 
@@ -12,6 +14,8 @@ from lerobot_vtrefine.sim.config import BACKENDS, WarpConfig
 __all__ = ["Backend", "Trace", "get_backend"]
 
 INSTALL = "pip install 'lerobot_policy_vtrefine[gpu]'"
+RELEASE = "4.0."
+"""Of mujoco_warp: its parts, which are no public interface, are put together anew in `warp_step`."""
 
 
 def get_backend(
@@ -27,9 +31,20 @@ def get_backend(
     if name == "batch":
         return BatchBackend(model, num_envs, num_threads)
     if name == "warp":
-        if importlib.util.find_spec("mujoco_warp") is None:
-            raise ValueError(f"backend 'warp' needs mujoco_warp: {INSTALL}, or use single or batch")
+        _check_mujoco_warp()
         from lerobot_vtrefine.sim.backends.warp import WarpBackend  # seconds to import
 
         return WarpBackend(model, num_envs, warp or WarpConfig())
     raise ValueError(f"unknown backend {name!r}: use one of {', '.join(BACKENDS)}")
+
+
+def _check_mujoco_warp() -> None:
+    if importlib.util.find_spec("mujoco_warp") is None:
+        raise ValueError(f"backend 'warp' needs mujoco_warp: {INSTALL}, or use single or batch")
+    with suppress(importlib.metadata.PackageNotFoundError):  # where it was copied instead of installed
+        found = importlib.metadata.version("mujoco-warp")
+        if not found.startswith(RELEASE):
+            raise ValueError(
+                f"backend 'warp' knows mujoco_warp {RELEASE}x, not {found}: "
+                f"pip install 'mujoco-warp=={RELEASE}*', or use single or batch"
+            )
