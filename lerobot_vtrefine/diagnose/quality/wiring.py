@@ -20,8 +20,10 @@ BETTER = 0.4
 """Another order of the lines must leave less than this part of the squared error ..."""
 WRONG = 0.1
 """... and the recorded order more than this part of the signal unexplained."""
-MIN_IDLE_SPREAD = 4.0
-"""Idle maps identify lines only if taxels differ by this many deviations of the map's own noise."""
+MIN_IDLE_SPREAD = 3.0
+"""Idle maps identify lines only if taxels differ by this many deviations of the map's own noise ..."""
+BEYOND_NOISE = 3.0
+"""... and a map is another one's only if it differs by this many times the square that noise makes."""
 STRAY = 0.1
 """Misplaced lines show at least this part of the signal where nothing presses; dead ones do not."""
 MAX_FRAMES = 100
@@ -154,4 +156,6 @@ def _idle_order(press: Press, found: list[Press], shape: tuple[int, int]) -> str
     if usual.std() < MIN_IDLE_SPREAD * noise:
         return None
     own = press.idle - np.median(press.idle)
+    if float(((own - usual) ** 2).mean()) < BEYOND_NOISE * noise**2:
+        return None
     return Costs.between(own.reshape(1, *shape), usual.reshape(1, *shape)).best_order()
