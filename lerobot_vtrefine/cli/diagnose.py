@@ -130,19 +130,13 @@ def diagnose(recordings: "RecordingSet", seed: int) -> "Diagnosis":
             from lerobot_vtrefine.diagnose.pad_engine import diagnose_pad
 
             return diagnose_pad(recordings, seed=seed, progress=progress)
+        if (recordings.path / "meta" / "info.json").is_file():
+            from lerobot_vtrefine.diagnose.dataset.engine import diagnose_dataset
+
+            return diagnose_dataset(recordings, seed, progress)
         from lerobot_vtrefine.diagnose.robot.engine import diagnose_robot
 
-        robot = diagnose_robot(recordings, seed=seed, progress=progress)
-        if not (recordings.path / "meta" / "info.json").is_file():
-            return robot
-        from lerobot_vtrefine.diagnose.vision.frames import has_depth
-
-        if not has_depth(recordings.path):
-            return robot
-        from lerobot_vtrefine.diagnose.vision.engine import diagnose_vision
-        from lerobot_vtrefine.diagnose.vision.merge import with_camera
-
-        return with_camera(robot, diagnose_vision(recordings.path, seed, progress))
+        return diagnose_robot(recordings, seed=seed, progress=progress)
 
 
 def make_verdict(diagnosis: "Diagnosis | None", issues: Sequence["DataIssue"]) -> "Verdict":

@@ -17,6 +17,7 @@ from robot_rigs import Rig, make_set
 
 from lerobot_vtrefine.diagnose.recordings import read_recording_set
 from lerobot_vtrefine.diagnose.robot.engine import diagnose_robot
+from lerobot_vtrefine.embodiments import ALOHA
 
 TABLE = ("shoulder", "elbow", "wrist_flex", "gripper")
 ARM = ("left_waist", "left_shoulder", "left_elbow", "left_wrist_angle")
@@ -112,8 +113,36 @@ def run(kind, seed):
         "rmse": [held.baseline, held.extended, held.noise_floor],
         "cpu_s": round(time.process_time() - begun, 2),
         "params": {f"{c.name}.{k}": (p.value, p.ci95) for c in found.causes for k, p in c.params.items()},
-        "sizes": {"latency": rig.latency_s, **rig.offset, **rig.backlash, **rig.friction, **rig.sag},
+        "sizes": truths(rig),
     }
+
+
+def truths(rig):
+    """Parameter -> true value in the verdict's units; friction in Nm where the servo's stiffness is known."""
+    out = {"control_latency.tau_s": rig.latency_s}
+    for cause, sizes in (
+        ("encoder_offset", rig.offset),
+        ("backlash", rig.backlash),
+        ("joint_friction", rig.friction),
+        ("gravity_sag", rig.sag),
+    ):
+        out |= {f"{cause}.{joint}_rad": size for joint, size in sizes.items()}
+    for joint, size in rig.friction.items():
+        known = {f"left_{item.name}": item.stiffness for item in ALOHA.joints} | rig.stiffness
+        if joint in known:
+            out[f"joint_friction.{joint}_nm"] = size * known[joint]
+    for size in rig.compliance.values():
+        out["gripper_compliance.m_per_n"] = size
+    return out
+
+
+def covered(row, cause=""):
+    """Whether each found parameter (of a cause) that has a true value lies in its interval."""
+    return [
+        low <= row["sizes"][name] <= high
+        for name, (_, (low, high)) in row["params"].items()
+        if row["sizes"].get(name) and name.startswith(cause)
+    ]
 
 
 def grade(row):
@@ -140,6 +169,12 @@ def table(rows):
             counts = [sum(grade(row) == name for row in mine) for name in grades]
             cpu = float(np.median([row["cpu_s"] for row in mine]))
             lines.append(f"{kind:22}" + "".join(f"{n:12}" for n in (*counts, len(mine))) + f"{cpu:12.1f}")
+    inside = [hit for row in rows for hit in covered(row)]
+    lines.append(f"95 % intervals that cover: {sum(inside)} of {len(inside)} ({np.mean(inside):.3f})")
+    causes = sorted({name.split(".")[0] for row in rows for name in row["params"]})
+    for cause in causes:
+        hits = [hit for row in rows for hit in covered(row, cause)]
+        lines.append(f"  {cause}: {sum(hits)} of {len(hits)}")
     return "\n".join(lines)
 
 

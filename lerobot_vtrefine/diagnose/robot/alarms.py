@@ -14,7 +14,7 @@ from lerobot_vtrefine.diagnose.robot.batch import Batch
 from lerobot_vtrefine.diagnose.robot.candidates import DECOY, LATENCY, resolution
 from lerobot_vtrefine.diagnose.robot.fitting import derivatives, frame_s
 from lerobot_vtrefine.diagnose.robot.gravity import is_gripper
-from lerobot_vtrefine.diagnose.robot.selection import LEAST_EFFECT_RAD, Selection
+from lerobot_vtrefine.diagnose.robot.selection import LEAST_EFFECT_RAD, LEAST_UNKNOWN, Selection
 
 Array = np.ndarray
 
@@ -28,7 +28,6 @@ _FOLLOWS, _FOLLOWS_IF_OWNED = 0.1, 0.4
 _LINE = 0.1
 FEW_TRIALS = 8
 _HELPS = 0.25
-_OF_BASELINE = 0.02
 _OWNED = {
     "speed": {"backlash", "joint_friction", LATENCY},
     "direction": {"backlash", "joint_friction", LATENCY},
@@ -89,7 +88,7 @@ def _matters(selection: Selection, joint: int, share: float) -> bool:
     left = selection.fit.total[joint]
     size = np.sqrt(share * left)
     least = max(0.5 * resolution(selection.problem)[joint], _least(selection, joint))
-    return bool(size > least and share * left > _OF_BASELINE * selection.baseline.total[joint])
+    return bool(size > least and share * left > LEAST_UNKNOWN * selection.baseline.total[joint])
 
 
 def _least(selection: Selection, joint: int) -> float:

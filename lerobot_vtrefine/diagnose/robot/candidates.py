@@ -15,6 +15,10 @@ Array = np.ndarray
 LATENCY = "control_latency"
 FRICTION = "joint_friction"
 DECOY = "unknown"
+STOP = ("stop", "give")
+"""A gripper that meets what it holds: no load is needed to see that."""
+_USUAL_STOP = 0.25
+"""Part of the frames in which a gripper is supposed to be stopped when a fit of it begins."""
 
 
 @dataclass(frozen=True)
@@ -48,6 +52,9 @@ class Candidate:
                 return np.zeros_like(moved)
             loaded = np.ptp(load, axis=(0, 1)) > 0
             return loaded & np.array([gravity.is_gripper(name) for name in problem.names])
+        if self.parameters == STOP:
+            grippers = [gravity.is_gripper(name) and gravity.is_sliding(name) for name in problem.names]
+            return moved & np.array(grippers) & (problem.batch.load is None)
         if self.form is not None:
             terms = problem.shapes[self.form][problem.batch.valid]
             power = np.square(terms).sum((0, 2))
@@ -63,6 +70,10 @@ class Candidate:
             for name in SAG:
                 point = point.with_values(name, 0.0, joints)
             return point
+        if self.parameters == STOP:
+            opening = np.abs(problem.batch.position[problem.batch.valid][:, joints])
+            point = point.with_values("stop", np.quantile(opening, _USUAL_STOP, axis=0), joints)
+            return point.with_values("give", 0.1, joints)
         for name in self.parameters:
             start = 0.0 if name in ("offset", "bend") else multiple * problem.scale[joints]
             point = point.with_values(name, start, joints)
@@ -89,12 +100,18 @@ CANDIDATES = (
     Candidate("gravity_sag", SAG[:2], gravity.TWO_TERM_FORM),
     Candidate("gravity_sag", SAG, gravity.FREE_FORM),
     Candidate("gripper_compliance", ("bend",)),
+    Candidate("gripper_compliance", STOP),
     Candidate(DECOY, SAG[:1], "gain", clue="the position's scale: error grows with position"),
     Candidate(DECOY, SAG[:1], "square", clue="error grows with the square of the position"),
     Candidate(DECOY, SAG[:2], "drift", clue="session time: the zero wanders"),
     Candidate(DECOY, SAG[:2], "gain_drift", clue="position x session time: the scale wanders (warming up?)"),
 )
 """Everything that is fitted joint by joint; the commands' delay, common to all joints, is handled apart."""
+
+
+def candidates_for(problem: Problem) -> tuple[Candidate, ...]:
+    """Those that the problem's predictions know."""
+    return tuple(item for item in CANDIDATES if problem.offers(item.parameters, item.form))
 
 
 def moving(problem: Problem) -> Array:

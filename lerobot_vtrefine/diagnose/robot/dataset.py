@@ -45,7 +45,7 @@ def read_dataset(repo_id: str | None = None, root: str | Path | None = None) -> 
         time_s = episode.time_s.astype(float) - float(episode.time_s[0])
         trials.append(
             RobotTrial(
-                file=f"episode_{episode.index:06d}",
+                file=episode_name(episode.index),
                 condition=f"episode {episode.index}",
                 replicate=0,
                 order=episode.index,
@@ -58,6 +58,11 @@ def read_dataset(repo_id: str | None = None, root: str | Path | None = None) -> 
         )
         start_s += float(time_s[-1]) + PAUSE_S
     return RecordingSet(folder.root, "robot", 0, 0, 0.0, "rad", 0.0, names, tuple(trials))
+
+
+def episode_name(index: int) -> str:
+    """An episode's name as a trial."""
+    return f"episode_{index:06d}"
 
 
 def joint_names(folder: EpisodeFolder) -> tuple[str, ...]:

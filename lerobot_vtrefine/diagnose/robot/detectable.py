@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from lerobot_vtrefine.diagnose.robot.candidates import CANDIDATES, DECOY, LATENCY, Candidate
+from lerobot_vtrefine.diagnose.robot.candidates import DECOY, LATENCY, STOP, Candidate, candidates_for
 from lerobot_vtrefine.diagnose.robot.fitting import INDEX, derivatives, evaluate
 from lerobot_vtrefine.diagnose.robot.gravity import FREE_FORM, TWO_TERM_FORM, is_sliding
 from lerobot_vtrefine.diagnose.robot.selection import LEAST_GAIN, Selection
@@ -20,11 +20,11 @@ def minimum_detectable(selection: Selection) -> dict[str, float]:
     are left out. Slides do not count where angles do."""
     own = derivatives(selection.problem, selection.fit).columns
     out: dict[str, float] = {}
-    for candidate in CANDIDATES:
+    for candidate in candidates_for(selection.problem):
         if (
             candidate.cause == DECOY
             or candidate.form in (FREE_FORM, TWO_TERM_FORM)
-            or candidate.parameters == ("loose",)
+            or candidate.parameters in (("loose",), STOP)
         ):
             continue
         sizes = _sizes(selection, candidate, own)

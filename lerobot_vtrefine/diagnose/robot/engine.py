@@ -13,9 +13,10 @@ from lerobot_vtrefine.diagnose.robot import experiments, views
 from lerobot_vtrefine.diagnose.robot.alarms import Alarm, raise_alarms
 from lerobot_vtrefine.diagnose.robot.batch import make_batch
 from lerobot_vtrefine.diagnose.robot.candidates import DECOY
+from lerobot_vtrefine.diagnose.robot.conversion import to_model
 from lerobot_vtrefine.diagnose.robot.detectable import minimum_detectable
 from lerobot_vtrefine.diagnose.robot.estimates import Estimates, repeatability
-from lerobot_vtrefine.diagnose.robot.fitting import INDEX, Point, Problem, fit, to_model
+from lerobot_vtrefine.diagnose.robot.fitting import INDEX, Point, Problem, fit
 from lerobot_vtrefine.diagnose.robot.model import RobotModel
 from lerobot_vtrefine.diagnose.robot.rivals import Rival, adopt, find_rivals, settle_by_load, without_cause
 from lerobot_vtrefine.diagnose.robot.selection import Selection, Selector, Tried
@@ -75,11 +76,16 @@ def diagnose_robot(
     Raises:
         ValueError: a trial with commands or times that are not finite.
     """
-    tell = progress or (lambda text, done: None)
-    locked = lock([trial.condition for trial in recordings.trials], seed)
-    open_trials = [index for index in range(len(recordings.trials)) if index not in set(locked)]
     whole = Problem.of(recordings.joints, make_batch(recordings.trials))
-    problem = whole.subset(np.array(open_trials))
+    return diagnose_problem(whole, seed, progress)
+
+
+def diagnose_problem(whole: Problem, seed: int = 0, progress: Progress | None = None) -> RobotDiagnosis:
+    """The same for a problem that is posed already."""
+    tell = progress or (lambda text, done: None)
+    count = len(whole.batch.conditions)
+    locked = lock(whole.batch.conditions, seed)
+    problem = whole.subset(np.array([index for index in range(count) if index not in set(locked)]))
     selection = Selector(problem, seed, _steps(tell)).run()
     tell("robot: looking for what is left", 0.6)
     alarms = raise_alarms(selection, seed)

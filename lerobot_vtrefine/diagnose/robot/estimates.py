@@ -1,15 +1,14 @@
-"""Parameters as the verdict gives them: names and units of contract §5, intervals by resampling trials."""
+"""Parameters as the verdict gives them: names and units of contract §5, intervals by leaving trials out."""
 
 from itertools import pairwise
 
 import numpy as np
-from scipy.stats import t as student_t
 
 from lerobot_vtrefine.diagnose.robot.candidates import FRICTION, LATENCY
 from lerobot_vtrefine.diagnose.robot.fitting import INDEX, SAG, Problem
 from lerobot_vtrefine.diagnose.robot.friction_load import friction_in_load, stiffness_in_load
 from lerobot_vtrefine.diagnose.robot.gravity import full_reach, is_sliding
-from lerobot_vtrefine.diagnose.robot.resampling import bootstrap
+from lerobot_vtrefine.diagnose.robot.resampling import jackknife, leave_out
 from lerobot_vtrefine.diagnose.robot.selection import Selection
 from lerobot_vtrefine.diagnose.verdict import Parameter
 from lerobot_vtrefine.embodiments import ALOHA
@@ -18,20 +17,19 @@ Array = np.ndarray
 
 
 class Estimates:
-    """Fitted values of a selection with their resampled spread."""
+    """Fitted values of a selection, and what they become without each condition."""
 
     def __init__(self, selection: Selection, seed: int) -> None:
         self.selection, self.seed = selection, seed
-        self.trials = selection.problem.batch.trials
-        self.theta, self.tau = bootstrap(selection.problem, selection.fit, seed)
+        self.theta, self.tau = leave_out(selection.problem, selection.fit)
 
     def of(self, cause: str, joints: tuple[int, ...]) -> dict[str, Parameter]:
         """The cause's parameters on those joints."""
         if cause == LATENCY:
             value = self.selection.fit.point.tau_s
-            return {"tau_s": Parameter(value, _interval(self.tau, value, self.trials), "s")}
+            return {"tau_s": Parameter(value, jackknife(self.tau, value), "s")}
         if cause == "gripper_compliance":
-            return {"m_per_n": self._compliance(joints)}
+            return self._gripper(joints)
         out: dict[str, Parameter] = {}
         for joint in joints:
             name = self.selection.problem.names[joint]
@@ -63,7 +61,7 @@ class Estimates:
             names = ("play", "loose") if cause == "backlash" else ("offset",)
             columns = [INDEX[name] for name in names]
             value, spread = float(now[columns].sum()), drawn[:, columns].sum(1)
-        return Parameter(value, _interval(spread, value, self.trials), unit)
+        return Parameter(value, jackknife(spread, value), unit)
 
     def _friction(self, joint: int, name: str) -> tuple[str, Parameter]:
         """In Nm where loads or the robot's known servo gains give the scale; else as the servo's error."""
@@ -71,7 +69,7 @@ class Estimates:
         sliding = is_sliding(name)
         column = INDEX["friction"]
         value = float(self.selection.fit.point.theta[joint, column])
-        low, high = _interval(self.theta[:, joint, column], value, self.trials)
+        low, high = jackknife(self.theta[:, joint, column], value)
         stiffness = stiffness_in_load(problem, self.selection.fit, joint)
         if stiffness is None and problem.batch.load is not None:
             seen = friction_in_load(problem, self.selection.fit, joint, self.seed)
@@ -86,6 +84,20 @@ class Estimates:
         scaled = (low * stiffness, high * stiffness)
         return f"{name}_{unit.lower()}", Parameter(value * stiffness, scaled, unit)
 
+    def _gripper(self, joints: tuple[int, ...]) -> dict[str, Parameter]:
+        """By its load, or by where the gripper stops and how far it gives there."""
+        free, theta = self.selection.fit.free, self.selection.fit.point.theta
+        loaded = tuple(joint for joint in joints if free[joint, INDEX["bend"]])
+        out = {"m_per_n": self._compliance(loaded)} if loaded else {}
+        for joint in joints:
+            for parameter, unit in (("stop", "m"), ("give", "1")):
+                column = INDEX[parameter]
+                if free[joint, column]:
+                    value = float(theta[joint, column])
+                    key = f"{self.selection.problem.names[joint]}_{parameter}" + ("_m" if unit == "m" else "")
+                    out[key] = Parameter(value, jackknife(self.theta[:, joint, column], value), unit)
+        return out
+
     def _compliance(self, joints: tuple[int, ...]) -> Parameter:
         """One number for all grippers: their mean, each weighted by how well it is known; fingers that move
         the other way have loads of the other sign or not, so sizes are averaged."""
@@ -98,7 +110,7 @@ class Estimates:
         mean = float((weight * np.abs(value)).sum() / weight.sum())
         spread = (drawn * sign * weight).sum(1) / weight.sum()
         overall = 1.0 if (sign >= 0).any() else -1.0
-        low, high = _interval(spread, mean, self.trials)
+        low, high = jackknife(spread, mean)
         if overall < 0:
             low, high = -high, -low
         return Parameter(overall * mean, (low, high), "m/N")
@@ -112,13 +124,6 @@ def _stiffness(name: str) -> float | None:
     if is_sliding(plain):
         return ALOHA.fingers.stiffness
     return next(joint.stiffness for joint in ALOHA.joints if plain.endswith(joint.name))
-
-
-def _interval(drawn: Array, value: float, trials: int) -> tuple[float, float]:
-    """95 % interval of resampled values, widened by what resampling few trials leaves out (Student's t)."""
-    low, high = np.percentile(drawn, [2.5, 97.5])
-    wider = student_t.ppf(0.975, max(trials - 1, 1)) / 1.96 * np.sqrt(trials / max(trials - 1, 1))
-    return float(value - wider * max(value - low, 0.0)), float(value + wider * max(high - value, 0.0))
 
 
 def repeatability(problem: Problem, residual: Array) -> float | None:

@@ -10,15 +10,14 @@ import numpy as np
 
 from lerobot_vtrefine.diagnose.robot import gravity
 from lerobot_vtrefine.diagnose.robot.batch import Batch
-from lerobot_vtrefine.diagnose.robot.model import JointModel, RobotModel
 from lerobot_vtrefine.diagnose.robot.servo import Columns, simulate
 
 Array = np.ndarray
 
 SAG = tuple(f"sag{term}" for term in range(gravity.TERMS))
-PARAMETERS = ("log_omega", "log_zeta", "offset", "play", "loose", "friction", *SAG, "bend")
+PARAMETERS = ("log_omega", "log_zeta", "offset", "play", "loose", "friction", *SAG, "bend", "stop", "give")
 INDEX = {name: place for place, name in enumerate(PARAMETERS)}
-POSITIVE = ("play", "loose", "friction")
+POSITIVE = ("play", "loose", "friction", "stop")
 OMEGA_BOUNDS = (0.5, 300.0)
 ZETA_BOUNDS = (0.1, 20.0)
 _RADIANS_PER_FRAME = (6.0, 3.0)
@@ -65,6 +64,10 @@ class Problem:
     """Form -> (N, T, J, K)."""
     scale: Array = field(repr=False)
     """(J,) typical error: what finite differences and starts are measured by."""
+    misfit: float = 0.0
+    """What is called a cause must change a joint's prediction by this part of its baseline's error ..."""
+    floor: float = 0.0
+    """... and by this much [rad; a tenth of it in m for slides]."""
 
     @classmethod
     def of(cls, names: tuple[str, ...], batch: Batch) -> "Problem":
@@ -84,6 +87,14 @@ class Problem:
         shapes = {form: values[:length][:, np.asarray(trials)] for form, values in self.shapes.items()}
         return replace(self, batch=batch, shapes=shapes)
 
+    def start(self) -> Point:
+        """Where fits of the baseline begin."""
+        return first_point(self)
+
+    def offers(self, parameters: tuple[str, ...], form: str | None) -> bool:
+        """Whether predictions know such parameters, and the form of sag, so that they may be tried."""
+        return True
+
     def predict(self, point: Point, joint: Array | None = None, theta: Array | None = None) -> Array:
         """Positions (N, T, C) of columns: joints (C,) under parameters (C, P); by default all joints."""
         joint = np.arange(self.batch.joints) if joint is None else joint
@@ -96,6 +107,8 @@ class Problem:
             play=theta[:, INDEX["play"]],
             loose=theta[:, INDEX["loose"]],
             friction=theta[:, INDEX["friction"]],
+            stop=theta[:, INDEX["stop"]],
+            give=theta[:, INDEX["give"]],
             tau_s=point.tau_s,
             push=self._push(point.forms, joint, theta),
         )
@@ -337,28 +350,6 @@ def frame_s(batch: Batch) -> float:
     return float(np.median(dt)) if len(dt) else 1.0
 
 
-def to_model(names: tuple[str, ...], point: Point) -> RobotModel:
-    """As the file that is written."""
-    joints = []
-    for index, name in enumerate(names):
-        value = dict(zip(PARAMETERS, point.theta[index].tolist(), strict=True))
-        joints.append(
-            JointModel(
-                name=name,
-                natural_frequency_rad_s=float(np.exp(value["log_omega"])),
-                damping_ratio=float(np.exp(value["log_zeta"])),
-                encoder_offset=value["offset"],
-                backlash_command=value["play"],
-                backlash_output=value["loose"],
-                friction=value["friction"],
-                sag_form=point.forms[index],
-                sag_terms=tuple(value[name] for name in SAG),
-                compliance=value["bend"],
-            )
-        )
-    return RobotModel(tuple(joints), point.tau_s)
-
-
 def _solve(normal: Array, slope: Array, damping: float) -> Array:
     diagonal = np.diag(normal).copy()
     diagonal = np.where(diagonal > 0, diagonal, 1.0)
@@ -376,5 +367,6 @@ def _bounded(problem: Problem, point: Point, free: Array) -> Point:
     widest = np.maximum(np.ptp(problem.batch.command, axis=(0, 1)), 10 * problem.scale)
     for name in POSITIVE:
         theta[:, INDEX[name]] = theta[:, INDEX[name]].clip(0.0, widest)
+    theta[:, INDEX["give"]] = theta[:, INDEX["give"]].clip(0.0, 1.0)
     theta = np.where(free, theta, point.theta)
     return replace(point, theta=theta, tau_s=float(np.clip(point.tau_s, 0.0, TAU_BOUND_S)))

@@ -36,6 +36,10 @@ class JointModel:
     """Coefficients of the form's terms, see `gravity.shapes` [rad]."""
     compliance: float = 0.0
     """Target shift against the load [rad or m per unit of load]."""
+    stop: float = 0.0
+    """Distance from zero at which a gripper's joint meets what it holds [rad or m]."""
+    give: float = 0.0
+    """Part of its way beyond the stop that the joint still goes."""
 
 
 @dataclass(frozen=True)
@@ -79,6 +83,8 @@ class RobotModel:
             play=column("backlash_command"),
             loose=column("backlash_output"),
             friction=column("friction"),
+            stop=column("stop"),
+            give=column("give"),
             tau_s=self.control_latency_s,
             push=push if push.any() else None,
         )

@@ -1,4 +1,4 @@
-"""Fits to other choices of the same trials by one Newton step: cross-validation, bootstrap.
+"""Fits to other choices of the same trials by one Newton step: cross-validation, intervals.
 
 At the end of a fit the trials' gradients cancel. Reweighting the trials moves the optimum by the reweighted
 curvature's inverse times the reweighted gradient, to first order.
@@ -7,10 +7,10 @@ curvature's inverse times the reweighted gradient, to first order.
 from dataclasses import dataclass, replace
 
 import numpy as np
+from scipy.stats import t as student_t
 
 from lerobot_vtrefine.diagnose.robot.fitting import (
     INDEX,
-    PARAMETERS,
     POSITIVE,
     TAU_BOUND_S,
     Fit,
@@ -23,7 +23,9 @@ from lerobot_vtrefine.diagnose.robot.fitting import (
 Array = np.ndarray
 
 FOLDS = 5
-BOOTSTRAP = 1000
+MIN_CONDITIONS = 4
+"""With fewer conditions than this, trials are left out one by one."""
+_MIN_FREEDOM = 2.0
 _RIDGE = 1e-7
 
 
@@ -130,19 +132,34 @@ def cross_validated(
     return mse
 
 
-def bootstrap(problem: Problem, fit: Fit, seed: int) -> tuple[Array, Array]:
-    """Parameters (B, J, P) and delays (B,) under trials drawn with replacement."""
+def leave_out(problem: Problem, fit: Fit) -> tuple[Array, Array]:
+    """Parameters (G, J, P) and delays (G,) without each condition; without each trial where conditions are
+    few.
+
+    Trials of one condition share what the model gets wrong about it, so the condition is what varies.
+    """
+    names = problem.batch.conditions
+    units = sorted(set(names)) if len(set(names)) >= MIN_CONDITIONS else list(range(len(names)))
+    of_trial = names if isinstance(units[0], str) else range(len(names))
     curvature = Curvature.at(problem, fit)
-    rng = np.random.default_rng(seed)
-    trials = problem.batch.trials
-    theta = np.empty((BOOTSTRAP, *fit.point.theta.shape))
-    tau = np.empty(BOOTSTRAP)
-    for draw in range(BOOTSTRAP):
-        weights = np.bincount(rng.integers(0, trials, trials), minlength=trials).astype(float)
-        point = curvature.moved(weights)
-        theta[draw], tau[draw] = point.theta, point.tau_s
-    assert theta.shape[2] == len(PARAMETERS)
-    return theta, tau
+    points = [curvature.moved(np.array([float(own != unit) for own in of_trial])) for unit in units]
+    return np.stack([point.theta for point in points]), np.array([point.tau_s for point in points])
+
+
+def jackknife(without: Array, value: float) -> tuple[float, float]:
+    """95 % interval of a value by what it becomes without each unit (G,).
+
+    Student's factor has the degrees of freedom that the contributions show: one unit that carries everything
+    leaves two (Bell & McCaffrey 2002).
+    """
+    moved = np.asarray(without) - np.mean(without)
+    count, power = len(moved), moved**2
+    total = float(power.sum())
+    if count < 2 or not total > 0:
+        return value, value
+    freedom = float(np.clip(3.0 * total**2 / (power**2).sum() - 1.0, _MIN_FREEDOM, count - 1))
+    half = np.sqrt((count - 1) / count * total) * float(student_t.ppf(0.975, freedom))
+    return float(value - half), float(value + half)
 
 
 def _solve(normal: Array, slope: Array) -> Array:

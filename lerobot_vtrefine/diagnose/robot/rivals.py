@@ -6,11 +6,11 @@ import numpy as np
 
 from lerobot_vtrefine.diagnose.robot import flips
 from lerobot_vtrefine.diagnose.robot.candidates import (
-    CANDIDATES,
     DECOY,
     FRICTION,
     LATENCY,
     Candidate,
+    candidates_for,
     delay_starts,
 )
 from lerobot_vtrefine.diagnose.robot.fitting import INDEX, Fit, Problem, fit, refit
@@ -109,7 +109,7 @@ def _alternatives(selection: Selection, cause: str, joints: Array) -> dict[str, 
     """Other names that are not in use on those joints, with their forms."""
     used = {candidate.cause for joint in joints for candidate in selection.chosen.get(int(joint), ())}
     out: dict[str, list[Candidate | None]] = {}
-    for candidate in CANDIDATES:
+    for candidate in candidates_for(selection.problem):
         if candidate.cause in (cause, DECOY) or candidate.cause in used:
             continue
         if np.all(candidate.applicable(selection.problem)[joints]):

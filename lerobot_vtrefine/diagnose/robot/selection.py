@@ -7,11 +7,11 @@ import numpy as np
 
 from lerobot_vtrefine.diagnose.robot import flips
 from lerobot_vtrefine.diagnose.robot.candidates import (
-    CANDIDATES,
     DECOY,
     FRICTION,
     LATENCY,
     Candidate,
+    candidates_for,
     delay_starts,
     resolution,
 )
@@ -20,7 +20,6 @@ from lerobot_vtrefine.diagnose.robot.fitting import (
     SAG,
     Fit,
     Problem,
-    first_point,
     fit,
     refit,
     servo_only,
@@ -35,6 +34,8 @@ LEAST_GAIN = 0.01
 """Smallest part of a joint's squared error that is worth a name."""
 LEAST_EFFECT_RAD, LEAST_EFFECT_M = 1e-4, 1e-5
 """Smallest change of the prediction (root mean square) that is worth a name."""
+LEAST_UNKNOWN = 0.02
+"""Smallest part of the baseline's squared error for which something without a name is worth an alarm."""
 MAX_ROUNDS = 4
 _EXTRAPOLATION = (4.0, 8.0)
 """Largest size of a cause over the largest error seen: of several that may cancel, and of one alone."""
@@ -76,7 +77,7 @@ class Selector:
         self.folds = folds_of(problem.batch.conditions, seed)
         progress("robot: fitting every joint's servo")
         free = servo_only(problem)
-        self.baseline = fit(problem, first_point(problem), free)
+        self.baseline = fit(problem, problem.start(), free)
         self.now = self.baseline
         self.held_out = cross_validated(problem, self.now, self.folds)
         self.baseline_held_out = self.held_out
@@ -89,6 +90,10 @@ class Selector:
         self.least_effect = np.maximum(
             np.where(sliding, LEAST_EFFECT_M, LEAST_EFFECT_RAD), 0.25 * resolution(problem)
         )
+        own = np.maximum(
+            problem.misfit * np.sqrt(self.baseline.total), np.where(sliding, 0.1, 1) * problem.floor
+        )
+        self.least_effect = np.maximum(self.least_effect, own)
 
     def run(self) -> Selection:
         """Forward rounds, then backward."""
@@ -117,7 +122,7 @@ class Selector:
     def try_all(self, joints: Array) -> tuple[Tried, ...]:
         """Every candidate on top of what is accepted, on some joints, with family-wise p."""
         tried: list[Tried] = []
-        for candidate in CANDIDATES:
+        for candidate in candidates_for(self.problem):
             allowed = joints
             if candidate.cause == FRICTION:
                 # Slow to simulate, and to first order the same as play: only where play helps at all.
@@ -168,6 +173,8 @@ class Selector:
         eligible = allowed & (gain > LEAST_GAIN) & (effect > self.least_effect)
         if candidate is not None:
             eligible &= self._plausible(best, candidate)
+        if candidate is not None and candidate.cause == DECOY:
+            eligible &= effect**2 > LEAST_UNKNOWN * self.baseline.total
         return Tried(candidate, best, held_out, improvement, gain, eligible)
 
     def _plausible(self, best: Fit, candidate: Candidate) -> Array:
@@ -302,7 +309,9 @@ class Selector:
     def loss_without_delay(self) -> float:
         """The same for the delay, averaged over joints."""
         _, held_out = self._without_delay()
-        return float((1 - self.held_out.mean(0) / held_out.mean(0).clip(1e-300)).mean())
+        # Ratios are averaged as logarithms: one joint whose cross-validation runs away decides nothing.
+        now, then = (np.log(errors.mean(0).clip(1e-300)) for errors in (self.held_out, held_out))
+        return float(1 - np.exp((now - then).mean()))
 
     def _without_delay(self) -> tuple[Fit, Array]:
         fitted = fit(self.problem, replace(self.now.point, tau_s=0.0), self.now.free, iterations=8)

@@ -44,6 +44,10 @@ class Columns:
     """Full width of the play between servo and encoder."""
     friction: Array
     """Dry friction, divided by the servo's stiffness."""
+    stop: Array | None = None
+    """Distance from zero at which the joint meets what its gripper holds; zero where it meets nothing."""
+    give: Array | None = None
+    """How far a stopped joint still follows its target, as a part of the way."""
     tau_s: float = 0.0
     """Every command acts this late."""
     push: Array | None = None
@@ -52,13 +56,16 @@ class Columns:
     def only(self, kind: Array) -> "Columns":
         """The servo's parameters of some columns."""
         names = ("joint", "omega", "zeta", "offset", "play", "loose", "friction")
-        return replace(self, **{name: getattr(self, name)[kind] for name in names}, push=None)
+        own = {name: getattr(self, name)[kind] for name in names}
+        return replace(self, **own, stop=None, give=None, push=None)
 
 
 def simulate(batch: Batch, columns: Columns) -> Array:
     """Encoder readings (N, T, C) that follow from the commands and the first position alone."""
     start = batch.first_position[:, columns.joint] - columns.offset
     target = _play(batch.command[:, :, columns.joint], columns.play, start, columns.push)
+    if columns.stop is not None and columns.give is not None and (columns.stop > 0).any():
+        target = blocked(target, columns.stop, columns.give)
     start = np.clip(target[0], start - columns.loose / 2, start + columns.loose / 2)
     dry = columns.friction > 0
     q = np.empty_like(target)
@@ -69,6 +76,14 @@ def simulate(batch: Batch, columns: Columns) -> Array:
         first = batch.first_position[:, columns.joint] - columns.offset
         q = _dragged(q, columns.loose, first)
     return q + columns.offset
+
+
+def blocked(target: Array, stop: Array, give: Array) -> Array:
+    """Targets (N, T, C) of joints that close towards zero and meet something at `stop` (C,)."""
+    side = np.sign(target.mean((0, 1)))
+    way = side * target
+    met = (way < stop) & (stop > 0)
+    return np.where(met, side * (stop + give * (way - stop)), target)
 
 
 def _play(command: Array, width: Array, start: Array, push: Array | None) -> Array:

@@ -33,13 +33,6 @@ ALPHA = 0.02
 LEAST_GAIN = 0.01
 FOLDS = 5
 CANDIDATES = {"camera_extrinsics": EXTRINSICS, "depth_scale": SCALE}
-NEVER = {
-    "object_mass": "a part of 60 g turns a shoulder by about 1 mrad, less than an encoder step; lift parts "
-    "of known mass, heavier than 0.5 kg, and record the servos' load",
-    "object_friction": "needs parts that slip in the hand while they are tracked, or a pad that feels shear",
-    "clearance": "needs the parts' poses at first contact and when seated; track the parts while inserting",
-}
-"""Names that joints, pads and depth images as recorded here cannot decide, and what could."""
 _NAMES = ("x_m", "y_m", "z_m", "rx_rad", "ry_rad", "rz_rad")
 _DRAWS = 1000
 _PARSIMONY = 0.02
@@ -226,9 +219,6 @@ class _Search:
             decision = "accepted" if name in self.found else "tie" if name == self.rival else "rejected"
             reason = f"agreement of the twin's depth with {len(self.episodes)} episodes' images"
             out.append(Evidence(name, alone, adjusted, self.gain((name,), ()), decision, reason))
-        out += [
-            Evidence(name, None, None, None, "not identifiable", reason) for name, reason in NEVER.items()
-        ]
         return tuple(out)
 
 

@@ -1,0 +1,120 @@
+"""A dataset's robot against the MuJoCo twin, then its parts and its camera, one after the other.
+
+Where a dataset notes the scene that it was thought to show, robot and parts are judged by replay through the
+twin; what the robot does beyond the twin is taken off before the parts are judged, and the parts' weight is
+known before the robot is. Other datasets have their joints judged by plain servos: no part and no clamp of
+their commands is known.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from lerobot_vtrefine.datasets.episodes import open_episodes
+from lerobot_vtrefine.diagnose.dataset.merge import beside
+from lerobot_vtrefine.diagnose.object.engine import (
+    ObjectDiagnosis,
+    assumed_masses,
+    diagnose_objects,
+    found_masses,
+    unknown_parts,
+)
+from lerobot_vtrefine.diagnose.object.episodes import (
+    AssumedScene,
+    HandledEpisode,
+    assumed_scene,
+    is_twins_robot,
+    lately,
+    read_episodes,
+)
+from lerobot_vtrefine.diagnose.object.payload import GRAVITY_M_S2, Arms, given, replay_loaded
+from lerobot_vtrefine.diagnose.recordings import RecordingSet
+from lerobot_vtrefine.diagnose.robot.dataset import episode_name
+from lerobot_vtrefine.diagnose.robot.engine import Progress, RobotDiagnosis, diagnose_robot
+from lerobot_vtrefine.diagnose.robot.on_twin import TwinTrial, beyond_twin, diagnose_on_twin
+from lerobot_vtrefine.diagnose.vision.engine import diagnose_vision
+from lerobot_vtrefine.diagnose.vision.frames import has_depth
+
+Array = np.ndarray
+
+BUMP_RAD = 5e-5
+"""The twin with and without contacts differ by so much only where a hand meets the table or the other one."""
+_RECOVERS_S = 0.6
+
+
+def diagnose_dataset(
+    recordings: RecordingSet, seed: int = 0, progress: Progress | None = None
+) -> RobotDiagnosis:
+    """Judge a dataset; `recordings` are its episodes after quality control.
+
+    Raises:
+        ValueError: commands that are not finite, or a damaged note of the assumed scene.
+    """
+    tell = progress or (lambda text, done: None)
+    scene = assumed_scene(open_episodes(recordings.path)) if is_twins_robot(recordings.joints) else None
+    if scene is None:
+        found, objects = diagnose_robot(recordings, seed, progress), unknown_parts()
+    else:
+        found, objects = _on_twin(recordings, scene, seed, progress)
+    found = beside(found, objects)
+    if not has_depth(recordings.path):
+        return found
+    tell("camera: comparing depth images", 0.9)
+    return beside(found, diagnose_vision(recordings.path, seed, progress))
+
+
+@dataclass(frozen=True)
+class _Session:
+    """What robot and parts are judged from."""
+
+    recordings: RecordingSet
+    arms: Arms
+    scene: AssumedScene
+    episodes: tuple[HandledEpisode, ...]
+
+    def twin(self, mass_kg: Array) -> dict[str, TwinTrial]:
+        """What the twin does in every episode with parts of those masses (2,)."""
+        weights = [episode.hanging * mass_kg * GRAVITY_M_S2 for episode in self.episodes]
+        touching, free = (
+            replay_loaded(self.arms, self.episodes, weights, contacts=contacts) for contacts in (True, False)
+        )
+        frames = max(1, round(_RECOVERS_S / self.arms.dt_s))
+        out = {}
+        for episode, path, other in zip(self.episodes, touching, free, strict=True):
+            bumped = lately((np.abs(path - other).max(1) > BUMP_RAD)[:, None], frames)[:, 0]
+            usable = (episode.free | episode.carried).all(1) & ~bumped
+            out[episode_name(episode.index)] = TwinTrial(given(self.arms, episode), path, usable)
+        return out
+
+
+def _on_twin(
+    recordings: RecordingSet, scene: AssumedScene, seed: int, progress: Progress | None
+) -> tuple[RobotDiagnosis, ObjectDiagnosis]:
+    kept = {trial.file for trial in recordings.trials}
+    episodes = read_episodes(recordings.path, scene)
+    episodes = tuple(item for item in episodes if episode_name(item.index) in kept)
+    arms = Arms(scene.scene, scene.rules, scene.rules.control_dt_s, "linear")
+    session = _Session(recordings, arms, scene, episodes)
+    mass = found_masses(arms, scene, episodes, seed)
+    found = _robot(session, mass, seed, progress)
+    objects = diagnose_objects(arms, scene, _corrected(session, found, mass), seed)
+    if np.abs(objects.mass_kg - mass).max() > 0.1 * assumed_masses(scene).min():
+        found = _robot(session, objects.mass_kg, seed, progress)
+    return found, objects
+
+
+def _robot(session: _Session, mass_kg: Array, seed: int, progress: Progress | None) -> RobotDiagnosis:
+    twin = session.twin(mass_kg)
+    arms = session.arms
+    return diagnose_on_twin(session.recordings, twin, arms.config, arms.hold, seed, progress)
+
+
+def _corrected(session: _Session, found: RobotDiagnosis, mass_kg: Array) -> Sequence[HandledEpisode]:
+    """Episodes as the twin's own encoders would have read them, had the robot none of what was found."""
+    twin, arms = session.twin(mass_kg), session.arms
+    more = beyond_twin(session.recordings, twin, arms.config, arms.hold, found.extended_model)
+    return [
+        replace(episode, position=episode.position - more[episode_name(episode.index)])
+        for episode in session.episodes
+    ]
