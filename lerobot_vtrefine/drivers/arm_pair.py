@@ -8,7 +8,7 @@ import numpy as np
 from lerobot.motors import MotorCalibration
 
 from lerobot_vtrefine.drivers.arm_models import ArmModel
-from lerobot_vtrefine.drivers.dynamixel_arm import RETRIES, DynamixelArm, Floats
+from lerobot_vtrefine.drivers.dynamixel_arm import DynamixelArm, Floats
 from lerobot_vtrefine.drivers.ports import PortError
 
 logger = logging.getLogger(__name__)
@@ -75,7 +75,6 @@ class ArmPair:
     def write_calibration(self) -> None:
         """Writes the loaded calibration to the motors, with torque off."""
         for arm in self.arms.values():
-            arm.bus.disable_torque(num_retry=RETRIES)
             arm.write_calibration()
 
     def setup_motors(self, ask: Ask) -> None:

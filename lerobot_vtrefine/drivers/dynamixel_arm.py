@@ -201,7 +201,8 @@ class DynamixelArm:
         """Whether a calibration is loaded and the motors hold its homing offsets."""
         if set(self.calibration) != set(self._names):
             return False
-        offsets = self.bus.sync_read("Homing_Offset", self._names, normalize=False, num_retry=RETRIES)
+        with self._talking():
+            offsets = self.bus.sync_read("Homing_Offset", self._names, normalize=False, num_retry=RETRIES)
         return all(offsets[name] == self.calibration[name].homing_offset for name in self._names)
 
     def calibrate(
@@ -215,7 +216,8 @@ class DynamixelArm:
             lower: Lower joint limits (6,) [rad]; `upper` the upper ones.
             upper: See lower.
         """
-        self.bus.disable_torque(num_retry=RETRIES)
+        with self._talking():
+            self.bus.disable_torque(num_retry=RETRIES)
         joints = list(self.model.joints)
         answer = ask(
             f"{self.name} arm: hold it in its zero pose (upper arm upright, forearm level, gripper straight) "
@@ -242,15 +244,18 @@ class DynamixelArm:
         return self.calibration
 
     def write_calibration(self) -> None:
-        """Writes the loaded calibration's homing offsets to the motors; torque must be off."""
+        """Switches torque off, and writes the loaded calibration's homing offsets to the motors."""
+        with self._talking():
+            self.bus.disable_torque(num_retry=RETRIES)
         self._write_offsets({name: entry.homing_offset for name, entry in self.calibration.items()})
 
     def _write_offsets(self, offsets: dict[str, int]) -> None:
         followed = {name: motor for name, _, _, motor in self.model.shadows}
-        for name, offset in offsets.items():
-            self.bus.write("Homing_Offset", name, offset, normalize=False, num_retry=RETRIES)
-        for shadow, motor in followed.items():
-            self.bus.write("Homing_Offset", shadow, offsets[motor], normalize=False, num_retry=RETRIES)
+        with self._talking():
+            for name, offset in offsets.items():
+                self.bus.write("Homing_Offset", name, offset, normalize=False, num_retry=RETRIES)
+            for shadow, motor in followed.items():
+                self.bus.write("Homing_Offset", shadow, offsets[motor], normalize=False, num_retry=RETRIES)
 
     # --- set-up -------------------------------------------------------------------------------------
 

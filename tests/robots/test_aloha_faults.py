@@ -54,6 +54,27 @@ def test_a_motor_that_shut_down_is_named(rig: Rig) -> None:
     assert "gripper (id 9) report a hardware error" in message
 
 
+def test_errors_while_calibrating_name_the_arm(rig: Rig, monkeypatch: pytest.MonkeyPatch) -> None:
+    """An overload while the gripper is closed by hand, and a cable that comes off."""
+    gripper = rig.motor("follower", "left", 9)
+
+    def operator(text: str) -> str:
+        if "open the gripper" in text:
+            gripper.shaft, gripper.alert = 2500.0, True
+        return ""
+
+    monkeypatch.setattr("builtins.input", operator)
+    assert "left arm" in connect_error(rig, id="fresh")
+    gripper.alert = False
+
+    def cable_off(text: str) -> str:
+        rig.buses["follower_left"].motors.clear()
+        return ""
+
+    monkeypatch.setattr("builtins.input", cable_off)
+    assert "left arm" in connect_error(rig, id="fresh")
+
+
 def test_a_motor_that_shut_down_or_is_lost_keeps_no_other_driven(
     follower: AlohaTactileFollower, rig: Rig, caplog: pytest.LogCaptureFixture
 ) -> None:
