@@ -41,7 +41,8 @@ def scene(layout: PadLayout, shape: list[Primitive]) -> tuple[tuple[torch.Tensor
     body = np.tile([0.0, 0.0, 0.0115], (ENVS, 1, 1))
     speeds = [rng.normal(0, 0.02, (ENVS, count, 6)) for count in (PADS, 1)]
     arrays = [place, eye, speeds[0], body, turn, speeds[1]]
-    poses = tuple(torch.tensor(np.array(array), dtype=torch.float32) for array in arrays)
+    # Contiguous, as copies that the solver would have to make could not be captured in a graph.
+    poses = tuple(torch.tensor(np.ascontiguousarray(array), dtype=torch.float32) for array in arrays)
     heights, _ = ContactQuery(layout, [BodyGeometry(shape)])("column", *poses)
     depth = torch.tensor(rng.uniform(-1e-4, 6e-4, (ENVS, PADS)), dtype=torch.float32)
     highest = heights.flatten(2).max(2).values
