@@ -3,6 +3,8 @@
 Replicates of one motion share what the model gets wrong about that motion, so the motion, not the recording,
 is what varies independently. The spread of the estimates without each of them covers noise, repeatability and
 misfit alike (Bell & McCaffrey 2002); Student's factor has the degrees of freedom that the contributions show.
+With a dozen motions that spread is itself uncertain: an interval is never narrower than what noise and
+repeatability alone, as fitted, leave open.
 """
 
 from collections.abc import Callable, Mapping, Sequence
@@ -28,24 +30,38 @@ DIGITS = 6
 
 @dataclass(frozen=True)
 class LeftOut:
-    """A fit's coordinates (p,), and what they become without each motion (G, p)."""
+    """A fit's coordinates (p,), and what they become without each motion (G, p).
+
+    `spread` (q, p) are independent deviations that noise and repeatability make, one each; `recordings` is
+    the number that these were fitted to.
+    """
 
     values: np.ndarray
     without: np.ndarray
+    spread: np.ndarray
+    recordings: int
 
     def interval(self, of: Callable[[np.ndarray], float]) -> tuple[float, float]:
         """95 % interval of a function of the coordinates."""
         best = of(self.values)
+        half = max(self._by_motions(of, best), self._by_noise(of, best))
+        return float(best - half), float(best + half)
+
+    def _by_noise(self, of: Callable[[np.ndarray], float], best: float) -> float:
+        moved = np.array([of(self.values + step) for step in self.spread]) - best
+        error = float(np.sqrt((moved**2).sum()))
+        return error * float(stats.t.ppf(0.975, max(self.recordings - 1, 1))) if np.isfinite(error) else 0.0
+
+    def _by_motions(self, of: Callable[[np.ndarray], float], best: float) -> float:
         moved = np.array([of(values) for values in self.without]) - best
         count, power = len(moved), moved**2
         total = float(power.sum())
         if count < 2 or not np.isfinite(total) or total <= 0:
-            return best, best
+            return 0.0
         error = float(np.sqrt((count - 1) / count * total))
         # A normal deviate's fourth moment is 3: one motion that carries everything leaves 2 degrees.
         freedom = float(np.clip(3.0 * total**2 / (power**2).sum() - 1.0, MIN_FREEDOM, count - 1))
-        half = error * float(stats.t.ppf(0.975, freedom))
-        return float(best - half), float(best + half)
+        return error * float(stats.t.ppf(0.975, freedom))
 
 
 def motions_of(presses: PressSet) -> list[list[int]]:
@@ -68,7 +84,20 @@ def leave_out(fitted: Fit, presses: PressSet, held: Sequence[int] = ()) -> LeftO
         free_step(fitted.model, total - fitted.grams[motion].sum(axis=0), held) - everyone
         for motion in motions_of(presses)
     ]
-    return LeftOut(fitted.model.values, fitted.model.values + np.array(steps))
+    spread = deviations(fitted, held)
+    return LeftOut(fitted.model.values, fitted.model.values + np.array(steps), spread, len(fitted.grams))
+
+
+def deviations(fitted: Fit, held: Sequence[int] = ()) -> np.ndarray:
+    """Principal deviations (q, p) of the coordinates from the inverse of their curvature."""
+    free = np.setdiff1d(fitted.model.free, np.array(held, dtype=int))
+    curvature = fitted.grams.sum(axis=0)[:-1, :-1]
+    scale = np.sqrt(np.diag(curvature).clip(min=1e-30))
+    power, along = np.linalg.eigh(curvature / np.outer(scale, scale))
+    known = power > 1e-9
+    spread = np.zeros((int(known.sum()), len(fitted.model.values)))
+    spread[:, free] = (along[:, known] / np.sqrt(power[known]) / scale[:, None]).T
+    return spread
 
 
 def interval(values: np.ndarray) -> tuple[float, float]:

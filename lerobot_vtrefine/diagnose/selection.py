@@ -241,8 +241,8 @@ def forward(search: Search, fitted: Fit, tell: Callable[[str, float], None]) -> 
 
 
 def polish(search: Search, fitted: Fit) -> Fit:
-    """The same causes in forms as plain as they may be, at their best parameters."""
-    return untwine(search, simplify(search, fitted))
+    """The same causes in forms as plain as they may be, at their best parameters under settled weights."""
+    return reweigh(search, untwine(search, reweigh(search, simplify(search, fitted))))
 
 
 def untwine(search: Search, fitted: Fit) -> Fit:
