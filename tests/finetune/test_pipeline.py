@@ -104,12 +104,14 @@ def test_records_and_checkpoint(finetune, tmp_path):
     assert (path / "policy_postprocessor.json").is_file()
 
 
-def test_reloaded_checkpoint_deploys_what_was_evaluated(finetune, tmp_path):
+@pytest.mark.parametrize("eta", [0.0, 1.0])
+def test_reloaded_checkpoint_deploys_what_was_evaluated(finetune, tmp_path, eta):
     """The last evaluation of the run is repeated by the policy's own inference from the files."""
     output = tmp_path / "run"
-    assert finetune(output, "--dppo.encoder=trained", iterations=2) == 0
+    assert finetune(output, "--dppo.encoder=trained", f"--dppo.eta={eta}", iterations=2) == 0
     path = output / "checkpoints" / "last" / "pretrained_model"
     policy = VtDp3Policy.from_pretrained(path, config=PreTrainedConfig.from_pretrained(path)).eval()
+    assert policy.config.ft_eta == eta
     env, first = ReachEnv(6), EVALUATION_SEEDS
     success = []
     torch.manual_seed(first)
