@@ -218,6 +218,8 @@ def test_the_same_episode_on_a_gpu(pair, graph):
     assert (np.abs(ours["depth_mm"].astype(int) - truth["depth_mm"]) > 1).mean() < 1e-3
     loads = [sim._episode.pad_load for sim in (gpu, single)]
     np.testing.assert_allclose(loads[0][..., :3], loads[1][..., :3], rtol=2e-3, atol=2e-5)
+    gpu.step(gpu.command_targets() + 0.01)  # images were read before: these are begun with the step
+    np.testing.assert_array_equal(gpu.depth_mm(), gpu.depth_mm())
 
 
 def test_a_gpu_that_is_not_there_is_said_in_one_line(pair):
