@@ -92,7 +92,7 @@ def run_stages(stages: Sequence[Stage], bench: Bench, cache: "Prefix | None" = N
 
 def _begin(stages: Sequence[Stage], sheet: Sheet) -> Field:
     if sheet.loaded or not any(stage.domain == "depth" for stage in stages):
-        return Field(sheet.drive[:, sheet.touched], sheet.touched, sheet.rate[:, sheet.touched])
+        return Field(*sheet.pressed)
     return Field(sheet.drive, np.arange(len(sheet.taxels)), sheet.rate)
 
 

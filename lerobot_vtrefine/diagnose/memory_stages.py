@@ -90,9 +90,8 @@ def play(x: np.ndarray, half_width: float | np.ndarray) -> np.ndarray:
     out = np.where(touched, np.maximum(x - half_width, 0.0), 0.0)
     state = np.zeros(x.shape[1])
     for high, line in zip(upper, out, strict=True):
-        np.minimum(state, high, out=state)
-        np.maximum(state, line, out=line)
-        state = line.copy()
+        np.maximum(np.minimum(state, high, out=high), line, out=line)
+        state = line
     return out
 
 

@@ -59,6 +59,11 @@ class Sheet:
         return np.flatnonzero((self.drive > 0).any(axis=0))
 
     @cached_property
+    def pressed(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Drive of those columns, their numbers, and the drive's rate."""
+        return self.drive[:, self.touched], self.touched, self.rate[:, self.touched]
+
+    @cached_property
     def recorded(self) -> "Sheet":
         """The same columns at the recorded frames only, for what comes after the last memory."""
         if all(len(time_s) == len(frames) for time_s, frames in zip(self.times_s, self.frames, strict=True)):
