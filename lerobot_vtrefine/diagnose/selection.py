@@ -282,7 +282,9 @@ def rank(search: Search, fitted: Fit, candidates: Sequence[Screened], probes: Se
     for item in candidates:
         name = item.probe.name
         plain[name] = add(search, fitted, name, probes)
-        if name == "dead_taxels" and plain[name][1].gain_over(base) > needed:
+        score = plain[name][1]
+        sure = score.gain_over(base) > needed and score.better_by(base).sum() > 0
+        if name == "dead_taxels" and sure:
             # Taxels without an answer disturb whatever else is fitted.
             plain = {name: plain[name]}
             break
