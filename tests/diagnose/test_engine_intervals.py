@@ -1,0 +1,101 @@
+"""Intervals, noise with memory and the instants between frames, against tiny independent references."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from scipy import stats
+
+from lerobot_vtrefine.diagnose.candidates.sample_and_hold import undecided
+from lerobot_vtrefine.diagnose.intervals import LeftOut
+from lerobot_vtrefine.diagnose.presses import prepare
+from lerobot_vtrefine.diagnose.recordings import RecordingSet, Trial
+from lerobot_vtrefine.diagnose.refinement import instants_of, motion
+from lerobot_vtrefine.diagnose.whitening import Whitener
+from lerobot_vtrefine.tactile.layout import PadLayout
+
+
+def press(depth: np.ndarray, time_s: np.ndarray, raw: np.ndarray | None = None) -> Trial:
+    zero = np.zeros(len(depth))
+    readings = np.zeros((len(depth), 9)) if raw is None else raw
+    ball = {"shape": "sphere", "radius_m": 0.01}
+    return Trial(
+        "t.parquet", "c", 0, 0, 0.0, ball, time_s, zero, zero, depth, zero, zero, None, None, readings
+    )
+
+
+@pytest.mark.parametrize(("rho", "slow"), [(0.4, 1.0), (0.9, 0.5), (0.95, 0.2), (0.0, 1.0), (0.7, 0.0)])
+def test_whitened_noise_is_white_and_comes_back(rho: float, slow: float) -> None:
+    rng = np.random.default_rng(0)
+    frames = 4000
+    wander = np.zeros((frames, 4))
+    wander[0] = rng.standard_normal(4)
+    for t in range(1, frames):
+        wander[t] = rho * wander[t - 1] + np.sqrt(1 - rho**2) * rng.standard_normal(4)
+    noise = np.sqrt(slow) * wander + np.sqrt(1 - slow) * rng.standard_normal((frames, 4))
+    filter_ = Whitener(rho, slow)
+    white = filter_.white(noise)
+    assert np.var(white) == pytest.approx(1.0, abs=0.05)
+    for lag in (1, 2, 5, 20):
+        assert abs(float((white[lag:] * white[:-lag]).mean())) < 0.04
+    assert np.allclose(filter_.coloured(white), noise, atol=1e-9)
+
+
+def test_leaving_motions_out_gives_students_interval_of_a_mean() -> None:
+    values = np.random.default_rng(1).normal(3.0, 2.0, 12)
+    mean = values.mean()
+    without = np.array([[np.delete(values, k).mean()] for k in range(12)])
+    low, high = LeftOut(np.array([mean]), without, np.zeros((0, 1)), 12).interval(lambda v: float(v[0]))
+    error = values.std(ddof=1) / np.sqrt(12)
+    assert low + high == pytest.approx(2 * mean)
+    assert stats.t.ppf(0.975, 11) * error <= high - mean < 1.3 * stats.t.ppf(0.975, 11) * error
+
+
+def test_an_interval_is_not_narrower_than_noise_leaves_open() -> None:
+    alike = LeftOut(np.array([1.0]), np.ones((8, 1)), np.array([[0.1]]), 8)
+    low, high = alike.interval(lambda v: float(v[0]))
+    assert high - low == pytest.approx(0.2 * stats.t.ppf(0.975, 7))
+
+
+def test_one_motion_that_carries_everything_widens_the_interval() -> None:
+    even = LeftOut(np.zeros(1), np.full((10, 1), 0.1), np.zeros((0, 1)), 10)
+    carried = np.zeros((10, 1))
+    carried[0] = 0.1 * np.sqrt(10)
+    one = LeftOut(np.zeros(1), carried, np.zeros((0, 1)), 10)
+    widths = [np.ptp(case.interval(lambda v: float(v[0]))) for case in (even, one)]
+    assert widths[1] > 1.5 * widths[0]
+
+
+def test_instants_are_added_at_touches_and_corners_only() -> None:
+    time_s = np.arange(0, 4, 0.05)
+    depth = np.interp(time_s, [0, 1.02, 1.52, 3.0, 4.0], [-3e-4, -3e-4, 7e-4, 7e-4, 7e-4])
+    times, frames = instants_of(press(depth, time_s), PadLayout(3, 3, 0.002), "bent")
+    assert np.allclose(times[frames], time_s)
+    added = np.diff(frames) - 1
+    assert added[(time_s[:-1] > 1.65)].max() == 0  # held
+    assert added[time_s[:-1] < 0.9].max() == 0  # in the air
+    touch = int(np.searchsorted(time_s, 1.02 + 0.15)) - 1
+    assert added[touch] == 9
+
+
+def test_rates_come_from_the_body_over_the_taxel() -> None:
+    time_s = np.arange(0, 1, 0.05)
+    trial = press(1e-3 * (time_s - 0.5), time_s)
+    heights, rate = motion(trial, PadLayout(3, 3, 0.002), np.linspace(0.1, 0.8, 50))
+    assert heights.shape == rate.shape == (50, 3, 3)
+    assert np.allclose(rate[:, 1, 1], 1e-3)
+
+
+def test_periods_that_repeat_the_same_frames_are_the_interval() -> None:
+    rng = np.random.default_rng(2)
+    time_s = np.arange(200) / 20.0
+    depth = 5e-4 * np.abs(np.sin(0.7 * time_s)) + 1e-5
+    slot = np.floor(time_s / 0.123 + 1e-9)
+    fresh = 20.0 + rng.normal(0, 5.0, (200, 9))
+    first = np.concatenate([[True], slot[1:] != slot[:-1]])
+    raw = fresh[np.maximum.accumulate(np.where(first, np.arange(200), 0))]
+    trials = [press(depth, time_s, raw)]
+    pad = RecordingSet(Path(), "pad", 3, 3, 0.002, "adc_counts", 255.0, (), tuple(trials))
+    low, high = undecided(np.array([0.1231]), prepare(pad, trials, [0]))["period_s"]
+    assert low <= 0.123 <= high
+    assert 0 < high - low < 0.003
