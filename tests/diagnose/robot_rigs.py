@@ -48,6 +48,8 @@ class Rig:
     """link: cosine of the summed pitch; own: cosine of the joint's own angle; stretch: two links."""
     compliance: dict = field(default_factory=dict)
     """Joint -> m per N; loads come with it."""
+    holds: dict = field(default_factory=dict)
+    """Gripper -> (opening at which it meets something hard, part of its way that it still goes)."""
     stiffness: dict = field(default_factory=dict)
     """Joint -> Nm/rad: makes a load column of the servo's torque."""
     unknown: dict = field(default_factory=dict)
@@ -118,6 +120,10 @@ class Robot:
 
     def target_of(self, slack, bend_load, session_s, now, v, u):
         target = slack + self.sag_of(slack) - bend_load
+        for name, (opening, give) in self.rig.holds.items():
+            k = self.rig.joints.index(name)
+            beyond = np.minimum(target[..., k] - opening, 0.0)
+            target[..., k] = np.maximum(target[..., k], opening) + give * beyond
         for kind, size in self.rig.unknown.items():
             if kind == "gain_drift":
                 target = target + size * session_s / 600 * slack

@@ -64,6 +64,16 @@ def check_prediction(found, recordings) -> None:
     assert np.sqrt(np.mean(errors)) == pytest.approx(found.heldout.extended, rel=1e-6)
 
 
+def test_gripper_that_meets_something_is_named_without_loads(tmp_path) -> None:
+    found, _ = diagnose(tmp_path, holds={"gripper": (0.02, 0.1)}, joints=("elbow", "gripper"))
+    assert found.status == "explained", (found.status, found.ambiguous_with, found.unknown)
+    assert [cause.name for cause in found.causes] == ["gripper_compliance"]
+    params = found.causes[0].params
+    assert params["gripper_stop_m"].value == pytest.approx(0.02, abs=5e-4)
+    assert params["gripper_give"].value == pytest.approx(0.1, abs=0.03)
+    assert found.joint_gains["gripper"] > 0.9
+
+
 def test_nothing_is_found_where_nothing_is(tmp_path) -> None:
     found, _ = diagnose(tmp_path)
     assert found.status == "adequate"
@@ -111,9 +121,11 @@ def test_a_blocked_gripper_is_not_given_a_wrong_name(tmp_path) -> None:
         position[:, 1] = np.maximum(position[:, 1], 0.02)
         trials.append(dataclasses.replace(trial, position=position))
     found = diagnose_robot(dataclasses.replace(recordings, trials=tuple(trials)))
-    assert found.status == "unexplained"
-    assert "closes on something" in found.unknown.clue
-    assert "load" in found.next_experiment["text"]
+    assert found.status == "explained"
+    assert [cause.name for cause in found.causes] == ["gripper_compliance"]
+    assert found.causes[0].params["gripper_stop_m"].value == pytest.approx(0.02, abs=5e-4)
+    reason = next(item.reason for item in found.evidence if item.name == "gripper_compliance")
+    assert "load" in reason
 
 
 def test_few_trials_and_one_joint(tmp_path) -> None:

@@ -41,6 +41,8 @@ Array = np.ndarray
 BUMP_RAD = 5e-5
 """The twin with and without contacts differ by so much only where a hand meets the table or the other one."""
 _RECOVERS_S = 0.6
+WEIGHT_KNOWN = 0.05
+"""Part of what the carried weight does to the joints that may be wrong without the robot being so."""
 
 
 def diagnose_dataset(
@@ -105,9 +107,13 @@ def _on_twin(
 
 
 def _robot(session: _Session, mass_kg: Array, seed: int, progress: Progress | None) -> RobotDiagnosis:
-    twin = session.twin(mass_kg)
+    twin, empty = session.twin(mass_kg), session.twin(np.zeros(2))
+    bent = [np.abs(one.path - empty[name].path)[one.usable] for name, one in twin.items()]
+    floor = WEIGHT_KNOWN * max(float(np.max(item, initial=0.0)) for item in bent)
     arms = session.arms
-    return diagnose_on_twin(session.recordings, twin, arms.config, arms.hold, seed, progress)
+    return diagnose_on_twin(
+        session.recordings, twin, arms.config, arms.hold, seed=seed, floor=floor, progress=progress
+    )
 
 
 def _corrected(session: _Session, found: RobotDiagnosis, mass_kg: Array) -> Sequence[HandledEpisode]:

@@ -25,10 +25,10 @@ Array = np.ndarray
 
 ALPHA = 0.02
 LEAST_GAIN = 0.01
-MASS_FORM = (0.15, 0.004)
-"""What the method errs by on the twin's own recordings: part of the deviation, and at least so much [kg]."""
-FRICTION_FORM = (0.08, 0.02)
-CLEARANCE_FORM = (0.05, 6e-5)
+MASS_FORM = (0.06, 0.004)
+"""What the method errs by on the twin's own recordings: part of the value, and at least so much [kg]."""
+FRICTION_FORM = (0.1, 0.02)
+CLEARANCE_FORM = (0.03, 6e-5)
 _SURE = 4.0
 UNKNOWN_PARTS = (
     "the parts are not known: datasets of vtrefine-record-demos note the assumed scene, others hold no part "
@@ -63,8 +63,8 @@ class Estimate:
     @property
     def slack(self) -> float:
         """What the method itself may err by."""
-        assert self.line is not None
-        return max(self.form[0] * abs(self.line.value), self.form[1])
+        value = self.assumed + (0.0 if self.line is None else self.line.value)
+        return max(self.form[0] * abs(value), self.form[1])
 
     @property
     def believed(self) -> float:
@@ -161,7 +161,7 @@ def _summary(estimates: list[Estimate], mass: Array) -> ObjectDiagnosis:
         own = [item for item in estimates if item.cause == cause]
         found = [item for item in own if item.found and item.line]
         evidence.append(_merged([item.evidence for item in own]))
-        sizes = [max(_SURE * item.line.error, 2 * item.form[1]) for item in own if item.line is not None]
+        sizes = [max(_SURE * item.line.error, 2 * item.slack) for item in own if item.line is not None]
         if sizes:
             detectable[cause] = max(sizes)
         if found:

@@ -92,7 +92,8 @@ def _matters(selection: Selection, joint: int, share: float) -> bool:
 
 
 def _least(selection: Selection, joint: int) -> float:
-    return LEAST_EFFECT_RAD * (0.1 if is_gripper(selection.problem.names[joint]) else 1.0)
+    size = max(LEAST_EFFECT_RAD, selection.problem.floor)
+    return size * (0.1 if is_gripper(selection.problem.names[joint]) else 1.0)
 
 
 def _repeating(selection: Selection, seed: int) -> list[Alarm]:

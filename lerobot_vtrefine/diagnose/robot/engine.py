@@ -282,7 +282,7 @@ def _evidence(selection: Selection, rivals: tuple[Rival, ...], alarmed: bool) ->
         p_value, adjusted, gain, where = _strongest(selection, tried)
         if name in accepted:
             decision = "symptom" if alarmed else "accepted"
-            reason = f"on {_joined(selection, accepted[name])}"
+            reason = f"on {_joined(selection, accepted[name])}{_caveat(selection, name, accepted[name])}"
         elif name in ties:
             decision = "tie"
             reason = f"explains {ties[name].cause} on {_joined(selection, ties[name].joints)} as well"
@@ -295,6 +295,16 @@ def _evidence(selection: Selection, rivals: tuple[Rival, ...], alarmed: bool) ->
                 reason = f"significant on {where} by itself, but another cause explains it better"
         out.append(Evidence(label, p_value, adjusted, gain, decision, reason))
     return tuple(out)
+
+
+def _caveat(selection: Selection, name: str, joints: tuple[int, ...]) -> str:
+    """What an accepted cause leaves open."""
+    if name != "gripper_compliance" or selection.fit.free[list(joints), INDEX["bend"]].any():
+        return ""
+    return (
+        ": it stops at one opening whatever is commanded; whether a part or the gripper's own end stops it, "
+        "and how hard it presses, only the column load or pads can tell"
+    )
 
 
 def _strongest(selection: Selection, tried: list[Tried]) -> tuple[float, float, float, str]:

@@ -46,9 +46,13 @@ def diagnose_on_twin(
     config: SceneConfig,
     hold: str,
     seed: int = 0,
+    floor: float = 0.0,
     progress: Progress | None = None,
 ) -> RobotDiagnosis:
     """As `diagnose_robot`, against what the twin did (by trial file).
+
+    Args:
+        floor: what the twin itself may be wrong by [rad]; smaller effects get no name.
 
     Raises:
         KeyError: a trial that the twin did not follow.
@@ -56,6 +60,7 @@ def diagnose_on_twin(
     extra = beyond_coarse(recordings, twin, config, hold)
     trials = [_relative(trial, twin[trial.file], extra[trial.file]) for trial in recordings.trials]
     problem = TwinProblem.on(recordings.joints, make_batch(trials), config, hold)
+    problem = replace(problem, floor=max(problem.floor, floor))
     found = diagnose_problem(problem, seed, progress)
     traces = tuple(_absolute(trace, recordings.joints, extra, twin) for trace in found.traces)
     return replace(found, traces=traces, baseline_params=_servos(found))

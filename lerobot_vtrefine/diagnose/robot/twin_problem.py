@@ -42,7 +42,7 @@ class TwinProblem(Problem):
     """linear or zero_order, see `command_replay.HOLDS`."""
     config: SceneConfig = SceneConfig()  # noqa: RUF009  frozen
 
-    misfit: float = 0.1
+    misfit: float = 0.2
     """Coarse replays follow a fault only so exactly ..."""
     floor: float = 3e-4
     """... and the weight of carried parts is known only so well."""
