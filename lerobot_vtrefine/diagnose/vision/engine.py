@@ -5,16 +5,16 @@ episodes must say so together.
 """
 
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from lerobot_vtrefine.diagnose.evidence import Evidence, ResidualView, Trace, TrialError
+from lerobot_vtrefine.diagnose.evidence import Evidence, TrialError
 from lerobot_vtrefine.diagnose.locking import lock
 from lerobot_vtrefine.diagnose.robot import flips
-from lerobot_vtrefine.diagnose.verdict import Cause, DataIssue, Heldout, Parameter, Status, Unknown
+from lerobot_vtrefine.diagnose.verdict import Cause, Heldout, Parameter, Status
 from lerobot_vtrefine.diagnose.vision.frames import DepthFrames, read_frames
 from lerobot_vtrefine.diagnose.vision.model import CameraModel
 from lerobot_vtrefine.diagnose.vision.registration import (
@@ -40,7 +40,7 @@ _PARSIMONY = 0.02
 
 @dataclass(frozen=True)
 class VisionDiagnosis:
-    """As `evidence.Diagnosis`; errors are depths in metres."""
+    """What images tell about a camera, to stand beside a robot's diagnosis; errors are depths in metres."""
 
     status: Status
     causes: tuple[Cause, ...]
@@ -51,14 +51,6 @@ class VisionDiagnosis:
     extended_model: CameraModel
     evidence: tuple[Evidence, ...]
     trial_errors: tuple[TrialError, ...]
-    unknown: Unknown = Unknown(False)  # noqa: RUF009  frozen
-    baseline_model: CameraModel = CameraModel()  # noqa: RUF009  frozen
-    baseline_params: Mapping[str, Parameter] = field(default_factory=dict)
-    traces: tuple[Trace, ...] = ()
-    residuals: tuple[ResidualView, ...] = ()
-    issues: tuple[DataIssue, ...] = ()
-    maps: Mapping[str, Array] = field(default_factory=dict)
-    unit: str = "m"
 
 
 def diagnose_vision(root: Path, seed: int = 0, progress: Progress | None = None) -> VisionDiagnosis:
