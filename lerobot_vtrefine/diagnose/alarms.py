@@ -9,8 +9,9 @@ import numpy as np
 from scipy.stats import norm
 
 from lerobot_vtrefine.diagnose.fitting import Fit
-from lerobot_vtrefine.diagnose.presses import PressSet
+from lerobot_vtrefine.diagnose.presses import Press, PressSet
 from lerobot_vtrefine.diagnose.weights import TrialWeights
+from lerobot_vtrefine.tactile.replay import NO_BODY_M
 
 REPEATABLE_P, REPEATABLE_SHARE = 0.01, 0.15
 MIN_RMS = 0.4 / 255.0
@@ -34,16 +35,33 @@ class Alarm:
 
 
 def cleaned(fitted: Fit, presses: PressSet, weights: Sequence[TrialWeights]) -> list[np.ndarray]:
-    """Residuals (T, n) without every recording's own gain and first touch [counts]."""
+    """Residuals (T, n) without each recording's own gain and first touch, and without edges [counts]."""
     result = []
-    for weight, residual in zip(weights, fitted.residuals(presses), strict=True):
+    for press, weight, residual in zip(presses.presses, weights, fitted.residuals(presses), strict=True):
         white = weight.whiten(residual)
         size = weight.coupling @ (weight.nuisance.T @ white)
         # Undo whitening of the nuisance part: its directions were whitened the same way.
         unit = (weight.nuisance @ size).reshape(residual.shape)
         plain = weight.memory.coloured(unit)
-        result.append(residual - plain * weight.sigma)
+        result.append(np.where(_under_edge(press), 0.0, residual - plain * weight.sigma))
     return result
+
+
+def _under_edge(press: Press) -> np.ndarray:
+    """Readings (T, n) over which the edge of a pressed punch passes within a frame.
+
+    Whether the taxel is under it hangs on micrometres and milliseconds that no recording knows, alike in
+    every replicate.
+    """
+    heights = press.drive[:, press.scored]
+    if press.loaded or len(heights) < 2:
+        return np.zeros(heights.shape, dtype=bool)
+    there = heights > NO_BODY_M
+    passes = (there[1:] != there[:-1]) & (np.maximum(heights[1:], heights[:-1]) > 0)
+    edge = np.zeros(heights.shape, dtype=bool)
+    edge[1:] |= passes
+    edge[:-1] |= passes
+    return edge
 
 
 def replicate_alarm(presses: PressSet, residuals: Sequence[np.ndarray], seed: int) -> Alarm | None:
