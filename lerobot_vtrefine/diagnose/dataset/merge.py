@@ -4,9 +4,9 @@ from collections.abc import Mapping
 from dataclasses import replace
 from typing import Any, Protocol
 
-from lerobot_vtrefine.diagnose.evidence import Evidence
+from lerobot_vtrefine.diagnose.evidence import Evidence, TrialError
 from lerobot_vtrefine.diagnose.robot.engine import RobotDiagnosis
-from lerobot_vtrefine.diagnose.verdict import Cause, Status
+from lerobot_vtrefine.diagnose.verdict import Cause, Heldout, Status
 
 _WORSE: tuple[Status, ...] = ("adequate", "explained", "ambiguous", "unexplained")
 
@@ -25,15 +25,25 @@ class Findings(Protocol):
     @property
     def next_experiment(self) -> Mapping[str, Any] | None: ...  # noqa: D102
     @property
+    def heldout(self) -> Heldout | None: ...  # noqa: D102
+    @property
+    def trial_errors(self) -> tuple[TrialError, ...]: ...  # noqa: D102
+    @property
+    def unit(self) -> str: ...  # noqa: D102
+    @property
     def evidence(self) -> tuple[Evidence, ...]: ...  # noqa: D102
 
 
 def beside(robot: RobotDiagnosis, other: Findings) -> RobotDiagnosis:
     """The robot's diagnosis with other causes beside its own.
 
-    Held-out errors stay those of the joints; another cause's gain stands with it. An alarm about joints says
-    nothing about a camera, but a verdict that is unexplained holds symptoms only.
+    Held-out errors are those of the joints where something was found about these, else those of what was
+    found; every cause's own gain stands with it. An alarm about joints says nothing about a camera, but a
+    verdict that is unexplained holds symptoms only.
     """
+    if other.causes and robot.status == "adequate":
+        errors = {"heldout": other.heldout, "trial_errors": other.trial_errors, "unit": other.unit}
+        robot = replace(robot, **errors, traces=(), residuals=())
     alarmed = robot.unknown.alarm
     causes = [replace(cause, role="symptom") if alarmed else cause for cause in other.causes]
     evidence = [

@@ -11,14 +11,14 @@ from typing import Any
 
 import numpy as np
 
-from lerobot_vtrefine.diagnose.evidence import Evidence
+from lerobot_vtrefine.diagnose.evidence import Evidence, TrialError
 from lerobot_vtrefine.diagnose.object.clearance import contacts_of, estimate_clearance
 from lerobot_vtrefine.diagnose.object.episodes import AssumedScene, HandledEpisode
 from lerobot_vtrefine.diagnose.object.friction import estimate_friction
 from lerobot_vtrefine.diagnose.object.mass import PartMass, estimate_masses
 from lerobot_vtrefine.diagnose.object.payload import GRAVITY_M_S2, Arms, replay_loaded
 from lerobot_vtrefine.diagnose.object.regression import Line
-from lerobot_vtrefine.diagnose.verdict import Cause, Parameter, Status
+from lerobot_vtrefine.diagnose.verdict import Cause, Heldout, Parameter, Status
 from lerobot_vtrefine.sim.scene import build_scene
 
 Array = np.ndarray
@@ -101,6 +101,10 @@ class ObjectDiagnosis:
     mass_kg: Array = field(repr=False)
     """(2,) of socket and plug, as found where they differ from what was assumed; zero where unknown."""
     ambiguous_with: tuple[tuple[str, ...], ...] = ()
+    heldout: Heldout | None = None
+    """Estimates differ in what they are errors of: each cause's own gain says what it takes away."""
+    trial_errors: tuple[TrialError, ...] = ()
+    unit: str = "rad"
 
     @property
     def status(self) -> Status:

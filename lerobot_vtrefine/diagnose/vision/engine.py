@@ -51,6 +51,7 @@ class VisionDiagnosis:
     extended_model: CameraModel
     evidence: tuple[Evidence, ...]
     trial_errors: tuple[TrialError, ...]
+    unit: str = "m"
 
 
 def diagnose_vision(root: Path, seed: int = 0, progress: Progress | None = None) -> VisionDiagnosis:
