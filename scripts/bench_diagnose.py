@@ -41,7 +41,7 @@ def arguments() -> argparse.Namespace:
         "--first_seed", type=int, default=cases.REPORT_SEED, help="0 to tune; default %(default)s"
     )
     parser.add_argument(
-        "--naive_every", type=int, default=12, help="run the naive analysts on every n-th set"
+        "--naive_every", type=int, default=12, help="run the naive analysts on every n-th set; 0: never"
     )
     parser.add_argument("--jobs", type=int, default=os.cpu_count() or 1)
     parser.add_argument("--output_dir", type=Path, default=ROOT / "outputs" / "bench_diagnose")
@@ -82,7 +82,10 @@ def main() -> None:
     args = arguments()
     args.output_dir.mkdir(parents=True, exist_ok=True)
     wanted = chosen(args)
-    naive = [case.spec.rig == "4x4" and i % args.naive_every == 0 for i, case in enumerate(wanted)]
+    naive = [
+        case.spec.rig == "4x4" and args.naive_every > 0 and i % args.naive_every == 0
+        for i, case in enumerate(wanted)
+    ]
     tasks = list(zip(wanted, naive, strict=True))
     if args.table:
         tasks = [task for task in tasks if (args.output_dir / f"{task[0].name}.json").exists()]

@@ -122,7 +122,7 @@ def form_parameters(
     else:
         bounds = {name: left_out.interval(reporter) for name, reporter in reporters.items()}
     return {
-        name: Parameter(float(value), _possible(form, model.setting, name, bounds[name]), unit)
+        name: Parameter(float(value), _possible(form, model.setting, name, float(value), bounds[name]), unit)
         for name, (value, unit) in best.items()
     }
 
@@ -154,10 +154,16 @@ def _reporter(form: Form, setting: Setting, name: str, own: slice) -> Callable[[
     return lambda values: float(form.report(values[own], setting)[name][0])
 
 
-def _possible(form: Form, setting: Setting, name: str, bounds: tuple[float, float]) -> tuple[float, float]:
-    """An interval within what the form's bounds allow, where these bound the parameter at all."""
+def _possible(
+    form: Form, setting: Setting, name: str, value: float, bounds: tuple[float, float]
+) -> tuple[float, float]:
+    """An interval within what the form's bounds allow.
+
+    The coordinates' ends need not be the parameter's: a drift's mean rate is zero where all its knots are at
+    theirs. Ends that leave the estimate itself out bound nothing.
+    """
     ends = sorted(float(form.report(values, setting)[name][0]) for values in (form.low, form.high))
-    if not ends[0] <= bounds[0] <= bounds[1] <= ends[1] and ends[0] < ends[1]:
+    if ends[0] < ends[1] and ends[0] <= value <= ends[1]:
         return max(bounds[0], ends[0]), min(bounds[1], ends[1])
     return bounds
 

@@ -6,8 +6,10 @@ import numpy as np
 import pytest
 from scipy import stats
 
+from lerobot_vtrefine.diagnose.candidates.base import Setting
+from lerobot_vtrefine.diagnose.candidates.baseline_drift import FORMS as DRIFTS
 from lerobot_vtrefine.diagnose.candidates.sample_and_hold import undecided
-from lerobot_vtrefine.diagnose.intervals import LeftOut
+from lerobot_vtrefine.diagnose.intervals import LeftOut, _possible
 from lerobot_vtrefine.diagnose.presses import prepare
 from lerobot_vtrefine.diagnose.recordings import RecordingSet, Trial
 from lerobot_vtrefine.diagnose.refinement import instants_of, motion
@@ -99,3 +101,13 @@ def test_periods_that_repeat_the_same_frames_are_the_interval() -> None:
     low, high = undecided(np.array([0.1231]), prepare(pad, trials, [0]))["period_s"]
     assert low <= 0.123 <= high
     assert 0 < high - low < 0.003
+
+
+def test_ends_of_coordinates_bound_only_a_parameter_that_lies_between_them() -> None:
+    """With all knots of a drift's curve at one end its mean rate is zero, give or take rounding."""
+    layout = PadLayout(4, 4, 0.002)
+    setting = Setting(layout, 100.0, 255.0, 0.033, 6.0, 600.0, 1e-3, False, 0.0, 4, 4, 300.0)
+    linear, curve = DRIFTS
+    falling = (-0.02, -0.01)
+    assert _possible(curve, setting, "rate_counts_per_s", -0.015, falling) == falling
+    assert _possible(linear, setting, "rate_counts_per_s", -49.0, (-60.0, -38.0)) == (-50.0, -38.0)
