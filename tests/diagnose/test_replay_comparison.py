@@ -133,8 +133,11 @@ def test_page_is_whole_and_names_what_it_shows(with_touch: bool) -> None:
         touch,
         pairs,
         {7: "why"},
+        [],
+        ["The left hand hangs above the part <b>"],
     )
     page = render_page(comparison)
+    assert "The left hand hangs above the part &lt;b&gt;" in page
     assert "aloha &lt;b&gt;" in page
     assert "Episode 7 was left out: why" in page
     moments = page.count(", recorded above twin")
