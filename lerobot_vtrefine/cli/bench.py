@@ -191,3 +191,7 @@ def main() -> int:
         config.json.parent.mkdir(parents=True, exist_ok=True)
         config.json.write_text(json.dumps([asdict(row) for row in rows], indent=2) + "\n", encoding="utf-8")
     return 0 if found else 1
+
+
+if __name__ == "__main__":
+    raise SystemExit(main())

@@ -70,3 +70,7 @@ def main() -> None:
     signal.signal(signal.SIGTERM, signal.default_int_handler)
     path = run_demo(parse_config(sys.argv[1:]))
     print(f"Report: {path}")
+
+
+if __name__ == "__main__":
+    raise SystemExit(main())

@@ -20,3 +20,7 @@ def main() -> None:
     init_logging()
     register_third_party_plugins()
     finetune()
+
+
+if __name__ == "__main__":
+    raise SystemExit(main())
