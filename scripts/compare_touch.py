@@ -5,8 +5,8 @@
 
 Every run is one ``vtrefine-demo`` in one of the settings below; flags that this script does not know are
 passed on to it, after the setting's, for example ``--num_demos=40``. On a machine with many cores ``--jobs``
-runs several side by side, each on cores of its own. Interrupted and started again, it continues. The
-comparison is printed and saved as ``comparison.json`` and ``comparison.md``.
+runs several side by side, each on cores of its own, and on the GPUs by turns. Interrupted and started again,
+it continues. The comparison is printed and saved as ``comparison.json`` and ``comparison.md``.
 """
 
 import argparse
@@ -16,11 +16,13 @@ import shutil
 import subprocess
 import sys
 import time
+from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+import torch
 from scipy.stats import t as student_t
 
 from lerobot_vtrefine.cli.pipeline.demo_config import default_env, default_policy
@@ -69,51 +71,79 @@ def demo_command(folder: Path, run: Run, extra: list[str]) -> list[str]:
     return [command, *own, *setting_flags(setting), *extra]
 
 
+@dataclass(frozen=True)
+class Share:
+    """What one of several runs side by side may use of the machine."""
+
+    cores: list[int]
+    """Empty where the cores cannot be chosen."""
+    gpu: str | None
+    """As ``CUDA_VISIBLE_DEVICES`` names it; None without a GPU."""
+
+
 def run_all(commands: dict[Path, list[str]], jobs: int) -> None:
     """Run the pipelines, ``jobs`` side by side; finished stages are not repeated.
 
-    Side by side, each prints to ``FOLDER.log`` and keeps to its own share of the cores.
+    Side by side, each prints to ``FOLDER.log`` and keeps to its own share of the machine; one that fails
+    does not stop the others.
 
     Raises:
-        subprocess.CalledProcessError: a pipeline failed; the others are stopped.
+        subprocess.CalledProcessError: a pipeline failed.
     """
     if jobs == 1:
         for folder, command in commands.items():
             print(f"\n== {folder.name}", flush=True)
             subprocess.run(command, check=True)
         return
-    free, waiting, running = core_shares(jobs), list(commands), {}
+    free, waiting, running, failed = shares(jobs), list(commands), {}, []
     try:
         while waiting or running:
             while waiting and free:
-                folder, cores = waiting.pop(0), free.pop(0)
+                folder, share = waiting.pop(0), free.pop(0)
                 print(f"== {folder.name}: progress in {folder}.log", flush=True)
-                running[folder] = (start(commands[folder], folder, cores), cores)
+                running[folder] = (start(commands[folder], folder, share), share)
             for folder in [name for name, (child, _) in running.items() if child.poll() is not None]:
-                child, cores = running.pop(folder)
-                free.append(cores)
+                child, share = running.pop(folder)
+                free.append(share)
                 if child.returncode:
-                    raise subprocess.CalledProcessError(child.returncode, commands[folder])
-                print(f"== {folder.name}: done", flush=True)
+                    failed.append(subprocess.CalledProcessError(child.returncode, commands[folder]))
+                print(f"== {folder.name}: {'failed' if child.returncode else 'done'}", flush=True)
             time.sleep(POLL_S)
     finally:
         for child, _ in running.values():
             child.terminate()
+    if failed:
+        raise failed[0]
 
 
-def core_shares(jobs: int) -> list[list[int]]:
-    """The cores that this process may use, dealt out to ``jobs`` runs; empty where it cannot choose."""
-    cores = sorted(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else []
-    share = len(cores) // jobs
-    return [cores[job * share : (job + 1) * share] for job in range(jobs)]
+def shares(jobs: int) -> list[Share]:
+    """The machine, dealt out to ``jobs`` runs: cores in equal parts, GPUs by turns."""
+    cores, gpus = usable_cores(), visible_gpus()
+    part = len(cores) // jobs
+    return [
+        Share(cores[job * part : (job + 1) * part], gpus[job % len(gpus)] if gpus else None)
+        for job in range(jobs)
+    ]
 
 
-def start(command: list[str], folder: Path, cores: list[int]) -> subprocess.Popen:
-    """One pipeline in the background, on the given cores if there are any."""
+def usable_cores() -> list[int]:
+    """The cores that this process may use; none where the system does not tell."""
+    return sorted(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else []
+
+
+def visible_gpus() -> list[str]:
+    """The GPUs that this process may use, as ``CUDA_VISIBLE_DEVICES`` names them."""
+    named = os.environ.get("CUDA_VISIBLE_DEVICES")
+    return named.split(",") if named else [str(index) for index in range(torch.cuda.device_count())]
+
+
+def start(command: list[str], folder: Path, share: Share) -> subprocess.Popen:
+    """One pipeline in the background, on its share of the machine."""
     folder.parent.mkdir(parents=True, exist_ok=True)
-    pin = partial(os.sched_setaffinity, 0, cores) if cores else None
+    pin = partial(os.sched_setaffinity, 0, share.cores) if share.cores else None
+    env = os.environ | ({"CUDA_VISIBLE_DEVICES": share.gpu} if share.gpu else {})
     with Path(f"{folder}.log").open("wb") as log:
-        return subprocess.Popen(command, stdout=log, stderr=subprocess.STDOUT, preexec_fn=pin)
+        return subprocess.Popen(command, stdout=log, stderr=subprocess.STDOUT, preexec_fn=pin, env=env)
 
 
 def mean_interval(values: list[float]) -> tuple[float, float, float]:

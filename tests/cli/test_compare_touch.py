@@ -57,7 +57,8 @@ folder.mkdir(parents=True)
 rate = 80 if flags["modalities"] == "visual" else 60
 run = dict(success=rate, episodes=100, rate=rate / 100)
 cores = sorted(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else []
-results = dict(pretrain=run, finetune=run, flags=flags, cores=cores)
+gpu = os.environ.get("CUDA_VISIBLE_DEVICES")
+results = dict(pretrain=run, finetune=run, flags=flags, cores=cores, gpu=gpu)
 (folder / "results.json").write_text(json.dumps(results))
 """
 
@@ -88,8 +89,8 @@ def test_passes_flags_on_and_saves(
         ("visuo_tactile", "4"),
     ]
     assert all(run["flags"]["num_demos"] == "9" for run in runs)
-    shares = script.core_shares(jobs)
-    assert jobs == 1 or not shares[0] or all(run["cores"] in shares for run in runs)
+    parts = [share.cores for share in script.shares(jobs)]
+    assert jobs == 1 or not parts[0] or all(run["cores"] in parts for run in runs)
     assert json.loads((out / "comparison.json").read_text())["demo"]["finetune"]["visual"]["rate"] == 0.8
     assert "touch costs" in (out / "comparison.md").read_text()
 
@@ -104,6 +105,17 @@ def test_a_failed_run_ends_the_comparison(
     with pytest.raises(subprocess.CalledProcessError, match="status 3"):
         script.main()
     assert not (out / "comparison.json").exists()
+    assert jobs == 1 or len(list(out.glob("demo/*_3/results.json"))) == 2  # the others went on
+
+
+def test_runs_side_by_side_take_gpus_by_turns(
+    script: ModuleType, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, fake_demo: None
+) -> None:
+    monkeypatch.setenv("CUDA_VISIBLE_DEVICES", "5,7")
+    monkeypatch.setattr(sys, "argv", ["compare_touch.py", f"--output_dir={tmp_path}", "--jobs=6"])
+    script.main()
+    runs = [json.loads(path.read_text()) for path in tmp_path.glob("demo/*/results.json")]
+    assert sorted(run["gpu"] for run in runs) == ["5", "5", "5", "7", "7", "7"]
 
 
 def test_every_setting_is_a_task_that_the_demo_accepts(script: ModuleType) -> None:
