@@ -1,14 +1,12 @@
 """ALOHA's follower and leader on emulated motors and boards, through LeRobot's own Dynamixel bus."""
 
 import logging
-from collections.abc import Generator
-from pathlib import Path
 
 import numpy as np
 import pytest
 import serial
 from lerobot.motors.dynamixel.tables import MODEL_NUMBER_TABLE
-from rig import Rig, allow_slow_answers, aloha_rig, connect_error, follower_config
+from rig import Rig, connect_error, follower_config
 
 from lerobot_vtrefine.datasets.features import NUM_JOINTS, PADS, TAXEL_INFO
 from lerobot_vtrefine.drivers import dynamixel_arm
@@ -22,22 +20,6 @@ from lerobot_vtrefine.teleoperators import AlohaLeaderConfig
 from lerobot_vtrefine.teleoperators.aloha_leader import AlohaLeader
 
 SECONDARY_ID, CURRENT_MODE, OPERATING_MODE, GOAL_CURRENT, PWM_LIMIT = 12, 5, 11, 102, 36
-
-
-@pytest.fixture
-def rig(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Generator[Rig]:
-    allow_slow_answers(monkeypatch)
-    with aloha_rig(tmp_path) as built:
-        yield built
-
-
-@pytest.fixture
-def follower(rig: Rig) -> Generator[AlohaTactileFollower]:
-    robot = AlohaTactileFollower(follower_config(rig))
-    robot.connect()
-    yield robot
-    if robot.is_connected:
-        robot.disconnect()
 
 
 def test_observation_matches_its_features(follower: AlohaTactileFollower) -> None:

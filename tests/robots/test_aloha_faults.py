@@ -1,8 +1,6 @@
 """ALOHA's arms when something breaks: nothing stays driven, open or running, and the error names the arm."""
 
 import threading
-from collections.abc import Generator
-from pathlib import Path
 
 import draccus
 import numpy as np
@@ -10,29 +8,13 @@ import pytest
 import yaml
 from lerobot.cameras.configs import CameraConfig
 from realsense import FakeDepthCamera, camera_flag, plug_in
-from rig import Rig, allow_slow_answers, aloha_rig, connect_error, follower_config
+from rig import Rig, connect_error, follower_config
 
 from lerobot_vtrefine.drivers.arm_models import WIDOWX_250S
 from lerobot_vtrefine.drivers.board import PadReader
 from lerobot_vtrefine.drivers.dynamixel_arm import DynamixelArm
 from lerobot_vtrefine.drivers.ports import PortError
 from lerobot_vtrefine.robots.aloha_tactile_follower import AlohaTactileFollower
-
-
-@pytest.fixture
-def rig(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Generator[Rig]:
-    allow_slow_answers(monkeypatch)
-    with aloha_rig(tmp_path) as built:
-        yield built
-
-
-@pytest.fixture
-def follower(rig: Rig) -> Generator[AlohaTactileFollower]:
-    robot = AlohaTactileFollower(follower_config(rig))
-    robot.connect()
-    yield robot
-    if robot.is_connected:
-        robot.disconnect()
 
 
 def test_an_arm_in_use_is_busy(rig: Rig) -> None:

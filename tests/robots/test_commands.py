@@ -3,14 +3,13 @@
 import os
 import threading
 import time
-from collections.abc import Generator
 from pathlib import Path
 
 import numpy as np
 import pytest
 from commands import dataset_flags, flags, follower_flags, leader_flags, run_command
 from lerobot.datasets.lerobot_dataset import LeRobotDataset
-from rig import Rig, allow_slow_answers, aloha_rig, emulated_elsewhere
+from rig import Rig, allow_slow_answers, emulated_elsewhere
 
 from lerobot_vtrefine.datasets.features import ACTION_KEY, PADS, STATE_KEY, TACTILE_KEYS
 from lerobot_vtrefine.drivers import arm_pair, pad_set
@@ -18,13 +17,6 @@ from lerobot_vtrefine.drivers.sources import check_pattern
 
 FPS = 15
 AGE_KEY = "observation.tactile_age"
-
-
-@pytest.fixture
-def rig(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Generator[Rig]:
-    allow_slow_answers(monkeypatch)
-    with aloha_rig(tmp_path) as built:
-        yield built
 
 
 def opened(root: Path) -> LeRobotDataset:

@@ -8,7 +8,7 @@ import lerobot.utils.visualization_utils as dispatch
 import numpy as np
 import pytest
 from commands import follower_flags, leader_flags, run_command
-from rig import Rig, allow_slow_answers, aloha_rig
+from rig import Rig
 
 from lerobot_vtrefine.cli.view_pads import main as view_pads
 from lerobot_vtrefine.datasets.features import PADS
@@ -23,13 +23,6 @@ pytestmark = pytest.mark.filterwarnings("ignore::DeprecationWarning")
 def restore() -> Generator[None]:
     yield
     live_view.uninstall()
-
-
-@pytest.fixture
-def rig(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Generator[Rig]:
-    allow_slow_answers(monkeypatch)
-    with aloha_rig(tmp_path) as built:
-        yield built
 
 
 def logged(path: Path) -> dict[str, list[set[str]]]:
