@@ -124,9 +124,15 @@ def test_the_hessian_is_mujoco_warps_own_with_sliding_contacts(touching):
     sim._backend.write(WORLDS, qpos, qvel + np.random.default_rng(0).normal(0, 0.05, qvel.shape))
     data.ctrl.assign(truth._episode.command)
     hessians = []
+
+    def own_direction(model, data, context):
+        sliding = warp_solve.no_sliding(data)
+        warp_solve._gradient(model, data, context)
+        warp_solve._direction(model, data, context, sliding)
+
     with wp.ScopedDevice("cpu"):
         mjw.step(model, data)
-        for direction in (solver._update_gradient, warp_solve._direction):
+        for direction in (solver._update_gradient, own_direction):
             context = solver._create_solver_context(model, data, inplace_cholesky=True)
             data.qacc.zero_()
             solver.init_context(model, data, context, grad=False)

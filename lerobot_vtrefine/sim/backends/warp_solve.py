@@ -1,7 +1,9 @@
-"""mujoco_warp's Newton solver, with the cones' curvature summed world by world. Imports warp and mujoco_warp.
+"""mujoco_warp's Newton solver, with the cones' curvature summed world by world and no Hessian that is not used.
+Imports warp and mujoco_warp.
 
-mujoco_warp sums it contact by contact, where most contacts stick and contribute nothing; at a thousand worlds
-that is the largest part of a physics step. All else is `mujoco_warp.solve`.
+mujoco_warp sums the curvature contact by contact, where most contacts stick and contribute nothing; at a
+thousand worlds that is the largest part of a physics step. And it computes the next direction before it asks
+whether one is needed, which in half of the substeps is not. All else is `mujoco_warp.solve`.
 """
 
 import mujoco_warp as mjw
@@ -9,6 +11,9 @@ import warp as wp
 from mujoco_warp._src import solver
 
 from lerobot_vtrefine.sim.backends import warp_solve_kernels as kernels
+
+SMALLEST_CONE = 3
+"""Rows of a contact with friction at least."""
 
 
 def solve(model: mjw.Model, data: mjw.Data) -> None:
@@ -20,44 +25,73 @@ def solve(model: mjw.Model, data: mjw.Data) -> None:
     start = [data.nefc, data.qacc_warmstart, data.qacc_smooth]
     wp.launch(begin, (data.nworld, model.nv), start, [data.qacc, data.qfrc_constraint])
     solver.init_context(model, data, context, grad=False)
-    _direction(model, data, context)
+    sliding = no_sliding(data)
+    _gradient(model, data, context)
+    _direction(model, data, context, sliding)
     unsolved = wp.full(1, data.nworld, dtype=int)
+    given = {"model": model, "data": data, "context": context, "sliding": sliding, "unsolved": unsolved}
     if model.opt.graph_conditional:
-        wp.capture_while(unsolved, _iterate, model=model, data=data, context=context, unsolved=unsolved)
+        wp.capture_while(unsolved, _iterate, **given)
     else:
         for _ in range(model.opt.iterations):
-            _iterate(model, data, context, unsolved)
+            _iterate(**given)
 
 
-def _iterate(model: mjw.Model, data: mjw.Data, context: solver.SolverContext, unsolved: wp.array) -> None:
-    """One step along the direction, and the next direction."""
+def _iterate(
+    model: mjw.Model,
+    data: mjw.Data,
+    context: solver.SolverContext,
+    sliding: kernels.Sliding,
+    unsolved: wp.array,
+) -> None:
+    """One step along the direction, and the next direction in the worlds that need one."""
     solver._linesearch(model, data, context)
     solver._update_constraint(model, data, context)
-    _direction(model, data, context)
-    progress = [context.grad_dot, context.newton_decrement, context.improvement, context.alpha, context.done]
-    limits = [model.opt.tolerance, model.opt.iterations, context.inertia_scale]
-    result = [data.solver_niter, data.overflow, unsolved, context.done]
-    wp.launch(solver._solve_done(0), data.nworld, [*limits, *progress], result)
+    _gradient(model, data, context)
+    progress = [context.inertia_scale, context.grad_dot, context.improvement, context.alpha]
+    limits = [model.opt.tolerance, model.opt.iterations]
+    result = [data.solver_niter, data.overflow, sliding.count, unsolved, context.done]
+    wp.launch(kernels.finish_by_step, data.nworld, [*limits, *progress], result)
+    _direction(model, data, context, sliding)
+    expected = [model.opt.tolerance, context.inertia_scale, context.newton_decrement]
+    wp.launch(kernels.finish_by_model, data.nworld, expected, [unsolved, context.done])
 
 
-def _direction(model: mjw.Model, data: mjw.Data, context: solver.SolverContext) -> None:
-    """Newton's direction at the present accelerations."""
-    worlds, done = data.nworld, context.done
+def _gradient(model: mjw.Model, data: mjw.Data, context: solver.SolverContext) -> None:
+    """The cost's gradient at the present accelerations."""
+    done = context.done
     cleared = [context.grad_dot, context.newton_decrement, context.grad_scale, context.search_unchanged]
     clear = solver._update_gradient_zero_grad_dot(False)
-    wp.launch(clear, worlds, [data.nefc, context.alpha, done], cleared)
+    wp.launch(clear, data.nworld, [data.nefc, context.alpha, done], cleared)
     forces = [data.qfrc_smooth, data.qfrc_constraint, data.efc.Ma, data.nefc, done]
     gradient = solver._update_gradient_grad(False, False)
-    wp.launch(gradient, (worlds, model.nv), forces, [context.grad, context.grad_dot])
+    wp.launch(gradient, (data.nworld, model.nv), forces, [context.grad, context.grad_dot])
+
+
+def _direction(
+    model: mjw.Model, data: mjw.Data, context: solver.SolverContext, sliding: kernels.Sliding
+) -> None:
+    """Newton's direction for the present gradient."""
+    worlds, done = data.nworld, context.done
     size = (model.nv_pad, solver.types.TILE_SIZE_JTDAJ_DENSE, data.njmax, model.M_colind.shape[0])
     quadratic = [model.M_colind, model.M_hinit_i, data.nefc, data.M]
     quadratic += [data.efc.J, data.efc.D, data.efc.state, done]
     hessian = solver._update_gradient_JTDAJ_dense_tiled(*size)
     block = model.block_dim.update_gradient_JTDAJ_dense
     wp.launch_tiled(hessian, dim=worlds, inputs=quadratic, outputs=[context.h], block_dim=block)
-    sliding = [model.dof_tri_row, model.dof_tri_col, done, _rows(data, context), _cones(model, data)]
-    wp.launch(kernels.add_curvature, (worlds, model.dof_tri_row.size), sliding, [context.h])
+    rows, cones = _rows(data, context), _cones(model, data)
+    wp.launch(kernels.find_sliding, (worlds, data.njmax), [done, rows, cones, sliding])
+    entries = [model.dof_tri_row, model.dof_tri_col, done, rows, cones, sliding]
+    wp.launch(kernels.add_curvature, (worlds, model.dof_tri_row.size), entries, [context.h])
     solver._cholesky_factorize_solve(model, data, context)
+
+
+def no_sliding(data: mjw.Data) -> kernels.Sliding:
+    """An empty list of sliding contacts, with room for all."""
+    sliding = kernels.Sliding()
+    sliding.count = wp.zeros(data.nworld, dtype=int)
+    sliding.row = wp.empty((data.nworld, data.njmax // SMALLEST_CONE), dtype=int)
+    return sliding
 
 
 def _rows(data: mjw.Data, context: solver.SolverContext) -> kernels.Rows:

@@ -1,15 +1,16 @@
-"""Warp kernel of the constraint solver: what sliding contacts add to the Hessian.
+"""Warp kernels of the constraint solver: what sliding contacts add to the Hessian, and when to stop.
 
 Shape legend: N worlds, C contacts, nv velocities.
 """
 
 import warp as wp
-from mujoco_warp._src.types import vec5
+from mujoco_warp._src.types import OverflowType, vec5
 
 wp.set_module_options({"enable_backward": False})
 
 CONE = wp.constant(4)
 """State of the rows of a contact that slides."""
+TOO_FEW_ITERATIONS = wp.constant(int(OverflowType.ITERATIONS))
 TINY = wp.constant(1.0e-15)
 
 
@@ -35,6 +36,14 @@ class Cones:
     dim: wp.array(dtype=int)
     friction: wp.array(dtype=vec5)
     ratio: wp.array(dtype=float)
+
+
+@wp.struct
+class Sliding:
+    """Which contacts slide: how many in each world (N,), and their first rows (N, most)."""
+
+    count: wp.array(dtype=int)
+    row: wp.array(dtype=int, ndim=2)
 
 
 @wp.func
@@ -77,26 +86,81 @@ def curvature(
 
 
 @wp.kernel
+def find_sliding(done: wp.array(dtype=bool), rows: Rows, cones: Cones, sliding: Sliding) -> None:
+    """List the contacts that slide; a thread per row. `sliding.count` is zero before."""
+    world, row = wp.tid()
+    if done[world] or row < rows.first[world] or row >= rows.count[world]:
+        return
+    if rows.state[world, row] == CONE:
+        if cones.row[rows.contact[world, row], 0] == row:
+            sliding.row[world, wp.atomic_add(sliding.count, world, 1)] = row
+
+
+@wp.kernel
 def add_curvature(
     pair_i: wp.array(dtype=int),
     pair_j: wp.array(dtype=int),
     done: wp.array(dtype=bool),
     rows: Rows,
     cones: Cones,
+    sliding: Sliding,
     hessian: wp.array(dtype=float, ndim=3),
 ) -> None:
     """Add the curvature of all sliding contacts to the Hessians (N, nv, nv); a thread per entry."""
     world, pair = wp.tid()
-    if done[world]:
+    if done[world] or sliding.count[world] == 0:
         return
     i = pair_i[pair]
     j = pair_j[pair]
     ratio = cones.ratio[world % cones.ratio.shape[0]]
     total = float(0.0)
-    for row in range(rows.first[world], wp.min(rows.count[world], rows.state.shape[1])):
-        if rows.state[world, row] == CONE:
-            contact = rows.contact[world, row]
-            if cones.row[contact, 0] == row:
-                total += curvature(world, row, contact, i, j, ratio, rows, cones)
-    if total != 0.0:
-        hessian[world, i, j] += total
+    for index in range(sliding.count[world]):
+        row = sliding.row[world, index]
+        total += curvature(world, row, rows.contact[world, row], i, j, ratio, rows, cones)
+    hessian[world, i, j] += total
+
+
+@wp.kernel
+def finish_by_step(
+    tolerance: wp.array(dtype=float),
+    iterations: int,
+    scale: wp.array(dtype=float),
+    gradient_squared: wp.array(dtype=float),
+    improvement: wp.array(dtype=float),
+    alpha: wp.array(dtype=float),
+    count: wp.array(dtype=int),
+    flags: wp.array(dtype=int),
+    sliding: wp.array(dtype=int),
+    unsolved: wp.array(dtype=int),
+    done: wp.array(dtype=bool),
+) -> None:
+    """Worlds in which the last step, or the gradient after it, says that no further one is needed."""
+    world = wp.tid()
+    sliding[world] = 0
+    if done[world]:
+        return
+    count[world] += 1
+    enough = tolerance[world % tolerance.shape[0]]
+    gained = scale[world] * improvement[world]
+    gradient = scale[world] * wp.sqrt(gradient_squared[world])
+    solved = alpha[world] == 0.0 or (gained > 0.0 and gained < enough) or gradient < enough
+    if solved or count[world] == iterations:
+        if not solved:
+            flags[world] = flags[world] | TOO_FEW_ITERATIONS
+        done[world] = True
+        wp.atomic_add(unsolved, 0, -1)
+
+
+@wp.kernel
+def finish_by_model(
+    tolerance: wp.array(dtype=float),
+    scale: wp.array(dtype=float),
+    decrement: wp.array(dtype=float),
+    unsolved: wp.array(dtype=int),
+    done: wp.array(dtype=bool),
+) -> None:
+    """Worlds in which the next step would gain next to nothing."""
+    world = wp.tid()
+    if not done[world] and scale[world] * 0.5 * decrement[world] < tolerance[world % tolerance.shape[0]]:
+        done[world] = True
+        wp.atomic_add(unsolved, 0, -1)
