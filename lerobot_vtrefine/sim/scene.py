@@ -1,5 +1,6 @@
 """The whole scene from one configuration: MjSpec, compiled model, and where everything lies in it."""
 
+import logging
 from dataclasses import dataclass
 
 import mujoco
@@ -22,6 +23,8 @@ MIN_PART_MASS_KG = 0.04
 _CONTACT_DATA = 1 | 2 | 4 | 16  # found, force, torque, position of mjtConDataField
 _NETFORCE = 3
 _CONTACT_SIZE = 10
+
+logger = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True)
@@ -79,6 +82,7 @@ def build_scene(config: SceneConfig) -> Scene:
     """
     embodiment = get_embodiment(config.embodiment)
     pair = load_pair(config)
+    _warn_of_close_hands(pair, embodiment)
     camera = make_camera(config)
     spec = mujoco.MjSpec()
     _set_options(spec, config)
@@ -93,6 +97,20 @@ def build_scene(config: SceneConfig) -> Scene:
     _add_sensors(spec, embodiment)
     model = spec.compile()
     return Scene(config, spec, model, embodiment, pair, camera, _addresses(model, embodiment))
+
+
+def _warn_of_close_hands(pair: PartPair, embodiment: Embodiment) -> None:
+    """Tell of pairs whose hands would have to be in the same place once the plug is seated."""
+    width_m = embodiment.fingers.pad_size_m[1]
+    apart_m = pair.seated_z_m + pair.plug.grip.centre_m[2] - pair.socket.grip.centre_m[2]
+    if apart_m < width_m:
+        logger.warning(
+            "%s cannot be seated by these hands: they hold the seated plug %.0f mm above where they hold the"
+            " socket, and a pad is %.0f mm wide",
+            pair.name,
+            1e3 * apart_m,
+            1e3 * width_m,
+        )
 
 
 def build_arms(config: SceneConfig) -> tuple[mujoco.MjModel, Embodiment, np.ndarray]:

@@ -132,6 +132,18 @@ def test_scene_is_built_with_grips_clear_of_each_other(folder: Path, ring: MeshP
     assert scene.pair.mouth_z_m == ring.fit.travel_m
 
 
+def test_hands_that_would_meet_are_told(folder: Path, caplog: pytest.LogCaptureFixture) -> None:
+    """The seated ring's middle lies 17.5 mm above the foot's, and pads are 26 mm wide."""
+    build_scene(SceneConfig(pair="automate/ring", mesh_dir=folder, mesh_scale="unit"))
+    (told,) = caplog.messages
+    assert told.startswith("automate/ring cannot be seated by these hands")
+    assert "seated plug 18 mm above" in told
+    assert "26 mm wide" in told
+    caplog.clear()
+    build_scene(SceneConfig(pair="round"))
+    assert caplog.messages == []
+
+
 def test_missing_folder_names_the_files(tmp_path: Path) -> None:
     with pytest.raises(FileNotFoundError, match=r"no folder .*gone.*ID_plug\.obj") as error:
         load_mesh_pair("automate/00186", tmp_path / "gone")
