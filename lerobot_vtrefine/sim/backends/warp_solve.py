@@ -1,9 +1,11 @@
-"""mujoco_warp's Newton solver, with the cones' curvature summed world by world and no Hessian that is not used.
-Imports warp and mujoco_warp.
+"""mujoco_warp's Newton solver, with less work in each of its steps. Imports warp and mujoco_warp.
 
-mujoco_warp sums the curvature contact by contact, where most contacts stick and contribute nothing; at a
-thousand worlds that is the largest part of a physics step. And it computes the next direction before it asks
-whether one is needed, which in half of the substeps is not. All else is `mujoco_warp.solve`.
+- The cones' curvature is summed world by world, over contacts that slide: mujoco_warp sums it contact by
+  contact, where most stick and contribute nothing.
+- Whether a further step is needed is asked before its direction is computed, as far as that can be said; in
+  most substeps it is not needed.
+
+All else is `mujoco_warp.solve`, with the same iterations.
 """
 
 import mujoco_warp as mjw

@@ -91,9 +91,10 @@ def find_sliding(done: wp.array(dtype=bool), rows: Rows, cones: Cones, sliding: 
     world, row = wp.tid()
     if done[world] or row < rows.first[world] or row >= rows.count[world]:
         return
-    if rows.state[world, row] == CONE:
-        if cones.row[rows.contact[world, row], 0] == row:
-            sliding.row[world, wp.atomic_add(sliding.count, world, 1)] = row
+    if rows.state[world, row] != CONE:  # also rows that are no contact's
+        return
+    if cones.row[rows.contact[world, row], 0] == row:
+        sliding.row[world, wp.atomic_add(sliding.count, world, 1)] = row
 
 
 @wp.kernel
