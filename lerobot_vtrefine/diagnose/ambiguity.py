@@ -1,12 +1,16 @@
 """Rivals: causes that explain the recordings as well as the ones that were named."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import partial
 from typing import Any
 
-from lerobot_vtrefine.diagnose.crossvalidation import agree
+from lerobot_vtrefine.diagnose.crossvalidation import Score, agree
 from lerobot_vtrefine.diagnose.experiments import next_experiment
 from lerobot_vtrefine.diagnose.fitting import Fit
 from lerobot_vtrefine.diagnose.noise import Noise
+from lerobot_vtrefine.diagnose.parallel import on_all_cores
+from lerobot_vtrefine.diagnose.screening import Probe
 from lerobot_vtrefine.diagnose.selection import MAPS, Search, add, all_probes, elaborate, scored, take_away
 
 TIE_P = 0.1
@@ -32,12 +36,10 @@ def find_ambiguities(search: Search, fitted: Fit, noise: Noise) -> Rivals:
         if not rivals or name in MAPS:
             continue
         slim = take_away(search, fitted, name)
-        probes, less = all_probes(search, slim), scored(search, slim)
+        probes, less = all_probes(search, slim, rivals), scored(search, slim)
+        best = partial(_in_place, search, slim, probes, less, NEARLY * full.gain_over(less))
         tied = []
-        for rival in rivals:
-            other, score = add(search, slim, rival, probes)
-            if score.gain_over(less) > NEARLY * full.gain_over(less):
-                other, score = elaborate(search, slim, rival, probes, (other, score))
+        for rival, (other, score) in zip(rivals, on_all_cores(best, rivals), strict=True):
             # Weights forgive much that plain errors do not, where a model is far off: both must be as good.
             worse = (full.better_by(score), score.squares - full.squares)
             if not any(agree(differences, search.seed, TIE_P) for differences in worse):
@@ -48,3 +50,11 @@ def find_ambiguities(search: Search, fitted: Fit, noise: Noise) -> Rivals:
                 names = (name, tied[0][0])
                 experiment = next_experiment(fitted.model, tied[0][1].model, search.presses, noise, names)
     return Rivals(tuple(groups), experiment)
+
+
+def _in_place(
+    search: Search, slim: Fit, probes: Sequence[Probe], less: Score, needed: float, rival: str
+) -> tuple[Fit, Score]:
+    """The best fit with a rival; in other forms too if the plain one gains what is needed over `less`."""
+    plain = add(search, slim, rival, probes)
+    return elaborate(search, slim, rival, probes, plain) if plain[1].gain_over(less) > needed else plain

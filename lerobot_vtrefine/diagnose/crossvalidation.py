@@ -6,7 +6,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from lerobot_vtrefine.diagnose.fitting import Fit, losses_of, predict, refit_without, squared_errors
-from lerobot_vtrefine.diagnose.maps import map_without
+from lerobot_vtrefine.diagnose.maps import map_evidence, map_without
 from lerobot_vtrefine.diagnose.presses import PressSet
 from lerobot_vtrefine.diagnose.weights import TrialWeights
 
@@ -49,11 +49,12 @@ def cross_validate(
 ) -> Score:
     """Errors of every recording under the fit without its fold."""
     losses, squares = np.array(fitted.losses), squared_errors(fitted.signals, presses)
+    evidence = map_evidence(fitted, presses, weights) if fitted.model.gain_map is not None else None
     for fold in folds if len(folds) > 1 else []:
         part = presses.subset(list(fold))
         model = refit_without(fitted, fold)
-        if model.gain_map is not None:
-            model = map_without(model, fitted, presses, weights, fold)
+        if evidence is not None:
+            model = map_without(model, fitted, evidence, fold)
         signals = predict(model, part)
         losses[list(fold)] = losses_of(signals, part, [weights[i] for i in fold])
         squares[list(fold)] = squared_errors(signals, part)

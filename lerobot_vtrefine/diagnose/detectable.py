@@ -4,11 +4,12 @@ import numpy as np
 
 from lerobot_vtrefine.diagnose.candidates import CATALOGUE
 from lerobot_vtrefine.diagnose.candidates.base import Form
+from lerobot_vtrefine.diagnose.parallel import on_all_cores
 from lerobot_vtrefine.diagnose.screening import Scorer
 
 MARGIN = 3.2 + 0.85
 """Standard errors that an effect must stand out by to pass the screening in four cases of five."""
-CORRECTIONS = 3
+CORRECTIONS = 2
 MAIN = {
     "nonlinear_stiffness": "exponent",
     "saturation": "knee_counts",
@@ -32,20 +33,20 @@ NULL = {"nonlinear_stiffness": 1.0}
 def minimum_detectable(scorer: Scorer) -> dict[str, float]:
     """Size of each cause's main parameter from which on it would be seen; causes never seen are left out."""
     setting = scorer.fitted.model.setting
-    found: dict[str, float] = {}
+    held = set(scorer.fitted.model.families)
     plain = {form.family: form for form in reversed(CATALOGUE)}
-    for form in plain.values():
-        if not form.screened or not form.possible(setting) or form.family in scorer.fitted.model.families:
-            continue
-        for guess in form.probes(setting):
-            size = _smallest(form, np.asarray(guess, dtype=float), scorer)
-            if size is None:
-                continue
-            value = _public(form, size, scorer)
-            better = max if form.family == "saturation" else min
-            held = found.get(form.family)
-            found[form.family] = value if held is None else better(held, value)
-    return found
+    forms = [form for form in plain.values() if form.screened and form.family not in held]
+    forms = [form for form in forms if form.possible(setting)]
+    sizes = on_all_cores(lambda form: _of_cause(form, scorer), forms)
+    return {form.family: size for form, size in zip(forms, sizes, strict=True) if size is not None}
+
+
+def _of_cause(form: Form, scorer: Scorer) -> float | None:
+    """The smallest visible size over a form's probes, None if none can be seen."""
+    better = max if form.family == "saturation" else min
+    guesses = [np.asarray(guess, dtype=float) for guess in form.probes(scorer.fitted.model.setting)]
+    sizes = [_smallest(form, guess, scorer) for guess in guesses]
+    return better((_public(form, size, scorer) for size in sizes if size is not None), default=None)
 
 
 def _public(form: Form, values: np.ndarray, scorer: Scorer) -> float:

@@ -59,7 +59,7 @@ def losses_of(
     """Weighted squared error of every recording (K,)."""
     return np.array(
         [
-            float(weight.gram(weight.whiten(press.signal - signal)[:, None])[0, 0])
+            float(weight.gram(weight.whiten(press.signal - signal)[None])[0, 0])
             for press, signal, weight in zip(presses.presses, signals, weights, strict=True)
         ]
     )
@@ -72,10 +72,13 @@ def squared_errors(signals: Sequence[np.ndarray], presses: PressSet) -> np.ndarr
 
 
 def tangents(
-    model: Composite, presses: PressSet, free: np.ndarray
+    model: Composite, presses: PressSet, free: np.ndarray, cache: Prefix | None = None
 ) -> tuple[list[np.ndarray], list[list[np.ndarray]]]:
-    """Expected signals, and their change per unit of free coordinates: [coordinate][recording] (T, n)."""
-    cache = Prefix()
+    """Expected signals, and their change per unit of free coordinates: [coordinate][recording] (T, n).
+
+    `cache` may hold the fields of the model's own run.
+    """
+    cache = cache or Prefix()
     signals = predict(model, presses, cache)
     cache.frozen = True
     columns = []
@@ -100,7 +103,7 @@ def grams_of(
     for k, (press, weight) in enumerate(zip(presses.presses, weights, strict=True)):
         vectors = [weight.whiten(column[k]) for column in columns]
         vectors.append(weight.whiten(press.signal - signals[k]))
-        grams.append(weight.gram(np.stack(vectors, axis=1)))
+        grams.append(weight.gram(np.stack(vectors)))
     return np.array(grams)
 
 
@@ -166,7 +169,8 @@ def fit(
     loss = float(grams[:, -1, -1].sum())
     for _ in range(max_steps):
         moved = model.at(bounded_step(model, grams.sum(axis=0), free, damping))
-        new_signals = predict(moved, presses)
+        cache = Prefix()
+        new_signals = predict(moved, presses, cache)
         new_loss = float(losses_of(new_signals, presses, weights).sum())
         if not new_loss < loss:
             damping *= 10.0
@@ -175,7 +179,7 @@ def fit(
             continue
         settled = loss - new_loss < TOLERANCE * max(loss, 1e-12)
         model, loss, damping = moved, new_loss, max(damping / 10.0, 1e-6)
-        signals, columns = tangents(model, presses, free)
+        signals, columns = tangents(model, presses, free, cache)
         grams = grams_of(presses, weights, signals, columns)
         if settled:
             break

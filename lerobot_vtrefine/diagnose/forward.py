@@ -4,9 +4,9 @@ Every stage of the catalogue has a fast equal on sheets (a test holds each to th
 is not listed runs its own code, press by press.
 """
 
+import threading
 from collections.abc import Sequence
 from dataclasses import dataclass
-from itertools import pairwise
 from typing import Any
 
 import numpy as np
@@ -19,7 +19,7 @@ from lerobot_vtrefine.diagnose.presses import Press
 from lerobot_vtrefine.diagnose.refinement import Kind, instants
 from lerobot_vtrefine.diagnose.sheets import Sheet, build_sheets
 from lerobot_vtrefine.tactile.stages.base import Frame, Stage
-from lerobot_vtrefine.tactile.stages.contact import ContactStage
+from lerobot_vtrefine.tactile.stages.contact import ContactStage, KelvinVoigt
 from lerobot_vtrefine.tactile.stages.mechanics import NonlinearStiffness
 from lerobot_vtrefine.tactile.stages.readout import TaxelGainSpread
 
@@ -32,12 +32,14 @@ class Bench:
     def __init__(self, presses: Sequence[Press], idle: np.ndarray) -> None:
         self.presses, self._idle = presses, idle
         self._sheets: dict[Kind, list[Sheet]] = {}
+        self._building = threading.Lock()
 
     def sheets(self, kind: Kind) -> list[Sheet]:
         """The presses at a model's instants."""
-        if kind not in self._sheets:
-            self._sheets[kind] = build_sheets(self.presses, self._idle, kind)
-        return self._sheets[kind]
+        with self._building:
+            if kind not in self._sheets:
+                self._sheets[kind] = build_sheets(self.presses, self._idle, kind)
+            return self._sheets[kind]
 
 
 @dataclass(frozen=True)
@@ -116,10 +118,15 @@ def mixes(stages: Sequence[Stage]) -> bool:
 
 def _scatter(field: Field, sheet: Sheet, found: list[np.ndarray]) -> None:
     """(T, n) of each press's scored taxels into its place among all presses."""
-    full = field.spread(sheet.all_scored)
-    ends = np.cumsum([0, *(len(columns) for columns in sheet.scored)]).tolist()
-    for member, frames, (begin, end) in zip(sheet.members, sheet.frames, pairwise(ends), strict=True):
-        found[member] = np.ascontiguousarray(full.values[: len(frames), begin:end])
+    for press, (member, frames, scored) in enumerate(
+        zip(sheet.members, sheet.frames, sheet.scored, strict=True)
+    ):
+        part = field.within(sheet, press)
+        own = field.columns[part]
+        place = np.searchsorted(scored, own).clip(max=len(scored) - 1)
+        kept = scored[place] == own
+        found[member] = np.zeros((len(frames), len(scored)))
+        found[member][:, place[kept]] = field.values[: len(frames), part][:, kept]
 
 
 class Prefix:
@@ -179,8 +186,15 @@ def _apply(stage: Stage, field: Field, context: Context) -> Field:
 
 
 def _contact(stage: ContactStage, field: Field, sheet: Sheet) -> Field:
-    depth, rate = (torch.from_numpy(np.ascontiguousarray(v)) for v in (field.values, field.rate))
-    force = stage.force(depth[:, None], rate[:, None], sheet.layout)[:, 0].numpy()
+    assert field.rate is not None
+    if isinstance(stage, KelvinVoigt):
+        force = stage.k_n * field.values
+        force += stage.k_d * field.rate
+        np.maximum(force, 0.0, out=force)
+        force *= field.values > 0
+    else:
+        depth, rate = (torch.from_numpy(np.ascontiguousarray(v)) for v in (field.values, field.rate))
+        force = stage.force(depth[:, None], rate[:, None], sheet.layout)[:, 0].numpy()
     if field.columns is sheet.touched:
         return Field(force, field.columns)
     felt = force.any(axis=0)

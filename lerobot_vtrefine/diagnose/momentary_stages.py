@@ -83,9 +83,17 @@ def _row_sharing(stage: RowSharing, field: Field, context: Context) -> Field:
     sheet = context.sheet
 
     def work(x: np.ndarray, time_s: np.ndarray, rows: np.ndarray) -> np.ndarray:
-        weights = (rows[:, None] == rows[None]).astype(float)
-        weights[np.diag_indices(len(rows))] = stage.own
-        return x / (1.0 + stage.conductance_per_count * (x @ weights))
+        if not len(rows):
+            return x
+        # Columns are in the order of their rows.
+        first = np.flatnonzero(np.diff(rows, prepend=-1))
+        total = np.add.reduceat(x, first, axis=1)
+        line = np.repeat(np.arange(len(first)), np.diff(first, append=len(rows)))
+        load = total[:, line]
+        load -= (1.0 - stage.own) * x
+        load *= stage.conductance_per_count
+        load += 1.0
+        return x / load
 
     return by_press(field, sheet, work)
 

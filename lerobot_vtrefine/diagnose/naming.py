@@ -5,11 +5,12 @@ from collections.abc import Sequence
 from lerobot_vtrefine.diagnose.baseline import plain_weights
 from lerobot_vtrefine.diagnose.candidates import CATALOGUE
 from lerobot_vtrefine.diagnose.evidence import Evidence
-from lerobot_vtrefine.diagnose.fitting import Fit, predict, squared_errors
+from lerobot_vtrefine.diagnose.fitting import Fit, fit, predict, squared_errors
 from lerobot_vtrefine.diagnose.intervals import LeftOut, form_parameters, map_parameters
+from lerobot_vtrefine.diagnose.parallel import on_all_cores
 from lerobot_vtrefine.diagnose.presses import PressSet
 from lerobot_vtrefine.diagnose.screening import ALPHA
-from lerobot_vtrefine.diagnose.selection import EXTRA_GAIN, MAPS, Search, settle
+from lerobot_vtrefine.diagnose.selection import EXTRA_GAIN, MAPS, Search
 from lerobot_vtrefine.diagnose.verdict import Cause, Parameter
 
 
@@ -18,20 +19,23 @@ def named_causes(
 ) -> tuple[Cause, ...]:
     """The model's causes with parameters, evidence, and what each gains on held-out recordings."""
     full = float(squared_errors(predict(fitted.model, locked), locked).mean())
-    causes = []
-    for name in fitted.model.families:
-        slim = settle(search, fitted.model.minus(name), plain_weights(search.presses))
+
+    def named(name: str) -> Cause:
+        slim = fit(fitted.model.minus(name), search.presses, plain_weights(search.presses), SLIM_STEPS)
         without = float(squared_errors(predict(slim.model, locked), locked).mean())
-        causes.append(
-            Cause(
-                name,
-                "symptom" if role == "symptom" else "cause",
-                _parameters(search, fitted, name, left_out, seed),
-                search.p_adjusted.get(name),
-                1.0 - full / without if without > 0 else 0.0,
-            )
+        return Cause(
+            name,
+            "symptom" if role == "symptom" else "cause",
+            _parameters(search, fitted, name, left_out, seed),
+            search.p_adjusted.get(name),
+            1.0 - full / without if without > 0 else 0.0,
         )
-    return tuple(causes)
+
+    return tuple(on_all_cores(named, fitted.model.families))
+
+
+SLIM_STEPS = 5
+"""Steps of the refit that tells what held-out recordings lose without a cause."""
 
 
 def _parameters(search: Search, fitted: Fit, name: str, left_out: LeftOut, seed: int) -> dict[str, Parameter]:

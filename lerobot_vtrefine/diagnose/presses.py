@@ -148,8 +148,12 @@ class PressSet:
     """Step of the converter, 0 if readings are not on a lattice."""
 
     def subset(self, keep: list[int]) -> "PressSet":
-        """With the presses of those numbers."""
-        return replace(self, presses=tuple(self.presses[index] for index in keep))
+        """With the presses of those numbers; kept, so that what is built of it is built once."""
+        kept = self.__dict__.setdefault("_subsets", {})
+        key = tuple(keep)
+        if key not in kept:
+            kept[key] = replace(self, presses=tuple(self.presses[index] for index in keep))
+        return kept[key]
 
     @property
     def conditions(self) -> list[str]:

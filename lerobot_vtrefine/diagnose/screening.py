@@ -101,24 +101,30 @@ class Scorer:
         for k, (press, weight) in enumerate(zip(presses.presses, weights, strict=True)):
             vectors = [weight.whiten(column[k]) for column in columns]
             vectors.append(weight.whiten(press.signal - fitted.signals[k]))
-            self._fixed.append(np.stack(vectors, axis=1))
+            self._fixed.append(np.stack(vectors))
+        self._known = [weight.gram(fixed) for weight, fixed in zip(weights, self._fixed, strict=True)]
 
     def change(self, form: Form, values: np.ndarray) -> list[np.ndarray]:
         """What adding a form does to the expected signals: (T, n) per recording."""
         moved = predict(self.fitted.model.plus(form, values), self.presses, self._prefix)
         return [a - b for a, b in zip(moved, self.fitted.signals, strict=True)]
 
-    def grams(self, changes: Sequence[Sequence[np.ndarray]]) -> np.ndarray:
-        """Inner products of (own tangents, changes..., residual): (K, q, q)."""
+    def grams(self, change: Sequence[np.ndarray]) -> np.ndarray:
+        """Inner products of (own tangents, the change, residual): (K, q, q)."""
         grams = []
-        for k, (fixed, weight) in enumerate(zip(self._fixed, self.weights, strict=True)):
-            vectors = np.stack([weight.whiten(change[k]) for change in changes], axis=1)
-            grams.append(weight.gram(np.concatenate([fixed[:, :-1], vectors, fixed[:, -1:]], axis=1)))
+        for k, (fixed, known, weight) in enumerate(zip(self._fixed, self._known, self.weights, strict=True)):
+            products = weight.products(fixed, weight.whiten(change[k]))
+            last = len(products) - 2
+            order = [*range(last), last + 1, last]
+            gram = np.empty((last + 2, last + 2))
+            gram[:-1, :-1] = known
+            gram[-1] = gram[:, -1] = products
+            grams.append(gram[np.ix_(order, order)])
         return np.array(grams)
 
     def score(self, change: Sequence[np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
         """Effective scores and information (K,) of a change (T, n) per recording."""
-        return cleared(self.grams([change]))
+        return cleared(self.grams(change))
 
 
 def probe_form(form: Form, scorer: Scorer) -> list[Probe]:

@@ -1,7 +1,8 @@
 """From survivors of the screening to a model: refit, rank on recordings left out, add, swap, take away."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Collection, Sequence
 from dataclasses import dataclass, field, replace
+from functools import partial
 
 import numpy as np
 
@@ -12,6 +13,7 @@ from lerobot_vtrefine.diagnose.composite import Composite
 from lerobot_vtrefine.diagnose.crossvalidation import Score, agree, cross_validate, folds_of
 from lerobot_vtrefine.diagnose.fitting import Fit, fit, predict, tangents
 from lerobot_vtrefine.diagnose.maps import find_dead, map_evidence, with_map
+from lerobot_vtrefine.diagnose.parallel import on_all_cores
 from lerobot_vtrefine.diagnose.presses import PressSet
 from lerobot_vtrefine.diagnose.screening import ALPHA, Probe, Scorer, Screened, probe_form, screen
 from lerobot_vtrefine.diagnose.twins import walk
@@ -25,6 +27,8 @@ AGREEMENT_P = 0.05
 EXTRA_GAIN = 0.025
 """The same for causes beside the first: a little is also gained by patching up the first one's form."""
 SCOUTING_STEPS = 2
+MAP_TOLERANCE = 1e-4
+"""Relative decrease of the loss at which a map of gains needs no second turn."""
 PROMISING = 0.5
 """Part of the best candidate's gain that a plain form must reach for its family's other forms to be tried."""
 REFITTED = 6
@@ -72,16 +76,18 @@ def forms_of(family: str, fitted: Fit) -> list[Form]:
     return [form for form in CATALOGUE if form.family == family and form.possible(fitted.model.setting)]
 
 
-def all_probes(search: Search, fitted: Fit) -> list[Probe]:
-    """Probes of every candidate that the model does not hold yet."""
+def all_probes(search: Search, fitted: Fit, families: Collection[str] | None = None) -> list[Probe]:
+    """Probes of every candidate (or of those families) that the model does not hold yet."""
     _, columns = tangents(fitted.model, search.presses, fitted.model.free)
     scorer = Scorer(fitted, search.presses, search.weights, columns)
-    probes: list[Probe] = []
-    for form in CATALOGUE:
-        usable = form.screened and form.possible(fitted.model.setting)
-        if usable and form.family not in fitted.model.families:
-            probes += probe_form(form, scorer)
-    return probes
+    held = set(fitted.model.families)
+    forms = [
+        form
+        for form in CATALOGUE
+        if form.screened and form.possible(fitted.model.setting) and form.family not in held
+        if families is None or form.family in families
+    ]
+    return [probe for found in on_all_cores(partial(probe_form, scorer=scorer), forms) for probe in found]
 
 
 def refit(search: Search, fitted: Fit, form: Form, probes: Sequence[Probe]) -> Fit:
@@ -131,7 +137,10 @@ def settle(search: Search, model: Composite, weights: Sequence[TrialWeights] | N
     if model.gain_map is None:
         return fitted
     for _ in range(2):
+        before = fitted.loss
         fitted = fit(with_map(fitted, search.presses, search.weights), search.presses, weights, 4)
+        if before - fitted.loss < MAP_TOLERANCE * before:
+            break
     return fitted
 
 
@@ -278,26 +287,31 @@ def rank(search: Search, fitted: Fit, candidates: Sequence[Screened], probes: Se
     """
     base = scored(search, fitted)
     needed = EXTRA_GAIN if fitted.model.families else MIN_GAIN
+    names = [item.probe.name for item in candidates]
     plain = {}
-    for item in candidates:
-        name = item.probe.name
-        plain[name] = add(search, fitted, name, probes)
-        score = plain[name][1]
-        sure = score.gain_over(base) > needed and score.better_by(base).sum() > 0
-        if name == "dead_taxels" and sure:
+    if "dead_taxels" in names:
+        plain = {"dead_taxels": add(search, fitted, "dead_taxels", probes)}
+        score = plain["dead_taxels"][1]
+        if score.gain_over(base) > needed and score.better_by(base).sum() > 0:
             # Taxels without an answer disturb whatever else is fitted.
-            plain = {name: plain[name]}
-            break
+            names = []
+    others = [name for name in names if name not in plain]
+    plain |= dict(
+        zip(others, on_all_cores(lambda name: add(search, fitted, name, probes), others), strict=True)
+    )
     gains = {name: score.gain_over(base) for name, (_, score) in plain.items()}
     worth = PROMISING * max([0.0, *gains.values()])
-    steps = []
-    for item in candidates:
+
+    def further(item: Screened) -> tuple[Fit, Score]:
         name = item.probe.name
-        if name not in plain:
-            continue
-        found, score = plain[name]
         if gains[name] >= worth or item.probe.form not in (None, *forms_of(name, fitted)[:1]):
-            found, score = elaborate(search, fitted, name, probes, plain[name])
+            return elaborate(search, fitted, name, probes, plain[name])
+        return plain[name]
+
+    steps = []
+    tried = [item for item in candidates if item.probe.name in plain]
+    for item, (found, score) in zip(tried, on_all_cores(further, tried), strict=True):
+        name = item.probe.name
         gain, logs = score.gain_over(base), score.better_by(base)
         search.tried[name] = max(gain, search.tried.get(name, -np.inf))
         agreed = name == "dead_taxels" or agree(logs, search.seed, AGREEMENT_P)
@@ -310,12 +324,9 @@ def backward(search: Search, fitted: Fit) -> Fit:
     """Drop causes whose removal costs less than EXTRA_GAIN."""
     while len(fitted.model.families) > 1:
         full = scored(search, fitted)
-        costs = []
-        for name in fitted.model.families:
-            slim = take_away(search, fitted, name)
-            costs.append((full.gain_over(scored(search, slim)), name, slim))
-        cost, _, slim = min(costs, key=lambda item: item[0])
-        if cost >= EXTRA_GAIN:
+        slims = on_all_cores(partial(take_away, search, fitted), fitted.model.families)
+        costs = [full.gain_over(scored(search, slim)) for slim in slims]
+        if min(costs) >= EXTRA_GAIN:
             break
-        fitted = slim
+        fitted = slims[int(np.argmin(costs))]
     return fitted

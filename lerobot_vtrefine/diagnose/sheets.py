@@ -61,7 +61,9 @@ class Sheet:
     @cached_property
     def pressed(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Drive of those columns, their numbers, and the drive's rate."""
-        return self.drive[:, self.touched], self.touched, self.rate[:, self.touched]
+        # Picking columns leaves an array that lies column by column; instants are what is run through.
+        drive, rate = (np.ascontiguousarray(values[:, self.touched]) for values in (self.drive, self.rate))
+        return drive, self.touched, rate
 
     @cached_property
     def recorded(self) -> "Sheet":

@@ -25,18 +25,36 @@ class TrialWeights:
         """(T, n) counts to a vector (T*n,) of unit variance within the recording."""
         return whiten(image, self.sigma, self.memory)
 
-    def gram(self, columns: np.ndarray) -> np.ndarray:
-        """All inner products of whitened columns (T*n, p) in the full metric: (p, p)."""
-        plain = columns.T @ columns
+    def gram(self, vectors: np.ndarray) -> np.ndarray:
+        """All inner products of whitened vectors (p, T*n) in the full metric: (p, p)."""
+        plain = vectors @ vectors.T
         if not self.nuisance.shape[1]:
             return plain
-        along = self.nuisance.T @ columns
-        return plain - along.T @ self.coupling @ along
+        along = vectors @ self.nuisance
+        return plain - along @ self.coupling @ along.T
+
+    def products(self, vectors: np.ndarray, vector: np.ndarray) -> np.ndarray:
+        """Inner products of whitened vectors (p, T*n) with one more (T*n,), and last its own: (p+1,)."""
+        own, others = np.array([vector @ vector]), vectors @ vector
+        if not self.nuisance.shape[1]:
+            return np.concatenate([others, own])
+        along = vector @ self.nuisance
+        return np.concatenate(
+            [others - (vectors @ self.nuisance) @ self.coupling @ along, own - along @ self.coupling @ along]
+        )
 
 
 def whiten(image: np.ndarray, sigma: np.ndarray, memory: Whitener) -> np.ndarray:
     """Divide by sigma and take out memory: (T, n) to (T*n,)."""
-    return memory.white(image / sigma).ravel()
+    moved = image.any(axis=0)
+    if moved.all():
+        return memory.white(image / sigma).ravel()
+    if not moved.any():
+        return np.zeros(image.size)
+    # Taxels that a change does not reach need no filter.
+    white = np.zeros(image.shape)
+    white[:, moved] = memory.white(image[:, moved] / sigma[:, moved])
+    return white.ravel()
 
 
 def build_weights(

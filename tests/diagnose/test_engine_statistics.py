@@ -64,9 +64,11 @@ def test_weights_are_the_inverse_covariance() -> None:
     shared = 0.01 * signal, 1e-5 * tangent
     covariance = np.outer(sigma, sigma) * memory + sum(d @ d.T for d in shared)
     images = rng.standard_normal((2, 7, 1))
-    columns = np.stack([weight.whiten(image) for image in images], axis=1)
+    vectors = np.stack([weight.whiten(image) for image in images])
     flat = images.reshape(2, 7)
-    assert np.allclose(weight.gram(columns), flat @ np.linalg.inv(covariance) @ flat.T)
+    inverse = flat @ np.linalg.inv(covariance) @ flat.T
+    assert np.allclose(weight.gram(vectors), inverse)
+    assert np.allclose(weight.products(vectors, vectors[0]), [*inverse[0], inverse[0, 0]])
 
 
 def test_paired_p_matches_counting_all_flips() -> None:
