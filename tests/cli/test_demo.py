@@ -56,7 +56,8 @@ def test_demo_end_to_end(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> 
     assert page.count("data:video/mp4;base64,") == 6
     assert page.count("data:image/png;base64,") == 4
     for record in results["stages"]:
-        assert record["command"].replace("'", "&#39;") in page
+        assert record["command"].replace("'", "&#39;") in re.sub("</?span[^>]*>", "", page)
+    assert "imitation, failure (dropped), seed 8000001" in page
     with Image.open(config.output_dir / "demo.gif") as gif:
         assert gif.width == demo.GIF_WIDTH
 

@@ -117,8 +117,8 @@ def choose_videos(results: dict[str, Any], policy: str) -> list[dict[str, Any]]:
 
 
 def caption(policy: str, video: dict[str, Any]) -> str:
-    """For example ``after DPPO, success, seed 9000003``."""
-    outcome = "success" if video["success"] else "failure"
+    """For example ``after DPPO, failure (contact force), seed 9000003``."""
+    outcome = "success" if video["success"] else f"failure ({video['failure']})"
     return f"{NAMES[policy]}, {outcome}, seed {video['seed']}"
 
 

@@ -27,29 +27,31 @@ def load_evaluation(directory: Path, first_seed: int, num_videos: int = 0) -> di
     Returns:
         ``success``, ``episodes``, ``rate``, ``ci95``, ``eval_seconds``, ``seeds``, ``metrics`` (quantiles
         over all episodes and over successes; SI units), ``failures`` (count by reason) and ``videos``
-        (``[{"path", "seed", "success"}]``, the first ``num_videos``: ``lerobot-eval`` writes ten, the
-        environment draws fewer).
+        (``[{"path", "seed", "success", "failure"}]``, the first ``num_videos``: ``lerobot-eval`` writes ten,
+        the environment draws fewer).
     """
     info = json.loads((directory / "eval_info.json").read_text(encoding="utf-8"))
     task = info["per_task"][0]["metrics"]
     successes = [bool(value) for value in task["successes"]]
     rows = read_episode_log(directory / "episodes.jsonl", first_seed, len(successes))
+    reasons = {row["seed"]: failure_name(row) for row in rows if not row["success"]}
     videos = [
-        {"path": path, "seed": first_seed + index, "success": successes[index]}
-        for index, path in enumerate(task.get("video_paths", [])[:num_videos])
+        {"path": path, "seed": seed, "success": successes[seed - first_seed], "failure": reasons.get(seed)}
+        for seed, path in enumerate(task.get("video_paths", [])[:num_videos], first_seed)
     ]
     return proportion(sum(successes), len(successes)) | {
         "eval_seconds": round(info["overall"]["eval_s"], 1),
         "seeds": [first_seed + index for index in range(len(successes))],
         "metrics": summarise(rows),
-        "failures": dict(Counter(failure_name(row) for row in rows if not row["success"])),
+        "failures": dict(Counter(reasons.values()).most_common()),
         "videos": videos,
     }
 
 
 def failure_name(row: dict[str, Any]) -> str:
     """Why an episode failed; the simulation names no reason when the time ran out."""
-    return "time-out" if row["failure"] in (None, "", "none") else row["failure"].replace("_", " ")
+    name = row["failure"]
+    return "time-out" if name in (None, "", "none") else name.replace("in_hand", "in-hand").replace("_", " ")
 
 
 def summarise(rows: Sequence[dict[str, Any]]) -> dict[str, Any]:
