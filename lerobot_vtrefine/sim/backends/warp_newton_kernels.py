@@ -1,0 +1,316 @@
+"""Newton's method for the constraint forces, all of it in one kernel. Imports warp and mujoco_warp.
+
+One block of threads per world, from the warm start to the solution: worlds that need many steps do not keep
+the others waiting, and nothing waits for launches. Steps, line search and the criteria for stopping are those
+of `mujoco_warp.solve` for elliptic cones and a dense Jacobian.
+
+Shape legend: N worlds, nv velocities, G groups of threads that each take a part of the rows.
+"""
+
+import functools
+
+import warp as wp
+
+from lerobot_vtrefine.sim.backends.warp_rows_kernels import Cones, Rows, along_line, curvature, push
+
+wp.set_module_options({"enable_backward": False})
+
+ROUNDING = wp.constant(9.5e-7)
+"""Sums of a hundred float32 are off by about so much of what they are made of."""
+REGISTERS = 128
+"""Of a thread on a GPU: eight blocks then run beside each other on a multiprocessor."""
+LEAST_SLOPE = wp.constant(1.0e-6)
+MIN_TRACE = wp.constant(1.0e-15)
+
+
+@wp.struct
+class Inertia:
+    """Mass matrices (N, entries), as mujoco_warp keeps them, and where each entry belongs."""
+
+    values: wp.array(dtype=float, ndim=2)
+    row: wp.array(dtype=int)
+    col: wp.array(dtype=int)
+    first: wp.array(dtype=int)
+    """(nv + 1,) where each row's products with a vector begin, in `other` and `entry`."""
+    other: wp.array(dtype=int)
+    entry: wp.array(dtype=int)
+
+
+@wp.struct
+class Motion:
+    """Per world and velocity (N, nv): accelerations and generalised forces."""
+
+    start: wp.array(dtype=float, ndim=2)
+    qacc: wp.array(dtype=float, ndim=2)
+    inertial: wp.array(dtype=float, ndim=2)
+    """M qacc."""
+    smooth: wp.array(dtype=float, ndim=2)
+    constraint: wp.array(dtype=float, ndim=2)
+
+
+@wp.struct
+class Search:
+    """The solver's own memory: gradient, direction and M direction (N, nv), partial sums (N, G, nv) of the
+    constraint forces and (N, G, nv, nv) of the Hessian.
+    """
+
+    gradient: wp.array(dtype=float, ndim=2)
+    direction: wp.array(dtype=float, ndim=2)
+    pushed: wp.array(dtype=float, ndim=2)
+    force: wp.array(dtype=float, ndim=3)
+    hessian: wp.array(dtype=float, ndim=4)
+
+
+@wp.struct
+class Limits:
+    """When to stop, and (N,) how many steps it took."""
+
+    tolerance: wp.array(dtype=float)
+    line_tolerance: wp.array(dtype=float)
+    steps: int
+    line_steps: int
+    count: wp.array(dtype=int)
+
+
+@wp.func_native(snippet="WP_TILE_SYNC();")
+def wait() -> None:
+    """Until all threads of a block are here."""
+    ...
+
+
+@wp.func
+def total(value: wp.vec4) -> wp.vec4:
+    """Sum over the threads of a block."""
+    return wp.tile_reduce(wp.add, wp.tile(value, preserve_type=True))[0]
+
+
+@wp.func
+def product(world: int, dof: int, vector: wp.array(dtype=float, ndim=2), inertia: Inertia) -> float:
+    """One element of M times a vector."""
+    result = float(0.0)
+    for index in range(inertia.first[dof], inertia.first[dof + 1]):
+        result += inertia.values[world, inertia.entry[index]] * vector[world, inertia.other[index]]
+    return result
+
+
+@wp.func
+def moved(world: int, row: int, vector: wp.array(dtype=float, ndim=2), rows: Rows) -> float:
+    """One element of the Jacobian times a vector."""
+    result = float(0.0)
+    for dof in range(vector.shape[1]):
+        result += rows.jacobian[world, row, dof] * vector[world, dof]
+    return result
+
+
+@wp.func
+def begin(world: int, lane: int, count: int, motion: Motion, rows: Rows, inertia: Inertia) -> float:
+    """Accelerations of the last step and their residuals; returns the scale of the criteria, 1 / trace M."""
+    lanes = wp.block_dim()
+    nv = motion.qacc.shape[1]
+    for dof in range(lane, nv, lanes):
+        motion.qacc[world, dof] = motion.start[world, dof]
+        motion.inertial[world, dof] = product(world, dof, motion.start, inertia)
+    for row in range(lane, count, lanes):
+        rows.residual[world, row] = moved(world, row, motion.start, rows) - rows.target[world, row]
+    trace = float(0.0)
+    for entry in range(lane, inertia.row.shape[0], lanes):
+        if inertia.row[entry] == inertia.col[entry]:
+            trace += inertia.values[world, entry]
+    return 1.0 / wp.max(MIN_TRACE, total(wp.vec4(trace, 0.0, 0.0, 0.0))[0])
+
+
+@wp.func
+def slopes(world: int, lane: int, count: int, motion: Motion, search: Search, rows: Rows) -> wp.vec2:
+    """How residuals change along the direction; returns first and second derivative of the smooth cost."""
+    lanes = wp.block_dim()
+    for row in range(lane, count, lanes):
+        rows.slope[world, row] = moved(world, row, search.direction, rows)
+    sums = wp.vec4(0.0)
+    for dof in range(lane, motion.qacc.shape[1], lanes):
+        along = search.direction[world, dof]
+        unbalanced = motion.inertial[world, dof] - motion.smooth[world, dof]
+        sums += wp.vec4(along * unbalanced, along * search.pushed[world, dof], 0.0, 0.0)
+    sums = total(sums)
+    return wp.vec2(sums[0], sums[1])
+
+
+@wp.func
+def cost(
+    world: int, lane: int, count: int, step: float, smooth: wp.vec2, rows: Rows, cones: Cones
+) -> wp.vec4:
+    """Cost after a step along the direction: its change, two derivatives, and what the first is a sum of."""
+    sums = wp.vec4(0.0)
+    for row in range(lane, count, wp.block_dim()):
+        mine = along_line(world, row, step, rows, cones)
+        sums += wp.vec4(mine[0], mine[1], mine[2], wp.abs(mine[1]))
+    rate = smooth[0] + step * smooth[1]
+    whole = wp.vec4(step * (smooth[0] + 0.5 * step * smooth[1]), rate, smooth[1], wp.abs(smooth[0]))
+    return total(sums) + whole
+
+
+@wp.func
+def line_search(
+    world: int, lane: int, count: int, flat: float, most: int, smooth: wp.vec2, rows: Rows, cones: Cones
+) -> wp.vec2:
+    """Where the slope is below `flat`, by Newton's method within a bracket; returns the step and its gain,
+    zeros where there is nothing to gain.
+    """
+    point = cost(world, lane, count, 0.0, smooth, rows, cones)
+    enough = wp.max(flat, ROUNDING * point[3])
+    best = wp.vec2(0.0, 0.0)
+    if wp.abs(point[1]) < ROUNDING * point[3]:
+        return best
+    low = float(0.0)
+    high = float(-1.0)
+    step = -point[1] / wp.max(point[2], MIN_TRACE)
+    for index in range(most):
+        point = cost(world, lane, count, step, smooth, rows, cones)
+        if point[0] < -best[1]:
+            best = wp.vec2(step, -point[0])
+        if wp.abs(point[1]) < enough:
+            break
+        if point[1] < 0.0:
+            low = step
+        else:
+            high = step
+        after = step - point[1] / wp.max(point[2], MIN_TRACE)
+        if high > 0.0 and (after <= low or after >= high or index % 4 == 3):
+            after = 0.5 * (low + high)
+        if after == step:
+            break
+        step = after
+    return best
+
+
+@wp.func
+def take(world: int, lane: int, count: int, step: float, motion: Motion, search: Search, rows: Rows) -> None:
+    """Go so far along the direction."""
+    lanes = wp.block_dim()
+    for dof in range(lane, motion.qacc.shape[1], lanes):
+        motion.qacc[world, dof] += step * search.direction[world, dof]
+        motion.inertial[world, dof] += step * search.pushed[world, dof]
+    for row in range(lane, count, lanes):
+        rows.residual[world, row] += step * rows.slope[world, row]
+
+
+@wp.func
+def descend(
+    world: int, lane: int, count: int, motion: Motion, search: Search, rows: Rows, cones: Cones
+) -> float:
+    """Forces of all rows, and the gradient; returns its squared length."""
+    lanes = wp.block_dim()
+    nv = motion.qacc.shape[1]
+    groups = search.force.shape[1]
+    for row in range(lane, count, lanes):
+        push(world, row, rows, cones)
+    wait()
+    for item in range(lane, groups * nv, lanes):
+        group = item // nv
+        dof = item % nv
+        part = float(0.0)
+        for row in range(group, count, groups):
+            part += rows.jacobian[world, row, dof] * rows.force[world, row]
+        search.force[world, group, dof] = part
+    wait()
+    square = float(0.0)
+    for dof in range(lane, nv, lanes):
+        force = float(0.0)
+        for group in range(groups):
+            force += search.force[world, group, dof]
+        motion.constraint[world, dof] = force
+        slope = motion.inertial[world, dof] - motion.smooth[world, dof] - force
+        search.gradient[world, dof] = slope
+        square += slope * slope
+    return total(wp.vec4(square, 0.0, 0.0, 0.0))[0]
+
+
+@wp.func
+def bend(
+    world: int, lane: int, count: int, search: Search, rows: Rows, cones: Cones, inertia: Inertia
+) -> None:
+    """The Hessian's upper triangle, as G matrices that add up to it."""
+    lanes = wp.block_dim()
+    groups = search.hessian.shape[1]
+    nv = search.hessian.shape[2]
+    side = (nv + 3) // 4
+    per_group = side * (side + 1) // 2
+    for item in range(lane, groups * per_group, lanes):
+        group = item // per_group
+        column = int(0)
+        rest = item % per_group
+        while rest > column:
+            column += 1
+            rest -= column
+        i = 4 * rest
+        j = 4 * column
+        sums = wp.mat44(0.0)
+        for row in range(group, count, groups):
+            sums += curvature(world, row, i, j, rows, cones)
+        for a in range(4):
+            for b in range(4):
+                if i + a < nv and j + b < nv:
+                    search.hessian[world, group, i + a, j + b] = sums[a, b]
+    wait()
+    for entry in range(lane, inertia.row.shape[0], lanes):
+        search.hessian[world, 0, inertia.col[entry], inertia.row[entry]] += inertia.values[world, entry]
+    wait()
+
+
+def patches(nv: int) -> int:
+    """Four by four pieces of a Hessian's upper triangle, each of which one thread sums."""
+    side = (nv + 3) // 4
+    return side * (side + 1) // 2
+
+
+@functools.cache
+def newton_kernel(nv: int, groups: int) -> wp.Kernel:
+    """The kernel for so many velocities and groups of threads; a block of threads per world."""
+
+    @wp.kernel(module="unique", enable_backward=False, grid_stride=False, cuda_max_registers=REGISTERS)
+    def newton(
+        limits: Limits, motion: Motion, search: Search, rows: Rows, cones: Cones, inertia: Inertia
+    ) -> None:
+        world, lane = wp.tid()
+        count = wp.min(rows.count[world], rows.residual.shape[1])
+        enough = limits.tolerance[world % limits.tolerance.shape[0]]
+        line = enough * limits.line_tolerance[world % limits.line_tolerance.shape[0]]
+        scale = begin(world, lane, count, motion, rows, inertia)
+        done = bool(False)
+        length = float(0.0)
+        steps = int(0)
+        for index in range(limits.steps + 1):
+            wait()
+            gained = wp.vec2(0.0)
+            if index > 0:
+                smooth = slopes(world, lane, count, motion, search, rows)
+                wait()
+                flat = wp.max(line * length / scale, LEAST_SLOPE)
+                gained = line_search(world, lane, count, flat, limits.line_steps, smooth, rows, cones)
+                take(world, lane, count, gained[0], motion, search, rows)
+                steps = index
+                wait()
+            square = descend(world, lane, count, motion, search, rows, cones)
+            if index > 0:
+                gain = scale * gained[1]
+                done = gained[0] == 0.0 or (gain > 0.0 and gain < enough) or scale * wp.sqrt(square) < enough
+            if done or index == limits.steps:
+                break
+            bend(world, lane, count, search, rows, cones, inertia)
+            hessian = wp.tile_load(search.hessian[world, 0], shape=(nv, nv))
+            for group in range(1, groups):
+                hessian += wp.tile_load(search.hessian[world, group], shape=(nv, nv))
+            wp.tile_cholesky_inplace(hessian, fill_mode="upper")
+            gradient = wp.tile_load(search.gradient[world], shape=nv)
+            direction = wp.tile_cholesky_solve(hessian, gradient, fill_mode="upper")
+            length = wp.sqrt(wp.tile_sum(wp.tile_map(wp.mul, direction, direction))[0])
+            expected = wp.tile_sum(wp.tile_map(wp.mul, direction, gradient))[0]
+            if index > 0 and scale * 0.5 * expected < enough:
+                break
+            wp.tile_store(search.direction[world], wp.tile_map(wp.neg, direction))
+            wait()
+            for dof in range(lane, nv, wp.block_dim()):
+                search.pushed[world, dof] = product(world, dof, search.direction, inertia)
+        if lane == 0:
+            limits.count[world] = steps
+
+    return newton

@@ -1,0 +1,339 @@
+"""Constraint rows as functions of the accelerations: forces, cost along a line, curvature. Imports warp.
+
+MuJoCo's cost of a row with residual r and stiffness D: an equality D/2 r^2, a limit the same where r < 0, dry
+friction the same as far as its force is below the loss, and linear beyond. A contact with friction has one
+cost for all of its rows: with n = mu r_0 and t = |f_k r_k| nothing where n >= mu t, D_k/2 r_k^2 summed where
+mu n + t <= 0, and s/2 (n - mu t)^2 between (it slides), s = D_0 / (mu^2 (1 + mu^2)).
+
+Shape legend: N worlds, C contacts, nv velocities.
+"""
+
+import warp as wp
+from mujoco_warp._src.types import ConstraintState, ConstraintType
+
+wp.set_module_options({"enable_backward": False})
+
+ELLIPTIC = wp.constant(int(ConstraintType.CONTACT_ELLIPTIC))
+FREE = wp.constant(int(ConstraintState.SATISFIED))
+QUADRATIC = wp.constant(int(ConstraintState.QUADRATIC))
+LINEAR_NEGATIVE = wp.constant(int(ConstraintState.LINEARNEG))
+LINEAR_POSITIVE = wp.constant(int(ConstraintState.LINEARPOS))
+SLIDING = wp.constant(int(ConstraintState.CONE))
+TINY = wp.constant(1.0e-15)
+
+
+@wp.struct
+class Rows:
+    """Constraint rows of N worlds, as mujoco_warp keeps them, (N, rows) each, and what the solver adds."""
+
+    equalities: wp.array(dtype=int)
+    """(N,): they come first, then dry friction, limits and contacts."""
+    frictions: wp.array(dtype=int)
+    count: wp.array(dtype=int)
+    kind: wp.array(dtype=int, ndim=2)
+    contact: wp.array(dtype=int, ndim=2)
+    stiffness: wp.array(dtype=float, ndim=2)
+    loss: wp.array(dtype=float, ndim=2)
+    target: wp.array(dtype=float, ndim=2)
+    jacobian: wp.array(dtype=float, ndim=3)
+    force: wp.array(dtype=float, ndim=2)
+    state: wp.array(dtype=int, ndim=2)
+    residual: wp.array(dtype=float, ndim=2)
+    slope: wp.array(dtype=float, ndim=2)
+    """Change of the residual along the search direction."""
+
+
+@wp.struct
+class Cones:
+    """Contacts (C,): which rows each has, its friction, and the solver's ratio of the impedances."""
+
+    row: wp.array(dtype=int, ndim=2)
+    dim: wp.array(dtype=int)
+    friction: wp.array(dtype=float, ndim=2)
+    ratio: wp.array(dtype=float)
+
+
+@wp.func
+def is_whole(contact: int, row: int, cones: Cones) -> bool:
+    """Whether `row` is the first of a contact's rows and the buffer had room for all of them."""
+    return cones.row[contact, 0] == row and cones.row[contact, cones.dim[contact] - 1] >= 0
+
+
+@wp.func
+def mu_of(world: int, contact: int, cones: Cones) -> float:
+    """Friction that the solver's cone has once it is made circular."""
+    return cones.friction[contact, 0] * cones.ratio[world % cones.ratio.shape[0]]
+
+
+@wp.func
+def set_row(world: int, row: int, force: float, state: int, rows: Rows) -> None:
+    """Write one row."""
+    rows.force[world, row] = force
+    rows.state[world, row] = state
+
+
+@wp.func
+def push_cone(world: int, row: int, contact: int, rows: Rows, cones: Cones) -> None:
+    """Forces of a contact's rows."""
+    dim = cones.dim[contact]
+    mu = mu_of(world, contact, cones)
+    n = mu * rows.residual[world, row]
+    square = float(0.0)
+    for k in range(1, dim):
+        u = cones.friction[contact, k - 1] * rows.residual[world, cones.row[contact, k]]
+        square += u * u
+    t = wp.sqrt(square)
+    if n >= mu * t:
+        for k in range(dim):
+            set_row(world, cones.row[contact, k], 0.0, FREE, rows)
+    elif mu * n + t <= 0.0:
+        for k in range(dim):
+            other = cones.row[contact, k]
+            force = -rows.stiffness[world, other] * rows.residual[world, other]
+            set_row(world, other, force, QUADRATIC, rows)
+    else:
+        pull = rows.stiffness[world, row] / wp.max(mu * mu * (1.0 + mu * mu), TINY) * mu * (mu * t - n)
+        set_row(world, row, pull, SLIDING, rows)
+        for k in range(1, dim):
+            other = cones.row[contact, k]
+            friction = cones.friction[contact, k - 1]
+            share = friction * friction * rows.residual[world, other] / t
+            set_row(world, other, -pull * share, SLIDING, rows)
+
+
+@wp.func
+def push(world: int, row: int, rows: Rows, cones: Cones) -> None:
+    """Force and state of a row; of a whole contact where it is the first of one."""
+    if rows.kind[world, row] == ELLIPTIC:
+        contact = rows.contact[world, row]
+        if is_whole(contact, row, cones):
+            push_cone(world, row, contact, rows, cones)
+        return
+    residual = rows.residual[world, row]
+    force = -rows.stiffness[world, row] * residual
+    state = int(QUADRATIC)
+    equalities = rows.equalities[world]
+    if row >= equalities:
+        if row < equalities + rows.frictions[world]:
+            loss = rows.loss[world, row]
+            if force >= loss:
+                force = loss
+                state = LINEAR_NEGATIVE
+            elif force <= -loss:
+                force = -loss
+                state = LINEAR_POSITIVE
+        elif residual >= 0.0:
+            force = 0.0
+            state = FREE
+    set_row(world, row, force, state, rows)
+
+
+@wp.func
+def quadratic(stiffness: float, residual: float, slope: float, step: float) -> wp.vec3:
+    """D/2 r^2 along a line: its change, and its first two derivatives."""
+    rate = stiffness * slope
+    return wp.vec3(
+        rate * step * (residual + 0.5 * step * slope), rate * (residual + step * slope), rate * slope
+    )
+
+
+@wp.func
+def dry(stiffness: float, loss: float, residual: float, slope: float, step: float) -> wp.vec3:
+    """Dry friction along a line: change of the cost, first two derivatives."""
+    edge = loss / wp.max(stiffness, TINY)
+    after = residual + step * slope
+    if wp.abs(residual) < edge and wp.abs(after) < edge:
+        return quadratic(stiffness, residual, slope, step)
+    if residual <= -edge and after <= -edge:
+        return wp.vec3(-loss * step * slope, -loss * slope, 0.0)
+    if residual >= edge and after >= edge:
+        return wp.vec3(loss * step * slope, loss * slope, 0.0)
+    change = huber(stiffness, loss, edge, after) - huber(stiffness, loss, edge, residual)
+    if wp.abs(after) < edge:
+        return wp.vec3(change, stiffness * after * slope, stiffness * slope * slope)
+    return wp.vec3(change, wp.where(after > 0.0, loss, -loss) * slope, 0.0)
+
+
+@wp.func
+def huber(stiffness: float, loss: float, edge: float, residual: float) -> float:
+    """Cost of dry friction."""
+    if wp.abs(residual) < edge:
+        return 0.5 * stiffness * residual * residual
+    return loss * (wp.abs(residual) - 0.5 * edge)
+
+
+@wp.func
+def limit(stiffness: float, residual: float, slope: float, step: float) -> wp.vec3:
+    """A limit along a line: change of the cost, first two derivatives."""
+    after = residual + step * slope
+    if residual < 0.0 and after < 0.0:
+        return quadratic(stiffness, residual, slope, step)
+    if after < 0.0:
+        return wp.vec3(0.5 * stiffness * after * after, stiffness * after * slope, stiffness * slope * slope)
+    if residual < 0.0:
+        return wp.vec3(-0.5 * stiffness * residual * residual, 0.0, 0.0)
+    return wp.vec3(0.0)
+
+
+@wp.func
+def slide(world: int, contact: int, rows: Rows, cones: Cones) -> wp.vec4:
+    """A contact's tangential residuals u and their slopes w: |u|, u along w, u across w, |w|."""
+    uu = float(0.0)
+    uw = float(0.0)
+    ww = float(0.0)
+    for k in range(1, cones.dim[contact]):
+        other = cones.row[contact, k]
+        u = cones.friction[contact, k - 1] * rows.residual[world, other]
+        w = cones.friction[contact, k - 1] * rows.slope[world, other]
+        uu += u * u
+        uw += u * w
+        ww += w * w
+    speed = wp.sqrt(ww)
+    along = uw / wp.max(speed, TINY)
+    across = float(0.0)
+    for k in range(1, cones.dim[contact]):
+        other = cones.row[contact, k]
+        u = cones.friction[contact, k - 1] * rows.residual[world, other]
+        w = cones.friction[contact, k - 1] * rows.slope[world, other]
+        rest = u - along * w / wp.max(speed, TINY)
+        across += rest * rest
+    return wp.vec4(wp.sqrt(uu), along, wp.sqrt(across), speed)
+
+
+@wp.func
+def cone(world: int, row: int, contact: int, step: float, rows: Rows, cones: Cones) -> wp.vec3:
+    """A contact along a line: change of the cost, first two derivatives.
+
+    The tangential residual's length t is put together from its parts along and across the line, which keeps
+    the digits that u.u + 2 a u.w + a^2 w.w loses.
+    """
+    mu = mu_of(world, contact, cones)
+    first = rows.residual[world, row]
+    first_slope = rows.slope[world, row]
+    bottom = wp.vec3(0.0)
+    whole = float(0.0)
+    for k in range(cones.dim[contact]):
+        other = cones.row[contact, k]
+        residual = rows.residual[world, other]
+        stiffness = rows.stiffness[world, other]
+        bottom += quadratic(stiffness, residual, rows.slope[world, other], step)
+        whole += stiffness * residual * residual
+    parts = slide(world, contact, rows, cones)
+    before = parts[0]
+    along = parts[1]
+    across = parts[2] * parts[2]
+    speed = parts[3]
+    reached = along + step * speed
+    t = wp.sqrt(across + reached * reached)
+    scale = rows.stiffness[world, row] / wp.max(mu * mu * (1.0 + mu * mu), TINY)
+    n = mu * (first + step * first_slope)
+    zone_before = zone(mu * first, before, mu)
+    zone_after = zone(n, t, mu)
+    gap_before = mu * (first - before)
+    gap = n - mu * t
+    cost_before = wp.where(zone_before == SLIDING, 0.5 * scale * gap_before * gap_before, 0.0)
+    if zone_before == QUADRATIC:
+        cost_before = 0.5 * whole
+    if zone_after == FREE:
+        return wp.vec3(-cost_before, 0.0, 0.0)
+    if zone_after == QUADRATIC:
+        rise = 0.5 * whole - cost_before
+        return wp.vec3(wp.where(zone_before == QUADRATIC, 0.0, rise) + bottom[0], bottom[1], bottom[2])
+    turn = speed * reached / wp.max(t, TINY)
+    bend = speed * speed * (across / wp.max(t * t, TINY * TINY)) / wp.max(t, TINY)
+    rate = mu * (first_slope - turn)
+    change = 0.5 * scale * gap * gap - cost_before
+    if zone_before == SLIDING:
+        longer = step * speed * (along + reached) / wp.max(t + before, TINY)
+        change = 0.5 * scale * mu * (step * first_slope - longer) * (gap + gap_before)
+    return wp.vec3(change, scale * gap * rate, scale * (rate * rate - gap * mu * bend))
+
+
+@wp.func
+def zone(n: float, t: float, mu: float) -> int:
+    """What a contact does at normal and tangential residual n and t."""
+    if n >= mu * t:
+        return FREE
+    if mu * n + t <= 0.0:
+        return QUADRATIC
+    return SLIDING
+
+
+@wp.func
+def along_line(world: int, row: int, step: float, rows: Rows, cones: Cones) -> wp.vec3:
+    """A row's cost along the search direction: change since step 0, first two derivatives; of a whole contact
+    where it is the first of one.
+    """
+    if rows.kind[world, row] == ELLIPTIC:
+        contact = rows.contact[world, row]
+        if is_whole(contact, row, cones):
+            return cone(world, row, contact, step, rows, cones)
+        return wp.vec3(0.0)
+    residual = rows.residual[world, row]
+    slope = rows.slope[world, row]
+    stiffness = rows.stiffness[world, row]
+    equalities = rows.equalities[world]
+    if row < equalities:
+        return quadratic(stiffness, residual, slope, step)
+    if row < equalities + rows.frictions[world]:
+        return dry(stiffness, rows.loss[world, row], residual, slope, step)
+    return limit(stiffness, residual, slope, step)
+
+
+@wp.func
+def four(world: int, row: int, first: int, rows: Rows) -> wp.vec4:
+    """Four neighbours of a row of the Jacobian, the last one again beyond its end."""
+    last = rows.jacobian.shape[2] - 1
+    return wp.vec4(
+        rows.jacobian[world, row, first],
+        rows.jacobian[world, row, wp.min(first + 1, last)],
+        rows.jacobian[world, row, wp.min(first + 2, last)],
+        rows.jacobian[world, row, wp.min(first + 3, last)],
+    )
+
+
+@wp.func
+def cone_curvature(world: int, row: int, contact: int, i: int, j: int, rows: Rows, cones: Cones) -> wp.mat44:
+    """Second derivatives of a sliding contact's cost by velocities i to i + 3 and j to j + 3.
+
+    With z = dn and u_k = f_k r_k, v_k of the Jacobian's columns alike, and p = u.v / t:
+    s (z_i z_j - mu (z_i p_j + p_i z_j) + (mu^2 - mu n / t) v_i.v_j + mu n / t p_i p_j).
+    """
+    mu = mu_of(world, contact, cones)
+    scale = rows.stiffness[world, row] / wp.max(mu * mu * (1.0 + mu * mu), TINY)
+    z_i = mu * four(world, row, i, rows)
+    z_j = mu * four(world, row, j, rows)
+    square = float(0.0)
+    p_i = wp.vec4(0.0)
+    p_j = wp.vec4(0.0)
+    both = wp.mat44(0.0)
+    for k in range(1, cones.dim[contact]):
+        other = cones.row[contact, k]
+        friction = cones.friction[contact, k - 1]
+        u = friction * rows.residual[world, other]
+        v_i = friction * four(world, other, i, rows)
+        v_j = friction * four(world, other, j, rows)
+        square += u * u
+        p_i += u * v_i
+        p_j += u * v_j
+        both += wp.outer(v_i, v_j)
+    t = wp.max(wp.sqrt(square), TINY)
+    p_i = p_i / t
+    p_j = p_j / t
+    share = mu * mu * rows.residual[world, row] / t
+    total = wp.outer(z_i - mu * p_i, z_j) - wp.outer(mu * z_i - share * p_i, p_j) + (mu * mu - share) * both
+    return scale * total
+
+
+@wp.func
+def curvature(world: int, row: int, i: int, j: int, rows: Rows, cones: Cones) -> wp.mat44:
+    """What a row adds to the Hessian's entries (i..i+3, j..j+3); a whole contact where it slides."""
+    state = rows.state[world, row]
+    if state == QUADRATIC:
+        left = rows.stiffness[world, row] * four(world, row, i, rows)
+        return wp.outer(left, four(world, row, j, rows))
+    if state == SLIDING:
+        contact = rows.contact[world, row]
+        if is_whole(contact, row, cones):
+            return cone_curvature(world, row, contact, i, j, rows, cones)
+    return wp.mat44(0.0)
