@@ -103,8 +103,7 @@ COLUMNS: tuple[tuple[str, str, Callable[[WorldsRow], float]], ...] = (
 
 def _measure(warp: WarpConfig, count: int, steps: int, scene: SceneConfig) -> WorldsRow:
     device = warp.device
-    gc.collect()
-    torch.cuda.empty_cache()  # nothing without a GPU
+    _give_back()
     before, ids = _memory_gib(device), np.arange(count)
     start = time.perf_counter()
     sim = InsertionSim(scene, num_envs=count, backend="warp", warp=warp)
@@ -150,6 +149,14 @@ def _seconds(work: Callable[[], object]) -> float:
     start = time.perf_counter()
     work()  # everything measured here ends on the host, and so waits for the device
     return time.perf_counter() - start
+
+
+def _give_back() -> None:
+    """Let the driver have back what the simulation before held: what it frees later would count as ours."""
+    gc.collect()
+    if torch.cuda.is_available():
+        torch.cuda.synchronize()  # only then do the pools let go of what was freed
+        torch.cuda.empty_cache()
 
 
 def _memory_gib(device: str) -> float:
