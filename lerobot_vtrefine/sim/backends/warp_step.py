@@ -1,9 +1,9 @@
 """One physics step on mujoco_warp, in an order that suits a GPU. Imports warp and mujoco_warp.
 
 The same functions in the same roles as `mujoco_warp.step`, so the same physics, but
-- what does not depend on contacts (inertia, bias forces, servos) runs beside the search for contacts, on a
-  stream of its own: a step of a thousand worlds is some ninety small kernels, which wait for each other
-  longer than they work;
+- what does not depend on contacts (inertia, bias forces, servos, other constraints) runs beside the search
+  for contacts, on a stream of its own: a step of a thousand worlds is some sixty small kernels, which wait
+  for each other longer than they work;
 - pairs of geoms that a face of a box separates are dropped before the general convex collision, two thirds of
   them while a round plug is in its hole (at a thousand worlds on an H200 this neither gains nor costs);
 - contact sensors are summed contact by contact, and nothing is computed that this package does not read
@@ -21,6 +21,7 @@ import warp as wp
 from mujoco_warp._src import collision_driver, forward, smooth
 
 from lerobot_vtrefine.sim.backends import warp_contact_kernels as kernels
+from lerobot_vtrefine.sim.backends.warp_constraint import add_contact_rows, rows_without_contacts
 from lerobot_vtrefine.sim.backends.warp_solve import solve
 
 NET_FORCE = 3
@@ -43,6 +44,7 @@ class WarpStep:
     def __init__(self, host: mujoco.MjModel, model: mjw.Model, data: mjw.Data, concurrent: bool) -> None:
         self._model, self._data = model, data
         self._side = wp.Stream(wp.get_device()) if concurrent else None
+        self._marked = wp.Event(wp.get_device()) if concurrent else None
         own, other = _sides(host)
         self._own, self._other = wp.array(own, dtype=int), wp.array(other, dtype=int)
         self._addresses = wp.array(host.sensor_adr.astype(np.int32), dtype=int)
@@ -60,9 +62,12 @@ class WarpStep:
         mjw.com_pos(model, data)
         mjw.tendon(model, data)
         with self._on_the_side():
+            rows_without_contacts(model, data)
+            self._mark()
             self._smooth()
         self._collide()
-        mjw.make_constraint(model, data)
+        self._wait_for_mark()
+        add_contact_rows(model, data)
         self._join()
         solve(model, data)
         self._read_contacts()
@@ -75,6 +80,14 @@ class WarpStep:
             return
         with wp.ScopedStream(self._side, sync_enter=True):
             yield
+
+    def _mark(self) -> None:
+        if self._side is not None:
+            wp.record_event(self._marked)
+
+    def _wait_for_mark(self) -> None:
+        if self._side is not None:
+            wp.wait_event(self._marked)
 
     def _join(self) -> None:
         if self._side is not None:
