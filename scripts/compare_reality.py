@@ -13,14 +13,13 @@ interrupted and started again, it continues. Results: ``comparison.json`` and ``
 import argparse
 import json
 import os
-import subprocess
 import sys
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-from compare_touch import interval_text, run_all
+from compare_touch import interval_text, run_all, run_script, save
 
 from lerobot_vtrefine.cli.pipeline.demo_config import (
     SEED_STRIDE,
@@ -369,16 +368,8 @@ def main() -> None:
             min(options.jobs, len(together)),
         )
     results = compare(budget)
-    text = as_text(results)
-    (budget.output_dir / "comparison.json").write_text(json.dumps(results, indent=2) + "\n", encoding="utf-8")
-    (budget.output_dir / "comparison.md").write_text(text + "\n", encoding="utf-8")
-    print(f"\n{text}")
+    save(budget.output_dir, results, as_text(results))
 
 
 if __name__ == "__main__":
-    try:
-        main()
-    except subprocess.CalledProcessError as error:
-        sys.exit(error.returncode)
-    except KeyboardInterrupt:
-        sys.exit(130)
+    run_script(main)

@@ -16,6 +16,7 @@ import shutil
 import subprocess
 import sys
 import time
+from collections.abc import Callable
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -227,12 +228,7 @@ def main() -> None:
     }
     run_all({folder: demo_command(folder, run, extra) for run, folder in folders.items()}, options.jobs)
     comparisons = {setting: compare(results_of(folders, setting)) for setting in options.settings}
-    text = as_text(comparisons)
-    (options.output_dir / "comparison.json").write_text(
-        json.dumps(comparisons, indent=2) + "\n", encoding="utf-8"
-    )
-    (options.output_dir / "comparison.md").write_text(text + "\n", encoding="utf-8")
-    print(f"\n{text}")
+    save(options.output_dir, comparisons, as_text(comparisons))
 
 
 def results_of(folders: dict[Run, Path], setting: str) -> dict[str, dict[int, dict]]:
@@ -245,10 +241,22 @@ def results_of(folders: dict[Run, Path], setting: str) -> dict[str, dict[int, di
     return results
 
 
-if __name__ == "__main__":
+def save(folder: Path, comparison: dict[str, Any], text: str) -> None:
+    """Keep a comparison as ``comparison.json`` and ``comparison.md``, and print it."""
+    (folder / "comparison.json").write_text(json.dumps(comparison, indent=2) + "\n", encoding="utf-8")
+    (folder / "comparison.md").write_text(text + "\n", encoding="utf-8")
+    print(f"\n{text}")
+
+
+def run_script(entry: Callable[[], None]) -> None:
+    """Run a script's entry; it ends with the status of the pipeline that failed, or 130 when interrupted."""
     try:
-        main()
+        entry()
     except subprocess.CalledProcessError as error:
         sys.exit(error.returncode)
     except KeyboardInterrupt:
         sys.exit(130)
+
+
+if __name__ == "__main__":
+    run_script(main)

@@ -141,3 +141,16 @@ def test_settings_are_compared_one_by_one(
     flags = json.loads((out / "slip" / "visual_0" / "results.json").read_text())["flags"]
     assert json.loads(flags["env"])["rules"] == {"grasped": {"slip_m": 0.004, "slip_rad": 0.1}}
     assert "| short_chunk | after DPPO |" in (out / "comparison.md").read_text()
+
+
+@pytest.mark.parametrize(
+    ("error", "status"),
+    [(subprocess.CalledProcessError(3, ["vtrefine-demo"]), 3), (KeyboardInterrupt(), 130)],
+)
+def test_a_failure_is_the_scripts_status(script: ModuleType, error: BaseException, status: int) -> None:
+    def entry() -> None:
+        raise error
+
+    with pytest.raises(SystemExit) as ended:
+        script.run_script(entry)
+    assert ended.value.code == status
