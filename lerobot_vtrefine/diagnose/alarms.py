@@ -16,6 +16,9 @@ from lerobot_vtrefine.tactile.replay import NO_BODY_M
 REPEATABLE_P, REPEATABLE_SHARE = 0.01, 0.15
 MIN_RMS = 0.4 / 255.0
 """Repeatable residual below this part of full scale may be the converter's rounding."""
+MISFIT, MISFIT_NOISE = 0.1, 1.0 / 3.0
+"""Parts of the baseline's repeatable squared error, and of the squared error that is left, up to which what
+still repeats is laid to the names' form. Effects outside the catalogue that borrow names leave a fifth."""
 FLIPS = 4999
 PAIR_CORRELATION, PAIR_DEVIATIONS, MIN_STRANGERS = 0.2, 6.0, 30
 LINE_RATIO = 8.0
@@ -64,33 +67,62 @@ def _under_edge(press: Press) -> np.ndarray:
     return edge
 
 
-def replicate_alarm(presses: PressSet, residuals: Sequence[np.ndarray], seed: int) -> Alarm | None:
-    """Products of residuals between replicates estimate what repeats; None without replicates."""
-    groups: dict[str, list[int]] = defaultdict(list)
-    for index, name in enumerate(presses.conditions):
-        groups[name].append(index)
-    pairs, products, powers, sizes = [], [], [], []
-    for members in groups.values():
-        for i, j in combinations(members, 2):
-            both = _aligned(presses, residuals, i, j)
-            if both is None:
-                continue
-            pairs.append((i, j))
-            products.append(float((both[0] * both[1]).sum()))
-            powers.append(0.5 * float((both[0] ** 2 + both[1] ** 2).sum()))
-            sizes.append(both[0].size)
+@dataclass(frozen=True)
+class _Replicated:
+    """Pairs of replicates (P, 2), the sum of the products of their residuals and their mean power (P,)."""
+
+    pairs: np.ndarray
+    products: np.ndarray
+    powers: np.ndarray
+    readings: int
+
+
+def _replicated(presses: PressSet, residuals: Sequence[np.ndarray]) -> _Replicated | None:
+    """None with fewer than two pairs."""
+    names = presses.conditions
+    pairs, products, powers, readings = [], [], [], 0
+    for i, j in combinations(range(len(names)), 2):
+        both = _aligned(presses, residuals, i, j) if names[i] == names[j] else None
+        if both is None:
+            continue
+        pairs.append((i, j))
+        products.append(float((both[0] * both[1]).sum()))
+        powers.append(0.5 * float((both[0] ** 2 + both[1] ** 2).sum()))
+        readings += both[0].size
     if len(pairs) < 2:
         return None
-    seen, power = float(np.sum(products)), max(float(np.sum(powers)), 1e-12)
+    return _Replicated(np.array(pairs), np.array(products), np.array(powers), readings)
+
+
+def only_misfit(presses: PressSet, before: Sequence[np.ndarray], after: Sequence[np.ndarray]) -> bool:
+    """Whether what still repeats between replicates is little beside what the named causes took away, and
+    beside noise: then their form is not quite the sensor's, which is no unknown cause.
+
+    Args:
+        before, after: residuals (T, n) of the baseline and of the extended model [counts].
+    """
+    plain, extended = _replicated(presses, before), _replicated(presses, after)
+    if plain is None or extended is None:
+        return False
+    left = float(extended.products.sum())
+    return left < MISFIT * float(plain.products.sum()) and left < MISFIT_NOISE * float(extended.powers.sum())
+
+
+def replicate_alarm(presses: PressSet, residuals: Sequence[np.ndarray], seed: int) -> Alarm | None:
+    """Products of residuals between replicates estimate what repeats; None without replicates."""
+    found = _replicated(presses, residuals)
+    if found is None:
+        return None
+    seen, power = float(found.products.sum()), max(float(found.powers.sum()), 1e-12)
     rng = np.random.default_rng([seed, 9])
     signs = rng.integers(0, 2, (FLIPS, len(presses.presses))) * 2.0 - 1.0
-    first, second = np.array(pairs).T
-    flipped = (signs[:, first] * signs[:, second]) @ np.array(products)
+    first, second = found.pairs.T
+    flipped = (signs[:, first] * signs[:, second]) @ found.products
     p_value = float((1 + (flipped >= seen - 1e-9 * abs(seen)).sum()) / (1 + FLIPS))
     share = seen / power
-    rms = np.sqrt(max(seen, 0.0) / max(sum(sizes), 1))
+    rms = np.sqrt(max(seen, 0.0) / max(found.readings, 1))
     fired = (
-        p_value < max(REPEATABLE_P, 1.5 * 2.0 ** -len(groups))
+        p_value < max(REPEATABLE_P, 1.5 * 2.0 ** -len(set(presses.conditions)))
         and share > REPEATABLE_SHARE
         and rms > MIN_RMS * presses.full_scale
     )

@@ -7,6 +7,7 @@ from typing import Any
 import numpy as np
 
 from lerobot_vtrefine.diagnose.fields import Context, Field, by_press
+from lerobot_vtrefine.diagnose.rhythm import slots
 from lerobot_vtrefine.tactile.stages.host import Latency, SampleAndHold, ScanSkew
 from lerobot_vtrefine.tactile.stages.mechanics import Hysteresis, ViscoelasticRelaxation
 
@@ -75,12 +76,16 @@ def _scan_skew(stage: ScanSkew, field: Field, context: Context) -> Field:
 
 
 def _hold(stage: SampleAndHold, field: Field, context: Context) -> Field:
-    def work(x: np.ndarray, time_s: np.ndarray, rows: np.ndarray) -> np.ndarray:
-        slot = np.floor(time_s / stage.period_s + 1e-6).astype(np.int64)
+    """A free board's instants are those that the recording itself shows."""
+    sheet, out = context.sheet, np.zeros_like(field.values)
+    for press, (time_s, rhythm) in enumerate(zip(sheet.times_s, sheet.rhythms, strict=True)):
+        phase = rhythm.phase(float(stage.period_s)) if stage.free else 0.0
+        slot = slots(time_s, float(stage.period_s), phase)
         new = np.concatenate([[True], slot[1:] != slot[:-1]])
-        return x[np.maximum.accumulate(np.where(new, np.arange(len(slot)), 0))]
-
-    return by_press(field, context.sheet, work)
+        part = field.within(sheet, press)
+        held = np.maximum.accumulate(np.where(new, np.arange(len(slot)), 0))
+        out[: len(time_s), part] = field.values[: len(time_s), part][held]
+    return Field(out, field.columns)
 
 
 def play(x: np.ndarray, half_width: float | np.ndarray) -> np.ndarray:

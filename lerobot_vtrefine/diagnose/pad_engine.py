@@ -137,7 +137,7 @@ def _diagnose(
     tell("rival explanations", 0.62)
     rivals = find_ambiguities(search, fitted, baseline.noise)
     tell("structure that no cause explains", 0.75)
-    suspicion = look_for_unknowns(search, fitted)
+    suspicion = look_for_unknowns(search, fitted, baseline.plain)
     tell("held-out recordings", 0.85)
     return _conclude(everyone, locked, baseline, search, fitted, rivals, suspicion, seed, issues)
 

@@ -7,6 +7,7 @@ import numpy as np
 from lerobot_vtrefine.diagnose.indenters import trial_forces
 from lerobot_vtrefine.diagnose.recordings import RecordingSet, Trial
 from lerobot_vtrefine.diagnose.refinement import Kind, instants_of, motion
+from lerobot_vtrefine.diagnose.rhythm import Rhythm
 from lerobot_vtrefine.tactile.layout import PadLayout
 
 MARGIN_TAXELS = 2
@@ -109,6 +110,14 @@ class Press:
         if self.loaded:
             drive, rate = self.layout.cut(drive), self.layout.cut(rate)
         return Course(times, drive - self.sunk_m, rate, frames)
+
+    @property
+    def rhythm(self) -> Rhythm:
+        """When readings were new; kept with the press."""
+        kept = self.__dict__.get("_rhythm")
+        if kept is None:
+            kept = self.__dict__["_rhythm"] = Rhythm.of(self.time_s, self.signal, self.touching)
+        return kept
 
     def sunk(self, by_m: float) -> "Press":
         """The same press with the face lowered."""

@@ -9,6 +9,7 @@ import numpy as np
 from lerobot_vtrefine.diagnose.baseline import Baseline, weigh
 from lerobot_vtrefine.diagnose.candidates import CATALOGUE
 from lerobot_vtrefine.diagnose.candidates.base import Form
+from lerobot_vtrefine.diagnose.candidates.sample_and_hold import pattern
 from lerobot_vtrefine.diagnose.composite import Composite
 from lerobot_vtrefine.diagnose.crossvalidation import Score, agree, cross_validate, folds_of
 from lerobot_vtrefine.diagnose.fitting import Fit, fit, predict, tangents
@@ -224,6 +225,18 @@ def map_probes(search: Search, fitted: Fit) -> list[Probe]:
     return found
 
 
+def hold_probe(search: Search, fitted: Fit) -> Probe | None:
+    """Readings that repeat bit for bit, in a rhythm, are held whatever the motion: that needs no flips."""
+    if "sample_and_hold" in fitted.model.families:
+        return None
+    rhythm = pattern(search.presses, fitted.model.setting.frame_s)
+    if rhythm is None:
+        return None
+    size = np.array([1e9])
+    form = forms_of("sample_and_hold", fitted)[int(rhythm.free)]
+    return Probe("sample_and_hold", form, np.array([rhythm.period_s]), size, size, True, 1e-4)
+
+
 def survivors(found: dict[str, Screened]) -> list[Screened]:
     """Candidates that pass the screening, the most promising first."""
     passed = [item for item in found.values() if item.p_adjusted <= ALPHA]
@@ -234,6 +247,9 @@ def forward(search: Search, fitted: Fit, tell: Callable[[str, float], None]) -> 
     """Add causes one by one while one takes away at least MIN_GAIN on recordings left out."""
     for number in range(MAX_CAUSES):
         probes = [*all_probes(search, fitted), *map_probes(search, fitted)]
+        hold = hold_probe(search, fitted)
+        if hold is not None:
+            probes = [*(probe for probe in probes if probe.name != hold.name), hold]
         found = screen(probes, len(search.weights), search.seed)
         if not number:
             search.screened = found

@@ -9,6 +9,7 @@ import numpy as np
 
 from lerobot_vtrefine.diagnose.presses import MARGIN_TAXELS, Press
 from lerobot_vtrefine.diagnose.refinement import Kind
+from lerobot_vtrefine.diagnose.rhythm import Rhythm
 from lerobot_vtrefine.tactile.layout import PadLayout
 
 LONG = 1.3
@@ -42,6 +43,8 @@ class Sheet:
     idle: np.ndarray
     """Idle level of every column's taxel (M,) [counts]."""
     loaded: bool
+    rhythms: tuple[Rhythm, ...]
+    """When each press's readings were new."""
 
     @cached_property
     def rows(self) -> np.ndarray:
@@ -135,4 +138,5 @@ def _build(everyone: Sequence[Press], members: list[int], idle: np.ndarray, kind
         tuple(scored),
         idle.ravel()[taxels],
         loaded,
+        tuple(press.rhythm for press in presses),
     )

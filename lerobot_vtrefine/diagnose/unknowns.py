@@ -1,11 +1,18 @@
 """Whether structure is left that no named cause accounts for."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
-from lerobot_vtrefine.diagnose.alarms import Alarm, cleaned, line_alarm, pair_alarm, replicate_alarm
+from lerobot_vtrefine.diagnose.alarms import (
+    Alarm,
+    cleaned,
+    line_alarm,
+    only_misfit,
+    pair_alarm,
+    replicate_alarm,
+)
 from lerobot_vtrefine.diagnose.descriptors import DESCRIPTORS, Descriptor
 from lerobot_vtrefine.diagnose.fitting import Fit, tangents
 from lerobot_vtrefine.diagnose.presses import PressSet
@@ -36,8 +43,8 @@ class Found:
     share: float
 
 
-def look_for_unknowns(search: Search, fitted: Fit) -> Suspicion:
-    """Run the three alarms on the extended model's residuals."""
+def look_for_unknowns(search: Search, fitted: Fit, baseline: Fit) -> Suspicion:
+    """Run the alarms on the extended model's residuals; what names' forms leave of their own is none."""
     residuals = cleaned(fitted, search.presses, search.weights)
     generic = describe_residual(search, fitted)
     families = set(fitted.model.families)
@@ -47,6 +54,11 @@ def look_for_unknowns(search: Search, fitted: Fit) -> Suspicion:
     alarms.append(_descriptor_alarm(strangers, generic))
     known = tuple(alarm for alarm in alarms if alarm is not None)
     fired = [alarm for alarm in known if alarm.fired]
+    before, after = (model.residuals(search.presses) for model in (baseline, fitted))
+    if fired and families and only_misfit(search.presses, before, after):
+        # A line in time does not repeat, so repeatable errors say nothing about it.
+        fired = [alarm for alarm in fired if alarm.name == "spectrum"]
+        known = tuple(alarm if alarm in fired else replace(alarm, fired=False) for alarm in known)
     clues = [alarm.clue for alarm in reversed(fired)]
     if fired and generic and not strangers:
         clues.append(f"the residual correlates with {generic[0].descriptor.text}")

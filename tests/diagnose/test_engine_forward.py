@@ -59,7 +59,11 @@ def composite(held: PressSet) -> Composite:
     return Composite(describe(held), np.array([np.log(4e5), 3e-3]))
 
 
-@pytest.mark.parametrize("form", CATALOGUE, ids=lambda form: f"{form.family}-{form.label}")
+# What a free board held is known of recordings only; predictions are means over its instants.
+FORETOLD = [form for form in CATALOGUE if "free of" not in form.label]
+
+
+@pytest.mark.parametrize("form", FORETOLD, ids=lambda form: f"{form.family}-{form.label}")
 def test_every_form_predicts_as_the_simulator_does(form: Form) -> None:
     held = presses()
     model = composite(held)
@@ -74,7 +78,7 @@ def test_every_form_predicts_as_the_simulator_does(form: Form) -> None:
 def test_all_forms_at_once_and_maps() -> None:
     held = presses()
     model = composite(held)
-    for form in {form.family: form for form in CATALOGUE}.values():
+    for form in {form.family: form for form in FORETOLD}.values():
         model = model.plus(form, np.array(form.probes(model.setting)[0], dtype=float))
     gains = np.exp(np.random.default_rng(0).normal(0, 0.2, (5, 8)))
     assert_same(Composite(model.setting, model.values, model.forms, gains, 0.2, ((2, 3),)), held)

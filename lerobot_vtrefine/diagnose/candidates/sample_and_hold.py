@@ -1,5 +1,8 @@
 """sample_and_hold: readings repeat while time goes on."""
 
+from collections.abc import Callable
+from dataclasses import dataclass
+
 import numpy as np
 
 from lerobot_vtrefine.diagnose.candidates.base import Form, Value
@@ -8,20 +11,67 @@ from lerobot_vtrefine.tactile.stages.host import SampleAndHold
 
 MAX_FRAMES = 12.0
 """Longest period looked for, in frames."""
+RARITY = 0.08
+"""How far the mean time between new readings may be off as a period."""
+MIN_REPEATED = 0.1
+"""Share of frames that must repeat the one before for a rhythm to be looked for."""
+CONTRADICTED = 0.1
+"""Share of changes where a rhythm wants none, up to which it is believed; of repeats where it wants a change,
+three times as much, for readings may stay what they were."""
 
 
 def repeated_share(presses: PressSet) -> float:
     """Share of frames on the pad that repeat the one before, reading for reading."""
-    same, moves = 0, 0
-    for press in presses.presses:
-        repeats, moving = _repeats(press.signal), press.touching[1:] & (np.diff(press.time_s) > 0)
-        same += int((repeats & moving).sum())
-        moves += int(moving.sum())
-    return same / moves if moves else 0.0
+    repeats = sum(int((press.rhythm.telling & ~press.rhythm.fresh).sum()) for press in presses.presses)
+    moves = sum(int(press.rhythm.telling.sum()) for press in presses.presses)
+    return repeats / moves if moves else 0.0
 
 
-def _repeats(signal: np.ndarray) -> np.ndarray:
-    return (np.diff(signal, axis=0) == 0.0).all(axis=1)
+@dataclass(frozen=True)
+class Pattern:
+    """How readings repeat: seconds between new ones, and whether these come free of the trial's start."""
+
+    period_s: float
+    free: bool
+
+
+def pattern(presses: PressSet, frame_s: float) -> Pattern | None:
+    """The rhythm in which readings repeat bit for bit; None where none explains the repeats.
+
+    Readings with noise do not repeat by chance, and where a single quiet taxel's do, not in step.
+    """
+    if repeated_share(presses) < MIN_REPEATED:
+        return None
+    for free in (False, True):
+        period_s = float(np.mean(_best(presses, frame_s, free)))
+        if contradicted(presses, period_s, free) < CONTRADICTED:
+            return Pattern(period_s, free)
+    return None
+
+
+def _best(presses: PressSet, frame_s: float, free: bool) -> tuple[float, float]:
+    """Ends of the periods, about as long as new readings are rare, that are contradicted least [s]."""
+    guess = frame_s / max(1.0 - repeated_share(presses), 1.0 / MAX_FRAMES)
+    grid = guess * np.exp(np.linspace(-RARITY, RARITY, 160))
+    wrong = [contradicted(presses, float(period), free) for period in grid]
+    finer = grid[int(np.argmin(wrong))] * np.exp(np.linspace(-0.004, 0.004, 61))
+    return alike(presses, finer, free)
+
+
+def contradicted(presses: PressSet, period_s: float, free: bool) -> float:
+    """Largest share in which the frames speak against a period."""
+    counts = np.sum([press.rhythm.against(period_s, free) for press in presses.presses], axis=0)
+    due, changed, changes, repeats, late = np.maximum(counts, [1.0, 0.0, 1.0, 1.0, 0.0])
+    return float(max(changed / due, changed / changes, late / repeats / 3.0))
+
+
+def alike(presses: PressSet, grid: np.ndarray, free: bool = False) -> tuple[float, float]:
+    """Ends of the periods, of a rising grid, whose pattern of new readings fits the recorded one best [s]."""
+    sums = [sum(press.rhythm.against(float(period), free) for press in presses.presses) for period in grid]
+    error = np.array([float(np.asarray(counts)[[1, 4]].sum()) for counts in sums])
+    best = np.flatnonzero(error <= error.min() + 0.5)
+    spacing = grid[1] / grid[0]
+    return float(grid[best].min() / spacing), float(grid[best].max() * spacing)
 
 
 def periods(presses: PressSet, frame_s: float) -> list[list[float]]:
@@ -29,33 +79,32 @@ def periods(presses: PressSet, frame_s: float) -> list[list[float]]:
     plain = [[count * frame_s * 1.0001] for count in (2.0, 3.0, 4.0, 5.0)]
     if repeated_share(presses) < 0.05:
         return plain
-    low, high = alike(presses, frame_s * np.exp(np.linspace(np.log(1.05), np.log(MAX_FRAMES), 1500)))
-    # Periods that repeat the same frames differ in when, between them, the readings were taken.
+    grid = frame_s * np.exp(np.linspace(np.log(1.05), np.log(MAX_FRAMES), 1500))
+    return [*_between(*alike(presses, grid)), *plain]
+
+
+def free_periods(presses: PressSet, frame_s: float) -> list[list[float]]:
+    """Periods that fit best if new readings come free of the trials' starts [s]."""
+    return _between(*_best(presses, frame_s, True))
+
+
+def _between(low: float, high: float) -> list[list[float]]:
+    """Periods that repeat the same frames differ in when, between them, the readings were taken."""
     inside = [[float(period)] for period in np.linspace(low, high, 9)]
-    whole = [[round(low, digits)] for digits in (2, 3) if low <= round(low, digits) <= high]
-    whole += [[round(high, digits)] for digits in (2, 3) if low <= round(high, digits) <= high]
-    return [*inside, *whole, *plain]
+    whole = [[round(end, digits)] for end in (low, high) for digits in (2, 3)]
+    return [*inside, *(period for period in whole if low <= period[0] <= high)]
 
 
-def alike(presses: PressSet, grid: np.ndarray) -> tuple[float, float]:
-    """Ends of the periods, of a rising grid, whose pattern of new readings fits the recorded one best [s]."""
-    error = np.zeros(len(grid))
-    for press in presses.presses:
-        repeats = _repeats(press.signal) & press.touching[1:]
-        fresh = ~_repeats(press.signal) & press.touching[1:]
-        slots = np.floor(press.time_s[None, :] / grid[:, None] + 1e-6)
-        new = slots[:, 1:] != slots[:, :-1]
-        error += (new & repeats).sum(axis=1) + (~new & fresh).sum(axis=1)
-    best = np.flatnonzero(error <= error.min() + 0.5)
-    spacing = grid[1] / grid[0]
-    return float(grid[best].min() / spacing), float(grid[best].max() * spacing)
-
-
-def undecided(values: np.ndarray, presses: PressSet) -> dict[str, tuple[float, float]]:
+def undecided(free: bool) -> Callable[[np.ndarray, PressSet], dict[str, tuple[float, float]]]:
     """Periods that repeat the same frames as the best one does: nothing recorded tells them apart."""
-    best = float(values[0])
-    low, high = alike(presses, best * np.exp(np.linspace(-0.05, 0.05, 2001)))
-    return {"period_s": (min(low, best), max(high, best))}
+
+    def ends(values: np.ndarray, presses: PressSet) -> dict[str, tuple[float, float]]:
+        best = float(values[0])
+        reach, count = (0.003, 121) if free else (0.05, 2001)
+        low, high = alike(presses, best * np.exp(np.linspace(-reach, reach, count)), free)
+        return {"period_s": (min(low, best), max(high, best))}
+
+    return ends
 
 
 FORMS = (
@@ -68,6 +117,18 @@ FORMS = (
         lambda s: [[2.0001 * s.frame_s], [3.0001 * s.frame_s], [5.0001 * s.frame_s]],
         amplitude=None,
         search=periods,
-        range=undecided,
+        range=undecided(False),
+    ),
+    Form(
+        "sample_and_hold",
+        "fixed period, free of the trial's start",
+        (Value("period_s", 1e-3, 2.0, 0.0),),
+        lambda v, s: (SampleAndHold(float(v[0]), free=True),),
+        lambda v, s: {"period_s": (float(v[0]), "s")},
+        lambda s: [[2.0001 * s.frame_s]],
+        amplitude=None,
+        search=free_periods,
+        range=undecided(True),
+        screened=False,
     ),
 )

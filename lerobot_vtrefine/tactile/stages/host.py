@@ -9,6 +9,8 @@ import torch
 from lerobot_vtrefine.tactile.layout import PadLayout
 from lerobot_vtrefine.tactile.stages.base import Frame, Stage, State, Traits, parameter, register
 
+PHASES = 16
+"""Instants over which the mean reading of a free-running board is taken."""
 HISTORY_FRAMES = 16
 """Frames that a delay remembers while simulating; replay has no such limit."""
 
@@ -108,13 +110,22 @@ class ScanSkew(Delay):
 @register
 @dataclass(frozen=True)
 class SampleAndHold(Stage):
-    """A new reading reaches the host every `period_s` of episode time; between, the last one is repeated."""
+    """A new reading reaches the host every `period_s`; between, the last one is repeated.
+
+    Periods are counted from the episode's start or, where the board runs `free` of the host, from an instant
+    drawn for every episode.
+    """
 
     name: ClassVar[str] = "sample_and_hold"
     domain: ClassVar[str] = "counts"
     rank: ClassVar[int] = 90
     has_state: ClassVar[bool] = True
     period_s: float = parameter(0.043, "s", 0.01, 0.1, minimum=1e-6)
+    free: bool = False
+
+    @override
+    def traits(self, layout: PadLayout, pads: int, rng: np.random.Generator) -> Traits:
+        return {"phase": rng.uniform(0.0, 1.0, (pads, 1, 1))} if self.free else {}
 
     @override
     def initial(self, layout: PadLayout, pads: int) -> Traits:
@@ -126,6 +137,17 @@ class SampleAndHold(Stage):
     @override
     def step(self, x: torch.Tensor, state: State, frame: Frame) -> tuple[torch.Tensor, State]:
         time_s = torch.as_tensor(frame.time_s, dtype=torch.float64, device=x.device)
-        slot = torch.floor(time_s / self.period_s + 1e-6).to(torch.int64).expand(state["slot"].shape).clone()
+        phase = state.get("phase", 0.0)
+        slot = torch.floor(time_s / self.period_s + phase + 1e-6)
+        slot = slot.to(torch.int64).expand(state["slot"].shape).clone()
         held = torch.where(slot != state["slot"], x, state["held"])
-        return held, {"held": held, "slot": slot}
+        return held, {**state, "held": held, "slot": slot}
+
+    @override
+    def sequence(self, x: torch.Tensor, times_s: torch.Tensor, frame: Frame) -> torch.Tensor:
+        """As `step` frame by frame; of a free board, whose instants nobody knows, the mean over them."""
+        if not self.free:
+            return super().sequence(x, times_s, frame)
+        rows, ages = x.shape[-2], (torch.arange(PHASES, dtype=torch.float64) + 0.5) / PHASES * self.period_s
+        delays = ages[:, None].expand(-1, rows)
+        return torch.stack([delayed_sequence(x, times_s, delay) for delay in delays]).mean(dim=0)
