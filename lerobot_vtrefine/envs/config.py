@@ -7,6 +7,7 @@ from typing import Any
 from lerobot.configs import FeatureType, PolicyFeature
 from lerobot.envs.configs import EnvConfig
 
+from lerobot_vtrefine.config_errors import told_by_lerobot
 from lerobot_vtrefine.datasets.features import ACTION_KEY, NUM_JOINTS, env_key_map, env_observation_shapes
 from lerobot_vtrefine.envs.schedule import ReadSchedule
 from lerobot_vtrefine.sim.config import (
@@ -85,6 +86,7 @@ class VtRefineEnvConfig(EnvConfig):
     features: dict[str, PolicyFeature] = field(default_factory=dict)
     features_map: dict[str, str] = field(default_factory=env_key_map)
 
+    @told_by_lerobot
     def __post_init__(self) -> None:
         _check_choice("vectorization", self.vectorization, VECTORIZATIONS)
         _check_choice("ablate", self.ablate, ABLATIONS)

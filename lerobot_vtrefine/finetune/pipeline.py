@@ -100,7 +100,7 @@ def load_policy(path: Path) -> VtDp3Policy:
     overrides = parser.get_yaml_overrides("policy") + (parser.get_cli_overrides("policy") or [])
     config = PreTrainedConfig.from_pretrained(path, cli_overrides=overrides)
     if not isinstance(config, VtDp3Config):
-        raise ValueError(f"{path} is a {config.type} policy; vtrefine-finetune needs vt_dp3")
+        raise ValueError(f"{path} holds a policy of type {config.type}; vtrefine-finetune needs vt_dp3")
     return VtDp3Policy.from_pretrained(path, config=config)
 
 

@@ -3,6 +3,7 @@ from pathlib import Path
 import draccus
 import pytest
 import yaml
+from draccus.utils import ParsingError
 from lerobot.configs import FeatureType
 from lerobot.configs.eval import EvalPipelineConfig
 from lerobot.envs.configs import EnvConfig
@@ -91,12 +92,16 @@ def test_there_are_environment_files():
     ],
 )
 def test_bad_settings_are_named_at_once(settings, message):
-    with pytest.raises(ValueError, match=message):
+    with pytest.raises(ParsingError, match=message):
         VtRefineEnvConfig(**settings)
+    # LeRobot's parser, and so the last line of its commands, says the same.
+    with pytest.raises(ParsingError, match=message) as told:
+        draccus.decode(EnvConfig, {"type": "vtrefine", **settings})
+    assert "\n" not in str(told.value)
 
 
 def test_control_rate_has_one_flag():
-    with pytest.raises(ValueError, match="fps"):
+    with pytest.raises(ParsingError, match="fps"):
         VtRefineEnvConfig(rules=TaskConfig(control_hz=20.0))
 
 

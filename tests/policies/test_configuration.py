@@ -5,6 +5,7 @@ from typing import Any
 
 import draccus
 import pytest
+from draccus.utils import ParsingError
 from lerobot.configs import FeatureType, PolicyFeature, PreTrainedConfig
 from lerobot.configs.train import TrainPipelineConfig
 
@@ -63,7 +64,7 @@ def test_chunks_start_at_the_current_observation() -> None:
     ],
 )
 def test_wrong_values_name_the_choices(values: dict[str, Any], message: str) -> None:
-    with pytest.raises(ValueError, match=message):
+    with pytest.raises(ParsingError, match=message):
         VtDp3Config(device="cpu", **values)
 
 

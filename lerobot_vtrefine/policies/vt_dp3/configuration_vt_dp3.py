@@ -9,6 +9,7 @@ from lerobot.configs import FeatureType, NormalizationMode, PreTrainedConfig
 from lerobot.optim import AdamWConfig
 from lerobot.optim.schedulers import CosineAnnealingWithWarmupSchedulerConfig
 
+from lerobot_vtrefine.config_errors import told_by_lerobot
 from lerobot_vtrefine.datasets import fast_reader
 from lerobot_vtrefine.datasets.features import (
     ACTION_KEY,
@@ -115,6 +116,7 @@ class VtDp3Config(PreTrainedConfig):
     optimizer_grad_clip_norm: float = 10.0
     scheduler_warmup_steps: int = 0
 
+    @told_by_lerobot
     def __post_init__(self) -> None:
         super().__post_init__()
         if self.preset not in PRESETS:

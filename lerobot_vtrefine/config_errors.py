@@ -1,0 +1,22 @@
+"""Why a configuration refuses its values, as the last line of LeRobot's own commands, too."""
+
+import functools
+from collections.abc import Callable
+
+from draccus.utils import ParsingError
+
+
+def told_by_lerobot[Config](check: Callable[[Config], None]) -> Callable[[Config], None]:
+    """Decorate ``__post_init__``: its ValueError becomes a ParsingError with the same words.
+
+    LeRobot's parser replaces a ValueError by "Couldn't instantiate class ...", which hides the reason.
+    """
+
+    @functools.wraps(check)
+    def wrapper(config: Config) -> None:
+        try:
+            check(config)
+        except ValueError as error:
+            raise ParsingError(str(error)) from error
+
+    return wrapper
