@@ -10,8 +10,9 @@ from typing import Any
 import numpy as np
 
 from lerobot_vtrefine.diagnose.ambiguity import find_ambiguities
-from lerobot_vtrefine.diagnose.baseline import Baseline, fit_baseline
-from lerobot_vtrefine.diagnose.composite import sensor_model
+from lerobot_vtrefine.diagnose.baseline import Baseline, fit_baseline, plain_weights
+from lerobot_vtrefine.diagnose.composite import Composite, sensor_model
+from lerobot_vtrefine.diagnose.crossvalidation import cross_validate
 from lerobot_vtrefine.diagnose.detectable import minimum_detectable
 from lerobot_vtrefine.diagnose.evaluation import (
     foretell,
@@ -23,7 +24,8 @@ from lerobot_vtrefine.diagnose.evaluation import (
     trial_errors,
 )
 from lerobot_vtrefine.diagnose.evidence import Evidence, ResidualView, Trace, TrialError
-from lerobot_vtrefine.diagnose.fitting import Fit, predict, tangents
+from lerobot_vtrefine.diagnose.fitting import Fit, predict, rest, tangents
+from lerobot_vtrefine.diagnose.idle import settled_idle
 from lerobot_vtrefine.diagnose.intervals import baseline_parameters, leave_out
 from lerobot_vtrefine.diagnose.locking import lock
 from lerobot_vtrefine.diagnose.naming import evidence_table, named_causes
@@ -31,7 +33,15 @@ from lerobot_vtrefine.diagnose.pairs import reconsider
 from lerobot_vtrefine.diagnose.presses import PressSet, prepare, usable
 from lerobot_vtrefine.diagnose.recordings import RecordingSet, Trial
 from lerobot_vtrefine.diagnose.screening import Scorer
-from lerobot_vtrefine.diagnose.selection import Search, forward, polish, start_search
+from lerobot_vtrefine.diagnose.selection import (
+    MIN_GAIN,
+    Search,
+    forward,
+    polish,
+    scored,
+    settle,
+    start_search,
+)
 from lerobot_vtrefine.diagnose.unknowns import Suspicion, look_for_unknowns
 from lerobot_vtrefine.diagnose.verdict import Cause, DataIssue, Heldout, Parameter, Unknown
 from lerobot_vtrefine.tactile.model import SensorModel
@@ -154,14 +164,16 @@ def _conclude(
     issues: list[DataIssue],
 ) -> PadDiagnosis:
     names = fitted.model.families
+    status = _status(names, rivals.groups, suspicion)
+    best = _trusted(search, baseline, fitted) if status == "unexplained" else fitted.model
+    idle = settled_idle(best if names else baseline.plain.model, search.presses)
     plain, extended = (
-        sensor_model(model, everyone.idle, everyone.step_counts, baseline.noise.floor)
-        for model in (baseline.plain.model, fitted.model if names else baseline.plain.model)
+        sensor_model(model, idle, everyone.step_counts, baseline.noise.floor)
+        for model in (baseline.plain.model, best if names else baseline.plain.model)
     )
     held_set = everyone.subset(locked)
     foretold = foretell(held_set, plain, extended)
     floor = noise_floor(everyone, locked, baseline.noise, predict(fitted.model, held_set))
-    status = _status(names, rivals.groups, suspicion)
     role = "symptom" if status == "unexplained" else "cause"
     smallest = _smallest(search, fitted)
     return PadDiagnosis(
@@ -191,6 +203,18 @@ def _status(names: tuple[str, ...], groups: tuple[tuple[str, ...], ...], suspici
     if groups:
         return "ambiguous"
     return "explained" if names else "adequate"
+
+
+def _trusted(search: Search, baseline: Baseline, fitted: Fit) -> Composite:
+    """Beside an unknown cause, the model that foretells plain readings best: with the symptoms as they
+    were weighed, as plain errors have them, or without any."""
+    weights = plain_weights(search.presses)
+    plain = rest(baseline.plain.model, search.presses, weights)
+    even = settle(search, fitted.model, weights)
+    found = (cross_validate(fit, search.presses, weights, search.folds) for fit in (plain, even))
+    errors = [score.squares.sum() for score in (*found, scored(search, fitted))]
+    errors[0] *= 1.0 - MIN_GAIN
+    return (plain.model, even.model, fitted.model)[int(np.argmin(errors))]
 
 
 def _smallest(search: Search, fitted: Fit) -> dict[str, float]:
