@@ -1,4 +1,5 @@
-"""Robot recordings with known faults, made without any code of the engine: Euler steps of 1 ms.
+"""Robot recordings with known faults, made without any code of the engine: steps of 1 ms, in which a command
+counts from when it arrives.
 
 Commands are held between frames; a frame is recorded before its own command acts.
 """
@@ -137,16 +138,22 @@ class Robot:
                 target = target + size * np.roll(v, 1, axis=1) ** 2
         return target
 
+    def late(self, t, command, then, h):
+        """Mean command in force from `then` to `then + h`: one that arrives inside counts for its part."""
+        everyone = np.arange(len(t))
+        old, new = (np.maximum((t <= (when + 1e-9)[:, None]).sum(1) - 1, 0) for when in (then, then + h))
+        part = np.where(new > old, (then + h - t[everyone, new]) / h, 1.0)[:, None]
+        return part * command[everyone, new] + (1 - part) * command[everyone, old]
+
     def run(self, t, command, load_n, session_s):
         """Encoder readings and servo torques (T, N, J) at t (T, N); session_s (T, 1)."""
         rig = self.rig
         half, bend = column(rig, rig.backlash) / 2, column(rig, rig.compliance)
         dry = self.omega**2 * column(rig, rig.friction)
-        trials, frames = t.shape
+        frames = t.shape[1]
         q = command[:, 0] + self.sag_of(command[:, 0])
         v, slack = np.zeros_like(q), command[:, 0].copy()
         out, torque = np.empty_like(command), np.zeros_like(command)
-        everyone = np.arange(trials)
         steps = max(1, round(np.median(np.diff(t)) / 1e-3))
         for k in range(frames):
             out[:, k], torque[:, k] = q, slack + self.sag_of(slack) - q
@@ -155,18 +162,18 @@ class Robot:
             h = (t[:, k + 1] - t[:, k]) / steps
             for step in range(steps):
                 now = t[:, k] + step * h
-                row = k
+                u = command[:, k]
                 if rig.latency_s:
-                    row = np.maximum((t[:, : k + 1] <= (now - rig.latency_s + 1e-9)[:, None]).sum(1) - 1, 0)
-                u = command[everyone, row]
+                    u = self.late(t[:, : k + 1], command, now - rig.latency_s, h)
                 slack = np.clip(slack, u - half, u + half)
                 target = self.target_of(slack, bend * load_n[:, k], session_s, now, v, u)
                 force = self.omega**2 * (target - q) - 2 * self.zeta * self.omega * v
                 stuck = (v == 0) & (np.abs(force) <= dry)
                 a = np.where(stuck, 0.0, force - dry * np.sign(np.where(v != 0, v, force)))
                 new = v + a * h[:, None]
-                v = np.where((new * v < 0) & (dry > 0), 0.0, new)
-                q = q + v * h[:, None]
+                new = np.where((new * v < 0) & (dry > 0), 0.0, new)
+                q = q + 0.5 * (v + new) * h[:, None]
+                v = new
         return out, torque
 
 

@@ -7,7 +7,10 @@ import pytest
 from robot_rigs import Rig, make_set
 
 from lerobot_vtrefine.diagnose.recordings import read_recording_set
-from lerobot_vtrefine.diagnose.robot.engine import diagnose_robot
+from lerobot_vtrefine.diagnose.robot.batch import make_batch
+from lerobot_vtrefine.diagnose.robot.engine import diagnose_problem, diagnose_robot
+from lerobot_vtrefine.diagnose.robot.estimates import widened
+from lerobot_vtrefine.diagnose.robot.fitting import SERVO_TICK_S, Problem
 from lerobot_vtrefine.diagnose.robot.model import predict_positions
 
 SMALL = {
@@ -132,3 +135,29 @@ def test_few_trials_and_one_joint(tmp_path) -> None:
     found, _ = diagnose(tmp_path, joints=("joint_1",), conditions=2, replicates=1)
     assert found.status == "adequate"
     assert found.next_experiment is not None
+
+
+def test_an_offset_that_servo_and_reading_share_is_said_to_be_invisible(tmp_path) -> None:
+    recordings = read_recording_set(make_set(Rig(**SMALL), tmp_path, 0))
+    plain = Problem.of(recordings.joints, make_batch(recordings.trials))
+    told = {}
+    for shared in (False, True):
+        found = diagnose_problem(dataclasses.replace(plain, shared_encoders=shared))
+        assert found.status == "adequate"
+        item = next(item for item in found.evidence if item.name == "encoder_offset")
+        told[shared] = ("encoder_offset" in found.minimum_detectable, item.decision, item.reason)
+    assert told[False][:2] == (True, "rejected")
+    assert told[True][:2] == (False, "not identifiable")
+    assert "known from outside" in told[True][2]
+
+
+def test_a_delay_is_never_known_better_than_the_servos_tick(tmp_path) -> None:
+    found, _ = diagnose(tmp_path, latency_s=0.07, noise=0.05, quantum=1e-6)
+    low, high = found.causes[0].params["tau_s"].ci95
+    assert high - low > 2 * 1.9 * SERVO_TICK_S / np.sqrt(12)
+    assert low < 0.07 < high
+
+
+def test_an_interval_is_widened_on_both_sides_and_not_below_zero() -> None:
+    assert widened((0.7, 1.3), 1.0, 0.4) == pytest.approx((0.5, 1.5))
+    assert widened((0.001, 0.003), 0.002, 0.01)[0] == 0.0

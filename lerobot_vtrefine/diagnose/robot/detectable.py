@@ -25,6 +25,7 @@ def minimum_detectable(selection: Selection) -> dict[str, float]:
             candidate.cause == DECOY
             or candidate.form in (FREE_FORM, TWO_TERM_FORM)
             or candidate.parameters in (("loose",), STOP)
+            or (candidate.cause == "encoder_offset" and selection.problem.shared_encoders)
         ):
             continue
         sizes = _sizes(selection, candidate, own)

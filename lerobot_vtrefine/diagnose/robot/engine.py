@@ -36,6 +36,13 @@ Progress = Callable[[str, float], None]
 
 _DRAWS = 2000
 _CLUES = 4
+_SHARED = (
+    "readings stand at no constant distance from where the servos should bring them; an offset that servo "
+    "and reading share moves both alike, whatever its size: to see it, bring the hand to places that are "
+    "known from outside (a gauge block, a calibrated camera) in eight postures"
+)
+_SETTLING = 5
+"""Iterations of a refit that begins next to its end."""
 
 
 @dataclass(frozen=True)
@@ -95,9 +102,21 @@ def diagnose_problem(whole: Problem, seed: int = 0, progress: Progress | None = 
         tell("robot: looking for other explanations", 0.7)
         selection, rivals = _settled(selection, seed)
         alarms = raise_alarms(selection, seed)
-    selection = _named_only(selection)
+    tell("robot: settling the sizes", 0.8)
+    selection, whole = _settled_finely(_named_only(selection), whole)
     tell("robot: intervals, and what could have been seen", 0.85)
     return _report(selection, rivals, alarms, whole, np.array(locked, dtype=int), seed)
+
+
+def _settled_finely(selection: Selection, whole: Problem) -> tuple[Selection, Problem]:
+    """What was chosen, refitted to better predictions where there are any; what was tried stays as it was."""
+    problem, everything = selection.problem.finer(), whole.finer()
+    if problem is None or everything is None:
+        return selection, whole
+    baseline, now = selection.baseline, selection.fit
+    again = fit(problem, baseline.point, baseline.free, iterations=_SETTLING)
+    fitted = fit(problem, now.point, now.free, now.tau_free, iterations=_SETTLING)
+    return replace(selection, problem=problem, baseline=again, fit=fitted), everything
 
 
 def _steps(tell: Progress) -> Callable[[str], None]:
@@ -286,6 +305,8 @@ def _evidence(selection: Selection, rivals: tuple[Rival, ...], alarmed: bool) ->
         elif name in ties:
             decision = "tie"
             reason = f"explains {ties[name].cause} on {_joined(selection, ties[name].joints)} as well"
+        elif name == "encoder_offset" and selection.problem.shared_encoders:
+            decision, reason = "not identifiable", _SHARED
         else:
             decision, reason = (
                 "rejected",

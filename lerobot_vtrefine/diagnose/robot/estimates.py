@@ -27,7 +27,9 @@ class Estimates:
         """The cause's parameters on those joints."""
         if cause == LATENCY:
             value = self.selection.fit.point.tau_s
-            return {"tau_s": Parameter(value, jackknife(self.tau, value), "s")}
+            # A uniform error of width w has the standard deviation w / sqrt(12).
+            tick = 1.96 * self.selection.problem.tick_s / np.sqrt(12)
+            return {"tau_s": Parameter(value, widened(jackknife(self.tau, value), value, tick), "s")}
         if cause == "gripper_compliance":
             return self._gripper(joints)
         out: dict[str, Parameter] = {}
@@ -61,7 +63,8 @@ class Estimates:
             names = ("play", "loose") if cause == "backlash" else ("offset",)
             columns = [INDEX[name] for name in names]
             value, spread = float(now[columns].sum()), drawn[:, columns].sum(1)
-        return Parameter(value, jackknife(spread, value), unit)
+        own = self.selection.problem.vague * abs(value) if cause == "backlash" else 0.0
+        return Parameter(value, widened(jackknife(spread, value), value, own), unit)
 
     def _friction(self, joint: int, name: str) -> tuple[str, Parameter]:
         """In Nm where loads or the robot's known servo gains give the scale; else as the servo's error."""
@@ -114,6 +117,13 @@ class Estimates:
         if overall < 0:
             low, high = -high, -low
         return Parameter(overall * mean, (low, high), "m/N")
+
+
+def widened(ci95: tuple[float, float], value: float, own: float) -> tuple[float, float]:
+    """An interval about a value with an independent error of 95 % half-width `own`; delays and plays are not
+    negative."""
+    low, high = (float(np.hypot(end - value, own)) for end in ci95)
+    return max(value - low, min(ci95[0], 0.0)), value + high
 
 
 def _stiffness(name: str) -> float | None:

@@ -23,6 +23,9 @@ ZETA_BOUNDS = (0.1, 20.0)
 _RADIANS_PER_FRAME = (6.0, 3.0)
 """Fastest servo that frames can tell, well damped and swinging: beyond, oscillations alias."""
 TAU_BOUND_S = 1.0
+SERVO_TICK_S = 1e-3
+"""Servos look at their command once in about a millisecond (simulations: once a step). When, no recording
+tells: a delay is known up to a uniform error of this width, whatever the trials agree on."""
 _START_OMEGA = (4.0, 10.0, 25.0, 60.0)
 _START_ZETA = (0.4, 1.0, 2.0)
 _ITERATIONS = 20
@@ -68,6 +71,13 @@ class Problem:
     """What is called a cause must change a joint's prediction by this part of its baseline's error ..."""
     floor: float = 0.0
     """... and by this much [rad; a tenth of it in m for slides]."""
+    shared_encoders: bool = False
+    """Servos close their loop on the encoders that are read: an offset of these moves commands and readings
+    alike, and only one that comes behind the servo shows."""
+    tick_s: float = SERVO_TICK_S
+    """How long a command may wait for the servo."""
+    vague: float = 0.0
+    """Part of a play's width that 95 % intervals allow for the method's own error."""
 
     @classmethod
     def of(cls, names: tuple[str, ...], batch: Batch) -> "Problem":
@@ -86,6 +96,15 @@ class Problem:
         length = len(batch.time_s)
         shapes = {form: values[:length][:, np.asarray(trials)] for form, values in self.shapes.items()}
         return replace(self, batch=batch, shapes=shapes)
+
+    def finer(self) -> "Problem | None":
+        """The same trials with predictions for which the search is too slow; None where there are none."""
+        return None
+
+    @property
+    def weight(self) -> Array:
+        """(J,) that makes the joints' squared errors comparable where they share the delay."""
+        return 1.0 / self.scale**2
 
     def start(self) -> Point:
         """Where fits of the baseline begin."""
@@ -241,7 +260,7 @@ class _Fitter:
     def __init__(self, problem: Problem, free: Array, tau_free: bool) -> None:
         self.problem, self.free, self.tau_free = problem, free, tau_free
         self.damping = np.full(len(free), 1e-3)
-        self.weight = 1.0 / problem.scale**2
+        self.weight = problem.weight
         self.ridge = ridge(problem, free)
         self.settled: Array = ~np.any(free, axis=1)
 

@@ -3,7 +3,8 @@
 Two replays of the commands differ in what is known and does not depend on the robot's faults: one has
 fine steps, the table and the weight of the parts that are carried, the other coarse steps and nothing around.
 Their difference is taken from the recorded positions; the engine then replays the coarse one under each fault
-that it tries (`twin_problem`).
+that it tries (`twin_problem`). What it settles on is refitted in fine steps: coarse ones are off by a few per
+cent of a delay or a play.
 
 Shapes: T frames, J joints.
 """
@@ -20,7 +21,7 @@ from lerobot_vtrefine.diagnose.robot.conversion import from_model
 from lerobot_vtrefine.diagnose.robot.engine import Progress, RobotDiagnosis, diagnose_problem
 from lerobot_vtrefine.diagnose.robot.gravity import is_sliding
 from lerobot_vtrefine.diagnose.robot.model import RobotModel
-from lerobot_vtrefine.diagnose.robot.twin_problem import NOMINAL, TwinProblem
+from lerobot_vtrefine.diagnose.robot.twin_problem import COARSE_S, FINE_S, NOMINAL, TwinProblem
 from lerobot_vtrefine.diagnose.verdict import Parameter
 from lerobot_vtrefine.embodiments import ALOHA
 from lerobot_vtrefine.sim.config import SceneConfig
@@ -57,21 +58,29 @@ def diagnose_on_twin(
     Raises:
         KeyError: a trial that the twin did not follow.
     """
-    extra = beyond_coarse(recordings, twin, config, hold)
-    trials = [_relative(trial, twin[trial.file], extra[trial.file]) for trial in recordings.trials]
-    problem = TwinProblem.on(recordings.joints, make_batch(trials), config, hold)
-    problem = replace(problem, floor=max(problem.floor, floor))
+    problem, _ = posed(recordings, twin, config, hold, COARSE_S)
+    fine, extra = posed(recordings, twin, config, hold, FINE_S)
+    problem = replace(problem, fine=fine, floor=max(problem.floor, floor))
     found = diagnose_problem(problem, seed, progress)
     traces = tuple(_absolute(trace, recordings.joints, extra, twin) for trace in found.traces)
     return replace(found, traces=traces, baseline_params=_servos(found))
 
 
-def beyond_coarse(
-    recordings: RecordingSet, twin: Mapping[str, TwinTrial], config: SceneConfig, hold: str
+def posed(
+    recordings: RecordingSet, twin: Mapping[str, TwinTrial], config: SceneConfig, hold: str, step_s: float
+) -> tuple[TwinProblem, dict[str, Array]]:
+    """The problem in steps of that length; by trial file (T, J) that was taken from the positions for it."""
+    extra = beyond_bare(recordings, twin, config, hold, step_s)
+    trials = [_relative(trial, twin[trial.file], extra[trial.file]) for trial in recordings.trials]
+    return TwinProblem.on(recordings.joints, make_batch(trials), config, hold, step_s), extra
+
+
+def beyond_bare(
+    recordings: RecordingSet, twin: Mapping[str, TwinTrial], config: SceneConfig, hold: str, step_s: float
 ) -> dict[str, Array]:
-    """By trial file: (T, J) that the whole twin does beyond the coarse one."""
+    """By trial file: (T, J) that the whole twin does beyond the bare arms in steps of that length."""
     copies = [replace(t, command=twin[t.file].command, position=twin[t.file].path) for t in recordings.trials]
-    problem = TwinProblem.on(recordings.joints, make_batch(copies), config, hold)
+    problem = TwinProblem.on(recordings.joints, make_batch(copies), config, hold, step_s)
     left = problem.residual(problem.predict(problem.start()))
     return {trial.file: left[: len(trial.time_s), k] for k, trial in enumerate(copies)}
 
@@ -81,7 +90,7 @@ def beyond_twin(
 ) -> dict[str, Array]:
     """By trial file: (T, J) that a model found by `diagnose_on_twin` adds to the twin."""
     trials = [replace(trial, command=twin[trial.file].command) for trial in recordings.trials]
-    problem = TwinProblem.on(recordings.joints, make_batch(trials), config, hold)
+    problem = TwinProblem.on(recordings.joints, make_batch(trials), config, hold, FINE_S)
     more = problem.predict(from_model(model)) - problem.predict(problem.start())
     return {trial.file: more[: len(trial.time_s), k] for k, trial in enumerate(trials)}
 

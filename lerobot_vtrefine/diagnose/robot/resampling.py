@@ -53,7 +53,7 @@ class Curvature:
             by_trial = jacobian.transpose(1, 0, 2)
             normal.append(by_trial.transpose(0, 2, 1) @ by_trial)
             slope.append(np.einsum("tnp,nt->tp", by_trial, fit.residual[..., joint]))
-        return cls(fit, tuple(normal), tuple(slope), ridge(problem, fit.free), 1.0 / problem.scale**2)
+        return cls(fit, tuple(normal), tuple(slope), ridge(problem, fit.free), problem.weight)
 
     def moved(self, weights: Array) -> Point:
         """Where the fit would end if every trial counted `weights` (T,) times."""
