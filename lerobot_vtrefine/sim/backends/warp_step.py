@@ -1,8 +1,8 @@
 """One physics step on mujoco_warp, in an order that suits a GPU. Imports warp and mujoco_warp.
 
 The same functions in the same roles as `mujoco_warp.step`, so the same physics, but
-- what does not depend on contacts (inertia, bias forces, servos, other constraints) runs beside the search
-  for contacts, on a stream of its own: a step of a thousand worlds is some sixty small kernels, which wait
+- what does not depend on contacts (inertia, bias forces, servos; other constraints) runs beside the search
+  for contacts, on streams of its own: a step of a thousand worlds is some ninety small kernels, which wait
   for each other longer than they work;
 - pairs of geoms that a face of a box separates are dropped before the general convex collision, two thirds of
   them while a round plug is in its hole (at a thousand worlds on an H200 this neither gains nor costs);
@@ -19,6 +19,7 @@ import mujoco_warp as mjw
 import numpy as np
 import warp as wp
 from mujoco_warp._src import collision_driver, forward, smooth
+from mujoco_warp._src.types import CollisionType
 
 from lerobot_vtrefine.sim.backends import warp_contact_kernels as kernels
 from lerobot_vtrefine.sim.backends.warp_constraint import add_contact_rows, rows_without_contacts
@@ -35,7 +36,7 @@ class WarpStep:
     Args:
         host: the model as MuJoCo has it.
         model, data: the same on the device.
-        concurrent: whether to use two streams; only a GPU has them.
+        concurrent: whether to use several streams; only a GPU has them.
 
     Raises:
         ValueError: sensors other than net forces of contacts between geoms and bodies.
@@ -43,8 +44,8 @@ class WarpStep:
 
     def __init__(self, host: mujoco.MjModel, model: mjw.Model, data: mjw.Data, concurrent: bool) -> None:
         self._model, self._data = model, data
-        self._side = wp.Stream(wp.get_device()) if concurrent else None
-        self._marked = wp.Event(wp.get_device()) if concurrent else None
+        names = ("smooth", "rows", "convex") if concurrent else ()
+        self._streams = {name: wp.Stream(wp.get_device()) for name in names}
         own, other = _sides(host)
         self._own, self._other = wp.array(own, dtype=int), wp.array(other, dtype=int)
         self._addresses = wp.array(host.sensor_adr.astype(np.int32), dtype=int)
@@ -61,37 +62,30 @@ class WarpStep:
         mjw.kinematics(model, data)
         mjw.com_pos(model, data)
         mjw.tendon(model, data)
-        with self._on_the_side():
-            rows_without_contacts(model, data)
-            self._mark()
+        with self._beside("smooth"):
             self._smooth()
+        with self._beside("rows"):
+            rows_without_contacts(model, data)
         self._collide()
-        self._wait_for_mark()
+        self._join("rows")
         add_contact_rows(model, data)
-        self._join()
+        self._join("smooth")
         solve(model, data)
         self._read_contacts()
         self._integrate()
 
     @contextmanager
-    def _on_the_side(self) -> Generator[None]:
-        if self._side is None:
+    def _beside(self, name: str) -> Generator[None]:
+        """Work on a stream of this name, from here on and until `_join`."""
+        if not self._streams:
             yield
             return
-        with wp.ScopedStream(self._side, sync_enter=True):
+        with wp.ScopedStream(self._streams[name], sync_enter=True):
             yield
 
-    def _mark(self) -> None:
-        if self._side is not None:
-            wp.record_event(self._marked)
-
-    def _wait_for_mark(self) -> None:
-        if self._side is not None:
-            wp.wait_event(self._marked)
-
-    def _join(self) -> None:
-        if self._side is not None:
-            wp.wait_stream(self._side)
+    def _join(self, name: str) -> None:
+        if self._streams:
+            wp.wait_stream(self._streams[name])
 
     def _smooth(self) -> None:
         """Everything that contacts do not enter."""
@@ -120,7 +114,11 @@ class WarpStep:
         wp.launch(kernels.drop_separated, data.naconmax, given)
         kept = dataclasses.replace(context, collision_pair=left.geoms, collision_pairid=left.ids)
         kept = dataclasses.replace(kept, collision_worldid=left.world)
-        collision_driver._narrowphase(model, dataclasses.replace(data, ncollision=left.count), kept)
+        counted = dataclasses.replace(data, ncollision=left.count)
+        with self._beside("convex"):
+            collision_driver.convex_narrowphase(model, counted, kept, CONVEX)
+        collision_driver.primitive_narrowphase(model, counted, kept, PRIMITIVE)
+        self._join("convex")
 
     def _read_contacts(self) -> None:
         """Contact sensors, as `mujoco_warp.sensor_acc` reads them."""
@@ -141,6 +139,11 @@ class WarpStep:
         forward.implicit_free_body(model, data, data.efc.Ma, qacc, solve=True)
         forward._advance(model, data, qacc)
 
+
+KINDS = collision_driver.MJ_COLLISION_TABLE | {(mjw.GeomType.BOX, mjw.GeomType.BOX): CollisionType.PRIMITIVE}
+CONVEX = [pair for pair, kind in KINDS.items() if kind == CollisionType.CONVEX]
+PRIMITIVE = [pair for pair, kind in KINDS.items() if kind == CollisionType.PRIMITIVE]
+"""Kinds of geoms for the general convex collision and for closed forms: boxes as `WarpWorlds` wants them."""
 
 SUMS = {"found": float, "weight": float, "force": wp.vec3, "torque": wp.vec3, "pos": wp.vec3}
 CONTACTS = {
