@@ -198,7 +198,7 @@ def test_policy_of_another_type_is_refused(finetune, tmp_path, capsys):
     other = tmp_path / "act"
     ACTConfig(device="cpu").save_pretrained(other)
     assert finetune(tmp_path / "run", policy=other) == 2
-    assert "is a act policy; vtrefine-finetune needs vt_dp3" in capsys.readouterr().err
+    assert "holds a policy of type act; vtrefine-finetune needs vt_dp3" in capsys.readouterr().err
 
 
 @pytest.mark.parametrize(
