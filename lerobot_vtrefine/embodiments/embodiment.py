@@ -135,6 +135,12 @@ class Embodiment:
         """TCP's distance from the last revolute joint, along the hand's x."""
         return self.fingers.slide_offset_m + self.fingers.pad_offset_m
 
+    def hands(self, q: Tensor) -> kinematics.Hands:
+        """Both arms at joint positions q (..., J) [rad, m], for whoever asks for more than one of what
+        follows.
+        """
+        return kinematics.hands(self, q)
+
     def tcp_poses(self, q: Tensor) -> tuple[Tensor, Tensor]:
         """Poses midway between each hand's pads.
 
@@ -144,7 +150,7 @@ class Embodiment:
         Returns:
             World positions (..., 2, 3) [m] and rotations (..., 2, 3, 3), differentiable in q.
         """
-        return kinematics.hands(self, q).offset(self.tcp_offset_m)
+        return self.hands(q).tcp()
 
     def pad_poses(self, q: Tensor) -> tuple[Tensor, Tensor]:
         """Poses of the pads' faces, in the order of `pad_names`.
@@ -155,7 +161,7 @@ class Embodiment:
         Returns:
             World positions (..., 4, 3) [m] and rotations (..., 4, 3, 3), differentiable in q.
         """
-        return kinematics.pads(self, q)
+        return self.hands(q).pads()
 
     def pad_twists(self, q: Tensor, qd: Tensor) -> Tensor:
         """Velocities of the pads' frames.
@@ -168,7 +174,7 @@ class Embodiment:
             (..., 4, 6): linear velocity of the pad's origin [m/s], then angular velocity [rad/s], in the
             world frame.
         """
-        return kinematics.pad_twists(self, q, qd)
+        return self.hands(q).pad_twists(qd)
 
     def tcp_jacobian(self, q: Tensor) -> Tensor:
         """Geometric Jacobian of each TCP with respect to its own arm's revolute joints.

@@ -23,6 +23,9 @@ _IK_MAX_STEP_RAD = 0.4
 class Hands:
     """The chains of both arms, evaluated."""
 
+    embodiment: "Embodiment"
+    joints: Tensor
+    """(..., J) they were evaluated for."""
     position: Tensor
     """(..., A, 3) origin of the last link [m]."""
     rotation: Tensor
@@ -32,9 +35,37 @@ class Hands:
     origins: Tensor
     """(..., A, K, 3) points on the axes [m]."""
 
-    def offset(self, along_x_m: float) -> tuple[Tensor, Tensor]:
-        """Pose of the frame that lies `along_x_m` ahead of the hand frame."""
-        return self.position + along_x_m * self.rotation[..., 0], self.rotation
+    def tcp(self) -> tuple[Tensor, Tensor]:
+        """Poses midway between each hand's pads: (..., A, 3) [m] and (..., A, 3, 3)."""
+        return self.position + self.embodiment.tcp_offset_m * self.rotation[..., 0], self.rotation
+
+    def pads(self) -> tuple[Tensor, Tensor]:
+        """Poses of the pads' faces: (..., 4, 3) [m] and (..., 4, 3, 3)."""
+        fingers = self.embodiment.fingers
+        centre, rotation = self.tcp()
+        slide = self.joints.unflatten(-1, (2, self.embodiment.joints_per_arm))[..., -2:]
+        inward = self.joints.new_tensor([-1.0, 1.0])  # the left finger's pad looks along -y of the hand
+        face = slide + fingers.face_offset_m * inward
+        x, y, z = rotation.unsqueeze(-3).unbind(-1)  # each (..., A, 1, 3)
+        position = centre.unsqueeze(-2) + face.unsqueeze(-1) * y
+        sign = inward.unsqueeze(-1)
+        pad_axes = torch.stack([-x.expand_as(position), sign * z, sign * y], -1)
+        return position.flatten(-3, -2), pad_axes.flatten(-4, -3)
+
+    def pad_twists(self, rates: Tensor) -> Tensor:
+        """Linear (at the pad's origin) and angular velocity of the pads (..., 4, 6) for joint velocities
+        (..., J).
+        """
+        position, _ = self.pads()
+        rates = rates.unflatten(-1, (2, self.embodiment.joints_per_arm))
+        count = len(self.embodiment.joints)
+        spins = (self.axes * rates[..., :count, None]).unsqueeze(-3)  # (..., A, 1, K, 3)
+        arms = position.unflatten(-2, (2, 2))  # (..., A, finger, 3)
+        arms_lever = arms.unsqueeze(-2) - self.origins.unsqueeze(-3)
+        linear = torch.linalg.cross(spins.expand_as(arms_lever), arms_lever).sum(-2)
+        linear = linear + rates[..., count:, None] * self.rotation[..., None, :, 1]
+        angular = spins.sum(-2).expand_as(linear)
+        return torch.cat([linear, angular], -1).flatten(-3, -2)
 
 
 def hands(embodiment: "Embodiment", q: Tensor) -> Hands:
@@ -44,40 +75,23 @@ def hands(embodiment: "Embodiment", q: Tensor) -> Hands:
     position = q.new_tensor([arm.base_pos_m for arm in embodiment.arms]).expand(*arm_q.shape[:-1], 3)
     columns = [column.expand_as(position) for column in columns]
     axes, origins = [], []
-    for index, joint in enumerate(embodiment.joints):
+    angles = arm_q[..., : len(embodiment.joints), None]
+    turns = zip(torch.cos(angles).unbind(-2), torch.sin(angles).unbind(-2), strict=True)
+    for joint, (cos, sin) in zip(embodiment.joints, turns, strict=True):
         for axis, length in enumerate(joint.offset_m):
             if length:
                 position = position + length * columns[axis]
         axes.append(columns[joint.axis])
         origins.append(position)
-        _turn(columns, joint.axis, arm_q[..., index, None])
-    return Hands(position, torch.stack(columns, -1), torch.stack(axes, -2), torch.stack(origins, -2))
-
-
-def pads(embodiment: "Embodiment", q: Tensor) -> tuple[Tensor, Tensor]:
-    """Poses of the pads' faces: (..., 4, 3) and (..., 4, 3, 3)."""
-    return _pads_of(embodiment, hands(embodiment, q), q)
-
-
-def pad_twists(embodiment: "Embodiment", q: Tensor, qd: Tensor) -> Tensor:
-    """Linear (at the pad's origin) and angular velocity of the pads, (..., 4, 6)."""
-    chain = hands(embodiment, q)
-    position, _ = _pads_of(embodiment, chain, q)
-    rates = qd.reshape(*qd.shape[:-1], 2, embodiment.joints_per_arm)
-    count = len(embodiment.joints)
-    spins = (chain.axes * rates[..., :count, None]).unsqueeze(-3)  # (..., A, 1, K, 3)
-    arms = position.unflatten(-2, (2, 2))  # (..., A, finger, 3)
-    arms_lever = arms.unsqueeze(-2) - chain.origins.unsqueeze(-3)
-    linear = torch.linalg.cross(spins.expand_as(arms_lever), arms_lever).sum(-2)
-    linear = linear + rates[..., count:, None] * chain.rotation[..., None, :, 1]
-    angular = spins.sum(-2).expand_as(linear)
-    return torch.cat([linear, angular], -1).flatten(-3, -2)
+        _turn(columns, joint.axis, cos, sin)
+    frames = torch.stack(columns, -1), torch.stack(axes, -2), torch.stack(origins, -2)
+    return Hands(embodiment, q, position, *frames)
 
 
 def tcp_jacobian(embodiment: "Embodiment", q: Tensor) -> Tensor:
     """(..., A, 6, K) of each TCP in its own arm's revolute joints."""
     chain = hands(embodiment, q)
-    position, _ = chain.offset(embodiment.tcp_offset_m)
+    position, _ = chain.tcp()
     linear = torch.linalg.cross(chain.axes, position.unsqueeze(-2) - chain.origins)
     return torch.cat([linear, chain.axes], -1).transpose(-1, -2)
 
@@ -121,24 +135,9 @@ def _base_rotation(embodiment: "Embodiment", like: Tensor) -> Tensor:
     return torch.as_tensor(rotation, dtype=like.dtype, device=like.device)
 
 
-def _turn(columns: list[Tensor], axis: int, angle: Tensor) -> None:
+def _turn(columns: list[Tensor], axis: int, cos: Tensor, sin: Tensor) -> None:
     """Turn a frame, given by its columns, about one of its own axes, in place in the list."""
-    cos, sin = torch.cos(angle), torch.sin(angle)
     first, second = (axis + 1) % 3, (axis + 2) % 3
     u, v = columns[first], columns[second]
     columns[first] = cos * u + sin * v
     columns[second] = cos * v - sin * u
-
-
-def _pads_of(embodiment: "Embodiment", chain: Hands, q: Tensor) -> tuple[Tensor, Tensor]:
-    fingers = embodiment.fingers
-    centre, rotation = chain.offset(embodiment.tcp_offset_m)
-    slide = q.unflatten(-1, (2, embodiment.joints_per_arm))[..., -2:]
-    inward = q.new_tensor([-1.0, 1.0])  # the left finger's pad looks along -y of the hand
-    face = slide + fingers.face_offset_m * inward
-    x, y, z = rotation.unsqueeze(-4).unbind(-1)  # each (..., 1, A, 3)
-    x, y, z = (axis.squeeze(-3).unsqueeze(-2) for axis in (x, y, z))  # (..., A, 1, 3)
-    position = centre.unsqueeze(-2) + face.unsqueeze(-1) * y
-    sign = inward.unsqueeze(-1)
-    pad_axes = torch.stack([-x.expand_as(position), sign * z, sign * y], -1)
-    return position.flatten(-3, -2), pad_axes.flatten(-4, -3)

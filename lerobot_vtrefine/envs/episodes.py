@@ -91,14 +91,15 @@ class Episodes:
         reward = np.zeros(self.num_envs)
         finished = ids[:0]
         if len(ids):
-            result = self.sim.step(np.asarray(actions, np.float64)[ids], ids)
             self.steps[ids] += 1
+            read = reads(self.steps[ids]) if callable(reads) else np.full(len(ids), reads)
+            result = self.sim.step(np.asarray(actions, np.float64)[ids], ids, images=ids[read])
             reward[ids] = result.reward
             self.terminated[ids], self.truncated[ids] = result.terminated, result.truncated
             self.success[ids] = result.success
             finished = ids[self.terminated[ids] | self.truncated[ids]]
             self.done[finished] = True
-            self._refresh(ids, reads)
+            self._refresh(ids, read)
             self._collect(finished)
         flags = (self.terminated.copy(), self.truncated.copy(), self.success.copy())
         return Transition(reward, *flags, finished)
@@ -110,8 +111,9 @@ class Episodes:
             self.raw = {
                 key: np.zeros((self.num_envs, *value.shape[1:]), value.dtype) for key, value in frames.items()
             }
+        rows = slice(None) if len(ids) == self.num_envs else ids
         for key, value in frames.items():
-            self.raw[key][ids] = value
+            self.raw[key][rows] = value
         return frames
 
     def _frames(self, ids: Array) -> Raw:
@@ -124,8 +126,8 @@ class Episodes:
         frames["noise_level"] = np.full((count, 1), self.sim.noise_level, np.float32)
         return frames if self._ablate is None else self._ablate(frames)
 
-    def _refresh(self, ids: Array, reads: Callable[[Array], Array] | bool) -> None:
-        read = reads(self.steps[ids]) if callable(reads) else np.full(len(ids), reads)
+    def _refresh(self, ids: Array, read: Array) -> None:
+        """Read the sensors where `read` (m,) says so, joint positions everywhere."""
         if read.any():
             self.read(ids[read])
         if not read.all():

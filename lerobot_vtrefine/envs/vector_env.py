@@ -137,9 +137,9 @@ class VtRefineVectorEnv(gym.vector.VectorEnv[Observation, Array, Array]):
         return np.array([d if s is None else s for s, d in zip(seed, drawn, strict=True)], np.int64)
 
     def _observation(self) -> Observation:
-        # Copies: the raw frames change in place, and callers keep observations.
-        observation = raw_to_env_observation(self.episodes.raw)
-        return {key: np.array(value) for key, value in observation.items()}
+        # Nothing of the raw frames themselves: these change in place, and callers keep observations.
+        raw = self.episodes.raw
+        return {key: _own(value, raw) for key, value in raw_to_env_observation(raw).items()}
 
     def _shear(self) -> dict[str, Array]:
         return {"shear": self.episodes.sim.shear()} if self.config.shear.on else {}
@@ -151,6 +151,11 @@ class VtRefineVectorEnv(gym.vector.VectorEnv[Observation, Array, Array]):
             info["final_info"] = {**metrics, "is_success": result.success.copy()}
             info["_final_info"] = np.isin(np.arange(self.num_envs), result.finished)
         return info
+
+
+def _own(value: Array, raw: Observation) -> Array:
+    """The value, copied where it is part of a raw frame."""
+    return value.copy() if any(np.may_share_memory(value, item) for item in raw.values()) else value
 
 
 class LazyFrames(Sequence[Array]):

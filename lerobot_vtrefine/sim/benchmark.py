@@ -117,7 +117,7 @@ def _measure(warp: WarpConfig, count: int, steps: int, scene: SceneConfig) -> Wo
     times, parts = [], {}
     for step in range(steps):
         action = expert.act(ids)
-        times.append(_seconds(lambda: (sim.step(action), sim.observe())))  # noqa: B023  called at once
+        times.append(_seconds(lambda: (sim.step(action, images=ids), sim.observe())))  # noqa: B023  called at once
         if step == steps // 2:
             parts = _parts(sim)
     success = float(sim.metrics()["success"].mean()) if steps >= STEPS else float("nan")

@@ -3,7 +3,6 @@
 from dataclasses import dataclass
 
 import numpy as np
-import torch
 
 from lerobot_vtrefine.sim.config import GRASPED_CAMERA, TABLE_CAMERA, CameraConfig, SceneConfig
 from lerobot_vtrefine.sim.rotations import matrix_to_quat
@@ -60,12 +59,6 @@ def make_camera(config: SceneConfig) -> Camera:
         position_m=np.asarray(settings.position_m, float),
         rotation=rotation,
     )
-
-
-def depth_to_millimetres(depth_m: torch.Tensor) -> torch.Tensor:
-    """z-depth [m], any shape, negative for a miss -> int16 millimetres, 0 where nothing lies within 2 m."""
-    valid = (depth_m >= 0.0) & (depth_m <= MAX_DEPTH_M)
-    return torch.where(valid, torch.round(1e3 * depth_m), 0.0).to(torch.int16)
 
 
 def _look_at(settings: CameraConfig) -> np.ndarray:

@@ -1,11 +1,13 @@
 """Warp kernels of the depth camera; one source for CPU and CUDA.
 
-Shape legend: m worlds, G geoms, F planes, H x W pixels; float32, metres, everything in the camera's optical
-frame. `project` finds the pixels that a geom can cover, `raster` intersects only those. Solids are convex, so
-that a ray meets them in one interval; a capsule is three of them.
+Shape legend: m worlds of N, named by ids; S solids of a model's G geoms, F planes, H x W pixels; metres.
+`project` brings solids into the camera's optical frame and finds the pixels that each can cover, `raster`
+intersects only those. Solids are convex: a ray meets them in one interval; a capsule is three of them.
 """
 
 import warp as wp
+
+from lerobot_vtrefine.sim.camera import MAX_DEPTH_M
 
 wp.set_module_options({"enable_backward": False})
 
@@ -17,6 +19,10 @@ BOX = wp.constant(6)
 HULL = wp.constant(7)
 MISS = wp.constant(1.0e9)
 NEAR_M = wp.constant(0.01)
+MAX_M = wp.constant(float(MAX_DEPTH_M))
+NEVER_PER_M = wp.constant(1.0e9)
+"""Bound of the inverse depth where a face sets none."""
+LEAST_M = wp.constant(1.0e-9)
 
 ivec4 = wp.types.vector(length=4, dtype=wp.int32)
 
@@ -108,11 +114,7 @@ def hit(
     planes: wp.array(dtype=wp.vec4),
     range_: wp.vec2i,
 ) -> float:
-    """z-depth at which a ray meets a geom, both in the geom's frame."""
-    if kind == BOX:
-        interval = clip_slab(wp.vec2(-MISS, MISS), origin[0], slope[0], size[0])
-        interval = clip_slab(interval, origin[1], slope[1], size[1])
-        return entry(clip_slab(interval, origin[2], slope[2], size[2]))
+    """z-depth at which a ray meets a geom other than a box, both in the geom's frame."""
     if kind == CYLINDER:
         return hit_cylinder(origin, slope, size[0], size[1])
     if kind == CAPSULE:
@@ -129,24 +131,125 @@ def hit(
     return MISS
 
 
-@wp.kernel
-def project(
-    kind: wp.array(dtype=int),
-    centre: wp.array(dtype=wp.vec3, ndim=2),
-    half: wp.array(dtype=wp.vec3, ndim=2),
-    shared: int,
-    pos: wp.array(dtype=wp.vec3, ndim=2),
-    rot: wp.array(dtype=wp.mat33, ndim=2),
-    camera: wp.vec4,
-    height: int,
-    width: int,
-    cover: wp.array(dtype=ivec4, ndim=2),
+@wp.struct
+class Slabs:
+    """The planes of a box's faces, in pairs; a ray's inverse depth at a plane is linear in its direction, so
+    that nothing need be divided until the ray has hit.
+    """
+
+    near: wp.mat33
+    """Inverse depth [1/m] at the plane of each pair that is nearer to the camera: this times a direction."""
+    far: wp.mat33
+    """The same of the other one."""
+    beyond: wp.vec3
+    """How far the camera lies outside the nearer plane, negative within the pair [m]."""
+
+
+@wp.func
+def make_slabs(position: wp.vec3, rotation: wp.mat33, half: wp.vec3) -> Slabs:
+    """Of a box in the camera's frame."""
+    back = wp.transpose(rotation)
+    origin = back * (-position)
+    slabs = Slabs()
+    for axis in range(3):
+        sign = wp.where(origin[axis] < 0.0, -1.0, 1.0)
+        beyond = sign * origin[axis] - half[axis]
+        beyond = wp.where(wp.abs(beyond) < LEAST_M, LEAST_M, beyond)
+        slabs.beyond[axis] = beyond
+        slabs.near[axis] = -sign / beyond * back[axis]
+        slabs.far[axis] = -sign / (sign * origin[axis] + half[axis]) * back[axis]
+    return slabs
+
+
+@wp.func
+def draw_box(
+    image: wp.array(dtype=float, ndim=3),
+    nth: int,
+    row: int,
+    first: int,
+    last: int,
+    start: wp.vec3,
+    step: wp.vec3,
+    slabs: Slabs,
 ) -> None:
-    """Pixel rectangle (first and last column, first and last row) around each geom's bounding box."""
-    world, geom = wp.tid()
-    own = wp.where(shared == 1, 0, world)
+    """Lower columns `first` to `last` of a row to a box: rays start + column step in the camera's frame."""
+    near, near_step = slabs.near * start, slabs.near * step
+    far, far_step = slabs.far * start, slabs.far * step
+    upper, upper_step = wp.vec3(NEVER_PER_M), wp.vec3()
+    lower, lower_step = wp.vec3(), wp.vec3()
+    for axis in range(3):
+        if slabs.beyond[axis] > 0.0:
+            upper[axis] = near[axis]
+            upper_step[axis] = near_step[axis]
+        else:
+            lower[axis] = near[axis]
+            lower_step[axis] = near_step[axis]
+    entered = int(0)
+    for column in range(first, last + 1):
+        u = float(column)
+        high = wp.min(upper + u * upper_step)
+        low = wp.max(wp.max(lower + u * lower_step), wp.max(far + u * far_step))
+        if low <= high and high < NEVER_PER_M:
+            entered = int(1)
+            if high * image[nth, row, column] > 1.0:
+                image[nth, row, column] = 1.0 / high
+        elif entered == 1:
+            break
+
+
+@wp.struct
+class Solids:
+    """Some of a model's geoms."""
+
+    geom: wp.array(dtype=int)
+    """(S,) their numbers."""
+    kind: wp.array(dtype=int)
+    planes: wp.array(dtype=wp.vec4)
+    """(F,) half-spaces of convex meshes, in their own frames."""
+    plane_range: wp.array(dtype=wp.vec2i)
+    """(S,) which of them."""
+
+
+@wp.struct
+class Shapes:
+    """Of all geoms, (N or 1, G)."""
+
+    size: wp.array(dtype=wp.vec3, ndim=2)
+    centre: wp.array(dtype=wp.vec3, ndim=2)
+    """Of the bounding box, in the geom's frame."""
+    half: wp.array(dtype=wp.vec3, ndim=2)
+    """Of the bounding box."""
+
+
+@wp.struct
+class Eye:
+    """The cameras of all worlds."""
+
+    position: wp.array(dtype=wp.vec3d)
+    """(N,)"""
+    axes: wp.array(dtype=wp.mat33d)
+    """(N,) optical frames."""
+    intrinsics: wp.vec4
+    height: int
+    width: int
+
+
+@wp.struct
+class View:
+    """Solids as cameras see them, (m, S) each."""
+
+    position: wp.array(dtype=wp.vec3, ndim=2)
+    rotation: wp.array(dtype=wp.mat33, ndim=2)
+    slabs: wp.array(dtype=Slabs, ndim=2)
+    """Of boxes only."""
+    cover: wp.array(dtype=ivec4, ndim=2)
+    """First and last column, first and last row of the pixels around a solid's bounding box."""
+
+
+@wp.func
+def covered(eye: Eye, position: wp.vec3, rotation: wp.mat33, centre: wp.vec3, half: wp.vec3) -> ivec4:
+    """Pixels around a box; a box that reaches behind the camera covers all of them."""
     low_u, low_v, high_u, high_v = float(MISS), float(MISS), float(-MISS), float(-MISS)
-    whole = kind[geom] == PLANE
     behind = int(0)  # a bare literal would be a constant to warp
     for corner in range(8):
         sign = wp.vec3(
@@ -154,56 +257,96 @@ def project(
             wp.where((corner & 2) == 2, 1.0, -1.0),
             wp.where((corner & 4) == 4, 1.0, -1.0),
         )
-        p = pos[world, geom] + rot[world, geom] * (centre[own, geom] + wp.cw_mul(sign, half[own, geom]))
+        p = position + rotation * (centre + wp.cw_mul(sign, half))
         if p[2] < NEAR_M:
             behind += 1
         else:
-            u, v = p[0] / p[2] * camera[0] + camera[2], p[1] / p[2] * camera[1] + camera[3]
+            u = p[0] / p[2] * eye.intrinsics[0] + eye.intrinsics[2]
+            v = p[1] / p[2] * eye.intrinsics[1] + eye.intrinsics[3]
             low_u, high_u = wp.min(low_u, u), wp.max(high_u, u)
             low_v, high_v = wp.min(low_v, v), wp.max(high_v, v)
-    if whole or (behind > 0 and behind < 8):
-        cover[world, geom] = ivec4(0, width - 1, 0, height - 1)
-    elif behind == 8:
-        cover[world, geom] = ivec4(0, -1, 0, -1)
+    if behind == 8:
+        return ivec4(0, -1, 0, -1)
+    if behind > 0:
+        return ivec4(0, eye.width - 1, 0, eye.height - 1)
+    width, height = float(eye.width), float(eye.height)
+    # Clamped as floats: a far-off corner would overflow an integer.
+    return ivec4(
+        int(wp.ceil(wp.clamp(low_u, 0.0, width) - 1.0e-3)),
+        int(wp.floor(wp.clamp(high_u, -1.0, width - 1.0) + 1.0e-3)),
+        int(wp.ceil(wp.clamp(low_v, 0.0, height) - 1.0e-3)),
+        int(wp.floor(wp.clamp(high_v, -1.0, height - 1.0) + 1.0e-3)),
+    )
+
+
+@wp.kernel
+def project(
+    first: int,
+    ids: wp.array(dtype=int),
+    solids: Solids,
+    shapes: Shapes,
+    eye: Eye,
+    position: wp.array(dtype=wp.vec3d, ndim=2),
+    rotation: wp.array(dtype=wp.mat33d, ndim=2),
+    view: View,
+) -> None:
+    """Fill `view` from the geoms' poses (m, G) in the world, for the worlds ids[first] and on."""
+    nth, solid = wp.tid()
+    nth += first
+    world, geom = ids[nth], solids.geom[solid]
+    back = wp.transpose(eye.axes[world])
+    here = wp.vec3(back * (position[nth, geom] - eye.position[world]))
+    turned = wp.mat33(back * rotation[nth, geom])
+    view.position[nth, solid] = here
+    view.rotation[nth, solid] = turned
+    own = wp.min(world, shapes.size.shape[0] - 1)
+    if solids.kind[solid] == BOX:
+        view.slabs[nth, solid] = make_slabs(here, turned, shapes.size[own, geom])
+    if solids.kind[solid] == PLANE:
+        view.cover[nth, solid] = ivec4(0, eye.width - 1, 0, eye.height - 1)
     else:
-        # Clamped as floats: a far-off corner would overflow an integer.
-        cover[world, geom] = ivec4(
-            int(wp.ceil(wp.clamp(low_u, -1.0, float(width)) - 1.0e-3)),
-            int(wp.floor(wp.clamp(high_u, -1.0, float(width)) + 1.0e-3)),
-            int(wp.ceil(wp.clamp(low_v, -1.0, float(height)) - 1.0e-3)),
-            int(wp.floor(wp.clamp(high_v, -1.0, float(height)) + 1.0e-3)),
-        )
+        centre, half = shapes.centre[own, geom], shapes.half[own, geom]
+        view.cover[nth, solid] = covered(eye, here, turned, centre, half)
 
 
 @wp.kernel
 def raster(
-    first_world: int,
-    kind: wp.array(dtype=int),
-    size: wp.array(dtype=wp.vec3, ndim=2),
-    shared: int,
-    pos: wp.array(dtype=wp.vec3, ndim=2),
-    rot: wp.array(dtype=wp.mat33, ndim=2),
-    cover: wp.array(dtype=ivec4, ndim=2),
-    planes: wp.array(dtype=wp.vec4),
-    plane_range: wp.array(dtype=wp.vec2i),
-    camera: wp.vec4,
-    width: int,
+    first: int,
+    ids: wp.array(dtype=int),
+    solids: Solids,
+    shapes: Shapes,
+    eye: Eye,
+    view: View,
+    background: wp.array(dtype=float, ndim=3),
     depth: wp.array(dtype=float, ndim=3),
+    millimetres: wp.array(dtype=wp.int16, ndim=3),
 ) -> None:
-    """Lower `depth` [m] to the nearest geom of each pixel, from `first_world` on; a thread per image row."""
+    """Depth (m, H, W) of the nearest solid [m], of `background` (N or 1, H, W) where there is none, and the
+    same in millimetres, 0 beyond `MAX_M`; for the worlds ids[first] and on, a thread per image row.
+    """
     nth, row = wp.tid()
-    world = first_world + nth
-    own = wp.where(shared == 1, 0, world)
-    for geom in range(kind.shape[0]):
-        rect = cover[world, geom]
+    nth += first
+    world = ids[nth]
+    own = wp.min(world, shapes.size.shape[0] - 1)
+    behind = wp.min(world, background.shape[0] - 1)
+    camera = eye.intrinsics
+    start = wp.vec3(-camera[2] / camera[0], (float(row) - camera[3]) / camera[1], 1.0)
+    step = wp.vec3(1.0 / camera[0], 0.0, 0.0)
+    for column in range(eye.width):
+        depth[nth, row, column] = background[behind, row, column]
+    for solid in range(solids.kind.shape[0]):
+        rect = view.cover[nth, solid]
         if row >= rect[2] and row <= rect[3]:
-            back = wp.transpose(rot[world, geom])
-            origin = back * (-pos[world, geom])
-            start = back * wp.vec3(-camera[2] / camera[0], (float(row) - camera[3]) / camera[1], 1.0)
-            step = back * wp.vec3(1.0 / camera[0], 0.0, 0.0)
-            dims = size[own, geom]
-            for column in range(wp.max(rect[0], 0), wp.min(rect[1], width - 1) + 1):
-                slope = start + float(column) * step
-                t = hit(kind[geom], dims, origin, slope, planes, plane_range[geom])
-                if t < depth[world, row, column]:
-                    depth[world, row, column] = t
+            kind = solids.kind[solid]
+            if kind == BOX:
+                draw_box(depth, nth, row, rect[0], rect[1], start, step, view.slabs[nth, solid])
+            else:
+                back = wp.transpose(view.rotation[nth, solid])
+                origin, first_ray, turn = back * (-view.position[nth, solid]), back * start, back * step
+                size, planes = shapes.size[own, solids.geom[solid]], solids.plane_range[solid]
+                for column in range(rect[0], rect[1] + 1):
+                    t = hit(kind, size, origin, first_ray + float(column) * turn, solids.planes, planes)
+                    depth[nth, row, column] = wp.min(depth[nth, row, column], t)
+    for column in range(eye.width):
+        far = depth[nth, row, column]
+        millimetres[nth, row, column] = wp.int16(wp.where(far <= MAX_M, wp.rint(1.0e3 * far), 0.0))

@@ -49,8 +49,9 @@ def describe(
     """
     m = len(ids)
     insertion = task.insertion(scene.pair, seen.plug, seen.socket, scene.config.table_height_m)
-    relative = turn_back(seen.socket[1], seen.plug_velocity[:, :3] - seen.socket_velocity[:, :3])
-    spin = turn_back(seen.socket[1], seen.plug_velocity[:, 3:] - seen.socket_velocity[:, 3:])
+    velocity = seen.part_velocities[:, 0] - seen.part_velocities[:, 1]
+    relative = turn_back(seen.socket[1], velocity[:, :3])
+    spin = turn_back(seen.socket[1], velocity[:, 3:])
     columns = {
         "joint_position": seen.joints,
         "joint_velocity": seen.joint_velocities,
@@ -60,9 +61,10 @@ def describe(
         "plug_in_socket_velocity": relative,
         "plug_in_socket_spin": spin,
     }
+    hand_position, hand_rotation = seen.hands
     for hand, (name, part) in enumerate((("socket", seen.socket), ("plug", seen.plug))):
-        rotation = seen.hand_rotation[:, hand]
-        columns[f"{name}_in_hand"] = turn_back(rotation, part[0] - seen.hand_position[:, hand])
+        rotation = hand_rotation[:, hand]
+        columns[f"{name}_in_hand"] = turn_back(rotation, part[0] - hand_position[:, hand])
         columns[f"{name}_in_hand_rotation"] = _two_columns(np.swapaxes(rotation, -1, -2) @ part[1])
     limits, hold_steps = config.limits, config.success.hold_steps(config.control_dt_s)
     columns |= {

@@ -3,13 +3,14 @@
 Shapes: m worlds, 4 pads, B = 2 bodies (plug, socket).
 """
 
-from dataclasses import dataclass
+from functools import cached_property
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import torch
 
 from lerobot_vtrefine.embodiments import Embodiment
+from lerobot_vtrefine.embodiments.kinematics import Hands
 from lerobot_vtrefine.sim.config import ShearConfig
 from lerobot_vtrefine.sim.host import to_host
 from lerobot_vtrefine.sim.pairs import Part
@@ -34,40 +35,68 @@ HELD = (1, 1, 0, 0)
 """What each pad holds, of (plug, socket): the left hand the socket, the right one the plug."""
 
 
-@dataclass(frozen=True)
 class Kinematics:
-    """Poses of m worlds, from their positions and velocities."""
+    """Where everything is in m worlds with positions (m, nq) and velocities (m, nv); what is asked for is
+    computed once.
+    """
 
-    joints: Array
-    """(m, J)"""
-    joint_velocities: Array
-    hand_position: Array
-    """(m, 2, 3) TCPs."""
-    hand_rotation: Array
-    plug: tuple[Array, Array]
-    """Position (m, 3) and rotation (m, 3, 3)."""
-    socket: tuple[Array, Array]
-    plug_velocity: Array
-    """(m, 6) linear velocity of the origin, then angular, world frame."""
-    socket_velocity: Array
+    def __init__(self, scene: Scene, qpos: Array, qvel: Array) -> None:
+        self._scene, self._qpos, self._qvel = scene, qpos, qvel
 
+    @cached_property
+    def joints(self) -> Array:
+        """(m, J)"""
+        return self._qpos[:, self._scene.addresses.qpos]
 
-def read_kinematics(scene: Scene, qpos: Array, qvel: Array) -> Kinematics:
-    """Poses for positions (m, nq) and velocities (m, nv)."""
-    at = scene.addresses
-    joints = qpos[:, at.qpos]
-    position, rotation = scene.embodiment.tcp_poses(torch.from_numpy(joints))
-    plug, socket = part_pose(qpos[:, at.plug_qpos]), part_pose(qpos[:, at.socket_qpos])
-    return Kinematics(
-        joints=joints,
-        joint_velocities=qvel[:, at.dof],
-        hand_position=position.numpy(),
-        hand_rotation=rotation.numpy(),
-        plug=plug,
-        socket=socket,
-        plug_velocity=_twist(qvel[:, at.plug_dof], plug[1]),
-        socket_velocity=_twist(qvel[:, at.socket_dof], socket[1]),
-    )
+    @cached_property
+    def joint_velocities(self) -> Array:
+        """(m, J)"""
+        return self._qvel[:, self._scene.addresses.dof]
+
+    @cached_property
+    def hands(self) -> tuple[Array, Array]:
+        """Positions (m, 2, 3) and rotations (m, 2, 3, 3) of the TCPs."""
+        position, rotation = self._arms.tcp()
+        return position.numpy(), rotation.numpy()
+
+    @cached_property
+    def pads(self) -> tuple[Array, Array]:
+        """Positions (m, 4, 3) and rotations (m, 4, 3, 3) of the pads."""
+        position, rotation = self._arms.pads()
+        return position.numpy(), rotation.numpy()
+
+    @cached_property
+    def pad_velocities(self) -> Array:
+        """(m, 4, 6) linear velocity of the origin, then angular, world frame; the same of the parts."""
+        return self._arms.pad_twists(torch.from_numpy(self.joint_velocities)).numpy()
+
+    @cached_property
+    def parts(self) -> tuple[Array, Array]:
+        """Positions (m, B, 3) and rotations (m, B, 3, 3) of the plug and the socket."""
+        at = self._scene.addresses
+        return part_pose(np.stack([self._qpos[:, at.plug_qpos], self._qpos[:, at.socket_qpos]], 1))
+
+    @cached_property
+    def part_velocities(self) -> Array:
+        """(m, B, 6)"""
+        at = self._scene.addresses
+        velocity = np.stack([self._qvel[:, at.plug_dof], self._qvel[:, at.socket_dof]], 1)
+        # A free joint's velocity has its angular part in the body's frame.
+        return np.concatenate([velocity[..., :3], turn(self.parts[1], velocity[..., 3:])], -1)
+
+    @property
+    def plug(self) -> tuple[Array, Array]:
+        """Position (m, 3) and rotation (m, 3, 3)."""
+        return self.parts[0][:, 0], self.parts[1][:, 0]
+
+    @property
+    def socket(self) -> tuple[Array, Array]:
+        """Position (m, 3) and rotation (m, 3, 3)."""
+        return self.parts[0][:, 1], self.parts[1][:, 1]
+
+    @cached_property
+    def _arms(self) -> Hands:
+        return self._scene.embodiment.hands(torch.from_numpy(self.joints))
 
 
 def part_pose(pose: Array) -> tuple[Array, Array]:
@@ -75,18 +104,18 @@ def part_pose(pose: Array) -> tuple[Array, Array]:
     return pose[..., :3], quat_to_matrix(pose[..., 3:])
 
 
-def pad_loads(embodiment: Embodiment, joints: Array, contacts: Array) -> Array:
+def pad_loads(pads: tuple[Array, Array], contacts: Array) -> Array:
     """Contact sensors' wrenches as loads on the pads.
 
     Args:
-        joints: (m, J).
+        pads: their positions (m, 4, 3) and rotations (m, 4, 3, 3).
         contacts: (m, 4, 10) found, force of the pad on its counterpart, torque, centre; world frame.
 
     Returns:
         (m, 4, LOAD_SIZE): normal force pressing on the pad [N], its centre's x and y [m], the tangential
         force on the pad along x and y [N]; in the pad's frame, zeros where nothing touches.
     """
-    position, rotation = (item.numpy() for item in embodiment.pad_poses(torch.from_numpy(joints)))
+    position, rotation = pads
     force = turn_back(rotation, contacts[..., 1:4])
     centre = turn_back(rotation, contacts[..., 7:10] - position)[..., :2]
     touched = contacts[..., 0] > 0
@@ -187,8 +216,3 @@ def pad_layout(embodiment: Embodiment) -> PadLayout:
 
 def _touch_geometry(part: Part) -> BodyGeometry:
     return BodyGeometry([part.surface] if part.surface is not None else list(part.pieces))
-
-
-def _twist(velocity: Array, rotation: Array) -> Array:
-    """A free joint's velocity has its angular part in the body's frame: bring it to the world's."""
-    return np.concatenate([velocity[:, :3], turn(rotation, velocity[:, 3:])], -1)

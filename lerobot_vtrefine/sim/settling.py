@@ -12,6 +12,7 @@ from lerobot_vtrefine.sim.backends import Backend
 from lerobot_vtrefine.sim.backends.base import LOAD_SIZE
 from lerobot_vtrefine.sim.config import TaskConfig
 from lerobot_vtrefine.sim.scene import Scene
+from lerobot_vtrefine.sim.sensing import Kinematics
 from lerobot_vtrefine.sim.touch import TouchSource
 
 Array = np.ndarray
@@ -71,7 +72,8 @@ class Settler:
         self._backend.write(ids, qpos, np.zeros((len(ids), model.nv)))
         command = task.servo_commands(self._scene.embodiment, start.targets)
         substeps = round(start.settle_s / self._scene.config.timestep_s)
-        load = self._touch.load(ids, self._backend.advance_linearly(ids, command, command, substeps))
+        trace = self._backend.advance_linearly(ids, command, command, substeps)
+        load = self._touch.load(ids, trace, lambda: Kinematics(self._scene, *self._backend.read(ids)))
         rows = self._backend.get_rows(ids)
         return [_Rest(*parts) for parts in zip(rows, command, load, strict=True)]
 

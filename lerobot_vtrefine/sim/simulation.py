@@ -25,10 +25,10 @@ from lerobot_vtrefine.sim.config import (
 from lerobot_vtrefine.sim.depth import DepthCamera
 from lerobot_vtrefine.sim.drive import make_drive
 from lerobot_vtrefine.sim.episode import EpisodeState, Measured, update
+from lerobot_vtrefine.sim.present import Present
 from lerobot_vtrefine.sim.privileged import Privileged, describe
 from lerobot_vtrefine.sim.randomization import Randomizer, WorldParameters
 from lerobot_vtrefine.sim.reality import RobotFaults
-from lerobot_vtrefine.sim.rotations import matrix_to_quat
 from lerobot_vtrefine.sim.scene import Scene, build_scene
 from lerobot_vtrefine.sim.sensing import Kinematics
 from lerobot_vtrefine.sim.settling import Settler
@@ -112,9 +112,7 @@ class InsertionSim:
         everyone = self._randomizer.draw(np.zeros(num_envs, np.int64))
         self._parameters = dict(everyone.values)
         self._depth = DepthCamera(self.scene.model, self.scene.camera, num_envs, device, threads)
-        self._coming: tuple[Array, Callable[[], Array]] | None = None
-        """Depth images on their way, and of which worlds."""
-        self._images_read = False
+        self._present = Present(self.scene, self._backend, self._depth)
         self._settler = Settler(self.scene, self.config, self._backend, self._touch)
         self._drive = make_drive(
             self._backend, self.scene.embodiment, self.substeps, self.config, robot_faults
@@ -153,14 +151,14 @@ class InsertionSim:
     @property
     def camera_pose(self) -> Array:
         """(N, 7) float32 position [m] and quaternion (w, x, y, z) of the optical frame in the world."""
-        quat = matrix_to_quat(self._depth.rotation)
-        return np.concatenate([self._depth.position, quat], 1).astype(np.float32)
+        return self._depth.pose.copy()
 
     def reset(self, ids: Array, seeds: Array, start: starts.Start | None = None) -> None:
         """Start new episodes in worlds `ids` (m,); each is a pure function of its seed (m,), and of `start`
         where one is given in place of the seed's.
         """
-        ids, self._coming = self._checked(ids), None
+        ids = self._checked(ids)
+        self._present.forget()
         seeds = np.broadcast_to(np.asarray(seeds, np.int64), ids.shape)
         drawn = self._randomizer.draw(seeds)
         self._apply(ids, drawn)
@@ -171,7 +169,7 @@ class InsertionSim:
         state.command[ids] = self._drive.reset(ids, command)
         state.pad_force[ids] = state.pad_load[ids][..., 0]
         self._pads.reset(ids, seeds, drawn.values)
-        seen = self._seen(ids)
+        seen = self._present.see(ids)
         measured = self._grip_points(seen)
         in_hand = self.scene.config.start == "grasped"
         state.grasped[ids] = in_hand
@@ -179,12 +177,14 @@ class InsertionSim:
         state.tip[ids] = self._insertion(seen).position_m
         self._remember(ids)
 
-    def step(self, action: Array, ids: Array | None = None) -> StepResult:
+    def step(self, action: Array, ids: Array | None = None, images: Array | None = None) -> StepResult:
         """One control step of worlds `ids` (m,), all by default.
 
         Args:
             action: (m, J) absolute joint targets [rad, m]. They are clamped to the joint limits and to the
                 rate limits, and approached linearly over the control step.
+            images: worlds whose depth images are asked for next, sorted; they are begun at once, beside all
+                else. None by default.
         """
         ids = self._checked(ids)
         action = np.asarray(action, float)
@@ -196,9 +196,13 @@ class InsertionSim:
         wanted = task.servo_commands(self.scene.embodiment, action)
         after = np.clip(wanted, before - self._rates, before + self._rates)
         earlier = [torch.as_tensor(item[ids], device=self.device) for item in (state.tip, state.force_tail)]
+        self._present.forget()
         trace = self._drive.advance(ids, before, after)
         state.command[ids] = after
-        reward = update(state, ids, self._start_measuring(ids, trace, earlier)(), self.config)
+        measured = self._start_measuring(ids, trace, earlier)
+        if images is not None and len(images):
+            self._present.start_images(self._checked(images))
+        reward = update(state, ids, measured(), self.config)
         self._remember(ids)
         terminated = state.done[ids]
         truncated = ~terminated & (state.steps[ids] >= self.episode_steps)
@@ -244,17 +248,14 @@ class InsertionSim:
     def hold(self) -> None:
         """Let the physics of one control step pass under the present commands, and nothing else."""
         command = self._episode.command
-        everyone, self._coming = np.arange(self.num_envs), None
+        everyone = np.arange(self.num_envs)
+        self._present.forget()
         self._backend.advance_linearly(everyone, command, command, self.substeps)
         self._backend.diverged(everyone)  # waits for it
 
     def depth_mm(self, ids: Array | None = None) -> Array:
         """Depth images (m, H, W) uint16 [mm]."""
-        ids = self._checked(ids)
-        coming, self._coming, self._images_read = self._coming, None, True
-        if coming is not None and np.array_equal(coming[0], ids):
-            return coming[1]()
-        return self._depth.start_mm(ids, *self._backend.geom_poses(ids))()
+        return self._present.images(self._checked(ids))
 
     def command_targets(self, ids: Array | None = None) -> Array:
         """Joint targets (m, J) that the servos hold at the end of the last control step."""
@@ -267,7 +268,7 @@ class InsertionSim:
 
     def insertion(self, ids: Array | None = None) -> task.Insertion:
         """Where each plug is with respect to its socket."""
-        seen = self._seen(self._checked(ids))
+        seen = self._present.see(self._checked(ids))
         return self._insertion(seen)
 
     def privileged(self, ids: Array | None = None) -> Array:
@@ -312,7 +313,7 @@ class InsertionSim:
         """Continue world `env` from a state taken by `get_state`."""
         values = {name: np.atleast_1d(value) for name, value in state["parameters"].items()}
         position, rotation = state["camera"]
-        self._coming = None
+        self._present.forget()
         self._apply(np.array([env]), WorldParameters(values, position[None], rotation[None]))
         self._backend.set_rows(np.array([env]), state["row"][None])
         self._episode.set_row(env, state["episode"])
@@ -341,11 +342,8 @@ class InsertionSim:
             if "geom_size" in fields:
                 self._depth.set_shapes(ids, fields["geom_size"], fields["geom_aabb"])
 
-    def _seen(self, ids: Array) -> Kinematics:
-        return sensing.read_kinematics(self.scene, *self._backend.read(ids))
-
     def _touch_at(self, ids: Array) -> Touch:
-        return self._touch(ids, lambda: self._seen(ids), self._episode.pad_load[ids])
+        return self._touch(ids, lambda: self._present.see(ids), self._episode.pad_load[ids])
 
     def _remember(self, ids: Array) -> None:
         if self._pads.remembers:
@@ -356,7 +354,7 @@ class InsertionSim:
 
     def _grip_points(self, seen: Kinematics) -> Array:
         grips = self.scene.pair.socket.grip, self.scene.pair.plug.grip
-        return task.grip_points(grips, (seen.socket, seen.plug), (seen.hand_position, seen.hand_rotation))
+        return task.grip_points(grips, (seen.socket, seen.plug), seen.hands)
 
     def _start_measuring(
         self, ids: Array, trace: Trace, earlier: list[torch.Tensor]
@@ -364,16 +362,13 @@ class InsertionSim:
         """Ask for all that follows from a trace before waiting for any of it: a GPU then never idles."""
         scene, pair = self.scene, self.scene.pair
         summary = start_summary(trace, scene.addresses, scene.config.timestep_s, *earlier, pair.mouth_z_m)
-        load, state = self._touch.start_load(ids, trace), self._backend.start_read(ids)
-        self._coming = None
-        if self._images_read and self.device != "cpu":  # as after the last step: most likely they will be now
-            self._coming = ids, self._depth.start_mm(ids, *self._backend.geom_poses(ids))
-        self._images_read = False
+        load = self._touch.start_load(ids, trace, lambda: self._present.see(ids))
+        state = self._backend.start_read(ids)
 
         def wait() -> Measured:
-            seen = sensing.read_kinematics(scene, *state())
+            seen = self._present.see(ids, state())
             rest = np.array([pair.socket.rest_height_m, pair.plug.rest_height_m])
-            positions = np.stack([seen.socket[0], seen.plug[0]], 1)
+            positions = seen.parts[0][:, ::-1]
             return Measured(
                 insertion=self._insertion(seen),
                 grip_points=self._grip_points(seen),
@@ -387,7 +382,7 @@ class InsertionSim:
         return wait
 
     def _describe(self, ids: Array) -> Privileged:
-        return describe(self.scene, self.config, self._episode, ids, self._seen(ids), self._parameters)
+        return describe(self.scene, self.config, self._episode, ids, self._present.see(ids), self._parameters)
 
 
 def _substeps(scene: SceneConfig, config: TaskConfig) -> int:

@@ -18,6 +18,7 @@ from lerobot_vtrefine.sim.sensing import Kinematics, pad_loads
 
 Array = np.ndarray
 ArrayLike = np.ndarray | torch.Tensor
+See = Callable[[], Kinematics]
 
 
 @dataclass(frozen=True)
@@ -38,44 +39,35 @@ class TouchSource(ABC):
     """Where a `Touch` comes from."""
 
     @abstractmethod
-    def start_load(self, ids: Array, trace: Trace) -> Callable[[], Array]:
+    def start_load(self, ids: Array, trace: Trace, see: See) -> Callable[[], Array]:
         """Begin to read the loads on the pads at the end of a trace that has just been made; what is returned
-        waits for them, (m, 4, LOAD_SIZE) on the host.
+        waits for them, (m, 4, LOAD_SIZE) on the host. `see` gives the worlds' kinematics there.
         """
 
-    def load(self, ids: Array, trace: Trace) -> Array:
+    def load(self, ids: Array, trace: Trace, see: See) -> Array:
         """The same at once."""
-        return self.start_load(ids, trace)()
+        return self.start_load(ids, trace, see)()
 
     @abstractmethod
-    def __call__(self, ids: Array, see: Callable[[], Kinematics], load: Array) -> Touch:
+    def __call__(self, ids: Array, see: See, load: Array) -> Touch:
         """At the present state; `see` gives the worlds' kinematics, `load` is what `load` gave."""
 
 
 class HostTouch(TouchSource):
-    """By the embodiment's forward kinematics."""
+    """By the host's kinematics."""
 
     def __init__(self, scene: Scene) -> None:
-        self._robot, self._at = scene.embodiment, scene.addresses
+        self._at = scene.addresses
 
-    def start_load(self, ids: Array, trace: Trace) -> Callable[[], Array]:
+    def start_load(self, ids: Array, trace: Trace, see: See) -> Callable[[], Array]:
         """See `TouchSource.start_load`."""
-        joints, contacts = trace.qpos[:, -1][:, self._at.qpos], trace.sensors[:, -1][:, self._at.pad_contacts]
-        return lambda: pad_loads(self._robot, np.asarray(joints), np.asarray(contacts))
+        contacts = np.asarray(trace.sensors[:, -1][:, self._at.pad_contacts])
+        return lambda: pad_loads(see().pads, contacts)
 
-    def __call__(self, ids: Array, see: Callable[[], Kinematics], load: Array) -> Touch:
+    def __call__(self, ids: Array, see: See, load: Array) -> Touch:
         """See `TouchSource.__call__`."""
         seen = see()
-        joints, rates = torch.from_numpy(seen.joints), torch.from_numpy(seen.joint_velocities)
-        position, rotation = self._robot.pad_poses(joints)
-        poses = (
-            position.numpy(),
-            rotation.numpy(),
-            self._robot.pad_twists(joints, rates).numpy(),
-            np.stack([seen.plug[0], seen.socket[0]], 1),
-            np.stack([seen.plug[1], seen.socket[1]], 1),
-            np.stack([seen.plug_velocity, seen.socket_velocity], 1),
-        )
+        poses = (*seen.pads, seen.pad_velocities, *seen.parts, seen.part_velocities)
         return Touch(poses, load[..., :3], load[..., 3:])
 
 
@@ -85,12 +77,12 @@ class DeviceTouch(TouchSource):
     def __init__(self, reader: TouchReader) -> None:
         self._reader = reader
 
-    def start_load(self, ids: Array, trace: Trace) -> Callable[[], Array]:
+    def start_load(self, ids: Array, trace: Trace, see: See) -> Callable[[], Array]:
         """See `TouchSource.start_load`."""
         copied = start_copy(torch.cat(self._reader(ids)[1:], -1))
         return lambda: copied().astype(float)
 
-    def __call__(self, ids: Array, see: Callable[[], Kinematics], load: Array) -> Touch:
+    def __call__(self, ids: Array, see: See, load: Array) -> Touch:
         """See `TouchSource.__call__`."""
         return Touch(*self._reader(ids))
 

@@ -12,19 +12,19 @@ _MIX = 3935559000370003845
 
 
 @cache
-def _table(device: str) -> torch.Tensor:
+def _windows(device: str, count: int) -> torch.Tensor:
+    """All windows of `count` numbers of the table, which goes on at its beginning: (TABLE_SIZE, count)."""
     values = np.random.default_rng(TABLE_SEED).standard_normal(TABLE_SIZE, dtype=np.float32)
-    return torch.from_numpy(values).to(device)
+    return torch.from_numpy(np.resize(values, TABLE_SIZE + count - 1)).to(device).unfold(0, count, 1)
 
 
 def noise_frames(seed: torch.Tensor, frame: torch.Tensor, count: int) -> torch.Tensor:
     """Standard normal numbers (..., count) for int64 seeds and frame numbers (...), equal on every device.
 
-    Each frame is a window, at a hashed position, of one fixed table of 2^20 numbers: a gather instead of a
+    Each frame is a window, at a hashed position, of one fixed table of 2^20 numbers: a copy instead of a
     generator.
     """
     mixed = (seed + frame * _MULTIPLIER) * _MIX
     mixed = mixed ^ ((mixed >> 29) & 0x7FFFFFFFF)
     start = ((mixed * _MULTIPLIER) >> 33) & (TABLE_SIZE - 1)
-    index = (start.unsqueeze(-1) + torch.arange(count, device=seed.device)) & (TABLE_SIZE - 1)
-    return _table(str(seed.device))[index]
+    return _windows(str(seed.device), count)[start]

@@ -191,13 +191,14 @@ class PadSensors:
         stage = self._specialised(self.model.contact, index)
         return stage.scaled(_per_env(self._stiffness_scale[index]))
 
-    def _frame(self, index: torch.Tensor, dt_s: float, load: ArrayLike | None = None) -> Frame:
-        contact = self.model.contact
+    def _frame(
+        self, index: torch.Tensor, dt_s: float, contact: ContactStage, load: ArrayLike | None = None
+    ) -> Frame:
         return Frame(
             layout=self.layout,
             dt_s=dt_s,
             time_s=_per_env(self._time_s[index]),
-            stiffness_n_per_m=self._contact_stage(index).stiffness(self.layout),
+            stiffness_n_per_m=contact.stiffness(self.layout),
             load_conserving=contact.load_conserving and load is not None,
         )
 
@@ -222,7 +223,7 @@ class PadSensors:
     def _update_baseline(self, ids: np.ndarray) -> None:
         index = torch.as_tensor(ids, dtype=torch.long, device=self.device)
         x = torch.zeros((len(ids), self.num_pads, self.layout.rows, self.layout.cols), device=self.device)
-        frame = self._frame(index, 0.0)
+        frame = self._frame(index, 0.0, self._contact_stage(index))
         for stage in self.model.force_stages:
             if not (stage.has_state or stage.stochastic):
                 state = {key: value[index] for key, value in self._state.get(stage.name, {}).items()}
@@ -233,9 +234,11 @@ class PadSensors:
         return torch.as_tensor(array, device=self.device).to(torch.float32)
 
     def _contact_forces(
-        self, index: torch.Tensor, poses: Poses, load: ArrayLike | None, frame: Frame
-    ) -> torch.Tensor:
+        self, index: torch.Tensor, poses: Poses, dt_s: float, load: ArrayLike | None
+    ) -> tuple[torch.Tensor, Frame]:
+        """Forces per taxel (m, P, R, C) [N], and what later stages may know of the frame."""
         contact = self._contact_stage(index)
+        frame = self._frame(index, dt_s, contact, load)
         solved = contact.load_conserving and load is not None
         if solved not in self._engines:
             from lerobot_vtrefine.tactile.engine import ContactEngine  # warp is slow to import
@@ -245,13 +248,14 @@ class PadSensors:
             )
         loads = None if load is None else self._tensor(load)
         # The engine reuses its buffers, while callers and stages with memory may keep what they get.
-        return self._engines[solved](contact, [self._tensor(pose) for pose in poses], loads, frame).clone()
+        force = self._engines[solved](contact, [self._tensor(pose) for pose in poses], loads, frame)
+        return force.clone(), frame
 
     def forces(self, ids: np.ndarray, poses: Poses, dt_s: float, load: ArrayLike | None = None) -> ArrayLike:
         """Contact force per taxel before mechanics and readout: (m, P, N) float32 [N]; arguments as in
         `counts`."""
         index = torch.as_tensor(np.atleast_1d(ids), dtype=torch.long, device=self.device)
-        force = self._contact_forces(index, poses, load, self._frame(index, dt_s, load)).flatten(2)
+        force = self._contact_forces(index, poses, dt_s, load)[0].flatten(2)
         return force if isinstance(poses.pad_pos, torch.Tensor) else force.cpu().numpy()
 
     def counts(self, ids: np.ndarray, poses: Poses, dt_s: float, load: ArrayLike | None = None) -> ArrayLike:
@@ -266,8 +270,7 @@ class PadSensors:
         Returns numpy for numpy poses, a tensor on `device` for tensors.
         """
         index = torch.as_tensor(np.atleast_1d(ids), dtype=torch.long, device=self.device)
-        frame = self._frame(index, dt_s, load)
-        force = self._contact_forces(index, poses, load, frame)
+        force, frame = self._contact_forces(index, poses, dt_s, load)
         counts = self._run(self.model.force_stages, force, index, frame)
         self._time_s[index] += dt_s
         counts = counts.flatten(2).clamp(0.0, 255.0).to(torch.uint8)

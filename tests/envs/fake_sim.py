@@ -36,7 +36,9 @@ class FakeSim:
         self.seeds[ids], self.time[ids] = seeds, 0
         self.joints[ids] = np.asarray(seeds)[:, None] * 0.01
 
-    def step(self, action: np.ndarray, ids: np.ndarray | None = None) -> FakeResult:
+    def step(
+        self, action: np.ndarray, ids: np.ndarray | None = None, images: np.ndarray | None = None
+    ) -> FakeResult:
         ids = np.arange(self.num_envs) if ids is None else ids
         self.stepped.append(np.array(ids))
         self.time[ids] += 1

@@ -1,10 +1,10 @@
 import mujoco
 import numpy as np
 import pytest
-import torch
 
-from lerobot_vtrefine.sim.camera import depth_to_millimetres, make_camera
+from lerobot_vtrefine.sim.camera import Camera, make_camera
 from lerobot_vtrefine.sim.config import CameraConfig, RandomizationConfig, SceneConfig
+from lerobot_vtrefine.sim.depth import DepthCamera
 from lerobot_vtrefine.sim.simulation import InsertionSim
 
 
@@ -17,7 +17,7 @@ def cast(sim, env, pixels):
     rays = sim.scene.camera.directions()[pixels] @ matrix.reshape(3, 3).T
     geom = np.zeros(1, np.int32)
     depth = np.array([mujoco.mj_ray(model, data, position, ray, None, 1, -1, geom) for ray in rays])
-    return depth_to_millimetres(torch.from_numpy(depth)).numpy()
+    return np.where((depth >= 0.0) & (depth <= 2.0), np.round(1e3 * depth), 0).astype(int)
 
 
 @pytest.mark.parametrize(("pair", "start"), [("round", "grasped"), ("d_shape", "table"), ("key", "grasped")])
@@ -75,9 +75,79 @@ def test_camera_geometry_follows_opencv():
     assert np.arctan(-edge[1]) == pytest.approx(0.25, rel=0.02)
 
 
-def test_depth_outside_its_range_is_zero():
-    depth = torch.tensor([-1.0, 0.0004, 0.0006, 0.5, 1.9999, 2.5])
-    np.testing.assert_array_equal(depth_to_millimetres(depth), [0, 0, 1, 500, 2000, 0])
+def one_world(xml, camera):
+    """A depth camera in front of a model, and the model's geoms' poses as it takes them."""
+    model = mujoco.MjModel.from_xml_string(f"<mujoco><worldbody>{xml}</worldbody></mujoco>")
+    data = mujoco.MjData(model)
+    mujoco.mj_forward(model, data)
+    poses = data.geom_xpos[None], data.geom_xmat.reshape(1, -1, 3, 3)
+    return model, data, DepthCamera(model, camera, 1), poses
+
+
+@pytest.mark.parametrize(("distance_m", "millimetres"), [(0.05, 50), (0.5004, 500), (1.9999, 2000), (2.5, 0)])
+@pytest.mark.parametrize("joint", ["<freejoint/>", ""])
+def test_depth_outside_its_range_is_zero(distance_m, millimetres, joint):
+    geom = '<geom type="box" size=".01 .01 .01" mass="1"/>'
+    camera = Camera(3, 3, 500.0, 500.0, 1.0, 1.0, np.zeros(3), np.eye(3))
+    body = f'<body pos="0 0 {distance_m + 0.01}">{joint}{geom}</body>'
+    _, _, eye, poses = one_world(body, camera)
+    image = eye.start_mm(np.zeros(1, int), *poses)()
+    np.testing.assert_array_equal(image, np.full((1, 3, 3), millimetres))
+    hit = eye.render(np.zeros(1, int), *poses)
+    np.testing.assert_allclose(hit, distance_m, rtol=1e-5)
+
+
+def test_nothing_in_view_is_a_miss():
+    camera = Camera(4, 3, 5.0, 5.0, 1.5, 1.0, np.zeros(3), np.eye(3))
+    behind = '<body pos="0 0 -1"><freejoint/><geom type="box" size=".1 .1 .1" mass="1"/></body>'
+    around = '<body><freejoint/><geom type="box" size=".1 .1 .1" mass="1"/></body>'
+    _, _, eye, poses = one_world(behind + around, camera)
+    assert (eye.render(np.zeros(1, int), *poses) == -1.0).all()
+    assert (eye.start_mm(np.zeros(1, int), *poses)() == 0).all()
+
+
+@pytest.mark.parametrize("seed", range(8))
+def test_any_solids_around_the_camera_are_met_as_by_rays(seed):
+    rng = np.random.default_rng(seed)
+    bodies = []
+    for kind in ("box",) * 8 + ("sphere", "capsule", "cylinder") * 2:
+        place, quat = rng.normal((0.0, 0.0, 0.8), 0.5), rng.normal(0.0, 1.0, 4)
+        size = rng.uniform(0.02, 0.5 if kind == "box" else 0.15, 3)
+        numbers = (" ".join(map(str, item)) for item in (place, quat, size))
+        bodies.append(
+            '<body pos="{}" quat="{}"><freejoint/><geom type="{kind}" size="{}" mass="1"/></body>'.format(
+                *numbers, kind=kind
+            )
+        )
+    camera = Camera(32, 24, 14.0, 16.0, 15.2, 11.7, np.array([0.1, -0.2, 0.3]), np.eye(3))
+    model, data, eye, poses = one_world("".join(bodies), camera)
+    # A ray that starts inside a solid leaves it for MuJoCo, while the camera does not see it from there.
+    outside = [geom for geom in range(model.ngeom) if not _inside(model, data, geom, camera.position_m)]
+    found = np.full(32 * 24, np.inf)
+    for index, ray in enumerate(camera.directions()):
+        for geom in outside:
+            single = mujoco.mju_rayGeom(
+                data.geom_xpos[geom],
+                data.geom_xmat[geom],
+                model.geom_size[geom],
+                camera.position_m,
+                ray,
+                int(model.geom_type[geom]),
+            )
+            found[index] = min(found[index], single if single >= 0 else np.inf)
+    found = np.where(np.isfinite(found), found, -1.0)
+    seen = eye.render(np.zeros(1, int), *poses).ravel()
+    assert (found > 0).mean() > 0.05
+    assert (np.abs(seen - found) > 1e-4 * np.abs(found)).mean() < 0.005  # silhouettes fall either way
+
+
+def _inside(model, data, geom, point):
+    """Whether a point lies in a geom, by rays both ways along one line: only one of them meets it then."""
+    place = data.geom_xpos[geom], data.geom_xmat[geom], model.geom_size[geom]
+    kind = int(model.geom_type[geom])
+    local = data.geom_xpos[geom] - point
+    ways = [mujoco.mju_rayGeom(*place, point, sign * local, kind) for sign in (1.0, -1.0)]
+    return min(ways) >= 0
 
 
 def test_bad_cameras_are_named():

@@ -20,6 +20,7 @@ from lerobot_vtrefine.sim.config import (
 from lerobot_vtrefine.sim.expert import ScriptedExpert
 from lerobot_vtrefine.sim.randomization import GEOMETRY_FIELDS
 from lerobot_vtrefine.sim.scene import build_scene
+from lerobot_vtrefine.sim.sensing import Kinematics
 from lerobot_vtrefine.sim.simulation import InsertionSim
 
 pytest.importorskip("mujoco_warp")
@@ -86,7 +87,12 @@ def test_the_same_state_gives_the_same_wrench_and_poses_on_every_pad(pair):
     for mine, exact in zip(ours.poses, truth.poses, strict=True):
         np.testing.assert_allclose(mine.numpy(), exact, atol=1e-6)
     hold = single._episode.command[:, None]
-    loads = [sim._touch.load(EVERYONE, sim._backend.advance(EVERYONE, hold)) for sim in pair]
+    traces = [sim._backend.advance(EVERYONE, hold) for sim in pair]
+    seen = [Kinematics(sim.scene, *sim._backend.read(EVERYONE)) for sim in pair]
+    loads = [
+        sim._touch.load(EVERYONE, trace, lambda now=now: now)
+        for sim, trace, now in zip(pair, traces, seen, strict=True)
+    ]
     assert (loads[1][..., 0] > 10.0).all()
     np.testing.assert_allclose(loads[0][..., 0], loads[1][..., 0], rtol=2e-4)
     np.testing.assert_allclose(loads[0][..., 1:3], loads[1][..., 1:3], atol=2e-5)
@@ -221,7 +227,7 @@ def test_the_same_episode_on_a_gpu(pair, graph):
     assert np.abs(felt[0] - felt[1]).max() <= 10
     np.testing.assert_allclose(felt[0].sum(-1), felt[1].sum(-1), rtol=0.02, atol=20)
     assert (np.abs(ours["depth_mm"].astype(int) - truth["depth_mm"]) > 1).mean() < 1e-3
-    gpu.step(gpu.command_targets() + 0.01)  # images were read before: these are begun with the step
+    gpu.step(gpu.command_targets() + 0.01, images=EVERYONE)
     np.testing.assert_array_equal(gpu.depth_mm(), gpu.depth_mm())
 
 
