@@ -1,6 +1,7 @@
 import numpy as np
 import pytest
 import torch
+from draccus.utils import ParsingError
 from fake_sim import FakeSim
 from lerobot.envs.utils import preprocess_observation
 
@@ -112,7 +113,7 @@ def test_read_schedule(every: int, window: int, read):
 
 
 def test_read_schedule_rejects_a_window_longer_than_its_period():
-    with pytest.raises(ValueError, match="read_window"):
+    with pytest.raises(ParsingError, match="read_window"):
         VtRefineEnvConfig(read_every=2, read_window=3)
 
 

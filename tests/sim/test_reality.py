@@ -4,6 +4,7 @@ import json
 
 import numpy as np
 import pytest
+from draccus.utils import ParsingError
 
 from lerobot_vtrefine.embodiments import get_embodiment
 from lerobot_vtrefine.envs.config import VtRefineEnvConfig
@@ -202,7 +203,7 @@ def test_faults_of_the_file_are_named(tmp_path, content, words):
     with pytest.raises(ValueError, match=r"reality\.json") as error:
         load_reality(file)
     assert words in str(error.value)
-    with pytest.raises(ValueError, match=r"reality\.json"):
+    with pytest.raises(ParsingError, match=r"reality\.json"):
         VtRefineEnvConfig(reality=file)
 
 
@@ -215,5 +216,5 @@ def test_missing_files_unknown_joints_and_two_sensor_models_are_refused(tmp_path
         )
     model = SensorModel.paper().to_dict()
     file = write(tmp_path / "reality.json", sensor_model=model)
-    with pytest.raises(ValueError, match=r"drop --env\.sensor_model"):
+    with pytest.raises(ParsingError, match=r"drop --env\.sensor_model"):
         VtRefineEnvConfig(reality=file, sensor_model="paper")
