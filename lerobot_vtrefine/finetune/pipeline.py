@@ -95,10 +95,18 @@ def start_path(cfg: FinetunePipelineConfig) -> tuple[Path, Path | None]:
 def load_policy(path: Path) -> VtDp3Policy:
     """Load a ``vt_dp3`` checkpoint, with ``--policy.*`` overrides from the command line.
 
-    Raises: ValueError for a checkpoint of another policy type.
+    Raises: ValueError for a checkpoint of another policy type, FileNotFoundError where there is none.
     """
     overrides = parser.get_yaml_overrides("policy") + (parser.get_cli_overrides("policy") or [])
-    config = PreTrainedConfig.from_pretrained(path, cli_overrides=overrides)
+    try:
+        config = PreTrainedConfig.from_pretrained(path, cli_overrides=overrides)
+    except (OSError, ValueError) as error:  # what the Hub says of a folder that is not there is no help
+        if path.is_dir():
+            raise
+        raise FileNotFoundError(
+            f"no checkpoint at --policy.path={path}: neither a folder (.../pretrained_model) nor a model on"
+            " the Hub"
+        ) from error
     if not isinstance(config, VtDp3Config):
         raise ValueError(f"{path} holds a policy of type {config.type}; vtrefine-finetune needs vt_dp3")
     return VtDp3Policy.from_pretrained(path, config=config)

@@ -170,7 +170,7 @@ def test_bad_input_is_one_clear_line(finetune, tmp_path, capsys):
     assert "within" in complaint("--dppo.sampler_steps=5", "--dppo.ft_denoising_steps=40")
     assert "ddpm, ddim, tail" in complaint("--dppo.sampler=euler")
     missing = tmp_path / "nowhere"
-    assert str(missing) in complaint(policy=missing)
+    assert f"no checkpoint at --policy.path={missing}" in complaint(policy=missing)
     assert finetune(tmp_path / "run", iterations=1) == 0
     tuned = tmp_path / "run" / "checkpoints" / "last" / "pretrained_model"
     assert "fine-tuned already" in complaint(policy=tuned)
