@@ -1,9 +1,9 @@
 """One physics step on mujoco_warp, in an order that suits a GPU. Imports warp and mujoco_warp.
 
 The same functions in the same roles as `mujoco_warp.step`, so the same physics, but
-- what does not depend on contacts (inertia, bias forces, servos; other constraints) runs beside the search
-  for contacts, on streams of its own: a step of a thousand worlds is some ninety small kernels, which wait
-  for each other longer than they work;
+- what does not depend on each other runs on streams of its own: other forces, inertia and constraints beside
+  the search for contacts, the integrator's matrix beside the solver. A step of a thousand worlds is some
+  ninety small kernels, which wait for each other longer than they work;
 - pairs of geoms that a face of a box separates are dropped before the general convex collision, two thirds of
   them while a round plug is in its hole (at a thousand worlds on an H200 this neither gains nor costs);
 - contact sensors are summed contact by contact, and nothing is computed that this package does not read
@@ -44,7 +44,7 @@ class WarpStep:
 
     def __init__(self, host: mujoco.MjModel, model: mjw.Model, data: mjw.Data, concurrent: bool) -> None:
         self._model, self._data = model, data
-        names = ("smooth", "rows", "convex") if concurrent else ()
+        names = ("forces", "rows", "convex") if concurrent else ()
         self._streams = {name: wp.Stream(wp.get_device()) for name in names}
         own, other = _sides(host)
         self._own, self._other = wp.array(own, dtype=int), wp.array(other, dtype=int)
@@ -62,17 +62,24 @@ class WarpStep:
         mjw.kinematics(model, data)
         mjw.com_pos(model, data)
         mjw.tendon(model, data)
-        with self._beside("smooth"):
-            self._smooth()
+        with self._beside("forces"):
+            self._smooth_forces()
         with self._beside("rows"):
+            mjw.crb(model, data)
+            smooth.tendon_armature(model, data)
             rows_without_contacts(model, data)
         self._collide()
         self._join("rows")
         add_contact_rows(model, data)
-        self._join("smooth")
+        self._join("forces")
+        with self._beside("forces"):
+            self._differentiate()
         solve(model, data)
-        self._read_contacts()
+        with self._beside("rows"):
+            self._read_contacts()
+        self._join("forces")
         self._integrate()
+        self._join("rows")
 
     @contextmanager
     def _beside(self, name: str) -> Generator[None]:
@@ -87,15 +94,17 @@ class WarpStep:
         if self._streams:
             wp.wait_stream(self._streams[name])
 
-    def _smooth(self) -> None:
-        """Everything that contacts do not enter."""
+    def _smooth_forces(self) -> None:
+        """All forces but those of constraints."""
         model, data = self._model, self._data
-        mjw.crb(model, data)
-        smooth.tendon_armature(model, data)
         mjw.transmission(model, data)
         mjw.fwd_velocity(model, data)
         mjw.fwd_actuation(model, data)
-        mjw.fwd_acceleration(model, data, factorize=True)
+        mjw.fwd_acceleration(model, data)
+
+    def _differentiate(self) -> None:
+        """What the integrator solves with: inertia, and how forces change with velocities."""
+        model, data = self._model, self._data
         mjw.deriv_smooth_vel(model, data, self._derivative)
         free = [model.body_dofadr, model.M_rownnz, model.M_rowadr, model.body_freeadr, data.M]
         count = (data.nworld, model.body_freeadr.size)
@@ -131,7 +140,7 @@ class WarpStep:
         wp.launch(kernels.finish_forces, dim, [self._sums, self._addresses, data.sensordata])
 
     def _integrate(self) -> None:
-        """`mujoco_warp.implicit` with the derivative that `_smooth` has prepared."""
+        """`mujoco_warp.implicit` with the derivative that `_differentiate` has prepared."""
         model, data = self._model, self._data
         factor, diagonal = wp.empty_like(data.qLD), wp.empty((data.nworld, model.nv), dtype=float)
         qacc = wp.empty((data.nworld, model.nv), dtype=float)
