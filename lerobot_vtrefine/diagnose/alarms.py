@@ -21,6 +21,13 @@ MISFIT, MISFIT_NOISE = 0.1, 1.0 / 3.0
 still repeats is laid to the names' form. Effects outside the catalogue that borrow names leave a fifth."""
 FLIPS = 4999
 PAIR_CORRELATION, PAIR_DEVIATIONS, MIN_STRANGERS = 0.2, 6.0, 30
+LAG = 3
+LOADED = 0.05
+"""Part of the largest signal from which on a taxel counts as loaded."""
+LEVEL = 4.0
+"""Mean square of slow errors under load, in variances of a frame's noise, that is no misfit of a form."""
+CONDITION_LEVEL, MIN_LOADED = 2.5, 200
+"""The same in all recordings of one condition, and the readings that each needs; clean ones reach 1."""
 LINE_RATIO = 8.0
 LINE_FROM = 8
 """Slowest line looked for, in periods per recording."""
@@ -182,6 +189,49 @@ def _aligned(
     nearer = np.abs(two.trial.time_s[step - 1] - time_s) < np.abs(two.trial.time_s[step] - time_s)
     index = np.where(nearer, step - 1, step)
     return residuals[i][:, left], other[index]
+
+
+def slow_errors(
+    fitted: Fit, residuals: Sequence[np.ndarray], weights: Sequence[TrialWeights]
+) -> tuple[np.ndarray, np.ndarray]:
+    """Mean square of slow errors under load in variances of a frame's noise, per recording (K,), and the
+    number of readings that it rests on.
+
+    From products of errors a few frames apart: noise without memory and single spikes do not count.
+    """
+    sums, readings = np.zeros(len(weights)), np.zeros(len(weights))
+    for k, (residual, signal, weight) in enumerate(zip(residuals, fitted.signals, weights, strict=True)):
+        loaded = signal > LOADED * fitted.model.setting.top_counts
+        unit = np.where(loaded, residual / weight.sigma, 0.0)
+        sums[k] = float((unit[LAG:] * unit[:-LAG]).sum())
+        readings[k] = int((loaded[LAG:] & loaded[:-LAG]).sum())
+    return sums / np.maximum(readings, 1), readings
+
+
+def level_alarm(residuals: Sequence[np.ndarray], fitted: Fit, weights: Sequence[TrialWeights]) -> Alarm:
+    """Slow errors far above the frames' own noise: recordings neither follow the model nor repeat, whatever
+    each one's gain and first touch."""
+    each, readings = slow_errors(fitted, residuals, weights)
+    ratio = float(each @ readings / max(readings.sum(), 1))
+    text = f"errors under load are {np.sqrt(max(ratio, 0.0)):.1f} times the noise of single frames"
+    return Alarm("level", ratio > LEVEL, ratio, 1e-4 if ratio > LEVEL else 1.0, text)
+
+
+def condition_alarm(
+    presses: PressSet, residuals: Sequence[np.ndarray], fitted: Fit, weights: Sequence[TrialWeights]
+) -> Alarm | None:
+    """The same in all recordings of one condition, which drowns among the others; None without replicates."""
+    each, readings = slow_errors(fitted, residuals, weights)
+    names = np.array(presses.conditions)
+    repeated = [name for name in sorted(set(names)) if (names == name).sum() > 1]
+    known = {name: each[names == name] for name in repeated if readings[names == name].min() >= MIN_LOADED}
+    if not known:
+        return None
+    worst = max(known, key=lambda name: float(known[name].min()))
+    ratio = float(known[worst].min())
+    text = f"errors in condition {worst} are {np.sqrt(max(ratio, 0.0)):.1f} times the noise of single frames"
+    fired = ratio > CONDITION_LEVEL
+    return Alarm("level of one condition", fired, ratio, 1e-3, text + _motion_of(presses, worst))
 
 
 def line_alarm(presses: PressSet, residuals: Sequence[np.ndarray]) -> Alarm | None:

@@ -6,13 +6,14 @@ from functools import partial
 
 import numpy as np
 
-from lerobot_vtrefine.diagnose.baseline import Baseline, weigh
+from lerobot_vtrefine.diagnose.alarms import LEVEL, slow_errors
+from lerobot_vtrefine.diagnose.baseline import Baseline, plain_weights, weigh
 from lerobot_vtrefine.diagnose.candidates import CATALOGUE
 from lerobot_vtrefine.diagnose.candidates.base import Form
 from lerobot_vtrefine.diagnose.candidates.sample_and_hold import pattern
 from lerobot_vtrefine.diagnose.composite import Composite
 from lerobot_vtrefine.diagnose.crossvalidation import Score, agree, cross_validate, folds_of
-from lerobot_vtrefine.diagnose.fitting import Fit, fit, predict, tangents
+from lerobot_vtrefine.diagnose.fitting import Fit, fit, predict, squared_errors, tangents
 from lerobot_vtrefine.diagnose.maps import find_dead, map_evidence, with_map
 from lerobot_vtrefine.diagnose.parallel import on_all_cores
 from lerobot_vtrefine.diagnose.presses import PressSet
@@ -27,6 +28,8 @@ AGREEMENT_P = 0.05
 """Chance that recordings left out are foretold better as often, if there were nothing (sign flips)."""
 EXTRA_GAIN = 0.025
 """The same for causes beside the first: a little is also gained by patching up the first one's form."""
+FORGIVEN = 1.5
+"""Factor by which weights may raise the plain squared error of a model."""
 SCOUTING_STEPS = 2
 MAP_TOLERANCE = 1e-4
 """Relative decrease of the loss at which a map of gains needs no second turn."""
@@ -185,9 +188,18 @@ def take_away(search: Search, fitted: Fit, name: str) -> Fit:
 
 
 def reweigh(search: Search, fitted: Fit) -> Fit:
-    """Noise and weights anew around a better model, and the model's fit with them."""
+    """Noise and weights anew around a better model, and the model's fit with them.
+
+    Weights forgive recordings their own gain and touch; a model that is far off may use that to fit next to
+    nothing. Then all readings count alike until a better one is found.
+    """
     _, weights = weigh(fitted, search.presses)
     search.weights = tuple(weights)
+    found = settle(search, fitted.model)
+    before, after = (squared_errors(fit.signals, search.presses).sum() for fit in (fitted, found))
+    if after <= FORGIVEN * before:
+        return found
+    search.weights = tuple(plain_weights(search.presses))
     return settle(search, fitted.model)
 
 
@@ -246,14 +258,11 @@ def survivors(found: dict[str, Screened]) -> list[Screened]:
 def forward(search: Search, fitted: Fit, tell: Callable[[str, float], None]) -> Fit:
     """Add causes one by one while one takes away at least MIN_GAIN on recordings left out."""
     for number in range(MAX_CAUSES):
-        probes = [*all_probes(search, fitted), *map_probes(search, fitted)]
-        hold = hold_probe(search, fitted)
-        if hold is not None:
-            probes = [*(probe for probe in probes if probe.name != hold.name), hold]
-        found = screen(probes, len(search.weights), search.seed)
+        found, steps = look_round(search, fitted)
         if not number:
             search.screened = found
-        steps = rank(search, fitted, survivors(found)[:REFITTED], probes)
+        if not steps and far_off(search, fitted):
+            found, steps = without_weights(search, fitted)
         tell(f"step {number + 1}: {len(steps)} candidates refitted", (number + 1) / (MAX_CAUSES + 1))
         if not steps:
             break
@@ -263,6 +272,31 @@ def forward(search: Search, fitted: Fit, tell: Callable[[str, float], None]) -> 
         fitted = reweigh(search, best.fitted)
         fitted = backward(search, fitted)
     return fitted
+
+
+def look_round(search: Search, fitted: Fit) -> tuple[dict[str, Screened], list[Step]]:
+    """How candidates beside the present model are screened, and those that foretell better, best first."""
+    probes = [*all_probes(search, fitted), *map_probes(search, fitted)]
+    hold = hold_probe(search, fitted)
+    if hold is not None:
+        probes = [*(probe for probe in probes if probe.name != hold.name), hold]
+    found = screen(probes, len(search.weights), search.seed)
+    return found, rank(search, fitted, survivors(found)[:REFITTED], probes)
+
+
+def far_off(search: Search, fitted: Fit) -> bool:
+    """Whether slow errors are far above noise: what weights forgive a recording then hides what is wrong."""
+    each, readings = slow_errors(fitted, fitted.residuals(search.presses), search.weights)
+    return float(each @ readings) > LEVEL * max(float(readings.sum()), 1.0)
+
+
+def without_weights(search: Search, fitted: Fit) -> tuple[dict[str, Screened], list[Step]]:
+    """A round in which all readings count alike."""
+    weights = search.weights
+    search.weights = tuple(plain_weights(search.presses))
+    found, steps = look_round(search, settle(search, fitted.model))
+    search.weights = weights
+    return found, steps
 
 
 def polish(search: Search, fitted: Fit) -> Fit:

@@ -8,11 +8,14 @@ import numpy as np
 from lerobot_vtrefine.diagnose.alarms import (
     Alarm,
     cleaned,
+    condition_alarm,
+    level_alarm,
     line_alarm,
     only_misfit,
     pair_alarm,
     replicate_alarm,
 )
+from lerobot_vtrefine.diagnose.baseline import weigh
 from lerobot_vtrefine.diagnose.descriptors import DESCRIPTORS, Descriptor
 from lerobot_vtrefine.diagnose.fitting import Fit, tangents
 from lerobot_vtrefine.diagnose.presses import PressSet
@@ -45,19 +48,22 @@ class Found:
 
 def look_for_unknowns(search: Search, fitted: Fit, baseline: Fit) -> Suspicion:
     """Run the alarms on the extended model's residuals; what names' forms leave of their own is none."""
-    residuals = cleaned(fitted, search.presses, search.weights)
+    _, weights = weigh(fitted, search.presses)
+    residuals = cleaned(fitted, search.presses, weights)
     generic = describe_residual(search, fitted)
     families = set(fitted.model.families)
     strangers = [item for item in generic if not families & set(item.descriptor.owners)]
     alarms = [replicate_alarm(search.presses, residuals, search.seed), line_alarm(search.presses, residuals)]
     alarms.append(pair_alarm(search.presses, residuals))
+    alarms.append(level_alarm(residuals, fitted, weights))
+    alarms.append(condition_alarm(search.presses, residuals, fitted, weights))
     alarms.append(_descriptor_alarm(strangers, generic))
     known = tuple(alarm for alarm in alarms if alarm is not None)
     fired = [alarm for alarm in known if alarm.fired]
     before, after = (model.residuals(search.presses) for model in (baseline, fitted))
     if fired and families and only_misfit(search.presses, before, after):
-        # A line in time does not repeat, so repeatable errors say nothing about it.
-        fired = [alarm for alarm in fired if alarm.name == "spectrum"]
+        # Of what does not repeat, repeatable errors say nothing.
+        fired = [alarm for alarm in fired if alarm.name in ("spectrum", "level")]
         known = tuple(alarm if alarm in fired else replace(alarm, fired=False) for alarm in known)
     clues = [alarm.clue for alarm in reversed(fired)]
     if fired and generic and not strangers:
