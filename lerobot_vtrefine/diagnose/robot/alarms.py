@@ -1,7 +1,8 @@
 """Signs that something acts which no accepted cause accounts for.
 
-Three of them, on what the extended model leaves: it repeats in trials of one condition; it follows something
-that the model does not know (time, other joints, a load, ...); it rings at one frequency.
+Four of them, on what the extended model leaves: it repeats in trials of one condition; it does not, by far
+more than encoders scatter; it follows something that the model does not know (time, other joints, a load);
+it rings at one frequency.
 """
 
 from dataclasses import dataclass
@@ -10,10 +11,10 @@ from itertools import combinations
 import numpy as np
 
 from lerobot_vtrefine.diagnose.robot import flips
-from lerobot_vtrefine.diagnose.robot.batch import Batch
 from lerobot_vtrefine.diagnose.robot.candidates import DECOY, LATENCY, resolution
 from lerobot_vtrefine.diagnose.robot.fitting import derivatives, frame_s
 from lerobot_vtrefine.diagnose.robot.gravity import is_gripper
+from lerobot_vtrefine.diagnose.robot.repeats import alike, scatter
 from lerobot_vtrefine.diagnose.robot.selection import LEAST_EFFECT_RAD, LEAST_UNKNOWN, Selection
 
 Array = np.ndarray
@@ -22,7 +23,12 @@ ALPHA = 0.01
 _REPEATS, _REPEATS_ALL = 0.3, 0.6
 """Least part of what is left that must repeat; where it is this much, and in every condition, the conditions
 need not be enough for a small p."""
-_LEAST_CONDITIONS = 4
+_LEAST_CONDITIONS, _FEW_CONDITIONS = 4, 2
+_NEARLY_ALL = 0.8
+"""Part of what is left that must repeat in each of few conditions."""
+_SHAPES_DIFFER, _ZEROS_DIFFER = 5.0, 12.0
+"""Difference of trials of one command, in scatters from frame to frame: noise that wanders makes up to three,
+a robot that is zeroed anew before every trial up to eight."""
 _FOLLOWS, _FOLLOWS_IF_OWNED = 0.1, 0.4
 """Least part of what is left that must follow a descriptor; more where an accepted form may be off."""
 _LINE = 0.1
@@ -57,6 +63,7 @@ def raise_alarms(selection: Selection, seed: int) -> tuple[Alarm, ...]:
         if candidate.cause == DECOY
     ]
     found += _repeating(selection, seed)
+    found += _not_repeating(selection)
     found += _following(selection, seed)
     found += _ringing(selection)
     found.sort(key=lambda alarm: -alarm.share)
@@ -102,29 +109,42 @@ def _repeating(selection: Selection, seed: int) -> list[Alarm]:
     rows = []
     for condition in sorted(set(batch.conditions)):
         trials = [index for index, name in enumerate(batch.conditions) if name == condition]
-        pairs = [pair for pair in combinations(trials, 2) if _alike(batch, *pair)]
+        pairs = [pair for pair in combinations(trials, 2) if alike(batch, *pair)]
         if pairs:
             products = [
                 _mean(left[:, a] * left[:, b], batch.valid[:, a] & batch.valid[:, b]) for a, b in pairs
             ]
             rows.append(np.mean(products, 0))
-    if len(rows) < _LEAST_CONDITIONS:
+    if len(rows) < _FEW_CONDITIONS:
         return []
     _, adjusted = flips.one_sided(np.array(rows), seed)
     share = np.mean(rows, 0) / selection.fit.total.clip(1e-300)
+    alone = _REPEATS_ALL if len(rows) >= _LEAST_CONDITIONS else _NEARLY_ALL
     return [
         Alarm(joint, "what is left repeats when the command is repeated", float(share[joint]), float(p))
         for joint, p in enumerate(adjusted)
-        if (p < ALPHA or (share[joint] > _REPEATS_ALL and np.min(rows, 0)[joint] > 0))
+        if (p < ALPHA or (share[joint] > alone and np.min(rows, 0)[joint] > 0))
         and share[joint] > _REPEATS
         and _matters(selection, joint, share[joint])
     ]
 
 
-def _alike(batch: Batch, a: int, b: int) -> bool:
-    valid = batch.valid[:, a] & batch.valid[:, b]
-    change = batch.command[valid][:, a] - batch.command[valid][:, b]
-    return bool(valid.sum() > 8 and np.abs(change).max() < 1e-6)
+def _not_repeating(selection: Selection) -> list[Alarm]:
+    """Trials of one command that differ by far more than their encoders scatter: what no command sets."""
+    problem = selection.problem
+    seen = scatter(problem.batch, selection.fit.residual)
+    if seen is None:
+        return []
+    found = []
+    for joint in range(problem.batch.joints):
+        white = max(float(seen.white[joint]), 0.5 * float(resolution(problem)[joint]))
+        for size, limit in ((seen.shape[joint], _SHAPES_DIFFER), (seen.zero[joint], _ZEROS_DIFFER)):
+            share = float(size**2 / max(selection.fit.total[joint], 1e-300))
+            if size > limit * white and share > _REPEATS and _matters(selection, joint, min(share, 1.0)):
+                clue = "trials of one command differ by far more than the encoder scatters"
+                found.append(Alarm(joint, clue, min(share, 1.0), 0.0))
+                break
+    return found
 
 
 def _mean(values: Array, valid: Array) -> Array:

@@ -23,9 +23,10 @@ ZETA_BOUNDS = (0.1, 20.0)
 _RADIANS_PER_FRAME = (6.0, 3.0)
 """Fastest servo that frames can tell, well damped and swinging: beyond, oscillations alias."""
 TAU_BOUND_S = 1.0
-SERVO_TICK_S = 1e-3
-"""Servos look at their command once in about a millisecond (simulations: once a step). When, no recording
-tells: a delay is known up to a uniform error of this width, whatever the trials agree on."""
+SERVO_TICK_S = 2e-3
+"""Servos look at their command once in one or two milliseconds (simulations: once a step), and encoders are
+read as much beside their frame's time. When, no recording tells: a delay is known up to a uniform error of
+this width, whatever the trials agree on."""
 _START_OMEGA = (4.0, 10.0, 25.0, 60.0)
 _START_ZETA = (0.4, 1.0, 2.0)
 _ITERATIONS = 20

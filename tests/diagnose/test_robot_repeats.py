@@ -1,0 +1,57 @@
+"""Trials of one command that differ: what is noise, and what is a robot that does something of its own."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from robot_rigs import Rig, make_set
+
+from lerobot_vtrefine.diagnose.recordings import read_recording_set
+from lerobot_vtrefine.diagnose.robot.batch import make_batch
+from lerobot_vtrefine.diagnose.robot.engine import diagnose_robot
+from lerobot_vtrefine.diagnose.robot.repeats import scatter
+
+SMALL = Rig(joints=("shoulder", "elbow"), rate_hz=20.0, seconds=5.0, conditions=8, jitter=0.1)
+
+
+@pytest.fixture(scope="module")
+def recordings(tmp_path_factory):
+    return read_recording_set(make_set(SMALL, tmp_path_factory.mktemp("robot"), 0))
+
+
+def test_scatter_tells_noise_from_shape_and_zero(recordings) -> None:
+    batch = make_batch(recordings.trials)
+    noise = 1e-3 * np.random.default_rng(0).normal(size=batch.position.shape)
+    plain = scatter(batch, noise)
+    assert plain is not None
+    np.testing.assert_allclose(plain.white, 1e-3, rtol=0.2)
+    np.testing.assert_allclose(plain.shape, 1e-3, rtol=0.2)
+    second = np.array([place % 2 for place in range(batch.trials)])
+    waves = np.sin(2 * np.pi * 0.7 * batch.time_s)[..., None] * second[:, None]
+    shaped, shifted = scatter(batch, noise + 0.02 * waves), scatter(batch, noise + 0.02 * second[:, None])
+    assert shaped is not None
+    assert shifted is not None
+    assert (shaped.shape > 5e-3).all()
+    assert (shifted.zero > 0.01).all()
+    np.testing.assert_allclose(shifted.shape, plain.shape, rtol=1e-6)
+    np.testing.assert_allclose(shaped.white, plain.white, rtol=0.2)
+
+
+def test_no_scatter_without_repeated_commands(recordings) -> None:
+    once = [trial for trial in recordings.trials if trial.replicate == 0]
+    batch = make_batch(once)
+    assert scatter(batch, np.zeros_like(batch.position)) is None
+
+
+def test_trials_that_do_not_repeat_raise_an_alarm(recordings) -> None:
+    rng = np.random.default_rng(1)
+    trials = []
+    for trial in recordings.trials:
+        drop = rng.uniform(0.5, 1.0) * np.sin(
+            2 * np.pi * rng.uniform(0.3, 0.6) * trial.time_s + rng.uniform(0, 6)
+        )
+        trials.append(replace(trial, position=trial.position + 0.03 * drop[:, None] * [1, 0]))
+    found = diagnose_robot(replace(recordings, trials=tuple(trials)), seed=0)
+    assert found.status == "unexplained"
+    assert found.unknown.alarm
+    assert "shoulder" in (found.unknown.clue or "")
