@@ -151,7 +151,7 @@ def measure_device(config: BenchConfig, device: str) -> list[Row]:
 
     worlds = []
     for row in measure_worlds(WarpConfig(device=device), config.world_counts, config.steps):
-        print(f"{row.worlds} worlds: {row.worlds / row.step_s:.4g} steps/s", file=sys.stderr, flush=True)
+        print(f"{row.worlds} worlds: {row.worlds / row.mean_s:.4g} steps/s", file=sys.stderr, flush=True)
         worlds.append(row)
     print(worlds_table(worlds))
     return [Row("tactile", *row) for row in run_cuda()] if device.startswith("cuda") else []

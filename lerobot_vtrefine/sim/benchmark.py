@@ -87,8 +87,8 @@ def _cell(value: float) -> str:
 COLUMNS: tuple[tuple[str, str, Callable[[WorldsRow], float]], ...] = (
     ("worlds", "", lambda row: row.worlds),
     ("step", "[ms]", lambda row: 1e3 * row.step_s),
-    ("env steps", "[k/s]", lambda row: 1e-3 * row.worlds / row.step_s),
     ("mean step", "[ms]", lambda row: 1e3 * row.mean_s),
+    ("env steps", "[k/s]", lambda row: 1e-3 * row.worlds / row.mean_s),
     ("physics", "[ms]", lambda row: 1e3 * row.physics_s),
     ("physics steps", "[M/s]", lambda row: 1e-6 * row.worlds * row.substeps / row.physics_s),
     ("tactile", "[ms]", lambda row: 1e3 * row.tactile_s),
