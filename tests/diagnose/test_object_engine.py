@@ -39,6 +39,8 @@ def test_parts_as_believed_are_adequate(plain) -> None:
         "object_friction": "not identifiable",
         "clearance": "not identifiable",
     }
+    reasons = {item.name: item.reason for item in found.evidence}
+    assert "friction between pads and part: not identifiable" in reasons["object_friction"]
     assert 0 < found.minimum_detectable["object_mass"] < 0.05
     assert set(found.next_experiment["decides"]) == {"object_friction", "clearance"}
 

@@ -34,6 +34,11 @@ UNKNOWN_PARTS = (
     "the parts are not known: datasets of vtrefine-record-demos note the assumed scene, others hold no part "
     "that the twin could carry"
 )
+PAD_FRICTION = (
+    "friction between pads and part: not identifiable, because pads tell how hard they are pressed but not "
+    "when the part slips, and no joint's load tells the pull; close the hand on a part that is clamped to "
+    "the table, pull until it slips at two closing forces, five times each, and record the joints' load"
+)
 _ROUND = (
     "pads close along one axis only, and along that axis a round hole is as wide as assumed only where the "
     "plug is in its middle: use a pair with flat walls"
@@ -146,6 +151,10 @@ def diagnose_objects(
     line, reason = estimate_friction(scene, episodes, contacts, seed)
     known = scene.scene.part_friction
     estimates.append(Estimate("object_friction", "friction", known, line, FRICTION_FORM, "1", reason))
+    slip = scene.scene.pad_friction
+    estimates.append(
+        Estimate("object_friction", "pad_friction", slip, None, FRICTION_FORM, "1", PAD_FRICTION)
+    )
     line, reason = estimate_clearance(scene, episodes, contacts, seed)
     if line is not None and scene.pair.name == "round" and line.value < 0:
         reason = _ROUND
