@@ -49,7 +49,7 @@ class TwinProblem(Problem):
     """The same trials, to be replayed in fine steps."""
 
     shared_encoders: bool = True
-    vague: float = 0.02
+    vague: float = 0.03
     misfit: float = 0.2
     """Coarse replays follow a fault only so exactly ..."""
     floor: float = 3e-4
