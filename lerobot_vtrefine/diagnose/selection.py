@@ -19,6 +19,7 @@ from lerobot_vtrefine.diagnose.parallel import on_all_cores
 from lerobot_vtrefine.diagnose.presses import PressSet
 from lerobot_vtrefine.diagnose.screening import ALPHA, Probe, Scorer, Screened, probe_form, screen
 from lerobot_vtrefine.diagnose.twins import walk
+from lerobot_vtrefine.diagnose.wander import wander_probe
 from lerobot_vtrefine.diagnose.weights import TrialWeights
 
 MAX_CAUSES = 4
@@ -280,6 +281,10 @@ def look_round(search: Search, fitted: Fit) -> tuple[dict[str, Screened], list[S
     hold = hold_probe(search, fitted)
     if hold is not None:
         probes = [*(probe for probe in probes if probe.name != hold.name), hold]
+    curves = forms_of("baseline_drift", fitted)[1:]
+    if curves and "baseline_drift" not in fitted.model.families:
+        wander = wander_probe(fitted, search.presses, curves[0], search.seed)
+        probes += [wander] if wander is not None else []
     found = screen(probes, len(search.weights), search.seed)
     return found, rank(search, fitted, survivors(found)[:REFITTED], probes)
 

@@ -1,0 +1,34 @@
+"""Idle levels that wander through the session."""
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+from test_engine_pad import COLS, ROWS, linear, one_trial
+
+from lerobot_vtrefine.diagnose.baseline import fit_baseline
+from lerobot_vtrefine.diagnose.candidates.baseline_drift import FORMS
+from lerobot_vtrefine.diagnose.presses import prepare
+from lerobot_vtrefine.diagnose.recordings import RecordingSet
+from lerobot_vtrefine.diagnose.wander import wander_probe
+
+
+def p_of(levels: np.ndarray) -> float:
+    """The probe's p-value for a session whose recordings rest at these levels [counts]."""
+    trials = [one_trial(number, linear, 21, 1.0, 1.0) for number in range(len(levels))]
+    moved = tuple(replace(t, raw=t.raw + level) for t, level in zip(trials, levels, strict=True))
+    held = RecordingSet(Path(), "pad", ROWS, COLS, 0.002, "adc_counts", 255.0, (), moved)
+    presses = prepare(held, list(held.trials), list(range(len(levels))))
+    probe = wander_probe(fit_baseline(presses).fitted, presses, FORMS[1], 0)
+    assert probe is not None
+    assert probe.permuted is not None
+    return probe.permuted
+
+
+def test_a_random_walk_of_the_idle_level_is_seen() -> None:
+    assert p_of(np.cumsum(np.random.default_rng(1).normal(0, 2.0, 16))) < 0.004
+
+
+def test_levels_without_an_order_are_not() -> None:
+    rng = np.random.default_rng(2)
+    assert np.median([p_of(rng.normal(0, 2.0, 16)) for _ in range(3)]) > 0.05
