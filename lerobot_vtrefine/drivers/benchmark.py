@@ -5,6 +5,7 @@ checksum: every frame received is checked for itself. `python -m lerobot_vtrefin
 measures each part for a minute and says how busy the machine was.
 """
 
+import importlib
 import importlib.util
 import logging
 import os
@@ -134,7 +135,7 @@ def read_ours(ports: list[str], seconds: float, look_s: float) -> list[Tally]:
 
 def read_reference(port: str, seconds: float, method: str) -> Tally:
     """Reads one board with `flexitac`, by its method "read" (every frame) or "read_latest"."""
-    import flexitac
+    flexitac: Any = importlib.import_module("flexitac")
 
     sensor: Any = flexitac.FlexiTacSensor(port, baseline=20.0)
     with sensor:
