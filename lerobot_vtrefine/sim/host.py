@@ -1,9 +1,31 @@
-"""From a device's memory to the host's."""
+"""From a device's memory to the host's, and what the host's threads do meanwhile."""
 
 from collections.abc import Callable
+from functools import wraps
 
 import numpy as np
 import torch
+
+
+def without_torch_threads[**P, R](work: Callable[P, R]) -> Callable[P, R]:
+    """The function, run without torch's own threads on CPU.
+
+    These wait for each other by spinning: on arrays as small as a step's they take more from the threads of
+    physics and kernels than they give.
+    """
+
+    @wraps(work)
+    def run(*args: P.args, **kwargs: P.kwargs) -> R:
+        threads = torch.get_num_threads()
+        if threads == 1:
+            return work(*args, **kwargs)
+        torch.set_num_threads(1)
+        try:
+            return work(*args, **kwargs)
+        finally:
+            torch.set_num_threads(threads)
+
+    return run
 
 
 def to_host(tensor: torch.Tensor) -> np.ndarray:

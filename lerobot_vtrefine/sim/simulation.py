@@ -25,6 +25,7 @@ from lerobot_vtrefine.sim.config import (
 from lerobot_vtrefine.sim.depth import DepthCamera
 from lerobot_vtrefine.sim.drive import make_drive
 from lerobot_vtrefine.sim.episode import EpisodeState, Measured, update
+from lerobot_vtrefine.sim.host import without_torch_threads
 from lerobot_vtrefine.sim.present import Present
 from lerobot_vtrefine.sim.privileged import Privileged, describe
 from lerobot_vtrefine.sim.randomization import Randomizer, WorldParameters
@@ -153,6 +154,7 @@ class InsertionSim:
         """(N, 7) float32 position [m] and quaternion (w, x, y, z) of the optical frame in the world."""
         return self._depth.pose.copy()
 
+    @without_torch_threads
     def reset(self, ids: Array, seeds: Array, start: starts.Start | None = None) -> None:
         """Start new episodes in worlds `ids` (m,); each is a pure function of its seed (m,), and of `start`
         where one is given in place of the seed's.
@@ -177,6 +179,7 @@ class InsertionSim:
         state.tip[ids] = self._insertion(seen).position_m
         self._remember(ids)
 
+    @without_torch_threads
     def step(self, action: Array, ids: Array | None = None, images: Array | None = None) -> StepResult:
         """One control step of worlds `ids` (m,), all by default.
 
@@ -208,6 +211,7 @@ class InsertionSim:
         truncated = ~terminated & (state.steps[ids] >= self.episode_steps)
         return StepResult(reward, terminated, truncated, state.success[ids])
 
+    @without_torch_threads
     def observe(self, ids: Array | None = None) -> dict[str, Array]:
         """What the sensors give now, as the hardware would.
 
@@ -228,6 +232,7 @@ class InsertionSim:
         qpos, _ = self._backend.read(self._checked(ids))
         return self._drive.readings(qpos[:, self.scene.addresses.qpos]).astype(np.float32)
 
+    @without_torch_threads
     def tactile(self, ids: Array | None = None) -> Array:
         """The `tactile` part of `observe` alone: (m, 4, 384) uint8 counts."""
         ids = self._checked(ids)

@@ -2,8 +2,10 @@
 
 import numpy as np
 import pytest
+import torch
 
 from lerobot_vtrefine.sim.config import RandomizationConfig, SceneConfig
+from lerobot_vtrefine.sim.host import without_torch_threads
 from lerobot_vtrefine.sim.simulation import InsertionSim
 
 WORLDS = np.arange(6)
@@ -82,3 +84,36 @@ def test_worlds_to_image_must_exist():
     sim = make(1)
     with pytest.raises(ValueError, match="ids must be sorted"):
         sim.step(sim.command_targets(), images=np.array([7]))
+
+
+def test_torch_gets_its_threads_back():
+    before = torch.get_num_threads()
+    try:
+        torch.set_num_threads(3)
+        assert without_torch_threads(torch.get_num_threads)() == 1
+        assert torch.get_num_threads() == 3
+        with pytest.raises(ZeroDivisionError):
+            without_torch_threads(lambda: 1 // 0)()
+        assert torch.get_num_threads() == 3
+    finally:
+        torch.set_num_threads(before)
+
+
+def test_a_step_and_an_observation_leave_torchs_threads_alone(monkeypatch):
+    sim, seen, before = make(2), [], torch.get_num_threads()
+    counts = sim._pads.counts
+
+    def watch(*given):
+        seen.append(torch.get_num_threads())
+        return counts(*given)
+
+    monkeypatch.setattr(sim._pads, "counts", watch)
+    try:
+        torch.set_num_threads(2)
+        sim.step(sim.command_targets(), images=WORLDS)
+        sim.observe()
+        sim.tactile()
+        assert seen == [1, 1]
+        assert torch.get_num_threads() == 2
+    finally:
+        torch.set_num_threads(before)
