@@ -282,6 +282,19 @@ def test_single_taxel_driven_by_force(tmp_path):
     assert len(left.trials) == 7
 
 
+def with_values(name, where, value):
+    def change(trial):
+        trial[name][where] = value
+        return trial
+
+    return change
+
+
+def turned_after(trial, frame):
+    """A lost turn of the first joint."""
+    return 2 * np.pi * (np.arange(len(trial["time_s"])) >= frame)[:, None] * [1, 0, 0]
+
+
 def test_sound_robot_set_is_left_alone(tmp_path):
     recordings, left, issues = checked(tmp_path, *make_robot_set())
     assert issues == []
@@ -300,6 +313,14 @@ def test_sound_robot_set_is_left_alone(tmp_path):
         ),
         (lambda t: frames(t, np.r_[np.arange(200), 50:60]), "10 duplicated frames", "repaired"),
         (clock_back, "clock step", "set aside"),
+        (with_values("command", slice(40, 44), np.nan), "without a number in command", "repaired"),
+        (with_values("command", slice(20, 150), np.inf), "without a number in command", "set aside"),
+        (with_values("position", slice(0, 1), np.nan), "without a number in position", "repaired"),
+        (lambda t: frames(t, np.r_[0:60, 110:200]), "missing frames", "set aside"),
+        (with_values("position", (slice(60, 62), 0), 10.0), "which no unit explains", "set aside"),
+        (with_values("position", (slice(60, 62), 0), 3.0), "position jumps by", "set aside"),
+        (lambda t: t | {"position": t["position"] + turned_after(t, 100)}, "jumps by 6.", "set aside"),
+        (with_values("command", (slice(None), 1), 0.3), "command stays constant", "set aside"),
     ],
 )
 def test_broken_robot_trials(tmp_path, change, words, action):

@@ -8,7 +8,12 @@ from lerobot_vtrefine.diagnose.quality.frames import (
     check_optional,
     check_repeats,
 )
-from lerobot_vtrefine.diagnose.quality.joints import check_encoders, check_joint_order
+from lerobot_vtrefine.diagnose.quality.joints import (
+    check_commands,
+    check_encoders,
+    check_joint_order,
+    check_jumps,
+)
 from lerobot_vtrefine.diagnose.quality.response import check_answers, check_start, check_stuck
 from lerobot_vtrefine.diagnose.quality.units import check_scales, check_units
 from lerobot_vtrefine.diagnose.quality.wiring import check_wiring
@@ -32,7 +37,7 @@ FRAME_CHECKS: tuple[Check, ...] = (
     check_length,
 )
 PAD_CHECKS: tuple[Check, ...] = (check_scales, check_stuck, check_wiring, check_start, check_answers)
-ROBOT_CHECKS: tuple[Check, ...] = (check_encoders, check_joint_order)
+ROBOT_CHECKS: tuple[Check, ...] = (check_jumps, check_commands, check_encoders, check_joint_order)
 
 
 def check_quality(recordings: RecordingSet) -> tuple[RecordingSet, list[DataIssue]]:

@@ -12,6 +12,8 @@ MOVES = 0.1
 """A joint moves in a trial if its command's range is this part of its largest range in the set."""
 STILL = 1e-3
 """An encoder sticks if its range is below this part of the command's."""
+JUMP_RAD = 1.0
+"""No joint moves further between two frames, unless its command does."""
 WRONG, BETTER = 0.5, 0.4
 """1 − correlation with the own command that is suspicious, and what part of it another order must leave."""
 
@@ -31,6 +33,29 @@ def check_encoders(recordings: RecordingSet) -> Iterator[Finding]:
     for index in np.flatnonzero((stuck & ~always).any(axis=1)):
         names = [recordings.joints[joint] for joint in np.flatnonzero(stuck[index] & ~always)]
         yield Finding(int(index), f"position stays constant: {', '.join(names)}", SET_ASIDE)
+
+
+def check_jumps(recordings: RecordingSet) -> Iterator[Finding]:
+    """Encoders that jump where their command does not: turns that were lost, frames that were garbled."""
+    for index, trial in enumerate(recordings.trials):
+        step = np.abs(np.diff(trial.position, axis=0)).max(axis=0, initial=0.0)
+        commanded = np.ptp(trial.command, axis=0)
+        jumps = (step > JUMP_RAD) & (step > commanded)
+        if jumps.any():
+            names = ", ".join(recordings.joints[joint] for joint in np.flatnonzero(jumps))
+            problem = f"position jumps by {step[jumps].max():.3g} in one frame: {names}"
+            yield Finding(index, problem, SET_ASIDE)
+
+
+def check_commands(recordings: RecordingSet) -> Iterator[Finding]:
+    """Commands that stay constant in a trial although the joint moves as far as in others."""
+    command = np.array([np.ptp(trial.command, axis=0) for trial in recordings.trials])
+    position = np.array([np.ptp(trial.position, axis=0) for trial in recordings.trials])
+    still = (command < STILL * position) & (position > MOVES * command.max(axis=0))
+    still &= command.max(axis=0) > 0
+    for index in np.flatnonzero(still.any(axis=1)):
+        names = ", ".join(recordings.joints[joint] for joint in np.flatnonzero(still[index]))
+        yield Finding(int(index), f"command stays constant while the joint moves: {names}", SET_ASIDE)
 
 
 def check_joint_order(recordings: RecordingSet) -> Iterator[Finding]:

@@ -12,6 +12,8 @@ import numpy as np
 from lerobot_vtrefine.diagnose.quality.edits import KEPT, MINORITY, SET_ASIDE, Finding
 from lerobot_vtrefine.diagnose.recordings import RecordingSet
 
+SPIKES = 0.02
+"""Values that only this part of the frames, or less, exceeds are no other unit."""
 GRAMS_PER_NEWTON = 1e3 / 9.80665
 
 
@@ -58,7 +60,7 @@ def check_units(recordings: RecordingSet) -> Iterator[Finding]:
             problem = f"{mistake.column} reaches {size:.3g}: {mistake.unit} instead of {mistake.right}"
             if mistake.steps:
                 problem = f"{mistake.column} steps by {size:.3g}: {mistake.unit} instead of {mistake.right}"
-            if size / mistake.factor > mistake.limit:
+            if size / mistake.factor > mistake.limit or _spikes(values, mistake):
                 yield Finding(
                     index, f"{mistake.column} reaches {size:.3g}, which no unit explains", SET_ASIDE
                 )
@@ -71,6 +73,12 @@ def _size(values: np.ndarray, mistake: Mistake) -> float:
     if mistake.steps:
         return float(np.nanmedian(np.diff(values))) if np.isfinite(values).sum() > 1 else 0.0
     return float(np.abs(values[np.isfinite(values)]).max(initial=0.0))
+
+
+def _spikes(values: np.ndarray, mistake: Mistake) -> bool:
+    """Whether only a few frames are beyond what is plausible."""
+    beyond = np.abs(values) > mistake.limit
+    return not mistake.steps and 0 < beyond.reshape(len(values), -1).any(1).mean() < SPIKES
 
 
 def check_scales(recordings: RecordingSet) -> Iterator[Finding]:
