@@ -55,7 +55,7 @@ def on_warp(drawn):
     losses = np.zeros((WORLDS, ROWS), np.float32)
     losses[:, DRY] = loss
     numbers = {"residual": residual, "slope": slope, "stiffness": stiffness, "loss": losses}
-    numbers |= {"jacobian": jacobian, "force": 0 * residual}
+    numbers["force"] = 0 * residual
     contact = np.repeat(np.arange(WORLDS)[:, None], ROWS, 1)
     counts = {"equalities": np.ones(WORLDS), "frictions": np.ones(WORLDS), "count": np.full(WORLDS, ROWS)}
     integers = {"kind": kinds, "contact": contact, "state": 0 * contact} | counts
@@ -63,6 +63,7 @@ def on_warp(drawn):
         setattr(rows, name, wp.array(values, dtype=float, device="cpu"))
     for name, values in integers.items():
         setattr(rows, name, wp.array(values.astype(np.int32), dtype=int, device="cpu"))
+    rows.quads = wp.array(jacobian.reshape(WORLDS, ROWS, 1, SPEEDS), dtype=wp.vec4, device="cpu")
     cones.row = wp.array(np.tile(np.arange(3, 7, dtype=np.int32), (WORLDS, 1)), dtype=int, device="cpu")
     cones.dim = wp.full(WORLDS, 4, dtype=int, device="cpu")
     frictions = np.tile(np.append(FRICTION, [0, 0]).astype(np.float32), (WORLDS, 1))

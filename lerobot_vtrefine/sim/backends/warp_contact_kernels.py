@@ -132,6 +132,28 @@ def drop_separated(
 
 
 @wp.kernel
+def spread_general(
+    given: Pairs, kind: wp.array(dtype=int), general: wp.array(dtype=int, ndim=2), apart: int, spread: Pairs
+) -> None:
+    """Those pairs whose kinds `general` (kinds, kinds) marks, each `apart` places from the next, so that
+    threads of one warp do not wait for each other; `spread` is full of other pairs before.
+    """
+    pair = wp.tid()
+    if pair >= wp.min(given.count[0], given.geoms.shape[0]):
+        return
+    geoms = given.geoms[pair]
+    if general[kind[geoms[0]], kind[geoms[1]]] == 0:
+        return
+    room = spread.geoms.shape[0]
+    number = apart * wp.atomic_add(spread.count, 1, 1)
+    place = number % room + number // room
+    wp.atomic_max(spread.count, 0, place + 1)
+    spread.geoms[place] = geoms
+    spread.ids[place] = given.ids[pair]
+    spread.world[place] = given.world[pair]
+
+
+@wp.kernel
 def add_forces(
     contacts: Contacts, own: wp.array(dtype=int, ndim=2), other: wp.array(dtype=int, ndim=2), sums: Sums
 ) -> None:

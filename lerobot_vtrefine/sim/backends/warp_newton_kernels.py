@@ -11,7 +11,7 @@ import functools
 
 import warp as wp
 
-from lerobot_vtrefine.sim.backends.warp_rows_kernels import Cones, Rows, along_line, curvature, push
+from lerobot_vtrefine.sim.backends.warp_rows_kernels import Cones, Rows, along_line, curvature, is_lone, push
 
 wp.set_module_options({"enable_backward": False})
 
@@ -97,21 +97,34 @@ def product(world: int, dof: int, vector: wp.array(dtype=float, ndim=2), inertia
 def moved(world: int, row: int, vector: wp.array(dtype=float, ndim=2), rows: Rows) -> float:
     """One element of the Jacobian times a vector."""
     result = float(0.0)
-    for dof in range(vector.shape[1]):
-        result += rows.jacobian[world, row, dof] * vector[world, dof]
+    last = vector.shape[1] - 1  # the Jacobian is zero beyond
+    for quad in range(rows.quads.shape[2]):
+        four = rows.quads[world, row, quad]
+        first = 4 * quad
+        result += four[0] * vector[world, wp.min(first, last)]
+        result += four[1] * vector[world, wp.min(first + 1, last)]
+        result += four[2] * vector[world, wp.min(first + 2, last)]
+        result += four[3] * vector[world, wp.min(first + 3, last)]
     return result
 
 
 @wp.func
-def begin(world: int, lane: int, count: int, motion: Motion, rows: Rows, inertia: Inertia) -> float:
+def begin(
+    world: int, lane: int, count: int, motion: Motion, rows: Rows, cones: Cones, inertia: Inertia
+) -> float:
     """Accelerations of the last step and their residuals; returns the scale of the criteria, 1 / trace M."""
     lanes = wp.block_dim()
+    if lane == 0:
+        rows.lones[world] = 0
+    wait()
     nv = motion.qacc.shape[1]
     for dof in range(lane, nv, lanes):
         motion.qacc[world, dof] = motion.start[world, dof]
         motion.inertial[world, dof] = product(world, dof, motion.start, inertia)
     for row in range(lane, count, lanes):
         rows.residual[world, row] = moved(world, row, motion.start, rows) - rows.target[world, row]
+        if is_lone(world, row, rows, cones):
+            rows.lone[world, wp.atomic_add(rows.lones, world, 1)] = row
     trace = float(0.0)
     for entry in range(lane, inertia.row.shape[0], lanes):
         if inertia.row[entry] == inertia.col[entry]:
@@ -140,8 +153,8 @@ def cost(
 ) -> wp.vec4:
     """Cost after a step along the direction: its change, two derivatives, and what the first is a sum of."""
     sums = wp.vec4(0.0)
-    for row in range(lane, count, wp.block_dim()):
-        mine = along_line(world, row, step, rows, cones)
+    for index in range(lane, rows.lones[world], wp.block_dim()):
+        mine = along_line(world, rows.lone[world, index], step, rows, cones)
         sums += wp.vec4(mine[0], mine[1], mine[2], wp.abs(mine[1]))
     rate = smooth[0] + step * smooth[1]
     whole = wp.vec4(step * (smooth[0] + 0.5 * step * smooth[1]), rate, smooth[1], wp.abs(smooth[0]))
@@ -201,8 +214,8 @@ def descend(
     lanes = wp.block_dim()
     nv = motion.qacc.shape[1]
     groups = search.force.shape[1]
-    for row in range(lane, count, lanes):
-        push(world, row, rows, cones)
+    for index in range(lane, rows.lones[world], lanes):
+        push(world, rows.lone[world, index], rows, cones)
     wait()
     for item in range(lane, groups * nv, lanes):
         group = item // nv
@@ -241,11 +254,11 @@ def bend(
         while rest > column:
             column += 1
             rest -= column
-        i = 4 * rest
-        j = 4 * column
         sums = wp.mat44(0.0)
         for row in range(group, count, groups):
-            sums += curvature(world, row, i, j, rows, cones)
+            sums += curvature(world, row, rest, column, rows, cones)
+        i = 4 * rest
+        j = 4 * column
         for a in range(4):
             for b in range(4):
                 if i + a < nv and j + b < nv:
@@ -274,7 +287,7 @@ def newton_kernel(nv: int, groups: int) -> wp.Kernel:
         count = wp.min(rows.count[world], rows.residual.shape[1])
         enough = limits.tolerance[world % limits.tolerance.shape[0]]
         line = enough * limits.line_tolerance[world % limits.line_tolerance.shape[0]]
-        scale = begin(world, lane, count, motion, rows, inertia)
+        scale = begin(world, lane, count, motion, rows, cones, inertia)
         done = bool(False)
         length = float(0.0)
         steps = int(0)

@@ -36,11 +36,17 @@ class Rows:
     loss: wp.array(dtype=float, ndim=2)
     target: wp.array(dtype=float, ndim=2)
     jacobian: wp.array(dtype=float, ndim=3)
+    quads: wp.array(dtype=wp.vec4, ndim=3)
+    """The same Jacobian, four neighbours at a time."""
     force: wp.array(dtype=float, ndim=2)
     state: wp.array(dtype=int, ndim=2)
     residual: wp.array(dtype=float, ndim=2)
     slope: wp.array(dtype=float, ndim=2)
     """Change of the residual along the search direction."""
+    lone: wp.array(dtype=int, ndim=2)
+    """Rows with a cost of their own: all but those of a contact after its first."""
+    lones: wp.array(dtype=int)
+    """(N,) how many."""
 
 
 @wp.struct
@@ -99,6 +105,14 @@ def push_cone(world: int, row: int, contact: int, rows: Rows, cones: Cones) -> N
             friction = cones.friction[contact, k - 1]
             share = friction * friction * rows.residual[world, other] / t
             set_row(world, other, -pull * share, SLIDING, rows)
+
+
+@wp.func
+def is_lone(world: int, row: int, rows: Rows, cones: Cones) -> bool:
+    """Whether a row has a cost of its own, or stands for those of a whole contact."""
+    if rows.kind[world, row] != ELLIPTIC:
+        return True
+    return is_whole(rows.contact[world, row], row, cones)
 
 
 @wp.func
@@ -281,28 +295,16 @@ def along_line(world: int, row: int, step: float, rows: Rows, cones: Cones) -> w
 
 
 @wp.func
-def four(world: int, row: int, first: int, rows: Rows) -> wp.vec4:
-    """Four neighbours of a row of the Jacobian, the last one again beyond its end."""
-    last = rows.jacobian.shape[2] - 1
-    return wp.vec4(
-        rows.jacobian[world, row, first],
-        rows.jacobian[world, row, wp.min(first + 1, last)],
-        rows.jacobian[world, row, wp.min(first + 2, last)],
-        rows.jacobian[world, row, wp.min(first + 3, last)],
-    )
-
-
-@wp.func
 def cone_curvature(world: int, row: int, contact: int, i: int, j: int, rows: Rows, cones: Cones) -> wp.mat44:
-    """Second derivatives of a sliding contact's cost by velocities i to i + 3 and j to j + 3.
+    """Second derivatives of a sliding contact's cost by velocities 4 i to 4 i + 3 and 4 j to 4 j + 3.
 
     With z = dn and u_k = f_k r_k, v_k of the Jacobian's columns alike, and p = u.v / t:
     s (z_i z_j - mu (z_i p_j + p_i z_j) + (mu^2 - mu n / t) v_i.v_j + mu n / t p_i p_j).
     """
     mu = mu_of(world, contact, cones)
     scale = rows.stiffness[world, row] / wp.max(mu * mu * (1.0 + mu * mu), TINY)
-    z_i = mu * four(world, row, i, rows)
-    z_j = mu * four(world, row, j, rows)
+    z_i = mu * rows.quads[world, row, i]
+    z_j = mu * rows.quads[world, row, j]
     square = float(0.0)
     p_i = wp.vec4(0.0)
     p_j = wp.vec4(0.0)
@@ -311,8 +313,8 @@ def cone_curvature(world: int, row: int, contact: int, i: int, j: int, rows: Row
         other = cones.row[contact, k]
         friction = cones.friction[contact, k - 1]
         u = friction * rows.residual[world, other]
-        v_i = friction * four(world, other, i, rows)
-        v_j = friction * four(world, other, j, rows)
+        v_i = friction * rows.quads[world, other, i]
+        v_j = friction * rows.quads[world, other, j]
         square += u * u
         p_i += u * v_i
         p_j += u * v_j
@@ -327,11 +329,11 @@ def cone_curvature(world: int, row: int, contact: int, i: int, j: int, rows: Row
 
 @wp.func
 def curvature(world: int, row: int, i: int, j: int, rows: Rows, cones: Cones) -> wp.mat44:
-    """What a row adds to the Hessian's entries (i..i+3, j..j+3); a whole contact where it slides."""
+    """What a row adds to the Hessian's entries (4i..4i+3, 4j..4j+3); a whole contact where it slides."""
     state = rows.state[world, row]
     if state == QUADRATIC:
-        left = rows.stiffness[world, row] * four(world, row, i, rows)
-        return wp.outer(left, four(world, row, j, rows))
+        left = rows.stiffness[world, row] * rows.quads[world, row, i]
+        return wp.outer(left, rows.quads[world, row, j])
     if state == SLIDING:
         contact = rows.contact[world, row]
         if is_whole(contact, row, cones):

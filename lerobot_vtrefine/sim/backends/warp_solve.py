@@ -53,6 +53,11 @@ def _rows(data: mjw.Data) -> Rows:
     rows.stiffness, rows.jacobian, rows.force, rows.state = efc.D, efc.J, efc.force, efc.state
     for name in ("residual", "slope"):
         setattr(rows, name, wp.empty((data.nworld, data.njmax), dtype=float))
+    rows.lone, rows.lones = wp.empty((data.nworld, data.njmax), dtype=int), wp.empty(data.nworld, dtype=int)
+    worlds, room, wide = efc.J.shape
+    rows.quads = wp.array(
+        ptr=efc.J.ptr, dtype=wp.vec4, shape=(worlds, room, wide // 4), device=efc.J.device, copy=False
+    )
     return rows
 
 

@@ -25,6 +25,8 @@ from lerobot_vtrefine.sim.backends import warp_contact_kernels as kernels
 from lerobot_vtrefine.sim.backends.warp_constraint import add_contact_rows, rows_without_contacts
 from lerobot_vtrefine.sim.backends.warp_solve import solve
 
+APART = 32
+"""Threads of a warp."""
 NET_FORCE = 3
 DATA = 1 | 2 | 4 | 16
 """found, force, torque, position of mjtConDataField."""
@@ -54,6 +56,14 @@ class WarpStep:
         for name, dtype in SUMS.items():
             setattr(self._sums, name, wp.zeros(shape, dtype=dtype))
         self._derivative = wp.zeros((data.nworld, model.nC), dtype=float)
+        kinds = 1 + max(int(kind) for pair in KINDS for kind in pair)
+        general = np.zeros((kinds, kinds), np.int32)
+        general[tuple(np.transpose(CONVEX))] = 1
+        self._general = wp.array(general, dtype=int)
+        box = int(np.flatnonzero(host.geom_type == mujoco.mjtGeom.mjGEOM_BOX)[0])
+        self._box = wp.vec2i(box, box)  # no pair for the general collision
+        spread = collision_driver.create_collision_context(data.naconmax)
+        self._spread = _pairs(spread, wp.zeros(2, dtype=int))
         self._left = _pairs(collision_driver.create_collision_context(data.naconmax), wp.zeros(1, dtype=int))
 
     def __call__(self) -> None:
@@ -121,13 +131,21 @@ class WarpStep:
         left.count.zero_()
         given = [_shapes(model), data.geom_xpos, data.geom_xmat, _pairs(context, data.ncollision), left]
         wp.launch(kernels.drop_separated, data.naconmax, given)
-        kept = dataclasses.replace(context, collision_pair=left.geoms, collision_pairid=left.ids)
-        kept = dataclasses.replace(kept, collision_worldid=left.world)
-        counted = dataclasses.replace(data, ncollision=left.count)
         with self._beside("convex"):
-            collision_driver.convex_narrowphase(model, counted, kept, CONVEX)
-        collision_driver.primitive_narrowphase(model, counted, kept, PRIMITIVE)
+            self._collide_convex(context)
+        counted = dataclasses.replace(data, ncollision=left.count)
+        collision_driver.primitive_narrowphase(model, counted, _context(context, left), PRIMITIVE)
         self._join("convex")
+
+    def _collide_convex(self, context: collision_driver.CollisionContext) -> None:
+        """The general collision, which takes one thread a quarter of a millisecond: a warp for each pair."""
+        model, data, spread = self._model, self._data, self._spread
+        spread.count.zero_()
+        spread.geoms.fill_(self._box)
+        given = [self._left, model.geom_type, self._general, APART, spread]
+        wp.launch(kernels.spread_general, data.naconmax, given)
+        counted = dataclasses.replace(data, ncollision=spread.count)
+        collision_driver.convex_narrowphase(model, counted, _context(context, spread), CONVEX)
 
     def _read_contacts(self) -> None:
         """Contact sensors, as `mujoco_warp.sensor_acc` reads them."""
@@ -165,6 +183,13 @@ CONTACTS = {
     "row": "efc_address",
 }
 """Fields of `kernels.Contacts` by their names in mujoco_warp."""
+
+
+def _context(
+    context: collision_driver.CollisionContext, pairs: kernels.Pairs
+) -> collision_driver.CollisionContext:
+    own = {"collision_pair": pairs.geoms, "collision_pairid": pairs.ids, "collision_worldid": pairs.world}
+    return dataclasses.replace(context, **own)
 
 
 def _pairs(context: collision_driver.CollisionContext, count: wp.array) -> kernels.Pairs:
