@@ -22,6 +22,8 @@ class Descriptor:
     """What the residual then correlates with, for people."""
     owners: tuple[str, ...]
     direction: Callable[[Press, Signal], Signal]
+    session: bool = False
+    """Whether it differs between recordings of one command, so that what follows it does not repeat."""
 
 
 def _age(press: Press, signal: Signal) -> np.ndarray:
@@ -92,8 +94,13 @@ DESCRIPTORS = (
         ("hysteresis",),
         lambda p, s: s * np.maximum.accumulate(s, axis=0),
     ),
-    Descriptor("load times session time", (), lambda p, s: s * (p.trial.start_s + p.trial.time_s)[:, None]),
-    Descriptor("load times the recording's number", (), lambda p, s: s * p.trial.order),
+    Descriptor(
+        "load times session time",
+        (),
+        lambda p, s: s * (p.trial.start_s + p.trial.time_s)[:, None],
+        session=True,
+    ),
+    Descriptor("load times the recording's number", (), lambda p, s: s * p.trial.order, session=True),
     Descriptor("load times time in the recording", (), lambda p, s: s * p.trial.time_s[:, None]),
     Descriptor(
         "load times the age of the contact", ("viscoelastic_relaxation",), lambda p, s: s * _age(p, s)
@@ -141,9 +148,15 @@ DESCRIPTORS = (
         "session time",
         ("baseline_drift",),
         lambda p, s: np.broadcast_to((p.trial.start_s + p.trial.time_s)[:, None], s.shape),
+        session=True,
     ),
-    Descriptor("temperature", ("baseline_drift",), lambda p, s: np.broadcast_to(_temperature(p), s.shape)),
-    Descriptor("load times temperature", (), lambda p, s: s * _temperature(p)),
+    Descriptor(
+        "temperature",
+        ("baseline_drift",),
+        lambda p, s: np.broadcast_to(_temperature(p), s.shape),
+        session=True,
+    ),
+    Descriptor("load times temperature", (), lambda p, s: s * _temperature(p), session=True),
     Descriptor("even and odd frames", (), lambda p, s: np.broadcast_to(_parity(p), s.shape)),
     Descriptor("load in even and odd frames", (), lambda p, s: s * _parity(p)),
 )

@@ -62,8 +62,10 @@ def look_for_unknowns(search: Search, fitted: Fit, baseline: Fit) -> Suspicion:
     fired = [alarm for alarm in known if alarm.fired]
     before, after = (model.residuals(search.presses) for model in (baseline, fitted))
     if fired and families and only_misfit(search.presses, before, after):
-        # Of what does not repeat, repeatable errors say nothing.
-        fired = [alarm for alarm in fired if alarm.name in ("spectrum", "level")]
+        # Of what does not repeat, or changes through the session, repeatable errors say nothing.
+        changing = any(item.descriptor.session for item in strangers)
+        kept = ("spectrum", "level", "descriptors") if changing else ("spectrum", "level")
+        fired = [alarm for alarm in fired if alarm.name in kept]
         known = tuple(alarm if alarm in fired else replace(alarm, fired=False) for alarm in known)
     clues = [alarm.clue for alarm in reversed(fired)]
     if fired and generic and not strangers:
