@@ -41,11 +41,18 @@ def alive(pid: int) -> bool:
     return status.is_file() and status.read_text().rsplit(")", 1)[1].split()[0] != "Z"
 
 
+def hear_interrupts() -> None:
+    """A shell's background job, which these tests may be, starts its children deaf to Ctrl-C."""
+    signal.signal(signal.SIGINT, signal.SIG_DFL)
+
+
 @pytest.mark.skipif(not Path("/proc/self/stat").is_file(), reason="looks at processes in /proc")
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
 def test_interrupted_demo_continues_from_its_last_finished_stage(tmp_path: Path, number: int) -> None:
     command = [sys.executable, "-c", DEMO, str(tmp_path)]
-    running = subprocess.Popen(command, stderr=subprocess.PIPE, stdout=subprocess.DEVNULL, text=True)
+    running = subprocess.Popen(
+        command, stderr=subprocess.PIPE, stdout=subprocess.DEVNULL, text=True, preexec_fn=hear_interrupts
+    )
     note = tmp_path / "b" / "pid"
     deadline = time.monotonic() + 60
     while not (note.is_file() and note.read_text()):

@@ -98,7 +98,7 @@ def test_periods_that_repeat_the_same_frames_are_the_interval() -> None:
     raw = fresh[np.maximum.accumulate(np.where(first, np.arange(200), 0))]
     trials = [press(depth, time_s, raw)]
     pad = RecordingSet(Path(), "pad", 3, 3, 0.002, "adc_counts", 255.0, (), tuple(trials))
-    low, high = undecided(np.array([0.1231]), prepare(pad, trials, [0]))["period_s"]
+    low, high = undecided(False)(np.array([0.1231]), prepare(pad, trials, [0]))["period_s"]
     assert low <= 0.123 <= high
     assert 0 < high - low < 0.003
 
