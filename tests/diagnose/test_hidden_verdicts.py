@@ -57,7 +57,7 @@ def test_two_causes_at_once_are_both_named(tmp_path, names):
     assert gains["gain"] > 0.85 * gains["oracle_gain"]
 
 
-@pytest.mark.parametrize(("form", "size"), [("mains_hum", 2.0), ("bowl", 2.0)])
+@pytest.mark.parametrize(("form", "size"), [("mains_hum", 2.0), ("bowl", 2.0), ("aging", 2.0)])
 def test_what_no_list_holds_is_said_to_be_unknown(tmp_path, form, size):
     _, verdict, _ = verdict_on(tmp_path, Spec("4x4", (("outside", form, size),), changes=SMALL))
     assert verdict["status"] == "unexplained"
