@@ -3,6 +3,7 @@
     python tests/diagnose/robot_bench.py --jobs=8 --seeds=1000-1024 --output=robot_bench.jsonl
 
 Rules were tuned on seeds below 100; report others. One line per set goes to the output, the table to stdout.
+Sets that the output holds already are not run again.
 """
 
 import argparse
@@ -10,6 +11,7 @@ import json
 import tempfile
 import time
 from concurrent.futures import ProcessPoolExecutor, as_completed
+from itertools import product
 from pathlib import Path
 
 import numpy as np
@@ -21,7 +23,16 @@ from lerobot_vtrefine.embodiments import ALOHA
 
 TABLE = ("shoulder", "elbow", "wrist_flex", "gripper")
 ARM = ("left_waist", "left_shoulder", "left_elbow", "left_wrist_angle")
-UNKNOWNS = ("gain", "gain_drift", "ripple", "coupling", "coriolis")
+UNKNOWNS = ("gain", "gain_drift", "ripple", "coupling", "coriolis", "weak_servo", "packet_loss", "slip")
+STRENGTH = {
+    "gain_drift": 0.06,
+    "ripple": 0.004,
+    "coupling": 0.03,
+    "weak_servo": 0.5,
+    "packet_loss": 1.0,
+    "slip": 0.02,
+}
+# A kind's place is part of its seeds: add at the end.
 KINDS = (
     "clean",
     "nasty",
@@ -36,6 +47,10 @@ KINDS = (
     "two causes",
     "unknown",
     "slow",
+    "backlash+encoder",
+    "backlash+rounded",
+    "control_latency+jitter",
+    "joint_friction+stribeck",
 )
 
 
@@ -71,6 +86,7 @@ def case(kind, seed):
     places = dict(zip(sorted(names), (one, other), strict=False))
     for name in names:
         add(rig, name, str(places[name]), size)
+    form(rig, kind, rng)
     if kind.endswith("load"):
         rig.stiffness = {str(one): rng.uniform(20, 200)}
     if kind == "gravity_sag+form":
@@ -78,10 +94,21 @@ def case(kind, seed):
     if kind == "gripper_compliance":
         rig.joints, rig.compliance = TABLE, {"gripper": rng.uniform(4e-5, 3e-4)}
     if kind == "unknown":
-        strength = {"gain": 0.03 * sign, "gain_drift": 0.06, "ripple": 0.004, "coupling": 0.03}
         which = UNKNOWNS[seed % len(UNKNOWNS)]
+        strength = {**STRENGTH, "gain": 0.03 * sign}
         rig.unknown = {which: strength.get(which, 0.015) * rng.uniform(0.7, 1.3)}
     return rig, names
+
+
+def form(rig, kind, rng):
+    """The same cause in another form than the engine's first."""
+    if kind.startswith("backlash+"):
+        rig.slack, rig.backlash = rig.backlash, {}
+        rig.rounding = 3.0 if kind.endswith("rounded") else 0.0
+    if kind == "control_latency+jitter":
+        rig.latency_spread = rng.uniform(0.2, 0.6)
+    if kind == "joint_friction+stribeck":
+        rig.stribeck = rng.uniform(0.3, 0.8)
 
 
 def add(rig, name, joint, size):
@@ -101,7 +128,7 @@ def run(kind, seed):
     begun = time.process_time()
     found = diagnose_robot(recordings, seed=0)
     held = found.heldout
-    return {
+    row = {
         "kind": kind,
         "seed": seed,
         "truth": sorted(names),
@@ -115,6 +142,7 @@ def run(kind, seed):
         "params": {f"{c.name}.{k}": (p.value, p.ci95) for c in found.causes for k, p in c.params.items()},
         "sizes": truths(rig),
     }
+    return {"grade": grade(row), **row}
 
 
 def truths(rig):
@@ -122,7 +150,7 @@ def truths(rig):
     out = {"control_latency.tau_s": rig.latency_s}
     for cause, sizes in (
         ("encoder_offset", rig.offset),
-        ("backlash", rig.backlash),
+        ("backlash", rig.backlash | rig.slack),
         ("joint_friction", rig.friction),
         ("gravity_sag", rig.sag),
     ):
@@ -178,6 +206,17 @@ def table(rows):
     return "\n".join(lines)
 
 
+def done(path):
+    """Rows of an earlier run; a line that was cut short counts for nothing."""
+    rows = []
+    for line in path.read_text().splitlines() if path.exists() else []:
+        try:
+            rows.append(json.loads(line))
+        except json.JSONDecodeError:
+            continue
+    return rows
+
+
 def main():
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--jobs", type=int, default=1)
@@ -186,12 +225,14 @@ def main():
     parser.add_argument("--output", type=Path, default=Path("robot_bench.jsonl"))
     options = parser.parse_args()
     low, _, high = options.seeds.partition("-")
-    work = [(kind, s) for s in range(int(low), int(high or low) + 1) for kind in options.kinds.split(",")]
-    rows = []
+    kinds, seeds = options.kinds.split(","), range(int(low), int(high or low) + 1)
+    rows = done(options.output)
+    known = {(row["kind"], row["seed"]) for row in rows}
+    work = [item for item in product(kinds, seeds) if item not in known]
     with ProcessPoolExecutor(options.jobs) as pool, options.output.open("a") as out:
         for job in as_completed([pool.submit(run, *item) for item in work]):
-            rows.append(job.result())
-            out.write(json.dumps(rows[-1], default=float) + "\n")
+            rows.append(json.loads(json.dumps(job.result(), default=float)))
+            out.write(json.dumps(rows[-1]) + "\n")
             out.flush()
     print(table(rows))
 

@@ -26,6 +26,7 @@ ALOHA_JOINTS = [
         "right_finger",
     )
 ]
+STRIBECK_RAD_S = 0.02
 
 
 @dataclass
@@ -41,9 +42,17 @@ class Rig:
     """mixed: smooth moves, steps and holds at several speeds; slow: one slow sine."""
     offset: dict = field(default_factory=dict)
     backlash: dict = field(default_factory=dict)
+    slack: dict = field(default_factory=dict)
+    """Play between the joint and its encoder."""
+    rounding: float = 0.0
+    """Of that play: its flanks give way little by little, as (1 + x)^rounding of the way across; 0: sharp."""
     latency_s: float = 0.0
+    latency_spread: float = 0.0
+    """Standard deviation of single commands' delays, as a part of their mean (gamma distributed)."""
     friction: dict = field(default_factory=dict)
     """As servo error [rad]."""
+    stribeck: float = 0.0
+    """By what part friction at rest exceeds sliding friction; falls off over `STRIBECK_RAD_S`."""
     sag: dict = field(default_factory=dict)
     sag_shape: str = "link"
     """link: cosine of the summed pitch; own: cosine of the joint's own angle; stretch: two links."""
@@ -78,8 +87,23 @@ def smooth_moves(rng, t, span, centre):
     return out
 
 
-def play(x, state, width):
-    return min(max(state, x - width / 2), x + width / 2)
+def dragged(x, width, rounding):
+    """Readings (..., N) of an encoder behind play: across the play the reading gives way more and more."""
+    out = np.empty_like(x)
+    out[..., 0] = x[..., 0]
+    for k in range(1, x.shape[-1]):
+        before = out[..., k - 1]
+        sharp = np.clip(before, x[..., k] - width / 2, x[..., k] + width / 2)
+        if rounding:
+            change = x[..., k] - x[..., k - 1]
+            across = 0.5 * (1 + np.sign(change) * (x[..., k - 1] - before) / (width / 2)).clip(0, 2)
+            sharp = np.clip(before + change * across.clip(0, 1) ** rounding, *_window(x[..., k], width))
+        out[..., k] = sharp
+    return out
+
+
+def _window(x, width):
+    return x - width / 2, x + width / 2
 
 
 def pitch_of(joints, q, index):
@@ -138,18 +162,21 @@ class Robot:
                 target = target + size * np.roll(v, 1, axis=1) ** 2
         return target
 
-    def late(self, t, command, then, h):
+    def late(self, arrival, command, then, h):
         """Mean command in force from `then` to `then + h`: one that arrives inside counts for its part."""
-        everyone = np.arange(len(t))
-        old, new = (np.maximum((t <= (when + 1e-9)[:, None]).sum(1) - 1, 0) for when in (then, then + h))
-        part = np.where(new > old, (then + h - t[everyone, new]) / h, 1.0)[:, None]
+        everyone = np.arange(len(arrival))
+        old, new = (np.maximum((arrival <= (w + 1e-9)[:, None]).sum(1) - 1, 0) for w in (then, then + h))
+        part = np.where(new > old, (then + h - arrival[everyone, new]) / h, 1.0)[:, None]
         return part * command[everyone, new] + (1 - part) * command[everyone, old]
 
-    def run(self, t, command, load_n, session_s):
+    def run(self, t, command, load_n, session_s, rng):
         """Encoder readings and servo torques (T, N, J) at t (T, N); session_s (T, 1)."""
         rig = self.rig
+        command = lossy(rig, rng, command)
+        arrival = arrivals(rig, rng, t)
         half, bend = column(rig, rig.backlash) / 2, column(rig, rig.compliance)
         dry = self.omega**2 * column(rig, rig.friction)
+        pull = self.omega**2 * (1 - rig.unknown.get("weak_servo", 0.0) * session_s / session_s.max())
         frames = t.shape[1]
         q = command[:, 0] + self.sag_of(command[:, 0])
         v, slack = np.zeros_like(q), command[:, 0].copy()
@@ -164,17 +191,40 @@ class Robot:
                 now = t[:, k] + step * h
                 u = command[:, k]
                 if rig.latency_s:
-                    u = self.late(t[:, : k + 1], command, now - rig.latency_s, h)
+                    u = self.late(arrival[:, : k + 1], command, now, h)
                 slack = np.clip(slack, u - half, u + half)
                 target = self.target_of(slack, bend * load_n[:, k], session_s, now, v, u)
-                force = self.omega**2 * (target - q) - 2 * self.zeta * self.omega * v
-                stuck = (v == 0) & (np.abs(force) <= dry)
-                a = np.where(stuck, 0.0, force - dry * np.sign(np.where(v != 0, v, force)))
+                force = pull * (target - q) - 2 * self.zeta * self.omega * v
+                stick = dry * (1 + rig.stribeck * np.exp(-((v / STRIBECK_RAD_S) ** 2)))
+                stuck = (v == 0) & (np.abs(force) <= stick)
+                a = np.where(stuck, 0.0, force - stick * np.sign(np.where(v != 0, v, force)))
                 new = v + a * h[:, None]
                 new = np.where((new * v < 0) & (dry > 0), 0.0, new)
                 q = q + 0.5 * (v + new) * h[:, None]
                 v = new
         return out, torque
+
+
+def arrivals(rig, rng, t):
+    """When commands (T, N) reach the servo: never out of order."""
+    late = np.full(t.shape, rig.latency_s)
+    if rig.latency_spread:
+        shape = rig.latency_spread**-2
+        late = rng.gamma(shape, rig.latency_s / shape, t.shape)
+    return np.maximum.accumulate(t + late, axis=1)
+
+
+def lossy(rig, rng, command):
+    """Commands (T, N, J) of which now and then a few in a row never come."""
+    if "packet_loss" not in rig.unknown:
+        return command
+    lost = rng.random(command.shape[:2]) < 1 / 45
+    length = round(12 * rig.unknown["packet_loss"])
+    for k in range(1, length):
+        lost[:, k:] |= lost[:, :-k] & (rng.random((len(lost), 1)) < 1 - k / (2 * length))
+    lost[:, 0] = False
+    last = np.maximum.accumulate(np.where(lost, 0, np.arange(command.shape[1])), axis=1)
+    return np.take_along_axis(command, last[..., None], 1)
 
 
 def frames_of(rig, rng):
@@ -235,7 +285,12 @@ def make_set(rig, folder, seed):
     u = np.stack([moves[c] for c, _ in plan])
     load = np.stack([loads_of(rig, rng, times[c], c) for c, _ in plan])
     session = 30.0 * order[:, None]
-    q, torque = robot.run(t, u, load, session)
+    q, torque = robot.run(t, u, load, session, np.random.default_rng([seed, 1]))
+    for name, width in rig.slack.items():
+        k = rig.joints.index(name)
+        q[..., k] = dragged(q[..., k], width, rig.rounding)
+    if "slip" in rig.unknown:
+        q[..., 1] += rig.unknown["slip"] * (session > 0.5 * session.max())
     for name, k_nm in rig.stiffness.items():
         k = rig.joints.index(name)
         load[..., k] = k_nm * torque[..., k] * (1 + 0.02 * rng.normal(size=t.shape))
