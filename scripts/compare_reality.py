@@ -2,24 +2,31 @@
 """Does diagnosis pay where it matters, in the policy? Fine-tune in the plain and in the diagnosed simulator.
 
     .venv/bin/python scripts/compare_reality.py --seeds 0 1 2
+    .venv/bin/python scripts/compare_reality.py --seeds 0 1 2 3 4 5 --jobs 24 --device=cuda
 
 A simulation with hidden physics stands in for reality (``--env.reality``); nothing is ever trained in it.
 From one imitation-learned checkpoint DPPO runs, with the same budget and seeds, in the plain simulator and in
-the one that ``vtrefine-diagnose`` made from presses of the hidden pad. All policies are then evaluated in the
-stand-in reality and in their own simulator, on the same episodes. Every stage is a command that users run;
-interrupted and started again, it continues. Results: ``comparison.json`` and ``comparison.md``.
+the one that ``vtrefine-diagnose`` made from recordings: presses of the hidden pad, or episodes of the hidden
+robot. All policies are then evaluated in the stand-in reality and in their own simulator, on the same
+episodes. Every stage is a command that users run; interrupted and started again, it continues. With
+``--jobs`` several run side by side, each on cores of its own and on the GPUs by turns; one that fails does
+not stop the others, and the comparison is of the seeds that are whole. Results: ``comparison.json`` and
+``comparison.md``.
 """
 
 import argparse
 import json
 import os
+import subprocess
 import sys
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-from compare_touch import interval_text, run_all, run_script, save
+from compare_touch import run_all, run_script, save
+from realities import PLAIN, REALITIES, of_robot
+from reality_results import as_text, difference
 
 from lerobot_vtrefine.cli.pipeline.demo_config import (
     SEED_STRIDE,
@@ -30,42 +37,14 @@ from lerobot_vtrefine.cli.pipeline.demo_config import (
     flags,
     pretrain_stage,
     record_stage,
+    recording_env,
 )
 from lerobot_vtrefine.cli.pipeline.stages import Stage, StageRunner
 from lerobot_vtrefine.cli.report.statistics import proportion
-from lerobot_vtrefine.tactile.model import SensorModel
-from lerobot_vtrefine.tactile.stages.contact import KelvinVoigt
-from lerobot_vtrefine.tactile.stages.host import Latency
-from lerobot_vtrefine.tactile.stages.mechanics import Hysteresis
-from lerobot_vtrefine.tactile.stages.readout import (
-    Gain,
-    Idle,
-    Noise,
-    Quantisation,
-    RowSharing,
-    TaxelGainSpread,
-)
+from lerobot_vtrefine.sim.reality import SCHEMA
 
-PLAIN = SensorModel((KelvinVoigt(400.0, 1.2), Gain(500.0), Idle(25.0, 10.0), Noise(1.0), Quantisation()))
-"""The simulator before diagnosis: the paper's model in the units of the hardware."""
-RESAMPLES = 10_000
-
-
-def row_sharing_and_hysteresis() -> SensorModel:
-    """A readout whose rows' taxels load each other, under a cover with a wide loop."""
-    return PLAIN.with_stage(RowSharing(3e-3)).with_stage(Hysteresis(fraction=0.5, width_m=4e-4))
-
-
-def latency_and_gain_spread() -> SensorModel:
-    """Readings that arrive two control steps late, from taxels that differ by half."""
-    gains = np.exp(np.random.default_rng(186).normal(0.0, 0.5, (12, 32)))
-    return PLAIN.with_stage(Latency(0.2)).with_stage(TaxelGainSpread(0.5, gains.round(4).tolist()))
-
-
-REALITIES = {
-    "row_sharing+hysteresis": row_sharing_and_hysteresis,
-    "latency+taxel_gain_spread": latency_and_gain_spread,
-}
+MOTION_SEED_OFFSET = 500_000
+"""Between the seeds of demonstrations and those of fine-tuning."""
 
 
 @dataclass(frozen=True)
@@ -83,6 +62,7 @@ class Budget:
     eval_episodes: int
     eval_envs: int
     presses: int
+    motions: int
     env: dict[str, str]
 
     @property
@@ -122,11 +102,18 @@ def env_flags(budget: Budget, world: str) -> list[str]:
     env = acting_env(recipe(budget, budget.seeds[0]))
     kind, _, name = world.partition(":")
     if kind == "diagnosed":
-        env["sensor_model"] = str(budget.diagnosis(name) / "sensor_model.json")
+        env["reality" if of_robot(name) else "sensor_model"] = str(
+            budget.diagnosis(name) / "sensor_model.json"
+        )
     elif kind == "real":
-        del env["sensor_model"]
-        env["reality"] = str(budget.output_dir / folder_name(name) / "reality.json")
+        env = real_env(budget, name, env)
     return flags("env", {"type": "vtrefine"} | env)
+
+
+def real_env(budget: Budget, name: str, env: dict[str, Any]) -> dict[str, Any]:
+    """An environment's flags in a stand-in reality; its pads are the plain ones unless it hides others."""
+    kept = env if of_robot(name) else {key: value for key, value in env.items() if key != "sensor_model"}
+    return kept | {"reality": str(budget.output_dir / folder_name(name) / "reality.json")}
 
 
 def imitation_stages(budget: Budget) -> list[Stage]:
@@ -136,17 +123,44 @@ def imitation_stages(budget: Budget) -> list[Stage]:
 
 
 def diagnosis_stages(budget: Budget, name: str) -> list[Stage]:
-    """Presses of a hidden pad, and what diagnosis makes of them."""
-    folder, output = budget.output_dir / folder_name(name), budget.diagnosis(name)
+    """Recordings in a stand-in reality, and what diagnosis makes of them."""
+    output = budget.diagnosis(name)
+    recorded = motion_stage(budget, name) if of_robot(name) else press_stage(budget, name)
+    source = "dataset.root" if of_robot(name) else "recording"
+    diagnose = ("vtrefine-diagnose", f"--{source}={recorded.output}", f"--output_dir={output}")
+    product = output / "verdict.json"
+    return [
+        recorded,
+        Stage(output_name(name), f"Diagnose {name}", diagnose, output, product, (recorded.name,)),
+    ]
+
+
+def press_stage(budget: Budget, name: str) -> Stage:
+    """Presses of a hidden pad."""
+    folder = budget.output_dir / folder_name(name)
     script = os.path.relpath(Path(__file__).with_name("press_reality.py"))  # what a user would type
     press = ("python", script, f"--reality={folder / 'reality.json'}", f"--trials={budget.presses}")
-    press = (*press, f"--output_dir={folder / 'presses'}")
-    diagnose = ("vtrefine-diagnose", f"--recording={folder / 'presses'}", f"--output_dir={output}")
-    pressed, product = f"press_{folder.name}", folder / "presses" / "recording.json"
-    return [
-        Stage(pressed, f"Press the pad of {name}", press, folder / "presses", product),
-        Stage(output_name(name), f"Diagnose {name}", diagnose, output, output / "verdict.json", (pressed,)),
+    press, output = (*press, f"--output_dir={folder / 'presses'}"), folder / "presses"
+    return Stage(f"press_{folder.name}", f"Press the pad of {name}", press, output, output / "recording.json")
+
+
+def motion_stage(budget: Budget, name: str) -> Stage:
+    """Episodes of the scripted expert on a hidden robot, whether they succeed or not."""
+    config = recipe(budget, budget.seeds[0])
+    output = budget.output_dir / folder_name(name) / "motions"
+    command = [
+        "vtrefine-record-demos",
+        f"--root={output}",
+        "--repo_id=local/motions",
+        f"--num_episodes={budget.motions}",
+        f"--num_envs={budget.motions}",
+        "--include_failures=true",
+        f"--seed={config.seed * SEED_STRIDE + MOTION_SEED_OFFSET}",
+        *flags("env", {"type": "vtrefine"} | real_env(budget, name, recording_env(config))),
+        *flags("degradation", config.degradation),
     ]
+    stage, title = f"record_{folder_name(name)}", f"Record the robot of {name}"
+    return Stage(stage, title, tuple(command), output, output / "meta" / "info.json", resumable=True)
 
 
 def output_name(name: str) -> str:
@@ -206,28 +220,44 @@ def evaluation_stage(budget: Budget, trained: str, world: str, seed: int) -> Sta
     return Stage(output.name, title, tuple(command), output, output / "eval_info.json", needs)
 
 
+def cells(name: str) -> dict[str, tuple[str, str]]:
+    """The comparison's cells for a reality: pairs (trained in, evaluated in) by what they are called."""
+    real, model = f"real:{name}", f"diagnosed:{name}"
+    return {
+        "imitation in reality": ("bc", real),
+        "imitation in the plain simulator": ("bc", "plain"),
+        "plain in reality": ("plain", real),
+        "plain in its own simulator": ("plain", "plain"),
+        "diagnosed in reality": (model, real),
+        "diagnosed in its own simulator": (model, model),
+    }
+
+
 def evaluations(budget: Budget) -> list[tuple[str, str]]:
-    """Pairs (trained in, evaluated in)."""
-    pairs = [("bc", "plain"), ("plain", "plain")]
-    for name in budget.realities:
-        pairs += [("bc", f"real:{name}"), ("plain", f"real:{name}")]
-        pairs += [(f"diagnosed:{name}", f"diagnosed:{name}"), (f"diagnosed:{name}", f"real:{name}")]
-    return pairs
+    """Pairs (trained in, evaluated in) of all realities."""
+    return list(dict.fromkeys(pair for name in budget.realities for pair in cells(name).values()))
 
 
 def lanes(budget: Budget) -> tuple[dict[str, list[Stage]], dict[str, list[Stage]]]:
     """Stages that run side by side, each list in its order: preparation first, then the policies."""
     before = {"imitation": imitation_stages(budget)}
     before |= {output_name(name): diagnosis_stages(budget, name) for name in budget.realities}
-    done = [stage for stages in before.values() for stage in stages]
     policies = {}
     for seed in budget.seeds:
         for trained in ("plain", *(f"diagnosed:{name}" for name in budget.realities), "bc"):
+            name = trained.partition(":")[2]
+            prepared = [*before["imitation"], *(before[output_name(name)] if name else [])]
             tuning = [] if trained == "bc" else [finetune_stage(budget, trained, seed)]
             worlds = [world for policy, world in evaluations(budget) if policy == trained]
             judged = [evaluation_stage(budget, trained, world, seed) for world in worlds]
-            policies[folder_name(trained, str(seed))] = [*done, *tuning, *judged]
+            policies[folder_name(trained, str(seed))] = [*prepared, *tuning, *judged]
     return before, policies
+
+
+def prepared(before: dict[str, list[Stage]], policies: dict[str, list[Stage]]) -> dict[str, list[Stage]]:
+    """The policies that can run: nothing that they need of the preparation failed."""
+    missing = {stage.name for stages in before.values() for stage in stages if not stage.product.exists()}
+    return {name: lane for name, lane in policies.items() if missing.isdisjoint(s.name for s in lane)}
 
 
 def write_worlds(budget: Budget) -> None:
@@ -237,86 +267,50 @@ def write_worlds(budget: Budget) -> None:
     for name in budget.realities:
         folder = budget.output_dir / folder_name(name)
         folder.mkdir(parents=True, exist_ok=True)
-        content = {"schema": "vtrefine/reality@1", "sensor_model": REALITIES[name]().to_dict()}
+        content = {"schema": SCHEMA} | REALITIES[name]()
         (folder / "reality.json").write_text(json.dumps(content, indent=2), encoding="utf-8")
+
+
+def results_path(budget: Budget, trained: str, world: str, seed: int) -> Path:
+    """What LeRobot's evaluation leaves."""
+    return evaluation_dir(budget, trained, world, seed) / "eval_info.json"
 
 
 def successes(budget: Budget, trained: str, world: str, seed: int) -> list[bool]:
     """Outcome of every evaluation episode."""
-    path = evaluation_dir(budget, trained, world, seed) / "eval_info.json"
-    info = json.loads(path.read_text(encoding="utf-8"))
+    info = json.loads(results_path(budget, trained, world, seed).read_text(encoding="utf-8"))
     return [bool(value) for value in info["per_task"][0]["metrics"]["successes"]]
 
 
-def paired_difference(one: list[bool], two: list[bool]) -> dict[str, object]:
-    """Mean of two minus one over the same episodes, with a bootstrap interval over episodes."""
-    change = np.array(two, float) - np.array(one, float)
-    picks = np.random.default_rng(0).integers(0, len(change), (RESAMPLES, len(change)))
-    low, high = np.percentile(change[picks].mean(axis=1), (2.5, 97.5))
-    return {"mean": round(float(change.mean()), 4), "ci95": [round(float(low), 4), round(float(high), 4)]}
-
-
 def compare(budget: Budget) -> dict[str, Any]:
-    """Success of every policy in every world over all seeds, and what the diagnosis said."""
-    pooled = {
-        pair: [success for seed in budget.seeds for success in successes(budget, *pair, seed)]
-        for pair in evaluations(budget)
-    }
+    """Every reality's comparison over the seeds whose evaluations are all there."""
     results = {}
     for name in budget.realities:
-        real, model = f"real:{name}", f"diagnosed:{name}"
-        verdict = json.loads((budget.diagnosis(name) / "verdict.json").read_text(encoding="utf-8"))
-        rates = {
-            "imitation in reality": ("bc", real),
-            "imitation in the plain simulator": ("bc", "plain"),
-            "plain in reality": ("plain", real),
-            "plain in its own simulator": ("plain", "plain"),
-            "diagnosed in reality": (model, real),
-            "diagnosed in its own simulator": (model, model),
-        }
-        results[name] = {
-            "verdict": {
-                "status": verdict["status"],
-                "causes": [cause["name"] for cause in verdict["causes"]],
-                "heldout": verdict["heldout"],
-            },
-            **{title: proportion(sum(pooled[pair]), len(pooled[pair])) for title, pair in rates.items()},
-            "per_seed_in_reality": {
-                title: [float(np.mean(successes(budget, trained, real, seed))) for seed in budget.seeds]
-                for title, trained in (("plain", "plain"), ("diagnosed", model))
-            },
-            "diagnosed_minus_plain_in_reality": paired_difference(pooled["plain", real], pooled[model, real]),
-        }
+        pairs = cells(name).values()
+        whole = [s for s in budget.seeds if all(results_path(budget, *pair, s).is_file() for pair in pairs)]
+        if whole:
+            results[name] = compare_one(budget, name, whole)
     return results
 
 
-def as_text(results: dict[str, Any]) -> str:
-    """The comparison as a Markdown table, and a sentence per reality."""
-    lines = [
-        "| stand-in reality | fine-tuned in | success in reality | in its own simulator |",
-        "|---|---|---|---|",
-    ]
-    words = []
-    for name, row in results.items():
-        for title, real, own in (
-            ("nowhere (imitation)", "imitation in reality", "imitation in the plain simulator"),
-            ("plain", "plain in reality", "plain in its own simulator"),
-            ("diagnosed", "diagnosed in reality", "diagnosed in its own simulator"),
-        ):
-            cells = [interval_text(row[key]["rate"], row[key]["ci95"]) for key in (real, own)]
-            lines.append(f"| {name} | {title} | {' | '.join(cells)} |")
-        gain = row["diagnosed_minus_plain_in_reality"]
-        low, high = gain["ci95"]
-        effect = (
-            "pays" if low > 0 else "costs" if high < 0 else "makes no difference that these episodes can show"
-        )
-        found = ", ".join(row["verdict"]["causes"]) or "nothing"
-        episodes = row["plain in reality"]["episodes"]
-        words.append(
-            f"{name}: diagnosis ({row['verdict']['status']}: {found}) {effect}, "
-            f"{interval_text(gain['mean'], gain['ci95'])} on the same {episodes} episodes."
-        )
-    return "\n".join([*lines, "", *words])
+def compare_one(budget: Budget, name: str, seeds: list[int]) -> dict[str, Any]:
+    """Success of every policy in every world over these seeds, and what the diagnosis said."""
+    verdict = json.loads((budget.diagnosis(name) / "verdict.json").read_text(encoding="utf-8"))
+    row: dict[str, Any] = {
+        "verdict": {
+            "status": verdict["status"],
+            "causes": [cause["name"] for cause in verdict["causes"]],
+            "heldout": verdict["heldout"],
+        },
+        "seeds": seeds,
+    }
+    for title, pair in cells(name).items():
+        runs = [successes(budget, *pair, seed) for seed in seeds]
+        pooled = proportion(sum(map(sum, runs)), sum(map(len, runs)))
+        row[title] = pooled | {"per_seed": [round(float(np.mean(run)), 4) for run in runs]}
+    row["reality_minus_simulator"] = difference(row, "plain in its own simulator", "plain in reality")
+    row["diagnosed_minus_plain"] = difference(row, "plain in reality", "diagnosed in reality")
+    return row
 
 
 def parse() -> tuple[argparse.Namespace, Budget]:
@@ -342,6 +336,7 @@ def parse() -> tuple[argparse.Namespace, Budget]:
         ("eval_episodes", 200),
         ("eval_envs", 50),
         ("presses", 16),
+        ("motions", 30),
     ):
         parser.add_argument(f"--{name}", type=int, default=default, help=f"default {default}")
     parser.add_argument("--lane", help=argparse.SUPPRESS)
@@ -361,14 +356,25 @@ def main() -> None:
         StageRunner(budget.output_dir, (before | policies)[options.lane]).run()
         return
     write_worlds(budget)
-    again = [sys.executable, str(Path(__file__)), *sys.argv[1:]]
-    for together in (before, policies):
-        run_all(
-            {budget.output_dir / name: [*again, f"--lane={name}"] for name in together},
-            min(options.jobs, len(together)),
-        )
+    failed = run_lanes(budget, before, options.jobs)
+    failed = run_lanes(budget, prepared(before, policies), options.jobs) or failed
     results = compare(budget)
     save(budget.output_dir, results, as_text(results))
+    if failed is not None:
+        raise failed
+
+
+def run_lanes(
+    budget: Budget, together: dict[str, list[Stage]], jobs: int
+) -> subprocess.CalledProcessError | None:
+    """Run these lanes, as many side by side; one of the failures, if there was any."""
+    again = [sys.executable, str(Path(__file__)), *sys.argv[1:]]
+    commands = {budget.output_dir / name: [*again, f"--lane={name}"] for name in together}
+    try:
+        run_all(commands, max(1, min(jobs, len(commands))))
+    except subprocess.CalledProcessError as error:
+        return error
+    return None
 
 
 if __name__ == "__main__":

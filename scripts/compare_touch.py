@@ -85,18 +85,28 @@ class Share:
 def run_all(commands: dict[Path, list[str]], jobs: int) -> None:
     """Run the pipelines, ``jobs`` side by side; finished stages are not repeated.
 
-    Side by side, each prints to ``FOLDER.log`` and keeps to its own share of the machine; one that fails
+    Side by side, each prints to ``FOLDER.log`` and keeps to its own share of the machine. One that fails
     does not stop the others.
 
     Raises:
         subprocess.CalledProcessError: a pipeline failed.
     """
+    failed: list[subprocess.CalledProcessError] = []
     if jobs == 1:
         for folder, command in commands.items():
             print(f"\n== {folder.name}", flush=True)
-            subprocess.run(command, check=True)
-        return
-    free, waiting, running, failed = shares(jobs), list(commands), {}, []
+            status = subprocess.run(command, check=False).returncode
+            failed += [subprocess.CalledProcessError(status, command)] if status else []
+    else:
+        failed = run_together(commands, jobs)
+    if failed:
+        raise failed[0]
+
+
+def run_together(commands: dict[Path, list[str]], jobs: int) -> list[subprocess.CalledProcessError]:
+    """Run the pipelines side by side; the failures."""
+    free, waiting, running = shares(jobs), list(commands), {}
+    failed: list[subprocess.CalledProcessError] = []
     try:
         while waiting or running:
             while waiting and free:
@@ -113,8 +123,7 @@ def run_all(commands: dict[Path, list[str]], jobs: int) -> None:
     finally:
         for child, _ in running.values():
             child.terminate()
-    if failed:
-        raise failed[0]
+    return failed
 
 
 def shares(jobs: int) -> list[Share]:

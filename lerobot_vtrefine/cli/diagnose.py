@@ -31,8 +31,9 @@ EPILOG = """\
 Results in the output folder:
   verdict.json         status (adequate, explained, ambiguous, unexplained, invalid_data), causes with
                        parameters and intervals, held-out gain, what could not have been seen, data issues
-  sensor_model.json    the extended model; load it with vtrefine-predict --sensor_model=FILE, and pads' models
-                       with --env.sensor_model=FILE in lerobot-eval and vtrefine-finetune
+  sensor_model.json    the extended model; load it with vtrefine-predict --sensor_model=FILE, and in
+                       lerobot-eval and vtrefine-finetune with --env.sensor_model=FILE (of pads) or
+                       --env.reality=FILE (of a robot like the simulated one)
   baseline_model.json  the simulation's own model, refitted, for comparison
   report.html          all of it for reading, on one page that needs no network
 

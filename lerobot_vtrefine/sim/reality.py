@@ -8,7 +8,8 @@
 
 Every part is optional. The names are those of diagnosis: `control_latency_s` delays commands, `backlash_rad`
 is the full width of the play between command and servo, and an encoder reads `encoder_offset_rad` more than
-is true. Imports no simulator.
+is true. The ``sensor_model.json`` that diagnosis makes of a robot's recordings is read as well: its delay,
+play and encoder offsets. Imports no simulator.
 """
 
 import json
@@ -19,10 +20,12 @@ from typing import Any
 
 import numpy as np
 
+from lerobot_vtrefine.embodiments import ALOHA
 from lerobot_vtrefine.sim.config import SceneConfig
 from lerobot_vtrefine.tactile import SensorModel
 
 SCHEMA = "vtrefine/reality@1"
+ROBOT_MODEL_SCHEMA = "vtrefine/robot-model@1"
 SCENE_FIELDS = (
     "clearance_m",
     "part_friction",
@@ -91,6 +94,8 @@ def load_reality(path: str | Path) -> Reality:
 
 
 def _from_dict(data: Any, folder: Path) -> Reality:
+    if isinstance(data, dict) and data.get("schema") == ROBOT_MODEL_SCHEMA:
+        return Reality(robot=_diagnosed(data))
     if not isinstance(data, dict) or data.get("schema") != SCHEMA:
         raise ValueError(f'reality must hold "schema": "{SCHEMA}"')
     _check_keys("reality", data, ("schema", *(item.name for item in fields(Reality))))
@@ -105,6 +110,31 @@ def _from_dict(data: Any, folder: Path) -> Reality:
     reality = Reality(sensor, RobotFaults(**robot), scene)
     reality.applied(SceneConfig())  # its own checks
     return reality
+
+
+def _diagnosed(model: dict[str, Any]) -> RobotFaults:
+    """What a diagnosed robot does beyond the simulated one.
+
+    Sag and friction are left out: the simulation has gravity and friction of its own; so are the fingers,
+    which have no faults here.
+    """
+    joints = model.get("joints")
+    if not isinstance(joints, list) or not all(isinstance(item, dict) and "name" in item for item in joints):
+        raise ValueError('robot model must hold a list "joints" of objects with a "name"')
+    by_name = {str(item["name"]).removesuffix(".pos"): item for item in joints}
+    unknown = [name for name in by_name if name not in ALOHA.joint_names]
+    if unknown:
+        raise ValueError(f"the simulated arms have no joint {unknown[0]!r}")
+    arms = {name: item for name, item in by_name.items() if not name.endswith("_finger")}
+    play = {
+        n: item.get("backlash_command", 0.0) + item.get("backlash_output", 0.0) for n, item in arms.items()
+    }
+    offsets = {name: item.get("encoder_offset", 0.0) for name, item in arms.items()}
+    return RobotFaults(
+        min(model.get("control_latency_s", 0.0), MAX_LATENCY_S),
+        {name: value for name, value in play.items() if value},
+        {name: value for name, value in offsets.items() if value},
+    )
 
 
 def _check_keys(where: str, data: Any, valid: tuple[str, ...]) -> None:

@@ -8,6 +8,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from lerobot_vtrefine.diagnose.robot.model import RobotModel
+from lerobot_vtrefine.embodiments import ALOHA
+from lerobot_vtrefine.tactile.model import SensorModel
+
 SCRIPTS = Path(__file__).parents[2] / "scripts"
 
 
@@ -24,11 +28,15 @@ def scripts():
 @pytest.fixture
 def budget(scripts, tmp_path):
     compare, _ = scripts
-    budget = compare.Budget(tmp_path, tuple(compare.REALITIES), (3, 4), "cpu", 4, 20, 1, 4, 4, 4, 8, {})
+    budget = compare.Budget(tmp_path, tuple(compare.REALITIES), (3, 4), "cpu", 4, 20, 1, 4, 4, 4, 8, 3, {})
     compare.write_worlds(budget)
     for name in budget.realities:  # as if diagnosed
         budget.diagnosis(name).mkdir(parents=True)
-        compare.PLAIN.save(budget.diagnosis(name) / "sensor_model.json")
+        model = budget.diagnosis(name) / "sensor_model.json"
+        if compare.of_robot(name):
+            RobotModel.default(ALOHA.joint_names).save(model)
+        else:
+            compare.PLAIN.save(model)
     return budget
 
 
@@ -42,14 +50,15 @@ def test_fine_tunings_differ_in_the_simulator_alone(scripts, budget):
     stages = {
         stage.name: stage for lane in policies.values() for stage in lane if stage.name.startswith("finetune")
     }
-    assert len(stages) == 6  # three simulators, two seeds
-    kept = []
+    assert len(stages) == 8  # four simulators, two seeds
+    kept, differ = [], ("env.sensor_model", "env.reality", "output_dir", "seed")
     for stage in stages.values():
         flags = flags_of(stage)
-        assert "env.reality" not in flags
-        kept.append({k: v for k, v in flags.items() if k not in ("env.sensor_model", "output_dir", "seed")})
+        assert "/diagnosis/" in flags.get("env.reality", "/diagnosis/")  # never the hidden one
+        kept.append({k: v for k, v in flags.items() if k not in differ})
     assert all(flags == kept[0] for flags in kept)
-    assert len({flags_of(stage)["env.sensor_model"] for stage in stages.values()}) == 3
+    models = {(flags_of(s)["env.sensor_model"], flags_of(s).get("env.reality")) for s in stages.values()}
+    assert len(models) == 4
     assert len({flags_of(stage)["seed"] for stage in stages.values()}) == 2
 
 
@@ -59,23 +68,24 @@ def test_evaluations_use_the_same_episodes_and_valid_environments(scripts, budge
     compare, _ = scripts
     _, policies = compare.lanes(budget)
     stages = [stage for lane in policies.values() for stage in lane if stage.name.startswith("eval")]
-    assert len(stages) == 2 * len(compare.evaluations(budget)) == 20
+    assert len(stages) == 2 * len(compare.evaluations(budget)) == 28
     seeds = {(flags_of(stage)["seed"], stage.name[-1]) for stage in stages}
     assert len(seeds) == 2
     for stage in stages:
         env = {key[4:]: value for key, value in flags_of(stage).items() if key.startswith("env.")}
-        assert ("reality" in env) == ("_in_real_" in stage.name)
-        assert ("sensor_model" in env) != ("reality" in env)
+        assert ("reality.json" in env.get("reality", "")) == ("_in_real_" in stage.name)
         config = parse_env({k: v for k, v in env.items() if k != "type"})
+        assert (config.hidden.sensor_model is None) == ("sensor_model" in env)
         names = {item.name for item in (config.hidden.sensor_model or compare.PLAIN).stages}
         assert ("row_sharing" in names) == ("in_real_row_sharing" in stage.name)
+        assert bool(config.hidden.robot.backlash_rad) == ("in_real_control_latency" in stage.name)
 
 
 def test_every_lane_can_run_on_its_own(scripts, budget):
     compare, _ = scripts
     before, policies = compare.lanes(budget)
-    assert len(before) == 3
-    assert len(policies) == 8
+    assert len(before) == 4
+    assert len(policies) == 10
     for stages in (before | policies).values():
         names = [stage.name for stage in stages]
         assert len(set(names)) == len(names)
@@ -84,27 +94,57 @@ def test_every_lane_can_run_on_its_own(scripts, budget):
             assert "/" not in stage.name
 
 
-def test_difference_is_paired_and_named_honestly(scripts):
-    compare, _ = scripts
-    rng = np.random.default_rng(0)
-    plain = list(rng.random(200) < 0.5)
-    better = [a or b for a, b in zip(plain, rng.random(200) < 0.4, strict=True)]
-    gain = compare.paired_difference(plain, better)
-    assert gain["ci95"][0] > 0.1
-    assert compare.paired_difference(plain, plain) == {"mean": 0.0, "ci95": [0.0, 0.0]}
+def leave_results(compare, budget, rates, seeds):
+    """Evaluations as LeRobot leaves them: success of these shares of four episodes, by (trained, world)."""
+    for pair in compare.evaluations(budget):
+        for seed in seeds:
+            done = [k < rates.get(pair, 1) for k in range(4)]
+            path = compare.results_path(budget, *pair, seed)
+            path.parent.mkdir(parents=True)
+            path.write_text(json.dumps({"per_task": [{"metrics": {"successes": done}}]}))
+    for name in budget.realities:
+        verdict = {"status": "explained", "causes": [{"name": "backlash"}], "heldout": None}
+        (budget.diagnosis(name) / "verdict.json").write_text(json.dumps(verdict))
 
-    rate = {"rate": 0.5, "ci95": [0.4, 0.6], "episodes": 200}
-    keys = ("imitation in reality", "imitation in the plain simulator", "plain in reality")
-    keys += ("plain in its own simulator", "diagnosed in reality", "diagnosed in its own simulator")
-    row = dict.fromkeys(keys, rate) | {"verdict": {"status": "explained", "causes": ["latency"]}}
-    for interval, words in (
-        ((0.1, 0.3), "pays"),
-        ((-0.1, 0.3), "makes no difference"),
-        ((-0.3, -0.1), "costs"),
-    ):
-        difference = {"mean": float(np.mean(interval)), "ci95": list(interval)}
-        text = compare.as_text({"x": row | {"diagnosed_minus_plain_in_reality": difference}})
-        assert f"(explained: latency) {words}" in text
+
+def test_results_say_what_reality_costs_and_what_diagnosis_brings_back(scripts, budget):
+    compare, _ = scripts
+    name = "control_latency+backlash"
+    rates = {("plain", "plain"): 3, (f"diagnosed:{name}", f"real:{name}"): 2}
+    leave_results(compare, budget, rates, budget.seeds)
+    results = compare.compare(budget)
+    row = results[name]
+    assert row["plain in its own simulator"]["rate"] == 0.75
+    assert row["reality_minus_simulator"] == {"mean": -0.5, "ci95": [-0.5, -0.5]}
+    assert row["diagnosed_minus_plain"] == {"mean": 0.25, "ci95": [0.25, 0.25]}
+    text = compare.as_text(results)
+    assert "(explained: backlash) pays, 25 % [25, 25] over 2 seeds of 4 episodes" in text
+    assert text.count("makes no difference that these seeds can show") == 2
+
+
+def test_unfinished_seeds_are_left_out(scripts, budget):
+    compare, _ = scripts
+    leave_results(compare, budget, {}, budget.seeds)
+    first, *others = budget.realities
+    compare.results_path(budget, "bc", f"real:{first}", 4).unlink()
+    results = compare.compare(budget)
+    assert results[first]["seeds"] == [3]
+    assert all(results[name]["seeds"] == [3, 4] for name in others)
+    for seed in budget.seeds:
+        compare.results_path(budget, "plain", "plain", seed).unlink()
+    assert compare.compare(budget) == {}
+
+
+def test_a_failed_diagnosis_stops_its_own_policies_only(scripts, budget):
+    compare, _ = scripts
+    before, policies = compare.lanes(budget)
+    for stage in (stage for stages in before.values() for stage in stages):
+        stage.product.parent.mkdir(parents=True, exist_ok=True)
+        stage.product.touch()
+    assert compare.prepared(before, policies) == policies
+    before[compare.output_name(budget.realities[0])][-1].product.unlink()
+    left = set(policies) - set(compare.prepared(before, policies))
+    assert left == {f"diagnosed_row_sharing_and_hysteresis_{seed}" for seed in budget.seeds}
 
 
 def test_presses_follow_the_contract_and_the_hidden_pad(scripts, budget):
@@ -120,7 +160,8 @@ def test_presses_follow_the_contract_and_the_hidden_pad(scripts, budget):
     assert len({trial.condition for trial in recordings.trials}) == 2
     assert check_quality(recordings)[1] == []
 
-    hidden = press.this_pad(compare.REALITIES[budget.realities[0]](), np.random.default_rng(1))
+    pad = SensorModel.from_dict(compare.REALITIES[budget.realities[0]]()["sensor_model"])
+    hidden = press.this_pad(pad, np.random.default_rng(1))
     for trial in recordings.trials:
         pressed = trial.raw - press.idle_map(hidden).ravel()
         assert pressed.max() > 20

@@ -105,7 +105,7 @@ def test_a_failed_run_ends_the_comparison(
     with pytest.raises(subprocess.CalledProcessError, match="status 3"):
         script.main()
     assert not (out / "comparison.json").exists()
-    assert jobs == 1 or len(list(out.glob("demo/*_3/results.json"))) == 2  # the others went on
+    assert len(list(out.glob("demo/*_3/results.json"))) == 2  # the others went on
 
 
 def test_runs_side_by_side_take_gpus_by_turns(

@@ -1,12 +1,12 @@
 """Servo parameters of the MuJoCo twin recovered from its own replay, and a diagnosed robot put into it."""
 
+import json
 from pathlib import Path
 
 import numpy as np
 import pytest
 
 from lerobot_vtrefine.diagnose.recordings import RecordingSet, RobotTrial
-from lerobot_vtrefine.diagnose.robot.as_reality import save_reality
 from lerobot_vtrefine.diagnose.robot.model import JointModel, RobotModel
 from lerobot_vtrefine.diagnose.robot.twin import fit_twin
 from lerobot_vtrefine.embodiments import ALOHA
@@ -67,8 +67,29 @@ def test_diagnosed_robot_as_reality(tmp_path) -> None:
     joints = [JointModel(name, 20.0, 1.0) for name in ALOHA.joint_names]
     joints[2] = JointModel("left_elbow", 20.0, 1.0, encoder_offset=-0.01, backlash_command=0.02)
     joints[6] = JointModel("left_left_finger", 20.0, 1.0, encoder_offset=0.005)
-    save_reality(RobotModel(tuple(joints), 0.03), tmp_path / "r.json")
-    robot = load_reality(tmp_path / "r.json").robot
+    joints[3] = JointModel("left_forearm_roll.pos", 20.0, 1.0, backlash_output=0.004)  # as datasets name it
+    RobotModel(tuple(joints), 0.03).save(tmp_path / "sensor_model.json")
+    robot = load_reality(tmp_path / "sensor_model.json").robot
     assert robot.control_latency_s == 0.03
-    assert dict(robot.backlash_rad) == {"left_elbow": 0.02}
+    assert dict(robot.backlash_rad) == {"left_elbow": 0.02, "left_forearm_roll": 0.004}
     assert dict(robot.encoder_offset_rad) == {"left_elbow": -0.01}
+
+
+@pytest.mark.parametrize(
+    ("joints", "words"),
+    [
+        (
+            [{"name": "shoulder_pan", "encoder_offset": 0.1}],
+            "arms have no joint 'shoulder_pan'",
+        ),
+        ([{"encoder_offset": 0.1}], 'a list "joints" of objects with a "name"'),
+        ([{"name": "left_elbow", "backlash_command": -0.1}], "must not be negative"),
+        (None, 'a list "joints"'),
+    ],
+)
+def test_a_robot_that_is_not_simulated_is_refused_as_reality(tmp_path, joints, words) -> None:
+    path = tmp_path / "sensor_model.json"
+    path.write_text(json.dumps({"schema": "vtrefine/robot-model@1", "joints": joints}))
+    with pytest.raises(ValueError, match=words) as error:
+        load_reality(path)
+    assert str(path) in str(error.value)

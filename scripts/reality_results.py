@@ -1,0 +1,45 @@
+"""How ``compare_reality.py`` tells its results."""
+
+from typing import Any
+
+import numpy as np
+from compare_touch import interval_text, mean_interval, rate_text
+
+
+def difference(row: dict[str, Any], one: str, two: str) -> dict[str, Any]:
+    """Two minus one: mean over seeds with its t-interval, for fine-tuning's luck differs by seed."""
+    change = np.subtract(row[two]["per_seed"], row[one]["per_seed"])
+    mean, low, high = mean_interval(change.tolist())
+    return {"mean": round(mean, 4), "ci95": [round(low, 4), round(high, 4)]}
+
+
+def as_text(results: dict[str, Any]) -> str:
+    """The comparison as a Markdown table, and a sentence per reality."""
+    lines = [
+        "| stand-in reality | fine-tuned in | success in reality | in its own simulator |",
+        "|---|---|---|---|",
+    ]
+    words = []
+    for name, row in results.items():
+        for title, real, own in (
+            ("nowhere (imitation)", "imitation in reality", "imitation in the plain simulator"),
+            ("plain", "plain in reality", "plain in its own simulator"),
+            ("diagnosed", "diagnosed in reality", "diagnosed in its own simulator"),
+        ):
+            lines.append(f"| {name} | {title} | {rate_text(row[real])} | {rate_text(row[own])} |")
+        words.append(sentence(name, row))
+    return "\n".join([*lines, "", *words])
+
+
+def sentence(name: str, row: dict[str, Any]) -> str:
+    """What the hidden physics costs a policy that does not know it, and what diagnosis brings back."""
+    gap, gain = row["reality_minus_simulator"], row["diagnosed_minus_plain"]
+    low, high = gain["ci95"]
+    effect = "pays" if low > 0 else "costs" if high < 0 else "makes no difference that these seeds can show"
+    found = ", ".join(row["verdict"]["causes"]) or "nothing"
+    return (
+        f"{name}: the plain simulator's policy changes by {interval_text(gap['mean'], gap['ci95'])} in the"
+        f" stand-in reality; fine-tuning in the diagnosed simulator ({row['verdict']['status']}: {found})"
+        f" {effect}, {interval_text(gain['mean'], gain['ci95'])} over {len(row['seeds'])} seeds of"
+        f" {row['plain in reality']['episodes'] // len(row['seeds'])} episodes."
+    )
