@@ -3,6 +3,7 @@
 ``vtrefine-predict --recording=DIR --sensor_model=OUT/sensor_model.json --output_dir=PREDICTED``
 """
 
+import sys
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -19,6 +20,8 @@ Pads: the trial's motion (or load) goes through the simulator's own sensor code;
 readings are never opened, and may be absent. Robots: its commands go through the servo model; of
 its positions only the first is used."""
 EPILOG = """\
+Lengths, angles and times that clearly are in other units than the contract's are converted, and said.
+
 Result: a Parquet file of each trial's name, with time_s and the predicted raw (or position), a row
 per recorded frame. Noise and rounding are left out: the mean is what predicts best.
 
@@ -55,16 +58,21 @@ def main(arguments: Sequence[str] | None = None) -> None:
     if options.output_dir.resolve() == options.recording.resolve():
         raise ValueError("--output_dir is the folder of the recordings, which predictions would replace")
     from lerobot_vtrefine.diagnose.predict import load_predictor, predict_frames, write_prediction
+    from lerobot_vtrefine.diagnose.quality import in_si_units
     from lerobot_vtrefine.diagnose.recordings import read_recording_set
 
-    recordings = read_recording_set(options.recording, measured=False)
+    recorded = read_recording_set(options.recording, measured=False)
+    recordings, repairs = in_si_units(recorded)
+    for repair in repairs:
+        print(f"{repair.trial or 'all trials'}: {repair.problem}; {repair.action}", file=sys.stderr)
     predict = load_predictor(options.sensor_model, recordings)
     names = [trial.file for trial in recordings.trials]
     if outside := [name for name in names if ".." in Path(name).parts or Path(name).is_absolute()]:
         raise ValueError(f"{options.recording}: trial file {outside[0]} lies outside of the folder")
     with staged(options.output_dir, names, overwrite=options.overwrite) as folder:
-        for trial in tqdm(recordings.trials, desc="predict", unit="trial"):
-            write_prediction(folder / trial.file, recordings, trial, predict_frames(trial, predict))
+        pairs = zip(recorded.trials, recordings.trials, strict=True)
+        for trial, mended in tqdm(pairs, desc="predict", unit="trial", total=len(names)):
+            write_prediction(folder / trial.file, recordings, trial, predict_frames(mended, predict))
     print(f"wrote {len(names)} predictions to {options.output_dir}")
 
 

@@ -101,10 +101,18 @@ def _mesh(file: str, scale: float | tuple[float, ...], quat: tuple[float, ...]) 
         raise ValueError(f"{Path(file)}: {error}") from error
 
 
-def _mesh_heights(trial: Trial, depth_m: np.ndarray, layout: PadLayout) -> np.ndarray:
-    spec = trial.object
+def mesh_extent_m(spec: dict[str, Any]) -> float:
+    """Longest side of the box around a mesh, as scaled and turned [m]; ValueError where it cannot be used."""
+    return float(np.ptp(_mesh_of(spec).vertices, axis=0).max())
+
+
+def _mesh_of(spec: dict[str, Any]) -> TriangleMesh:
     scale = spec.get("scale", 1.0)
-    mesh = _mesh(spec["file"], tuple(scale) if isinstance(scale, list) else scale, tuple(spec["quat_wxyz"]))
+    return _mesh(spec["file"], tuple(scale) if isinstance(scale, list) else scale, tuple(spec["quat_wxyz"]))
+
+
+def _mesh_heights(trial: Trial, depth_m: np.ndarray, layout: PadLayout) -> np.ndarray:
+    mesh = _mesh_of(trial.object)
     turn = rotations(trial.tilt_x_rad, trial.tilt_y_rad)
     lowest = np.concatenate(
         [(turn[start : start + 64, 2] @ mesh.vertices.T).min(axis=1) for start in range(0, len(turn), 64)]

@@ -110,7 +110,7 @@ def read_recording_set(path: str | Path, *, measured: bool = True) -> RecordingS
 
 def _read_header(path: Path) -> dict[str, Any]:
     try:
-        header = json.loads(path.read_text(encoding="utf-8"))
+        header = json.loads(path.read_text(encoding="utf-8-sig"))
     except (json.JSONDecodeError, UnicodeDecodeError) as error:
         raise ValueError(f"{path}: not valid JSON ({error})") from error
     if not isinstance(header, dict) or header.get("schema") != SCHEMA:
@@ -137,6 +137,19 @@ def _number(where: str, value: Any, name: str, positive: bool = False) -> float:
     if positive and value <= 0:
         raise ValueError(f'{where}: "{name}" must be positive, got {value!r}')
     return float(value)
+
+
+def _whole(where: str, value: Any, name: str) -> int:
+    number = _number(where, value, name)
+    if number != int(number):
+        raise ValueError(f'{where}: "{name}" must be a whole number, got {value!r}')
+    return int(number)
+
+
+def _label(where: str, value: Any, name: str) -> str:
+    if isinstance(value, bool) or not isinstance(value, str | int | float):
+        raise ValueError(f'{where}: "{name}" must be a text or a number, got {value!r}')
+    return str(value)
 
 
 def _pad(path: Path, header: dict[str, Any]) -> tuple[int, int, float]:
@@ -287,9 +300,9 @@ class _Table:
         start = _number(self.where, entry.get("start_s", 0.0), "start_s")
         return {
             "file": entry["file"],
-            "condition": str(entry.get("condition", f"trial {self.index}")),
-            "replicate": int(_number(self.where, entry.get("replicate", 0), "replicate")),
-            "order": int(_number(self.where, entry.get("order", self.index), "order")),
+            "condition": _label(self.where, entry.get("condition", f"trial {self.index}"), "condition"),
+            "replicate": _whole(self.where, entry.get("replicate", 0), "replicate"),
+            "order": _whole(self.where, entry.get("order", self.index), "order"),
             "start_s": start,
             "time_s": self.scalar("time_s"),
         }

@@ -59,8 +59,8 @@ def make_set(seed=0, trials=8, rows=6, cols=8, *, spread=0.15, idle_spread=12.0,
         "trials": [
             {
                 "file": f"trial_{k:04d}.parquet",
-                "condition": f"c{k // 2:02d}",
-                "replicate": k % 2,
+                "condition": f"c{k:02d}",
+                "replicate": 0,
                 "order": k,
                 "start_s": 20.0 * k,
             }

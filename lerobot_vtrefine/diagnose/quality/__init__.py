@@ -1,5 +1,5 @@
 """Quality control of recordings: what is broken is set aside or repaired, and always said (contract §3)."""
 
-from lerobot_vtrefine.diagnose.quality.checks import MIN_TRIALS, check_quality, too_little
+from lerobot_vtrefine.diagnose.quality.checks import MIN_TRIALS, check_quality, in_si_units, too_little
 
-__all__ = ["MIN_TRIALS", "check_quality", "too_little"]
+__all__ = ["MIN_TRIALS", "check_quality", "in_si_units", "too_little"]

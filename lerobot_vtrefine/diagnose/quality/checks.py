@@ -1,5 +1,11 @@
 """All checks in their order."""
 
+from lerobot_vtrefine.diagnose.quality.drive import (
+    check_contact,
+    check_drives,
+    check_forces,
+    check_signs,
+)
 from lerobot_vtrefine.diagnose.quality.edits import Check, apply
 from lerobot_vtrefine.diagnose.quality.frames import (
     check_clock,
@@ -14,8 +20,13 @@ from lerobot_vtrefine.diagnose.quality.joints import (
     check_joint_order,
     check_jumps,
 )
+from lerobot_vtrefine.diagnose.quality.readings import check_readings, check_wraps
 from lerobot_vtrefine.diagnose.quality.response import check_answers, check_start, check_stuck
-from lerobot_vtrefine.diagnose.quality.units import check_scales, check_units
+from lerobot_vtrefine.diagnose.quality.session import check_conditions, check_session
+from lerobot_vtrefine.diagnose.quality.sizes import check_sizes
+from lerobot_vtrefine.diagnose.quality.spikes import check_spikes
+from lerobot_vtrefine.diagnose.quality.temperature import check_temperature
+from lerobot_vtrefine.diagnose.quality.units import check_units
 from lerobot_vtrefine.diagnose.quality.wiring import check_wiring
 from lerobot_vtrefine.diagnose.recordings import RecordingSet
 from lerobot_vtrefine.diagnose.verdict import DataIssue
@@ -28,16 +39,39 @@ MIN_PART = 1 / 3
 # Each check sees what the ones before it left: first frames and times, then what the pad says. Frames without
 # numbers are dropped after the clock was checked, which would take them for lost ones; all other checks need
 # numbers.
+UNIT_CHECKS: tuple[Check, ...] = (check_sizes, check_units)
+"""What a prediction has to mend as well; none of these looks at readings."""
 FRAME_CHECKS: tuple[Check, ...] = (
     check_repeats,
-    check_units,
+    check_spikes,
+    *UNIT_CHECKS,
     check_clock,
+    check_temperature,
     check_optional,
     check_numbers,
     check_length,
+    check_session,
 )
-PAD_CHECKS: tuple[Check, ...] = (check_scales, check_stuck, check_wiring, check_start, check_answers)
-ROBOT_CHECKS: tuple[Check, ...] = (check_jumps, check_commands, check_encoders, check_joint_order)
+PAD_CHECKS: tuple[Check, ...] = (
+    check_drives,
+    check_readings,
+    check_signs,
+    check_forces,
+    check_contact,
+    check_stuck,
+    check_wraps,
+    check_wiring,
+    check_start,
+    check_answers,
+    check_conditions,
+)
+ROBOT_CHECKS: tuple[Check, ...] = (
+    check_jumps,
+    check_commands,
+    check_encoders,
+    check_joint_order,
+    check_conditions,
+)
 
 
 def check_quality(recordings: RecordingSet) -> tuple[RecordingSet, list[DataIssue]]:
@@ -54,6 +88,19 @@ def check_quality(recordings: RecordingSet) -> tuple[RecordingSet, list[DataIssu
             continue  # lines in the wrong place would all look dead
         recordings, found = apply(recordings, list(check(recordings)))
         miswired |= check is check_wiring and any(issue.trial is None for issue in found)
+        issues += found
+    return recordings, issues
+
+
+def in_si_units(recordings: RecordingSet) -> tuple[RecordingSet, list[DataIssue]]:
+    """The set with lengths, angles and times in the contract's units where they clearly were in others.
+
+    Trials in units that nobody knows are kept as they are.
+    """
+    issues: list[DataIssue] = []
+    for check in UNIT_CHECKS:
+        repairs = [finding for finding in check(recordings) if finding.trial is not None or finding.setting]
+        recordings, found = apply(recordings, repairs)
         issues += found
     return recordings, issues
 

@@ -1,8 +1,8 @@
 """What every check returns, and how it changes a recording set."""
 
 import dataclasses
-from collections.abc import Callable, Iterable
-from dataclasses import dataclass
+from collections.abc import Callable, Iterable, Mapping
+from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
@@ -12,6 +12,8 @@ from lerobot_vtrefine.diagnose.verdict import DataIssue
 
 SET_ASIDE = "set aside"
 KEPT = "kept"
+NO_VERDICT = "no verdict"
+"""Nothing in the set can be judged before its maker has mended this."""
 MINORITY = 0.5
 """A fault of fewer trials than this part of the set is theirs; of more, it is a property of the rig."""
 
@@ -21,12 +23,14 @@ class Finding:
     """A fault of trial ``index`` (None: of the whole set) and what becomes of it.
 
     ``trial`` takes the old one's place after a repair; without it, ``action`` says whether the old one stays.
+    ``setting`` holds fields of the set that are repaired.
     """
 
     index: int | None
     problem: str
     action: str
     trial: Any = None
+    setting: Mapping[str, Any] = field(default_factory=dict)
 
 
 Check = Callable[[RecordingSet], Iterable[Finding]]
@@ -35,17 +39,20 @@ Check = Callable[[RecordingSet], Iterable[Finding]]
 def apply(recordings: RecordingSet, findings: Iterable[Finding]) -> tuple[RecordingSet, list[DataIssue]]:
     """The set without what was set aside and with what was repaired, and the list of it."""
     trials = dict(enumerate(recordings.trials))
-    issues = []
+    issues, settings = [], {}
     for finding in findings:
+        settings |= finding.setting
         file = None if finding.index is None else recordings.trials[finding.index].file
         issues.append(DataIssue(file, finding.problem, finding.action))
+        if finding.action == NO_VERDICT:
+            trials.clear()
         if finding.index is None:
             continue
         if finding.action == SET_ASIDE:
             trials.pop(finding.index, None)
         elif finding.trial is not None and finding.index in trials:
             trials[finding.index] = finding.trial
-    return dataclasses.replace(recordings, trials=tuple(trials.values())), issues
+    return dataclasses.replace(recordings, trials=tuple(trials.values()), **settings), issues
 
 
 def columns(trial: Any) -> dict[str, np.ndarray]:

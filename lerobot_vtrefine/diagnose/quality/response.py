@@ -75,6 +75,8 @@ def check_answers(recordings: RecordingSet) -> Iterator[Finding]:
     silent = whole < NO_ANSWER * usual
     for index in np.flatnonzero(silent):
         yield Finding(int(index), "does not answer: the readings ignore the press", SET_ASIDE)
+    if not _outlined(recordings):
+        return
     pressed = covered > 0.3 * np.nanmax(covered, initial=1e-30)
     alive = ((slope > ALIVE * usual) & pressed)[~silent].sum(axis=0)
     dead = (slope < DEAD * usual) & pressed & (alive >= 2)
@@ -84,6 +86,12 @@ def check_answers(recordings: RecordingSet) -> Iterator[Finding]:
         if len(taxels) > 4:
             problem += f" and {len(taxels) - 4} more"
         yield Finding(int(index), problem, SET_ASIDE)
+
+
+def _outlined(recordings: RecordingSet) -> bool:
+    """Whether it is known which taxels are pressed: a load alone tells only under flat-ended indenters."""
+    flat = all(trial.object["shape"] in ("flat", "cylinder") for trial in recordings.trials)
+    return flat or all(trial.depth_m is not None for trial in recordings.trials)
 
 
 def _slopes(found: list[Press]) -> tuple[np.ndarray, np.ndarray]:

@@ -1,4 +1,4 @@
-"""Checks of units: millimetres, grams, milliseconds and degrees where the contract wants SI units.
+"""Checks of units: millimetres, milliseconds and degrees where the contract wants SI units.
 
 A column is repaired only where nothing else fits: its values are impossible in the unit that they should
 have, or a clear factor away from the other trials', and usual after the division.
@@ -6,129 +6,136 @@ have, or a clear factor away from the other trials', and usual after the divisio
 
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 
-from lerobot_vtrefine.diagnose.quality.edits import KEPT, MINORITY, SET_ASIDE, Finding
+from lerobot_vtrefine.diagnose.quality.edits import MINORITY, SET_ASIDE, Finding
 from lerobot_vtrefine.diagnose.recordings import RecordingSet
 
 SPIKES = 0.02
 """Values that only this part of the frames, or less, exceeds are no other unit."""
-GRAMS_PER_NEWTON = 1e3 / 9.80665
+STILL_M = 2e-5
+"""A depth that varies less than this in a whole trial is no press: it was no other unit, but another zero."""
+SLOWEST_STEP_S, SHORT_STEP_S = 3.0, 1.0
+"""Frames further apart are taken for another unit of time; in the right one they are not as far apart."""
+CROWDED, CROWDED_STEP_S = 1.5, 0.3
+"""Trials that last longer than so many times the time between their starts cannot be in seconds, if their
+frames are further apart than this."""
+FAR_START_S = 10.0
+"""A first frame later than this, and than the trial is long, was not timed from the trial's start."""
 
 
 @dataclass(frozen=True)
 class Mistake:
-    """A unit that people write instead of the contract's.
+    """Units that people write instead of the contract's.
 
-    ``limit`` is the largest plausible value in the right unit; a column above it in every trial is repaired
-    when dividing by ``factor`` brings it below. ``steps``: the column's steps are judged, not its values.
+    ``limit`` is the largest plausible value in the right unit; a column above it is repaired when dividing by
+    one of the ``units``' factors brings it below.
     """
 
     column: str
-    unit: str
     right: str
-    factor: float
+    units: tuple[tuple[str, float], ...]
     limit: float
-    steps: bool = False
 
 
+PLACES_M = 0.3
+"""No indenter that presses a pad is further than this from its centre."""
+SMALL_LENGTHS = (("millimetres", 1e3), ("micrometres", 1e6))
+DEGREES = (("degrees", 180 / np.pi),)
+SHORT_TIMES = (("milliseconds", 1e3), ("microseconds", 1e6), ("nanoseconds", 1e9))
 PAD_MISTAKES = (
-    Mistake("depth_m", "millimetres", "metres", 1e3, 0.03),
-    Mistake("x_m", "millimetres", "metres", 1e3, 0.3),
-    Mistake("y_m", "millimetres", "metres", 1e3, 0.3),
-    Mistake("tilt_x_rad", "degrees", "radians", 180 / np.pi, 0.8),
-    Mistake("tilt_y_rad", "degrees", "radians", 180 / np.pi, 0.8),
-    Mistake("time_s", "milliseconds", "seconds", 1e3, 3.0, steps=True),
+    Mistake("depth_m", "metres", SMALL_LENGTHS, 0.03),
+    Mistake("x_m", "metres", SMALL_LENGTHS, PLACES_M),
+    Mistake("y_m", "metres", SMALL_LENGTHS, PLACES_M),
+    Mistake("tilt_x_rad", "radians", DEGREES, 0.8),
+    Mistake("tilt_y_rad", "radians", DEGREES, 0.8),
 )
 ROBOT_MISTAKES = (
-    Mistake("position", "degrees", "radians", 180 / np.pi, 7.0),
-    Mistake("command", "degrees", "radians", 180 / np.pi, 7.0),
-    Mistake("time_s", "milliseconds", "seconds", 1e3, 3.0, steps=True),
+    Mistake("position", "radians", DEGREES, 7.0),
+    Mistake("command", "radians", DEGREES, 7.0),
 )
 
 
 def check_units(recordings: RecordingSet) -> Iterator[Finding]:
-    """Columns in another unit than the contract's."""
+    """Columns in another unit than the contract's, and times that do not count from the trial's start."""
     trials = dict(enumerate(recordings.trials))
-    for mistake in PAD_MISTAKES if recordings.kind == "pad" else ROBOT_MISTAKES:
+    mistakes = _mistakes(recordings)
+    for mistake in mistakes:
         for index, trial in trials.items():
             values = getattr(trial, mistake.column)
-            if values is None or _size(values, mistake) <= mistake.limit:
+            size = 0.0 if values is None else _largest(values)
+            if values is None or size <= mistake.limit:
                 continue
-            size = _size(values, mistake)
-            problem = f"{mistake.column} reaches {size:.3g}: {mistake.unit} instead of {mistake.right}"
-            if mistake.steps:
-                problem = f"{mistake.column} steps by {size:.3g}: {mistake.unit} instead of {mistake.right}"
-            if size / mistake.factor > mistake.limit or _spikes(values, mistake):
-                yield Finding(
-                    index, f"{mistake.column} reaches {size:.3g}, which no unit explains", SET_ASIDE
-                )
+            found = _unit(values, mistake)
+            if found is None:
+                text = f"{mistake.column} reaches {size:.3g}, which no unit explains"
+                yield Finding(index, text, SET_ASIDE)
                 continue
-            trials[index] = replace(trial, **{mistake.column: values / mistake.factor})
-            yield Finding(index, problem, f"repaired: divided by {mistake.factor:.4g}", trials[index])
+            unit, factor = found
+            trials[index] = replace(trial, **{mistake.column: values / factor})
+            problem = f"{mistake.column} reaches {size:.3g}: {unit} instead of {mistake.right}"
+            yield Finding(index, problem, f"repaired: divided by {factor:.4g}", trials[index])
+    yield from _times(recordings, trials)
 
 
-def _size(values: np.ndarray, mistake: Mistake) -> float:
-    if mistake.steps:
-        return float(np.nanmedian(np.diff(values))) if np.isfinite(values).sum() > 1 else 0.0
+def _mistakes(recordings: RecordingSet) -> tuple[Mistake, ...]:
+    """Units to look for; places off the pad are judged more strictly where most are in another unit."""
+    if recordings.kind != "pad":
+        return ROBOT_MISTAKES
+    places = [max(_largest(trial.x_m), _largest(trial.y_m)) for trial in recordings.trials]
+    if np.mean(np.array(places) > PLACES_M) < MINORITY:
+        return PAD_MISTAKES
+    half_m = 0.5 * recordings.pitch_m * max(recordings.rows, recordings.cols)
+    return tuple(replace(m, limit=half_m) if m.column in ("x_m", "y_m") else m for m in PAD_MISTAKES)
+
+
+def _largest(values: np.ndarray) -> float:
     return float(np.abs(values[np.isfinite(values)]).max(initial=0.0))
 
 
-def _spikes(values: np.ndarray, mistake: Mistake) -> bool:
-    """Whether only a few frames are beyond what is plausible."""
+def _unit(values: np.ndarray, mistake: Mistake) -> tuple[str, float] | None:
+    """The unit that values are in, with its factor; None where none explains them."""
     beyond = np.abs(values) > mistake.limit
-    return not mistake.steps and 0 < beyond.reshape(len(values), -1).any(1).mean() < SPIKES
+    if 0 < beyond.reshape(len(values), -1).any(1).mean() < SPIKES:
+        return None
+    for unit, factor in mistake.units:
+        if _largest(values) / factor <= mistake.limit:
+            known = values[np.isfinite(values)] / factor
+            still = mistake.column == "depth_m" and np.ptp(known) < STILL_M
+            return None if still else (unit, factor)
+    return None
 
 
-def check_scales(recordings: RecordingSet) -> Iterator[Finding]:
-    """Forces and readings of single trials on another scale than the other trials'."""
-    if recordings.kind != "pad":
-        return
-    yield from _forces(recordings)
-    yield from _readings(recordings)
+def _times(recordings: RecordingSet, trials: dict[int, Any]) -> Iterator[Finding]:
+    """Clocks that count in fractions of seconds, or from another instant than the trial's start."""
+    limit_s = CROWDED_STEP_S if _crowded(recordings) else SLOWEST_STEP_S
+    for index, trial in trials.items():
+        time_s = trial.time_s
+        known = time_s[np.isfinite(time_s)]
+        step = float(np.median(np.diff(known))) if len(known) > 1 else 0.0
+        if step > limit_s:
+            unit, factor = next((u for u in SHORT_TIMES if step / u[1] <= SHORT_STEP_S), SHORT_TIMES[-1])
+            if step == 1.0:
+                yield Finding(index, "time_s counts frames or milliseconds, not seconds", SET_ASIDE)
+                continue
+            trial = replace(trial, time_s=time_s / factor)
+            problem = f"time_s steps by {step:.3g}: {unit} instead of seconds"
+            yield Finding(index, problem, f"repaired: divided by {factor:.4g}", trial)
+            known = known / factor
+        first = float(known[0]) if len(known) else 0.0
+        if abs(first) > max(FAR_START_S, float(np.ptp(known)) if len(known) else 0.0):
+            trial = replace(trial, time_s=trial.time_s - first)
+            problem = f"time_s begins at {first:.6g} s instead of at the trial's start"
+            yield Finding(index, problem, "repaired: counted from the first frame", trial)
 
 
-def _forces(recordings: RecordingSet) -> Iterator[Finding]:
-    """Force against reading, trial by trial: about 100 times the usual is grams, 1000 times millinewtons."""
-    ratios = np.full(len(recordings.trials), np.nan)
-    for index, trial in enumerate(recordings.trials):
-        if trial.force_n is None:
-            continue
-        span = np.ptp(trial.raw - np.median(trial.raw[:5], axis=0), axis=0).sum()
-        if span > 0:
-            ratios[index] = np.ptp(trial.force_n) / span
-    usual = np.nanmedian(ratios) if np.isfinite(ratios).any() else np.nan
-    for index in np.flatnonzero(np.isfinite(ratios)):
-        trial = recordings.trials[index]
-        for factor, unit in ((GRAMS_PER_NEWTON, "grams"), (1e3, "millinewtons")):
-            if usual > 0 and factor / 2.5 < ratios[index] / usual < factor * 2.5:
-                fixed = replace(trial, force_n=trial.force_n / factor)
-                problem = f"force_n reaches {np.abs(trial.force_n).max():.3g}: {unit} instead of newtons"
-                yield Finding(index, problem, f"repaired: divided by {factor:.4g}", fixed)
-                break
-    loads = [np.abs(trial.force_n).max() for trial in recordings.trials if trial.force_n is not None]
-    if loads and np.median(loads) > 500.0:
-        problem = f"force_n reaches {np.median(loads):.3g} N in the median trial, which looks like grams"
-        yield Finding(None, problem, f"{KEPT}: stiffness and gain absorb the scale")
-
-
-def _readings(recordings: RecordingSet) -> Iterator[Finding]:
-    """Readings beyond full scale, or on another scale than the other trials'."""
-    top = np.array([trial.raw.max() for trial in recordings.trials])
-    usual = float(np.median(top)) if len(top) else 0.0
-    beyond = top > 1.01 * recordings.full_scale
-    bottom = np.array([trial.raw.min() for trial in recordings.trials])
-    negative = bottom < -0.05 * recordings.full_scale
-    common = beyond.mean() >= MINORITY if len(top) else False
-    if common:
-        problem = f"raw reaches {usual:.4g}, above full_scale {recordings.full_scale:g}, in most trials"
-        yield Finding(None, problem, f"{KEPT}: full_scale in recording.json is wrong")
-    for index, reading in enumerate(top):
-        if beyond[index] and not common:
-            problem = f"raw reaches {reading:.4g}, above full_scale {recordings.full_scale:g}"
-            yield Finding(index, problem, SET_ASIDE)
-        elif usual > 0 and reading < usual / 25 and 0 < reading <= 1.5:
-            yield Finding(index, f"raw reaches only {reading:.3g}: normalised readings", SET_ASIDE)
-        elif negative[index] and negative.mean() < MINORITY:
-            yield Finding(index, "raw is negative: the idle level has been removed already", SET_ASIDE)
+def _crowded(recordings: RecordingSet) -> bool:
+    """Whether trials last far longer than the time between their starts."""
+    starts = np.sort([trial.start_s for trial in recordings.trials])
+    gap = float(np.median(np.diff(starts))) if len(starts) > 1 else 0.0
+    lengths = [
+        np.ptp(t.time_s[np.isfinite(t.time_s)]) for t in recordings.trials if np.isfinite(t.time_s).any()
+    ]
+    return gap > 0 and bool(lengths) and float(np.median(lengths)) > CROWDED * gap
