@@ -112,6 +112,18 @@ def test_unknown_cause_demotes_names_to_symptoms(pad_set):
     assert "What looks wrong" in text
     assert "vary one thing at a time" in text
     assert "a symptom: the name may be borrowed" in text
+    assert "Added to the model, they take 66 % of the squared error away all the same." in text[:400]
+    useless = replace(unknown.heldout, gain=0.1, gain_ci95=(-0.1, 0.3))
+    assert "all the same" not in text_of(page(replace(unknown, heldout=useless), pad_set))
+
+
+def test_residuals_say_what_they_are_drawn_against(pad_set, robot_set):
+    text = text_of(page(pad_diagnosis(), pad_set))
+    assert "Against history: how far the load is below the largest one so far" in text
+    assert "of the joint that the simulation misses most" not in text
+    robot = robot_diagnosis()
+    worst = robot.traces[0].channels[0]
+    assert f"of the joint that the simulation misses most ({worst})" in text_of(page(robot, robot_set))
 
 
 def test_everything_found_and_not_found_is_there(pad_set):
@@ -122,8 +134,8 @@ def test_everything_found_and_not_found_is_there(pad_set):
         "baseline drift baseline_drift – – – cannot be told here",
         "hysteresis width_m 0.21 mm 0.18 to 0.24 mm",
         "baseline k_n 380 N/m 371 to 390 N/m",
-        "latency delay 6 ms",
-        "contact offset offset 30 µm",
+        "latency delay: 6 ms",
+        "contact offset offset: 30 µm",
         "the worst predicted",
         "2 more held-out recordings",
         "Set aside: 1 of 8 recordings",

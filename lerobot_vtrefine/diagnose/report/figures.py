@@ -44,7 +44,7 @@ def trace_figure(trace: Trace, unit: str) -> str:
         factor, shown = scale_of(float(np.nanmax(np.abs(values), initial=0.0)), drive_unit)
         panel = Panel(LEFT, top, width, DRIVE_HEIGHT, x_range, span(values * factor, zero=True))
         last = name == list(trace.drive)[-1]
-        parts.append(panel.frame("time [s]", f"{title} [{shown}]", x_ticks=last, y_count=2))
+        parts.append(panel.frame("time [s]", f"{title} [{shown}]", x_ticks=last, y_count=3))
         parts.append(panel.line(times, values * factor, "d"))
         top += DRIVE_HEIGHT + 30
     return drawing(WIDTH, top + 10, parts, f"{trace.file}: measured, simulated and extended")

@@ -12,6 +12,11 @@ SCALES = {
     "counts": ((1.0, "counts"),),
     "counts/s": ((1.0, "counts/s"), (60.0, "counts/min")),
     "m/N": ((1e3, "mm/N"),),
+    "Nm": ((1.0, "N·m"),),
+    "N*m": ((1.0, "N·m"),),
+    "N*s/m": ((1.0, "N·s/m"),),
+    "N*m/rad": ((1.0, "N·m/rad"),),
+    "N*m*s/rad": ((1.0, "N·m·s/rad"),),
     "1": ((1.0, ""),),
 }
 """Unit -> factors and names to choose from, the first one that makes the number at least 0.1."""

@@ -19,7 +19,7 @@ from lerobot_vtrefine.diagnose.report.figures import (
     trial_figure,
 )
 from lerobot_vtrefine.diagnose.report.numbers import interval, nested, p_text, percent, quantity
-from lerobot_vtrefine.diagnose.report.words import MEANINGS, doubts, headline, title
+from lerobot_vtrefine.diagnose.report.words import AXES, MEANINGS, doubts, headline, title
 from lerobot_vtrefine.diagnose.verdict import Parameter, Verdict
 
 SHOWN_TRACES = 4
@@ -51,10 +51,14 @@ def render_report(
         lstrip_blocks=True,
     )
     unit = diagnosis.unit if diagnosis is not None else "counts"
+    of_pad = recordings.kind == "pad"
     return environment.get_template("report.html").render(
         headline=headline(verdict, unit),
         verdict=verdict,
+        verdict_of_pad=of_pad,
         meanings=MEANINGS,
+        percent=percent,
+        p_text=p_text,
         title=title,
         doubts=doubts(verdict, len(recordings.trials), sound),
         facts=_facts(verdict, recordings, sound, seed),
@@ -67,7 +71,7 @@ def render_report(
             }
             for name, size in verdict.minimum_detectable.items()
         ],
-        **(_nothing() if diagnosis is None else _findings(verdict, diagnosis, unit)),
+        **(_nothing() if diagnosis is None else _findings(verdict, diagnosis, unit, of_pad)),
     )
 
 
@@ -79,6 +83,7 @@ def _nothing() -> dict[str, Any]:
         "traces",
         "more_traces",
         "residuals",
+        "worst_joint",
         "evidence",
         "parameters",
         "baseline",
@@ -87,7 +92,7 @@ def _nothing() -> dict[str, Any]:
     return dict.fromkeys(names, ())
 
 
-def _findings(verdict: Verdict, diagnosis: Diagnosis, unit: str) -> dict[str, Any]:
+def _findings(verdict: Verdict, diagnosis: Diagnosis, unit: str, of_pad: bool) -> dict[str, Any]:
     traces = [{"caption": text, "figure": trace_figure(t, unit)} for t, text in _ordered(diagnosis.traces)]
     groups = [(title(cause.name), cause.params) for cause in verdict.causes]
     return {
@@ -96,7 +101,11 @@ def _findings(verdict: Verdict, diagnosis: Diagnosis, unit: str) -> dict[str, An
         "trial_note": _trial_note(len(diagnosis.trial_errors)),
         "traces": traces[:SHOWN_TRACES],
         "more_traces": traces[SHOWN_TRACES:],
-        "residuals": [residual_figure(view, unit) for view in diagnosis.residuals],
+        "residuals": [
+            {"caption": AXES.get(view.axis, view.axis), "figure": residual_figure(view, unit)}
+            for view in diagnosis.residuals
+        ],
+        "worst_joint": "" if of_pad or not diagnosis.traces else diagnosis.traces[0].channels[0],
         "evidence": [_evidence_row(item) for item in _by_decision(diagnosis.evidence)],
         "parameters": [_parameter_row(of, name, p) for of, params in groups for name, p in params.items()],
         "baseline": [_parameter_row("baseline", name, p) for name, p in diagnosis.baseline_params.items()],
@@ -123,7 +132,7 @@ def _facts(verdict: Verdict, recordings: RecordingSet, sound: int, seed: int) ->
             "recordings",
             f"{len(recordings.trials)} in {conditions} conditions, {seconds:.0f} s in all; {sound} sound",
         ),
-        ("what", f"{what}, from {PurePath(recordings.path).name}"),
+        ("what", f"{what}, from the folder {PurePath(recordings.path).name}"),
     ]
     if verdict.heldout is not None:
         facts.append(
@@ -148,7 +157,8 @@ def _ordered(traces: Sequence[Trace]) -> list[tuple[Trace, str]]:
 
 
 def _caption(trace: Trace, remark: str) -> str:
-    parts = [PurePath(trace.file).stem, f"condition {trace.condition}", remark]
+    condition = "" if trace.condition.startswith("episode") else f"condition {trace.condition}"
+    parts = [PurePath(trace.file).stem, condition, remark]
     return ", ".join(part for part in parts if part)
 
 

@@ -98,6 +98,18 @@ MEANINGS = {
 }
 
 
+AXES = {
+    "load": "Against load: of a taxel the reading above idle that the simulation expects",
+    "history": "Against history: how far the load is below the largest one so far",
+    "rate": "Against the rate at which it is driven; into the pad is above zero",
+    "depth": "Against depth; below zero nothing touches the taxel",
+    "column": "Against the position along the columns",
+    "row": "Against the position along the rows",
+    "position": "Against the commanded position",
+    "time": "Against time in the recording",
+    "session": "Against time in the session",
+}
+"""What a residual is drawn against."""
 LONGEST_CLUE = 110
 """Longer clues are told below the headline only."""
 
@@ -132,8 +144,17 @@ def headline(verdict: Verdict, unit: str) -> str:
         return f"The simulation is wrong, but these recordings cannot tell whether it lacks {pairs}.{beside}"
     clue = verdict.unknown.clue or ""
     clue = f" What is known of it: {clue}." if 0 < len(clue) <= LONGEST_CLUE else ""
-    symptoms = f" What looks like {names} may be a symptom of it." if names else ""
+    symptoms = f" What looks like {names} may be a symptom of it.{_all_the_same(verdict)}" if names else ""
     return f"The simulation is wrong in a way that no known cause explains.{clue}{symptoms}"
+
+
+def _all_the_same(verdict: Verdict) -> str:
+    """What symptoms are good for, where they are good for something."""
+    held = verdict.heldout
+    if held is None or held.gain <= 0 or (held.gain_ci95 is not None and held.gain_ci95[0] <= 0):
+        return ""
+    it_takes = "it takes" if len(verdict.causes) == 1 else "they take"
+    return f" Added to the model, {it_takes} {percent(held.gain)} of the squared error away all the same."
 
 
 def repaired(verdict: Verdict, unit: str) -> str:
