@@ -205,6 +205,15 @@ def test_a_trial_that_contradicts_itself_is_set_aside(tmp_path, name):
     assert len(left.trials) == 7
 
 
+def test_readings_of_another_trial_are_found(tmp_path):
+    header, columns = make_set()
+    columns[BAD] = columns[BAD] | {"raw": columns[BAD + 2]["raw"][::-1].copy()}
+    left, issues = checked(tmp_path, header, columns)
+    assert {(issue.trial, issue.action) for issue in issues} == {(FILE, "set aside")}
+    assert "not of the recorded motion" in issues[-1].problem
+    assert len(left.trials) == 7
+
+
 SESSION = {
     "no start": (lambda k: {"start_s": 0.0}, "start_s is missing"),
     "starts too close": (lambda k: {"start_s": 1.0 * k}, "start_s or time_s is in another unit"),

@@ -20,6 +20,7 @@ from lerobot_vtrefine.diagnose.quality.joints import (
     check_joint_order,
     check_jumps,
 )
+from lerobot_vtrefine.diagnose.quality.odd import check_odd
 from lerobot_vtrefine.diagnose.quality.readings import check_readings, check_wraps
 from lerobot_vtrefine.diagnose.quality.response import check_answers, check_start, check_stuck
 from lerobot_vtrefine.diagnose.quality.session import check_conditions, check_session
@@ -63,8 +64,11 @@ PAD_CHECKS: tuple[Check, ...] = (
     check_wiring,
     check_start,
     check_answers,
+    check_odd,
     check_conditions,
 )
+PLACED_CHECKS: tuple[Check, ...] = (check_answers, check_odd)
+"""With lines in the wrong place, these would find every trial at fault."""
 ROBOT_CHECKS: tuple[Check, ...] = (
     check_jumps,
     check_commands,
@@ -84,8 +88,8 @@ def check_quality(recordings: RecordingSet) -> tuple[RecordingSet, list[DataIssu
     issues: list[DataIssue] = []
     miswired = False
     for check in FRAME_CHECKS + (PAD_CHECKS if recordings.kind == "pad" else ROBOT_CHECKS):
-        if not recordings.trials or (check is check_answers and miswired):
-            continue  # lines in the wrong place would all look dead
+        if not recordings.trials or (check in PLACED_CHECKS and miswired):
+            continue
         recordings, found = apply(recordings, list(check(recordings)))
         miswired |= check is check_wiring and any(issue.trial is None for issue in found)
         issues += found
