@@ -9,7 +9,7 @@ from robot_rigs import Rig, make_set
 from lerobot_vtrefine.diagnose.recordings import read_recording_set
 from lerobot_vtrefine.diagnose.robot.batch import make_batch
 from lerobot_vtrefine.diagnose.robot.engine import diagnose_robot
-from lerobot_vtrefine.diagnose.robot.repeats import scatter
+from lerobot_vtrefine.diagnose.robot.repeats import common_part, scatter
 
 SMALL = Rig(joints=("shoulder", "elbow"), rate_hz=20.0, seconds=5.0, conditions=8, jitter=0.1)
 
@@ -35,6 +35,19 @@ def test_scatter_tells_noise_from_shape_and_zero(recordings) -> None:
     assert (shifted.zero > 0.01).all()
     np.testing.assert_allclose(shifted.shape, plain.shape, rtol=1e-6)
     np.testing.assert_allclose(shaped.white, plain.white, rtol=0.2)
+
+
+def test_what_repeats_is_a_part_of_the_repeated_trials_alone(recordings) -> None:
+    batch = make_batch(recordings.trials)
+    keep = [place for place, trial in enumerate(recordings.trials) if trial.replicate == 0 or trial.order % 2]
+    fewer = batch.subset(keep)
+    # All trials repeat exactly; those whose command came once err most.
+    once = np.array([fewer.conditions.count(name) == 1 for name in fewer.conditions])
+    assert once.any()
+    wave = np.sin(fewer.time_s)[..., None] * np.where(once, 3.0, 1.0)[:, None] * np.ones(2)
+    products, squares = common_part(fewer, wave)
+    assert len(products) == (~once).sum() / 2
+    np.testing.assert_allclose(products, squares)
 
 
 def test_no_scatter_without_repeated_commands(recordings) -> None:

@@ -21,7 +21,7 @@ def random_trial(frames=16, joints=1, seed=0):
     return trial_of(t - t[0], np.cumsum(rng.normal(0, 0.05, (frames, joints)), 0))
 
 
-def euler(trial, omega, zeta, tau=0.0, friction=0.0, play=0.0):
+def euler(trial, omega, zeta, tau=0.0, friction=0.0, play=0.0, stick=0.0):
     t, u = trial.time_s, trial.command[:, 0]
     q, v, slack, out, h = u[0], 0.0, u[0], [u[0]], 2e-4
     for k in range(len(t) - 1):
@@ -30,7 +30,7 @@ def euler(trial, omega, zeta, tau=0.0, friction=0.0, play=0.0):
             slack = min(max(slack, u[row] - play / 2), u[row] + play / 2)
             force = omega**2 * (slack - q) - 2 * zeta * omega * v
             dry = omega**2 * friction
-            if v == 0 and abs(force) <= dry:
+            if v == 0 and abs(force) <= dry * (1 + stick):
                 continue
             force -= dry * np.sign(v if v else force)
             new = v + force * h
@@ -41,7 +41,7 @@ def euler(trial, omega, zeta, tau=0.0, friction=0.0, play=0.0):
 
 
 def columns(**values):
-    names = ("omega", "zeta", "offset", "play", "loose", "friction")
+    names = ("omega", "zeta", "offset", "play", "loose", "friction", "rounding", "stick")
     arrays = {name: np.array([float(values.get(name, 0.0))]) for name in names}
     return Columns(joint=np.array([0]), **arrays, tau_s=values.get("tau", 0.0))
 
@@ -54,6 +54,7 @@ def columns(**values):
         {"omega": 15, "zeta": 1.0, "tau": 0.013},
         {"omega": 15, "zeta": 0.4, "friction": 0.02},
         {"omega": 25, "zeta": 1.5, "friction": 0.02, "tau": 0.04},
+        {"omega": 15, "zeta": 0.6, "friction": 0.03, "stick": 0.8},
         {"omega": 20, "zeta": 0.8, "play": 0.06},
     ],
 )
@@ -69,6 +70,19 @@ def test_offset_shifts_readings_and_not_the_motion() -> None:
     plain = simulate(make_batch([trial]), columns(omega=12, zeta=0.8))
     moved = simulate(make_batch([shifted]), columns(omega=12, zeta=0.8, offset=0.1))
     np.testing.assert_allclose(moved, plain + 0.1, atol=1e-12)
+
+
+def test_rounded_play_is_taken_up_little_by_little() -> None:
+    t = np.arange(0, 4, 0.02)
+    u = (0.3 * np.minimum(t, 4 - t))[:, None]
+    batch = make_batch([trial_of(t, u)])
+    rigid = simulate(batch, columns(omega=60, zeta=1.0))[:, 0, 0]
+    sharp = simulate(batch, columns(omega=60, zeta=1.0, loose=0.04))[:, 0, 0]
+    q = simulate(batch, columns(omega=60, zeta=1.0, loose=0.04, rounding=0.8))[:, 0, 0]
+    # As wide in the end, but the reading moves again long before a sharp one does.
+    np.testing.assert_allclose((rigid - q)[[90, 190]], [0.02, -0.02], atol=2e-3)
+    assert sharp.max() - sharp[108] < 1e-4
+    assert q.max() - q[108] > 1e-3
 
 
 def test_loose_encoder_drags_behind_by_half_the_play() -> None:

@@ -6,15 +6,15 @@ it rings at one frequency.
 """
 
 from dataclasses import dataclass
-from itertools import combinations
 
 import numpy as np
 
 from lerobot_vtrefine.diagnose.robot import flips
+from lerobot_vtrefine.diagnose.robot.batch import frame_s
 from lerobot_vtrefine.diagnose.robot.candidates import DECOY, LATENCY, resolution
-from lerobot_vtrefine.diagnose.robot.fitting import derivatives, frame_s
+from lerobot_vtrefine.diagnose.robot.fitting import derivatives
 from lerobot_vtrefine.diagnose.robot.gravity import is_gripper
-from lerobot_vtrefine.diagnose.robot.repeats import alike, scatter
+from lerobot_vtrefine.diagnose.robot.repeats import common_part, scatter
 from lerobot_vtrefine.diagnose.robot.selection import LEAST_EFFECT_RAD, LEAST_UNKNOWN, Selection
 
 Array = np.ndarray
@@ -105,20 +105,12 @@ def _least(selection: Selection, joint: int) -> float:
 
 def _repeating(selection: Selection, seed: int) -> list[Alarm]:
     """Residuals of trials of one condition, multiplied frame by frame: noise cancels, causes do not."""
-    batch, left = selection.problem.batch, selection.fit.residual
-    rows = []
-    for condition in sorted(set(batch.conditions)):
-        trials = [index for index, name in enumerate(batch.conditions) if name == condition]
-        pairs = [pair for pair in combinations(trials, 2) if alike(batch, *pair)]
-        if pairs:
-            products = [
-                _mean(left[:, a] * left[:, b], batch.valid[:, a] & batch.valid[:, b]) for a, b in pairs
-            ]
-            rows.append(np.mean(products, 0))
+    rows, squares = common_part(selection.problem.batch, selection.fit.residual)
     if len(rows) < _FEW_CONDITIONS:
         return []
-    _, adjusted = flips.one_sided(np.array(rows), seed)
-    share = np.mean(rows, 0) / selection.fit.total.clip(1e-300)
+    _, adjusted = flips.one_sided(rows, seed)
+    # Of what those trials leave: others, whose command came once, say nothing about it.
+    share = np.mean(rows, 0) / np.mean(squares, 0).clip(1e-300)
     alone = _REPEATS_ALL if len(rows) >= _LEAST_CONDITIONS else _NEARLY_ALL
     return [
         Alarm(joint, "what is left repeats when the command is repeated", float(share[joint]), float(p))
@@ -145,10 +137,6 @@ def _not_repeating(selection: Selection) -> list[Alarm]:
                 found.append(Alarm(joint, clue, min(share, 1.0), 0.0))
                 break
     return found
-
-
-def _mean(values: Array, valid: Array) -> Array:
-    return values[valid].mean(0)
 
 
 def descriptors(selection: Selection, joint: int) -> dict[str, Array]:

@@ -101,6 +101,13 @@ def make_batch(trials: Sequence[RobotTrial]) -> Batch:
     )
 
 
+def frame_s(batch: Batch) -> float:
+    """Median time between frames [s]."""
+    dt = np.diff(batch.time_s, axis=0)
+    dt = dt[(dt > 0) & batch.valid[1:]]
+    return float(np.median(dt)) if len(dt) else 1.0
+
+
 def _padded(values: Array, length: int) -> Array:
     return np.concatenate([values, np.repeat(values[-1:], length - len(values), 0)])
 

@@ -8,13 +8,18 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from lerobot_vtrefine.diagnose.robot import gravity
-from lerobot_vtrefine.diagnose.robot.fitting import INDEX, SAG, Point, Problem, frame_s
+from lerobot_vtrefine.diagnose.robot.batch import frame_s
+from lerobot_vtrefine.diagnose.robot.fitting import INDEX, RATIOS, SAG, Point, Problem
 
 Array = np.ndarray
 
 LATENCY = "control_latency"
 FRICTION = "joint_friction"
 DECOY = "unknown"
+ROUNDED = (("play", "round"), ("loose", "round"))
+"""Play that is taken up little by little, before the servo or behind it."""
+STICKING = ("friction", "stick")
+"""Friction that is larger at rest than in motion."""
 STOP = ("stop", "give")
 """A gripper that meets what it holds: no load is needed to see that."""
 _USUAL_STOP = 0.25
@@ -31,9 +36,14 @@ class Candidate:
     form: str | None = None
     """Shape of the joint's sag, where that is what is fitted."""
     starts: tuple[float, ...] = (1.0,)
-    """Multiples of the joint's typical error."""
+    """Multiples of the joint's typical error; of a form that refines another, its ratio."""
     clue: str = ""
     """What a decoy would mean."""
+
+    @property
+    def plain(self) -> tuple[str, ...] | None:
+        """Parameters of the form that it refines, from whose fit it starts; None: it starts by itself."""
+        return self.parameters[:1] if self.parameters[-1] in RATIOS else None
 
     @property
     def label(self) -> str:
@@ -75,8 +85,11 @@ class Candidate:
             point = point.with_values("stop", np.quantile(opening, _USUAL_STOP, axis=0), joints)
             return point.with_values("give", 0.1, joints)
         for name in self.parameters:
-            start = 0.0 if name in ("offset", "bend") else multiple * problem.scale[joints]
-            point = point.with_values(name, start, joints)
+            if name in RATIOS:
+                point = point.with_values(name, multiple, joints)
+            elif self.plain is None:
+                start = 0.0 if name in ("offset", "bend") else multiple * problem.scale[joints]
+                point = point.with_values(name, start, joints)
         return point
 
     def freed(self, free: Array, joints: Array) -> Array:
@@ -95,7 +108,9 @@ CANDIDATES = (
     Candidate("encoder_offset", ("offset",)),
     Candidate("backlash", ("play",), starts=(0.5, 2.0)),
     Candidate("backlash", ("loose",), starts=(1.0,)),
+    *(Candidate("backlash", names, starts=(0.4,)) for names in ROUNDED),
     Candidate(FRICTION, ("friction",), starts=(0.5,)),
+    Candidate(FRICTION, STICKING, starts=(0.25, 0.75)),
     *(Candidate("gravity_sag", SAG[:1], form) for form in gravity.ONE_TERM_FORMS),
     Candidate("gravity_sag", SAG[:2], gravity.TWO_TERM_FORM),
     Candidate("gravity_sag", SAG, gravity.FREE_FORM),

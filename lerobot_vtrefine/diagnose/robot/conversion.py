@@ -25,6 +25,8 @@ def to_model(names: tuple[str, ...], point: Point) -> RobotModel:
                 compliance=value["bend"],
                 stop=value["stop"],
                 give=value["give"],
+                backlash_rounding=value["round"],
+                breakaway=value["stick"],
             )
         )
     return RobotModel(tuple(joints), point.tau_s)
@@ -44,6 +46,8 @@ def from_model(model: RobotModel) -> Point:
             joint.compliance,
             joint.stop,
             joint.give,
+            joint.backlash_rounding,
+            joint.breakaway,
         )
         for joint in model.joints
     ]

@@ -2,7 +2,15 @@
 
 import numpy as np
 
-from lerobot_vtrefine.diagnose.robot.candidates import DECOY, LATENCY, STOP, Candidate, candidates_for
+from lerobot_vtrefine.diagnose.robot.candidates import (
+    DECOY,
+    LATENCY,
+    ROUNDED,
+    STICKING,
+    STOP,
+    Candidate,
+    candidates_for,
+)
 from lerobot_vtrefine.diagnose.robot.fitting import INDEX, derivatives, evaluate
 from lerobot_vtrefine.diagnose.robot.gravity import FREE_FORM, TWO_TERM_FORM, is_sliding
 from lerobot_vtrefine.diagnose.robot.selection import LEAST_GAIN, Selection
@@ -24,7 +32,7 @@ def minimum_detectable(selection: Selection) -> dict[str, float]:
         if (
             candidate.cause == DECOY
             or candidate.form in (FREE_FORM, TWO_TERM_FORM)
-            or candidate.parameters in (("loose",), STOP)
+            or candidate.parameters in (("loose",), STOP, *ROUNDED, STICKING)
             or (candidate.cause == "encoder_offset" and selection.problem.shared_encoders)
         ):
             continue

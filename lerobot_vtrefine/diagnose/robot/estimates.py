@@ -16,6 +16,12 @@ from lerobot_vtrefine.embodiments import ALOHA
 Array = np.ndarray
 
 
+_ROUNDING_VAGUE = 0.08
+"""Where a play ends that is taken up bit by bit depends on its form: part of its width, per rounding."""
+_STICKING_VAGUE = 0.12
+"""How friction falls from rest to motion is not resolved: part of it that intervals allow for."""
+
+
 class Estimates:
     """Fitted values of a selection, and what they become without each condition."""
 
@@ -63,7 +69,8 @@ class Estimates:
             names = ("play", "loose") if cause == "backlash" else ("offset",)
             columns = [INDEX[name] for name in names]
             value, spread = float(now[columns].sum()), drawn[:, columns].sum(1)
-        own = self.selection.problem.vague * abs(value) if cause == "backlash" else 0.0
+        vague = self.selection.problem.vague + _ROUNDING_VAGUE * now[INDEX["round"]]
+        own = vague * abs(value) if cause == "backlash" else 0.0
         return Parameter(value, widened(jackknife(spread, value), value, own), unit)
 
     def _friction(self, joint: int, name: str) -> tuple[str, Parameter]:
@@ -72,7 +79,8 @@ class Estimates:
         sliding = is_sliding(name)
         column = INDEX["friction"]
         value = float(self.selection.fit.point.theta[joint, column])
-        low, high = jackknife(self.theta[:, joint, column], value)
+        own = _STICKING_VAGUE * value if self.selection.fit.free[joint, INDEX["stick"]] else 0.0
+        low, high = widened(jackknife(self.theta[:, joint, column], value), value, own)
         stiffness = stiffness_in_load(problem, self.selection.fit, joint)
         if stiffness is None and problem.batch.load is not None:
             seen = friction_in_load(problem, self.selection.fit, joint, self.seed)

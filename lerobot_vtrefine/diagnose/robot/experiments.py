@@ -8,9 +8,9 @@ import numpy as np
 
 from lerobot_vtrefine.diagnose.recordings import RobotTrial
 from lerobot_vtrefine.diagnose.robot.alarms import Alarm
-from lerobot_vtrefine.diagnose.robot.batch import make_batch
+from lerobot_vtrefine.diagnose.robot.batch import frame_s, make_batch
 from lerobot_vtrefine.diagnose.robot.candidates import FRICTION, LATENCY
-from lerobot_vtrefine.diagnose.robot.fitting import Problem, frame_s
+from lerobot_vtrefine.diagnose.robot.fitting import Problem
 from lerobot_vtrefine.diagnose.robot.gravity import is_sliding
 from lerobot_vtrefine.diagnose.robot.rivals import Rival, joint_names
 from lerobot_vtrefine.diagnose.robot.selection import Selection

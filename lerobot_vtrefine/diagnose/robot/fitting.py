@@ -9,20 +9,24 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 
 from lerobot_vtrefine.diagnose.robot import gravity
-from lerobot_vtrefine.diagnose.robot.batch import Batch
+from lerobot_vtrefine.diagnose.robot.batch import Batch, frame_s
 from lerobot_vtrefine.diagnose.robot.servo import Columns, simulate
 
 Array = np.ndarray
 
 SAG = tuple(f"sag{term}" for term in range(gravity.TERMS))
-PARAMETERS = ("log_omega", "log_zeta", "offset", "play", "loose", "friction", *SAG, "bend", "stop", "give")
+RATIOS = ("round", "stick")
+"""Numbers without a unit, of the order of one."""
+_SERVO = ("log_omega", "log_zeta", "offset", "play", "loose", "friction")
+PARAMETERS = (*_SERVO, *SAG, "bend", "stop", "give", *RATIOS)
 INDEX = {name: place for place, name in enumerate(PARAMETERS)}
-POSITIVE = ("play", "loose", "friction", "stop")
+POSITIVE = ("play", "loose", "friction", "stop", *RATIOS)
 OMEGA_BOUNDS = (0.5, 300.0)
 ZETA_BOUNDS = (0.1, 20.0)
 _RADIANS_PER_FRAME = (6.0, 3.0)
 """Fastest servo that frames can tell, well damped and swinging: beyond, oscillations alias."""
 TAU_BOUND_S = 1.0
+_LARGEST = {"round": 1.0, "stick": 3.0}
 SERVO_TICK_S = 2e-3
 """Servos look at their command once in one or two milliseconds (simulations: once a step), and encoders are
 read as much beside their frame's time. When, no recording tells: a delay is known up to a uniform error of
@@ -129,6 +133,8 @@ class Problem:
             friction=theta[:, INDEX["friction"]],
             stop=theta[:, INDEX["stop"]],
             give=theta[:, INDEX["give"]],
+            rounding=theta[:, INDEX["round"]],
+            stick=theta[:, INDEX["stick"]],
             tau_s=point.tau_s,
             push=self._push(point.forms, joint, theta),
         )
@@ -350,6 +356,7 @@ def derivatives(problem: Problem, now: Fit) -> Derivatives:
     joint, parameter = np.nonzero(now.free)
     theta = now.point.theta[joint].copy()
     steps = np.where(parameter < 2, 1e-3, 0.02 * problem.scale[joint])
+    steps = np.where(np.isin(parameter, [INDEX[name] for name in RATIOS]), 0.02, steps)
     theta[np.arange(len(joint)), parameter] += steps
     here = problem.batch.position - now.residual
     moved = problem.predict(now.point, joint, theta) - here[..., joint]
@@ -361,13 +368,6 @@ def derivatives(problem: Problem, now: Fit) -> Derivatives:
         later = problem.predict(replace(now.point, tau_s=now.point.tau_s + step))
         tau = np.where(problem.batch.valid[..., None], later - here, 0.0) / step
     return Derivatives(columns, tau)
-
-
-def frame_s(batch: Batch) -> float:
-    """Median time between frames [s]."""
-    dt = np.diff(batch.time_s, axis=0)
-    dt = dt[(dt > 0) & batch.valid[1:]]
-    return float(np.median(dt)) if len(dt) else 1.0
 
 
 def _solve(normal: Array, slope: Array, damping: float) -> Array:
@@ -386,7 +386,8 @@ def _bounded(problem: Problem, point: Point, free: Array) -> Point:
     theta[:, 0] = theta[:, 0].clip(np.log(OMEGA_BOUNDS[0]), np.log(fastest))
     widest = np.maximum(np.ptp(problem.batch.command, axis=(0, 1)), 10 * problem.scale)
     for name in POSITIVE:
-        theta[:, INDEX[name]] = theta[:, INDEX[name]].clip(0.0, widest)
+        most = _LARGEST.get(name, widest)
+        theta[:, INDEX[name]] = theta[:, INDEX[name]].clip(0.0, most)
     theta[:, INDEX["give"]] = theta[:, INDEX["give"]].clip(0.0, 1.0)
     theta = np.where(free, theta, point.theta)
     return replace(point, theta=theta, tau_s=float(np.clip(point.tau_s, 0.0, TAU_BOUND_S)))

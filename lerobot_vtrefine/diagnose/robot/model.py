@@ -40,6 +40,10 @@ class JointModel:
     """Distance from zero at which a gripper's joint meets what it holds [rad or m]."""
     give: float = 0.0
     """Part of its way beyond the stop that the joint still goes."""
+    backlash_rounding: float = 0.0
+    """Half the spread of the widths that make up the plays, as a part of their mean."""
+    breakaway: float = 0.0
+    """By what part breaking away takes more than `friction`."""
 
 
 @dataclass(frozen=True)
@@ -85,6 +89,8 @@ class RobotModel:
             friction=column("friction"),
             stop=column("stop"),
             give=column("give"),
+            rounding=column("backlash_rounding"),
+            stick=column("breakaway"),
             tau_s=self.control_latency_s,
             push=push if push.any() else None,
         )

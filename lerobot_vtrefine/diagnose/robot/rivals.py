@@ -26,6 +26,8 @@ TIE_LEAD, SURE_P = 0.03, 0.01
 """Where two models' held-out squared errors differ by less, trials must prefer one of them more surely."""
 SHARE_OF_GAIN = 0.9
 _ITERATIONS = 10
+_PLAIN_START = 0.5
+"""Multiple of the joint's typical error."""
 
 
 @dataclass(frozen=True)
@@ -128,12 +130,22 @@ def _swapped(
         fitted = fit(problem, start, bare.free, True, iterations=_ITERATIONS)
         return fitted, cross_validated(problem, fitted, folds), candidate
     free = candidate.freed(bare.free, joints)
-    fitted = bare
+    fitted, begin = bare, bare
+    if candidate.plain is not None:
+        begin = _plainly(selection, bare, candidate, joints)
     for multiple in candidate.starts:
-        point = candidate.starting(problem, bare.point, joints, multiple)
+        point = candidate.starting(problem, begin.point, joints, multiple)
         again = refit(problem, bare, point, free, joints, _ITERATIONS)
         fitted = again if fitted is bare else merged(fitted, again, again.total < fitted.total, free)
     return fitted, cross_validated(problem, fitted, folds, selection.held_out, joints), candidate
+
+
+def _plainly(selection: Selection, bare: Fit, candidate: Candidate, joints: Array) -> Fit:
+    """The fit of the form that the candidate refines."""
+    assert candidate.plain is not None
+    plain = replace(candidate, parameters=candidate.plain)
+    point = plain.starting(selection.problem, bare.point, joints, _PLAIN_START)
+    return refit(selection.problem, bare, point, plain.freed(bare.free, joints), joints, _ITERATIONS)
 
 
 def _compared(

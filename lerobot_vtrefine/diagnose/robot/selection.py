@@ -129,21 +129,26 @@ class Selector:
                 helped = [item.gain > LEAST_GAIN / 2 for item in tried if item.cause == "backlash"]
                 allowed = np.any([np.zeros(self.problem.batch.joints), *helped], axis=0)
                 allowed = allowed & joints
-            item = self.attempt(candidate, allowed)
+            known = next((one.fit for one in tried if _refines(candidate, one)), None)
+            item = self.attempt(candidate, allowed, known)
             tried += [] if item is None else [item]
         if not self.delayed:
             tried.append(self._attempt_delay())
         return self._with_p(tried)
 
-    def attempt(self, candidate: Candidate, joints: Array) -> Tried | None:
-        """Fit one candidate on those of the joints that allow it; None where none does."""
+    def attempt(self, candidate: Candidate, joints: Array, plain: Fit | None = None) -> Tried | None:
+        """Fit one candidate on those of the joints that allow it; None where none does.
+
+        A form that refines another starts from that one's fit.
+        """
         allowed = joints & candidate.applicable(self.problem) & ~candidate.clashes(self.now.free)
         index = np.flatnonzero(allowed)
         if not len(index):
             return None
         # Joints that it is not tried on rest, and so does the delay for now.
         free = candidate.freed(self.now.free, index) & allowed[:, None]
-        starts = [candidate.starting(self.problem, self.now.point, index, m) for m in candidate.starts]
+        begin = self.now if plain is None else merged(self.now, plain, allowed)
+        starts = [candidate.starting(self.problem, begin.point, index, m) for m in candidate.starts]
         fits = [fit(self.problem, start, free, iterations=12, known=self.now) for start in starts]
         best = fits[0]
         for other in fits[1:]:
@@ -328,6 +333,13 @@ class Selector:
         self.now, self.held_out = self._without_delay()
         self.delayed = False
         self.p_values.pop((LATENCY, -1), None)
+
+
+def _refines(candidate: Candidate, item: Tried) -> bool:
+    """Whether a candidate refines the form that was tried."""
+    if candidate.plain is None or item.candidate is None:
+        return False
+    return item.cause == candidate.cause and item.candidate.parameters == candidate.plain
 
 
 def merged(one: Fit, other: Fit, take_other: Array, free: Array | None = None) -> Fit:

@@ -5,8 +5,10 @@ what a load bends). The servo follows:
 
     q'' = omega^2 (r - friction sign(q') - q) - 2 zeta omega q'          (friction as servo error, [rad])
 
-and the encoder reads q + offset, possibly through play of its own (`loose`). Without friction every step is
-exact, whatever the frames' spacing and the delay; with friction, so are the stops between them.
+and the encoder reads q + offset, possibly through play of its own (`loose`). A joint at rest may need more
+than its friction to break away (`stick`), and play may be taken up little by little (`rounding`): several
+plays side by side, whose widths spread evenly about their mean (Prandtl-Ishlinskii). Without friction every
+step is exact, whatever the frames' spacing and the delay; with friction, so are the stops between them.
 
 Shapes: N frames, T trials, C columns. A column is one joint under one set of parameters: columns repeat
 joints when several sets are tried at once.
@@ -24,6 +26,8 @@ MAX_PARTS = 4
 _TURN_RAD = 1.5
 """A joint with friction is followed in steps of at most this phase, so that it stops at most once in each."""
 _CRITICAL = 1e-6
+_SPREAD = (-0.8, -0.4, 0.0, 0.4, 0.8)
+"""Middles of five equal parts of a spread of widths."""
 _DT_DIGITS = 6
 
 
@@ -48,6 +52,10 @@ class Columns:
     """Distance from zero at which the joint meets what its gripper holds; zero where it meets nothing."""
     give: Array | None = None
     """How far a stopped joint still follows its target, as a part of the way."""
+    rounding: Array | None = None
+    """Half the spread of the widths that make up a play, as a part of their mean; zero is one sharp play."""
+    stick: Array | None = None
+    """By what part breaking away takes more than friction in motion."""
     tau_s: float = 0.0
     """Every command acts this late."""
     push: Array | None = None
@@ -57,13 +65,14 @@ class Columns:
         """The servo's parameters of some columns."""
         names = ("joint", "omega", "zeta", "offset", "play", "loose", "friction")
         own = {name: getattr(self, name)[kind] for name in names}
-        return replace(self, **own, stop=None, give=None, push=None)
+        stick = None if self.stick is None else self.stick[kind]
+        return replace(self, **own, stop=None, give=None, push=None, rounding=None, stick=stick)
 
 
 def simulate(batch: Batch, columns: Columns) -> Array:
     """Encoder readings (N, T, C) that follow from the commands and the first position alone."""
     start = batch.first_position[:, columns.joint] - columns.offset
-    target = _play(batch.command[:, :, columns.joint], columns.play, start, columns.push)
+    target = _play(batch.command[:, :, columns.joint], columns, start)
     if columns.stop is not None and columns.give is not None and (columns.stop > 0).any():
         target = blocked(target, columns.stop, columns.give)
     start = np.clip(target[0], start - columns.loose / 2, start + columns.loose / 2)
@@ -74,7 +83,7 @@ def simulate(batch: Batch, columns: Columns) -> Array:
             q[..., kind] = follow(batch.time_s, target[..., kind], start[:, kind], columns.only(kind))
     if (columns.loose > 0).any():
         first = batch.first_position[:, columns.joint] - columns.offset
-        q = _dragged(q, columns.loose, first)
+        q = _worn(q, columns.loose, columns.rounding, first)
     return q + columns.offset
 
 
@@ -86,11 +95,27 @@ def blocked(target: Array, stop: Array, give: Array) -> Array:
     return np.where(met, side * (stop + give * (way - stop)), target)
 
 
-def _play(command: Array, width: Array, start: Array, push: Array | None) -> Array:
+def _play(command: Array, columns: Columns, start: Array) -> Array:
     """Target after play; at the beginning the joint rests where the play lets it."""
+    push = columns.push
     rest = start if push is None else start - push[0]
-    target = _dragged(command, width, rest) if (width > 0).any() else command
+    target = command
+    if (columns.play > 0).any():
+        target = _worn(command, columns.play, columns.rounding, rest)
     return target if push is None else target + push
+
+
+def _worn(x: Array, width: Array, rounding: Array | None, first: Array) -> Array:
+    """Play of mean full width `width` (C,), sharp or rounded."""
+    sharp = _dragged(x, width, first)
+    if rounding is None or not (rounding > 0).any():
+        return sharp
+    out, some = sharp.copy(), rounding > 0
+    part = [
+        _dragged(x[..., some], width[some] * (1 + rounding[some] * at), first[..., some]) for at in _SPREAD
+    ]
+    out[..., some] = np.mean(part, 0)
+    return out
 
 
 def _dragged(x: Array, width: Array, first: Array) -> Array:
@@ -191,12 +216,13 @@ def _with_friction(time_s: Array, target: Array, start: Array, columns: Columns)
     q, v = start.copy(), np.zeros_like(start)
     path[0] = q
     friction = np.broadcast_to(columns.friction, q.shape)
+    hold = np.broadcast_to(columns.friction * _breakaway(columns), q.shape)
     for k in range(len(step_s)):
         step = inverse[k]
         r = target[held[k], trials]
         pull = r - q
         sign = np.sign(np.where(v == 0, pull, v))
-        stuck = (v == 0) & (np.abs(pull) <= friction)
+        stuck = (v == 0) & (np.abs(pull) <= hold)
         error = friction * sign - pull
         moved = q - error + a11[step] * error + a12[step] * v
         speed = a21[step] * error + a22[step] * v
@@ -226,8 +252,13 @@ def _through_stop(
     pull = r - rest
     back = friction * np.sign(pull) - pull
     a11, _, a21, _ = transition(h - stop, omega, zeta)
-    sticks = np.abs(pull) <= friction
+    sticks = np.abs(pull) <= friction * _breakaway(columns)[column]
     return np.where(sticks, rest, rest - back + a11 * back), np.where(sticks, 0.0, a21 * back)
+
+
+def _breakaway(columns: Columns) -> Array:
+    """(C,) what breaking away takes, as a multiple of friction in motion."""
+    return np.ones_like(columns.friction) if columns.stick is None else 1.0 + columns.stick
 
 
 def _grid(time_s: Array, columns: Columns) -> tuple[Array, Array, Array]:

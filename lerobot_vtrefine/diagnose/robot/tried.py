@@ -5,7 +5,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from lerobot_vtrefine.diagnose.robot import flips
-from lerobot_vtrefine.diagnose.robot.candidates import DECOY, LATENCY, Candidate
+from lerobot_vtrefine.diagnose.robot.candidates import DECOY, LATENCY, ROUNDED, STICKING, Candidate
 from lerobot_vtrefine.diagnose.robot.fitting import Fit
 from lerobot_vtrefine.diagnose.robot.gravity import FREE_FORM, TWO_TERM_FORM
 
@@ -14,6 +14,7 @@ Array = np.ndarray
 ALPHA = 0.02
 """Chance that clean trials yield any name, over all causes and joints."""
 _FORM_LEAD = {TWO_TERM_FORM: 0.02, FREE_FORM: 0.05}
+_SHAPE_LEAD = 0.02
 """By how much forms with more terms must beat those with one."""
 _DECOY_LEAD, _DECOY_P = 0.05, 0.01
 
@@ -77,4 +78,6 @@ def _handicapped(item: Tried, joint: int) -> float:
     form = item.candidate.form if item.candidate is not None else None
     if form in _FORM_LEAD:
         return error * (1 + _FORM_LEAD[form])
+    if item.candidate is not None and item.candidate.parameters in (*ROUNDED, STICKING):
+        return error * (1 + _SHAPE_LEAD)
     return error

@@ -21,7 +21,7 @@ from mujoco.batch import Batch as Worlds
 
 from lerobot_vtrefine.diagnose.robot import gravity
 from lerobot_vtrefine.diagnose.robot.batch import Batch
-from lerobot_vtrefine.diagnose.robot.candidates import STOP
+from lerobot_vtrefine.diagnose.robot.candidates import ROUNDED, STICKING, STOP
 from lerobot_vtrefine.diagnose.robot.fitting import INDEX, PARAMETERS, Point, Problem
 from lerobot_vtrefine.sim import task
 from lerobot_vtrefine.sim.backends.batch import usable_cores
@@ -96,7 +96,8 @@ class TwinProblem(Problem):
 
     def offers(self, parameters: tuple[str, ...], form: str | None) -> bool:
         """Replays are slow: one form of each cause, and the decoys that are not forms of it."""
-        return parameters not in (("loose",), ("bend",), STOP) and form in (None, "mass", "gain", "drift")
+        slow = (("loose",), ("bend",), STOP, *ROUNDED, STICKING)
+        return parameters not in slow and form in (None, "mass", "gain", "drift")
 
     def predict(self, point: Point, joint: Array | None = None, theta: Array | None = None) -> Array:
         """See `Problem.predict`."""
