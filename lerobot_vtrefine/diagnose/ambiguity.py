@@ -11,7 +11,16 @@ from lerobot_vtrefine.diagnose.fitting import Fit
 from lerobot_vtrefine.diagnose.noise import Noise
 from lerobot_vtrefine.diagnose.parallel import on_all_cores
 from lerobot_vtrefine.diagnose.screening import Probe
-from lerobot_vtrefine.diagnose.selection import MAPS, Search, add, all_probes, elaborate, scored, take_away
+from lerobot_vtrefine.diagnose.search import Search, all_probes
+from lerobot_vtrefine.diagnose.selection import (
+    MAPS,
+    RICH,
+    add,
+    coordinates_of,
+    elaborate,
+    scored,
+    take_away,
+)
 
 TIE_P = 0.1
 NEARLY = 0.6
@@ -37,7 +46,9 @@ def find_ambiguities(search: Search, fitted: Fit, noise: Noise) -> Rivals:
             continue
         slim = take_away(search, fitted, name)
         probes, less = all_probes(search, slim, rivals), scored(search, slim)
-        best = partial(_in_place, search, slim, probes, less, NEARLY * full.gain_over(less))
+        # A rich form imitates much: a rival may have one only if what was named has.
+        richest = max(coordinates_of(fitted, name), RICH)
+        best = partial(_in_place, search, slim, probes, less, NEARLY * full.gain_over(less), richest)
         tied = []
         for rival, (other, score) in zip(rivals, on_all_cores(best, rivals), strict=True):
             # Weights forgive much that plain errors do not, where a model is far off: both must be as good.
@@ -53,8 +64,10 @@ def find_ambiguities(search: Search, fitted: Fit, noise: Noise) -> Rivals:
 
 
 def _in_place(
-    search: Search, slim: Fit, probes: Sequence[Probe], less: Score, needed: float, rival: str
+    search: Search, slim: Fit, probes: Sequence[Probe], less: Score, needed: float, richest: int, rival: str
 ) -> tuple[Fit, Score]:
     """The best fit with a rival; in other forms too if the plain one gains what is needed over `less`."""
     plain = add(search, slim, rival, probes)
-    return elaborate(search, slim, rival, probes, plain) if plain[1].gain_over(less) > needed else plain
+    if plain[1].gain_over(less) <= needed:
+        return plain
+    return elaborate(search, slim, rival, probes, plain, richest)

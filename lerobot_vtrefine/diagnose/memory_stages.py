@@ -60,16 +60,25 @@ def delayed(x: np.ndarray, time_s: np.ndarray, delay_s: float) -> np.ndarray:
 
 
 def _latency(stage: Latency, field: Field, context: Context) -> Field:
-    return by_press(field, context.sheet, lambda x, time_s, rows: delayed(x, time_s, float(stage.tau_s)))
+    lag_s = float(stage.smoothing * stage.tau_s)
+
+    def work(x: np.ndarray, time_s: np.ndarray, rows: np.ndarray) -> np.ndarray:
+        late = delayed(x, time_s, float(stage.tau_s) - lag_s)
+        return late[:1] + low_passed(late - late[:1], time_s, max(lag_s, 1e-6)) if stage.smoothing else late
+
+    return by_press(field, context.sheet, work)
 
 
 def _scan_skew(stage: ScanSkew, field: Field, context: Context) -> Field:
-    last = max(context.sheet.layout.rows - 1, 1)
+    count = context.sheet.layout.rows
+    delays = stage.of_rows(count)
+    if delays is None:
+        delays = stage.skew_s * np.arange(count) / max(count - 1, 1)
 
     def work(x: np.ndarray, time_s: np.ndarray, rows: np.ndarray) -> np.ndarray:
         out = np.empty_like(x)
         for row in np.unique(rows):
-            out[:, rows == row] = delayed(x[:, rows == row], time_s, stage.skew_s * float(row) / last)
+            out[:, rows == row] = delayed(x[:, rows == row], time_s, float(delays[row]))
         return out
 
     return by_press(field, context.sheet, work)

@@ -11,6 +11,7 @@ from lerobot_vtrefine.tactile.stages.base import Frame, Stage
 from lerobot_vtrefine.tactile.stages.mechanics import (
     MechanicalSpreading,
     NonlinearStiffness,
+    ring_matrix,
     spreading_matrix,
 )
 from lerobot_vtrefine.tactile.stages.readout import (
@@ -24,7 +25,7 @@ from lerobot_vtrefine.tactile.stages.readout import (
     Saturation,
     TaxelGainSpread,
 )
-from lerobot_vtrefine.tactile.stages.surface import ContactOffset, PadTilt
+from lerobot_vtrefine.tactile.stages.surface import ContactOffset, PadTilt, StiffeningDepth
 
 
 def _elementwise(stage: Stage, field: Field, context: Context) -> Field:
@@ -35,7 +36,13 @@ def _elementwise(stage: Stage, field: Field, context: Context) -> Field:
     )
 
 
-def _lowered(stage: ContactOffset | PadTilt, field: Field, context: Context) -> Field:
+def _deepened(stage: ContactOffset | StiffeningDepth, field: Field, context: Context) -> Field:
+    """Depths become others, alike for all taxels; their rates stay."""
+    out = _elementwise(stage, field, context)
+    return Field(out.values, field.columns, field.rate)
+
+
+def _lowered(stage: PadTilt, field: Field, context: Context) -> Field:
     """Depths move by an amount that belongs to the taxel."""
     sheet = context.sheet
     flat = torch.zeros((sheet.layout.rows, sheet.layout.cols), dtype=torch.float64)
@@ -58,6 +65,9 @@ def _mixed(field: Field, context: Context, weights: Callable[[np.ndarray, np.nda
 
 def _spreading(stage: MechanicalSpreading, field: Field, context: Context) -> Field:
     sheet = context.sheet
+    if stage.rings:
+        matrix = ring_matrix(sheet.layout.rows, sheet.layout.cols, stage.rings, stage.kept)
+        return _mixed(field, context, lambda to, of: matrix[np.ix_(sheet.taxels[to], sheet.taxels[of])])
     sigma = torch.full((1, 1), stage.sigma_m / sheet.layout.pitch_m, dtype=torch.float64)
     down, along = (spreading_matrix(n, sigma).numpy() for n in (sheet.layout.rows, sheet.layout.cols))
 
@@ -69,12 +79,14 @@ def _spreading(stage: MechanicalSpreading, field: Field, context: Context) -> Fi
 
 def _crosstalk(stage: Crosstalk, field: Field, context: Context) -> Field:
     sheet = context.sheet
+    along, down = stage.line(sheet.layout.cols, stage.row_side), stage.line(sheet.layout.rows, stage.col_side)
 
     def weights(to: np.ndarray, of: np.ndarray) -> np.ndarray:
         row = sheet.rows[to][:, None] == sheet.rows[of][None]
         col = sheet.cols[to][:, None] == sheet.cols[of][None]
-        own = row & col
-        return np.where(own, 1.0, stage.row * row + stage.col * col)
+        leaks = stage.row * row * along[np.ix_(sheet.cols[to], sheet.cols[of])]
+        leaks += stage.col * col * down[np.ix_(sheet.rows[to], sheet.rows[of])]
+        return np.where(row & col, 1.0, leaks)
 
     return _mixed(field, context, weights)
 
@@ -138,7 +150,8 @@ def _convert(stage: Quantisation, field: Field, context: Context) -> Field:
 
 
 SEPARATE: dict[type, Callable[[Any, Field, Context], Field]] = {
-    ContactOffset: _lowered,
+    ContactOffset: _deepened,
+    StiffeningDepth: _deepened,
     PadTilt: _lowered,
     NonlinearStiffness: _elementwise,
     Gain: _elementwise,

@@ -10,7 +10,8 @@ from lerobot_vtrefine.diagnose.intervals import LeftOut, form_parameters, map_pa
 from lerobot_vtrefine.diagnose.parallel import on_all_cores
 from lerobot_vtrefine.diagnose.presses import PressSet
 from lerobot_vtrefine.diagnose.screening import ALPHA
-from lerobot_vtrefine.diagnose.selection import EXTRA_GAIN, MAPS, Search
+from lerobot_vtrefine.diagnose.search import Search
+from lerobot_vtrefine.diagnose.selection import EXTRA_GAIN, MAPS
 from lerobot_vtrefine.diagnose.verdict import Cause, Parameter
 
 

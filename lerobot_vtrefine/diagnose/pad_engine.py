@@ -12,7 +12,7 @@ import numpy as np
 from lerobot_vtrefine.diagnose.ambiguity import find_ambiguities
 from lerobot_vtrefine.diagnose.baseline import Baseline, fit_baseline, plain_weights
 from lerobot_vtrefine.diagnose.composite import Composite, sensor_model
-from lerobot_vtrefine.diagnose.crossvalidation import cross_validate
+from lerobot_vtrefine.diagnose.crossvalidation import agree, cross_validate
 from lerobot_vtrefine.diagnose.detectable import minimum_detectable
 from lerobot_vtrefine.diagnose.evaluation import (
     foretell,
@@ -33,14 +33,14 @@ from lerobot_vtrefine.diagnose.pairs import reconsider
 from lerobot_vtrefine.diagnose.presses import PressSet, prepare, usable
 from lerobot_vtrefine.diagnose.recordings import RecordingSet, Trial
 from lerobot_vtrefine.diagnose.screening import Scorer
+from lerobot_vtrefine.diagnose.search import Search, start_search
 from lerobot_vtrefine.diagnose.selection import (
+    AGREEMENT_P,
     MIN_GAIN,
-    Search,
     forward,
     polish,
     scored,
     settle,
-    start_search,
 )
 from lerobot_vtrefine.diagnose.unknowns import Suspicion, look_for_unknowns
 from lerobot_vtrefine.diagnose.verdict import Cause, DataIssue, Heldout, Parameter, Unknown
@@ -165,11 +165,11 @@ def _conclude(
 ) -> PadDiagnosis:
     names = fitted.model.families
     status = _status(names, rivals.groups, suspicion)
-    best = _trusted(search, baseline, fitted) if status == "unexplained" else fitted.model
-    idle = settled_idle(best if names else baseline.plain.model, search.presses)
+    best = _trusted(search, baseline, fitted, status == "unexplained") if names else baseline.plain.model
+    idle = settled_idle(best, search.presses)
     plain, extended = (
         sensor_model(model, idle, everyone.step_counts, baseline.noise.floor)
-        for model in (baseline.plain.model, best if names else baseline.plain.model)
+        for model in (baseline.plain.model, best)
     )
     held_set = everyone.subset(locked)
     foretold = foretell(held_set, plain, extended)
@@ -205,16 +205,24 @@ def _status(names: tuple[str, ...], groups: tuple[tuple[str, ...], ...], suspici
     return "explained" if names else "adequate"
 
 
-def _trusted(search: Search, baseline: Baseline, fitted: Fit) -> Composite:
-    """Beside an unknown cause, the model that foretells plain readings best: with the symptoms as they
-    were weighed, as plain errors have them, or without any."""
+def _trusted(search: Search, baseline: Baseline, fitted: Fit, doubtful: bool) -> Composite:
+    """What is handed out: never a model that foretells plain readings of recordings left out worse than the
+    baseline does.
+
+    Named causes are taken as they were weighed, or as plain errors have them where those are worse. Beside an
+    unknown cause (`doubtful`) the better one of both must do better in most recordings, not by luck in a few.
+    """
     weights = plain_weights(search.presses)
     plain = rest(baseline.plain.model, search.presses, weights)
-    even = settle(search, fitted.model, weights)
-    found = (cross_validate(fit, search.presses, weights, search.folds) for fit in (plain, even))
-    errors = [score.squares.sum() for score in (*found, scored(search, fitted))]
-    errors[0] *= 1.0 - MIN_GAIN
-    return (plain.model, even.model, fitted.model)[int(np.argmin(errors))]
+    before = cross_validate(plain, search.presses, weights, search.folds)
+    found = [(fitted.model, scored(search, fitted))]
+    if doubtful or found[0][1].gain_over(before) <= 0.0:
+        even = settle(search, fitted.model, weights)
+        found.append((even.model, cross_validate(even, search.presses, weights, search.folds)))
+    model, score = max(found, key=lambda item: item[1].gain_over(before))
+    needed = MIN_GAIN if doubtful else 0.0
+    lucky = doubtful and not agree(before.squares - score.squares, search.seed, AGREEMENT_P)
+    return plain.model if score.gain_over(before) <= needed or lucky else model
 
 
 def _smallest(search: Search, fitted: Fit) -> dict[str, float]:

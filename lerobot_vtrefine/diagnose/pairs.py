@@ -4,11 +4,10 @@ from itertools import combinations
 
 from lerobot_vtrefine.diagnose.fitting import Fit, tangents
 from lerobot_vtrefine.diagnose.screening import Scorer, probe_form
+from lerobot_vtrefine.diagnose.search import Search, forms_of
 from lerobot_vtrefine.diagnose.selection import (
     EXTRA_GAIN,
-    Search,
     clearly_better,
-    forms_of,
     refit,
     reweigh,
     scored,

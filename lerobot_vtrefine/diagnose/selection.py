@@ -1,23 +1,27 @@
 """From survivors of the screening to a model: refit, rank on recordings left out, add, swap, take away."""
 
-from collections.abc import Callable, Collection, Sequence
-from dataclasses import dataclass, field, replace
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
 from functools import partial
 
 import numpy as np
 
 from lerobot_vtrefine.diagnose.alarms import LEVEL, slow_errors
-from lerobot_vtrefine.diagnose.baseline import Baseline, plain_weights, weigh
-from lerobot_vtrefine.diagnose.candidates import CATALOGUE
+from lerobot_vtrefine.diagnose.baseline import plain_weights, weigh
 from lerobot_vtrefine.diagnose.candidates.base import Form
-from lerobot_vtrefine.diagnose.candidates.sample_and_hold import pattern
 from lerobot_vtrefine.diagnose.composite import Composite
-from lerobot_vtrefine.diagnose.crossvalidation import Score, agree, cross_validate, folds_of
+from lerobot_vtrefine.diagnose.crossvalidation import Score, agree, cross_validate
 from lerobot_vtrefine.diagnose.fitting import Fit, fit, predict, squared_errors, tangents
-from lerobot_vtrefine.diagnose.maps import find_dead, map_evidence, with_map
+from lerobot_vtrefine.diagnose.maps import find_dead, with_map
 from lerobot_vtrefine.diagnose.parallel import on_all_cores
-from lerobot_vtrefine.diagnose.presses import PressSet
 from lerobot_vtrefine.diagnose.screening import ALPHA, Probe, Scorer, Screened, probe_form, screen
+from lerobot_vtrefine.diagnose.search import (
+    Search,
+    all_probes,
+    forms_of,
+    hold_probe,
+    map_probes,
+)
 from lerobot_vtrefine.diagnose.twins import walk
 from lerobot_vtrefine.diagnose.wander import wander_probe
 from lerobot_vtrefine.diagnose.weights import TrialWeights
@@ -36,6 +40,8 @@ MAP_TOLERANCE = 1e-4
 """Relative decrease of the loss at which a map of gains needs no second turn."""
 PROMISING = 0.5
 """Part of the best candidate's gain that a plain form must reach for its family's other forms to be tried."""
+RICH = 2
+"""Coordinates of a form from which on it imitates other causes."""
 REFITTED = 6
 """Survivors that are refitted in a round."""
 MAPS = ("taxel_gain_spread", "dead_taxels")
@@ -52,47 +58,6 @@ class Step:
     """Part of the previous model's squared error that is gone, on recordings left out."""
     logs: np.ndarray
     """Gain in log score of every recording (K,)."""
-
-
-@dataclass
-class Search:
-    """Discovery recordings, the present weights, and what the search has found so far."""
-
-    presses: PressSet
-    seed: int
-    weights: tuple[TrialWeights, ...]
-    folds: list[list[int]]
-    screened: dict[str, Screened] = field(default_factory=dict)
-    """First screening of every candidate, against the baseline."""
-    tried: dict[str, float] = field(default_factory=dict)
-    """Best gain on recordings left out that each candidate reached when it was refitted."""
-    rivals: dict[str, set[str]] = field(default_factory=dict)
-    """Survivors beside which each accepted cause was chosen."""
-    p_adjusted: dict[str, float] = field(default_factory=dict)
-
-
-def start_search(baseline: Baseline, presses: PressSet, seed: int) -> Search:
-    """A search with the baseline's weights."""
-    return Search(presses, seed, baseline.weights, folds_of(presses, seed))
-
-
-def forms_of(family: str, fitted: Fit) -> list[Form]:
-    """Forms of a family that can show in these recordings."""
-    return [form for form in CATALOGUE if form.family == family and form.possible(fitted.model.setting)]
-
-
-def all_probes(search: Search, fitted: Fit, families: Collection[str] | None = None) -> list[Probe]:
-    """Probes of every candidate (or of those families) that the model does not hold yet."""
-    _, columns = tangents(fitted.model, search.presses, fitted.model.free)
-    scorer = Scorer(fitted, search.presses, search.weights, columns)
-    held = set(fitted.model.families)
-    forms = [
-        form
-        for form in CATALOGUE
-        if form.screened and form.possible(fitted.model.setting) and form.family not in held
-        if families is None or form.family in families
-    ]
-    return [probe for found in on_all_cores(partial(probe_form, scorer=scorer), forms) for probe in found]
 
 
 def refit(search: Search, fitted: Fit, form: Form, probes: Sequence[Probe]) -> Fit:
@@ -161,16 +126,31 @@ def add(search: Search, fitted: Fit, name: str, probes: Sequence[Probe]) -> tupl
 
 
 def elaborate(
-    search: Search, fitted: Fit, name: str, probes: Sequence[Probe], plain: tuple[Fit, Score]
+    search: Search,
+    fitted: Fit,
+    name: str,
+    probes: Sequence[Probe],
+    plain: tuple[Fit, Score],
+    richest: float = np.inf,
 ) -> tuple[Fit, Score]:
-    """The same with another form of the cause, where one foretells clearly better."""
+    """The same with another form of the cause (of at most so many coordinates), where one foretells clearly
+    better."""
     best = plain
-    for form in forms_of(name, fitted)[1:] if name not in MAPS else []:
-        found = refit(search, fitted, form, probes)
+    forms = forms_of(name, fitted)[1:] if name not in MAPS else []
+    for form in (form for form in forms if len(form.values) <= richest):
+        found = refit(search, fitted, form, probes) if form.grown is None else grow(search, plain[0], form)
         score = scored(search, found)
         if clearly_better(score, best[1], search.seed):
             best = found, score
     return best
+
+
+def grow(search: Search, plain: Fit, form: Form) -> Fit:
+    """The best fit with another form of a family, from where its plain form has come to rest."""
+    assert form.grown is not None
+    index = plain.model.families.index(form.family)
+    values = np.asarray(form.grown(plain.model.own(index), plain.model.setting), dtype=float)
+    return settle(search, plain.model.plus(form, np.clip(values, form.low, form.high)))
 
 
 def clearly_better(score: Score, than: Score, seed: int, needed: float = MIN_GAIN) -> bool:
@@ -202,52 +182,6 @@ def reweigh(search: Search, fitted: Fit) -> Fit:
         return found
     search.weights = tuple(plain_weights(search.presses))
     return settle(search, fitted.model)
-
-
-def gain_spread_probe(search: Search, fitted: Fit) -> Probe:
-    """Products between recordings of what they say about every taxel's gain, as one vector of flips.
-
-    The statistic is quadratic in the signs, so the probe carries its own permutation p-value.
-    """
-    evidence = map_evidence(fitted, search.presses, search.weights)
-    total = evidence.information.sum(axis=0)
-    known = total > 0
-    unit = np.where(known, evidence.scores / np.sqrt(np.where(known, total, 1.0)), 0.0)
-    products = unit @ unit.T
-    np.fill_diagonal(products, 0.0)
-    rng = np.random.default_rng([search.seed, 4])
-    signs = rng.integers(0, 2, (9999, len(products))) * 2.0 - 1.0
-    seen = float(products.sum())
-    flipped = np.einsum("bi,ij,bj->b", signs, products, signs)
-    p_value = float((1 + (flipped >= seen - 1e-9 * abs(seen)).sum()) / 10000.0)
-    size = np.array([max(seen, 0.0)])
-    return Probe("taxel_gain_spread", None, np.zeros(0), size, np.maximum(size, 1e-12), True, p_value)
-
-
-def map_probes(search: Search, fitted: Fit) -> list[Probe]:
-    """Probes of gains and dead taxels that the model does not hold yet."""
-    found = []
-    if search.presses.layout.num_taxels < 2:
-        return found
-    if "taxel_gain_spread" not in fitted.model.families:
-        found.append(gain_spread_probe(search, fitted))
-    if "dead_taxels" not in fitted.model.families and find_dead(fitted, search.presses):
-        # Answers that fail by a factor of eight at many times their error need no permutation.
-        size = np.array([1e9])
-        found.append(Probe("dead_taxels", None, np.zeros(0), size, size, True, 1e-4))
-    return found
-
-
-def hold_probe(search: Search, fitted: Fit) -> Probe | None:
-    """Readings that repeat bit for bit, in a rhythm, are held whatever the motion: that needs no flips."""
-    if "sample_and_hold" in fitted.model.families:
-        return None
-    rhythm = pattern(search.presses, fitted.model.setting.frame_s)
-    if rhythm is None:
-        return None
-    size = np.array([1e9])
-    form = forms_of("sample_and_hold", fitted)[int(rhythm.free)]
-    return Probe("sample_and_hold", form, np.array([rhythm.period_s]), size, size, True, 1e-4)
 
 
 def survivors(found: dict[str, Screened]) -> list[Screened]:
@@ -363,16 +297,39 @@ def rank(search: Search, fitted: Fit, candidates: Sequence[Screened], probes: Se
             return elaborate(search, fitted, name, probes, plain[name])
         return plain[name]
 
-    steps = []
     tried = [item for item in candidates if item.probe.name in plain]
-    for item, (found, score) in zip(tried, on_all_cores(further, tried), strict=True):
-        name = item.probe.name
+    grown = dict(zip([item.probe.name for item in tried], on_all_cores(further, tried), strict=True))
+    richest = max((coordinates_of(found, name) for name, (found, _) in grown.items()), default=0)
+    # What a rich form does, another cause may do with fewer coordinates.
+    slighted = [name for name in grown if grown[name] is plain[name] and gains[name] > needed]
+    for name in slighted if richest > RICH else []:
+        grown[name] = elaborate(search, fitted, name, probes, plain[name], richest - 1)
+    steps = []
+    for name, (found, score) in grown.items():
         gain, logs = score.gain_over(base), score.better_by(base)
         search.tried[name] = max(gain, search.tried.get(name, -np.inf))
         agreed = name == "dead_taxels" or agree(logs, search.seed, AGREEMENT_P)
         if gain > needed and logs.sum() > 0 and agreed:
             steps.append(Step(name, found, score, gain, logs))
-    return sorted(steps, key=lambda step: -float(step.logs.sum()))
+    return frugal(search, sorted(steps, key=lambda step: -float(step.logs.sum())))
+
+
+def coordinates_of(fitted: Fit, name: str) -> int:
+    """Number of coordinates of the form in which a model holds a cause; 0 for maps, which are shrunk."""
+    return sum(len(form.values) for form in fitted.model.forms if form.family == name)
+
+
+def frugal(search: Search, steps: list[Step]) -> list[Step]:
+    """The first step last where its form is rich and others with fewer coordinates foretell as well."""
+    if not steps or coordinates_of(steps[0].fitted, steps[0].name) <= RICH:
+        return steps
+    best, others = steps[0], steps[1:]
+    count = coordinates_of(best.fitted, best.name)
+    for step in others:
+        fewer = 0 < coordinates_of(step.fitted, step.name) < count
+        if fewer and not clearly_better(best.score, step.score, search.seed):
+            return [step, *(other for other in others if other is not step), best]
+    return steps
 
 
 def backward(search: Search, fitted: Fit) -> Fit:

@@ -20,7 +20,7 @@ from lerobot_vtrefine.diagnose.descriptors import DESCRIPTORS, Descriptor
 from lerobot_vtrefine.diagnose.fitting import Fit, tangents
 from lerobot_vtrefine.diagnose.presses import PressSet
 from lerobot_vtrefine.diagnose.screening import Probe, Scorer, screen
-from lerobot_vtrefine.diagnose.selection import Search
+from lerobot_vtrefine.diagnose.search import Search
 
 DESCRIPTOR_P = 0.01
 DESCRIPTOR_SHARE = 0.02

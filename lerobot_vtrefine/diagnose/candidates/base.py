@@ -84,6 +84,8 @@ class Form:
     """Number of the coordinate that trades off against the baseline's damping, if one does."""
     screened: bool = True
     """Whether its probes take part in screening; fallbacks are only fitted where their family is named."""
+    grown: Callable[[np.ndarray, Setting], list[float]] | None = None
+    """The family's plain form, given by its coordinates, as this form has it: where descents start."""
 
     @property
     def low(self) -> np.ndarray:

@@ -1,13 +1,22 @@
 """Stages of sampling and transport: when a reading was taken, and how long the host repeats it."""
 
+import math
 from dataclasses import dataclass
-from typing import ClassVar, override
+from typing import Any, ClassVar, override
 
 import numpy as np
 import torch
 
 from lerobot_vtrefine.tactile.layout import PadLayout
-from lerobot_vtrefine.tactile.stages.base import Frame, Stage, State, Traits, parameter, register
+from lerobot_vtrefine.tactile.stages.base import (
+    Frame,
+    Stage,
+    State,
+    Traits,
+    as_tuple,
+    parameter,
+    register,
+)
 
 PHASES = 16
 """Instants over which the mean reading of a free-running board is taken."""
@@ -79,30 +88,101 @@ class Delay(Stage):
 @register
 @dataclass(frozen=True)
 class Latency(Delay):
-    """Readings are `tau_s` old when the host stamps them."""
+    """Readings are `tau_s` old when the host stamps them.
+
+    The part `smoothing` of that age is a one-pole filter's (of the board or its driver), the rest a delay.
+    """
 
     name: ClassVar[str] = "latency"
     rank: ClassVar[int] = 70
     tau_s: float = parameter(0.01, "s", 0.0, 0.05)
+    smoothing: float = parameter(0.0, "1", 0.0, 0.0)
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if not isinstance(self.smoothing, torch.Tensor) and self.smoothing > 1.0:
+            raise ValueError(f"latency.smoothing must be at most 1, got {self.smoothing:g}")
+
+    @property
+    def _plain(self) -> bool:
+        return not isinstance(self.smoothing, torch.Tensor) and self.smoothing == 0.0
 
     @override
     def delay_s(self, rows: int, like: torch.Tensor) -> torch.Tensor:
-        return torch.as_tensor(self.tau_s, dtype=like.dtype, device=like.device).reshape(
-            -1, *(1,) * (like.ndim - 1)
-        )
+        delay = torch.as_tensor((1.0 - self.smoothing) * self.tau_s, dtype=like.dtype, device=like.device)
+        return delay.reshape(-1, *(1,) * (like.ndim - 1))
+
+    @override
+    def initial(self, layout: PadLayout, pads: int) -> Traits:
+        found = super().initial(layout, pads)
+        if not self._plain:
+            shape = (pads, layout.rows, layout.cols)
+            found |= {name: np.zeros(shape, dtype=np.float32) for name in ("before", "smooth")}
+        return found
+
+    @override
+    def step(self, x: torch.Tensor, state: State, frame: Frame) -> tuple[torch.Tensor, State]:
+        late, new = super().step(x, state, frame)
+        if self._plain:
+            return late, new
+        first = (state["frames"] == 0)[..., None, None]
+        before = torch.where(first, late, state["before"])
+        smooth = torch.where(first, late, state["smooth"])
+        smooth = self._followed(smooth, before, late, frame.dt_s)
+        return smooth, {**new, "before": late, "smooth": smooth}
+
+    def _followed(self, smooth: Any, before: Any, now: Any, dt_s: float) -> Any:
+        """The filter's reading after a step in which its input went straight from `before` to `now`."""
+        if dt_s <= 0.0:
+            return smooth
+        tau_s = self.smoothing * self.tau_s
+        tau_s = tau_s.clamp(min=1e-6) if isinstance(tau_s, torch.Tensor) else max(tau_s, 1e-6)
+        decay = torch.exp(-dt_s / tau_s) if isinstance(tau_s, torch.Tensor) else math.exp(-dt_s / tau_s)
+        ramp = 1.0 - (1.0 - decay) * (tau_s / dt_s)
+        return decay * smooth + (1.0 - decay) * before + ramp * (now - before)
+
+    @override
+    def sequence(self, x: torch.Tensor, times_s: torch.Tensor, frame: Frame) -> torch.Tensor:
+        late = super().sequence(x, times_s, frame)
+        if self._plain or not len(late):
+            return late
+        smooth = [late[0]]
+        for before, now, dt_s in zip(late[:-1], late[1:], times_s.diff().tolist(), strict=True):
+            smooth.append(self._followed(smooth[-1], before, now, dt_s))
+        return torch.stack(smooth)
 
 
 @register
 @dataclass(frozen=True)
 class ScanSkew(Delay):
-    """Rows are read one after the other: row r is sampled skew_s * r / (R - 1) before the frame's time."""
+    """Rows are read one after the other: row r is sampled skew_s * r / (R - 1) before the frame's time.
+
+    `rows_s`, delays at equal steps from the first row to the last and straight between them, stand in for
+    that where a board reads its rows in another rhythm; `skew_s` is then their slope alone.
+    """
 
     name: ClassVar[str] = "scan_skew"
     rank: ClassVar[int] = 72
     skew_s: float = parameter(0.008, "s", 0.0, 0.043, minimum=None)
+    rows_s: tuple[float, ...] = ()
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        object.__setattr__(self, "rows_s", as_tuple(self.rows_s))
+        if len(self.rows_s) == 1 or not all(math.isfinite(value) for value in self.rows_s):
+            raise ValueError("scan_skew.rows_s needs at least two finite numbers")
+
+    def of_rows(self, rows: int) -> np.ndarray | None:
+        """Delay of each row where `rows_s` gives it, (R,) [s]."""
+        if not self.rows_s:
+            return None
+        return np.interp(np.linspace(0.0, 1.0, rows), np.linspace(0.0, 1.0, len(self.rows_s)), self.rows_s)
 
     @override
     def delay_s(self, rows: int, like: torch.Tensor) -> torch.Tensor:
+        own = self.of_rows(rows)
+        if own is not None:
+            return torch.as_tensor(own, dtype=like.dtype, device=like.device)[:, None]
         share = torch.arange(rows, dtype=like.dtype, device=like.device)[:, None] / max(rows - 1, 1)
         return self.skew_s * share
 

@@ -2,6 +2,7 @@
 
 import math
 from dataclasses import dataclass, field
+from functools import lru_cache
 from typing import Any, ClassVar, override
 
 import numpy as np
@@ -57,19 +58,68 @@ def spreading_matrix(count: int, sigma_taxels: torch.Tensor) -> torch.Tensor:
     return weights / weights.sum(dim=-1, keepdim=True)
 
 
+RING_TAXELS = (1.0, 2.0**0.5, 2.0, 5.0**0.5, 8.0**0.5, 3.0)
+"""Distances between taxels of a square lattice, the shortest ones [taxels]."""
+RINGS_END_TAXELS = 4.0
+
+
+@lru_cache(maxsize=32)
+def ring_matrix(rows: int, cols: int, rings: tuple[float, ...], kept: float = 1.0) -> np.ndarray:
+    """Weights (R*C, R*C) of a round kernel; mirrored at the edges, every taxel's add up to one.
+
+    Args:
+        rings: weight at each of RING_TAXELS over the weight at the centre; straight in between, 0 from
+            RINGS_END_TAXELS on.
+        kept: part that stays of what would leave the pad.
+    """
+    known, weights = (0.0, *RING_TAXELS, RINGS_END_TAXELS), (1.0, *rings, 0.0)
+    down, along = (_image_distances(count) for count in (rows, cols))
+    kernels = [
+        np.interp(np.hypot(one[:, None, :, None], other[None, :, None, :]), known, weights)
+        for one in down
+        for other in along
+    ]
+    size = rows * cols
+    inside, mirrored = kernels[0].reshape(size, size), sum(kernels[1:]).reshape(size, size)
+    return (inside + kept * mirrored) / (inside + mirrored).sum(axis=1, keepdims=True)
+
+
+def _image_distances(count: int) -> list[np.ndarray]:
+    """Distance from every taxel of a line to every other and to its mirror images: (count, count) each."""
+    index = np.arange(count)
+    return [index[:, None] - image[None] for image in (index, -1 - index, 2 * count - 1 - index)]
+
+
 @register
 @dataclass(frozen=True)
 class MechanicalSpreading(Stage):
     """The cover layer spreads force over neighbours: a Gaussian of `sigma_m`, mirrored at the edges; keeps
-    the sum."""
+    the sum.
+
+    `rings`, weights at the shortest distances of the lattice over that at the centre (`ring_matrix`), stand
+    in for the Gaussian where a cover spreads otherwise; `sigma_m` is then their deviation alone. With them,
+    a cover that reaches beyond the taxels keeps only the part `kept` of what would leave the pad.
+    """
 
     name: ClassVar[str] = "mechanical_spreading"
     domain: ClassVar[str] = "force"
     rank: ClassVar[int] = 32
     sigma_m: float = parameter(1.0e-3, "m", 0.0, 3.0e-3)
+    rings: tuple[float, ...] = ()
+    kept: float = parameter(1.0, "1", 1.0, 1.0)
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        object.__setattr__(self, "rings", as_tuple(self.rings))
+        if self.rings and (len(self.rings) != len(RING_TAXELS) or not all(0 <= w <= 1 for w in self.rings)):
+            raise ValueError(f"mechanical_spreading.rings needs {len(RING_TAXELS)} numbers from 0 to 1")
 
     @override
     def step(self, x: torch.Tensor, state: State, frame: Frame) -> tuple[torch.Tensor, State]:
+        if self.rings:
+            weights = ring_matrix(*x.shape[-2:], self.rings, self.kept)
+            matrix = torch.as_tensor(weights, dtype=x.dtype, device=x.device)
+            return (x.flatten(-2) @ matrix.T).view(x.shape), state
         sigma = torch.as_tensor(self.sigma_m, dtype=x.dtype, device=x.device) / frame.layout.pitch_m
         sigma = sigma.view(1, 1) if sigma.ndim == 0 else sigma
         rows, cols = x.shape[-2:]

@@ -166,16 +166,47 @@ class RowSharing(Stage):
 @dataclass(frozen=True)
 class Crosstalk(Stage):
     """Additive leakage: every taxel gets the fraction `row` of each other reading in its row, `col` of its
-    column."""
+    column.
+
+    With `reach` the next reading leaks that much, further ones less by exp(-1 / reach) per taxel. A `side` of
+    +1 lets a line's readings leak to taxels of larger index only, -1 to smaller ones.
+    """
 
     name: ClassVar[str] = "crosstalk"
     domain: ClassVar[str] = "counts"
     rank: ClassVar[int] = 58
     row: float = parameter(0.005, "1", 0.0, 0.02)
     col: float = parameter(0.005, "1", 0.0, 0.02)
+    reach: float | None = None
+    row_side: int = 0
+    col_side: int = 0
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if self.reach is not None and not self.reach > 0:
+            raise ValueError(f"crosstalk.reach must be positive, got {self.reach}")
+        if not {self.row_side, self.col_side} <= {-1, 0, 1}:
+            raise ValueError("crosstalk.row_side and col_side must be -1, 0 or 1")
+
+    @property
+    def even(self) -> bool:
+        """Whether all other readings of a line leak alike."""
+        return self.reach is None and not self.row_side and not self.col_side
+
+    def line(self, count: int, side: int) -> np.ndarray:
+        """What a taxel gets (first index) of each of its line (second): (count, count), 0 of itself."""
+        ahead = np.arange(count)[:, None] - np.arange(count)[None]
+        decay = np.ones(ahead.shape) if self.reach is None else np.exp((1.0 - np.abs(ahead)) / self.reach)
+        return decay * ((ahead != 0) & (ahead * side >= 0))
 
     @override
     def step(self, x: torch.Tensor, state: State, frame: Frame) -> tuple[torch.Tensor, State]:
+        if not self.even:
+            down, along = (
+                torch.as_tensor(self.line(count, side), dtype=x.dtype, device=x.device)
+                for count, side in zip(x.shape[-2:], (self.col_side, self.row_side), strict=True)
+            )
+            return x + self.row * (x @ along.T) + self.col * (down @ x), state
         along_row = x.sum(dim=-1, keepdim=True) - x
         along_col = x.sum(dim=-2, keepdim=True) - x
         return x + self.row * along_row + self.col * along_col, state

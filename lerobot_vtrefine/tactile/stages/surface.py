@@ -8,6 +8,7 @@ from dataclasses import dataclass
 from typing import ClassVar, override
 
 import torch
+from torch.nn.functional import softplus
 
 from lerobot_vtrefine.tactile.stages.base import Frame, Stage, State, parameter, register, taxel_map
 
@@ -15,16 +16,50 @@ from lerobot_vtrefine.tactile.stages.base import Frame, Stage, State, parameter,
 @register
 @dataclass(frozen=True)
 class ContactOffset(Stage):
-    """The face lies `offset_m` deeper than assumed, so that contact is felt later: d - offset."""
+    """The face lies `offset_m` deeper than assumed, so that contact is felt later: d - offset.
+
+    With `softness_m` a fluffy face is felt from the first touch on, but only in full beyond `offset_m`, over
+    about that depth.
+    """
 
     name: ClassVar[str] = "contact_offset"
     domain: ClassVar[str] = "depth"
     rank: ClassVar[int] = 10
     offset_m: float = parameter(0.0, "m", -2e-4, 2e-4, minimum=None)
+    softness_m: float = parameter(0.0, "m", 0.0, 0.0)
 
     @override
     def step(self, x: torch.Tensor, state: State, frame: Frame) -> tuple[torch.Tensor, State]:
-        return x - self.offset_m, state
+        if not isinstance(self.softness_m, torch.Tensor) and self.softness_m == 0.0:
+            return x - self.offset_m, state
+        return torch.where(x > 0, hinge(x, self.offset_m, self.softness_m), x), state
+
+
+def hinge(depth: torch.Tensor, at_m: float, width_m: float) -> torch.Tensor:
+    """0 at the face, level up to `at_m`, of slope 1 beyond; rounded over `width_m` [m]."""
+    width = torch.as_tensor(width_m, dtype=depth.dtype, device=depth.device).clamp(min=1e-8)
+    return width * (softplus((depth - at_m) / width) - softplus(-at_m / width))
+
+
+@register
+@dataclass(frozen=True)
+class StiffeningDepth(Stage):
+    """Layers that bottom out: beyond `knee_m` every further metre counts for 1 + `more` metres.
+
+    Rounded over `width_m`. Acts on the elastic part of the contact law alone: damping follows the rate as
+    before.
+    """
+
+    name: ClassVar[str] = "stiffening_depth"
+    domain: ClassVar[str] = "depth"
+    rank: ClassVar[int] = 14
+    more: float = parameter(0.0, "1", 0.0, 2.0, minimum=-1.0)
+    knee_m: float = parameter(5e-4, "m", 2e-4, 1e-3)
+    width_m: float = parameter(5e-5, "m", 1e-5, 1e-4, minimum=1e-8)
+
+    @override
+    def step(self, x: torch.Tensor, state: State, frame: Frame) -> tuple[torch.Tensor, State]:
+        return torch.where(x > 0, x + self.more * hinge(x, self.knee_m, self.width_m), x), state
 
 
 @register

@@ -33,6 +33,7 @@ FORMS: dict[str, dict[str, Factory]] = {
         "prandtl_ishlinskii": mechanics.many_plays,
         "bouc_wen": mechanics.bouc_wen,
         "preisach": mechanics.preisach,
+        "branch": mechanics.branch,
     },
     "taxel_gain_spread": {
         "log_normal": electronics.log_normal_gains,
@@ -46,11 +47,13 @@ FORMS: dict[str, dict[str, Factory]] = {
         "both": electronics.crosstalk,
         "columns": electronics.crosstalk_columns,
         "strongest": electronics.crosstalk_strongest,
+        "one_sided": electronics.crosstalk_one_sided,
     },
     "mechanical_spreading": {
         "gaussian": mechanics.gaussian_spread,
         "exponential": mechanics.exponential_spread,
         "neighbours": mechanics.neighbour_spread,
+        "box": mechanics.box_spread,
     },
     "baseline_drift": {
         "linear": electronics.drift,
@@ -65,7 +68,11 @@ FORMS: dict[str, dict[str, Factory]] = {
     },
     "scan_skew": {"rows": electronics.skew, "blocks": electronics.skew_blocks},
     "sample_and_hold": {"from_start": electronics.hold, "free_running": electronics.hold_free},
-    "contact_offset": {"shift": mechanics.offset, "wander": mechanics.offset_wander},
+    "contact_offset": {
+        "shift": mechanics.offset,
+        "wander": mechanics.offset_wander,
+        "soft": mechanics.offset_soft,
+    },
     "pad_tilt": {"plane": mechanics.tilt, "wobble": mechanics.tilt_wobble},
     "outside": {
         "mains_hum": outside.hum,

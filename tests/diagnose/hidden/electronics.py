@@ -145,6 +145,18 @@ def crosstalk_strongest(pad: Pad, size: float, rng: Draw) -> Effect:
     return Effect("crosstalk", "strongest", "counts", apply)
 
 
+def crosstalk_one_sided(pad: Pad, size: float, rng: Draw) -> Effect:
+    """The converter keeps some of the channel that it read before: the neighbour in the row."""
+    share = 0.05 * size
+
+    def apply(scene: Scene, x: np.ndarray) -> np.ndarray:
+        image = scene.grid(x).copy()
+        image[:, :, 1:] += share * scene.grid(x)[:, :, :-1]
+        return image.reshape(x.shape)
+
+    return Effect("crosstalk", "one_sided", "counts", apply)
+
+
 def drift(pad: Pad, size: float, rng: Draw) -> Effect:
     rate = 0.018 * size * pad.rig.full_scale / 255 * 8 / pad.rig.conditions
     rate *= rng.choice([-1.0, 1.0])

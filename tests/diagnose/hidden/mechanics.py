@@ -22,6 +22,19 @@ def offset_wander(pad: Pad, size: float, rng: Draw) -> Effect:
     return Effect("contact_offset", "wander", "surface", apply, {"offset_m": shift})
 
 
+def offset_soft(pad: Pad, size: float, rng: Draw) -> Effect:
+    """A fluffy face: some of the force comes from the first touch on."""
+    shift = 8e-5 * size
+
+    def rounded(x: np.ndarray) -> np.ndarray:
+        return 0.5 * shift * np.logaddexp(0.0, x / (0.5 * shift))
+
+    def apply(scene: Scene, height: np.ndarray) -> np.ndarray:
+        return np.where(height > 0, rounded(height - shift) - rounded(np.array(-shift)), height)
+
+    return Effect("contact_offset", "soft", "surface", apply, {"offset_m": shift})
+
+
 def tilt(pad: Pad, size: float, rng: Draw, wobble: float = 0.0) -> Effect:
     x, y = pad.rig.taxels_m()
     angle = rng.uniform(0, 2 * np.pi)
@@ -187,6 +200,20 @@ def preisach(pad: Pad, size: float, rng: Draw) -> Effect:
     return Effect("hysteresis", "preisach", "force", apply)
 
 
+def branch(pad: Pad, size: float, rng: Draw) -> Effect:
+    """A loop as wide as the load is high: more is read while unloading, after some travel."""
+    travel, more = 0.12 * pad.peak / pad.gain, 0.09 * size
+
+    def apply(scene: Scene, f: np.ndarray) -> np.ndarray:
+        steps, back, out = np.diff(f, axis=0, prepend=f[:1]), np.zeros(f.shape[1]), np.empty_like(f)
+        for i, step in enumerate(steps):
+            back = np.where(f[i] > 0, np.clip(back - step / travel, 0.0, 1.0), 0.0)
+            out[i] = back
+        return f * (1 + more * out)
+
+    return Effect("hysteresis", "branch", "force", apply)
+
+
 def _spread(rows: int, cols: int, kernel: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Mixing matrices along rows and columns; what would leave the pad stays on its edge."""
 
@@ -222,3 +249,19 @@ def exponential_spread(pad: Pad, size: float, rng: Draw) -> Effect:
 
 def neighbour_spread(pad: Pad, size: float, rng: Draw) -> Effect:
     return _spreader(pad, np.array([1.0, 1 / (0.05 * size) - 2, 1.0]), "neighbours", {})
+
+
+def box_spread(pad: Pad, size: float, rng: Draw) -> Effect:
+    """A stiff sheet over a soft one: even within a radius; what leaves the pad is lost."""
+    step = np.arange(-2, 3)
+    far = np.hypot(step[:, None], step[None])
+    kernel = np.clip(0.55 + 0.5 * size - far, 0.0, 1.0)
+    kernel /= kernel.sum()
+
+    def apply(scene: Scene, f: np.ndarray) -> np.ndarray:
+        image = np.pad(scene.grid(f), ((0, 0), (2, 2), (2, 2)))
+        rows, cols = pad.rig.rows, pad.rig.cols
+        parts = (kernel[i, j] * image[:, i : i + rows, j : j + cols] for i in range(5) for j in range(5))
+        return sum(parts, np.zeros((len(f), rows, cols))).reshape(f.shape)
+
+    return Effect("mechanical_spreading", "box", "force", apply)

@@ -1,0 +1,106 @@
+"""What a search for causes works on, and the probes of everything that it may add."""
+
+from collections.abc import Collection
+from dataclasses import dataclass, field
+from functools import partial
+
+import numpy as np
+
+from lerobot_vtrefine.diagnose.baseline import Baseline
+from lerobot_vtrefine.diagnose.candidates import CATALOGUE
+from lerobot_vtrefine.diagnose.candidates.base import Form
+from lerobot_vtrefine.diagnose.candidates.sample_and_hold import pattern
+from lerobot_vtrefine.diagnose.crossvalidation import folds_of
+from lerobot_vtrefine.diagnose.fitting import Fit, tangents
+from lerobot_vtrefine.diagnose.maps import find_dead, map_evidence
+from lerobot_vtrefine.diagnose.parallel import on_all_cores
+from lerobot_vtrefine.diagnose.presses import PressSet
+from lerobot_vtrefine.diagnose.screening import Probe, Scorer, Screened, probe_form
+from lerobot_vtrefine.diagnose.weights import TrialWeights
+
+
+@dataclass
+class Search:
+    """Discovery recordings, the present weights, and what the search has found so far."""
+
+    presses: PressSet
+    seed: int
+    weights: tuple[TrialWeights, ...]
+    folds: list[list[int]]
+    screened: dict[str, Screened] = field(default_factory=dict)
+    """First screening of every candidate, against the baseline."""
+    tried: dict[str, float] = field(default_factory=dict)
+    """Best gain on recordings left out that each candidate reached when it was refitted."""
+    rivals: dict[str, set[str]] = field(default_factory=dict)
+    """Survivors beside which each accepted cause was chosen."""
+    p_adjusted: dict[str, float] = field(default_factory=dict)
+
+
+def start_search(baseline: Baseline, presses: PressSet, seed: int) -> Search:
+    """A search with the baseline's weights."""
+    return Search(presses, seed, baseline.weights, folds_of(presses, seed))
+
+
+def forms_of(family: str, fitted: Fit) -> list[Form]:
+    """Forms of a family that can show in these recordings."""
+    return [form for form in CATALOGUE if form.family == family and form.possible(fitted.model.setting)]
+
+
+def all_probes(search: Search, fitted: Fit, families: Collection[str] | None = None) -> list[Probe]:
+    """Probes of every candidate (or of those families) that the model does not hold yet."""
+    _, columns = tangents(fitted.model, search.presses, fitted.model.free)
+    scorer = Scorer(fitted, search.presses, search.weights, columns)
+    held = set(fitted.model.families)
+    forms = [
+        form
+        for form in CATALOGUE
+        if form.screened and form.possible(fitted.model.setting) and form.family not in held
+        if families is None or form.family in families
+    ]
+    return [probe for found in on_all_cores(partial(probe_form, scorer=scorer), forms) for probe in found]
+
+
+def gain_spread_probe(search: Search, fitted: Fit) -> Probe:
+    """Products between recordings of what they say about every taxel's gain, as one vector of flips.
+
+    The statistic is quadratic in the signs, so the probe carries its own permutation p-value.
+    """
+    evidence = map_evidence(fitted, search.presses, search.weights)
+    total = evidence.information.sum(axis=0)
+    known = total > 0
+    unit = np.where(known, evidence.scores / np.sqrt(np.where(known, total, 1.0)), 0.0)
+    products = unit @ unit.T
+    np.fill_diagonal(products, 0.0)
+    rng = np.random.default_rng([search.seed, 4])
+    signs = rng.integers(0, 2, (9999, len(products))) * 2.0 - 1.0
+    seen = float(products.sum())
+    flipped = np.einsum("bi,ij,bj->b", signs, products, signs)
+    p_value = float((1 + (flipped >= seen - 1e-9 * abs(seen)).sum()) / 10000.0)
+    size = np.array([max(seen, 0.0)])
+    return Probe("taxel_gain_spread", None, np.zeros(0), size, np.maximum(size, 1e-12), True, p_value)
+
+
+def map_probes(search: Search, fitted: Fit) -> list[Probe]:
+    """Probes of gains and dead taxels that the model does not hold yet."""
+    found = []
+    if search.presses.layout.num_taxels < 2:
+        return found
+    if "taxel_gain_spread" not in fitted.model.families:
+        found.append(gain_spread_probe(search, fitted))
+    if "dead_taxels" not in fitted.model.families and find_dead(fitted, search.presses):
+        # Answers that fail by a factor of eight at many times their error need no permutation.
+        size = np.array([1e9])
+        found.append(Probe("dead_taxels", None, np.zeros(0), size, size, True, 1e-4))
+    return found
+
+
+def hold_probe(search: Search, fitted: Fit) -> Probe | None:
+    """Readings that repeat bit for bit, in a rhythm, are held whatever the motion: that needs no flips."""
+    if "sample_and_hold" in fitted.model.families:
+        return None
+    rhythm = pattern(search.presses, fitted.model.setting.frame_s)
+    if rhythm is None:
+        return None
+    size = np.array([1e9])
+    form = forms_of("sample_and_hold", fitted)[int(rhythm.free)]
+    return Probe("sample_and_hold", form, np.array([rhythm.period_s]), size, size, True, 1e-4)

@@ -1,0 +1,28 @@
+"""Truths of other functional forms than a family's plain one: named once, without extras, and foretold."""
+
+import pytest
+from hidden.grading import names_of
+from hidden.session import Spec
+from test_hidden_verdicts import verdict_on
+
+SEED = 7011
+
+
+@pytest.mark.parametrize(
+    ("family", "form"),
+    [
+        ("scan_skew", "blocks"),
+        ("latency", "filter"),
+        ("nonlinear_stiffness", "densification"),
+        ("contact_offset", "soft"),
+        ("mechanical_spreading", "box"),
+        ("crosstalk", "one_sided"),
+    ],
+    ids=lambda name: name,
+)
+def test_a_family_has_a_form_for_it(tmp_path, family, form):
+    spec = Spec("4x4", ((family, form, 2.0),))
+    _, verdict, gains = verdict_on(tmp_path, spec, SEED, locked=4)
+    assert gains["oracle_gain"] > 0.1, "the generator made it too faint to ask for"
+    assert (verdict["status"], names_of(verdict)) == ("explained", (family,))
+    assert gains["gain"] > 0.93 * gains["oracle_gain"]
