@@ -35,8 +35,6 @@ from lerobot_vtrefine.diagnose.recordings import RecordingSet, Trial
 from lerobot_vtrefine.diagnose.screening import Scorer
 from lerobot_vtrefine.diagnose.search import Search, start_search
 from lerobot_vtrefine.diagnose.selection import (
-    AGREEMENT_P,
-    MIN_GAIN,
     forward,
     polish,
     scored,
@@ -48,6 +46,8 @@ from lerobot_vtrefine.tactile.model import SensorModel
 
 MIN_RECORDINGS = 2
 FEW_RECORDINGS = 8
+DOUBTFUL_GAIN, DOUBTFUL_P = 0.03, 0.01
+"""What symptoms must take away of the squared error of recordings left out to be handed out as a model."""
 Tell = Callable[[str, float], None]
 
 
@@ -210,7 +210,8 @@ def _trusted(search: Search, baseline: Baseline, fitted: Fit, doubtful: bool) ->
     baseline does.
 
     Named causes are taken as they were weighed, or as plain errors have them where those are worse. Beside an
-    unknown cause (`doubtful`) the better one of both must do better in most recordings, not by luck in a few.
+    unknown cause (`doubtful`) the better one of both must do clearly better in nearly all recordings: names
+    are symptoms then, and what they stand in for may be otherwise next time.
     """
     weights = plain_weights(search.presses)
     plain = rest(baseline.plain.model, search.presses, weights)
@@ -220,8 +221,8 @@ def _trusted(search: Search, baseline: Baseline, fitted: Fit, doubtful: bool) ->
         even = settle(search, fitted.model, weights)
         found.append((even.model, cross_validate(even, search.presses, weights, search.folds)))
     model, score = max(found, key=lambda item: item[1].gain_over(before))
-    needed = MIN_GAIN if doubtful else 0.0
-    lucky = doubtful and not agree(before.squares - score.squares, search.seed, AGREEMENT_P)
+    needed = DOUBTFUL_GAIN if doubtful else 0.0
+    lucky = doubtful and not agree(before.squares - score.squares, search.seed, DOUBTFUL_P)
     return plain.model if score.gain_over(before) <= needed or lucky else model
 
 
