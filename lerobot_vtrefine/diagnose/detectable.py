@@ -11,21 +11,10 @@ MARGIN = 3.2 + 0.85
 """Standard errors that an effect must stand out by to pass the screening in four cases of five."""
 CORRECTIONS = 2
 MAIN = {
-    "nonlinear_stiffness": "exponent",
-    "saturation": "knee_counts",
     "viscoelastic_relaxation": "fraction",
     "hysteresis": "fraction",
-    "row_sharing": "conductance_per_count",
-    "crosstalk": "row",
-    "mechanical_spreading": "sigma_m",
-    "baseline_drift": "rate_counts_per_s",
-    "latency": "tau_s",
-    "scan_skew": "skew_s",
-    "sample_and_hold": "period_s",
-    "contact_offset": "offset_m",
-    "pad_tilt": "tilt_x_rad",
 }
-"""Parameter in which the smallest effect is given."""
+"""Parameter in which the smallest effect is given, where it is not the first that a form reports."""
 NULL = {"nonlinear_stiffness": 1.0}
 """Value that means no effect, where it is not 0; an exponent's excess is given."""
 
@@ -51,7 +40,7 @@ def _of_cause(form: Form, scorer: Scorer) -> float | None:
 
 def _public(form: Form, values: np.ndarray, scorer: Scorer) -> float:
     report = form.report(values, scorer.fitted.model.setting)
-    name = MAIN[form.family]
+    name = MAIN.get(form.family, next(iter(report)))
     value = report[name][0]
     if value == 0.0 and form.family in ("crosstalk", "pad_tilt"):
         value = max((abs(item[0]) for item in report.values()), default=0.0)

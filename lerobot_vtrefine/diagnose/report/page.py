@@ -19,7 +19,7 @@ from lerobot_vtrefine.diagnose.report.figures import (
     trial_figure,
 )
 from lerobot_vtrefine.diagnose.report.numbers import interval, nested, p_text, percent, quantity
-from lerobot_vtrefine.diagnose.report.words import AXES, MEANINGS, doubts, headline, title
+from lerobot_vtrefine.diagnose.report.words import AXES, MEANINGS, doubts, headline, meaning, title
 from lerobot_vtrefine.diagnose.verdict import Parameter, Verdict
 
 SHOWN_TRACES = 4
@@ -56,7 +56,7 @@ def render_report(
         headline=headline(verdict, unit),
         verdict=verdict,
         verdict_of_pad=of_pad,
-        meanings=MEANINGS,
+        meaning=meaning,
         percent=percent,
         p_text=p_text,
         title=title,
@@ -66,8 +66,8 @@ def render_report(
         detectable=[
             {
                 "title": title(name),
-                "what": MEANINGS[name].parameter,
-                "size": quantity(size, MEANINGS[name].unit),
+                "what": meaning(name).parameter,
+                "size": quantity(size, meaning(name).unit),
             }
             for name, size in verdict.minimum_detectable.items()
         ],

@@ -119,6 +119,16 @@ def title(name: str) -> str:
     return MEANINGS[name].title if name in MEANINGS else name.replace("_", " ")
 
 
+def meaning(name: str) -> Meaning:
+    """What a cause is; one that was added to the catalogue says so in its file."""
+    if name in MEANINGS:
+        return MEANINGS[name]
+    from lerobot_vtrefine.diagnose.candidates import MEANING
+
+    text = MEANING.get(name, "")
+    return Meaning(title(name), text[:1].upper() + text[1:], "size", "1")
+
+
 def listing(items: Sequence[str], last: str = "and") -> str:
     """ "a", "a and b", "a, b and c"."""
     items = list(items)

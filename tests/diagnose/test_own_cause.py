@@ -1,0 +1,102 @@
+"""A cause of one's own, added as README says, is screened, named, reported and predicted."""
+
+import json
+import os
+import shutil
+import subprocess
+import sys
+from pathlib import Path
+
+import lerobot_vtrefine
+from lerobot_vtrefine.diagnose import candidates
+from lerobot_vtrefine.diagnose.verdict import SENSOR_CAUSES
+
+PACKAGE = Path(lerobot_vtrefine.__file__).parent
+SCRIPTS = Path(__file__).parents[2] / "scripts"
+
+STAGE = '''
+
+@register
+@dataclass(frozen=True)
+class ColumnSharing(Stage):
+    """s_rc / (1 + k * sum_i s_ic): the taxels of a column load each other."""
+
+    name: ClassVar[str] = "column_sharing"
+    domain: ClassVar[str] = "counts"
+    rank: ClassVar[int] = 57
+    conductance_per_count: float = parameter(1e-3, "1/counts", 0.0, 5e-3)
+
+    @override
+    def step(self, x: torch.Tensor, state: State, frame: Frame) -> tuple[torch.Tensor, State]:
+        return x / (1.0 + self.conductance_per_count * x.sum(dim=-2, keepdim=True)), state
+'''
+CANDIDATE = '''"""column_sharing: a taxel's reading falls as others of its column are pressed."""
+
+from lerobot_vtrefine.diagnose.candidates.base import Form, Value
+from lerobot_vtrefine.tactile.stages.readout import ColumnSharing
+
+FORMS = (
+    Form(
+        "column_sharing",
+        "divider",
+        (Value("load", 0.0, 3.0, 2e-3),),  # times the largest reading; 0 is no effect; step of differences
+        lambda v, s: (ColumnSharing(float(v[0]) / s.top_counts),),
+        lambda v, s: {"conductance_per_count": (float(v[0]) / s.top_counts, "1/counts")},
+        lambda s: [[0.05]],  # a small effect, for the screening
+        possible=lambda s: s.touched_rows > 1,
+    ),
+)
+'''
+HIDDEN = {
+    "schema": "vtrefine/reality@1",
+    "sensor_model": {
+        "schema": "vtrefine/sensor-model@1",
+        "stages": [
+            {"stage": "kelvin_voigt", "k_n": 400.0, "k_d": 1.2},
+            {"stage": "gain", "counts_per_n": 500.0},
+            {"stage": "column_sharing", "conductance_per_count": 3e-3},
+            {"stage": "idle", "level_counts": 25.0, "spread_counts": 10.0},
+            {"stage": "noise", "sigma_counts": 1.0},
+            {"stage": "quantisation"},
+        ],
+    },
+}
+
+
+def test_every_file_of_the_catalogue_is_asked_about() -> None:
+    files = {path.stem for path in (PACKAGE / "diagnose" / "candidates").glob("*.py")} - {"__init__", "base"}
+    families = {form.family for form in candidates.CATALOGUE}
+    assert families == files == set(SENSOR_CAUSES) - {"taxel_gain_spread", "dead_taxels"}
+    assert all(candidates.MEANING[name] for name in files)
+
+
+def test_a_cause_of_ones_own_is_named_reported_and_predicted(tmp_path: Path) -> None:
+    copy = tmp_path / "lerobot_vtrefine"
+    shutil.copytree(PACKAGE, copy, ignore=shutil.ignore_patterns("__pycache__", "assets"))
+    with (copy / "tactile" / "stages" / "readout.py").open("a", encoding="utf-8") as file:
+        file.write(STAGE)
+    (copy / "diagnose" / "candidates" / "column_sharing.py").write_text(CANDIDATE, encoding="utf-8")
+    (tmp_path / "reality.json").write_text(json.dumps(HIDDEN), encoding="utf-8")
+
+    def run(*command: str) -> str:
+        env = os.environ | {"PYTHONPATH": str(tmp_path)}
+        done = subprocess.run(
+            [sys.executable, *command], cwd=tmp_path, env=env, capture_output=True, text=True, check=False
+        )
+        assert done.returncode == 0, done.stderr[-2000:]
+        return done.stdout
+
+    run(str(SCRIPTS / "press_reality.py"), "--reality=reality.json", "--output_dir=presses")
+    said = run("-m", "lerobot_vtrefine.cli.diagnose", "--recording=presses", "--output_dir=out")
+    assert "explained: The simulation lacks column sharing." in said
+    verdict = json.loads((tmp_path / "out" / "verdict.json").read_text())
+    (cause,) = verdict["causes"]
+    low, high = cause["params"]["conductance_per_count"]["ci95"]
+    assert low <= 3e-3 <= high
+    assert verdict["heldout"]["gain"] > 0.8
+    assert "A taxel&#39;s reading falls as others of its column are pressed" in (
+        tmp_path / "out" / "report.html"
+    ).read_text(encoding="utf-8")
+    model = "--sensor_model=out/sensor_model.json"
+    run("-m", "lerobot_vtrefine.cli.predict", "--recording=presses", model, "--output_dir=predicted")
+    assert len(list((tmp_path / "predicted").glob("*.parquet"))) == 16
