@@ -18,14 +18,19 @@ from lerobot_vtrefine.diagnose.alarms import (
 from lerobot_vtrefine.diagnose.baseline import weigh
 from lerobot_vtrefine.diagnose.descriptors import DESCRIPTORS, Descriptor
 from lerobot_vtrefine.diagnose.fitting import Fit, tangents
+from lerobot_vtrefine.diagnose.gain_course import course_alarm
 from lerobot_vtrefine.diagnose.presses import PressSet
 from lerobot_vtrefine.diagnose.screening import Probe, Scorer, screen
 from lerobot_vtrefine.diagnose.search import Search
+from lerobot_vtrefine.diagnose.sliding import sliding_alarm
 
 DESCRIPTOR_P = 0.01
 DESCRIPTOR_SHARE = 0.02
 """Part of the squared error that a descriptor must take away on recordings left out."""
 RIDGE = 1e-9
+NO_MISFIT = ("spectrum", "level", "sliding", "gain course")
+"""Alarms that the form of no named cause has raised: a line, errors far above noise, what only sliding does
+and what changes through the session."""
 
 
 @dataclass(frozen=True)
@@ -57,6 +62,8 @@ def look_for_unknowns(search: Search, fitted: Fit, baseline: Fit) -> Suspicion:
     alarms.append(pair_alarm(search.presses, residuals))
     alarms.append(level_alarm(residuals, fitted, weights))
     alarms.append(condition_alarm(search.presses, residuals, fitted, weights))
+    alarms.append(sliding_alarm(search.presses, residuals, fitted, weights))
+    alarms.append(course_alarm(fitted, search.presses, weights))
     alarms.append(_descriptor_alarm(strangers, generic))
     known = tuple(alarm for alarm in alarms if alarm is not None)
     fired = [alarm for alarm in known if alarm.fired]
@@ -64,7 +71,7 @@ def look_for_unknowns(search: Search, fitted: Fit, baseline: Fit) -> Suspicion:
     if fired and families and only_misfit(search.presses, before, after):
         # Of what does not repeat, or changes through the session, repeatable errors say nothing.
         changing = any(item.descriptor.session for item in strangers)
-        kept = ("spectrum", "level", "descriptors") if changing else ("spectrum", "level")
+        kept = (*NO_MISFIT, "descriptors") if changing else NO_MISFIT
         fired = [alarm for alarm in fired if alarm.name in kept]
         known = tuple(alarm if alarm in fired else replace(alarm, fired=False) for alarm in known)
     clues = [alarm.clue for alarm in reversed(fired)]

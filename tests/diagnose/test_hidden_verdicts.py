@@ -66,6 +66,21 @@ def test_what_no_list_holds_is_said_to_be_unknown(tmp_path, form, size):
     assert names_of(verdict) == ()  # what was found beside it is a symptom
 
 
+@pytest.mark.parametrize(
+    ("form", "size", "seed", "word"),
+    [
+        ("direction", 2.0, 5490002, "slides"),
+        ("stick_slip", 1.0, 56330001, "slides"),
+        ("thermal_gain", 1.0, 6790000, "temperature"),
+    ],
+)
+def test_what_few_recordings_show_or_only_their_order_is_unknown_too(tmp_path, form, size, seed, word):
+    # No replicate repeats the slides that discovery sees; gains scatter between recordings anyway.
+    _, verdict, _ = verdict_on(tmp_path, Spec("4x4", (("outside", form, size),)), seed=seed)
+    assert verdict["status"] == "unexplained"
+    assert word in verdict["unknown"]["clue"]
+
+
 @pytest.mark.parametrize("noise", ["normal", "repeatability"])
 def test_nothing_is_found_where_nothing_is(tmp_path, noise):
     _, verdict, _ = verdict_on(tmp_path, Spec("4x4", noise=noise, changes=SMALL))

@@ -1,0 +1,67 @@
+"""Gains that follow the session or the temperature, though recordings scatter in gain anyway."""
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+from test_engine_pad import COLS, ROWS, linear, one_trial
+
+from lerobot_vtrefine.diagnose.alarms import Alarm
+from lerobot_vtrefine.diagnose.baseline import fit_baseline
+from lerobot_vtrefine.diagnose.gain_course import course_alarm, own_gains
+from lerobot_vtrefine.diagnose.presses import prepare
+from lerobot_vtrefine.diagnose.recordings import RecordingSet
+
+COUNT = 16
+SCATTER = np.random.default_rng(5).normal(0, 0.015, COUNT)
+
+
+def judged(gains: np.ndarray, warmth: np.ndarray | None = None, in_a_row: bool = False) -> Alarm | None:
+    """The alarm on recordings with these relative gains and temperatures [deg C], in the order of time."""
+    whole = np.arange(COUNT) if in_a_row else np.random.default_rng(3).permutation(COUNT)
+    trials = []
+    for place, number in enumerate(whole):
+        plain = one_trial(int(number), linear, 21, 1.0, 0.0)
+        idle = np.median(plain.raw, axis=0)
+        heat = None if warmth is None else np.full(len(plain.time_s), warmth[place])
+        raw = idle + (plain.raw - idle) * (1 + gains[place])
+        trials.append(replace(plain, order=place, start_s=30.0 * place, raw=raw, temperature_c=heat))
+    held = RecordingSet(Path(), "pad", ROWS, COLS, 0.002, "adc_counts", 255.0, (), tuple(trials))
+    presses = prepare(held, trials, list(range(COUNT)))
+    baseline = fit_baseline(presses)
+    assert np.corrcoef(own_gains(baseline.fitted, presses, baseline.weights), gains)[0, 1] > 0.95
+    return course_alarm(baseline.fitted, presses, baseline.weights)
+
+
+def fired(alarm: Alarm | None) -> bool:
+    assert alarm is not None
+    return alarm.fired
+
+
+def test_gains_that_only_scatter_are_nothing() -> None:
+    rng = np.random.default_rng(6)
+    assert not fired(judged(SCATTER))
+    assert not fired(judged(SCATTER, 22.0 + rng.standard_normal(COUNT)))
+
+
+def test_gains_that_swing_slowly_are_seen_without_a_thermometer() -> None:
+    swing = 0.05 * np.cos(2 * np.pi * np.arange(COUNT) / COUNT)
+    alarm = judged(SCATTER + swing)
+    assert alarm is not None
+    assert alarm.fired
+    assert "before and after" in alarm.clue
+
+
+def test_gains_that_follow_the_temperature_are_said_to() -> None:
+    warmth = 22.0 + np.random.default_rng(7).standard_normal(COUNT)
+    alarm = judged(SCATTER - 0.02 * (warmth - 22.0), warmth)
+    assert alarm is not None
+    assert alarm.fired
+    assert "temperature" in alarm.clue
+
+
+def test_a_course_that_conditions_made_in_a_row_share_is_no_course() -> None:
+    # Whatever depends on the command rises through the session when commands come in the order of their size.
+    steps = np.repeat([0.0, 0.0, 0.0, 0.0, 0.0, 0.05, 0.05, 0.05], 2)
+    assert fired(judged(SCATTER + steps))
+    assert not fired(judged(SCATTER + steps, in_a_row=True))
