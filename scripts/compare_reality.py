@@ -145,8 +145,12 @@ def press_stage(budget: Budget, name: str) -> Stage:
 
 
 def motion_stage(budget: Budget, name: str) -> Stage:
-    """Episodes of the scripted expert on a hidden robot, whether they succeed or not."""
+    """Episodes of the scripted expert on a hidden robot, whether they succeed or not.
+
+    It takes the parts from the table: motions that are wide beside any play.
+    """
     config = recipe(budget, budget.seeds[0])
+    env = recording_env(config) | {"start": "table"}
     output = budget.output_dir / folder_name(name) / "motions"
     command = [
         "vtrefine-record-demos",
@@ -156,7 +160,7 @@ def motion_stage(budget: Budget, name: str) -> Stage:
         f"--num_envs={budget.motions}",
         "--include_failures=true",
         f"--seed={config.seed * SEED_STRIDE + MOTION_SEED_OFFSET}",
-        *flags("env", {"type": "vtrefine"} | real_env(budget, name, recording_env(config))),
+        *flags("env", {"type": "vtrefine"} | real_env(budget, name, env)),
         *flags("degradation", config.degradation),
     ]
     stage, title = f"record_{folder_name(name)}", f"Record the robot of {name}"
@@ -336,7 +340,7 @@ def parse() -> tuple[argparse.Namespace, Budget]:
         ("eval_episodes", 200),
         ("eval_envs", 50),
         ("presses", 16),
-        ("motions", 30),
+        ("motions", 12),
     ):
         parser.add_argument(f"--{name}", type=int, default=default, help=f"default {default}")
     parser.add_argument("--lane", help=argparse.SUPPRESS)

@@ -17,8 +17,8 @@ from lerobot_vtrefine.diagnose.recordings import read_recording_set
 from lerobot_vtrefine.diagnose.report import render_report
 from lerobot_vtrefine.diagnose.report.axes import ticks
 from lerobot_vtrefine.diagnose.report.numbers import digits, interval, percent, quantity
-from lerobot_vtrefine.diagnose.report.words import MEANINGS
-from lerobot_vtrefine.diagnose.verdict import CAUSES, DataIssue, Unknown
+from lerobot_vtrefine.diagnose.report.words import MEANINGS, ties
+from lerobot_vtrefine.diagnose.verdict import CAUSES, DataIssue, Unknown, Verdict
 
 ISSUE = DataIssue("trial_0003.parquet", "starts loaded", "set aside")
 BROWSERS = ("chromium", "chromium-browser", "google-chrome", "chrome")
@@ -96,6 +96,15 @@ def test_first_line_is_the_verdict_in_plain_words(pad_set, robot_set):
     adequate = pad_diagnosis(status="adequate", causes=())
     assert "The simulation is adequate" in text_of(page(adequate, pad_set))[:120]
     assert "allow no verdict" in text_of(page(None, pad_set))[:120]
+
+
+def test_ties_are_told_once_whatever_their_order():
+    groups = (("backlash", "joint_friction"), ("joint_friction", "backlash"), ("latency", "crosstalk"))
+    verdict = Verdict("ambiguous", ambiguous_with=groups, next_experiment={"text": "drag it"})
+    assert ties(verdict) == [
+        "backlash or joint friction",
+        "latency or crosstalk",
+    ]
 
 
 def test_unknown_cause_demotes_names_to_symptoms(pad_set):

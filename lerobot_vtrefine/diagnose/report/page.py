@@ -19,7 +19,7 @@ from lerobot_vtrefine.diagnose.report.figures import (
     trial_figure,
 )
 from lerobot_vtrefine.diagnose.report.numbers import interval, nested, p_text, percent, quantity
-from lerobot_vtrefine.diagnose.report.words import AXES, MEANINGS, doubts, headline, meaning, title
+from lerobot_vtrefine.diagnose.report.words import AXES, MEANINGS, doubts, headline, meaning, ties, title
 from lerobot_vtrefine.diagnose.verdict import Parameter, Verdict
 
 SHOWN_TRACES = 4
@@ -60,6 +60,7 @@ def render_report(
         percent=percent,
         p_text=p_text,
         title=title,
+        ties=ties(verdict),
         doubts=doubts(verdict, len(recordings.trials), sound),
         facts=_facts(verdict, recordings, sound, seed),
         next_experiment=_experiment(verdict.next_experiment),

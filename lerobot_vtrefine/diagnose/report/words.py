@@ -137,10 +137,16 @@ def listing(items: Sequence[str], last: str = "and") -> str:
     return f"{', '.join(items[:-1])} {last} {items[-1]}"
 
 
+def ties(verdict: Verdict) -> list[str]:
+    """Names that cannot be told apart, "a or b"; joints that tie the other way round add nothing."""
+    groups = {frozenset(group): group for group in reversed(verdict.ambiguous_with)}
+    return [listing([title(name) for name in group], "or") for group in reversed(groups.values())]
+
+
 def headline(verdict: Verdict, unit: str) -> str:
     """The first sentence of the report."""
     names = listing([title(cause.name) for cause in verdict.causes])
-    pairs = listing([listing([title(name) for name in group], "or") for group in verdict.ambiguous_with])
+    pairs = listing(ties(verdict))
     if verdict.status == "invalid_data":
         return "These recordings allow no verdict: too little of them is sound."
     if verdict.status == "adequate":
