@@ -101,10 +101,13 @@ def _folder(source: SourceConfig) -> EpisodeFolder:
 
 def describe(comparison: Comparison) -> list[str]:
     """The result in a few lines of text."""
+    from lerobot_vtrefine.diagnose.episode_replay.figures import unit_of
+
     lines = [f"{len(comparison.pairs)} episodes; {comparison.twin}"]
     for row in comparison.tracking:
-        unit = "mm" if row.joint.endswith("finger") else "mrad"
-        explained = "" if row.explained is None else f", explains {100 * row.explained:.0f} %"
+        unit, explained = unit_of(row.joint), ""
+        if row.explained is not None:
+            explained = f", explains {100 * row.explained:.0f} %"
         lines.append(
             f"  {row.joint:<20} RMSE {1e3 * row.rmse:6.1f} {unit:<4} bias {1e3 * row.bias:+6.1f}{explained}"
         )

@@ -22,9 +22,9 @@ def data_uri(figure: Figure) -> str:
     return f"data:image/png;base64,{base64.b64encode(buffer.getvalue()).decode('ascii')}"
 
 
-def unit_of(joint: str) -> tuple[str, float]:
-    """Unit for people, and its factor: mm for fingers, mrad for the rest."""
-    return ("mm", 1e3) if joint.endswith("finger") else ("mrad", 1e3)
+def unit_of(joint: str) -> str:
+    """Unit for people, a thousandth of the SI unit: mm for fingers, mrad for the rest."""
+    return "mm" if joint.endswith("finger") else "mrad"
 
 
 def tracking_bars(tracking: list[JointTracking]) -> Figure:
@@ -32,7 +32,7 @@ def tracking_bars(tracking: list[JointTracking]) -> Figure:
     figure = Figure(figsize=(10, 3.4), layout="constrained")
     axes = figure.subplots(1, 2, width_ratios=[3, 1])
     for axis, unit in zip(axes, ("mrad", "mm"), strict=True):
-        rows = [row for row in tracking if unit_of(row.joint)[0] == unit]
+        rows = [row for row in tracking if unit_of(row.joint) == unit]
         place = np.arange(len(rows))
         reference = [1e3 * row.command_rmse for row in rows]
         axis.bar(place - 0.2, reference, 0.4, color=COMMAND, label="recorded − command")
@@ -55,7 +55,7 @@ def joint_traces(pair: EpisodePair, joints: list[str], fps: float) -> Figure:
     axes = figure.subplots(rows, columns, sharex=True, squeeze=False).ravel()
     time = np.arange(len(pair.position)) / fps
     for j, (axis, joint) in enumerate(zip(axes, joints, strict=False)):
-        unit, scale = ("mm", 1e3) if unit_of(joint)[0] == "mm" else ("rad", 1.0)
+        unit, scale = ("mm", 1e3) if unit_of(joint) == "mm" else ("rad", 1.0)
         axis.step(time, scale * pair.recorded.action[:, j], where="post", color=COMMAND, lw=1)
         axis.plot(time, scale * pair.recorded.state[:, j], color=RECORDED, lw=1.4)
         axis.plot(time, scale * pair.position[:, j], color=TWIN, lw=1.2)

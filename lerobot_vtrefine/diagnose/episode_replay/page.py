@@ -46,21 +46,19 @@ def render_page(comparison: Comparison) -> str:
 
 
 def _tracking_row(row: Any) -> dict[str, str]:
-    unit, scale = figures.unit_of(row.joint)
-
-    def number(value: float | None, factor: float = scale, digits: int = 1) -> str:
-        return "–" if value is None else f"{factor * value:.{digits}f}"
+    def number(value: float | None, digits: int = 1) -> str:
+        return "–" if value is None else f"{1e3 * value:.{digits}f}"
 
     interval = "" if row.rmse_ci95 is None else f" [{number(row.rmse_ci95[0])}, {number(row.rmse_ci95[1])}]"
     return {
         "joint": row.joint.replace("_", " "),
-        "unit": unit,
+        "unit": figures.unit_of(row.joint),
         "rmse": number(row.rmse) + interval,
         "bias": number(row.bias),
         "peak": number(row.peak),
         "command": number(row.command_rmse),
         "explained": "–" if row.explained is None else f"{100 * row.explained:.0f} %",
-        "lags": f"{number(row.recorded_lag_s, 1e3, 0)} / {number(row.twin_lag_s, 1e3, 0)}",
+        "lags": f"{number(row.recorded_lag_s, 0)} / {number(row.twin_lag_s, 0)}",
     }
 
 
