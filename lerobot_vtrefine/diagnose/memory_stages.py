@@ -8,7 +8,7 @@ import numpy as np
 
 from lerobot_vtrefine.diagnose.fields import Context, Field, by_press
 from lerobot_vtrefine.diagnose.rhythm import slots
-from lerobot_vtrefine.tactile.stages.host import Latency, SampleAndHold, ScanSkew
+from lerobot_vtrefine.tactile.stages.host import Latency, SampleAndHold, ScanSkew, taken_at_frames
 from lerobot_vtrefine.tactile.stages.mechanics import Hysteresis, ViscoelasticRelaxation
 
 MAX_EXPONENT = 200.0
@@ -84,10 +84,27 @@ def _scan_skew(stage: ScanSkew, field: Field, context: Context) -> Field:
     return by_press(field, context.sheet, work)
 
 
+def interpolated(x: np.ndarray, time_s: np.ndarray, at_s: np.ndarray) -> np.ndarray:
+    """Columns of x (T, n), known at times (T,), at other times (K,); the ends go on as they are."""
+    after = np.clip(np.searchsorted(time_s, at_s), 1, len(time_s) - 1)
+    span = np.maximum(time_s[after] - time_s[after - 1], 1e-12)
+    part = np.clip((at_s - time_s[after - 1]) / span, 0.0, 1.0)[:, None]
+    return (1.0 - part) * x[after - 1] + part * x[after]
+
+
 def _hold(stage: SampleAndHold, field: Field, context: Context) -> Field:
     """A free board's instants are those that the recording itself shows."""
     sheet, out = context.sheet, np.zeros_like(field.values)
     for press, (time_s, rhythm) in enumerate(zip(sheet.times_s, sheet.rhythms, strict=True)):
+        if stage.irregular or stage.frame_s:
+            part = field.within(sheet, press)
+            at = (
+                rhythm.taken_s(time_s) - float(stage.lag_s)
+                if stage.irregular
+                else taken_at_frames(time_s, float(stage.period_s), float(stage.frame_s))
+            )
+            out[: len(time_s), part] = interpolated(field.values[: len(time_s), part], time_s, at)
+            continue
         phase = rhythm.phase(float(stage.period_s)) if stage.free else 0.0
         slot = slots(time_s, float(stage.period_s), phase)
         new = np.concatenate([[True], slot[1:] != slot[:-1]])

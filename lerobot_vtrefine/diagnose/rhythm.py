@@ -27,6 +27,11 @@ class Rhythm:
         telling = touching & np.concatenate([[False], np.diff(time_s) > 0])
         return cls(time_s, np.concatenate([[True], changed]), telling)
 
+    def taken_s(self, times_s: np.ndarray) -> np.ndarray:
+        """When the readings that are there at times (T,) were new: the last frame whose readings changed."""
+        fresh = self.time_s[self.fresh]
+        return fresh[np.maximum(np.searchsorted(fresh, times_s + 1e-9, "right") - 1, 0)]
+
     def phase(self, period_s: float) -> float:
         """Part of a period that had gone by at the trial's start, as far as new readings tell."""
         kept = self.__dict__.setdefault("_phases", {})

@@ -9,7 +9,7 @@ import numpy as np
 from lerobot_vtrefine.diagnose.baseline import Baseline
 from lerobot_vtrefine.diagnose.candidates import CATALOGUE
 from lerobot_vtrefine.diagnose.candidates.base import Form
-from lerobot_vtrefine.diagnose.candidates.sample_and_hold import pattern
+from lerobot_vtrefine.diagnose.candidates.sample_and_hold import held, irregular_periods, pattern
 from lerobot_vtrefine.diagnose.crossvalidation import folds_of
 from lerobot_vtrefine.diagnose.fitting import Fit, tangents
 from lerobot_vtrefine.diagnose.maps import find_dead, map_evidence
@@ -17,6 +17,9 @@ from lerobot_vtrefine.diagnose.parallel import on_all_cores
 from lerobot_vtrefine.diagnose.presses import PressSet
 from lerobot_vtrefine.diagnose.screening import Probe, Scorer, Screened, probe_form
 from lerobot_vtrefine.diagnose.weights import TrialWeights
+
+SEEN = 1e9
+"""What is seen in the readings themselves explains more than any score: it needs no permutation."""
 
 
 @dataclass
@@ -95,12 +98,17 @@ def map_probes(search: Search, fitted: Fit) -> list[Probe]:
 
 
 def hold_probe(search: Search, fitted: Fit) -> Probe | None:
-    """Readings that repeat bit for bit, in a rhythm, are held whatever the motion: that needs no flips."""
+    """Readings that repeat, in a rhythm or more often than by chance, are held whatever the motion."""
     if "sample_and_hold" in fitted.model.families:
         return None
-    rhythm = pattern(search.presses, fitted.model.setting.frame_s)
-    if rhythm is None:
-        return None
-    size = np.array([1e9])
-    form = forms_of("sample_and_hold", fitted)[int(rhythm.free)]
-    return Probe("sample_and_hold", form, np.array([rhythm.period_s]), size, size, True, 1e-4)
+    frame_s = fitted.model.setting.frame_s
+    rhythm = pattern(search.presses, frame_s)
+    forms = forms_of("sample_and_hold", fitted)
+    size = np.array([SEEN])
+    if rhythm is not None:
+        values = np.array([rhythm.period_s])
+        return Probe("sample_and_hold", forms[int(rhythm.free)], values, size, size, True, 1e-4)
+    if held(search.presses):
+        values = np.array(irregular_periods(search.presses, frame_s)[0])
+        return Probe("sample_and_hold", forms[-1], values, size, size, True, 1e-4)
+    return None

@@ -9,6 +9,7 @@ import numpy as np
 from lerobot_vtrefine.diagnose.alarms import LEVEL, slow_errors
 from lerobot_vtrefine.diagnose.baseline import plain_weights, weigh
 from lerobot_vtrefine.diagnose.candidates.base import Form
+from lerobot_vtrefine.diagnose.candidates.sample_and_hold import held
 from lerobot_vtrefine.diagnose.composite import Composite
 from lerobot_vtrefine.diagnose.crossvalidation import Score, agree, cross_validate
 from lerobot_vtrefine.diagnose.fitting import Fit, fit, predict, squared_errors, tangents
@@ -16,6 +17,7 @@ from lerobot_vtrefine.diagnose.maps import find_dead, with_map
 from lerobot_vtrefine.diagnose.parallel import on_all_cores
 from lerobot_vtrefine.diagnose.screening import ALPHA, Probe, Scorer, Screened, probe_form, screen
 from lerobot_vtrefine.diagnose.search import (
+    SEEN,
     Search,
     all_probes,
     forms_of,
@@ -293,7 +295,8 @@ def rank(search: Search, fitted: Fit, candidates: Sequence[Screened], probes: Se
 
     def further(item: Screened) -> tuple[Fit, Score]:
         name = item.probe.name
-        if gains[name] >= worth or item.probe.form not in (None, *forms_of(name, fitted)[:1]):
+        other = item.probe.form not in (None, *forms_of(name, fitted)[:1])
+        if gains[name] >= worth or other or item.probe.explained >= SEEN:
             return elaborate(search, fitted, name, probes, plain[name])
         return plain[name]
 
@@ -304,12 +307,15 @@ def rank(search: Search, fitted: Fit, candidates: Sequence[Screened], probes: Se
     slighted = [name for name in grown if grown[name] is plain[name] and gains[name] > needed]
     for name in slighted if richest > RICH else []:
         grown[name] = elaborate(search, fitted, name, probes, plain[name], richest - 1)
+    # Frames that repeat bit for bit are there, however little is foretold by it.
+    seen = {item.probe.name for item in tried if item.probe.explained >= SEEN} - set(MAPS)
     steps = []
     for name, (found, score) in grown.items():
         gain, logs = score.gain_over(base), score.better_by(base)
         search.tried[name] = max(gain, search.tried.get(name, -np.inf))
-        agreed = name == "dead_taxels" or agree(logs, search.seed, AGREEMENT_P)
-        if gain > needed and logs.sum() > 0 and agreed:
+        sure = name == "dead_taxels" or name in seen
+        agreed = sure or agree(logs, search.seed, AGREEMENT_P)
+        if gain > (0.0 if name in seen else needed) and logs.sum() > 0 and agreed:
             steps.append(Step(name, found, score, gain, logs))
     return frugal(search, sorted(steps, key=lambda step: -float(step.logs.sum())))
 
@@ -333,11 +339,14 @@ def frugal(search: Search, steps: list[Step]) -> list[Step]:
 
 
 def backward(search: Search, fitted: Fit) -> Fit:
-    """Drop causes whose removal costs less than EXTRA_GAIN."""
+    """Drop causes whose removal costs less than EXTRA_GAIN; held frames, which are seen, if it costs none."""
     while len(fitted.model.families) > 1:
         full = scored(search, fitted)
         slims = on_all_cores(partial(take_away, search, fitted), fitted.model.families)
         costs = [full.gain_over(scored(search, slim)) for slim in slims]
+        if held(search.presses):
+            shown = [name == "sample_and_hold" for name in fitted.model.families]
+            costs = [np.inf if sure and cost > 0 else cost for sure, cost in zip(shown, costs, strict=True)]
         if min(costs) >= EXTRA_GAIN:
             break
         fitted = slims[int(np.argmin(costs))]

@@ -1,14 +1,18 @@
 """When readings were new, and the rhythm in which they are held."""
 
+from types import SimpleNamespace
+
 import numpy as np
 import pytest
 import torch
 
+from lerobot_vtrefine.diagnose.candidates.sample_and_hold import held, irregular_periods
+from lerobot_vtrefine.diagnose.memory_stages import interpolated
 from lerobot_vtrefine.diagnose.rhythm import Rhythm, slots
 from lerobot_vtrefine.tactile.layout import PadLayout
 from lerobot_vtrefine.tactile.model import SensorModel
 from lerobot_vtrefine.tactile.stages.base import Frame
-from lerobot_vtrefine.tactile.stages.host import SampleAndHold
+from lerobot_vtrefine.tactile.stages.host import SampleAndHold, taken_at_frames
 
 
 def held_recording(period_s: float, phase: float, seed: int) -> Rhythm:
@@ -63,3 +67,71 @@ def test_a_free_board_holds_from_an_instant_of_its_own_in_every_episode() -> Non
 def test_models_of_free_boards_survive_their_file() -> None:
     model = SensorModel.paper().with_stage(SampleAndHold(0.2, free=True))
     assert SensorModel.from_dict(model.to_dict()) == model
+
+
+def test_a_board_read_at_the_frames_holds_what_the_first_frame_of_a_period_showed() -> None:
+    time_s = np.arange(40) * 0.05
+    held = taken_at_frames(time_s, 0.12, 0.05)
+    np.testing.assert_allclose(held[:8], [0, 0, 0, 0.15, 0.15, 0.25, 0.25, 0.25], atol=1e-9)
+    late = torch.as_tensor(3.0 * time_s)[:, None, None]
+    frames = SampleAndHold(0.12, frame_s=0.05).sequence(
+        late, torch.as_tensor(time_s), Frame(PadLayout(1, 1, 0.002))
+    )
+    np.testing.assert_allclose(frames[:, 0, 0], 3.0 * held, atol=1e-9)
+
+
+def test_irregular_readings_are_as_old_on_average_as_was_seen() -> None:
+    time_s = torch.arange(100, dtype=torch.float64) * 0.05
+    stage = SampleAndHold(0.1, free=True, irregular=True, age_s=0.04, lag_s=0.01)
+    mean = stage.sequence((2.0 * time_s)[:, None, None], time_s, Frame(PadLayout(1, 1, 0.002)))
+    assert torch.allclose(mean[50:, 0, 0], 2.0 * (time_s[50:] - 0.05))
+    assert (
+        SensorModel.from_dict(SensorModel.paper().with_stage(stage).to_dict()).find("sample_and_hold")
+        == stage
+    )
+
+
+def press_set(signals: list[np.ndarray]) -> SimpleNamespace:
+    """Presses at 20 Hz, always in touch, with a drive that goes up and down."""
+    presses = []
+    for signal in signals:
+        time_s = np.arange(len(signal)) * 0.05
+        drive = np.abs(np.sin(2.0 * time_s))[:, None, None]
+        rhythm = Rhythm.of(time_s, signal, np.ones(len(signal), dtype=bool))
+        presses.append(SimpleNamespace(time_s=time_s, signal=signal, drive=drive, rhythm=rhythm))
+    return SimpleNamespace(presses=tuple(presses))
+
+
+def dropped(signal: np.ndarray, chance: float, rng: np.random.Generator) -> np.ndarray:
+    """Frames lost at random, the one before in their place."""
+    there = rng.random(len(signal)) >= chance
+    there[0] = True
+    return signal[np.maximum.accumulate(np.where(there, np.arange(len(signal)), 0))]
+
+
+@pytest.mark.parametrize(("taxels", "noise"), [(20, 0.6), (1, 1.0)])
+def test_frames_that_repeat_at_random_are_held_and_chance_repeats_are_not(taxels: int, noise: float) -> None:
+    rng = np.random.default_rng(5)
+    motion = 80.0 * np.abs(np.sin(2.0 * np.arange(200) * 0.05))[:, None]
+    whole = [np.round(motion + noise * rng.standard_normal((200, taxels))) for _ in range(6)]
+    lost = [dropped(signal, 0.25, rng) for signal in whole]
+    assert held(press_set(lost))
+    assert not held(press_set(whole))
+    period_s, age_s, _ = irregular_periods(press_set(lost), 0.05)[0]
+    assert period_s == pytest.approx(0.05 / 0.75, rel=0.1)
+    assert age_s == pytest.approx(0.05 * 0.25 / 0.75, rel=0.3)
+
+
+def test_a_still_pad_of_one_taxel_that_repeats_is_not_held() -> None:
+    rng = np.random.default_rng(6)
+    still = [np.round(0.3 * rng.standard_normal((200, 1))) for _ in range(6)]
+    assert not held(press_set(still))
+
+
+def test_held_frames_show_what_the_model_said_at_the_last_new_one() -> None:
+    rhythm = press_set([np.array([[1.0], [1.0], [2.0], [2.0], [2.0], [3.0]])]).presses[0].rhythm
+    np.testing.assert_allclose(rhythm.taken_s(rhythm.time_s), np.array([0, 0, 2, 2, 2, 5]) * 0.05)
+    values = np.arange(12.0)[:, None]
+    fine_s = np.arange(12) * 0.025
+    shown = interpolated(values, fine_s, rhythm.taken_s(fine_s))
+    np.testing.assert_allclose(shown[:, 0], [0, 0, 0, 0, 4, 4, 4, 4, 4, 4, 10, 10], atol=1e-9)

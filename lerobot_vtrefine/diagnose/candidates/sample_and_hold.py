@@ -6,13 +6,16 @@ from dataclasses import dataclass
 import numpy as np
 
 from lerobot_vtrefine.diagnose.candidates.base import Form, Value
-from lerobot_vtrefine.diagnose.presses import PressSet
+from lerobot_vtrefine.diagnose.presses import Press, PressSet
 from lerobot_vtrefine.tactile.stages.host import SampleAndHold
 
 MAX_FRAMES = 12.0
 """Longest period looked for, in frames."""
 RARITY = 0.08
 """How far the mean time between new readings may be off as a period."""
+MIN_HELD, CHANCE = 0.04, 0.2
+"""Share of frames that must repeat the one before for readings to be held, and what part may be chance."""
+MANY_TAXELS, MIN_TELLING, SURE_MOVE = 6, 10, 4.0
 MIN_REPEATED = 0.1
 """Share of frames that must repeat the one before for a rhythm to be looked for."""
 CONTRADICTED = 0.1
@@ -25,6 +28,47 @@ def repeated_share(presses: PressSet) -> float:
     repeats = sum(int((press.rhythm.telling & ~press.rhythm.fresh).sum()) for press in presses.presses)
     moves = sum(int(press.rhythm.telling.sum()) for press in presses.presses)
     return repeats / moves if moves else 0.0
+
+
+def held(presses: PressSet) -> bool:
+    """Whether more frames repeat the one before than noise and rounding make by chance."""
+    shares = [share for press in presses.presses if (share := _repeats(press)) is not None]
+    if not shares:
+        return False
+    seen, by_chance = np.mean(shares, axis=0)
+    return bool(seen > MIN_HELD and by_chance < CHANCE * seen)
+
+
+def _repeats(press: Press) -> tuple[float, float] | None:
+    """Share of frames under load that repeat the one before, and what share would by chance; None if unknown.
+
+    By chance all taxels repeat together as often as each does while others change. Few taxels say little of
+    each other: then frames count in which the motion alone changes readings by far more than noise.
+    """
+    changed = np.diff(press.signal, axis=0) != 0.0
+    use = press.rhythm.telling[1:]
+    few = changed.shape[1] < MANY_TAXELS
+    if few:
+        use = use & _moving(press)
+    changed = changed[use]
+    fresh = changed.any(axis=1)
+    if len(fresh) < MIN_TELLING or not fresh.any():
+        return None
+    same = float(np.prod(1.0 - changed[fresh].mean(axis=0)))
+    return float(1.0 - fresh.mean()), 0.0 if few else same
+
+
+def _moving(press: Press) -> np.ndarray:
+    """Steps (T-1,) in which the drive moves so much that the reading must."""
+    steps = np.abs(np.diff(np.maximum(press.drive, 0.0).sum(axis=(1, 2))))
+    jumps = np.abs(np.diff(press.signal, axis=0)).max(axis=1)
+    still = steps < 1e-3 * max(float(steps.max()), 1e-12)
+    noise = float(np.std(jumps[still])) + float(np.mean(jumps[still])) if still.sum() > MIN_TELLING else 1.0
+    fast = (
+        steps > np.quantile(steps[steps > 0], 0.5) if (steps > 0).any() else np.zeros(len(steps), dtype=bool)
+    )
+    usual = float(np.median(jumps[fast & (jumps > 0)])) if (fast & (jumps > 0)).any() else 0.0
+    return fast if usual > SURE_MOVE * max(noise, 1e-9) else np.zeros(len(steps), dtype=bool)
 
 
 @dataclass(frozen=True)
@@ -83,6 +127,16 @@ def periods(presses: PressSet, frame_s: float) -> list[list[float]]:
     return [*_between(*alike(presses, grid)), *plain]
 
 
+def frame_periods(presses: PressSet, frame_s: float) -> list[list[float]]:
+    """The same, as close as the frames of whole recordings tell: many periods go by in one [s]."""
+    coarse = periods(presses, frame_s)
+    if repeated_share(presses) < MIN_HELD:
+        return coarse
+    guess, _ = _best(presses, frame_s, False)
+    finer = guess * np.exp(np.linspace(-0.003, 0.003, 601))
+    return _between(*alike(presses, finer))
+
+
 def free_periods(presses: PressSet, frame_s: float) -> list[list[float]]:
     """Periods that fit best if new readings come free of the trials' starts [s]."""
     return _between(*_best(presses, frame_s, True))
@@ -93,6 +147,30 @@ def _between(low: float, high: float) -> list[list[float]]:
     inside = [[float(period)] for period in np.linspace(low, high, 9)]
     whole = [[round(end, digits)] for end in (low, high) for digits in (2, 3)]
     return [*inside, *(period for period in whole if low <= period[0] <= high)]
+
+
+def irregular_periods(presses: PressSet, frame_s: float) -> list[list[float]]:
+    """Mean time between new readings and since the last one; read at the frame, or before it [s]."""
+    ages = [press.time_s - press.rhythm.taken_s(press.time_s) for press in presses.presses]
+    telling = [press.rhythm.telling for press in presses.presses]
+    age_s = float(
+        np.mean(np.concatenate([age[use] for age, use in zip(ages, telling, strict=True)] or [[0.0]]))
+    )
+    period_s = frame_s / max(1.0 - repeated_share(presses), 1.0 / MAX_FRAMES)
+    return [[period_s, age_s, lag] for lag in (0.0, 0.5 * frame_s)]
+
+
+def _mean_period(values: np.ndarray, presses: PressSet) -> dict[str, tuple[float, float]]:
+    """The mean period's own scatter between recordings."""
+    shares = []
+    for press in presses.presses:
+        telling = int(press.rhythm.telling.sum())
+        if telling >= MIN_TELLING:
+            shares.append(float((press.rhythm.telling & press.rhythm.fresh).sum()) / telling)
+    known = np.array(shares)
+    error = 1.96 * float(known.std(ddof=1)) / np.sqrt(len(known)) if len(known) > 1 else 0.5
+    part = min(error / max(float(known.mean()), 1e-3), 0.9) if len(known) else 0.9
+    return {"period_s": (float(values[0]) / (1.0 + part), float(values[0]) / (1.0 - part))}
 
 
 def undecided(free: bool) -> Callable[[np.ndarray, PressSet], dict[str, tuple[float, float]]]:
@@ -129,6 +207,34 @@ FORMS = (
         amplitude=None,
         search=free_periods,
         range=undecided(True),
+        screened=False,
+    ),
+    Form(
+        "sample_and_hold",
+        "fixed period, read at the frames",
+        (Value("period_s", 1e-3, 2.0, 0.0),),
+        lambda v, s: (SampleAndHold(float(v[0]), frame_s=s.frame_s),),
+        lambda v, s: {"period_s": (float(v[0]), "s")},
+        lambda s: [[2.0001 * s.frame_s]],
+        amplitude=None,
+        search=frame_periods,
+        range=undecided(False),
+        screened=False,
+    ),
+    Form(
+        "sample_and_hold",
+        "irregular periods",
+        (Value("period_s", 1e-3, 2.0, 0.0), Value("age_s", 0.0, 2.0, 0.0), Value("lag_s", 0.0, 0.1, 1e-3)),
+        lambda v, s: (
+            SampleAndHold(
+                float(v[0]), free=True, irregular=True, age_s=float(v[1]), lag_s=max(float(v[2]), 0.0)
+            ),
+        ),
+        lambda v, s: {"period_s": (float(v[0]), "s")},
+        lambda s: [[2.0 * s.frame_s, 0.5 * s.frame_s, 0.0]],
+        amplitude=None,
+        search=irregular_periods,
+        range=_mean_period,
         screened=False,
     ),
 )

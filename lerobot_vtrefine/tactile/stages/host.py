@@ -25,10 +25,11 @@ HISTORY_FRAMES = 16
 
 
 def delayed_sequence(x: torch.Tensor, times_s: torch.Tensor, delay_s: torch.Tensor) -> torch.Tensor:
-    """x (T, ..., R, C) as it was `delay_s` (R,) earlier, linear between frames, held before the first."""
+    """x (T, ..., R, C) as it was `delay_s`, (R,) or (T, R), earlier; linear between frames, held before the
+    first."""
     if len(times_s) < 2:
         return x
-    wanted = times_s[:, None] - delay_s[None].to(times_s)
+    wanted = times_s[:, None] - delay_s.to(times_s)
     after = torch.searchsorted(times_s, wanted.contiguous(), right=True).clamp(1, len(times_s) - 1)
     span = (times_s[after] - times_s[after - 1]).clamp(min=1e-12)
     weight = ((wanted - times_s[after - 1]) / span).clamp(0.0, 1.0).to(x.dtype)
@@ -38,6 +39,12 @@ def delayed_sequence(x: torch.Tensor, times_s: torch.Tensor, delay_s: torch.Tens
     weight = weight.view(*weight.shape, *middle, 1)
     earlier, later = by_row[after - 1, rows], by_row[after, rows]
     return (earlier + weight * (later - earlier)).movedim(1, -2)
+
+
+def taken_at_frames(times_s: np.ndarray, period_s: float, frame_s: float) -> np.ndarray:
+    """When what is held at times (T,) was read: at the first frame after the present period began [s]."""
+    begun = np.floor(times_s / period_s + 1e-6) * period_s
+    return np.minimum(np.ceil(begun / frame_s - 1e-3) * frame_s, times_s)
 
 
 @dataclass(frozen=True)
@@ -193,7 +200,9 @@ class SampleAndHold(Stage):
     """A new reading reaches the host every `period_s`; between, the last one is repeated.
 
     Periods are counted from the episode's start or, where the board runs `free` of the host, from an instant
-    drawn for every episode.
+    drawn for every episode. Where they are `irregular` (`period_s` is their mean), readings are `lag_s` to
+    `lag_s` + 2 `age_s` old. With `frame_s` the reading is that of the first frame, of frames this far apart,
+    after the period began.
     """
 
     name: ClassVar[str] = "sample_and_hold"
@@ -202,10 +211,14 @@ class SampleAndHold(Stage):
     has_state: ClassVar[bool] = True
     period_s: float = parameter(0.043, "s", 0.01, 0.1, minimum=1e-6)
     free: bool = False
+    irregular: bool = False
+    age_s: float = parameter(0.0, "s", 0.0, 0.0)
+    lag_s: float = parameter(0.0, "s", 0.0, 0.0)
+    frame_s: float = parameter(0.0, "s", 0.0, 0.0)
 
     @override
     def traits(self, layout: PadLayout, pads: int, rng: np.random.Generator) -> Traits:
-        return {"phase": rng.uniform(0.0, 1.0, (pads, 1, 1))} if self.free else {}
+        return {"phase": rng.uniform(0.0, 1.0, (pads, 1, 1))} if self.free or self.irregular else {}
 
     @override
     def initial(self, layout: PadLayout, pads: int) -> Traits:
@@ -226,8 +239,13 @@ class SampleAndHold(Stage):
     @override
     def sequence(self, x: torch.Tensor, times_s: torch.Tensor, frame: Frame) -> torch.Tensor:
         """As `step` frame by frame; of a free board, whose instants nobody knows, the mean over them."""
-        if not self.free:
+        if self.frame_s:
+            held = taken_at_frames(times_s.numpy(), self.period_s, self.frame_s)
+            delay_s = times_s.to(torch.float64) - torch.from_numpy(held)
+            return delayed_sequence(x, times_s, delay_s[:, None].expand(-1, x.shape[-2]))
+        if not self.free and not self.irregular:
             return super().sequence(x, times_s, frame)
-        rows, ages = x.shape[-2], (torch.arange(PHASES, dtype=torch.float64) + 0.5) / PHASES * self.period_s
+        rows, parts = x.shape[-2], (torch.arange(PHASES, dtype=torch.float64) + 0.5) / PHASES
+        ages = self.lag_s + 2.0 * self.age_s * parts if self.irregular else self.period_s * parts
         delays = ages[:, None].expand(-1, rows)
         return torch.stack([delayed_sequence(x, times_s, delay) for delay in delays]).mean(dim=0)
