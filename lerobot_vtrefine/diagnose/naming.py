@@ -88,7 +88,7 @@ def _why_rejected(adjusted: float | None, gain: float | None) -> str:
     if adjusted is None:
         return "no sign of it"
     if adjusted > ALPHA:
-        return "recordings agree on it no more than by chance"
+        return f"recordings agree on it no more than by chance (adjusted p above {ALPHA:g})"
     if gain is None:
         return "passed the screening, but others explained more and left nothing for it"
     if gain <= EXTRA_GAIN:

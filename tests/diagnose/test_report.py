@@ -107,6 +107,14 @@ def test_ties_are_told_once_whatever_their_order():
     ]
 
 
+def test_nothing_wrong_is_said_without_an_extension(pad_set):
+    text = text_of(page(pad_diagnosis(status="adequate", causes=()), pad_set))
+    assert text.index("The simulation is adequate") < 60
+    assert "Nothing was added to the model, so extended and simulated are the same" in text
+    assert "More recordings would show smaller effects than those listed" in text
+    assert "Nothing was added" not in text_of(page(pad_diagnosis(), pad_set))
+
+
 def test_unknown_cause_demotes_names_to_symptoms(pad_set):
     symptoms = tuple(
         type(c)(c.name, "symptom", c.params, c.p_value, c.heldout_gain) for c in pad_diagnosis().causes
