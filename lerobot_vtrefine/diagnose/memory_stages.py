@@ -42,7 +42,7 @@ def _relaxation(stage: ViscoelasticRelaxation, field: Field, context: Context) -
         relaxed = x.copy()
         for tau_s, fraction in zip(taus, fractions, strict=True):
             relaxed -= fraction * low_passed(x, time_s, tau_s)
-        return relaxed
+        return np.maximum(relaxed, 0.0, out=relaxed) if stage.pushes_only else relaxed
 
     return by_press(field, context.sheet, work)
 
@@ -114,11 +114,17 @@ def _hold(stage: SampleAndHold, field: Field, context: Context) -> Field:
     return Field(out, field.columns)
 
 
-def play(x: np.ndarray, half_width: float | np.ndarray) -> np.ndarray:
-    """Play operator on columns of x (T, n) with reset at zero, as in the hysteresis stage: (T, n)."""
+def play(
+    x: np.ndarray, half_width: float | np.ndarray, above: float | np.ndarray | None = None
+) -> np.ndarray:
+    """Play operator on columns of x (T, n) with reset at zero, as in the hysteresis stage: (T, n).
+
+    Its band reaches from `above` (half its width by default) over x to the rest of the width below.
+    """
+    above = half_width if above is None else above
     touched = x > 0
-    upper = np.where(touched, x + half_width, 0.0)
-    out = np.where(touched, np.maximum(x - half_width, 0.0), 0.0)
+    upper = np.where(touched, x + above, 0.0)
+    out = np.where(touched, np.maximum(x + above - 2.0 * half_width, 0.0), 0.0)
     state = np.zeros(x.shape[1])
     for high, line in zip(upper, out, strict=True):
         np.maximum(np.minimum(state, high, out=high), line, out=line)
@@ -126,12 +132,42 @@ def play(x: np.ndarray, half_width: float | np.ndarray) -> np.ndarray:
     return out
 
 
+def turned_back(x: np.ndarray, width: float) -> np.ndarray:
+    """Unloading so far (T, n), as a part of `width` up to 1; taken back by loading, 0 without contact."""
+    steps, touched = np.diff(x, axis=0, prepend=np.zeros_like(x[:1])) / max(width, 1e-12), x > 0
+    out, state = np.empty_like(x), np.zeros(x.shape[1])
+    for step, contact, line in zip(steps, touched, out, strict=True):
+        np.clip(state - step, 0.0, 1.0, out=line)
+        line *= contact
+        state = line
+    return out
+
+
+def peak_share(x: np.ndarray) -> np.ndarray:
+    """x (T, n) over its largest value since its column was last untouched; 1 while it rises."""
+    out, peak = np.ones_like(x), np.zeros(x.shape[1])
+    for row, line in zip(x, out, strict=True):
+        peak = np.where(row > 0, np.maximum(peak, row), 0.0)
+        np.divide(row, peak, out=line, where=peak > 0)
+    return out
+
+
 def _hysteresis(stage: Hysteresis, field: Field, context: Context) -> Field:
     widths = stage.width_m if isinstance(stage.width_m, tuple) else (stage.width_m,)
     fractions = stage.fraction if isinstance(stage.fraction, tuple) else (stage.fraction,)
+    if stage.loop == "scaled":
+        held = field.values.copy()
+        for width_m, fraction in zip(widths, fractions, strict=True):
+            held += fraction * field.values * turned_back(field.values, width_m * context.stiffness)
+        return Field(np.maximum(held, 0.0), field.columns)
+    if stage.loop == "peak":
+        share = peak_share(field.values)
+        bent = 1.0 + 4.0 * math.fsum(fractions) * share * (1.0 - share)
+        return Field(np.maximum(field.values * bent, 0.0), field.columns)
     held = (1.0 - math.fsum(fractions)) * field.values
     for width_m, fraction in zip(widths, fractions, strict=True):
-        held += fraction * play(field.values, 0.5 * width_m * context.stiffness)
+        half = 0.5 * width_m * context.stiffness
+        held += fraction * play(field.values, half, half if stage.loop == "even" else 0.0)
     return Field(np.maximum(held, 0.0), field.columns)
 
 

@@ -17,6 +17,9 @@ SEED = 7011
         ("contact_offset", "soft"),
         ("mechanical_spreading", "box"),
         ("crosstalk", "one_sided"),
+        ("hysteresis", "branch"),
+        ("hysteresis", "below_peak"),
+        ("viscoelastic_relaxation", "power_creep"),
     ],
     ids=lambda name: name,
 )

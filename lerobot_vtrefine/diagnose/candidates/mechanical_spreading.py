@@ -31,10 +31,20 @@ def _rings(values: np.ndarray, setting: Setting) -> tuple[Stage, ...]:
     return (MechanicalSpreading(sigma_m, rings, float(values[-1])),)
 
 
+def _gaussian(taxels: float) -> np.ndarray:
+    """Weights at the centre and at every ring's distance."""
+    return np.exp(-0.5 * (np.array((0.0, *RING_TAXELS)) / max(taxels, 0.1)) ** 2)
+
+
+def _lost(values: np.ndarray, setting: Setting) -> tuple[Stage, ...]:
+    taxels, kept = (float(value) for value in values)
+    rings = tuple(float(weight) for weight in _gaussian(taxels)[1:])
+    return (MechanicalSpreading(taxels * setting.layout.pitch_m, rings, kept),)
+
+
 def _as_rings(values: np.ndarray, setting: Setting) -> list[float]:
     """The Gaussian's weights, each over the one before; not quite zero, where slopes vanish."""
-    taxels = max(float(values[0]), 0.3)
-    weights = np.exp(-0.5 * (np.array((0.0, *RING_TAXELS)) / taxels) ** 2)
+    weights = _gaussian(max(float(values[0]), 0.3))
     return [*np.clip(weights[1:] / weights[:-1], 0.05, 0.95).tolist(), 0.5]
 
 
@@ -48,6 +58,18 @@ FORMS = (
         lambda s: [[0.35], [0.7]],
         amplitude=None,
         possible=lambda s: s.layout.num_taxels > 1,
+    ),
+    Form(
+        "mechanical_spreading",
+        "Gaussian, of a cover that reaches beyond the taxels",
+        (Value("taxels", 0.0, 1.3, 5e-3), Value("kept", 0.0, 1.0, 2e-3)),
+        _lost,
+        lambda v, s: {"sigma_m": (float(v[0]) * s.layout.pitch_m, "m")},
+        lambda s: [[0.5, 0.2]],
+        amplitude=None,
+        possible=lambda s: min(s.layout.rows, s.layout.cols) > 1,
+        screened=False,
+        grown=lambda v, s: [float(v[0]), 0.2],
     ),
     Form(
         "mechanical_spreading",

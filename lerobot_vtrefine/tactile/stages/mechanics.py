@@ -142,6 +142,7 @@ class ViscoelasticRelaxation(Stage):
     sum(fraction).
 
     `tau_s` and `fraction` are numbers or equally long lists. Exact for a force that is linear between frames.
+    What has relaxed may pull after release; with `pushes_only` the result is never negative.
     """
 
     name: ClassVar[str] = "viscoelastic_relaxation"
@@ -150,6 +151,7 @@ class ViscoelasticRelaxation(Stage):
     has_state: ClassVar[bool] = True
     tau_s: Any = field(default=1.0, metadata={"unit": "s", "range": (0.3, 3.0), "minimum": 1e-6})
     fraction: Any = field(default=0.15, metadata={"unit": "1", "range": (0.0, 0.3), "minimum": None})
+    pushes_only: bool = False
 
     def __post_init__(self) -> None:
         for name in ("tau_s", "fraction"):
@@ -178,7 +180,10 @@ class ViscoelasticRelaxation(Stage):
                 slow = decay * slow + (1.0 - decay) * previous + ramp * (x - previous)
             new[f"slow_{j}"] = slow
             relaxed = relaxed - fraction * slow
-        return relaxed, new
+        return (relaxed.clamp(min=0.0) if self.pushes_only else relaxed), new
+
+
+LOOPS = ("even", "behind", "scaled", "peak")
 
 
 @register
@@ -192,6 +197,11 @@ class Hysteresis(Stage):
     `fraction` and `width_m` are numbers or equally long lists (several operators make loops of any shape). A
     positive
     fraction reads less while loading, a negative one more, as a cover that dissipates energy does.
+
+    `loop` says where the band lies: "even" about f; "behind" it, so that only loading differs from f, as sums
+    of relays have it; "scaled" is a loop as wide as the load is high: f (1 + fraction b), with b from 0 to 1
+    over `width_m` of unloading; "peak" follows f / (largest f of this contact) = s: f (1 + 4 fraction s (1 -
+    s)), so that loops close at both ends (`width_m` has no part in it).
     """
 
     name: ClassVar[str] = "hysteresis"
@@ -200,11 +210,14 @@ class Hysteresis(Stage):
     has_state: ClassVar[bool] = True
     fraction: Any = field(default=0.15, metadata={"unit": "1", "range": (0.0, 0.3), "minimum": None})
     width_m: Any = field(default=2e-4, metadata={"unit": "m", "range": (5e-5, 5e-4), "minimum": 0.0})
+    loop: str = "even"
 
     def __post_init__(self) -> None:
         for name in ("fraction", "width_m"):
             object.__setattr__(self, name, as_tuple(getattr(self, name)))
         super().__post_init__()
+        if self.loop not in LOOPS:
+            raise ValueError(f"hysteresis.loop must be one of {', '.join(LOOPS)}, got {self.loop!r}")
         self._operators()
 
     def _operators(self) -> list[tuple[str, Any, Any]]:
@@ -215,14 +228,27 @@ class Hysteresis(Stage):
     @override
     def initial(self, layout: PadLayout, pads: int) -> Traits:
         shape = (pads, layout.rows, layout.cols)
-        return {name: np.zeros(shape, dtype=np.float32) for name, _, _ in self._operators()}
+        names = [name for name, _, _ in self._operators()] + (["before"] if self.loop == "scaled" else [])
+        return {name: np.zeros(shape, dtype=np.float32) for name in names}
 
     @override
     def step(self, x: torch.Tensor, state: State, frame: Frame) -> tuple[torch.Tensor, State]:
         new, looped = dict(state), x
         for name, fraction, width_m in self._operators():
-            half_width = 0.5 * width_m * frame.stiffness_n_per_m
-            play = torch.maximum(torch.minimum(state[name], x + half_width), x - half_width).clamp(min=0.0)
+            width = width_m * frame.stiffness_n_per_m
+            if self.loop == "scaled":
+                tiny = torch.as_tensor(width, dtype=x.dtype, device=x.device).clamp(min=1e-12)
+                back = (state[name] - (x - state["before"]) / tiny).clamp(0.0, 1.0)
+                new |= {name: back * (x > 0), "before": x}
+                looped = looped + fraction * new[name] * x
+                continue
+            if self.loop == "peak":
+                new[name] = torch.maximum(state[name], x) * (x > 0)
+                share = x / new[name].clamp(min=1e-12)
+                looped = looped + 4.0 * fraction * share * (1.0 - share) * x.clamp(min=0.0)
+                continue
+            above = 0.5 * width if self.loop == "even" else 0.0 * width
+            play = torch.maximum(torch.minimum(state[name], x + above), x + above - width).clamp(min=0.0)
             new[name] = play * (x > 0)
             looped = looped + fraction * (new[name] - x)
         return looped.clamp(min=0.0), new

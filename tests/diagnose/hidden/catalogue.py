@@ -27,6 +27,7 @@ FORMS: dict[str, dict[str, Factory]] = {
         "prony_pair": mechanics.prony_pair,
         "log_creep": mechanics.log_creep,
         "stretched": mechanics.stretched,
+        "power_creep": mechanics.power_creep,
     },
     "hysteresis": {
         "play": mechanics.play_loop,
@@ -34,6 +35,7 @@ FORMS: dict[str, dict[str, Factory]] = {
         "bouc_wen": mechanics.bouc_wen,
         "preisach": mechanics.preisach,
         "branch": mechanics.branch,
+        "below_peak": mechanics.below_peak,
     },
     "taxel_gain_spread": {
         "log_normal": electronics.log_normal_gains,

@@ -137,6 +137,17 @@ def stretched(pad: Pad, size: float, rng: Draw) -> Effect:
     return Effect("viscoelastic_relaxation", "stretched", "force", apply)
 
 
+def power_creep(pad: Pad, size: float, rng: Draw) -> Effect:
+    """Relaxation over three decades of time, of a cover that lets go instead of pulling."""
+    times = np.geomspace(0.03, 10.0, 6)
+    share = 0.035 * size
+
+    def apply(scene: Scene, f: np.ndarray) -> np.ndarray:
+        return np.maximum(f - sum(share * low_pass(f, tau, scene.dt) for tau in times), 0.0)
+
+    return Effect("viscoelastic_relaxation", "power_creep", "force", apply)
+
+
 def play(d: np.ndarray, half: float | np.ndarray) -> np.ndarray:
     """Play operator of half width `half`, along time; forgets what it knew where there is no contact."""
     out, now = np.empty_like(d), np.zeros_like(d[0])
@@ -212,6 +223,21 @@ def branch(pad: Pad, size: float, rng: Draw) -> Effect:
         return f * (1 + more * out)
 
     return Effect("hysteresis", "branch", "force", apply)
+
+
+def below_peak(pad: Pad, size: float, rng: Draw) -> Effect:
+    """Less is read below the largest load of a contact, most of all at half of it."""
+    less = 0.1 * size
+
+    def apply(scene: Scene, f: np.ndarray) -> np.ndarray:
+        peak, out = np.zeros(f.shape[1]), np.empty_like(f)
+        for i, now in enumerate(f):
+            peak = np.where(now > 0, np.maximum(peak, now), 0.0)
+            rest = np.divide(now, peak, out=np.ones_like(now), where=peak > 0)
+            out[i] = now * (1 - 4 * less * rest * (1 - rest))
+        return out
+
+    return Effect("hysteresis", "below_peak", "force", apply)
 
 
 def _spread(rows: int, cols: int, kernel: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
