@@ -140,7 +140,15 @@ def test_residuals_say_what_they_are_drawn_against(pad_set, robot_set):
     assert "of the joint that the simulation misses most" not in text
     robot = robot_diagnosis()
     worst = robot.traces[0].channels[0]
-    assert f"of the joint that the simulation misses most ({worst})" in text_of(page(robot, robot_set))
+    text = text_of(page(robot, robot_set))
+    assert f"of the joint that the simulation misses most ({worst})" in text
+    assert "into the pad" not in text
+
+
+def test_headline_tells_the_first_of_several_clues(robot_set):
+    clues = Unknown(True, f"left_waist: too few trials; {'; '.join(['right_elbow: too few trials'] * 9)}")
+    text = text_of(page(robot_diagnosis(status="unexplained", causes=(), unknown=clues), robot_set))
+    assert text.count("What is known of it: left_waist: too few trials.") == 1
 
 
 def test_everything_found_and_not_found_is_there(pad_set):

@@ -19,7 +19,16 @@ from lerobot_vtrefine.diagnose.report.figures import (
     trial_figure,
 )
 from lerobot_vtrefine.diagnose.report.numbers import interval, nested, p_text, percent, quantity
-from lerobot_vtrefine.diagnose.report.words import AXES, MEANINGS, doubts, headline, meaning, ties, title
+from lerobot_vtrefine.diagnose.report.words import (
+    AXES,
+    MEANINGS,
+    ROBOT_AXES,
+    doubts,
+    headline,
+    meaning,
+    ties,
+    title,
+)
 from lerobot_vtrefine.diagnose.verdict import Parameter, Verdict
 
 SHOWN_TRACES = 4
@@ -96,6 +105,7 @@ def _nothing() -> dict[str, Any]:
 def _findings(verdict: Verdict, diagnosis: Diagnosis, unit: str, of_pad: bool) -> dict[str, Any]:
     traces = [{"caption": text, "figure": trace_figure(t, unit)} for t, text in _ordered(diagnosis.traces)]
     groups = [(title(cause.name), cause.params) for cause in verdict.causes]
+    axes = AXES if of_pad else ROBOT_AXES
     return {
         "error_chart": error_figure(verdict.heldout, unit) if verdict.heldout else "",
         "trial_chart": trial_figure(diagnosis.trial_errors, unit) if diagnosis.trial_errors else "",
@@ -103,7 +113,7 @@ def _findings(verdict: Verdict, diagnosis: Diagnosis, unit: str, of_pad: bool) -
         "traces": traces[:SHOWN_TRACES],
         "more_traces": traces[SHOWN_TRACES:],
         "residuals": [
-            {"caption": AXES.get(view.axis, view.axis), "figure": residual_figure(view, unit)}
+            {"caption": axes.get(view.axis, view.axis), "figure": residual_figure(view, unit)}
             for view in diagnosis.residuals
         ],
         "worst_joint": "" if of_pad or not diagnosis.traces else diagnosis.traces[0].channels[0],

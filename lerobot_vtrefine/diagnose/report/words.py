@@ -99,7 +99,7 @@ MEANINGS = {
 
 
 AXES = {
-    "load": "Against load: of a taxel the reading above idle that the simulation expects",
+    "load": "Against load: the reading above idle that the simulation expects",
     "history": "Against history: how far the load is below the largest one so far",
     "rate": "Against the rate at which it is driven; into the pad is above zero",
     "depth": "Against depth; below zero nothing touches the taxel",
@@ -110,8 +110,12 @@ AXES = {
     "session": "Against time in the session",
 }
 """What a residual is drawn against."""
-LONGEST_CLUE = 110
-"""Longer clues are told below the headline only."""
+ROBOT_AXES = AXES | {
+    "load": "Against the joint's measured load",
+    "rate": "Against the commanded speed",
+}
+LONGEST_CLUE = 130
+"""Longer clues are told below the headline only, and of several the first one."""
 
 
 def title(name: str) -> str:
@@ -158,7 +162,7 @@ def headline(verdict: Verdict, unit: str) -> str:
         sure = [title(c.name) for c in verdict.causes if not any(c.name in g for g in verdict.ambiguous_with)]
         beside = f" It surely lacks {listing(sure)}." if sure else ""
         return f"The simulation is wrong, but these recordings cannot tell whether it lacks {pairs}.{beside}"
-    clue = verdict.unknown.clue or ""
+    clue = (verdict.unknown.clue or "").split(";")[0]
     clue = f" What is known of it: {clue}." if 0 < len(clue) <= LONGEST_CLUE else ""
     symptoms = f" What looks like {names} may be a symptom of it.{_all_the_same(verdict)}" if names else ""
     return f"The simulation is wrong in a way that no known cause explains.{clue}{symptoms}"
