@@ -21,6 +21,12 @@ MISFIT, MISFIT_NOISE = 0.1, 1.0 / 3.0
 still repeats is laid to the names' form. Effects outside the catalogue that borrow names leave a fifth."""
 FLIPS = 4999
 PAIR_CORRELATION, PAIR_DEVIATIONS, MIN_STRANGERS = 0.2, 6.0, 30
+PAIRS, PAIRS_LEFT, PAIRS_MISFIT = (0.1, 4.5), (0.1, 2.8), (0.15, 4.5)
+"""Mean correlation of all replicates, and its distance from strangers' in standard errors, that mean an
+unknown cause: without a name, beside names that leave much, and beside names that leave little. Site effects
+that replicates share bring .08 and 3.5."""
+LEFT = 0.25
+"""Part of what repeats that names of true causes, in whatever form, do not leave."""
 LAG = 3
 LOADED = 0.05
 """Part of the largest signal from which on a taxel counts as loaded."""
@@ -137,35 +143,75 @@ def replicate_alarm(presses: PressSet, residuals: Sequence[np.ndarray], seed: in
     return Alarm("replicates", bool(fired), share, p_value, text)
 
 
-def pair_alarm(presses: PressSet, residuals: Sequence[np.ndarray]) -> Alarm | None:
-    """Correlations between replicates of one command, against those between strangers: what repeats in only a
-    few conditions (a slide, say) drowns in the sum over all.
+@dataclass(frozen=True)
+class Correlations:
+    """Correlations of residuals between recordings: of every condition, and between strangers."""
 
-    None without enough replicates and strangers.
-    """
-    names = presses.conditions
-    alike: dict[str, list[float]] = defaultdict(list)
-    strangers = []
-    for i, j in combinations(range(len(names)), 2):
-        both = _aligned(presses, residuals, i, j)
-        if both is None:
-            continue
-        power = np.sqrt(float((both[0] ** 2).sum()) * float((both[1] ** 2).sum()))
-        value = float((both[0] * both[1]).sum()) / power if power > 0 else 0.0
-        if names[i] == names[j]:
-            alike[names[i]].append(value)
-        else:
-            strangers.append(value)
-    if not alike or len(strangers) < MIN_STRANGERS:
-        return None
-    spread = max(float(np.std(strangers)), 1e-6)
-    best = max(alike, key=lambda name: float(np.mean(alike[name])))
-    seen = float(np.mean(alike[best]))
+    alike: dict[str, list[float]]
+    strangers: np.ndarray
+
+    @classmethod
+    def of(cls, presses: PressSet, residuals: Sequence[np.ndarray]) -> "Correlations | None":
+        """None without enough replicates and strangers."""
+        names = presses.conditions
+        alike: dict[str, list[float]] = defaultdict(list)
+        strangers = []
+        for i, j in combinations(range(len(names)), 2):
+            both = _aligned(presses, residuals, i, j)
+            if both is None:
+                continue
+            power = np.sqrt(float((both[0] ** 2).sum()) * float((both[1] ** 2).sum()))
+            value = float((both[0] * both[1]).sum()) / power if power > 0 else 0.0
+            if names[i] == names[j]:
+                alike[names[i]].append(value)
+            else:
+                strangers.append(value)
+        return cls(dict(alike), np.array(strangers)) if alike and len(strangers) >= MIN_STRANGERS else None
+
+    @property
+    def spread(self) -> float:
+        """Standard deviation among strangers."""
+        return max(float(np.std(self.strangers)), 1e-6)
+
+
+def pair_alarm(presses: PressSet, residuals: Sequence[np.ndarray], found: Correlations) -> Alarm:
+    """Correlations between replicates of one command, against those between strangers: what repeats in only a
+    few conditions (a slide, say) drowns in the sum over all."""
+    best = max(found.alike, key=lambda name: float(np.mean(found.alike[name])))
+    seen = float(np.mean(found.alike[best]))
     rms = np.sqrt(max(seen, 0.0)) * np.sqrt(np.mean([np.mean(r**2) for r in residuals]))
-    far = (seen - float(np.mean(strangers))) / spread
+    far = (seen - float(np.mean(found.strangers))) / found.spread
     fired = far > PAIR_DEVIATIONS and seen > PAIR_CORRELATION and rms > MIN_RMS * presses.full_scale
     text = f"{100 * seen:.0f} % of the residual of condition {best} repeats between its recordings"
     return Alarm("one condition", bool(fired), seen, float(norm.sf(far)), text + _motion_of(presses, best))
+
+
+def left_over(presses: PressSet, before: Sequence[np.ndarray], after: Sequence[np.ndarray]) -> float:
+    """Part of the baseline's repeatable squared error (residuals `before`) that is left in `after`."""
+    plain, extended = _replicated(presses, before), _replicated(presses, after)
+    if plain is None or extended is None or plain.products.sum() <= 0:
+        return 0.0
+    return float(extended.products.sum() / plain.products.sum())
+
+
+def pairs_alarm(
+    presses: PressSet, residuals: Sequence[np.ndarray], found: Correlations, left: float | None
+) -> Alarm:
+    """The mean over all pairs of replicates, against strangers: a handful of pairs, whose signs alone tell
+    little, agree far more than recordings of other commands do.
+
+    Args:
+        left: part of what repeats that the named causes leave; None if there are none. Where they leave much,
+            less certainty is asked for; where they leave little, form misfit repeats as well.
+    """
+    values = np.concatenate([np.array(pairs) for pairs in found.alike.values()])
+    seen = float(values.mean())
+    rms = np.sqrt(max(seen, 0.0)) * np.sqrt(np.mean([np.mean(r**2) for r in residuals]))
+    far = (seen - float(found.strangers.mean())) / found.spread * np.sqrt(len(values))
+    least, deviations = PAIRS if left is None else PAIRS_LEFT if left > LEFT else PAIRS_MISFIT
+    fired = far > deviations and seen > least and rms > MIN_RMS * presses.full_scale
+    text = f"{100 * seen:.0f} % of the residual repeats between recordings of the same command"
+    return Alarm("all pairs", bool(fired), seen, float(norm.sf(far)), text)
 
 
 def _motion_of(presses: PressSet, condition: str) -> str:

@@ -46,6 +46,12 @@ def _sliding(press: Press) -> tuple[np.ndarray, np.ndarray]:
     return (np.gradient(press.trial.x_m) / step)[:, None], (np.gradient(press.trial.y_m) / step)[:, None]
 
 
+def _carriage(press: Press, signal: Signal, axis: int) -> np.ndarray:
+    """Where the indenter is, from the pad's centre (T, n) [m]."""
+    where = press.trial.x_m if axis == 0 else press.trial.y_m
+    return np.broadcast_to(where[:, None], signal.shape)
+
+
 def _place(press: Press, axis: int) -> np.ndarray:
     """x or y of the scored taxels (n,) in half pads."""
     cols = press.layout.full_cols
@@ -114,6 +120,8 @@ DESCRIPTORS = (
     Descriptor("load times the rate of depth", (*TIMING, *MEMORY), lambda p, s: s * _depth_rate(p, s)),
     Descriptor("loading or unloading", (*MEMORY, *TIMING), lambda p, s: s * np.sign(_depth_rate(p, s))),
     Descriptor("the speed of depth, either way", MEMORY, lambda p, s: s * np.abs(_depth_rate(p, s))),
+    Descriptor("the indenter's place along the row, at every taxel", (), lambda p, s: _carriage(p, s, 0)),
+    Descriptor("the indenter's place along the column, at every taxel", (), lambda p, s: _carriage(p, s, 1)),
     Descriptor("the speed of sliding", (), lambda p, s: s * np.hypot(*_sliding(p))),
     Descriptor("the direction of sliding along the row", TIMING, lambda p, s: s * np.sign(_sliding(p)[0])),
     Descriptor("the direction of sliding along the column", TIMING, lambda p, s: s * np.sign(_sliding(p)[1])),

@@ -7,15 +7,19 @@ import numpy as np
 
 from lerobot_vtrefine.diagnose.alarms import (
     Alarm,
+    Correlations,
     cleaned,
     condition_alarm,
+    left_over,
     level_alarm,
     line_alarm,
     only_misfit,
     pair_alarm,
+    pairs_alarm,
     replicate_alarm,
 )
 from lerobot_vtrefine.diagnose.baseline import weigh
+from lerobot_vtrefine.diagnose.beside import beside_alarm, taxel_alarm
 from lerobot_vtrefine.diagnose.descriptors import DESCRIPTORS, Descriptor
 from lerobot_vtrefine.diagnose.fitting import Fit, tangents
 from lerobot_vtrefine.diagnose.gain_course import course_alarm
@@ -27,6 +31,8 @@ from lerobot_vtrefine.diagnose.sliding import sliding_alarm
 DESCRIPTOR_P = 0.01
 DESCRIPTOR_SHARE = 0.02
 """Part of the squared error that a descriptor must take away on recordings left out."""
+OWNED_SHARE = 0.1
+"""Part that no form of a family leaves to the descriptors of its own kind of effect."""
 RIDGE = 1e-9
 NO_MISFIT = ("spectrum", "level", "sliding", "gain course")
 """Alarms that the form of no named cause has raised: a line, errors far above noise, what only sliding does
@@ -57,12 +63,20 @@ def look_for_unknowns(search: Search, fitted: Fit, baseline: Fit) -> Suspicion:
     residuals = cleaned(fitted, search.presses, weights)
     generic = describe_residual(search, fitted)
     families = set(fitted.model.families)
-    strangers = [item for item in generic if not families & set(item.descriptor.owners)]
+    strangers = [
+        item for item in generic if item.share > OWNED_SHARE or not families & set(item.descriptor.owners)
+    ]
     alarms = [replicate_alarm(search.presses, residuals, search.seed), line_alarm(search.presses, residuals)]
-    alarms.append(pair_alarm(search.presses, residuals))
+    pairs = Correlations.of(search.presses, residuals)
+    if pairs is not None:
+        alarms.append(pair_alarm(search.presses, residuals, pairs))
+        left = left_over(search.presses, baseline.residuals(search.presses), residuals) if families else None
+        alarms.append(pairs_alarm(search.presses, residuals, pairs, left))
     alarms.append(level_alarm(residuals, fitted, weights))
     alarms.append(condition_alarm(search.presses, residuals, fitted, weights))
     alarms.append(sliding_alarm(search.presses, residuals, fitted, weights))
+    alarms.append(beside_alarm(search.presses, residuals, fitted, weights))
+    alarms.append(taxel_alarm(search.presses, residuals, weights))
     alarms.append(course_alarm(fitted, search.presses, weights))
     alarms.append(_descriptor_alarm(strangers, generic))
     known = tuple(alarm for alarm in alarms if alarm is not None)

@@ -1,0 +1,89 @@
+"""Alarms for what no name accounts for: beside the indenter, at one taxel, by its place, in replicates."""
+
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from test_engine_pad import COLS, ROWS, linear, one_trial
+
+from lerobot_vtrefine.diagnose.alarms import Correlations, cleaned, left_over, pairs_alarm
+from lerobot_vtrefine.diagnose.baseline import Baseline, fit_baseline
+from lerobot_vtrefine.diagnose.beside import beside_alarm, taxel_alarm
+from lerobot_vtrefine.diagnose.presses import PressSet, prepare
+from lerobot_vtrefine.diagnose.recordings import RecordingSet, Trial
+from lerobot_vtrefine.diagnose.search import start_search
+from lerobot_vtrefine.diagnose.unknowns import describe_residual
+
+COUNT = 16
+
+
+def fitted(added: Callable[[Trial], np.ndarray]) -> tuple[PressSet, Baseline]:
+    """Presses of a plain pad to whose readings (T, N) something is added [counts], and their baseline."""
+    trials = [one_trial(number, linear, 21, 1.0, 1.0) for number in range(COUNT)]
+    trials = [replace(trial, raw=np.round(trial.raw + added(trial)).clip(0, 255)) for trial in trials]
+    held = RecordingSet(Path(), "pad", ROWS, COLS, 0.002, "adc_counts", 255.0, (), tuple(trials))
+    presses = prepare(held, trials, list(range(COUNT)))
+    return presses, fit_baseline(presses)
+
+
+def nothing(trial: Trial) -> np.ndarray:
+    return np.zeros((1, 1))
+
+
+def load_of(trial: Trial) -> np.ndarray:
+    assert trial.depth_m is not None
+    return np.maximum(trial.depth_m, 0.0)[:, None] / 5e-4
+
+
+def hot_corner(trial: Trial) -> np.ndarray:
+    return 9.0 * load_of(trial) * (np.arange(ROWS * COLS) == 0)
+
+
+@pytest.mark.parametrize(("added", "expected"), [(nothing, False), (hot_corner, True)])
+def test_a_taxel_that_answers_to_all_loads_stands_out(added, expected) -> None:
+    presses, baseline = fitted(added)
+    residuals = cleaned(baseline.fitted, presses, baseline.weights)
+    alarm = taxel_alarm(presses, residuals, baseline.weights)
+    assert alarm is not None
+    assert alarm.fired == expected
+    if expected:
+        assert "(0, 0)" in alarm.clue
+
+
+@pytest.mark.parametrize(("added", "expected"), [(nothing, False), (lambda t: 4.0 * load_of(t) ** 2, True)])
+def test_taxels_beside_the_indenter_read_nothing(added, expected) -> None:
+    presses, baseline = fitted(added)
+    residuals = cleaned(baseline.fitted, presses, baseline.weights)
+    alarm = beside_alarm(presses, residuals, baseline.fitted, baseline.weights)
+    assert alarm is not None
+    assert alarm.fired == expected
+
+
+def test_readings_that_follow_the_indenters_place_without_contact_are_described() -> None:
+    presses, baseline = fitted(lambda trial: 1.5 * trial.x_m[:, None] / 1e-3)
+    found = describe_residual(start_search(baseline, presses, 0), baseline.fitted)
+    assert "place along the row" in found[0].descriptor.text
+
+
+def test_pairs_of_replicates_are_judged_by_what_names_leave() -> None:
+    presses, baseline = fitted(nothing)
+    rng = np.random.default_rng(4)
+    shared = {name: rng.standard_normal((200, ROWS * COLS)) for name in presses.conditions}
+    noise = [3.0 * rng.standard_normal(signal.shape) for signal in baseline.fitted.signals]
+
+    def with_shared(size: float) -> list[np.ndarray]:
+        pairs = zip(noise, presses.presses, strict=True)
+        return [n + size * shared[p.trial.condition][: len(n), : n.shape[1]] for n, p in pairs]
+
+    much, some = with_shared(3.0), with_shared(1.1)
+    assert left_over(presses, much, some) == pytest.approx(1.1**2 / 3.0**2, rel=0.2)
+    found = Correlations.of(presses, some)
+    assert found is not None
+    assert pairs_alarm(presses, some, found, None).fired  # nothing is named: a tenth of the power repeats
+    assert pairs_alarm(presses, some, found, 0.5).fired  # names took half: they are symptoms
+    assert not pairs_alarm(presses, some, found, 0.1).fired  # names took nearly all: their form's misfit
+    silent = Correlations.of(presses, noise)
+    assert silent is not None
+    assert not pairs_alarm(presses, noise, silent, 0.5).fired
