@@ -26,6 +26,9 @@ MIN_MOTIONS = 4
 """With fewer motions than this, recordings are left out one by one."""
 MIN_FREEDOM = 2.0
 DIGITS = 6
+UNSEEN = 0.1
+"""Part of a frame by which delays may be off whatever the noise: nobody saw where between two frames a motion
+turned, and only there does a delay read otherwise than damping does."""
 
 
 @dataclass(frozen=True)
@@ -60,7 +63,8 @@ class LeftOut:
             return 0.0
         error = float(np.sqrt((count - 1) / count * total))
         # A normal deviate's fourth moment is 3: one motion that carries everything leaves 2 degrees.
-        freedom = float(np.clip(3.0 * total**2 / (power**2).sum() - 1.0, MIN_FREEDOM, count - 1))
+        shares = power / total
+        freedom = float(np.clip(3.0 / (shares**2).sum() - 1.0, MIN_FREEDOM, count - 1))
         return error * float(stats.t.ppf(0.975, freedom))
 
 
@@ -143,15 +147,23 @@ def _along_damping(
         best, values = of(fitted.model.values), [of(other.model.values) for other in alike]
         low, high = left_out.interval(of)
         half = 0.5 * (high - low)
+        unseen = UNSEEN * fitted.model.setting.frame_s
         bounds[name] = (
-            best - float(np.hypot(half, max(best - min(values), 0.0))),
-            best + float(np.hypot(half, max(max(values) - best, 0.0))),
+            best - unseen - float(np.hypot(half, max(best - min(values), 0.0))),
+            best + unseen + float(np.hypot(half, max(max(values) - best, 0.0))),
         )
     return bounds
 
 
 def _reporter(form: Form, setting: Setting, name: str, own: slice) -> Callable[[np.ndarray], float]:
-    return lambda values: float(form.report(values[own], setting)[name][0])
+    def report(values: np.ndarray) -> float:
+        try:
+            return float(form.report(values[own], setting)[name][0])
+        except OverflowError:
+            # A step without bounds may lead to where the parameter is no number any more.
+            return float(form.report(np.clip(values[own], form.low, form.high), setting)[name][0])
+
+    return report
 
 
 def _possible(

@@ -1,15 +1,18 @@
 """Intervals, noise with memory and the instants between frames, against tiny independent references."""
 
+import math
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 from scipy import stats
 
-from lerobot_vtrefine.diagnose.candidates.base import Setting
+from lerobot_vtrefine.diagnose import intervals
+from lerobot_vtrefine.diagnose.candidates.base import Form, Setting, Value
 from lerobot_vtrefine.diagnose.candidates.baseline_drift import FORMS as DRIFTS
 from lerobot_vtrefine.diagnose.candidates.sample_and_hold import undecided
-from lerobot_vtrefine.diagnose.intervals import LeftOut, _possible
+from lerobot_vtrefine.diagnose.intervals import LeftOut, _possible, _reporter
 from lerobot_vtrefine.diagnose.presses import prepare
 from lerobot_vtrefine.diagnose.recordings import RecordingSet, Trial
 from lerobot_vtrefine.diagnose.refinement import instants_of, motion
@@ -57,6 +60,38 @@ def test_an_interval_is_not_narrower_than_noise_leaves_open() -> None:
     alike = LeftOut(np.array([1.0]), np.ones((8, 1)), np.array([[0.1]]), 8)
     low, high = alike.interval(lambda v: float(v[0]))
     assert high - low == pytest.approx(0.2 * stats.t.ppf(0.975, 7))
+
+
+def test_estimates_that_run_away_without_a_motion_leave_everything_open() -> None:
+    """Squares of squares of such steps are beyond what a number holds."""
+    wild = LeftOut(np.array([1.0]), np.array([[1.0], [1e90], [-1e90], [1.0]]), np.zeros((0, 1)), 8)
+    low, high = wild.interval(lambda v: float(v[0]))
+    assert low < -1e90
+    assert high > 1e90
+
+
+def test_a_parameter_that_overflows_is_taken_at_its_coordinates_end() -> None:
+    value = Value("log", -3.0, 3.0, 1e-3)
+    form = Form(
+        "latency", "", (value,), lambda v, s: (), lambda v, s: {"a": (math.exp(v[0]), "1")}, lambda s: []
+    )
+    setting = Setting(PadLayout(4, 4, 0.002), 100.0, 255.0, 0.033, 6.0, 600.0, 1e-3, False, 0.0, 4, 4, 300.0)
+    of = _reporter(form, setting, "a", slice(0, 1))
+    assert of(np.array([1e4])) == pytest.approx(math.exp(3.0))
+
+
+def test_delays_are_known_to_a_part_of_a_frame_at_best(monkeypatch: pytest.MonkeyPatch) -> None:
+    found = SimpleNamespace(best=None, alike=lambda motions: [])
+    exact = LeftOut(np.array([0.03]), np.full((4, 1), 0.03), np.zeros((0, 1)), 8)
+    monkeypatch.setattr(intervals, "walk", lambda *given: found)
+    monkeypatch.setattr(intervals, "leave_out", lambda *given: exact)
+    monkeypatch.setattr(intervals, "motions_of", lambda presses: [])
+    found.alike = lambda motions: [SimpleNamespace(model=SimpleNamespace(values=np.array([0.03])))]
+    model = SimpleNamespace(values=np.array([0.03]), setting=SimpleNamespace(frame_s=0.04))
+    of = {"tau_s": lambda values: float(values[0])}
+    low, high = intervals._along_damping(SimpleNamespace(model=model), None, (), 0, of)["tau_s"]
+    assert low < 0.03 - 0.1 * 0.03
+    assert high > 0.03 + 0.1 * 0.03
 
 
 def test_one_motion_that_carries_everything_widens_the_interval() -> None:
