@@ -56,6 +56,8 @@ class Rig:
     sag: dict = field(default_factory=dict)
     sag_shape: str = "link"
     """link: cosine of the summed pitch; own: cosine of the joint's own angle; stretch: two links."""
+    sag_where: str = "command"
+    """Where gravity pulls: at the posture that is commanded, or where the joints are ("joints")."""
     compliance: dict = field(default_factory=dict)
     """Joint -> m per N; loads come with it."""
     holds: dict = field(default_factory=dict)
@@ -65,6 +67,8 @@ class Rig:
     unknown: dict = field(default_factory=dict)
     noise: float = 1.0
     nasty: float = 0.0
+    servo_scatter: float = 0.0
+    """Standard deviation of the servos' stiffness from trial to trial, as a part of it."""
     jitter: float = 0.0
     quantum: float = 2 * np.pi / 4096
 
@@ -143,8 +147,8 @@ class Robot:
                 out[..., k] = size * np.cos(first)
         return out
 
-    def target_of(self, slack, bend_load, session_s, now, v, u):
-        target = slack + self.sag_of(slack) - bend_load
+    def target_of(self, slack, bend_load, session_s, now, v, u, q):
+        target = slack + self.sag_of(q if self.rig.sag_where == "joints" else slack) - bend_load
         for name, (opening, give) in self.rig.holds.items():
             k = self.rig.joints.index(name)
             beyond = np.minimum(target[..., k] - opening, 0.0)
@@ -177,6 +181,7 @@ class Robot:
         half, bend = column(rig, rig.backlash) / 2, column(rig, rig.compliance)
         dry = self.omega**2 * column(rig, rig.friction)
         pull = self.omega**2 * (1 - rig.unknown.get("weak_servo", 0.0) * session_s / session_s.max())
+        pull = pull * (1 + rig.servo_scatter * rng.normal(size=(len(t), 1)))
         frames = t.shape[1]
         q = command[:, 0] + self.sag_of(command[:, 0])
         v, slack = np.zeros_like(q), command[:, 0].copy()
@@ -193,7 +198,7 @@ class Robot:
                 if rig.latency_s:
                     u = self.late(arrival[:, : k + 1], command, now, h)
                 slack = np.clip(slack, u - half, u + half)
-                target = self.target_of(slack, bend * load_n[:, k], session_s, now, v, u)
+                target = self.target_of(slack, bend * load_n[:, k], session_s, now, v, u, q)
                 force = pull * (target - q) - 2 * self.zeta * self.omega * v
                 stick = dry * (1 + rig.stribeck * np.exp(-((v / STRIBECK_RAD_S) ** 2)))
                 stuck = (v == 0) & (np.abs(force) <= stick)

@@ -50,6 +50,33 @@ def test_what_repeats_is_a_part_of_the_repeated_trials_alone(recordings) -> None
     np.testing.assert_allclose(products, squares)
 
 
+def test_readings_in_coarse_steps_scatter_by_their_step(recordings) -> None:
+    batch = make_batch(recordings.trials)
+    rng = np.random.default_rng(0)
+    # Less than a step of noise: most readings stay, some jump by a whole step.
+    coarse = 2e-3 * (rng.random(batch.position.shape) < 0.1)
+    seen = scatter(batch, coarse)
+    assert seen is not None
+    assert (seen.white > 0.3 * seen.shape).all()
+
+
+def test_scatter_tells_what_comes_with_motion_and_what_is_the_servos(recordings) -> None:
+    batch = make_batch(recordings.trials)
+    rng = np.random.default_rng(0)
+    noise = 1e-4 * rng.normal(size=batch.position.shape)
+    speed = np.abs(np.gradient(batch.command, axis=0))
+    moving = noise + 0.5 * speed * rng.normal(size=batch.position.shape)
+    wandering = noise + 0.005 * np.sin(3 * batch.time_s + 6 * rng.random(batch.trials))[..., None]
+    own = {k: np.stack([speed[..., k], speed[..., k] ** 2], -1) for k in range(2)}
+    changed = noise + 0.02 * own[1][..., :1] * rng.normal(size=batch.trials)[:, None]
+    seen = [scatter(batch, values, own) for values in (moving, wandering, changed)]
+    ratios = [item.shape / item.resting for item in seen]
+    assert (ratios[0] > 1.6).all()
+    assert (ratios[1] < 1.6).all()
+    assert seen[2].servo[1] > 0.01
+    np.testing.assert_allclose(seen[2].shape[1], 1e-4, rtol=0.3)
+
+
 def test_no_scatter_without_repeated_commands(recordings) -> None:
     once = [trial for trial in recordings.trials if trial.replicate == 0]
     batch = make_batch(once)

@@ -1,11 +1,11 @@
 """Signs that something acts which no accepted cause accounts for.
 
-Four of them, on what the extended model leaves: it repeats in trials of one condition; it does not, by far
-more than encoders scatter; it follows something that the model does not know (time, other joints, a load);
-it rings at one frequency.
+Five of them, on what the extended model leaves: it repeats in trials of one condition; it does not, by far
+more than encoders scatter; it follows the order of the trials, or something else that the model does not know
+(time, other joints, a load); it rings at one frequency.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -16,6 +16,8 @@ from lerobot_vtrefine.diagnose.robot.fitting import derivatives
 from lerobot_vtrefine.diagnose.robot.gravity import is_gripper
 from lerobot_vtrefine.diagnose.robot.repeats import common_part, scatter
 from lerobot_vtrefine.diagnose.robot.selection import LEAST_EFFECT_RAD, LEAST_UNKNOWN, Selection
+from lerobot_vtrefine.diagnose.robot.sessions import trends
+from lerobot_vtrefine.diagnose.robot.timing import mirrored
 
 Array = np.ndarray
 
@@ -26,9 +28,15 @@ need not be enough for a small p."""
 _LEAST_CONDITIONS, _FEW_CONDITIONS = 4, 2
 _NEARLY_ALL = 0.8
 """Part of what is left that must repeat in each of few conditions."""
-_SHAPES_DIFFER, _ZEROS_DIFFER = 5.0, 12.0
+_SHAPES_DIFFER, _FAR, _ZEROS_DIFFER = 5.0, 20.0, 12.0
 """Difference of trials of one command, in scatters from frame to frame: noise that wanders makes up to three,
-a robot that is zeroed anew before every trial up to eight."""
+a robot that is zeroed anew before every trial up to eight. Up to `_FAR`, motion must have to do with it."""
+_MOVING = 1.6
+"""How much larger such a difference is over all frames than over slow ones, if it comes with motion."""
+_SERVOS_DIFFER = 0.04
+"""Part by which a servo's frequency may differ from trial to trial: batteries and oil, no fault."""
+_TREND = 0.1
+"""Least part of what is left that must follow the session."""
 _FOLLOWS, _FOLLOWS_IF_OWNED = 0.1, 0.4
 """Least part of what is left that must follow a descriptor; more where an accepted form may be off."""
 _LINE = 0.1
@@ -63,7 +71,8 @@ def raise_alarms(selection: Selection, seed: int) -> tuple[Alarm, ...]:
         if candidate.cause == DECOY
     ]
     found += _repeating(selection, seed)
-    found += _not_repeating(selection)
+    found += not_repeating(selection)
+    found += _through_the_session(selection, seed)
     found += _following(selection, seed)
     found += _ringing(selection)
     found.sort(key=lambda alarm: -alarm.share)
@@ -121,22 +130,43 @@ def _repeating(selection: Selection, seed: int) -> list[Alarm]:
     ]
 
 
-def _not_repeating(selection: Selection) -> list[Alarm]:
+def not_repeating(selection: Selection) -> list[Alarm]:
     """Trials of one command that differ by far more than their encoders scatter: what no command sets."""
-    problem = selection.problem
-    seen = scatter(problem.batch, selection.fit.residual)
+    problem, fitted = selection.problem, selection.fit
+    seen = scatter(problem.batch, fitted.residual, derivatives(problem, fitted).columns)
     if seen is None:
         return []
+    white = np.maximum(seen.white, 0.5 * resolution(problem))
+    with_motion = seen.shape > _MOVING * np.maximum(seen.resting, white)
+    shapes = seen.shape > np.where(with_motion, _SHAPES_DIFFER, _FAR) * white
+    # A delay that changes comes with motion.
+    shapes &= ~with_motion | (selection.delay_spread_s == 0)
+    servos = (seen.servo > _SERVOS_DIFFER) & (seen.servo_effect > _SHAPES_DIFFER * white)
+    zeros = seen.zero > _ZEROS_DIFFER * white
+    # What differs in shape has a mean and a likeness to slower servos, too.
+    servos, zeros = servos & (seen.servo_effect > seen.shape), zeros & (seen.zero > seen.shape)
     found = []
     for joint in range(problem.batch.joints):
-        white = max(float(seen.white[joint]), 0.5 * float(resolution(problem)[joint]))
-        for size, limit in ((seen.shape[joint], _SHAPES_DIFFER), (seen.zero[joint], _ZEROS_DIFFER)):
-            share = float(size**2 / max(selection.fit.total[joint], 1e-300))
-            if size > limit * white and share > _REPEATS and _matters(selection, joint, min(share, 1.0)):
+        for size, far in ((seen.shape, shapes), (seen.servo_effect, servos), (seen.zero, zeros)):
+            share = float(min(size[joint] ** 2 / max(fitted.total[joint], 1e-300), 1.0))
+            if far[joint] and share > _REPEATS and _matters(selection, joint, share):
                 clue = "trials of one command differ by far more than the encoder scatters"
-                found.append(Alarm(joint, clue, min(share, 1.0), 0.0))
+                found.append(Alarm(joint, clue, share, 0.0))
                 break
     return found
+
+
+def _through_the_session(selection: Selection, seed: int) -> list[Alarm]:
+    """A joint's zero, scale, servo or delay that follows the order of the trials."""
+    problem, fitted = selection.problem, selection.fit
+    later = derivatives(problem, replace(fitted, tau_free=True))
+    assert later.tau is not None
+    found = trends(problem.batch, fitted.residual, later.columns, later.tau, seed)
+    return [
+        Alarm(item.joint, f"the {item.kind} changes through the session", item.share, item.p_value)
+        for item in found
+        if item.p_value < ALPHA and item.share > _TREND and _matters(selection, item.joint, item.share)
+    ]
 
 
 def descriptors(selection: Selection, joint: int) -> dict[str, Array]:
@@ -169,16 +199,12 @@ def descriptors(selection: Selection, joint: int) -> dict[str, Array]:
     if batch.load is not None:
         out["load"] = batch.load[..., joint]
     for other in range(batch.joints):
-        if other != joint and not _mirrored(batch.command, joint, other):
+        if other != joint and not mirrored(batch.command, joint, other):
             name = problem.names[other]
             out[f"position of {name}"] = model[..., other]
             out[f"squared speed of {name}"] = speed[..., other] ** 2
             out[f"speed of {name}"] = speed[..., other]
     return out
-
-
-def _mirrored(command: Array, a: int, b: int) -> bool:
-    return bool(np.abs(np.abs(command[..., a]) - np.abs(command[..., b])).max() < 1e-6)
 
 
 def _following(selection: Selection, seed: int) -> list[Alarm]:

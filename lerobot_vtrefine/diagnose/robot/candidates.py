@@ -22,6 +22,7 @@ STICKING = ("friction", "stick")
 """Friction that is larger at rest than in motion."""
 STOP = ("stop", "give")
 """A gripper that meets what it holds: no load is needed to see that."""
+_FEWEST_VALUES, _FINEST, _OFF_LATTICE = 8, 2e-6, 0.05
 _USUAL_STOP = 0.25
 """Part of the frames in which a gripper is supposed to be stopped when a fit of it begins."""
 
@@ -139,8 +140,18 @@ def resolution(problem: Problem) -> Array:
     steps = np.empty(problem.batch.joints)
     for joint in range(problem.batch.joints):
         values = np.unique(problem.batch.position[..., joint][problem.batch.valid].round(9))
-        steps[joint] = np.median(np.diff(values)) if 1 < len(values) < 0.25 * problem.batch.valid.sum() else 0
+        coarse = 1 < len(values) < 0.25 * problem.batch.valid.sum()
+        steps[joint] = np.median(np.diff(values)) if coarse else _lattice(values)
     return np.maximum(steps, 1e-9)
+
+
+def _lattice(values: Array) -> float:
+    """The step of which all values are multiples, beside a constant; 0 where there is none."""
+    if len(values) < _FEWEST_VALUES:
+        return 0.0
+    step = float(np.diff(values).min())
+    places = (values - values[0]) / step
+    return step if step > _FINEST and np.abs(places - places.round()).max() < _OFF_LATTICE else 0.0
 
 
 def delay_starts(problem: Problem) -> tuple[float, ...]:

@@ -10,9 +10,9 @@ from lerobot_vtrefine.diagnose.evidence import Evidence, ResidualView, Trace, Tr
 from lerobot_vtrefine.diagnose.locking import lock
 from lerobot_vtrefine.diagnose.recordings import RecordingSet
 from lerobot_vtrefine.diagnose.robot import experiments, views
-from lerobot_vtrefine.diagnose.robot.alarms import Alarm, raise_alarms
+from lerobot_vtrefine.diagnose.robot.alarms import Alarm, not_repeating, raise_alarms
 from lerobot_vtrefine.diagnose.robot.batch import make_batch
-from lerobot_vtrefine.diagnose.robot.candidates import DECOY
+from lerobot_vtrefine.diagnose.robot.candidates import DECOY, LATENCY
 from lerobot_vtrefine.diagnose.robot.conversion import to_model
 from lerobot_vtrefine.diagnose.robot.detectable import minimum_detectable
 from lerobot_vtrefine.diagnose.robot.estimates import Estimates, repeatability
@@ -20,6 +20,7 @@ from lerobot_vtrefine.diagnose.robot.fitting import INDEX, Point, Problem, fit
 from lerobot_vtrefine.diagnose.robot.model import RobotModel
 from lerobot_vtrefine.diagnose.robot.rivals import Rival, adopt, find_rivals, settle_by_load, without_cause
 from lerobot_vtrefine.diagnose.robot.selection import Selection, Selector, Tried
+from lerobot_vtrefine.diagnose.robot.timing import with_changing_delay
 from lerobot_vtrefine.diagnose.verdict import (
     ROBOT_CAUSES,
     Cause,
@@ -94,6 +95,9 @@ def diagnose_problem(whole: Problem, seed: int = 0, progress: Progress | None = 
     locked = lock(whole.batch.conditions, seed)
     problem = whole.subset(np.array([index for index in range(count) if index not in set(locked)]))
     selection = Selector(problem, seed, _steps(tell)).run()
+    whole = whole.bent(selection.fit.point)
+    if not_repeating(selection):
+        selection = with_changing_delay(selection, seed)
     tell("robot: looking for what is left", 0.6)
     alarms = raise_alarms(selection, seed)
     rivals: tuple[Rival, ...] = ()
@@ -310,7 +314,7 @@ def _evidence(selection: Selection, rivals: tuple[Rival, ...], alarmed: bool) ->
         else:
             decision, reason = (
                 "rejected",
-                f"strongest on {where}; no more than chance or less than 1 % of error",
+                f"strongest on {where}; in such trials chance gives as much, or it is under 1 % of error",
             )
             if adjusted < 0.02:
                 reason = f"significant on {where} by itself, but another cause explains it better"
@@ -320,6 +324,8 @@ def _evidence(selection: Selection, rivals: tuple[Rival, ...], alarmed: bool) ->
 
 def _caveat(selection: Selection, name: str, joints: tuple[int, ...]) -> str:
     """What an accepted cause leaves open."""
+    if name == LATENCY and selection.delay_spread_s:
+        return f", which changes from command to command by about {1e3 * selection.delay_spread_s:.0f} ms"
     if name != "gripper_compliance" or selection.fit.free[list(joints), INDEX["bend"]].any():
         return ""
     return (

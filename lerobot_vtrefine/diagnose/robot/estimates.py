@@ -35,7 +35,8 @@ class Estimates:
             value = self.selection.fit.point.tau_s
             # A uniform error of width w has the standard deviation w / sqrt(12).
             tick = 1.96 * self.selection.problem.tick_s / np.sqrt(12)
-            return {"tau_s": Parameter(value, widened(jackknife(self.tau, value), value, tick), "s")}
+            own = float(np.hypot(tick, self.selection.delay_spread_s))
+            return {"tau_s": Parameter(value, widened(jackknife(self.tau, value), value, own), "s")}
         if cause == "gripper_compliance":
             return self._gripper(joints)
         out: dict[str, Parameter] = {}

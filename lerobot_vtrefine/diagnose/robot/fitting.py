@@ -28,9 +28,8 @@ _RADIANS_PER_FRAME = (6.0, 3.0)
 TAU_BOUND_S = 1.0
 _LARGEST = {"round": 1.0, "stick": 3.0}
 SERVO_TICK_S = 2e-3
-"""Servos look at their command once in one or two milliseconds (simulations: once a step), and encoders are
-read as much beside their frame's time. When, no recording tells: a delay is known up to a uniform error of
-this width, whatever the trials agree on."""
+"""Servos look at their command once in one or two milliseconds, and encoders are read as much beside their
+frame's time. When, no recording tells: a delay is known up to a uniform error of this width."""
 _START_OMEGA = (4.0, 10.0, 25.0, 60.0)
 _START_ZETA = (0.4, 1.0, 2.0)
 _ITERATIONS = 20
@@ -101,6 +100,14 @@ class Problem:
         length = len(batch.time_s)
         shapes = {form: values[:length][:, np.asarray(trials)] for form, values in self.shapes.items()}
         return replace(self, batch=batch, shapes=shapes)
+
+    def bent(self, point: Point) -> "Problem":
+        """With gravity's shapes where the arm stands once it has sagged, not where it was commanded to."""
+        bare = point.with_values("bend", 0.0).theta
+        push = self._push(point.forms, np.arange(self.batch.joints), bare)
+        if push is None:
+            return self
+        return replace(self, shapes=self.shapes | gravity.shapes(self.names, self.batch.command + push))
 
     def finer(self) -> "Problem | None":
         """The same trials with predictions for which the search is too slow; None where there are none."""

@@ -73,9 +73,9 @@ class RobotModel:
 
         push = np.zeros_like(batch.command)
         if any(any(joint.sag_terms) for joint in self.joints):
-            forms = gravity.shapes(self.names, batch.command)
-            for index, joint in enumerate(self.joints):
-                push[..., index] = forms[joint.sag_form][..., index, :] @ np.array(joint.sag_terms)
+            # Gravity pulls at the arm where it stands once it has sagged.
+            for _ in range(2):
+                push = self._sag(batch.command + push)
         compliance = column("compliance")
         if compliance.any() and batch.load is not None:
             push -= compliance * batch.load
@@ -94,6 +94,14 @@ class RobotModel:
             tau_s=self.control_latency_s,
             push=push if push.any() else None,
         )
+
+    def _sag(self, posture: np.ndarray) -> np.ndarray:
+        """(N, T, J) at a posture (N, T, J)."""
+        forms = gravity.shapes(self.names, posture)
+        terms = [
+            forms[item.sag_form][..., k, :] @ np.array(item.sag_terms) for k, item in enumerate(self.joints)
+        ]
+        return np.stack(terms, -1)
 
     def to_dict(self) -> dict[str, Any]:
         """JSON-ready form."""

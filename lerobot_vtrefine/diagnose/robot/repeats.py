@@ -16,6 +16,9 @@ LEAST_PAIRS = 2
 _FEWEST_FRAMES = 8
 _TO_SIGMA = 0.6745 * np.sqrt(6)
 """Median size of second differences of white noise, in its standard deviations."""
+_SLOWEST, _SETTLES = 0.2, 8
+"""Part of the frames that count as slow; frames for which a motion is felt."""
+_TRIMMED = 0.95
 
 
 @dataclass(frozen=True)
@@ -23,25 +26,40 @@ class Scatter:
     """Root mean squares over pairs of trials, of what one of the two contributes (J,)."""
 
     shape: Array
-    """Difference beyond a zero and a scale of each trial's own."""
+    """Difference beyond a zero, a scale and a servo of each trial's own."""
+    resting: Array
+    """The same in the frames in which the joint moves least."""
+    servo: Array
+    """Change of the servo's frequency, as a part of it."""
+    servo_effect: Array
+    """What that change does to the positions."""
     zero: Array
     """Difference of the trials' means."""
     white: Array
     """Scatter from frame to frame."""
 
 
-def scatter(batch: Batch, residual: Array) -> Scatter | None:
-    """From residuals (N, T, J) of trials with equal commands; None with too few of them."""
+def scatter(batch: Batch, residual: Array, own: dict[int, Array] | None = None) -> Scatter | None:
+    """From residuals (N, T, J) of trials with equal commands; None with too few of them.
+
+    Args:
+        own: joint -> (N, T, 2 or more) derivatives by the servo's frequency and damping (logarithms), first.
+    """
     parts = []
     for a, b in combinations(range(batch.trials), 2):
         if batch.conditions[a] == batch.conditions[b] and alike(batch, a, b):
             valid = batch.valid[:, a] & batch.valid[:, b]
-            parts.append(_of_pair((residual[valid, a] - residual[valid, b]), batch.command[valid, a]))
+            difference = residual[valid, a] - residual[valid, b]
+            servo = [
+                np.zeros((int(valid.sum()), 0)) if own is None else own[k][valid, a, :2]
+                for k in range(batch.joints)
+            ]
+            parts.append(_of_pair(difference, batch.command[valid, a], servo))
     if len(parts) < LEAST_PAIRS:
         return None
-    shape, zero, white = (np.stack([part[k] for part in parts]) for k in range(3))
-    size = [np.sqrt(np.mean(values**2, 0) / 2) for values in (shape, zero)]
-    return Scatter(size[0], size[1], np.median(white, 0) / np.sqrt(2))
+    values = np.stack(parts)
+    shape, resting, servo, effect, zero = (np.sqrt(np.mean(values[:, k] ** 2, 0) / 2) for k in range(5))
+    return Scatter(shape, resting, servo, effect, zero, np.median(values[:, 5], 0) / np.sqrt(2))
 
 
 def common_part(batch: Batch, residual: Array) -> tuple[Array, Array]:
@@ -67,11 +85,29 @@ def alike(batch: Batch, a: int, b: int) -> bool:
     return bool(valid.sum() > _FEWEST_FRAMES and np.abs(change).max() < 1e-6)
 
 
-def _of_pair(difference: Array, command: Array) -> tuple[Array, Array, Array]:
-    """Shape, zero and white scatter (J,) of one pair's difference (n, J)."""
-    zero = difference.mean(0)
-    centred, along = difference - zero, command - command.mean(0)
-    scale = (centred * along).sum(0) / np.square(along).sum(0).clip(1e-12)
-    shape = np.sqrt(np.mean((centred - scale * along) ** 2, 0))
-    second = np.abs(np.diff(difference, 2, axis=0))
-    return shape, zero, np.median(second, 0) / _TO_SIGMA
+def _of_pair(difference: Array, command: Array, servo: list[Array]) -> Array:
+    """(6, J) what `Scatter` holds, of one pair's difference (n, J)."""
+    # Readings in coarse steps hardly ever change twice: their median would be nothing.
+    second = np.sort(np.abs(np.diff(difference, 2, axis=0)), 0)[: int(_TRIMMED * len(difference))]
+    white = np.maximum(np.median(second, 0) / _TO_SIGMA, np.sqrt(np.mean(second**2, 0) / 6))
+    out = []
+    for joint, own in enumerate(servo):
+        design = np.concatenate([np.ones((len(own), 1)), command[:, [joint]], own], 1)
+        design[:, 1] -= design[:, 1].mean()
+        scale = np.sqrt(np.square(design).sum(0)).clip(1e-9)
+        size = np.linalg.lstsq(design / scale, difference[:, joint], rcond=1e-6)[0] / scale
+        left = difference[:, joint] - design @ size
+        quiet = np.sqrt(np.mean(left[_slow(command[:, joint])] ** 2))
+        change = size[2] if own.shape[1] else 0.0
+        effect = np.sqrt(np.mean((own @ size[2:]) ** 2)) if own.shape[1] else 0.0
+        zero = difference[:, joint].mean()
+        out.append((np.sqrt(np.mean(left**2)), quiet, change, effect, zero, white[joint]))
+    return np.array(out).T
+
+
+def _slow(command: Array) -> Array:
+    """The frames in and before which a command (n,) moved least."""
+    speed = np.abs(np.gradient(command))
+    lately = np.max([np.roll(speed, lag) for lag in range(_SETTLES)], 0)
+    lately[: _SETTLES - 1] = np.maximum.accumulate(speed[: _SETTLES - 1])
+    return lately <= np.quantile(lately, _SLOWEST)

@@ -57,6 +57,8 @@ class Selection:
     """(cause, joint) -> adjusted p when it was accepted; joint -1: the delay."""
     first_round: tuple[Tried, ...] = field(repr=False)
     """Every candidate alone on the baseline."""
+    delay_spread_s: float = 0.0
+    """By how much the delay changes from command to command."""
 
     def causes(self) -> dict[str, tuple[int, ...]]:
         """Named cause -> joints that it acts on."""
@@ -235,6 +237,8 @@ class Selector:
         self.changed = np.isin(np.arange(len(self.changed)), list(best))
         for joint, item in best.items():
             self._take(item, np.array([joint]))
+        if any(item.cause == "gravity_sag" for item in best.values()):
+            self.problem = self.problem.bent(self.now.point)
         if best:
             self._refit()
         return bool(best)

@@ -77,6 +77,11 @@ class TwinProblem(Problem):
         return part if self.fine is None else replace(part, fine=self.fine.subset(trials))
 
     @override
+    def bent(self, point: Point) -> "TwinProblem":
+        """See `Problem.bent`; the twin's own gravity does that, and what it lacks is small."""
+        return self
+
+    @override
     def finer(self) -> "TwinProblem | None":
         """See `Problem.finer`."""
         return self.fine

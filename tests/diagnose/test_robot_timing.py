@@ -1,0 +1,67 @@
+"""What changes from command to command, from trial to trial, and through the session."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from robot_rigs import Rig, make_set
+
+from lerobot_vtrefine.diagnose.recordings import read_recording_set
+from lerobot_vtrefine.diagnose.robot.batch import make_batch
+from lerobot_vtrefine.diagnose.robot.engine import diagnose_robot
+from lerobot_vtrefine.diagnose.robot.sessions import trends
+
+SMALL = Rig(joints=("shoulder", "elbow", "waist"), rate_hz=20.0, seconds=5.0, conditions=8, noise=0.5)
+
+
+def diagnosed(rig, folder, seed=0):
+    return diagnose_robot(read_recording_set(make_set(rig, folder, seed)), seed=0)
+
+
+def test_a_delay_that_changes_with_every_command_is_a_delay(tmp_path) -> None:
+    found = diagnosed(replace(SMALL, rate_hz=30.0, latency_s=0.08, latency_spread=0.5), tmp_path)
+    assert found.status == "explained"
+    assert [cause.name for cause in found.causes] == ["control_latency"]
+    low, high = found.causes[0].params["tau_s"].ci95
+    assert low < 0.08 < high
+    reasons = [item.reason for item in found.evidence if item.name == "control_latency"]
+    assert "changes from command to command" in reasons[0]
+
+
+def test_commands_that_never_come_are_no_delay(tmp_path) -> None:
+    found = diagnosed(replace(SMALL, unknown={"packet_loss": 1.0}), tmp_path)
+    assert found.status == "unexplained"
+
+
+def test_servos_that_are_never_quite_the_same_are_no_fault(tmp_path) -> None:
+    # Fine encoders see two per cent of stiffness from trial to trial.
+    found = diagnosed(replace(SMALL, servo_scatter=0.02, noise=0.1, quantum=1e-5), tmp_path)
+    assert found.status == "adequate"
+
+
+def test_servos_that_weaken_through_the_session_are(tmp_path) -> None:
+    found = diagnosed(replace(SMALL, unknown={"weak_servo": 0.15}), tmp_path)
+    assert found.status == "unexplained"
+    assert "servo's response changes through the session" in (found.unknown.clue or "")
+
+
+@pytest.fixture(scope="module")
+def batch(tmp_path_factory):
+    return make_batch(read_recording_set(make_set(SMALL, tmp_path_factory.mktemp("robot"), 0)).trials)
+
+
+def test_trends_follow_the_order_of_trials_and_nothing_else(batch) -> None:
+    rng = np.random.default_rng(0)
+    noise = 1e-3 * rng.normal(size=batch.position.shape)
+    own = {k: rng.normal(size=(*batch.time_s.shape, 2)) for k in range(3)}
+    tau = rng.normal(size=batch.position.shape)
+    drawn = rng.permutation(batch.trials) / batch.trials
+    ordered = noise.copy()
+    ordered[..., 1] += 0.004 * tau[..., 1] * (batch.order / batch.trials)
+    ordered[..., 2] += 0.004 * tau[..., 2] * drawn
+    sure = [(t.joint, t.kind) for t in trends(batch, ordered, own, tau, 0) if t.p_value < 0.01]
+    assert sure == [(1, "delay")]
+    found = next(t for t in trends(batch, ordered, own, tau, 0) if (t.joint, t.kind) == (1, "delay"))
+    # Variance of a uniform number beside its mean square, noise included.
+    assert found.share == pytest.approx((16 / 12) / (16 / 3 + 1), rel=0.25)
+    assert not [t for t in trends(batch, noise, own, tau, 0) if t.p_value < 0.01]
