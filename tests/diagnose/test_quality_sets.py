@@ -214,6 +214,33 @@ def test_readings_of_another_trial_are_found(tmp_path):
     assert len(left.trials) == 7
 
 
+def replicated():
+    """A sound set in which every motion was recorded twice."""
+    header, columns = make_set()
+    rng = np.random.default_rng(9)
+    for k in range(4):
+        raw = columns[2 * k]["raw"]
+        again = np.clip(np.round(raw + rng.normal(0, 1.0, raw.shape)), 0, 255)
+        columns[2 * k + 1] = columns[2 * k] | {"raw": again}
+    return labelled(lambda k: {"condition": f"c{k // 2}", "replicate": k % 2})(header, columns)
+
+
+def test_a_trial_that_reads_half_as_much_is_set_aside(tmp_path):
+    left, issues = checked(tmp_path, *in_one(scaled("raw", 0.5))(*replicated()))
+    assert [(issue.trial, issue.action) for issue in issues] == [(FILE, "set aside")]
+    assert "of what the same motion gives" in issues[0].problem
+    assert len(left.trials) == 7
+
+
+@pytest.mark.parametrize("spread", [0.0, 0.1, 0.25])
+def test_gains_that_differ_between_recordings_are_no_fault_of_single_ones(tmp_path, spread):
+    header, columns = replicated()
+    for k, trial in enumerate(columns):
+        trial["raw"] = np.clip(np.round(trial["raw"] * (1 - spread * k / 7)), 0, 255)
+    _, issues = checked(tmp_path, header, columns)
+    assert issues == []
+
+
 SESSION = {
     "no start": (lambda k: {"start_s": 0.0}, "start_s is missing"),
     "starts too close": (lambda k: {"start_s": 1.0 * k}, "start_s or time_s is in another unit"),

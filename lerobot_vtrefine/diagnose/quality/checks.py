@@ -20,7 +20,7 @@ from lerobot_vtrefine.diagnose.quality.joints import (
     check_joint_order,
     check_jumps,
 )
-from lerobot_vtrefine.diagnose.quality.odd import check_odd
+from lerobot_vtrefine.diagnose.quality.odd import check_gain, check_odd
 from lerobot_vtrefine.diagnose.quality.readings import check_readings, check_wraps
 from lerobot_vtrefine.diagnose.quality.response import check_answers, check_start, check_stuck
 from lerobot_vtrefine.diagnose.quality.session import check_conditions, check_session
@@ -65,9 +65,10 @@ PAD_CHECKS: tuple[Check, ...] = (
     check_start,
     check_answers,
     check_odd,
+    check_gain,
     check_conditions,
 )
-PLACED_CHECKS: tuple[Check, ...] = (check_answers, check_odd)
+PLACED_CHECKS: tuple[Check, ...] = (check_answers, check_odd, check_gain)
 """With lines in the wrong place, these would find every trial at fault."""
 ROBOT_CHECKS: tuple[Check, ...] = (
     check_jumps,

@@ -1,4 +1,4 @@
-"""Check of single trials whose readings are not those of the motion beside them: files that were mixed up."""
+"""Checks of single trials that are unlike all others: files that were mixed up, supplies that were low."""
 
 from collections.abc import Iterator
 
@@ -12,6 +12,12 @@ STRANGE, USUAL = 0.5, 0.2
 """Part of a trial's readings that is not in proportion to its drive: in an odd one, and in most."""
 APART = 2.0
 """A trial's replicates must be this many times better, for a motion may be hard to foretell by itself."""
+APART_GAIN, USUAL_GAIN = 0.3, 0.05
+"""Logarithm by which a trial's reading per drive is off, and what that of its set usually is."""
+FEW = 0.1
+"""Part of the trials that may be off; more are a property of the rig."""
+MIN_KNOWN = 6
+"""Trials with replicates that it takes to know what is usual."""
 MIN_SHARE = 0.1
 """Trials that answer less than this part of the usual power say too little."""
 
@@ -33,6 +39,38 @@ def check_odd(recordings: RecordingSet) -> Iterator[Finding]:
             part = f"{100 * strange[index]:.0f} %"
             problem = f"{part} of the readings' power is not of the recorded motion, unlike in other trials"
             yield Finding(int(index), problem, SET_ASIDE)
+
+
+def check_gain(recordings: RecordingSet) -> Iterator[Finding]:
+    """Trials that read far more or far less than all others do under the same motion."""
+    found = presses(recordings)
+    gains = np.array([_gain(press) for press in found])
+    conditions = np.array([trial.condition for trial in recordings.trials])
+    offsets = np.full(len(gains), np.nan)
+    for index in range(len(gains)):
+        mates = gains[(conditions == conditions[index]) & (np.arange(len(gains)) != index)]
+        if np.isfinite(mates).any():
+            offsets[index] = gains[index] - np.nanmedian(mates)
+    if np.isfinite(offsets).sum() < MIN_KNOWN or not np.nanmedian(np.abs(offsets)) < USUAL_GAIN:
+        return
+    off = np.flatnonzero(np.abs(offsets) > APART_GAIN)
+    # Of two replicates, each is off the other: the one that is off the rest of the set as well is meant.
+    usual = float(np.nanmedian(np.delete(gains, off)))
+    worst: dict[str, int] = {}
+    for index in off:
+        name = str(conditions[index])
+        if name not in worst or abs(gains[index] - usual) > abs(gains[worst[name]] - usual):
+            worst[name] = int(index)
+    if 0 < len(worst) <= max(1.0, FEW * len(gains)):
+        for index in worst.values():
+            part = f"{100 * np.exp(offsets[index]):.0f} %"
+            yield Finding(index, f"reads {part} of what the same motion gives in other trials", SET_ASIDE)
+
+
+def _gain(press: Press) -> float:
+    """Logarithm of reading per drive; NaN where there is none."""
+    drive, both = _power(press.drive, press.drive), _power(press.answer, press.drive)
+    return float(np.log(both / drive)) if drive > 0 and both > 0 else np.nan
 
 
 def _strangeness(press: Press) -> float:
