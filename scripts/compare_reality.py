@@ -5,13 +5,13 @@
     .venv/bin/python scripts/compare_reality.py --seeds 0 1 2 3 4 5 --jobs 24 --device=cuda
 
 A simulation with hidden physics stands in for reality (``--env.reality``); nothing is ever trained in it.
-From one imitation-learned checkpoint DPPO runs, with the same budget and seeds, in the plain simulator and in
-the one that ``vtrefine-diagnose`` made from recordings: presses of the hidden pad, or episodes of the hidden
-robot. All policies are then evaluated in the stand-in reality and in their own simulator, on the same
-episodes. Every stage is a command that users run; interrupted and started again, it continues. With
-``--jobs`` several run side by side, each on cores of its own and on the GPUs by turns; one that fails does
-not stop the others, and the comparison is of the seeds that are whole. Results: ``comparison.json`` and
-``comparison.md``.
+A policy is imitation-learned and fine-tuned by DPPO for a while in the plain simulator. From there DPPO goes
+on, with the same budget and seeds, in the plain simulator and in the one that ``vtrefine-diagnose`` made from
+recordings: presses of the hidden pad, or episodes of the hidden robot. All policies are then evaluated in the
+stand-in reality and in their own simulator, on the same episodes. Every stage is a command that users run;
+interrupted and started again, it continues. With ``--jobs`` several run side by side, each on cores of its
+own and on the GPUs by turns; one that fails does not stop the others, and the comparison is of the seeds that
+are whole. Results: ``comparison.json`` and ``comparison.md``.
 """
 
 import argparse
@@ -19,21 +19,18 @@ import json
 import os
 import subprocess
 import sys
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from compare_touch import run_all, run_script, save
 from realities import PLAIN, REALITIES, of_robot
+from reality_budget import Budget, env_flags, folder_name, real_env, recipe
 from reality_results import as_text, difference
 
 from lerobot_vtrefine.cli.pipeline.demo_config import (
     SEED_STRIDE,
     TRAIN_SEED_OFFSET,
-    DemoConfig,
-    acting_env,
-    default_env,
     flags,
     pretrain_stage,
     record_stage,
@@ -45,75 +42,9 @@ from lerobot_vtrefine.sim.reality import SCHEMA
 
 MOTION_SEED_OFFSET = 500_000
 """Between the seeds of demonstrations and those of fine-tuning."""
-
-
-@dataclass(frozen=True)
-class Budget:
-    """What every run may spend; the same for the plain and the diagnosed simulator."""
-
-    output_dir: Path
-    realities: tuple[str, ...]
-    seeds: tuple[int, ...]
-    device: str
-    num_demos: int
-    pretrain_steps: int
-    iterations: int
-    envs: int
-    eval_episodes: int
-    eval_envs: int
-    presses: int
-    motions: int
-    env: dict[str, str]
-
-    @property
-    def checkpoint(self) -> Path:
-        """The imitation-learned policy that every fine-tuning starts from."""
-        return recipe(self, self.seeds[0]).checkpoint("pretrain")
-
-    def diagnosis(self, name: str) -> Path:
-        """Folder of a reality's diagnosis."""
-        return self.output_dir / folder_name(name) / "diagnosis"
-
-
-def recipe(budget: Budget, seed: int) -> DemoConfig:
-    """The demo's recipe with this budget, in the plain simulator."""
-    plain = {"sensor_model": str(budget.output_dir / "plain" / "sensor_model.json")}
-    return DemoConfig(
-        output_dir=budget.output_dir / "imitation",
-        seed=seed,
-        device=budget.device,
-        num_demos=budget.num_demos,
-        pretrain_steps=budget.pretrain_steps,
-        finetune_iterations=budget.iterations,
-        finetune_envs=budget.envs,
-        eval_episodes=budget.eval_episodes,
-        eval_envs=budget.eval_envs,
-        env=default_env() | budget.env | plain,
-    )
-
-
-def folder_name(*parts: str) -> str:
-    """A name for folders and stages, from worlds."""
-    return "_".join(part.replace(":", "_").replace("+", "_and_") for part in parts)
-
-
-def env_flags(budget: Budget, world: str) -> list[str]:
-    """Flags of a world: plain, diagnosed:NAME or real:NAME."""
-    env = acting_env(recipe(budget, budget.seeds[0]))
-    kind, _, name = world.partition(":")
-    if kind == "diagnosed":
-        env["reality" if of_robot(name) else "sensor_model"] = str(
-            budget.diagnosis(name) / "sensor_model.json"
-        )
-    elif kind == "real":
-        env = real_env(budget, name, env)
-    return flags("env", {"type": "vtrefine"} | env)
-
-
-def real_env(budget: Budget, name: str, env: dict[str, Any]) -> dict[str, Any]:
-    """An environment's flags in a stand-in reality; its pads are the plain ones unless it hides others."""
-    kept = env if of_robot(name) else {key: value for key, value in env.items() if key != "sensor_model"}
-    return kept | {"reality": str(budget.output_dir / folder_name(name) / "reality.json")}
+GOING_ON_SEEDS = 3_000_000
+"""Between the seeds of the start's episodes and those of what goes on from it."""
+START = "start"
 
 
 def imitation_stages(budget: Budget) -> list[Stage]:
@@ -172,30 +103,58 @@ def output_name(name: str) -> str:
     return f"diagnose_{folder_name(name)}"
 
 
-def finetune_dir(budget: Budget, world: str, seed: int) -> Path:
-    """Folder of one fine-tuning."""
-    return budget.output_dir / folder_name("finetune", world, str(seed))
+def finetune_dir(budget: Budget, name: str, seed: int) -> Path:
+    """Folder of one fine-tuning: the start, or what goes on from it in a world."""
+    return budget.output_dir / folder_name("finetune", name, str(seed))
+
+
+def tuned_policy(budget: Budget, name: str, seed: int) -> Path:
+    """The checkpoint that a fine-tuning leaves."""
+    return finetune_dir(budget, name, seed) / "checkpoints" / "last" / "pretrained_model"
+
+
+def start_stage(budget: Budget, seed: int) -> Stage:
+    """DPPO from imitation in the plain simulator, which all policies of a seed share."""
+    where = (START, "plain", budget.imitation, budget.start_iterations, TRAIN_SEED_OFFSET)
+    return dppo_stage(budget, seed, *where, ("pretrain",))
 
 
 def finetune_stage(budget: Budget, world: str, seed: int) -> Stage:
-    """DPPO from the imitation-learned checkpoint in one world."""
-    output, config = finetune_dir(budget, world, seed), recipe(budget, seed)
+    """DPPO from a seed's start in one world, on other episodes than before."""
+    diagnosed = [output_name(world.partition(":")[2])] if world != "plain" else []
+    needs = (finetune_dir(budget, START, seed).name, *diagnosed)
+    policy = tuned_policy(budget, START, seed)
+    where = (world, world, policy, budget.iterations, TRAIN_SEED_OFFSET + GOING_ON_SEEDS)
+    return dppo_stage(budget, seed, *where, needs)
+
+
+def dppo_stage(
+    budget: Budget,
+    seed: int,
+    name: str,
+    world: str,
+    policy: Path,
+    iterations: int,
+    seed_offset: int,
+    needs: tuple[str, ...],
+) -> Stage:
+    """DPPO from a policy in a world."""
+    output, config = finetune_dir(budget, name, seed), recipe(budget, seed)
     command = [
         "vtrefine-finetune",
-        f"--policy.path={budget.checkpoint}",
+        f"--policy.path={policy}",
         f"--policy.device={budget.device}",
         *env_flags(budget, world),
         *flags("dppo", config.dppo),
-        f"--dppo.iterations={budget.iterations}",
+        f"--dppo.iterations={iterations}",
         f"--dppo.num_envs={budget.envs}",
-        f"--seed={seed * SEED_STRIDE + TRAIN_SEED_OFFSET}",
+        f"--seed={seed * SEED_STRIDE + seed_offset}",
         f"--output_dir={output}",
         "--resume=true",
     ]
-    needs = ["pretrain", *([output_name(world.partition(":")[2])] if world != "plain" else [])]
-    product = output / "checkpoints" / "last" / "pretrained_model" / "model.safetensors"
-    title = f"Fine-tune in {world}, seed {seed}"
-    return Stage(output.name, title, tuple(command), output, product, tuple(needs), resumable=True)
+    product = tuned_policy(budget, name, seed) / "model.safetensors"
+    title = f"Fine-tune {name}, seed {seed}"
+    return Stage(output.name, title, tuple(command), output, product, needs, resumable=True)
 
 
 def evaluation_dir(budget: Budget, trained: str, world: str, seed: int) -> Path:
@@ -204,12 +163,11 @@ def evaluation_dir(budget: Budget, trained: str, world: str, seed: int) -> Path:
 
 
 def evaluation_stage(budget: Budget, trained: str, world: str, seed: int) -> Stage:
-    """A policy, "bc" or the world that it was fine-tuned in, in a world, on this seed's episodes."""
-    output, tuned = evaluation_dir(budget, trained, world, seed), finetune_dir(budget, trained, seed)
-    path = budget.checkpoint if trained == "bc" else tuned / "checkpoints" / "last" / "pretrained_model"
+    """A policy, the start or named by the world that it was fine-tuned in, on this seed's episodes."""
+    output = evaluation_dir(budget, trained, world, seed)
     command = [
         "lerobot-eval",
-        f"--policy.path={path}",
+        f"--policy.path={tuned_policy(budget, trained, seed)}",
         f"--policy.device={budget.device}",
         *env_flags(budget, world),
         f"--env.metrics_path={output / 'episodes.jsonl'}",
@@ -220,7 +178,7 @@ def evaluation_stage(budget: Budget, trained: str, world: str, seed: int) -> Sta
         f"--output_dir={output}",
     ]
     title = f"Evaluate {trained} in {world}, seed {seed}"
-    needs = ("pretrain" if trained == "bc" else tuned.name,)
+    needs = (finetune_dir(budget, trained, seed).name,)
     return Stage(output.name, title, tuple(command), output, output / "eval_info.json", needs)
 
 
@@ -228,8 +186,8 @@ def cells(name: str) -> dict[str, tuple[str, str]]:
     """The comparison's cells for a reality: pairs (trained in, evaluated in) by what they are called."""
     real, model = f"real:{name}", f"diagnosed:{name}"
     return {
-        "imitation in reality": ("bc", real),
-        "imitation in the plain simulator": ("bc", "plain"),
+        "start in reality": (START, real),
+        "start in the plain simulator": (START, "plain"),
         "plain in reality": ("plain", real),
         "plain in its own simulator": ("plain", "plain"),
         "diagnosed in reality": (model, real),
@@ -242,26 +200,33 @@ def evaluations(budget: Budget) -> list[tuple[str, str]]:
     return list(dict.fromkeys(pair for name in budget.realities for pair in cells(name).values()))
 
 
-def lanes(budget: Budget) -> tuple[dict[str, list[Stage]], dict[str, list[Stage]]]:
-    """Stages that run side by side, each list in its order: preparation first, then the policies."""
+Lanes = dict[str, list[Stage]]
+"""Stages that run one after the other, by name."""
+
+
+def lanes(budget: Budget) -> tuple[Lanes, Lanes, Lanes]:
+    """What runs side by side: preparation first, then every seed's start, then the policies."""
     before = {"imitation": imitation_stages(budget)}
     before |= {output_name(name): diagnosis_stages(budget, name) for name in budget.realities}
-    policies = {}
+    starts, policies = {}, {}
     for seed in budget.seeds:
-        for trained in ("plain", *(f"diagnosed:{name}" for name in budget.realities), "bc"):
+        begun = [*before["imitation"], start_stage(budget, seed)]
+        starts[folder_name(START, str(seed))] = begun
+        for trained in ("plain", *(f"diagnosed:{name}" for name in budget.realities), START):
             name = trained.partition(":")[2]
-            prepared = [*before["imitation"], *(before[output_name(name)] if name else [])]
-            tuning = [] if trained == "bc" else [finetune_stage(budget, trained, seed)]
+            diagnosed = before[output_name(name)] if name else []
+            tuning = [] if trained == START else [finetune_stage(budget, trained, seed)]
             worlds = [world for policy, world in evaluations(budget) if policy == trained]
             judged = [evaluation_stage(budget, trained, world, seed) for world in worlds]
-            policies[folder_name(trained, str(seed))] = [*prepared, *tuning, *judged]
-    return before, policies
+            lane = folder_name("policy", trained, str(seed))
+            policies[lane] = [*begun, *diagnosed, *tuning, *judged]
+    return before, starts, policies
 
 
-def prepared(before: dict[str, list[Stage]], policies: dict[str, list[Stage]]) -> dict[str, list[Stage]]:
-    """The policies that can run: nothing that they need of the preparation failed."""
-    missing = {stage.name for stages in before.values() for stage in stages if not stage.product.exists()}
-    return {name: lane for name, lane in policies.items() if missing.isdisjoint(s.name for s in lane)}
+def runnable(done: Lanes, waiting: Lanes) -> Lanes:
+    """The lanes whose stages among those done have left what they should."""
+    missing = {stage.name for lane in done.values() for stage in lane if not stage.product.exists()}
+    return {name: lane for name, lane in waiting.items() if missing.isdisjoint(s.name for s in lane)}
 
 
 def write_worlds(budget: Budget) -> None:
@@ -335,7 +300,8 @@ def parse() -> tuple[argparse.Namespace, Budget]:
     for name, default in (
         ("num_demos", 80),
         ("pretrain_steps", 1000),
-        ("iterations", 30),
+        ("start_iterations", 20),
+        ("iterations", 20),
         ("envs", 128),
         ("eval_episodes", 200),
         ("eval_envs", 50),
@@ -355,22 +321,22 @@ def parse() -> tuple[argparse.Namespace, Budget]:
 def main() -> None:
     """Prepare, run every policy, compare."""
     options, budget = parse()
-    before, policies = lanes(budget)
+    before, starts, policies = lanes(budget)
     if options.lane is not None:
-        StageRunner(budget.output_dir, (before | policies)[options.lane]).run()
+        StageRunner(budget.output_dir, (before | starts | policies)[options.lane]).run()
         return
     write_worlds(budget)
     failed = run_lanes(budget, before, options.jobs)
-    failed = run_lanes(budget, prepared(before, policies), options.jobs) or failed
+    ready = runnable({"imitation": before["imitation"]}, starts)
+    failed = run_lanes(budget, ready, options.jobs) or failed
+    failed = run_lanes(budget, runnable(before | starts, policies), options.jobs) or failed
     results = compare(budget)
     save(budget.output_dir, results, as_text(results))
     if failed is not None:
         raise failed
 
 
-def run_lanes(
-    budget: Budget, together: dict[str, list[Stage]], jobs: int
-) -> subprocess.CalledProcessError | None:
+def run_lanes(budget: Budget, together: Lanes, jobs: int) -> subprocess.CalledProcessError | None:
     """Run these lanes, as many side by side; one of the failures, if there was any."""
     again = [sys.executable, str(Path(__file__)), *sys.argv[1:]]
     commands = {budget.output_dir / name: [*again, f"--lane={name}"] for name in together}

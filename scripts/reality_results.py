@@ -22,9 +22,9 @@ def as_text(results: dict[str, Any]) -> str:
     words = []
     for name, row in results.items():
         for title, real, own in (
-            ("nowhere (imitation)", "imitation in reality", "imitation in the plain simulator"),
-            ("plain", "plain in reality", "plain in its own simulator"),
-            ("diagnosed", "diagnosed in reality", "diagnosed in its own simulator"),
+            ("the shared start (plain)", "start in reality", "start in the plain simulator"),
+            ("then the plain one", "plain in reality", "plain in its own simulator"),
+            ("then the diagnosed one", "diagnosed in reality", "diagnosed in its own simulator"),
         ):
             lines.append(f"| {name} | {title} | {rate_text(row[real])} | {rate_text(row[own])} |")
         words.append(sentence(name, row))

@@ -28,7 +28,7 @@ def scripts():
 @pytest.fixture
 def budget(scripts, tmp_path):
     compare, _ = scripts
-    budget = compare.Budget(tmp_path, tuple(compare.REALITIES), (3, 4), "cpu", 4, 20, 1, 4, 4, 4, 8, 3, {})
+    budget = compare.Budget(tmp_path, tuple(compare.REALITIES), (3, 4), "cpu", 4, 20, 2, 1, 4, 4, 4, 8, 3, {})
     compare.write_worlds(budget)
     for name in budget.realities:  # as if diagnosed
         budget.diagnosis(name).mkdir(parents=True)
@@ -46,12 +46,22 @@ def flags_of(stage):
 
 def test_fine_tunings_differ_in_the_simulator_alone(scripts, budget):
     compare, _ = scripts
-    _, policies = compare.lanes(budget)
+    _, starts, policies = compare.lanes(budget)
     stages = {
-        stage.name: stage for lane in policies.values() for stage in lane if stage.name.startswith("finetune")
+        stage.name: stage
+        for lane in policies.values()
+        for stage in lane
+        if stage.name.startswith("finetune") and "start" not in stage.name
     }
+    begun = {stage.name: stage for lane in starts.values() for stage in lane if "start" in stage.name}
+    assert len(begun) == 2
+    for stage in stages.values():
+        start = begun[f"finetune_start_{stage.name[-1]}"]
+        assert stage.needs[0] == start.name
+        assert flags_of(stage)["policy.path"] == str(start.product.parent)
+        assert int(flags_of(stage)["seed"]) > int(flags_of(start)["seed"]) + 4 * 2  # other episodes
     assert len(stages) == 8  # four simulators, two seeds
-    kept, differ = [], ("env.sensor_model", "env.reality", "output_dir", "seed")
+    kept, differ = [], ("env.sensor_model", "env.reality", "output_dir", "seed", "policy.path")
     for stage in stages.values():
         flags = flags_of(stage)
         assert "/diagnosis/" in flags.get("env.reality", "/diagnosis/")  # never the hidden one
@@ -66,7 +76,7 @@ def test_evaluations_use_the_same_episodes_and_valid_environments(scripts, budge
     from lerobot_vtrefine.cli.pipeline.child_configs import parse_env
 
     compare, _ = scripts
-    _, policies = compare.lanes(budget)
+    policies = compare.lanes(budget)[2]
     stages = [stage for lane in policies.values() for stage in lane if stage.name.startswith("eval")]
     assert len(stages) == 2 * len(compare.evaluations(budget)) == 28
     seeds = {(flags_of(stage)["seed"], stage.name[-1]) for stage in stages}
@@ -83,10 +93,10 @@ def test_evaluations_use_the_same_episodes_and_valid_environments(scripts, budge
 
 def test_every_lane_can_run_on_its_own(scripts, budget):
     compare, _ = scripts
-    before, policies = compare.lanes(budget)
-    assert len(before) == 4
-    assert len(policies) == 10
-    for stages in (before | policies).values():
+    before, starts, policies = compare.lanes(budget)
+    assert [len(lanes) for lanes in (before, starts, policies)] == [4, 2, 10]
+    assert len(before | starts | policies) == 16
+    for stages in (before | starts | policies).values():
         names = [stage.name for stage in stages]
         assert len(set(names)) == len(names)
         for index, stage in enumerate(stages):
@@ -126,7 +136,7 @@ def test_unfinished_seeds_are_left_out(scripts, budget):
     compare, _ = scripts
     leave_results(compare, budget, {}, budget.seeds)
     first, *others = budget.realities
-    compare.results_path(budget, "bc", f"real:{first}", 4).unlink()
+    compare.results_path(budget, "start", f"real:{first}", 4).unlink()
     results = compare.compare(budget)
     assert results[first]["seeds"] == [3]
     assert all(results[name]["seeds"] == [3, 4] for name in others)
@@ -137,14 +147,17 @@ def test_unfinished_seeds_are_left_out(scripts, budget):
 
 def test_a_failed_diagnosis_stops_its_own_policies_only(scripts, budget):
     compare, _ = scripts
-    before, policies = compare.lanes(budget)
-    for stage in (stage for stages in before.values() for stage in stages):
+    before, starts, policies = compare.lanes(budget)
+    done = before | starts
+    for stage in (stage for stages in done.values() for stage in stages):
         stage.product.parent.mkdir(parents=True, exist_ok=True)
         stage.product.touch()
-    assert compare.prepared(before, policies) == policies
+    assert compare.runnable(done, policies) == policies
     before[compare.output_name(budget.realities[0])][-1].product.unlink()
-    left = set(policies) - set(compare.prepared(before, policies))
-    assert left == {f"diagnosed_row_sharing_and_hysteresis_{seed}" for seed in budget.seeds}
+    left = set(policies) - set(compare.runnable(done, policies))
+    assert left == {f"policy_diagnosed_row_sharing_and_hysteresis_{seed}" for seed in budget.seeds}
+    starts["start_3"][-1].product.unlink()
+    assert not any(name.endswith("_3") for name in compare.runnable(done, policies))
 
 
 def test_presses_follow_the_contract_and_the_hidden_pad(scripts, budget):

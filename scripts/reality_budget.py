@@ -1,0 +1,84 @@
+"""What every run of ``compare_reality.py`` may spend, and the flags of the worlds that it runs in."""
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from realities import of_robot
+
+from lerobot_vtrefine.cli.pipeline.demo_config import (
+    DemoConfig,
+    acting_env,
+    default_env,
+    flags,
+)
+
+
+@dataclass(frozen=True)
+class Budget:
+    """What every run may spend; the same for the plain and the diagnosed simulator."""
+
+    output_dir: Path
+    realities: tuple[str, ...]
+    seeds: tuple[int, ...]
+    device: str
+    num_demos: int
+    pretrain_steps: int
+    start_iterations: int
+    iterations: int
+    envs: int
+    eval_episodes: int
+    eval_envs: int
+    presses: int
+    motions: int
+    env: dict[str, str]
+
+    @property
+    def imitation(self) -> Path:
+        """The imitation-learned policy that every seed starts from."""
+        return recipe(self, self.seeds[0]).checkpoint("pretrain")
+
+    def diagnosis(self, name: str) -> Path:
+        """Folder of a reality's diagnosis."""
+        return self.output_dir / folder_name(name) / "diagnosis"
+
+
+def recipe(budget: Budget, seed: int) -> DemoConfig:
+    """The demo's recipe with this budget, in the plain simulator."""
+    plain = {"sensor_model": str(budget.output_dir / "plain" / "sensor_model.json")}
+    return DemoConfig(
+        output_dir=budget.output_dir / "imitation",
+        seed=seed,
+        device=budget.device,
+        num_demos=budget.num_demos,
+        pretrain_steps=budget.pretrain_steps,
+        finetune_iterations=budget.iterations,
+        finetune_envs=budget.envs,
+        eval_episodes=budget.eval_episodes,
+        eval_envs=budget.eval_envs,
+        env=default_env() | budget.env | plain,
+    )
+
+
+def folder_name(*parts: str) -> str:
+    """A name for folders and stages, from worlds."""
+    return "_".join(part.replace(":", "_").replace("+", "_and_") for part in parts)
+
+
+def env_flags(budget: Budget, world: str) -> list[str]:
+    """Flags of a world: plain, diagnosed:NAME or real:NAME."""
+    env = acting_env(recipe(budget, budget.seeds[0]))
+    kind, _, name = world.partition(":")
+    if kind == "diagnosed":
+        env["reality" if of_robot(name) else "sensor_model"] = str(
+            budget.diagnosis(name) / "sensor_model.json"
+        )
+    elif kind == "real":
+        env = real_env(budget, name, env)
+    return flags("env", {"type": "vtrefine"} | env)
+
+
+def real_env(budget: Budget, name: str, env: dict[str, Any]) -> dict[str, Any]:
+    """An environment's flags in a stand-in reality; its pads are the plain ones unless it hides others."""
+    kept = env if of_robot(name) else {key: value for key, value in env.items() if key != "sensor_model"}
+    return kept | {"reality": str(budget.output_dir / folder_name(name) / "reality.json")}
