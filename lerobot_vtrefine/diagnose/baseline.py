@@ -38,6 +38,10 @@ class Baseline:
     weights: tuple[TrialWeights, ...]
 
 
+LEAST_C = 0.2
+"""Range of the recordings' temperatures from which on something may be seen to follow it."""
+
+
 def describe(presses: PressSet) -> Setting:
     """What candidates may know; the largest signal is not known before the first fit."""
     steps = np.concatenate([np.diff(press.time_s) for press in presses.presses])
@@ -62,7 +66,17 @@ def describe(presses: PressSet) -> Setting:
         touched_rows=int(touched.any(axis=1).sum()),
         touched_cols=int(touched.any(axis=0).sum()),
         rest_session_s=presses.idle.session_s,
+        temperature_c=_temperature(presses),
     )
+
+
+def _temperature(presses: PressSet) -> float | None:
+    """Mean over the recordings [degrees Celsius]."""
+    values = [press.trial.temperature_c for press in presses.presses]
+    known = [value for value in values if value is not None and np.isfinite(value).all()]
+    if len(known) < len(values) or np.ptp([value.mean() for value in known]) < LEAST_C:
+        return None
+    return float(np.mean([value.mean() for value in known]))
 
 
 def _reach(top: float, loaded: bool) -> float:

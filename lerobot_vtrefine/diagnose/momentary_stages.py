@@ -114,11 +114,14 @@ def _drift(stage: BaselineDrift, field: Field, context: Context) -> Field:
     sheet = context.sheet
     field = field.spread(context.wanted if context.wanted is not None else np.arange(len(sheet.taxels)))
     out = field.values.copy()
-    for press, (time_s, start_s) in enumerate(zip(sheet.times_s, sheet.starts_s, strict=True)):
+    when = zip(sheet.times_s, sheet.starts_s, sheet.warmth_c, strict=True)
+    for press, (time_s, start_s, warm) in enumerate(when):
         session_s = time_s + start_s
         moved = stage.rate_counts_per_s * session_s
         if stage.knots_s:
             moved = moved + np.interp(session_s, stage.knots_s, stage.knot_counts)
+        if warm is not None:
+            moved = moved + stage.counts_per_c * (warm - stage.reference_c)
         out[: len(time_s), field.within(sheet, press)] += moved[:, None]
     return Field(out, field.columns)
 

@@ -3,7 +3,7 @@
 import numpy as np
 
 from lerobot_vtrefine.diagnose.recordings import Trial
-from lerobot_vtrefine.diagnose.refinement import instants, instants_of, motion
+from lerobot_vtrefine.diagnose.refinement import instants, instants_of, motion, warmth
 from lerobot_vtrefine.tactile.layout import PadLayout
 from lerobot_vtrefine.tactile.model import SensorModel
 from lerobot_vtrefine.tactile.replay import replay
@@ -18,10 +18,11 @@ def predict_trial(model: SensorModel, trial: Trial, layout: PadLayout) -> np.nda
     """
     times, frames = instants_of(trial, layout, instants(tuple(model.stages)))
     drive, rate = motion(trial, layout, times)
+    warm, start_s = warmth(trial, times), trial.start_s
     if trial.depth_m is None:
-        fine = replay(model, times, force_n=drive, layout=layout, start_s=trial.start_s)
+        fine = replay(model, times, force_n=drive, layout=layout, start_s=start_s, temperature_c=warm)
     else:
-        fine = replay(model, times, drive, rate, layout=layout, start_s=trial.start_s)
+        fine = replay(model, times, drive, rate, layout=layout, start_s=start_s, temperature_c=warm)
     converter = model.find("quantisation")
     limit = converter.full_scale_counts if isinstance(converter, Quantisation) else np.inf
     predicted = fine[frames].numpy().astype(float)

@@ -81,6 +81,13 @@ def resampled(trial: Trial, times: np.ndarray) -> Trial:
     )
 
 
+def warmth(trial: Trial, times: np.ndarray) -> np.ndarray | None:
+    """Temperature at times (T,) [degrees Celsius]; None where it was not recorded throughout."""
+    if trial.temperature_c is None or not np.isfinite(trial.temperature_c).all():
+        return None
+    return np.interp(times, trial.time_s, trial.temperature_c)
+
+
 def motion(trial: Trial, layout: PadLayout, times: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Column heights [m] and their rate [m/s] at times (T,): (T, R, C) each; or force per taxel [N] and zero.
 

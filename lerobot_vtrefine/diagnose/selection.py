@@ -9,6 +9,7 @@ import numpy as np
 from lerobot_vtrefine.diagnose.alarms import LEVEL, slow_errors
 from lerobot_vtrefine.diagnose.baseline import plain_weights, weigh
 from lerobot_vtrefine.diagnose.candidates.base import Form
+from lerobot_vtrefine.diagnose.candidates.baseline_drift import CURVE
 from lerobot_vtrefine.diagnose.candidates.sample_and_hold import held
 from lerobot_vtrefine.diagnose.composite import Composite
 from lerobot_vtrefine.diagnose.crossvalidation import Score, agree, cross_validate
@@ -142,7 +143,7 @@ def elaborate(
     for form in (form for form in forms if len(form.values) <= richest):
         found = refit(search, fitted, form, probes) if form.grown is None else grow(search, plain[0], form)
         score = scored(search, found)
-        if clearly_better(score, best[1], search.seed):
+        if preferable(form, score, best[1], search.seed):
             best = found, score
     return best
 
@@ -153,6 +154,13 @@ def grow(search: Search, plain: Fit, form: Form) -> Fit:
     index = plain.model.families.index(form.family)
     values = np.asarray(form.grown(plain.model.own(index), plain.model.setting), dtype=float)
     return settle(search, plain.model.plus(form, np.clip(values, form.low, form.high)))
+
+
+def preferable(form: Form, score: Score, than: Score, seed: int) -> bool:
+    """Whether a form is to stand in for a plainer one."""
+    if form.peer:
+        return score.gain_over(than) > 0 and float(score.better_by(than).sum()) > 0
+    return clearly_better(score, than, seed)
 
 
 def clearly_better(score: Score, than: Score, seed: int, needed: float = MIN_GAIN) -> bool:
@@ -217,9 +225,8 @@ def look_round(search: Search, fitted: Fit) -> tuple[dict[str, Screened], list[S
     hold = hold_probe(search, fitted)
     if hold is not None:
         probes = [*(probe for probe in probes if probe.name != hold.name), hold]
-    curves = forms_of("baseline_drift", fitted)[1:]
-    if curves and "baseline_drift" not in fitted.model.families:
-        wander = wander_probe(fitted, search.presses, curves[0], search.seed)
+    if CURVE.possible(fitted.model.setting) and "baseline_drift" not in fitted.model.families:
+        wander = wander_probe(fitted, search.presses, CURVE, search.seed)
         probes += [wander] if wander is not None else []
     found = screen(probes, len(search.weights), search.seed)
     return found, rank(search, fitted, survivors(found)[:REFITTED], probes)
@@ -266,7 +273,7 @@ def simplify(search: Search, fitted: Fit) -> Fit:
         _, columns = tangents(slim.model, search.presses, slim.model.free)
         probes = probe_form(plain, Scorer(slim, search.presses, search.weights, columns))
         found = refit(search, slim, plain, probes)
-        if not clearly_better(scored(search, fitted), scored(search, found), search.seed):
+        if not preferable(form, scored(search, fitted), scored(search, found), search.seed):
             fitted = reweigh(search, found)
     return fitted
 

@@ -8,7 +8,7 @@ from itertools import pairwise
 import numpy as np
 
 from lerobot_vtrefine.diagnose.presses import MARGIN_TAXELS, Press
-from lerobot_vtrefine.diagnose.refinement import Kind
+from lerobot_vtrefine.diagnose.refinement import Kind, warmth
 from lerobot_vtrefine.diagnose.rhythm import Rhythm
 from lerobot_vtrefine.tactile.layout import PadLayout
 
@@ -45,6 +45,8 @@ class Sheet:
     loaded: bool
     rhythms: tuple[Rhythm, ...]
     """When each press's readings were new."""
+    warmth_c: tuple[np.ndarray | None, ...]
+    """Temperature at every press's instants; None where it was not recorded."""
 
     @cached_property
     def rows(self) -> np.ndarray:
@@ -74,7 +76,12 @@ class Sheet:
         if all(len(time_s) == len(frames) for time_s, frames in zip(self.times_s, self.frames, strict=True)):
             return self
         times_s = tuple(time_s[frames] for time_s, frames in zip(self.times_s, self.frames, strict=True))
-        sheet = replace(self, times_s=times_s, frames=tuple(np.arange(len(time_s)) for time_s in times_s))
+        frames = tuple(np.arange(len(time_s)) for time_s in times_s)
+        warmth_c = tuple(
+            None if warm is None else warm[kept]
+            for warm, kept in zip(self.warmth_c, self.frames, strict=True)
+        )
+        sheet = replace(self, times_s=times_s, frames=frames, warmth_c=warmth_c)
         sheet.__dict__["all_scored"] = self.all_scored
         return sheet
 
@@ -139,4 +146,5 @@ def _build(everyone: Sequence[Press], members: list[int], idle: np.ndarray, kind
         idle.ravel()[taxels],
         loaded,
         tuple(press.rhythm for press in presses),
+        tuple(warmth(press.trial, course.time_s) for press, course in zip(presses, courses, strict=True)),
     )

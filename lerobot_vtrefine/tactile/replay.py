@@ -70,6 +70,7 @@ def replay(
     force_n: ArrayLike | None = None,
     layout: PadLayout | None = None,
     start_s: float = 0.0,
+    temperature_c: ArrayLike | None = None,
     skip: Collection[str] = ("noise", "quantisation"),
     device: str = "cpu",
 ) -> torch.Tensor:
@@ -86,6 +87,7 @@ def replay(
         rate_m_s: its rate; central differences by default.
         force_n: (T, ..., R, C) force per taxel [N].
         start_s: session time of the trial's first frame, for drift [s].
+        temperature_c: (T,) where it was recorded, for drift [degrees Celsius].
         skip: stages left out; by default those that only add noise to a prediction.
 
     Raises:
@@ -104,7 +106,10 @@ def replay(
         raise ValueError(f"replay got {tuple(x.shape[-2:])} taxels for a {layout.rows} x {layout.cols} pad")
     contact = model.contact
     frame = Frame(
-        layout=layout, stiffness_n_per_m=contact.stiffness(layout), load_conserving=force_n is not None
+        layout=layout,
+        stiffness_n_per_m=contact.stiffness(layout),
+        temperature_c=None if temperature_c is None else torch.as_tensor(temperature_c, device=device),
+        load_conserving=force_n is not None,
     )
     if force_n is None:
         rate = (

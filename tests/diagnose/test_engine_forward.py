@@ -36,7 +36,7 @@ def trial(number: int, rng: np.random.Generator, frames: int = 60) -> Trial:
         zero,
         zero,
         None,
-        None,
+        np.linspace(21.0, 24.0, frames) + number,
         20.0 + rng.normal(0, 0.5, (frames, 40)),
     )
 
@@ -60,7 +60,7 @@ def composite(held: PressSet) -> Composite:
 
 
 # What a free board held is known of recordings only; predictions are means over its instants.
-FORETOLD = [form for form in CATALOGUE if "free of" not in form.label]
+FORETOLD = [form for form in CATALOGUE if not ("free of" in form.label or "irregular" in form.label)]
 
 
 @pytest.mark.parametrize("form", FORETOLD, ids=lambda form: f"{form.family}-{form.label}")

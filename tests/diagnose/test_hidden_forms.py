@@ -20,6 +20,7 @@ SEED = 7011
         ("hysteresis", "branch"),
         ("hysteresis", "below_peak"),
         ("viscoelastic_relaxation", "power_creep"),
+        ("baseline_drift", "temperature"),
     ],
     ids=lambda name: name,
 )

@@ -33,6 +33,8 @@ class Setting:
     touched_cols: int
     rest_session_s: float
     """Mean session time of the frames that the idle map rests on [s]."""
+    temperature_c: float | None = None
+    """Mean temperature; None where it was not recorded throughout, or did not change."""
     log_gain: float | None = None
     """Logarithm of the plain baseline's counts per metre (or newton); None before it is fitted."""
 
@@ -84,6 +86,8 @@ class Form:
     """Number of the coordinate that trades off against the baseline's damping, if one does."""
     screened: bool = True
     """Whether its probes take part in screening; fallbacks are only fitted where their family is named."""
+    peer: bool = False
+    """Whether it is no richer than the plain form, so that it need not foretell clearly better, only better."""
     grown: Callable[[np.ndarray, Setting], list[float]] | None = None
     """The family's plain form, given by its coordinates, as this form has it: where descents start."""
 

@@ -28,10 +28,31 @@ def _curve(values: np.ndarray, setting: Setting) -> tuple[Stage, ...]:
     return (BaselineDrift(0.0, knots, tuple(float(value) for value in values)),)
 
 
+def _thermal(values: np.ndarray, setting: Setting) -> tuple[Stage, ...]:
+    """Around a fitted temperature, at which the idle map holds."""
+    per_c, shift_c = float(values[0]), float(values[1])
+    reference_c = (setting.temperature_c or 0.0) + shift_c
+    return (BaselineDrift(0.0, counts_per_c=per_c, reference_c=reference_c),)
+
+
 def _report_curve(values: np.ndarray, setting: Setting) -> dict[str, tuple[float, str]]:
     """The mean rate."""
     return {"rate_counts_per_s": (float(np.polyfit(_knots(setting), values, 1)[0]), "counts/s")}
 
+
+CURVE = Form(
+    "baseline_drift",
+    "curve over session time",
+    tuple(Value(f"counts_{j}", -1e3, 1e3, 1e-2) for j in range(KNOTS)),
+    _curve,
+    _report_curve,
+    lambda s: [
+        (0.5 * np.cos(np.pi * order * np.arange(KNOTS) / (KNOTS - 1))).tolist() for order in (1, 2, 3)
+    ],
+    amplitude=None,
+    signed=True,
+    possible=lambda s: s.session_s > 2.0 * s.duration_s,
+)
 
 FORMS = (
     Form(
@@ -43,17 +64,16 @@ FORMS = (
         lambda s: [[1.0]],
         signed=True,
     ),
+    CURVE,
     Form(
         "baseline_drift",
-        "curve over session time",
-        tuple(Value(f"counts_{j}", -1e3, 1e3, 1e-2) for j in range(KNOTS)),
-        _curve,
-        _report_curve,
-        lambda s: [
-            (0.5 * np.cos(np.pi * order * np.arange(KNOTS) / (KNOTS - 1))).tolist() for order in (1, 2, 3)
-        ],
-        amplitude=None,
+        "follows the temperature",
+        (Value("counts_per_c", -200.0, 200.0, 1e-2), Value("shift_c", -30.0, 30.0, 1e-2)),
+        _thermal,
+        lambda v, s: {"counts_per_c": (float(v[0]), "counts/degC")},
+        lambda s: [[0.1, 0.0]],
         signed=True,
-        possible=lambda s: s.session_s > 2.0 * s.duration_s,
+        possible=lambda s: s.temperature_c is not None,
+        peer=True,
     ),
 )

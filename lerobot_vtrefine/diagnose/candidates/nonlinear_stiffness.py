@@ -54,8 +54,7 @@ FORMS = (
         ),
         _bottoming,
         _report_bottoming,
-        lambda s: [[0.5, knee, float(np.log(0.05))] for knee in (0.35, 0.55, 0.75)],
+        lambda s: [[0.05, knee, float(np.log(0.05))] for knee in (0.4, 0.65)],
         possible=lambda s: not s.loaded,
-        screened=False,
     ),
 )

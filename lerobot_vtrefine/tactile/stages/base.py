@@ -35,6 +35,8 @@ class Frame:
     """Session time, broadcastable to (..., R, C) [s]."""
     stiffness_n_per_m: torch.Tensor | float = 0.0
     """One taxel's stiffness in the contact stage [N/m]."""
+    temperature_c: torch.Tensor | None = None
+    """Temperature, broadcastable to (..., R, C); None where nobody measured it [degrees Celsius]."""
     load_conserving: bool = False
     """Whether the taxels' sum is a measured or solved load, which mechanics must not change."""
 

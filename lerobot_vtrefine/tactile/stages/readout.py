@@ -1,6 +1,6 @@
 """Readout stages: force to conductance, the row's shared divider, and 8-bit counts on an idle level."""
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from itertools import pairwise
 from typing import Any, ClassVar, override
 
@@ -245,7 +245,7 @@ class BaselineDrift(Stage):
     """The idle level moves with session time: counts += rate_counts_per_s * t.
 
     `knots_s` and `knot_counts`, equally long, add a curve that is straight between its knots and level beyond
-    them.
+    them; `counts_per_c` follows the temperature around `reference_c`, where a recording knows it.
     """
 
     name: ClassVar[str] = "baseline_drift"
@@ -255,6 +255,8 @@ class BaselineDrift(Stage):
     rate_counts_per_s: float = parameter(0.0, "counts/s", -3e-3, 3e-3, minimum=None)
     knots_s: tuple[float, ...] = ()
     knot_counts: tuple[float, ...] = ()
+    counts_per_c: float = parameter(0.0, "counts/degC", 0.0, 0.0, minimum=None)
+    reference_c: float = 22.0
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -271,7 +273,15 @@ class BaselineDrift(Stage):
         knots = zip(pairwise(self.knots_s), pairwise(self.knot_counts), strict=True)
         for (begin, end), (first, last) in knots:
             moved = moved + (last - first) / (end - begin) * (time_s - begin).clamp(0.0, end - begin)
+        if frame.temperature_c is not None:
+            moved = moved + self.counts_per_c * (frame.temperature_c - self.reference_c)
         return x + moved.to(x), state
+
+    @override
+    def sequence(self, x: torch.Tensor, times_s: torch.Tensor, frame: Frame) -> torch.Tensor:
+        shape = (-1,) + (1,) * (x.ndim - 1)
+        warmth = None if frame.temperature_c is None else frame.temperature_c.view(shape)
+        return self.step(x, {}, replace(frame, time_s=times_s.view(shape), temperature_c=warmth))[0]
 
 
 @register
