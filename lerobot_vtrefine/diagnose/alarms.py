@@ -20,6 +20,8 @@ MISFIT, MISFIT_NOISE = 0.1, 1.0 / 3.0
 """Parts of the baseline's repeatable squared error, and of the squared error that is left, up to which what
 still repeats is laid to the names' form. Effects outside the catalogue that borrow names leave a fifth."""
 FLIPS = 4999
+CORNER = 0.4
+"""Doubt about the damping's part, in a frame's noise, from which on a reading says nothing about causes."""
 PAIR_CORRELATION, PAIR_DEVIATIONS, MIN_STRANGERS = 0.2, 6.0, 30
 PAIRS, PAIRS_LEFT, PAIRS_MISFIT = (0.1, 4.5), (0.1, 2.8), (0.15, 4.5)
 """Mean correlation of all replicates, and its distance from strangers' in standard errors, that mean an
@@ -51,7 +53,8 @@ class Alarm:
 
 
 def cleaned(fitted: Fit, presses: PressSet, weights: Sequence[TrialWeights]) -> list[np.ndarray]:
-    """Residuals (T, n) without each recording's own gain and first touch, and without edges [counts]."""
+    """Residuals (T, n) without each recording's own gain and first touch, and without edges and
+    corners [counts]."""
     result = []
     for press, weight, residual in zip(presses.presses, weights, fitted.residuals(presses), strict=True):
         white = weight.whiten(residual)
@@ -59,8 +62,24 @@ def cleaned(fitted: Fit, presses: PressSet, weights: Sequence[TrialWeights]) -> 
         # Undo whitening of the nuisance part: its directions were whitened the same way.
         unit = (weight.nuisance @ size).reshape(residual.shape)
         plain = weight.memory.coloured(unit)
-        result.append(np.where(_under_edge(press), 0.0, residual - plain * weight.sigma))
+        unsure = _under_edge(press) | (_rate_doubt(press, fitted) > CORNER * weight.sigma)
+        result.append(np.where(unsure, 0.0, residual - plain * weight.sigma))
     return result
+
+
+def _rate_doubt(press: Press, fitted: Fit) -> np.ndarray:
+    """What the rate of depth may err by where the motion turns between two frames, (T, n) [counts].
+
+    Frames do not say when it turned, alike in every replicate; a slow frame rate and strong damping make that
+    the largest error of all.
+    """
+    rate = np.where(press.drive[:, press.scored] > 0, press.rate[:, press.scored], 0.0)
+    if press.loaded or len(rate) < 2:
+        return np.zeros(rate.shape)
+    steps = np.abs(np.diff(rate, axis=0))
+    turn = np.maximum(np.vstack([steps, steps[:1] * 0.0]), np.vstack([steps[:1] * 0.0, steps]))
+    log_gain, damping_s = fitted.model.values[:2]
+    return 0.5 * float(np.exp(log_gain) * damping_s) * turn
 
 
 def _under_edge(press: Press) -> np.ndarray:

@@ -6,8 +6,9 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from test_engine_pad import COLS, ROWS, linear, one_trial
+from test_engine_pad import COLS, ROWS, heights, linear, one_trial
 
+from lerobot_vtrefine.diagnose import alarms
 from lerobot_vtrefine.diagnose.alarms import Correlations, cleaned, left_over, pairs_alarm
 from lerobot_vtrefine.diagnose.baseline import Baseline, fit_baseline
 from lerobot_vtrefine.diagnose.beside import beside_alarm, taxel_alarm
@@ -22,7 +23,10 @@ COUNT = 16
 def fitted(added: Callable[[Trial], np.ndarray]) -> tuple[PressSet, Baseline]:
     """Presses of a plain pad to whose readings (T, N) something is added [counts], and their baseline."""
     trials = [one_trial(number, linear, 21, 1.0, 1.0) for number in range(COUNT)]
-    trials = [replace(trial, raw=np.round(trial.raw + added(trial)).clip(0, 255)) for trial in trials]
+    return prepared([replace(trial, raw=np.round(trial.raw + added(trial)).clip(0, 255)) for trial in trials])
+
+
+def prepared(trials: list[Trial]) -> tuple[PressSet, Baseline]:
     held = RecordingSet(Path(), "pad", ROWS, COLS, 0.002, "adc_counts", 255.0, (), tuple(trials))
     presses = prepare(held, trials, list(range(COUNT)))
     return presses, fit_baseline(presses)
@@ -87,3 +91,33 @@ def test_pairs_of_replicates_are_judged_by_what_names_leave() -> None:
     silent = Correlations.of(presses, noise)
     assert silent is not None
     assert not pairs_alarm(presses, noise, silent, 0.5).fired
+
+
+def jerky(number: int) -> Trial:
+    """Twelve frames a second of a pad with strong damping, whose presses turn between frames."""
+    condition, rng = np.random.default_rng([31, number // 2]), np.random.default_rng([32, number])
+    time_s = np.arange(100) / 12.0
+    knots = np.cumsum(condition.uniform(0.15, 0.45, 40))
+    levels = np.where(np.arange(40) % 4 == 0, -1e-4, condition.uniform(1e-4, 7e-4, 40))
+    depth, ahead = (np.interp(time_s + step, knots, levels) for step in (0.0, 1e-4))
+    height, later = (heights(0.0, 0.0, values) for values in (depth, ahead))
+    felt = np.maximum(1.5e5 * (height + 0.03 * (later - height) / 1e-4), 0.0) * (height > 0)
+    raw = np.round(20.0 + felt.reshape(len(time_s), -1) + rng.normal(0, 1.0, (len(time_s), ROWS * COLS)))
+    zero = np.zeros(len(time_s))
+    still = {"x_m": zero, "y_m": zero, "tilt_x_rad": zero, "tilt_y_rad": zero}
+    plain = one_trial(number, linear, 21, 1.0, 1.0)
+    return replace(plain, time_s=time_s, depth_m=depth, raw=raw.clip(0, 255), **still)
+
+
+def test_corners_between_two_frames_are_no_cause(monkeypatch) -> None:
+    presses, baseline = prepared([jerky(number) for number in range(COUNT)])
+
+    def fired() -> bool:
+        residuals = cleaned(baseline.fitted, presses, baseline.weights)
+        found = Correlations.of(presses, residuals)
+        assert found is not None
+        return pairs_alarm(presses, residuals, found, None).fired
+
+    assert not fired()
+    monkeypatch.setattr(alarms, "CORNER", np.inf)
+    assert fired()  # every replicate turns at the same moment
