@@ -55,7 +55,8 @@ class Rig:
     """By what part friction at rest exceeds sliding friction; falls off over `STRIBECK_RAD_S`."""
     sag: dict = field(default_factory=dict)
     sag_shape: str = "link"
-    """link: cosine of the summed pitch; own: cosine of the joint's own angle; stretch: two links."""
+    """link: cosine of the summed pitch; own: cosine of the joint's own angle; stretch: two links; upright:
+    two links, the first of which stands at zero."""
     sag_where: str = "command"
     """Where gravity pulls: at the posture that is commanded, or where the joints are ("joints")."""
     compliance: dict = field(default_factory=dict)
@@ -141,6 +142,8 @@ class Robot:
             first = pitch_of(rig.joints, u, k)
             if rig.sag_shape == "own":
                 out[..., k] = size * np.cos(u[..., k])
+            elif rig.sag_shape == "upright":
+                out[..., k] = size * (0.6 * np.sin(first) + 0.4 * np.cos(first + u[..., k + 1]))
             elif rig.sag_shape == "stretch":
                 out[..., k] = size * (0.6 * np.cos(first) + 0.4 * np.cos(first + u[..., k + 1]))
             else:

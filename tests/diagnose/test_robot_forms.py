@@ -30,3 +30,34 @@ def test_friction_that_is_larger_at_rest_is_no_play(tmp_path) -> None:
     assert [cause.name for cause in found.causes] == ["joint_friction"]
     assert found.causes[0].params["elbow_rad"].value == pytest.approx(0.03, rel=0.15)
     assert found.extended_model.joints[1].breakaway > 0.2
+
+
+def test_sag_of_an_upright_arm_is_told_at_full_reach(tmp_path) -> None:
+    rig = replace(SLOW, conditions=12, noise=0.3, sag={"shoulder": 0.02}, sag_shape="upright")
+    found = diagnosed(rig, tmp_path, 1)
+    assert [cause.name for cause in found.causes] == ["gravity_sag"]
+    size = found.causes[0].params["shoulder_rad"]
+    assert size.value == pytest.approx(0.02, rel=0.08)
+    assert size.ci95[0] < 0.02 < size.ci95[1]
+
+
+def test_sag_where_the_arm_has_sagged_to_needs_no_offset(tmp_path) -> None:
+    rig = replace(FAST, sag={"shoulder": 0.06, "elbow": 0.05}, sag_where="joints")
+    found = diagnosed(rig, tmp_path, 0)
+    assert [cause.name for cause in found.causes] == ["gravity_sag"]
+    for joint, size in (("shoulder", 0.06), ("elbow", 0.05)):
+        assert found.causes[0].params[f"{joint}_rad"].value == pytest.approx(size, rel=0.004)
+
+
+def test_what_a_stopped_jaw_does_besides_is_not_named(tmp_path) -> None:
+    rig = replace(
+        FAST,
+        joints=("shoulder", "gripper"),
+        noise=0.3,
+        holds={"gripper": (0.022, 0.1)},
+        backlash={"gripper": 1.5e-4},
+    )
+    found = diagnosed(rig, tmp_path, 0)
+    assert found.status == "explained"
+    assert [cause.name for cause in found.causes] == ["gripper_compliance"]
+    assert found.causes[0].params["gripper_stop_m"].value == pytest.approx(0.022, abs=2e-4)

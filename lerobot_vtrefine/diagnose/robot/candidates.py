@@ -23,8 +23,8 @@ STICKING = ("friction", "stick")
 STOP = ("stop", "give")
 """A gripper that meets what it holds: no load is needed to see that."""
 _FEWEST_VALUES, _FINEST, _OFF_LATTICE = 8, 2e-6, 0.05
-_USUAL_STOP = 0.25
-"""Part of the frames in which a gripper is supposed to be stopped when a fit of it begins."""
+_SURELY_STOPPED = 0.1
+"""Part of the frames, those in which a gripper's command is furthest beyond it, that show where it stops."""
 
 
 @dataclass(frozen=True)
@@ -82,9 +82,8 @@ class Candidate:
                 point = point.with_values(name, 0.0, joints)
             return point
         if self.parameters == STOP:
-            opening = np.abs(problem.batch.position[problem.batch.valid][:, joints])
-            point = point.with_values("stop", np.quantile(opening, _USUAL_STOP, axis=0), joints)
-            return point.with_values("give", 0.1, joints)
+            point = point.with_values("stop", _where_it_stops(problem, joints), joints)
+            return point.with_values("give", multiple, joints)
         for name in self.parameters:
             if name in RATIOS:
                 point = point.with_values(name, multiple, joints)
@@ -116,7 +115,7 @@ CANDIDATES = (
     Candidate("gravity_sag", SAG[:2], gravity.TWO_TERM_FORM),
     Candidate("gravity_sag", SAG, gravity.FREE_FORM),
     Candidate("gripper_compliance", ("bend",)),
-    Candidate("gripper_compliance", STOP),
+    Candidate("gripper_compliance", STOP, starts=(0.02, 0.2)),
     Candidate(DECOY, SAG[:1], "gain", clue="the position's scale: error grows with position"),
     Candidate(DECOY, SAG[:1], "square", clue="error grows with the square of the position"),
     Candidate(DECOY, SAG[:2], "drift", clue="session time: the zero wanders"),
@@ -143,6 +142,15 @@ def resolution(problem: Problem) -> Array:
         coarse = 1 < len(values) < 0.25 * problem.batch.valid.sum()
         steps[joint] = np.median(np.diff(values)) if coarse else _lattice(values)
     return np.maximum(steps, 1e-9)
+
+
+def _where_it_stops(problem: Problem, joints: Array) -> Array:
+    """(joints,) distance from zero at which grippers are where their commands have long gone on."""
+    valid = problem.batch.valid
+    opening, wanted = (np.abs(x[valid][:, joints]) for x in (problem.batch.position, problem.batch.command))
+    beyond = wanted - opening
+    furthest = beyond <= np.quantile(beyond, _SURELY_STOPPED, axis=0)
+    return np.nanmedian(np.where(furthest, opening, np.nan), axis=0)
 
 
 def _lattice(values: Array) -> float:

@@ -8,7 +8,7 @@ from lerobot_vtrefine.diagnose.robot.candidates import FRICTION, LATENCY
 from lerobot_vtrefine.diagnose.robot.fitting import INDEX, SAG, Problem
 from lerobot_vtrefine.diagnose.robot.friction_load import friction_in_load, stiffness_in_load
 from lerobot_vtrefine.diagnose.robot.gravity import full_reach, is_sliding
-from lerobot_vtrefine.diagnose.robot.resampling import jackknife, leave_out
+from lerobot_vtrefine.diagnose.robot.resampling import jackknife, leave_out, without_ridge
 from lerobot_vtrefine.diagnose.robot.selection import Selection
 from lerobot_vtrefine.diagnose.verdict import Parameter
 from lerobot_vtrefine.embodiments import ALOHA
@@ -18,6 +18,8 @@ Array = np.ndarray
 
 _ROUNDING_VAGUE = 0.08
 """Where a play ends that is taken up bit by bit depends on its form: part of its width, per rounding."""
+_AS_GOOD = 1.03
+"""Held-out squared error of a form over the least one, up to which it tells the trials as well."""
 _STICKING_VAGUE = 0.12
 """How friction falls from rest to motion is not resolved: part of it that intervals allow for."""
 
@@ -28,6 +30,7 @@ class Estimates:
     def __init__(self, selection: Selection, seed: int) -> None:
         self.selection, self.seed = selection, seed
         self.theta, self.tau = leave_out(selection.problem, selection.fit)
+        self.unheld = without_ridge(selection.problem, selection.fit)
 
     def of(self, cause: str, joints: tuple[int, ...]) -> dict[str, Parameter]:
         """The cause's parameters on those joints."""
@@ -59,12 +62,13 @@ class Estimates:
         return out
 
     def _length(self, cause: str, joint: int, unit: str) -> Parameter:
-        now = self.selection.fit.point.theta[joint]
+        now, loose = self.selection.fit.point.theta[joint], 0.0
         drawn = self.theta[:, joint]
         if cause == "gravity_sag":
             form = self.selection.fit.point.forms[joint]
             columns = [INDEX[name] for name in SAG]
             value = full_reach(form, now[columns])
+            loose = full_reach(form, self.unheld[joint, columns])
             spread = np.array([full_reach(form, terms) for terms in drawn[:, columns]])
         else:
             names = ("play", "loose") if cause == "backlash" else ("offset",)
@@ -72,7 +76,23 @@ class Estimates:
             value, spread = float(now[columns].sum()), drawn[:, columns].sum(1)
         vague = self.selection.problem.vague + _ROUNDING_VAGUE * now[INDEX["round"]]
         own = vague * abs(value) if cause == "backlash" else 0.0
+        if cause == "gravity_sag":
+            own = max(abs(loose - value), self._among_forms(joint, value))
         return Parameter(value, widened(jackknife(spread, value), value, own), unit)
+
+    def _among_forms(self, joint: int, value: float) -> float:
+        """How far a sag's size at full reach is off by forms that tell the trials as well: where all of them
+        do, the postures seen do not reach as far as the number does."""
+        tried = [item for item in self.selection.first_round if item.cause == "gravity_sag"]
+        errors = {k: float(item.held_out.mean(0)[joint]) for k, item in enumerate(tried)}
+        least = min(errors.values(), default=0.0)
+        sizes = [value]
+        for k, error in errors.items():
+            point = tried[k].fit.point
+            terms = point.theta[joint, [INDEX[name] for name in SAG]]
+            if error < _AS_GOOD * least and terms.any():
+                sizes.append(full_reach(point.forms[joint], terms))
+        return float(np.max(np.abs(np.array(sizes) - value)))
 
     def _friction(self, joint: int, name: str) -> tuple[str, Parameter]:
         """In Nm where loads or the robot's known servo gains give the scale; else as the servo's error."""

@@ -34,7 +34,7 @@ _START_OMEGA = (4.0, 10.0, 25.0, 60.0)
 _START_ZETA = (0.4, 1.0, 2.0)
 _ITERATIONS = 20
 _TOLERANCE = 1e-5
-_RIDGE = 3e-3
+_RIDGE = 1e-4
 _SHORTEST = 1e5
 """Damping beyond which a joint has nowhere better to go."""
 

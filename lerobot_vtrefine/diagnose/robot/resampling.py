@@ -146,6 +146,13 @@ def leave_out(problem: Problem, fit: Fit) -> tuple[Array, Array]:
     return np.stack([point.theta for point in points]), np.array([point.tau_s for point in points])
 
 
+def without_ridge(problem: Problem, fit: Fit) -> Array:
+    """Parameters (J, P) where the fit would end if no sag were held back: what the ridge may cost."""
+    curvature = Curvature.at(problem, fit)
+    bare = replace(curvature, ridge=np.zeros_like(curvature.ridge))
+    return bare.moved(np.ones(problem.batch.trials)).theta
+
+
 def jackknife(without: Array, value: float) -> tuple[float, float]:
     """95 % interval of a value by what it becomes without each unit (G,).
 

@@ -178,6 +178,9 @@ class Selector:
         valid = self.problem.batch.valid.sum()
         effect = np.sqrt(np.square(best.residual - self.now.residual).sum((0, 1)) / valid)
         eligible = allowed & (gain > LEAST_GAIN) & (effect > self.least_effect)
+        # What a jaw does where it stops no form follows exactly: another cause there must explain more.
+        stopped = self.now.free[:, INDEX["stop"]]
+        eligible &= ~stopped | (change.mean(0) > LEAST_GAIN * self.baseline_held_out.mean(0))
         if candidate is not None:
             eligible &= self._plausible(best, candidate)
         if candidate is not None and candidate.cause == DECOY:
