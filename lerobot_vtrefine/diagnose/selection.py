@@ -48,6 +48,8 @@ RICH = 2
 REFITTED = 6
 """Survivors that are refitted in a round."""
 MAPS = ("taxel_gain_spread", "dead_taxels")
+TIMING = ("latency", "scan_skew")
+"""Causes that are imitated by what a motion did between two frames, which nobody saw."""
 
 
 @dataclass(frozen=True)
@@ -322,9 +324,24 @@ def rank(search: Search, fitted: Fit, candidates: Sequence[Screened], probes: Se
         search.tried[name] = max(gain, search.tried.get(name, -np.inf))
         sure = name == "dead_taxels" or name in seen
         agreed = sure or agree(logs, search.seed, AGREEMENT_P)
-        if gain > (0.0 if name in seen else needed) and logs.sum() > 0 and agreed:
+        if not (gain > (0.0 if name in seen else needed) and logs.sum() > 0 and agreed):
+            continue
+        if name not in TIMING or plainly_better(search, fitted, found):
             steps.append(Step(name, found, score, gain, logs))
     return frugal(search, sorted(steps, key=lambda step: -float(step.logs.sum())))
+
+
+def plainly_better(search: Search, fitted: Fit, found: Fit) -> bool:
+    """Whether the richer model foretells better also where all readings count alike, both fitted so.
+
+    Weights trust fast changes most, and it is there that a course drawn between two frames is wrong.
+    """
+    weights = plain_weights(search.presses)
+    before, after = (
+        cross_validate(settle(search, fit.model, weights), search.presses, weights, search.folds)
+        for fit in (fitted, found)
+    )
+    return after.gain_over(before) > MIN_GAIN
 
 
 def coordinates_of(fitted: Fit, name: str) -> int:

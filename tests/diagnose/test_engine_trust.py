@@ -5,7 +5,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from lerobot_vtrefine.diagnose import pad_engine
+from lerobot_vtrefine.diagnose import pad_engine, selection
 from lerobot_vtrefine.diagnose.crossvalidation import Score
 
 BASELINE = np.full(9, 10.0)
@@ -39,3 +39,15 @@ def test_the_best_trustworthy_model_is_handed_out(monkeypatch, weighed, even, do
     search = SimpleNamespace(presses=None, folds=[], seed=0)
     baseline = SimpleNamespace(plain=plain)
     assert pad_engine._trusted(search, baseline, found, doubtful) == handed_out
+
+
+@pytest.mark.parametrize(("after", "better"), [(BASELINE * 0.98, True), (BASELINE * 0.997, False)])
+def test_delays_must_show_in_plain_errors_too(monkeypatch, after, better):
+    """Weighted scores alone named delays of a tenth of a frame in sound sets: motions drawn between frames."""
+    scores = iter([Score(np.zeros(9), BASELINE), Score(np.zeros(9), after)])
+    monkeypatch.setattr(selection, "plain_weights", lambda presses: ())
+    monkeypatch.setattr(selection, "settle", lambda search, model, weights: model)
+    monkeypatch.setattr(selection, "cross_validate", lambda fit, presses, weights, folds: next(scores))
+    search, fit = SimpleNamespace(presses=None, folds=[]), SimpleNamespace(model=None)
+    assert selection.plainly_better(search, fit, fit) == better
+    assert set(selection.TIMING) == {"latency", "scan_skew"}
