@@ -43,7 +43,7 @@ def test_the_best_trustworthy_model_is_handed_out(monkeypatch, weighed, even, do
 
 @pytest.mark.parametrize(("after", "better"), [(BASELINE * 0.98, True), (BASELINE * 0.997, False)])
 def test_delays_must_show_in_plain_errors_too(monkeypatch, after, better):
-    """Weighted scores alone named delays of a tenth of a frame in sound sets: motions drawn between frames."""
+    """Weighted scores alone named delays of a tenth of a frame in sound sets."""
     scores = iter([Score(np.zeros(9), BASELINE), Score(np.zeros(9), after)])
     monkeypatch.setattr(selection, "plain_weights", lambda presses: ())
     monkeypatch.setattr(selection, "settle", lambda search, model, weights: model)
