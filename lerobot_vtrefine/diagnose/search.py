@@ -5,6 +5,7 @@ from dataclasses import dataclass, field
 from functools import partial
 
 import numpy as np
+from scipy.stats import norm
 
 from lerobot_vtrefine.diagnose.baseline import Baseline
 from lerobot_vtrefine.diagnose.candidates import CATALOGUE
@@ -15,7 +16,7 @@ from lerobot_vtrefine.diagnose.fitting import Fit, tangents
 from lerobot_vtrefine.diagnose.maps import find_dead, map_evidence
 from lerobot_vtrefine.diagnose.parallel import on_all_cores
 from lerobot_vtrefine.diagnose.presses import PressSet
-from lerobot_vtrefine.diagnose.screening import Probe, Scorer, Screened, probe_form
+from lerobot_vtrefine.diagnose.screening import DOUBT, FEW, Probe, Scorer, Screened, probe_form
 from lerobot_vtrefine.diagnose.weights import TrialWeights
 
 SEEN = 1e9
@@ -79,6 +80,11 @@ def gain_spread_probe(search: Search, fitted: Fit) -> Probe:
     seen = float(products.sum())
     flipped = np.einsum("bi,ij,bj->b", signs, products, signs)
     p_value = float((1 + (flipped >= seen - 1e-9 * abs(seen)).sum()) / 10000.0)
+    if len(products) < FEW and p_value <= 2.5 * 2.0 ** (1 - len(products)):
+        # So few signs cannot reach significance: how large the products are counts as well.
+        share = np.where(known, evidence.information / np.where(known, total, 1.0), 0.0)
+        spread = np.sqrt(2.0 * float((share.sum(axis=0) ** 2 - (share**2).sum(axis=0)).sum()))
+        p_value = min(p_value, float(norm.sf(seen / (DOUBT**2 * max(spread, 1e-12)))))
     size = np.array([max(seen, 0.0)])
     return Probe("taxel_gain_spread", None, np.zeros(0), size, np.maximum(size, 1e-12), True, p_value)
 

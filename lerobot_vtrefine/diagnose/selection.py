@@ -41,7 +41,7 @@ FORGIVEN = 1.5
 SCOUTING_STEPS = 2
 MAP_TOLERANCE = 1e-4
 """Relative decrease of the loss at which a map of gains needs no second turn."""
-PROMISING = 0.5
+PROMISING = 0.4
 """Part of the best candidate's gain that a plain form must reach for its family's other forms to be tried."""
 RICH = 2
 """Coordinates of a form from which on it imitates other causes."""
@@ -208,7 +208,8 @@ def forward(search: Search, fitted: Fit, tell: Callable[[str, float], None]) -> 
         found, steps = look_round(search, fitted)
         if not number:
             search.screened = found
-        if not steps and far_off(search, fitted):
+        # What passes the screening and yet foretells nothing may be a cause that weights forgive in part.
+        if not steps and (survivors(found) or far_off(search, fitted)):
             found, steps = without_weights(search, fitted)
         tell(f"step {number + 1}: {len(steps)} candidates refitted", (number + 1) / (MAX_CAUSES + 1))
         if not steps:

@@ -87,7 +87,7 @@ class Form:
     screened: bool = True
     """Whether its probes take part in screening; fallbacks are only fitted where their family is named."""
     peer: bool = False
-    """Whether it is no richer than the plain form, so that it need not foretell clearly better, only better."""
+    """Whether it is no richer than the plain form: it need not foretell clearly better, only better."""
     grown: Callable[[np.ndarray, Setting], list[float]] | None = None
     """The family's plain form, given by its coordinates, as this form has it: where descents start."""
 
