@@ -17,6 +17,7 @@ are whole. Results: ``comparison.json`` and ``comparison.md``.
 import argparse
 import json
 import os
+import shlex
 import subprocess
 import sys
 from pathlib import Path
@@ -36,14 +37,12 @@ from lerobot_vtrefine.cli.pipeline.demo_config import (
     record_stage,
     recording_env,
 )
-from lerobot_vtrefine.cli.pipeline.stages import Stage, StageRunner
+from lerobot_vtrefine.cli.pipeline.stages import Stage, StageRunner, find_command
 from lerobot_vtrefine.cli.report.statistics import proportion
 from lerobot_vtrefine.sim.reality import SCHEMA
 
 MOTION_SEED_OFFSET = 500_000
 """Between the seeds of demonstrations and those of fine-tuning."""
-GOING_ON_SEEDS = 3_000_000
-"""Between the seeds of the start's episodes and those of what goes on from it."""
 START = "start"
 
 
@@ -115,46 +114,45 @@ def tuned_policy(budget: Budget, name: str, seed: int) -> Path:
 
 def start_stage(budget: Budget, seed: int) -> Stage:
     """DPPO from imitation in the plain simulator, which all policies of a seed share."""
-    where = (START, "plain", budget.imitation, budget.start_iterations, TRAIN_SEED_OFFSET)
-    return dppo_stage(budget, seed, *where, ("pretrain",))
+    command = dppo_command(budget, START, "plain", seed, budget.start_iterations)
+    output = finetune_dir(budget, START, seed)
+    product = tuned_policy(budget, START, seed) / "model.safetensors"
+    title = f"Fine-tune the start, seed {seed}"
+    return Stage(output.name, title, tuple(command), output, product, ("pretrain",), resumable=True)
 
 
 def finetune_stage(budget: Budget, world: str, seed: int) -> Stage:
-    """DPPO from a seed's start in one world, on other episodes than before."""
-    diagnosed = [output_name(world.partition(":")[2])] if world != "plain" else []
-    needs = (finetune_dir(budget, START, seed).name, *diagnosed)
-    policy = tuned_policy(budget, START, seed)
-    where = (world, world, policy, budget.iterations, TRAIN_SEED_OFFSET + GOING_ON_SEEDS)
-    return dppo_stage(budget, seed, *where, needs)
+    """A copy of a seed's start goes on in one world, with the start's optimisers and on new episodes.
+
+    Success in another world is no collapse, so nothing returns to earlier weights.
+    """
+    start, output = finetune_dir(budget, START, seed), finetune_dir(budget, world, seed)
+    command = dppo_command(budget, world, world, seed, budget.start_iterations + budget.iterations)
+    command.append("--dppo.rollback_sigmas=0")
+    begin = f"test -d {output} || (cp -R {start} {output}.part && mv {output}.part {output})"
+    shell = ("sh", "-c", f"{begin} && exec {shlex.join([find_command(command[0]), *command[1:]])}")
+    needs = [start.name, *([output_name(world.partition(":")[2])] if world != "plain" else [])]
+    more = budget.start_iterations + budget.iterations
+    product = output / "checkpoints" / f"{more:06d}" / "pretrained_model" / "model.safetensors"
+    title = f"Fine-tune in {world}, seed {seed}"
+    return Stage(output.name, title, shell, output, product, tuple(needs), resumable=True)
 
 
-def dppo_stage(
-    budget: Budget,
-    seed: int,
-    name: str,
-    world: str,
-    policy: Path,
-    iterations: int,
-    seed_offset: int,
-    needs: tuple[str, ...],
-) -> Stage:
-    """DPPO from a policy in a world."""
-    output, config = finetune_dir(budget, name, seed), recipe(budget, seed)
-    command = [
+def dppo_command(budget: Budget, name: str, world: str, seed: int, iterations: int) -> list[str]:
+    """DPPO in a world, from imitation or from where its folder has come to."""
+    config = recipe(budget, seed)
+    return [
         "vtrefine-finetune",
-        f"--policy.path={policy}",
+        f"--policy.path={budget.imitation}",
         f"--policy.device={budget.device}",
         *env_flags(budget, world),
         *flags("dppo", config.dppo),
         f"--dppo.iterations={iterations}",
         f"--dppo.num_envs={budget.envs}",
-        f"--seed={seed * SEED_STRIDE + seed_offset}",
-        f"--output_dir={output}",
+        f"--seed={seed * SEED_STRIDE + TRAIN_SEED_OFFSET}",
+        f"--output_dir={finetune_dir(budget, name, seed)}",
         "--resume=true",
     ]
-    product = tuned_policy(budget, name, seed) / "model.safetensors"
-    title = f"Fine-tune {name}, seed {seed}"
-    return Stage(output.name, title, tuple(command), output, product, needs, resumable=True)
 
 
 def evaluation_dir(budget: Budget, trained: str, world: str, seed: int) -> Path:

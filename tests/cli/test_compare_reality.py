@@ -41,7 +41,8 @@ def budget(scripts, tmp_path):
 
 
 def flags_of(stage):
-    return dict(word[2:].partition("=")[::2] for word in shlex.split(stage.line)[1:] if word.startswith("--"))
+    line = stage.command[-1] if stage.command[0] == "sh" else stage.line
+    return dict(word[2:].partition("=")[::2] for word in shlex.split(line)[1:] if word.startswith("--"))
 
 
 def test_fine_tunings_differ_in_the_simulator_alone(scripts, budget):
@@ -58,10 +59,12 @@ def test_fine_tunings_differ_in_the_simulator_alone(scripts, budget):
     for stage in stages.values():
         start = begun[f"finetune_start_{stage.name[-1]}"]
         assert stage.needs[0] == start.name
-        assert flags_of(stage)["policy.path"] == str(start.product.parent)
-        assert int(flags_of(stage)["seed"]) > int(flags_of(start)["seed"]) + 4 * 2  # other episodes
+        assert f"cp -R {start.output} {stage.output}.part" in stage.command[-1]
+        assert flags_of(stage)["resume"] == "true"  # so that episodes go on from the start's last one
+        assert flags_of(stage)["seed"] == flags_of(start)["seed"]
+        assert (flags_of(start)["dppo.iterations"], flags_of(stage)["dppo.iterations"]) == ("2", "3")
     assert len(stages) == 8  # four simulators, two seeds
-    kept, differ = [], ("env.sensor_model", "env.reality", "output_dir", "seed", "policy.path")
+    kept, differ = [], ("env.sensor_model", "env.reality", "output_dir", "seed")
     for stage in stages.values():
         flags = flags_of(stage)
         assert "/diagnosis/" in flags.get("env.reality", "/diagnosis/")  # never the hidden one
