@@ -133,14 +133,14 @@ def _repeating(selection: Selection, seed: int) -> list[Alarm]:
 def not_repeating(selection: Selection) -> list[Alarm]:
     """Trials of one command that differ by far more than their encoders scatter: what no command sets."""
     problem, fitted = selection.problem, selection.fit
+    if selection.delay_spread_s:  # which is a difference of that kind
+        return []
     seen = scatter(problem.batch, fitted.residual, derivatives(problem, fitted).columns)
     if seen is None:
         return []
     white = np.maximum(seen.white, 0.5 * resolution(problem))
     with_motion = seen.shape > _MOVING * np.maximum(seen.resting, white)
     shapes = seen.shape > np.where(with_motion, _SHAPES_DIFFER, _FAR) * white
-    # A delay that changes comes with motion.
-    shapes &= ~with_motion | (selection.delay_spread_s == 0)
     servos = (seen.servo > _SERVOS_DIFFER) & (seen.servo_effect > _SHAPES_DIFFER * white)
     zeros = seen.zero > _ZEROS_DIFFER * white
     # What differs in shape has a mean and a likeness to slower servos, too.

@@ -192,7 +192,7 @@ def _report(
         for name, joints in selection.causes().items()
     )
     detectable = minimum_detectable(selection)
-    ambiguous = () if alarms else tuple(dict.fromkeys((item.cause, item.rival) for item in rivals))
+    ambiguous = () if alarms else _pairs(rivals)
     status = _status(causes, ambiguous, alarms)
     return RobotDiagnosis(
         status=status,
@@ -212,6 +212,12 @@ def _report(
         joint_gains=_joint_gains(names, *errors),
         alarms=alarms,
     )
+
+
+def _pairs(rivals: tuple[Rival, ...]) -> tuple[tuple[str, ...], ...]:
+    """Names that tie, every pair once."""
+    pairs = {frozenset((item.cause, item.rival)): (item.cause, item.rival) for item in reversed(rivals)}
+    return tuple(reversed(pairs.values()))
 
 
 def _status(

@@ -4,7 +4,7 @@ from itertools import pairwise
 
 import numpy as np
 
-from lerobot_vtrefine.diagnose.robot.candidates import FRICTION, LATENCY
+from lerobot_vtrefine.diagnose.robot.candidates import FRICTION, LATENCY, resolution
 from lerobot_vtrefine.diagnose.robot.fitting import INDEX, SAG, Problem
 from lerobot_vtrefine.diagnose.robot.friction_load import friction_in_load, stiffness_in_load
 from lerobot_vtrefine.diagnose.robot.gravity import full_reach, is_sliding
@@ -16,6 +16,16 @@ from lerobot_vtrefine.embodiments import ALOHA
 Array = np.ndarray
 
 
+_METHOD = {
+    LATENCY: (0.01, 0.0),
+    "backlash": (0.005, 0.2),
+    FRICTION: (0.012, 0.1),
+    "gravity_sag": (0.012, 0.03),
+    "encoder_offset": (0.001, 0.04),
+    "gripper_compliance": (0.015, 0.0),
+}
+"""What sizes are off by where trials agree on them: when servos act and encoders are read within a frame, and
+coarse readings. Half-width of 95 %: part of the size, and encoder steps; set by robots of other code."""
 _ROUNDING_VAGUE = 0.08
 """Where a play ends that is taken up bit by bit depends on its form: part of its width, per rounding."""
 _AS_GOOD = 1.03
@@ -30,6 +40,7 @@ class Estimates:
     def __init__(self, selection: Selection, seed: int) -> None:
         self.selection, self.seed = selection, seed
         self.theta, self.tau = leave_out(selection.problem, selection.fit)
+        self.steps = resolution(selection.problem)
         self.unheld = without_ridge(selection.problem, selection.fit)
 
     def of(self, cause: str, joints: tuple[int, ...]) -> dict[str, Parameter]:
@@ -38,7 +49,7 @@ class Estimates:
             value = self.selection.fit.point.tau_s
             # A uniform error of width w has the standard deviation w / sqrt(12).
             tick = 1.96 * self.selection.problem.tick_s / np.sqrt(12)
-            own = float(np.hypot(tick, self.selection.delay_spread_s))
+            own = float(np.hypot(np.hypot(tick, self.selection.delay_spread_s), self._method(LATENCY, value)))
             return {"tau_s": Parameter(value, widened(jackknife(self.tau, value), value, own), "s")}
         if cause == "gripper_compliance":
             return self._gripper(joints)
@@ -78,7 +89,14 @@ class Estimates:
         own = vague * abs(value) if cause == "backlash" else 0.0
         if cause == "gravity_sag":
             own = max(abs(loose - value), self._among_forms(joint, value))
+        own = float(np.hypot(own, self._method(cause, value, joint)))
         return Parameter(value, widened(jackknife(spread, value), value, own), unit)
+
+    def _method(self, cause: str, value: float, joint: int | None = None) -> float:
+        """What the method itself errs by, see `_METHOD`."""
+        part, steps = _METHOD[cause]
+        step = 0.0 if joint is None else float(self.steps[joint])
+        return float(np.hypot(part * value, steps * step))
 
     def _among_forms(self, joint: int, value: float) -> float:
         """How far a sag's size at full reach is off by forms that tell the trials as well: where all of them
@@ -101,6 +119,7 @@ class Estimates:
         column = INDEX["friction"]
         value = float(self.selection.fit.point.theta[joint, column])
         own = _STICKING_VAGUE * value if self.selection.fit.free[joint, INDEX["stick"]] else 0.0
+        own = float(np.hypot(own, self._method(FRICTION, value, joint)))
         low, high = widened(jackknife(self.theta[:, joint, column], value), value, own)
         stiffness = stiffness_in_load(problem, self.selection.fit, joint)
         if stiffness is None and problem.batch.load is not None:
@@ -142,17 +161,18 @@ class Estimates:
         mean = float((weight * np.abs(value)).sum() / weight.sum())
         spread = (drawn * sign * weight).sum(1) / weight.sum()
         overall = 1.0 if (sign >= 0).any() else -1.0
-        low, high = jackknife(spread, mean)
+        low, high = widened(jackknife(spread, mean), mean, self._method("gripper_compliance", mean))
         if overall < 0:
             low, high = -high, -low
         return Parameter(overall * mean, (low, high), "m/N")
 
 
 def widened(ci95: tuple[float, float], value: float, own: float) -> tuple[float, float]:
-    """An interval about a value with an independent error of 95 % half-width `own`; delays and plays are not
-    negative."""
+    """An interval about a value with an independent error of 95 % half-width `own`; what is surely positive
+    stays so."""
     low, high = (float(np.hypot(end - value, own)) for end in ci95)
-    return max(value - low, min(ci95[0], 0.0)), value + high
+    least = min(ci95[0], 0.0) if value >= 0 else -np.inf
+    return max(value - low, least), value + high
 
 
 def _stiffness(name: str) -> float | None:

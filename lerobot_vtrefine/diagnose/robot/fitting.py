@@ -34,7 +34,7 @@ _START_OMEGA = (4.0, 10.0, 25.0, 60.0)
 _START_ZETA = (0.4, 1.0, 2.0)
 _ITERATIONS = 20
 _TOLERANCE = 1e-5
-_RIDGE = 1e-4
+_RIDGE = (1e-4, 3e-3)  # where commands are repeated, and where nothing tells misfit from sag
 _SHORTEST = 1e5
 """Damping beyond which a joint has nowhere better to go."""
 
@@ -189,13 +189,12 @@ class Fit:
 def ridge(problem: Problem, free: Array) -> Array:
     """(J, P) weights of squared parameters that are added to the squared error.
 
-    Sags of several terms nearly cancel in the postures that are seen; where these do not tell, terms stay
-    small.
-    """
+    Sags of several terms nearly cancel in the postures seen; where these do not tell, terms stay small."""
     out = np.zeros(free.shape)
     columns = [INDEX[name] for name in SAG]
     several = free[:, columns].sum(1) > 1
-    out[np.ix_(several, columns)] = _RIDGE * problem.batch.valid.sum()
+    alone = len(set(problem.batch.conditions)) == problem.batch.trials
+    out[np.ix_(several, columns)] = _RIDGE[alone] * problem.batch.valid.sum()
     return out
 
 

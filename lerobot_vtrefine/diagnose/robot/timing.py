@@ -27,7 +27,7 @@ _SHARED, _NOT_AGAINST = 0.2, -0.1
 """Least part of a joint's error that the other joints' lag must explain: of one in four joints, and of half.
 Noise that joints do not share is made worse by each other's lag. Commands may come so rarely that joints of
 unequal speed show little of one another's lag."""
-_FURTHEST = 1.5
+_FURTHEST = 2.5
 """Latest of a hundred commands, in mean delays beyond the mean: of lost ones it is many."""
 _EARLIEST = 1.25
 _LASTS_S, _LASTING = 0.8, 0.5
