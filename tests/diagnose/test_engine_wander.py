@@ -7,10 +7,12 @@ import numpy as np
 from test_engine_pad import COLS, ROWS, linear, one_trial
 
 from lerobot_vtrefine.diagnose.baseline import fit_baseline
-from lerobot_vtrefine.diagnose.candidates.baseline_drift import FORMS
+from lerobot_vtrefine.diagnose.candidates.base import Setting
+from lerobot_vtrefine.diagnose.candidates.baseline_drift import CURVE, FORMS, WANDERING
 from lerobot_vtrefine.diagnose.presses import prepare
 from lerobot_vtrefine.diagnose.recordings import RecordingSet
 from lerobot_vtrefine.diagnose.wander import wander_probe
+from lerobot_vtrefine.tactile.layout import PadLayout
 
 
 def p_of(levels: np.ndarray) -> float:
@@ -32,3 +34,19 @@ def test_a_random_walk_of_the_idle_level_is_seen() -> None:
 def test_levels_without_an_order_are_not() -> None:
     rng = np.random.default_rng(2)
     assert np.median([p_of(rng.normal(0, 2.0, 16)) for _ in range(3)]) > 0.05
+
+
+def test_a_wandering_level_is_followed_by_its_family() -> None:
+    """Levels of 24 recordings, half a minute apart, that go a step up or down from one to the next."""
+    layout = PadLayout(4, 4, 0.002)
+    setting = Setting(layout, 100.0, 255.0, 0.033, 10.0, 700.0, 1e-3, False, 0.0, 4, 4, 300.0)
+    middles = np.arange(24) * 30.0 + 5.0
+    levels = np.cumsum(np.random.default_rng(3).choice([-1.0, 1.0], 24))
+    left = []
+    for form in (CURVE, WANDERING):
+        assert form.possible(setting)
+        stages = [form.build(unit, setting)[0] for unit in np.eye(len(form.values))]
+        basis = np.stack([np.interp(middles, stage.knots_s, stage.knot_counts) for stage in stages], axis=1)
+        left.append(float(((levels - basis @ np.linalg.lstsq(basis, levels, rcond=None)[0]) ** 2).mean()))
+    assert left[1] < 0.3 * left[0]
+    assert not WANDERING.possible(replace(setting, session_s=100.0))

@@ -16,15 +16,15 @@ def _linear(values: np.ndarray, setting: Setting) -> tuple[Stage, ...]:
     return (Idle(-rate * setting.rest_session_s, 0.0), BaselineDrift(rate))
 
 
-KNOTS = 6
+KNOTS, MANY_KNOTS = 6, 16
 
 
-def _knots(setting: Setting) -> np.ndarray:
-    return setting.session_start_s + np.linspace(0.0, setting.session_s + setting.duration_s, KNOTS)
+def _knots(setting: Setting, count: int) -> np.ndarray:
+    return setting.session_start_s + np.linspace(0.0, setting.session_s + setting.duration_s, count)
 
 
 def _curve(values: np.ndarray, setting: Setting) -> tuple[Stage, ...]:
-    knots = tuple(float(knot) for knot in _knots(setting))
+    knots = tuple(float(knot) for knot in _knots(setting, len(values)))
     return (BaselineDrift(0.0, knots, tuple(float(value) for value in values)),)
 
 
@@ -37,22 +37,30 @@ def _thermal(values: np.ndarray, setting: Setting) -> tuple[Stage, ...]:
 
 def _report_curve(values: np.ndarray, setting: Setting) -> dict[str, tuple[float, str]]:
     """The mean rate."""
-    return {"rate_counts_per_s": (float(np.polyfit(_knots(setting), values, 1)[0]), "counts/s")}
+    return {"rate_counts_per_s": (float(np.polyfit(_knots(setting, len(values)), values, 1)[0]), "counts/s")}
 
 
-CURVE = Form(
-    "baseline_drift",
-    "curve over session time",
-    tuple(Value(f"counts_{j}", -1e3, 1e3, 1e-2) for j in range(KNOTS)),
-    _curve,
-    _report_curve,
-    lambda s: [
-        (0.5 * np.cos(np.pi * order * np.arange(KNOTS) / (KNOTS - 1))).tolist() for order in (1, 2, 3)
-    ],
-    amplitude=None,
-    signed=True,
-    possible=lambda s: s.session_s > 2.0 * s.duration_s,
-)
+def _curve_of(label: str, count: int, least: float) -> Form:
+    """A curve through `count` knots, for sessions of at least so many recordings' lengths."""
+    return Form(
+        "baseline_drift",
+        label,
+        tuple(Value(f"counts_{j}", -1e3, 1e3, 1e-2) for j in range(count)),
+        _curve,
+        _report_curve,
+        lambda s: [
+            (0.5 * np.cos(np.pi * order * np.arange(count) / (count - 1))).tolist() for order in (1, 2, 3)
+        ],
+        amplitude=None,
+        signed=True,
+        possible=lambda s: s.session_s > least * s.duration_s,
+        screened=count == KNOTS,
+    )
+
+
+CURVE = _curve_of("curve over session time", KNOTS, 2.0)
+WANDERING = _curve_of("wandering over session time", MANY_KNOTS, MANY_KNOTS)
+"""What wanders keeps its level for a recording or two only."""
 
 FORMS = (
     Form(
@@ -65,6 +73,7 @@ FORMS = (
         signed=True,
     ),
     CURVE,
+    WANDERING,
     Form(
         "baseline_drift",
         "follows the temperature",
