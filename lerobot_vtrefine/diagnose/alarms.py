@@ -23,10 +23,10 @@ FLIPS = 4999
 CORNER = 0.4
 """Doubt about the damping's part, in a frame's noise, from which on a reading says nothing about causes."""
 PAIR_CORRELATION, PAIR_DEVIATIONS, MIN_STRANGERS = 0.2, 6.0, 30
-PAIRS, PAIRS_LEFT, PAIRS_MISFIT = (0.1, 4.5), (0.1, 2.8), (0.15, 4.5)
+PAIRS, PAIRS_LEFT, PAIRS_MISFIT = (0.15, 5.0), (0.1, 2.8), (0.2, 5.0)
 """Mean correlation of all replicates, and its distance from strangers' in standard errors, that mean an
 unknown cause: without a name, beside names that leave much, and beside names that leave little. Site effects
-that replicates share bring .08 and 3.5."""
+that replicates share bring .08 and 3.5, three times the usual scatter .13."""
 LEFT = 0.25
 """Part of what repeats that names of true causes, in whatever form, do not leave."""
 LAG = 3
@@ -229,7 +229,7 @@ def pairs_alarm(
     far = (seen - float(found.strangers.mean())) / found.spread * np.sqrt(len(values))
     least, deviations = PAIRS if left is None else PAIRS_LEFT if left > LEFT else PAIRS_MISFIT
     fired = far > deviations and seen > least and rms > MIN_RMS * presses.full_scale
-    text = f"{100 * seen:.0f} % of the residual repeats between recordings of the same command"
+    text = f"residuals of replicates correlate by {seen:.2f}, those of other recordings do not"
     return Alarm("all pairs", bool(fired), seen, float(norm.sf(far)), text)
 
 

@@ -16,6 +16,8 @@ TAXEL = 6.0
 OTHERS = 4.0
 """Factor by which it must exceed that of the taxel in the middle: errors of all are no taxel's."""
 MIN_READINGS = 200
+CLEAR_M = 1e-4
+"""Distance of the indenter from which on no recording's own first touch reaches a taxel [m]."""
 OUTLIER = 4.0
 """Whitened errors, in standard deviations, that are cut to this size."""
 
@@ -29,6 +31,7 @@ def beside_alarm(
         presses.presses, residuals, fitted.signals, weights, strict=True
     ):
         light = signal <= LOADED * fitted.model.setting.top_counts
+        light &= press.drive[:, press.scored] < (0.0 if press.loaded else -CLEAR_M) + 1e-12
         square = np.minimum(weight.memory.white(residual / weight.sigma) ** 2, OUTLIER**2)
         pressed = press.touching[:, None]
         for index, mask in enumerate((light & pressed, light & ~pressed)):

@@ -15,7 +15,7 @@ from lerobot_vtrefine.diagnose.weights import TrialWeights
 
 COURSE_P = 0.002
 """Chance of such an order of gains, if there were no course."""
-ASKED_P = 0.01
+ASKED_P = 0.004
 """The same for the temperature, where it was logged."""
 NEIGHBOURS = "those of the recordings before and after"
 MIN_COURSE = 0.005

@@ -72,7 +72,7 @@ def test_what_no_list_holds_is_said_to_be_unknown(tmp_path, form, size):
         ("direction", 2.0, 5490002, "slides"),
         ("stick_slip", 1.0, 56330001, "slides"),
         ("thermal_gain", 1.0, 6790000, "temperature"),
-        ("neighbour_pad", 1.0, 30880001, "repeats"),
+        ("neighbour_pad", 1.0, 30880001, "replicates"),
     ],
 )
 def test_what_few_recordings_show_or_only_their_order_is_unknown_too(tmp_path, form, size, seed, word):
