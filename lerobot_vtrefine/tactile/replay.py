@@ -78,8 +78,7 @@ def replay(
     float32 counts.
 
     Give either the depth of every taxel (contract: column height), or force per taxel, which then replaces
-    the contact
-    model and everything before it.
+    the contact model and everything before it.
 
     Args:
         times_s: (T,) non-decreasing, from the trial's start [s].
@@ -105,12 +104,9 @@ def replay(
     if (layout.rows, layout.cols) != tuple(x.shape[-2:]):
         raise ValueError(f"replay got {tuple(x.shape[-2:])} taxels for a {layout.rows} x {layout.cols} pad")
     contact = model.contact
-    frame = Frame(
-        layout=layout,
-        stiffness_n_per_m=contact.stiffness(layout),
-        temperature_c=None if temperature_c is None else torch.as_tensor(temperature_c, device=device),
-        load_conserving=force_n is not None,
-    )
+    warmth = None if temperature_c is None else torch.as_tensor(temperature_c, device=device)
+    known = {"stiffness_n_per_m": contact.stiffness(layout), "temperature_c": warmth}
+    frame = Frame(layout, **known, load_conserving=force_n is not None)
     if force_n is None:
         rate = (
             finite_rate(times, x)
