@@ -105,8 +105,10 @@ def replay(
         raise ValueError(f"replay got {tuple(x.shape[-2:])} taxels for a {layout.rows} x {layout.cols} pad")
     contact = model.contact
     warmth = None if temperature_c is None else torch.as_tensor(temperature_c, device=device)
-    known = {"stiffness_n_per_m": contact.stiffness(layout), "temperature_c": warmth}
-    frame = Frame(layout, **known, load_conserving=force_n is not None)
+    stiffness = contact.stiffness(layout)
+    frame = Frame(
+        layout, stiffness_n_per_m=stiffness, temperature_c=warmth, load_conserving=force_n is not None
+    )
     if force_n is None:
         rate = (
             finite_rate(times, x)
