@@ -6,8 +6,10 @@ import pytest
 from robot_rigs import Rig, make_set
 
 from lerobot_vtrefine.diagnose.recordings import read_recording_set
+from lerobot_vtrefine.diagnose.robot.batch import make_batch
 from lerobot_vtrefine.diagnose.robot.engine import diagnose_robot
 from lerobot_vtrefine.diagnose.robot.estimates import widened
+from lerobot_vtrefine.diagnose.robot.fitting import INDEX, SAG, Problem, ridge, servo_only
 
 SLOW = Rig(joints=("shoulder", "elbow"), rate_hz=20.0, seconds=5.0, conditions=8, jitter=0.1)
 FAST = replace(SLOW, rate_hz=50.0, jitter=0.0, noise=0.5)
@@ -71,3 +73,13 @@ def test_widened_intervals_keep_signs_and_sides() -> None:
     low, high = widened((-0.021, -0.019), -0.02, 0.01)
     assert (low, high) == pytest.approx((-0.02 - 0.01005, -0.02 + 0.01005), abs=1e-5)
     assert widened((0.001, 0.003), 0.002, 0.01)[0] == 0.0
+
+
+def test_sags_of_many_terms_are_held_back_more_where_no_command_is_repeated(tmp_path) -> None:
+    recordings = read_recording_set(make_set(replace(SLOW, conditions=2), tmp_path, 0))
+    again = Problem.of(recordings.joints, make_batch(recordings.trials))
+    once = again.subset([k for k, trial in enumerate(recordings.trials) if trial.replicate == 0])
+    free = servo_only(again)
+    free[1, [INDEX[name] for name in SAG]] = True
+    held = [ridge(item, free)[1].max() / item.batch.valid.sum() for item in (again, once)]
+    assert held[1] > 10 * held[0] > 0
