@@ -110,11 +110,8 @@ def replay(
         layout, stiffness_n_per_m=stiffness, temperature_c=warmth, load_conserving=force_n is not None
     )
     if force_n is None:
-        rate = (
-            finite_rate(times, x)
-            if rate_m_s is None
-            else torch.as_tensor(rate_m_s, device=device).to(x.dtype)
-        )
+        given = None if rate_m_s is None else torch.as_tensor(rate_m_s, device=device).to(x.dtype)
+        rate = finite_rate(times, x) if given is None else given
         for stage in model.depth_stages:
             x = stage.sequence(x, times, frame) if stage.name not in skip else x
         x = contact.force(x, rate, layout)
