@@ -171,6 +171,8 @@ def _conclude(
         sensor_model(model, idle, everyone.step_counts, baseline.noise.floor)
         for model in (baseline.plain.model, best)
     )
+    if "sample_and_hold" in names and not _blindly_better(search, plain, extended):
+        extended = plain
     held_set = everyone.subset(locked)
     foretold = foretell(held_set, plain, extended)
     floor = noise_floor(everyone, locked, baseline.noise, predict(fitted.model, held_set))
@@ -224,6 +226,16 @@ def _trusted(search: Search, baseline: Baseline, fitted: Fit, doubtful: bool) ->
     needed = DOUBTFUL_GAIN if doubtful else 0.0
     lucky = doubtful and not agree(before.squares - score.squares, search.seed, DOUBTFUL_P)
     return plain.model if score.gain_over(before) <= needed or lucky else model
+
+
+def _blindly_better(search: Search, plain: SensorModel, extended: SensorModel) -> bool:
+    """Whether readings are foretold better when nobody says which frames were held, as for new recordings."""
+    foretold = foretell(search.presses, plain, extended)
+    before, after = (
+        sum(float(np.mean((f.measured - values(f)) ** 2)) for f in foretold)
+        for values in (lambda f: f.simulated, lambda f: f.extended)
+    )
+    return after < before
 
 
 def _smallest(search: Search, fitted: Fit) -> dict[str, float]:

@@ -128,6 +128,16 @@ def test_a_still_pad_of_one_taxel_that_repeats_is_not_held() -> None:
     assert not held(press_set(still))
 
 
+def test_readings_without_noise_that_repeat_while_the_indenter_rests_are_not_held() -> None:
+    presses = press_set([np.zeros((200, 8)) for _ in range(4)]).presses
+    for press in presses:
+        press.drive[:] = np.minimum(press.drive, 0.5)
+        press.signal[:] = 100.0 * press.drive[:, :, 0] * np.arange(1, 9)
+        press.rhythm = Rhythm.of(press.time_s, press.signal, np.ones(200, dtype=bool))
+        assert (press.rhythm.telling & ~press.rhythm.fresh).sum() > 50
+    assert not held(SimpleNamespace(presses=presses))
+
+
 def test_held_frames_show_what_the_model_said_at_the_last_new_one() -> None:
     rhythm = press_set([np.array([[1.0], [1.0], [2.0], [2.0], [2.0], [3.0]])]).presses[0].rhythm
     np.testing.assert_allclose(rhythm.taken_s(rhythm.time_s), np.array([0, 0, 2, 2, 2, 5]) * 0.05)

@@ -15,6 +15,8 @@ RARITY = 0.08
 """How far the mean time between new readings may be off as a period."""
 MIN_HELD, CHANCE = 0.04, 0.2
 """Share of frames that must repeat the one before for readings to be held, and what part may be chance."""
+VISIBLE = 0.01
+"""Part of a press's deepest drive by which it must change for a repeat to tell."""
 MANY_TAXELS, MIN_TELLING, SURE_MOVE = 6, 10, 4.0
 MIN_REPEATED = 0.1
 """Share of frames that must repeat the one before for a rhythm to be looked for."""
@@ -46,7 +48,7 @@ def _repeats(press: Press) -> tuple[float, float] | None:
     each other: then frames count in which the motion alone changes readings by far more than noise.
     """
     changed = np.diff(press.signal, axis=0) != 0.0
-    use = press.rhythm.telling[1:]
+    use = press.rhythm.telling[1:] & _driven(press)
     few = changed.shape[1] < MANY_TAXELS
     if few:
         use = use & _moving(press)
@@ -56,6 +58,13 @@ def _repeats(press: Press) -> tuple[float, float] | None:
         return None
     same = float(np.prod(1.0 - changed[fresh].mean(axis=0)))
     return float(1.0 - fresh.mean()), 0.0 if few else same
+
+
+def _driven(press: Press) -> np.ndarray:
+    """Steps (T-1,) in which some drive changes visibly: readings under a still indenter may well repeat."""
+    drive = np.maximum(press.drive, 0.0)
+    steps = np.abs(np.diff(drive, axis=0)).max(axis=(1, 2))
+    return steps > VISIBLE * max(float(drive.max()), 1e-12)
 
 
 def _moving(press: Press) -> np.ndarray:
