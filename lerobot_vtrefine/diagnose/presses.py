@@ -7,7 +7,7 @@ import numpy as np
 from lerobot_vtrefine.diagnose.indenters import trial_forces
 from lerobot_vtrefine.diagnose.recordings import RecordingSet, Trial
 from lerobot_vtrefine.diagnose.refinement import Kind, instants_of, motion
-from lerobot_vtrefine.diagnose.rhythm import Rhythm
+from lerobot_vtrefine.diagnose.rhythm import Rhythm, silent
 from lerobot_vtrefine.tactile.layout import PadLayout
 
 MARGIN_TAXELS = 2
@@ -116,7 +116,8 @@ class Press:
         """When readings were new; kept with the press."""
         kept = self.__dict__.get("_rhythm")
         if kept is None:
-            kept = self.__dict__["_rhythm"] = Rhythm.of(self.time_s, self.signal, self.touching)
+            telling = self.touching & ~silent(self.drive, self.signal)
+            kept = self.__dict__["_rhythm"] = Rhythm.of(self.time_s, self.signal, telling)
         return kept
 
     def sunk(self, by_m: float) -> "Press":

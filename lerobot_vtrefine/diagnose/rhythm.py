@@ -12,6 +12,18 @@ def slots(time_s: np.ndarray, period_s: float, phase: float | np.ndarray = 0.0) 
     return np.floor(time_s / period_s + phase + 1e-6)
 
 
+def silent(drive: np.ndarray, signal: np.ndarray) -> np.ndarray:
+    """Frames (T,) in which the indenter stands still, if readings (T, n) never change there: without noise
+    repeats say nothing.
+
+    Args:
+        drive: heights or loads (T, r, c).
+    """
+    still = np.concatenate([[False], (np.diff(drive, axis=0) == 0.0).all(axis=(1, 2))])
+    fresh = np.concatenate([[True], (np.diff(signal, axis=0) != 0.0).any(axis=1)])
+    return still & ~(still & fresh).any()
+
+
 @dataclass(frozen=True)
 class Rhythm:
     """Frames with new readings (T,) bool, and those that may tell: on the pad, while time goes on."""
