@@ -115,14 +115,18 @@ def _hold(stage: SampleAndHold, field: Field, context: Context) -> Field:
 
 
 def play(
-    x: np.ndarray, half_width: float | np.ndarray, above: float | np.ndarray | None = None
+    x: np.ndarray,
+    half_width: float | np.ndarray,
+    above: float | np.ndarray | None = None,
+    resting: bool = False,
 ) -> np.ndarray:
-    """Play operator on columns of x (T, n) with reset at zero, as in the hysteresis stage: (T, n).
+    """Play operator on columns of x (T, n), as in the hysteresis stage: (T, n).
 
-    Its band reaches from `above` (half its width by default) over x to the rest of the width below.
+    Its band reaches from `above` (half its width by default) over x to the rest of the width below. It is
+    reset at zero unless it keeps `resting` where it was let go.
     """
     above = half_width if above is None else above
-    touched = x > 0
+    touched = (x > 0) | resting
     upper = np.where(touched, x + above, 0.0)
     out = np.where(touched, np.maximum(x + above - 2.0 * half_width, 0.0), 0.0)
     state = np.zeros(x.shape[1])
@@ -167,7 +171,8 @@ def _hysteresis(stage: Hysteresis, field: Field, context: Context) -> Field:
     held = (1.0 - math.fsum(fractions)) * field.values
     for width_m, fraction in zip(widths, fractions, strict=True):
         half = 0.5 * width_m * context.stiffness
-        held += fraction * play(field.values, half, half if stage.loop == "even" else 0.0)
+        above = 0.0 if stage.loop == "behind" else half
+        held += fraction * play(field.values, half, above, stage.loop == "resting")
     return Field(np.maximum(held, 0.0), field.columns)
 
 

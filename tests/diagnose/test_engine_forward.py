@@ -107,6 +107,12 @@ def test_delay_of_a_ramp_is_a_shift() -> None:
     assert np.allclose(late, np.maximum(time_s - 0.13, 0))
 
 
+def test_play_that_rests_keeps_half_its_width_without_contact() -> None:
+    touch = np.array([0.0, 1.0, 0.0, 0.0])[:, None]
+    assert play(touch, 0.2)[:, 0].tolist() == pytest.approx([0.0, 0.8, 0.0, 0.0])
+    assert play(touch, 0.2, resting=True)[:, 0].tolist() == pytest.approx([0.0, 0.8, 0.2, 0.2])
+
+
 def test_play_follows_behind_by_half_its_width() -> None:
     up_down = np.concatenate([np.linspace(0, 1, 11), np.linspace(0.95, 0.5, 10)])[:, None]
     out = play(up_down, 0.2)[:, 0]

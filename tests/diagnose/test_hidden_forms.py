@@ -19,6 +19,7 @@ SEED = 7011
         ("crosstalk", "one_sided"),
         ("hysteresis", "branch"),
         ("hysteresis", "below_peak"),
+        ("hysteresis", "resting"),
         ("viscoelastic_relaxation", "power_creep"),
         ("baseline_drift", "temperature"),
     ],

@@ -24,6 +24,10 @@ def _behind(values: np.ndarray, setting: Setting) -> tuple[Stage, ...]:
     return (Hysteresis(tuple(float(value) for value in values), widths, "behind"),)
 
 
+def _resting(values: np.ndarray, setting: Setting) -> tuple[Stage, ...]:
+    return (Hysteresis(float(values[0]), float(np.exp(values[1]) * setting.top_depth_m), "resting"),)
+
+
 def _scaled(values: np.ndarray, setting: Setting) -> tuple[Stage, ...]:
     return (Hysteresis(float(values[0]), float(np.exp(values[1]) * setting.top_depth_m), "scaled"),)
 
@@ -71,6 +75,16 @@ FORMS = (
         _report_several,
         lambda s: [[0.03] * len(SEVERAL_WIDTHS)],
         amplitude=None,
+        signed=True,
+        screened=False,
+    ),
+    Form(
+        "hysteresis",
+        "one play operator that rests where it was let go",
+        (Value("fraction", -0.9, 0.9, 2e-3), LOG_WIDTH),
+        _resting,
+        _report_one,
+        lambda s: [[0.1, float(np.log(share))] for share in (0.25, 0.6)],
         signed=True,
         screened=False,
     ),

@@ -183,7 +183,7 @@ class ViscoelasticRelaxation(Stage):
         return (relaxed.clamp(min=0.0) if self.pushes_only else relaxed), new
 
 
-LOOPS = ("even", "behind", "scaled", "peak")
+LOOPS = ("even", "resting", "behind", "scaled", "peak")
 
 
 @register
@@ -198,7 +198,8 @@ class Hysteresis(Stage):
     positive
     fraction reads less while loading, a negative one more, as a cover that dissipates energy does.
 
-    `loop` says where the band lies: "even" about f; "behind" it, so that only loading differs from f, as sums
+    `loop` says where the band lies: "even" about f; "resting" too, but kept without contact, so that readings
+    rest above idle once they were let go; "behind" it, so that only loading differs from f, as sums
     of relays have it; "scaled" is a loop as wide as the load is high: f (1 + fraction b), with b from 0 to 1
     over `width_m` of unloading; "peak" follows f / (largest f of this contact) = s: f (1 + 4 fraction s (1 -
     s)), so that loops close at both ends (`width_m` has no part in it).
@@ -247,8 +248,8 @@ class Hysteresis(Stage):
                 share = x / new[name].clamp(min=1e-12)
                 looped = looped + 4.0 * fraction * share * (1.0 - share) * x.clamp(min=0.0)
                 continue
-            above = 0.5 * width if self.loop == "even" else 0.0 * width
+            above = 0.0 * width if self.loop == "behind" else 0.5 * width
             play = torch.maximum(torch.minimum(state[name], x + above), x + above - width).clamp(min=0.0)
-            new[name] = play * (x > 0)
+            new[name] = play if self.loop == "resting" else play * (x > 0)
             looped = looped + fraction * (new[name] - x)
         return looped.clamp(min=0.0), new

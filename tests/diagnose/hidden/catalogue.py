@@ -36,6 +36,7 @@ FORMS: dict[str, dict[str, Factory]] = {
         "preisach": mechanics.preisach,
         "branch": mechanics.branch,
         "below_peak": mechanics.below_peak,
+        "resting": mechanics.resting_play,
     },
     "taxel_gain_spread": {
         "log_normal": electronics.log_normal_gains,

@@ -148,11 +148,12 @@ def power_creep(pad: Pad, size: float, rng: Draw) -> Effect:
     return Effect("viscoelastic_relaxation", "power_creep", "force", apply)
 
 
-def play(d: np.ndarray, half: float | np.ndarray) -> np.ndarray:
-    """Play operator of half width `half`, along time; forgets what it knew where there is no contact."""
+def play(d: np.ndarray, half: float | np.ndarray, forgets: bool = True) -> np.ndarray:
+    """Play operator of half width `half`, along time; may forget what it knew where there is no contact."""
     out, now = np.empty_like(d), np.zeros_like(d[0])
     for i, value in enumerate(d):
-        now = np.where(value > 0, np.minimum(np.maximum(now, value - half), value + half), 0.0)
+        moved = np.minimum(np.maximum(now, value - half), value + half)
+        now = np.where((value > 0) | (not forgets), moved, 0.0)
         out[i] = now
     return out
 
@@ -165,6 +166,16 @@ def play_loop(pad: Pad, size: float, rng: Draw) -> Effect:
         return np.maximum((1 - w) * f + w * pad.k_n * held, 0.0)
 
     return Effect("hysteresis", "play", "force", apply, {"fraction": w, "width_m": width})
+
+
+def resting_play(pad: Pad, size: float, rng: Draw) -> Effect:
+    """What was pressed stays a little in: the play is not undone when the indenter leaves."""
+    w, width = min(0.24 * size, 0.7), 1.4e-4 * rng.uniform(0.8, 1.3)
+
+    def apply(scene: Scene, f: np.ndarray) -> np.ndarray:
+        return (1 - w) * f + w * pad.k_n * play(f / pad.k_n, width / 2, forgets=False)
+
+    return Effect("hysteresis", "resting", "force", apply)
 
 
 def many_plays(pad: Pad, size: float, rng: Draw) -> Effect:
