@@ -1,5 +1,6 @@
 """Pairs from meshes: one clear line per fault, the cache, the measured fit, sliding in under physics."""
 
+import logging
 import sys
 from collections.abc import Iterator
 from pathlib import Path
@@ -134,6 +135,7 @@ def test_scene_is_built_with_grips_clear_of_each_other(folder: Path, ring: MeshP
 
 def test_hands_that_would_meet_are_told(folder: Path, caplog: pytest.LogCaptureFixture) -> None:
     """The seated ring's middle lies 17.5 mm above the foot's, and pads are 26 mm wide."""
+    caplog.set_level(logging.WARNING)  # libraries tell more where another test opened the root logger
     build_scene(SceneConfig(pair="automate/ring", mesh_dir=folder, mesh_scale="unit"))
     (told,) = caplog.messages
     assert told.startswith("automate/ring cannot be seated by these hands")
