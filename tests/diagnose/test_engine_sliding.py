@@ -1,0 +1,36 @@
+"""Whether errors belong to sliding, or to the recordings that happen to slide."""
+
+from types import SimpleNamespace
+
+import numpy as np
+
+from lerobot_vtrefine.diagnose.sliding import sliding_alarm
+
+
+def alarm_of(sliding: list[float], standing: list[float], share: list[float]):
+    """The alarm for recordings of 400 frames with those errors (standard deviations) and parts that slide."""
+    rng = np.random.default_rng(5)
+    presses, residuals, weights = [], [], []
+    for moved, still, part in zip(sliding, standing, share, strict=True):
+        moves = np.arange(400) < part * 400
+        x_m = np.cumsum(moves * 1e-4)
+        trial = SimpleNamespace(time_s=np.arange(400) * 0.05, x_m=x_m, y_m=np.zeros(400))
+        presses.append(SimpleNamespace(trial=trial, touching=np.ones(400, dtype=bool)))
+        residuals.append(rng.standard_normal((400, 3)) * np.where(moves, moved, still)[:, None])
+        weights.append(SimpleNamespace(sigma=1.0, memory=SimpleNamespace(white=lambda error: error)))
+    model = SimpleNamespace(setting=SimpleNamespace(top_counts=100.0))
+    fitted = SimpleNamespace(signals=[np.full((400, 3), 50.0)] * len(presses), model=model)
+    return sliding_alarm(SimpleNamespace(presses=presses), residuals, fitted, weights)
+
+
+def test_errors_that_every_slide_shows_are_told() -> None:
+    found = alarm_of([1.5] * 4 + [1.0] * 4, [1.0] * 8, [0.4] * 4 + [0.0] * 4)
+    assert found.fired
+    assert 2.0 < found.share < 2.5
+
+
+def test_recordings_that_err_all_the_time_do_not_blame_their_slides() -> None:
+    """They slide far, so that their errors weigh in what slides."""
+    found = alarm_of([2.0] * 4 + [1.0] * 4, [2.0] * 4 + [1.0] * 4, [0.7] * 4 + [0.0] * 4)
+    assert found.share > 1.6
+    assert not found.fired
