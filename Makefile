@@ -1,5 +1,5 @@
 .DEFAULT_GOAL := help
-.PHONY: help setup demo test test-slow check format bench bench-diagnose clean-demo
+.PHONY: help setup demo test test-slow check format bench bench-diagnose tables clean-demo
 
 VENV := .venv/bin
 JOBS ?= 2
@@ -35,6 +35,9 @@ bench: setup ## speed, as ratios measured in one run
 
 bench-diagnose: setup ## vtrefine-diagnose on recordings with known causes: the table and its bars
 	@$(VENV)/python scripts/bench_diagnose.py $(ARGS)
+
+tables: setup ## the README's tables from results/*.json; scripts/collect_results.py --help fills these
+	@$(VENV)/python scripts/make_tables.py
 
 clean-demo: ## remove the demo's outputs, so that the next one starts afresh
 	@rm -rf outputs/demo

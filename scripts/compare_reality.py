@@ -39,6 +39,10 @@ from lerobot_vtrefine.cli.pipeline.demo_config import (
 )
 from lerobot_vtrefine.cli.pipeline.stages import Stage, StageRunner, find_command
 from lerobot_vtrefine.cli.report.statistics import proportion
+from lerobot_vtrefine.cli.results.collect import Progress, last_steps, read_json
+from lerobot_vtrefine.cli.results.provenance import write_provenance
+from lerobot_vtrefine.cli.results.rows import Run
+from lerobot_vtrefine.finetune.logger import read_progress
 from lerobot_vtrefine.sim.reality import SCHEMA
 
 MOTION_SEED_OFFSET = 500_000
@@ -280,6 +284,39 @@ def compare_one(budget: Budget, name: str, seeds: list[int]) -> dict[str, Any]:
     return row
 
 
+def reality_rows(folder: Path, origin: dict[str, str | None]) -> list[tuple[Run, Progress]]:
+    """Rows of the results file from a comparison's folder: every policy in every world, by seed."""
+    rows = []
+    for name in REALITIES:
+        verdict = read_json(folder / folder_name(name) / "diagnosis" / "verdict.json") or {"causes": []}
+        causes = ", ".join(cause["name"] for cause in verdict["causes"]) or "nothing"
+        for title, (trained, world) in cells(name).items():
+            prefix = folder_name("eval", trained, "in", world, "")
+            for path in sorted(folder.glob(f"{prefix}*/eval_info.json")):
+                seed = path.parent.name.removeprefix(prefix)
+                tuning = folder_name("finetune", trained, seed)
+                progress, stamp = (
+                    read_progress(folder / tuning),
+                    read_json(folder / "stages" / f"{tuning}.json"),
+                )
+                outcomes = read_json(path)["per_task"][0]["metrics"]["successes"]
+                row = Run(
+                    table="reality",
+                    task=name,
+                    policy="visuo_tactile",
+                    variant=title,
+                    seed=int(seed),
+                    success=sum(map(bool, outcomes)) / len(outcomes),
+                    episodes=len(outcomes),
+                    iterations=int(progress[-1]["iteration"]) if progress else None,
+                    env_steps=last_steps(progress),
+                    extra={"diagnosis": causes},
+                    **origin | {"commit": (stamp or {}).get("commit") or origin["commit"]},
+                )
+                rows.append((row, progress if title.endswith("simulator") else []))
+    return rows
+
+
 def parse() -> tuple[argparse.Namespace, Budget]:
     """Options, and the budget among them."""
     parser = argparse.ArgumentParser(
@@ -330,6 +367,7 @@ def main() -> None:
     failed = run_lanes(budget, runnable(before | starts, policies), options.jobs) or failed
     results = compare(budget)
     save(budget.output_dir, results, as_text(results))
+    write_provenance(budget.output_dir)
     if failed is not None:
         raise failed
 

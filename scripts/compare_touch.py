@@ -22,12 +22,10 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import torch
-from scipy.stats import t as student_t
 
 from lerobot_vtrefine.cli.pipeline.demo_config import default_env, default_policy
-from lerobot_vtrefine.cli.report.statistics import proportion
+from lerobot_vtrefine.cli.report.statistics import mean_interval, proportion
 
 MODALITIES = ("visuo_tactile", "visual")
 POLICIES = {"pretrain": "imitation", "finetune": "after DPPO"}
@@ -154,15 +152,6 @@ def start(command: list[str], folder: Path, share: Share) -> subprocess.Popen:
     env = os.environ | ({"CUDA_VISIBLE_DEVICES": share.gpu} if share.gpu else {})
     with Path(f"{folder}.log").open("wb") as log:
         return subprocess.Popen(command, stdout=log, stderr=subprocess.STDOUT, preexec_fn=pin, env=env)
-
-
-def mean_interval(values: list[float]) -> tuple[float, float, float]:
-    """Mean and Student-t 95 % interval over seeds; an infinite interval for a single seed."""
-    mean = float(np.mean(values))
-    if len(values) < 2:
-        return mean, -float("inf"), float("inf")
-    half = float(student_t.ppf(0.975, len(values) - 1) * np.std(values, ddof=1) / np.sqrt(len(values)))
-    return mean, mean - half, mean + half
 
 
 def compare(results: dict[str, dict[int, dict]]) -> dict:

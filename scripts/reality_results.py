@@ -3,7 +3,9 @@
 from typing import Any
 
 import numpy as np
-from compare_touch import interval_text, mean_interval, rate_text
+from compare_touch import interval_text, rate_text
+
+from lerobot_vtrefine.cli.report.statistics import mean_interval
 
 
 def difference(row: dict[str, Any], one: str, two: str) -> dict[str, Any]:

@@ -5,6 +5,7 @@ from lerobot.utils.import_utils import register_third_party_plugins
 from lerobot.utils.utils import init_logging
 
 from lerobot_vtrefine.cli.errors import run_cli
+from lerobot_vtrefine.cli.results.provenance import write_provenance
 from lerobot_vtrefine.finetune.pipeline import FinetunePipelineConfig, run
 
 
@@ -12,6 +13,7 @@ from lerobot_vtrefine.finetune.pipeline import FinetunePipelineConfig, run
 def finetune(cfg: FinetunePipelineConfig) -> None:
     """Parse the command line as LeRobot's commands do, and run."""
     run(cfg)
+    write_provenance(cfg.output_dir)
 
 
 @run_cli

@@ -14,6 +14,7 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 
 from lerobot_vtrefine.cli.pipeline.progress import LiveLine, parse_progress, read_tail
+from lerobot_vtrefine.cli.results.provenance import commit
 
 POLL_S = 0.25
 STOP_TIMEOUT_S = 10.0
@@ -51,7 +52,8 @@ class Stage:
 class StageRecord:
     """What a finished stage leaves in its stamp.
 
-    ``seconds`` is the wall time of all processes that it took, ``key`` the fingerprint of what it did.
+    ``seconds`` is the wall time of all processes that it took, ``key`` the fingerprint of what it did,
+    ``commit`` the code's; None where that is not known.
     """
 
     name: str
@@ -59,6 +61,7 @@ class StageRecord:
     command: str
     seconds: float
     key: str
+    commit: str | None = None
 
 
 def stage_keys(stages: list[Stage]) -> dict[str, str]:
@@ -99,7 +102,8 @@ class StageRunner:
         finally:
             seconds = earlier + time.monotonic() - started
             self._note_start(stage, seconds)
-        record = StageRecord(stage.name, stage.title, stage.line, round(seconds, 1), self.keys[stage.name])
+        key = self.keys[stage.name]
+        record = StageRecord(stage.name, stage.title, stage.line, round(seconds, 1), key, commit())
         self._stamp(stage).write_text(json.dumps(asdict(record), indent=2), encoding="utf-8")
         self.line.finish(label, f"{seconds:.0f} s")
         return record

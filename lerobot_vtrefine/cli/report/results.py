@@ -13,6 +13,7 @@ from typing import Any
 from lerobot_vtrefine.cli.pipeline.demo_config import DemoConfig
 from lerobot_vtrefine.cli.pipeline.stages import StageRecord
 from lerobot_vtrefine.cli.report.statistics import proportion, quantiles
+from lerobot_vtrefine.cli.results.provenance import provenance
 from lerobot_vtrefine.envs.episode_log import read_episode_log
 
 # Measurements of every episode, and those that only a success has.
@@ -84,6 +85,7 @@ def collect_results(config: DemoConfig, records: Sequence[StageRecord]) -> dict[
         "stages": [asdict(record) for record in records],
         "config": json.loads(json.dumps(asdict(config), default=str)),
         "machine": machine(),
+        "provenance": provenance(),
     }
 
 

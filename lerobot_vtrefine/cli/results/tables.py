@@ -1,0 +1,220 @@
+"""Markdown tables from rows, and the documents' blocks that hold them.
+
+A block is what lies between ``<!-- table: NAME -->`` and ``<!-- end -->``. Brackets hold 95 % intervals,
+Wilson's over pooled episodes or Student's t over seeds; parentheses hold each seed.
+"""
+
+import re
+from collections.abc import Callable, Sequence
+from statistics import mean, median
+
+from lerobot_vtrefine.cli.report.statistics import mean_interval, wilson_interval
+from lerobot_vtrefine.cli.results.rows import Line, Row, Run
+
+IMITATION = "imitation"
+BLOCK = re.compile(r"(<!-- table: (\w+) -->\n).*?(<!-- end -->)", re.DOTALL)
+LABELS = {
+    "demo": "demo: round pair, 2 mm clearance",
+    "tight": "tight: 1 mm clearance",
+    "occluded": "occluded: camera above, the hole hidden",
+    "slip": "slip: twice the pose error in the hand",
+    "short_chunk": "short_chunk: decisions twice as often",
+    "row_sharing+hysteresis": "row sharing, hysteresis",
+    "latency+taxel_gain_spread": "latency 0.2 s, gain spread 0.5",
+    "control_latency+backlash": "commands 0.1 s late, 20 mrad of play in all arm joints",
+    "visuo_tactile": "touch",
+    "visual": "vision only",
+}
+"""Tasks and policies in words; others stand as they are."""
+MEASURED = (
+    ("in_hand_shift_m", "in-hand shift of successes, median", 1e3, "mm"),
+    ("rim_slide_m", "sliding on the rim, median", 1e3, "mm"),
+    ("peak_force_n", "peak force, median", 1.0, "N"),
+    ("time_to_success_s", "time to success, median (1 s of it is the hold)", 1.0, "s"),
+)
+WORLDS = (
+    ("start", "the start"),
+    ("plain", "then the plain simulator"),
+    ("diagnosed", "then the diagnosed one"),
+)
+
+
+def pick(rows: Sequence[Run], **wanted: str) -> list[Run]:
+    """The rows with these values, by seed."""
+    found = [row for row in rows if all(getattr(row, name) == value for name, value in wanted.items())]
+    return sorted(found, key=lambda row: -1 if row.seed is None else row.seed)
+
+
+def values(rows: Sequence[Run], name: str) -> list[str]:
+    """What a field takes on, in the rows' order."""
+    return list(dict.fromkeys(getattr(row, name) for row in rows))
+
+
+def markdown(head: Sequence[str], body: Sequence[Sequence[str]]) -> str:
+    """A Markdown table."""
+    lines = [f"|{'|'.join(f' {cell} ' if cell else ' ' for cell in cells)}|" for cells in (head, *body)]
+    return "\n".join([lines[0], "|" + "---|" * len(head), *lines[1:]])
+
+
+def percent(value: float) -> str:
+    """A share in per cent, without the sign."""
+    return f"{100 * value:.0f}"
+
+
+def interval(low: float, high: float) -> str:
+    """For example ``[62, 75]``."""
+    return f"[{percent(low)}, {percent(high)}]"
+
+
+def pooled(rows: Sequence[Run], seeds: bool = True, bounds: bool = True, unit: str = "") -> str:
+    """Success over all episodes with Wilson's interval, and each seed's; a dash without rows."""
+    if not rows:
+        return "-"
+    whole = [row for row in rows if row.seed is None] or rows
+    successes, episodes = sum(row.successes for row in whole), sum(row.episodes for row in whole)
+    text = percent(successes / episodes) + unit
+    text += " " + interval(*wilson_interval(successes, episodes)) if bounds else ""
+    single = [percent(row.success) for row in rows if row.seed is not None]
+    return f"{text} ({', '.join(single)})" if seeds and len(single) > 1 else text
+
+
+def difference(one: Sequence[Run], two: Sequence[Run]) -> str:
+    """Two minus one over the seeds that both have, in points, with the t-interval."""
+    before = {row.seed: row.success for row in one}
+    changes = [row.success - before[row.seed] for row in two if row.seed in before and row.seed is not None]
+    if not changes:
+        return "-"
+    middle, *bounds = mean_interval(changes)
+    return f"{100 * middle:+.0f}" + (f" {interval(*bounds)}" if len(changes) > 1 else "")
+
+
+def demo_table(rows: Sequence[Run]) -> str:
+    """Imitation beside fine-tuning, with what is missed when a sense is taken away."""
+    head = [
+        ", ".join(f"seed {seed}" for seed in values(pick(rows, variant=""), "seed")),
+        IMITATION,
+        "after DPPO",
+    ]
+    body = []
+    for name, words in (("", ""), (" without touch", "touch"), (" without vision", "vision")):
+        both = [pick(rows, variant=(stage + name).strip()) for stage in (IMITATION, "")]
+        if not any(both):
+            continue
+        count = "/".join(dict.fromkeys(str(row.episodes) for row in both[1] or both[0]))
+        plain, taken = (
+            f", {count} unseen episodes [95 % interval]",
+            f" with {words} replaced by its mean ({count} episodes)",
+        )
+        body.append(["success" + (taken if words else plain), *(pooled(runs, unit=" %") for runs in both)])
+    for key, words, scale, unit in MEASURED:
+        cells = []
+        for stage in (IMITATION, ""):
+            found = [float(row.extra[key]) for row in pick(rows, variant=stage) if key in row.extra]
+            cells.append(f"{scale * median(found):.1f} {unit}" if found else "-")
+        body.append([words, *cells])
+    return markdown(head, body)
+
+
+def touch_table(rows: Sequence[Run]) -> str:
+    """Touch against vision alone, task by task."""
+    body = []
+    for task in values(rows, "task"):
+        touch, sight = (pick(rows, task=task, policy=name) for name in ("visuo_tactile", "visual"))
+        before = [pooled(pick(kind, variant=IMITATION), False, False) for kind in (touch, sight)]
+        after = [pick(kind, variant="") for kind in (touch, sight)]
+        cells = [pooled(runs, bounds=False) for runs in after]
+        body.append([LABELS.get(task, task), " / ".join(before), *cells, difference(after[1], after[0])])
+    head = [
+        "setting",
+        "imitation, touch / vision only",
+        "after DPPO, touch",
+        "after DPPO, vision only",
+        "difference",
+    ]
+    return markdown(head, body)
+
+
+def reality_table(rows: Sequence[Run]) -> str:
+    """Policies tuned in the plain and in the diagnosed simulator, in the stand-in reality and at home."""
+    body = []
+    for task in values(rows, "task"):
+        chosen = pick(rows, task=task)
+        named = next((str(row.extra["diagnosis"]) for row in chosen if "diagnosis" in row.extra), "-")
+        for world, words in WORLDS:
+            home = "the plain simulator" if world == "start" else "its own simulator"
+            away = pooled(pick(chosen, variant=f"{world} in reality"), seeds=world != "start")
+            first = [LABELS.get(task, task), named] if world == "start" else ["", ""]
+            body.append(
+                [*first, words, away, pooled(pick(chosen, variant=f"{world} in {home}"), seeds=False)]
+            )
+    head = ["hidden in the stand-in reality", "diagnosis", "fine-tuned in"]
+    return markdown([*head, "success in the stand-in reality", "in its own simulator"], body)
+
+
+def runs_table(rows: Sequence[Run]) -> str:
+    """Every task, policy and variant: mean over seeds, worst seed, what it took."""
+    body = []
+    for task in values(rows, "task"):
+        for policy in values(pick(rows, task=task), "policy"):
+            for variant in values(pick(rows, task=task, policy=policy), "variant"):
+                runs = pick(rows, task=task, policy=policy, variant=variant)
+                middle, *bounds = mean_interval([row.success for row in runs])
+                text = percent(middle) + (f" {interval(*bounds)}" if len(runs) > 1 else "")
+                cells = [f"{text} ({', '.join(percent(row.success) for row in runs)})"]
+                cells.append(percent(min(row.success for row in runs)))
+                cells += [
+                    average([getattr(row, name) for row in runs]) for name in ("iterations", "env_steps")
+                ]
+                falls = [float(row.extra["largest_fall"]) for row in runs if "largest_fall" in row.extra]
+                cells.append(percent(max(falls)) if falls else "-")
+                body.append(
+                    [LABELS.get(task, task), LABELS.get(policy, policy), variant or "after DPPO", *cells]
+                )
+    head = [
+        "task",
+        "policy",
+        "",
+        "mean over seeds [t-interval] (each)",
+        "worst",
+        "iterations",
+        "environment steps",
+    ]
+    return markdown([*head, "largest fall, last half"], body)
+
+
+def average(counts: Sequence[int | None]) -> str:
+    """Mean of counts with thin groups of thousands; a dash where one was not recorded."""
+    known = [count for count in counts if count is not None]
+    return f"{mean(known):,.0f}".replace(",", " ") if known and len(known) == len(counts) else "-"
+
+
+def lines_table(rows: Sequence[Line]) -> str:
+    """A benchmark's table as it was printed."""
+    head = list(rows[0].cells)
+    return markdown(head, [[row.cells.get(name, "") for name in head] for row in rows])
+
+
+RENDERERS: dict[str, Callable[[Sequence], str]] = (
+    dict.fromkeys(Run.TABLES, runs_table)
+    | dict.fromkeys(Line.TABLES, lines_table)
+    | {"demo": demo_table, "touch": touch_table, "twin": touch_table, "reality": reality_table}
+)
+
+
+def table(name: str, rows: Sequence[Row]) -> str:
+    """One table, and where its figures come from.
+
+    Raises:
+        ValueError: there is no such table, or no row of it.
+    """
+    chosen = [row for row in rows if row.table == name]
+    if not chosen:
+        raise ValueError(f"table {name}: results/ hold no rows of it; tables: {', '.join(RENDERERS)}")
+    origin = {field: dict.fromkeys(getattr(row, field) for row in chosen) for field in ("commit", "machine")}
+    known = [", ".join(filter(None, found)) or "not recorded" for found in origin.values()]
+    return f"{RENDERERS[name](chosen)}\n\n<sub>Commit: {known[0]}; machine: {known[1]}.</sub>"
+
+
+def fill(text: str, rows: Sequence[Row]) -> str:
+    """A document with every block's table made anew."""
+    return BLOCK.sub(lambda block: f"{block[1]}{table(block[2], rows)}\n{block[3]}", text)

@@ -1,0 +1,67 @@
+#!/usr/bin/env python
+"""Turn what runs left into rows of results/*.json, from which ``make tables`` makes the README's tables.
+
+One command replaces a table; without --replace, only rows of the same task, policy and seed:
+
+    python scripts/collect_results.py demo outputs/demo --task=demo --replace
+    python scripts/collect_results.py touch outputs/compare_touch/*/*/ --replace
+    python scripts/collect_results.py reality outputs/compare_reality --replace
+    python scripts/collect_results.py converges outputs/square/*/ --task=square_1mm --replace
+    python scripts/collect_results.py tactile outputs/bench/tactile.md --replace
+    make tables
+
+A source is the folder of a vtrefine-demo or of a vtrefine-finetune (judged by a lerobot-eval whose
+--output_dir was its folder eval/, else by its own last evaluation), that of scripts/compare_reality.py, or,
+for tables of benchmarks, a file with the table that was printed. Learning curves come to results/curves/.
+Commit, command and machine are those that the run recorded; --commit, --command and --machine say them of
+runs that could not (on a machine without git, say). What nobody says is null.
+"""
+
+import argparse
+import sys
+from pathlib import Path
+
+from compare_reality import reality_rows
+
+from lerobot_vtrefine.cli.errors import run_cli
+from lerobot_vtrefine.cli.results.collect import ORIGIN, origin_of, printed_lines, run_rows, save
+from lerobot_vtrefine.cli.results.rows import Line, Run
+
+RESULTS = Path(__file__).parents[1] / "results"
+
+
+@run_cli
+def main() -> None:
+    """Collect every source, then write."""
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument("table", choices=[*Run.TABLES, *Line.TABLES])
+    parser.add_argument("sources", type=Path, nargs="+")
+    parser.add_argument("--results", type=Path, help="file (default results/TABLE.json)")
+    parser.add_argument("--replace", action="store_true", help="drop the table's earlier rows")
+    parser.add_argument("--task", help="default: the name of the folder that holds the run's")
+    parser.add_argument("--policy", help="visuo_tactile, visual, ...; default: what the run recorded")
+    parser.add_argument("--variant", help="what else sets the runs apart, for example '10 demonstrations'")
+    for name in ORIGIN:
+        parser.add_argument(f"--{name}", help="of runs that did not record it")
+    options = parser.parse_args()
+    origin = {name: getattr(options, name) for name in ORIGIN}
+    given = {name: getattr(options, name) for name in ("policy", "variant") if getattr(options, name)}
+    found = []
+    for source in options.sources:
+        if options.table in Line.TABLES:
+            found += [(row, []) for row in printed_lines(source, options.table, origin)]
+        elif options.table == "reality":
+            found += reality_rows(source, origin_of(source, **origin))
+        else:
+            task = options.task or source.resolve().parent.name
+            found += run_rows(source, {"table": options.table, "task": task} | given, origin)
+    path = options.results or RESULTS / f"{options.table}.json"
+    save(path, options.table, found, replace=options.replace)
+    unknown = sum(row.commit is None for row, _ in found)
+    print(f"{len(found)} rows in {path}" + (f"; {unknown} without a commit: add --commit" if unknown else ""))
+
+
+if __name__ == "__main__":
+    sys.exit(main())
