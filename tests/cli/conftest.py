@@ -53,6 +53,23 @@ def record(root: Path, *arguments: str) -> int:
         return record_demos.main()
 
 
+@pytest.fixture
+def fake_commands(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Stand-ins for the commands of the demo's stages."""
+    from lerobot_vtrefine.cli.pipeline import stages
+
+    fakes = Path(__file__).with_name("fake_commands.py")
+
+    def find(name: str) -> str:
+        script = tmp_path / "bin" / name
+        script.parent.mkdir(exist_ok=True)
+        script.write_text(f'#!/bin/sh\nexec "{sys.executable}" "{fakes}" {name} "$@"\n')
+        script.chmod(0o755)
+        return str(script)
+
+    monkeypatch.setattr(stages, "find_command", find)
+
+
 @pytest.fixture(scope="session")
 def demos(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A small recorded dataset; tests copy it before they change it."""

@@ -8,8 +8,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from lerobot_vtrefine.cli.results.tables import table
 from lerobot_vtrefine.diagnose.robot.model import RobotModel
 from lerobot_vtrefine.embodiments import ALOHA
+from lerobot_vtrefine.finetune.logger import ProgressLog
 from lerobot_vtrefine.tactile.model import SensorModel
 
 SCRIPTS = Path(__file__).parents[2] / "scripts"
@@ -133,6 +135,25 @@ def test_results_say_what_reality_costs_and_what_diagnosis_brings_back(scripts, 
     text = compare.as_text(results)
     assert "(explained: backlash) pays, 25 % [25, 25] over 2 seeds of 4 episodes" in text
     assert text.count("makes no difference that these seeds can show") == 2
+
+
+def test_comparison_becomes_rows_of_the_results(scripts, budget):
+    compare, _ = scripts
+    name = "control_latency+backlash"
+    leave_results(compare, budget, {("plain", "plain"): 3}, budget.seeds)
+    folder = compare.finetune_dir(budget, "plain", 4)
+    folder.mkdir()
+    ProgressLog(folder, 0, None).add(3, {"success": 0.5, "env_steps": 400.0})
+    origin = {"commit": "0123abc", "command": None, "machine": "2 cores"}
+    rows = [row for row, _ in compare.reality_rows(budget.output_dir, origin)]
+    assert len({row.key for row in rows}) == len(rows) == 3 * 6 * 2
+    (row,) = (r for r in rows if r.task == name and r.seed == 4 and r.variant == "plain in its own simulator")
+    assert (row.success, row.episodes, row.iterations, row.env_steps) == (0.75, 4, 3, 400)
+    assert row.extra == {"diagnosis": "backlash"}
+    text = table("reality", rows)
+    hidden = "commands 0.1 s late, 20 mrad of play in all arm joints"
+    assert f"| {hidden} | backlash | the start | 25 [7, 59] | 25 [7, 59] |" in text
+    assert "| | | then the plain simulator | 25 [7, 59] (25, 25) | 75 [41, 93] |" in text
 
 
 def test_unfinished_seeds_are_left_out(scripts, budget):

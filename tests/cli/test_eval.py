@@ -6,7 +6,12 @@ import numpy as np
 import pytest
 from conftest import TINY_ENV
 
+from lerobot_vtrefine.cli.results.collect import run_rows
+from lerobot_vtrefine.envs.config import VtRefineEnvConfig
 from lerobot_vtrefine.envs.episode_log import read_episode_log
+from lerobot_vtrefine.finetune.config import SmallDppo
+from lerobot_vtrefine.finetune.logger import ProgressLog
+from lerobot_vtrefine.finetune.pipeline import FinetunePipelineConfig, save_config
 
 
 @pytest.fixture
@@ -60,9 +65,18 @@ def test_lerobot_eval_plays_the_same_episodes_in_every_vectorisation(evaluate, t
     assert played["async"] == pytest.approx(played["native"], rel=1e-3, abs=1e-6)
 
 
-def test_surplus_episodes_of_the_last_batch_are_dropped(evaluate):
-    _, rows = evaluate("three", "--eval.n_episodes=3")
+def test_surplus_episodes_are_dropped_and_the_others_are_a_fine_tunings_result(evaluate, tmp_path):
+    info, rows = evaluate("run/eval", "--eval.n_episodes=3")
     assert [row["seed"] for row in rows] == [40, 41]
+
+    folder, dppo = tmp_path / "run", SmallDppo(iterations=1)
+    save_config(FinetunePipelineConfig(VtRefineEnvConfig(), dppo=dppo, output_dir=folder, seed=7))
+    ProgressLog(folder, 0, None).add(1, {"success": 0.9, "env_steps": 1000.0, "seconds": 2.0})
+    common = {"table": "converges", "task": "round_2mm", "policy": "visual"}
+    ((row, _),) = run_rows(folder, common, dict.fromkeys(("commit", "command", "machine")))
+    assert (row.seed, row.episodes, row.iterations, row.env_steps) == (7, 3, 1, 1000)
+    assert row.success == pytest.approx(info["overall"]["pc_success"] / 100)
+    assert row.commit is None
 
 
 @pytest.mark.parametrize("part", ["touch", "vision"])

@@ -12,6 +12,8 @@ from safetensors.torch import load_file
 from tiny_policy import ReachEnv, save_tiny_checkpoint
 
 from lerobot_vtrefine.cli.finetune import main
+from lerobot_vtrefine.cli.results.collect import run_rows
+from lerobot_vtrefine.cli.results.provenance import commit, machine
 from lerobot_vtrefine.envs.decisions import make_decision_env
 from lerobot_vtrefine.finetune import pipeline
 from lerobot_vtrefine.finetune.logger import read_progress
@@ -102,6 +104,28 @@ def test_records_and_checkpoint(finetune, tmp_path):
     assert policy.config.ft_eta == 1.0
     assert (path / "policy_preprocessor.json").is_file()
     assert (path / "policy_postprocessor.json").is_file()
+
+
+def test_a_run_becomes_a_row_of_the_results(finetune, tmp_path):
+    output, common = tmp_path / "run", {"table": "converges", "task": "reach"}
+    assert finetune(output, "--seed=30000000", iterations=3) == 0
+    ((row, progress),) = run_rows(output, common, dict.fromkeys(("commit", "command", "machine")))
+    logged = read_progress(output)
+    assert progress == logged
+    assert (row.task, row.policy, row.seed) == ("reach", "visuo_tactile", 30_000_000)
+    assert (row.success, row.episodes) == (logged[-1]["eval_success"], 12)  # 8 in two batches of 6
+    assert (row.iterations, row.env_steps) == (3, logged[-1]["env_steps"])
+    assert row.extra["seconds"] == pytest.approx(sum(line.get("seconds", 0) for line in logged), abs=0.06)
+    assert row.commit == commit()
+    assert row.command.startswith("vtrefine-finetune --policy.path=.../start --output_dir=.../run")
+    assert row.machine == machine()
+
+    shutil.rmtree(output / "checkpoints")  # as copied from another machine
+    with pytest.raises(ValueError, match="holds no checkpoint that tells the policy; add --policy="):
+        run_rows(output, common, {})
+    (output / "progress.csv").write_text("\n".join((output / "progress.csv").read_text().splitlines()[:3]))
+    with pytest.raises(ValueError, match="run has 1 of 3 iterations; finish it with --resume=true"):
+        run_rows(output, common, {})
 
 
 @pytest.mark.parametrize("eta", [0.0, 1.0])

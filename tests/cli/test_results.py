@@ -1,0 +1,267 @@
+"""Results are files: rows are checked, runs become rows, documents hold the tables that the rows give."""
+
+import csv
+import json
+import re
+import sys
+from dataclasses import asdict, replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from lerobot_vtrefine.cli import demo
+from lerobot_vtrefine.cli.report.statistics import mean_interval, wilson_interval
+from lerobot_vtrefine.cli.results import provenance
+from lerobot_vtrefine.cli.results.collect import largest_fall
+from lerobot_vtrefine.cli.results.rows import Line, Row, Run, merge, read_all, read_rows, write_rows
+from lerobot_vtrefine.cli.results.tables import BLOCK, difference, fill, pooled, table
+
+ROOT = Path(__file__).parents[2]
+RESULTS = ROOT / "results"
+ORIGIN = {"commit": "0123abc", "command": "vtrefine-demo", "machine": "2 cores"}
+
+
+@pytest.fixture(scope="module")
+def scripts():
+    sys.path.insert(0, str(ROOT / "scripts"))
+    import collect_results
+    import make_tables
+
+    yield collect_results, make_tables
+    sys.path.remove(str(ROOT / "scripts"))
+
+
+def run_of(success: float, seed: int | None = 0, **changes) -> Run:
+    row = Run(
+        table="touch",
+        task="tight",
+        policy="visual",
+        seed=seed,
+        success=success,
+        episodes=200,
+        iterations=30,
+        env_steps=123_456,
+        **ORIGIN,
+    )
+    return replace(row, **changes)
+
+
+def test_documents_hold_the_tables_of_the_files(scripts) -> None:
+    """After a change of results/*.json: make tables."""
+    _, make_tables = scripts
+    rows = read_all(RESULTS)
+    for path in make_tables.documents():
+        text = path.read_text(encoding="utf-8")
+        assert fill(text, rows) == text, f"{path.name} differs from results/*.json; run make tables"
+    readme = (ROOT / "README.md").read_text(encoding="utf-8")
+    assert {block[1] for block in BLOCK.findall(readme)} == {row.table for row in rows}
+    outside = re.sub(r"```.*?```", "", BLOCK.sub("", readme), flags=re.DOTALL)
+    assert [line for line in outside.splitlines() if line.startswith("|")] == []
+
+
+def test_curves_are_small_and_belong_to_rows() -> None:
+    named = {RESULTS / row.curve for row in read_all(RESULTS) if isinstance(row, Run) and row.curve}
+    assert set(RESULTS.glob("curves/*")) == named
+    assert sum(path.stat().st_size for path in RESULTS.rglob("*") if path.is_file()) < 2_000_000
+
+
+def test_a_changed_figure_changes_the_document(tmp_path: Path) -> None:
+    rows = [run_of(0.5, seed, policy=name) for seed in (0, 1) for name in ("visuo_tactile", "visual")]
+    text = fill("# Title\n<!-- table: touch -->\nold\n<!-- end -->\nafter\n", rows)
+    assert "| tight: 1 mm clearance | - / - | 50 (50, 50) | 50 (50, 50) | +0 [0, 0] |" in text
+    assert text.startswith("# Title\n")
+    assert text.endswith("<sub>Commit: 0123abc; machine: 2 cores.</sub>\n<!-- end -->\nafter\n")
+    assert fill(text, rows) == text
+    assert "52 (55, 50)" in fill(text, [replace(rows[0], success=0.55), *rows[1:]])
+    with pytest.raises(ValueError, match="table demo: results/ hold no rows of it"):
+        fill("<!-- table: demo -->\n<!-- end -->", rows)
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"success": 68}, "success must lie in 0..1, got 68"),
+        ({"success": None}, "success must be a number, got None"),
+        ({"seed": "3"}, "seed must be a whole number or null, got '3'"),
+        ({"seed": True}, "seed must be a whole number or null, got True"),
+        ({"seed": -1}, "seed must not be negative, got -1"),
+        ({"episodes": 0}, "episodes must be at least 1, got 0"),
+        ({"table": "tuoch"}, "table 'tuoch' is none of converges, demo, touch"),
+        ({"commit": "yesterday"}, "commit must be a hash, got 'yesterday'"),
+        ({"extra": {"seconds": [1]}}, "extra must map names to a number or text"),
+        ({"sucess": 0.5}, "has unknown sucess"),
+        ({"curve": "curves/none.csv"}, "curve curves/none.csv is no file"),
+        ({"cells": {"a": "b"}}, "has unknown"),
+    ],
+)
+def test_a_wrong_row_is_told_by_file_row_and_field(change: dict, message: str, tmp_path: Path) -> None:
+    path = tmp_path / "touch.json"
+    good = asdict(run_of(0.5))
+    path.write_text(json.dumps({"rows": [good, good | {"seed": 1} | change]}))
+    with pytest.raises(ValueError, match=r"touch.json: row 2: " + re.escape(message)) as error:
+        read_rows(path)
+    assert "\n" not in str(error.value)
+
+
+def test_what_is_no_file_of_rows_is_told(tmp_path: Path) -> None:
+    path, good = tmp_path / "touch.json", asdict(run_of(0.5))
+    for text, message in (
+        ("{", "touch.json: no JSON"),
+        ("[]", r"touch.json: must be \{\"rows\""),
+        (json.dumps({"rows": [good, good]}), "row 2: stands for the same as an earlier one"),
+        (json.dumps({"rows": [{k: v for k, v in good.items() if k != "machine"}]}), "row 1: lacks machine"),
+    ):
+        path.write_text(text)
+        with pytest.raises(ValueError, match=message):
+            read_rows(path)
+    for name in ("a.json", "b.json"):
+        write_rows(tmp_path / "two" / name, [run_of(0.5)])
+    with pytest.raises(ValueError, match=r"b\.json: table touch is in another file too"):
+        read_all(tmp_path / "two")
+
+
+def test_rows_survive_the_file_and_replace_their_like(tmp_path: Path) -> None:
+    pool = run_of(0.4, None, commit=None, command=None, machine=None, env_steps=None)
+    rows: list[Row] = [pool, run_of(0.5, 7), Line(table="worlds", cells={"worlds": "64", "": ""}, **ORIGIN)]
+    write_rows(tmp_path / "rows.json", rows)
+    assert read_rows(tmp_path / "rows.json") == rows
+    assert '"commit": null' in (tmp_path / "rows.json").read_text()
+    assert merge(rows, rows) == rows
+    assert merge(rows, [run_of(0.6, 7)]) == [run_of(0.6, 7), rows[2]]  # a seed's own takes the pool's place
+    other = run_of(0.6, 7, variant="imitation")
+    assert merge(rows, [other]) == [*rows, other]
+
+
+@pytest.mark.parametrize(("successes", "trials"), [(71, 200), (0, 10), (10, 10), (1, 1024), (1000, 1024)])
+def test_wilson_bounds_lie_where_the_rate_is_196_deviations_away(successes: int, trials: int) -> None:
+    for bound in wilson_interval(successes, trials):
+        deviation = 1.959964 * np.sqrt(bound * (1 - bound) / trials)
+        assert abs(successes / trials - bound) == pytest.approx(deviation, abs=1e-6)
+
+
+def test_interval_over_seeds_has_students_quantile() -> None:
+    assert mean_interval([1.0, 2.0, 3.0]) == pytest.approx(
+        (2.0, 2 - 4.302653 / 3**0.5, 2 + 4.302653 / 3**0.5)
+    )
+    values = np.random.default_rng(0).normal(size=(20_000, 6))
+    half = 2.570582 * values.std(axis=1, ddof=1) / 6**0.5  # 5 degrees of freedom
+    assert np.mean(np.abs(values.mean(axis=1)) < half) == pytest.approx(0.95, abs=0.01)
+    assert mean_interval(list(values[0]))[2] == pytest.approx(values[0].mean() + half[0])
+    assert mean_interval([0.5]) == (0.5, -np.inf, np.inf)
+
+
+def test_figures_of_a_cell() -> None:
+    assert pooled([run_of(0.685)], unit=" %") == "68 % [62, 75]"
+    assert pooled([run_of(0.6, 0), run_of(0.8, 1)]) == "70 [65, 74] (60, 80)"
+    assert (
+        pooled([run_of(0.71, None, episodes=400), run_of(0.6, 0), run_of(0.8, 1)], bounds=False)
+        == "71 (60, 80)"
+    )
+    assert pooled([]) == "-"
+    one, two = (
+        [run_of(rate, seed) for seed, rate in rates] for rates in (((0, 0.5), (1, 0.6)), ((1, 0.7), (2, 0.9)))
+    )
+    assert difference(one, two) == "+10"  # the one seed that both have
+    assert difference(one, [run_of(0.6, 0), run_of(0.6, 1)]) == "+5 [-59, 69]"
+
+
+def test_converging_runs_show_mean_worst_seed_and_cost() -> None:
+    rows = [
+        run_of(rate, seed, table="converges", task="square_1mm", iterations=150, extra={"largest_fall": fall})
+        for seed, rate, fall in ((0, 0.96, 0.02), (1, 0.94, 0.075))
+    ]
+    expected = "| square_1mm | vision only | after DPPO | 95 [82, 108] (96, 94) | 94 | 150 | 123 456 | 8 |"
+    assert expected in table("converges", rows)
+    assert "| 150 | - | 8 |" in table("converges", [replace(row, env_steps=None) for row in rows])
+
+
+def test_a_fall_counts_in_the_last_half_alone() -> None:
+    success = [0.0, 0.5, 0.1, 0.7, 0.55, 0.8]
+    rows = [{"iteration": float(index), "success": value} for index, value in enumerate(success)]
+    assert largest_fall(rows) == 0.15
+    assert largest_fall(rows[:3]) == 0.4
+
+
+@pytest.fixture
+def collect(scripts, tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    """Run the script on a results file of the test's own -> exit status, rows."""
+    path = tmp_path / "results" / "rows.json"
+
+    def run(*arguments: str) -> tuple[int, list[Row]]:
+        monkeypatch.setattr(sys, "argv", ["collect_results.py", *arguments, f"--results={path}"])
+        return scripts[0].main(), read_rows(path) if path.is_file() else []
+
+    return run
+
+
+@pytest.mark.usefixtures("fake_commands")
+def test_a_demo_becomes_rows(collect, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    folder = tmp_path / "tight" / "visuo_tactile_3"
+    flags = ["--quick", "--videos=0", "--ablation_episodes=8", "--seed=3", f"--output_dir={folder}"]
+    demo.run_demo(demo.parse_config(flags))
+    status, rows = collect("demo", str(folder))
+    assert (status, len(rows)) == (0, 6)
+    before, after = (next(row for row in rows if row.variant == name) for name in ("imitation", ""))
+    assert (before.task, before.policy, before.seed) == ("tight", "visuo_tactile", 3)
+    assert (before.success, before.episodes, before.iterations, before.env_steps) == (0.25, 8, 0, 0)
+    assert (after.success, after.iterations) == (0.75, 2)
+    assert after.extra == {
+        "in_hand_shift_m": 0.001,
+        "rim_slide_m": 0.01,
+        "peak_force_n": 8.0,
+        "time_to_success_s": 2.0,
+    }
+    assert after.commit == provenance.commit()
+    assert after.machine.endswith("cores")
+    text = table("demo", rows)
+    assert "| seed 3 | imitation | after DPPO |" in text
+    assert "| success with vision replaced by its mean (8 episodes) | 25 % [7, 59] | 75 % [41, 93] |" in text
+
+    curve = tmp_path / "results" / after.curve
+    assert before.curve is None
+    with curve.open() as file:
+        assert [float(row["success"]) for row in csv.DictReader(file)] == pytest.approx(np.arange(5) / 10)
+
+    assert collect("demo", str(folder)) == (0, rows)  # the same again
+    assert (
+        collect("demo", str(folder), "--variant=10 demonstrations")[1][6].variant
+        == "10 demonstrations, imitation"
+    )
+    status, replaced = collect("demo", str(folder), "--task=other", "--replace")
+    assert {row.task for row in replaced} == {"other"}
+    assert not curve.exists()
+    assert "6 rows in" in capsys.readouterr().out
+
+
+def test_printed_tables_become_rows(collect, tmp_path: Path) -> None:
+    printed = tmp_path / "worlds.md"
+    printed.write_text(
+        "measuring ...\n| worlds | rate | |\n|---|---|---|\n| 1 | 63 | |\n| 64 | 3 160 | .3 |\n"
+    )
+    status, rows = collect("worlds", str(printed), "--commit=0123abc", "--machine=1 x NVIDIA H200")
+    assert status == 0
+    assert [row.cells for row in rows] == [
+        {"worlds": "1", "rate": "63", "": ""},
+        {"worlds": "64", "rate": "3 160", "": ".3"},
+    ]
+    assert table("worlds", rows).splitlines()[:3] == ["| worlds | rate | |", "|---|---|---|", "| 1 | 63 | |"]
+
+
+def test_what_cannot_be_collected_is_one_line_and_changes_nothing(
+    collect, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    write_rows(tmp_path / "results" / "rows.json", [run_of(0.5)])
+    status, rows = collect("touch", str(tmp_path), "--replace")
+    assert (status, rows) == (2, [run_of(0.5)])
+    assert capsys.readouterr().err.startswith(f"error: {tmp_path} holds neither results.json")
+
+
+def test_commands_name_no_machine(monkeypatch: pytest.MonkeyPatch) -> None:
+    arguments = ["/" + "opt/bin/vtrefine-finetune", "--output_dir=/" + "home/me/a/run", "--env.type=vtrefine"]
+    monkeypatch.setattr(sys, "argv", [*arguments, "--policy.path=outputs/pretrain", "--env={pair: key}"])
+    line = provenance.command()
+    assert line == (
+        "vtrefine-finetune --output_dir=.../run --env.type=vtrefine --policy.path=outputs/pretrain"
+        " '--env={pair: key}'"
+    )
