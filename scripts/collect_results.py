@@ -1,7 +1,8 @@
 #!/usr/bin/env python
 """Turn what runs left into rows of results/*.json, from which ``make tables`` makes the README's tables.
 
-One command replaces a table; without --replace, only rows of the same task, policy and seed:
+One command replaces a table: --replace drops the earlier rows, of all seeds, of the tasks, policies and
+variants that come; without it only rows of the same seed give way:
 
     python scripts/collect_results.py demo outputs/demo --task=demo --replace
     python scripts/collect_results.py touch outputs/compare_touch/*/*/ --replace
@@ -39,7 +40,9 @@ def main() -> None:
     parser.add_argument("table", choices=[*Run.TABLES, *Line.TABLES])
     parser.add_argument("sources", type=Path, nargs="+")
     parser.add_argument("--results", type=Path, help="file (default results/TABLE.json)")
-    parser.add_argument("--replace", action="store_true", help="drop the table's earlier rows")
+    parser.add_argument(
+        "--replace", action="store_true", help="drop earlier rows of these tasks, policies and variants"
+    )
     parser.add_argument("--task", help="default: the name of the folder that holds the run's")
     parser.add_argument("--policy", help="visuo_tactile, visual, ...; default: what the run recorded")
     parser.add_argument("--variant", help="what else sets the runs apart, for example '10 demonstrations'")

@@ -228,9 +228,14 @@ def test_a_demo_becomes_rows(collect, tmp_path: Path, capsys: pytest.CaptureFixt
         collect("demo", str(folder), "--variant=10 demonstrations")[1][6].variant
         == "10 demonstrations, imitation"
     )
-    status, replaced = collect("demo", str(folder), "--task=other", "--replace")
-    assert {row.task for row in replaced} == {"other"}
-    assert not curve.exists()
+
+    others = [replace(row, seed=8, curve=None) for row in rows]
+    write_rows(tmp_path / "results" / "rows.json", [*others, *(replace(row, task="else") for row in others)])
+    curve.with_name("demo-of_nothing.csv").touch()
+    assert len(collect("demo", str(folder))[1]) == 18
+    replaced = collect("demo", str(folder), "--replace")[1]
+    assert {(row.task, row.seed) for row in replaced} == {("tight", 3), ("else", 8)}
+    assert [path.name for path in curve.parent.iterdir()] == [curve.name]
     assert "6 rows in" in capsys.readouterr().out
 
 

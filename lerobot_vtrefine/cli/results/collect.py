@@ -153,7 +153,7 @@ def printed_lines(path: Path, name: str, origin: dict[str, str | None]) -> list[
 
 
 def save(path: Path, name: str, found: list[tuple[Row, Progress]], *, replace: bool) -> None:
-    """Put rows and curves into a results file; ``replace`` drops the table's earlier rows first."""
+    """Put rows and curves into a results file; ``replace`` drops their groups' earlier rows, of all seeds."""
     old = read_rows(path) if path.is_file() else []
     rows = []
     for row, progress in found:
@@ -164,7 +164,8 @@ def save(path: Path, name: str, found: list[tuple[Row, Progress]], *, replace: b
             row = replace_fields(row, curve=f"curves/{name}-{label}.csv")
             write_curve(path.parent / str(row.curve), progress)
         rows.append(row)
-    rows = merge([row for row in old if not (replace and row.table == name)], rows)
+    groups = {row.key[:-1] for row in rows} if replace else set()
+    rows = merge([row for row in old if row.key[:-1] not in groups], rows)
     write_rows(path, rows)
     kept = {path.parent / row.curve for row in rows if isinstance(row, Run) and row.curve}
     for curve in set((path.parent / "curves").glob(f"{name}-*.csv")) - kept:
