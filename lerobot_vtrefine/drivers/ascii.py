@@ -56,6 +56,11 @@ class AsciiFramer:
         return False
 
     @property
+    def doubtful(self) -> bool:
+        """Never: silence is not needed here."""
+        return False
+
+    @property
     def buffered(self) -> int:
         """Bytes held."""
         return self._lines.buffered + sum(map(len, self._rows or []))

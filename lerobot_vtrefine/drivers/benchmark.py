@@ -23,6 +23,8 @@ import numpy as np
 
 from lerobot_vtrefine.drivers.board import PadReader
 from lerobot_vtrefine.drivers.config import PadConfig
+from lerobot_vtrefine.drivers.frames import MARKER, STREAM_BAUD, FrameShape
+from lerobot_vtrefine.drivers.framing import BinaryFramer
 from lerobot_vtrefine.drivers.sources import check_pattern
 
 logger = logging.getLogger(__name__)
@@ -181,7 +183,7 @@ def run(seconds: float = SHORT_S) -> list[Row]:
         four = read_ours(ports, seconds, CONTROL_S)
     bad = sum(one.missing + one.corrupt for one in four)
     text = f"of one core, every frame of four boards, 30 looks/s; {bad} frames lost or corrupt"
-    return [*rows, ("pads: processor share, four boards", four[0].cpu_share, text)]
+    return [*rows, ("pads: processor share, four boards", four[0].cpu_share, text), parser_row()]
 
 
 def clean_rows(port: str, seconds: float, reference: bool) -> list[Row]:
@@ -210,6 +212,39 @@ def lossy_row(port: str, seconds: float, reference: bool, loss: str) -> Row:
         theirs = read_reference(port, seconds, "read_latest")
         text += f"; flexitac.read_latest: {theirs.frames} frames, {theirs.corrupt} corrupt"
     return f"pads: corrupt frames, {loss} of bytes lost", float(ours.corrupt), text
+
+
+def hard_streams(shape: FrameShape, frames: int, seed: int = 0) -> dict[str, bytes]:
+    """Streams without a pause, from the middle of a frame on, that may keep a parser busy."""
+    rng = np.random.default_rng(seed)
+    size = (frames, shape.taxels)
+    marker = np.frombuffer(MARKER, np.uint8)
+    idle = rng.integers(10, 40, size, dtype=np.uint8)
+    half = idle.copy()
+    half[:, shape.taxels // 2 - 1 : shape.taxels // 2 + 1] = marker
+    payloads = {
+        "idle": idle,
+        "random bytes": rng.integers(0, 256, size, dtype=np.uint8),
+        "many markers": rng.choice(np.array([*marker, 0, 1], np.uint8), size),
+        "markers only": np.resize(marker, size),
+        "frames at another alignment": half,
+    }
+    header = np.broadcast_to(marker, (frames, 2))
+    streams = {name: np.hstack([header, body]).tobytes()[99:] for name, body in payloads.items()}
+    return {**streams, "no frames": rng.integers(0, 256, size, dtype=np.uint8).tobytes()}
+
+
+def parser_row() -> Row:
+    """Processor time of the parser per second of the worst stream, in packets as USB brings them."""
+    shape, packet, bytes_per_s = FrameShape(12, 32), 62, STREAM_BAUD / 10
+    shares: dict[str, float] = {}
+    for name, data in hard_streams(shape, frames=200).items():
+        framer, started = BinaryFramer(shape), time.process_time()
+        for at in range(0, len(data), packet):
+            framer.feed(data[at : at + packet])
+        shares[name] = (time.process_time() - started) / (len(data) / bytes_per_s)
+    text = ", ".join(f"{name} {share:.2f}" for name, share in shares.items())
+    return "pads: processor share of the parser, worst stream at 2 Mbaud", max(shares.values()), text
 
 
 def main(seconds: float) -> None:

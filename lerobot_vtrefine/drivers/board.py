@@ -212,6 +212,9 @@ class PadReader(SerialReader):
                 data = device.read(pending)
             silent_since = None
             self._take(data, after_silence, then_quiet=not device.in_waiting)
+            if self._framer.doubtful:
+                time.sleep(SILENCE_S)
+                self._take(b"", after_silence=not device.in_waiting, then_quiet=False)
 
     def _whole(self, data: bytes) -> bool:
         """Whether a burst may be complete, so that there is nothing to wait for."""
@@ -220,8 +223,9 @@ class PadReader(SerialReader):
     def _take(self, data: bytes, after_silence: bool, then_quiet: bool) -> None:
         now = time.monotonic()
         with self._changed:
-            self._last_bytes_s = now
-            self._keep_sample(data)
+            if data:
+                self._last_bytes_s = now
+                self._keep_sample(data)
             framed = self._framer.feed(data, after_silence=after_silence, then_quiet=then_quiet)
             self._marks.append((self._framer.stats.bytes_in, now))
             if framed:

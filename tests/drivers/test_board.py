@@ -66,6 +66,22 @@ def test_motionless_marker_inside_payloads_opened_mid_stream(tmp_path: Path) -> 
     assert (frames[:, :32] < 16).all()
 
 
+@pytest.mark.parametrize("spacing", [2, 193], ids=["markers only", "look-alike"])
+def test_payloads_that_look_like_other_frames_come_out_in_time(tmp_path: Path, spacing: int) -> None:
+    """Nothing but markers, and a motionless one where half a period is over; opened mid-stream."""
+    source = with_markers(pattern_source(PAD, time.monotonic_ns), tuple(range(spacing - 2, 384, spacing)))
+    with emulated(tmp_path, source=source) as board, reading(PadConfig(board.port)) as reader:
+        before, sent = reader.health().frames, board.sent
+        wait_until(lambda: board.sent >= sent + 150)
+        came, sent = reader.health().frames - before, board.sent - sent
+        frames = np.stack([frame.raw.reshape(-1) for frame in reader.frames_after(-1)])
+    assert came >= 0.8 * sent
+    assert board.overruns == 0
+    assert (frames[:, spacing - 2] == 0xAA).all()
+    if spacing > 2:
+        assert (frames[:, :32] < 16).all()
+
+
 def test_stall_is_reported_and_survived(tmp_path: Path) -> None:
     with emulated(tmp_path) as board, reading(PadConfig(board.port)) as reader:
         assert reader.health().status is Status.STREAMING

@@ -4,6 +4,9 @@ import numpy as np
 import pytest
 
 from lerobot_vtrefine.drivers import benchmark
+from lerobot_vtrefine.drivers.frames import MARKER, FrameShape
+
+PAD = FrameShape(12, 32)
 
 
 def test_every_frame_of_four_boards_in_another_process() -> None:
@@ -13,6 +16,16 @@ def test_every_frame_of_four_boards_in_another_process() -> None:
     for tally in tallies:
         assert tally.frames > 20
         assert (tally.missing, tally.corrupt) == (0, 0)
+
+
+def test_parser_is_measured_on_the_streams_that_may_keep_it_busy() -> None:
+    name, share, text = benchmark.parser_row()
+    assert "2 Mbaud" in name
+    assert share > 0
+    streams = benchmark.hard_streams(PAD, frames=3)
+    assert all(f"{stream} " in text for stream in streams)
+    assert {len(data) for data in streams.values()} == {3 * PAD.period - 99, 3 * PAD.taxels}
+    assert streams["markers only"].count(MARKER) == (3 * PAD.period - 99) // 2
 
 
 @pytest.mark.slow

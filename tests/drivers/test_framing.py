@@ -56,10 +56,10 @@ def test_nothing_comes_out_before_three_markers_in_place() -> None:
     framer = BinaryFramer(PAD)
     assert framer.feed(encode(sent[:2])) == []
     assert not framer.locked
-    assert [f.payload for f in framer.feed(MARKER)] == sent[:1]
+    assert [f.payload for f in framer.feed(MARKER)] == sent[:2]
     assert framer.locked
     assert framer.feed(sent[2] + MARKER[:1]) == []
-    assert [f.payload for f in framer.feed(MARKER[1:])] == sent[1:2]
+    assert [f.payload for f in framer.feed(MARKER[1:])] == sent[2:3]
 
 
 def test_after_a_calm_stretch_the_next_marker_is_enough() -> None:
@@ -95,6 +95,52 @@ def test_silence_settles_a_motionless_marker() -> None:
     received = feed_in_bursts(BinaryFramer(PAD), [bursts[0][100:], *bursts[1:]])
     assert not_sent(received, sent) == 0
     assert len(received) >= 26
+
+
+def test_a_damaged_frame_made_up_to_length_alone_in_its_burst_is_withheld() -> None:
+    """Ten bytes of it are missing, and the first ten of the next frame came before the line was looked at."""
+    sent = random_payloads(PAD, 12, REST, seed=18)
+    frames = [encode([payload]) for payload in sent]
+    for lost in (1, 2, 10, 380):
+        framer = BinaryFramer(PAD)
+        received = feed_in_bursts(framer, frames[:6])
+        received += feed_in_bursts(framer, [frames[6][: PAD.period - lost] + frames[7][:lost]])
+        received += [f.payload for f in framer.feed(frames[7][lost:])] + feed_in_bursts(framer, frames[8:])
+        assert received == sent[:6] + sent[7:], lost
+
+
+def test_silence_frames_payloads_that_are_markers_only() -> None:
+    """Every second place holds a marker: silence on both sides is believed, after three before a marker."""
+    sent = [bytes([number]) + (MARKER * 192)[1:] for number in range(40)]
+    framer = BinaryFramer(PAD)
+    received = feed_in_bursts(framer, [encode(sent[:1])[100:], *(encode([p]) for p in sent[1:])])
+    received += [f.payload for f in framer.feed(b"", after_silence=True)]
+    assert received == sent[-len(received) :]
+    assert len(received) >= 40 - LOCK_MARKERS - 2
+
+
+@pytest.mark.parametrize("lost", [1, 2, 14, 62, 124, 385])
+def test_motionless_markers_are_found_again_after_a_gap(lost: int) -> None:
+    """Their places relative to the firmware's marker, known from before, tell which chain is its own."""
+    clean = random_payloads(PAD, 8, REST, seed=lost)
+    marked = [p[:77] + MARKER + p[79:200] + MARKER + p[202:] for p in random_payloads(PAD, 40, REST, seed=10)]
+    for at in (25 * PAD.period + 2, 25 * PAD.period + 40, 25 * PAD.period + 100):
+        sent = clean + marked
+        stream = encode(sent)
+        received = feed_in_chunks(BinaryFramer(PAD), stream[:at] + stream[at + lost :], seed=lost)
+        assert not_sent(received, sent) == 0
+        assert len(received) >= len(sent) - 6
+
+
+def test_an_altered_marker_does_not_leave_the_field_to_a_payload_pattern() -> None:
+    """The payload's chain goes on unbroken while the firmware's lacks one marker."""
+    sent = random_payloads(PAD, 8, REST, seed=1)
+    sent += [p[:77] + MARKER + p[79:] for p in random_payloads(PAD, 60, REST, seed=10)]
+    stream = bytearray(encode(sent))
+    stream[30 * PAD.period] ^= 1
+    received = feed_in_chunks(BinaryFramer(PAD), bytes(stream), seed=1)
+    assert not_sent(received, sent) == 0
+    assert len(received) >= len(sent) - 5
 
 
 def test_marker_that_appears_while_locked_costs_no_frame() -> None:
