@@ -15,11 +15,11 @@ from lerobot.configs import FeatureType, PolicyFeature
 from torch import Tensor
 
 from lerobot_vtrefine.datasets.features import ACTION_KEY, CLOUD_KEY, NUM_JOINTS, STATE_KEY
+from lerobot_vtrefine.finetune.chains import chain_log_probs
 from lerobot_vtrefine.finetune.config import SmallDppo
 from lerobot_vtrefine.finetune.dppo import (
     Rollout,
     TrainState,
-    chain_log_probs,
     decision_advantages,
     policy_loss,
     update,
@@ -92,12 +92,13 @@ def _rollout(agent: Agent, cfg: SmallDppo) -> Rollout:
         CLOUD_KEY: torch.rand(DECISIONS, config.n_obs_steps, points, 5),
     }
     latents = 0.5 * torch.randn(DECISIONS, cfg.ft_denoising_steps + 1, *agent.action_shape)
-    log_probs, _, _ = chain_log_probs(agent, latents, agent.actor.encode(obs), cfg)
+    log_probs, means, _ = chain_log_probs(agent, latents, agent.actor.encode(obs), cfg)
     once = torch.ones(1, DECISIONS, dtype=torch.bool)
     return Rollout(
         obs=obs,
         latents=latents,
         log_probs=log_probs,
+        means=means,
         step=torch.zeros(DECISIONS, dtype=torch.long),
         env=torch.arange(DECISIONS),
         privileged=torch.randn(2, DECISIONS, PRIVILEGED),

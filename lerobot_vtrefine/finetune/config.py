@@ -1,6 +1,7 @@
 """DPPO settings: ``paper`` holds the defaults, the other presets state only what differs.
 
-Choose with ``--dppo.type=paper|seed_literal|small``, then change single fields, e.g. ``--dppo.epochs=5``.
+Choose with ``--dppo.type=paper|seed_literal|trust_region|small``, then change single fields, e.g.
+``--dppo.epochs=5``.
 """
 
 import math
@@ -39,6 +40,8 @@ class DppoConfig(draccus.ChoiceRegistry):
     # Floors of the standard deviation when sampling, and in the log-probability [normalised action units].
     min_sampling_std: float = 0.01
     min_log_prob_std: float = 0.1
+    # Correlation of the exploration noise between neighbouring actions of a chunk; 0 is white noise.
+    noise_correlation: float = 0.0
 
     # Discount and GAE parameter, per decision.
     gamma: float = 0.999
@@ -58,6 +61,11 @@ class DppoConfig(draccus.ChoiceRegistry):
     clip_rate: float = 3.0
     # Stop the iteration's update when a minibatch's approximate KL divergence exceeds this.
     target_kl: float = 1.0
+    # Trust region: the actor's learning rate is adapted so that an iteration moves the policy by this KL
+    # divergence per decision [nats], summed over executed actions and tuned steps. It falls geometrically to
+    # the final value. 0: the learning rate follows its own schedule.
+    kl_per_decision: float = 0.0
+    kl_per_decision_final: float = 0.0
     # Penalty on the KL divergence to the frozen base network, per action element and tuned step.
     kl_coef: float = 0.0
     # Weight of the log-likelihood of chains sampled from the base network (behaviour cloning).
@@ -68,6 +76,8 @@ class DppoConfig(draccus.ChoiceRegistry):
     epochs: int = 10
     # Minibatches hold whole decisions: all their tuned steps together. The paper's rows / K'.
     minibatch_decisions: int = 1024
+    # Minibatches per epoch; 0: as many as minibatch_decisions makes.
+    minibatches: int = 0
     # Decisions per backward pass; gradients accumulate over a minibatch. 0: the whole minibatch at once.
     micro_batch_decisions: int = 0
     # Iterations at the start in which only the critic learns.
@@ -114,6 +124,15 @@ class DppoConfig(draccus.ChoiceRegistry):
                 f"--dppo.min_log_prob_std must be at least {MIN_LOG_PROB_STD}, got {self.min_log_prob_std}: "
                 "below it the clamp of log-probabilities removes the gradient"
             )
+        if not 0.0 <= self.noise_correlation < 1.0:
+            raise ValueError(f"--dppo.noise_correlation must lie in [0, 1), got {self.noise_correlation}")
+        if self.kl_per_decision < 0 or (self.kl_per_decision > 0) != (self.kl_per_decision_final > 0):
+            raise ValueError(
+                "--dppo.kl_per_decision and --dppo.kl_per_decision_final must both be positive, or both 0, "
+                f"got {self.kl_per_decision} and {self.kl_per_decision_final}"
+            )
+        if self.minibatches < 0:
+            raise ValueError(f"--dppo.minibatches must not be negative, got {self.minibatches}")
         if self.rollback_sigmas < 0:
             raise ValueError(f"--dppo.rollback_sigmas must not be negative, got {self.rollback_sigmas}")
         for name, choices in (("timeout", TIMEOUTS), ("encoder", ENCODERS)):
@@ -172,6 +191,34 @@ class SeedLiteralDppo(DppoConfig):
 
     clip: float = 2e-4
     clip_first: float = 2e-4
+
+
+@DppoConfig.register_subclass("trust_region")
+@dataclass(frozen=True)
+class TrustRegionDppo(DppoConfig):
+    """Many environments on a GPU, stable without supervision: a trust region in nats per decision.
+
+    Measured on the round and square pairs with 1024 worlds (docs/learning.md): 12 nats that fall to 3 learn
+    fast and without a fall; 40 collapse on the tighter task; 4 and less are as stable and slower. Exploration
+    is small and smooth in time, so that success while training is near the success of the deployed policy.
+    """
+
+    iterations: int = 100
+    min_sampling_std: float = 0.03
+    min_log_prob_std: float = 0.06
+    noise_correlation: float = 0.8
+    reward_scaling: bool = False
+    clip: float = 0.02
+    clip_first: float = 0.02
+    kl_per_decision: float = 12.0
+    kl_per_decision_final: float = 3.0
+    epochs: int = 5
+    minibatches: int = 4
+    micro_batch_decisions: int = 4096
+    critic_warmup: int = 1
+    actor_lr: float = 1e-4
+    max_grad_norm: float = 1.0
+    critic_width: int = 256
 
 
 @DppoConfig.register_subclass("small")

@@ -24,6 +24,7 @@ from functools import partial
 import torch
 from torch import Tensor
 
+from lerobot_vtrefine.finetune.chains import Regulariser, chain_log_probs, decision_kl
 from lerobot_vtrefine.finetune.config import DppoConfig
 from lerobot_vtrefine.finetune.critic import Critic, explained_variance
 from lerobot_vtrefine.finetune.distributed import (
@@ -36,7 +37,6 @@ from lerobot_vtrefine.finetune.distributed import (
 )
 from lerobot_vtrefine.finetune.gae import RewardScaler, generalised_advantages
 from lerobot_vtrefine.finetune.protocols import (
-    Actor,
     Agent,
     DecisionEnv,
     Observation,
@@ -49,7 +49,8 @@ from lerobot_vtrefine.finetune.protocols import (
 )
 from lerobot_vtrefine.finetune.rollback import Rollback
 from lerobot_vtrefine.finetune.seeds import TRAINING_SEEDS
-from lerobot_vtrefine.policies.vt_dp3.diffusion import denoise_prefix, sample_chain, slice_log_prob
+from lerobot_vtrefine.finetune.trust_region import TrustRegion
+from lerobot_vtrefine.policies.vt_dp3.diffusion import denoise_prefix, sample_chain
 
 Metrics = dict[str, float]
 
@@ -64,6 +65,7 @@ class TrainState:
     reward_scaler: RewardScaler
     generator: torch.Generator
     rollback: Rollback
+    trust_region: TrustRegion
     iteration: int = 0
     env_steps: int = 0
 
@@ -82,6 +84,7 @@ class TrainState:
             RewardScaler(),
             torch.Generator(device).manual_seed(seed + 7919 * rank_index()),
             Rollback(cfg.rollback_sigmas),
+            TrustRegion(cfg),
         )
 
 
@@ -92,6 +95,7 @@ class Rollout:
     obs: Observation  # (N, ...) policy input, or {"cond": (N, C)} with a frozen encoder
     latents: Tensor  # (N, K'+1, H, D)
     log_probs: Tensor  # (N, K') under the sampling policy
+    means: Tensor  # (N, K', H, D) of the sampling policy's steps
     step: Tensor  # (N,) decision index
     env: Tensor  # (N,) environment index
     privileged: Tensor  # (S+1, E, P)
@@ -129,6 +133,7 @@ def collect(
             eta=cfg.eta,
             min_sampling_std=cfg.min_sampling_std,
             min_log_prob_std=cfg.min_log_prob_std,
+            correlation=cfg.noise_correlation,
             generator=generator,
         )
         transition = execute(env, chain.latents[:, -1, agent.executed], ids)
@@ -149,6 +154,7 @@ def collect(
         obs=concatenate(kept),
         latents=torch.cat([chain.latents for chain in chains]),
         log_probs=torch.cat([chain.log_probs for chain in chains]),
+        means=torch.cat([chain.means for chain in chains]),
         step=step_index,
         env=env_index,
         privileged=torch.stack(states),
@@ -183,69 +189,6 @@ def decision_advantages(rollout: Rollout, state: TrainState, cfg: DppoConfig) ->
     return (advantages - mean) / (std + 1e-8), targets
 
 
-@dataclass
-class Regulariser:
-    """What the frozen base network would do in the visited decisions, for the optional KL and BC terms."""
-
-    means: Tensor | None = None  # (N, K', H, D) base means at the stored latents
-    latents: Tensor | None = None  # (N, K'+1, H, D) chains sampled from the base
-
-    @classmethod
-    @torch.no_grad()
-    def of(cls, rollout: Rollout, agent: Agent, cfg: DppoConfig, generator: torch.Generator) -> "Regulariser":
-        """Computed once per iteration, and only what a non-zero coefficient needs."""
-        if not (cfg.kl_coef or cfg.bc_coef):
-            return cls()
-        means, chains = [], []
-        for ids in torch.arange(len(rollout.latents)).split(cfg.minibatch_decisions):
-            obs = select(rollout.obs, ids)
-            cond = obs["cond"] if agent.frozen_encoder else agent.base.encode(obs)
-            if cfg.kl_coef:
-                means.append(_reverse_steps(agent, agent.base, rollout.latents[ids], cond, cfg.eta)[0])
-            if cfg.bc_coef:
-                noise = torch.randn((len(ids), *agent.action_shape), generator=generator, device=cond.device)
-                base = predictor(agent.base, cond)
-                latent = denoise_prefix(agent.process, base, noise, agent.num_tuned)
-                chains.append(
-                    sample_chain(
-                        agent.process,
-                        base,
-                        latent,
-                        num_tuned=agent.num_tuned,
-                        executed=agent.executed,
-                        eta=cfg.eta,
-                        min_sampling_std=cfg.min_sampling_std,
-                        min_log_prob_std=cfg.min_log_prob_std,
-                        generator=generator,
-                    ).latents
-                )
-        return cls(torch.cat(means) if means else None, torch.cat(chains) if chains else None)
-
-
-def _reverse_steps(
-    agent: Agent, network: Actor, latents: Tensor, cond: Tensor, eta: float
-) -> tuple[Tensor, Tensor]:
-    """Means (B, K', H, D) and stds (B, K', 1, 1) of all tuned steps of B decisions, in one network call."""
-    batch, steps = latents.shape[0], agent.num_tuned
-    positions = torch.arange(
-        agent.process.num_steps - steps, agent.process.num_steps, device=latents.device
-    ).repeat(batch)
-    rows = latents[:, :-1].flatten(0, 1)
-    eps = network.denoiser(rows, agent.process.times(positions), cond.repeat_interleave(steps, dim=0))
-    mean, std = agent.process.posterior(rows, eps, positions, eta)
-    return mean.unflatten(0, (batch, steps)), std.unflatten(0, (batch, steps))
-
-
-def chain_log_probs(
-    agent: Agent, latents: Tensor, cond: Tensor, cfg: DppoConfig
-) -> tuple[Tensor, Tensor, Tensor]:
-    """Log-probabilities (B, K') of stored chains under the current actor, with means and floored stds."""
-    mean, std = _reverse_steps(agent, agent.actor, latents, cond, cfg.eta)
-    std = std.clamp(min=cfg.min_log_prob_std)
-    rows = slice_log_prob(latents[:, 1:].flatten(0, 1), mean.flatten(0, 1), std.flatten(0, 1), agent.executed)
-    return rows.view(latents.shape[0], agent.num_tuned), mean, std
-
-
 def policy_loss(log_ratio: Tensor, advantages: Tensor, cfg: DppoConfig) -> Tensor:
     """PPO's clipped loss per row. log_ratio (B, K'), advantages (B,) -> (B, K')."""
     steps = range(cfg.ft_denoising_steps)
@@ -266,15 +209,19 @@ def update(
     advantages, targets = decision_advantages(rollout, state, cfg)
     privileged = rollout.privileged[rollout.step, rollout.env]
     train_actor = state.iteration >= cfg.critic_warmup and not critic_only
-    actor_lr = cfg.actor_lr_at(state.iteration) * state.rollback.lr_scale
-    regulariser = Regulariser.of(rollout, agent, cfg, state.generator) if train_actor else Regulariser()
+    region = state.trust_region
+    actor_lr = region.actor_lr(state.iteration) * state.rollback.lr_scale
+    regulariser = Regulariser()
+    if train_actor:
+        regulariser = Regulariser.of(rollout.obs, rollout.latents, agent, cfg, state.generator)
     state.actor_optimizer.param_groups[0]["lr"] = actor_lr
     state.critic_optimizer.param_groups[0]["lr"] = cfg.critic_lr_at(state.iteration)
     actor_parameters, critic_parameters = agent.trained_parameters(), list(state.critic.parameters())
     clip = advantages.new_tensor([cfg.clip_range(step) for step in range(cfg.ft_denoising_steps)])
     num_valid = len(advantages)
     # Ranks own different numbers of decisions: the same number of minibatches everywhere, of unequal sizes.
-    num_minibatches = math.ceil(max_over_ranks(num_valid, advantages.device) / cfg.minibatch_decisions)
+    most = max_over_ranks(num_valid, advantages.device)
+    num_minibatches = cfg.minibatches or math.ceil(most / cfg.minibatch_decisions)
     history: list[list[float]] = []
     initial_log_ratio, stopped = 0.0, False
 
@@ -284,7 +231,7 @@ def update(
             # Sums over ranks, divided by the number of decisions in the minibatches of all ranks.
             size = float(sum_over_ranks(torch.tensor(float(len(minibatch)), device=advantages.device)))
             rows = size * cfg.ft_denoising_steps
-            sums = torch.zeros(5, dtype=torch.float64, device=advantages.device)
+            sums = torch.zeros(6, dtype=torch.float64, device=advantages.device)
             state.actor_optimizer.zero_grad(set_to_none=True)
             state.critic_optimizer.zero_grad(set_to_none=True)
             for ids in minibatch.split(cfg.micro_batch_decisions or max(len(minibatch), 1)):
@@ -311,14 +258,18 @@ def update(
                     sums[2] += (exact.expm1() - exact).sum() / rows  # Schulman's k3 estimator
                     sums[3] += (log_ratio.expm1().abs() > clip).double().sum() / rows
                     sums[4] += log_ratio.abs().sum() / rows
-            value_loss, loss_value, approx_kl, clip_fraction, log_ratio_size = sum_over_ranks(sums).tolist()
+                    moved = decision_kl(rollout.means[ids], mean, std, agent.executed, cfg.noise_correlation)
+                    sums[5] += moved.sum() / size
+            value_loss, loss_value, approx_kl, clip_fraction, log_ratio_size, kl = sum_over_ranks(
+                sums
+            ).tolist()
             if not math.isfinite(value_loss + loss_value):
                 raise FloatingPointError(
                     f"loss is not finite in iteration {state.iteration}: lower --dppo.actor_lr"
                 )
             if train_actor and not history:
                 initial_log_ratio = log_ratio_size  # zero up to rounding, or the stored chains are wrong
-            if train_actor and approx_kl > cfg.target_kl:
+            if train_actor and (approx_kl > cfg.target_kl or region.left(kl, state.iteration)):
                 stopped = True
                 break
             sum_gradients(critic_parameters)
@@ -329,12 +280,14 @@ def update(
                 sum_gradients(actor_parameters)
                 grad_norm = _clip_gradients(actor_parameters, cfg.max_grad_norm)
                 state.actor_optimizer.step()
-            history.append([value_loss, loss_value, approx_kl, clip_fraction, grad_norm])
+            history.append([value_loss, loss_value, approx_kl, clip_fraction, grad_norm, kl])
         if stopped:
             break
 
-    averages = torch.tensor(history or [[0.0] * 5], dtype=torch.float64).mean(0).tolist()
-    names = ("value_loss", "policy_loss", "approx_kl", "clip_fraction", "grad_norm")
+    if train_actor:
+        region.adapt([row[-1] for row in history[-num_minibatches:]], stopped, state.iteration)
+    averages = torch.tensor(history or [[0.0] * 6], dtype=torch.float64).mean(0).tolist()
+    names = ("value_loss", "policy_loss", "approx_kl", "clip_fraction", "grad_norm", "decision_kl")
     with torch.no_grad():
         explained = explained_variance(state.critic(privileged), targets)
     return dict(zip(names, averages, strict=True)) | {

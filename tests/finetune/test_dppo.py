@@ -6,10 +6,10 @@ import pytest
 import torch
 from toy import BlindPeg, ToyActor, make_agent
 
+from lerobot_vtrefine.finetune.chains import chain_log_probs
 from lerobot_vtrefine.finetune.config import DppoConfig, PaperDppo, SmallDppo
 from lerobot_vtrefine.finetune.dppo import (
     TrainState,
-    chain_log_probs,
     collect,
     decision_advantages,
     policy_loss,

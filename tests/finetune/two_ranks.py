@@ -22,6 +22,7 @@ def part_of(rollout: Rollout, envs: range) -> Rollout:
         obs={key: value[rows] for key, value in rollout.obs.items()},
         latents=rollout.latents[rows],
         log_probs=rollout.log_probs[rows],
+        means=rollout.means[rows],
         step=rollout.step[rows],
         env=rollout.env[rows] - envs.start,
         privileged=rollout.privileged[:, columns],

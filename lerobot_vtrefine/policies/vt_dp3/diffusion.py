@@ -124,14 +124,35 @@ class DiffusionProcess:
         return self.posterior(x, predict_noise(x, self.times(positions)), positions, eta)
 
 
-def slice_log_prob(latent: Tensor, mean: Tensor, std: Tensor, executed: slice) -> Tensor:
+def correlated_noise(white: Tensor, correlation: float) -> Tensor:
+    """Unit-variance noise (B, H, D) that is smooth in time: an AR(1) process over H driven by ``white``."""
+    if correlation == 0.0:
+        return white
+    noise, fresh = [white[:, 0]], math.sqrt(1 - correlation**2)
+    for step in range(1, white.shape[1]):
+        noise.append(correlation * noise[-1] + fresh * white[:, step])
+    return torch.stack(noise, dim=1)
+
+
+def whiten(noise: Tensor, correlation: float) -> Tensor:
+    """The white sequence (..., H, D) that ``correlated_noise`` was made from; of a prefix, its prefix."""
+    if correlation == 0.0:
+        return noise
+    steps = (noise[..., 1:, :] - correlation * noise[..., :-1, :]) / math.sqrt(1 - correlation**2)
+    return torch.cat([noise[..., :1, :], steps], dim=-2)
+
+
+def slice_log_prob(
+    latent: Tensor, mean: Tensor, std: Tensor, executed: slice, correlation: float = 0.0
+) -> Tensor:
     """Average log-probability (B,) per element of the executed part of a latent.
 
     latent, mean (B, H, D); std broadcastable to them; ``executed`` selects along H the actions that reach the
-    environment: the rest of the horizon has no effect on the return and must not enter the ratio.
+    environment: the rest of the horizon has no effect on the return and must not enter the ratio. It starts
+    at 0. The constant of the ``correlation``'s determinant is left out: it cancels in every ratio.
     """
-    latent, mean = latent[:, executed], mean[:, executed]
-    log_prob = -0.5 * ((latent - mean) / std) ** 2 - std.log() - 0.5 * math.log(2 * math.pi)
+    white = whiten((latent[:, executed] - mean[:, executed]) / std, correlation)
+    log_prob = -0.5 * white**2 - std.log() - 0.5 * math.log(2 * math.pi)
     return log_prob.clamp(*LOG_PROB_RANGE).mean(dim=(1, 2))
 
 
@@ -142,6 +163,8 @@ class Chain(NamedTuple):
     """(B, K'+1, H, D): latents[:, 0] enters the first tuned step, latents[:, -1] is the action chunk."""
     log_probs: Tensor
     """(B, K'): ``slice_log_prob`` of each transition under the sampling policy."""
+    means: Tensor
+    """(B, K', H, D) means of the transitions."""
 
 
 @torch.no_grad()
@@ -155,21 +178,24 @@ def sample_chain(
     eta: float,
     min_sampling_std: float,
     min_log_prob_std: float,
+    correlation: float = 0.0,
     generator: torch.Generator | None = None,
 ) -> Chain:
     """Sample the last ``num_tuned`` steps with exploration noise.
 
     latent (B, H, D) is what ``denoise_prefix`` returned. Each step draws
     mean + max(sigma, min_sampling_std) * clip(N(0, 1), ±3); its log-probability uses
-    max(sigma, min_log_prob_std).
+    max(sigma, min_log_prob_std). ``correlation`` of the noise from one action of the chunk to the next.
     """
-    latents, log_probs = [latent], []
+    latents, log_probs, means = [latent], [], []
     for position in range(process.num_steps - num_tuned, process.num_steps):
         mean, std = process.step(predict_noise, latent, position, eta)
-        latent = mean + std.clamp(min=min_sampling_std) * _clipped_noise(mean, generator)
-        log_probs.append(slice_log_prob(latent, mean, std.clamp(min=min_log_prob_std), executed))
+        noise = correlated_noise(_clipped_noise(mean, generator), correlation)
+        latent = mean + std.clamp(min=min_sampling_std) * noise
+        log_probs.append(slice_log_prob(latent, mean, std.clamp(min=min_log_prob_std), executed, correlation))
         latents.append(latent)
-    return Chain(torch.stack(latents, dim=1), torch.stack(log_probs, dim=1))
+        means.append(mean)
+    return Chain(torch.stack(latents, dim=1), torch.stack(log_probs, dim=1), torch.stack(means, dim=1))
 
 
 @torch.no_grad()

@@ -1,0 +1,58 @@
+"""How far one iteration may move the policy, in units of behaviour: KL divergence per decision [nats].
+
+PPO's clip range does not bind in DPPO's small presets, since log-probabilities are averaged over all action
+elements; what then decides is the learning rate, and the right one depends on batch, network and task. Here
+the rate follows from the divergence that the last iteration reached, and the target falls geometrically, so
+that learning starts fast and settles.
+"""
+
+from collections.abc import Sequence
+
+from lerobot_vtrefine.finetune.config import DppoConfig
+
+TOO_FAR = 2.0
+"""Times the target at which an iteration's update ends."""
+SLOWEST, FASTEST = 0.5, 1.5
+"""Bounds of the change of the learning rate from one iteration to the next."""
+
+
+class TrustRegion:
+    """The actor's learning rate: the configured schedule, or what reaches ``cfg.kl_per_decision``."""
+
+    def __init__(self, cfg: DppoConfig) -> None:
+        self.cfg = cfg
+        self.rate = cfg.actor_lr
+
+    def target(self, iteration: int) -> float:
+        """KL divergence per decision that this iteration aims at; 0 where the rate follows its schedule."""
+        cfg = self.cfg
+        progress = min(1.0, iteration / max(1, cfg.iterations - 1))
+        return cfg.kl_per_decision ** (1 - progress) * cfg.kl_per_decision_final**progress
+
+    def actor_lr(self, iteration: int) -> float:
+        """Learning rate of this iteration."""
+        return self.rate if self.cfg.kl_per_decision else self.cfg.actor_lr_at(iteration)
+
+    def left(self, kl: float, iteration: int) -> bool:
+        """Whether a minibatch finds the policy too far from where the iteration began."""
+        return self.cfg.kl_per_decision > 0 and kl > TOO_FAR * self.target(iteration)
+
+    def adapt(self, reached: Sequence[float], stopped: bool, iteration: int) -> None:
+        """Set the next iteration's rate from the divergences (m,) of this one's last epoch.
+
+        They grow with the square of the rate. ``stopped``: the iteration left the region and went no
+        further.
+        """
+        if not self.cfg.kl_per_decision or not (reached or stopped):
+            return
+        target = self.target(iteration)
+        furthest = (TOO_FAR + 1) * target if stopped else max(reached)
+        self.rate *= min(max((target / max(furthest, 1e-9)) ** 0.5, SLOWEST), FASTEST)
+
+    def state_dict(self) -> dict[str, float]:
+        """The present rate."""
+        return {"rate": self.rate}
+
+    def load_state_dict(self, state: dict[str, float]) -> None:
+        """Restore ``state_dict``."""
+        self.rate = state["rate"]
