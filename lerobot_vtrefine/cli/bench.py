@@ -20,6 +20,7 @@ PARTS = {
     "envs": "lerobot_vtrefine.envs.benchmark",
     "finetune": "lerobot_vtrefine.finetune.benchmark",
     "drivers": "lerobot_vtrefine.drivers.benchmark",
+    "busy": "lerobot_vtrefine.finetune.benchmark_busy",
 }
 
 SHORTENED: dict[str, dict[str, float]] = {"drivers": {"seconds": 2.0}}
@@ -41,7 +42,7 @@ class BenchConfig:
     """What to measure and where to write it."""
 
     parts: tuple[str, ...] = tuple(PARTS)
-    """Parts to measure, of tactile, envs, finetune, drivers."""
+    """Parts to measure, of tactile, envs, finetune, drivers, busy."""
     limit_s: float = 60.0
     """Seconds that a part may take; a slower one is left out. No limit with --full."""
     full: bool = False

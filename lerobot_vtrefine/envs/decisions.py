@@ -16,6 +16,7 @@ from lerobot_vtrefine.datasets.features import raw_to_env_observation
 from lerobot_vtrefine.envs.config import VtRefineEnvConfig
 from lerobot_vtrefine.envs.episodes import Array, Episodes
 from lerobot_vtrefine.envs.factory import make_episodes
+from lerobot_vtrefine.sim.task import FAILURES
 
 Batch = dict[str, Tensor]
 
@@ -34,7 +35,8 @@ class Decision(NamedTuple):
     truncated: Tensor
     """(n,) bool: the time was over."""
     info: dict[str, Tensor]
-    """(n,) each: ``success``, ``steps`` (of the episode) and the episode's metrics so far."""
+    """(n,) each: ``success``, ``steps`` (of the episode), its metrics so far, and ``failed_<reason>`` for
+    every reason of failure but time-out; ``unstable`` and ``overflow`` are the simulation's own."""
 
 
 class LeRobotDecisionEnv:
@@ -120,7 +122,9 @@ class LeRobotDecisionEnv:
 
     def _info(self) -> dict[str, Tensor]:
         metrics = self.episodes.sim.metrics(self.episodes.ids)
-        columns = {**metrics, "steps": self.episodes.steps, "success": self.episodes.success}
+        failure = metrics.pop("failure")
+        failed = {f"failed_{FAILURES[code]}": failure == code for code in range(1, len(FAILURES))}
+        columns = {**metrics, **failed, "steps": self.episodes.steps, "success": self.episodes.success}
         return {name: torch.from_numpy(np.array(values)) for name, values in columns.items()}
 
     def _push(self, ids: Array) -> None:

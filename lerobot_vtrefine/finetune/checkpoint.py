@@ -1,7 +1,8 @@
 """LeRobot checkpoints of a fine-tuning run, from which it continues exactly.
 
-``checkpoints/NNNNNN/pretrained_model`` is a policy that ``lerobot-eval`` loads, with its processors;
-``training_state`` holds the critic, both optimisers, the reward scale, and every rank's random states.
+``checkpoints/NNNNNN/pretrained_model`` is a policy that ``lerobot-eval`` loads, with its processors and the
+run's settings (``train_config.json``); ``training_state`` holds the critic, both optimisers, the reward
+scale, and every rank's random states.
 """
 
 import shutil
@@ -11,7 +12,7 @@ from typing import Any
 
 import torch
 import torch.distributed as dist
-from lerobot.common.train_utils import get_step_checkpoint_dir, update_last_checkpoint
+from lerobot.common.train_utils import get_step_checkpoint_dir
 from lerobot.utils.constants import (
     CHECKPOINTS_DIR,
     LAST_CHECKPOINT_LINK,
@@ -33,12 +34,28 @@ class Saveable:
     policy: Any
     preprocessor: Any
     postprocessor: Any
+    config: Any
+
+    def save(self, folder: Path) -> None:
+        """Write everything to ``pretrained_model``."""
+        for part in (self.policy, self.preprocessor, self.postprocessor, self.config):
+            part.save_pretrained(folder)
 
 
 def last_checkpoint(output_dir: Path) -> Path | None:
-    """The newest complete checkpoint of a run, if there is one."""
-    path = output_dir / CHECKPOINTS_DIR / LAST_CHECKPOINT_LINK
-    return path.resolve() if path.exists() else None
+    """The newest complete checkpoint of a run, if there is one; whether or not ``last`` points to it yet."""
+    steps = output_dir.resolve().glob(f"{CHECKPOINTS_DIR}/*/{TRAINING_STATE_DIR}/{STATE_NAME}")
+    complete = [path.parents[1] for path in steps if path.parents[1].name.isdigit()]
+    return max(complete, key=lambda path: int(path.name), default=None)
+
+
+def point_last_at(checkpoint: Path) -> None:
+    """Let ``last`` name this checkpoint; at no moment is there no ``last`` when there was one before."""
+    link = checkpoint.with_name(LAST_CHECKPOINT_LINK)
+    fresh = link.with_name(f"{LAST_CHECKPOINT_LINK}.partial")
+    fresh.unlink(missing_ok=True)
+    fresh.symlink_to(checkpoint.name)
+    fresh.replace(link)
 
 
 def save_checkpoint(output_dir: Path, saveable: Saveable, state: TrainState, total: int) -> None:
@@ -55,18 +72,17 @@ def save_checkpoint(output_dir: Path, saveable: Saveable, state: TrainState, tot
         final = get_step_checkpoint_dir(output_dir, total, state.iteration)
         partial = final.with_name(f"{final.name}.partial")
         shutil.rmtree(partial, ignore_errors=True)
-        for part in (saveable.policy, saveable.preprocessor, saveable.postprocessor):
-            part.save_pretrained(partial / PRETRAINED_MODEL_DIR)
+        saveable.save(partial / PRETRAINED_MODEL_DIR)
         (partial / TRAINING_STATE_DIR).mkdir()
         torch.save(_state_dict(state) | {"ranks": ranks}, partial / TRAINING_STATE_DIR / STATE_NAME)
         shutil.rmtree(final, ignore_errors=True)
         partial.rename(final)
-        update_last_checkpoint(final)
+        point_last_at(final)
     barrier()
 
 
 def load_training_state(checkpoint: Path, state: TrainState) -> None:
-    """Restore everything but the policy's weights.
+    """Restore everything but the policy's weights; the run's ``last`` names this checkpoint from now on.
 
     Raises:
         FileNotFoundError: the checkpoint has no DPPO training state.
@@ -85,6 +101,8 @@ def load_training_state(checkpoint: Path, state: TrainState) -> None:
     state.trust_region.load_state_dict(saved["trust_region"])
     state.rollback.load_state_dict(saved["rollback"], state.generator.device)
     state.iteration, state.env_steps = saved["iteration"], saved["env_steps"]
+    if rank_index() == 0:
+        point_last_at(checkpoint)
     own = saved["ranks"][rank_index()]
     state.generator.set_state(own["generator"])
     deserialize_rng_state(own["global"])

@@ -11,6 +11,8 @@ from lerobot_vtrefine.finetune.plots import draw_curves
 
 CSV_NAME = "progress.csv"
 CURVES_NAME = "curves.png"
+CLOCK = frozenset({"seconds", "rollout_s", "steps_per_s"})
+"""Columns that tell how fast the machine was, and nothing else."""
 
 
 def read_progress(output_dir: Path) -> list[dict[str, float]]:
@@ -25,12 +27,14 @@ def read_progress(output_dir: Path) -> list[dict[str, float]]:
 class ProgressLog:
     """One row of metrics per iteration.
 
-    Resuming at an iteration drops the rows of later ones, which will be run again.
+    Resuming after an iteration drops the rows of later ones, which will be run again; a run that starts anew
+    drops all. So a run that was interrupted has the rows of one that was not, but for those of `CLOCK`.
     """
 
     def __init__(self, output_dir: Path, iteration: int, wandb_run: Any | None) -> None:
         self.output_dir = output_dir
-        self.rows = [row for row in read_progress(output_dir) if row["iteration"] <= iteration]
+        earlier = read_progress(output_dir) if iteration else []
+        self.rows = [row for row in earlier if row["iteration"] <= iteration]
         self._wandb_run = wandb_run
 
     def add(self, iteration: int, metrics: dict[str, float]) -> None:
@@ -41,7 +45,7 @@ class ProgressLog:
         with partial.open("w", newline="") as file:
             writer = csv.DictWriter(file, columns)
             writer.writeheader()
-            writer.writerows(self.rows)
+            writer.writerows({**row, "iteration": int(row["iteration"])} for row in self.rows)
         partial.replace(self.output_dir / CSV_NAME)
         if self._wandb_run is not None:
             self._wandb_run.log(metrics, step=iteration)
@@ -74,7 +78,7 @@ def start_wandb(
         raise ImportError("--wandb.enable=true needs the package wandb: pip install wandb") from error
 
     id_file = output_dir / "wandb_run_id"
-    known = id_file.read_text().strip() if resume and id_file.is_file() else None
+    known = (id_file.read_text().strip() if resume and id_file.is_file() else "") or None
     try:
         run = wandb.init(
             id=cfg.run_id or known,

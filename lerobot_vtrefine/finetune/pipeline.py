@@ -1,6 +1,8 @@
 """``vtrefine-finetune``: connects DPPO to a ``vt_dp3`` checkpoint, an environment and an output folder."""
 
+import copy
 import logging
+from collections.abc import Sequence
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any
@@ -10,6 +12,7 @@ import numpy as np
 import torch
 from lerobot.configs import PreTrainedConfig, parser
 from lerobot.configs.default import EvalConfig, WandBConfig
+from lerobot.configs.train import TRAIN_CONFIG_NAME
 from lerobot.envs import EnvConfig
 from lerobot.policies import make_pre_post_processors
 from lerobot.utils.constants import PRETRAINED_MODEL_DIR
@@ -48,7 +51,11 @@ SHOWN = (
 
 @dataclass
 class FinetunePipelineConfig:
-    """Settings of ``vtrefine-finetune``; ``--policy.path`` names the checkpoint to start from."""
+    """Settings of ``vtrefine-finetune``; ``--policy.path`` names the checkpoint to start from.
+
+    Checkpoints hold them as ``train_config.json``, whose ``policy`` is the one trained and whose
+    ``policy.pretrained_path`` is the one that the run started from.
+    """
 
     env: EnvConfig
     policy: PreTrainedConfig | None = None
@@ -74,6 +81,26 @@ class FinetunePipelineConfig:
         """Lets LeRobot's parser take ``--policy.path``."""
         return ["policy"]
 
+    @classmethod
+    def from_pretrained(cls, path: str | Path, cli_args: Sequence[str] = ()) -> "FinetunePipelineConfig":
+        """Settings from a file, or of a checkpoint's folder ``pretrained_model``, with changes from flags.
+
+        Raises: OSError where there is none, draccus' errors for settings that cannot be.
+        """
+        path = Path(path)
+        return draccus.parse(cls, path / TRAIN_CONFIG_NAME if path.is_dir() else path, args=list(cli_args))
+
+    def save_pretrained(self, folder: Path) -> None:
+        """Write all settings into a checkpoint's folder ``pretrained_model``."""
+        write_config(self, folder / TRAIN_CONFIG_NAME)
+
+    @property
+    def start(self) -> Path | None:
+        """The policy that ``--policy.path`` names, or that the settings in ``--config_path`` started from."""
+        known = None if self.policy is None else self.policy.pretrained_path
+        named = parser.get_path_arg("policy") or known
+        return Path(named) if named else None
+
 
 def start_path(cfg: FinetunePipelineConfig) -> tuple[Path, Path | None]:
     """The policy to load and, when resuming, the checkpoint it belongs to.
@@ -86,10 +113,9 @@ def start_path(cfg: FinetunePipelineConfig) -> tuple[Path, Path | None]:
         if not cfg.resume:
             raise FileExistsError(f"{cfg.output_dir} holds a run: add --resume=true or change --output_dir")
         return checkpoint / PRETRAINED_MODEL_DIR, checkpoint
-    path = parser.get_path_arg("policy")
-    if path is None:
+    if cfg.start is None:
         raise ValueError("name the checkpoint to fine-tune with --policy.path=.../pretrained_model")
-    return Path(path), None
+    return cfg.start, None
 
 
 def load_policy(path: Path) -> VtDp3Policy:
@@ -206,9 +232,9 @@ class Recorder:
             metrics |= evaluate(self.env, self.agent, cfg.eval.n_episodes)
         self._record(iteration, metrics)
         if iteration == last or (cfg.save_freq and iteration % cfg.save_freq == 0):
-            save_checkpoint(cfg.output_dir, self.saveable, state, last)
             if self.log is not None:
                 self.log.draw()
+            save_checkpoint(cfg.output_dir, self.saveable, state, last)
         if self.bar is not None:
             self.bar.update()
             if iteration == last:
@@ -227,12 +253,23 @@ class Recorder:
         logging.info("iteration %d: %s", iteration, shown)
 
 
-def save_config(cfg: FinetunePipelineConfig) -> None:
-    """Write all settings to the output folder; ``--config_path`` reads them again."""
+def save_config(cfg: FinetunePipelineConfig, policy: VtDp3Config) -> None:
+    """Complete the settings by the policy's own and write them to the output folder; ``--config_path`` reads
+    them again.
+    """
+    start, cfg.policy = cfg.start, copy.deepcopy(policy)
+    cfg.policy.pretrained_path = start
     cfg.output_dir.mkdir(parents=True, exist_ok=True)
     if rank_index() == 0:
-        with draccus.config_type("json"), (cfg.output_dir / CONFIG_NAME).open("w") as file:
-            draccus.dump(cfg, file, indent=2)
+        write_config(cfg, cfg.output_dir / CONFIG_NAME)
+
+
+def write_config(cfg: FinetunePipelineConfig, path: Path) -> None:
+    """Write all settings as JSON, complete or not at all."""
+    partial = path.with_name(f"{path.name}.partial")
+    with draccus.config_type("json"), partial.open("w") as file:
+        draccus.dump(cfg, file, indent=2)
+    partial.replace(path)
 
 
 def run(cfg: FinetunePipelineConfig) -> None:
@@ -247,13 +284,13 @@ def run(cfg: FinetunePipelineConfig) -> None:
     device = torch.device(policy.config.device or "cpu")
     join_ranks(device)
     set_seed(cfg.seed + rank_index())
-    save_config(cfg)
     overrides = {"device_processor": {"device": str(device)}}
     processors = make_pre_post_processors(policy.config, str(path), preprocessor_overrides=overrides)
     agent = make_agent(policy, cfg.dppo)
+    save_config(cfg, policy.config)
     env = make_env_for(cfg, policy, processors)
     state = TrainState.create(agent, cfg.dppo, env.privileged_dim, cfg.seed)
-    recorder = Recorder(cfg, env, agent, Saveable(policy, *processors))
+    recorder = Recorder(cfg, env, agent, Saveable(policy, *processors, cfg))
     with logging_redirect_tqdm():
         if checkpoint is not None:
             load_training_state(checkpoint, state)

@@ -221,7 +221,9 @@ class ShearConfig:
 
 @dataclass(frozen=True)
 class WarpConfig:
-    """The warp backend: where it runs, and the fixed room that it sets aside. Too little is an error."""
+    """The warp backend: where it runs, and the fixed room that it sets aside; an episode that
+    finds too little of it ends as a failure.
+    """
 
     device: str = "auto"
     """auto (a CUDA GPU where there is one), cpu, cuda or cuda:i."""

@@ -3,7 +3,7 @@
 Shapes: N worlds, m of them addressed; hands are ordered left (socket), right (plug).
 """
 
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, fields, replace
 
 import numpy as np
 
@@ -128,7 +128,24 @@ class Measured:
     pad_load: Array
     """(m, 4, LOAD_SIZE)"""
     diverged: Array
-    """(m,)"""
+    """(m,) whether the state blew up: everything else then says nothing and may be no number."""
+    overflowed: Array
+    """(m,) whether contacts were lost for want of room."""
+
+    def checked(self) -> "Measured":
+        """The same, with zeros for the forces of worlds that blew up, and those whose forces are no numbers
+        among them: what an episode remembers stays finite.
+        """
+        forces = {item.name: getattr(self.substeps, item.name) for item in fields(self.substeps)}
+        finite = [np.isfinite(values).reshape(len(values), -1).all(1) for values in forces.values()]
+        finite.append(np.isfinite(self.pad_load).all((1, 2)))
+        bad = self.diverged | ~np.logical_and.reduce(finite)
+        quiet = {name: _without(values, bad) for name, values in forces.items()}
+        return replace(self, substeps=Substeps(**quiet), pad_load=_without(self.pad_load, bad), diverged=bad)
+
+
+def _without(values: Array, bad: Array) -> Array:
+    return np.where(bad.reshape(-1, *[1] * (values.ndim - 1)), 0.0, values)
 
 
 def update(state: EpisodeState, ids: Array, seen: Measured, config: TaskConfig) -> Array:
@@ -138,6 +155,7 @@ def update(state: EpisodeState, ids: Array, seen: Measured, config: TaskConfig) 
         (m,) reward: 1 in the step in which success is reached, else 0.
     """
     state.steps[ids] += 1
+    seen = seen.checked()
     _update_forces(state, ids, seen)
     state.rim_slide[ids] += seen.substeps.rim_slide
     state.tip[ids] = seen.substeps.tip
@@ -195,10 +213,11 @@ def _update_failure(
     lost |= (position[..., 2] > WORKSPACE_M[2]) | (seen.part_heights < -0.02)
     dropped = state.unheld_steps[ids] * dt_s >= config.drop_s
     causes = (
+        (task.UNSTABLE, seen.diverged),
+        (task.OVERFLOWED, seen.overflowed),
         (task.SHIFTED, (state.shift[ids] > config.in_hand_shift_m).any(1)),
         (task.FORCED, state.step_force[ids] > config.contact_force_n),
         (task.DROPPED, (dropped | lost).any(1)),
-        (task.UNSTABLE, seen.diverged),
     )
     failure = state.failure[ids]
     for code, happened in causes:

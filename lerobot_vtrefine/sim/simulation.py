@@ -273,8 +273,7 @@ class InsertionSim:
 
     def insertion(self, ids: Array | None = None) -> task.Insertion:
         """Where each plug is with respect to its socket."""
-        seen = self._present.see(self._checked(ids))
-        return self._insertion(seen)
+        return self._insertion(self._present.see(self._checked(ids)))
 
     def privileged(self, ids: Array | None = None) -> Array:
         """State for a critic, (m, P) float32, columns named by `privileged_names`."""
@@ -382,6 +381,7 @@ class InsertionSim:
                 substeps=summary(),
                 pad_load=load(),
                 diverged=self._backend.diverged(ids),
+                overflowed=self._backend.overflowed(ids),
             )
 
         return wait

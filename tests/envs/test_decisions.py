@@ -6,6 +6,7 @@ from fake_sim import HEIGHT, WIDTH, FakeSim
 from lerobot_vtrefine.datasets.features import DEPTH_KEY, STATE_KEY, TACTILE_KEYS
 from lerobot_vtrefine.envs.decisions import LeRobotDecisionEnv
 from lerobot_vtrefine.envs.episodes import Episodes
+from lerobot_vtrefine.sim.task import FAILURES
 
 
 def keep_raw(batch: dict) -> dict:
@@ -132,3 +133,18 @@ def test_decisions_see_the_same_cloud_as_lerobot_eval(monkeypatch, tiny_dataset)
     assert batch[CLOUD_KEY].shape[:2] == (2, 2)
     assert torch.equal(batch[CLOUD_KEY][:, 1], single[CLOUD_KEY])
     assert torch.equal(batch[STATE_KEY][:, 1], single[STATE_KEY])
+
+
+def test_why_episodes_failed_is_told_by_reason(monkeypatch):
+    env = make_env(3)
+    env.reset([1, 3, 5])
+    sim = env.episodes.sim
+    plain = sim.metrics(np.arange(3))
+    codes = np.array([FAILURES.index(name) for name in ("none", "overflow", "unstable")])
+    monkeypatch.setattr(sim, "metrics", lambda ids: {**plain, "failure": codes})
+    info = env.step_chunk(chunk(3, [0.0])).info
+    assert "failure" not in info
+    told = {
+        name: values.tolist() for name, values in info.items() if name.startswith("failed_") and any(values)
+    }
+    assert told == {"failed_overflow": [False, True, False], "failed_unstable": [False, False, True]}

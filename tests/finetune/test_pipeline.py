@@ -16,7 +16,7 @@ from lerobot_vtrefine.cli.results.collect import run_rows
 from lerobot_vtrefine.cli.results.provenance import commit, machine
 from lerobot_vtrefine.envs.decisions import make_decision_env
 from lerobot_vtrefine.finetune import pipeline
-from lerobot_vtrefine.finetune.logger import read_progress
+from lerobot_vtrefine.finetune.logger import CLOCK, read_progress
 from lerobot_vtrefine.finetune.seeds import EVALUATION_SEEDS
 from lerobot_vtrefine.policies.vt_dp3.modeling_vt_dp3 import VtDp3Policy
 
@@ -77,9 +77,8 @@ def test_resumed_run_equals_the_uninterrupted_one(finetune, tmp_path, encoder):
         for run in (whole, resumed)
     ]
     torch.testing.assert_close(*state, rtol=0, atol=0)
-    clock = {"seconds", "rollout_s", "steps_per_s"}
     rows = [
-        [{key: value for key, value in row.items() if key not in clock} for row in read_progress(run)]
+        [{key: value for key, value in row.items() if key not in CLOCK} for row in read_progress(run)]
         for run in (whole, resumed)
     ]
     assert rows[0] == rows[1]
@@ -175,6 +174,31 @@ def test_settings_are_saved_and_can_be_read_again(finetune, tmp_path):
     assert saved[0] == saved[1]
     assert saved[1]["env"]["clearance_m"] == 0.001
     assert saved[1]["dppo"]["epochs"] == 2
+
+
+def test_checkpoints_hold_the_settings_of_their_run(finetune, tmp_path, monkeypatch):
+    """As those of ``lerobot-train`` do; ``--config_path`` takes the file, or the folder, and continues."""
+    output, again = tmp_path / "run", tmp_path / "again"
+    assert finetune(output, "--env.clearance_m=0.001", iterations=2) == 0
+    settings = output / "checkpoints" / "last" / "pretrained_model" / "train_config.json"
+    saved = json.loads(settings.read_text())
+    assert saved == json.loads((output / "finetune_config.json").read_text())
+    policy = json.loads((settings.parent / "config.json").read_text())
+    assert saved["policy"] == policy | {"pretrained_path": str(tmp_path / "start")}
+    assert (saved["env"]["clearance_m"], saved["dppo"]["epochs"]) == (0.001, 2)
+    loaded = pipeline.FinetunePipelineConfig.from_pretrained(settings.parent)
+    assert (loaded.dppo.num_envs, loaded.start) == (6, tmp_path / "start")
+
+    def command(*arguments: str) -> int:
+        monkeypatch.setattr("sys.argv", ["vtrefine-finetune", *arguments])
+        return main()
+
+    assert command(f"--config_path={settings}", "--resume=true", "--dppo.iterations=3") == 0
+    assert [row["iteration"] for row in read_progress(output)] == [0, 1, 2, 3]
+    assert (output / "checkpoints" / "last").resolve().name == "000003"
+    assert command(f"--config_path={settings.parent}", f"--output_dir={again}", "--dppo.iterations=2") == 0
+    first, second = tensors(output, "000002"), tensors(again, "000002")
+    assert all(torch.equal(first[key], second[key]) for key in first)
 
 
 def test_a_finished_run_resumes_to_nothing(finetune, tmp_path):

@@ -87,6 +87,10 @@ class Backend(ABC):
     def diverged(self, ids: Array) -> Array:
         """(m,) whether MuJoCo has given up on a world since it was last written."""
 
+    def overflowed(self, ids: Array) -> Array:
+        """(m,) whether a world has lost contacts since it was last written, for want of room for them."""
+        return np.zeros(len(ids), bool)
+
     @abstractmethod
     def get_rows(self, ids: Array) -> Array:
         """The complete integration states of worlds, (m, S)."""

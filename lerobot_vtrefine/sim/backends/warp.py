@@ -4,6 +4,7 @@ A call for some worlds steps all of them and puts the others back: on a GPU that
 """
 
 import copy
+import logging
 from collections.abc import Callable
 from typing import TYPE_CHECKING
 
@@ -21,6 +22,8 @@ from lerobot_vtrefine.sim.host import start_copy, to_host
 if TYPE_CHECKING:
     from lerobot_vtrefine.sim.scene import Scene
 
+logger = logging.getLogger(__name__)
+
 HOST_FIELDS = ("bvh_aabb",)
 """Fields of MuJoCo's that mujoco_warp has no use for."""
 
@@ -30,7 +33,6 @@ class WarpBackend(Backend):
 
     Raises:
         ValueError: a GPU is asked for and there is none.
-        RuntimeError: by what reads the worlds after `advance`, when a buffer was too small for the contacts.
     """
 
     def __init__(self, model: mujoco.MjModel, num_envs: int, config: WarpConfig) -> None:
@@ -38,8 +40,8 @@ class WarpBackend(Backend):
         self.worlds = WarpWorlds(model, num_envs, config)
         self.device = self.worlds.device
         self._model, self._fields = model, dict[str, Array]()
-        self._flags: Callable[[], Array] | None = None
-        self._diverged: tuple[Array, Callable[[], Array]] | None = None
+        self._flags: tuple[Array, Callable[[], Array]] | None = None
+        self._told = 0
 
     def read(self, ids: Array) -> tuple[Array, Array]:
         """See `Backend.read`."""
@@ -51,7 +53,6 @@ class WarpBackend(Backend):
         copied = start_copy(torch.cat([self.worlds.qpos[index], self.worlds.qvel[index]], 1))
 
         def wait() -> tuple[Array, Array]:
-            self._check_overflow()
             both = copied().astype(float)
             return both[:, : self._model.nq], both[:, self._model.nq :]
 
@@ -59,9 +60,9 @@ class WarpBackend(Backend):
 
     def write(self, ids: Array, qpos: Array, qvel: Array) -> None:
         """See `Backend.write`."""
-        index, worlds, self._diverged = self.index(ids), self.worlds, None
+        index, worlds, self._flags = self.index(ids), self.worlds, None
         worlds.qpos[index], worlds.qvel[index] = self._tensor(qpos), self._tensor(qvel)
-        for rest in (worlds.warmstart, worlds.sensors, worlds.time, worlds.diverged):
+        for rest in (worlds.warmstart, worlds.sensors, worlds.time, worlds.diverged, worlds.lost):
             rest[index] = 0
         worlds.moved()
 
@@ -81,26 +82,24 @@ class WarpBackend(Backend):
         return self._run(ids, substeps)
 
     def _run(self, ids: Array, substeps: int) -> Trace:
-        self._check_overflow()
         others = np.setdiff1d(np.arange(self.num_envs), ids, assume_unique=True)
         kept = self._rows(others) if len(others) else None
         qpos, sensors = self.worlds.run(substeps)
         index = self.index(ids)
-        # A world that has blown up may ask for any number of rows; that it failed is said elsewhere.
-        diverged = self.worlds.diverged[index]
-        self._flags = start_copy(torch.where(diverged > 0, 0, self.worlds.overflow[index]))
-        self._diverged = ids, start_copy(diverged)
+        self._flags = ids, start_copy(self._told_of(index))
         if kept is not None:
             self._put_rows(others, kept)
         return Trace(qpos[index], sensors[index])
 
-    def _check_overflow(self) -> None:
-        """Raise what the last `advance` has to say; later than there, so that the host need not wait for it
-        before it gives the GPU more to do.
-        """
-        if self._flags is not None:
-            flags, self._flags = self._flags(), None
-            self.worlds.check_overflow(int(np.bitwise_or.reduce(flags, initial=0)))
+    def _told_of(self, index: torch.Tensor) -> torch.Tensor:
+        """(m, 2) int32 whether worlds have blown up, and what they had no room for."""
+        return torch.stack([self.worlds.diverged[index], self.worlds.lost[index]], 1)
+
+    def _failures(self, ids: Array) -> Array:
+        """The same on the host; what the last `advance` said is on its way there already."""
+        if self._flags is not None and np.array_equal(ids, self._flags[0]):
+            return self._flags[1]()
+        return to_host(self._told_of(self.index(ids)))
 
     def geom_poses(self, ids: Array) -> tuple[torch.Tensor, torch.Tensor]:
         """See `Backend.geom_poses`: on the worlds' device."""
@@ -128,21 +127,26 @@ class WarpBackend(Backend):
 
     def diverged(self, ids: Array) -> Array:
         """See `Backend.diverged`."""
-        self._check_overflow()
-        if self._diverged is not None and np.array_equal(ids, self._diverged[0]):
-            return self._diverged[1]() > 0
-        return to_host(self.worlds.diverged[self.index(ids)]) > 0
+        return self._failures(ids)[:, 0] > 0
+
+    def overflowed(self, ids: Array) -> Array:
+        """See `Backend.overflowed`. The first time that something has no room, that is logged."""
+        diverged, lost = self._failures(ids).T
+        lost = np.where(diverged > 0, 0, lost)  # a world that has blown up may ask for any amount of room
+        news = int(np.bitwise_or.reduce(lost, initial=0)) & ~self._told
+        self._told |= news
+        for message in self.worlds.complaints(news):
+            logger.warning("%s", message)
+        return lost > 0
 
     def get_rows(self, ids: Array) -> Array:
         """See `Backend.get_rows`."""
-        self._check_overflow()
         return to_host(self._rows(ids))
 
     def set_rows(self, ids: Array, rows: Array) -> None:
         """See `Backend.set_rows`."""
         self._put_rows(ids, self._tensor(rows))
-        self._diverged = None
-        self.worlds.diverged[self.index(ids)] = 0
+        self._flags = None
 
     def _rows(self, ids: Array) -> torch.Tensor:
         index = self.index(ids)
@@ -157,9 +161,11 @@ class WarpBackend(Backend):
         self.worlds.moved()
 
     def _state(self) -> tuple[torch.Tensor, ...]:
-        # Readings belong to the state: the pads' loads are taken from them after the step.
+        # Readings belong to the state: the pads' loads are taken from them after the step. So do failures: an
+        # episode whose start went wrong is none.
         worlds = self.worlds
-        return worlds.time, worlds.qpos, worlds.qvel, worlds.warmstart, worlds.sensors, worlds.diverged
+        motion = worlds.time, worlds.qpos, worlds.qvel, worlds.warmstart
+        return *motion, worlds.sensors, worlds.diverged, worlds.lost
 
     def instance(self, env: int) -> tuple[mujoco.MjModel, mujoco.MjData]:
         """See `Backend.instance`: plain MuJoCo at this world's state."""

@@ -28,7 +28,10 @@ OVERFLOWS = {
     mjw.OverflowType.CONTACT_MATCH: ("contacts of one contact sensor", ROWS),
     mjw.OverflowType.EPA_HORIZON: ("edges while measuring a penetration", None),
 }
-"""Buffers that can be too small -> what they hold and the setting that sizes them."""
+"""Buffers that can be too small -> what they hold and the setting that sizes them. mujoco_warp says so of
+each world, but of all worlds where they share the buffer (pairs of geoms, contacts).
+"""
+LOSSES = sum(int(flag) for flag in OVERFLOWS)
 
 
 LONGEST = 40
@@ -75,7 +78,7 @@ class WarpWorlds:
         self.warmstart, self.time = wp.to_torch(data.qacc_warmstart), wp.to_torch(data.time)
         self.sensors, self.overflow = wp.to_torch(data.sensordata), wp.to_torch(data.overflow)
         self._diverged = wp.zeros(num_envs, dtype=int, device=self.device)
-        self.diverged = wp.to_torch(self._diverged)
+        self.diverged, self.lost = wp.to_torch(self._diverged), torch.zeros_like(self.overflow)
         self._widths = (model.nq, model.nsensordata, model.nu)
         self._recorded: dict[tuple[str, int], Recording] = {}
         self._everyone = torch.arange(num_envs, dtype=torch.int32, device=self.device)
@@ -112,6 +115,7 @@ class WarpWorlds:
         with wp.ScopedDevice(self.device):
             self._do("substep", self._substep, substeps)
             self._guard()
+        self.lost |= self.overflow & LOSSES
         trace = self._trace
         return wp.to_torch(trace.qpos)[:, :substeps], wp.to_torch(trace.sensors)[:, :substeps]
 
@@ -142,19 +146,17 @@ class WarpWorlds:
         state = [self.model.qpos0, data.qpos, data.qvel, data.qacc_warmstart]
         wp.launch(kernels.guard, self.num_envs, [*state, self._diverged, self._trace.cursor])
 
-    def check_overflow(self, flags: int) -> None:
-        """Raise for a bit set of `mjw.OverflowType`.
-
-        Raises:
-            RuntimeError: a buffer was too small, so that contacts were lost.
-        """
+    def complaints(self, flags: int) -> list[str]:
+        """A line for each bit set of `mjw.OverflowType` that means lost contacts."""
+        lines = []
         for flag, (what, setting) in OVERFLOWS.items():
             if flags & int(flag):
-                size = f" (now {getattr(self._config, setting)})" if setting else ""
-                remedy = (
-                    f"raise warp.{setting}{size}" if setting else "use --env.backend=batch for this scene"
+                remedy = f"; raise warp.{setting} (now {getattr(self._config, setting)})" if setting else ""
+                lines.append(
+                    f"mujoco_warp ran out of room for {what} and lost contacts: the episodes concerned end as"
+                    f" failures of the kind 'overflow'{remedy}"
                 )
-                raise RuntimeError(f"mujoco_warp ran out of room for {what}, contacts were lost: {remedy}")
+        return lines
 
     def index(self, ids: np.ndarray) -> torch.Tensor:
         """World numbers (m,), sorted, int32 on the device."""
