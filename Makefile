@@ -21,10 +21,8 @@ test-slow: setup ## the tests marked slow
 	@$(VENV)/python -m pytest -m slow $(ARGS)
 
 check: setup ## format, lint, types, structure
-	@$(VENV)/ruff format --check --quiet .
-	@$(VENV)/ruff check --quiet .
 	@$(VENV)/ty check --quiet
-	@$(VENV)/python -m pytest -q tests/test_structure.py
+	@$(VENV)/python -m pytest -q tests/test_structure.py  # runs ruff, too
 
 format: setup ## rewrite the sources in the project's format
 	@$(VENV)/ruff check --quiet --fix-only .

@@ -5,9 +5,11 @@ from collections.abc import Callable
 
 from draccus.utils import ParsingError
 
+from lerobot_vtrefine.extras import MissingExtraError
+
 
 def told_by_lerobot[Config](check: Callable[[Config], None]) -> Callable[[Config], None]:
-    """Decorate ``__post_init__``: its ValueError becomes a ParsingError with the same words.
+    """Decorate ``__post_init__``: its refusal becomes a ParsingError with the same words.
 
     LeRobot's parser replaces a ValueError by "Couldn't instantiate class ...", which hides the reason.
     """
@@ -16,7 +18,7 @@ def told_by_lerobot[Config](check: Callable[[Config], None]) -> Callable[[Config
     def wrapper(config: Config) -> None:
         try:
             check(config)
-        except ValueError as error:
+        except (ValueError, MissingExtraError) as error:
             raise ParsingError(str(error)) from error
 
     return wrapper

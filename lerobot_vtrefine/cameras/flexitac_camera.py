@@ -11,6 +11,7 @@ from lerobot_vtrefine.cameras.config_flexitac_camera import FlexitacCameraConfig
 from lerobot_vtrefine.drivers.board import PadReader
 from lerobot_vtrefine.drivers.frames import PadFrame
 from lerobot_vtrefine.drivers.ports import stable_ports
+from lerobot_vtrefine.extras import PADS, require
 
 CONNECT_TIMEOUT_S = 8.0
 
@@ -19,6 +20,7 @@ class FlexitacCamera(Camera):
     """Depth frames, uint16 (rows, cols, 1), of raw counts."""
 
     def __init__(self, config: FlexitacCameraConfig) -> None:
+        require("camera type flexitac", PADS)
         super().__init__(config)
         self.config = config
         self.use_rgb, self.use_depth = config.use_rgb, config.use_depth

@@ -13,6 +13,7 @@ import draccus
 
 from lerobot_vtrefine.cli.errors import run_cli
 from lerobot_vtrefine.cli.pipeline.stages import last_line, stop
+from lerobot_vtrefine.extras import SIMULATOR, require
 
 # Every module offers run() -> [(what, ratio, explanation)].
 PARTS = {
@@ -22,6 +23,9 @@ PARTS = {
     "drivers": "lerobot_vtrefine.drivers.benchmark",
     "busy": "lerobot_vtrefine.finetune.benchmark_busy",
 }
+
+SIMULATED = ("tactile", "envs")
+"""Parts that need the simulator."""
 
 SHORTENED: dict[str, dict[str, float]] = {"drivers": {"seconds": 2.0}}
 """Arguments of run() that keep a part within the limit; with --full it gets its own defaults."""
@@ -100,7 +104,7 @@ def measure(parts: Iterable[str], limit_s: float, full: bool = False) -> list[Ro
         print(f"measuring {part} ...", file=sys.stderr, flush=True)
         try:
             rows += measure_part(part, None if full else limit_s, {} if full else SHORTENED.get(part, {}))
-        except (ChildProcessError, TimeoutError, ModuleNotFoundError) as error:
+        except (ChildProcessError, TimeoutError, ImportError) as error:
             print(f"{part}: {error}", file=sys.stderr, flush=True)
     return rows
 
@@ -110,11 +114,14 @@ def measure_part(part: str, limit_s: float | None, arguments: dict[str, float]) 
 
     Raises:
         ModuleNotFoundError: it has no benchmark.
+        MissingExtraError: it needs the simulator, which is not installed.
         TimeoutError: it took too long.
         ChildProcessError: it failed.
     """
     if importlib.util.find_spec(PARTS[part]) is None:
         raise ModuleNotFoundError("no benchmark, skipped")
+    if part in SIMULATED:
+        require("it", SIMULATOR)
     with tempfile.TemporaryDirectory() as folder:
         result, log = Path(folder) / "rows.json", Path(folder) / "log"
         with log.open("wb") as file:

@@ -8,6 +8,8 @@ from collections.abc import Callable
 
 from draccus.utils import DraccusException
 
+from lerobot_vtrefine.extras import explain
+
 DEBUG_VARIABLE = "VTREFINE_DEBUG"
 USAGE_STATUS = 2
 INTERRUPT_STATUS = 130
@@ -24,6 +26,8 @@ def describe(error: BaseException) -> str:
         return f"{error.strerror}: {error.filename}"
     if isinstance(error, DraccusException) and isinstance(error.__cause__, ValueError) and _is_wrapper(error):
         return describe(error.__cause__)
+    if isinstance(error, ModuleNotFoundError) and (advice := explain(error)) is not None:
+        return advice
     message = " ".join(str(error).split())
     return message or type(error).__name__
 

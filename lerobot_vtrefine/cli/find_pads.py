@@ -5,6 +5,7 @@ from collections.abc import Sequence
 from contextlib import ExitStack
 from pathlib import Path
 
+from lerobot_vtrefine import extras
 from lerobot_vtrefine.cli.errors import run_cli
 from lerobot_vtrefine.datasets.features import PADS
 from lerobot_vtrefine.drivers.config import PadConfig
@@ -60,6 +61,7 @@ def parse_arguments(arguments: Sequence[str] | None) -> argparse.Namespace:
 def main(arguments: Sequence[str] | None = None) -> None:
     """Entry point of `vtrefine-find-pads`."""
     options = parse_arguments(arguments)
+    extras.require("vtrefine-find-pads", extras.PADS)
     if len(set(options.names)) < len(options.names):
         raise ValueError(f"--names must differ from each other, got {' '.join(options.names)}")
     ports = options.ports or stable_ports()

@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from lerobot_vtrefine import extras
 from lerobot_vtrefine.cli.errors import run_cli
 from lerobot_vtrefine.drivers.board import PadReader, Status
 from lerobot_vtrefine.drivers.config import PadConfig
@@ -88,6 +89,7 @@ def chosen_pads(options: argparse.Namespace) -> dict[str, PadConfig]:
 def main(arguments: Sequence[str] | None = None) -> None:
     """Entry point of `vtrefine-view-pads`."""
     options = parse_arguments(arguments)
+    extras.require("vtrefine-view-pads", extras.PADS)
     if options.hz <= 0:
         raise ValueError(f"--hz={options.hz} must be positive")
     if options.diagnostic:

@@ -20,15 +20,14 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from lerobot_vtrefine.datasets.features import TACTILE_KEYS
 from lerobot_vtrefine.datasets.lerobot_version import is_supported
+from lerobot_vtrefine.datasets.shared_array import Array, SharedArray
 
 if TYPE_CHECKING:
     from lerobot.datasets.dataset_reader import DatasetReader
 
 logger = logging.getLogger(__name__)
 
-Array = np.ndarray[Any, np.dtype[Any]]
 DATASET_MODULE = "lerobot.datasets.lerobot_dataset"
 MAX_DEPTH_BYTES = 1 << 30
 """Depth frames stay in memory up to this size; beyond it LeRobot decodes them per item."""
@@ -42,7 +41,7 @@ class NotCoveredError(Exception):
 class Block:
     """Columns that share dtype and time offsets, side by side in one array."""
 
-    values: Array
+    frames: SharedArray
     """(frames, sum of widths)"""
     columns: tuple[tuple[str, int, int, tuple[int, ...]], ...]
     """(key, first, last + 1, shape of one frame's value)"""
@@ -53,7 +52,8 @@ class Block:
 
     def read(self, rows: Any, lead: tuple[int, ...]) -> dict[str, Tensor]:
         """The columns at the given rows; tensors of shape (*lead, *shape)."""
-        picked = torch.from_numpy(self.values.take(rows, axis=0).astype(self.dtype).reshape(*lead, -1))
+        rows_of = self.frames.values.take(rows, axis=0).astype(self.dtype)
+        picked = torch.from_numpy(rows_of.reshape(*lead, -1))
         return {
             key: picked[..., first:end].reshape((*lead, *shape)) for key, first, end, shape in self.columns
         }
@@ -151,7 +151,8 @@ class FrameStore:
             (key, first, end, shape)
             for (key, _, shape), first, end in zip(members, starts, ends, strict=True)
         )
-        return Block(np.concatenate([values for _, values, _ in members], axis=1), columns, offsets, loaded)
+        joined = np.concatenate([values for _, values, _ in members], axis=1)
+        return Block(SharedArray(joined), columns, offsets, loaded)
 
     def _episode_bounds(self) -> tuple[Array, Array]:
         """First and last row of every row's episode."""
@@ -192,51 +193,17 @@ class FrameStore:
         return torch.stack(self._hf_dataset[key][windows[self._offsets[key]].tolist()])
 
 
-def _reader_class() -> "type[DatasetReader]":
-    """A subclass of LeRobot's reader that serves covered datasets from a ``FrameStore``."""
-    from lerobot.datasets.dataset_reader import DatasetReader
-    from lerobot.datasets.depth_utils import MM_PER_METRE
-
-    class FastDatasetReader(DatasetReader):
-        _store: FrameStore | None = None
-        _store_source: Any = None
-
-        def _frame_store(self) -> FrameStore | None:
-            if self._store_source is not self.hf_dataset:  # loaded, or reloaded after recording
-                self._store_source = self.hf_dataset
-                try:
-                    self._store = FrameStore(self) if TACTILE_KEYS[0] in self._meta.features else None
-                except NotCoveredError as reason:
-                    logger.warning("Reading items the slow way: the dataset has %s.", reason)
-                    self._store = None
-            return self._store
-
-        def get_item(self, idx: int) -> dict[str, Any]:
-            store = self._frame_store()
-            if store is None:
-                return super().get_item(idx)
-            item = store.item(idx)
-            if self._image_transforms is not None:
-                for key in set(self._meta.camera_keys) - set(self._meta.depth_keys):
-                    item[key] = self._image_transforms(item[key])
-            for key, unit in self._image_depth_units.items():
-                if key in item and unit is not None and unit != self._depth_output_unit:
-                    item[key] = item[key] * MM_PER_METRE if unit == "m" else item[key] / MM_PER_METRE
-            item["task"] = store.tasks[int(item["task_index"])]
-            return item
-
-    return FastDatasetReader
-
-
 def install() -> None:
     """Serve covered datasets from memory in this process; does nothing if no dataset code is loaded yet.
 
     Idempotent. On a LeRobot version that was not tested it logs a warning and leaves LeRobot as it is.
     """
     module: Any = sys.modules.get(DATASET_MODULE)
-    if module is None or module.DatasetReader.__name__ == "FastDatasetReader":
+    if module is None:
         return
     if not is_supported():
         logger.warning("This LeRobot version is untested: dataset items are read the slow way.")
         return
-    module.DatasetReader = _reader_class()
+    from lerobot_vtrefine.datasets.frame_reader import FastDatasetReader
+
+    module.DatasetReader = FastDatasetReader

@@ -113,7 +113,7 @@ def settle(search: Search, model: Composite, weights: Sequence[TrialWeights] | N
         return fitted
     for _ in range(2):
         before = fitted.loss
-        fitted = fit(with_map(fitted, search.presses, search.weights), search.presses, weights, 4)
+        fitted = fit(with_map(fitted, search.presses, weights), search.presses, weights, 4)
         if before - fitted.loss < MAP_TOLERANCE * before:
             break
     return fitted

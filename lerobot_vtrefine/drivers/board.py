@@ -4,9 +4,9 @@ import time
 from collections import deque
 from dataclasses import dataclass
 from enum import StrEnum
+from typing import TYPE_CHECKING
 
 import numpy as np
-import serial
 from numpy.typing import NDArray
 
 from lerobot_vtrefine.drivers.ascii import AsciiFramer
@@ -16,6 +16,9 @@ from lerobot_vtrefine.drivers.framing import BinaryFramer, Framed
 from lerobot_vtrefine.drivers.identify import SAMPLE_BYTES, StreamKind, explain_stream
 from lerobot_vtrefine.drivers.ports import PortError
 from lerobot_vtrefine.drivers.serial_reader import SerialReader
+
+if TYPE_CHECKING:
+    import serial
 
 HISTORY_FRAMES = 1000
 """Frames kept for every-frame access: 10 s at 100 frames/s."""
@@ -194,7 +197,7 @@ class PadReader(SerialReader):
         self._sample.clear()
         self._sampled = 0
 
-    def _pump(self, device: serial.Serial) -> None:
+    def _pump(self, device: "serial.Serial") -> None:
         silent_since: float | None = None
         while not self._stop.is_set():
             after_silence = False

@@ -6,14 +6,16 @@ For looking at a pad's wiring taxel by taxel: `vtrefine-view-pads --diagnostic P
 import time
 from collections import deque
 from collections.abc import Callable
-
-import serial
+from typing import TYPE_CHECKING
 
 from lerobot_vtrefine.drivers.ascii import DiagnosticSample, LineBuffer, diagnostic_command, parse_diagnostic
 from lerobot_vtrefine.drivers.frames import DIAGNOSTIC_BAUD
 from lerobot_vtrefine.drivers.identify import SAMPLE_BYTES, StreamKind, explain_stream
 from lerobot_vtrefine.drivers.ports import LOST, PortError
 from lerobot_vtrefine.drivers.serial_reader import UNPLUGGED, SerialReader
+
+if TYPE_CHECKING:
+    import serial
 
 READ_TIMEOUT_S = 0.1
 KEPT_SAMPLES = 1000
@@ -103,7 +105,7 @@ class DiagnosticReader(SerialReader):
     def _begin(self) -> None:
         self._received = b""
 
-    def _pump(self, device: serial.Serial) -> None:
+    def _pump(self, device: "serial.Serial") -> None:
         lines = LineBuffer()
         while not self._stop.is_set():
             data = device.read(max(1, device.in_waiting))

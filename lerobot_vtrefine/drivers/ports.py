@@ -3,13 +3,17 @@
 import errno
 import os
 from pathlib import Path
+from typing import TYPE_CHECKING
 
-import serial
+if TYPE_CHECKING:
+    import serial
 
 try:
     from termios import error as _TerminalError  # noqa: N812
 except ImportError:  # Windows has no termios, and so no such errors
     _TerminalError = OSError
+
+from lerobot_vtrefine.extras import PADS, require
 
 FTDI_LATENCY_MS = 1
 """What the latency timer of an FTDI adapter should be; its default of 16 ms delays the last bytes of every
@@ -21,8 +25,9 @@ STABLE_FOLDERS = ("by-path", "by-id")
 
 FALLBACK_PATTERNS = ("ttyUSB*", "ttyACM*", "tty.usbserial*", "tty.usbmodem*")
 
-GONE: tuple[type[Exception], ...] = (serial.SerialException, OSError, _TerminalError)
-"""What a port raises whose device goes away; flushing raises termios errors, which are no OSError."""
+GONE: tuple[type[Exception], ...] = (OSError, _TerminalError)
+"""What a port raises whose device goes away (pyserial's errors are OSErrors); flushing raises termios errors,
+which are none."""
 
 LOST: tuple[type[Exception], ...] = (*GONE, TypeError)
 """The same of pyserial alone: TypeError in the middle of a read."""
@@ -32,15 +37,19 @@ class PortError(ConnectionError):
     """A serial port cannot be used; the message names the port and the fix."""
 
 
-def open_port(port: str, baud: int, timeout_s: float) -> serial.Serial:
+def open_port(port: str, baud: int, timeout_s: float) -> "serial.Serial":
     """Opens a port exclusively, with input flushed.
 
     Raises:
         PortError: missing, not permitted, busy, or not a serial port.
+        MissingExtraError: pyserial is not installed.
     """
+    require(f"reading {port}", PADS)
+    import serial
+
     try:
         device = serial.Serial(port, baud, timeout=timeout_s, exclusive=True)
-    except (serial.SerialException, OSError, ValueError) as error:
+    except (OSError, ValueError) as error:
         raise PortError(explain_open_error(port, baud, error)) from error
     try:
         ask_for_low_latency(device)
@@ -51,7 +60,7 @@ def open_port(port: str, baud: int, timeout_s: float) -> serial.Serial:
     return device
 
 
-def ask_for_low_latency(device: serial.Serial) -> None:
+def ask_for_low_latency(device: "serial.Serial") -> None:
     """Sets an FTDI adapter's timer to 1 ms where the driver allows it (else see `latency_advice`)."""
     try:
         device.set_low_latency_mode(True)

@@ -3,11 +3,12 @@
 import logging
 import threading
 from abc import ABC, abstractmethod
-from typing import Self
-
-import serial
+from typing import TYPE_CHECKING, Self
 
 from lerobot_vtrefine.drivers.ports import LOST, PortError, latency_advice, open_port
+
+if TYPE_CHECKING:
+    import serial
 
 logger = logging.getLogger(__name__)
 
@@ -73,7 +74,7 @@ class SerialReader(ABC):
         """Forgets the stream so far: the port was opened, or is lost. Called with `_changed` held."""
 
     @abstractmethod
-    def _pump(self, device: serial.Serial) -> None:
+    def _pump(self, device: "serial.Serial") -> None:
         """Reads until told to stop; raises one of `LOST` when the port goes away."""
 
     def _run(self) -> None:

@@ -10,6 +10,7 @@ from lerobot.envs.configs import EnvConfig
 from lerobot_vtrefine.config_errors import told_by_lerobot
 from lerobot_vtrefine.datasets.features import ACTION_KEY, NUM_JOINTS, env_key_map, env_observation_shapes
 from lerobot_vtrefine.envs.schedule import ReadSchedule
+from lerobot_vtrefine.extras import SIMULATOR, require
 from lerobot_vtrefine.sim.config import (
     BACKENDS,
     GRASPED_CAMERA,
@@ -88,6 +89,7 @@ class VtRefineEnvConfig(EnvConfig):
 
     @told_by_lerobot
     def __post_init__(self) -> None:
+        require("--env.type=vtrefine", SIMULATOR)  # now, not when a training first evaluates
         _check_choice("vectorization", self.vectorization, VECTORIZATIONS)
         _check_choice("ablate", self.ablate, ABLATIONS)
         _check_choice("backend", self.backend, BACKENDS)

@@ -8,9 +8,13 @@ from lerobot_vtrefine.embodiments import get_embodiment
 from lerobot_vtrefine.envs.config import VtRefineEnvConfig
 
 
-def action_space() -> spaces.Box:
-    """Absolute joint targets (16,) within the joint limits, rad and m."""
-    robot = get_embodiment("aloha")
+def action_space(config: VtRefineEnvConfig) -> spaces.Box:
+    """Absolute joint targets (16,) within the joint limits of the configured embodiment, rad and m.
+
+    Raises:
+        ValueError: ``scene.embodiment`` is unknown.
+    """
+    robot = get_embodiment(config.scene_config.embodiment)
     return spaces.Box(robot.lower.astype(np.float32), robot.upper.astype(np.float32), dtype=np.float32)
 
 

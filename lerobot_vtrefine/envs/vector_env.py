@@ -49,7 +49,7 @@ class VtRefineVectorEnv(gym.vector.VectorEnv[Observation, Array, Array]):
         }
         self.render_mode = "rgb_array"
         self.single_observation_space = observation_space(config)
-        self.single_action_space = action_space()
+        self.single_action_space = action_space(config)
         self.observation_space = batch_space(self.single_observation_space, num_envs)
         self.action_space = batch_space(self.single_action_space, num_envs)
         self._schedule = config.read_schedule

@@ -18,6 +18,7 @@ from lerobot_vtrefine.drivers.dynamixel_arm import Floats
 from lerobot_vtrefine.drivers.pad_set import PadSet
 from lerobot_vtrefine.drivers.ports import PortError
 from lerobot_vtrefine.embodiments import get_embodiment
+from lerobot_vtrefine.extras import ARMS, require
 from lerobot_vtrefine.robots.camera_models import CameraModels
 from lerobot_vtrefine.robots.config_aloha_tactile_follower import AlohaTactileFollowerConfig
 from lerobot_vtrefine.robots.extensions import extend_lerobot
@@ -46,6 +47,7 @@ class AlohaTactileFollower(Robot):
     name = "aloha_tactile_follower"
 
     def __init__(self, config: AlohaTactileFollowerConfig) -> None:
+        require("robot type aloha_tactile_follower", ARMS)
         super().__init__(config)
         self.config = config
         self.body = get_embodiment("aloha")

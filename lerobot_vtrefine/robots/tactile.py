@@ -11,6 +11,7 @@ from lerobot.robots.utils import make_robot_from_config
 from lerobot.utils.decorators import check_if_already_connected, check_if_not_connected
 
 from lerobot_vtrefine.drivers.pad_set import PadSet
+from lerobot_vtrefine.extras import PADS, require
 from lerobot_vtrefine.robots.camera_models import CameraModels
 from lerobot_vtrefine.robots.config_tactile import TactileConfig
 from lerobot_vtrefine.robots.extensions import extend_lerobot
@@ -25,6 +26,7 @@ class Tactile(Robot):
     name = "tactile"
 
     def __init__(self, config: TactileConfig) -> None:
+        require("robot type tactile", PADS)
         super().__init__(config)
         self.config = config
         self.base = make_robot_from_config(base_config(config))

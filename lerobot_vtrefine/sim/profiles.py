@@ -9,6 +9,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from lerobot_vtrefine.sim.config import PROCEDURAL_PAIRS
 from lerobot_vtrefine.tactile.geometry import Box, ConvexHull, Cylinder
 
 Primitive = Box | Cylinder | ConvexHull
@@ -33,7 +34,11 @@ class Profile:
 
 
 def make_profile(name: str, length_m: float) -> Profile:
-    """Profile of a procedural pair's plug, extruded from z = 0 to `length_m`."""
+    """Profile of a procedural pair's plug, extruded from z = 0 to `length_m`.
+
+    Raises:
+        ValueError: unknown pair; the message lists those that are known.
+    """
     half, pos = length_m / 2, (0.0, 0.0, length_m / 2)
     if name == "round":
         peg: tuple[Primitive, ...] = (Cylinder(ROUND_RADIUS_M, half, pos),)
@@ -50,7 +55,9 @@ def make_profile(name: str, length_m: float) -> Profile:
         corners = [(a, -b), (a, b), (b, b), (b, a), (-b, a), (-b, b)]
         outline = np.array([*corners, *((-x, -y) for x, y in corners)])
         return Profile((Box((a, b, half), pos), Box((b, a, half), pos)), outline, 2 * b)
-    return _key(half, pos, length_m)
+    if name == "key":
+        return _key(half, pos, length_m)
+    raise ValueError(f"unknown pair {name!r}: use one of {', '.join(PROCEDURAL_PAIRS)}")
 
 
 def offset_outline(outline: np.ndarray, distance_m: float) -> np.ndarray:

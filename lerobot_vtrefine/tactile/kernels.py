@@ -1,4 +1,4 @@
-"""Warp kernels of the contact geometry; one source for CPU and CUDA.
+"""Warp kernels of the contact geometry; this module is one source for CPU and CUDA (native snippets are not).
 
 Shape legend: m environments, P pads, B bodies, K primitives, Q planes, N lattice points; float32 [m, m/s].
 

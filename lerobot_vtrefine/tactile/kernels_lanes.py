@@ -1,4 +1,6 @@
-"""How the threads of a pad share its work: one on CPU, on CUDA the 32 lanes of a warp, same source.
+"""How the threads of a pad share its work: one on CPU, on CUDA the 32 lanes of a warp.
+
+Each is a native snippet with a branch for CUDA; kernels that call them are written once.
 
 What these functions answer is known when a kernel is compiled, so that nothing is left of them on CPU.
 """

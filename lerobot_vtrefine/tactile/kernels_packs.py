@@ -1,4 +1,4 @@
-"""Native loops over a pad's lattice: eight points at a time on CPU, a lane's own on CUDA, same source.
+"""Native loops over a pad's lattice: eight points at a time on CPU, a lane's own on CUDA, a branch for each.
 
 Warp's own code handles one number at a time on CPU, which costs these loops most of their speed. `stride` is
 the length of a row of heights and leads, which `kernels_surface` lays out.

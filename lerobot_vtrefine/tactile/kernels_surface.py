@@ -1,4 +1,5 @@
-"""A pad's heights and their rates while its bodies are looked at, one source for CPU and CUDA.
+"""A pad's heights and their rates while its bodies are looked at: one name for two native
+implementations.
 
 On CPU two arrays. On CUDA, in the memory of a multiprocessor, one number per point that has the height in its
 upper half, ordered as whole numbers are, and the rate (later the lead) in its lower: that the higher of two

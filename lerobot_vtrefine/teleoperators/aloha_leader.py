@@ -13,6 +13,7 @@ from lerobot_vtrefine.datasets.features import JOINT_SUFFIX
 from lerobot_vtrefine.drivers.arm_models import WIDOWX_250S
 from lerobot_vtrefine.drivers.arm_pair import ArmPair
 from lerobot_vtrefine.embodiments import get_embodiment
+from lerobot_vtrefine.extras import ARMS, require
 from lerobot_vtrefine.teleoperators.config_aloha_leader import AlohaLeaderConfig
 
 logger = logging.getLogger(__name__)
@@ -25,6 +26,7 @@ class AlohaLeader(Teleoperator):
     name = "aloha_leader"
 
     def __init__(self, config: AlohaLeaderConfig) -> None:
+        require("teleoperator type aloha_leader", ARMS)
         super().__init__(config)
         self.config = config
         self.body = get_embodiment("aloha")

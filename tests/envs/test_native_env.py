@@ -1,3 +1,5 @@
+from dataclasses import replace
+
 import numpy as np
 import pytest
 import torch
@@ -5,14 +7,16 @@ from draccus.utils import ParsingError
 from fake_sim import FakeSim
 from lerobot.envs.utils import preprocess_observation
 
+from lerobot_vtrefine import embodiments
 from lerobot_vtrefine.datasets.features import DEPTH_KEY, STATE_KEY, TACTILE_KEYS
+from lerobot_vtrefine.embodiments import get_embodiment
 from lerobot_vtrefine.envs import VtRefineEnvConfig
 from lerobot_vtrefine.envs.episode_log import EpisodeLog, read_episode_log
 from lerobot_vtrefine.envs.episodes import Episodes
 from lerobot_vtrefine.envs.schedule import ReadSchedule
 from lerobot_vtrefine.envs.single_env import VtRefineEnv
 from lerobot_vtrefine.envs.vector_env import LazyFrames, VtRefineVectorEnv
-from lerobot_vtrefine.sim.config import ShearConfig
+from lerobot_vtrefine.sim.config import SceneConfig, ShearConfig
 
 
 @pytest.fixture
@@ -37,6 +41,17 @@ def test_reset_is_a_function_of_each_seed(make_env):
     again, _ = env.reset(seed=[4, 9, 7])
     for key, value in first.items():
         assert np.array_equal(value[[1, 2, 0]], again[key]), key
+
+
+def test_actions_are_those_of_the_configured_embodiment(monkeypatch: pytest.MonkeyPatch) -> None:
+    arms = get_embodiment("aloha")
+    joints = tuple(replace(joint, lower_rad=joint.lower_rad + 0.1) for joint in arms.joints)
+    other = replace(arms, name="other", joints=joints)
+    monkeypatch.setitem(embodiments._EMBODIMENTS, "other", other)
+    env = VtRefineVectorEnv(VtRefineEnvConfig(scene=SceneConfig(embodiment="other")), 2)
+    np.testing.assert_array_equal(env.single_action_space.low, other.lower.astype(np.float32))
+    with pytest.raises(ValueError, match="unknown embodiment 'nobody': use one of aloha, other"):
+        VtRefineVectorEnv(VtRefineEnvConfig(scene=SceneConfig(embodiment="nobody")), 2)
 
 
 def test_reset_without_seeds_draws_different_ones(make_env):

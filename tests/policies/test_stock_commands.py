@@ -23,7 +23,13 @@ TINY = (
     "--policy.device=cpu",
     "--policy.push_to_hub=false",
 )
-RUN = ("--batch_size=4", "--num_workers=0", "--log_freq=2", "--wandb.enable=false")
+DEFAULT_RUN = ("--batch_size=4", "--log_freq=2", "--wandb.enable=false")
+"""LeRobot's own data loader: four persistent workers, spawned."""
+RUN = (*DEFAULT_RUN, "--num_workers=0")
+"""In one process: starting the workers takes LeRobot a minute of processor time."""
+CONFIGS = Path(__file__).parents[2] / "configs" / "policy"
+
+pytestmark = pytest.mark.timeout(900)  # five processes that import LeRobot, where others use the cores, too
 
 
 def command(*arguments: object, fails: bool = False) -> str:
@@ -44,17 +50,21 @@ def data(root: Path) -> tuple[str, str]:
 
 @pytest.fixture(scope="module")
 def trained(tiny_dataset: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Output folder of ten steps of ``lerobot-train``."""
+    """Output folder of ten steps of ``lerobot-train``, with the loader that LeRobot makes by default."""
     output = tmp_path_factory.mktemp("run") / "bc"
     command(
         "lerobot-train",
         *TINY,
-        *RUN,
+        *DEFAULT_RUN,
         *data(tiny_dataset),
         f"--output_dir={output}",
         "--steps=10",
         "--save_freq=10",
     )
+    saved = json.loads(
+        (output / "checkpoints" / "last" / "pretrained_model" / "train_config.json").read_text()
+    )
+    assert (saved["num_workers"], saved["dataloader_multiprocessing_context"]) == (4, "spawn")
     return output
 
 
@@ -74,7 +84,12 @@ def test_training_writes_a_checkpoint_that_loads(trained: Path) -> None:
 def test_training_resumes_where_it_stopped(trained: Path) -> None:
     config = trained / "checkpoints" / "last" / "pretrained_model" / "train_config.json"
     printed = command(
-        "lerobot-train", f"--config_path={config}", "--resume=true", "--steps=14", "--save_freq=14"
+        "lerobot-train",
+        f"--config_path={config}",
+        "--resume=true",
+        "--steps=14",
+        "--save_freq=14",
+        "--num_workers=0",
     )
     assert "step:12" in printed
     assert average_steps(trained / "checkpoints" / "000014") == 14
@@ -97,6 +112,21 @@ def test_training_starts_from_a_checkpoint_on_another_dataset(
     saved = tmp_path / "run" / "checkpoints" / "000004" / "pretrained_model"
     assert json.loads((saved / "config.json").read_text())["down_dims"] == [32, 32]
     assert average_steps(saved.parent) == 14
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", ["vt_dp3_paper", "vt_dp3_visual"])
+def test_the_paper_network_trains_from_its_file(tiny_dataset: Path, tmp_path: Path, name: str) -> None:
+    command(
+        "lerobot-train",
+        f"--config_path={CONFIGS / name}.yaml",
+        "--policy.device=cpu",
+        "--batch_size=8",
+        "--steps=2",
+        *data(tiny_dataset),
+        f"--output_dir={tmp_path / 'run'}",
+    )
+    assert average_steps(tmp_path / "run" / "checkpoints" / "000002") == 2
 
 
 @pytest.mark.slow

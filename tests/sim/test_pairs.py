@@ -57,6 +57,11 @@ def test_shapes_hinder_turning(name, yaw):
     assert overlap(scene, (0, 0, -0.01), yaw) > 1e-4
 
 
+def test_unknown_profile_is_refused_with_the_known_ones():
+    with pytest.raises(ValueError, match=r"unknown pair 'star': use one of round, square, .*, key$"):
+        make_profile("star", 0.02)
+
+
 @pytest.mark.parametrize("name", PROCEDURAL_PAIRS)
 def test_outline_offset_moves_every_edge_by_the_same_distance(name):
     outline = make_profile(name, 0.02).outline
