@@ -35,7 +35,6 @@ from lerobot_vtrefine.cli.pipeline.demo_config import (
     flags,
     pretrain_stage,
     record_stage,
-    recording_env,
 )
 from lerobot_vtrefine.cli.pipeline.stages import Stage, StageRunner, find_command
 from lerobot_vtrefine.cli.report.statistics import proportion
@@ -84,7 +83,7 @@ def motion_stage(budget: Budget, name: str) -> Stage:
     It takes the parts from the table: motions that are wide beside any play.
     """
     config = recipe(budget, budget.seeds[0])
-    env = recording_env(config) | {"start": "table"}
+    env = config.env | {"start": "table"}
     output = budget.output_dir / folder_name(name) / "motions"
     command = [
         "vtrefine-record-demos",

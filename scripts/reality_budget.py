@@ -8,7 +8,6 @@ from realities import of_robot
 
 from lerobot_vtrefine.cli.pipeline.demo_config import (
     DemoConfig,
-    acting_env,
     default_env,
     flags,
 )
@@ -67,7 +66,7 @@ def folder_name(*parts: str) -> str:
 
 def env_flags(budget: Budget, world: str) -> list[str]:
     """Flags of a world: plain, diagnosed:NAME or real:NAME."""
-    env = acting_env(recipe(budget, budget.seeds[0]))
+    env = dict(recipe(budget, budget.seeds[0]).env)
     kind, _, name = world.partition(":")
     if kind == "diagnosed":
         env["reality" if of_robot(name) else "sensor_model"] = str(

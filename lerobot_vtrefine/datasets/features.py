@@ -147,19 +147,28 @@ def raw_to_env_observation(raw: Mapping[str, Array]) -> dict[str, Array]:
     """A raw observation (leading dimensions allowed) as an environment observation.
 
     LeRobot's ``preprocess_observation`` turns its keys into the dataset's (``agent_pos`` becomes
-    ``observation.state``). Depth is float32 (..., 1, H, W) in mm, exactly what the dataset loader yields.
+    ``observation.state``). Everything is float32, counts too, because ``lerobot-eval --eval.recording=true``
+    stores nothing else. Depth is (..., 1, H, W) in mm, exactly what the dataset loader yields.
     """
-    observation = {key.removeprefix(OBS_PREFIX): value for key, value in _columns_of(raw).items()}
+    columns = _columns_of(raw).items()
+    observation = {
+        key.removeprefix(OBS_PREFIX): value.astype(np.float32, copy=False) for key, value in columns
+    }
     observation["agent_pos"] = observation.pop("state")
     observation[DEPTH_KEY.removeprefix(OBS_PREFIX)] = raw["depth_mm"].astype(np.float32)[..., None, :, :]
     return observation
 
 
-def env_observation_shapes(camera_height: int, camera_width: int) -> dict[str, tuple[tuple[int, ...], str]]:
-    """Shape and dtype of every environment observation key, without leading dimensions."""
-    shapes = {column.key.removeprefix(OBS_PREFIX): (column.shape, column.dtype) for column in COLUMNS}
+def env_observation_shapes(camera_height: int, camera_width: int) -> dict[str, tuple[tuple[int, ...], float]]:
+    """Shape of every environment observation key, without leading dimensions, and the largest value of counts
+    (infinite for everything else).
+    """
+    shapes = {
+        column.key.removeprefix(OBS_PREFIX): (column.shape, 255.0 if column.dtype == "uint8" else np.inf)
+        for column in COLUMNS
+    }
     shapes["agent_pos"] = shapes.pop("state")
-    shapes[DEPTH_KEY.removeprefix(OBS_PREFIX)] = ((1, camera_height, camera_width), "float32")
+    shapes[DEPTH_KEY.removeprefix(OBS_PREFIX)] = ((1, camera_height, camera_width), np.inf)
     return shapes
 
 

@@ -9,7 +9,6 @@ from lerobot.envs.configs import EnvConfig
 
 from lerobot_vtrefine.config_errors import told_by_lerobot
 from lerobot_vtrefine.datasets.features import ACTION_KEY, NUM_JOINTS, env_key_map, env_observation_shapes
-from lerobot_vtrefine.envs.schedule import ReadSchedule
 from lerobot_vtrefine.extras import SIMULATOR, require
 from lerobot_vtrefine.sim.config import (
     BACKENDS,
@@ -72,16 +71,12 @@ class VtRefineEnvConfig(EnvConfig):
     """Device and buffers of the warp backend."""
     vectorization: str = "native"
     """native: one batched simulation. gym: one per environment, sync or async by --eval.use_async_envs."""
-    read_every: int = 1
-    """Read the sensors for a policy that decides every ``read_every`` steps (its n_action_steps) ..."""
-    read_window: int = 1
-    """... from the last ``read_window`` frames (its n_obs_steps); other steps repeat the last one read."""
     ablate: str = "none"
     """none, or touch or vision, replaced by its mean over ``ablate_dataset``."""
     ablate_dataset: Path | None = None
     """Root of the LeRobot dataset whose mean frame the ablation shows."""
     video_episodes: int = 10
-    """Episodes that evaluation videos show; the other videos stay black, which costs no rendering."""
+    """Episodes that ``lerobot-eval`` makes videos of: the first ones, at most its ten; 0 draws nothing."""
     metrics_path: Path | None = None
     """JSON-lines file; every finished episode appends seed, success, in-hand shift, peak force, ..."""
     features: dict[str, PolicyFeature] = field(default_factory=dict)
@@ -104,7 +99,7 @@ class VtRefineEnvConfig(EnvConfig):
                 f"{self.reality} holds a sensor model: drop --env.sensor_model={self.sensor_model}"
             )
         self.features = policy_features(*self.camera_size)
-        _ = self.task_config, self.read_schedule  # their own checks, now rather than in a worker process
+        _ = self.task_config  # its own checks, now rather than in a worker process
 
     @property
     def scene_config(self) -> SceneConfig:
@@ -136,11 +131,6 @@ class VtRefineEnvConfig(EnvConfig):
         return self.task_config.steps_of(self.scene_config.start)
 
     @property
-    def read_schedule(self) -> ReadSchedule:
-        """Which control steps have their sensors read."""
-        return ReadSchedule(self.read_every, self.read_window)
-
-    @property
     def gym_kwargs(self) -> dict[str, Any]:
         """Unused: environments are built by ``create_envs``."""
         return {}
@@ -153,14 +143,14 @@ class VtRefineEnvConfig(EnvConfig):
 
 
 def policy_features(camera_height: int, camera_width: int) -> dict[str, PolicyFeature]:
-    """LeRobot features under environment keys; depth is declared (H, W, 1) as LeRobot expects images."""
-    features = {ACTION_KEY: PolicyFeature(type=FeatureType.ACTION, shape=(NUM_JOINTS,))}
-    for key, (shape, _) in env_observation_shapes(camera_height, camera_width).items():
-        if key.startswith("images."):
-            features[key] = PolicyFeature(type=FeatureType.VISUAL, shape=(camera_height, camera_width, 1))
-        else:
-            features[key] = PolicyFeature(type=FeatureType.STATE, shape=shape)
-    return features
+    """LeRobot features under environment keys.
+
+    Depth is no VISUAL feature here: ``lerobot-eval --eval.recording=true`` makes videos of these, and
+    millimetres do not fit into one.
+    """
+    shapes = env_observation_shapes(camera_height, camera_width)
+    features = {key: PolicyFeature(type=FeatureType.STATE, shape=shape) for key, (shape, _) in shapes.items()}
+    return {ACTION_KEY: PolicyFeature(type=FeatureType.ACTION, shape=(NUM_JOINTS,)), **features}
 
 
 def _check_choice(name: str, value: str, choices: tuple[str, ...]) -> None:

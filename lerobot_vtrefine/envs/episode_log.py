@@ -7,11 +7,8 @@ from typing import Any
 import numpy as np
 
 
-def episode_rows(
-    seeds: np.ndarray, steps: np.ndarray, metrics: dict[str, np.ndarray]
-) -> list[dict[str, Any]]:
-    """One plain dict per finished episode: seed, steps and every metric (arrays of length m)."""
-    columns = {"seed": seeds, "steps": steps, **metrics}
+def episode_rows(columns: dict[str, np.ndarray]) -> list[dict[str, Any]]:
+    """One plain dict per finished episode from columns of length m."""
     rows = zip(*(np.asarray(column).tolist() for column in columns.values()), strict=True)
     return [dict(zip(columns, map(_plain, row), strict=True)) for row in rows]
 

@@ -79,27 +79,29 @@ class Episodes:
             flag[ids] = False
         self.read(ids)
 
-    def step(self, actions: Array, reads: Callable[[Array], Array] | bool = True) -> Transition:
+    def step(self, actions: Array, reads: bool = True) -> Transition:
         """One control step of the unfinished environments.
 
         Args:
             actions: (n, 16) absolute joint targets in rad and m; rows of finished environments are ignored.
-            reads: Whether to read the sensors afterwards, or a function of the step counts (m,) -> (m,) bool.
-                Unread environments keep their last sensor frame; their joint positions are always fresh.
+            reads: Whether to read the sensors afterwards. False is for callers who know that nobody looks at
+                this frame: ``raw`` then keeps the last one.
         """
         ids = self.active
         reward = np.zeros(self.num_envs)
         finished = ids[:0]
         if len(ids):
             self.steps[ids] += 1
-            read = reads(self.steps[ids]) if callable(reads) else np.full(len(ids), reads)
-            result = self.sim.step(np.asarray(actions, np.float64)[ids], ids, images=ids[read])
+            result = self.sim.step(
+                np.asarray(actions, np.float64)[ids], ids, images=ids if reads else ids[:0]
+            )
             reward[ids] = result.reward
             self.terminated[ids], self.truncated[ids] = result.terminated, result.truncated
             self.success[ids] = result.success
             finished = ids[self.terminated[ids] | self.truncated[ids]]
             self.done[finished] = True
-            self._refresh(ids, read)
+            if reads:
+                self.read(ids)
             self._collect(finished)
         flags = (self.terminated.copy(), self.truncated.copy(), self.success.copy())
         return Transition(reward, *flags, finished)
@@ -126,14 +128,6 @@ class Episodes:
         frames["noise_level"] = np.full((count, 1), self.sim.noise_level, np.float32)
         return frames if self._ablate is None else self._ablate(frames)
 
-    def _refresh(self, ids: Array, read: Array) -> None:
-        """Read the sensors where `read` (m,) says so, joint positions everywhere."""
-        if read.any():
-            self.read(ids[read])
-        if not read.all():
-            unread = ids[~read]
-            self.raw["state"][unread] = self.sim.joint_state(unread)
-
     def _collect(self, finished: Array) -> None:
         """Keep (and log) the metrics of episodes that just ended."""
         if len(finished) == 0:
@@ -147,10 +141,16 @@ class Episodes:
         if self._log is not None:
             self._log.append(self.rows(finished))
 
-    def rows(self, ids: Array) -> list[dict[str, Any]]:
-        """Seed, steps, metrics and the reason of failure of finished episodes ``ids`` as plain dicts."""
-        if len(ids) == 0:
-            return []
+    def summary(self, ids: Array) -> dict[str, Array]:
+        """How the finished episodes of ``ids`` (m,) went: seed, steps, every metric, (m,) each.
+
+        ``failure`` names the reason: none, time_out or another of ``FAILURES``. Call it once an episode has
+        ended; rows of episodes that still run mean nothing.
+        """
         metrics = {name: values[ids] for name, values in self.metrics.items()}
         reasons = np.where(self.truncated[ids], "time_out", np.array(FAILURES)[metrics["failure"]])
-        return episode_rows(self.seeds[ids], self.steps[ids], {**metrics, "failure": reasons})
+        return {"seed": self.seeds[ids], "steps": self.steps[ids], **metrics, "failure": reasons}
+
+    def rows(self, ids: Array) -> list[dict[str, Any]]:
+        """``summary`` as one plain dict per episode."""
+        return episode_rows(self.summary(ids)) if len(ids) else []

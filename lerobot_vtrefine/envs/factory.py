@@ -12,6 +12,7 @@ from lerobot_vtrefine.envs.ablation import make_ablation
 from lerobot_vtrefine.envs.config import VtRefineEnvConfig
 from lerobot_vtrefine.envs.episode_log import EpisodeLog
 from lerobot_vtrefine.envs.episodes import Episodes
+from lerobot_vtrefine.envs.rendering import EvalVideos
 
 if TYPE_CHECKING:
     from lerobot_vtrefine.sim.simulation import InsertionSim
@@ -53,17 +54,22 @@ def make_vector_env(
     config: VtRefineEnvConfig, num_envs: int, use_async: bool
 ) -> gym.vector.VectorEnv | _LazyAsyncVectorEnv:
     """The native batched environment, or Gymnasium's sync or async one around single environments."""
-    from lerobot_vtrefine.envs.single_env import VtRefineEnv
     from lerobot_vtrefine.envs.vector_env import VtRefineVectorEnv
 
     if config.vectorization == "native":
         return VtRefineVectorEnv(config, num_envs)
     makers: list[Callable[[], gym.Env]] = [
-        partial(VtRefineEnv, config, position, num_envs) for position in range(num_envs)
+        partial(_make_single, config, position, num_envs) for position in range(num_envs)
     ]
     if use_async and num_envs > 1:
-        env = VtRefineEnv(config)
+        env = _make_single(config, 0, num_envs)
         # LeRobot's own stand-in for a vector env: worker processes start at the first reset.
         return _LazyAsyncVectorEnv(makers, env.observation_space, env.action_space, env.metadata)
     frozen = [freeze_after_episode_end(make) for make in makers]
     return gym.vector.SyncVectorEnv(frozen, autoreset_mode=AutoresetMode.NEXT_STEP)
+
+
+def _make_single(config: VtRefineEnvConfig, position: int, total: int) -> gym.Env:
+    from lerobot_vtrefine.envs.single_env import VtRefineEnv
+
+    return EvalVideos(VtRefineEnv(config), config.video_episodes, position, total)

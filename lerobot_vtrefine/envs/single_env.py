@@ -5,17 +5,22 @@ from typing import Any
 import gymnasium as gym
 import numpy as np
 
+from lerobot_vtrefine.datasets.features import NUM_JOINTS
 from lerobot_vtrefine.envs.config import VtRefineEnvConfig
 from lerobot_vtrefine.envs.episodes import Array
 from lerobot_vtrefine.envs.vector_env import Observation, VtRefineVectorEnv
 
 
 class VtRefineEnv(gym.Env[Observation, Array]):
-    """One insertion episode at a time; observations of ``VtRefineVectorEnv`` without the leading ``n``."""
+    """One insertion episode at a time; observations of ``VtRefineVectorEnv`` without the leading ``n``.
 
-    def __init__(self, config: VtRefineEnvConfig, position: int = 0, total: int = 1) -> None:
-        """``position`` and ``total``: which of the environments that play together this one is."""
-        self._batch = VtRefineVectorEnv(config, 1, position, total)
+    ``info["is_success"]`` comes with every step; in the last one of an episode come why and how it ended, as
+    Python values: ``failure`` (none, time_out or another reason), ``steps`` and the metrics. What was not
+    measured, the time to success of a failure, is left out; Gymnasium's vector environments then mask it.
+    """
+
+    def __init__(self, config: VtRefineEnvConfig) -> None:
+        self._batch = VtRefineVectorEnv(config, 1)
         self.metadata = self._batch.metadata
         self.render_mode = self._batch.render_mode
         self.observation_space = self._batch.single_observation_space
@@ -35,8 +40,12 @@ class VtRefineEnv(gym.Env[Observation, Array]):
 
     def step(self, action: Array) -> tuple[Observation, float, bool, bool, dict[str, Any]]:
         """One control step with absolute joint targets (16,) in rad and m."""
+        if np.shape(action) != (NUM_JOINTS,):
+            raise ValueError(f"action must have shape ({NUM_JOINTS},), got {np.shape(action)}")
         observation, reward, terminated, truncated, info = self._batch.step(np.asarray(action)[None])
-        told = {"is_success": bool(info["is_success"][0]), **_shear(info)}
+        ended = {name: values[0].item() for name, values in info.get("final_info", {}).items()}
+        measured = {name: value for name, value in ended.items() if value == value}  # NaN does not
+        told = {**measured, "is_success": bool(info["is_success"][0]), **_shear(info)}
         return _first(observation), float(reward[0]), bool(terminated[0]), bool(truncated[0]), told
 
     def render(self) -> Array:

@@ -22,10 +22,8 @@ def observation_space(config: VtRefineEnvConfig) -> spaces.Dict:
     """One environment's raw observation: joints, pad counts, depth, camera."""
     height, width = config.camera_size
     shapes = env_observation_shapes(height, width)
-    return spaces.Dict({key: _box(shape, np.dtype(dtype)) for key, (shape, dtype) in shapes.items()})
+    return spaces.Dict({key: _box(shape, highest) for key, (shape, highest) in shapes.items()})
 
 
-def _box(shape: tuple[int, ...], dtype: np.dtype) -> spaces.Box:
-    if dtype == np.uint8:
-        return spaces.Box(0, 255, shape, np.uint8)
-    return spaces.Box(-np.inf, np.inf, shape, np.float32)
+def _box(shape: tuple[int, ...], highest: float) -> spaces.Box:
+    return spaces.Box(0.0 if np.isfinite(highest) else -np.inf, highest, shape, np.float32)

@@ -1,7 +1,7 @@
 """The natively batched Gymnasium environment: one simulation object steps every world."""
 
-from collections.abc import Callable, Iterator, Sequence
-from typing import Any, SupportsIndex, overload
+from collections.abc import Sequence
+from typing import Any
 
 import gymnasium as gym
 import numpy as np
@@ -13,7 +13,7 @@ from lerobot_vtrefine.datasets.features import NUM_JOINTS, raw_to_env_observatio
 from lerobot_vtrefine.envs.config import VtRefineEnvConfig
 from lerobot_vtrefine.envs.episodes import Array, Episodes, Transition
 from lerobot_vtrefine.envs.factory import make_episodes
-from lerobot_vtrefine.envs.rendering import FrameSource
+from lerobot_vtrefine.envs.rendering import EvalFrame, FrameSource, LazyFrames, eval_frame
 from lerobot_vtrefine.envs.spaces import action_space, observation_space
 
 Observation = dict[str, Array]
@@ -29,17 +29,14 @@ class VtRefineVectorEnv(gym.vector.VectorEnv[Observation, Array, Array]):
     - There is no autoreset: a finished environment costs nothing, repeats its last observation and flags with
       reward 0, and waits for a reset. This is what ``lerobot-eval`` needs.
     - ``info["is_success"]`` is (n,) bool; ``info["final_info"]`` appears in steps in which an episode ends
-    and
-      holds the same plus the metrics of finished episodes.
+      and holds the same plus how finished episodes went: ``failure`` (n,) str names the reason, see
+      ``Episodes.summary``.
     - With ``--env.shear.on=true``, ``info["shear"]`` is (n, 4, 384, 2) float32: tangential force per taxel
       [N], of every control step.
     - Observations are those of ``datasets.features.env_observation_shapes`` with a leading ``n``.
     """
 
-    def __init__(
-        self, config: VtRefineEnvConfig, num_envs: int, position: int = 0, total: int | None = None
-    ) -> None:
-        """``position`` and ``total``: where these environments stand among all that play together."""
+    def __init__(self, config: VtRefineEnvConfig, num_envs: int) -> None:
         self.config = config
         self.num_envs = num_envs
         self.metadata = {
@@ -52,9 +49,7 @@ class VtRefineVectorEnv(gym.vector.VectorEnv[Observation, Array, Array]):
         self.single_action_space = action_space(config)
         self.observation_space = batch_space(self.single_observation_space, num_envs)
         self.action_space = batch_space(self.single_action_space, num_envs)
-        self._schedule = config.read_schedule
-        self._stride = num_envs if total is None else total
-        self._first_episode = position - self._stride
+        self._first_episode = -num_envs
         self._episodes: Episodes | None = None
         self._frames: FrameSource | None = None
 
@@ -76,7 +71,7 @@ class VtRefineVectorEnv(gym.vector.VectorEnv[Observation, Array, Array]):
         if self._episodes is None and not mask.all():
             raise ValueError("the first reset must restart every environment")
         ids = np.flatnonzero(mask)
-        self._first_episode += self._stride if mask.all() else 0
+        self._first_episode += self.num_envs if mask.all() else 0
         self.episodes.reset(ids, self._seeds(seed)[ids])
         return self._observation(), {"is_success": np.zeros(self.num_envs, bool), **self._shear()}
 
@@ -88,13 +83,15 @@ class VtRefineVectorEnv(gym.vector.VectorEnv[Observation, Array, Array]):
             )
         if not self.episodes.raw:
             raise gym.error.ResetNeeded("call reset() before step()")
-        result = self.episodes.step(actions, self._schedule.reads)
+        result = self.episodes.step(actions)
         return self._observation(), result.reward, result.terminated, result.truncated, self._info(result)
 
     def call(self, name: str, *args: Any, **kwargs: Any) -> Sequence[Any]:
-        """Gymnasium's per-environment call; ``render`` is lazy, so that a slice renders only itself."""
+        """Gymnasium's per-environment call; frames are for ``lerobot-eval``: drawn when indexed, and only
+        those of the first ``video_episodes`` episodes (``EvalFrame``).
+        """
         if name == "render":
-            return LazyFrames(self.render_env, self.num_envs)
+            return LazyFrames(self._eval_frame, self.num_envs)
         return self.get_attr(name)
 
     def get_attr(self, name: str) -> tuple[Any, ...]:
@@ -112,11 +109,14 @@ class VtRefineVectorEnv(gym.vector.VectorEnv[Observation, Array, Array]):
         return tuple(self.render_env(index) for index in range(self.num_envs))
 
     def render_env(self, index: int) -> Array:
-        """The frame of one environment: black once ``video_episodes`` episodes were shown."""
+        """The frame of one environment."""
         if self._frames is None:
             self._frames = FrameSource(self.episodes)
-        shown = self._first_episode + index < self.config.video_episodes
-        return self._frames.frame(index) if shown else self._frames.blank()
+        return self._frames.frame(index)
+
+    def _eval_frame(self, index: int) -> EvalFrame:
+        wanted = self._first_episode + index < self.config.video_episodes
+        return eval_frame(lambda: self.render_env(index), wanted)
 
     def close_extras(self, **kwargs: Any) -> None:
         """Release simulation and renderers; a later reset builds them again."""
@@ -147,8 +147,8 @@ class VtRefineVectorEnv(gym.vector.VectorEnv[Observation, Array, Array]):
     def _info(self, result: Transition) -> dict[str, Any]:
         info: dict[str, Any] = {"is_success": result.success, **self._shear()}
         if len(result.finished):
-            metrics = {name: values.copy() for name, values in self.episodes.metrics.items()}
-            info["final_info"] = {**metrics, "is_success": result.success.copy()}
+            summary = self.episodes.summary(self.episodes.ids)
+            info["final_info"] = {**summary, "is_success": result.success.copy()}
             info["_final_info"] = np.isin(np.arange(self.num_envs), result.finished)
         return info
 
@@ -156,26 +156,3 @@ class VtRefineVectorEnv(gym.vector.VectorEnv[Observation, Array, Array]):
 def _own(value: Array, raw: Observation) -> Array:
     """The value, copied where it is part of a raw frame."""
     return value.copy() if any(np.may_share_memory(value, item) for item in raw.values()) else value
-
-
-class LazyFrames(Sequence[Array]):
-    """Frames rendered when indexed: ``lerobot-eval`` asks for all environments and keeps the first few."""
-
-    def __init__(self, render: Callable[[int], Array], count: int) -> None:
-        self._render = render
-        self._indices = range(count)
-
-    def __len__(self) -> int:
-        return len(self._indices)
-
-    @overload
-    def __getitem__(self, index: SupportsIndex) -> Array: ...
-    @overload
-    def __getitem__(self, index: slice) -> tuple[Array, ...]: ...
-    def __getitem__(self, index: SupportsIndex | slice) -> Array | tuple[Array, ...]:
-        if isinstance(index, slice):
-            return tuple(self._render(i) for i in self._indices[index])
-        return self._render(self._indices[index])
-
-    def __iter__(self) -> Iterator[Array]:
-        return (self._render(index) for index in self._indices)

@@ -8,7 +8,6 @@ from pathlib import Path
 from typing import Any
 
 import draccus
-import numpy as np
 import torch
 from lerobot.configs import PreTrainedConfig, parser
 from lerobot.configs.default import EvalConfig, WandBConfig
@@ -168,33 +167,16 @@ def make_agent(policy: VtDp3Policy, dppo: DppoConfig) -> Agent:
     )
 
 
-def check_read_schedule(env: VtRefineEnvConfig, policy: VtDp3Config) -> None:
-    """Check that the environment reads its sensors at every frame that the policy decides from.
-
-    Raises: ValueError where ``lerobot-eval`` would decide from older frames than fine-tuning does.
-    """
-    chunk, window = policy.n_action_steps, policy.n_obs_steps
-    ends = chunk * np.arange(1, env.read_every + 1)  # the schedule repeats after this many decisions at most
-    frames = ends[:, None] - np.arange(min(chunk, window))
-    if not env.read_schedule.reads(frames).all():
-        raise ValueError(
-            f"env.read_every={env.read_every} with env.read_window={env.read_window} skips frames that a"
-            f" policy with n_action_steps={chunk} and n_obs_steps={window} decides from;"
-            f" use --env.read_every={chunk} --env.read_window={min(chunk, window)}"
-        )
-
-
 def make_env_for(
     cfg: FinetunePipelineConfig, policy: VtDp3Policy, processors: tuple[Any, Any]
 ) -> DecisionEnv:
     """The environments of this rank.
 
-    Raises: ValueError for another environment type, or one that does not read what the policy needs.
+    Raises: ValueError for another environment type.
     """
     if not isinstance(cfg.env, VtRefineEnvConfig):
         raise ValueError(f"vtrefine-finetune needs --env.type=vtrefine, got {cfg.env.type}")
     config = policy.config
-    check_read_schedule(cfg.env, config)
     return make_decision_env(
         cfg.env, cfg.dppo.num_envs, *processors, config.n_obs_steps, config.n_action_steps
     )

@@ -103,6 +103,10 @@ class EpisodeState:
             getattr(self, item.name)[ids] = 0
         self.success_step[ids] = -1
 
+    def seated_s(self, dt_s: float) -> Array:
+        """(N,) for how long each plug has been seen seated at every control step; NaN where it is not."""
+        return np.where(self.hold_steps > 0, (self.hold_steps - 1) * dt_s, np.nan)
+
     def row(self, env: int) -> dict[str, Array]:
         """A copy of one world's row."""
         return {item.name: getattr(self, item.name)[env].copy() for item in fields(self)}

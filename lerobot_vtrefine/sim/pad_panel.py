@@ -1,5 +1,6 @@
 """Four tactile pads drawn as labelled heat maps, and the text beside a video frame (PIL and numpy only)."""
 
+from dataclasses import dataclass
 from functools import cache
 
 import numpy as np
@@ -15,7 +16,26 @@ _TEXT_PX = 14
 _GAP_PX = 6
 _BACKGROUND = (24, 26, 32)
 _INK = (226, 228, 232)
-_GOOD = (96, 214, 132)
+_GOOD, _BAD, _FAINT = (96, 214, 132), (240, 110, 96), (78, 82, 92)
+_RING_PX = 4
+
+
+@dataclass(frozen=True)
+class Progress:
+    """How far the episode is."""
+
+    step: int
+    seated_s: float
+    """For how long the plug has been seated without interruption; NaN while it is not."""
+    hold_s: float
+    """Seated for this long is a success."""
+    outcome: str = ""
+    """How the episode ended; empty while it runs."""
+
+    @property
+    def held(self) -> float:
+        """Share of the hold that is done, 0 to 1."""
+        return min(self.seated_s / self.hold_s, 1.0) if self.hold_s > 0 and self.seated_s > 0 else 0.0
 
 
 def panel_size(rows: int, cols: int) -> tuple[int, int]:
@@ -25,16 +45,15 @@ def panel_size(rows: int, cols: int) -> tuple[int, int]:
     ) + 2 * _TEXT_PX + _GAP_PX, cols * _TAXEL_PX + 2 * _GAP_PX
 
 
-def pad_panel(counts: NDArray, baseline: NDArray, rows: int, cols: int, status: str, success: bool) -> Frame:
-    """Draw `counts` - `baseline`, both (4, rows * cols) uint8, below each other with a status line above.
+def pad_panel(counts: NDArray, baseline: NDArray, rows: int, cols: int, progress: Progress) -> Frame:
+    """Draw `counts` - `baseline`, both (4, rows * cols) uint8, below each other, with the progress above.
 
     Row 0 of a pad is drawn at the top and column 0, the fingertip, on the left. Returns uint8 (H, W, 3).
     """
     height, width = panel_size(rows, cols)
     image = Image.new("RGB", (width, height), _BACKGROUND)
     draw = ImageDraw.Draw(image)
-    draw.text((_GAP_PX, _GAP_PX // 2), status, fill=_INK)
-    draw.text((_GAP_PX, _GAP_PX // 2 + _TEXT_PX), "SUCCESS" if success else "", fill=_GOOD)
+    _draw_progress(draw, width, progress)
     top = 2 * _TEXT_PX + _GAP_PX
     for label, reading, idle in zip(PAD_LABELS, counts, baseline, strict=True):
         above = np.clip(reading.astype(float) - idle, 0, None)
@@ -42,6 +61,19 @@ def pad_panel(counts: NDArray, baseline: NDArray, rows: int, cols: int, status: 
         image.paste(Image.fromarray(_heat_map(above.reshape(rows, cols))), (_GAP_PX, top + _TEXT_PX))
         top += rows * _TAXEL_PX + _TEXT_PX + _GAP_PX
     return np.asarray(image)
+
+
+def _draw_progress(draw: ImageDraw.ImageDraw, width: int, progress: Progress) -> None:
+    """Step, and hold or outcome, in two lines; beside them a ring that fills while the plug is seated."""
+    colour = _BAD if progress.outcome not in ("", "success") else _GOOD
+    seated = f"seated {progress.seated_s:.1f} of {progress.hold_s:.1f} s" if progress.seated_s >= 0 else ""
+    draw.text((_GAP_PX, _GAP_PX // 2), f"step {progress.step:3d}", fill=_INK)
+    draw.text((_GAP_PX, _GAP_PX // 2 + _TEXT_PX), progress.outcome.upper() or seated, fill=colour)
+    size = 2 * _TEXT_PX
+    ring = (width - _GAP_PX - size, _GAP_PX // 2, width - _GAP_PX, _GAP_PX // 2 + size)
+    draw.arc(ring, 0, 360, fill=_FAINT, width=_RING_PX)
+    if progress.held > 0:
+        draw.arc(ring, -90, -90 + 360 * progress.held, fill=colour, width=_RING_PX)
 
 
 def _heat_map(above: NDArray) -> Frame:

@@ -12,7 +12,8 @@ import numpy as np
 from numpy.typing import NDArray
 from PIL import Image
 
-from lerobot_vtrefine.sim.pad_panel import Frame, pad_panel, panel_size
+from lerobot_vtrefine.sim.pad_panel import Frame, Progress, pad_panel, panel_size
+from lerobot_vtrefine.sim.task import FAILURES
 
 if TYPE_CHECKING:
     from lerobot_vtrefine.sim.simulation import InsertionSim
@@ -66,11 +67,18 @@ class VideoRenderer:
             if self._scene
             else shaded_depth(raw["depth_mm"][0], self._sim.camera_intrinsics)
         )
-        success = bool(self._sim.metrics(ids)["success"][0])
-        status = f"step {int(self._sim.steps[self._env]):3d}"
-        panel = pad_panel(raw["tactile"][0], raw["tactile_baseline"][0], *_PAD_SHAPE, status, success)
+        panel = pad_panel(raw["tactile"][0], raw["tactile_baseline"][0], *_PAD_SHAPE, self._progress())
         joined = np.concatenate([_fit(scene, self._size), panel], axis=1)
         return np.ascontiguousarray(joined[: joined.shape[0] // 2 * 2, : joined.shape[1] // 2 * 2])
+
+    def _progress(self) -> Progress:
+        sim, env = self._sim, self._env
+        seen = sim.metrics(np.array([env]))
+        step, failure = int(sim.steps[env]), FAILURES[int(seen["failure"][0])]
+        outcome = "success" if seen["success"][0] else failure.replace("_", " ")
+        if outcome == "none":
+            outcome = "time out" if step >= sim.episode_steps else ""
+        return Progress(step, float(sim.seated_s[env]), sim.config.success.hold_s, outcome)
 
     def close(self) -> None:
         """Free the OpenGL context; later frames raise."""

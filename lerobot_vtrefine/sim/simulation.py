@@ -145,6 +145,11 @@ class InsertionSim:
         return self._episode.steps
 
     @property
+    def seated_s(self) -> Array:
+        """(N,) for how long each plug has been seated without interruption; NaN where it is not seated."""
+        return self._episode.seated_s(self.config.control_dt_s)
+
+    @property
     def camera_intrinsics(self) -> Array:
         """(4,) float32 fx, fy, cx, cy [pixels]."""
         return self.scene.camera.intrinsics
@@ -190,10 +195,7 @@ class InsertionSim:
                 else. None by default.
         """
         ids = self._checked(ids)
-        action = np.asarray(action, float)
-        shape = len(ids), self.scene.embodiment.num_joints
-        if action.shape != shape or not np.isfinite(action).all():
-            raise ValueError(f"action must be finite, of shape {shape}, got shape {action.shape}")
+        action = task.checked_action(action, (len(ids), self.scene.embodiment.num_joints))
         state = self._episode
         before = state.command[ids]
         wanted = task.servo_commands(self.scene.embodiment, action)
@@ -286,9 +288,7 @@ class InsertionSim:
         return self._describe(np.arange(1)).names
 
     def metrics(self, ids: Array | None = None) -> dict[str, Array]:
-        """How the episodes went so far, (m,) each; `failure` indexes `FAILURES`, times are NaN without
-        success.
-        """
+        """How the episodes went so far, (m,) each; `failure` indexes `FAILURES`, no success has time NaN."""
         ids = self._checked(ids)
         state = self._episode
         steps = np.where(state.success[ids], state.success_step[ids], np.nan)

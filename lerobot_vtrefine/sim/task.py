@@ -44,6 +44,18 @@ class Insertion:
     """Above the table."""
 
 
+def checked_action(action: Array, shape: tuple[int, int]) -> Array:
+    """Joint targets as float64 (m, J). Raises: ValueError for another shape, infinities and NaN."""
+    action = np.asarray(action, float)
+    if action.shape != shape:
+        raise ValueError(f"action must have shape {shape}, got {action.shape}")
+    wrong = np.argwhere(~np.isfinite(action))
+    if len(wrong):
+        row, joint = wrong[0].tolist()
+        raise ValueError(f"action must be finite: joint {joint} is to go to {action[row, joint]}")
+    return action
+
+
 def servo_commands(embodiment: Embodiment, targets: Array) -> Array:
     """Joint targets (m, J) -> servo commands (m, nu): clamped to the limits, one opening per gripper."""
     clamped = np.clip(targets, embodiment.lower, embodiment.upper)

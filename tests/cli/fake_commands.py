@@ -54,7 +54,10 @@ def evaluate(options: dict[str, str]) -> None:
     episodes, seed = int(options["eval.n_episodes"]), int(options["seed"])
     wins = 3 if "finetune" in options["policy.path"] else 1
     successes = [index % 4 < wins for index in range(episodes)]
-    videos = [output / "videos" / f"eval_episode_{index}.mp4" for index in range(min(4, episodes))]
+    videos = [
+        output / "videos" / f"eval_episode_{index}.mp4"
+        for index in range(min(int(options["env.video_episodes"]), episodes))
+    ]
     for video in videos:
         write_video(video)
     metrics = {"successes": successes, "video_paths": [str(video) for video in videos]}

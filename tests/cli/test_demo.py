@@ -7,6 +7,7 @@ from dataclasses import replace
 from itertools import pairwise
 from pathlib import Path
 
+import numpy as np
 import pytest
 from PIL import Image
 
@@ -44,6 +45,8 @@ def test_demo_end_to_end(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> 
     assert "imitation, failure (dropped), seed 8000001" in page
     with Image.open(config.output_dir / "demo.gif") as gif:
         assert gif.width == demo.GIF_WIDTH
+        gif.seek(gif.n_frames - 1)
+        assert np.asarray(gif.convert("RGB")).mean() > 215  # the video's last frame, which tells the outcome
 
 
 @pytest.mark.usefixtures("fake_commands")
@@ -87,14 +90,6 @@ def test_episodes_are_never_shared() -> None:
     assert ranges[-1][1] < 2**32
 
 
-def test_sensors_are_read_where_the_policy_reads_them() -> None:
-    config = DemoConfig(policy={"preset": "small", "n_action_steps": 4, "n_obs_steps": 3})
-    for stage in demo_stages(config):
-        reads = [part for part in stage.command if part.startswith("--env.read_")]
-        expected = ["--env.read_every=4", "--env.read_window=3"]
-        assert reads == ([] if stage.name in ("record", "pretrain") else expected)
-
-
 @pytest.mark.parametrize(
     ("flag", "message"),
     [
@@ -109,7 +104,7 @@ def test_sensors_are_read_where_the_policy_reads_them() -> None:
         ("--policy={n_action_step: 8}", "--policy: The fields `n_action_step` are not valid"),
         ("--policy={n_action_steps: 99}", "--policy: policy.n_action_steps=99 must be within"),
         ("--env={clearance_m: -1}", "--env: clearance_m must be above 0, got -1.0"),
-        ("--env={read_every: 3, read_window: 2}", "use --env.read_every=8 --env.read_window=2"),
+        ("--env={read_every: 8}", "--env: The fields `read_every` are not valid"),
         ("--degradation={lateral_std_m: -1}", "--degradation: degradation.lateral_std_m must be"),
     ],
 )

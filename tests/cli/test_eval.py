@@ -2,6 +2,7 @@ import json
 import sys
 from pathlib import Path
 
+import av
 import numpy as np
 import pytest
 from conftest import TINY_ENV
@@ -52,21 +53,49 @@ VECTORISATIONS = {
 def test_lerobot_eval_plays_the_same_episodes_in_every_vectorisation(evaluate, tmp_path):
     played = {}
     for name, flags in VECTORISATIONS.items():
-        info, rows = evaluate(name, *flags)
+        info, rows = evaluate(name, *flags, "--env.video_episodes=1")
         assert info["overall"]["n_episodes"] == 2
         assert [row["seed"] for row in rows] == [40, 41]
         assert all(0 < row["steps"] <= 5 and row["failure"] != "none" for row in rows)
         assert all(row["in_hand_shift_m"] >= 0 and row["peak_force_n"] >= 0 for row in rows)
         videos = sorted((tmp_path / name / "videos").rglob("*.mp4"))
-        assert len(videos) == 2
-        assert all(video.stat().st_size > 0 for video in videos)
+        assert [str(video) for video in videos] == info["overall"]["video_paths"]
+        pictures = [list(av.open(str(video)).decode(video=0)) for video in videos]
+        assert [len(frames) for frames in pictures] == [rows[0]["steps"]]
+        assert all(frame.to_ndarray(format="rgb24").std() > 20 for frame in pictures[0])
         played[name] = [row["in_hand_shift_m"] for row in rows]
     assert played["sync"] == pytest.approx(played["native"], rel=1e-3, abs=1e-6)
     assert played["async"] == pytest.approx(played["native"], rel=1e-3, abs=1e-6)
 
 
+def test_recording_by_lerobot_eval_can_be_loaded(evaluate, tmp_path):
+    from lerobot.datasets import LeRobotDataset
+
+    _, rows = evaluate("recorded", "--eval.recording=true")
+    for number, row in enumerate(rows):
+        root = tmp_path / "recorded" / "recordings" / "vtrefine_0" / f"env_{number}"
+        dataset = LeRobotDataset("local/recorded", root=root)
+        assert (dataset.num_episodes, len(dataset)) == (1, row["steps"])
+        frame = dataset[0]
+        assert frame["images.front_depth"].shape == (1, 12, 16)
+        assert frame["images.front_depth"].max() > 300  # mm
+        counts = frame["tactile.left_arm_left_finger"]
+        assert counts.shape == (384,)
+        assert counts.max() > 10
+        assert not (counts % 1).any()
+    assert not list((tmp_path / "recorded").rglob("*.mp4"))
+
+
+def test_frames_that_were_not_read_cannot_be_scored(evaluate, capsys, tmp_path):
+    with pytest.raises(SystemExit) as ended:
+        evaluate("skipping", "--env.read_every=16")
+    assert ended.value.code == 2
+    assert "unrecognized arguments: --env.read_every=16" in capsys.readouterr().err
+    assert not (tmp_path / "skipping").exists()
+
+
 def test_surplus_episodes_are_dropped_and_the_others_are_a_fine_tunings_result(evaluate, tmp_path):
-    info, rows = evaluate("run/eval", "--eval.n_episodes=3")
+    info, rows = evaluate("run/eval", "--eval.n_episodes=3", "--env.video_episodes=0")
     assert [row["seed"] for row in rows] == [40, 41]
 
     folder, dppo = tmp_path / "run", SmallDppo(iterations=1)

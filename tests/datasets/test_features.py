@@ -49,9 +49,10 @@ def test_environment_spaces_match_the_observation(make_raw: MakeRaw) -> None:
     observation = raw_to_env_observation(make_raw(np.random.default_rng(0), 3.0))
     shapes = env_observation_shapes(24, 32)
     assert set(shapes) == set(observation)
-    for key, (shape, dtype) in shapes.items():
+    for key, (shape, highest) in shapes.items():
         assert observation[key].shape == shape
-        assert observation[key].dtype == dtype
+        assert observation[key].dtype == np.float32
+        assert (highest == 255.0) == key.startswith(("tactile.", "tactile_baseline."))
     assert set(env_key_map()) == {*shapes, "action"}
 
 

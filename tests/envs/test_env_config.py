@@ -1,9 +1,11 @@
 from pathlib import Path
 
 import draccus
+import numpy as np
 import pytest
 import yaml
 from draccus.utils import ParsingError
+from fake_sim import FakeSim
 from lerobot.configs import FeatureType
 from lerobot.configs.eval import EvalPipelineConfig
 from lerobot.envs.configs import EnvConfig
@@ -11,7 +13,8 @@ from lerobot.envs.factory import make_env
 from lerobot.envs.utils import env_to_policy_features
 
 from lerobot_vtrefine.datasets.features import DEPTH_KEY, TACTILE_KEYS
-from lerobot_vtrefine.envs import VtRefineEnvConfig
+from lerobot_vtrefine.envs import VtRefineEnvConfig, vector_env
+from lerobot_vtrefine.envs.episodes import Episodes
 from lerobot_vtrefine.sim.config import TaskConfig
 
 ENV_FILES = sorted((Path(__file__).parents[2] / "configs" / "env").glob("*.yaml"))
@@ -61,7 +64,7 @@ def test_policy_features_have_the_datasets_keys_and_shapes():
     features = env_to_policy_features(config)
     height, width = config.camera_size
     assert features[DEPTH_KEY].shape == (1, height, width)
-    assert features[DEPTH_KEY].type is FeatureType.VISUAL
+    assert features[DEPTH_KEY].type is FeatureType.STATE  # no video can hold millimetres
     assert features[TACTILE_KEYS[0]].shape == (384,)
     assert features["action"].shape == (16,)
 
@@ -72,6 +75,17 @@ def test_environment_files_parse_and_hold_only_env_and_eval(path: Path):
     config = draccus.parse(EvalPipelineConfig, config_path=path, args=[])
     assert isinstance(config.env, VtRefineEnvConfig)
     assert config.env.scene_config.start == config.env.start
+
+
+@pytest.mark.parametrize("path", ENV_FILES, ids=lambda path: path.stem)
+def test_environment_files_suit_policies_of_every_chunk_length(path: Path, monkeypatch: pytest.MonkeyPatch):
+    """A policy may decide at any step: each must hand out its own frame."""
+    config = draccus.parse(EvalPipelineConfig, config_path=path, args=[]).env
+    monkeypatch.setattr(vector_env, "make_episodes", lambda config, n: Episodes(FakeSim(n)))
+    env = vector_env.VtRefineVectorEnv(config, 1)
+    env.reset(seed=[1])
+    stamps = [int(env.step(np.zeros((1, 16)))[0]["tactile.left_arm_left_finger"][0, 0]) for _ in range(9)]
+    assert stamps == list(range(2, 11))
 
 
 def test_there_are_environment_files():

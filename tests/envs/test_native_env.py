@@ -1,9 +1,9 @@
 from dataclasses import replace
+from functools import partial
 
 import numpy as np
 import pytest
 import torch
-from draccus.utils import ParsingError
 from fake_sim import FakeSim
 from lerobot.envs.utils import preprocess_observation
 
@@ -13,9 +13,9 @@ from lerobot_vtrefine.embodiments import get_embodiment
 from lerobot_vtrefine.envs import VtRefineEnvConfig
 from lerobot_vtrefine.envs.episode_log import EpisodeLog, read_episode_log
 from lerobot_vtrefine.envs.episodes import Episodes
-from lerobot_vtrefine.envs.schedule import ReadSchedule
+from lerobot_vtrefine.envs.rendering import LazyFrames, eval_frame
 from lerobot_vtrefine.envs.single_env import VtRefineEnv
-from lerobot_vtrefine.envs.vector_env import LazyFrames, VtRefineVectorEnv
+from lerobot_vtrefine.envs.vector_env import VtRefineVectorEnv
 from lerobot_vtrefine.sim.config import SceneConfig, ShearConfig
 
 
@@ -100,6 +100,8 @@ def test_info_follows_lerobots_format(make_env):
     assert infos[2]["_final_info"].tolist() == [True, False]
     assert infos[9]["is_success"].tolist() == [True, False]
     assert infos[2]["final_info"]["in_hand_shift_m"][0] == 1e-3
+    assert infos[9]["final_info"]["failure"].tolist() == ["none", "time_out"]
+    assert infos[9]["final_info"]["steps"].tolist() == [3, 10]
 
 
 def test_observations_fit_the_space_and_the_dataset_keys(make_env, monkeypatch):
@@ -120,30 +122,11 @@ def test_observations_fit_the_space_and_the_dataset_keys(make_env, monkeypatch):
     assert all(value.dtype == torch.float32 for value in batch.values())
 
 
-@pytest.mark.parametrize(
-    ("every", "window", "read"), [(1, 1, range(17)), (8, 2, [0, 7, 8, 15, 16]), (4, 1, [0, 4, 8, 12, 16])]
-)
-def test_read_schedule(every: int, window: int, read):
-    assert np.flatnonzero(ReadSchedule(every, window).reads(np.arange(17))).tolist() == list(read)
-
-
-def test_read_schedule_rejects_a_window_longer_than_its_period():
-    with pytest.raises(ParsingError, match="read_window"):
-        VtRefineEnvConfig(read_every=2, read_window=3)
-
-
-def test_unread_steps_keep_the_last_frame_but_show_fresh_joints(make_env):
-    env = make_env(1, read_every=8, read_window=2)
+def test_every_step_hands_out_the_frame_of_that_step(make_env):
+    env = make_env(1)
     env.reset(seed=[1])
-    sim = env.episodes.sim
-    stamps, joints = [], []
-    for step in range(9):
-        observation, *_ = env.step(np.full((1, 16), step, np.float32))
-        stamps.append(int(observation["tactile.left_arm_left_finger"][0, 0]))
-        joints.append(float(observation["agent_pos"][0, 0]))
-    assert stamps == [1] * 6 + [8, 9, 9]
-    assert joints == list(range(9))
-    assert len(sim.observed) == 3  # reset, steps 7 and 8
+    stamps = [int(env.step(hold(env))[0]["tactile.left_arm_left_finger"][0, 0]) for _ in range(9)]
+    assert stamps == list(range(2, 11))
 
 
 def test_metrics_log_has_a_row_per_episode(make_env, tmp_path):
@@ -236,14 +219,25 @@ def test_videos_show_the_first_episodes_and_draw_only_what_moved(make_env, monke
     assert FakeRenderer.drawn == [0, 1] * 3 + [1] * 2  # the first episode ended at step 3
     env.reset(seed=[2, 3])
     frames = np.stack(env.call("render")[:2])  # episodes 2 and 3, of which the first 3 are shown
-    assert frames[:, 0, 0, 0].tolist() == [10, 0]
+    assert frames[:, 0, 0, 0].tolist() == [10]
+    assert [frame[0, 0, 0] for frame in env.render()] == [10, 11]  # asked directly, it draws all
 
 
 def test_no_video_starts_no_renderer(make_env, monkeypatch):
     monkeypatch.setattr("lerobot_vtrefine.sim.render.VideoRenderer", None)
     env = make_env(2, video_episodes=0)
     env.reset(seed=[0, 1])
-    assert np.stack(env.call("render")[:2]).max() == 0
+    moments = [np.stack(env.call("render")[:2]) for _ in range(3)]
+    assert len(np.stack(moments, axis=1)) == 0  # what LeRobot makes videos of
+
+
+def test_the_last_frame_of_an_episode_is_the_last_that_lerobot_keeps():
+    frames = [eval_frame(partial(np.full, (2, 4, 3), step, np.uint8), wanted=True) for step in range(4)]
+    moments = [np.stack([frame]) for frame in frames]  # after the reset and after steps 1 to 3
+    kept = np.stack(moments, axis=1)[0][:3]  # LeRobot: as many as there were steps
+    assert kept[:, 0, 0, 0].tolist() == [1, 2, 3]
+    assert type(kept) is np.ndarray
+    assert np.concatenate(frames).shape == (8, 4, 3)  # everything else is as for any array
 
 
 def test_shear_is_part_of_info_when_switched_on():

@@ -247,33 +247,3 @@ def test_policy_of_another_type_is_refused(finetune, tmp_path, capsys):
     ACTConfig(device="cpu").save_pretrained(other)
     assert finetune(tmp_path / "run", policy=other) == 2
     assert "holds a policy of type act; vtrefine-finetune needs vt_dp3" in capsys.readouterr().err
-
-
-@pytest.mark.parametrize(
-    ("schedule", "policy", "fits"),
-    [
-        ((8, 2), (8, 2), True),
-        ((1, 1), (5, 3), True),  # every step is read
-        ((4, 2), (8, 2), True),
-        ((8, 3), (8, 2), True),
-        ((8, 2), (4, 2), False),
-        ((8, 1), (8, 2), False),
-        ((3, 2), (8, 2), False),
-    ],
-)
-def test_read_schedule_must_fit_the_policy(schedule, policy, fits):
-    env = pipeline.VtRefineEnvConfig(read_every=schedule[0], read_window=schedule[1])
-    config = pipeline.VtDp3Config(
-        preset="small", device="cpu", n_action_steps=policy[0], n_obs_steps=policy[1]
-    )
-    if fits:
-        pipeline.check_read_schedule(env, config)
-    else:
-        words = f"use --env.read_every={policy[0]} --env.read_window={policy[1]}"
-        with pytest.raises(ValueError, match=words):
-            pipeline.check_read_schedule(env, config)
-
-
-def test_command_refuses_a_schedule_that_skips_frames(finetune, tmp_path, capsys):
-    assert finetune(tmp_path / "run", "--env.read_every=7", "--env.read_window=1") == 2
-    assert "skips frames" in capsys.readouterr().err

@@ -1,13 +1,14 @@
 """Video frames: both ways to draw the scene, pads beside it, and no trace left in the episode."""
 
 import sys
+from itertools import combinations
 
 import numpy as np
 import pytest
 
 from lerobot_vtrefine.sim import headless, render
-from lerobot_vtrefine.sim.config import SceneConfig
-from lerobot_vtrefine.sim.pad_panel import pad_panel, panel_size
+from lerobot_vtrefine.sim.config import SceneConfig, TaskConfig
+from lerobot_vtrefine.sim.pad_panel import Progress, pad_panel, panel_size
 from lerobot_vtrefine.sim.render import VideoRenderer, shaded_depth
 from lerobot_vtrefine.sim.simulation import InsertionSim
 
@@ -91,7 +92,7 @@ def test_panel_brightens_where_a_pad_is_pressed() -> None:
     idle = np.full((4, 384), 20, np.uint8)
     pressed = idle.copy()
     pressed[2, :32] = 180  # row 0 of the third pad
-    before, after = (pad_panel(counts, idle, 12, 32, "step 3", success=False) for counts in (idle, pressed))
+    before, after = (pad_panel(counts, idle, 12, 32, Progress(3, np.nan, 1.0)) for counts in (idle, pressed))
     rows, cols = np.nonzero(np.abs(after.astype(int) - before).sum(-1) > 60)
     height, width = panel_size(12, 32)
     assert before.shape == (height, width, 3)
@@ -100,10 +101,38 @@ def test_panel_brightens_where_a_pad_is_pressed() -> None:
     assert np.ptp(cols) > 0.8 * width
 
 
-def test_panel_tells_success() -> None:
+def test_panel_shows_how_the_hold_fills() -> None:
+    """The more of the hold is done, the more of the ring is green; an outcome takes the second line."""
     idle = np.zeros((4, 384), np.uint8)
-    no, yes = (pad_panel(idle, idle, 12, 32, "step 3", success) for success in (False, True))
-    assert (no != yes).any()
+    green = []
+    for seated_s in (np.nan, 0.0, 0.3, 0.6, 1.0):
+        panel = pad_panel(idle, idle, 12, 32, Progress(3, seated_s, hold_s=1.0)).astype(int)[:34, -40:]
+        green.append(int((panel[..., 1] - panel[..., 0] > 60).sum()))
+    assert green[0] == green[1] == 0
+    assert np.all(np.diff(green[1:]) > 50)
+    ends = ("", "success", "contact force", "time out")
+    panels = [pad_panel(idle, idle, 12, 32, Progress(3, np.nan, 1.0, outcome))[:34] for outcome in ends]
+    assert all((one != other).any() for one, other in combinations(panels, 2))
+
+
+def test_frame_tells_hold_and_outcome(monkeypatch: pytest.MonkeyPatch) -> None:
+    told = []
+    monkeypatch.setattr(render, "pad_panel", lambda *given: told.append(given[-1]) or pad_panel(*given))
+    sim = InsertionSim(SceneConfig(start="grasped"), TaskConfig(episode_steps=2), num_envs=2, num_threads=1)
+    sim.reset(np.arange(2), np.arange(2))
+    renderer = VideoRenderer(sim, 1, backend="rays")
+    state = sim.get_state(1)
+    for held, success, failure in ((0, False, 0), (1, False, 0), (4, False, 0), (11, True, 0), (0, False, 2)):
+        state["episode"] |= {"hold_steps": held, "success": success, "failure": failure}
+        sim.set_state(1, state)
+        renderer.frame()
+    for _ in range(2):
+        sim.set_state(1, state | {"episode": state["episode"] | {"failure": 0}})
+        sim.step(sim.command_targets())
+        state = sim.get_state(1)
+    renderer.frame()
+    assert [progress.held for progress in told] == pytest.approx([0.0, 0.0, 0.3, 1.0, 0.0, 0.0])
+    assert [progress.outcome for progress in told] == ["", "", "", "success", "contact force", "time out"]
 
 
 def test_shading_tells_surfaces_apart_and_leaves_holes_dark() -> None:

@@ -105,7 +105,7 @@ class DemoConfig:
     finetune_envs: int = 128
     """Simulations that DPPO collects from."""
     env: dict[str, Any] = field(default_factory=default_env)
-    """Flags of the environment, ``--env.KEY=VALUE``; its read schedule follows the policy."""
+    """Flags of the environment, ``--env.KEY=VALUE``."""
     degradation: dict[str, Any] = field(default_factory=default_degradation)
     """Flags of the expert's imperfections, ``--degradation.KEY=VALUE``."""
     policy: dict[str, Any] = field(default_factory=default_policy)
@@ -131,13 +131,12 @@ class DemoConfig:
     def _check_children(self) -> None:
         """Parse what the stages will parse. Imports LeRobot, which ``--help`` can do without."""
         from lerobot_vtrefine.cli.pipeline import child_configs
-        from lerobot_vtrefine.finetune.pipeline import check_read_schedule
 
         child_configs.parse_degradation(self.degradation)
         numbers = {"iterations": self.finetune_iterations, "num_envs": self.finetune_envs}
         child_configs.parse_dppo(self.dppo | numbers)
-        env, policy = child_configs.parse_env(acting_env(self)), child_configs.parse_policy(self.policy)
-        check_read_schedule(env, policy)
+        child_configs.parse_env(self.env)
+        child_configs.parse_policy(self.policy)
 
     @property
     def dataset_dir(self) -> Path:
@@ -186,29 +185,13 @@ def record_stage(config: DemoConfig) -> Stage:
         f"--num_episodes={config.num_demos}",
         f"--num_envs={config.demo_envs}",
         f"--seed={config.seed * SEED_STRIDE}",
-        *flags("env", {"type": "vtrefine"} | recording_env(config)),
+        *flags("env", {"type": "vtrefine"} | config.env),
         *flags("degradation", config.degradation),
     ]
     product = config.dataset_dir / "meta" / "info.json"
     return Stage(
         "record", "Record demonstrations", tuple(command), config.dataset_dir, product, resumable=True
     )
-
-
-def recording_env(config: DemoConfig) -> dict[str, Any]:
-    """The environment's flags without the read schedule: a recording holds every frame."""
-    return {key: value for key, value in config.env.items() if not key.startswith("read_")}
-
-
-def acting_env(config: DemoConfig) -> dict[str, Any]:
-    """The environment's flags where the policy acts: sensors are read only where it reads them."""
-    from lerobot_vtrefine.cli.pipeline.child_configs import parse_policy
-
-    policy = parse_policy(config.policy)
-    chunk = policy.n_action_steps
-    derived = {"read_every": chunk, "read_window": min(chunk, policy.n_obs_steps)}
-    given = {key: config.env[key] for key in derived if key in config.env}
-    return recording_env(config) | derived | given
 
 
 def pretrain_stage(config: DemoConfig) -> Stage:
@@ -249,7 +232,7 @@ def evaluation_stage(config: DemoConfig, policy: str, ablation: str = "none") ->
         "lerobot-eval",
         f"--policy.path={config.checkpoint(policy)}",
         f"--policy.device={config.device}",
-        *flags("env", {"type": "vtrefine"} | acting_env(config)),
+        *flags("env", {"type": "vtrefine"} | config.env),
         f"--env.metrics_path={output / 'episodes.jsonl'}",
         f"--env.video_episodes={config.videos if ablation == 'none' else 0}",
         f"--eval.n_episodes={episodes}",
@@ -272,7 +255,7 @@ def finetune_stage(config: DemoConfig) -> Stage:
         "vtrefine-finetune",
         f"--policy.path={config.checkpoint('pretrain')}",
         f"--policy.device={config.device}",
-        *flags("env", {"type": "vtrefine"} | acting_env(config)),
+        *flags("env", {"type": "vtrefine"} | config.env),
         *flags("dppo", config.dppo),
         f"--dppo.iterations={config.finetune_iterations}",
         f"--dppo.num_envs={config.finetune_envs}",

@@ -22,14 +22,13 @@ SUCCESS_METRICS = ("time_to_success_s", *METRICS)
 CLEAR_LIFT = 0.2
 
 
-def load_evaluation(directory: Path, first_seed: int, num_videos: int = 0) -> dict[str, Any]:
+def load_evaluation(directory: Path, first_seed: int) -> dict[str, Any]:
     """One evaluation as ``lerobot-eval`` and the environment's episode log left it.
 
     Returns:
         ``success``, ``episodes``, ``rate``, ``ci95``, ``eval_seconds``, ``seeds``, ``metrics`` (quantiles
         over all episodes and over successes; SI units), ``failures`` (count by reason) and ``videos``
-        (``[{"path", "seed", "success", "failure"}]``, the first ``num_videos``: ``lerobot-eval`` writes ten,
-        the environment draws fewer).
+        (``[{"path", "seed", "success", "failure"}]``).
     """
     info = json.loads((directory / "eval_info.json").read_text(encoding="utf-8"))
     task = info["per_task"][0]["metrics"]
@@ -38,7 +37,7 @@ def load_evaluation(directory: Path, first_seed: int, num_videos: int = 0) -> di
     reasons = {row["seed"]: failure_name(row) for row in rows if not row["success"]}
     videos = [
         {"path": path, "seed": seed, "success": successes[seed - first_seed], "failure": reasons.get(seed)}
-        for seed, path in enumerate(task.get("video_paths", [])[:num_videos], first_seed)
+        for seed, path in enumerate(task.get("video_paths", []), first_seed)
     ]
     return proportion(sum(successes), len(successes)) | {
         "eval_seconds": round(info["overall"]["eval_s"], 1),
@@ -68,7 +67,7 @@ def collect_results(config: DemoConfig, records: Sequence[StageRecord]) -> dict[
     """Everything of ``results.json``; ``pretrain`` and ``finetune`` first."""
     seconds = {record.name: record.seconds for record in records}
     policies = {
-        policy: load_evaluation(config.evaluation_dir(policy), config.eval_seed, config.videos)
+        policy: load_evaluation(config.evaluation_dir(policy), config.eval_seed)
         | {"seconds": seconds[policy], "modalities": config.modalities}
         for policy in ("pretrain", "finetune")
     }
