@@ -2,17 +2,18 @@
 
 from collections.abc import Mapping
 
-from lerobot_vtrefine.datasets import arrays, card
+from lerobot_vtrefine.datasets import arrays, card, safe_recording
 from lerobot_vtrefine.drivers.config import PadConfig
 from lerobot_vtrefine.robots import live_view
 
 
 def extend_lerobot(pads: Mapping[str, PadConfig]) -> None:
-    """Lets stock commands record array columns, describe them on dataset cards, and show pads as pictures.
+    """Lets stock commands record array columns, lose no saved episode, describe pads on cards and show them.
 
     Raises:
         RuntimeError: a LeRobot version whose recorder was not tested with array columns.
     """
     arrays.install()
     card.install()
+    safe_recording.install()
     live_view.install(pads)
