@@ -1,15 +1,17 @@
 """A LeRobotDataset that grows in commits: a crash or a full disk costs at most what came after the last.
 
 LeRobot's Parquet files are unreadable until they are closed, while ``info.json`` already counts their
-episodes. A commit closes them and notes in ``meta/recording.json`` which files belong to it and which seed
-every episode came from. While episodes are being added, copies of ``info.json`` and ``stats.json`` lie beside
-them, so that a rollback returns to the last commit without needing space.
+episodes. So episodes are added to a copy beside the dataset, which shares the closed Parquet files with it; a
+commit closes the new ones, notes in ``meta/recording.json`` which files belong to it and which seed every
+episode came from, and lets the copy take the dataset's place in one step. Whatever happens in between, the
+dataset is that of the last commit.
 """
 
 import errno
 import json
 import os
 import shutil
+from collections.abc import Sequence
 from pathlib import Path
 from types import TracebackType
 from typing import Any, Self
@@ -20,9 +22,20 @@ from lerobot.datasets.lerobot_dataset import LeRobotDataset
 from lerobot_vtrefine.datasets.features import ACTION_KEY, raw_to_frame
 from lerobot_vtrefine.envs.demonstrations import Demonstration
 from lerobot_vtrefine.envs.fast_saving import fast_saving
+from lerobot_vtrefine.folders import (
+    check_replaceable,
+    link_or_copy,
+    put_in_place,
+    recover,
+    working_folder,
+    write_in_place,
+)
 
 LEDGER = Path("meta") / "recording.json"
-SUMMARIES = (Path("meta") / "info.json", Path("meta") / "stats.json")
+INFO = Path("meta") / "info.json"
+TASKS = Path("meta") / "tasks.parquet"
+DATASET_FOLDERS = ("data", "meta", "images")
+"""What is the dataset's in its folder; anything else there is the user's."""
 COMMIT_EVERY = 20
 IMAGE_WRITER_THREADS = 2
 
@@ -42,7 +55,7 @@ class DemoDataset:
 
     Raises:
         FileExistsError: if ``root`` holds something that was not recorded here.
-        ValueError: if it was recorded with other settings.
+        ValueError: if it was recorded with other settings, is incomplete, or cannot be replaced as a whole.
     """
 
     def __init__(
@@ -57,19 +70,19 @@ class DemoDataset:
         first_seed: int,
     ) -> None:
         self.root = Path(root)
+        self._place = self.root.resolve()
+        self._work = working_folder(self._place)
         self._task = task
         self._robot_type = robot_type
         self._repo_id, self._fps, self._features = repo_id, fps, features
-        self._ledger: dict[str, Any] = {
-            "settings": json.loads(json.dumps(settings)),
-            "next_seed": first_seed,
-            "files": [],
-            "episodes": [],
-        }
+        self._nothing = {"settings": json.loads(json.dumps(settings)), "next_seed": first_seed, "files": []}
+        self._ledger: dict[str, Any] = {**self._nothing, "episodes": []}
         self._dataset: LeRobotDataset | None = None
         self._uncommitted = 0
         self._saving = False
-        if self.root.is_dir() and any(self.root.iterdir()):
+        recover(self._place)
+        check_replaceable(self._place)
+        if self._place.is_file() or (self._place.is_dir() and any(self._place.iterdir())):
             self._continue()
 
     @property
@@ -108,27 +121,21 @@ class DemoDataset:
         if self._dataset is not None:
             self._dataset.finalize()
             self._dataset = None
-        self._ledger["files"] = self._parquet_files()
-        part = (self.root / LEDGER).with_suffix(".part")
-        part.write_text(json.dumps(self._ledger, indent=1), encoding="utf-8")
-        part.replace(self.root / LEDGER)
-        for summary in SUMMARIES:
-            _copy_of(self.root / summary).unlink(missing_ok=True)
+            shutil.rmtree(self._work / "images", ignore_errors=True)
+            self._ledger["files"] = _parquet_files(self._work)
+            (self._work / LEDGER).write_text(self._ledger_text(), encoding="utf-8")
+            put_in_place(self._work, self._place, whole=DATASET_FOLDERS)
+        elif (self._place / LEDGER).is_file():  # the seeds tried since
+            write_in_place(self._place, LEDGER, self._ledger_text())
         self._uncommitted = 0
 
     def rollback(self) -> None:
-        """Return to the last commit: drop later files, put its ``info.json`` and ``stats.json`` back."""
+        """Return to the last commit: drop what was saved since."""
         self._abandon()
-        self._ledger = json.loads((self.root / LEDGER).read_text(encoding="utf-8"))
-        for name in set(self._parquet_files()) - set(self._ledger["files"]):
-            (self.root / name).unlink()
-        shutil.rmtree(self.root / "images", ignore_errors=True)
-        for summary in SUMMARIES:
-            if _copy_of(self.root / summary).is_file():  # a rename needs no space on the disk
-                _copy_of(self.root / summary).replace(self.root / summary)
+        recover(self._place)
+        committed = (self._place / LEDGER).is_file()
+        self._ledger = _read_ledger(self._place) if committed else {**self._nothing, "episodes": []}
         self._uncommitted = 0
-        if not self._ledger["episodes"]:
-            shutil.rmtree(self.root)
 
     def __enter__(self) -> Self:
         return self
@@ -138,8 +145,7 @@ class DemoDataset:
     ) -> None:
         if not self._saving:  # also after Ctrl-C while simulating
             try:
-                if self.root.is_dir():
-                    self.commit()
+                self.commit()
                 return
             except OSError as failure:
                 self._recover(failure)
@@ -148,12 +154,8 @@ class DemoDataset:
 
     def _recover(self, error: BaseException | None) -> None:
         """Return to the last commit after a failed save; a full disk becomes one clear error."""
-        full = disk_is_full(error, self.root)
-        if (self.root / LEDGER).is_file():
-            self.rollback()
-        else:  # failed while the dataset was being created
-            self._abandon()
-            shutil.rmtree(self.root, ignore_errors=True)
+        full = disk_is_full(error, self._place)
+        self.rollback()
         if full:
             saved = self.num_episodes
             raise OSError(
@@ -164,45 +166,49 @@ class DemoDataset:
     def _open(self) -> LeRobotDataset:
         if self._dataset is not None:
             return self._dataset
-        if self._ledger["episodes"]:
-            for summary in SUMMARIES:
-                _keep_copy(self.root / summary)
+        shutil.rmtree(self._work, ignore_errors=True)
+        if self._ledger["files"]:
+            self._copy_committed()
             self._dataset = LeRobotDataset.resume(
-                self._repo_id, root=self.root, image_writer_threads=IMAGE_WRITER_THREADS
+                self._repo_id, root=self._work, image_writer_threads=IMAGE_WRITER_THREADS
             )
             return self._dataset
-        if self.root.is_dir():
-            self.root.rmdir()
+        self._place.parent.mkdir(parents=True, exist_ok=True)
         self._dataset = LeRobotDataset.create(
             self._repo_id,
             self._fps,
             self._features,
-            root=self.root,
+            root=self._work,
             robot_type=self._robot_type,
             use_videos=False,
             image_writer_threads=IMAGE_WRITER_THREADS,
         )
-        (self.root / LEDGER).write_text(json.dumps(self._ledger), encoding="utf-8")
         return self._dataset
 
+    def _copy_committed(self) -> None:
+        """Begin the next commit: the files of the last one, those that LeRobot changes in place as copies."""
+        committed = set(self._ledger["files"])
+        for path in _files(self._place, DATASET_FOLDERS[:2]):
+            name = path.relative_to(self._place)
+            (self._work / name).parent.mkdir(parents=True, exist_ok=True)
+            if str(name) in committed:
+                link_or_copy(str(path), str(self._work / name))
+            else:
+                shutil.copyfile(path, self._work / name)
+
     def _continue(self) -> None:
-        if not (self.root / LEDGER).is_file():
-            raise FileExistsError(
-                f"{self.root} exists and is no recording of this command; choose another --root or remove it"
-            )
-        wanted = self._ledger["settings"]
-        self.rollback()
-        recorded = self._ledger["settings"]
-        changed = sorted(key for key in wanted if wanted[key] != recorded.get(key))
+        recorded = _read_ledger(self._place)
+        wanted, used = self._ledger["settings"], recorded["settings"]
+        changed = sorted(key for key in wanted if wanted[key] != used.get(key))
         if changed:
             raise ValueError(
                 f"{self.root} was recorded with other settings ({', '.join(changed)});"
                 " use the same ones to continue, or choose another --root"
             )
+        self._ledger = recorded
 
-    def _parquet_files(self) -> list[str]:
-        paths = [*self.root.glob("data/**/*.parquet"), *self.root.glob("meta/episodes/**/*.parquet")]
-        return sorted(str(path.relative_to(self.root)) for path in paths)
+    def _ledger_text(self) -> str:
+        return json.dumps(self._ledger, indent=1)
 
     def _abandon(self) -> None:
         """Drop the open dataset without letting its destructor write anything more."""
@@ -226,16 +232,37 @@ def disk_is_full(error: BaseException | None, folder: Path) -> bool:
     return status.f_bavail * status.f_frsize < 2**20
 
 
-def _keep_copy(path: Path) -> None:
-    """Copy a summary beside itself, whole or not at all: a rollback puts the copy in place of the file."""
-    part = path.with_name(f"{path.name}.part")
+def _read_ledger(root: Path) -> dict[str, Any]:
+    """The record of the last commit; FileExistsError without one, ValueError if it does not fit the files."""
+    path = root / LEDGER
+    if not path.is_file():
+        raise FileExistsError(
+            f"{root} exists and is no recording of this command; choose another --root or remove it"
+        )
     try:
-        shutil.copyfile(path, part)
-    except OSError:
-        part.unlink(missing_ok=True)
-        raise
-    part.replace(_copy_of(path))
+        ledger = json.loads(path.read_text(encoding="utf-8"))
+        episodes = json.loads((root / INFO).read_text(encoding="utf-8"))["total_episodes"]
+        whole = (
+            isinstance(ledger["settings"], dict)
+            and isinstance(ledger["next_seed"], int)
+            and [row["episode_index"] for row in ledger["episodes"]] == list(range(episodes))
+            and ledger["files"] == _parquet_files(root)
+        )
+    except (OSError, ValueError, KeyError, TypeError, RecursionError):
+        whole = False
+    if not whole:
+        raise ValueError(
+            f"{path} does not fit the dataset's files (damaged, edited, or an older version's): this"
+            " recording cannot be continued; choose another --root or remove the folder"
+        )
+    return ledger
 
 
-def _copy_of(path: Path) -> Path:
-    return path.with_name(f"{path.name}.committed")
+def _parquet_files(root: Path) -> list[str]:
+    """Files of episodes below ``root``, as ``meta/recording.json`` lists them."""
+    names = (path.relative_to(root) for path in _files(root, DATASET_FOLDERS[:2]))
+    return sorted(str(name) for name in names if name.suffix == ".parquet" and name != TASKS)
+
+
+def _files(root: Path, folders: Sequence[str]) -> list[Path]:
+    return [path for folder in folders for path in sorted((root / folder).rglob("*")) if path.is_file()]

@@ -10,7 +10,6 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-import torch
 import torch.distributed as dist
 from lerobot.common.train_utils import get_step_checkpoint_dir
 from lerobot.utils.constants import (
@@ -23,8 +22,9 @@ from lerobot.utils.random_utils import deserialize_rng_state, serialize_rng_stat
 
 from lerobot_vtrefine.finetune.distributed import barrier, num_ranks, rank_index
 from lerobot_vtrefine.finetune.dppo import TrainState
+from lerobot_vtrefine.finetune.state_file import load_state, save_state
 
-STATE_NAME = "dppo_state.pt"
+STATE_NAME = "dppo_state.safetensors"
 
 
 @dataclass
@@ -74,7 +74,7 @@ def save_checkpoint(output_dir: Path, saveable: Saveable, state: TrainState, tot
         shutil.rmtree(partial, ignore_errors=True)
         saveable.save(partial / PRETRAINED_MODEL_DIR)
         (partial / TRAINING_STATE_DIR).mkdir()
-        torch.save(_state_dict(state) | {"ranks": ranks}, partial / TRAINING_STATE_DIR / STATE_NAME)
+        save_state(_state_dict(state) | {"ranks": ranks}, partial / TRAINING_STATE_DIR / STATE_NAME)
         shutil.rmtree(final, ignore_errors=True)
         partial.rename(final)
         point_last_at(final)
@@ -86,12 +86,12 @@ def load_training_state(checkpoint: Path, state: TrainState) -> None:
 
     Raises:
         FileNotFoundError: the checkpoint has no DPPO training state.
-        ValueError: it was written by another number of ranks.
+        ValueError: it is damaged, or was written by another number of ranks.
     """
     path = checkpoint / TRAINING_STATE_DIR / STATE_NAME
     if not path.is_file():
-        raise FileNotFoundError(f"{path} is missing: this is not a checkpoint of vtrefine-finetune")
-    saved = torch.load(path, map_location="cpu", weights_only=True)
+        raise FileNotFoundError(f"{path} is missing: this is not a checkpoint of this vtrefine-finetune")
+    saved = load_state(path)
     if len(saved["ranks"]) != num_ranks():
         raise ValueError(f"{checkpoint} was written by {len(saved['ranks'])} processes: resume with as many")
     state.critic.load_state_dict(saved["critic"])

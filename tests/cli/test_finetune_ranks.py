@@ -14,6 +14,7 @@ from lerobot.common.train_utils import update_last_checkpoint
 
 from lerobot_vtrefine.finetune.logger import read_progress
 from lerobot_vtrefine.finetune.seeds import EVALUATION_SEEDS, TRAINING_SEEDS
+from lerobot_vtrefine.finetune.state_file import load_state
 
 BIN = Path(sys.executable).parent
 ENVS, EPISODE_STEPS, ITERATIONS, SEED = 2, 8, 2, 40
@@ -60,8 +61,8 @@ def seeds(episodes: Path) -> list[int]:
 
 def trained_state(output: Path) -> dict:
     """Critic, optimisers and every rank's random states after the last iteration."""
-    path = output / "checkpoints" / f"{ITERATIONS:06d}" / "training_state" / "dppo_state.pt"
-    return torch.load(path, weights_only=True)
+    path = output / "checkpoints" / f"{ITERATIONS:06d}" / "training_state" / "dppo_state.safetensors"
+    return load_state(path)
 
 
 def test_every_rank_plays_its_own_episodes(run: tuple[Path, Path, str]) -> None:

@@ -2,9 +2,13 @@ import errno
 import json
 import shutil
 from pathlib import Path
+from typing import Any
 
 import numpy as np
+import pyarrow as pa
+import pyarrow.parquet as pq
 import pytest
+from file_faults import contents, in_fork, killed_at_each
 from lerobot.datasets import LeRobotDataset
 
 from lerobot_vtrefine.datasets.features import (
@@ -18,6 +22,7 @@ from lerobot_vtrefine.datasets.features import (
 from lerobot_vtrefine.envs import demo_dataset
 from lerobot_vtrefine.envs.demo_dataset import DemoDataset
 from lerobot_vtrefine.envs.demonstrations import Demonstration
+from lerobot_vtrefine.folders import put_in_place
 
 HEIGHT, WIDTH = 6, 8
 
@@ -186,10 +191,15 @@ def test_interrupt_while_simulating_keeps_every_saved_episode(tmp_path):
 
 
 def test_full_disk_before_the_first_commit_leaves_nothing(tmp_path, monkeypatch):
-    monkeypatch.setattr(LeRobotDataset, "save_episode", raise_full)
-    with pytest.raises(OSError, match="disk is full"), open_recording(tmp_path / "demo") as demos:
-        demos.append(demonstration(0))
-    assert not (tmp_path / "demo").exists()
+    def record() -> None:
+        with open_recording(tmp_path / "demo") as demos:
+            demos.append(demonstration(0))
+            monkeypatch.setattr(LeRobotDataset, "save_episode", raise_full)
+            demos.append(demonstration(1))
+
+    with pytest.raises(OSError, match="disk is full: the 0 episodes"):
+        record()
+    assert list(tmp_path.iterdir()) == []
 
 
 def test_other_settings_and_foreign_folders_are_refused(tmp_path):
@@ -209,3 +219,101 @@ def test_robot_type_and_pad_ages_are_written(tmp_path):
         demos.append(demonstration(0))
     assert read(tmp_path / "demo")[2][AGE_KEY].tolist() == [0, 0, 0, 0]
     assert read(tmp_path / "demo").meta.robot_type == "some_robot"
+
+
+def dataset_files(root: Path) -> dict[str, Any]:
+    """Every file of a dataset; Parquet as tables without metadata, in which each writing leaves a mark."""
+    return {
+        name: pq.read_table(pa.BufferReader(data)).replace_schema_metadata(None)
+        if name.endswith(".parquet")
+        else data
+        for name, data in contents(root).items()
+    }
+
+
+def record_all(root: Path, episodes: int) -> None:
+    with open_recording(root) as demos:
+        while demos.num_episodes < episodes:
+            seed = demos.next_seed
+            if seed == 3:
+                demos.skip(seed)
+            else:
+                demos.append(demonstration(seed))
+
+
+def as_committed(root: Path, episodes: int) -> list[dict[str, Any]]:
+    """The files of an uninterrupted recording after each of its commits, that of nothing first."""
+    states = [dataset_files(root)]
+
+    def noting(work: Path, place: Path, **options: Any) -> None:
+        put_in_place(work, place, **options)
+        states.append(dataset_files(place))
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(demo_dataset, "put_in_place", noting)
+        record_all(root, episodes)
+    return states
+
+
+@pytest.mark.parametrize(
+    ("episodes", "commit_every", "stride"), [(2, 1, 13), pytest.param(5, 2, 1, marks=pytest.mark.slow)]
+)
+def test_a_kill_at_any_file_operation_leaves_a_commit_and_continues_to_the_same_dataset(
+    tmp_path, monkeypatch, episodes, commit_every, stride
+) -> None:
+    monkeypatch.setattr(demo_dataset, "COMMIT_EVERY", commit_every)
+    monkeypatch.setattr(demo_dataset, "IMAGE_WRITER_THREADS", 0)
+    monkeypatch.setattr("os.fsync", lambda descriptor: None)
+    states, root = as_committed(tmp_path / "whole" / "demo", episodes), tmp_path / "killed" / "demo"
+    seen = set()
+    prepare, work = (
+        (lambda: shutil.rmtree(root.parent, ignore_errors=True)),
+        lambda: record_all(root, episodes),
+    )
+    for at in killed_at_each(prepare, work, stride):
+        assert dataset_files(root) in states, at  # which LeRobot's own loader reads, as other tests show
+        seen.add(states.index(dataset_files(root)))
+        assert in_fork(work) == 0
+        assert dataset_files(root) == states[-1], at
+        assert [path.name for path in root.parent.iterdir()] == ["demo"]
+    assert len(states) == 1 + -(-episodes // commit_every)
+    assert {0, 1} <= seen
+
+
+def test_every_commit_loads_while_the_next_one_is_recorded(tmp_path, small_commits) -> None:
+    root = tmp_path / "demo"
+    with open_recording(root) as demos:
+        for seed in range(3):
+            demos.append(demonstration(seed))
+        assert read(root).num_episodes == 2
+        assert np.array_equal(read(root)[5][ACTION_KEY], demonstration(1).actions[2])
+        (root / "notes.txt").write_text("mine")
+    assert read(root).num_episodes == 3
+    assert (root / "notes.txt").read_text() == "mine"
+
+
+@pytest.mark.parametrize(
+    ("file", "damaged"),
+    [
+        ("recording.json", ""),
+        ("recording.json", "{"),
+        ("recording.json", "[]"),
+        ("recording.json", '{"settings": {"pair": "round"}, "next_seed": 1, "files": [], "episodes": []}'),
+        ("recording.json", "[" * 100_000),
+        ("info.json", ""),
+        ("info.json", "\x00"),
+        ("info.json", None),
+    ],
+)
+def test_a_damaged_record_is_one_line_and_nothing_is_removed(tmp_path, file, damaged) -> None:
+    with open_recording(tmp_path / "demo") as demos:
+        demos.append(demonstration(0))
+    path = tmp_path / "demo" / "meta" / file
+    path.unlink() if damaged is None else path.write_text(damaged)
+    before = contents(tmp_path / "demo")
+    with pytest.raises(
+        ValueError, match=r"recording\.json does not fit .*; choose another --root"
+    ) as refused:
+        open_recording(tmp_path / "demo")
+    assert "\n" not in str(refused.value)
+    assert contents(tmp_path / "demo") == before

@@ -1,6 +1,7 @@
 """``vtrefine-finetune`` on a tiny policy without a simulator: files, exact resumption, bad input."""
 
 import json
+import pickle
 import shutil
 from pathlib import Path
 
@@ -18,6 +19,7 @@ from lerobot_vtrefine.envs.decisions import make_decision_env
 from lerobot_vtrefine.finetune import pipeline
 from lerobot_vtrefine.finetune.logger import CLOCK, read_progress
 from lerobot_vtrefine.finetune.seeds import EVALUATION_SEEDS
+from lerobot_vtrefine.finetune.state_file import load_state, save_state
 from lerobot_vtrefine.policies.vt_dp3.modeling_vt_dp3 import VtDp3Policy
 
 SMALL = [
@@ -73,7 +75,7 @@ def test_resumed_run_equals_the_uninterrupted_one(finetune, tmp_path, encoder):
     assert all(torch.equal(expected[key], found[key]) for key in expected)
     assert not all(torch.equal(expected[key], value) for key, value in tensors(whole, "000002").items())
     state = [
-        torch.load(run / "checkpoints" / "000004" / "training_state" / "dppo_state.pt", weights_only=True)
+        load_state(run / "checkpoints" / "000004" / "training_state" / "dppo_state.safetensors")
         for run in (whole, resumed)
     ]
     torch.testing.assert_close(*state, rtol=0, atol=0)
@@ -247,3 +249,48 @@ def test_policy_of_another_type_is_refused(finetune, tmp_path, capsys):
     ACTConfig(device="cpu").save_pretrained(other)
     assert finetune(tmp_path / "run", policy=other) == 2
     assert "holds a policy of type act; vtrefine-finetune needs vt_dp3" in capsys.readouterr().err
+
+
+def test_training_state_comes_back_exactly_and_is_no_pickle(tmp_path):
+    state = {
+        0: {"step": torch.tensor(3.0), "betas": (0.9, 0.999)},
+        "weights": [torch.rand(2, 3).T, torch.zeros(0, dtype=torch.uint8)],
+        "rest": [None, True, 7, 1 / 3, float("-inf"), "text", []],
+    }
+    path = tmp_path / "state.safetensors"
+    save_state(state, path)
+    loaded = load_state(path)
+    rest = state.pop("rest")
+    assert loaded.pop("rest") == rest
+    torch.testing.assert_close(loaded, state, rtol=0, atol=0)
+    assert loaded[0]["betas"] == (0.9, 0.999)
+    with pytest.raises(TypeError, match="Path"):
+        save_state({"x": tmp_path}, path)
+
+
+class Marking:
+    """Unpickling it creates a file."""
+
+    def __init__(self, path: Path) -> None:
+        self.path = path
+
+    def __reduce__(self):
+        return Path.touch, (self.path,)
+
+
+def test_pickles_and_damaged_files_in_a_checkpoint_are_one_line(finetune, tmp_path, capsys):
+    run, marker = tmp_path / "run", tmp_path / "ran"
+    assert finetune(run, iterations=1) == 0
+    last = run / "checkpoints" / "last"
+    for file in (
+        last / "training_state" / "dppo_state.safetensors",
+        last / "pretrained_model" / "model.safetensors",
+    ):
+        sound = file.read_bytes()
+        for damaged in (pickle.dumps(Marking(marker)), b"", sound[: len(sound) // 2]):
+            file.write_bytes(damaged)
+            assert finetune(run, "--resume=true", iterations=2) == 2
+            assert "damaged" in capsys.readouterr().err.strip().splitlines()[-1]
+        file.write_bytes(sound)
+    assert not marker.exists()
+    assert finetune(run, "--resume=true", iterations=2) == 0

@@ -1,5 +1,6 @@
 """From emulated hardware to a policy that moves it, by LeRobot's own commands: record, train, roll out."""
 
+import json
 import signal
 from collections.abc import Generator
 from pathlib import Path
@@ -80,6 +81,7 @@ def test_record_train_and_roll_out_on_the_same_robot(
         task="insert the plug",
         return_to_initial_position="false",
     )
+    refuse_a_command_in_the_checkpoint(rig, checkpoint, arguments, tmp_path / "ran", monkeypatch)
     run_command(monkeypatch, "rollout", [*robot_flags(rig), *arguments])
     assert len(sent) >= 8
     moved = np.array([list(action.values()) for action in sent])
@@ -87,3 +89,18 @@ def test_record_train_and_roll_out_on_the_same_robot(
     assert np.isfinite(moved).all()
     assert 0 <= moved[:, 0].max() <= 0.2  # the waist was moved by 0.153 rad while recording
     assert not any(rig.motor("follower", side, 1).torque for side in ("left", "right"))
+
+
+def refuse_a_command_in_the_checkpoint(
+    rig: Rig, checkpoint: Path, arguments: list[str], marker: Path, patch: pytest.MonkeyPatch
+) -> None:
+    """``lerobot-rollout`` must not run what a processor file names; leaves the checkpoint as it was."""
+    file = checkpoint / "policy_postprocessor.json"
+    text = file.read_text()
+    saved = json.loads(text)
+    saved["steps"].append({"class": "subprocess.Popen", "config": {"args": ["touch", str(marker)]}})
+    file.write_text(json.dumps(saved))
+    with pytest.raises(ValueError, match=r"policy_postprocessor\.json of .* the class 'subprocess\.Popen'"):
+        run_command(patch, "rollout", [*robot_flags(rig), *arguments])
+    assert not marker.exists()
+    file.write_text(text)

@@ -1,9 +1,10 @@
 """A folder that appears whole or not at all, and never in place of another."""
 
-import tempfile
 from collections.abc import Generator
 from contextlib import contextmanager
 from pathlib import Path
+
+from lerobot_vtrefine.folders import beside, put_in_place
 
 
 @contextmanager
@@ -14,12 +15,12 @@ def new_folder(target: Path) -> Generator[Path]:
         FileExistsError: there is something at ``target``, before or after the work.
     """
     _require_free(target)
-    target.parent.mkdir(parents=True, exist_ok=True)
-    with tempfile.TemporaryDirectory(prefix=f".{target.name}-", dir=target.parent) as staging:
-        work = Path(staging) / target.name
+    place = target.resolve()
+    with beside(place) as staging:
+        work = staging / place.name
         yield work
         _require_free(target)
-        work.rename(target)
+        put_in_place(work, place)
 
 
 def _require_free(target: Path) -> None:

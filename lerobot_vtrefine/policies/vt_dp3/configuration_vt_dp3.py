@@ -19,6 +19,7 @@ from lerobot_vtrefine.datasets.features import (
     VISUAL_KEYS,
 )
 from lerobot_vtrefine.observation import MODALITIES, VisuoTactileConfig
+from lerobot_vtrefine.policies import checkpoint_guard
 from lerobot_vtrefine.policies.vt_dp3.denoisers import DENOISERS
 from lerobot_vtrefine.policies.vt_dp3.diffusion import step_grid
 
@@ -119,6 +120,7 @@ class VtDp3Config(PreTrainedConfig):
     @told_by_lerobot
     def __post_init__(self) -> None:
         super().__post_init__()
+        checkpoint_guard.restrict()
         if self.preset not in PRESETS:
             raise ValueError(f"unknown policy.preset {self.preset!r}; choose one of {', '.join(PRESETS)}")
         values = dict(PRESETS[self.preset])

@@ -12,6 +12,7 @@ from typing import Any
 
 import torch
 from lerobot.policies import PreTrainedPolicy
+from safetensors import SafetensorError
 from torch import Tensor, nn
 from torch.nn import functional
 
@@ -75,6 +76,8 @@ class VtDp3Policy(PreTrainedPolicy):
         if not isinstance(config, VtDp3Config):
             found = getattr(config, "type", type(config).__name__)
             raise ValueError(f"the checkpoint holds a policy of type '{found}', expected 'vt_dp3'")
+        if config.use_peft:
+            raise ValueError("vt_dp3 has no PEFT adapters: leave out --peft.*, and use_peft in config.json")
         super().__init__(config)
         config.validate_features()
         if dataset_stats:
@@ -97,12 +100,19 @@ class VtDp3Policy(PreTrainedPolicy):
     @classmethod
     def from_pretrained(cls, pretrained_name_or_path: str | Path, **kwargs: Any) -> "VtDp3Policy":
         """Load a checkpoint. Raises: FileNotFoundError if the folder holds no policy, ValueError on its
-        type.
+        type or for damaged weights.
         """
         path = Path(pretrained_name_or_path)
         if path.is_dir() and not (path / "config.json").is_file():
             raise FileNotFoundError(f"{path} holds no policy; give the checkpoint's pretrained_model folder")
-        return super().from_pretrained(pretrained_name_or_path, **kwargs)
+        try:
+            return super().from_pretrained(pretrained_name_or_path, **kwargs)
+        except SafetensorError as error:
+            raise ValueError(f"the weights of {pretrained_name_or_path} are damaged: {error}") from error
+
+    def _validate_peft_config(self, peft_config: Any) -> None:
+        """Called by the trainer for ``--peft.*``, which would adapt a copy that the average never follows."""
+        raise ValueError("vt_dp3 has no PEFT adapters: leave out --peft.*")
 
     @property
     def process(self) -> DiffusionProcess:
