@@ -4,9 +4,13 @@ import errno
 import functools
 import os
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
+from pathlib import Path
 
 from draccus.utils import DraccusException
+from yaml import YAMLError
+
+from lerobot_vtrefine.files import check_settings
 
 from lerobot_vtrefine.extras import explain
 
@@ -14,18 +18,29 @@ DEBUG_VARIABLE = "VTREFINE_DEBUG"
 USAGE_STATUS = 2
 INTERRUPT_STATUS = 130
 
-EXPECTED = (ValueError, OSError, ImportError, DraccusException)
+EXPECTED = (ValueError, OSError, ImportError, DraccusException, YAMLError)
+CONFIG_FLAG = "--config_path"
+
+
+LONGEST_LINE = 1500
 
 
 def describe(error: BaseException) -> str:
-    """Return one line that tells a user what went wrong, without the traceback."""
+    """Return one printable line that tells a user what went wrong, without the traceback."""
+    line = "".join(letter if letter.isprintable() else "?" for letter in _message(error))
+    return line if len(line) <= LONGEST_LINE else f"{line[:LONGEST_LINE]} ..."
+
+
+def _message(error: BaseException) -> str:
     if isinstance(error, OSError) and error.errno == errno.ENOSPC:
         where = f" while writing {error.filename}" if error.filename else ""
         return f"the disk is full{where}; free some space and run the command again"
+    if isinstance(error, UnicodeEncodeError):  # a flag's bytes that are no text, or half a pair of surrogates
+        return f"{error.object[:60]!a} is no text that a file or a terminal can have"
     if isinstance(error, OSError) and error.errno is not None and error.filename:
         return f"{error.strerror}: {error.filename}"
     if isinstance(error, DraccusException) and isinstance(error.__cause__, ValueError) and _is_wrapper(error):
-        return describe(error.__cause__)
+        return _message(error.__cause__)
     if isinstance(error, ModuleNotFoundError) and (advice := explain(error)) is not None:
         return advice
     message = " ".join(str(error).split())
@@ -35,6 +50,15 @@ def describe(error: BaseException) -> str:
 def _is_wrapper(error: DraccusException) -> bool:
     """Whether the message only says that a configuration class refused its values; its cause says why."""
     return "Couldn't instantiate class" in str(error)
+
+
+def _check_config_file(arguments: Sequence[str]) -> None:
+    """What draccus will read, before it does: it has no bounds. Names on the Hub are left to LeRobot."""
+    for index, argument in enumerate(arguments):
+        flag, equals, value = argument.partition("=")
+        given = value if equals else "".join(arguments[index + 1 : index + 2])
+        if flag == CONFIG_FLAG and Path(given).is_file():
+            check_settings(given)
 
 
 def run_cli[**P](main: Callable[P, int | None]) -> Callable[P, int]:
@@ -48,6 +72,7 @@ def run_cli[**P](main: Callable[P, int | None]) -> Callable[P, int]:
     @functools.wraps(main)
     def wrapper(*args: P.args, **kwargs: P.kwargs) -> int:
         try:
+            _check_config_file(sys.argv[1:])
             return main(*args, **kwargs) or 0
         except KeyboardInterrupt:
             print("interrupted", file=sys.stderr)

@@ -1,17 +1,20 @@
 """`vtrefine-pad-emulator`: FlexiTac boards on pseudo-terminals, to try everything without hardware."""
 
 import argparse
+import re
 import signal
 import threading
 import time
 from collections.abc import Callable, Sequence
 from contextlib import ExitStack
+from dataclasses import dataclass
 from pathlib import Path
 
+from lerobot_vtrefine.cli.arguments import OneLineParser
 from lerobot_vtrefine.cli.errors import run_cli
 from lerobot_vtrefine.datasets.features import PADS
 from lerobot_vtrefine.drivers.diagnostic_emulator import DiagnosticEmulator
-from lerobot_vtrefine.drivers.emulator import ENCODERS, Faults, PadEmulator
+from lerobot_vtrefine.drivers.emulator import ENCODERS, LONGEST_S, Faults, PadEmulator
 from lerobot_vtrefine.drivers.frames import FrameShape
 from lerobot_vtrefine.drivers.sources import (
     Source,
@@ -22,18 +25,22 @@ from lerobot_vtrefine.drivers.sources import (
     recording_source,
     with_markers,
 )
+from lerobot_vtrefine.files import decode, limits
 
 TURN_S = 4.0
 """With --source=press each pad is pressed for half of this time, one after the other [s]."""
 
+MAX_BOARDS = 64
+"""Each is a pseudo-terminal and a thread; a system lends some hundreds to a user."""
 SOURCES = ("contact", "noise", "press", "pattern", "recording")
 
 
 def parse_arguments(arguments: Sequence[str] | None) -> argparse.Namespace:
     """Command line of `vtrefine-pad-emulator`."""
-    parser = argparse.ArgumentParser(
-        prog="vtrefine-pad-emulator",
-        description="Emulate FlexiTac boards on pseudo-terminals. Prints their ports; runs until Ctrl-C.",
+    parser = OneLineParser(
+        "vtrefine-pad-emulator",
+        "Emulate FlexiTac boards on pseudo-terminals. Prints their ports; runs until Ctrl-C.",
+        "",
     )
     add = parser.add_argument
     add(
@@ -88,11 +95,39 @@ def parse_arguments(arguments: Sequence[str] | None) -> argparse.Namespace:
     return parser.parse_args(arguments)
 
 
+@dataclass(frozen=True)
+class Numbers:
+    """Limits of the flags that are numbers, faults apart."""
+
+    boards: int = limits(1, MAX_BOARDS)
+    rate: float = limits(0.01, 10_000.0)
+    seconds: float = limits(0.0, LONGEST_S)
+    seed: int = limits(0, 2**53 - MAX_BOARDS)
+
+
+def parse_faults(options: argparse.Namespace) -> Faults:
+    """The faults of the flags, all of whose numbers are checked.
+
+    Raises:
+        ValueError: names the flag.
+    """
+    decode(Numbers, vars(options), "flags", "--", others=True)
+    faults = {
+        "loss": options.loss,
+        "burst_loss": options.burst_loss,
+        "stall_every_s": options.stall_every,
+        "stall_s": options.stall,
+        "unplug_at_s": options.unplug_at,
+        "replug_after_s": options.replug_after,
+    }
+    return decode(Faults, faults, "faults", "fault ")
+
+
 def parse_shape(text: str) -> FrameShape:
     """`12x32` as a shape."""
     rows, _, cols = text.partition("x")
-    if not (rows.isdigit() and cols.isdigit()):
-        raise ValueError(f"--shape={text} is not rows x columns, such as 12x32 or 16x32")
+    if not re.fullmatch(r"[0-9]{1,3}x[0-9]{1,3}", text):
+        raise ValueError(f"--shape={text[:40]} is not rows x columns, such as 12x32 or 16x32")
     return FrameShape(int(rows), int(cols))
 
 
@@ -168,16 +203,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     """Entry point of `vtrefine-pad-emulator`."""
     options = parse_arguments(arguments)
     shape = parse_shape(options.shape)
-    faults = Faults(
-        loss=options.loss,
-        burst_loss=options.burst_loss,
-        stall_every_s=options.stall_every,
-        stall_s=options.stall,
-        unplug_at_s=options.unplug_at,
-        replug_after_s=options.replug_after,
-    )
-    if options.boards < 1:
-        raise ValueError(f"--boards={options.boards} must be at least 1")
+    faults = parse_faults(options)
     names = PADS if options.boards <= len(PADS) else tuple(f"pad_{i}" for i in range(options.boards))
     turns = Turns()
     with ExitStack() as stack:

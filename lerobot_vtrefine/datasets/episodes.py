@@ -3,8 +3,7 @@
 Shapes: T frames, J joints, K readings of a pad.
 """
 
-import json
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from itertools import pairwise
 from pathlib import Path
@@ -12,12 +11,32 @@ from typing import Any
 
 import numpy as np
 import pyarrow as pa
-import pyarrow.parquet as pq
 
 from lerobot_vtrefine.datasets.features import ACTION_KEY, STATE_KEY, Array
+from lerobot_vtrefine.files import decode, limits, read_json
+from lerobot_vtrefine.files.tables import read_table
 
 TACTILE_PREFIX = "observation.tactile."
 BASELINE_PREFIX = "observation.tactile_baseline."
+
+
+@dataclass(frozen=True)
+class FeatureInfo:
+    """What is read of a feature's description in meta/info.json."""
+
+    dtype: str
+    shape: tuple[int, ...] = limits(0, 1e6)
+    names: Any = None
+
+
+@dataclass(frozen=True)
+class _Info:
+    """What is read of meta/info.json, whose other fields are LeRobot's."""
+
+    features: dict[str, FeatureInfo]
+    codebase_version: str
+    fps: float = limits(above=0.0, maximum=1e5)
+    total_episodes: int = limits(0, 1e7)
 
 
 @dataclass(frozen=True)
@@ -75,24 +94,45 @@ class EpisodeFolder:
         columns = ["episode_index", "frame_index", "timestamp", STATE_KEY, ACTION_KEY]
         columns += [f"{prefix}{pad}" for prefix in (TACTILE_PREFIX, BASELINE_PREFIX) for pad in self.pads]
         try:
-            return pq.read_table(path, columns=columns)
-        except (pa.ArrowException, OSError) as error:
-            raise ValueError(f"{path} cannot be read: {str(error).splitlines()[0]}") from error
+            table = read_table(path, columns)
+        except ValueError as error:
+            raise ValueError(f"{path} cannot be read: {error}") from error
+        if missing := [name for name in columns if name not in table.column_names]:
+            raise ValueError(f"{path} has no column {missing[0]}")
+        for name in columns:
+            _check_numbers(path, name, table[name])
+        return table
 
     def _episode(self, index: int, table: pa.Table) -> RecordedEpisode:
         table = table.sort_by("frame_index")
         pads = {pad: _matrix(table[f"{TACTILE_PREFIX}{pad}"]) for pad in self.pads}
         idle = {pad: _matrix(table[f"{BASELINE_PREFIX}{pad}"])[0] for pad in self.pads}
         state, action = (self._numbers(index, key, table[key]) for key in (STATE_KEY, ACTION_KEY))
-        return RecordedEpisode(index, table["timestamp"].to_numpy(), state, action, pads, idle)
+        time_s = self._numbers(index, "timestamp", table["timestamp"])[:, 0]
+        if (np.diff(time_s) <= 0).any():
+            raise ValueError(f"{self.root}: episode {index}: timestamp does not rise from frame to frame")
+        return RecordedEpisode(index, time_s, state, action, pads, idle)
 
     def _numbers(self, index: int, key: str, column: pa.ChunkedArray) -> Array:
+        width = 1 if key == "timestamp" else self.num_joints
         values = _matrix(column).astype(np.float64)
+        if values.shape[1] != width:
+            raise ValueError(f"{self.root}: episode {index}: {key} has {values.shape[1]} values, not {width}")
         if not np.isfinite(values).all():
             frame, joint = np.argwhere(~np.isfinite(values))[0]
-            name = self.joints[joint] if self.joints else f"joint {joint}"
+            name = self.joints[joint] if len(self.joints) == values.shape[1] else f"number {joint}"
             raise ValueError(f"{self.root}: episode {index}, frame {frame}: {key} {name} is not a number")
         return values
+
+
+def check_names(path: Path, features: Mapping[str, FeatureInfo]) -> None:
+    """ValueError where the names that a list gives to a feature's values are not as many, or no texts."""
+    for key, feature in features.items():
+        names, shape = feature.names, feature.shape
+        if not isinstance(names, list) or len(shape) != 1:
+            continue
+        if len(names) != shape[0] or not all(isinstance(name, str) for name in names):
+            raise ValueError(f"{path}: the names of {key[:60]} must be {shape[0]} texts")
 
 
 def open_episodes(root: Path) -> EpisodeFolder:
@@ -105,36 +145,48 @@ def open_episodes(root: Path) -> EpisodeFolder:
     path = root / "meta" / "info.json"
     if not path.is_file():
         raise FileNotFoundError(f"{root} holds no LeRobot dataset (no {path})")
+    data = read_json(path)
     try:
-        info: dict[str, Any] = json.loads(path.read_text(encoding="utf-8"))
-        features, version = info["features"], info["codebase_version"]
-        fps, episodes = float(info["fps"]), int(info["total_episodes"])
-        shapes = {key: tuple(feature["shape"]) for key, feature in features.items()}
-    except (ValueError, KeyError, TypeError, AttributeError) as error:
-        raise ValueError(f"{path} is no description of a LeRobot dataset: {error!r}") from error
+        info = decode(_Info, data, "the dataset's description", others=True)
+    except ValueError as error:
+        raise ValueError(f"{path} is no description of a LeRobot dataset: {error}") from error
+    features, version = info.features, info.codebase_version
     if version != "v3.0":
         raise ValueError(f"{path}: dataset version {version} is not v3.0; convert it with LeRobot first")
     for key in (STATE_KEY, ACTION_KEY):
         if key not in features:
             raise ValueError(f"{path}: the dataset has no {key}")
-    state, action = shapes[STATE_KEY], shapes[ACTION_KEY]
+    state, action = features[STATE_KEY].shape, features[ACTION_KEY].shape
     if len(state) != 1 or state != action:
         raise ValueError(f"{path}: {STATE_KEY} is {state}, {ACTION_KEY} is {action}: they must match")
-    names = features[STATE_KEY].get("names")
-    joints = tuple(map(str, names)) if isinstance(names, list) else ()
-    return EpisodeFolder(root, fps, joints, state[0], _pads(features), episodes)
+    check_names(path, features)
+    names = features[STATE_KEY].names
+    joints = tuple(names) if isinstance(names, list) else ()
+    return EpisodeFolder(root, info.fps, joints, state[0], _pads(features), info.total_episodes)
 
 
-def _pads(features: dict[str, Any]) -> tuple[str, ...]:
+def _pads(features: dict[str, FeatureInfo]) -> tuple[str, ...]:
     """Pads with both columns, flat and uint8."""
     return tuple(
         name
         for key, feature in features.items()
         if key.startswith(TACTILE_PREFIX)
-        and feature["dtype"] == "uint8"
-        and len(feature["shape"]) == 1
+        and feature.dtype == "uint8"
+        and len(feature.shape) == 1
         and f"{BASELINE_PREFIX}{(name := key.removeprefix(TACTILE_PREFIX))}" in features
     )
+
+
+def _check_numbers(path: Path, name: str, column: pa.ChunkedArray) -> None:
+    """ValueError unless a column holds a number, or equally many, per frame; indices are whole."""
+    kind = column.type
+    while pa.types.is_list(kind) or pa.types.is_large_list(kind) or pa.types.is_fixed_size_list(kind):
+        kind = kind.value_type
+    whole = pa.types.is_integer(kind) and kind == column.type
+    if not (whole if name.endswith("_index") else pa.types.is_integer(kind) or pa.types.is_floating(kind)):
+        raise ValueError(f"{path}: column {name} must hold numbers, not {column.type}")
+    if column.null_count:
+        raise ValueError(f"{path}: column {name} has empty frames")
 
 
 def _split(table: pa.Table, wanted: set[int]) -> list[tuple[int, pa.Table]]:
@@ -148,6 +200,14 @@ def _split(table: pa.Table, wanted: set[int]) -> list[tuple[int, pa.Table]]:
 
 
 def _matrix(column: pa.ChunkedArray) -> Array:
-    """A column of equally long lists as (T, K)."""
-    flat = np.concatenate([chunk.flatten().to_numpy(zero_copy_only=False) for chunk in column.chunks])
+    """A column of equally long lists, or of numbers, as (T, K)."""
+    flat = np.concatenate([_flat(chunk).to_numpy(zero_copy_only=False) for chunk in column.chunks])
+    if flat.size % max(len(column), 1):
+        raise ValueError(f"a column of {len(column)} frames holds {flat.size} numbers: some are missing")
     return flat.reshape(len(column), -1)
+
+
+def _flat(values: pa.Array) -> pa.Array:
+    while pa.types.is_nested(values.type):
+        values = values.flatten()
+    return values

@@ -128,7 +128,7 @@ def sensor_model(
     drift = next((stage for stage in stages if isinstance(stage, BaselineDrift)), None)
     level = idle.level - (drift.rate_counts_per_s * idle.session_s if drift is not None else 0.0)
     # Plain floats: the file is JSON.
-    stages.append(Idle([[float(v) for v in row] for row in level], 0.0))
+    stages.append(Idle(tuple(tuple(float(v) for v in row) for row in level), 0.0))
     if noise_counts > 0.0:
         stages.append(Noise(noise_counts))
     stages.append(Quantisation(step_counts or 1e-3, composite.setting.full_scale))

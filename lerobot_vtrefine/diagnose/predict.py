@@ -1,7 +1,6 @@
 """What a saved model predicts for recordings whose readings it has not seen (``vtrefine-predict``)."""
 
-import json
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -12,6 +11,7 @@ import pyarrow.parquet as pq
 from lerobot_vtrefine.diagnose.prediction import predict_trial
 from lerobot_vtrefine.diagnose.recordings import RecordingSet, RobotTrial, Trial
 from lerobot_vtrefine.diagnose.robot import model as robot_model
+from lerobot_vtrefine.files import read_json
 from lerobot_vtrefine.tactile import model as sensor_model
 from lerobot_vtrefine.tactile.layout import PadLayout
 
@@ -25,20 +25,27 @@ def load_predictor(path: str | Path, recordings: RecordingSet) -> Predict:
     Raises:
         ValueError: the file is no model, or one of the other kind (pad, robot); names the file.
     """
-    try:
-        data = json.loads(Path(path).read_text(encoding="utf-8"))
-    except ValueError as error:
-        raise ValueError(f"{path}: not valid JSON ({error})") from error
+    data = read_json(path)
     schema = data.get("schema") if isinstance(data, dict) else None
     wanted = {"pad": sensor_model.SCHEMA, "robot": robot_model.SCHEMA}[recordings.kind]
     if schema != wanted:
         raise ValueError(f'{path}: {recordings.kind} recordings need a model of "{wanted}", not {schema!r}')
     if recordings.kind == "robot":
         robot = robot_model.RobotModel.load(path)
+        pairs = zip(_plain_names(robot.names), _plain_names(recordings.joints), strict=False)
+        if other := next((pair for pair in pairs if pair[0] != pair[1]), None):
+            raise ValueError(
+                f"{path}: has joint {other[0][:60]!r} where the recordings have {other[1][:60]!r}"
+            )
         return lambda trial: robot_model.predict_positions(robot, trial)
     sensor = sensor_model.SensorModel.load(path)
     layout = PadLayout(recordings.rows, recordings.cols, recordings.pitch_m)
     return lambda trial: predict_trial(sensor, trial, layout)
+
+
+def _plain_names(joints: Sequence[str]) -> list[str]:
+    """Joints as robots name them; datasets add what was measured."""
+    return [name.removesuffix(".pos") for name in joints]
 
 
 def sound_frames(trial: Trial | RobotTrial) -> np.ndarray:

@@ -1,18 +1,102 @@
 """Read a recording set: a folder with `recording.json` and a Parquet file per trial (contract §1)."""
 
-import json
-from dataclasses import dataclass, replace
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 import pyarrow as pa
-import pyarrow.parquet as pq
+
+from lerobot_vtrefine.files import decode, inside, limits, read_json
+from lerobot_vtrefine.files.schema import LARGEST_NUMBER
+from lerobot_vtrefine.files.tables import read_table
 
 SCHEMA = "vtrefine/recording-set@1"
-KINDS = ("pad", "robot")
-SHAPES = {"sphere": ("radius_m",), "flat": ("size_m",), "cylinder": ("radius_m",), "mesh": ("file",)}
-"""Indenters and the fields that each needs."""
+LARGEST_LENGTH = 1e4
+"""Lengths may be in millimetres, which `quality` tells; none is larger than this in any unit."""
+MAX_TAXELS_A_SIDE = 256
+
+
+@dataclass(frozen=True)
+class _Round:
+    """A sphere or a cylinder."""
+
+    shape: str
+    radius_m: float = limits(above=0.0, maximum=LARGEST_LENGTH)
+
+
+@dataclass(frozen=True)
+class _Flat:
+    shape: str
+    size_m: tuple[float, float] = limits(above=0.0, maximum=LARGEST_LENGTH)
+
+
+@dataclass(frozen=True)
+class _Mesh:
+    shape: str
+    file: str
+    scale: float | tuple[float, float, float] = limits(above=0.0, maximum=1e6, default=1.0)
+    quat_wxyz: tuple[float, float, float, float] = limits(maximum=1e6, default=(1.0, 0.0, 0.0, 0.0))
+
+    def __post_init__(self) -> None:
+        if not any(self.quat_wxyz):
+            raise ValueError("object.quat_wxyz must not be all zero")
+
+
+SHAPES = {"sphere": _Round, "flat": _Flat, "cylinder": _Round, "mesh": _Mesh}
+"""Indenters by name."""
+
+
+@dataclass(frozen=True)
+class _Pad:
+    rows: int = limits(1, MAX_TAXELS_A_SIDE)
+    cols: int = limits(1, MAX_TAXELS_A_SIDE)
+    pitch_m: float = limits(above=0.0, maximum=LARGEST_LENGTH)
+
+
+@dataclass(frozen=True)
+class _Reading:
+    full_scale: float = limits(above=0.0, maximum=1e9)
+    unit: str = "adc_counts"
+
+
+@dataclass(frozen=True)
+class _Entry:
+    """One trial as the header lists it."""
+
+    file: str
+    condition: str | float = ""
+    replicate: int = limits(maximum=1e9, default=0)
+    order: int | None = limits(maximum=1e9, default=None)
+    start_s: float = 0.0
+    object: dict[str, Any] | None = None
+
+
+@dataclass(frozen=True)
+class _Header:
+    """Content of recording.json."""
+
+    schema: Literal["vtrefine/recording-set@1"]
+    kind: Literal["pad", "robot"]
+    trials: tuple[_Entry, ...]
+    pad: _Pad | None = None
+    reading: _Reading | None = None
+    object: dict[str, Any] | None = None
+    joints: tuple[str, ...] | None = None
+
+    def __post_init__(self) -> None:
+        if not self.trials:
+            raise ValueError("trials must list at least one trial")
+        files = [entry.file for entry in self.trials]
+        for index, file in enumerate(files):
+            if files.index(file) < index:
+                raise ValueError(f"trial {index}: file {file[:200]} is listed twice")
+        if self.kind == "robot" and not self.joints:
+            raise ValueError("joints must be a list of names")
+        if self.joints and len(set(self.joints)) < len(self.joints):
+            raise ValueError("joints repeats a name")
+        if self.kind == "pad" and (self.pad is None or self.reading is None):
+            raise ValueError("recordings of a pad need pad (rows, cols, pitch_m) and reading (full_scale)")
 
 
 @dataclass(frozen=True)
@@ -88,127 +172,52 @@ def read_recording_set(path: str | Path, *, measured: bool = True) -> RecordingS
             f"{header_path}: no such file; a recording set is a folder with recording.json"
         )
     header = _read_header(header_path)
-    if header["kind"] == "pad":
-        rows, cols, pitch_m = _pad(header_path, header)
-        unit, full_scale = _reading(header_path, header)
-        joints: tuple[str, ...] = ()
-    else:
-        rows, cols, pitch_m, unit, full_scale = 0, 0, 0.0, "rad", 0.0
-        joints = _joints(header_path, header)
-    default = header.get("object")
+    pad, reading, joints = header.pad, header.reading, header.joints or ()
+    is_pad = header.kind == "pad" and pad is not None
+    if header.object is not None:
+        _check_object(str(header_path), header.object, folder)
+    rows, cols, pitch_m = (pad.rows, pad.cols, pad.pitch_m) if is_pad else (0, 0, 0.0)
+    unit, full_scale = (reading.unit, reading.full_scale) if is_pad and reading else ("rad", 0.0)
     trials: list[Trial | RobotTrial] = []
-    for index, entry in enumerate(header["trials"]):
+    for index, entry in enumerate(header.trials):
         table = _Table(folder, header_path, index, entry, without=() if measured else ("raw",))
-        if header["kind"] == "pad":
-            trials.append(_pad_trial(table, entry.get("object", default), rows * cols if measured else 0))
+        if is_pad:
+            spec = header.object if entry.object is None else entry.object
+            trials.append(_pad_trial(table, spec, rows * cols if measured else 0))
         else:
             trial = _robot_trial(table, len(joints))
             first = np.repeat(trial.position[:1], len(trial.position), axis=0)
             trials.append(trial if measured else replace(trial, position=first))
-    return RecordingSet(folder, header["kind"], rows, cols, pitch_m, unit, full_scale, joints, tuple(trials))
+    return RecordingSet(folder, header.kind, rows, cols, pitch_m, unit, full_scale, joints, tuple(trials))
 
 
-def _read_header(path: Path) -> dict[str, Any]:
+def _read_header(path: Path) -> _Header:
+    data = read_json(path)
+    if not isinstance(data, dict) or data.get("schema") != SCHEMA:
+        found = str(data.get("schema") if isinstance(data, dict) else type(data).__name__)
+        raise ValueError(f'{path}: "schema" must be "{SCHEMA}", got {found[:60]!r}')
     try:
-        header = json.loads(path.read_text(encoding="utf-8-sig"))
-    except (json.JSONDecodeError, UnicodeDecodeError) as error:
-        raise ValueError(f"{path}: not valid JSON ({error})") from error
-    if not isinstance(header, dict) or header.get("schema") != SCHEMA:
-        found = header.get("schema") if isinstance(header, dict) else type(header).__name__
-        raise ValueError(f'{path}: "schema" must be "{SCHEMA}", got {found!r}')
-    if header.get("kind") not in KINDS:
-        raise ValueError(f'{path}: "kind" must be one of {", ".join(KINDS)}, got {header.get("kind")!r}')
-    trials = header.get("trials")
-    if not isinstance(trials, list) or not trials:
-        raise ValueError(f'{path}: "trials" must be a list with at least one trial')
-    seen: set[str] = set()
-    for index, entry in enumerate(trials):
-        if not isinstance(entry, dict) or not isinstance(entry.get("file"), str):
-            raise ValueError(f'{path}: trial {index}: "file" must name a Parquet file')
-        if entry["file"] in seen:
-            raise ValueError(f"{path}: trial {index}: file {entry['file']} is listed twice")
-        seen.add(entry["file"])
-    return header
+        return decode(_Header, data, path.name)
+    except ValueError as error:
+        raise ValueError(f"{path}: {error}") from error
 
 
-def _number(where: str, value: Any, name: str, positive: bool = False) -> float:
-    if isinstance(value, bool) or not isinstance(value, int | float) or not np.isfinite(value):
-        raise ValueError(f'{where}: "{name}" must be a finite number, got {value!r}')
-    if positive and value <= 0:
-        raise ValueError(f'{where}: "{name}" must be positive, got {value!r}')
-    return float(value)
-
-
-def _whole(where: str, value: Any, name: str) -> int:
-    number = _number(where, value, name)
-    if number != int(number):
-        raise ValueError(f'{where}: "{name}" must be a whole number, got {value!r}')
-    return int(number)
-
-
-def _label(where: str, value: Any, name: str) -> str:
-    if isinstance(value, bool) or not isinstance(value, str | int | float):
-        raise ValueError(f'{where}: "{name}" must be a text or a number, got {value!r}')
-    return str(value)
-
-
-def _pad(path: Path, header: dict[str, Any]) -> tuple[int, int, float]:
-    pad = header.get("pad")
-    if not isinstance(pad, dict):
-        raise ValueError(f'{path}: "pad" must hold rows, cols and pitch_m')
-    rows, cols = (_number(str(path), pad.get(key), f"pad.{key}", positive=True) for key in ("rows", "cols"))
-    if rows != int(rows) or cols != int(cols):
-        raise ValueError(f'{path}: "pad.rows" and "pad.cols" must be whole numbers, got {rows:g}, {cols:g}')
-    return int(rows), int(cols), _number(str(path), pad.get("pitch_m"), "pad.pitch_m", positive=True)
-
-
-def _reading(path: Path, header: dict[str, Any]) -> tuple[str, float]:
-    reading = header.get("reading")
-    if not isinstance(reading, dict):
-        raise ValueError(f'{path}: "reading" must hold unit and full_scale')
-    full_scale = _number(str(path), reading.get("full_scale"), "reading.full_scale", positive=True)
-    return str(reading.get("unit", "adc_counts")), full_scale
-
-
-def _joints(path: Path, header: dict[str, Any]) -> tuple[str, ...]:
-    joints = header.get("joints")
-    if not isinstance(joints, list) or not joints or not all(isinstance(name, str) for name in joints):
-        raise ValueError(f'{path}: "joints" must be a list of names')
-    if len(set(joints)) != len(joints):
-        raise ValueError(f'{path}: "joints" repeats a name')
-    return tuple(joints)
-
-
-def check_object(where: str, spec: Any, folder: Path) -> dict[str, Any]:
+def _check_object(where: str, spec: Any, folder: Path) -> dict[str, Any]:
     """The indenter's description, checked; a mesh's file becomes an absolute path. ValueError starts with
     `where`."""
-    if not isinstance(spec, dict) or spec.get("shape") not in SHAPES:
-        shape = spec.get("shape") if isinstance(spec, dict) else spec
-        raise ValueError(f'{where}: "object.shape" must be one of {", ".join(SHAPES)}, got {shape!r}')
-    spec = dict(spec)
-    if spec["shape"] == "flat":
-        size = spec.get("size_m")
-        if not isinstance(size, list | tuple) or len(size) != 2:
-            raise ValueError(f'{where}: "object.size_m" must be two lengths, got {size!r}')
-        spec["size_m"] = tuple(_number(where, side, "object.size_m", positive=True) for side in size)
-    elif spec["shape"] == "mesh":
-        file = folder / str(spec.get("file"))
-        if not file.is_file():
-            raise ValueError(f'{where}: "object.file" {file} does not exist')
-        scale = spec.get("scale", 1.0)
-        scales = scale if isinstance(scale, list | tuple) and len(scale) == 3 else (scale,)
-        for number in scales:
-            _number(where, number, "object.scale", positive=True)
-        quat = spec.get("quat_wxyz", (1.0, 0.0, 0.0, 0.0))
-        if not isinstance(quat, list | tuple) or len(quat) != 4:
-            raise ValueError(f'{where}: "object.quat_wxyz" must be four numbers, got {quat!r}')
-        numbers = tuple(_number(where, number, "object.quat_wxyz") for number in quat)
-        if not any(numbers):
-            raise ValueError(f'{where}: "object.quat_wxyz" must not be all zero')
-        spec |= {"file": str(file.resolve()), "quat_wxyz": numbers}
-    else:
-        spec["radius_m"] = _number(where, spec.get("radius_m"), "object.radius_m", positive=True)
-    return spec
+    shape = spec.get("shape") if isinstance(spec, dict) else None
+    if not isinstance(shape, str) or shape not in SHAPES:
+        raise ValueError(f"{where}: object.shape must be one of {', '.join(SHAPES)}, got {str(shape)[:60]!r}")
+    try:
+        found = asdict(decode(SHAPES[shape], spec, "object", "object."))
+        if shape == "mesh":
+            file = inside(folder, found["file"])
+            if not file.is_file():
+                raise ValueError(f"object.file {file} does not exist")
+            found["file"] = str(file.resolve())
+    except ValueError as error:
+        raise ValueError(f"{where}: {error}") from error
+    return found
 
 
 class _Table:
@@ -219,25 +228,21 @@ class _Table:
         folder: Path,
         header_path: Path,
         index: int,
-        entry: dict[str, Any],
+        entry: _Entry,
         without: tuple[str, ...] = (),
     ) -> None:
         self.folder, self.entry, self.index = folder, entry, index
-        self.file = folder / entry["file"]
+        try:
+            self.file = inside(folder, entry.file)
+        except ValueError as error:
+            raise ValueError(f"{header_path}: trial {index}: {error}") from error
         self.where = f"{self.file}: trial {index}"
         if not self.file.is_file():
             raise FileNotFoundError(f"{self.file}: no such file (trial {index} of {header_path})")
         try:
-            names = pq.read_schema(self.file).names
-            kept = [name for name in names if name not in without] if without else None
-            self.table = pq.read_table(self.file, columns=kept, memory_map=False)
-        except (pa.ArrowInvalid, pa.ArrowException, OSError) as error:
-            raise ValueError(
-                f"{self.where}: not a readable Parquet file ({str(error).splitlines()[0]})"
-            ) from error
-        repeated = [name for name in set(self.table.column_names) if self.table.column_names.count(name) > 1]
-        if repeated:
-            raise ValueError(f"{self.where}: column {repeated[0]}: appears twice")
+            self.table = read_table(self.file, without=without)
+        except ValueError as error:
+            raise ValueError(f"{self.where}: not a readable Parquet file ({error})") from error
         if self.table.num_rows == 0:
             raise ValueError(f"{self.where}: column time_s: has no frames")
 
@@ -255,7 +260,7 @@ class _Table:
         kind = column.type
         if not (pa.types.is_integer(kind) or pa.types.is_floating(kind) or pa.types.is_null(kind)):
             raise self.fail(name, f"must hold numbers, not {kind}")
-        return column.cast(pa.float64()).to_numpy(zero_copy_only=False).astype(float)
+        return self._numbers(name, column.combine_chunks())
 
     def optional(self, name: str) -> np.ndarray | None:
         """The column, or None where it is absent or wholly empty."""
@@ -291,25 +296,34 @@ class _Table:
         if (lengths != width).any():
             frame = int(np.flatnonzero(lengths != width)[0])
             raise self.fail(name, f"frame {frame} has {lengths[frame]} values, expected {width}")
-        flat = column.flatten().cast(pa.float64()).to_numpy(zero_copy_only=False)
-        return flat.reshape(-1, width).astype(float)
+        return self._numbers(name, column.flatten()).reshape(-1, width)
+
+    def _numbers(self, name: str, column: pa.Array | pa.ChunkedArray) -> np.ndarray:
+        """float64; null becomes NaN. Numbers that nothing can have measured are refused."""
+        try:
+            values = column.cast(pa.float64(), safe=False).to_numpy(zero_copy_only=False).astype(float)
+        except pa.ArrowException as error:
+            raise self.fail(name, f"cannot be read as numbers, it holds {column.type}") from error
+        if (huge := np.flatnonzero(np.isfinite(values) & (np.abs(values) > LARGEST_NUMBER))).size:
+            raise self.fail(name, f"holds {values[huge[0]]:g}, which is no measurement")
+        return values
 
     def meta(self) -> dict[str, Any]:
         """Fields that pad and robot trials share."""
         entry = self.entry
-        start = _number(self.where, entry.get("start_s", 0.0), "start_s")
+        condition = f"trial {self.index}" if entry.condition == "" else entry.condition
         return {
-            "file": entry["file"],
-            "condition": _label(self.where, entry.get("condition", f"trial {self.index}"), "condition"),
-            "replicate": _whole(self.where, entry.get("replicate", 0), "replicate"),
-            "order": _whole(self.where, entry.get("order", self.index), "order"),
-            "start_s": start,
+            "file": entry.file,
+            "condition": condition if isinstance(condition, str) else f"{condition:g}",
+            "replicate": entry.replicate,
+            "order": self.index if entry.order is None else entry.order,
+            "start_s": entry.start_s,
             "time_s": self.scalar("time_s"),
         }
 
 
 def _pad_trial(table: _Table, spec: Any, taxels: int) -> Trial:
-    spec = check_object(table.where, spec, table.folder)
+    spec = _check_object(table.where, spec, table.folder)
     meta = table.meta()
     zeros = np.zeros(len(meta["time_s"]))
     depth, force = table.optional("depth_m"), table.optional("force_n")

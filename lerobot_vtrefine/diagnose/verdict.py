@@ -12,6 +12,8 @@ from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any, Literal, get_args
 
+from lerobot_vtrefine.files import decode, read_json
+
 SCHEMA = "vtrefine/verdict@1"
 
 Status = Literal["adequate", "explained", "ambiguous", "unexplained", "invalid_data"]
@@ -164,10 +166,12 @@ class Verdict:
         values = {key: value for key, value in data.items() if key != "schema"}
         try:
             values["causes"] = tuple(_cause_from_dict(item) for item in values["causes"])
-            values["unknown"] = Unknown(**values["unknown"])
-            values["data_issues"] = tuple(DataIssue(**item) for item in values["data_issues"])
+            values["unknown"] = decode(Unknown, values["unknown"], "unknown", "unknown.")
+            values["data_issues"] = tuple(
+                decode(DataIssue, item, "data_issues") for item in values["data_issues"]
+            )
             if values["heldout"] is not None:
-                values["heldout"] = Heldout(**_with_tuple(values["heldout"], "gain_ci95"))
+                values["heldout"] = decode(Heldout, values["heldout"], "heldout", "heldout.")
             return cls(**values)
         except (KeyError, TypeError) as error:
             raise ValueError(f"verdict is malformed: {error}") from error
@@ -181,8 +185,9 @@ def write_verdict(verdict: Verdict, path: str | Path) -> None:
 
 def read_verdict(path: str | Path) -> Verdict:
     """Read verdict.json; ValueError names the file and what is wrong with it."""
+    data = read_json(path)
     try:
-        return Verdict.from_dict(json.loads(Path(path).read_text()))
+        return Verdict.from_dict(data)
     except ValueError as error:
         raise ValueError(f"{path}: {error}") from error
 

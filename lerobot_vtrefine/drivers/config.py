@@ -5,6 +5,7 @@ from typing import Literal
 
 from lerobot_vtrefine.drivers.frames import STREAM_BAUD, FrameShape
 from lerobot_vtrefine.drivers.orientation import Orientation
+from lerobot_vtrefine.files import limits
 
 Protocol = Literal["binary", "ascii"]
 PROTOCOLS: tuple[Protocol, ...] = ("binary", "ascii")
@@ -36,11 +37,11 @@ class PadConfig:
     flip_rows: bool = False
     flip_cols: bool = False
     protocol: str = "binary"
-    baud: int = STREAM_BAUD
-    stale_after_s: float = 0.2
+    baud: int = limits(50, 100_000_000, default=STREAM_BAUD)
+    stale_after_s: float = limits(above=0.0, maximum=3600.0, default=0.2)
 
     def __post_init__(self) -> None:
-        if not self.port:
+        if not self.port or not self.port.isprintable():
             raise ValueError("a pad needs a port; vtrefine-find-pads finds it and writes the pads file")
         if self.protocol not in PROTOCOLS:
             raise ValueError(f"protocol {self.protocol!r} does not exist; choose from {', '.join(PROTOCOLS)}")

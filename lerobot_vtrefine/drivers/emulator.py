@@ -14,7 +14,10 @@ import numpy as np
 from lerobot_vtrefine.drivers.emulated_port import EmulatedPort
 from lerobot_vtrefine.drivers.frames import MARKER, FrameShape
 from lerobot_vtrefine.drivers.sources import Source
+from lerobot_vtrefine.files import limits
 
+LONGEST_S = 1e9
+"""No time that an emulator is asked for is longer [s]."""
 READ_WITHIN_S = 1.0
 """A board is being read if a frame was taken within this time; a busy reader pauses now and then [s]."""
 
@@ -32,12 +35,12 @@ class Faults:
         replug_after_s: Time after which it is back [s].
     """
 
-    loss: float = 0.0
-    burst_loss: float = 0.0
-    stall_every_s: float = 0.0
-    stall_s: float = 1.0
-    unplug_at_s: float = 0.0
-    replug_after_s: float = 1.0
+    loss: float = limits(0.0, 1.0, default=0.0)
+    burst_loss: float = limits(0.0, 1.0, default=0.0)
+    stall_every_s: float = limits(0.0, LONGEST_S, default=0.0)
+    stall_s: float = limits(0.0, LONGEST_S, default=1.0)
+    unplug_at_s: float = limits(0.0, LONGEST_S, default=0.0)
+    replug_after_s: float = limits(0.0, LONGEST_S, default=1.0)
 
     def __post_init__(self) -> None:
         for name in ("loss", "burst_loss"):

@@ -1,13 +1,16 @@
 """The pads file: which pad is on which port. `vtrefine-find-pads` writes it, robot configurations read it."""
 
-from dataclasses import asdict, fields
+import re
+from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
 import yaml
 
 from lerobot_vtrefine.drivers.config import PadConfig
+from lerobot_vtrefine.files import decode, read_yaml
 
+_NAME = re.compile(r"\w[\w.-]{0,99}")
 _HEADER = "# FlexiTac pads by name, from vtrefine-find-pads. Ports name USB sockets: do not swap cables.\n"
 
 
@@ -34,14 +37,16 @@ def load_pads(path: Path) -> dict[str, PadConfig]:
             f"pads file {path} does not exist; write it with: vtrefine-find-pads --output {path}"
         )
     try:
-        content = yaml.safe_load(path.read_text(encoding="utf-8"))
-    except yaml.YAMLError as error:
-        raise ValueError(f"pads file {path} is not valid YAML: {error}") from error
+        content = read_yaml(path)
+    except ValueError as error:
+        raise ValueError(f"pads file {error}") from error
     entries = content.get("pads") if isinstance(content, dict) else None
     if not isinstance(entries, dict) or not entries:
         raise ValueError(
             f"pads file {path} has no 'pads:' section with entries like 'left_pad: {{port: /dev/...}}'"
         )
+    if others := sorted(map(str, set(content) - {"pads"})):
+        raise ValueError(f"pads file {path} has no {others[0][:60]!r}; valid: pads")
     return decode_pads(entries, f"pads file {path}")
 
 
@@ -51,22 +56,20 @@ def decode_pads(entries: dict[str, Any], where: str) -> dict[str, PadConfig]:
     Raises:
         ValueError: an entry is not a mapping, has an unknown key or a wrong value.
     """
-    known = [field.name for field in fields(PadConfig)]
     pads: dict[str, PadConfig] = {}
     for name, entry in entries.items():
+        if not isinstance(name, str) or not _NAME.fullmatch(name):
+            raise ValueError(
+                f"{where}: {str(name)[:60]!r} is no name of a pad: letters, digits, _ . and - make one"
+            )
         if isinstance(entry, PadConfig):
             pads[name] = entry
             continue
         if not isinstance(entry, dict) or "port" not in entry:
             raise ValueError(f"{where}: pad {name!r} needs a port: {{port: /dev/serial/by-path/...}}")
-        unknown = sorted(set(entry) - set(known))
-        if unknown:
-            raise ValueError(
-                f"{where}: pad {name!r} has unknown {', '.join(unknown)}; known: {', '.join(known)}"
-            )
         try:
-            pads[name] = PadConfig(**entry)
-        except (TypeError, ValueError) as error:
+            pads[name] = decode(PadConfig, entry, "it")
+        except ValueError as error:
             raise ValueError(f"{where}: pad {name!r}: {error}") from error
     check_distinct_ports(pads, where)
     return pads

@@ -4,7 +4,6 @@ A source maps a frame number to counts, uint8 (R, C); it is deterministic in its
 """
 
 import struct
-import zipfile
 import zlib
 from collections.abc import Callable
 from pathlib import Path
@@ -13,6 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lerobot_vtrefine.drivers.frames import MARKER, FrameShape
+from lerobot_vtrefine.files.arrays import NUMBERS, TEXTS, read_arrays
 
 Source = Callable[[int], NDArray[np.uint8]]
 """Frame number -> counts, uint8 (R, C)."""
@@ -96,16 +96,11 @@ def recording_source(path: Path, shape: FrameShape) -> Source:
     if not path.is_file():
         raise FileNotFoundError(f"recording {path} does not exist; give a .npy or .npz file of uint8 frames")
     try:
-        loaded = np.load(path)
-        if isinstance(loaded, np.ndarray):
-            arrays = {"array": loaded}
-        else:
-            with loaded:
-                arrays = {key: loaded[key] for key in loaded.files}
-    except (ValueError, EOFError, zipfile.BadZipFile) as error:
-        raise ValueError(f"recording {path} cannot be read as .npy or .npz: {error}") from error
+        arrays = read_arrays(path, NUMBERS + TEXTS + "b")
+    except ValueError as error:
+        raise ValueError(f"recording {error}") from error
     for array in arrays.values():
-        if array.dtype == np.uint8 and array.ndim in (2, 3) and array[0].size == shape.taxels:
+        if array.dtype == np.uint8 and array.ndim in (2, 3) and len(array) and array[0].size == shape.taxels:
             frames = array.reshape(len(array), shape.rows, shape.cols)
             return lambda number: frames[number % len(frames)]
     held = ", ".join(f"{key} {array.dtype}{array.shape}" for key, array in arrays.items())

@@ -10,11 +10,16 @@ Terminal = tuple[int, int]
 
 def plug_in(link: Path) -> Terminal:
     """Opens a raw pseudo-terminal that `link` names."""
-    hardware, reader = os.openpty()
-    tty.setraw(reader)
     link.parent.mkdir(parents=True, exist_ok=True)
     link.unlink(missing_ok=True)
-    link.symlink_to(os.ttyname(reader))
+    hardware, reader = os.openpty()
+    try:
+        tty.setraw(reader)
+        link.symlink_to(os.ttyname(reader))
+    except OSError as error:  # the system names the terminal; what it refuses is the link
+        os.close(hardware)
+        os.close(reader)
+        raise OSError(error.errno, error.strerror, str(link)) from error
     return hardware, reader
 
 

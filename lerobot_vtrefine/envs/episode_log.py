@@ -1,10 +1,28 @@
 """Per-episode metrics as JSON lines, readable after a stock ``lerobot-eval``."""
 
 import json
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+
+from lerobot_vtrefine.files import decode, limits, read_json_lines
+
+
+@dataclass(frozen=True)
+class _Episode:
+    """What every line has; measurements come beside it."""
+
+    success: bool
+    seed: int = limits(0, 2**63)
+    steps: int = limits(0, 1e9)
+    failure: str | None = None
+
+
+@dataclass(frozen=True)
+class _Values:
+    values: dict[str, float | bool | str | None]
 
 
 def episode_rows(columns: dict[str, np.ndarray]) -> list[dict[str, Any]]:
@@ -42,7 +60,12 @@ def read_episode_log(path: Path, first_seed: int, num_episodes: int) -> list[dic
     """
     if not Path(path).is_file():
         raise FileNotFoundError(f"no episode metrics at {path}; evaluate with --env.metrics_path={path}")
-    rows = [json.loads(line) for line in Path(path).read_text(encoding="utf-8").splitlines() if line]
-    by_seed = {row["seed"]: row for row in rows}
+    by_seed = {}
+    for number, row in enumerate(read_json_lines(path), start=1):
+        try:
+            by_seed[decode(_Episode, row, "it", others=True).seed] = row
+            decode(_Values, {"values": row}, "it")
+        except ValueError as error:
+            raise ValueError(f"{path}: entry {number} is no episode: {error}") from error
     wanted = range(first_seed, first_seed + num_episodes)
     return [by_seed[seed] for seed in wanted if seed in by_seed]

@@ -7,6 +7,7 @@ from typing import Any
 
 from lerobot.configs.default import WandBConfig
 
+from lerobot_vtrefine.files import read_number_rows
 from lerobot_vtrefine.finetune.plots import draw_curves
 
 CSV_NAME = "progress.csv"
@@ -20,8 +21,7 @@ def read_progress(output_dir: Path) -> list[dict[str, float]]:
     path = output_dir / CSV_NAME
     if not path.is_file():
         return []
-    with path.open(newline="") as file:
-        return [{key: float(value) for key, value in row.items() if value} for row in csv.DictReader(file)]
+    return read_number_rows(path)
 
 
 class ProgressLog:

@@ -12,31 +12,23 @@ is true. The ``sensor_model.json`` that diagnosis makes of a robot's recordings 
 play and encoder offsets. Imports no simulator.
 """
 
-import json
 from collections.abc import Mapping
-from dataclasses import dataclass, field, fields, replace
+from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 
 from lerobot_vtrefine.embodiments import ALOHA
+from lerobot_vtrefine.embodiments.robot_file import SCHEMA as ROBOT_MODEL_SCHEMA
+from lerobot_vtrefine.embodiments.robot_file import RobotFile, decode_robot
+from lerobot_vtrefine.files import decode, inside, limits, read_json
 from lerobot_vtrefine.sim.config import SceneConfig
 from lerobot_vtrefine.tactile import SensorModel
 
 SCHEMA = "vtrefine/reality@1"
-ROBOT_MODEL_SCHEMA = "vtrefine/robot-model@1"
-SCENE_FIELDS = (
-    "clearance_m",
-    "part_friction",
-    "pad_friction",
-    "part_density",
-    "pad_time_constant_s",
-    "servo_gain_scale",
-    "gravity_compensation",
-)
-"""What may differ in the scene; the task itself stays the same."""
 MAX_LATENCY_S = 1.0
+MAX_ANGLE_RAD = 2 * np.pi
 
 
 @dataclass(frozen=True)
@@ -63,6 +55,29 @@ class RobotFaults:
                     raise ValueError(f"{name}.{joint} must be a finite number, got {value!r}")
                 if name == "backlash_rad" and value < 0:
                     raise ValueError(f"backlash_rad.{joint} must not be negative, got {value}")
+                if abs(value) > MAX_ANGLE_RAD:
+                    raise ValueError(f"{name}.{joint} must not exceed a whole turn, got {value} rad")
+
+
+@dataclass(frozen=True)
+class HiddenScene:
+    """What may differ in the scene, the task itself staying the same; None leaves it."""
+
+    clearance_m: float | None = limits(1e-6, 0.02, above=0.0, default=None)
+    part_friction: float | None = limits(1e-4, 10.0, above=0.0, default=None)
+    pad_friction: float | None = limits(1e-4, 10.0, above=0.0, default=None)
+    part_density: float | None = limits(1.0, 1e5, above=0.0, default=None)
+    pad_time_constant_s: float | None = limits(1e-3, 1.0, above=0.0, default=None)
+    servo_gain_scale: float | None = limits(1e-3, 100.0, above=0.0, default=None)
+    gravity_compensation: bool | None = None
+
+
+@dataclass(frozen=True)
+class _RealityFile:
+    schema: Literal["vtrefine/reality@1"]
+    sensor_model: str | dict[str, Any] | None = None
+    robot: RobotFaults = field(default_factory=RobotFaults)
+    scene: HiddenScene = field(default_factory=HiddenScene)
 
 
 @dataclass(frozen=True)
@@ -86,60 +101,47 @@ def load_reality(path: str | Path) -> Reality:
         FileNotFoundError: the file, or the sensor model that it names, does not exist.
     """
     path = Path(path)
+    data = read_json(path)
     try:
-        data = json.loads(path.read_text(encoding="utf-8"))
         return _from_dict(data, path.parent)
-    except (ValueError, TypeError) as error:
+    except ValueError as error:
         raise ValueError(f"{path}: {error}") from error
 
 
 def _from_dict(data: Any, folder: Path) -> Reality:
     if isinstance(data, dict) and data.get("schema") == ROBOT_MODEL_SCHEMA:
-        return Reality(robot=_diagnosed(data))
+        return Reality(robot=_diagnosed(decode_robot(data)))
     if not isinstance(data, dict) or data.get("schema") != SCHEMA:
         raise ValueError(f'reality must hold "schema": "{SCHEMA}"')
-    _check_keys("reality", data, ("schema", *(item.name for item in fields(Reality))))
-    robot, scene = data.get("robot", {}), data.get("scene", {})
-    _check_keys("robot", robot, tuple(item.name for item in fields(RobotFaults)))
-    _check_keys("scene", scene, SCENE_FIELDS)
-    sensor = data.get("sensor_model")
-    if isinstance(sensor, str):
-        sensor = SensorModel.load(folder / sensor)
-    elif sensor is not None:
-        sensor = SensorModel.from_dict(sensor)
-    reality = Reality(sensor, RobotFaults(**robot), scene)
+    content = decode(_RealityFile, data, "reality")
+    for joint in (*content.robot.backlash_rad, *content.robot.encoder_offset_rad):
+        if joint not in ALOHA.joint_names or joint.endswith("_finger"):
+            raise ValueError(f"no arm has a joint {joint[:60]!r} that could have play or an encoder's offset")
+    sensor = None
+    if isinstance(content.sensor_model, str):
+        sensor = SensorModel.load(inside(folder, content.sensor_model))
+    elif content.sensor_model is not None:
+        sensor = SensorModel.from_dict(content.sensor_model)
+    given = {name: value for name, value in asdict(content.scene).items() if value is not None}
+    reality = Reality(sensor, content.robot, given)
     reality.applied(SceneConfig())  # its own checks
     return reality
 
 
-def _diagnosed(model: dict[str, Any]) -> RobotFaults:
+def _diagnosed(model: RobotFile) -> RobotFaults:
     """What a diagnosed robot does beyond the simulated one.
 
     Sag and friction are left out: the simulation has gravity and friction of its own; so are the fingers,
     which have no faults here.
     """
-    joints = model.get("joints")
-    if not isinstance(joints, list) or not all(isinstance(item, dict) and "name" in item for item in joints):
-        raise ValueError('robot model must hold a list "joints" of objects with a "name"')
-    by_name = {str(item["name"]).removesuffix(".pos"): item for item in joints}
+    by_name = {item.name.removesuffix(".pos"): item for item in model.joints}
     unknown = [name for name in by_name if name not in ALOHA.joint_names]
     if unknown:
-        raise ValueError(f"the simulated arms have no joint {unknown[0]!r}")
+        raise ValueError(f"the simulated arms have no joint {unknown[0][:60]!r}")
     arms = {name: item for name, item in by_name.items() if not name.endswith("_finger")}
-    play = {
-        n: item.get("backlash_command", 0.0) + item.get("backlash_output", 0.0) for n, item in arms.items()
-    }
-    offsets = {name: item.get("encoder_offset", 0.0) for name, item in arms.items()}
+    play = {name: item.backlash_command + item.backlash_output for name, item in arms.items()}
     return RobotFaults(
-        min(model.get("control_latency_s", 0.0), MAX_LATENCY_S),
+        min(model.control_latency_s, MAX_LATENCY_S),
         {name: value for name, value in play.items() if value},
-        {name: value for name, value in offsets.items() if value},
+        {name: item.encoder_offset for name, item in arms.items() if item.encoder_offset},
     )
-
-
-def _check_keys(where: str, data: Any, valid: tuple[str, ...]) -> None:
-    if not isinstance(data, dict):
-        raise ValueError(f'"{where}" must be an object')
-    for key in data:
-        if key not in valid:
-            raise ValueError(f"{where} has no {key!r}; valid: {', '.join(valid)}")

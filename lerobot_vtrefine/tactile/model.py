@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import Any
 
 import lerobot_vtrefine.tactile.stages  # noqa: F401  registers every stage
+from lerobot_vtrefine.files import decode, read_json
 from lerobot_vtrefine.tactile.stages.base import DOMAINS, STAGES, Stage, stage_class
 from lerobot_vtrefine.tactile.stages.contact import Consistent, ContactStage, KelvinVoigt
 from lerobot_vtrefine.tactile.stages.readout import Gain, Idle, Noise, Quantisation, RowSharing
@@ -134,6 +135,8 @@ class SensorModel:
             or not isinstance(data.get("stages"), list)
         ):
             raise ValueError(f'sensor model must hold "schema": "{SCHEMA}" and a list "stages"')
+        if others := sorted(set(data) - {"schema", "stages"}):
+            raise ValueError(f"sensor model has no {others[0][:60]!r}; valid: schema, stages")
         return cls(tuple(_stage_from_dict(item) for item in data["stages"]))
 
     def save(self, path: str | Path) -> None:
@@ -143,21 +146,16 @@ class SensorModel:
     @classmethod
     def load(cls, path: str | Path) -> "SensorModel":
         """Read sensor_model.json; ValueError names the file and what is wrong with it."""
+        data = read_json(path)
         try:
-            return cls.from_dict(json.loads(Path(path).read_text()))
-        except (ValueError, TypeError) as error:
+            return cls.from_dict(data)
+        except ValueError as error:
             raise ValueError(f"{path}: {error}") from error
 
 
-def _stage_from_dict(item: dict[str, Any]) -> Stage:
+def _stage_from_dict(item: Any) -> Stage:
     if not isinstance(item, dict) or not isinstance(item.get("stage"), str):
         raise ValueError(f'every stage needs a "stage" name; valid names: {", ".join(sorted(STAGES))}')
     cls = stage_class(item["stage"])
     parameters = {key: value for key, value in item.items() if key != "stage"}
-    valid = [field.name for field in dataclasses.fields(cls)]
-    for key in parameters:
-        if key not in valid:
-            raise ValueError(
-                f"stage {cls.name!r} has no parameter {key!r}; valid: {', '.join(valid) or 'none'}"
-            )
-    return cls(**parameters)
+    return decode(cls, parameters, f"stage {cls.name!r}", f"{cls.name}.")

@@ -140,7 +140,7 @@ def test_broken_folders(joints_only: Path, tmp_path: Path) -> None:
     with pytest.raises(ValueError, match="data files lack episode 0"):
         replay(ReplayConfig(tmp_path / "out", SourceConfig(copy)))
     damage(copy, "info.json", lambda text: text.replace('"features"', '"columns"'))
-    with pytest.raises(ValueError, match=r"no description of a LeRobot dataset: KeyError\('features'\)"):
+    with pytest.raises(ValueError, match=r"no description of a LeRobot dataset: .* lacks 'features'"):
         replay(ReplayConfig(tmp_path / "out", SourceConfig(copy)))
     damage(copy, "info.json", lambda text: text.replace('"columns"', '"features"'))
     damage(copy, "info.json", lambda text: text.replace('"v3.0"', '"v2.1"'))
@@ -177,7 +177,7 @@ def test_notes_of_other_recordings_are_refused(demos: Path, tmp_path: Path) -> N
     other = {**whole["settings"], "scene": {**whole["settings"]["scene"], "gravity_m_s2": 3.7}}
     refuse({**whole, "settings": other}, "written by another version")
     del other["rules"]
-    refuse({**whole, "settings": other}, "lacks the setting 'rules'")
+    refuse({**whole, "settings": other}, "settings lacks 'rules'")
 
 
 def test_positions_that_are_no_numbers_are_refused(tmp_path: Path) -> None:

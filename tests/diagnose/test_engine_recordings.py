@@ -55,9 +55,9 @@ def test_a_set_is_read(tmp_path: Path) -> None:
         ({}, ("depth_m", "force_n"), {}, "column depth_m: needs depth_m or force_n"),
         ({"time_s": ["a"] * 5}, (), {}, "column time_s: must hold numbers"),
         ({}, (), {"schema": "x"}, 'recording.json: "schema" must be'),
-        ({}, (), {"object": {"shape": "cone"}}, '"object.shape" must be one of sphere'),
-        ({}, (), {"object": {"shape": "flat", "size_m": [0.1]}}, '"object.size_m" must be two lengths'),
-        ({}, (), {"pad": {"rows": 2.5, "cols": 1, "pitch_m": 0.002}}, "whole numbers"),
+        ({}, (), {"object": {"shape": "cone"}}, "object.shape must be one of sphere"),
+        ({}, (), {"object": {"shape": "flat", "size_m": [0.1]}}, "object.size_m must hold 2 values"),
+        ({}, (), {"pad": {"rows": 2.5, "cols": 1, "pitch_m": 0.002}}, "pad.rows must be a whole number"),
         ({}, (), {"trials": []}, "at least one trial"),
     ],
 )

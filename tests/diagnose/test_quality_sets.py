@@ -312,5 +312,5 @@ def test_a_byte_order_mark_does_no_harm(tmp_path):
 )
 def test_labels_of_other_kinds_are_refused(tmp_path, entry):
     header, columns = labelled(lambda k: entry if k == BAD else {})(*make_set())
-    with pytest.raises(ValueError, match=rf"{FILE}: trial {BAD}: \"{next(iter(entry))}\" must be"):
+    with pytest.raises(ValueError, match=rf"recording\.json: trials\[{BAD}\]\.{next(iter(entry))} must be"):
         read_recording_set(write_set(tmp_path / "set", header, columns))

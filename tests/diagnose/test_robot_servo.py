@@ -145,14 +145,23 @@ def test_file_round_trip(tmp_path) -> None:
     assert RobotModel.load(tmp_path / "m.json") == model
 
 
+JOINT = {"name": "a", "natural_frequency_rad_s": 20.0, "damping_ratio": 1.0}
+
+
 @pytest.mark.parametrize(
     ("change", "message"),
     [
+        ({"joints": [{**JOINT, "friction": "0.1"}]}, r"joints\[0\].friction must be a number, got '0.1'"),
+        ({"joints": [{**JOINT, "friction": -0.1}]}, r"joints\[0\].friction must not be negative"),
+        ({"joints": [{**JOINT, "sag_terms": [1.0]}]}, r"joints\[0\].sag_terms must hold 4 values"),
+        ({"joints": [{**JOINT, "give": 2.0}]}, r"joints\[0\].give must be at most 1"),
+        ({"joints": [JOINT, JOINT]}, "each its own"),
+        ({"latency": 0.1}, "robot model has no 'latency'; valid: schema, joints, control_latency_s"),
         ({"schema": "x"}, "schema"),
         ({"joints": []}, "joints"),
-        ({"joints": [{"name": "a", "speed": 3}]}, "speed"),
+        ({"joints": [{**JOINT, "speed": 3}]}, "has no 'speed'; valid: name"),
         ({"joints": [{"name": "a"}]}, "natural_frequency"),
-        ({"joints": [{"name": "a", "sag_form": "x"}]}, "sag_form"),
+        ({"joints": [{**JOINT, "sag_form": "x"}]}, "sag_form must be one of mass"),
     ],
 )
 def test_bad_file_is_refused_by_name(tmp_path, change, message) -> None:

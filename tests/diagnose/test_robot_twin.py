@@ -75,16 +75,20 @@ def test_diagnosed_robot_as_reality(tmp_path) -> None:
     assert dict(robot.encoder_offset_rad) == {"left_elbow": -0.01}
 
 
+SERVO = {"natural_frequency_rad_s": 20.0, "damping_ratio": 1.0}
+
+
 @pytest.mark.parametrize(
     ("joints", "words"),
     [
         (
-            [{"name": "shoulder_pan", "encoder_offset": 0.1}],
+            [{"name": "shoulder_pan", **SERVO, "encoder_offset": 0.1}],
             "arms have no joint 'shoulder_pan'",
         ),
-        ([{"encoder_offset": 0.1}], 'a list "joints" of objects with a "name"'),
-        ([{"name": "left_elbow", "backlash_command": -0.1}], "must not be negative"),
-        (None, 'a list "joints"'),
+        ([{**SERVO, "encoder_offset": 0.1}], r"joints\[0\] lacks 'name'"),
+        ([{"name": "left_elbow", **SERVO, "backlash_command": -0.1}], "must not be negative"),
+        ([{"name": "left_elbow"}], "lacks 'natural_frequency_rad_s'"),
+        (None, "joints must be a list, got None"),
     ],
 )
 def test_a_robot_that_is_not_simulated_is_refused_as_reality(tmp_path, joints, words) -> None:

@@ -176,7 +176,7 @@ def test_pads_file_round_trip_keeps_only_what_differs(tmp_path: Path) -> None:
     [
         ("", "no 'pads:' section"),
         ("pads: {a: {rows: 12}}", "'a' needs a port"),
-        ("pads: {a: {port: x, row: 12}}", "unknown row; known: port, rows"),
+        ("pads: {a: {port: x, row: 12}}", "'a': it has no 'row'; valid: port, rows"),
         ("pads: {a: {port: x, row_offset: 40}}", "'a': row_offset=40"),
         ("pads: {a: {port: x}, b: {port: x}}", "'a' and 'b' are both on x"),
         ("pads: [", "not valid YAML"),
@@ -237,7 +237,7 @@ def test_terminated_emulator_removes_its_ports(tmp_path: Path) -> None:
         (pad_emulator, ["--shape", "12"], "--shape=12 is not rows x columns"),
         (pad_emulator, ["--recording", "nowhere.npy"], "nowhere.npy does not exist"),
         (pad_emulator, ["--markers", "999"], "taxel 999"),
-        (pad_emulator, ["--loss", "2"], "loss=2.0 must lie within 0 .. 1"),
+        (pad_emulator, ["--loss", "2"], "loss must be at most 1, got 2.0"),
         (find_pads, ["--ports", "/nowhere/pty"], "/nowhere/pty does not exist"),
         (find_pads, ["--ports", "x", "--names", "a", "a"], "must differ"),
         (view_pads, [], "give either --pads-file"),

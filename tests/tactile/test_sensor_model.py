@@ -83,7 +83,7 @@ def test_unknown_names_list_the_valid_ones(tmp_path: Path) -> None:
         SensorModel.default().find("hysterisis")
     data = SensorModel.default().to_dict()
     data["stages"][1]["gain"] = 3
-    with pytest.raises(ValueError, match="stage 'gain' has no parameter 'gain'; valid: counts_per_n"):
+    with pytest.raises(ValueError, match="stage 'gain' has no 'gain'; valid: counts_per_n"):
         SensorModel.from_dict(data)
     path = tmp_path / "broken.json"
     path.write_text(json.dumps({"schema": "other", "stages": []}))

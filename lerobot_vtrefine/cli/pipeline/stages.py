@@ -15,6 +15,7 @@ from pathlib import Path
 
 from lerobot_vtrefine.cli.pipeline.progress import LiveLine, parse_progress, read_tail
 from lerobot_vtrefine.cli.results.provenance import commit
+from lerobot_vtrefine.files import decode, read_json
 
 POLL_S = 0.25
 STOP_TIMEOUT_S = 10.0
@@ -151,7 +152,10 @@ class StageRunner:
         stamp = self._stamp(stage)
         if not (stamp.is_file() and stage.product.exists()):
             return None
-        record = StageRecord(**json.loads(stamp.read_text(encoding="utf-8")))
+        try:
+            record = decode(StageRecord, read_json(stamp), "the stamp of a stage")
+        except ValueError as error:
+            raise ValueError(f"{error}; remove {stamp} to run this stage again") from error
         return record if record.key == self.keys[stage.name] else None
 
     def _stamp(self, stage: Stage) -> Path:

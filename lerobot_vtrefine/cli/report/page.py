@@ -1,6 +1,5 @@
 """``report.html``: one self-contained page about a pipeline's results."""
 
-import csv
 import json
 from pathlib import Path
 from typing import Any
@@ -11,6 +10,7 @@ from lerobot_vtrefine.cli.pipeline.progress import clock
 from lerobot_vtrefine.cli.report.charts import Bar, Series, bar_chart, line_chart
 from lerobot_vtrefine.cli.report.media import data_uri, heat_map, strongest_contact
 from lerobot_vtrefine.datasets.features import PADS
+from lerobot_vtrefine.files import read_number_rows
 
 NAMES = {"pretrain": "imitation", "finetune": "after DPPO"}
 STYLES = {"pretrain": "a", "finetune": "b"}
@@ -76,14 +76,17 @@ def read_curve(path: Path) -> list[dict[str, float]]:
     """Rows of the fine-tuning log as numbers; empty when there is none."""
     if not path.is_file():
         return []
-    with path.open(encoding="utf-8", newline="") as file:
-        return [{key: float(value) for key, value in row.items() if value} for row in csv.DictReader(file)]
+    return read_number_rows(path)
 
 
 def curve_chart(rows: list[dict[str, float]]) -> str:
     """Success of DPPO's rollouts, and of its evaluations on the way, over its iterations."""
     lines = [
-        Series(label, [(row["iteration"], row[column]) for row in rows if column in row], style)
+        Series(
+            label,
+            [(row["iteration"], row[column]) for row in rows if {"iteration", column} <= row.keys()],
+            style,
+        )
         for column, label, style in CURVES
     ]
     return line_chart(lines, "DPPO iteration", "success while fine-tuning")

@@ -5,7 +5,7 @@ import os
 import platform
 from collections import Counter
 from collections.abc import Sequence
-from dataclasses import asdict
+from dataclasses import asdict, dataclass
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any
@@ -15,11 +15,36 @@ from lerobot_vtrefine.cli.pipeline.stages import StageRecord
 from lerobot_vtrefine.cli.report.statistics import proportion, quantiles
 from lerobot_vtrefine.cli.results.provenance import provenance
 from lerobot_vtrefine.envs.episode_log import read_episode_log
+from lerobot_vtrefine.files import decode, limits, read_json
 
 # Measurements of every episode, and those that only a success has.
 METRICS = ("in_hand_shift_m", "rim_slide_m", "peak_force_n")
 SUCCESS_METRICS = ("time_to_success_s", *METRICS)
 CLEAR_LIFT = 0.2
+
+
+@dataclass(frozen=True)
+class _Overall:
+    eval_s: float = limits(0.0, 1e9)
+
+
+@dataclass(frozen=True)
+class _TaskMetrics:
+    successes: tuple[bool, ...]
+    video_paths: tuple[str, ...] = ()
+
+
+@dataclass(frozen=True)
+class _Task:
+    metrics: _TaskMetrics
+
+
+@dataclass(frozen=True)
+class _EvalInfo:
+    """What is read of lerobot-eval's eval_info.json, whose other fields are LeRobot's."""
+
+    per_task: tuple[_Task, ...]
+    overall: _Overall
 
 
 def load_evaluation(directory: Path, first_seed: int) -> dict[str, Any]:
@@ -30,17 +55,23 @@ def load_evaluation(directory: Path, first_seed: int) -> dict[str, Any]:
         over all episodes and over successes; SI units), ``failures`` (count by reason) and ``videos``
         (``[{"path", "seed", "success", "failure"}]``).
     """
-    info = json.loads((directory / "eval_info.json").read_text(encoding="utf-8"))
-    task = info["per_task"][0]["metrics"]
-    successes = [bool(value) for value in task["successes"]]
+    path = directory / "eval_info.json"
+    try:
+        info = decode(_EvalInfo, read_json(path), "the evaluation", others=True)
+        if len(info.per_task) != 1:
+            raise ValueError(f"per_task must hold one task, got {len(info.per_task)}")
+    except ValueError as error:
+        raise ValueError(f"{path} is no result of lerobot-eval: {error}") from error
+    task = info.per_task[0].metrics
+    successes = list(task.successes)
     rows = read_episode_log(directory / "episodes.jsonl", first_seed, len(successes))
     reasons = {row["seed"]: failure_name(row) for row in rows if not row["success"]}
     videos = [
         {"path": path, "seed": seed, "success": successes[seed - first_seed], "failure": reasons.get(seed)}
-        for seed, path in enumerate(task.get("video_paths", []), first_seed)
+        for seed, path in enumerate(task.video_paths, first_seed)
     ]
     return proportion(sum(successes), len(successes)) | {
-        "eval_seconds": round(info["overall"]["eval_s"], 1),
+        "eval_seconds": round(info.overall.eval_s, 1),
         "seeds": [first_seed + index for index in range(len(successes))],
         "metrics": summarise(rows),
         "failures": dict(Counter(reasons.values()).most_common()),
@@ -50,7 +81,7 @@ def load_evaluation(directory: Path, first_seed: int) -> dict[str, Any]:
 
 def failure_name(row: dict[str, Any]) -> str:
     """Why an episode failed; the simulation names no reason when the time ran out."""
-    name = row["failure"]
+    name = row.get("failure")
     return "time-out" if name in (None, "", "none") else name.replace("in_hand", "in-hand").replace("_", " ")
 
 

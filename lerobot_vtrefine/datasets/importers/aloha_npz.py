@@ -5,15 +5,17 @@ Arrays: ``command`` and ``position`` (N, 16) in rad and m, ``length`` (E,) frame
 motion.
 """
 
-import zipfile
 from pathlib import Path
 
 import numpy as np
 
 from lerobot_vtrefine.datasets.importers.joint_episodes import JointEpisode
 from lerobot_vtrefine.embodiments import get_embodiment
+from lerobot_vtrefine.files.arrays import NUMBERS, TEXTS, WHOLE, read_arrays
 
-KEYS = ("command", "position", "length", "joints")
+KINDS = {"command": NUMBERS, "position": NUMBERS, "length": WHOLE, "joints": TEXTS}
+LARGEST_POSITION = 100.0
+"""No command or position is further from zero [rad or m]."""
 NORMALISED_KEYS = ("actions", "joint_states", "traj_lengths")
 
 
@@ -23,22 +25,20 @@ def read_aloha_npz(path: Path) -> list[JointEpisode]:
     Raises:
         ValueError: the file is no npz of this format; says in which respect.
     """
-    try:
-        with np.load(path, allow_pickle=False) as file:
-            arrays = {key: file[key] for key in file.files}
-    except (ValueError, zipfile.BadZipFile, EOFError) as error:
-        raise ValueError(f"{path} cannot be read as an npz of arrays: {error}") from error
+    arrays = read_arrays(path, KINDS | dict.fromkeys(NORMALISED_KEYS, NUMBERS))
     if set(NORMALISED_KEYS) <= set(arrays):
         raise ValueError(f"{path} holds values normalised to [-1, 1]: de-normalise them to rad and m first")
-    missing = [key for key in KEYS if key not in arrays]
+    missing = [key for key in KINDS if key not in arrays]
     if missing:
-        raise ValueError(f"{path} has no array {missing[0]!r}; this format has {', '.join(KEYS)}")
+        raise ValueError(f"{path} has no array {missing[0]!r}; this format has {', '.join(KINDS)}")
     order = _order(path, arrays["joints"])
     command, position, length = arrays["command"], arrays["position"], arrays["length"]
     for name, values in (("command", command), ("position", position)):
         if values.ndim != 2 or values.shape[1] != len(order) or not np.isfinite(values).all():
             raise ValueError(f"{path}: {name} must be finite, (frames, {len(order)}), got {values.shape}")
-    if length.ndim != 1 or not len(length) or (length < 1).any():
+        if np.abs(values).max(initial=0.0) > LARGEST_POSITION:
+            raise ValueError(f"{path}: {name} must be in rad and m, got {np.abs(values).max():g}")
+    if length.ndim != 1 or not len(length) or (length < 1).any() or (length > len(command)).any():
         raise ValueError(f"{path}: length must list the frames of at least one episode")
     if not int(length.sum()) == len(command) == len(position):
         counts = f"{int(length.sum())}, {len(command)} and {len(position)}"
@@ -53,6 +53,6 @@ def _order(path: Path, joints: np.ndarray) -> list[int]:
     names = [str(name) for name in joints.ravel()]
     wanted = get_embodiment("aloha").joint_names
     if sorted(names) != sorted(wanted):
-        wrong = sorted(set(names) ^ set(wanted)) or ["a repeated one"]
+        wrong = [name[:60] for name in sorted(set(names) ^ set(wanted))] or ["a repeated one"]
         raise ValueError(f"{path}: joints must be the 16 of ALOHA, but differ in {', '.join(wrong[:4])}")
     return [names.index(name) for name in wanted]

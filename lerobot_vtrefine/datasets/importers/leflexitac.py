@@ -10,7 +10,7 @@ counts are not. State, action, images and videos are taken over as they are.
 import json
 import shutil
 from collections.abc import Iterator, Mapping
-from dataclasses import dataclass, field
+from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -19,9 +19,13 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 from tqdm import tqdm
 
+from lerobot_vtrefine.datasets.episodes import FeatureInfo, check_names
 from lerobot_vtrefine.datasets.features import Array
 from lerobot_vtrefine.datasets.importers.flexitac_counts import HostRule, UnknownRuleError, recover_counts
 from lerobot_vtrefine.datasets.importers.new_folder import new_folder
+from lerobot_vtrefine.datasets.importers.source_checks import check_frames, read_stats
+from lerobot_vtrefine.files import decode, limits, read_json
+from lerobot_vtrefine.files.tables import read_table
 
 PREFIX = "observation.tactile."
 ONLY_PAD = "primary"
@@ -29,6 +33,38 @@ ONLY_PAD = "primary"
 BASELINE_PREFIX = "observation.tactile_baseline."
 DRIVER_DEFAULTS = {"threshold": 25.0, "noise_scale": 30.0}
 """What the host software uses when a dataset does not say."""
+
+MAX_TAXELS_A_SIDE = 256
+INDEX_COLUMNS = ("episode_index", "index")
+"""What every data file of a LeRobot dataset has."""
+
+
+@dataclass(frozen=True)
+class _Sensor:
+    """The host's rule; null where the software did not say."""
+
+    threshold: float | None = limits(0.0, 1e4, default=None)
+    noise_scale: float | None = limits(1e-3, 1e6, default=None)
+    baseline: float | tuple[tuple[float, ...], ...] | None = limits(-1e4, 1e4, default=None)
+
+
+@dataclass(frozen=True)
+class _Described:
+    features: dict[str, FeatureInfo]
+
+
+@dataclass(frozen=True)
+class _Info(_Described):
+    """What is read of meta/info.json, whose other fields are LeRobot's."""
+
+    total_episodes: int = limits(1, 1e7)
+    total_frames: int = limits(1, 1e9)
+    codebase_version: str | None = None
+    fps: float = limits(above=0.0, maximum=1e5, default=1.0)
+    data_path: str = ""
+    video_path: str | None = None
+    tactile_sensors: dict[str, _Sensor | None] | None = None
+
 
 Stats = dict[str, dict[str, Array]]
 
@@ -72,10 +108,10 @@ def is_leflexitac(root: Path) -> bool:
     if not path.is_file():
         return False
     try:
-        features = json.loads(path.read_text(encoding="utf-8"))["features"]
-        return any(_is_pad(key, feature) for key, feature in features.items())
-    except (ValueError, KeyError, TypeError, AttributeError):  # some other JSON
+        content = decode(_Described, read_json(path), "info.json", others=True)
+    except ValueError:  # some other JSON
         return False
+    return any(_is_pad(key, feature) for key, feature in content.features.items())
 
 
 def import_leflexitac(source: Path, root: Path, pads: Mapping[str, str]) -> ImportSummary:
@@ -90,32 +126,40 @@ def import_leflexitac(source: Path, root: Path, pads: Mapping[str, str]) -> Impo
         FileExistsError: there is something at ``root``.
     """
     from lerobot.datasets.compute_stats import aggregate_stats, compute_episode_stats
-    from lerobot.datasets.io_utils import load_stats, write_stats
+    from lerobot.datasets.io_utils import write_stats
 
-    info = _read_info(source)
-    columns = _pad_columns(source, info, pads)
+    info, content = _read_info(source)
+    columns = _pad_columns(source, content, pads)
     features = _new_features(info, columns)
     above_idle = tuple(column.pad for column in columns if not column.idle_known)
     summary = ImportSummary(
-        episodes=info["total_episodes"],
-        frames=info["total_frames"],
+        episodes=content.total_episodes,
+        frames=content.total_frames,
         normalised=tuple(column.pad for column in columns if column.rule is not None),
         above_idle=above_idle,
     )
     episode_stats: dict[int, Stats] = {}
+    frames = 0
     with new_folder(root) as work:
-        with tqdm(total=info["total_frames"], unit="frame", desc="import") as progress:
+        with tqdm(total=content.total_frames, unit="frame", desc="import") as progress:
             for path in sorted((source / "data").rglob("*.parquet")):
-                table = pq.read_table(path)
+                table = _read_columns(path, None)
+                check_frames(path, table)
                 arrays = _counts(table, columns, summary)
                 _write_data(table, arrays, features, work / path.relative_to(source))
                 for episode, rows in _episodes(table):
                     parts: dict[str, Any] = {key: values[rows] for key, values in arrays.items()}
                     episode_stats[episode] = compute_episode_stats(parts, features)
+                frames += len(table)
                 progress.update(len(table))
+        if (frames, len(episode_stats)) != (content.total_frames, content.total_episodes):
+            raise ValueError(
+                f"{source}: meta/info.json counts {content.total_episodes} episodes of {content.total_frames}"
+                f" frames, the data files {len(episode_stats)} of {frames}; is the copy complete?"
+            )
         _write_episode_rows(source, work, columns, episode_stats)
         old = {column.source for column in columns}
-        stats = {key: value for key, value in (load_stats(source) or {}).items() if key not in old}
+        stats = read_stats(source, [key for key in info["features"] if key not in old])
         write_stats(stats | aggregate_stats(list(episode_stats.values())), work)
         _copy_rest(source, work)
         kept = {key: value for key, value in info.items() if key != "tactile_sensors"}
@@ -125,34 +169,39 @@ def import_leflexitac(source: Path, root: Path, pads: Mapping[str, str]) -> Impo
     return summary
 
 
-def _is_pad(key: str, feature: Mapping[str, Any]) -> bool:
-    shape = feature.get("shape", ())
+def _is_pad(key: str, feature: FeatureInfo) -> bool:
     named = key == PREFIX.removesuffix(".") or key.startswith(PREFIX)
-    return named and len(shape) == 2 and feature.get("dtype") == "float32"
+    return named and len(feature.shape) == 2 and feature.dtype == "float32"
 
 
-def _read_info(source: Path) -> dict[str, Any]:
+def _read_info(source: Path) -> tuple[dict[str, Any], _Info]:
+    """meta/info.json as it is, and what is read of it."""
     path = source / "meta" / "info.json"
+    info = read_json(path)
     try:
-        info = json.loads(path.read_text(encoding="utf-8"))
+        content = decode(_Info, info, "the dataset's description", others=True)
     except ValueError as error:
-        raise ValueError(f"{path} is no JSON: {error}") from error
-    missing = [key for key in ("features", "total_episodes", "total_frames") if key not in info]
-    if missing:
-        raise ValueError(f"{path} lacks {missing[0]!r}: it is no complete description of a dataset")
-    version = info.get("codebase_version")
+        raise ValueError(f"{path}: {error}") from error
+    check_names(path, content.features)
+    version = content.codebase_version
     if version != "v3.0":
         raise ValueError(
             f"{path}: dataset version {version} is not v3.0; convert it first with"
             " python -m lerobot.scripts.convert_dataset_v21_to_v30"
         )
-    return info
+    return info, content
 
 
-def _pad_columns(source: Path, info: dict[str, Any], pads: Mapping[str, str]) -> list[PadColumn]:
-    keys = [key for key, feature in info["features"].items() if _is_pad(key, feature)]
+def _pad_columns(source: Path, info: _Info, pads: Mapping[str, str]) -> list[PadColumn]:
+    keys = [key for key, feature in info.features.items() if _is_pad(key, feature)]
     sources = {key[len(PREFIX) :] or ONLY_PAD: key for key in keys}
-    found = {name: tuple(info["features"][key]["shape"]) for name, key in sources.items()}
+    found = {}
+    for name, key in sources.items():
+        rows, cols = found[name] = info.features[key].shape
+        if not (1 <= rows <= MAX_TAXELS_A_SIDE and 1 <= cols <= MAX_TAXELS_A_SIDE):
+            raise ValueError(
+                f"{source}: pad {name!r} is {rows} x {cols}, not 1 to {MAX_TAXELS_A_SIDE} a side"
+            )
     unknown = sorted(set(pads) - set(found))
     if unknown:
         raise ValueError(f"--pads names {unknown[0]!r}, but {source} has the pads {', '.join(sorted(found))}")
@@ -160,10 +209,11 @@ def _pad_columns(source: Path, info: dict[str, Any], pads: Mapping[str, str]) ->
     if len(set(names)) < len(names):
         raise ValueError(f"--pads gives two pads the same name: {', '.join(sorted(names))}")
     largest = _largest_readings(source, {sources[name]: shape for name, shape in found.items()})
-    sensors = info.get("tactile_sensors") or {}
+    sensors = info.tactile_sensors or {}
     columns = []
     for name, shape in found.items():
-        sensor = {key: value for key, value in (sensors.get(name) or {}).items() if value is not None}
+        given = asdict(sensors.get(name) or _Sensor())
+        sensor = {key: value for key, value in given.items() if value is not None}
         rule = _host_rule(sensor, shape, largest[sources[name]])
         known = rule is not None and "baseline" in sensor
         columns.append(PadColumn(sources[name], pads.get(name, name), shape, rule, known))
@@ -174,9 +224,12 @@ def _host_rule(sensor: Mapping[str, Any], shape: tuple[int, int], largest: float
     """The rule behind a pad's readings; None for counts, which exceed 1."""
     if largest > 1.0 + 1e-6:
         return None
-    baseline = np.asarray(sensor.get("baseline", 0.0), float)
-    if baseline.shape not in ((), shape):
-        raise ValueError(f"meta/info.json: a pad's baseline is {baseline.shape}, its frames are {shape}")
+    baseline = sensor.get("baseline", 0.0)
+    if isinstance(baseline, tuple) and (len(baseline), *{len(row) for row in baseline}) != shape:
+        raise ValueError(
+            f"meta/info.json: a pad's baseline is not {shape[0]} x {shape[1]}, as its frames are"
+        )
+    baseline = np.asarray(baseline, float)
     threshold, scale = (float(sensor.get(name, default)) for name, default in DRIVER_DEFAULTS.items())
     return HostRule(threshold, scale, np.broadcast_to(baseline, shape))
 
@@ -191,6 +244,8 @@ def _largest_readings(source: Path, shapes: Mapping[str, tuple[int, int]]) -> di
         table = _read_columns(path, list(shapes))
         for key, shape in shapes.items():
             values = _flat(table[key])
+            if values.dtype.kind not in "fiu":
+                raise ValueError(f"{path}, column {key}: must hold numbers, not {table[key].type}")
             if len(values) != len(table) * int(np.prod(shape)):
                 raise ValueError(f"{path}, column {key}: frames are not of shape {shape}")
             if not np.isfinite(values).all() or (len(values) and values.min() < 0):
@@ -199,11 +254,18 @@ def _largest_readings(source: Path, shapes: Mapping[str, tuple[int, int]]) -> di
     return largest
 
 
-def _read_columns(path: Path, columns: list[str]) -> pa.Table:
+def _read_columns(path: Path, columns: list[str] | None) -> pa.Table:
     try:
-        return pq.read_table(path, columns=columns)
-    except (pa.ArrowException, OSError) as error:
-        raise ValueError(f"{path} cannot be read: {str(error).splitlines()[0]}") from error
+        table = read_table(path, columns)
+    except ValueError as error:
+        raise ValueError(f"{path} cannot be read: {error}") from error
+    wanted = INDEX_COLUMNS if columns is None else columns
+    if missing := [name for name in wanted if name not in table.column_names]:
+        raise ValueError(f"{path} has no column {missing[0]}")
+    for name in set(INDEX_COLUMNS) & set(table.column_names):
+        if not pa.types.is_integer(table[name].type) or table[name].null_count:
+            raise ValueError(f"{path}: column {name} must hold whole numbers, not {table[name].type}")
+    return table
 
 
 def _flat(column: pa.ChunkedArray) -> Array:
@@ -256,11 +318,19 @@ def _write_data(
     schema = get_hf_features_from_features(
         {key: {**feature, "shape": tuple(feature["shape"])} for key, feature in features.items()}
     ).arrow_schema
+    if absent := [key for key in schema.names if key not in {*table.column_names, *arrays}]:
+        raise ValueError(f"meta/info.json lists {absent[0]}, which {path.name} lacks")
     data = {name: table[name] for name in table.column_names}
     for key, values in arrays.items():
         data[key] = pa.FixedSizeListArray.from_arrays(pa.array(values.ravel()), values.shape[1])
     path.parent.mkdir(parents=True, exist_ok=True)
-    pq.write_table(pa.table([data[name] for name in schema.names], names=schema.names).cast(schema), path)
+    try:
+        table = pa.table([data[name] for name in schema.names], names=schema.names).cast(schema)
+    except pa.ArrowException as error:
+        raise ValueError(
+            f"{path.name} is not as meta/info.json says: {str(error).splitlines()[0]}"
+        ) from error
+    pq.write_table(table, path)
 
 
 def _episodes(table: pa.Table) -> Iterator[tuple[int, slice]]:
@@ -276,23 +346,31 @@ def _write_episode_rows(
 ) -> None:
     """The episodes' metadata, with the statistics of the new columns in place of the old ones'."""
     old = tuple(f"stats/{column.source}/" for column in columns)
+    unlisted = set(episode_stats)
     for path in sorted((source / "meta" / "episodes").rglob("*.parquet")):
-        table = pq.read_table(path)
+        table = read_table(path)
+        check_frames(path, table, "stats/")
+        if "episode_index" not in table.column_names:
+            raise ValueError(f"{path} has no column episode_index")
         table = table.select([name for name in table.column_names if not name.startswith(old)])
-        listed = [int(index) for index in table["episode_index"].to_pylist()]
-        absent = sorted(set(listed) - set(episode_stats))
+        listed = table["episode_index"].to_pylist()
+        absent = [index for index in listed if index not in episode_stats]
         if absent:
             raise ValueError(
                 f"{path} lists episode {absent[0]}, which the data files lack; is the copy complete?"
             )
+        unlisted -= set(listed)
         rows = [episode_stats[index] for index in listed]
-        for key in rows[0]:
+        for key in rows[0] if rows else ():
             for name in rows[0][key]:
                 values = [np.atleast_1d(row[key][name]).tolist() for row in rows]
                 table = table.append_column(f"stats/{key}/{name}", pa.array(values))
         target = work / path.relative_to(source)
         target.parent.mkdir(parents=True, exist_ok=True)
         pq.write_table(table, target)
+
+    if unlisted:
+        raise ValueError(f"{source}: the metadata lack episode {min(unlisted)}; is the copy complete?")
 
 
 def _copy_rest(source: Path, work: Path) -> None:

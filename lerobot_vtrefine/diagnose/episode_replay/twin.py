@@ -1,8 +1,7 @@
 """Which simulation is a dataset's twin, and from which state each episode starts in it."""
 
-import json
 from collections.abc import Mapping
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from typing import Any
 
 import draccus
@@ -11,10 +10,33 @@ from draccus.utils import DraccusException
 from lerobot_vtrefine.datasets.episodes import EpisodeFolder
 from lerobot_vtrefine.envs.config import VtRefineEnvConfig
 from lerobot_vtrefine.envs.demo_dataset import LEDGER
+from lerobot_vtrefine.files import decode, limits, read_json
 from lerobot_vtrefine.sim.config import RandomizationConfig, SceneConfig, TaskConfig
 
-SETTINGS = ("scene", "rules", "randomization", "sensor_model", "task")
-"""What decides how an episode comes out, beside its seed."""
+
+@dataclass(frozen=True)
+class _Settings:
+    """What decides how an episode comes out, beside its seed."""
+
+    scene: dict[str, Any]
+    rules: dict[str, Any]
+    randomization: dict[str, Any]
+    sensor_model: str
+    task: str
+
+
+@dataclass(frozen=True)
+class _Row:
+    episode_index: int = limits(0, 1e7)
+    seed: int = limits(0, 2**63)
+
+
+@dataclass(frozen=True)
+class _Ledger:
+    """What is read of the note; the rest is for continuing."""
+
+    settings: _Settings
+    episodes: tuple[_Row, ...]
 
 
 def read_ledger(folder: EpisodeFolder) -> dict[str, Any] | None:
@@ -26,14 +48,11 @@ def read_ledger(folder: EpisodeFolder) -> dict[str, Any] | None:
     path = folder.root / LEDGER
     if not path.is_file():
         return None
+    ledger = read_json(path)
     try:
-        ledger = json.loads(path.read_text(encoding="utf-8"))
-        missing = set(SETTINGS) - set(ledger["settings"])
-        _ = _seeds(ledger)
-    except (ValueError, KeyError, TypeError) as error:
-        raise ValueError(f"{path} is no note of vtrefine-record-demos: {error!r}") from error
-    if missing:
-        raise ValueError(f"{path} lacks the setting {min(missing)!r}")
+        decode(_Ledger, ledger, "it", others=True)
+    except ValueError as error:
+        raise ValueError(f"{path} is no note of vtrefine-record-demos: {error}") from error
     return ledger
 
 

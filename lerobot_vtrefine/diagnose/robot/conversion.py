@@ -1,9 +1,14 @@
 """Between the parameters of fits and the model file that is written."""
 
+from typing import TYPE_CHECKING, cast
+
 import numpy as np
 
 from lerobot_vtrefine.diagnose.robot.fitting import PARAMETERS, SAG, Point
 from lerobot_vtrefine.diagnose.robot.model import JointModel, RobotModel
+
+if TYPE_CHECKING:
+    from lerobot_vtrefine.embodiments.robot_file import SagForm
 
 
 def to_model(names: tuple[str, ...], point: Point) -> RobotModel:
@@ -20,7 +25,7 @@ def to_model(names: tuple[str, ...], point: Point) -> RobotModel:
                 backlash_command=value["play"],
                 backlash_output=value["loose"],
                 friction=value["friction"],
-                sag_form=point.forms[index],
+                sag_form=cast("SagForm", point.forms[index]),
                 sag_terms=tuple(value[name] for name in SAG),
                 compliance=value["bend"],
                 stop=value["stop"],

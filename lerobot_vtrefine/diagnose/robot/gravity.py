@@ -12,10 +12,10 @@ from dataclasses import dataclass
 import numpy as np
 
 from lerobot_vtrefine.embodiments import ALOHA
+from lerobot_vtrefine.embodiments.robot_file import TERMS
 
 Array = np.ndarray
 
-TERMS = 4
 ONE_TERM_FORMS = ("mass", "reach", "link", "own")
 """Shapes with one free number: link masses, TCP alone, own link alone, own angle alone."""
 TWO_TERM_FORM = "arm"

@@ -1,7 +1,7 @@
 """The robot model: servo constants per joint and what was found beyond them, in one JSON file."""
 
 import json
-from dataclasses import asdict, dataclass, fields, replace
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -12,38 +12,9 @@ from lerobot_vtrefine.diagnose.robot import gravity
 from lerobot_vtrefine.diagnose.robot.batch import Batch, make_batch
 from lerobot_vtrefine.diagnose.robot.servo import Columns, simulate
 from lerobot_vtrefine.diagnose.verdict import write_atomically
+from lerobot_vtrefine.embodiments.robot_file import SCHEMA, JointModel, decode_robot, read_robot_file
 
-SCHEMA = "vtrefine/robot-model@1"
-
-
-@dataclass(frozen=True)
-class JointModel:
-    """One joint's servo and what was found on it; zero means absent. Lengths instead of angles for slides."""
-
-    name: str
-    natural_frequency_rad_s: float
-    damping_ratio: float
-    encoder_offset: float = 0.0
-    """Reading minus true position [rad or m]."""
-    backlash_command: float = 0.0
-    """Full width of play between command and servo [rad or m]."""
-    backlash_output: float = 0.0
-    """Full width of play between servo and encoder [rad or m]."""
-    friction: float = 0.0
-    """Dry friction divided by the servo's stiffness [rad or m]."""
-    sag_form: str = gravity.ONE_TERM_FORMS[0]
-    sag_terms: tuple[float, ...] = (0.0,) * gravity.TERMS
-    """Coefficients of the form's terms, see `gravity.shapes` [rad]."""
-    compliance: float = 0.0
-    """Target shift against the load [rad or m per unit of load]."""
-    stop: float = 0.0
-    """Distance from zero at which a gripper's joint meets what it holds [rad or m]."""
-    give: float = 0.0
-    """Part of its way beyond the stop that the joint still goes."""
-    backlash_rounding: float = 0.0
-    """Half the spread of the widths that make up the plays, as a part of their mean."""
-    breakaway: float = 0.0
-    """By what part breaking away takes more than `friction`."""
+__all__ = ["SCHEMA", "JointModel", "RobotModel", "predict_positions"]
 
 
 @dataclass(frozen=True)
@@ -114,24 +85,8 @@ class RobotModel:
     @classmethod
     def from_dict(cls, data: Any) -> "RobotModel":
         """Inverse of `to_dict`; ValueError says what is missing or wrong."""
-        if not isinstance(data, dict) or data.get("schema") != SCHEMA:
-            raise ValueError(f'robot model must hold "schema": "{SCHEMA}"')
-        if not isinstance(data.get("joints"), list) or not data["joints"]:
-            raise ValueError('robot model must hold a list "joints"')
-        valid = {item.name for item in fields(JointModel)}
-        joints = []
-        for item in data["joints"]:
-            unknown = set(item) - valid
-            if unknown:
-                raise ValueError(
-                    f"joint has no parameter {sorted(unknown)[0]!r}; valid: {', '.join(sorted(valid))}"
-                )
-            if item.get("sag_form", gravity.FORMS[0]) not in gravity.FORMS:
-                raise ValueError(f"sag_form must be one of {', '.join(gravity.FORMS)}")
-            terms = tuple(item.get("sag_terms", (0.0,) * gravity.TERMS))
-            values: dict[str, Any] = {**item, "sag_terms": terms}
-            joints.append(JointModel(**values))
-        return cls(tuple(joints), float(data.get("control_latency_s", 0.0)))
+        content = decode_robot(data)
+        return cls(content.joints, content.control_latency_s)
 
     def save(self, path: str | Path) -> None:
         """Write the file, whole or not at all."""
@@ -140,10 +95,8 @@ class RobotModel:
     @classmethod
     def load(cls, path: str | Path) -> "RobotModel":
         """Read the file; ValueError names it and what is wrong with it."""
-        try:
-            return cls.from_dict(json.loads(Path(path).read_text(encoding="utf-8")))
-        except (ValueError, TypeError) as error:
-            raise ValueError(f"{path}: {error}") from error
+        content = read_robot_file(path)
+        return cls(content.joints, content.control_latency_s)
 
 
 def predict_positions(model: RobotModel, trial: RobotTrial) -> np.ndarray:

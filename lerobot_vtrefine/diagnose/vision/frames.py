@@ -11,6 +11,8 @@ import pyarrow.parquet as pq
 from PIL import Image
 
 from lerobot_vtrefine.datasets.features import CAMERA_POSE_KEY, DEPTH_KEY, INTRINSICS_KEY, STATE_KEY
+from lerobot_vtrefine.files import inside
+from lerobot_vtrefine.files.tables import read_table
 
 Array = np.ndarray
 
@@ -63,7 +65,12 @@ def read_frames(root: Path, per_episode: int = FRAMES_PER_EPISODE) -> DepthFrame
     columns = ["episode_index", "frame_index", STATE_KEY, INTRINSICS_KEY, CAMERA_POSE_KEY, DEPTH_KEY]
     parts = []
     for path in sorted((root / "data").rglob("*.parquet")):
-        table = pq.read_table(path, columns=columns)
+        try:
+            table = read_table(path, columns)
+        except ValueError as error:
+            raise ValueError(f"{path} cannot be read: {error}") from error
+        if missing := [name for name in columns if name not in table.column_names]:
+            raise ValueError(f"{path} has no column {missing[0]}")
         parts.append(table.take(pa.array(_chosen(table, per_episode))))
     table = pa.concat_tables(parts)
     intrinsics = _matrix(table[INTRINSICS_KEY])
@@ -96,7 +103,7 @@ def _matrix(column: pa.ChunkedArray) -> Array:
 
 def _image(root: Path, row: dict[str, bytes | str | None]) -> Array:
     data = row.get("bytes")
-    source = io.BytesIO(data) if isinstance(data, bytes) else root / str(row.get("path"))
+    source = io.BytesIO(data) if isinstance(data, bytes) else inside(root, str(row.get("path")))
     return np.asarray(Image.open(source), dtype=float)
 
 

@@ -1,11 +1,13 @@
 """What was found about a camera, as a file."""
 
 import json
+import math
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
 from lerobot_vtrefine.diagnose.verdict import write_atomically
+from lerobot_vtrefine.files import decode, limits, read_json
 
 SCHEMA = "vtrefine/camera-model@1"
 
@@ -14,11 +16,11 @@ SCHEMA = "vtrefine/camera-model@1"
 class CameraModel:
     """Where the camera is against where the dataset says, in its own optical axes, and its depths' scale."""
 
-    translation_m: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    translation_m: tuple[float, float, float] = limits(maximum=10.0, default=(0.0, 0.0, 0.0))
     """x right, y down, z forward."""
-    rotation_rad: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    rotation_rad: tuple[float, float, float] = limits(maximum=2 * math.pi, default=(0.0, 0.0, 0.0))
     """About x, then y, then z."""
-    depth_scale: float = 1.0
+    depth_scale: float = limits(above=0.0, maximum=1e4, default=1.0)
     """Measured over true depth."""
 
     def to_dict(self) -> dict[str, Any]:
@@ -32,11 +34,10 @@ class CameraModel:
     @classmethod
     def load(cls, path: str | Path) -> "CameraModel":
         """Read the file; ValueError names it and what is wrong with it."""
+        data = read_json(path)
         try:
-            data = json.loads(Path(path).read_text(encoding="utf-8"))
             if not isinstance(data, dict) or data.pop("schema", None) != SCHEMA:
                 raise ValueError(f'camera model must hold "schema": "{SCHEMA}"')
-            shift, turn = (tuple(data.pop(key)) for key in ("translation_m", "rotation_rad"))
-            return cls(translation_m=shift, rotation_rad=turn, **data)
-        except (ValueError, TypeError, KeyError) as error:
+            return decode(cls, data, "camera model")
+        except ValueError as error:
             raise ValueError(f"{path}: {error}") from error

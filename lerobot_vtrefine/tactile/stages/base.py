@@ -7,6 +7,7 @@ broadcast
 against (..., R, C), which is how each environment gets its own value.
 """
 
+import math
 from dataclasses import dataclass, field, fields, replace
 from typing import Any, ClassVar
 
@@ -41,15 +42,43 @@ class Frame:
     """Whether the taxels' sum is a measured or solved load, which mechanics must not change."""
 
 
-def parameter(default: float, unit: str, low: float, high: float, minimum: float | None = 0.0) -> Any:
+LARGEST = {
+    "1": 1e3,
+    "m": 1.0,
+    "rad": math.pi,
+    "s": 1e6,
+    "N": 1e6,
+    "degC": 1e3,
+    "counts": 1e9,
+    "counts/N": 1e12,
+    "counts/s": 1e6,
+    "counts/degC": 1e6,
+    "1/counts": 1e3,
+    "N/m": 1e12,
+    "N*s/m": 1e12,
+    "N/m^3": 1e15,
+}
+"""What no pad's parameter exceeds, by unit: far from any real one, and far from where numbers break down."""
+
+
+def parameter(
+    default: Any,
+    unit: str,
+    low: float,
+    high: float,
+    minimum: float | None = 0.0,
+    maximum: float | None = None,
+) -> Any:
     """Dataclass field of a stage's parameter.
 
     Args:
         unit: SI unit, "1" for none.
         low, high: range for randomisation.
         minimum: smallest valid value; None if any finite number is valid.
+        maximum: largest valid size; by default the unit's in `LARGEST`.
     """
-    return field(default=default, metadata={"unit": unit, "range": (low, high), "minimum": minimum})
+    ends = {"minimum": minimum, "maximum": LARGEST[unit] if maximum is None else maximum}
+    return field(default=default, metadata={"unit": unit, "range": (low, high), **ends})
 
 
 @dataclass(frozen=True)
@@ -136,6 +165,14 @@ def stage_class(name: str) -> type[Stage]:
 def as_tuple(value: Any) -> Any:
     """Nested lists as nested tuples, so that stages stay hashable and comparable."""
     return tuple(as_tuple(item) for item in value) if isinstance(value, list | tuple | np.ndarray) else value
+
+
+def as_map(name: str, values: Any) -> Any:
+    """Rows of a map as a nested tuple, a number as it is; ValueError where rows differ in length."""
+    rows = as_tuple(values)
+    if isinstance(rows, tuple) and (not rows or not rows[0] or len({len(row) for row in rows}) > 1):
+        raise ValueError(f"{name} must hold equally long rows of a number per taxel")
+    return rows
 
 
 def taxel_map(values: Any, like: torch.Tensor) -> torch.Tensor:

@@ -103,7 +103,7 @@ class Latency(Delay):
     name: ClassVar[str] = "latency"
     rank: ClassVar[int] = 70
     tau_s: float = parameter(0.01, "s", 0.0, 0.05)
-    smoothing: float = parameter(0.0, "1", 0.0, 0.0)
+    smoothing: float = parameter(0.0, "1", 0.0, 0.0, maximum=1.0)
 
     def __post_init__(self) -> None:
         super().__post_init__()

@@ -1,13 +1,14 @@
 """Stages that act on force: what the layers between the face and the electrodes do to it."""
 
 import math
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from functools import lru_cache
 from typing import Any, ClassVar, override
 
 import numpy as np
 import torch
 
+from lerobot_vtrefine.files import limits
 from lerobot_vtrefine.tactile.layout import PadLayout
 from lerobot_vtrefine.tactile.stages.base import Frame, Stage, State, Traits, as_tuple, parameter, register
 
@@ -30,8 +31,8 @@ class NonlinearStiffness(Stage):
     name: ClassVar[str] = "nonlinear_stiffness"
     domain: ClassVar[str] = "force"
     rank: ClassVar[int] = 30
-    exponent: float = parameter(1.0, "1", 0.8, 1.6, minimum=1e-3)
-    share: float = parameter(1.0, "1", 1.0, 1.0)
+    exponent: float = parameter(1.0, "1", 0.8, 1.6, minimum=1e-3, maximum=10.0)
+    share: float = parameter(1.0, "1", 1.0, 1.0, maximum=1.0)
 
     @override
     def step(self, x: torch.Tensor, state: State, frame: Frame) -> tuple[torch.Tensor, State]:
@@ -105,8 +106,8 @@ class MechanicalSpreading(Stage):
     domain: ClassVar[str] = "force"
     rank: ClassVar[int] = 32
     sigma_m: float = parameter(1.0e-3, "m", 0.0, 3.0e-3)
-    rings: tuple[float, ...] = ()
-    kept: float = parameter(1.0, "1", 1.0, 1.0)
+    rings: tuple[float, ...] = limits(0.0, 1.0, default=())
+    kept: float = parameter(1.0, "1", 1.0, 1.0, maximum=1.0)
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -130,7 +131,7 @@ def _paired(stage: str, first: Any, second: Any, names: str = "tau_s and fractio
     """Numbers or equally long lists of them, branch by branch."""
     firsts = first if isinstance(first, tuple) else (first,)
     seconds = second if isinstance(second, tuple) else (second,)
-    if len(firsts) != len(seconds):
+    if len(firsts) != len(seconds) or not firsts:
         raise ValueError(f"{stage}: {names} need the same number of branches, got {firsts} and {seconds}")
     return list(zip(firsts, seconds, strict=True))
 
@@ -149,8 +150,8 @@ class ViscoelasticRelaxation(Stage):
     domain: ClassVar[str] = "force"
     rank: ClassVar[int] = 34
     has_state: ClassVar[bool] = True
-    tau_s: Any = field(default=1.0, metadata={"unit": "s", "range": (0.3, 3.0), "minimum": 1e-6})
-    fraction: Any = field(default=0.15, metadata={"unit": "1", "range": (0.0, 0.3), "minimum": None})
+    tau_s: float | tuple[float, ...] = parameter(1.0, "s", 0.3, 3.0, minimum=1e-6)
+    fraction: float | tuple[float, ...] = parameter(0.15, "1", 0.0, 0.3, minimum=None)
     pushes_only: bool = False
 
     def __post_init__(self) -> None:
@@ -209,8 +210,8 @@ class Hysteresis(Stage):
     domain: ClassVar[str] = "force"
     rank: ClassVar[int] = 36
     has_state: ClassVar[bool] = True
-    fraction: Any = field(default=0.15, metadata={"unit": "1", "range": (0.0, 0.3), "minimum": None})
-    width_m: Any = field(default=2e-4, metadata={"unit": "m", "range": (5e-5, 5e-4), "minimum": 0.0})
+    fraction: float | tuple[float, ...] = parameter(0.15, "1", 0.0, 0.3, minimum=None)
+    width_m: float | tuple[float, ...] = parameter(2e-4, "m", 5e-5, 5e-4)
     loop: str = "even"
 
     def __post_init__(self) -> None:

@@ -2,18 +2,21 @@
 
 from dataclasses import dataclass, field, replace
 from itertools import pairwise
-from typing import Any, ClassVar, override
+from typing import ClassVar, override
 
 import numpy as np
 import torch
 
+from lerobot_vtrefine.files import limits
 from lerobot_vtrefine.tactile.layout import PadLayout
 from lerobot_vtrefine.tactile.noise import noise_frames
 from lerobot_vtrefine.tactile.stages.base import (
+    LARGEST,
     Frame,
     Stage,
     State,
     Traits,
+    as_map,
     as_tuple,
     parameter,
     register,
@@ -46,12 +49,12 @@ class TaxelGainSpread(Stage):
     name: ClassVar[str] = "taxel_gain_spread"
     domain: ClassVar[str] = "counts"
     rank: ClassVar[int] = 50
-    sigma: float = parameter(0.1, "1", 0.0, 0.3)
-    map: tuple[tuple[float, ...], ...] | None = None
+    sigma: float = parameter(0.1, "1", 0.0, 0.3, maximum=3.0)
+    map: tuple[tuple[float, ...], ...] | None = limits(maximum=1e6, default=None)
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        object.__setattr__(self, "map", as_tuple(self.map))
+        object.__setattr__(self, "map", as_map("taxel_gain_spread.map", self.map))
 
     @override
     def traits(self, layout: PadLayout, pads: int, rng: np.random.Generator) -> Traits:
@@ -78,10 +81,10 @@ class DeadTaxels(Stage):
     name: ClassVar[str] = "dead_taxels"
     domain: ClassVar[str] = "counts"
     rank: ClassVar[int] = 52
-    taxels: tuple[tuple[int, int], ...] = ()
-    rows: tuple[int, ...] = ()
-    cols: tuple[int, ...] = ()
-    probability: float = parameter(0.0, "1", 0.0, 0.02)
+    taxels: tuple[tuple[int, int], ...] = limits(0, 9999, default=())
+    rows: tuple[int, ...] = limits(0, 9999, default=())
+    cols: tuple[int, ...] = limits(0, 9999, default=())
+    probability: float = parameter(0.0, "1", 0.0, 0.02, maximum=1.0)
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -124,7 +127,7 @@ class Saturation(Stage):
     domain: ClassVar[str] = "counts"
     rank: ClassVar[int] = 54
     knee_counts: float = parameter(200.0, "counts", 120.0, 400.0, minimum=1e-6)
-    sharpness: float | None = None
+    sharpness: float | None = limits(above=0.0, maximum=100.0, default=None)
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -154,7 +157,7 @@ class RowSharing(Stage):
     domain: ClassVar[str] = "counts"
     rank: ClassVar[int] = 56
     conductance_per_count: float = parameter(4e-4, "1/counts", 0.0, 2e-3)
-    own: float = parameter(1.0, "1", 1.0, 1.0)
+    own: float = parameter(1.0, "1", 1.0, 1.0, maximum=1.0)
 
     @override
     def step(self, x: torch.Tensor, state: State, frame: Frame) -> tuple[torch.Tensor, State]:
@@ -175,11 +178,11 @@ class Crosstalk(Stage):
     name: ClassVar[str] = "crosstalk"
     domain: ClassVar[str] = "counts"
     rank: ClassVar[int] = 58
-    row: float = parameter(0.005, "1", 0.0, 0.02)
-    col: float = parameter(0.005, "1", 0.0, 0.02)
-    reach: float | None = None
-    row_side: int = 0
-    col_side: int = 0
+    row: float = parameter(0.005, "1", 0.0, 0.02, maximum=10.0)
+    col: float = parameter(0.005, "1", 0.0, 0.02, maximum=10.0)
+    reach: float | None = limits(above=0.0, maximum=1e6, default=None)
+    row_side: int = limits(-1, 1, default=0)
+    col_side: int = limits(-1, 1, default=0)
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -222,12 +225,14 @@ class Idle(Stage):
     name: ClassVar[str] = "idle"
     domain: ClassVar[str] = "counts"
     rank: ClassVar[int] = 60
-    level_counts: Any = field(default=25.0, metadata={"range": (15.0, 35.0)})
+    level_counts: float | tuple[tuple[float, ...], ...] = field(
+        default=25.0, metadata={"range": (15.0, 35.0), "maximum": LARGEST["counts"]}
+    )
     spread_counts: float = parameter(15.0, "counts", 0.0, 15.0)
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        object.__setattr__(self, "level_counts", as_tuple(self.level_counts))
+        object.__setattr__(self, "level_counts", as_map("idle.level_counts", self.level_counts))
 
     @override
     def traits(self, layout: PadLayout, pads: int, rng: np.random.Generator) -> Traits:
