@@ -10,9 +10,8 @@ from pathlib import Path
 from draccus.utils import DraccusException
 from yaml import YAMLError
 
-from lerobot_vtrefine.files import check_settings
-
 from lerobot_vtrefine.extras import explain
+from lerobot_vtrefine.files import check_settings
 
 DEBUG_VARIABLE = "VTREFINE_DEBUG"
 USAGE_STATUS = 2
