@@ -197,7 +197,7 @@ def _read_header(path: Path) -> _Header:
         found = str(data.get("schema") if isinstance(data, dict) else type(data).__name__)
         raise ValueError(f'{path}: "schema" must be "{SCHEMA}", got {found[:60]!r}')
     try:
-        return decode(_Header, data, path.name)
+        return decode(_Header, data, path.name, others=True)
     except ValueError as error:
         raise ValueError(f"{path}: {error}") from error
 
@@ -209,7 +209,7 @@ def _check_object(where: str, spec: Any, folder: Path) -> dict[str, Any]:
     if not isinstance(shape, str) or shape not in SHAPES:
         raise ValueError(f"{where}: object.shape must be one of {', '.join(SHAPES)}, got {str(shape)[:60]!r}")
     try:
-        found = asdict(decode(SHAPES[shape], spec, "object", "object."))
+        found = asdict(decode(SHAPES[shape], spec, "object", "object.", others=True))
         if shape == "mesh":
             file = inside(folder, found["file"])
             if not file.is_file():

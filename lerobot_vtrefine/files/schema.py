@@ -3,6 +3,7 @@
 import dataclasses
 import math
 from collections.abc import Mapping
+from difflib import get_close_matches
 from functools import lru_cache
 from types import NoneType, UnionType
 from typing import Any, Literal, Union, get_args, get_origin, get_type_hints
@@ -35,7 +36,9 @@ def decode[Kind](kind: type[Kind], data: Any, name: str, prefix: str = "", other
     Args:
         name: what the data are, for messages about their fields.
         prefix: what stands before a field's name in messages about its value.
-        others: let fields pass that the dataclass does not have; they are left out. For formats of others.
+        others: let fields pass that the dataclass does not have; they are left out. For formats of others,
+            and for files whose writers add notes of their own. What is nearly a missing field's name is
+            still refused.
 
     Raises:
         ValueError: names the field and what is wrong with it, or the fields that there are.
@@ -43,9 +46,14 @@ def decode[Kind](kind: type[Kind], data: Any, name: str, prefix: str = "", other
     if not isinstance(data, Mapping):
         raise ValueError(f"{name} must be an object, got {_shown(data)}")
     hints, fields = _hints(kind), {item.name: item for item in dataclasses.fields(kind) if item.init}  # ty: ignore[invalid-argument-type]
+    absent = [key for key in fields if key not in data]
     for key in data:
-        if key not in fields and not others:
+        if key in fields:
+            continue
+        if not others:
             raise ValueError(f"{name} has no {_shown(key)}; valid: {', '.join(fields) or 'none'}")
+        if meant := get_close_matches(str(key)[:_SHOWN], absent, n=1, cutoff=0.8):
+            raise ValueError(f"{name} has no {_shown(key)}; is {meant[0]!r} meant?")
     values = {}
     for key, item in fields.items():
         if key in data:

@@ -52,6 +52,15 @@ def test_a_dataclass_is_made_of_plain_data() -> None:
     assert decode(Whole, {"name": "x", "more": 1}, "file", others=True) == Whole("x")
 
 
+def test_notes_of_others_pass_and_slips_of_the_pen_do_not() -> None:
+    noted = {"name": "x", "parts": [{"size_m": 1, "maker": "me"}], "rig": {"bench": 3}}
+    assert decode(Whole, noted, "file", others=True).parts == (Part(1.0),)
+    with pytest.raises(ValueError, match="file has no 'by_joints'; is 'by_joint' meant"):
+        decode(Whole, {"name": "x", "by_joints": {}}, "file", others=True)
+    both = {"name": "x", "by_joint": {"elbow": 1}, "by_joints": 3}
+    assert decode(Whole, both, "file", others=True).by_joint == {"elbow": 1.0}
+
+
 @pytest.mark.parametrize(
     ("change", "message"),
     [
