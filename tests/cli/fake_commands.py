@@ -66,6 +66,7 @@ def evaluate(options: dict[str, str]) -> None:
     rows = [
         {
             "seed": seed + index,
+            "steps": 24,
             "success": success,
             "failure": None if success else "dropped",
             "in_hand_shift_m": 0.001,

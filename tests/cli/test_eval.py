@@ -12,7 +12,7 @@ from lerobot_vtrefine.envs.config import VtRefineEnvConfig
 from lerobot_vtrefine.envs.episode_log import read_episode_log
 from lerobot_vtrefine.finetune.config import SmallDppo
 from lerobot_vtrefine.finetune.logger import ProgressLog
-from lerobot_vtrefine.finetune.pipeline import FinetunePipelineConfig, save_config
+from lerobot_vtrefine.finetune.pipeline import CONFIG_NAME, FinetunePipelineConfig, write_config
 
 
 @pytest.fixture
@@ -99,7 +99,10 @@ def test_surplus_episodes_are_dropped_and_the_others_are_a_fine_tunings_result(e
     assert [row["seed"] for row in rows] == [40, 41]
 
     folder, dppo = tmp_path / "run", SmallDppo(iterations=1)
-    save_config(FinetunePipelineConfig(VtRefineEnvConfig(), dppo=dppo, output_dir=folder, seed=7))
+    write_config(
+        FinetunePipelineConfig(VtRefineEnvConfig(), dppo=dppo, output_dir=folder, seed=7),
+        folder / CONFIG_NAME,
+    )
     ProgressLog(folder, 0, None).add(1, {"success": 0.9, "env_steps": 1000.0, "seconds": 2.0})
     common = {"table": "converges", "task": "round_2mm", "policy": "visual"}
     ((row, _),) = run_rows(folder, common, dict.fromkeys(("commit", "command", "machine")))
