@@ -198,9 +198,10 @@ class SeedLiteralDppo(DppoConfig):
 class TrustRegionDppo(DppoConfig):
     """Many environments on a GPU, stable without supervision: a trust region in nats per decision.
 
-    Measured on the round and square pairs with 1024 worlds (docs/learning.md): 12 nats that fall to 3 learn
-    fast and without a fall; 40 collapse on the tighter task; 4 and less are as stable and slower. Exploration
-    is small and smooth in time, so that success while training is near the success of the deployed policy.
+    Measured on the round and square pairs with 1024 worlds, one seed a run (docs/learning.md): 12 nats that
+    fall to 3 learn fast and without a fall; 40 collapse on the tighter task; 4 and less are as stable and
+    slower. Exploration is small and smooth in time, so that success while training is near the success of
+    the deployed policy.
     """
 
     iterations: int = 100
