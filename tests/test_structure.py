@@ -25,7 +25,7 @@ LAYERS = (
     ("sim",),
     ("envs",),
     ("policies",),
-    ("finetune",),
+    ("finetune", "information"),
     ("diagnose",),
     ("cli",),
 )

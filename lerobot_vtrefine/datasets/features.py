@@ -50,6 +50,8 @@ NOISE_LEVEL_KEY = f"observation.camera.{CAMERA}.noise_level"
 AGE_KEY = "observation.tactile_age"
 CLOUD_KEY = "observation.visuo_tactile"
 """Built by the policy's preprocessor from the raw columns; never stored."""
+GRIDS_KEY = "observation.tactile_grids"
+"""Readings of the pads as images, built likewise."""
 
 VISUAL_KEYS = (DEPTH_KEY, INTRINSICS_KEY, CAMERA_POSE_KEY)
 RAW_KEYS = (*TACTILE_KEYS, *BASELINE_KEYS, AGE_KEY, *VISUAL_KEYS, NOISE_LEVEL_KEY)

@@ -7,6 +7,7 @@ Shapes: m environments; hands and parts are ordered left, right: the left hand t
 the plug.
 """
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from enum import IntEnum
 from typing import TYPE_CHECKING
@@ -26,6 +27,9 @@ if TYPE_CHECKING:
 
 Array = NDArray[np.float64]
 Ids = NDArray[np.int64]
+
+PartPoses = Callable[[Ids], tuple[Array, Array]]
+"""Environments (m,) -> poses of plug and socket, each (m, 7) as x y z [m] and qw qx qy qz."""
 
 LEFT, RIGHT = 0, 1
 
@@ -111,8 +115,15 @@ class ScriptedExpert:
     not depend on how many run beside it.
     """
 
-    def __init__(self, sim: "InsertionSim", degradation: Degradation | None = None) -> None:
+    def __init__(
+        self,
+        sim: "InsertionSim",
+        degradation: Degradation | None = None,
+        part_poses: PartPoses | None = None,
+    ) -> None:
+        """``part_poses``: where the parts are believed to be, in place of where they are."""
         self._sim = sim
+        self._part_poses = part_poses or sim.part_poses
         self._robot = sim.scene.embodiment
         self._pair = sim.scene.pair
         self._hz = sim.config.control_hz
@@ -171,7 +182,7 @@ class ScriptedExpert:
 
     def _observe(self, ids: Ids) -> View:
         q = np.asarray(self._sim.joint_state(ids), float)
-        plug, socket = self._sim.part_poses(ids)
+        plug, socket = self._part_poses(ids)
         return View(
             q, Poses(*hand_poses(self._robot, q)), Poses.from_quaternions(np.stack([socket, plug], 1))
         )

@@ -4,9 +4,12 @@ import pytest
 import torch
 from torch import nn
 
+from lerobot_vtrefine.datasets.features import CLOUD_KEY, GRIDS_KEY, STATE_KEY
 from lerobot_vtrefine.policies.vt_dp3.denoisers import MLPDenoiser, UNetDenoiser
 from lerobot_vtrefine.policies.vt_dp3.ema import Ema
-from lerobot_vtrefine.policies.vt_dp3.point_encoder import ObservationEncoder, PointEncoder
+from lerobot_vtrefine.policies.vt_dp3.observation_encoder import ObservationEncoder
+from lerobot_vtrefine.policies.vt_dp3.pad_encoder import PadEncoder
+from lerobot_vtrefine.policies.vt_dp3.point_encoder import PointEncoder
 
 
 def encoder() -> PointEncoder:
@@ -45,11 +48,13 @@ def test_one_metric_scale_for_all_axes() -> None:
 
 
 def test_condition_keeps_frames_apart() -> None:
-    encode = ObservationEncoder(encoder(), 6, state_dim=3, n_obs_steps=2)
-    cloud, state = torch.randn(2, 2, 20, 5), torch.randn(2, 2, 3)
-    cond = encode(cloud, state)
-    assert cond.shape == (2, encode.cond_dim) == (2, 2 * (6 + 64))
-    swapped = encode(cloud.flip(1), state.flip(1))
+    encode = ObservationEncoder(encoder(), PadEncoder(4, (12, 32), 8, 5), state_dim=3, n_obs_steps=2)
+    batch = {CLOUD_KEY: torch.randn(2, 2, 20, 5), GRIDS_KEY: torch.rand(2, 2, 4, 12, 32)}
+    batch[STATE_KEY] = torch.randn(2, 2, 3)
+    assert set(encode.keys) == set(batch)
+    cond = encode(batch)
+    assert cond.shape == (2, encode.cond_dim) == (2, 2 * (6 + 5 + 64))
+    swapped = encode({key: value.flip(1) for key, value in batch.items()})
     assert torch.allclose(cond.view(2, 2, -1).flip(1), swapped.view(2, 2, -1), atol=1e-6)
 
 

@@ -3,6 +3,7 @@ Train").
 """
 
 from dataclasses import dataclass, field, replace
+from pathlib import Path
 from typing import Any
 
 from lerobot.configs import FeatureType, NormalizationMode, PreTrainedConfig
@@ -23,6 +24,7 @@ from lerobot_vtrefine.policies import checkpoint_guard
 from lerobot_vtrefine.policies.vt_dp3.denoisers import DENOISERS
 from lerobot_vtrefine.policies.vt_dp3.diffusion import step_grid
 
+FUSIONS = ("cloud", "pads")
 PRESETS: dict[str, dict[str, Any]] = {
     "paper": {
         "point_dims": (64, 128, 256, 512),
@@ -59,7 +61,11 @@ class VtDp3Config(PreTrainedConfig):
     preset: str = "paper"
     """``paper``, or ``small`` for a CPU."""
     modalities: str = "visuo_tactile"
-    """``visuo_tactile``, ``visual`` (the paper's baseline) or ``tactile``: which points enter the cloud."""
+    """``visuo_tactile``, ``visual`` (the paper's baseline) or ``tactile``: what the policy perceives."""
+    fusion: str = "cloud"
+    """How touch enters: ``cloud``, taxels as points among the visual ones (paper), or ``pads``, each pad as
+    an image through a network of its own, which keeps where and how hard it is pressed.
+    """
 
     n_obs_steps: int = 2
     horizon: int = 16
@@ -70,6 +76,16 @@ class VtDp3Config(PreTrainedConfig):
     point_dims: tuple[int, ...] = ()
     """Widths of the point encoder's shared layers."""
     point_features: int = 64
+    pad_width: int = 64
+    """Features of one pad (``fusion=pads``)."""
+    pad_features: int = 64
+    """Features of all pads together (``fusion=pads``)."""
+    pretrained_encoder: Path | None = None
+    """Folder of an encoder that ``vtrefine-information`` trained on simulated contacts; training starts from
+    it.
+    """
+    freeze_encoder: bool = False
+    """Behaviour cloning leaves the encoder as it is; needs ``pretrained_encoder``."""
     denoiser: str = ""
     """``unet`` (paper) or ``mlp``."""
     down_dims: tuple[int, ...] = ()
@@ -139,6 +155,12 @@ class VtDp3Config(PreTrainedConfig):
             raise ValueError(
                 f"unknown policy.modalities {self.modalities!r}; choose one of {', '.join(MODALITIES)}"
             )
+        if self.fusion not in FUSIONS:
+            raise ValueError(f"unknown policy.fusion {self.fusion!r}; choose one of {', '.join(FUSIONS)}")
+        if self.freeze_encoder and self.pretrained_encoder is None:
+            raise ValueError(
+                "policy.freeze_encoder=true needs policy.pretrained_encoder: an untrained one sees nothing"
+            )
         if self.denoiser not in DENOISERS:
             raise ValueError(
                 f"unknown policy.denoiser {self.denoiser!r}; choose one of {', '.join(DENOISERS)}"
@@ -158,6 +180,18 @@ class VtDp3Config(PreTrainedConfig):
             raise ValueError(
                 f"policy.ft_denoising_steps={self.ft_denoising_steps} must be within 0..{len(self.timesteps)}"
             )
+
+    @property
+    def sees_grids(self) -> bool:
+        """Whether pads enter as images."""
+        return self.fusion == "pads" and self.modalities != "visual"
+
+    @property
+    def cloud_modalities(self) -> str:
+        """What the cloud holds; empty where there is none."""
+        if self.fusion == "cloud":
+            return self.modalities
+        return "" if self.modalities == "tactile" else "visual"
 
     @property
     def state_dim(self) -> int:

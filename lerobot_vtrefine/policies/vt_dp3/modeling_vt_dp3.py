@@ -16,12 +16,12 @@ from safetensors import SafetensorError
 from torch import Tensor, nn
 from torch.nn import functional
 
-from lerobot_vtrefine.datasets.features import ACTION_KEY, CLOUD_KEY, STATE_KEY
+from lerobot_vtrefine.datasets.features import ACTION_KEY, STATE_KEY
 from lerobot_vtrefine.policies.vt_dp3.configuration_vt_dp3 import VtDp3Config
 from lerobot_vtrefine.policies.vt_dp3.denoisers import MLPDenoiser, UNetDenoiser
 from lerobot_vtrefine.policies.vt_dp3.diffusion import DiffusionProcess, PredictNoise, deploy
 from lerobot_vtrefine.policies.vt_dp3.ema import Ema
-from lerobot_vtrefine.policies.vt_dp3.point_encoder import ObservationEncoder, PointEncoder
+from lerobot_vtrefine.policies.vt_dp3.observation_encoder import load_encoder, make_encoder
 from lerobot_vtrefine.policies.vt_dp3.processor_vt_dp3 import widen_narrow_ranges
 
 Batch = dict[str, Tensor]
@@ -32,9 +32,7 @@ class VtDp3Model(nn.Module):
 
     def __init__(self, config: VtDp3Config, state_dim: int, action_dim: int) -> None:
         super().__init__()
-        view = config.observation
-        points = PointEncoder(config.point_dims, config.point_features, view.center_m, view.scale_m)
-        self.encoder = ObservationEncoder(points, config.point_features, state_dim, config.n_obs_steps)
+        self.encoder = make_encoder(config, state_dim)
         cond_dim = self.encoder.cond_dim
         if config.denoiser == "unet":
             self.denoiser: nn.Module = UNetDenoiser(
@@ -51,8 +49,8 @@ class VtDp3Model(nn.Module):
             )
 
     def encode(self, batch: Batch) -> Tensor:
-        """Cloud (B, To, N, 5) and normalised state (B, To, Ds) of a processed batch -> condition (B, C)."""
-        return self.encoder(batch[CLOUD_KEY], batch[STATE_KEY])
+        """Columns ``encoder.keys`` (B, To, ...) of a processed batch -> condition (B, C)."""
+        return self.encoder(batch)
 
     def predictor(self, cond: Tensor) -> PredictNoise:
         """The noise predictor with its condition bound."""
@@ -71,8 +69,13 @@ class VtDp3Policy(PreTrainedPolicy):
     name = "vt_dp3"  # ty: ignore[invalid-assignment]
 
     def __init__(
-        self, config: VtDp3Config, dataset_stats: dict[str, Any] | None = None, dataset_meta: Any = None
+        self,
+        config: VtDp3Config,
+        dataset_stats: dict[str, Any] | None = None,
+        dataset_meta: Any = None,
+        read_encoder: bool = True,
     ) -> None:
+        """``read_encoder``: start from ``config.pretrained_encoder``; not where weights are loaded anyway."""
         if not isinstance(config, VtDp3Config):
             found = getattr(config, "type", type(config).__name__)
             raise ValueError(f"the checkpoint holds a policy of type '{found}', expected 'vt_dp3'")
@@ -86,15 +89,20 @@ class VtDp3Policy(PreTrainedPolicy):
             widen_narrow_ranges(dataset_stats)
         self.config: VtDp3Config = config
         self.model = VtDp3Model(config, config.state_dim, config.action_dim)
+        if read_encoder and config.pretrained_encoder is not None:
+            load_encoder(self.model.encoder, config.pretrained_encoder)
         self.base: VtDp3Model | None = None
         self.online: VtDp3Model | None = None
         self.ema: Ema | None = None
         if config.ft_denoising_steps:
             self._attach_base()
-        elif config.use_ema:
-            self.online = deepcopy(self.model)
-            self.model.requires_grad_(False)
-            self.ema = Ema(config.ema_power, config.ema_max_decay)
+        else:
+            for part in self.model.encoder.perception if config.freeze_encoder else ():
+                part.requires_grad_(False)
+            if config.use_ema:
+                self.online = deepcopy(self.model)
+                self.model.requires_grad_(False)
+                self.ema = Ema(config.ema_power, config.ema_max_decay)
         self.reset()
 
     @classmethod
@@ -106,7 +114,7 @@ class VtDp3Policy(PreTrainedPolicy):
         if path.is_dir() and not (path / "config.json").is_file():
             raise FileNotFoundError(f"{path} holds no policy; give the checkpoint's pretrained_model folder")
         try:
-            return super().from_pretrained(pretrained_name_or_path, **kwargs)
+            return super().from_pretrained(pretrained_name_or_path, read_encoder=False, **kwargs)
         except SafetensorError as error:
             raise ValueError(f"the weights of {pretrained_name_or_path} are damaged: {error}") from error
 
@@ -124,7 +132,7 @@ class VtDp3Policy(PreTrainedPolicy):
 
     def get_optim_params(self) -> Any:
         """Parameters that behaviour cloning trains."""
-        return (self.online or self.model).parameters()
+        return [weight for weight in (self.online or self.model).parameters() if weight.requires_grad]
 
     def forward(self, batch: Batch, reduction: str = "mean") -> tuple[Tensor, dict[str, float]]:
         """Noise-prediction loss of a processed training batch; ``action`` (B, H, D) starts at the current
@@ -198,7 +206,7 @@ class VtDp3Policy(PreTrainedPolicy):
 
     def _observe(self, batch: Batch) -> None:
         """Append processed frames (B, ...) to the history; the first one fills it."""
-        frame = {CLOUD_KEY: batch[CLOUD_KEY], STATE_KEY: batch[STATE_KEY]}
+        frame = {key: batch[key] for key in self.model.encoder.keys}
         missing = self.config.n_obs_steps - len(self._frames)
         self._frames.extend([frame] * (missing if len(self._frames) == 0 else 1))
 

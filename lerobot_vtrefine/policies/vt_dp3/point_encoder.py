@@ -1,6 +1,6 @@
-"""PointNet and the per-frame observation encoder (paper appendix, "Backbone"; DP3's XYZRGB encoder extended).
+"""PointNet over the visuo-tactile cloud (paper appendix, "Backbone"; DP3's XYZRGB encoder extended).
 
-Shapes: ``B`` batch, ``To`` observation steps, ``F`` clouds, ``N`` points, ``C`` feature channels.
+Shapes: ``F`` clouds, ``N`` points, ``C`` feature channels.
 """
 
 from itertools import pairwise
@@ -22,6 +22,7 @@ class PointEncoder(nn.Module):
         self, dims: tuple[int, ...], out_dim: int, center_m: tuple[float, float, float], scale_m: float
     ) -> None:
         super().__init__()
+        self.out_dim = out_dim
         hidden = [
             layer
             for narrow, wide in pairwise((5, *dims[:-1]))
@@ -51,21 +52,3 @@ class PointEncoder(nn.Module):
             winners = self.last(self.hidden(cloud)).argmax(dim=1)
         points = cloud.gather(1, winners.unsqueeze(-1).expand(-1, -1, cloud.shape[-1]))
         return torch.einsum("fch,ch->fc", self.hidden(points), self.last.weight) + self.last.bias
-
-
-class ObservationEncoder(nn.Module):
-    """Clouds and joint states of To frames -> condition (B, To * (point_features + state_features))."""
-
-    def __init__(self, points: PointEncoder, point_features: int, state_dim: int, n_obs_steps: int) -> None:
-        super().__init__()
-        self.points = points
-        state_features = 64
-        self.state = nn.Sequential(
-            nn.Linear(state_dim, state_features), nn.ReLU(), nn.Linear(state_features, state_features)
-        )
-        self.cond_dim = n_obs_steps * (point_features + state_features)
-
-    def forward(self, cloud: Tensor, state: Tensor) -> Tensor:
-        """cloud (B, To, N, 5), state (B, To, Ds) normalised -> (B, cond_dim)."""
-        features = self.points(cloud.flatten(0, 1)).unflatten(0, cloud.shape[:2])
-        return torch.cat([features, self.state(state)], dim=-1).flatten(1)

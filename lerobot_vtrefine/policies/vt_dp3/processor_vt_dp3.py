@@ -31,13 +31,17 @@ from lerobot_vtrefine.datasets.features import (
     CAMERA_POSE_KEY,
     CLOUD_KEY,
     DEPTH_KEY,
+    GRIDS_KEY,
     INTRINSICS_KEY,
     NOISE_LEVEL_KEY,
+    PAD_COLS,
+    PAD_ROWS,
     RAW_KEYS,
     STATE_KEY,
     TACTILE_KEYS,
 )
 from lerobot_vtrefine.observation import VisuoTactileConfig, build_visuo_tactile, num_points
+from lerobot_vtrefine.observation.grids import pad_grids
 from lerobot_vtrefine.observation.visuo_tactile import POINT_CHANNELS
 from lerobot_vtrefine.policies.vt_dp3.configuration_vt_dp3 import VtDp3Config
 
@@ -69,7 +73,8 @@ def widen_narrow_ranges(stats: Stats) -> None:
 @ProcessorStepRegistry.register("vt_visuo_tactile")
 @dataclass
 class VisuoTactileProcessorStep(ObservationProcessorStep):
-    """Replaces the raw tactile, depth and camera columns by ``observation.visuo_tactile`` (..., N, 5).
+    """Replaces the raw tactile, depth and camera columns by ``observation.visuo_tactile`` (..., N, 5) and,
+    with ``fusion=pads``, ``observation.tactile_grids`` (..., P, R, C).
 
     Leading dimensions are those of ``observation.state`` (..., 16), which must still be in rad and m here.
     Depth noise is drawn from torch's global generator, so LeRobot's seed makes it repeatable.
@@ -77,6 +82,9 @@ class VisuoTactileProcessorStep(ObservationProcessorStep):
 
     observation_config: VisuoTactileConfig = field(default_factory=VisuoTactileConfig)
     modalities: str = "visuo_tactile"
+    """What the cloud holds; empty for none."""
+    grids: bool = False
+    """Whether pads become images."""
 
     def __post_init__(self) -> None:
         if isinstance(self.observation_config, dict):  # as loaded from a saved pipeline
@@ -84,10 +92,15 @@ class VisuoTactileProcessorStep(ObservationProcessorStep):
         self.observation_config.validate()
 
     def observation(self, observation: dict[str, Any]) -> dict[str, Any]:
-        """Build the cloud and drop what it was built from; masks (``*_is_pad``) stay untouched."""
-        cloud = self._cloud(observation)
-        kept = {key: value for key, value in observation.items() if key not in RAW_KEYS}
-        return {**kept, CLOUD_KEY: cloud}
+        """Build cloud and images, and drop what they were built from; masks (``*_is_pad``) stay untouched."""
+        built = {key: value for key, value in observation.items() if key not in RAW_KEYS}
+        if self.modalities:
+            built[CLOUD_KEY] = self._cloud(observation)
+        if self.grids:
+            lead = _require(observation, STATE_KEY).shape[:-1]
+            tactile, baseline = (_pads(observation, keys, lead) for keys in (TACTILE_KEYS, BASELINE_KEYS))
+            built[GRIDS_KEY] = pad_grids(tactile, baseline, (PAD_ROWS, PAD_COLS), self.observation_config)
+        return built
 
     def _cloud(self, observation: dict[str, Any]) -> Tensor:
         state = _require(observation, STATE_KEY)
@@ -114,16 +127,24 @@ class VisuoTactileProcessorStep(ObservationProcessorStep):
 
     def get_config(self) -> dict[str, Any]:
         """Saved with the checkpoint."""
-        return {"observation_config": asdict(self.observation_config), "modalities": self.modalities}
+        return {
+            "observation_config": asdict(self.observation_config),
+            "modalities": self.modalities,
+            "grids": self.grids,
+        }
 
     def transform_features(
         self, features: dict[PipelineFeatureType, dict[str, PolicyFeature]]
     ) -> dict[PipelineFeatureType, dict[str, PolicyFeature]]:
-        """The raw columns' features become the cloud's."""
+        """The raw columns' features become those of cloud and images."""
         observations = features.get(PipelineFeatureType.OBSERVATION, {})
         kept = {key: value for key, value in observations.items() if key not in RAW_KEYS}
-        points = num_points(self.observation_config, self.modalities)
-        kept[CLOUD_KEY] = PolicyFeature(type=FeatureType.STATE, shape=(points, POINT_CHANNELS))
+        if self.modalities:
+            points = num_points(self.observation_config, self.modalities)
+            kept[CLOUD_KEY] = PolicyFeature(type=FeatureType.STATE, shape=(points, POINT_CHANNELS))
+        if self.grids:
+            shape = (len(TACTILE_KEYS), PAD_ROWS, PAD_COLS)
+            kept[GRIDS_KEY] = PolicyFeature(type=FeatureType.STATE, shape=shape)
         return {**features, PipelineFeatureType.OBSERVATION: kept}
 
 
@@ -166,7 +187,7 @@ def make_vt_dp3_pre_post_processors(
             RenameObservationsProcessorStep(rename_map={}),
             AddBatchDimensionProcessorStep(),
             DeviceProcessorStep(device=config.device or "cpu"),
-            VisuoTactileProcessorStep(config.observation, config.modalities),
+            VisuoTactileProcessorStep(config.observation, config.cloud_modalities, config.sees_grids),
             normalizer,
         ],
         output_steps=[unnormalizer, DeviceProcessorStep(device="cpu")],

@@ -1,0 +1,101 @@
+"""``vtrefine-information``: what joints, vision and touch know in a task, before a policy is trained.
+
+``vtrefine-information --config_path=configs/env/round_grasped.yaml --output_dir=outputs/information``
+"""
+
+import logging
+from dataclasses import dataclass, field
+from pathlib import Path
+
+from lerobot.configs import parser
+from lerobot.configs.default import EvalConfig
+from lerobot.envs.configs import EnvConfig
+from lerobot.utils.utils import init_logging
+from tqdm import tqdm
+
+from lerobot_vtrefine.cli.errors import run_cli
+from lerobot_vtrefine.cli.results.provenance import write_provenance
+from lerobot_vtrefine.envs import VtRefineEnvConfig
+from lerobot_vtrefine.folders import beside, put_in_place
+from lerobot_vtrefine.information.chart import draw
+from lerobot_vtrefine.information.estimator import SENSES
+from lerobot_vtrefine.information.study import Effort, Study, save_keeper, study, write
+
+
+@dataclass
+class InformationConfig:
+    """Flags of ``vtrefine-information``."""
+
+    output_dir: Path = Path("outputs/information")
+    """Folder of information.json, information.png and the trained encoders; replaced as a whole."""
+    env: EnvConfig = field(default_factory=VtRefineEnvConfig)
+    senses: tuple[str, ...] = ("joints", "visual", "tactile", "visuo_tactile")
+    """Of joints, visual, tactile, visuo_tactile, visuo_tactile_cloud (paper: taxels as points)."""
+    effort: Effort = field(default_factory=Effort)
+    """How much is simulated and trained."""
+    eval: EvalConfig = field(default_factory=EvalConfig)
+    """Unused; lets files of configs/env serve this command too."""
+
+    def __post_init__(self) -> None:
+        unknown = [name for name in self.senses if name not in SENSES]
+        if unknown or not self.senses:
+            raise ValueError(f"--senses={','.join(self.senses)}: choose from {', '.join(SENSES)}")
+        if not isinstance(self.env, VtRefineEnvConfig):
+            raise ValueError(f"--env.type={self.env.type} has no scripted expert; use --env.type=vtrefine")
+        if self.env.scene_config.start != "grasped":
+            raise ValueError("--env.start must be grasped: what is told is how parts lie in the hands")
+
+
+class Bars:
+    """One progress bar per kind of work."""
+
+    def __init__(self) -> None:
+        self._bars: dict[str, tqdm] = {}
+
+    def __call__(self, label: str, total: int, done: int) -> None:
+        """As ``study.Told``."""
+        bar = self._bars.setdefault(label, tqdm(total=total, desc=label))
+        bar.update(done)
+
+
+def summary(found: Study) -> str:
+    """A few lines for the terminal."""
+    lines = ["error of the plug's place in the socket across its axis, held-out episodes:"]
+    name = "plug_in_socket_y"
+    lines.append(f"  {'nothing seen':<32} {found.prior[name]:6.2f} mm")
+    for finding in found.findings:
+        value, low, high = finding.rms[name]
+        label = f"{finding.senses}, {finding.history} frame{'s' * (finding.history > 1)}"
+        success = (
+            "" if finding.success is None else f"   expert: {finding.success[0]} of {finding.success[1]}"
+        )
+        lines.append(f"  {label:<32} {value:6.2f} mm [{low:.2f}, {high:.2f}]{success}")
+    if found.true_success is not None:
+        lines.append(f"  expert that knows the truth: {found.true_success[0]} of {found.true_success[1]}")
+    return "\n".join([*lines, found.verdict])
+
+
+@parser.wrap()
+def information(cfg: InformationConfig) -> None:
+    """Study one task and write what was found."""
+    env = cfg.env
+    assert isinstance(env, VtRefineEnvConfig)
+    with beside(cfg.output_dir) as folder:
+        found = study(env, cfg.senses, cfg.effort, Bars(), save_keeper(folder))
+        write(found, cfg.effort, folder)
+        draw(found, folder / "information.png")
+        write_provenance(folder)
+        put_in_place(folder, cfg.output_dir)
+    print(summary(found))
+    logging.info("everything is in %s", cfg.output_dir)
+
+
+@run_cli
+def main() -> None:
+    """Console entry point."""
+    init_logging()
+    information()
+
+
+if __name__ == "__main__":
+    raise SystemExit(main())

@@ -1,0 +1,100 @@
+"""How often the expert succeeds when it acts on estimates in place of the truth: no actions are learnt."""
+
+from collections.abc import Callable
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from lerobot_vtrefine.envs.config import VtRefineEnvConfig
+from lerobot_vtrefine.envs.episodes import Episodes
+from lerobot_vtrefine.envs.factory import make_episodes
+from lerobot_vtrefine.information.estimator import Estimator
+from lerobot_vtrefine.information.frames import Views, view_columns
+from lerobot_vtrefine.information.quantities import Grasps, part_poses
+from lerobot_vtrefine.sim.expert import ScriptedExpert
+
+FIRST_SEED = 4_000_000
+"""Episodes that no regressor has seen."""
+
+
+class Believer:
+    """Keeps the history of sensor readings and says where the parts seem to be.
+
+    One environment's estimates are averaged over its episode with the weights of an exponential filter: parts
+    move little in their hands, and an estimate from one frame trembles.
+    """
+
+    SMOOTHING = 0.3
+
+    def __init__(
+        self, episodes: Episodes, estimator: Estimator, views: Views, grasps: Grasps, device: torch.device
+    ) -> None:
+        self._episodes, self._estimator, self._views = episodes, estimator, views
+        self._grasps, self._device = grasps, device
+        self._window: dict[str, Tensor] = {}
+        self._believed = np.zeros((episodes.num_envs, 0))
+
+    def start(self) -> None:
+        """Forget everything and read the first frames."""
+        frame = self._frame(self._episodes.ids)
+        self._window = {
+            key: value[:, None].repeat_interleave(self._estimator.history, 1) for key, value in frame.items()
+        }
+        self._believed = self._estimate(self._episodes.ids)
+
+    def look(self, ids: np.ndarray) -> None:
+        """Take in the newest frames of environments ``ids`` (m,)."""
+        rows = torch.as_tensor(ids, device=self._device)
+        for key, value in self._frame(ids).items():
+            window = self._window[key]
+            window[rows] = torch.cat([window[rows, 1:], value[:, None]], 1)
+        self._believed[ids] += self.SMOOTHING * (self._estimate(ids) - self._believed[ids])
+
+    def part_poses(self, ids: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Believed poses of plug and socket, each (m, 7)."""
+        sim = self._episodes.sim
+        q = np.asarray(sim.joint_state(ids), float)
+        return part_poses(sim.scene.embodiment, q, self._believed[ids], self._grasps)
+
+    def _frame(self, ids: np.ndarray) -> dict[str, Tensor]:
+        raw = {key: value[ids] for key, value in self._episodes.raw.items()}
+        return {k: v.float() for k, v in view_columns(raw, self._views, self._device).items()}
+
+    @torch.no_grad()
+    def _estimate(self, ids: np.ndarray) -> np.ndarray:
+        rows = torch.as_tensor(ids, device=self._device)
+        return (
+            self._estimator({key: value[rows] for key, value in self._window.items()}).double().cpu().numpy()
+        )
+
+
+def expert_success(
+    config: VtRefineEnvConfig,
+    num_episodes: int,
+    num_envs: int,
+    estimator: Estimator | None,
+    views: Views,
+    grasps: Grasps,
+    device: torch.device,
+    told: Callable[[int], None] = lambda _: None,
+) -> np.ndarray:
+    """Success (at least ``num_episodes``,) bool of the clean expert on estimates; None: on the truth."""
+    episodes = make_episodes(config, num_envs)
+    believer = None if estimator is None else Believer(episodes, estimator, views, grasps, device)
+    expert = ScriptedExpert(episodes.sim, part_poses=None if believer is None else believer.part_poses)
+    successes = []
+    for first in range(0, num_episodes, num_envs):
+        episodes.reset(episodes.ids, FIRST_SEED + first + episodes.ids)
+        if believer is not None:
+            believer.start()
+        expert.reset(episodes.ids)
+        targets = np.zeros((num_envs, episodes.sim.scene.embodiment.num_joints))
+        while len(running := episodes.active):
+            targets[running] = expert.act(running)
+            episodes.step(targets)
+            if believer is not None and len(episodes.active):
+                believer.look(episodes.active)
+        successes.append(episodes.success.copy())
+        told(num_envs)
+    return np.concatenate(successes)

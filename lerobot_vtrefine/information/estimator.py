@@ -1,0 +1,176 @@
+"""Regression of what insertion needs to know from what sensors show, by the policy's own encoder.
+
+Shapes: ``B`` samples, ``To`` frames of history, ``K`` quantities, ``E`` episodes, ``T`` frames of an episode.
+"""
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor, nn
+
+from lerobot_vtrefine.datasets.features import STATE_KEY
+from lerobot_vtrefine.information.frames import Frames, Views
+from lerobot_vtrefine.policies.vt_dp3 import VisuoTactileProcessorStep, VtDp3Config
+from lerobot_vtrefine.policies.vt_dp3.observation_encoder import ObservationEncoder, make_encoder
+
+HEAD_WIDTH = 256
+LEARNING_RATE = 1e-3
+WEIGHT_DECAY = 1e-3
+
+
+@dataclass(frozen=True)
+class Senses:
+    """Which sensors a regressor has, and how they enter."""
+
+    name: str
+    modalities: str
+    """As of ``--policy.modalities``; empty for joint positions alone."""
+    fusion: str = "pads"
+
+    def policy(self, preset: str, device: str, history: int) -> VtDp3Config:
+        """Settings of the policy whose encoder this is."""
+        return VtDp3Config(
+            preset=preset,
+            modalities=self.modalities or "visual",
+            fusion=self.fusion,
+            n_obs_steps=history,
+            device=device,
+        )
+
+
+SENSES = {
+    senses.name: senses
+    for senses in (
+        Senses("joints", ""),
+        Senses("visual", "visual"),
+        Senses("tactile", "tactile"),
+        Senses("visuo_tactile", "visuo_tactile"),
+        Senses("visuo_tactile_cloud", "visuo_tactile", "cloud"),
+    )
+}
+"""Every set of sensors that can be asked for."""
+
+
+def views_of(chosen: list[Senses], preset: str, device: str) -> Views:
+    """The preprocessing that regressors need: one view for every different cloud, and one with images."""
+    views: Views = {}
+    for senses in chosen:
+        config = senses.policy(preset, device, 1)
+        if not senses.modalities:
+            continue
+        if config.cloud_modalities:
+            views[config.cloud_modalities] = VisuoTactileProcessorStep(
+                config.observation, config.cloud_modalities
+            )
+        if config.sees_grids:
+            views["grids"] = VisuoTactileProcessorStep(config.observation, "", grids=True)
+    return views
+
+
+class Estimator(nn.Module):
+    """Encoder and head: history of processed frames -> ``NAMES`` (B, K) in SI units."""
+
+    mean: Tensor
+    std: Tensor
+    state_mean: Tensor
+    state_std: Tensor
+
+    def __init__(self, senses: Senses, frames: Frames, preset: str, device: str, history: int) -> None:
+        super().__init__()
+        config = senses.policy(preset, device, history)
+        self.sources = {
+            key: f"{view}/{key}"
+            for view, key in (
+                (config.cloud_modalities, "observation.visuo_tactile"),
+                ("grids", "observation.tactile_grids"),
+            )
+        }
+        state = frames.columns["state"]
+        if senses.modalities:
+            self.encoder = make_encoder(config, state.shape[-1])
+        else:
+            self.encoder = ObservationEncoder(None, None, state.shape[-1], history)
+        episode, frame = frames.index()
+        seen, truth = state[episode, frame], frames.truth[episode, frame]
+        for name, values in (("state_", seen), ("", truth)):
+            self.register_buffer(f"{name}mean", values.mean(0))
+            self.register_buffer(f"{name}std", values.std(0).clamp(min=1e-6))
+        self.head = nn.Sequential(
+            nn.Linear(self.encoder.cond_dim, HEAD_WIDTH),
+            nn.ReLU(),
+            nn.Linear(HEAD_WIDTH, HEAD_WIDTH),
+            nn.ReLU(),
+            nn.Linear(HEAD_WIDTH, truth.shape[-1]),
+        )
+        self.history = history
+
+    def standardised(self, window: dict[str, Tensor]) -> Tensor:
+        """Estimates (B, K) in standard deviations, of columns (B, To, ...)."""
+        batch = {key: window[self.sources[key]] for key in self.encoder.keys if key != STATE_KEY}
+        batch[STATE_KEY] = (window["state"] - self.state_mean) / self.state_std
+        return self.head(self.encoder(batch))
+
+    def forward(self, window: dict[str, Tensor]) -> Tensor:
+        """Estimates (B, K) in SI units."""
+        return self.standardised(window) * self.std + self.mean
+
+    def window(self, frames: Frames, episode: Tensor, frame: Tensor) -> dict[str, Tensor]:
+        """The last To frames (B, To, ...) up to ``frame`` (B,); the first one fills the window."""
+        back = torch.arange(1 - self.history, 1, device=frame.device)
+        rows = (frame[:, None] + back).clamp(min=0)
+        wanted = {"state", *(self.sources[key] for key in self.encoder.keys if key != STATE_KEY)}
+        return {key: frames.columns[key][episode[:, None], rows] for key in wanted}
+
+
+def train_estimator(
+    estimator: Estimator,
+    frames: Frames,
+    steps: int,
+    batch_size: int,
+    seed: int,
+    told: Callable[[int], None] = lambda _: None,
+) -> None:
+    """Least squares in standard deviations: AdamW with a cosine schedule over ``steps``."""
+    device = frames.truth.device
+    generator = torch.Generator(device).manual_seed(seed)
+    episode, frame = frames.index()
+    optimizer = torch.optim.AdamW(estimator.parameters(), lr=LEARNING_RATE, weight_decay=WEIGHT_DECAY)
+    schedule = torch.optim.lr_scheduler.LambdaLR(
+        optimizer, lambda step: min(1.0, (step + 1) / 100) * 0.5 * (1 + math.cos(math.pi * step / steps))
+    )
+    estimator.train()
+    for _ in range(steps):
+        rows = torch.randint(len(episode), (batch_size,), generator=generator, device=device)
+        window = estimator.window(frames, episode[rows], frame[rows])
+        truth = (frames.truth[episode[rows], frame[rows]] - estimator.mean) / estimator.std
+        loss = (estimator.standardised(window) - truth).square().mean()
+        optimizer.zero_grad(set_to_none=True)
+        loss.backward()
+        optimizer.step()
+        schedule.step()
+        told(1)
+    estimator.eval()
+
+
+@torch.no_grad()
+def episode_errors(estimator: Estimator, frames: Frames, batch_size: int = 4096) -> Tensor:
+    """Mean squared error per episode and quantity (E, K), in SI units squared."""
+    episode, frame = frames.index()
+    sums = torch.zeros_like(frames.truth[:, 0])
+    for rows in torch.arange(len(episode), device=episode.device).split(batch_size):
+        error = estimator(estimator.window(frames, episode[rows], frame[rows]))
+        error = error - frames.truth[episode[rows], frame[rows]]
+        sums.index_add_(0, episode[rows], error.square())
+    return sums / frames.length[:, None]
+
+
+def rms_with_interval(squares: Tensor, seed: int = 0, draws: int = 400) -> Tensor:
+    """RMS error and the ends of its 95 % interval (3, K), by a bootstrap over episodes (E, K)."""
+    generator = torch.Generator().manual_seed(seed)
+    squares = squares.cpu()
+    rows = torch.randint(len(squares), (draws, len(squares)), generator=generator)
+    drawn = torch.stack([squares[row].mean(0) for row in rows])
+    ends = drawn.quantile(torch.tensor([0.025, 0.975]), dim=0)
+    return torch.cat([squares.mean(0, keepdim=True), ends]).sqrt()

@@ -1,0 +1,153 @@
+"""Frames with the truth beside them: an expert that misjudges where things are, in many worlds.
+
+Its errors are larger than those of demonstrations, so that plugs land beside the hole, on its rim and askew:
+the contacts that a policy meets while it learns. Shapes: ``E`` episodes, ``T`` frames of the longest.
+"""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from math import radians
+from typing import Any
+
+import numpy as np
+import torch
+from lerobot.envs.utils import preprocess_observation
+from torch import Tensor
+
+from lerobot_vtrefine.datasets.features import raw_to_env_observation
+from lerobot_vtrefine.envs.config import VtRefineEnvConfig
+from lerobot_vtrefine.envs.episodes import Episodes
+from lerobot_vtrefine.envs.factory import make_episodes
+from lerobot_vtrefine.information.quantities import NAMES, Grasps, Relative, observe
+from lerobot_vtrefine.policies.vt_dp3 import VisuoTactileProcessorStep
+from lerobot_vtrefine.sim.demonstrations import Degradation
+from lerobot_vtrefine.sim.expert import ScriptedExpert
+
+ERRORS = Degradation(
+    lateral_std_m=2.5e-3,
+    tilt_std_rad=radians(3.0),
+    grasp_std_m=3e-3,
+    tremor_std_m=8e-4,
+    pause_probability=0.02,
+    pace_std=0.2,
+)
+"""Misses a hole of 1 to 2 mm more often than not."""
+FIRST_SEED = 3_000_000
+"""Apart from the seeds of demonstrations, training and evaluation."""
+
+Views = dict[str, VisuoTactileProcessorStep]
+"""How frames are seen; the name of a view is the prefix of its columns."""
+
+
+@dataclass
+class Frames:
+    """All frames that were recorded."""
+
+    columns: dict[str, Tensor]
+    """(E, T, ...) each: what the views made of a frame, and ``state`` in rad and m."""
+    truth: Tensor
+    """(E, T, K) quantities."""
+    length: Tensor
+    """(E,) frames of each episode."""
+    grasps: Grasps
+
+    def split(self, share: float) -> tuple["Frames", "Frames"]:
+        """The first episodes for training, a ``share`` of them, and the others."""
+        count = round(share * len(self.length))
+        return self._part(slice(None, count)), self._part(slice(count, None))
+
+    def _part(self, rows: slice) -> "Frames":
+        columns = {key: value[rows] for key, value in self.columns.items()}
+        return Frames(columns, self.truth[rows], self.length[rows], self.grasps)
+
+    def index(self) -> tuple[Tensor, Tensor]:
+        """Episode and frame number of every frame, (N,) each."""
+        frames = torch.arange(self.truth.shape[1], device=self.length.device)
+        episode, frame = (frames < self.length[:, None]).nonzero(as_tuple=True)
+        return episode, frame
+
+
+def view_columns(raw: dict[str, Any], views: Views, device: torch.device) -> dict[str, Tensor]:
+    """``VIEW/column`` (m, ...) of a raw frame (m, ...), and ``state`` (m, J)."""
+    frame = preprocess_observation(raw_to_env_observation(raw))
+    frame = {key: value.to(device) for key, value in frame.items() if isinstance(value, Tensor)}
+    made = {
+        f"{name}/{key}": value
+        for name, view in views.items()
+        for key, value in view.observation(dict(frame)).items()
+        if key not in frame
+    }
+    return {**made, "state": frame["observation.state"].float()}
+
+
+def collect_frames(
+    config: VtRefineEnvConfig,
+    num_episodes: int,
+    num_envs: int,
+    views: Views,
+    device: torch.device,
+    told: Callable[[int], None] = lambda _: None,
+) -> Frames:
+    """Frames of at least ``num_episodes`` episodes, ``num_envs`` at a time; ``told`` hears of every batch."""
+    episodes = make_episodes(config, num_envs)
+    expert = ScriptedExpert(episodes.sim, ERRORS)
+    batches: list[_Batch] = []
+    for first in range(0, num_episodes, num_envs):
+        batches.append(_one_batch(episodes, expert, FIRST_SEED + first, views, device))
+        told(num_envs)
+    length = np.concatenate([batch.length for batch in batches])
+    valid = np.arange(episode_frames(episodes)) < length[:, None]
+    relative = Relative(*(np.concatenate(parts) for parts in zip(*(b.truth for b in batches), strict=True)))
+    grasps = Grasps.mean(Relative(*(part[valid] for part in relative)))
+    truth = torch.zeros((*valid.shape, len(NAMES)))
+    truth[torch.from_numpy(valid)] = torch.from_numpy(
+        Relative(*(part[valid] for part in relative)).quantities(grasps)
+    ).float()
+    columns = {key: torch.cat([batch.columns[key] for batch in batches]) for key in batches[0].columns}
+    return Frames(columns, truth.to(device), torch.from_numpy(length).to(device), grasps)
+
+
+@dataclass
+class _Batch:
+    columns: dict[str, Tensor]  # (n, T, ...)
+    truth: Relative  # (n, T, ...)
+    length: np.ndarray  # (n,)
+
+
+def _one_batch(
+    episodes: Episodes, expert: ScriptedExpert, first_seed: int, views: Views, device: torch.device
+) -> _Batch:
+    sim, ids, frames = episodes.sim, episodes.ids, episode_frames(episodes)
+    episodes.reset(ids, first_seed + ids)
+    expert.reset(ids)
+    columns = {
+        key: torch.zeros((len(ids), frames, *value.shape[1:]), device=device)
+        for key, value in view_columns(_rows(episodes.raw, ids[:1]), views, device).items()
+    }
+    truth = Relative(*(np.zeros((len(ids), frames, *part.shape[1:])) for part in observe(sim, ids[:1])))
+    length = np.zeros(len(ids), np.int64)
+    targets = np.zeros((len(ids), sim.scene.embodiment.num_joints))
+    running = ids
+    for frame in range(frames):
+        rows = torch.as_tensor(running, device=device)
+        for key, value in view_columns(_rows(episodes.raw, running), views, device).items():
+            columns[key][rows, frame] = value.float()
+        for whole, part in zip(truth, observe(sim, running), strict=True):
+            whole[running, frame] = part
+        length[running] += 1
+        targets[running] = expert.act(running)
+        episodes.step(targets)
+        running = episodes.active
+        if len(running) == 0:
+            break
+    return _Batch(columns, truth, length)
+
+
+def episode_frames(episodes: Episodes) -> int:
+    """T: the frame before every control step of the longest episode."""
+    sim = episodes.sim
+    return sim.config.steps_of(sim.scene.config.start)
+
+
+def _rows(raw: dict[str, Any], ids: np.ndarray) -> dict[str, Any]:
+    return {key: value[ids] for key, value in raw.items()}

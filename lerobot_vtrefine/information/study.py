@@ -1,0 +1,243 @@
+"""One task's study: frames, a regressor per set of senses, and the expert acting on each.
+
+What comes out is a ``Study``; ``save`` writes it with the trained encoders.
+"""
+
+import json
+from collections.abc import Callable, Sequence
+from dataclasses import asdict, dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from scipy.stats import binomtest
+
+from lerobot_vtrefine.datasets.features import STATE_KEY
+from lerobot_vtrefine.envs.config import VtRefineEnvConfig
+from lerobot_vtrefine.information.closed_loop import expert_success
+from lerobot_vtrefine.information.estimator import (
+    SENSES,
+    Estimator,
+    Senses,
+    episode_errors,
+    rms_with_interval,
+    train_estimator,
+    views_of,
+)
+from lerobot_vtrefine.information.frames import Frames, Views, collect_frames
+from lerobot_vtrefine.information.quantities import NAMES, unit_of
+from lerobot_vtrefine.policies.vt_dp3.observation_encoder import save_encoder
+
+TRUE_AT_LEAST, TOUCH_AT_LEAST, VISION_AT_MOST = 0.95, 0.90, 0.70
+"""A task needs touch if the expert succeeds this often on the truth, on both senses, and on vision."""
+TRAINING_SHARE = 0.85
+TRUTH = "truth"
+
+Told = Callable[[str, int, int], None]
+"""(what is done, total, done now)"""
+
+
+@dataclass(frozen=True)
+class Effort:
+    """How much is simulated and trained."""
+
+    episodes: int = 1024
+    """Episodes of frames; the last 15 % of them are held out."""
+    num_envs: int = 64
+    steps: int = 2000
+    """Training steps of each regressor."""
+    batch_size: int = 256
+    history: tuple[int, ...] = (1, 10)
+    """Frames that a regressor sees; encoders are saved for the first entry."""
+    closed_loop_episodes: int = 256
+    """Episodes of the expert per set of senses; 0: none."""
+    preset: str = "small"
+    """Whose encoder: ``--policy.preset``."""
+    device: str = "cpu"
+    seed: int = 0
+
+    def __post_init__(self) -> None:
+        for name in ("episodes", "num_envs", "steps", "batch_size"):
+            if getattr(self, name) < 1:
+                raise ValueError(f"--{name} must be at least 1, got {getattr(self, name)}")
+        if not self.history or min(self.history) < 1:
+            raise ValueError(f"--history must hold numbers of frames from 1, got {self.history}")
+        if self.episodes < 2 * self.num_envs:
+            raise ValueError(f"--episodes={self.episodes} must be at least twice --num_envs={self.num_envs}")
+
+
+@dataclass
+class Finding:
+    """What one set of senses with one length of history knows."""
+
+    senses: str
+    history: int
+    rms: dict[str, tuple[float, float, float]]
+    """Error on held-out episodes and its 95 % interval, in the units of ``unit_of``."""
+    success: tuple[int, int] | None = None
+    """Of episodes in which the expert acted on the estimates."""
+
+
+@dataclass
+class Study:
+    """All findings on one task."""
+
+    prior: dict[str, float]
+    """Standard deviation of each quantity in the held-out frames: the error of one who sees nothing."""
+    findings: list[Finding] = field(default_factory=list)
+    true_success: tuple[int, int] | None = None
+
+    def success_of(self, senses: str) -> float | None:
+        """Best success over lengths of history; None where it was not measured."""
+        if senses == TRUTH:
+            return None if self.true_success is None else _rate(self.true_success)
+        rates = [_rate(f.success) for f in self.findings if f.senses == senses and f.success is not None]
+        return max(rates) if rates else None
+
+    @property
+    def verdict(self) -> str:
+        """Whether this task can show that touch pays, in a sentence."""
+        truth, both, vision = (self.success_of(name) for name in (TRUTH, "visuo_tactile", "visual"))
+        if truth is None or both is None or vision is None:
+            return "Not judged: it needs the expert's success on the truth, on both senses and on vision."
+        if truth < TRUE_AT_LEAST:
+            return f"Not a touch task: the expert fails where it knows everything ({truth:.2f} succeed)."
+        if both < TOUCH_AT_LEAST:
+            return f"Not a touch task: touch and vision together do not suffice ({both:.2f} succeed)."
+        if vision > VISION_AT_MOST:
+            return f"Not a touch task: vision alone suffices ({vision:.2f} succeed)."
+        return f"A touch task: {both:.2f} succeed with touch and vision, {vision:.2f} with vision alone."
+
+
+def study(
+    config: VtRefineEnvConfig,
+    senses: Sequence[str],
+    effort: Effort,
+    told: Told = lambda *_: None,
+    keep: Callable[[Senses, Estimator], None] = lambda *_: None,
+) -> Study:
+    """Collect, train, test, and let the expert act; ``keep`` gets the regressors of the first history."""
+    chosen = [SENSES[name] for name in senses]
+    views, device = views_of(chosen, effort.preset, effort.device), torch.device(effort.device)
+    count = effort.num_envs
+    frames = collect_frames(
+        config, effort.episodes, count, views, device, lambda n: told("frames", effort.episodes, n)
+    )
+    training, held_out = frames.split(TRAINING_SHARE)
+    result = Study(_shown(_spread(held_out)))
+    if effort.closed_loop_episodes:
+        done = expert_success(config, effort.closed_loop_episodes, count, None, {}, frames.grasps, device)
+        result.true_success = (int(done.sum()), len(done))
+    for history in effort.history:
+        for item in chosen:
+            estimator = _trained(item, training, effort, history, told)
+            if history == effort.history[0]:
+                keep(item, estimator)
+            result.findings.append(_tested(item, estimator, held_out, config, effort, views))
+            told("senses", len(chosen) * len(effort.history), 1)
+    return result
+
+
+def _trained(item: Senses, frames: Frames, effort: Effort, history: int, told: Told) -> Estimator:
+    torch.manual_seed(effort.seed)
+    estimator = Estimator(item, frames, effort.preset, effort.device, history).to(effort.device)
+    label = f"{item.name}, {history} frame{'s' * (history > 1)}"
+    train_estimator(
+        estimator,
+        frames,
+        effort.steps,
+        effort.batch_size,
+        effort.seed,
+        lambda n: told(label, effort.steps, n),
+    )
+    return estimator
+
+
+def _tested(
+    item: Senses,
+    estimator: Estimator,
+    held_out: Frames,
+    config: VtRefineEnvConfig,
+    effort: Effort,
+    views: Views,
+) -> Finding:
+    ends = rms_with_interval(episode_errors(estimator, held_out), effort.seed)
+    columns = [_shown(row) for row in ends.numpy()]
+    finding = Finding(
+        item.name,
+        estimator.history,
+        {name: (columns[0][name], columns[1][name], columns[2][name]) for name in NAMES},
+    )
+    if effort.closed_loop_episodes:
+        read = [estimator.sources[key].split("/")[0] for key in estimator.encoder.keys if key != STATE_KEY]
+        needed = {name: views[name] for name in read}
+        done = expert_success(
+            config,
+            effort.closed_loop_episodes,
+            effort.num_envs,
+            estimator,
+            needed,
+            held_out.grasps,
+            torch.device(effort.device),
+        )
+        finding.success = (int(done.sum()), len(done))
+    return finding
+
+
+def _spread(frames: Frames) -> np.ndarray:
+    episode, frame = frames.index()
+    return frames.truth[episode, frame].std(0).cpu().numpy()
+
+
+def _shown(values: np.ndarray) -> dict[str, float]:
+    """Values (K,) in SI units, by name, in the units they are reported in."""
+    return {
+        name: round(float(value) * unit_of(name)[0], 4) for name, value in zip(NAMES, values, strict=True)
+    }
+
+
+def _rate(success: tuple[int, int]) -> float:
+    return success[0] / success[1]
+
+
+def as_json(found: Study, effort: Effort) -> dict[str, Any]:
+    """Everything, with units and Wilson's intervals."""
+
+    def proportion(success: tuple[int, int] | None) -> dict[str, Any] | None:
+        if success is None:
+            return None
+        low, high = binomtest(*success).proportion_ci(method="wilson")
+        return {"success": success[0], "episodes": success[1], "ci95": [round(low, 4), round(high, 4)]}
+
+    return {
+        "verdict": found.verdict,
+        "units": {name: unit_of(name)[1] for name in NAMES},
+        "prior": found.prior,
+        "true_state": proportion(found.true_success),
+        "findings": [
+            {
+                "senses": finding.senses,
+                "history": finding.history,
+                "rms": {name: {"rms": v[0], "ci95": list(v[1:])} for name, v in finding.rms.items()},
+                "expert": proportion(finding.success),
+            }
+            for finding in found.findings
+        ],
+        "effort": asdict(effort),
+    }
+
+
+def save_keeper(folder: Path) -> Callable[[Senses, Estimator], None]:
+    """A ``keep`` that writes encoders to ``folder/encoder_NAME``."""
+
+    def keep(senses: Senses, estimator: Estimator) -> None:
+        if senses.modalities:
+            save_encoder(estimator.encoder, folder / f"encoder_{senses.name}")
+
+    return keep
+
+
+def write(found: Study, effort: Effort, folder: Path) -> None:
+    """``information.json`` in ``folder``."""
+    (folder / "information.json").write_text(json.dumps(as_json(found, effort), indent=2) + "\n")
