@@ -13,6 +13,7 @@ import io
 import logging
 import operator
 import sys
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
@@ -170,9 +171,7 @@ class FrameStore:
         """What ``DatasetReader.get_item`` returns before image transforms, depth units and the task."""
         row = range(len(self.first))[operator.index(idx)]
         found: dict[str, Any] = {}
-        windows: dict[tuple[int, ...], Array] = {}
-        for offsets in set(self._offsets.values()):
-            windows[offsets] = np.clip(row + np.array(offsets), self.first[row], self.last[row])
+        windows = self._windows(row)
         for block in self.blocks:
             if block.offsets is None:
                 found.update(block.read(row, ()))
@@ -186,6 +185,34 @@ class FrameStore:
             padded = (wanted < self.first[row]) | (wanted > self.last[row])
             item[f"{key}_is_pad"] = torch.from_numpy(padded)
         return item
+
+    def batch(self, indices: Sequence[int]) -> dict[str, Any]:
+        """The items of ``indices`` (B,) side by side: tensors (B, ...)."""
+        rows = np.array([range(len(self.first))[operator.index(index)] for index in indices])
+        first, last = self.first[rows, None], self.last[rows, None]
+        windows = {
+            offsets: np.clip(rows[:, None] + np.array(offsets), first, last)
+            for offsets in set(self._offsets.values())
+        }
+        found: dict[str, Any] = {}
+        for block in self.blocks:
+            picked = rows if block.offsets is None else windows[block.offsets]
+            columns = block.read(picked.ravel(), picked.shape)
+            found |= {key: value.contiguous() for key, value in columns.items()}
+        for key in self.lazy_keys:
+            found[key] = torch.stack([self._decode(key, row, self._windows(row)) for row in rows.tolist()])
+        batch = {key: found[key] for key in self.keys}
+        for key, offsets in self._offsets.items():
+            wanted = rows[:, None] + np.array(offsets)
+            batch[f"{key}_is_pad"] = torch.from_numpy((wanted < first) | (wanted > last))
+        return batch
+
+    def _windows(self, row: int) -> dict[tuple[int, ...], Array]:
+        """Rows of every window of the item in ``row``."""
+        return {
+            offsets: np.clip(row + np.array(offsets), self.first[row], self.last[row])
+            for offsets in set(self._offsets.values())
+        }
 
     def _decode(self, key: str, row: int, windows: dict[tuple[int, ...], Array]) -> Tensor:
         if key not in self._offsets:
@@ -204,6 +231,7 @@ def install() -> None:
     if not is_supported():
         logger.warning("This LeRobot version is untested: dataset items are read the slow way.")
         return
-    from lerobot_vtrefine.datasets.frame_reader import FastDatasetReader
+    from lerobot_vtrefine.datasets.frame_reader import FastDatasetReader, serve_batches
 
     module.DatasetReader = FastDatasetReader
+    serve_batches()

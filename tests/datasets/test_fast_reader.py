@@ -11,6 +11,7 @@ import pytest
 import torch
 from lerobot.datasets.dataset_reader import DatasetReader
 from lerobot.datasets.lerobot_dataset import LeRobotDataset
+from torch.utils.data import DataLoader
 
 from lerobot_vtrefine.datasets import fast_reader
 from lerobot_vtrefine.datasets.features import RAW_KEYS, STATE_KEY
@@ -56,6 +57,12 @@ def test_items_are_bit_identical(tiny_dataset: Path, options: dict[str, Any]) ->
         assert_same_item(slow[index], fast[index])
     with pytest.raises(IndexError):
         fast[len(fast)]
+    indices = [3, 0, len(slow) - 1, 11, 12]
+    (slow_batch,), (fast_batch,) = (DataLoader(data, batch_sampler=[indices]) for data in (slow, fast))
+    assert_same_item(slow_batch, fast_batch)
+    assert len(fast.__getitems__(indices)) == 1, "a whole batch, not items"
+    with pytest.raises(IndexError):
+        fast.__getitems__([0, len(fast)])
 
 
 @pytest.mark.usefixtures("stock")
@@ -68,6 +75,8 @@ def test_depth_that_does_not_fit_in_memory_is_decoded_per_item(
     fast = LeRobotDataset("local/tiny", root=tiny_dataset, delta_timestamps=WINDOWS)
     for index in (0, 5, 35):
         assert_same_item(slow[index], fast[index])
+    (slow_batch,), (fast_batch,) = (DataLoader(data, batch_sampler=[[5, 35]]) for data in (slow, fast))
+    assert_same_item(slow_batch, fast_batch)
 
 
 @pytest.mark.usefixtures("stock")
