@@ -81,7 +81,7 @@ def information(cfg: InformationConfig) -> None:
     env = cfg.env
     assert isinstance(env, VtRefineEnvConfig)
     with beside(cfg.output_dir) as folder:
-        found = study(env, cfg.senses, cfg.effort, Bars(), save_keeper(folder))
+        found = study(env, cfg.senses, cfg.effort, Bars(), save_keeper(folder, cfg.effort))
         write(found, cfg.effort, folder)
         draw(found, folder / "information.png")
         write_provenance(folder)

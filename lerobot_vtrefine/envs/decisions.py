@@ -16,7 +16,7 @@ from lerobot_vtrefine.datasets.features import raw_to_env_observation
 from lerobot_vtrefine.envs.config import VtRefineEnvConfig
 from lerobot_vtrefine.envs.episodes import Array, Episodes
 from lerobot_vtrefine.envs.factory import make_episodes
-from lerobot_vtrefine.sim.task import FAILURES
+from lerobot_vtrefine.sim.task import FAILURES, SIMULATION_FAILED
 
 Batch = dict[str, Tensor]
 
@@ -36,7 +36,7 @@ class Decision(NamedTuple):
     """(n,) bool: the time was over."""
     info: dict[str, Tensor]
     """(n,) each: ``success``, ``steps`` (of the episode), its metrics so far, and ``failed_<reason>`` for
-    every reason of failure but time-out; ``unstable`` and ``overflow`` are the simulation's own."""
+    every reason of failure but time-out; ``void`` where the simulation itself failed."""
 
 
 class LeRobotDecisionEnv:
@@ -124,7 +124,14 @@ class LeRobotDecisionEnv:
         metrics = self.episodes.sim.metrics(self.episodes.ids)
         failure = metrics.pop("failure")
         failed = {f"failed_{FAILURES[code]}": failure == code for code in range(1, len(FAILURES))}
-        columns = {**metrics, **failed, "steps": self.episodes.steps, "success": self.episodes.success}
+        void = np.isin(failure, SIMULATION_FAILED)
+        columns = {
+            **metrics,
+            **failed,
+            "void": void,
+            "steps": self.episodes.steps,
+            "success": self.episodes.success,
+        }
         return {name: torch.from_numpy(np.array(values)) for name, values in columns.items()}
 
     def _push(self, ids: Array) -> None:

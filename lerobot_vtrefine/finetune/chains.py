@@ -11,11 +11,31 @@ from torch import Tensor
 from lerobot_vtrefine.finetune.config import DppoConfig
 from lerobot_vtrefine.finetune.protocols import Actor, Agent, Observation, predictor, select
 from lerobot_vtrefine.policies.vt_dp3.diffusion import (
+    Chain,
+    PredictNoise,
     denoise_prefix,
     sample_chain,
     slice_log_prob,
     whiten,
 )
+
+
+def explore(
+    agent: Agent, predict_noise: PredictNoise, latent: Tensor, cfg: DppoConfig, generator: torch.Generator
+) -> Chain:
+    """Sample the tuned steps from ``latent`` (B, H, D) with the exploration noise of ``cfg``."""
+    return sample_chain(
+        agent.process,
+        predict_noise,
+        latent,
+        num_tuned=agent.num_tuned,
+        executed=agent.executed,
+        eta=cfg.eta,
+        min_sampling_std=cfg.min_sampling_std,
+        min_log_prob_std=cfg.min_log_prob_std,
+        correlation=cfg.noise_correlation,
+        generator=generator,
+    )
 
 
 @dataclass
@@ -48,20 +68,7 @@ class Regulariser:
                 noise = torch.randn((len(ids), *agent.action_shape), generator=generator, device=cond.device)
                 base = predictor(agent.base, cond)
                 start = denoise_prefix(agent.process, base, noise, agent.num_tuned)
-                chains.append(
-                    sample_chain(
-                        agent.process,
-                        base,
-                        start,
-                        num_tuned=agent.num_tuned,
-                        executed=agent.executed,
-                        eta=cfg.eta,
-                        min_sampling_std=cfg.min_sampling_std,
-                        min_log_prob_std=cfg.min_log_prob_std,
-                        correlation=cfg.noise_correlation,
-                        generator=generator,
-                    ).latents
-                )
+                chains.append(explore(agent, base, start, cfg, generator).latents)
         return cls(torch.cat(means) if means else None, torch.cat(chains) if chains else None)
 
 

@@ -18,13 +18,13 @@ Shapes: E environments, S decisions, N valid decisions, K' tuned steps, H horizo
 import math
 import time
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 
 import torch
 from torch import Tensor
 
-from lerobot_vtrefine.finetune.chains import Regulariser, chain_log_probs, decision_kl
+from lerobot_vtrefine.finetune.chains import Regulariser, chain_log_probs, decision_kl, explore
 from lerobot_vtrefine.finetune.config import DppoConfig
 from lerobot_vtrefine.finetune.critic import Critic, explained_variance
 from lerobot_vtrefine.finetune.distributed import (
@@ -50,7 +50,7 @@ from lerobot_vtrefine.finetune.protocols import (
 from lerobot_vtrefine.finetune.rollback import Rollback
 from lerobot_vtrefine.finetune.seeds import TRAINING_SEEDS
 from lerobot_vtrefine.finetune.trust_region import TrustRegion
-from lerobot_vtrefine.policies.vt_dp3.diffusion import denoise_prefix, sample_chain
+from lerobot_vtrefine.policies.vt_dp3.diffusion import denoise_prefix
 
 Metrics = dict[str, float]
 
@@ -124,18 +124,7 @@ def collect(
         cond, cond_base = agent.conditions(obs)
         noise = torch.randn((len(ids), *agent.action_shape), generator=generator, device=device)
         latent = denoise_prefix(agent.process, predictor(agent.base, cond_base), noise, agent.num_tuned)
-        chain = sample_chain(
-            agent.process,
-            predictor(agent.actor, cond),
-            latent,
-            num_tuned=agent.num_tuned,
-            executed=agent.executed,
-            eta=cfg.eta,
-            min_sampling_std=cfg.min_sampling_std,
-            min_log_prob_std=cfg.min_log_prob_std,
-            correlation=cfg.noise_correlation,
-            generator=generator,
-        )
+        chain = explore(agent, predictor(agent.actor, cond), latent, cfg, generator)
         transition = execute(env, chain.latents[:, -1, agent.executed], ids)
         kept.append({"cond": cond} if agent.frozen_encoder else obs)
         chains.append(chain)
@@ -150,21 +139,33 @@ def collect(
         if not running.any():
             break
     step_index, env_index = torch.cat(index, dim=1)
-    return Rollout(
-        obs=concatenate(kept),
-        latents=torch.cat([chain.latents for chain in chains]),
-        log_probs=torch.cat([chain.log_probs for chain in chains]),
-        means=torch.cat([chain.means for chain in chains]),
-        step=step_index,
-        env=env_index,
-        privileged=torch.stack(states),
-        reward=torch.stack([t.reward * a for t, a in zip(transitions, active, strict=True)]),
-        terminated=torch.stack([t.terminated for t in transitions]),
-        truncated=torch.stack([t.truncated for t in transitions]),
-        active=torch.stack(active),
-        success=success,
-        info=info,
+    return _without_void(
+        Rollout(
+            obs=concatenate(kept),
+            latents=torch.cat([chain.latents for chain in chains]),
+            log_probs=torch.cat([chain.log_probs for chain in chains]),
+            means=torch.cat([chain.means for chain in chains]),
+            step=step_index,
+            env=env_index,
+            privileged=torch.stack(states),
+            reward=torch.stack([t.reward * a for t, a in zip(transitions, active, strict=True)]),
+            terminated=torch.stack([t.terminated for t in transitions]),
+            truncated=torch.stack([t.truncated for t in transitions]),
+            active=torch.stack(active),
+            success=success,
+            info=info,
+        )
     )
+
+
+def _without_void(rollout: Rollout) -> Rollout:
+    """Leave out the episodes whose simulation broke: what happened there is no one's doing."""
+    void = rollout.info.get("void", torch.zeros_like(rollout.success)).bool()
+    if not void.any():
+        return rollout
+    rows = ~void[rollout.env]
+    kept = {name: getattr(rollout, name)[rows] for name in ("latents", "log_probs", "means", "step", "env")}
+    return replace(rollout, obs=select(rollout.obs, rows), active=rollout.active & ~void, **kept)
 
 
 @torch.no_grad()

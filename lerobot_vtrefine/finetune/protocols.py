@@ -84,7 +84,9 @@ class Transition(NamedTuple):
     reward: Tensor  # (n,) sum over the chunk
     terminated: Tensor  # (n,) bool: the task ended (success or failure)
     truncated: Tensor  # (n,) bool: the time was over
-    info: dict[str, Tensor]  # "success" (n,) bool, further (n,) metrics of the episode so far
+    info: dict[str, Tensor]
+    """"success" (n,) bool, further (n,) metrics of the episode so far; "void" (n,) bool where the simulation
+    failed: such episodes are left out of what is learnt from."""
 
 
 class DecisionEnv(Protocol):

@@ -228,12 +228,12 @@ def as_json(found: Study, effort: Effort) -> dict[str, Any]:
     }
 
 
-def save_keeper(folder: Path) -> Callable[[Senses, Estimator], None]:
-    """A ``keep`` that writes encoders to ``folder/encoder_NAME``."""
+def save_keeper(folder: Path, effort: Effort) -> Callable[[Senses, Estimator], None]:
+    """A ``keep`` that writes encoders to ``folder``, where ``--policy.pretrained_encoder`` finds them."""
 
     def keep(senses: Senses, estimator: Estimator) -> None:
         if senses.modalities:
-            save_encoder(estimator.encoder, folder / f"encoder_{senses.name}")
+            save_encoder(estimator.encoder, senses.policy(effort.preset, effort.device, 1), folder)
 
     return keep
 

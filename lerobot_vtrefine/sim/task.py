@@ -20,7 +20,8 @@ Pose = tuple[Array, Array]
 
 FAILURES = ("none", "in_hand_shift", "contact_force", "dropped", "unstable", "overflow")
 NO_FAILURE, SHIFTED, FORCED, DROPPED, UNSTABLE, OVERFLOWED = range(6)
-"""The last two are the simulation's failures: a state that blew up, and contacts that found no room."""
+SIMULATION_FAILED = (UNSTABLE, OVERFLOWED)
+"""The simulation's own failures: a state that blew up, and contacts that found no room."""
 
 HELD_FORCE_N = 1.0
 """A part is held while both pads of its hand press at least this hard."""

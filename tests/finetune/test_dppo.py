@@ -180,6 +180,41 @@ def test_batch_holds_exactly_the_decisions_that_were_made():
     assert torch.equal(rollout.success, rollout.reward.sum(0) > 0)
 
 
+def test_episodes_whose_simulation_failed_are_not_learnt_from():
+    """Whatever happens in such a world, the update is the one without it."""
+
+    class Breaking(BlindPeg):
+        """World 2 breaks in its second decision, and then shows nonsense."""
+
+        nonsense = 1e6
+
+        def step_chunk(self, actions):
+            made = super().step_chunk(actions)
+            void = (torch.arange(self.num_envs) == 2) & (self.decision >= 2)
+            return made._replace(
+                reward=torch.where(void, self.nonsense, made.reward),
+                terminated=made.terminated | void,
+                truncated=made.truncated & ~void,
+                info=made.info | {"void": void},
+            )
+
+    results = []
+    for nonsense in (1e6, -1e6):
+        cfg = small_config()
+        _, agent, state = problem(cfg)
+        env = Breaking(cfg.num_envs, feel=True)
+        env.nonsense = nonsense
+        rollout = rollout_of(cfg, env, agent, state)
+        assert len(rollout.env) > 0
+        assert 2 not in rollout.env
+        assert not rollout.active[:, 2].any()
+        assert rollout.active[:, 3].any()
+        metrics = update(rollout, agent, state, cfg)
+        results.append((metrics["value_loss"], metrics["policy_loss"], weights(agent.actor)))
+    assert results[0][:2] == results[1][:2]
+    assert all(torch.equal(one, other) for one, other in zip(results[0][2], results[1][2], strict=True))
+
+
 def test_micro_batches_change_nothing_but_memory():
     results = []
     for micro in (0, 3):

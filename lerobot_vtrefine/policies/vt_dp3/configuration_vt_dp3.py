@@ -3,7 +3,6 @@ Train").
 """
 
 from dataclasses import dataclass, field, replace
-from pathlib import Path
 from typing import Any
 
 from lerobot.configs import FeatureType, NormalizationMode, PreTrainedConfig
@@ -80,9 +79,9 @@ class VtDp3Config(PreTrainedConfig):
     """Features of one pad (``fusion=pads``)."""
     pad_features: int = 64
     """Features of all pads together (``fusion=pads``)."""
-    pretrained_encoder: Path | None = None
-    """Folder of an encoder that ``vtrefine-information`` trained on simulated contacts; training starts from
-    it.
+    pretrained_encoder: str = ""
+    """Start from the encoder that ``vtrefine-information`` trained on simulated contacts: its --output_dir,
+    or ``vtrefine:NAME`` for one that comes with this package. Empty: from scratch.
     """
     freeze_encoder: bool = False
     """Behaviour cloning leaves the encoder as it is; needs ``pretrained_encoder``."""
@@ -157,7 +156,7 @@ class VtDp3Config(PreTrainedConfig):
             )
         if self.fusion not in FUSIONS:
             raise ValueError(f"unknown policy.fusion {self.fusion!r}; choose one of {', '.join(FUSIONS)}")
-        if self.freeze_encoder and self.pretrained_encoder is None:
+        if self.freeze_encoder and not self.pretrained_encoder:
             raise ValueError(
                 "policy.freeze_encoder=true needs policy.pretrained_encoder: an untrained one sees nothing"
             )

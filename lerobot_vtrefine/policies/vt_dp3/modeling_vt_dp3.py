@@ -89,8 +89,8 @@ class VtDp3Policy(PreTrainedPolicy):
             widen_narrow_ranges(dataset_stats)
         self.config: VtDp3Config = config
         self.model = VtDp3Model(config, config.state_dim, config.action_dim)
-        if read_encoder and config.pretrained_encoder is not None:
-            load_encoder(self.model.encoder, config.pretrained_encoder)
+        if read_encoder and config.pretrained_encoder:
+            load_encoder(self.model.encoder, config)
         self.base: VtDp3Model | None = None
         self.online: VtDp3Model | None = None
         self.ema: Ema | None = None

@@ -17,7 +17,9 @@ from lerobot_vtrefine.policies.vt_dp3.pad_encoder import PadEncoder
 from lerobot_vtrefine.policies.vt_dp3.point_encoder import PointEncoder
 
 STATE_FEATURES = 64
-ENCODER_FILE = "encoder.safetensors"
+SHIPPED_PREFIX = "vtrefine:"
+SHIPPED = Path(__file__).parents[2] / "assets" / "encoders"
+"""Encoders that come with this package, a folder per task; docs/learning.md says how they were made."""
 
 
 class ObservationEncoder(nn.Module):
@@ -79,31 +81,44 @@ def make_encoder(config: VtDp3Config, state_dim: int) -> ObservationEncoder:
     return ObservationEncoder(points, pads, state_dim, config.n_obs_steps)
 
 
-def save_encoder(encoder: ObservationEncoder, folder: Path) -> None:
+def encoder_file(config: VtDp3Config) -> str:
+    """Name of the weights of an encoder with these senses, below a folder of encoders."""
+    touch = "" if config.modalities == "visual" else f"_{config.fusion}"
+    return f"encoder_{config.modalities}{touch}.safetensors"
+
+
+def save_encoder(encoder: ObservationEncoder, config: VtDp3Config, folder: Path) -> None:
     """Write the networks of cloud and pads; that of the joints depends on a dataset's normalisation."""
     weights = {name: value.contiguous() for name, value in _perception_weights(encoder).items()}
-    folder.mkdir(parents=True, exist_ok=True)
-    save_file(weights, folder / ENCODER_FILE)
+    save_file(weights, folder / encoder_file(config))
 
 
-def load_encoder(encoder: ObservationEncoder, folder: Path) -> None:
-    """Start from the networks that ``save_encoder`` wrote.
+def load_encoder(encoder: ObservationEncoder, config: VtDp3Config) -> None:
+    """Start from the networks that ``save_encoder`` wrote to the folder ``config.pretrained_encoder``.
 
     Raises:
-        FileNotFoundError: the folder holds no encoder. ValueError: it fits another policy, or is damaged.
+        FileNotFoundError: the folder holds no such encoder.
+        ValueError: it fits another policy, or is damaged.
     """
-    path = folder / ENCODER_FILE
+    name = config.pretrained_encoder
+    folder = SHIPPED / name.removeprefix(SHIPPED_PREFIX) if name.startswith(SHIPPED_PREFIX) else Path(name)
+    path = folder / encoder_file(config)
     if not path.is_file():
-        raise FileNotFoundError(f"--policy.pretrained_encoder={folder} holds no {ENCODER_FILE}")
+        held = sorted(item.name for item in folder.glob("encoder_*.safetensors"))
+        known = ", ".join(f"{SHIPPED_PREFIX}{item.name}" for item in sorted(SHIPPED.iterdir()))
+        raise FileNotFoundError(
+            f"--policy.pretrained_encoder={name} holds no {path.name}"
+            f" (but {', '.join(held) or 'no encoder'}): make it with vtrefine-information, or use {known}"
+        )
     try:
         weights = load_file(path)
     except SafetensorError as error:
         raise ValueError(f"{path} is damaged: {error}") from error
-    own = _perception_weights(encoder)
-    if {name: value.shape for name, value in own.items()} != {k: v.shape for k, v in weights.items()}:
+    own = {key: value.shape for key, value in _perception_weights(encoder).items()}
+    if own != {key: value.shape for key, value in weights.items()}:
         raise ValueError(
-            f"{path} was trained for other networks: give --policy.modalities, --policy.fusion and"
-            " --policy.preset as vtrefine-information had them"
+            f"{path} was trained for networks of other sizes: give --policy.preset, and whatever else changes"
+            " them, as vtrefine-information had it"
         )
     encoder.load_state_dict(weights, strict=False)
 
