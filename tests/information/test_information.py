@@ -1,0 +1,136 @@
+"""What a study of a task's information says, and the encoders that it leaves."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+from lerobot_vtrefine.datasets.features import GRIDS_KEY
+from lerobot_vtrefine.envs import VtRefineEnvConfig
+from lerobot_vtrefine.envs.factory import make_simulation
+from lerobot_vtrefine.information.closed_loop import expert_success
+from lerobot_vtrefine.information.estimator import (
+    SENSES,
+    Estimator,
+    episode_errors,
+    rms_with_interval,
+    train_estimator,
+)
+from lerobot_vtrefine.information.frames import Frames
+from lerobot_vtrefine.information.quantities import NAMES, Grasps, observe, part_poses
+from lerobot_vtrefine.information.study import Effort, Finding, Study, as_json, save_keeper, study
+
+EPISODES, LENGTH, JOINTS = 60, 9, 16
+
+
+def synthetic(seed: int) -> Frames:
+    """Frames whose first quantity is where a pad is pressed; joints tell nothing."""
+    rng = torch.Generator().manual_seed(seed)
+    place = torch.randint(32, (EPISODES, LENGTH), generator=rng)
+    grids = torch.zeros(EPISODES, LENGTH, 4, 12, 32)
+    grids.scatter_(-1, place[..., None, None, None].expand(-1, -1, 4, 12, 1), 1.0)
+    truth = torch.zeros(EPISODES, LENGTH, len(NAMES))
+    truth[..., 0] = 1e-3 * (place - 16)
+    columns = {"state": torch.randn(EPISODES, LENGTH, JOINTS, generator=rng), f"grids/{GRIDS_KEY}": grids}
+    length = torch.randint(3, LENGTH + 1, (EPISODES,), generator=rng)
+    return Frames(columns, truth, length, Grasps(np.tile(np.eye(3), (3, 1, 1))))
+
+
+def trained(senses: str, frames: Frames, history: int = 1) -> Estimator:
+    torch.manual_seed(0)
+    estimator = Estimator(SENSES[senses], frames, "small", "cpu", history)
+    train_estimator(estimator, frames, steps=160, batch_size=64, seed=0)
+    return estimator
+
+
+def test_pads_tell_what_joints_do_not() -> None:
+    frames, held_out = synthetic(0), synthetic(1)
+    prior = held_out.truth[held_out.index()][:, 0].std()
+    for senses, lowest, highest in (("tactile", 0.0, 0.35), ("joints", 0.9, 1.5)):
+        value, low, high = rms_with_interval(episode_errors(trained(senses, frames), held_out))[:, 0]
+        assert lowest < value / prior < highest, senses
+        assert low < value < high
+
+
+def test_windows_start_at_the_episodes_first_frame() -> None:
+    frames = synthetic(0)
+    estimator = Estimator(SENSES["tactile"], frames, "small", "cpu", 3)
+    window = estimator.window(frames, torch.tensor([5, 5]), torch.tensor([0, 4]))
+    state = frames.columns["state"][5]
+    assert torch.equal(window["state"][0], state[[0, 0, 0]])
+    assert torch.equal(window["state"][1], state[[2, 3, 4]])
+    assert estimator(window).shape == (2, len(NAMES))
+
+
+def test_quantities_say_where_the_parts_are() -> None:
+    sim = make_simulation(VtRefineEnvConfig(start="grasped"), 3)
+    ids = np.arange(3)
+    sim.reset(ids, ids)
+    seen = observe(sim, ids)
+    grasps = Grasps.mean(seen)
+    q = np.asarray(sim.joint_state(ids), float)
+    believed = part_poses(sim.scene.embodiment, q, seen.quantities(grasps), grasps)
+    for pose, truth in zip(believed, sim.part_poses(ids), strict=True):
+        np.testing.assert_allclose(pose[:, :3], truth[:, :3], atol=1e-9)
+        same = np.abs((pose[:, 3:] * truth[:, 3:]).sum(-1))  # q and -q are one rotation
+        np.testing.assert_allclose(same, 1, atol=1e-9)
+
+
+@pytest.mark.parametrize(
+    ("truth", "both", "vision", "said"),
+    [
+        (0.90, 0.9, 0.1, "knows everything"),
+        (0.99, 0.8, 0.1, "do not suffice"),
+        (0.99, 0.95, 0.8, "vision alone suffices"),
+        (0.99, 0.95, 0.5, "A touch task"),
+        (0.99, None, 0.5, "Not judged"),
+    ],
+)
+def test_verdicts(truth: float, both: float | None, vision: float, said: str) -> None:
+    def finding(senses: str, rate: float | None) -> Finding:
+        return Finding(senses, 1, {}, None if rate is None else (round(100 * rate), 100))
+
+    found = Study({}, [finding("visuo_tactile", both), finding("visual", vision)], (round(100 * truth), 100))
+    assert said in found.verdict
+
+
+def test_a_study_leaves_encoders_that_policies_start_from(tmp_path: Path) -> None:
+    from lerobot.configs import FeatureType, PolicyFeature
+
+    from lerobot_vtrefine.datasets.features import ACTION_KEY, BASELINE_KEYS, STATE_KEY, TACTILE_KEYS
+    from lerobot_vtrefine.policies.vt_dp3 import VtDp3Config
+    from lerobot_vtrefine.policies.vt_dp3.modeling_vt_dp3 import VtDp3Policy
+
+    env = VtRefineEnvConfig(start="grasped", episode_steps=3)
+    effort = Effort(episodes=8, num_envs=4, steps=2, batch_size=8, history=(1,), closed_loop_episodes=4)
+    found = study(env, ["tactile"], effort, keep=save_keeper(tmp_path, effort))
+    told = as_json(found, effort)
+    assert told["true_state"]["episodes"] == told["findings"][0]["expert"]["episodes"] == 4
+    assert set(told["findings"][0]["rms"]) == set(NAMES) == set(told["prior"])
+
+    def policy(folder: Path, **changes: object) -> VtDp3Policy:
+        settings = {"preset": "small", "device": "cpu", "modalities": "tactile", "fusion": "pads"}
+        config = VtDp3Config(**settings | changes, pretrained_encoder=str(folder))
+        state = (STATE_KEY, *TACTILE_KEYS, *BASELINE_KEYS)
+        config.input_features = {key: PolicyFeature(FeatureType.STATE, (JOINTS,)) for key in state}
+        config.output_features = {ACTION_KEY: PolicyFeature(FeatureType.ACTION, (JOINTS,))}
+        return VtDp3Policy(config)
+
+    first, second = policy(tmp_path), policy(tmp_path, freeze_encoder=True)
+    pads, frozen = first.model.encoder.pads, second.model.encoder.pads
+    assert pads is not None
+    assert frozen is not None
+    assert all(torch.equal(a, b) for a, b in zip(pads.parameters(), frozen.parameters(), strict=True))
+    assert len(second.get_optim_params()) == len(first.get_optim_params()) - len(list(pads.parameters()))
+    second.save_pretrained(tmp_path / "checkpoint")
+    (tmp_path / "encoder_tactile_pads.safetensors").unlink()
+    VtDp3Policy.from_pretrained(tmp_path / "checkpoint")  # needs the encoder's folder no more
+    with pytest.raises(FileNotFoundError, match=r"holds no encoder_tactile_pads.safetensors .*vtrefine:"):
+        policy(tmp_path)
+
+
+def test_the_expert_succeeds_on_the_truth() -> None:
+    env = VtRefineEnvConfig(start="grasped")
+    done = expert_success(env, 4, 4, None, {}, Grasps(np.tile(np.eye(3), (3, 1, 1))), torch.device("cpu"))
+    assert done.tolist() == [True] * 4
