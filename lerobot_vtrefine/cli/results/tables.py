@@ -18,6 +18,7 @@ LABELS = {
     "tight": "tight: 1 mm clearance",
     "occluded": "occluded: camera above, the hole hidden",
     "slip": "slip: twice the pose error in the hand",
+    "square_1mm_slip": "square pair, 1 mm, slip 4 mm / .1 rad",
     "short_chunk": "short_chunk: decisions twice as often",
     "row_sharing+hysteresis": "row sharing, hysteresis",
     "latency+taxel_gain_spread": "latency 0.2 s, gain spread 0.5",
