@@ -1,11 +1,36 @@
 """What a robot is: joints, link constants, servo gains, where its pads sit, and its kinematics."""
 
 from lerobot_vtrefine.embodiments.aloha import ALOHA
-from lerobot_vtrefine.embodiments.embodiment import Arm, Embodiment, Fingers, Joint
+from lerobot_vtrefine.embodiments.camera_config import CameraConfig
+from lerobot_vtrefine.embodiments.embodiment import Arm, Embodiment, Joint
+from lerobot_vtrefine.embodiments.fingers import Fingers, FourBarFingers, Pad, SlidingFingers
 
-__all__ = ["Arm", "Embodiment", "Fingers", "Joint", "get_embodiment"]
+__all__ = [
+    "ALOHA",
+    "Arm",
+    "CameraConfig",
+    "Embodiment",
+    "Fingers",
+    "FourBarFingers",
+    "Joint",
+    "Pad",
+    "SlidingFingers",
+    "embodiment_of",
+    "get_embodiment",
+    "register_embodiment",
+]
 
-_EMBODIMENTS = {ALOHA.name: ALOHA}
+_EMBODIMENTS = {body.name: body for body in (ALOHA,)}
+
+
+def register_embodiment(body: Embodiment) -> None:
+    """Make a body known by its name, in this process.
+
+    Raises:
+        ValueError: another body has the name.
+    """
+    if _EMBODIMENTS.setdefault(body.name, body) is not body:
+        raise ValueError(f"there is an embodiment {body.name!r} already")
 
 
 def get_embodiment(name: str) -> Embodiment:
@@ -17,3 +42,9 @@ def get_embodiment(name: str) -> Embodiment:
     if name not in _EMBODIMENTS:
         raise ValueError(f"unknown embodiment {name!r}: use one of {', '.join(sorted(_EMBODIMENTS))}")
     return _EMBODIMENTS[name]
+
+
+def embodiment_of(joints: tuple[str, ...]) -> Embodiment | None:
+    """The body that has all these joints, by their names with or without LeRobot's ".pos"; None if none has."""
+    names = {name.removesuffix(".pos") for name in joints}
+    return next((body for body in _EMBODIMENTS.values() if names and names <= set(body.joint_names)), None)

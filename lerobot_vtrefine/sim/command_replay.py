@@ -144,9 +144,11 @@ def grasp_start(
         table_height_m: of the table on which the parts stand.
 
     Returns:
-        None when a gripper never closes.
+        None when a gripper never closes, or a part has no hand of its own.
     """
     poses = []
+    if None in embodiment.holders:
+        return None
     for arm, (part, yaw) in enumerate(((pair.socket, np.pi / 2), (pair.plug, -np.pi / 2))):
         moment = grasp_frame(embodiment, position, arm)
         if moment is None:
@@ -163,7 +165,7 @@ def grasp_frame(embodiment: Embodiment, position: Array, arm: int) -> int | None
     Args:
         position: (T, J) of one episode.
     """
-    opening = position[:, embodiment.joints_per_arm * (arm + 1) - 2]
+    opening = embodiment.openings(position)[:, arm]
     low, high = float(opening.min()), float(opening.max())
     if high - low < CLOSING_M:
         return None

@@ -20,7 +20,7 @@ from lerobot_vtrefine.sim.demonstrations import Degradation, EpisodeErrors
 from lerobot_vtrefine.sim.ik import hand_poses, solve_hands
 from lerobot_vtrefine.sim.poses import Poses, rotation_vector
 from lerobot_vtrefine.sim.servo_model import ServoModel
-from lerobot_vtrefine.sim.starts import ideal_hand
+from lerobot_vtrefine.sim.starts import grip_openings, ideal_hand
 
 if TYPE_CHECKING:
     from lerobot_vtrefine.sim.simulation import InsertionSim
@@ -125,6 +125,8 @@ class ScriptedExpert:
         self._sim = sim
         self._part_poses = part_poses or sim.part_poses
         self._robot = sim.scene.embodiment
+        if None in self._robot.holders:
+            raise ValueError(f"the scripted expert needs two hands, and {self._robot.name} has one")
         self._pair = sim.scene.pair
         self._hz = sim.config.control_hz
         self._from_table = sim.scene.config.start == "table"
@@ -175,7 +177,7 @@ class ScriptedExpert:
         self._servos.learn(ids, view.q, (self.phase[ids] != Phase.CLOSE) & ~self._entered[ids])
         command = self._servos.command(ids, self._target[ids], target)
         for q in (target, command):
-            _arms(q)[..., -2:] = self._opening[ids][..., None] * [1.0, -1.0]
+            self._robot.set_openings(q, self._opening[ids])
         self._target[ids] = target
         self._step[ids] += 1
         return np.clip(command, self._robot.lower, self._robot.upper)
@@ -312,8 +314,8 @@ def _grasps(sim: "InsertionSim") -> tuple[Poses, Array]:
     right = ideal_hand(pair.plug, -np.pi / 2, pitches[RIGHT])
     hands = Poses(np.stack([left[0], right[0]]), np.stack([left[1], right[1]]))
     hands.position[:, 2] += raised
-    width = np.array([pair.socket.grip.half_size_m[0], pair.plug.grip.half_size_m[0]])
-    return hands, np.maximum(width + fingers.face_offset_m - grasped.squeeze_m, 0.0)
+    touching = grip_openings(pair, sim.scene.embodiment)
+    return hands, np.maximum(touching - grasped.squeeze_m, 0.0)
 
 
 def _above_table(fingers: Fingers, pitch_rad: float, height_m: float) -> tuple[float, float]:
@@ -342,7 +344,3 @@ def _distance(start: Poses, goal: Poses) -> Array:
     turn = np.linalg.norm(rotation_vector(np.swapaxes(start.rotation, -1, -2) @ goal.rotation), axis=-1)
     return np.maximum(way, TURN_M_PER_RAD * turn).max(-1)
 
-
-def _arms(q: Array) -> Array:
-    """View joint positions (m, J) as (m, 2, J / 2)."""
-    return q.reshape(len(q), 2, -1)

@@ -7,9 +7,10 @@ import mujoco
 import numpy as np
 
 from lerobot_vtrefine.embodiments import Embodiment, get_embodiment
-from lerobot_vtrefine.sim.arms import LEFT_HAND, PLUG, RIGHT_HAND, SOCKET, TABLE, add_arm
+from lerobot_vtrefine.sim.arms import add_arms
 from lerobot_vtrefine.sim.camera import Camera, make_camera
 from lerobot_vtrefine.sim.config import SceneConfig
+from lerobot_vtrefine.sim.links import FIRST_HAND, PLUG, SECOND_HAND, SOCKET, TABLE
 from lerobot_vtrefine.sim.looks import PLUG_COLOUR, SOCKET_COLOUR, Rgba, add_looks
 from lerobot_vtrefine.sim.pairs import Part, PartPair, load_pair
 from lerobot_vtrefine.sim.profiles import Primitive
@@ -44,10 +45,10 @@ class Addresses:
     part_contact: slice
     """Contact sensor, force of the plug on the socket: found, force, torque, position; world frame."""
     pad_contacts: np.ndarray
-    """(4, 10) the same per pad, force of the pad on whatever touches it."""
+    """(P, 10) the same per pad, force of the pad on whatever touches it."""
     part_geoms: np.ndarray
     pad_geoms: np.ndarray
-    """(4,) in the order of the pads."""
+    """(P,) in the order of the pads."""
 
 
 @dataclass(frozen=True)
@@ -83,16 +84,16 @@ def build_scene(config: SceneConfig) -> Scene:
     embodiment = get_embodiment(config.embodiment)
     pair = load_pair(config)
     _warn_of_close_hands(pair, embodiment)
-    camera = make_camera(config)
+    camera = make_camera(config, embodiment)
     spec = mujoco.MjSpec()
     _set_options(spec, config)
     add_looks(spec)
     _add_table(spec, config)
-    for arm in embodiment.arms:
-        add_arm(spec, embodiment, arm, config)
-    # The right hand holds the plug and the left the socket, but either may brush against any hand.
-    _add_part(spec, "plug", pair.plug, config, PLUG, TABLE | SOCKET | LEFT_HAND | RIGHT_HAND, PLUG_COLOUR)
-    _add_part(spec, "socket", pair.socket, config, SOCKET, TABLE | LEFT_HAND | RIGHT_HAND, SOCKET_COLOUR)
+    add_arms(spec, embodiment, config)
+    # One hand holds the plug and one the socket, but either part may brush against any hand.
+    around = TABLE | FIRST_HAND | SECOND_HAND
+    _add_part(spec, "plug", pair.plug, config, PLUG, around | SOCKET, PLUG_COLOUR)
+    _add_part(spec, "socket", pair.socket, config, SOCKET, around, SOCKET_COLOUR)
     _add_camera(spec, camera)
     _add_sensors(spec, embodiment)
     model = spec.compile()
@@ -114,7 +115,7 @@ def _warn_of_close_hands(pair: PartPair, embodiment: Embodiment) -> None:
 
 
 def build_arms(config: SceneConfig) -> tuple[mujoco.MjModel, Embodiment, np.ndarray]:
-    """Both arms above the table, without parts, camera and sensors.
+    """A body's arms above the table, without parts, camera and sensors.
 
     Returns:
         The model, the embodiment, and where its joints (J,) lie in qpos.
@@ -124,8 +125,7 @@ def build_arms(config: SceneConfig) -> tuple[mujoco.MjModel, Embodiment, np.ndar
     _set_options(spec, config)
     add_looks(spec)
     _add_table(spec, config)
-    for arm in embodiment.arms:
-        add_arm(spec, embodiment, arm, config)
+    add_arms(spec, embodiment, config)
     model = spec.compile()
     joints = np.array([int(model.joint(name).qposadr[0]) for name in embodiment.joint_names])
     return model, embodiment, joints

@@ -1,7 +1,7 @@
 """The task as pure functions on arrays: servo commands, insertion geometry, success, in-hand shift, forces.
 
-Shapes: m worlds. Poses are (position (m, 3) [m], rotation (m, 3, 3)) in the world frame. Hands are ordered
-left, right; the left hand holds the socket, the right one the plug.
+Shapes: m worlds. Poses are (position (m, 3) [m], rotation (m, 3, 3)) in the world frame. Parts, and hands by
+the part that they hold, are ordered socket, plug.
 """
 
 from dataclasses import dataclass
@@ -58,23 +58,46 @@ def checked_action(action: Array, shape: tuple[int, int]) -> Array:
 
 
 def servo_commands(embodiment: Embodiment, targets: Array) -> Array:
-    """Joint targets (m, J) -> servo commands (m, nu): clamped to the limits, one opening per gripper."""
-    clamped = np.clip(targets, embodiment.lower, embodiment.upper)
-    arms = clamped.reshape(len(targets), 2, embodiment.joints_per_arm)
-    opening = (arms[..., -2:-1] - arms[..., -1:]) / 2
-    return np.concatenate([arms[..., :-2], opening], -1).reshape(len(targets), -1)
+    """Joint targets (m, J) -> servo commands (m, nu): clamped to the limits, one command per gripper."""
+    return servo_values(embodiment, np.clip(targets, embodiment.lower, embodiment.upper))
+
+
+def servo_values(embodiment: Embodiment, joints: Array) -> Array:
+    """Values per joint (m, J) -> values per servo (m, nu), the grippers' merged into one each."""
+    arms, count = embodiment.by_arm(joints), len(embodiment.joints)
+    gripper = embodiment.fingers.command(arms[..., count:])
+    return np.concatenate([arms[..., :count], gripper], -1).reshape(len(joints), -1)
 
 
 def joint_targets(embodiment: Embodiment, commands: Array) -> Array:
     """Servo commands (m, nu) -> joint targets (m, J), the inverse of `servo_commands`."""
-    arms = commands.reshape(len(commands), 2, -1)
-    return np.concatenate([arms, -arms[..., -1:]], -1).reshape(len(commands), embodiment.num_joints)
+    arms = commands.reshape(len(commands), embodiment.num_arms, -1)
+    gripper = embodiment.fingers.targets(arms[..., -1:])
+    return np.concatenate([arms[..., :-1], gripper], -1).reshape(len(commands), embodiment.num_joints)
 
 
 def rate_limits(embodiment: Embodiment, config: TaskConfig) -> Array:
     """Largest change of each servo command in one control step (nu,)."""
-    arm = [config.joint_rate] * len(embodiment.joints) + [config.finger_rate]
-    return np.array(arm * 2) * config.control_dt_s
+    gripper = embodiment.fingers.command_rate(config.finger_rate)
+    arm = [config.joint_rate] * len(embodiment.joints) + [gripper]
+    return np.array(arm * embodiment.num_arms) * config.control_dt_s
+
+
+def held_parts(embodiment: Embodiment, pad_force: Array) -> Array:
+    """(m, part) whether all pads of the hand whose part it is press on something, for forces (m, P) [N]."""
+    pressed = (pad_force > HELD_FORCE_N).reshape(len(pad_force), embodiment.num_arms, -1).all(-1)
+    nobody = np.zeros(len(pad_force), bool)
+    return np.stack([nobody if arm is None else pressed[:, arm] for arm in embodiment.holders], 1)
+
+
+def holding_hands(embodiment: Embodiment, hands: Pose) -> Pose:
+    """Poses (m, part, ...) of the hands that hold the socket and the plug, out of those of all hands (m, A,
+    ...); the world's frame for a part that no hand holds.
+    """
+    none = np.zeros_like(hands[0][:, 0]), np.broadcast_to(np.eye(3), hands[1][:, 0].shape)
+    chosen = [none if arm is None else (hands[0][:, arm], hands[1][:, arm]) for arm in embodiment.holders]
+    position, rotation = zip(*chosen, strict=True)
+    return np.stack(position, 1), np.stack(rotation, 1)
 
 
 def insertion(pair: PartPair, plug: Pose, socket: Pose, table_height_m: float) -> Insertion:
