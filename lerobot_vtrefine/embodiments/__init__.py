@@ -4,9 +4,11 @@ from lerobot_vtrefine.embodiments.aloha import ALOHA
 from lerobot_vtrefine.embodiments.camera_config import CameraConfig
 from lerobot_vtrefine.embodiments.embodiment import Arm, Embodiment, Joint
 from lerobot_vtrefine.embodiments.fingers import Fingers, FourBarFingers, Pad, SlidingFingers
+from lerobot_vtrefine.embodiments.kinova import KINOVA
 
 __all__ = [
     "ALOHA",
+    "KINOVA",
     "Arm",
     "CameraConfig",
     "Embodiment",
@@ -20,7 +22,7 @@ __all__ = [
     "register_embodiment",
 ]
 
-_EMBODIMENTS = {body.name: body for body in (ALOHA,)}
+_EMBODIMENTS = {body.name: body for body in (ALOHA, KINOVA)}
 
 
 def register_embodiment(body: Embodiment) -> None:

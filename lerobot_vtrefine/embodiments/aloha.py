@@ -122,7 +122,7 @@ JOINTS = (
 FINGER_KG = 0.0863
 
 FINGERS = SlidingFingers(
-    pad=Pad((0.06665, 0.026, 0.003)),
+    pad=Pad("{arm}_arm_{side}_finger", (0.06665, 0.026, 0.003)),
     stiffness=4000.0,
     damping=40.0,
     armature=0.243,

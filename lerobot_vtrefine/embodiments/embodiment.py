@@ -129,7 +129,7 @@ class Embodiment:
         count, opened = len(self.arms), self.fingers.joints(np.asarray(self.fingers.travel_m))
         derived = {
             "joint_names": tuple(f"{arm.name}_{joint}" for arm in self.arms for joint in per_arm),
-            "pad_names": tuple(f"{arm.name}_arm_{side}_finger" for arm in self.arms for side in self.fingers.sides),
+            "pad_names": tuple(name for arm in self.arms for name in self.fingers.pad_names(arm.name)),
             "lower": np.tile([*(joint.lower_rad for joint in self.joints), *low], count),
             "upper": np.tile([*(joint.upper_rad for joint in self.joints), *high], count),
             "home": np.concatenate([[*arm.home_rad, *opened] for arm in self.arms]),
@@ -190,6 +190,10 @@ class Embodiment:
     def openings(self, q: np.ndarray) -> np.ndarray:
         """Grippers' openings (..., A) [m] at joint positions (..., J)."""
         return self.fingers.opening(self.by_arm(q)[..., len(self.joints) :])
+
+    def set_grippers(self, q: np.ndarray, like: np.ndarray) -> None:
+        """Write the grippers' joints of `like` (..., J) into joint positions (..., J), in place."""
+        self.by_arm(q)[..., len(self.joints) :] = self.by_arm(like)[..., len(self.joints) :]
 
     def set_openings(self, q: np.ndarray, openings_m: np.ndarray) -> None:
         """Write grippers' openings (..., A) into joint positions (..., J), in place."""

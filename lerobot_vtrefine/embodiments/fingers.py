@@ -29,6 +29,10 @@ SIGNS = {"left": 1.0, "right": -1.0}
 class Pad:
     """A tactile pad; all pads of a body are alike."""
 
+    name: str
+    """Pads' names, with {arm} and {side}. Bodies differ in them, so that a policy of one body does not take
+    another one's touch for its own.
+    """
     size_m: tuple[float, float, float]
     """Extent along the finger (columns), across it (rows), and thickness."""
     layout: PadLayout = PadLayout()
@@ -74,6 +78,10 @@ class Fingers(ABC):
     def pad_size_m(self) -> tuple[float, float, float]:
         """Pad's extent along the finger, across it, and its thickness."""
         return self.pad.size_m
+
+    def pad_names(self, arm: str) -> tuple[str, ...]:
+        """(S,) names of one arm's pads."""
+        return tuple(self.pad.name.format(arm=arm, side=side) for side in self.sides)
 
     @property
     @abstractmethod

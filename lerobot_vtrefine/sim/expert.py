@@ -172,7 +172,9 @@ class ScriptedExpert:
         wanted = self._plan(ids, view)
         self._wanted.assign(ids[moving], wanted[moving])
         wanted = self._wanted[ids]
-        target, _, _ = solve_hands(self._robot, wanted.position, wanted.rotation, self._target[ids])
+        start = self._target[ids]
+        self._robot.set_grippers(start, view.q)  # whose angles decide where between swinging pads the TCP is
+        target, _, _ = solve_hands(self._robot, wanted.position, wanted.rotation, start)
         # Servos that press against a contact lack something else than those that move freely.
         self._servos.learn(ids, view.q, (self.phase[ids] != Phase.CLOSE) & ~self._entered[ids])
         command = self._servos.command(ids, self._target[ids], target)

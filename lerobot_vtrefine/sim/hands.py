@@ -107,7 +107,11 @@ def _add_swinging_finger(
     _add_hinge(knuckle, driver, -sign, (0.0, fingers.closed_rad), fingers)
     add_shape(knuckle, capsule(0.010, (0.0, 0.0, 0.0), (ahead, sign * out, 0.0), "grey"))
 
-    finger = knuckle.add_body(name=f"{arm}_{side}_finger", pos=[ahead, sign * out, 0])
+    # All joints at 0 is a state of the linkage: what the finger is turned by there is no angle of its hinge.
+    turn = list(fingers.turn_terms)
+    half = -sign * turn[0] / 2
+    rest = [np.cos(half), 0, 0, np.sin(half)]
+    finger = knuckle.add_body(name=f"{arm}_{side}_finger", pos=[ahead, sign * out, 0], quat=rest)
     pad_out, pad_ahead = fingers.pad_m
     middle = [pad_ahead / 2, sign * pad_out / 2, 0]
     _set_mass(finger, fingers.finger_kg, middle, fingers.finger_inertia, config)
@@ -121,9 +125,8 @@ def _add_swinging_finger(
     add_solid(finger, index, f"{arm}_{side}_plate", plate, [pad_ahead, back, 0], GREY)
     add_shape(finger, capsule(0.008, (0.0, 0.0, 0.0), (pad_ahead - length / 2, back, 0.0)))
 
-    turn = list(fingers.turn_terms)  # of the finger in the hand's frame; the hinge's angle is to the knuckle
-    turn[1] -= 1.0
-    _couple(spec, hinge, hinge, driver, turn, config).solimp = _STIFF
+    # The finger's turn is told in the hand's frame, the hinge's angle is to the knuckle.
+    _couple(spec, hinge, hinge, driver, [0.0, turn[1] - 1.0, *turn[2:]], config).solimp = _STIFF
     return driver
 
 
@@ -164,7 +167,8 @@ def _add_pad(
 ) -> None:
     length, width, thickness = fingers.pad_size_m
     half = [length / 2, thickness / 2, width / 2]
-    pad = add_solid(body, index, f"{arm}_arm_{side}_finger", half, centre, PAD)
+    name = fingers.pad.name.format(arm=arm, side=side)
+    pad = add_solid(body, index, name, half, centre, PAD)
     pad.priority = 1  # the pad's softness and friction hold, whatever it touches
     pad.condim = 4
     pad.friction = [config.pad_friction, 0.005, 0.0001]

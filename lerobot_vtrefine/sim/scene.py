@@ -52,6 +52,41 @@ class Addresses:
 
 
 @dataclass(frozen=True)
+class JointMap:
+    """A body's joints in qpos, and those that are none of its state but follow them: a linkage's hinges."""
+
+    qpos: np.ndarray
+    """(J,) joints in the embodiment's order."""
+    followers: tuple[tuple[int, int, tuple[float, ...]], ...]
+    """(follower, driver, coefficients of the driver's powers), each after its driver; indices into qpos."""
+
+    def write(self, qpos: np.ndarray, joints: np.ndarray) -> None:
+        """Put joint positions (m, J) into qpos (m, nq), in place."""
+        qpos[:, self.qpos] = joints
+        for follower, driver, terms in self.followers:
+            qpos[:, follower] = np.polynomial.Polynomial(terms)(qpos[:, driver])
+
+
+def map_joints(model: mujoco.MjModel, embodiment: Embodiment) -> JointMap:
+    """Where a body's joints lie in a model."""
+    own = [int(model.joint(name).id) for name in embodiment.joint_names]
+    follows = {
+        int(model.eq_obj1id[k]): (int(model.eq_obj2id[k]), tuple(model.eq_data[k, :5].tolist()))
+        for k in np.flatnonzero(model.eq_type == mujoco.mjtEq.mjEQ_JOINT)
+        if int(model.eq_obj1id[k]) not in own
+    }
+    # A chain's drivers come first: how many there are on the way to a joint of the state.
+    order = sorted(follows, key=lambda joint: _chain_length(joint, follows))
+    at = model.jnt_qposadr
+    followers = tuple((int(at[j]), int(at[follows[j][0]]), follows[j][1]) for j in order)
+    return JointMap(at[own].astype(int), followers)
+
+
+def _chain_length(joint: int, follows: dict[int, tuple[int, tuple[float, ...]]]) -> int:
+    return 1 + _chain_length(follows[joint][0], follows) if joint in follows else 0
+
+
+@dataclass(frozen=True)
 class Scene:
     """A compiled scene."""
 
@@ -62,6 +97,7 @@ class Scene:
     pair: PartPair
     camera: Camera
     addresses: Addresses
+    joints: JointMap
 
     @property
     def plug_body(self) -> int:
@@ -97,7 +133,7 @@ def build_scene(config: SceneConfig) -> Scene:
     _add_camera(spec, camera)
     _add_sensors(spec, embodiment)
     model = spec.compile()
-    return Scene(config, spec, model, embodiment, pair, camera, _addresses(model, embodiment))
+    return Scene(config, spec, model, embodiment, pair, camera, _addresses(model, embodiment), map_joints(model, embodiment))
 
 
 def _warn_of_close_hands(pair: PartPair, embodiment: Embodiment) -> None:
@@ -127,8 +163,7 @@ def build_arms(config: SceneConfig) -> tuple[mujoco.MjModel, Embodiment, np.ndar
     _add_table(spec, config)
     add_arms(spec, embodiment, config)
     model = spec.compile()
-    joints = np.array([int(model.joint(name).qposadr[0]) for name in embodiment.joint_names])
-    return model, embodiment, joints
+    return model, embodiment, map_joints(model, embodiment).qpos
 
 
 def _set_options(spec: mujoco.MjSpec, config: SceneConfig) -> None:

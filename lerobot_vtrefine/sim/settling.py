@@ -67,7 +67,7 @@ class Settler:
     def _settle_physically(self, ids: Array, start: starts.Start) -> list[_Rest]:
         at, model = self._scene.addresses, self._scene.model
         qpos = np.zeros((len(ids), model.nq))
-        qpos[:, at.qpos] = start.joints
+        self._scene.joints.write(qpos, start.joints)
         qpos[:, at.plug_qpos], qpos[:, at.socket_qpos] = start.plug, start.socket
         self._backend.write(ids, qpos, np.zeros((len(ids), model.nv)))
         command = task.servo_commands(self._scene.embodiment, start.targets)

@@ -13,11 +13,12 @@ from lerobot_vtrefine.config_errors import told_by_lerobot
 from lerobot_vtrefine.datasets import fast_reader
 from lerobot_vtrefine.datasets.features import (
     ACTION_KEY,
-    BASELINE_KEYS,
     STATE_KEY,
-    TACTILE_KEYS,
     VISUAL_KEYS,
+    baseline_keys,
+    tactile_keys,
 )
+from lerobot_vtrefine.embodiments import get_embodiment
 from lerobot_vtrefine.observation import MODALITIES, VisuoTactileConfig
 from lerobot_vtrefine.policies import checkpoint_guard
 from lerobot_vtrefine.policies.vt_dp3.denoisers import DENOISERS
@@ -238,7 +239,8 @@ class VtDp3Config(PreTrainedConfig):
     @property
     def required_keys(self) -> tuple[str, ...]:
         """Observation columns that the chosen modalities need."""
-        tactile = () if self.modalities == "visual" else (*TACTILE_KEYS, *BASELINE_KEYS)
+        body = get_embodiment(self.observation.embodiment)
+        tactile = () if self.modalities == "visual" else (*tactile_keys(body), *baseline_keys(body))
         visual = () if self.modalities == "tactile" else VISUAL_KEYS
         return (STATE_KEY, *tactile, *visual)
 
