@@ -93,7 +93,7 @@ def record(config: RecordDemosConfig) -> None:
         config.repo_id,
         env.fps,
         features,
-        robot.robot_type,
+        robot,
         env.task or "",
         config.settings(),
         config.seed,

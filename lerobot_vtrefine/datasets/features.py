@@ -108,7 +108,10 @@ def columns(body: Embodiment) -> tuple[Column, ...]:
     return (
         Column(STATE_KEY, "state", "float32", (body.num_joints,)),
         *(Column(key, "tactile", "uint8", taxels, pad) for pad, key in enumerate(tactile_keys(body))),
-        *(Column(key, "tactile_baseline", "uint8", taxels, pad) for pad, key in enumerate(baseline_keys(body))),
+        *(
+            Column(key, "tactile_baseline", "uint8", taxels, pad)
+            for pad, key in enumerate(baseline_keys(body))
+        ),
         Column(AGE_KEY, "tactile_age", "float32", (len(body.pad_names),)),
         Column(INTRINSICS_KEY, "camera_intrinsics", "float32", (4,)),
         Column(CAMERA_POSE_KEY, "camera_pose", "float32", (7,)),

@@ -5,6 +5,7 @@ from lerobot_vtrefine.embodiments.camera_config import CameraConfig
 from lerobot_vtrefine.embodiments.embodiment import Arm, Embodiment, Joint
 from lerobot_vtrefine.embodiments.fingers import Fingers, FourBarFingers, Pad, SlidingFingers
 from lerobot_vtrefine.embodiments.kinova import KINOVA
+from lerobot_vtrefine.tactile.layout import PadLayout
 
 __all__ = [
     "ALOHA",
@@ -19,6 +20,7 @@ __all__ = [
     "SlidingFingers",
     "embodiment_of",
     "get_embodiment",
+    "pad_layout_of",
     "register_embodiment",
 ]
 
@@ -46,7 +48,13 @@ def get_embodiment(name: str) -> Embodiment:
     return _EMBODIMENTS[name]
 
 
+def pad_layout_of(pad: str) -> PadLayout:
+    """The taxels of the pad of this name; FlexiTac's standard layout where no known body has it."""
+    found = (body.pad_layout for body in _EMBODIMENTS.values() if pad in body.pad_names)
+    return next(found, PadLayout())
+
+
 def embodiment_of(joints: tuple[str, ...]) -> Embodiment | None:
-    """The body that has all these joints, by their names with or without LeRobot's ".pos"; None if none has."""
+    """The body that has all these joints, with or without LeRobot's ".pos"; None if none has."""
     names = {name.removesuffix(".pos") for name in joints}
     return next((body for body in _EMBODIMENTS.values() if names and names <= set(body.joint_names)), None)

@@ -118,7 +118,9 @@ class Embodiment:
     def __post_init__(self) -> None:
         held = tuple(arm.holds for arm in self.arms)
         if held not in (PARTS, PARTS[:1], PARTS[1:]):
-            raise ValueError(f"{self.name}: its arms hold {', '.join(held)}; they must hold socket, then plug")
+            raise ValueError(
+                f"{self.name}: its arms hold {', '.join(held)}; they must hold socket, then plug"
+            )
         if set(self.cameras) != set(STARTS):
             raise ValueError(f"{self.name} needs a camera for each start: {', '.join(STARTS)}")
         for arm in self.arms:
@@ -198,6 +200,12 @@ class Embodiment:
     def set_openings(self, q: np.ndarray, openings_m: np.ndarray) -> None:
         """Write grippers' openings (..., A) into joint positions (..., J), in place."""
         self.by_arm(q)[..., len(self.joints) :] = self.fingers.joints(openings_m)
+
+    @property
+    def tcp_offset_m(self) -> float:
+        """TCP's distance from the last revolute joint with closed gripper, along the hand's x."""
+        closed = self.fingers.joints(np.asarray(0.0))
+        return float(self.fingers.reach_m(torch.as_tensor(closed)))
 
     def hands(self, q: Tensor) -> kinematics.Hands:
         """All arms at joint positions q (..., J) [rad, m], for whoever asks for more than one of what

@@ -35,7 +35,7 @@ class Pad:
     """
     size_m: tuple[float, float, float]
     """Extent along the finger (columns), across it (rows), and thickness."""
-    layout: PadLayout = PadLayout()
+    layout: PadLayout = field(default_factory=PadLayout)
     """Rows, columns and pitch of the taxels, which lie centred on the face."""
 
 
@@ -277,8 +277,10 @@ class FourBarFingers(Fingers):
 
         `driver_rad` (n,) must rise in small steps: each follows from the one before.
         """
-        crank = np.linalg.norm(np.add(np.add(self.driver_axis_m, self.knuckle_m), self.inner_hinge_m)
-                               - np.asarray(self.inner_axis_m))
+        crank = np.linalg.norm(
+            np.add(np.add(self.driver_axis_m, self.knuckle_m), self.inner_hinge_m)
+            - np.asarray(self.inner_axis_m)
+        )
         hinge, at_rest = np.hypot(*self.inner_hinge_m), np.arctan2(*self.inner_hinge_m[::-1])
         turns = [0.0]
         for angle in driver_rad:
@@ -365,7 +367,9 @@ class FourBarFingers(Fingers):
     def faces(self, joints: Tensor) -> Faces:
         signs = joints.new_tensor([SIGNS[side] for side in self.sides])
         _, y, turn, x_rate, y_rate, turn_rate = self._face(joints)  # (..., A, 1) each
-        return Faces(None, signs * y, -signs * turn, x_rate.expand_as(signs * y), signs * y_rate, -signs * turn_rate)
+        return Faces(
+            None, signs * y, -signs * turn, x_rate.expand_as(signs * y), signs * y_rate, -signs * turn_rate
+        )
 
     def _face(self, angle: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor, Tensor]:
         """Face's x and distance from the middle, its turn towards the middle, and their rates; all like

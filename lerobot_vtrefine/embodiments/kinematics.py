@@ -79,7 +79,10 @@ class Hands:
         linear = torch.linalg.cross(spins.expand_as(arms_lever), arms_lever).sum(-2)
         angular = spins.sum(-2).expand_as(linear)
         x, y, z = self.rotation.unsqueeze(-3).unbind(-1)
-        faces, driven = body.fingers.faces(self._grippers), rates[..., [count + k for k in body.fingers.drivers]]
+        faces, driven = (
+            body.fingers.faces(self._grippers),
+            rates[..., [count + k for k in body.fingers.drivers]],
+        )
         linear = linear + (driven if faces.y_rate is None else driven * faces.y_rate)[..., None] * y
         if faces.x_rate is not None:
             linear = linear + (driven * faces.x_rate)[..., None] * x

@@ -31,8 +31,8 @@ class VtRefineVectorEnv(gym.vector.VectorEnv[Observation, Array, Array]):
     - ``info["is_success"]`` is (n,) bool; ``info["final_info"]`` appears in steps in which an episode ends
       and holds the same plus how finished episodes went: ``failure`` (n,) str names the reason, see
       ``Episodes.summary``.
-    - With ``--env.shear.on=true``, ``info["shear"]`` is (n, pads, taxels, 2) float32: tangential force per taxel
-      [N], of every control step.
+    - With ``--env.shear.on=true``, ``info["shear"]`` is (n, pads, taxels, 2) float32: tangential force per
+      taxel [N], of every control step.
     - Observations are those of ``datasets.features.env_observation_shapes`` with a leading ``n``.
     """
 

@@ -16,9 +16,7 @@ def add_arms(spec: mujoco.MjSpec, embodiment: Embodiment, config: SceneConfig) -
         _add_arm(spec, embodiment, arm, index, config)
 
 
-def _add_arm(
-    spec: mujoco.MjSpec, embodiment: Embodiment, arm: Arm, index: int, config: SceneConfig
-) -> None:
+def _add_arm(spec: mujoco.MjSpec, embodiment: Embodiment, arm: Arm, index: int, config: SceneConfig) -> None:
     base = spec.worldbody.add_body(name=f"{arm.name}_base", pos=arm.base_pos_m, quat=_base_quat(arm))
     for shape in embodiment.base:
         add_shape(base, shape)

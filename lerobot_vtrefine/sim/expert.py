@@ -345,4 +345,3 @@ def _distance(start: Poses, goal: Poses) -> Array:
     way = np.linalg.norm(goal.position - start.position, axis=-1)
     turn = np.linalg.norm(rotation_vector(np.swapaxes(start.rotation, -1, -2) @ goal.rotation), axis=-1)
     return np.maximum(way, TURN_M_PER_RAD * turn).max(-1)
-

@@ -30,7 +30,9 @@ def add_hand(
         shares = [sign / len(joints) for sign in fingers.signs]
         ratio = -1.0
     elif isinstance(fingers, FourBarFingers):
-        joints = [_add_swinging_finger(spec, hand, fingers, arm, index, side, config) for side in fingers.sides]
+        joints = [
+            _add_swinging_finger(spec, hand, fingers, arm, index, side, config) for side in fingers.sides
+        ]
         shares = [1.0 / len(joints)] * len(joints)
         ratio = 1.0
     else:

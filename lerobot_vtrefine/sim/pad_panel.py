@@ -62,7 +62,9 @@ def pad_panel(
     for name, reading, idle in zip(names, counts, baseline, strict=True):
         above = np.clip(reading.astype(float) - idle, 0, None)
         draw.text((_GAP_PX, top), f"{_label(name)}   sum {above.sum():.0f}", fill=_INK)
-        image.paste(Image.fromarray(_heat_map(above.reshape(layout.rows, layout.cols))), (_GAP_PX, top + _TEXT_PX))
+        image.paste(
+            Image.fromarray(_heat_map(above.reshape(layout.rows, layout.cols))), (_GAP_PX, top + _TEXT_PX)
+        )
         top += layout.rows * _TAXEL_PX + _TEXT_PX + _GAP_PX
     return np.asarray(image)
 

@@ -133,7 +133,16 @@ def build_scene(config: SceneConfig) -> Scene:
     _add_camera(spec, camera)
     _add_sensors(spec, embodiment)
     model = spec.compile()
-    return Scene(config, spec, model, embodiment, pair, camera, _addresses(model, embodiment), map_joints(model, embodiment))
+    return Scene(
+        config,
+        spec,
+        model,
+        embodiment,
+        pair,
+        camera,
+        _addresses(model, embodiment),
+        map_joints(model, embodiment),
+    )
 
 
 def _warn_of_close_hands(pair: PartPair, embodiment: Embodiment) -> None:

@@ -31,6 +31,7 @@ if TYPE_CHECKING:
 
 Array = np.ndarray
 
+
 def held_bodies(embodiment: Embodiment) -> tuple[int, ...]:
     """What each pad holds, of (plug, socket): (P,) indices."""
     return tuple(
@@ -216,7 +217,9 @@ def pad_layout(embodiment: Embodiment) -> PadLayout:
     faces = [(0, 1, 3), (0, 3, 2), (4, 6, 7), (4, 7, 5), (0, 4, 5), (0, 5, 1)]
     faces += [(2, 3, 7), (2, 7, 6), (0, 2, 6), (0, 6, 4), (1, 5, 7), (1, 7, 3)]
     wanted, outward = embodiment.pad_layout, np.array([0.0, 0.0, 1.0])
-    return layout_from_mesh(vertices, np.array(faces), wanted.rows, wanted.cols, wanted.pitch_m, outward=outward)
+    return layout_from_mesh(
+        vertices, np.array(faces), wanted.rows, wanted.cols, wanted.pitch_m, outward=outward
+    )
 
 
 def _touch_geometry(part: Part) -> BodyGeometry:

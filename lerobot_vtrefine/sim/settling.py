@@ -51,7 +51,9 @@ class Settler:
         if len(rests):
             self._backend.set_rows(ids, np.stack([rest.row for rest in rests]))
         command = np.reshape([rest.command for rest in rests], (len(ids), -1))
-        return command, np.reshape([rest.pad_load for rest in rests], (len(ids), len(self._scene.embodiment.pad_names), LOAD_SIZE))
+        return command, np.reshape(
+            [rest.pad_load for rest in rests], (len(ids), len(self._scene.embodiment.pad_names), LOAD_SIZE)
+        )
 
     def _rests(self, ids: Array, seeds: Array) -> list[_Rest]:
         known = [self._settled.get(int(seed)) for seed in seeds]

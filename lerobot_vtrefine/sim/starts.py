@@ -133,9 +133,7 @@ def _ideal_places(config: GraspedStart, pair: PartPair) -> tuple[Array, Array]:
     return mouth + config.plug_height_m * up, socket_at
 
 
-def _nominal_joints(
-    config: GraspedStart, pair: PartPair, embodiment: Embodiment, openings: Array
-) -> Array:
+def _nominal_joints(config: GraspedStart, pair: PartPair, embodiment: Embodiment, openings: Array) -> Array:
     """Joint positions of the ideal start, found from home: what the jittered ones are solved from."""
     plug_at, socket_at = _ideal_places(config, pair)
     left = ideal_hand(pair.socket, np.pi / 2, config.left_pitch_rad)

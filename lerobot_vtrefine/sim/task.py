@@ -85,7 +85,7 @@ def rate_limits(embodiment: Embodiment, config: TaskConfig) -> Array:
 
 def held_parts(embodiment: Embodiment, pad_force: Array) -> Array:
     """(m, part) whether all pads of the hand whose part it is press on something, for forces (m, P) [N]."""
-    pressed = (pad_force > HELD_FORCE_N).reshape(len(pad_force), embodiment.num_arms, -1).all(-1)
+    pressed = np.all((pad_force > HELD_FORCE_N).reshape(len(pad_force), embodiment.num_arms, -1), axis=-1)
     nobody = np.zeros(len(pad_force), bool)
     return np.stack([nobody if arm is None else pressed[:, arm] for arm in embodiment.holders], 1)
 

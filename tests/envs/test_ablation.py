@@ -6,8 +6,8 @@ from fake_sim import HEIGHT, WIDTH, FakeSim
 from lerobot.datasets import LeRobotDataset
 
 from lerobot_vtrefine.datasets.features import BASELINE_KEYS, DEPTH_KEY, TACTILE_KEYS
-from lerobot_vtrefine.envs import ablation
 from lerobot_vtrefine.embodiments import ALOHA
+from lerobot_vtrefine.envs import ablation
 from lerobot_vtrefine.envs.ablation import make_ablation, mean_frame
 from lerobot_vtrefine.envs.episodes import Episodes
 
@@ -61,7 +61,9 @@ def test_touch_ablation_hides_the_idle_level(monkeypatch):
     }
     monkeypatch.setattr(ablation, "mean_frame", lambda root, keys: {key: means[key] for key in keys})
     baseline = np.stack([np.full((4, 384), level, np.uint8) for level in (10, 40)])
-    raw = make_ablation("touch", Path("somewhere"), ALOHA)({"tactile": baseline + 50, "tactile_baseline": baseline})
+    raw = make_ablation("touch", Path("somewhere"), ALOHA)(
+        {"tactile": baseline + 50, "tactile_baseline": baseline}
+    )
     assert np.array_equal(raw["tactile"] - baseline, np.full((2, 4, 384), 5))
     assert raw["tactile"].dtype == np.uint8
 
