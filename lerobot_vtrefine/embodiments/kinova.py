@@ -2,13 +2,13 @@
 FlexiTac pads on all four fingers, and a depth camera at the head.
 
 Sources: link offsets, axes, limits, masses, inertias and servo gains of the arm are those of MuJoCo
-Menagerie's `kinova_gen3` (BSD-3-Clause), turned into frames whose x runs along the stretched arm; products of
-inertia are left out. The gripper's hinges and its 27 x 65 mm pads are those of ROS-Industrial's description of
-the 2F-140 (BSD), the inner knuckle's hinge with the finger and the masses those of a 2F-140 proposed to
-Menagerie (pull request 161). Robotiq's manual gives 10 to 125 N for its grip. Springs and the fingers'
-adaptive fold are left out. The paper does not say where its arms stand: shoulders, head and rest pose here are
-this project's choice. The gripper's stiffness is chosen as ALOHA's: a command 10 mm below the part's width
-presses with 20 N per pad.
+Menagerie's `kinova_gen3` (BSD-3-Clause), turned into frames whose x runs along the stretched arm; products
+of inertia are left out. The gripper's hinges and its 27 x 65 mm pads are those of ROS-Industrial's
+description of the 2F-140 (BSD), the inner knuckle's hinge with the finger and the masses those of a 2F-140
+proposed to Menagerie (pull request 161). Robotiq's manual gives 10 to 125 N for its grip. Springs and the
+fingers' adaptive fold are left out. The paper does not say where its arms stand: shoulders, head and rest
+pose here are this project's choice. The gripper's stiffness is chosen as ALOHA's: a command 10 mm below the
+part's width presses with 20 N per pad.
 """
 
 import math

@@ -42,7 +42,6 @@ from lerobot_vtrefine.policies.vt_dp3.modeling_vt_dp3 import VtDp3Policy
 from lerobot_vtrefine.policies.vt_dp3.processor_vt_dp3 import make_vt_dp3_pre_post_processors
 from lerobot_vtrefine.sim.config import SceneConfig
 from lerobot_vtrefine.sim.expert import ScriptedExpert
-from lerobot_vtrefine.sim.reality import load_reality
 from lerobot_vtrefine.sim.simulation import InsertionSim
 from lerobot_vtrefine.sim.starts import Start
 from lerobot_vtrefine.tactile.layout import PadLayout
@@ -87,7 +86,7 @@ TOY = Embodiment(
 register_embodiment(TOY)
 
 FRAMES = 40
-FAULT_RAD = 0.05
+PLAY_RAD = 0.04
 TOUCHES = ("observation.tactile.only_skin", "observation.tactile_baseline.only_skin")
 
 
@@ -106,10 +105,10 @@ def commands(episode: int) -> np.ndarray:
 
 @pytest.fixture(scope="module")
 def faulty(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A reality file: one encoder of the toy reads too much."""
+    """A reality file: the upright axis has play, and no servo carries the arm's weight."""
     path = tmp_path_factory.mktemp("toy") / "reality.json"
-    robot = {"encoder_offset_rad": {"only_alpha": FAULT_RAD}}
-    path.write_text(json.dumps({"schema": "vtrefine/reality@1", "robot": robot}))
+    hidden = {"robot": {"backlash_rad": {"only_alpha": PLAY_RAD}}, "scene": {"gravity_compensation": False}}
+    path.write_text(json.dumps({"schema": "vtrefine/reality@1", **hidden}))
     return path
 
 
@@ -245,14 +244,19 @@ def test_replay_reproduces_its_recording(dataset: Path) -> None:
     assert max(row.peak for row in comparison.tracking) == 0.0
 
 
-def test_diagnosis_finds_its_encoders_offset(faulty: Path, tmp_path: Path) -> None:
-    assert load_reality(faulty).robot.encoder_offset_rad == {"only_alpha": FAULT_RAD}
+def test_diagnosis_finds_its_play_and_its_weight(faulty: Path, tmp_path: Path) -> None:
+    """Which joints gravity pulls at, and how much, is the body's knowledge: their names do not tell."""
     root = record(tmp_path / "faulty", environment(faulty), 8)
     options = diagnose_command.make_parser().parse_args([f"--dataset.root={root}", "--output_dir=unused"])
     found = diagnose_robot(diagnose_command.read(options), seed=0)
-    assert [cause.name for cause in found.causes] == ["encoder_offset"]
-    (value,) = found.causes[0].params.values()
-    assert value.value == pytest.approx(FAULT_RAD, rel=0.15)
+    params = {cause.name: {key: item.value for key, item in cause.params.items()} for cause in found.causes}
+    assert set(params) == {"backlash", "gravity_sag"}
+    assert params["backlash"] == pytest.approx({"only_alpha_rad": PLAY_RAD}, rel=0.05)
+    # Weights [kg] times levers [m] of the stretched arm: forearm and finger, then upper arm as well.
+    forearm, stiffness, g = 0.5 * 0.1 + 0.05 * 0.23, 60.0, 9.81
+    both = 0.5 * 0.1 + 0.5 * 0.3 + 0.05 * 0.43
+    sag = {"only_beta_rad": both * g / stiffness, "only_gamma_rad": forearm * g / stiffness}
+    assert params["gravity_sag"] == pytest.approx(sag, rel=0.03)
 
 
 def test_bodies_differ_in_the_names_of_their_pads() -> None:
