@@ -1,5 +1,7 @@
 """What a robot is: joints, link constants, servo gains, where its pads sit, and its kinematics."""
 
+from collections.abc import Collection
+
 from lerobot_vtrefine.embodiments.aloha import ALOHA
 from lerobot_vtrefine.embodiments.camera_config import CameraConfig
 from lerobot_vtrefine.embodiments.embodiment import Arm, Embodiment, Joint
@@ -19,6 +21,7 @@ __all__ = [
     "Pad",
     "SlidingFingers",
     "embodiment_of",
+    "embodiment_with_pads",
     "get_embodiment",
     "pad_layout_of",
     "register_embodiment",
@@ -52,6 +55,11 @@ def pad_layout_of(pad: str) -> PadLayout:
     """The taxels of the pad of this name; FlexiTac's standard layout where no known body has it."""
     found = (body.pad_layout for body in _EMBODIMENTS.values() if pad in body.pad_names)
     return next(found, PadLayout())
+
+
+def embodiment_with_pads(pads: Collection[str]) -> Embodiment | None:
+    """The body whose pads all have names among these; None if none is known."""
+    return next((body for body in _EMBODIMENTS.values() if set(body.pad_names) <= set(pads)), None)
 
 
 def embodiment_of(joints: tuple[str, ...]) -> Embodiment | None:

@@ -1,4 +1,4 @@
-"""ALOHA is what it was before other bodies came; the Kinova is the linkage and the arm that its sources say."""
+"""ALOHA is what it was before other bodies came; the Kinova is the arm and the linkage of its sources."""
 
 from dataclasses import replace
 
@@ -6,9 +6,11 @@ import mujoco
 import numpy as np
 import pytest
 import torch
+from lerobot.configs import FeatureType, PolicyFeature
 
-from lerobot_vtrefine.datasets.features import dataset_features
+from lerobot_vtrefine.datasets.features import ACTION_KEY, STATE_KEY, dataset_features, raw_keys
 from lerobot_vtrefine.embodiments import ALOHA, KINOVA, get_embodiment, register_embodiment
+from lerobot_vtrefine.policies.vt_dp3.configuration_vt_dp3 import VtDp3Config
 from lerobot_vtrefine.sim.config import SceneConfig
 from lerobot_vtrefine.sim.scene import build_scene
 from lerobot_vtrefine.sim.simulation import InsertionSim
@@ -113,7 +115,7 @@ def test_four_bar_closes_and_turns_its_pads() -> None:
         cos, sin = np.cos(angle), np.sin(angle)
         end = np.add(fingers.driver_axis_m, (out * cos - ahead * sin, out * sin + ahead * cos))
         x, y = fingers.inner_hinge_m
-        hinge = end + (x * np.cos(turned) - y * np.sin(turned), x * np.sin(turned) + y * np.cos(turned))
+        hinge = end + np.array([[np.cos(turned), -np.sin(turned)], [np.sin(turned), np.cos(turned)]]) @ (x, y)
         lengths.append(np.linalg.norm(hinge - fingers.inner_axis_m))
     np.testing.assert_allclose(lengths, lengths[0], atol=1e-9)
     assert np.degrees(turn[0] - turn[-1]) == pytest.approx(2.05, abs=0.02)
@@ -156,3 +158,14 @@ def test_names_are_taken_once() -> None:
         register_embodiment(replace(KINOVA, name="aloha"))
     with pytest.raises(ValueError, match="unknown embodiment 'ur5': use one of aloha, kinova"):
         get_embodiment("ur5")
+
+
+def test_a_policy_says_whose_data_it_was_given() -> None:
+    config = VtDp3Config(preset="small", device="cpu")
+    for key in (STATE_KEY, *raw_keys(KINOVA)):
+        config.input_features[key] = PolicyFeature(FeatureType.STATE, (4,))
+    config.output_features = {ACTION_KEY: PolicyFeature(FeatureType.ACTION, (KINOVA.num_joints,))}
+    with pytest.raises(ValueError, match=r"is of kinova: set --policy\.observation\.embodiment=kinova"):
+        config.validate_features()
+    config.observation = replace(config.observation, embodiment="kinova")
+    config.validate_features()
