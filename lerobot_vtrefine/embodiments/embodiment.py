@@ -94,9 +94,12 @@ class Arm:
         return yaw @ pitch @ np.array([[1.0, 0.0, 0.0], [0.0, cos, -sin], [0.0, sin, cos]])
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Embodiment:
-    """A robot with one or two equal arms, each with a gripper that carries a pad on every finger."""
+    """A robot with one or two equal arms, each with a gripper that carries a pad on every finger.
+
+    Bodies are told apart by identity: there is one object of each.
+    """
 
     name: str
     robot_type: str
@@ -107,13 +110,13 @@ class Embodiment:
     fingers: Fingers
     base: tuple[Shape, ...]
     """What an arm stands on, in the base's frame."""
-    cameras: Mapping[str, CameraConfig] = field(hash=False)
+    cameras: Mapping[str, CameraConfig]
     """The depth camera's set-up for each start of an episode."""
     joint_names: tuple[str, ...] = field(init=False)
     pad_names: tuple[str, ...] = field(init=False)
-    lower: np.ndarray = field(init=False, repr=False, compare=False)
-    upper: np.ndarray = field(init=False, repr=False, compare=False)
-    home: np.ndarray = field(init=False, repr=False, compare=False)
+    lower: np.ndarray = field(init=False, repr=False)
+    upper: np.ndarray = field(init=False, repr=False)
+    home: np.ndarray = field(init=False, repr=False)
 
     def __post_init__(self) -> None:
         held = tuple(arm.holds for arm in self.arms)

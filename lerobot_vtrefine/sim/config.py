@@ -10,6 +10,7 @@ from lerobot_vtrefine.embodiments.embodiment import STARTS
 PROCEDURAL_PAIRS = ("round", "square", "hexagon", "d_shape", "cross", "key")
 MESH_PAIR_PREFIX = "automate/"
 MAX_TABLE_HEIGHT_M = 0.2
+SOCKETS = ("held", "stands")
 BACKENDS = ("single", "batch", "warp")
 
 
@@ -25,6 +26,8 @@ class SceneConfig:
     """Above 0 the hole is this much *smaller* than the plug (diametral): a check that must never succeed."""
     start: str = "table"
     """table: both parts stand on the table. grasped: both are in hand."""
+    socket: str = "held"
+    """held: a hand lifts the socket, and the plug is inserted in air. stands: the socket stays on the table."""
     embodiment: str = "aloha"
     """The robot, see `embodiments`."""
     table_height_m: float = 0.0
@@ -52,6 +55,9 @@ class SceneConfig:
 
     def __post_init__(self) -> None:
         _check_choice("start", self.start, STARTS)
+        _check_choice("socket", self.socket, SOCKETS)
+        if self.socket == "stands" and self.start != "table":
+            raise ValueError(f"socket=stands needs start=table, not start={self.start}")
         if not 0.0 < self.timestep_s <= 0.005:
             raise ValueError(f"timestep_s must lie in (0, 0.005] s, got {self.timestep_s}")
         if not self.clearance_m > 0.0:

@@ -7,10 +7,10 @@ from dataclasses import dataclass, fields, replace
 
 import numpy as np
 
-from lerobot_vtrefine.embodiments import Embodiment
 from lerobot_vtrefine.sim import task
 from lerobot_vtrefine.sim.backends.base import LOAD_SIZE
 from lerobot_vtrefine.sim.config import LimitsConfig, SuccessConfig, TaskConfig
+from lerobot_vtrefine.sim.scene import Scene
 from lerobot_vtrefine.sim.substeps import Substeps
 
 Array = np.ndarray
@@ -153,9 +153,7 @@ def _without(values: Array, bad: Array) -> Array:
     return np.where(bad.reshape(-1, *[1] * (values.ndim - 1)), 0.0, values)
 
 
-def update(
-    state: EpisodeState, ids: Array, seen: Measured, config: TaskConfig, embodiment: Embodiment
-) -> Array:
+def update(state: EpisodeState, ids: Array, seen: Measured, config: TaskConfig, scene: Scene) -> Array:
     """Advance the episodes of `ids` by one control step.
 
     Returns:
@@ -166,7 +164,7 @@ def update(
     _update_forces(state, ids, seen)
     state.rim_slide[ids] += seen.substeps.rim_slide
     state.tip[ids] = seen.substeps.tip
-    _update_grasp(state, ids, seen, embodiment)
+    _update_grasp(state, ids, seen, scene)
     fresh = _update_success(state, ids, seen, config.success, config.control_dt_s)
     _update_failure(state, ids, seen, config.limits, config.control_dt_s)
     state.done[ids] |= state.success[ids] | (state.failure[ids] != task.NO_FAILURE)
@@ -181,12 +179,13 @@ def _update_forces(state: EpisodeState, ids: Array, seen: Measured) -> None:
     state.pad_load[ids], state.pad_force[ids] = seen.pad_load, seen.pad_load[..., 0]
 
 
-def _update_grasp(state: EpisodeState, ids: Array, seen: Measured, embodiment: Embodiment) -> None:
+def _update_grasp(state: EpisodeState, ids: Array, seen: Measured, scene: Scene) -> None:
     """Take each part's reference once its own hand has held it long enough; a part set down again loses it.
 
     From then on the shift counts, also while the part is being lifted: starts in hand begin with a reference.
     """
-    held, lifted = task.held_parts(embodiment, state.pad_force[ids]), seen.part_heights > LIFT_M
+    held = task.held_parts(scene.holders, scene.embodiment.num_arms, state.pad_force[ids])
+    lifted = seen.part_heights > LIFT_M
     state.held_steps[ids] = np.where(held, state.held_steps[ids] + 1, 0)
     state.unheld_steps[ids] = np.where(held | ~lifted, 0, state.unheld_steps[ids] + 1)
     grasped = state.grasped[ids]

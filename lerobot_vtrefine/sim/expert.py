@@ -130,6 +130,7 @@ class ScriptedExpert:
         self._pair = sim.scene.pair
         self._hz = sim.config.control_hz
         self._from_table = sim.scene.config.start == "table"
+        self._stands = sim.scene.config.socket == "stands"
         self._grasp, self._grip_m = _grasps(sim)
         self._stations = _stations(sim)
         count = sim.num_envs
@@ -217,7 +218,12 @@ class ScriptedExpert:
             self._height_m[ids] = self._pair.mouth_z_m + STANDOFF_M
         if phase == Phase.CLOSE:
             self._opening[ids] = self._grip_m
-        self._goal.assign(ids, self._destination(ids, phase, view))
+        goal = self._destination(ids, phase, view)
+        if self._stands:  # the hand that would hold the socket rests, open
+            self._opening[ids, LEFT] = self._robot.fingers.travel_m
+            rest = self._wanted[ids]
+            goal.position[:, LEFT], goal.rotation[:, LEFT] = rest.position[:, LEFT], rest.rotation[:, LEFT]
+        self._goal.assign(ids, goal)
         way = _distance(self._start[ids], self._goal[ids])
         if phase == Phase.INSERT:
             way = self._height_m[ids] - self._pair.seated_z_m
@@ -231,16 +237,26 @@ class ScriptedExpert:
             back = RETREAT_M if phase == Phase.REACH else 0.0
             offset = np.stack([along - back, np.zeros_like(along), across], -1)
             return view.parts @ self._grasp @ Poses.from_vectors(offset, np.zeros(3))
-        if phase == Phase.LIFT:
-            raised = view.parts.position.copy()
-            raised[..., 2] = self._stations.position[:, 2]
-            return Poses(raised, view.parts.rotation) @ self._held[ids]
-        if phase == Phase.CARRY:
-            return self._stations @ self._held[ids]
+        if phase in (Phase.LIFT, Phase.CARRY):
+            stations = self._stations_now(view)
+            if phase == Phase.LIFT:
+                raised = view.parts.position.copy()
+                raised[..., 2] = stations.position[..., 2]
+                stations = Poses(raised, view.parts.rotation)
+            return stations @ self._held[ids]
         goal = self._wanted[ids]
         if phase == Phase.ALIGN:
             goal.position[:, RIGHT] = self._aligned(ids, view).position
         return goal
+
+    def _stations_now(self, view: View) -> Poses:
+        """Where parts are brought before they are aligned (m, 2): above a socket that stands, the plug."""
+        stations = self._stations @ Poses.identity(len(view.q), 2)
+        if self._stands:
+            above = Poses.from_vectors(np.array([0.0, 0.0, self._pair.mouth_z_m + CARRY_M]), np.zeros(3))
+            plug = view.parts[:, LEFT] @ above
+            stations.position[:, RIGHT], stations.rotation[:, RIGHT] = plug.position, plug.rotation
+        return stations
 
     def _plan(self, ids: Ids, view: View) -> Poses:
         """Hand poses (m, 2) wanted in this control step."""

@@ -12,7 +12,7 @@ from lerobot_vtrefine.sim.looks import DARK, GREY, PAD
 
 PLATE_M = 0.004
 """Half thickness of the plate that carries a pad."""
-_STIFF = (0.99, 0.999, 0.001, 0.5, 2.0)
+_STIFF = (0.999, 0.9999, 0.001, 0.5, 2.0)
 """solimp of couplings that stand for steel."""
 
 

@@ -100,6 +100,12 @@ class Scene:
     joints: JointMap
 
     @property
+    def holders(self) -> tuple[int | None, int | None]:
+        """Which arm takes the socket and which the plug; None for a part that no arm takes."""
+        socket, plug = self.embodiment.holders
+        return (None if self.config.socket == "stands" else socket), plug
+
+    @property
     def plug_body(self) -> int:
         """Body id of the plug."""
         return self.model.body("plug").id
@@ -119,7 +125,8 @@ def build_scene(config: SceneConfig) -> Scene:
     """
     embodiment = get_embodiment(config.embodiment)
     pair = load_pair(config)
-    _warn_of_close_hands(pair, embodiment)
+    if config.socket == "held":
+        _warn_of_close_hands(pair, embodiment)
     camera = make_camera(config, embodiment)
     spec = mujoco.MjSpec()
     _set_options(spec, config)
@@ -182,6 +189,9 @@ def _set_options(spec: mujoco.MjSpec, config: SceneConfig) -> None:
     spec.option.integrator = mujoco.mjtIntegrator.mjINT_IMPLICITFAST
     spec.option.cone = mujoco.mjtCone.mjCONE_ELLIPTIC
     spec.option.impratio = 10.0
+    # MuJoCo takes dense matrices for so few joints anyway; mujoco_warp would not beyond 32 velocities, and
+    # the warp backend's kernels read dense ones.
+    spec.option.jacobian = mujoco.mjtJacobian.mjJAC_DENSE
     # Solver iterations stay at their defaults: fewer make this scene explode.
 
 

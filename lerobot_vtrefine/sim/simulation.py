@@ -93,8 +93,8 @@ class InsertionSim:
     ) -> None:
         if num_envs < 1:
             raise ValueError(f"num_envs must be at least 1, got {num_envs}")
-        self.config = task_config or TaskConfig()
         self.scene: Scene = build_scene(scene_config or SceneConfig())
+        self.config = task.rules_in(self.scene.config, task_config or TaskConfig())
         self.num_envs = num_envs
         self.noise_level = NOISE_LEVEL
         self.substeps = _substeps(self.scene.config, self.config)
@@ -209,7 +209,7 @@ class InsertionSim:
         measured = self._start_measuring(ids, trace, earlier)
         if images is not None and len(images):
             self._present.start_images(self._checked(images))
-        reward = update(state, ids, measured(), self.config, self.embodiment)
+        reward = update(state, ids, measured(), self.config, self.scene)
         self._remember(ids)
         terminated = state.done[ids]
         truncated = ~terminated & (state.steps[ids] >= self.episode_steps)
@@ -360,7 +360,7 @@ class InsertionSim:
 
     def _grip_points(self, seen: Kinematics) -> Array:
         grips = self.scene.pair.socket.grip, self.scene.pair.plug.grip
-        hands = task.holding_hands(self.embodiment, seen.hands)
+        hands = task.holding_hands(self.scene.holders, seen.hands)
         return task.grip_points(grips, (seen.socket, seen.plug), hands)
 
     def _start_measuring(

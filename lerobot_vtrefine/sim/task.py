@@ -4,12 +4,12 @@ Shapes: m worlds. Poses are (position (m, 3) [m], rotation (m, 3, 3)) in the wor
 the part that they hold, are ordered socket, plug.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 from lerobot_vtrefine.embodiments import Embodiment
-from lerobot_vtrefine.sim.config import SuccessConfig, TaskConfig
+from lerobot_vtrefine.sim.config import SceneConfig, SuccessConfig, TaskConfig
 from lerobot_vtrefine.sim.pairs import Grip, PartPair
 from lerobot_vtrefine.sim.rotations import turn, turn_back
 
@@ -17,6 +17,8 @@ __all__ = ["FAILURES", "TaskConfig"]
 
 Array = np.ndarray
 Pose = tuple[Array, Array]
+Holders = tuple[int | None, int | None]
+"""Arms that hold the socket and the plug."""
 
 FAILURES = ("none", "in_hand_shift", "contact_force", "dropped", "unstable", "overflow")
 NO_FAILURE, SHIFTED, FORCED, DROPPED, UNSTABLE, OVERFLOWED = range(6)
@@ -43,6 +45,13 @@ class Insertion:
     tilt_rad: Array
     mouth_height_m: Array
     """Above the table."""
+
+
+def rules_in(scene: SceneConfig, config: TaskConfig) -> TaskConfig:
+    """The rules as they hold in a scene: a socket that stands need not be lifted above the table."""
+    if scene.socket == "held":
+        return config
+    return replace(config, success=replace(config.success, mouth_height_m=-np.inf))
 
 
 def checked_action(action: Array, shape: tuple[int, int]) -> Array:
@@ -83,19 +92,19 @@ def rate_limits(embodiment: Embodiment, config: TaskConfig) -> Array:
     return np.array(arm * embodiment.num_arms) * config.control_dt_s
 
 
-def held_parts(embodiment: Embodiment, pad_force: Array) -> Array:
+def held_parts(holders: Holders, num_arms: int, pad_force: Array) -> Array:
     """(m, part) whether all pads of the hand whose part it is press on something, for forces (m, P) [N]."""
-    pressed = np.all((pad_force > HELD_FORCE_N).reshape(len(pad_force), embodiment.num_arms, -1), axis=-1)
+    pressed = np.all((pad_force > HELD_FORCE_N).reshape(len(pad_force), num_arms, -1), axis=-1)
     nobody = np.zeros(len(pad_force), bool)
-    return np.stack([nobody if arm is None else pressed[:, arm] for arm in embodiment.holders], 1)
+    return np.stack([nobody if arm is None else pressed[:, arm] for arm in holders], 1)
 
 
-def holding_hands(embodiment: Embodiment, hands: Pose) -> Pose:
+def holding_hands(holders: Holders, hands: Pose) -> Pose:
     """Poses (m, part, ...) of the hands that hold the socket and the plug, out of those of all hands (m, A,
     ...); the world's frame for a part that no hand holds.
     """
     none = np.zeros_like(hands[0][:, 0]), np.broadcast_to(np.eye(3), hands[1][:, 0].shape)
-    chosen = [none if arm is None else (hands[0][:, arm], hands[1][:, arm]) for arm in embodiment.holders]
+    chosen = [none if arm is None else (hands[0][:, arm], hands[1][:, arm]) for arm in holders]
     position, rotation = zip(*chosen, strict=True)
     return np.stack(position, 1), np.stack(rotation, 1)
 

@@ -34,6 +34,30 @@ def test_expert_inserts_gently(start: str, num_envs: int) -> None:
     assert steps < 120
 
 
+@pytest.mark.parametrize("body", ["aloha", "kinova"])
+def test_plug_goes_into_a_socket_that_stands(body: str) -> None:
+    """One hand works, the other rests; a seated plug counts although nothing was lifted."""
+    config = SceneConfig(embodiment=body, socket="stands")
+    sim = InsertionSim(config, num_envs=1, num_threads=1)
+    world = np.zeros(1, np.int64)
+    sim.reset(world, world)
+    expert = ScriptedExpert(sim)
+    expert.reset(world)
+    result = sim.step(expert.act(world))
+    while not (result.terminated | result.truncated).any():
+        result = sim.step(expert.act(world))
+    assert result.success.all()
+    assert sim.insertion().mouth_height_m[0] < 0.08
+    assert not sim._episode.grasped[0, 0]
+    rest = sim.embodiment.home[: sim.embodiment.joints_per_arm]
+    np.testing.assert_allclose(sim.joint_state()[0, : len(rest)], rest, atol=0.01)
+
+
+def test_a_socket_in_hand_does_not_stand() -> None:
+    with pytest.raises(ValueError, match="socket=stands needs start=table"):
+        SceneConfig(start="grasped", socket="stands")
+
+
 def test_pads_feel_the_parts_in_hand() -> None:
     """Every pad feels its part, somewhere on itself."""
     sim = kinova("grasped", 1)
@@ -49,7 +73,7 @@ def test_pads_feel_the_parts_in_hand() -> None:
 @pytest.mark.timeout(1200)  # the kernels of another number of joints are compiled first
 def test_warp_backend_gives_the_same_readings() -> None:
     pytest.importorskip("mujoco_warp")
-    sims = [kinova("grasped", 2, backend, timestep_s=0.004) for backend in ("warp", "single")]
+    sims = [kinova("grasped", 2, backend, timestep_s=0.0025) for backend in ("warp", "single")]
     both = np.arange(2)
     for sim in sims:
         sim.reset(both, both)
@@ -57,6 +81,8 @@ def test_warp_backend_gives_the_same_readings() -> None:
     ours, truth = (sim.observe() for sim in sims)
     np.testing.assert_allclose(ours["state"], truth["state"], atol=1e-4)
     difference = np.abs(ours["tactile"].astype(int) - truth["tactile"])
-    assert difference.max() <= 2
+    assert (difference > 1).mean() < 0.01  # a taxel at a part's edge feels micrometres between both
+    sums = [sensed["tactile"].astype(float).sum(-1) for sensed in (ours, truth)]
+    np.testing.assert_allclose(*sums, rtol=0.005)
     assert (truth["tactile"].astype(int) - truth["tactile_baseline"]).max() > 20
     np.testing.assert_allclose(sims[0]._episode.pad_force, sims[1]._episode.pad_force, rtol=0.02)
