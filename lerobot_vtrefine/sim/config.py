@@ -27,7 +27,7 @@ class SceneConfig:
     start: str = "table"
     """table: both parts stand on the table. grasped: both are in hand."""
     socket: str = "held"
-    """held: a hand lifts the socket, and the plug is inserted in air. stands: the socket stays on the table."""
+    """held: a hand lifts the socket, and the plug goes in in air. stands: the socket stays on the table."""
     embodiment: str = "aloha"
     """The robot, see `embodiments`."""
     table_height_m: float = 0.0
