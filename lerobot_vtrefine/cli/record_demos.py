@@ -17,7 +17,6 @@ from tqdm import tqdm
 
 from lerobot_vtrefine.cli.errors import run_cli
 from lerobot_vtrefine.datasets.features import dataset_features
-from lerobot_vtrefine.embodiments import get_embodiment
 from lerobot_vtrefine.envs import VtRefineEnvConfig
 from lerobot_vtrefine.envs.demo_dataset import DemoDataset
 from lerobot_vtrefine.envs.demo_workers import demonstration_stream
@@ -87,14 +86,14 @@ def record(config: RecordDemosConfig) -> None:
     """
     env = config.env
     assert isinstance(env, VtRefineEnvConfig)
-    robot = get_embodiment(env.scene_config.embodiment)
-    features = dataset_features(*env.camera_size, robot.joint_names)
+    robot = env.body
+    features = dataset_features(*env.camera_size, robot)
     with DemoDataset(
         config.root,
         config.repo_id,
         env.fps,
         features,
-        robot.robot_type,
+        robot,
         env.task or "",
         config.settings(),
         config.seed,

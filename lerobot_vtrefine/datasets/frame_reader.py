@@ -16,7 +16,7 @@ from lerobot.datasets.depth_utils import MM_PER_METRE
 from torch.utils.data._utils.collate import default_collate_fn_map
 
 from lerobot_vtrefine.datasets.fast_reader import DATASET_MODULE, FrameStore, NotCoveredError
-from lerobot_vtrefine.datasets.features import TACTILE_KEYS
+from lerobot_vtrefine.datasets.features import TACTILE_PREFIX
 
 logger = logging.getLogger(__name__)
 
@@ -44,7 +44,8 @@ class FastDatasetReader(DatasetReader):
         if self._store_source is not self.hf_dataset:  # loaded, or reloaded after recording
             self._store_source = self.hf_dataset
             try:
-                self._store = FrameStore(self) if TACTILE_KEYS[0] in self._meta.features else None
+                touch = any(key.startswith(TACTILE_PREFIX) for key in self._meta.features)
+                self._store = FrameStore(self) if touch else None
             except NotCoveredError as reason:
                 logger.warning("Reading items the slow way: the dataset has %s.", reason)
                 self._store = None

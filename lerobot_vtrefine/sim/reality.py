@@ -19,7 +19,7 @@ from typing import Any, Literal
 
 import numpy as np
 
-from lerobot_vtrefine.embodiments import ALOHA
+from lerobot_vtrefine.embodiments import embodiment_of
 from lerobot_vtrefine.embodiments.robot_file import SCHEMA as ROBOT_MODEL_SCHEMA
 from lerobot_vtrefine.embodiments.robot_file import RobotFile, decode_robot
 from lerobot_vtrefine.files import decode, inside, limits, read_json
@@ -115,7 +115,8 @@ def _from_dict(data: Any, folder: Path) -> Reality:
         raise ValueError(f'reality must hold "schema": "{SCHEMA}"')
     content = decode(_RealityFile, data, "reality")
     for joint in (*content.robot.backlash_rad, *content.robot.encoder_offset_rad):
-        if joint not in ALOHA.joint_names or joint.endswith("_finger"):
+        body = embodiment_of((joint,))
+        if body is None or body.joint_of(joint) is None:
             raise ValueError(f"no arm has a joint {joint[:60]!r} that could have play or an encoder's offset")
     sensor = None
     if isinstance(content.sensor_model, str):
@@ -135,10 +136,12 @@ def _diagnosed(model: RobotFile) -> RobotFaults:
     which have no faults here.
     """
     by_name = {item.name.removesuffix(".pos"): item for item in model.joints}
-    unknown = [name for name in by_name if name not in ALOHA.joint_names]
-    if unknown:
-        raise ValueError(f"the simulated arms have no joint {unknown[0][:60]!r}")
-    arms = {name: item for name, item in by_name.items() if not name.endswith("_finger")}
+    body = embodiment_of(tuple(by_name))
+    if body is None:
+        unknown = [name for name in by_name if embodiment_of((name,)) is None]
+        what = f"no joint {unknown[0][:60]!r}" if unknown else "never all of the model's joints at once"
+        raise ValueError(f"the simulated arms have {what}")
+    arms = {name: item for name, item in by_name.items() if body.joint_of(name) is not None}
     play = {name: item.backlash_command + item.backlash_output for name, item in arms.items()}
     return RobotFaults(
         min(model.control_latency_s, MAX_LATENCY_S),

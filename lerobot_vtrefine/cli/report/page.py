@@ -9,7 +9,6 @@ from jinja2 import Environment, PackageLoader, StrictUndefined
 from lerobot_vtrefine.cli.pipeline.progress import clock
 from lerobot_vtrefine.cli.report.charts import Bar, Series, bar_chart, line_chart
 from lerobot_vtrefine.cli.report.media import data_uri, heat_map, strongest_contact
-from lerobot_vtrefine.datasets.features import PADS
 from lerobot_vtrefine.files import read_number_rows
 
 NAMES = {"pretrain": "imitation", "finetune": "after DPPO"}
@@ -126,7 +125,7 @@ def caption(policy: str, video: dict[str, Any]) -> str:
 
 
 def pad_pictures(dataset_root: Path) -> list[dict[str, str]]:
-    """The four pads' frames at the strongest contact of a demonstration, on one colour scale."""
+    """The pads' frames at the strongest contact of a demonstration, on one colour scale."""
     frames = strongest_contact(dataset_root)
     maximum = max(float(frame.max()) for frame in frames.values())
     return [
@@ -135,5 +134,5 @@ def pad_pictures(dataset_root: Path) -> list[dict[str, str]]:
             "source": heat_map(frames[pad], maximum),
             "maximum": f"{frames[pad].max():.0f}",
         }
-        for pad in PADS
+        for pad in frames
     ]

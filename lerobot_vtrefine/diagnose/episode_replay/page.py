@@ -5,7 +5,6 @@ from typing import Any
 import numpy as np
 from jinja2 import Environment, PackageLoader, StrictUndefined
 
-from lerobot_vtrefine.datasets.features import PADS
 from lerobot_vtrefine.diagnose.episode_replay import figures
 from lerobot_vtrefine.diagnose.episode_replay.compare import Comparison, EpisodePair
 from lerobot_vtrefine.diagnose.episode_replay.touch import telling_frames
@@ -82,7 +81,7 @@ def _strongest_touch(comparison: Comparison) -> EpisodePair | None:
 
 
 def _moments(pair: EpisodePair, fps: float) -> list[tuple[str, str]]:
-    pads = [pad for pad in PADS if pad in pair.recorded.counts and pad in pair.counts]
+    pads = [pad for pad in pair.counts if pad in pair.recorded.counts]
     above = np.concatenate([figures.pads_above(pair, pad)[0] for pad in pads], axis=1)
     return [
         (f"{moment / fps:.1f} s", figures.data_uri(figures.frames(pair, moment)))

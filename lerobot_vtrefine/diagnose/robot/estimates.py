@@ -11,7 +11,7 @@ from lerobot_vtrefine.diagnose.robot.gravity import full_reach, is_sliding
 from lerobot_vtrefine.diagnose.robot.resampling import jackknife, leave_out, without_ridge
 from lerobot_vtrefine.diagnose.robot.selection import Selection
 from lerobot_vtrefine.diagnose.verdict import Parameter
-from lerobot_vtrefine.embodiments import ALOHA
+from lerobot_vtrefine.embodiments import embodiment_of
 
 Array = np.ndarray
 
@@ -176,13 +176,12 @@ def widened(ci95: tuple[float, float], value: float, own: float) -> tuple[float,
 
 
 def _stiffness(name: str) -> float | None:
-    """Servo gain [Nm/rad, N/m] of a joint that is named as ALOHA's."""
-    plain = name.removesuffix(".pos")
-    if plain not in ALOHA.joint_names:
+    """Servo gain [Nm/rad, N/m] of a joint of a known body."""
+    body = embodiment_of((name,))
+    if body is None:
         return None
-    if is_sliding(plain):
-        return ALOHA.fingers.stiffness
-    return next(joint.stiffness for joint in ALOHA.joints if plain.endswith(joint.name))
+    joint = body.joint_of(name.removesuffix(".pos"))
+    return body.fingers.stiffness if joint is None else joint.stiffness
 
 
 def repeatability(problem: Problem, residual: Array) -> float | None:

@@ -11,7 +11,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from lerobot_vtrefine.embodiments import ALOHA
+from lerobot_vtrefine.embodiments import Embodiment, embodiment_of
+from lerobot_vtrefine.embodiments.embodiment import PITCH, YAW
 from lerobot_vtrefine.embodiments.robot_file import TERMS
 
 Array = np.ndarray
@@ -53,11 +54,16 @@ class Chain:
 
 
 def chains(joints: tuple[str, ...]) -> tuple[Chain, ...]:
-    """The arms among named joints. Joints named otherwise than ALOHA's are chained in order within their
-    prefix if their names say that they pitch, and stand alone otherwise."""
+    """The arms among named joints. A known body tells which of its joints pitch; where its arms do not reach
+    within an upright plane, each joint stands alone. Joints of no known body are chained in order within
+    their prefix if their names say that they pitch, and stand alone otherwise."""
     names = [name.removesuffix(".pos") for name in joints]
-    if all(name in ALOHA.joint_names for name in names):
-        found = [_aloha_chain(names, arm.name) for arm in ALOHA.arms]
+    body = embodiment_of(joints)
+    if body is not None:
+        if not _reaches_in_a_plane(body):
+            arms = [index for index, name in enumerate(names) if body.joint_of(name) is not None]
+            return tuple(Chain((index,), ((0.0, 1.0),), ((1.0, 0.0),)) for index in arms)
+        found = [_chain(body, names, arm.name) for arm in body.arms]
         return tuple(chain for chain in found if chain.joints)
     eligible = [index for index, name in enumerate(names) if not _LEVEL_OR_SLIDING.search(name.lower())]
     pitching = [index for index in eligible if _PITCHING.search(names[index].lower())]
@@ -142,30 +148,32 @@ def _level_sum(pitch: Array, vectors: tuple[tuple[float, float], ...]) -> Array:
     return np.asarray(ahead) / total
 
 
-def _aloha_chain(names: list[str], arm: str) -> Chain:
-    """Upper arm, forearm, hand of one ViperX; its rolls are taken as zero."""
-    wanted = [f"{arm}_{name}" for name in ("shoulder", "elbow", "wrist_angle")]
+def _reaches_in_a_plane(body: Embodiment) -> bool:
+    """Whether upright arms turn about the vertical first, and then pitch; later rolls are taken as zero."""
+    upright = not any(arm.base_pitch_rad or arm.base_roll_rad for arm in body.arms)
+    axes = [joint.axis for joint in body.joints]
+    return upright and PITCH in axes and set(axes[: axes.index(PITCH)]) <= {YAW}
+
+
+def _chain(body: Embodiment, names: list[str], arm: str) -> Chain:
+    """The pitching links of one arm: upper arm, forearm, hand of a ViperX; its rolls are taken as zero."""
+    pitching = [place for place, joint in enumerate(body.joints) if joint.axis == PITCH]
+    wanted = [f"{arm}_{body.joints[place].name}" for place in pitching]
     present = [name for name in wanted if name in names]
     if present != wanted[: len(present)]:
         return Chain((), (), ())
-    index = {joint.name: place for place, joint in enumerate(ALOHA.joints)}
-    offsets = [np.array(joint.offset_m) for joint in ALOHA.joints]
-    elbow, roll = index["elbow"], index["forearm_roll"]
-    angle, rotate = index["wrist_angle"], index["wrist_rotate"]
-    ends = [offsets[elbow], offsets[roll] + offsets[angle], offsets[rotate] + [ALOHA.tcp_offset_m, 0, 0]]
-    hand_kg = ALOHA.joints[rotate].mass_kg + 2 * ALOHA.fingers.mass_kg
-    parts = [
-        [(index["shoulder"], np.zeros(3))],
-        [(elbow, np.zeros(3)), (roll, offsets[roll])],
-        [(angle, np.zeros(3)), (rotate, offsets[rotate])],
-    ]
-    mass = [sum(ALOHA.joints[i].mass_kg for i, _ in part) for part in parts]
-    mass[2] = ALOHA.joints[angle].mass_kg + hand_kg
-    moments = []
-    for place, part in enumerate(parts):
-        own = sum(ALOHA.joints[i].mass_kg * (np.array(ALOHA.joints[i].com_m) + base) for i, base in part)
-        own = own + sum(mass[place + 1 :]) * ends[place]
-        moments.append((float(own[0]), float(own[2])))
-    count = len(present)
-    links = tuple((float(end[0]), float(end[2])) for end in ends[:count])
-    return Chain(tuple(names.index(name) for name in present), links, tuple(moments[:count]))
+    offsets = [np.array(joint.offset_m) for joint in body.joints]
+    links, masses, owns = [], [], []
+    for first, after in zip(pitching, [*pitching[1:], len(body.joints)], strict=True):
+        own, mass, base = np.zeros(3), 0.0, np.zeros(3)
+        for place in range(first, after):
+            joint = body.joints[place]
+            base = base + (offsets[place] if place > first else 0.0)
+            own, mass = own + joint.mass_kg * (np.array(joint.com_m) + base), mass + joint.mass_kg
+        last = after == len(body.joints)
+        links.append(base + ([body.tcp_offset_m, 0.0, 0.0] if last else offsets[after]))
+        masses.append(mass + (body.pads_per_arm * body.fingers.mass_kg if last else 0.0))
+        owns.append(own)
+    moments = [own + sum(masses[k + 1 :]) * end for k, (own, end) in enumerate(zip(owns, links, strict=True))]
+    pairs = [tuple((float(v[0]), float(v[2])) for v in part[: len(present)]) for part in (links, moments)]
+    return Chain(tuple(names.index(name) for name in present), *pairs)
