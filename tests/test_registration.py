@@ -70,7 +70,7 @@ EXPECTED = {
     "CameraConfig": {"flexitac"},
     "PreTrainedConfig": {"vt_dp3"},
     "EnvConfig": {"vtrefine"},
-    "RobotConfig": {"tactile", "aloha_tactile_follower"},
+    "RobotConfig": {"tactile", "aloha_tactile_follower", "vtrefine_sim"},
     "TeleoperatorConfig": {"aloha_leader"},
     "steps": {"vt_visuo_tactile"},
 }
