@@ -28,6 +28,8 @@ class LiveWorld:
         self.seed = 0
         self.outcome = RUNNING
         """success, time_out or a failure; empty while the episode runs. The first outcome stays."""
+        self.raw: Raw = {}
+        """The raw frame last observed; looking at it draws no sensor noise."""
         self._row: dict[str, Any] = {}
 
     @property
@@ -44,6 +46,7 @@ class LiveWorld:
         """Start the episode of ``seed``."""
         self.seed, self.outcome = seed, RUNNING
         self._episodes.reset(IDS, np.array([seed]))
+        self.raw = {key: value[0].copy() for key, value in self._episodes.raw.items()}
 
     def step(self, targets: Array) -> None:
         """One control step with absolute joint targets (J,) in rad and m."""
@@ -62,7 +65,8 @@ class LiveWorld:
 
     def observe(self) -> Raw:
         """The raw frame of this moment, as ``datasets.features`` describes it; no leading dimensions."""
-        return {key: value[0].copy() for key, value in self._episodes.read(IDS).items()}
+        self.raw = {key: value[0].copy() for key, value in self._episodes.read(IDS).items()}
+        return self.raw
 
     def row(self) -> dict[str, Any]:
         """How the episode went: seed, steps, success, failure (none or a reason), metrics.

@@ -1,4 +1,4 @@
-"""What is noted beside a simulated dataset: the simulation's settings, and each episode's seed and outcome."""
+"""What is noted beside a simulated dataset: the simulation's settings, each episode's seed and outcome."""
 
 import hashlib
 import json

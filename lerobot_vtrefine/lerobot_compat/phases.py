@@ -81,5 +81,5 @@ def _phased(loop: Callable[..., None]) -> Callable[..., None]:
         with robot.phase(settings["events"], settings["fps"], settings.get("dataset")):
             return loop(*args, **settings)
 
-    run.unphased = loop  # ty: ignore[unresolved-attribute]
+    run.unphased = loop  # ty: ignore[missing-attribute]
     return run

@@ -15,6 +15,8 @@ from lerobot_vtrefine.files import read_yaml
 
 TYPE = "vtrefine"
 VIEWS = ("none", "browser")
+FASTEST_HZ = 40
+"""A control step must hold at least one sample of how the parts touch each other."""
 
 
 @RobotConfig.register_subclass("vtrefine_sim")
@@ -23,7 +25,7 @@ class VtRefineSimConfig(RobotConfig):
     """The simulation as a robot.
 
     Attributes:
-        env_file: Environment file such as configs/env/round_table.yaml, as lerobot-eval's --config_path takes it.
+        env_file: Environment file, as lerobot-eval's --config_path takes it: configs/env/round_table.yaml.
         env: Fields of --env.type=vtrefine that win over the file's, such as "{pair: square}".
         seed: Episode i of a dataset starts from seed + i: its parts stand where this seed puts them.
         fps: Control steps and observations per simulated second; the command must run at the same rate.
@@ -50,6 +52,8 @@ class VtRefineSimConfig(RobotConfig):
             raise ValueError(f"--robot.view={self.view} is unknown; choose from {', '.join(VIEWS)}")
         if self.seed < 0:
             raise ValueError(f"--robot.seed must not be negative, got {self.seed}")
+        if not 1 <= self.fps <= FASTEST_HZ:
+            raise ValueError(f"--robot.fps must lie between 1 and {FASTEST_HZ}, got {self.fps}")
         self.simulation()
 
     def simulation(self) -> VtRefineEnvConfig:

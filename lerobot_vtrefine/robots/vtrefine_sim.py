@@ -190,8 +190,8 @@ class VtRefineSim(Robot):
                 f"give --robot.fps={fps:g}, or the command's own rate (--dataset.fps, --fps) as "
                 f"{self.config.fps}"
             )
-        self._note_outcome()
         if dataset is not None:
+            self._note_outcome()  # LeRobot saves an episode after the wait that follows it
             self._start(self.config.seed + dataset.num_episodes)
         elif not events.get("rerecord_episode"):
             self._start(self.world.seed + 1)
