@@ -12,7 +12,7 @@ from collections.abc import Callable, Iterator
 from contextlib import AbstractContextManager
 from typing import Any, Protocol, runtime_checkable
 
-from lerobot_vtrefine.datasets.lerobot_version import is_supported
+from lerobot_vtrefine.lerobot_compat.guard import is_supported
 
 LOOPS = (
     ("lerobot.scripts.lerobot_record", None, "record_loop"),

@@ -9,9 +9,9 @@ from draccus.utils import DraccusException
 from lerobot.envs.configs import EnvConfig
 from lerobot.robots.config import RobotConfig
 
-from lerobot_vtrefine.config_errors import told_by_lerobot
 from lerobot_vtrefine.envs.config import VtRefineEnvConfig
 from lerobot_vtrefine.files import read_yaml
+from lerobot_vtrefine.lerobot_compat.config_errors import told_by_lerobot
 
 TYPE = "vtrefine"
 VIEWS = ("none", "browser")

@@ -18,7 +18,6 @@ from lerobot.lerobot_types import RobotAction, RobotObservation
 from lerobot.robots.robot import Robot
 from lerobot.utils.decorators import check_if_already_connected, check_if_not_connected
 
-from lerobot_vtrefine.datasets.arrays import ArraySpec
 from lerobot_vtrefine.datasets.features import (
     CAMERA,
     JOINT_SUFFIX,
@@ -32,6 +31,7 @@ from lerobot_vtrefine.embodiments import get_embodiment
 from lerobot_vtrefine.envs.recording_note import add_episode, simulation_settings
 from lerobot_vtrefine.extras import SIMULATOR, require
 from lerobot_vtrefine.lerobot_compat import phases
+from lerobot_vtrefine.lerobot_compat.arrays import ArraySpec
 from lerobot_vtrefine.robots.config_vtrefine_sim import VtRefineSimConfig
 from lerobot_vtrefine.robots.extensions import extend_lerobot
 from lerobot_vtrefine.robots.simulated_pace import Pace

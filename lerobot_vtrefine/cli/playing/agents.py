@@ -11,6 +11,7 @@ from lerobot_vtrefine.datasets.features import raw_to_env_observation
 from lerobot_vtrefine.diagnose.episode_replay.twin import read_ledger, recorded_seeds, recorded_twin
 from lerobot_vtrefine.envs.config import VtRefineEnvConfig
 from lerobot_vtrefine.envs.live_world import IDS, LiveWorld
+from lerobot_vtrefine.lerobot_compat.registration import register
 from lerobot_vtrefine.observation import VisuoTactileConfig
 from lerobot_vtrefine.sim.demonstrations import Degradation
 
@@ -82,6 +83,7 @@ class PolicyAgent:
         from lerobot.configs.policies import PreTrainedConfig
         from lerobot.policies.factory import make_policy, make_pre_post_processors
 
+        register()  # a checkpoint may be of this package's policy
         try:
             config = PreTrainedConfig.from_pretrained(path)
         except (OSError, ValueError, TypeError) as error:

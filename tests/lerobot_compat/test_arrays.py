@@ -14,8 +14,8 @@ from lerobot.datasets.lerobot_dataset import LeRobotDataset
 from lerobot.robots import Robot, RobotConfig
 from lerobot.teleoperators import Teleoperator, TeleoperatorConfig
 
-from lerobot_vtrefine.datasets import arrays
-from lerobot_vtrefine.datasets.arrays import ArraySpec
+from lerobot_vtrefine.lerobot_compat import arrays
+from lerobot_vtrefine.lerobot_compat.arrays import ArraySpec
 
 TAXELS = {"array_shape": [12, 32], "unit": "adc_counts"}
 

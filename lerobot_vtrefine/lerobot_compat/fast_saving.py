@@ -14,7 +14,7 @@ import numpy as np
 from datasets.table import embed_table_storage
 from lerobot.datasets import compute_stats, dataset_writer, io_utils
 
-from lerobot_vtrefine.envs.episodes import Array
+Array = np.ndarray[Any, np.dtype[Any]]
 
 Stats = dict[str, dict[str, Array]]
 

@@ -1,4 +1,4 @@
-"""The LeRobot versions whose internals this package may extend."""
+"""The LeRobot versions whose internals this package may extend: every seam asks here."""
 
 from importlib.metadata import version
 
@@ -17,5 +17,5 @@ def lerobot_version() -> tuple[int, ...]:
 
 
 def is_supported() -> bool:
-    """Whether the installed LeRobot is one that the extensions were tested with."""
+    """Whether the installed LeRobot is one that the seams were tested with."""
     return FIRST_SUPPORTED <= lerobot_version() < FIRST_UNSUPPORTED

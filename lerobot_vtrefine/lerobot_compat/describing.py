@@ -14,7 +14,7 @@ from lerobot.datasets.utils import DatasetInfo, update_chunk_file_indices
 from lerobot.datasets.video_utils import decode_video_frames_pyav, get_video_duration_in_s
 from PIL import Image
 
-from lerobot_vtrefine.datasets.safe_recording import SafeMetadata
+from lerobot_vtrefine.lerobot_compat.safe_recording import SafeMetadata
 
 Row = dict[str, Any]
 

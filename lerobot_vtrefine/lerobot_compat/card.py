@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from lerobot_vtrefine.datasets.features import ACTION_KEY, AGE_KEY, NOISE_LEVEL_KEY, STATE_KEY, TAXEL_INFO
-from lerobot_vtrefine.datasets.lerobot_version import is_supported
+from lerobot_vtrefine.lerobot_compat.guard import is_supported
 
 if TYPE_CHECKING:
     from lerobot.datasets.dataset_metadata import LeRobotDatasetMetadata

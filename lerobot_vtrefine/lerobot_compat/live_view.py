@@ -2,7 +2,7 @@
 
 LeRobot 0.6.1 draws a 1-D observation as one curve per value: 384 of them per pad, and as many for its idle
 counts. `install` lets the two functions that log observations see pictures of R x C pixels instead. Robots
-call it when they are made, as they call `datasets.arrays.install`; commands with other robots stay untouched.
+call it when they are made, as they call `arrays.install`; commands with other robots stay untouched.
 """
 
 import logging
@@ -11,10 +11,10 @@ from typing import Any
 
 import numpy as np
 
-from lerobot_vtrefine.datasets.lerobot_version import is_supported
 from lerobot_vtrefine.drivers.config import PadConfig
 from lerobot_vtrefine.drivers.picture import colours
-from lerobot_vtrefine.robots.pad_features import BASELINE, PAD_AGE, TACTILE
+from lerobot_vtrefine.lerobot_compat.guard import is_supported
+from lerobot_vtrefine.lerobot_compat.pad_features import BASELINE, PAD_AGE, TACTILE
 
 logger = logging.getLogger(__name__)
 

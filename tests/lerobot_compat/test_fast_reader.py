@@ -13,8 +13,8 @@ from lerobot.datasets.dataset_reader import DatasetReader
 from lerobot.datasets.lerobot_dataset import LeRobotDataset
 from torch.utils.data import DataLoader
 
-from lerobot_vtrefine.datasets import fast_reader
 from lerobot_vtrefine.datasets.features import RAW_KEYS, STATE_KEY
+from lerobot_vtrefine.lerobot_compat import fast_reader
 
 WINDOWS = {key: [-0.1, 0.0] for key in (*RAW_KEYS, STATE_KEY)} | {"action": [i / 10 for i in range(16)]}
 

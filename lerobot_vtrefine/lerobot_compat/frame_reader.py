@@ -15,8 +15,8 @@ from lerobot.datasets.dataset_reader import DatasetReader
 from lerobot.datasets.depth_utils import MM_PER_METRE
 from torch.utils.data._utils.collate import default_collate_fn_map
 
-from lerobot_vtrefine.datasets.fast_reader import DATASET_MODULE, FrameStore, NotCoveredError
 from lerobot_vtrefine.datasets.features import TACTILE_KEYS
+from lerobot_vtrefine.lerobot_compat.fast_reader import DATASET_MODULE, FrameStore, NotCoveredError
 
 logger = logging.getLogger(__name__)
 

@@ -13,7 +13,7 @@ from lerobot.processor.tokenizer_processor import TokenizerProcessorStep
 from safetensors.torch import save_file
 
 from lerobot_vtrefine.datasets.features import ACTION_KEY, STATE_KEY
-from lerobot_vtrefine.policies import checkpoint_guard
+from lerobot_vtrefine.lerobot_compat import checkpoint_guard
 from lerobot_vtrefine.policies.vt_dp3.configuration_vt_dp3 import VtDp3Config
 from lerobot_vtrefine.policies.vt_dp3.modeling_vt_dp3 import VtDp3Policy
 from lerobot_vtrefine.policies.vt_dp3.processor_vt_dp3 import make_vt_dp3_pre_post_processors

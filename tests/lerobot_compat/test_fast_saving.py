@@ -4,7 +4,7 @@ import pytest
 from lerobot.datasets import compute_stats, dataset_writer, io_utils
 from PIL import Image
 
-from lerobot_vtrefine.envs.fast_saving import embed_images, episode_stats, fast_saving
+from lerobot_vtrefine.lerobot_compat.fast_saving import embed_images, episode_stats, fast_saving
 
 FEATURES = {name: {"dtype": "float32"} for name in ("counts", "state", "timestamp")}
 

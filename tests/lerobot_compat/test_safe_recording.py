@@ -15,7 +15,7 @@ import numpy as np
 import pytest
 from lerobot.datasets.lerobot_dataset import LeRobotDataset
 
-from lerobot_vtrefine.datasets import recovery, safe_recording
+from lerobot_vtrefine.lerobot_compat import recovery, safe_recording
 
 REPO = "local/safe"
 FRAMES = 4

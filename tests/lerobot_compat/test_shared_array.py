@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from lerobot_vtrefine.datasets.shared_array import SharedArray
+from lerobot_vtrefine.lerobot_compat.shared_array import SharedArray
 
 
 def counts() -> Any:

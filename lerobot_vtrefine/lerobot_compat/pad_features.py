@@ -5,9 +5,9 @@ from typing import Any
 
 import numpy as np
 
-from lerobot_vtrefine.datasets.arrays import ArraySpec
 from lerobot_vtrefine.drivers.config import PadConfig
 from lerobot_vtrefine.drivers.pads_file import load_pads
+from lerobot_vtrefine.lerobot_compat.arrays import ArraySpec
 
 TACTILE = "tactile"
 """Counts of a pad are `tactile.<pad>`."""

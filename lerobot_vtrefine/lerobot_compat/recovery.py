@@ -28,10 +28,10 @@ from lerobot.datasets.io_utils import (
 from lerobot.datasets.utils import DATA_DIR, EPISODES_DIR, INFO_PATH, STATS_PATH, VIDEO_DIR, DatasetInfo
 from numpy.typing import NDArray
 
-from lerobot_vtrefine.datasets.describing import Row, describe_episodes, video_keys, video_length_s
 from lerobot_vtrefine.datasets.footers import read_without_footer
-from lerobot_vtrefine.datasets.safe_recording import write_info, write_stats
 from lerobot_vtrefine.datasets.whole_files import PART, whole_file
+from lerobot_vtrefine.lerobot_compat.describing import Row, describe_episodes, video_keys, video_length_s
+from lerobot_vtrefine.lerobot_compat.safe_recording import write_info, write_stats
 
 logger = logging.getLogger(__name__)
 

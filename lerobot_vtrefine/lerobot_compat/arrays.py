@@ -18,7 +18,7 @@ from typing import Any
 
 import numpy as np
 
-from lerobot_vtrefine.datasets.lerobot_version import is_supported, lerobot_version
+from lerobot_vtrefine.lerobot_compat.guard import is_supported, lerobot_version
 
 PATCHED = ("hw_to_dataset_features", "build_dataset_frame")
 Features = dict[str, dict[str, Any]]

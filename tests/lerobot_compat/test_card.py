@@ -10,8 +10,8 @@ from lerobot.datasets import remove_feature
 from lerobot.datasets.lerobot_dataset import LeRobotDataset
 from local_hub import use_folder_as_hub
 
-from lerobot_vtrefine.datasets import card
 from lerobot_vtrefine.datasets.features import BASELINE_KEYS, PADS, TACTILE_KEYS
+from lerobot_vtrefine.lerobot_compat import card
 
 
 @pytest.fixture(autouse=True)

@@ -41,8 +41,8 @@ from lerobot.datasets.utils import (
 from lerobot.utils.constants import HF_LEROBOT_HOME
 from lerobot.utils.utils import flatten_dict
 
-from lerobot_vtrefine.datasets.lerobot_version import is_supported
 from lerobot_vtrefine.datasets.whole_files import PART, sync, whole_file, write_json
+from lerobot_vtrefine.lerobot_compat.guard import is_supported
 
 logger = logging.getLogger(__name__)
 
@@ -137,7 +137,7 @@ class SafeWriter(DatasetWriter):
             raise
 
     def _take_back(self) -> None:
-        from lerobot_vtrefine.datasets.recovery import recover
+        from lerobot_vtrefine.lerobot_compat.recovery import recover
 
         self._meta._metadata_buffer.clear()
         with suppress(OSError):  # the disk may be full: resuming the recording tries again
@@ -252,7 +252,7 @@ def _resuming(original: Callable[..., LeRobotDataset]) -> Callable[..., LeRobotD
     def resume(
         cls: type[LeRobotDataset], repo_id: str, root: str | Path | None = None, *args: Any, **kwargs: Any
     ) -> LeRobotDataset:
-        from lerobot_vtrefine.datasets.recovery import recover
+        from lerobot_vtrefine.lerobot_compat.recovery import recover
 
         if root and Path(root).is_dir() and any(Path(root).iterdir()):  # else it is fetched from the Hub
             logger.info("%s", recover(Path(root)))

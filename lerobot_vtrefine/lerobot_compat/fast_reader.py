@@ -21,8 +21,8 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from lerobot_vtrefine.datasets.lerobot_version import is_supported
-from lerobot_vtrefine.datasets.shared_array import Array, SharedArray
+from lerobot_vtrefine.lerobot_compat.guard import is_supported
+from lerobot_vtrefine.lerobot_compat.shared_array import Array, SharedArray
 
 if TYPE_CHECKING:
     from lerobot.datasets.dataset_reader import DatasetReader
@@ -231,7 +231,7 @@ def install() -> None:
     if not is_supported():
         logger.warning("This LeRobot version is untested: dataset items are read the slow way.")
         return
-    from lerobot_vtrefine.datasets.frame_reader import FastDatasetReader, serve_batches
+    from lerobot_vtrefine.lerobot_compat.frame_reader import FastDatasetReader, serve_batches
 
     module.DatasetReader = FastDatasetReader
     serve_batches()
