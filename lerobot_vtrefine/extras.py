@@ -9,6 +9,7 @@ EXTRA_OF = {
     "mjviser": "view",
     "viser": "view",
     "mink": "teleop",
+    "daqp": "teleop",
     "serial": "hardware",
     "dynamixel_sdk": "hardware",
     "deepdiff": "hardware",
@@ -17,6 +18,7 @@ EXTRA_OF = {
 
 SIMULATOR = ("mujoco", "warp")
 VIEW = ("mujoco", "warp", "mjviser")
+TELEOPERATION = ("mujoco", "warp", "mink", "daqp")
 PADS = ("serial",)
 ARMS = ("serial", "dynamixel_sdk", "deepdiff")
 

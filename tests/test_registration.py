@@ -67,7 +67,7 @@ EXPECTED = {
     "PreTrainedConfig": {"vt_dp3"},
     "EnvConfig": {"vtrefine"},
     "RobotConfig": {"tactile", "aloha_tactile_follower", "vtrefine_sim"},
-    "TeleoperatorConfig": {"aloha_leader"},
+    "TeleoperatorConfig": {"aloha_leader", "vtrefine_ee"},
     "steps": {"vt_visuo_tactile"},
 }
 

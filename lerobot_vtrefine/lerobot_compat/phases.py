@@ -1,21 +1,23 @@
-"""Tells a robot when LeRobot's recording loops begin and end an episode, or the time between two.
+"""Tells robots and teleoperators when LeRobot's loops begin and end an episode, or the time between two.
 
 LeRobot 0.6.1's robots see observations and actions only. Real ones need no more, because a person puts the
 parts back; a simulated one must know when to start anew, and can end an episode itself. `install` wraps the
-loops of ``lerobot-record`` and of the episodic strategy of ``lerobot-rollout``. Robots without ``phase`` see
-nothing of it.
+loops of ``lerobot-record`` and of the episodic strategy of ``lerobot-rollout``. Teleoperators that solve for
+joint positions themselves must know where the joints are when a loop begins, that of ``lerobot-teleoperate``
+included. Robots without ``phase`` and teleoperators without ``follow`` see nothing of it.
 """
 
 import functools
 import sys
-from collections.abc import Callable, Iterator
-from contextlib import AbstractContextManager
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import AbstractContextManager, ExitStack
 from typing import Any, Protocol, runtime_checkable
 
 from lerobot_vtrefine.lerobot_compat.guard import is_supported
 
 LOOPS = (
     ("lerobot.scripts.lerobot_record", None, "record_loop"),
+    ("lerobot.scripts.lerobot_teleoperate", None, "teleop_loop"),
     ("lerobot.rollout.strategies.episodic", "EpisodicStrategy", "_policy_loop"),
     ("lerobot.rollout.strategies.episodic", "EpisodicStrategy", "_reset_loop"),
 )
@@ -34,6 +36,15 @@ class PhasedRobot(Protocol):
             fps: the loop's rate [Hz].
             dataset: what the episode is recorded into; None between two episodes.
         """
+        ...
+
+
+@runtime_checkable
+class FollowingTeleoperator(Protocol):
+    """A teleoperator that goes on from where the robot is."""
+
+    def follow(self, positions: Mapping[str, float]) -> None:
+        """The robot's joint positions by their action keys."""
         ...
 
 
@@ -76,9 +87,13 @@ def _phased(loop: Callable[..., None]) -> Callable[..., None]:
     @functools.wraps(loop)
     def run(*args: Any, **settings: Any) -> None:
         robot = getattr(settings["robot"], "inner", settings["robot"])
-        if not isinstance(robot, PhasedRobot):
-            return loop(*args, **settings)
-        with robot.phase(settings["events"], settings["fps"], settings.get("dataset")):
+        with ExitStack() as stack:
+            if isinstance(robot, PhasedRobot) and "events" in settings:
+                phase = robot.phase(settings["events"], settings["fps"], settings.get("dataset"))
+                stack.enter_context(phase)
+            if isinstance(teleop := settings.get("teleop"), FollowingTeleoperator):
+                observation = robot.get_observation()
+                teleop.follow({key: observation[key] for key in robot.action_features})
             return loop(*args, **settings)
 
     run.unphased = loop  # ty: ignore[missing-attribute]

@@ -1,8 +1,8 @@
 """The one list of what this package changes in LeRobot 0.6.1 or depends on beyond its interfaces, and why.
 
 Each seam is one module of this package, is opened only by what needs it, and asks `guard` for the version.
-`tests/lerobot_compat/test_seams.py` holds a probe for each: it fails once LeRobot does by itself what the seam
-is for, which then can go.
+`tests/lerobot_compat/test_seams.py` holds a probe for each: it fails once LeRobot does by itself what the
+seam is for, which then can go.
 """
 
 from dataclasses import dataclass
@@ -86,12 +86,13 @@ SEAMS = (
         "phases",
         (
             "lerobot.scripts.lerobot_record.record_loop",
+            "lerobot.scripts.lerobot_teleoperate.teleop_loop",
             "lerobot.rollout.strategies.episodic.EpisodicStrategy._policy_loop",
             "lerobot.rollout.strategies.episodic.EpisodicStrategy._reset_loop",
         ),
         "a robot is not told where an episode begins or ends, so a simulated one could not start anew",
-        "simulated robots, when they are made",
-        "refuses to simulate a robot",
+        "simulated robots and vtrefine_ee, when they are made",
+        "refuses to make them",
     ),
     Seam(
         "registration",

@@ -25,7 +25,7 @@ POINT_M = 0.0022
 CLOUD = VisuoTactileConfig(num_visual_points=512, pixel_stride=1, pool_rows=2, pool_cols=2)
 """Drawn where no policy says what it sees."""
 SEEN, FELT = np.array([120, 170, 235]), np.array([255, 96, 32])
-EYE_M, LOOK_AT_M = (-0.5, -0.06, 0.34), (0.0, -0.06, 0.10)
+EYE_M, LOOK_AT_M = (0.5, 0.06, 0.34), (0.0, 0.06, 0.10)  # left arm on the left
 
 
 @dataclass

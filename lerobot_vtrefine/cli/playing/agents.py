@@ -91,13 +91,13 @@ class PolicyAgent:
                 f"--policy.path={path} holds no checkpoint of LeRobot (a folder with config.json and"
                 f" model.safetensors, or a name on the Hub): {error}"
             ) from error
-        config.pretrained_path = Path(path) if Path(path).exists() else path
+        config.pretrained_path = Path(path)
         config.device = device or ("cuda" if torch.cuda.is_available() else "cpu")
         self.policy = make_policy(cfg=config, env_cfg=env)
         self.policy.eval()
         self._preprocess, self._postprocess = make_pre_post_processors(
             policy_cfg=config,
-            pretrained_path=str(config.pretrained_path),
+            pretrained_path=path,
             preprocessor_overrides={"device_processor": {"device": config.device}},
         )
         self.cloud: VisuoTactileConfig | None = getattr(config, "observation", None)
