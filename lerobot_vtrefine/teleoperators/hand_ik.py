@@ -18,8 +18,10 @@ from lerobot_vtrefine.teleoperators.hand_motion import Pose
 
 Array = NDArray[np.float64]
 
-STEPS = 2
-"""Newton-like steps per control step: with a warm start a second one leaves less than 0.1 mm."""
+LEAST_STEPS = 2
+"""Solver's steps per control step: with a warm start a second one leaves less than 0.1 mm."""
+LONGEST_STEP_S = 0.01
+"""No solver's step is longer: arms that look ahead by `LOOK_AHEAD_M` then cannot pass through each other."""
 POSTURE_COST = 1e-3
 """Pulls towards the last joint positions; small, so that it decides only what the hands leave open."""
 ORIENTATION_COST = 0.2
@@ -28,6 +30,10 @@ DAMPING = 1e-4
 HANDS_APART_M = 0.004
 LOOK_AHEAD_M = 0.03
 """Closer geoms than this enter the solver."""
+APPROACH = 0.5
+"""Largest share of the distance that is left by which a step may bring things closer."""
+PARTING_M_S = 0.01
+"""What has come closer than `HANDS_APART_M`, as curved ways do little by little, is moved apart this fast."""
 SOLVER = "daqp"
 
 
@@ -43,7 +49,7 @@ class TwoArmIk:
     def __init__(self, embodiment: str, dt_s: float, speed: float = 1.0) -> None:
         self.model, self.body, self._qpos = build_arms(SceneConfig(embodiment=embodiment))
         rules = TaskConfig()
-        self._dt_s = dt_s
+        self._dt_s, self._steps = dt_s, max(LEAST_STEPS, round(dt_s / LONGEST_STEP_S))
         self._rate = np.array([self._joint_rate(rules, joint) for joint in self._joints]) * speed
         self._configuration = mink.Configuration(self.model)
         self._is_finger = self.model.jnt_type[self._joints] == mujoco.mjtJoint.mjJNT_SLIDE
@@ -93,16 +99,16 @@ class TwoArmIk:
             task.set_target(target)
         self._posture.set_target(self._configuration.q)
         try:
-            for _ in range(STEPS):
+            for _ in range(self._steps):
                 velocity = mink.solve_ik(
                     self._configuration,
                     [*self._tasks, self._posture],
-                    self._dt_s / STEPS,
+                    self._dt_s / self._steps,
                     SOLVER,
                     DAMPING,
                     limits=self._limits,
                 )
-                self._configuration.integrate_inplace(velocity, self._dt_s / STEPS)
+                self._configuration.integrate_inplace(velocity, self._dt_s / self._steps)
             solved = self._configuration.q[self._qpos]
         except mink.exceptions.MinkError:  # nothing satisfies all limits: stay
             solved = before
@@ -153,9 +159,12 @@ class TwoArmIk:
         pairs = [(side, fixed) for side in sides]
         if len(sides) == 2:
             pairs.append((sides[0], sides[1]))
+        step_s = self._dt_s / self._steps
         return mink.CollisionAvoidanceLimit(
             self.model,
             pairs,
+            gain=APPROACH * step_s,  # mink 1.3 bounds a step's way by gain * distance / dt
             minimum_distance_from_collisions=HANDS_APART_M,
             collision_detection_distance=LOOK_AHEAD_M,
+            bound_relaxation=-PARTING_M_S * step_s,
         )

@@ -50,8 +50,8 @@ class MotionSettings:
 class ClutchedHand:
     """The wanted pose of one hand: it follows its controller while the clutch is held, from where both were.
 
-    A sample that is missing, not finite or far from the last one moves nothing; the hand goes on from where
-    it is with the next good one.
+    Without a clutch, and with a sample that is missing, not finite or far from the last one, the hand stays
+    where it is; it goes on from there with the next good one.
     """
 
     def __init__(self, settings: MotionSettings, start: Pose) -> None:
@@ -64,15 +64,17 @@ class ClutchedHand:
         self._anchor: tuple[HandSample, Pose] | None = None
         self._last: HandSample | None = None
 
-    def update(self, sample: HandSample | None) -> Pose:
-        """The wanted pose after a sample; None where the controller was not seen."""
+    def update(self, sample: HandSample | None, reached: Pose) -> Pose:
+        """The wanted pose after a sample, None where there is none; the hand is at `reached`."""
         if sample is None or not is_sound(sample):
             self._anchor = self._last = None
+            self.wanted = reached
             return self.wanted
         self.grip = float(np.clip(sample.grip, 0.0, 1.0))
         jumped = self._last is not None and self._jumped(self._last, sample)
         self._last = sample
         if not sample.clutch or jumped or self._anchor is None:
+            self.wanted = reached
             self._anchor = (sample, self.wanted) if sample.clutch else None
             return self.wanted
         self.wanted = self._follow(*self._anchor, sample)

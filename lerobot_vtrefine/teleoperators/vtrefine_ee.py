@@ -108,7 +108,8 @@ class VtRefineEe(Teleoperator):
         began = time.perf_counter()
         samples = self._source.read()
         wanted = [
-            hand.update(samples.get(arm.name)) for hand, arm in zip(self._hands, self.body.arms, strict=True)
+            hand.update(samples.get(arm.name), reached)
+            for hand, arm, reached in zip(self._hands, self.body.arms, self._ik.hands(), strict=True)
         ]
         targets = self._ik.step(wanted, [hand.grip for hand in self._hands])
         for hand, pose, reached in zip(self._hands, wanted, self._ik.hands(), strict=True):
