@@ -57,8 +57,8 @@ SEAMS = (
     ),
     Seam(
         "fast_reader",
-        ("lerobot.datasets.lerobot_dataset.DatasetReader",),
-        "every array column of every item is decoded through Python lists: 45 ms an item",
+        ("lerobot.datasets.lerobot_dataset.DatasetReader", "lerobot.datasets.lerobot_dataset.LeRobotDataset"),
+        "array columns are decoded through Python lists, 45 ms an item, and never a batch at once",
         "configurations of vt_dp3, when they are made",
         "warns and reads the slow way",
     ),
