@@ -29,6 +29,7 @@ class VtRefineSimConfig(RobotConfig):
         env: Fields of --env.type=vtrefine that win over the file's, such as "{pair: square}".
         seed: Episode i of a dataset starts from seed + i: its parts stand where this seed puts them.
         fps: Control steps and observations per simulated second; the command must run at the same rate.
+        episode_s: Time-out of an episode [s]: people take longer than what an environment gives a policy.
         end_episodes: End a recorded episode at success, failure or time-out; otherwise at LeRobot's keys and
             times only.
         pause_s: Without recording, the next episode starts this long after one has ended [s].
@@ -40,6 +41,7 @@ class VtRefineSimConfig(RobotConfig):
     env: dict[str, Any] = field(default_factory=dict)
     seed: int = 0
     fps: int = 10
+    episode_s: float = 60.0
     end_episodes: bool = True
     pause_s: float = 2.0
     view: str = "none"
@@ -54,6 +56,8 @@ class VtRefineSimConfig(RobotConfig):
             raise ValueError(f"--robot.seed must not be negative, got {self.seed}")
         if not 1 <= self.fps <= FASTEST_HZ:
             raise ValueError(f"--robot.fps must lie between 1 and {FASTEST_HZ}, got {self.fps}")
+        if not 1 <= self.episode_s <= 3600:
+            raise ValueError(f"--robot.episode_s must lie between 1 and 3600, got {self.episode_s}")
         self.simulation()
 
     def simulation(self) -> VtRefineEnvConfig:
@@ -63,7 +67,8 @@ class VtRefineSimConfig(RobotConfig):
             ValueError: the file or a field is wrong.
         """
         given = {} if self.env_file is None else _env_of(self.env_file)
-        values = {"type": TYPE, **given, **self.env, "fps": self.fps}
+        steps = {"episode_steps": round(self.episode_s * self.fps)}
+        values = {"type": TYPE, **steps, **given, **self.env, "fps": self.fps}
         try:
             env = draccus.decode(EnvConfig, values)
         except (DraccusException, ValueError, TypeError) as error:

@@ -195,7 +195,9 @@ def test_the_physics_step_divides_every_control_step(fps: int) -> None:
     step_s = fitting_timestep(0.0025, fps)
     assert step_s <= 0.0025
     assert 1 / fps / step_s == pytest.approx(round(1 / fps / step_s))
-    assert VtRefineSimConfig(fps=fps).simulation().scene_config.timestep_s == step_s
+    env = VtRefineSimConfig(fps=fps, episode_s=20).simulation()
+    assert env.scene_config.timestep_s == step_s
+    assert env.max_episode_steps == 20 * fps
 
 
 def test_wrong_settings_are_one_line(tmp_path: Path) -> None:
