@@ -7,10 +7,10 @@ from typing import Any
 from lerobot.configs import FeatureType, PolicyFeature
 from lerobot.envs.configs import EnvConfig
 
-from lerobot_vtrefine.config_errors import told_by_lerobot
 from lerobot_vtrefine.datasets.features import ACTION_KEY, env_key_map, env_observation_shapes
 from lerobot_vtrefine.embodiments import Embodiment, get_embodiment
 from lerobot_vtrefine.extras import SIMULATOR, require
+from lerobot_vtrefine.lerobot_compat.config_errors import told_by_lerobot
 from lerobot_vtrefine.sim.config import (
     BACKENDS,
     RandomizationConfig,

@@ -22,7 +22,7 @@ from lerobot.datasets.lerobot_dataset import LeRobotDataset
 from lerobot_vtrefine.datasets.features import ACTION_KEY, raw_to_frame
 from lerobot_vtrefine.embodiments import Embodiment
 from lerobot_vtrefine.envs.demonstrations import Demonstration
-from lerobot_vtrefine.envs.fast_saving import fast_saving
+from lerobot_vtrefine.envs.recording_note import NOTE
 from lerobot_vtrefine.folders import (
     check_replaceable,
     link_or_copy,
@@ -31,8 +31,9 @@ from lerobot_vtrefine.folders import (
     working_folder,
     write_in_place,
 )
+from lerobot_vtrefine.lerobot_compat.fast_saving import fast_saving
 
-LEDGER = Path("meta") / "recording.json"
+LEDGER = NOTE
 INFO = Path("meta") / "info.json"
 TASKS = Path("meta") / "tasks.parquet"
 DATASET_FOLDERS = ("data", "meta", "images")

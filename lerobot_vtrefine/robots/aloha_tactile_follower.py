@@ -19,10 +19,10 @@ from lerobot_vtrefine.drivers.pad_set import PadSet
 from lerobot_vtrefine.drivers.ports import PortError
 from lerobot_vtrefine.embodiments import ALOHA
 from lerobot_vtrefine.extras import ARMS, require
+from lerobot_vtrefine.lerobot_compat.pad_features import configured_pads, pad_features
 from lerobot_vtrefine.robots.camera_models import CameraModels
 from lerobot_vtrefine.robots.config_aloha_tactile_follower import AlohaTactileFollowerConfig
 from lerobot_vtrefine.robots.extensions import extend_lerobot
-from lerobot_vtrefine.robots.pad_features import configured_pads, pad_features
 from lerobot_vtrefine.robots.pad_reading import pad_observation
 
 logger = logging.getLogger(__name__)

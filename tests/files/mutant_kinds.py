@@ -32,7 +32,7 @@ from lerobot_vtrefine.embodiments import ALOHA
 from lerobot_vtrefine.envs.config import VtRefineEnvConfig
 from lerobot_vtrefine.envs.demo_dataset import LEDGER
 from lerobot_vtrefine.envs.factory import make_simulation
-from lerobot_vtrefine.robots.pad_features import configured_pads
+from lerobot_vtrefine.lerobot_compat.pad_features import configured_pads
 from lerobot_vtrefine.tactile import SensorModel
 from lerobot_vtrefine.tactile.stages.base import STAGES
 

@@ -9,8 +9,6 @@ from lerobot.configs import FeatureType, NormalizationMode, PreTrainedConfig
 from lerobot.optim import AdamWConfig
 from lerobot.optim.schedulers import CosineAnnealingWithWarmupSchedulerConfig
 
-from lerobot_vtrefine.config_errors import told_by_lerobot
-from lerobot_vtrefine.datasets import fast_reader
 from lerobot_vtrefine.datasets.features import (
     ACTION_KEY,
     STATE_KEY,
@@ -20,8 +18,9 @@ from lerobot_vtrefine.datasets.features import (
     tactile_keys,
 )
 from lerobot_vtrefine.embodiments import embodiment_with_pads, get_embodiment
+from lerobot_vtrefine.lerobot_compat import checkpoint_guard, fast_reader
+from lerobot_vtrefine.lerobot_compat.config_errors import told_by_lerobot
 from lerobot_vtrefine.observation import MODALITIES, VisuoTactileConfig
-from lerobot_vtrefine.policies import checkpoint_guard
 from lerobot_vtrefine.policies.vt_dp3.denoisers import DENOISERS
 from lerobot_vtrefine.policies.vt_dp3.diffusion import step_grid
 
