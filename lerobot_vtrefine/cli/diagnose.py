@@ -90,7 +90,7 @@ def read(options: argparse.Namespace) -> "RecordingSet":
         from lerobot_vtrefine.diagnose.recordings import read_recording_set
 
         return read_recording_set(options.recording)
-    from lerobot_vtrefine.diagnose.robot.dataset import read_dataset
+    from lerobot_vtrefine.diagnose.joints.dataset import read_dataset
 
     return read_dataset(options.repo_id, options.root)
 
@@ -135,7 +135,7 @@ def diagnose(recordings: "RecordingSet", seed: int) -> "Diagnosis":
             from lerobot_vtrefine.diagnose.dataset.engine import diagnose_dataset
 
             return diagnose_dataset(recordings, seed, progress)
-        from lerobot_vtrefine.diagnose.robot.engine import diagnose_robot
+        from lerobot_vtrefine.diagnose.joints.engine import diagnose_robot
 
         return diagnose_robot(recordings, seed=seed, progress=progress)
 
@@ -161,7 +161,7 @@ def make_verdict(diagnosis: "Diagnosis | None", issues: Sequence["DataIssue"]) -
 def unfitted_model(recordings: "RecordingSet") -> "Savable":
     """What the simulation assumes before anything is fitted, for data that allow no fit."""
     if recordings.kind == "robot":
-        from lerobot_vtrefine.diagnose.robot.model import RobotModel
+        from lerobot_vtrefine.diagnose.joints.model import RobotModel
 
         return RobotModel.default(recordings.joints)
     from lerobot_vtrefine.tactile.model import SensorModel

@@ -33,7 +33,7 @@ class JointModel:
     """Dry friction divided by the servo's stiffness [rad or m]."""
     sag_form: SagForm = "mass"
     sag_terms: tuple[float, float, float, float] = limits(maximum=MAX_POSITION, default=(0.0,) * TERMS)
-    """Coefficients of the form's terms, see `diagnose.robot.gravity.shapes` [rad]."""
+    """Coefficients of the form's terms, see `diagnose.joints.gravity.shapes` [rad]."""
     compliance: float = limits(maximum=MAX_POSITION, default=0.0)
     """Target shift against the load [rad or m per unit of load]."""
     stop: float = limits(0.0, MAX_POSITION, default=0.0)

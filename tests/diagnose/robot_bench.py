@@ -18,7 +18,7 @@ import numpy as np
 from robot_rigs import Rig, make_set
 
 from lerobot_vtrefine.diagnose.recordings import read_recording_set
-from lerobot_vtrefine.diagnose.robot.engine import diagnose_robot
+from lerobot_vtrefine.diagnose.joints.engine import diagnose_robot
 from lerobot_vtrefine.embodiments import ALOHA
 
 TABLE = ("shoulder", "elbow", "wrist_flex", "gripper")

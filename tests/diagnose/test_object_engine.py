@@ -4,9 +4,9 @@ import numpy as np
 import pytest
 from object_rigs import record
 
-from lerobot_vtrefine.diagnose.object.engine import assumed_masses, diagnose_objects
-from lerobot_vtrefine.diagnose.object.episodes import AssumedScene, handled
-from lerobot_vtrefine.diagnose.object.payload import Arms
+from lerobot_vtrefine.diagnose.parts.engine import assumed_masses, diagnose_objects
+from lerobot_vtrefine.diagnose.parts.episodes import AssumedScene, handled
+from lerobot_vtrefine.diagnose.parts.payload import Arms
 from lerobot_vtrefine.sim.config import SceneConfig
 from lerobot_vtrefine.sim.pairs import load_pair
 from lerobot_vtrefine.sim.reality import RobotFaults

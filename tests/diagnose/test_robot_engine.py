@@ -7,11 +7,11 @@ import pytest
 from robot_rigs import Rig, make_set
 
 from lerobot_vtrefine.diagnose.recordings import read_recording_set
-from lerobot_vtrefine.diagnose.robot.batch import make_batch
-from lerobot_vtrefine.diagnose.robot.engine import diagnose_problem, diagnose_robot
-from lerobot_vtrefine.diagnose.robot.estimates import widened
-from lerobot_vtrefine.diagnose.robot.fitting import SERVO_TICK_S, Problem
-from lerobot_vtrefine.diagnose.robot.model import predict_positions
+from lerobot_vtrefine.diagnose.joints.batch import make_batch
+from lerobot_vtrefine.diagnose.joints.engine import diagnose_problem, diagnose_robot
+from lerobot_vtrefine.diagnose.joints.estimates import widened
+from lerobot_vtrefine.diagnose.joints.fitting import SERVO_TICK_S, Problem
+from lerobot_vtrefine.diagnose.joints.model import predict_positions
 
 SMALL = {
     "joints": ("shoulder", "elbow"),

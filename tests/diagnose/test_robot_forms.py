@@ -6,10 +6,10 @@ import pytest
 from robot_rigs import Rig, make_set
 
 from lerobot_vtrefine.diagnose.recordings import read_recording_set
-from lerobot_vtrefine.diagnose.robot.batch import make_batch
-from lerobot_vtrefine.diagnose.robot.engine import diagnose_robot
-from lerobot_vtrefine.diagnose.robot.estimates import widened
-from lerobot_vtrefine.diagnose.robot.fitting import INDEX, SAG, Problem, ridge, servo_only
+from lerobot_vtrefine.diagnose.joints.batch import make_batch
+from lerobot_vtrefine.diagnose.joints.engine import diagnose_robot
+from lerobot_vtrefine.diagnose.joints.estimates import widened
+from lerobot_vtrefine.diagnose.joints.fitting import INDEX, SAG, Problem, ridge, servo_only
 
 SLOW = Rig(joints=("shoulder", "elbow"), rate_hz=20.0, seconds=5.0, conditions=8, jitter=0.1)
 FAST = replace(SLOW, rate_hz=50.0, jitter=0.0, noise=0.5)

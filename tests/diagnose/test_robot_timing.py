@@ -7,9 +7,9 @@ import pytest
 from robot_rigs import Rig, make_set
 
 from lerobot_vtrefine.diagnose.recordings import read_recording_set
-from lerobot_vtrefine.diagnose.robot.batch import make_batch
-from lerobot_vtrefine.diagnose.robot.engine import diagnose_robot
-from lerobot_vtrefine.diagnose.robot.sessions import trends
+from lerobot_vtrefine.diagnose.joints.batch import make_batch
+from lerobot_vtrefine.diagnose.joints.engine import diagnose_robot
+from lerobot_vtrefine.diagnose.joints.session_trends import trends
 
 SMALL = Rig(joints=("shoulder", "elbow", "waist"), rate_hz=20.0, seconds=5.0, conditions=8, noise=0.5)
 

@@ -13,14 +13,14 @@ import numpy as np
 
 from lerobot_vtrefine.datasets.episodes import open_episodes
 from lerobot_vtrefine.diagnose.dataset.merge import beside
-from lerobot_vtrefine.diagnose.object.engine import (
+from lerobot_vtrefine.diagnose.parts.engine import (
     ObjectDiagnosis,
     assumed_masses,
     diagnose_objects,
     found_masses,
     unknown_parts,
 )
-from lerobot_vtrefine.diagnose.object.episodes import (
+from lerobot_vtrefine.diagnose.parts.episodes import (
     AssumedScene,
     HandledEpisode,
     assumed_scene,
@@ -28,13 +28,13 @@ from lerobot_vtrefine.diagnose.object.episodes import (
     lately,
     read_episodes,
 )
-from lerobot_vtrefine.diagnose.object.payload import GRAVITY_M_S2, Arms, given, replay_loaded
+from lerobot_vtrefine.diagnose.parts.payload import GRAVITY_M_S2, Arms, given, replay_loaded
 from lerobot_vtrefine.diagnose.recordings import RecordingSet
-from lerobot_vtrefine.diagnose.robot.dataset import episode_name
-from lerobot_vtrefine.diagnose.robot.engine import Progress, RobotDiagnosis, diagnose_robot
-from lerobot_vtrefine.diagnose.robot.on_twin import TwinTrial, beyond_twin, diagnose_on_twin
-from lerobot_vtrefine.diagnose.vision.engine import diagnose_vision
-from lerobot_vtrefine.diagnose.vision.frames import has_depth
+from lerobot_vtrefine.diagnose.joints.dataset import episode_name
+from lerobot_vtrefine.diagnose.joints.engine import Progress, RobotDiagnosis, diagnose_robot
+from lerobot_vtrefine.diagnose.joints.twin_diagnosis import TwinTrial, beyond_twin, diagnose_on_twin
+from lerobot_vtrefine.diagnose.camera.engine import diagnose_vision
+from lerobot_vtrefine.diagnose.camera.frames import has_depth
 
 Array = np.ndarray
 

@@ -5,7 +5,7 @@ from dataclasses import replace
 from typing import Any, Protocol
 
 from lerobot_vtrefine.diagnose.evidence import Evidence, TrialError
-from lerobot_vtrefine.diagnose.robot.engine import RobotDiagnosis
+from lerobot_vtrefine.diagnose.joints.engine import RobotDiagnosis
 from lerobot_vtrefine.diagnose.verdict import Cause, Heldout, Status
 
 _WORSE: tuple[Status, ...] = ("adequate", "explained", "ambiguous", "unexplained")
