@@ -27,7 +27,7 @@ from lerobot_vtrefine.diagnose.evidence import Evidence, ResidualView, Trace, Tr
 from lerobot_vtrefine.diagnose.fitting import Fit, predict, rest, tangents
 from lerobot_vtrefine.diagnose.idle import settled_idle
 from lerobot_vtrefine.diagnose.intervals import baseline_parameters, leave_out
-from lerobot_vtrefine.diagnose.locking import lock
+from lerobot_vtrefine.diagnose.core.heldout import lock
 from lerobot_vtrefine.diagnose.naming import evidence_table, named_causes
 from lerobot_vtrefine.diagnose.pairs import reconsider
 from lerobot_vtrefine.diagnose.presses import PressSet, prepare, usable

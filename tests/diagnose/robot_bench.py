@@ -17,8 +17,8 @@ from pathlib import Path
 import numpy as np
 from robot_rigs import Rig, make_set
 
-from lerobot_vtrefine.diagnose.recordings import read_recording_set
 from lerobot_vtrefine.diagnose.joints.engine import diagnose_robot
+from lerobot_vtrefine.diagnose.recordings import read_recording_set
 from lerobot_vtrefine.embodiments import ALOHA
 
 TABLE = ("shoulder", "elbow", "wrist_flex", "gripper")

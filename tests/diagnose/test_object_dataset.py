@@ -8,9 +8,9 @@ from object_rigs import record, write_dataset
 
 from lerobot_vtrefine.cli.diagnose import main
 from lerobot_vtrefine.diagnose.dataset.merge import beside
-from lerobot_vtrefine.diagnose.parts.engine import unknown_parts
 from lerobot_vtrefine.diagnose.joints.dataset import read_dataset
 from lerobot_vtrefine.diagnose.joints.engine import diagnose_robot
+from lerobot_vtrefine.diagnose.parts.engine import unknown_parts
 from lerobot_vtrefine.sim.config import CameraConfig, SceneConfig
 
 CAMERA = CameraConfig(80, 60, 0.56, (-0.46, 0.0, 0.46), (0.0, 0.0, 0.09))

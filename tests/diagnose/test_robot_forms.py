@@ -5,11 +5,11 @@ from dataclasses import replace
 import pytest
 from robot_rigs import Rig, make_set
 
-from lerobot_vtrefine.diagnose.recordings import read_recording_set
 from lerobot_vtrefine.diagnose.joints.batch import make_batch
 from lerobot_vtrefine.diagnose.joints.engine import diagnose_robot
 from lerobot_vtrefine.diagnose.joints.estimates import widened
-from lerobot_vtrefine.diagnose.joints.fitting import INDEX, SAG, Problem, ridge, servo_only
+from lerobot_vtrefine.diagnose.joints.fitting import INDEX, SAG, ServoTrials, ridge, servo_only
+from lerobot_vtrefine.diagnose.recordings import read_recording_set
 
 SLOW = Rig(joints=("shoulder", "elbow"), rate_hz=20.0, seconds=5.0, conditions=8, jitter=0.1)
 FAST = replace(SLOW, rate_hz=50.0, jitter=0.0, noise=0.5)
@@ -77,7 +77,7 @@ def test_widened_intervals_keep_signs_and_sides() -> None:
 
 def test_sags_of_many_terms_are_held_back_more_where_no_command_is_repeated(tmp_path) -> None:
     recordings = read_recording_set(make_set(replace(SLOW, conditions=2), tmp_path, 0))
-    again = Problem.of(recordings.joints, make_batch(recordings.trials))
+    again = ServoTrials.of(recordings.joints, make_batch(recordings.trials))
     once = again.subset([k for k, trial in enumerate(recordings.trials) if trial.replicate == 0])
     free = servo_only(again)
     free[1, [INDEX[name] for name in SAG]] = True

@@ -11,10 +11,6 @@ from typing import Any
 
 import numpy as np
 
-from lerobot_vtrefine.diagnose.evidence import Evidence, TrialError
-from lerobot_vtrefine.diagnose.locking import lock
-from lerobot_vtrefine.diagnose.joints import flips
-from lerobot_vtrefine.diagnose.verdict import Cause, Heldout, Parameter, Status
 from lerobot_vtrefine.diagnose.camera.frames import DepthFrames, read_frames
 from lerobot_vtrefine.diagnose.camera.model import CameraModel
 from lerobot_vtrefine.diagnose.camera.registration import (
@@ -25,6 +21,10 @@ from lerobot_vtrefine.diagnose.camera.registration import (
     errors,
     register,
 )
+from lerobot_vtrefine.diagnose.evidence import Evidence, TrialError
+from lerobot_vtrefine.diagnose.joints import flips
+from lerobot_vtrefine.diagnose.core.heldout import lock
+from lerobot_vtrefine.diagnose.verdict import Cause, Heldout, Parameter, Status
 
 Array = np.ndarray
 Progress = Callable[[str, float], None]

@@ -12,7 +12,12 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from lerobot_vtrefine.datasets.episodes import open_episodes
+from lerobot_vtrefine.diagnose.camera.engine import diagnose_vision
+from lerobot_vtrefine.diagnose.camera.frames import has_depth
 from lerobot_vtrefine.diagnose.dataset.merge import beside
+from lerobot_vtrefine.diagnose.joints.dataset import episode_name
+from lerobot_vtrefine.diagnose.joints.engine import Progress, RobotDiagnosis, diagnose_robot
+from lerobot_vtrefine.diagnose.joints.twin_diagnosis import TwinTrial, beyond_twin, diagnose_on_twin
 from lerobot_vtrefine.diagnose.parts.engine import (
     ObjectDiagnosis,
     assumed_masses,
@@ -30,11 +35,6 @@ from lerobot_vtrefine.diagnose.parts.episodes import (
 )
 from lerobot_vtrefine.diagnose.parts.payload import GRAVITY_M_S2, Arms, given, replay_loaded
 from lerobot_vtrefine.diagnose.recordings import RecordingSet
-from lerobot_vtrefine.diagnose.joints.dataset import episode_name
-from lerobot_vtrefine.diagnose.joints.engine import Progress, RobotDiagnosis, diagnose_robot
-from lerobot_vtrefine.diagnose.joints.twin_diagnosis import TwinTrial, beyond_twin, diagnose_on_twin
-from lerobot_vtrefine.diagnose.camera.engine import diagnose_vision
-from lerobot_vtrefine.diagnose.camera.frames import has_depth
 
 Array = np.ndarray
 

@@ -2,18 +2,19 @@
 
 from collections.abc import Sequence
 from dataclasses import replace
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from lerobot_vtrefine.diagnose.recordings import RobotTrial
-from lerobot_vtrefine.diagnose.joints.alarms import Alarm
+from lerobot_vtrefine.diagnose.core.rivals import Rival
+from lerobot_vtrefine.diagnose.core.suspicion import Alarm
 from lerobot_vtrefine.diagnose.joints.batch import frame_s, make_batch
-from lerobot_vtrefine.diagnose.joints.candidates import FRICTION, LATENCY
-from lerobot_vtrefine.diagnose.joints.fitting import Problem
+from lerobot_vtrefine.diagnose.joints.fitting import ServoTrials
 from lerobot_vtrefine.diagnose.joints.gravity import is_sliding
-from lerobot_vtrefine.diagnose.joints.rivals import Rival, joint_names
-from lerobot_vtrefine.diagnose.joints.selection import Selection
+from lerobot_vtrefine.diagnose.recordings import RobotTrial
+
+if TYPE_CHECKING:
+    from lerobot_vtrefine.diagnose.joints.problem import Selected
 
 Array = np.ndarray
 
@@ -29,22 +30,22 @@ PROTOCOLS = {
 }
 
 
-def for_rivals(selection: Selection, rivals: Sequence[Rival]) -> dict[str, Any]:
+def for_rivals(selection: "Selected", rivals: Sequence[Rival[Any, Any]]) -> dict[str, Any]:
     """The protocol that separates the strongest tie best, as the verdict's `next_experiment`."""
     rival = max(rivals, key=lambda item: item.p_value)
-    decides = [rival.cause, rival.rival]
+    decides = [rival.cause, rival.name]
     gaps = {name: _gap(selection, rival, name) for name in PROTOCOLS}
     best = max(gaps, key=lambda name: gaps[name])
-    where = joint_names(selection.problem, rival.joints)
+    where = ", ".join(selection.problem.names[joint] for joint in rival.channels)
     protocol: dict[str, Any] = {
-        "joints": [selection.problem.names[joint] for joint in rival.joints],
+        "joints": [selection.problem.names[joint] for joint in rival.channels],
         "command": best,
         "trials": ENOUGH_TRIALS,
         "seconds": _SECONDS,
         "predicted_gap_in_noise": round(gaps[best], 2),
     }
     text = f"Record {ENOUGH_TRIALS} trials of {where}: {PROTOCOLS[best]}."
-    if {rival.cause, rival.rival} == {"backlash", FRICTION} and selection.problem.batch.load is None:
+    if {rival.cause, rival.name} == {"backlash", "joint_friction"} and selection.problem.batch.load is None:
         protocol["columns"] = ["load"]
         text += " Record the servos' torque or current as `load`: friction takes torque, play takes none."
     elif "gripper_compliance" in decides:
@@ -54,9 +55,9 @@ def for_rivals(selection: Selection, rivals: Sequence[Rival]) -> dict[str, Any]:
     return {"decides": decides, "text": text, "protocol": protocol}
 
 
-def for_alarm(selection: Selection, alarm: Alarm) -> dict[str, Any]:
+def for_alarm(selection: "Selected", alarm: Alarm) -> dict[str, Any]:
     """How to find out more about an unknown cause."""
-    name = selection.problem.names[alarm.joint]
+    name = selection.problem.names[alarm.channel]
     if "closes on something" in alarm.clue:
         text = (
             f"Close {name} on nothing in eight trials, and on a block of known width in eight more, with the "
@@ -72,21 +73,25 @@ def for_alarm(selection: Selection, alarm: Alarm) -> dict[str, Any]:
     return {"decides": [], "text": text, "protocol": protocol}
 
 
-def for_little_data(selection: Selection, detectable: dict[str, float]) -> dict[str, Any] | None:
+def for_little_data(selection: "Selected", detectable: dict[str, float]) -> dict[str, Any] | None:
     """What these trials cannot show at all, if they are few or slow; None where nothing is lacking."""
     problem = selection.problem
     trials = problem.batch.trials
     if trials < ENOUGH_TRIALS - 2:
         text = f"{trials} trials are too few to judge by: record six commands twice each, in random order."
         return {"decides": [], "text": text, "protocol": {"command": "steps", "trials": 12}}
-    delay = detectable.get(LATENCY)
+    delay = detectable.get("control_latency")
     if delay is None or delay > 2 * frame_s(problem.batch):
         text = "A delay would not show at these speeds: record steps, and reversals at two speeds."
-        return {"decides": [LATENCY], "text": text, "protocol": {"command": "fast reversals", "trials": 8}}
+        return {
+            "decides": ["control_latency"],
+            "text": text,
+            "protocol": {"command": "fast reversals", "trials": 8},
+        }
     return None
 
 
-def _gap(selection: Selection, rival: Rival, name: str) -> float:
+def _gap(selection: "Selected", rival: Rival[Any, Any], name: str) -> float:
     """Distance between both models' predictions of a protocol, root mean square, in units of the noise."""
     problem = selection.problem
     frame = frame_s(problem.batch)
@@ -94,14 +99,14 @@ def _gap(selection: Selection, rival: Rival, name: str) -> float:
     low, high = problem.batch.command.min((0, 1)), problem.batch.command.max((0, 1))
     middle = np.median(problem.batch.command.reshape(-1, problem.batch.joints), 0)
     command = np.repeat(middle[None], len(time_s), 0)
-    for joint in rival.joints:
+    for joint in rival.channels:
         wide = (-1.2, 1.2) if not is_sliding(problem.names[joint]) else (low[joint], high[joint])
         command[:, joint] = _drive(name, time_s, low[joint], high[joint], wide, problem.names[joint])
     trial = RobotTrial("", "", 0, 0, 0.0, time_s, command, command[:1].repeat(len(time_s), 0), None)
-    there = Problem.of(problem.names, make_batch([trial]))
+    there = ServoTrials.of(problem.names, make_batch([trial]))
     here = replace(selection.fit.point)
     difference = there.predict(here) - there.predict(rival.fit.point)
-    joints = list(rival.joints)
+    joints = list(rival.channels)
     noise = np.sqrt(selection.fit.total[joints]).clip(1e-9)
     return float((np.sqrt(np.square(difference[:, 0, joints]).mean(0)) / noise).max())
 

@@ -5,6 +5,7 @@ simulation yields the derivatives of all. Shapes: T trials, J joints, P = `len(P
 """
 
 from dataclasses import dataclass, field, replace
+from typing import Self
 
 import numpy as np
 
@@ -32,7 +33,6 @@ SERVO_TICK_S = 2e-3
 frame's time. When, no recording tells: a delay is known up to a uniform error of this width."""
 _START_OMEGA = (4.0, 10.0, 25.0, 60.0)
 _START_ZETA = (0.4, 1.0, 2.0)
-_ITERATIONS = 20
 _TOLERANCE = 1e-5
 _RIDGE = (1e-4, 3e-3)  # where commands are repeated, and where nothing tells misfit from sag
 _SHORTEST = 1e5
@@ -62,8 +62,9 @@ class Point:
 
 
 @dataclass(frozen=True)
-class Problem:
-    """Trials to be explained, with gravity's shapes at their commands worked out once."""
+class ServoTrials:
+    """Trials and the servo model's predictions of them, with gravity's shapes at their commands worked out
+    once."""
 
     names: tuple[str, ...]
     batch: Batch
@@ -82,9 +83,11 @@ class Problem:
     """How long a command may wait for the servo."""
     vague: float = 0.0
     """Part of a play's width that 95 % intervals allow for the method's own error."""
+    iterations: int = 20
+    """Most steps of a fit."""
 
     @classmethod
-    def of(cls, names: tuple[str, ...], batch: Batch) -> "Problem":
+    def of(cls, names: tuple[str, ...], batch: Batch) -> Self:
         """From the joints' names and their trials."""
         error = np.where(batch.valid[..., None], batch.position - batch.command, 0.0)
         moved = np.ptp(batch.command, axis=(0, 1))
@@ -94,14 +97,14 @@ class Problem:
         shapes = gravity.shapes(names, batch.command) | gravity.decoys(batch.command, session, known)
         return cls(names, batch, shapes, np.maximum(scale, 1e-7))
 
-    def subset(self, trials: Array) -> "Problem":
+    def subset(self, trials: Array) -> Self:
         """The same problem on fewer trials."""
         batch = self.batch.subset(trials)
         length = len(batch.time_s)
         shapes = {form: values[:length][:, np.asarray(trials)] for form, values in self.shapes.items()}
         return replace(self, batch=batch, shapes=shapes)
 
-    def bent(self, point: Point) -> "Problem":
+    def bent(self, point: Point) -> Self:
         """With gravity's shapes where the arm stands once it has sagged, not where it was commanded to."""
         bare = point.with_values("bend", 0.0).theta
         push = self._push(point.forms, np.arange(self.batch.joints), bare)
@@ -109,7 +112,7 @@ class Problem:
             return self
         return replace(self, shapes=self.shapes | gravity.shapes(self.names, self.batch.command + push))
 
-    def finer(self) -> "Problem | None":
+    def finer(self) -> Self | None:
         """The same trials with predictions for which the search is too slow; None where there are none."""
         return None
 
@@ -186,7 +189,7 @@ class Fit:
         return self.mse.mean(0)
 
 
-def ridge(problem: Problem, free: Array) -> Array:
+def ridge(problem: ServoTrials, free: Array) -> Array:
     """(J, P) weights of squared parameters that are added to the squared error.
 
     Sags of several terms nearly cancel in the postures seen; where these do not tell, terms stay small."""
@@ -198,7 +201,7 @@ def ridge(problem: Problem, free: Array) -> Array:
     return out
 
 
-def first_point(problem: Problem) -> Point:
+def first_point(problem: ServoTrials) -> Point:
     """The best of a few plain servos per joint."""
     count = problem.batch.joints
     theta = np.zeros((count, len(PARAMETERS)))
@@ -213,7 +216,7 @@ def first_point(problem: Problem) -> Point:
     return point
 
 
-def servo_only(problem: Problem) -> Array:
+def servo_only(problem: ServoTrials) -> Array:
     """Free parameters of the baseline (J, P): frequency and damping."""
     free = np.zeros((problem.batch.joints, len(PARAMETERS)), dtype=bool)
     free[:, :2] = True
@@ -221,7 +224,7 @@ def servo_only(problem: Problem) -> Array:
 
 
 def evaluate(
-    problem: Problem,
+    problem: ServoTrials,
     point: Point,
     free: Array,
     tau_free: bool = False,
@@ -239,11 +242,11 @@ def evaluate(
 
 
 def fit(
-    problem: Problem,
+    problem: ServoTrials,
     start: Point,
     free: Array,
     tau_free: bool = False,
-    iterations: int = _ITERATIONS,
+    iterations: int | None = None,
     known: Fit | None = None,
 ) -> Fit:
     """Minimise every joint's squared error over its free parameters, and over the delay if it is free.
@@ -253,14 +256,15 @@ def fit(
     fitter = _Fitter(problem, free, tau_free)
     moving = None if tau_free else np.flatnonzero(np.any(free, axis=1))
     now = evaluate(problem, _bounded(problem, start, free), free, tau_free, known, moving)
-    for _ in range(iterations if free.any() or tau_free else 0):
+    most = problem.iterations if iterations is None else iterations
+    for _ in range(most if free.any() or tau_free else 0):
         now, done = fitter.step(now)
         if done:
             break
     return now
 
 
-def refit(problem: Problem, known: Fit, point: Point, free: Array, joints: Array, iterations: int) -> Fit:
+def refit(problem: ServoTrials, known: Fit, point: Point, free: Array, joints: Array, iterations: int) -> Fit:
     """Fit some joints anew from a point that differs from `known` only there; the delay stays."""
     mask = np.isin(np.arange(len(free)), joints)
     fitted = fit(problem, point, free & mask[:, None], iterations=iterations, known=known)
@@ -270,7 +274,7 @@ def refit(problem: Problem, known: Fit, point: Point, free: Array, joints: Array
 class _Fitter:
     """Damping of the steps, kept between iterations."""
 
-    def __init__(self, problem: Problem, free: Array, tau_free: bool) -> None:
+    def __init__(self, problem: ServoTrials, free: Array, tau_free: bool) -> None:
         self.problem, self.free, self.tau_free = problem, free, tau_free
         self.damping = np.full(len(free), 1e-3)
         self.weight = problem.weight
@@ -357,7 +361,7 @@ class Derivatives:
         return flat.T @ flat, flat.T @ residual[..., joint].reshape(-1)
 
 
-def derivatives(problem: Problem, now: Fit) -> Derivatives:
+def derivatives(problem: ServoTrials, now: Fit) -> Derivatives:
     """Finite differences of all free parameters in one simulation."""
     joint, parameter = np.nonzero(now.free)
     theta = now.point.theta[joint].copy()
@@ -384,7 +388,7 @@ def _solve(normal: Array, slope: Array, damping: float) -> Array:
     return scale * np.linalg.solve(matrix, scale * slope)
 
 
-def _bounded(problem: Problem, point: Point, free: Array) -> Point:
+def _bounded(problem: ServoTrials, point: Point, free: Array) -> Point:
     theta = point.theta.copy()
     theta[:, 1] = theta[:, 1].clip(*np.log(ZETA_BOUNDS))
     per_frame = np.where(theta[:, 1] > np.log(0.5), *_RADIANS_PER_FRAME)

@@ -4,8 +4,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from lerobot_vtrefine.diagnose.joints import flips
-from lerobot_vtrefine.diagnose.joints.fitting import Fit, Problem
+from lerobot_vtrefine.diagnose.core.resampling import draws_of, one_sided
+from lerobot_vtrefine.diagnose.joints.fitting import Fit, ServoTrials
 
 Array = np.ndarray
 
@@ -32,7 +32,7 @@ class LoadFriction:
         return self.p_value < _ALPHA and self.share > _LEAST_SHARE and self.torque > 0
 
 
-def stiffness_in_load(problem: Problem, fitted: Fit, joint: int) -> float | None:
+def stiffness_in_load(problem: ServoTrials, fitted: Fit, joint: int) -> float | None:
     """Load per unit of servo error [Nm/rad, N/m]: what turns a fitted friction into torque.
 
     None unless the load is mostly the servo's own pull, as far as the model knows it.
@@ -44,19 +44,19 @@ def stiffness_in_load(problem: Problem, fitted: Fit, joint: int) -> float | None
     return slope if share > _SERVO_SHARE and slope > 0 else None
 
 
-def load_prefers(problem: Problem, one: Fit, other: Fit, joint: int, seed: int) -> int:
+def load_prefers(problem: ServoTrials, one: Fit, other: Fit, joint: int, seed: int) -> int:
     """Whose servo pull the measured load resembles: 1 the one's, -1 the other's, 0 if trials disagree."""
     left_one, total, _ = _explained(problem, one, joint)
     left_other, _, _ = _explained(problem, other, joint)
     lead = ((left_other - left_one) / (left_other + left_one).clip(1e-300))[:, None]
     if min(left_one.sum(), left_other.sum()) > (1 - _LEAST_SHARE) * total.sum():
         return 0
-    if flips.one_sided(lead, seed)[0][0] < _ALPHA:
+    if one_sided(lead, seed)[0][0] < _ALPHA:
         return 1
-    return -1 if flips.one_sided(-lead, seed)[0][0] < _ALPHA else 0
+    return -1 if one_sided(-lead, seed)[0][0] < _ALPHA else 0
 
 
-def _explained(problem: Problem, fitted: Fit, joint: int) -> tuple[Array, Array, float]:
+def _explained(problem: ServoTrials, fitted: Fit, joint: int) -> tuple[Array, Array, float]:
     """Squared load (T,) that a model's servo pull leaves, all of it, and the load per unit of pull."""
     batch = problem.batch
     assert batch.load is not None
@@ -92,7 +92,7 @@ def pull_target(command: Array, width: float, start: Array) -> Array:
     return out
 
 
-def friction_in_load(problem: Problem, fitted: Fit, joint: int, seed: int) -> LoadFriction:
+def friction_in_load(problem: ServoTrials, fitted: Fit, joint: int, seed: int) -> LoadFriction:
     """Regress a joint's load on inertia, damping, gravity and the motion's direction, trial by trial.
 
     Raises ValueError without loads.
@@ -123,8 +123,8 @@ def friction_in_load(problem: Problem, fitted: Fit, joint: int, seed: int) -> Lo
     scores, power = np.array(scores), np.array(power)
     torque = float(scores.sum() / max(power.sum(), 1e-12))
     share = float(scores.sum() ** 2 / max(power.sum() * (left @ left), 1e-30))
-    p_value = float(flips.one_sided(scores[:, None], seed)[0][0])
-    draws = np.random.default_rng(seed).integers(0, len(scores), (1000, len(scores)))
+    p_value = float(one_sided(scores[:, None], seed)[0][0])
+    draws = draws_of(len(scores), seed, 1000)
     spread = scores[draws].sum(1) / power[draws].sum(1).clip(1e-12)
     low, high = np.percentile(spread, [2.5, 97.5])
     return LoadFriction(torque, (float(low), float(high)), p_value, share)

@@ -7,10 +7,10 @@ from typing import Any
 
 import numpy as np
 
-from lerobot_vtrefine.diagnose.recordings import RobotTrial
 from lerobot_vtrefine.diagnose.joints import gravity
 from lerobot_vtrefine.diagnose.joints.batch import Batch, make_batch
 from lerobot_vtrefine.diagnose.joints.servo import Columns, simulate
+from lerobot_vtrefine.diagnose.recordings import RobotTrial
 from lerobot_vtrefine.diagnose.verdict import write_atomically
 from lerobot_vtrefine.embodiments.robot_file import SCHEMA, JointModel, decode_robot, read_robot_file
 

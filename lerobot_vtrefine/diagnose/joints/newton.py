@@ -7,25 +7,21 @@ curvature's inverse times the reweighted gradient, to first order.
 from dataclasses import dataclass, replace
 
 import numpy as np
-from scipy.stats import t as student_t
 
+from lerobot_vtrefine.diagnose.core.rules import MIN_CONDITIONS
 from lerobot_vtrefine.diagnose.joints.fitting import (
     INDEX,
     POSITIVE,
     TAU_BOUND_S,
     Fit,
     Point,
-    Problem,
+    ServoTrials,
     derivatives,
     ridge,
 )
 
 Array = np.ndarray
 
-FOLDS = 5
-MIN_CONDITIONS = 4
-"""With fewer conditions than this, trials are left out one by one."""
-_MIN_FREEDOM = 2.0
 _RIDGE = 1e-7
 
 
@@ -42,7 +38,7 @@ class Curvature:
     """(J,) that makes the joints' errors comparable where they share the delay."""
 
     @classmethod
-    def at(cls, problem: Problem, fit: Fit) -> "Curvature":
+    def at(cls, problem: ServoTrials, fit: Fit) -> "Curvature":
         """At the end of a fit."""
         derivative = derivatives(problem, fit)
         normal, slope = [], []
@@ -98,41 +94,31 @@ class Curvature:
         return float(step)
 
 
-def folds_of(conditions: tuple[str, ...], seed: int) -> Array:
-    """Fold (T,) of every trial: trials of one condition stay together."""
-    names = sorted(set(conditions))
-    shuffled = np.random.default_rng(seed).permutation(len(names))
-    count = min(FOLDS, len(names))
-    fold = {names[name]: place % count for place, name in enumerate(shuffled)}
-    return np.array([fold[condition] for condition in conditions])
+@dataclass(frozen=True)
+class Refits:
+    """Fits to other choices of the trials, as `core.problem.Reweighted`."""
+
+    problem: ServoTrials
+    curvature: Curvature
+    channels: Array
+
+    def errors(self, weights: Array, trials: Array) -> Array:
+        """Mean squared errors (trials, channels) if every trial counted `weights` (T,) times."""
+        part = self.problem.subset(trials)
+        left = part.residual(part.predict(self.curvature.moved(weights), self.channels), self.channels)
+        return (left**2).sum(0) / np.maximum(part.batch.frames, 1)[:, None]
 
 
-def cross_validated(
-    problem: Problem, fit: Fit, folds: Array, known: Array | None = None, joints: Array | None = None
-) -> Array:
-    """Mean squared error (T, J) of every trial under a fit to the other folds.
-
-    Joints without free parameters, and all but `joints` if they are given, keep the errors that are `known`;
-    the delay is then kept too.
-    """
-    if joints is not None:
-        mask = np.isin(np.arange(len(fit.free)), joints)
+def refits(problem: ServoTrials, fit: Fit, channels: Array | None = None) -> Refits:
+    """Of all joints that are free, or of some, the delay then being kept."""
+    if channels is not None:
+        mask = np.isin(np.arange(len(fit.free)), channels)
         fit = replace(fit, free=fit.free & mask[:, None], tau_free=False)
-    if len(set(folds)) < 2:
-        return fit.mse
-    curvature = Curvature.at(problem, fit)
-    mse = fit.mse.copy() if known is None else known.copy()
     own = np.flatnonzero(np.any(fit.free, axis=1) | fit.tau_free)
-    for fold in np.unique(folds):
-        held = np.flatnonzero(folds == fold)
-        part = problem.subset(held)
-        point = curvature.moved((folds != fold).astype(float))
-        left = part.residual(part.predict(point, own), own)
-        mse[np.ix_(held, own)] = (left**2).sum(0) / np.maximum(part.batch.frames, 1)[:, None]
-    return mse
+    return Refits(problem, Curvature.at(problem, fit), own)
 
 
-def leave_out(problem: Problem, fit: Fit) -> tuple[Array, Array]:
+def leave_out(problem: ServoTrials, fit: Fit) -> tuple[Array, Array]:
     """Parameters (G, J, P) and delays (G,) without each condition; without each trial where conditions are
     few.
 
@@ -146,27 +132,11 @@ def leave_out(problem: Problem, fit: Fit) -> tuple[Array, Array]:
     return np.stack([point.theta for point in points]), np.array([point.tau_s for point in points])
 
 
-def without_ridge(problem: Problem, fit: Fit) -> Array:
+def without_ridge(problem: ServoTrials, fit: Fit) -> Array:
     """Parameters (J, P) where the fit would end if no sag were held back: what the ridge may cost."""
     curvature = Curvature.at(problem, fit)
     bare = replace(curvature, ridge=np.zeros_like(curvature.ridge))
     return bare.moved(np.ones(problem.batch.trials)).theta
-
-
-def jackknife(without: Array, value: float) -> tuple[float, float]:
-    """95 % interval of a value by what it becomes without each unit (G,).
-
-    Student's factor has the degrees of freedom that the contributions show: one unit that carries everything
-    leaves two (Bell & McCaffrey 2002).
-    """
-    moved = np.asarray(without) - np.mean(without)
-    count, power = len(moved), moved**2
-    total = float(power.sum())
-    if count < 2 or not total > 0:
-        return value, value
-    freedom = float(np.clip(3.0 * total**2 / (power**2).sum() - 1.0, _MIN_FREEDOM, count - 1))
-    half = np.sqrt((count - 1) / count * total) * float(student_t.ppf(0.975, freedom))
-    return float(value - half), float(value + half)
 
 
 def _solve(normal: Array, slope: Array) -> Array:

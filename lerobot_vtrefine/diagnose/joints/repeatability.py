@@ -66,16 +66,22 @@ def common_part(batch: Batch, residual: Array) -> tuple[Array, Array]:
     """Per repeated condition (K, J): mean product of its trials' residuals, frame by frame, and their mean
     square."""
     products, squares = [], []
-    for condition in sorted(set(batch.conditions)):
-        trials = [index for index, name in enumerate(batch.conditions) if name == condition]
-        pairs = [pair for pair in combinations(trials, 2) if alike(batch, *pair)]
-        if pairs:
-            both = [batch.valid[:, a] & batch.valid[:, b] for a, b in pairs]
-            parts = [(residual[v, a], residual[v, b]) for v, (a, b) in zip(both, pairs, strict=True)]
-            products.append(np.mean([(one * other).mean(0) for one, other in parts], 0))
-            squares.append(np.mean([(one**2 + other**2).mean(0) / 2 for one, other in parts], 0))
+    for pairs in repeated(batch):
+        both = [batch.valid[:, a] & batch.valid[:, b] for a, b in pairs]
+        parts = [(residual[v, a], residual[v, b]) for v, (a, b) in zip(both, pairs, strict=True)]
+        products.append(np.mean([(one * other).mean(0) for one, other in parts], 0))
+        squares.append(np.mean([(one**2 + other**2).mean(0) / 2 for one, other in parts], 0))
     shape = (len(products), residual.shape[2])
     return np.reshape(products, shape), np.reshape(squares, shape)
+
+
+def repeated(batch: Batch) -> list[list[tuple[int, int]]]:
+    """Pairs of trials with equal commands, per condition that has any."""
+    found = []
+    for condition in sorted(set(batch.conditions)):
+        trials = [index for index, name in enumerate(batch.conditions) if name == condition]
+        found.append([pair for pair in combinations(trials, 2) if alike(batch, *pair)])
+    return [pairs for pairs in found if pairs]
 
 
 def alike(batch: Batch, a: int, b: int) -> bool:

@@ -1,7 +1,6 @@
 """What changes from trial to trial: each joint's zero, scale, servo and delay, fitted to every trial alone.
 
 Trials differ a little, and that is nothing; that they differ in the order in which they were recorded, is.
-The test permutes the order of acquisition.
 
 Shapes: N frames, T trials, J joints.
 """
@@ -16,7 +15,6 @@ Array = np.ndarray
 
 KINDS = ("zero", "scale", "servo's response", "servo's response", "delay")
 FEWEST_TRIALS = 6
-_PERMUTATIONS = 4999
 _RIDGE = 1e-6
 
 
@@ -28,12 +26,14 @@ class Trend:
     kind: str
     share: float
     """Part of the joint's squared error that a straight line over the session would take away."""
-    p_value: float
-    """Adjusted for all joints and quantities."""
+    change: Array
+    """(T,) the quantity of every trial, about its mean."""
+    place: Array
+    """(T,) every trial's place in the session, standardised."""
 
 
-def trends(batch: Batch, residual: Array, columns: dict[int, Array], tau: Array, seed: int) -> list[Trend]:
-    """Quantities that follow the session.
+def trends(batch: Batch, residual: Array, columns: dict[int, Array], tau: Array) -> list[Trend]:
+    """How every quantity follows the session.
 
     Args:
         residual: (N, T, J) what the model leaves.
@@ -47,17 +47,12 @@ def trends(batch: Batch, residual: Array, columns: dict[int, Array], tau: Array,
     fitted = [_by_trial(batch, residual, columns[joint], tau, joint) for joint in range(batch.joints)]
     change = np.stack([item[0] for item in fitted], 1)
     change = change - change.mean(0)
-    unit = change / np.sqrt(np.square(change).sum(0)).clip(1e-300)
-    rng = np.random.default_rng(seed)
-    shuffled = np.stack([place, *(rng.permutation(place) for _ in range(_PERMUTATIONS))])
-    size = np.abs(shuffled @ unit.reshape(batch.trials, -1))
-    adjusted = (size.max(1)[:, None] >= size[0] - 1e-12).mean(0).reshape(batch.joints, len(KINDS))
     slope = np.einsum("t,tjk->jk", place, change) / batch.trials
     power = np.stack([item[1] for item in fitted])
     total = np.square(residual[batch.valid]).sum(0).clip(1e-300)
     share = slope**2 * np.einsum("t,jtk->jk", place**2, power) / total[:, None]
     return [
-        Trend(joint, kind, float(share[joint, k]), float(adjusted[joint, k]))
+        Trend(joint, kind, float(share[joint, k]), change[:, joint, k], place)
         for joint in range(batch.joints)
         for k, kind in enumerate(KINDS)
     ]

@@ -9,15 +9,20 @@ Shapes: N frames, T trials, J joints.
 """
 
 from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING
 
 import numpy as np
 
-from lerobot_vtrefine.diagnose.joints import flips
+from lerobot_vtrefine.diagnose.core.heldout import cross_validated
+from lerobot_vtrefine.diagnose.core.resampling import folds_of, one_sided
+from lerobot_vtrefine.diagnose.core.rules import LEAST_GAIN
+from lerobot_vtrefine.diagnose.core.search import ALL
 from lerobot_vtrefine.diagnose.joints.batch import Batch, frame_s
-from lerobot_vtrefine.diagnose.joints.candidates import LATENCY, delay_starts
-from lerobot_vtrefine.diagnose.joints.fitting import Fit, Problem, derivatives, fit
-from lerobot_vtrefine.diagnose.joints.newton import cross_validated, folds_of
-from lerobot_vtrefine.diagnose.joints.selection import LEAST_GAIN, Selection
+from lerobot_vtrefine.diagnose.joints.candidates import CATALOGUE
+from lerobot_vtrefine.diagnose.joints.fitting import Fit, ServoTrials, derivatives, fit
+
+if TYPE_CHECKING:
+    from lerobot_vtrefine.diagnose.joints.problem import Selected
 
 Array = np.ndarray
 
@@ -56,41 +61,52 @@ class CommonLag:
         return bool(best > _SHARED and middle > _NOT_AGAINST)
 
 
-def with_changing_delay(selection: Selection, seed: int) -> Selection:
+def with_changing_delay(selection: "Selected", seed: int) -> "Selected":
     """The selection with a delay that changes, if that is what its joints' errors have in common."""
     problem = selection.problem
+    delay = next(item for item in CATALOGUE if item.shared)
     if _distinct(problem.batch) < 3:
         return selection
-    fitted, held_out, p_value = _delayed(selection, seed)
+    fitted, errors, p_value = selection.fit, selection.errors, selection.p_values.get((delay.cause, ALL))
+    if p_value is None:
+        fitted, errors, p_value = _delayed(selection, seed)
     if p_value >= _ALPHA or fitted.point.tau_s <= 0:
         return selection
     lag, tau = common_lag(problem, fitted), fitted.point.tau_s
     alike = -_EARLIEST * tau < lag.earliest_s and lag.latest_s < _FURTHEST * tau
     if not (lag.shared and alike and lag.lasting < _LASTING):
         return selection
-    p_values = {**selection.p_values, (LATENCY, -1): p_value}
     return replace(
-        selection, fit=fitted, held_out=held_out, delayed=True, p_values=p_values, delay_spread_s=lag.spread_s
+        selection,
+        problem=replace(problem, delay_spread_s=lag.spread_s),
+        fit=fitted,
+        errors=errors,
+        chosen={**selection.chosen, ALL: (delay,)},
+        p_values={**selection.p_values, (delay.cause, ALL): p_value},
     )
 
 
-def _delayed(selection: Selection, seed: int) -> tuple[Fit, Array, float]:
-    """The fit with a delay, its held-out errors, and the chance that it helps by accident."""
+def _delayed(selection: "Selected", seed: int) -> tuple[Fit, Array, float]:
+    """The fit with a delay, its cross-validated errors, and the chance that it helps by accident."""
     problem, now = selection.problem, selection.fit
-    if selection.delayed:
-        return now, selection.held_out, selection.p_values.get((LATENCY, -1), 0.0)
     starts = [replace(now.point, tau_s=start) for start in delay_starts(problem)[1:]]
     fits = [fit(problem, start, now.free, True, iterations=12) for start in starts]
     best = min(fits, key=lambda item: float((item.total * problem.weight).sum()))
-    held_out = cross_validated(problem, best, folds_of(problem.batch.conditions, seed))
-    change = selection.held_out - held_out
-    improvement = (change / (selection.held_out + held_out).clip(1e-300)).mean(1, keepdims=True)
-    gain = float((change.mean(0) / selection.held_out.mean(0).clip(1e-300)).mean())
-    p_value = float(flips.one_sided(improvement, seed)[0][0])
-    return best, held_out, p_value if gain > LEAST_GAIN else 1.0
+    errors = cross_validated(problem, best, folds_of(problem.conditions, seed))
+    change = selection.errors - errors
+    improvement = (change / (selection.errors + errors).clip(1e-300)).mean(1, keepdims=True)
+    gain = float((change.mean(0) / selection.errors.mean(0).clip(1e-300)).mean())
+    p_value = float(one_sided(improvement, seed)[0][0])
+    return best, errors, p_value if gain > LEAST_GAIN else 1.0
 
 
-def common_lag(problem: Problem, fitted: Fit) -> CommonLag:
+def delay_starts(problem: ServoTrials) -> tuple[float, ...]:
+    """Delays to begin a fit from [s]."""
+    frame = frame_s(problem.batch)
+    return (0.5 * frame, 1.5 * frame, 4 * frame)
+
+
+def common_lag(problem: ServoTrials, fitted: Fit) -> CommonLag:
     """The lag that joints share in what a fit leaves."""
     tau = derivatives(problem, replace(fitted, tau_free=True)).tau
     assert tau is not None

@@ -14,14 +14,16 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from lerobot_vtrefine.diagnose.core.diagnosis import Diagnosis
+from lerobot_vtrefine.diagnose.core.engine import Progress
 from lerobot_vtrefine.diagnose.evidence import Trace
-from lerobot_vtrefine.diagnose.recordings import RecordingSet, RobotTrial
 from lerobot_vtrefine.diagnose.joints.batch import make_batch
 from lerobot_vtrefine.diagnose.joints.conversion import from_model
-from lerobot_vtrefine.diagnose.joints.engine import Progress, RobotDiagnosis, diagnose_problem
+from lerobot_vtrefine.diagnose.joints.engine import diagnose_problem
 from lerobot_vtrefine.diagnose.joints.gravity import is_sliding
 from lerobot_vtrefine.diagnose.joints.model import RobotModel
 from lerobot_vtrefine.diagnose.joints.twin_problem import COARSE_S, FINE_S, NOMINAL, TwinProblem
+from lerobot_vtrefine.diagnose.recordings import RecordingSet, RobotTrial
 from lerobot_vtrefine.diagnose.verdict import Parameter
 from lerobot_vtrefine.embodiments import ALOHA
 from lerobot_vtrefine.sim.config import SceneConfig
@@ -49,7 +51,7 @@ def diagnose_on_twin(
     seed: int = 0,
     floor: float = 0.0,
     progress: Progress | None = None,
-) -> RobotDiagnosis:
+) -> Diagnosis:
     """As `diagnose_robot`, against what the twin did (by trial file).
 
     Args:
@@ -114,7 +116,7 @@ def _absolute(
     return replace(trace, measured=shifted[0], simulated=shifted[1], extended=shifted[2])
 
 
-def _servos(found: RobotDiagnosis) -> dict[str, Parameter]:
+def _servos(found: Diagnosis) -> dict[str, Parameter]:
     """The refitted servo gains and dampings of the twin's revolute joints."""
     out: dict[str, Parameter] = {}
     for joint in found.baseline_model.joints:

@@ -21,8 +21,8 @@ from mujoco.batch import Batch as Worlds
 
 from lerobot_vtrefine.diagnose.joints import gravity
 from lerobot_vtrefine.diagnose.joints.batch import Batch
-from lerobot_vtrefine.diagnose.joints.candidates import ROUNDED, STICKING, STOP
-from lerobot_vtrefine.diagnose.joints.fitting import INDEX, PARAMETERS, Point, Problem
+from lerobot_vtrefine.diagnose.joints.fitting import INDEX, PARAMETERS, SAG, Point
+from lerobot_vtrefine.diagnose.joints.problem import JointProblem
 from lerobot_vtrefine.sim import task
 from lerobot_vtrefine.sim.backends.batch import usable_cores
 from lerobot_vtrefine.sim.config import SceneConfig
@@ -32,13 +32,15 @@ Array = np.ndarray
 
 NOMINAL = (20.0, 1.0)
 """Frequency [rad/s] and damping ratio that stand for the twin's servos as they come."""
+_SETTLING = 5
+"""Steps of a refit that begins next to its end."""
 COARSE_S, FINE_S = 0.02, 0.005
 """Steps of the replays by which causes are sought, and by which their sizes are settled."""
 
 
 @dataclass(frozen=True)
-class TwinProblem(Problem):
-    """A `Problem` whose predictions are replays; trials are those of the twin's own robot, evenly spaced."""
+class TwinProblem(JointProblem):
+    """A `JointProblem` whose predictions are replays; trials are those of the twin's own robot, evenly spaced."""
 
     hold: str = "linear"
     """linear or zero_order, see `command_replay.HOLDS`."""
@@ -65,30 +67,30 @@ class TwinProblem(Problem):
         step_s: float = COARSE_S,
     ) -> "TwinProblem":
         """From the joints' names and their trials."""
-        plain = Problem.of(names, batch)
+        plain = JointProblem.of(names, batch)
         parts = plain.names, plain.batch, plain.shapes, plain.scale
         return cls(*parts, hold=hold, config=config, step_s=step_s)
 
     @override
     def subset(self, trials: Array) -> "TwinProblem":
-        """See `Problem.subset`."""
+        """See `JointProblem.subset`."""
         part = super().subset(trials)
         assert isinstance(part, TwinProblem)
         return part if self.fine is None else replace(part, fine=self.fine.subset(trials))
 
     @override
     def bent(self, point: Point) -> "TwinProblem":
-        """See `Problem.bent`; the twin's own gravity does that, and what it lacks is small."""
+        """See `JointProblem.bent`; the twin's own gravity does that, and what it lacks is small."""
         return self
 
     @override
     def finer(self) -> "TwinProblem | None":
-        """See `Problem.finer`."""
-        return self.fine
+        """See `JointProblem.finer`."""
+        return None if self.fine is None else replace(self.fine, iterations=_SETTLING)
 
     @property
     def weight(self) -> Array:
-        """See `Problem.weight`. Fingers tell nothing about a delay: where they hold something, their commands
+        """See `JointProblem.weight`. Fingers tell nothing about a delay: where they hold something, their commands
         are their own positions."""
         slides = np.array([gravity.is_sliding(name) for name in self.names])
         return np.where(slides, 0.0, super().weight)
@@ -101,11 +103,15 @@ class TwinProblem(Problem):
 
     def offers(self, parameters: tuple[str, ...], form: str | None) -> bool:
         """Replays are slow: one form of each cause, and the decoys that are not forms of it."""
-        slow = (("loose",), ("bend",), STOP, *ROUNDED, STICKING)
-        return parameters not in slow and form in (None, "mass", "gain", "drift")
+        return set(parameters) <= {"offset", "play", "friction", *SAG} and form in (
+            None,
+            "mass",
+            "gain",
+            "drift",
+        )
 
     def predict(self, point: Point, joint: Array | None = None, theta: Array | None = None) -> Array:
-        """See `Problem.predict`."""
+        """See `JointProblem.predict`."""
         if joint is None:
             joint = np.arange(self.batch.joints)
         if not len(joint):

@@ -10,8 +10,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from lerobot_vtrefine.diagnose.recordings import RecordingSet, RobotTrial
 from lerobot_vtrefine.diagnose.joints.gravity import is_sliding
+from lerobot_vtrefine.diagnose.recordings import RecordingSet, RobotTrial
 from lerobot_vtrefine.sim.command_replay import replay_commands
 from lerobot_vtrefine.sim.config import SceneConfig
 from lerobot_vtrefine.sim.scene import build_arms

@@ -2,7 +2,8 @@
 
 import numpy as np
 
-from lerobot_vtrefine.diagnose.evidence import ResidualView, Trace, TrialError
+from lerobot_vtrefine.diagnose.core.resampling import draws_of
+from lerobot_vtrefine.diagnose.evidence import ResidualView, Trace
 from lerobot_vtrefine.diagnose.joints.batch import Batch
 
 Array = np.ndarray
@@ -33,16 +34,6 @@ def traces(batch: Batch, names: tuple[str, ...], simulated: Array, extended: Arr
             )
         )
     return tuple(out)
-
-
-def trial_errors(batch: Batch, baseline: Array, extended: Array) -> tuple[TrialError, ...]:
-    """Root mean square error of every held-out trial; mean squared errors are (T,)."""
-    return tuple(
-        TrialError(
-            batch.files[i], batch.conditions[i], float(np.sqrt(baseline[i])), float(np.sqrt(extended[i]))
-        )
-        for i in range(batch.trials)
-    )
 
 
 def residual_views(batch: Batch, simulated: Array, extended: Array, seed: int) -> tuple[ResidualView, ...]:
@@ -82,7 +73,7 @@ def _view(
         return np.bincount(flat, x[valid], minlength=count * trials).reshape(trials, count)
 
     sums = [per_trial(np.ones_like(values)), per_trial(before), per_trial(after)]
-    draws = np.random.default_rng(seed).integers(0, trials, (_DRAWS, trials))
+    draws = draws_of(trials, seed, _DRAWS)
     number = sums[0].sum(0)
     drawn = sums[0][draws].sum(1).clip(1)
     intervals = [np.percentile(x[draws].sum(1) / drawn, [2.5, 97.5], axis=0).T for x in sums[1:]]

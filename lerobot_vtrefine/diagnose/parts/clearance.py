@@ -12,8 +12,8 @@ import numpy as np
 
 from lerobot_vtrefine.diagnose.parts.episodes import AssumedScene, HandledEpisode, hands
 from lerobot_vtrefine.diagnose.parts.forces import places, point_forces
-from lerobot_vtrefine.diagnose.parts.payload import Arms
 from lerobot_vtrefine.diagnose.parts.grasp_geometry import pitches, tip_and_mouth
+from lerobot_vtrefine.diagnose.parts.payload import Arms
 from lerobot_vtrefine.diagnose.parts.regression import Blocks, Line, regress
 
 Array = np.ndarray

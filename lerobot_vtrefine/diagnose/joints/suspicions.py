@@ -1,27 +1,30 @@
-"""Signs that something acts which no accepted cause accounts for.
+"""What may be left on a joint: it repeats with the command, or does not; it follows the order of the trials,
+or something else that the model does not know (time, other joints, a load); it rings; it stands still.
 
-Five of them, on what the extended model leaves: it repeats in trials of one condition; it does not, by far
-more than encoders scatter; it follows the order of the trials, or something else that the model does not know
-(time, other joints, a load); it rings at one frequency.
+Shapes: N frames, T trials, J joints.
 """
 
-from dataclasses import dataclass, replace
+from dataclasses import replace
+from typing import TYPE_CHECKING
 
 import numpy as np
 
-from lerobot_vtrefine.diagnose.joints import flips
+from lerobot_vtrefine.diagnose.core.rules import LEAST_UNKNOWN
+from lerobot_vtrefine.diagnose.core.search import ALL
+from lerobot_vtrefine.diagnose.core.suspicion import Suspicion
 from lerobot_vtrefine.diagnose.joints.batch import frame_s
-from lerobot_vtrefine.diagnose.joints.candidates import DECOY, LATENCY, resolution
+from lerobot_vtrefine.diagnose.joints.encoder_steps import LEAST_EFFECT_RAD, resolution
 from lerobot_vtrefine.diagnose.joints.fitting import derivatives
 from lerobot_vtrefine.diagnose.joints.gravity import is_gripper
-from lerobot_vtrefine.diagnose.joints.repeatability import common_part, scatter
-from lerobot_vtrefine.diagnose.joints.selection import LEAST_EFFECT_RAD, LEAST_UNKNOWN, Selection
+from lerobot_vtrefine.diagnose.joints.repeatability import common_part, repeated, scatter
 from lerobot_vtrefine.diagnose.joints.session_trends import trends
 from lerobot_vtrefine.diagnose.joints.timing import mirrored
 
+if TYPE_CHECKING:
+    from lerobot_vtrefine.diagnose.joints.problem import Selected
+
 Array = np.ndarray
 
-ALPHA = 0.01
 _REPEATS, _REPEATS_ALL = 0.3, 0.6
 """Least part of what is left that must repeat; where it is this much, and in every condition, the conditions
 need not be enough for a small p."""
@@ -40,100 +43,66 @@ _TREND = 0.1
 _FOLLOWS, _FOLLOWS_IF_OWNED = 0.1, 0.4
 """Least part of what is left that must follow a descriptor; more where an accepted form may be off."""
 _LINE = 0.1
-FEW_TRIALS = 8
-_HELPS = 0.25
+_STOPPED = 0.4
+"""Part of the baseline's squared error in frames where a gripper stands far from its command, if it is met."""
+_MOTION = {"backlash", "joint_friction", "control_latency"}
+_POSTURE = {"gravity_sag", "encoder_offset"}
 _OWNED = {
-    "speed": {"backlash", "joint_friction", LATENCY},
-    "direction": {"backlash", "joint_friction", LATENCY},
-    "acceleration": {LATENCY, "backlash", "joint_friction"},
-    "position": {"gravity_sag", "encoder_offset"},
-    "squared position": {"gravity_sag", "encoder_offset"},
+    "speed": _MOTION,
+    "direction": _MOTION,
+    "acceleration": _MOTION,
+    "position": _POSTURE,
+    "squared position": _POSTURE,
     "load": {"gripper_compliance"},
 }
+"""Causes whose other forms follow a descriptor, too."""
 
 
-@dataclass(frozen=True)
-class Alarm:
-    """One joint's alarm: what it follows, and how much of the remaining squared error that is."""
-
-    joint: int
-    clue: str
-    share: float
-    p_value: float
-
-
-def raise_alarms(selection: Selection, seed: int) -> tuple[Alarm, ...]:
-    """All alarms: grippers that are stopped, then the strongest first; a decoy that was accepted is one."""
-    found = [
-        Alarm(joint, candidate.clue, 1.0, selection.p_values.get((DECOY, joint), 0.0))
-        for joint, candidates in selection.chosen.items()
-        for candidate in candidates
-        if candidate.cause == DECOY
-    ]
-    found += _repeating(selection, seed)
+def suspicions(selection: "Selected") -> list[Suspicion]:
+    """All of them; each must account for what is worth speaking of."""
+    found = _stopped(selection)
+    found += _repeating(selection)
     found += not_repeating(selection)
-    found += _through_the_session(selection, seed)
-    found += _following(selection, seed)
+    found += _through_the_session(selection)
+    found += _following(selection)
     found += _ringing(selection)
-    found.sort(key=lambda alarm: -alarm.share)
-    found += [] if found or selection.causes() else _too_few(selection)
-    # What stands still explains whatever else is odd about it.
-    stopped = _stopped(selection)
-    still = {alarm.joint for alarm in stopped}
-    return (*stopped, *(alarm for alarm in found if alarm.joint not in still))
+    least = _worth_speaking_of(selection)
+    return [replace(item, least=max(item.least, float(least[item.channel]))) for item in found]
 
 
-def _too_few(selection: Selection) -> list[Alarm]:
-    """Something helps on trials left out, but with so few trials nothing can be significant."""
-    if not 2 <= selection.problem.batch.trials < FEW_TRIALS:
-        return []
-    gains = {item.cause: item.gain for item in selection.first_round if item.cause != DECOY}
-    out = []
-    for joint in range(selection.problem.batch.joints):
-        names = sorted(
-            (name for name in gains if gains[name][joint] > _HELPS), key=lambda n: -gains[n][joint]
-        )
-        if names and _matters(selection, joint, gains[names[0]][joint]):
-            clue = f"the trials are too few to say which of these it is: {', '.join(names[:3])}"
-            out.append(Alarm(joint, clue, float(gains[names[0]][joint]), 1.0))
-    return out
+def _worth_speaking_of(selection: "Selected") -> Array:
+    """(J,) part of what is left that is: enough of the baseline's error, and more than encoders' steps."""
+    problem, left = selection.problem, selection.fit.total.clip(1e-300)
+    floor = max(LEAST_EFFECT_RAD, problem.floor)
+    size = np.array([floor * (0.1 if is_gripper(name) else 1.0) for name in problem.names])
+    size = np.maximum(size, 0.5 * resolution(problem))
+    return np.maximum(size**2, LEAST_UNKNOWN * selection.baseline.total) / left
 
 
-def _matters(selection: Selection, joint: int, share: float) -> bool:
-    """Whether that part of what is left on a joint is worth speaking of."""
-    left = selection.fit.total[joint]
-    size = np.sqrt(share * left)
-    least = max(0.5 * resolution(selection.problem)[joint], _least(selection, joint))
-    return bool(size > least and share * left > LEAST_UNKNOWN * selection.baseline.total[joint])
-
-
-def _least(selection: Selection, joint: int) -> float:
-    size = max(LEAST_EFFECT_RAD, selection.problem.floor)
-    return size * (0.1 if is_gripper(selection.problem.names[joint]) else 1.0)
-
-
-def _repeating(selection: Selection, seed: int) -> list[Alarm]:
+def _repeating(selection: "Selected") -> list[Suspicion]:
     """Residuals of trials of one condition, multiplied frame by frame: noise cancels, causes do not."""
-    rows, squares = common_part(selection.problem.batch, selection.fit.residual)
+    batch = selection.problem.batch
+    rows, squares = common_part(batch, selection.fit.residual)
     if len(rows) < _FEW_CONDITIONS:
         return []
-    _, adjusted = flips.one_sided(rows, seed)
+    scores = np.zeros((batch.trials, batch.joints))
+    scores[[pairs[0][0] for pairs in repeated(batch)]] = rows
     # Of what those trials leave: others, whose command came once, say nothing about it.
-    share = np.mean(rows, 0) / np.mean(squares, 0).clip(1e-300)
+    shares = np.mean(rows, 0) / np.mean(squares, 0).clip(1e-300)
     alone = _REPEATS_ALL if len(rows) >= _LEAST_CONDITIONS else _NEARLY_ALL
+    clue = "what is left repeats when the command is repeated"
     return [
-        Alarm(joint, "what is left repeats when the command is repeated", float(share[joint]), float(p))
-        for joint, p in enumerate(adjusted)
-        if (p < ALPHA or (share[joint] > alone and np.min(rows, 0)[joint] > 0))
-        and share[joint] > _REPEATS
-        and _matters(selection, joint, share[joint])
+        Suspicion(joint, clue, float(share), alone)
+        if share > alone and rows[:, joint].min() > 0
+        else Suspicion(joint, clue, float(share), _REPEATS, scores[:, joint])
+        for joint, share in enumerate(shares)
     ]
 
 
-def not_repeating(selection: Selection) -> list[Alarm]:
+def not_repeating(selection: "Selected") -> list[Suspicion]:
     """Trials of one command that differ by far more than their encoders scatter: what no command sets."""
     problem, fitted = selection.problem, selection.fit
-    if selection.delay_spread_s:  # which is a difference of that kind
+    if problem.delay_spread_s:  # which is a difference of that kind
         return []
     seen = scatter(problem.batch, fitted.residual, derivatives(problem, fitted).columns)
     if seen is None:
@@ -145,31 +114,40 @@ def not_repeating(selection: Selection) -> list[Alarm]:
     zeros = seen.zero > _ZEROS_DIFFER * white
     # What differs in shape has a mean and a likeness to slower servos, too.
     servos, zeros = servos & (seen.servo_effect > seen.shape), zeros & (seen.zero > seen.shape)
+    least, clue = (
+        _worth_speaking_of(selection),
+        "trials of one command differ by far more than the encoder scatters",
+    )
     found = []
     for joint in range(problem.batch.joints):
         for size, far in ((seen.shape, shapes), (seen.servo_effect, servos), (seen.zero, zeros)):
             share = float(min(size[joint] ** 2 / max(fitted.total[joint], 1e-300), 1.0))
-            if far[joint] and share > _REPEATS and _matters(selection, joint, share):
-                clue = "trials of one command differ by far more than the encoder scatters"
-                found.append(Alarm(joint, clue, share, 0.0))
+            if far[joint] and share > max(_REPEATS, least[joint]):
+                found.append(Suspicion(joint, clue, share, _REPEATS))
                 break
     return found
 
 
-def _through_the_session(selection: Selection, seed: int) -> list[Alarm]:
+def _through_the_session(selection: "Selected") -> list[Suspicion]:
     """A joint's zero, scale, servo or delay that follows the order of the trials."""
     problem, fitted = selection.problem, selection.fit
     later = derivatives(problem, replace(fitted, tau_free=True))
     assert later.tau is not None
-    found = trends(problem.batch, fitted.residual, later.columns, later.tau, seed)
     return [
-        Alarm(item.joint, f"the {item.kind} changes through the session", item.share, item.p_value)
-        for item in found
-        if item.p_value < ALPHA and item.share > _TREND and _matters(selection, item.joint, item.share)
+        Suspicion(
+            item.joint,
+            f"the {item.kind} changes through the session",
+            item.share,
+            _TREND,
+            item.change,
+            either_sign=True,
+            along=item.place,
+        )
+        for item in trends(problem.batch, fitted.residual, later.columns, later.tau)
     ]
 
 
-def descriptors(selection: Selection, joint: int) -> dict[str, Array]:
+def descriptors(selection: "Selected", joint: int) -> dict[str, Array]:
     """What an unknown cause may follow: name -> (N, T). Positions are the model's own, not measured ones."""
     problem, left = selection.problem, selection.fit.residual
     batch = problem.batch
@@ -207,13 +185,13 @@ def descriptors(selection: Selection, joint: int) -> dict[str, Array]:
     return out
 
 
-def _following(selection: Selection, seed: int) -> list[Alarm]:
+def _following(selection: "Selected") -> list[Suspicion]:
     """Descriptors, cleared of what the model's own parameters do, that trials agree on."""
     problem, fitted = selection.problem, selection.fit
     valid = problem.batch.valid
     derivative = derivatives(problem, fitted)
     trial = np.broadcast_to(np.arange(problem.batch.trials), valid.shape)[valid]
-    names, columns, shares = [], [], []
+    found = []
     for joint in range(problem.batch.joints):
         own = derivative.columns[joint][valid]
         if derivative.tau is not None:
@@ -227,21 +205,16 @@ def _following(selection: Selection, seed: int) -> list[Alarm]:
         power = np.square(z).sum(0)
         z = np.where(power > 1e-12 * len(z), z, 0.0)
         scores = np.stack([np.bincount(trial, z[:, k] * left) for k in range(z.shape[1])], 1)
-        shares.append(scores.sum(0) ** 2 / np.maximum(power * (left @ left), 1e-300))
-        columns.append(scores)
-        names += [(joint, name) for name in items]
-    _, adjusted = flips.two_sided(np.concatenate(columns, 1), seed)
-    found = []
-    for (joint, name), share, p in zip(names, np.concatenate(shares), adjusted, strict=True):
-        here = {candidate.cause for candidate in selection.chosen.get(joint, ())}
-        here |= {LATENCY} if selection.delayed else set()
-        least = _FOLLOWS_IF_OWNED if _OWNED.get(name, set()) & here else _FOLLOWS
-        if p < ALPHA and share > least and _matters(selection, joint, share):
-            found.append(Alarm(joint, f"what is left follows {name}", float(share), float(p)))
+        shares = scores.sum(0) ** 2 / np.maximum(power * (left @ left), 1e-300)
+        here = {item.cause for item in (*selection.chosen.get(joint, ()), *selection.chosen.get(ALL, ()))}
+        for k, name in enumerate(items):
+            least = _FOLLOWS_IF_OWNED if _OWNED.get(name, set()) & here else _FOLLOWS
+            clue = f"what is left follows {name}"
+            found.append(Suspicion(joint, clue, float(shares[k]), least, scores[:, k], either_sign=True))
     return found
 
 
-def _ringing(selection: Selection) -> list[Alarm]:
+def _ringing(selection: "Selected") -> list[Suspicion]:
     """A line in the mean spectrum of what is left that is no broad bump."""
     batch, left = selection.problem.batch, selection.fit.residual
     frame = frame_s(batch)
@@ -265,29 +238,26 @@ def _ringing(selection: Selection) -> list[Alarm]:
         share = float(spectrum[line - 2 : line + 3].sum() - 5 * np.median(around))
         driven = drive[line, joint] > 0.02 * drive[1:, joint].max()
         sharp = spectrum[line] > 6 * np.max(around) if len(around) else False
-        if sharp and share > _LINE and not driven and _matters(selection, joint, share):
-            found.append(Alarm(joint, f"what is left rings at {frequency[line]:.2g} Hz", share, 0.0))
+        if sharp and not driven:
+            found.append(Suspicion(joint, f"what is left rings at {frequency[line]:.2g} Hz", share, _LINE))
     return found
 
 
-def _stopped(selection: Selection) -> list[Alarm]:
+def _stopped(selection: "Selected") -> list[Suspicion]:
     """A gripper that stands still while its command goes on: it holds something, or is blocked."""
     found = []
     for joint, name in enumerate(selection.problem.names):
-        if not is_gripper(name):
-            continue
         used = {candidate.cause for candidate in selection.chosen.get(joint, ())}
-        if "gripper_compliance" in used:
-            continue
-        share = _stopped_share(selection, joint)
-        if share is not None and _matters(selection, joint, share):
+        if is_gripper(name) and "gripper_compliance" not in used:
             clue = "stands still while its command goes on: it closes on something"
-            found.append(Alarm(joint, clue, share, 0.0))
+            share = _stopped_share(selection, joint)
+            found.append(Suspicion(joint, clue, share, _STOPPED, decisive=True))
     return found
 
 
-def _stopped_share(selection: Selection, joint: int) -> float | None:
-    """Part of the baseline's squared error in frames where the joint rests far from its command, if most."""
+def _stopped_share(selection: "Selected", joint: int) -> float:
+    """Part of the baseline's squared error in frames where the joint rests far from its command; zero where
+    few trials have such frames."""
     batch = selection.problem.batch
     valid = batch.valid[1:]
     error = (batch.command - batch.position)[1:, :, joint]
@@ -296,5 +266,4 @@ def _stopped_share(selection: Selection, joint: int) -> float | None:
     stopped = valid & still & steady & (np.abs(error) > 2e-3)
     base = np.square(selection.baseline.residual[1:, :, joint])
     share = base[stopped].sum() / max(base[valid].sum(), 1e-300)
-    trials = np.any(stopped, axis=0).mean()
-    return float(share) if share > 0.4 and trials > 0.3 else None
+    return float(share) if np.any(stopped, axis=0).mean() > 0.3 else 0.0
