@@ -52,12 +52,15 @@ def cross_validated(
 ) -> Array:
     """Mean squared error (T, J) of every trial under a fit to the other folds, by one Newton step each.
 
-    Channels that cannot change, and all but `channels` if these are given, keep the errors that are `known`.
+    Where only some `channels` are given, the others keep the errors that are `known`.
     """
     if len(set(folds)) < 2:
         return fit.mse
     again = problem.reweighted(fit, channels)
-    mse = fit.mse.copy() if known is None else known.copy()
+    mse = fit.mse.copy()
+    if known is not None and channels is not None:
+        others = np.isin(np.arange(mse.shape[1]), channels, invert=True)
+        mse[:, others] = known[:, others]
     for fold in np.unique(folds):
         held = np.flatnonzero(folds == fold)
         mse[np.ix_(held, again.channels)] = again.errors((folds != fold).astype(float), held)

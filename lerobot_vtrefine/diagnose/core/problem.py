@@ -4,6 +4,7 @@ Shapes: T trials, J channels (1 for a camera, one per joint for a robot, one per
 """
 
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, Protocol, Self
 
 import numpy as np
@@ -50,6 +51,21 @@ class Candidate(Protocol):
     def refines(self, other: "Candidate") -> bool:
         """Whether its fit starts from that of another."""
         ...
+
+
+@dataclass(frozen=True)
+class PlainCandidate:
+    """A cause of one form that acts on single channels: what most instruments need."""
+
+    cause: str
+    handicap: float = 0.0
+    shared: bool = False
+    clue: str = ""
+    only_where: str = ""
+
+    def refines(self, other: Candidate) -> bool:
+        """It starts by itself."""
+        return False
 
 
 class Fit(Protocol):

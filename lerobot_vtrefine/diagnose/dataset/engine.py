@@ -12,7 +12,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from lerobot_vtrefine.datasets.episodes import open_episodes
-from lerobot_vtrefine.diagnose.camera.engine import diagnose_vision
+from lerobot_vtrefine.diagnose.camera.engine import diagnose_camera
 from lerobot_vtrefine.diagnose.camera.frames import has_depth
 from lerobot_vtrefine.diagnose.dataset.merge import beside
 from lerobot_vtrefine.diagnose.joints.dataset import episode_name
@@ -63,7 +63,7 @@ def diagnose_dataset(
     if not has_depth(recordings.path):
         return found
     tell("camera: comparing depth images", 0.9)
-    return beside(found, diagnose_vision(recordings.path, seed, progress))
+    return beside(found, diagnose_camera(recordings.path, seed, progress))
 
 
 @dataclass(frozen=True)
