@@ -6,7 +6,6 @@ Shapes: T episodes, F frames.
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Any
 
 import numpy as np
 
@@ -20,9 +19,7 @@ from lerobot_vtrefine.diagnose.camera.registration import (
     errors,
     register,
 )
-from lerobot_vtrefine.diagnose.core.problem import PlainCandidate
-from lerobot_vtrefine.diagnose.core.search import Selection
-from lerobot_vtrefine.diagnose.core.suspicion import Suspicion
+from lerobot_vtrefine.diagnose.core.problem import NothingBesides, PlainCandidate
 
 Array = np.ndarray
 
@@ -70,12 +67,12 @@ class Refits:
         return self.problem.mse(theta)[trials][:, self.channels]
 
 
-class CameraProblem:
-    """See `core.problem.Problem`."""
+class CameraProblem(NothingBesides):
+    """See `core.problem.Problem`; parts that the twin does not hold are in every image, so that nothing can be
+    said about what is left."""
 
     subject = "camera"
     channels = ("depth",)
-    can_settle = False
 
     def __init__(self, frames: DepthFrames) -> None:
         self.frames = frames
@@ -109,9 +106,7 @@ class CameraProblem:
         """(1,) whether its parameters are not free yet."""
         return np.array([not (now.registration.free & candidate.free).any()])
 
-    def extended(
-        self, now: Fit, candidate: Candidate, channels: Array, plainer: Fit | None = None
-    ) -> Fit:
+    def extended(self, now: Fit, candidate: Candidate, channels: Array, plainer: Fit | None = None) -> Fit:
         """With the candidate's parameters, too."""
         return self._fit(now.registration.free | candidate.free)
 
@@ -139,26 +134,6 @@ class CameraProblem:
     def credible(self, baseline: Fit, now: Fit, best: Fit, candidate: Candidate) -> Array:
         """(1,) Any size is."""
         return np.ones(1, dtype=bool)
-
-    def revised(self, now: Fit, accepted: Sequence[Candidate]) -> "CameraProblem":
-        """It stays."""
-        return self
-
-    def reviewed(self, selection: Selection[Any, Fit, Candidate], seed: int) -> Selection[Any, Fit, Candidate]:
-        """It stays."""
-        return selection
-
-    def settles(self, rival: Any, selection: Selection[Any, Fit, Candidate], seed: int) -> int:
-        """Nothing but the errors tells."""
-        return 0
-
-    def finer(self) -> None:
-        """There are no finer predictions."""
-        return
-
-    def suspicions(self, selection: Selection[Any, Fit, Candidate], seed: int) -> list[Suspicion]:
-        """Parts that the twin does not hold are in every image: nothing can be said about what is left."""
-        return []
 
     def _fit(self, free: Array) -> Fit:
         registration = register(self.twin, free)

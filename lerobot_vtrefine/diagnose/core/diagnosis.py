@@ -8,7 +8,7 @@ import numpy as np
 
 from lerobot_vtrefine.diagnose.core.suspicion import Alarm
 from lerobot_vtrefine.diagnose.evidence import Evidence, ResidualView, Savable, Trace, TrialError
-from lerobot_vtrefine.diagnose.verdict import Cause, DataIssue, Heldout, Parameter, Status, Unknown
+from lerobot_vtrefine.diagnose.verdict import Cause, DataIssue, Heldout, Parameter, Status, Unknown, Verdict
 
 
 @dataclass(frozen=True)
@@ -17,7 +17,7 @@ class Diagnosis:
 
     Attributes:
         status, causes, ambiguous_with, unknown, heldout, minimum_detectable, next_experiment: as in `Verdict`.
-        issues: problems of the data that were met beyond quality control.
+        issues: problems of the data.
         baseline_model, extended_model: what ``vtrefine-predict`` loads; None where nothing was fitted.
         baseline_params: the refitted parameters of the baseline, name -> value with interval.
         evidence: every candidate that was examined, rejected ones too.
@@ -26,6 +26,7 @@ class Diagnosis:
         alarms: everything behind `unknown`.
         maps: title -> (R, C); of pads only.
         unit: of readings or positions: "counts", "rad", "m".
+        checked: number of recordings that passed quality control.
     """
 
     status: Status
@@ -47,3 +48,18 @@ class Diagnosis:
     alarms: tuple[Alarm, ...] = ()
     maps: Mapping[str, np.ndarray] = field(default_factory=dict)
     unit: str = "rad"
+    checked: int = 0
+
+    @property
+    def verdict(self) -> Verdict:
+        """What ``verdict.json`` holds."""
+        return Verdict(
+            self.status,
+            self.causes,
+            self.ambiguous_with,
+            self.unknown,
+            self.heldout,
+            self.minimum_detectable,
+            self.next_experiment,
+            self.issues,
+        )

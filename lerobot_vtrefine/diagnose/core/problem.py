@@ -191,6 +191,32 @@ class Problem[F: Fit, C: Candidate](Protocol):
         ...
 
 
+class NothingBesides:
+    """For instruments that know nothing besides their errors."""
+
+    can_settle = False
+
+    def revised(self, now: Any, accepted: Any) -> Self:
+        """It stays."""
+        return self
+
+    def reviewed[S](self, selection: S, seed: int) -> S:
+        """It stays."""
+        return selection
+
+    def settles(self, rival: Any, selection: Any, seed: int) -> int:
+        """Nothing decides a tie."""
+        return 0
+
+    def finer(self) -> Self | None:
+        """There are no finer predictions."""
+        return None
+
+    def suspicions(self, selection: Any, seed: int) -> "Sequence[Suspicion]":
+        """Nothing can be said about what is left."""
+        return ()
+
+
 class Account[F: Fit, C: Candidate](Protocol):
     """How an instrument tells what was found: sizes, models, sentences, drawings."""
 

@@ -8,19 +8,22 @@ that the fit has not seen, all of them together saying so, is it the parts that 
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
 
 from lerobot_vtrefine.diagnose.parts.episodes import HandledEpisode
 from lerobot_vtrefine.diagnose.parts.payload import GRAVITY_M_S2, Arms, replay_loaded
-from lerobot_vtrefine.diagnose.parts.regression import Blocks, Line, regress
+from lerobot_vtrefine.diagnose.parts.problem import Measured, Quantity
+from lerobot_vtrefine.diagnose.parts.regression import Blocks, Line, slope_of
 from lerobot_vtrefine.embodiments import ALOHA
 
 Array = np.ndarray
 
 PARTS = ("socket", "plug")
 """In the order of the hands that hold them."""
+FORM = (0.06, 0.004)
+"""What the method errs by on the twin's own recordings: part of the value, and at least so much [kg]."""
 _HEAVIER_KG = 0.05
 _LIGHTEST_KG = 0.005
 _AGAIN = 0.2
@@ -35,63 +38,62 @@ _APART = 0.25
 chance."""
 
 
-@dataclass(frozen=True)
-class PartMass:
-    """One part's mass; `line` has the mass beyond the assumed one as its slope [kg]."""
-
-    part: str
-    assumed_kg: float
-    line: Line | None
-    """None where the hand is never seen both empty and loaded."""
-    reason: str = ""
-    """Why it cannot be told, or is not believed."""
-
-
-def estimate_masses(
+def masses(
     arms: Arms, episodes: Sequence[HandledEpisode], assumed_kg: Array, seed: int
-) -> tuple[PartMass, ...]:
-    """Masses of both parts (2,) from episodes in which they are picked up.
-
-    With friction in the joints the weight's effect is no straight line: it is taken anew at what was found.
-    """
-    first = _estimated(arms, episodes, assumed_kg, seed)
-    change = np.array([0.0 if item.line is None or item.reason else item.line.value for item in first])
-    near = np.maximum(assumed_kg + change, _LIGHTEST_KG) - assumed_kg
-    if not (np.abs(near) > _AGAIN * assumed_kg).any():
-        return first
-    second = _estimated(arms, episodes, assumed_kg + near, seed)
-    return tuple(
-        replace(item, line=_moved(item.line, again.line, float(step))) if item.line and again.line else item
-        for item, again, step in zip(first, second, near, strict=True)
-    )
+) -> tuple[Quantity, ...]:
+    """Of socket and plug, from episodes in which they are picked up; `assumed_kg` is (2,)."""
+    lines = _lines(arms, episodes, assumed_kg)
+    out = []
+    for part, known, item in zip(PARTS, assumed_kg, lines, strict=True):
+        name = f"{part}_kg"
+        if isinstance(item, str):
+            out.append(Quantity("object_mass", name, float(known), "kg", FORM, None, item))
+            continue
+        reason = _disagreement(item, slope_of(Blocks.of(item), seed), seed)
+        out.append(Quantity("object_mass", name, float(known), "kg", FORM, Blocks.of(item), reason))
+    return tuple(out)
 
 
-def _moved(first: Line, second: Line, step: float) -> Line:
-    """The second line's place, counted from where the first began; evidence is the first one's."""
-    low, high = second.ci95
-    return replace(first, value=second.value + step, ci95=(low + step, high + step), error=second.error)
+def remeasured(
+    arms: Arms, episodes: Sequence[HandledEpisode], found: Sequence[Measured], seed: int
+) -> tuple[Measured, ...]:
+    """Masses that are far off, taken anew where they were found: with friction in the joints the weight's
+    effect is no straight line. What was found stays found."""
+    assumed = np.array([item.quantity.assumed for item in found])
+    change = np.array([item.line.value if item.line and not item.quantity.reason else 0.0 for item in found])
+    near = np.maximum(assumed + change, _LIGHTEST_KG) - assumed
+    if not (np.abs(near) > _AGAIN * assumed).any():
+        return tuple(found)
+    out = []
+    for item, lines, step in zip(found, _lines(arms, episodes, assumed + near), near, strict=True):
+        if item.line is None or isinstance(lines, str):
+            out.append(item)
+            continue
+        again = slope_of(Blocks.of(lines), seed)
+        low, high = again.ci95
+        moved = Line(again.value + step, (low + step, high + step), again.error)
+        out.append(replace(item, line=moved))
+    return tuple(out)
 
 
-def _estimated(
-    arms: Arms, episodes: Sequence[HandledEpisode], assumed_kg: Array, seed: int
-) -> tuple[PartMass, ...]:
+def _lines(
+    arms: Arms, episodes: Sequence[HandledEpisode], assumed_kg: Array
+) -> list[list[tuple[Array, Array, Array]] | str]:
+    """Of either hand: blocks for `Blocks.of`, or why there are none."""
     light = [episode.hanging * assumed_kg * GRAVITY_M_S2 for episode in episodes]
     heavy = [episode.hanging * (assumed_kg + _HEAVIER_KG) * GRAVITY_M_S2 for episode in episodes]
     replays = [replay_loaded(arms, episodes, weights) for weights in (light, heavy)]
-    out = []
+    out: list[list[tuple[Array, Array, Array]] | str] = []
     for hand, part in enumerate(PARTS):
         seen = [bool(e.free[:, hand].any() and e.carried[:, hand].any()) for e in episodes]
         if sum(seen) < _LEAST_EPISODES:
-            reason = (
+            out.append(
                 f"the {part} is not picked up in sight of the encoders: a hand that always holds it cannot "
                 "tell its weight from offsets; record picking it up from the table"
             )
-            out.append(PartMass(part, float(assumed_kg[hand]), None, reason))
-            continue
-        blocks = [_block(e, *item, hand) for e, *item in zip(episodes, *replays, strict=True)]
-        line = regress(Blocks.of(blocks), seed)
-        out.append(PartMass(part, float(assumed_kg[hand]), line, _disagreement(blocks, line, seed)))
-    return tuple(out)
+        else:
+            out.append([_block(e, *item, hand) for e, *item in zip(episodes, *replays, strict=True)])
+    return out
 
 
 def _disagreement(blocks: list[tuple[Array, Array, Array]], line: Line, seed: int) -> str:
@@ -101,7 +103,7 @@ def _disagreement(blocks: list[tuple[Array, Array, Array]], line: Line, seed: in
         own = [(item[0][:, [channel]], item[1][:, [channel]], item[2][:, [channel]]) for item in blocks]
         if not any(effect.any() for _, effect, _ in own):
             continue
-        alone = regress(Blocks.of(own), seed)
+        alone = slope_of(Blocks.of(own), seed)
         if alone.error > _TELLING_KG:
             continue
         chance = 3 * np.hypot(alone.error, line.error)

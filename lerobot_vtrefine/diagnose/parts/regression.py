@@ -1,4 +1,4 @@
-"""One number that all joints share, beside nuisances of their own; the episode is the unit of evidence.
+"""Normal equations of one number that all joints share, beside nuisances of their own, episode by episode.
 
 Shapes: E episodes of N rows, C channels (joints), K nuisances per channel.
 """
@@ -9,12 +9,11 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.stats import t as student_t
 
-from lerobot_vtrefine.diagnose.joints import flips
+from lerobot_vtrefine.diagnose.core.resampling import draws_of
 
 Array = np.ndarray
 
 _DRAWS = 1000
-_FOLDS = 5
 _RIDGE = 1e-9
 
 
@@ -47,6 +46,11 @@ class Blocks:
             rows.append(len(left))
         return cls(np.stack(normal), np.stack(right), np.array(power), np.array(rows), scale)
 
+    def subset(self, episodes: Array) -> "Blocks":
+        """Only some episodes."""
+        parts = (self.normal, self.right, self.power, self.rows)
+        return Blocks(*(part[episodes] for part in parts), self.scale)
+
     def solve(self, weights: Array, slope: bool) -> Array:
         """Coefficients (P,) with every episode counted by its weight (E,); without slope it stays zero."""
         own = np.arange(self.normal.shape[1] - (not slope))
@@ -65,44 +69,25 @@ class Blocks:
 
 @dataclass(frozen=True)
 class Line:
-    """A slope that was found, or not."""
+    """A slope with its interval."""
 
     value: float
     ci95: tuple[float, float]
-    p_value: float
-    """That all episodes agree by accident that it lessens their error when left out of the fit."""
-    gain: float
-    """Part of the held-out squared error that it takes away."""
     error: float
     """Standard error, between episodes."""
 
 
-def regress(blocks: Blocks, seed: int) -> Line:
-    """Fit the slope; interval by resampling episodes, evidence by leaving episodes out."""
+def slope_of(blocks: Blocks, seed: int) -> Line:
+    """Fit the slope; interval by drawing whole episodes."""
     count = len(blocks.rows)
-    without, having = (_held_out(blocks, slope, seed) for slope in (False, True))
-    score = (without - having) / (without + having).clip(1e-300)
-    alone, _ = flips.one_sided(score[:, None], seed)
     value = float(blocks.solve(np.ones(count), slope=True)[-1])
-    rng = np.random.default_rng(seed)
-    drawn = np.empty(_DRAWS)
-    for draw in range(_DRAWS):
-        weights = np.bincount(rng.integers(0, count, count), minlength=count).astype(float)
-        drawn[draw] = blocks.solve(weights, slope=True)[-1]
-    error = float(drawn.std(ddof=1) * np.sqrt(count / max(count - 1, 1)))
+    drawn = [
+        blocks.solve(np.bincount(row, minlength=count).astype(float), slope=True)[-1]
+        for row in draws_of(count, seed, _DRAWS)
+    ]
+    error = float(np.std(drawn, ddof=1) * np.sqrt(count / max(count - 1, 1)))
     half = float(student_t.ppf(0.975, max(count - 1, 1))) * error
-    gain = float(1 - having.mean() / max(without.mean(), 1e-300))
-    return Line(value, (value - half, value + half), float(alone[0]), gain, error)
-
-
-def _held_out(blocks: Blocks, slope: bool, seed: int) -> Array:
-    count = len(blocks.rows)
-    fold = np.random.default_rng(seed).permutation(count) % min(_FOLDS, count)
-    out = np.empty(count)
-    for number in np.unique(fold):
-        theta = blocks.solve((fold != number).astype(float), slope)
-        out[fold == number] = blocks.errors(theta)[fold == number]
-    return out
+    return Line(value, (value - half, value + half), error)
 
 
 def _design(effect: Array, nuisance: Array) -> Array:
