@@ -44,8 +44,8 @@ def diagnose(
     """Quality control and diagnosis.
 
     Args:
-        source: a folder with ``recording.json``, a LeRobot dataset or its folder (one episode is one trial), or
-            recordings that were read already.
+        source: a folder with ``recording.json``, a LeRobot dataset or its folder (one episode is one trial),
+            or recordings that were read already.
         seed: of resampling and of what is locked away.
         progress: told what is being done and the fraction done.
 

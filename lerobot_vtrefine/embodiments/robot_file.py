@@ -1,5 +1,6 @@
 """The robot model as a file: what diagnosis writes, and what prediction and the simulation read."""
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal
@@ -44,6 +45,8 @@ class JointModel:
     """Half the spread of the widths that make up the plays, as a part of their mean."""
     breakaway: float = limits(0.0, 100.0, default=0.0)
     """By what part breaking away takes more than `friction`."""
+    laws: Mapping[str, float] = limits(maximum=MAX_POSITION, default_factory=dict)
+    """Parameters of further laws, see `diagnose.joints.stages`; what is not there is zero."""
 
 
 @dataclass(frozen=True)

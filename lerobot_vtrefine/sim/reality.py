@@ -139,6 +139,11 @@ def _diagnosed(model: RobotFile) -> RobotFaults:
     if unknown:
         raise ValueError(f"the simulated arms have no joint {unknown[0][:60]!r}")
     arms = {name: item for name, item in by_name.items() if not name.endswith("_finger")}
+    strange = next(((name, law) for name, item in arms.items() for law in item.laws), None)
+    if strange is not None:
+        raise ValueError(
+            f"the simulated arms know no law {strange[1][:60]!r}, which joint {strange[0]!r} has"
+        )
     play = {name: item.backlash_command + item.backlash_output for name, item in arms.items()}
     return RobotFaults(
         min(model.control_latency_s, MAX_LATENCY_S),

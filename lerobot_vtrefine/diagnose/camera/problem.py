@@ -68,8 +68,8 @@ class Refits:
 
 
 class CameraProblem(NothingBesides):
-    """See `core.problem.Problem`; parts that the twin does not hold are in every image, so that nothing can be
-    said about what is left."""
+    """See `core.problem.Problem`; parts that the twin does not hold are in every image, so that nothing can
+    be said about what is left."""
 
     subject = "camera"
     channels = ("depth",)

@@ -16,7 +16,8 @@ class Diagnosis:
     """What was found, for pads, joints, cameras and parts alike.
 
     Attributes:
-        status, causes, ambiguous_with, unknown, heldout, minimum_detectable, next_experiment: as in `Verdict`.
+        status, causes, ambiguous_with, unknown, heldout, minimum_detectable, next_experiment: as in
+            `Verdict`.
         issues: problems of the data.
         baseline_model, extended_model: what ``vtrefine-predict`` loads; None where nothing was fitted.
         baseline_params: the refitted parameters of the baseline, name -> value with interval.

@@ -1,7 +1,7 @@
 """Resampling of whole trials: sign flips, folds, the jackknife, the bootstrap.
 
-Trials are the unit of evidence, for readings within one share its faults. Under the null a trial's score is as
-likely negative as positive, whatever its variance (Hemerik et al. 2020). Shapes: T trials, K hypotheses.
+Trials are the unit of evidence, for readings within one share its faults. Under the null a trial's score is
+as likely negative as positive, whatever its variance (Hemerik et al. 2020). Shapes: T trials, K hypotheses.
 """
 
 from collections.abc import Sequence

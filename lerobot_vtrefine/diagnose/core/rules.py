@@ -46,6 +46,6 @@ WHOLE_CONDITIONS_FROM = 6
 SURE = 3.2 + 0.84
 """Standard errors at which four in five searches find an effect, all candidates considered."""
 UNSEEN = 0.05
-"""An effect of which less than this part is not what the baseline's own parameters can do is not identifiable."""
+"""Part of an effect that the baseline's own parameters must not be able to do for it to be identifiable."""
 FEW_TRIALS = 8
 """With fewer trials than this no sign flips can be significant over a catalogue of candidates."""

@@ -191,11 +191,11 @@ class Search[P: Problem[Any, Any], F: Fit, C: Candidate]:
         before = np.log(self.errors.mean(0).clip(1e-300))
         own = sum(before[k] - np.log(item.errors.mean(0)[k].clip(1e-300)) for k, item in best.items())
         for item in tried:
-            if item.candidate.shared and item.accepted.any():
-                if (before - np.log(item.errors.mean(0).clip(1e-300))).sum() > own:
-                    self._take(item, ALL)
-                    self.changed = np.ones_like(self.changed)
-                    return True
+            together = (before - np.log(item.errors.mean(0).clip(1e-300))).sum()
+            if item.candidate.shared and item.accepted.any() and together > own:
+                self._take(item, ALL)
+                self.changed = np.ones_like(self.changed)
+                return True
         self.changed = np.isin(np.arange(len(self.changed)), list(best))
         for channel, item in best.items():
             self._take(item, channel)

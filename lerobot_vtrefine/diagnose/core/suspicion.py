@@ -1,8 +1,8 @@
 """Signs that something acts which no accepted cause accounts for, under one error rate.
 
-A suspicion that can be tested is a score per trial, as likely negative as positive (or in any order) if nothing
-is there; all of them together are one max-T test. What can only be observed (a size beyond any that sound recordings have, in
-trials too few to test) has no p-value and says so.
+A suspicion that can be tested is a score per trial, as likely negative as positive (or in any order) if
+nothing is there; all of them together are one max-T test. What can only be observed (a size beyond any that
+sound recordings have, in trials too few to test) has no p-value and says so.
 """
 
 from collections.abc import Sequence
@@ -32,7 +32,8 @@ class Suspicion:
     least: float
     """Smallest such part that is worth an alarm."""
     scores: Array | None = None
-    """(T,), as likely negative as positive under the null; zero for trials that say nothing, None: observed."""
+    """(T,), as likely negative as positive under the null; zero for trials that say nothing.
+    None: observed."""
     either_sign: bool = False
     """Whether scores that are negative throughout are as telling."""
     along: Array | None = None

@@ -19,6 +19,7 @@ from lerobot_vtrefine.diagnose.core.engine import Progress
 from lerobot_vtrefine.diagnose.dataset.merge import merged
 from lerobot_vtrefine.diagnose.joints.dataset import episode_name
 from lerobot_vtrefine.diagnose.joints.engine import diagnose_robot
+from lerobot_vtrefine.diagnose.joints.model import RobotModel
 from lerobot_vtrefine.diagnose.joints.twin_diagnosis import TwinTrial, beyond_twin, diagnose_on_twin
 from lerobot_vtrefine.diagnose.parts.engine import (
     assumed_masses,
@@ -120,6 +121,7 @@ def _robot(session: _Session, mass_kg: Array, seed: int, progress: Progress | No
 def _corrected(session: _Session, found: Diagnosis, mass_kg: Array) -> Sequence[HandledEpisode]:
     """Episodes as the twin's own encoders would have read them, had the robot none of what was found."""
     twin, arms = session.twin(mass_kg), session.arms
+    assert isinstance(found.extended_model, RobotModel)
     more = beyond_twin(session.recordings, twin, arms.config, arms.hold, found.extended_model)
     return [
         replace(episode, position=episode.position - more[episode_name(episode.index)])

@@ -10,11 +10,10 @@ from lerobot_vtrefine.diagnose.evidence import ResidualView, Trace
 from lerobot_vtrefine.diagnose.joints import experiments, views
 from lerobot_vtrefine.diagnose.joints.candidates import NAMES, NOT_SHOWN, SIZES
 from lerobot_vtrefine.diagnose.joints.candidates.base import Candidate
-from lerobot_vtrefine.diagnose.joints.conversion import to_model
 from lerobot_vtrefine.diagnose.joints.detectable import minimum_detectable
 from lerobot_vtrefine.diagnose.joints.estimates import Estimates, repeatability
 from lerobot_vtrefine.diagnose.joints.fitting import INDEX, Fit
-from lerobot_vtrefine.diagnose.joints.model import RobotModel
+from lerobot_vtrefine.diagnose.joints.model import RobotModel, to_model
 from lerobot_vtrefine.diagnose.joints.problem import JointProblem
 from lerobot_vtrefine.diagnose.verdict import Parameter
 

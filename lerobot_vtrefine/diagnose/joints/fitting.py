@@ -9,19 +9,21 @@ from typing import Self
 
 import numpy as np
 
-from lerobot_vtrefine.diagnose.joints import gravity
+from lerobot_vtrefine.diagnose.joints import gravity, stages
 from lerobot_vtrefine.diagnose.joints.batch import Batch, frame_s
 from lerobot_vtrefine.diagnose.joints.servo import Columns, simulate
+from lerobot_vtrefine.diagnose.joints.stages import STAGES
 
 Array = np.ndarray
 
 SAG = tuple(f"sag{term}" for term in range(gravity.TERMS))
-RATIOS = ("round", "stick")
+_SHAPES = ("round", "stick")
+RATIOS = (*_SHAPES, *(name for stage in STAGES for name in stage.ratios))
 """Numbers without a unit, of the order of one."""
 _SERVO = ("log_omega", "log_zeta", "offset", "play", "loose", "friction")
-PARAMETERS = (*_SERVO, *SAG, "bend", "stop", "give", *RATIOS)
+PARAMETERS = (*_SERVO, *SAG, "bend", "stop", "give", *_SHAPES, *stages.parameters())
 INDEX = {name: place for place, name in enumerate(PARAMETERS)}
-POSITIVE = ("play", "loose", "friction", "stop", *RATIOS)
+POSITIVE = ("play", "loose", "friction", "stop", *_SHAPES)
 OMEGA_BOUNDS = (0.5, 300.0)
 ZETA_BOUNDS = (0.1, 20.0)
 _RADIANS_PER_FRAME = (6.0, 3.0)
@@ -133,20 +135,17 @@ class ServoTrials:
         """Positions (N, T, C) of columns: joints (C,) under parameters (C, P); by default all joints."""
         joint = np.arange(self.batch.joints) if joint is None else joint
         theta = point.theta[joint] if theta is None else theta
+        value = dict(zip(PARAMETERS, theta.T, strict=True))
+        plain = ("offset", "play", "loose", "friction", "stop", "give", "stick")
         columns = Columns(
             joint=joint,
-            omega=np.exp(theta[:, INDEX["log_omega"]]),
-            zeta=np.exp(theta[:, INDEX["log_zeta"]]),
-            offset=theta[:, INDEX["offset"]],
-            play=theta[:, INDEX["play"]],
-            loose=theta[:, INDEX["loose"]],
-            friction=theta[:, INDEX["friction"]],
-            stop=theta[:, INDEX["stop"]],
-            give=theta[:, INDEX["give"]],
-            rounding=theta[:, INDEX["round"]],
-            stick=theta[:, INDEX["stick"]],
+            omega=np.exp(value["log_omega"]),
+            zeta=np.exp(value["log_zeta"]),
+            rounding=value["round"],
             tau_s=point.tau_s,
             push=self._push(point.forms, joint, theta),
+            stages={name: value[name] for name in stages.parameters()},
+            **{name: value[name] for name in plain},
         )
         return simulate(self.batch, columns)
 
@@ -165,8 +164,9 @@ class ServoTrials:
         for column, index in enumerate(joint):
             if sag[column].any():
                 push[..., column] = self.shapes[forms[index]][:, :, index] @ sag[column]
-            if load is not None and bend[column]:
-                push[..., column] -= bend[column] * load[..., index]
+        if load is not None and bend.any():
+            values = {name: theta[:, INDEX[name]] for name in stages.parameters()}
+            push -= bend * stages.spring(load[..., joint], values)
         return push
 
 
@@ -398,6 +398,7 @@ def _bounded(problem: ServoTrials, point: Point, free: Array) -> Point:
     for name in POSITIVE:
         most = _LARGEST.get(name, widest)
         theta[:, INDEX[name]] = theta[:, INDEX[name]].clip(0.0, most)
-    theta[:, INDEX["give"]] = theta[:, INDEX["give"]].clip(0.0, 1.0)
+    for name, ends in (("give", (0.0, 1.0)), *(item for stage in STAGES for item in stage.bounds.items())):
+        theta[:, INDEX[name]] = theta[:, INDEX[name]].clip(*ends)
     theta = np.where(free, theta, point.theta)
     return replace(point, theta=theta, tau_s=float(np.clip(point.tau_s, 0.0, TAU_BOUND_S)))

@@ -3,16 +3,23 @@
 import json
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 
-from lerobot_vtrefine.diagnose.joints import gravity
+from lerobot_vtrefine.diagnose.joints import stages
 from lerobot_vtrefine.diagnose.joints.batch import Batch, make_batch
-from lerobot_vtrefine.diagnose.joints.servo import Columns, simulate
+from lerobot_vtrefine.diagnose.joints.fitting import PARAMETERS, SAG, Point, ServoTrials
 from lerobot_vtrefine.diagnose.recordings import RobotTrial
 from lerobot_vtrefine.diagnose.verdict import write_atomically
-from lerobot_vtrefine.embodiments.robot_file import SCHEMA, JointModel, decode_robot, read_robot_file
+from lerobot_vtrefine.embodiments.robot_file import (
+    SCHEMA,
+    JointModel,
+    RobotFile,
+    SagForm,
+    decode_robot,
+    read_robot_file,
+)
 
 __all__ = ["SCHEMA", "JointModel", "RobotModel", "predict_positions"]
 
@@ -36,43 +43,9 @@ class RobotModel:
 
     def predict(self, batch: Batch) -> np.ndarray:
         """Positions (N, T, J) of trials from their commands, loads and first positions."""
-        return simulate(batch, self._columns(batch))
-
-    def _columns(self, batch: Batch) -> Columns:
-        def column(name: str) -> np.ndarray:
-            return np.array([getattr(joint, name) for joint in self.joints], dtype=float)
-
-        push = np.zeros_like(batch.command)
-        if any(any(joint.sag_terms) for joint in self.joints):
-            # Gravity pulls at the arm where it stands once it has sagged.
-            for _ in range(2):
-                push = self._sag(batch.command + push)
-        compliance = column("compliance")
-        if compliance.any() and batch.load is not None:
-            push -= compliance * batch.load
-        return Columns(
-            joint=np.arange(len(self.joints)),
-            omega=column("natural_frequency_rad_s"),
-            zeta=column("damping_ratio"),
-            offset=column("encoder_offset"),
-            play=column("backlash_command"),
-            loose=column("backlash_output"),
-            friction=column("friction"),
-            stop=column("stop"),
-            give=column("give"),
-            rounding=column("backlash_rounding"),
-            stick=column("breakaway"),
-            tau_s=self.control_latency_s,
-            push=push if push.any() else None,
-        )
-
-    def _sag(self, posture: np.ndarray) -> np.ndarray:
-        """(N, T, J) at a posture (N, T, J)."""
-        forms = gravity.shapes(self.names, posture)
-        terms = [
-            forms[item.sag_form][..., k, :] @ np.array(item.sag_terms) for k, item in enumerate(self.joints)
-        ]
-        return np.stack(terms, -1)
+        point = from_model(self)
+        # Gravity pulls at the arm where it stands once it has sagged.
+        return ServoTrials.of(self.names, batch).bent(point).predict(point)
 
     def to_dict(self) -> dict[str, Any]:
         """JSON-ready form."""
@@ -85,8 +58,7 @@ class RobotModel:
     @classmethod
     def from_dict(cls, data: Any) -> "RobotModel":
         """Inverse of `to_dict`; ValueError says what is missing or wrong."""
-        content = decode_robot(data)
-        return cls(content.joints, content.control_latency_s)
+        return cls._of(decode_robot(data))
 
     def save(self, path: str | Path) -> None:
         """Write the file, whole or not at all."""
@@ -96,6 +68,19 @@ class RobotModel:
     def load(cls, path: str | Path) -> "RobotModel":
         """Read the file; ValueError names it and what is wrong with it."""
         content = read_robot_file(path)
+        try:
+            return cls._of(content)
+        except ValueError as error:
+            raise ValueError(f"{path}: {error}") from error
+
+    @classmethod
+    def _of(cls, content: RobotFile) -> "RobotModel":
+        known = stages.parameters()
+        for joint in content.joints:
+            if unknown := sorted(set(joint.laws) - set(known)):
+                raise ValueError(
+                    f"joint {joint.name[:60]!r} has no law {unknown[0][:60]!r}; valid: {', '.join(known)}"
+                )
         return cls(content.joints, content.control_latency_s)
 
 
@@ -110,3 +95,53 @@ def predict_positions(model: RobotModel, trial: RobotTrial) -> np.ndarray:
         )
     hidden = np.repeat(trial.position[:1], len(trial.time_s), 0)
     return model.predict(make_batch([replace(trial, position=hidden)]))[:, 0]
+
+
+def to_model(names: tuple[str, ...], point: Point) -> RobotModel:
+    """As the file that is written."""
+    joints = []
+    for index, name in enumerate(names):
+        value = dict(zip(PARAMETERS, point.theta[index].tolist(), strict=True))
+        joints.append(
+            JointModel(
+                name=name,
+                natural_frequency_rad_s=float(np.exp(value["log_omega"])),
+                damping_ratio=float(np.exp(value["log_zeta"])),
+                encoder_offset=value["offset"],
+                backlash_command=value["play"],
+                backlash_output=value["loose"],
+                friction=value["friction"],
+                sag_form=cast("SagForm", point.forms[index]),
+                sag_terms=tuple(value[name] for name in SAG),
+                compliance=value["bend"],
+                stop=value["stop"],
+                give=value["give"],
+                backlash_rounding=value["round"],
+                breakaway=value["stick"],
+                laws={name: value[name] for name in stages.parameters() if value[name]},
+            )
+        )
+    return RobotModel(tuple(joints), point.tau_s)
+
+
+def from_model(model: RobotModel) -> Point:
+    """Inverse of `to_model`."""
+    rows = [
+        (
+            np.log(joint.natural_frequency_rad_s),
+            np.log(joint.damping_ratio),
+            joint.encoder_offset,
+            joint.backlash_command,
+            joint.backlash_output,
+            joint.friction,
+            *joint.sag_terms,
+            joint.compliance,
+            joint.stop,
+            joint.give,
+            joint.backlash_rounding,
+            joint.breakaway,
+            *(joint.laws.get(name, 0.0) for name in stages.parameters()),
+        )
+        for joint in model.joints
+    ]
+    return Point(np.array(rows), tuple(joint.sag_form for joint in model.joints), model.control_latency_s)

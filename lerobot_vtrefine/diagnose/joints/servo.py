@@ -14,11 +14,13 @@ Shapes: N frames, T trials, C columns. A column is one joint under one set of pa
 joints when several sets are tried at once.
 """
 
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 
 import numpy as np
 
 from lerobot_vtrefine.diagnose.joints.batch import Batch
+from lerobot_vtrefine.diagnose.joints.stages import applied
 
 Array = np.ndarray
 
@@ -60,13 +62,15 @@ class Columns:
     """Every command acts this late."""
     push: Array | None = None
     """(N, T, C) added to the target."""
+    stages: Mapping[str, Array] | None = None
+    """Values (C,) of `stages.parameters`."""
 
     def only(self, kind: Array) -> "Columns":
         """The servo's parameters of some columns."""
         names = ("joint", "omega", "zeta", "offset", "play", "loose", "friction")
         own = {name: getattr(self, name)[kind] for name in names}
         stick = None if self.stick is None else self.stick[kind]
-        return replace(self, **own, stop=None, give=None, push=None, rounding=None, stick=stick)
+        return replace(self, **own, stop=None, give=None, push=None, stages=None, rounding=None, stick=stick)
 
 
 def simulate(batch: Batch, columns: Columns) -> Array:
@@ -75,6 +79,9 @@ def simulate(batch: Batch, columns: Columns) -> Array:
     target = _play(batch.command[:, :, columns.joint], columns, start)
     if columns.stop is not None and columns.give is not None and (columns.stop > 0).any():
         target = blocked(target, columns.stop, columns.give)
+    load = None if batch.load is None else batch.load[:, :, columns.joint]
+    if columns.stages is not None:
+        target = applied("target", target, columns.stages, load)
     start = np.clip(target[0], start - columns.loose / 2, start + columns.loose / 2)
     dry = columns.friction > 0
     q = np.empty_like(target)
@@ -84,6 +91,8 @@ def simulate(batch: Batch, columns: Columns) -> Array:
     if (columns.loose > 0).any():
         first = batch.first_position[:, columns.joint] - columns.offset
         q = _worn(q, columns.loose, columns.rounding, first)
+    if columns.stages is not None:
+        q = applied("reading", q, columns.stages, load)
     return q + columns.offset
 
 

@@ -44,7 +44,7 @@ _FOLLOWS, _FOLLOWS_IF_OWNED = 0.1, 0.4
 """Least part of what is left that must follow a descriptor; more where an accepted form may be off."""
 _LINE = 0.1
 _STOPPED = 0.4
-"""Part of the baseline's squared error in frames where a gripper stands far from its command, if it is met."""
+"""Part of the baseline's squared error in frames where a gripper stands far from its command."""
 _MOTION = {"backlash", "joint_friction", "control_latency"}
 _POSTURE = {"gravity_sag", "encoder_offset"}
 _OWNED = {

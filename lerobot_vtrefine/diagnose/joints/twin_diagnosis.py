@@ -18,10 +18,9 @@ from lerobot_vtrefine.diagnose.core.diagnosis import Diagnosis
 from lerobot_vtrefine.diagnose.core.engine import Progress
 from lerobot_vtrefine.diagnose.evidence import Trace
 from lerobot_vtrefine.diagnose.joints.batch import make_batch
-from lerobot_vtrefine.diagnose.joints.conversion import from_model
 from lerobot_vtrefine.diagnose.joints.engine import diagnose_problem
 from lerobot_vtrefine.diagnose.joints.gravity import is_sliding
-from lerobot_vtrefine.diagnose.joints.model import RobotModel
+from lerobot_vtrefine.diagnose.joints.model import RobotModel, from_model
 from lerobot_vtrefine.diagnose.joints.twin_problem import COARSE_S, FINE_S, NOMINAL, TwinProblem
 from lerobot_vtrefine.diagnose.recordings import RecordingSet, RobotTrial
 from lerobot_vtrefine.diagnose.verdict import Parameter
@@ -119,6 +118,7 @@ def _absolute(
 def _servos(found: Diagnosis) -> dict[str, Parameter]:
     """The refitted servo gains and dampings of the twin's revolute joints."""
     out: dict[str, Parameter] = {}
+    assert isinstance(found.baseline_model, RobotModel)
     for joint in found.baseline_model.joints:
         if is_sliding(joint.name):
             continue

@@ -40,7 +40,8 @@ COARSE_S, FINE_S = 0.02, 0.005
 
 @dataclass(frozen=True)
 class TwinProblem(JointProblem):
-    """A `JointProblem` whose predictions are replays; trials are those of the twin's own robot, evenly spaced."""
+    """A `JointProblem` whose predictions are replays; trials are those of the twin's own robot,
+    evenly spaced."""
 
     hold: str = "linear"
     """linear or zero_order, see `command_replay.HOLDS`."""
@@ -90,8 +91,8 @@ class TwinProblem(JointProblem):
 
     @property
     def weight(self) -> Array:
-        """See `JointProblem.weight`. Fingers tell nothing about a delay: where they hold something, their commands
-        are their own positions."""
+        """See `JointProblem.weight`. Fingers tell nothing about a delay: where they hold something, their
+        commands are their own positions."""
         slides = np.array([gravity.is_sliding(name) for name in self.names])
         return np.where(slides, 0.0, super().weight)
 

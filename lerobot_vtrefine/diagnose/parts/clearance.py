@@ -66,9 +66,9 @@ def clearance(
     """The hole's, across the pads."""
     known = scene.scene.hole_clearance_m
     blocks, reason = _blocks(known, episodes, contacts)
-    if blocks is not None and scene.pair.name == "round":
-        if blocks.solve(np.ones(len(blocks.rows)), slope=True)[-1] < 0:
-            reason = _ROUND
+    round_hole = blocks is not None and scene.pair.name == "round"
+    if round_hole and blocks.solve(np.ones(len(blocks.rows)), slope=True)[-1] < 0:
+        reason = _ROUND
     return Quantity("clearance", "clearance", known, "m", FORM, blocks, reason)
 
 

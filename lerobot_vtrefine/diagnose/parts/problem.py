@@ -1,5 +1,5 @@
-"""Numbers about parts as the core's problem: episodes are trials, every number is a channel with errors of its
-own, and what it differs by from what is assumed is its one candidate.
+"""Numbers about parts as the core's problem: episodes are trials, every number is a channel with errors of
+its own, and what it differs by from what is assumed is its one candidate.
 
 Shapes: T episodes, J numbers.
 """
@@ -216,7 +216,9 @@ def measure(quantities: Sequence[Quantity], seed: int) -> tuple[Measured, ...]:
         selection = infer(PartProblem(tuple(shown), blocks, lines), seed, locking=False).selection
         for channel, (item, line) in enumerate(zip(shown, lines, strict=True)):
             tried = next(one for one in selection.first_round if one.cause == item.cause)
-            evidence = (x[channel] for x in (tried.p_alone, tried.p_adjusted, tried.gain))
+            assert tried.p_alone is not None
+            assert tried.p_adjusted is not None
+            p_values = float(tried.p_alone[channel]), float(tried.p_adjusted[channel])
             found = channel in selection.causes().get(item.cause, ())
-            known[item.name] = Measured(item, line, *(float(x) for x in evidence), found)
+            known[item.name] = Measured(item, line, *p_values, float(tried.gain[channel]), found)
     return tuple(known.get(item.name, Measured(item)) for item in quantities)

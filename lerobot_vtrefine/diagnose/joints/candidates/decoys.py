@@ -1,4 +1,4 @@
-"""Faults that no name of the catalogue covers: they compete with causes, and where one wins it is an alarm."""
+"""Faults that no name of the catalogue covers. They compete with causes; one that wins is an alarm."""
 
 from functools import partial
 

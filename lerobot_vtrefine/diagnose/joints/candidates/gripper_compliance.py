@@ -8,12 +8,15 @@ from lerobot_vtrefine.diagnose.joints.candidates.base import Candidate, at_zero
 from lerobot_vtrefine.diagnose.joints.encoder_steps import moving
 from lerobot_vtrefine.diagnose.joints.estimates import Estimates, MethodError, widened
 from lerobot_vtrefine.diagnose.joints.fitting import INDEX, Point, ServoTrials
+from lerobot_vtrefine.diagnose.joints.stages import parameters, spring
 from lerobot_vtrefine.diagnose.verdict import Parameter
 
 Array = np.ndarray
 
 METHOD = MethodError(0.015, 0.0)
 NOT_SHOWN = "needs the column load on a gripper"
+_PRESSED = 0.15
+"""Part of the largest load from which on slack is taken up."""
 _SURELY_STOPPED = 0.1
 """Part of the frames, those in which a gripper's command is furthest beyond it, that show where it stops."""
 
@@ -45,8 +48,24 @@ def _stopped(problem: ServoTrials, point: Point, joints: Array, multiple: float)
     return point.with_values("give", multiple, joints)
 
 
+_CURVE_LEAD = 0.02
+"""By how much a spring that is not linear must beat a linear one."""
+
 FORMS = (
+    # Before the servo, which then follows, or behind it, at once.
     Candidate("gripper_compliance", ("bend",), possible=_loaded, start=at_zero),
+    Candidate("gripper_compliance", ("flex",), possible=_loaded, start=at_zero, sized=False),
+    *(
+        Candidate(
+            "gripper_compliance",
+            (size, "back", "slack", "curve"),
+            (0.0,),
+            possible=_loaded,
+            handicap=_CURVE_LEAD,
+            sized=False,
+        )
+        for size in ("bend", "flex")
+    ),
     Candidate(
         "gripper_compliance", ("stop", "give"), (0.02, 0.2), possible=_may_meet, start=_stopped, sized=False
     ),
@@ -56,7 +75,7 @@ FORMS = (
 def sizes(estimates: Estimates, joints: tuple[int, ...]) -> dict[str, Parameter]:
     """By its load, or by where the gripper stops and how far it gives there."""
     free, theta = estimates.selection.fit.free, estimates.selection.fit.point.theta
-    loaded = tuple(joint for joint in joints if free[joint, INDEX["bend"]])
+    loaded = tuple(joint for joint in joints if free[joint, [INDEX["bend"], INDEX["flex"]]].any())
     out = {"m_per_n": _compliance(estimates, loaded)} if loaded else {}
     for joint in joints:
         for parameter, unit in (("stop", "m"), ("give", "1")):
@@ -72,9 +91,11 @@ def sizes(estimates: Estimates, joints: tuple[int, ...]) -> dict[str, Parameter]
 def _compliance(estimates: Estimates, joints: tuple[int, ...]) -> Parameter:
     """One number for all grippers: their mean, each weighted by how well it is known; fingers that move the
     other way have loads of the other sign or not, so sizes are averaged."""
-    index, column = list(joints), INDEX["bend"]
-    value = estimates.selection.fit.point.theta[index, column]
-    drawn = estimates.theta[:, index, column]
+    index = list(joints)
+    value = np.array(
+        [_slope(estimates, joint, estimates.selection.fit.point.theta[joint]) for joint in index]
+    )
+    drawn = np.array([[_slope(estimates, k, theta[k]) for k in index] for theta in estimates.theta])
     weight = 1 / drawn.var(0).clip(1e-300)
     sign = np.sign(value)
     mean = float((weight * np.abs(value)).sum() / weight.sum())
@@ -85,3 +106,18 @@ def _compliance(estimates: Estimates, joints: tuple[int, ...]) -> Parameter:
     if overall < 0:
         low, high = -high, -low
     return Parameter(overall * mean, (low, high), "m/N")
+
+
+def _slope(estimates: Estimates, joint: int, theta: Array) -> float:
+    """How far a newton more bends one joint (P,) under the loads that it mostly has, any slack taken up."""
+    batch = estimates.selection.problem.batch
+    assert batch.load is not None
+    load = batch.load[..., [joint]]
+    values = {name: theta[INDEX[name]] for name in parameters()}
+    bent = (theta[INDEX["bend"]] + theta[INDEX["flex"]]) * spring(load, values)
+    force, bent = load[batch.valid][:, 0], bent[batch.valid][:, 0]
+    mostly = 1.0 if (force > 0).sum() >= (force < 0).sum() else -1.0
+    pressed = mostly * force > _PRESSED * np.abs(force).max()
+    if np.ptp(force[pressed]) <= 0:
+        return float(theta[INDEX["bend"]] + theta[INDEX["flex"]])
+    return float(np.polyfit(force[pressed], bent[pressed], 1)[0])
