@@ -8,9 +8,10 @@ import pytest
 from object_rigs import record
 
 from lerobot_vtrefine.diagnose.joints.batch import make_batch
-from lerobot_vtrefine.diagnose.joints.fitting import INDEX, fit, servo_only
+from lerobot_vtrefine.diagnose.joints.fitting import fit, servo_only
 from lerobot_vtrefine.diagnose.joints.gravity import is_sliding
 from lerobot_vtrefine.diagnose.joints.model import from_model, to_model
+from lerobot_vtrefine.diagnose.joints.parameters import INDEX
 from lerobot_vtrefine.diagnose.joints.twin_problem import COARSE_S, FINE_S, TwinProblem
 from lerobot_vtrefine.diagnose.parts.engine import assumed_masses
 from lerobot_vtrefine.diagnose.parts.episodes import AssumedScene, handled, lately

@@ -12,8 +12,9 @@ from lerobot_vtrefine.diagnose.joints.candidates import NAMES, NOT_SHOWN, SIZES
 from lerobot_vtrefine.diagnose.joints.candidates.base import Candidate
 from lerobot_vtrefine.diagnose.joints.detectable import minimum_detectable
 from lerobot_vtrefine.diagnose.joints.estimates import Estimates, repeatability
-from lerobot_vtrefine.diagnose.joints.fitting import INDEX, Fit
+from lerobot_vtrefine.diagnose.joints.fitting import Fit
 from lerobot_vtrefine.diagnose.joints.model import RobotModel, to_model
+from lerobot_vtrefine.diagnose.joints.parameters import INDEX
 from lerobot_vtrefine.diagnose.joints.problem import JointProblem
 from lerobot_vtrefine.diagnose.verdict import Parameter
 

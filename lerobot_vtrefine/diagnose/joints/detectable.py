@@ -7,8 +7,9 @@ import numpy as np
 from lerobot_vtrefine.diagnose.core.detectable import beyond_model, from_scores, smallest
 from lerobot_vtrefine.diagnose.core.rules import UNSEEN
 from lerobot_vtrefine.diagnose.joints.candidates.base import Candidate
-from lerobot_vtrefine.diagnose.joints.fitting import INDEX, derivatives, evaluate
+from lerobot_vtrefine.diagnose.joints.fitting import derivatives, evaluate
 from lerobot_vtrefine.diagnose.joints.gravity import is_sliding
+from lerobot_vtrefine.diagnose.joints.parameters import INDEX
 
 if TYPE_CHECKING:
     from lerobot_vtrefine.diagnose.joints.problem import Selected

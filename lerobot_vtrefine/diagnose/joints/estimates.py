@@ -9,9 +9,10 @@ import numpy as np
 
 from lerobot_vtrefine.diagnose.core.resampling import jackknife
 from lerobot_vtrefine.diagnose.joints.encoder_steps import resolution
-from lerobot_vtrefine.diagnose.joints.fitting import INDEX, ServoTrials
+from lerobot_vtrefine.diagnose.joints.fitting import ServoTrials
 from lerobot_vtrefine.diagnose.joints.gravity import is_sliding
 from lerobot_vtrefine.diagnose.joints.newton import leave_out, without_ridge
+from lerobot_vtrefine.diagnose.joints.parameters import INDEX
 from lerobot_vtrefine.diagnose.verdict import Parameter
 
 if TYPE_CHECKING:

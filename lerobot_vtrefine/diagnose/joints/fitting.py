@@ -11,19 +11,12 @@ import numpy as np
 
 from lerobot_vtrefine.diagnose.joints import gravity, stages
 from lerobot_vtrefine.diagnose.joints.batch import Batch, frame_s
+from lerobot_vtrefine.diagnose.joints.parameters import INDEX, PARAMETERS, POSITIVE, RATIOS, SAG
 from lerobot_vtrefine.diagnose.joints.servo import Columns, simulate
 from lerobot_vtrefine.diagnose.joints.stages import STAGES
 
 Array = np.ndarray
 
-SAG = tuple(f"sag{term}" for term in range(gravity.TERMS))
-_SHAPES = ("round", "stick")
-RATIOS = (*_SHAPES, *(name for stage in STAGES for name in stage.ratios))
-"""Numbers without a unit, of the order of one."""
-_SERVO = ("log_omega", "log_zeta", "offset", "play", "loose", "friction")
-PARAMETERS = (*_SERVO, *SAG, "bend", "stop", "give", *_SHAPES, *stages.parameters())
-INDEX = {name: place for place, name in enumerate(PARAMETERS)}
-POSITIVE = ("play", "loose", "friction", "stop", *_SHAPES)
 OMEGA_BOUNDS = (0.5, 300.0)
 ZETA_BOUNDS = (0.1, 20.0)
 _RADIANS_PER_FRAME = (6.0, 3.0)

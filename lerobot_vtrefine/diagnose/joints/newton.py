@@ -9,16 +9,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from lerobot_vtrefine.diagnose.core.rules import MIN_CONDITIONS
-from lerobot_vtrefine.diagnose.joints.fitting import (
-    INDEX,
-    POSITIVE,
-    TAU_BOUND_S,
-    Fit,
-    Point,
-    ServoTrials,
-    derivatives,
-    ridge,
-)
+from lerobot_vtrefine.diagnose.joints.fitting import TAU_BOUND_S, Fit, Point, ServoTrials, derivatives, ridge
+from lerobot_vtrefine.diagnose.joints.parameters import INDEX, POSITIVE
 
 Array = np.ndarray
 

@@ -14,19 +14,10 @@ from lerobot_vtrefine.diagnose.joints import gravity
 from lerobot_vtrefine.diagnose.joints.candidates import CATALOGUE
 from lerobot_vtrefine.diagnose.joints.candidates.base import Candidate
 from lerobot_vtrefine.diagnose.joints.encoder_steps import LEAST_EFFECT_M, LEAST_EFFECT_RAD, resolution
-from lerobot_vtrefine.diagnose.joints.fitting import (
-    INDEX,
-    SAG,
-    Fit,
-    Point,
-    ServoTrials,
-    evaluate,
-    fit,
-    refit,
-    servo_only,
-)
+from lerobot_vtrefine.diagnose.joints.fitting import Fit, Point, ServoTrials, evaluate, fit, refit, servo_only
 from lerobot_vtrefine.diagnose.joints.friction_load import load_prefers
 from lerobot_vtrefine.diagnose.joints.newton import Refits, refits
+from lerobot_vtrefine.diagnose.joints.parameters import INDEX, SAG
 from lerobot_vtrefine.diagnose.joints.suspicions import not_repeating, suspicions
 from lerobot_vtrefine.diagnose.joints.timing import delay_starts, with_changing_delay
 

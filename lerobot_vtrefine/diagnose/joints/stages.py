@@ -1,7 +1,7 @@
 """What a joint adds to its target before the servo, or to its reading behind it, one law each.
 
-To add a law, register a `Stage` here; a file of the catalogue (`joints/candidates`) then names its parameters.
-Play, gravity's sag and what happens inside the servo are in `servo`.
+To add a law, register a `Stage` here; a file of the catalogue (`joints/candidates`) then names its
+parameters. Play, gravity's sag and what happens inside the servo are in `servo`.
 
 Shapes: N frames, T trials, C columns.
 """
@@ -19,7 +19,7 @@ Law = Callable[[Array, Values, Array | None], Array]
 
 @dataclass(frozen=True)
 class Stage:
-    """One law: what becomes of a signal (N, T, C), by parameters (C,) and measured loads (N, T, C) or None."""
+    """One law: what becomes of a signal (N, T, C), by parameters (C,) and loads (N, T, C) or None."""
 
     place: Literal["target", "reading"]
     law: Law
@@ -36,8 +36,8 @@ _TAKEN_UP = 0.05
 def spring(load: Array, values: Values) -> Array:
     """Load (N, T, C) that would bend a linear spring as far as it bends this one.
 
-    Pulls may bend it otherwise than pushes (``back``), slack may be taken up first (``slack``), and it may get
-    harder or softer (``curve``); each as a part of what the plain spring does.
+    Pulls may bend it otherwise than pushes (``back``), slack may be taken up first (``slack``), and it may
+    get harder or softer (``curve``); each as a part of what the plain spring does.
     """
     largest = np.abs(load).max((0, 1)).clip(1e-12)
     out = load + values["back"] * np.minimum(load, 0.0)

@@ -21,7 +21,8 @@ from mujoco.batch import Batch as Worlds
 
 from lerobot_vtrefine.diagnose.joints import gravity
 from lerobot_vtrefine.diagnose.joints.batch import Batch
-from lerobot_vtrefine.diagnose.joints.fitting import INDEX, PARAMETERS, SAG, Point
+from lerobot_vtrefine.diagnose.joints.fitting import Point
+from lerobot_vtrefine.diagnose.joints.parameters import INDEX, PARAMETERS, SAG
 from lerobot_vtrefine.diagnose.joints.problem import JointProblem
 from lerobot_vtrefine.sim import task
 from lerobot_vtrefine.sim.backends.batch import usable_cores

@@ -2,7 +2,7 @@
 
 from lerobot_vtrefine.diagnose.joints.candidates.base import Candidate
 from lerobot_vtrefine.diagnose.joints.estimates import Estimates, MethodError
-from lerobot_vtrefine.diagnose.joints.fitting import INDEX
+from lerobot_vtrefine.diagnose.joints.parameters import INDEX
 from lerobot_vtrefine.diagnose.verdict import Parameter
 
 METHOD = MethodError(0.005, 0.2)

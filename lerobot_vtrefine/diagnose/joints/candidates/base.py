@@ -8,7 +8,8 @@ import numpy as np
 
 from lerobot_vtrefine.diagnose.core.problem import Candidate as AnyCandidate
 from lerobot_vtrefine.diagnose.joints.encoder_steps import moving
-from lerobot_vtrefine.diagnose.joints.fitting import INDEX, RATIOS, Point, ServoTrials
+from lerobot_vtrefine.diagnose.joints.fitting import Point, ServoTrials
+from lerobot_vtrefine.diagnose.joints.parameters import INDEX, RATIOS
 from lerobot_vtrefine.diagnose.verdict import Parameter
 
 if TYPE_CHECKING:

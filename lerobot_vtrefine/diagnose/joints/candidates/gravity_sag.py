@@ -9,7 +9,8 @@ from lerobot_vtrefine.diagnose.joints import gravity
 from lerobot_vtrefine.diagnose.joints.candidates.base import Candidate
 from lerobot_vtrefine.diagnose.joints.encoder_steps import moving
 from lerobot_vtrefine.diagnose.joints.estimates import Estimates, MethodError
-from lerobot_vtrefine.diagnose.joints.fitting import INDEX, SAG, Point, ServoTrials
+from lerobot_vtrefine.diagnose.joints.fitting import Point, ServoTrials
+from lerobot_vtrefine.diagnose.joints.parameters import INDEX, SAG
 from lerobot_vtrefine.diagnose.verdict import Parameter
 
 Array = np.ndarray

@@ -7,7 +7,8 @@ from lerobot_vtrefine.diagnose.joints import gravity
 from lerobot_vtrefine.diagnose.joints.candidates.base import Candidate, at_zero
 from lerobot_vtrefine.diagnose.joints.encoder_steps import moving
 from lerobot_vtrefine.diagnose.joints.estimates import Estimates, MethodError, widened
-from lerobot_vtrefine.diagnose.joints.fitting import INDEX, Point, ServoTrials
+from lerobot_vtrefine.diagnose.joints.fitting import Point, ServoTrials
+from lerobot_vtrefine.diagnose.joints.parameters import INDEX
 from lerobot_vtrefine.diagnose.joints.stages import parameters, spring
 from lerobot_vtrefine.diagnose.verdict import Parameter
 

@@ -5,9 +5,9 @@ import numpy as np
 from lerobot_vtrefine.diagnose.core.resampling import jackknife
 from lerobot_vtrefine.diagnose.joints.candidates.base import Candidate
 from lerobot_vtrefine.diagnose.joints.estimates import Estimates, MethodError, widened
-from lerobot_vtrefine.diagnose.joints.fitting import INDEX
 from lerobot_vtrefine.diagnose.joints.friction_load import friction_in_load, stiffness_in_load
 from lerobot_vtrefine.diagnose.joints.gravity import is_sliding
+from lerobot_vtrefine.diagnose.joints.parameters import INDEX
 from lerobot_vtrefine.diagnose.verdict import Parameter
 from lerobot_vtrefine.embodiments import ALOHA
 
