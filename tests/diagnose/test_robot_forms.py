@@ -69,6 +69,18 @@ def test_what_a_stopped_jaw_does_besides_is_not_named(tmp_path) -> None:
     assert found.causes[0].params["gripper_stop_m"].value == pytest.approx(0.022, abs=2e-4)
 
 
+@pytest.mark.parametrize("form", ["finger", "slack", "one_way"])
+def test_a_gripper_that_gives_way_in_another_form_keeps_its_name(tmp_path, form) -> None:
+    rig = replace(SLOW, joints=("gripper",), noise=0.5, compliance={"gripper": 2e-4}, compliance_form=form)
+    found = diagnosed(rig, tmp_path, 1)
+    assert found.status == "explained", found.unknown
+    assert [cause.name for cause in found.causes] == ["gripper_compliance"]
+    size = found.causes[0].params["m_per_n"]
+    assert size.value == pytest.approx(2e-4, rel=0.1)
+    # The model that is handed out has the form, too.
+    assert found.heldout.extended < 1.15 * found.heldout.noise_floor
+
+
 def test_widened_intervals_keep_signs_and_sides() -> None:
     assert widened((-0.03, -0.01), -0.02, 0.0) == pytest.approx((-0.03, -0.01))
     low, high = widened((-0.021, -0.019), -0.02, 0.01)
