@@ -91,7 +91,7 @@ FORMS = (Candidate("cogging", ("cogging",), start=at_zero),)
 
 def sizes(estimates: Estimates, joints: tuple[int, ...]) -> dict[str, Parameter]:
     """Amplitude of every joint."""
-    return estimates.lengths(MethodError(0.01, 0.0), joints, ("cogging",))
+    return estimates.lengths(MethodError(0.04, 0.0), joints, ("cogging",))
 '''
 COGGING_RAD = 0.008
 
