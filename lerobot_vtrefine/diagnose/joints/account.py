@@ -70,8 +70,8 @@ class JointAccount:
 
     def not_identifiable(self, cause: str) -> str:
         """Why no joint can show it."""
-        tried = any(item.cause == cause for item in self.selection.first_round)
-        hidden = cause == "encoder_offset" and self.selection.problem.shared_encoders
+        tried = [item.candidate for item in self.selection.first_round if item.cause == cause]
+        hidden = self.selection.problem.shared_encoders and all(item.in_shared_encoders for item in tried)
         return NOT_SHOWN.get(cause, "") if hidden or not tried else ""
 
     def next_experiment(

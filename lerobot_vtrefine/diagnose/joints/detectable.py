@@ -16,9 +16,6 @@ if TYPE_CHECKING:
 
 Array = np.ndarray
 
-_STEP = 2.0
-"""Step of a size, in units of the noise; what is no length has steps a tenth of it per unit of load."""
-
 
 def minimum_detectable(selection: "Selected") -> dict[str, float]:
     """Cause -> size [rad, s, m/N] that the worst joint would still have shown; causes that no joint can show
@@ -27,7 +24,7 @@ def minimum_detectable(selection: "Selected") -> dict[str, float]:
     own = derivatives(problem, selection.fit).columns
     out: dict[str, float] = {}
     for candidate in problem.candidates():
-        if not candidate.sized or (candidate.parameters == ("offset",) and problem.shared_encoders):
+        if not candidate.sized or (candidate.in_shared_encoders and problem.shared_encoders):
             continue
         if candidate.shared:
             size = _delay(selection, own)
@@ -56,8 +53,7 @@ def _change(selection: "Selected", candidate: Candidate, joints: Array) -> Array
     """What a unit of the cause does to the prediction (N, T, joints), by a step of the size of the noise."""
     problem, fitted = selection.problem, selection.fit
     noise = np.sqrt(fitted.total[joints]).clip(1e-9)
-    # Angles and lengths step by twice the noise; newtons bend by far less than one per unit.
-    step = noise * (0.05 * _STEP if candidate.parameters == ("bend",) else _STEP)
+    step = noise * candidate.step
     forms = tuple(candidate.form or form for form in fitted.point.forms)
     theta = fitted.point.theta[joints].copy()
     theta[np.arange(len(joints)), INDEX[candidate.parameters[0]]] += step

@@ -44,6 +44,11 @@ class Candidate:
     sized: bool = True
     """Whether the smallest size that would have been seen is told by this form."""
 
+    step: float = 2.0
+    """By how much its size is moved to see what it does, in units of the noise."""
+    in_shared_encoders: bool = False
+    """Whether it does not show where servos close their loop on the encoders that are read."""
+
     @property
     def plain(self) -> tuple[str, ...] | None:
         """Parameters of the form that it refines, from whose fit it starts; None: it starts by itself."""

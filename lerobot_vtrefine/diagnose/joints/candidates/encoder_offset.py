@@ -18,6 +18,7 @@ FORMS = (
         ("offset",),
         possible=lambda problem: np.ones(problem.batch.joints, dtype=bool),
         start=at_zero,
+        in_shared_encoders=True,
     ),
 )
 

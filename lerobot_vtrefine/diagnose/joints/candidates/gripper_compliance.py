@@ -54,7 +54,8 @@ _CURVE_LEAD = 0.02
 
 FORMS = (
     # Before the servo, which then follows, or behind it, at once.
-    Candidate("gripper_compliance", ("bend",), possible=_loaded, start=at_zero),
+    # A newton bends by far less than the noise is long.
+    Candidate("gripper_compliance", ("bend",), possible=_loaded, start=at_zero, step=0.1),
     Candidate("gripper_compliance", ("flex",), possible=_loaded, start=at_zero, sized=False),
     *(
         Candidate(
