@@ -2,6 +2,7 @@
 
 import json
 import os
+import re
 import shutil
 import subprocess
 import sys
@@ -19,7 +20,8 @@ from lerobot_vtrefine.diagnose.joints import candidates as joint_candidates
 from lerobot_vtrefine.diagnose.verdict import ROBOT_CAUSES, SENSOR_CAUSES
 
 PACKAGE = Path(lerobot_vtrefine.__file__).parent
-SCRIPTS = Path(__file__).parents[2] / "scripts"
+ROOT = Path(__file__).parents[2]
+SCRIPTS = ROOT / "scripts"
 
 STAGE = '''
 
@@ -70,29 +72,9 @@ HIDDEN = {
 }
 
 
-JOINT_STAGE = """
-
-register(
-    Stage(
-        "reading",
-        lambda reading, values, load: reading + values["cogging"] * np.sin(8 * reading),
-        {"cogging": (-0.1, 0.1)},
-    )
+JOINT_STAGE, JOINT_CANDIDATE = re.findall(
+    r"```python\n(.*?)```", (ROOT / "docs" / "diagnosis-method.md").read_text(encoding="utf-8"), re.DOTALL
 )
-"""
-JOINT_CANDIDATE = '''"""cogging: magnets pull a joint towards eight places of a turn."""
-
-from lerobot_vtrefine.diagnose.joints.candidates.base import Candidate, at_zero
-from lerobot_vtrefine.diagnose.joints.estimates import Estimates, MethodError
-from lerobot_vtrefine.diagnose.verdict import Parameter
-
-FORMS = (Candidate("cogging", ("cogging",), start=at_zero),)
-
-
-def sizes(estimates: Estimates, joints: tuple[int, ...]) -> dict[str, Parameter]:
-    """Amplitude of every joint."""
-    return estimates.lengths(MethodError(0.04, 0.0), joints, ("cogging",))
-'''
 COGGING_RAD = 0.008
 
 
@@ -115,7 +97,7 @@ def test_a_joints_cause_of_ones_own_is_named_reported_and_predicted(tmp_path: Pa
     copy = tmp_path / "lerobot_vtrefine"
     shutil.copytree(PACKAGE, copy, ignore=shutil.ignore_patterns("__pycache__", "assets"))
     with (copy / "diagnose" / "joints" / "stages.py").open("a", encoding="utf-8") as file:
-        file.write(JOINT_STAGE)
+        file.write("\n\n" + JOINT_STAGE)
     (copy / "diagnose" / "joints" / "candidates" / "cogging.py").write_text(JOINT_CANDIDATE, encoding="utf-8")
     rig = Rig(joints=("elbow",), rate_hz=20.0, seconds=5.0, conditions=8, noise=0.5)
     folder = make_set(rig, tmp_path / "moves", 0)
