@@ -64,7 +64,7 @@ class Rig:
     compliance_form: str = "servo"
     """Where and how a load bends: servo: before the servo, in proportion; finger: behind it, at once; slack:
     behind it, through play that the load takes up; one_way: pulls bend three times as far as pushes; harder:
-    as the load's power 0.6."""
+    as the load's power 0.6; between: before the servo, the load changing between frames, too."""
     holds: dict = field(default_factory=dict)
     """Gripper -> (opening at which it meets something hard, part of its way that it still goes)."""
     stiffness: dict = field(default_factory=dict)
@@ -206,7 +206,9 @@ class Robot:
                 if rig.latency_s:
                     u = self.late(arrival[:, : k + 1], command, now, h)
                 slack = np.clip(slack, u - half, u + half)
-                bent = bend * yielding(rig, load_n[:, k]) * (not behind)
+                part = step / steps if rig.compliance_form == "between" else 0.0
+                force_n = (1 - part) * load_n[:, k] + part * load_n[:, k + 1]
+                bent = bend * yielding(rig, force_n) * (not behind)
                 target = self.target_of(slack, bent, session_s, now, v, u, q)
                 force = pull * (target - q) - 2 * self.zeta * self.omega * v
                 stick = dry * (1 + rig.stribeck * np.exp(-((v / STRIBECK_RAD_S) ** 2)))

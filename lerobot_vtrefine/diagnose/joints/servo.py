@@ -75,25 +75,32 @@ class Columns:
 
 def simulate(batch: Batch, columns: Columns) -> Array:
     """Encoder readings (N, T, C) that follow from the commands and the first position alone."""
-    start = batch.first_position[:, columns.joint] - columns.offset
-    target = _play(batch.command[:, :, columns.joint], columns, start)
+    load = None if batch.load is None else batch.load[:, :, columns.joint]
+    first = _true_first(batch.first_position[:, columns.joint] - columns.offset, columns, load)
+    target = _play(batch.command[:, :, columns.joint], columns, first)
     if columns.stop is not None and columns.give is not None and (columns.stop > 0).any():
         target = blocked(target, columns.stop, columns.give)
-    load = None if batch.load is None else batch.load[:, :, columns.joint]
     if columns.stages is not None:
         target = applied("target", target, columns.stages, load)
-    start = np.clip(target[0], start - columns.loose / 2, start + columns.loose / 2)
+    start = np.clip(target[0], first - columns.loose / 2, first + columns.loose / 2)
     dry = columns.friction > 0
     q = np.empty_like(target)
     for kind, follow in ((~dry, _linear), (dry, _with_friction)):
         if kind.any():
             q[..., kind] = follow(batch.time_s, target[..., kind], start[:, kind], columns.only(kind))
     if (columns.loose > 0).any():
-        first = batch.first_position[:, columns.joint] - columns.offset
         q = _worn(q, columns.loose, columns.rounding, first)
     if columns.stages is not None:
         q = applied("reading", q, columns.stages, load)
     return q + columns.offset
+
+
+def _true_first(read: Array, columns: Columns, load: Array | None) -> Array:
+    """Where joints (T, C) are that are read there: without what stages add to a reading, to first order."""
+    if columns.stages is None:
+        return read
+    added = applied("reading", read[None], columns.stages, None if load is None else load[:1]) - read
+    return read - added[0]
 
 
 def blocked(target: Array, stop: Array, give: Array) -> Array:

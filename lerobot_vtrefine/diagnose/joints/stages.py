@@ -30,19 +30,19 @@ class Stage:
 
 
 _TAKEN_UP = 0.05
-"""Part of the largest load by which slack in a spring is mostly taken up."""
+"""Part of the full load by which slack in a spring is mostly taken up."""
 
 
 def spring(load: Array, values: Values) -> Array:
     """Load (N, T, C) that would bend a linear spring as far as it bends this one.
 
     Pulls may bend it otherwise than pushes (``back``), slack may be taken up first (``slack``), and it may
-    get harder or softer (``curve``); each as a part of what the plain spring does.
+    get harder or softer (``curve``); each as a part of what the plain spring does under ``full_load``.
     """
-    largest = np.abs(load).max((0, 1)).clip(1e-12)
+    full = np.where(values["full_load"] > 0, values["full_load"], 1.0)
     out = load + values["back"] * np.minimum(load, 0.0)
-    out = out + values["slack"] * largest * np.tanh(load / (_TAKEN_UP * largest))
-    return out + values["curve"] * load * np.abs(load) / largest
+    out = out + values["slack"] * full * np.tanh(load / (_TAKEN_UP * full))
+    return out + values["curve"] * load * np.abs(load) / full
 
 
 def _flexible(reading: Array, values: Values, load: Array | None) -> Array:
@@ -54,7 +54,13 @@ STAGES: list[Stage] = [
     Stage(
         "reading",
         _flexible,
-        {"flex": (-np.inf, np.inf), "back": (-1.0, 20.0), "slack": (-0.5, 5.0), "curve": (-1.0, 5.0)},
+        {
+            "flex": (-np.inf, np.inf),
+            "full_load": (0.0, np.inf),
+            "back": (-1.0, 20.0),
+            "slack": (-0.5, 5.0),
+            "curve": (-1.0, 5.0),
+        },
         ratios=("back", "slack", "curve"),
     ),
 ]

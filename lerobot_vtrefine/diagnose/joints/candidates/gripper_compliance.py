@@ -49,6 +49,12 @@ def _stopped(problem: ServoTrials, point: Point, joints: Array, multiple: float)
     return point.with_values("give", multiple, joints)
 
 
+def _nearly_linear(problem: ServoTrials, point: Point, joints: Array, multiple: float) -> Point:
+    """A linear spring whose other terms are told by the largest load."""
+    assert problem.batch.load is not None
+    return point.with_values("full_load", np.abs(problem.batch.load).max((0, 1))[joints], joints)
+
+
 _CURVE_LEAD = 0.02
 """By how much a spring that is not linear must beat a linear one."""
 
@@ -61,8 +67,8 @@ FORMS = (
         Candidate(
             "gripper_compliance",
             (size, "back", "slack", "curve"),
-            (0.0,),
             possible=_loaded,
+            start=_nearly_linear,
             handicap=_CURVE_LEAD,
             sized=False,
         )
