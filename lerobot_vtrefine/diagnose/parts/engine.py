@@ -6,6 +6,7 @@ the recordings cannot tell, the evidence says what to record.
 """
 
 from collections.abc import Sequence
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -111,7 +112,7 @@ def _strongest(items: list[Evidence]) -> Evidence:
     order = ("accepted", "rejected", "not identifiable")
     best = min(items, key=lambda item: (order.index(item.decision), item.p_value or 0.0))
     reason = "; ".join(dict.fromkeys(item.reason for item in items))
-    return Evidence(best.name, best.p_value, best.p_adjusted, best.heldout_gain, best.decision, reason)
+    return replace(best, reason=reason)
 
 
 def _next(evidence: list[Evidence]) -> dict[str, Any] | None:
