@@ -170,7 +170,9 @@ def test_a_model_worse_than_the_baseline_on_locked_trials_is_not_handed_out() ->
         found.test.errors(fit).mean(0) for fit in (found.selection.baseline, found.selection.fit)
     )
     np.testing.assert_allclose(after, before)
-    assert found.refused["3"] < -1.0
+    (refused,) = found.refused
+    assert (refused.cause, refused.channel, refused.surely) == ("3", 1, True)
+    assert refused.gain < -1.0
     # What is significant and yet predicts worse is something else than its name.
     assert [alarm.channel for alarm in found.alarms] == [1]
     assert "worse" in found.alarms[0].clue

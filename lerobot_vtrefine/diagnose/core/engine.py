@@ -1,6 +1,6 @@
 """The method: lock, baseline, search, suspicion, rivals, guard. `telling` makes a diagnosis of its result."""
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -8,8 +8,8 @@ import numpy as np
 
 from lerobot_vtrefine.diagnose.core.heldout import lock
 from lerobot_vtrefine.diagnose.core.problem import Candidate, Fit, Problem
+from lerobot_vtrefine.diagnose.core.resampling import gain_interval
 from lerobot_vtrefine.diagnose.core.rivals import Rival, settled
-from lerobot_vtrefine.diagnose.core.rules import LEAST_GAIN
 from lerobot_vtrefine.diagnose.core.search import ALL, Search, Selection
 from lerobot_vtrefine.diagnose.core.suspicion import Alarm, raise_alarms
 
@@ -27,8 +27,7 @@ class Inference[P: Problem[Any, Any], F: Fit, C: Candidate]:
     test: P
     """The locked trials; those of the search where none could be locked."""
     locked: bool
-    refused: Mapping[str, float]
-    """Cause -> gain on locked trials for which it was taken back."""
+    refused: "tuple[Refusal, ...]"
     seed: int
 
 
@@ -62,14 +61,14 @@ def infer[P: Problem[Any, Any]](
     tell(f"{whole.subject}: settling the sizes", 0.8)
     selection, whole = _settled_finely(named_only(selection), whole)
     test = whole.subset(locked) if len(locked) else selection.problem
-    selection, refused = guarded(selection, test)
+    selection, refused = guarded(selection, test, seed)
     return Inference(
         selection,
         tuple(item for item in rivals if item.cause in selection.causes()),
         _with_refused(alarms, refused),
         test,
         bool(len(locked)),
-        {cause: gain for (cause, _), gain in refused.items()},
+        refused,
         seed,
     )
 
@@ -95,40 +94,52 @@ def taken_back[P: Problem[Any, Any], F: Fit, C: Candidate](
     return replace(selection, fit=fitted, chosen={k: items for k, items in chosen.items() if items})
 
 
+@dataclass(frozen=True)
+class Refusal:
+    """What was taken back."""
+
+    cause: str
+    channel: int
+    gain: float
+    """On locked trials, beside the baseline."""
+    surely: bool
+    """Whether the gain's 95 % interval lies below zero."""
+
+
 def guarded[P: Problem[Any, Any], F: Fit, C: Candidate](
-    selection: Selection[P, F, C], test: P
-) -> tuple[Selection[P, F, C], dict[tuple[str, int], float]]:
+    selection: Selection[P, F, C], test: P, seed: int
+) -> tuple[Selection[P, F, C], tuple[Refusal, ...]]:
     """No channel's model that predicts worse than the baseline is handed out, whatever chose it.
 
-    On each channel where it does, what was accepted last is taken back first; (cause, channel) -> the gain
-    for which it was.
+    On each channel where it does, what was accepted last is taken back first. What all channels share is
+    judged by all of them together, each in units of its baseline's error.
     """
-    before = test.errors(selection.baseline).mean(0).clip(1e-300)
-    refused: dict[tuple[str, int], float] = {}
+    before = test.errors(selection.baseline)
+    refused = []
     for channel in [*(k for k in selection.chosen if k != ALL), ALL]:
+        part = slice(None) if channel == ALL else [channel]
+        scale = before[:, part].mean(0).clip(1e-300)
         for candidate in reversed(selection.chosen.get(channel, ())):
-            gains = 1 - test.errors(selection.fit).mean(0) / before
-            # What all channels share is judged by all of them together.
-            gain = float(gains[channel]) if channel != ALL else _mean_gain(gains)
+            after = test.errors(selection.fit)
+            base, extended = ((errors[:, part] / scale).mean(1) for errors in (before, after))
+            gain = float(1 - extended.mean() / base.mean())
             if gain >= 0:
                 break
-            refused[candidate.cause, channel] = gain
+            surely = gain_interval(base, extended, seed)[1] < 0
+            refused.append(Refusal(candidate.cause, channel, gain, surely))
             selection = taken_back(selection, [candidate], channel)
-    return selection, refused
+    return selection, tuple(refused)
 
 
-def _mean_gain(gains: Array) -> float:
-    """Of several channels (J,), as a mean of logarithms: one that is hardly in error counts as the others."""
-    return float(1 - np.exp(np.log((1 - gains).clip(1e-12)).mean()))
-
-
-def _with_refused(alarms: tuple[Alarm, ...], refused: Mapping[tuple[str, int], float]) -> tuple[Alarm, ...]:
-    """What was significant and yet predicts worse is something else than its name; noise about a small effect
-    is not."""
+def _with_refused(alarms: tuple[Alarm, ...], refused: tuple[Refusal, ...]) -> tuple[Alarm, ...]:
+    """What was significant and yet surely predicts worse is something else than its name; a small effect that
+    locked trials happen to show the other way is not."""
     more = [
-        Alarm(max(channel, 0), f"what looks like {cause} predicts worse on trials left out", 1.0, None)
-        for (cause, channel), gain in refused.items()
-        if gain < -LEAST_GAIN
+        Alarm(
+            max(item.channel, 0), f"what looks like {item.cause} predicts worse on trials left out", 1.0, None
+        )
+        for item in refused
+        if item.surely
     ]
     return (*alarms, *more)
 

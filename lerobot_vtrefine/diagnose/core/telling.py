@@ -115,9 +115,9 @@ def _evidence(found: Found, account: Account[Any, Any], name: str) -> Evidence:
     elif name in ties:
         decision = "tie"
         reason = f"explains {ties[name].cause} on {_joined(found, ties[name].channels)} as well"
-    elif name in found.refused:
+    elif refused := [item.gain for item in found.refused if item.cause == name]:
         decision = "rejected"
-        reason = f"predicts worse than the baseline on trials left out (gain {found.refused[name]:.2f})"
+        reason = f"predicts worse than the baseline on trials left out (gain {min(refused):.2f})"
     elif why := account.not_identifiable(name):
         decision, reason = "not identifiable", why
     else:
