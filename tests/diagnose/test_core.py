@@ -187,7 +187,7 @@ def test_the_guard_leaves_other_channels_alone() -> None:
 
 
 def test_suspicions_have_one_error_rate() -> None:
-    rng, alarms, sets = np.random.default_rng(0), 0, 20
+    rng, alarms, sets = np.random.default_rng(0), 0, 10
     selection = infer(toy()).selection
     place = (np.arange(18) - 8.5) / np.arange(18).std()
     for number in range(sets):
@@ -197,7 +197,7 @@ def test_suspicions_have_one_error_rate() -> None:
             for k, row in enumerate(scores)
         ]
         alarms += bool(raise_alarms(selection, found, number))
-    assert alarms <= 1  # of 20 sets with forty suspicions each, at one in a hundred
+    assert alarms <= 1  # of 10 sets with forty suspicions each, at one in a hundred
 
 
 def test_suspicions_that_hold_are_told_and_what_was_observed_has_no_p_value() -> None:

@@ -69,7 +69,14 @@ def test_what_a_stopped_jaw_does_besides_is_not_named(tmp_path) -> None:
     assert found.causes[0].params["gripper_stop_m"].value == pytest.approx(0.022, abs=2e-4)
 
 
-@pytest.mark.parametrize("form", ["finger", "slack", "one_way"])
+@pytest.mark.parametrize(
+    "form",
+    [
+        "slack",
+        pytest.param("finger", marks=pytest.mark.slow),
+        pytest.param("one_way", marks=pytest.mark.slow),
+    ],
+)
 def test_a_gripper_that_gives_way_in_another_form_keeps_its_name(tmp_path, form) -> None:
     rig = replace(SLOW, joints=("gripper",), noise=0.5, compliance={"gripper": 2e-4}, compliance_form=form)
     found = diagnosed(rig, tmp_path, 1)

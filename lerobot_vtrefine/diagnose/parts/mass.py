@@ -65,7 +65,7 @@ def remeasured(
     if not (np.abs(near) > _AGAIN * assumed).any():
         return tuple(found)
     out = []
-    for item, lines, step in zip(found, _lines(arms, episodes, assumed + near), near, strict=True):
+    for item, lines, step in zip(found, _lines(arms, episodes, assumed + near), near.tolist(), strict=True):
         if item.line is None or isinstance(lines, str):
             out.append(item)
             continue
