@@ -12,6 +12,7 @@ import numpy as np
 from lerobot_vtrefine.diagnose.ambiguity import find_ambiguities
 from lerobot_vtrefine.diagnose.baseline import Baseline, fit_baseline, plain_weights
 from lerobot_vtrefine.diagnose.composite import Composite, sensor_model
+from lerobot_vtrefine.diagnose.core.heldout import lock
 from lerobot_vtrefine.diagnose.crossvalidation import agree, cross_validate
 from lerobot_vtrefine.diagnose.detectable import minimum_detectable
 from lerobot_vtrefine.diagnose.evaluation import (
@@ -27,7 +28,6 @@ from lerobot_vtrefine.diagnose.evidence import Evidence, ResidualView, Trace, Tr
 from lerobot_vtrefine.diagnose.fitting import Fit, predict, rest, tangents
 from lerobot_vtrefine.diagnose.idle import settled_idle
 from lerobot_vtrefine.diagnose.intervals import baseline_parameters, leave_out
-from lerobot_vtrefine.diagnose.locking import lock
 from lerobot_vtrefine.diagnose.naming import evidence_table, named_causes
 from lerobot_vtrefine.diagnose.pairs import reconsider
 from lerobot_vtrefine.diagnose.presses import PressSet, prepare, usable

@@ -232,10 +232,11 @@ def _check_names(where: str, names: tuple[str, ...]) -> None:
 
 
 def _own_causes() -> tuple[str, ...]:
-    """Causes that somebody added to the catalogue, which needs the tactile stages."""
+    """Causes that somebody added to a catalogue, which needs the simulator's stages."""
     from lerobot_vtrefine.diagnose.candidates import CATALOGUE
+    from lerobot_vtrefine.diagnose.joints.candidates import NAMES
 
-    return tuple(form.family for form in CATALOGUE)
+    return (*(form.family for form in CATALOGUE), *NAMES)
 
 
 def _check_consistent(verdict: Verdict) -> None:

@@ -142,6 +142,11 @@ def _diagnosed(model: RobotFile) -> RobotFaults:
         what = f"no joint {unknown[0][:60]!r}" if unknown else "never all of the model's joints at once"
         raise ValueError(f"the simulated arms have {what}")
     arms = {name: item for name, item in by_name.items() if body.joint_of(name) is not None}
+    strange = next(((name, law) for name, item in arms.items() for law in item.laws), None)
+    if strange is not None:
+        raise ValueError(
+            f"the simulated arms know no law {strange[1][:60]!r}, which joint {strange[0]!r} has"
+        )
     play = {name: item.backlash_command + item.backlash_output for name, item in arms.items()}
     return RobotFaults(
         min(model.control_latency_s, MAX_LATENCY_S),

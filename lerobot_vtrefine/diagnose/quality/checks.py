@@ -20,7 +20,7 @@ from lerobot_vtrefine.diagnose.quality.joints import (
     check_joint_order,
     check_jumps,
 )
-from lerobot_vtrefine.diagnose.quality.odd import check_gain, check_odd
+from lerobot_vtrefine.diagnose.quality.outliers import check_gain, check_odd
 from lerobot_vtrefine.diagnose.quality.readings import check_readings, check_wraps
 from lerobot_vtrefine.diagnose.quality.response import check_answers, check_start, check_stuck
 from lerobot_vtrefine.diagnose.quality.session import check_conditions, check_session

@@ -8,7 +8,8 @@ from typing import Any
 import numpy as np
 from jinja2 import Environment, PackageLoader, StrictUndefined
 
-from lerobot_vtrefine.diagnose.evidence import Diagnosis, Evidence, Trace
+from lerobot_vtrefine.diagnose.core.diagnosis import Diagnosis
+from lerobot_vtrefine.diagnose.evidence import Evidence, Trace
 from lerobot_vtrefine.diagnose.recordings import RecordingSet
 from lerobot_vtrefine.diagnose.report.figures import (
     SHOWN_TRIALS,

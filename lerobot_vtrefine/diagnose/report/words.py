@@ -127,9 +127,10 @@ def meaning(name: str) -> Meaning:
     """What a cause is; one that was added to the catalogue says so in its file."""
     if name in MEANINGS:
         return MEANINGS[name]
-    from lerobot_vtrefine.diagnose.candidates import MEANING
+    from lerobot_vtrefine.diagnose import candidates
+    from lerobot_vtrefine.diagnose.joints import candidates as joint_candidates
 
-    text = MEANING.get(name, "")
+    text = candidates.MEANING.get(name, "") or joint_candidates.MEANING.get(name, "")
     return Meaning(title(name), text[:1].upper() + text[1:], "size", "1")
 
 
