@@ -14,17 +14,20 @@ from lerobot_vtrefine.diagnose.verdict import Cause, DataIssue, Heldout, Paramet
 class Evidence:
     """One candidate cause and what became of it; candidates that were rejected are listed too.
 
-    ``p_adjusted`` is controlled over the family of candidates. ``heldout_gain`` is the part of the mean
-    squared error on held-out recordings that the candidate takes away. ``decision`` is one of DECISIONS,
-    ``reason`` one sentence for people.
+    ``p_adjusted`` is controlled over the family of candidates; both p-values are None where nothing was
+    tested, and ``observed`` says that the cause was seen in the readings themselves instead. ``cv_gain`` is
+    the part of the mean squared error that the candidate takes away in cross-validation within the
+    recordings that choices are made from: not the gain on locked ones, which belongs to `Cause`.
+    ``decision`` is one of DECISIONS, ``reason`` one sentence for people.
     """
 
     name: str
     p_value: float | None
     p_adjusted: float | None
-    heldout_gain: float | None
+    cv_gain: float | None
     decision: str
     reason: str
+    observed: bool = False
 
     def __post_init__(self) -> None:
         if self.decision not in DECISIONS:

@@ -30,6 +30,7 @@ def named_causes(
             _parameters(search, fitted, name, left_out, seed),
             search.p_adjusted.get(name),
             1.0 - full / without if without > 0 else 0.0,
+            "observed" if _observed(search, name) else "tested",
         )
 
     return tuple(on_all_cores(named, fitted.model.families))
@@ -37,6 +38,11 @@ def named_causes(
 
 SLIM_STEPS = 5
 """Steps of the refit that tells what held-out recordings lose without a cause."""
+
+
+def _observed(search: Search, name: str) -> bool:
+    """Whether an accepted cause was seen in the readings themselves, so that nothing had to be tested."""
+    return name in search.p_adjusted and search.p_adjusted[name] is None
 
 
 def _parameters(search: Search, fitted: Fit, name: str, left_out: LeftOut, seed: int) -> dict[str, Parameter]:
@@ -57,7 +63,7 @@ def evidence_table(
     for form in CATALOGUE:
         possible[form.family] |= form.possible(setting)
     rows = [_row(name, search, fitted, role, groups, possible.get(name, True)) for name in [*possible, *MAPS]]
-    return tuple(sorted(rows, key=lambda row: (-(row.heldout_gain or -1.0), row.p_adjusted or 1.0)))
+    return tuple(sorted(rows, key=lambda row: (-(row.cv_gain or -1.0), row.p_adjusted or 1.0)))
 
 
 def _row(
@@ -65,32 +71,37 @@ def _row(
 ) -> Evidence:
     found = search.screened.get(name)
     p_value, adjusted = (found.p_value, found.p_adjusted) if found is not None else (None, None)
-    gain = search.tried.get(name)
+    gain = search.cv_gains.get(name)
     if name in fitted.model.families:
         adjusted = search.p_adjusted.get(name, adjusted)
+        observed = _observed(search, name)
         tied = [other for group in groups if name in group for other in group if other != name]
         if tied and role != "symptom":
-            return Evidence(
-                name, p_value, adjusted, gain, "tie", f"explains the data, but so does {', '.join(tied)}"
-            )
+            text = f"explains the data, but so does {', '.join(tied)}"
+            return Evidence(name, p_value, adjusted, gain, "tie", text, observed)
         if role == "symptom":
             text = "improves the fit, but structure is left that no cause explains: the name may be borrowed"
-            return Evidence(name, p_value, adjusted, gain, "symptom", text)
-        return Evidence(name, p_value, adjusted, gain, "accepted", "foretells recordings left out better")
+            return Evidence(name, p_value, adjusted, gain, "symptom", text, observed)
+        text = "predicts recordings that its fit has not seen better"
+        if observed:
+            text = f"seen in the readings themselves, not tested; {text}"
+        return Evidence(name, p_value, adjusted, gain, "accepted", text, observed)
     if any(name in group for group in groups) and role != "symptom":
         return Evidence(name, p_value, adjusted, gain, "tie", "explains the data as well as what was named")
     if not possible:
         return Evidence(name, None, None, None, "not identifiable", "cannot act in these recordings")
-    return Evidence(name, p_value, adjusted, gain, "rejected", _why_rejected(adjusted, gain))
+    seen = found is not None and found.probe.observed
+    reason = _why_rejected(found is not None, adjusted, gain)
+    return Evidence(name, p_value, adjusted, gain, "rejected", reason, seen)
 
 
-def _why_rejected(adjusted: float | None, gain: float | None) -> str:
-    if adjusted is None:
+def _why_rejected(screened: bool, adjusted: float | None, gain: float | None) -> str:
+    if not screened:
         return "no sign of it"
-    if adjusted > ALPHA:
+    if adjusted is not None and adjusted > ALPHA:
         return f"recordings agree on it no more than by chance (adjusted p above {ALPHA:g})"
     if gain is None:
         return "passed the screening, but others explained more and left nothing for it"
     if gain <= EXTRA_GAIN:
-        return "takes away too little of the error on recordings left out"
+        return "takes away too little of the cross-validated error"
     return "another cause explains the same better"

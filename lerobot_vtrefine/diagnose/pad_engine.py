@@ -47,7 +47,7 @@ from lerobot_vtrefine.tactile.model import SensorModel
 MIN_RECORDINGS = 2
 FEW_RECORDINGS = 8
 DOUBTFUL_GAIN, DOUBTFUL_P = 0.03, 0.01
-"""What symptoms must take away of the squared error of recordings left out to be handed out as a model."""
+"""What symptoms must take away of the cross-validated squared error to be handed out as a model."""
 Tell = Callable[[str, float], None]
 
 
@@ -63,7 +63,8 @@ class PadDiagnosis:
         baseline_params: k_n, k_d and gain as refitted.
         evidence: one row per candidate examined.
         traces, residuals, trial_errors, maps: on held-out recordings; arrays in `unit`.
-        alarms: name of every alarm for unknown causes -> (whether it fired, share, p-value, clue).
+        alarms: name of every alarm for unknown causes -> (whether it fired, share, p-value, clue); there is
+            no p-value where a size is compared with a threshold and nothing is tested.
     """
 
     status: str
@@ -82,7 +83,7 @@ class PadDiagnosis:
     residuals: tuple[ResidualView, ...] = ()
     trial_errors: tuple[TrialError, ...] = ()
     maps: dict[str, np.ndarray] = field(default_factory=dict)
-    alarms: dict[str, tuple[bool, float, float, str]] = field(default_factory=dict)
+    alarms: dict[str, tuple[bool, float, float | None, str]] = field(default_factory=dict)
     unit: str = "counts"
 
 

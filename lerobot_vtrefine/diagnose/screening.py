@@ -24,6 +24,8 @@ FEW = 10
 """With fewer recordings than this, signs alone cannot reach significance: size counts as well."""
 DOUBT = 2.0
 """Factor by which scores may stray more than the fitted noise says, where their size counts."""
+ORDER_SHARE = 0.2
+"""Part of the error rate that tests by permuting the session's order get, where there are any."""
 
 
 @dataclass(frozen=True)
@@ -33,7 +35,11 @@ class Probe:
     Attributes:
         scores: (K,) effective score of every recording.
         information: (K,) effective information: the score that the probe itself would give.
-        permuted: p-value that was found otherwise (by permuting the session's order), in place of flips.
+        products: (K, K) products between recordings, whose sum is the statistic where it is quadratic in the
+            signs; None where the sum of the scores is.
+        products_scatter: standard deviation of that sum without an effect, as the fitted noise has it.
+        permuted: p-value found by permuting the session's order, in place of flips.
+        observed: seen in the readings themselves: nothing is tested, so there is no p-value.
     """
 
     name: str
@@ -43,6 +49,9 @@ class Probe:
     information: np.ndarray
     one_sided: bool
     permuted: float | None = None
+    observed: bool = False
+    products: np.ndarray | None = None
+    products_scatter: float = 0.0
 
     @property
     def size(self) -> float:
@@ -60,11 +69,19 @@ class Probe:
 
 @dataclass(frozen=True)
 class Screened:
-    """A candidate's best probe with its p-value and the one adjusted over all candidates."""
+    """A candidate's best probe with its p-value and the one adjusted over all candidates.
+
+    Both are None for what is observed rather than tested.
+    """
 
     probe: Probe
-    p_value: float
-    p_adjusted: float
+    p_value: float | None
+    p_adjusted: float | None
+
+    @property
+    def passed(self) -> bool:
+        """Whether it is to be refitted."""
+        return self.p_adjusted is None or self.p_adjusted <= ALPHA
 
 
 def cleared(grams: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -149,8 +166,11 @@ def flip_statistics(probes: Sequence[Probe], signs: np.ndarray) -> np.ndarray:
     """Standardised sums of scores under every flip: (FLIPS + 1, number of probes); larger is stronger."""
     columns = []
     for probe in probes:
-        norm = np.sqrt(float((probe.scores**2).sum()))
-        values = signs @ probe.scores / norm if norm > 0 else np.zeros(len(signs))
+        if probe.products is not None:
+            columns.append(((signs @ probe.products) * signs).sum(axis=1))
+            continue
+        length = np.sqrt(float((probe.scores**2).sum()))
+        values = signs @ probe.scores / length if length > 0 else np.zeros(len(signs))
         columns.append(values if probe.one_sided else np.abs(values))
     return np.stack(columns, axis=1)
 
@@ -167,35 +187,48 @@ def tail_shares(statistics: np.ndarray) -> np.ndarray:
 
 
 def screen(probes: Sequence[Probe], count: int, seed: int) -> dict[str, Screened]:
-    """The best probe of every name with its family-wise adjusted p-value."""
-    flipped = [probe for probe in probes if probe.permuted is None]
-    if not flipped:
-        return {}
-    shares = tail_shares(flip_statistics(flipped, flip_signs(count, seed)))
-    smallest = np.sort(shares.min(axis=1))
-    names = {probe.name for probe in probes}
-    extra = len(names) - len({probe.name for probe in flipped})
+    """The best probe of every name with its p-value adjusted over all of them.
+
+    Flips of the recordings' signs and permutations of their order are two families of tests, which share the
+    error rate by a weighted Bonferroni rule (Holm 1979); what is observed takes no part.
+    """
     best: dict[str, Screened] = {}
-    for index, probe in enumerate(flipped):
-        p_value = float(shares[0, index])
-        adjusted = float(np.searchsorted(smallest, p_value, side="right")) / len(smallest)
-        if count < FEW and p_value <= 2.5 * 2.0 ** (1 - count):
-            adjusted = min(adjusted, len(names) * size_p(probe))
-        _keep(best, Screened(probe, p_value, min(1.0, adjusted * (1 + 0.1 * extra))))
+    flipped = [probe for probe in probes if probe.permuted is None and not probe.observed]
+    ordered = [probe for probe in probes if probe.permuted is not None]
+    share = 1.0 - ORDER_SHARE * bool(ordered)
+    if flipped:
+        shares = tail_shares(flip_statistics(flipped, flip_signs(count, seed)))
+        smallest = np.sort(shares.min(axis=1))
+        names = len({probe.name for probe in flipped})
+        for index, probe in enumerate(flipped):
+            p_value = float(shares[0, index])
+            adjusted = float(np.searchsorted(smallest, p_value, side="right")) / len(smallest)
+            if count < FEW and p_value <= 2.5 * 2.0 ** (1 - count):
+                adjusted = min(adjusted, names * size_p(probe))
+            _keep(best, Screened(probe, p_value, min(1.0, adjusted / share)))
+    for probe in ordered:
+        assert probe.permuted is not None
+        adjusted = min(1.0, len(ordered) * probe.permuted / ORDER_SHARE)
+        _keep(best, Screened(probe, probe.permuted, adjusted))
     for probe in probes:
-        if probe.permuted is not None:
-            # Another reference distribution: Bonferroni over a handful of effectively independent names.
-            _keep(best, Screened(probe, probe.permuted, min(1.0, 5.0 * probe.permuted)))
+        if probe.observed:
+            best[probe.name] = Screened(probe, None, None)
     return best
 
 
 def size_p(probe: Probe) -> float:
     """p-value from the scores' size against the noise, with a wide margin for what the noise model misses."""
+    if probe.products is not None:
+        return float(norm.sf(probe.products.sum() / (DOUBT**2 * max(probe.products_scatter, 1e-12))))
     return float(2.0 * norm.sf(np.sqrt(max(probe.explained, 0.0)) / DOUBT))
 
 
 def _keep(best: dict[str, Screened], found: Screened) -> None:
     held = best.get(found.probe.name)
-    rank = (found.p_adjusted, -found.probe.explained)
-    if held is None or rank < (held.p_adjusted, -held.probe.explained):
+    if held is None or _rank(found) < _rank(held):
         best[found.probe.name] = found
+
+
+def _rank(item: Screened) -> tuple[float, float]:
+    """Most certain first, of equals the one that explains most."""
+    return (0.0 if item.p_adjusted is None else item.p_adjusted, -item.probe.explained)

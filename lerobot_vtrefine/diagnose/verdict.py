@@ -18,6 +18,7 @@ SCHEMA = "vtrefine/verdict@1"
 
 Status = Literal["adequate", "explained", "ambiguous", "unexplained", "invalid_data"]
 Role = Literal["cause", "symptom"]
+Basis = Literal["tested", "observed"]
 
 SENSOR_CAUSES = (
     "nonlinear_stiffness",
@@ -73,6 +74,8 @@ class Cause:
     """One name with its evidence: family-wise adjusted p, and what its removal loses on held-out trials.
 
     A ``symptom`` was found together with structure that no known cause accounts for: its name may be false.
+    What was ``observed`` in the readings themselves (a taxel that never answers, frames that repeat) was not
+    tested, and has no p-value.
     """
 
     name: str
@@ -80,10 +83,14 @@ class Cause:
     params: Mapping[str, Parameter]
     p_value: float | None
     heldout_gain: float | None
+    basis: Basis = "tested"
 
     def __post_init__(self) -> None:
         _check_names("cause", (self.name,))
         _check_choice("role", self.role, get_args(Role))
+        _check_choice("basis", self.basis, get_args(Basis))
+        if self.basis == "observed" and self.p_value is not None:
+            raise ValueError(f"{self.name} was observed, not tested: it has no p_value, got {self.p_value}")
         if self.p_value is not None and not 0.0 <= self.p_value <= 1.0:
             raise ValueError(f"p_value of {self.name} must lie in [0, 1], got {self.p_value}")
 

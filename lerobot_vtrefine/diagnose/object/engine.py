@@ -190,7 +190,7 @@ def _merged(items: list[Evidence]) -> Evidence:
     order = ("accepted", "rejected", "not identifiable")
     best = min(items, key=lambda item: (order.index(item.decision), item.p_value or 0.0))
     reason = "; ".join(dict.fromkeys(item.reason for item in items))
-    return Evidence(best.name, best.p_value, best.p_adjusted, best.heldout_gain, best.decision, reason)
+    return Evidence(best.name, best.p_value, best.p_adjusted, best.cv_gain, best.decision, reason)
 
 
 def _next(evidence: list[Evidence]) -> dict[str, Any] | None:

@@ -174,18 +174,18 @@ def _caption(trace: Trace, remark: str) -> str:
 
 
 def _by_decision(evidence: Sequence[Evidence]) -> list[Evidence]:
-    """Found ones first, each group by what it gains on held-out recordings."""
+    """Found ones first, each group by what it gains in cross-validation."""
     order = list(DECISIONS)
-    return sorted(evidence, key=lambda item: (order.index(item.decision), -(item.heldout_gain or 0.0)))
+    return sorted(evidence, key=lambda item: (order.index(item.decision), -(item.cv_gain or 0.0)))
 
 
 def _evidence_row(item: Evidence) -> dict[str, Any]:
-    gain = item.heldout_gain
+    gain = item.cv_gain
     return {
         "title": title(item.name),
         "name": item.name if item.name in MEANINGS else "",
         "p": p_text(item.p_value),
-        "p_adjusted": p_text(item.p_adjusted),
+        "p_adjusted": "observed" if item.observed else p_text(item.p_adjusted),
         "gain": "–" if gain is None else percent(gain),
         "bar": 0.0 if gain is None else 100.0 * min(max(gain, 0.0), 1.0),
         "decision": DECISIONS[item.decision],

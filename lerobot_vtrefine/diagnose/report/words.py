@@ -220,7 +220,8 @@ def doubts(verdict: Verdict, recorded: int, checked: int) -> list[str]:
             )
         elif excess < -0.02:
             found.append("The error is below the estimated noise floor, so that floor is estimated too high.")
-    weak = [title(c.name) for c in verdict.causes if c.p_value is None or c.p_value > 0.01]
+    tested = [cause for cause in verdict.causes if cause.basis == "tested"]
+    weak = [title(c.name) for c in tested if c.p_value is None or c.p_value > 0.01]
     if weak:
         found.append(f"The evidence for {listing(weak)} is thin (p above 0.01, or none).")
     if verdict.unknown.alarm and verdict.causes:
