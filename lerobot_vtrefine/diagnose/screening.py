@@ -24,8 +24,8 @@ FEW = 10
 """With fewer recordings than this, signs alone cannot reach significance: size counts as well."""
 DOUBT = 2.0
 """Factor by which scores may stray more than the fitted noise says, where their size counts."""
-ORDER_SHARE = 0.2
-"""Part of the error rate that tests by permuting the session's order get, where there are any."""
+SHARES = {"scores": 0.7, "products": 0.2, "order": 0.1}
+"""Parts of the error rate that kinds of tests get; where one is missing, the others share its part."""
 
 
 @dataclass(frozen=True)
@@ -189,31 +189,49 @@ def tail_shares(statistics: np.ndarray) -> np.ndarray:
 def screen(probes: Sequence[Probe], count: int, seed: int) -> dict[str, Screened]:
     """The best probe of every name with its p-value adjusted over all of them.
 
-    Flips of the recordings' signs and permutations of their order are two families of tests, which share the
-    error rate by a weighted Bonferroni rule (Holm 1979); what is observed takes no part.
+    Tests of three kinds share the error rate by a weighted Bonferroni rule (Holm 1979), each kind by its part
+    in SHARES: sums of scores under flips of the recordings' signs, judged together by the smallest p; sums of
+    products under the same flips; permutations of the session's order. What is observed takes no part.
     """
     best: dict[str, Screened] = {}
-    flipped = [probe for probe in probes if probe.permuted is None and not probe.observed]
-    ordered = [probe for probe in probes if probe.permuted is not None]
-    share = 1.0 - ORDER_SHARE * bool(ordered)
-    if flipped:
-        shares = tail_shares(flip_statistics(flipped, flip_signs(count, seed)))
-        smallest = np.sort(shares.min(axis=1))
-        names = len({probe.name for probe in flipped})
-        for index, probe in enumerate(flipped):
-            p_value = float(shares[0, index])
-            adjusted = float(np.searchsorted(smallest, p_value, side="right")) / len(smallest)
-            if count < FEW and p_value <= 2.5 * 2.0 ** (1 - count):
-                adjusted = min(adjusted, names * size_p(probe))
-            _keep(best, Screened(probe, p_value, min(1.0, adjusted / share)))
-    for probe in ordered:
-        assert probe.permuted is not None
-        adjusted = min(1.0, len(ordered) * probe.permuted / ORDER_SHARE)
-        _keep(best, Screened(probe, probe.permuted, adjusted))
+    kinds: dict[str, list[Probe]] = {}
     for probe in probes:
-        if probe.observed:
-            best[probe.name] = Screened(probe, None, None)
+        kinds.setdefault(_kind(probe), []).append(probe)
+    observed = kinds.pop("observed", [])
+    whole = sum(SHARES[kind] for kind in kinds)
+    signs = flip_signs(count, seed)
+    for kind, tested in kinds.items():
+        names = len({probe.name for probe in tested})
+        p_values, adjusted = _order_p(tested) if kind == "order" else _flip_p(tested, signs)
+        for probe, p_value, together in zip(tested, p_values, adjusted, strict=True):
+            if kind != "order" and count < FEW and p_value <= 2.5 * 2.0 ** (1 - count):
+                together = min(together, names * size_p(probe))
+            _keep(best, Screened(probe, p_value, min(1.0, together * whole / SHARES[kind])))
+    for probe in observed:
+        best[probe.name] = Screened(probe, None, None)
     return best
+
+
+def _kind(probe: Probe) -> str:
+    if probe.observed:
+        return "observed"
+    if probe.permuted is not None:
+        return "order"
+    return "scores" if probe.products is None else "products"
+
+
+def _flip_p(probes: Sequence[Probe], signs: np.ndarray) -> tuple[list[float], list[float]]:
+    """p-value of every probe under the same flips, and the one adjusted by the smallest of all."""
+    shares = tail_shares(flip_statistics(probes, signs))
+    smallest = np.sort(shares.min(axis=1))
+    adjusted = np.searchsorted(smallest, shares[0], side="right") / len(smallest)
+    return shares[0].tolist(), adjusted.tolist()
+
+
+def _order_p(probes: Sequence[Probe]) -> tuple[list[float], list[float]]:
+    """The same of probes that were permuted already, each by itself."""
+    p_values = [probe.permuted for probe in probes if probe.permuted is not None]
+    return p_values, [min(1.0, len(probes) * p_value) for p_value in p_values]
 
 
 def size_p(probe: Probe) -> float:

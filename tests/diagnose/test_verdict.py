@@ -43,6 +43,7 @@ def test_file_has_the_contracts_keys_and_values(tmp_path):
                 "params": {"width": {"value": 0.18, "ci95": [0.15, 0.21], "unit": "1"}},
                 "p_value": 0.0004,
                 "heldout_gain": 0.41,
+                "basis": "tested",
             }
         ],
         "ambiguous_with": [],
