@@ -1,4 +1,4 @@
-"""Diagnose pads of the third, jittered rig: scripts/bench_jittered.py --effects mullins,clean --gains .3 --seeds 0:3.
+"""Diagnose pads of the third, jittered rig: bench_jittered.py --effects mullins,clean --gains .3 --seeds 0:3.
 
 Seeds below 1000 are for tuning, from 1000 on for reporting. One line of JSON per set goes to --output.
 """
@@ -11,10 +11,10 @@ from pathlib import Path
 
 sys.path.insert(0, str(Path(__file__).parents[1] / "tests" / "diagnose"))
 
-from jittered_rig import EFFECTS, Rig  # noqa: E402  the rig is a test's
+from jittered_rig import EFFECTS, Rig
 
-from lerobot_vtrefine.diagnose.pad_engine import diagnose_pad  # noqa: E402
-from lerobot_vtrefine.diagnose.quality import check_quality  # noqa: E402
+from lerobot_vtrefine.diagnose.pad_engine import diagnose_pad
+from lerobot_vtrefine.diagnose.quality import check_quality
 
 
 def run(name: str, gain: float, seed: int) -> dict:
@@ -35,12 +35,12 @@ def run(name: str, gain: float, seed: int) -> dict:
     row["cpu_s"] = round(time.process_time() - begin, 1)
     row["issues"] = [issue.problem for issue in issues]
     row["minimum_detectable"] = dict(found.minimum_detectable)
-    truth = {"k_d/k_n": rig.damping_s} | ({effect.parameter: effects[0][1]} if effect and effect.parameter else {})
+    truth = {"k_d/k_n": rig.damping_s} | (
+        {effect.parameter: effects[0][1]} if effect and effect.parameter else {}
+    )
     params = {name: p for cause in found.causes for name, p in cause.params.items()}
     row["truth"] = truth
-    row["params"] = {
-        key: [params[key].value, params[key].ci95] for key in truth if key in params
-    }
+    row["params"] = {key: [params[key].value, params[key].ci95] for key in truth if key in params}
     return row
 
 
@@ -61,8 +61,16 @@ def main() -> None:
                 if options.output:
                     with options.output.open("a") as file:
                         file.write(line + "\n")
-                short = {key: row[key] for key in ("effect", "gain", "seed", "hz", "status", "named", "clue", "cpu_s")}
-                print(json.dumps(short), f"{row['heldout_gain']:.3f}/{row['achievable']:.3f}", row["params"], flush=True)
+                short = {
+                    key: row[key]
+                    for key in ("effect", "gain", "seed", "hz", "status", "named", "clue", "cpu_s")
+                }
+                print(
+                    json.dumps(short),
+                    f"{row['heldout_gain']:.3f}/{row['achievable']:.3f}",
+                    row["params"],
+                    flush=True,
+                )
 
 
 if __name__ == "__main__":

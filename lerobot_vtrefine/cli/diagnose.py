@@ -142,6 +142,7 @@ def diagnose(recordings: "RecordingSet", seed: int) -> "Diagnosis":
 
 def make_verdict(diagnosis: "Diagnosis | None", issues: Sequence["DataIssue"]) -> "Verdict":
     """The verdict of a diagnosis, or ``invalid_data`` without one."""
+    from lerobot_vtrefine.diagnose.evidence import not_tested
     from lerobot_vtrefine.diagnose.verdict import Verdict
 
     if diagnosis is None:
@@ -155,6 +156,7 @@ def make_verdict(diagnosis: "Diagnosis | None", issues: Sequence["DataIssue"]) -
         diagnosis.minimum_detectable,
         diagnosis.next_experiment,
         tuple(issues),
+        not_tested(diagnosis.evidence),
     )
 
 
@@ -174,9 +176,11 @@ def unfitted_model(recordings: "RecordingSet") -> "Savable":
 
 def summarise(verdict: "Verdict", unit: str, output_dir: Path) -> None:
     """The verdict and where to read about it, in a few lines."""
-    from lerobot_vtrefine.diagnose.report.words import headline
+    from lerobot_vtrefine.diagnose.report.words import headline, power_line
 
     print(f"{verdict.status}: {headline(verdict, unit)}")
+    if power := power_line(verdict):
+        print(power)
     if verdict.data_issues:
         aside = sum(issue.action == "set aside" for issue in verdict.data_issues)
         print(f"data issues: {len(verdict.data_issues)}, {aside} recordings set aside")

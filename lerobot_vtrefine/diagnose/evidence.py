@@ -1,6 +1,6 @@
 """What an engine hands to the report beside its verdict: evidence per candidate, traces, residuals."""
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Protocol
@@ -35,6 +35,15 @@ class Evidence:
 
 
 DECISIONS = ("accepted", "symptom", "tie", "rejected", "not identifiable")
+
+
+def not_tested(evidence: Sequence[Evidence]) -> dict[str, str]:
+    """Causes that the recordings could not have shown whatever their size, and what to record for each."""
+    return {
+        item.name: item.reason
+        for item in evidence
+        if item.decision == "not identifiable" and item.name.isidentifier()
+    }
 
 
 @dataclass(frozen=True)

@@ -1,6 +1,6 @@
 """Causes and evidence as the verdict and the report name them."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 
 from lerobot_vtrefine.diagnose.baseline import plain_weights
 from lerobot_vtrefine.diagnose.candidates import CATALOGUE
@@ -55,19 +55,29 @@ def _parameters(search: Search, fitted: Fit, name: str, left_out: LeftOut, seed:
 
 
 def evidence_table(
-    search: Search, fitted: Fit, role: str, groups: Sequence[Sequence[str]]
+    search: Search,
+    fitted: Fit,
+    role: str,
+    groups: Sequence[Sequence[str]],
+    not_tested: Mapping[str, str],
 ) -> tuple[Evidence, ...]:
-    """One row per candidate, found or not, the most promising first."""
-    setting = fitted.model.setting
-    possible = {form.family: False for form in CATALOGUE}
-    for form in CATALOGUE:
-        possible[form.family] |= form.possible(setting)
-    rows = [_row(name, search, fitted, role, groups, possible.get(name, True)) for name in [*possible, *MAPS]]
+    """One row per candidate, found or not, the most promising first.
+
+    Args:
+        not_tested: causes that these recordings cannot show, and what to record.
+    """
+    names = [*dict.fromkeys(form.family for form in CATALOGUE), *MAPS]
+    rows = [_row(name, search, fitted, role, groups, not_tested.get(name)) for name in names]
     return tuple(sorted(rows, key=lambda row: (-(row.cv_gain or -1.0), row.p_adjusted or 1.0)))
 
 
 def _row(
-    name: str, search: Search, fitted: Fit, role: str, groups: Sequence[Sequence[str]], possible: bool
+    name: str,
+    search: Search,
+    fitted: Fit,
+    role: str,
+    groups: Sequence[Sequence[str]],
+    to_record: str | None,
 ) -> Evidence:
     found = search.screened.get(name)
     p_value, adjusted = (found.p_value, found.p_adjusted) if found is not None else (None, None)
@@ -88,8 +98,8 @@ def _row(
         return Evidence(name, p_value, adjusted, gain, "accepted", text, observed)
     if any(name in group for group in groups) and role != "symptom":
         return Evidence(name, p_value, adjusted, gain, "tie", "explains the data as well as what was named")
-    if not possible:
-        return Evidence(name, None, None, None, "not identifiable", "cannot act in these recordings")
+    if to_record is not None:
+        return Evidence(name, None, None, None, "not identifiable", to_record)
     seen = found is not None and found.probe.observed
     reason = _why_rejected(found is not None, adjusted, gain)
     return Evidence(name, p_value, adjusted, gain, "rejected", reason, seen)

@@ -13,7 +13,7 @@ from lerobot_vtrefine.diagnose.ambiguity import find_ambiguities
 from lerobot_vtrefine.diagnose.baseline import Baseline, fit_baseline, plain_weights
 from lerobot_vtrefine.diagnose.composite import Composite, sensor_model
 from lerobot_vtrefine.diagnose.crossvalidation import agree, cross_validate
-from lerobot_vtrefine.diagnose.detectable import minimum_detectable
+from lerobot_vtrefine.diagnose.detectable import power_of
 from lerobot_vtrefine.diagnose.evaluation import (
     foretell,
     heldout,
@@ -24,7 +24,7 @@ from lerobot_vtrefine.diagnose.evaluation import (
     trial_errors,
 )
 from lerobot_vtrefine.diagnose.evidence import Evidence, ResidualView, Trace, TrialError
-from lerobot_vtrefine.diagnose.fitting import Fit, predict, rest, tangents
+from lerobot_vtrefine.diagnose.fitting import Fit, predict, rest
 from lerobot_vtrefine.diagnose.idle import settled_idle
 from lerobot_vtrefine.diagnose.intervals import baseline_parameters, leave_out
 from lerobot_vtrefine.diagnose.locking import lock
@@ -32,7 +32,6 @@ from lerobot_vtrefine.diagnose.naming import evidence_table, named_causes
 from lerobot_vtrefine.diagnose.pairs import reconsider
 from lerobot_vtrefine.diagnose.presses import PressSet, prepare, usable
 from lerobot_vtrefine.diagnose.recordings import RecordingSet, Trial
-from lerobot_vtrefine.diagnose.screening import Scorer
 from lerobot_vtrefine.diagnose.search import Search, start_search
 from lerobot_vtrefine.diagnose.selection import (
     forward,
@@ -178,20 +177,20 @@ def _conclude(
     foretold = foretell(held_set, plain, extended)
     floor = noise_floor(everyone, locked, baseline.noise, predict(fitted.model, held_set))
     role = "symptom" if status == "unexplained" else "cause"
-    smallest = _smallest(search, fitted)
+    power = power_of(search, fitted)
     return PadDiagnosis(
         status=status,
         causes=named_causes(search, fitted, leave_out(fitted, search.presses), role, held_set, seed),
         ambiguous_with=rivals.groups if status == "ambiguous" else (),
         unknown=Unknown(suspicion.alarm, suspicion.clue),
         heldout=heldout(foretold, floor, seed),
-        minimum_detectable=smallest,
+        minimum_detectable=power.smallest,
         next_experiment=rivals.experiment if status == "ambiguous" else None,
         issues=tuple(issues),
         baseline_model=plain,
         extended_model=extended,
         baseline_params=baseline_parameters(baseline.plain, search.presses),
-        evidence=evidence_table(search, fitted, role, rivals.groups),
+        evidence=evidence_table(search, fitted, role, rivals.groups, power.not_tested),
         traces=traces(foretold),
         residuals=residual_views(foretold, seed),
         trial_errors=trial_errors(foretold),
@@ -237,9 +236,3 @@ def _blindly_better(search: Search, plain: SensorModel, extended: SensorModel) -
         for values in (lambda f: f.simulated, lambda f: f.extended)
     )
     return after < before
-
-
-def _smallest(search: Search, fitted: Fit) -> dict[str, float]:
-    """Smallest effects that would have been seen; only of causes that were not found."""
-    _, columns = tangents(fitted.model, search.presses, fitted.model.free)
-    return minimum_detectable(Scorer(fitted, search.presses, search.weights, columns))

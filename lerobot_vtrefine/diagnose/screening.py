@@ -19,7 +19,8 @@ from lerobot_vtrefine.diagnose.presses import PressSet
 from lerobot_vtrefine.diagnose.weights import TrialWeights
 
 FLIPS = 9999
-ALPHA = 0.02
+ALPHA = 0.05
+"""Chance that any candidate passes the screening where none is there; it must then predict better, too."""
 FEW = 10
 """With fewer recordings than this, signs alone cannot reach significance: size counts as well."""
 DOUBT = 2.0
@@ -155,7 +156,9 @@ def probe_form(form: Form, scorer: Scorer) -> list[Probe]:
 
 
 def flip_signs(count: int, seed: int) -> np.ndarray:
-    """(FLIPS + 1, K) signs, the first row without flips."""
+    """(F, K) signs, the first row without flips: all there are, or as many at random as there may be."""
+    if 2**count <= FLIPS + 1:
+        return 1.0 - 2.0 * ((np.arange(2**count)[:, None] >> np.arange(count)) & 1)
     rng = np.random.default_rng([seed, 1])
     signs = rng.integers(0, 2, (FLIPS + 1, count)) * 2.0 - 1.0
     signs[0] = 1.0
@@ -163,7 +166,7 @@ def flip_signs(count: int, seed: int) -> np.ndarray:
 
 
 def flip_statistics(probes: Sequence[Probe], signs: np.ndarray) -> np.ndarray:
-    """Standardised sums of scores under every flip: (FLIPS + 1, number of probes); larger is stronger."""
+    """Standardised sums of scores under every flip: (F, number of probes); larger is stronger."""
     columns = []
     for probe in probes:
         if probe.products is not None:

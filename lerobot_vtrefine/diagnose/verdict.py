@@ -135,7 +135,9 @@ class DataIssue:
 class Verdict:
     """Everything in ``verdict.json``. ``heldout`` is None when nothing could be fitted (``invalid_data``).
 
-    ``next_experiment`` is a JSON object (a protocol that the rig can run, with what it decides) or None.
+    ``minimum_detectable`` says from which size on a cause would have been named, ``not_tested`` which causes
+    these recordings cannot show, and what to record for each. ``next_experiment`` is a JSON object (a
+    protocol that the rig can run, with what it decides) or None.
     """
 
     status: Status
@@ -146,6 +148,7 @@ class Verdict:
     minimum_detectable: Mapping[str, float] = field(default_factory=dict)
     next_experiment: Mapping[str, Any] | None = None
     data_issues: tuple[DataIssue, ...] = ()
+    not_tested: Mapping[str, str] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
         by_gain = sorted(self.causes, key=lambda cause: -(cause.heldout_gain or 0.0))
@@ -156,6 +159,7 @@ class Verdict:
         for names in self.ambiguous_with:
             _check_names("ambiguous_with", names)
         _check_names("minimum_detectable", tuple(self.minimum_detectable))
+        _check_names("not_tested", tuple(self.not_tested))
         _check_consistent(self)
         for where, number in _numbers("", asdict(self)):
             if not math.isfinite(number):

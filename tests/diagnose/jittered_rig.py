@@ -50,7 +50,7 @@ class Press:
 
 @dataclass(frozen=True)
 class Effect:
-    """Where it acts ("height", "force", "reading", "delay", "frames"), its law, and the parameters of its truth.
+    """Where it acts ("height", "force", "reading", "delay", "frames"), its law, and its parameter.
 
     `law(press, x, strength)` gives the changed x; a delay's law gives seconds per taxel (n,).
     """
@@ -174,7 +174,9 @@ def _courses(rng: np.random.Generator, rows: int, cols: int, number: int) -> tup
     peak, share = rng.uniform(0.6e-3, 1.2e-3), rng.uniform(0.3, 0.7)
     knots = np.cumsum(rng.uniform(0.4, 1.6, 9))
     knots *= 0.97 * span / knots[-1]
-    levels = np.array([-3e-4, share * peak, share * peak, 0.1 * peak, peak, peak, 0.45 * peak, 0.8 * peak, -3e-4])
+    levels = np.array(
+        [-3e-4, share * peak, share * peak, 0.1 * peak, peak, peak, 0.45 * peak, 0.8 * peak, -3e-4]
+    )
     depth = np.interp(time, knots, levels)
     if number % 4 == 1:  # a swing on top
         depth = depth + 0.12 * peak * np.sin(2 * np.pi * rng.uniform(0.5, 2.0) * time) * (depth > 0)
@@ -184,7 +186,9 @@ def _courses(rng: np.random.Generator, rows: int, cols: int, number: int) -> tup
     depth = np.convolve(np.pad(depth, width, mode="edge"), np.ones(width) / width, mode="same")[width:-width]
     x0 = rng.uniform(-0.35, 0.35) * (cols - 1) * PITCH_M
     y0 = rng.uniform(-0.3, 0.3) * (rows - 1) * PITCH_M
-    slide = rng.uniform(0.003, 0.008) * np.interp(time, [0.3 * span, 0.8 * span], [0.0, 1.0]) * (number % 4 == 3)
+    slide = (
+        rng.uniform(0.003, 0.008) * np.interp(time, [0.3 * span, 0.8 * span], [0.0, 1.0]) * (number % 4 == 3)
+    )
     return time, x0 + slide, np.full(len(time), y0), depth
 
 
@@ -228,7 +232,9 @@ class Rig:
     def readings(self, press: Press, effects, deviate: bool) -> np.ndarray:
         """Readings above idle without noise at the frames (F, n) [counts]."""
         rng = np.random.default_rng([self.seed, 33, *np.ravel(press.frames_s[:2] * 1e6).astype(int)])
-        own_gain, own_offset = (1 + 0.01 * rng.standard_normal(), 1e-5 * rng.standard_normal()) if deviate else (1, 0)
+        own_gain, own_offset = (
+            (1 + 0.01 * rng.standard_normal(), 1e-5 * rng.standard_normal()) if deviate else (1, 0)
+        )
         x = press.heights - own_offset
         for effect, strength in effects:
             x = effect.law(press, x, strength) if effect.where == "height" else x
@@ -242,7 +248,9 @@ class Rig:
         for effect, strength in effects:
             x = effect.law(press, x, strength) if effect.where == "reading" else x
         x = np.minimum(x, FULL_SCALE)
-        delay = sum((e.law(press, x, s) for e, s in effects if e.where == "delay"), np.zeros(len(press.taxels)))
+        delay = sum(
+            (e.law(press, x, s) for e, s in effects if e.where == "delay"), np.zeros(len(press.taxels))
+        )
         taken = press.frames_s.copy()
         for effect, strength in effects:
             if effect.where == "frames":
@@ -256,23 +264,22 @@ class Rig:
         return out
 
     def achievable(self, effects) -> float:
-        """Part of the squared error of the best spring and damper that the true law takes away."""
-        noise = self.white**2 + self.slow**2 + 1 / 12
-        gram, error, power, count = np.zeros((2, 2)), np.zeros(2), 0.0, 0
-        own = 0.0
-        for press in self.presses[:: 1 if len(self.presses) < 9 else 2]:
-            truth = self.readings(press, effects, False)
+        """Part of the squared error of the best spring and damper that the true law takes away.
+
+        Both are judged on recordings with deviations and noise of their own, which neither knows.
+        """
+        gram, along, power, left, count = np.zeros((2, 2)), np.zeros(2), 0.0, 0.0, 0
+        for press in self.presses:
+            truth, measured = (self.readings(press, effects, deviate) for deviate in (False, True))
             at = np.searchsorted(press.time_s, press.frames_s).clip(max=len(press.time_s) - 1)
-            d = np.maximum(press.heights, 0)[at]
-            v = (np.gradient(press.heights, STEP_S, axis=0) * (press.heights > 0))[at]
-            columns = np.stack([d.ravel(), v.ravel()])
-            gram += columns @ columns.T
-            error += columns @ truth.ravel()
-            power, count = power + float((truth**2).sum()), count + truth.size
-            own += float((0.01 * truth) ** 2 @ np.ones(truth.shape[1]) @ np.ones(len(truth))) if False else float(((0.01 * truth) ** 2).sum())
-        misfit = (power - error @ np.linalg.solve(gram, error) + own) / count
-        floor = noise + own / count
-        return float(1 - floor / (misfit + noise))
+            touch = press.heights[at] > 0
+            rate = np.gradient(press.heights, STEP_S, axis=0)[at]
+            columns = np.stack([(press.heights[at] * touch).ravel(), (rate * touch).ravel()])
+            gram, along = gram + columns @ columns.T, along + columns @ measured.ravel()
+            power, count = power + float((measured**2).sum()), count + truth.size
+            left += float(((measured - truth) ** 2).sum())
+        noise = count * (self.white**2 + self.slow**2 + 1 / 12)
+        return 1.0 - (left + noise) / (power - along @ np.linalg.solve(gram, along) + noise)
 
     def strength_for(self, effect: Effect, gain: float) -> float:
         """Strength at which the effect has that achievable gain, by bisection of its logarithm."""
@@ -281,7 +288,9 @@ class Rig:
             high = np.log(0.85)
         for _ in range(9):
             middle = 0.5 * (low + high)
-            low, high = (middle, high) if self.achievable([(effect, np.exp(middle))]) < gain else (low, middle)
+            low, high = (
+                (middle, high) if self.achievable([(effect, np.exp(middle))]) < gain else (low, middle)
+            )
         return float(np.exp(0.5 * (low + high)))
 
     def record(self, effects=()) -> RecordingSet:
@@ -305,8 +314,8 @@ class Rig:
             column = [np.interp(at, press.time_s, values) for values in (press.x_m, press.y_m, press.depth_m)]
             trials.append(
                 Trial(
-                    f"p{order:02d}.parquet", f"c{press.condition}", 0, order, start_s, self.shape, at, *column,
-                    zeros, zeros, None, None, raw,
+                    f"p{order:02d}.parquet", f"c{press.condition}", 0, order, start_s, self.shape, at,
+                    *column, zeros, zeros, None, None, raw,
                 )
             )  # fmt: skip
             start_s += float(at[-1]) + 8.0

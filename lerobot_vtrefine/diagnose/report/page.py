@@ -26,6 +26,7 @@ from lerobot_vtrefine.diagnose.report.words import (
     doubts,
     headline,
     meaning,
+    size_text,
     ties,
     title,
 )
@@ -74,13 +75,10 @@ def render_report(
         facts=_facts(verdict, recordings, sound, seed),
         next_experiment=_experiment(verdict.next_experiment),
         detectable=[
-            {
-                "title": title(name),
-                "what": meaning(name).parameter,
-                "size": quantity(size, meaning(name).unit),
-            }
+            {"title": title(name), "size": size_text(name, size)}
             for name, size in verdict.minimum_detectable.items()
         ],
+        not_tested=[{"title": title(name), "needs": what} for name, what in verdict.not_tested.items()],
         **(_nothing() if diagnosis is None else _findings(verdict, diagnosis, unit, of_pad)),
     )
 

@@ -155,7 +155,10 @@ def headline(verdict: Verdict, unit: str) -> str:
         return "These recordings allow no verdict: too little of them is sound."
     if verdict.status == "adequate":
         fitted = "stiffness, damping and gain" if unit == "counts" else "servo constants"
-        return f"The simulation is adequate: once its {fitted} are refitted, nothing significant is left."
+        scope = " for what was tested" if verdict.not_tested else ""
+        return (
+            f"The simulation is adequate{scope}: once its {fitted} are refitted, nothing significant is left."
+        )
     if verdict.status == "explained":
         return f"The simulation lacks {names}. {repaired(verdict, unit)}"
     if verdict.status == "ambiguous":
@@ -166,6 +169,28 @@ def headline(verdict: Verdict, unit: str) -> str:
     clue = f" What is known of it: {clue}." if 0 < len(clue) <= LONGEST_CLUE else ""
     symptoms = f" What looks like {names} may be a symptom of it.{_all_the_same(verdict)}" if names else ""
     return f"The simulation is wrong in a way that no known cause explains.{clue}{symptoms}"
+
+
+def power_line(verdict: Verdict) -> str:
+    """What an adequate verdict would have shown, and what it could not have; empty for others."""
+    if verdict.status != "adequate":
+        return ""
+    shown = listing(
+        [f"{title(name)} ({size_text(name, size)})" for name, size in verdict.minimum_detectable.items()]
+    )
+    parts = [f"would have shown: {shown}"] if shown else []
+    if verdict.not_tested:
+        missing = [f"{title(name)} ({what})" for name, what in sorted(verdict.not_tested.items())]
+        parts.append(f"not tested: {listing(missing)}")
+    return "; ".join(parts)
+
+
+def size_text(name: str, size: float) -> str:
+    """A cause's main parameter at some size, for example "delay 4 ms"."""
+    about = meaning(name)
+    if name == "dead_taxels":
+        return "one of those pressed hard enough"
+    return f"{about.parameter} {quantity(size, about.unit)}"
 
 
 def _all_the_same(verdict: Verdict) -> str:
