@@ -1,6 +1,6 @@
-"""The verdict of a diagnosis, as the public file ``verdict.json`` holds it (contract §3).
+"""The verdict of a diagnosis, as the public file ``verdict.json`` holds it (docs/verdict.md).
 
-The dataclasses refuse what the contract does not allow, so that no other program has to: numbers that are not
+The dataclasses refuse what the format does not allow, so that no other program has to: numbers that are not
 finite, unknown names, a status that its causes contradict.
 """
 
@@ -12,7 +12,7 @@ from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any, Literal, get_args
 
-from lerobot_vtrefine.files import decode, read_json
+from lerobot_vtrefine.files import decode, limits, read_json
 
 SCHEMA = "vtrefine/verdict@1"
 
@@ -47,7 +47,7 @@ ROBOT_CAUSES = (
 )
 SCENE_CAUSES = ("camera_extrinsics", "depth_scale", "object_mass", "object_friction", "clearance")
 CAUSES = SENSOR_CAUSES + ROBOT_CAUSES + SCENE_CAUSES
-"""Every name that the contract lists (§4); a verdict may give those of the catalogue's other files too."""
+"""Every name that docs/verdict.md lists; a verdict may give those of the catalogue's other files too."""
 
 
 @dataclass(frozen=True)
@@ -166,26 +166,54 @@ class Verdict:
                 raise ValueError(f"verdict holds {number} at {where}; JSON knows no such number, use None")
 
     def to_dict(self) -> dict[str, Any]:
-        """JSON-ready form with the contract's keys in the contract's order."""
+        """JSON-ready form with the format's keys in the format's order."""
         return {"schema": SCHEMA, **asdict(self)}
 
     @classmethod
-    def from_dict(cls, data: Mapping[str, Any]) -> "Verdict":
-        """Inverse of `to_dict`; ValueError says what is missing or wrong."""
+    def from_dict(cls, data: Any) -> "Verdict":
+        """Inverse of `to_dict`; ValueError names the field and what is wrong with it."""
         if not isinstance(data, Mapping) or data.get("schema") != SCHEMA:
             raise ValueError(f'verdict must hold "schema": "{SCHEMA}"')
-        values = {key: value for key, value in data.items() if key != "schema"}
-        try:
-            values["causes"] = tuple(_cause_from_dict(item) for item in values["causes"])
-            values["unknown"] = decode(Unknown, values["unknown"], "unknown", "unknown.")
-            values["data_issues"] = tuple(
-                decode(DataIssue, item, "data_issues") for item in values["data_issues"]
-            )
-            if values["heldout"] is not None:
-                values["heldout"] = decode(Heldout, values["heldout"], "heldout", "heldout.")
-            return cls(**values)
-        except (KeyError, TypeError) as error:
-            raise ValueError(f"verdict is malformed: {error}") from error
+        content = decode(VerdictFile, data, "verdict", others=True)
+        causes = tuple(
+            Cause(**vars(cause) | {"params": {name: _parameter(item) for name, item in cause.params.items()}})
+            for cause in content.causes
+        )
+        values = {key: value for key, value in vars(content).items() if key != "schema"}
+        return cls(**values | {"causes": causes})
+
+
+@dataclass(frozen=True)
+class _ParameterEntry:
+    value: float | list[Any]
+    ci95: list[Any] | None
+    unit: str
+
+
+@dataclass(frozen=True)
+class _CauseEntry:
+    name: str
+    role: Role
+    params: dict[str, _ParameterEntry]
+    p_value: float | None = limits(0.0, 1.0)
+    heldout_gain: float | None = limits(maximum=1.0)
+    basis: Basis = "tested"
+
+
+@dataclass(frozen=True)
+class VerdictFile:
+    """Content of verdict.json; fields without a default are always there."""
+
+    schema: Literal["vtrefine/verdict@1"]
+    status: Status
+    causes: tuple[_CauseEntry, ...]
+    ambiguous_with: tuple[tuple[str, ...], ...]
+    unknown: Unknown
+    heldout: Heldout | None
+    minimum_detectable: dict[str, float]
+    next_experiment: dict[str, Any] | None
+    data_issues: tuple[DataIssue, ...]
+    not_tested: dict[str, str] = field(default_factory=dict)
 
 
 def write_verdict(verdict: Verdict, path: str | Path) -> None:
@@ -218,17 +246,13 @@ def _plain(value: Any) -> Any:
     raise TypeError(f"verdict.json cannot hold {type(value).__name__}")
 
 
-def _cause_from_dict(item: Mapping[str, Any]) -> Cause:
-    params = {name: Parameter(**_with_tuple(value, "ci95")) for name, value in item["params"].items()}
-    rest: dict[str, Any] = {key: value for key, value in item.items() if key != "params"}
-    return Cause(params=params, **rest)
-
-
-def _with_tuple(item: Mapping[str, Any], key: str) -> dict[str, Any]:
-    """JSON's list of two numbers back as the tuple that was written."""
-    value = item[key]
-    is_interval = isinstance(value, list) and len(value) == 2 and not isinstance(value[0], list)
-    return {**item, key: tuple(value) if is_interval else value}
+def _parameter(entry: _ParameterEntry) -> Parameter:
+    """With JSON's list of two numbers as the tuple that was written."""
+    ci95 = entry.ci95
+    is_interval = ci95 is not None and len(ci95) == 2 and not isinstance(ci95[0], list)
+    return Parameter(
+        entry.value, (ci95[0], ci95[1]) if ci95 is not None and is_interval else ci95, entry.unit
+    )
 
 
 def _check_choice(name: str, value: str, choices: tuple[str, ...]) -> None:
@@ -250,7 +274,7 @@ def _own_causes() -> tuple[str, ...]:
 
 
 def _check_consistent(verdict: Verdict) -> None:
-    """A status must not contradict the rest (contract §3)."""
+    """A status must not contradict the rest (docs/verdict.md)."""
     roles = {cause.role for cause in verdict.causes}
     wrong = {
         "adequate": bool(verdict.causes or verdict.ambiguous_with or verdict.unknown.alarm),

@@ -77,7 +77,7 @@ def replay(
     """Readings that the model predicts for one trial, or for several with the same times: (T, ..., R, C)
     float32 counts.
 
-    Give either the depth of every taxel (contract: column height), or force per taxel, which then replaces
+    Give either the depth of every taxel (column height, see docs/recording-format.md), or force per taxel, which then replaces
     the contact model and everything before it.
 
     Args:

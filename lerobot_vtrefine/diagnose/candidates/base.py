@@ -60,7 +60,7 @@ class Form:
     """One functional form of a cause.
 
     Attributes:
-        family: name of the cause (contract §4).
+        family: name of the cause (docs/verdict.md).
         label: what form this is, for people.
         values: fitted coordinates; coordinate vectors elsewhere follow their order.
         build: coordinates and setting to stages.

@@ -9,7 +9,7 @@ from lerobot_vtrefine.diagnose.verdict import Verdict
 
 @dataclass(frozen=True)
 class Meaning:
-    """A cause for people: its title, what it is, and the unit of its main parameter (contract §5)."""
+    """A cause for people: its title, what it is, and the unit of its main parameter (docs/verdict.md)."""
 
     title: str
     what: str
