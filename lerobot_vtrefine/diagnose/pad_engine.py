@@ -52,7 +52,7 @@ Tell = Callable[[str, float], None]
 
 @dataclass(frozen=True)
 class PadDiagnosis:
-    """What was found on a pad: the verdict's fields (docs/verdict.md), both models, and what the report draws.
+    """What was found on a pad: fields of the verdict (docs/verdict.md), both models, what the report draws.
 
     Attributes:
         status, causes, ambiguous_with, unknown, heldout, minimum_detectable, next_experiment: as

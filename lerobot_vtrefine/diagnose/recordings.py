@@ -1,4 +1,4 @@
-"""Read a recording set: a folder with `recording.json` and a Parquet file per trial (docs/recording-format.md)."""
+"""Read a recording set: a folder with `recording.json` and a Parquet file per trial."""
 
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
