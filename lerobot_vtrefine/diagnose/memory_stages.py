@@ -5,11 +5,14 @@ from collections.abc import Callable
 from typing import Any
 
 import numpy as np
+import torch
 
 from lerobot_vtrefine.diagnose.fields import Context, Field, by_press
 from lerobot_vtrefine.diagnose.rhythm import slots
+from lerobot_vtrefine.tactile.stages.base import Frame, Stage
 from lerobot_vtrefine.tactile.stages.host import Latency, SampleAndHold, ScanSkew, taken_at_frames
 from lerobot_vtrefine.tactile.stages.mechanics import Hysteresis, ViscoelasticRelaxation
+from lerobot_vtrefine.tactile.stages.softening import FirstLoadSoftening
 
 MAX_EXPONENT = 200.0
 
@@ -176,9 +179,21 @@ def _hysteresis(stage: Hysteresis, field: Field, context: Context) -> Field:
     return Field(np.maximum(held, 0.0), field.columns)
 
 
+def _own_sequence(stage: Stage, field: Field, context: Context) -> Field:
+    """The stage's own code, of a stage that treats every taxel by itself."""
+    frame = Frame(context.sheet.layout, stiffness_n_per_m=context.stiffness)
+
+    def work(x: np.ndarray, time_s: np.ndarray, rows: np.ndarray) -> np.ndarray:
+        images = torch.from_numpy(np.ascontiguousarray(x))[:, None]
+        return stage.sequence(images, torch.from_numpy(time_s), frame)[:, 0].numpy()
+
+    return by_press(field, context.sheet, work)
+
+
 MEMORY: dict[type, Callable[[Any, Field, Context], Field]] = {
     ViscoelasticRelaxation: _relaxation,
     Hysteresis: _hysteresis,
+    FirstLoadSoftening: _own_sequence,
     Latency: _latency,
     ScanSkew: _scan_skew,
     SampleAndHold: _hold,

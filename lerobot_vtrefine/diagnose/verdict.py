@@ -25,6 +25,7 @@ SENSOR_CAUSES = (
     "saturation",
     "viscoelastic_relaxation",
     "hysteresis",
+    "first_load_softening",
     "taxel_gain_spread",
     "dead_taxels",
     "row_sharing",

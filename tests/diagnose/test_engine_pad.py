@@ -113,7 +113,7 @@ def test_the_gain_is_what_locked_recordings_say(hardened: PadDiagnosis) -> None:
 
 def test_every_candidate_has_a_row_of_evidence(hardened: PadDiagnosis) -> None:
     rows = {row.name: row for row in hardened.evidence}
-    assert len(rows) == 15
+    assert len(rows) == 16
     assert rows["nonlinear_stiffness"].decision == "accepted"
     assert rows["latency"].decision == "rejected"
 

@@ -39,6 +39,12 @@ MEANINGS = {
         "fraction",
         "1",
     ),
+    "first_load_softening": Meaning(
+        "first-load softening",
+        "Below the largest load so far the pad reads less than it did on the first load.",
+        "softening",
+        "1",
+    ),
     "taxel_gain_spread": Meaning(
         "taxel gain spread", "Every taxel has a sensitivity of its own.", "spread", "1"
     ),
