@@ -13,7 +13,7 @@ from lerobot_vtrefine.diagnose.baseline import plain_weights
 from lerobot_vtrefine.diagnose.candidates import CATALOGUE
 from lerobot_vtrefine.diagnose.candidates.base import Form
 from lerobot_vtrefine.diagnose.candidates.sample_and_hold import shortest_period
-from lerobot_vtrefine.diagnose.fitting import Fit, squared_errors, tangents
+from lerobot_vtrefine.diagnose.fitting import Fit, movable, squared_errors, tangents
 from lerobot_vtrefine.diagnose.maps import DEAD_ERROR, MAX_SIGMA, map_evidence, plain_gains
 from lerobot_vtrefine.diagnose.parallel import on_all_cores
 from lerobot_vtrefine.diagnose.screening import (
@@ -86,7 +86,7 @@ class _Injection:
 
     def __init__(self, search: Search, fitted: Fit) -> None:
         self.search, self.fitted = search, fitted
-        _, columns = tangents(fitted.model, search.presses, fitted.model.free)
+        _, columns = tangents(fitted.model, search.presses, movable(fitted))
         self.scorer = Scorer(fitted, search.presses, search.weights, columns)
         self._even = Scorer(fitted, search.presses, plain_weights(search.presses), columns)
         self._signs = flip_signs(len(search.weights), search.seed)

@@ -11,7 +11,7 @@ from lerobot_vtrefine.diagnose.candidates import CATALOGUE
 from lerobot_vtrefine.diagnose.candidates.base import Form
 from lerobot_vtrefine.diagnose.candidates.sample_and_hold import held, irregular_periods, pattern
 from lerobot_vtrefine.diagnose.crossvalidation import folds_of
-from lerobot_vtrefine.diagnose.fitting import Fit, tangents
+from lerobot_vtrefine.diagnose.fitting import Fit, movable, tangents
 from lerobot_vtrefine.diagnose.maps import find_dead, map_evidence
 from lerobot_vtrefine.diagnose.parallel import on_all_cores
 from lerobot_vtrefine.diagnose.presses import PressSet
@@ -52,7 +52,7 @@ def forms_of(family: str, fitted: Fit) -> list[Form]:
 
 def all_probes(search: Search, fitted: Fit, families: Collection[str] | None = None) -> list[Probe]:
     """Probes of every candidate (or of those families) that the model does not hold yet."""
-    _, columns = tangents(fitted.model, search.presses, fitted.model.free)
+    _, columns = tangents(fitted.model, search.presses, movable(fitted))
     scorer = Scorer(fitted, search.presses, search.weights, columns)
     held = set(fitted.model.families)
     forms = [

@@ -13,7 +13,7 @@ from lerobot_vtrefine.diagnose.candidates.baseline_drift import CURVE
 from lerobot_vtrefine.diagnose.candidates.sample_and_hold import held
 from lerobot_vtrefine.diagnose.composite import Composite
 from lerobot_vtrefine.diagnose.crossvalidation import Score, agree, cross_validate
-from lerobot_vtrefine.diagnose.fitting import Fit, fit, predict, squared_errors, tangents
+from lerobot_vtrefine.diagnose.fitting import Fit, fit, movable, predict, squared_errors, tangents
 from lerobot_vtrefine.diagnose.maps import find_dead, with_map
 from lerobot_vtrefine.diagnose.parallel import on_all_cores
 from lerobot_vtrefine.diagnose.screening import Probe, Scorer, Screened, probe_form, screen
@@ -272,7 +272,7 @@ def simplify(search: Search, fitted: Fit) -> Fit:
         if form is plain:
             continue
         slim = take_away(search, fitted, form.family)
-        _, columns = tangents(slim.model, search.presses, slim.model.free)
+        _, columns = tangents(slim.model, search.presses, movable(slim))
         probes = probe_form(plain, Scorer(slim, search.presses, search.weights, columns))
         found = refit(search, slim, plain, probes)
         if not preferable(form, scored(search, fitted), scored(search, found), search.seed):

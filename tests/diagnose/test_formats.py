@@ -1,4 +1,4 @@
-"""Public formats: schemas say what the readers check, the pages name every field, and the template is sound."""
+"""Public formats: schemas say what readers check, the pages name every field, and the template is sound."""
 
 import json
 import re

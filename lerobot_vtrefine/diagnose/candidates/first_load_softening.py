@@ -1,13 +1,16 @@
 """first_load_softening: below the largest load so far the pad reads less than on the first load."""
 
+from typing import Any
+
 import numpy as np
 
 from lerobot_vtrefine.diagnose.candidates.base import Form, Setting, Value
 from lerobot_vtrefine.tactile.stages.base import Stage
 from lerobot_vtrefine.tactile.stages.softening import FirstLoadSoftening
 
-SOFTENING = Value("softening", -0.9, 0.9, 2e-3)
+SOFTENING = Value("softening", -0.9, 2.0, 2e-3)
 LOG_SHARPNESS = Value("log_sharpness", float(np.log(0.05)), float(np.log(8.0)), 1e-2)
+GROWTH = Value("growth", 0.0, 2.0, 1e-2)
 LOG_RECOVERY = Value("log_recovery", float(np.log(0.3)), float(np.log(100.0)), 1e-2)
 
 
@@ -15,12 +18,14 @@ def _plain(values: np.ndarray, setting: Setting) -> tuple[Stage, ...]:
     return (FirstLoadSoftening(float(values[0])),)
 
 
-def _sharp(values: np.ndarray, setting: Setting) -> tuple[Stage, ...]:
-    return (FirstLoadSoftening(float(values[0]), float(np.exp(values[1]))),)
+def _growing(values: np.ndarray, setting: Setting) -> tuple[Stage, ...]:
+    return (FirstLoadSoftening(float(values[0]), growth=1.0),)
 
 
-def _recovering(values: np.ndarray, setting: Setting) -> tuple[Stage, ...]:
-    return (FirstLoadSoftening(float(values[0]), float(np.exp(values[1])), float(np.exp(values[2]))),)
+def _free(values: np.ndarray, setting: Setting) -> tuple[Stage, ...]:
+    softening, log_sharpness, growth, *recovery = (float(value) for value in values)
+    recovery_s = float(np.exp(recovery[0])) if recovery else 0.0
+    return (FirstLoadSoftening(softening, float(np.exp(log_sharpness)), growth, recovery_s),)
 
 
 def _report(values: np.ndarray, setting: Setting) -> dict[str, tuple[float, str]]:
@@ -28,42 +33,43 @@ def _report(values: np.ndarray, setting: Setting) -> dict[str, tuple[float, str]
     found = {"softening": (float(values[0]), "1")}
     if len(values) > 1:
         found["sharpness"] = (float(np.exp(values[1])), "1")
-    if len(values) > 2:
-        found["recovery_s"] = (float(np.exp(values[2])), "s")
+    if len(values) > 3:
+        found["recovery_s"] = (float(np.exp(values[3])), "s")
     return found
 
 
+def _form(label: str, *more: Value, **rest: Any) -> Form:
+    return Form("first_load_softening", label, (SOFTENING, *more), report=_report, signed=True, **rest)
+
+
 FORMS = (
-    Form(
-        "first_load_softening",
-        "in proportion to what was let go",
-        (SOFTENING,),
-        _plain,
-        _report,
-        lambda s: [[0.05]],
-        signed=True,
+    _form(
+        "by the part that was let go",
+        build=_plain,
+        probes=lambda s: [[0.05]],
         needs="unload in part and load again at the same place, beyond the first load",
     ),
-    Form(
-        "first_load_softening",
-        "of free sharpness",
-        (SOFTENING, LOG_SHARPNESS),
-        _sharp,
-        _report,
-        lambda s: [[0.05, float(np.log(0.2))], [0.05, float(np.log(3.0))]],
-        signed=True,
-        screened=False,
-        grown=lambda v, s: [0.8 * float(v[0]), -0.7],
+    _form(
+        "by the load that was let go",
+        build=_growing,
+        probes=lambda s: [[0.05]],
+        peer=True,
     ),
-    Form(
-        "first_load_softening",
-        "of free sharpness, with recovery",
-        (SOFTENING, LOG_SHARPNESS, LOG_RECOVERY),
-        _recovering,
-        _report,
-        lambda s: [[0.05, 0.0, float(np.log(5.0))]],
-        signed=True,
+    _form(
+        "of free sharpness",
+        LOG_SHARPNESS,
+        GROWTH,
+        build=_free,
+        probes=lambda s: [[0.05, -1.0, 0.0], [0.05, 0.5, 0.5]],
         screened=False,
-        grown=lambda v, s: [float(v[0]), 0.0, float(np.log(s.duration_s))],
+    ),
+    _form(
+        "of free sharpness, with recovery",
+        LOG_SHARPNESS,
+        GROWTH,
+        LOG_RECOVERY,
+        build=_free,
+        probes=lambda s: [[0.05, 0.0, 0.0, float(np.log(s.duration_s))]],
+        screened=False,
     ),
 )

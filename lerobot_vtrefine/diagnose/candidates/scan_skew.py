@@ -50,5 +50,16 @@ FORMS = (
         signed=True,
         possible=lambda s: s.layout.rows > 1 and s.touched_rows > 1,
     ),
+    Form(
+        "scan_skew",
+        "along the columns, too",
+        (Value("skew_s", -LONGEST_S, LONGEST_S, 1e-3), Value("cols_s", -LONGEST_S, LONGEST_S, 1e-3)),
+        lambda v, s: (ScanSkew(float(v[0]), cols_s=float(v[1])),),
+        lambda v, s: {"skew_s": (float(v[0]), "s"), "cols_s": (float(v[1]), "s")},
+        lambda s: [[0.0, 0.5 * s.frame_s], [0.25 * s.frame_s, 0.25 * s.frame_s]],
+        amplitude=None,
+        signed=True,
+        possible=lambda s: s.layout.cols > 1 and s.touched_cols > 1,
+    ),
     *(_rows_form(rows) for rows in range(3, MAX_ROWS + 1)),
 )
