@@ -1,17 +1,21 @@
 """Causes and evidence as the verdict and the report name them."""
 
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
+
+import numpy as np
 
 from lerobot_vtrefine.diagnose.baseline import plain_weights
 from lerobot_vtrefine.diagnose.candidates import CATALOGUE
+from lerobot_vtrefine.diagnose.candidates.base import Form, Setting
 from lerobot_vtrefine.diagnose.evidence import Evidence
 from lerobot_vtrefine.diagnose.fitting import Fit, fit, predict, squared_errors
 from lerobot_vtrefine.diagnose.intervals import LeftOut, form_parameters, map_parameters
 from lerobot_vtrefine.diagnose.parallel import on_all_cores
 from lerobot_vtrefine.diagnose.presses import PressSet
 from lerobot_vtrefine.diagnose.screening import ALPHA
-from lerobot_vtrefine.diagnose.search import Search
-from lerobot_vtrefine.diagnose.selection import EXTRA_GAIN, MAPS
+from lerobot_vtrefine.diagnose.search import Search, forms_of
+from lerobot_vtrefine.diagnose.selection import EXTRA_GAIN, MAPS, clearly_better, scored, settle
 from lerobot_vtrefine.diagnose.verdict import Cause, Parameter
 
 
@@ -36,6 +40,8 @@ def named_causes(
     return tuple(on_all_cores(named, fitted.model.families))
 
 
+MORE_COORDINATES = 2
+"""Coordinates that another form may have beyond the named one's, for its parameters to be heard."""
 SLIM_STEPS = 5
 """Steps of the refit that tells what held-out recordings lose without a cause."""
 
@@ -51,7 +57,59 @@ def _parameters(search: Search, fitted: Fit, name: str, left_out: LeftOut, seed:
     if name == "dead_taxels":
         return {"taxels": Parameter([list(taxel) for taxel in fitted.model.dead], None, "1")}
     index = [form.family for form in fitted.model.forms].index(name)
-    return form_parameters(fitted, index, left_out, search.presses, search.weights)
+    found = form_parameters(fitted, index, left_out, search.presses, search.weights)
+    return with_form_spread(found, other_forms(search, fitted, index))
+
+
+def other_forms(search: Search, fitted: Fit, index: int) -> list[dict[str, tuple[float, str]]]:
+    """Parameters in other forms of a cause that predict about as well as form number `index`.
+
+    Recordings that cannot tell two laws apart do not know what only one of them says.
+    """
+    form, setting = fitted.model.forms[index], fitted.model.setting
+    if form.range is not None:
+        return []
+    others = [
+        other
+        for other in forms_of(form.family, fitted)
+        if other is not form and 0 < len(other.values) <= len(form.values) + MORE_COORDINATES
+    ]
+    full = scored(search, fitted)
+    reports = []
+    for other in others:
+        found = settle(
+            search, fitted.model.plus(other, _start(other, form, fitted.model.own(index), setting))
+        )
+        if not clearly_better(full, scored(search, found), search.seed):
+            place = found.model.forms.index(other)
+            reports.append(other.report(found.model.own(place), setting))
+    return reports
+
+
+def _start(other: Form, form: Form, values: np.ndarray, setting: Setting) -> np.ndarray:
+    """Where the descent of another form starts: at the same values, where it has the same coordinates."""
+    if other.values == form.values:
+        return values
+    if other.grown is not None and len(values) < len(other.values):
+        start = other.grown(values, setting)
+    else:
+        start = other.probes(setting)[0]
+    return np.clip(np.asarray(start, dtype=float), other.low, other.high)
+
+
+def with_form_spread(
+    found: Mapping[str, Parameter], others: Sequence[Mapping[str, tuple[float, str]]]
+) -> dict[str, Parameter]:
+    """Parameters whose intervals reach as far as what other forms say of the same."""
+    wide = {}
+    for name, item in found.items():
+        values = [other[name][0] for other in others if name in other and other[name][1] == item.unit]
+        if isinstance(item.ci95, tuple) and values:
+            ends = (min(item.ci95[0], *values), max(item.ci95[1], *values))
+            wide[name] = replace(item, ci95=ends)
+        else:
+            wide[name] = item
+    return wide
 
 
 def evidence_table(

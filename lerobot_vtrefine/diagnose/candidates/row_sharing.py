@@ -29,6 +29,7 @@ FORMS = tuple(
         lambda s: [[0.05]],
         needs="press two taxels of a row or more at once, with a wider indenter",
         possible=lambda s: s.row_company > 1,
+        peer=build is _others,
     )
     for label, build in (("divider", _plain), ("divider of the others", _others))
 )

@@ -80,6 +80,7 @@ FORMS = (
         label="one branch, never pulling",
         build=_pushing(_one),
         screened=False,
+        peer=True,
         grown=lambda v, s: v.tolist(),
     ),
     SEVERAL,
