@@ -4,23 +4,23 @@ Seeds below 1000 are for tuning, from 1000 on for reporting. One line of JSON pe
 """
 
 import argparse
+import importlib
 import json
 import sys
 import time
 from pathlib import Path
 
-sys.path.insert(0, str(Path(__file__).parents[1] / "tests" / "diagnose"))
-
-from jittered_rig import EFFECTS, Rig
-
 from lerobot_vtrefine.diagnose.pad_engine import diagnose_pad
 from lerobot_vtrefine.diagnose.quality import check_quality
+
+sys.path.insert(0, str(Path(__file__).parents[1] / "tests" / "diagnose"))
+jittered_rig = importlib.import_module("jittered_rig")
 
 
 def run(name: str, gain: float, seed: int) -> dict:
     """One set's row."""
-    rig = Rig(seed)
-    effect = EFFECTS.get(name)
+    rig = jittered_rig.Rig(seed)
+    effect = jittered_rig.EFFECTS.get(name)
     effects = [(effect, rig.strength_for(effect, gain))] if effect else []
     recordings, issues = check_quality(rig.record(effects))
     begin = time.process_time()

@@ -15,7 +15,7 @@ class _HelpFormat(argparse.Action):
         parser: argparse.ArgumentParser,
         namespace: argparse.Namespace,
         values: Any,
-        option: str | None = None,
+        option_string: str | None = None,
     ) -> None:
         from lerobot_vtrefine.diagnose.formats import describe_recording, schema_of
 
@@ -32,7 +32,7 @@ class _Template(argparse.Action):
         parser: argparse.ArgumentParser,
         namespace: argparse.Namespace,
         values: Any,
-        option: str | None = None,
+        option_string: str | None = None,
     ) -> None:
         from lerobot_vtrefine.diagnose.template import write_template
 

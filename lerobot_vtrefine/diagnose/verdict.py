@@ -177,11 +177,27 @@ class Verdict:
             raise ValueError(f'verdict must hold "schema": "{SCHEMA}"')
         content = decode(VerdictFile, data, "verdict", others=True)
         causes = tuple(
-            Cause(**vars(cause) | {"params": {name: _parameter(item) for name, item in cause.params.items()}})
-            for cause in content.causes
+            Cause(
+                entry.name,
+                entry.role,
+                {name: _parameter(item) for name, item in entry.params.items()},
+                entry.p_value,
+                entry.heldout_gain,
+                entry.basis,
+            )
+            for entry in content.causes
         )
-        values = {key: value for key, value in vars(content).items() if key != "schema"}
-        return cls(**values | {"causes": causes})
+        return cls(
+            content.status,
+            causes,
+            content.ambiguous_with,
+            content.unknown,
+            content.heldout,
+            content.minimum_detectable,
+            content.next_experiment,
+            content.data_issues,
+            content.not_tested,
+        )
 
 
 @dataclass(frozen=True)

@@ -25,7 +25,8 @@ def json_schema(kind: type, others: bool = False) -> dict[str, Any]:
     Args:
         others: whether fields that the dataclass does not have may be there, as for `decode`.
     """
-    hints, fields = get_type_hints(kind), [item for item in dataclasses.fields(kind) if item.init]
+    hints = get_type_hints(kind)
+    fields = [item for item in dataclasses.fields(kind) if item.init]  # ty: ignore[invalid-argument-type]
     required = [
         item.name
         for item in fields
