@@ -4,7 +4,7 @@
 """
 
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
@@ -15,6 +15,7 @@ from lerobot_vtrefine.diagnose.composite import Composite, sensor_model
 from lerobot_vtrefine.diagnose.crossvalidation import agree, cross_validate
 from lerobot_vtrefine.diagnose.detectable import power_of
 from lerobot_vtrefine.diagnose.evaluation import (
+    Foretold,
     foretell,
     heldout,
     noise_floor,
@@ -45,6 +46,7 @@ from lerobot_vtrefine.tactile.model import SensorModel
 
 MIN_RECORDINGS = 2
 FEW_RECORDINGS = 8
+WORSE = "locked recordings are predicted worse with what was found than without it"
 DOUBTFUL_GAIN, DOUBTFUL_P = 0.03, 0.01
 """What symptoms must take away of the cross-validated squared error to be handed out as a model."""
 Tell = Callable[[str, float], None]
@@ -174,8 +176,11 @@ def _conclude(
     if "sample_and_hold" in names and not _blindly_better(search, plain, extended):
         extended = plain
     held_set = everyone.subset(locked)
-    foretold = foretell(held_set, plain, extended)
     floor = noise_floor(everyone, locked, baseline.noise, predict(fitted.model, held_set))
+    extended, foretold, held, surely_worse = not_worse(held_set, plain, extended, floor, seed)
+    if surely_worse:
+        suspicion = replace(suspicion, alarm=True, clue=suspicion.clue or WORSE)
+        status = "unexplained"
     role = "symptom" if status == "unexplained" else "cause"
     power = power_of(search, fitted)
     return PadDiagnosis(
@@ -183,7 +188,7 @@ def _conclude(
         causes=named_causes(search, fitted, leave_out(fitted, search.presses), role, held_set, seed),
         ambiguous_with=rivals.groups if status == "ambiguous" else (),
         unknown=Unknown(suspicion.alarm, suspicion.clue),
-        heldout=heldout(foretold, floor, seed),
+        heldout=held,
         minimum_detectable=power.smallest,
         next_experiment=rivals.experiment if status == "ambiguous" else None,
         issues=tuple(issues),
@@ -197,6 +202,22 @@ def _conclude(
         maps=residual_maps(foretold, everyone),
         alarms={a.name: (a.fired, a.share, a.p_value, a.clue) for a in suspicion.alarms},
     )
+
+
+def not_worse(
+    locked: PressSet, plain: SensorModel, extended: SensorModel, floor: float | None, seed: int
+) -> tuple[SensorModel, list[Foretold], Heldout, bool]:
+    """The extended model, or the plain one where it predicts locked recordings worse, whatever chose it.
+
+    Returns the model with its predictions and errors, and whether the extension was surely worse (95 %).
+    """
+    foretold = foretell(locked, plain, extended)
+    held = heldout(foretold, floor, seed)
+    if held.gain >= 0.0:
+        return extended, foretold, held, False
+    surely = held.gain_ci95 is not None and held.gain_ci95[1] < 0.0
+    foretold = foretell(locked, plain, plain)
+    return plain, foretold, heldout(foretold, floor, seed), surely
 
 
 def _status(names: tuple[str, ...], groups: tuple[tuple[str, ...], ...], suspicion: Suspicion) -> str:

@@ -5,7 +5,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from lerobot_vtrefine.diagnose.pad_engine import PadDiagnosis, diagnose_pad
+from lerobot_vtrefine.diagnose.pad_engine import PadDiagnosis, diagnose_pad, not_worse
+from lerobot_vtrefine.diagnose.presses import prepare
 from lerobot_vtrefine.diagnose.recordings import RecordingSet, Trial
 
 ROWS, COLS, PITCH, RADIUS = 3, 4, 0.002, 0.01
@@ -109,6 +110,16 @@ def test_the_gain_is_what_locked_recordings_say(hardened: PadDiagnosis) -> None:
     trace = hardened.traces[0]
     errors = [np.mean((trace.measured - other) ** 2) for other in (trace.simulated, trace.extended)]
     assert errors[1] < errors[0]
+
+
+def test_a_model_that_predicts_locked_recordings_worse_is_not_handed_out(hardened: PadDiagnosis) -> None:
+    held = recordings(hardening)
+    presses = prepare(held, list(held.trials), list(range(16))).subset([0, 5, 10, 15])
+    good, bad = hardened.extended_model, hardened.baseline_model
+    assert not_worse(presses, bad, good, None, 0)[0] is good
+    model, _, errors, surely = not_worse(presses, good, bad, None, 0)
+    assert model is good
+    assert (errors.gain, surely) == (0.0, True)
 
 
 def test_every_candidate_has_a_row_of_evidence(hardened: PadDiagnosis) -> None:
