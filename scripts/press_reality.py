@@ -1,5 +1,5 @@
 #!/usr/bin/env python
-"""A rig that presses the pad of a stand-in reality: recordings as a user would make them, in contract format.
+"""A rig that presses the pad of a stand-in reality: recordings as a user would make them.
 
     .venv/bin/python scripts/press_reality.py --output_dir=presses                           # an example
     .venv/bin/python scripts/press_reality.py --reality=reality.json --output_dir=presses

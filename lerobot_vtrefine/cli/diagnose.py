@@ -12,6 +12,7 @@ from tqdm import tqdm
 
 from lerobot_vtrefine.cli.arguments import OneLineParser
 from lerobot_vtrefine.cli.errors import run_cli
+from lerobot_vtrefine.cli.formats import add_format_flags
 from lerobot_vtrefine.cli.outputs import staged
 
 if TYPE_CHECKING:
@@ -40,6 +41,7 @@ The exit status is 0 whatever the verdict, and 2 when the input cannot be read; 
 file, trial and column is wrong.
 
 examples:
+  vtrefine-diagnose --template=presses
   vtrefine-diagnose --recording=presses --output_dir=diagnosis
   vtrefine-diagnose --dataset.root=outputs/aloha --output_dir=diagnosis"""
 
@@ -61,6 +63,7 @@ def make_parser() -> OneLineParser:
         "--seed", type=int, default=0, help="of resampling and of what is held out (default %(default)s)"
     )
     parser.add_argument("--overwrite", action="store_true", help="replace results that are there already")
+    add_format_flags(parser)
     return parser
 
 
@@ -118,9 +121,11 @@ def run(recordings: "RecordingSet", folder: Path, seed: int) -> tuple["Verdict",
 
 def summarise(verdict: "Verdict", unit: str, output_dir: Path) -> None:
     """The verdict and where to read about it, in a few lines."""
-    from lerobot_vtrefine.diagnose.report.words import headline
+    from lerobot_vtrefine.diagnose.report.words import headline, power_line
 
     print(f"{verdict.status}: {headline(verdict, unit)}")
+    if power := power_line(verdict):
+        print(power)
     if verdict.data_issues:
         aside = sum(issue.action == "set aside" for issue in verdict.data_issues)
         print(f"data issues: {len(verdict.data_issues)}, {aside} recordings set aside")

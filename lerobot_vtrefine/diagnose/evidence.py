@@ -1,6 +1,6 @@
 """What an engine hands to the report beside its verdict: evidence per candidate, traces, residuals."""
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Protocol
@@ -12,17 +12,20 @@ import numpy as np
 class Evidence:
     """One candidate cause and what became of it; candidates that were rejected are listed too.
 
-    ``p_adjusted`` is controlled over the family of candidates. ``heldout_gain`` is the part of the mean
-    squared error on held-out recordings that the candidate takes away. ``decision`` is one of DECISIONS,
-    ``reason`` one sentence for people.
+    ``p_adjusted`` is controlled over the family of candidates; both p-values are None where nothing was
+    tested, and ``observed`` says that the cause was seen in the readings themselves instead. ``cv_gain`` is
+    the part of the mean squared error that the candidate takes away in cross-validation within the
+    recordings that choices are made from: not the gain on locked ones, which belongs to `Cause`.
+    ``decision`` is one of DECISIONS, ``reason`` one sentence for people.
     """
 
     name: str
     p_value: float | None
     p_adjusted: float | None
-    heldout_gain: float | None
+    cv_gain: float | None
     decision: str
     reason: str
+    observed: bool = False
 
     def __post_init__(self) -> None:
         if self.decision not in DECISIONS:
@@ -30,6 +33,15 @@ class Evidence:
 
 
 DECISIONS = ("accepted", "symptom", "tie", "rejected", "not identifiable")
+
+
+def not_tested(evidence: Sequence[Evidence]) -> dict[str, str]:
+    """Causes that the recordings could not have shown whatever their size, and what to record for each."""
+    return {
+        item.name: item.reason
+        for item in evidence
+        if item.decision == "not identifiable" and item.name.isidentifier()
+    }
 
 
 @dataclass(frozen=True)

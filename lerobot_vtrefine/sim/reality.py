@@ -73,7 +73,9 @@ class HiddenScene:
 
 
 @dataclass(frozen=True)
-class _RealityFile:
+class RealityFile:
+    """Content of reality.json."""
+
     schema: Literal["vtrefine/reality@1"]
     sensor_model: str | dict[str, Any] | None = None
     robot: RobotFaults = field(default_factory=RobotFaults)
@@ -113,7 +115,7 @@ def _from_dict(data: Any, folder: Path) -> Reality:
         return Reality(robot=_diagnosed(decode_robot(data)))
     if not isinstance(data, dict) or data.get("schema") != SCHEMA:
         raise ValueError(f'reality must hold "schema": "{SCHEMA}"')
-    content = decode(_RealityFile, data, "reality")
+    content = decode(RealityFile, data, "reality")
     for joint in (*content.robot.backlash_rad, *content.robot.encoder_offset_rad):
         body = embodiment_of((joint,))
         if body is None or body.joint_of(joint) is None:

@@ -20,7 +20,7 @@ from lerobot_vtrefine.cli.record_demos import RecordDemosConfig
 from lerobot_vtrefine.datasets.episodes import open_episodes
 from lerobot_vtrefine.datasets.features import ACTION_KEY, STATE_KEY, dataset_features, raw_keys
 from lerobot_vtrefine.diagnose.episode_replay.compare import compare_episodes
-from lerobot_vtrefine.diagnose.robot.engine import diagnose_robot
+from lerobot_vtrefine.diagnose.joints.engine import diagnose_robot
 from lerobot_vtrefine.embodiments import (
     ALOHA,
     Arm,

@@ -63,4 +63,5 @@ class Diagnosis:
             self.minimum_detectable,
             self.next_experiment,
             self.issues,
+            not_tested(self.evidence),
         )

@@ -98,7 +98,7 @@ def check_quality(recordings: RecordingSet) -> tuple[RecordingSet, list[DataIssu
 
 
 def in_si_units(recordings: RecordingSet) -> tuple[RecordingSet, list[DataIssue]]:
-    """The set with lengths, angles and times in the contract's units where they clearly were in others.
+    """The set with lengths, angles and times in the format's units where they clearly were in others.
 
     Trials in units that nobody knows are kept as they are.
     """

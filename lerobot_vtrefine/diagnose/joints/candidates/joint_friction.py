@@ -9,7 +9,7 @@ from lerobot_vtrefine.diagnose.joints.friction_load import friction_in_load, sti
 from lerobot_vtrefine.diagnose.joints.gravity import is_sliding
 from lerobot_vtrefine.diagnose.joints.parameters import INDEX
 from lerobot_vtrefine.diagnose.verdict import Parameter
-from lerobot_vtrefine.embodiments import ALOHA
+from lerobot_vtrefine.embodiments import embodiment_of
 
 METHOD = MethodError(0.012, 0.1)
 NOT_SHOWN = "no joint shows enough for it to matter"
@@ -58,10 +58,9 @@ def _size(estimates: Estimates, joint: int) -> tuple[str, Parameter]:
 
 
 def _known_stiffness(name: str) -> float | None:
-    """Servo gain [Nm/rad, N/m] of a joint that is named as ALOHA's."""
-    plain = name.removesuffix(".pos")
-    if plain not in ALOHA.joint_names:
+    """Servo gain [Nm/rad, N/m] of a joint of a known body."""
+    body = embodiment_of((name,))
+    if body is None:
         return None
-    if is_sliding(plain):
-        return ALOHA.fingers.stiffness
-    return next(joint.stiffness for joint in ALOHA.joints if plain.endswith(joint.name))
+    joint = body.joint_of(name.removesuffix(".pos"))
+    return body.fingers.stiffness if joint is None else joint.stiffness
