@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 
 from lerobot_vtrefine.diagnose.core.suspicion import Alarm
-from lerobot_vtrefine.diagnose.evidence import Evidence, ResidualView, Savable, Trace, TrialError
+from lerobot_vtrefine.diagnose.evidence import Evidence, ResidualView, Savable, Trace, TrialError, not_tested
 from lerobot_vtrefine.diagnose.verdict import Cause, DataIssue, Heldout, Parameter, Status, Unknown, Verdict
 
 
