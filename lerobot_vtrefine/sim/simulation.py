@@ -73,9 +73,7 @@ class InsertionSim:
         robot_faults: what the arms do that commands and readings do not tell.
         shear: whether `shear` gives tangential forces, and the skin that they strain.
 
-    Raises:
-        ValueError: zero worlds, or a setting that makes no sense.
-        FileNotFoundError: missing meshes or sensor model.
+    Raises: ValueError for settings that make no sense, FileNotFoundError without meshes or sensor model.
     """
 
     def __init__(
@@ -281,8 +279,7 @@ class InsertionSim:
 
     def privileged(self, ids: Array | None = None) -> Array:
         """State for a critic, (m, P) float32, columns named by `privileged_names`."""
-        ids = self._checked(ids)
-        return self._describe(ids).vector
+        return self._describe(self._checked(ids)).vector
 
     @property
     def privileged_names(self) -> tuple[str, ...]:
