@@ -71,6 +71,8 @@ class Fingers(ABC):
     """Largest servo force [N] or torque [Nm], summed over the fingers."""
     palm: tuple[Shape, ...]
     """What the fingers are mounted on, in the hand frame."""
+    flattest_rad: float
+    """A hand that points down by less would touch the table with its palm before its fingertips get there."""
     sides: tuple[str, ...] = SIDES
     """Fingers that the hand has; those of `SIDES`, in their order."""
 
