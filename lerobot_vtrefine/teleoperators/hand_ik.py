@@ -7,7 +7,6 @@ from functools import cached_property
 from typing import Any
 
 import mink
-import mujoco
 import numpy as np
 import torch
 from numpy.typing import NDArray
@@ -56,8 +55,8 @@ class TwoArmIk:
         self._configuration = mink.Configuration(self.model)
         self._is_finger = np.ones(self.body.num_joints, bool)
         self._is_finger[self.body.arm_columns] = False
-        self._frames = [self._hand_frame(hand) for hand in range(len(self.body.arms))]
-        names = [self.model.body(body).name for body, _, _ in self._frames]
+        self._bodies = [self._hand_body(hand) for hand in range(len(self.body.arms))]
+        names = [self.model.body(body).name for body in self._bodies]
         self._tasks = [mink.FrameTask(name, "body", 1.0, ORIENTATION_COST, lm_damping=1e-6) for name in names]
         self._posture = mink.PostureTask(self.model, POSTURE_COST)
         limited = {self.model.joint(int(j)).name: r for j, r in zip(self._joints, self._rate, strict=True)}
@@ -94,7 +93,8 @@ class TwoArmIk:
             Joint targets (J,), no farther from the last ones than the rate limits allow, whatever is asked.
         """
         before = self.joints.copy()
-        for task, pose, (_, position, rotation) in zip(self._tasks, wanted, self._frames, strict=True):
+        for hand, (task, pose, tcp) in enumerate(zip(self._tasks, wanted, self.hands(), strict=True)):
+            position, rotation = self._in_hand(hand, tcp)
             turned = pose.rotation @ rotation.T
             target = mink.SE3.from_rotation_and_translation(
                 mink.SO3.from_matrix(turned), pose.position - turned @ position
@@ -130,17 +130,16 @@ class TwoArmIk:
         self.body.set_openings(targets, openings)
         return targets
 
-    def _hand_frame(self, hand: int) -> tuple[int, Array, Array]:
-        """Body that carries a hand, and position (3,) and rotation (3, 3) of its TCP in that body's frame."""
+    def _hand_body(self, hand: int) -> int:
+        """The body that carries a hand."""
         last = self.body.by_arm(self._joints)[hand, len(self.body.joints) - 1]
-        body = int(self.model.jnt_bodyid[last])
-        home = np.asarray(self.body.home, float)
-        data = mujoco.MjData(self.model)
-        data.qpos[self._qpos] = home
-        mujoco.mj_kinematics(self.model, data)
-        base, turned = data.xpos[body], data.xmat[body].reshape(3, 3)
-        tcp = self.hands(home)[hand]
-        return body, turned.T @ (tcp.position - base), turned.T @ tcp.rotation
+        return int(self.model.jnt_bodyid[last])
+
+    def _in_hand(self, hand: int, tcp: Pose) -> tuple[Array, Array]:
+        """Position (3,) and rotation (3, 3) of a TCP in its hand's body; some reach less far opened."""
+        data, body = self._configuration.data, self._bodies[hand]
+        turned = data.xmat[body].reshape(3, 3)
+        return turned.T @ (tcp.position - data.xpos[body]), turned.T @ tcp.rotation
 
     def _collisions(self) -> mink.CollisionAvoidanceLimit:
         """The arms' solid parts against each other and against what does not move."""
