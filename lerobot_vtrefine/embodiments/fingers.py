@@ -343,9 +343,7 @@ class FourBarFingers(Fingers):
 
     @override
     def opening(self, joints: Array) -> Array:
-        import torch
-
-        return self._face(torch.as_tensor(np.asarray(joints, float)))[1][..., 0].numpy()
+        return self._face(np.asarray(joints, float))[1][..., 0]
 
     @override
     def command(self, targets: Array) -> Array:
@@ -376,9 +374,9 @@ class FourBarFingers(Fingers):
             None, signs * y, -signs * turn, x_rate.expand_as(signs * y), signs * y_rate, -signs * turn_rate
         )
 
-    def _face(self, angle: "Tensor") -> "tuple[Tensor, ...]":
+    def _face(self, angle: Any) -> tuple[Any, ...]:
         """Face's x and distance from the middle, its turn towards the middle, and their rates; all like
-        `angle`.
+        `angle`, an array or a tensor.
         """
         a0, a1, a2, a3, a4 = self.turn_terms
         turn = a0 + angle * (a1 + angle * (a2 + angle * (a3 + angle * a4)))
@@ -390,10 +388,8 @@ class FourBarFingers(Fingers):
         return x, y, turn, out + turn_rate * pad_out, -ahead - turn_rate * pad_ahead, turn_rate
 
 
-def _swung(vector: tuple[float, float], angle: "Tensor") -> "tuple[Tensor, Tensor]":
-    """(out, ahead) turned towards the middle by an angle."""
+def _swung(vector: tuple[float, float], angle: Any) -> tuple[Any, Any]:
+    """(out, ahead) turned towards the middle by an angle, an array or a tensor."""
     out, ahead = vector
-    import torch
-
-    cos, sin = torch.cos(angle), torch.sin(angle)
+    cos, sin = (np.cos(angle), np.sin(angle)) if isinstance(angle, np.ndarray) else (angle.cos(), angle.sin())
     return out * cos - ahead * sin, out * sin + ahead * cos

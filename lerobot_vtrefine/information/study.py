@@ -43,7 +43,7 @@ class Effort:
     """How much is simulated and trained."""
 
     episodes: int = 1024
-    """Episodes of frames; the last 15 % of them are held out."""
+    """Episodes of frames; the last of them, three of twenty, are held out."""
     num_envs: int = 64
     steps: int = 2000
     """Training steps of each regressor."""
