@@ -13,6 +13,8 @@ from importlib.abc import MetaPathFinder
 from importlib.machinery import ModuleSpec
 from types import ModuleType
 
+from lerobot_vtrefine.named_configs import expand
+
 LEROBOT = "lerobot"
 REGISTERING = (
     "lerobot_vtrefine.cameras",
@@ -61,8 +63,16 @@ class RegisterWithLeRobot(MetaPathFinder):
 
 
 def register_or_wait() -> None:
-    """Register all types now if LeRobot is loaded, else when it is."""
+    """Register all types now if LeRobot is loaded, else when it is.
+
+    LeRobot's commands import this package just before they parse their command line: the moment to replace
+    names of configuration files. They would log an exception and go on, hence SystemExit for unknown names.
+    """
     if LEROBOT in sys.modules:
         register()
+        try:
+            sys.argv[1:] = expand(sys.argv[1:])
+        except ValueError as error:
+            raise SystemExit(f"error: {error}") from None
     elif not any(isinstance(finder, RegisterWithLeRobot) for finder in sys.meta_path):
         sys.meta_path.insert(0, RegisterWithLeRobot())

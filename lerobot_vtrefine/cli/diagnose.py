@@ -1,7 +1,4 @@
-"""``vtrefine-diagnose``: what the simulation gets wrong, why, the repaired model, and the measured gain.
-
-``vtrefine-diagnose --recording=DIR --output_dir=OUT``
-"""
+"""``vtrefine-diagnose``: name what the simulation gets wrong, repair its model and measure the gain."""
 
 import argparse
 from collections.abc import Sequence
