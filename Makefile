@@ -38,7 +38,6 @@ bench-diagnose: setup ## vtrefine-diagnose on recordings with known causes: the 
 	@$(VENV)/python scripts/bench_diagnose.py $(ARGS)
 
 docs: setup ## the documentation as a site, links checked strictly: outputs/site/index.html
-	@$(VENV)/python scripts/make_docs.py
 	@$(VENV)/mkdocs build --quiet --strict
 
 docs-serve: setup ## the same, served while you write

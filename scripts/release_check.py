@@ -1,10 +1,10 @@
 #!/usr/bin/env python
-"""Is the wheel fit to be released? Build it, check its metadata, and do what the README says in an empty place.
+"""Is the wheel fit to be released? Build and check it, and do what the README says in an empty place.
 
     python scripts/release_check.py [--dist_only]
 
-The README's blocks after ``<!-- release-check -->`` run line by line in an empty folder, in an environment that
-holds the wheel and its dependencies only; ``pip`` stands for uv's, and packages of this name come from the
+The README's blocks after ``<!-- release-check -->`` run line by line in an empty folder, in an environment
+that holds the wheel and its dependencies only; ``pip`` stands for uv's, and this name comes from the
 build. PyTorch comes for the CPU unless UV_TORCH_BACKEND says otherwise.
 """
 

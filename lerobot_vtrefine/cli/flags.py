@@ -55,8 +55,9 @@ def _fields(module: str, name: str, prefix: str) -> Iterator[Flag]:
     node = next(n for n in _tree(module).body if isinstance(n, ast.ClassDef) and n.name == name)
     lines = _path(module).read_text(encoding="utf-8").splitlines()
     for base in node.bases:
-        place = _defined_in(module, ast.unparse(base)) if isinstance(base, ast.Name) else None
-        if place is not None and base.id not in STAND_INS:
+        inherited = ast.unparse(base)
+        place = None if inherited in STAND_INS else _defined_in(module, inherited)
+        if place is not None:
             yield from _fields(*place, prefix)
     for entry, following in zip(node.body, [*node.body[1:], None], strict=True):
         if not isinstance(entry, ast.AnnAssign) or not isinstance(entry.target, ast.Name):
