@@ -38,7 +38,7 @@ SECTIONS: dict[str, tuple[str, ...]] = {
     "Results": ("results", "learning", "diagnosis-results"),
     "Notebooks": ("notebooks/environment", "notebooks/dataset", "notebooks/diagnosis"),
 }
-"""Pages by section, those that other people may still add included; what is not named here comes under More."""
+"""Pages by section, also those that may not be there yet; what is not named here comes under More."""
 GENERATED = ("commands", "settings")
 CONFIGS = (
     ("--env.*", "lerobot_vtrefine.envs.config", "VtRefineEnvConfig", "env."),
