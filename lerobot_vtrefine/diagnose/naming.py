@@ -76,7 +76,7 @@ def _row(
         if role == "symptom":
             text = "improves the fit, but structure is left that no cause explains: the name may be borrowed"
             return Evidence(name, p_value, adjusted, gain, "symptom", text)
-        return Evidence(name, p_value, adjusted, gain, "accepted", "foretells recordings left out better")
+        return Evidence(name, p_value, adjusted, gain, "accepted", "predicts held-out recordings better")
     if any(name in group for group in groups) and role != "symptom":
         return Evidence(name, p_value, adjusted, gain, "tie", "explains the data as well as what was named")
     if not possible:

@@ -79,7 +79,7 @@ def test_page_is_well_formed_and_needs_no_network(kind, pad_set, robot_set):
     assert not re.findall(r"(?:https?:)?//[a-z]", html)
     assert not re.findall(r"<(?:link|script|iframe)\b", html)
     sources = re.findall(r'(?:src|href)="([^"]*)"', html)
-    assert all(source.startswith("data:image/png;base64,") for source in sources)
+    assert all(re.match("data:image/(png|gif);base64,", source) for source in sources)
     assert "nan" not in re.sub(r"base64,[^\"]*", "", html).lower()
 
 
