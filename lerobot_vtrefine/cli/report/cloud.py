@@ -38,7 +38,12 @@ def recorded_cloud(dataset_root: Path) -> str | None:
 
 
 def cloud_of(row: dict[str, Any]) -> list[list[int]]:
-    """The cloud of a dataset's row as whole numbers."""
+    """The cloud of a dataset's row as whole numbers: mm and per cent."""
+    return np.rint(build_cloud(row) * [1e3, 1e3, 1e3, 100.0, 1.0]).astype(int).tolist()
+
+
+def build_cloud(row: dict[str, Any]) -> np.ndarray:
+    """The cloud (N, 5) of a dataset's row: x, y, z [m], reading, whether it was felt."""
     import torch
 
     from lerobot_vtrefine.observation.visuo_tactile import VisuoTactileConfig, build_visuo_tactile
@@ -46,19 +51,21 @@ def cloud_of(row: dict[str, Any]) -> list[list[int]]:
     def tensor(key: str) -> torch.Tensor:
         return torch.tensor(row[key], dtype=torch.float32)
 
-    depth = np.asarray(Image.open(io.BytesIO(row[DEPTH_KEY]["bytes"]))).astype(np.float32)
     config = VisuoTactileConfig(
         num_visual_points=SEEN_POINTS, pixel_stride=STRIDE, pool_rows=POOL_ROWS, pool_cols=POOL_COLS
     )
-    cloud = build_visuo_tactile(
+    return build_visuo_tactile(
         tensor(STATE_KEY),
         torch.stack([tensor(key) for key in TACTILE_KEYS]),
         torch.stack([tensor(key) for key in BASELINE_KEYS]),
-        torch.from_numpy(depth),
+        torch.from_numpy(depth_mm(row)),
         tensor(INTRINSICS_KEY),
         tensor(CAMERA_POSE_KEY),
         config,
         generator=torch.Generator().manual_seed(0),
-    )
-    scaled = cloud * torch.tensor([1e3, 1e3, 1e3, 100.0, 1.0])
-    return scaled.round().int().tolist()
+    ).numpy()
+
+
+def depth_mm(row: dict[str, Any]) -> np.ndarray:
+    """The depth image (H, W) float32 [mm] of a dataset's row."""
+    return np.asarray(Image.open(io.BytesIO(row[DEPTH_KEY]["bytes"]))).astype(np.float32)
