@@ -60,7 +60,7 @@ def try_out(uv: str, wheel: Path) -> None:
         "PATH": f"{venv / 'bin'}{os.pathsep}{Path(uv).parent}{os.pathsep}{os.environ['PATH']}",
     }
     environment.setdefault("UV_TORCH_BACKEND", "cpu")
-    run([uv, "venv", "--quiet", "--python", f"{sys.version_info[0]}.{sys.version_info[1]}", str(venv)])
+    run([uv, "venv", "--quiet", "--python", sys.executable, str(venv)])
     for line in ["pip install " + NAME, "vtrefine --version", *readme_lines(), "vtrefine"]:
         called = re.sub("^pip ", "uv pip ", line)
         run(["bash", "-e", "-c", called], cwd=place, env=environment)
