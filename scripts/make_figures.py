@@ -17,6 +17,8 @@ from typing import Any
 import lerobot  # noqa: F401  registers the environment
 import matplotlib as mpl
 import numpy as np
+from matplotlib.lines import Line2D
+from matplotlib.patches import Patch
 
 from lerobot_vtrefine.cli.results.rows import Run, read_all
 from lerobot_vtrefine.datasets.features import PADS
@@ -39,7 +41,7 @@ NAMES = (
     ("fingers with a pad\non each inner face", (0.28, 0.14), (0.56, 0.30)),
 )
 """What is called what in the picture of the task: words, their place and what they point at, as shares."""
-STYLE = {
+STYLE: dict[str, Any] = {
     "font.size": 12,
     "axes.spines.top": False,
     "axes.spines.right": False,
@@ -262,10 +264,10 @@ def draw_results(plt: Any) -> None:
     ax.set_xticks(range(len(names)), list(names.values()))
     ax.set(ylabel="success [%]", ylim=(0, 100))
     handles = [
-        mpl.patches.Patch(color=BLUE, alpha=0.45, label="vision and touch, after DPPO"),
-        mpl.patches.Patch(color=ORANGE, alpha=0.45, label="vision only, after DPPO"),
-        mpl.lines.Line2D([], [], color="black", label="imitation before it"),
-        mpl.lines.Line2D([], [], marker="o", ls="", ms=4, color=GREY, label="one seed"),
+        Patch(color=BLUE, alpha=0.45, label="vision and touch, after DPPO"),
+        Patch(color=ORANGE, alpha=0.45, label="vision only, after DPPO"),
+        Line2D([], [], color="black", label="imitation before it"),
+        Line2D([], [], marker="o", ls="", ms=4, color=GREY, label="one seed"),
     ]
     ax.legend(handles=handles, ncols=2, frameon=False, loc="upper center", bbox_to_anchor=(0.5, 1.22))
     figure.savefig(IMAGES / "results.png")
@@ -287,7 +289,7 @@ OTHERS: dict[str, Callable[..., None]] = {
 def main() -> int:
     """Draw what is asked for."""
     mpl.use("Agg")
-    mpl.rcParams.update(STYLE)
+    mpl.rcParams.update(STYLE)  # ty: ignore[no-matching-overload]
     import matplotlib.pyplot as plt
 
     wanted = sys.argv[1:] or [*SIMULATED, *OTHERS]

@@ -31,6 +31,12 @@ def finetune() -> int:
 
 
 @run_cli
+def information() -> int:
+    """Console entry point of ``vtrefine-information``."""
+    return launch("information", "lerobot_vtrefine.cli.information", "InformationConfig")
+
+
+@run_cli
 def bench() -> int:
     """Console entry point of ``vtrefine-bench``."""
     return launch("bench", "lerobot_vtrefine.cli.bench", "BenchConfig")
