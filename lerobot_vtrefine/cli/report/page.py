@@ -1,12 +1,14 @@
 """``report.html``: one self-contained page about a pipeline's results."""
 
 import json
+import shlex
 from pathlib import Path
 from typing import Any
 
 from matplotlib import colormaps
 from matplotlib.colors import to_hex
 
+from lerobot_vtrefine.cli.pipeline.demo_config import flags
 from lerobot_vtrefine.cli.pipeline.progress import clock
 from lerobot_vtrefine.cli.report.charts import Bar, Series, bar_chart, line_chart
 from lerobot_vtrefine.cli.report.cloud import recorded_cloud
@@ -25,6 +27,8 @@ MEASUREMENTS = (
     ("peak_force_n", "peak contact force", "N", 1.0),
     ("time_to_success_s", "time to success", "s", 1.0),
 )
+RARE = 0.05
+"""A policy that may succeed less often than this tells nothing about its senses."""
 VIDEOS_PER_POLICY = 2
 """Beside the pair that is shown first."""
 # Columns of the fine-tuning log, with the style of their line.
@@ -129,6 +133,8 @@ def senses(results: dict[str, Any]) -> str:
     if not taken:
         return ""
     intact = results["finetune"]
+    if intact["ci95"][0] < RARE:
+        return "The policy succeeds too rarely to tell which senses it needs."
     needed = [name for name, evaluation in taken.items() if evaluation["ci95"][1] < intact["ci95"][0]]
     rates = ", ".join(f"{100 * e['rate']:.0f} % without {name}" for name, e in taken.items())
     rates = f"{100 * intact['rate']:.0f} % intact, {rates}"
@@ -155,15 +161,17 @@ def embedded(policy: str, video: dict[str, Any]) -> dict[str, Any]:
 
 
 def next_commands(results: dict[str, Any]) -> str:
-    """What somebody types next, with this run's folders."""
-    root = results["config"]["output_dir"]
+    """What somebody types next, with this run's folders and task."""
+    config = results["config"]
+    root = config["output_dir"]
     checkpoint = f"{root}/finetune/checkpoints/last/pretrained_model"
+    task = shlex.join(["--env.type=vtrefine", *flags("env", config["env"])])
     lines = (
-        f"lerobot-eval --policy.path={checkpoint} --policy.device=cpu --env.type=vtrefine --env.start=grasped"
-        " --eval.n_episodes=50 --eval.batch_size=50 --seed=9000000",
-        f"vtrefine-finetune --policy.path={checkpoint} --policy.device=cpu --env.type=vtrefine"
-        f" --env.start=grasped --dppo.type=small --seed=20000000 --output_dir={root}/more",
-        f"vtrefine-replay --dataset.root={root}/dataset --episodes='[0]' --output_dir={root}/replay",
+        f"lerobot-eval --policy.path={checkpoint} --policy.device=cpu {task} --eval.n_episodes=200"
+        f" --eval.batch_size=50 --seed=9000000 --output_dir={root}/again"
+        f" --env.metrics_path={root}/again/episodes.jsonl",
+        f"vtrefine-view-data --dataset.root={root}/dataset",
+        f"vtrefine-share {checkpoint} --repo_id=USER/insertion --evaluation={root}/again",
     )
     return "\n\n".join(shell_line(line) for line in lines)
 
