@@ -33,6 +33,16 @@ CURVES = {
     "square pair, 1 mm, more slip": {"B.g8.k12": "12 to 3", "B.g8.k40": "40 to 2"},
 }
 """Learning curves that show what the size of a step does, by their names in docs/step_size_curves.csv."""
+POLICIES = {"visuo_tactile": BLUE, "visual": ORANGE}
+HARD_TASK = "square_1mm_slip"
+STAGES = {"imitation": "imitation", "half-way": "half-way", "": "after DPPO"}
+TASKS = {
+    "demo": "round,\n2 mm",
+    "tight": "round,\n1 mm",
+    "occluded": "hole\nhidden",
+    "slip": "twice\nthe slip",
+    "short_chunk": "decisions\ntwice as often",
+}
 NAMES = (
     ("left arm", (0.10, 0.62), (0.20, 0.42)),
     ("right arm", (0.90, 0.62), (0.85, 0.33)),
@@ -238,39 +248,42 @@ def rms(values: np.ndarray) -> float:
 
 
 def draw_results(plt: Any) -> None:
-    """Imitation and DPPO, with touch and without, over six seeds."""
-    rows = [row for row in read_all(ROOT / "results") if isinstance(row, Run) and row.table == "touch"]
-    names = {
-        "demo": "round,\n2 mm",
-        "tight": "round,\n1 mm",
-        "occluded": "hole\nhidden",
-        "slip": "twice\nthe slip",
-        "short_chunk": "decisions\ntwice as often",
-    }
-    figure, ax = plt.subplots(figsize=(8.6, 3.7), layout="constrained")
-    for place, task in enumerate(names):
-        for side, (policy, colour) in enumerate((("visuo_tactile", BLUE), ("visual", ORANGE))):
-            for variant in ("imitation", ""):
-                found = [
-                    100 * r.success for r in rows if (r.task, r.policy, r.variant) == (task, policy, variant)
-                ]
-                x = place + (side - 0.5) * 0.36
-                if variant:
-                    ax.plot([x - 0.15, x + 0.15], [np.mean(found)] * 2, color="black", lw=1.5, zorder=3)
-                else:
-                    ax.bar(x, np.mean(found), 0.32, color=colour, alpha=0.45)
-                    spread = np.linspace(-0.1, 0.1, len(found))
-                    ax.plot(x + spread, found, "o", ms=4, color=colour, zorder=4)
-    ax.set_xticks(range(len(names)), list(names.values()))
-    ax.set(ylabel="success [%]", ylim=(0, 100))
+    """Success with touch and without: a hard pair on a GPU, and the demo's recipe on five tasks."""
+    rows = [row for row in read_all(ROOT / "results") if isinstance(row, Run)]
+    figure, (left, right) = plt.subplots(
+        1, 2, figsize=(11.5, 4.0), sharey=True, width_ratios=[3, 5], layout="constrained"
+    )
+    hard = [row for row in rows if row.table == "converges" and row.task == HARD_TASK]
+    for place, variant in enumerate(STAGES):
+        for side, (policy, colour) in enumerate(POLICIES.items()):
+            found = [100 * r.success for r in hard if (r.policy, r.variant) == (policy, variant)]
+            draw_seeds(left, place + (side - 0.5) * 0.36, found, colour)
+    left.set_xticks(range(len(STAGES)), list(STAGES.values()))
+    left.set_title("square pair, 1 mm, parts askew (GPU)", loc="left")
+    for place, task in enumerate(TASKS):
+        for side, (policy, colour) in enumerate(POLICIES.items()):
+            mine = [r for r in rows if (r.table, r.task, r.policy) == ("touch", task, policy)]
+            x = place + (side - 0.5) * 0.36
+            draw_seeds(right, x, [100 * r.success for r in mine if not r.variant], colour)
+            before = np.mean([100 * r.success for r in mine if r.variant == "imitation"])
+            right.plot([x - 0.15, x + 0.15], [before] * 2, color="black", lw=1.5, zorder=3)
+    right.set_xticks(range(len(TASKS)), list(TASKS.values()), fontsize=11)
+    right.set_title("the demo's recipe (laptop), after DPPO", loc="left")
+    left.set(ylabel="success [%]", ylim=(0, 100))
     handles = [
-        Patch(color=BLUE, alpha=0.45, label="vision and touch, after DPPO"),
-        Patch(color=ORANGE, alpha=0.45, label="vision only, after DPPO"),
-        Line2D([], [], color="black", label="imitation before it"),
+        Patch(color=BLUE, alpha=0.45, label="vision and touch"),
+        Patch(color=ORANGE, alpha=0.45, label="vision only"),
         Line2D([], [], marker="o", ls="", ms=4, color=GREY, label="one seed"),
+        Line2D([], [], color="black", label="imitation before it"),
     ]
-    ax.legend(handles=handles, ncols=2, frameon=False, loc="upper center", bbox_to_anchor=(0.5, 1.22))
+    figure.legend(handles=handles, ncols=4, frameon=False, loc="outside lower center")
     figure.savefig(IMAGES / "results.png")
+
+
+def draw_seeds(ax: Any, x: float, found: list[float], colour: str) -> None:
+    """A bar of the mean with a dot for every seed."""
+    ax.bar(x, np.mean(found), 0.32, color=colour, alpha=0.45)
+    ax.plot(x + np.linspace(-0.1, 0.1, len(found)), found, "o", ms=4, color=colour, zorder=4)
 
 
 SIMULATED: dict[str, Callable[..., None]] = {
