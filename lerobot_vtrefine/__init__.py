@@ -1,10 +1,19 @@
 """LeRobot plugin for visuo-tactile policy learning with simulation fine-tuning (VT-Refine).
 
-Importing this package registers its policy, environment, processor steps, robots, teleoperators and cameras
-with LeRobot. It stays light: neither LeRobot nor PyTorch is imported before something needs them, and no
+LeRobot's commands find it by themselves and register its policy, environment, processor steps, robots,
+teleoperators and cameras; so does importing it after LeRobot. A script that imports it first calls
+`register`.
+Importing it alone stays light: neither LeRobot nor PyTorch is imported before something needs them, and no
 simulator, Warp, serial port or plotting library at all.
 """
 
-from lerobot_vtrefine.registration import register_or_wait
+import sys
 
-register_or_wait()
+from lerobot_vtrefine.lerobot_compat.registration import LEROBOT, register
+from lerobot_vtrefine.named_configs import expand_command_line
+
+__all__ = ["register"]
+
+if LEROBOT in sys.modules:  # LeRobot's commands import plugins just before they parse their command line
+    register()
+    expand_command_line()

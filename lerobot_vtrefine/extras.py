@@ -6,6 +6,10 @@ EXTRA_OF = {
     "mujoco": "sim",
     "warp": "sim",
     "mujoco_warp": "gpu",
+    "mjviser": "view",
+    "viser": "view",
+    "mink": "teleop",
+    "daqp": "teleop",
     "serial": "hardware",
     "dynamixel_sdk": "hardware",
     "deepdiff": "hardware",
@@ -13,6 +17,8 @@ EXTRA_OF = {
 """Extra by the name under which a module is imported; LeRobot's motor buses compare settings by deepdiff."""
 
 SIMULATOR = ("mujoco", "warp")
+VIEW = ("mujoco", "warp", "mjviser")
+TELEOPERATION = ("mujoco", "warp", "mink", "daqp")
 PADS = ("serial",)
 ARMS = ("serial", "dynamixel_sdk", "deepdiff")
 

@@ -5,6 +5,7 @@ its path in the command line itself, before anything parses it: when a command o
 LeRobot's own when they discover the plugin.
 """
 
+import sys
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -39,6 +40,18 @@ def expand(arguments: Sequence[str]) -> list[str]:
             argument = str(find(argument))
         expanded.append(argument)
     return expanded
+
+
+def expand_command_line() -> None:
+    """Expand this process's own command line.
+
+    Raises:
+        SystemExit: there is no such file. LeRobot would log another exception of a plugin, and go on.
+    """
+    try:
+        sys.argv[1:] = expand(sys.argv[1:])
+    except ValueError as error:
+        raise SystemExit(f"error: {error}") from None
 
 
 def find(name: str) -> Path:

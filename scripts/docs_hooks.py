@@ -19,7 +19,16 @@ ROOT = Path(__file__).parents[1]
 DOCS = ROOT / "docs"
 SECTIONS: dict[str, tuple[str, ...]] = {
     "Start": ("index", "quickstart", "play"),
-    "Concepts": ("task", "pads", "point-cloud", "policy", "dppo", "diagnosis", "glossary"),
+    "Concepts": (
+        "task",
+        "pads",
+        "point-cloud",
+        "policy",
+        "dppo",
+        "diagnosis",
+        "diagnosis-method",
+        "glossary",
+    ),
     "How to": (
         "record-robot",
         "simulated-robot",

@@ -36,7 +36,7 @@ def write_tiny_dataset(root: Path, episodes: int, frames: int, seed: int, noise_
     from lerobot_vtrefine.datasets.features import dataset_features, raw_to_frame
     from lerobot_vtrefine.embodiments import get_embodiment
 
-    features = dataset_features(*TINY_CAMERA, get_embodiment("aloha").joint_names)
+    features = dataset_features(*TINY_CAMERA, get_embodiment("aloha"))
     dataset = LeRobotDataset.create("local/tiny", fps=10, root=root, features=features, use_videos=False)
     rng = np.random.default_rng(seed)
     for _ in range(episodes):

@@ -1,16 +1,12 @@
-"""Importing the package loads neither LeRobot nor PyTorch, and registers all types once LeRobot is there."""
+"""Importing the package loads neither LeRobot nor PyTorch, and `register` registers all types."""
 
-import importlib.util
 import json
 import os
 import subprocess
 import sys
-from pathlib import Path
 from typing import Any
 
 import pytest
-
-from lerobot_vtrefine import registration
 
 # Each case runs in a child of one process that has loaded what makes LeRobot slow to import, but not LeRobot.
 FIRST_IMPORTS = """
@@ -24,10 +20,10 @@ def found(first):
         load_plugin("lerobot_vtrefine")
     else:
         import lerobot_vtrefine
-        assert importlib.util.find_spec("lerobot") is not None and "lerobot" not in sys.modules
+        assert "lerobot" not in sys.modules
         importlib.import_module(first)
+        lerobot_vtrefine.register()
     import lerobot
-    assert not any(type(finder).__name__ == "RegisterWithLeRobot" for finder in sys.meta_path)
     from lerobot.cameras import CameraConfig
     from lerobot.configs.policies import PreTrainedConfig
     from lerobot.envs.configs import EnvConfig
@@ -70,8 +66,8 @@ EXPECTED = {
     "CameraConfig": {"flexitac"},
     "PreTrainedConfig": {"vt_dp3"},
     "EnvConfig": {"vtrefine"},
-    "RobotConfig": {"tactile", "aloha_tactile_follower"},
-    "TeleoperatorConfig": {"aloha_leader"},
+    "RobotConfig": {"tactile", "aloha_tactile_follower", "vtrefine_sim"},
+    "TeleoperatorConfig": {"aloha_leader", "vtrefine_ee"},
     "steps": {"vt_visuo_tactile"},
 }
 
@@ -130,39 +126,3 @@ def test_every_type_is_registered_whatever_is_imported_first(answers: dict[str, 
     assert found is not None, "the import failed"
     assert found.pop("version")
     assert {key: set(values) for key, values in found.items()} == EXPECTED
-
-
-def test_a_failing_registration_is_seen_and_tried_again(
-    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
-) -> None:
-    """The import of LeRobot then fails as the package's own import would, now and at the next attempt."""
-    (tmp_path / "lerobot").mkdir()
-    (tmp_path / "lerobot" / "__init__.py").write_text("loaded = True")
-    finder = registration.RegisterWithLeRobot()
-    monkeypatch.setattr(sys, "meta_path", [finder, *sys.meta_path])
-
-    def load() -> None:
-        spec = finder.find_spec("lerobot", [str(tmp_path)])
-        assert spec is not None
-        assert spec.loader is not None
-        module = importlib.util.module_from_spec(spec)
-        spec.loader.exec_module(module)
-        assert module.loaded
-
-    def fail() -> None:
-        raise ImportError("half installed")
-
-    monkeypatch.setattr(registration, "register", fail)
-    for _ in range(2):
-        with pytest.raises(ImportError, match="half installed"):
-            load()
-        assert finder in sys.meta_path
-    monkeypatch.setattr(registration, "register", lambda: None)
-    load()
-    assert finder not in sys.meta_path
-
-
-def test_other_modules_are_none_of_its_business() -> None:
-    finder = registration.RegisterWithLeRobot()
-    assert finder.find_spec("lerobot.configs", None) is None
-    assert finder.find_spec("json", None) is None

@@ -22,9 +22,11 @@ LAYERS = (
     ("observation",),
     ("datasets",),
     ("drivers",),
-    ("robots", "teleoperators", "cameras"),
+    ("lerobot_compat",),
     ("sim",),
     ("envs",),
+    ("view",),
+    ("robots", "teleoperators", "cameras"),
     ("policies",),
     ("finetune", "information"),
     ("diagnose",),
@@ -220,3 +222,71 @@ def test_ruff(arguments: list[str]) -> None:
         [ruff, *arguments, "--quiet", str(ROOT)], capture_output=True, text=True, check=False
     )
     assert result.returncode == 0, result.stdout
+
+
+# The same inside the diagnosis: a room imports only from rooms above it. Pads are all files without a folder.
+DIAGNOSE_LAYERS = (
+    ("verdict", "evidence", "recordings"),
+    ("core",),
+    ("joints", "camera", "pads"),
+    ("quality", "report", "episode_replay"),
+    ("parts", "calibration"),
+    ("dataset",),
+    ("api", "predict"),
+)
+DIAGNOSE_RANK = {room: rank for rank, rooms in enumerate(DIAGNOSE_LAYERS) for room in rooms}
+# Causes of one's own are asked for in the catalogues, where a name is not among the listed ones.
+DIAGNOSE_EXCEPTIONS = {("verdict", "pads"), ("verdict", "joints")}
+ALLOWED_IN_CORE = ("lerobot_vtrefine.diagnose.verdict", "lerobot_vtrefine.diagnose.evidence")
+
+
+def room_of(module: str) -> str | None:
+    """Room of a module inside the diagnosis; None for others."""
+    parts = module.split(".")
+    if parts[:2] != ["lerobot_vtrefine", "diagnose"] or len(parts) < 3:
+        return None
+    own_folder = (PACKAGE / "diagnose" / parts[2]).is_dir() and parts[2] != "candidates"
+    return parts[2] if own_folder or parts[2] in DIAGNOSE_RANK else "pads"
+
+
+def room_violations(room: str, modules: list[str]) -> list[str]:
+    """Names among ``modules`` that code of a room must not import."""
+    targets = {module: target for module in modules if (target := room_of(module)) and target != room}
+    return [
+        module
+        for module, target in targets.items()
+        if DIAGNOSE_RANK[target] >= DIAGNOSE_RANK[room] and (room, target) not in DIAGNOSE_EXCEPTIONS
+    ]
+
+
+def diagnose_sources() -> list[tuple[str, Path]]:
+    folder = PACKAGE / "diagnose"
+    modules = {path: ".".join(path.relative_to(ROOT).with_suffix("").parts) for path in folder.rglob("*.py")}
+    return [(room, path) for path, module in modules.items() if (room := room_of(module))]
+
+
+def test_room_rule_is_strict() -> None:
+    assert room_violations("core", ["lerobot_vtrefine.diagnose.joints.fitting"])
+    assert room_violations("joints", ["lerobot_vtrefine.diagnose.selection"])
+    assert room_violations("pads", ["lerobot_vtrefine.diagnose.camera.problem"])
+    assert not room_violations("parts", ["lerobot_vtrefine.diagnose.core.search", "numpy"])
+
+
+def test_rooms_of_the_diagnosis_import_only_from_rooms_above() -> None:
+    wrong = {
+        relative(path): bad
+        for room, path in diagnose_sources()
+        if (bad := room_violations(room, imported_modules(tree_of(path))))
+    }
+    assert wrong == {}
+
+
+def test_the_core_knows_no_instrument_and_names_no_cause() -> None:
+    from lerobot_vtrefine.diagnose.verdict import CAUSES
+
+    for path in sorted((PACKAGE / "diagnose" / "core").glob("*.py")):
+        own = [name for name in imported_modules(tree_of(path)) if name.startswith("lerobot_vtrefine")]
+        allowed = ("lerobot_vtrefine.diagnose.core", *ALLOWED_IN_CORE)
+        assert [name for name in own if not name.startswith(allowed)] == [], relative(path)
+        words = set(re.findall(r"\w+", path.read_text(encoding="utf-8")))
+        assert words & {*CAUSES, "mujoco", "torch"} == set(), relative(path)

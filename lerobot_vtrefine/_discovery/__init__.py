@@ -1,3 +1,5 @@
 """Shim that LeRobot's plugin discovery imports by name; importing it registers every type."""
 
-import lerobot_vtrefine  # noqa: F401
+import lerobot_vtrefine
+
+lerobot_vtrefine.register()  # also where a script imported the package before LeRobot

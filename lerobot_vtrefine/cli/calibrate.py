@@ -26,7 +26,7 @@ Results in the output folder:
   report.html        response curves, uncertainty, presses over time, on one page that needs no network
 
 What to record: at least 4 presses (better 16), each beginning above the pad; at least three depths and three
-speeds; depth and load cell (columns depth_m and force_n).
+speeds; depth and load cell (depth_m and force_n in docs/recording-format.md).
 
 examples:
   vtrefine-calibrate --recording=presses --output_dir=calibration

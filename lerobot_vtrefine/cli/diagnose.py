@@ -3,18 +3,18 @@
 import argparse
 from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, cast
+from typing import TYPE_CHECKING
 
 from tqdm import tqdm
 
 from lerobot_vtrefine.cli.arguments import OneLineParser
 from lerobot_vtrefine.cli.errors import run_cli
+from lerobot_vtrefine.cli.formats import add_format_flags
 from lerobot_vtrefine.cli.outputs import staged
 
 if TYPE_CHECKING:
-    from lerobot_vtrefine.diagnose.evidence import Diagnosis, Savable
     from lerobot_vtrefine.diagnose.recordings import RecordingSet
-    from lerobot_vtrefine.diagnose.verdict import DataIssue, Status, Verdict
+    from lerobot_vtrefine.diagnose.verdict import Verdict
 
 FILES = ("baseline_model.json", "sensor_model.json", "report.html", "verdict.json")
 """What a run leaves in the output folder; the verdict last, so that it stands for a whole run."""
@@ -38,6 +38,7 @@ The exit status is 0 whatever the verdict, and 2 when the input cannot be read; 
 file, trial and column is wrong.
 
 examples:
+  vtrefine-diagnose --template=presses
   vtrefine-diagnose --recording=presses --output_dir=diagnosis
   vtrefine-diagnose --dataset.root=outputs/aloha --output_dir=diagnosis"""
 
@@ -59,6 +60,7 @@ def make_parser() -> OneLineParser:
         "--seed", type=int, default=0, help="of resampling and of what is held out (default %(default)s)"
     )
     parser.add_argument("--overwrite", action="store_true", help="replace results that are there already")
+    add_format_flags(parser)
     return parser
 
 
@@ -87,93 +89,40 @@ def read(options: argparse.Namespace) -> "RecordingSet":
         from lerobot_vtrefine.diagnose.recordings import read_recording_set
 
         return read_recording_set(options.recording)
-    from lerobot_vtrefine.diagnose.robot.dataset import read_dataset
+    from lerobot_vtrefine.diagnose.joints.dataset import read_dataset
 
     return read_dataset(options.repo_id, options.root)
 
 
 def run(recordings: "RecordingSet", folder: Path, seed: int) -> tuple["Verdict", str]:
-    """Quality control, diagnosis, and all result files into ``folder``; the verdict and its unit of error."""
-    from lerobot_vtrefine.diagnose.quality import check_quality, too_little
+    """Diagnose, and write all result files into ``folder``; the verdict and its unit of error."""
+    from lerobot_vtrefine.diagnose.api import diagnose
     from lerobot_vtrefine.diagnose.report import render_report
     from lerobot_vtrefine.diagnose.verdict import write_verdict
 
-    sound, issues = check_quality(recordings)
-    hopeless = too_little(sound, recordings)
-    if hopeless is None:
-        diagnosis = diagnose(sound, seed)
-        issues += diagnosis.issues
-        models = (diagnosis.baseline_model, diagnosis.extended_model)
-    else:
-        diagnosis, models = None, (None, None)
-        issues.append(hopeless)
-    verdict = make_verdict(diagnosis, issues)
-    for model, name in zip(models, FILES[:2], strict=True):
-        (model or unfitted_model(recordings)).save(folder / name)
-    page = render_report(verdict, diagnosis, recordings, len(sound.trials), seed)
-    (folder / "report.html").write_text(page, encoding="utf-8")
-    write_verdict(verdict, folder / "verdict.json")
-    return verdict, diagnosis.unit if diagnosis is not None else "counts"
-
-
-def diagnose(recordings: "RecordingSet", seed: int) -> "Diagnosis":
-    """Run the engine for this kind of recordings, with a progress bar."""
     with tqdm(total=100, bar_format="{desc:<44} {percentage:3.0f} % |{bar}| {elapsed}") as bar:
 
         def progress(doing: str, done: float) -> None:
             bar.set_description_str(doing, refresh=False)
             bar.update(100.0 * min(done, 1.0) - bar.n)
 
-        if recordings.kind == "pad":
-            from lerobot_vtrefine.diagnose.pad_engine import diagnose_pad
-
-            return diagnose_pad(recordings, seed=seed, progress=progress)
-        if (recordings.path / "meta" / "info.json").is_file():
-            from lerobot_vtrefine.diagnose.dataset.engine import diagnose_dataset
-
-            return diagnose_dataset(recordings, seed, progress)
-        from lerobot_vtrefine.diagnose.robot.engine import diagnose_robot
-
-        return diagnose_robot(recordings, seed=seed, progress=progress)
-
-
-def make_verdict(diagnosis: "Diagnosis | None", issues: Sequence["DataIssue"]) -> "Verdict":
-    """The verdict of a diagnosis, or ``invalid_data`` without one."""
-    from lerobot_vtrefine.diagnose.verdict import Verdict
-
-    if diagnosis is None:
-        return Verdict("invalid_data", data_issues=tuple(issues))
-    return Verdict(
-        cast("Status", diagnosis.status),
-        diagnosis.causes,
-        diagnosis.ambiguous_with,
-        diagnosis.unknown,
-        diagnosis.heldout,
-        diagnosis.minimum_detectable,
-        diagnosis.next_experiment,
-        tuple(issues),
-    )
-
-
-def unfitted_model(recordings: "RecordingSet") -> "Savable":
-    """What the simulation assumes before anything is fitted, for data that allow no fit."""
-    if recordings.kind == "robot":
-        from lerobot_vtrefine.diagnose.robot.model import RobotModel
-
-        return RobotModel.default(recordings.joints)
-    from lerobot_vtrefine.tactile.model import SensorModel
-    from lerobot_vtrefine.tactile.stages.contact import KelvinVoigt
-    from lerobot_vtrefine.tactile.stages.readout import Gain, Idle, Quantisation
-
-    converter = Quantisation(full_scale_counts=recordings.full_scale)
-    return SensorModel((KelvinVoigt(), Gain(), Idle(spread_counts=0.0), converter))
+        found = diagnose(recordings, seed, progress)
+    for model, name in zip((found.baseline_model, found.extended_model), FILES[:2], strict=True):
+        if model is not None:
+            model.save(folder / name)
+    page = render_report(found.verdict, found, recordings, found.checked, seed)
+    (folder / "report.html").write_text(page, encoding="utf-8")
+    write_verdict(found.verdict, folder / "verdict.json")
+    return found.verdict, found.unit
 
 
 def summarise(verdict: "Verdict", unit: str, output_dir: Path) -> None:
     """The verdict and where to read about it, in a few lines."""
-    from lerobot_vtrefine.diagnose.report.words import headline
+    from lerobot_vtrefine.diagnose.report.words import headline, power_line
 
     print(f"{verdict.status}: {headline(verdict, unit)}")
+    if power := power_line(verdict):
+        print(power)
     if verdict.data_issues:
         aside = sum(issue.action == "set aside" for issue in verdict.data_issues)
         print(f"data issues: {len(verdict.data_issues)}, {aside} recordings set aside")

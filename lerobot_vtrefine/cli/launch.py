@@ -37,6 +37,12 @@ def information() -> int:
 
 
 @run_cli
+def play() -> int:
+    """Console entry point of ``vtrefine-play``."""
+    return launch("play", "lerobot_vtrefine.cli.play", "PlayConfig")
+
+
+@run_cli
 def bench() -> int:
     """Console entry point of ``vtrefine-bench``."""
     return launch("bench", "lerobot_vtrefine.cli.bench", "BenchConfig")

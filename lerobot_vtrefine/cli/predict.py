@@ -17,7 +17,7 @@ Pads: the trial's motion (or load) goes through the simulator's own sensor code;
 readings are never opened, and may be absent. Robots: its commands go through the servo model; of
 its positions only the first is used."""
 EPILOG = """\
-Lengths, angles and times that clearly are in other units than the contract's are converted, and said.
+Lengths, angles and times that clearly are in other units than the format's are converted, and said.
 
 Result: a Parquet file of each trial's name, with time_s and the predicted raw (or position), a row
 per recorded frame. Noise and rounding are left out: the mean is what predicts best.

@@ -6,9 +6,8 @@ example:
 Interrupted, the same command continues.
 """
 
-import hashlib
 import logging
-from dataclasses import asdict, dataclass, field, replace
+from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -20,10 +19,10 @@ from tqdm import tqdm
 
 from lerobot_vtrefine.cli.errors import run_cli
 from lerobot_vtrefine.datasets.features import dataset_features
-from lerobot_vtrefine.embodiments import get_embodiment
 from lerobot_vtrefine.envs import VtRefineEnvConfig
 from lerobot_vtrefine.envs.demo_dataset import DemoDataset
 from lerobot_vtrefine.envs.demo_workers import demonstration_stream
+from lerobot_vtrefine.envs.recording_note import simulation_settings
 from lerobot_vtrefine.sim.demonstrations import Degradation
 
 HOPELESS_ATTEMPTS = 100
@@ -63,19 +62,10 @@ class RecordDemosConfig:
             raise ValueError(f"--env.type={self.env.type} has no scripted expert; use --env.type=vtrefine")
 
     def settings(self) -> dict[str, Any]:
-        """What determines the episodes; of a reality's hidden physics only a fingerprint."""
+        """What determines the episodes."""
         env = self.env
         assert isinstance(env, VtRefineEnvConfig)
-        known = replace(env, reality=None)
-        hidden = (
-            {} if env.reality is None else {"reality": hashlib.sha256(env.reality.read_bytes()).hexdigest()}
-        )
-        return hidden | {
-            "scene": _plain(asdict(known.scene_config)),
-            "rules": asdict(env.task_config),
-            "randomization": asdict(env.randomization),
-            "sensor_model": env.sensor_model,
-            "task": env.task,
+        return simulation_settings(env) | {
             "degradation": asdict(self.degradation),
             "seed": self.seed,
             "include_failures": self.include_failures,
@@ -91,14 +81,14 @@ def record(config: RecordDemosConfig) -> None:
     """
     env = config.env
     assert isinstance(env, VtRefineEnvConfig)
-    robot = get_embodiment(env.scene_config.embodiment)
-    features = dataset_features(*env.camera_size, robot.joint_names)
+    robot = env.body
+    features = dataset_features(*env.camera_size, robot)
     with DemoDataset(
         config.root,
         config.repo_id,
         env.fps,
         features,
-        robot.robot_type,
+        robot,
         env.task or "",
         config.settings(),
         config.seed,
@@ -127,10 +117,6 @@ def record(config: RecordDemosConfig) -> None:
                         f"none of {attempts} attempts succeeded; use smaller --degradation.* errors,"
                         " a larger --env.clearance_m, or --include_failures=true"
                     )
-
-
-def _plain(values: dict[str, Any]) -> dict[str, Any]:
-    return {key: str(value) if isinstance(value, Path) else value for key, value in values.items()}
 
 
 @parser.wrap()

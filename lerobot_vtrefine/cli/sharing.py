@@ -41,7 +41,7 @@ def push_dataset(root: Path, repo_id: str, *, private: bool) -> None:
     """Upload a LeRobotDataset, with a card that describes its pads."""
     from lerobot.datasets.lerobot_dataset import LeRobotDataset
 
-    from lerobot_vtrefine.datasets import card
+    from lerobot_vtrefine.lerobot_compat import card
 
     card.install()
     LeRobotDataset(repo_id, root=root).push_to_hub(private=private)

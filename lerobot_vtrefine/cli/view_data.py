@@ -114,11 +114,11 @@ def above(counts: np.ndarray, idle: np.ndarray) -> np.ndarray:
 
 
 def pad_picture(counts: np.ndarray, idle: np.ndarray) -> np.ndarray:
-    """A pad as it is drawn live, RGB (R, C, 3); one that is not 12 x 32 as a single row."""
-    from lerobot_vtrefine.datasets.features import NUM_TAXELS, PAD_COLS, PAD_ROWS
+    """A pad as it is drawn live, RGB (R, C, 3); one that is not ALOHA's 12 x 32 as a single row."""
+    from lerobot_vtrefine.datasets.features import PAD_COLS, PAD_ROWS
     from lerobot_vtrefine.drivers.picture import colours
 
-    shape = (PAD_ROWS, PAD_COLS) if counts.size == NUM_TAXELS else (1, counts.size)
+    shape = (PAD_ROWS, PAD_COLS) if counts.size == PAD_ROWS * PAD_COLS else (1, counts.size)
     return colours(counts.reshape(shape), idle.reshape(shape))
 
 

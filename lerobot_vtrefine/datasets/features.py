@@ -1,16 +1,17 @@
 """Names, shapes and units of what reality and simulation hand over: the one table.
 
 Recorder, robot, environment and policy read it; nothing else spells these names. Shapes: ``...`` any leading
-dimensions (none for one frame, ``m`` environments), ``P`` = 4 pads, ``H, W`` depth image height and width.
+dimensions (none for one frame, ``m`` environments), ``J`` joints and ``P`` pads of ``T`` taxels, as the body
+has them, ``H, W`` depth image height and width.
 
 A *raw* observation is a dict of numpy arrays:
 
 ===================  =================  =======  ==========================================================
 key                  shape              dtype    meaning
 ===================  =================  =======  ==========================================================
-``state``            (..., 16)          float32  joint positions, rad and m, in the embodiment's order
-``tactile``          (..., P, 384)      uint8    raw pad counts, row-major 12 x 32
-``tactile_baseline`` (..., P, 384)      uint8    idle counts of the same taxels
+``state``            (..., J)           float32  joint positions, rad and m, in the embodiment's order
+``tactile``          (..., P, T)        uint8    raw pad counts, row-major
+``tactile_baseline`` (..., P, T)        uint8    idle counts of the same taxels
 ``depth_mm``         (..., H, W)        uint16   depth along the optical axis, mm; 0 = no return
 ``camera_intrinsics`` (..., 4)          float32  fx, fy, cx, cy in pixels
 ``camera_pose``      (..., 7)           float32  x y z in m, qw qx qy qz: optical frame (OpenCV) in the world
@@ -24,25 +25,26 @@ Datasets of both kinds have the same columns, joint names and robot type, becaus
 """
 
 from collections.abc import Mapping
+from functools import cache
 from typing import Any, NamedTuple
 
 import numpy as np
 
+from lerobot_vtrefine.embodiments import ALOHA, Embodiment
+from lerobot_vtrefine.tactile.layout import PadLayout
+
 Array = np.ndarray[Any, np.dtype[Any]]
 
-PADS = ("left_arm_left_finger", "left_arm_right_finger", "right_arm_left_finger", "right_arm_right_finger")
-PAD_ROWS, PAD_COLS = 12, 32
-NUM_TAXELS = PAD_ROWS * PAD_COLS
-NUM_JOINTS = 16
 JOINT_SUFFIX = ".pos"
 """LeRobot's robots call the position of a joint so; recorded and simulated datasets do, too."""
 CAMERA = "front"
+"""The depth camera that sees the workspace, on every body, so that policies find it."""
 
 OBS_PREFIX = "observation."
+TACTILE_PREFIX = "observation.tactile."
+BASELINE_PREFIX = "observation.tactile_baseline."
 STATE_KEY = "observation.state"
 ACTION_KEY = "action"
-TACTILE_KEYS = tuple(f"observation.tactile.{pad}" for pad in PADS)
-BASELINE_KEYS = tuple(f"observation.tactile_baseline.{pad}" for pad in PADS)
 DEPTH_KEY = f"observation.images.{CAMERA}_depth"
 INTRINSICS_KEY = f"observation.camera.{CAMERA}.intrinsics"
 CAMERA_POSE_KEY = f"observation.camera.{CAMERA}.pose"
@@ -54,11 +56,32 @@ GRIDS_KEY = "observation.tactile_grids"
 """Readings of the pads as images, built likewise."""
 
 VISUAL_KEYS = (DEPTH_KEY, INTRINSICS_KEY, CAMERA_POSE_KEY)
-RAW_KEYS = (*TACTILE_KEYS, *BASELINE_KEYS, AGE_KEY, *VISUAL_KEYS, NOISE_LEVEL_KEY)
-"""What comes with the joint positions, to build the cloud from; the preprocessor drops it afterwards."""
+TAXEL_UNIT = "adc_counts"
 
 DEFAULT_NOISE_LEVEL = 3.0
 """The paper's depth noise level in simulation (appendix, vision alignment, step iv)."""
+
+
+def tactile_keys(body: Embodiment) -> tuple[str, ...]:
+    """Columns of the pads' counts, in the order of the body's pads."""
+    return tuple(f"{TACTILE_PREFIX}{pad}" for pad in body.pad_names)
+
+
+def baseline_keys(body: Embodiment) -> tuple[str, ...]:
+    """Columns of the pads' idle counts."""
+    return tuple(f"{BASELINE_PREFIX}{pad}" for pad in body.pad_names)
+
+
+def raw_keys(body: Embodiment) -> tuple[str, ...]:
+    """What comes with the joint positions, to build the cloud from; the preprocessor drops it afterwards."""
+    return (*tactile_keys(body), *baseline_keys(body), AGE_KEY, *VISUAL_KEYS, NOISE_LEVEL_KEY)
+
+
+# What the paper's robot and FlexiTac's standard pad have, for code that is about these.
+PADS = ALOHA.pad_names
+PAD_ROWS, PAD_COLS = ALOHA.pad_layout.rows, ALOHA.pad_layout.cols
+NUM_JOINTS = ALOHA.num_joints
+TACTILE_KEYS, BASELINE_KEYS, RAW_KEYS = tactile_keys(ALOHA), baseline_keys(ALOHA), raw_keys(ALOHA)
 
 
 class Column(NamedTuple):
@@ -78,27 +101,36 @@ class Column(NamedTuple):
         return np.ascontiguousarray(value, dtype=self.dtype)
 
 
-COLUMNS = (
-    Column(STATE_KEY, "state", "float32", (NUM_JOINTS,)),
-    *(Column(key, "tactile", "uint8", (NUM_TAXELS,), pad) for pad, key in enumerate(TACTILE_KEYS)),
-    *(Column(key, "tactile_baseline", "uint8", (NUM_TAXELS,), pad) for pad, key in enumerate(BASELINE_KEYS)),
-    Column(AGE_KEY, "tactile_age", "float32", (len(PADS),)),
-    Column(INTRINSICS_KEY, "camera_intrinsics", "float32", (4,)),
-    Column(CAMERA_POSE_KEY, "camera_pose", "float32", (7,)),
-    Column(NOISE_LEVEL_KEY, "noise_level", "float32", (1,)),
-)
-"""Every array column; the depth image comes on top because LeRobot stores it as an image."""
+@cache
+def columns(body: Embodiment) -> tuple[Column, ...]:
+    """Every array column; the depth image comes on top because LeRobot stores it as an image."""
+    taxels = (body.pad_layout.num_taxels,)
+    return (
+        Column(STATE_KEY, "state", "float32", (body.num_joints,)),
+        *(Column(key, "tactile", "uint8", taxels, pad) for pad, key in enumerate(tactile_keys(body))),
+        *(
+            Column(key, "tactile_baseline", "uint8", taxels, pad)
+            for pad, key in enumerate(baseline_keys(body))
+        ),
+        Column(AGE_KEY, "tactile_age", "float32", (len(body.pad_names),)),
+        Column(INTRINSICS_KEY, "camera_intrinsics", "float32", (4,)),
+        Column(CAMERA_POSE_KEY, "camera_pose", "float32", (7,)),
+        Column(NOISE_LEVEL_KEY, "noise_level", "float32", (1,)),
+    )
 
-MAY_BE_MISSING = {"noise_level": 1, "tactile_age": len(PADS)}
-"""Sources that count as 0 where they are missing, and their widths."""
 
-TAXEL_INFO = {"array_shape": [PAD_ROWS, PAD_COLS], "unit": "adc_counts"}
+def taxel_info(layout: PadLayout) -> dict[str, Any]:
+    """What datasets say of a pad's column."""
+    return {"array_shape": [layout.rows, layout.cols], "unit": TAXEL_UNIT}
+
+
+TAXEL_INFO = taxel_info(ALOHA.pad_layout)
 
 
 def dataset_features(
-    camera_height: int, camera_width: int, joint_names: tuple[str, ...] | list[str] | None = None
+    camera_height: int, camera_width: int, body: Embodiment = ALOHA
 ) -> dict[str, dict[str, Any]]:
-    """Features for ``LeRobotDataset.create(..., use_videos=False)``.
+    """Features of a body's data for ``LeRobotDataset.create(..., use_videos=False)``.
 
     ``use_videos=False`` because the depth image is kept exactly (TIFF, uint16 mm). Calibration is stored in
     columns, not in ``info``: LeRobot refuses to merge datasets whose ``info`` differs. Array columns carry no
@@ -107,12 +139,11 @@ def dataset_features(
     if camera_height < 1 or camera_width < 1:
         raise ValueError(f"camera size must be positive, got {camera_height} x {camera_width}")
     features: dict[str, dict[str, Any]] = {}
-    for column in COLUMNS:
+    for column in columns(body):
         features[column.key] = {"dtype": column.dtype, "shape": column.shape}
         if column.source in ("tactile", "tactile_baseline"):
-            features[column.key]["info"] = dict(TAXEL_INFO)
-    suffixed = [f"{name}{JOINT_SUFFIX}" for name in joint_names] if joint_names is not None else None
-    names = {"names": suffixed}
+            features[column.key]["info"] = taxel_info(body.pad_layout)
+    names = {"names": [f"{name}{JOINT_SUFFIX}" for name in body.joint_names]}
     features[STATE_KEY] |= names
     features[DEPTH_KEY] = {
         "dtype": "image",
@@ -120,61 +151,65 @@ def dataset_features(
         "names": ["height", "width", "channels"],
         "info": {"is_depth_map": True},
     }
-    features[ACTION_KEY] = {"dtype": "float32", "shape": (NUM_JOINTS,), **names}
+    features[ACTION_KEY] = {"dtype": "float32", "shape": (body.num_joints,), **names}
     return features
 
 
-def _columns_of(raw: Mapping[str, Array]) -> dict[str, Array]:
+def _columns_of(raw: Mapping[str, Array], body: Embodiment) -> dict[str, Array]:
     """All array columns of a raw observation; what may be missing becomes 0."""
     lead = raw["state"].shape[:-1] if "state" in raw else ()
-    absent = {key: width for key, width in MAY_BE_MISSING.items() if key not in raw}
+    may_be_missing = {"noise_level": 1, "tactile_age": len(body.pad_names)}
+    absent = {key: width for key, width in may_be_missing.items() if key not in raw}
     raw = {**raw, **{key: np.zeros((*lead, width), np.float32) for key, width in absent.items()}}
-    missing = {column.source for column in COLUMNS} - set(raw)
+    missing = {column.source for column in columns(body)} - set(raw)
     if missing:
         raise ValueError(f"raw observation lacks {', '.join(sorted(missing))}")
-    return {column.key: column.value(raw) for column in COLUMNS}
+    return {column.key: column.value(raw) for column in columns(body)}
 
 
-def raw_to_frame(raw: Mapping[str, Array]) -> dict[str, Array]:
+def raw_to_frame(raw: Mapping[str, Array], body: Embodiment = ALOHA) -> dict[str, Array]:
     """One raw observation (no leading dimensions) as a frame for ``LeRobotDataset.add_frame``.
 
-    The caller adds ``action`` (16,) float32 and ``task``.
+    The caller adds ``action`` (J,) float32 and ``task``.
     """
-    if raw["state"].shape != (NUM_JOINTS,):
-        raise ValueError(f"a frame needs state of shape ({NUM_JOINTS},), got {raw['state'].shape}")
-    return {**_columns_of(raw), DEPTH_KEY: np.ascontiguousarray(raw["depth_mm"], np.uint16)[..., None]}
+    if raw["state"].shape != (body.num_joints,):
+        raise ValueError(f"a frame needs state of shape ({body.num_joints},), got {raw['state'].shape}")
+    depth = np.ascontiguousarray(raw["depth_mm"], np.uint16)[..., None]
+    return {**_columns_of(raw, body), DEPTH_KEY: depth}
 
 
-def raw_to_env_observation(raw: Mapping[str, Array]) -> dict[str, Array]:
+def raw_to_env_observation(raw: Mapping[str, Array], body: Embodiment = ALOHA) -> dict[str, Array]:
     """A raw observation (leading dimensions allowed) as an environment observation.
 
     LeRobot's ``preprocess_observation`` turns its keys into the dataset's (``agent_pos`` becomes
     ``observation.state``). Everything is float32, counts too, because ``lerobot-eval --eval.recording=true``
     stores nothing else. Depth is (..., 1, H, W) in mm, exactly what the dataset loader yields.
     """
-    columns = _columns_of(raw).items()
     observation = {
-        key.removeprefix(OBS_PREFIX): value.astype(np.float32, copy=False) for key, value in columns
+        key.removeprefix(OBS_PREFIX): value.astype(np.float32, copy=False)
+        for key, value in _columns_of(raw, body).items()
     }
     observation["agent_pos"] = observation.pop("state")
     observation[DEPTH_KEY.removeprefix(OBS_PREFIX)] = raw["depth_mm"].astype(np.float32)[..., None, :, :]
     return observation
 
 
-def env_observation_shapes(camera_height: int, camera_width: int) -> dict[str, tuple[tuple[int, ...], float]]:
+def env_observation_shapes(
+    camera_height: int, camera_width: int, body: Embodiment = ALOHA
+) -> dict[str, tuple[tuple[int, ...], float]]:
     """Shape of every environment observation key, without leading dimensions, and the largest value of counts
     (infinite for everything else).
     """
     shapes = {
         column.key.removeprefix(OBS_PREFIX): (column.shape, 255.0 if column.dtype == "uint8" else np.inf)
-        for column in COLUMNS
+        for column in columns(body)
     }
     shapes["agent_pos"] = shapes.pop("state")
     shapes[DEPTH_KEY.removeprefix(OBS_PREFIX)] = ((1, camera_height, camera_width), np.inf)
     return shapes
 
 
-def env_key_map() -> dict[str, str]:
+def env_key_map(body: Embodiment = ALOHA) -> dict[str, str]:
     """Environment observation key -> dataset key (LeRobot's ``features_map``, the action included)."""
-    keys = [*(column.key for column in COLUMNS if column.key != STATE_KEY), DEPTH_KEY]
+    keys = [*(column.key for column in columns(body) if column.key != STATE_KEY), DEPTH_KEY]
     return {"agent_pos": STATE_KEY, "action": ACTION_KEY, **{k.removeprefix(OBS_PREFIX): k for k in keys}}

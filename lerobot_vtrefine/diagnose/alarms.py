@@ -6,7 +6,6 @@ from dataclasses import dataclass
 from itertools import combinations
 
 import numpy as np
-from scipy.stats import norm
 
 from lerobot_vtrefine.diagnose.fitting import Fit
 from lerobot_vtrefine.diagnose.presses import Press, PressSet
@@ -43,12 +42,15 @@ LINE_FROM = 8
 
 @dataclass(frozen=True)
 class Alarm:
-    """One alarm: whether it fired, how much of the residual it concerns, and what it points to."""
+    """One alarm: whether it fired, how much of the residual it concerns, and what it points to.
+
+    `p_value` is None where a size is compared with a threshold and nothing is tested.
+    """
 
     name: str
     fired: bool
     share: float
-    p_value: float
+    p_value: float | None
     clue: str
 
 
@@ -202,7 +204,7 @@ def pair_alarm(presses: PressSet, residuals: Sequence[np.ndarray], found: Correl
     far = (seen - float(np.mean(found.strangers))) / found.spread
     fired = far > PAIR_DEVIATIONS and seen > PAIR_CORRELATION and rms > MIN_RMS * presses.full_scale
     text = f"{100 * seen:.0f} % of the residual of condition {best} repeats between its recordings"
-    return Alarm("one condition", bool(fired), seen, float(norm.sf(far)), text + _motion_of(presses, best))
+    return Alarm("one condition", bool(fired), seen, None, text + _motion_of(presses, best))
 
 
 def left_over(presses: PressSet, before: Sequence[np.ndarray], after: Sequence[np.ndarray]) -> float:
@@ -230,7 +232,7 @@ def pairs_alarm(
     least, deviations = PAIRS if left is None else PAIRS_LEFT if left > LEFT else PAIRS_MISFIT
     fired = far > deviations and seen > least and rms > MIN_RMS * presses.full_scale
     text = f"residuals of replicates correlate by {seen:.2f}, those of other recordings do not"
-    return Alarm("all pairs", bool(fired), seen, float(norm.sf(far)), text)
+    return Alarm("all pairs", bool(fired), seen, None, text)
 
 
 def _motion_of(presses: PressSet, condition: str) -> str:
@@ -279,7 +281,7 @@ def level_alarm(residuals: Sequence[np.ndarray], fitted: Fit, weights: Sequence[
     each, readings = slow_errors(fitted, residuals, weights)
     ratio = float(each @ readings / max(readings.sum(), 1))
     text = f"errors under load are {np.sqrt(max(ratio, 0.0)):.1f} times the noise of single frames"
-    return Alarm("level", ratio > LEVEL, ratio, 1e-4 if ratio > LEVEL else 1.0, text)
+    return Alarm("level", ratio > LEVEL, ratio, None, text)
 
 
 def condition_alarm(
@@ -296,7 +298,7 @@ def condition_alarm(
     ratio = float(known[worst].min())
     text = f"errors in condition {worst} are {np.sqrt(max(ratio, 0.0)):.1f} times the noise of single frames"
     fired = ratio > CONDITION_LEVEL
-    return Alarm("level of one condition", fired, ratio, 1e-3, text + _motion_of(presses, worst))
+    return Alarm("level of one condition", fired, ratio, None, text + _motion_of(presses, worst))
 
 
 def line_alarm(presses: PressSet, residuals: Sequence[np.ndarray]) -> Alarm | None:
@@ -323,7 +325,7 @@ def line_alarm(presses: PressSet, residuals: Sequence[np.ndarray]) -> Alarm | No
     # Presses that come at regular intervals have lines of their own, and so has any misfit to them.
     fired = bool(ratio[best] > LINE_RATIO and len(ratios) >= 3 and motion[best] < 0.5 * LINE_RATIO)
     text = f"a line at {frequencies[best]:.2f} Hz in the residual (or its alias from a faster one)"
-    return Alarm("spectrum", fired, float(ratio[best]), 1e-4 if fired else 1.0, text)
+    return Alarm("spectrum", fired, float(ratio[best]), None, text)
 
 
 def _local_median(power: np.ndarray, half: int = 10) -> np.ndarray:

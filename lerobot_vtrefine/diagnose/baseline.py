@@ -48,9 +48,11 @@ def describe(presses: PressSet) -> Setting:
     spans = [float(press.time_s[-1] - press.time_s[0]) for press in presses.presses]
     starts = [press.trial.start_s for press in presses.presses]
     touched = np.zeros((presses.layout.rows, presses.layout.cols), dtype=bool)
-    depth = 0.0
+    depth, company = 0.0, 1
     for press in presses.presses:
-        touched[press.layout.lines, press.layout.columns] |= (press.drive > 0).any(axis=0)
+        pressed = press.drive > 0
+        touched[press.layout.lines, press.layout.columns] |= pressed.any(axis=0)
+        company = max(company, int(pressed.sum(axis=-1).max(initial=0)))
         depth = max(depth, float(press.drive.max()))
     positive = steps[steps > 0]
     return Setting(
@@ -67,6 +69,7 @@ def describe(presses: PressSet) -> Setting:
         touched_cols=int(touched.any(axis=0).sum()),
         rest_session_s=presses.idle.session_s,
         temperature_c=_temperature(presses),
+        row_company=company,
     )
 
 

@@ -41,7 +41,7 @@ def beside_alarm(
         return None
     ratio = float((sums[0] / counts[0]) / max(sums[1] / counts[1], 1e-12))
     text = f"errors beside the pressed indenter are {np.sqrt(ratio):.1f} times those at rest"
-    return Alarm("beside", ratio > BESIDE, ratio, 1e-3 if ratio > BESIDE else 1.0, text)
+    return Alarm("beside", ratio > BESIDE, ratio, None, text)
 
 
 def taxel_alarm(
@@ -64,4 +64,4 @@ def taxel_alarm(
         f"errors of taxel ({row}, {col}) are {np.sqrt(max(ratio, 0.0)):.1f} times the noise of single frames"
     )
     fired = ratio > TAXEL and ratio > OTHERS * max(middle, 0.5)
-    return Alarm("one taxel", fired, ratio, 1e-3 if fired else 1.0, text)
+    return Alarm("one taxel", fired, ratio, None, text)

@@ -86,7 +86,7 @@ def _parity(press: Press) -> np.ndarray:
 
 
 STIFFNESS = ("nonlinear_stiffness", "saturation", "row_sharing", "contact_offset")
-MEMORY = ("viscoelastic_relaxation", "hysteresis")
+MEMORY = ("viscoelastic_relaxation", "hysteresis", "first_load_softening")
 PLACES = ("taxel_gain_spread", "pad_tilt", "dead_taxels", "contact_offset")
 LINES = ("row_sharing", "crosstalk", "mechanical_spreading")
 TIMING = ("latency", "scan_skew", "sample_and_hold")
@@ -97,7 +97,7 @@ DESCRIPTORS = (
     Descriptor("light contact", STIFFNESS, lambda p, s: np.sqrt(np.maximum(s, 0.0))),
     Descriptor(
         "the largest load so far in the recording",
-        ("hysteresis",),
+        ("hysteresis", "first_load_softening"),
         lambda p, s: s * np.maximum.accumulate(s, axis=0),
     ),
     Descriptor(

@@ -1,30 +1,31 @@
 """What an engine hands to the report beside its verdict: evidence per candidate, traces, residuals."""
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Protocol
 
 import numpy as np
-
-from lerobot_vtrefine.diagnose.verdict import Cause, DataIssue, Heldout, Parameter, Unknown
 
 
 @dataclass(frozen=True)
 class Evidence:
     """One candidate cause and what became of it; candidates that were rejected are listed too.
 
-    ``p_adjusted`` is controlled over the family of candidates. ``heldout_gain`` is the part of the mean
-    squared error on held-out recordings that the candidate takes away. ``decision`` is one of DECISIONS,
-    ``reason`` one sentence for people.
+    ``p_adjusted`` is controlled over the family of candidates; both p-values are None where nothing was
+    tested, and ``observed`` says that the cause was seen in the readings themselves instead. ``cv_gain`` is
+    the part of the mean squared error that the candidate takes away in cross-validation within the
+    recordings that choices are made from: not the gain on locked ones, which belongs to `Cause`.
+    ``decision`` is one of DECISIONS, ``reason`` one sentence for people.
     """
 
     name: str
     p_value: float | None
     p_adjusted: float | None
-    heldout_gain: float | None
+    cv_gain: float | None
     decision: str
     reason: str
+    observed: bool = False
 
     def __post_init__(self) -> None:
         if self.decision not in DECISIONS:
@@ -32,6 +33,15 @@ class Evidence:
 
 
 DECISIONS = ("accepted", "symptom", "tie", "rejected", "not identifiable")
+
+
+def not_tested(evidence: Sequence[Evidence]) -> dict[str, str]:
+    """Causes that the recordings could not have shown whatever their size, and what to record for each."""
+    return {
+        item.name: item.reason
+        for item in evidence
+        if item.decision == "not identifiable" and item.name.isidentifier()
+    }
 
 
 @dataclass(frozen=True)
@@ -92,54 +102,3 @@ class Savable(Protocol):
     def save(self, path: str | Path) -> None:
         """Write the file."""
         ...
-
-
-class Diagnosis(Protocol):
-    """What every engine returns, for pads and for robots alike; the report and the command read only this.
-
-    Attributes:
-        status, causes, ambiguous_with, unknown, heldout: as in `Verdict`, and so are minimum_detectable and
-            next_experiment.
-        issues: problems of the data that the engine met beyond quality control.
-        baseline_model, extended_model: what ``vtrefine-predict`` loads; None for ``invalid_data``.
-        baseline_params: the refitted parameters of the baseline, name -> value with interval.
-        evidence: every candidate that was examined, rejected ones too.
-        traces, residuals, trial_errors: about held-out trials only.
-        maps: title -> (R, C); empty for robots.
-        unit: of readings or positions, "counts" or "rad".
-    """
-
-    @property
-    def status(self) -> str: ...  # noqa: D102
-    @property
-    def causes(self) -> tuple[Cause, ...]: ...  # noqa: D102
-    @property
-    def ambiguous_with(self) -> tuple[tuple[str, ...], ...]: ...  # noqa: D102
-    @property
-    def unknown(self) -> Unknown: ...  # noqa: D102
-    @property
-    def heldout(self) -> Heldout | None: ...  # noqa: D102
-    @property
-    def minimum_detectable(self) -> Mapping[str, float]: ...  # noqa: D102
-    @property
-    def next_experiment(self) -> Mapping[str, Any] | None: ...  # noqa: D102
-    @property
-    def issues(self) -> tuple[DataIssue, ...]: ...  # noqa: D102
-    @property
-    def baseline_model(self) -> Savable | None: ...  # noqa: D102
-    @property
-    def extended_model(self) -> Savable | None: ...  # noqa: D102
-    @property
-    def baseline_params(self) -> Mapping[str, Parameter]: ...  # noqa: D102
-    @property
-    def evidence(self) -> tuple[Evidence, ...]: ...  # noqa: D102
-    @property
-    def traces(self) -> tuple[Trace, ...]: ...  # noqa: D102
-    @property
-    def residuals(self) -> tuple[ResidualView, ...]: ...  # noqa: D102
-    @property
-    def trial_errors(self) -> tuple[TrialError, ...]: ...  # noqa: D102
-    @property
-    def maps(self) -> Mapping[str, np.ndarray]: ...  # noqa: D102
-    @property
-    def unit(self) -> str: ...  # noqa: D102

@@ -92,6 +92,20 @@ def tangents(
     return signals, columns
 
 
+def movable(fitted: Fit) -> np.ndarray:
+    """Numbers of the free coordinates that no bound stops: what a tangent test must clear a change of.
+
+    A coordinate that its best value lies beyond (late readings ask for a negative damping) cannot follow a
+    change, and errors that lean on the bound are evidence for it.
+    """
+    free = fitted.model.free
+    values, pull = fitted.model.values[free], fitted.grams.sum(axis=0)[:-1, -1]
+    low, high = (
+        np.array([getattr(v, end) for v in fitted.model.coordinates])[free] for end in ("low", "high")
+    )
+    return free[~(((values <= low) & (pull < 0)) | ((values >= high) & (pull > 0)))]
+
+
 def grams_of(
     presses: PressSet,
     weights: Sequence[TrialWeights],

@@ -41,7 +41,7 @@ def trial_forces(trial: Trial, layout: PadLayout) -> np.ndarray:
     """The measured load shared evenly by the taxels under the indenter (the nearest one if there is none):
     (N, R, C) [N].
 
-    For trials without `depth_m`; a rounded or unknown contact shares over its whole outline (contract §1).
+    For trials without `depth_m`; a rounded or unknown contact shares over its whole outline.
     """
     if trial.force_n is None:
         raise ValueError(f"{trial.file}: has no force_n")

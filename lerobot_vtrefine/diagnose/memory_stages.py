@@ -5,11 +5,14 @@ from collections.abc import Callable
 from typing import Any
 
 import numpy as np
+import torch
 
 from lerobot_vtrefine.diagnose.fields import Context, Field, by_press
 from lerobot_vtrefine.diagnose.rhythm import slots
+from lerobot_vtrefine.tactile.stages.base import Frame, Stage
 from lerobot_vtrefine.tactile.stages.host import Latency, SampleAndHold, ScanSkew, taken_at_frames
 from lerobot_vtrefine.tactile.stages.mechanics import Hysteresis, ViscoelasticRelaxation
+from lerobot_vtrefine.tactile.stages.softening import FirstLoadSoftening
 
 MAX_EXPONENT = 200.0
 
@@ -70,18 +73,20 @@ def _latency(stage: Latency, field: Field, context: Context) -> Field:
 
 
 def _scan_skew(stage: ScanSkew, field: Field, context: Context) -> Field:
-    count = context.sheet.layout.rows
-    delays = stage.of_rows(count)
-    if delays is None:
-        delays = stage.skew_s * np.arange(count) / max(count - 1, 1)
-
-    def work(x: np.ndarray, time_s: np.ndarray, rows: np.ndarray) -> np.ndarray:
-        out = np.empty_like(x)
-        for row in np.unique(rows):
-            out[:, rows == row] = delayed(x[:, rows == row], time_s, float(delays[row]))
-        return out
-
-    return by_press(field, context.sheet, work)
+    sheet, out = context.sheet, np.zeros_like(field.values)
+    of_rows = stage.of_rows(sheet.layout.rows)
+    if of_rows is None:
+        of_rows = stage.skew_s * np.arange(sheet.layout.rows) / max(sheet.layout.rows - 1, 1)
+    of_cols = stage.cols_s * np.arange(sheet.layout.cols) / max(sheet.layout.cols - 1, 1)
+    for press, time_s in enumerate(sheet.times_s):
+        part = field.within(sheet, press)
+        taxels = field.columns[part]
+        delays = of_rows[sheet.rows[taxels]] + of_cols[sheet.cols[taxels]]
+        x, late = field.values[: len(time_s), part], np.zeros((len(time_s), len(taxels)))
+        for delay in np.unique(delays):
+            late[:, delays == delay] = delayed(x[:, delays == delay], time_s, float(delay))
+        out[: len(time_s), part] = late
+    return Field(out, field.columns)
 
 
 def interpolated(x: np.ndarray, time_s: np.ndarray, at_s: np.ndarray) -> np.ndarray:
@@ -176,9 +181,21 @@ def _hysteresis(stage: Hysteresis, field: Field, context: Context) -> Field:
     return Field(np.maximum(held, 0.0), field.columns)
 
 
+def _own_sequence(stage: Stage, field: Field, context: Context) -> Field:
+    """The stage's own code, of a stage that treats every taxel by itself."""
+    frame = Frame(context.sheet.layout, stiffness_n_per_m=context.stiffness)
+
+    def work(x: np.ndarray, time_s: np.ndarray, rows: np.ndarray) -> np.ndarray:
+        images = torch.from_numpy(np.ascontiguousarray(x))[:, None]
+        return stage.sequence(images, torch.from_numpy(time_s), frame)[:, 0].numpy()
+
+    return by_press(field, context.sheet, work)
+
+
 MEMORY: dict[type, Callable[[Any, Field, Context], Field]] = {
     ViscoelasticRelaxation: _relaxation,
     Hysteresis: _hysteresis,
+    FirstLoadSoftening: _own_sequence,
     Latency: _latency,
     ScanSkew: _scan_skew,
     SampleAndHold: _hold,

@@ -4,7 +4,7 @@
 """
 
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
@@ -12,9 +12,11 @@ import numpy as np
 from lerobot_vtrefine.diagnose.ambiguity import find_ambiguities
 from lerobot_vtrefine.diagnose.baseline import Baseline, fit_baseline, plain_weights
 from lerobot_vtrefine.diagnose.composite import Composite, sensor_model
+from lerobot_vtrefine.diagnose.core.heldout import lock
 from lerobot_vtrefine.diagnose.crossvalidation import agree, cross_validate
-from lerobot_vtrefine.diagnose.detectable import minimum_detectable
+from lerobot_vtrefine.diagnose.detectable import power_of
 from lerobot_vtrefine.diagnose.evaluation import (
+    Foretold,
     foretell,
     heldout,
     noise_floor,
@@ -24,15 +26,13 @@ from lerobot_vtrefine.diagnose.evaluation import (
     trial_errors,
 )
 from lerobot_vtrefine.diagnose.evidence import Evidence, ResidualView, Trace, TrialError
-from lerobot_vtrefine.diagnose.fitting import Fit, predict, rest, tangents
+from lerobot_vtrefine.diagnose.fitting import Fit, predict, rest
 from lerobot_vtrefine.diagnose.idle import settled_idle
 from lerobot_vtrefine.diagnose.intervals import baseline_parameters, leave_out
-from lerobot_vtrefine.diagnose.locking import lock
 from lerobot_vtrefine.diagnose.naming import evidence_table, named_causes
 from lerobot_vtrefine.diagnose.pairs import reconsider
 from lerobot_vtrefine.diagnose.presses import PressSet, prepare, usable
 from lerobot_vtrefine.diagnose.recordings import RecordingSet, Trial
-from lerobot_vtrefine.diagnose.screening import Scorer
 from lerobot_vtrefine.diagnose.search import Search, start_search
 from lerobot_vtrefine.diagnose.selection import (
     forward,
@@ -46,14 +46,15 @@ from lerobot_vtrefine.tactile.model import SensorModel
 
 MIN_RECORDINGS = 2
 FEW_RECORDINGS = 8
+WORSE = "locked recordings are predicted worse with what was found than without it"
 DOUBTFUL_GAIN, DOUBTFUL_P = 0.03, 0.01
-"""What symptoms must take away of the squared error of recordings left out to be handed out as a model."""
+"""What symptoms must take away of the cross-validated squared error to be handed out as a model."""
 Tell = Callable[[str, float], None]
 
 
 @dataclass(frozen=True)
 class PadDiagnosis:
-    """What was found on a pad: the verdict's fields (contract §3), both models, and what the report draws.
+    """What was found on a pad: fields of the verdict (docs/verdict.md), both models, what the report draws.
 
     Attributes:
         status, causes, ambiguous_with, unknown, heldout, minimum_detectable, next_experiment: as
@@ -63,7 +64,8 @@ class PadDiagnosis:
         baseline_params: k_n, k_d and gain as refitted.
         evidence: one row per candidate examined.
         traces, residuals, trial_errors, maps: on held-out recordings; arrays in `unit`.
-        alarms: name of every alarm for unknown causes -> (whether it fired, share, p-value, clue).
+        alarms: name of every alarm for unknown causes -> (whether it fired, share, p-value, clue); there is
+            no p-value where a size is compared with a threshold and nothing is tested.
     """
 
     status: str
@@ -82,7 +84,7 @@ class PadDiagnosis:
     residuals: tuple[ResidualView, ...] = ()
     trial_errors: tuple[TrialError, ...] = ()
     maps: dict[str, np.ndarray] = field(default_factory=dict)
-    alarms: dict[str, tuple[bool, float, float, str]] = field(default_factory=dict)
+    alarms: dict[str, tuple[bool, float, float | None, str]] = field(default_factory=dict)
     unit: str = "counts"
 
 
@@ -174,29 +176,48 @@ def _conclude(
     if "sample_and_hold" in names and not _blindly_better(search, plain, extended):
         extended = plain
     held_set = everyone.subset(locked)
-    foretold = foretell(held_set, plain, extended)
     floor = noise_floor(everyone, locked, baseline.noise, predict(fitted.model, held_set))
+    extended, foretold, held, surely_worse = not_worse(held_set, plain, extended, floor, seed)
+    if surely_worse:
+        suspicion = replace(suspicion, alarm=True, clue=suspicion.clue or WORSE)
+        status = "unexplained"
     role = "symptom" if status == "unexplained" else "cause"
-    smallest = _smallest(search, fitted)
+    power = power_of(search, fitted)
     return PadDiagnosis(
         status=status,
         causes=named_causes(search, fitted, leave_out(fitted, search.presses), role, held_set, seed),
         ambiguous_with=rivals.groups if status == "ambiguous" else (),
         unknown=Unknown(suspicion.alarm, suspicion.clue),
-        heldout=heldout(foretold, floor, seed),
-        minimum_detectable=smallest,
+        heldout=held,
+        minimum_detectable=power.smallest,
         next_experiment=rivals.experiment if status == "ambiguous" else None,
         issues=tuple(issues),
         baseline_model=plain,
         extended_model=extended,
         baseline_params=baseline_parameters(baseline.plain, search.presses),
-        evidence=evidence_table(search, fitted, role, rivals.groups),
+        evidence=evidence_table(search, fitted, role, rivals.groups, power.not_tested),
         traces=traces(foretold),
         residuals=residual_views(foretold, seed),
         trial_errors=trial_errors(foretold),
         maps=residual_maps(foretold, everyone),
         alarms={a.name: (a.fired, a.share, a.p_value, a.clue) for a in suspicion.alarms},
     )
+
+
+def not_worse(
+    locked: PressSet, plain: SensorModel, extended: SensorModel, floor: float | None, seed: int
+) -> tuple[SensorModel, list[Foretold], Heldout, bool]:
+    """The extended model, or the plain one where it predicts locked recordings worse, whatever chose it.
+
+    Returns the model with its predictions and errors, and whether the extension was surely worse (95 %).
+    """
+    foretold = foretell(locked, plain, extended)
+    held = heldout(foretold, floor, seed)
+    if held.gain >= 0.0:
+        return extended, foretold, held, False
+    surely = held.gain_ci95 is not None and held.gain_ci95[1] < 0.0
+    foretold = foretell(locked, plain, plain)
+    return plain, foretold, heldout(foretold, floor, seed), surely
 
 
 def _status(names: tuple[str, ...], groups: tuple[tuple[str, ...], ...], suspicion: Suspicion) -> str:
@@ -236,9 +257,3 @@ def _blindly_better(search: Search, plain: SensorModel, extended: SensorModel) -
         for values in (lambda f: f.simulated, lambda f: f.extended)
     )
     return after < before
-
-
-def _smallest(search: Search, fitted: Fit) -> dict[str, float]:
-    """Smallest effects that would have been seen; only of causes that were not found."""
-    _, columns = tangents(fitted.model, search.presses, fitted.model.free)
-    return minimum_detectable(Scorer(fitted, search.presses, search.weights, columns))

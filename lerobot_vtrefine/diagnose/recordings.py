@@ -1,4 +1,4 @@
-"""Read a recording set: a folder with `recording.json` and a Parquet file per trial (contract §1)."""
+"""Read a recording set: a folder with `recording.json` and a Parquet file per trial."""
 
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
@@ -61,7 +61,7 @@ class _Reading:
 
 
 @dataclass(frozen=True)
-class _Entry:
+class Entry:
     """One trial as the header lists it."""
 
     file: str
@@ -73,12 +73,12 @@ class _Entry:
 
 
 @dataclass(frozen=True)
-class _Header:
+class Header:
     """Content of recording.json."""
 
     schema: Literal["vtrefine/recording-set@1"]
     kind: Literal["pad", "robot"]
-    trials: tuple[_Entry, ...]
+    trials: tuple[Entry, ...]
     pad: _Pad | None = None
     reading: _Reading | None = None
     object: dict[str, Any] | None = None
@@ -157,7 +157,7 @@ class RecordingSet:
 
 
 def read_recording_set(path: str | Path, *, measured: bool = True) -> RecordingSet:
-    """Read and check a folder as in contract §1.
+    """Read and check a folder as in docs/recording-format.md.
 
     Without `measured`, what a prediction must not see is not even opened: `raw` comes out with no columns (N,
     0), and every row of `position` repeats the first.
@@ -191,13 +191,13 @@ def read_recording_set(path: str | Path, *, measured: bool = True) -> RecordingS
     return RecordingSet(folder, header.kind, rows, cols, pitch_m, unit, full_scale, joints, tuple(trials))
 
 
-def _read_header(path: Path) -> _Header:
+def _read_header(path: Path) -> Header:
     data = read_json(path)
     if not isinstance(data, dict) or data.get("schema") != SCHEMA:
         found = str(data.get("schema") if isinstance(data, dict) else type(data).__name__)
         raise ValueError(f'{path}: "schema" must be "{SCHEMA}", got {found[:60]!r}')
     try:
-        return decode(_Header, data, path.name, others=True)
+        return decode(Header, data, path.name, others=True)
     except ValueError as error:
         raise ValueError(f"{path}: {error}") from error
 
@@ -228,7 +228,7 @@ class _Table:
         folder: Path,
         header_path: Path,
         index: int,
-        entry: _Entry,
+        entry: Entry,
         without: tuple[str, ...] = (),
     ) -> None:
         self.folder, self.entry, self.index = folder, entry, index

@@ -19,11 +19,14 @@ from lerobot_vtrefine.diagnose.presses import PressSet
 from lerobot_vtrefine.diagnose.weights import TrialWeights
 
 FLIPS = 9999
-ALPHA = 0.02
+ALPHA = 0.05
+"""Chance that any candidate passes the screening where none is there; it must then predict better, too."""
 FEW = 10
 """With fewer recordings than this, signs alone cannot reach significance: size counts as well."""
 DOUBT = 2.0
 """Factor by which scores may stray more than the fitted noise says, where their size counts."""
+SHARES = {"scores": 0.7, "products": 0.2, "order": 0.1}
+"""Parts of the error rate that kinds of tests get; where one is missing, the others share its part."""
 
 
 @dataclass(frozen=True)
@@ -33,7 +36,11 @@ class Probe:
     Attributes:
         scores: (K,) effective score of every recording.
         information: (K,) effective information: the score that the probe itself would give.
-        permuted: p-value that was found otherwise (by permuting the session's order), in place of flips.
+        products: (K, K) products between recordings, whose sum is the statistic where it is quadratic in the
+            signs; None where the sum of the scores is.
+        products_scatter: standard deviation of that sum without an effect, as the fitted noise has it.
+        permuted: p-value found by permuting the session's order, in place of flips.
+        observed: seen in the readings themselves: nothing is tested, so there is no p-value.
     """
 
     name: str
@@ -43,6 +50,9 @@ class Probe:
     information: np.ndarray
     one_sided: bool
     permuted: float | None = None
+    observed: bool = False
+    products: np.ndarray | None = None
+    products_scatter: float = 0.0
 
     @property
     def size(self) -> float:
@@ -60,11 +70,19 @@ class Probe:
 
 @dataclass(frozen=True)
 class Screened:
-    """A candidate's best probe with its p-value and the one adjusted over all candidates."""
+    """A candidate's best probe with its p-value and the one adjusted over all candidates.
+
+    Both are None for what is observed rather than tested.
+    """
 
     probe: Probe
-    p_value: float
-    p_adjusted: float
+    p_value: float | None
+    p_adjusted: float | None
+
+    @property
+    def passed(self) -> bool:
+        """Whether it is to be refitted."""
+        return self.p_adjusted is None or self.p_adjusted <= ALPHA
 
 
 def cleared(grams: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -138,7 +156,9 @@ def probe_form(form: Form, scorer: Scorer) -> list[Probe]:
 
 
 def flip_signs(count: int, seed: int) -> np.ndarray:
-    """(FLIPS + 1, K) signs, the first row without flips."""
+    """(F, K) signs, the first row without flips: all there are, or as many at random as there may be."""
+    if 2**count <= FLIPS + 1:
+        return 1.0 - 2.0 * ((np.arange(2**count)[:, None] >> np.arange(count)) & 1)
     rng = np.random.default_rng([seed, 1])
     signs = rng.integers(0, 2, (FLIPS + 1, count)) * 2.0 - 1.0
     signs[0] = 1.0
@@ -146,11 +166,14 @@ def flip_signs(count: int, seed: int) -> np.ndarray:
 
 
 def flip_statistics(probes: Sequence[Probe], signs: np.ndarray) -> np.ndarray:
-    """Standardised sums of scores under every flip: (FLIPS + 1, number of probes); larger is stronger."""
+    """Standardised sums of scores under every flip: (F, number of probes); larger is stronger."""
     columns = []
     for probe in probes:
-        norm = np.sqrt(float((probe.scores**2).sum()))
-        values = signs @ probe.scores / norm if norm > 0 else np.zeros(len(signs))
+        if probe.products is not None:
+            columns.append(((signs @ probe.products) * signs).sum(axis=1))
+            continue
+        length = np.sqrt(float((probe.scores**2).sum()))
+        values = signs @ probe.scores / length if length > 0 else np.zeros(len(signs))
         columns.append(values if probe.one_sided else np.abs(values))
     return np.stack(columns, axis=1)
 
@@ -167,35 +190,66 @@ def tail_shares(statistics: np.ndarray) -> np.ndarray:
 
 
 def screen(probes: Sequence[Probe], count: int, seed: int) -> dict[str, Screened]:
-    """The best probe of every name with its family-wise adjusted p-value."""
-    flipped = [probe for probe in probes if probe.permuted is None]
-    if not flipped:
-        return {}
-    shares = tail_shares(flip_statistics(flipped, flip_signs(count, seed)))
-    smallest = np.sort(shares.min(axis=1))
-    names = {probe.name for probe in probes}
-    extra = len(names) - len({probe.name for probe in flipped})
+    """The best probe of every name with its p-value adjusted over all of them.
+
+    Tests of three kinds share the error rate by a weighted Bonferroni rule (Holm 1979), each kind by its part
+    in SHARES: sums of scores under flips of the recordings' signs, judged together by the smallest p; sums of
+    products under the same flips; permutations of the session's order. What is observed takes no part.
+    """
     best: dict[str, Screened] = {}
-    for index, probe in enumerate(flipped):
-        p_value = float(shares[0, index])
-        adjusted = float(np.searchsorted(smallest, p_value, side="right")) / len(smallest)
-        if count < FEW and p_value <= 2.5 * 2.0 ** (1 - count):
-            adjusted = min(adjusted, len(names) * size_p(probe))
-        _keep(best, Screened(probe, p_value, min(1.0, adjusted * (1 + 0.1 * extra))))
+    kinds: dict[str, list[Probe]] = {}
     for probe in probes:
-        if probe.permuted is not None:
-            # Another reference distribution: Bonferroni over a handful of effectively independent names.
-            _keep(best, Screened(probe, probe.permuted, min(1.0, 5.0 * probe.permuted)))
+        kinds.setdefault(_kind(probe), []).append(probe)
+    observed = kinds.pop("observed", [])
+    whole = sum(SHARES[kind] for kind in kinds)
+    signs = flip_signs(count, seed)
+    for kind, tested in kinds.items():
+        names = len({probe.name for probe in tested})
+        p_values, adjusted = _order_p(tested) if kind == "order" else _flip_p(tested, signs)
+        for probe, p_value, together in zip(tested, p_values, adjusted, strict=True):
+            if kind != "order" and count < FEW and p_value <= 2.5 * 2.0 ** (1 - count):
+                together = min(together, names * size_p(probe))
+            _keep(best, Screened(probe, p_value, min(1.0, together * whole / SHARES[kind])))
+    for probe in observed:
+        best[probe.name] = Screened(probe, None, None)
     return best
+
+
+def _kind(probe: Probe) -> str:
+    if probe.observed:
+        return "observed"
+    if probe.permuted is not None:
+        return "order"
+    return "scores" if probe.products is None else "products"
+
+
+def _flip_p(probes: Sequence[Probe], signs: np.ndarray) -> tuple[list[float], list[float]]:
+    """p-value of every probe under the same flips, and the one adjusted by the smallest of all."""
+    shares = tail_shares(flip_statistics(probes, signs))
+    smallest = np.sort(shares.min(axis=1))
+    adjusted = np.searchsorted(smallest, shares[0], side="right") / len(smallest)
+    return shares[0].tolist(), adjusted.tolist()
+
+
+def _order_p(probes: Sequence[Probe]) -> tuple[list[float], list[float]]:
+    """The same of probes that were permuted already, each by itself."""
+    p_values = [probe.permuted for probe in probes if probe.permuted is not None]
+    return p_values, [min(1.0, len(probes) * p_value) for p_value in p_values]
 
 
 def size_p(probe: Probe) -> float:
     """p-value from the scores' size against the noise, with a wide margin for what the noise model misses."""
+    if probe.products is not None:
+        return float(norm.sf(probe.products.sum() / (DOUBT**2 * max(probe.products_scatter, 1e-12))))
     return float(2.0 * norm.sf(np.sqrt(max(probe.explained, 0.0)) / DOUBT))
 
 
 def _keep(best: dict[str, Screened], found: Screened) -> None:
     held = best.get(found.probe.name)
-    rank = (found.p_adjusted, -found.probe.explained)
-    if held is None or rank < (held.p_adjusted, -held.probe.explained):
+    if held is None or _rank(found) < _rank(held):
         best[found.probe.name] = found
+
+
+def _rank(item: Screened) -> tuple[float, float]:
+    """Most certain first, of equals the one that explains most."""
+    return (0.0 if item.p_adjusted is None else item.p_adjusted, -item.probe.explained)

@@ -5,22 +5,21 @@ from dataclasses import dataclass, field
 from functools import partial
 
 import numpy as np
-from scipy.stats import norm
 
 from lerobot_vtrefine.diagnose.baseline import Baseline
 from lerobot_vtrefine.diagnose.candidates import CATALOGUE
 from lerobot_vtrefine.diagnose.candidates.base import Form
 from lerobot_vtrefine.diagnose.candidates.sample_and_hold import held, irregular_periods, pattern
 from lerobot_vtrefine.diagnose.crossvalidation import folds_of
-from lerobot_vtrefine.diagnose.fitting import Fit, tangents
+from lerobot_vtrefine.diagnose.fitting import Fit, movable, tangents
 from lerobot_vtrefine.diagnose.maps import find_dead, map_evidence
 from lerobot_vtrefine.diagnose.parallel import on_all_cores
 from lerobot_vtrefine.diagnose.presses import PressSet
-from lerobot_vtrefine.diagnose.screening import DOUBT, FEW, Probe, Scorer, Screened, probe_form
+from lerobot_vtrefine.diagnose.screening import Probe, Scorer, Screened, probe_form
 from lerobot_vtrefine.diagnose.weights import TrialWeights
 
 SEEN = 1e9
-"""What is seen in the readings themselves explains more than any score: it needs no permutation."""
+"""Size that stands for what is seen in the readings themselves: it explains more than any score."""
 
 
 @dataclass
@@ -33,11 +32,12 @@ class Search:
     folds: list[list[int]]
     screened: dict[str, Screened] = field(default_factory=dict)
     """First screening of every candidate, against the baseline."""
-    tried: dict[str, float] = field(default_factory=dict)
-    """Best gain on recordings left out that each candidate reached when it was refitted."""
+    cv_gains: dict[str, float] = field(default_factory=dict)
+    """Best cross-validated gain that each candidate reached when it was refitted."""
     rivals: dict[str, set[str]] = field(default_factory=dict)
     """Survivors beside which each accepted cause was chosen."""
-    p_adjusted: dict[str, float] = field(default_factory=dict)
+    p_adjusted: dict[str, float | None] = field(default_factory=dict)
+    """Adjusted p-value with which each accepted cause was screened; None where it was observed."""
 
 
 def start_search(baseline: Baseline, presses: PressSet, seed: int) -> Search:
@@ -52,7 +52,7 @@ def forms_of(family: str, fitted: Fit) -> list[Form]:
 
 def all_probes(search: Search, fitted: Fit, families: Collection[str] | None = None) -> list[Probe]:
     """Probes of every candidate (or of those families) that the model does not hold yet."""
-    _, columns = tangents(fitted.model, search.presses, fitted.model.free)
+    _, columns = tangents(fitted.model, search.presses, movable(fitted))
     scorer = Scorer(fitted, search.presses, search.weights, columns)
     held = set(fitted.model.families)
     forms = [
@@ -65,28 +65,26 @@ def all_probes(search: Search, fitted: Fit, families: Collection[str] | None = N
 
 
 def gain_spread_probe(search: Search, fitted: Fit) -> Probe:
-    """Products between recordings of what they say about every taxel's gain, as one vector of flips.
-
-    The statistic is quadratic in the signs, so the probe carries its own permutation p-value.
-    """
+    """Products between recordings of what they say about every taxel's gain: quadratic in the signs."""
     evidence = map_evidence(fitted, search.presses, search.weights)
     total = evidence.information.sum(axis=0)
     known = total > 0
     unit = np.where(known, evidence.scores / np.sqrt(np.where(known, total, 1.0)), 0.0)
     products = unit @ unit.T
     np.fill_diagonal(products, 0.0)
-    rng = np.random.default_rng([search.seed, 4])
-    signs = rng.integers(0, 2, (9999, len(products))) * 2.0 - 1.0
-    seen = float(products.sum())
-    flipped = np.einsum("bi,ij,bj->b", signs, products, signs)
-    p_value = float((1 + (flipped >= seen - 1e-9 * abs(seen)).sum()) / 10000.0)
-    if len(products) < FEW and p_value <= 2.5 * 2.0 ** (1 - len(products)):
-        # So few signs cannot reach significance: how large the products are counts as well.
-        share = np.where(known, evidence.information / np.where(known, total, 1.0), 0.0)
-        spread = np.sqrt(2.0 * float((share.sum(axis=0) ** 2 - (share**2).sum(axis=0)).sum()))
-        p_value = min(p_value, float(norm.sf(seen / (DOUBT**2 * max(spread, 1e-12)))))
-    size = np.array([max(seen, 0.0)])
-    return Probe("taxel_gain_spread", None, np.zeros(0), size, np.maximum(size, 1e-12), True, p_value)
+    share = np.where(known, evidence.information / np.where(known, total, 1.0), 0.0)
+    scatter = float(np.sqrt(2.0 * (share.sum(axis=0) ** 2 - (share**2).sum(axis=0)).sum()))
+    size = np.array([max(float(products.sum()), 0.0)])
+    return Probe(
+        "taxel_gain_spread",
+        None,
+        np.zeros(0),
+        size,
+        np.maximum(size, 1e-12),
+        True,
+        products=products,
+        products_scatter=scatter,
+    )
 
 
 def map_probes(search: Search, fitted: Fit) -> list[Probe]:
@@ -97,10 +95,15 @@ def map_probes(search: Search, fitted: Fit) -> list[Probe]:
     if "taxel_gain_spread" not in fitted.model.families:
         found.append(gain_spread_probe(search, fitted))
     if "dead_taxels" not in fitted.model.families and find_dead(fitted, search.presses):
-        # Answers that fail by a factor of eight at many times their error need no permutation.
-        size = np.array([1e9])
-        found.append(Probe("dead_taxels", None, np.zeros(0), size, size, True, 1e-4))
+        # Answers that fail by a factor of eight at many times their error are seen, not tested.
+        found.append(_observed("dead_taxels", None, np.zeros(0)))
     return found
+
+
+def _observed(name: str, form: Form | None, values: np.ndarray) -> Probe:
+    """What is seen in the readings themselves explains more than any score."""
+    size = np.array([SEEN])
+    return Probe(name, form, values, size, size, True, observed=True)
 
 
 def hold_probe(search: Search, fitted: Fit) -> Probe | None:
@@ -110,11 +113,9 @@ def hold_probe(search: Search, fitted: Fit) -> Probe | None:
     frame_s = fitted.model.setting.frame_s
     rhythm = pattern(search.presses, frame_s)
     forms = forms_of("sample_and_hold", fitted)
-    size = np.array([SEEN])
     if rhythm is not None:
-        values = np.array([rhythm.period_s])
-        return Probe("sample_and_hold", forms[int(rhythm.free)], values, size, size, True, 1e-4)
+        return _observed("sample_and_hold", forms[int(rhythm.free)], np.array([rhythm.period_s]))
     if held(search.presses):
         values = np.array(irregular_periods(search.presses, frame_s)[0])
-        return Probe("sample_and_hold", forms[-1], values, size, size, True, 1e-4)
+        return _observed("sample_and_hold", forms[-1], values)
     return None

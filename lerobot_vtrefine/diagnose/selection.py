@@ -13,10 +13,10 @@ from lerobot_vtrefine.diagnose.candidates.baseline_drift import CURVE
 from lerobot_vtrefine.diagnose.candidates.sample_and_hold import held
 from lerobot_vtrefine.diagnose.composite import Composite
 from lerobot_vtrefine.diagnose.crossvalidation import Score, agree, cross_validate
-from lerobot_vtrefine.diagnose.fitting import Fit, fit, predict, squared_errors, tangents
+from lerobot_vtrefine.diagnose.fitting import Fit, fit, movable, predict, squared_errors, tangents
 from lerobot_vtrefine.diagnose.maps import find_dead, with_map
 from lerobot_vtrefine.diagnose.parallel import on_all_cores
-from lerobot_vtrefine.diagnose.screening import ALPHA, Probe, Scorer, Screened, probe_form, screen
+from lerobot_vtrefine.diagnose.screening import Probe, Scorer, Screened, probe_form, screen
 from lerobot_vtrefine.diagnose.search import (
     SEEN,
     Search,
@@ -198,8 +198,7 @@ def reweigh(search: Search, fitted: Fit) -> Fit:
 
 def survivors(found: dict[str, Screened]) -> list[Screened]:
     """Candidates that pass the screening, the most promising first."""
-    passed = [item for item in found.values() if item.p_adjusted <= ALPHA]
-    return sorted(passed, key=lambda item: -item.probe.explained)
+    return sorted((item for item in found.values() if item.passed), key=lambda item: -item.probe.explained)
 
 
 def forward(search: Search, fitted: Fit, tell: Callable[[str, float], None]) -> Fit:
@@ -273,7 +272,7 @@ def simplify(search: Search, fitted: Fit) -> Fit:
         if form is plain:
             continue
         slim = take_away(search, fitted, form.family)
-        _, columns = tangents(slim.model, search.presses, slim.model.free)
+        _, columns = tangents(slim.model, search.presses, movable(slim))
         probes = probe_form(plain, Scorer(slim, search.presses, search.weights, columns))
         found = refit(search, slim, plain, probes)
         if not preferable(form, scored(search, fitted), scored(search, found), search.seed):
@@ -322,7 +321,7 @@ def rank(search: Search, fitted: Fit, candidates: Sequence[Screened], probes: Se
     steps = []
     for name, (found, score) in grown.items():
         gain, logs = score.gain_over(base), score.better_by(base)
-        search.tried[name] = max(gain, search.tried.get(name, -np.inf))
+        search.cv_gains[name] = max(gain, search.cv_gains.get(name, -np.inf))
         sure = name == "dead_taxels" or name in seen
         agreed = sure or agree(logs, search.seed, AGREEMENT_P)
         if not (gain > (0.0 if name in seen else needed) and logs.sum() > 0 and agreed):

@@ -58,4 +58,4 @@ def sliding_alarm(
     agree = not both.any() or float(np.mean(np.log(own[:, 0] / own[:, 1]))) > np.log(AGREED)
     fired = ratio > SLIDING and agree
     text = f"errors while the indenter slides are {np.sqrt(ratio):.1f} times those while it does not"
-    return Alarm("sliding", fired, ratio, 1e-3 if fired else 1.0, text)
+    return Alarm("sliding", fired, ratio, None, text)

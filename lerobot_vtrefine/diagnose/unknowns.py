@@ -50,7 +50,7 @@ class Suspicion:
 
 @dataclass(frozen=True)
 class Found:
-    """A descriptor that matters: adjusted p-value, part of the squared error on recordings left out."""
+    """A descriptor that matters: adjusted p-value, part of the cross-validated squared error."""
 
     descriptor: Descriptor
     p_adjusted: float
@@ -99,7 +99,7 @@ def _descriptor_alarm(strangers: Sequence[Found], generic: Sequence[Found]) -> A
         best = strangers[0]
         text = f"the residual correlates with {best.descriptor.text} ({100 * best.share:.0f} % of its power)"
         return Alarm("descriptors", True, best.share, best.p_adjusted, text)
-    share, p_value = (generic[0].share, generic[0].p_adjusted) if generic else (0.0, 1.0)
+    share, p_value = (generic[0].share, generic[0].p_adjusted) if generic else (0.0, None)
     return Alarm("descriptors", False, share, p_value, "no stranger to the named causes")
 
 
@@ -122,7 +122,7 @@ def describe_residual(search: Search, fitted: Fit) -> list[Found]:
     found = []
     for descriptor, change in kept:
         p_adjusted = screened[descriptor.text].p_adjusted
-        if p_adjusted <= DESCRIPTOR_P:
+        if p_adjusted is not None and p_adjusted <= DESCRIPTOR_P:
             share = left_out_share(fitted, presses, columns, change, search.folds)
             if share > DESCRIPTOR_SHARE:
                 found.append(Found(descriptor, p_adjusted, share))

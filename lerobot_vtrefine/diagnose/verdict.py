@@ -1,6 +1,6 @@
-"""The verdict of a diagnosis, as the public file ``verdict.json`` holds it (contract §3).
+"""The verdict of a diagnosis, as the public file ``verdict.json`` holds it (docs/verdict.md).
 
-The dataclasses refuse what the contract does not allow, so that no other program has to: numbers that are not
+The dataclasses refuse what the format does not allow, so that no other program has to: numbers that are not
 finite, unknown names, a status that its causes contradict.
 """
 
@@ -12,18 +12,20 @@ from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any, Literal, get_args
 
-from lerobot_vtrefine.files import decode, read_json
+from lerobot_vtrefine.files import decode, limits, read_json
 
 SCHEMA = "vtrefine/verdict@1"
 
 Status = Literal["adequate", "explained", "ambiguous", "unexplained", "invalid_data"]
 Role = Literal["cause", "symptom"]
+Basis = Literal["tested", "observed"]
 
 SENSOR_CAUSES = (
     "nonlinear_stiffness",
     "saturation",
     "viscoelastic_relaxation",
     "hysteresis",
+    "first_load_softening",
     "taxel_gain_spread",
     "dead_taxels",
     "row_sharing",
@@ -46,7 +48,7 @@ ROBOT_CAUSES = (
 )
 SCENE_CAUSES = ("camera_extrinsics", "depth_scale", "object_mass", "object_friction", "clearance")
 CAUSES = SENSOR_CAUSES + ROBOT_CAUSES + SCENE_CAUSES
-"""Every name that the contract lists (§4); a verdict may give those of the catalogue's other files too."""
+"""Every name that docs/verdict.md lists; a verdict may give those of the catalogue's other files too."""
 
 
 @dataclass(frozen=True)
@@ -73,6 +75,8 @@ class Cause:
     """One name with its evidence: family-wise adjusted p, and what its removal loses on held-out trials.
 
     A ``symptom`` was found together with structure that no known cause accounts for: its name may be false.
+    What was ``observed`` in the readings themselves (a taxel that never answers, frames that repeat) was not
+    tested, and has no p-value.
     """
 
     name: str
@@ -80,10 +84,14 @@ class Cause:
     params: Mapping[str, Parameter]
     p_value: float | None
     heldout_gain: float | None
+    basis: Basis = "tested"
 
     def __post_init__(self) -> None:
         _check_names("cause", (self.name,))
         _check_choice("role", self.role, get_args(Role))
+        _check_choice("basis", self.basis, get_args(Basis))
+        if self.basis == "observed" and self.p_value is not None:
+            raise ValueError(f"{self.name} was observed, not tested: it has no p_value, got {self.p_value}")
         if self.p_value is not None and not 0.0 <= self.p_value <= 1.0:
             raise ValueError(f"p_value of {self.name} must lie in [0, 1], got {self.p_value}")
 
@@ -128,7 +136,9 @@ class DataIssue:
 class Verdict:
     """Everything in ``verdict.json``. ``heldout`` is None when nothing could be fitted (``invalid_data``).
 
-    ``next_experiment`` is a JSON object (a protocol that the rig can run, with what it decides) or None.
+    ``minimum_detectable`` says from which size on a cause would have been named, ``not_tested`` which causes
+    these recordings cannot show, and what to record for each. ``next_experiment`` is a JSON object (a
+    protocol that the rig can run, with what it decides) or None.
     """
 
     status: Status
@@ -139,6 +149,7 @@ class Verdict:
     minimum_detectable: Mapping[str, float] = field(default_factory=dict)
     next_experiment: Mapping[str, Any] | None = None
     data_issues: tuple[DataIssue, ...] = ()
+    not_tested: Mapping[str, str] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
         by_gain = sorted(self.causes, key=lambda cause: -(cause.heldout_gain or 0.0))
@@ -149,32 +160,77 @@ class Verdict:
         for names in self.ambiguous_with:
             _check_names("ambiguous_with", names)
         _check_names("minimum_detectable", tuple(self.minimum_detectable))
+        _check_names("not_tested", tuple(self.not_tested))
         _check_consistent(self)
         for where, number in _numbers("", asdict(self)):
             if not math.isfinite(number):
                 raise ValueError(f"verdict holds {number} at {where}; JSON knows no such number, use None")
 
     def to_dict(self) -> dict[str, Any]:
-        """JSON-ready form with the contract's keys in the contract's order."""
+        """JSON-ready form with the format's keys in the format's order."""
         return {"schema": SCHEMA, **asdict(self)}
 
     @classmethod
-    def from_dict(cls, data: Mapping[str, Any]) -> "Verdict":
-        """Inverse of `to_dict`; ValueError says what is missing or wrong."""
+    def from_dict(cls, data: Any) -> "Verdict":
+        """Inverse of `to_dict`; ValueError names the field and what is wrong with it."""
         if not isinstance(data, Mapping) or data.get("schema") != SCHEMA:
             raise ValueError(f'verdict must hold "schema": "{SCHEMA}"')
-        values = {key: value for key, value in data.items() if key != "schema"}
-        try:
-            values["causes"] = tuple(_cause_from_dict(item) for item in values["causes"])
-            values["unknown"] = decode(Unknown, values["unknown"], "unknown", "unknown.")
-            values["data_issues"] = tuple(
-                decode(DataIssue, item, "data_issues") for item in values["data_issues"]
+        content = decode(VerdictFile, data, "verdict", others=True)
+        causes = tuple(
+            Cause(
+                entry.name,
+                entry.role,
+                {name: _parameter(item) for name, item in entry.params.items()},
+                entry.p_value,
+                entry.heldout_gain,
+                entry.basis,
             )
-            if values["heldout"] is not None:
-                values["heldout"] = decode(Heldout, values["heldout"], "heldout", "heldout.")
-            return cls(**values)
-        except (KeyError, TypeError) as error:
-            raise ValueError(f"verdict is malformed: {error}") from error
+            for entry in content.causes
+        )
+        return cls(
+            content.status,
+            causes,
+            content.ambiguous_with,
+            content.unknown,
+            content.heldout,
+            content.minimum_detectable,
+            content.next_experiment,
+            content.data_issues,
+            content.not_tested,
+        )
+
+
+@dataclass(frozen=True)
+class _ParameterEntry:
+    value: float | list[Any]
+    ci95: list[Any] | None
+    unit: str
+
+
+@dataclass(frozen=True)
+class _CauseEntry:
+    name: str
+    role: Role
+    params: dict[str, _ParameterEntry]
+    p_value: float | None = limits(0.0, 1.0)
+    heldout_gain: float | None = limits(maximum=1.0)
+    basis: Basis = "tested"
+
+
+@dataclass(frozen=True)
+class VerdictFile:
+    """Content of verdict.json; fields without a default are always there."""
+
+    schema: Literal["vtrefine/verdict@1"]
+    status: Status
+    causes: tuple[_CauseEntry, ...]
+    ambiguous_with: tuple[tuple[str, ...], ...]
+    unknown: Unknown
+    heldout: Heldout | None
+    minimum_detectable: dict[str, float]
+    next_experiment: dict[str, Any] | None
+    data_issues: tuple[DataIssue, ...]
+    not_tested: dict[str, str] = field(default_factory=dict)
 
 
 def write_verdict(verdict: Verdict, path: str | Path) -> None:
@@ -207,17 +263,13 @@ def _plain(value: Any) -> Any:
     raise TypeError(f"verdict.json cannot hold {type(value).__name__}")
 
 
-def _cause_from_dict(item: Mapping[str, Any]) -> Cause:
-    params = {name: Parameter(**_with_tuple(value, "ci95")) for name, value in item["params"].items()}
-    rest: dict[str, Any] = {key: value for key, value in item.items() if key != "params"}
-    return Cause(params=params, **rest)
-
-
-def _with_tuple(item: Mapping[str, Any], key: str) -> dict[str, Any]:
-    """JSON's list of two numbers back as the tuple that was written."""
-    value = item[key]
-    is_interval = isinstance(value, list) and len(value) == 2 and not isinstance(value[0], list)
-    return {**item, key: tuple(value) if is_interval else value}
+def _parameter(entry: _ParameterEntry) -> Parameter:
+    """With JSON's list of two numbers as the tuple that was written."""
+    ci95 = entry.ci95
+    is_interval = ci95 is not None and len(ci95) == 2 and not isinstance(ci95[0], list)
+    return Parameter(
+        entry.value, (ci95[0], ci95[1]) if ci95 is not None and is_interval else ci95, entry.unit
+    )
 
 
 def _check_choice(name: str, value: str, choices: tuple[str, ...]) -> None:
@@ -232,14 +284,15 @@ def _check_names(where: str, names: tuple[str, ...]) -> None:
 
 
 def _own_causes() -> tuple[str, ...]:
-    """Causes that somebody added to the catalogue, which needs the tactile stages."""
+    """Causes that somebody added to a catalogue, which needs the simulator's stages."""
     from lerobot_vtrefine.diagnose.candidates import CATALOGUE
+    from lerobot_vtrefine.diagnose.joints.candidates import NAMES
 
-    return tuple(form.family for form in CATALOGUE)
+    return (*(form.family for form in CATALOGUE), *NAMES)
 
 
 def _check_consistent(verdict: Verdict) -> None:
-    """A status must not contradict the rest (contract §3)."""
+    """A status must not contradict the rest (docs/verdict.md)."""
     roles = {cause.role for cause in verdict.causes}
     wrong = {
         "adequate": bool(verdict.causes or verdict.ambiguous_with or verdict.unknown.alarm),

@@ -1,27 +1,36 @@
-"""What a bimanual robot is: constants only, no simulator and no driver.
+"""What a robot is: constants only, no simulator and no driver. Whoever needs a fact about a body asks it.
 
 Conventions, shared by every embodiment:
 
 - World frame: origin at the centre of the table's top, z up. SI units, radians.
-- Joints, state and actions: per arm (left, then right) the revolute joints from the base on, then
-  `left_finger` and `right_finger`. One servo drives both fingers, right = -left.
-- Hand frame of an arm (after the last revolute joint): +x towards the fingertips, fingers slide along y, the
-  left finger at y > 0.
+- Joints, state and actions: per arm the revolute joints from the base on, then those of its gripper.
+- Arms stand in the order of the parts that they hold: socket, then plug. A body with one arm holds one part;
+  the other stands on the table.
+- Hand frame of an arm (after the last revolute joint): +x towards the fingertips, fingers move in its x-y
+  plane, the left finger at y > 0.
 - Pad frame: origin at the centre of the undeformed face, +x along increasing column, +y along increasing row,
   +z out of the face. Column 0 lies at the fingertip; rows of opposing pads are mirrored: (r, c) faces (R-1-r,
   c).
 - TCP: midway between the pads, axes of the hand frame.
 """
 
+from collections.abc import Mapping
 from dataclasses import dataclass, field
+from typing import Literal
 
 import numpy as np
 import torch
 from torch import Tensor
 
 from lerobot_vtrefine.embodiments import kinematics
+from lerobot_vtrefine.embodiments.camera_config import CameraConfig
+from lerobot_vtrefine.embodiments.fingers import Fingers
+from lerobot_vtrefine.embodiments.shapes import Shape, Vector
+from lerobot_vtrefine.tactile.layout import PadLayout
 
-ARM_NAMES = ("left", "right")
+PARTS = ("socket", "plug")
+ROLL, PITCH, YAW = 0, 1, 2
+STARTS = ("table", "grasped")
 
 
 @dataclass(frozen=True)
@@ -29,10 +38,10 @@ class Joint:
     """One revolute joint and the link that it moves."""
 
     name: str
-    offset_m: tuple[float, float, float]
+    offset_m: Vector
     """Origin in the parent link's frame."""
     axis: int
-    """0, 1 or 2: turns about the link's x, y or z."""
+    """0, 1 or 2: turns about the link's x (a roll), y (a pitch) or z (a yaw)."""
     lower_rad: float
     upper_rad: float
     stiffness: float
@@ -46,97 +55,163 @@ class Joint:
     torque_limit: float
     """Largest servo torque [Nm]."""
     mass_kg: float
-    com_m: tuple[float, float, float]
+    com_m: Vector
     """Link's centre of mass in its own frame."""
-    inertia: tuple[float, float, float]
+    inertia: Vector
     """Link's inertia about its centre of mass, along its own axes [kg m^2]."""
+    shapes: tuple[Shape, ...] = ()
+    """What the link looks like."""
+    reversed: bool = False
+    """Whether positive angles turn about the axis' negative direction."""
 
-
-@dataclass(frozen=True)
-class Fingers:
-    """The parallel gripper: two sliding fingers with one pad each, driven by one servo."""
-
-    slide_offset_m: float
-    """Finger frame's origin along the hand's x."""
-    pad_offset_m: float
-    """Pad centre's distance from the finger frame, along x."""
-    travel_m: float
-    """Largest opening per finger."""
-    face_offset_m: float
-    """Pad face's y minus the finger's position, positive towards the other pad."""
-    pad_size_m: tuple[float, float, float]
-    """Pad's extent along the finger (columns), across it (rows) and its thickness."""
-    stiffness: float
-    """Servo gain on the opening per finger [N/m], summed over both fingers."""
-    damping: float
-    """Per finger [Ns/m]."""
-    armature: float
-    """Per finger [kg]."""
-    force_limit_n: float
-    """Largest servo force, summed over both fingers."""
-    mass_kg: float
-    """Per finger, pad included."""
+    @property
+    def sign(self) -> float:
+        """-1 for a reversed joint, else 1."""
+        return -1.0 if self.reversed else 1.0
 
 
 @dataclass(frozen=True)
 class Arm:
-    """Where one arm stands."""
+    """Where one arm stands, what it holds, and how it rests."""
 
     name: str
-    base_pos_m: tuple[float, float, float]
+    holds: Literal["socket", "plug"]
+    base_pos_m: Vector
     base_yaw_rad: float
+    home_rad: tuple[float, ...]
+    """Its revolute joints at rest."""
+    base_pitch_rad: float = 0.0
+    """The base is turned about its x, then about y, then by the yaw."""
+    base_roll_rad: float = 0.0
+
+    def base_rotation(self) -> np.ndarray:
+        """(3, 3) of the base in the world."""
+        cos, sin = np.cos(self.base_yaw_rad), np.sin(self.base_yaw_rad)
+        yaw = np.array([[cos, -sin, 0.0], [sin, cos, 0.0], [0.0, 0.0, 1.0]])
+        cos, sin = np.cos(self.base_pitch_rad), np.sin(self.base_pitch_rad)
+        pitch = np.array([[cos, 0.0, sin], [0.0, 1.0, 0.0], [-sin, 0.0, cos]])
+        cos, sin = np.cos(self.base_roll_rad), np.sin(self.base_roll_rad)
+        return yaw @ pitch @ np.array([[1.0, 0.0, 0.0], [0.0, cos, -sin], [0.0, sin, cos]])
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Embodiment:
-    """A bimanual robot with two equal arms, two sliding fingers each, and a pad on every finger."""
+    """A robot with one or two equal arms, each with a gripper that carries a pad on every finger.
+
+    Bodies are told apart by identity: there is one object of each.
+    """
 
     name: str
     robot_type: str
     """What LeRobot calls this robot: recorded and simulated datasets must say the same to be merged."""
-    arms: tuple[Arm, Arm]
+    arms: tuple[Arm, ...]
     joints: tuple[Joint, ...]
     """Revolute joints of one arm."""
     fingers: Fingers
-    home_arm_rad: tuple[float, ...]
-    """Revolute joints of one arm at rest."""
+    base: tuple[Shape, ...]
+    """What an arm stands on, in the base's frame."""
+    cameras: Mapping[str, CameraConfig]
+    """The depth camera's set-up for each start of an episode."""
     joint_names: tuple[str, ...] = field(init=False)
     pad_names: tuple[str, ...] = field(init=False)
-    lower: np.ndarray = field(init=False, repr=False, compare=False)
-    upper: np.ndarray = field(init=False, repr=False, compare=False)
-    home: np.ndarray = field(init=False, repr=False, compare=False)
+    lower: np.ndarray = field(init=False, repr=False)
+    upper: np.ndarray = field(init=False, repr=False)
+    home: np.ndarray = field(init=False, repr=False)
 
     def __post_init__(self) -> None:
-        per_arm = (*(joint.name for joint in self.joints), "left_finger", "right_finger")
-        sides = ("left_finger", "right_finger")
-        travel = self.fingers.travel_m
+        held = tuple(arm.holds for arm in self.arms)
+        if held not in (PARTS, PARTS[:1], PARTS[1:]):
+            raise ValueError(
+                f"{self.name}: its arms hold {', '.join(held)}; they must hold socket, then plug"
+            )
+        if set(self.cameras) != set(STARTS):
+            raise ValueError(f"{self.name} needs a camera for each start: {', '.join(STARTS)}")
+        for arm in self.arms:
+            if len(arm.home_rad) != len(self.joints):
+                raise ValueError(f"{self.name}: home_rad of {arm.name} must give {len(self.joints)} joints")
+        per_arm = (*(joint.name for joint in self.joints), *self.fingers.joint_names)
+        low, high = self.fingers.limits
+        count, opened = len(self.arms), self.fingers.joints(np.asarray(self.fingers.travel_m))
         derived = {
             "joint_names": tuple(f"{arm.name}_{joint}" for arm in self.arms for joint in per_arm),
-            "pad_names": tuple(f"{arm.name}_arm_{side}" for arm in self.arms for side in sides),
-            "lower": np.array([*(joint.lower_rad for joint in self.joints), 0.0, -travel] * 2),
-            "upper": np.array([*(joint.upper_rad for joint in self.joints), travel, 0.0] * 2),
-            "home": np.array([*self.home_arm_rad, travel, -travel] * 2),
+            "pad_names": tuple(name for arm in self.arms for name in self.fingers.pad_names(arm.name)),
+            "lower": np.tile([*(joint.lower_rad for joint in self.joints), *low], count),
+            "upper": np.tile([*(joint.upper_rad for joint in self.joints), *high], count),
+            "home": np.concatenate([[*arm.home_rad, *opened] for arm in self.arms]),
         }
         for name, value in derived.items():
             object.__setattr__(self, name, value)
 
     @property
     def num_joints(self) -> int:
-        """Joints of both arms, fingers included."""
+        """Joints of all arms, grippers included."""
         return len(self.joint_names)
 
     @property
     def joints_per_arm(self) -> int:
-        """Joints of one arm, fingers included."""
-        return len(self.joints) + 2
+        """Joints of one arm, its gripper's included."""
+        return len(self.joints) + len(self.fingers.joint_names)
+
+    @property
+    def num_arms(self) -> int:
+        """A."""
+        return len(self.arms)
+
+    @property
+    def pads_per_arm(self) -> int:
+        """S, pads of one hand."""
+        return len(self.fingers.sides)
+
+    @property
+    def pad_layout(self) -> PadLayout:
+        """Rows, columns and pitch of every pad's taxels."""
+        return self.fingers.pad.layout
+
+    @property
+    def holders(self) -> tuple[int | None, int | None]:
+        """Which arm holds the socket and which the plug; None for a part that no arm holds."""
+        held = [arm.holds for arm in self.arms]
+        socket, plug = (held.index(part) if part in held else None for part in PARTS)
+        return socket, plug
+
+    @property
+    def arm_columns(self) -> np.ndarray:
+        """Columns of the state that hold revolute joints of arms, in order."""
+        return np.flatnonzero(np.arange(self.num_joints) % self.joints_per_arm < len(self.joints))
+
+    def arm_of(self, joint: str) -> int:
+        """Index of the arm to which the joint of this full name belongs."""
+        return self.joint_names.index(joint) // self.joints_per_arm
+
+    def joint_of(self, name: str) -> Joint | None:
+        """The revolute joint of this full name; None for one of a gripper, or of no arm."""
+        place = self.joint_names.index(name) % self.joints_per_arm if name in self.joint_names else -1
+        return self.joints[place] if 0 <= place < len(self.joints) else None
+
+    def by_arm(self, values: np.ndarray) -> np.ndarray:
+        """View joint values (..., J) as (..., A, J / A)."""
+        return values.reshape(*values.shape[:-1], self.num_arms, self.joints_per_arm)
+
+    def openings(self, q: np.ndarray) -> np.ndarray:
+        """Grippers' openings (..., A) [m] at joint positions (..., J)."""
+        return self.fingers.opening(self.by_arm(q)[..., len(self.joints) :])
+
+    def set_grippers(self, q: np.ndarray, like: np.ndarray) -> None:
+        """Write the grippers' joints of `like` (..., J) into joint positions (..., J), in place."""
+        self.by_arm(q)[..., len(self.joints) :] = self.by_arm(like)[..., len(self.joints) :]
+
+    def set_openings(self, q: np.ndarray, openings_m: np.ndarray) -> None:
+        """Write grippers' openings (..., A) into joint positions (..., J), in place."""
+        self.by_arm(q)[..., len(self.joints) :] = self.fingers.joints(openings_m)
 
     @property
     def tcp_offset_m(self) -> float:
-        """TCP's distance from the last revolute joint, along the hand's x."""
-        return self.fingers.slide_offset_m + self.fingers.pad_offset_m
+        """TCP's distance from the last revolute joint with closed gripper, along the hand's x."""
+        closed = self.fingers.joints(np.asarray(0.0))
+        return float(self.fingers.reach_m(torch.as_tensor(closed)))
 
     def hands(self, q: Tensor) -> kinematics.Hands:
-        """Both arms at joint positions q (..., J) [rad, m], for whoever asks for more than one of what
+        """All arms at joint positions q (..., J) [rad, m], for whoever asks for more than one of what
         follows.
         """
         return kinematics.hands(self, q)
@@ -148,7 +223,7 @@ class Embodiment:
             q: joint positions (..., J) [rad, m].
 
         Returns:
-            World positions (..., 2, 3) [m] and rotations (..., 2, 3, 3), differentiable in q.
+            World positions (..., A, 3) [m] and rotations (..., A, 3, 3), differentiable in q.
         """
         return self.hands(q).tcp()
 
@@ -159,7 +234,7 @@ class Embodiment:
             q: joint positions (..., J) [rad, m].
 
         Returns:
-            World positions (..., 4, 3) [m] and rotations (..., 4, 3, 3), differentiable in q.
+            World positions (..., P, 3) [m] and rotations (..., P, 3, 3), differentiable in q.
         """
         return self.hands(q).pads()
 
@@ -171,7 +246,7 @@ class Embodiment:
             qd: joint velocities (..., J) [rad/s, m/s].
 
         Returns:
-            (..., 4, 6): linear velocity of the pad's origin [m/s], then angular velocity [rad/s], in the
+            (..., P, 6): linear velocity of the pad's origin [m/s], then angular velocity [rad/s], in the
             world frame.
         """
         return self.hands(q).pad_twists(qd)
@@ -183,16 +258,16 @@ class Embodiment:
             q: joint positions (..., J).
 
         Returns:
-            (..., 2, 6, joints): linear rows first [m/rad], then angular, in the world frame.
+            (..., A, 6, joints): linear rows first [m/rad], then angular, in the world frame.
         """
         return kinematics.tcp_jacobian(self, q)
 
     def solve_tcp(self, position: Tensor, rotation: Tensor, initial: Tensor, iterations: int = 30) -> Tensor:
-        """Inverse kinematics of both hands by damped least squares; fingers keep their values.
+        """Inverse kinematics of all hands by damped least squares; grippers keep their values.
 
         Args:
-            position: wanted TCP positions (..., 2, 3) [m].
-            rotation: wanted TCP rotations (..., 2, 3, 3).
+            position: wanted TCP positions (..., A, 3) [m].
+            rotation: wanted TCP rotations (..., A, 3, 3).
             initial: joint positions to start from (..., J).
             iterations: fixed number of steps, so that the result is a function of the arguments only.
 

@@ -1,6 +1,7 @@
-"""Kinematics of an embodiment's two arms, batched over any leading shape and differentiable.
+"""Kinematics of an embodiment's arms, batched over any leading shape and differentiable.
 
-Shapes: `...` leading batch, A = 2 arms, K revolute joints per arm, J = A * (K + 2) joints.
+Shapes: `...` leading batch, A arms, K revolute joints per arm, F joints and S pads of its gripper, J = A * (K
++ F) joints, P = A * S pads.
 """
 
 from dataclasses import dataclass
@@ -9,6 +10,8 @@ from typing import TYPE_CHECKING
 import numpy as np
 import torch
 from torch import Tensor
+
+from lerobot_vtrefine.embodiments.fingers import SIGNS
 
 if TYPE_CHECKING:
     from lerobot_vtrefine.embodiments.embodiment import Embodiment
@@ -37,51 +40,73 @@ class Hands:
 
     def tcp(self) -> tuple[Tensor, Tensor]:
         """Poses midway between each hand's pads: (..., A, 3) [m] and (..., A, 3, 3)."""
-        return self.position + self.embodiment.tcp_offset_m * self.rotation[..., 0], self.rotation
+        reach = self.embodiment.fingers.reach_m(self._grippers)
+        if isinstance(reach, Tensor):
+            reach = reach.unsqueeze(-1)
+        return self.position + reach * self.rotation[..., 0], self.rotation
+
+    @property
+    def _grippers(self) -> Tensor:
+        """(..., A, F)"""
+        return _by_arm(self.embodiment, self.joints)[..., len(self.embodiment.joints) :]
 
     def pads(self) -> tuple[Tensor, Tensor]:
-        """Poses of the pads' faces: (..., 4, 3) [m] and (..., 4, 3, 3)."""
+        """Poses of the pads' faces: (..., P, 3) [m] and (..., P, 3, 3)."""
         fingers = self.embodiment.fingers
         centre, rotation = self.tcp()
-        slide = self.joints.unflatten(-1, (2, self.embodiment.joints_per_arm))[..., -2:]
-        inward = self.joints.new_tensor([-1.0, 1.0])  # the left finger's pad looks along -y of the hand
-        face = slide + fingers.face_offset_m * inward
+        faces = fingers.faces(self._grippers)
+        inward = self.joints.new_tensor([-SIGNS[side] for side in fingers.sides])
         x, y, z = rotation.unsqueeze(-3).unbind(-1)  # each (..., A, 1, 3)
-        position = centre.unsqueeze(-2) + face.unsqueeze(-1) * y
+        position = centre.unsqueeze(-2) + faces.y.unsqueeze(-1) * y
         sign = inward.unsqueeze(-1)
+        if faces.turn is not None:
+            cos, sin = torch.cos(faces.turn).unsqueeze(-1), torch.sin(faces.turn).unsqueeze(-1)
+            x, y = cos * x + sin * y, cos * y - sin * x
         pad_axes = torch.stack([-x.expand_as(position), sign * z, sign * y], -1)
         return position.flatten(-3, -2), pad_axes.flatten(-4, -3)
 
     def pad_twists(self, rates: Tensor) -> Tensor:
-        """Linear (at the pad's origin) and angular velocity of the pads (..., 4, 6) for joint velocities
+        """Linear (at the pad's origin) and angular velocity of the pads (..., P, 6) for joint velocities
         (..., J).
         """
+        body = self.embodiment
         position, _ = self.pads()
-        rates = rates.unflatten(-1, (2, self.embodiment.joints_per_arm))
-        count = len(self.embodiment.joints)
+        rates = _by_arm(body, rates)
+        count = len(body.joints)
         spins = (self.axes * rates[..., :count, None]).unsqueeze(-3)  # (..., A, 1, K, 3)
-        arms = position.unflatten(-2, (2, 2))  # (..., A, finger, 3)
+        arms = position.unflatten(-2, (body.num_arms, body.pads_per_arm))  # (..., A, finger, 3)
         arms_lever = arms.unsqueeze(-2) - self.origins.unsqueeze(-3)
         linear = torch.linalg.cross(spins.expand_as(arms_lever), arms_lever).sum(-2)
-        linear = linear + rates[..., count:, None] * self.rotation[..., None, :, 1]
         angular = spins.sum(-2).expand_as(linear)
+        x, y, z = self.rotation.unsqueeze(-3).unbind(-1)
+        faces, driven = (
+            body.fingers.faces(self._grippers),
+            rates[..., [count + k for k in body.fingers.drivers]],
+        )
+        linear = linear + (driven if faces.y_rate is None else driven * faces.y_rate)[..., None] * y
+        if faces.x_rate is not None:
+            linear = linear + (driven * faces.x_rate)[..., None] * x
+        if faces.turn_rate is not None:
+            angular = angular + (driven * faces.turn_rate)[..., None] * z
         return torch.cat([linear, angular], -1).flatten(-3, -2)
 
 
 def hands(embodiment: "Embodiment", q: Tensor) -> Hands:
-    """Run both chains for joint positions q (..., J)."""
-    arm_q = q.reshape(*q.shape[:-1], 2, embodiment.joints_per_arm)
+    """Run all chains for joint positions q (..., J)."""
+    arm_q = _by_arm(embodiment, q)
     columns = list(_base_rotation(embodiment, q).unbind(-1))
     position = q.new_tensor([arm.base_pos_m for arm in embodiment.arms]).expand(*arm_q.shape[:-1], 3)
     columns = [column.expand_as(position) for column in columns]
     axes, origins = [], []
     angles = arm_q[..., : len(embodiment.joints), None]
+    if any(joint.reversed for joint in embodiment.joints):
+        angles = angles * q.new_tensor([joint.sign for joint in embodiment.joints])[:, None]
     turns = zip(torch.cos(angles).unbind(-2), torch.sin(angles).unbind(-2), strict=True)
     for joint, (cos, sin) in zip(embodiment.joints, turns, strict=True):
         for axis, length in enumerate(joint.offset_m):
             if length:
                 position = position + length * columns[axis]
-        axes.append(columns[joint.axis])
+        axes.append(-columns[joint.axis] if joint.reversed else columns[joint.axis])
         origins.append(position)
         _turn(columns, joint.axis, cos, sin)
     frames = torch.stack(columns, -1), torch.stack(axes, -2), torch.stack(origins, -2)
@@ -112,7 +137,7 @@ def solve_tcp(
         step = torch.linalg.solve(transposed @ jacobian + eye, transposed @ error.unsqueeze(-1)).squeeze(-1)
         largest = step.abs().amax(-1, keepdim=True)
         step = step * (_IK_MAX_STEP_RAD / largest.clamp(min=_IK_MAX_STEP_RAD))
-        arms = q.unflatten(-1, (2, embodiment.joints_per_arm)).clone()
+        arms = _by_arm(embodiment, q).clone()
         arms[..., :count] += step
         q = torch.minimum(torch.maximum(arms.flatten(-2), lower), upper)
     return q
@@ -126,12 +151,13 @@ def rotation_error(current: Tensor, wanted: Tensor) -> Tensor:
     return 0.5 * torch.linalg.cross(current.transpose(-1, -2), wanted.transpose(-1, -2)).sum(-2)
 
 
+def _by_arm(embodiment: "Embodiment", values: Tensor) -> Tensor:
+    """Joint values (..., J) as (..., A, J / A)."""
+    return values.unflatten(-1, (embodiment.num_arms, embodiment.joints_per_arm))
+
+
 def _base_rotation(embodiment: "Embodiment", like: Tensor) -> Tensor:
-    yaw = np.array([arm.base_yaw_rad for arm in embodiment.arms])
-    rotation = np.zeros((2, 3, 3))
-    rotation[:, 0, 0] = rotation[:, 1, 1] = np.cos(yaw)
-    rotation[:, 1, 0], rotation[:, 0, 1] = np.sin(yaw), -np.sin(yaw)
-    rotation[:, 2, 2] = 1.0
+    rotation = np.stack([arm.base_rotation() for arm in embodiment.arms])
     return torch.as_tensor(rotation, dtype=like.dtype, device=like.device)
 
 

@@ -1,5 +1,6 @@
 """The robot model as a file: what diagnosis writes, and what prediction and the simulation read."""
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal
@@ -33,7 +34,7 @@ class JointModel:
     """Dry friction divided by the servo's stiffness [rad or m]."""
     sag_form: SagForm = "mass"
     sag_terms: tuple[float, float, float, float] = limits(maximum=MAX_POSITION, default=(0.0,) * TERMS)
-    """Coefficients of the form's terms, see `diagnose.robot.gravity.shapes` [rad]."""
+    """Coefficients of the form's terms, see `diagnose.joints.gravity.shapes` [rad]."""
     compliance: float = limits(maximum=MAX_POSITION, default=0.0)
     """Target shift against the load [rad or m per unit of load]."""
     stop: float = limits(0.0, MAX_POSITION, default=0.0)
@@ -44,6 +45,8 @@ class JointModel:
     """Half the spread of the widths that make up the plays, as a part of their mean."""
     breakaway: float = limits(0.0, 100.0, default=0.0)
     """By what part breaking away takes more than `friction`."""
+    laws: Mapping[str, float] = limits(maximum=MAX_POSITION, default_factory=dict)
+    """Parameters of further laws, see `diagnose.joints.stages`; what is not there is zero."""
 
 
 @dataclass(frozen=True)

@@ -5,7 +5,8 @@ from pathlib import Path
 
 import numpy as np
 
-from lerobot_vtrefine.datasets.features import BASELINE_KEYS, DEPTH_KEY, TACTILE_KEYS
+from lerobot_vtrefine.datasets.features import DEPTH_KEY, baseline_keys, tactile_keys
+from lerobot_vtrefine.embodiments import Embodiment
 from lerobot_vtrefine.envs.episodes import Array, Raw
 
 MAX_FRAMES = 400
@@ -41,7 +42,7 @@ def mean_frame(root: Path, keys: Sequence[str]) -> dict[str, Array]:
     return {key: value / np.maximum(counts[key], 1.0) for key, value in sums.items()}
 
 
-def make_ablation(ablate: str, dataset: Path | None) -> Callable[[Raw], Raw] | None:
+def make_ablation(ablate: str, dataset: Path | None, body: Embodiment) -> Callable[[Raw], Raw] | None:
     """A function that replaces the ablated part of raw frames (m, ...), or None for ``none``.
 
     Touch: the counts above the idle level become their mean per taxel, on top of each frame's own baseline;
@@ -51,10 +52,9 @@ def make_ablation(ablate: str, dataset: Path | None) -> Callable[[Raw], Raw] | N
     if ablate == "none" or dataset is None:
         return None
     if ablate == "touch":
-        mean = mean_frame(dataset, (*TACTILE_KEYS, *BASELINE_KEYS))
-        pressed = np.stack(
-            [mean[key] - mean[idle] for key, idle in zip(TACTILE_KEYS, BASELINE_KEYS, strict=True)]
-        ).round()
+        touch, idle = tactile_keys(body), baseline_keys(body)
+        mean = mean_frame(dataset, (*touch, *idle))
+        pressed = np.stack([mean[key] - mean[rest] for key, rest in zip(touch, idle, strict=True)]).round()
         return lambda raw: {
             **raw,
             "tactile": np.clip(raw["tactile_baseline"] + pressed, 0, 255).astype(np.uint8),

@@ -7,13 +7,12 @@ from typing import Any
 from lerobot.configs import FeatureType, PolicyFeature
 from lerobot.envs.configs import EnvConfig
 
-from lerobot_vtrefine.config_errors import told_by_lerobot
-from lerobot_vtrefine.datasets.features import ACTION_KEY, NUM_JOINTS, env_key_map, env_observation_shapes
+from lerobot_vtrefine.datasets.features import ACTION_KEY, env_key_map, env_observation_shapes
+from lerobot_vtrefine.embodiments import Embodiment, get_embodiment
 from lerobot_vtrefine.extras import SIMULATOR, require
+from lerobot_vtrefine.lerobot_compat.config_errors import told_by_lerobot
 from lerobot_vtrefine.sim.config import (
     BACKENDS,
-    GRASPED_CAMERA,
-    TABLE_CAMERA,
     RandomizationConfig,
     SceneConfig,
     ShearConfig,
@@ -31,7 +30,7 @@ SHORTCUTS = ("pair", "clearance_m", "start", "mesh_dir")
 @EnvConfig.register_subclass("vtrefine")
 @dataclass
 class VtRefineEnvConfig(EnvConfig):
-    """Bimanual insertion with four tactile pads and a depth camera, simulated in MuJoCo.
+    """Bimanual insertion with tactile pads and a depth camera, simulated in MuJoCo.
 
     ``pair``, ``clearance_m``, ``start``, ``mesh_dir`` and ``episode_steps`` are short for the fields of
     ``scene`` and ``rules`` with these names, and win over them.
@@ -81,7 +80,7 @@ class VtRefineEnvConfig(EnvConfig):
     """JSON-lines file; every finished episode appends seed, success, in-hand shift, peak force, ..."""
     features: dict[str, PolicyFeature] = field(default_factory=dict)
     """Unused as a flag: follows from the camera's size."""
-    features_map: dict[str, str] = field(default_factory=env_key_map)
+    features_map: dict[str, str] = field(default_factory=dict)
     """Unused as a flag: LeRobot's names of the observations."""
 
     @told_by_lerobot
@@ -100,7 +99,8 @@ class VtRefineEnvConfig(EnvConfig):
             raise ValueError(
                 f"{self.reality} holds a sensor model: drop --env.sensor_model={self.sensor_model}"
             )
-        self.features = policy_features(*self.camera_size)
+        self.features = policy_features(*self.camera_size, self.body)
+        self.features_map = env_key_map(self.body)
         _ = self.task_config  # its own checks, now rather than in a worker process
 
     @property
@@ -108,6 +108,15 @@ class VtRefineEnvConfig(EnvConfig):
         """The scene with the shortcuts put in, as it really is."""
         given = {name: getattr(self, name) for name in SHORTCUTS if getattr(self, name) is not None}
         return self.hidden.applied(replace(self.scene, **given))
+
+    @property
+    def body(self) -> Embodiment:
+        """The robot in the scene.
+
+        Raises:
+            ValueError: ``scene.embodiment`` is unknown.
+        """
+        return get_embodiment(self.scene.embodiment)
 
     @property
     def hidden(self) -> Reality:
@@ -124,7 +133,7 @@ class VtRefineEnvConfig(EnvConfig):
     def camera_size(self) -> tuple[int, int]:
         """Height and width of the depth image in pixels."""
         scene = self.scene_config
-        camera = scene.camera or {"grasped": GRASPED_CAMERA, "table": TABLE_CAMERA}[scene.start]
+        camera = scene.camera or self.body.cameras[scene.start]
         return camera.height, camera.width
 
     @property
@@ -144,15 +153,15 @@ class VtRefineEnvConfig(EnvConfig):
         return {self.type: {0: make_vector_env(self, n_envs, use_async_envs)}}
 
 
-def policy_features(camera_height: int, camera_width: int) -> dict[str, PolicyFeature]:
+def policy_features(camera_height: int, camera_width: int, body: Embodiment) -> dict[str, PolicyFeature]:
     """LeRobot features under environment keys.
 
     Depth is no VISUAL feature here: ``lerobot-eval --eval.recording=true`` makes videos of these, and
     millimetres do not fit into one.
     """
-    shapes = env_observation_shapes(camera_height, camera_width)
+    shapes = env_observation_shapes(camera_height, camera_width, body)
     features = {key: PolicyFeature(type=FeatureType.STATE, shape=shape) for key, (shape, _) in shapes.items()}
-    return {ACTION_KEY: PolicyFeature(type=FeatureType.ACTION, shape=(NUM_JOINTS,)), **features}
+    return {ACTION_KEY: PolicyFeature(type=FeatureType.ACTION, shape=(body.num_joints,)), **features}
 
 
 def _check_choice(name: str, value: str, choices: tuple[str, ...]) -> None:

@@ -97,7 +97,7 @@ class LeRobotDecisionEnv:
         return self._batch, self._privileged()
 
     def step_chunk(self, actions: Tensor) -> Decision:
-        """Run a chunk of normalised actions (n, Ta, 16), as the policy's sampler gives them."""
+        """Run a chunk of normalised actions (n, Ta, J), as the policy's sampler gives them."""
         targets = self._postprocessor(actions).detach().cpu().numpy()
         length = targets.shape[1]
         reward = np.zeros(self.num_envs, np.float32)
@@ -145,7 +145,7 @@ class LeRobotDecisionEnv:
         if len(ids) == 0:
             return
         flat = {key: window[ids].reshape(-1, *window.shape[2:]) for key, window in self._history.items()}
-        frames = preprocess_observation(raw_to_env_observation(flat))
+        frames = preprocess_observation(raw_to_env_observation(flat, self.episodes.body))
         shape = (len(ids), self.n_obs_steps)
         batch = self._preprocessor({key: value.unflatten(0, shape) for key, value in frames.items()})
         fresh = {

@@ -20,8 +20,9 @@ from lerobot.datasets.io_utils import SuppressProgressBars
 from lerobot.datasets.lerobot_dataset import LeRobotDataset
 
 from lerobot_vtrefine.datasets.features import ACTION_KEY, raw_to_frame
+from lerobot_vtrefine.embodiments import Embodiment
 from lerobot_vtrefine.envs.demonstrations import Demonstration
-from lerobot_vtrefine.envs.fast_saving import fast_saving
+from lerobot_vtrefine.envs.recording_note import NOTE
 from lerobot_vtrefine.folders import (
     check_replaceable,
     link_or_copy,
@@ -30,8 +31,9 @@ from lerobot_vtrefine.folders import (
     working_folder,
     write_in_place,
 )
+from lerobot_vtrefine.lerobot_compat.fast_saving import fast_saving
 
-LEDGER = Path("meta") / "recording.json"
+LEDGER = NOTE
 INFO = Path("meta") / "info.json"
 TASKS = Path("meta") / "tasks.parquet"
 DATASET_FOLDERS = ("data", "meta", "images")
@@ -48,7 +50,7 @@ class DemoDataset:
         repo_id: LeRobot's name for it.
         fps: Control rate [Hz].
         features: From ``datasets.features.dataset_features``.
-        robot_type: LeRobot's name of the robot that the data fits.
+        body: The robot that the data fits.
         task: Natural-language task of every frame.
         settings: What determines the episodes (JSON values); continuing with other settings is refused.
         first_seed: Seed of the first attempt.
@@ -64,7 +66,7 @@ class DemoDataset:
         repo_id: str,
         fps: int,
         features: dict[str, Any],
-        robot_type: str,
+        body: Embodiment,
         task: str,
         settings: dict[str, Any],
         first_seed: int,
@@ -73,7 +75,7 @@ class DemoDataset:
         self._place = self.root.resolve()
         self._work = working_folder(self._place)
         self._task = task
-        self._robot_type = robot_type
+        self._body = body
         self._repo_id, self._fps, self._features = repo_id, fps, features
         self._nothing = {"settings": json.loads(json.dumps(settings)), "next_seed": first_seed, "files": []}
         self._ledger: dict[str, Any] = {**self._nothing, "episodes": []}
@@ -105,7 +107,7 @@ class DemoDataset:
         dataset = self._open()
         for step, action in enumerate(demonstration.actions):
             raw = {key: value[step] for key, value in demonstration.raw.items()}
-            dataset.add_frame({**raw_to_frame(raw), ACTION_KEY: action, "task": self._task})
+            dataset.add_frame({**raw_to_frame(raw, self._body), ACTION_KEY: action, "task": self._task})
         with fast_saving(), SuppressProgressBars():
             dataset.save_episode()
         row = {"episode_index": self.num_episodes, **demonstration.row}
@@ -179,7 +181,7 @@ class DemoDataset:
             self._fps,
             self._features,
             root=self._work,
-            robot_type=self._robot_type,
+            robot_type=self._body.robot_type,
             use_videos=False,
             image_writer_threads=IMAGE_WRITER_THREADS,
         )

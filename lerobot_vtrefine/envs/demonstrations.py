@@ -22,7 +22,7 @@ class Demonstration:
     raw: Raw
     """Raw frames before each action, arrays (T, ...)."""
     actions: Array
-    """(T, 16) float32 absolute joint targets."""
+    """(T, J) float32 absolute joint targets."""
     row: dict[str, Any]
     """Seed, steps, success and metrics."""
 

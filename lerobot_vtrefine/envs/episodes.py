@@ -52,6 +52,7 @@ class Episodes:
     ) -> None:
         self.sim = sim
         self.num_envs = sim.num_envs
+        self.body = sim.embodiment
         self.ids = np.arange(self.num_envs)
         self.seeds = np.zeros(self.num_envs, np.int64)
         self.steps = np.zeros(self.num_envs, np.int64)
@@ -83,7 +84,7 @@ class Episodes:
         """One control step of the unfinished environments.
 
         Args:
-            actions: (n, 16) absolute joint targets in rad and m; rows of finished environments are ignored.
+            actions: (n, J) absolute joint targets in rad and m; rows of finished environments are ignored.
             reads: Whether to read the sensors afterwards. False is for callers who know that nobody looks at
                 this frame: ``raw`` then keeps the last one.
         """

@@ -45,7 +45,7 @@ def make_simulation(config: VtRefineEnvConfig, num_envs: int) -> "InsertionSim":
 
 def make_episodes(config: VtRefineEnvConfig, num_envs: int) -> Episodes:
     """The simulation with ablation and metrics log as configured."""
-    ablation = make_ablation(config.ablate, config.ablate_dataset)
+    ablation = make_ablation(config.ablate, config.ablate_dataset, config.body)
     log = EpisodeLog(config.metrics_path) if config.metrics_path is not None else None
     return Episodes(make_simulation(config, num_envs), ablation, log)
 

@@ -5,7 +5,6 @@ from typing import Any
 import gymnasium as gym
 import numpy as np
 
-from lerobot_vtrefine.datasets.features import NUM_JOINTS
 from lerobot_vtrefine.envs.config import VtRefineEnvConfig
 from lerobot_vtrefine.envs.episodes import Array
 from lerobot_vtrefine.envs.vector_env import Observation, VtRefineVectorEnv
@@ -39,9 +38,9 @@ class VtRefineEnv(gym.Env[Observation, Array]):
         return _first(observation), {"is_success": False, **_shear(info)}
 
     def step(self, action: Array) -> tuple[Observation, float, bool, bool, dict[str, Any]]:
-        """One control step with absolute joint targets (16,) in rad and m."""
-        if np.shape(action) != (NUM_JOINTS,):
-            raise ValueError(f"action must have shape ({NUM_JOINTS},), got {np.shape(action)}")
+        """One control step with absolute joint targets (J,) in rad and m."""
+        if np.shape(action) != self.action_space.shape:
+            raise ValueError(f"action must have shape {self.action_space.shape}, got {np.shape(action)}")
         observation, reward, terminated, truncated, info = self._batch.step(np.asarray(action)[None])
         ended = {name: values[0].item() for name, values in info.get("final_info", {}).items()}
         measured = {name: value for name, value in ended.items() if value == value}  # NaN does not
@@ -49,7 +48,7 @@ class VtRefineEnv(gym.Env[Observation, Array]):
         return _first(observation), float(reward[0]), bool(terminated[0]), bool(truncated[0]), told
 
     def render(self) -> Array:
-        """uint8 (H, W, 3): the scene beside its four pads."""
+        """uint8 (H, W, 3): the scene beside its pads."""
         return self._batch.render_env(0)
 
     def close(self) -> None:

@@ -4,24 +4,23 @@ import numpy as np
 from gymnasium import spaces
 
 from lerobot_vtrefine.datasets.features import env_observation_shapes
-from lerobot_vtrefine.embodiments import get_embodiment
 from lerobot_vtrefine.envs.config import VtRefineEnvConfig
 
 
 def action_space(config: VtRefineEnvConfig) -> spaces.Box:
-    """Absolute joint targets (16,) within the joint limits of the configured embodiment, rad and m.
+    """Absolute joint targets (J,) within the joint limits of the configured embodiment, rad and m.
 
     Raises:
         ValueError: ``scene.embodiment`` is unknown.
     """
-    robot = get_embodiment(config.scene_config.embodiment)
+    robot = config.body
     return spaces.Box(robot.lower.astype(np.float32), robot.upper.astype(np.float32), dtype=np.float32)
 
 
 def observation_space(config: VtRefineEnvConfig) -> spaces.Dict:
     """One environment's raw observation: joints, pad counts, depth, camera."""
     height, width = config.camera_size
-    shapes = env_observation_shapes(height, width)
+    shapes = env_observation_shapes(height, width, config.body)
     return spaces.Dict({key: _box(shape, highest) for key, (shape, highest) in shapes.items()})
 
 

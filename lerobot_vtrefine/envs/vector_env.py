@@ -9,7 +9,7 @@ from gymnasium.utils.seeding import np_random
 from gymnasium.vector import AutoresetMode
 from gymnasium.vector.utils import batch_space
 
-from lerobot_vtrefine.datasets.features import NUM_JOINTS, raw_to_env_observation
+from lerobot_vtrefine.datasets.features import raw_to_env_observation
 from lerobot_vtrefine.envs.config import VtRefineEnvConfig
 from lerobot_vtrefine.envs.episodes import Array, Episodes, Transition
 from lerobot_vtrefine.envs.factory import make_episodes
@@ -31,8 +31,8 @@ class VtRefineVectorEnv(gym.vector.VectorEnv[Observation, Array, Array]):
     - ``info["is_success"]`` is (n,) bool; ``info["final_info"]`` appears in steps in which an episode ends
       and holds the same plus how finished episodes went: ``failure`` (n,) str names the reason, see
       ``Episodes.summary``.
-    - With ``--env.shear.on=true``, ``info["shear"]`` is (n, 4, 384, 2) float32: tangential force per taxel
-      [N], of every control step.
+    - With ``--env.shear.on=true``, ``info["shear"]`` is (n, pads, taxels, 2) float32: tangential force per
+      taxel [N], of every control step.
     - Observations are those of ``datasets.features.env_observation_shapes`` with a leading ``n``.
     """
 
@@ -76,11 +76,9 @@ class VtRefineVectorEnv(gym.vector.VectorEnv[Observation, Array, Array]):
         return self._observation(), {"is_success": np.zeros(self.num_envs, bool), **self._shear()}
 
     def step(self, actions: Array) -> tuple[Observation, Array, Array, Array, dict[str, Any]]:
-        """One control step with absolute joint targets (n, 16) in rad and m."""
-        if np.shape(actions) != (self.num_envs, NUM_JOINTS):
-            raise ValueError(
-                f"actions must have shape ({self.num_envs}, {NUM_JOINTS}), got {np.shape(actions)}"
-            )
+        """One control step with absolute joint targets (n, J) in rad and m."""
+        if np.shape(actions) != self.action_space.shape:
+            raise ValueError(f"actions must have shape {self.action_space.shape}, got {np.shape(actions)}")
         if not self.episodes.raw:
             raise gym.error.ResetNeeded("call reset() before step()")
         result = self.episodes.step(actions)
@@ -105,7 +103,7 @@ class VtRefineVectorEnv(gym.vector.VectorEnv[Observation, Array, Array]):
         return (value,) * self.num_envs
 
     def render(self) -> tuple[Array, ...]:
-        """A uint8 (H, W, 3) frame of every environment: the scene beside its four pads."""
+        """A uint8 (H, W, 3) frame of every environment: the scene beside its pads."""
         return tuple(self.render_env(index) for index in range(self.num_envs))
 
     def render_env(self, index: int) -> Array:
@@ -139,7 +137,7 @@ class VtRefineVectorEnv(gym.vector.VectorEnv[Observation, Array, Array]):
     def _observation(self) -> Observation:
         # Nothing of the raw frames themselves: these change in place, and callers keep observations.
         raw = self.episodes.raw
-        return {key: _own(value, raw) for key, value in raw_to_env_observation(raw).items()}
+        return {key: _own(value, raw) for key, value in raw_to_env_observation(raw, self.config.body).items()}
 
     def _shear(self) -> dict[str, Array]:
         return {"shear": self.episodes.sim.shear()} if self.config.shear.on else {}

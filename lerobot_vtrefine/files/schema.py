@@ -30,8 +30,8 @@ def limits(
 def decode[Kind](kind: type[Kind], data: Any, name: str, prefix: str = "", others: bool = False) -> Kind:
     """A dataclass made of plain data: mappings, lists, texts, numbers, true, false, null.
 
-    Fields are checked by their annotation (bool, int, float, str, Literal, tuples, mappings by text,
-    dataclasses, and unions of these) and by the `limits` in their metadata.
+    Fields are checked by their annotation (bool, int, float, str, Literal, tuples, lists of anything,
+    mappings by text, dataclasses, and unions of these) and by the `limits` in their metadata.
 
     Args:
         name: what the data are, for messages about their fields.
@@ -114,6 +114,8 @@ def _fits(kind: Any, value: Any) -> bool:
         return isinstance(value, str) and value in get_args(kind)
     if origin is tuple:
         return isinstance(value, list | tuple)
+    if origin is list:
+        return isinstance(value, list)
     if (isinstance(origin, type) and issubclass(origin, Mapping)) or dataclasses.is_dataclass(kind):
         return isinstance(value, Mapping) and all(isinstance(key, str) for key in value)
     raise TypeError(f"no schema can hold {kind}")
@@ -123,7 +125,7 @@ def _word(kind: Any) -> str:
     if get_origin(kind) is Literal:
         return f"one of {', '.join(get_args(kind))}"
     words = {int: "a whole number", float: "a number", str: "a text", bool: "true or false", NoneType: "null"}
-    return words.get(kind, "a list" if get_origin(kind) is tuple else "an object")
+    return words.get(kind, "a list" if get_origin(kind) in (tuple, list) else "an object")
 
 
 def _items(parts: tuple[Any, ...], value: Any, where: str, ends: Limits, others: bool) -> tuple[Any, ...]:

@@ -37,6 +37,7 @@ class VisuoTactileConfig:
     """
 
     embodiment: str = "aloha"
+    """The robot whose joints, pads and taxels the readings are, see `embodiments`."""
     crop_min_m: tuple[float, float, float] = (-0.20, -0.25, 0.005)
     """Lower corner of the workspace box in the world frame; z above 0 leaves the table out."""
     crop_max_m: tuple[float, float, float] = (0.20, 0.25, 0.40)
@@ -45,9 +46,9 @@ class VisuoTactileConfig:
     pixel_stride: int = 0
     """Deproject every n-th row and column of the depth image only."""
     pool_rows: int = 0
-    """Taxel rows merged into one point (the largest count wins); must divide 12."""
+    """Taxel rows merged into one point (the largest count wins); must divide the pad's rows."""
     pool_cols: int = 0
-    """Taxel columns merged into one point; must divide 32."""
+    """Taxel columns merged into one point; must divide the pad's columns."""
     noise_floor_counts: float = 2.0
     """Counts above the baseline that still mean nothing."""
     threshold_counts: float = 12.0
@@ -67,7 +68,7 @@ class VisuoTactileConfig:
 
     def validate(self) -> None:
         """Raises: ValueError naming the field that is wrong."""
-        layout = PadLayout()
+        layout = get_embodiment(self.embodiment).pad_layout
         if any(low >= high for low, high in zip(self.crop_min_m, self.crop_max_m, strict=True)):
             raise ValueError(f"crop_min_m {self.crop_min_m} must be below crop_max_m {self.crop_max_m}")
         for name in ("num_visual_points", "pixel_stride", "pool_rows", "pool_cols"):
@@ -90,9 +91,9 @@ class VisuoTactileConfig:
 
 def num_points(cfg: VisuoTactileConfig, modalities: str = "visuo_tactile") -> int:
     """N of the cloud."""
-    layout = PadLayout()
-    pads = len(get_embodiment(cfg.embodiment).pad_names)
-    taxels = pads * (layout.rows // cfg.pool_rows) * (layout.cols // cfg.pool_cols)
+    body = get_embodiment(cfg.embodiment)
+    layout = body.pad_layout
+    taxels = len(body.pad_names) * (layout.rows // cfg.pool_rows) * (layout.cols // cfg.pool_cols)
     return {
         "visuo_tactile": cfg.num_visual_points + taxels,
         "visual": cfg.num_visual_points,
@@ -101,9 +102,10 @@ def num_points(cfg: VisuoTactileConfig, modalities: str = "visuo_tactile") -> in
 
 
 @lru_cache(maxsize=8)
-def _taxel_lattice(pool: tuple[int, int], device: torch.device, dtype: torch.dtype) -> Tensor:
+def _taxel_lattice(
+    layout: PadLayout, pool: tuple[int, int], device: torch.device, dtype: torch.dtype
+) -> Tensor:
     """Pooled taxel positions (T, 3) in the pad frame."""
-    layout = PadLayout()
     positions = torch.as_tensor(np.asarray(layout.positions()), device=device, dtype=dtype)
     return pooled_positions(positions, layout.rows, layout.cols, pool)
 
@@ -114,13 +116,14 @@ def _pack(points: Tensor, reading: Tensor, flag: float) -> Tensor:
 
 
 def tactile_cloud(state: Tensor, tactile: Tensor, baseline: Tensor, cfg: VisuoTactileConfig) -> Tensor:
-    """state (B, 16), tactile and baseline (B, P, 384) counts -> (B, P * T, 5)."""
-    layout, pool = PadLayout(), (cfg.pool_rows, cfg.pool_cols)
+    """state (B, J), tactile and baseline (B, P, R * C) counts -> (B, P * T, 5)."""
+    body = get_embodiment(cfg.embodiment)
+    layout, pool = body.pad_layout, (cfg.pool_rows, cfg.pool_cols)
     counts = pressed_counts(tactile.to(state), baseline.to(state), cfg.noise_floor_counts)
     counts = pool_counts(counts.unflatten(-1, (layout.rows, layout.cols)), pool)
     reading = normalize_counts(counts, cfg.threshold_counts, cfg.full_scale_counts, cfg.normalization)
-    position, rotation = get_embodiment(cfg.embodiment).pad_poses(state)
-    points = taxel_points(position, rotation, _taxel_lattice(pool, state.device, state.dtype))
+    position, rotation = body.pad_poses(state)
+    points = taxel_points(position, rotation, _taxel_lattice(layout, pool, state.device, state.dtype))
     return _pack(points.flatten(1, 2), reading.flatten(1), 1.0)
 
 
@@ -163,7 +166,7 @@ def build_visuo_tactile(
 ) -> Tensor:
     """The cloud (..., N, 5) of raw readings with any leading dimensions: visual points first, then taxels.
 
-    state (..., 16) joint positions (rad, m); tactile, baseline (..., 4, 384) counts or both None for no
+    state (..., J) joint positions (rad, m); tactile, baseline (..., P, R * C) counts or both None for no
     taxels; depth_mm (..., H, W) or (..., 1, H, W), intrinsics (..., 4), camera_pose (..., 7) or all None for
     no visual points; noise_level (...) or (..., 1), None means no noise. Without ``generator`` torch's global
     one is used.

@@ -17,20 +17,19 @@ from lerobot_vtrefine.drivers.arm_pair import ArmPair
 from lerobot_vtrefine.drivers.dynamixel_arm import Floats
 from lerobot_vtrefine.drivers.pad_set import PadSet
 from lerobot_vtrefine.drivers.ports import PortError
-from lerobot_vtrefine.embodiments import get_embodiment
+from lerobot_vtrefine.embodiments import ALOHA
 from lerobot_vtrefine.extras import ARMS, require
+from lerobot_vtrefine.lerobot_compat.pad_features import configured_pads, pad_features
 from lerobot_vtrefine.robots.camera_models import CameraModels
 from lerobot_vtrefine.robots.config_aloha_tactile_follower import AlohaTactileFollowerConfig
 from lerobot_vtrefine.robots.extensions import extend_lerobot
-from lerobot_vtrefine.robots.pad_features import configured_pads, pad_features
 from lerobot_vtrefine.robots.pad_reading import pad_observation
 
 logger = logging.getLogger(__name__)
 
-PER_ARM = 8
-"""Values of one arm: six joints, two fingers."""
-
-FINGERS = slice(6, 8)
+BODY = ALOHA
+PER_ARM, REVOLUTE = BODY.joints_per_arm, len(BODY.joints)
+FINGERS = slice(REVOLUTE, PER_ARM)
 
 RECENT_S = 0.05
 """Positions read within this time count as present where a target's distance is limited; it saves two bus
@@ -50,7 +49,7 @@ class AlohaTactileFollower(Robot):
         require("robot type aloha_tactile_follower", ARMS)
         super().__init__(config)
         self.config = config
-        self.body = get_embodiment("aloha")
+        self.body = BODY
         travel_m = self.body.fingers.travel_m
         self.pair = ArmPair(config.left_port, config.right_port, VIPERX_300S, travel_m)
         self.pair.calibration = self.calibration
@@ -166,7 +165,7 @@ class AlohaTactileFollower(Robot):
         if self.calibration and not self._asked_anew():
             self.pair.write_calibration()
             return
-        self.pair.calibrate(input, self.body.lower[:6], self.body.upper[:6])
+        self.pair.calibrate(input, self.body.lower[:REVOLUTE], self.body.upper[:REVOLUTE])
         self.calibration = self.pair.calibration
         self._save_calibration()
         logger.info("calibration saved to %s", self.calibration_fpath)
@@ -219,7 +218,7 @@ class AlohaTactileFollower(Robot):
 def limit_step(target: Floats, present: Floats, max_step_rad: float) -> Floats:
     """Targets (8,) with joints at most one step from the present ones; the right finger mirrors the left."""
     limited = present + np.clip(target - present, -max_step_rad, max_step_rad)
-    limited[FINGERS] = target[6], -target[6]
+    limited[FINGERS] = BODY.fingers.targets(target[REVOLUTE : REVOLUTE + 1])
     return limited
 
 

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from lerobot_vtrefine.datasets.arrays import ArraySpec
+from lerobot_vtrefine.lerobot_compat.arrays import ArraySpec
 
 logger = logging.getLogger(__name__)
 

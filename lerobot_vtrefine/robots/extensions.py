@@ -2,9 +2,8 @@
 
 from collections.abc import Mapping
 
-from lerobot_vtrefine.datasets import arrays, card, safe_recording
 from lerobot_vtrefine.drivers.config import PadConfig
-from lerobot_vtrefine.robots import live_view
+from lerobot_vtrefine.lerobot_compat import arrays, card, live_view, safe_recording
 
 
 def extend_lerobot(pads: Mapping[str, PadConfig]) -> None:

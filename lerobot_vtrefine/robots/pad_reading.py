@@ -3,7 +3,7 @@
 import numpy as np
 
 from lerobot_vtrefine.drivers.pad_set import PadSet
-from lerobot_vtrefine.robots.pad_features import BASELINE, PAD_AGE, TACTILE, Observation
+from lerobot_vtrefine.lerobot_compat.pad_features import BASELINE, PAD_AGE, TACTILE, Observation
 
 
 def pad_observation(pads: PadSet) -> Observation:

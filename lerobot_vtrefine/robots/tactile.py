@@ -12,10 +12,10 @@ from lerobot.utils.decorators import check_if_already_connected, check_if_not_co
 
 from lerobot_vtrefine.drivers.pad_set import PadSet
 from lerobot_vtrefine.extras import PADS, require
+from lerobot_vtrefine.lerobot_compat.pad_features import configured_pads, pad_features
 from lerobot_vtrefine.robots.camera_models import CameraModels
 from lerobot_vtrefine.robots.config_tactile import TactileConfig
 from lerobot_vtrefine.robots.extensions import extend_lerobot
-from lerobot_vtrefine.robots.pad_features import configured_pads, pad_features
 from lerobot_vtrefine.robots.pad_reading import pad_observation
 
 

@@ -4,7 +4,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from lerobot_vtrefine.sim.config import GRASPED_CAMERA, TABLE_CAMERA, CameraConfig, SceneConfig
+from lerobot_vtrefine.embodiments import CameraConfig, Embodiment
+from lerobot_vtrefine.sim.config import SceneConfig
 from lerobot_vtrefine.sim.rotations import matrix_to_quat
 
 MAX_DEPTH_M = 2.0
@@ -44,9 +45,11 @@ class Camera:
         return rays.reshape(-1, 3)
 
 
-def make_camera(config: SceneConfig) -> Camera:
-    """The camera of a scene; square pixels, principal point in the middle, image upright."""
-    settings = config.camera or {"table": TABLE_CAMERA, "grasped": GRASPED_CAMERA}[config.start]
+def make_camera(config: SceneConfig, embodiment: Embodiment) -> Camera:
+    """The camera of a scene, the body's own unless the scene sets one up; square pixels, principal point in
+    the middle, image upright.
+    """
+    settings = config.camera or embodiment.cameras[config.start]
     focal = settings.height / 2 / np.tan(settings.fov_y_rad / 2)
     rotation = _look_at(settings)
     return Camera(

@@ -18,7 +18,7 @@ from lerobot_vtrefine.sim.backends.base import ramp
 from lerobot_vtrefine.sim.config import SceneConfig
 from lerobot_vtrefine.sim.pairs import Part, PartPair
 from lerobot_vtrefine.sim.rotations import about_axis, matrix_to_quat
-from lerobot_vtrefine.sim.scene import build_arms
+from lerobot_vtrefine.sim.scene import build_arms, map_joints
 from lerobot_vtrefine.sim.simulation import InsertionSim
 from lerobot_vtrefine.sim.starts import HAND_RETREAT_M, Start
 
@@ -82,7 +82,8 @@ def replay_commands(
         raise ValueError(f"the time between frames must be above 0, got {dt_s}")
     config = config or SceneConfig()
     substeps = int(np.ceil(dt_s / config.timestep_s - 1e-6))
-    model, embodiment, joints = build_arms(replace(config, timestep_s=dt_s / substeps))
+    model, embodiment, _ = build_arms(replace(config, timestep_s=dt_s / substeps))
+    joints = map_joints(model, embodiment)
     model.opt.disableflags |= int(mujoco.mjtDisableBit.mjDSBL_CONTACT)
     lengths = _checked_lengths(commands, starts, embodiment)
     backend = get_backend("batch", model, len(lengths), num_threads)
@@ -90,14 +91,14 @@ def replay_commands(
     if fields:
         backend.set_fields(ids, dict(fields))
     qpos = np.zeros((len(ids), model.nq))
-    qpos[:, joints] = np.clip(starts, embodiment.lower, embodiment.upper)
+    joints.write(qpos, np.clip(starts, embodiment.lower, embodiment.upper))
     backend.write(ids, qpos, np.zeros((len(ids), model.nv)))
     padded = np.stack([_padded(item, max(lengths)) for item in commands])
     servo = np.stack([task.servo_commands(embodiment, frame) for frame in padded.swapaxes(0, 1)])
-    positions, before = [qpos[:, joints]], servo[0]
+    positions, before = [qpos[:, joints.qpos]], servo[0]
     for command in servo[:-1]:
         controls = ramp(before, command, substeps) if hold == "linear" else _held(command, substeps)
-        positions.append(np.asarray(backend.advance(ids, controls).qpos)[:, -1, joints])
+        positions.append(np.asarray(backend.advance(ids, controls).qpos)[:, -1, joints.qpos])
         before = command
     stacked = np.stack(positions, 1)
     return [stacked[episode, :length] for episode, length in enumerate(lengths)]
@@ -144,9 +145,11 @@ def grasp_start(
         table_height_m: of the table on which the parts stand.
 
     Returns:
-        None when a gripper never closes.
+        None when a gripper never closes, or a part has no hand of its own.
     """
     poses = []
+    if None in embodiment.holders:
+        return None
     for arm, (part, yaw) in enumerate(((pair.socket, np.pi / 2), (pair.plug, -np.pi / 2))):
         moment = grasp_frame(embodiment, position, arm)
         if moment is None:
@@ -163,7 +166,7 @@ def grasp_frame(embodiment: Embodiment, position: Array, arm: int) -> int | None
     Args:
         position: (T, J) of one episode.
     """
-    opening = position[:, embodiment.joints_per_arm * (arm + 1) - 2]
+    opening = embodiment.openings(position)[:, arm]
     low, high = float(opening.min()), float(opening.max())
     if high - low < CLOSING_M:
         return None

@@ -4,36 +4,14 @@ import re
 from dataclasses import dataclass, field
 from pathlib import Path
 
+from lerobot_vtrefine.embodiments.camera_config import CameraConfig
+from lerobot_vtrefine.embodiments.embodiment import STARTS
+
 PROCEDURAL_PAIRS = ("round", "square", "hexagon", "d_shape", "cross", "key")
 MESH_PAIR_PREFIX = "automate/"
-STARTS = ("table", "grasped")
 MAX_TABLE_HEIGHT_M = 0.2
+SOCKETS = ("held", "stands")
 BACKENDS = ("single", "batch", "warp")
-
-
-@dataclass(frozen=True)
-class CameraConfig:
-    """One depth camera; a ray grid, no lens."""
-
-    width: int
-    height: int
-    fov_y_rad: float
-    """Vertical field of view."""
-    position_m: tuple[float, float, float]
-    target_m: tuple[float, float, float]
-    """Point that lies on the optical axis."""
-
-    def __post_init__(self) -> None:
-        if self.width < 1 or self.height < 1:
-            raise ValueError(f"camera needs at least one pixel, got {self.width} x {self.height}")
-        if not 0.0 < self.fov_y_rad < 3.0:
-            raise ValueError(f"camera.fov_y_rad must lie between 0 and 3 rad, got {self.fov_y_rad}")
-
-
-# grasped: a narrow region of interest around the insertion, so that most pixels show parts and hands. table:
-# the picking areas of both arms and the insertion above them.
-GRASPED_CAMERA = CameraConfig(80, 60, 0.384, (-0.44, 0.0, 0.42), (0.0, 0.0, 0.145))
-TABLE_CAMERA = CameraConfig(160, 120, 0.56, (-0.46, 0.0, 0.46), (0.0, 0.0, 0.09))
 
 
 @dataclass(frozen=True)
@@ -48,7 +26,10 @@ class SceneConfig:
     """Above 0 the hole is this much *smaller* than the plug (diametral): a check that must never succeed."""
     start: str = "table"
     """table: both parts stand on the table. grasped: both are in hand."""
+    socket: str = "held"
+    """held: a hand lifts the socket, and the plug goes in in air. stands: the socket stays on the table."""
     embodiment: str = "aloha"
+    """The robot, see `embodiments`."""
     table_height_m: float = 0.0
     """Height of the table's top in the world, in which the arms' bases have fixed places. A lab's arms may
     stand higher or lower beside their table: `vtrefine-replay` estimates it from recorded episodes."""
@@ -59,7 +40,7 @@ class SceneConfig:
     timestep_s: float = 0.0025
     """Physics step; at clearances of 1 mm and below use 0.002 or less."""
     camera: CameraConfig | None = None
-    """By default the camera that suits `start`."""
+    """By default the body's camera for `start`."""
     servo_gain_scale: float = 1.0
     """Factor on the arms' servo stiffness; damping follows with its square root."""
     gravity_compensation: bool = True
@@ -74,6 +55,9 @@ class SceneConfig:
 
     def __post_init__(self) -> None:
         _check_choice("start", self.start, STARTS)
+        _check_choice("socket", self.socket, SOCKETS)
+        if self.socket == "stands" and self.start != "table":
+            raise ValueError(f"socket=stands needs start=table, not start={self.start}")
         if not 0.0 < self.timestep_s <= 0.005:
             raise ValueError(f"timestep_s must lie in (0, 0.005] s, got {self.timestep_s}")
         if not self.clearance_m > 0.0:

@@ -129,10 +129,9 @@ def make_drive(
 
 def servo_values(robot: Embodiment, values: Mapping[str, float]) -> Array:
     """Values by joint name as an array over servos (nu,), zero where none is given; arms' joints only."""
-    per_arm = robot.joints_per_arm
-    names = [name for k, name in enumerate(robot.joint_names) if k % per_arm != per_arm - 1]
-    valid = [name for k, name in enumerate(names) if k % (per_arm - 1) != per_arm - 2]
+    valid = [robot.joint_names[column] for column in robot.arm_columns]
     for name in values:
         if name not in valid:
             raise ValueError(f"reality: no arm has a joint {name!r}; valid: {', '.join(valid)}")
-    return np.array([float(values.get(name, 0.0)) for name in names])
+    by_joint = np.array([float(values.get(name, 0.0)) for name in robot.joint_names])
+    return task.servo_values(robot, by_joint[None])[0]

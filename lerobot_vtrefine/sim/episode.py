@@ -1,6 +1,6 @@
 """What the task remembers of each world's episode, and how one control step changes it.
 
-Shapes: N worlds, m of them addressed; hands are ordered left (socket), right (plug).
+Shapes: N worlds, m of them addressed; parts are ordered socket, plug; P pads.
 """
 
 from dataclasses import dataclass, fields, replace
@@ -10,6 +10,7 @@ import numpy as np
 from lerobot_vtrefine.sim import task
 from lerobot_vtrefine.sim.backends.base import LOAD_SIZE
 from lerobot_vtrefine.sim.config import LimitsConfig, SuccessConfig, TaskConfig
+from lerobot_vtrefine.sim.scene import Scene
 from lerobot_vtrefine.sim.substeps import Substeps
 
 Array = np.ndarray
@@ -34,25 +35,25 @@ class EpisodeState:
     hold_steps: Array
     """Control steps for which the plug has been seated without interruption."""
     held_steps: Array
-    """(N, hand) control steps for which the part has been held without interruption."""
+    """(N, part) control steps for which the part has been held without interruption."""
     unheld_steps: Array
-    """(N, hand) control steps for which a lifted part has not been held."""
+    """(N, part) control steps for which a lifted part has not been held."""
     grasped: Array
-    """(N, hand) whether `reference` holds."""
+    """(N, part) whether `reference` holds."""
     reference: Array
-    """(N, hand, 2, 3) grip points in the hand's frame at the grasp."""
+    """(N, part, 2, 3) grip points in the hand's frame at the grasp."""
     shift: Array
-    """(N, hand) displacement since the grasp [m]."""
+    """(N, part) displacement since the grasp [m]."""
     largest_shift: Array
-    """(N, hand) largest so far."""
+    """(N, part) largest so far."""
     force_tail: Array
     """(N, w - 1, 3) last contact forces, for the moving average."""
     part_force: Array
     """(N, 3) force of the plug on the socket at the last substep, world frame [N]."""
     pad_force: Array
-    """(N, 4) normal force on each pad at the last substep [N]."""
+    """(N, P) normal force on each pad at the last substep [N]."""
     pad_load: Array
-    """(N, 4, LOAD_SIZE) what the solver says of each pad."""
+    """(N, P, LOAD_SIZE) what the solver says of each pad."""
     step_force: Array
     """(N,) peak of the averaged contact force in the last control step [N]."""
     peak_force: Array
@@ -68,9 +69,9 @@ class EpisodeState:
     """Control step at which success was reached, -1 before."""
 
     @classmethod
-    def empty(cls, num_envs: int, num_servos: int, window: int) -> "EpisodeState":
+    def empty(cls, num_envs: int, num_servos: int, num_pads: int, window: int) -> "EpisodeState":
         """All zeros for `num_envs` worlds and a force window of `window` samples."""
-        n = num_envs
+        n, pads = num_envs, num_pads
         shapes: dict[str, tuple[tuple[int, ...], type]] = {
             "seed": ((n,), np.int64),
             "steps": ((n,), np.int64),
@@ -84,8 +85,8 @@ class EpisodeState:
             "largest_shift": ((n, 2), float),
             "force_tail": ((n, window - 1, 3), float),
             "part_force": ((n, 3), float),
-            "pad_force": ((n, 4), float),
-            "pad_load": ((n, 4, LOAD_SIZE), float),
+            "pad_force": ((n, pads), float),
+            "pad_load": ((n, pads, LOAD_SIZE), float),
             "step_force": ((n,), float),
             "peak_force": ((n,), float),
             "rim_slide": ((n,), float),
@@ -123,14 +124,14 @@ class Measured:
 
     insertion: task.Insertion
     grip_points: Array
-    """(m, hand, 2, 3) [m]"""
+    """(m, part, 2, 3) [m]"""
     part_heights: Array
-    """(m, hand) height of each part's origin above its resting height [m]."""
+    """(m, part) height of each part's origin above its resting height [m]."""
     part_positions: Array
-    """(m, hand, 3)"""
+    """(m, part, 3)"""
     substeps: Substeps
     pad_load: Array
-    """(m, 4, LOAD_SIZE)"""
+    """(m, P, LOAD_SIZE)"""
     diverged: Array
     """(m,) whether the state blew up: everything else then says nothing and may be no number."""
     overflowed: Array
@@ -152,7 +153,7 @@ def _without(values: Array, bad: Array) -> Array:
     return np.where(bad.reshape(-1, *[1] * (values.ndim - 1)), 0.0, values)
 
 
-def update(state: EpisodeState, ids: Array, seen: Measured, config: TaskConfig) -> Array:
+def update(state: EpisodeState, ids: Array, seen: Measured, config: TaskConfig, scene: Scene) -> Array:
     """Advance the episodes of `ids` by one control step.
 
     Returns:
@@ -163,7 +164,7 @@ def update(state: EpisodeState, ids: Array, seen: Measured, config: TaskConfig) 
     _update_forces(state, ids, seen)
     state.rim_slide[ids] += seen.substeps.rim_slide
     state.tip[ids] = seen.substeps.tip
-    _update_grasp(state, ids, seen)
+    _update_grasp(state, ids, seen, scene)
     fresh = _update_success(state, ids, seen, config.success, config.control_dt_s)
     _update_failure(state, ids, seen, config.limits, config.control_dt_s)
     state.done[ids] |= state.success[ids] | (state.failure[ids] != task.NO_FAILURE)
@@ -178,13 +179,13 @@ def _update_forces(state: EpisodeState, ids: Array, seen: Measured) -> None:
     state.pad_load[ids], state.pad_force[ids] = seen.pad_load, seen.pad_load[..., 0]
 
 
-def _update_grasp(state: EpisodeState, ids: Array, seen: Measured) -> None:
+def _update_grasp(state: EpisodeState, ids: Array, seen: Measured, scene: Scene) -> None:
     """Take each part's reference once its own hand has held it long enough; a part set down again loses it.
 
     From then on the shift counts, also while the part is being lifted: starts in hand begin with a reference.
     """
-    pressed = state.pad_force[ids].reshape(-1, 2, 2) > task.HELD_FORCE_N
-    held, lifted = pressed.all(-1), seen.part_heights > LIFT_M
+    held = task.held_parts(scene.holders, scene.embodiment.num_arms, state.pad_force[ids])
+    lifted = seen.part_heights > LIFT_M
     state.held_steps[ids] = np.where(held, state.held_steps[ids] + 1, 0)
     state.unheld_steps[ids] = np.where(held | ~lifted, 0, state.unheld_steps[ids] + 1)
     grasped = state.grasped[ids]

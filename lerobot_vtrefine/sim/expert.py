@@ -20,7 +20,7 @@ from lerobot_vtrefine.sim.demonstrations import Degradation, EpisodeErrors
 from lerobot_vtrefine.sim.ik import hand_poses, solve_hands
 from lerobot_vtrefine.sim.poses import Poses, rotation_vector
 from lerobot_vtrefine.sim.servo_model import ServoModel
-from lerobot_vtrefine.sim.starts import ideal_hand
+from lerobot_vtrefine.sim.starts import grip_openings, ideal_hand
 
 if TYPE_CHECKING:
     from lerobot_vtrefine.sim.simulation import InsertionSim
@@ -125,9 +125,12 @@ class ScriptedExpert:
         self._sim = sim
         self._part_poses = part_poses or sim.part_poses
         self._robot = sim.scene.embodiment
+        if None in self._robot.holders:
+            raise ValueError(f"the scripted expert needs two hands, and {self._robot.name} has one")
         self._pair = sim.scene.pair
         self._hz = sim.config.control_hz
         self._from_table = sim.scene.config.start == "table"
+        self._stands = sim.scene.config.socket == "stands"
         self._grasp, self._grip_m = _grasps(sim)
         self._stations = _stations(sim)
         count = sim.num_envs
@@ -170,12 +173,14 @@ class ScriptedExpert:
         wanted = self._plan(ids, view)
         self._wanted.assign(ids[moving], wanted[moving])
         wanted = self._wanted[ids]
-        target, _, _ = solve_hands(self._robot, wanted.position, wanted.rotation, self._target[ids])
+        start = self._target[ids]
+        self._robot.set_grippers(start, view.q)  # whose angles decide where between swinging pads the TCP is
+        target, _, _ = solve_hands(self._robot, wanted.position, wanted.rotation, start)
         # Servos that press against a contact lack something else than those that move freely.
         self._servos.learn(ids, view.q, (self.phase[ids] != Phase.CLOSE) & ~self._entered[ids])
         command = self._servos.command(ids, self._target[ids], target)
         for q in (target, command):
-            _arms(q)[..., -2:] = self._opening[ids][..., None] * [1.0, -1.0]
+            self._robot.set_openings(q, self._opening[ids])
         self._target[ids] = target
         self._step[ids] += 1
         return np.clip(command, self._robot.lower, self._robot.upper)
@@ -213,7 +218,12 @@ class ScriptedExpert:
             self._height_m[ids] = self._pair.mouth_z_m + STANDOFF_M
         if phase == Phase.CLOSE:
             self._opening[ids] = self._grip_m
-        self._goal.assign(ids, self._destination(ids, phase, view))
+        goal = self._destination(ids, phase, view)
+        if self._stands:  # the hand that would hold the socket rests, open
+            self._opening[ids, LEFT] = self._robot.fingers.travel_m
+            rest = self._wanted[ids]
+            goal.position[:, LEFT], goal.rotation[:, LEFT] = rest.position[:, LEFT], rest.rotation[:, LEFT]
+        self._goal.assign(ids, goal)
         way = _distance(self._start[ids], self._goal[ids])
         if phase == Phase.INSERT:
             way = self._height_m[ids] - self._pair.seated_z_m
@@ -227,16 +237,26 @@ class ScriptedExpert:
             back = RETREAT_M if phase == Phase.REACH else 0.0
             offset = np.stack([along - back, np.zeros_like(along), across], -1)
             return view.parts @ self._grasp @ Poses.from_vectors(offset, np.zeros(3))
-        if phase == Phase.LIFT:
-            raised = view.parts.position.copy()
-            raised[..., 2] = self._stations.position[:, 2]
-            return Poses(raised, view.parts.rotation) @ self._held[ids]
-        if phase == Phase.CARRY:
-            return self._stations @ self._held[ids]
+        if phase in (Phase.LIFT, Phase.CARRY):
+            stations = self._stations_now(view)
+            if phase == Phase.LIFT:
+                raised = view.parts.position.copy()
+                raised[..., 2] = stations.position[..., 2]
+                stations = Poses(raised, view.parts.rotation)
+            return stations @ self._held[ids]
         goal = self._wanted[ids]
         if phase == Phase.ALIGN:
             goal.position[:, RIGHT] = self._aligned(ids, view).position
         return goal
+
+    def _stations_now(self, view: View) -> Poses:
+        """Where parts are brought before they are aligned (m, 2): above a socket that stands, the plug."""
+        stations = self._stations @ Poses.identity(len(view.q), 2)
+        if self._stands:
+            above = Poses.from_vectors(np.array([0.0, 0.0, self._pair.mouth_z_m + CARRY_M]), np.zeros(3))
+            plug = view.parts[:, LEFT] @ above
+            stations.position[:, RIGHT], stations.rotation[:, RIGHT] = plug.position, plug.rotation
+        return stations
 
     def _plan(self, ids: Ids, view: View) -> Poses:
         """Hand poses (m, 2) wanted in this control step."""
@@ -312,8 +332,8 @@ def _grasps(sim: "InsertionSim") -> tuple[Poses, Array]:
     right = ideal_hand(pair.plug, -np.pi / 2, pitches[RIGHT])
     hands = Poses(np.stack([left[0], right[0]]), np.stack([left[1], right[1]]))
     hands.position[:, 2] += raised
-    width = np.array([pair.socket.grip.half_size_m[0], pair.plug.grip.half_size_m[0]])
-    return hands, np.maximum(width + fingers.face_offset_m - grasped.squeeze_m, 0.0)
+    touching = grip_openings(pair, sim.scene.embodiment)
+    return hands, np.maximum(touching - grasped.squeeze_m, 0.0)
 
 
 def _above_table(fingers: Fingers, pitch_rad: float, height_m: float) -> tuple[float, float]:
@@ -341,8 +361,3 @@ def _distance(start: Poses, goal: Poses) -> Array:
     way = np.linalg.norm(goal.position - start.position, axis=-1)
     turn = np.linalg.norm(rotation_vector(np.swapaxes(start.rotation, -1, -2) @ goal.rotation), axis=-1)
     return np.maximum(way, TURN_M_PER_RAD * turn).max(-1)
-
-
-def _arms(q: Array) -> Array:
-    """View joint positions (m, J) as (m, 2, J / 2)."""
-    return q.reshape(len(q), 2, -1)

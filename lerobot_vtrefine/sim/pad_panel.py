@@ -1,5 +1,6 @@
-"""Four tactile pads drawn as labelled heat maps, and the text beside a video frame (PIL and numpy only)."""
+"""Tactile pads drawn as labelled heat maps, and the text beside a video frame (PIL and numpy only)."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cache
 
@@ -7,13 +8,15 @@ import numpy as np
 from numpy.typing import NDArray
 from PIL import Image, ImageDraw
 
+from lerobot_vtrefine.tactile.layout import PadLayout
+
 Frame = NDArray[np.uint8]
 
-PAD_LABELS = ("L arm, L finger", "L arm, R finger", "R arm, L finger", "R arm, R finger")
 FULL_SCALE_COUNTS = 160  # counts above the idle level that get the brightest colour
 _TAXEL_PX = 6
 _TEXT_PX = 14
 _GAP_PX = 6
+_TEXT_WIDTH_PX = 160
 _BACKGROUND = (24, 26, 32)
 _INK = (226, 228, 232)
 _GOOD, _BAD, _FAINT = (96, 214, 132), (240, 110, 96), (78, 82, 92)
@@ -38,29 +41,38 @@ class Progress:
         return min(self.seated_s / self.hold_s, 1.0) if self.hold_s > 0 and self.seated_s > 0 else 0.0
 
 
-def panel_size(rows: int, cols: int) -> tuple[int, int]:
-    """Return (height, width) in pixels of the panel for four pads of `rows` x `cols` taxels."""
-    return 4 * (
-        rows * _TAXEL_PX + _TEXT_PX + _GAP_PX
-    ) + 2 * _TEXT_PX + _GAP_PX, cols * _TAXEL_PX + 2 * _GAP_PX
+def panel_size(names: Sequence[str], layout: PadLayout) -> tuple[int, int]:
+    """Return (height, width) in pixels of the panel for pads of these names and this layout."""
+    height = len(names) * (layout.rows * _TAXEL_PX + _TEXT_PX + _GAP_PX) + 2 * _TEXT_PX + _GAP_PX
+    return height, max(layout.cols * _TAXEL_PX, _TEXT_WIDTH_PX) + 2 * _GAP_PX
 
 
-def pad_panel(counts: NDArray, baseline: NDArray, rows: int, cols: int, progress: Progress) -> Frame:
-    """Draw `counts` - `baseline`, both (4, rows * cols) uint8, below each other, with the progress above.
+def pad_panel(
+    counts: NDArray, baseline: NDArray, names: Sequence[str], layout: PadLayout, progress: Progress
+) -> Frame:
+    """Draw `counts` - `baseline`, both (pads, taxels) uint8, below each other, with the progress above.
 
     Row 0 of a pad is drawn at the top and column 0, the fingertip, on the left. Returns uint8 (H, W, 3).
     """
-    height, width = panel_size(rows, cols)
+    height, width = panel_size(names, layout)
     image = Image.new("RGB", (width, height), _BACKGROUND)
     draw = ImageDraw.Draw(image)
     _draw_progress(draw, width, progress)
     top = 2 * _TEXT_PX + _GAP_PX
-    for label, reading, idle in zip(PAD_LABELS, counts, baseline, strict=True):
+    for name, reading, idle in zip(names, counts, baseline, strict=True):
         above = np.clip(reading.astype(float) - idle, 0, None)
-        draw.text((_GAP_PX, top), f"{label}   sum {above.sum():.0f}", fill=_INK)
-        image.paste(Image.fromarray(_heat_map(above.reshape(rows, cols))), (_GAP_PX, top + _TEXT_PX))
-        top += rows * _TAXEL_PX + _TEXT_PX + _GAP_PX
+        draw.text((_GAP_PX, top), f"{_label(name)}   sum {above.sum():.0f}", fill=_INK)
+        image.paste(
+            Image.fromarray(_heat_map(above.reshape(layout.rows, layout.cols))), (_GAP_PX, top + _TEXT_PX)
+        )
+        top += layout.rows * _TAXEL_PX + _TEXT_PX + _GAP_PX
     return np.asarray(image)
+
+
+def _label(name: str) -> str:
+    """A short text for a pad's name: "left_arm_right_finger" -> "L arm, R finger"."""
+    words = name.replace("left", "L").replace("right", "R").split("_")
+    return f"{' '.join(words[:2])}, {' '.join(words[2:])}" if len(words) > 2 else name
 
 
 def _draw_progress(draw: ImageDraw.ImageDraw, width: int, progress: Progress) -> None:

@@ -61,8 +61,10 @@ def describe(
         "plug_in_socket_velocity": relative,
         "plug_in_socket_spin": spin,
     }
-    hand_position, hand_rotation = seen.hands
+    hand_position, hand_rotation = task.holding_hands(scene.holders, seen.hands)
     for hand, (name, part) in enumerate((("socket", seen.socket), ("plug", seen.plug))):
+        if scene.holders[hand] is None:
+            continue
         rotation = hand_rotation[:, hand]
         columns[f"{name}_in_hand"] = turn_back(rotation, part[0] - hand_position[:, hand])
         columns[f"{name}_in_hand_rotation"] = _two_columns(np.swapaxes(rotation, -1, -2) @ part[1])

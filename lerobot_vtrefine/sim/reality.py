@@ -19,7 +19,7 @@ from typing import Any, Literal
 
 import numpy as np
 
-from lerobot_vtrefine.embodiments import ALOHA
+from lerobot_vtrefine.embodiments import embodiment_of
 from lerobot_vtrefine.embodiments.robot_file import SCHEMA as ROBOT_MODEL_SCHEMA
 from lerobot_vtrefine.embodiments.robot_file import RobotFile, decode_robot
 from lerobot_vtrefine.files import decode, inside, limits, read_json
@@ -73,7 +73,9 @@ class HiddenScene:
 
 
 @dataclass(frozen=True)
-class _RealityFile:
+class RealityFile:
+    """Content of reality.json."""
+
     schema: Literal["vtrefine/reality@1"]
     sensor_model: str | dict[str, Any] | None = None
     robot: RobotFaults = field(default_factory=RobotFaults)
@@ -113,9 +115,10 @@ def _from_dict(data: Any, folder: Path) -> Reality:
         return Reality(robot=_diagnosed(decode_robot(data)))
     if not isinstance(data, dict) or data.get("schema") != SCHEMA:
         raise ValueError(f'reality must hold "schema": "{SCHEMA}"')
-    content = decode(_RealityFile, data, "reality")
+    content = decode(RealityFile, data, "reality")
     for joint in (*content.robot.backlash_rad, *content.robot.encoder_offset_rad):
-        if joint not in ALOHA.joint_names or joint.endswith("_finger"):
+        body = embodiment_of((joint,))
+        if body is None or body.joint_of(joint) is None:
             raise ValueError(f"no arm has a joint {joint[:60]!r} that could have play or an encoder's offset")
     sensor = None
     if isinstance(content.sensor_model, str):
@@ -135,10 +138,17 @@ def _diagnosed(model: RobotFile) -> RobotFaults:
     which have no faults here.
     """
     by_name = {item.name.removesuffix(".pos"): item for item in model.joints}
-    unknown = [name for name in by_name if name not in ALOHA.joint_names]
-    if unknown:
-        raise ValueError(f"the simulated arms have no joint {unknown[0][:60]!r}")
-    arms = {name: item for name, item in by_name.items() if not name.endswith("_finger")}
+    body = embodiment_of(tuple(by_name))
+    if body is None:
+        unknown = [name for name in by_name if embodiment_of((name,)) is None]
+        what = f"no joint {unknown[0][:60]!r}" if unknown else "never all of the model's joints at once"
+        raise ValueError(f"the simulated arms have {what}")
+    arms = {name: item for name, item in by_name.items() if body.joint_of(name) is not None}
+    strange = next(((name, law) for name, item in arms.items() for law in item.laws), None)
+    if strange is not None:
+        raise ValueError(
+            f"the simulated arms know no law {strange[1][:60]!r}, which joint {strange[0]!r} has"
+        )
     play = {name: item.backlash_command + item.backlash_output for name, item in arms.items()}
     return RobotFaults(
         min(model.control_latency_s, MAX_LATENCY_S),

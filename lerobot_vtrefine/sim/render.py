@@ -1,4 +1,4 @@
-"""Video frames of one environment: the scene beside its four tactile pads.
+"""Video frames of one environment: the scene beside its tactile pads.
 
 The scene is drawn with OpenGL where that works, and else from the depth camera's rays as a shaded image, so
 that videos exist on any machine.
@@ -21,7 +21,6 @@ if TYPE_CHECKING:
 log = logging.getLogger(__name__)
 
 GL_HELP = "install EGL (Debian: apt install libegl1 libgl1-mesa-dri) and start with MUJOCO_GL=egl"
-_PAD_SHAPE = (12, 32)
 _BACKGROUND = (24, 26, 32)
 _SHADOW_PX, _SAMPLES = 1024, 2
 
@@ -53,7 +52,8 @@ class VideoRenderer:
     ) -> None:
         self._sim = sim
         self._env = env
-        self._size = (panel_size(*_PAD_SHAPE)[0], width)
+        self._pads = sim.embodiment.pad_names, sim.embodiment.pad_layout
+        self._size = (panel_size(*self._pads)[0], width)
         self._scene = _make_scene(sim, env, view or CameraView(), self._size, backend)
 
     def frame(self) -> Frame:
@@ -67,7 +67,7 @@ class VideoRenderer:
             if self._scene
             else shaded_depth(raw["depth_mm"][0], self._sim.camera_intrinsics)
         )
-        panel = pad_panel(raw["tactile"][0], raw["tactile_baseline"][0], *_PAD_SHAPE, self._progress())
+        panel = pad_panel(raw["tactile"][0], raw["tactile_baseline"][0], *self._pads, self._progress())
         joined = np.concatenate([_fit(scene, self._size), panel], axis=1)
         return np.ascontiguousarray(joined[: joined.shape[0] // 2 * 2, : joined.shape[1] // 2 * 2])
 

@@ -7,9 +7,10 @@ import mujoco
 import numpy as np
 
 from lerobot_vtrefine.embodiments import Embodiment, get_embodiment
-from lerobot_vtrefine.sim.arms import LEFT_HAND, PLUG, RIGHT_HAND, SOCKET, TABLE, add_arm
+from lerobot_vtrefine.sim.arms import add_arms
 from lerobot_vtrefine.sim.camera import Camera, make_camera
 from lerobot_vtrefine.sim.config import SceneConfig
+from lerobot_vtrefine.sim.links import FIRST_HAND, PLUG, SECOND_HAND, SOCKET, TABLE
 from lerobot_vtrefine.sim.looks import PLUG_COLOUR, SOCKET_COLOUR, Rgba, add_looks
 from lerobot_vtrefine.sim.pairs import Part, PartPair, load_pair
 from lerobot_vtrefine.sim.profiles import Primitive
@@ -44,10 +45,45 @@ class Addresses:
     part_contact: slice
     """Contact sensor, force of the plug on the socket: found, force, torque, position; world frame."""
     pad_contacts: np.ndarray
-    """(4, 10) the same per pad, force of the pad on whatever touches it."""
+    """(P, 10) the same per pad, force of the pad on whatever touches it."""
     part_geoms: np.ndarray
     pad_geoms: np.ndarray
-    """(4,) in the order of the pads."""
+    """(P,) in the order of the pads."""
+
+
+@dataclass(frozen=True)
+class JointMap:
+    """A body's joints in qpos, and those that are none of its state but follow them: a linkage's hinges."""
+
+    qpos: np.ndarray
+    """(J,) joints in the embodiment's order."""
+    followers: tuple[tuple[int, int, tuple[float, ...]], ...]
+    """(follower, driver, coefficients of the driver's powers), each after its driver; indices into qpos."""
+
+    def write(self, qpos: np.ndarray, joints: np.ndarray) -> None:
+        """Put joint positions (m, J) into qpos (m, nq), in place."""
+        qpos[:, self.qpos] = joints
+        for follower, driver, terms in self.followers:
+            qpos[:, follower] = np.polynomial.Polynomial(terms)(qpos[:, driver])
+
+
+def map_joints(model: mujoco.MjModel, embodiment: Embodiment) -> JointMap:
+    """Where a body's joints lie in a model."""
+    own = [int(model.joint(name).id) for name in embodiment.joint_names]
+    follows = {
+        int(model.eq_obj1id[k]): (int(model.eq_obj2id[k]), tuple(model.eq_data[k, :5].tolist()))
+        for k in np.flatnonzero(model.eq_type == mujoco.mjtEq.mjEQ_JOINT)
+        if int(model.eq_obj1id[k]) not in own
+    }
+    # A chain's drivers come first: how many there are on the way to a joint of the state.
+    order = sorted(follows, key=lambda joint: _chain_length(joint, follows))
+    at = model.jnt_qposadr
+    followers = tuple((int(at[j]), int(at[follows[j][0]]), follows[j][1]) for j in order)
+    return JointMap(at[own].astype(int), followers)
+
+
+def _chain_length(joint: int, follows: dict[int, tuple[int, tuple[float, ...]]]) -> int:
+    return 1 + _chain_length(follows[joint][0], follows) if joint in follows else 0
 
 
 @dataclass(frozen=True)
@@ -61,6 +97,13 @@ class Scene:
     pair: PartPair
     camera: Camera
     addresses: Addresses
+    joints: JointMap
+
+    @property
+    def holders(self) -> tuple[int | None, int | None]:
+        """Which arm takes the socket and which the plug; None for a part that no arm takes."""
+        socket, plug = self.embodiment.holders
+        return (None if self.config.socket == "stands" else socket), plug
 
     @property
     def plug_body(self) -> int:
@@ -82,21 +125,31 @@ def build_scene(config: SceneConfig) -> Scene:
     """
     embodiment = get_embodiment(config.embodiment)
     pair = load_pair(config)
-    _warn_of_close_hands(pair, embodiment)
-    camera = make_camera(config)
+    if config.socket == "held":
+        _warn_of_close_hands(pair, embodiment)
+    camera = make_camera(config, embodiment)
     spec = mujoco.MjSpec()
     _set_options(spec, config)
     add_looks(spec)
     _add_table(spec, config)
-    for arm in embodiment.arms:
-        add_arm(spec, embodiment, arm, config)
-    # The right hand holds the plug and the left the socket, but either may brush against any hand.
-    _add_part(spec, "plug", pair.plug, config, PLUG, TABLE | SOCKET | LEFT_HAND | RIGHT_HAND, PLUG_COLOUR)
-    _add_part(spec, "socket", pair.socket, config, SOCKET, TABLE | LEFT_HAND | RIGHT_HAND, SOCKET_COLOUR)
+    add_arms(spec, embodiment, config)
+    # One hand holds the plug and one the socket, but either part may brush against any hand.
+    around = TABLE | FIRST_HAND | SECOND_HAND
+    _add_part(spec, "plug", pair.plug, config, PLUG, around | SOCKET, PLUG_COLOUR)
+    _add_part(spec, "socket", pair.socket, config, SOCKET, around, SOCKET_COLOUR)
     _add_camera(spec, camera)
     _add_sensors(spec, embodiment)
     model = spec.compile()
-    return Scene(config, spec, model, embodiment, pair, camera, _addresses(model, embodiment))
+    return Scene(
+        config,
+        spec,
+        model,
+        embodiment,
+        pair,
+        camera,
+        _addresses(model, embodiment),
+        map_joints(model, embodiment),
+    )
 
 
 def _warn_of_close_hands(pair: PartPair, embodiment: Embodiment) -> None:
@@ -114,7 +167,7 @@ def _warn_of_close_hands(pair: PartPair, embodiment: Embodiment) -> None:
 
 
 def build_arms(config: SceneConfig) -> tuple[mujoco.MjModel, Embodiment, np.ndarray]:
-    """Both arms above the table, without parts, camera and sensors.
+    """A body's arms above the table, without parts, camera and sensors.
 
     Returns:
         The model, the embodiment, and where its joints (J,) lie in qpos.
@@ -124,11 +177,9 @@ def build_arms(config: SceneConfig) -> tuple[mujoco.MjModel, Embodiment, np.ndar
     _set_options(spec, config)
     add_looks(spec)
     _add_table(spec, config)
-    for arm in embodiment.arms:
-        add_arm(spec, embodiment, arm, config)
+    add_arms(spec, embodiment, config)
     model = spec.compile()
-    joints = np.array([int(model.joint(name).qposadr[0]) for name in embodiment.joint_names])
-    return model, embodiment, joints
+    return model, embodiment, map_joints(model, embodiment).qpos
 
 
 def _set_options(spec: mujoco.MjSpec, config: SceneConfig) -> None:
@@ -138,6 +189,9 @@ def _set_options(spec: mujoco.MjSpec, config: SceneConfig) -> None:
     spec.option.integrator = mujoco.mjtIntegrator.mjINT_IMPLICITFAST
     spec.option.cone = mujoco.mjtCone.mjCONE_ELLIPTIC
     spec.option.impratio = 10.0
+    # MuJoCo takes dense matrices for so few joints anyway; mujoco_warp would not beyond 32 velocities, and
+    # the warp backend's kernels read dense ones.
+    spec.option.jacobian = mujoco.mjtJacobian.mjJAC_DENSE
     # Solver iterations stay at their defaults: fewer make this scene explode.
 
 

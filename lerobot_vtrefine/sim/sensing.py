@@ -1,6 +1,6 @@
 """From the state of worlds to what the robot's sensors would give: joint positions, raw pad counts, depth.
 
-Shapes: m worlds, 4 pads, B = 2 bodies (plug, socket).
+Shapes: m worlds, A hands, P pads of T taxels, B = 2 bodies (plug, socket).
 """
 
 from functools import cached_property
@@ -31,8 +31,12 @@ if TYPE_CHECKING:
 
 Array = np.ndarray
 
-HELD = (1, 1, 0, 0)
-"""What each pad holds, of (plug, socket): the left hand the socket, the right one the plug."""
+
+def held_bodies(embodiment: Embodiment) -> tuple[int, ...]:
+    """What each pad holds, of (plug, socket): (P,) indices."""
+    return tuple(
+        ("plug", "socket").index(arm.holds) for arm in embodiment.arms for _ in embodiment.fingers.sides
+    )
 
 
 class Kinematics:
@@ -55,19 +59,19 @@ class Kinematics:
 
     @cached_property
     def hands(self) -> tuple[Array, Array]:
-        """Positions (m, 2, 3) and rotations (m, 2, 3, 3) of the TCPs."""
+        """Positions (m, A, 3) and rotations (m, A, 3, 3) of the TCPs."""
         position, rotation = self._arms.tcp()
         return position.numpy(), rotation.numpy()
 
     @cached_property
     def pads(self) -> tuple[Array, Array]:
-        """Positions (m, 4, 3) and rotations (m, 4, 3, 3) of the pads."""
+        """Positions (m, P, 3) and rotations (m, P, 3, 3) of the pads."""
         position, rotation = self._arms.pads()
         return position.numpy(), rotation.numpy()
 
     @cached_property
     def pad_velocities(self) -> Array:
-        """(m, 4, 6) linear velocity of the origin, then angular, world frame; the same of the parts."""
+        """(m, P, 6) linear velocity of the origin, then angular, world frame; the same of the parts."""
         return self._arms.pad_twists(torch.from_numpy(self.joint_velocities)).numpy()
 
     @cached_property
@@ -108,11 +112,11 @@ def pad_loads(pads: tuple[Array, Array], contacts: Array) -> Array:
     """Contact sensors' wrenches as loads on the pads.
 
     Args:
-        pads: their positions (m, 4, 3) and rotations (m, 4, 3, 3).
-        contacts: (m, 4, 10) found, force of the pad on its counterpart, torque, centre; world frame.
+        pads: their positions (m, P, 3) and rotations (m, P, 3, 3).
+        contacts: (m, P, 10) found, force of the pad on its counterpart, torque, centre; world frame.
 
     Returns:
-        (m, 4, LOAD_SIZE): normal force pressing on the pad [N], its centre's x and y [m], the tangential
+        (m, P, LOAD_SIZE): normal force pressing on the pad [N], its centre's x and y [m], the tangential
         force on the pad along x and y [N]; in the pad's frame, zeros where nothing touches.
     """
     position, rotation = pads
@@ -124,7 +128,7 @@ def pad_loads(pads: tuple[Array, Array], contacts: Array) -> Array:
 
 
 class Pads:
-    """The four pads of every world."""
+    """The pads of every world."""
 
     def __init__(
         self,
@@ -139,15 +143,16 @@ class Pads:
         self._dt_s = control_dt_s
         bodies = [_touch_geometry(scene.pair.plug), _touch_geometry(scene.pair.socket)]
         self.layout = pad_layout(scene.embodiment)
+        pads = len(scene.embodiment.pad_names)
         self.sensors = PadSensors(
-            self.layout, bodies, num_envs, 4, model=model, device=device, num_threads=num_threads
+            self.layout, bodies, num_envs, pads, model=model, device=device, num_threads=num_threads
         )
         self._shear = None
         if shear is not None and shear.on:
             skin = Shear(scene.config.pad_friction, shear.stiffness_n_per_m)
-            self._shear = ShearSensors(self.layout, num_envs, HELD, skin, device)
+            self._shear = ShearSensors(self.layout, num_envs, held_bodies(scene.embodiment), skin, device)
         self._in_order = model.has_state
-        self._last = np.zeros((num_envs, 4, self.layout.num_taxels), np.uint8)
+        self._last = np.zeros((num_envs, pads, self.layout.num_taxels), np.uint8)
 
     @property
     def remembers(self) -> bool:
@@ -174,11 +179,11 @@ class Pads:
             self._last[ids] = self._read(ids, touch)
 
     def counts(self, ids: Array, touch: "Touch") -> Array:
-        """Raw counts (m, 4, 384) uint8 at the worlds' present state."""
+        """Raw counts (m, P, T) uint8 at the worlds' present state."""
         return self._last[ids] if self._in_order else self._read(ids, touch)
 
     def shear(self, ids: Array) -> Array:
-        """Tangential force per taxel (m, 4, 384, 2) float32 [N] as of the last control step.
+        """Tangential force per taxel (m, P, T, 2) float32 [N] as of the last control step.
 
         Raises:
             ValueError: shear is off.
@@ -211,7 +216,10 @@ def pad_layout(embodiment: Embodiment) -> PadLayout:
     vertices = signs * np.array([length, width, thickness]) / 2
     faces = [(0, 1, 3), (0, 3, 2), (4, 6, 7), (4, 7, 5), (0, 4, 5), (0, 5, 1)]
     faces += [(2, 3, 7), (2, 7, 6), (0, 2, 6), (0, 6, 4), (1, 5, 7), (1, 7, 3)]
-    return layout_from_mesh(vertices, np.array(faces), outward=np.array([0.0, 0.0, 1.0]))
+    wanted, outward = embodiment.pad_layout, np.array([0.0, 0.0, 1.0])
+    return layout_from_mesh(
+        vertices, np.array(faces), wanted.rows, wanted.cols, wanted.pitch_m, outward=outward
+    )
 
 
 def _touch_geometry(part: Part) -> BodyGeometry:

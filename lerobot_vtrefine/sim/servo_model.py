@@ -29,10 +29,10 @@ class ServoModel:
         # Grippers are only opened and closed: no model of theirs is needed.
         lag_s = [joint.damping / joint.stiffness / np.sqrt(scale) for joint in robot.joints]
         friction = [joint.friction_loss / joint.stiffness / scale for joint in robot.joints]
-        arms = len(robot.arms)
+        grippers = [0.0] * len(robot.fingers.joint_names)
         self._period_s = sim.config.control_dt_s
-        self._lag_s = np.maximum([*lag_s, 0.0, 0.0] * arms, 1e-3)
-        self._friction = np.array([*friction, 0.0, 0.0] * arms)
+        self._lag_s = np.maximum([*lag_s, *grippers] * robot.num_arms, 1e-3)
+        self._friction = np.array([*friction, *grippers] * robot.num_arms)
         self._decay = np.exp(-self._period_s / self._lag_s)
         shape = (sim.num_envs, robot.num_joints)
         self._q, self._before, self._command = np.zeros(shape), np.zeros(shape), np.zeros(shape)

@@ -1,6 +1,6 @@
 """Brings worlds to where their episodes start, at rest; a start that was settled once is not settled again.
 
-Shapes: m worlds, nu servos, 4 pads.
+Shapes: m worlds, nu servos, P pads.
 """
 
 from dataclasses import dataclass
@@ -29,7 +29,7 @@ class _Rest:
     command: Array
     """(nu,)"""
     pad_load: Array
-    """(4, LOAD_SIZE)"""
+    """(P, LOAD_SIZE)"""
 
 
 class Settler:
@@ -45,13 +45,15 @@ class Settler:
         same seed left them; to `start` where one is given.
 
         Returns:
-            Servo commands (m, nu), and loads on the pads (m, 4, LOAD_SIZE).
+            Servo commands (m, nu), and loads on the pads (m, P, LOAD_SIZE).
         """
         rests = self._rests(ids, seeds) if start is None else self._settle_physically(ids, start)
         if len(rests):
             self._backend.set_rows(ids, np.stack([rest.row for rest in rests]))
         command = np.reshape([rest.command for rest in rests], (len(ids), -1))
-        return command, np.reshape([rest.pad_load for rest in rests], (len(ids), 4, LOAD_SIZE))
+        return command, np.reshape(
+            [rest.pad_load for rest in rests], (len(ids), len(self._scene.embodiment.pad_names), LOAD_SIZE)
+        )
 
     def _rests(self, ids: Array, seeds: Array) -> list[_Rest]:
         known = [self._settled.get(int(seed)) for seed in seeds]
@@ -67,7 +69,7 @@ class Settler:
     def _settle_physically(self, ids: Array, start: starts.Start) -> list[_Rest]:
         at, model = self._scene.addresses, self._scene.model
         qpos = np.zeros((len(ids), model.nq))
-        qpos[:, at.qpos] = start.joints
+        self._scene.joints.write(qpos, start.joints)
         qpos[:, at.plug_qpos], qpos[:, at.socket_qpos] = start.plug, start.socket
         self._backend.write(ids, qpos, np.zeros((len(ids), model.nv)))
         command = task.servo_commands(self._scene.embodiment, start.targets)

@@ -1,6 +1,6 @@
 """Bimanual insertion in many worlds: reset by seed, step by joint targets, observe raw sensor data.
 
-Shapes: N worlds, m of them addressed by sorted ids; J = 16 joints; H x W depth pixels; 4 pads of 384 taxels.
+Shapes: N worlds, m of them addressed by sorted ids; J joints; H x W depth pixels; P pads of T taxels.
 """
 
 from collections.abc import Callable
@@ -11,6 +11,7 @@ import mujoco
 import numpy as np
 import torch
 
+from lerobot_vtrefine.embodiments import Embodiment
 from lerobot_vtrefine.sim import sensing, starts, task
 from lerobot_vtrefine.sim.backends import Trace, get_backend
 from lerobot_vtrefine.sim.backends.batch import usable_cores
@@ -72,9 +73,7 @@ class InsertionSim:
         robot_faults: what the arms do that commands and readings do not tell.
         shear: whether `shear` gives tangential forces, and the skin that they strain.
 
-    Raises:
-        ValueError: zero worlds, or a setting that makes no sense.
-        FileNotFoundError: missing meshes or sensor model.
+    Raises: ValueError for settings that make no sense, FileNotFoundError without meshes or sensor model.
     """
 
     def __init__(
@@ -92,8 +91,8 @@ class InsertionSim:
     ) -> None:
         if num_envs < 1:
             raise ValueError(f"num_envs must be at least 1, got {num_envs}")
-        self.config = task_config or TaskConfig()
         self.scene: Scene = build_scene(scene_config or SceneConfig())
+        self.config = task.rules_in(self.scene.config, task_config or TaskConfig())
         self.num_envs = num_envs
         self.noise_level = NOISE_LEVEL
         self.substeps = _substeps(self.scene.config, self.config)
@@ -108,7 +107,8 @@ class InsertionSim:
             self.scene, model, num_envs, self.config.control_dt_s, device, threads, shear
         )
         window = max(1, round(self.config.limits.force_window_s / self.scene.config.timestep_s))
-        self._episode = EpisodeState.empty(num_envs, self.scene.model.nu, window)
+        num_pads = len(self.embodiment.pad_names)
+        self._episode = EpisodeState.empty(num_envs, self.scene.model.nu, num_pads, window)
         self._rates = task.rate_limits(self.scene.embodiment, self.config)
         everyone = self._randomizer.draw(np.zeros(num_envs, np.int64))
         self._parameters = dict(everyone.values)
@@ -120,7 +120,7 @@ class InsertionSim:
         )
 
     @property
-    def embodiment(self) -> Any:
+    def embodiment(self) -> Embodiment:
         """The robot."""
         return self.scene.embodiment
 
@@ -207,7 +207,7 @@ class InsertionSim:
         measured = self._start_measuring(ids, trace, earlier)
         if images is not None and len(images):
             self._present.start_images(self._checked(images))
-        reward = update(state, ids, measured(), self.config)
+        reward = update(state, ids, measured(), self.config, self.scene)
         self._remember(ids)
         terminated = state.done[ids]
         truncated = ~terminated & (state.steps[ids] >= self.episode_steps)
@@ -218,7 +218,7 @@ class InsertionSim:
         """What the sensors give now, as the hardware would.
 
         Returns:
-            `state` (m, J) float32 [rad, m]; `tactile` and `tactile_baseline` (m, 4, 384) uint8 counts;
+            `state` (m, J) float32 [rad, m]; `tactile` and `tactile_baseline` (m, P, T) uint8 counts;
             `depth_mm` (m, H, W) uint16, 0 where nothing lies within 2 m.
         """
         ids = self._checked(ids)
@@ -230,18 +230,18 @@ class InsertionSim:
         }
 
     def joint_state(self, ids: Array | None = None) -> Array:
-        """The `state` part of `observe` alone: (m, 16) float32."""
+        """The `state` part of `observe` alone: (m, J) float32."""
         qpos, _ = self._backend.read(self._checked(ids))
         return self._drive.readings(qpos[:, self.scene.addresses.qpos]).astype(np.float32)
 
     @without_torch_threads
     def tactile(self, ids: Array | None = None) -> Array:
-        """The `tactile` part of `observe` alone: (m, 4, 384) uint8 counts."""
+        """The `tactile` part of `observe` alone: (m, P, T) uint8 counts."""
         ids = self._checked(ids)
         return self._pads.counts(ids, self._touch_at(ids))
 
     def shear(self, ids: Array | None = None) -> Array:
-        """Tangential forces on the taxels at the end of the last control step, (m, 4, 384, 2) float32 [N]:
+        """Tangential forces on the taxels at the end of the last control step, (m, P, T, 2) float32 [N]:
         along x and y of the pad's frame.
 
         They add up to the solver's tangential force on that pad, and none exceeds friction times the
@@ -279,8 +279,7 @@ class InsertionSim:
 
     def privileged(self, ids: Array | None = None) -> Array:
         """State for a critic, (m, P) float32, columns named by `privileged_names`."""
-        ids = self._checked(ids)
-        return self._describe(ids).vector
+        return self._describe(self._checked(ids)).vector
 
     @property
     def privileged_names(self) -> tuple[str, ...]:
@@ -358,7 +357,8 @@ class InsertionSim:
 
     def _grip_points(self, seen: Kinematics) -> Array:
         grips = self.scene.pair.socket.grip, self.scene.pair.plug.grip
-        return task.grip_points(grips, (seen.socket, seen.plug), seen.hands)
+        hands = task.holding_hands(self.scene.holders, seen.hands)
+        return task.grip_points(grips, (seen.socket, seen.plug), hands)
 
     def _start_measuring(
         self, ids: Array, trace: Trace, earlier: list[torch.Tensor]

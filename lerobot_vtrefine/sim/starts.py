@@ -61,22 +61,33 @@ def start_on_table(
 def start_in_hand(config: GraspedStart, pair: PartPair, embodiment: Embodiment, draws: Array) -> Start:
     """Both parts in hand, the plug above the mouth. `draws`: (m, GRASPED_DRAWS), seven for each hand.
 
+    Raises:
+        ValueError: the body has one hand only, or its hands do not reach there.
+
     Each hand stands displaced and turned about the vertical from where it would hold its part ideally; the
     part stands displaced along both axes of the pads and turned about their normal from where its hand
     expects it (slip).
     """
+    if None in embodiment.holders:
+        raise ValueError(f"start=grasped needs two hands, and {embodiment.name} has one: use start=table")
     plug_at, socket_at = _ideal_places(config, pair)
     left = _hand_and_part(config, pair.socket, socket_at, np.pi / 2, config.left_pitch_rad, draws[:, :7])
     right = _hand_and_part(config, pair.plug, plug_at, -np.pi / 2, config.right_pitch_rad, draws[:, 7:])
     position = np.stack([left[0], right[0]], 1)
     rotation = np.stack([left[1], right[1]], 1)
-    joints = solve_hands(embodiment, position, rotation, _nominal_joints(config, pair, embodiment))
-    width = np.array([pair.socket.grip.half_size_m[0], pair.plug.grip.half_size_m[0]])
-    touching = width + embodiment.fingers.face_offset_m
+    touching = grip_openings(pair, embodiment)
+    nominal = _nominal_joints(config, pair, embodiment, touching)
+    joints = solve_hands(embodiment, position, rotation, nominal)
     targets = joints.copy()
-    _set_fingers(embodiment, joints, touching)
-    _set_fingers(embodiment, targets, np.maximum(touching - config.squeeze_m, 0.0))
+    embodiment.set_openings(joints, touching)
+    embodiment.set_openings(targets, np.maximum(touching - config.squeeze_m, 0.0))
     return Start(joints, targets, plug=right[2], socket=left[2], settle_s=config.settle_s)
+
+
+def grip_openings(pair: PartPair, embodiment: Embodiment) -> Array:
+    """Grippers' openings (2,) [m] at which the pads of both hands just touch their parts."""
+    width = np.array([pair.socket.grip.half_size_m[0], pair.plug.grip.half_size_m[0]])
+    return width + embodiment.fingers.face_offset_m
 
 
 def solve_hands(embodiment: Embodiment, position: Array, rotation: Array, initial: Array) -> Array:
@@ -122,21 +133,17 @@ def _ideal_places(config: GraspedStart, pair: PartPair) -> tuple[Array, Array]:
     return mouth + config.plug_height_m * up, socket_at
 
 
-def _nominal_joints(config: GraspedStart, pair: PartPair, embodiment: Embodiment) -> Array:
+def _nominal_joints(config: GraspedStart, pair: PartPair, embodiment: Embodiment, openings: Array) -> Array:
     """Joint positions of the ideal start, found from home: what the jittered ones are solved from."""
     plug_at, socket_at = _ideal_places(config, pair)
     left = ideal_hand(pair.socket, np.pi / 2, config.left_pitch_rad)
     right = ideal_hand(pair.plug, -np.pi / 2, config.right_pitch_rad)
     position = torch.as_tensor(np.stack([socket_at + left[0], plug_at + right[0]]))
     rotation = torch.as_tensor(np.stack([left[1], right[1]]))
-    joints = embodiment.solve_tcp(position, rotation, torch.as_tensor(embodiment.home), iterations=40)
+    home = embodiment.home.copy()
+    embodiment.set_openings(home, openings)  # on which the TCPs of swinging fingers depend
+    joints = embodiment.solve_tcp(position, rotation, torch.as_tensor(home), iterations=40)
     reached, _ = embodiment.tcp_poses(joints)
     if float((reached - position).abs().max()) > 1e-3:
         raise ValueError(f"grasped.mouth_m = {config.mouth_m}: the hands cannot reach their parts there")
     return joints.numpy()
-
-
-def _set_fingers(embodiment: Embodiment, joints: Array, openings: Array) -> None:
-    """Write the opening per hand (2,) into joint positions (m, J), in place."""
-    arms = joints.reshape(len(joints), 2, embodiment.joints_per_arm)
-    arms[..., -2], arms[..., -1] = openings, -openings

@@ -1,15 +1,15 @@
 """The task as pure functions on arrays: servo commands, insertion geometry, success, in-hand shift, forces.
 
-Shapes: m worlds. Poses are (position (m, 3) [m], rotation (m, 3, 3)) in the world frame. Hands are ordered
-left, right; the left hand holds the socket, the right one the plug.
+Shapes: m worlds. Poses are (position (m, 3) [m], rotation (m, 3, 3)) in the world frame. Parts, and hands by
+the part that they hold, are ordered socket, plug.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 from lerobot_vtrefine.embodiments import Embodiment
-from lerobot_vtrefine.sim.config import SuccessConfig, TaskConfig
+from lerobot_vtrefine.sim.config import SceneConfig, SuccessConfig, TaskConfig
 from lerobot_vtrefine.sim.pairs import Grip, PartPair
 from lerobot_vtrefine.sim.rotations import turn, turn_back
 
@@ -17,6 +17,8 @@ __all__ = ["FAILURES", "TaskConfig"]
 
 Array = np.ndarray
 Pose = tuple[Array, Array]
+Holders = tuple[int | None, int | None]
+"""Arms that hold the socket and the plug."""
 
 FAILURES = ("none", "in_hand_shift", "contact_force", "dropped", "unstable", "overflow")
 NO_FAILURE, SHIFTED, FORCED, DROPPED, UNSTABLE, OVERFLOWED = range(6)
@@ -45,6 +47,13 @@ class Insertion:
     """Above the table."""
 
 
+def rules_in(scene: SceneConfig, config: TaskConfig) -> TaskConfig:
+    """The rules as they hold in a scene: a socket that stands need not be lifted above the table."""
+    if scene.socket == "held":
+        return config
+    return replace(config, success=replace(config.success, mouth_height_m=-np.inf))
+
+
 def checked_action(action: Array, shape: tuple[int, int]) -> Array:
     """Joint targets as float64 (m, J). Raises: ValueError for another shape, infinities and NaN."""
     action = np.asarray(action, float)
@@ -58,23 +67,46 @@ def checked_action(action: Array, shape: tuple[int, int]) -> Array:
 
 
 def servo_commands(embodiment: Embodiment, targets: Array) -> Array:
-    """Joint targets (m, J) -> servo commands (m, nu): clamped to the limits, one opening per gripper."""
-    clamped = np.clip(targets, embodiment.lower, embodiment.upper)
-    arms = clamped.reshape(len(targets), 2, embodiment.joints_per_arm)
-    opening = (arms[..., -2:-1] - arms[..., -1:]) / 2
-    return np.concatenate([arms[..., :-2], opening], -1).reshape(len(targets), -1)
+    """Joint targets (m, J) -> servo commands (m, nu): clamped to the limits, one command per gripper."""
+    return servo_values(embodiment, np.clip(targets, embodiment.lower, embodiment.upper))
+
+
+def servo_values(embodiment: Embodiment, joints: Array) -> Array:
+    """Values per joint (m, J) -> values per servo (m, nu), the grippers' merged into one each."""
+    arms, count = embodiment.by_arm(joints), len(embodiment.joints)
+    gripper = embodiment.fingers.command(arms[..., count:])
+    return np.concatenate([arms[..., :count], gripper], -1).reshape(len(joints), -1)
 
 
 def joint_targets(embodiment: Embodiment, commands: Array) -> Array:
     """Servo commands (m, nu) -> joint targets (m, J), the inverse of `servo_commands`."""
-    arms = commands.reshape(len(commands), 2, -1)
-    return np.concatenate([arms, -arms[..., -1:]], -1).reshape(len(commands), embodiment.num_joints)
+    arms = commands.reshape(len(commands), embodiment.num_arms, -1)
+    gripper = embodiment.fingers.targets(arms[..., -1:])
+    return np.concatenate([arms[..., :-1], gripper], -1).reshape(len(commands), embodiment.num_joints)
 
 
 def rate_limits(embodiment: Embodiment, config: TaskConfig) -> Array:
     """Largest change of each servo command in one control step (nu,)."""
-    arm = [config.joint_rate] * len(embodiment.joints) + [config.finger_rate]
-    return np.array(arm * 2) * config.control_dt_s
+    gripper = embodiment.fingers.command_rate(config.finger_rate)
+    arm = [config.joint_rate] * len(embodiment.joints) + [gripper]
+    return np.array(arm * embodiment.num_arms) * config.control_dt_s
+
+
+def held_parts(holders: Holders, num_arms: int, pad_force: Array) -> Array:
+    """(m, part) whether all pads of the hand whose part it is press on something, for forces (m, P) [N]."""
+    pressed = np.all((pad_force > HELD_FORCE_N).reshape(len(pad_force), num_arms, -1), axis=-1)
+    nobody = np.zeros(len(pad_force), bool)
+    return np.stack([nobody if arm is None else pressed[:, arm] for arm in holders], 1)
+
+
+def holding_hands(holders: Holders, hands: Pose) -> Pose:
+    """Poses (m, part, ...) of the hands that hold the socket and the plug, out of those of all hands (m, A,
+    ...); the world's frame for a part that no hand holds.
+    """
+    none = np.zeros_like(hands[0][:, 0]), np.broadcast_to(np.eye(3), hands[1][:, 0].shape)
+    chosen = [none if arm is None else (hands[0][:, arm], hands[1][:, arm]) for arm in holders]
+    position, rotation = zip(*chosen, strict=True)
+    return np.stack(position, 1), np.stack(rotation, 1)
 
 
 def insertion(pair: PartPair, plug: Pose, socket: Pose, table_height_m: float) -> Insertion:

@@ -1,6 +1,6 @@
 """What the pads' sensor model reads of worlds: poses, velocities and the solver's loads, wherever they live.
 
-Shapes: m worlds, 4 pads, B = 2 bodies (plug, socket).
+Shapes: m worlds, P pads, B = 2 bodies (plug, socket).
 """
 
 from abc import ABC, abstractmethod
@@ -26,13 +26,13 @@ class Touch:
     """Arguments of `PadSensors.counts`: arrays, or tensors on the pads' device."""
 
     poses: tuple[ArrayLike, ArrayLike, ArrayLike, ArrayLike, ArrayLike, ArrayLike]
-    """Positions (m, 4, 3) [m], rotations (m, 4, 3, 3) and velocities (m, 4, 6) of the pads, world frame; the
+    """Positions (m, P, 3) [m], rotations (m, P, 3, 3) and velocities (m, P, 6) of the pads, world frame; the
     same of the bodies (m, B, ...).
     """
     load: ArrayLike
-    """(m, 4, 3) normal force [N], its centre's x and y in the pad's frame [m]."""
+    """(m, P, 3) normal force [N], its centre's x and y in the pad's frame [m]."""
     pull: ArrayLike
-    """(m, 4, 2) tangential force on the pad, in its frame [N]: what `Pads` shares out as shear."""
+    """(m, P, 2) tangential force on the pad, in its frame [N]: what `Pads` shares out as shear."""
 
 
 class TouchSource(ABC):
@@ -41,7 +41,7 @@ class TouchSource(ABC):
     @abstractmethod
     def start_load(self, ids: Array, trace: Trace, see: See) -> Callable[[], Array]:
         """Begin to read the loads on the pads at the end of a trace that has just been made; what is returned
-        waits for them, (m, 4, LOAD_SIZE) on the host. `see` gives the worlds' kinematics there.
+        waits for them, (m, P, LOAD_SIZE) on the host. `see` gives the worlds' kinematics there.
         """
 
     def load(self, ids: Array, trace: Trace, see: See) -> Array:

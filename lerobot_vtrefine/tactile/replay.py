@@ -77,8 +77,8 @@ def replay(
     """Readings that the model predicts for one trial, or for several with the same times: (T, ..., R, C)
     float32 counts.
 
-    Give either the depth of every taxel (contract: column height), or force per taxel, which then replaces
-    the contact model and everything before it.
+    Give either the depth of every taxel (column height, see docs/recording-format.md), or force per taxel,
+    which then replaces the contact model and everything before it.
 
     Args:
         times_s: (T,) non-decreasing, from the trial's start [s].

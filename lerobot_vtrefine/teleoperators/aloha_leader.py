@@ -77,7 +77,8 @@ class AlohaLeader(Teleoperator):
 
     def calibrate(self) -> None:
         """Calibrates both arms by hand."""
-        self.pair.calibrate(input, self.body.lower[:6], self.body.upper[:6])
+        count = len(self.body.joints)
+        self.pair.calibrate(input, self.body.lower[:count], self.body.upper[:count])
         self.calibration = self.pair.calibration
         self._save_calibration()
         logger.info("calibration saved to %s", self.calibration_fpath)

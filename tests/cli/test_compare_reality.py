@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from lerobot_vtrefine.cli.results.tables import table
-from lerobot_vtrefine.diagnose.robot.model import RobotModel
+from lerobot_vtrefine.diagnose.joints.model import RobotModel
 from lerobot_vtrefine.embodiments import ALOHA
 from lerobot_vtrefine.finetune.logger import ProgressLog
 from lerobot_vtrefine.tactile.model import SensorModel

@@ -12,6 +12,7 @@ from fake_diagnosis import pad_diagnosis, robot_diagnosis
 from pad_sets import make_robot_set, make_set, write_set
 
 from lerobot_vtrefine.cli import diagnose, predict
+from lerobot_vtrefine.diagnose import api
 from lerobot_vtrefine.diagnose.verdict import read_verdict
 from lerobot_vtrefine.tactile.model import SensorModel
 
@@ -23,11 +24,11 @@ def engine(monkeypatch):
     """Replaces the engine by one that remembers what it got and answers what a test wants."""
     seen = {}
 
-    def fake(recordings, seed):
+    def fake(recordings, seed, progress):
         seen.update(recordings=recordings, seed=seed)
         return seen.get("answer", pad_diagnosis())
 
-    monkeypatch.setattr(diagnose, "diagnose", fake)
+    monkeypatch.setattr(api, "_judged", fake)
     return seen
 
 
@@ -132,7 +133,7 @@ def test_a_failing_run_leaves_nothing_behind(tmp_path, engine, monkeypatch):
     def broken(*arguments):
         raise ValueError("engine trouble")
 
-    monkeypatch.setattr(diagnose, "diagnose", broken)
+    monkeypatch.setattr(api, "_judged", broken)
     assert run(write_set(tmp_path / "set", *make_set()), tmp_path / "out") == 2
     assert not (tmp_path / "out").exists()
 

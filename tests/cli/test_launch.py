@@ -3,11 +3,10 @@
 import sys
 from dataclasses import fields
 from pathlib import Path
-from types import ModuleType
 
 import pytest
 
-from lerobot_vtrefine import named_configs, registration
+from lerobot_vtrefine import named_configs
 from lerobot_vtrefine.cli import launch, umbrella
 from lerobot_vtrefine.cli.flags import flags_of
 from lerobot_vtrefine.cli.pipeline.demo_config import DemoConfig
@@ -102,11 +101,9 @@ def test_the_umbrella_runs_a_command_as_if_called_by_its_name(monkeypatch, capsy
 
 
 def test_stock_commands_get_the_path_when_they_discover_the_plugin(monkeypatch) -> None:
-    monkeypatch.setitem(sys.modules, registration.LEROBOT, ModuleType("lerobot"))
-    monkeypatch.setattr(registration, "register", lambda: None)
     monkeypatch.setattr(sys, "argv", ["lerobot-eval", "--config_path=vtrefine:round_table"])
-    registration.register_or_wait()
+    named_configs.expand_command_line()
     assert Path(sys.argv[1].partition("=")[2]).is_file()
     monkeypatch.setattr(sys, "argv", ["lerobot-eval", "--config_path=vtrefine:nothing"])
     with pytest.raises(SystemExit, match="error: --config_path=vtrefine:nothing: no such configuration"):
-        registration.register_or_wait()
+        named_configs.expand_command_line()

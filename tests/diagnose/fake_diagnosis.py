@@ -1,9 +1,8 @@
 """Diagnoses by hand, for tests of the report and of the command: no engine involved."""
 
-from types import SimpleNamespace
-
 import numpy as np
 
+from lerobot_vtrefine.diagnose.core.diagnosis import Diagnosis
 from lerobot_vtrefine.diagnose.evidence import Evidence, ResidualView, Trace, TrialError
 from lerobot_vtrefine.diagnose.verdict import Cause, Heldout, Parameter, Unknown
 from lerobot_vtrefine.tactile.model import SensorModel
@@ -129,7 +128,7 @@ def pad_diagnosis(**changes):
         "maps": {"rms residual before": np.full((6, 8), 4.0), "rms residual after": np.full((6, 8), 2.0)},
         "unit": "counts",
     }
-    return SimpleNamespace(**(values | changes))
+    return Diagnosis(**(values | changes))
 
 
 def robot_diagnosis(**changes):

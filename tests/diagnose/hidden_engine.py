@@ -17,29 +17,16 @@ from hidden.writer import truth_of, write_session
 
 
 def diagnose_folder(path: Path, seed: int = 0) -> tuple[dict[str, Any], Any]:
-    """What `vtrefine-diagnose` would write to verdict.json, and the extended model."""
-    from lerobot_vtrefine.diagnose.pad_engine import diagnose_pad
-    from lerobot_vtrefine.diagnose.quality import check_quality
-    from lerobot_vtrefine.diagnose.recordings import read_recording_set
+    """What `vtrefine-diagnose` writes to verdict.json, and the extended model."""
+    from lerobot_vtrefine.diagnose.api import diagnose
+    from lerobot_vtrefine.diagnose.verdict import read_verdict, write_verdict
 
-    recordings, issues = check_quality(read_recording_set(path))
-    found = diagnose_pad(recordings, seed=seed)
-    verdict = {
-        "status": found.status,
-        "causes": [dataclasses.asdict(cause) for cause in found.causes],
-        "ambiguous_with": [list(group) for group in found.ambiguous_with],
-        "unknown": dataclasses.asdict(found.unknown),
-        "heldout": dataclasses.asdict(found.heldout) if found.heldout else None,
-        "minimum_detectable": dict(found.minimum_detectable),
-        "next_experiment": found.next_experiment,
-        "data_issues": [dataclasses.asdict(issue) for issue in issues],
-    }
-    return json.loads(json.dumps(verdict, default=plain)), found.extended_model
-
-
-def plain(value: Any) -> Any:
-    """Arrays and numpy's numbers as JSON knows them."""
-    return value.tolist() if isinstance(value, np.ndarray | np.generic) else dict(value)
+    found = diagnose(path, seed)
+    with tempfile.TemporaryDirectory() as scratch:
+        file = Path(scratch) / "verdict.json"
+        write_verdict(found.verdict, file)
+        read_verdict(file)  # the contract's own checks
+        return json.loads(file.read_text(encoding="utf-8")), found.extended_model
 
 
 def predictions(model: Any, path: Path) -> list[np.ndarray]:

@@ -17,8 +17,7 @@ from pathlib import Path
 import numpy as np
 from robot_rigs import Rig, make_set
 
-from lerobot_vtrefine.diagnose.recordings import read_recording_set
-from lerobot_vtrefine.diagnose.robot.engine import diagnose_robot
+from lerobot_vtrefine.diagnose.api import diagnose
 from lerobot_vtrefine.embodiments import ALOHA
 
 TABLE = ("shoulder", "elbow", "wrist_flex", "gripper")
@@ -124,9 +123,9 @@ def add(rig, name, joint, size):
 def run(kind, seed):
     rig, names = case(kind, seed)
     with tempfile.TemporaryDirectory() as folder:
-        recordings = read_recording_set(make_set(rig, folder, seed))
-    begun = time.process_time()
-    found = diagnose_robot(recordings, seed=0)
+        made = make_set(rig, folder, seed)
+        begun = time.process_time()
+        found = diagnose(made)
     held = found.heldout
     row = {
         "kind": kind,

@@ -61,6 +61,10 @@ class Rig:
     """Where gravity pulls: at the posture that is commanded, or where the joints are ("joints")."""
     compliance: dict = field(default_factory=dict)
     """Joint -> m per N; loads come with it."""
+    compliance_form: str = "servo"
+    """Where and how a load bends: servo: before the servo, in proportion; finger: behind it, at once; slack:
+    behind it, through play that the load takes up; one_way: pulls bend three times as far as pushes; harder:
+    as the load's power 0.6; between: before the servo, the load changing between frames, too."""
     holds: dict = field(default_factory=dict)
     """Gripper -> (opening at which it meets something hard, part of its way that it still goes)."""
     stiffness: dict = field(default_factory=dict)
@@ -182,6 +186,7 @@ class Robot:
         command = lossy(rig, rng, command)
         arrival = arrivals(rig, rng, t)
         half, bend = column(rig, rig.backlash) / 2, column(rig, rig.compliance)
+        behind = rig.compliance_form in ("finger", "slack")
         dry = self.omega**2 * column(rig, rig.friction)
         pull = self.omega**2 * (1 - rig.unknown.get("weak_servo", 0.0) * session_s / session_s.max())
         pull = pull * (1 + rig.servo_scatter * rng.normal(size=(len(t), 1)))
@@ -201,7 +206,10 @@ class Robot:
                 if rig.latency_s:
                     u = self.late(arrival[:, : k + 1], command, now, h)
                 slack = np.clip(slack, u - half, u + half)
-                target = self.target_of(slack, bend * load_n[:, k], session_s, now, v, u, q)
+                part = step / steps if rig.compliance_form == "between" else 0.0
+                force_n = (1 - part) * load_n[:, k] + part * load_n[:, k + 1]
+                bent = bend * yielding(rig, force_n) * (not behind)
+                target = self.target_of(slack, bent, session_s, now, v, u, q)
                 force = pull * (target - q) - 2 * self.zeta * self.omega * v
                 stick = dry * (1 + rig.stribeck * np.exp(-((v / STRIBECK_RAD_S) ** 2)))
                 stuck = (v == 0) & (np.abs(force) <= stick)
@@ -210,7 +218,18 @@ class Robot:
                 new = np.where((new * v < 0) & (dry > 0), 0.0, new)
                 q = q + 0.5 * (v + new) * h[:, None]
                 v = new
-        return out, torque
+        return out - bend * yielding(rig, load_n) * behind, torque
+
+
+def yielding(rig, load_n):
+    """The load that would bend a plain spring as far."""
+    if rig.compliance_form == "slack":
+        return load_n + 6.0 * np.sign(load_n) * (np.abs(load_n) > 0.5)
+    if rig.compliance_form == "one_way":
+        return np.where(load_n < 0, 3.0, 1.0) * load_n
+    return (
+        15.0 * (np.abs(load_n) / 15.0) ** 0.6 * np.sign(load_n) if rig.compliance_form == "harder" else load_n
+    )
 
 
 def arrivals(rig, rng, t):
@@ -275,6 +294,8 @@ def loads_of(rig, rng, t, c):
     load = np.zeros((len(t), len(rig.joints)))
     for name in rig.compliance:
         grasp = (np.sin(2 * np.pi * t / rig.seconds + c) > 0.2) * rng.uniform(5, 25)
+        if rig.compliance_form == "one_way":
+            grasp = grasp - (np.sin(2 * np.pi * t / rig.seconds + c) < -0.3) * rng.uniform(5, 25)
         load[:, rig.joints.index(name)] = np.convolve(grasp, np.ones(9) / 9, "same")
     return load
 

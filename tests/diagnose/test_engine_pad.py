@@ -5,7 +5,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from lerobot_vtrefine.diagnose.pad_engine import PadDiagnosis, diagnose_pad
+from lerobot_vtrefine.diagnose.pad_engine import PadDiagnosis, diagnose_pad, not_worse
+from lerobot_vtrefine.diagnose.presses import prepare
 from lerobot_vtrefine.diagnose.recordings import RecordingSet, Trial
 
 ROWS, COLS, PITCH, RADIUS = 3, 4, 0.002, 0.01
@@ -111,9 +112,19 @@ def test_the_gain_is_what_locked_recordings_say(hardened: PadDiagnosis) -> None:
     assert errors[1] < errors[0]
 
 
+def test_a_model_that_predicts_locked_recordings_worse_is_not_handed_out(hardened: PadDiagnosis) -> None:
+    held = recordings(hardening)
+    presses = prepare(held, list(held.trials), list(range(16))).subset([0, 5, 10, 15])
+    good, bad = hardened.extended_model, hardened.baseline_model
+    assert not_worse(presses, bad, good, None, 0)[0] is good
+    model, _, errors, surely = not_worse(presses, good, bad, None, 0)
+    assert model is good
+    assert (errors.gain, surely) == (0.0, True)
+
+
 def test_every_candidate_has_a_row_of_evidence(hardened: PadDiagnosis) -> None:
     rows = {row.name: row for row in hardened.evidence}
-    assert len(rows) == 15
+    assert len(rows) == 16
     assert rows["nonlinear_stiffness"].decision == "accepted"
     assert rows["latency"].decision == "rejected"
 

@@ -3,8 +3,8 @@
 import numpy as np
 import pytest
 
+from lerobot_vtrefine.diagnose.core.heldout import lock
 from lerobot_vtrefine.diagnose.crossvalidation import paired_p
-from lerobot_vtrefine.diagnose.locking import lock
 from lerobot_vtrefine.diagnose.noise import Noise
 from lerobot_vtrefine.diagnose.screening import Probe, cleared, screen
 from lerobot_vtrefine.diagnose.weights import build_weights

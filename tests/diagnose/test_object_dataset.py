@@ -7,10 +7,10 @@ import pytest
 from object_rigs import record, write_dataset
 
 from lerobot_vtrefine.cli.diagnose import main
-from lerobot_vtrefine.diagnose.dataset.merge import beside
-from lerobot_vtrefine.diagnose.object.engine import unknown_parts
-from lerobot_vtrefine.diagnose.robot.dataset import read_dataset
-from lerobot_vtrefine.diagnose.robot.engine import diagnose_robot
+from lerobot_vtrefine.diagnose.dataset.merge import merged
+from lerobot_vtrefine.diagnose.joints.dataset import read_dataset
+from lerobot_vtrefine.diagnose.joints.engine import diagnose_robot
+from lerobot_vtrefine.diagnose.parts.engine import unknown_parts
 from lerobot_vtrefine.sim.config import CameraConfig, SceneConfig
 
 CAMERA = CameraConfig(80, 60, 0.56, (-0.46, 0.0, 0.46), (0.0, 0.0, 0.09))
@@ -49,7 +49,7 @@ def test_sizes_are_right(verdict) -> None:
 def test_a_dataset_without_known_parts_says_so(tmp_path) -> None:
     recorded = record(SceneConfig(pair="square"), 4)
     root = write_dataset(tmp_path / "ds", recorded, BELIEVED)
-    found = beside(diagnose_robot(read_dataset(root=root)), unknown_parts())
+    found = merged(diagnose_robot(read_dataset(root=root)), unknown_parts())
     undecided = {item.name: item.reason for item in found.evidence if item.decision == "not identifiable"}
     assert "parts are not known" in undecided["object_mass"]
     assert {"object_friction", "clearance"} <= set(undecided)

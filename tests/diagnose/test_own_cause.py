@@ -2,16 +2,25 @@
 
 import json
 import os
+import re
 import shutil
 import subprocess
 import sys
 from pathlib import Path
 
+import numpy as np
+import pyarrow as pa
+import pyarrow.parquet as pq
+import pytest
+from robot_rigs import Rig, make_set
+
 import lerobot_vtrefine
 from lerobot_vtrefine.diagnose import candidates
-from lerobot_vtrefine.diagnose.verdict import SENSOR_CAUSES
+from lerobot_vtrefine.diagnose.joints import candidates as joint_candidates
+from lerobot_vtrefine.diagnose.verdict import ROBOT_CAUSES, SENSOR_CAUSES
 
 PACKAGE = Path(lerobot_vtrefine.__file__).parent
+ROOT = Path(__file__).parents[2]
 
 STAGE = '''
 
@@ -62,11 +71,57 @@ HIDDEN = {
 }
 
 
+JOINT_STAGE, JOINT_CANDIDATE = re.findall(
+    r"```python\n(.*?)```", (ROOT / "docs" / "diagnosis-method.md").read_text(encoding="utf-8"), re.DOTALL
+)
+COGGING_RAD = 0.008
+
+
 def test_every_file_of_the_catalogue_is_asked_about() -> None:
     files = {path.stem for path in (PACKAGE / "diagnose" / "candidates").glob("*.py")} - {"__init__", "base"}
     families = {form.family for form in candidates.CATALOGUE}
     assert families == files == set(SENSOR_CAUSES) - {"taxel_gain_spread", "dead_taxels"}
     assert all(candidates.MEANING[name] for name in files)
+
+
+def test_every_file_of_the_joints_catalogue_is_asked_about() -> None:
+    folder = PACKAGE / "diagnose" / "joints" / "candidates"
+    files = {path.stem for path in folder.glob("*.py")} - {"__init__", "base", "decoys"}
+    assert set(joint_candidates.NAMES) == files == set(ROBOT_CAUSES)
+    assert {item.cause for item in joint_candidates.CATALOGUE if not item.clue} == files
+    assert all(joint_candidates.MEANING[name] for name in files)
+
+
+def test_a_joints_cause_of_ones_own_is_named_reported_and_predicted(tmp_path: Path) -> None:
+    copy = tmp_path / "lerobot_vtrefine"
+    shutil.copytree(PACKAGE, copy, ignore=shutil.ignore_patterns("__pycache__", "assets"))
+    with (copy / "diagnose" / "joints" / "stages.py").open("a", encoding="utf-8") as file:
+        file.write("\n\n" + JOINT_STAGE)
+    (copy / "diagnose" / "joints" / "candidates" / "cogging.py").write_text(JOINT_CANDIDATE, encoding="utf-8")
+    rig = Rig(joints=("elbow",), rate_hz=20.0, seconds=5.0, conditions=8, noise=0.5)
+    folder = make_set(rig, tmp_path / "moves", 0)
+    for path in folder.glob("*.parquet"):
+        table = pq.read_table(path)
+        q = np.array(table["position"].to_pylist())
+        cogged = pa.array((q + COGGING_RAD * np.sin(8 * q)).tolist())
+        pq.write_table(table.set_column(table.column_names.index("position"), "position", cogged), path)
+    script = (
+        "from lerobot_vtrefine.cli import diagnose, predict\n"
+        "diagnose.main(['--recording=moves', '--output_dir=out'])\n"
+        "predict.main(['--recording=moves', '--sensor_model=out/sensor_model.json', '--output_dir=p'])"
+    )
+    env = os.environ | {"PYTHONPATH": str(tmp_path)}
+    done = subprocess.run(
+        [sys.executable, "-c", script], cwd=tmp_path, env=env, capture_output=True, text=True, check=False
+    )
+    assert done.returncode == 0, done.stderr[-2000:]
+    assert "explained: The simulation lacks cogging." in done.stdout
+    (cause,) = json.loads((tmp_path / "out" / "verdict.json").read_text())["causes"]
+    size = cause["params"]["elbow_rad"]
+    assert size["value"] == pytest.approx(COGGING_RAD, rel=0.05)
+    assert size["ci95"][0] <= COGGING_RAD <= size["ci95"][1]
+    assert "Magnets pull a joint" in (tmp_path / "out" / "report.html").read_text(encoding="utf-8")
+    assert len(list((tmp_path / "p").glob("*.parquet"))) == 16
 
 
 def test_a_cause_of_ones_own_is_named_reported_and_predicted(tmp_path: Path) -> None:

@@ -8,7 +8,7 @@ import pytest
 from pad_sets import PITCH, make_robot_set, make_set, sphere_depth, write_set
 
 from lerobot_vtrefine.cli.predict import main
-from lerobot_vtrefine.diagnose.robot.model import JointModel, RobotModel
+from lerobot_vtrefine.diagnose.joints.model import JointModel, RobotModel
 from lerobot_vtrefine.tactile.model import SensorModel
 from lerobot_vtrefine.tactile.stages.contact import KelvinVoigt
 from lerobot_vtrefine.tactile.stages.readout import Gain, Idle, Quantisation

@@ -14,7 +14,7 @@ from fake_diagnosis import pad_diagnosis, robot_diagnosis
 from pad_sets import make_robot_set, make_set, write_set
 from PIL import Image
 
-from lerobot_vtrefine.cli.diagnose import make_verdict
+from lerobot_vtrefine.diagnose.core.diagnosis import Diagnosis
 from lerobot_vtrefine.diagnose.recordings import read_recording_set
 from lerobot_vtrefine.diagnose.report import render_report
 from lerobot_vtrefine.diagnose.report.axes import ticks
@@ -44,9 +44,8 @@ def robot_set(tmp_path_factory):
 
 
 def page(diagnosis, recordings, issues=(ISSUE,)):
-    return render_report(
-        make_verdict(diagnosis, issues), diagnosis, recordings, len(recordings.trials) - 1, 0
-    )
+    found = replace(diagnosis, issues=tuple(issues))
+    return render_report(found.verdict, found, recordings, len(recordings.trials) - 1, 0)
 
 
 def text_of(html):
@@ -78,7 +77,7 @@ def test_page_is_well_formed_and_needs_no_network(kind, pad_set, robot_set):
     html = {
         "pad": lambda: page(pad_diagnosis(), pad_set),
         "robot": lambda: page(robot_diagnosis(), robot_set),
-        "invalid": lambda: page(None, pad_set),
+        "invalid": lambda: page(Diagnosis("invalid_data"), pad_set),
     }[kind]()
     balance = Balance()
     balance.feed(html)
@@ -123,7 +122,7 @@ def test_first_line_is_the_verdict_in_plain_words(pad_set, robot_set):
     )
     adequate = pad_diagnosis(status="adequate", causes=())
     assert "The simulation is adequate" in text_of(page(adequate, pad_set))[:120]
-    assert "allow no verdict" in text_of(page(None, pad_set))[:120]
+    assert "allow no verdict" in text_of(page(Diagnosis("invalid_data"), pad_set))[:120]
 
 
 def test_ties_are_told_once_whatever_their_order():

@@ -10,8 +10,8 @@ import pytest
 from PIL import Image
 
 from lerobot_vtrefine.datasets.features import CAMERA_POSE_KEY, DEPTH_KEY, INTRINSICS_KEY
-from lerobot_vtrefine.diagnose.robot.dataset import read_dataset
-from lerobot_vtrefine.diagnose.vision.frames import has_depth, read_frames
+from lerobot_vtrefine.diagnose.camera.frames import has_depth, read_frames
+from lerobot_vtrefine.diagnose.joints.dataset import read_dataset
 
 LENGTHS = (5, 8)
 

@@ -6,12 +6,13 @@ import numpy as np
 import pytest
 from robot_rigs import Rig, make_set
 
+from lerobot_vtrefine.diagnose.joints.batch import make_batch
+from lerobot_vtrefine.diagnose.joints.engine import diagnose_problem, diagnose_robot
+from lerobot_vtrefine.diagnose.joints.estimates import widened
+from lerobot_vtrefine.diagnose.joints.fitting import SERVO_TICK_S
+from lerobot_vtrefine.diagnose.joints.model import predict_positions
+from lerobot_vtrefine.diagnose.joints.problem import JointProblem
 from lerobot_vtrefine.diagnose.recordings import read_recording_set
-from lerobot_vtrefine.diagnose.robot.batch import make_batch
-from lerobot_vtrefine.diagnose.robot.engine import diagnose_problem, diagnose_robot
-from lerobot_vtrefine.diagnose.robot.estimates import widened
-from lerobot_vtrefine.diagnose.robot.fitting import SERVO_TICK_S, Problem
-from lerobot_vtrefine.diagnose.robot.model import predict_positions
 
 SMALL = {
     "joints": ("shoulder", "elbow"),
@@ -74,7 +75,7 @@ def test_gripper_that_meets_something_is_named_without_loads(tmp_path) -> None:
     params = found.causes[0].params
     assert params["gripper_stop_m"].value == pytest.approx(0.02, abs=5e-4)
     assert params["gripper_give"].value == pytest.approx(0.1, abs=0.03)
-    assert found.joint_gains["gripper"] > 0.9
+    assert found.channel_gains["gripper"] > 0.9
 
 
 def test_nothing_is_found_where_nothing_is(tmp_path) -> None:
@@ -139,7 +140,7 @@ def test_few_trials_and_one_joint(tmp_path) -> None:
 
 def test_an_offset_that_servo_and_reading_share_is_said_to_be_invisible(tmp_path) -> None:
     recordings = read_recording_set(make_set(Rig(**SMALL), tmp_path, 0))
-    plain = Problem.of(recordings.joints, make_batch(recordings.trials))
+    plain = JointProblem.of(recordings.joints, make_batch(recordings.trials))
     told = {}
     for shared in (False, True):
         found = diagnose_problem(dataclasses.replace(plain, shared_encoders=shared))

@@ -5,11 +5,12 @@ from dataclasses import replace
 import pytest
 from robot_rigs import Rig, make_set
 
+from lerobot_vtrefine.diagnose.joints.batch import make_batch
+from lerobot_vtrefine.diagnose.joints.engine import diagnose_robot
+from lerobot_vtrefine.diagnose.joints.estimates import widened
+from lerobot_vtrefine.diagnose.joints.fitting import ServoTrials, ridge, servo_only
+from lerobot_vtrefine.diagnose.joints.parameters import INDEX, SAG
 from lerobot_vtrefine.diagnose.recordings import read_recording_set
-from lerobot_vtrefine.diagnose.robot.batch import make_batch
-from lerobot_vtrefine.diagnose.robot.engine import diagnose_robot
-from lerobot_vtrefine.diagnose.robot.estimates import widened
-from lerobot_vtrefine.diagnose.robot.fitting import INDEX, SAG, Problem, ridge, servo_only
 
 SLOW = Rig(joints=("shoulder", "elbow"), rate_hz=20.0, seconds=5.0, conditions=8, jitter=0.1)
 FAST = replace(SLOW, rate_hz=50.0, jitter=0.0, noise=0.5)
@@ -68,6 +69,25 @@ def test_what_a_stopped_jaw_does_besides_is_not_named(tmp_path) -> None:
     assert found.causes[0].params["gripper_stop_m"].value == pytest.approx(0.022, abs=2e-4)
 
 
+@pytest.mark.parametrize(
+    "form",
+    [
+        "slack",
+        pytest.param("finger", marks=pytest.mark.slow),
+        pytest.param("one_way", marks=pytest.mark.slow),
+    ],
+)
+def test_a_gripper_that_gives_way_in_another_form_keeps_its_name(tmp_path, form) -> None:
+    rig = replace(SLOW, joints=("gripper",), noise=0.5, compliance={"gripper": 2e-4}, compliance_form=form)
+    found = diagnosed(rig, tmp_path, 1)
+    assert found.status == "explained", found.unknown
+    assert [cause.name for cause in found.causes] == ["gripper_compliance"]
+    size = found.causes[0].params["m_per_n"]
+    assert size.value == pytest.approx(2e-4, rel=0.1)
+    # The model that is handed out has the form, too.
+    assert found.heldout.extended < 1.15 * found.heldout.noise_floor
+
+
 def test_widened_intervals_keep_signs_and_sides() -> None:
     assert widened((-0.03, -0.01), -0.02, 0.0) == pytest.approx((-0.03, -0.01))
     low, high = widened((-0.021, -0.019), -0.02, 0.01)
@@ -77,7 +97,7 @@ def test_widened_intervals_keep_signs_and_sides() -> None:
 
 def test_sags_of_many_terms_are_held_back_more_where_no_command_is_repeated(tmp_path) -> None:
     recordings = read_recording_set(make_set(replace(SLOW, conditions=2), tmp_path, 0))
-    again = Problem.of(recordings.joints, make_batch(recordings.trials))
+    again = ServoTrials.of(recordings.joints, make_batch(recordings.trials))
     once = again.subset([k for k, trial in enumerate(recordings.trials) if trial.replicate == 0])
     free = servo_only(again)
     free[1, [INDEX[name] for name in SAG]] = True

@@ -7,15 +7,16 @@ import numpy as np
 import pytest
 from object_rigs import record
 
-from lerobot_vtrefine.diagnose.object.engine import assumed_masses
-from lerobot_vtrefine.diagnose.object.episodes import AssumedScene, handled, lately
-from lerobot_vtrefine.diagnose.object.payload import GRAVITY_M_S2, Arms, given, replay_loaded
+from lerobot_vtrefine.diagnose.joints.batch import make_batch
+from lerobot_vtrefine.diagnose.joints.fitting import fit, servo_only
+from lerobot_vtrefine.diagnose.joints.gravity import is_sliding
+from lerobot_vtrefine.diagnose.joints.model import from_model, to_model
+from lerobot_vtrefine.diagnose.joints.parameters import INDEX
+from lerobot_vtrefine.diagnose.joints.twin_problem import COARSE_S, FINE_S, TwinProblem
+from lerobot_vtrefine.diagnose.parts.engine import assumed_masses
+from lerobot_vtrefine.diagnose.parts.episodes import AssumedScene, handled, lately
+from lerobot_vtrefine.diagnose.parts.payload import GRAVITY_M_S2, Arms, given, replay_loaded
 from lerobot_vtrefine.diagnose.recordings import RobotTrial
-from lerobot_vtrefine.diagnose.robot.batch import make_batch
-from lerobot_vtrefine.diagnose.robot.conversion import from_model, to_model
-from lerobot_vtrefine.diagnose.robot.fitting import INDEX, fit, servo_only
-from lerobot_vtrefine.diagnose.robot.gravity import is_sliding
-from lerobot_vtrefine.diagnose.robot.twin_problem import COARSE_S, FINE_S, TwinProblem
 from lerobot_vtrefine.embodiments import ALOHA
 from lerobot_vtrefine.sim.config import SceneConfig
 from lerobot_vtrefine.sim.pairs import load_pair

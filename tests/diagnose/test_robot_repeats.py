@@ -6,10 +6,10 @@ import numpy as np
 import pytest
 from robot_rigs import Rig, make_set
 
+from lerobot_vtrefine.diagnose.joints.batch import make_batch
+from lerobot_vtrefine.diagnose.joints.engine import diagnose_robot
+from lerobot_vtrefine.diagnose.joints.repeatability import common_part, scatter
 from lerobot_vtrefine.diagnose.recordings import read_recording_set
-from lerobot_vtrefine.diagnose.robot.batch import make_batch
-from lerobot_vtrefine.diagnose.robot.engine import diagnose_robot
-from lerobot_vtrefine.diagnose.robot.repeats import common_part, scatter
 
 SMALL = Rig(joints=("shoulder", "elbow"), rate_hz=20.0, seconds=5.0, conditions=8, jitter=0.1)
 

@@ -5,10 +5,10 @@ import json
 import numpy as np
 import pytest
 
+from lerobot_vtrefine.diagnose.joints.batch import make_batch
+from lerobot_vtrefine.diagnose.joints.model import JointModel, RobotModel, predict_positions
+from lerobot_vtrefine.diagnose.joints.servo import Columns, simulate
 from lerobot_vtrefine.diagnose.recordings import RobotTrial
-from lerobot_vtrefine.diagnose.robot.batch import make_batch
-from lerobot_vtrefine.diagnose.robot.model import JointModel, RobotModel, predict_positions
-from lerobot_vtrefine.diagnose.robot.servo import Columns, simulate
 
 
 def trial_of(t, u, q=None, load=None, file="a.parquet"):

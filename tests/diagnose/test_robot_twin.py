@@ -6,9 +6,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from lerobot_vtrefine.diagnose.joints.model import JointModel, RobotModel
+from lerobot_vtrefine.diagnose.joints.twin_servos import fit_twin
 from lerobot_vtrefine.diagnose.recordings import RecordingSet, RobotTrial
-from lerobot_vtrefine.diagnose.robot.model import JointModel, RobotModel
-from lerobot_vtrefine.diagnose.robot.twin import fit_twin
 from lerobot_vtrefine.embodiments import ALOHA
 from lerobot_vtrefine.sim.command_replay import replay_commands
 from lerobot_vtrefine.sim.config import SceneConfig

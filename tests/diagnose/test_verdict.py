@@ -43,6 +43,7 @@ def test_file_has_the_contracts_keys_and_values(tmp_path):
                 "params": {"width": {"value": 0.18, "ci95": [0.15, 0.21], "unit": "1"}},
                 "p_value": 0.0004,
                 "heldout_gain": 0.41,
+                "basis": "tested",
             }
         ],
         "ambiguous_with": [],
@@ -59,6 +60,7 @@ def test_file_has_the_contracts_keys_and_values(tmp_path):
         "minimum_detectable": {"crosstalk": 0.004},
         "next_experiment": None,
         "data_issues": [{"trial": "trial_0003.parquet", "problem": "starts loaded", "action": "set aside"}],
+        "not_tested": {},
     }
     assert [path.name for path in tmp_path.iterdir()] == ["verdict.json"]
 
@@ -132,7 +134,7 @@ def test_symptoms_belong_to_unexplained():
     ("text", "match"),
     [
         ("{}", "vtrefine/verdict@1"),
-        ('{"schema": "vtrefine/verdict@1", "status": "adequate"}', "malformed"),
+        ('{"schema": "vtrefine/verdict@1", "status": "adequate"}', "verdict lacks 'causes'"),
         ("{", "verdict.json"),
     ],
 )

@@ -7,9 +7,9 @@ import mujoco
 import numpy as np
 import pytest
 
-from lerobot_vtrefine.diagnose.vision.engine import diagnose_frames
-from lerobot_vtrefine.diagnose.vision.frames import DepthFrames
-from lerobot_vtrefine.diagnose.vision.model import CameraModel
+from lerobot_vtrefine.diagnose.camera.engine import diagnose_frames
+from lerobot_vtrefine.diagnose.camera.frames import DepthFrames
+from lerobot_vtrefine.diagnose.camera.model import CameraModel
 from lerobot_vtrefine.embodiments import ALOHA
 from lerobot_vtrefine.sim.config import SceneConfig
 from lerobot_vtrefine.sim.scene import build_arms

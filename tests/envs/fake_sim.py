@@ -4,6 +4,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from lerobot_vtrefine.embodiments import ALOHA
+
 HEIGHT, WIDTH = 6, 8
 
 
@@ -19,6 +21,7 @@ class FakeSim:
     """As ``InsertionSim``; even seeds succeed after ``3 + seed % 5`` steps, odd ones never."""
 
     noise_level = 3.0
+    embodiment = ALOHA
     privileged_names = ("time", "seed")
 
     def __init__(self, num_envs: int, episode_steps: int = 10) -> None:

@@ -6,6 +6,7 @@ from fake_sim import HEIGHT, WIDTH, FakeSim
 from lerobot.datasets import LeRobotDataset
 
 from lerobot_vtrefine.datasets.features import BASELINE_KEYS, DEPTH_KEY, TACTILE_KEYS
+from lerobot_vtrefine.embodiments import ALOHA
 from lerobot_vtrefine.envs import ablation
 from lerobot_vtrefine.envs.ablation import make_ablation, mean_frame
 from lerobot_vtrefine.envs.episodes import Episodes
@@ -33,7 +34,7 @@ def test_only_the_ablated_part_changes(part, replaced, monkeypatch):
     }
     means[DEPTH_KEY] = np.full((1, HEIGHT, WIDTH), 650.6)
     monkeypatch.setattr(ablation, "mean_frame", lambda root, keys: {key: means[key] for key in keys})
-    plain, ablated = Episodes(FakeSim(2)), Episodes(FakeSim(2), make_ablation(part, Path("somewhere")))
+    plain, ablated = Episodes(FakeSim(2)), Episodes(FakeSim(2), make_ablation(part, Path("somewhere"), ALOHA))
     for episodes in (plain, ablated):
         episodes.reset(np.arange(2), np.arange(2))
         episodes.step(np.zeros((2, 16)))
@@ -45,12 +46,12 @@ def test_only_the_ablated_part_changes(part, replaced, monkeypatch):
 
 
 def test_none_changes_nothing():
-    assert make_ablation("none", None) is None
+    assert make_ablation("none", None, ALOHA) is None
 
 
 def test_missing_dataset_is_named(tmp_path):
     with pytest.raises(FileNotFoundError, match="ablate_dataset"):
-        make_ablation("touch", tmp_path / "nothing")
+        make_ablation("touch", tmp_path / "nothing", ALOHA)
 
 
 def test_touch_ablation_hides_the_idle_level(monkeypatch):
@@ -60,7 +61,9 @@ def test_touch_ablation_hides_the_idle_level(monkeypatch):
     }
     monkeypatch.setattr(ablation, "mean_frame", lambda root, keys: {key: means[key] for key in keys})
     baseline = np.stack([np.full((4, 384), level, np.uint8) for level in (10, 40)])
-    raw = make_ablation("touch", Path("somewhere"))({"tactile": baseline + 50, "tactile_baseline": baseline})
+    raw = make_ablation("touch", Path("somewhere"), ALOHA)(
+        {"tactile": baseline + 50, "tactile_baseline": baseline}
+    )
     assert np.array_equal(raw["tactile"] - baseline, np.full((2, 4, 384), 5))
     assert raw["tactile"].dtype == np.uint8
 

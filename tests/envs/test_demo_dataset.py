@@ -19,6 +19,7 @@ from lerobot_vtrefine.datasets.features import (
     TACTILE_KEYS,
     dataset_features,
 )
+from lerobot_vtrefine.embodiments import ALOHA
 from lerobot_vtrefine.envs import demo_dataset
 from lerobot_vtrefine.envs.demo_dataset import DemoDataset
 from lerobot_vtrefine.envs.demonstrations import Demonstration
@@ -47,7 +48,7 @@ FEATURES = dataset_features(HEIGHT, WIDTH)
 
 def open_recording(root: Path, **changes) -> DemoDataset:
     settings = {"pair": "round", **changes}
-    return DemoDataset(root, "local/demo", 10, FEATURES, "some_robot", "insert", settings, first_seed=0)
+    return DemoDataset(root, "local/demo", 10, FEATURES, ALOHA, "insert", settings, first_seed=0)
 
 
 def read(root: Path) -> LeRobotDataset:
@@ -218,7 +219,7 @@ def test_robot_type_and_pad_ages_are_written(tmp_path):
     with open_recording(tmp_path / "demo") as demos:
         demos.append(demonstration(0))
     assert read(tmp_path / "demo")[2][AGE_KEY].tolist() == [0, 0, 0, 0]
-    assert read(tmp_path / "demo").meta.robot_type == "some_robot"
+    assert read(tmp_path / "demo").meta.robot_type == ALOHA.robot_type
 
 
 def dataset_files(root: Path) -> dict[str, Any]:

@@ -23,16 +23,16 @@ from lerobot_vtrefine.cli.replay import ReplayConfig
 from lerobot_vtrefine.cli.report.page import read_curve
 from lerobot_vtrefine.cli.report.results import load_evaluation
 from lerobot_vtrefine.datasets.episodes import open_episodes
+from lerobot_vtrefine.diagnose.camera.model import CameraModel
 from lerobot_vtrefine.diagnose.episode_replay.twin import read_ledger, recorded_twin
+from lerobot_vtrefine.diagnose.joints.model import JointModel, RobotModel
 from lerobot_vtrefine.diagnose.quality import check_quality, too_little
-from lerobot_vtrefine.diagnose.robot.model import JointModel, RobotModel
 from lerobot_vtrefine.diagnose.verdict import Verdict, read_verdict, write_verdict
-from lerobot_vtrefine.diagnose.vision.model import CameraModel
 from lerobot_vtrefine.embodiments import ALOHA
 from lerobot_vtrefine.envs.config import VtRefineEnvConfig
 from lerobot_vtrefine.envs.demo_dataset import LEDGER
 from lerobot_vtrefine.envs.factory import make_simulation
-from lerobot_vtrefine.robots.pad_features import configured_pads
+from lerobot_vtrefine.lerobot_compat.pad_features import configured_pads
 from lerobot_vtrefine.tactile import SensorModel
 from lerobot_vtrefine.tactile.stages.base import STAGES
 

@@ -13,9 +13,9 @@ from commands import dataset_flags, follower_flags, leader_flags, run_command
 from lerobot.datasets.lerobot_dataset import LeRobotDataset
 from rig import Rig
 
-from lerobot_vtrefine.datasets import safe_recording
 from lerobot_vtrefine.datasets.features import TACTILE_KEYS
 from lerobot_vtrefine.drivers.sources import check_pattern
+from lerobot_vtrefine.lerobot_compat import safe_recording
 
 FPS = 10
 RECORD = """

@@ -13,7 +13,7 @@ from rig import Rig
 from lerobot_vtrefine.cli.view_pads import main as view_pads
 from lerobot_vtrefine.datasets.features import PADS
 from lerobot_vtrefine.drivers.config import PadConfig
-from lerobot_vtrefine.robots import live_view
+from lerobot_vtrefine.lerobot_compat import live_view
 
 rr = pytest.importorskip("rerun")
 pytestmark = pytest.mark.filterwarnings("ignore::DeprecationWarning")

@@ -121,8 +121,7 @@ def test_making_a_robot_extends_the_stock_commands(boards: dict[str, PadEmulator
     from lerobot.datasets.lerobot_dataset import LeRobotDataset
     from lerobot.utils import feature_utils, visualization_utils
 
-    from lerobot_vtrefine.datasets import arrays, card
-    from lerobot_vtrefine.robots import live_view
+    from lerobot_vtrefine.lerobot_compat import arrays, card, live_view
 
     for part in (arrays, card, live_view):
         part.uninstall()

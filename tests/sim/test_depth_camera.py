@@ -2,6 +2,7 @@ import mujoco
 import numpy as np
 import pytest
 
+from lerobot_vtrefine.embodiments import ALOHA
 from lerobot_vtrefine.sim.camera import Camera, make_camera
 from lerobot_vtrefine.sim.config import CameraConfig, RandomizationConfig, SceneConfig
 from lerobot_vtrefine.sim.depth import DepthCamera
@@ -65,7 +66,7 @@ def test_plug_tip_mouth_and_both_hands_are_in_view():
 
 def test_camera_geometry_follows_opencv():
     settings = CameraConfig(81, 61, 0.5, (-0.4, 0.1, 0.4), (0.0, 0.1, 0.1))
-    camera = make_camera(SceneConfig(camera=settings))
+    camera = make_camera(SceneConfig(camera=settings), ALOHA)
     middle = camera.directions().reshape(61, 81, 3)[30, 40]
     np.testing.assert_allclose(middle, [0, 0, 1], atol=1e-12)
     forward = camera.rotation @ middle
@@ -154,4 +155,4 @@ def test_bad_cameras_are_named():
     with pytest.raises(ValueError, match="at least one pixel"):
         CameraConfig(0, 60, 0.5, (0, 0, 1), (0, 0, 0))
     with pytest.raises(ValueError, match=r"camera.position_m and camera.target_m"):
-        make_camera(SceneConfig(camera=CameraConfig(8, 6, 0.5, (0, 0, 1), (0, 0, 0))))
+        make_camera(SceneConfig(camera=CameraConfig(8, 6, 0.5, (0, 0, 1), (0, 0, 0))), ALOHA)

@@ -6,11 +6,14 @@ from itertools import combinations
 import numpy as np
 import pytest
 
+from lerobot_vtrefine.embodiments import ALOHA
 from lerobot_vtrefine.sim import headless, render
 from lerobot_vtrefine.sim.config import SceneConfig, TaskConfig
 from lerobot_vtrefine.sim.pad_panel import Progress, pad_panel, panel_size
 from lerobot_vtrefine.sim.render import VideoRenderer, shaded_depth
 from lerobot_vtrefine.sim.simulation import InsertionSim
+
+PADS = ALOHA.pad_names, ALOHA.pad_layout
 
 
 @pytest.fixture(scope="module")
@@ -92,9 +95,9 @@ def test_panel_brightens_where_a_pad_is_pressed() -> None:
     idle = np.full((4, 384), 20, np.uint8)
     pressed = idle.copy()
     pressed[2, :32] = 180  # row 0 of the third pad
-    before, after = (pad_panel(counts, idle, 12, 32, Progress(3, np.nan, 1.0)) for counts in (idle, pressed))
+    before, after = (pad_panel(counts, idle, *PADS, Progress(3, np.nan, 1.0)) for counts in (idle, pressed))
     rows, cols = np.nonzero(np.abs(after.astype(int) - before).sum(-1) > 60)
-    height, width = panel_size(12, 32)
+    height, width = panel_size(*PADS)
     assert before.shape == (height, width, 3)
     # Inside the third quarter: its label and the band of its first row.
     assert height * 0.5 < rows.min() < rows.max() < height * 0.7
@@ -106,12 +109,12 @@ def test_panel_shows_how_the_hold_fills() -> None:
     idle = np.zeros((4, 384), np.uint8)
     green = []
     for seated_s in (np.nan, 0.0, 0.3, 0.6, 1.0):
-        panel = pad_panel(idle, idle, 12, 32, Progress(3, seated_s, hold_s=1.0)).astype(int)[:34, -40:]
+        panel = pad_panel(idle, idle, *PADS, Progress(3, seated_s, hold_s=1.0)).astype(int)[:34, -40:]
         green.append(int((panel[..., 1] - panel[..., 0] > 60).sum()))
     assert green[0] == green[1] == 0
     assert np.all(np.diff(green[1:]) > 50)
     ends = ("", "success", "contact force", "time out")
-    panels = [pad_panel(idle, idle, 12, 32, Progress(3, np.nan, 1.0, outcome))[:34] for outcome in ends]
+    panels = [pad_panel(idle, idle, *PADS, Progress(3, np.nan, 1.0, outcome))[:34] for outcome in ends]
     assert all((one != other).any() for one, other in combinations(panels, 2))
 
 

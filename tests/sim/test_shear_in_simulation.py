@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from lerobot_vtrefine.sim.config import RandomizationConfig, SceneConfig, ShearConfig, TaskConfig
-from lerobot_vtrefine.sim.sensing import HELD
+from lerobot_vtrefine.sim.sensing import held_bodies
 from lerobot_vtrefine.sim.simulation import InsertionSim
 from lerobot_vtrefine.tactile import Poses
 
@@ -56,7 +56,7 @@ def test_a_part_at_rest_hangs_on_its_two_pads(sim):
     force = (sim._touch_at(TWO).poses[1] @ on_pad[..., None])[..., 0]
     mass = sim.scene.model.body_mass[[sim.scene.plug_body, sim.scene.socket_body]]
     for part, weight in enumerate(9.81 * mass):
-        carried = force[:, np.array(HELD) == part].sum(1)
+        carried = force[:, np.array(held_bodies(sim.embodiment)) == part].sum(1)
         np.testing.assert_allclose(carried, np.tile([0.0, 0.0, -weight], (2, 1)), atol=0.02 * weight + 2e-3)
     assert np.abs(shear).max() > 0.1
 

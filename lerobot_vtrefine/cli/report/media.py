@@ -7,7 +7,8 @@ import numpy as np
 import pyarrow.parquet as pq
 from PIL import Image
 
-from lerobot_vtrefine.datasets.features import BASELINE_KEYS, PAD_COLS, PAD_ROWS, PADS, TACTILE_KEYS, Array
+from lerobot_vtrefine.datasets.features import BASELINE_PREFIX, TACTILE_PREFIX, Array
+from lerobot_vtrefine.embodiments import pad_layout_of
 from lerobot_vtrefine.pages.pads import encode
 
 MIME = {".mp4": "video/mp4", ".webm": "video/webm", ".png": "image/png", ".gif": "image/gif"}
@@ -28,7 +29,7 @@ def strongest_contact(dataset_root: Path) -> dict[str, Array]:
     """Counts above the baseline of the frame with the strongest contact in a dataset's first data file.
 
     Returns:
-        Pad name -> (12, 32) int array.
+        Pad name -> int array (rows, columns), in the order of the dataset's columns.
 
     Raises:
         FileNotFoundError: there is no data file below ``dataset_root``.
@@ -36,15 +37,18 @@ def strongest_contact(dataset_root: Path) -> dict[str, Array]:
     files = sorted((dataset_root / "data").rglob("*.parquet"))
     if not files:
         raise FileNotFoundError(f"no recorded frames below {dataset_root / 'data'}")
-    table = pq.read_table(files[0], columns=[*TACTILE_KEYS, *BASELINE_KEYS])
-    counts = {
-        key: np.stack(table[key].to_numpy(zero_copy_only=False)).astype(int) for key in table.column_names
-    }
-    pressed = [
-        np.abs(counts[key] - counts[idle]) for key, idle in zip(TACTILE_KEYS, BASELINE_KEYS, strict=True)
-    ]
+    names = pq.read_schema(files[0]).names
+    pads = [name.removeprefix(TACTILE_PREFIX) for name in names if name.startswith(TACTILE_PREFIX)]
+    keys = [f"{prefix}{pad}" for pad in pads for prefix in (TACTILE_PREFIX, BASELINE_PREFIX)]
+    table = pq.read_table(files[0], columns=keys)
+    counts = [np.stack(table[key].to_numpy(zero_copy_only=False)).astype(int) for key in keys]
+    pressed = [np.abs(now - idle) for now, idle in zip(counts[::2], counts[1::2], strict=True)]
     frame = int(np.argmax(sum(values.sum(axis=1) for values in pressed)))
-    return {pad: values[frame].reshape(PAD_ROWS, PAD_COLS) for pad, values in zip(PADS, pressed, strict=True)}
+    layouts = [pad_layout_of(pad) for pad in pads]
+    return {
+        pad: values[frame].reshape(layout.rows, layout.cols)
+        for pad, values, layout in zip(pads, pressed, layouts, strict=True)
+    }
 
 
 def write_gif(video: Path, target: Path, width: int, every: int) -> None:

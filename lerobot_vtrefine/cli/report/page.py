@@ -13,7 +13,7 @@ from lerobot_vtrefine.cli.pipeline.progress import clock
 from lerobot_vtrefine.cli.report.charts import Bar, Series, bar_chart, line_chart
 from lerobot_vtrefine.cli.report.cloud import recorded_cloud
 from lerobot_vtrefine.cli.report.media import data_uri, strongest_contact
-from lerobot_vtrefine.datasets.features import PADS, Array
+from lerobot_vtrefine.datasets.features import Array
 from lerobot_vtrefine.files import read_number_rows
 from lerobot_vtrefine.pages.pads import COLOUR_MAP, colour_scale, pad_image
 from lerobot_vtrefine.pages.render import render
@@ -198,12 +198,12 @@ def caption(policy: str, video: dict[str, Any]) -> str:
 
 
 def pad_pictures(frames: dict[str, Array], highest: float) -> list[dict[str, str]]:
-    """The four pads' frames on one colour scale."""
+    """The pads' frames on one colour scale."""
     return [
         {
             "title": pad.replace("_", " "),
             "source": pad_image(frames[pad], highest),
             "maximum": f"{frames[pad].max():.0f}",
         }
-        for pad in PADS
+        for pad in frames
     ]

@@ -67,7 +67,7 @@ def _abandon(dataset: "LeRobotDataset") -> None:
 def write_recording_set(
     episodes: Sequence[JointEpisode], joints: Sequence[str], folder: Path, fps: float
 ) -> None:
-    """Write a recording set of ``kind: robot`` (``contract_diagnose.md`` §1), one trial per episode.
+    """Write a recording set of ``kind: robot`` (``docs/recording-format.md``), one trial per episode.
 
     Trials were recorded one after the other: session times add up, pauses between episodes are not known.
 

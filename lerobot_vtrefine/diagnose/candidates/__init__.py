@@ -14,6 +14,7 @@ LISTED = (
     "saturation",
     "viscoelastic_relaxation",
     "hysteresis",
+    "first_load_softening",
     "row_sharing",
     "crosstalk",
     "mechanical_spreading",

@@ -35,6 +35,8 @@ class Setting:
     """Mean session time of the frames that the idle map rests on [s]."""
     temperature_c: float | None = None
     """Mean temperature; None where it was not recorded throughout, or did not change."""
+    row_company: int = 1
+    """Most taxels of a row that are pressed at once."""
     log_gain: float | None = None
     """Logarithm of the plain baseline's counts per metre (or newton); None before it is fitted."""
 
@@ -58,7 +60,7 @@ class Form:
     """One functional form of a cause.
 
     Attributes:
-        family: name of the cause (contract §4).
+        family: name of the cause (docs/verdict.md).
         label: what form this is, for people.
         values: fitted coordinates; coordinate vectors elsewhere follow their order.
         build: coordinates and setting to stages.
@@ -88,6 +90,8 @@ class Form:
     """Whether its probes take part in screening; fallbacks are only fitted where their family is named."""
     peer: bool = False
     """Whether it is no richer than the plain form: it need not foretell clearly better, only better."""
+    needs: str = "recordings in which it can act"
+    """What to record where the cause cannot show."""
     grown: Callable[[np.ndarray, Setting], list[float]] | None = None
     """The family's plain form, given by its coordinates, as this form has it: where descents start."""
 

@@ -22,6 +22,7 @@ FORMS = (
         lambda v, s: (ContactOffset(float(v[0])),),
         lambda v, s: {"offset_m": (float(v[0]), "m")},
         lambda s: [[2e-5]],
+        needs="log depth_m, and press shallow and deep",
         signed=True,
         possible=lambda s: not s.loaded,
     ),

@@ -18,6 +18,7 @@ FORMS = (
             if lines > 1
         ],
         amplitude=None,
+        needs="log depth_m, and press at three places or more that are not on a line",
         signed=True,
         possible=lambda s: not s.loaded and max(s.touched_rows, s.touched_cols) > 1,
     ),

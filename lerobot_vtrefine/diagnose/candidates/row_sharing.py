@@ -27,7 +27,9 @@ FORMS = tuple(
         build,
         _report,
         lambda s: [[0.05]],
-        possible=lambda s: s.layout.cols > 1 and s.touched_cols > 1,
+        needs="press two taxels of a row or more at once, with a wider indenter",
+        possible=lambda s: s.row_company > 1,
+        peer=build is _others,
     )
     for label, build in (("divider", _plain), ("divider of the others", _others))
 )

@@ -41,6 +41,15 @@ def held(presses: PressSet) -> bool:
     return bool(seen > MIN_HELD and by_chance < CHANCE * seen)
 
 
+def shortest_period(presses: PressSet, frame_s: float) -> float | None:
+    """Mean time between new readings from which on `held` sees it [s]; None where repeats tell nothing."""
+    shares = [share for press in presses.presses if (share := _repeats(press)) is not None]
+    if not shares:
+        return None
+    seen = max(MIN_HELD, float(np.mean([chance for _, chance in shares])) / CHANCE)
+    return frame_s / (1.0 - seen) if seen < 1.0 else None
+
+
 def _repeats(press: Press) -> tuple[float, float] | None:
     """Share of frames under load that repeat the one before, and what share would by chance; None if unknown.
 
@@ -202,6 +211,7 @@ FORMS = (
         lambda v, s: (SampleAndHold(float(v[0])),),
         lambda v, s: {"period_s": (float(v[0]), "s")},
         lambda s: [[2.0001 * s.frame_s], [3.0001 * s.frame_s], [5.0001 * s.frame_s]],
+        needs="record every frame with its own time, moving, with readings that carry noise",
         amplitude=None,
         search=periods,
         range=undecided(False),

@@ -59,6 +59,7 @@ ONE = Form(
     _one,
     lambda v, s: {"tau_s": (float(np.exp(v[1])), "s"), "fraction": (float(v[0]), "1")},
     lambda s: [[0.05, float(np.log(tau))] for tau in _taus(s)],
+    needs="hold for several seconds, and record on after the release",
     signed=True,
 )
 SEVERAL = Form(
@@ -79,6 +80,7 @@ FORMS = (
         label="one branch, never pulling",
         build=_pushing(_one),
         screened=False,
+        peer=True,
         grown=lambda v, s: v.tolist(),
     ),
     SEVERAL,

@@ -12,15 +12,23 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from lerobot_vtrefine.datasets.episodes import open_episodes
-from lerobot_vtrefine.diagnose.dataset.merge import beside
-from lerobot_vtrefine.diagnose.object.engine import (
-    ObjectDiagnosis,
+from lerobot_vtrefine.diagnose.camera.engine import diagnose_camera
+from lerobot_vtrefine.diagnose.camera.frames import has_depth
+from lerobot_vtrefine.diagnose.core.diagnosis import Diagnosis
+from lerobot_vtrefine.diagnose.core.engine import Progress
+from lerobot_vtrefine.diagnose.dataset.merge import merged
+from lerobot_vtrefine.diagnose.joints.dataset import episode_name
+from lerobot_vtrefine.diagnose.joints.engine import diagnose_robot
+from lerobot_vtrefine.diagnose.joints.model import RobotModel
+from lerobot_vtrefine.diagnose.joints.twin_diagnosis import TwinTrial, beyond_twin, diagnose_on_twin
+from lerobot_vtrefine.diagnose.parts.engine import (
     assumed_masses,
-    diagnose_objects,
+    believed_masses,
+    diagnose_parts,
     found_masses,
     unknown_parts,
 )
-from lerobot_vtrefine.diagnose.object.episodes import (
+from lerobot_vtrefine.diagnose.parts.episodes import (
     AssumedScene,
     HandledEpisode,
     assumed_scene,
@@ -28,13 +36,8 @@ from lerobot_vtrefine.diagnose.object.episodes import (
     lately,
     read_episodes,
 )
-from lerobot_vtrefine.diagnose.object.payload import GRAVITY_M_S2, Arms, given, replay_loaded
+from lerobot_vtrefine.diagnose.parts.payload import GRAVITY_M_S2, Arms, given, replay_loaded
 from lerobot_vtrefine.diagnose.recordings import RecordingSet
-from lerobot_vtrefine.diagnose.robot.dataset import episode_name
-from lerobot_vtrefine.diagnose.robot.engine import Progress, RobotDiagnosis, diagnose_robot
-from lerobot_vtrefine.diagnose.robot.on_twin import TwinTrial, beyond_twin, diagnose_on_twin
-from lerobot_vtrefine.diagnose.vision.engine import diagnose_vision
-from lerobot_vtrefine.diagnose.vision.frames import has_depth
 
 Array = np.ndarray
 
@@ -45,9 +48,7 @@ WEIGHT_KNOWN = 0.05
 """Part of what the carried weight does to the joints that may be wrong without the robot being so."""
 
 
-def diagnose_dataset(
-    recordings: RecordingSet, seed: int = 0, progress: Progress | None = None
-) -> RobotDiagnosis:
+def diagnose_dataset(recordings: RecordingSet, seed: int = 0, progress: Progress | None = None) -> Diagnosis:
     """Judge a dataset; `recordings` are its episodes after quality control.
 
     Raises:
@@ -59,11 +60,11 @@ def diagnose_dataset(
         found, objects = diagnose_robot(recordings, seed, progress), unknown_parts()
     else:
         found, objects = _on_twin(recordings, scene, seed, progress)
-    found = beside(found, objects)
+    found = merged(found, objects)
     if not has_depth(recordings.path):
         return found
     tell("camera: comparing depth images", 0.9)
-    return beside(found, diagnose_vision(recordings.path, seed, progress))
+    return merged(found, diagnose_camera(recordings.path, seed, progress))
 
 
 @dataclass(frozen=True)
@@ -92,7 +93,7 @@ class _Session:
 
 def _on_twin(
     recordings: RecordingSet, scene: AssumedScene, seed: int, progress: Progress | None
-) -> tuple[RobotDiagnosis, ObjectDiagnosis]:
+) -> tuple[Diagnosis, Diagnosis]:
     kept = {trial.file for trial in recordings.trials}
     episodes = read_episodes(recordings.path, scene)
     episodes = tuple(item for item in episodes if episode_name(item.index) in kept)
@@ -100,13 +101,14 @@ def _on_twin(
     session = _Session(recordings, arms, scene, episodes)
     mass = found_masses(arms, scene, episodes, seed)
     found = _robot(session, mass, seed, progress)
-    objects = diagnose_objects(arms, scene, _corrected(session, found, mass), seed)
-    if np.abs(objects.mass_kg - mass).max() > 0.1 * assumed_masses(scene).min():
-        found = _robot(session, objects.mass_kg, seed, progress)
+    objects = diagnose_parts(arms, scene, _corrected(session, found, mass), seed)
+    now = believed_masses(objects, scene)
+    if np.abs(now - mass).max() > 0.1 * assumed_masses(scene).min():
+        found = _robot(session, now, seed, progress)
     return found, objects
 
 
-def _robot(session: _Session, mass_kg: Array, seed: int, progress: Progress | None) -> RobotDiagnosis:
+def _robot(session: _Session, mass_kg: Array, seed: int, progress: Progress | None) -> Diagnosis:
     twin, empty = session.twin(mass_kg), session.twin(np.zeros(2))
     bent = [np.abs(one.path - empty[name].path)[one.usable] for name, one in twin.items()]
     floor = WEIGHT_KNOWN * max(float(np.max(item, initial=0.0)) for item in bent)
@@ -116,9 +118,10 @@ def _robot(session: _Session, mass_kg: Array, seed: int, progress: Progress | No
     )
 
 
-def _corrected(session: _Session, found: RobotDiagnosis, mass_kg: Array) -> Sequence[HandledEpisode]:
+def _corrected(session: _Session, found: Diagnosis, mass_kg: Array) -> Sequence[HandledEpisode]:
     """Episodes as the twin's own encoders would have read them, had the robot none of what was found."""
     twin, arms = session.twin(mass_kg), session.arms
+    assert isinstance(found.extended_model, RobotModel)
     more = beyond_twin(session.recordings, twin, arms.config, arms.hold, found.extended_model)
     return [
         replace(episode, position=episode.position - more[episode_name(episode.index)])

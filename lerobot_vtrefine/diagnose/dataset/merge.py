@@ -1,40 +1,14 @@
 """One verdict from several: what was found about parts or a camera, beside what was found about the robot."""
 
-from collections.abc import Mapping
 from dataclasses import replace
-from typing import Any, Protocol
 
-from lerobot_vtrefine.diagnose.evidence import Evidence, TrialError
-from lerobot_vtrefine.diagnose.robot.engine import RobotDiagnosis
-from lerobot_vtrefine.diagnose.verdict import Cause, Heldout, Status
+from lerobot_vtrefine.diagnose.core.diagnosis import Diagnosis
+from lerobot_vtrefine.diagnose.verdict import Status
 
 _WORSE: tuple[Status, ...] = ("adequate", "explained", "ambiguous", "unexplained")
 
 
-class Findings(Protocol):
-    """What else a dataset tells."""
-
-    @property
-    def status(self) -> Status: ...  # noqa: D102
-    @property
-    def causes(self) -> tuple[Cause, ...]: ...  # noqa: D102
-    @property
-    def ambiguous_with(self) -> tuple[tuple[str, ...], ...]: ...  # noqa: D102
-    @property
-    def minimum_detectable(self) -> Mapping[str, float]: ...  # noqa: D102
-    @property
-    def next_experiment(self) -> Mapping[str, Any] | None: ...  # noqa: D102
-    @property
-    def heldout(self) -> Heldout | None: ...  # noqa: D102
-    @property
-    def trial_errors(self) -> tuple[TrialError, ...]: ...  # noqa: D102
-    @property
-    def unit(self) -> str: ...  # noqa: D102
-    @property
-    def evidence(self) -> tuple[Evidence, ...]: ...  # noqa: D102
-
-
-def beside(robot: RobotDiagnosis, other: Findings) -> RobotDiagnosis:
+def merged(robot: Diagnosis, other: Diagnosis) -> Diagnosis:
     """The robot's diagnosis with other causes beside its own.
 
     Held-out errors are those of the joints where something was found about these, else those of what was
@@ -44,18 +18,21 @@ def beside(robot: RobotDiagnosis, other: Findings) -> RobotDiagnosis:
     if other.causes and robot.status == "adequate":
         errors = {"heldout": other.heldout, "trial_errors": other.trial_errors, "unit": other.unit}
         robot = replace(robot, **errors, traces=(), residuals=())
-    alarmed = robot.unknown.alarm
-    causes = [replace(cause, role="symptom") if alarmed else cause for cause in other.causes]
+    unknown = robot.unknown if robot.unknown.alarm else other.unknown
+    causes = [
+        replace(cause, role="symptom") if unknown.alarm else cause for cause in (*robot.causes, *other.causes)
+    ]
     evidence = [
-        replace(item, decision="symptom") if alarmed and item.decision == "accepted" else item
-        for item in other.evidence
+        replace(item, decision="symptom") if unknown.alarm and item.decision == "accepted" else item
+        for item in (*robot.evidence, *other.evidence)
     ]
     return replace(
         robot,
         status=max(robot.status, other.status, key=_WORSE.index),
-        causes=(*robot.causes, *causes),
-        ambiguous_with=() if alarmed else (*robot.ambiguous_with, *other.ambiguous_with),
+        causes=tuple(causes),
+        ambiguous_with=() if unknown.alarm else (*robot.ambiguous_with, *other.ambiguous_with),
+        unknown=unknown,
         minimum_detectable={**robot.minimum_detectable, **other.minimum_detectable},
         next_experiment=robot.next_experiment or other.next_experiment,
-        evidence=(*robot.evidence, *evidence),
+        evidence=tuple(evidence),
     )

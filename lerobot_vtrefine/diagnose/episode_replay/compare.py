@@ -10,7 +10,7 @@ import numpy as np
 from tqdm import tqdm
 
 from lerobot_vtrefine.datasets.episodes import EpisodeFolder, RecordedEpisode
-from lerobot_vtrefine.datasets.features import JOINT_SUFFIX, PADS, Array
+from lerobot_vtrefine.datasets.features import JOINT_SUFFIX, Array
 from lerobot_vtrefine.diagnose.episode_replay.reach import (
     HandReach,
     describe_reach,
@@ -177,7 +177,7 @@ def _reach(pairs: list[EpisodePair], config: VtRefineEnvConfig, fps: float, own:
 
     parts = load_pair(scene)
     tops = part_top_m(parts.socket), part_top_m(parts.plug)
-    touches = [pad_peaks({pad: pair.counts[pad] for pad in PADS}, pair.baselines) for pair in pairs]
+    touches = [pad_peaks(pair.counts, pair.baselines) for pair in pairs]
     return hand_reaches(robot, states, scene.table_height_m, tops, touches, fps)
 
 
@@ -219,8 +219,8 @@ def _replay_scenes(
                 continue
         seed = seeds[episode.index] if seeds else episode.index
         replayed = replay_scene(sim, episode.action, seed, start)
-        counts = {pad: replayed.counts[:, i] for i, pad in enumerate(PADS)}
-        baselines = {pad: replayed.baseline[i] for i, pad in enumerate(PADS)}
+        counts = {pad: replayed.counts[:, i] for i, pad in enumerate(sim.embodiment.pad_names)}
+        baselines = {pad: replayed.baseline[i] for i, pad in enumerate(sim.embodiment.pad_names)}
         pairs.append(EpisodePair(episode, replayed.position, counts, baselines, replayed.success))
     if not pairs:
         raise ValueError(f"none of {len(recorded)} episodes can be replayed: {next(iter(skipped.values()))}")
@@ -229,7 +229,7 @@ def _replay_scenes(
 
 def _compare_touch(pairs: list[EpisodePair]) -> list[PadTouch]:
     rows = []
-    for pad in PADS:
+    for pad in pairs[0].counts:
         both = [pair for pair in pairs if pad in pair.recorded.counts and pad in pair.counts]
         both = [pair for pair in both if pair.recorded.counts[pad].shape == pair.counts[pad].shape]
         if not both:

@@ -6,10 +6,11 @@ import io
 import numpy as np
 from matplotlib.figure import Figure
 
-from lerobot_vtrefine.datasets.features import PAD_COLS, PAD_ROWS, PADS, Array
+from lerobot_vtrefine.datasets.features import Array
 from lerobot_vtrefine.diagnose.episode_replay.compare import EpisodePair
 from lerobot_vtrefine.diagnose.episode_replay.touch import COUNT_BINS, READING_BINS, PadTouch, pressed
 from lerobot_vtrefine.diagnose.episode_replay.tracking import JointTracking
+from lerobot_vtrefine.embodiments import pad_layout_of
 
 RECORDED, TWIN, COMMAND = "#1f6fb4", "#d1601f", "#9a9a9a"
 DPI = 95
@@ -93,7 +94,7 @@ def histograms(touch: list[PadTouch]) -> Figure:
 
 def pad_totals(pair: EpisodePair, fps: float) -> Figure:
     """Sum of counts above idle over one episode, per pad."""
-    pads = [pad for pad in PADS if pad in pair.recorded.counts and pad in pair.counts]
+    pads = [pad for pad in pair.counts if pad in pair.recorded.counts]
     figure = Figure(figsize=(12, 2.4), layout="constrained")
     axes = figure.subplots(1, len(pads), squeeze=False, sharex=True)[0]
     for axis, pad in zip(axes, pads, strict=True):
@@ -111,17 +112,17 @@ def pad_totals(pair: EpisodePair, fps: float) -> Figure:
 
 def frames(pair: EpisodePair, moment: int) -> Figure:
     """Recorded above twin, all pads at one frame on one colour scale (counts above idle)."""
-    pads = [pad for pad in PADS if pad in pair.recorded.counts and pad in pair.counts]
+    pads = [pad for pad in pair.counts if pad in pair.recorded.counts]
     above = {pad: [side[moment] for side in pads_above(pair, pad)] for pad in pads}
     highest = max(1.0, *(float(side.max()) for sides in above.values() for side in sides))
     figure = Figure(figsize=(3.1 * len(pads), 2.7), layout="constrained")
     axes = figure.subplots(2, len(pads), squeeze=False)
     for column, pad in enumerate(pads):
+        layout = pad_layout_of(pad)
         for row, name in enumerate(("recorded", "twin")):
             axis = axes[row, column]
-            image = axis.imshow(
-                above[pad][row].reshape(PAD_ROWS, PAD_COLS), vmin=0, vmax=highest, cmap="viridis"
-            )
+            picture = above[pad][row].reshape(layout.rows, layout.cols)
+            image = axis.imshow(picture, vmin=0, vmax=highest, cmap="viridis")
             axis.set_xticks([])
             axis.set_yticks([])
             if column == 0:

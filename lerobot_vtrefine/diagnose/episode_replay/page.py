@@ -4,10 +4,10 @@ from typing import Any
 
 import numpy as np
 
-from lerobot_vtrefine.datasets.features import PAD_COLS, PAD_ROWS, PADS
 from lerobot_vtrefine.diagnose.episode_replay import figures
 from lerobot_vtrefine.diagnose.episode_replay.compare import Comparison, EpisodePair
 from lerobot_vtrefine.diagnose.episode_replay.touch import telling_frames
+from lerobot_vtrefine.embodiments import pad_layout_of
 from lerobot_vtrefine.pages.pads import colour_scale, pad_film
 from lerobot_vtrefine.pages.render import render
 
@@ -68,9 +68,11 @@ def verdict(comparison: Comparison) -> str:
 
 def _films(pair: EpisodePair, fps: float) -> list[dict[str, str]]:
     """Every pad in motion, recorded beside the twin, on one scale."""
-    pads = [pad for pad in PADS if pad in pair.recorded.counts and pad in pair.counts]
-    shape = (-1, PAD_ROWS, PAD_COLS)
-    sides = {pad: [side.reshape(shape) for side in figures.pads_above(pair, pad)] for pad in pads}
+    sides = {}
+    for pad in (name for name in pair.recorded.counts if name in pair.counts):
+        layout = pad_layout_of(pad)
+        shape = (-1, layout.rows, layout.cols)
+        sides[pad] = [side.reshape(shape) for side in figures.pads_above(pair, pad)]
     top = max(1.0, *(float(side.max()) for both in sides.values() for side in both))
     return [
         {
@@ -119,7 +121,7 @@ def _strongest_touch(comparison: Comparison) -> EpisodePair | None:
 
 
 def _moments(pair: EpisodePair, fps: float) -> list[tuple[str, str]]:
-    pads = [pad for pad in PADS if pad in pair.recorded.counts and pad in pair.counts]
+    pads = [pad for pad in pair.counts if pad in pair.recorded.counts]
     above = np.concatenate([figures.pads_above(pair, pad)[0] for pad in pads], axis=1)
     return [
         (f"{moment / fps:.1f} s", figures.data_uri(figures.frames(pair, moment)))

@@ -14,7 +14,6 @@ import torch
 from lerobot_vtrefine.datasets.features import Array
 from lerobot_vtrefine.diagnose.episode_replay.touch import pressed
 from lerobot_vtrefine.embodiments import Embodiment
-from lerobot_vtrefine.embodiments.embodiment import ARM_NAMES
 from lerobot_vtrefine.observation.visuo_tactile import VisuoTactileConfig
 from lerobot_vtrefine.tactile.geometry import Box, Cylinder, quaternion_matrix
 
@@ -49,7 +48,7 @@ def lowest_edges(embodiment: Embodiment, joints: Array) -> Array:
     length, width, _ = embodiment.fingers.pad_size_m
     along, across = rotation[..., 2, 0].abs(), rotation[..., 2, 1].abs()
     lowest = position[..., 2] - (length * along + width * across) / 2
-    return lowest.unflatten(-1, (2, 2)).amin(-1).numpy()
+    return lowest.unflatten(-1, (embodiment.num_arms, -1)).amin(-1).numpy()
 
 
 def hand_reaches(
@@ -74,7 +73,7 @@ def hand_reaches(
     from lerobot_vtrefine.sim.command_replay import grasp_frame  # MuJoCo takes seconds to import
 
     rows = []
-    for arm, name in enumerate(ARM_NAMES):
+    for arm, name in enumerate(item.name for item in embodiment.arms):
         moments = [grasp_frame(embodiment, state, arm) for state in states]
         closing = [index for index, moment in enumerate(moments) if moment is not None]
         if not closing:

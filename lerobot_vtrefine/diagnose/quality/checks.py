@@ -20,7 +20,7 @@ from lerobot_vtrefine.diagnose.quality.joints import (
     check_joint_order,
     check_jumps,
 )
-from lerobot_vtrefine.diagnose.quality.odd import check_gain, check_odd
+from lerobot_vtrefine.diagnose.quality.outliers import check_gain, check_odd
 from lerobot_vtrefine.diagnose.quality.readings import check_readings, check_wraps
 from lerobot_vtrefine.diagnose.quality.response import check_answers, check_start, check_stuck
 from lerobot_vtrefine.diagnose.quality.session import check_conditions, check_session
@@ -98,7 +98,7 @@ def check_quality(recordings: RecordingSet) -> tuple[RecordingSet, list[DataIssu
 
 
 def in_si_units(recordings: RecordingSet) -> tuple[RecordingSet, list[DataIssue]]:
-    """The set with lengths, angles and times in the contract's units where they clearly were in others.
+    """The set with lengths, angles and times in the format's units where they clearly were in others.
 
     Trials in units that nobody knows are kept as they are.
     """

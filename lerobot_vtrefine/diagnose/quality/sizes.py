@@ -1,4 +1,4 @@
-"""Checks of lengths in `recording.json`: millimetres where the contract wants metres."""
+"""Checks of lengths in `recording.json`: millimetres where the format wants metres."""
 
 from collections.abc import Iterator
 from dataclasses import replace

@@ -1,4 +1,4 @@
-"""Checks of units: millimetres, milliseconds and degrees where the contract wants SI units.
+"""Checks of units: millimetres, milliseconds and degrees where the format wants SI units.
 
 A column is repaired only where nothing else fits: its values are impossible in the unit that they should
 have, or a clear factor away from the other trials', and usual after the division.
@@ -28,7 +28,7 @@ FAR_START_S = 10.0
 
 @dataclass(frozen=True)
 class Mistake:
-    """Units that people write instead of the contract's.
+    """Units that people write instead of the format's.
 
     ``limit`` is the largest plausible value in the right unit; a column above it is repaired when dividing by
     one of the ``units``' factors brings it below.
@@ -59,7 +59,7 @@ ROBOT_MISTAKES = (
 
 
 def check_units(recordings: RecordingSet) -> Iterator[Finding]:
-    """Columns in another unit than the contract's, and times that do not count from the trial's start."""
+    """Columns in another unit than the format's, and times that do not count from the trial's start."""
     trials = dict(enumerate(recordings.trials))
     mistakes = _mistakes(recordings)
     for mistake in mistakes:

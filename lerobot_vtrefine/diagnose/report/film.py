@@ -5,7 +5,7 @@ from typing import Any
 
 import numpy as np
 
-from lerobot_vtrefine.diagnose.evidence import Diagnosis
+from lerobot_vtrefine.diagnose.core.diagnosis import Diagnosis
 from lerobot_vtrefine.diagnose.predict import predict_frames
 from lerobot_vtrefine.diagnose.prediction import predict_trial
 from lerobot_vtrefine.diagnose.quality import in_si_units

@@ -7,7 +7,8 @@ from typing import Any
 
 import numpy as np
 
-from lerobot_vtrefine.diagnose.evidence import Diagnosis, Evidence, Trace
+from lerobot_vtrefine.diagnose.core.diagnosis import Diagnosis
+from lerobot_vtrefine.diagnose.evidence import Evidence, Trace
 from lerobot_vtrefine.diagnose.recordings import RecordingSet
 from lerobot_vtrefine.diagnose.report.effects import effect_drawing
 from lerobot_vtrefine.diagnose.report.figures import (
@@ -26,6 +27,7 @@ from lerobot_vtrefine.diagnose.report.words import (
     doubts,
     headline,
     meaning,
+    size_text,
     ties,
     title,
 )
@@ -72,16 +74,13 @@ def render_report(
         facts=_facts(verdict, recordings, sound, seed),
         next_experiment=_experiment(verdict.next_experiment),
         detectable=[
-            {
-                "title": title(name),
-                "what": meaning(name).parameter,
-                "size": quantity(size, meaning(name).unit),
-            }
+            {"title": title(name), "size": size_text(name, size)}
             for name, size in verdict.minimum_detectable.items()
         ],
         drawings={cause.name: effect_drawing(cause.name) for cause in verdict.causes},
         use=_use(verdict, recordings),
         film=None if diagnosis is None else press_film(diagnosis, recordings),
+        not_tested=[{"title": title(name), "needs": what} for name, what in verdict.not_tested.items()],
         **(_nothing() if diagnosis is None else _findings(verdict, diagnosis, unit, of_pad)),
     )
 
@@ -198,18 +197,18 @@ def _caption(trace: Trace, remark: str) -> str:
 
 
 def _by_decision(evidence: Sequence[Evidence]) -> list[Evidence]:
-    """Found ones first, each group by what it gains on held-out recordings."""
+    """Found ones first, each group by what it gains in cross-validation."""
     order = list(DECISIONS)
-    return sorted(evidence, key=lambda item: (order.index(item.decision), -(item.heldout_gain or 0.0)))
+    return sorted(evidence, key=lambda item: (order.index(item.decision), -(item.cv_gain or 0.0)))
 
 
 def _evidence_row(item: Evidence) -> dict[str, Any]:
-    gain = item.heldout_gain
+    gain = item.cv_gain
     return {
         "title": title(item.name),
         "name": item.name if item.name in MEANINGS else "",
         "p": p_text(item.p_value),
-        "p_adjusted": p_text(item.p_adjusted),
+        "p_adjusted": "observed" if item.observed else p_text(item.p_adjusted),
         "gain": "–" if gain is None else percent(gain),
         "bar": 0.0 if gain is None else 100.0 * min(max(gain, 0.0), 1.0),
         "decision": DECISIONS[item.decision],

@@ -9,7 +9,7 @@ from lerobot_vtrefine.diagnose.verdict import Verdict
 
 @dataclass(frozen=True)
 class Meaning:
-    """A cause for people: its title, what it is, and the unit of its main parameter (contract §5)."""
+    """A cause for people: its title, what it is, and the unit of its main parameter (docs/verdict.md)."""
 
     title: str
     what: str
@@ -37,6 +37,12 @@ MEANINGS = {
         "hysteresis",
         "At the same depth the pad reads differently while it is loaded and unloaded.",
         "fraction",
+        "1",
+    ),
+    "first_load_softening": Meaning(
+        "first-load softening",
+        "Below the largest load so far the pad reads less than it did on the first load.",
+        "softening",
         "1",
     ),
     "taxel_gain_spread": Meaning(
@@ -127,9 +133,10 @@ def meaning(name: str) -> Meaning:
     """What a cause is; one that was added to the catalogue says so in its file."""
     if name in MEANINGS:
         return MEANINGS[name]
-    from lerobot_vtrefine.diagnose.candidates import MEANING
+    from lerobot_vtrefine.diagnose import candidates
+    from lerobot_vtrefine.diagnose.joints import candidates as joint_candidates
 
-    text = MEANING.get(name, "")
+    text = candidates.MEANING.get(name, "") or joint_candidates.MEANING.get(name, "")
     return Meaning(title(name), text[:1].upper() + text[1:], "size", "1")
 
 
@@ -155,7 +162,10 @@ def headline(verdict: Verdict, unit: str) -> str:
         return "These recordings allow no verdict: too little of them is sound."
     if verdict.status == "adequate":
         fitted = "stiffness, damping and gain" if unit == "counts" else "servo constants"
-        return f"The simulation is adequate: once its {fitted} are refitted, nothing significant is left."
+        scope = " for what was tested" if verdict.not_tested else ""
+        return (
+            f"The simulation is adequate{scope}: once its {fitted} are refitted, nothing significant is left."
+        )
     if verdict.status == "explained":
         return f"The simulation lacks {names}. {repaired(verdict, unit)}"
     if verdict.status == "ambiguous":
@@ -166,6 +176,28 @@ def headline(verdict: Verdict, unit: str) -> str:
     clue = f" What is known of it: {clue}." if 0 < len(clue) <= LONGEST_CLUE else ""
     symptoms = f" What looks like {names} may be a symptom of it.{_all_the_same(verdict)}" if names else ""
     return f"The simulation is wrong in a way that no known cause explains.{clue}{symptoms}"
+
+
+def power_line(verdict: Verdict) -> str:
+    """What an adequate verdict would have shown, and what it could not have; empty for others."""
+    if verdict.status != "adequate":
+        return ""
+    shown = listing(
+        [f"{title(name)} ({size_text(name, size)})" for name, size in verdict.minimum_detectable.items()]
+    )
+    parts = [f"would have shown: {shown}"] if shown else []
+    if verdict.not_tested:
+        missing = [f"{title(name)} ({what})" for name, what in sorted(verdict.not_tested.items())]
+        parts.append(f"not tested: {listing(missing)}")
+    return "; ".join(parts)
+
+
+def size_text(name: str, size: float) -> str:
+    """A cause's main parameter at some size, for example "delay 4 ms"."""
+    about = meaning(name)
+    if name == "dead_taxels":
+        return "one of those pressed hard enough"
+    return f"{about.parameter} {quantity(size, about.unit)}"
 
 
 def _all_the_same(verdict: Verdict) -> str:
@@ -220,7 +252,8 @@ def doubts(verdict: Verdict, recorded: int, checked: int) -> list[str]:
             )
         elif excess < -0.02:
             found.append("The error is below the estimated noise floor, so that floor is estimated too high.")
-    weak = [title(c.name) for c in verdict.causes if c.p_value is None or c.p_value > 0.01]
+    tested = [cause for cause in verdict.causes if cause.basis == "tested"]
+    weak = [title(c.name) for c in tested if c.p_value is None or c.p_value > 0.01]
     if weak:
         found.append(f"The evidence for {listing(weak)} is thin (p above 0.01, or none).")
     if verdict.unknown.alarm and verdict.causes:

@@ -2,7 +2,7 @@
 guards what checkpoints may load.
 """
 
-from lerobot_vtrefine.policies import checkpoint_guard
+from lerobot_vtrefine.lerobot_compat import checkpoint_guard
 from lerobot_vtrefine.policies.vt_dp3.configuration_vt_dp3 import VtDp3Config
 from lerobot_vtrefine.policies.vt_dp3.processor_vt_dp3 import (
     VisuoTactileProcessorStep,

@@ -9,17 +9,18 @@ from lerobot.configs import FeatureType, NormalizationMode, PreTrainedConfig
 from lerobot.optim import AdamWConfig
 from lerobot.optim.schedulers import CosineAnnealingWithWarmupSchedulerConfig
 
-from lerobot_vtrefine.config_errors import told_by_lerobot
-from lerobot_vtrefine.datasets import fast_reader
 from lerobot_vtrefine.datasets.features import (
     ACTION_KEY,
-    BASELINE_KEYS,
     STATE_KEY,
-    TACTILE_KEYS,
+    TACTILE_PREFIX,
     VISUAL_KEYS,
+    baseline_keys,
+    tactile_keys,
 )
+from lerobot_vtrefine.embodiments import embodiment_with_pads, get_embodiment
+from lerobot_vtrefine.lerobot_compat import checkpoint_guard, fast_reader
+from lerobot_vtrefine.lerobot_compat.config_errors import told_by_lerobot
 from lerobot_vtrefine.observation import MODALITIES, VisuoTactileConfig
-from lerobot_vtrefine.policies import checkpoint_guard
 from lerobot_vtrefine.policies.vt_dp3.denoisers import DENOISERS
 from lerobot_vtrefine.policies.vt_dp3.diffusion import step_grid
 
@@ -238,9 +239,18 @@ class VtDp3Config(PreTrainedConfig):
     @property
     def required_keys(self) -> tuple[str, ...]:
         """Observation columns that the chosen modalities need."""
-        tactile = () if self.modalities == "visual" else (*TACTILE_KEYS, *BASELINE_KEYS)
+        body = get_embodiment(self.observation.embodiment)
+        tactile = () if self.modalities == "visual" else (*tactile_keys(body), *baseline_keys(body))
         visual = () if self.modalities == "tactile" else VISUAL_KEYS
         return (STATE_KEY, *tactile, *visual)
+
+    def _way_out(self) -> str:
+        """What to do about missing columns."""
+        keys = [key for key in self.input_features or {} if key.startswith(TACTILE_PREFIX)]
+        body = embodiment_with_pads([key.removeprefix(TACTILE_PREFIX) for key in keys])
+        if body is not None and body.name != self.observation.embodiment:
+            return f"the data is of {body.name}: set --policy.observation.embodiment={body.name}"
+        return "record with vtrefine-record-demos or a tactile robot, or choose other modalities"
 
     def validate_features(self) -> None:
         """Raises: ValueError naming the columns that a dataset or environment lacks for this policy."""
@@ -249,7 +259,7 @@ class VtDp3Config(PreTrainedConfig):
             shown = ", ".join(missing[:3]) + (f" and {len(missing) - 3} more" if len(missing) > 3 else "")
             raise ValueError(
                 f"vt_dp3 with policy.modalities={self.modalities} needs columns that the data lacks: "
-                f"{shown}; record with vtrefine-record-demos or a tactile robot, or choose other modalities"
+                f"{shown}; {self._way_out()}"
             )
         action = (self.output_features or {}).get(ACTION_KEY)
         if action is None or action.type is not FeatureType.ACTION or len(action.shape) != 1:

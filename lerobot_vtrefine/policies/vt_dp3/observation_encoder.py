@@ -10,7 +10,7 @@ from safetensors import SafetensorError
 from safetensors.torch import load_file, save_file
 from torch import Tensor, nn
 
-from lerobot_vtrefine.datasets.features import CLOUD_KEY, GRIDS_KEY, PAD_COLS, PAD_ROWS, STATE_KEY
+from lerobot_vtrefine.datasets.features import CLOUD_KEY, GRIDS_KEY, STATE_KEY
 from lerobot_vtrefine.embodiments import get_embodiment
 from lerobot_vtrefine.policies.vt_dp3.configuration_vt_dp3 import VtDp3Config
 from lerobot_vtrefine.policies.vt_dp3.pad_encoder import PadEncoder
@@ -77,7 +77,8 @@ def make_encoder(config: VtDp3Config, state_dim: int) -> ObservationEncoder:
         points = PointEncoder(config.point_dims, config.point_features, view.center_m, view.scale_m)
     if config.sees_grids:
         body = get_embodiment(view.embodiment)
-        pads = PadEncoder(len(body.pad_names), (PAD_ROWS, PAD_COLS), config.pad_width, config.pad_features)
+        shape = body.pad_layout.rows, body.pad_layout.cols
+        pads = PadEncoder(len(body.pad_names), shape, config.pad_width, config.pad_features)
     return ObservationEncoder(points, pads, state_dim, config.n_obs_steps)
 
 

@@ -27,19 +27,18 @@ from torch import Tensor
 
 from lerobot_vtrefine.datasets.features import (
     ACTION_KEY,
-    BASELINE_KEYS,
     CAMERA_POSE_KEY,
     CLOUD_KEY,
     DEPTH_KEY,
     GRIDS_KEY,
     INTRINSICS_KEY,
     NOISE_LEVEL_KEY,
-    PAD_COLS,
-    PAD_ROWS,
-    RAW_KEYS,
     STATE_KEY,
-    TACTILE_KEYS,
+    baseline_keys,
+    raw_keys,
+    tactile_keys,
 )
+from lerobot_vtrefine.embodiments import Embodiment, get_embodiment
 from lerobot_vtrefine.observation import VisuoTactileConfig, build_visuo_tactile, num_points
 from lerobot_vtrefine.observation.grids import pad_grids
 from lerobot_vtrefine.observation.visuo_tactile import POINT_CHANNELS
@@ -76,7 +75,7 @@ class VisuoTactileProcessorStep(ObservationProcessorStep):
     """Replaces the raw tactile, depth and camera columns by ``observation.visuo_tactile`` (..., N, 5) and,
     with ``fusion=pads``, ``observation.tactile_grids`` (..., P, R, C).
 
-    Leading dimensions are those of ``observation.state`` (..., 16), which must still be in rad and m here.
+    Leading dimensions are those of ``observation.state`` (..., J), which must still be in rad and m here.
     Depth noise is drawn from torch's global generator, so LeRobot's seed makes it repeatable.
     """
 
@@ -93,14 +92,24 @@ class VisuoTactileProcessorStep(ObservationProcessorStep):
 
     def observation(self, observation: dict[str, Any]) -> dict[str, Any]:
         """Build cloud and images, and drop what they were built from; masks (``*_is_pad``) stay untouched."""
-        built = {key: value for key, value in observation.items() if key not in RAW_KEYS}
+        used = raw_keys(self._body)
+        built = {key: value for key, value in observation.items() if key not in used}
         if self.modalities:
             built[CLOUD_KEY] = self._cloud(observation)
         if self.grids:
-            lead = _require(observation, STATE_KEY).shape[:-1]
-            tactile, baseline = (_pads(observation, keys, lead) for keys in (TACTILE_KEYS, BASELINE_KEYS))
-            built[GRIDS_KEY] = pad_grids(tactile, baseline, (PAD_ROWS, PAD_COLS), self.observation_config)
+            lead, keys = _require(observation, STATE_KEY).shape[:-1], (tactile_keys, baseline_keys)
+            tactile, baseline = (_pads(observation, of(self._body), lead) for of in keys)
+            built[GRIDS_KEY] = pad_grids(tactile, baseline, self._grid_shape, self.observation_config)
         return built
+
+    @property
+    def _grid_shape(self) -> tuple[int, int]:
+        layout = self._body.pad_layout
+        return layout.rows, layout.cols
+
+    @property
+    def _body(self) -> Embodiment:
+        return get_embodiment(self.observation_config.embodiment)
 
     def _cloud(self, observation: dict[str, Any]) -> Tensor:
         state = _require(observation, STATE_KEY)
@@ -108,8 +117,8 @@ class VisuoTactileProcessorStep(ObservationProcessorStep):
         tactile = baseline = depth = intrinsics = pose = None
         if self.modalities != "visual":
             tactile, baseline = (
-                _pads(observation, TACTILE_KEYS, lead),
-                _pads(observation, BASELINE_KEYS, lead),
+                _pads(observation, tactile_keys(self._body), lead),
+                _pads(observation, baseline_keys(self._body), lead),
             )
         if self.modalities != "tactile":
             depth = _require(observation, DEPTH_KEY)
@@ -137,13 +146,13 @@ class VisuoTactileProcessorStep(ObservationProcessorStep):
         self, features: dict[PipelineFeatureType, dict[str, PolicyFeature]]
     ) -> dict[PipelineFeatureType, dict[str, PolicyFeature]]:
         """The raw columns' features become those of cloud and images."""
-        observations = features.get(PipelineFeatureType.OBSERVATION, {})
-        kept = {key: value for key, value in observations.items() if key not in RAW_KEYS}
+        observations, used = features.get(PipelineFeatureType.OBSERVATION, {}), raw_keys(self._body)
+        kept = {key: value for key, value in observations.items() if key not in used}
         if self.modalities:
             points = num_points(self.observation_config, self.modalities)
             kept[CLOUD_KEY] = PolicyFeature(type=FeatureType.STATE, shape=(points, POINT_CHANNELS))
         if self.grids:
-            shape = (len(TACTILE_KEYS), PAD_ROWS, PAD_COLS)
+            shape = (len(self._body.pad_names), *self._grid_shape)
             kept[GRIDS_KEY] = PolicyFeature(type=FeatureType.STATE, shape=shape)
         return {**features, PipelineFeatureType.OBSERVATION: kept}
 
@@ -161,7 +170,7 @@ def _require(observation: dict[str, Any], key: str) -> Tensor:
 
 
 def _pads(observation: dict[str, Any], keys: tuple[str, ...], lead: Sequence[int]) -> Tensor:
-    """Counts of all pads, (*lead, P, 384)."""
+    """Counts of all pads, (*lead, P, taxels)."""
     return torch.stack([_require(observation, key).reshape(*lead, -1) for key in keys], dim=-2)
 
 

@@ -70,7 +70,7 @@ class WarpTouch:
 
 
 def _faces(scene: "Scene") -> tuple[Array, Array]:
-    """Each pad's face in its geom's frame: offsets (4, 3) [m] and rotations (4, 3, 3)."""
+    """Each pad's face in its geom's frame: offsets (P, 3) [m] and rotations (P, 3, 3)."""
     data = mujoco.MjData(scene.model)
     mujoco.mj_kinematics(scene.model, data)
     joints = torch.from_numpy(data.qpos[scene.addresses.qpos])

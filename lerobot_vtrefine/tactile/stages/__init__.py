@@ -1,6 +1,6 @@
 """Stages of the sensor model, by domain; importing this package registers them all."""
 
-from lerobot_vtrefine.tactile.stages import contact, host, mechanics, readout, surface
+from lerobot_vtrefine.tactile.stages import contact, host, mechanics, readout, softening, surface
 from lerobot_vtrefine.tactile.stages.base import STAGES, Frame, Stage, register, stage_class
 
 __all__ = [
@@ -12,6 +12,7 @@ __all__ = [
     "mechanics",
     "readout",
     "register",
+    "softening",
     "stage_class",
     "surface",
 ]

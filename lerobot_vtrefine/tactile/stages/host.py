@@ -164,14 +164,17 @@ class Latency(Delay):
 class ScanSkew(Delay):
     """Rows are read one after the other: row r is sampled skew_s * r / (R - 1) before the frame's time.
 
-    `rows_s`, delays at equal steps from the first row to the last and straight between them, stand in for
-    that where a board reads its rows in another rhythm; `skew_s` is then their slope alone.
+    A board that goes along the rows as well reads column c another `cols_s` * c / (C - 1) earlier: of one
+    that reads element by element, the smaller of both is what one line takes. `rows_s`, delays at equal steps
+    from the first row to the last and straight between them, stand in for `skew_s` where a board reads its
+    rows in another rhythm; `skew_s` is then their slope alone.
     """
 
     name: ClassVar[str] = "scan_skew"
     rank: ClassVar[int] = 72
     skew_s: float = parameter(0.008, "s", 0.0, 0.043, minimum=None)
     rows_s: tuple[float, ...] = ()
+    cols_s: float = parameter(0.0, "s", 0.0, 0.0, minimum=None)
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -189,9 +192,23 @@ class ScanSkew(Delay):
     def delay_s(self, rows: int, like: torch.Tensor) -> torch.Tensor:
         own = self.of_rows(rows)
         if own is not None:
-            return torch.as_tensor(own, dtype=like.dtype, device=like.device)[:, None]
-        share = torch.arange(rows, dtype=like.dtype, device=like.device)[:, None] / max(rows - 1, 1)
-        return self.skew_s * share
+            late = torch.as_tensor(own, dtype=like.dtype, device=like.device)[:, None]
+        else:
+            share = torch.arange(rows, dtype=like.dtype, device=like.device)[:, None] / max(rows - 1, 1)
+            late = self.skew_s * share
+        if not isinstance(self.cols_s, torch.Tensor) and self.cols_s == 0.0:
+            return late
+        cols = like.shape[-1]
+        along = torch.arange(cols, dtype=like.dtype, device=like.device) / max(cols - 1, 1)
+        return late + self.cols_s * along
+
+    @override
+    def sequence(self, x: torch.Tensor, times_s: torch.Tensor, frame: Frame) -> torch.Tensor:
+        delay = self.delay_s(x.shape[-2], x)
+        if delay.shape[-1] == 1:
+            return super().sequence(x, times_s, frame)
+        columns = [delayed_sequence(x[..., c : c + 1], times_s, delay[:, c]) for c in range(x.shape[-1])]
+        return torch.cat(columns, dim=-1)
 
 
 @register

@@ -38,6 +38,7 @@ FORMS: dict[str, dict[str, Factory]] = {
         "below_peak": mechanics.below_peak,
         "resting": mechanics.resting_play,
     },
+    "first_load_softening": {"let_go": mechanics.first_load},
     "taxel_gain_spread": {
         "log_normal": electronics.log_normal_gains,
         "gradient": electronics.gradient_gains,
@@ -86,7 +87,6 @@ FORMS: dict[str, dict[str, Factory]] = {
         "neighbour_pad": outside.neighbour,
         "clock_warp": outside.clock_warp,
         "bowl": outside.bowl,
-        "mullins": outside.softening,
         "thermal_gain": outside.thermal_gain,
         "contact_age": outside.fatigue_of_contact,
     },

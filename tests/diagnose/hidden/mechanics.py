@@ -251,6 +251,17 @@ def below_peak(pad: Pad, size: float, rng: Draw) -> Effect:
     return Effect("hysteresis", "below_peak", "force", apply)
 
 
+def first_load(pad: Pad, size: float, rng: Draw) -> Effect:
+    """Mullins: within a recording the layer is softer below the largest load that it has seen."""
+    share = 0.4 * size
+
+    def apply(scene: Scene, f: np.ndarray) -> np.ndarray:
+        most = np.maximum.accumulate(f, axis=0)
+        return f * (1 - share * (most - f) / (pad.peak / pad.gain))
+
+    return Effect("first_load_softening", "let_go", "force", apply)
+
+
 def _spread(rows: int, cols: int, kernel: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Mixing matrices along rows and columns; what would leave the pad stays on its edge."""
 

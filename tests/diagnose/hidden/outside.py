@@ -108,17 +108,6 @@ def bowl(pad: Pad, size: float, rng: Draw) -> Effect:
     return _outside("bowl", "surface", apply)
 
 
-def softening(pad: Pad, size: float, rng: Draw) -> Effect:
-    """Mullins: within a recording the layer is softer below the largest load that it has seen."""
-    share = 0.4 * size
-
-    def apply(scene: Scene, f: np.ndarray) -> np.ndarray:
-        most = np.maximum.accumulate(f, axis=0)
-        return f * (1 - share * (most - f) / (pad.peak / pad.gain))
-
-    return _outside("mullins", "force", apply)
-
-
 def thermal_gain(pad: Pad, size: float, rng: Draw) -> Effect:
     """The gain follows the room's temperature."""
     share = 0.03 * size

@@ -1,0 +1,1 @@
+"""What `vtrefine-play` consists of."""

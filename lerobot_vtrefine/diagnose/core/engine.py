@@ -1,0 +1,167 @@
+"""The method: lock, baseline, search, suspicion, rivals, guard. `telling` makes a diagnosis of its result."""
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+
+from lerobot_vtrefine.diagnose.core.heldout import lock
+from lerobot_vtrefine.diagnose.core.problem import Candidate, Fit, Problem
+from lerobot_vtrefine.diagnose.core.resampling import gain_interval
+from lerobot_vtrefine.diagnose.core.rivals import Rival, settled
+from lerobot_vtrefine.diagnose.core.search import ALL, Search, Selection
+from lerobot_vtrefine.diagnose.core.suspicion import Alarm, raise_alarms
+
+Array = np.ndarray
+Progress = Callable[[str, float], None]
+
+
+@dataclass(frozen=True)
+class Inference[P: Problem[Any, Any], F: Fit, C: Candidate]:
+    """What the method found; everything that is told follows from it."""
+
+    selection: Selection[P, F, C]
+    rivals: tuple[Rival[F, C], ...]
+    alarms: tuple[Alarm, ...]
+    test: P
+    """The locked trials; those of the search where none could be locked."""
+    locked: bool
+    refused: "tuple[Refusal, ...]"
+    seed: int
+
+
+def infer[P: Problem[Any, Any]](
+    whole: P, seed: int = 0, progress: Progress | None = None, *, locking: bool = True
+) -> Inference[P, Any, Any]:
+    """Find what the baseline gets wrong.
+
+    Args:
+        seed: of the locked trials, folds, sign flips and resampling.
+        progress: told what is being done and the fraction done.
+        locking: False where all trials are needed to see anything.
+    """
+    tell = progress or (lambda text, done: None)
+    count = len(whole.conditions)
+    locked = np.array(lock(whole.conditions, seed) if locking else [], dtype=int)
+    problem = whole.subset(np.setdiff1d(np.arange(count), locked))
+    selection = Search(problem, seed, _steps(tell)).run()
+    selection = problem.reviewed(selection, seed)
+    whole = whole.revised(selection.fit, [item for items in selection.chosen.values() for item in items])
+    tell(f"{whole.subject}: looking for what is left", 0.6)
+    alarms = raise_alarms(selection, selection.problem.suspicions(selection, seed), seed)
+    rivals: tuple[Rival[Any, Any], ...] = ()
+    # Ties do not matter where something else is wrong, unless something else than errors may settle them.
+    if not alarms or selection.problem.can_settle:
+        tell(f"{whole.subject}: looking for other explanations", 0.7)
+        before = selection
+        selection, rivals = settled(selection, seed)
+        if selection is not before:
+            alarms = raise_alarms(selection, selection.problem.suspicions(selection, seed), seed)
+    tell(f"{whole.subject}: settling the sizes", 0.8)
+    selection, whole = _settled_finely(named_only(selection), whole)
+    test = whole.subset(locked) if len(locked) else selection.problem
+    selection, refused = guarded(selection, test, seed)
+    return Inference(
+        selection,
+        tuple(item for item in rivals if item.cause in selection.causes()),
+        _with_refused(alarms, refused),
+        test,
+        bool(len(locked)),
+        refused,
+        seed,
+    )
+
+
+def named_only[P: Problem[Any, Any], F: Fit, C: Candidate](
+    selection: Selection[P, F, C],
+) -> Selection[P, F, C]:
+    """Without decoys: the model that is handed out holds only what has a name."""
+    for channel, candidates in list(selection.chosen.items()):
+        if decoys := [item for item in candidates if item.clue]:
+            selection = taken_back(selection, decoys, channel)
+    return selection
+
+
+def taken_back[P: Problem[Any, Any], F: Fit, C: Candidate](
+    selection: Selection[P, F, C], candidates: list[C], channel: int
+) -> Selection[P, F, C]:
+    """The selection without candidates that had been accepted on a channel, the others refitted."""
+    mask = (np.arange(selection.errors.shape[1]) == channel) | (channel == ALL)
+    kept = tuple(item for item in selection.chosen[channel] if item not in candidates)
+    chosen = {**selection.chosen, channel: kept}
+    fitted = selection.problem.reduced(selection.fit, candidates, mask)
+    return replace(selection, fit=fitted, chosen={k: items for k, items in chosen.items() if items})
+
+
+@dataclass(frozen=True)
+class Refusal:
+    """What was taken back."""
+
+    cause: str
+    channel: int
+    gain: float
+    """On locked trials, beside the baseline."""
+    surely: bool
+    """Whether the gain's 95 % interval lies below zero."""
+
+
+def guarded[P: Problem[Any, Any], F: Fit, C: Candidate](
+    selection: Selection[P, F, C], test: P, seed: int
+) -> tuple[Selection[P, F, C], tuple[Refusal, ...]]:
+    """No channel's model that predicts worse than the baseline is handed out, whatever chose it.
+
+    On each channel where it does, what was accepted last is taken back first. What all channels share is
+    judged by all of them together, each in units of its baseline's error.
+    """
+    before = test.errors(selection.baseline)
+    refused = []
+    for channel in [*(k for k in selection.chosen if k != ALL), ALL]:
+        part = slice(None) if channel == ALL else [channel]
+        scale = before[:, part].mean(0).clip(1e-300)
+        for candidate in reversed(selection.chosen.get(channel, ())):
+            after = test.errors(selection.fit)
+            base, extended = ((errors[:, part] / scale).mean(1) for errors in (before, after))
+            gain = float(1 - extended.mean() / base.mean())
+            if gain >= 0:
+                break
+            surely = gain_interval(base, extended, seed)[1] < 0
+            refused.append(Refusal(candidate.cause, channel, gain, surely))
+            selection = taken_back(selection, [candidate], channel)
+    return selection, tuple(refused)
+
+
+def _with_refused(alarms: tuple[Alarm, ...], refused: tuple[Refusal, ...]) -> tuple[Alarm, ...]:
+    """What was significant and yet surely predicts worse is something else than its name; a small effect that
+    locked trials happen to show the other way is not."""
+    more = [
+        Alarm(
+            max(item.channel, 0), f"what looks like {item.cause} predicts worse on trials left out", 1.0, None
+        )
+        for item in refused
+        if item.surely
+    ]
+    return (*alarms, *more)
+
+
+def _settled_finely[P: Problem[Any, Any], F: Fit, C: Candidate](
+    selection: Selection[P, F, C], whole: P
+) -> tuple[Selection[P, F, C], P]:
+    """What was chosen, refitted to better predictions where there are any; what was tried stays as it was."""
+    problem, everything = selection.problem.finer(), whole.finer()
+    if problem is None or everything is None:
+        return selection, whole
+    baseline, fitted = (problem.refitted(item) for item in (selection.baseline, selection.fit))
+    return replace(selection, problem=problem, baseline=baseline, fit=fitted), everything
+
+
+def _steps(tell: Progress) -> Callable[[str], None]:
+    """The search's rounds as fractions of the whole."""
+    count = 0
+
+    def step(text: str) -> None:
+        nonlocal count
+        tell(text, min(0.1 * count, 0.55))
+        count += 1
+
+    return step

@@ -1,0 +1,266 @@
+"""What the method asks of an instrument: trials, a baseline, candidates, and fits that can be reweighted.
+
+Shapes: T trials, J channels (1 for a camera, one per joint for a robot, one per quantity for parts).
+"""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any, Protocol, Self
+
+import numpy as np
+
+from lerobot_vtrefine.diagnose.evidence import ResidualView, Savable, Trace
+from lerobot_vtrefine.diagnose.verdict import Parameter
+
+if TYPE_CHECKING:
+    from lerobot_vtrefine.diagnose.core.rivals import Rival
+    from lerobot_vtrefine.diagnose.core.search import Selection
+    from lerobot_vtrefine.diagnose.core.suspicion import Alarm, Suspicion
+
+Array = np.ndarray
+
+
+class Candidate(Protocol):
+    """One form of one cause."""
+
+    @property
+    def cause(self) -> str:
+        """A name of the catalogue, or of something without a name (a decoy)."""
+        ...
+
+    @property
+    def shared(self) -> bool:
+        """Whether it acts on all channels together and is one hypothesis."""
+        ...
+
+    @property
+    def clue(self) -> str:
+        """What a decoy would mean; empty for what has a name. Decoys compete and are never handed out."""
+        ...
+
+    @property
+    def handicap(self) -> float:
+        """Part of the error by which it must beat forms with fewer terms."""
+        ...
+
+    @property
+    def only_where(self) -> str:
+        """Cause that must have helped on a channel for this one to be tried there; empty: everywhere."""
+        ...
+
+    def refines(self, other: "Candidate") -> bool:
+        """Whether its fit starts from that of another."""
+        ...
+
+
+@dataclass(frozen=True)
+class PlainCandidate:
+    """A cause of one form that acts on single channels: what most instruments need."""
+
+    cause: str
+    handicap: float = 0.0
+    shared: bool = False
+    clue: str = ""
+    only_where: str = ""
+
+    def refines(self, other: Candidate) -> bool:
+        """It starts by itself."""
+        return False
+
+
+class Fit(Protocol):
+    """Where a fit ended."""
+
+    @property
+    def mse(self) -> Array:
+        """(T, J) mean squared error."""
+        ...
+
+
+class Reweighted(Protocol):
+    """A fit to other choices of the same trials, by one Newton step."""
+
+    @property
+    def channels(self) -> Array:
+        """Numbers of the channels that may change."""
+        ...
+
+    def errors(self, weights: Array, trials: Array) -> Array:
+        """Mean squared errors of some trials on `channels` if every trial counted `weights` (T,) times."""
+        ...
+
+
+class Problem[F: Fit, C: Candidate](Protocol):
+    """Trials to be explained."""
+
+    @property
+    def subject(self) -> str:
+        """What is judged, for progress and sentences."""
+        ...
+
+    @property
+    def channels(self) -> tuple[str, ...]:
+        """Names of the J channels."""
+        ...
+
+    @property
+    def conditions(self) -> tuple[str, ...]:
+        """(T,) equal where trials are driven alike."""
+        ...
+
+    @property
+    def files(self) -> tuple[str, ...]:
+        """(T,) names of the trials."""
+        ...
+
+    def subset(self, trials: Array) -> Self:
+        """The same on fewer trials."""
+        ...
+
+    # Fits.
+
+    def baseline(self) -> F:
+        """The simulation's own model, refitted."""
+        ...
+
+    def candidates(self) -> Sequence[C]:
+        """Everything that may be wrong."""
+        ...
+
+    def applicable(self, candidate: C, now: F) -> Array:
+        """(J,) bool: channels on which these trials could show it, and which a fit does not give it yet."""
+        ...
+
+    def extended(self, now: F, candidate: C, channels: Array, plainer: F | None = None) -> F:
+        """Fit a candidate on top of a fit, on channels (J,) bool where it is applicable.
+
+        Args:
+            plainer: the fit of the candidate that it refines, where there is one already.
+        """
+        ...
+
+    def reduced(self, now: F, candidates: Sequence[C], channels: Array) -> F:
+        """Refit without candidates on channels (J,) bool; what is shared goes everywhere."""
+        ...
+
+    def refitted(self, now: F) -> F:
+        """Everything that is free, fitted anew."""
+        ...
+
+    def merged(self, one: F, other: F, take_other: Array) -> F:
+        """Channels of the one fit, those of the other where (J,) says so."""
+        ...
+
+    def errors(self, fit: F) -> Array:
+        """(T, J) mean squared errors under a fit that may have been made on other trials."""
+        ...
+
+    def reweighted(self, fit: F, channels: Array | None = None) -> Reweighted:
+        """For cross-validation; only some channels (numbers) move if they are given."""
+        ...
+
+    def credible(self, baseline: F, now: F, best: F, candidate: C) -> Array:
+        """(J,) bool: whether the size found is large enough to be seen and no larger than errors allow."""
+        ...
+
+    # What only the instrument knows, between the steps of the method.
+
+    def revised(self, now: F, accepted: Sequence[C]) -> Self:
+        """The problem after candidates were accepted; itself where these change nothing about it."""
+        ...
+
+    def reviewed(self, selection: "Selection[Any, F, C]", seed: int) -> "Selection[Any, F, C]":
+        """The selection after a look at what candidates cannot say."""
+        ...
+
+    @property
+    def can_settle(self) -> bool:
+        """Whether `settles` can decide anything here."""
+        ...
+
+    def settles(self, rival: "Rival[F, C]", selection: "Selection[Any, F, C]", seed: int) -> int:
+        """What else than the errors decides a tie: 1 for the rival, -1 for the cause, 0 for neither."""
+        ...
+
+    def finer(self) -> Self | None:
+        """The same trials with predictions for which the search is too slow; None where there are none."""
+        ...
+
+    def suspicions(self, selection: "Selection[Any, F, C]", seed: int) -> "Sequence[Suspicion]":
+        """What may be left, as scores of trials."""
+        ...
+
+
+class NothingBesides:
+    """For instruments that know nothing besides their errors."""
+
+    can_settle = False
+
+    def revised(self, now: Any, accepted: Any) -> Self:
+        """It stays."""
+        return self
+
+    def reviewed[S](self, selection: S, seed: int) -> S:
+        """It stays."""
+        return selection
+
+    def settles(self, rival: Any, selection: Any, seed: int) -> int:
+        """Nothing decides a tie."""
+        return 0
+
+    def finer(self) -> Self | None:
+        """There are no finer predictions."""
+        return None
+
+    def suspicions(self, selection: Any, seed: int) -> "Sequence[Suspicion]":
+        """Nothing can be said about what is left."""
+        return ()
+
+
+class Account[F: Fit, C: Candidate](Protocol):
+    """How an instrument tells what was found: sizes, models, sentences, drawings."""
+
+    unit: str
+    metric: str
+
+    def parameters(self, cause: str, channels: tuple[int, ...]) -> Mapping[str, Parameter]:
+        """Sizes with intervals."""
+        ...
+
+    def baseline_parameters(self) -> Mapping[str, Parameter]:
+        """Those of the refitted baseline."""
+        ...
+
+    def model(self, fit: F) -> Savable | None:
+        """As the file that is written."""
+        ...
+
+    def minimum_detectable(self) -> Mapping[str, float]:
+        """Cause -> smallest size that these trials would have shown."""
+        ...
+
+    def noise_floor(self) -> float | None:
+        """Root mean square error that no model could undo."""
+        ...
+
+    def causes(self) -> Sequence[str]:
+        """Names that are told about, found or not."""
+        ...
+
+    def caveat(self, cause: str, channels: tuple[int, ...]) -> str:
+        """What an accepted cause leaves open."""
+        ...
+
+    def not_identifiable(self, cause: str) -> str:
+        """Why these trials cannot show a cause; empty where they can."""
+        ...
+
+    def next_experiment(
+        self, rivals: "Sequence[Rival[F, C]]", alarms: "Sequence[Alarm]"
+    ) -> Mapping[str, Any] | None:
+        """What to record next."""
+        ...
+
+    def drawings(self, test: Any, seed: int) -> tuple[tuple[Trace, ...], tuple[ResidualView, ...]]:
+        """What the report draws about locked trials."""
+        ...

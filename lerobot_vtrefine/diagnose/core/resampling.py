@@ -1,0 +1,120 @@
+"""Resampling of whole trials: sign flips, folds, the jackknife, the bootstrap.
+
+Trials are the unit of evidence, for readings within one share its faults. Under the null a trial's score is
+as likely negative as positive, whatever its variance (Hemerik et al. 2020). Shapes: T trials, K hypotheses.
+"""
+
+from collections.abc import Sequence
+
+import numpy as np
+from scipy.stats import t as student_t
+
+from lerobot_vtrefine.diagnose.core.rules import DRAWS, EXACT_UP_TO, FLIPS, FOLDS
+
+Array = np.ndarray
+
+_MIN_FREEDOM = 2.0
+
+
+def sign_matrix(trials: int, seed: int) -> Array:
+    """Signs (B, T); all of them when there are few, the identity first."""
+    if trials <= EXACT_UP_TO:
+        bits = (np.arange(2**trials)[:, None] >> np.arange(trials)) & 1
+        return 1.0 - 2.0 * bits
+    signs = np.random.default_rng(seed).integers(0, 2, (FLIPS + 1, trials)) * 2.0 - 1.0
+    signs[0] = 1.0
+    return signs
+
+
+def one_sided(scores: Array, seed: int) -> tuple[Array, Array]:
+    """p (K,) that scores (T, K) are positive by accident: each alone, and adjusted for all K (max-T)."""
+    return _flipped(scores, np.zeros(scores.shape[1], dtype=bool), seed)
+
+
+def two_sided(scores: Array, seed: int) -> tuple[Array, Array]:
+    """The same for either sign."""
+    return _flipped(scores, np.ones(scores.shape[1], dtype=bool), seed)
+
+
+def _flipped(scores: Array, either_sign: Array, seed: int) -> tuple[Array, Array]:
+    size = np.sqrt(np.square(scores).sum(0))
+    flipped = sign_matrix(len(scores), seed) @ _of_unit_length(scores)
+    flipped[:, either_sign] = np.abs(flipped[:, either_sign])
+    observed = flipped[0] - 1e-12
+    alone = (flipped >= observed).mean(0)
+    adjusted = _exceeding(flipped.max(1), observed)
+    return np.where(size > 0, alone, 1.0), np.where(size > 0, adjusted, 1.0)
+
+
+def jointly_adjusted(hypotheses: Sequence[tuple[Array, Array | None, bool]], seed: int) -> Array:
+    """p (K,) adjusted over hypotheses of two kinds together (max-T).
+
+    Args:
+        hypotheses: scores (T,); what they may follow (T,), standardised, whose order is then permuted, or
+            None, and their signs are flipped; whether either sign tells.
+    """
+    scores = _of_unit_length(np.stack([item[0] for item in hypotheses], 1))
+    signs = sign_matrix(len(scores), seed)
+    rng = np.random.default_rng([seed, 1])
+    if len(signs) < FLIPS:
+        signs = signs[np.r_[0, rng.integers(0, len(signs), FLIPS)]]
+    drawn = np.empty((len(signs), len(hypotheses)))
+    ordered = [k for k, item in enumerate(hypotheses) if item[1] is not None]
+    plain = np.setdiff1d(np.arange(len(hypotheses)), ordered)
+    drawn[:, plain] = signs @ scores[:, plain]
+    if ordered:
+        order = rng.permuted(np.tile(np.arange(len(scores)), (len(signs), 1)), axis=1)
+        order[0] = np.arange(len(scores))
+        for k in ordered:
+            drawn[:, k] = np.asarray(hypotheses[k][1])[order] @ scores[:, k]
+    either = np.array([item[2] for item in hypotheses])
+    drawn[:, either] = np.abs(drawn[:, either])
+    return np.where(np.any(scores, axis=0), _exceeding(drawn.max(1), drawn[0] - 1e-12), 1.0)
+
+
+def _of_unit_length(scores: Array) -> Array:
+    size = np.sqrt(np.square(scores).sum(0))
+    return np.divide(scores, size, out=np.zeros_like(scores), where=size > 0)
+
+
+def _exceeding(largest: Array, observed: Array) -> Array:
+    """Part of the largest values (B,) that reach each observed one (K,)."""
+    return np.searchsorted(np.sort(-largest), -observed, side="right") / len(largest)
+
+
+def folds_of(conditions: Sequence[str], seed: int) -> Array:
+    """Fold (T,) of every trial: trials of one condition stay together."""
+    names = sorted(set(conditions))
+    shuffled = np.random.default_rng(seed).permutation(len(names))
+    count = min(FOLDS, len(names))
+    fold = {names[name]: place % count for place, name in enumerate(shuffled)}
+    return np.array([fold[condition] for condition in conditions])
+
+
+def jackknife(without: Array, value: float) -> tuple[float, float]:
+    """95 % interval of a value by what it becomes without each unit (G,).
+
+    Student's factor has the degrees of freedom that the contributions show: one unit that carries everything
+    leaves two (Bell & McCaffrey 2002).
+    """
+    moved = np.asarray(without) - np.mean(without)
+    count, power = len(moved), moved**2
+    total = float(power.sum())
+    if count < 2 or not total > 0:
+        return value, value
+    freedom = float(np.clip(3.0 * total**2 / (power**2).sum() - 1.0, _MIN_FREEDOM, count - 1))
+    half = np.sqrt((count - 1) / count * total) * float(student_t.ppf(0.975, freedom))
+    return float(value - half), float(value + half)
+
+
+def draws_of(trials: int, seed: int, count: int = DRAWS) -> Array:
+    """(count, T) numbers of trials drawn with replacement: the bootstrap's."""
+    return np.random.default_rng(seed).integers(0, trials, (count, trials))
+
+
+def gain_interval(before: Array, after: Array, seed: int) -> tuple[float, float]:
+    """95 % interval of 1 - sum(after) / sum(before), errors (T,), by drawing whole trials."""
+    draws = draws_of(len(before), seed)
+    drawn = 1 - after[draws].sum(1) / before[draws].sum(1).clip(1e-300)
+    low, high = np.percentile(drawn, [2.5, 97.5])
+    return float(low), float(high)

@@ -1,0 +1,51 @@
+"""Every threshold of the method, once, with its reason."""
+
+ALPHA = 0.02
+"""Chance that trials without any effect yield a name, over all candidates and channels together."""
+SUSPICION_ALPHA = 0.01
+"""Chance that trials without any effect raise an alarm, over all suspicions and channels together."""
+LEAST_GAIN = 0.01
+"""Smallest part of a channel's squared error that is worth a name: below, no user would notice."""
+LEAST_UNKNOWN = 0.02
+"""Smallest part of the baseline's squared error for which something without a name is worth an alarm: twice
+what a name needs, for a name says what to do and an alarm only that something is to be done."""
+AS_GOOD = 1.02
+"""Cross-validated error of one cause over that of several, up to which the one is enough."""
+MAX_ROUNDS = 4
+"""Causes that one channel may have. Five trials in six that reach a fifth explain noise."""
+FOLDS = 5
+"""Parts that trials are cross-validated in: a fit to four fifths is nearly the fit to all."""
+MIN_CONDITIONS = 4
+"""With fewer conditions than this, trials are left out one by one where conditions would be."""
+FLIPS = 9999
+"""Random sign flips; p-values are then known to a tenth of `ALPHA`."""
+EXACT_UP_TO = 13
+"""Trials up to which all sign flips are tried: 2^13 are fewer than `FLIPS`."""
+DRAWS = 2000
+"""Draws of whole trials for the interval of a gain."""
+
+TIE_P = 0.1
+"""Above this, trials do not prefer one of two models."""
+TIE_LEAD, SURE_P = 0.03, 0.01
+"""Where two models' cross-validated errors differ by less, trials must prefer one of them more surely: forms
+that are not quite right differ by as much."""
+SHARE_OF_GAIN = 0.9
+"""Part of a cause's gain that another must reach to be its rival."""
+DECOY_LEAD, DECOY_P = 0.05, 0.01
+"""By how much, and how surely, a decoy must beat every name: names are believed first."""
+HELPED = 0.5
+"""Part of `LEAST_GAIN` by which a plainer cause must have helped for a slower one like it to be tried."""
+
+LOCKED_SHARE = 0.25
+"""Part of the recordings that is locked away for the final number."""
+MIN_DISCOVERY = 3
+"""Recordings that are left for discovery, whatever is locked."""
+WHOLE_CONDITIONS_FROM = 6
+"""Number of conditions from which on whole conditions are locked as well."""
+
+SURE = 3.2 + 0.84
+"""Standard errors at which four in five searches find an effect, all candidates considered."""
+UNSEEN = 0.05
+"""Part of an effect that the baseline's own parameters must not be able to do for it to be identifiable."""
+FEW_TRIALS = 8
+"""With fewer trials than this no sign flips can be significant over a catalogue of candidates."""

@@ -1,0 +1,106 @@
+"""Signs that something acts which no accepted cause accounts for, under one error rate.
+
+A suspicion that can be tested is a score per trial, as likely negative as positive (or in any order) if
+nothing is there; all of them together are one max-T test. What can only be observed (a size beyond any that
+sound recordings have, in trials too few to test) has no p-value and says so.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from lerobot_vtrefine.diagnose.core.resampling import jointly_adjusted
+from lerobot_vtrefine.diagnose.core.rules import FEW_TRIALS, SUSPICION_ALPHA
+from lerobot_vtrefine.diagnose.core.search import Selection
+
+Array = np.ndarray
+
+_HELPS = 0.25
+"""Gain on trials left out by which a cause is spoken of where trials are too few for any test."""
+
+
+@dataclass(frozen=True)
+class Suspicion:
+    """One thing that may be left on one channel."""
+
+    channel: int
+    clue: str
+    share: float
+    """Part of what the model leaves that it accounts for."""
+    least: float
+    """Smallest such part that is worth an alarm."""
+    scores: Array | None = None
+    """(T,), as likely negative as positive under the null; zero for trials that say nothing.
+    None: observed."""
+    either_sign: bool = False
+    """Whether scores that are negative throughout are as telling."""
+    along: Array | None = None
+    """(T,) what the scores may follow, standardised: under the null its order is arbitrary; None: their sum
+    is what tells, and under the null their signs are arbitrary."""
+    decisive: bool = False
+    """Whether it explains whatever else is odd about its channel."""
+
+
+@dataclass(frozen=True)
+class Alarm:
+    """A suspicion that was confirmed."""
+
+    channel: int
+    clue: str
+    share: float
+    p_value: float | None
+    """Adjusted for all suspicions; None where it was observed, not tested."""
+
+
+def raise_alarms(
+    selection: Selection[Any, Any, Any], suspicions: Sequence[Suspicion], seed: int
+) -> tuple[Alarm, ...]:
+    """All alarms, what is decisive first, then by size; an accepted decoy is one."""
+    found = [
+        Alarm(channel, item.clue, 1.0, selection.p_values.get((item.cause, channel)))
+        for channel, candidates in selection.chosen.items()
+        for item in candidates
+        if item.clue
+    ]
+    p_values = _tested(suspicions, seed)
+    fired = [
+        (item.decisive, Alarm(item.channel, item.clue, item.share, p))
+        for item, p in zip(suspicions, p_values, strict=True)
+        if item.share > item.least and (p is None or p < SUSPICION_ALPHA)
+    ]
+    found += [alarm for decisive, alarm in fired if not decisive]
+    found.sort(key=lambda alarm: -alarm.share)
+    found += [] if found or selection.causes() else _too_few(selection)
+    first = [alarm for decisive, alarm in fired if decisive]
+    settled = {alarm.channel for alarm in first}
+    return (*first, *(alarm for alarm in found if alarm.channel not in settled))
+
+
+def _tested(suspicions: Sequence[Suspicion], seed: int) -> list[float | None]:
+    """Adjusted p of each; one max-T test over all that have scores."""
+    tested = [item for item in suspicions if item.scores is not None]
+    if not tested:
+        return [None] * len(suspicions)
+    hypotheses = [(item.scores, item.along, item.either_sign) for item in tested if item.scores is not None]
+    adjusted = jointly_adjusted(hypotheses, seed)
+    of = {id(item): float(p) for item, p in zip(tested, adjusted, strict=True)}
+    return [of.get(id(item)) for item in suspicions]
+
+
+def _too_few(selection: Selection[Any, Any, Any]) -> list[Alarm]:
+    """Something helps on trials left out, but with so few trials nothing can be significant."""
+    if not 2 <= len(selection.problem.conditions) < FEW_TRIALS:
+        return []
+    out = []
+    for channel in range(len(selection.problem.channels)):
+        gains: dict[str, float] = {}
+        for item in selection.first_round:
+            if not item.candidate.clue and item.eligible[channel] and item.gain[channel] > _HELPS:
+                gains[item.cause] = max(gains.get(item.cause, 0.0), float(item.gain[channel]))
+        names = sorted(gains, key=lambda name: -gains[name])[:3]
+        if names:
+            clue = f"the trials are too few to say which of these it is: {', '.join(names)}"
+            out.append(Alarm(channel, clue, gains[names[0]], None))
+    return out

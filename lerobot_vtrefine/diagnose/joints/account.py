@@ -1,0 +1,94 @@
+"""How a robot's diagnosis is told: sizes per joint, the model file, what to record next, what to draw."""
+
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+from lerobot_vtrefine.diagnose.core.engine import Inference
+from lerobot_vtrefine.diagnose.core.rivals import Rival
+from lerobot_vtrefine.diagnose.core.suspicion import Alarm
+from lerobot_vtrefine.diagnose.evidence import ResidualView, Trace
+from lerobot_vtrefine.diagnose.joints import experiments, views
+from lerobot_vtrefine.diagnose.joints.candidates import NAMES, NOT_SHOWN, SIZES
+from lerobot_vtrefine.diagnose.joints.candidates.base import Candidate
+from lerobot_vtrefine.diagnose.joints.detectable import minimum_detectable
+from lerobot_vtrefine.diagnose.joints.estimates import Estimates, repeatability
+from lerobot_vtrefine.diagnose.joints.fitting import Fit
+from lerobot_vtrefine.diagnose.joints.model import RobotModel, to_model
+from lerobot_vtrefine.diagnose.joints.parameters import INDEX
+from lerobot_vtrefine.diagnose.joints.problem import JointProblem
+from lerobot_vtrefine.diagnose.verdict import Parameter
+
+
+class JointAccount:
+    """See `core.problem.Account`."""
+
+    unit = "rad"
+    metric = "rmse"
+
+    def __init__(self, found: Inference[JointProblem, Fit, Candidate]) -> None:
+        self.selection = found.selection
+        self.estimates = Estimates(found.selection, found.seed)
+        self.detectable = minimum_detectable(found.selection)
+
+    def parameters(self, cause: str, channels: tuple[int, ...]) -> Mapping[str, Parameter]:
+        """By the cause's own file."""
+        return SIZES[cause](self.estimates, channels)
+
+    def baseline_parameters(self) -> Mapping[str, Parameter]:
+        """The servos'."""
+        return self.estimates.baseline(self.selection.baseline.point.theta)
+
+    def model(self, fit: Fit) -> RobotModel:
+        """The file that is written."""
+        return to_model(self.selection.problem.names, fit.point)
+
+    def minimum_detectable(self) -> Mapping[str, float]:
+        """On the worst joint."""
+        return self.detectable
+
+    def noise_floor(self) -> float | None:
+        """By repeated commands."""
+        return repeatability(self.selection.problem, self.selection.fit.residual)
+
+    def causes(self) -> Sequence[str]:
+        """The catalogue."""
+        return NAMES
+
+    def caveat(self, cause: str, channels: tuple[int, ...]) -> str:
+        """What an accepted cause leaves open."""
+        forms = self.selection.candidates_of(cause, channels)
+        spread = self.selection.problem.delay_spread_s
+        if spread and any(form.shared for form in forms):
+            return f", which changes from command to command by about {1e3 * spread:.0f} ms"
+        free = self.selection.fit.free[list(channels)]
+        if not free[:, INDEX["stop"]].any() or free[:, INDEX["bend"]].any():
+            return ""
+        return (
+            ": it stops at one opening whatever is commanded; whether a part or the gripper's own end stops "
+            "it, and how hard it presses, only the column load or pads can tell"
+        )
+
+    def not_identifiable(self, cause: str) -> str:
+        """Why no joint can show it."""
+        tried = [item.candidate for item in self.selection.first_round if item.cause == cause]
+        hidden = self.selection.problem.shared_encoders and all(item.in_shared_encoders for item in tried)
+        return NOT_SHOWN.get(cause, "") if hidden or not tried else ""
+
+    def next_experiment(
+        self, rivals: Sequence[Rival[Fit, Candidate]], alarms: Sequence[Alarm]
+    ) -> Mapping[str, Any] | None:
+        """What to record next."""
+        if alarms:
+            return experiments.for_alarm(self.selection, alarms[0])
+        if rivals:
+            return experiments.for_rivals(self.selection, rivals)
+        if self.selection.causes():
+            return None
+        return experiments.for_little_data(self.selection, self.detectable)
+
+    def drawings(self, test: JointProblem, seed: int) -> tuple[tuple[Trace, ...], tuple[ResidualView, ...]]:
+        """Traces of the worst joints, and what their residuals may follow."""
+        batch, fits = test.batch, (self.selection.baseline, self.selection.fit)
+        simulated, predicted = (test.predict(fit.point) for fit in fits)
+        traces = views.traces(batch, test.names, simulated, predicted)
+        return traces, views.residual_views(batch, simulated, predicted, seed)

@@ -1,0 +1,30 @@
+"""backlash: a joint has play, and after a reversal first does not follow."""
+
+from lerobot_vtrefine.diagnose.joints.candidates.base import Candidate
+from lerobot_vtrefine.diagnose.joints.estimates import Estimates, MethodError
+from lerobot_vtrefine.diagnose.joints.parameters import INDEX
+from lerobot_vtrefine.diagnose.verdict import Parameter
+
+METHOD = MethodError(0.005, 0.2)
+NOT_SHOWN = "no joint moves"
+_SHAPE_LEAD = 0.02
+"""By how much play that is taken up little by little must beat sharp play."""
+_ROUNDING_VAGUE = 0.08
+"""Where a play ends that is taken up bit by bit depends on its form: part of its width, per rounding."""
+
+FORMS = (
+    # Between command and servo, or between servo and encoder.
+    Candidate("backlash", ("play",), (0.5, 2.0)),
+    Candidate("backlash", ("loose",), sized=False),
+    *(
+        Candidate("backlash", (width, "round"), (0.4,), handicap=_SHAPE_LEAD, sized=False)
+        for width in ("play", "loose")
+    ),
+)
+
+
+def sizes(estimates: Estimates, joints: tuple[int, ...]) -> dict[str, Parameter]:
+    """Full widths."""
+    point, problem = estimates.selection.fit.point, estimates.selection.problem
+    vague = {joint: problem.vague + _ROUNDING_VAGUE * point.theta[joint, INDEX["round"]] for joint in joints}
+    return estimates.lengths(METHOD, joints, ("play", "loose"), vague)

@@ -1,0 +1,26 @@
+"""control_latency: commands take effect late."""
+
+import numpy as np
+
+from lerobot_vtrefine.diagnose.core.resampling import jackknife
+from lerobot_vtrefine.diagnose.joints.candidates.base import Candidate
+from lerobot_vtrefine.diagnose.joints.estimates import Estimates, MethodError, widened
+from lerobot_vtrefine.diagnose.verdict import Parameter
+
+METHOD = MethodError(0.01, 0.0)
+NOT_SHOWN = "no joint moves"
+FORMS = (
+    Candidate(
+        "control_latency", (), shared=True, possible=lambda problem: np.ones(problem.batch.joints, dtype=bool)
+    ),
+)
+
+
+def sizes(estimates: Estimates, joints: tuple[int, ...]) -> dict[str, Parameter]:
+    """One delay of all joints."""
+    problem, value = estimates.selection.problem, estimates.selection.fit.point.tau_s
+    # A uniform error of width w has the standard deviation w / sqrt(12).
+    tick = 1.96 * problem.tick_s / np.sqrt(12)
+    method = estimates.method_error(METHOD, value)
+    own = float(np.hypot(np.hypot(tick, problem.delay_spread_s), method))
+    return {"tau_s": Parameter(value, widened(jackknife(estimates.tau, value), value, own), "s")}

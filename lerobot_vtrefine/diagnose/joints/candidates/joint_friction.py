@@ -1,0 +1,66 @@
+"""joint_friction: dry friction holds a joint back."""
+
+import numpy as np
+
+from lerobot_vtrefine.diagnose.core.resampling import jackknife
+from lerobot_vtrefine.diagnose.joints.candidates.base import Candidate
+from lerobot_vtrefine.diagnose.joints.estimates import Estimates, MethodError, widened
+from lerobot_vtrefine.diagnose.joints.friction_load import friction_in_load, stiffness_in_load
+from lerobot_vtrefine.diagnose.joints.gravity import is_sliding
+from lerobot_vtrefine.diagnose.joints.parameters import INDEX
+from lerobot_vtrefine.diagnose.verdict import Parameter
+from lerobot_vtrefine.embodiments import embodiment_of
+
+METHOD = MethodError(0.012, 0.1)
+NOT_SHOWN = "no joint shows enough for it to matter"
+_SHAPE_LEAD = 0.02
+"""By how much friction that is larger at rest must beat one that is the same throughout."""
+_STICKING_VAGUE = 0.12
+"""How friction falls from rest to motion is not resolved: part of it that intervals allow for."""
+
+# Slow to simulate, and to first order the same as play: only where play helps at all.
+FORMS = (
+    Candidate("joint_friction", ("friction",), (0.5,), only_where="backlash"),
+    Candidate(
+        "joint_friction",
+        ("friction", "stick"),
+        (0.25, 0.75),
+        handicap=_SHAPE_LEAD,
+        only_where="backlash",
+        sized=False,
+    ),
+)
+
+
+def sizes(estimates: Estimates, joints: tuple[int, ...]) -> dict[str, Parameter]:
+    """In Nm where loads or the robot's known servo gains give the scale; else as the servo's error."""
+    return dict(_size(estimates, joint) for joint in joints)
+
+
+def _size(estimates: Estimates, joint: int) -> tuple[str, Parameter]:
+    problem, fitted = estimates.selection.problem, estimates.selection.fit
+    name = problem.names[joint]
+    force, length = ("N", "m") if is_sliding(name) else ("Nm", "rad")
+    column = INDEX["friction"]
+    value = float(fitted.point.theta[joint, column])
+    own = _STICKING_VAGUE * value if fitted.free[joint, INDEX["stick"]] else 0.0
+    own = float(np.hypot(own, estimates.method_error(METHOD, value, joint)))
+    low, high = widened(jackknife(estimates.theta[:, joint, column], value), value, own)
+    stiffness = stiffness_in_load(problem, fitted, joint)
+    if stiffness is None and problem.batch.load is not None:
+        seen = friction_in_load(problem, fitted, joint, estimates.seed)
+        if seen.seen:
+            return f"{name}_{force.lower()}", Parameter(seen.torque, seen.ci95, force)
+    stiffness = stiffness or _known_stiffness(name)
+    if stiffness is None:
+        return f"{name}_{length}", Parameter(value, (low, high), f"{length} of servo error")
+    return f"{name}_{force.lower()}", Parameter(value * stiffness, (low * stiffness, high * stiffness), force)
+
+
+def _known_stiffness(name: str) -> float | None:
+    """Servo gain [Nm/rad, N/m] of a joint of a known body."""
+    body = embodiment_of((name,))
+    if body is None:
+        return None
+    joint = body.joint_of(name.removesuffix(".pos"))
+    return body.fingers.stiffness if joint is None else joint.stiffness

@@ -1,0 +1,397 @@
+"""Least-squares fits of the servo model to trials, all joints at once (Levenberg-Marquardt).
+
+Joints share nothing but the commands' delay, so every joint has its own damping of the step, and one batched
+simulation yields the derivatives of all. Shapes: T trials, J joints, P = `len(PARAMETERS)`.
+"""
+
+from dataclasses import dataclass, field, replace
+from typing import Self
+
+import numpy as np
+
+from lerobot_vtrefine.diagnose.joints import gravity, stages
+from lerobot_vtrefine.diagnose.joints.batch import Batch, frame_s
+from lerobot_vtrefine.diagnose.joints.parameters import INDEX, PARAMETERS, POSITIVE, RATIOS, SAG
+from lerobot_vtrefine.diagnose.joints.servo import Columns, simulate
+from lerobot_vtrefine.diagnose.joints.stages import STAGES
+
+Array = np.ndarray
+
+OMEGA_BOUNDS = (0.5, 300.0)
+ZETA_BOUNDS = (0.1, 20.0)
+_RADIANS_PER_FRAME = (6.0, 3.0)
+"""Fastest servo that frames can tell, well damped and swinging: beyond, oscillations alias."""
+TAU_BOUND_S = 1.0
+_LARGEST = {"round": 1.0, "stick": 3.0}
+SERVO_TICK_S = 2e-3
+"""Servos look at their command once in one or two milliseconds, and encoders are read as much beside their
+frame's time. When, no recording tells: a delay is known up to a uniform error of this width."""
+_START_OMEGA = (4.0, 10.0, 25.0, 60.0)
+_START_ZETA = (0.4, 1.0, 2.0)
+_TOLERANCE = 1e-5
+_RIDGE = (1e-4, 3e-3)  # where commands are repeated, and where nothing tells misfit from sag
+_SHORTEST = 1e5
+"""Damping beyond which a joint has nowhere better to go."""
+
+
+@dataclass(frozen=True)
+class Point:
+    """Parameter values of all joints."""
+
+    theta: Array
+    """(J, P); angles in rad, slides in m, frequencies and damping as logarithms."""
+    forms: tuple[str, ...]
+    """Shape of each joint's sag."""
+    tau_s: float = 0.0
+
+    def with_values(self, name: str, values: Array | float, joints: Array | None = None) -> "Point":
+        """With one parameter set, for some joints or all."""
+        theta = self.theta.copy()
+        rows = np.arange(len(theta)) if joints is None else joints
+        theta[rows, INDEX[name]] = values
+        return replace(self, theta=theta)
+
+    def value(self, name: str) -> Array:
+        """One parameter of all joints (J,)."""
+        return self.theta[:, INDEX[name]]
+
+
+@dataclass(frozen=True)
+class ServoTrials:
+    """Trials and the servo model's predictions of them, with gravity's shapes at their commands worked out
+    once."""
+
+    names: tuple[str, ...]
+    batch: Batch
+    shapes: dict[str, Array]
+    """Form -> (N, T, J, K)."""
+    scale: Array = field(repr=False)
+    """(J,) typical error: what finite differences and starts are measured by."""
+    misfit: float = 0.0
+    """What is called a cause must change a joint's prediction by this part of its baseline's error ..."""
+    floor: float = 0.0
+    """... and by this much [rad; a tenth of it in m for slides]."""
+    shared_encoders: bool = False
+    """Servos close their loop on the encoders that are read: an offset of these moves commands and readings
+    alike, and only one that comes behind the servo shows."""
+    tick_s: float = SERVO_TICK_S
+    """How long a command may wait for the servo."""
+    vague: float = 0.0
+    """Part of a play's width that 95 % intervals allow for the method's own error."""
+    iterations: int = 20
+    """Most steps of a fit."""
+
+    @classmethod
+    def of(cls, names: tuple[str, ...], batch: Batch) -> Self:
+        """From the joints' names and their trials."""
+        error = np.where(batch.valid[..., None], batch.position - batch.command, 0.0)
+        moved = np.ptp(batch.command, axis=(0, 1))
+        scale = np.maximum(error.reshape(-1, batch.joints).std(0), 1e-3 * moved)
+        session = batch.start_s + batch.time_s
+        known = np.array([session.min(), session.max()])
+        shapes = gravity.shapes(names, batch.command) | gravity.decoys(batch.command, session, known)
+        return cls(names, batch, shapes, np.maximum(scale, 1e-7))
+
+    def subset(self, trials: Array) -> Self:
+        """The same problem on fewer trials."""
+        batch = self.batch.subset(trials)
+        length = len(batch.time_s)
+        shapes = {form: values[:length][:, np.asarray(trials)] for form, values in self.shapes.items()}
+        return replace(self, batch=batch, shapes=shapes)
+
+    def bent(self, point: Point) -> Self:
+        """With gravity's shapes where the arm stands once it has sagged, not where it was commanded to."""
+        bare = point.with_values("bend", 0.0).theta
+        push = self._push(point.forms, np.arange(self.batch.joints), bare)
+        if push is None:
+            return self
+        return replace(self, shapes=self.shapes | gravity.shapes(self.names, self.batch.command + push))
+
+    def finer(self) -> Self | None:
+        """The same trials with predictions for which the search is too slow; None where there are none."""
+        return None
+
+    @property
+    def weight(self) -> Array:
+        """(J,) that makes the joints' squared errors comparable where they share the delay."""
+        return 1.0 / self.scale**2
+
+    def start(self) -> Point:
+        """Where fits of the baseline begin."""
+        return first_point(self)
+
+    def offers(self, parameters: tuple[str, ...], form: str | None) -> bool:
+        """Whether predictions know such parameters, and the form of sag, so that they may be tried."""
+        return True
+
+    def predict(self, point: Point, joint: Array | None = None, theta: Array | None = None) -> Array:
+        """Positions (N, T, C) of columns: joints (C,) under parameters (C, P); by default all joints."""
+        joint = np.arange(self.batch.joints) if joint is None else joint
+        theta = point.theta[joint] if theta is None else theta
+        value = dict(zip(PARAMETERS, theta.T, strict=True))
+        plain = ("offset", "play", "loose", "friction", "stop", "give", "stick")
+        columns = Columns(
+            joint=joint,
+            omega=np.exp(value["log_omega"]),
+            zeta=np.exp(value["log_zeta"]),
+            rounding=value["round"],
+            tau_s=point.tau_s,
+            push=self._push(point.forms, joint, theta),
+            stages={name: value[name] for name in stages.parameters()},
+            **{name: value[name] for name in plain},
+        )
+        return simulate(self.batch, columns)
+
+    def residual(self, prediction: Array, joint: Array | None = None) -> Array:
+        """Measured minus predicted (N, T, C), zero where there is nothing to compare."""
+        position = self.batch.position if joint is None else self.batch.position[..., joint]
+        return np.where(self.batch.valid[..., None], position - prediction, 0.0)
+
+    def _push(self, forms: tuple[str, ...], joint: Array, theta: Array) -> Array | None:
+        sag = theta[:, [INDEX[name] for name in SAG]]
+        bend = theta[:, INDEX["bend"]]
+        load = self.batch.load
+        if not sag.any() and (load is None or not bend.any()):
+            return None
+        push = np.zeros((*self.batch.time_s.shape, len(joint)))
+        for column, index in enumerate(joint):
+            if sag[column].any():
+                push[..., column] = self.shapes[forms[index]][:, :, index] @ sag[column]
+        if load is not None and bend.any():
+            values = {name: theta[:, INDEX[name]] for name in stages.parameters()}
+            push -= bend * stages.spring(load[..., joint], values)
+        return push
+
+
+@dataclass(frozen=True)
+class Fit:
+    """Where a fit ended, and what it leaves."""
+
+    point: Point
+    free: Array
+    """(J, P) bool."""
+    tau_free: bool
+    mse: Array
+    """(T, J) mean squared error per trial."""
+    residual: Array = field(repr=False)
+    """(N, T, J)"""
+
+    @property
+    def total(self) -> Array:
+        """(J,) mean over trials of the mean squared error: the contract's metric, per joint."""
+        return self.mse.mean(0)
+
+
+def ridge(problem: ServoTrials, free: Array) -> Array:
+    """(J, P) weights of squared parameters that are added to the squared error.
+
+    Sags of several terms nearly cancel in the postures seen; where these do not tell, terms stay small."""
+    out = np.zeros(free.shape)
+    columns = [INDEX[name] for name in SAG]
+    several = free[:, columns].sum(1) > 1
+    alone = len(set(problem.batch.conditions)) == problem.batch.trials
+    out[np.ix_(several, columns)] = _RIDGE[alone] * problem.batch.valid.sum()
+    return out
+
+
+def first_point(problem: ServoTrials) -> Point:
+    """The best of a few plain servos per joint."""
+    count = problem.batch.joints
+    theta = np.zeros((count, len(PARAMETERS)))
+    grid = [(np.log(omega), np.log(zeta)) for omega in _START_OMEGA for zeta in _START_ZETA]
+    columns = np.tile(np.arange(count), len(grid))
+    many = theta[columns].copy()
+    many[:, :2] = np.repeat(np.array(grid), count, 0)
+    point = Point(theta, (gravity.ONE_TERM_FORMS[0],) * count)
+    left = problem.residual(problem.predict(point, columns, many), columns)
+    cost = (left**2).sum((0, 1)).reshape(len(grid), count)
+    point.theta[:, :2] = np.array(grid)[cost.argmin(0)]
+    return point
+
+
+def servo_only(problem: ServoTrials) -> Array:
+    """Free parameters of the baseline (J, P): frequency and damping."""
+    free = np.zeros((problem.batch.joints, len(PARAMETERS)), dtype=bool)
+    free[:, :2] = True
+    return free
+
+
+def evaluate(
+    problem: ServoTrials,
+    point: Point,
+    free: Array,
+    tau_free: bool = False,
+    known: Fit | None = None,
+    joints: Array | None = None,
+) -> Fit:
+    """A fit that stays where it starts; only some joints differ from a known one if both are given."""
+    if known is None or joints is None:
+        left = problem.residual(problem.predict(point))
+    else:
+        left = known.residual.copy()
+        left[..., joints] = problem.residual(problem.predict(point, joints), joints)
+    mse = (left**2).sum(0) / np.maximum(problem.batch.frames, 1)[:, None]
+    return Fit(point, free, tau_free, mse, left)
+
+
+def fit(
+    problem: ServoTrials,
+    start: Point,
+    free: Array,
+    tau_free: bool = False,
+    iterations: int | None = None,
+    known: Fit | None = None,
+) -> Fit:
+    """Minimise every joint's squared error over its free parameters, and over the delay if it is free.
+
+    Joints without free parameters must be as in `known`, if that is given: they are not simulated again.
+    """
+    fitter = _Fitter(problem, free, tau_free)
+    moving = None if tau_free else np.flatnonzero(np.any(free, axis=1))
+    now = evaluate(problem, _bounded(problem, start, free), free, tau_free, known, moving)
+    most = problem.iterations if iterations is None else iterations
+    for _ in range(most if free.any() or tau_free else 0):
+        now, done = fitter.step(now)
+        if done:
+            break
+    return now
+
+
+def refit(problem: ServoTrials, known: Fit, point: Point, free: Array, joints: Array, iterations: int) -> Fit:
+    """Fit some joints anew from a point that differs from `known` only there; the delay stays."""
+    mask = np.isin(np.arange(len(free)), joints)
+    fitted = fit(problem, point, free & mask[:, None], iterations=iterations, known=known)
+    return replace(fitted, free=np.where(mask[:, None], free, known.free), tau_free=known.tau_free)
+
+
+class _Fitter:
+    """Damping of the steps, kept between iterations."""
+
+    def __init__(self, problem: ServoTrials, free: Array, tau_free: bool) -> None:
+        self.problem, self.free, self.tau_free = problem, free, tau_free
+        self.damping = np.full(len(free), 1e-3)
+        self.weight = problem.weight
+        self.ridge = ridge(problem, free)
+        self.settled: Array = ~np.any(free, axis=1)
+
+    def step(self, now: Fit) -> tuple[Fit, bool]:
+        """One damped step; joints that it does not improve keep their values and try a shorter one next."""
+        derivative = derivatives(self.problem, replace(now, free=now.free & ~self.settled[:, None]))
+        open_joints = None if self.tau_free else np.flatnonzero(~self.settled)
+        proposed = self._propose(now, derivative)
+        then = evaluate(self.problem, proposed, self.free, self.tau_free, now, open_joints)
+        before, after = self._cost(now), self._cost(then)
+        if self.tau_free:
+            before, after = (np.full(len(before), (x * self.weight).sum()) for x in (before, after))
+        better = (after < before) & ~self.settled
+        gained = np.where(better, (before - after) / np.maximum(before, 1e-300), 0.0)
+        self.damping = np.where(better, self.damping * 0.2, self.damping * 8).clip(1e-9, 1e9)
+        self.settled |= (better & (gained < _TOLERANCE)) | (self.damping > _SHORTEST)
+        if better.all():
+            return then, bool(self.settled.all())
+        return _merged(now, then, better, self.tau_free), bool(self.settled.all())
+
+    def _cost(self, item: Fit) -> Array:
+        return (item.residual**2).sum((0, 1)) + (self.ridge * item.point.theta**2).sum(1)
+
+    def _normal(self, now: Fit, derivative: "Derivatives", joint: int) -> tuple[Array, Array]:
+        """Normal equations of one joint, ridge included."""
+        normal, slope = derivative.normal(joint, now.residual, with_tau=self.tau_free)
+        own = np.flatnonzero(self.free[joint])
+        normal[range(len(own)), range(len(own))] += self.ridge[joint, own]
+        slope[: len(own)] -= self.ridge[joint, own] * now.point.theta[joint, own]
+        return normal, slope
+
+    def _propose(self, now: Fit, derivative: "Derivatives") -> Point:
+        theta, tau = now.point.theta.copy(), now.point.tau_s
+        if self.tau_free:
+            tau += self._tau_step(now, derivative, theta)
+        else:
+            for joint in np.flatnonzero(~self.settled):
+                normal, slope = self._normal(now, derivative, joint)
+                theta[joint, self.free[joint]] += _solve(normal, slope, self.damping[joint])
+        return _bounded(self.problem, replace(now.point, theta=theta, tau_s=tau), self.free)
+
+    def _tau_step(self, now: Fit, derivative: "Derivatives", theta: Array) -> float:
+        """Step of everything at once: joints meet only in the delay (last unknown)."""
+        sizes = self.free.sum(1)
+        ends = np.cumsum(sizes)
+        normal, slope = np.zeros((ends[-1] + 1,) * 2), np.zeros(ends[-1] + 1)
+        for joint, end in enumerate(ends):
+            block, right = self._normal(now, derivative, joint)
+            index = [*range(end - sizes[joint], end), ends[-1]]
+            normal[np.ix_(index, index)] += self.weight[joint] * block
+            slope[index] += self.weight[joint] * right
+        change = _solve(normal, slope, float(self.damping[0]))
+        theta[self.free] += change[:-1]
+        return float(change[-1])
+
+
+def _merged(now: Fit, then: Fit, better: Array, tau_free: bool) -> Fit:
+    """Joints that improved as they are then, the others as they are now."""
+    if tau_free:  # joints meet in the delay: all or none
+        return then if better.any() else now
+    point = replace(now.point, theta=np.where(better[:, None], then.point.theta, now.point.theta))
+    mse = np.where(better, then.mse, now.mse)
+    return replace(now, point=point, mse=mse, residual=np.where(better, then.residual, now.residual))
+
+
+@dataclass(frozen=True)
+class Derivatives:
+    """d position / d parameter of every free parameter."""
+
+    columns: dict[int, Array]
+    """Joint -> (N, T, free parameters)."""
+    tau: Array | None
+    """(N, T, J), None where the delay is fixed."""
+
+    def normal(self, joint: int, residual: Array, with_tau: bool = False) -> tuple[Array, Array]:
+        """J^T J and J^T r of one joint."""
+        jacobian = self.columns[joint]
+        if with_tau and self.tau is not None:
+            jacobian = np.concatenate([jacobian, self.tau[..., joint, None]], -1)
+        flat = jacobian.reshape(-1, jacobian.shape[-1])
+        return flat.T @ flat, flat.T @ residual[..., joint].reshape(-1)
+
+
+def derivatives(problem: ServoTrials, now: Fit) -> Derivatives:
+    """Finite differences of all free parameters in one simulation."""
+    joint, parameter = np.nonzero(now.free)
+    theta = now.point.theta[joint].copy()
+    steps = np.where(parameter < 2, 1e-3, 0.02 * problem.scale[joint])
+    steps = np.where(np.isin(parameter, [INDEX[name] for name in RATIOS]), 0.02, steps)
+    theta[np.arange(len(joint)), parameter] += steps
+    here = problem.batch.position - now.residual
+    moved = problem.predict(now.point, joint, theta) - here[..., joint]
+    moved = np.where(problem.batch.valid[..., None], moved, 0.0) / steps
+    columns = {index: moved[..., joint == index] for index in range(problem.batch.joints)}
+    tau = None
+    if now.tau_free:
+        step = 0.05 * frame_s(problem.batch)
+        later = problem.predict(replace(now.point, tau_s=now.point.tau_s + step))
+        tau = np.where(problem.batch.valid[..., None], later - here, 0.0) / step
+    return Derivatives(columns, tau)
+
+
+def _solve(normal: Array, slope: Array, damping: float) -> Array:
+    diagonal = np.diag(normal).copy()
+    diagonal = np.where(diagonal > 0, diagonal, 1.0)
+    scale = 1 / np.sqrt(diagonal)
+    matrix = normal * scale[:, None] * scale + (damping + 1e-9) * np.eye(len(normal))
+    return scale * np.linalg.solve(matrix, scale * slope)
+
+
+def _bounded(problem: ServoTrials, point: Point, free: Array) -> Point:
+    theta = point.theta.copy()
+    theta[:, 1] = theta[:, 1].clip(*np.log(ZETA_BOUNDS))
+    per_frame = np.where(theta[:, 1] > np.log(0.5), *_RADIANS_PER_FRAME)
+    fastest = np.minimum(OMEGA_BOUNDS[1], per_frame / frame_s(problem.batch))
+    theta[:, 0] = theta[:, 0].clip(np.log(OMEGA_BOUNDS[0]), np.log(fastest))
+    widest = np.maximum(np.ptp(problem.batch.command, axis=(0, 1)), 10 * problem.scale)
+    for name in POSITIVE:
+        most = _LARGEST.get(name, widest)
+        theta[:, INDEX[name]] = theta[:, INDEX[name]].clip(0.0, most)
+    for name, ends in (("give", (0.0, 1.0)), *(item for stage in STAGES for item in stage.bounds.items())):
+        theta[:, INDEX[name]] = theta[:, INDEX[name]].clip(*ends)
+    theta = np.where(free, theta, point.theta)
+    return replace(point, theta=theta, tau_s=float(np.clip(point.tau_s, 0.0, TAU_BOUND_S)))

@@ -1,0 +1,296 @@
+"""The joints' servo model: second-order response to zero-order-held commands, and what real joints add to it.
+
+A joint's target r is its command, late by tau, through play of full width `play`, plus `push` (gravity's sag,
+what a load bends). The servo follows:
+
+    q'' = omega^2 (r - friction sign(q') - q) - 2 zeta omega q'          (friction as servo error, [rad])
+
+and the encoder reads q + offset, possibly through play of its own (`loose`). A joint at rest may need more
+than its friction to break away (`stick`), and play may be taken up little by little (`rounding`): several
+plays side by side, whose widths spread evenly about their mean (Prandtl-Ishlinskii). Without friction every
+step is exact, whatever the frames' spacing and the delay; with friction, so are the stops between them.
+
+Shapes: N frames, T trials, C columns. A column is one joint under one set of parameters: columns repeat
+joints when several sets are tried at once.
+"""
+
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from lerobot_vtrefine.diagnose.joints.batch import Batch
+from lerobot_vtrefine.diagnose.joints.stages import applied
+
+Array = np.ndarray
+
+MAX_PARTS = 4
+_TURN_RAD = 1.5
+"""A joint with friction is followed in steps of at most this phase, so that it stops at most once in each."""
+_CRITICAL = 1e-6
+_SPREAD = (-0.8, -0.4, 0.0, 0.4, 0.8)
+"""Middles of five equal parts of a spread of widths."""
+_DT_DIGITS = 6
+
+
+@dataclass(frozen=True)
+class Columns:
+    """What to simulate: C columns of joints with their parameters (C,), SI units."""
+
+    joint: Array
+    omega: Array
+    """Natural frequency [rad/s]."""
+    zeta: Array
+    """Damping ratio."""
+    offset: Array
+    """Reading minus true position."""
+    play: Array
+    """Full width of the play between command and servo."""
+    loose: Array
+    """Full width of the play between servo and encoder."""
+    friction: Array
+    """Dry friction, divided by the servo's stiffness."""
+    stop: Array | None = None
+    """Distance from zero at which the joint meets what its gripper holds; zero where it meets nothing."""
+    give: Array | None = None
+    """How far a stopped joint still follows its target, as a part of the way."""
+    rounding: Array | None = None
+    """Half the spread of the widths that make up a play, as a part of their mean; zero is one sharp play."""
+    stick: Array | None = None
+    """By what part breaking away takes more than friction in motion."""
+    tau_s: float = 0.0
+    """Every command acts this late."""
+    push: Array | None = None
+    """(N, T, C) added to the target."""
+    stages: Mapping[str, Array] | None = None
+    """Values (C,) of `stages.parameters`."""
+
+    def only(self, kind: Array) -> "Columns":
+        """The servo's parameters of some columns."""
+        names = ("joint", "omega", "zeta", "offset", "play", "loose", "friction")
+        own = {name: getattr(self, name)[kind] for name in names}
+        stick = None if self.stick is None else self.stick[kind]
+        return replace(self, **own, stop=None, give=None, push=None, stages=None, rounding=None, stick=stick)
+
+
+def simulate(batch: Batch, columns: Columns) -> Array:
+    """Encoder readings (N, T, C) that follow from the commands and the first position alone."""
+    load = None if batch.load is None else batch.load[:, :, columns.joint]
+    first = _true_first(batch.first_position[:, columns.joint] - columns.offset, columns, load)
+    target = _play(batch.command[:, :, columns.joint], columns, first)
+    if columns.stop is not None and columns.give is not None and (columns.stop > 0).any():
+        target = blocked(target, columns.stop, columns.give)
+    if columns.stages is not None:
+        target = applied("target", target, columns.stages, load)
+    start = np.clip(target[0], first - columns.loose / 2, first + columns.loose / 2)
+    dry = columns.friction > 0
+    q = np.empty_like(target)
+    for kind, follow in ((~dry, _linear), (dry, _with_friction)):
+        if kind.any():
+            q[..., kind] = follow(batch.time_s, target[..., kind], start[:, kind], columns.only(kind))
+    if (columns.loose > 0).any():
+        q = _worn(q, columns.loose, columns.rounding, first)
+    if columns.stages is not None:
+        q = applied("reading", q, columns.stages, load)
+    return q + columns.offset
+
+
+def _true_first(read: Array, columns: Columns, load: Array | None) -> Array:
+    """Where joints (T, C) are that are read there: without what stages add to a reading, to first order."""
+    if columns.stages is None:
+        return read
+    added = applied("reading", read[None], columns.stages, None if load is None else load[:1]) - read
+    return read - added[0]
+
+
+def blocked(target: Array, stop: Array, give: Array) -> Array:
+    """Targets (N, T, C) of joints that close towards zero and meet something at `stop` (C,)."""
+    side = np.sign(target.mean((0, 1)))
+    way = side * target
+    met = (way < stop) & (stop > 0)
+    return np.where(met, side * (stop + give * (way - stop)), target)
+
+
+def _play(command: Array, columns: Columns, start: Array) -> Array:
+    """Target after play; at the beginning the joint rests where the play lets it."""
+    push = columns.push
+    rest = start if push is None else start - push[0]
+    target = command
+    if (columns.play > 0).any():
+        target = _worn(command, columns.play, columns.rounding, rest)
+    return target if push is None else target + push
+
+
+def _worn(x: Array, width: Array, rounding: Array | None, first: Array) -> Array:
+    """Play of mean full width `width` (C,), sharp or rounded."""
+    sharp = _dragged(x, width, first)
+    if rounding is None or not (rounding > 0).any():
+        return sharp
+    out, some = sharp.copy(), rounding > 0
+    part = [
+        _dragged(x[..., some], width[some] * (1 + rounding[some] * at), first[..., some]) for at in _SPREAD
+    ]
+    out[..., some] = np.mean(part, 0)
+    return out
+
+
+def _dragged(x: Array, width: Array, first: Array) -> Array:
+    """The play operator along frames: the output moves only when the input leaves a window of that width."""
+    half = width / 2
+    out = np.empty_like(x)
+    state = first
+    for k in range(len(x)):
+        state = np.minimum(np.maximum(state, x[k] - half), x[k] + half)
+        out[k] = state
+    return out
+
+
+def transition(h: Array, omega: Array, zeta: Array) -> tuple[Array, Array, Array, Array]:
+    """Exact state transition of (q - r, q') over time h: entries 11, 12, 21, 22, shapes broadcast."""
+    decay = zeta * omega
+    beat = omega**2 * (1 - zeta**2)
+    root = np.sqrt(np.abs(beat))
+    root = np.where(root < _CRITICAL * omega, _CRITICAL * omega, root)
+    x = root * h
+    swing = beat > 0
+    slow, fast = np.exp(-(decay - root) * h), np.exp(-(decay + root) * h)
+    envelope = np.exp(-decay * h)
+    cosine = np.where(swing, envelope * np.cos(x), 0.5 * (slow + fast))
+    sine = np.where(swing, envelope * np.sin(x), 0.5 * (slow - fast)) / root
+    return cosine + decay * sine, sine, -(omega**2) * sine, cosine - decay * sine
+
+
+def _linear(time_s: Array, target: Array, start: Array, columns: Columns) -> Array:
+    dt = np.diff(time_s, axis=0)
+    unique, inverse = np.unique(dt.round(_DT_DIGITS), return_inverse=True)
+    inverse = inverse.reshape(dt.shape)
+    a11, a12, a21, a22 = transition(unique[:, None], columns.omega, columns.zeta)
+    held, extra = _arrivals(time_s, target, columns)
+    out = np.empty_like(target)
+    q, v = start, np.zeros_like(start)
+    out[0] = q
+    for k in range(len(dt)):
+        step = inverse[k]
+        error = q - held[k]
+        q, v = held[k] + a11[step] * error + a12[step] * v, a21[step] * error + a22[step] * v
+        if extra is not None:
+            q, v = q + extra[0][k], v + extra[1][k]
+        out[k + 1] = q
+    return out
+
+
+def _arrivals(time_s: Array, target: Array, columns: Columns) -> tuple[Array, tuple[Array, Array] | None]:
+    """Target in force at the start of every interval (N-1, T, C), and what later arrivals add by its end."""
+    if columns.tau_s <= 0:
+        return target[:-1], None
+    count, trials = time_s.shape
+    arrival = time_s + columns.tau_s
+    # Trials one after the other on one time axis, so that one search serves all.
+    lane = np.arange(trials) * (time_s.max() + columns.tau_s + 1.0)
+    lanes = (time_s + lane).T.ravel()
+    first = np.arange(trials) * count
+    interval = (
+        np.searchsorted(lanes, (arrival[1:] + lane).ravel(), side="left").reshape(-1, trials) - first - 1
+    )
+    inside = (interval >= 0) & (interval < count - 1)
+    where, trial = np.nonzero(inside)
+    row = interval[inside]
+    rest = time_s[row + 1, trial] - arrival[where + 1, trial]
+    unique, inverse = np.unique(rest.round(_DT_DIGITS), return_inverse=True)
+    b11, _, b21, _ = transition(unique[:, None], columns.omega, columns.zeta)
+    change = target[where + 1, trial] - target[where, trial]
+    extra = np.zeros((2, count - 1, *target.shape[1:]))
+    _add(extra[0], row, trial, (1 - b11)[inverse] * change)
+    _add(extra[1], row, trial, -b21[inverse] * change)
+    arrived = (arrival[1:] + lane).T.ravel()
+    # Arrivals up to and at the interval's start are in force there.
+    held = np.searchsorted(arrived, (time_s + lane).ravel(), side="right").reshape(count, trials)
+    held = (held - np.arange(trials) * (count - 1)).clip(0, count - 1)
+    return np.take_along_axis(target, held[..., None], 0)[:-1], (extra[0], extra[1])
+
+
+def _add(out: Array, row: Array, trial: Array, values: Array) -> None:
+    """Sum values into out[row, trial]; almost always each place gets one."""
+    place = row * out.shape[1] + trial
+    _, once, count = np.unique(place, return_index=True, return_counts=True)
+    out[row[once], trial[once]] = values[once]
+    if (count > 1).any():
+        again = np.ones(len(place), dtype=bool)
+        again[once] = False
+        np.add.at(out, (row[again], trial[again]), values[again])
+
+
+def _with_friction(time_s: Array, target: Array, start: Array, columns: Columns) -> Array:
+    """Between changes of the target the motion is linear until the joint stops; stops are found exactly."""
+    grid, held, frame = _grid(time_s, columns)
+    step_s = np.diff(grid, axis=0)
+    unique, inverse = np.unique(step_s.round(_DT_DIGITS), return_inverse=True)
+    inverse = inverse.reshape(step_s.shape)
+    a11, a12, a21, a22 = transition(unique[:, None], columns.omega, columns.zeta)
+    trials = np.arange(time_s.shape[1])
+    path = np.empty((len(grid), *start.shape))
+    q, v = start.copy(), np.zeros_like(start)
+    path[0] = q
+    friction = np.broadcast_to(columns.friction, q.shape)
+    hold = np.broadcast_to(columns.friction * _breakaway(columns), q.shape)
+    for k in range(len(step_s)):
+        step = inverse[k]
+        r = target[held[k], trials]
+        pull = r - q
+        sign = np.sign(np.where(v == 0, pull, v))
+        stuck = (v == 0) & (np.abs(pull) <= hold)
+        error = friction * sign - pull
+        moved = q - error + a11[step] * error + a12[step] * v
+        speed = a21[step] * error + a22[step] * v
+        turned = (speed * sign < 0) & ~stuck
+        if turned.any():
+            where = np.nonzero(turned)
+            part = (step_s[k][where[0]], r[where], q[where], v[where], error[where])
+            moved[where], speed[where] = _through_stop(*part, columns, where[1])
+        q, v = np.where(stuck, q, moved), np.where(stuck, 0.0, speed)
+        path[k + 1] = q
+    return np.take_along_axis(path, frame[..., None], 0)
+
+
+def _through_stop(
+    h: Array, r: Array, q: Array, v: Array, error: Array, columns: Columns, column: Array
+) -> tuple[Array, Array]:
+    """State after time h of joints that come to a stop before it, and then stick or turn back."""
+    omega, zeta, friction = columns.omega[column], columns.zeta[column], columns.friction[column]
+    decay, beat = zeta * omega, omega**2 * (1 - zeta**2)
+    root = np.maximum(np.sqrt(np.abs(beat)), _CRITICAL * omega)
+    rising, falling = np.abs(v) * root, np.sign(v) * (omega**2 * error + decay * v)
+    ratio = np.clip(rising / np.where(falling > 0, falling, np.inf), 0.0, 1 - 1e-12)
+    stop = np.where(beat > 0, np.arctan2(rising, falling), np.arctanh(ratio)) / root
+    stop = np.clip(stop, 0.0, h)
+    a11, a12, _, _ = transition(stop, omega, zeta)
+    rest = q - error + a11 * error + a12 * v
+    pull = r - rest
+    back = friction * np.sign(pull) - pull
+    a11, _, a21, _ = transition(h - stop, omega, zeta)
+    sticks = np.abs(pull) <= friction * _breakaway(columns)[column]
+    return np.where(sticks, rest, rest - back + a11 * back), np.where(sticks, 0.0, a21 * back)
+
+
+def _breakaway(columns: Columns) -> Array:
+    """(C,) what breaking away takes, as a multiple of friction in motion."""
+    return np.ones_like(columns.friction) if columns.stick is None else 1.0 + columns.stick
+
+
+def _grid(time_s: Array, columns: Columns) -> tuple[Array, Array, Array]:
+    """Times (M, T) between which nothing changes and no joint turns twice; the target's row in force at each;
+    where the frames are."""
+    count, trials = time_s.shape
+    dt = np.diff(time_s, axis=0)
+    typical = np.median(dt[dt > 0]) if (dt > 0).any() else 1.0
+    parts = int(np.clip(np.ceil(columns.omega.max() * typical / _TURN_RAD), 1, MAX_PARTS))
+    inner = [time_s[:-1] + dt * part / parts for part in range(1, parts)]
+    arrival = time_s[1:] + max(columns.tau_s, 0.0)
+    late = [np.minimum(arrival, time_s[-1])] if columns.tau_s > 0 else []
+    grid = np.sort(np.concatenate([time_s, *inner, *late]), axis=0)
+    held = np.empty(grid.shape, dtype=np.int64)
+    frame = np.empty(time_s.shape, dtype=np.int64)
+    for trial in range(trials):
+        held[:, trial] = np.searchsorted(arrival[:, trial], grid[:, trial] + 1e-12, side="right")
+        frame[:, trial] = np.searchsorted(grid[:, trial], time_s[:, trial], side="left")
+    return grid, held.clip(0, count - 1), frame

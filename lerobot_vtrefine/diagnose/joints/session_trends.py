@@ -1,0 +1,75 @@
+"""What changes from trial to trial: each joint's zero, scale, servo and delay, fitted to every trial alone.
+
+Trials differ a little, and that is nothing; that they differ in the order in which they were recorded, is.
+
+Shapes: N frames, T trials, J joints.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from lerobot_vtrefine.diagnose.joints.batch import Batch
+
+Array = np.ndarray
+
+KINDS = ("zero", "scale", "servo's response", "servo's response", "delay")
+FEWEST_TRIALS = 6
+_RIDGE = 1e-6
+
+
+@dataclass(frozen=True)
+class Trend:
+    """One quantity of one joint that follows the order of the trials."""
+
+    joint: int
+    kind: str
+    share: float
+    """Part of the joint's squared error that a straight line over the session would take away."""
+    change: Array
+    """(T,) the quantity of every trial, about its mean."""
+    place: Array
+    """(T,) every trial's place in the session, standardised."""
+
+
+def trends(batch: Batch, residual: Array, columns: dict[int, Array], tau: Array) -> list[Trend]:
+    """How every quantity follows the session.
+
+    Args:
+        residual: (N, T, J) what the model leaves.
+        columns: joint -> (N, T, 2 or more) derivatives by frequency and damping (logarithms), first.
+        tau: (N, T, J) derivative by the delay.
+    """
+    if batch.trials < FEWEST_TRIALS or not np.ptp(batch.order):
+        return []
+    place = np.argsort(np.argsort(batch.order, kind="stable")).astype(float)
+    place = (place - place.mean()) / place.std()
+    fitted = [_by_trial(batch, residual, columns[joint], tau, joint) for joint in range(batch.joints)]
+    change = np.stack([item[0] for item in fitted], 1)
+    change = change - change.mean(0)
+    slope = np.einsum("t,tjk->jk", place, change) / batch.trials
+    power = np.stack([item[1] for item in fitted])
+    total = np.square(residual[batch.valid]).sum(0).clip(1e-300)
+    share = slope**2 * np.einsum("t,jtk->jk", place**2, power) / total[:, None]
+    return [
+        Trend(joint, kind, float(share[joint, k]), change[:, joint, k], place)
+        for joint in range(batch.joints)
+        for k, kind in enumerate(KINDS)
+    ]
+
+
+def _by_trial(batch: Batch, residual: Array, own: Array, tau: Array, joint: int) -> tuple[Array, Array]:
+    """Least-squares sizes (T, K) of the quantities in every trial, and their columns' squares (T, K)."""
+    sizes, power = [], []
+    for trial in range(batch.trials):
+        valid = batch.valid[:, trial]
+        command = batch.command[valid, trial, joint]
+        parts = [np.ones(len(command)), command, *own[valid, trial, :2].T, tau[valid, trial, joint]]
+        design = np.stack(parts, 1)
+        norm = np.square(design).sum(0).clip(1e-300)
+        scaled = design / np.sqrt(norm)
+        normal = scaled.T @ scaled + _RIDGE * np.eye(len(norm))
+        solved = np.linalg.solve(normal, scaled.T @ residual[valid, trial, joint])
+        sizes.append(solved / np.sqrt(norm))
+        power.append(norm)
+    return np.array(sizes), np.array(power)

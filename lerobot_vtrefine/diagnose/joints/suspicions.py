@@ -1,0 +1,269 @@
+"""What may be left on a joint: it repeats with the command, or does not; it follows the order of the trials,
+or something else that the model does not know (time, other joints, a load); it rings; it stands still.
+
+Shapes: N frames, T trials, J joints.
+"""
+
+from dataclasses import replace
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from lerobot_vtrefine.diagnose.core.rules import LEAST_UNKNOWN
+from lerobot_vtrefine.diagnose.core.search import ALL
+from lerobot_vtrefine.diagnose.core.suspicion import Suspicion
+from lerobot_vtrefine.diagnose.joints.batch import frame_s
+from lerobot_vtrefine.diagnose.joints.encoder_steps import LEAST_EFFECT_RAD, resolution
+from lerobot_vtrefine.diagnose.joints.fitting import derivatives
+from lerobot_vtrefine.diagnose.joints.gravity import is_gripper
+from lerobot_vtrefine.diagnose.joints.repeatability import common_part, repeated, scatter
+from lerobot_vtrefine.diagnose.joints.session_trends import trends
+from lerobot_vtrefine.diagnose.joints.timing import mirrored
+
+if TYPE_CHECKING:
+    from lerobot_vtrefine.diagnose.joints.problem import Selected
+
+Array = np.ndarray
+
+_REPEATS, _REPEATS_ALL = 0.3, 0.6
+"""Least part of what is left that must repeat; where it is this much, and in every condition, the conditions
+need not be enough for a small p."""
+_LEAST_CONDITIONS, _FEW_CONDITIONS = 4, 2
+_NEARLY_ALL = 0.8
+"""Part of what is left that must repeat in each of few conditions."""
+_SHAPES_DIFFER, _FAR, _ZEROS_DIFFER = 5.0, 20.0, 12.0
+"""Difference of trials of one command, in scatters from frame to frame: noise that wanders makes up to three,
+a robot that is zeroed anew before every trial up to eight. Up to `_FAR`, motion must have to do with it."""
+_MOVING = 1.6
+"""How much larger such a difference is over all frames than over slow ones, if it comes with motion."""
+_SERVOS_DIFFER = 0.04
+"""Part by which a servo's frequency may differ from trial to trial: batteries and oil, no fault."""
+_TREND = 0.1
+"""Least part of what is left that must follow the session."""
+_FOLLOWS, _FOLLOWS_IF_OWNED = 0.1, 0.4
+"""Least part of what is left that must follow a descriptor; more where an accepted form may be off."""
+_LINE = 0.1
+_STOPPED = 0.4
+"""Part of the baseline's squared error in frames where a gripper stands far from its command."""
+_MOTION = {"backlash", "joint_friction", "control_latency"}
+_POSTURE = {"gravity_sag", "encoder_offset"}
+_OWNED = {
+    "speed": _MOTION,
+    "direction": _MOTION,
+    "acceleration": _MOTION,
+    "position": _POSTURE,
+    "squared position": _POSTURE,
+    "load": {"gripper_compliance"},
+}
+"""Causes whose other forms follow a descriptor, too."""
+
+
+def suspicions(selection: "Selected") -> list[Suspicion]:
+    """All of them; each must account for what is worth speaking of."""
+    found = _stopped(selection)
+    found += _repeating(selection)
+    found += not_repeating(selection)
+    found += _through_the_session(selection)
+    found += _following(selection)
+    found += _ringing(selection)
+    least = _worth_speaking_of(selection)
+    return [replace(item, least=max(item.least, float(least[item.channel]))) for item in found]
+
+
+def _worth_speaking_of(selection: "Selected") -> Array:
+    """(J,) part of what is left that is: enough of the baseline's error, and more than encoders' steps."""
+    problem, left = selection.problem, selection.fit.total.clip(1e-300)
+    floor = max(LEAST_EFFECT_RAD, problem.floor)
+    size = np.array([floor * (0.1 if is_gripper(name) else 1.0) for name in problem.names])
+    size = np.maximum(size, 0.5 * resolution(problem))
+    return np.maximum(size**2, LEAST_UNKNOWN * selection.baseline.total) / left
+
+
+def _repeating(selection: "Selected") -> list[Suspicion]:
+    """Residuals of trials of one condition, multiplied frame by frame: noise cancels, causes do not."""
+    batch = selection.problem.batch
+    rows, squares = common_part(batch, selection.fit.residual)
+    if len(rows) < _FEW_CONDITIONS:
+        return []
+    scores = np.zeros((batch.trials, batch.joints))
+    scores[[pairs[0][0] for pairs in repeated(batch)]] = rows
+    # Of what those trials leave: others, whose command came once, say nothing about it.
+    shares = np.mean(rows, 0) / np.mean(squares, 0).clip(1e-300)
+    alone = _REPEATS_ALL if len(rows) >= _LEAST_CONDITIONS else _NEARLY_ALL
+    clue = "what is left repeats when the command is repeated"
+    return [
+        Suspicion(joint, clue, float(share), alone)
+        if share > alone and rows[:, joint].min() > 0
+        else Suspicion(joint, clue, float(share), _REPEATS, scores[:, joint])
+        for joint, share in enumerate(shares)
+    ]
+
+
+def not_repeating(selection: "Selected") -> list[Suspicion]:
+    """Trials of one command that differ by far more than their encoders scatter: what no command sets."""
+    problem, fitted = selection.problem, selection.fit
+    if problem.delay_spread_s:  # which is a difference of that kind
+        return []
+    seen = scatter(problem.batch, fitted.residual, derivatives(problem, fitted).columns)
+    if seen is None:
+        return []
+    white = np.maximum(seen.white, 0.5 * resolution(problem))
+    with_motion = seen.shape > _MOVING * np.maximum(seen.resting, white)
+    shapes = seen.shape > np.where(with_motion, _SHAPES_DIFFER, _FAR) * white
+    servos = (seen.servo > _SERVOS_DIFFER) & (seen.servo_effect > _SHAPES_DIFFER * white)
+    zeros = seen.zero > _ZEROS_DIFFER * white
+    # What differs in shape has a mean and a likeness to slower servos, too.
+    servos, zeros = servos & (seen.servo_effect > seen.shape), zeros & (seen.zero > seen.shape)
+    least, clue = (
+        _worth_speaking_of(selection),
+        "trials of one command differ by far more than the encoder scatters",
+    )
+    found = []
+    for joint in range(problem.batch.joints):
+        for size, far in ((seen.shape, shapes), (seen.servo_effect, servos), (seen.zero, zeros)):
+            share = float(min(size[joint] ** 2 / max(fitted.total[joint], 1e-300), 1.0))
+            if far[joint] and share > max(_REPEATS, least[joint]):
+                found.append(Suspicion(joint, clue, share, _REPEATS))
+                break
+    return found
+
+
+def _through_the_session(selection: "Selected") -> list[Suspicion]:
+    """A joint's zero, scale, servo or delay that follows the order of the trials."""
+    problem, fitted = selection.problem, selection.fit
+    later = derivatives(problem, replace(fitted, tau_free=True))
+    assert later.tau is not None
+    return [
+        Suspicion(
+            item.joint,
+            f"the {item.kind} changes through the session",
+            item.share,
+            _TREND,
+            item.change,
+            either_sign=True,
+            along=item.place,
+        )
+        for item in trends(problem.batch, fitted.residual, later.columns, later.tau)
+    ]
+
+
+def descriptors(selection: "Selected", joint: int) -> dict[str, Array]:
+    """What an unknown cause may follow: name -> (N, T). Positions are the model's own, not measured ones."""
+    problem, left = selection.problem, selection.fit.residual
+    batch = problem.batch
+    model = np.where(batch.valid[..., None], batch.position - left, 0.0)
+    frame = frame_s(batch)
+    speed = np.gradient(model, axis=0) / frame if len(model) > 1 else np.zeros_like(model)
+    acceleration = np.gradient(speed, axis=0) / frame if len(model) > 1 else np.zeros_like(model)
+    q, v = model[..., joint], speed[..., joint]
+    typical = np.sqrt(np.mean(v[batch.valid] ** 2)) + 1e-12
+    session = batch.start_s + batch.time_s
+    session = session - session[batch.valid].mean()
+    elapsed = batch.time_s - batch.time_s[0]
+    out = {
+        "speed": v,
+        "direction": np.tanh(v / (0.2 * typical)),
+        "squared speed": v**2,
+        "absolute speed": np.abs(v),
+        "acceleration": acceleration[..., joint],
+        "position": q,
+        "squared position": q**2,
+        "speed x position": v * q,
+        "time in the trial": elapsed,
+        "session time": session,
+        "position x session time": q * session,
+        "speed x session time": v * session,
+    }
+    if batch.load is not None:
+        out["load"] = batch.load[..., joint]
+    for other in range(batch.joints):
+        if other != joint and not mirrored(batch.command, joint, other):
+            name = problem.names[other]
+            out[f"position of {name}"] = model[..., other]
+            out[f"squared speed of {name}"] = speed[..., other] ** 2
+            out[f"speed of {name}"] = speed[..., other]
+    return out
+
+
+def _following(selection: "Selected") -> list[Suspicion]:
+    """Descriptors, cleared of what the model's own parameters do, that trials agree on."""
+    problem, fitted = selection.problem, selection.fit
+    valid = problem.batch.valid
+    derivative = derivatives(problem, fitted)
+    trial = np.broadcast_to(np.arange(problem.batch.trials), valid.shape)[valid]
+    found = []
+    for joint in range(problem.batch.joints):
+        own = derivative.columns[joint][valid]
+        if derivative.tau is not None:
+            own = np.concatenate([own, derivative.tau[..., joint][valid][:, None]], 1)
+        own = np.concatenate([own, np.ones((len(own), 1))], 1)
+        left = fitted.residual[..., joint][valid]
+        items = descriptors(selection, joint)
+        z = np.stack([values[valid] for values in items.values()], 1)
+        scale = np.sqrt(np.square(own).sum(0)).clip(1e-300)
+        z = z - own @ (np.linalg.lstsq(own / scale, z, rcond=1e-9)[0] / scale[:, None])
+        power = np.square(z).sum(0)
+        z = np.where(power > 1e-12 * len(z), z, 0.0)
+        scores = np.stack([np.bincount(trial, z[:, k] * left) for k in range(z.shape[1])], 1)
+        shares = scores.sum(0) ** 2 / np.maximum(power * (left @ left), 1e-300)
+        here = {item.cause for item in (*selection.chosen.get(joint, ()), *selection.chosen.get(ALL, ()))}
+        for k, name in enumerate(items):
+            least = _FOLLOWS_IF_OWNED if _OWNED.get(name, set()) & here else _FOLLOWS
+            clue = f"what is left follows {name}"
+            found.append(Suspicion(joint, clue, float(shares[k]), least, scores[:, k], either_sign=True))
+    return found
+
+
+def _ringing(selection: "Selected") -> list[Suspicion]:
+    """A line in the mean spectrum of what is left that is no broad bump."""
+    batch, left = selection.problem.batch, selection.fit.residual
+    frame = frame_s(batch)
+    length = int(np.median(batch.frames))
+    whole = np.flatnonzero(batch.frames >= length)
+    dt = np.diff(batch.time_s[:length, whole], axis=0)
+    if length < 40 or len(whole) < 4 or np.abs(dt - frame).max() > 0.5 * frame:
+        return []
+    window = np.hanning(length)[:, None, None]
+    part = left[:length, whole] - left[:length, whole].mean(0)
+    power = np.square(np.abs(np.fft.rfft(part * window, axis=0)))
+    power = (power / power.sum(0).clip(1e-300)).mean(1)
+    commanded = batch.command[:length, whole] - batch.command[:length, whole].mean(0)
+    drive = np.square(np.abs(np.fft.rfft(commanded * window, axis=0))).mean(1)
+    frequency = np.fft.rfftfreq(length, frame)
+    found = []
+    for joint in range(batch.joints):
+        spectrum = power[:, joint]
+        line = 4 + int(spectrum[4:-2].argmax())
+        around = np.r_[spectrum[max(line - 9, 1) : line - 2], spectrum[line + 3 : line + 10]]
+        share = float(spectrum[line - 2 : line + 3].sum() - 5 * np.median(around))
+        driven = drive[line, joint] > 0.02 * drive[1:, joint].max()
+        sharp = spectrum[line] > 6 * np.max(around) if len(around) else False
+        if sharp and not driven:
+            found.append(Suspicion(joint, f"what is left rings at {frequency[line]:.2g} Hz", share, _LINE))
+    return found
+
+
+def _stopped(selection: "Selected") -> list[Suspicion]:
+    """A gripper that stands still while its command goes on: it holds something, or is blocked."""
+    found = []
+    for joint, name in enumerate(selection.problem.names):
+        used = {candidate.cause for candidate in selection.chosen.get(joint, ())}
+        if is_gripper(name) and "gripper_compliance" not in used:
+            clue = "stands still while its command goes on: it closes on something"
+            share = _stopped_share(selection, joint)
+            found.append(Suspicion(joint, clue, share, _STOPPED, decisive=True))
+    return found
+
+
+def _stopped_share(selection: "Selected", joint: int) -> float:
+    """Part of the baseline's squared error in frames where the joint rests far from its command; zero where
+    few trials have such frames."""
+    batch = selection.problem.batch
+    valid = batch.valid[1:]
+    error = (batch.command - batch.position)[1:, :, joint]
+    still = np.abs(np.diff(batch.position[..., joint], axis=0)) < 2e-4
+    steady = np.abs(np.diff(batch.command[..., joint], axis=0)) < 5e-4
+    stopped = valid & still & steady & (np.abs(error) > 2e-3)
+    base = np.square(selection.baseline.residual[1:, :, joint])
+    share = base[stopped].sum() / max(base[valid].sum(), 1e-300)
+    return float(share) if np.any(stopped, axis=0).mean() > 0.3 else 0.0

@@ -1,0 +1,98 @@
+"""The hole's clearance, from how far the plug goes sideways in it before the walls push back.
+
+Fingers centre their parts across the pads, so both hands' encoders tell where the plug is in the hole along
+that axis, and the arms' give tells when a wall pushes. In frames with a push, place = zero -+ half the
+clearance - give x force, the sign being the force's. The zero is fitted, too: walls on both sides are needed.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from lerobot_vtrefine.diagnose.parts.episodes import AssumedScene, HandledEpisode, hands
+from lerobot_vtrefine.diagnose.parts.forces import places, point_forces
+from lerobot_vtrefine.diagnose.parts.grasp_geometry import pitches, tip_and_mouth
+from lerobot_vtrefine.diagnose.parts.payload import Arms
+from lerobot_vtrefine.diagnose.parts.problem import Quantity
+from lerobot_vtrefine.diagnose.parts.regression import Blocks
+
+Array = np.ndarray
+
+FORM = (0.03, 6e-5)
+"""What the method errs by on the twin's own recordings: part of the value, and at least so much [m]."""
+_ROUND = (
+    "pads close along one axis only, and along that axis a round hole is as wide as assumed only where the "
+    "plug is in its middle: use a pair with flat walls"
+)
+PUSH_N = 0.12
+INSERTED_M = 0.006
+"""The plug's tip is this far below the mouth; how high a part is held may be off by half of it."""
+RESTS_M_S = 0.003
+"""A plug at a wall moves no faster; on its way between the walls arms lag, which is no push."""
+GIVE_M_PER_N = 3.3e-5
+"""How far four pads, preloaded, let the parts give way: 0.6 mm per pad at 20 N."""
+FEWEST = 3
+"""Episodes, and frames on each wall."""
+
+
+@dataclass(frozen=True)
+class Contact:
+    """Forces on the hands and where the parts are in one episode."""
+
+    force_n: Array
+    """(T, 2, 3) on the mouth and on the tip, world axes."""
+    place_m: Array
+    """(T, 2, 3) of mouth and tip, if the hands hold their parts ideally."""
+
+
+def contacts_of(
+    arms: Arms, scene: AssumedScene, episodes: Sequence[HandledEpisode], untouched: Sequence[Array]
+) -> list[Contact]:
+    """Of every episode; `untouched` are the twin's positions (T, J) with the parts' weights."""
+    out = []
+    for episode, path in zip(episodes, untouched, strict=True):
+        held = np.flatnonzero(episode.held.all(1))
+        turns = hands(episode.position[held[:1]] if len(held) else episode.position[:1])[1]
+        points = tip_and_mouth(scene, pitches(turns)[0])
+        force = point_forces(arms, episode, path, points)
+        out.append(Contact(force, places(episode.position, points)))
+    return out
+
+
+def clearance(
+    scene: AssumedScene, episodes: Sequence[HandledEpisode], contacts: Sequence[Contact]
+) -> Quantity:
+    """The hole's, across the pads."""
+    known = scene.scene.hole_clearance_m
+    blocks, reason = _blocks(known, episodes, contacts)
+    round_hole = blocks is not None and scene.pair.name == "round"
+    if round_hole and blocks.solve(np.ones(len(blocks.rows)), slope=True)[-1] < 0:
+        reason = _ROUND
+    return Quantity("clearance", "clearance", known, "m", FORM, blocks, reason)
+
+
+def _blocks(
+    assumed: float, episodes: Sequence[HandledEpisode], contacts: Sequence[Contact]
+) -> tuple[Blocks | None, str]:
+    """None with the reason where walls are not felt."""
+    blocks, walls = [], np.zeros(2, dtype=int)
+    for episode, contact in zip(episodes, contacts, strict=True):
+        offset = contact.place_m[:, 1] - contact.place_m[:, 0]
+        push = (contact.force_n[:, 1, 0] - contact.force_n[:, 0, 0]) / 2
+        speed = np.gradient(offset[:, 0], float(np.median(np.diff(episode.time_s))))
+        use = episode.together & (offset[:, 2] < -INSERTED_M) & (np.abs(push) > PUSH_N)
+        use &= np.abs(speed) < RESTS_M_S
+        if not use.any():
+            continue
+        side, force, place = np.sign(push[use]), push[use], offset[use, 0]
+        walls += [int((side > 0).sum()), int((side < 0).sum())]
+        # A wall pushes the plug back: the force on it points away from the wall.
+        error = place + GIVE_M_PER_N * force + side * assumed / 2
+        blocks.append((error[:, None], -side[:, None] / 2, np.ones((len(side), 1, 1))))
+    if len(blocks) < FEWEST or walls.min() < FEWEST:
+        return None, (
+            "the inserted plug is not pushed against both walls across the pads in three episodes; insert it "
+            "and move the hand 10 mm to either side across the pads, twice, slowly"
+        )
+    return Blocks.of(blocks), ""

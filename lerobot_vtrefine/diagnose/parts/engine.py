@@ -1,0 +1,125 @@
+"""The diagnosis of parts: episodes of the twin's robot in, object_mass, object_friction and clearance out.
+
+Each is named only where episodes show it: the estimate lessens the error of episodes left out of the fit, all
+of them saying so together, and differs from what the simulation assumes by more than the method errs. Where
+the recordings cannot tell, the evidence says what to record.
+"""
+
+from collections.abc import Sequence
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+
+from lerobot_vtrefine.diagnose.core.diagnosis import Diagnosis
+from lerobot_vtrefine.diagnose.evidence import Evidence
+from lerobot_vtrefine.diagnose.parts import friction as sliding
+from lerobot_vtrefine.diagnose.parts.clearance import clearance, contacts_of
+from lerobot_vtrefine.diagnose.parts.episodes import AssumedScene, HandledEpisode
+from lerobot_vtrefine.diagnose.parts.mass import PARTS, masses, remeasured
+from lerobot_vtrefine.diagnose.parts.payload import GRAVITY_M_S2, Arms, replay_loaded
+from lerobot_vtrefine.diagnose.parts.problem import Measured, Quantity, measure
+from lerobot_vtrefine.diagnose.verdict import Cause
+from lerobot_vtrefine.sim.scene import build_scene
+
+Array = np.ndarray
+
+NAMES = ("object_mass", "object_friction", "clearance")
+UNKNOWN_PARTS = (
+    "the parts are not known: datasets of vtrefine-record-demos note the assumed scene, others hold no part "
+    "that the twin could carry"
+)
+PAD_FRICTION = (
+    "friction between pads and part: not identifiable, because pads tell how hard they are pressed but not "
+    "when the part slips, and no joint's load tells the pull; close the hand on a part that is clamped to "
+    "the table, pull until it slips at two closing forces, five times each, and record the joints' load"
+)
+
+
+def unknown_parts() -> Diagnosis:
+    """Of a dataset whose parts the twin does not know."""
+    evidence = tuple(Evidence(name, None, None, None, "not identifiable", UNKNOWN_PARTS) for name in NAMES)
+    return Diagnosis("adequate", evidence=evidence)
+
+
+def assumed_masses(scene: AssumedScene) -> Array:
+    """(2,) of socket and plug [kg]."""
+    built = build_scene(scene.scene)
+    return np.array([built.model.body_mass[built.socket_body], built.model.body_mass[built.plug_body]])
+
+
+def weighed(
+    arms: Arms, scene: AssumedScene, episodes: Sequence[HandledEpisode], seed: int
+) -> tuple[Measured, ...]:
+    """Socket and plug, as far as episodes show them."""
+    found = measure(masses(arms, episodes, assumed_masses(scene), seed), seed)
+    return remeasured(arms, episodes, found, seed)
+
+
+def found_masses(arms: Arms, scene: AssumedScene, episodes: Sequence[HandledEpisode], seed: int) -> Array:
+    """(2,) of socket and plug as episodes show them, as assumed where they show nothing else."""
+    return np.array([item.believed for item in weighed(arms, scene, episodes, seed)])
+
+
+def believed_masses(found: Diagnosis, scene: AssumedScene) -> Array:
+    """(2,) the same, from a diagnosis."""
+    named = {key: item.value for cause in found.causes for key, item in cause.params.items()}
+    return np.array(
+        [named.get(f"{part}_kg", known) for part, known in zip(PARTS, assumed_masses(scene), strict=True)]
+    )
+
+
+def diagnose_parts(
+    arms: Arms, scene: AssumedScene, episodes: Sequence[HandledEpisode], seed: int = 0
+) -> Diagnosis:
+    """Judge the parts of episodes whose encoders are trusted (what robots get wrong taken off before)."""
+    found = list(weighed(arms, scene, episodes, seed))
+    mass = np.array([item.believed for item in found])
+    weights = [episode.hanging * mass * GRAVITY_M_S2 for episode in episodes]
+    untouched = replay_loaded(arms, episodes, weights, contacts=False)
+    contacts = contacts_of(arms, scene, episodes, untouched)
+    found += measure([sliding.friction(scene, episodes, contacts)], seed)
+    known = scene.scene.pad_friction
+    pads = Quantity("object_friction", "pad_friction", known, "1", sliding.FORM, None, PAD_FRICTION)
+    found.append(Measured(pads))
+    found += measure([clearance(scene, episodes, contacts)], seed)
+    return _summary(found)
+
+
+def _summary(measured: Sequence[Measured]) -> Diagnosis:
+    causes, evidence, detectable = [], [], {}
+    for name in NAMES:
+        own = [item for item in measured if item.quantity.cause == name]
+        evidence.append(_strongest([item.evidence for item in own]))
+        if sizes := [item.detectable for item in own if item.detectable is not None]:
+            detectable[name] = max(sizes)
+        if found := [item for item in own if item.found]:
+            params = {item.quantity.name: item.parameter for item in found}
+            p_value = min(item.p_adjusted for item in found if item.p_adjusted is not None)
+            # No episode is locked away, so that there is no gain on locked ones.
+            causes.append(Cause(name, "cause", params, p_value, None))
+    return Diagnosis(
+        "explained" if causes else "adequate",
+        tuple(causes),
+        minimum_detectable=detectable,
+        next_experiment=_next(evidence),
+        evidence=tuple(evidence),
+    )
+
+
+def _strongest(items: list[Evidence]) -> Evidence:
+    """One line per cause: the strongest of its parts', with every part's sentence."""
+    order = ("accepted", "rejected", "not identifiable")
+    best = min(items, key=lambda item: (order.index(item.decision), item.p_value or 0.0))
+    reason = "; ".join(dict.fromkeys(item.reason for item in items))
+    return replace(best, reason=reason)
+
+
+def _next(evidence: list[Evidence]) -> dict[str, Any] | None:
+    """What to record so that everything about the parts can be told."""
+    missing = [item for item in evidence if item.decision == "not identifiable"]
+    if not missing:
+        return None
+    protocol = {"episodes": 8, "pick_up_from_table": True, "drag_m": 0.03, "press_n": 5.0, "wiggle_m": 0.01}
+    text = " ".join(f"{item.name}: {item.reason}." for item in missing)
+    return {"decides": [item.name for item in missing], "text": text, "protocol": protocol}

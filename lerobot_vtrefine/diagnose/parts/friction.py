@@ -1,0 +1,58 @@
+"""Friction of the plug, from the pull against sliding while it is pressed down on the table.
+
+The arm's give tells both forces. Only slides across the pads count: there the joints that tell them have next
+to no dry friction of their own.
+"""
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from lerobot_vtrefine.diagnose.parts.clearance import Contact
+from lerobot_vtrefine.diagnose.parts.episodes import AssumedScene, HandledEpisode
+from lerobot_vtrefine.diagnose.parts.problem import Quantity
+from lerobot_vtrefine.diagnose.parts.regression import Blocks
+
+Array = np.ndarray
+
+FORM = (0.1, 0.02)
+"""What the method errs by on the twin's own recordings: part of the value, and at least so much."""
+PRESS_N = 1.5
+SLIDES_M_S = 0.02
+FLAT_M = 0.008
+"""The plug's tip is this close to the table."""
+FEWEST_FRAMES, FEWEST_EPISODES = 5, 3
+
+
+def friction(
+    scene: AssumedScene, episodes: Sequence[HandledEpisode], contacts: Sequence[Contact]
+) -> Quantity:
+    """The plug's coefficient."""
+    known = scene.scene.part_friction
+    blocks, reason = _blocks(known, episodes, contacts)
+    return Quantity("object_friction", "friction", known, "1", FORM, blocks, reason)
+
+
+def _blocks(
+    assumed: float, episodes: Sequence[HandledEpisode], contacts: Sequence[Contact]
+) -> tuple[Blocks | None, str]:
+    """None with the reason where nothing slides under load."""
+    blocks = []
+    for episode, contact in zip(episodes, contacts, strict=True):
+        step_s = float(np.median(np.diff(episode.time_s)))
+        speed = np.gradient(contact.place_m[:, 1], step_s, axis=0)
+        force = contact.force_n[:, 1]
+        use = episode.held[:, 1] & ~episode.together & (np.abs(contact.place_m[:, 1, 2]) < FLAT_M)
+        use &= (force[:, 2] > PRESS_N) & (np.abs(speed[:, 0]) > SLIDES_M_S)
+        use &= np.abs(speed[:, 0]) > 2 * np.hypot(speed[:, 1], speed[:, 2])
+        if use.sum() < FEWEST_FRAMES:
+            continue
+        normal, pull = force[use, 2], -force[use, 0] * np.sign(speed[use, 0])
+        error = pull - assumed * normal
+        blocks.append((error[:, None], normal[:, None], np.zeros((len(normal), 1, 0))))
+    if len(blocks) < FEWEST_EPISODES:
+        return None, (
+            "no held part slides under load in three episodes; press the plug on the table with 5 N or more "
+            "and drag it 30 mm to either side across the pads, twice, slowly"
+        )
+    return Blocks.of(blocks), ""

@@ -1,0 +1,128 @@
+"""The parts' masses, by how much further the servos give way under them than in the twin.
+
+The twin's arms are replayed twice with weights in the hands while these carry parts: as assumed, and heavier.
+What the recorded joints do beyond the first replay is explained by a multiple of the difference of both, one
+number per hand for all its joints, beside what the robot itself may get wrong: an offset and a pull against
+the direction of motion for every joint. Only if the mass lessens the error of episodes
+that the fit has not seen, all of them together saying so, is it the parts that are heavier or lighter.
+"""
+
+from collections.abc import Sequence
+from dataclasses import replace
+
+import numpy as np
+
+from lerobot_vtrefine.diagnose.parts.episodes import HandledEpisode
+from lerobot_vtrefine.diagnose.parts.payload import GRAVITY_M_S2, Arms, replay_loaded
+from lerobot_vtrefine.diagnose.parts.problem import Measured, Quantity
+from lerobot_vtrefine.diagnose.parts.regression import Blocks, Line, slope_of
+from lerobot_vtrefine.embodiments import ALOHA
+
+Array = np.ndarray
+
+PARTS = ("socket", "plug")
+"""In the order of the hands that hold them."""
+FORM = (0.06, 0.004)
+"""What the method errs by on the twin's own recordings: part of the value, and at least so much [kg]."""
+_HEAVIER_KG = 0.05
+_LIGHTEST_KG = 0.005
+_AGAIN = 0.2
+"""A mass that is off by more than this part is estimated again from where it was found."""
+_MOVES_RAD_S = 0.02
+_LEAST_EPISODES = 3
+_TELLING_KG = 0.04
+"""A joint has a say in the mass if its own estimate's standard error is below this."""
+_FEWEST_JOINTS = 2
+_APART = 0.25
+"""Joints agree where their estimates differ from the common one by less than this part of it, or by
+chance."""
+
+
+def masses(
+    arms: Arms, episodes: Sequence[HandledEpisode], assumed_kg: Array, seed: int
+) -> tuple[Quantity, ...]:
+    """Of socket and plug, from episodes in which they are picked up; `assumed_kg` is (2,)."""
+    lines = _lines(arms, episodes, assumed_kg)
+    out = []
+    for part, known, item in zip(PARTS, assumed_kg, lines, strict=True):
+        name = f"{part}_kg"
+        if isinstance(item, str):
+            out.append(Quantity("object_mass", name, float(known), "kg", FORM, None, item))
+            continue
+        reason = _disagreement(item, slope_of(Blocks.of(item), seed), seed)
+        out.append(Quantity("object_mass", name, float(known), "kg", FORM, Blocks.of(item), reason))
+    return tuple(out)
+
+
+def remeasured(
+    arms: Arms, episodes: Sequence[HandledEpisode], found: Sequence[Measured], seed: int
+) -> tuple[Measured, ...]:
+    """Masses that are far off, taken anew where they were found: with friction in the joints the weight's
+    effect is no straight line. What was found stays found."""
+    assumed = np.array([item.quantity.assumed for item in found])
+    change = np.array([item.line.value if item.line and not item.quantity.reason else 0.0 for item in found])
+    near = np.maximum(assumed + change, _LIGHTEST_KG) - assumed
+    if not (np.abs(near) > _AGAIN * assumed).any():
+        return tuple(found)
+    out = []
+    for item, lines, step in zip(found, _lines(arms, episodes, assumed + near), near.tolist(), strict=True):
+        if item.line is None or isinstance(lines, str):
+            out.append(item)
+            continue
+        again = slope_of(Blocks.of(lines), seed)
+        low, high = again.ci95
+        moved = Line(again.value + step, (low + step, high + step), again.error)
+        out.append(replace(item, line=moved))
+    return tuple(out)
+
+
+def _lines(
+    arms: Arms, episodes: Sequence[HandledEpisode], assumed_kg: Array
+) -> list[list[tuple[Array, Array, Array]] | str]:
+    """Of either hand: blocks for `Blocks.of`, or why there are none."""
+    light = [episode.hanging * assumed_kg * GRAVITY_M_S2 for episode in episodes]
+    heavy = [episode.hanging * (assumed_kg + _HEAVIER_KG) * GRAVITY_M_S2 for episode in episodes]
+    replays = [replay_loaded(arms, episodes, weights) for weights in (light, heavy)]
+    out: list[list[tuple[Array, Array, Array]] | str] = []
+    for hand, part in enumerate(PARTS):
+        seen = [bool(e.free[:, hand].any() and e.carried[:, hand].any()) for e in episodes]
+        if sum(seen) < _LEAST_EPISODES:
+            out.append(
+                f"the {part} is not picked up in sight of the encoders: a hand that always holds it cannot "
+                "tell its weight from offsets; record picking it up from the table"
+            )
+        else:
+            out.append([_block(e, *item, hand) for e, *item in zip(episodes, *replays, strict=True)])
+    return out
+
+
+def _disagreement(blocks: list[tuple[Array, Array, Array]], line: Line, seed: int) -> str:
+    """Why it is not the mass, although it helps: a mass pulls at every pitching joint, a fault at its own."""
+    agree, differ = 0, []
+    for channel, joint in enumerate(ALOHA.joints):
+        own = [(item[0][:, [channel]], item[1][:, [channel]], item[2][:, [channel]]) for item in blocks]
+        if not any(effect.any() for _, effect, _ in own):
+            continue
+        alone = slope_of(Blocks.of(own), seed)
+        if alone.error > _TELLING_KG:
+            continue
+        chance = 3 * np.hypot(alone.error, line.error)
+        near = abs(alone.value - line.value) < max(_APART * abs(line.value), chance)
+        agree += near and alone.value * line.value > 0
+        differ += [] if near else [joint.name]
+    if agree >= _FEWEST_JOINTS and len(differ) < agree:
+        return ""
+    return (
+        f"joints contradict each other about it ({', '.join(differ) or 'too few can tell'}): it is the robot"
+    )
+
+
+def _block(episode: HandledEpisode, light: Array, heavy: Array, hand: int) -> tuple[Array, Array, Array]:
+    """Per joint: error (N, 6), the mass's effect (N, 6) per kg, and nuisances (N, 6, 2)."""
+    joints = slice(ALOHA.joints_per_arm * hand, ALOHA.joints_per_arm * hand + len(ALOHA.joints))
+    use = episode.free[:, hand] | episode.carried[:, hand]
+    error = (episode.position - light)[use, joints]
+    effect = ((heavy - light) / _HEAVIER_KG)[use, joints]
+    step_s = float(np.median(np.diff(episode.time_s)))
+    direction = np.tanh(np.gradient(light, step_s, axis=0)[use, joints] / _MOVES_RAD_S)
+    return error, effect, np.stack([np.ones_like(error), direction], -1)

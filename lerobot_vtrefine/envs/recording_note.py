@@ -1,0 +1,47 @@
+"""What is noted beside a simulated dataset: the simulation's settings, each episode's seed and outcome."""
+
+import hashlib
+import json
+from dataclasses import asdict, replace
+from pathlib import Path
+from typing import Any
+
+from lerobot_vtrefine.envs.config import VtRefineEnvConfig
+from lerobot_vtrefine.files import read_json
+from lerobot_vtrefine.folders import write_in_place
+
+NOTE = Path("meta") / "recording.json"
+
+
+def simulation_settings(env: VtRefineEnvConfig) -> dict[str, Any]:
+    """What decides how an episode comes out beside its seed (JSON values); of a reality's hidden physics only
+    a fingerprint.
+    """
+    known = replace(env, reality=None)
+    hidden = {} if env.reality is None else {"reality": hashlib.sha256(env.reality.read_bytes()).hexdigest()}
+    return hidden | {
+        "scene": {
+            key: str(value) if isinstance(value, Path) else value
+            for key, value in asdict(known.scene_config).items()
+        },
+        "rules": asdict(env.task_config),
+        "randomization": asdict(env.randomization),
+        "sensor_model": env.sensor_model,
+        "task": env.task,
+    }
+
+
+def add_episode(root: Path, settings: dict[str, Any], index: int, row: dict[str, Any]) -> None:
+    """Note episode ``index`` of the dataset at ``root``; a note of the same or a later index is replaced.
+
+    Raises:
+        ValueError: the note that is there cannot be read, or is about another simulation.
+    """
+    path = root / NOTE
+    settings = json.loads(json.dumps(settings))
+    note = read_json(path) if path.is_file() else {"settings": settings, "episodes": []}
+    if not isinstance(note, dict) or note.get("settings") != settings:
+        raise ValueError(f"{path} notes a recording in another simulation: choose another --dataset.root")
+    earlier = [known for known in note["episodes"] if known["episode_index"] < index]
+    note["episodes"] = [*earlier, {"episode_index": index, **row}]
+    write_in_place(root, NOTE, json.dumps(note, indent=1))

@@ -1,0 +1,1 @@
+"""Everything that this package changes in LeRobot or hooks into; `seams` lists what and why."""

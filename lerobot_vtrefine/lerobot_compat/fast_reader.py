@@ -1,0 +1,237 @@
+"""Array columns and depth frames of LeRobot datasets from memory.
+
+LeRobot 0.6.1 decodes every column of every item from Arrow through Python lists: with eight pad columns and
+depth at two observation steps that costs about 45 ms per item, many times a training step of a small policy.
+This module reads each column once into a numpy block and serves items from it; the items are bit-identical.
+
+Scope: only datasets with the pad columns of ``features.py``; every other dataset, and every case that is not
+covered (videos, language columns, another LeRobot version), takes LeRobot's own path. ``install`` is called
+when a ``vt_dp3`` configuration is made.
+"""
+
+import io
+import logging
+import operator
+import sys
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from lerobot_vtrefine.lerobot_compat.guard import is_supported
+from lerobot_vtrefine.lerobot_compat.shared_array import Array, SharedArray
+
+if TYPE_CHECKING:
+    from lerobot.datasets.dataset_reader import DatasetReader
+
+logger = logging.getLogger(__name__)
+
+DATASET_MODULE = "lerobot.datasets.lerobot_dataset"
+MAX_DEPTH_BYTES = 1 << 30
+"""Depth frames stay in memory up to this size; beyond it LeRobot decodes them per item."""
+
+
+class NotCoveredError(Exception):
+    """This dataset takes LeRobot's own path."""
+
+
+@dataclass(frozen=True)
+class Block:
+    """Columns that share dtype and time offsets, side by side in one array."""
+
+    frames: SharedArray
+    """(frames, sum of widths)"""
+    columns: tuple[tuple[str, int, int, tuple[int, ...]], ...]
+    """(key, first, last + 1, shape of one frame's value)"""
+    offsets: tuple[int, ...] | None
+    """Frame offsets of an item's window, or None for the item's own frame."""
+    dtype: np.dtype[Any]
+    """What LeRobot's loader yields: int64, float32 or bool."""
+
+    def read(self, rows: Any, lead: tuple[int, ...]) -> dict[str, Tensor]:
+        """The columns at the given rows; tensors of shape (*lead, *shape)."""
+        rows_of = self.frames.values.take(rows, axis=0).astype(self.dtype)
+        picked = torch.from_numpy(rows_of.reshape(*lead, -1))
+        return {
+            key: picked[..., first:end].reshape((*lead, *shape)) for key, first, end, shape in self.columns
+        }
+
+
+def _loaded_dtype(dtype: np.dtype[Any]) -> np.dtype[Any]:
+    """dtype of ``torch.tensor(python values)``, through which LeRobot's loader goes."""
+    kinds = {"i": np.int64, "u": np.int64, "f": np.float32, "b": np.bool_}
+    if dtype.kind not in kinds:
+        raise NotCoveredError(f"columns of dtype {dtype}")
+    return np.dtype(kinds[dtype.kind])
+
+
+def _array_column(hf_dataset: Any, key: str, shape: tuple[int, ...]) -> Array:
+    """A numeric column as (frames, width)."""
+    import pyarrow as pa
+
+    values = hf_dataset.data.column(key).combine_chunks()
+    while pa.types.is_nested(values.type):
+        values = values.flatten()
+    width = int(np.prod(shape, dtype=int))
+    array = values.to_numpy(zero_copy_only=False)
+    if array.size != len(hf_dataset) * width:
+        raise NotCoveredError(f"column {key} with missing values")
+    return array.reshape(-1, width)
+
+
+def _depth_column(hf_dataset: Any, key: str, shape: tuple[int, ...]) -> Array:
+    """Decoded depth images as (frames, H * W) in their stored dtype."""
+    from PIL import Image
+
+    frames: Array | None = None
+    row = 0
+    for chunk in hf_dataset.data.column(key).chunks:
+        for encoded in chunk.field("bytes"):
+            data = encoded.as_py()
+            if data is None:
+                raise NotCoveredError(f"images of {key} outside the dataset's files")
+            image = np.asarray(Image.open(io.BytesIO(data)))
+            if frames is None:
+                frames = np.empty((len(hf_dataset), image.size), image.dtype)
+            frames[row] = image.ravel()
+            row += 1
+    if frames is None or frames.shape[1] != np.prod(shape) or frames.dtype.kind not in "uf":
+        raise NotCoveredError(f"depth images of {key} that differ from the declared shape")
+    return frames
+
+
+class FrameStore:
+    """All columns of one dataset in memory."""
+
+    def __init__(self, reader: "DatasetReader") -> None:
+        """Raises: NotCoveredError if any part of the dataset needs LeRobot's own path."""
+        self._hf_dataset: Any = reader.hf_dataset
+        self._meta: Any = reader._meta
+        if self._meta.video_keys or self._meta.has_language_columns:
+            raise NotCoveredError("videos or language columns")
+        if self._hf_dataset is None or self._hf_dataset._indices is not None or len(self._hf_dataset) == 0:
+            raise NotCoveredError("an empty or re-indexed table")
+        self._offsets = {key: tuple(value) for key, value in (reader.delta_indices or {}).items()}
+        self._windowed = bool(self._offsets)
+        self.lazy_keys: list[str] = []
+        self.blocks = self._make_blocks()
+        self.first, self.last = self._episode_bounds()
+        self.tasks = list(self._meta.tasks.index)
+        self.keys = list(self._hf_dataset.column_names)
+
+    def _make_blocks(self) -> list[Block]:
+        groups: dict[tuple[Any, ...], list[tuple[str, Array, tuple[int, ...]]]] = {}
+        for key in self._hf_dataset.column_names:
+            feature = self._meta.features[key]
+            shape = () if tuple(feature["shape"]) == (1,) else tuple(feature["shape"])
+            if feature["dtype"] == "image":
+                shape = (1, *shape[:2])
+                nbytes = len(self._hf_dataset) * 2 * int(np.prod(shape))
+                if key not in self._meta.depth_keys or nbytes > MAX_DEPTH_BYTES:
+                    self.lazy_keys.append(key)
+                    continue
+                values, loaded = _depth_column(self._hf_dataset, key, shape), np.dtype(np.float32)
+            else:
+                values = _array_column(self._hf_dataset, key, shape)
+                loaded = _loaded_dtype(values.dtype)
+            groups.setdefault((values.dtype, loaded, self._offsets.get(key)), []).append((key, values, shape))
+        return [self._join(members, loaded, offsets) for (_, loaded, offsets), members in groups.items()]
+
+    @staticmethod
+    def _join(
+        members: list[tuple[str, Array, tuple[int, ...]]],
+        loaded: np.dtype[Any],
+        offsets: tuple[int, ...] | None,
+    ) -> Block:
+        ends = np.cumsum([values.shape[1] for _, values, _ in members]).tolist()
+        starts = [0, *ends[:-1]]
+        columns = tuple(
+            (key, first, end, shape)
+            for (key, _, shape), first, end in zip(members, starts, ends, strict=True)
+        )
+        joined = np.concatenate([values for _, values, _ in members], axis=1)
+        return Block(SharedArray(joined), columns, offsets, loaded)
+
+    def _episode_bounds(self) -> tuple[Array, Array]:
+        """First and last row of every row's episode."""
+        episode = self._hf_dataset.data.column("episode_index").to_numpy()
+        index = self._hf_dataset.data.column("index").to_numpy()
+        start = np.asarray(self._meta.episodes["dataset_from_index"])[episode]
+        end = np.asarray(self._meta.episodes["dataset_to_index"])[episode]
+        rows = np.arange(len(index))
+        first, last = rows - (index - start), rows + (end - 1 - index)
+        if first.min() < 0 or last.max() >= len(rows) or (index[first] != start).any():
+            raise NotCoveredError("episodes whose frames are not contiguous")
+        return first, last
+
+    def item(self, idx: int) -> dict[str, Any]:
+        """What ``DatasetReader.get_item`` returns before image transforms, depth units and the task."""
+        row = range(len(self.first))[operator.index(idx)]
+        found: dict[str, Any] = {}
+        windows = self._windows(row)
+        for block in self.blocks:
+            if block.offsets is None:
+                found.update(block.read(row, ()))
+            else:
+                found.update(block.read(windows[block.offsets], (len(block.offsets),)))
+        for key in self.lazy_keys:
+            found[key] = self._decode(key, row, windows)
+        item = {key: found[key] for key in self.keys}
+        for key, offsets in self._offsets.items():
+            wanted = row + np.array(offsets)
+            padded = (wanted < self.first[row]) | (wanted > self.last[row])
+            item[f"{key}_is_pad"] = torch.from_numpy(padded)
+        return item
+
+    def batch(self, indices: Sequence[int]) -> dict[str, Any]:
+        """The items of ``indices`` (B,) side by side: tensors (B, ...)."""
+        rows = np.array([range(len(self.first))[operator.index(index)] for index in indices])
+        first, last = self.first[rows, None], self.last[rows, None]
+        windows = {
+            offsets: np.clip(rows[:, None] + np.array(offsets), first, last)
+            for offsets in set(self._offsets.values())
+        }
+        found: dict[str, Any] = {}
+        for block in self.blocks:
+            picked = rows if block.offsets is None else windows[block.offsets]
+            columns = block.read(picked.ravel(), picked.shape)
+            found |= {key: value.contiguous() for key, value in columns.items()}
+        for key in self.lazy_keys:
+            found[key] = torch.stack([self._decode(key, row, self._windows(row)) for row in rows.tolist()])
+        batch = {key: found[key] for key in self.keys}
+        for key, offsets in self._offsets.items():
+            wanted = rows[:, None] + np.array(offsets)
+            batch[f"{key}_is_pad"] = torch.from_numpy((wanted < first) | (wanted > last))
+        return batch
+
+    def _windows(self, row: int) -> dict[tuple[int, ...], Array]:
+        """Rows of every window of the item in ``row``."""
+        return {
+            offsets: np.clip(row + np.array(offsets), self.first[row], self.last[row])
+            for offsets in set(self._offsets.values())
+        }
+
+    def _decode(self, key: str, row: int, windows: dict[tuple[int, ...], Array]) -> Tensor:
+        if key not in self._offsets:
+            return self._hf_dataset[key][row]
+        return torch.stack(self._hf_dataset[key][windows[self._offsets[key]].tolist()])
+
+
+def install() -> None:
+    """Serve covered datasets from memory in this process; does nothing if no dataset code is loaded yet.
+
+    Idempotent. On a LeRobot version that was not tested it logs a warning and leaves LeRobot as it is.
+    """
+    module: Any = sys.modules.get(DATASET_MODULE)
+    if module is None:
+        return
+    if not is_supported():
+        logger.warning("This LeRobot version is untested: dataset items are read the slow way.")
+        return
+    from lerobot_vtrefine.lerobot_compat.frame_reader import FastDatasetReader, serve_batches
+
+    module.DatasetReader = FastDatasetReader
+    serve_batches()

@@ -1,0 +1,80 @@
+"""Pads as pictures in the live view of LeRobot's commands (`--display_data=true`, rerun and foxglove).
+
+LeRobot 0.6.1 draws a 1-D observation as one curve per value: 384 of them per pad, and as many for its idle
+counts. `install` lets the two functions that log observations see pictures of R x C pixels instead. Robots
+call it when they are made, as they call `arrays.install`; commands with other robots stay untouched.
+"""
+
+import logging
+from collections.abc import Callable, Mapping
+from typing import Any
+
+import numpy as np
+
+from lerobot_vtrefine.drivers.config import PadConfig
+from lerobot_vtrefine.drivers.picture import colours
+from lerobot_vtrefine.lerobot_compat.guard import is_supported
+from lerobot_vtrefine.lerobot_compat.pad_features import BASELINE, PAD_AGE, TACTILE
+
+logger = logging.getLogger(__name__)
+
+LOGGERS = ("log_rerun_data", "log_foxglove_data")
+OBSERVATION = "observation."
+CONSTANT = ("camera.",)
+"""Beginnings of keys whose values never change during a session."""
+
+Observation = Mapping[str, Any]
+
+
+def drawable(observation: Observation, pads: Mapping[str, PadConfig]) -> dict[str, Any]:
+    """The observation as it is shown: a picture per pad, grey while stale, without idle counts and constants.
+
+    Args:
+        observation: Keys with or without `observation.`; a pad that is missing is left out.
+        pads: The robot's pads, in the order of its ages.
+    """
+    plain = {key.removeprefix(OBSERVATION): value for key, value in observation.items()}
+    ages = np.atleast_1d(plain.get(PAD_AGE, np.zeros(len(pads))))
+    shown = {key: value for key, value in plain.items() if not key.startswith((*CONSTANT, f"{BASELINE}."))}
+    for (name, pad), age_s in zip(pads.items(), ages, strict=False):
+        key = f"{TACTILE}.{name}"
+        if key not in plain:
+            continue
+        counts = np.asarray(plain[key]).reshape(pad.pad_shape)
+        idle = np.asarray(plain.get(f"{BASELINE}.{name}", np.zeros_like(counts))).reshape(pad.pad_shape)
+        shown[key] = colours(counts, idle, stale=age_s > pad.stale_after_s)
+    return shown
+
+
+def install(pads: Mapping[str, PadConfig]) -> None:
+    """Shows these pads as pictures from now on; again with other pads, those are shown.
+
+    On a LeRobot version that was not tested it logs a warning and leaves LeRobot as it is.
+    """
+    import lerobot.utils.visualization_utils as dispatch
+
+    if not is_supported() or not all(hasattr(dispatch, name) for name in LOGGERS):
+        logger.warning("This LeRobot version is untested: --display_data shows pads as curves.")
+        return
+    for name in LOGGERS:
+        original = getattr(dispatch, name)
+        setattr(dispatch, name, _drawing(getattr(original, "undrawn", original), pads))
+
+
+def uninstall() -> None:
+    """Restores LeRobot's own functions."""
+    import lerobot.utils.visualization_utils as dispatch
+
+    for name in LOGGERS:
+        current = getattr(dispatch, name)
+        setattr(dispatch, name, getattr(current, "undrawn", current))
+
+
+def _drawing(original: Callable[..., None], pads: Mapping[str, PadConfig]) -> Callable[..., None]:
+    """LeRobot's logging function, which gets pictures."""
+
+    def log(observation: Observation | None = None, **others: Any) -> None:
+        original(observation=drawable(observation, pads) if observation else observation, **others)
+
+    log.undrawn = original  # ty: ignore[missing-attribute]
+    return log

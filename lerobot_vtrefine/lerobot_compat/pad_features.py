@@ -1,0 +1,46 @@
+"""Pads as robot features: arrays that stock `lerobot-record` carries through."""
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from lerobot_vtrefine.drivers.config import PadConfig
+from lerobot_vtrefine.drivers.pads_file import load_pads
+from lerobot_vtrefine.lerobot_compat.arrays import ArraySpec
+
+TACTILE = "tactile"
+"""Counts of a pad are `tactile.<pad>`."""
+
+BASELINE = "tactile_baseline"
+"""Idle counts of a pad are `tactile_baseline.<pad>`."""
+
+PAD_AGE = "tactile_age"
+"""Age of every pad's frame [s], in the order of the pads; beyond the pad's `stale_after_s` it is stale."""
+
+Observation = dict[str, Any]
+
+
+def configured_pads(pads: dict[str, PadConfig], pads_file: Path | None) -> dict[str, PadConfig]:
+    """The robot's pads, from its configuration or from the pads file.
+
+    Raises:
+        ValueError: neither or both are given.
+    """
+    if bool(pads) == (pads_file is not None):
+        raise ValueError(
+            "give the pads either by --robot.pads_file=FILE (vtrefine-find-pads writes it) "
+            "or by --robot.pads='{NAME: {port: /dev/...}}'"
+        )
+    return pads if pads_file is None else load_pads(pads_file)
+
+
+def pad_features(pads: dict[str, PadConfig]) -> dict[str, ArraySpec]:
+    """Features of the pads' counts, idle counts and ages."""
+    features: dict[str, ArraySpec] = {}
+    for kind in (TACTILE, BASELINE):
+        for name, pad in pads.items():
+            info = {"array_shape": list(pad.pad_shape), "unit": "adc_counts"}
+            features[f"{kind}.{name}"] = ArraySpec((int(np.prod(pad.pad_shape)),), "uint8", info)
+    features[PAD_AGE] = ArraySpec((len(pads),), "float32")
+    return features

@@ -1,0 +1,100 @@
+"""Tells robots and teleoperators when LeRobot's loops begin and end an episode, or the time between two.
+
+LeRobot 0.6.1's robots see observations and actions only. Real ones need no more, because a person puts the
+parts back; a simulated one must know when to start anew, and can end an episode itself. `install` wraps the
+loops of ``lerobot-record`` and of the episodic strategy of ``lerobot-rollout``. Teleoperators that solve for
+joint positions themselves must know where the joints are when a loop begins, that of ``lerobot-teleoperate``
+included. Robots without ``phase`` and teleoperators without ``follow`` see nothing of it.
+"""
+
+import functools
+import sys
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import AbstractContextManager, ExitStack
+from typing import Any, Protocol, runtime_checkable
+
+from lerobot_vtrefine.lerobot_compat.guard import is_supported
+
+LOOPS = (
+    ("lerobot.scripts.lerobot_record", None, "record_loop"),
+    ("lerobot.scripts.lerobot_teleoperate", None, "teleop_loop"),
+    ("lerobot.rollout.strategies.episodic", "EpisodicStrategy", "_policy_loop"),
+    ("lerobot.rollout.strategies.episodic", "EpisodicStrategy", "_reset_loop"),
+)
+"""Module, class and name of each function that runs one phase of a recording."""
+
+
+@runtime_checkable
+class PhasedRobot(Protocol):
+    """A robot that wants to know."""
+
+    def phase(self, events: dict[str, bool], fps: float, dataset: Any | None) -> AbstractContextManager[None]:
+        """Entered where a phase begins and left where it ends.
+
+        Args:
+            events: LeRobot's keys; setting ``exit_early`` ends the phase.
+            fps: the loop's rate [Hz].
+            dataset: what the episode is recorded into; None between two episodes.
+        """
+        ...
+
+
+@runtime_checkable
+class FollowingTeleoperator(Protocol):
+    """A teleoperator that goes on from where the robot is."""
+
+    def follow(self, positions: Mapping[str, float]) -> None:
+        """The robot's joint positions by their action keys."""
+        ...
+
+
+def install() -> None:
+    """Wrap the loops that are loaded; idempotent, also picks up what has been loaded since.
+
+    Raises: RuntimeError on a LeRobot version whose loops were not tested with this.
+    """
+    if not is_supported():
+        raise RuntimeError(
+            "a simulated robot needs lerobot >=0.6.1,<0.7: its recording loops are hooked into"
+        )
+    for owner, name in _loaded():
+        loop = vars(owner)[name]
+        if not hasattr(loop, "unphased"):
+            setattr(owner, name, _phased(loop))
+
+
+def uninstall() -> None:
+    """Restore LeRobot's own loops."""
+    for owner, name in _loaded():
+        loop = vars(owner)[name]
+        setattr(owner, name, getattr(loop, "unphased", loop))
+
+
+def _loaded() -> Iterator[tuple[Any, str]]:
+    """Module or class, and name, of every loop whose module is loaded, also as the script that runs."""
+    main = sys.modules["__main__"]
+    for module_name, class_name, name in LOOPS:
+        modules = [sys.modules[module_name]] if module_name in sys.modules else []
+        if getattr(getattr(main, "__spec__", None), "name", None) == module_name:
+            modules.append(main)
+        for module in modules:
+            yield (module if class_name is None else getattr(module, class_name)), name
+
+
+def _phased(loop: Callable[..., None]) -> Callable[..., None]:
+    """The loop, inside the robot's phase; LeRobot passes all of its arguments by name."""
+
+    @functools.wraps(loop)
+    def run(*args: Any, **settings: Any) -> None:
+        robot = getattr(settings["robot"], "inner", settings["robot"])
+        with ExitStack() as stack:
+            if isinstance(robot, PhasedRobot) and "events" in settings:
+                phase = robot.phase(settings["events"], settings["fps"], settings.get("dataset"))
+                stack.enter_context(phase)
+            if isinstance(teleop := settings.get("teleop"), FollowingTeleoperator):
+                observation = robot.get_observation()
+                teleop.follow({key: observation[key] for key in robot.action_features})
+            return loop(*args, **settings)
+
+    run.unphased = loop  # ty: ignore[missing-attribute]
+    return run

@@ -1,0 +1,93 @@
+"""Configuration of the simulated robot."""
+
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Any
+
+import draccus
+from draccus.utils import DraccusException
+from lerobot.envs.configs import EnvConfig
+from lerobot.robots.config import RobotConfig
+
+from lerobot_vtrefine.envs.config import VtRefineEnvConfig
+from lerobot_vtrefine.files import read_yaml
+from lerobot_vtrefine.lerobot_compat.config_errors import told_by_lerobot
+
+TYPE = "vtrefine"
+VIEWS = ("none", "browser")
+FASTEST_HZ = 40
+"""A control step must hold at least one sample of how the parts touch each other."""
+
+
+@RobotConfig.register_subclass("vtrefine_sim")
+@dataclass(kw_only=True)
+class VtRefineSimConfig(RobotConfig):
+    """The simulation as a robot.
+
+    Attributes:
+        env_file: Environment file, as lerobot-eval's --config_path takes it: configs/env/round_table.yaml.
+        env: Fields of --env.type=vtrefine that win over the file's, such as "{pair: square}".
+        seed: Episode i of a dataset starts from seed + i: its parts stand where this seed puts them.
+        fps: Control steps and observations per simulated second; the command must run at the same rate.
+        episode_s: Time-out of an episode [s]: people take longer than what an environment gives a policy.
+        end_episodes: End a recorded episode at success, failure or time-out; otherwise at LeRobot's keys and
+            times only.
+        pause_s: Without recording, the next episode starts this long after one has ended [s].
+        view: none, or browser: the live view of vtrefine-play.
+        view_port: Port of the live view.
+    """
+
+    env_file: Path | None = None
+    env: dict[str, Any] = field(default_factory=dict)
+    seed: int = 0
+    fps: int = 10
+    episode_s: float = 60.0
+    end_episodes: bool = True
+    pause_s: float = 2.0
+    view: str = "none"
+    view_port: int = 8080
+
+    @told_by_lerobot
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if self.view not in VIEWS:
+            raise ValueError(f"--robot.view={self.view} is unknown; choose from {', '.join(VIEWS)}")
+        if self.seed < 0:
+            raise ValueError(f"--robot.seed must not be negative, got {self.seed}")
+        if not 1 <= self.fps <= FASTEST_HZ:
+            raise ValueError(f"--robot.fps must lie between 1 and {FASTEST_HZ}, got {self.fps}")
+        if not 1 <= self.episode_s <= 3600:
+            raise ValueError(f"--robot.episode_s must lie between 1 and 3600, got {self.episode_s}")
+        self.simulation()
+
+    def simulation(self) -> VtRefineEnvConfig:
+        """The environment that this robot lives in.
+
+        Raises:
+            ValueError: the file or a field is wrong.
+        """
+        given = {} if self.env_file is None else _env_of(self.env_file)
+        steps = {"episode_steps": round(self.episode_s * self.fps)}
+        values = {"type": TYPE, **steps, **given, **self.env, "fps": self.fps}
+        try:
+            env = draccus.decode(EnvConfig, values)
+        except (DraccusException, ValueError, TypeError) as error:
+            raise ValueError(f"--robot.env: {error}") from error
+        if not isinstance(env, VtRefineEnvConfig):
+            raise ValueError(f"--robot.env: type {env.type} is no simulation of this package; use {TYPE}")
+        return replace(
+            env, scene=replace(env.scene, timestep_s=fitting_timestep(env.scene.timestep_s, self.fps))
+        )
+
+
+def fitting_timestep(longest_s: float, fps: float) -> float:
+    """The longest physics step up to `longest_s` of which a control step at `fps` [Hz] is a whole number."""
+    steps = 1.0 / (fps * longest_s)
+    return longest_s if abs(steps - round(steps)) < 1e-6 else 1.0 / (fps * (int(steps) + 1))
+
+
+def _env_of(path: Path) -> dict[str, Any]:
+    values = read_yaml(path)
+    if not isinstance(values, dict) or not isinstance(values.get("env"), dict):
+        raise ValueError(f"{path} has no part `env:`, as the files of configs/env have")
+    return values["env"]

@@ -1,0 +1,170 @@
+"""Joint targets of both arms from wanted hand poses, by mink: limits, collisions, posture, warm start.
+
+Shapes: J joints of both arms, H hands.
+"""
+
+from functools import cached_property
+from typing import Any
+
+import mink
+import mujoco
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+from lerobot_vtrefine.sim.config import SceneConfig, TaskConfig
+from lerobot_vtrefine.sim.scene import build_arms
+from lerobot_vtrefine.teleoperators.hand_motion import Pose
+
+Array = NDArray[np.float64]
+
+LEAST_STEPS = 2
+"""Solver's steps per control step: with a warm start a second one leaves less than 0.1 mm."""
+LONGEST_STEP_S = 0.01
+"""No solver's step is longer: arms that look ahead by `LOOK_AHEAD_M` then cannot pass through each other."""
+POSTURE_COST = 1e-3
+"""Pulls towards the last joint positions; small, so that it decides only what the hands leave open."""
+ORIENTATION_COST = 0.2
+"""One radian weighs as much as this many metres."""
+DAMPING = 1e-4
+HANDS_APART_M = 0.004
+LOOK_AHEAD_M = 0.03
+"""Closer geoms than this enter the solver."""
+APPROACH = 0.5
+"""Largest share of the distance that is left by which a step may bring things closer."""
+PARTING_M_S = 0.01
+"""What has come closer than `HANDS_APART_M`, as curved ways do little by little, is moved apart this fast."""
+SOLVER = "daqp"
+
+
+class TwoArmIk:
+    """Inverse kinematics of an embodiment's arms, one control step after the other.
+
+    Args:
+        embodiment: its name.
+        dt_s: control step.
+        speed: share of the simulation's rate limits that joints may use.
+    """
+
+    def __init__(self, embodiment: str, dt_s: float, speed: float = 1.0) -> None:
+        self.model, self.body, self._qpos = build_arms(SceneConfig(embodiment=embodiment))
+        rules = TaskConfig()
+        self._dt_s, self._steps = dt_s, max(LEAST_STEPS, round(dt_s / LONGEST_STEP_S))
+        self._rate = np.array([self._joint_rate(rules, joint) for joint in self._joints]) * speed
+        self._configuration = mink.Configuration(self.model)
+        self._is_finger = self.model.jnt_type[self._joints] == mujoco.mjtJoint.mjJNT_SLIDE
+        self._frames = [self._hand_frame(hand) for hand in range(len(self.body.arms))]
+        names = [self.model.body(body).name for body, _, _ in self._frames]
+        self._tasks = [mink.FrameTask(name, "body", 1.0, ORIENTATION_COST, lm_damping=1e-6) for name in names]
+        self._posture = mink.PostureTask(self.model, POSTURE_COST)
+        limited = {self.model.joint(int(j)).name: r for j, r in zip(self._joints, self._rate, strict=True)}
+        self._limits: list[Any] = [
+            mink.ConfigurationLimit(self.model),
+            mink.VelocityLimit(self.model, limited),
+            self._collisions(),
+        ]
+        self.restart(np.asarray(self.body.home, float))
+
+    @cached_property
+    def _joints(self) -> Array:
+        """(J,) joint ids in the embodiment's order."""
+        by_address = {int(address): joint for joint, address in enumerate(self.model.jnt_qposadr)}
+        return np.array([by_address[int(address)] for address in self._qpos])
+
+    def restart(self, joints: Array) -> None:
+        """The arms are at joint positions (J,)."""
+        self.joints = np.clip(joints, self.body.lower, self.body.upper)
+        qpos = self._configuration.q.copy()
+        qpos[self._qpos] = self.joints
+        self._configuration.update(qpos)
+
+    def hands(self, joints: Array | None = None) -> list[Pose]:
+        """Poses of the TCPs at joint positions (J,); at the present ones by default."""
+        q = torch.as_tensor(self.joints if joints is None else joints)
+        position, rotation = self.body.tcp_poses(q)
+        return [Pose(p.numpy(), r.numpy()) for p, r in zip(position, rotation, strict=True)]
+
+    def step(self, wanted: list[Pose], grips: list[float | None]) -> Array:
+        """One control step towards wanted hand poses (H) and grips (H, 0 open, 1 closed, None as it is).
+
+        Returns:
+            Joint targets (J,), no farther from the last ones than the rate limits allow, whatever is asked.
+        """
+        before = self.joints.copy()
+        for task, pose, (_, position, rotation) in zip(self._tasks, wanted, self._frames, strict=True):
+            turned = pose.rotation @ rotation.T
+            target = mink.SE3.from_rotation_and_translation(
+                mink.SO3.from_matrix(turned), pose.position - turned @ position
+            )
+            task.set_target(target)
+        self._posture.set_target(self._configuration.q)
+        try:
+            for _ in range(self._steps):
+                velocity = mink.solve_ik(
+                    self._configuration,
+                    [*self._tasks, self._posture],
+                    self._dt_s / self._steps,
+                    SOLVER,
+                    DAMPING,
+                    limits=self._limits,
+                )
+                self._configuration.integrate_inplace(velocity, self._dt_s / self._steps)
+            solved = self._configuration.q[self._qpos]
+        except mink.exceptions.MinkError:  # nothing satisfies all limits: stay
+            solved = before
+        targets = np.where(self._is_finger, self._fingers(before, grips), solved)
+        targets = np.where(np.isfinite(targets), targets, before)
+        most = self._rate * self._dt_s
+        self.restart(before + np.clip(targets - before, -most, most))
+        return self.joints
+
+    def _fingers(self, before: Array, grips: list[float | None]) -> Array:
+        """(J,) finger positions for these grips; arm joints mean nothing."""
+        lower, upper = np.asarray(self.body.lower), np.asarray(self.body.upper)
+        wide = np.where(np.abs(upper) > np.abs(lower), upper, lower)
+        closed = np.where(np.abs(upper) > np.abs(lower), lower, upper)
+        targets, per_arm = before.copy(), len(before) // len(grips)
+        for hand, grip in enumerate(grips):
+            if grip is not None:
+                rows = slice(hand * per_arm, (hand + 1) * per_arm)
+                targets[rows] = wide[rows] + grip * (closed[rows] - wide[rows])
+        return targets
+
+    def _joint_rate(self, rules: TaskConfig, joint: int) -> float:
+        is_slide = self.model.jnt_type[joint] == mujoco.mjtJoint.mjJNT_SLIDE
+        return rules.finger_rate if is_slide else rules.joint_rate
+
+    def _hand_frame(self, hand: int) -> tuple[int, Array, Array]:
+        """Body that carries a hand, and position (3,) and rotation (3, 3) of its TCP in that body's frame."""
+        per_arm = len(self._joints) // len(self.body.arms)
+        hinges = [j for j, slide in zip(self._joints, self._is_finger, strict=True) if not slide]
+        own = set(self._joints[hand * per_arm : (hand + 1) * per_arm].tolist())
+        body = int(self.model.jnt_bodyid[[j for j in hinges if int(j) in own][-1]])
+        home = np.asarray(self.body.home, float)
+        data = mujoco.MjData(self.model)
+        data.qpos[self._qpos] = home
+        mujoco.mj_kinematics(self.model, data)
+        base, turned = data.xpos[body], data.xmat[body].reshape(3, 3)
+        tcp = self.hands(home)[hand]
+        return body, turned.T @ (tcp.position - base), turned.T @ tcp.rotation
+
+    def _collisions(self) -> mink.CollisionAvoidanceLimit:
+        """The arms' solid parts against each other and against what does not move."""
+        solid = np.flatnonzero(self.model.geom_contype | self.model.geom_conaffinity)
+        root = self.model.body_rootid[self.model.geom_bodyid]
+        arms = self._joints.reshape(len(self.body.arms), -1)
+        roots = [self.model.body_rootid[self.model.jnt_bodyid[joints[0]]] for joints in arms]
+        sides = [[int(g) for g in solid if root[g] == side] for side in roots]
+        fixed = [int(g) for g in solid if self.model.geom_bodyid[g] == 0]
+        pairs = [(side, fixed) for side in sides]
+        if len(sides) == 2:
+            pairs.append((sides[0], sides[1]))
+        step_s = self._dt_s / self._steps
+        return mink.CollisionAvoidanceLimit(
+            self.model,
+            pairs,
+            gain=APPROACH * step_s,  # mink 1.3 bounds a step's way by gain * distance / dt
+            minimum_distance_from_collisions=HANDS_APART_M,
+            collision_detection_distance=LOOK_AHEAD_M,
+            bound_relaxation=-PARTING_M_S * step_s,
+        )

@@ -1,0 +1,51 @@
+"""What people hold in their hands. Packages are imported by the input that needs them."""
+
+from typing import Protocol
+
+from lerobot_vtrefine.teleoperators.config_vtrefine_ee import VtRefineEeConfig
+from lerobot_vtrefine.teleoperators.hand_motion import HandSample
+
+__all__ = ["Source", "make_source"]
+
+
+class Source(Protocol):
+    """Controllers of both hands."""
+
+    def connect(self) -> None:
+        """Open the device."""
+        ...
+
+    def restart(self) -> None:
+        """An episode begins."""
+        ...
+
+    def read(self) -> dict[str, HandSample]:
+        """The latest samples by arm; an arm whose controller is not seen is left out."""
+        ...
+
+    def disconnect(self) -> None:
+        """Close the device."""
+        ...
+
+
+def make_source(config: VtRefineEeConfig, arms: list[str]) -> Source:
+    """The input of a configuration. Raises: ValueError for a recording that cannot be read."""
+    if config.input == "recording":
+        from lerobot_vtrefine.teleoperators.inputs.recording import RecordedControllers
+
+        assert config.path is not None
+        return RecordedControllers(config.path, arms)
+    if config.input == "webxr":
+        from lerobot_vtrefine.teleoperators.inputs.webxr import WebXrControllers
+
+        return WebXrControllers({arm: config.webxr_ports[arm] for arm in arms}, config.timeout_s)
+    from lerobot_vtrefine.teleoperators.inputs.speed import SpeedControllers
+
+    step_m, step_rad = config.key_speed_m_s / config.fps, config.key_speed_rad_s / config.fps
+    if config.input == "gamepad":
+        from lerobot_vtrefine.teleoperators.inputs.gamepad import Gamepad
+
+        return SpeedControllers(Gamepad(), arms, step_m, step_rad)
+    from lerobot_vtrefine.teleoperators.inputs.keyboard import Keyboard
+
+    return SpeedControllers(Keyboard(), arms, step_m, step_rad)

@@ -1,0 +1,69 @@
+"""Keys through pynput, as LeRobot's own keyboard teleoperator reads them: one block of keys per hand."""
+
+from collections.abc import Set as AbstractSet
+from typing import Any
+
+import numpy as np
+
+from lerobot_vtrefine.teleoperators.inputs.speed import Push
+
+KEYS = (
+    {"forward": "w", "back": "s", "left": "a", "right": "d", "up": "e", "down": "q", "grip": "f"}
+    | {"turn_left": "z", "turn_right": "x", "tip_up": "c", "tip_down": "v"},
+    {"forward": "i", "back": "k", "left": "j", "right": "l", "up": "o", "down": "u", "grip": "h"}
+    | {"turn_left": "n", "turn_right": "m", "tip_up": ",", "tip_down": "."},
+)
+"""Left hand, right hand."""
+WAYS = (("forward", "back"), ("left", "right"), ("up", "down"))
+TURNS = ((None, None), ("tip_down", "tip_up"), ("turn_left", "turn_right"))
+
+
+def push_of(held: AbstractSet[str], pressed: AbstractSet[str], keys: dict[str, str]) -> Push:
+    """What keys that are held, and keys that went down since the last look, ask of one hand."""
+
+    def along(pairs: Any) -> np.ndarray:
+        return np.array(
+            [float(keys.get(one) in held) - float(keys.get(other) in held) for one, other in pairs]
+        )
+
+    return Push(along(WAYS), along(TURNS), keys["grip"] in pressed)
+
+
+class Keyboard:
+    """Needs a display, or on macOS the permission to watch keys."""
+
+    def __init__(self) -> None:
+        self._held: set[str] = set()
+        self._pressed: set[str] = set()
+        self._listener: Any = None
+
+    def connect(self) -> None:
+        """Watch the keys. Raises: ImportError where pynput is missing or finds no display."""
+        try:
+            from pynput import keyboard  # ty: ignore[import-not-found]
+        except ImportError as error:
+            raise ImportError(
+                f"--teleop.input=keyboard needs pynput and a display ({error}): "
+                "pip install 'lerobot_policy_vtrefine[teleop]'"
+            ) from error
+        self._listener = keyboard.Listener(on_press=self._down, on_release=self._up)
+        self._listener.start()
+
+    def pushes(self) -> list[Push]:
+        """One per hand."""
+        pressed, self._pressed = self._pressed, set()
+        return [push_of(self._held, pressed, keys) for keys in KEYS]
+
+    def disconnect(self) -> None:
+        """Watch no longer."""
+        if self._listener is not None:
+            self._listener.stop()
+
+    def _down(self, key: Any) -> None:
+        name = getattr(key, "char", None)
+        if name is not None and name.lower() not in self._held:
+            self._held.add(name.lower())
+            self._pressed.add(name.lower())
+
+    def _up(self, key: Any) -> None:
+        self._held.discard((getattr(key, "char", None) or "").lower())

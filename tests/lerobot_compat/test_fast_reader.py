@@ -1,0 +1,120 @@
+"""Items from memory are bit-identical to LeRobot's, and everything not covered takes LeRobot's path."""
+
+import logging
+import time
+from pathlib import Path
+from typing import Any
+
+import lerobot.datasets.lerobot_dataset as stock_module
+import numpy as np
+import pytest
+import torch
+from lerobot.datasets.dataset_reader import DatasetReader
+from lerobot.datasets.lerobot_dataset import LeRobotDataset
+from torch.utils.data import DataLoader
+
+from lerobot_vtrefine.datasets.features import RAW_KEYS, STATE_KEY
+from lerobot_vtrefine.lerobot_compat import fast_reader
+
+WINDOWS = {key: [-0.1, 0.0] for key in (*RAW_KEYS, STATE_KEY)} | {"action": [i / 10 for i in range(16)]}
+
+
+@pytest.fixture
+def stock(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Start from LeRobot as it comes and restore it afterwards."""
+    monkeypatch.setattr(stock_module, "DatasetReader", DatasetReader)
+
+
+def assert_same_item(first: dict[str, Any], second: dict[str, Any]) -> None:
+    """Same keys in the same order, same values, dtypes and shapes."""
+    assert list(first) == list(second)
+    for key, value in first.items():
+        if isinstance(value, torch.Tensor):
+            assert value.dtype == second[key].dtype, key
+            assert value.shape == second[key].shape, key
+            assert torch.equal(value, second[key]), key
+        else:
+            assert value == second[key], key
+
+
+@pytest.mark.usefixtures("stock")
+@pytest.mark.parametrize(
+    "options",
+    [
+        {},
+        {"delta_timestamps": WINDOWS},
+        {"delta_timestamps": WINDOWS, "episodes": [0, 2]},
+        {"delta_timestamps": WINDOWS, "depth_output_unit": "m"},
+    ],
+    ids=["single frames", "windows", "some episodes", "metres"],
+)
+def test_items_are_bit_identical(tiny_dataset: Path, options: dict[str, Any]) -> None:
+    slow = LeRobotDataset("local/tiny", root=tiny_dataset, **options)
+    fast_reader.install()
+    fast = LeRobotDataset("local/tiny", root=tiny_dataset, **options)
+    assert fast.reader._frame_store() is not None
+    for index in (0, 1, 11, 12, 13, len(slow) - 1, -2):
+        assert_same_item(slow[index], fast[index])
+    with pytest.raises(IndexError):
+        fast[len(fast)]
+    indices = [3, 0, len(slow) - 1, 11, 12]
+    (slow_batch,), (fast_batch,) = (DataLoader(data, batch_sampler=[indices]) for data in (slow, fast))
+    assert_same_item(slow_batch, fast_batch)
+    assert len(fast.__getitems__(indices)) == 1, "a whole batch, not items"
+    with pytest.raises(IndexError):
+        fast.__getitems__([0, len(fast)])
+
+
+@pytest.mark.usefixtures("stock")
+def test_depth_that_does_not_fit_in_memory_is_decoded_per_item(
+    tiny_dataset: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    slow = LeRobotDataset("local/tiny", root=tiny_dataset, delta_timestamps=WINDOWS)
+    monkeypatch.setattr(fast_reader, "MAX_DEPTH_BYTES", 1000)
+    fast_reader.install()
+    fast = LeRobotDataset("local/tiny", root=tiny_dataset, delta_timestamps=WINDOWS)
+    for index in (0, 5, 35):
+        assert_same_item(slow[index], fast[index])
+    (slow_batch,), (fast_batch,) = (DataLoader(data, batch_sampler=[[5, 35]]) for data in (slow, fast))
+    assert_same_item(slow_batch, fast_batch)
+
+
+@pytest.mark.usefixtures("stock")
+def test_items_are_many_times_faster(tiny_dataset: Path) -> None:
+    def milliseconds(dataset: LeRobotDataset) -> float:
+        dataset[0]
+        times = []
+        for index in range(1, 12):
+            start = time.process_time()
+            dataset[index]
+            times.append(time.process_time() - start)
+        return 1e3 * float(np.median(times))
+
+    slow = milliseconds(LeRobotDataset("local/tiny", root=tiny_dataset, delta_timestamps=WINDOWS))
+    fast_reader.install()
+    fast = milliseconds(LeRobotDataset("local/tiny", root=tiny_dataset, delta_timestamps=WINDOWS))
+    assert fast < slow / 10
+
+
+@pytest.mark.usefixtures("stock")
+def test_other_datasets_take_the_stock_path(tmp_path: Path) -> None:
+    features = {STATE_KEY: {"dtype": "float32", "shape": (2,), "names": ["a", "b"]}}
+    dataset = LeRobotDataset.create("local/plain", fps=10, root=tmp_path / "plain", features=features)
+    dataset.add_frame({STATE_KEY: np.zeros(2, np.float32), "task": "wait"})
+    dataset.save_episode()
+    dataset.finalize()
+    fast_reader.install()
+    plain = LeRobotDataset("local/plain", root=tmp_path / "plain")
+    assert plain[0][STATE_KEY].tolist() == [0.0, 0.0]
+    assert plain.reader._frame_store() is None
+
+
+@pytest.mark.usefixtures("stock")
+def test_an_untested_lerobot_is_left_alone(
+    monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    monkeypatch.setattr(fast_reader, "is_supported", lambda: False)
+    with caplog.at_level(logging.WARNING):
+        fast_reader.install()
+    assert stock_module.DatasetReader is DatasetReader
+    assert "untested" in caplog.text

@@ -1,0 +1,155 @@
+"""Each seam is still needed: its probe shows what LeRobot does without it, and fails once LeRobot does it."""
+
+import inspect
+import pkgutil
+import re
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+
+import draccus
+import numpy as np
+import pyarrow as pa
+import pyarrow.parquet as pq
+import pytest
+from lerobot.datasets import compute_stats, io_utils
+from lerobot.datasets.lerobot_dataset import LeRobotDataset
+from lerobot.datasets.utils import create_lerobot_dataset_card
+from lerobot.processor.pipeline import DataProcessorPipeline
+from lerobot.utils import feature_utils, import_utils, visualization_utils
+
+from lerobot_vtrefine import lerobot_compat
+from lerobot_vtrefine.lerobot_compat import arrays, card, checkpoint_guard, live_view, phases, safe_recording
+from lerobot_vtrefine.lerobot_compat.seams import SEAMS
+
+PROBES: dict[str, Callable[..., None]] = {}
+
+
+def probe(function: Callable[..., None]) -> Callable[..., None]:
+    PROBES[function.__name__] = function
+    return function
+
+
+@pytest.fixture(autouse=True)
+def stock() -> None:
+    """LeRobot as it is, whatever earlier tests opened."""
+    for seam in (arrays, card, live_view, phases, safe_recording):
+        seam.uninstall()
+
+
+@probe
+def arrays_(_: Path) -> None:
+    with pytest.raises(ValueError, match="3-tuple"):
+        feature_utils.hw_to_dataset_features({"tactile.left": (384,)}, "observation")
+
+
+@probe
+def card_(_: Path) -> None:
+    text = str(create_lerobot_dataset_card(tags=["a"], repo_id="me/set"))
+    assert "[More Information Needed]" in text.split("## Dataset Structure")[0]
+
+
+@probe
+def checkpoint_guard_(_: Path) -> None:
+    steps = [{"class": "subprocess.Popen", "config": {"args": ["true"]}}]
+    checkpoint_guard._validate(DataProcessorPipeline, "me/policy", {"name": "x", "steps": steps}, "file.json")
+
+
+@dataclass
+class Refusing:
+    size: int = 0
+
+    def __post_init__(self) -> None:
+        if self.size:
+            raise ValueError("sizes are out of fashion")
+
+
+@probe
+def config_errors_(_: Path) -> None:
+    with pytest.raises(draccus.utils.DraccusException) as caught:
+        draccus.decode(Refusing, {"size": 1})
+    assert "fashion" not in str(caught.value)
+
+
+@probe
+def fast_reader_(folder: Path) -> None:
+    dataset = small_dataset(folder)
+    dataset.finalize()
+    read = LeRobotDataset("local/small", root=folder / "small")
+    assert read.hf_dataset.format["type"] == "custom"  # a function over Python lists
+
+
+@probe
+def fast_saving_(_: Path) -> None:
+    stats = compute_stats.RunningQuantileStats()
+    stats.update(np.zeros((4, 7)))
+    assert len(stats._histograms) == 7
+    assert "batched=False" in inspect.getsource(io_utils.embed_images)
+
+
+@probe
+def live_view_(_: Path) -> None:
+    rerun = pytest.importorskip("rerun")
+    logged: list[str] = []
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(rerun, "log", lambda path, entity, **_: logged.append(type(entity).__name__))
+        patch.setattr(rerun, "send_blueprint", lambda *_, **__: None)
+        visualization_utils.log_rerun_data(observation={"observation.tactile.left": np.zeros(384, np.uint8)})
+    assert logged == ["Scalars"]  # a curve for each of its values
+
+
+@probe
+def phases_(_: Path) -> None:
+    from lerobot.scripts import lerobot_record
+
+    asked = set(re.findall(r"\brobot\.(\w+)\(", inspect.getsource(lerobot_record)))
+    asked -= {"connect", "disconnect"}  # once a session, not once an episode
+    assert asked == {"get_observation", "send_action", "_from_keyboard_to_base_action"}
+
+
+@probe
+def registration_(_: Path) -> None:
+    source = inspect.getsource(import_utils.register_third_party_plugins)
+    assert "lerobot_policy_" in source
+    assert "entry_points" not in source
+
+
+@probe
+def safe_recording_(folder: Path) -> None:
+    dataset = small_dataset(folder)
+    (path,) = (folder / "small" / "data").rglob("*.parquet")
+    with pytest.raises(pa.ArrowInvalid):
+        pq.read_table(path)
+    dataset.finalize()
+
+
+def small_dataset(folder: Path) -> LeRobotDataset:
+    """One saved episode of a session that has not ended."""
+    features = {"observation.state": {"dtype": "float32", "shape": (2,), "names": ["a", "b"]}}
+    dataset = LeRobotDataset.create("local/small", 10, features, root=folder / "small", use_videos=False)
+    for _ in range(3):
+        dataset.add_frame({"observation.state": np.zeros(2, np.float32), "task": "none"})
+    dataset.save_episode()
+    return dataset
+
+
+@pytest.mark.parametrize("seam", SEAMS, ids=lambda seam: seam.module)
+def test_lerobot_still_needs_it(seam: object, tmp_path: Path) -> None:
+    PROBES[f"{seam.module}_"](tmp_path)
+
+
+@pytest.mark.parametrize("seam", SEAMS, ids=lambda seam: seam.module)
+def test_what_it_changes_is_there(seam: object) -> None:
+    for path in seam.changes:
+        owner, name = path.rsplit(".", 1)
+        assert hasattr(pkgutil.resolve_name(owner), name), path
+
+
+def test_every_module_that_reaches_into_lerobot_is_listed() -> None:
+    folder = Path(lerobot_compat.__file__).parent
+    opens = re.compile(r"\bsetattr\(|^def install\(", re.MULTILINE)
+    opening = {path.stem for path in folder.glob("*.py") if opens.search(path.read_text())}
+    assert opening <= {seam.module for seam in SEAMS}
+    reaches = re.compile(r"^def install\(|setattr\((dispatch|dataset_writer|lerobot)", re.MULTILINE)
+    others = (path for path in folder.parent.rglob("*.py") if folder not in path.parents)
+    assert [path for path in others if reaches.search(path.read_text())] == []

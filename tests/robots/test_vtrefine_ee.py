@@ -1,0 +1,275 @@
+"""End-effector teleoperation: recorded controllers insert in simulation, and nothing they do is dangerous."""
+
+import json
+import time
+from collections.abc import Generator
+from dataclasses import replace
+from pathlib import Path
+
+import mujoco
+import numpy as np
+import pytest
+from commands import dataset_flags, flags, run_command
+from scipy.spatial.transform import Rotation
+
+from lerobot_vtrefine.embodiments import get_embodiment
+from lerobot_vtrefine.envs import VtRefineEnvConfig
+from lerobot_vtrefine.envs.live_world import IDS, LiveWorld
+from lerobot_vtrefine.lerobot_compat import phases
+from lerobot_vtrefine.sim.config import TaskConfig
+from lerobot_vtrefine.sim.demonstrations import Degradation
+from lerobot_vtrefine.sim.expert import ScriptedExpert
+from lerobot_vtrefine.teleoperators import VtRefineEeConfig
+from lerobot_vtrefine.teleoperators.hand_ik import TwoArmIk
+from lerobot_vtrefine.teleoperators.hand_motion import ClutchedHand, HandSample, MotionSettings, Pose, still
+from lerobot_vtrefine.teleoperators.inputs import gamepad, keyboard, webxr
+from lerobot_vtrefine.teleoperators.inputs.speed import Push, SpeedControllers
+from lerobot_vtrefine.teleoperators.vtrefine_ee import VtRefineEe
+
+BODY = get_embodiment("aloha")
+ARMS = [arm.name for arm in BODY.arms]
+FPS = 10
+YAW = Rotation.from_euler("z", np.pi)
+"""The operator's frame in the world, by default."""
+
+
+@pytest.fixture(autouse=True)
+def restored() -> Generator[None]:
+    yield
+    phases.uninstall()
+
+
+def expert_targets(env: VtRefineEnvConfig, seed: int) -> np.ndarray:
+    """(T + 1, J) commands of the scripted expert, the start first."""
+    world = LiveWorld(env)
+    world.reset(seed)
+    expert = ScriptedExpert(world.sim, Degradation())
+    expert.reset(IDS)
+    targets = [world.sim.command_targets()[0].copy()]
+    while not world.outcome:
+        world.step(expert.act(IDS)[0])
+        targets.append(world.sim.command_targets()[0].copy())
+    assert world.outcome == "success"
+    return np.stack(targets)
+
+
+def as_controllers(targets: np.ndarray, tremor_m: float = 0.0, delay: int = 0) -> dict[str, np.ndarray]:
+    """What controllers would say whose hands move so: anywhere in the room, turned anyhow."""
+    ik = TwoArmIk("aloha", 1 / FPS)
+    rng = np.random.default_rng(0)
+    hands = [ik.hands(row) for row in np.concatenate([np.repeat(targets[:1], 1 + delay, 0), targets[1:]])]
+    per_arm, travel = BODY.joints_per_arm, BODY.fingers.travel_m
+    fingers = np.concatenate([np.repeat(targets[:1], 1 + delay, 0), targets[1:]])
+    arrays: dict[str, np.ndarray] = {}
+    for index, arm in enumerate(ARMS):
+        held = Rotation.from_euler("xyz", [0.3, -0.5, 0.8])  # how the controller lies in the person's hand
+        place = np.array([0.2, -0.4, 1.1])
+        world = [pose[index] for pose in hands]
+        turned = [YAW.inv() * Rotation.from_matrix(pose.rotation) * held for pose in world]
+        shaken = tremor_m * rng.standard_normal((len(world), 3))
+        arrays[f"{arm}_position"] = YAW.inv().apply([pose.position for pose in world]) + place + shaken
+        arrays[f"{arm}_quaternion"] = np.stack([turn.as_quat(scalar_first=True) for turn in turned])
+        arrays[f"{arm}_clutch"] = np.ones(len(world), bool)
+        arrays[f"{arm}_grip"] = 1 - fingers[:, index * per_arm + per_arm - 2] / travel
+    return arrays
+
+
+def record(patch: pytest.MonkeyPatch, arrays: dict[str, np.ndarray], folder: Path, env: str) -> dict:
+    np.savez(folder / "people.npz", **arrays)
+    teleop = flags(teleop__type="vtrefine_ee", teleop__input="recording", teleop__path=folder / "people.npz")
+    robot = flags(robot__type="vtrefine_sim", robot__env=env, robot__fps=FPS, robot__seed=3)
+    root = folder / "recorded"
+    run_command(patch, "record", [*robot, *teleop, *dataset_flags(root, 1, 30.0, FPS)])
+    return json.loads((root / "meta" / "recording.json").read_text())["episodes"][0]
+
+
+def test_recorded_controllers_insert_through_stock_lerobot_record(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    targets = expert_targets(VtRefineEnvConfig(start="grasped", num_threads=1), seed=3)
+    row = record(monkeypatch, as_controllers(targets), tmp_path, "{start: grasped, num_threads: 1}")
+    assert row["success"]
+    assert row["in_hand_shift_m"] < 0.003
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("tremor_m", "delay"), [(0.0, 0), (0.0003, 2)])
+def test_recorded_people_pick_and_insert_from_the_table(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, tremor_m: float, delay: int
+) -> None:
+    targets = expert_targets(VtRefineEnvConfig(start="table", num_threads=1), seed=3)
+    row = record(monkeypatch, as_controllers(targets, tremor_m, delay), tmp_path, "{num_threads: 1}")
+    print(tremor_m, delay, row)
+    assert row["success"]
+
+
+def connected(samples: list[dict[str, HandSample]], **settings: object) -> VtRefineEe:
+    teleop = VtRefineEe(VtRefineEeConfig(fps=FPS, **settings))
+    given = iter(samples)
+
+    class Given:
+        def connect(self) -> None: ...
+        def restart(self) -> None: ...
+        def disconnect(self) -> None: ...
+        def read(self) -> dict[str, HandSample]:
+            return next(given, {})
+
+    teleop._source = Given()
+    teleop.connect()
+    return teleop
+
+
+def at(x: float, clutch: bool = True, turn: float = 0.0, grip: float = 0.0) -> HandSample:
+    rotation = Rotation.from_euler("z", turn).as_matrix()
+    return HandSample(np.array([x, 0.0, 0.0]), rotation, clutch, grip)
+
+
+NAN = replace(at(0.0), position=np.full(3, np.nan))
+FAULTS = {
+    "a jump": [at(0.0), at(0.01), at(3.0), at(3.01)],
+    "a jump below the guard, again and again": [at(0.14 * (-1) ** k) for k in range(12)],
+    "a spin": [at(0.0), at(0.0, turn=3.0), at(0.0, turn=-3.0)],
+    "lost tracking": [at(0.0), None, None, at(0.9), at(0.91)],
+    "no numbers": [at(0.0), NAN, at(0.02), NAN],
+    "infinite": [at(0.0), replace(at(0.0), position=np.array([np.inf, 0, 0])), at(0.0)],
+    "no rotation": [at(0.0), replace(at(0.0), rotation=np.zeros((3, 3))), at(0.1)],
+    "a released clutch": [at(0.0), at(0.02), at(0.5, clutch=False), at(0.6, clutch=False), at(0.9)],
+    "a dead connection": [at(0.0), at(0.05)],
+    "a grip beyond its range": [at(0.0, grip=50.0), at(0.0, grip=-50.0), at(0.0, grip=np.nan)],
+    "out of reach": [at(0.1 * k) for k in range(20)],
+}
+
+
+@pytest.mark.parametrize("fault", FAULTS)
+def test_nothing_moves_an_arm_faster_than_its_rate_limit(fault: str) -> None:
+    teleop = connected([{arm: s for arm in ARMS if s is not None} for s in FAULTS[fault]])
+    rules = TaskConfig()
+    slides = np.array(["finger" in joint for joint in BODY.joint_names])
+    most = np.where(slides, rules.finger_rate, rules.joint_rate) / FPS
+    actions = [np.asarray(BODY.home)]
+    actions += [np.array(list(teleop.get_action().values())) for _ in range(len(FAULTS[fault]) + 3)]
+    steps = np.abs(np.diff(actions, axis=0))
+    assert np.isfinite(actions).all()
+    assert (steps <= most + 1e-9).all()
+    assert (np.array(actions) >= BODY.lower - 1e-9).all()
+    assert (np.array(actions) <= BODY.upper + 1e-9).all()
+    if fault in ("a jump", "lost tracking", "a released clutch"):
+        reached = teleop._ik.hands(actions[-1])[0].position - teleop._ik.hands(actions[0])[0].position
+        assert np.linalg.norm(reached) < 0.04  # the good samples' way alone
+    assert (steps[-1] < 1e-4).all() or fault == "out of reach"  # nothing is heard any more, nothing moves
+
+
+HELD = Pose(np.array([0.1, 0.2, 0.3]), Rotation.from_euler("xyz", [0.2, 0.4, -0.3]).as_matrix())
+
+
+def clutched(tool: bool = False, scale: float = 1.0) -> ClutchedHand:
+    return ClutchedHand(MotionSettings(scale, YAW.as_matrix(), tool, 0.15, 1.0), HELD)
+
+
+def test_a_hand_follows_scaled_and_from_where_the_clutch_was_pressed() -> None:
+    hand = clutched(scale=0.5)
+    assert hand.update(at(0.7), HELD).position is HELD.position
+    np.testing.assert_allclose(
+        hand.update(at(0.8), HELD).position, HELD.position + np.array([-0.05, 0, 0]), atol=1e-12
+    )
+    there = Pose(HELD.position + np.array([-0.05, 0, 0]), HELD.rotation)
+    hand.update(at(0.85, clutch=False), there)
+    hand.update(at(0.75, clutch=True), there)
+    np.testing.assert_allclose(
+        hand.update(at(0.85), there).position, HELD.position + np.array([-0.1, 0, 0]), atol=1e-12
+    )
+    turned = hand.update(at(0.85, turn=0.3), there).rotation
+    np.testing.assert_allclose(turned, Rotation.from_euler("z", 0.3).as_matrix() @ HELD.rotation, atol=1e-12)
+
+
+def test_in_the_tool_frame_forward_is_where_the_hand_points() -> None:
+    hand = clutched(tool=True)
+    hand.update(at(0.0), HELD)
+    way = hand.update(at(0.1), HELD).position - HELD.position
+    np.testing.assert_allclose(way, 0.1 * HELD.rotation[:, 0], atol=1e-12)
+
+
+def test_both_arms_are_solved_a_hundred_times_a_second_and_track() -> None:
+    ik = TwoArmIk("aloha", 0.01)
+    start, errors, took = ik.hands(), [], []
+    for k in range(300):
+        way = 0.02 * np.array([np.sin(k / 80), np.sin(k / 100), 1 - np.cos(k / 90)])
+        wanted = [Pose(pose.position + way, pose.rotation) for pose in start]
+        began = time.process_time()
+        ik.step(wanted, [0.0, None])
+        took.append(time.process_time() - began)
+        errors += [np.linalg.norm(a.position - b.position) for a, b in zip(wanted, ik.hands(), strict=True)]
+    print(f"{1e3 * np.median(took):.2f} ms, largest error {1e3 * max(errors):.4f} mm")
+    assert np.median(took) < 0.01
+    assert max(errors) < 1e-4
+
+
+def test_hands_are_kept_apart_and_above_the_table() -> None:
+    ik = TwoArmIk("aloha", 0.1)
+    middle = [Pose(np.array([0.0, 0.0, 0.15]), pose.rotation) for pose in ik.hands()]
+    below = [Pose(pose.position * [1, 1, 0] - [0, 0, 0.1], pose.rotation) for pose in ik.hands()]
+    for wanted in (middle, below):
+        ik.restart(np.asarray(BODY.home))
+        for _ in range(60):
+            ik.step(wanted, [0.0, 0.0])
+        data = mujoco.MjData(ik.model)
+        data.qpos[:] = ik._configuration.q
+        mujoco.mj_forward(ik.model, data)
+        own = [tuple(sorted(c.geom)) for c in data.contact if c.dist < 0]
+        root = ik.model.body_rootid[ik.model.geom_bodyid]
+        assert [pair for pair in own if root[pair[0]] != root[pair[1]]] == []
+
+
+def test_keys_and_sticks_move_imaginary_controllers() -> None:
+    left, right = keyboard.KEYS
+    push = keyboard.push_of({"w", "a"}, {"f"}, left)
+    assert push.way.tolist() == [1, 1, 0]
+    assert push.toggle_grip
+    assert keyboard.push_of({"w", "a"}, set(), right).way.tolist() == [0, 0, 0]
+    assert gamepad.push_of((0.05, -1.0), shoulder=False, grip=False).way.tolist() == [1, 0, 0]
+    assert gamepad.push_of((0.0, -1.0), shoulder=True, grip=True).way.tolist() == [0, 0, 1]
+
+    class Device:
+        given = iter([[Push(), Push()], [Push(np.array([9.0, 0, 0]), toggle_grip=True), Push()]])
+
+        def connect(self) -> None: ...
+        def disconnect(self) -> None: ...
+        def pushes(self) -> list[Push]:
+            return next(self.given)
+
+    controllers = SpeedControllers(Device(), ARMS, 0.01, 0.1)
+    assert controllers.read()["left"].clutch
+    moved = controllers.read()
+    assert moved["left"].position.tolist() == pytest.approx([0.01, 0, 0])
+    assert (moved["left"].grip, moved["right"].grip) == (1.0, 0.0)
+
+
+def test_a_phone_that_falls_silent_is_lost() -> None:
+    phones = webxr.WebXrControllers({"left": 1, "right": 2}, timeout_s=0.05)
+    phones.hear("left", np.eye(4), {"move": True, "reservedButtonA": True})
+    sample = phones.read()["left"]
+    assert (sample.clutch, sample.grip) == (True, 1.0)
+    assert "right" not in phones.read()
+    time.sleep(0.06)
+    assert phones.read() == {}
+
+
+@pytest.mark.parametrize(
+    ("settings", "words"),
+    [
+        ({"input": "mind"}, "--teleop.input=mind is unknown"),
+        ({"input": "recording"}, "belong together"),
+        ({"scale": 0.0}, "--teleop.scale must be above 0"),
+        ({"speed": 1.5}, "--teleop.speed"),
+    ],
+)
+def test_wrong_settings_are_one_line(settings: dict, words: str) -> None:
+    with pytest.raises(Exception, match=words):
+        VtRefineEeConfig(**settings)
+
+
+def test_a_recording_that_lacks_something_is_named(tmp_path: Path) -> None:
+    np.savez(tmp_path / "x.npz", left_position=np.zeros((3, 3)))
+    with pytest.raises(ValueError, match=r"x.npz needs left_quaternion of shape \(T, 4\)"):
+        VtRefineEe(VtRefineEeConfig(input="recording", path=tmp_path / "x.npz"))
+    assert still().clutch is False

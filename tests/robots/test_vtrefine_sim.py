@@ -1,0 +1,245 @@
+"""The simulation as a robot of LeRobot's stock commands."""
+
+import json
+from collections.abc import Generator
+from pathlib import Path
+
+import numpy as np
+import pytest
+from commands import dataset_flags, flags, leader_flags, run_command, train
+from lerobot.datasets.lerobot_dataset import LeRobotDataset
+from rig import Rig
+
+from lerobot_vtrefine.cli.record_demos import RecordDemosConfig, record
+from lerobot_vtrefine.datasets.features import ACTION_KEY, DEPTH_KEY, STATE_KEY
+from lerobot_vtrefine.envs import VtRefineEnvConfig
+from lerobot_vtrefine.lerobot_compat import phases
+from lerobot_vtrefine.robots import VtRefineSimConfig
+from lerobot_vtrefine.robots import vtrefine_sim as module
+from lerobot_vtrefine.robots.config_vtrefine_sim import fitting_timestep
+from lerobot_vtrefine.robots.vtrefine_sim import VtRefineSim
+
+FPS = 10
+GRASPED = "{start: grasped, num_threads: 1}"
+
+
+@pytest.fixture(scope="module")
+def demos(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """One episode of the scripted expert, from seed 0."""
+    root = tmp_path_factory.mktemp("demos") / "demos"
+    record(RecordDemosConfig(root, num_episodes=1, env=VtRefineEnvConfig(start="grasped", num_threads=1)))
+    return root
+
+
+@pytest.fixture(autouse=True)
+def restored() -> Generator[None]:
+    yield
+    phases.uninstall()
+
+
+def robot_flags(**more: object) -> list[str]:
+    return flags(robot__type="vtrefine_sim", robot__env=GRASPED, robot__fps=FPS, **more)
+
+
+def table_flags(**env: object) -> list[str]:
+    told = ", ".join(f"{key}: {value}" for key, value in {"num_threads": 1, **env}.items())
+    camera = "{width: 80, height: 60, fov_y_rad: 0.384, position_m: [-0.44, 0, 0.42], target_m: [0, 0, 0.09]}"
+    return flags(
+        robot__type="vtrefine_sim", robot__env=f"{{scene: {{camera: {camera}}}, {told}}}", robot__fps=FPS
+    )
+
+
+def pictures(dataset: LeRobotDataset, index: int) -> np.ndarray:
+    return np.asarray(dataset[index][DEPTH_KEY])
+
+
+def states(root: Path) -> np.ndarray:
+    return np.array(LeRobotDataset("local/x", root=root).hf_dataset.with_format("numpy")[STATE_KEY])
+
+
+def noted(root: Path) -> list[dict]:
+    return json.loads((root / "meta" / "recording.json").read_text())["episodes"]
+
+
+def merge(patch: pytest.MonkeyPatch, roots: list[Path], target: Path) -> LeRobotDataset:
+    command = flags(
+        operation__type="merge",
+        operation__repo_ids=f"[{', '.join(f'local/{root.name}' for root in roots)}]",
+        operation__roots=f"[{', '.join(map(str, roots))}]",
+        new_repo_id="local/merged",
+        new_root=target,
+    )
+    run_command(patch, "edit_dataset", command)
+    return LeRobotDataset("local/merged", root=target)
+
+
+def test_stock_record_with_leaders_merges_with_expert_demonstrations_both_ways(
+    rig: Rig, demos: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    root = tmp_path / "driven"
+    command = [*table_flags(episode_steps=8), *leader_flags(rig), *dataset_flags(root, 2, 3.0, FPS)]
+    told: list[str] = []
+    monkeypatch.setattr(module.logger, "info", lambda text, *values: told.append(text % values))
+    run_command(monkeypatch, "record", command)
+    assert all(row["failure"] not in ("none", "stopped") for row in noted(root))  # arms sweep the parts away
+    assert [row["seed"] for row in noted(root)] == [0, 1]
+    dataset = LeRobotDataset("local/driven", root=root)
+    lengths = list(dataset.meta.episodes["length"])
+    assert lengths == [row["steps"] for row in noted(root)]  # the loop ended where the episode did
+    assert max(lengths) <= 8 < 3.0 * FPS
+    assert (pictures(dataset, 0) != pictures(dataset, lengths[0])).sum() > 20  # the parts stand elsewhere
+    assert sum("behind real time" in line for line in told) == 2
+
+    for order in ([demos, root], [root, demos]):
+        merged = merge(monkeypatch, order, tmp_path / f"merged_{order[0].name}")
+        assert merged.meta.total_episodes == 3
+        assert merged.meta.robot_type == "aloha_tactile_follower"
+
+
+def test_stock_replay_repeats_an_experts_episode_exactly(
+    demos: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    seen: list[list[float]] = []
+    rows: list[dict] = []
+    look, leave = VtRefineSim.get_observation, VtRefineSim.disconnect
+
+    def noting(robot: VtRefineSim) -> dict:
+        values = look(robot)
+        seen.append([values[key] for key in robot.action_features])
+        return values
+
+    def leaving(robot: VtRefineSim) -> None:
+        rows.append(robot.world.row())
+        leave(robot)
+
+    monkeypatch.setattr(VtRefineSim, "get_observation", noting)
+    monkeypatch.setattr(VtRefineSim, "disconnect", leaving)
+    replayed = flags(dataset__repo_id="local/demos", dataset__root=demos, dataset__episode=0)
+    run_command(monkeypatch, "replay", [*robot_flags(robot__seed=0), *replayed, "--play_sounds=false"])
+    np.testing.assert_array_equal(np.array(seen, np.float32), states(demos))
+    assert rows[0]["success"]
+
+
+def test_teleoperation_starts_the_next_episode_by_itself(rig: Rig, monkeypatch: pytest.MonkeyPatch) -> None:
+    seeds: list[int] = []
+    start = VtRefineSim._start
+
+    def noting(robot: VtRefineSim, seed: int) -> None:
+        seeds.append(seed)
+        start(robot, seed)
+
+    monkeypatch.setattr(VtRefineSim, "_start", noting)
+    for side in ("left", "right"):
+        rig.motor("leader", side, 9).shaft = 2500.0
+    command = [*robot_flags(robot__seed=7, robot__pause_s=0.1), *leader_flags(rig)]
+    run_command(monkeypatch, "teleoperate", [*command, "--teleop_time_s=3", f"--fps={FPS}"])
+    assert seeds[:2] == [7, 8]
+
+
+def test_another_rate_is_refused_in_one_line(
+    rig: Rig, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    command = [*robot_flags(), *leader_flags(rig), *dataset_flags(tmp_path / "d", 1, 1.0, 15)]
+    with pytest.raises(ValueError, match=r"--robot.fps=15"):
+        run_command(monkeypatch, "record", command)
+
+
+def connected(**settings: object) -> VtRefineSim:
+    robot = VtRefineSim(VtRefineSimConfig(env={"start": "grasped", "num_threads": 1}, **settings))
+    robot.connect()
+    return robot
+
+
+class Dataset:
+    """What a phase asks of a dataset."""
+
+    def __init__(self, root: Path) -> None:
+        self.root, self.num_episodes = root, 0
+
+
+def test_a_rerecorded_episode_starts_from_the_same_seed_and_is_not_noted(tmp_path: Path) -> None:
+    robot, dataset = connected(seed=5), Dataset(tmp_path)
+    (tmp_path / "meta").mkdir()
+    home = dict(zip(robot.action_features, robot.world.sim.command_targets()[0], strict=True))
+    events = {"exit_early": False, "rerecord_episode": False}
+
+    def episode() -> int:
+        with robot.phase(events, FPS, dataset):
+            robot.get_observation()
+            robot.send_action(home)
+            return robot.world.seed
+
+    assert episode() == 5
+    assert episode() == 5  # discarded: the dataset did not grow
+    dataset.num_episodes = 1
+    with robot.phase(events, FPS, None):
+        assert robot.world.seed == 6
+    assert episode() == 6
+    robot.disconnect()  # not saved either
+    assert [(row["episode_index"], row["seed"], row["failure"]) for row in noted(tmp_path)] == [
+        (0, 5, "stopped")
+    ]
+
+
+def test_no_action_that_is_no_number_reaches_the_arms() -> None:
+    robot = connected()
+    action = dict.fromkeys(robot.action_features, 0.0)
+    for bad in (float("nan"), float("inf")):
+        with pytest.raises(ValueError, match="nothing was sent"):
+            robot.send_action(action | {next(iter(action)): bad})
+    assert robot.world.steps == 0
+
+
+@pytest.mark.parametrize("fps", [10, 15, 20, 30])
+def test_the_physics_step_divides_every_control_step(fps: int) -> None:
+    step_s = fitting_timestep(0.0025, fps)
+    assert step_s <= 0.0025
+    assert 1 / fps / step_s == pytest.approx(round(1 / fps / step_s))
+    env = VtRefineSimConfig(fps=fps, episode_s=20).simulation()
+    assert env.scene_config.timestep_s == step_s
+    assert env.max_episode_steps == 20 * fps
+
+
+def test_wrong_settings_are_one_line(tmp_path: Path) -> None:
+    (tmp_path / "none.yaml").write_text("policy: {}\n")
+    for settings, words in (
+        ({"env": {"pair": "sqare"}}, "sqare"),
+        ({"env_file": tmp_path / "none.yaml"}, "has no part `env:`"),
+        ({"env": {"unheard": 1}}, "unheard"),
+        ({"view": "window"}, "--robot.view=window"),
+    ):
+        with pytest.raises(Exception, match=words):
+            VtRefineSim(VtRefineSimConfig(**settings)).connect()
+
+
+@pytest.mark.slow
+def test_record_train_and_roll_out_in_simulation(
+    rig: Rig, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("HF_HUB_OFFLINE", "1")
+    root = tmp_path / "driven"
+    run_command(
+        monkeypatch, "record", [*robot_flags(), *leader_flags(rig), *dataset_flags(root, 1, 2.0, FPS)]
+    )
+    policy = train(monkeypatch, root, tmp_path / "out", steps=2)
+    common = [*robot_flags(), *flags(policy__path=policy, fps=FPS, device="cpu", play_sounds="false")]
+    run_command(monkeypatch, "rollout", [*common, "--strategy.type=base", "--duration=3"])
+    target = tmp_path / "rolled" / "rollout_x"
+    recorded = [
+        line
+        for line in dataset_flags(target, 2, 1.0, FPS)
+        if "play_sounds" not in line and "num_ep" not in line and "repo_id" not in line
+    ]
+    run_command(
+        monkeypatch,
+        "rollout",
+        [
+            *common,
+            "--strategy.type=episodic",
+            *recorded,
+            "--dataset.num_episodes=2",
+            "--dataset.repo_id=local/rollout_x",
+        ],
+    )
+    assert [row["seed"] for row in noted(target)] == [0, 1]
+    assert LeRobotDataset("local/x", root=target).features[ACTION_KEY]["shape"] == (16,)

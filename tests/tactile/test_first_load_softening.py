@@ -1,0 +1,68 @@
+"""First-load softening and element-by-element scanning, against closed forms."""
+
+import numpy as np
+import pytest
+import torch
+
+from lerobot_vtrefine.tactile.layout import PadLayout
+from lerobot_vtrefine.tactile.stages.base import Frame
+from lerobot_vtrefine.tactile.stages.host import ScanSkew
+from lerobot_vtrefine.tactile.stages.softening import FirstLoadSoftening
+
+FRAME = Frame(PadLayout(1, 1, 0.002), stiffness_n_per_m=1000.0)
+
+
+def course(values: list[float]) -> torch.Tensor:
+    return torch.tensor(values, dtype=torch.float64).view(-1, 1, 1)
+
+
+def softened(stage: FirstLoadSoftening, values: list[float], step_s: float = 0.1) -> np.ndarray:
+    times = step_s * torch.arange(len(values), dtype=torch.float64)
+    return stage.sequence(course(values), times, FRAME).numpy().ravel()
+
+
+def test_first_load_is_virgin_and_reloading_is_softer_until_the_largest_load() -> None:
+    found = softened(FirstLoadSoftening(0.4), [0.0, 0.5, 1.0, 0.5, 0.0, 0.5, 1.0, 1.2])
+    below = 0.5 * (1 - 0.4 * 0.5)
+    assert np.allclose(found, [0.0, 0.5, 1.0, below, 0.0, below, 1.0, 1.2])
+
+
+def test_sharpness_and_growth() -> None:
+    assert softened(FirstLoadSoftening(0.4, sharpness=2.0), [1.0, 0.5])[1] == pytest.approx(
+        0.5 * (1 - 0.4 * 0.25)
+    )
+    # The load of a press of 1 mm is 1 N here: half of it softens half as much.
+    stage = FirstLoadSoftening(0.4, growth=1.0)
+    assert softened(stage, [0.5, 0.25])[1] == pytest.approx(0.25 * (1 - 0.4 * 0.5 * 0.5))
+
+
+def test_what_was_softened_recovers() -> None:
+    values = [1.0, *[0.0] * 30, 0.5]
+    late = softened(FirstLoadSoftening(0.4, recovery_s=1.0), values)
+    largest = max(0.5, np.exp(-3.1))
+    assert late[-1] == pytest.approx(0.5 * (1 - 0.4 * (1 - 0.5 / largest)))
+    assert late[-1] > softened(FirstLoadSoftening(0.4), values)[-1]
+
+
+@pytest.mark.parametrize("recovery_s", [0.0, 0.7])
+def test_a_recording_is_what_single_frames_give(recovery_s: float) -> None:
+    stage = FirstLoadSoftening(0.3, 0.6, 0.5, recovery_s)
+    rng = np.random.default_rng(0)
+    x, times = (
+        torch.from_numpy(rng.uniform(0, 2, (40, 3, 4))),
+        torch.from_numpy(np.cumsum(rng.uniform(0.02, 0.2, 40))),
+    )
+    state, previous = {"largest": torch.zeros(3, 4, dtype=torch.float64)}, times[0]
+    for value, time, whole in zip(x, times, stage.sequence(x, times, FRAME), strict=True):
+        frame = Frame(FRAME.layout, float(time - previous), stiffness_n_per_m=1000.0)
+        one, state = stage.step(value, state, frame)
+        previous = time
+        assert torch.allclose(one, whole)
+
+
+def test_a_board_may_scan_along_the_columns_too() -> None:
+    times = torch.linspace(0, 1, 101, dtype=torch.float64)
+    ramp = times.view(-1, 1, 1).expand(-1, 3, 5)
+    late = ScanSkew(0.02, cols_s=0.04).sequence(ramp, times, Frame(PadLayout(3, 5, 0.002)))
+    rows, cols = torch.meshgrid(torch.arange(3) / 2, torch.arange(5) / 4, indexing="ij")
+    assert torch.allclose(ramp[50] - late[50], (0.02 * rows + 0.04 * cols).to(late))
