@@ -14,12 +14,12 @@ from fake_diagnosis import pad_diagnosis, robot_diagnosis
 from pad_sets import make_robot_set, make_set, write_set
 from PIL import Image
 
+from lerobot_vtrefine.cli.report.press_film import MOST_FRAMES, press_film
 from lerobot_vtrefine.diagnose.core.diagnosis import Diagnosis
 from lerobot_vtrefine.diagnose.recordings import read_recording_set
 from lerobot_vtrefine.diagnose.report import render_report
 from lerobot_vtrefine.diagnose.report.axes import ticks
 from lerobot_vtrefine.diagnose.report.effects import effect_drawing
-from lerobot_vtrefine.diagnose.report.film import MOST_FRAMES, press_film
 from lerobot_vtrefine.diagnose.report.numbers import digits, interval, percent, quantity
 from lerobot_vtrefine.diagnose.report.words import MEANINGS, ties
 from lerobot_vtrefine.diagnose.verdict import CAUSES, DataIssue, Unknown, Verdict
@@ -101,8 +101,7 @@ def test_named_causes_are_drawn_and_the_page_says_what_to_do(pad_set):
 
 def test_a_press_in_motion_is_shown_beside_its_simulations(pad_set, robot_set):
     model = SensorModel((KelvinVoigt(), Gain(100.0)))
-    diagnosis = pad_diagnosis()
-    diagnosis.baseline_model = diagnosis.extended_model = model
+    diagnosis = replace(pad_diagnosis(), baseline_model=model, extended_model=model)
     film = press_film(diagnosis, pad_set)
     with Image.open(io.BytesIO(base64.b64decode(film["source"].partition(",")[2]))) as gif:
         assert gif.size == (3 * pad_set.cols + 2 * GAP_TAXELS, pad_set.rows)
@@ -157,7 +156,7 @@ def test_unknown_cause_demotes_names_to_symptoms(pad_set):
     assert "vary one thing at a time" in text
     assert "a symptom: the name may be borrowed" in text
     assert "Added to the model, they take 66 % of the squared error away all the same." in text[:400]
-    unknown.heldout = replace(unknown.heldout, gain=0.1, gain_ci95=(-0.1, 0.3))
+    unknown = replace(unknown, heldout=replace(unknown.heldout, gain=0.1, gain_ci95=(-0.1, 0.3)))
     assert "all the same" not in text_of(page(unknown, pad_set))
 
 
@@ -187,8 +186,8 @@ def test_everything_found_and_not_found_is_there(pad_set):
         "baseline drift baseline_drift – – – cannot be told here",
         "hysteresis width_m 0.21 mm 0.18 to 0.24 mm",
         "baseline k_n 380 N/m 371 to 390 N/m",
-        "latency delay: 6 ms",
-        "contact offset offset: 30 µm",
+        "latency delay 6 ms",
+        "contact offset offset 30 µm",
         "the worst predicted",
         "2 more held-out recordings",
         "Set aside: 1 of 8 recordings",

@@ -18,7 +18,6 @@ from lerobot_vtrefine.diagnose.report.figures import (
     trace_figure,
     trial_figure,
 )
-from lerobot_vtrefine.diagnose.report.film import press_film
 from lerobot_vtrefine.diagnose.report.numbers import interval, nested, p_text, percent, quantity
 from lerobot_vtrefine.diagnose.report.words import (
     AXES,
@@ -48,7 +47,12 @@ DECISIONS = {
 
 
 def render_report(
-    verdict: Verdict, diagnosis: Diagnosis | None, recordings: RecordingSet, sound: int, seed: int
+    verdict: Verdict,
+    diagnosis: Diagnosis | None,
+    recordings: RecordingSet,
+    sound: int,
+    seed: int,
+    film: dict[str, str] | None = None,
 ) -> str:
     """The page as HTML text.
 
@@ -56,6 +60,7 @@ def render_report(
         diagnosis: None when the data allowed none (``invalid_data``).
         recordings: as they were read, before quality control.
         sound: number of trials that passed it.
+        film: a press in motion: its source, caption and colour scale.
     """
     unit = diagnosis.unit if diagnosis is not None else "counts"
     of_pad = recordings.kind == "pad"
@@ -79,7 +84,7 @@ def render_report(
         ],
         drawings={cause.name: effect_drawing(cause.name) for cause in verdict.causes},
         use=_use(verdict, recordings),
-        film=None if diagnosis is None else press_film(diagnosis, recordings),
+        film=film,
         not_tested=[{"title": title(name), "needs": what} for name, what in verdict.not_tested.items()],
         **(_nothing() if diagnosis is None else _findings(verdict, diagnosis, unit, of_pad)),
     )

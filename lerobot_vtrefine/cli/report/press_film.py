@@ -1,7 +1,6 @@
 """One held-out press in motion: measured, simulated and extended, side by side."""
 
 from pathlib import PurePath
-from typing import Any
 
 import numpy as np
 
@@ -19,7 +18,7 @@ IDLE_FRAMES = 3
 """First frames of a trial, in which nothing touches the pad."""
 
 
-def press_film(diagnosis: Diagnosis, recordings: RecordingSet) -> dict[str, Any] | None:
+def press_film(diagnosis: Diagnosis, recordings: RecordingSet) -> dict[str, str] | None:
     """The film of the typical held-out trial, its caption and scale; None where there is nothing to show."""
     models = (diagnosis.baseline_model, diagnosis.extended_model)
     shown = typical_trial(diagnosis, recordings)
