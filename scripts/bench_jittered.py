@@ -17,9 +17,9 @@ sys.path.insert(0, str(Path(__file__).parents[1] / "tests" / "diagnose"))
 jittered_rig = importlib.import_module("jittered_rig")
 
 
-def run(name: str, gain: float, seed: int) -> dict:
+def run(name: str, gain: float, seed: int, rows: int, cols: int) -> dict:
     """One set's row."""
-    rig = jittered_rig.Rig(seed)
+    rig = jittered_rig.Rig(seed, rows, cols)
     effect = jittered_rig.EFFECTS.get(name)
     effects = [(effect, rig.strength_for(effect, gain))] if effect else []
     recordings, issues = check_quality(rig.record(effects))
@@ -50,13 +50,15 @@ def main() -> None:
     parser.add_argument("--effects", default="clean")
     parser.add_argument("--gains", default="0.3")
     parser.add_argument("--seeds", default="0:2")
+    parser.add_argument("--pad", default="12x32", help="rows and columns (default %(default)s)")
     parser.add_argument("--output", type=Path)
     options = parser.parse_args()
     first, last = (int(part) for part in options.seeds.split(":"))
+    rows, cols = (int(part) for part in options.pad.split("x"))
     for name in options.effects.split(","):
         for gain in (float(part) for part in options.gains.split(",")):
             for seed in range(first, last):
-                row = run(name, gain, seed)
+                row = run(name, gain, seed, rows, cols)
                 line = json.dumps(row, default=lambda value: value.tolist())
                 if options.output:
                     with options.output.open("a") as file:

@@ -128,6 +128,7 @@ FINGERS = SlidingFingers(
     armature=0.243,
     force_limit_n=80.0,
     palm=(box((0.028, 0.055, 0.028), (0.0387, 0.0, 0.0), name="palm"),),
+    flattest_rad=0.1,
     slide_offset_m=0.0687,
     pad_offset_m=0.10,
     slide_m=0.042,

@@ -16,17 +16,19 @@ Conventions, shared by every embodiment:
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
-from typing import Literal
+from typing import TYPE_CHECKING, Literal
 
 import numpy as np
-import torch
-from torch import Tensor
 
-from lerobot_vtrefine.embodiments import kinematics
 from lerobot_vtrefine.embodiments.camera_config import CameraConfig
 from lerobot_vtrefine.embodiments.fingers import Fingers
 from lerobot_vtrefine.embodiments.shapes import Shape, Vector
 from lerobot_vtrefine.tactile.layout import PadLayout
+
+if TYPE_CHECKING:  # torch takes a second to import, and most of who asks for a name or a size needs none
+    from torch import Tensor
+
+    from lerobot_vtrefine.embodiments import kinematics
 
 PARTS = ("socket", "plug")
 ROLL, PITCH, YAW = 0, 1, 2
@@ -208,15 +210,19 @@ class Embodiment:
     def tcp_offset_m(self) -> float:
         """TCP's distance from the last revolute joint with closed gripper, along the hand's x."""
         closed = self.fingers.joints(np.asarray(0.0))
+        import torch
+
         return float(self.fingers.reach_m(torch.as_tensor(closed)))
 
-    def hands(self, q: Tensor) -> kinematics.Hands:
+    def hands(self, q: "Tensor") -> "kinematics.Hands":
         """All arms at joint positions q (..., J) [rad, m], for whoever asks for more than one of what
         follows.
         """
+        from lerobot_vtrefine.embodiments import kinematics
+
         return kinematics.hands(self, q)
 
-    def tcp_poses(self, q: Tensor) -> tuple[Tensor, Tensor]:
+    def tcp_poses(self, q: "Tensor") -> "tuple[Tensor, Tensor]":
         """Poses midway between each hand's pads.
 
         Args:
@@ -227,7 +233,7 @@ class Embodiment:
         """
         return self.hands(q).tcp()
 
-    def pad_poses(self, q: Tensor) -> tuple[Tensor, Tensor]:
+    def pad_poses(self, q: "Tensor") -> "tuple[Tensor, Tensor]":
         """Poses of the pads' faces, in the order of `pad_names`.
 
         Args:
@@ -238,7 +244,7 @@ class Embodiment:
         """
         return self.hands(q).pads()
 
-    def pad_twists(self, q: Tensor, qd: Tensor) -> Tensor:
+    def pad_twists(self, q: "Tensor", qd: "Tensor") -> "Tensor":
         """Velocities of the pads' frames.
 
         Args:
@@ -251,7 +257,7 @@ class Embodiment:
         """
         return self.hands(q).pad_twists(qd)
 
-    def tcp_jacobian(self, q: Tensor) -> Tensor:
+    def tcp_jacobian(self, q: "Tensor") -> "Tensor":
         """Geometric Jacobian of each TCP with respect to its own arm's revolute joints.
 
         Args:
@@ -260,9 +266,13 @@ class Embodiment:
         Returns:
             (..., A, 6, joints): linear rows first [m/rad], then angular, in the world frame.
         """
+        from lerobot_vtrefine.embodiments import kinematics
+
         return kinematics.tcp_jacobian(self, q)
 
-    def solve_tcp(self, position: Tensor, rotation: Tensor, initial: Tensor, iterations: int = 30) -> Tensor:
+    def solve_tcp(
+        self, position: "Tensor", rotation: "Tensor", initial: "Tensor", iterations: int = 30
+    ) -> "Tensor":
         """Inverse kinematics of all hands by damped least squares; grippers keep their values.
 
         Args:
@@ -275,9 +285,13 @@ class Embodiment:
             Joint positions (..., J) within the limits. A pose out of reach gives the closest that the steps
             found; check with `tcp_poses`.
         """
+        from lerobot_vtrefine.embodiments import kinematics
+
         return kinematics.solve_tcp(self, position, rotation, initial, iterations)
 
-    def limits(self, like: Tensor) -> tuple[Tensor, Tensor]:
+    def limits(self, like: "Tensor") -> "tuple[Tensor, Tensor]":
         """Lower and upper joint limits (J,) as tensors of the device and type of `like`."""
+        import torch
+
         lower = torch.as_tensor(self.lower, dtype=like.dtype, device=like.device)
         return lower, torch.as_tensor(self.upper, dtype=like.dtype, device=like.device)

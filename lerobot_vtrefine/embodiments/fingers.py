@@ -9,14 +9,15 @@ hand frame: x towards the fingertips, y from the right finger to the left one.
 
 from abc import ABC, abstractmethod
 from dataclasses import dataclass, field
-from typing import Any, NamedTuple, override
+from typing import TYPE_CHECKING, Any, NamedTuple, override
 
 import numpy as np
-import torch
-from torch import Tensor
 
 from lerobot_vtrefine.embodiments.shapes import Shape
 from lerobot_vtrefine.tactile.layout import PadLayout
+
+if TYPE_CHECKING:  # torch takes a second to import, and most of who asks for a name or a size needs none
+    from torch import Tensor
 
 Array = np.ndarray[Any, np.dtype[Any]]
 
@@ -42,17 +43,17 @@ class Pad:
 class Faces(NamedTuple):
     """Pads' faces in the plane of the fingers, and how they move with the joint that drives each."""
 
-    x: Tensor | None
+    x: "Tensor | None"
     """(..., A, S) centre's distance ahead of the TCP [m]; None is 0."""
-    y: Tensor
+    y: "Tensor"
     """(..., A, S) [m]"""
-    turn: Tensor | None
+    turn: "Tensor | None"
     """(..., A, S) by how much the finger's direction is turned about the hand's z [rad]; None is 0."""
-    x_rate: Tensor | None
+    x_rate: "Tensor | None"
     """(..., A, S) [m per unit of the joint]; None is 0."""
-    y_rate: Tensor | None
+    y_rate: "Tensor | None"
     """Likewise; None is 1."""
-    turn_rate: Tensor | None
+    turn_rate: "Tensor | None"
     """[rad per unit of the joint]; None is 0."""
 
 
@@ -71,6 +72,8 @@ class Fingers(ABC):
     """Largest servo force [N] or torque [Nm], summed over the fingers."""
     palm: tuple[Shape, ...]
     """What the fingers are mounted on, in the hand frame."""
+    flattest_rad: float
+    """A hand that points down by less would touch the table with its palm before its fingertips get there."""
     sides: tuple[str, ...] = SIDES
     """Fingers that the hand has; those of `SIDES`, in their order."""
 
@@ -139,13 +142,13 @@ class Fingers(ABC):
         """Speed of the command at which no pad moves sideways faster than `opening_rate_m_s`."""
 
     @abstractmethod
-    def reach_m(self, joints: Tensor) -> float | Tensor:
+    def reach_m(self, joints: "Tensor") -> "float | Tensor":
         """Distance of the TCP ahead of the hand frame's origin, for joints (..., A, F): one number, or
         (..., A).
         """
 
     @abstractmethod
-    def faces(self, joints: Tensor) -> Faces:
+    def faces(self, joints: "Tensor") -> Faces:
         """Where the pads' faces are at joints (..., A, F)."""
 
 
@@ -230,11 +233,11 @@ class SlidingFingers(Fingers):
         return opening_rate_m_s
 
     @override
-    def reach_m(self, joints: Tensor) -> float | Tensor:
+    def reach_m(self, joints: "Tensor") -> "float | Tensor":
         return self.slide_offset_m + self.pad_offset_m
 
     @override
-    def faces(self, joints: Tensor) -> Faces:
+    def faces(self, joints: "Tensor") -> Faces:
         inward = joints.new_tensor([-sign for sign in self.signs])
         return Faces(None, joints + self.face_m * inward, None, None, None, None)
 
@@ -340,6 +343,8 @@ class FourBarFingers(Fingers):
 
     @override
     def opening(self, joints: Array) -> Array:
+        import torch
+
         return self._face(torch.as_tensor(np.asarray(joints, float)))[1][..., 0].numpy()
 
     @override
@@ -360,18 +365,18 @@ class FourBarFingers(Fingers):
         return opening_rate_m_s / float(np.hypot(*self.knuckle_m))
 
     @override
-    def reach_m(self, joints: Tensor) -> float | Tensor:
+    def reach_m(self, joints: "Tensor") -> "float | Tensor":
         return self._face(joints)[0][..., 0]
 
     @override
-    def faces(self, joints: Tensor) -> Faces:
+    def faces(self, joints: "Tensor") -> Faces:
         signs = joints.new_tensor([SIGNS[side] for side in self.sides])
         _, y, turn, x_rate, y_rate, turn_rate = self._face(joints)  # (..., A, 1) each
         return Faces(
             None, signs * y, -signs * turn, x_rate.expand_as(signs * y), signs * y_rate, -signs * turn_rate
         )
 
-    def _face(self, angle: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor, Tensor]:
+    def _face(self, angle: "Tensor") -> "tuple[Tensor, ...]":
         """Face's x and distance from the middle, its turn towards the middle, and their rates; all like
         `angle`.
         """
@@ -385,8 +390,10 @@ class FourBarFingers(Fingers):
         return x, y, turn, out + turn_rate * pad_out, -ahead - turn_rate * pad_ahead, turn_rate
 
 
-def _swung(vector: tuple[float, float], angle: Tensor) -> tuple[Tensor, Tensor]:
+def _swung(vector: tuple[float, float], angle: "Tensor") -> "tuple[Tensor, Tensor]":
     """(out, ahead) turned towards the middle by an angle."""
     out, ahead = vector
+    import torch
+
     cos, sin = torch.cos(angle), torch.sin(angle)
     return out * cos - ahead * sin, out * sin + ahead * cos

@@ -90,6 +90,7 @@ FINGERS = FourBarFingers(
     armature=0.005,
     force_limit_n=25.0,
     palm=(box((0.045, 0.0375, 0.0375), (FLANGE_M + 0.045, 0.0, 0.0), name="palm"),),
+    flattest_rad=0.2,
     driver_axis_m=(0.030601, GRIPPER_M + 0.054905),
     inner_axis_m=(0.0127, GRIPPER_M + 0.06142),
     knuckle_m=(0.0646367, 0.0763027),

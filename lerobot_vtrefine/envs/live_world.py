@@ -30,6 +30,7 @@ class LiveWorld:
         """success, time_out or a failure; empty while the episode runs. The first outcome stays."""
         self.raw: Raw = {}
         """The raw frame last observed; looking at it draws no sensor noise."""
+        self._moved = False
         self._row: dict[str, Any] = {}
 
     @property
@@ -47,9 +48,11 @@ class LiveWorld:
         self.seed, self.outcome = seed, RUNNING
         self._episodes.reset(IDS, np.array([seed]))
         self.raw = {key: value[0].copy() for key, value in self._episodes.raw.items()}
+        self._moved = False
 
     def step(self, targets: Array) -> None:
         """One control step with absolute joint targets (J,) in rad and m."""
+        self._moved = True
         result = self.sim.step(np.asarray(targets, np.float64)[None], IDS, images=IDS)
         if self.outcome != RUNNING:
             return
@@ -64,8 +67,13 @@ class LiveWorld:
             self._row = self._measure(self.outcome)
 
     def observe(self) -> Raw:
-        """The raw frame of this moment, as ``datasets.features`` describes it; no leading dimensions."""
-        self.raw = {key: value[0].copy() for key, value in self._episodes.read(IDS).items()}
+        """The raw frame of this moment, as ``datasets.features`` describes it; no leading dimensions.
+
+        Sensors are read once per step, however often they are asked: their noise is part of the episode.
+        """
+        if self._moved:
+            self.raw = {key: value[0].copy() for key, value in self._episodes.read(IDS).items()}
+            self._moved = False
         return self.raw
 
     def row(self) -> dict[str, Any]:

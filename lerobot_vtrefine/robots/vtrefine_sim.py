@@ -163,7 +163,8 @@ class VtRefineSim(Robot):
             ValueError: a target is not a number; nothing is sent.
         """
         began = time.perf_counter()
-        wanted = np.array([float(action[key]) for key in self.action_features])
+        # As datasets keep them: an episode that is replayed is then the same.
+        wanted = np.array([float(action[key]) for key in self.action_features], np.float32)
         if not np.isfinite(wanted).all():
             wrong = [key for key in self.action_features if not np.isfinite(float(action[key]))]
             raise ValueError(f"the action's {', '.join(wrong)} must be finite: nothing was sent to the arms")

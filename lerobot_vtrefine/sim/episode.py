@@ -69,13 +69,13 @@ class EpisodeState:
     """Control step at which success was reached, -1 before."""
 
     @classmethod
-    def empty(cls, num_envs: int, num_servos: int, num_pads: int, window: int) -> "EpisodeState":
-        """All zeros for `num_envs` worlds and a force window of `window` samples."""
-        n, pads = num_envs, num_pads
+    def empty(cls, scene: Scene, num_envs: int, window: int) -> "EpisodeState":
+        """All zeros for `num_envs` worlds of a scene and a force window of `window` samples."""
+        n, pads = num_envs, len(scene.embodiment.pad_names)
         shapes: dict[str, tuple[tuple[int, ...], type]] = {
             "seed": ((n,), np.int64),
             "steps": ((n,), np.int64),
-            "command": ((n, num_servos), float),
+            "command": ((n, scene.model.nu), float),
             "hold_steps": ((n,), np.int64),
             "held_steps": ((n, 2), np.int64),
             "unheld_steps": ((n, 2), np.int64),

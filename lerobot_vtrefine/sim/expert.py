@@ -84,7 +84,6 @@ PRESS_M = 0.008  # a blocked plug is pushed as if it should be this much lower: 
 SLOWDOWN = 0.35  # before the seat: largest share of the way left in one control step
 BOTTOM_M = 0.0005  # a seated plug is pushed this far beyond its seat
 TABLE_GAP_M = 0.003  # between fingertips and table
-FLATTEST_RAD = 0.1  # a flatter hand would touch the table with its palm
 TURN_M_PER_RAD = 0.1  # a turn takes as long as this way
 
 
@@ -342,7 +341,7 @@ def _above_table(fingers: Fingers, pitch_rad: float, height_m: float) -> tuple[f
     Where even the flattest hand is too low, the second number says how much higher it must grip [m].
     """
     length, width, _ = fingers.pad_size_m
-    pitches = np.linspace(pitch_rad, min(pitch_rad, FLATTEST_RAD), 50)
+    pitches = np.linspace(pitch_rad, min(pitch_rad, fingers.flattest_rad), 50)
     gaps = height_m - (length * np.sin(pitches) + width * np.cos(pitches)) / 2 - TABLE_GAP_M
     chosen = int(np.argmax(gaps >= 0)) if gaps[-1] >= 0 else -1
     return float(pitches[chosen]), max(0.0, -float(gaps[chosen]))

@@ -107,17 +107,14 @@ class InsertionSim:
             self.scene, model, num_envs, self.config.control_dt_s, device, threads, shear
         )
         window = max(1, round(self.config.limits.force_window_s / self.scene.config.timestep_s))
-        num_pads = len(self.embodiment.pad_names)
-        self._episode = EpisodeState.empty(num_envs, self.scene.model.nu, num_pads, window)
-        self._rates = task.rate_limits(self.scene.embodiment, self.config)
+        self._episode = EpisodeState.empty(self.scene, num_envs, window)
+        self._rates = task.rate_limits(self.embodiment, self.config)
         everyone = self._randomizer.draw(np.zeros(num_envs, np.int64))
         self._parameters = dict(everyone.values)
         self._depth = DepthCamera(self.scene.model, self.scene.camera, num_envs, device, threads)
         self._present = Present(self.scene, self._backend, self._depth)
         self._settler = Settler(self.scene, self.config, self._backend, self._touch)
-        self._drive = make_drive(
-            self._backend, self.scene.embodiment, self.substeps, self.config, robot_faults
-        )
+        self._drive = make_drive(self._backend, self.embodiment, self.substeps, self.config, robot_faults)
 
     @property
     def embodiment(self) -> Embodiment:

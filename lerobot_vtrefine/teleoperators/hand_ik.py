@@ -7,7 +7,6 @@ from functools import cached_property
 from typing import Any
 
 import mink
-import mujoco
 import numpy as np
 import torch
 from numpy.typing import NDArray
@@ -50,11 +49,14 @@ class TwoArmIk:
         self.model, self.body, self._qpos = build_arms(SceneConfig(embodiment=embodiment))
         rules = TaskConfig()
         self._dt_s, self._steps = dt_s, max(LEAST_STEPS, round(dt_s / LONGEST_STEP_S))
-        self._rate = np.array([self._joint_rate(rules, joint) for joint in self._joints]) * speed
+        rate = np.full(self.body.num_joints, self.body.fingers.command_rate(rules.finger_rate))
+        rate[self.body.arm_columns] = rules.joint_rate
+        self._rate = rate * speed
         self._configuration = mink.Configuration(self.model)
-        self._is_finger = self.model.jnt_type[self._joints] == mujoco.mjtJoint.mjJNT_SLIDE
-        self._frames = [self._hand_frame(hand) for hand in range(len(self.body.arms))]
-        names = [self.model.body(body).name for body, _, _ in self._frames]
+        self._is_finger = np.ones(self.body.num_joints, bool)
+        self._is_finger[self.body.arm_columns] = False
+        self._bodies = [self._hand_body(hand) for hand in range(len(self.body.arms))]
+        names = [self.model.body(body).name for body in self._bodies]
         self._tasks = [mink.FrameTask(name, "body", 1.0, ORIENTATION_COST, lm_damping=1e-6) for name in names]
         self._posture = mink.PostureTask(self.model, POSTURE_COST)
         limited = {self.model.joint(int(j)).name: r for j, r in zip(self._joints, self._rate, strict=True)}
@@ -91,7 +93,8 @@ class TwoArmIk:
             Joint targets (J,), no farther from the last ones than the rate limits allow, whatever is asked.
         """
         before = self.joints.copy()
-        for task, pose, (_, position, rotation) in zip(self._tasks, wanted, self._frames, strict=True):
+        for hand, (task, pose, tcp) in enumerate(zip(self._tasks, wanted, self.hands(), strict=True)):
+            position, rotation = self._in_hand(hand, tcp)
             turned = pose.rotation @ rotation.T
             target = mink.SE3.from_rotation_and_translation(
                 mink.SO3.from_matrix(turned), pose.position - turned @ position
@@ -120,33 +123,23 @@ class TwoArmIk:
 
     def _fingers(self, before: Array, grips: list[float | None]) -> Array:
         """(J,) finger positions for these grips; arm joints mean nothing."""
-        lower, upper = np.asarray(self.body.lower), np.asarray(self.body.upper)
-        wide = np.where(np.abs(upper) > np.abs(lower), upper, lower)
-        closed = np.where(np.abs(upper) > np.abs(lower), lower, upper)
-        targets, per_arm = before.copy(), len(before) // len(grips)
+        targets, openings = before.copy(), self.body.openings(before).copy()
         for hand, grip in enumerate(grips):
             if grip is not None:
-                rows = slice(hand * per_arm, (hand + 1) * per_arm)
-                targets[rows] = wide[rows] + grip * (closed[rows] - wide[rows])
+                openings[hand] = (1.0 - grip) * self.body.fingers.travel_m
+        self.body.set_openings(targets, openings)
         return targets
 
-    def _joint_rate(self, rules: TaskConfig, joint: int) -> float:
-        is_slide = self.model.jnt_type[joint] == mujoco.mjtJoint.mjJNT_SLIDE
-        return rules.finger_rate if is_slide else rules.joint_rate
+    def _hand_body(self, hand: int) -> int:
+        """The body that carries a hand."""
+        last = self.body.by_arm(self._joints)[hand, len(self.body.joints) - 1]
+        return int(self.model.jnt_bodyid[last])
 
-    def _hand_frame(self, hand: int) -> tuple[int, Array, Array]:
-        """Body that carries a hand, and position (3,) and rotation (3, 3) of its TCP in that body's frame."""
-        per_arm = len(self._joints) // len(self.body.arms)
-        hinges = [j for j, slide in zip(self._joints, self._is_finger, strict=True) if not slide]
-        own = set(self._joints[hand * per_arm : (hand + 1) * per_arm].tolist())
-        body = int(self.model.jnt_bodyid[[j for j in hinges if int(j) in own][-1]])
-        home = np.asarray(self.body.home, float)
-        data = mujoco.MjData(self.model)
-        data.qpos[self._qpos] = home
-        mujoco.mj_kinematics(self.model, data)
-        base, turned = data.xpos[body], data.xmat[body].reshape(3, 3)
-        tcp = self.hands(home)[hand]
-        return body, turned.T @ (tcp.position - base), turned.T @ tcp.rotation
+    def _in_hand(self, hand: int, tcp: Pose) -> tuple[Array, Array]:
+        """Position (3,) and rotation (3, 3) of a TCP in its hand's body; some reach less far opened."""
+        data, body = self._configuration.data, self._bodies[hand]
+        turned = data.xmat[body].reshape(3, 3)
+        return turned.T @ (tcp.position - data.xpos[body]), turned.T @ tcp.rotation
 
     def _collisions(self) -> mink.CollisionAvoidanceLimit:
         """The arms' solid parts against each other and against what does not move."""

@@ -71,7 +71,7 @@ def test_adequate_says_what_was_not_tested() -> None:
     assert "adequate for what was tested" in headline(verdict, "counts")
     line = power_line(verdict)
     assert "\n" not in line
-    assert "latency (delay 4 ms)" in line
+    assert "latency (delay: 4 ms)" in line
     assert "not tested: row sharing (press two at once)" in line
     assert "for what was tested" not in headline(replace(verdict, not_tested={}), "counts")
 

@@ -8,6 +8,7 @@ import pytest
 from lerobot_vtrefine.diagnose.joints.batch import make_batch
 from lerobot_vtrefine.diagnose.joints.model import JointModel, RobotModel, predict_positions
 from lerobot_vtrefine.diagnose.joints.servo import Columns, simulate
+from lerobot_vtrefine.diagnose.joints.stages import spring
 from lerobot_vtrefine.diagnose.recordings import RobotTrial
 
 
@@ -185,3 +186,35 @@ def test_bad_times_and_commands_are_refused() -> None:
     holes = trial_of(trial.time_s, np.where(trial.command > 0, np.nan, trial.command))
     with pytest.raises(ValueError, match="command"):
         make_batch([holes])
+
+
+def test_laws_of_stages_are_kept_in_the_file_and_unknown_ones_refused(tmp_path) -> None:
+    model = RobotModel((JointModel("gripper", 20.0, 1.0, laws={"flex": 2e-4, "slack": 0.3}),))
+    model.save(tmp_path / "robot.json")
+    assert RobotModel.load(tmp_path / "robot.json") == model
+    data = model.to_dict()
+    data["joints"][0]["laws"]["warp"] = 1.0
+    (tmp_path / "robot.json").write_text(json.dumps(data))
+    with pytest.raises(ValueError, match=r"robot\.json: joint 'gripper' has no law 'warp'; valid: flex"):
+        RobotModel.load(tmp_path / "robot.json")
+
+
+def test_a_finger_that_gives_way_behind_its_servo_moves_with_its_load_at_once() -> None:
+    t = np.arange(40) / 20.0
+    load = np.where(t < 1.0, 10.0, 30.0)[:, None]
+    u = np.full((40, 1), 0.02)
+    model = RobotModel((JointModel("gripper", 8.0, 1.0, laws={"flex": 2e-4}),))
+    read = predict_positions(model, trial_of(t, u, u - 10.0 * 2e-4, load))[:, 0]
+    # Loaded from the beginning, it rests; more load bends it by as much more, in the same frame.
+    np.testing.assert_allclose(read, 0.02 - 2e-4 * load[:, 0], atol=1e-12)
+
+
+def test_a_spring_takes_up_its_slack_and_tells_pulls_from_pushes() -> None:
+    load = np.array([-20.0, -10.0, 0.0, 5.0, 10.0, 20.0])[:, None, None]
+    zero = dict.fromkeys(("flex", "back", "slack", "curve"), np.zeros(1)) | {"full_load": np.array([20.0])}
+    np.testing.assert_allclose(spring(load, zero), load)
+    other = spring(load, zero | {"back": np.array([2.0])})
+    np.testing.assert_allclose(other[:, 0, 0], [-60.0, -30.0, 0.0, 5.0, 10.0, 20.0])
+    slack = spring(load, zero | {"slack": np.array([0.3])})[:, 0, 0]
+    np.testing.assert_allclose(np.diff(slack[3:]), [5.0, 10.0], rtol=1e-3)
+    assert slack[3] == pytest.approx(5.0 + 0.3 * 20.0, rel=1e-3)

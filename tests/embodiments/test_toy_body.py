@@ -71,6 +71,7 @@ TOY = Embodiment(
         armature=0.1,
         force_limit_n=40.0,
         palm=(box((0.02, 0.02, 0.02), (0.18, 0.0, 0.0), name="palm"),),
+        flattest_rad=0.1,
         sides=("left",),
         slide_offset_m=0.2,
         pad_offset_m=0.05,

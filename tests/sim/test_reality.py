@@ -214,6 +214,15 @@ def test_missing_files_unknown_joints_and_two_sensor_models_are_refused(tmp_path
         make_drive(
             Recorder(), ROBOT, SUBSTEPS, TaskConfig(), RobotFaults(backlash_rad={"left_left_finger": 0.1})
         )
+    joint = {
+        "name": "left_elbow",
+        "natural_frequency_rad_s": 20.0,
+        "damping_ratio": 1.0,
+        "laws": {"flex": 1.0},
+    }
+    (tmp_path / "robot.json").write_text(json.dumps({"schema": "vtrefine/robot-model@1", "joints": [joint]}))
+    with pytest.raises(ValueError, match=r"robot\.json: the simulated arms know no law 'flex'"):
+        load_reality(tmp_path / "robot.json")
     model = SensorModel.paper().to_dict()
     file = write(tmp_path / "reality.json", sensor_model=model)
     with pytest.raises(ParsingError, match=r"drop --env\.sensor_model"):

@@ -18,6 +18,18 @@ Progress = Callable[[str, float], None]
 
 
 @dataclass(frozen=True)
+class Refusal:
+    """What was taken back."""
+
+    cause: str
+    channel: int
+    gain: float
+    """On locked trials, beside the baseline."""
+    surely: bool
+    """Whether the gain's 95 % interval lies below zero."""
+
+
+@dataclass(frozen=True)
 class Inference[P: Problem[Any, Any], F: Fit, C: Candidate]:
     """What the method found; everything that is told follows from it."""
 
@@ -27,7 +39,7 @@ class Inference[P: Problem[Any, Any], F: Fit, C: Candidate]:
     test: P
     """The locked trials; those of the search where none could be locked."""
     locked: bool
-    refused: "tuple[Refusal, ...]"
+    refused: tuple[Refusal, ...]
     seed: int
 
 
@@ -46,7 +58,7 @@ def infer[P: Problem[Any, Any]](
     locked = np.array(lock(whole.conditions, seed) if locking else [], dtype=int)
     problem = whole.subset(np.setdiff1d(np.arange(count), locked))
     selection = Search(problem, seed, _steps(tell)).run()
-    selection = problem.reviewed(selection, seed)
+    selection = selection.problem.reviewed(selection, seed)
     whole = whole.revised(selection.fit, [item for items in selection.chosen.values() for item in items])
     tell(f"{whole.subject}: looking for what is left", 0.6)
     alarms = raise_alarms(selection, selection.problem.suspicions(selection, seed), seed)
@@ -92,18 +104,6 @@ def taken_back[P: Problem[Any, Any], F: Fit, C: Candidate](
     chosen = {**selection.chosen, channel: kept}
     fitted = selection.problem.reduced(selection.fit, candidates, mask)
     return replace(selection, fit=fitted, chosen={k: items for k, items in chosen.items() if items})
-
-
-@dataclass(frozen=True)
-class Refusal:
-    """What was taken back."""
-
-    cause: str
-    channel: int
-    gain: float
-    """On locked trials, beside the baseline."""
-    surely: bool
-    """Whether the gain's 95 % interval lies below zero."""
 
 
 def guarded[P: Problem[Any, Any], F: Fit, C: Candidate](

@@ -193,11 +193,11 @@ def power_line(verdict: Verdict) -> str:
 
 
 def size_text(name: str, size: float) -> str:
-    """A cause's main parameter at some size, for example "delay 4 ms"."""
+    """A cause's main parameter at some size, for example "delay: 4 ms"."""
     about = meaning(name)
     if name == "dead_taxels":
         return "one of those pressed hard enough"
-    return f"{about.parameter} {quantity(size, about.unit)}"
+    return f"{about.parameter}: {quantity(size, about.unit)}"
 
 
 def _all_the_same(verdict: Verdict) -> str:
