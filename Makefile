@@ -1,5 +1,5 @@
 .DEFAULT_GOAL := help
-.PHONY: help setup demo test test-slow check format bench bench-diagnose tables clean-demo
+.PHONY: help setup demo test test-slow check format bench bench-diagnose tables docs docs-serve release-check demo-quick clean-demo
 
 VENV := .venv/bin
 JOBS ?= 2
@@ -13,6 +13,9 @@ setup: ## create .venv with pinned packages (automatic in every other target)
 
 demo: setup ## demonstrations, imitation, DPPO, evaluation, report: outputs/demo/report.html
 	@$(VENV)/vtrefine-demo $(ARGS)
+
+demo-quick: setup ## the same with tiny numbers, in minutes, to see that everything works
+	@$(VENV)/vtrefine-demo --quick --output_dir=outputs/demo_quick $(ARGS)
 
 test: setup ## the test-suite, without slow, gpu and hardware tests
 	@OMP_NUM_THREADS=1 MKL_NUM_THREADS=1 $(VENV)/python -m pytest -q -n $(JOBS) --dist loadfile $(ARGS)
@@ -34,7 +37,16 @@ bench: setup ## speed, as ratios measured in one run
 bench-diagnose: setup ## vtrefine-diagnose on recordings with known causes: the table and its bars
 	@$(VENV)/python scripts/bench_diagnose.py $(ARGS)
 
-tables: setup ## the README's tables from results/*.json; scripts/collect_results.py --help fills these
+docs: setup ## the documentation as a site, links checked strictly: outputs/site/index.html
+	@$(VENV)/mkdocs build --quiet --strict
+
+docs-serve: setup ## the same, served while you write
+	@$(VENV)/mkdocs serve
+
+release-check: setup ## build the wheel and try it, and the README's lines, in an empty environment
+	@$(VENV)/python scripts/release_check.py $(ARGS)
+
+tables: setup ## the tables of README and docs from results/*.json; scripts/collect_results.py --help fills these
 	@$(VENV)/python scripts/make_tables.py
 
 clean-demo: ## remove the demo's outputs, so that the next one starts afresh

@@ -10,8 +10,10 @@ simulator, Warp, serial port or plotting library at all.
 import sys
 
 from lerobot_vtrefine.lerobot_compat.registration import LEROBOT, register
+from lerobot_vtrefine.named_configs import expand_command_line
 
 __all__ = ["register"]
 
-if LEROBOT in sys.modules:
+if LEROBOT in sys.modules:  # LeRobot's commands import plugins just before they parse their command line
     register()
+    expand_command_line()

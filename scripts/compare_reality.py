@@ -16,7 +16,6 @@ are whole. Results: ``comparison.json`` and ``comparison.md``.
 
 import argparse
 import json
-import os
 import shlex
 import subprocess
 import sys
@@ -71,8 +70,7 @@ def diagnosis_stages(budget: Budget, name: str) -> list[Stage]:
 def press_stage(budget: Budget, name: str) -> Stage:
     """Presses of a hidden pad."""
     folder = budget.output_dir / folder_name(name)
-    script = os.path.relpath(Path(__file__).with_name("press_reality.py"))  # what a user would type
-    press = ("python", script, f"--reality={folder / 'reality.json'}", f"--trials={budget.presses}")
+    press = ("vtrefine-press", f"--reality={folder / 'reality.json'}", f"--trials={budget.presses}")
     press, output = (*press, f"--output_dir={folder / 'presses'}"), folder / "presses"
     return Stage(f"press_{folder.name}", f"Press the pad of {name}", press, output, output / "recording.json")
 

@@ -93,6 +93,7 @@ def test_what_simulates_names_the_extra(tiny_dataset: Path, tmp_path: Path) -> N
         ["demo", out],
         ["replay", dataset, out],
         ["bench", "--plot"],
+        ["press", out],
         ["bench", "--parts=[tactile,envs]"],
     ]
     for command, (status, _, lines) in zip(commands, run_commands(SIMULATORS, commands), strict=True):

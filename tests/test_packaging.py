@@ -3,14 +3,20 @@
 import ast
 import json
 import os
+import re
+import shutil
 import subprocess
 import sys
 import tomllib
-from importlib.metadata import distribution
+import zipfile
+from importlib.metadata import EntryPoint, distribution
 from pathlib import Path
 from typing import Any
 
 import pytest
+
+from lerobot_vtrefine.cli.flags import describe_module
+from lerobot_vtrefine.cli.umbrella import module_of
 
 ROOT = Path(__file__).parents[1]
 PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"]
@@ -24,9 +30,8 @@ import lerobot_vtrefine
 print(json.dumps([name for name in json.loads(sys.argv[1]) if name in set(sys.modules) - before]))
 """
 
-# One process for both: importing PyTorch and LeRobot takes most of the time.
-DISCOVER_AND_HELP = """
-import contextlib, importlib, io, json, sys
+DISCOVER = """
+import json
 from lerobot.utils.import_utils import register_third_party_plugins
 register_third_party_plugins()
 from lerobot.cameras import CameraConfig
@@ -46,6 +51,11 @@ found = {
         for config in base.get_known_choices().values()
     ],
 }
+print(json.dumps(found))
+"""
+
+HELP = """
+import contextlib, importlib, io, json, sys
 help_texts = {}
 for name, target in json.loads(sys.argv[1]).items():
     module, function = target.split(":")
@@ -57,7 +67,8 @@ for name, target in json.loads(sys.argv[1]).items():
         except SystemExit as stop:
             status = stop.code
     help_texts[name] = [status or 0, text.getvalue()]
-print(json.dumps([found, help_texts]))
+heavy = [name for name in ("lerobot", "torch", "mujoco", "warp") if name in sys.modules]
+print(json.dumps([help_texts, heavy]))
 """
 
 
@@ -69,19 +80,13 @@ def run_python(code: str, argument: Any) -> Any:
     return json.loads(result.stdout.strip().splitlines()[-1])
 
 
-@pytest.fixture(scope="module")
-def installed() -> Any:
-    """What LeRobot's discovery finds, and (status, text) of every entry point's help."""
-    return run_python(DISCOVER_AND_HELP, PROJECT["scripts"])
-
-
 def test_import_is_light() -> None:
     """Nothing heavy is loaded beyond what LeRobot itself loads for a plugin."""
     assert run_python(LIGHT, HEAVY) == []
 
 
-def test_lerobot_discovers_every_type(installed: Any) -> None:
-    found, _ = installed
+def test_lerobot_discovers_every_type() -> None:
+    found = run_python(DISCOVER, None)
     assert "vt_dp3" in found["policies"]
     assert "vtrefine" in found["envs"]
     assert [step for step in found["steps"] if step.startswith("vt_")] != []
@@ -89,10 +94,22 @@ def test_lerobot_discovers_every_type(installed: Any) -> None:
     assert ours == {"robots", "teleoperators", "cameras"}
 
 
-def test_every_entry_point_shows_help(installed: Any) -> None:
-    _, help_texts = installed
+def test_every_entry_point_shows_help_at_once() -> None:
+    """A sentence, an example, the flags; and without importing what takes seconds."""
+    help_texts, heavy = run_python(HELP, PROJECT["scripts"])
     assert {name: status for name, (status, _) in help_texts.items() if status != 0} == {}
     assert [name for name, (_, text) in help_texts.items() if "usage:" not in text] == []
+    assert [name for name, (_, text) in help_texts.items() if not re.search("^examples?:", text, re.M)] == []
+    assert [name for name, (_, text) in help_texts.items() if f"\n  {name}" not in text] == []
+    assert heavy == []
+
+
+def test_every_command_is_described_in_one_sentence() -> None:
+    for name, target in PROJECT["scripts"].items():
+        entry = EntryPoint(name, target, "console_scripts")
+        sentence, _ = describe_module(module_of(entry))
+        assert sentence.endswith("."), name
+        assert ". " not in sentence, name
 
 
 def test_distribution_name_keeps_underscores() -> None:
@@ -108,3 +125,19 @@ def test_entry_point_exists(name: str) -> None:
     path = ROOT / Path(*module.split(".")).with_suffix(".py")
     tree = ast.parse(path.read_text(encoding="utf-8"))
     assert function in [node.name for node in tree.body if isinstance(node, ast.FunctionDef)]
+
+
+@pytest.mark.slow
+def test_the_wheel_holds_configurations_and_pages(tmp_path: Path) -> None:
+    uv = shutil.which("uv", path=str(Path(sys.executable).parent)) or shutil.which("uv")
+    if uv is None:
+        pytest.skip("uv is not installed")
+    subprocess.run(
+        [uv, "build", "--wheel", "--out-dir", str(tmp_path), str(ROOT)], check=True, capture_output=True
+    )
+    (wheel,) = tmp_path.glob("*.whl")
+    held = set(zipfile.ZipFile(wheel).namelist())
+    wanted = {f"lerobot_vtrefine/{path.relative_to(ROOT)}" for path in (ROOT / "configs").rglob("*.yaml")}
+    wanted |= {str(path.relative_to(ROOT)) for path in (ROOT / "lerobot_vtrefine").rglob("*.html")}
+    assert wanted - held == set()
+    assert not [name for name in held if name.startswith(("tests", "scripts", "results"))]

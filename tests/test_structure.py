@@ -16,6 +16,7 @@ SOURCES = sorted(PACKAGE.rglob("*.py"))
 # A package imports only from its own layer's packages above it; those on one line do not import each other.
 LAYERS = (
     ("files",),
+    ("pages",),
     ("tactile",),
     ("embodiments",),
     ("observation",),

@@ -1,4 +1,10 @@
-"""``vtrefine-bench``: speed as ratios, each measured within one run so that the machine's load cancels."""
+"""``vtrefine-bench``: measure speed, as ratios within one run so that the machine's load cancels.
+
+examples:
+  vtrefine-bench
+  vtrefine-bench --plot                        pressure images of the contact models, and their errors
+  vtrefine-bench --device=cuda                 many worlds on a GPU
+"""
 
 import importlib.util
 import json

@@ -1,7 +1,4 @@
-"""``vtrefine-calibrate``: stiffness, damping and readout of a pad from press recordings.
-
-``vtrefine-calibrate --recording=DIR --output_dir=OUT``
-"""
+"""``vtrefine-calibrate``: fit a pad's stiffness, damping and readout to recorded presses."""
 
 import argparse
 import json
@@ -29,7 +26,11 @@ Results in the output folder:
   report.html        response curves, uncertainty, presses over time, on one page that needs no network
 
 What to record: at least 4 presses (better 16), each beginning above the pad; at least three depths and three
-speeds; depth and load cell (see depth_m and force_n in docs/recording-format.md)."""
+speeds; depth and load cell (depth_m and force_n in docs/recording-format.md).
+
+examples:
+  vtrefine-calibrate --recording=presses --output_dir=calibration
+  vtrefine-calibrate --recording=presses --k_n=400 --output_dir=calibration      without a load cell"""
 
 
 def make_parser() -> OneLineParser:

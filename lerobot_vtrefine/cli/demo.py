@@ -1,4 +1,12 @@
-"""``vtrefine-demo``: demonstrations, imitation, DPPO, evaluations and a report, by the commands users run."""
+"""``vtrefine-demo``: run demonstrations, imitation, DPPO and evaluations, and write a report of them.
+
+examples:
+  vtrefine-demo --quick                        minutes: tiny numbers, to see that everything works
+  vtrefine-demo                                a quarter of an hour on two cores
+  vtrefine-demo --output_dir=outputs/square --env='{pair: square, clearance_m: 0.001, start: grasped}'
+
+Interrupted, the same command continues. --quick stands for tiny numbers; other flags still change them.
+"""
 
 import json
 import logging

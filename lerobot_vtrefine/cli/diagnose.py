@@ -1,7 +1,4 @@
-"""``vtrefine-diagnose``: what the simulation gets wrong, why, the repaired model, and the measured gain.
-
-``vtrefine-diagnose --recording=DIR --output_dir=OUT``
-"""
+"""``vtrefine-diagnose``: name what the simulation gets wrong, repair its model and measure the gain."""
 
 import argparse
 from collections.abc import Sequence
@@ -99,6 +96,7 @@ def read(options: argparse.Namespace) -> "RecordingSet":
 
 def run(recordings: "RecordingSet", folder: Path, seed: int) -> tuple["Verdict", str]:
     """Diagnose, and write all result files into ``folder``; the verdict and its unit of error."""
+    from lerobot_vtrefine.cli.report.press_film import press_film
     from lerobot_vtrefine.diagnose.api import diagnose
     from lerobot_vtrefine.diagnose.report import render_report
     from lerobot_vtrefine.diagnose.verdict import write_verdict
@@ -113,7 +111,8 @@ def run(recordings: "RecordingSet", folder: Path, seed: int) -> tuple["Verdict",
     for model, name in zip((found.baseline_model, found.extended_model), FILES[:2], strict=True):
         if model is not None:
             model.save(folder / name)
-    page = render_report(found.verdict, found, recordings, found.checked, seed)
+    film = press_film(found, recordings)
+    page = render_report(found.verdict, found, recordings, found.checked, seed, film)
     (folder / "report.html").write_text(page, encoding="utf-8")
     write_verdict(found.verdict, folder / "verdict.json")
     return found.verdict, found.unit

@@ -12,6 +12,7 @@ from yaml import YAMLError
 
 from lerobot_vtrefine.extras import explain
 from lerobot_vtrefine.files import check_settings
+from lerobot_vtrefine.named_configs import expand
 
 DEBUG_VARIABLE = "VTREFINE_DEBUG"
 USAGE_STATUS = 2
@@ -71,6 +72,7 @@ def run_cli[**P](main: Callable[P, int | None]) -> Callable[P, int]:
     @functools.wraps(main)
     def wrapper(*args: P.args, **kwargs: P.kwargs) -> int:
         try:
+            sys.argv[1:] = expand(sys.argv[1:])
             _check_config_file(sys.argv[1:])
             return main(*args, **kwargs) or 0
         except KeyboardInterrupt:

@@ -1,4 +1,4 @@
-"""`vtrefine-find-pads`: press a pad, name it; writes the YAML file that robot configurations read."""
+"""``vtrefine-find-pads``: find out which pad is on which serial port, by pressing one after the other."""
 
 import argparse
 from collections.abc import Sequence
@@ -20,6 +20,14 @@ from lerobot_vtrefine.drivers.discovery import (
 from lerobot_vtrefine.drivers.pads_file import save_pads
 from lerobot_vtrefine.drivers.ports import PortError, stable_path, stable_ports
 
+DESCRIPTION = """\
+Find out which FlexiTac pad is on which serial port: the command asks for one pad after the other, you press
+it, and the answer is written with stable USB paths."""
+EPILOG = """\
+examples:
+  vtrefine-find-pads --output=pads.yaml
+  vtrefine-pad-emulator --source=press &          without hardware
+  vtrefine-find-pads --ports outputs/pads/* --output=pads.yaml"""
 SLIDE_S = 5.0
 """How long a finger slides over a pad [s]."""
 
@@ -28,10 +36,9 @@ def parse_arguments(arguments: Sequence[str] | None) -> argparse.Namespace:
     """Command line of `vtrefine-find-pads`."""
     parser = argparse.ArgumentParser(
         prog="vtrefine-find-pads",
-        description="Find out which FlexiTac pad is on which serial port: the command asks for one pad after "
-        "the other, you press it, and the answer is written with stable USB paths.",
-        epilog="Try it without hardware: vtrefine-pad-emulator --folder /tmp/pads --source press & "
-        "vtrefine-find-pads --ports /tmp/pads/*",
+        description=DESCRIPTION,
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+        epilog=EPILOG,
     )
     parser.add_argument(
         "--output", type=Path, default=Path("pads.yaml"), help="file to write (default %(default)s)"
@@ -49,7 +56,7 @@ def parse_arguments(arguments: Sequence[str] | None) -> argparse.Namespace:
         "--timeout", type=float, default=60.0, help="seconds to wait for each press (%(default)s)"
     )
     parser.add_argument(
-        "--check-rows",
+        "--check_rows",
         action="store_true",
         help="after each press, slide a finger over the pad's rows: tells rows that arrive shifted",
     )

@@ -1,4 +1,12 @@
-"""``vtrefine-finetune``: DPPO fine-tuning of a ``vt_dp3`` checkpoint in simulation."""
+"""``vtrefine-finetune``: improve a vt_dp3 checkpoint by reinforcement learning in simulation (DPPO).
+
+example:
+  vtrefine-finetune --config_path=vtrefine:round_grasped --policy.device=cpu --dppo.type=small \\
+      --policy.path=outputs/pretrain/checkpoints/last/pretrained_model --output_dir=outputs/finetune
+
+--policy.path=FOLDER names the checkpoint to start from, --dppo.type a preset: paper, seed_literal,
+trust_region (many worlds on a GPU) or small (a laptop). --resume=true continues an interrupted run exactly.
+"""
 
 from lerobot.configs import parser
 from lerobot.utils.import_utils import register_third_party_plugins

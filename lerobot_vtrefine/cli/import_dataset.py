@@ -1,7 +1,8 @@
-"""``vtrefine-import``: datasets of others as LeRobotDatasets with this project's features.
+"""``vtrefine-import``: turn datasets of others into LeRobotDatasets with this project's features.
 
-``vtrefine-import --source=aloha_31_episodes.npz --root=outputs/aloha`` (the paper authors' npz)
-``vtrefine-import --source=FOLDER --root=outputs/pads --pads='{primary: left_arm_left_finger}'`` (LeFlexiTac)
+examples:
+  vtrefine-import --source=aloha_31_episodes.npz --root=outputs/aloha        the VT-Refine authors' file
+  vtrefine-import --source=LEFLEXITAC_DATASET --root=outputs/pads --pads='{primary: left_arm_left_finger}'
 """
 
 import logging

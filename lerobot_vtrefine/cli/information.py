@@ -1,6 +1,7 @@
-"""``vtrefine-information``: what joints, vision and touch know in a task, before a policy is trained.
+"""``vtrefine-information``: measure what joints, vision and touch know in a task, before a policy is trained.
 
-``vtrefine-information --config_path=configs/env/round_grasped.yaml --output_dir=outputs/information``
+example:
+  vtrefine-information --config_path=vtrefine:round_grasped --output_dir=outputs/information
 """
 
 import logging

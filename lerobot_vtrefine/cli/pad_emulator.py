@@ -1,4 +1,4 @@
-"""`vtrefine-pad-emulator`: FlexiTac boards on pseudo-terminals, to try everything without hardware."""
+"""``vtrefine-pad-emulator``: emulate FlexiTac boards and ALOHA arms, to try everything without hardware."""
 
 import argparse
 import re
@@ -32,6 +32,10 @@ TURN_S = 4.0
 
 MAX_BOARDS = 64
 """Each is a pseudo-terminal and a thread; a system lends some hundreds to a user."""
+EPILOG = """\
+examples:
+  vtrefine-pad-emulator --source=press            then, elsewhere: vtrefine-find-pads --ports outputs/pads/*
+  vtrefine-pad-emulator --arms=outputs/arms       four emulated arms beside the pads"""
 SOURCES = ("contact", "noise", "press", "pattern", "recording")
 
 
@@ -40,7 +44,7 @@ def parse_arguments(arguments: Sequence[str] | None) -> argparse.Namespace:
     parser = OneLineParser(
         "vtrefine-pad-emulator",
         "Emulate FlexiTac boards on pseudo-terminals. Prints their ports; runs until Ctrl-C.",
-        "",
+        EPILOG,
     )
     add = parser.add_argument
     add(
@@ -82,15 +86,15 @@ def parse_arguments(arguments: Sequence[str] | None) -> argparse.Namespace:
     add = faults.add_argument
     add("--loss", type=float, default=0.0, help="probability that a byte is lost")
     add(
-        "--burst-loss",
+        "--burst_loss",
         type=float,
         default=0.0,
         help="probability per frame that 2..62 bytes in a row are lost",
     )
-    add("--stall-every", type=float, default=0.0, help="seconds between stalls")
+    add("--stall_every", type=float, default=0.0, help="seconds between stalls")
     add("--stall", type=float, default=1.0, help="length of a stall in seconds (%(default)s)")
-    add("--unplug-at", type=float, default=0.0, help="seconds after the start at which the ports vanish")
-    add("--replug-after", type=float, default=1.0, help="seconds until they are back (%(default)s)")
+    add("--unplug_at", type=float, default=0.0, help="seconds after the start at which the ports vanish")
+    add("--replug_after", type=float, default=1.0, help="seconds until they are back (%(default)s)")
     add("--markers", type=int, nargs="+", default=[], metavar="TAXEL", help="taxels that read AA 55 for ever")
     return parser.parse_args(arguments)
 

@@ -1,6 +1,9 @@
-"""``vtrefine-play``: the simulation live in a browser, moved by an expert, a policy or a recorded episode.
+"""``vtrefine-play``: show the simulation live in a browser, moved by an expert, a policy or a recording.
 
-``vtrefine-play --config_path=configs/env/round_table.yaml --agent=expert``
+examples:
+  vtrefine-play --config_path=vtrefine:round_table
+  vtrefine-play --config_path=vtrefine:round_grasped --policy.path=CHECKPOINT
+  vtrefine-play --config_path=vtrefine:round_grasped --viewer=none --episodes=20
 """
 
 import logging

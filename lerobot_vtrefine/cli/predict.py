@@ -1,7 +1,4 @@
-"""``vtrefine-predict``: what a model predicts for recordings, without looking at their readings.
-
-``vtrefine-predict --recording=DIR --sensor_model=OUT/sensor_model.json --output_dir=PREDICTED``
-"""
+"""``vtrefine-predict``: predict recordings with a saved model, without looking at their readings."""
 
 import sys
 from collections.abc import Sequence

@@ -1,6 +1,9 @@
-"""``vtrefine-record-demos``: the scripted expert's episodes as a LeRobotDataset v3.
+"""``vtrefine-record-demos``: record a scripted, imperfect expert's episodes as a LeRobotDataset v3.
 
-``vtrefine-record-demos --config_path=configs/env/round_grasped.yaml --root=outputs/demos --num_episodes=60``
+example:
+  vtrefine-record-demos --config_path=vtrefine:round_grasped --root=outputs/demos --num_episodes=60
+
+Interrupted, the same command continues.
 """
 
 import logging
@@ -45,6 +48,7 @@ class RecordDemosConfig:
     include_failures: bool = False
     """Keep failed episodes too."""
     env: EnvConfig = field(default_factory=VtRefineEnvConfig)
+    """The task that the expert demonstrates."""
     degradation: Degradation = field(default_factory=Degradation)
     """Errors of the expert; all zero is the clean one."""
     eval: EvalConfig = field(default_factory=EvalConfig)

@@ -1,6 +1,7 @@
-"""``vtrefine-replay``: a recorded dataset's commands in the simulated twin, compared with what was measured.
+"""``vtrefine-replay``: run a dataset's commands in the simulated twin and compare what both measured.
 
-``vtrefine-replay --dataset.root=outputs/demos --episodes='[0, 1]' --output_dir=outputs/replay``
+example:
+  vtrefine-replay --dataset.root=outputs/demos --episodes='[0, 1]' --output_dir=outputs/replay
 """
 
 import logging
@@ -44,6 +45,7 @@ class ReplayConfig:
     output_dir: Path
     """Folder for replay.json and report.html."""
     dataset: SourceConfig = field(default_factory=SourceConfig)
+    """What to replay."""
     episodes: list[int] | None = None
     """Episodes to replay, e.g. '[0, 3]'; all by default."""
     parts: str = "auto"

@@ -1,4 +1,4 @@
-"""`vtrefine-view-pads`: boards live in the terminal or in rerun, without a robot."""
+"""``vtrefine-view-pads``: show FlexiTac pads live, in the terminal or in rerun."""
 
 import argparse
 import sys
@@ -21,6 +21,10 @@ from lerobot_vtrefine.drivers.picture import colours
 from lerobot_vtrefine.drivers.ports import PortError
 from lerobot_vtrefine.drivers.serial_reader import RETRY_S
 
+EPILOG = """\
+examples:
+  vtrefine-view-pads --pads_file=pads.yaml
+  vtrefine-view-pads --ports /dev/ttyUSB0 --rerun"""
 _HOME, _CLEAR, _RESET, _SHOW, _HIDE = "\x1b[H", "\x1b[2J", "\x1b[0m", "\x1b[?25h", "\x1b[?25l"
 
 
@@ -29,9 +33,11 @@ def parse_arguments(arguments: Sequence[str] | None) -> argparse.Namespace:
     parser = argparse.ArgumentParser(
         prog="vtrefine-view-pads",
         description="Show FlexiTac pads live, row 0 at the top, column 0 at the left.",
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+        epilog=EPILOG,
     )
     add = parser.add_argument
-    add("--pads-file", type=Path, help="file written by vtrefine-find-pads")
+    add("--pads_file", type=Path, help="file written by vtrefine-find-pads")
     add("--ports", nargs="+", default=[], metavar="PORT", help="ports to show instead of a pads file")
     add("--rows", type=int, default=12, help="rows that the boards on --ports send (%(default)s)")
     add("--cols", type=int, default=32, help="columns that the boards on --ports send (%(default)s)")
@@ -74,10 +80,10 @@ def chosen_pads(options: argparse.Namespace) -> dict[str, PadConfig]:
     """The pads to show.
 
     Raises:
-        ValueError: neither or both of --pads-file and --ports are given.
+        ValueError: neither or both of --pads_file and --ports are given.
     """
     if bool(options.ports) == (options.pads_file is not None):
-        raise ValueError("give either --pads-file=FILE (vtrefine-find-pads writes it) or --ports PORT ...")
+        raise ValueError("give either --pads_file=FILE (vtrefine-find-pads writes it) or --ports PORT ...")
     if options.pads_file is not None:
         return load_pads(options.pads_file)
     pads = {Path(port).name: PadConfig(port, options.rows, options.cols) for port in options.ports}

@@ -79,7 +79,9 @@ class VtRefineEnvConfig(EnvConfig):
     metrics_path: Path | None = None
     """JSON-lines file; every finished episode appends seed, success, in-hand shift, peak force, ..."""
     features: dict[str, PolicyFeature] = field(default_factory=dict)
+    """Unused as a flag: follows from the camera's size."""
     features_map: dict[str, str] = field(default_factory=dict)
+    """Unused as a flag: LeRobot's names of the observations."""
 
     @told_by_lerobot
     def __post_init__(self) -> None:

@@ -56,10 +56,15 @@ class FinetunePipelineConfig:
     ``policy.pretrained_path`` is the one that the run started from.
     """
 
+    # Where the policy practises: --env.type=vtrefine, or a file of configs/env.
     env: EnvConfig
+    # The checkpoint to start from: --policy.path=FOLDER; --policy.device=cpu or cuda; its other settings too.
     policy: PreTrainedConfig | None = None
+    # The update; --dppo.type=paper|seed_literal|trust_region|small chooses a preset.
     dppo: DppoConfig = field(default_factory=PaperDppo)
+    # Folder of checkpoints/, progress.csv and curves.png.
     output_dir: Path = Path("outputs/finetune")
+    # Name of the run in Weights & Biases.
     job_name: str = "dppo"
     # Training episodes have the environment seeds from 1000000 + seed on; runs whose seeds are 10000000 apart
     # share no episode.

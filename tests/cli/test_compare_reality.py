@@ -21,9 +21,10 @@ SCRIPTS = Path(__file__).parents[2] / "scripts"
 def scripts():
     sys.path.insert(0, str(SCRIPTS))
     import compare_reality
-    import press_reality
 
-    yield compare_reality, press_reality
+    from lerobot_vtrefine.diagnose import stand_in_rig
+
+    yield compare_reality, stand_in_rig
     sys.path.remove(str(SCRIPTS))
 
 

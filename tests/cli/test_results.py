@@ -79,6 +79,15 @@ def test_a_changed_figure_changes_the_document(tmp_path: Path) -> None:
         fill("<!-- table: demo -->\n<!-- end -->", rows)
 
 
+def test_decimals_have_a_zero_before_the_point() -> None:
+    row = Line(
+        table="diagnosis",
+        cells={"": "gain .1 to .2", "engine": ".98 [.95, 1.0]", "bar": "v1.2 3.5"},
+        **ORIGIN,
+    )
+    assert "| gain 0.1 to 0.2 | 0.98 [0.95, 1.0] | v1.2 3.5 |" in table("diagnosis", [row])
+
+
 @pytest.mark.parametrize(
     ("change", "message"),
     [

@@ -1,4 +1,4 @@
-"""A cause of one's own, added as README says, is screened, named, reported and predicted."""
+"""A cause of one's own, added as docs/own-cause.md says, is screened, named, reported and predicted."""
 
 import json
 import os
@@ -21,7 +21,6 @@ from lerobot_vtrefine.diagnose.verdict import ROBOT_CAUSES, SENSOR_CAUSES
 
 PACKAGE = Path(lerobot_vtrefine.__file__).parent
 ROOT = Path(__file__).parents[2]
-SCRIPTS = ROOT / "scripts"
 
 STAGE = '''
 
@@ -141,7 +140,7 @@ def test_a_cause_of_ones_own_is_named_reported_and_predicted(tmp_path: Path) -> 
         assert done.returncode == 0, done.stderr[-2000:]
         return done.stdout
 
-    run(str(SCRIPTS / "press_reality.py"), "--reality=reality.json", "--output_dir=presses")
+    run("-m", "lerobot_vtrefine.cli.press", "--reality=reality.json", "--output_dir=presses")
     said = run("-m", "lerobot_vtrefine.cli.diagnose", "--recording=presses", "--output_dir=out")
     assert "explained: The simulation lacks column sharing." in said
     verdict = json.loads((tmp_path / "out" / "verdict.json").read_text())

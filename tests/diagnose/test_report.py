@@ -1,5 +1,7 @@
 """report.html: complete, self-contained and well-formed; looked at in a browser where there is one."""
 
+import base64
+import io
 import re
 import shutil
 import subprocess
@@ -12,13 +14,19 @@ from fake_diagnosis import pad_diagnosis, robot_diagnosis
 from pad_sets import make_robot_set, make_set, write_set
 from PIL import Image
 
+from lerobot_vtrefine.cli.report.press_film import MOST_FRAMES, press_film
 from lerobot_vtrefine.diagnose.core.diagnosis import Diagnosis
 from lerobot_vtrefine.diagnose.recordings import read_recording_set
 from lerobot_vtrefine.diagnose.report import render_report
 from lerobot_vtrefine.diagnose.report.axes import ticks
+from lerobot_vtrefine.diagnose.report.effects import effect_drawing
 from lerobot_vtrefine.diagnose.report.numbers import digits, interval, percent, quantity
 from lerobot_vtrefine.diagnose.report.words import MEANINGS, ties
 from lerobot_vtrefine.diagnose.verdict import CAUSES, DataIssue, Unknown, Verdict
+from lerobot_vtrefine.pages.pads import GAP_TAXELS
+from lerobot_vtrefine.tactile.model import SensorModel
+from lerobot_vtrefine.tactile.stages.contact import KelvinVoigt
+from lerobot_vtrefine.tactile.stages.readout import Gain
 
 ISSUE = DataIssue("trial_0003.parquet", "starts loaded", "set aside")
 BROWSERS = ("chromium", "chromium-browser", "google-chrome", "chrome")
@@ -78,8 +86,27 @@ def test_page_is_well_formed_and_needs_no_network(kind, pad_set, robot_set):
     assert not re.findall(r"(?:https?:)?//[a-z]", html)
     assert not re.findall(r"<(?:link|script|iframe)\b", html)
     sources = re.findall(r'(?:src|href)="([^"]*)"', html)
-    assert all(source.startswith("data:image/png;base64,") for source in sources)
+    assert all(re.match("data:image/(png|gif);base64,", source) for source in sources)
     assert "nan" not in re.sub(r"base64,[^\"]*", "", html).lower()
+
+
+def test_named_causes_are_drawn_and_the_page_says_what_to_do(pad_set):
+    html = page(pad_diagnosis(), pad_set)
+    assert html.count('<svg class="effect"') == 2
+    assert "--env.sensor_model=sensor_model.json" in html
+    nothing = page(pad_diagnosis(status="adequate", causes=()), pad_set)
+    assert "What to do now" not in text_of(nothing)
+    assert effect_drawing("no such cause") == ""
+
+
+def test_a_press_in_motion_is_shown_beside_its_simulations(pad_set, robot_set):
+    model = SensorModel((KelvinVoigt(), Gain(100.0)))
+    diagnosis = replace(pad_diagnosis(), baseline_model=model, extended_model=model)
+    film = press_film(diagnosis, pad_set)
+    with Image.open(io.BytesIO(base64.b64decode(film["source"].partition(",")[2]))) as gif:
+        assert gif.size == (3 * pad_set.cols + 2 * GAP_TAXELS, pad_set.rows)
+        assert 20 < gif.n_frames <= MOST_FRAMES
+    assert press_film(robot_diagnosis(), robot_set) is None
 
 
 def test_first_line_is_the_verdict_in_plain_words(pad_set, robot_set):
@@ -154,7 +181,8 @@ def test_everything_found_and_not_found_is_there(pad_set):
     text = text_of(page(pad_diagnosis(), pad_set))
     for words in (
         "trial_0003.parquet starts loaded set aside",
-        "crosstalk crosstalk 0.4 0.99 0.1 % not found no more than chance gives",
+        "crosstalk 0.4 0.99 0.1 % no more than chance gives",
+        "Not found, ",
         "baseline drift baseline_drift – – – cannot be told here",
         "hysteresis width_m 0.21 mm 0.18 to 0.24 mm",
         "baseline k_n 380 N/m 371 to 390 N/m",

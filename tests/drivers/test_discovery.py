@@ -104,7 +104,7 @@ def test_rows_that_arrive_shifted_are_put_in_order(
 
     output = tmp_path / "pads.yaml"
     with emulated(tmp_path, "port0", source=source) as board, redirect_stdout(operator):
-        arguments = ["--ports", board.port, "--names", "thumb", "--check-rows", "--output", str(output)]
+        arguments = ["--ports", board.port, "--names", "thumb", "--check_rows", "--output", str(output)]
         assert find_pads(arguments) == 0
     assert load_pads(output)["thumb"].row_offset == shift
 
@@ -240,7 +240,7 @@ def test_terminated_emulator_removes_its_ports(tmp_path: Path) -> None:
         (pad_emulator, ["--loss", "2"], "loss must be at most 1, got 2.0"),
         (find_pads, ["--ports", "/nowhere/pty"], "/nowhere/pty does not exist"),
         (find_pads, ["--ports", "x", "--names", "a", "a"], "must differ"),
-        (view_pads, [], "give either --pads-file"),
+        (view_pads, [], "give either --pads_file"),
     ],
 )
 def test_bad_usage_is_one_line_and_status_2(

@@ -45,7 +45,7 @@ def test_recording_is_played(tmp_path: Path) -> None:
 
 
 def test_unplugging_on_request(tmp_path: Path) -> None:
-    flags = ("--source", "pattern", "--unplug-at", "1", "--replug-after", "0.7")
+    flags = ("--source", "pattern", "--unplug_at", "1", "--replug_after", "0.7")
     with emulating(tmp_path, 4.0, *flags) as config, reading(config) as reader:
         wait_until(lambda: reader.health().status is Status.DISCONNECTED)
         wait_until(lambda: reader.health().status is Status.STREAMING)
@@ -54,7 +54,7 @@ def test_unplugging_on_request(tmp_path: Path) -> None:
 
 
 def test_stalls_on_request(tmp_path: Path) -> None:
-    flags = ("--source", "pattern", "--stall-every", "1", "--stall", "0.5")
+    flags = ("--source", "pattern", "--stall_every", "1", "--stall", "0.5")
     with emulating(tmp_path, 3.0, *flags) as config, reading(config) as reader:
         wait_until(lambda: reader.health().status is Status.STALE)
         wait_until(lambda: reader.health().status is Status.STREAMING)
@@ -62,7 +62,7 @@ def test_stalls_on_request(tmp_path: Path) -> None:
 
 
 def test_lost_bytes_on_request(tmp_path: Path) -> None:
-    flags = ("--source", "pattern", "--loss", "0.001", "--burst-loss", "0.05")
+    flags = ("--source", "pattern", "--loss", "0.001", "--burst_loss", "0.05")
     with emulating(tmp_path, 2.5, *flags) as config, reading(config) as reader:
         wait_until(lambda: reader.health().locks_lost > 0)
         wait_until(lambda: reader.health().frames >= 20)

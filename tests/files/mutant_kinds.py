@@ -238,7 +238,7 @@ def reading_pads(folder: Path) -> None:
     """What the robots and ``vtrefine-view-pads`` do before they open ports."""
     path = folder / "pads.yaml"
     first = configured_pads({}, path)
-    second = view_pads.chosen_pads(view_pads.parse_arguments(["--pads-file", str(path)]))
+    second = view_pads.chosen_pads(view_pads.parse_arguments(["--pads_file", str(path)]))
     assert first == second
     for pad in first.values():
         assert np.zeros(pad.pad_shape).size <= 64 * 64
@@ -340,11 +340,11 @@ def emulator_flags(rng: random.Random) -> list[str]:
             ("--shape", (*junk, "12x", "0x0", "64x65", "1x1", "999999999x1", "12x32x3", "²x²")),
             ("--seed", junk),
             ("--loss", (*junk, "1", "2")),
-            ("--burst-loss", (*junk, "1")),
-            ("--stall-every", (*junk, "0.01")),
+            ("--burst_loss", (*junk, "1")),
+            ("--stall_every", (*junk, "0.01")),
             ("--stall", junk),
-            ("--unplug-at", (*junk, "0.01")),
-            ("--replug-after", junk),
+            ("--unplug_at", (*junk, "0.01")),
+            ("--replug_after", junk),
             ("--protocol", ("ascii", "diagnostic", "morse")),
             ("--source", ("press", "pattern", "recording", "music")),
             ("--markers", junk),

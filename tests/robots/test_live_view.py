@@ -62,7 +62,7 @@ def test_teleoperating_shows_four_pictures(rig: Rig, tmp_path: Path, monkeypatch
 
 def test_view_pads_writes_a_rerun_file(rig: Rig, tmp_path: Path) -> None:
     path = tmp_path / "new" / "pads.rrd"
-    assert view_pads(["--pads-file", str(rig.pads_file), "--seconds", "0.6", "--save", str(path)]) == 0
+    assert view_pads(["--pads_file", str(rig.pads_file), "--seconds", "0.6", "--save", str(path)]) == 0
     found = logged(path)
     for pad in PADS:
         assert shape_in(path, f"pads/{pad}")["width"] == 32

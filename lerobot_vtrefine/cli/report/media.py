@@ -1,17 +1,15 @@
 """Pictures and videos as data URIs, so that the page needs no other file."""
 
-import base64
-import io
 from pathlib import Path
 
 import av
 import numpy as np
 import pyarrow.parquet as pq
-from matplotlib import colormaps
 from PIL import Image
 
 from lerobot_vtrefine.datasets.features import BASELINE_PREFIX, TACTILE_PREFIX, Array
 from lerobot_vtrefine.embodiments import pad_layout_of
+from lerobot_vtrefine.pages.pads import encode
 
 MIME = {".mp4": "video/mp4", ".webm": "video/webm", ".png": "image/png", ".gif": "image/gif"}
 
@@ -25,19 +23,6 @@ def data_uri(path: Path) -> str:
     if path.suffix not in MIME:
         raise ValueError(f"cannot embed {path}: suffix is not one of {', '.join(MIME)}")
     return encode(path.read_bytes(), MIME[path.suffix])
-
-
-def encode(content: bytes, mime: str) -> str:
-    """Bytes as a ``data:`` URI."""
-    return f"data:{mime};base64,{base64.b64encode(content).decode('ascii')}"
-
-
-def heat_map(values: Array, maximum: float) -> str:
-    """A (rows, columns) array from 0 to ``maximum`` as a PNG data URI, one pixel per taxel."""
-    shades = colormaps["magma"](np.clip(values / max(maximum, 1e-9), 0, 1), bytes=True)[..., :3]
-    buffer = io.BytesIO()
-    Image.fromarray(shades).save(buffer, "PNG")
-    return encode(buffer.getvalue(), "image/png")
 
 
 def strongest_contact(dataset_root: Path) -> dict[str, Array]:

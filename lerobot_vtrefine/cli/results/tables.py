@@ -13,6 +13,7 @@ from lerobot_vtrefine.cli.results.rows import Line, Row, Run
 
 IMITATION = "imitation"
 BLOCK = re.compile(r"(<!-- table: (\w+) -->\n).*?(<!-- end -->)", re.DOTALL)
+LEADING_POINT = re.compile(r"(?<![\d.])\.(?=\d)")
 LABELS = {
     "demo": "demo: round pair, 2 mm clearance",
     "tight": "tight: 1 mm clearance",
@@ -190,9 +191,11 @@ def average(counts: Sequence[int | None]) -> str:
 
 
 def lines_table(rows: Sequence[Line]) -> str:
-    """A benchmark's table as it was printed."""
+    """A benchmark's table as it was printed, with a zero before every decimal point."""
     head = list(rows[0].cells)
-    return markdown(head, [[row.cells.get(name, "") for name in head] for row in rows])
+    rows_of_cells = [head, *([row.cells.get(name, "") for name in head] for row in rows)]
+    head, *body = [[LEADING_POINT.sub("0.", cell) for cell in cells] for cells in rows_of_cells]
+    return markdown(head, body)
 
 
 RENDERERS: dict[str, Callable[[Sequence], str]] = (

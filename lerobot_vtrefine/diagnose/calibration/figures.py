@@ -48,7 +48,7 @@ def _reading_curve(axis: Axes, calibration: Calibration) -> None:
         )
     axis.set_xlabel(name)
     axis.set_ylabel("counts above idle")
-    axis.legend(fontsize=8, frameon=False)
+    axis.legend(fontsize=10, frameon=False)
 
 
 def binned(
@@ -95,9 +95,9 @@ def resampled(calibration: Calibration) -> Figure:
         axis.axvline(parameter.value, color=MODEL, lw=1.6)
         for bound in parameter.ci95 or ():
             axis.axvline(bound, color="black", lw=0.8, ls="--")
-        axis.set_title(f"{name} [{parameter.unit}]", fontsize=9)
+        axis.set_title(f"{name} [{parameter.unit}]", fontsize=10)
         axis.set_yticks([])
-        axis.tick_params(labelsize=8)
+        axis.tick_params(labelsize=10)
     return figure
 
 
@@ -117,11 +117,11 @@ def presses_over_time(calibration: Calibration, number: int = 3) -> Figure:
         axis.plot(time_s, press.signal[:, pressed].mean(1), color=MEASURED, lw=1.4, label="measured")
         model = calibration.fitted.signals[index]
         axis.plot(time_s, model[:, pressed].mean(1), color=MODEL, lw=1.1, label="model")
-        axis.set_title(f"{press.trial.file}: RMS {errors[index]:.1f} counts", fontsize=9)
-        axis.set_xlabel("time [s]", fontsize=8)
-        axis.tick_params(labelsize=8)
-    axes[0].set_ylabel("mean counts above idle", fontsize=8)
-    axes[0].legend(fontsize=8, frameon=False)
+        axis.set_title(f"{press.trial.file}: RMS {errors[index]:.1f} counts", fontsize=10)
+        axis.set_xlabel("time [s]", fontsize=10)
+        axis.tick_params(labelsize=10)
+    axes[0].set_ylabel("mean counts above idle", fontsize=10)
+    axes[0].legend(fontsize=10, frameon=False)
     return figure
 
 

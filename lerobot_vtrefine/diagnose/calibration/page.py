@@ -2,12 +2,11 @@
 
 from typing import Any
 
-from jinja2 import Environment, PackageLoader, StrictUndefined
-
 from lerobot_vtrefine.diagnose.calibration import figures
 from lerobot_vtrefine.diagnose.calibration.fit import Calibration, fits_the_simulation
 from lerobot_vtrefine.diagnose.episode_replay.figures import data_uri
 from lerobot_vtrefine.diagnose.report.numbers import interval
+from lerobot_vtrefine.pages.render import render
 
 SCHEMA = "vtrefine/calibration@1"
 SIMULATED_FULL_SCALE = 255.0
@@ -75,19 +74,14 @@ def remarks(calibration: Calibration) -> list[str]:
 
 def render_page(calibration: Calibration, source: str) -> str:
     """The page as HTML text; figures are embedded."""
-    environment = Environment(
-        loader=PackageLoader("lerobot_vtrefine.diagnose.calibration", "."),
-        autoescape=True,
-        undefined=StrictUndefined,
-        trim_blocks=True,
-        lstrip_blocks=True,
-    )
     rows = [
         (name, WORDS.get(name, name.replace("_", " ")), *interval(item.value, item.ci95, item.unit))
         for name, item in calibration.parameters.items()
         if isinstance(item.value, float)
     ]
-    return environment.get_template("page.html").render(
+    return render(
+        "lerobot_vtrefine.diagnose.calibration",
+        "page.html",
         source=source,
         calibration=calibration,
         rows=rows,

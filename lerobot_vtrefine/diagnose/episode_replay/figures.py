@@ -14,6 +14,8 @@ from lerobot_vtrefine.embodiments import pad_layout_of
 
 RECORDED, TWIN, COMMAND = "#1f6fb4", "#d1601f", "#9a9a9a"
 DPI = 95
+LEAST_SPAN = {"rad": 0.05, "mm": 2.0}
+"""What an axis of positions shows at least, so that noise does not look like motion."""
 
 
 def data_uri(figure: Figure) -> str:
@@ -42,9 +44,9 @@ def tracking_bars(tracking: list[JointTracking]) -> Figure:
             if row.rmse_ci95 is not None:
                 axis.plot([x + 0.2] * 2, [1e3 * value for value in row.rmse_ci95], color="black", lw=1)
         names = [row.joint.replace("_", " ", 1).replace("_", " ") for row in rows]
-        axis.set_xticks(place, names, rotation=35, ha="right", fontsize=8)
+        axis.set_xticks(place, names, rotation=35, ha="right", fontsize=10)
         axis.set_ylabel(f"RMS [{unit}]")
-    axes[0].legend(fontsize=8, frameon=False)
+    axes[0].legend(fontsize=10, frameon=False)
     return figure
 
 
@@ -60,9 +62,12 @@ def joint_traces(pair: EpisodePair, joints: list[str], fps: float) -> Figure:
         axis.step(time, scale * pair.recorded.action[:, j], where="post", color=COMMAND, lw=1)
         axis.plot(time, scale * pair.recorded.state[:, j], color=RECORDED, lw=1.4)
         axis.plot(time, scale * pair.position[:, j], color=TWIN, lw=1.2)
-        axis.set_title(f"{joint.replace('_', ' ')} [{unit}]", fontsize=9)
-        axis.tick_params(labelsize=7)
-    axes[0].legend(["command", "recorded", "twin"], fontsize=7, frameon=False)
+        low, high = axis.get_ylim()
+        middle, half = (low + high) / 2, max((high - low) / 2, LEAST_SPAN[unit] / 2)
+        axis.set_ylim(middle - half, middle + half)
+        axis.set_title(f"{joint.replace('_', ' ')} [{unit}]", fontsize=10)
+        axis.tick_params(labelsize=10)
+    axes[0].legend(["command", "recorded", "twin"], fontsize=10, frameon=False)
     return figure
 
 
@@ -77,13 +82,13 @@ def histograms(touch: list[PadTouch]) -> Figure:
             axis = axes[row, column]
             axis.stairs(density[0], bins, fill=True, color=RECORDED, alpha=0.45)
             axis.stairs(density[1], bins, color=TWIN, lw=1.6)
-            axis.tick_params(labelsize=7)
-            axis.set_xlabel(("normalised reading", "counts above idle")[row], fontsize=8)
+            axis.tick_params(labelsize=10)
+            axis.set_xlabel(("normalised reading", "counts above idle")[row], fontsize=10)
             if row:
                 axis.set_yscale("log")
-        axes[0, column].set_title(pad.pad.replace("_", " "), fontsize=9)
-    axes[0, 0].set_ylabel("share of touched taxels", fontsize=8)
-    axes[0, 0].legend(["recorded", "twin"], fontsize=8, frameon=False)
+        axes[0, column].set_title(pad.pad.replace("_", " "), fontsize=10)
+    axes[0, 0].set_ylabel("share of touched taxels", fontsize=10)
+    axes[0, 0].legend(["recorded", "twin"], fontsize=10, frameon=False)
     return figure
 
 
@@ -97,11 +102,11 @@ def pad_totals(pair: EpisodePair, fps: float) -> Figure:
         time = np.arange(len(recorded)) / fps
         axis.plot(time, recorded.sum(1), color=RECORDED, lw=1.4)
         axis.plot(time, twin.sum(1), color=TWIN, lw=1.2)
-        axis.set_title(pad.replace("_", " "), fontsize=9)
-        axis.set_xlabel("time [s]", fontsize=8)
-        axis.tick_params(labelsize=7)
-    axes[0].set_ylabel("sum of counts", fontsize=8)
-    axes[0].legend(["recorded", "twin"], fontsize=7, frameon=False)
+        axis.set_title(pad.replace("_", " "), fontsize=10)
+        axis.set_xlabel("time [s]", fontsize=10)
+        axis.tick_params(labelsize=10)
+    axes[0].set_ylabel("sum of counts", fontsize=10)
+    axes[0].legend(["recorded", "twin"], fontsize=10, frameon=False)
     return figure
 
 
@@ -117,12 +122,12 @@ def frames(pair: EpisodePair, moment: int) -> Figure:
         for row, name in enumerate(("recorded", "twin")):
             axis = axes[row, column]
             picture = above[pad][row].reshape(layout.rows, layout.cols)
-            image = axis.imshow(picture, vmin=0, vmax=highest, cmap="magma")
+            image = axis.imshow(picture, vmin=0, vmax=highest, cmap="viridis")
             axis.set_xticks([])
             axis.set_yticks([])
             if column == 0:
-                axis.set_ylabel(name, fontsize=9)
-        axes[0, column].set_title(pad.replace("_", " "), fontsize=9)
+                axis.set_ylabel(name, fontsize=10)
+        axes[0, column].set_title(pad.replace("_", " "), fontsize=10)
     figure.colorbar(image, ax=axes, shrink=0.8, label="counts")
     return figure
 

@@ -3,33 +3,31 @@
 from typing import Any
 
 import numpy as np
-from jinja2 import Environment, PackageLoader, StrictUndefined
 
 from lerobot_vtrefine.diagnose.episode_replay import figures
 from lerobot_vtrefine.diagnose.episode_replay.compare import Comparison, EpisodePair
 from lerobot_vtrefine.diagnose.episode_replay.touch import telling_frames
+from lerobot_vtrefine.embodiments import pad_layout_of
+from lerobot_vtrefine.pages.pads import colour_scale, pad_film
+from lerobot_vtrefine.pages.render import render
 
 FRAMES_SHOWN = 4
 
 
 def render_page(comparison: Comparison) -> str:
     """The page as HTML text; figures are embedded."""
-    environment = Environment(
-        loader=PackageLoader("lerobot_vtrefine.diagnose.episode_replay", "."),
-        autoescape=True,
-        undefined=StrictUndefined,
-        trim_blocks=True,
-        lstrip_blocks=True,
-    )
     joints = [row.joint for row in comparison.tracking]
     worst, typical = _worst_and_typical(comparison)
     shown = {"typical": typical} if worst is typical else {"typical": typical, "worst": worst}
     pads_pair = _strongest_touch(comparison)
-    return environment.get_template("page.html").render(
+    return render(
+        "lerobot_vtrefine.diagnose.episode_replay",
+        "page.html",
+        verdict=verdict(comparison),
+        films=_films(pads_pair, comparison.fps) if pads_pair else [],
         comparison=comparison,
         episodes=len(comparison.pairs),
         frames=sum(len(pair.position) for pair in comparison.pairs),
-        successes=[pair.success for pair in comparison.pairs if pair.success is not None],
         rows=[_tracking_row(row) for row in comparison.tracking],
         bars=figures.data_uri(figures.tracking_bars(comparison.tracking)),
         traces=[
@@ -42,6 +40,48 @@ def render_page(comparison: Comparison) -> str:
         moments=_moments(pads_pair, comparison.fps) if pads_pair else [],
         touch_episode=pads_pair.recorded.index if pads_pair else None,
     )
+
+
+def verdict(comparison: Comparison) -> str:
+    """What the replay says, in a sentence or two."""
+    if not comparison.tracking:
+        return "No joint was compared."
+    arms = [row for row in comparison.tracking if figures.unit_of(row.joint) == "mrad"]
+    worst = max(arms or comparison.tracking, key=lambda row: row.rmse)
+    if max(row.peak for row in comparison.tracking) == 0.0:
+        said = "The twin repeats the recorded motion exactly."
+    else:
+        error = f"{1e3 * worst.rmse:.1f} {figures.unit_of(worst.joint)}"
+        joint = worst.joint.replace("_", " ")
+        said = f"The twin follows the recorded arms to within {error} RMS; the worst joint is {joint}."
+    felt = [pad for pad in comparison.touch if pad.overlap is not None]
+    if comparison.touch and all(pad.identical_frames == pad.frames for pad in comparison.touch):
+        said += " All pads read the same in every frame."
+    elif felt:
+        least = min(felt, key=lambda pad: pad.overlap or 0.0)
+        said += f" Pad readings overlap by {100 * (least.overlap or 0.0):.0f} % or more."
+    ended = [pair.success for pair in comparison.pairs if pair.success is not None]
+    if ended:
+        said += f" In the twin {sum(ended)} of {len(ended)} episodes ended with the plug seated and held."
+    return said
+
+
+def _films(pair: EpisodePair, fps: float) -> list[dict[str, str]]:
+    """Every pad in motion, recorded beside the twin, on one scale."""
+    sides = {}
+    for pad in (name for name in pair.recorded.counts if name in pair.counts):
+        layout = pad_layout_of(pad)
+        shape = (-1, layout.rows, layout.cols)
+        sides[pad] = [side.reshape(shape) for side in figures.pads_above(pair, pad)]
+    top = max(1.0, *(float(side.max()) for both in sides.values() for side in both))
+    return [
+        {
+            "source": pad_film(both, top, 1.0 / fps),
+            "caption": f"{pad.replace('_', ' ')}: recorded, and in the twin.",
+            "scale": colour_scale(top, "counts above idle"),
+        }
+        for pad, both in sides.items()
+    ]
 
 
 def _tracking_row(row: Any) -> dict[str, str]:

@@ -9,6 +9,8 @@ import numpy as np
 
 from lerobot_vtrefine.diagnose.report.numbers import digits
 
+NARROW = 400.0
+"""Drawings up to this width [px] are shown smaller on narrow screens."""
 MAX_POINTS = 400
 """Lines are thinned to this many points, which is more than pixels show."""
 
@@ -62,8 +64,8 @@ class Panel:
             for tick in ticks(*self.x_range, 6):
                 place = self.x(tick)
                 parts.append(f'<path class="grid" d="M{place:.1f} {bottom:.1f}v4"/>')
-                parts.append(label(place, bottom + 17, digits(tick), "middle"))
-            parts.append(label(self.left + self.width / 2, bottom + 34, x_title, "middle"))
+                parts.append(label(place, bottom + 19, digits(tick), "middle"))
+            parts.append(label(self.left + self.width / 2, bottom + 38, x_title, "middle"))
         parts.append(f'<path class="axis" d="M{self.left:.1f} {self.top:.1f}V{bottom:.1f}H{right:.1f}"/>')
         parts.append(label(self.left, self.top - 7, y_title, "start"))
         return "".join(parts)
@@ -97,7 +99,6 @@ def label(x: float, y: float, text: str, anchor: str, style: str = "tick") -> st
 def drawing(width: float, height: float, parts: Sequence[str], title: str) -> str:
     """The parts as one picture, with a title for those who cannot see it."""
     body = "".join(parts)
-    return (
-        f'<svg viewBox="0 0 {width:.0f} {height:.0f}" role="img" aria-label="{escape(title, quote=True)}">'
-        f"{body}</svg>"
-    )
+    style = "wide" if width > NARROW else "narrow"
+    size = f'class="{style}" viewBox="0 0 {width:.0f} {height:.0f}"'
+    return f'<svg {size} role="img" aria-label="{escape(title, quote=True)}">{body}</svg>'

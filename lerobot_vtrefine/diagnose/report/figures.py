@@ -1,13 +1,9 @@
 """The pictures of a report: held-out traces, residuals, errors per trial, maps."""
 
-import base64
-import io
 from collections.abc import Sequence
 from pathlib import PurePath
 
 import numpy as np
-from matplotlib import colormaps
-from PIL import Image
 
 from lerobot_vtrefine.diagnose.evidence import ResidualView, Trace, TrialError
 from lerobot_vtrefine.diagnose.report.axes import Panel, drawing, label, span
@@ -36,7 +32,7 @@ def trace_figure(trace: Trace, unit: str) -> str:
         curves = [curve * factor for curve in lines]
         panel = Panel(LEFT, top, width, CHANNEL_HEIGHT, x_range, span(*curves))
         parts.append(panel.frame("", f"{trace.channels[k]} [{name}]", x_ticks=False))
-        for curve, style in zip(curves, ("m", "a", "b"), strict=True):
+        for curve, style in zip(curves, ("m", "a dashed", "b"), strict=True):
             parts.append(panel.line(times, curve, style))
         top += CHANNEL_HEIGHT + 30
     for name, values in trace.drive.items():
@@ -89,7 +85,7 @@ def error_figure(heldout: Heldout, unit: str) -> str:
     longest = max(value for _, value, _ in rows) or 1.0
     parts = []
     for k, (name, value, style) in enumerate(rows):
-        y, length = 10 + 34 * k, 270 * value / longest
+        y, length = 10 + 34 * k, 225 * value / longest
         parts.append(label(96, y + 17, name, "end", "name"))
         parts.append(f'<rect class="bar {style}" x="106" y="{y}" width="{length:.1f}" height="24" rx="3"/>')
         parts.append(label(114 + length, y + 17, quantity(value, unit), "start", "value"))
@@ -112,13 +108,3 @@ def trial_figure(errors: Sequence[TrialError], unit: str) -> str:
         parts.append(f'<circle class="dot a" cx="{before:.1f}" cy="{y:.1f}" r="5"/>')
         parts.append(f'<circle class="dot b" cx="{after:.1f}" cy="{y:.1f}" r="5"/>')
     return drawing(WIDTH, height + 68, parts, "error of every held-out recording")
-
-
-def map_image(values: np.ndarray, top: float, *, diverging: bool = False) -> str:
-    """A map (R, C) as a PNG data URI, a pixel per taxel; row 0 at the bottom, as in the pad frame (+y up)."""
-    finite = np.nan_to_num(values)
-    level = 0.5 + 0.5 * finite / max(top, 1e-12) if diverging else finite / max(top, 1e-12)
-    shades = colormaps["RdBu_r" if diverging else "magma"](np.clip(level, 0, 1), bytes=True)[::-1, :, :3]
-    buffer = io.BytesIO()
-    Image.fromarray(np.ascontiguousarray(shades)).save(buffer, "PNG")
-    return f"data:image/png;base64,{base64.b64encode(buffer.getvalue()).decode('ascii')}"

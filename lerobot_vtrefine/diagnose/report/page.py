@@ -6,15 +6,14 @@ from pathlib import PurePath
 from typing import Any
 
 import numpy as np
-from jinja2 import Environment, PackageLoader, StrictUndefined
 
 from lerobot_vtrefine.diagnose.core.diagnosis import Diagnosis
 from lerobot_vtrefine.diagnose.evidence import Evidence, Trace
 from lerobot_vtrefine.diagnose.recordings import RecordingSet
+from lerobot_vtrefine.diagnose.report.effects import effect_drawing
 from lerobot_vtrefine.diagnose.report.figures import (
     SHOWN_TRIALS,
     error_figure,
-    map_image,
     residual_figure,
     trace_figure,
     trial_figure,
@@ -32,9 +31,12 @@ from lerobot_vtrefine.diagnose.report.words import (
     title,
 )
 from lerobot_vtrefine.diagnose.verdict import Parameter, Verdict
+from lerobot_vtrefine.pages.pads import colour_scale, pad_image
+from lerobot_vtrefine.pages.render import render
 
 SHOWN_TRACES = 4
 """Trials drawn at once; the others are folded away."""
+NOT_FOUND = "rejected"
 DECISIONS = {
     "accepted": "found",
     "symptom": "symptom",
@@ -45,7 +47,12 @@ DECISIONS = {
 
 
 def render_report(
-    verdict: Verdict, diagnosis: Diagnosis | None, recordings: RecordingSet, sound: int, seed: int
+    verdict: Verdict,
+    diagnosis: Diagnosis | None,
+    recordings: RecordingSet,
+    sound: int,
+    seed: int,
+    film: dict[str, str] | None = None,
 ) -> str:
     """The page as HTML text.
 
@@ -53,17 +60,13 @@ def render_report(
         diagnosis: None when the data allowed none (``invalid_data``).
         recordings: as they were read, before quality control.
         sound: number of trials that passed it.
+        film: a press in motion: its source, caption and colour scale.
     """
-    environment = Environment(
-        loader=PackageLoader("lerobot_vtrefine.diagnose.report", "."),
-        autoescape=True,
-        undefined=StrictUndefined,
-        trim_blocks=True,
-        lstrip_blocks=True,
-    )
     unit = diagnosis.unit if diagnosis is not None else "counts"
     of_pad = recordings.kind == "pad"
-    return environment.get_template("report.html").render(
+    return render(
+        "lerobot_vtrefine.diagnose.report",
+        "report.html",
         headline=headline(verdict, unit),
         verdict=verdict,
         verdict_of_pad=of_pad,
@@ -79,9 +82,31 @@ def render_report(
             {"title": title(name), "size": size_text(name, size)}
             for name, size in verdict.minimum_detectable.items()
         ],
+        drawings={cause.name: effect_drawing(cause.name) for cause in verdict.causes},
+        use=_use(verdict, recordings),
+        film=film,
         not_tested=[{"title": title(name), "needs": what} for name, what in verdict.not_tested.items()],
         **(_nothing() if diagnosis is None else _findings(verdict, diagnosis, unit, of_pad)),
     )
+
+
+def _use(verdict: Verdict, recordings: RecordingSet) -> dict[str, str] | None:
+    """What to do with the extended model, and the commands; None where it adds nothing."""
+    if not verdict.causes or verdict.heldout is None:
+        return None
+    flag = "--env.sensor_model" if recordings.kind == "pad" else "--env.reality"
+    task = "--config_path=vtrefine:round_grasped"
+    said = "sensor_model.json beside this page holds the repaired model."
+    if verdict.status in ("unexplained", "ambiguous"):
+        said += " Its names are not settled, so check first that it predicts other recordings better."
+    else:
+        said += " Record, fine-tune and evaluate with it, and predict other recordings to see that it holds."
+    lines = [
+        f"vtrefine-record-demos {task} --root=outputs/demos {flag}=sensor_model.json",
+        f"vtrefine-finetune {task} --policy.path=CHECKPOINT {flag}=sensor_model.json",
+        "vtrefine-predict --recording=OTHERS --sensor_model=sensor_model.json --output_dir=predicted",
+    ]
+    return {"words": said, "commands": "\n".join(lines)}
 
 
 def _nothing() -> dict[str, Any]:
@@ -94,6 +119,7 @@ def _nothing() -> dict[str, Any]:
         "residuals",
         "worst_joint",
         "evidence",
+        "not_found",
         "parameters",
         "baseline",
         "maps",
@@ -105,6 +131,8 @@ def _findings(verdict: Verdict, diagnosis: Diagnosis, unit: str, of_pad: bool) -
     traces = [{"caption": text, "figure": trace_figure(t, unit)} for t, text in _ordered(diagnosis.traces)]
     groups = [(title(cause.name), cause.params) for cause in verdict.causes]
     axes = AXES if of_pad else ROBOT_AXES
+    found = [item for item in diagnosis.evidence if item.decision != NOT_FOUND]
+    not_found = [item for item in diagnosis.evidence if item.decision == NOT_FOUND]
     return {
         "error_chart": error_figure(verdict.heldout, unit) if verdict.heldout else "",
         "trial_chart": trial_figure(diagnosis.trial_errors, unit) if diagnosis.trial_errors else "",
@@ -116,7 +144,8 @@ def _findings(verdict: Verdict, diagnosis: Diagnosis, unit: str, of_pad: bool) -
             for view in diagnosis.residuals
         ],
         "worst_joint": "" if of_pad or not diagnosis.traces else diagnosis.traces[0].channels[0],
-        "evidence": [_evidence_row(item) for item in _by_decision(diagnosis.evidence)],
+        "evidence": [_evidence_row(item) for item in _by_decision(found)],
+        "not_found": [_evidence_row(item) for item in _by_decision(not_found)],
         "parameters": [_parameter_row(of, name, p) for of, params in groups for name, p in params.items()],
         "baseline": [_parameter_row("baseline", name, p) for name, p in diagnosis.baseline_params.items()],
         "maps": _maps(diagnosis.maps, unit),
@@ -207,7 +236,7 @@ def _parameter_row(group: str, name: str, parameter: Parameter) -> dict[str, Any
     span = max(high - 1.0, 1.0 - low, 1e-9)
     return row | {
         "value": f"{low:.3g} to {high:.3g}, median {np.median(array):.3g}",
-        "image": map_image(array - 1.0, span, diverging=True),
+        "image": pad_image(array - 1.0, span, diverging=True),
     }
 
 
@@ -228,7 +257,8 @@ def _maps(maps: Mapping[str, np.ndarray], unit: str) -> list[dict[str, str]]:
         alike = [other for key, other in maps.items() if key.rsplit(" ", 1)[0] == family]
         top = max(float(np.nanmax(np.abs(other))) for other in alike)
         caption = f"{name}: up to {quantity(float(np.nanmax(values)), unit)}"
-        shown.append({"caption": caption, "image": map_image(np.abs(values), top)})
+        scale = colour_scale(top, unit)
+        shown.append({"caption": caption, "image": pad_image(np.abs(values), top), "scale": scale})
     return shown
 
 

@@ -1,15 +1,10 @@
-#!/usr/bin/env python
-"""A rig that presses the pad of a stand-in reality: recordings as a user would make them.
-
-    .venv/bin/python scripts/press_reality.py --output_dir=presses                           # an example
-    .venv/bin/python scripts/press_reality.py --reality=reality.json --output_dir=presses
+"""A rig that presses the pad of a stand-in reality: recordings as a user would make them, in contract format.
 
 A sphere and a square punch press, hold, let go in part and slide over the whole pad at several speeds, each
 motion twice. The readings come from the reality's sensor model, run on a finer clock than the recorded
 frames, with what rigs add: noise, rounding, and small errors of gain and contact height between recordings.
 """
 
-import argparse
 import json
 from pathlib import Path
 
@@ -32,6 +27,7 @@ SECONDS = 6.0
 REPLICATES = 2
 OBJECTS = ({"shape": "sphere", "radius_m": 0.01}, {"shape": "flat", "size_m": [0.011, 0.011]})
 SHALLOW_M, DEEP_M = 4e-4, 8e-4
+HEADER = "recording.json"
 GAIN_ERROR, HEIGHT_ERROR_M = 0.01, 1e-5
 
 
@@ -101,7 +97,13 @@ def this_pad(model: SensorModel, rng: np.random.Generator) -> SensorModel:
 
 
 def record(reality: Path | None, output_dir: Path, trials: int, seed: int) -> None:
-    """Write the recording set."""
+    """Write a set of ``trials`` recordings, two of every motion, into a new or empty folder.
+
+    Raises:
+        ValueError: the reality has no sensor model. FileExistsError: the folder holds recordings already.
+    """
+    if (output_dir / HEADER).exists():
+        raise FileExistsError(f"{output_dir / HEADER} exists; choose another --output_dir")
     hidden = load_reality(reality).sensor_model if reality else EXAMPLE
     if hidden is None:
         raise ValueError(f"{reality}: has no sensor model, so presses tell nothing")
@@ -129,23 +131,4 @@ def record(reality: Path | None, output_dir: Path, trials: int, seed: int) -> No
         "reading": {"unit": "adc_counts", "full_scale": 255.0},
         "trials": entries,
     }
-    (output_dir / "recording.json").write_text(json.dumps(header, indent=2), encoding="utf-8")
-
-
-def main() -> None:
-    """Parse and record."""
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
-    parser.add_argument(
-        "--reality", type=Path, help="file for --env.reality (default: an example with row sharing)"
-    )
-    parser.add_argument("--output_dir", type=Path, required=True)
-    parser.add_argument("--trials", type=int, default=16, help="recordings, two of every motion (default 16)")
-    parser.add_argument("--seed", type=int, default=0)
-    options = parser.parse_args()
-    record(options.reality, options.output_dir, options.trials, options.seed)
-
-
-if __name__ == "__main__":
-    main()
+    (output_dir / HEADER).write_text(json.dumps(header, indent=2), encoding="utf-8")

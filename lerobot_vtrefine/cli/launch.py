@@ -1,0 +1,97 @@
+"""Entry points of the commands that need LeRobot: their help is printed before anything heavy is imported."""
+
+import importlib
+import sys
+import textwrap
+
+from lerobot_vtrefine.cli.errors import run_cli
+from lerobot_vtrefine.cli.flags import Flag, describe_module, flags_of
+
+HELP_FLAGS = ("-h", "--help")
+WIDTH = 100
+INDENT = 30
+
+
+@run_cli
+def demo() -> int:
+    """Console entry point of ``vtrefine-demo``."""
+    return launch("demo", "lerobot_vtrefine.cli.pipeline.demo_config", "DemoConfig")
+
+
+@run_cli
+def record_demos() -> int:
+    """Console entry point of ``vtrefine-record-demos``."""
+    return launch("record_demos", "lerobot_vtrefine.cli.record_demos", "RecordDemosConfig")
+
+
+@run_cli
+def finetune() -> int:
+    """Console entry point of ``vtrefine-finetune``."""
+    return launch("finetune", "lerobot_vtrefine.finetune.pipeline", "FinetunePipelineConfig")
+
+
+@run_cli
+def information() -> int:
+    """Console entry point of ``vtrefine-information``."""
+    return launch("information", "lerobot_vtrefine.cli.information", "InformationConfig")
+
+
+@run_cli
+def play() -> int:
+    """Console entry point of ``vtrefine-play``."""
+    return launch("play", "lerobot_vtrefine.cli.play", "PlayConfig")
+
+
+@run_cli
+def bench() -> int:
+    """Console entry point of ``vtrefine-bench``."""
+    return launch("bench", "lerobot_vtrefine.cli.bench", "BenchConfig")
+
+
+@run_cli
+def import_dataset() -> int:
+    """Console entry point of ``vtrefine-import``."""
+    return launch("import_dataset", "lerobot_vtrefine.cli.import_dataset", "ImportConfig")
+
+
+@run_cli
+def replay() -> int:
+    """Console entry point of ``vtrefine-replay``."""
+    return launch("replay", "lerobot_vtrefine.cli.replay", "ReplayConfig")
+
+
+def launch(command: str, module: str, config: str) -> int:
+    """Show help, or hand over to ``lerobot_vtrefine.cli.COMMAND``, whose flags are a dataclass's fields."""
+    name = f"lerobot_vtrefine.cli.{command}"
+    if set(HELP_FLAGS) & set(sys.argv[1:]):
+        print(help_text(name, module, config))
+        return 0
+    return importlib.import_module(name).main()
+
+
+def help_text(command: str, module: str, config: str) -> str:
+    """What the command does, an example, and its flags."""
+    sentence, rest = describe_module(command)
+    called = "vtrefine-" + command.rpartition(".")[2].removesuffix("_dataset").replace("_", "-")
+    flags = flags_of(module, config)
+    shown = [line for flag in flags for line in _lines(flag)]
+    for flag in flags:
+        if flag.group is not None:
+            shown += ["", f"flags of --{flag.name}:"]
+            shown += [line for inner in flags_of(*flag.group, f"{flag.name}.") for line in _lines(inner)]
+    usage = f"usage: {called} [--config_path=FILE] [--FLAG=VALUE ...]"
+    files = "FILE is a YAML file of flags; vtrefine:NAME takes one that comes with the package."
+    return "\n".join([usage, "", sentence, "", rest, "", "flags:", *shown, "", files])
+
+
+def _lines(flag: Flag) -> list[str]:
+    head = f"  --{flag.name}.*" if flag.group is not None else f"  --{flag.name}={flag.type}"
+    said = flag.text
+    if flag.required:
+        said = f"{said} (required)"
+    elif flag.default:
+        said = f"{said} (default: {flag.default})"
+    wrapped = textwrap.wrap(said.strip().replace("``", ""), WIDTH - INDENT) or [""]
+    if len(head) < INDENT - 1:
+        return [f"{head:<{INDENT}}{wrapped[0]}".rstrip(), *(" " * INDENT + line for line in wrapped[1:])]
+    return [head, *(" " * INDENT + line for line in wrapped if line)]

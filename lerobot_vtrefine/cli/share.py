@@ -1,0 +1,57 @@
+"""``vtrefine-share``: upload a dataset or a policy to the Hugging Face Hub, with a card of what it is."""
+
+from collections.abc import Sequence
+from pathlib import Path
+
+from lerobot_vtrefine.cli.arguments import OneLineParser
+from lerobot_vtrefine.cli.errors import run_cli
+
+DESCRIPTION = """\
+Upload a dataset or a policy to the Hugging Face Hub. A policy goes with its processors, without which nobody
+can run it, and with a card that holds its success, interval and seeds; a dataset with one that describes its
+pads. Log in first: hf auth login."""
+EPILOG = """\
+examples:
+  vtrefine-share outputs/demos --repo_id=USER/demos
+  vtrefine-share outputs/finetune/checkpoints/last/pretrained_model --repo_id=USER/insertion \\
+      --evaluation=outputs/eval"""
+
+
+def make_parser() -> OneLineParser:
+    """Command line of ``vtrefine-share``."""
+    parser = OneLineParser("vtrefine-share", DESCRIPTION, EPILOG)
+    add = parser.add_argument
+    add("folder", type=Path, metavar="FOLDER", help="a dataset's root, or a checkpoint's pretrained_model")
+    add("--repo_id", required=True, metavar="USER/NAME", help="its name on the Hub")
+    add(
+        "--evaluation",
+        type=Path,
+        metavar="DIR",
+        help="--output_dir of a lerobot-eval that wrote episodes.jsonl there with --env.metrics_path",
+    )
+    add("--private", action="store_true", help="only for those whom you invite")
+    return parser
+
+
+@run_cli
+def main(arguments: Sequence[str] | None = None) -> None:
+    """Console entry point."""
+    options = make_parser().parse_args(arguments)
+    from lerobot_vtrefine.cli.sharing import check_repo_id, is_checkpoint, push_dataset, push_policy
+
+    check_repo_id(options.repo_id)
+    if not options.folder.is_dir():
+        raise FileNotFoundError(f"{options.folder}: no such folder")
+    if is_checkpoint(options.folder):
+        push_policy(options.folder, options.repo_id, options.evaluation, private=options.private)
+    elif (options.folder / "meta" / "info.json").is_file():
+        if options.evaluation is not None:
+            raise ValueError("--evaluation is about policies; leave it out for a dataset")
+        push_dataset(options.folder, options.repo_id, private=options.private)
+    else:
+        raise ValueError(f"{options.folder} is neither a LeRobotDataset (meta/info.json) nor a checkpoint")
+    print(f"{options.folder} -> {options.repo_id}")
+
+
+if __name__ == "__main__":
+    raise SystemExit(main())

@@ -1,0 +1,142 @@
+"""Datasets and policies on the Hugging Face Hub, with cards that say what they are and how good."""
+
+import json
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+from lerobot_vtrefine.cli.report.results import load_evaluation, percent
+from lerobot_vtrefine.files import read_json, read_json_lines
+
+CHECKPOINT_FILES = (
+    "config.json",
+    "model.safetensors",
+    "policy_preprocessor.json",
+    "policy_postprocessor.json",
+)
+"""What another machine needs to run a policy; the processors hold the point cloud's settings."""
+LOCAL = "local"
+CARD, EPISODES = "README.md", "episodes.jsonl"
+TASK_FIELDS = ("pair", "clearance_m", "start", "backend")
+MEASURED = (
+    ("in_hand_shift_m", "in-hand shift", 1e3, "mm"),
+    ("peak_force_n", "peak contact force", 1.0, "N"),
+    ("time_to_success_s", "time to success", 1.0, "s"),
+)
+
+
+def check_repo_id(repo_id: str) -> None:
+    """ValueError unless it is a name on the Hub."""
+    user, slash, name = repo_id.partition("/")
+    if not (user and slash and name) or "/" in name or user == LOCAL:
+        raise ValueError(f"--repo_id={repo_id}: give a name on the Hub, such as USER/insertion")
+
+
+def is_checkpoint(folder: Path) -> bool:
+    """Whether the folder holds a policy rather than a dataset."""
+    return (folder / "config.json").is_file() and not (folder / "meta" / "info.json").is_file()
+
+
+def push_dataset(root: Path, repo_id: str, *, private: bool) -> None:
+    """Upload a LeRobotDataset, with a card that describes its pads."""
+    from lerobot.datasets.lerobot_dataset import LeRobotDataset
+
+    from lerobot_vtrefine.lerobot_compat import card
+
+    card.install()
+    LeRobotDataset(repo_id, root=root).push_to_hub(private=private)
+
+
+def push_policy(folder: Path, repo_id: str, evaluation: Path | None, *, private: bool) -> None:
+    """Write a card into the checkpoint's folder and upload all of it, processors included.
+
+    Raises:
+        FileNotFoundError: the checkpoint lacks a file that others need to run it.
+    """
+    from huggingface_hub import HfApi
+
+    if missing := [name for name in CHECKPOINT_FILES if not (folder / name).is_file()]:
+        raise FileNotFoundError(f"{folder} lacks {missing[0]}: name a folder such as .../pretrained_model")
+    text = policy_card(folder, repo_id, evaluation)
+    (folder / CARD).write_text(text, encoding="utf-8")
+    api = HfApi()
+    api.create_repo(repo_id=repo_id, private=private, exist_ok=True)
+    api.upload_folder(repo_id=repo_id, folder_path=folder, allow_patterns=None, ignore_patterns=None)
+
+
+def policy_card(folder: Path, repo_id: str, evaluation: Path | None) -> str:
+    """The card: what the policy is, on which task it was tuned, how often it succeeds, how to run it."""
+    policy = _settings(folder / "config.json")
+    training = folder / "train_config.json"
+    env = _settings(training).get("env") if training.is_file() else None
+    parts = [
+        "---\nlibrary_name: lerobot\npipeline_tag: robotics\ntags: [LeRobot, tactile, flexitac, vt_dp3]\n---",
+        f"# {repo_id.partition('/')[2]}",
+        "A visuo-tactile diffusion policy (`vt_dp3` of lerobot_vtrefine) for two-armed insertion; "
+        f"{_kind(policy)}.",
+        _task(env),
+        _success(evaluation),
+        _use(repo_id),
+    ]
+    return "\n\n".join(part for part in parts if part) + "\n"
+
+
+def _settings(path: Path) -> dict[str, Any]:
+    found = read_json(path)
+    if not isinstance(found, dict):
+        raise ValueError(f"{path} does not hold settings")
+    return found
+
+
+def _kind(policy: Mapping[str, Any]) -> str:
+    tuned = "fine-tuned by DPPO" if policy.get("ft_denoising_steps") else "trained by imitation"
+    return f"it sees {policy.get('modalities', 'visuo_tactile').replace('_', '-')} input and was {tuned}"
+
+
+def _task(env: Any) -> str:
+    if not isinstance(env, Mapping):
+        return ""
+    known = {name: env.get(name) for name in TASK_FIELDS if env.get(name) is not None}
+    return f"Tuned in the environment `{json.dumps({'type': env.get('type'), **known})}`." if known else ""
+
+
+def _success(evaluation: Path | None) -> str:
+    if evaluation is None:
+        return "## Success\n\nNot evaluated: nothing is claimed."
+    found = load_evaluation(evaluation, first_seed(evaluation / EPISODES))
+    lines = [
+        "| | |",
+        "|---|---|",
+        f"| success [95 % Wilson interval] | {percent(found)} |",
+        f"| environment seeds | {found['seeds'][0]} to {found['seeds'][-1]} |",
+    ]
+    for key, words, scale, unit in MEASURED:
+        value = found["metrics"]["successes"].get(key)
+        if value is not None:
+            lines.append(f"| {words}, median of successes | {scale * value['median']:.1f} {unit} |")
+    failures = ", ".join(f"{reason} {count}" for reason, count in found["failures"].items()) or "none"
+    lines.append(f"| failures by reason | {failures} |")
+    return "## Success\n\nIn simulation, by `lerobot-eval`:\n\n" + "\n".join(lines)
+
+
+def first_seed(path: Path) -> int:
+    """The first environment seed of an evaluation's episodes.
+
+    Raises:
+        FileNotFoundError: there is no log. ValueError: it holds several evaluations.
+    """
+    if not path.is_file():
+        raise FileNotFoundError(f"no {path}: run lerobot-eval with --env.metrics_path={path}")
+    rows = [row for row in read_json_lines(path) if isinstance(row, dict)]
+    seeds = sorted({row["seed"] for row in rows if isinstance(row.get("seed"), int)})
+    if not seeds or seeds[-1] - seeds[0] >= len(seeds):
+        raise ValueError(f"{path} is not of one evaluation: its seeds do not follow each other")
+    return seeds[0]
+
+
+def _use(repo_id: str) -> str:
+    return (
+        "## Use\n\n```bash\npip install 'lerobot_policy_vtrefine[sim]'\n"
+        f"lerobot-eval --policy.path={repo_id} --policy.device=cpu"
+        " --config_path=vtrefine:round_grasped\n```"
+    )

@@ -1,0 +1,74 @@
+"""``vtrefine``: list this project's commands, or run one of them.
+
+examples:
+  vtrefine                        the list
+  vtrefine diagnose --help        the same as vtrefine-diagnose --help
+  vtrefine configs                names that --config_path=vtrefine:NAME takes
+"""
+
+import sys
+from importlib.metadata import EntryPoint, distribution
+
+from lerobot_vtrefine.cli.errors import run_cli
+from lerobot_vtrefine.cli.flags import describe_module
+from lerobot_vtrefine.named_configs import names
+
+DISTRIBUTION = "lerobot_policy_vtrefine"
+PREFIX = "vtrefine-"
+STOCK = """\
+Recording on robots, training and evaluation are LeRobot's own commands:
+  lerobot-record, lerobot-teleoperate, lerobot-rollout    --robot.type=aloha_tactile_follower
+  lerobot-train                                           --policy.type=vt_dp3
+  lerobot-eval                                            --env.type=vtrefine"""
+
+
+def commands() -> dict[str, EntryPoint]:
+    """Every other command of the installed distribution, by its name without ``vtrefine-``."""
+    found = distribution(DISTRIBUTION).entry_points.select(group="console_scripts")
+    return {e.name.removeprefix(PREFIX): e for e in sorted(found, key=lambda e: e.name) if PREFIX in e.name}
+
+
+def module_of(entry: EntryPoint) -> str:
+    """The module whose docstring describes a command; those that start late are named as their function."""
+    return f"{entry.module.rpartition('.')[0]}.{entry.attr}" if entry.attr != "main" else entry.module
+
+
+def overview() -> str:
+    """The list of commands, a sentence each."""
+    sentence, examples = describe_module(__name__)
+    rows = [f"  {PREFIX + name:<24} {describe_module(module_of(e))[0]}" for name, e in commands().items()]
+    usage = "usage: vtrefine [--version | COMMAND [FLAGS ...]]"
+    return "\n".join([usage, "", sentence, "", "commands:", *rows, "", STOCK, "", examples])
+
+
+def configurations() -> str:
+    """Names of configuration files and what their first line says."""
+    lines = []
+    for name, path in names().items():
+        first = path.read_text(encoding="utf-8").partition("\n")[0].removeprefix("# ")
+        lines.append(f"  {'vtrefine:' + name:<36} {first}")
+    return "\n".join(lines)
+
+
+@run_cli
+def main() -> int:
+    """Console entry point."""
+    name, *rest = sys.argv[1:] or ["--help"]
+    if name in ("-h", "--help"):
+        print(overview())
+        return 0
+    if name == "--version":
+        print(f"{DISTRIBUTION} {distribution(DISTRIBUTION).version}")
+        return 0
+    if name == "configs":
+        print(configurations())
+        return 0
+    known = commands()
+    if name not in known:
+        raise ValueError(f"unknown command {name!r}; choose from {', '.join(known)}, configs")
+    sys.argv = [PREFIX + name, *rest]
+    return known[name].load()() or 0
+
+
+if __name__ == "__main__":
+    raise SystemExit(main())

@@ -1,0 +1,109 @@
+"""Starting commands: names of configuration files, the umbrella, flags read from the source."""
+
+import sys
+from dataclasses import fields
+from pathlib import Path
+
+import pytest
+
+from lerobot_vtrefine import named_configs
+from lerobot_vtrefine.cli import launch, umbrella
+from lerobot_vtrefine.cli.flags import flags_of
+from lerobot_vtrefine.cli.pipeline.demo_config import DemoConfig
+
+RECORD = ("lerobot_vtrefine.cli.record_demos", "RecordDemosConfig")
+
+
+def test_names_become_paths_wherever_a_path_may_stand() -> None:
+    path = named_configs.folder() / "env" / "round_grasped.yaml"
+    assert path.is_file()
+    assert named_configs.expand(["--config_path=vtrefine:round_grasped", "--seed=3"]) == [
+        f"--config_path={path}",
+        "--seed=3",
+    ]
+    assert named_configs.expand(["--config_path", "vtrefine:round_grasped"]) == ["--config_path", str(path)]
+    others = ["--root=vtrefine:round_grasped", "--config_path=my.yaml", "vtrefine:round_grasped"]
+    assert named_configs.expand(others) == others
+
+
+def test_an_unknown_name_lists_those_there_are() -> None:
+    with pytest.raises(
+        ValueError, match=r"vtrefine:rund: no such configuration; choose from .*round_grasped"
+    ):
+        named_configs.expand(["--config_path=vtrefine:rund"])
+
+
+def test_names_are_unambiguous() -> None:
+    files = list(named_configs.folder().glob("*/*.yaml"))
+    assert len(named_configs.names()) == len(files) > 0
+
+
+def test_help_shows_what_the_dataclass_declares() -> None:
+    """The source is read, not imported; both must say the same."""
+    shown = {flag.name: flag for flag in flags_of("lerobot_vtrefine.cli.pipeline.demo_config", "DemoConfig")}
+    declared = {entry.name: entry for entry in fields(DemoConfig)}
+    assert shown.keys() == declared.keys()
+    assert shown["num_demos"].default == str(DemoConfig().num_demos)
+    assert shown["output_dir"].default == str(DemoConfig().output_dir)
+    assert [flag.name for flag in shown.values() if not flag.text] == []
+
+
+def test_nested_flags_are_followed_into_their_modules() -> None:
+    flags = {flag.name: flag for flag in flags_of(*RECORD, nested=True)}
+    assert flags["root"].required
+    assert flags["degradation.lateral_std_m"].default == "0.0"
+    assert flags["env.pair"].text.startswith("round, square")
+    assert "env.rules.grasped.slip_m" in flags
+    assert "eval" not in flags  # declared as unused
+    top = [flag for flag in flags.values() if flag.name.count(".") < 2]
+    assert [flag.name for flag in top if not flag.text] == []
+
+
+def test_comments_document_flags_too() -> None:
+    flags = {f.name: f for f in flags_of("lerobot_vtrefine.finetune.pipeline", "FinetunePipelineConfig")}
+    assert flags["resume"].text.startswith("Continue from the last checkpoint")
+    assert "--policy.path" in flags["policy"].text
+
+
+def test_help_is_text_without_markup(monkeypatch, capsys: pytest.CaptureFixture[str]) -> None:
+    monkeypatch.setattr(sys, "argv", ["vtrefine-record-demos", "--help"])
+    assert launch.record_demos() == 0
+    shown = capsys.readouterr().out
+    assert "``" not in shown
+    assert "--root=Path" in shown
+    assert "(required)" in shown
+
+
+def test_the_umbrella_lists_commands_and_configurations(monkeypatch, capsys) -> None:
+    monkeypatch.setattr(sys, "argv", ["vtrefine"])
+    assert umbrella.main() == 0
+    listed = capsys.readouterr().out
+    assert "vtrefine-diagnose" in listed
+    assert "lerobot-train" in listed
+    monkeypatch.setattr(sys, "argv", ["vtrefine", "configs"])
+    assert umbrella.main() == 0
+    assert "vtrefine:round_grasped" in capsys.readouterr().out
+    monkeypatch.setattr(sys, "argv", ["vtrefine", "--version"])
+    assert umbrella.main() == 0
+    assert capsys.readouterr().out.startswith("lerobot_policy_vtrefine ")
+
+
+def test_the_umbrella_runs_a_command_as_if_called_by_its_name(monkeypatch, capsys, tmp_path: Path) -> None:
+    arguments = ["diagnose", f"--recording={tmp_path / 'nowhere'}", f"--output_dir={tmp_path / 'out'}"]
+    monkeypatch.setattr(sys, "argv", ["vtrefine", *arguments])
+    assert umbrella.main() == 2
+    error = capsys.readouterr().err
+    assert "nowhere" in error
+    assert error.count("\n") == 1
+    monkeypatch.setattr(sys, "argv", ["vtrefine", "diagnos"])
+    assert umbrella.main() == 2
+    assert "unknown command 'diagnos'; choose from" in capsys.readouterr().err
+
+
+def test_stock_commands_get_the_path_when_they_discover_the_plugin(monkeypatch) -> None:
+    monkeypatch.setattr(sys, "argv", ["lerobot-eval", "--config_path=vtrefine:round_table"])
+    named_configs.expand_command_line()
+    assert Path(sys.argv[1].partition("=")[2]).is_file()
+    monkeypatch.setattr(sys, "argv", ["lerobot-eval", "--config_path=vtrefine:nothing"])
+    with pytest.raises(SystemExit, match="error: --config_path=vtrefine:nothing: no such configuration"):
+        named_configs.expand_command_line()

@@ -1,0 +1,54 @@
+"""A dataset in rerun: pads, cloud and motion are in the file, under one timeline."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from lerobot_vtrefine.cli import view_data
+from lerobot_vtrefine.cli.report.cloud import recorded_cloud
+from lerobot_vtrefine.cli.view_data import cloud_colours, clouds_of, pad_picture
+
+
+def test_pads_cloud_and_motion_are_saved(tiny_dataset: Path, tmp_path: Path, capsys) -> None:
+    pytest.importorskip("rerun")
+    target = tmp_path / "shown" / "demos.rrd"
+    assert view_data.main([f"--dataset.root={tiny_dataset}", f"--save={target}"]) == 0
+    assert "1 episode, " in capsys.readouterr().out
+    content = target.read_bytes()
+    for entity in (b"/pads/left_arm_left_finger", b"/cloud", b"/depth", b"/command"):
+        assert entity in content
+
+
+def test_clouds_hold_what_was_seen_and_felt(tiny_dataset: Path) -> None:
+    points, depth = next(clouds_of(tiny_dataset, 0))
+    assert points.shape == (512 + 4 * 384, 5)
+    assert depth.ndim == 2
+    colours = cloud_colours(points)
+    assert (colours[points[:, 4] == 0] == view_data.GREY).all()
+    assert recorded_cloud(tiny_dataset).count("[") == len(points) + 1
+
+
+def test_a_pressed_taxel_is_bright_at_its_place() -> None:
+    counts, idle = np.full(384, 4, np.uint8), np.full(384, 4, np.uint8)
+    counts[2 * 32 + 5] = 200
+    picture = pad_picture(counts, idle)
+    assert picture.shape == (12, 32, 3)
+    assert tuple(np.unravel_index(picture.sum(axis=2).argmax(), (12, 32))) == (2, 5)
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        ([], "give either --dataset.root=DIR or --dataset.repo_id=NAME"),
+        (["--dataset.root=nowhere"], "nowhere"),
+        (["--dataset.root=TINY", "--episodes", "99"], "episode 99 was asked for"),
+    ],
+)
+def test_bad_flags_are_one_line(arguments, message, tiny_dataset: Path, tmp_path: Path, capsys) -> None:
+    pytest.importorskip("rerun")
+    given = [argument.replace("TINY", str(tiny_dataset)) for argument in arguments]
+    assert view_data.main([*given, f"--save={tmp_path / 'x.rrd'}"]) == 2
+    error = capsys.readouterr().err
+    assert message in error
+    assert error.count("\n") == 1

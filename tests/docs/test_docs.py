@@ -1,0 +1,91 @@
+"""The documentation: the site builds with every link checked, notebooks run, the README's promises hold."""
+
+import json
+import os
+import re
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from lerobot_vtrefine.named_configs import PREFIX, names
+
+ROOT = Path(__file__).parents[2]
+DOCS = ROOT / "docs"
+PAGES = [ROOT / "README.md", ROOT / "CONTRIBUTING.md", *sorted(DOCS.glob("*.md"))]
+NOTEBOOKS = sorted((DOCS / "notebooks").glob("*.ipynb"))
+LINK = re.compile(r"\]\((?!https?://)([^)#\s]+)")
+MAX_README_LINES = 150
+
+
+def test_the_site_builds_with_strict_links(tmp_path: Path) -> None:
+    pytest.importorskip("material", reason="pip install 'lerobot_policy_vtrefine[docs]'")
+    command = [sys.executable, "-m", "mkdocs", "build", "--quiet", "--strict", "--site-dir", str(tmp_path)]
+    environment = os.environ | {"NO_MKDOCS_2_WARNING": "1"}
+    done = subprocess.run(command, cwd=ROOT, env=environment, capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stdout + done.stderr
+    commands = (tmp_path / "commands.html").read_text(encoding="utf-8")
+    assert "--num_episodes=int" in commands
+    assert "--env.rules.limits" in (tmp_path / "settings.html").read_text(encoding="utf-8")
+    for page in DOCS.glob("*.md"):
+        assert (tmp_path / f"{page.stem}.html").is_file()
+
+
+def test_the_readme_is_short() -> None:
+    assert len((ROOT / "README.md").read_text(encoding="utf-8").splitlines()) <= MAX_README_LINES
+
+
+def test_links_of_pages_outside_the_site_lead_somewhere() -> None:
+    missing = [
+        f"{page.name}: {target}"
+        for page in PAGES[:2]
+        for target in LINK.findall(page.read_text(encoding="utf-8"))
+        if not (page.parent / target).exists()
+    ]
+    assert missing == []
+
+
+def test_configurations_that_pages_name_exist() -> None:
+    named = {
+        name for page in PAGES for name in re.findall(rf"{PREFIX}(\w+)", page.read_text(encoding="utf-8"))
+    }
+    assert named - {"NAME"} <= names().keys()
+
+
+def test_commands_that_pages_name_exist() -> None:
+    scripts = (ROOT / "pyproject.toml").read_text(encoding="utf-8")
+    named = {
+        name
+        for page in PAGES
+        for block in re.findall("```bash\n(.*?)```", page.read_text(encoding="utf-8"), re.DOTALL)
+        for name in re.findall(r"^(vtrefine(?:-[a-z-]+)?) ", block, re.MULTILINE)
+    }
+    assert len(named) > 5
+    assert [name for name in named if f"\n{name} = " not in scripts] == []
+
+
+@pytest.mark.parametrize("path", NOTEBOOKS, ids=lambda path: path.stem)
+def test_notebooks_are_stored_without_outputs(path: Path) -> None:
+    cells = json.loads(path.read_text(encoding="utf-8"))["cells"]
+    assert [cell for cell in cells if cell.get("outputs") or cell.get("execution_count")] == []
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("path", NOTEBOOKS, ids=lambda path: path.stem)
+def test_notebooks_run(path: Path, tmp_path: Path) -> None:
+    nbclient = pytest.importorskip("nbclient")
+    nbformat = pytest.importorskip("nbformat")
+    notebook = nbformat.read(path, as_version=4)
+    client = nbclient.NotebookClient(
+        notebook, timeout=280, kernel_name="python3", resources={"metadata": {"path": str(tmp_path)}}
+    )
+    client.execute()
+    drawn = [
+        output
+        for cell in notebook.cells
+        if cell.cell_type == "code"
+        for output in cell.outputs
+        if "image/png" in output.get("data", {})
+    ]
+    assert drawn != []
