@@ -159,6 +159,8 @@ class FrameStore:
         """First and last row of every row's episode."""
         episode = self._hf_dataset.data.column("episode_index").to_numpy()
         index = self._hf_dataset.data.column("index").to_numpy()
+        if episode.max() >= len(self._meta.episodes):  # of a recording that was killed
+            raise NotCoveredError("episodes that its metadata lack")
         start = np.asarray(self._meta.episodes["dataset_from_index"])[episode]
         end = np.asarray(self._meta.episodes["dataset_to_index"])[episode]
         rows = np.arange(len(index))

@@ -142,7 +142,7 @@ def test_page_is_whole_and_names_what_it_shows(with_touch: bool) -> None:
     assert "Episode 7 was left out: why" in page
     moments = page.count(", recorded above twin")
     assert 3 <= moments <= 4 if with_touch else moments == 0
-    assert page.count("data:image/png") == (5 + moments if with_touch else 3)
+    assert page.count("data:image/png") == (5 + moments + 4 if with_touch else 3)  # four films
     assert ("right arm right finger" in page) == with_touch
     assert ("Not compared: the twin replayed the arms alone" in page) != with_touch
     assert "http" not in page.replace("http-equiv", "")

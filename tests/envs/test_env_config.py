@@ -13,6 +13,7 @@ from lerobot.envs.factory import make_env
 from lerobot.envs.utils import env_to_policy_features
 
 from lerobot_vtrefine.datasets.features import DEPTH_KEY, TACTILE_KEYS
+from lerobot_vtrefine.embodiments import get_embodiment
 from lerobot_vtrefine.envs import VtRefineEnvConfig, vector_env
 from lerobot_vtrefine.envs.episodes import Episodes
 from lerobot_vtrefine.sim.config import TaskConfig
@@ -84,7 +85,8 @@ def test_environment_files_suit_policies_of_every_chunk_length(path: Path, monke
     monkeypatch.setattr(vector_env, "make_episodes", lambda config, n: Episodes(FakeSim(n)))
     env = vector_env.VtRefineVectorEnv(config, 1)
     env.reset(seed=[1])
-    stamps = [int(env.step(np.zeros((1, 16)))[0]["tactile.left_arm_left_finger"][0, 0]) for _ in range(9)]
+    pad = f"tactile.{get_embodiment(config.scene_config.embodiment).pad_names[0]}"
+    stamps = [int(env.step(np.zeros((1, 16)))[0][pad][0, 0]) for _ in range(9)]
     assert stamps == list(range(2, 11))
 
 

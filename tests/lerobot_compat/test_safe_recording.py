@@ -15,7 +15,7 @@ import numpy as np
 import pytest
 from lerobot.datasets.lerobot_dataset import LeRobotDataset
 
-from lerobot_vtrefine.lerobot_compat import recovery, safe_recording
+from lerobot_vtrefine.lerobot_compat import fast_reader, recovery, safe_recording
 
 REPO = "local/safe"
 FRAMES = 4
@@ -169,6 +169,7 @@ def states_of(root: Path, folder: Path, monkeypatch: pytest.MonkeyPatch) -> Gene
 def test_a_kill_before_any_file_operation_loses_nothing_announced(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, kind: str, episodes: list[int]
 ) -> None:
+    fast_reader.install()  # what a policy's settings do: it must not stumble over what a kill left
     root = tmp_path / "dataset"
     dataset = create(root, kind)
     record(dataset, *range(episodes[0]))
