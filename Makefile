@@ -18,7 +18,7 @@ demo-quick: setup ## the same with tiny numbers, in minutes, to see that everyth
 	@$(VENV)/vtrefine-demo --quick --output_dir=outputs/demo_quick $(ARGS)
 
 test: setup ## the test-suite, without slow, gpu and hardware tests
-	@OMP_NUM_THREADS=1 MKL_NUM_THREADS=1 $(VENV)/python -m pytest -q -n $(JOBS) --dist loadfile $(ARGS)
+	@OMP_NUM_THREADS=1 MKL_NUM_THREADS=1 $(VENV)/python -m pytest -q -n $(JOBS) --dist loadfile --no-loadscope-reorder $(ARGS)
 
 test-slow: setup ## the tests marked slow
 	@$(VENV)/python -m pytest -m slow $(ARGS)

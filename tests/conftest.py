@@ -7,6 +7,24 @@ from typing import Any
 import numpy as np
 import pytest
 
+LONGEST = (
+    "policies/test_stock_commands.py",
+    "test_extras.py",
+    "cli/test_record_demos.py",
+    "robots/test_killed_recording.py",
+    "test_registration.py",
+    "lerobot_compat/test_safe_recording.py",
+    "test_packaging.py",
+)
+"""Files that start many processes: first, so that no worker is left alone with one of them at the end."""
+
+
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    """Longest files first; the order within a file stays."""
+    places = {Path(__file__).parent / name: place for place, name in enumerate(LONGEST)}
+    items.sort(key=lambda item: places.get(item.path, len(places)))
+
+
 TINY_CAMERA = (24, 32)
 """Height and width of the tiny dataset's depth images."""
 

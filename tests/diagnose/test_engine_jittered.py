@@ -30,6 +30,7 @@ def test_late_readings_show_although_damping_rests_on_its_bound() -> None:
     assert found["scan_skew"].probe.scores.min() > 0
 
 
+@pytest.mark.slow
 def test_first_load_softening_is_named() -> None:
     found = diagnose_pad(recorded("mullins", 0.5, 0))
     assert [cause.name for cause in found.causes][:1] == ["first_load_softening"]

@@ -4,6 +4,7 @@ from functools import partial
 import numpy as np
 import pytest
 import torch
+from draccus.utils import ParsingError
 from fake_sim import FakeSim
 from lerobot.envs.utils import preprocess_observation
 
@@ -50,8 +51,8 @@ def test_actions_are_those_of_the_configured_embodiment(monkeypatch: pytest.Monk
     monkeypatch.setitem(embodiments._EMBODIMENTS, "other", other)
     env = VtRefineVectorEnv(VtRefineEnvConfig(scene=SceneConfig(embodiment="other")), 2)
     np.testing.assert_array_equal(env.single_action_space.low, other.lower.astype(np.float32))
-    with pytest.raises(ValueError, match=r"unknown embodiment 'nobody': use one of aloha, .*other"):
-        VtRefineVectorEnv(VtRefineEnvConfig(scene=SceneConfig(embodiment="nobody")), 2)
+    with pytest.raises(ParsingError, match=r"unknown embodiment 'nobody': use one of aloha, .*other"):
+        VtRefineEnvConfig(scene=SceneConfig(embodiment="nobody"))
 
 
 def test_reset_without_seeds_draws_different_ones(make_env):

@@ -161,6 +161,7 @@ def test_training_without_pads_says_what_is_missing(tiny_dataset: Path, tmp_path
     assert message in printed.strip().splitlines()[-1]
 
 
+@pytest.mark.slow
 def test_episodes_are_deleted_and_merged(tiny_dataset: Path, tmp_path: Path) -> None:
     command(
         "lerobot-edit-dataset",

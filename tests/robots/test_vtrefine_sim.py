@@ -78,6 +78,7 @@ def merge(patch: pytest.MonkeyPatch, roots: list[Path], target: Path) -> LeRobot
     return LeRobotDataset("local/merged", root=target)
 
 
+@pytest.mark.slow
 def test_stock_record_with_leaders_merges_with_expert_demonstrations_both_ways(
     rig: Rig, demos: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
