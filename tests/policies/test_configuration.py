@@ -99,9 +99,10 @@ def test_data_without_the_needed_columns_is_refused_in_one_line() -> None:
 def test_shipped_files_parse(path: Path) -> None:
     config = draccus.parse(TrainPipelineConfig, path, args=["--dataset.repo_id=local/tiny"])
     assert isinstance(config.policy, VtDp3Config)
-    assert config.policy.preset == ("small" if "small" in path.stem else "paper")
+    assert config.policy.preset == ("paper" if path.stem in ("vt_dp3_paper", "vt_dp3_visual") else "small")
+    assert config.policy.fusion == ("pads" if path.stem == "vt_dp3_pads" else "cloud")
     assert config.policy.modalities == ("visual" if "visual" in path.stem else "visuo_tactile")
 
 
 def test_there_are_shipped_files() -> None:
-    assert [path.stem for path in CONFIGS] == ["vt_dp3_paper", "vt_dp3_small", "vt_dp3_visual"]
+    assert [path.stem for path in CONFIGS] == ["vt_dp3_pads", "vt_dp3_paper", "vt_dp3_small", "vt_dp3_visual"]
