@@ -1,5 +1,5 @@
 .DEFAULT_GOAL := help
-.PHONY: help setup demo test test-slow check format bench bench-diagnose tables docs docs-serve release-check demo-quick clean-demo
+.PHONY: help setup play demo test test-slow check format bench bench-diagnose tables docs docs-serve release-check demo-quick clean-demo
 
 VENV := .venv/bin
 JOBS ?= 2
@@ -13,6 +13,9 @@ setup: ## create .venv with pinned packages (automatic in every other target)
 
 demo: setup ## demonstrations, imitation, DPPO, evaluation, report: outputs/demo/report.html
 	@$(VENV)/vtrefine-demo $(ARGS)
+
+play: setup ## a trained policy in the simulation, live in a browser
+	@$(VENV)/vtrefine-play $(ARGS)
 
 demo-quick: setup ## the same with tiny numbers, in minutes, to see that everything works
 	@$(VENV)/vtrefine-demo --quick --output_dir=outputs/demo_quick $(ARGS)

@@ -10,7 +10,7 @@ simulator, Warp, serial port or plotting library at all.
 import sys
 
 from lerobot_vtrefine.lerobot_compat.registration import LEROBOT, register
-from lerobot_vtrefine.named_configs import expand_command_line
+from lerobot_vtrefine.shipped import expand_command_line
 
 __all__ = ["register"]
 

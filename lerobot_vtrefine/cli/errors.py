@@ -12,7 +12,7 @@ from yaml import YAMLError
 
 from lerobot_vtrefine.extras import explain
 from lerobot_vtrefine.files import check_settings
-from lerobot_vtrefine.named_configs import expand
+from lerobot_vtrefine.shipped import expand
 
 DEBUG_VARIABLE = "VTREFINE_DEBUG"
 USAGE_STATUS = 2

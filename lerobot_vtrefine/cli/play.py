@@ -1,12 +1,15 @@
-"""``vtrefine-play``: show the simulation live in a browser, moved by an expert, a policy or a recording.
+"""``vtrefine-play``: show the simulation live in a browser, moved by a policy, an expert or a recording.
 
 examples:
-  vtrefine-play --config_path=vtrefine:round_table
+  vtrefine-play                                        the trained policy that comes with the package
+  vtrefine-play --viewer=none --episodes=20            how often it succeeds
+  vtrefine-play --config_path=vtrefine:round_table     the scripted expert, both parts from the table
   vtrefine-play --config_path=vtrefine:round_grasped --policy.path=CHECKPOINT
-  vtrefine-play --config_path=vtrefine:round_grasped --viewer=none --episodes=20
 """
 
 import logging
+import sys
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -20,7 +23,12 @@ from lerobot_vtrefine.cli.playing.agents import Agent, PolicyAgent, recorded_age
 from lerobot_vtrefine.cli.playing.session import Session
 from lerobot_vtrefine.cli.report.statistics import wilson_interval
 from lerobot_vtrefine.envs import VtRefineEnvConfig
+from lerobot_vtrefine.shipped import expand
 
+SHOWN = ("--config_path=vtrefine:square_grasped_1mm", "--policy.path=vtrefine:square_grasped_1mm")
+"""What is played where nothing is said about it."""
+CHOICES = ("--config_path", "--env", "--agent", "--policy.path", "--dataset")
+"""Flags that say what is played."""
 VIEWERS = ("browser", "none")
 
 
@@ -29,7 +37,7 @@ class PolicySource:
     """A trained policy."""
 
     path: str | None = None
-    """Its checkpoint: a folder, or a name on the Hub."""
+    """Its checkpoint: a folder, vtrefine:NAME for one that comes with the package, or a name on the Hub."""
     device: str | None = None
     """Where it runs; a GPU if there is one, by default."""
 
@@ -124,6 +132,12 @@ def _choose(config: PlayConfig) -> tuple[Agent, VtRefineEnvConfig, int]:
     return scripted_agent(config.agent), env, config.seed or 0
 
 
+def with_something_to_play(arguments: Sequence[str]) -> list[str]:
+    """A command line that says what is played: `SHOWN` where it does not."""
+    chosen = any(argument.startswith(CHOICES) for argument in arguments)
+    return list(arguments) if chosen else expand([*SHOWN, *arguments])
+
+
 def summary(rows: list[dict]) -> str:
     """How many episodes succeeded, with the 95 % interval."""
     good = sum(bool(row["success"]) for row in rows)
@@ -143,6 +157,7 @@ def main() -> None:
     """Console entry point."""
     init_logging()
     logging.getLogger("PIL").setLevel(logging.INFO)
+    sys.argv[1:] = with_something_to_play(sys.argv[1:])
     _main()
 
 

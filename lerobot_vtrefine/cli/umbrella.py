@@ -11,7 +11,7 @@ from importlib.metadata import EntryPoint, distribution
 
 from lerobot_vtrefine.cli.errors import run_cli
 from lerobot_vtrefine.cli.flags import describe_module
-from lerobot_vtrefine.named_configs import names
+from lerobot_vtrefine.shipped import names
 
 DISTRIBUTION = "lerobot_policy_vtrefine"
 PREFIX = "vtrefine-"

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from lerobot_vtrefine import named_configs
+from lerobot_vtrefine import shipped
 from lerobot_vtrefine.cli import launch, umbrella
 from lerobot_vtrefine.cli.flags import flags_of
 from lerobot_vtrefine.cli.pipeline.demo_config import DemoConfig
@@ -15,27 +15,27 @@ RECORD = ("lerobot_vtrefine.cli.record_demos", "RecordDemosConfig")
 
 
 def test_names_become_paths_wherever_a_path_may_stand() -> None:
-    path = named_configs.folder() / "env" / "round_grasped.yaml"
+    path = shipped.folder() / "env" / "round_grasped.yaml"
     assert path.is_file()
-    assert named_configs.expand(["--config_path=vtrefine:round_grasped", "--seed=3"]) == [
+    assert shipped.expand(["--config_path=vtrefine:round_grasped", "--seed=3"]) == [
         f"--config_path={path}",
         "--seed=3",
     ]
-    assert named_configs.expand(["--config_path", "vtrefine:round_grasped"]) == ["--config_path", str(path)]
+    assert shipped.expand(["--config_path", "vtrefine:round_grasped"]) == ["--config_path", str(path)]
     others = ["--root=vtrefine:round_grasped", "--config_path=my.yaml", "vtrefine:round_grasped"]
-    assert named_configs.expand(others) == others
+    assert shipped.expand(others) == others
 
 
 def test_an_unknown_name_lists_those_there_are() -> None:
     with pytest.raises(
         ValueError, match=r"vtrefine:rund: no such configuration; choose from .*round_grasped"
     ):
-        named_configs.expand(["--config_path=vtrefine:rund"])
+        shipped.expand(["--config_path=vtrefine:rund"])
 
 
 def test_names_are_unambiguous() -> None:
-    files = list(named_configs.folder().glob("*/*.yaml"))
-    assert len(named_configs.names()) == len(files) > 0
+    files = list(shipped.folder().glob("*/*.yaml"))
+    assert len(shipped.names()) == len(files) > 0
 
 
 def test_help_shows_what_the_dataclass_declares() -> None:
@@ -102,8 +102,8 @@ def test_the_umbrella_runs_a_command_as_if_called_by_its_name(monkeypatch, capsy
 
 def test_stock_commands_get_the_path_when_they_discover_the_plugin(monkeypatch) -> None:
     monkeypatch.setattr(sys, "argv", ["lerobot-eval", "--config_path=vtrefine:round_table"])
-    named_configs.expand_command_line()
+    shipped.expand_command_line()
     assert Path(sys.argv[1].partition("=")[2]).is_file()
     monkeypatch.setattr(sys, "argv", ["lerobot-eval", "--config_path=vtrefine:nothing"])
     with pytest.raises(SystemExit, match="error: --config_path=vtrefine:nothing: no such configuration"):
-        named_configs.expand_command_line()
+        shipped.expand_command_line()

@@ -9,7 +9,7 @@ from pathlib import Path
 
 import pytest
 
-from lerobot_vtrefine.named_configs import PREFIX, names
+from lerobot_vtrefine.shipped import PREFIX, names
 
 ROOT = Path(__file__).parents[2]
 DOCS = ROOT / "docs"

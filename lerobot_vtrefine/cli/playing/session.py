@@ -56,7 +56,7 @@ class Session:
         while episodes is None or len(self.rows) < episodes:
             if self._episode(seed):
                 self.rows.append(self._world.row())
-                self._tell(_describe(self.rows[-1]))
+                self._tell(f"{_describe(self.rows[-1])} ({self._tally()})")
                 self._save_video()
                 seed += 1
                 if self._view is not None:
@@ -71,6 +71,9 @@ class Session:
         """Free what draws the videos."""
         if self._renderer is not None:
             self._renderer.close()
+
+    def _tally(self) -> str:
+        return f"{sum(bool(row['success']) for row in self.rows)} of {len(self.rows)} succeeded"
 
     def _episode(self, seed: int) -> bool:
         """Whether the episode of `seed` ended; it does not where somebody resets it."""
