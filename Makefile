@@ -1,6 +1,9 @@
 .DEFAULT_GOAL := help
 .PHONY: help setup play demo test test-slow check format bench bench-diagnose tables docs docs-serve release-check demo-quick clean-demo
 
+# Commands start twice as fast when Python may keep what it has compiled.
+unexport PYTHONDONTWRITEBYTECODE
+
 VENV := .venv/bin
 JOBS ?= 2
 ARGS ?=

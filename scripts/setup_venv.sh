@@ -70,8 +70,9 @@ install() {
     if [ -t 2 ]; then quiet=; fi
     say "Installing the pinned packages (the first time downloads about 3 GB, most of it PyTorch) ..."
     uv=$(find_uv)
+    # Without bytecode, commands compile LeRobot and PyTorch anew, each time where Python is told not to write it.
     # shellcheck disable=SC2086
-    if [ -n "$uv" ] && "$uv" pip install $quiet --python "$PYTHON" -c constraints.txt -e '.[dev]'; then
+    if [ -n "$uv" ] && "$uv" pip install $quiet --compile-bytecode --python "$PYTHON" -c constraints.txt -e '.[dev]'; then
         return 0
     fi
     say "uv could not install them; trying pip ..."

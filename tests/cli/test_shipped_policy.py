@@ -40,7 +40,9 @@ def test_what_is_played_by_default_can_be_found() -> None:
 
 
 def test_the_policy_inserts(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
-    """Its success rate is above .9 (docs/play.md); holding still or an untrained network gives 0 of 3, and another processor may round one episode differently."""
+    """Its success rate is above .9 (docs/play.md); an untrained network succeeds in none of these episodes.
+    On another processor one may end differently.
+    """
     from lerobot_vtrefine.cli.play import main
 
     flags = ["--viewer=none", "--episodes=3", "--env.num_threads=1", "--policy.device=cpu"]
