@@ -24,7 +24,7 @@ from typing import Any
 
 import torch
 
-from lerobot_vtrefine.cli.pipeline.demo_config import default_env, default_policy
+from lerobot_vtrefine.cli.pipeline.demo_config import CLOUD_RECIPE, default_env
 from lerobot_vtrefine.cli.report.statistics import mean_interval, proportion
 
 MODALITIES = ("visuo_tactile", "visual")
@@ -58,8 +58,8 @@ Run = tuple[str, str, int]
 
 def setting_flags(setting: str) -> list[str]:
     """The demo's flags that make a setting."""
-    defaults = {"env": default_env(), "policy": default_policy()}
-    return [f"--{name}={json.dumps(defaults[name] | change)}" for name, change in SETTINGS[setting].items()]
+    changes, defaults = SETTINGS[setting], {"env": default_env(), **CLOUD_RECIPE}
+    return [f"--{name}={json.dumps(values | changes.get(name, {}))}" for name, values in defaults.items()]
 
 
 def demo_command(folder: Path, run: Run, extra: list[str]) -> list[str]:

@@ -1,7 +1,8 @@
-"""Nested training states as one safetensors file: reading it cannot run code, as a pickle's could.
+"""Nested training states as safetensors files: reading them cannot run code, as a pickle's could.
 
 Tensors are stored as such; a JSON text in the file's metadata holds everything else and says where they
-belong.
+belong. What is too much for one file goes on in others beside it: small files can be copied from a machine
+that will be gone.
 """
 
 import json
@@ -10,17 +11,22 @@ from typing import Any
 
 import torch
 from safetensors import SafetensorError, safe_open
-from safetensors.torch import save_file
+from safetensors.torch import load_file, save_file
 
-TREE = "tree"
+TREE, FILES = "tree", "files"
+FILE_BYTES = 15_000_000
+"""Tensors in one file, unless a single one is larger."""
 Tensors = dict[str, torch.Tensor]
 
 
-def save_state(state: Any, path: Path) -> None:
+def save_state(state: Any, path: Path, file_bytes: int = FILE_BYTES) -> None:
     """Write dicts, lists and tuples of tensors, numbers, texts and None; TypeError for anything else."""
     tensors: Tensors = {}
     tree = _encode(state, tensors)
-    save_file(tensors, path, metadata={TREE: json.dumps(tree)})
+    first, *others = _portions(tensors, file_bytes)
+    for number, portion in enumerate(others, start=2):
+        save_file(portion, _file(path, number))
+    save_file(first, path, metadata={TREE: json.dumps(tree), FILES: str(1 + len(others))})
 
 
 def load_state(path: Path) -> Any:
@@ -32,9 +38,30 @@ def load_state(path: Path) -> Any:
     try:
         with safe_open(path, framework="pt") as file:
             tensors = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118  it is no dict
-            return _decode(json.loads((file.metadata() or {})[TREE]), tensors)
-    except (SafetensorError, KeyError, TypeError, ValueError, RecursionError) as error:
+            notes = file.metadata() or {}
+        for number in range(2, int(notes[FILES]) + 1):
+            tensors |= load_file(_file(path, number))
+        return _decode(json.loads(notes[TREE]), tensors)
+    except (SafetensorError, FileNotFoundError, KeyError, TypeError, ValueError, RecursionError) as error:
         raise ValueError(f"{path} is damaged or no training state: {error}") from error
+
+
+def _file(path: Path, number: int) -> Path:
+    return path.with_stem(f"{path.stem}-{number}")
+
+
+def _portions(tensors: Tensors, file_bytes: int) -> list[Tensors]:
+    """The tensors in their order, as much in each file as it may hold; at least one file."""
+    portions: list[Tensors] = [{}]
+    room = file_bytes
+    for name, tensor in tensors.items():
+        size = tensor.numel() * tensor.element_size()
+        if size > room and portions[-1]:
+            portions.append({})
+            room = file_bytes
+        portions[-1][name] = tensor
+        room -= size
+    return portions
 
 
 def _encode(value: Any, tensors: Tensors) -> Any:
