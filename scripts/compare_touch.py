@@ -2,6 +2,11 @@
 """Does touch pay? Train visuo-tactile and visual-only policies the same way on several seeds and compare.
 
     .venv/bin/python scripts/compare_touch.py --seeds 0 1 2 --settings demo tight occluded slip short_chunk
+    .venv/bin/python scripts/compare_touch.py --seeds 1 2 3 --settings worlds_round worlds_square --jobs 4
+
+The settings worlds_* are the recipe of docs/learning.md and need GPUs; worlds_key needs an encoder of its own
+first, in outputs/information_key: ``vtrefine-information --config_path=vtrefine:key_grasped_1mm`` with the
+flags that docs/learning.md gives.
 
 Every run is one ``vtrefine-demo`` in one of the settings below; flags that this script does not know are
 passed on to it, after the setting's, for example ``--num_demos=40``. On a machine with many cores ``--jobs``
@@ -24,7 +29,7 @@ from typing import Any
 
 import torch
 
-from lerobot_vtrefine.cli.pipeline.demo_config import CLOUD_RECIPE, default_env
+from lerobot_vtrefine.cli.pipeline.demo_config import CLOUD_RECIPE, default_env, default_policy
 from lerobot_vtrefine.cli.report.statistics import mean_interval, proportion
 
 MODALITIES = ("visuo_tactile", "visual")
@@ -50,6 +55,36 @@ SETTINGS: dict[str, dict[str, dict[str, Any]]] = {
 """What differs from the demo: half the clearance, a hidden hole, twice the slip in the hand, or decisions
 twice as often."""
 
+MANY_WORLDS: dict[str, Any] = {
+    "env": {"start": "grasped", "backend": "warp"},
+    "policy": default_policy(),
+    "dppo": {"type": "trust_region", "encoder": "frozen"},
+    "num_demos": 100,
+    "pretrain_steps": 2000,
+    "finetune_iterations": 36,
+    "finetune_envs": 1024,
+    "eval_episodes": 1024,
+    "eval_envs": 512,
+    "ablation_episodes": 0,
+    "videos": 0,
+    "device": "cuda",
+}
+"""The demo on a GPU: 1024 worlds and a trust region."""
+_TIGHT = {"clearance_m": 0.001, "scene": {"timestep_s": 0.002}}
+_ASKEW = {"rules": {"grasped": {"slip_m": 0.004, "slip_rad": 0.1}}}
+WORLDS: dict[str, dict[str, dict[str, Any]]] = {
+    "worlds_round": {"env": {"pair": "round", "clearance_m": 0.002}},
+    "worlds_square": {
+        "env": {"pair": "square", **_TIGHT, **_ASKEW},
+        "policy": {"pretrained_encoder": "vtrefine:square_grasped_1mm"},
+    },
+    "worlds_key": {
+        "env": {"pair": "key", **_TIGHT},
+        "policy": {"pretrained_encoder": "outputs/information_key"},
+    },
+}
+"""Tasks for MANY_WORLDS."""
+
 POLL_S = 0.5
 
 Run = tuple[str, str, int]
@@ -58,8 +93,13 @@ Run = tuple[str, str, int]
 
 def setting_flags(setting: str) -> list[str]:
     """The demo's flags that make a setting."""
-    changes, defaults = SETTINGS[setting], {"env": default_env(), **CLOUD_RECIPE}
-    return [f"--{name}={json.dumps(values | changes.get(name, {}))}" for name, values in defaults.items()]
+    defaults: dict[str, Any] = {"env": default_env(), **CLOUD_RECIPE} if setting in SETTINGS else MANY_WORLDS
+    changes = (SETTINGS | WORLDS)[setting]
+    return [f"--{name}={_value(values, changes.get(name, {}))}" for name, values in defaults.items()]
+
+
+def _value(default: Any, changes: dict[str, Any]) -> str:
+    return json.dumps(default | changes) if isinstance(default, dict) else str(default)
 
 
 def demo_command(folder: Path, run: Run, extra: list[str]) -> list[str]:
@@ -212,7 +252,7 @@ def main() -> None:
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
     parser.add_argument("--seeds", type=int, nargs="+", default=[0, 1, 2])
-    parser.add_argument("--settings", nargs="+", choices=list(SETTINGS), default=["demo"])
+    parser.add_argument("--settings", nargs="+", choices=[*SETTINGS, *WORLDS], default=["demo"])
     parser.add_argument("--output_dir", type=Path, default=Path("outputs/compare_touch"))
     parser.add_argument("--jobs", type=int, default=1, help="pipelines side by side (default 1)")
     options, extra = parser.parse_known_args()

@@ -131,6 +131,18 @@ def test_every_setting_is_a_task_that_the_demo_accepts(script: ModuleType) -> No
         assert "fusion" not in config.policy, "the paper's cloud is what is compared"
 
 
+def test_many_worlds_are_the_recipe_of_the_docs(script: ModuleType) -> None:
+    for setting in script.WORLDS:
+        flags = dict(flag.removeprefix("--").split("=", 1) for flag in script.setting_flags(setting))
+        values = {name: json.loads(text) for name, text in flags.items() if name != "device"}
+        config = DemoConfig(**values, device=flags["device"])
+        assert (config.finetune_envs, config.finetune_iterations, config.device) == (1024, 36, "cuda")
+        assert config.dppo == {"type": "trust_region", "encoder": "frozen"}
+        assert config.policy["fusion"] == "pads"
+        assert config.env["backend"] == "warp"
+        assert config.env["pair"] == setting.removeprefix("worlds_")
+
+
 def test_settings_are_compared_one_by_one(
     script: ModuleType, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, fake_demo: None
 ) -> None:
