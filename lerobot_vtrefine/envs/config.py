@@ -18,6 +18,8 @@ from lerobot_vtrefine.sim.config import (
     ShearConfig,
     TaskConfig,
     WarpConfig,
+    check_control_rate,
+    fitting_timestep,
 )
 from lerobot_vtrefine.sim.reality import Reality, load_reality
 
@@ -39,7 +41,7 @@ class VtRefineEnvConfig(EnvConfig):
     task: str | None = "insert the plug into the socket"
     """Natural-language task: stored in datasets, shown to policies."""
     fps: int = int(TaskConfig.control_hz)
-    """Control steps, and so observations and actions, per second."""
+    """Control steps, and so observations and actions, per second: 1 to 100."""
     pair: str | None = None
     """round, square, hexagon, d_shape, cross, key or automate/ID."""
     clearance_m: float | None = None
@@ -89,6 +91,7 @@ class VtRefineEnvConfig(EnvConfig):
         _check_choice("vectorization", self.vectorization, VECTORIZATIONS)
         _check_choice("ablate", self.ablate, ABLATIONS)
         _check_choice("backend", self.backend, BACKENDS)
+        check_control_rate("--env.fps", self.fps)
         if self.ablate != "none" and self.ablate_dataset is None:
             raise ValueError(
                 f"--env.ablate={self.ablate} needs --env.ablate_dataset, the policy's training data"
@@ -105,8 +108,9 @@ class VtRefineEnvConfig(EnvConfig):
 
     @property
     def scene_config(self) -> SceneConfig:
-        """The scene with the shortcuts put in, as it really is."""
+        """The scene with the shortcuts and a physics step that fits the control rate, as it really is."""
         given = {name: getattr(self, name) for name in SHORTCUTS if getattr(self, name) is not None}
+        given["timestep_s"] = fitting_timestep(self.scene.timestep_s, self.fps)
         return self.hidden.applied(replace(self.scene, **given))
 
     @property

@@ -43,8 +43,17 @@ class PhasedRobot(Protocol):
 class FollowingTeleoperator(Protocol):
     """A teleoperator that goes on from where the robot is."""
 
-    def follow(self, positions: Mapping[str, float]) -> None:
-        """The robot's joint positions by their action keys."""
+    def follow(self, positions: Mapping[str, float], fps: float) -> None:
+        """The robot's joint positions by their action keys, and the loop's rate [Hz]."""
+        ...
+
+
+@runtime_checkable
+class HoldingRobot(Protocol):
+    """A robot that says where its servos hold the joints, which differs from where these are under a load."""
+
+    def held_targets(self) -> Mapping[str, float]:
+        """Joint targets by their action keys."""
         ...
 
 
@@ -92,8 +101,8 @@ def _phased(loop: Callable[..., None]) -> Callable[..., None]:
                 phase = robot.phase(settings["events"], settings["fps"], settings.get("dataset"))
                 stack.enter_context(phase)
             if isinstance(teleop := settings.get("teleop"), FollowingTeleoperator):
-                observation = robot.get_observation()
-                teleop.follow({key: observation[key] for key in robot.action_features})
+                held = robot.held_targets() if isinstance(robot, HoldingRobot) else robot.get_observation()
+                teleop.follow({key: held[key] for key in robot.action_features}, settings["fps"])
             return loop(*args, **settings)
 
     run.unphased = loop  # ty: ignore[missing-attribute]

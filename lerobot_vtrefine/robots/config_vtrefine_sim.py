@@ -1,6 +1,6 @@
 """Configuration of the simulated robot."""
 
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -12,11 +12,10 @@ from lerobot.robots.config import RobotConfig
 from lerobot_vtrefine.envs.config import VtRefineEnvConfig
 from lerobot_vtrefine.files import read_yaml
 from lerobot_vtrefine.lerobot_compat.config_errors import told_by_lerobot
+from lerobot_vtrefine.sim.config import check_control_rate
 
 TYPE = "vtrefine"
 VIEWS = ("none", "browser")
-FASTEST_HZ = 40
-"""A control step must hold at least one sample of how the parts touch each other."""
 
 
 @RobotConfig.register_subclass("vtrefine_sim")
@@ -28,7 +27,8 @@ class VtRefineSimConfig(RobotConfig):
         env_file: Environment file, as lerobot-eval's --config_path takes it: configs/env/round_table.yaml.
         env: Fields of --env.type=vtrefine that win over the file's, such as "{pair: square}".
         seed: Episode i of a dataset starts from seed + i: its parts stand where this seed puts them.
-        fps: Control steps and observations per simulated second; the command must run at the same rate.
+        fps: Control steps and observations per simulated second, 1 to 100; the command must run at the same
+            rate.
         episode_s: Time-out of an episode [s]: people take longer than what an environment gives a policy.
         end_episodes: End a recorded episode at success, failure or time-out; otherwise at LeRobot's keys and
             times only.
@@ -54,8 +54,7 @@ class VtRefineSimConfig(RobotConfig):
             raise ValueError(f"--robot.view={self.view} is unknown; choose from {', '.join(VIEWS)}")
         if self.seed < 0:
             raise ValueError(f"--robot.seed must not be negative, got {self.seed}")
-        if not 1 <= self.fps <= FASTEST_HZ:
-            raise ValueError(f"--robot.fps must lie between 1 and {FASTEST_HZ}, got {self.fps}")
+        check_control_rate("--robot.fps", self.fps)
         if not 1 <= self.episode_s <= 3600:
             raise ValueError(f"--robot.episode_s must lie between 1 and 3600, got {self.episode_s}")
         self.simulation()
@@ -75,15 +74,7 @@ class VtRefineSimConfig(RobotConfig):
             raise ValueError(f"--robot.env: {error}") from error
         if not isinstance(env, VtRefineEnvConfig):
             raise ValueError(f"--robot.env: type {env.type} is no simulation of this package; use {TYPE}")
-        return replace(
-            env, scene=replace(env.scene, timestep_s=fitting_timestep(env.scene.timestep_s, self.fps))
-        )
-
-
-def fitting_timestep(longest_s: float, fps: float) -> float:
-    """The longest physics step up to `longest_s` of which a control step at `fps` [Hz] is a whole number."""
-    steps = 1.0 / (fps * longest_s)
-    return longest_s if abs(steps - round(steps)) < 1e-6 else 1.0 / (fps * (int(steps) + 1))
+        return env
 
 
 def _env_of(path: Path) -> dict[str, Any]:

@@ -173,6 +173,10 @@ class VtRefineSim(Robot):
             self._viewer.update()
         self._pace.step_done(time.perf_counter() - began + self._observing_s)
         self._end_or_go_on()
+        return self.held_targets()
+
+    def held_targets(self) -> RobotAction:
+        """The targets that the servos hold now: hands that grip something are told to close farther."""
         targets = self.world.sim.command_targets()[0]
         return dict(zip(self.action_features, map(float, targets), strict=True))
 

@@ -12,6 +12,10 @@ MESH_PAIR_PREFIX = "automate/"
 MAX_TABLE_HEIGHT_M = 0.2
 SOCKETS = ("held", "stands")
 BACKENDS = ("single", "batch", "warp")
+CONTROL_HZ = (1, 100)
+"""Slowest and fastest control rate: command rates, servo model and grasp are tried in between."""
+EPISODE_S = {"table": 24.0, "grasped": 4.8}
+"""Time-out by start, where no number of control steps is given."""
 
 
 @dataclass(frozen=True)
@@ -38,7 +42,8 @@ class SceneConfig:
     mesh_scale: str = "flexitac"
     """flexitac (that setup's factors for its five pairs), unit, or one factor for both parts."""
     timestep_s: float = 0.0025
-    """Physics step; at clearances of 1 mm and below use 0.002 or less."""
+    """Longest physics step; at clearances of 1 mm and below use 0.002 or less. Where control steps are no
+    whole number of these, --env.fps shortens it."""
     camera: CameraConfig | None = None
     """By default the body's camera for `start`."""
     servo_gain_scale: float = 1.0
@@ -159,7 +164,7 @@ class TaskConfig:
 
     control_hz: float = 10.0
     episode_steps: int | None = None
-    """Control steps until the time-out; by default 240 from the table, 48 in hand."""
+    """Control steps until the time-out; by default 24 s from the table, 4.8 s in hand."""
     joint_rate: float = 1.0
     """Largest commanded speed of a revolute joint [rad/s]."""
     finger_rate: float = 0.15
@@ -170,8 +175,7 @@ class TaskConfig:
     limits: LimitsConfig = field(default_factory=LimitsConfig)
 
     def __post_init__(self) -> None:
-        if not 1.0 <= self.control_hz <= 100.0:
-            raise ValueError(f"control_hz must lie between 1 and 100 Hz, got {self.control_hz}")
+        check_control_rate("control_hz", self.control_hz)
         if self.episode_steps is not None and self.episode_steps < 1:
             raise ValueError(f"episode_steps must be at least 1, got {self.episode_steps}")
         for name in ("joint_rate", "finger_rate"):
@@ -185,7 +189,7 @@ class TaskConfig:
 
     def steps_of(self, start: str) -> int:
         """Control steps of an episode from this start."""
-        return self.episode_steps or {"table": 240, "grasped": 48}[start]
+        return self.episode_steps or round(EPISODE_S[start] * self.control_hz)
 
 
 @dataclass(frozen=True)
@@ -266,6 +270,21 @@ RANGES = (
     "pad_stiffness_scale",
     "sensor_gain_scale",
 )
+
+
+def check_control_rate(name: str, rate_hz: float) -> None:
+    """Raises: ValueError for a control rate [Hz] outside of `CONTROL_HZ`."""
+    slowest, fastest = CONTROL_HZ
+    if not slowest <= rate_hz <= fastest:
+        raise ValueError(
+            f"{name} must lie between {slowest} and {fastest} control steps a second, got {rate_hz:g}"
+        )
+
+
+def fitting_timestep(longest_s: float, control_hz: float) -> float:
+    """The longest physics step up to `longest_s` [s] of which a control step is a whole number."""
+    steps = 1.0 / (control_hz * longest_s)
+    return longest_s if abs(steps - round(steps)) < 1e-6 else 1.0 / (control_hz * (int(steps) + 1))
 
 
 def _check_choice(flag: str, value: str, choices: tuple[str, ...]) -> None:

@@ -15,8 +15,8 @@ from lerobot_vtrefine.sim.substeps import Substeps
 
 Array = np.ndarray
 
-GRASP_SETTLE_STEPS = 3
-"""Control steps that a part must have been held before its place in the hand becomes the reference."""
+GRASP_SETTLE_S = 0.3
+"""A part must have been held for so long before its place in the hand becomes the reference."""
 LIFT_M = 0.01
 """A part this much above its resting height has been lifted."""
 WORKSPACE_M = (0.35, 0.4, 0.6)
@@ -164,7 +164,7 @@ def update(state: EpisodeState, ids: Array, seen: Measured, config: TaskConfig, 
     _update_forces(state, ids, seen)
     state.rim_slide[ids] += seen.substeps.rim_slide
     state.tip[ids] = seen.substeps.tip
-    _update_grasp(state, ids, seen, scene)
+    _update_grasp(state, ids, seen, scene, config.control_dt_s)
     fresh = _update_success(state, ids, seen, config.success, config.control_dt_s)
     _update_failure(state, ids, seen, config.limits, config.control_dt_s)
     state.done[ids] |= state.success[ids] | (state.failure[ids] != task.NO_FAILURE)
@@ -179,7 +179,7 @@ def _update_forces(state: EpisodeState, ids: Array, seen: Measured) -> None:
     state.pad_load[ids], state.pad_force[ids] = seen.pad_load, seen.pad_load[..., 0]
 
 
-def _update_grasp(state: EpisodeState, ids: Array, seen: Measured, scene: Scene) -> None:
+def _update_grasp(state: EpisodeState, ids: Array, seen: Measured, scene: Scene, dt_s: float) -> None:
     """Take each part's reference once its own hand has held it long enough; a part set down again loses it.
 
     From then on the shift counts, also while the part is being lifted: starts in hand begin with a reference.
@@ -189,7 +189,7 @@ def _update_grasp(state: EpisodeState, ids: Array, seen: Measured, scene: Scene)
     state.held_steps[ids] = np.where(held, state.held_steps[ids] + 1, 0)
     state.unheld_steps[ids] = np.where(held | ~lifted, 0, state.unheld_steps[ids] + 1)
     grasped = state.grasped[ids]
-    starts = ~grasped & (state.held_steps[ids] >= GRASP_SETTLE_STEPS)
+    starts = ~grasped & (state.held_steps[ids] >= max(1, round(GRASP_SETTLE_S / dt_s)))
     state.reference[ids] = np.where(starts[..., None, None], seen.grip_points, state.reference[ids])
     set_down = grasped & ~held & ~lifted
     grasped = (grasped | starts) & ~set_down

@@ -17,7 +17,10 @@ Array = NDArray[np.float64]
 
 LEARNING_RATE = 0.3
 LOAD_LIMIT_RAD = 0.08
-FEEDBACK = 0.4  # share of a remaining error that is to be made up for in one control step
+FEEDBACK = (
+    0.4  # share of a remaining error that is to be made up for in `FEEDBACK_S`, whatever the control rate
+)
+FEEDBACK_S = 0.1
 CREEP_RAD_S = 0.004  # below this speed a joint may as well stick: friction tells nothing about its direction
 
 
@@ -31,6 +34,7 @@ class ServoModel:
         friction = [joint.friction_loss / joint.stiffness / scale for joint in robot.joints]
         grippers = [0.0] * len(robot.fingers.joint_names)
         self._period_s = sim.config.control_dt_s
+        self._feedback = 1.0 - (1.0 - FEEDBACK) ** (self._period_s / FEEDBACK_S)
         self._lag_s = np.maximum([*lag_s, *grippers] * robot.num_arms, 1e-3)
         self._friction = np.array([*friction, *grippers] * robot.num_arms)
         self._decay = np.exp(-self._period_s / self._lag_s)
@@ -63,7 +67,7 @@ class ServoModel:
 
     def command(self, ids: NDArray[np.int64], start: Array, goal: Array) -> Array:
         """Command (m, J) under which joints, wanted at `start` now, move to `goal` within the next period."""
-        speed = (goal - start + FEEDBACK * (start - self._q[ids])) / self._period_s
+        speed = (goal - start + self._feedback * (start - self._q[ids])) / self._period_s
         push = self._friction * np.tanh(speed / CREEP_RAD_S)
         command = goal + self._lag_s * speed + push + self._load[ids]
         self._before[ids], self._command[ids] = self._command[ids], command

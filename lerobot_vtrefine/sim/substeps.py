@@ -17,7 +17,7 @@ Array = np.ndarray
 Tensor = torch.Tensor
 
 SAMPLE_S = 0.025
-"""Sliding on the rim is sampled this often."""
+"""Sliding on the rim is sampled this often, or once per control step where these are shorter."""
 RIM_DEPTH_M = 0.003
 """Contact at less depth than this is contact with the rim."""
 
@@ -52,7 +52,7 @@ def start_summary(
         mouth_z_m: height of first entry in the socket's frame.
     """
     qpos, contact = (torch.as_tensor(part) for part in (trace.qpos, trace.sensors[:, :, at.part_contact]))
-    stride = max(1, round(SAMPLE_S / timestep_s))
+    stride = min(max(1, round(SAMPLE_S / timestep_s)), qpos.shape[1])
     samples, touching = qpos[:, stride - 1 :: stride], contact[:, stride - 1 :: stride, 0] > 0
     plug, socket = samples[..., at.plug_qpos], samples[..., at.socket_qpos]
     tips = turn_back(socket[..., 3:], plug[..., :3] - socket[..., :3])

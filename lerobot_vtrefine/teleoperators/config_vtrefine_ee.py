@@ -3,23 +3,28 @@
 import math
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import Any
 
 from lerobot.teleoperators.config import TeleoperatorConfig
 
+from lerobot_vtrefine.embodiments import get_embodiment
 from lerobot_vtrefine.lerobot_compat.config_errors import told_by_lerobot
 
-INPUTS = ("keyboard", "gamepad", "webxr", "recording")
+INPUTS = ("keyboard", "gamepad", "webxr", "lerobot", "recording")
 FRAMES = ("world", "tool")
 
 
 @TeleoperatorConfig.register_subclass("vtrefine_ee")
 @dataclass(kw_only=True)
 class VtRefineEeConfig(TeleoperatorConfig):
-    """Both hands of a robot, moved by hand-held controllers, a gamepad or keys.
+    """Both hands of a robot, moved by hand-held controllers, a gamepad, keys, or LeRobot's own devices.
 
     Attributes:
         embodiment: Whose arms: the name of a robot of this package.
-        input: keyboard, gamepad, webxr (phones or headsets in their browsers) or recording.
+        input: keyboard, gamepad, webxr (phones or headsets in their browsers), lerobot (its own
+            teleoperators, see devices) or recording.
+        devices: For input=lerobot, by the arm's name: one of LeRobot's end-effector teleoperators with its
+            fields, such as "{right: {type: gamepad}}". An arm without one stays where it is.
         path: The recorded controllers, for input=recording: an .npz file, see docs/teleoperation.md.
         webxr_ports: Port of the page for each hand's device, by the arm's name.
         fps: Control steps a second; the command must run at the same rate.
@@ -37,6 +42,7 @@ class VtRefineEeConfig(TeleoperatorConfig):
 
     embodiment: str = "aloha"
     input: str = "keyboard"
+    devices: dict[str, Any] = field(default_factory=dict)
     path: Path | None = None
     webxr_ports: dict[str, int] = field(default_factory=lambda: {"left": 4443, "right": 4444})
     fps: int = 10
@@ -57,6 +63,15 @@ class VtRefineEeConfig(TeleoperatorConfig):
                 raise ValueError(f"--teleop.{name}={value} is unknown; choose from {', '.join(choices)}")
         if (self.input == "recording") != (self.path is not None):
             raise ValueError("--teleop.input=recording and --teleop.path=FILE.npz belong together")
+        if (self.input == "lerobot") != bool(self.devices):
+            raise ValueError(
+                '--teleop.input=lerobot and --teleop.devices="{right: {type: gamepad}}" belong together'
+            )
+        arms = [arm.name for arm in get_embodiment(self.embodiment).arms]
+        if unknown := [name for name in self.devices if name not in arms]:
+            raise ValueError(
+                f"--teleop.devices: no arm is called {unknown[0]}; choose from {', '.join(arms)}"
+            )
         for name in ("fps", "scale", "jump_m", "jump_rad", "timeout_s", "key_speed_m_s", "key_speed_rad_s"):
             if not 0 < getattr(self, name) < math.inf:
                 raise ValueError(f"--teleop.{name} must be above 0, got {getattr(self, name)}")

@@ -82,13 +82,25 @@ class VtRefineEe(Teleoperator):
         self._hands = [ClutchedHand(settings, pose) for pose in ik.hands()]
         self._ik = ik
 
-    def follow(self, positions: Mapping[str, float]) -> None:
-        """The robot's joints are here, by their action keys: the hands go on from there."""
+    def follow(self, positions: Mapping[str, float], fps: float) -> None:
+        """The robot's joints are held here, by their action keys: the hands go on from there.
+
+        Raises:
+            ValueError: LeRobot's loop runs at another rate than the inverse kinematics.
+        """
         assert self._ik is not None
+        if fps != self.config.fps:
+            raise ValueError(
+                f"--teleop.fps={self.config.fps}, but this command asks {fps:g} times a second: "
+                f"give --teleop.fps={fps:g}, so that hands move at the right speed"
+            )
         self._ik.restart(np.array([positions[key] for key in self.action_features], float))
         for hand, pose in zip(self._hands, self._ik.hands(), strict=True):
             hand.restart(pose)
-        self._source.restart()
+        closed = 1.0 - self.body.openings(self._ik.joints) / self.body.fingers.travel_m
+        self._source.restart(
+            {arm.name: float(grip) for arm, grip in zip(self.body.arms, closed, strict=True)}
+        )
 
     def configure(self) -> None:
         """Nothing to configure."""

@@ -16,6 +16,7 @@ from lerobot_vtrefine.datasets.features import DEPTH_KEY, TACTILE_KEYS
 from lerobot_vtrefine.embodiments import get_embodiment
 from lerobot_vtrefine.envs import VtRefineEnvConfig, vector_env
 from lerobot_vtrefine.envs.episodes import Episodes
+from lerobot_vtrefine.envs.live_world import LiveWorld
 from lerobot_vtrefine.sim.config import TaskConfig
 
 ENV_FILES = sorted((Path(__file__).parents[2] / "configs" / "env").glob("*.yaml"))
@@ -58,6 +59,19 @@ def test_episode_length_follows_the_start():
     assert table == 240
     assert grasped == TaskConfig().steps_of("grasped") < table
     assert VtRefineEnvConfig(start="table", episode_steps=7).max_episode_steps == 7
+    assert VtRefineEnvConfig(start="table", fps=50).max_episode_steps == 5 * table  # as many seconds
+
+
+def test_any_control_rate_runs_in_whole_physics_steps():
+    for fps in (15, 100):
+        config = VtRefineEnvConfig(start="grasped", fps=fps, num_threads=1)
+        world = LiveWorld(config)
+        world.reset(0)
+        for _ in range(2):
+            world.step(world.sim.command_targets()[0])
+        assert world.sim.substeps * config.scene_config.timestep_s == pytest.approx(1 / fps)
+        assert config.scene_config.timestep_s <= config.scene.timestep_s
+        assert world.row()["failure"] == "stopped"
 
 
 def test_policy_features_have_the_datasets_keys_and_shapes():
@@ -104,7 +118,8 @@ def test_there_are_environment_files():
         ({"backend": "gpu"}, "single, batch, warp"),
         ({"ablate": "smell"}, "none, touch, vision"),
         ({"ablate": "touch"}, "--env.ablate_dataset"),
-        ({"fps": 0}, "control_hz|fps"),
+        ({"fps": 0}, "--env.fps must lie between 1 and 100 control steps a second, got 0"),
+        ({"fps": 101}, "--env.fps must lie between 1 and 100 control steps a second, got 101"),
     ],
 )
 def test_bad_settings_are_named_at_once(settings, message):

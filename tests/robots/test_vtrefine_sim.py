@@ -16,8 +16,8 @@ from lerobot_vtrefine.envs import VtRefineEnvConfig
 from lerobot_vtrefine.lerobot_compat import phases
 from lerobot_vtrefine.robots import VtRefineSimConfig
 from lerobot_vtrefine.robots import vtrefine_sim as module
-from lerobot_vtrefine.robots.config_vtrefine_sim import fitting_timestep
 from lerobot_vtrefine.robots.vtrefine_sim import VtRefineSim
+from lerobot_vtrefine.sim.config import fitting_timestep
 
 FPS = 10
 TACTILE = TACTILE_KEYS[0].removeprefix("observation.")
@@ -202,7 +202,7 @@ def test_no_action_that_is_no_number_reaches_the_arms() -> None:
     assert robot.world.steps == 0
 
 
-@pytest.mark.parametrize("fps", [10, 15, 20, 30])
+@pytest.mark.parametrize("fps", [10, 15, 30, 50, 100])
 def test_the_physics_step_divides_every_control_step(fps: int) -> None:
     step_s = fitting_timestep(0.0025, fps)
     assert step_s <= 0.0025
@@ -219,6 +219,7 @@ def test_wrong_settings_are_one_line(tmp_path: Path) -> None:
         ({"env_file": tmp_path / "none.yaml"}, "has no part `env:`"),
         ({"env": {"unheard": 1}}, "unheard"),
         ({"view": "window"}, "--robot.view=window"),
+        ({"fps": 120}, "--robot.fps must lie between 1 and 100 control steps a second, got 120"),
     ):
         with pytest.raises(Exception, match=words):
             VtRefineSim(VtRefineSimConfig(**settings)).connect()

@@ -52,6 +52,15 @@ def test_inserts_from_the_hand_at_a_persons_pace() -> None:
     assert metrics["rim_slide_m"].max() < 5e-4
 
 
+@pytest.mark.slow
+@pytest.mark.parametrize("control_hz", [5, 50, 100])
+def test_inserts_as_gently_at_other_control_rates(control_hz: int) -> None:
+    rules = TaskConfig(control_hz=control_hz)
+    metrics, _ = _episodes(InsertionSim(SceneConfig(start="grasped"), rules, num_envs=4, num_threads=1))
+    assert metrics["success"].all()
+    _assert_gentle(metrics)
+
+
 def test_picks_both_parts_and_inserts_in_the_air() -> None:
     metrics, actions = _episodes(_sim("square", "table", 2, 0.001), first_seed=7)
     assert metrics["success"].all()

@@ -1,5 +1,6 @@
 """What people hold in their hands. Packages are imported by the input that needs them."""
 
+from collections.abc import Mapping
 from typing import Protocol
 
 from lerobot_vtrefine.teleoperators.config_vtrefine_ee import VtRefineEeConfig
@@ -15,8 +16,8 @@ class Source(Protocol):
         """Open the device."""
         ...
 
-    def restart(self) -> None:
-        """An episode begins."""
+    def restart(self, grips: Mapping[str, float]) -> None:
+        """An episode begins, with hands closed so far by arm: 0 open, 1 closed."""
         ...
 
     def read(self) -> dict[str, HandSample]:
@@ -29,7 +30,12 @@ class Source(Protocol):
 
 
 def make_source(config: VtRefineEeConfig, arms: list[str]) -> Source:
-    """The input of a configuration. Raises: ValueError for a recording that cannot be read."""
+    """The input of a configuration.
+
+    Raises:
+        ValueError: a recording cannot be read, or a device of LeRobot's is not configured rightly.
+        ImportError: LeRobot lacks the package that reads its device.
+    """
     if config.input == "recording":
         from lerobot_vtrefine.teleoperators.inputs.recording import RecordedControllers
 
@@ -39,6 +45,10 @@ def make_source(config: VtRefineEeConfig, arms: list[str]) -> Source:
         from lerobot_vtrefine.teleoperators.inputs.webxr import WebXrControllers
 
         return WebXrControllers({arm: config.webxr_ports[arm] for arm in arms}, config.timeout_s)
+    if config.input == "lerobot":
+        from lerobot_vtrefine.teleoperators.inputs.lerobot_devices import LeRobotDevices
+
+        return LeRobotDevices(config.devices, config.fps, config.key_speed_m_s)
     from lerobot_vtrefine.teleoperators.inputs.speed import SpeedControllers
 
     step_m, step_rad = config.key_speed_m_s / config.fps, config.key_speed_rad_s / config.fps

@@ -5,6 +5,7 @@ operator's frame, `<arm>_clutch` (T,) bool, `<arm>_grip` (T,) from 0 (open) to 1
 lost, `<arm>_tracked` (T,) bool.
 """
 
+from collections.abc import Mapping
 from pathlib import Path
 
 import numpy as np
@@ -42,8 +43,8 @@ class RecordedControllers:
         """Begin."""
         self._next = 0
 
-    def restart(self) -> None:
-        """Begin again."""
+    def restart(self, grips: Mapping[str, float]) -> None:
+        """Begin again; the recording says how far hands are closed."""
         self._next = 0
 
     def read(self) -> dict[str, HandSample]:

@@ -43,8 +43,8 @@ class WebXrControllers:
             page.subscribe(lambda pose, message, arm=arm: self.hear(arm, pose, message))
             threading.Thread(target=page.run, daemon=True).start()
 
-    def restart(self) -> None:
-        """Nothing to forget."""
+    def restart(self, grips: Mapping[str, float]) -> None:
+        """Nothing to forget: the pages say whether hands are closed."""
 
     def hear(self, arm: str, pose: np.ndarray, message: Message) -> None:
         """A device has spoken."""
