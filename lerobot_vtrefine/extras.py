@@ -10,6 +10,7 @@ EXTRA_OF = {
     "viser": "view",
     "mink": "teleop",
     "daqp": "teleop",
+    "grpc": "async",
     "serial": "hardware",
     "dynamixel_sdk": "hardware",
     "deepdiff": "hardware",
@@ -18,6 +19,7 @@ EXTRA_OF = {
 
 SIMULATOR = ("mujoco", "warp")
 VIEW = ("mujoco", "warp", "mjviser")
+ASYNCHRONOUS = ("grpc",)
 TELEOPERATION = ("mujoco", "warp", "mink", "daqp")
 PADS = ("serial",)
 ARMS = ("serial", "dynamixel_sdk", "deepdiff")
