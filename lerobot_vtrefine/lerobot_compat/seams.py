@@ -95,6 +95,13 @@ SEAMS = (
         "refuses to make them",
     ),
     Seam(
+        "policy_server",
+        ("lerobot.async_inference.constants.SUPPORTED_POLICIES",),
+        "its policy server refuses policies that are not in its list, and hands them no arrays",
+        "vtrefine-policy-server",
+        "refuses to start",
+    ),
+    Seam(
         "registration",
         (),
         "plugins are found by the prefix of their distribution's name only",

@@ -108,6 +108,14 @@ def phases_(_: Path) -> None:
 
 
 @probe
+def policy_server_(_: Path) -> None:
+    pytest.importorskip("grpc")
+    folder = Path(import_utils.__file__).parents[1] / "async_inference"
+    assert "policy_type not in SUPPORTED_POLICIES" in (folder / "policy_server.py").read_text()
+    assert "return {**state_dict, **image_dict}" in (folder / "helpers.py").read_text()  # and nothing else
+
+
+@probe
 def registration_(_: Path) -> None:
     source = inspect.getsource(import_utils.register_third_party_plugins)
     assert "lerobot_policy_" in source
