@@ -80,7 +80,7 @@ def policy_server_frame(features: dict[str, dict], observation: Mapping[str, Any
 
 
 def window[T](seen: Mapping[int, T], step: int, length: int) -> list[T]:
-    """What was seen at the last ``length`` steps up to ``step``, or the next one where a step was not sent."""
+    """What was seen at the last ``length`` steps up to ``step``; where nothing was sent, the next."""
     found = [seen[step]]
     for earlier in range(step - 1, step - length, -1):
         found.insert(0, seen.get(earlier, found[0]))

@@ -25,7 +25,6 @@ from lerobot_vtrefine.policies.vt_dp3.processor_vt_dp3 import make_vt_dp3_pre_po
 from lerobot_vtrefine.robots import VtRefineSimConfig
 
 pytest.importorskip("grpc")
-BIN = Path(sys.executable).parent
 ENV = {"start": "grasped", "num_threads": 1}
 CHUNK = 4
 
@@ -166,7 +165,8 @@ def test_both_commands_over_localhost(checkpoint: Path, tmp_path: Path) -> None:
     port = free_port()
     quiet = os.environ | {"OMP_NUM_THREADS": "1", "HF_HUB_OFFLINE": "1"}
     pipes = {"stdout": subprocess.PIPE, "stderr": subprocess.STDOUT, "text": True, "env": quiet}
-    server = subprocess.Popen([BIN / "vtrefine-policy-server", f"--port={port}"], **pipes)
+    command = [sys.executable, "-m", "lerobot_vtrefine.cli.policy_server", f"--port={port}"]
+    server = subprocess.Popen(command, **pipes)
     try:
         assert server.stdout is not None
         assert any("listening at" in line for line in server.stdout)

@@ -26,6 +26,10 @@ LABELS = {
     "control_latency+backlash": "commands 0.1 s late, 20 mrad of play in all arm joints",
     "visuo_tactile": "touch",
     "visual": "vision only",
+    "aloha": "ALOHA",
+    "kinova": "two Kinova Gen3",
+    "table": "from the table",
+    "grasped": "in hand",
 }
 """Tasks and policies in words; others stand as they are."""
 MEASURED = (
@@ -153,6 +157,28 @@ def reality_table(rows: Sequence[Run]) -> str:
     return markdown([*head, "success in the stand-in reality", "in its own simulator"], body)
 
 
+def expert_table(rows: Sequence[Run]) -> str:
+    """The scripted expert, pair by pair: every body and start beside each other."""
+    places = [(body, start) for body in values(rows, "policy") for start in values(rows, "variant")]
+    body = [
+        [task, *(_counted(pick(rows, task=task, policy=name, variant=start)) for name, start in places)]
+        for task in values(rows, "task")
+    ]
+    head = [
+        "pair, diametral clearance",
+        *(f"{LABELS.get(name, name)}, {LABELS[start]}" for name, start in places),
+    ]
+    return markdown(head, body)
+
+
+def _counted(rows: Sequence[Run]) -> str:
+    """Successes of all episodes, with the interval."""
+    if not rows:
+        return "-"
+    (row,) = rows
+    return f"{row.successes} of {row.episodes} {interval(*wilson_interval(row.successes, row.episodes))}"
+
+
 def runs_table(rows: Sequence[Run]) -> str:
     """Every task, policy and variant: mean over seeds, worst seed, what it took."""
     body = []
@@ -202,6 +228,7 @@ RENDERERS: dict[str, Callable[[Sequence], str]] = (
     dict.fromkeys(Run.TABLES, runs_table)
     | dict.fromkeys(Line.TABLES, lines_table)
     | {"demo": demo_table, "touch": touch_table, "twin": touch_table, "reality": reality_table}
+    | {"expert": expert_table}
 )
 
 
