@@ -18,6 +18,8 @@ from lerobot_vtrefine.cli.report.results import verdict
 from lerobot_vtrefine.cli.report.statistics import proportion, quantiles, wilson_interval
 from lerobot_vtrefine.finetune.seeds import EVALUATION_SEEDS, TRAINING_SEEDS
 
+ENV_FILES = Path(__file__).parents[2] / "configs" / "env"
+
 
 @pytest.mark.usefixtures("fake_commands")
 def test_demo_end_to_end(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
@@ -78,6 +80,14 @@ def test_commands_are_those_of_users() -> None:
     assert names[5:] == ["lerobot-eval"] * 4
     visual = demo_stages(DemoConfig(modalities="visual"))
     assert [stage.name for stage in visual[5:]] == ["eval_pretrain_no_vision", "eval_finetune_no_vision"]
+
+
+def test_another_body_comes_by_its_environments_file() -> None:
+    config = demo.parse_config(["--quick", f"--config_path={ENV_FILES / 'kinova_round_grasped.yaml'}"])
+    record, pretrain, *_ = (stage.command for stage in demo_stages(config))
+    assert "--env.scene.embodiment=kinova" in record
+    assert "--policy.observation.embodiment=kinova" in pretrain
+    assert (config.num_demos, config.eval_episodes) == (4, 8)  # the file's eval: is lerobot-eval's
 
 
 def test_episodes_are_never_shared() -> None:

@@ -126,6 +126,8 @@ class DemoConfig:
     """Flags of the policy, ``--policy.KEY=VALUE``."""
     dppo: dict[str, Any] = field(default_factory=default_dppo)
     """Flags of DPPO, ``--dppo.KEY=VALUE``."""
+    eval: dict[str, Any] = field(default_factory=dict)
+    """Unused; lets files of configs/env serve this command too."""
 
     def __post_init__(self) -> None:
         for name, lowest in LOWEST.items():
@@ -150,7 +152,15 @@ class DemoConfig:
         numbers = {"iterations": self.finetune_iterations, "num_envs": self.finetune_envs}
         child_configs.parse_dppo(self.dppo | numbers)
         child_configs.parse_env(self.env)
-        child_configs.parse_policy(self.policy)
+        child_configs.parse_policy(self.policy_flags)
+
+    @property
+    def policy_flags(self) -> dict[str, Any]:
+        """``policy``, which sees with the environment's robot where it does not say with which."""
+        body = (self.env.get("scene") or {}).get("embodiment")
+        if body is None:
+            return self.policy
+        return self.policy | {"observation": {"embodiment": body} | self.policy.get("observation", {})}
 
     @property
     def dataset_dir(self) -> Path:
@@ -214,7 +224,7 @@ def pretrain_stage(config: DemoConfig) -> Stage:
         "lerobot-train",
         f"--dataset.repo_id={REPO_ID}",
         f"--dataset.root={config.dataset_dir}",
-        *flags("policy", {"type": "vt_dp3"} | config.policy),
+        *flags("policy", {"type": "vt_dp3"} | config.policy_flags),
         f"--policy.modalities={config.modalities}",
         f"--policy.device={config.device}",
         "--policy.push_to_hub=false",
