@@ -186,6 +186,16 @@ def test_converging_runs_show_mean_worst_seed_and_cost() -> None:
     assert "| 150 | - | 8 |" in table("converges", [replace(row, env_steps=None) for row in rows])
 
 
+def test_the_experts_table_lays_bodies_and_starts_beside_each_other() -> None:
+    rows = [
+        run_of(19 / 20, None, table="expert", task="round, 2 mm", policy=body, variant=start, episodes=20)
+        for body, start in (("aloha", "table"), ("kinova", "grasped"))
+    ]
+    text = table("expert", rows)
+    assert "ALOHA, from the table | ALOHA, in hand | two Kinova Gen3, from the table" in text
+    assert "| round, 2 mm | 19 of 20 [76, 99] | - | - | 19 of 20 [76, 99] |" in text
+
+
 def test_a_fall_counts_in_the_last_half_alone() -> None:
     success = [0.0, 0.5, 0.1, 0.7, 0.55, 0.8]
     rows = [{"iteration": float(index), "success": value} for index, value in enumerate(success)]

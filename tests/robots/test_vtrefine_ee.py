@@ -246,9 +246,11 @@ def test_keys_and_sticks_move_imaginary_controllers() -> None:
 
 def test_a_phone_that_falls_silent_is_lost() -> None:
     phones = webxr.WebXrControllers({"left": 1, "right": 2}, timeout_s=0.05)
-    phones.hear("left", np.eye(4), {"move": True, "reservedButtonA": True})
-    sample = phones.read()["left"]
-    assert (sample.clutch, sample.grip) == (True, 1.0)
+    phones.restart({"left": 0.6})  # it holds something, which a page that says "open" does not drop
+    for shown, grip in (("open", 0.6), ("close", 0.0), ("close", 0.0), ("open", 1.0)):
+        phones.hear("left", np.eye(4), {"move": True, "gripper": shown})
+        sample = phones.read()["left"]
+        assert (sample.clutch, sample.grip) == (True, grip)
     assert "right" not in phones.read()
     time.sleep(0.06)
     assert phones.read() == {}

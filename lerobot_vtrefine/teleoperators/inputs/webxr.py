@@ -1,6 +1,7 @@
 """Phones or headsets by WebXR in their browsers, through the package `teleop` that LeRobot's phone uses.
 
-One device and one page per hand. Touching and holding is the clutch; the page's first button closes the hand.
+One device and one page per hand: of a headset's controllers that page reads the right one alone. Touching and
+holding is the clutch; the page's gripper button opens a closed hand and closes an open one.
 """
 
 import threading
@@ -11,15 +12,15 @@ from typing import Any
 import numpy as np
 
 from lerobot_vtrefine.teleoperators.hand_motion import HandSample
+from lerobot_vtrefine.teleoperators.inputs.speed import HOLDS
 
 Message = Mapping[str, Any]
 
 
-def sample_of(pose: np.ndarray, message: Message) -> HandSample:
-    """A device's pose (4, 4), x forward, y left, z up, and its message."""
+def sample_of(pose: np.ndarray, message: Message, grip: float) -> HandSample:
+    """A device's pose (4, 4), x forward, y left, z up, and its message; the hand is closed by `grip`."""
     pose = np.asarray(pose, float)
-    clutch, grip = bool(message.get("move", False)), float(bool(message.get("reservedButtonA", False)))
-    return HandSample(pose[:3, 3].copy(), pose[:3, :3].copy(), clutch, grip)
+    return HandSample(pose[:3, 3].copy(), pose[:3, :3].copy(), bool(message.get("move", False)), grip)
 
 
 class WebXrControllers:
@@ -29,6 +30,9 @@ class WebXrControllers:
         self._ports, self._timeout_s = ports, timeout_s
         self._lock = threading.Lock()
         self._heard: dict[str, tuple[float, HandSample]] = {}
+        self._pages: dict[str, Any] = {}
+        """What each page shows of its gripper: "open" or "close", whatever the hand does."""
+        self.restart({})
 
     def connect(self) -> None:
         """Serve the pages. Raises: ImportError where `teleop` is missing."""
@@ -44,12 +48,18 @@ class WebXrControllers:
             threading.Thread(target=page.run, daemon=True).start()
 
     def restart(self, grips: Mapping[str, float]) -> None:
-        """Nothing to forget: the pages say whether hands are closed."""
+        """Hands are closed as they are, until a page's button is pressed."""
+        with self._lock:
+            self._grips = dict(grips)
 
     def hear(self, arm: str, pose: np.ndarray, message: Message) -> None:
         """A device has spoken."""
         with self._lock:
-            self._heard[arm] = time.monotonic(), sample_of(pose, message)
+            grip, shown = self._grips.get(arm, 0.0), message.get("gripper")
+            if shown != self._pages.setdefault(arm, shown):
+                grip = float(grip <= HOLDS)
+            self._pages[arm], self._grips[arm] = shown, grip
+            self._heard[arm] = time.monotonic(), sample_of(pose, message, grip)
 
     def read(self) -> dict[str, HandSample]:
         """The latest samples of devices that are heard."""
