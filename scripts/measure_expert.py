@@ -14,7 +14,7 @@ import argparse
 import itertools
 import sys
 from collections import Counter
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -57,17 +57,13 @@ class Setting:
 
     def scene(self, mesh_dir: Path | None) -> SceneConfig:
         """The scene; raises ValueError for what cannot be."""
-        given = {} if self.clearance_m is None else {"clearance_m": self.clearance_m}
-        if self.clearance_m is None or self.clearance_m < CLEARANCES_M[0]:
-            given["timestep_s"] = TIGHT_TIMESTEP_S
-        return SceneConfig(
-            pair=self.pair,
-            start=self.start,
-            socket=self.socket,
-            embodiment=self.body,
-            mesh_dir=mesh_dir,
-            **given,
+        scene = SceneConfig(
+            pair=self.pair, start=self.start, socket=self.socket, embodiment=self.body, mesh_dir=mesh_dir
         )
+        if self.clearance_m is not None:
+            scene = replace(scene, clearance_m=self.clearance_m)
+        is_tight = self.clearance_m is None or self.clearance_m < CLEARANCES_M[0]
+        return replace(scene, timestep_s=TIGHT_TIMESTEP_S) if is_tight else scene
 
 
 def measure(setting: Setting, episodes: int, mesh_dir: Path | None) -> Run:

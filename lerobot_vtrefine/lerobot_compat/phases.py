@@ -9,8 +9,8 @@ included. Robots without ``phase`` and teleoperators without ``follow`` see noth
 
 import functools
 import sys
-from collections.abc import Callable, Iterator, Mapping
-from contextlib import AbstractContextManager, ExitStack
+from collections.abc import Callable, Generator, Iterator, Mapping
+from contextlib import AbstractContextManager, ExitStack, contextmanager
 from typing import Any, Protocol, runtime_checkable
 
 from lerobot_vtrefine.lerobot_compat.guard import is_supported
@@ -50,7 +50,12 @@ class FollowingTeleoperator(Protocol):
 
 @runtime_checkable
 class HoldingRobot(Protocol):
-    """A robot that says where its servos hold the joints, which differs from where these are under a load."""
+    """A robot that says where its servos hold the joints: under a load these are elsewhere. It may begin
+    another episode by itself.
+    """
+
+    on_restart: Callable[[], None] | None
+    """To be called when it has."""
 
     def held_targets(self) -> Mapping[str, float]:
         """Joint targets by their action keys."""
@@ -90,6 +95,25 @@ def _loaded() -> Iterator[tuple[Any, str]]:
             yield (module if class_name is None else getattr(module, class_name)), name
 
 
+@contextmanager
+def _followed(robot: Any, teleop: FollowingTeleoperator, fps: float) -> Generator[None]:
+    """The teleoperator goes on from where the robot is, now and whenever the robot starts anew by itself."""
+
+    def follow() -> None:
+        held = robot.held_targets() if isinstance(robot, HoldingRobot) else robot.get_observation()
+        teleop.follow({key: held[key] for key in robot.action_features}, fps)
+
+    follow()
+    if not isinstance(robot, HoldingRobot):
+        yield
+        return
+    robot.on_restart = follow
+    try:
+        yield
+    finally:
+        robot.on_restart = None
+
+
 def _phased(loop: Callable[..., None]) -> Callable[..., None]:
     """The loop, inside the robot's phase; LeRobot passes all of its arguments by name."""
 
@@ -101,8 +125,7 @@ def _phased(loop: Callable[..., None]) -> Callable[..., None]:
                 phase = robot.phase(settings["events"], settings["fps"], settings.get("dataset"))
                 stack.enter_context(phase)
             if isinstance(teleop := settings.get("teleop"), FollowingTeleoperator):
-                held = robot.held_targets() if isinstance(robot, HoldingRobot) else robot.get_observation()
-                teleop.follow({key: held[key] for key in robot.action_features}, settings["fps"])
+                stack.enter_context(_followed(robot, teleop, settings["fps"]))
             return loop(*args, **settings)
 
     run.unphased = loop  # ty: ignore[missing-attribute]

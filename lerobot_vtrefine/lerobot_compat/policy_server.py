@@ -33,6 +33,13 @@ class PadPolicyServer(policy_server.PolicyServer):
     as ever.
     """
 
+    # Set by the client's first message.
+    policy: Any
+    preprocessor: Any
+    postprocessor: Any
+    lerobot_features: Any
+    device: Any
+
     def _reset_server(self) -> None:
         super()._reset_server()
         self._seen: dict[int, TimedObservation] = {}

@@ -7,7 +7,7 @@ the machine was.
 
 import logging
 import time
-from collections.abc import Generator
+from collections.abc import Callable, Generator
 from contextlib import contextmanager
 from functools import cached_property
 from pathlib import Path
@@ -69,6 +69,8 @@ class VtRefineSim(Robot):
         self._in_phase = False
         self._events: dict[str, bool] | None = None
         """LeRobot's keys, while an episode is recorded."""
+        self.on_restart: Callable[[], None] | None = None
+        """Called when the next episode has begun without LeRobot's doing."""
         self._recorded: tuple[Any, int, dict[str, Any]] | None = None
         """Dataset, index and row of the last recorded episode, until it is known whether it was saved."""
 
@@ -231,6 +233,8 @@ class VtRefineSim(Robot):
             logger.info("seed %d: %s", self.world.seed, describe(self.world.row()))
         elif self.world.time_s - self._ended_s >= self.config.pause_s:
             self._start(self.world.seed + 1)
+            if self.on_restart is not None:
+                self.on_restart()
 
     def _note_outcome(self) -> None:
         """Note the last recorded episode beside its dataset, unless it was discarded."""

@@ -193,6 +193,27 @@ def test_a_rerecorded_episode_starts_from_the_same_seed_and_is_not_noted(tmp_pat
     ]
 
 
+def test_a_teleoperator_goes_on_from_where_the_next_episode_begins() -> None:
+    robot = connected(seed=5, pause_s=0.1)
+    followed: list[tuple[int, dict, float]] = []
+
+    class Hands:
+        def follow(self, positions: dict[str, float], fps: float) -> None:
+            followed.append((robot.world.seed, positions, fps))
+
+    def loop(**_settings: object) -> None:
+        robot.world.outcome, robot.world._row = "success", {**robot.world.row(), "time_to_success_s": 1.0}
+        for _ in range(3):
+            robot.send_action(robot.held_targets())
+
+    phases._phased(loop)(robot=robot, teleop=Hands(), fps=FPS)
+    assert [(seed, fps) for seed, _, fps in followed] == [(5, FPS), (6, FPS)]
+    (_, first, _), (_, second, _) = followed
+    assert list(first) == list(robot.action_features)
+    assert first != second  # in hand, another seed holds the parts elsewhere
+    assert robot.on_restart is None
+
+
 def test_no_action_that_is_no_number_reaches_the_arms() -> None:
     robot = connected()
     action = dict.fromkeys(robot.action_features, 0.0)

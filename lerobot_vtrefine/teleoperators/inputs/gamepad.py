@@ -37,7 +37,7 @@ class Gamepad:
     def connect(self) -> None:
         """Open it. Raises: ImportError without pygame, ValueError without a gamepad."""
         try:
-            import pygame  # ty: ignore[import-not-found]
+            import pygame
         except ImportError as error:
             raise ImportError(
                 "--teleop.input=gamepad needs pygame: pip install 'lerobot_policy_vtrefine[teleop]'"
@@ -51,7 +51,7 @@ class Gamepad:
 
     def pushes(self) -> list[Push]:
         """One per hand; nothing moves once the gamepad is gone."""
-        import pygame  # ty: ignore[import-not-found]
+        import pygame
 
         pygame.event.pump()
         if not self._pad.get_init() or pygame.joystick.get_count() == 0:

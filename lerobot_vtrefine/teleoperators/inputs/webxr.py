@@ -37,7 +37,7 @@ class WebXrControllers:
     def connect(self) -> None:
         """Serve the pages. Raises: ImportError where `teleop` is missing."""
         try:
-            from teleop import Teleop  # ty: ignore[import-not-found]
+            from teleop import Teleop
         except ImportError as error:
             raise ImportError(
                 "--teleop.input=webxr needs teleop: pip install 'lerobot_policy_vtrefine[teleop]'"
