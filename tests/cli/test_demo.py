@@ -87,6 +87,9 @@ def test_another_body_comes_by_its_environments_file() -> None:
     record, pretrain, *_ = (stage.command for stage in demo_stages(config))
     assert "--env.scene.embodiment=kinova" in record
     assert "--policy.observation.embodiment=kinova" in pretrain
+    assert not [flag for flag in pretrain if "encoder" in flag]  # which has learnt with ALOHA
+    given = demo.parse_config(["--env={scene: {embodiment: kinova}}", "--policy={preset: small, horizon: 8}"])
+    assert "--policy.horizon=8" in demo_stages(given)[1].command
     assert (config.num_demos, config.eval_episodes) == (4, 8)  # the file's eval: is lerobot-eval's
 
 

@@ -9,6 +9,8 @@ from lerobot_vtrefine.cli.pipeline.stages import Stage
 from lerobot_vtrefine.finetune.seeds import TRAINING_SEEDS
 
 REPO_ID = "local/vtrefine_demo"
+HOME_BODY = "aloha"
+"""The robot with which the demo's encoder has learnt."""
 POLICIES = ("pretrain", "finetune")
 ABLATIONS = ("touch", "vision")
 
@@ -150,17 +152,30 @@ class DemoConfig:
 
         child_configs.parse_degradation(self.degradation)
         numbers = {"iterations": self.finetune_iterations, "num_envs": self.finetune_envs}
-        child_configs.parse_dppo(self.dppo | numbers)
+        child_configs.parse_dppo(self.dppo_flags | numbers)
         child_configs.parse_env(self.env)
         child_configs.parse_policy(self.policy_flags)
 
     @property
     def policy_flags(self) -> dict[str, Any]:
-        """``policy``, which sees with the environment's robot where it does not say with which."""
-        body = (self.env.get("scene") or {}).get("embodiment")
-        if body is None:
+        """``policy``, which sees with the environment's robot where it does not say with which.
+
+        The default's encoder has learnt with ALOHA: other robots get the cloud's recipe instead.
+        """
+        if self._body == HOME_BODY:
             return self.policy
-        return self.policy | {"observation": {"embodiment": body} | self.policy.get("observation", {})}
+        policy = CLOUD_RECIPE["policy"] if self.policy == default_policy() else self.policy
+        return policy | {"observation": {"embodiment": self._body} | policy.get("observation", {})}
+
+    @property
+    def dppo_flags(self) -> dict[str, Any]:
+        """``dppo``, or the cloud's recipe where the policy has that."""
+        other = self._body != HOME_BODY and self.dppo == default_dppo()
+        return CLOUD_RECIPE["dppo"] if other and self.policy == default_policy() else self.dppo
+
+    @property
+    def _body(self) -> str:
+        return (self.env.get("scene") or {}).get("embodiment", HOME_BODY)
 
     @property
     def dataset_dir(self) -> Path:
@@ -280,7 +295,7 @@ def finetune_stage(config: DemoConfig) -> Stage:
         f"--policy.path={config.checkpoint('pretrain')}",
         f"--policy.device={config.device}",
         *flags("env", {"type": "vtrefine"} | config.env),
-        *flags("dppo", config.dppo),
+        *flags("dppo", config.dppo_flags),
         f"--dppo.iterations={config.finetune_iterations}",
         f"--dppo.num_envs={config.finetune_envs}",
         f"--seed={config.seed * SEED_STRIDE + TRAIN_SEED_OFFSET}",
