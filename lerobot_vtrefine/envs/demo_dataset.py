@@ -20,9 +20,9 @@ from lerobot.datasets.io_utils import SuppressProgressBars
 from lerobot.datasets.lerobot_dataset import LeRobotDataset
 
 from lerobot_vtrefine.datasets.features import ACTION_KEY, raw_to_frame
+from lerobot_vtrefine.datasets.simulation_card import NOTE
 from lerobot_vtrefine.embodiments import Embodiment
 from lerobot_vtrefine.envs.demonstrations import Demonstration
-from lerobot_vtrefine.envs.recording_note import NOTE
 from lerobot_vtrefine.folders import (
     check_replaceable,
     link_or_copy,

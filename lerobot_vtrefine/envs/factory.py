@@ -12,6 +12,7 @@ from lerobot_vtrefine.envs.ablation import make_ablation
 from lerobot_vtrefine.envs.config import VtRefineEnvConfig
 from lerobot_vtrefine.envs.episode_log import EpisodeLog
 from lerobot_vtrefine.envs.episodes import Episodes
+from lerobot_vtrefine.envs.evaluation_note import write_note
 from lerobot_vtrefine.envs.rendering import EvalVideos
 
 if TYPE_CHECKING:
@@ -56,6 +57,7 @@ def make_vector_env(
     """The native batched environment, or Gymnasium's sync or async one around single environments."""
     from lerobot_vtrefine.envs.vector_env import VtRefineVectorEnv
 
+    write_note(config, num_envs)
     if config.vectorization == "native":
         return VtRefineVectorEnv(config, num_envs)
     makers: list[Callable[[], gym.Env]] = [

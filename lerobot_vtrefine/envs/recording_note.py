@@ -6,11 +6,10 @@ from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
 
+from lerobot_vtrefine.datasets.simulation_card import NOTE
 from lerobot_vtrefine.envs.config import VtRefineEnvConfig
 from lerobot_vtrefine.files import read_json
 from lerobot_vtrefine.folders import write_in_place
-
-NOTE = Path("meta") / "recording.json"
 
 
 def simulation_settings(env: VtRefineEnvConfig) -> dict[str, Any]:

@@ -75,8 +75,14 @@ class FinetunePipelineConfig:
     eval_freq: int = 10
     # Write a checkpoint every so many iterations, and after the last.
     save_freq: int = 10
-    # Only eval.n_episodes counts; the other fields let files of configs/env serve this command too.
+    # n_episodes counts, and batch_size with push_to_hub; the rest lets files of configs/env serve this too.
     eval: EvalConfig = field(default_factory=EvalConfig)
+    # Evaluate the result by lerobot-eval and upload it to the Hugging Face Hub with a card of what was found.
+    push_to_hub: bool = False
+    # Its name on the Hub: USER/NAME.
+    repo_id: str | None = None
+    # Upload it for those only whom you invite.
+    private: bool = False
     # Curves and settings only: no artifacts are uploaded, so disable_artifact changes nothing.
     wandb: WandBConfig = field(default_factory=WandBConfig)
 
