@@ -90,7 +90,7 @@ def record(config: RecordDemosConfig) -> None:
     env = config.env
     assert isinstance(env, VtRefineEnvConfig)
     robot = env.body
-    features = dataset_features(*env.camera_size, robot)
+    features = dataset_features(*env.camera_size, robot, env.colour_size)
     with DemoDataset(
         config.root,
         config.repo_id,

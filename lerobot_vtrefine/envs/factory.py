@@ -5,6 +5,7 @@ from functools import partial
 from typing import TYPE_CHECKING
 
 import gymnasium as gym
+import numpy as np
 from gymnasium.vector import AutoresetMode
 from lerobot.envs.utils import _LazyAsyncVectorEnv, freeze_after_episode_end
 
@@ -45,10 +46,21 @@ def make_simulation(config: VtRefineEnvConfig, num_envs: int) -> "InsertionSim":
 
 
 def make_episodes(config: VtRefineEnvConfig, num_envs: int) -> Episodes:
-    """The simulation with ablation and metrics log as configured."""
+    """The simulation with ablation, metrics log and colour camera as configured."""
     ablation = make_ablation(config.ablate, config.ablate_dataset, config.body)
     log = EpisodeLog(config.metrics_path) if config.metrics_path is not None else None
-    return Episodes(make_simulation(config, num_envs), ablation, log)
+    sim = make_simulation(config, num_envs)
+    return Episodes(sim, ablation, log, _colour_camera(config, sim))
+
+
+def _colour_camera(
+    config: VtRefineEnvConfig, sim: "InsertionSim"
+) -> Callable[[np.ndarray], np.ndarray] | None:
+    if config.colour_size is None:
+        return None
+    from lerobot_vtrefine.sim.rgb import RgbCamera
+
+    return RgbCamera(sim, *config.colour_size).images
 
 
 def make_vector_env(

@@ -18,16 +18,21 @@ def simulation_settings(env: VtRefineEnvConfig) -> dict[str, Any]:
     """
     known = replace(env, reality=None)
     hidden = {} if env.reality is None else {"reality": hashlib.sha256(env.reality.read_bytes()).hexdigest()}
-    return hidden | {
-        "scene": {
-            key: str(value) if isinstance(value, Path) else value
-            for key, value in asdict(known.scene_config).items()
-        },
-        "rules": asdict(env.task_config),
-        "randomization": asdict(env.randomization),
-        "sensor_model": env.sensor_model,
-        "task": env.task,
-    }
+    colour = {} if env.colour_size is None else {"colour": list(env.colour_size)}
+    return (
+        hidden
+        | colour
+        | {
+            "scene": {
+                key: str(value) if isinstance(value, Path) else value
+                for key, value in asdict(known.scene_config).items()
+            },
+            "rules": asdict(env.task_config),
+            "randomization": asdict(env.randomization),
+            "sensor_model": env.sensor_model,
+            "task": env.task,
+        }
+    )
 
 
 def add_episode(root: Path, settings: dict[str, Any], index: int, row: dict[str, Any]) -> None:

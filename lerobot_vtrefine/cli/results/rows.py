@@ -54,7 +54,7 @@ def _words(kind: Any) -> str:
 class Run(Row):
     """One policy's evaluation."""
 
-    TABLES = ("converges", "demo", "touch", "twin", "paper", "demonstrations", "reality")
+    TABLES = ("converges", "demo", "touch", "twin", "paper", "demonstrations", "policies", "reality")
 
     task: str
     policy: str

@@ -26,6 +26,11 @@ LABELS = {
     "control_latency+backlash": "commands 0.1 s late, 20 mrad of play in all arm joints",
     "visuo_tactile": "touch",
     "visual": "vision only",
+    "vt_dp3_paper": "vt_dp3, touch and depth",
+    "vt_dp3_visual": "vt_dp3, depth",
+    "act_rgb": "LeRobot's ACT, colour",
+    "diffusion_rgb": "LeRobot's diffusion policy, colour",
+    "smolvla_rgb": "LeRobot's SmolVLA, colour",
 }
 """Tasks and policies in words; others stand as they are."""
 MEASURED = (
