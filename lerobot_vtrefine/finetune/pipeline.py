@@ -145,6 +145,8 @@ def load_policy(path: Path) -> VtDp3Policy:
         ) from error
     if not isinstance(config, VtDp3Config):
         raise ValueError(f"{path} holds a policy of type {config.type}; vtrefine-finetune needs vt_dp3")
+    if config.use_peft:
+        raise ValueError(f"{path} holds adapters (--peft.*) only; vtrefine-finetune needs all weights")
     return VtDp3Policy.from_pretrained(path, config=config)
 
 

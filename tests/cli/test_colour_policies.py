@@ -8,7 +8,7 @@ from conftest import TINY_ENV, finish, lerobot, record
 
 from lerobot_vtrefine.named_configs import find
 
-SIZE = ("--env.rgb=true", "--env.rgb_size=[96, 128]")
+COLOUR = "--env.rgb=true"
 SMALL = {
     "act_rgb": (
         "--policy.pretrained_backbone_weights=null",
@@ -16,14 +16,10 @@ SMALL = {
         "--policy.n_heads=2",
         "--policy.dim_feedforward=64",
         "--policy.n_encoder_layers=1",
-        "--policy.input_features={observation.state: {type: STATE, shape: [16]},"
-        " observation.images.front: {type: VISUAL, shape: [3, 96, 128]}}",
     ),
     "diffusion_rgb": (
         "--policy.down_dims=[32, 64]",
         "--policy.num_train_timesteps=4",
-        "--policy.input_features={observation.state: {type: STATE, shape: [16]},"
-        " observation.images.front: {type: VISUAL, shape: [3, 96, 128]}}",
     ),
     "vt_dp3_small": (),
 }
@@ -33,7 +29,7 @@ SMALL = {
 def coloured(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Two episodes with colour."""
     root = tmp_path_factory.mktemp("coloured") / "demos"
-    assert record(root, "--num_episodes=2", "--num_envs=2", "--seed=5", *SIZE) == 0
+    assert record(root, "--num_episodes=2", "--num_envs=2", "--seed=5", COLOUR) == 0
     return root
 
 
@@ -65,7 +61,7 @@ def test_stock_commands_train_and_evaluate_it(coloured: Path, name: str, tmp_pat
             f"--policy.path={tmp_path / 'out' / 'checkpoints' / 'last' / 'pretrained_model'}",
             "--policy.device=cpu",
             *TINY_ENV,
-            *SIZE,
+            COLOUR,
             "--env.episode_steps=6",
             "--env.video_episodes=0",
             "--eval.n_episodes=2",
