@@ -18,6 +18,7 @@ SMALL = {
         "--policy.n_encoder_layers=1",
     ),
     "diffusion_rgb": (
+        "--policy.pretrained_backbone_weights=null",
         "--policy.down_dims=[32, 64]",
         "--policy.num_train_timesteps=4",
     ),
