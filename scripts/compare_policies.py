@@ -96,6 +96,7 @@ def row(options: argparse.Namespace, policy: str, seed: int) -> Run:
     """What an evaluation found."""
     first = seed * SEED_STRIDE + FIRST_EVALUATION_SEED
     found = load_evaluation(options.output_dir / f"eval_{policy}_{seed}", first)
+    origin = provenance()
     return Run(
         table="policies",
         task=options.task,
@@ -106,7 +107,9 @@ def row(options: argparse.Namespace, policy: str, seed: int) -> Run:
         episodes=found["episodes"],
         iterations=0,
         env_steps=0,
-        **provenance(),
+        commit=origin["commit"],
+        command=origin["command"],
+        machine=origin["machine"],
     )
 
 

@@ -195,7 +195,7 @@ def raw_to_env_observation(raw: Mapping[str, Array], body: Embodiment = ALOHA) -
     stores nothing else. Depth is (..., 1, H, W) in mm, exactly what the dataset loader yields. Only colour
     stays uint8 (..., H, W, 3), below ``pixels``, where LeRobot expects it.
     """
-    observation = {
+    observation: dict[str, Any] = {
         key.removeprefix(OBS_PREFIX): value.astype(np.float32, copy=False)
         for key, value in _columns_of(raw, body).items()
     }

@@ -99,7 +99,7 @@ def resampled(calibration: Calibration) -> list[str]:
         parameter = calibration.parameters[name]
         factor, unit = scale_of(float(np.max(np.abs(draws), initial=0.0)), parameter.unit)
         counts, edges = np.histogram(factor * np.asarray(draws), bins=30)
-        value, *bounds = (factor * float(number) for number in (parameter.value, *(parameter.ci95 or ())))
+        value, *bounds = (factor * np.array([parameter.value, *(parameter.ci95 or ())], float)).tolist()
         x_range = span(edges, np.array([value, *bounds]))
         panel = _panel(SMALL_WIDTH, SMALL_HEIGHT, x_range, (0.0, 1.05 * float(counts.max())))
         parts = [

@@ -71,8 +71,8 @@ def joint_traces(pair: EpisodePair, joints: list[str], fps: float) -> list[str]:
         parts = [
             panel.frame("time [s]", f"{joint.replace('_', ' ')} [{unit}]"),
             panel.steps(time, command, COMMAND),
-            panel.line(time, recorded, RECORDED),
             panel.line(time, twin, TWIN),
+            panel.line(time, recorded, RECORDED),  # thin, so that both show where they are the same
         ]
         drawings.append(drawing(WIDTH, HEIGHT, parts, f"position of {joint.replace('_', ' ')} over time"))
     return drawings
@@ -109,8 +109,8 @@ def pad_totals(pair: EpisodePair, fps: float) -> list[str]:
         panel = _panel(span(time, margin=0.0), highest)
         parts = [
             panel.frame("time [s]", f"{words}: sum of counts"),
-            panel.line(time, recorded, RECORDED),
             panel.line(time, twin, TWIN),
+            panel.line(time, recorded, RECORDED),
         ]
         drawings.append(drawing(WIDTH, HEIGHT, parts, f"sum of the counts of {words} over time"))
     return drawings

@@ -13,6 +13,8 @@ from lerobot_vtrefine.pages.pads import colour_scale, pad_film
 from lerobot_vtrefine.pages.render import render
 
 FRAMES_SHOWN = 4
+LEAST_TOLD = 0.1
+"""Errors of joints below this are not told in figures [mrad, mm]."""
 
 
 def render_page(comparison: Comparison) -> str:
@@ -54,9 +56,10 @@ def verdict(comparison: Comparison) -> str:
     if max(row.peak for row in comparison.tracking) == 0.0:
         said = "The twin repeats the recorded motion exactly."
     else:
-        error = f"{1e3 * worst.rmse:.1f} {figures.unit_of(worst.joint)}"
+        error, unit = 1e3 * worst.rmse, figures.unit_of(worst.joint)
+        within = f"{error:.1f} {unit} RMS" if error >= LEAST_TOLD else f"less than {LEAST_TOLD} {unit} RMS"
         joint = worst.joint.replace("_", " ")
-        said = f"The twin follows the recorded arms to within {error} RMS; the worst joint is {joint}."
+        said = f"The twin follows the recorded arms to within {within}; the worst joint is {joint}."
     felt = [pad for pad in comparison.touch if pad.overlap is not None]
     if comparison.touch and all(pad.identical_frames == pad.frames for pad in comparison.touch):
         said += " All pads read the same in every frame."
@@ -89,7 +92,10 @@ def _films(pair: EpisodePair, fps: float) -> list[dict[str, str]]:
 
 def _tracking_row(row: Any) -> dict[str, str]:
     def number(value: float | None, digits: int = 1) -> str:
-        return "–" if value is None else f"{1e3 * value:.{digits}f}"
+        if value is None:
+            return "–"
+        rounded = round(1e3 * value, digits) + 0.0  # no minus before a zero
+        return f"{rounded:.{digits}f}".replace("-", "−")
 
     interval = "" if row.rmse_ci95 is None else f" [{number(row.rmse_ci95[0])}, {number(row.rmse_ci95[1])}]"
     return {
