@@ -21,7 +21,7 @@ from lerobot_vtrefine.cli.results.collect import save
 from lerobot_vtrefine.cli.results.provenance import provenance
 from lerobot_vtrefine.cli.results.rows import Run
 from lerobot_vtrefine.cli.results.tables import IMITATION
-from lerobot_vtrefine.named_configs import PREFIX, find
+from lerobot_vtrefine.shipped import PREFIX, find
 
 RESULTS = Path(__file__).parents[1] / "results" / "policies.json"
 POLICIES = ("vt_dp3_paper", "vt_dp3_visual", "act_rgb", "diffusion_rgb")
@@ -136,7 +136,7 @@ def main() -> None:
     """Run what is not done yet; every evaluation becomes a row as soon as it is there."""
     options = make_parser().parse_args()
     for name in (options.task, *options.policies):
-        find(PREFIX + name)  # a misspelt name is told now
+        find("--config_path", name)  # a misspelt name is told now
     for seed in options.seeds:
         for policy in options.policies:
             stages = [record_stage(options, seed), *policy_stages(options, policy, seed)]

@@ -6,7 +6,7 @@ from pathlib import Path
 import pytest
 from conftest import TINY_ENV, finish, lerobot, record
 
-from lerobot_vtrefine.named_configs import find
+from lerobot_vtrefine.shipped import find
 
 COLOUR = "--env.rgb=true"
 SMALL = {
@@ -43,7 +43,7 @@ def test_stock_commands_train_and_evaluate_it(coloured: Path, name: str, tmp_pat
     finish(
         lerobot(
             "train",
-            f"--config_path={find(name)}",
+            f"--config_path={find('--config_path', name)}",
             "--dataset.repo_id=local/vtrefine_demos",
             f"--dataset.root={coloured}",
             "--policy.device=cpu",

@@ -133,7 +133,7 @@ def presses_over_time(calibration: Calibration, number: int = 3) -> list[str]:
             panel.frame("time [s]", "mean counts above idle"),
             panel.line(time_s, measured, MEASURED),
             panel.line(time_s, model, MODEL),
-            label(SMALL_WIDTH - RIGHT, TOP + 14, f"RMS {errors[index]:.1f} counts", "end"),
+            label(SMALL_WIDTH - RIGHT, TOP - 7, f"RMS {errors[index]:.1f} counts", "end"),
         ]
         drawings.append(drawing(SMALL_WIDTH, SMALL_HEIGHT + 20, parts, f"{press.trial.file} over time"))
     return drawings

@@ -57,8 +57,7 @@ def verdict(comparison: Comparison) -> str:
         said = "The twin repeats the recorded motion exactly."
     else:
         error, unit = 1e3 * worst.rmse, figures.unit_of(worst.joint)
-        within = f"{error:.1f} {unit} RMS" if error >= LEAST_TOLD else f"less than {LEAST_TOLD} {unit} RMS"
-        joint = worst.joint.replace("_", " ")
+        within, joint = f"{max(error, LEAST_TOLD):.1f} {unit} RMS", worst.joint.replace("_", " ")
         said = f"The twin follows the recorded arms to within {within}; the worst joint is {joint}."
     felt = [pad for pad in comparison.touch if pad.overlap is not None]
     if comparison.touch and all(pad.identical_frames == pad.frames for pad in comparison.touch):
