@@ -8,7 +8,7 @@ from types import ModuleType
 import numpy as np
 import pytest
 
-from lerobot_vtrefine.sim.config import RandomizationConfig, SceneConfig
+from lerobot_vtrefine.sim.config import RandomizationConfig, SceneConfig, WarpConfig
 from lerobot_vtrefine.sim.rgb import RgbCamera
 from lerobot_vtrefine.sim.simulation import InsertionSim
 
@@ -91,3 +91,13 @@ def test_a_mujoco_warp_without_renderer_is_one_line(monkeypatch: pytest.MonkeyPa
     unused: Callable[..., InsertionSim] = make
     with pytest.raises(ImportError, match="lacks create_render_context: pip install -U mujoco-warp"):
         RgbCamera(unused, HEIGHT, WIDTH)
+
+
+@pytest.mark.gpu
+def test_a_gpu_draws_the_same_pictures() -> None:
+    pictures = {}
+    for device in ("cpu", "cuda"):
+        sim = make(3, backend="warp", warp=WarpConfig(device=device))
+        sim.reset(np.arange(3), np.array([3, 4, 5]))
+        pictures[device] = RgbCamera(sim, HEIGHT, WIDTH).images(np.arange(3)).astype(int)
+    assert np.mean(np.abs(pictures["cpu"] - pictures["cuda"]).max(-1) > 8) < 0.02  # edges alone

@@ -1,4 +1,4 @@
-"""The demo page's charts: success rates as bars with intervals, and over iterations."""
+"""Charts of success rates: as bars with intervals, and over iterations."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
