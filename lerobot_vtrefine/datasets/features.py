@@ -49,8 +49,6 @@ ACTION_KEY = "action"
 DEPTH_KEY = f"observation.images.{CAMERA}_depth"
 RGB_KEY = f"observation.images.{CAMERA}"
 """Only where colour is recorded; both names are those of LeRobot's cameras with colour and depth."""
-PIXELS_KEY = f"pixels/{CAMERA}"
-"""The same among an environment's features."""
 INTRINSICS_KEY = f"observation.camera.{CAMERA}.intrinsics"
 CAMERA_POSE_KEY = f"observation.camera.{CAMERA}.pose"
 NOISE_LEVEL_KEY = f"observation.camera.{CAMERA}.noise_level"
@@ -222,8 +220,12 @@ def env_observation_shapes(
 
 
 def env_key_map(body: Embodiment = ALOHA, *, colour: bool = False) -> dict[str, str]:
-    """Environment observation key -> dataset key (LeRobot's ``features_map``, the action included)."""
-    pixels = {PIXELS_KEY: RGB_KEY} if colour else {}
+    """Environment observation key -> dataset key (LeRobot's ``features_map``, the action included).
+
+    Colour, which comes below ``pixels``, goes by the name that LeRobot gives it: ``lerobot-eval`` records
+    only such images.
+    """
+    pixels = {RGB_KEY: RGB_KEY} if colour else {}
     keys = [*(column.key for column in columns(body) if column.key != STATE_KEY), DEPTH_KEY]
     own = {"agent_pos": STATE_KEY, "action": ACTION_KEY, **pixels}
     return own | {key.removeprefix(OBS_PREFIX): key for key in keys}

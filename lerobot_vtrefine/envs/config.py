@@ -7,7 +7,7 @@ from typing import Any
 from lerobot.configs import FeatureType, PolicyFeature
 from lerobot.envs.configs import EnvConfig
 
-from lerobot_vtrefine.datasets.features import ACTION_KEY, PIXELS_KEY, env_key_map, env_observation_shapes
+from lerobot_vtrefine.datasets.features import ACTION_KEY, RGB_KEY, env_key_map, env_observation_shapes
 from lerobot_vtrefine.embodiments import Embodiment, get_embodiment
 from lerobot_vtrefine.extras import SIMULATOR, require
 from lerobot_vtrefine.lerobot_compat.config_errors import told_by_lerobot
@@ -182,7 +182,7 @@ def policy_features(
     shapes = env_observation_shapes(camera_height, camera_width, body)
     features = {key: PolicyFeature(type=FeatureType.STATE, shape=shape) for key, (shape, _) in shapes.items()}
     if colour is not None:
-        features[PIXELS_KEY] = PolicyFeature(type=FeatureType.VISUAL, shape=(*colour, 3))
+        features[RGB_KEY] = PolicyFeature(type=FeatureType.VISUAL, shape=(*colour, 3))
     return {ACTION_KEY: PolicyFeature(type=FeatureType.ACTION, shape=(body.num_joints,)), **features}
 
 

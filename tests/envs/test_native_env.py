@@ -8,6 +8,7 @@ from draccus.utils import ParsingError
 from fake_sim import FakeSim
 from lerobot.configs import FeatureType, PolicyFeature
 from lerobot.envs.utils import env_to_policy_features, preprocess_observation
+from lerobot.scripts import lerobot_eval
 
 from lerobot_vtrefine import embodiments
 from lerobot_vtrefine.datasets.features import DEPTH_KEY, RGB_KEY, STATE_KEY, TACTILE_KEYS
@@ -145,6 +146,13 @@ def test_colour_is_one_observation_more(monkeypatch):
     features = env_to_policy_features(env.config)
     assert features[RGB_KEY] == PolicyFeature(FeatureType.VISUAL, (3, 24, 32))
     assert set(batch) == set(features) - {"action"}
+    stored = lerobot_eval._env_features_to_dataset_features(env.config.features)
+    frame = lerobot_eval._build_raw_frame(
+        second, 1, hold(env)[1], 0.0, False, False, "t", env.config.features
+    )
+    assert set(frame) == {*stored, "task"}  # lerobot-eval --eval.recording=true
+    assert stored[RGB_KEY]["dtype"] == "video"
+    assert frame[RGB_KEY].shape == stored[RGB_KEY]["shape"] == (24, 32, 3)
     single = VtRefineEnv(env.config)
     assert single.observation_space.contains(single.reset(seed=0)[0])
 
