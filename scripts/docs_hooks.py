@@ -36,6 +36,7 @@ SECTIONS: dict[str, tuple[str, ...]] = {
         "calibrate",
         "replay-import",
         "view-data",
+        "other-policies",
         "share",
         "gpu",
         "own-pad",

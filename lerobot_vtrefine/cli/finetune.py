@@ -6,7 +6,12 @@ example:
 
 --policy.path=FOLDER names the checkpoint to start from, --dppo.type a preset: paper, seed_literal,
 trust_region (many worlds on a GPU) or small (a laptop). --resume=true continues an interrupted run exactly.
+With --push_to_hub=true --repo_id=USER/NAME the result is evaluated by lerobot-eval on unseen seeds and
+uploaded, with its processors and a card that says what was found; a finished run is shared by repeating its
+command with --resume=true.
 """
+
+import os
 
 from lerobot.configs import parser
 from lerobot.utils.import_utils import register_third_party_plugins
@@ -14,14 +19,32 @@ from lerobot.utils.utils import init_logging
 
 from lerobot_vtrefine.cli.errors import run_cli
 from lerobot_vtrefine.cli.results.provenance import write_provenance
+from lerobot_vtrefine.cli.sharing import check_repo_id
 from lerobot_vtrefine.finetune.pipeline import FinetunePipelineConfig, run
+
+LEROBOTS_SHARING = ("--push_to_hub=true", "--repo_id=")
 
 
 @parser.wrap()
 def finetune(cfg: FinetunePipelineConfig) -> None:
     """Parse the command line as LeRobot's commands do, and run."""
+    _check_sharing(cfg)
     run(cfg)
     write_provenance(cfg.output_dir)
+    if cfg.push_to_hub and os.environ.get("RANK", "0") == "0":
+        from lerobot_vtrefine.cli.card_evaluation import evaluate_and_push
+
+        evaluate_and_push(cfg)
+
+
+def _check_sharing(cfg: FinetunePipelineConfig) -> None:
+    """Refuse, before hours of training, what could not be shared after them."""
+    if any(item.startswith(LEROBOTS_SHARING) for item in parser.get_cli_overrides("policy") or ()):
+        raise ValueError(
+            "share the result with --push_to_hub=true --repo_id=USER/NAME, without policy. before them"
+        )
+    if cfg.push_to_hub:
+        check_repo_id(cfg.repo_id or "")
 
 
 @run_cli

@@ -18,8 +18,8 @@ from lerobot_vtrefine.cli.errors import run_cli
 from lerobot_vtrefine.cli.results.provenance import write_provenance
 from lerobot_vtrefine.envs import VtRefineEnvConfig
 from lerobot_vtrefine.folders import beside, put_in_place
-from lerobot_vtrefine.information.chart import draw
 from lerobot_vtrefine.information.estimator import SENSES
+from lerobot_vtrefine.information.page import render_page
 from lerobot_vtrefine.information.study import Effort, Study, save_keeper, study, write
 
 
@@ -28,7 +28,7 @@ class InformationConfig:
     """Flags of ``vtrefine-information``."""
 
     output_dir: Path = Path("outputs/information")
-    """Folder of information.json, information.png and the trained encoders; replaced as a whole."""
+    """Folder of information.json, report.html and the trained encoders; replaced as a whole."""
     env: EnvConfig = field(default_factory=VtRefineEnvConfig)
     senses: tuple[str, ...] = ("joints", "visual", "tactile", "visuo_tactile")
     """Of joints, visual, tactile, visuo_tactile, visuo_tactile_cloud (paper: taxels as points)."""
@@ -84,7 +84,7 @@ def information(cfg: InformationConfig) -> None:
     with beside(cfg.output_dir) as folder:
         found = study(env, cfg.senses, cfg.effort, Bars(), save_keeper(folder, cfg.effort))
         write(found, cfg.effort, folder)
-        draw(found, folder / "information.png")
+        (folder / "report.html").write_text(render_page(found, env.scene_config.pair), encoding="utf-8")
         write_provenance(folder)
         put_in_place(folder, cfg.output_dir)
     print(summary(found))

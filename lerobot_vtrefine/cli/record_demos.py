@@ -3,7 +3,8 @@
 example:
   vtrefine-record-demos --config_path=vtrefine:round_grasped --root=outputs/demos --num_episodes=60
 
-Interrupted, the same command continues.
+Interrupted, the same command continues. With --push_to_hub=true --repo_id=USER/NAME the finished dataset is
+uploaded, with a card of its pads, its simulation and its seeds; repeated later, the command only uploads.
 """
 
 import logging
@@ -18,6 +19,7 @@ from lerobot.utils.utils import init_logging
 from tqdm import tqdm
 
 from lerobot_vtrefine.cli.errors import run_cli
+from lerobot_vtrefine.cli.sharing import check_repo_id, push_dataset
 from lerobot_vtrefine.datasets.features import dataset_features
 from lerobot_vtrefine.envs import VtRefineEnvConfig
 from lerobot_vtrefine.envs.demo_dataset import DemoDataset
@@ -36,7 +38,11 @@ class RecordDemosConfig:
     root: Path
     """Folder of the dataset; an interrupted recording in it is continued."""
     repo_id: str = "local/vtrefine_demos"
-    """LeRobot's name of the dataset."""
+    """LeRobot's name of the dataset, and its name on the Hub."""
+    push_to_hub: bool = False
+    """Upload the finished dataset to the Hugging Face Hub as ``repo_id``."""
+    private: bool = False
+    """Upload it for those only whom you invite."""
     num_episodes: int = 50
     """Episodes that the dataset shall hold."""
     seed: int = 0
@@ -58,6 +64,8 @@ class RecordDemosConfig:
         for name, lowest in (("num_episodes", 1), ("num_envs", 1), ("num_workers", 0), ("seed", 0)):
             if getattr(self, name) < lowest:
                 raise ValueError(f"--{name} must be at least {lowest}, got {getattr(self, name)}")
+        if self.push_to_hub:
+            check_repo_id(self.repo_id)
         if not isinstance(self.env, VtRefineEnvConfig):
             raise ValueError(f"--env.type={self.env.type} has no scripted expert; use --env.type=vtrefine")
 
@@ -82,7 +90,7 @@ def record(config: RecordDemosConfig) -> None:
     env = config.env
     assert isinstance(env, VtRefineEnvConfig)
     robot = env.body
-    features = dataset_features(*env.camera_size, robot)
+    features = dataset_features(*env.camera_size, robot, env.colour_size)
     with DemoDataset(
         config.root,
         config.repo_id,
@@ -122,6 +130,8 @@ def record(config: RecordDemosConfig) -> None:
 @parser.wrap()
 def _main(config: RecordDemosConfig) -> None:
     record(config)
+    if config.push_to_hub:
+        push_dataset(config.root, config.repo_id, private=config.private)
 
 
 @run_cli

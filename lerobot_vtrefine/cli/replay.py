@@ -55,6 +55,8 @@ class ReplayConfig:
     """How arms alone approach a command: zero_order or linear."""
     env: EnvConfig | None = None
     """The twin (--env.type=vtrefine ...); by default what a simulated dataset was recorded in."""
+    video: bool = True
+    """Draw the twin in the first episode, where there are parts."""
     overwrite: bool = False
     """Replace results that are there already."""
     eval: EvalConfig = field(default_factory=EvalConfig)
@@ -85,7 +87,12 @@ def replay(config: ReplayConfig) -> Comparison:
     env = config.env if isinstance(config.env, VtRefineEnvConfig) else None
     with staged(config.output_dir, FILES, overwrite=config.overwrite) as folder:
         comparison = compare_episodes(
-            _folder(config.dataset), config.episodes, parts=config.parts, hold=config.hold, env=env
+            _folder(config.dataset),
+            config.episodes,
+            parts=config.parts,
+            hold=config.hold,
+            env=env,
+            film=config.video,
         )
         write_summary(comparison, folder / FILES[0])
         (folder / FILES[1]).write_text(render_page(comparison), encoding="utf-8")

@@ -1,12 +1,17 @@
 """Datasets and policies on the Hugging Face Hub, with cards that say what they are and how good."""
 
 import json
+import shlex
 from collections.abc import Mapping
+from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
+from lerobot_vtrefine.cli.pipeline.demo_config import flags
 from lerobot_vtrefine.cli.report.results import load_evaluation, percent
+from lerobot_vtrefine.envs.evaluation_note import read_note
 from lerobot_vtrefine.files import read_json, read_json_lines
+from lerobot_vtrefine.finetune.seeds import TRAINING_SEEDS
 
 CHECKPOINT_FILES = (
     "config.json",
@@ -16,6 +21,7 @@ CHECKPOINT_FILES = (
 )
 """What another machine needs to run a policy; the processors hold the point cloud's settings."""
 LOCAL = "local"
+TRAIN_CONFIG = "train_config.json"
 CARD, EPISODES = "README.md", "episodes.jsonl"
 TASK_FIELDS = ("pair", "clearance_m", "start", "backend")
 MEASURED = (
@@ -65,18 +71,18 @@ def push_policy(folder: Path, repo_id: str, evaluation: Path | None, *, private:
 
 
 def policy_card(folder: Path, repo_id: str, evaluation: Path | None) -> str:
-    """The card: what the policy is, on which task it was tuned, how often it succeeds, how to run it."""
+    """The card: what the policy is, how it was trained, how often it succeeds, how to see the same."""
     policy = _settings(folder / "config.json")
-    training = folder / "train_config.json"
-    env = _settings(training).get("env") if training.is_file() else None
+    training = _settings(folder / TRAIN_CONFIG) if (folder / TRAIN_CONFIG).is_file() else {}
     parts = [
-        "---\nlibrary_name: lerobot\npipeline_tag: robotics\ntags: [LeRobot, tactile, flexitac, vt_dp3]\n---",
+        f"---\nlicense: {policy.get('license') or 'apache-2.0'}\nlibrary_name: lerobot\n"
+        "pipeline_tag: robotics\ntags: [LeRobot, tactile, flexitac, vt_dp3]\n---",
         f"# {repo_id.partition('/')[2]}",
         "A visuo-tactile diffusion policy (`vt_dp3` of lerobot_vtrefine) for two-armed insertion; "
         f"{_kind(policy)}.",
-        _task(env),
+        _training(training),
         _success(evaluation),
-        _use(repo_id),
+        _use(repo_id, policy, evaluation),
     ]
     return "\n\n".join(part for part in parts if part) + "\n"
 
@@ -93,11 +99,26 @@ def _kind(policy: Mapping[str, Any]) -> str:
     return f"it sees {policy.get('modalities', 'visuo_tactile').replace('_', '-')} input and was {tuned}"
 
 
-def _task(env: Any) -> str:
-    if not isinstance(env, Mapping):
-        return ""
-    known = {name: env.get(name) for name in TASK_FIELDS if env.get(name) is not None}
-    return f"Tuned in the environment `{json.dumps({'type': env.get('type'), **known})}`." if known else ""
+def _training(training: Mapping[str, Any]) -> str:
+    """Seeds and size of the training, from the settings that checkpoints of both trainers hold."""
+    env, dppo, dataset = (training.get(name) or {} for name in ("env", "dppo", "dataset"))
+    known = {name: env[name] for name in TASK_FIELDS if env.get(name) is not None}
+    lines = []
+    if dppo:
+        lines.append(
+            f"- DPPO preset `{dppo.get('type')}`: {dppo.get('iterations')} iterations of "
+            f"{dppo.get('num_envs')} worlds; "
+            f"environment seeds from {TRAINING_SEEDS + training.get('seed', 0)} on"
+        )
+    elif dataset:
+        lines.append(
+            f"- Imitation of the dataset `{dataset.get('repo_id')}`: {training.get('steps')} steps of "
+            f"{training.get('batch_size')} samples, seed {training.get('seed')}"
+        )
+    if known:
+        lines.append(f"- Task: `{json.dumps({'type': env.get('type'), **known})}`")
+    note = f"All settings are in `{TRAIN_CONFIG}`."
+    return "## Training\n\n" + "\n".join(lines) + f"\n\n{note}" if lines else ""
 
 
 def _success(evaluation: Path | None) -> str:
@@ -134,9 +155,32 @@ def first_seed(path: Path) -> int:
     return seeds[0]
 
 
-def _use(repo_id: str) -> str:
+def _use(repo_id: str, policy: Mapping[str, Any], evaluation: Path | None) -> str:
+    """The commands that repeat the evaluation, seed by seed."""
+    command = evaluation_command(repo_id, policy, evaluation)
+    repeats = (
+        "The same episodes and, on the same kind of machine, the same successes"
+        if "--seed" in command
+        else "An evaluation"
+    )
     return (
-        "## Use\n\n```bash\npip install 'lerobot_policy_vtrefine[sim]'\n"
-        f"lerobot-eval --policy.path={repo_id} --policy.device=cpu"
-        " --config_path=vtrefine:round_grasped\n```"
+        f"## Use\n\n```bash\npip install 'lerobot_policy_vtrefine[sim]'\n{command}\n```\n\n"
+        f"{repeats}, with version {version('lerobot_policy_vtrefine')} of the package."
+    )
+
+
+def evaluation_command(repo_id: str, policy: Mapping[str, Any], evaluation: Path | None) -> str:
+    """``lerobot-eval`` of a shared policy: as it was evaluated, where that was noted beside the episodes."""
+    begin = f"lerobot-eval --policy.path={repo_id} --policy.device={policy.get('device') or 'cpu'}"
+    note = None if evaluation is None else read_note(evaluation / EPISODES)
+    if evaluation is None or note is None:
+        return f"{begin} --config_path=vtrefine:round_grasped"
+    found = load_evaluation(evaluation, first := first_seed(evaluation / EPISODES))
+    sizes = (
+        f"--eval.n_episodes={found['episodes']}",
+        f"--eval.batch_size={note['batch_size']}",
+        f"--seed={first}",
+    )
+    return " \\\n    ".join(
+        [begin, *map(shlex.quote, flags("env", {"type": "vtrefine"} | note["env"])), *sizes]
     )

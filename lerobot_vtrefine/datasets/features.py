@@ -13,6 +13,7 @@ key                  shape              dtype    meaning
 ``tactile``          (..., P, T)        uint8    raw pad counts, row-major
 ``tactile_baseline`` (..., P, T)        uint8    idle counts of the same taxels
 ``depth_mm``         (..., H, W)        uint16   depth along the optical axis, mm; 0 = no return
+``rgb``              (..., Hc, Wc, 3)   uint8    colour image of the same camera, where one is recorded
 ``camera_intrinsics`` (..., 4)          float32  fx, fy, cx, cy in pixels
 ``camera_pose``      (..., 7)           float32  x y z in m, qw qx qy qz: optical frame (OpenCV) in the world
 ``noise_level``      (..., 1)           float32  depth noise to add when the cloud is built; 0 on hardware
@@ -46,6 +47,8 @@ BASELINE_PREFIX = "observation.tactile_baseline."
 STATE_KEY = "observation.state"
 ACTION_KEY = "action"
 DEPTH_KEY = f"observation.images.{CAMERA}_depth"
+RGB_KEY = f"observation.images.{CAMERA}"
+"""Only where colour is recorded; both names are those of LeRobot's cameras with colour and depth."""
 INTRINSICS_KEY = f"observation.camera.{CAMERA}.intrinsics"
 CAMERA_POSE_KEY = f"observation.camera.{CAMERA}.pose"
 NOISE_LEVEL_KEY = f"observation.camera.{CAMERA}.noise_level"
@@ -128,11 +131,11 @@ TAXEL_INFO = taxel_info(ALOHA.pad_layout)
 
 
 def dataset_features(
-    camera_height: int, camera_width: int, body: Embodiment = ALOHA
+    camera_height: int, camera_width: int, body: Embodiment = ALOHA, colour: tuple[int, int] | None = None
 ) -> dict[str, dict[str, Any]]:
-    """Features of a body's data for ``LeRobotDataset.create(..., use_videos=False)``.
+    """Features of a body's data for ``LeRobotDataset.create``; `colour` is a colour image's height and width.
 
-    ``use_videos=False`` because the depth image is kept exactly (TIFF, uint16 mm). Calibration is stored in
+    Colour is a video, depth is kept exactly (TIFF, uint16 mm). Calibration is stored in
     columns, not in ``info``: LeRobot refuses to merge datasets whose ``info`` differs. Array columns carry no
     ``names``: LeRobot's recording code would rebuild such features and drop their ``info``.
     """
@@ -151,6 +154,9 @@ def dataset_features(
         "names": ["height", "width", "channels"],
         "info": {"is_depth_map": True},
     }
+    if colour is not None:
+        channels = ["height", "width", "channels"]
+        features[RGB_KEY] = {"dtype": "video", "shape": (*colour, 3), "names": channels}
     features[ACTION_KEY] = {"dtype": "float32", "shape": (body.num_joints,), **names}
     return features
 
@@ -175,22 +181,26 @@ def raw_to_frame(raw: Mapping[str, Array], body: Embodiment = ALOHA) -> dict[str
     if raw["state"].shape != (body.num_joints,):
         raise ValueError(f"a frame needs state of shape ({body.num_joints},), got {raw['state'].shape}")
     depth = np.ascontiguousarray(raw["depth_mm"], np.uint16)[..., None]
-    return {**_columns_of(raw, body), DEPTH_KEY: depth}
+    colour = {RGB_KEY: raw["rgb"]} if "rgb" in raw else {}
+    return {**_columns_of(raw, body), DEPTH_KEY: depth, **colour}
 
 
-def raw_to_env_observation(raw: Mapping[str, Array], body: Embodiment = ALOHA) -> dict[str, Array]:
+def raw_to_env_observation(raw: Mapping[str, Array], body: Embodiment = ALOHA) -> dict[str, Any]:
     """A raw observation (leading dimensions allowed) as an environment observation.
 
     LeRobot's ``preprocess_observation`` turns its keys into the dataset's (``agent_pos`` becomes
     ``observation.state``). Everything is float32, counts too, because ``lerobot-eval --eval.recording=true``
-    stores nothing else. Depth is (..., 1, H, W) in mm, exactly what the dataset loader yields.
+    stores nothing else. Depth is (..., 1, H, W) in mm, exactly what the dataset loader yields. Only colour
+    stays uint8 (..., H, W, 3), below ``pixels``, where LeRobot expects it.
     """
-    observation = {
+    observation: dict[str, Any] = {
         key.removeprefix(OBS_PREFIX): value.astype(np.float32, copy=False)
         for key, value in _columns_of(raw, body).items()
     }
     observation["agent_pos"] = observation.pop("state")
     observation[DEPTH_KEY.removeprefix(OBS_PREFIX)] = raw["depth_mm"].astype(np.float32)[..., None, :, :]
+    if "rgb" in raw:
+        observation["pixels"] = {CAMERA: raw["rgb"]}
     return observation
 
 
@@ -209,7 +219,13 @@ def env_observation_shapes(
     return shapes
 
 
-def env_key_map(body: Embodiment = ALOHA) -> dict[str, str]:
-    """Environment observation key -> dataset key (LeRobot's ``features_map``, the action included)."""
+def env_key_map(body: Embodiment = ALOHA, *, colour: bool = False) -> dict[str, str]:
+    """Environment observation key -> dataset key (LeRobot's ``features_map``, the action included).
+
+    Colour, which comes below ``pixels``, goes by the name that LeRobot gives it: ``lerobot-eval`` records
+    only such images.
+    """
+    pixels = {RGB_KEY: RGB_KEY} if colour else {}
     keys = [*(column.key for column in columns(body) if column.key != STATE_KEY), DEPTH_KEY]
-    return {"agent_pos": STATE_KEY, "action": ACTION_KEY, **{k.removeprefix(OBS_PREFIX): k for k in keys}}
+    own = {"agent_pos": STATE_KEY, "action": ACTION_KEY, **pixels}
+    return own | {key.removeprefix(OBS_PREFIX): key for key in keys}

@@ -7,7 +7,7 @@ from typing import Any
 from lerobot.configs import FeatureType, PolicyFeature
 from lerobot.envs.configs import EnvConfig
 
-from lerobot_vtrefine.datasets.features import ACTION_KEY, env_key_map, env_observation_shapes
+from lerobot_vtrefine.datasets.features import ACTION_KEY, RGB_KEY, env_key_map, env_observation_shapes
 from lerobot_vtrefine.embodiments import Embodiment, get_embodiment
 from lerobot_vtrefine.extras import SIMULATOR, require
 from lerobot_vtrefine.lerobot_compat.config_errors import told_by_lerobot
@@ -25,6 +25,9 @@ from lerobot_vtrefine.sim.reality import Reality, load_reality
 
 VECTORIZATIONS = ("native", "gym")
 ABLATIONS = ("none", "touch", "vision")
+RENDERER = "mujoco_warp"
+SMALLEST_PX = 16
+"""Height and width that video encoders take."""
 SHORTCUTS = ("pair", "clearance_m", "start", "mesh_dir")
 """Fields of ``scene`` that have a flag of their own."""
 
@@ -76,6 +79,10 @@ class VtRefineEnvConfig(EnvConfig):
     """none, or touch or vision, replaced by its mean over ``ablate_dataset``."""
     ablate_dataset: Path | None = None
     """Root of the LeRobot dataset whose mean frame the ablation shows."""
+    rgb: bool = False
+    """Colour images of the camera's view too, as policies without a depth camera want them."""
+    rgb_size: tuple[int, int] = (120, 160)
+    """Height and width of the colour images in pixels."""
     video_episodes: int = 10
     """Episodes that ``lerobot-eval`` makes videos of: the first ones, at most its ten; 0 draws nothing."""
     metrics_path: Path | None = None
@@ -102,8 +109,14 @@ class VtRefineEnvConfig(EnvConfig):
             raise ValueError(
                 f"{self.reality} holds a sensor model: drop --env.sensor_model={self.sensor_model}"
             )
-        self.features = policy_features(*self.camera_size, self.body)
-        self.features_map = env_key_map(self.body)
+        if self.rgb:
+            require("--env.rgb=true", (*SIMULATOR, RENDERER))
+            if min(self.rgb_size) < SMALLEST_PX:
+                raise ValueError(f"--env.rgb_size must be at least {SMALLEST_PX} pixels, got {self.rgb_size}")
+            if self.ablate == "vision":
+                raise ValueError("--env.ablate=vision hides the depth image only: leave out --env.rgb=true")
+        self.features = policy_features(*self.camera_size, self.body, self.colour_size)
+        self.features_map = env_key_map(self.body, colour=self.rgb)
         _ = self.task_config  # its own checks, now rather than in a worker process
 
     @property
@@ -141,6 +154,11 @@ class VtRefineEnvConfig(EnvConfig):
         return camera.height, camera.width
 
     @property
+    def colour_size(self) -> tuple[int, int] | None:
+        """Height and width of the colour image in pixels; None where there is none."""
+        return self.rgb_size if self.rgb else None
+
+    @property
     def max_episode_steps(self) -> int:
         """Control steps until the time-out."""
         return self.task_config.steps_of(self.scene_config.start)
@@ -157,14 +175,18 @@ class VtRefineEnvConfig(EnvConfig):
         return {self.type: {0: make_vector_env(self, n_envs, use_async_envs)}}
 
 
-def policy_features(camera_height: int, camera_width: int, body: Embodiment) -> dict[str, PolicyFeature]:
-    """LeRobot features under environment keys.
+def policy_features(
+    camera_height: int, camera_width: int, body: Embodiment, colour: tuple[int, int] | None = None
+) -> dict[str, PolicyFeature]:
+    """LeRobot features under environment keys; `colour` is the colour image's height and width.
 
     Depth is no VISUAL feature here: ``lerobot-eval --eval.recording=true`` makes videos of these, and
     millimetres do not fit into one.
     """
     shapes = env_observation_shapes(camera_height, camera_width, body)
     features = {key: PolicyFeature(type=FeatureType.STATE, shape=shape) for key, (shape, _) in shapes.items()}
+    if colour is not None:
+        features[RGB_KEY] = PolicyFeature(type=FeatureType.VISUAL, shape=(*colour, 3))
     return {ACTION_KEY: PolicyFeature(type=FeatureType.ACTION, shape=(body.num_joints,)), **features}
 
 

@@ -20,9 +20,9 @@ from lerobot.datasets.io_utils import SuppressProgressBars
 from lerobot.datasets.lerobot_dataset import LeRobotDataset
 
 from lerobot_vtrefine.datasets.features import ACTION_KEY, raw_to_frame
+from lerobot_vtrefine.datasets.simulation_card import NOTE
 from lerobot_vtrefine.embodiments import Embodiment
 from lerobot_vtrefine.envs.demonstrations import Demonstration
-from lerobot_vtrefine.envs.recording_note import NOTE
 from lerobot_vtrefine.folders import (
     check_replaceable,
     link_or_copy,
@@ -36,7 +36,8 @@ from lerobot_vtrefine.lerobot_compat.fast_saving import fast_saving
 LEDGER = NOTE
 INFO = Path("meta") / "info.json"
 TASKS = Path("meta") / "tasks.parquet"
-DATASET_FOLDERS = ("data", "meta", "images")
+TABLES = ("data", "meta")
+DATASET_FOLDERS = (*TABLES, "videos", "images")
 """What is the dataset's in its folder; anything else there is the user's."""
 COMMIT_EVERY = 20
 IMAGE_WRITER_THREADS = 2
@@ -182,7 +183,7 @@ class DemoDataset:
             self._features,
             root=self._work,
             robot_type=self._body.robot_type,
-            use_videos=False,
+            use_videos=any(feature["dtype"] == "video" for feature in self._features.values()),
             image_writer_threads=IMAGE_WRITER_THREADS,
         )
         return self._dataset
@@ -190,7 +191,7 @@ class DemoDataset:
     def _copy_committed(self) -> None:
         """Begin the next commit: the files of the last one, those that LeRobot changes in place as copies."""
         committed = set(self._ledger["files"])
-        for path in _files(self._place, DATASET_FOLDERS[:2]):
+        for path in _files(self._place, (*TABLES, "videos")):
             name = path.relative_to(self._place)
             (self._work / name).parent.mkdir(parents=True, exist_ok=True)
             if str(name) in committed:
@@ -201,7 +202,7 @@ class DemoDataset:
     def _continue(self) -> None:
         recorded = _read_ledger(self._place)
         wanted, used = self._ledger["settings"], recorded["settings"]
-        changed = sorted(key for key in wanted if wanted[key] != used.get(key))
+        changed = sorted(key for key in {**wanted, **used} if wanted.get(key) != used.get(key))
         if changed:
             raise ValueError(
                 f"{self.root} was recorded with other settings ({', '.join(changed)});"
@@ -262,7 +263,7 @@ def _read_ledger(root: Path) -> dict[str, Any]:
 
 def _parquet_files(root: Path) -> list[str]:
     """Files of episodes below ``root``, as ``meta/recording.json`` lists them."""
-    names = (path.relative_to(root) for path in _files(root, DATASET_FOLDERS[:2]))
+    names = (path.relative_to(root) for path in _files(root, TABLES))
     return sorted(str(name) for name in names if name.suffix == ".parquet" and name != TASKS)
 
 

@@ -42,6 +42,7 @@ class Episodes:
         sim: The simulation; its reset of one environment is a pure function of the seed.
         ablate: Applied to every raw frame that is read (identity by default).
         log: Where a row per finished episode goes, if anywhere.
+        colour: Colour images (m, H, W, 3) uint8 of environments (m,), for frames that hold them.
     """
 
     def __init__(
@@ -49,6 +50,7 @@ class Episodes:
         sim: "InsertionSim",
         ablate: Callable[[Raw], Raw] | None = None,
         log: EpisodeLog | None = None,
+        colour: Callable[[Array], Array] | None = None,
     ) -> None:
         self.sim = sim
         self.num_envs = sim.num_envs
@@ -61,6 +63,7 @@ class Episodes:
         self.metrics: dict[str, Array] = {}
         self._ablate = ablate
         self._log = log
+        self._colour = colour
         self.terminated, self.truncated, self.success = np.zeros((3, self.num_envs), bool)
 
     @property
@@ -127,6 +130,8 @@ class Episodes:
         )
         frames["camera_pose"] = np.asarray(self.sim.camera_pose, np.float32)[ids]
         frames["noise_level"] = np.full((count, 1), self.sim.noise_level, np.float32)
+        if self._colour is not None:
+            frames["rgb"] = self._colour(ids)
         return frames if self._ablate is None else self._ablate(frames)
 
     def _collect(self, finished: Array) -> None:

@@ -5,6 +5,7 @@ from functools import partial
 from typing import TYPE_CHECKING
 
 import gymnasium as gym
+import numpy as np
 from gymnasium.vector import AutoresetMode
 from lerobot.envs.utils import _LazyAsyncVectorEnv, freeze_after_episode_end
 
@@ -12,6 +13,7 @@ from lerobot_vtrefine.envs.ablation import make_ablation
 from lerobot_vtrefine.envs.config import VtRefineEnvConfig
 from lerobot_vtrefine.envs.episode_log import EpisodeLog
 from lerobot_vtrefine.envs.episodes import Episodes
+from lerobot_vtrefine.envs.evaluation_note import write_note
 from lerobot_vtrefine.envs.rendering import EvalVideos
 
 if TYPE_CHECKING:
@@ -44,10 +46,21 @@ def make_simulation(config: VtRefineEnvConfig, num_envs: int) -> "InsertionSim":
 
 
 def make_episodes(config: VtRefineEnvConfig, num_envs: int) -> Episodes:
-    """The simulation with ablation and metrics log as configured."""
+    """The simulation with ablation, metrics log and colour camera as configured."""
     ablation = make_ablation(config.ablate, config.ablate_dataset, config.body)
     log = EpisodeLog(config.metrics_path) if config.metrics_path is not None else None
-    return Episodes(make_simulation(config, num_envs), ablation, log)
+    sim = make_simulation(config, num_envs)
+    return Episodes(sim, ablation, log, _colour_camera(config, sim))
+
+
+def _colour_camera(
+    config: VtRefineEnvConfig, sim: "InsertionSim"
+) -> Callable[[np.ndarray], np.ndarray] | None:
+    if config.colour_size is None:
+        return None
+    from lerobot_vtrefine.sim.rgb import RgbCamera
+
+    return RgbCamera(sim, *config.colour_size).images
 
 
 def make_vector_env(
@@ -56,6 +69,7 @@ def make_vector_env(
     """The native batched environment, or Gymnasium's sync or async one around single environments."""
     from lerobot_vtrefine.envs.vector_env import VtRefineVectorEnv
 
+    write_note(config, num_envs)
     if config.vectorization == "native":
         return VtRefineVectorEnv(config, num_envs)
     makers: list[Callable[[], gym.Env]] = [

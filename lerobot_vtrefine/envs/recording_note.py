@@ -6,11 +6,10 @@ from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
 
+from lerobot_vtrefine.datasets.simulation_card import NOTE
 from lerobot_vtrefine.envs.config import VtRefineEnvConfig
 from lerobot_vtrefine.files import read_json
 from lerobot_vtrefine.folders import write_in_place
-
-NOTE = Path("meta") / "recording.json"
 
 
 def simulation_settings(env: VtRefineEnvConfig) -> dict[str, Any]:
@@ -19,16 +18,21 @@ def simulation_settings(env: VtRefineEnvConfig) -> dict[str, Any]:
     """
     known = replace(env, reality=None)
     hidden = {} if env.reality is None else {"reality": hashlib.sha256(env.reality.read_bytes()).hexdigest()}
-    return hidden | {
-        "scene": {
-            key: str(value) if isinstance(value, Path) else value
-            for key, value in asdict(known.scene_config).items()
-        },
-        "rules": asdict(env.task_config),
-        "randomization": asdict(env.randomization),
-        "sensor_model": env.sensor_model,
-        "task": env.task,
-    }
+    colour = {} if env.colour_size is None else {"colour": list(env.colour_size)}
+    return (
+        hidden
+        | colour
+        | {
+            "scene": {
+                key: str(value) if isinstance(value, Path) else value
+                for key, value in asdict(known.scene_config).items()
+            },
+            "rules": asdict(env.task_config),
+            "randomization": asdict(env.randomization),
+            "sensor_model": env.sensor_model,
+            "task": env.task,
+        }
+    )
 
 
 def add_episode(root: Path, settings: dict[str, Any], index: int, row: dict[str, Any]) -> None:

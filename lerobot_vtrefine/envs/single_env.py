@@ -61,4 +61,4 @@ def _shear(info: dict[str, Any]) -> Observation:
 
 
 def _first(observation: Observation) -> Observation:
-    return {key: value[0] for key, value in observation.items()}
+    return {key: _first(value) if isinstance(value, dict) else value[0] for key, value in observation.items()}

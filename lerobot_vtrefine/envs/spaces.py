@@ -3,7 +3,7 @@
 import numpy as np
 from gymnasium import spaces
 
-from lerobot_vtrefine.datasets.features import env_observation_shapes
+from lerobot_vtrefine.datasets.features import CAMERA, env_observation_shapes
 from lerobot_vtrefine.envs.config import VtRefineEnvConfig
 
 
@@ -18,10 +18,13 @@ def action_space(config: VtRefineEnvConfig) -> spaces.Box:
 
 
 def observation_space(config: VtRefineEnvConfig) -> spaces.Dict:
-    """One environment's raw observation: joints, pad counts, depth, camera."""
+    """One environment's raw observation: joints, pad counts, depth, camera, and colour where it is on."""
     height, width = config.camera_size
     shapes = env_observation_shapes(height, width, config.body)
-    return spaces.Dict({key: _box(shape, highest) for key, (shape, highest) in shapes.items()})
+    found: dict[str, spaces.Space] = {key: _box(shape, highest) for key, (shape, highest) in shapes.items()}
+    if config.colour_size is not None:
+        found["pixels"] = spaces.Dict({CAMERA: spaces.Box(0, 255, (*config.colour_size, 3), np.uint8)})
+    return spaces.Dict(found)
 
 
 def _box(shape: tuple[int, ...], highest: float) -> spaces.Box:

@@ -16,7 +16,7 @@ from lerobot_vtrefine.envs.factory import make_episodes
 from lerobot_vtrefine.envs.rendering import EvalFrame, FrameSource, LazyFrames, eval_frame
 from lerobot_vtrefine.envs.spaces import action_space, observation_space
 
-Observation = dict[str, Array]
+Observation = dict[str, Any]
 SEED_LIMIT = 2**31
 
 
@@ -137,7 +137,7 @@ class VtRefineVectorEnv(gym.vector.VectorEnv[Observation, Array, Array]):
     def _observation(self) -> Observation:
         # Nothing of the raw frames themselves: these change in place, and callers keep observations.
         raw = self.episodes.raw
-        return {key: _own(value, raw) for key, value in raw_to_env_observation(raw, self.config.body).items()}
+        return _own(raw_to_env_observation(raw, self.config.body), raw)
 
     def _shear(self) -> dict[str, Array]:
         return {"shear": self.episodes.sim.shear()} if self.config.shear.on else {}
@@ -151,6 +151,8 @@ class VtRefineVectorEnv(gym.vector.VectorEnv[Observation, Array, Array]):
         return info
 
 
-def _own(value: Array, raw: Observation) -> Array:
-    """The value, copied where it is part of a raw frame."""
+def _own(value: Any, raw: Observation) -> Any:
+    """The value, copied where it is part of a raw frame; of a dict, its values."""
+    if isinstance(value, dict):
+        return {key: _own(item, raw) for key, item in value.items()}
     return value.copy() if any(np.may_share_memory(value, item) for item in raw.values()) else value

@@ -75,8 +75,14 @@ class FinetunePipelineConfig:
     eval_freq: int = 10
     # Write a checkpoint every so many iterations, and after the last.
     save_freq: int = 10
-    # Only eval.n_episodes counts; the other fields let files of configs/env serve this command too.
+    # n_episodes counts, and batch_size with push_to_hub; the rest lets files of configs/env serve this too.
     eval: EvalConfig = field(default_factory=EvalConfig)
+    # Evaluate the result by lerobot-eval and upload it to the Hugging Face Hub with a card of what was found.
+    push_to_hub: bool = False
+    # Its name on the Hub: USER/NAME.
+    repo_id: str | None = None
+    # Upload it for those only whom you invite.
+    private: bool = False
     # Curves and settings only: no artifacts are uploaded, so disable_artifact changes nothing.
     wandb: WandBConfig = field(default_factory=WandBConfig)
 
@@ -139,6 +145,8 @@ def load_policy(path: Path) -> VtDp3Policy:
         ) from error
     if not isinstance(config, VtDp3Config):
         raise ValueError(f"{path} holds a policy of type {config.type}; vtrefine-finetune needs vt_dp3")
+    if config.use_peft:
+        raise ValueError(f"{path} holds adapters (--peft.*) only; vtrefine-finetune needs all weights")
     return VtDp3Policy.from_pretrained(path, config=config)
 
 

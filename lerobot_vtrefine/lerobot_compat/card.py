@@ -1,4 +1,4 @@
-"""Dataset cards that say what tactile columns hold: pads, layout, units, calibration.
+"""Dataset cards that say what tactile columns hold, and which simulation they come from.
 
 `install` lets LeRobot's own `dataset.push_to_hub` (and so `lerobot-record`, `lerobot-rollout`) put this text
 into the card's "Dataset Description". Datasets without pads keep LeRobot's card. Robots with pads call it
@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from lerobot_vtrefine.datasets.features import ACTION_KEY, AGE_KEY, NOISE_LEVEL_KEY, STATE_KEY, TAXEL_INFO
+from lerobot_vtrefine.datasets.simulation_card import describe_simulation
 from lerobot_vtrefine.lerobot_compat.guard import is_supported
 
 if TYPE_CHECKING:
@@ -43,6 +44,7 @@ def describe(meta: "LeRobotDatasetMetadata") -> str:
         return ""
     parts = [
         _summary(meta),
+        describe_simulation(meta.root),
         _pads(features, stats),
         _layout(features),
         _calibration(features, stats),

@@ -85,14 +85,14 @@ class VtRefineSim(Robot):
 
     @cached_property
     def observation_features(self) -> dict[str, Any]:
-        """Joints, depth image, raw and idle pad counts, their age, the camera's model."""
-        features = dataset_features(*self.env.camera_size, self.body)
+        """Joints, depth, colour if it is on, raw and idle pad counts, their age, the camera's model."""
+        features = dataset_features(*self.env.camera_size, self.body, self.env.colour_size)
         found: dict[str, Any] = dict(self.action_features)
         for key, feature in features.items():
             if not key.startswith(OBS_PREFIX) or key == STATE_KEY:
                 continue
             name, shape = key.removeprefix(OBS_PREFIX).removeprefix(IMAGES), tuple(feature["shape"])
-            is_image = feature["dtype"] == "image"
+            is_image = feature["dtype"] in ("image", "video")
             found[name] = shape if is_image else ArraySpec(shape, feature["dtype"], feature.get("info"))
         return found
 

@@ -4,7 +4,7 @@ Shapes: E episodes of T frames, J joints, P pads. Frame t of an episode is what 
 t is issued; the command acts until frame t + 1.
 """
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import mujoco
@@ -104,7 +104,13 @@ def replay_commands(
     return [stacked[episode, :length] for episode, length in enumerate(lengths)]
 
 
-def replay_scene(sim: InsertionSim, commands: Array, seed: int, start: Start | None = None) -> SceneReplay:
+def replay_scene(
+    sim: InsertionSim,
+    commands: Array,
+    seed: int,
+    start: Start | None = None,
+    watch: Callable[[], None] = lambda: None,
+) -> SceneReplay:
     """One episode in world 0 of a simulation, with parts and pads.
 
     The simulation's own clamps, rates and ramps act on the commands, as in its recordings: an episode that it
@@ -114,16 +120,20 @@ def replay_scene(sim: InsertionSim, commands: Array, seed: int, start: Start | N
         commands: (T, J) [rad, m].
         seed: of the episode; decides the start (unless given), the pads' idle levels and noise.
         start: one world's state to start from.
+        watch: called at every frame, and at the end.
     """
     world = np.zeros(1, np.int64)
     sim.reset(world, np.array([seed]), start)
     first = sim.observe(world)
     positions, counts = [first["state"]], [first["tactile"]]
+    watch()
     for command in commands[:-1]:
         sim.step(command[None], world)
+        watch()
         positions.append(sim.joint_state(world))
         counts.append(sim.tactile(world))
     sim.step(commands[-1:], world)
+    watch()
     return SceneReplay(
         position=np.concatenate(positions),
         counts=np.concatenate(counts),

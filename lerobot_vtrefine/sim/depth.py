@@ -79,6 +79,10 @@ class DepthCamera:
             self._bounds = np.repeat(self._bounds, len(self.position), 0)
         self._size[ids], self._bounds[ids], self._shapes = size, bounds, None
 
+    def sizes(self, ids: Array) -> Array:
+        """(m, G, 3) sizes of the geoms of worlds `ids`, as `set_shapes` gave them."""
+        return self._size[ids] if len(self._size) > 1 else np.repeat(self._size, len(ids), 0)
+
     def render(
         self, ids: Array, geom_position: Array | torch.Tensor, geom_rotation: Array | torch.Tensor
     ) -> Array:

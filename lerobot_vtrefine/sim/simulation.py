@@ -261,6 +261,10 @@ class InsertionSim:
         """Depth images (m, H, W) uint16 [mm]."""
         return self._present.images(self._checked(ids))
 
+    def geometry(self, ids: Array) -> tuple[Array | torch.Tensor, Array | torch.Tensor, Array]:
+        """Geoms as cameras see them: positions (m, G, 3), rotations (m, G, 3, 3), sizes (m, G, 3)."""
+        return *self._backend.geom_poses(ids), self._depth.sizes(ids)
+
     def command_targets(self, ids: Array | None = None) -> Array:
         """Joint targets (m, J) that the servos hold at the end of the last control step."""
         return task.joint_targets(self.scene.embodiment, self._episode.command[self._checked(ids)])

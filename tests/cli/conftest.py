@@ -39,7 +39,7 @@ def lerobot(command: str, *arguments: str, cache: Path) -> subprocess.Popen[str]
 
 def finish(process: subprocess.Popen[str]) -> str:
     """Output of a command that must succeed."""
-    output, _ = process.communicate(timeout=240)
+    output, _ = process.communicate(timeout=600)
     assert process.returncode == 0, output[-3000:]
     return output
 

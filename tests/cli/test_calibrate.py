@@ -1,6 +1,7 @@
 """``vtrefine-calibrate`` as a command: files, text, and one line for what is wrong."""
 
 import json
+import re
 from pathlib import Path
 
 import numpy as np
@@ -72,7 +73,9 @@ def test_results_are_the_sensor_s(presses: Path, tmp_path: Path, capsys: pytest.
     assert "9 recordings" in text
     assert "k_n" in text
     page = (out / "report.html").read_text()
-    assert page.count("data:image/png") == 3
+    for drawn in ("reading over penetration", "resampled values of k_n", "over time"):
+        assert re.search(f'<svg [^>]*aria-label="[^"]*{drawn}', page), drawn
+    assert "nan" not in page.split("</style>")[1]
     assert "stiffness per taxel" in page
 
 

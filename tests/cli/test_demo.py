@@ -13,10 +13,10 @@ from PIL import Image
 
 from lerobot_vtrefine.cli import demo
 from lerobot_vtrefine.cli.pipeline.demo_config import LARGEST_SEED, DemoConfig, demo_stages, flags
-from lerobot_vtrefine.cli.report.charts import Bar, Series, bar_chart, line_chart
 from lerobot_vtrefine.cli.report.results import verdict
 from lerobot_vtrefine.cli.report.statistics import proportion, quantiles, wilson_interval
 from lerobot_vtrefine.finetune.seeds import EVALUATION_SEEDS, TRAINING_SEEDS
+from lerobot_vtrefine.pages.rates import Bar, Series, bar_chart, line_chart
 
 ENV_FILES = Path(__file__).parents[2] / "configs" / "env"
 

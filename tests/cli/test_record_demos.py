@@ -7,8 +7,18 @@ import numpy as np
 import pytest
 from conftest import finish, lerobot, record
 from lerobot.datasets import LeRobotDataset
+from local_hub import use_folder_as_hub
 
-from lerobot_vtrefine.datasets.features import ACTION_KEY, DEPTH_KEY, NOISE_LEVEL_KEY, STATE_KEY, TACTILE_KEYS
+from lerobot_vtrefine.datasets.features import (
+    ACTION_KEY,
+    DEPTH_KEY,
+    NOISE_LEVEL_KEY,
+    RGB_KEY,
+    STATE_KEY,
+    TACTILE_KEYS,
+)
+from lerobot_vtrefine.lerobot_compat import card
+from lerobot_vtrefine.sim.simulation import InsertionSim
 
 
 def read(root: Path) -> LeRobotDataset:
@@ -114,6 +124,7 @@ def test_stock_tools_accept_the_dataset(demos: Path, tmp_path: Path):
     ("flags", "message"),
     [
         (["--num_episodes=0"], "--num_episodes must be at least 1"),
+        (["--push_to_hub=true"], "--repo_id=local/vtrefine_demos: give a name on the Hub"),
         (["--num_envs=0"], "--num_envs must be at least 1"),
         (["--env.pair=star"], "round, square, hexagon"),
         (["--env.clearance_m=-1"], "clearance_m must be above 0"),
@@ -129,6 +140,44 @@ def test_bad_flags_end_in_one_line(flags, message, tmp_path, capsys):
     assert last.startswith("error:")
     assert message in last
     assert not (tmp_path / "x").exists()
+
+
+class Painter:
+    """A colour camera whose pictures tell the control step."""
+
+    def __init__(self, sim: InsertionSim, height: int, width: int) -> None:
+        self.sim, self.shape = sim, (height, width, 3)
+
+    def images(self, ids: np.ndarray) -> np.ndarray:
+        return np.stack([np.full(self.shape, 4 * step, np.uint8) for step in self.sim.steps[ids]])
+
+
+def test_colour_is_recorded_as_a_video_and_continued(tmp_path: Path, monkeypatch, capsys):
+    monkeypatch.setattr("lerobot_vtrefine.sim.rgb.RgbCamera", Painter)
+    root = tmp_path / "coloured"
+    flags = ("--num_envs=1", "--seed=5", "--env.rgb=true", "--env.rgb_size=[32, 48]")
+    assert record(root, "--num_episodes=1", *flags) == 0
+    assert record(root, "--num_episodes=2", *flags) == 0
+    dataset = read(root)
+    assert dataset.features[RGB_KEY]["dtype"] == "video"
+    assert dataset.features[DEPTH_KEY]["dtype"] == "image"
+    for index in (0, 3, len(dataset) - 1):
+        item = dataset[index]
+        assert item[RGB_KEY].shape == (3, 32, 48)
+        assert 255 * float(item[RGB_KEY].mean()) == pytest.approx(4 * int(item["frame_index"]), abs=3)
+    assert record(root, "--num_episodes=3", "--num_envs=1", "--seed=5") == 2
+    assert "other settings (colour)" in capsys.readouterr().err
+
+
+def test_a_finished_recording_is_uploaded_with_its_card(demos: Path, tmp_path: Path, monkeypatch):
+    use_folder_as_hub(monkeypatch, tmp_path / "hub")
+    shutil.copytree(demos, tmp_path / "copy")
+    sharing = ("--push_to_hub=true", "--repo_id=me/demos")
+    assert record(tmp_path / "copy", "--num_episodes=3", "--seed=5", *sharing) == 0
+    card.uninstall()
+    pushed = tmp_path / "hub" / "me" / "demos"
+    assert "in 3 attempts with environment seeds 5 to 7" in (pushed / "README.md").read_text()
+    same(demos, pushed)
 
 
 def test_other_settings_are_refused(demos: Path, tmp_path, capsys):

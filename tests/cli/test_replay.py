@@ -1,10 +1,14 @@
 """``vtrefine-replay`` on datasets with and without touch; bad input ends in one line."""
 
+import base64
+import io
 import json
+import re
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 
+import av
 import numpy as np
 import pytest
 import torch
@@ -56,6 +60,13 @@ def test_a_simulated_recording_is_reproduced_touch_included(demos: Path, tmp_pat
     summary = json.loads((tmp_path / "out" / "replay.json").read_text())
     assert summary["schema"] == "vtrefine/replay@1"
     assert "24 of 24 frames identical" in "\n".join(describe(comparison))
+    page = (tmp_path / "out" / "report.html").read_text()
+    source = re.search(r'src="data:video/mp4;base64,([^"]+)"', page)
+    assert source is not None
+    with av.open(io.BytesIO(base64.b64decode(source[1]))) as film:
+        frames = [frame.to_ndarray(format="rgb24") for frame in film.decode(video=0)]
+    assert len(frames) == 12 + 1  # and the twin was the same, though somebody looked
+    assert all(frame.std() > 20 for frame in frames)
 
 
 def test_another_sensor_model_shows(demos: Path, tmp_path: Path) -> None:
@@ -202,14 +213,14 @@ def test_hands_that_never_reach_the_twins_table_are_reported(tmp_path: Path) -> 
     )
     (tmp_path / "demos" / "meta" / "recording.json").unlink()  # nothing tells what the scene was
     source, flat = SourceConfig(tmp_path / "demos"), VtRefineEnvConfig(start="table", episode_steps=70)
-    comparison = replay(ReplayConfig(tmp_path / "flat", source, parts="grasp", env=flat))
+    comparison = replay(ReplayConfig(tmp_path / "flat", source, parts="grasp", env=flat, video=False))
     assert min(row.lowest_m for row in comparison.reach) == pytest.approx(0.05, abs=0.006)
     told = "\n".join(describe(comparison))
     assert "note: no finger ever came closer than 5" in told
     wanted = float(told.split("table_height_m=")[1].split()[0])
     assert "to the twin&#39;s table" in (tmp_path / "flat" / "report.html").read_text()
     fitting = replace(flat, scene=SceneConfig(table_height_m=wanted))
-    again = replay(ReplayConfig(tmp_path / "again", source, parts="grasp", env=fitting))
+    again = replay(ReplayConfig(tmp_path / "again", source, parts="grasp", env=fitting, video=False))
     assert again.remarks == []
     assert [row.held for row in again.reach] == [1, 1]
     over = [

@@ -1,30 +1,42 @@
 """Sharing: what lands on the Hub is complete, and its card says what was measured."""
 
 import json
+import shlex
+import sys
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
-import huggingface_hub
+import draccus
 import pytest
+from conftest import TINY_ENV
+from lerobot.envs.configs import EnvConfig
+from lerobot.scripts import lerobot_eval
+from local_hub import use_folder_as_hub
 
-from lerobot_vtrefine.cli import share, sharing
+from lerobot_vtrefine.cli import finetune, share, sharing
+from lerobot_vtrefine.cli.report.results import load_evaluation, percent
+from lerobot_vtrefine.embodiments import CameraConfig
+from lerobot_vtrefine.envs.config import VtRefineEnvConfig
+from lerobot_vtrefine.envs.evaluation_note import changed_settings
+from lerobot_vtrefine.envs.factory import make_vector_env
+from lerobot_vtrefine.files import read_json_lines
+from lerobot_vtrefine.sim.config import SceneConfig
 
 NAME = "--repo_id=me/insertion"
+
+
+@dataclass
+class EnvOnly:
+    """What LeRobot's commands parse from ``--env.*``."""
+
+    env: EnvConfig
 
 
 @pytest.fixture
 def hub(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     """A Hub that is a folder."""
 
-    class Api:
-        def create_repo(self, repo_id: str, **_: Any) -> None:
-            (tmp_path / "hub" / repo_id).mkdir(parents=True, exist_ok=True)
-
-        def upload_folder(self, repo_id: str, folder_path: Path, **_: Any) -> None:
-            for path in Path(folder_path).iterdir():
-                (tmp_path / "hub" / repo_id / path.name).write_bytes(path.read_bytes())
-
-    monkeypatch.setattr(huggingface_hub, "HfApi", Api)
+    use_folder_as_hub(monkeypatch, tmp_path / "hub")
     return tmp_path / "hub"
 
 
@@ -36,7 +48,8 @@ def policy(tmp_path: Path) -> Path:
         (folder / name).write_text("{}")
     (folder / "config.json").write_text(json.dumps({"modalities": "visuo_tactile", "ft_denoising_steps": 10}))
     env = {"type": "vtrefine", "pair": "round", "clearance_m": 0.002, "start": "grasped"}
-    (folder / "train_config.json").write_text(json.dumps({"env": env}))
+    dppo = {"type": "small", "iterations": 30, "num_envs": 128}
+    (folder / "train_config.json").write_text(json.dumps({"env": env, "dppo": dppo, "seed": 7}))
     return folder
 
 
@@ -68,7 +81,29 @@ def test_a_policy_goes_with_its_processors_and_what_was_measured(
     assert "contact force 60" in card
     assert "fine-tuned by DPPO" in card
     assert '"pair": "round"' in card
+    assert "30 iterations of 128 worlds; environment seeds from 1000007 on" in card
     assert "--policy.path=me/insertion" in card
+    assert "--seed" not in card  # in which environment it was evaluated, nobody noted
+
+
+def test_the_card_repeats_the_evaluation_where_its_environment_was_noted(
+    hub: Path, policy: Path, tmp_path: Path
+) -> None:
+    measured = evaluation(tmp_path / "eval", range(70, 80))
+    scene = SceneConfig(pad_friction=0.7, camera=CameraConfig(16, 12, 0.4, (-0.4, 0.0, 0.4), (0.0, 0.0, 0.1)))
+    config = VtRefineEnvConfig(
+        pair="square", task="put it in", scene=scene, metrics_path=measured / "episodes.jsonl"
+    )
+    make_vector_env(config, num_envs=5, use_async=False)
+    assert share.main([str(policy), NAME, f"--evaluation={measured}"]) == 0
+    card = (hub / "me" / "insertion" / "README.md").read_text()
+    command = shlex.split(card.split("sim]'\n")[1].split("```")[0].replace("\\\n", " "))
+    assert command[:3] == ["lerobot-eval", "--policy.path=me/insertion", "--policy.device=cpu"]
+    assert command[-3:] == ["--eval.n_episodes=10", "--eval.batch_size=5", "--seed=70"]
+    repeated = draccus.parse(EnvOnly, args=command[3:-3])
+    assert changed_settings(repeated.env) == changed_settings(config)
+    assert repeated.env.scene_config == config.scene_config
+    assert len(command) == 3 + 3 + 1 + 3 + 5  # nothing that is as ever: type, pair, task, friction, camera
 
 
 def test_without_an_evaluation_nothing_is_claimed(hub: Path, policy: Path) -> None:
@@ -100,3 +135,49 @@ def test_bad_input_is_one_line_and_nothing_is_pushed(
     assert share.main([str(policy), NAME]) == 2
     assert "lacks policy_preprocessor.json" in capsys.readouterr().err
     assert not hub.exists()
+
+
+@pytest.mark.slow
+@pytest.mark.timeout(900)
+def test_a_fine_tuned_policy_on_the_hub_repeats_what_its_card_claims(
+    hub: Path, checkpoint: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    task = (*TINY_ENV, "--env.episode_steps=8", "--eval.n_episodes=6", "--eval.batch_size=3")
+    dppo = ("--dppo.type=small", "--dppo.iterations=1", "--dppo.num_envs=2", "--dppo.critic_width=16")
+    start = (f"--policy.path={checkpoint}", "--policy.device=cpu", f"--output_dir={tmp_path / 'run'}")
+    arguments = ["vtrefine-finetune", *start, *task, *dppo, "--eval_freq=0"]
+    monkeypatch.setattr(sys, "argv", [*arguments, "--push_to_hub=true", NAME])
+    assert finetune.main() == 0
+    pushed = hub / "me" / "insertion"
+    assert {path.name for path in pushed.iterdir()} >= {*sharing.CHECKPOINT_FILES, "train_config.json"}
+    card = (pushed / "README.md").read_text()
+    command = shlex.split(card.split("sim]'\n")[1].split("```")[0].replace("\\\n", " "))
+    assert command[1] == "--policy.path=me/insertion"
+    command[1] = f"--policy.path={pushed}"
+    again = tmp_path / "again"
+    log = f"--env.metrics_path={again / 'episodes.jsonl'}"
+    monkeypatch.setattr(sys, "argv", [*command, log, f"--output_dir={again}"])
+    lerobot_eval.main()
+    assert f"| {percent(load_evaluation(again, 9_000_000))} |" in card
+    first, second = (
+        read_json_lines(folder / "episodes.jsonl")
+        for folder in (tmp_path / "run" / "evaluation_000001", again)
+    )
+    assert [row["seed"] for row in first] == list(range(9_000_000, 9_000_006))
+    assert first == second  # the same forces and shifts, not only the same count
+
+
+def test_finetuning_refuses_to_share_under_no_name_before_it_begins(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    cases = (
+        (["--push_to_hub=true"], "give a name on the Hub"),
+        (["--policy.push_to_hub=true"], "share the result with --push_to_hub=true --repo_id=USER/NAME"),
+    )
+    for flags, message in cases:
+        output = tmp_path / "run"
+        common = ["--env.type=vtrefine", "--policy.path=nowhere", f"--output_dir={output}"]
+        monkeypatch.setattr(sys, "argv", ["vtrefine-finetune", *common, *flags])
+        assert finetune.main() == 2
+        assert message in capsys.readouterr().err
+        assert not output.exists()

@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 from tqdm import tqdm
 
-from lerobot_vtrefine.cli.pipeline.progress import LiveLine, Progress, parse_progress, read_tail
+from lerobot_vtrefine.cli.pipeline.progress import ChildProgress, LiveLine, parse_progress, read_tail
 from lerobot_vtrefine.cli.pipeline.stages import Stage, StageRunner, find_command, stage_keys
 
 WRITE = (
@@ -127,7 +127,7 @@ def test_progress_of_a_real_bar() -> None:
         bar.set_postfix(loss=0.25)
         bar.update(50)
         text = stream.getvalue()
-    assert parse_progress(text) == Progress(50, 200, "loss=0.25")
+    assert parse_progress(text) == ChildProgress(50, 200, "loss=0.25")
     assert parse_progress("loading [1/2] weights") is None
 
 
@@ -138,13 +138,26 @@ def test_tail_reads_only_the_end(tmp_path: Path) -> None:
     assert read_tail(path, 4) == "aaé"
 
 
-def test_terminal_line_is_rewritten() -> None:
+def test_a_log_file_gets_a_line_a_minute() -> None:
     stream = io.StringIO()
     line = LiveLine(stream)
-    line.show("train", Progress(1, 4, "loss=1"), 59.0)
-    assert stream.getvalue() == ""  # a log file gets one line a minute
-    line.show("train", Progress(1, 4, "loss=1"), 61.0)
-    assert "1/4  25 %  loss=1" in stream.getvalue()
-    line.live = True
-    line.show("train", None, 62.0)
-    assert stream.getvalue().endswith("\x1b[2Ktrain" + " " * 38 + "1:02")
+    line.show("train", ChildProgress(1, 4, "loss=1"), 59.0)
+    assert stream.getvalue() == ""
+    line.show("train", ChildProgress(1, 4, "loss=[1]"), 61.0)
+    assert "1:01  1/4  25 %  loss=[1]" in stream.getvalue()
+    line.finish("train", "61 s, " + "a long note " * 9)
+    assert len(stream.getvalue().splitlines()) == 2
+
+
+def test_a_terminal_gets_a_bar_that_goes(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("TERM", "xterm")
+    stream = io.StringIO()
+    stream.isatty = lambda: True
+    line = LiveLine(stream)
+    line.show("train", None, 0.2)
+    line.show("train", ChildProgress(1, 4, "loss=1"), 1.0)
+    line.finish("train", "2 s")
+    drawn = stream.getvalue()
+    assert "1/4  25 %" in drawn
+    assert drawn.count("\x1b[?25l") == drawn.count("\x1b[?25h") == 1  # the cursor is back
+    assert drawn.splitlines()[-1].endswith("train" + " " * 38 + "2 s")

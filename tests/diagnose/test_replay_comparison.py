@@ -140,9 +140,13 @@ def test_page_is_whole_and_names_what_it_shows(with_touch: bool) -> None:
     assert "The left hand hangs above the part &lt;b&gt;" in page
     assert "aloha &lt;b&gt;" in page
     assert "Episode 7 was left out: why" in page
-    moments = page.count(", recorded above twin")
+    moments = page.count("<h2>At ")
     assert 3 <= moments <= 4 if with_touch else moments == 0
-    assert page.count("data:image/png") == (5 + moments + 4 if with_touch else 3)  # four films
+    films_and_moments = 4 + moments
+    assert page.count('class="scale"') == (films_and_moments if with_touch else 0)
+    assert page.count("data:image/png") == (films_and_moments + 8 * moments if with_touch else 0)
+    assert page.count("<svg") == 2 + 2 * 16 + (12 if with_touch else 0)  # errors, traces, touch
+    assert "nan" not in page
     assert ("right arm right finger" in page) == with_touch
     assert ("Not compared: the twin replayed the arms alone" in page) != with_touch
     assert "http" not in page.replace("http-equiv", "")

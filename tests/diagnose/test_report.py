@@ -18,11 +18,11 @@ from lerobot_vtrefine.cli.report.press_film import MOST_FRAMES, press_film
 from lerobot_vtrefine.diagnose.core.diagnosis import Diagnosis
 from lerobot_vtrefine.diagnose.recordings import read_recording_set
 from lerobot_vtrefine.diagnose.report import render_report
-from lerobot_vtrefine.diagnose.report.axes import ticks
 from lerobot_vtrefine.diagnose.report.effects import effect_drawing
 from lerobot_vtrefine.diagnose.report.numbers import digits, interval, percent, quantity
 from lerobot_vtrefine.diagnose.report.words import MEANINGS, ties
 from lerobot_vtrefine.diagnose.verdict import CAUSES, DataIssue, Unknown, Verdict
+from lerobot_vtrefine.pages.charts import ticks
 from lerobot_vtrefine.pages.pads import GAP_TAXELS
 from lerobot_vtrefine.tactile.model import SensorModel
 from lerobot_vtrefine.tactile.stages.contact import KelvinVoigt

@@ -6,10 +6,12 @@ import pytest
 import torch
 from draccus.utils import ParsingError
 from fake_sim import FakeSim
-from lerobot.envs.utils import preprocess_observation
+from lerobot.configs import FeatureType, PolicyFeature
+from lerobot.envs.utils import env_to_policy_features, preprocess_observation
+from lerobot.scripts import lerobot_eval
 
 from lerobot_vtrefine import embodiments
-from lerobot_vtrefine.datasets.features import DEPTH_KEY, STATE_KEY, TACTILE_KEYS
+from lerobot_vtrefine.datasets.features import DEPTH_KEY, RGB_KEY, STATE_KEY, TACTILE_KEYS
 from lerobot_vtrefine.embodiments import get_embodiment
 from lerobot_vtrefine.envs import VtRefineEnvConfig
 from lerobot_vtrefine.envs.episode_log import EpisodeLog, read_episode_log
@@ -121,6 +123,47 @@ def test_observations_fit_the_space_and_the_dataset_keys(make_env, monkeypatch):
     assert batch[TACTILE_KEYS[0]].shape == (2, 384)
     assert batch[DEPTH_KEY].shape == (2, 1, 60, 80)
     assert all(value.dtype == torch.float32 for value in batch.values())
+
+
+def test_colour_is_one_observation_more(monkeypatch):
+    def paint(ids: np.ndarray) -> np.ndarray:
+        return np.stack([np.full((24, 32, 3), 10 * i, np.uint8) for i in ids + sim.time[ids]])
+
+    sim = FakeSim(3)
+    monkeypatch.setattr("fake_sim.HEIGHT", 60)
+    monkeypatch.setattr("fake_sim.WIDTH", 80)
+    monkeypatch.setattr(
+        "lerobot_vtrefine.envs.vector_env.make_episodes", lambda *_: Episodes(sim, colour=paint)
+    )
+    env = VtRefineVectorEnv(VtRefineEnvConfig(start="grasped", rgb=True, rgb_size=(24, 32)), 3)
+    first, _ = env.reset(seed=[0, 1, 3])
+    assert env.observation_space.contains(first)
+    second, *_ = env.step(hold(env))
+    assert first["pixels"]["front"][:, 0, 0, 0].tolist() == [0, 10, 20]  # kept, though the frame has changed
+    assert second["pixels"]["front"][:, 0, 0, 0].tolist() == [10, 20, 30]
+    batch = preprocess_observation(second)
+    assert batch[RGB_KEY].shape == (3, 3, 24, 32)
+    features = env_to_policy_features(env.config)
+    assert features[RGB_KEY] == PolicyFeature(FeatureType.VISUAL, (3, 24, 32))
+    assert set(batch) == set(features) - {"action"}
+    stored = lerobot_eval._env_features_to_dataset_features(env.config.features)
+    frame = lerobot_eval._build_raw_frame(
+        second, 1, hold(env)[1], 0.0, False, False, "t", env.config.features
+    )
+    assert set(frame) == {*stored, "task"}  # lerobot-eval --eval.recording=true
+    assert stored[RGB_KEY]["dtype"] == "video"
+    assert frame[RGB_KEY].shape == stored[RGB_KEY]["shape"] == (24, 32, 3)
+    single = VtRefineEnv(env.config)
+    assert single.observation_space.contains(single.reset(seed=0)[0])
+
+
+@pytest.mark.parametrize(
+    ("settings", "message"),
+    [({"rgb_size": (8, 160)}, "at least 16 pixels"), ({"ablate": "vision"}, "hides the depth image only")],
+)
+def test_colour_that_cannot_be_is_refused(settings, message, tmp_path):
+    with pytest.raises(ParsingError, match=message):
+        VtRefineEnvConfig(rgb=True, ablate_dataset=tmp_path, **settings)
 
 
 def test_every_step_hands_out_the_frame_of_that_step(make_env):

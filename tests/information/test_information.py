@@ -1,5 +1,7 @@
 """What a study of a task's information says, and the encoders that it leaves."""
 
+import html
+import re
 from pathlib import Path
 
 import numpy as np
@@ -18,6 +20,7 @@ from lerobot_vtrefine.information.estimator import (
     train_estimator,
 )
 from lerobot_vtrefine.information.frames import Frames
+from lerobot_vtrefine.information.page import render_page
 from lerobot_vtrefine.information.quantities import NAMES, Grasps, observe, part_poses
 from lerobot_vtrefine.information.study import Effort, Finding, Study, as_json, save_keeper, study
 
@@ -134,3 +137,16 @@ def test_the_expert_succeeds_on_the_truth() -> None:
     env = VtRefineEnvConfig(start="grasped")
     done = expert_success(env, 4, 4, None, {}, Grasps(np.tile(np.eye(3), (3, 1, 1))), torch.device("cpu"))
     assert done.tolist() == [True] * 4
+
+
+def test_the_page_draws_every_error_as_a_share_of_the_unseen() -> None:
+    prior = dict.fromkeys(NAMES, 2.0)
+    rms = dict.fromkeys(NAMES, (1.0, 0.8, 1.2))
+    found = Study(prior, [Finding("visual", 1, rms, (3, 8)), Finding("tactile", 10, rms, None)], (8, 8))
+    page = render_page(found, "round")
+    assert found.verdict in html.unescape(page)
+    assert page.count("<svg") == 3 + 1
+    bars = re.findall(r'<rect class="bar (?:d|a faded)"[^>]*y="([0-9.]+)"[^>]*height="([0-9.]+)"', page)
+    assert len(bars) == 3 * 6 * 2 + 1  # and the expert on what vision tells; what was not measured has no bar
+    heights = {float(height) for _, height in bars[: 3 * 6 * 2]}
+    assert sorted(heights) == pytest.approx([182 * 0.5 / 1.1], abs=0.1)

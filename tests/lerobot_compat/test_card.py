@@ -1,5 +1,7 @@
 """A tactile dataset pushed to a Hub and back: every value, and a card that says what the values are."""
 
+import json
+import shutil
 from collections.abc import Generator
 from pathlib import Path
 
@@ -103,3 +105,24 @@ def test_untested_lerobot_is_left_alone(
     card.install()
     assert LeRobotDataset.push_to_hub is before
     assert "untested" in caplog.text
+
+
+def test_the_card_of_simulated_data_names_its_task_seeds_and_outcomes(
+    tiny_dataset: Path, tmp_path: Path
+) -> None:
+    root = tmp_path / "simulated"
+    shutil.copytree(tiny_dataset, root)
+    meta = LeRobotDataset("local/tiny", root=root).meta
+    assert "### Simulation" not in card.describe(meta)
+    scene = {"pair": "round", "clearance_m": 0.002, "start": "grasped"}
+    settings = {"scene": scene, "sensor_model": "default", "seed": 40, "include_failures": False}
+    settings["degradation"] = {"lateral_std_m": 0.0008, "tilt_std_rad": 0.0}
+    rows = [{"success": True, "time_to_success_s": 2.0 + k, "peak_force_n": 5.0} for k in range(3)]
+    note = {"settings": settings, "next_seed": 47, "episodes": rows}
+    (root / "meta" / "recording.json").write_text(json.dumps(note))
+    text = card.describe(meta)
+    assert "pair `round`, clearance 2 mm, start `grasped`" in text
+    assert "errors (`lateral_std_m` 0.0008), in 7 attempts with environment seeds 40 to 46" in text
+    assert "the 3 that succeeded were kept" in text
+    assert "| time to success | 3.0 s | 3.8 s |" in text
+    assert "3 of 3 episodes end in success" in text

@@ -8,12 +8,21 @@ import pytest
 from draccus.utils import ParsingError
 from lerobot.configs import FeatureType, PolicyFeature, PreTrainedConfig
 from lerobot.configs.train import TrainPipelineConfig
+from lerobot.utils.feature_utils import dataset_to_policy_features
 
-from lerobot_vtrefine.datasets.features import DEPTH_KEY, STATE_KEY, TACTILE_KEYS, dataset_features
+from lerobot_vtrefine.datasets.features import (
+    DEPTH_KEY,
+    RGB_KEY,
+    STATE_KEY,
+    TACTILE_KEYS,
+    dataset_features,
+)
+from lerobot_vtrefine.envs.config import VtRefineEnvConfig
 from lerobot_vtrefine.observation import VisuoTactileConfig
 from lerobot_vtrefine.policies.vt_dp3 import VtDp3Config
 
-CONFIGS = sorted((Path(__file__).parents[2] / "configs" / "policy").glob("*.yaml"))
+CONFIGS = sorted((Path(__file__).parents[2] / "configs" / "policy").glob("vt_dp3*.yaml"))
+OTHERS = sorted(set(CONFIGS[0].parent.glob("*.yaml")) - set(CONFIGS))
 
 
 def test_paper_preset_is_the_papers_network() -> None:
@@ -104,5 +113,17 @@ def test_shipped_files_parse(path: Path) -> None:
     assert config.policy.modalities == ("visual" if "visual" in path.stem else "visuo_tactile")
 
 
+@pytest.mark.parametrize("path", OTHERS, ids=lambda path: path.stem)
+def test_lerobots_policies_get_what_a_colour_recording_of_aloha_has(path: Path) -> None:
+    import lerobot.policies  # noqa: F401 (registers them)
+
+    config = draccus.parse(TrainPipelineConfig, path, args=["--dataset.repo_id=local/tiny"])
+    assert config.policy is not None
+    assert config.policy.type == path.stem.removesuffix("_rgb")
+    recorded = dataset_to_policy_features(dataset_features(60, 80, colour=VtRefineEnvConfig().rgb_size))
+    assert config.policy.input_features == {key: recorded[key] for key in (STATE_KEY, RGB_KEY)}
+
+
 def test_there_are_shipped_files() -> None:
     assert [path.stem for path in CONFIGS] == ["vt_dp3_pads", "vt_dp3_paper", "vt_dp3_small", "vt_dp3_visual"]
+    assert [path.stem for path in OTHERS] == ["act_rgb", "diffusion_rgb", "smolvla_rgb"]

@@ -214,6 +214,27 @@ def test_a_teleoperator_goes_on_from_where_the_next_episode_begins() -> None:
     assert robot.on_restart is None
 
 
+def test_the_robots_camera_gives_colour_where_the_environment_has_it(monkeypatch: pytest.MonkeyPatch) -> None:
+    painted = np.arange(24 * 32 * 3, dtype=np.uint8).reshape(1, 24, 32, 3)
+
+    class Painter:
+        def __init__(self, *size: object) -> None:
+            assert size[1:] == (24, 32)
+
+        def images(self, ids: np.ndarray) -> np.ndarray:
+            return painted
+
+    monkeypatch.setattr("lerobot_vtrefine.sim.rgb.RgbCamera", Painter)
+    colour = {"start": "grasped", "num_threads": 1, "rgb": True, "rgb_size": [24, 32]}
+    robot = VtRefineSim(VtRefineSimConfig(env=colour))
+    assert robot.observation_features["front"] == (24, 32, 3)
+    robot.connect()
+    seen = robot.get_observation()
+    assert set(seen) == set(robot.observation_features)
+    assert np.array_equal(seen["front"], painted[0])
+    robot.disconnect()
+
+
 def test_no_action_that_is_no_number_reaches_the_arms() -> None:
     robot = connected()
     action = dict.fromkeys(robot.action_features, 0.0)

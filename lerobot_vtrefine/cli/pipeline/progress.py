@@ -6,14 +6,19 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TextIO
 
+from rich.console import Console
+from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
+
 # "Training:  62%|█████ | 1240/2000 [01:23<00:51, 14.9step/s, loss=0.12]"
 TQDM = re.compile(r"\| *(\d+)/(\d+) \[[^\],]*,[^\],]*(?:, ([^\]]*))?\]")
 TAIL_BYTES = 4096
 PLAIN_INTERVAL_S = 60.0
+LABEL = 42
+"""Width of a stage's name."""
 
 
 @dataclass(frozen=True)
-class Progress:
+class ChildProgress:
     """How far a child is: ``done`` of ``total`` units, and what its bar says beside that."""
 
     done: int
@@ -25,14 +30,17 @@ class Progress:
         """Share of the work that is done, 0..100."""
         return 100 * self.done // max(1, self.total)
 
+    def __str__(self) -> str:
+        return f"{self.done}/{self.total} {self.percent:3d} %  {self.detail}".rstrip()
 
-def parse_progress(text: str) -> Progress | None:
+
+def parse_progress(text: str) -> ChildProgress | None:
     """The last tqdm bar in ``text``; None without one."""
     matches = TQDM.findall(text)
     if not matches:
         return None
     done, total, detail = matches[-1]
-    return Progress(int(done), int(total), detail.strip())
+    return ChildProgress(int(done), int(total), detail.strip())
 
 
 def read_tail(path: Path, size: int = TAIL_BYTES) -> str:
@@ -51,39 +59,46 @@ def clock(seconds: float) -> str:
 
 
 class LiveLine:
-    """One line per stage: rewritten in place on a terminal, else printed each minute and at the end."""
+    """One line per stage: a bar on a terminal, else text that is printed each minute and at the end."""
 
     def __init__(self, stream: TextIO | None = None) -> None:
-        self.stream = stream or sys.stderr
-        self.live = self.stream.isatty()
+        self.console = Console(file=stream or sys.stderr, highlight=False, markup=False)
+        self._bar: Progress | None = None
         self._last_plain = 0.0
 
-    def show(self, label: str, progress: Progress | None, seconds: float) -> None:
+    def show(self, label: str, child: ChildProgress | None, seconds: float) -> None:
         """Show a running stage."""
-        if self.live:
-            self._rewrite(self._text(label, progress, seconds))
-        elif seconds - self._last_plain >= PLAIN_INTERVAL_S:
-            self._last_plain = seconds
-            self._print(self._text(label, progress, seconds))
+        if not self.console.is_terminal:
+            if seconds - self._last_plain >= PLAIN_INTERVAL_S:
+                self._last_plain = seconds
+                self._print(f"{label:<{LABEL}} {clock(seconds)}  {child or ''}".rstrip())
+            return
+        if self._bar is None:
+            self._bar = Progress(
+                TextColumn(f"{{task.description:<{LABEL}}}", markup=False),
+                BarColumn(),
+                TimeElapsedColumn(),
+                TextColumn("{task.fields[counts]}", markup=False),
+                console=self.console,
+                transient=True,
+            )
+            self._bar.add_task(label, total=None, counts="")
+            self._bar.start()
+        (task,) = self._bar.task_ids
+        total, done = (None, 0) if child is None else (child.total, child.done)
+        self._bar.update(task, total=total, completed=done, counts=str(child or ""))
 
     def finish(self, label: str, note: str) -> None:
         """Replace the live line by a final one."""
+        self.stop()
         self._last_plain = 0.0
-        if self.live:
-            self._rewrite("")
-        self._print(f"{label:<42} {note}")
+        self._print(f"{label:<{LABEL}} {note}")
 
-    @staticmethod
-    def _text(label: str, progress: Progress | None, seconds: float) -> str:
-        if progress is None:
-            return f"{label:<42} {clock(seconds)}"
-        counts = f"{progress.done}/{progress.total} {progress.percent:3d} %"
-        return f"{label:<42} {clock(seconds)}  {counts}  {progress.detail}".rstrip()
-
-    def _rewrite(self, text: str) -> None:
-        self.stream.write(f"\r\x1b[2K{text[:118]}")
-        self.stream.flush()
+    def stop(self) -> None:
+        """Take the live line away."""
+        if self._bar is not None:
+            self._bar.stop()
+            self._bar = None
 
     def _print(self, text: str) -> None:
-        self.stream.write(f"{text}\n")
-        self.stream.flush()
+        self.console.print(text, soft_wrap=True)

@@ -185,6 +185,7 @@ class StageRunner:
                     self.line.show(label, parse_progress(read_tail(log)), time.monotonic() - started)
                     time.sleep(POLL_S)
             except BaseException:
+                self.line.stop()
                 stop(child)
                 raise
         if child.returncode:

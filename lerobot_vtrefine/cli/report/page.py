@@ -10,12 +10,12 @@ from matplotlib.colors import to_hex
 
 from lerobot_vtrefine.cli.pipeline.demo_config import flags
 from lerobot_vtrefine.cli.pipeline.progress import clock
-from lerobot_vtrefine.cli.report.charts import Bar, Series, bar_chart, line_chart
 from lerobot_vtrefine.cli.report.cloud import recorded_cloud
 from lerobot_vtrefine.cli.report.media import data_uri, strongest_contact
 from lerobot_vtrefine.datasets.features import Array
 from lerobot_vtrefine.files import read_number_rows
 from lerobot_vtrefine.pages.pads import COLOUR_MAP, colour_scale, pad_image
+from lerobot_vtrefine.pages.rates import Bar, Series, bar_chart, line_chart
 from lerobot_vtrefine.pages.render import render
 
 NAMES = {"pretrain": "imitation", "finetune": "after DPPO"}

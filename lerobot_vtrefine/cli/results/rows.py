@@ -54,7 +54,17 @@ def _words(kind: Any) -> str:
 class Run(Row):
     """One policy's evaluation."""
 
-    TABLES = ("converges", "demo", "touch", "twin", "paper", "demonstrations", "reality", "expert")
+    TABLES = (
+        "converges",
+        "demo",
+        "touch",
+        "twin",
+        "paper",
+        "demonstrations",
+        "policies",
+        "reality",
+        "expert",
+    )
 
     task: str
     policy: str

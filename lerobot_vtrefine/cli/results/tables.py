@@ -30,6 +30,11 @@ LABELS = {
     "kinova": "two Kinova Gen3",
     "table": "from the table",
     "grasped": "in hand",
+    "vt_dp3_paper": "vt_dp3, touch and depth",
+    "vt_dp3_visual": "vt_dp3, depth",
+    "act_rgb": "LeRobot's ACT, colour",
+    "diffusion_rgb": "LeRobot's diffusion policy, colour",
+    "smolvla_rgb": "LeRobot's SmolVLA, colour",
 }
 """Tasks and policies in words; others stand as they are."""
 MEASURED = (

@@ -1,30 +1,34 @@
-"""Figures of a calibration: response curves, load cell, resampled parameters, presses over time."""
+"""Drawings of a calibration: response curves, load cell, resampled parameters, presses over time."""
 
 import numpy as np
-from matplotlib.axes import Axes
-from matplotlib.figure import Figure
 
 from lerobot_vtrefine.diagnose.calibration.fit import Calibration
 from lerobot_vtrefine.diagnose.presses import Press
+from lerobot_vtrefine.diagnose.report.numbers import scale_of
+from lerobot_vtrefine.pages.charts import Panel, drawing, label, span
 
-MEASURED, MODEL, FAST = "#1f6fb4", "#d1601f", "#7a3f9d"
+MEASURED, MODEL, FAST = "m", "b", "a"
 BINS = 14
 MIN_COUNT = 8
+DRAWN_FRAMES = 800
+WIDTH, HEIGHT = 440.0, 290.0
+SMALL_WIDTH, SMALL_HEIGHT = 380.0, 200.0
+LEFT, RIGHT, TOP, BOTTOM = 62.0, 14.0, 26.0, 44.0
 
 
-def response_curves(calibration: Calibration) -> Figure:
+def _panel(width: float, height: float, x_range: tuple[float, float], y_range: tuple[float, float]) -> Panel:
+    return Panel(LEFT, TOP, width - LEFT - RIGHT, height - TOP - BOTTOM, x_range, y_range)
+
+
+def response_curves(calibration: Calibration) -> list[str]:
     """Reading over penetration (or load) per taxel, slow and fast motion apart, and the model's load."""
-    presses = calibration.presses
-    columns = 1 if presses.loaded or not calibration.excitation.has_force else 2
-    figure = Figure(figsize=(5.2 * columns, 3.6), layout="constrained")
-    axes = figure.subplots(1, columns, squeeze=False)[0]
-    _reading_curve(axes[0], calibration)
-    if columns == 2:
-        _load_curve(axes[1], calibration)
-    return figure
+    curves = [_reading_curve(calibration)]
+    if calibration.excitation.has_force and not calibration.presses.loaded:
+        curves.append(_load_curve(calibration))
+    return curves
 
 
-def _reading_curve(axis: Axes, calibration: Calibration) -> None:
+def _reading_curve(calibration: Calibration) -> str:
     presses = calibration.presses.presses
     scale, name = (1.0, "force per taxel [N]") if calibration.presses.loaded else (1e3, "penetration [mm]")
     drive = scale * np.concatenate([press.drive[:, press.scored].ravel() for press in presses])
@@ -34,21 +38,21 @@ def _reading_curve(axis: Axes, calibration: Calibration) -> None:
     pressed = drive > 0
     slow, fast = calibration.excitation.speeds_m_s
     middle = 0.5 * (slow + fast)
-    groups = [("all", pressed, MEASURED)]
+    groups = [(pressed, MEASURED)]
     if not calibration.presses.loaded:
-        groups = [("slow", pressed & (rate <= middle), MEASURED), ("fast", pressed & (rate > middle), FAST)]
+        groups = [(pressed & (rate <= middle), MEASURED), (pressed & (rate > middle), FAST)]
     edges = np.linspace(0.0, float(drive[pressed].max(initial=1e-9)), BINS + 1)
-    for label, mask, colour in groups:
-        centre, mean, spread, expected = binned(drive[mask], measured[mask], model[mask], edges)
-        axis.errorbar(
-            centre, mean, spread, fmt="o", ms=4, lw=1, color=colour, alpha=0.8, label=f"measured, {label}"
-        )
-        axis.plot(
-            centre, expected, color=colour, ls="--" if label == "fast" else "-", label=f"model, {label}"
-        )
-    axis.set_xlabel(name)
-    axis.set_ylabel("counts above idle")
-    axis.legend(fontsize=10, frameon=False)
+    found = [(binned(drive[mask], measured[mask], model[mask], edges), style) for mask, style in groups]
+    shown = [
+        item for (_, mean, spread, expected), _ in found for item in (mean - spread, mean + spread, expected)
+    ]
+    panel = _panel(WIDTH, HEIGHT, span(edges, margin=0.02), span(*shown, zero=True))
+    parts = [panel.frame(name, "counts above idle")]
+    for (centre, mean, spread, expected), style in found:
+        parts.append(panel.whiskers(centre, mean - spread, mean + spread))
+        parts.append(panel.dots(centre, mean, style, 4))
+        parts.append(panel.line(centre, expected, MODEL if style == MEASURED else f"{MODEL} dashed"))
+    return drawing(WIDTH, HEIGHT, parts, f"reading over {name}")
 
 
 def binned(
@@ -65,7 +69,7 @@ def binned(
     return columns[0], columns[1], columns[2], columns[3]
 
 
-def _load_curve(axis: Axes, calibration: Calibration) -> None:
+def _load_curve(calibration: Calibration) -> str:
     measured, model = [], []
     damping_s = float(calibration.fitted.model.values[1])
     for press in calibration.presses.presses:
@@ -76,53 +80,63 @@ def _load_curve(axis: Axes, calibration: Calibration) -> None:
         model.append(calibration.parameters["k_n"].value * depth.sum(axis=(1, 2)))
         measured.append(load)
     x, y = np.concatenate(measured), np.concatenate(model)
-    keep = np.random.default_rng(0).permutation(len(x))[:4000]
-    axis.plot(x[keep], y[keep], ".", ms=2, color=MODEL, alpha=0.4)
-    top = float(max(x.max(), y.max()))
-    axis.plot([0, top], [0, top], color="black", lw=0.8)
-    axis.set_xlabel("load cell [N]")
-    axis.set_ylabel("sum of the model's forces [N]")
+    keep = np.random.default_rng(0).permutation(len(x))[:DRAWN_FRAMES]
+    both = span(x, y, np.zeros(1))
+    panel = _panel(WIDTH, HEIGHT, both, both)
+    ends = np.array([0.0, max(x.max(), y.max())])
+    parts = [
+        panel.frame("load cell [N]", "sum of the model's forces [N]"),
+        panel.dots(x[keep], y[keep], MODEL, 1.5),
+        panel.line(ends, ends, MEASURED),
+    ]
+    return drawing(WIDTH, HEIGHT, parts, "the model's load over the load cell's")
 
 
-def resampled(calibration: Calibration) -> Figure:
+def resampled(calibration: Calibration) -> list[str]:
     """Resampled values of every parameter with its interval."""
-    names = list(calibration.draws)
-    figure = Figure(figsize=(3.1 * len(names), 2.5), layout="constrained")
-    axes = figure.subplots(1, len(names), squeeze=False)[0]
-    for axis, name in zip(axes, names, strict=True):
+    drawings = []
+    for name, draws in calibration.draws.items():
         parameter = calibration.parameters[name]
-        axis.hist(calibration.draws[name], bins=30, color=MEASURED, alpha=0.5)
-        axis.axvline(parameter.value, color=MODEL, lw=1.6)
-        for bound in parameter.ci95 or ():
-            axis.axvline(bound, color="black", lw=0.8, ls="--")
-        axis.set_title(f"{name} [{parameter.unit}]", fontsize=10)
-        axis.set_yticks([])
-        axis.tick_params(labelsize=10)
-    return figure
+        factor, unit = scale_of(float(np.max(np.abs(draws), initial=0.0)), parameter.unit)
+        counts, edges = np.histogram(factor * np.asarray(draws), bins=30)
+        value, *bounds = (factor * np.array([parameter.value, *(parameter.ci95 or ())], float)).tolist()
+        x_range = span(edges, np.array([value, *bounds]))
+        panel = _panel(SMALL_WIDTH, SMALL_HEIGHT, x_range, (0.0, 1.05 * float(counts.max())))
+        parts = [
+            panel.frame(f"{name} [{unit}]" if unit else name, "resampled values", y_count=0),
+            panel.stairs(edges, counts.astype(float), MEASURED, filled=True),
+            panel.rule(value, MODEL),
+            *(panel.rule(bound, f"{MEASURED} dashed") for bound in bounds),
+        ]
+        drawings.append(drawing(SMALL_WIDTH, SMALL_HEIGHT, parts, f"resampled values of {name}"))
+    return drawings
 
 
-def presses_over_time(calibration: Calibration, number: int = 3) -> Figure:
+def presses_over_time(calibration: Calibration, number: int = 3) -> list[str]:
     """Mean of the pressed taxels over time, measured and modelled: best, typical and worst recording."""
     errors = [
         float(np.sqrt(np.mean(values**2))) for values in calibration.fitted.residuals(calibration.presses)
     ]
     order = np.argsort(errors)
     chosen = order[np.unique(np.linspace(0, len(order) - 1, number).round().astype(int))].tolist()
-    figure = Figure(figsize=(3.9 * len(chosen), 2.7), layout="constrained")
-    axes = figure.subplots(1, len(chosen), squeeze=False)[0]
-    for axis, index in zip(axes, chosen, strict=True):
-        press = calibration.presses.presses[index]
+    means = []
+    for index in chosen:
+        press, model = calibration.presses.presses[index], calibration.fitted.signals[index]
         pressed = _pressed(press)
+        means.append((press, press.signal[:, pressed].mean(1), model[:, pressed].mean(1)))
+    y_range = span(*(side for _, *sides in means for side in sides), zero=True)
+    drawings = []
+    for index, (press, measured, model) in zip(chosen, means, strict=True):
         time_s = press.trial.time_s
-        axis.plot(time_s, press.signal[:, pressed].mean(1), color=MEASURED, lw=1.4, label="measured")
-        model = calibration.fitted.signals[index]
-        axis.plot(time_s, model[:, pressed].mean(1), color=MODEL, lw=1.1, label="model")
-        axis.set_title(f"{press.trial.file}: RMS {errors[index]:.1f} counts", fontsize=10)
-        axis.set_xlabel("time [s]", fontsize=10)
-        axis.tick_params(labelsize=10)
-    axes[0].set_ylabel("mean counts above idle", fontsize=10)
-    axes[0].legend(fontsize=10, frameon=False)
-    return figure
+        panel = _panel(SMALL_WIDTH, SMALL_HEIGHT + 20, span(time_s, margin=0.0), y_range)
+        parts = [
+            panel.frame("time [s]", "mean counts above idle"),
+            panel.line(time_s, measured, MEASURED),
+            panel.line(time_s, model, MODEL),
+            label(SMALL_WIDTH - RIGHT, TOP - 7, f"RMS {errors[index]:.1f} counts", "end"),
+        ]
+        drawings.append(drawing(SMALL_WIDTH, SMALL_HEIGHT + 20, parts, f"{press.trial.file} over time"))
+    return drawings
 
 
 def _pressed(press: Press) -> np.ndarray:

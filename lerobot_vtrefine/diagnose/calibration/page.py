@@ -4,7 +4,6 @@ from typing import Any
 
 from lerobot_vtrefine.diagnose.calibration import figures
 from lerobot_vtrefine.diagnose.calibration.fit import Calibration, fits_the_simulation
-from lerobot_vtrefine.diagnose.episode_replay.figures import data_uri
 from lerobot_vtrefine.diagnose.report.numbers import interval
 from lerobot_vtrefine.pages.render import render
 
@@ -87,7 +86,8 @@ def render_page(calibration: Calibration, source: str) -> str:
         rows=rows,
         remarks=remarks(calibration),
         stages=[stage.name for stage in calibration.model.stages],
-        curves=data_uri(figures.response_curves(calibration)),
-        draws=data_uri(figures.resampled(calibration)) if calibration.draws else None,
-        presses=data_uri(figures.presses_over_time(calibration)),
+        curves=figures.response_curves(calibration),
+        speeds=not calibration.presses.loaded,
+        draws=figures.resampled(calibration),
+        presses=figures.presses_over_time(calibration),
     )

@@ -2,9 +2,9 @@
 
 import json
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from tqdm import tqdm
@@ -23,6 +23,11 @@ from lerobot_vtrefine.diagnose.episode_replay.tracking import JointTracking, joi
 from lerobot_vtrefine.diagnose.episode_replay.twin import read_ledger, recorded_seeds, recorded_twin
 from lerobot_vtrefine.embodiments import get_embodiment
 from lerobot_vtrefine.envs.config import VtRefineEnvConfig
+
+if TYPE_CHECKING:
+    from lerobot_vtrefine.sim.command_replay import SceneReplay
+    from lerobot_vtrefine.sim.simulation import InsertionSim
+    from lerobot_vtrefine.sim.starts import Start
 
 HOLDS = {"zero_order": "held over the frame", "linear": "approached linearly"}
 DENSITIES = ("reading_density", "count_density")
@@ -66,6 +71,8 @@ class Comparison:
     """How low the recorded hands came, and whether the twin's hold their parts."""
     remarks: list[str]
     """What these say about the twin's table."""
+    film: list[Array] = field(default_factory=list)
+    """(H, W, 3) uint8 frames of the twin in the first of ``pairs``, if it was filmed."""
 
     def summary(self) -> dict[str, Any]:
         """All numbers as plain values for ``replay.json``."""
@@ -91,12 +98,15 @@ def compare_episodes(
     parts: str = "auto",
     hold: str = "zero_order",
     env: VtRefineEnvConfig | None = None,
+    *,
+    film: bool = False,
 ) -> Comparison:
     """Replay and compare; all episodes by default.
 
     Args:
         hold: how the arms alone approach a command; the scene with parts always ramps linearly.
         env: the twin; by default the recorded one of a simulated dataset, else the default environment.
+        film: draw the first episode's twin, where there are parts.
 
     Raises:
         ValueError: the twin is another robot than the dataset's, unknown episodes, or parts that the dataset
@@ -109,10 +119,11 @@ def compare_episodes(
     config = config or VtRefineEnvConfig()
     _require_same_robot(folder, config)
     recorded = folder.read(episodes)
+    frames: list[Array] = []
     if parts == "none":
         pairs, skipped = _replay_arms(folder, recorded, config, hold), {}
     else:
-        pairs, skipped = _replay_scenes(folder, recorded, config, parts, ledger)
+        pairs, skipped = _replay_scenes(folder, recorded, config, parts, ledger, frames if film else None)
     reach = _reach(pairs, config, folder.fps, own)
     return Comparison(
         root=folder.root,
@@ -131,6 +142,7 @@ def compare_episodes(
         skipped=skipped,
         reach=reach,
         remarks=[] if own else describe_reach(reach, config.scene_config.table_height_m),
+        film=frames,
     )
 
 
@@ -197,7 +209,9 @@ def _replay_scenes(
     config: VtRefineEnvConfig,
     parts: str,
     ledger: dict[str, Any] | None,
+    frames: list[Array] | None,
 ) -> tuple[list[EpisodePair], dict[int, str]]:
+    """The pairs, and why others were left out; `frames`, if given, takes a film of the first pair's twin."""
     from lerobot_vtrefine.envs.factory import make_simulation
     from lerobot_vtrefine.sim.command_replay import grasp_start, replay_scene
 
@@ -218,13 +232,30 @@ def _replay_scenes(
                 skipped[episode.index] = "a gripper never closes"
                 continue
         seed = seeds[episode.index] if seeds else episode.index
-        replayed = replay_scene(sim, episode.action, seed, start)
+        if frames is not None and not pairs:
+            replayed = _filmed(sim, episode, seed, start, frames)
+        else:
+            replayed = replay_scene(sim, episode.action, seed, start)
         counts = {pad: replayed.counts[:, i] for i, pad in enumerate(sim.embodiment.pad_names)}
         baselines = {pad: replayed.baseline[i] for i, pad in enumerate(sim.embodiment.pad_names)}
         pairs.append(EpisodePair(episode, replayed.position, counts, baselines, replayed.success))
     if not pairs:
         raise ValueError(f"none of {len(recorded)} episodes can be replayed: {next(iter(skipped.values()))}")
     return pairs, skipped
+
+
+def _filmed(
+    sim: "InsertionSim", episode: RecordedEpisode, seed: int, start: "Start | None", frames: list[Array]
+) -> "SceneReplay":
+    from lerobot_vtrefine.diagnose.episode_replay.film import TwinFilm
+    from lerobot_vtrefine.sim.command_replay import replay_scene
+
+    film = TwinFilm(sim)
+    try:
+        return replay_scene(sim, episode.action, seed, start, film.watch)
+    finally:
+        film.close()
+        frames += film.frames
 
 
 def _compare_touch(pairs: list[EpisodePair]) -> list[PadTouch]:

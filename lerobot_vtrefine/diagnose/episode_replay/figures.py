@@ -1,28 +1,23 @@
-"""Figures of a replay as PNG data URIs."""
-
-import base64
-import io
+"""Drawings of a replay: recorded dark, twin orange, commands pale."""
 
 import numpy as np
-from matplotlib.figure import Figure
 
 from lerobot_vtrefine.datasets.features import Array
 from lerobot_vtrefine.diagnose.episode_replay.compare import EpisodePair
 from lerobot_vtrefine.diagnose.episode_replay.touch import COUNT_BINS, READING_BINS, PadTouch, pressed
 from lerobot_vtrefine.diagnose.episode_replay.tracking import JointTracking
 from lerobot_vtrefine.embodiments import pad_layout_of
+from lerobot_vtrefine.pages.charts import Panel, drawing, label, span
+from lerobot_vtrefine.pages.pads import pad_image
 
-RECORDED, TWIN, COMMAND = "#1f6fb4", "#d1601f", "#9a9a9a"
-DPI = 95
+RECORDED, TWIN, COMMAND = "m", "b", "d"
+WIDTH, HEIGHT = 380.0, 190.0
+LEFT, RIGHT, TOP, BOTTOM = 62.0, 14.0, 26.0, 44.0
+NAMES_PX, BAR_PX, ROW_PX = 150.0, 11.0, 34.0
 LEAST_SPAN = {"rad": 0.05, "mm": 2.0}
 """What an axis of positions shows at least, so that noise does not look like motion."""
-
-
-def data_uri(figure: Figure) -> str:
-    """The figure as a PNG in a ``data:`` URI."""
-    buffer = io.BytesIO()
-    figure.savefig(buffer, format="png", dpi=DPI)
-    return f"data:image/png;base64,{base64.b64encode(buffer.getvalue()).decode('ascii')}"
+LEAST_SHARE = 1e-4
+"""Where the logarithmic axis of a histogram begins."""
 
 
 def unit_of(joint: str) -> str:
@@ -30,106 +25,113 @@ def unit_of(joint: str) -> str:
     return "mm" if joint.endswith("finger") else "mrad"
 
 
-def tracking_bars(tracking: list[JointTracking]) -> Figure:
-    """RMSE of every joint beside how far the recorded joint is from its command."""
-    figure = Figure(figsize=(10, 3.4), layout="constrained")
-    axes = figure.subplots(1, 2, width_ratios=[3, 1])
-    for axis, unit in zip(axes, ("mrad", "mm"), strict=True):
+def _panel(x_range: tuple[float, float], y_range: tuple[float, float]) -> Panel:
+    return Panel(LEFT, TOP, WIDTH - LEFT - RIGHT, HEIGHT - TOP - BOTTOM, x_range, y_range)
+
+
+def tracking_bars(tracking: list[JointTracking]) -> list[str]:
+    """RMSE of every joint beside how far the recorded joint is from its command; a drawing per unit."""
+    drawings = []
+    for unit in ("mrad", "mm"):
         rows = [row for row in tracking if unit_of(row.joint) == unit]
-        place = np.arange(len(rows))
-        reference = [1e3 * row.command_rmse for row in rows]
-        axis.bar(place - 0.2, reference, 0.4, color=COMMAND, label="recorded − command")
-        axis.bar(place + 0.2, [1e3 * row.rmse for row in rows], 0.4, color=TWIN, label="twin − recorded")
-        for x, row in zip(place, rows, strict=True):
-            if row.rmse_ci95 is not None:
-                axis.plot([x + 0.2] * 2, [1e3 * value for value in row.rmse_ci95], color="black", lw=1)
-        names = [row.joint.replace("_", " ", 1).replace("_", " ") for row in rows]
-        axis.set_xticks(place, names, rotation=35, ha="right", fontsize=10)
-        axis.set_ylabel(f"RMS [{unit}]")
-    axes[0].legend(fontsize=10, frameon=False)
-    return figure
+        if rows:
+            drawings.append(_tracking_bars(rows, unit))
+    return drawings
 
 
-def joint_traces(pair: EpisodePair, joints: list[str], fps: float) -> Figure:
+def _tracking_bars(rows: list[JointTracking], unit: str) -> str:
+    values = [1e3 * value for row in rows for value in (row.rmse, row.command_rmse, *(row.rmse_ci95 or ()))]
+    width, height = 520.0, ROW_PX * len(rows)
+    panel = Panel(NAMES_PX, 10, width - NAMES_PX - 24, height, (0.0, 1.05 * max(*values, 1e-6)), (0.0, 1.0))
+    parts = [panel.frame(f"RMS [{unit}]", "", y_count=0)]
+    for index, row in enumerate(rows):
+        top = 10 + ROW_PX * (index + 0.15)
+        parts.append(label(NAMES_PX - 8, top + BAR_PX + 5, row.joint.replace("_", " "), "end"))
+        for place, value, style in ((top, row.command_rmse, COMMAND), (top + BAR_PX + 1, row.rmse, TWIN)):
+            box = f'x="{NAMES_PX}" y="{place:.1f}" width="{panel.x(1e3 * value) - NAMES_PX:.1f}"'
+            parts.append(f'<rect class="bar {style}" {box} height="{BAR_PX}"/>')
+        if row.rmse_ci95 is not None:
+            low, high = (panel.x(1e3 * value) for value in row.rmse_ci95)
+            parts.append(f'<path class="whisker" d="M{low:.1f} {top + 1.5 * BAR_PX + 1:.1f}H{high:.1f}"/>')
+    return drawing(width, height + 58, parts, f"RMS error of every joint in {unit}")
+
+
+def joint_traces(pair: EpisodePair, joints: list[str], fps: float) -> list[str]:
     """Command, recorded and twin position of every joint of one episode."""
-    columns = 4
-    rows = -(-len(joints) // columns)
-    figure = Figure(figsize=(12, 1.9 * rows), layout="constrained")
-    axes = figure.subplots(rows, columns, sharex=True, squeeze=False).ravel()
     time = np.arange(len(pair.position)) / fps
-    for j, (axis, joint) in enumerate(zip(axes, joints, strict=False)):
+    drawings = []
+    for j, joint in enumerate(joints):
         unit, scale = ("mm", 1e3) if unit_of(joint) == "mm" else ("rad", 1.0)
-        axis.step(time, scale * pair.recorded.action[:, j], where="post", color=COMMAND, lw=1)
-        axis.plot(time, scale * pair.recorded.state[:, j], color=RECORDED, lw=1.4)
-        axis.plot(time, scale * pair.position[:, j], color=TWIN, lw=1.2)
-        low, high = axis.get_ylim()
+        command, recorded, twin = (
+            scale * values[:, j] for values in (pair.recorded.action, pair.recorded.state, pair.position)
+        )
+        low, high = span(command, recorded, twin)
         middle, half = (low + high) / 2, max((high - low) / 2, LEAST_SPAN[unit] / 2)
-        axis.set_ylim(middle - half, middle + half)
-        axis.set_title(f"{joint.replace('_', ' ')} [{unit}]", fontsize=10)
-        axis.tick_params(labelsize=10)
-    axes[0].legend(["command", "recorded", "twin"], fontsize=10, frameon=False)
-    return figure
+        panel = _panel(span(time, margin=0.0), (middle - half, middle + half))
+        parts = [
+            panel.frame("time [s]", f"{joint.replace('_', ' ')} [{unit}]"),
+            panel.steps(time, command, COMMAND),
+            panel.line(time, twin, TWIN),
+            panel.line(time, recorded, RECORDED),  # thin, so that both show where they are the same
+        ]
+        drawings.append(drawing(WIDTH, HEIGHT, parts, f"position of {joint.replace('_', ' ')} over time"))
+    return drawings
 
 
-def histograms(touch: list[PadTouch]) -> Figure:
+def histograms(touch: list[PadTouch]) -> list[str]:
     """Distributions of touched taxels per pad: normalised readings (as the paper's Figure 4) and counts."""
-    figure = Figure(figsize=(3.1 * len(touch), 4.8), layout="constrained")
-    axes = figure.subplots(2, len(touch), squeeze=False)
-    for column, pad in enumerate(touch):
-        for row, (bins, density) in enumerate(
-            ((READING_BINS, pad.reading_density), (COUNT_BINS, pad.count_density))
+    drawings = []
+    for pad in touch:
+        for bins, density, words in (
+            (READING_BINS, pad.reading_density, "normalised reading"),
+            (COUNT_BINS, pad.count_density, "counts above idle"),
         ):
-            axis = axes[row, column]
-            axis.stairs(density[0], bins, fill=True, color=RECORDED, alpha=0.45)
-            axis.stairs(density[1], bins, color=TWIN, lw=1.6)
-            axis.tick_params(labelsize=10)
-            axis.set_xlabel(("normalised reading", "counts above idle")[row], fontsize=10)
-            if row:
-                axis.set_yscale("log")
-        axes[0, column].set_title(pad.pad.replace("_", " "), fontsize=10)
-    axes[0, 0].set_ylabel("share of touched taxels", fontsize=10)
-    axes[0, 0].legend(["recorded", "twin"], fontsize=10, frameon=False)
-    return figure
+            shares = np.maximum(np.asarray(density, float), LEAST_SHARE)
+            sides = shares if words.startswith("norm") else np.log10(shares)
+            panel = _panel((bins[0], bins[-1]), (sides.min(), sides.max() + 1e-9))
+            log = "" if sides is shares else "log₁₀ of "
+            parts = [
+                panel.frame(words, f"{pad.pad.replace('_', ' ')}: {log}share of touched taxels"),
+                panel.stairs(np.asarray(bins), sides[0], RECORDED, filled=True),
+                panel.stairs(np.asarray(bins), sides[1], TWIN),
+            ]
+            drawings.append(drawing(WIDTH, HEIGHT, parts, f"{words} of {pad.pad.replace('_', ' ')}"))
+    return drawings
 
 
-def pad_totals(pair: EpisodePair, fps: float) -> Figure:
-    """Sum of counts above idle over one episode, per pad."""
-    pads = [pad for pad in pair.counts if pad in pair.recorded.counts]
-    figure = Figure(figsize=(12, 2.4), layout="constrained")
-    axes = figure.subplots(1, len(pads), squeeze=False, sharex=True)[0]
-    for axis, pad in zip(axes, pads, strict=True):
-        recorded, twin = pads_above(pair, pad)
-        time = np.arange(len(recorded)) / fps
-        axis.plot(time, recorded.sum(1), color=RECORDED, lw=1.4)
-        axis.plot(time, twin.sum(1), color=TWIN, lw=1.2)
-        axis.set_title(pad.replace("_", " "), fontsize=10)
-        axis.set_xlabel("time [s]", fontsize=10)
-        axis.tick_params(labelsize=10)
-    axes[0].set_ylabel("sum of counts", fontsize=10)
-    axes[0].legend(["recorded", "twin"], fontsize=10, frameon=False)
-    return figure
+def pad_totals(pair: EpisodePair, fps: float) -> list[str]:
+    """Sum of counts above idle over one episode, per pad, on one scale."""
+    sums = {pad: [side.sum(1) for side in pads_above(pair, pad)] for pad in shared_pads(pair)}
+    highest = span(*(side for sides in sums.values() for side in sides), zero=True)
+    drawings = []
+    for pad, (recorded, twin) in sums.items():
+        time, words = np.arange(len(recorded)) / fps, pad.replace("_", " ")
+        panel = _panel(span(time, margin=0.0), highest)
+        parts = [
+            panel.frame("time [s]", f"{words}: sum of counts"),
+            panel.line(time, twin, TWIN),
+            panel.line(time, recorded, RECORDED),
+        ]
+        drawings.append(drawing(WIDTH, HEIGHT, parts, f"sum of the counts of {words} over time"))
+    return drawings
 
 
-def frames(pair: EpisodePair, moment: int) -> Figure:
-    """Recorded above twin, all pads at one frame on one colour scale (counts above idle)."""
-    pads = [pad for pad in pair.counts if pad in pair.recorded.counts]
-    above = {pad: [side[moment] for side in pads_above(pair, pad)] for pad in pads}
+def frames(pair: EpisodePair, moment: int) -> tuple[list[dict[str, str]], float]:
+    """Recorded and twin pads at one frame as pictures on one scale, and its top [counts above idle]."""
+    above = {pad: [side[moment] for side in pads_above(pair, pad)] for pad in shared_pads(pair)}
     highest = max(1.0, *(float(side.max()) for sides in above.values() for side in sides))
-    figure = Figure(figsize=(3.1 * len(pads), 2.7), layout="constrained")
-    axes = figure.subplots(2, len(pads), squeeze=False)
-    for column, pad in enumerate(pads):
-        layout = pad_layout_of(pad)
-        for row, name in enumerate(("recorded", "twin")):
-            axis = axes[row, column]
-            picture = above[pad][row].reshape(layout.rows, layout.cols)
-            image = axis.imshow(picture, vmin=0, vmax=highest, cmap="viridis")
-            axis.set_xticks([])
-            axis.set_yticks([])
-            if column == 0:
-                axis.set_ylabel(name, fontsize=10)
-        axes[0, column].set_title(pad.replace("_", " "), fontsize=10)
-    figure.colorbar(image, ax=axes, shrink=0.8, label="counts")
-    return figure
+    pictures = []
+    for side, name in enumerate(("recorded", "twin")):
+        for pad, sides in above.items():
+            layout = pad_layout_of(pad)
+            picture = pad_image(sides[side].reshape(layout.rows, layout.cols), highest)
+            pictures.append({"source": picture, "caption": f"{pad.replace('_', ' ')}, {name}"})
+    return pictures, highest
+
+
+def shared_pads(pair: EpisodePair) -> list[str]:
+    """Pads that recording and twin both have."""
+    return [pad for pad in pair.counts if pad in pair.recorded.counts]
 
 
 def pads_above(pair: EpisodePair, pad: str) -> tuple[Array, Array]:

@@ -6,12 +6,15 @@ import numpy as np
 
 from lerobot_vtrefine.diagnose.episode_replay import figures
 from lerobot_vtrefine.diagnose.episode_replay.compare import Comparison, EpisodePair
+from lerobot_vtrefine.diagnose.episode_replay.film import video_uri
 from lerobot_vtrefine.diagnose.episode_replay.touch import telling_frames
 from lerobot_vtrefine.embodiments import pad_layout_of
 from lerobot_vtrefine.pages.pads import colour_scale, pad_film
 from lerobot_vtrefine.pages.render import render
 
 FRAMES_SHOWN = 4
+LEAST_TOLD = 0.1
+"""Errors of joints below this are not told in figures [mrad, mm]."""
 
 
 def render_page(comparison: Comparison) -> str:
@@ -24,19 +27,21 @@ def render_page(comparison: Comparison) -> str:
         "lerobot_vtrefine.diagnose.episode_replay",
         "page.html",
         verdict=verdict(comparison),
+        twin=video_uri(comparison.film, comparison.fps) if comparison.film else None,
+        filmed=comparison.pairs[0].recorded.index,
         films=_films(pads_pair, comparison.fps) if pads_pair else [],
         comparison=comparison,
         episodes=len(comparison.pairs),
         frames=sum(len(pair.position) for pair in comparison.pairs),
         rows=[_tracking_row(row) for row in comparison.tracking],
-        bars=figures.data_uri(figures.tracking_bars(comparison.tracking)),
+        bars=figures.tracking_bars(comparison.tracking),
         traces=[
-            (name, pair.recorded.index, figures.data_uri(figures.joint_traces(pair, joints, comparison.fps)))
+            (name, pair.recorded.index, figures.joint_traces(pair, joints, comparison.fps))
             for name, pair in shown.items()
         ],
         touch=comparison.touch,
-        histograms=figures.data_uri(figures.histograms(comparison.touch)) if comparison.touch else None,
-        totals=figures.data_uri(figures.pad_totals(pads_pair, comparison.fps)) if pads_pair else None,
+        histograms=figures.histograms(comparison.touch),
+        totals=figures.pad_totals(pads_pair, comparison.fps) if pads_pair else [],
         moments=_moments(pads_pair, comparison.fps) if pads_pair else [],
         touch_episode=pads_pair.recorded.index if pads_pair else None,
     )
@@ -51,9 +56,9 @@ def verdict(comparison: Comparison) -> str:
     if max(row.peak for row in comparison.tracking) == 0.0:
         said = "The twin repeats the recorded motion exactly."
     else:
-        error = f"{1e3 * worst.rmse:.1f} {figures.unit_of(worst.joint)}"
-        joint = worst.joint.replace("_", " ")
-        said = f"The twin follows the recorded arms to within {error} RMS; the worst joint is {joint}."
+        error, unit = 1e3 * worst.rmse, figures.unit_of(worst.joint)
+        within, joint = f"{max(error, LEAST_TOLD):.1f} {unit} RMS", worst.joint.replace("_", " ")
+        said = f"The twin follows the recorded arms to within {within}; the worst joint is {joint}."
     felt = [pad for pad in comparison.touch if pad.overlap is not None]
     if comparison.touch and all(pad.identical_frames == pad.frames for pad in comparison.touch):
         said += " All pads read the same in every frame."
@@ -69,7 +74,7 @@ def verdict(comparison: Comparison) -> str:
 def _films(pair: EpisodePair, fps: float) -> list[dict[str, str]]:
     """Every pad in motion, recorded beside the twin, on one scale."""
     sides = {}
-    for pad in (name for name in pair.recorded.counts if name in pair.counts):
+    for pad in figures.shared_pads(pair):
         layout = pad_layout_of(pad)
         shape = (-1, layout.rows, layout.cols)
         sides[pad] = [side.reshape(shape) for side in figures.pads_above(pair, pad)]
@@ -86,7 +91,10 @@ def _films(pair: EpisodePair, fps: float) -> list[dict[str, str]]:
 
 def _tracking_row(row: Any) -> dict[str, str]:
     def number(value: float | None, digits: int = 1) -> str:
-        return "–" if value is None else f"{1e3 * value:.{digits}f}"
+        if value is None:
+            return "–"
+        rounded = round(1e3 * value, digits) + 0.0  # no minus before a zero
+        return f"{rounded:.{digits}f}".replace("-", "−")
 
     interval = "" if row.rmse_ci95 is None else f" [{number(row.rmse_ci95[0])}, {number(row.rmse_ci95[1])}]"
     return {
@@ -120,10 +128,11 @@ def _strongest_touch(comparison: Comparison) -> EpisodePair | None:
     return max(pairs, key=lambda pair: sum(figures.pads_above(pair, pad)[0].sum() for pad in compared))
 
 
-def _moments(pair: EpisodePair, fps: float) -> list[tuple[str, str]]:
-    pads = [pad for pad in pair.counts if pad in pair.recorded.counts]
-    above = np.concatenate([figures.pads_above(pair, pad)[0] for pad in pads], axis=1)
-    return [
-        (f"{moment / fps:.1f} s", figures.data_uri(figures.frames(pair, moment)))
-        for moment in telling_frames(above, FRAMES_SHOWN)
-    ]
+def _moments(pair: EpisodePair, fps: float) -> list[tuple[str, list[dict[str, str]], str]]:
+    """Time, pictures and colour scale of the frames that tell most."""
+    above = np.concatenate([figures.pads_above(pair, pad)[0] for pad in figures.shared_pads(pair)], axis=1)
+    shown = []
+    for moment in telling_frames(above, FRAMES_SHOWN):
+        pictures, top = figures.frames(pair, moment)
+        shown.append((f"{moment / fps:.1f} s", pictures, colour_scale(top, "counts above idle")))
+    return shown

@@ -6,9 +6,9 @@ from pathlib import PurePath
 import numpy as np
 
 from lerobot_vtrefine.diagnose.evidence import ResidualView, Trace, TrialError
-from lerobot_vtrefine.diagnose.report.axes import Panel, drawing, label, span
 from lerobot_vtrefine.diagnose.report.numbers import quantity, scale_of
 from lerobot_vtrefine.diagnose.verdict import Heldout
+from lerobot_vtrefine.pages.charts import Panel, drawing, label, span
 
 WIDTH = 520.0
 LEFT, RIGHT = 58.0, 14.0

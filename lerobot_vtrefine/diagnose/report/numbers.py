@@ -3,6 +3,8 @@
 from collections.abc import Sequence
 from typing import Any
 
+from lerobot_vtrefine.pages.charts import digits
+
 SCALES = {
     "m": ((1e3, "mm"), (1e6, "µm")),
     "m/s": ((1e3, "mm/s"),),
@@ -29,16 +31,6 @@ def scale_of(size: float, unit: str) -> tuple[float, str]:
         if abs(size) * factor >= 0.1:
             return factor, name
     return options[0] if size == 0 else options[-1]
-
-
-def digits(value: float) -> str:
-    """Three significant digits without needless zeros or exponents."""
-    if value == 0:
-        return "0"
-    if not 1e-4 <= abs(value) < 1e5:
-        return f"{value:.2e}".replace("e-0", "e-").replace("e+0", "e")
-    text = f"{value:.3g}" if abs(value) < 1e3 else f"{value:.0f}"
-    return text.replace("-", "−")
 
 
 def quantity(value: float, unit: str) -> str:

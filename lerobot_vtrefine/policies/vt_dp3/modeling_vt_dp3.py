@@ -5,6 +5,7 @@ action dimension, ``C`` condition. All actions in here are normalised; the postp
 targets.
 """
 
+import re
 from collections import deque
 from copy import deepcopy
 from pathlib import Path
@@ -79,8 +80,6 @@ class VtDp3Policy(PreTrainedPolicy):
         if not isinstance(config, VtDp3Config):
             found = getattr(config, "type", type(config).__name__)
             raise ValueError(f"the checkpoint holds a policy of type '{found}', expected 'vt_dp3'")
-        if config.use_peft:
-            raise ValueError("vt_dp3 has no PEFT adapters: leave out --peft.*, and use_peft in config.json")
         super().__init__(config)
         config.validate_features()
         if dataset_stats:
@@ -114,13 +113,34 @@ class VtDp3Policy(PreTrainedPolicy):
         if path.is_dir() and not (path / "config.json").is_file():
             raise FileNotFoundError(f"{path} holds no policy; give the checkpoint's pretrained_model folder")
         try:
-            return super().from_pretrained(pretrained_name_or_path, read_encoder=False, **kwargs)
+            policy = super().from_pretrained(pretrained_name_or_path, read_encoder=False, **kwargs)
         except SafetensorError as error:
             raise ValueError(f"the weights of {pretrained_name_or_path} are damaged: {error}") from error
+        if policy.config.use_peft:  # the adapters that come next belong to the network that acts
+            policy._stop_averaging()
+        return policy
+
+    # LeRobot's hooks for --peft.*
+
+    def _get_default_peft_targets(self) -> dict[str, Any]:
+        """Every linear layer and convolution of the network that acts, its encoder included."""
+        kinds = (nn.Linear, nn.Conv1d, nn.Conv2d)
+        names = [re.escape(name) for name, part in self.model.named_modules() if isinstance(part, kinds)]
+        return {"target_modules": rf"model\.({'|'.join(names)})", "modules_to_save": []}
 
     def _validate_peft_config(self, peft_config: Any) -> None:
-        """Called by the trainer for ``--peft.*``, which would adapt a copy that the average never follows."""
-        raise ValueError("vt_dp3 has no PEFT adapters: leave out --peft.*")
+        """Called before adapters are put in: from then on they are trained, and no copy is averaged.
+
+        Raises: ValueError without a checkpoint to start from, or for one that DPPO has tuned.
+        """
+        super()._validate_peft_config(peft_config)
+        if self.config.ft_denoising_steps:
+            raise ValueError("--peft.* trains by imitation: start from the checkpoint before DPPO")
+        self._stop_averaging()
+
+    def _stop_averaging(self) -> None:
+        """Let the network that acts be the only one."""
+        self.online, self.ema = None, None
 
     @property
     def process(self) -> DiffusionProcess:
@@ -186,7 +206,7 @@ class VtDp3Policy(PreTrainedPolicy):
         config.ft_freeze_encoder = freeze_encoder
         if not 1 <= ft_denoising_steps <= len(config.timesteps):
             raise ValueError(f"{ft_denoising_steps=} must be within 1..{len(config.timesteps)}")
-        self.online, self.ema = None, None
+        self._stop_averaging()
         self._attach_base()
 
     def _attach_base(self) -> None:

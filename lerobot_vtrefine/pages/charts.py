@@ -1,18 +1,35 @@
-"""A plain x-y plot as inline SVG; the page's style sheet colours it, in light and dark mode."""
+"""Charts of all report pages as inline SVG: the page's style sheet colours them, in light and dark mode.
+
+Styles are its classes: ``m`` measured or recorded, ``a`` before or simulated, ``b`` after, extended or the
+twin, ``d`` what drove it. Text is 15 units high; drawings scroll rather than shrink it below 12 pixels.
+"""
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from html import escape
 
 import numpy as np
 
-from lerobot_vtrefine.diagnose.report.numbers import digits
-
-NARROW = 400.0
-"""Drawings up to this width [px] are shown smaller on narrow screens."""
+LEAST_SCALE = 0.82
+"""How far a drawing shrinks on a narrow screen: 15 units then are 12.3 pixels."""
 MAX_POINTS = 400
 """Lines are thinned to this many points, which is more than pixels show."""
+
+
+def digits(value: float) -> str:
+    """Three significant digits without needless zeros or exponents."""
+    if value == 0:
+        return "0"
+    if not 1e-4 <= abs(value) < 1e5:
+        return f"{value:.2e}".replace("e-0", "e-").replace("e+0", "e")
+    text = f"{value:.3g}" if abs(value) < 1e3 else f"{value:.0f}"
+    return text.replace("-", "−")
+
+
+def percent_tick(value: float) -> str:
+    """A rate from 0 to 1 on an axis."""
+    return f"{100 * value:.0f} %"
 
 
 @dataclass(frozen=True)
@@ -45,13 +62,54 @@ class Panel:
         points = self._points(np.concatenate([xs, xs[::-1]]), np.concatenate([low, high[::-1]]))
         return f'<polygon class="band {style}" points="{points}"/>'
 
+    def steps(self, xs: np.ndarray, ys: np.ndarray, style: str) -> str:
+        """A line that holds each value until the next one."""
+        return self.line(np.repeat(xs, 2)[1:], np.repeat(ys, 2)[:-1], style)
+
+    def dots(self, xs: np.ndarray, ys: np.ndarray, style: str, radius: float = 5.0) -> str:
+        """A dot at every finite point."""
+        return "".join(
+            f'<circle class="dot {style}" cx="{self.x(x):.1f}" cy="{self.y(y):.1f}" r="{radius:g}"/>'
+            for x, y in zip(xs, ys, strict=True)
+            if np.isfinite(x) and np.isfinite(y)
+        )
+
+    def whiskers(self, xs: np.ndarray, low: np.ndarray, high: np.ndarray) -> str:
+        """Upright intervals."""
+        spans = zip(xs, low, high, strict=True)
+        return "".join(
+            f'<path class="whisker" d="M{self.x(x):.1f} {self.y(a):.1f}V{self.y(b):.1f}"/>'
+            for x, a, b in spans
+        )
+
+    def stairs(self, edges: np.ndarray, heights: np.ndarray, style: str, *, filled: bool = False) -> str:
+        """A histogram's outline, or its area."""
+        xs, ys = np.repeat(edges, 2)[1:-1], np.repeat(heights, 2)
+        return (
+            self.band(xs, np.full(len(ys), self.y_range[0]), ys, style)
+            if filled
+            else self.line(xs, ys, style)
+        )
+
+    def rule(self, x: float, style: str) -> str:
+        """An upright line through the panel."""
+        return f'<path class="line {style}" d="M{self.x(x):.1f} {self.top:.1f}v{self.height:.1f}"/>'
+
     def _points(self, xs: np.ndarray, ys: np.ndarray) -> str:
         keep = np.flatnonzero(np.isfinite(xs) & np.isfinite(ys))
         if len(keep) > MAX_POINTS:
             keep = keep[np.linspace(0, len(keep) - 1, MAX_POINTS).astype(int)]
         return " ".join(f"{self.x(xs[k]):.1f},{self.y(ys[k]):.1f}" for k in keep)
 
-    def frame(self, x_title: str, y_title: str, *, x_ticks: bool = True, y_count: int = 4) -> str:
+    def frame(
+        self,
+        x_title: str,
+        y_title: str,
+        *,
+        x_ticks: bool = True,
+        y_count: int = 4,
+        y_text: Callable[[float], str] = digits,
+    ) -> str:
         """Grid lines with numbers, and titles of both axes; no grid for ``y_count`` 0."""
         right, bottom = self.left + self.width, self.top + self.height
         parts = []
@@ -59,7 +117,7 @@ class Panel:
             place = self.y(tick)
             style = "zero" if tick == 0 else "grid"
             parts.append(f'<path class="{style}" d="M{self.left:.1f} {place:.1f}H{right:.1f}"/>')
-            parts.append(label(self.left - 6, place + 4, digits(tick), "end"))
+            parts.append(label(self.left - 6, place + 5, y_text(tick), "end"))
         if x_ticks:
             for tick in ticks(*self.x_range, 6):
                 place = self.x(tick)
@@ -99,6 +157,5 @@ def label(x: float, y: float, text: str, anchor: str, style: str = "tick") -> st
 def drawing(width: float, height: float, parts: Sequence[str], title: str) -> str:
     """The parts as one picture, with a title for those who cannot see it."""
     body = "".join(parts)
-    style = "wide" if width > NARROW else "narrow"
-    size = f'class="{style}" viewBox="0 0 {width:.0f} {height:.0f}"'
+    size = f'viewBox="0 0 {width:.0f} {height:.0f}" style="min-width: {LEAST_SCALE * width:.0f}px"'
     return f'<svg {size} role="img" aria-label="{escape(title, quote=True)}">{body}</svg>'

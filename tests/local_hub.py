@@ -4,6 +4,7 @@ import shutil
 from pathlib import Path
 from typing import Any
 
+import huggingface_hub
 import pytest
 from huggingface_hub import DatasetCard
 from huggingface_hub.utils import filter_repo_objects
@@ -18,7 +19,7 @@ def copy(source: Path, target: Path, allow: Any, ignore: Any) -> None:
 
 
 class FolderApi:
-    """The calls of `HfApi` that pushing a dataset makes."""
+    """The calls of `HfApi` that pushing a dataset or a policy makes."""
 
     hub: Path
 
@@ -36,7 +37,7 @@ class FolderApi:
 
 
 def use_folder_as_hub(patch: pytest.MonkeyPatch, hub: Path) -> None:
-    """Redirects pushing and pulling of datasets."""
+    """Redirects pushing and pulling of datasets, and pushing of policies."""
     from lerobot.datasets import dataset_metadata, lerobot_dataset
 
     def snapshot_download(repo_id: str, **options: Any) -> str:
@@ -47,7 +48,9 @@ def use_folder_as_hub(patch: pytest.MonkeyPatch, hub: Path) -> None:
     def push_card(card: DatasetCard, repo_id: str, **_: Any) -> None:
         card.save(hub / repo_id / "README.md")
 
-    patch.setattr(lerobot_dataset, "HfApi", type("Api", (FolderApi,), {"hub": hub}))
+    api = type("Api", (FolderApi,), {"hub": hub})
+    patch.setattr(huggingface_hub, "HfApi", api)
+    patch.setattr(lerobot_dataset, "HfApi", api)
     patch.setattr(DatasetCard, "push_to_hub", push_card)
     for module in (dataset_metadata, lerobot_dataset):
         patch.setattr(module, "snapshot_download", snapshot_download)
