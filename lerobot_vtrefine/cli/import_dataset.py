@@ -3,7 +3,7 @@
 examples:
   vtrefine-import --source=aloha_31_episodes.npz --root=outputs/aloha        the VT-Refine authors' file
   vtrefine-import --source=LEFLEXITAC_DATASET --root=outputs/pads --pads='{primary: left_arm_left_finger}'
-  vtrefine-import --source=bam_xl330.npz --recording_dir=outputs/xl330       BAM's logs of a servo with a pendulum
+  vtrefine-import --source=bam_xl330.npz --recording_dir=outputs/xl330       BAM's logs of a servo
 """
 
 import logging
@@ -22,8 +22,8 @@ from lerobot_vtrefine.datasets.importers.leflexitac import import_leflexitac, is
 from lerobot_vtrefine.embodiments import get_embodiment
 
 FORMATS = (
-    "the paper authors' .npz of commands and positions, a LeRobot v3 folder with LeFlexiTac's pads, or BAM's logs "
-    "of a servo (.npz, or a folder of .json)"
+    "the paper authors' .npz of commands and positions, a LeRobot v3 folder with LeFlexiTac's pads, or BAM's "
+    "logs of a servo (.npz, or a folder of .json)"
 )
 
 
@@ -42,7 +42,7 @@ class ImportConfig:
     task: str = "insert the plug into the socket"
     """Natural-language task of every frame of the npz."""
     recording_dir: Path | None = None
-    """Also write the npz, or write BAM's logs, as a recording set for ``vtrefine-diagnose`` into this new folder."""
+    """New folder for a recording set for ``vtrefine-diagnose``: of BAM's logs, or of the npz as well."""
     pads: dict[str, str] = field(default_factory=dict)
     """New names of a folder's pads, e.g. '{primary: left_arm_left_finger}'; others keep theirs."""
 

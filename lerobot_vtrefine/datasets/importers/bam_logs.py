@@ -1,8 +1,8 @@
 """Logs of servos that swing a pendulum, as Rhoban's BAM (Better Actuator Models) records them.
 
 Either a folder of its JSON logs, or one npz: an array per run with the columns that ``columns`` names, and
-``meta``, JSON with an entry per run: name, mass [kg], length [m], kp, vin [V], motor, trajectory. What a gain kp
-means to a motor's firmware is measured by BAM's authors and documented with their library (Apache-2.0).
+``meta``, JSON with an entry per run: name, mass [kg], length [m], kp, vin [V], motor, trajectory. What a gain
+kp means to a motor's firmware was measured by BAM's authors, whose library (Apache-2.0) documents it.
 """
 
 import json

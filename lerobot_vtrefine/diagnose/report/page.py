@@ -30,6 +30,7 @@ from lerobot_vtrefine.diagnose.report.words import (
     ties,
     title,
 )
+from lerobot_vtrefine.diagnose.servo.bench import on_bench
 from lerobot_vtrefine.diagnose.verdict import Parameter, Verdict
 from lerobot_vtrefine.pages.pads import colour_scale, pad_image
 from lerobot_vtrefine.pages.render import render
@@ -101,9 +102,12 @@ def _use(verdict: Verdict, recordings: RecordingSet) -> dict[str, str] | None:
         said += " Its names are not settled, so check first that it predicts other recordings better."
     else:
         said += " Record, fine-tune and evaluate with it, and predict other recordings to see that it holds."
-    lines = [
+    in_simulation = [
         f"vtrefine-record-demos {task} --root=outputs/demos {flag}=sensor_model.json",
         f"vtrefine-finetune {task} --policy.path=CHECKPOINT {flag}=sensor_model.json",
+    ]
+    lines = [
+        *(() if on_bench(recordings) else in_simulation),
         "vtrefine-predict --recording=OTHERS --sensor_model=sensor_model.json --output_dir=predicted",
     ]
     return {"words": said, "commands": "\n".join(lines)}

@@ -22,6 +22,8 @@ from lerobot_vtrefine.diagnose.verdict import Parameter
 Array = np.ndarray
 
 _TRACES = 6
+_FIRST_STEP = 2e-3
+"""Of finite differences, as a part of a parameter's size."""
 
 
 class ServoAccount:
@@ -55,28 +57,29 @@ class ServoAccount:
         return ServoModel.of(fit.theta)
 
     def minimum_detectable(self) -> Mapping[str, float]:
-        """The main parameter's smallest size, the form's others where fits begin."""
+        """The main parameter's smallest size, with the speed at which fits begin and no other parameter."""
         fitter, fitted = self.problem.fitter, self.fit
-        own = fitter.derivatives(fitted).transpose(1, 2, 0)
+        free = np.flatnonzero(fitted.free)
+        own = fitter.derivatives(fitted.theta[None], fitted.residual[None], free, np.array([_FIRST_STEP]))
         out: dict[str, float] = {}
         for candidate in CATALOGUE:
             places = [INDEX[name] for name in candidate.parameters]
             if not candidate.possible(self.problem.bench) or fitted.free[places].any():
                 continue
-            begin = fitter.start[places] * 1.0
-            # A first small step, where its effect is still in proportion to it.
+            step = _FIRST_STEP * fitter.start[places[0]]
             theta = fitted.theta.copy()
-            theta[places] = begin
-            theta[places[0]] = 0.1 * begin[0]
-            theta[[place for place in places[1:] if LIMITS[_name(place)].unit == LIMITS[_name(places[0])].unit]] = 0.0
-            moved = fitted.residual - fitter.residuals(theta[None])[0]
-            size = smallest(moved / (0.1 * begin[0]), own, fitted.residual)
+            theta[places[0]] = step
+            for name, place in zip(candidate.parameters, places, strict=True):
+                if name.endswith("_speed"):
+                    theta[place] = fitter.start[place]
+            moved = (fitted.residual - fitter.residuals(theta[None])[0]) / step
+            size = smallest(moved, own[0].transpose(1, 2, 0), fitted.residual)
             if size is not None:
                 out[candidate.cause] = min(size, out.get(candidate.cause, np.inf))
         return out
 
     def noise_floor(self) -> float | None:
-        """What rounding by the encoder leaves: whatever else is left, trials that are not repeated cannot say."""
+        """What rounding by the encoder leaves; more could be told only from trials that are repeated."""
         return encoder_step(self.problem.bench) / np.sqrt(12)
 
     def causes(self) -> Sequence[str]:
@@ -110,7 +113,9 @@ class ServoAccount:
     def drawings(self, test: ServoProblem, seed: int) -> tuple[tuple[Trace, ...], tuple[ResidualView, ...]]:
         """Traces of locked trials."""
         bench = test.bench
-        before, after = (test.fitter.evaluate(f.theta, f.free).residual for f in (self.selection.baseline, self.fit))
+        before, after = (
+            test.fitter.evaluate(f.theta, f.free).residual for f in (self.selection.baseline, self.fit)
+        )
         out = []
         for trial in range(min(len(bench.files), _TRACES)):
             valid = bench.valid[:, trial]
@@ -133,10 +138,6 @@ class ServoAccount:
         place = INDEX[name]
         value = float(self.fit.theta[place])
         return Parameter(value, jackknife(self.without[:, place], value), LIMITS[name].unit)
-
-
-def _name(place: int) -> str:
-    return tuple(INDEX)[place]
 
 
 def _leave_one_out(problem: ServoProblem, fit: Fit) -> Array:

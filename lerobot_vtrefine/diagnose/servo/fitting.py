@@ -19,9 +19,13 @@ _TORQUES, _RESISTANCES, _FRICTIONS = (0.1, 0.4, 1.6), (1.0, 3.0, 10.0), (0.01, 0
 _DAMPINGS = (1e-6, 1e-3, 3e-2, 1.0, 30.0)
 _SHORTER = (1.0, 0.5, 0.2, 0.0)
 """Parts of a Newton step that are tried: simulations bend more than their derivatives say."""
-_TOLERANCE = 3e-4
-_STEP = 2e-3
-"""Of finite differences, as a part of a parameter's size."""
+_KEPT = 3
+"""Of these, how many are followed."""
+_ITERATIONS = 20
+_TOLERANCE = 1e-3
+_STEPS = (2e-3, 5e-4)
+"""Of finite differences, as parts of a parameter's size: where a shaft sticks and slips, errors are rough,
+and another step may find the way on."""
 
 
 @dataclass(frozen=True)
@@ -57,7 +61,7 @@ class Fitter:
     def evaluate(self, theta: Array, free: Array) -> Fit:
         """A fit that stays where it is."""
         left = self.residuals(theta[None])[0]
-        return Fit(theta, free, self._mse(left)[:, None], left)
+        return Fit(theta, free, self.mean_squared(left)[:, None], left)
 
     def baseline(self) -> Fit:
         """The simulated servo, from the best of several starts."""
@@ -69,50 +73,76 @@ class Fitter:
         many = np.repeat(theta[None], grid.shape[1], 0)
         columns = [INDEX[name] for name in ("log_torque", "log_resistance", "coulomb")]
         many[:, columns] = (grid * np.array([[1.0], [1.0], [float(self.bench.weight.mean())]])).T
-        cost = self._mse(self.residuals(many)).mean(-1)
-        best = np.argsort(cost)[:2]
-        fits = [self.fit(many[place], free, 40) for place in best]
-        return min(fits, key=lambda item: float(item.mse.mean()))
+        cost = self.mean_squared(self.residuals(many)).mean(-1)
+        return self.fit(many[np.argsort(cost)[:_KEPT]], free, 2 * _ITERATIONS)
 
-    def fit(self, theta: Array, free: Array, iterations: int = 15) -> Fit:
-        """Minimise the mean over trials of their mean squared error over the free parameters."""
-        theta = theta.clip(self.low, self.high) if free.any() else theta
-        theta = np.where(free, theta, 0.0)
-        columns, places = np.array(_DAMPINGS), np.flatnonzero(free)
-        now = self.evaluate(theta, free)
+    def fit(self, starts: Array, free: Array, iterations: int = _ITERATIONS) -> Fit:
+        """Minimise the mean over trials of their mean squared error over the free parameters.
+
+        From several starts (S, P), side by side, which costs little more than one; the best is it.
+        """
+        theta = np.where(free, starts.clip(self.low, self.high), 0.0)
+        left = self.residuals(theta)
+        mse = self.mean_squared(left)
+        stalled = np.zeros(len(theta), dtype=int)
         for _ in range(iterations):
-            normal, slope = self.curvature(now)
-            normal, slope = normal.mean(0), slope.mean(0)
-            tried = np.repeat(now.theta[None], len(columns), 0)
-            for row, damping in enumerate(columns):
-                tried[row, places] = self._stepped(now.theta, places, normal, slope, damping)
-            left = self.residuals(tried)
-            mse = self._mse(left)
-            best = int(np.nan_to_num(mse.mean(1), nan=np.inf).argmin())
-            gained = 1 - mse[best].mean() / max(now.mse.mean(), 1e-300)
-            if gained > 0:
-                now = Fit(tried[best], free, mse[best][:, None], left[best])
-            if gained < _TOLERANCE:
+            open_starts = np.flatnonzero(stalled < len(_STEPS))
+            if not len(open_starts):
                 break
-        return now
+            tried = self._proposed(theta[open_starts], left[open_starts], free, stalled[open_starts])
+            then = self.residuals(tried.reshape(-1, theta.shape[1])).reshape(
+                *tried.shape[:2], *left.shape[1:]
+            )
+            cost = self.mean_squared(then)
+            best = np.nan_to_num(cost.mean(-1), nan=np.inf).argmin(1)
+            for place, row, one in zip(open_starts, range(len(best)), best, strict=True):
+                gained = 1 - cost[row, one].mean() / max(mse[place].mean(), 1e-300)
+                stalled[place] = stalled[place] + 1 if gained < _TOLERANCE else 0
+                if gained > 0:
+                    theta[place], left[place], mse[place] = tried[row, one], then[row, one], cost[row, one]
+        one = int(mse.mean(1).argmin())
+        return Fit(theta[one], free, mse[one][:, None], left[one])
 
-    def curvature(self, now: Fit, moving: Array | None = None) -> tuple[Array, Array]:
+    def _proposed(self, theta: Array, left: Array, free: Array, stalled: Array) -> Array:
+        """(S, D, P) where steps of D dampings lead from each start."""
+        places = np.flatnonzero(free)
+        parts = np.array(_STEPS)[stalled]
+        moved = self.derivatives(theta, left, places, parts)
+        tried = np.repeat(theta[:, None], len(_DAMPINGS), 1)
+        for start in range(len(theta)):
+            normal, slope = (item.mean(0) for item in self._curvature(moved[start], left[start]))
+            for row, damping in enumerate(_DAMPINGS):
+                tried[start, row, places] = self.stepped(theta[start], places, normal, slope, damping)
+        return tried
+
+    def curvature(self, now: Fit) -> tuple[Array, Array]:
         """Per trial: J'J (T, K, K) and J'r (T, K), of the mean squared error."""
-        moved = self.derivatives(now, moving)
-        frames = self.bench.frames[:, None, None]
-        normal = np.einsum("knt,lnt->tkl", moved, moved, optimize=True) / frames
-        return normal, np.einsum("knt,nt->tk", moved, now.residual) / frames[:, :, 0]
+        moved = self.derivatives(
+            now.theta[None], now.residual[None], np.flatnonzero(now.free), np.array(_STEPS[:1])
+        )
+        return self._curvature(moved[0], now.residual)
 
-    def derivatives(self, now: Fit, moving: Array | None = None) -> Array:
-        """(K, N, T) d position / d parameter of those that are free, or of some (K,)."""
-        places = np.flatnonzero(now.free) if moving is None else moving
-        step = _STEP * np.maximum(np.abs(now.theta), np.abs(self.start))[places]
-        step = np.where(now.theta[places] + step > self.high[places], -step, step)
-        theta = np.repeat(now.theta[None], len(places), 0)
-        theta[np.arange(len(places)), places] += step
-        return (now.residual - self.residuals(theta)) / step[:, None, None]
+    def _curvature(self, moved: Array, left: Array) -> tuple[Array, Array]:
+        by_trial = moved.transpose(2, 0, 1)
+        normal = by_trial @ by_trial.transpose(0, 2, 1)
+        slope = (by_trial @ left.T[:, :, None])[:, :, 0]
+        return normal / self.bench.frames[:, None, None], slope / self.bench.frames[:, None]
 
-    def _stepped(self, theta: Array, places: Array, normal: Array, slope: Array, damping: float) -> Array:
+    def derivatives(self, theta: Array, left: Array, places: Array, parts: Array) -> Array:
+        """(S, K, N, T) d position / d parameter at points (S, P) that leave residuals (S, N, T).
+
+        Args:
+            places: (K,) numbers of the parameters.
+            parts: (S,) of the parameters' sizes that finite differences take.
+        """
+        step = parts[:, None] * np.maximum(np.abs(theta), np.abs(self.start))[:, places]
+        step = np.where(theta[:, places] + step > self.high[places], -step, step)
+        many = np.repeat(theta[:, None], len(places), 1)
+        many[:, np.arange(len(places)), places] += step
+        moved = self.residuals(many.reshape(-1, theta.shape[1])).reshape(*step.shape, *left.shape[1:])
+        return (left[:, None] - moved) / step[:, :, None, None]
+
+    def stepped(self, theta: Array, places: Array, normal: Array, slope: Array, damping: float) -> Array:
         """Parameters (K,) after a damped step; those that would leave their bounds rest on them."""
         inside = np.ones(len(places), dtype=bool)
         diagonal = np.diag(normal)
@@ -134,7 +164,7 @@ class Fitter:
                 break
         return (theta[places] + step).clip(self.low[places], self.high[places])
 
-    def _mse(self, left: Array) -> Array:
+    def mean_squared(self, left: Array) -> Array:
         """(..., T) of residuals (..., N, T)."""
         return np.square(left).sum(-2) / self.bench.frames
 
@@ -164,11 +194,11 @@ class Refits:
 
     def _tried(self, weights: Array) -> tuple[Array, Array]:
         normal, slope = (np.tensordot(weights, item, 1) for item in (self.normal, self.slope))
-        full = self.fitter._stepped(self.fit.theta, self.places, normal, slope, 1e-3)
+        full = self.fitter.stepped(self.fit.theta, self.places, normal, slope, 1e-3)
         tried = np.repeat(self.fit.theta[None], len(_SHORTER), 0)
         way = full - self.fit.theta[self.places]
         tried[:, self.places] += np.outer(_SHORTER, way)
-        return tried, self.fitter._mse(self.fitter.residuals(tried))
+        return tried, self.fitter.mean_squared(self.fitter.residuals(tried))
 
     @staticmethod
     def _best(mse: Array, weights: Array) -> Any:

@@ -14,7 +14,7 @@ from lerobot_vtrefine.diagnose.servo.parameters import INDEX
 Array = np.ndarray
 
 _SETTINGS = 3
-"""With so many settings (gain, supply, load), choices are made by settings left out: what a simulation is for."""
+"""With so many settings (gain, supply, load), choices are made by settings left out: so simulations are used."""
 _OF_A_STEP = 0.25
 """Means over many readings tell a quarter of the encoder's step."""
 
@@ -51,23 +51,21 @@ class ServoProblem(NothingBesides):
         """With the candidate's parameters, too, from the best of its starts."""
         places, free = _places(candidate), now.free.copy()
         free[places] = True
-        fits = []
-        for start in candidate.starts:
-            theta = now.theta.copy()
-            theta[places] = [self.fitter.start[INDEX[name]] * start.get(name, 1.0) for name in candidate.parameters]
-            fits.append(self.fitter.fit(theta, free))
-        return min(fits, key=lambda item: float(item.mse.mean()))
+        own = [[item.get(name, 1.0) for name in candidate.parameters] for item in candidate.starts]
+        theta = np.repeat(now.theta[None], len(own), 0)
+        theta[:, places] = self.fitter.start[places] * np.array(own)
+        return self.fitter.fit(theta, free)
 
     def reduced(self, now: Fit, candidates: Sequence[Candidate], channels: Array) -> Fit:
         """Without the candidates' parameters."""
         free = now.free.copy()
         for candidate in candidates:
             free[_places(candidate)] = False
-        return self.fitter.fit(now.theta, free)
+        return self.fitter.fit(now.theta[None], free)
 
     def refitted(self, now: Fit) -> Fit:
         """Everything that is free, fitted anew."""
-        return self.fitter.fit(now.theta, now.free)
+        return self.fitter.fit(now.theta[None], now.free)
 
     def merged(self, one: Fit, other: Fit, take_other: Array) -> Fit:
         """There is one channel."""

@@ -2,4 +2,4 @@
 
 from lerobot_vtrefine.diagnose.servo.candidates.base import Candidate
 
-FORMS = (Candidate("load_friction", parameters=("load_friction",)),)
+FORMS = (Candidate("load_friction", parameters=("load_friction",), starts=({}, {"load_friction": 3.0})),)

@@ -1,4 +1,5 @@
-"""load_stiction: the torque that the gears carry holds them at rest and at low speed (M4 of arXiv 2410.08650)."""
+"""load_stiction: the torque that the gears carry holds them at rest and at low speed (M4 and M5 of arXiv
+2410.08650)."""
 
 from lerobot_vtrefine.diagnose.servo.candidates.base import Candidate
 
