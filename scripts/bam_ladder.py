@@ -1,7 +1,7 @@
 """The friction models M1 to M6 of Duclusaud et al. (arXiv 2410.08650), written from the paper.
 
 A reference beside ``vtrefine-diagnose``, with which it shares only the reader of recordings: a simulation of
-its own (Euler's, in steps of 5 ms), and SciPy's least squares from several starts, among them the lower rungs.
+its own (Euler's, in steps of 5 ms), and SciPy's least squares from several starts, lower rungs among them.
 """
 
 from collections.abc import Mapping

@@ -167,6 +167,8 @@ def _facts(verdict: Verdict, recordings: RecordingSet, sound: int, seed: int) ->
         what = (
             f"pad of {recordings.rows} × {recordings.cols} taxels, {quantity(recordings.pitch_m, 'm')} apart"
         )
+    elif on_bench(recordings):
+        what = f"servo {recordings.joints[0]} with a pendulum"
     else:
         what = f"robot with {len(recordings.joints)} joints"
     seconds = sum(float(np.ptp(t.time_s[np.isfinite(t.time_s)])) for t in recordings.trials if len(t.time_s))

@@ -113,9 +113,8 @@ class ServoAccount:
     def drawings(self, test: ServoProblem, seed: int) -> tuple[tuple[Trace, ...], tuple[ResidualView, ...]]:
         """Traces of locked trials."""
         bench = test.bench
-        before, after = (
-            test.fitter.evaluate(f.theta, f.free).residual for f in (self.selection.baseline, self.fit)
-        )
+        fits = (self.selection.baseline, self.fit)
+        before, after = (test.fitter.evaluate(item.theta, item.free).residual for item in fits)
         out = []
         for trial in range(min(len(bench.files), _TRACES)):
             valid = bench.valid[:, trial]

@@ -14,7 +14,7 @@ from lerobot_vtrefine.diagnose.servo.parameters import INDEX
 Array = np.ndarray
 
 _SETTINGS = 3
-"""With so many settings (gain, supply, load), choices are made by settings left out: so simulations are used."""
+"""With so many settings (gain, supply, load) or more, folds are settings: a simulation is to predict new ones."""
 _OF_A_STEP = 0.25
 """Means over many readings tell a quarter of the encoder's step."""
 
