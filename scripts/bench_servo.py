@@ -49,7 +49,8 @@ def kept(path: Path, make: Callable[[], dict[str, Any]]) -> dict[str, Any]:
 def diagnosed(whole: ServoProblem, fitted: Array, held: Array, seed: int) -> dict[str, Any]:
     """Names found on some trials, and errors on the others."""
     found = infer(whole.subset(fitted), seed, locking=False)
-    test = whole.subset(held)
+    part = whole.subset(held)
+    test = part.finer() or part
     fits = {"baseline": found.selection.baseline, "engine": found.selection.fit}
     squared = {name: test.errors(item)[:, 0].tolist() for name, item in fits.items()}
     ties = sorted({item.name for item in found.rivals})
@@ -100,7 +101,7 @@ def main() -> None:
     options = parser.parse_args()
     options.output_dir.mkdir(parents=True, exist_ok=True)
     bench = Bench.of(read_recording_set(options.recording))
-    whole = ServoProblem(bench)
+    whole = ServoProblem.of(bench)
     settings = np.array(bench.settings)
     found, labels, said = [], [], []
     for number, name in enumerate(dict.fromkeys(bench.settings)):

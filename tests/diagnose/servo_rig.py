@@ -1,5 +1,5 @@
-"""Pendulums on servos, simulated by code that shares nothing with the engine: explicit steps of a quarter of a
-millisecond, and friction as in the papers."""
+"""Pendulums on servos, simulated by code that shares nothing with the engine: explicit steps of a quarter of
+a millisecond, and friction as in the papers."""
 
 import json
 from collections.abc import Callable

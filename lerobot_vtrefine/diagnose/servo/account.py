@@ -105,8 +105,8 @@ class ServoAccount:
         return {
             "decides": sorted({name for item in rivals for name in (item.cause, item.name)}),
             "text": "Record the same motions with a load twice as heavy and with half of it, and at one more "
-            "gain: let the servo lift it, hold it, lower it slowly and let it fall. Laws that tie at one load "
-            "differ at others, and between driving and being driven back.",
+            "gain: let the servo lift it, hold it, lower it slowly and let it fall. Laws that tie at one "
+            "load differ at others, and between driving and being driven back.",
             "protocol": {"load_factors": [0.5, 1.0, 2.0], "gains": 4, "replicates": 2},
         }
 

@@ -101,6 +101,21 @@ class Bench:
                 own[item.name] = value[:length, index] if value.ndim == 2 else value[index]
         return replace(self, **own)
 
+    def thinned(self, step_s: float) -> "Bench":
+        """With frames that are at least that far apart [s]."""
+        rows = [
+            _apart(time_s[: int(n)], step_s) for time_s, n in zip(self.time_s.T, self.frames, strict=True)
+        ]
+        longest = max(map(len, rows))
+        index = np.stack([np.r_[row, np.repeat(row[-1:], longest - len(row))] for row in rows], 1)
+        own = {}
+        for item in fields(self):
+            value = getattr(self, item.name)
+            is_course = isinstance(value, np.ndarray) and value.ndim == 2
+            own[item.name] = np.take_along_axis(value, index, 0) if is_course else value
+        own["valid"] &= np.arange(longest)[:, None] < np.array([len(row) for row in rows])
+        return replace(self, **own)
+
     @property
     def settings(self) -> tuple[str, ...]:
         """(T,) equal where gain, supply and load are."""
@@ -116,6 +131,15 @@ class Bench:
 def on_bench(recordings: RecordingSet) -> bool:
     """Whether these are of a servo with a known load."""
     return recordings.kind == "robot" and any(trial.plant is not None for trial in recordings.trials)
+
+
+def _apart(time_s: Array, step_s: float) -> Array:
+    """Numbers of frames that are at least that far apart."""
+    kept = [0]
+    for frame, at in enumerate(time_s):
+        if at >= time_s[kept[-1]] + step_s - 1e-9:
+            kept.append(frame)
+    return np.array(kept)
 
 
 def _check(trial: RobotTrial) -> None:

@@ -14,5 +14,5 @@ def diagnose_servo(recordings: RecordingSet, seed: int = 0, progress: Progress |
 
     Raises ValueError where a trial lacks its load or gain, or its commands or times are not finite.
     """
-    found = infer(ServoProblem(Bench.of(recordings)), seed, progress)
+    found = infer(ServoProblem.of(Bench.of(recordings)), seed, progress)
     return tell(found, ServoAccount(found))

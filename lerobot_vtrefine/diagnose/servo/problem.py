@@ -1,10 +1,13 @@
 """A servo's trials as the core's problem: one channel, the position of the shaft."""
 
 from collections.abc import Sequence
+from typing import Any, Self
 
 import numpy as np
 
 from lerobot_vtrefine.diagnose.core.problem import NothingBesides
+from lerobot_vtrefine.diagnose.core.rivals import Rival
+from lerobot_vtrefine.diagnose.core.search import Selection
 from lerobot_vtrefine.diagnose.servo.bench import Bench
 from lerobot_vtrefine.diagnose.servo.candidates import CATALOGUE
 from lerobot_vtrefine.diagnose.servo.candidates.base import Candidate
@@ -14,7 +17,9 @@ from lerobot_vtrefine.diagnose.servo.parameters import INDEX
 Array = np.ndarray
 
 _SETTINGS = 3
-"""With so many settings (gain, supply, load) or more, folds are settings: a simulation is to predict new ones."""
+"""With so many settings (gain, supply, load), folds are settings: a simulation is to predict new ones."""
+COARSE_STEP_S = 0.01
+"""Between the frames that a search needs."""
 _OF_A_STEP = 0.25
 """Means over many readings tell a quarter of the encoder's step."""
 
@@ -25,15 +30,26 @@ class ServoProblem(NothingBesides):
     subject = "servo"
     channels = ("position",)
 
-    def __init__(self, bench: Bench) -> None:
-        self.bench = bench
+    def __init__(self, bench: Bench, fine: Bench | None = None) -> None:
+        self.bench, self.fine = bench, fine
         self.fitter = Fitter(bench)
         self.conditions = bench.settings if len(set(bench.settings)) >= _SETTINGS else bench.recorded
         self.files = bench.files
 
-    def subset(self, trials: Array) -> "ServoProblem":
+    @classmethod
+    def of(cls, bench: Bench) -> Self:
+        """With fewer frames for the search where there are many."""
+        coarse = bench.thinned(COARSE_STEP_S)
+        return cls(coarse, bench) if len(coarse.time_s) < len(bench.time_s) else cls(bench)
+
+    def finer(self) -> Self | None:
+        """The same with all frames."""
+        return None if self.fine is None else type(self)(self.fine)
+
+    def subset(self, trials: Array) -> Self:
         """Only some trials."""
-        return ServoProblem(self.bench.subset(trials))
+        fine = None if self.fine is None else self.fine.subset(trials)
+        return type(self)(self.bench.subset(trials), fine)
 
     def baseline(self) -> Fit:
         """Motor, Coulomb and viscous friction."""
@@ -78,6 +94,15 @@ class ServoProblem(NothingBesides):
     def reweighted(self, fit: Fit, channels: Array | None = None) -> Refits:
         """By one Newton step."""
         return Refits(self.bench, fit)
+
+    can_settle = True
+
+    def settles(
+        self, rival: Rival[Fit, Candidate], selection: Selection[Any, Fit, Candidate], seed: int
+    ) -> int:
+        """A law that contains another is no rival of it, unless it predicts better by its handicap."""
+        better = rival.errors.mean() < (1 - rival.candidate.handicap) * selection.errors.mean()
+        return -1 if rival.cause in rival.candidate.contains and not better else 0
 
     def credible(self, baseline: Fit, now: Fit, best: Fit, candidate: Candidate) -> Array:
         """(1,) whether what it does is large enough for the encoder to see."""

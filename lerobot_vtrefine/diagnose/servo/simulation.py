@@ -17,7 +17,7 @@ from lerobot_vtrefine.diagnose.servo.stages import STAGES, Now, Stage
 
 Array = np.ndarray
 
-LONGEST_STEP_S = 0.006
+LONGEST_STEP_S = 0.0125
 _FASTEST = 200.0
 """No servo turns faster [rad/s]."""
 

@@ -18,6 +18,8 @@ class Candidate(PlainCandidate):
     parameters: tuple[str, ...] = ()
     starts: tuple[Mapping[str, float], ...] = field(default=({},), hash=False)
     """In place of the parameters' own, each as a multiple of these."""
+    contains: tuple[str, ...] = ()
+    """Causes whose law it becomes at some values of its own: that it does as well as these says nothing."""
     possible: Callable[[Bench], bool] = _always
     """Whether trials can show it."""
     needs: str = ""

@@ -8,6 +8,7 @@ FORMS = (
         "directional_friction",
         handicap=0.02,  # one number more than load_friction
         parameters=("motor_friction", "carried_friction"),
+        contains=("load_friction",),
         starts=({}, {"motor_friction": 0.2, "carried_friction": 4.0}),
     ),
 )
