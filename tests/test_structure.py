@@ -233,6 +233,7 @@ DIAGNOSE_LAYERS = (
     ("parts", "calibration"),
     ("dataset",),
     ("api", "predict"),
+    ("stability",),
 )
 DIAGNOSE_RANK = {room: rank for rank, rooms in enumerate(DIAGNOSE_LAYERS) for room in rooms}
 # Causes of one's own are asked for in the catalogues, where a name is not among the listed ones.

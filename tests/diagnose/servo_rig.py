@@ -1,4 +1,4 @@
-"""Pendulums on servos, simulated by code that shares nothing with the engine: explicit steps of a quarter of
+"""Pendulums on servos, simulated by code that shares nothing with the engine: explicit steps of half
 a millisecond, and friction as in the papers."""
 
 import json
@@ -15,7 +15,7 @@ Law = Callable[[Array, Array, Array], Array]
 
 MASS_KG, LENGTH_M, SUPPLY_V = 0.5, 0.1, 7.4
 KT, OHM, ARMATURE, COULOMB, VISCOUS = 0.37, 3.0, 2e-3, 0.015, 0.005
-FPS, SECONDS, FINE_S = 160.0, 2.0, 2.5e-4
+FPS, SECONDS, FINE_S = 160.0, 2.0, 5e-4
 ENCODER_RAD = 2 * np.pi / 4096
 GAINS = (0.3, 0.6, 1.2)
 

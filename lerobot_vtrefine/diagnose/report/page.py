@@ -54,6 +54,7 @@ def render_report(
     sound: int,
     seed: int,
     film: dict[str, str] | None = None,
+    survived: str = "",
 ) -> str:
     """The page as HTML text.
 
@@ -62,6 +63,7 @@ def render_report(
         recordings: as they were read, before quality control.
         sound: number of trials that passed it.
         film: a press in motion: its source, caption and colour scale.
+        survived: which names other draws and halves of the recordings give, in one line.
     """
     unit = diagnosis.unit if diagnosis is not None else "counts"
     of_pad = recordings.kind == "pad"
@@ -77,7 +79,7 @@ def render_report(
         title=title,
         ties=ties(verdict),
         doubts=doubts(verdict, len(recordings.trials), sound),
-        facts=_facts(verdict, recordings, sound, seed),
+        facts=_facts(verdict, recordings, sound, seed) + ([("stability", survived)] if survived else []),
         next_experiment=_experiment(verdict.next_experiment),
         detectable=[
             {"title": title(name), "size": size_text(name, size)}
