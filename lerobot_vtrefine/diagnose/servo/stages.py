@@ -77,7 +77,8 @@ def _quadratic(now: Now, values: Values) -> Array:
     return _slow(now, values["quadratic_speed"]) * np.where(opposed, lesser, 0.0)
 
 
-_SPEED = Limits(0.01, 30.0, 0.5, "rad/s")
+_SPEED = Limits(0.01, 3.0, 0.5, "rad/s")
+"""Beyond some rad/s, what fades with speed is no longer told from what does not."""
 
 STAGES: list[Stage] = [
     Stage(

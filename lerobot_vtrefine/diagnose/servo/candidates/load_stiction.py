@@ -8,7 +8,6 @@ FORMS = (
         "load_stiction",
         handicap=0.02,  # two numbers more than load_friction
         parameters=("motor_stiction", "carried_stiction", "load_stiction_speed"),
-        contains=("load_friction", "directional_friction"),  # where its speed is beyond all that occur
-        starts=({}, {"load_stiction_speed": 6.0}),
+        starts=({}, {"load_stiction_speed": 4.0}),
     ),
 )

@@ -7,6 +7,6 @@ FORMS = (
         "quadratic_friction",
         handicap=0.02,  # two numbers more than load_friction
         parameters=("quadratic_motor", "quadratic_load", "quadratic_speed"),
-        starts=({}, {"quadratic_speed": 6.0}),
+        starts=({}, {"quadratic_speed": 4.0}),
     ),
 )

@@ -6,6 +6,6 @@ FORMS = (
     Candidate(
         "stribeck_friction",
         parameters=("stiction", "stiction_speed"),
-        starts=({}, {"stiction_speed": 6.0}),
+        starts=({}, {"stiction_speed": 4.0}),
     ),
 )
