@@ -228,15 +228,16 @@ def test_ruff(arguments: list[str]) -> None:
 DIAGNOSE_LAYERS = (
     ("verdict", "evidence", "recordings"),
     ("core",),
-    ("joints", "camera", "pads"),
+    ("joints", "camera", "servo", "pads"),
     ("quality", "report", "episode_replay"),
     ("parts", "calibration"),
     ("dataset",),
     ("api", "predict"),
+    ("stability",),
 )
 DIAGNOSE_RANK = {room: rank for rank, rooms in enumerate(DIAGNOSE_LAYERS) for room in rooms}
 # Causes of one's own are asked for in the catalogues, where a name is not among the listed ones.
-DIAGNOSE_EXCEPTIONS = {("verdict", "pads"), ("verdict", "joints")}
+DIAGNOSE_EXCEPTIONS = {("verdict", "pads"), ("verdict", "joints"), ("verdict", "servo")}
 ALLOWED_IN_CORE = ("lerobot_vtrefine.diagnose.verdict", "lerobot_vtrefine.diagnose.evidence")
 
 

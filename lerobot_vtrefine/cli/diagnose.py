@@ -59,6 +59,14 @@ def make_parser() -> OneLineParser:
     parser.add_argument(
         "--seed", type=int, default=0, help="of resampling and of what is held out (default %(default)s)"
     )
+    parser.add_argument(
+        "--stability",
+        type=int,
+        default=0,
+        metavar="N",
+        help="diagnose 2 N times more, with other recordings held out and with halves of them, and say which "
+        "names survive (default %(default)s)",
+    )
     parser.add_argument("--overwrite", action="store_true", help="replace results that are there already")
     add_format_flags(parser)
     return parser
@@ -70,8 +78,8 @@ def main(arguments: Sequence[str] | None = None) -> None:
     options = make_parser().parse_args(arguments)
     check(options)
     with staged(options.output_dir, FILES, overwrite=options.overwrite) as folder:
-        verdict, unit = run(read(options), folder, options.seed)
-    summarise(verdict, unit, options.output_dir)
+        verdict, unit, survived = run(read(options), folder, options.seed, options.stability)
+    summarise(verdict, unit, options.output_dir, survived)
 
 
 def check(options: argparse.Namespace) -> None:
@@ -81,6 +89,8 @@ def check(options: argparse.Namespace) -> None:
         raise ValueError("give either --recording=DIR, or --dataset.root and/or --dataset.repo_id")
     if options.seed < 0:
         raise ValueError(f"--seed must be at least 0, got {options.seed}")
+    if options.stability < 0:
+        raise ValueError(f"--stability must be at least 0, got {options.stability}")
 
 
 def read(options: argparse.Namespace) -> "RecordingSet":
@@ -94,11 +104,16 @@ def read(options: argparse.Namespace) -> "RecordingSet":
     return read_dataset(options.repo_id, options.root)
 
 
-def run(recordings: "RecordingSet", folder: Path, seed: int) -> tuple["Verdict", str]:
-    """Diagnose, and write all result files into ``folder``; the verdict and its unit of error."""
+def run(
+    recordings: "RecordingSet", folder: Path, seed: int, repetitions: int = 0
+) -> tuple["Verdict", str, str]:
+    """Diagnose, and write all result files into ``folder``; the verdict, its unit of error, and what survives
+    repetitions in one line."""
     from lerobot_vtrefine.cli.report.press_film import press_film
     from lerobot_vtrefine.diagnose.api import diagnose
     from lerobot_vtrefine.diagnose.report import render_report
+    from lerobot_vtrefine.diagnose.report.words import title
+    from lerobot_vtrefine.diagnose.stability import stability
     from lerobot_vtrefine.diagnose.verdict import write_verdict
 
     with tqdm(total=100, bar_format="{desc:<44} {percentage:3.0f} % |{bar}| {elapsed}") as bar:
@@ -108,23 +123,26 @@ def run(recordings: "RecordingSet", folder: Path, seed: int) -> tuple["Verdict",
             bar.update(100.0 * min(done, 1.0) - bar.n)
 
         found = diagnose(recordings, seed, progress)
+    survived = stability(recordings, found, repetitions, seed, diagnose).line(title) if repetitions else ""
     for model, name in zip((found.baseline_model, found.extended_model), FILES[:2], strict=True):
         if model is not None:
             model.save(folder / name)
     film = press_film(found, recordings)
-    page = render_report(found.verdict, found, recordings, found.checked, seed, film)
+    page = render_report(found.verdict, found, recordings, found.checked, seed, film, survived)
     (folder / "report.html").write_text(page, encoding="utf-8")
     write_verdict(found.verdict, folder / "verdict.json")
-    return found.verdict, found.unit
+    return found.verdict, found.unit, survived
 
 
-def summarise(verdict: "Verdict", unit: str, output_dir: Path) -> None:
+def summarise(verdict: "Verdict", unit: str, output_dir: Path, survived: str) -> None:
     """The verdict and where to read about it, in a few lines."""
     from lerobot_vtrefine.diagnose.report.words import headline, power_line
 
     print(f"{verdict.status}: {headline(verdict, unit)}")
     if power := power_line(verdict):
         print(power)
+    if survived:
+        print(f"stability: {survived}")
     if verdict.data_issues:
         aside = sum(issue.action == "set aside" for issue in verdict.data_issues)
         print(f"data issues: {len(verdict.data_issues)}, {aside} recordings set aside")

@@ -3,6 +3,7 @@
 examples:
   vtrefine-import --source=aloha_31_episodes.npz --root=outputs/aloha        the VT-Refine authors' file
   vtrefine-import --source=LEFLEXITAC_DATASET --root=outputs/pads --pads='{primary: left_arm_left_finger}'
+  vtrefine-import --source=bam_xl330.npz --recording_dir=outputs/xl330       BAM's logs of a servo
 """
 
 import logging
@@ -15,11 +16,15 @@ from lerobot.utils.utils import init_logging
 from lerobot_vtrefine.cli.errors import run_cli
 from lerobot_vtrefine.datasets.features import JOINT_SUFFIX
 from lerobot_vtrefine.datasets.importers.aloha_npz import read_aloha_npz
+from lerobot_vtrefine.datasets.importers.bam_logs import is_bam, read_bam, write_bam
 from lerobot_vtrefine.datasets.importers.joint_episodes import write_dataset, write_recording_set
 from lerobot_vtrefine.datasets.importers.leflexitac import import_leflexitac, is_leflexitac
 from lerobot_vtrefine.embodiments import get_embodiment
 
-FORMATS = "the paper authors' .npz of commands and positions, or a LeRobot v3 folder with LeFlexiTac's pads"
+FORMATS = (
+    "the paper authors' .npz of commands and positions, a LeRobot v3 folder with LeFlexiTac's pads, or BAM's "
+    "logs of a servo (.npz, or a folder of .json)"
+)
 
 
 @dataclass
@@ -28,8 +33,8 @@ class ImportConfig:
 
     source: Path
     """File or folder to import; its format is recognised."""
-    root: Path
-    """Folder of the new LeRobotDataset; must not exist."""
+    root: Path | None = None
+    """Folder of the new LeRobotDataset; must not exist. BAM's logs become a recording set only."""
     repo_id: str = "local/imported"
     """LeRobot's name of the new dataset (npz only; a folder's dataset has no name of its own)."""
     fps: int = 10
@@ -37,7 +42,7 @@ class ImportConfig:
     task: str = "insert the plug into the socket"
     """Natural-language task of every frame of the npz."""
     recording_dir: Path | None = None
-    """Also write the npz as a recording set for ``vtrefine-diagnose`` into this new folder."""
+    """New folder for a recording set for ``vtrefine-diagnose``: of BAM's logs, or of the npz as well."""
     pads: dict[str, str] = field(default_factory=dict)
     """New names of a folder's pads, e.g. '{primary: left_arm_left_finger}'; others keep theirs."""
 
@@ -57,14 +62,31 @@ def import_dataset(config: ImportConfig) -> str:
     """
     if not config.source.exists():
         raise FileNotFoundError(f"--source={config.source} does not exist")
+    if is_bam(config.source):
+        return _import_bam(config)
     if config.source.suffix == ".npz" and config.source.is_file():
-        return _import_npz(config)
+        return _import_npz(config, _root(config))
     if config.source.is_dir() and is_leflexitac(config.source):
-        return _import_folder(config)
+        return _import_folder(config, _root(config))
     raise ValueError(f"--source={config.source} is of no format that can be imported: {FORMATS}")
 
 
-def _import_npz(config: ImportConfig) -> str:
+def _root(config: ImportConfig) -> Path:
+    if config.root is None:
+        raise ValueError("give --root=DIR, the folder of the new dataset")
+    return config.root
+
+
+def _import_bam(config: ImportConfig) -> str:
+    if config.root is not None or config.recording_dir is None:
+        raise ValueError("BAM's logs become a recording set: give --recording_dir=DIR, and no --root")
+    runs = read_bam(config.source)
+    write_bam(runs, config.recording_dir)
+    gains = len({run.setting.kp for run in runs})
+    return f"{len(runs)} runs of {runs[0].setting.motor} at {gains} gains -> {config.recording_dir}"
+
+
+def _import_npz(config: ImportConfig, root: Path) -> str:
     if config.pads:
         raise ValueError("--pads has no meaning here: the npz holds no pads")
     episodes = read_aloha_npz(config.source)
@@ -74,20 +96,20 @@ def _import_npz(config: ImportConfig) -> str:
     names = [
         f"{joint}{JOINT_SUFFIX}" for joint in joints
     ]  # as robots record them: lerobot-replay reads these
-    write_dataset(episodes, names, config.root, config.repo_id, config.fps, config.task)
+    write_dataset(episodes, names, root, config.repo_id, config.fps, config.task)
     if config.recording_dir is not None:
         write_recording_set(episodes, joints, config.recording_dir, config.fps)
     frames = sum(len(episode.command) for episode in episodes)
-    return f"{len(episodes)} episodes, {frames} frames, no touch -> {config.root}"
+    return f"{len(episodes)} episodes, {frames} frames, no touch -> {root}"
 
 
-def _import_folder(config: ImportConfig) -> str:
+def _import_folder(config: ImportConfig, root: Path) -> str:
     if config.recording_dir is not None:
         raise ValueError(
             "--recording_dir is for the npz only; vtrefine-diagnose reads the new dataset itself"
         )
-    summary = import_leflexitac(config.source, config.root, config.pads)
-    lines = [f"{summary.episodes} episodes, {summary.frames} frames -> {config.root}"]
+    summary = import_leflexitac(config.source, root, config.pads)
+    lines = [f"{summary.episodes} episodes, {summary.frames} frames -> {root}"]
     if summary.normalised:
         lines.append(f"raw counts recovered for {', '.join(summary.normalised)}")
         lines += [

@@ -20,6 +20,8 @@ from lerobot_vtrefine.diagnose.joints.dataset import read_dataset
 from lerobot_vtrefine.diagnose.joints.model import RobotModel
 from lerobot_vtrefine.diagnose.quality import check_quality, too_little
 from lerobot_vtrefine.diagnose.recordings import RecordingSet, read_recording_set
+from lerobot_vtrefine.diagnose.servo.bench import on_bench
+from lerobot_vtrefine.diagnose.servo.model import ServoModel
 from lerobot_vtrefine.tactile.model import SensorModel
 from lerobot_vtrefine.tactile.stages.contact import KelvinVoigt
 from lerobot_vtrefine.tactile.stages.readout import Gain, Idle, Quantisation
@@ -88,6 +90,10 @@ def _judged(sound: RecordingSet, seed: int, progress: Progress | None) -> Diagno
         from lerobot_vtrefine.diagnose.dataset.engine import diagnose_dataset
 
         return diagnose_dataset(sound, seed, progress)
+    if on_bench(sound):
+        from lerobot_vtrefine.diagnose.servo.engine import diagnose_servo
+
+        return diagnose_servo(sound, seed, progress)
     from lerobot_vtrefine.diagnose.joints.engine import diagnose_robot
 
     return diagnose_robot(sound, seed, progress)
@@ -101,6 +107,8 @@ def _plain(found: Any) -> Diagnosis:
 
 def _unfitted_model(recordings: RecordingSet) -> Savable:
     """What the simulation assumes before anything is fitted, for data that allow no fit."""
+    if on_bench(recordings):
+        return ServoModel.default()
     if recordings.kind == "robot":
         return RobotModel.default(recordings.joints)
     converter = Quantisation(full_scale_counts=recordings.full_scale)

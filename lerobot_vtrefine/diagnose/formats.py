@@ -33,6 +33,8 @@ ROBOT_COLUMNS = {
     "command": "list of commanded positions, one per joint [rad, m for fingers]",
     "position": "list of measured positions, one per joint [rad, m for fingers]",
     "load": "list of measured loads, one per joint, in any unit; optional",
+    "torque_on": "1 while a servo with a described plant drives, 0 while it lets go; optional",
+    "temperature_c": "of such a servo [degrees Celsius]; optional",
 }
 """Columns of a robot's trial, one row per frame."""
 

@@ -11,6 +11,8 @@ import pyarrow.parquet as pq
 from lerobot_vtrefine.diagnose.joints import model as robot_model
 from lerobot_vtrefine.diagnose.prediction import predict_trial
 from lerobot_vtrefine.diagnose.recordings import RecordingSet, RobotTrial, Trial
+from lerobot_vtrefine.diagnose.servo import model as servo_model
+from lerobot_vtrefine.diagnose.servo.bench import on_bench
 from lerobot_vtrefine.files import read_json
 from lerobot_vtrefine.tactile import model as sensor_model
 from lerobot_vtrefine.tactile.layout import PadLayout
@@ -28,8 +30,11 @@ def load_predictor(path: str | Path, recordings: RecordingSet) -> Predict:
     data = read_json(path)
     schema = data.get("schema") if isinstance(data, dict) else None
     wanted = {"pad": sensor_model.SCHEMA, "robot": robot_model.SCHEMA}[recordings.kind]
+    wanted = servo_model.SCHEMA if on_bench(recordings) else wanted
     if schema != wanted:
         raise ValueError(f'{path}: {recordings.kind} recordings need a model of "{wanted}", not {schema!r}')
+    if on_bench(recordings):
+        return servo_model.ServoModel.load(path).predict
     if recordings.kind == "robot":
         robot = robot_model.RobotModel.load(path)
         pairs = zip(_plain_names(robot.names), _plain_names(recordings.joints), strict=False)

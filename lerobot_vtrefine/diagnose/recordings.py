@@ -61,6 +61,25 @@ class _Reading:
 
 
 @dataclass(frozen=True)
+class Pendulum:
+    """A known load: a small mass at the end of a rod that hangs straight down where the position is zero."""
+
+    shape: Literal["pendulum"]
+    mass_kg: float = limits(above=0.0, maximum=1e4)
+    length_m: float = limits(above=0.0, maximum=LARGEST_LENGTH)
+    rod_kg: float = limits(minimum=0.0, maximum=1e4, default=0.0)
+
+
+@dataclass(frozen=True)
+class Servo:
+    """What is known of a servo: a proportional loop that puts a part of its supply on its motor."""
+
+    duty_per_rad: float = limits(above=0.0, maximum=1e6)
+    supply_v: float = limits(above=0.0, maximum=1e4)
+    max_duty: float = limits(above=0.0, maximum=1.0, default=1.0)
+
+
+@dataclass(frozen=True)
 class Entry:
     """One trial as the header lists it."""
 
@@ -70,6 +89,8 @@ class Entry:
     order: int | None = limits(maximum=1e9, default=None)
     start_s: float = 0.0
     object: dict[str, Any] | None = None
+    plant: Pendulum | None = None
+    servo: Servo | None = None
 
 
 @dataclass(frozen=True)
@@ -83,6 +104,8 @@ class Header:
     reading: _Reading | None = None
     object: dict[str, Any] | None = None
     joints: tuple[str, ...] | None = None
+    plant: Pendulum | None = None
+    servo: Servo | None = None
 
     def __post_init__(self) -> None:
         if not self.trials:
@@ -138,6 +161,13 @@ class RobotTrial:
     command: np.ndarray
     position: np.ndarray
     load: np.ndarray | None
+    plant: Pendulum | None = None
+    """The load that a single servo swings."""
+    servo: Servo | None = None
+    torque_on: np.ndarray | None = None
+    """(N,) 1 where the servo drives, 0 where it lets go."""
+    temperature_c: np.ndarray | None = None
+    """(N,) of the servo."""
 
 
 @dataclass(frozen=True)
@@ -185,7 +215,7 @@ def read_recording_set(path: str | Path, *, measured: bool = True) -> RecordingS
             spec = header.object if entry.object is None else entry.object
             trials.append(_pad_trial(table, spec, rows * cols if measured else 0))
         else:
-            trial = _robot_trial(table, len(joints))
+            trial = _robot_trial(table, len(joints), entry.plant or header.plant, entry.servo or header.servo)
             first = np.repeat(trial.position[:1], len(trial.position), axis=0)
             trials.append(trial if measured else replace(trial, position=first))
     return RecordingSet(folder, header.kind, rows, cols, pitch_m, unit, full_scale, joints, tuple(trials))
@@ -345,10 +375,14 @@ def _pad_trial(table: _Table, spec: Any, taxels: int) -> Trial:
     )
 
 
-def _robot_trial(table: _Table, joints: int) -> RobotTrial:
+def _robot_trial(table: _Table, joints: int, plant: Pendulum | None, servo: Servo | None) -> RobotTrial:
     return RobotTrial(
         **table.meta(),
         command=table.rows("command", joints),
         position=table.rows("position", joints),
         load=table.rows("load", joints) if table.has("load") else None,
+        plant=plant,
+        servo=servo,
+        torque_on=table.optional("torque_on") if plant else None,
+        temperature_c=table.optional("temperature_c") if plant else None,
     )

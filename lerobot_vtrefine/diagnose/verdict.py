@@ -46,8 +46,19 @@ ROBOT_CAUSES = (
     "gravity_sag",
     "gripper_compliance",
 )
+SERVO_CAUSES = (
+    "load_friction",
+    "directional_friction",
+    "stribeck_friction",
+    "load_stiction",
+    "quadratic_friction",
+    "supply_sag",
+    "motor_heating",
+    "voltage_limit",
+)
+"""Of a single servo with a known load, beside `backlash` and `control_latency`."""
 SCENE_CAUSES = ("camera_extrinsics", "depth_scale", "object_mass", "object_friction", "clearance")
-CAUSES = SENSOR_CAUSES + ROBOT_CAUSES + SCENE_CAUSES
+CAUSES = SENSOR_CAUSES + ROBOT_CAUSES + SERVO_CAUSES + SCENE_CAUSES
 """Every name that docs/verdict.md lists; a verdict may give those of the catalogue's other files too."""
 
 
@@ -287,8 +298,9 @@ def _own_causes() -> tuple[str, ...]:
     """Causes that somebody added to a catalogue, which needs the simulator's stages."""
     from lerobot_vtrefine.diagnose.candidates import CATALOGUE
     from lerobot_vtrefine.diagnose.joints.candidates import NAMES
+    from lerobot_vtrefine.diagnose.servo.candidates import NAMES as SERVO_NAMES
 
-    return (*(form.family for form in CATALOGUE), *NAMES)
+    return (*(form.family for form in CATALOGUE), *NAMES, *SERVO_NAMES)
 
 
 def _check_consistent(verdict: Verdict) -> None:

@@ -91,6 +91,14 @@ def test_too_little_sound_data_is_a_verdict_and_no_error(tmp_path, engine, capsy
     assert predict.main(arguments) == 0
 
 
+def test_stability_is_told_in_one_line_and_in_the_report(tmp_path, engine, capsys):
+    folder = write_set(tmp_path / "set", *make_set())
+    assert run(folder, tmp_path / "out", "--stability=2") == 0
+    line = "of 2 other draws and 2 halves: taxel gain spread 2 and 2; hysteresis 2 and 2 (explained 4)"
+    assert f"stability: {line}" in capsys.readouterr().out
+    assert line in (tmp_path / "out" / "report.html").read_text()
+
+
 def test_robot_sets(tmp_path, engine):
     engine["answer"] = robot_diagnosis()
     assert run(write_set(tmp_path / "set", *make_robot_set()), tmp_path / "out") == 0

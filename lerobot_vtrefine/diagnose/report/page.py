@@ -30,6 +30,7 @@ from lerobot_vtrefine.diagnose.report.words import (
     ties,
     title,
 )
+from lerobot_vtrefine.diagnose.servo.bench import on_bench
 from lerobot_vtrefine.diagnose.verdict import Parameter, Verdict
 from lerobot_vtrefine.pages.pads import colour_scale, pad_image
 from lerobot_vtrefine.pages.render import render
@@ -53,6 +54,7 @@ def render_report(
     sound: int,
     seed: int,
     film: dict[str, str] | None = None,
+    survived: str = "",
 ) -> str:
     """The page as HTML text.
 
@@ -61,6 +63,7 @@ def render_report(
         recordings: as they were read, before quality control.
         sound: number of trials that passed it.
         film: a press in motion: its source, caption and colour scale.
+        survived: which names other draws and halves of the recordings give, in one line.
     """
     unit = diagnosis.unit if diagnosis is not None else "counts"
     of_pad = recordings.kind == "pad"
@@ -76,7 +79,7 @@ def render_report(
         title=title,
         ties=ties(verdict),
         doubts=doubts(verdict, len(recordings.trials), sound),
-        facts=_facts(verdict, recordings, sound, seed),
+        facts=_facts(verdict, recordings, sound, seed) + ([("stability", survived)] if survived else []),
         next_experiment=_experiment(verdict.next_experiment),
         detectable=[
             {"title": title(name), "size": size_text(name, size)}
@@ -101,9 +104,12 @@ def _use(verdict: Verdict, recordings: RecordingSet) -> dict[str, str] | None:
         said += " Its names are not settled, so check first that it predicts other recordings better."
     else:
         said += " Record, fine-tune and evaluate with it, and predict other recordings to see that it holds."
-    lines = [
+    in_simulation = [
         f"vtrefine-record-demos {task} --root=outputs/demos {flag}=sensor_model.json",
         f"vtrefine-finetune {task} --policy.path=CHECKPOINT {flag}=sensor_model.json",
+    ]
+    lines = [
+        *(() if on_bench(recordings) else in_simulation),
         "vtrefine-predict --recording=OTHERS --sensor_model=sensor_model.json --output_dir=predicted",
     ]
     return {"words": said, "commands": "\n".join(lines)}
@@ -163,6 +169,8 @@ def _facts(verdict: Verdict, recordings: RecordingSet, sound: int, seed: int) ->
         what = (
             f"pad of {recordings.rows} × {recordings.cols} taxels, {quantity(recordings.pitch_m, 'm')} apart"
         )
+    elif on_bench(recordings):
+        what = f"servo {recordings.joints[0]} with a pendulum"
     else:
         what = f"robot with {len(recordings.joints)} joints"
     seconds = sum(float(np.ptp(t.time_s[np.isfinite(t.time_s)])) for t in recordings.trials if len(t.time_s))

@@ -90,6 +90,45 @@ MEANINGS = {
         "compliance",
         "m/N",
     ),
+    "load_friction": Meaning(
+        "load friction", "Friction grows with the torque that the gears carry.", "part of the load", "1"
+    ),
+    "directional_friction": Meaning(
+        "directional friction",
+        "Friction grows with the load, and otherwise when the motor drives it than when it drives the motor.",
+        "part of the motor's torque",
+        "1",
+    ),
+    "stribeck_friction": Meaning(
+        "Stribeck friction", "At rest and at low speed friction is larger than in motion.", "stiction", "N*m"
+    ),
+    "load_stiction": Meaning(
+        "load stiction",
+        "The torque that the gears carry holds them at rest and at low speed.",
+        "part of the motor's torque",
+        "1",
+    ),
+    "quadratic_friction": Meaning(
+        "quadratic friction", "Friction grows with the square of the load.", "coefficient", "1/(N*m)"
+    ),
+    "supply_sag": Meaning(
+        "supply sag",
+        "The more the drive puts on the motor, the more of it is lost in the supply.",
+        "resistance over the winding's",
+        "1",
+    ),
+    "motor_heating": Meaning(
+        "motor heating",
+        "The winding's resistance changes with its temperature.",
+        "change per kelvin",
+        "1/K",
+    ),
+    "voltage_limit": Meaning(
+        "voltage limit",
+        "The drive puts less of its supply on the motor than it should.",
+        "missing part",
+        "1",
+    ),
     "camera_extrinsics": Meaning(
         "camera extrinsics", "The camera does not stand where the simulation puts it.", "displacement", "m"
     ),
@@ -135,8 +174,10 @@ def meaning(name: str) -> Meaning:
         return MEANINGS[name]
     from lerobot_vtrefine.diagnose import candidates
     from lerobot_vtrefine.diagnose.joints import candidates as joint_candidates
+    from lerobot_vtrefine.diagnose.servo import candidates as servo_candidates
 
-    text = candidates.MEANING.get(name, "") or joint_candidates.MEANING.get(name, "")
+    catalogues = (candidates, joint_candidates, servo_candidates)
+    text = next((item.MEANING[name] for item in catalogues if item.MEANING.get(name)), "")
     return Meaning(title(name), text[:1].upper() + text[1:], "size", "1")
 
 

@@ -1,0 +1,18 @@
+"""The diagnosis of a servo with a known load: its trials in, what the core's method finds in them out."""
+
+from lerobot_vtrefine.diagnose.core.diagnosis import Diagnosis
+from lerobot_vtrefine.diagnose.core.engine import Progress, infer
+from lerobot_vtrefine.diagnose.core.telling import tell
+from lerobot_vtrefine.diagnose.recordings import RecordingSet
+from lerobot_vtrefine.diagnose.servo.account import ServoAccount
+from lerobot_vtrefine.diagnose.servo.bench import Bench
+from lerobot_vtrefine.diagnose.servo.problem import ServoProblem
+
+
+def diagnose_servo(recordings: RecordingSet, seed: int = 0, progress: Progress | None = None) -> Diagnosis:
+    """Find what a motor with Coulomb and viscous friction gets wrong about a servo.
+
+    Raises ValueError where a trial lacks its load or gain, or its commands or times are not finite.
+    """
+    found = infer(ServoProblem.of(Bench.of(recordings)), seed, progress)
+    return tell(found, ServoAccount(found))

@@ -1,0 +1,73 @@
+"""What was found about a servo, as a file, and what it predicts."""
+
+import json
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Literal
+
+import numpy as np
+
+from lerobot_vtrefine.diagnose.recordings import RecordingSet, RobotTrial
+from lerobot_vtrefine.diagnose.servo.bench import Bench
+from lerobot_vtrefine.diagnose.servo.parameters import INDEX, LIMITS, PARAMETERS
+from lerobot_vtrefine.diagnose.servo.simulation import simulate
+from lerobot_vtrefine.diagnose.verdict import write_atomically
+from lerobot_vtrefine.files import decode, read_json
+
+SCHEMA = "vtrefine/servo-model@1"
+
+
+@dataclass(frozen=True)
+class _ServoFile:
+    schema: Literal["vtrefine/servo-model@1"]
+    parameters: dict[str, float]
+
+
+@dataclass(frozen=True)
+class ServoModel:
+    """Values of the parameters that are not zero; logarithms as such."""
+
+    parameters: Mapping[str, float]
+
+    @classmethod
+    def default(cls) -> "ServoModel":
+        """A small servo that nothing was fitted to."""
+        return cls({name: LIMITS[name].start for name in PARAMETERS[:3]})
+
+    @classmethod
+    def of(cls, theta: np.ndarray) -> "ServoModel":
+        """From parameters (P,)."""
+        return cls({name: float(theta[place]) for name, place in INDEX.items() if theta[place]})
+
+    @property
+    def theta(self) -> np.ndarray:
+        """(P,)"""
+        return np.array([self.parameters.get(name, 0.0) for name in PARAMETERS])
+
+    def predict(self, trial: RobotTrial) -> np.ndarray:
+        """Positions (N, 1) of a trial from its commands and first position; ValueError without its load."""
+        hidden = RobotTrial(**{**vars(trial), "position": trial.position[:1].repeat(len(trial.time_s), 0)})
+        alone = RecordingSet(Path(), "robot", 0, 0, 0.0, "rad", 0.0, ("servo",), (hidden,))
+        return simulate(Bench.of(alone), self.theta[None])[:, 0]
+
+    def to_dict(self) -> dict[str, Any]:
+        """JSON-ready form."""
+        return {"schema": SCHEMA, "parameters": dict(self.parameters)}
+
+    def save(self, path: str | Path) -> None:
+        """Write the file, whole or not at all."""
+        write_atomically(path, json.dumps(self.to_dict(), indent=2, allow_nan=False) + "\n")
+
+    @classmethod
+    def load(cls, path: str | Path) -> "ServoModel":
+        """Read the file; ValueError names it and what is wrong with it."""
+        try:
+            content = decode(_ServoFile, read_json(path), "servo model")
+            if unknown := sorted(set(content.parameters) - set(PARAMETERS)):
+                raise ValueError(
+                    f"servo model has no parameter {unknown[0][:60]!r}; valid: {', '.join(PARAMETERS)}"
+                )
+        except ValueError as error:
+            raise ValueError(f"{path}: {error}") from error
+        return cls(content.parameters)

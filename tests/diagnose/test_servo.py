@@ -1,0 +1,211 @@
+"""A servo with a known load: its simulation against analytic truth and other code, and the verdicts."""
+
+import json
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from servo_rig import (
+    ARMATURE,
+    COULOMB,
+    FPS,
+    GAINS,
+    KT,
+    LENGTH_M,
+    MASS_KG,
+    OHM,
+    VISCOUS,
+    Law,
+    commands,
+    make_set,
+    plain,
+    swing,
+)
+
+from lerobot_vtrefine.cli.predict import main as predict
+from lerobot_vtrefine.diagnose.api import diagnose
+from lerobot_vtrefine.diagnose.recordings import read_recording_set
+from lerobot_vtrefine.diagnose.servo import candidates
+from lerobot_vtrefine.diagnose.servo.bench import Bench
+from lerobot_vtrefine.diagnose.servo.model import ServoModel
+from lerobot_vtrefine.diagnose.servo.parameters import INDEX
+from lerobot_vtrefine.diagnose.servo.simulation import simulate
+from lerobot_vtrefine.diagnose.verdict import SERVO_CAUSES
+
+Array = np.ndarray
+WEIGHT = MASS_KG * 9.80665 * LENGTH_M
+INERTIA = MASS_KG * LENGTH_M**2 + ARMATURE
+TRUTH = {
+    "log_torque": np.log(KT),
+    "log_resistance": np.log(OHM),
+    "log_armature": np.log(ARMATURE),
+    "coulomb": COULOMB,
+    "viscous": VISCOUS,
+}
+
+
+def bench_of(command: Array, gain: Array, first: Array, on: float = 1.0, fps: float = FPS) -> Bench:
+    count, trials = command.shape
+    ones = np.ones(trials)
+    return Bench(
+        time_s=np.repeat(np.arange(count)[:, None] / fps, trials, 1),
+        command=command,
+        position=np.repeat(first[None], count, 0),
+        torque_on=np.full(command.shape, on),
+        temperature_c=np.full(command.shape, 25.0),
+        valid=np.ones(command.shape, dtype=bool),
+        inertia=ones * MASS_KG * LENGTH_M**2,
+        weight=ones * WEIGHT,
+        duty_per_rad=gain,
+        supply_v=ones * 7.4,
+        max_duty=ones,
+        files=tuple(map(str, range(trials))),
+        recorded=tuple(map(str, range(trials))),
+    )
+
+
+def theta(**values: float) -> Array:
+    out = np.zeros(len(INDEX))
+    for name, value in (TRUTH | values).items():
+        out[INDEX[name]] = value
+    return out
+
+
+def released(angle: float, **values: float) -> tuple[Array, Array]:
+    """Times and positions of a shaft that is let go at an angle."""
+    bench = bench_of(np.zeros((2000, 1)), np.ones(1), np.array([angle]), on=0.0, fps=1000.0)
+    return bench.time_s[:, 0], simulate(bench, theta(**values)[None])[:, 0, 0]
+
+
+def test_a_free_pendulum_has_its_period() -> None:
+    time_s, q = released(0.05, coulomb=0.0, viscous=0.0)
+    crossing = time_s[1:][np.diff(np.sign(q)) != 0]
+    assert 2 * np.diff(crossing).mean() == pytest.approx(2 * np.pi * np.sqrt(INERTIA / WEIGHT), rel=5e-3)
+
+
+def test_coulomb_friction_takes_the_same_off_every_half_swing() -> None:
+    _, q = released(0.15, coulomb=0.005, viscous=0.0)
+    turns = np.flatnonzero(np.diff(np.sign(np.diff(q))) != 0) + 1
+    height = np.abs(np.r_[q[0], q[turns]])
+    lost = -np.diff(height)[: int(0.15 / (2 * 0.005 / WEIGHT)) - 1]
+    assert lost == pytest.approx(2 * 0.005 / WEIGHT, rel=0.05)
+
+
+def test_a_servo_comes_to_rest_where_motor_and_load_balance_within_friction() -> None:
+    gain = np.array(GAINS)
+    bench = bench_of(np.full((600, 3), 0.8), gain, np.zeros(3))
+    q = simulate(bench, theta()[None])[-1, 0]
+    left = KT * gain * (0.8 - q) * 7.4 / OHM - WEIGHT * np.sin(q)
+    assert (np.abs(left) <= COULOMB * 1.001).all()
+
+
+def at_rest(speed: Array, at: float) -> Array:
+    return np.exp(-np.abs(speed) / at)
+
+
+LAWS: dict[str, tuple[dict[str, float], Law]] = {
+    "M1": ({}, plain),
+    "M2": (
+        {"stiction": 0.06, "stiction_speed": 0.4},
+        lambda motor, load, v: plain(motor, load, v) + 0.06 * at_rest(v, 0.4),
+    ),
+    "M3": ({"load_friction": 0.2}, lambda motor, load, v: plain(motor, load, v) + 0.2 * np.abs(motor - load)),
+    "M5": (
+        {
+            "motor_friction": 0.4,
+            "carried_friction": 0.1,
+            "motor_stiction": 0.1,
+            "carried_stiction": 0.2,
+            "load_stiction_speed": 1.0,
+        },
+        lambda motor, load, v: (
+            plain(motor, load, v)
+            + np.abs(0.4 * motor - 0.1 * load)
+            + at_rest(v, 1.0) * np.abs(0.1 * motor - 0.2 * load)
+        ),
+    ),
+    "M6": (
+        {"quadratic_motor": 0.5, "quadratic_load": 0.8, "quadratic_speed": 2.0},
+        lambda motor, load, v: (
+            plain(motor, load, v)
+            + at_rest(v, 2.0)
+            * np.where(np.abs(motor) > np.abs(load), 0.8 * load**2, 0.5 * motor**2)
+            * (motor * load < 0)
+        ),
+    ),
+}
+
+
+@pytest.mark.parametrize("name", LAWS)
+def test_laws_of_friction_are_those_of_the_paper(name: str) -> None:
+    values, law = LAWS[name]
+    gain, command = np.array(GAINS), commands(3, np.random.default_rng(3))
+    ours = simulate(bench_of(command, gain, np.zeros(3)), theta(**values)[None])[:, 0]
+    error, effect = (np.sqrt(np.mean((ours - swing(command, gain, item)) ** 2)) for item in (law, plain))
+    assert error < 0.005
+    assert not values or error < 0.2 * effect
+
+
+def test_every_file_of_the_servos_catalogue_is_asked_about() -> None:
+    folder = Path(candidates.__file__).parent
+    files = {path.stem for path in folder.glob("*.py")} - {"__init__", "base"}
+    assert set(candidates.NAMES) == files == {*SERVO_CAUSES, "backlash", "control_latency"}
+    assert {item.cause for item in candidates.CATALOGUE} == files
+    assert all(candidates.MEANING[name] for name in files)
+
+
+def test_a_model_is_read_back_and_predicts_from_the_first_position_alone(tmp_path: Path) -> None:
+    folder = make_set(tmp_path / "set", plain, trials=3)
+    model = ServoModel.of(theta(load_friction=0.1))
+    model.save(tmp_path / "model.json")
+    assert ServoModel.load(tmp_path / "model.json") == model
+    predict(
+        [f"--recording={folder}", f"--sensor_model={tmp_path}/model.json", f"--output_dir={tmp_path}/out"]
+    )
+    assert len(list((tmp_path / "out").glob("*.parquet"))) == 3
+    trial = read_recording_set(folder).trials[1]
+    other = replace(trial, position=np.r_[trial.position[:1], 0 * trial.position[1:]])
+    assert (model.predict(trial) == model.predict(other)).all()
+    data = json.loads((tmp_path / "model.json").read_text())
+    data["parameters"]["weather"] = 1.0
+    (tmp_path / "model.json").write_text(json.dumps(data))
+    with pytest.raises(ValueError, match=r"model\.json: servo model has no parameter 'weather'"):
+        ServoModel.load(tmp_path / "model.json")
+
+
+def test_a_trial_without_its_servo_is_named(tmp_path: Path) -> None:
+    folder = make_set(tmp_path / "set", plain, trials=3)
+    header = json.loads((folder / "recording.json").read_text())
+    del header["trials"][2]["servo"]
+    (folder / "recording.json").write_text(json.dumps(header))
+    with pytest.raises(ValueError, match=r"trial_0002\.parquet: a servo with a known load needs"):
+        Bench.of(read_recording_set(folder))
+
+
+@pytest.mark.slow
+def test_what_only_coulomb_and_viscous_friction_hold_back_is_adequate(tmp_path: Path) -> None:
+    found = diagnose(make_set(tmp_path / "set", plain))
+    assert found.status == "adequate"
+    assert found.heldout is not None
+    assert found.heldout.extended < 5e-3
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("cause", "parameter", "size", "law"),
+    [
+        ("load_friction", "load_friction", 0.2, LAWS["M3"][1]),
+        ("stribeck_friction", "stiction", 0.06, lambda m, q, v: plain(m, q, v) + 0.06 * at_rest(v, 0.4)),
+    ],
+)
+def test_a_hidden_law_is_named_and_sized(
+    tmp_path: Path, cause: str, parameter: str, size: float, law: Law
+) -> None:
+    found = diagnose(make_set(tmp_path / "set", law))
+    assert found.heldout is not None
+    assert found.heldout.gain > 0.8
+    named = {item.name: item for item in found.causes}
+    assert cause in named
+    value = named[cause].params[parameter]
+    assert value.value == pytest.approx(size, rel=0.3)
