@@ -10,7 +10,7 @@ import sys
 import time
 from pathlib import Path
 
-from lerobot_vtrefine.diagnose.pad_engine import diagnose_pad
+from lerobot_vtrefine.diagnose.pad.engine import diagnose_pad
 from lerobot_vtrefine.diagnose.quality import check_quality
 
 sys.path.insert(0, str(Path(__file__).parents[1] / "tests" / "diagnose"))

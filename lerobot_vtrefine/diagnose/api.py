@@ -81,7 +81,7 @@ def read_recordings(source: str | Path | Rooted) -> RecordingSet:
 def _judged(sound: RecordingSet, seed: int, progress: Progress | None) -> Diagnosis:
     """By the instrument that the recordings are of."""
     if sound.kind == "pad":
-        from lerobot_vtrefine.diagnose.pad_engine import diagnose_pad
+        from lerobot_vtrefine.diagnose.pad.engine import diagnose_pad
 
         return _plain(diagnose_pad(sound, seed=seed, progress=progress))
     if (sound.path / "meta" / "info.json").is_file():

@@ -8,14 +8,14 @@ import numpy as np
 import pytest
 from test_engine_pad import COLS, ROWS, heights, linear, one_trial
 
-from lerobot_vtrefine.diagnose import alarms
-from lerobot_vtrefine.diagnose.alarms import Correlations, cleaned, left_over, pairs_alarm
-from lerobot_vtrefine.diagnose.baseline import Baseline, fit_baseline
-from lerobot_vtrefine.diagnose.beside import beside_alarm, taxel_alarm
-from lerobot_vtrefine.diagnose.presses import PressSet, prepare
+from lerobot_vtrefine.diagnose.pad import alarms
+from lerobot_vtrefine.diagnose.pad.alarms import Correlations, cleaned, left_over, pairs_alarm
+from lerobot_vtrefine.diagnose.pad.baseline import Baseline, fit_baseline
+from lerobot_vtrefine.diagnose.pad.local_errors import beside_alarm, taxel_alarm
+from lerobot_vtrefine.diagnose.pad.press_trials import PressSet, prepare
+from lerobot_vtrefine.diagnose.pad.search import start_search
+from lerobot_vtrefine.diagnose.pad.suspicions import describe_residual
 from lerobot_vtrefine.diagnose.recordings import RecordingSet, Trial
-from lerobot_vtrefine.diagnose.search import start_search
-from lerobot_vtrefine.diagnose.unknowns import describe_residual
 
 COUNT = 16
 

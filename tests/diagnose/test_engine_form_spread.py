@@ -3,8 +3,8 @@
 import pytest
 from jittered_rig import EFFECTS, Rig
 
-from lerobot_vtrefine.diagnose.naming import with_form_spread
-from lerobot_vtrefine.diagnose.pad_engine import diagnose_pad
+from lerobot_vtrefine.diagnose.pad.account import with_form_spread
+from lerobot_vtrefine.diagnose.pad.engine import diagnose_pad
 from lerobot_vtrefine.diagnose.verdict import Parameter
 
 

@@ -6,10 +6,10 @@ from pathlib import Path
 import numpy as np
 from test_engine_pad import COLS, ROWS, linear, one_trial
 
-from lerobot_vtrefine.diagnose.alarms import Alarm
-from lerobot_vtrefine.diagnose.baseline import fit_baseline
-from lerobot_vtrefine.diagnose.gain_course import course_alarm, own_gains
-from lerobot_vtrefine.diagnose.presses import prepare
+from lerobot_vtrefine.diagnose.pad.alarms import Alarm
+from lerobot_vtrefine.diagnose.pad.baseline import fit_baseline
+from lerobot_vtrefine.diagnose.pad.gain_drift import course_alarm, own_gains
+from lerobot_vtrefine.diagnose.pad.press_trials import prepare
 from lerobot_vtrefine.diagnose.recordings import RecordingSet
 
 COUNT = 16

@@ -8,11 +8,11 @@ from scipy.signal import lfilter
 from test_engine_forward import trial
 from test_engine_pad import COLS, ROWS, linear, one_trial
 
-from lerobot_vtrefine.diagnose.baseline import describe
-from lerobot_vtrefine.diagnose.composite import Composite
-from lerobot_vtrefine.diagnose.idle import settled_idle
-from lerobot_vtrefine.diagnose.pad_engine import diagnose_pad
-from lerobot_vtrefine.diagnose.presses import prepare
+from lerobot_vtrefine.diagnose.pad.baseline import describe
+from lerobot_vtrefine.diagnose.pad.engine import diagnose_pad
+from lerobot_vtrefine.diagnose.pad.idle_level import settled_idle
+from lerobot_vtrefine.diagnose.pad.model import Composite
+from lerobot_vtrefine.diagnose.pad.press_trials import prepare
 from lerobot_vtrefine.diagnose.recordings import RecordingSet
 
 TRUE_IDLE = 20.0

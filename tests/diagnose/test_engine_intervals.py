@@ -8,15 +8,15 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from lerobot_vtrefine.diagnose import intervals
-from lerobot_vtrefine.diagnose.candidates.base import Form, Setting, Value
-from lerobot_vtrefine.diagnose.candidates.baseline_drift import FORMS as DRIFTS
-from lerobot_vtrefine.diagnose.candidates.sample_and_hold import undecided
-from lerobot_vtrefine.diagnose.intervals import LeftOut, _possible, _reporter
-from lerobot_vtrefine.diagnose.presses import prepare
+from lerobot_vtrefine.diagnose.pad import intervals
+from lerobot_vtrefine.diagnose.pad.candidates.base import Form, Setting, Value
+from lerobot_vtrefine.diagnose.pad.candidates.baseline_drift import FORMS as DRIFTS
+from lerobot_vtrefine.diagnose.pad.candidates.sample_and_hold import undecided
+from lerobot_vtrefine.diagnose.pad.intervals import LeftOut, _possible, _reporter
+from lerobot_vtrefine.diagnose.pad.motion import instants_of, motion
+from lerobot_vtrefine.diagnose.pad.press_trials import prepare
+from lerobot_vtrefine.diagnose.pad.whitening import Whitener
 from lerobot_vtrefine.diagnose.recordings import RecordingSet, Trial
-from lerobot_vtrefine.diagnose.refinement import instants_of, motion
-from lerobot_vtrefine.diagnose.whitening import Whitener
 from lerobot_vtrefine.tactile.layout import PadLayout
 
 

@@ -4,12 +4,12 @@ import numpy as np
 import pytest
 from jittered_rig import EFFECTS, Rig
 
-from lerobot_vtrefine.diagnose.baseline import fit_baseline
-from lerobot_vtrefine.diagnose.fitting import movable
-from lerobot_vtrefine.diagnose.pad_engine import diagnose_pad
-from lerobot_vtrefine.diagnose.presses import prepare
-from lerobot_vtrefine.diagnose.screening import screen
-from lerobot_vtrefine.diagnose.search import all_probes, start_search
+from lerobot_vtrefine.diagnose.pad.baseline import fit_baseline
+from lerobot_vtrefine.diagnose.pad.engine import diagnose_pad
+from lerobot_vtrefine.diagnose.pad.fitting import movable
+from lerobot_vtrefine.diagnose.pad.press_trials import prepare
+from lerobot_vtrefine.diagnose.pad.score_test import screen
+from lerobot_vtrefine.diagnose.pad.search import all_probes, start_search
 
 
 def recorded(name: str, gain: float, seed: int):

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 import lerobot_vtrefine.diagnose as package
-from lerobot_vtrefine.diagnose.screening import ALPHA, Probe, screen
+from lerobot_vtrefine.diagnose.pad.score_test import ALPHA, Probe, screen
 from lerobot_vtrefine.diagnose.verdict import Cause
 
 PAD_FILES = sorted(Path(package.__file__).parent.glob("*.py"))

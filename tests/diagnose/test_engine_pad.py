@@ -5,8 +5,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from lerobot_vtrefine.diagnose.pad_engine import PadDiagnosis, diagnose_pad, not_worse
-from lerobot_vtrefine.diagnose.presses import prepare
+from lerobot_vtrefine.diagnose.pad.engine import PadDiagnosis, diagnose_pad, not_worse
+from lerobot_vtrefine.diagnose.pad.press_trials import prepare
 from lerobot_vtrefine.diagnose.recordings import RecordingSet, Trial
 
 ROWS, COLS, PITCH, RADIUS = 3, 4, 0.002, 0.01

@@ -7,16 +7,16 @@ import pytest
 from jittered_rig import Rig
 from test_engine_pad import linear, recordings
 
-from lerobot_vtrefine.diagnose.baseline import fit_baseline
-from lerobot_vtrefine.diagnose.candidates import CATALOGUE
-from lerobot_vtrefine.diagnose.detectable import Power, power_of
 from lerobot_vtrefine.diagnose.evidence import not_tested
-from lerobot_vtrefine.diagnose.pad_engine import diagnose_pad
-from lerobot_vtrefine.diagnose.presses import prepare
+from lerobot_vtrefine.diagnose.pad.baseline import fit_baseline
+from lerobot_vtrefine.diagnose.pad.candidates import CATALOGUE
+from lerobot_vtrefine.diagnose.pad.detectable import Power, power_of
+from lerobot_vtrefine.diagnose.pad.engine import diagnose_pad
+from lerobot_vtrefine.diagnose.pad.press_trials import prepare
+from lerobot_vtrefine.diagnose.pad.search import start_search
+from lerobot_vtrefine.diagnose.pad.selection import MAPS
 from lerobot_vtrefine.diagnose.recordings import RecordingSet
 from lerobot_vtrefine.diagnose.report.words import headline, power_line
-from lerobot_vtrefine.diagnose.search import start_search
-from lerobot_vtrefine.diagnose.selection import MAPS
 from lerobot_vtrefine.diagnose.verdict import Verdict
 
 FAMILIES = {form.family for form in CATALOGUE} | set(MAPS)

@@ -5,11 +5,11 @@ from dataclasses import replace
 import numpy as np
 from test_engine_forward import composite, presses
 
-from lerobot_vtrefine.diagnose.baseline import plain_weights
-from lerobot_vtrefine.diagnose.fitting import predict
-from lerobot_vtrefine.diagnose.presses import PressSet
-from lerobot_vtrefine.diagnose.search import Search
-from lerobot_vtrefine.diagnose.selection import settle
+from lerobot_vtrefine.diagnose.pad.baseline import plain_weights
+from lerobot_vtrefine.diagnose.pad.fitting import predict
+from lerobot_vtrefine.diagnose.pad.press_trials import PressSet
+from lerobot_vtrefine.diagnose.pad.search import Search
+from lerobot_vtrefine.diagnose.pad.selection import settle
 
 
 def uneven_pad() -> PressSet:

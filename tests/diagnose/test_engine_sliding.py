@@ -4,7 +4,7 @@ from types import SimpleNamespace
 
 import numpy as np
 
-from lerobot_vtrefine.diagnose.sliding import sliding_alarm
+from lerobot_vtrefine.diagnose.pad.sliding import sliding_alarm
 
 
 def alarm_of(sliding: list[float], standing: list[float], share: list[float]):

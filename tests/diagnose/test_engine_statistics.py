@@ -4,10 +4,10 @@ import numpy as np
 import pytest
 
 from lerobot_vtrefine.diagnose.core.heldout import lock
-from lerobot_vtrefine.diagnose.crossvalidation import paired_p
-from lerobot_vtrefine.diagnose.noise import Noise
-from lerobot_vtrefine.diagnose.screening import Probe, cleared, screen
-from lerobot_vtrefine.diagnose.weights import build_weights
+from lerobot_vtrefine.diagnose.pad.crossvalidation import paired_p
+from lerobot_vtrefine.diagnose.pad.noise import Noise
+from lerobot_vtrefine.diagnose.pad.score_test import Probe, cleared, screen
+from lerobot_vtrefine.diagnose.pad.weights import build_weights
 
 
 def probe(name: str, scores: np.ndarray, one_sided: bool = False) -> Probe:

@@ -5,8 +5,9 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from lerobot_vtrefine.diagnose import pad_engine, selection
-from lerobot_vtrefine.diagnose.crossvalidation import Score
+from lerobot_vtrefine.diagnose.pad import engine as pad_engine
+from lerobot_vtrefine.diagnose.pad import selection
+from lerobot_vtrefine.diagnose.pad.crossvalidation import Score
 
 BASELINE = np.full(9, 10.0)
 LUCKY = np.array([15.0, 11, -2, 14, -16, -5, -16, 9, 0])

@@ -6,12 +6,12 @@ from pathlib import Path
 import numpy as np
 from test_engine_pad import COLS, ROWS, linear, one_trial
 
-from lerobot_vtrefine.diagnose.baseline import fit_baseline
-from lerobot_vtrefine.diagnose.candidates.base import Setting
-from lerobot_vtrefine.diagnose.candidates.baseline_drift import CURVE, FORMS, WANDERING
-from lerobot_vtrefine.diagnose.presses import prepare
+from lerobot_vtrefine.diagnose.pad.baseline import fit_baseline
+from lerobot_vtrefine.diagnose.pad.candidates.base import Setting
+from lerobot_vtrefine.diagnose.pad.candidates.baseline_drift import CURVE, FORMS, WANDERING
+from lerobot_vtrefine.diagnose.pad.idle_drift import wander_probe
+from lerobot_vtrefine.diagnose.pad.press_trials import prepare
 from lerobot_vtrefine.diagnose.recordings import RecordingSet
-from lerobot_vtrefine.diagnose.wander import wander_probe
 from lerobot_vtrefine.tactile.layout import PadLayout
 
 

@@ -5,7 +5,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from lerobot_vtrefine.diagnose.calibration.fit import Calibration
-from lerobot_vtrefine.diagnose.presses import Press
+from lerobot_vtrefine.diagnose.pad.press_trials import Press
 
 MEASURED, MODEL, FAST = "#1f6fb4", "#d1601f", "#7a3f9d"
 BINS = 14

@@ -11,14 +11,14 @@ from dataclasses import dataclass, replace
 import numpy as np
 from scipy import stats
 
-from lerobot_vtrefine.diagnose.baseline import Baseline, fit_baseline, weigh
 from lerobot_vtrefine.diagnose.calibration.excitation import Excitation, excitation, problems
-from lerobot_vtrefine.diagnose.candidates import saturation
-from lerobot_vtrefine.diagnose.composite import Composite, sensor_model
-from lerobot_vtrefine.diagnose.crossvalidation import cross_validate, folds_of, paired_p
-from lerobot_vtrefine.diagnose.fitting import Fit, bounded_step, fit
-from lerobot_vtrefine.diagnose.intervals import interval
-from lerobot_vtrefine.diagnose.presses import PressSet, prepare, usable
+from lerobot_vtrefine.diagnose.pad.baseline import Baseline, fit_baseline, weigh
+from lerobot_vtrefine.diagnose.pad.candidates import saturation
+from lerobot_vtrefine.diagnose.pad.crossvalidation import cross_validate, folds_of, paired_p
+from lerobot_vtrefine.diagnose.pad.fitting import Fit, bounded_step, fit
+from lerobot_vtrefine.diagnose.pad.intervals import interval
+from lerobot_vtrefine.diagnose.pad.model import Composite, sensor_model
+from lerobot_vtrefine.diagnose.pad.press_trials import PressSet, prepare, usable
 from lerobot_vtrefine.diagnose.quality import check_quality
 from lerobot_vtrefine.diagnose.recordings import RecordingSet
 from lerobot_vtrefine.diagnose.verdict import DataIssue, Parameter

@@ -133,8 +133,8 @@ def meaning(name: str) -> Meaning:
     """What a cause is; one that was added to the catalogue says so in its file."""
     if name in MEANINGS:
         return MEANINGS[name]
-    from lerobot_vtrefine.diagnose import candidates
     from lerobot_vtrefine.diagnose.joints import candidates as joint_candidates
+    from lerobot_vtrefine.diagnose.pad import candidates
 
     text = candidates.MEANING.get(name, "") or joint_candidates.MEANING.get(name, "")
     return Meaning(title(name), text[:1].upper() + text[1:], "size", "1")

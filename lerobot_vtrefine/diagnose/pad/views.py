@@ -1,0 +1,212 @@
+"""The final number, on recordings that no fit and no choice has seen, and what the report draws."""
+
+from collections import defaultdict
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from lerobot_vtrefine.diagnose.evidence import ResidualView, Trace, TrialError
+from lerobot_vtrefine.diagnose.pad.noise import Noise
+from lerobot_vtrefine.diagnose.pad.prediction import predict_trial
+from lerobot_vtrefine.diagnose.pad.press_trials import Press, PressSet
+from lerobot_vtrefine.diagnose.verdict import Heldout
+from lerobot_vtrefine.tactile.model import SensorModel
+
+RESAMPLES = 2000
+TRACE_CHANNELS = 6
+BINS = 12
+
+
+@dataclass(frozen=True)
+class Foretold:
+    """One held-out recording with both models' readings, at its scored taxels (T, n) [counts]."""
+
+    press: Press
+    measured: np.ndarray
+    simulated: np.ndarray
+    extended: np.ndarray
+
+
+def foretell(presses: PressSet, baseline: SensorModel, extended: SensorModel) -> list[Foretold]:
+    """Both models on every recording, by the code that predicts for users."""
+    results = []
+    for press in presses.presses:
+        both = [
+            predict_trial(model, press.trial, presses.layout)[:, press.taxels]
+            for model in (baseline, extended)
+        ]
+        results.append(Foretold(press, press.signal + press.idle, both[0], both[1]))
+    return results
+
+
+def heldout(foretold: Sequence[Foretold], floor: float | None, seed: int) -> Heldout:
+    """RMSE of both models and the gain, with an interval from resampling recordings."""
+    before = np.array([float(np.mean((f.measured - f.simulated) ** 2)) for f in foretold])
+    after = np.array([float(np.mean((f.measured - f.extended) ** 2)) for f in foretold])
+    rng = np.random.default_rng([seed, 7])
+    picks = rng.integers(0, len(before), (RESAMPLES, len(before)))
+    gains = 1.0 - after[picks].sum(axis=1) / np.maximum(before[picks].sum(axis=1), 1e-12)
+    if before.mean() < 1e-12:
+        gains = np.zeros(RESAMPLES)
+    low, high = np.percentile(gains, (2.5, 97.5))
+    return Heldout(
+        metric="rmse",
+        baseline=float(np.sqrt(before.mean())),
+        extended=float(np.sqrt(after.mean())),
+        noise_floor=floor,
+        gain=float(1.0 - after.mean() / before.mean()) if before.mean() >= 1e-12 else 0.0,
+        gain_ci95=(float(low), float(high)),
+        trials=tuple(f.press.trial.file for f in foretold),
+    )
+
+
+def noise_floor(
+    everyone: PressSet, locked: Sequence[int], noise: Noise, signals: Sequence[np.ndarray]
+) -> float:
+    """Root mean squared error that repeating the same recording would leave [counts].
+
+    Half the mean square between replicates of the locked recordings' conditions; the fitted noise where a
+    condition was recorded once. `signals` are the expected ones of the locked recordings.
+    """
+    groups: dict[str, list[Press]] = defaultdict(list)
+    for press in everyone.presses:
+        groups[press.trial.condition].append(press)
+    squares = []
+    for index, signal in zip(locked, signals, strict=True):
+        press = everyone.presses[index]
+        others = [_half_square(press, other) for other in groups[press.trial.condition] if other is not press]
+        known = [value for value in others if value is not None]
+        fitted = float(np.mean(noise.sigma(signal) ** 2 + (noise.gain * signal) ** 2))
+        squares.append(float(np.mean(known)) if known else fitted)
+    return float(np.sqrt(np.mean(squares))) if squares else 0.0
+
+
+def _half_square(press: Press, other: Press) -> float | None:
+    """Half the mean square between two recordings of one command; None where frames do not match."""
+    frames = min(len(press.signal), len(other.signal))
+    mine, theirs = press.trial.time_s[:frames], other.trial.time_s[:frames]
+    if frames < 8 or np.abs(mine - theirs).max() > 0.25 * np.median(np.diff(mine)):
+        return None
+    raw, again = press.trial.raw[:frames, press.taxels], other.trial.raw[:frames, press.taxels]
+    return 0.5 * float(np.mean((raw - again) ** 2))
+
+
+def traces(foretold: Sequence[Foretold]) -> tuple[Trace, ...]:
+    """Held-out recordings at the taxels that answer most."""
+    found = []
+    for item in foretold:
+        press = item.press
+        strongest = np.argsort(-np.ptp(item.measured, axis=0), kind="stable")[:TRACE_CHANNELS]
+        cols = press.layout.full_cols
+        names = tuple(f"taxel ({press.taxels[k] // cols}, {press.taxels[k] % cols})" for k in strongest)
+        drive = {
+            name: values
+            for name, values in (("depth_m", press.trial.depth_m), ("force_n", press.trial.force_n))
+            if values is not None
+        }
+        found.append(
+            Trace(
+                press.trial.file,
+                press.trial.condition,
+                press.trial.time_s,
+                names,
+                item.measured[:, strongest],
+                item.simulated[:, strongest],
+                item.extended[:, strongest],
+                drive,
+            )
+        )
+    return tuple(found)
+
+
+def trial_errors(foretold: Sequence[Foretold]) -> tuple[TrialError, ...]:
+    """Root mean squared error of every held-out recording, of both models."""
+    return tuple(
+        TrialError(
+            f.press.trial.file,
+            f.press.trial.condition,
+            float(np.sqrt(np.mean((f.measured - f.simulated) ** 2))),
+            float(np.sqrt(np.mean((f.measured - f.extended) ** 2))),
+        )
+        for f in foretold
+    )
+
+
+def residual_views(foretold: Sequence[Foretold], seed: int) -> tuple[ResidualView, ...]:
+    """Mean residual against load, rate, history, position and time."""
+    axes: dict[str, tuple[str, list[np.ndarray]]] = {}
+    for item in foretold:
+        for name, (unit, values) in _axes(item).items():
+            axes.setdefault(name, (unit, []))[1].append(values)
+    return tuple(
+        view
+        for name, (unit, values) in axes.items()
+        if len(values) == len(foretold) and (view := _view(name, unit, values, foretold, seed)) is not None
+    )
+
+
+def _axes(item: Foretold) -> dict[str, tuple[str, np.ndarray]]:
+    """Coordinates of every reading (T, n)."""
+    press = item.press
+    shape = item.measured.shape
+    drive = press.drive[:, press.scored]
+    expected = item.simulated - press.idle
+    cols = press.layout.full_cols
+    x, y = press.layout.pitch_m * (press.taxels % cols), press.layout.pitch_m * (press.taxels // cols)
+    axes = {
+        "load": ("counts", expected),
+        "history": ("counts", np.maximum.accumulate(expected, axis=0) - expected),
+        "column": ("m", np.broadcast_to(x, shape)),
+        "row": ("m", np.broadcast_to(y, shape)),
+        "time": ("s", np.broadcast_to(press.trial.time_s[:, None], shape)),
+        "session": ("s", np.broadcast_to((press.trial.time_s + press.trial.start_s)[:, None], shape)),
+    }
+    if not press.loaded:
+        axes["rate"] = ("m/s", np.where(drive > 0, press.rate[:, press.scored], 0.0))
+        axes["depth"] = ("m", np.where(drive > -0.5, drive, np.nan))
+    return axes
+
+
+def _view(
+    name: str, unit: str, values: list[np.ndarray], foretold: Sequence[Foretold], seed: int
+) -> ResidualView | None:
+    everything = np.concatenate([value[np.isfinite(value)] for value in values])
+    if not len(everything) or np.ptp(everything) <= 0:
+        return None
+    edges = np.unique(np.linspace(*np.percentile(everything, (0.5, 99.5)), BINS + 1))
+    if len(edges) < 3:
+        return None
+    sums = np.zeros((3, len(foretold), len(edges) - 1))
+    for k, (value, item) in enumerate(zip(values, foretold, strict=True)):
+        good = np.isfinite(value)
+        place = np.clip(np.searchsorted(edges, value[good], side="right") - 1, 0, len(edges) - 2)
+        for row, part in enumerate((item.measured - item.simulated, item.measured - item.extended)):
+            sums[row, k] = np.bincount(place, part[good], len(edges) - 1)
+        sums[2, k] = np.bincount(place, minlength=len(edges) - 1)
+    keep = sums[2].sum(axis=0) > 0
+    sums = sums[:, :, keep]
+    count = sums[2].sum(axis=0)
+    rng = np.random.default_rng([seed, 8])
+    picks = rng.integers(0, len(foretold), (400, len(foretold)))
+    drawn = sums[:, picks].sum(axis=2)
+    bands = [np.percentile(drawn[row] / np.maximum(drawn[2], 1), (2.5, 97.5), axis=0).T for row in (0, 1)]
+    centres = 0.5 * (edges[1:] + edges[:-1])[keep]
+    before, after = sums[0].sum(axis=0) / count, sums[1].sum(axis=0) / count
+    return ResidualView(name, unit, centres, before, after, bands[0], bands[1], count)
+
+
+def residual_maps(foretold: Sequence[Foretold], presses: PressSet) -> dict[str, np.ndarray]:
+    """Per taxel (R, C): RMS residual before and after, and the idle level."""
+    shape = (presses.layout.rows, presses.layout.cols)
+    sums = np.zeros((3, presses.layout.num_taxels))
+    for item in foretold:
+        sums[0, item.press.taxels] += ((item.measured - item.simulated) ** 2).sum(axis=0)
+        sums[1, item.press.taxels] += ((item.measured - item.extended) ** 2).sum(axis=0)
+        sums[2, item.press.taxels] += len(item.measured)
+    root = np.sqrt(sums[:2] / np.maximum(sums[2], 1)).reshape(2, *shape)
+    return {
+        "rms residual before": root[0],
+        "rms residual after": root[1],
+        "idle level": presses.idle.level,
+    }
