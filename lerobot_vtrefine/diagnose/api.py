@@ -10,9 +10,9 @@
 """
 
 from collections.abc import Callable
-from dataclasses import fields, replace
+from dataclasses import replace
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Protocol
 
 from lerobot_vtrefine.diagnose.core.diagnosis import Diagnosis
 from lerobot_vtrefine.diagnose.evidence import Savable
@@ -83,7 +83,7 @@ def _judged(sound: RecordingSet, seed: int, progress: Progress | None) -> Diagno
     if sound.kind == "pad":
         from lerobot_vtrefine.diagnose.pad.engine import diagnose_pad
 
-        return _plain(diagnose_pad(sound, seed=seed, progress=progress))
+        return diagnose_pad(sound, seed, progress)
     if (sound.path / "meta" / "info.json").is_file():
         from lerobot_vtrefine.diagnose.dataset.engine import diagnose_dataset
 
@@ -91,12 +91,6 @@ def _judged(sound: RecordingSet, seed: int, progress: Progress | None) -> Diagno
     from lerobot_vtrefine.diagnose.joints.engine import diagnose_robot
 
     return diagnose_robot(sound, seed, progress)
-
-
-def _plain(found: Any) -> Diagnosis:
-    """A pad's diagnosis without what only its engine keeps."""
-    names = {item.name for item in fields(Diagnosis)} & set(vars(found)) - {"alarms"}
-    return Diagnosis(**{name: getattr(found, name) for name in names})
 
 
 def _unfitted_model(recordings: RecordingSet) -> Savable:

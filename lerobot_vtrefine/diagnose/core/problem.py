@@ -3,12 +3,13 @@
 Shapes: T trials, J channels (1 for a camera, one per joint for a robot, one per quantity for parts).
 """
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, Protocol, Self
+from typing import TYPE_CHECKING, Any, Protocol, Self, override
 
 import numpy as np
 
+from lerobot_vtrefine.diagnose.core.score_test import Tested
 from lerobot_vtrefine.diagnose.evidence import ResidualView, Savable, Trace
 from lerobot_vtrefine.diagnose.verdict import Parameter
 
@@ -163,6 +164,11 @@ class Problem[F: Fit, C: Candidate](Protocol):
         """(J,) bool: whether the size found is large enough to be seen and no larger than errors allow."""
         ...
 
+    @property
+    def screens(self) -> bool:
+        """Whether it is a `ScreenedProblem`."""
+        ...
+
     # What only the instrument knows, between the steps of the method.
 
     def revised(self, now: F, accepted: Sequence[C]) -> Self:
@@ -186,6 +192,12 @@ class Problem[F: Fit, C: Candidate](Protocol):
         """The same trials with predictions for which the search is too slow; None where there are none."""
         ...
 
+    def handed_out(
+        self, selection: "Selection[Any, F, C]", seed: int, *, doubtful: bool
+    ) -> "Selection[Any, F, C]":
+        """The selection with fits as users get them; `doubtful`: beside something that has no name."""
+        ...
+
     def suspicions(self, selection: "Selection[Any, F, C]", seed: int) -> "Sequence[Suspicion]":
         """What may be left, as scores of trials."""
         ...
@@ -194,6 +206,7 @@ class Problem[F: Fit, C: Candidate](Protocol):
 class NothingBesides:
     """For instruments that know nothing besides their errors."""
 
+    screens = False
     can_settle = False
 
     def revised(self, now: Any, accepted: Any) -> Self:
@@ -212,9 +225,96 @@ class NothingBesides:
         """There are no finer predictions."""
         return None
 
+    def handed_out[S](self, selection: S, seed: int, *, doubtful: bool) -> S:
+        """As they were found."""
+        return selection
+
     def suspicions(self, selection: Any, seed: int) -> "Sequence[Suspicion]":
         """Nothing can be said about what is left."""
         return ()
+
+
+class FormCandidate(Candidate, Protocol):
+    """One form of a cause that is tested by scores before it is fitted."""
+
+    @property
+    def terms(self) -> int:
+        """Coordinates that it adds; 0 where none are counted (a map that is shrunk): it imitates nothing."""
+        ...
+
+    @property
+    def peer(self) -> bool:
+        """Of another form than the plain one: whether it is no richer than that."""
+        ...
+
+    @property
+    def disturbs(self) -> bool:
+        """Whether nothing else can be fitted well before it is: where it helps, it is taken first."""
+        ...
+
+
+class ScoredFit(Fit, Protocol):
+    """A fit under a noise model."""
+
+    @property
+    def scores(self) -> Array:
+        """(T, J) log score of every trial, up to a constant."""
+        ...
+
+
+class Scored(Reweighted, Protocol):
+    """See `Reweighted`."""
+
+    def judged(self, weights: Array, trials: Array) -> tuple[Array, Array]:
+        """Mean squared errors and log scores of some trials if every trial counted `weights` (T,) times."""
+        ...
+
+
+@dataclass(frozen=True)
+class Promise[C]:
+    """A candidate and what its scores say before it is fitted."""
+
+    candidate: C
+    tested: Tested
+    refine: bool = False
+    """Whether another form of the same cause promised most, so that it is tried in any case."""
+
+
+class ScreenedProblem[F: ScoredFit, C: FormCandidate](Problem[F, C], Protocol):
+    """Trials of one channel with a noise model, and candidates of many forms whose fits are slow.
+
+    Candidates are tested by scores before any is fitted, in their plain forms first.
+    """
+
+    @property
+    def further_gain(self) -> float:
+        """Part of the error that a cause beside others must take away: patching their form gains some."""
+        ...
+
+    def weighed(self, now: F | None) -> tuple[Self, F]:
+        """The problem with the noise around a fit (None: the baseline's) for weights, and the fit anew."""
+        ...
+
+    def unweighed(self, now: F) -> tuple[Self, F]:
+        """The same where all readings count alike."""
+        ...
+
+    def far_off(self, now: F) -> bool:
+        """Whether errors are so far above noise that weights may hide what is wrong."""
+        ...
+
+    def screened(self, now: F, only: Collection[str] | None = None) -> list[Promise[C]]:
+        """Every cause that a fit does not hold (or those of some names), by the most certain of its probes."""
+        ...
+
+    def refinements(self, candidate: C) -> Sequence[C]:
+        """Other forms of the same cause, the plainer first."""
+        ...
+
+    @override
+    def reweighted(self, fit: F, channels: Array | None = None) -> Scored:
+        """With log scores."""
+        ...
 
 
 class Account[F: Fit, C: Candidate](Protocol):

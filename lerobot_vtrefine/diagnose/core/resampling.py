@@ -9,7 +9,7 @@ from collections.abc import Sequence
 import numpy as np
 from scipy.stats import t as student_t
 
-from lerobot_vtrefine.diagnose.core.rules import DRAWS, EXACT_UP_TO, FLIPS, FOLDS
+from lerobot_vtrefine.diagnose.core.rules import DRAWS, EXACT_UP_TO, FLIPS, FOLDS, MIN_CONDITIONS
 
 Array = np.ndarray
 
@@ -29,6 +29,12 @@ def sign_matrix(trials: int, seed: int) -> Array:
 def one_sided(scores: Array, seed: int) -> tuple[Array, Array]:
     """p (K,) that scores (T, K) are positive by accident: each alone, and adjusted for all K (max-T)."""
     return _flipped(scores, np.zeros(scores.shape[1], dtype=bool), seed)
+
+
+def agree(differences: Array, seed: int, level: float) -> bool:
+    """Whether paired differences (T,) are positive at a level, or all are where T is too small for it."""
+    p_value = float(one_sided(differences[:, None], seed)[0][0])
+    return p_value <= max(level, 1.05 * 2.0 ** -len(differences) + 1e-3)
 
 
 def two_sided(scores: Array, seed: int) -> tuple[Array, Array]:
@@ -80,6 +86,13 @@ def _of_unit_length(scores: Array) -> Array:
 def _exceeding(largest: Array, observed: Array) -> Array:
     """Part of the largest values (B,) that reach each observed one (K,)."""
     return np.searchsorted(np.sort(-largest), -observed, side="right") / len(largest)
+
+
+def independent_units(conditions: Sequence[str]) -> list[str]:
+    """(T,) what varies independently: conditions, or single trials where there are too few conditions."""
+    if len(set(conditions)) >= MIN_CONDITIONS:
+        return list(conditions)
+    return [str(number) for number in range(len(conditions))]
 
 
 def folds_of(conditions: Sequence[str], seed: int) -> Array:

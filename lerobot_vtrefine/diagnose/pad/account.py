@@ -1,67 +1,145 @@
-"""Causes and evidence as the verdict and the report name them."""
+"""How a pad's diagnosis is told: sizes with intervals, power, models, drawings."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
+from functools import cached_property
+from typing import Any
 
 import numpy as np
 
-from lerobot_vtrefine.diagnose.evidence import Evidence
-from lerobot_vtrefine.diagnose.pad.baseline import plain_weights
+from lerobot_vtrefine.diagnose.core.engine import Inference
+from lerobot_vtrefine.diagnose.core.heldout import out_of_fold
+from lerobot_vtrefine.diagnose.core.rivals import Rival
+from lerobot_vtrefine.diagnose.core.screened_search import clearly_better
+from lerobot_vtrefine.diagnose.evidence import ResidualView, Trace
+from lerobot_vtrefine.diagnose.pad import views
 from lerobot_vtrefine.diagnose.pad.candidates import CATALOGUE
 from lerobot_vtrefine.diagnose.pad.candidates.base import Form, Setting
-from lerobot_vtrefine.diagnose.pad.fitting import Fit, fit, predict, squared_errors
-from lerobot_vtrefine.diagnose.pad.intervals import LeftOut, form_parameters, map_parameters
-from lerobot_vtrefine.diagnose.pad.parallel import on_all_cores
-from lerobot_vtrefine.diagnose.pad.press_trials import PressSet
-from lerobot_vtrefine.diagnose.pad.score_test import ALPHA
-from lerobot_vtrefine.diagnose.pad.search import Search, forms_of
-from lerobot_vtrefine.diagnose.pad.selection import EXTRA_GAIN, MAPS, clearly_better, scored, settle
-from lerobot_vtrefine.diagnose.verdict import Cause, Parameter
+from lerobot_vtrefine.diagnose.pad.detectable import Power, power_of
+from lerobot_vtrefine.diagnose.pad.experiments import next_experiment
+from lerobot_vtrefine.diagnose.pad.final_model import FinalFit
+from lerobot_vtrefine.diagnose.pad.fitting import Fit, predict
+from lerobot_vtrefine.diagnose.pad.intervals import (
+    LeftOut,
+    baseline_parameters,
+    form_parameters,
+    leave_out,
+    map_parameters,
+)
+from lerobot_vtrefine.diagnose.pad.problem import Candidate, PadProblem
+from lerobot_vtrefine.diagnose.pad.screening import DEAD, GAIN_MAP, MAPS, forms_of
+from lerobot_vtrefine.diagnose.pad.views import Foretold
+from lerobot_vtrefine.diagnose.verdict import Parameter
+from lerobot_vtrefine.tactile.model import SensorModel
+
+_MORE_COORDINATES = 2
+"""Coordinates that another form may have beyond the named one's, for its parameters to be heard."""
 
 
-def named_causes(
-    search: Search, fitted: Fit, left_out: LeftOut, role: str, locked: PressSet, seed: int
-) -> tuple[Cause, ...]:
-    """The model's causes with parameters, evidence, and what each gains on held-out recordings."""
-    full = float(squared_errors(predict(fitted.model, locked), locked).mean())
+class PadAccount:
+    """See `core.problem.Account`.
 
-    def named(name: str) -> Cause:
-        slim = fit(fitted.model.minus(name), search.presses, plain_weights(search.presses), SLIM_STEPS)
-        without = float(squared_errors(predict(slim.model, locked), locked).mean())
-        return Cause(
-            name,
-            "symptom" if role == "symptom" else "cause",
-            _parameters(search, fitted, name, left_out, seed),
-            search.p_adjusted.get(name),
-            1.0 - full / without if without > 0 else 0.0,
-            "observed" if _observed(search, name) else "tested",
+    Args:
+        whole: all recordings, locked ones too.
+    """
+
+    unit = "counts"
+    metric = "rmse"
+
+    def __init__(self, found: Inference[PadProblem, Any, Candidate], whole: PadProblem) -> None:
+        self.found, self.whole = found, whole
+        self.problem = found.selection.problem
+        self.fit: Fit = found.selection.fit.fit
+        self.plain: Fit = found.selection.baseline.fit
+
+    @cached_property
+    def _left_out(self) -> LeftOut:
+        return leave_out(self.fit, self.problem.presses)
+
+    @cached_property
+    def _power(self) -> Power:
+        return power_of(self.problem, self.fit)
+
+    @cached_property
+    def _foretold(self) -> list[Foretold]:
+        selection, predictions = self.found.selection, self.found.test.predictions
+        before, after = (predictions.of(item.sensor) for item in (selection.baseline, selection.fit))
+        return views.foretold(self.found.test.presses, before, after)
+
+    def parameters(self, cause: str, channels: tuple[int, ...]) -> Mapping[str, Parameter]:
+        """With intervals by leaving out every motion."""
+        presses, weights = self.problem.presses, self.problem.weights
+        if cause == GAIN_MAP:
+            return map_parameters(self.fit, presses, weights, self.found.seed)
+        if cause == DEAD:
+            return {"taxels": Parameter([list(taxel) for taxel in self.fit.model.dead], None, "1")}
+        index = [form.family for form in self.fit.model.forms].index(cause)
+        found = form_parameters(self.fit, index, self._left_out, presses, weights)
+        return with_form_spread(found, other_forms(self.problem, self.fit, index))
+
+    def baseline_parameters(self) -> Mapping[str, Parameter]:
+        """k_n, k_d and gain."""
+        return baseline_parameters(self.plain, self.problem.presses)
+
+    def model(self, fit: FinalFit) -> SensorModel:
+        """As users load it."""
+        return fit.sensor
+
+    def minimum_detectable(self) -> Mapping[str, float]:
+        """By injecting effects."""
+        return self._power.smallest
+
+    def noise_floor(self) -> float | None:
+        """What repeating a recording would leave."""
+        test, noise = self.found.test, self.problem.noise
+        if noise is None:
+            return None
+        return views.noise_floor(
+            self.whole.presses, test.presses, noise, predict(self.fit.model, test.presses)
         )
 
-    return tuple(on_all_cores(named, fitted.model.families))
+    def causes(self) -> Sequence[str]:
+        """The catalogue, the most promising first."""
+        examined = self.found.selection.examined
+        names = [*dict.fromkeys(form.family for form in CATALOGUE), *MAPS]
+
+        def promise(name: str) -> tuple[float, float]:
+            seen = examined.get(name)
+            gain = seen.gain if seen is not None and seen.gain is not None else -1.0
+            p_adjusted = seen.p_adjusted if seen is not None and seen.p_adjusted is not None else 1.0
+            return -gain, p_adjusted
+
+        return sorted(names, key=promise)
+
+    def caveat(self, cause: str, channels: tuple[int, ...]) -> str:
+        """Nothing is left open."""
+        return ""
+
+    def not_identifiable(self, cause: str) -> str:
+        """What to record to see it."""
+        return self._power.not_tested.get(cause, "")
+
+    def next_experiment(
+        self, rivals: Sequence[Rival[Fit, Candidate]], alarms: Sequence[Any]
+    ) -> Mapping[str, Any] | None:
+        """The protocol on which the first rivals differ most."""
+        if not rivals or alarms or self.problem.noise is None:
+            return None
+        rival = rivals[0]
+        names = (rival.cause, rival.name)
+        models = (self.fit.model, rival.fit.model)
+        return next_experiment(*models, self.problem.presses, self.problem.noise, names)
+
+    def drawings(self, test: PadProblem, seed: int) -> tuple[tuple[Trace, ...], tuple[ResidualView, ...]]:
+        """Held-out recordings at the taxels that answer most, and what residuals may follow."""
+        return views.traces(self._foretold), views.residual_views(self._foretold, seed)
+
+    def maps(self) -> dict[str, np.ndarray]:
+        """Title -> (R, C)."""
+        return views.residual_maps(self._foretold, self.whole.presses)
 
 
-MORE_COORDINATES = 2
-"""Coordinates that another form may have beyond the named one's, for its parameters to be heard."""
-SLIM_STEPS = 5
-"""Steps of the refit that tells what held-out recordings lose without a cause."""
-
-
-def _observed(search: Search, name: str) -> bool:
-    """Whether an accepted cause was seen in the readings themselves, so that nothing had to be tested."""
-    return name in search.p_adjusted and search.p_adjusted[name] is None
-
-
-def _parameters(search: Search, fitted: Fit, name: str, left_out: LeftOut, seed: int) -> dict[str, Parameter]:
-    if name == "taxel_gain_spread":
-        return map_parameters(fitted, search.presses, search.weights, seed)
-    if name == "dead_taxels":
-        return {"taxels": Parameter([list(taxel) for taxel in fitted.model.dead], None, "1")}
-    index = [form.family for form in fitted.model.forms].index(name)
-    found = form_parameters(fitted, index, left_out, search.presses, search.weights)
-    return with_form_spread(found, other_forms(search, fitted, index))
-
-
-def other_forms(search: Search, fitted: Fit, index: int) -> list[dict[str, tuple[float, str]]]:
+def other_forms(problem: PadProblem, fitted: Fit, index: int) -> list[dict[str, tuple[float, str]]]:
     """Parameters in other forms of a cause that predict about as well as form number `index`.
 
     Recordings that cannot tell two laws apart do not know what only one of them says.
@@ -72,15 +150,15 @@ def other_forms(search: Search, fitted: Fit, index: int) -> list[dict[str, tuple
     others = [
         other
         for other in forms_of(form.family, fitted)
-        if other is not form and 0 < len(other.values) <= len(form.values) + MORE_COORDINATES
+        if other is not form and 0 < len(other.values) <= len(form.values) + _MORE_COORDINATES
     ]
-    full = scored(search, fitted)
+    full = out_of_fold(problem, fitted, problem.folds)
     reports = []
     for other in others:
-        found = settle(
-            search, fitted.model.plus(other, _start(other, form, fitted.model.own(index), setting))
+        found = problem.settled(
+            fitted.model.plus(other, _start(other, form, fitted.model.own(index), setting))
         )
-        if not clearly_better(full, scored(search, found), search.seed):
+        if not clearly_better(full, out_of_fold(problem, found, problem.folds), problem.seed):
             place = found.model.forms.index(other)
             reports.append(other.report(found.model.own(place), setting))
     return reports
@@ -110,66 +188,3 @@ def with_form_spread(
         else:
             wide[name] = item
     return wide
-
-
-def evidence_table(
-    search: Search,
-    fitted: Fit,
-    role: str,
-    groups: Sequence[Sequence[str]],
-    not_tested: Mapping[str, str],
-) -> tuple[Evidence, ...]:
-    """One row per candidate, found or not, the most promising first.
-
-    Args:
-        not_tested: causes that these recordings cannot show, and what to record.
-    """
-    names = [*dict.fromkeys(form.family for form in CATALOGUE), *MAPS]
-    rows = [_row(name, search, fitted, role, groups, not_tested.get(name)) for name in names]
-    return tuple(sorted(rows, key=lambda row: (-(row.cv_gain or -1.0), row.p_adjusted or 1.0)))
-
-
-def _row(
-    name: str,
-    search: Search,
-    fitted: Fit,
-    role: str,
-    groups: Sequence[Sequence[str]],
-    to_record: str | None,
-) -> Evidence:
-    found = search.screened.get(name)
-    p_value, adjusted = (found.p_value, found.p_adjusted) if found is not None else (None, None)
-    gain = search.cv_gains.get(name)
-    if name in fitted.model.families:
-        adjusted = search.p_adjusted.get(name, adjusted)
-        observed = _observed(search, name)
-        tied = [other for group in groups if name in group for other in group if other != name]
-        if tied and role != "symptom":
-            text = f"explains the data, but so does {', '.join(tied)}"
-            return Evidence(name, p_value, adjusted, gain, "tie", text, observed)
-        if role == "symptom":
-            text = "improves the fit, but structure is left that no cause explains: the name may be borrowed"
-            return Evidence(name, p_value, adjusted, gain, "symptom", text, observed)
-        text = "predicts recordings that its fit has not seen better"
-        if observed:
-            text = f"seen in the readings themselves, not tested; {text}"
-        return Evidence(name, p_value, adjusted, gain, "accepted", text, observed)
-    if any(name in group for group in groups) and role != "symptom":
-        return Evidence(name, p_value, adjusted, gain, "tie", "explains the data as well as what was named")
-    if to_record is not None:
-        return Evidence(name, None, None, None, "not identifiable", to_record)
-    seen = found is not None and found.probe.observed
-    reason = _why_rejected(found is not None, adjusted, gain)
-    return Evidence(name, p_value, adjusted, gain, "rejected", reason, seen)
-
-
-def _why_rejected(screened: bool, adjusted: float | None, gain: float | None) -> str:
-    if not screened:
-        return "no sign of it"
-    if adjusted is not None and adjusted > ALPHA:
-        return f"recordings agree on it no more than by chance (adjusted p above {ALPHA:g})"
-    if gain is None:
-        return "passed the screening, but others explained more and left nothing for it"
-    if gain <= EXTRA_GAIN:
-        return "takes away too little of the cross-validated error"
-    return "another cause explains the same better"

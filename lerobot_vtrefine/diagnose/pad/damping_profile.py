@@ -26,7 +26,7 @@ OVERCONFIDENCE = 10.0
 
 
 @dataclass(frozen=True)
-class Walk:
+class Profile:
     """Fits at neighbouring dampings, the damping held in each; and the best of them."""
 
     fits: tuple[Fit, ...]
@@ -49,7 +49,7 @@ class Walk:
         return kept
 
 
-def walk(fitted: Fit, presses: PressSet, weights: Sequence[TrialWeights], coordinate: int) -> Walk:
+def profile(fitted: Fit, presses: PressSet, weights: Sequence[TrialWeights], coordinate: int) -> Profile:
     """From a fit to both sides along the damping, a delay (number `coordinate`) moving with it."""
     start = fit(fitted.model, presses, weights, STEPS, (DAMPING,))
     found = [start]
@@ -67,4 +67,4 @@ def walk(fitted: Fit, presses: PressSet, weights: Sequence[TrialWeights], coordi
             found.append(here)
             if here.loss - min(other.loss for other in found) > 0.05 * start.loss:
                 break
-    return Walk(tuple(found), min(found, key=lambda other: other.loss))
+    return Profile(tuple(found), min(found, key=lambda other: other.loss))

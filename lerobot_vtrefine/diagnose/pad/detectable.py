@@ -6,33 +6,30 @@ named. Effects are injected into the fitted model on the recorded motions, in pr
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
 import numpy as np
 
-from lerobot_vtrefine.diagnose.pad.baseline import plain_weights
+from lerobot_vtrefine.diagnose.core.parallel import on_all_cores
+from lerobot_vtrefine.diagnose.core.resampling import sign_matrix
+from lerobot_vtrefine.diagnose.core.rules import (
+    FEW_FOR_SIGNS,
+    LEAST_GAIN,
+    SCREEN_ALPHA,
+    SCREEN_SHARES,
+    SURE,
+)
+from lerobot_vtrefine.diagnose.core.score_test import Probe, flip_statistics, size_p, tail_shares
 from lerobot_vtrefine.diagnose.pad.candidates import CATALOGUE
 from lerobot_vtrefine.diagnose.pad.candidates.base import Form
 from lerobot_vtrefine.diagnose.pad.candidates.sample_and_hold import shortest_period
 from lerobot_vtrefine.diagnose.pad.fitting import Fit, movable, squared_errors, tangents
-from lerobot_vtrefine.diagnose.pad.parallel import on_all_cores
-from lerobot_vtrefine.diagnose.pad.score_test import (
-    ALPHA,
-    FEW,
-    SHARES,
-    Probe,
-    Scorer,
-    flip_signs,
-    flip_statistics,
-    probe_form,
-    size_p,
-    tail_shares,
-)
-from lerobot_vtrefine.diagnose.pad.search import Search
-from lerobot_vtrefine.diagnose.pad.selection import EXTRA_GAIN, MAPS, MIN_GAIN
+from lerobot_vtrefine.diagnose.pad.screening import MAPS, Scorer, probe_form
 from lerobot_vtrefine.diagnose.pad.taxel_maps import DEAD_ERROR, MAX_SIGMA, map_evidence, plain_gains
 
-MARGIN = 3.2 + 0.85
-"""Standard errors that an effect must stand out by to pass the screening in four cases of five."""
+if TYPE_CHECKING:
+    from lerobot_vtrefine.diagnose.pad.problem import PadProblem
+
 TRIALS = 5
 """Sizes tried per effect, each corrected in proportion from the one before."""
 MAIN = {"viscoelastic_relaxation": "fraction", "hysteresis": "fraction"}
@@ -59,20 +56,20 @@ class Power:
     not_tested: dict[str, str]
 
 
-def power_of(search: Search, fitted: Fit) -> Power:
+def power_of(problem: "PadProblem", fitted: Fit) -> Power:
     """The power of a search's recordings for every cause that the model does not hold."""
     setting, held = fitted.model.setting, set(fitted.model.families)
-    bench = _Injection(search, fitted)
+    bench = _Injection(problem, fitted)
     plain = {form.family: form for form in reversed(CATALOGUE) if form.family not in held}
     asked = [form for form in plain.values() if form.screened and form.possible(setting)]
     sizes = dict(zip((form.family for form in asked), on_all_cores(bench.smallest, asked), strict=True))
     sizes |= {name: None for name in plain if name not in sizes}
     if "sample_and_hold" in sizes:
-        sizes["sample_and_hold"] = shortest_period(search.presses, setting.frame_s)
+        sizes["sample_and_hold"] = shortest_period(problem.presses, setting.frame_s)
     if "taxel_gain_spread" not in held:
         sizes["taxel_gain_spread"] = _smallest_spread(bench)
     if "dead_taxels" not in held:
-        _, error = plain_gains(fitted, search.presses)
+        _, error = plain_gains(fitted, problem.presses)
         sizes["dead_taxels"] = 1.0 if (error < DEAD_ERROR).sum() > 1 else None
     needs = {form.family: form.needs for form in reversed(CATALOGUE)} | NEEDS
     return Power(
@@ -84,14 +81,14 @@ def power_of(search: Search, fitted: Fit) -> Power:
 class _Injection:
     """Effects injected into one fitted model."""
 
-    def __init__(self, search: Search, fitted: Fit) -> None:
-        self.search, self.fitted = search, fitted
-        _, columns = tangents(fitted.model, search.presses, movable(fitted))
-        self.scorer = Scorer(fitted, search.presses, search.weights, columns)
-        self._even = Scorer(fitted, search.presses, plain_weights(search.presses), columns)
-        self._signs = flip_signs(len(search.weights), search.seed)
-        self.needed = MIN_GAIN if not fitted.model.families else EXTRA_GAIN
-        self.error = float(squared_errors(fitted.signals, search.presses).sum())
+    def __init__(self, problem: "PadProblem", fitted: Fit) -> None:
+        self.problem, self.fitted = problem, fitted
+        _, columns = tangents(fitted.model, problem.presses, movable(fitted))
+        self.scorer = Scorer(fitted, problem.presses, problem.weights, columns)
+        self._even = Scorer(fitted, problem.presses, problem.even.weights, columns)
+        self._signs = sign_matrix(len(problem.weights), problem.seed)
+        self.needed = LEAST_GAIN if not fitted.model.families else problem.further_gain
+        self.error = float(squared_errors(fitted.signals, problem.presses).sum())
         forms = [form for form in CATALOGUE if form.screened and form.possible(fitted.model.setting)]
         probes = [probe for form in forms for probe in probe_form(form, self.scorer)]
         self._names = len({probe.name for probe in probes}) + len(MAPS)
@@ -100,9 +97,9 @@ class _Injection:
     def _critical_p(self, probes: Sequence[Probe]) -> float:
         """Largest p-value that passes the screening after adjustment for all these probes."""
         if not probes:
-            return ALPHA
+            return SCREEN_ALPHA
         smallest = tail_shares(flip_statistics(probes, self._signs)).min(axis=1)
-        return max(float(np.quantile(smallest, SHARES["scores"] * ALPHA)), 1.0 / len(smallest))
+        return max(float(np.quantile(smallest, SCREEN_SHARES["scores"] * SCREEN_ALPHA)), 1.0 / len(smallest))
 
     def smallest(self, form: Form) -> float | None:
         """Size of a form's main parameter that just shows; None if none does."""
@@ -138,7 +135,7 @@ class _Injection:
         change = self.scorer.change(form, values)
         scores, information = self.scorer.score(change)
         scatter = scores - scores.mean()
-        size = float(information.sum()) / max(float(np.sqrt((scatter**2).sum())), 1e-12) / MARGIN
+        size = float(information.sum()) / max(float(np.sqrt((scatter**2).sum())), 1e-12) / SURE
         taken = float(self._even.score(change)[1].sum()) / max(self.error, 1e-12)
         worth = np.sqrt(taken * (1.0 - self.needed) / self.needed)
         reach = float(min(size, worth))
@@ -150,8 +147,8 @@ class _Injection:
         p_value = float(tail_shares(flip_statistics([probe], self._signs))[0, 0])
         if p_value <= self._critical:
             return True
-        count = len(scores)
-        return count < FEW and p_value <= 2.5 * 2.0 ** (1 - count) and self._names * size_p(probe) <= ALPHA
+        few = len(scores) < FEW_FOR_SIGNS and p_value <= 2.5 * 2.0 ** (1 - len(scores))
+        return few and self._names * size_p(probe) <= SCREEN_ALPHA
 
     def _public(self, form: Form, values: np.ndarray) -> float:
         report = form.report(values, self.fitted.model.setting)
@@ -166,10 +163,10 @@ def _smallest_spread(bench: _Injection) -> float | None:
 
     What one condition says about a taxel helps only where another condition presses it, too.
     """
-    presses, fitted = bench.search.presses, bench.fitted
+    presses, fitted = bench.problem.presses, bench.fitted
     if presses.layout.num_taxels < 2:
         return None
-    information = map_evidence(fitted, presses, bench.search.weights).information
+    information = map_evidence(fitted, presses, bench.problem.weights).information
     total = information.sum(axis=0)
     share = np.where(total > 0, information / np.where(total > 0, total, 1.0), 0.0)
     scatter = np.sqrt(2.0 * max(float((share.sum(axis=0) ** 2 - (share**2).sum(axis=0)).sum()), 0.0))
@@ -182,7 +179,7 @@ def _smallest_spread(bench: _Injection) -> float | None:
     gained = float((power * (others > 0.1 * information) * (others > 0)).sum()) / max(bench.error, 1e-12)
     if common <= 0 or gained <= 0:
         return None
-    shown = np.sqrt(MARGIN * scatter / common)
+    shown = np.sqrt(SURE * scatter / common)
     worth = np.sqrt(bench.needed / (1.0 - bench.needed) / gained)
     sigma = float(max(shown, worth))
     return sigma if sigma <= MAX_SIGMA else None

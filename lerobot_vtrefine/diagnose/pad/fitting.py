@@ -5,7 +5,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from lerobot_vtrefine.diagnose.pad.forward_model.run import Bench, Prefix, run_stages
+from lerobot_vtrefine.diagnose.pad.forward_model.run import Prefix, run_stages
 from lerobot_vtrefine.diagnose.pad.model import Composite
 from lerobot_vtrefine.diagnose.pad.press_trials import PressSet
 from lerobot_vtrefine.diagnose.pad.weights import TrialWeights
@@ -23,12 +23,19 @@ class Fit:
         losses: (K,) weighted squared error of every recording.
         grams: (K, p+1, p+1) inner products of the free coordinates' tangents and, last, the residual.
         signals: expected signals (T, n) of every recording.
+        mse: (K, 1) mean squared error of every recording [counts^2].
     """
 
     model: Composite
     losses: np.ndarray
     grams: np.ndarray
     signals: tuple[np.ndarray, ...]
+    mse: np.ndarray
+
+    @property
+    def scores(self) -> np.ndarray:
+        """(K, 1) log score of every recording under the weights, up to a constant."""
+        return -0.5 * self.losses[:, None]
 
     @property
     def loss(self) -> float:
@@ -42,15 +49,7 @@ class Fit:
 
 def predict(model: Composite, presses: PressSet, cache: Prefix | None = None) -> list[np.ndarray]:
     """Expected signals above idle of every recording's scored taxels (T, n)."""
-    return run_stages(model.stages(), bench_of(presses), cache)
-
-
-def bench_of(presses: PressSet) -> Bench:
-    """The set's presses grouped for running models; kept with the set."""
-    kept = presses.__dict__.get("_bench")
-    if kept is None:
-        kept = presses.__dict__["_bench"] = Bench(presses.presses, presses.idle.level)
-    return kept
+    return run_stages(model.stages(), presses.bench, cache)
 
 
 def losses_of(
@@ -162,7 +161,9 @@ def rest(model: Composite, presses: PressSet, weights: Sequence[TrialWeights]) -
     """A model as it stands, with its losses and tangents under these weights."""
     signals, columns = tangents(model, presses, model.free)
     grams = grams_of(presses, weights, signals, columns)
-    return Fit(model, grams[:, -1, -1].copy(), grams, tuple(signals))
+    return Fit(
+        model, grams[:, -1, -1].copy(), grams, tuple(signals), squared_errors(signals, presses)[:, None]
+    )
 
 
 def fit(
@@ -197,10 +198,12 @@ def fit(
         grams = grams_of(presses, weights, signals, columns)
         if settled:
             break
-    return Fit(model, grams[:, -1, -1].copy(), grams, tuple(signals))
+    return Fit(
+        model, grams[:, -1, -1].copy(), grams, tuple(signals), squared_errors(signals, presses)[:, None]
+    )
 
 
-def refit_without(fitted: Fit, left_out: Sequence[int]) -> Composite:
-    """One Gauss-Newton step from the whole fit to the fit without some recordings (exact where linear)."""
-    gram = fitted.grams.sum(axis=0) - fitted.grams[list(left_out)].sum(axis=0)
+def refit_weighted(fitted: Fit, counts: np.ndarray) -> Composite:
+    """One Gauss-Newton step from the whole fit to that in which recordings count so often (K,)."""
+    gram = np.tensordot(counts, fitted.grams, axes=1)
     return fitted.model.at(bounded_step(fitted.model, gram, fitted.model.free, 1e-6))

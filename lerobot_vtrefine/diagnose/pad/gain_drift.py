@@ -8,15 +8,12 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from lerobot_vtrefine.diagnose.pad.alarms import Alarm
+from lerobot_vtrefine.diagnose.core.rules import ORDER_ALPHA
+from lerobot_vtrefine.diagnose.core.suspicion import Suspicion
 from lerobot_vtrefine.diagnose.pad.fitting import Fit
 from lerobot_vtrefine.diagnose.pad.press_trials import PressSet
 from lerobot_vtrefine.diagnose.pad.weights import TrialWeights
 
-COURSE_P = 0.002
-"""Chance of such an order of gains, if there were no course."""
-ASKED_P = 0.004
-"""The same for the temperature, where it was logged."""
 NEIGHBOURS = "those of the recordings before and after"
 MIN_COURSE = 0.005
 """Deviation of gains along their course that is worth a word."""
@@ -50,7 +47,7 @@ def own_gains(fitted: Fit, presses: PressSet, weights: Sequence[TrialWeights]) -
     return np.array(gains)
 
 
-def course_alarm(fitted: Fit, presses: PressSet, weights: Sequence[TrialWeights]) -> Alarm | None:
+def gain_drift(fitted: Fit, presses: PressSet, weights: Sequence[TrialWeights]) -> Suspicion | None:
     """Whether gains follow the temperature or the session; None where too few recordings can tell."""
     gains = own_gains(fitted, presses, weights)
     starts = np.array([press.trial.start_s for press in presses.presses])
@@ -67,8 +64,8 @@ def course_alarm(fitted: Fit, presses: PressSet, weights: Sequence[TrialWeights]
     return _judge(gains, levels, starts, warmth) if len(gains) >= MIN_RECORDINGS else None
 
 
-def _judge(gains: np.ndarray, levels: np.ndarray, starts: np.ndarray, warmth: np.ndarray) -> Alarm:
-    """The alarm from one gain, largest signal, start [s] and temperature (K,) per unit."""
+def _judge(gains: np.ndarray, levels: np.ndarray, starts: np.ndarray, warmth: np.ndarray) -> Suspicion:
+    """The suspicion from one gain, largest signal, start [s] and temperature (K,) per unit."""
     order = np.argsort(starts, kind="stable")
     table, levels = (gains[order], starts[order], warmth[order]), levels[order]
     # What depends on how hard a recording presses is the law's misfit.
@@ -80,17 +77,16 @@ def _judge(gains: np.ndarray, levels: np.ndarray, starts: np.ndarray, warmth: np
     found = {text: np.abs(series @ course) for text, course in courses.items() if course.any()}
     found[NEIGHBOURS] = (series[:, 1:] * series[:, :-1]).sum(axis=1)
     shares = {text: _tails(values) for text, values in found.items()}
-    # Somebody who logs the temperature asks about it: a question of its own beside that of the session.
-    asked = shares.pop("the temperature", np.ones(1))
+    # Somebody who logs the temperature asks about it: a question of its own, at twice the session's level.
+    asked = 0.5 * shares.pop("the temperature", np.full(1, 2.0))
     smallest = np.min(list(shares.values()), axis=0)
     p_session, p_asked = float((smallest <= smallest[0]).mean()), float(asked[0])
-    warm = p_asked < ASKED_P and (p_session >= COURSE_P or p_asked <= p_session)
+    warm = p_asked < ORDER_ALPHA and (p_session >= ORDER_ALPHA or p_asked <= p_session)
     best = "the temperature" if warm else min(shares, key=lambda text: float(shares[text][0]))
     seen = float(found[best][0])
     size = np.sqrt(max(seen, 0.0) / len(gains)) if best == NEIGHBOURS else seen / np.sqrt(len(gains))
     text = f"gains of recordings follow {best} ({100 * size:.1f} % of the load)"
-    fired = (warm or p_session < COURSE_P) and size > MIN_COURSE
-    return Alarm("gain course", bool(fired), float(size), p_asked if warm else p_session, text)
+    return Suspicion(0, text, float(size), MIN_COURSE, permuted=p_asked if warm else p_session)
 
 
 def _clipped(values: np.ndarray) -> np.ndarray:

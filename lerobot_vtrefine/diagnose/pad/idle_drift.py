@@ -2,10 +2,10 @@
 
 import numpy as np
 
+from lerobot_vtrefine.diagnose.core.score_test import Probe
 from lerobot_vtrefine.diagnose.pad.candidates.base import Form
 from lerobot_vtrefine.diagnose.pad.fitting import Fit
 from lerobot_vtrefine.diagnose.pad.press_trials import PressSet
-from lerobot_vtrefine.diagnose.pad.score_test import Probe
 
 ORDERS = 9999
 MIN_RECORDINGS = 8
@@ -22,7 +22,7 @@ def resting_levels(fitted: Fit, presses: PressSet) -> np.ndarray:
     return np.array(levels)
 
 
-def wander_probe(fitted: Fit, presses: PressSet, form: Form, seed: int) -> Probe | None:
+def drift_probe(fitted: Fit, presses: PressSet, form: Form, seed: int) -> Probe | None:
     """Whether levels at rest of neighbours in the session agree more than in any other order.
 
     The order of recordings is what is permuted: a level that wanders has no sign of its own.

@@ -13,8 +13,9 @@ from dataclasses import dataclass
 import numpy as np
 from scipy import stats
 
+from lerobot_vtrefine.diagnose.core.resampling import independent_units
 from lerobot_vtrefine.diagnose.pad.candidates.base import Form, Setting
-from lerobot_vtrefine.diagnose.pad.damping_profile import DAMPING, walk
+from lerobot_vtrefine.diagnose.pad.damping_profile import DAMPING, profile
 from lerobot_vtrefine.diagnose.pad.fitting import Fit, free_step
 from lerobot_vtrefine.diagnose.pad.press_trials import PressSet
 from lerobot_vtrefine.diagnose.pad.taxel_maps import map_evidence, solve_map
@@ -22,8 +23,6 @@ from lerobot_vtrefine.diagnose.pad.weights import TrialWeights
 from lerobot_vtrefine.diagnose.verdict import Parameter
 
 LEVEL = (2.5, 97.5)
-MIN_MOTIONS = 4
-"""With fewer motions than this, recordings are left out one by one."""
 MIN_FREEDOM = 2.0
 DIGITS = 6
 UNSEEN = 0.1
@@ -70,9 +69,7 @@ class LeftOut:
 
 def motions_of(presses: PressSet) -> list[list[int]]:
     """Numbers of the recordings of every motion; single recordings where there are too few motions."""
-    names = presses.conditions
-    if len(set(names)) < MIN_MOTIONS:
-        return [[index] for index in range(len(names))]
+    names = independent_units(presses.conditions)
     return [[k for k, name in enumerate(names) if name == unit] for unit in sorted(set(names))]
 
 
@@ -139,7 +136,7 @@ def _along_damping(
     reporters: Mapping[str, Callable[[np.ndarray], float]],
 ) -> dict[str, tuple[float, float]]:
     """Intervals that span what other dampings would say, and what is not known at each of them."""
-    found = walk(fitted, presses, weights, coordinate)
+    found = profile(fitted, presses, weights, coordinate)
     left_out = leave_out(found.best, presses, (DAMPING,))
     alike = found.alike(motions_of(presses))
     bounds = {}

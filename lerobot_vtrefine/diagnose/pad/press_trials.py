@@ -1,6 +1,8 @@
 """Recorded presses as the engine works on them: cropped to the taxels that answer, above their idle level."""
 
 from dataclasses import dataclass, field, replace
+from functools import cached_property
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -9,6 +11,9 @@ from lerobot_vtrefine.diagnose.pad.motion import Kind, instants_of, motion
 from lerobot_vtrefine.diagnose.pad.repeated_frames import Rhythm, silent
 from lerobot_vtrefine.diagnose.recordings import RecordingSet, Trial
 from lerobot_vtrefine.tactile.layout import PadLayout
+
+if TYPE_CHECKING:
+    from lerobot_vtrefine.diagnose.pad.forward_model.run import Bench
 
 MARGIN_TAXELS = 2
 """Untouched taxels kept around those that answer, so that spreading does not see the crop's edge."""
@@ -94,10 +99,13 @@ class Press:
 
     def course(self, kind: Kind) -> Course:
         """The drive at a model's instants; kept with the press."""
-        kept = self.__dict__.setdefault("_courses", {})
-        if kind not in kept:
-            kept[kind] = self._course(kind)
-        return kept[kind]
+        if kind not in self._courses:
+            self._courses[kind] = self._course(kind)
+        return self._courses[kind]
+
+    @cached_property
+    def _courses(self) -> dict[Kind, Course]:
+        return {}
 
     def _course(self, kind: Kind) -> Course:
         if kind == "frames":
@@ -111,20 +119,15 @@ class Press:
             drive, rate = self.layout.cut(drive), self.layout.cut(rate)
         return Course(times, drive - self.sunk_m, rate, frames)
 
-    @property
+    @cached_property
     def rhythm(self) -> Rhythm:
-        """When readings were new; kept with the press."""
-        kept = self.__dict__.get("_rhythm")
-        if kept is None:
-            telling = self.touching & ~silent(self.drive, self.signal)
-            kept = self.__dict__["_rhythm"] = Rhythm.of(self.time_s, self.signal, telling)
-        return kept
+        """When readings were new."""
+        return Rhythm.of(self.time_s, self.signal, self.touching & ~silent(self.drive, self.signal))
 
     def sunk(self, by_m: float) -> "Press":
         """The same press with the face lowered."""
         lower = replace(self, drive=self.drive - by_m, sunk_m=self.sunk_m + by_m)
-        kept = {k: replace(c, drive=c.drive - by_m) for k, c in self.__dict__.get("_courses", {}).items()}
-        lower.__dict__["_courses"] = kept
+        lower._courses.update({k: replace(c, drive=c.drive - by_m) for k, c in self._courses.items()})
         return lower
 
     @property
@@ -159,11 +162,21 @@ class PressSet:
 
     def subset(self, keep: list[int]) -> "PressSet":
         """With the presses of those numbers; kept, so that what is built of it is built once."""
-        kept = self.__dict__.setdefault("_subsets", {})
         key = tuple(keep)
-        if key not in kept:
-            kept[key] = replace(self, presses=tuple(self.presses[index] for index in keep))
-        return kept[key]
+        if key not in self._subsets:
+            self._subsets[key] = replace(self, presses=tuple(self.presses[index] for index in keep))
+        return self._subsets[key]
+
+    @cached_property
+    def _subsets(self) -> dict[tuple[int, ...], "PressSet"]:
+        return {}
+
+    @cached_property
+    def bench(self) -> "Bench":
+        """The presses grouped for running models."""
+        from lerobot_vtrefine.diagnose.pad.forward_model.run import Bench
+
+        return Bench(self.presses, self.idle.level)
 
     @property
     def conditions(self) -> list[str]:

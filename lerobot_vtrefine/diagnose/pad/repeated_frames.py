@@ -1,6 +1,7 @@
 """When a recording's readings were new: frames whose readings are those of the frame before, bit for bit."""
 
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 
@@ -46,16 +47,21 @@ class Rhythm:
 
     def phase(self, period_s: float) -> float:
         """Part of a period that had gone by at the trial's start, as far as new readings tell."""
-        kept = self.__dict__.setdefault("_phases", {})
-        if period_s not in kept:
+        if period_s not in self._phases:
             phases = np.arange(PHASES) / PHASES
             due = np.diff(slots(self.time_s, period_s, phases[:, None]), axis=1) != 0
             wrong = ((due != self.fresh[1:]) & self.telling[1:]).sum(axis=1)
             # Phases lie on a circle: the middle of those that fit best, seen from the worst one.
             turned = np.roll(wrong, -int(np.argmax(wrong)))
             best = np.flatnonzero(turned == turned.min())
-            kept[period_s] = float(phases[(int(best[len(best) // 2]) + int(np.argmax(wrong))) % PHASES])
-        return kept[period_s]
+            self._phases[period_s] = float(
+                phases[(int(best[len(best) // 2]) + int(np.argmax(wrong))) % PHASES]
+            )
+        return self._phases[period_s]
+
+    @cached_property
+    def _phases(self) -> dict[float, float]:
+        return {}
 
     def against(self, period_s: float, free: bool) -> np.ndarray:
         """Counts (5,): repeats due, changes among them; changes; repeats, those where a change was due."""

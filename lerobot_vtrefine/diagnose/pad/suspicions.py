@@ -1,132 +1,101 @@
-"""Whether structure is left that no named cause accounts for."""
+"""What may be left on a pad: it repeats with the command, is far above noise, comes with sliding, has a line,
+follows the session's order, or follows something that the model does not know.
+"""
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from lerobot_vtrefine.diagnose.pad.alarms import (
-    Alarm,
-    Correlations,
-    cleaned,
-    condition_alarm,
-    left_over,
-    level_alarm,
-    line_alarm,
-    only_misfit,
-    pair_alarm,
-    pairs_alarm,
-    replicate_alarm,
-)
+from lerobot_vtrefine.diagnose.core.search import Selection
+from lerobot_vtrefine.diagnose.core.suspicion import Suspicion
+from lerobot_vtrefine.diagnose.pad import error_level, repeatability
 from lerobot_vtrefine.diagnose.pad.baseline import weigh
 from lerobot_vtrefine.diagnose.pad.descriptors import DESCRIPTORS, Descriptor
 from lerobot_vtrefine.diagnose.pad.fitting import Fit, tangents
-from lerobot_vtrefine.diagnose.pad.gain_drift import course_alarm
-from lerobot_vtrefine.diagnose.pad.local_errors import beside_alarm, taxel_alarm
+from lerobot_vtrefine.diagnose.pad.gain_drift import gain_drift
 from lerobot_vtrefine.diagnose.pad.press_trials import PressSet
-from lerobot_vtrefine.diagnose.pad.score_test import Probe, Scorer, screen
-from lerobot_vtrefine.diagnose.pad.search import Search
-from lerobot_vtrefine.diagnose.pad.sliding import sliding_alarm
+from lerobot_vtrefine.diagnose.pad.repeatability import Correlations
+from lerobot_vtrefine.diagnose.pad.screening import Scorer
+from lerobot_vtrefine.diagnose.pad.sliding_errors import while_sliding
+from lerobot_vtrefine.diagnose.pad.spectrum import spectral_line
 
-DESCRIPTOR_P = 0.01
-DESCRIPTOR_SHARE = 0.02
+if TYPE_CHECKING:
+    from lerobot_vtrefine.diagnose.pad.problem import PadProblem
+
+_FOLLOWS = 0.02
 """Part of the squared error that a descriptor must take away on recordings left out."""
-OWNED_SHARE = 0.1
+_FOLLOWS_IF_OWNED = 0.1
 """Part that no form of a family leaves to the descriptors of its own kind of effect."""
-RIDGE = 1e-9
-NO_MISFIT = ("spectrum", "level", "sliding", "gain course")
-"""Alarms that the form of no named cause has raised: a line, errors far above noise, what only sliding does
-and what changes through the session."""
+_RIDGE = 1e-9
+_WORTH_A_LOOK = 1.5
+"""Standardised sum of scores from which on a descriptor's share is worked out; tests ask for over three."""
 
 
-@dataclass(frozen=True)
-class Suspicion:
-    """All alarms, whether any means an unknown cause, and the clue it gives."""
+def suspicions(problem: "PadProblem", selection: Selection[Any, Fit, Any]) -> list[Suspicion]:
+    """All of them; where names leave hardly anything, what repeats is their form's misfit and no cause.
 
-    alarms: tuple[Alarm, ...]
-    alarm: bool
-    clue: str | None
-
-
-@dataclass(frozen=True)
-class Found:
-    """A descriptor that matters: adjusted p-value, part of the cross-validated squared error."""
-
-    descriptor: Descriptor
-    p_adjusted: float
-    share: float
-
-
-def look_for_unknowns(search: Search, fitted: Fit, baseline: Fit) -> Suspicion:
-    """Run the alarms on the extended model's residuals; what names' forms leave of their own is none."""
-    _, weights = weigh(fitted, search.presses)
-    residuals = cleaned(fitted, search.presses, weights)
-    generic = describe_residual(search, fitted)
-    families = set(fitted.model.families)
-    strangers = [
-        item for item in generic if item.share > OWNED_SHARE or not families & set(item.descriptor.owners)
+    Of what changes through the session, or comes with sliding alone, repeatable errors say nothing.
+    """
+    presses, fitted, plain = problem.presses, selection.fit, selection.baseline
+    _, weights = weigh(fitted, presses)
+    residuals = repeatability.cleaned(fitted, presses, weights)
+    descriptors = following(problem, fitted)
+    sure = [
+        spectral_line(presses, residuals),
+        error_level.level(residuals, fitted, weights),
+        while_sliding(presses, residuals, fitted, weights),
+        gain_drift(fitted, presses, weights),
+        *(item for descriptor, item in descriptors if descriptor.session),
     ]
-    alarms = [replicate_alarm(search.presses, residuals, search.seed), line_alarm(search.presses, residuals)]
-    pairs = Correlations.of(search.presses, residuals)
+    before, after = (fit.residuals(presses) for fit in (plain, fitted))
+    if fitted.model.families and repeatability.only_misfit(presses, before, after):
+        return [item for item in sure if item is not None]
+    found = [
+        *sure,
+        *_repeating(presses, fitted, before, residuals),
+        error_level.level_of_a_condition(presses, residuals, fitted, weights),
+        error_level.beside_the_indenter(presses, residuals, fitted, weights),
+        error_level.one_taxel(presses, residuals, weights),
+        *(item for descriptor, item in descriptors if not descriptor.session),
+    ]
+    return [item for item in found if item is not None]
+
+
+def _repeating(
+    presses: PressSet, fitted: Fit, before: Sequence[np.ndarray], residuals: Sequence[np.ndarray]
+) -> list[Suspicion | None]:
+    """Residuals of recordings of one command agree."""
+    found = [repeatability.in_all_conditions(presses, residuals)]
+    pairs = Correlations.of(presses, residuals)
     if pairs is not None:
-        alarms.append(pair_alarm(search.presses, residuals, pairs))
-        left = left_over(search.presses, baseline.residuals(search.presses), residuals) if families else None
-        alarms.append(pairs_alarm(search.presses, residuals, pairs, left))
-    alarms.append(level_alarm(residuals, fitted, weights))
-    alarms.append(condition_alarm(search.presses, residuals, fitted, weights))
-    alarms.append(sliding_alarm(search.presses, residuals, fitted, weights))
-    alarms.append(beside_alarm(search.presses, residuals, fitted, weights))
-    alarms.append(taxel_alarm(search.presses, residuals, weights))
-    alarms.append(course_alarm(fitted, search.presses, weights))
-    alarms.append(_descriptor_alarm(strangers, generic))
-    known = tuple(alarm for alarm in alarms if alarm is not None)
-    fired = [alarm for alarm in known if alarm.fired]
-    before, after = (model.residuals(search.presses) for model in (baseline, fitted))
-    if fired and families and only_misfit(search.presses, before, after):
-        # Of what does not repeat, or changes through the session, repeatable errors say nothing.
-        changing = any(item.descriptor.session for item in strangers)
-        kept = (*NO_MISFIT, "descriptors") if changing else NO_MISFIT
-        fired = [alarm for alarm in fired if alarm.name in kept]
-        known = tuple(alarm if alarm in fired else replace(alarm, fired=False) for alarm in known)
-    clues = [alarm.clue for alarm in reversed(fired)]
-    if fired and generic and not strangers:
-        clues.append(f"the residual correlates with {generic[0].descriptor.text}")
-    return Suspicion(known, bool(fired), "; ".join(clues) or None)
+        left = repeatability.left_over(presses, before, residuals) if fitted.model.families else None
+        found.append(repeatability.in_one_condition(presses, residuals, pairs))
+        found.append(repeatability.in_all_pairs(presses, residuals, pairs, left))
+    return found
 
 
-def _descriptor_alarm(strangers: Sequence[Found], generic: Sequence[Found]) -> Alarm:
-    if strangers:
-        best = strangers[0]
-        text = f"the residual correlates with {best.descriptor.text} ({100 * best.share:.0f} % of its power)"
-        return Alarm("descriptors", True, best.share, best.p_adjusted, text)
-    share, p_value = (generic[0].share, generic[0].p_adjusted) if generic else (0.0, None)
-    return Alarm("descriptors", False, share, p_value, "no stranger to the named causes")
-
-
-def describe_residual(search: Search, fitted: Fit) -> list[Found]:
-    """Descriptors that matter beside the model, the one that takes away most first."""
-    presses, weights = search.presses, search.weights
+def following(problem: "PadProblem", fitted: Fit) -> list[tuple[Descriptor, Suspicion]]:
+    """What is left may follow a descriptor; what a named family's own kind of effect leaves must be more."""
+    presses, families = problem.presses, set(fitted.model.families)
     _, columns = tangents(fitted.model, presses, fitted.model.free)
-    scorer = Scorer(fitted, presses, weights, columns)
-    probes, kept = [], []
+    scorer = Scorer(fitted, presses, problem.weights, columns)
+    found = []
     for descriptor in DESCRIPTORS:
         change = _directions(descriptor, presses, fitted)
         if change is None:
             continue
         scores, information = scorer.score(change)
-        if information.sum() <= RIDGE * max(float((scores**2).sum()), 1.0):
+        size = float(np.sqrt((scores**2).sum()))
+        if information.sum() <= _RIDGE * max(size**2, 1.0):
             continue
-        probes.append(Probe(descriptor.text, None, np.ones(1), scores, information, False))
-        kept.append((descriptor, change))
-    screened = screen(probes, len(weights), search.seed)
-    found = []
-    for descriptor, change in kept:
-        p_adjusted = screened[descriptor.text].p_adjusted
-        if p_adjusted is not None and p_adjusted <= DESCRIPTOR_P:
-            share = left_out_share(fitted, presses, columns, change, search.folds)
-            if share > DESCRIPTOR_SHARE:
-                found.append(Found(descriptor, p_adjusted, share))
-    return sorted(found, key=lambda item: -item.share)
+        share = 0.0
+        if abs(float(scores.sum())) > _WORTH_A_LOOK * size:
+            share = left_out_share(fitted, presses, columns, change, problem.folds)
+        least = _FOLLOWS_IF_OWNED if families & set(descriptor.owners) else _FOLLOWS
+        text = f"the residual correlates with {descriptor.text} ({100 * share:.0f} % of its power)"
+        found.append((descriptor, Suspicion(0, text, share, least, scores, either_sign=True)))
+    return found
 
 
 def _directions(descriptor: Descriptor, presses: PressSet, fitted: Fit) -> list[np.ndarray] | None:
@@ -144,7 +113,7 @@ def left_out_share(
     presses: PressSet,
     columns: Sequence[Sequence[np.ndarray]],
     change: Sequence[np.ndarray],
-    folds: Sequence[Sequence[int]],
+    folds: np.ndarray,
 ) -> float:
     """Part of the squared error of recordings left out that the change takes away, in plain counts.
 
@@ -158,9 +127,9 @@ def left_out_share(
         grams.append(matrix.T @ matrix)
     every = np.array(grams)
     before, after = 0.0, 0.0
-    for fold in folds:
-        rest = every.sum(axis=0) - every[list(fold)].sum(axis=0)
-        part = every[list(fold)].sum(axis=0)
+    for fold in np.unique(folds):
+        part = every[folds == fold].sum(axis=0)
+        rest = every.sum(axis=0) - part
         before += _error(part, _coefficients(rest, list(range(len(rest) - 2))))
         after += _error(part, _coefficients(rest, list(range(len(rest) - 1))))
     return 1.0 - after / before if before > 0 else 0.0

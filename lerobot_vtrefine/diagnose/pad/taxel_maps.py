@@ -134,10 +134,9 @@ def normalised(model: Composite, evidence: MapEvidence) -> Composite:
     return replace(model, gain_map=gain_map, values=values)
 
 
-def map_without(model: Composite, fitted: Fit, evidence: MapEvidence, left_out: Sequence[int]) -> Composite:
-    """The model with its map taken from the other recordings only."""
+def map_of(model: Composite, fitted: Fit, evidence: MapEvidence, keep: Sequence[int]) -> Composite:
+    """The model with its map taken from some recordings only."""
     assert fitted.model.gain_map is not None
-    keep = [k for k in range(len(evidence.coupling)) if k not in set(left_out)]
     log_map = np.log(np.asarray(fitted.model.gain_map)).ravel()
     fresh, _, _ = solve_map(evidence, keep, log_map, fitted.model.gain_sigma)
     return replace(

@@ -1,4 +1,4 @@
-"""The final number, on recordings that no fit and no choice has seen, and what the report draws."""
+"""What the report draws, on recordings that no fit and no choice has seen."""
 
 from collections import defaultdict
 from collections.abc import Sequence
@@ -6,14 +6,10 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from lerobot_vtrefine.diagnose.evidence import ResidualView, Trace, TrialError
+from lerobot_vtrefine.diagnose.evidence import ResidualView, Trace
 from lerobot_vtrefine.diagnose.pad.noise import Noise
-from lerobot_vtrefine.diagnose.pad.prediction import predict_trial
 from lerobot_vtrefine.diagnose.pad.press_trials import Press, PressSet
-from lerobot_vtrefine.diagnose.verdict import Heldout
-from lerobot_vtrefine.tactile.model import SensorModel
 
-RESAMPLES = 2000
 TRACE_CHANNELS = 6
 BINS = 12
 
@@ -28,42 +24,15 @@ class Foretold:
     extended: np.ndarray
 
 
-def foretell(presses: PressSet, baseline: SensorModel, extended: SensorModel) -> list[Foretold]:
-    """Both models on every recording, by the code that predicts for users."""
-    results = []
-    for press in presses.presses:
-        both = [
-            predict_trial(model, press.trial, presses.layout)[:, press.taxels]
-            for model in (baseline, extended)
-        ]
-        results.append(Foretold(press, press.signal + press.idle, both[0], both[1]))
-    return results
+def foretold(
+    presses: PressSet, simulated: Sequence[np.ndarray], extended: Sequence[np.ndarray]
+) -> list[Foretold]:
+    """Recordings with what both models say about them (T, n)."""
+    rows = zip(presses.presses, simulated, extended, strict=True)
+    return [Foretold(press, press.signal + press.idle, before, after) for press, before, after in rows]
 
 
-def heldout(foretold: Sequence[Foretold], floor: float | None, seed: int) -> Heldout:
-    """RMSE of both models and the gain, with an interval from resampling recordings."""
-    before = np.array([float(np.mean((f.measured - f.simulated) ** 2)) for f in foretold])
-    after = np.array([float(np.mean((f.measured - f.extended) ** 2)) for f in foretold])
-    rng = np.random.default_rng([seed, 7])
-    picks = rng.integers(0, len(before), (RESAMPLES, len(before)))
-    gains = 1.0 - after[picks].sum(axis=1) / np.maximum(before[picks].sum(axis=1), 1e-12)
-    if before.mean() < 1e-12:
-        gains = np.zeros(RESAMPLES)
-    low, high = np.percentile(gains, (2.5, 97.5))
-    return Heldout(
-        metric="rmse",
-        baseline=float(np.sqrt(before.mean())),
-        extended=float(np.sqrt(after.mean())),
-        noise_floor=floor,
-        gain=float(1.0 - after.mean() / before.mean()) if before.mean() >= 1e-12 else 0.0,
-        gain_ci95=(float(low), float(high)),
-        trials=tuple(f.press.trial.file for f in foretold),
-    )
-
-
-def noise_floor(
-    everyone: PressSet, locked: Sequence[int], noise: Noise, signals: Sequence[np.ndarray]
-) -> float:
+def noise_floor(everyone: PressSet, locked: PressSet, noise: Noise, signals: Sequence[np.ndarray]) -> float:
     """Root mean squared error that repeating the same recording would leave [counts].
 
     Half the mean square between replicates of the locked recordings' conditions; the fitted noise where a
@@ -73,8 +42,7 @@ def noise_floor(
     for press in everyone.presses:
         groups[press.trial.condition].append(press)
     squares = []
-    for index, signal in zip(locked, signals, strict=True):
-        press = everyone.presses[index]
+    for press, signal in zip(locked.presses, signals, strict=True):
         others = [_half_square(press, other) for other in groups[press.trial.condition] if other is not press]
         known = [value for value in others if value is not None]
         fitted = float(np.mean(noise.sigma(signal) ** 2 + (noise.gain * signal) ** 2))
@@ -118,19 +86,6 @@ def traces(foretold: Sequence[Foretold]) -> tuple[Trace, ...]:
             )
         )
     return tuple(found)
-
-
-def trial_errors(foretold: Sequence[Foretold]) -> tuple[TrialError, ...]:
-    """Root mean squared error of every held-out recording, of both models."""
-    return tuple(
-        TrialError(
-            f.press.trial.file,
-            f.press.trial.condition,
-            float(np.sqrt(np.mean((f.measured - f.simulated) ** 2))),
-            float(np.sqrt(np.mean((f.measured - f.extended) ** 2))),
-        )
-        for f in foretold
-    )
 
 
 def residual_views(foretold: Sequence[Foretold], seed: int) -> tuple[ResidualView, ...]:

@@ -81,9 +81,7 @@ class Sheet:
             None if warm is None else warm[kept]
             for warm, kept in zip(self.warmth_c, self.frames, strict=True)
         )
-        sheet = replace(self, times_s=times_s, frames=frames, warmth_c=warmth_c)
-        sheet.__dict__["all_scored"] = self.all_scored
-        return sheet
+        return replace(self, times_s=times_s, frames=frames, warmth_c=warmth_c)
 
     @cached_property
     def all_scored(self) -> np.ndarray:

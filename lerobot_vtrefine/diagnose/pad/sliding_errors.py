@@ -4,7 +4,8 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from lerobot_vtrefine.diagnose.pad.alarms import LOADED, Alarm
+from lerobot_vtrefine.diagnose.core.suspicion import Suspicion
+from lerobot_vtrefine.diagnose.pad.error_level import LOADED, beyond
 from lerobot_vtrefine.diagnose.pad.fitting import Fit
 from lerobot_vtrefine.diagnose.pad.press_trials import Press, PressSet
 from lerobot_vtrefine.diagnose.pad.weights import TrialWeights
@@ -31,9 +32,9 @@ def sliding(press: Press) -> np.ndarray:
     return press.touching & (speed > SLIDES_M_S)
 
 
-def sliding_alarm(
+def while_sliding(
     presses: PressSet, residuals: Sequence[np.ndarray], fitted: Fit, weights: Sequence[TrialWeights]
-) -> Alarm | None:
+) -> Suspicion | None:
     """Whether errors are larger while the indenter slides; None where too little slides or stays.
 
     Recordings must also say so when each is compared with itself: one that reads a little more than others
@@ -56,6 +57,5 @@ def sliding_alarm(
     both = counts.min(axis=1) >= MIN_OWN
     own = np.maximum(sums[both] / counts[both], 1e-12)
     agree = not both.any() or float(np.mean(np.log(own[:, 0] / own[:, 1]))) > np.log(AGREED)
-    fired = ratio > SLIDING and agree
     text = f"errors while the indenter slides are {np.sqrt(ratio):.1f} times those while it does not"
-    return Alarm("sliding", fired, ratio, None, text)
+    return beyond(ratio, SLIDING, text, also=agree)

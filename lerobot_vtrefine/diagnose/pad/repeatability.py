@@ -1,4 +1,4 @@
-"""Three independent alarms for structure that no named cause accounts for."""
+"""What repeats between recordings of one command, of that which the model leaves."""
 
 from collections import defaultdict
 from collections.abc import Sequence
@@ -7,18 +7,21 @@ from itertools import combinations
 
 import numpy as np
 
+from lerobot_vtrefine.diagnose.core.suspicion import Suspicion
+from lerobot_vtrefine.diagnose.pad.error_level import motion_of
 from lerobot_vtrefine.diagnose.pad.fitting import Fit
 from lerobot_vtrefine.diagnose.pad.press_trials import Press, PressSet
 from lerobot_vtrefine.diagnose.pad.weights import TrialWeights
 from lerobot_vtrefine.tactile.replay import NO_BODY_M
 
-REPEATABLE_P, REPEATABLE_SHARE = 0.01, 0.15
+REPEATABLE_SHARE = 0.15
+MIN_AGREEING = 4
+"""Conditions that must agree without exception for what repeats to be believed without a test."""
 MIN_RMS = 0.4 / 255.0
 """Repeatable residual below this part of full scale may be the converter's rounding."""
 MISFIT, MISFIT_NOISE = 0.1, 1.0 / 3.0
 """Parts of the baseline's repeatable squared error, and of the squared error that is left, up to which what
 still repeats is laid to the names' form. Effects outside the catalogue that borrow names leave a fifth."""
-FLIPS = 4999
 CORNER = 0.4
 """Doubt about the damping's part, in a frame's noise, from which on a reading says nothing about causes."""
 PAIR_CORRELATION, PAIR_DEVIATIONS, MIN_STRANGERS = 0.2, 6.0, 30
@@ -28,30 +31,6 @@ unknown cause: without a name, beside names that leave much, and beside names th
 that replicates share bring .08 and 3.5, three times the usual scatter .13."""
 LEFT = 0.25
 """Part of what repeats that names of true causes, in whatever form, do not leave."""
-LAG = 3
-LOADED = 0.05
-"""Part of the largest signal from which on a taxel counts as loaded."""
-LEVEL = 4.0
-"""Mean square of slow errors under load, in variances of a frame's noise, that is no misfit of a form."""
-CONDITION_LEVEL, MIN_LOADED = 2.5, 200
-"""The same in all recordings of one condition, and the readings that each needs; clean ones reach 1."""
-LINE_RATIO = 8.0
-LINE_FROM = 8
-"""Slowest line looked for, in periods per recording."""
-
-
-@dataclass(frozen=True)
-class Alarm:
-    """One alarm: whether it fired, how much of the residual it concerns, and what it points to.
-
-    `p_value` is None where a size is compared with a threshold and nothing is tested.
-    """
-
-    name: str
-    fired: bool
-    share: float
-    p_value: float | None
-    clue: str
 
 
 def cleaned(fitted: Fit, presses: PressSet, weights: Sequence[TrialWeights]) -> list[np.ndarray]:
@@ -142,26 +121,30 @@ def only_misfit(presses: PressSet, before: Sequence[np.ndarray], after: Sequence
     return left < MISFIT * float(plain.products.sum()) and left < MISFIT_NOISE * float(extended.powers.sum())
 
 
-def replicate_alarm(presses: PressSet, residuals: Sequence[np.ndarray], seed: int) -> Alarm | None:
-    """Products of residuals between replicates estimate what repeats; None without replicates."""
+def in_all_conditions(presses: PressSet, residuals: Sequence[np.ndarray]) -> Suspicion | None:
+    """Products of residuals between replicates estimate what repeats; None without replicates.
+
+    A condition is a score, as likely negative as positive if nothing repeats. Where all are positive, few
+    conditions need not be enough for a small p.
+    """
     found = _replicated(presses, residuals)
     if found is None:
         return None
     seen, power = float(found.products.sum()), max(float(found.powers.sum()), 1e-12)
-    rng = np.random.default_rng([seed, 9])
-    signs = rng.integers(0, 2, (FLIPS, len(presses.presses))) * 2.0 - 1.0
-    first, second = found.pairs.T
-    flipped = (signs[:, first] * signs[:, second]) @ found.products
-    p_value = float((1 + (flipped >= seen - 1e-9 * abs(seen)).sum()) / (1 + FLIPS))
-    share = seen / power
+    scores = np.zeros(len(presses.presses))
+    np.add.at(scores, _first_of_condition(presses)[found.pairs[:, 0]], found.products)
     rms = np.sqrt(max(seen, 0.0) / max(found.readings, 1))
-    fired = (
-        p_value < max(REPEATABLE_P, 1.5 * 2.0 ** -len(set(presses.conditions)))
-        and share > REPEATABLE_SHARE
-        and rms > MIN_RMS * presses.full_scale
-    )
-    text = f"{100 * share:.0f} % of the residual repeats between recordings of the same command"
-    return Alarm("replicates", bool(fired), share, p_value, text)
+    share = seen / power if rms > MIN_RMS * presses.full_scale else 0.0
+    text = f"{100 * seen / power:.0f} % of the residual repeats between recordings of the same command"
+    told = scores[scores != 0]
+    agreed = len(told) >= MIN_AGREEING and bool((told > 0).all())
+    return Suspicion(0, text, share, REPEATABLE_SHARE, None if agreed else scores)
+
+
+def _first_of_condition(presses: PressSet) -> np.ndarray:
+    """(K,) number of the first recording of everyone's condition."""
+    names = presses.conditions
+    return np.array([names.index(name) for name in names])
 
 
 @dataclass(frozen=True)
@@ -195,16 +178,16 @@ class Correlations:
         return max(float(np.std(self.strangers)), 1e-6)
 
 
-def pair_alarm(presses: PressSet, residuals: Sequence[np.ndarray], found: Correlations) -> Alarm:
+def in_one_condition(presses: PressSet, residuals: Sequence[np.ndarray], found: Correlations) -> Suspicion:
     """Correlations between replicates of one command, against those between strangers: what repeats in only a
     few conditions (a slide, say) drowns in the sum over all."""
     best = max(found.alike, key=lambda name: float(np.mean(found.alike[name])))
     seen = float(np.mean(found.alike[best]))
     rms = np.sqrt(max(seen, 0.0)) * np.sqrt(np.mean([np.mean(r**2) for r in residuals]))
     far = (seen - float(np.mean(found.strangers))) / found.spread
-    fired = far > PAIR_DEVIATIONS and seen > PAIR_CORRELATION and rms > MIN_RMS * presses.full_scale
+    sure = far > PAIR_DEVIATIONS and rms > MIN_RMS * presses.full_scale
     text = f"{100 * seen:.0f} % of the residual of condition {best} repeats between its recordings"
-    return Alarm("one condition", bool(fired), seen, None, text + _motion_of(presses, best))
+    return Suspicion(0, text + motion_of(presses, best), seen if sure else 0.0, PAIR_CORRELATION)
 
 
 def left_over(presses: PressSet, before: Sequence[np.ndarray], after: Sequence[np.ndarray]) -> float:
@@ -215,9 +198,9 @@ def left_over(presses: PressSet, before: Sequence[np.ndarray], after: Sequence[n
     return float(extended.products.sum() / plain.products.sum())
 
 
-def pairs_alarm(
+def in_all_pairs(
     presses: PressSet, residuals: Sequence[np.ndarray], found: Correlations, left: float | None
-) -> Alarm:
+) -> Suspicion:
     """The mean over all pairs of replicates, against strangers: a handful of pairs, whose signs alone tell
     little, agree far more than recordings of other commands do.
 
@@ -230,16 +213,9 @@ def pairs_alarm(
     rms = np.sqrt(max(seen, 0.0)) * np.sqrt(np.mean([np.mean(r**2) for r in residuals]))
     far = (seen - float(found.strangers.mean())) / found.spread * np.sqrt(len(values))
     least, deviations = PAIRS if left is None else PAIRS_LEFT if left > LEFT else PAIRS_MISFIT
-    fired = far > deviations and seen > least and rms > MIN_RMS * presses.full_scale
+    sure = far > deviations and rms > MIN_RMS * presses.full_scale
     text = f"residuals of replicates correlate by {seen:.2f}, those of other recordings do not"
-    return Alarm("all pairs", bool(fired), seen, None, text)
-
-
-def _motion_of(presses: PressSet, condition: str) -> str:
-    """What is special about a condition's motion."""
-    trial = next(press.trial for press in presses.presses if press.trial.condition == condition)
-    slid = float(np.hypot(np.ptp(trial.x_m), np.ptp(trial.y_m)))
-    return ", in which the indenter slides" if slid > 0.5 * presses.layout.pitch_m else ""
+    return Suspicion(0, text, seen if sure else 0.0, least)
 
 
 def _aligned(
@@ -256,81 +232,3 @@ def _aligned(
     nearer = np.abs(two.trial.time_s[step - 1] - time_s) < np.abs(two.trial.time_s[step] - time_s)
     index = np.where(nearer, step - 1, step)
     return residuals[i][:, left], other[index]
-
-
-def slow_errors(
-    fitted: Fit, residuals: Sequence[np.ndarray], weights: Sequence[TrialWeights]
-) -> tuple[np.ndarray, np.ndarray]:
-    """Mean square of slow errors under load in variances of a frame's noise, per recording (K,), and the
-    number of readings that it rests on.
-
-    From products of errors a few frames apart: noise without memory and single spikes do not count.
-    """
-    sums, readings = np.zeros(len(weights)), np.zeros(len(weights))
-    for k, (residual, signal, weight) in enumerate(zip(residuals, fitted.signals, weights, strict=True)):
-        loaded = signal > LOADED * fitted.model.setting.top_counts
-        unit = np.where(loaded, residual / weight.sigma, 0.0)
-        sums[k] = float((unit[LAG:] * unit[:-LAG]).sum())
-        readings[k] = int((loaded[LAG:] & loaded[:-LAG]).sum())
-    return sums / np.maximum(readings, 1), readings
-
-
-def level_alarm(residuals: Sequence[np.ndarray], fitted: Fit, weights: Sequence[TrialWeights]) -> Alarm:
-    """Slow errors far above the frames' own noise: recordings neither follow the model nor repeat, whatever
-    each one's gain and first touch."""
-    each, readings = slow_errors(fitted, residuals, weights)
-    ratio = float(each @ readings / max(readings.sum(), 1))
-    text = f"errors under load are {np.sqrt(max(ratio, 0.0)):.1f} times the noise of single frames"
-    return Alarm("level", ratio > LEVEL, ratio, None, text)
-
-
-def condition_alarm(
-    presses: PressSet, residuals: Sequence[np.ndarray], fitted: Fit, weights: Sequence[TrialWeights]
-) -> Alarm | None:
-    """The same in all recordings of one condition, which drowns among the others; None without replicates."""
-    each, readings = slow_errors(fitted, residuals, weights)
-    names = np.array(presses.conditions)
-    repeated = [name for name in sorted(set(names)) if (names == name).sum() > 1]
-    known = {name: each[names == name] for name in repeated if readings[names == name].min() >= MIN_LOADED}
-    if not known:
-        return None
-    worst = max(known, key=lambda name: float(known[name].min()))
-    ratio = float(known[worst].min())
-    text = f"errors in condition {worst} are {np.sqrt(max(ratio, 0.0)):.1f} times the noise of single frames"
-    fired = ratio > CONDITION_LEVEL
-    return Alarm("level of one condition", fired, ratio, None, text + _motion_of(presses, worst))
-
-
-def line_alarm(presses: PressSet, residuals: Sequence[np.ndarray]) -> Alarm | None:
-    """A sharp line in the residual's spectrum, taxels added up with their signs, in most recordings."""
-    trials = [press.trial for press in presses.presses]
-    span = float(np.median([trial.time_s[-1] - trial.time_s[0] for trial in trials]))
-    frame_s = float(np.median(np.concatenate([np.diff(trial.time_s) for trial in trials])))
-    if frame_s <= 0 or span < 64 * frame_s:
-        return None
-    frequencies = np.arange(LINE_FROM, int(0.5 * span / frame_s) + 1) / span
-    ratios, motions = [], []
-    for press, trial, residual in zip(presses.presses, trials, residuals, strict=True):
-        window = np.hanning(len(trial.time_s) + 2)[1:-1]
-        common = window * (residual - residual.mean(axis=0)).sum(axis=1)
-        kernel = np.exp(-2j * np.pi * frequencies[:, None] * trial.time_s[None, :])
-        power = np.abs(kernel @ common) ** 2
-        ratios.append(power / np.maximum(_local_median(power), 1e-12))
-        drive = (press.drive * (press.drive > 0)).sum(axis=(1, 2))
-        moves = np.abs(kernel @ (window * (drive - drive.mean()))) ** 2
-        motions.append(moves / np.maximum(_local_median(moves), 1e-30))
-    # Medians over recordings: one recording with a spike is not a line.
-    ratio, motion = np.median(ratios, axis=0), np.median(motions, axis=0)
-    best = int(np.argmax(ratio))
-    # Presses that come at regular intervals have lines of their own, and so has any misfit to them.
-    fired = bool(ratio[best] > LINE_RATIO and len(ratios) >= 3 and motion[best] < 0.5 * LINE_RATIO)
-    text = f"a line at {frequencies[best]:.2f} Hz in the residual (or its alias from a faster one)"
-    return Alarm("spectrum", fired, float(ratio[best]), None, text)
-
-
-def _local_median(power: np.ndarray, half: int = 10) -> np.ndarray:
-    padded = np.pad(power, half, mode="reflect") if len(power) > half else power
-    if len(power) <= half:
-        return np.full(len(power), float(np.median(power)))
-    windows = np.lib.stride_tricks.sliding_window_view(padded, 2 * half + 1)
-    return np.median(windows, axis=1)
