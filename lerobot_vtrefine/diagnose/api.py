@@ -3,7 +3,7 @@
     from lerobot_vtrefine.diagnose.api import diagnose
 
     found = diagnose("presses")
-    print(found.status, [cause.name for cause in found.causes])
+    print(found.verdict.status, [cause.name for cause in found.verdict.causes])
     found.extended_model.save("sensor_model.json")
 
 ``vtrefine-diagnose`` writes what `diagnose` returns, and ``scripts/bench_diagnose.py`` grades it.
@@ -20,6 +20,7 @@ from lerobot_vtrefine.diagnose.joints.dataset import read_dataset
 from lerobot_vtrefine.diagnose.joints.model import RobotModel
 from lerobot_vtrefine.diagnose.quality import check_quality, too_little
 from lerobot_vtrefine.diagnose.recordings import RecordingSet, read_recording_set
+from lerobot_vtrefine.diagnose.verdict import Verdict
 from lerobot_vtrefine.tactile.model import SensorModel
 from lerobot_vtrefine.tactile.stages.contact import KelvinVoigt
 from lerobot_vtrefine.tactile.stages.readout import Gain, Idle, Quantisation
@@ -60,10 +61,9 @@ def diagnose(
         found = _judged(sound, seed, progress)
     else:
         unit = "counts" if recordings.kind == "pad" else "rad"
-        found = Diagnosis("invalid_data", issues=(hopeless,), unit=unit)
+        found = Diagnosis(Verdict("invalid_data", data_issues=(hopeless,)), unit=unit)
     return replace(
-        found,
-        issues=(*issues, *found.issues),
+        found.noting(*issues),
         baseline_model=found.baseline_model or _unfitted_model(recordings),
         extended_model=found.extended_model or _unfitted_model(recordings),
         checked=len(sound.trials),

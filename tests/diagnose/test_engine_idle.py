@@ -42,5 +42,5 @@ def test_an_unexplained_verdict_hands_out_no_model_worse_than_the_baseline() -> 
     trials = tuple(one_trial(number, worn(number // 2), 12, 1.0, 0.0) for number in range(16))
     held = RecordingSet(Path(), "pad", ROWS, COLS, 0.002, "adc_counts", 255.0, (), trials)
     found = diagnose_pad(held)
-    assert found.heldout is not None
-    assert found.heldout.extended < 1.05 * found.heldout.baseline
+    assert found.verdict.heldout is not None
+    assert found.verdict.heldout.extended < 1.05 * found.verdict.heldout.baseline

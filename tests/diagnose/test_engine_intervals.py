@@ -83,7 +83,7 @@ def test_a_parameter_that_overflows_is_taken_at_its_coordinates_end() -> None:
 def test_delays_are_known_to_a_part_of_a_frame_at_best(monkeypatch: pytest.MonkeyPatch) -> None:
     found = SimpleNamespace(best=None, alike=lambda motions: [])
     exact = LeftOut(np.array([0.03]), np.full((4, 1), 0.03), np.zeros((0, 1)), 8)
-    monkeypatch.setattr(intervals, "walk", lambda *given: found)
+    monkeypatch.setattr(intervals, "profile", lambda *given: found)
     monkeypatch.setattr(intervals, "leave_out", lambda *given: exact)
     monkeypatch.setattr(intervals, "motions_of", lambda presses: [])
     found.alike = lambda motions: [SimpleNamespace(model=SimpleNamespace(values=np.array([0.03])))]

@@ -59,7 +59,7 @@ def infer[P: Problem[Any, Any]](
     count = len(whole.conditions)
     locked = np.array(lock(whole.conditions, seed) if locking else [], dtype=int)
     problem = whole.subset(np.setdiff1d(np.arange(count), locked))
-    search = ScreenedSearch if problem.screens else Search
+    search: Any = ScreenedSearch if problem.screens else Search
     selection = search(problem, seed, _steps(tell)).run()
     selection = selection.problem.reviewed(selection, seed)
     whole = whole.revised(selection.fit, [item for items in selection.chosen.values() for item in items])
@@ -131,6 +131,10 @@ def guarded[P: Problem[Any, Any], F: Fit, C: Candidate](
             if gain >= 0:
                 break
             surely = gain_interval(base, extended, seed)[1] < 0
+            if selection.problem.screens and not surely:
+                # Scores found the name, and errors of a few locked trials do not disprove it: the model goes.
+                kept = selection.problem.without_effect(selection.fit, selection.baseline)
+                return replace(selection, fit=kept), tuple(refused)
             refused.append(Refusal(candidate.cause, channel, gain, surely))
             selection = taken_back(selection, [candidate], channel)
     return selection, tuple(refused)

@@ -304,11 +304,15 @@ class ScreenedProblem[F: ScoredFit, C: FormCandidate](Problem[F, C], Protocol):
         ...
 
     def screened(self, now: F, only: Collection[str] | None = None) -> list[Promise[C]]:
-        """Every cause that a fit does not hold (or those of some names), by the most certain of its probes."""
+        """Every cause (or those of some names) that a fit does not hold, by its most certain probe."""
         ...
 
     def refinements(self, candidate: C) -> Sequence[C]:
         """Other forms of the same cause, the plainer first."""
+        ...
+
+    def without_effect(self, fit: F, baseline: F) -> F:
+        """A fit that keeps its names, and is handed out with the baseline's predictions."""
         ...
 
     @override

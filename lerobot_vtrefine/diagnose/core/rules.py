@@ -63,7 +63,7 @@ SIZE_DOUBT = 2.0
 FITTED = 6
 """Candidates that pass the score test and are fitted in a round, the most promising ones."""
 AGREEMENT_P = 0.05
-"""Chance that trials left out are predicted better as often by what passed the test, if there were nothing."""
+"""Chance that what passed the test predicts as many trials left out better, if there were nothing."""
 PROMISING = 0.4
 """Part of the best candidate's gain that a cause's plain form must reach for its other forms to be tried."""
 RICH = 2

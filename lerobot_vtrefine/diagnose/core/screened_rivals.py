@@ -1,4 +1,4 @@
-"""Causes that these trials cannot tell apart, of candidates that are tested by scores before any is fitted."""
+"""Causes that these trials cannot tell apart, where a score test says which candidates are fitted."""
 
 from functools import partial
 from typing import Any

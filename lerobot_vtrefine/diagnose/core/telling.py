@@ -13,8 +13,8 @@ from lerobot_vtrefine.diagnose.core.rivals import without_cause
 from lerobot_vtrefine.diagnose.core.rules import ALPHA, LEAST_GAIN, SCREEN_ALPHA
 from lerobot_vtrefine.diagnose.core.search import ALL, Examined
 from lerobot_vtrefine.diagnose.core.suspicion import Alarm
-from lerobot_vtrefine.diagnose.evidence import Evidence, TrialError
-from lerobot_vtrefine.diagnose.verdict import Cause, Role, Status, Unknown
+from lerobot_vtrefine.diagnose.evidence import Evidence, TrialError, not_tested
+from lerobot_vtrefine.diagnose.verdict import Cause, Role, Status, Unknown, Verdict
 
 Array = np.ndarray
 Found = Inference[Any, Any, Any]
@@ -44,18 +44,23 @@ def tell(found: Found, account: Account[Any, Any]) -> Diagnosis:
     traces, residuals = account.drawings(test, found.seed)
     gains = 1 - after.mean(0) / before.mean(0).clip(1e-300)
     held = heldout_gain(before, after, test.files, account.metric, account.noise_floor(), found.seed)
+    evidence = tuple(_evidence(found, account, name) for name in _names(found, account))
+    verdict = Verdict(
+        _status(bool(causes), bool(ambiguous), alarmed),
+        causes,
+        ambiguous,
+        _unknown(found.alarms, test.channels),
+        held if found.locked else None,
+        account.minimum_detectable(),
+        account.next_experiment(found.rivals, found.alarms),
+        not_tested=not_tested(evidence),
+    )
     return Diagnosis(
-        status=_status(bool(causes), bool(ambiguous), alarmed),
-        causes=causes,
-        ambiguous_with=ambiguous,
-        unknown=_unknown(found.alarms, test.channels),
-        heldout=held if found.locked else None,
-        minimum_detectable=account.minimum_detectable(),
-        next_experiment=account.next_experiment(found.rivals, found.alarms),
+        verdict,
         baseline_model=account.model(selection.baseline),
         extended_model=account.model(selection.fit),
         baseline_params=account.baseline_parameters(),
-        evidence=tuple(_evidence(found, account, name) for name in _names(found, account)),
+        evidence=evidence,
         traces=traces,
         residuals=residuals,
         trial_errors=_trial_errors(test, before, after),

@@ -24,7 +24,7 @@ from lerobot_vtrefine.diagnose.pad.candidates import CATALOGUE
 from lerobot_vtrefine.diagnose.pad.candidates.base import Form
 from lerobot_vtrefine.diagnose.pad.candidates.sample_and_hold import shortest_period
 from lerobot_vtrefine.diagnose.pad.fitting import Fit, movable, squared_errors, tangents
-from lerobot_vtrefine.diagnose.pad.screening import MAPS, Scorer, probe_form
+from lerobot_vtrefine.diagnose.pad.screening import MAPS, Scorer
 from lerobot_vtrefine.diagnose.pad.taxel_maps import DEAD_ERROR, MAX_SIGMA, map_evidence, plain_gains
 
 if TYPE_CHECKING:
@@ -78,6 +78,19 @@ def power_of(problem: "PadProblem", fitted: Fit) -> Power:
     )
 
 
+@dataclass(frozen=True)
+class _Effect:
+    """One effect at one size, as the recordings would see it."""
+
+    values: np.ndarray
+    scores: np.ndarray
+    """(K,) of what is left now."""
+    information: np.ndarray
+    """(K,) that the effect itself would score."""
+    taken: float
+    """Squared error that it is worth, beyond what the model's own parameters can do."""
+
+
 class _Injection:
     """Effects injected into one fitted model."""
 
@@ -90,9 +103,19 @@ class _Injection:
         self.needed = LEAST_GAIN if not fitted.model.families else problem.further_gain
         self.error = float(squared_errors(fitted.signals, problem.presses).sum())
         forms = [form for form in CATALOGUE if form.screened and form.possible(fitted.model.setting)]
-        probes = [probe for form in forms for probe in probe_form(form, self.scorer)]
+        self._guessed = dict(zip(forms, on_all_cores(self._guesses, forms), strict=True))
+        probes = [_probe(form, e, e.scores) for form, effects in self._guessed.items() for e in effects]
         self._names = len({probe.name for probe in probes}) + len(MAPS)
         self._critical = self._critical_p(probes)
+
+    def _guesses(self, form: Form) -> list[_Effect]:
+        guesses = form.probes(self.fitted.model.setting)
+        return [self._effect(form, np.asarray(guess, dtype=float)) for guess in guesses]
+
+    def _effect(self, form: Form, values: np.ndarray) -> _Effect:
+        change = self.scorer.change(form, values)
+        taken = float(self._even.score(change)[1].sum()) / max(self.error, 1e-12)
+        return _Effect(values, *self.scorer.score(change), taken)
 
     def _critical_p(self, probes: Sequence[Probe]) -> float:
         """Largest p-value that passes the screening after adjustment for all these probes."""
@@ -103,48 +126,44 @@ class _Injection:
 
     def smallest(self, form: Form) -> float | None:
         """Size of a form's main parameter that just shows; None if none does."""
-        guesses = [np.asarray(guess, dtype=float) for guess in form.probes(self.fitted.model.setting)]
-        if not guesses:
-            return None
-        reached = [self._reach(form, values) / max(self._public(form, values), 1e-12) for values in guesses]
+        guesses = self._guessed[form]
+        reached = [self._reach(form, e) / max(self._public(form, e.values), 1e-12) for e in guesses]
         better = max if form.family == "saturation" else min
         best = sorted(range(len(guesses)), key=lambda index: -reached[index])[:2]
         sizes = [self._grown(form, guesses[index]) for index in best]
         return better((self._public(form, size) for size in sizes if size is not None), default=None)
 
-    def _grown(self, form: Form, values: np.ndarray) -> np.ndarray | None:
+    def _grown(self, form: Form, guess: _Effect) -> np.ndarray | None:
         """Coordinates, corrected in proportion, at which the effect just shows; None if it never does."""
-        grow = np.arange(len(values)) if form.amplitude is None else np.array([form.amplitude])
-        best = None
-        for _ in range(TRIALS):
-            reach = self._reach(form, values)
+        grow = np.arange(len(guess.values)) if form.amplitude is None else np.array([form.amplitude])
+        effect, best = guess, None
+        for number in range(TRIALS):
+            values = effect.values
+            reach = self._reach(form, effect)
             if reach >= 1.0 and (best is None or np.abs(values[grow]).sum() < np.abs(best[grow]).sum()):
                 best = values
-            if 1.0 <= reach <= 1.2:
-                break
             at_end = bool(((values >= form.high) | (values <= form.low))[grow].any())
-            if reach < 1.0 and at_end:
+            if 1.0 <= reach <= 1.2 or (reach < 1.0 and at_end) or number == TRIALS - 1:
                 break
             values = values.copy()
             values[grow] *= float(np.clip(1.1 / max(reach, 1e-6), 0.02, 50.0))
-            values = np.clip(values, form.low, form.high)
+            effect = self._effect(form, np.clip(values, form.low, form.high))
         return best
 
-    def _reach(self, form: Form, values: np.ndarray) -> float:
+    def _reach(self, form: Form, effect: _Effect) -> float:
         """How far an injected effect goes towards being seen: 1 where it just is."""
-        change = self.scorer.change(form, values)
-        scores, information = self.scorer.score(change)
-        scatter = scores - scores.mean()
-        size = float(information.sum()) / max(float(np.sqrt((scatter**2).sum())), 1e-12) / SURE
-        taken = float(self._even.score(change)[1].sum()) / max(self.error, 1e-12)
-        worth = np.sqrt(taken * (1.0 - self.needed) / self.needed)
+        scatter = effect.scores - effect.scores.mean()
+        error = max(float(np.sqrt((scatter**2).sum())), 1e-12)
+        size = float(effect.information.sum()) / error / SURE
+        worth = np.sqrt(effect.taken * (1.0 - self.needed) / self.needed)
         reach = float(min(size, worth))
-        return reach if self._passes(form, information + scatter, information) else min(reach, 0.7)
+        return reach if self._passes(form, effect, effect.information + scatter) else min(reach, 0.7)
 
-    def _passes(self, form: Form, scores: np.ndarray, information: np.ndarray) -> bool:
+    def _passes(self, form: Form, effect: _Effect, scores: np.ndarray) -> bool:
         """Whether such scores pass the screening: an effect in a few recordings only cannot."""
-        probe = Probe(form.family, form, np.ones(1), scores, information, not form.signed)
-        p_value = float(tail_shares(flip_statistics([probe], self._signs))[0, 0])
+        probe = _probe(form, effect, scores)
+        statistics = flip_statistics([probe], self._signs)[:, 0]
+        p_value = float((statistics >= statistics[0] - 1e-9).mean())
         if p_value <= self._critical:
             return True
         few = len(scores) < FEW_FOR_SIGNS and p_value <= 2.5 * 2.0 ** (1 - len(scores))
@@ -156,6 +175,10 @@ class _Injection:
         if value == 0.0 and form.family in ("crosstalk", "pad_tilt"):
             value = max((abs(item[0]) for item in report.values()), default=0.0)
         return float(abs(value - NULL.get(form.family, 0.0)))
+
+
+def _probe(form: Form, effect: _Effect, scores: np.ndarray) -> Probe:
+    return Probe(form.family, form, effect.values, scores, effect.information, not form.signed)
 
 
 def _smallest_spread(bench: _Injection) -> float | None:

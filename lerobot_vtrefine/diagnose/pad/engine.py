@@ -10,7 +10,7 @@ from lerobot_vtrefine.diagnose.pad.account import PadAccount
 from lerobot_vtrefine.diagnose.pad.press_trials import prepare, usable
 from lerobot_vtrefine.diagnose.pad.problem import PadProblem
 from lerobot_vtrefine.diagnose.recordings import RecordingSet, Trial
-from lerobot_vtrefine.diagnose.verdict import DataIssue
+from lerobot_vtrefine.diagnose.verdict import DataIssue, Verdict
 
 MIN_RECORDINGS = 2
 FEW_RECORDINGS = 8
@@ -38,13 +38,12 @@ def diagnose_pad(recordings: RecordingSet, seed: int = 0, progress: Progress | N
     found = infer(whole, seed, progress)
     account = PadAccount(found, whole)
     told = tell(found, account)
-    return replace(told, issues=(*issues, *_little_data(len(trials), len(locked))), maps=account.maps())
+    return replace(told, maps=account.maps()).noting(*issues, *_little_data(len(trials), len(locked)))
 
 
 def _invalid(issues: list[DataIssue], problem: str) -> Diagnosis:
-    return Diagnosis(
-        "invalid_data", issues=(*issues, DataIssue(None, problem, "nothing was fitted")), unit="counts"
-    )
+    noted = (*issues, DataIssue(None, problem, "nothing was fitted"))
+    return Diagnosis(Verdict("invalid_data", data_issues=noted), unit="counts")
 
 
 def _little_data(count: int, locked: int) -> list[DataIssue]:

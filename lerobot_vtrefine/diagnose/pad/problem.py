@@ -23,6 +23,7 @@ from lerobot_vtrefine.diagnose.pad.baseline import Baseline, fit_baseline, plain
 from lerobot_vtrefine.diagnose.pad.candidates import CATALOGUE
 from lerobot_vtrefine.diagnose.pad.candidates.base import Form
 from lerobot_vtrefine.diagnose.pad.error_level import slow_errors
+from lerobot_vtrefine.diagnose.pad.final_model import FinalFit
 from lerobot_vtrefine.diagnose.pad.fitting import Fit, losses_of, predict, refit_weighted, squared_errors
 from lerobot_vtrefine.diagnose.pad.form_fitting import Starts, grown, settle, starts_of, with_form, without
 from lerobot_vtrefine.diagnose.pad.noise import Noise
@@ -33,6 +34,7 @@ from lerobot_vtrefine.diagnose.pad.taxel_maps import MapEvidence, find_dead, map
 from lerobot_vtrefine.diagnose.pad.weights import TrialWeights
 
 Array = np.ndarray
+type Found = Fit | FinalFit
 type Selected = Selection["PadProblem", Any, "Candidate"]
 
 FURTHER_GAIN = 0.025
@@ -173,10 +175,10 @@ class PadProblem(NothingBesides):
             return grown(plainer, form, self.presses, self.weights)
         return with_form(now, form, candidate.starts.get(form.label, ()), self.presses, self.weights)
 
-    def reduced(self, now: Fit, candidates: Sequence[Candidate], channels: Array) -> Fit:
+    def reduced(self, now: Found, candidates: Sequence[Candidate], channels: Array) -> Found:
         """Without candidates."""
         families = [item.cause for item in candidates]
-        if isinstance(now, final_model.FinalFit):
+        if isinstance(now, FinalFit):
             return now.without(families, self)
         return without(now, families, self.presses, self.weights)
 
@@ -192,9 +194,9 @@ class PadProblem(NothingBesides):
         """There is one channel."""
         return other if take_other[0] else one
 
-    def errors(self, fit: Fit) -> Array:
+    def errors(self, fit: Found) -> Array:
         """(K, 1) as users' predictions have them, where there is a model for users already."""
-        if isinstance(fit, final_model.FinalFit):
+        if isinstance(fit, FinalFit):
             return self.predictions.errors(fit.sensor)
         return squared_errors(predict(fit.model, self.presses), self.presses)[:, None]
 
@@ -260,6 +262,10 @@ class PadProblem(NothingBesides):
     def refinements(self, candidate: Candidate) -> list[Candidate]:
         """The cause's other forms."""
         return [replace(candidate, form=form, others=()) for form in candidate.others]
+
+    def without_effect(self, fit: FinalFit, baseline: FinalFit) -> FinalFit:
+        """Names and sizes stay; users get the baseline."""
+        return replace(fit, sensor=baseline.sensor)
 
     # Between the steps of the method.
 

@@ -11,7 +11,7 @@ from lerobot_vtrefine.diagnose.core.screened_search import CHANNEL, clearly_bett
 from lerobot_vtrefine.diagnose.core.search import Selection
 from lerobot_vtrefine.diagnose.pad.damping_profile import profile
 from lerobot_vtrefine.diagnose.pad.fitting import Fit
-from lerobot_vtrefine.diagnose.pad.form_fitting import starts_of
+from lerobot_vtrefine.diagnose.pad.form_fitting import starts_of, without
 from lerobot_vtrefine.diagnose.pad.screening import MAPS, forms_of, probe_form, scorer_of
 
 if TYPE_CHECKING:
@@ -43,7 +43,7 @@ class _State:
         return self.problem.extended(fit, _candidate(name, form, {form.label: starts}), _ALL)
 
     def without(self, name: str) -> Fit:
-        return self.problem.reduced(self.fit, [_candidate(name, None, {})], _ALL)
+        return without(self.fit, [name], self.problem.presses, self.problem.weights)
 
 
 def _candidate(name: str, form: Any, starts: dict[str, Any]) -> "Candidate":
@@ -66,7 +66,8 @@ def reviewed(selection: Selection["PadProblem", Fit, Any], seed: int) -> Selecti
         p_values[name, CHANNEL] = p_values.get((bend, CHANNEL))
     state = plain_forms(state)
     state = state.weighed(state.fit)
-    state = state.weighed(resolved(state))
+    best = resolved(state)
+    state = state if best is state.fit else state.weighed(best)
     model = state.fit.model
     chosen = tuple(_candidate(form.family, form, {}) for form in model.forms)
     chosen += tuple(_candidate(name, None, {}) for name in MAPS if name in model.families)

@@ -28,7 +28,7 @@ _FOLLOWS = 0.02
 _FOLLOWS_IF_OWNED = 0.1
 """Part that no form of a family leaves to the descriptors of its own kind of effect."""
 _RIDGE = 1e-9
-_WORTH_A_LOOK = 1.5
+_WORTH_A_LOOK = 2.5
 """Standardised sum of scores from which on a descriptor's share is worked out; tests ask for over three."""
 
 
