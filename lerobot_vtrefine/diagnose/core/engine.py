@@ -133,7 +133,8 @@ def guarded[P: Problem[Any, Any], F: Fit, C: Candidate](
             surely = gain_interval(base, extended, seed)[1] < 0
             if selection.problem.screens and not surely:
                 # Scores found the name, and errors of a few locked trials do not disprove it: the model goes.
-                kept = selection.problem.without_effect(selection.fit, selection.baseline)
+                screened: Any = selection.problem
+                kept = screened.without_effect(selection.fit, selection.baseline)
                 return replace(selection, fit=kept), tuple(refused)
             refused.append(Refusal(candidate.cause, channel, gain, surely))
             selection = taken_back(selection, [candidate], channel)

@@ -75,6 +75,11 @@ class FinalFit:
         """(K, 1) of the search's fit."""
         return self.fit.mse
 
+    @property
+    def scores(self) -> np.ndarray:
+        """(K, 1) of the search's fit."""
+        return self.fit.scores
+
     def without(self, families: Sequence[str], problem: "PadProblem") -> "FinalFit":
         """Without some causes, the others fitted to plain readings."""
         model = self.fit.model
