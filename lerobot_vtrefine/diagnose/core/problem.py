@@ -27,31 +27,25 @@ class Candidate(Protocol):
     @property
     def cause(self) -> str:
         """A name of the catalogue, or of something without a name (a decoy)."""
-        ...
 
     @property
     def shared(self) -> bool:
         """Whether it acts on all channels together and is one hypothesis."""
-        ...
 
     @property
     def clue(self) -> str:
         """What a decoy would mean; empty for what has a name. Decoys compete and are never handed out."""
-        ...
 
     @property
     def handicap(self) -> float:
         """Part of the error by which it must beat forms with fewer terms."""
-        ...
 
     @property
     def only_where(self) -> str:
         """Cause that must have helped on a channel for this one to be tried there; empty: everywhere."""
-        ...
 
     def refines(self, other: "Candidate") -> bool:
         """Whether its fit starts from that of another."""
-        ...
 
 
 @dataclass(frozen=True)
@@ -75,7 +69,6 @@ class Fit(Protocol):
     @property
     def mse(self) -> Array:
         """(T, J) mean squared error."""
-        ...
 
 
 class Reweighted(Protocol):
@@ -84,11 +77,9 @@ class Reweighted(Protocol):
     @property
     def channels(self) -> Array:
         """Numbers of the channels that may change."""
-        ...
 
     def errors(self, weights: Array, trials: Array) -> Array:
         """Mean squared errors of some trials on `channels` if every trial counted `weights` (T,) times."""
-        ...
 
 
 class Problem[F: Fit, C: Candidate](Protocol):
@@ -97,40 +88,32 @@ class Problem[F: Fit, C: Candidate](Protocol):
     @property
     def subject(self) -> str:
         """What is judged, for progress and sentences."""
-        ...
 
     @property
     def channels(self) -> tuple[str, ...]:
         """Names of the J channels."""
-        ...
 
     @property
     def conditions(self) -> tuple[str, ...]:
         """(T,) equal where trials are driven alike."""
-        ...
 
     @property
     def files(self) -> tuple[str, ...]:
         """(T,) names of the trials."""
-        ...
 
     def subset(self, trials: Array) -> Self:
         """The same on fewer trials."""
-        ...
 
     # Fits.
 
     def baseline(self) -> F:
         """The simulation's own model, refitted."""
-        ...
 
     def candidates(self) -> Sequence[C]:
         """Everything that may be wrong."""
-        ...
 
     def applicable(self, candidate: C, now: F) -> Array:
         """(J,) bool: channels on which these trials could show it, and which a fit does not give it yet."""
-        ...
 
     def extended(self, now: F, candidate: C, channels: Array, plainer: F | None = None) -> F:
         """Fit a candidate on top of a fit, on channels (J,) bool where it is applicable.
@@ -138,69 +121,54 @@ class Problem[F: Fit, C: Candidate](Protocol):
         Args:
             plainer: the fit of the candidate that it refines, where there is one already.
         """
-        ...
 
     def reduced(self, now: F, candidates: Sequence[C], channels: Array) -> F:
         """Refit without candidates on channels (J,) bool; what is shared goes everywhere."""
-        ...
 
     def refitted(self, now: F) -> F:
         """Everything that is free, fitted anew."""
-        ...
 
     def merged(self, one: F, other: F, take_other: Array) -> F:
         """Channels of the one fit, those of the other where (J,) says so."""
-        ...
 
     def errors(self, fit: F) -> Array:
         """(T, J) mean squared errors under a fit that may have been made on other trials."""
-        ...
 
     def reweighted(self, fit: F, channels: Array | None = None) -> Reweighted:
         """For cross-validation; only some channels (numbers) move if they are given."""
-        ...
 
     def credible(self, baseline: F, now: F, best: F, candidate: C) -> Array:
         """(J,) bool: whether the size found is large enough to be seen and no larger than errors allow."""
-        ...
 
     @property
     def screens(self) -> bool:
         """Whether it is a `ScreenedProblem`."""
-        ...
 
     # What only the instrument knows, between the steps of the method.
 
     def revised(self, now: F, accepted: Sequence[C]) -> Self:
         """The problem after candidates were accepted; itself where these change nothing about it."""
-        ...
 
     def reviewed(self, selection: "Selection[Any, F, C]", seed: int) -> "Selection[Any, F, C]":
         """The selection after a look at what candidates cannot say."""
-        ...
 
     @property
     def can_settle(self) -> bool:
         """Whether `settles` can decide anything here."""
-        ...
 
     def settles(self, rival: "Rival[F, C]", selection: "Selection[Any, F, C]", seed: int) -> int:
         """What else than the errors decides a tie: 1 for the rival, -1 for the cause, 0 for neither."""
-        ...
 
     def finer(self) -> Self | None:
         """The same trials with predictions for which the search is too slow; None where there are none."""
-        ...
 
     def handed_out(
         self, selection: "Selection[Any, F, C]", seed: int, *, doubtful: bool
     ) -> "Selection[Any, F, C]":
         """The selection with fits as users get them; `doubtful`: beside something that has no name."""
-        ...
 
     def suspicions(self, selection: "Selection[Any, F, C]", seed: int) -> "Sequence[Suspicion]":
         """What may be left, as scores of trials."""
-        ...
 
 
 class NothingBesides:
@@ -240,17 +208,14 @@ class FormCandidate(Candidate, Protocol):
     @property
     def terms(self) -> int:
         """Coordinates that it adds; 0 where none are counted (a map that is shrunk): it imitates nothing."""
-        ...
 
     @property
     def peer(self) -> bool:
         """Of another form than the plain one: whether it is no richer than that."""
-        ...
 
     @property
     def disturbs(self) -> bool:
         """Whether nothing else can be fitted well before it is: where it helps, it is taken first."""
-        ...
 
 
 class ScoredFit(Fit, Protocol):
@@ -259,7 +224,6 @@ class ScoredFit(Fit, Protocol):
     @property
     def scores(self) -> Array:
         """(T, J) log score of every trial, up to a constant."""
-        ...
 
 
 class Scored(Reweighted, Protocol):
@@ -267,7 +231,6 @@ class Scored(Reweighted, Protocol):
 
     def judged(self, weights: Array, trials: Array) -> tuple[Array, Array]:
         """Mean squared errors and log scores of some trials if every trial counted `weights` (T,) times."""
-        ...
 
 
 @dataclass(frozen=True)
@@ -289,36 +252,28 @@ class ScreenedProblem[F: ScoredFit, C: FormCandidate](Problem[F, C], Protocol):
     @property
     def further_gain(self) -> float:
         """Part of the error that a cause beside others must take away: patching their form gains some."""
-        ...
 
     def weighed(self, now: F | None) -> tuple[Self, F]:
         """The problem with the noise around a fit (None: the baseline's) for weights, and the fit anew."""
-        ...
 
     def unweighed(self, now: F) -> tuple[Self, F]:
         """The same where all readings count alike."""
-        ...
 
     def far_off(self, now: F) -> bool:
         """Whether errors are so far above noise that weights may hide what is wrong."""
-        ...
 
     def screened(self, now: F, only: Collection[str] | None = None) -> list[Promise[C]]:
         """Every cause (or those of some names) that a fit does not hold, by its most certain probe."""
-        ...
 
     def refinements(self, candidate: C) -> Sequence[C]:
         """Other forms of the same cause, the plainer first."""
-        ...
 
     def without_effect(self, fit: F, baseline: F) -> F:
         """A fit that keeps its names, and is handed out with the baseline's predictions."""
-        ...
 
     @override
     def reweighted(self, fit: F, channels: Array | None = None) -> Scored:
         """With log scores."""
-        ...
 
 
 class Account[F: Fit, C: Candidate](Protocol):
@@ -329,42 +284,32 @@ class Account[F: Fit, C: Candidate](Protocol):
 
     def parameters(self, cause: str, channels: tuple[int, ...]) -> Mapping[str, Parameter]:
         """Sizes with intervals."""
-        ...
 
     def baseline_parameters(self) -> Mapping[str, Parameter]:
         """Those of the refitted baseline."""
-        ...
 
     def model(self, fit: F) -> Savable | None:
         """As the file that is written."""
-        ...
 
     def minimum_detectable(self) -> Mapping[str, float]:
         """Cause -> smallest size that these trials would have shown."""
-        ...
 
     def noise_floor(self) -> float | None:
         """Root mean square error that no model could undo."""
-        ...
 
     def causes(self) -> Sequence[str]:
         """Names that are told about, found or not."""
-        ...
 
     def caveat(self, cause: str, channels: tuple[int, ...]) -> str:
         """What an accepted cause leaves open."""
-        ...
 
     def not_identifiable(self, cause: str) -> str:
         """Why these trials cannot show a cause; empty where they can."""
-        ...
 
     def next_experiment(
         self, rivals: "Sequence[Rival[F, C]]", alarms: "Sequence[Alarm]"
     ) -> Mapping[str, Any] | None:
         """What to record next."""
-        ...
 
     def drawings(self, test: Any, seed: int) -> tuple[tuple[Trace, ...], tuple[ResidualView, ...]]:
         """What the report draws about locked trials."""
-        ...

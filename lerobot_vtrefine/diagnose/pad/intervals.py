@@ -13,7 +13,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy import stats
 
-from lerobot_vtrefine.diagnose.core.resampling import independent_units
+from lerobot_vtrefine.diagnose.core.resampling import independent_units, jackknife
 from lerobot_vtrefine.diagnose.pad.candidates.base import Form, Setting
 from lerobot_vtrefine.diagnose.pad.damping_profile import DAMPING, profile
 from lerobot_vtrefine.diagnose.pad.fitting import Fit, free_step
@@ -23,7 +23,6 @@ from lerobot_vtrefine.diagnose.pad.weights import TrialWeights
 from lerobot_vtrefine.diagnose.verdict import Parameter
 
 LEVEL = (2.5, 97.5)
-MIN_FREEDOM = 2.0
 DIGITS = 6
 UNSEEN = 0.1
 """Part of a frame by which delays may be off whatever the noise: nobody saw where between two frames a motion
@@ -55,16 +54,8 @@ class LeftOut:
         return error * float(stats.t.ppf(0.975, max(self.recordings - 1, 1))) if np.isfinite(error) else 0.0
 
     def _by_motions(self, of: Callable[[np.ndarray], float], best: float) -> float:
-        moved = np.array([of(values) for values in self.without]) - best
-        count, power = len(moved), moved**2
-        total = float(power.sum())
-        if count < 2 or not np.isfinite(total) or total <= 0:
-            return 0.0
-        error = float(np.sqrt((count - 1) / count * total))
-        # A normal deviate's fourth moment is 3: one motion that carries everything leaves 2 degrees.
-        shares = power / total
-        freedom = float(np.clip(3.0 / (shares**2).sum() - 1.0, MIN_FREEDOM, count - 1))
-        return error * float(stats.t.ppf(0.975, freedom))
+        low, high = jackknife(np.array([of(values) for values in self.without]), best, best)
+        return 0.5 * (high - low)
 
 
 def motions_of(presses: PressSet) -> list[list[int]]:

@@ -6,12 +6,12 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from lerobot_vtrefine.diagnose.core.residual_views import residual_view
 from lerobot_vtrefine.diagnose.evidence import ResidualView, Trace
 from lerobot_vtrefine.diagnose.pad.noise import Noise
 from lerobot_vtrefine.diagnose.pad.press_trials import Press, PressSet
 
 TRACE_CHANNELS = 6
-BINS = 12
 
 
 @dataclass(frozen=True)
@@ -90,15 +90,15 @@ def traces(foretold: Sequence[Foretold]) -> tuple[Trace, ...]:
 
 def residual_views(foretold: Sequence[Foretold], seed: int) -> tuple[ResidualView, ...]:
     """Mean residual against load, rate, history, position and time."""
-    axes: dict[str, tuple[str, list[np.ndarray]]] = {}
-    for item in foretold:
-        for name, (unit, values) in _axes(item).items():
-            axes.setdefault(name, (unit, []))[1].append(values)
-    return tuple(
-        view
-        for name, (unit, values) in axes.items()
-        if len(values) == len(foretold) and (view := _view(name, unit, values, foretold, seed)) is not None
-    )
+    axes = [_axes(item) for item in foretold]
+    views = []
+    for name, (unit, _) in axes[0].items():
+        trials = [
+            (own[name][1], item.measured - item.simulated, item.measured - item.extended)
+            for own, item in zip(axes, foretold, strict=True)
+        ]
+        views.append(residual_view(name, unit, trials, seed))
+    return tuple(view for view in views if view is not None)
 
 
 def _axes(item: Foretold) -> dict[str, tuple[str, np.ndarray]]:
@@ -121,34 +121,6 @@ def _axes(item: Foretold) -> dict[str, tuple[str, np.ndarray]]:
         axes["rate"] = ("m/s", np.where(drive > 0, press.rate[:, press.scored], 0.0))
         axes["depth"] = ("m", np.where(drive > -0.5, drive, np.nan))
     return axes
-
-
-def _view(
-    name: str, unit: str, values: list[np.ndarray], foretold: Sequence[Foretold], seed: int
-) -> ResidualView | None:
-    everything = np.concatenate([value[np.isfinite(value)] for value in values])
-    if not len(everything) or np.ptp(everything) <= 0:
-        return None
-    edges = np.unique(np.linspace(*np.percentile(everything, (0.5, 99.5)), BINS + 1))
-    if len(edges) < 3:
-        return None
-    sums = np.zeros((3, len(foretold), len(edges) - 1))
-    for k, (value, item) in enumerate(zip(values, foretold, strict=True)):
-        good = np.isfinite(value)
-        place = np.clip(np.searchsorted(edges, value[good], side="right") - 1, 0, len(edges) - 2)
-        for row, part in enumerate((item.measured - item.simulated, item.measured - item.extended)):
-            sums[row, k] = np.bincount(place, part[good], len(edges) - 1)
-        sums[2, k] = np.bincount(place, minlength=len(edges) - 1)
-    keep = sums[2].sum(axis=0) > 0
-    sums = sums[:, :, keep]
-    count = sums[2].sum(axis=0)
-    rng = np.random.default_rng([seed, 8])
-    picks = rng.integers(0, len(foretold), (400, len(foretold)))
-    drawn = sums[:, picks].sum(axis=2)
-    bands = [np.percentile(drawn[row] / np.maximum(drawn[2], 1), (2.5, 97.5), axis=0).T for row in (0, 1)]
-    centres = 0.5 * (edges[1:] + edges[:-1])[keep]
-    before, after = sums[0].sum(axis=0) / count, sums[1].sum(axis=0) / count
-    return ResidualView(name, unit, centres, before, after, bands[0], bands[1], count)
 
 
 def residual_maps(foretold: Sequence[Foretold], presses: PressSet) -> dict[str, np.ndarray]:
