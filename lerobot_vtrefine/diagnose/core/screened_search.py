@@ -106,7 +106,6 @@ class ScreenedSearch[P: ScreenedProblem[Any, Any], F: ScoredFit, C: FormCandidat
 
     def run(self) -> Selection[P, F, C]:
         """Forward, and backward after every step."""
-        before = out_of_fold(self.problem, self.now, self.folds).errors
         for number in range(MAX_ROUNDS):
             self.tell(f"{self.problem.subject}: trying causes, round {number + 1}")
             found, step = self._round(self.problem, self.now)
@@ -121,7 +120,6 @@ class ScreenedSearch[P: ScreenedProblem[Any, Any], F: ScoredFit, C: FormCandidat
         return Selection(
             self.problem,
             self.baseline,
-            before,
             self.now,
             out_of_fold(self.problem, self.now, self.folds).errors,
             {CHANNEL: self.chosen} if self.chosen else {},

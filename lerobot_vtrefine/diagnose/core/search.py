@@ -75,8 +75,6 @@ class Selection[P: Problem[Any, Any], F: Fit, C: Candidate]:
 
     problem: P
     baseline: F
-    baseline_errors: Array
-    """(T, J) cross-validated."""
     fit: F
     errors: Array
     """(T, J) cross-validated."""
@@ -124,7 +122,7 @@ class Search[P: Problem[Any, Any], F: Fit, C: Candidate]:
         tell(f"{problem.subject}: fitting the baseline")
         self.baseline: F = problem.baseline()
         self.now = self.baseline
-        self.errors = self.baseline_errors = cross_validated(problem, self.now, self.folds)
+        self.errors = cross_validated(problem, self.now, self.folds)
         self.chosen: dict[int, tuple[C, ...]] = {}
         self.p_values: dict[tuple[str, int], float] = {}
         self.changed = np.ones(len(problem.channels), dtype=bool)
@@ -145,7 +143,6 @@ class Search[P: Problem[Any, Any], F: Fit, C: Candidate]:
         return Selection(
             self.problem,
             self.baseline,
-            self.baseline_errors,
             self.now,
             self.errors,
             self.chosen,
