@@ -134,18 +134,26 @@ def _decision(found: Found, account: Account[Any, Any], name: str, seen: Examine
     """What became of a name, and why."""
     accepted, ties = found.selection.causes(), {item.name: item for item in found.rivals}
     if name in accepted:
-        where, channels = _joined(found, accepted[name]), accepted[name]
-        reason = f"on {where}{account.caveat(name, channels)}"
-        return "symptom" if found.alarms else "accepted", reason
+        return _accepted(found, name, account.caveat(name, accepted[name]))
     if name in ties:
-        where = _joined(found, ties[name].channels)
-        return "tie", f"explains {ties[name].cause} on {where} as well"
+        return "tie", f"explains {ties[name].cause}{_where(found, ties[name].channels)} as well"
     if refused := [item.gain for item in found.refused if item.cause == name]:
         text = f"predicts worse than the baseline on trials left out (gain {min(refused):.2f})"
         return "rejected", text
-    if why := account.not_identifiable(name):
+    why, tried = account.not_identifiable(name), name in found.selection.examined
+    # A score test asks about everything; elsewhere, what was not tried could not be seen.
+    if why or not (tried or found.selection.problem.screens):
         return "not identifiable", why
     return "rejected", _why_rejected(found, seen)
+
+
+def _accepted(found: Found, name: str, caveat: str) -> tuple[str, str]:
+    where = _where(found, found.selection.causes()[name])
+    seen = "seen in the readings themselves, not tested; " if found.selection.observed(name) else ""
+    reason = f"{seen}predicts trials that its fit has not seen better{where}{caveat}"
+    if not found.alarms:
+        return "accepted", reason
+    return "symptom", f"{reason}; but something is left that no cause explains: the name may be borrowed"
 
 
 def _why_rejected(found: Found, seen: Examined) -> str:
@@ -155,20 +163,22 @@ def _why_rejected(found: Found, seen: Examined) -> str:
         if seen.p_adjusted > SCREEN_ALPHA:
             return f"trials agree on it no more than by chance (adjusted p above {SCREEN_ALPHA:g})"
         return "passed the score test, but others explained more and left nothing for it"
-    where = "all channels" if seen.channel == ALL else found.test.channels[seen.channel]
+    where = " on all channels" if seen.channel == ALL else _where(found, (seen.channel,))
     if seen.gain > LEAST_GAIN and (seen.p_adjusted is None or seen.p_adjusted < ALPHA):
-        return f"significant on {where} by itself, but another cause explains it better"
-    return (
-        f"strongest on {where}; in such trials chance gives as much, or it is under "
-        f"{100 * LEAST_GAIN:.0f} % of error"
-    )
+        return f"significant{where} by itself, but another cause explains it better"
+    least = f"under {100 * LEAST_GAIN:.0f} % of error"
+    place = f"strongest{where}; " if where else ""
+    return f"{place}in such trials chance gives as much, or it is {least}"
 
 
-def _joined(found: Found, channels: tuple[int, ...]) -> str:
+def _where(found: Found, channels: tuple[int, ...]) -> str:
+    """On which channels, where there are several."""
     names = found.test.channels
-    if len(channels) == len(names) > 1:
-        return f"all {len(names)}"
-    return ", ".join(names[channel] for channel in channels)
+    if len(names) == 1:
+        return ""
+    if len(channels) == len(names):
+        return f" on all {len(names)}"
+    return f" on {', '.join(names[channel] for channel in channels)}"
 
 
 def _trial_errors(test: Any, before: Array, after: Array) -> tuple[TrialError, ...]:
