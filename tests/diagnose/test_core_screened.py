@@ -40,7 +40,6 @@ class Fit:
 class Refits:
     problem: "Toy"
     fit: Fit
-    channels: np.ndarray
 
     def judged(self, weights, trials):
         mse = self.problem.mse(self.problem.solved(self.fit.free, weights))[trials]
@@ -124,8 +123,8 @@ class Toy(NothingBesides):
     def errors(self, fit):
         return self.mse(fit.theta if fit.told else np.array([1.0, 0, 0, 0]))
 
-    def reweighted(self, fit, channels=None):
-        return Refits(self, fit, np.zeros(1, dtype=int))
+    def reweighted(self, fit):
+        return Refits(self, fit)
 
     def credible(self, baseline, now, best, candidate):
         return np.ones(1, dtype=bool)

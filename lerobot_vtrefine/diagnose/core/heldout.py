@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from lerobot_vtrefine.diagnose.core.problem import Fit, Problem, ScoredFit, ScreenedProblem
+from lerobot_vtrefine.diagnose.core.problem import Fit, ScoredFit, ScreenedProblem, SearchedProblem
 from lerobot_vtrefine.diagnose.core.resampling import gain_interval
 from lerobot_vtrefine.diagnose.core.rules import LOCKED_SHARE, MIN_DISCOVERY, WHOLE_CONDITIONS_FROM
 from lerobot_vtrefine.diagnose.verdict import Heldout
@@ -73,7 +73,7 @@ def out_of_fold(problem: ScreenedProblem[Any, Any], fit: ScoredFit, folds: Array
 
 
 def cross_validated(
-    problem: Problem[Any, Any],
+    problem: SearchedProblem[Any, Any],
     fit: Fit,
     folds: Array,
     known: Array | None = None,

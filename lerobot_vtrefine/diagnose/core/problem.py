@@ -5,7 +5,7 @@ Shapes: T trials, J channels (1 for a camera, one per joint for a robot, one per
 
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, Protocol, Self, override
+from typing import TYPE_CHECKING, Any, Protocol, Self
 
 import numpy as np
 
@@ -82,8 +82,48 @@ class Reweighted(Protocol):
         """Mean squared errors of some trials on `channels` if every trial counted `weights` (T,) times."""
 
 
-class Problem[F: Fit, C: Candidate](Protocol):
-    """Trials to be explained."""
+class NothingBesides(Protocol):
+    """What only the instrument knows, between the steps of the method: nothing, unless it says so."""
+
+    @property
+    def screens(self) -> bool:
+        """Whether it is a `ScreenedProblem`; else a `SearchedProblem`."""
+        return False
+
+    @property
+    def can_settle(self) -> bool:
+        """Whether `settles` can decide anything here."""
+        return False
+
+    def revised(self, now: Any, accepted: Sequence[Any]) -> Self:
+        """The problem after candidates were accepted; itself where these change nothing about it."""
+        return self
+
+    def reviewed(self, selection: "Selection[Any, Any, Any]", seed: int) -> "Selection[Any, Any, Any]":
+        """The selection after a look at what candidates cannot say."""
+        return selection
+
+    def settles(self, rival: "Rival[Any, Any]", selection: "Selection[Any, Any, Any]", seed: int) -> int:
+        """What else than the errors decides a tie: 1 for the rival, -1 for the cause, 0 for neither."""
+        return 0
+
+    def finer(self) -> Self | None:
+        """The same trials with predictions for which the search is too slow; None where there are none."""
+        return None
+
+    def handed_out(
+        self, selection: "Selection[Any, Any, Any]", seed: int, *, doubtful: bool
+    ) -> "Selection[Any, Any, Any]":
+        """The selection with fits as users get them; `doubtful`: beside something that has no name."""
+        return selection
+
+    def suspicions(self, selection: "Selection[Any, Any, Any]", seed: int) -> "Sequence[Suspicion]":
+        """What may be left, as scores of trials."""
+        return ()
+
+
+class Problem[F: Fit, C: Candidate](NothingBesides, Protocol):
+    """Trials to be explained, and fits to them."""
 
     @property
     def subject(self) -> str:
@@ -104,16 +144,8 @@ class Problem[F: Fit, C: Candidate](Protocol):
     def subset(self, trials: Array) -> Self:
         """The same on fewer trials."""
 
-    # Fits.
-
     def baseline(self) -> F:
         """The simulation's own model, refitted."""
-
-    def candidates(self) -> Sequence[C]:
-        """Everything that may be wrong."""
-
-    def applicable(self, candidate: C, now: F) -> Array:
-        """(J,) bool: channels on which these trials could show it, and which a fit does not give it yet."""
 
     def extended(self, now: F, candidate: C, channels: Array, plainer: F | None = None) -> F:
         """Fit a candidate on top of a fit, on channels (J,) bool where it is applicable.
@@ -128,78 +160,27 @@ class Problem[F: Fit, C: Candidate](Protocol):
     def refitted(self, now: F) -> F:
         """Everything that is free, fitted anew."""
 
-    def merged(self, one: F, other: F, take_other: Array) -> F:
-        """Channels of the one fit, those of the other where (J,) says so."""
-
     def errors(self, fit: F) -> Array:
         """(T, J) mean squared errors under a fit that may have been made on other trials."""
-
-    def reweighted(self, fit: F, channels: Array | None = None) -> Reweighted:
-        """For cross-validation; only some channels (numbers) move if they are given."""
 
     def credible(self, baseline: F, now: F, best: F, candidate: C) -> Array:
         """(J,) bool: whether the size found is large enough to be seen and no larger than errors allow."""
 
-    @property
-    def screens(self) -> bool:
-        """Whether it is a `ScreenedProblem`."""
 
-    # What only the instrument knows, between the steps of the method.
+class SearchedProblem[F: Fit, C: Candidate](Problem[F, C], Protocol):
+    """Trials of many channels, and candidates that are all fitted to each."""
 
-    def revised(self, now: F, accepted: Sequence[C]) -> Self:
-        """The problem after candidates were accepted; itself where these change nothing about it."""
+    def candidates(self) -> Sequence[C]:
+        """Everything that may be wrong."""
 
-    def reviewed(self, selection: "Selection[Any, F, C]", seed: int) -> "Selection[Any, F, C]":
-        """The selection after a look at what candidates cannot say."""
+    def applicable(self, candidate: C, now: F) -> Array:
+        """(J,) bool: channels on which these trials could show it, and which a fit does not give it yet."""
 
-    @property
-    def can_settle(self) -> bool:
-        """Whether `settles` can decide anything here."""
+    def merged(self, one: F, other: F, take_other: Array) -> F:
+        """Channels of the one fit, those of the other where (J,) says so."""
 
-    def settles(self, rival: "Rival[F, C]", selection: "Selection[Any, F, C]", seed: int) -> int:
-        """What else than the errors decides a tie: 1 for the rival, -1 for the cause, 0 for neither."""
-
-    def finer(self) -> Self | None:
-        """The same trials with predictions for which the search is too slow; None where there are none."""
-
-    def handed_out(
-        self, selection: "Selection[Any, F, C]", seed: int, *, doubtful: bool
-    ) -> "Selection[Any, F, C]":
-        """The selection with fits as users get them; `doubtful`: beside something that has no name."""
-
-    def suspicions(self, selection: "Selection[Any, F, C]", seed: int) -> "Sequence[Suspicion]":
-        """What may be left, as scores of trials."""
-
-
-class NothingBesides:
-    """For instruments that know nothing besides their errors."""
-
-    screens = False
-    can_settle = False
-
-    def revised(self, now: Any, accepted: Any) -> Self:
-        """It stays."""
-        return self
-
-    def reviewed[S](self, selection: S, seed: int) -> S:
-        """It stays."""
-        return selection
-
-    def settles(self, rival: Any, selection: Any, seed: int) -> int:
-        """Nothing decides a tie."""
-        return 0
-
-    def finer(self) -> Self | None:
-        """There are no finer predictions."""
-        return None
-
-    def handed_out[S](self, selection: S, seed: int, *, doubtful: bool) -> S:
-        """As they were found."""
-        return selection
-
-    def suspicions(self, selection: Any, seed: int) -> "Sequence[Suspicion]":
-        """Nothing can be said about what is left."""
-        return ()
+    def reweighted(self, fit: F, channels: Array | None = None) -> Reweighted:
+        """For cross-validation; only some channels (numbers) move if they are given."""
 
 
 class FormCandidate(Candidate, Protocol):
@@ -226,7 +207,7 @@ class ScoredFit(Fit, Protocol):
         """(T, J) log score of every trial, up to a constant."""
 
 
-class Scored(Reweighted, Protocol):
+class Scored(Protocol):
     """See `Reweighted`."""
 
     def judged(self, weights: Array, trials: Array) -> tuple[Array, Array]:
@@ -271,9 +252,8 @@ class ScreenedProblem[F: ScoredFit, C: FormCandidate](Problem[F, C], Protocol):
     def without_effect(self, fit: F, baseline: F) -> F:
         """A fit that keeps its names, and is handed out with the baseline's predictions."""
 
-    @override
-    def reweighted(self, fit: F, channels: Array | None = None) -> Scored:
-        """With log scores."""
+    def reweighted(self, fit: F) -> Scored:
+        """For cross-validation."""
 
 
 class Account[F: Fit, C: Candidate](Protocol):

@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 
 from lerobot_vtrefine.diagnose.core.heldout import cross_validated
-from lerobot_vtrefine.diagnose.core.problem import Candidate, Fit, Problem
+from lerobot_vtrefine.diagnose.core.problem import Candidate, Fit, Problem, SearchedProblem
 from lerobot_vtrefine.diagnose.core.resampling import folds_of, one_sided
 from lerobot_vtrefine.diagnose.core.rules import (
     ALPHA,
@@ -113,7 +113,7 @@ class Selection[P: Problem[Any, Any], F: Fit, C: Candidate]:
         return self.p_value(cause) is None and any(name == cause for name, _ in self.p_values)
 
 
-class Search[P: Problem[Any, Any], F: Fit, C: Candidate]:
+class Search[P: SearchedProblem[Any, Any], F: Fit, C: Candidate]:
     """State of one search."""
 
     def __init__(self, problem: P, seed: int, tell: Callable[[str], None]) -> None:

@@ -20,7 +20,6 @@ from lerobot_vtrefine.diagnose.core.search import Selection
 from lerobot_vtrefine.diagnose.core.suspicion import Suspicion
 from lerobot_vtrefine.diagnose.pad import final_model, review
 from lerobot_vtrefine.diagnose.pad.baseline import Baseline, fit_baseline, plain_weights, weigh
-from lerobot_vtrefine.diagnose.pad.candidates import CATALOGUE
 from lerobot_vtrefine.diagnose.pad.candidates.base import Form
 from lerobot_vtrefine.diagnose.pad.error_level import slow_errors
 from lerobot_vtrefine.diagnose.pad.final_model import FinalFit
@@ -28,7 +27,7 @@ from lerobot_vtrefine.diagnose.pad.fitting import Fit, losses_of, predict, refit
 from lerobot_vtrefine.diagnose.pad.form_fitting import Starts, grown, settle, starts_of, with_form, without
 from lerobot_vtrefine.diagnose.pad.noise import Noise
 from lerobot_vtrefine.diagnose.pad.press_trials import PressSet
-from lerobot_vtrefine.diagnose.pad.screening import DEAD, GAIN_MAP, MAPS, all_probes, form_probes, forms_of
+from lerobot_vtrefine.diagnose.pad.screening import DEAD, GAIN_MAP, all_probes, form_probes, forms_of
 from lerobot_vtrefine.diagnose.pad.suspicions import suspicions
 from lerobot_vtrefine.diagnose.pad.taxel_maps import MapEvidence, find_dead, map_evidence, map_of, with_map
 from lerobot_vtrefine.diagnose.pad.weights import TrialWeights
@@ -79,18 +78,9 @@ class Refits:
     problem: "PadProblem"
     fit: Fit
 
-    @property
-    def channels(self) -> Array:
-        """The one."""
-        return np.zeros(1, dtype=int)
-
     @cached_property
     def _evidence(self) -> MapEvidence:
         return map_evidence(self.fit, self.problem.presses, self.problem.weights)
-
-    def errors(self, weights: Array, trials: Array) -> Array:
-        """(trials, 1)"""
-        return self.judged(weights, trials)[0]
 
     def judged(self, weights: Array, trials: Array) -> tuple[Array, Array]:
         """Errors and log scores, (trials, 1) each; the map comes from recordings that count."""
@@ -154,16 +144,6 @@ class PadProblem(NothingBesides):
         """The one that predicts plain readings best, and that an extension is measured against."""
         return self.refitted_baseline.plain
 
-    def candidates(self) -> Sequence[Candidate]:
-        """Every cause in its plain form."""
-        plain = {form.family: Candidate(form.family, form=form) for form in reversed(CATALOGUE)}
-        return (*reversed(plain.values()), *(Candidate(name) for name in MAPS))
-
-    def applicable(self, candidate: Candidate, now: Fit) -> Array:
-        """(1,) whether the recordings could show it, and it is not there yet."""
-        able = candidate.form is None or candidate.form.possible(now.model.setting)
-        return np.array([able and candidate.cause not in now.model.families])
-
     def extended(self, now: Fit, candidate: Candidate, channels: Array, plainer: Fit | None = None) -> Fit:
         """With a candidate; other forms grow from their plain one's fit, where they can."""
         form = candidate.form
@@ -190,10 +170,6 @@ class PadProblem(NothingBesides):
         """Under the present weights."""
         return self.settled(now.model)
 
-    def merged(self, one: Fit, other: Fit, take_other: Array) -> Fit:
-        """There is one channel."""
-        return other if take_other[0] else one
-
     def errors(self, fit: Found) -> Array:
         """(K, 1) as users' predictions have them, where there is a model for users already."""
         if isinstance(fit, FinalFit):
@@ -205,7 +181,7 @@ class PadProblem(NothingBesides):
         """What users' models say about these recordings."""
         return final_model.Predictions(self.presses)
 
-    def reweighted(self, fit: Fit, channels: Array | None = None) -> Refits:
+    def reweighted(self, fit: Fit) -> Refits:
         """By one Newton step."""
         return Refits(self, fit)
 
