@@ -22,15 +22,16 @@ def recordings(count: int) -> RecordingSet:
 
 def test_names_are_counted_over_draws_and_halves() -> None:
     found = pad_diagnosis()
-    gain_spread, hysteresis = found.causes
+    gain_spread, hysteresis = found.verdict.causes
     seen: list[tuple[int, int]] = []
 
     def again(given: RecordingSet, seed: int) -> Diagnosis:
         seen.append((len(given.trials), seed))
         if len(given.trials) < 9:
-            return replace(found, causes=(gain_spread,))
+            return replace(found, verdict=replace(found.verdict, causes=(gain_spread,)))
         tie = (("latency", "scan_skew"),) if seed == 8 else ()
-        return replace(found, causes=(gain_spread, hysteresis), ambiguous_with=tie)
+        seen_now = replace(found.verdict, causes=(gain_spread, hysteresis), ambiguous_with=tie)
+        return replace(found, verdict=seen_now)
 
     survived = stability(recordings(9), found, 2, 7, again)
     assert seen == [(9, 8), (9, 9), (5, 7), (5, 7)]

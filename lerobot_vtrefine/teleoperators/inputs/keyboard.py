@@ -1,5 +1,6 @@
 """Keys through pynput, as LeRobot's own keyboard teleoperator reads them: one block of keys per hand."""
 
+import importlib
 from collections.abc import Set as AbstractSet
 from typing import Any
 
@@ -40,7 +41,7 @@ class Keyboard:
     def connect(self) -> None:
         """Watch the keys. Raises: ImportError where pynput is missing or finds no display."""
         try:
-            from pynput import keyboard  # ty: ignore[import-not-found]
+            keyboard = importlib.import_module("pynput.keyboard")
         except ImportError as error:
             raise ImportError(
                 f"--teleop.input=keyboard needs pynput and a display ({error}): "
