@@ -29,9 +29,11 @@ def test_names_are_counted_over_draws_and_halves() -> None:
         seen.append((len(given.trials), seed))
         if len(given.trials) < 9:
             return replace(found, verdict=replace(found.verdict, causes=(gain_spread,)))
-        tie = (("latency", "scan_skew"),) if seed == 8 else ()
-        seen_now = replace(found.verdict, causes=(gain_spread, hysteresis), ambiguous_with=tie)
-        return replace(found, verdict=seen_now)
+        told = found.verdict
+        if seed == 8:
+            tie, ask = (("latency", "scan_skew"),), {"drive": "sweeps"}
+            told = replace(told, status="ambiguous", ambiguous_with=tie, next_experiment=ask)
+        return replace(found, verdict=told)
 
     survived = stability(recordings(9), found, 2, 7, again)
     assert seen == [(9, 8), (9, 9), (5, 7), (5, 7)]
