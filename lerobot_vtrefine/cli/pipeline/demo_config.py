@@ -81,9 +81,10 @@ def default_dppo() -> dict[str, Any]:
     return {"type": "small", "encoder": "frozen"}
 
 
-CLOUD_RECIPE: dict[str, dict[str, Any]] = {
+CLOUD_RECIPE: dict[str, Any] = {
     "policy": {"preset": "small", "n_action_steps": 8},
     "dppo": {"type": "small"},
+    "finetune_iterations": 30,
 }
 """The paper's cloud, learnt from demonstrations alone: what scripts/compare_*.py compare."""
 
@@ -116,7 +117,7 @@ class DemoConfig:
     """Episodes of each test-time ablation; 0 skips them."""
     videos: int = 6
     """Episodes of each headline evaluation that are drawn; drawing without a GPU is slow."""
-    finetune_iterations: int = 30
+    finetune_iterations: int = 16
     """DPPO iterations of one episode in every environment."""
     finetune_envs: int = 128
     """Simulations that DPPO collects from."""
