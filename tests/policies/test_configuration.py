@@ -113,6 +113,7 @@ def test_shipped_files_parse(path: Path) -> None:
     assert config.policy.modalities == ("visual" if "visual" in path.stem else "visuo_tactile")
 
 
+@pytest.mark.slow  # seconds for the import alone
 @pytest.mark.parametrize("path", OTHERS, ids=lambda path: path.stem)
 def test_lerobots_policies_get_what_a_colour_recording_of_aloha_has(path: Path) -> None:
     import lerobot.policies  # noqa: F401 (registers them)
