@@ -3,6 +3,7 @@
 import json
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -30,6 +31,7 @@ from lerobot_vtrefine.diagnose.servo import candidates
 from lerobot_vtrefine.diagnose.servo.bench import Bench
 from lerobot_vtrefine.diagnose.servo.model import ServoModel
 from lerobot_vtrefine.diagnose.servo.parameters import INDEX
+from lerobot_vtrefine.diagnose.servo.problem import ServoProblem
 from lerobot_vtrefine.diagnose.servo.simulation import simulate
 from lerobot_vtrefine.diagnose.verdict import SERVO_CAUSES
 
@@ -181,6 +183,31 @@ def test_a_trial_without_its_servo_is_named(tmp_path: Path) -> None:
     (folder / "recording.json").write_text(json.dumps(header))
     with pytest.raises(ValueError, match=r"trial_0002\.parquet: a servo with a known load needs"):
         Bench.of(read_recording_set(folder))
+
+
+@pytest.mark.parametrize(("error", "winner"), [(1.0, -1), (0.99, -1), (0.97, 0)])
+def test_a_law_that_contains_another_is_no_rival_of_it_unless_it_predicts_better(
+    error: float, winner: int
+) -> None:
+    forms = {item.cause: item for item in candidates.CATALOGUE}
+    problem = ServoProblem(bench_of(np.zeros((5, 3)), np.array(GAINS), np.zeros(3)))
+    now = SimpleNamespace(errors=np.ones((3, 1)))
+    rival = SimpleNamespace(
+        cause="load_friction", candidate=forms["directional_friction"], errors=np.full((3, 1), error)
+    )
+    assert problem.settles(rival, now, 0) == winner
+    rival.candidate = forms["quadratic_friction"]
+    assert problem.settles(rival, now, 0) == 0
+
+
+def test_thinned_frames_are_apart_and_those_that_were_recorded() -> None:
+    gain, command = np.array(GAINS), commands(3, np.random.default_rng(1))
+    bench = bench_of(command, gain, np.zeros(3))
+    bench.valid[200:, 1] = False
+    thin = bench.thinned(0.01)
+    assert (np.diff(thin.time_s[:, 0]) >= 0.01 - 1e-9).all()
+    assert thin.valid.sum(0).tolist() == [160, 100, 160]
+    assert np.isin(thin.command[:, 2], command[:, 2]).all()
 
 
 @pytest.mark.slow

@@ -5,8 +5,9 @@
 
 Friction is what would stop the shaft within the step, up to its limit (as in MuJoCo's ``frictionloss``):
 Coulomb's constant in the baseline, with the laws of `stages` beyond it. A frame's command is in force until
-the next one. Steps are the recording's own frames, cut where they are longer than `LONGEST_STEP_S`;
-damping is implicit. Shapes: N frames, C columns (sets of parameters), T trials.
+the next one. Steps are the recording's own frames, cut where they are longer than `LONGEST_STEP_S`; torques
+act in the middle of each, so that errors are of second order (position Verlet, damping by Crank and
+Nicolson). Shapes: N frames, C columns (sets of parameters), T trials.
 """
 
 import numpy as np
@@ -37,8 +38,10 @@ def simulate(bench: Bench, theta: Array) -> Array:
             break
         step = (bench.time_s[frame + 1] - bench.time_s[frame]) / parts
         for _ in range(parts):
+            angle = angle + 0.5 * step * speed
+            reading = drive.read(reading, angle)
             speed = drive.next_speed(frame, step, command[frame] - reading, angle, speed)
-            angle = angle + step * speed
+            angle = angle + 0.5 * step * speed
             reading = drive.read(reading, angle)
     return out - value["offset"]
 
@@ -97,8 +100,9 @@ class _Drive:
         now.gravity = -bench.weight * np.sin(angle)
         now.motor = driven - braked * speed
         friction = self._sum("friction", self.value["coulomb"])
-        damped = self.inertia + step * (self.value["viscous"] + braked)
-        free = (self.inertia * speed + step * (driven + now.gravity)) / damped
+        damping = 0.5 * step * (self.value["viscous"] + braked)
+        damped = self.inertia + damping
+        free = ((self.inertia - damping) * speed + step * (driven + now.gravity)) / damped
         slower = np.maximum(np.abs(free) - step * friction / damped, 0.0)
         return np.copysign(np.minimum(slower, _FASTEST), free)
 

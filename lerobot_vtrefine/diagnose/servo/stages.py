@@ -14,6 +14,8 @@ from typing import Literal
 import numpy as np
 
 Array = np.ndarray
+ROOM_C = 25.0
+"""Temperature at which a winding has its plain resistance."""
 Values = Mapping[str, Array]
 
 
@@ -44,7 +46,7 @@ class Limits:
 
 @dataclass(frozen=True)
 class Stage:
-    """One law: what it adds at its place. Where its first parameter is zero, it adds nothing.
+    """One law: what it adds at its place. Where all its parameters are zero, it adds nothing.
 
     Places: "friction", the torque that holds the shaft back [Nm]; "resistance", a part of the winding's;
     "duty", a part of the largest duty; "delay" of commands [s]; "play" of the encoder [rad].
@@ -54,15 +56,10 @@ class Stage:
     law: Callable[[Now, Values], Array]
     parameters: Mapping[str, Limits]
 
-    @property
-    def main(self) -> str:
-        """Its first parameter."""
-        return next(iter(self.parameters))
-
 
 def _slow(now: Now, speed: Array) -> Array:
     """1 at rest, falling with speed (Tustin's form of the Stribeck effect)."""
-    return np.exp(-np.abs(now.speed) / speed)
+    return np.exp(-np.abs(now.speed) / speed.clip(1e-6))
 
 
 def _quadratic(now: Now, values: Values) -> Array:
@@ -127,8 +124,8 @@ STAGES: list[Stage] = [
     ),
     Stage(
         "resistance",
-        lambda now, v: v["heating"] * (now.temperature_c - v["cold_c"]),
-        {"heating": Limits(-0.05, 0.05, 0.004, "1/K"), "cold_c": Limits(25.0, 25.0, 25.0, "Celsius")},
+        lambda now, v: v["heating"] * (now.temperature_c - ROOM_C),
+        {"heating": Limits(0.0, 0.01, 0.004, "1/K")},  # copper: 0.0039, and cases warm less than windings
     ),
     Stage(
         "duty",
