@@ -10,7 +10,7 @@ import sys
 import time
 from pathlib import Path
 
-from lerobot_vtrefine.diagnose.pad_engine import diagnose_pad
+from lerobot_vtrefine.diagnose.pad.engine import diagnose_pad
 from lerobot_vtrefine.diagnose.quality import check_quality
 
 sys.path.insert(0, str(Path(__file__).parents[1] / "tests" / "diagnose"))
@@ -25,20 +25,20 @@ def run(name: str, gain: float, seed: int, rows: int, cols: int) -> dict:
     recordings, issues = check_quality(rig.record(effects))
     begin = time.process_time()
     found = diagnose_pad(recordings)
-    row = {"effect": name, "gain": gain, "seed": seed, "hz": rig.rate_hz, "status": found.status}
+    row = {"effect": name, "gain": gain, "seed": seed, "hz": rig.rate_hz, "status": found.verdict.status}
     row["cause"] = effect.cause if effect else None
-    row["named"] = [cause.name for cause in found.causes]
-    row["ambiguous"] = [list(group) for group in found.ambiguous_with]
-    row["clue"] = found.unknown.clue
+    row["named"] = [cause.name for cause in found.verdict.causes]
+    row["ambiguous"] = [list(group) for group in found.verdict.ambiguous_with]
+    row["clue"] = found.verdict.unknown.clue
     row["achievable"] = rig.achievable(effects) if effects else 0.0
-    row["heldout_gain"] = found.heldout.gain if found.heldout else None
+    row["heldout_gain"] = found.verdict.heldout.gain if found.verdict.heldout else None
     row["cpu_s"] = round(time.process_time() - begin, 1)
     row["issues"] = [issue.problem for issue in issues]
-    row["minimum_detectable"] = dict(found.minimum_detectable)
+    row["minimum_detectable"] = dict(found.verdict.minimum_detectable)
     truth = {"k_d/k_n": rig.damping_s} | (
         {effect.parameter: effects[0][1]} if effect and effect.parameter else {}
     )
-    params = {name: p for cause in found.causes for name, p in cause.params.items()}
+    params = {name: p for cause in found.verdict.causes for name, p in cause.params.items()}
     row["truth"] = truth
     row["params"] = {key: [params[key].value, params[key].ci95] for key in truth if key in params}
     return row

@@ -44,7 +44,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     if options.seed < 0:
         raise ValueError(f"--seed must be at least 0, got {options.seed}")
     require("vtrefine-press", SIMULATOR)
-    from lerobot_vtrefine.diagnose.stand_in_rig import record
+    from lerobot_vtrefine.diagnose.pad.stand_in_rig import record
 
     record(options.reality, options.output_dir, options.trials, options.seed)
     print(f"{options.trials} recordings in {options.output_dir}")

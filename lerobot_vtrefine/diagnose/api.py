@@ -3,16 +3,16 @@
     from lerobot_vtrefine.diagnose.api import diagnose
 
     found = diagnose("presses")
-    print(found.status, [cause.name for cause in found.causes])
+    print(found.verdict.status, [cause.name for cause in found.verdict.causes])
     found.extended_model.save("sensor_model.json")
 
 ``vtrefine-diagnose`` writes what `diagnose` returns, and ``scripts/bench_diagnose.py`` grades it.
 """
 
 from collections.abc import Callable
-from dataclasses import fields, replace
+from dataclasses import replace
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Protocol
 
 from lerobot_vtrefine.diagnose.core.diagnosis import Diagnosis
 from lerobot_vtrefine.diagnose.evidence import Savable
@@ -22,6 +22,7 @@ from lerobot_vtrefine.diagnose.quality import check_quality, too_little
 from lerobot_vtrefine.diagnose.recordings import RecordingSet, read_recording_set
 from lerobot_vtrefine.diagnose.servo.bench import on_bench
 from lerobot_vtrefine.diagnose.servo.model import ServoModel
+from lerobot_vtrefine.diagnose.verdict import Verdict
 from lerobot_vtrefine.tactile.model import SensorModel
 from lerobot_vtrefine.tactile.stages.contact import KelvinVoigt
 from lerobot_vtrefine.tactile.stages.readout import Gain, Idle, Quantisation
@@ -62,10 +63,9 @@ def diagnose(
         found = _judged(sound, seed, progress)
     else:
         unit = "counts" if recordings.kind == "pad" else "rad"
-        found = Diagnosis("invalid_data", issues=(hopeless,), unit=unit)
+        found = Diagnosis(Verdict("invalid_data", data_issues=(hopeless,)), unit=unit)
     return replace(
-        found,
-        issues=(*issues, *found.issues),
+        found.noting(*issues),
         baseline_model=found.baseline_model or _unfitted_model(recordings),
         extended_model=found.extended_model or _unfitted_model(recordings),
         checked=len(sound.trials),
@@ -83,9 +83,9 @@ def read_recordings(source: str | Path | Rooted) -> RecordingSet:
 def _judged(sound: RecordingSet, seed: int, progress: Progress | None) -> Diagnosis:
     """By the instrument that the recordings are of."""
     if sound.kind == "pad":
-        from lerobot_vtrefine.diagnose.pad_engine import diagnose_pad
+        from lerobot_vtrefine.diagnose.pad.engine import diagnose_pad
 
-        return _plain(diagnose_pad(sound, seed=seed, progress=progress))
+        return diagnose_pad(sound, seed, progress)
     if (sound.path / "meta" / "info.json").is_file():
         from lerobot_vtrefine.diagnose.dataset.engine import diagnose_dataset
 
@@ -97,12 +97,6 @@ def _judged(sound: RecordingSet, seed: int, progress: Progress | None) -> Diagno
     from lerobot_vtrefine.diagnose.joints.engine import diagnose_robot
 
     return diagnose_robot(sound, seed, progress)
-
-
-def _plain(found: Any) -> Diagnosis:
-    """A pad's diagnosis without what only its engine keeps."""
-    names = {item.name for item in fields(Diagnosis)} & set(vars(found)) - {"alarms"}
-    return Diagnosis(**{name: getattr(found, name) for name in names})
 
 
 def _unfitted_model(recordings: RecordingSet) -> Savable:

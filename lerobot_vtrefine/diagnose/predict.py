@@ -9,7 +9,7 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 
 from lerobot_vtrefine.diagnose.joints import model as robot_model
-from lerobot_vtrefine.diagnose.prediction import predict_trial
+from lerobot_vtrefine.diagnose.pad.prediction import predict_trial
 from lerobot_vtrefine.diagnose.recordings import RecordingSet, RobotTrial, Trial
 from lerobot_vtrefine.diagnose.servo import model as servo_model
 from lerobot_vtrefine.diagnose.servo.bench import on_bench

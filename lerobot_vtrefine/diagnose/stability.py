@@ -60,7 +60,7 @@ def stability(
         _names(found),
         dict(Counter(name for item in draws for name in _names(item))),
         dict(Counter(name for item in halves for name in _names(item))),
-        tuple(item.status for item in (*draws, *halves)),
+        tuple(item.verdict.status for item in (*draws, *halves)),
     )
 
 
@@ -72,5 +72,5 @@ def half(recordings: RecordingSet, seed: int) -> RecordingSet:
 
 
 def _names(found: Diagnosis) -> tuple[str, ...]:
-    ties = (name for group in found.ambiguous_with for name in group)
-    return tuple(dict.fromkeys((*(cause.name for cause in found.causes), *ties)))
+    ties = (name for group in found.verdict.ambiguous_with for name in group)
+    return tuple(dict.fromkeys((*(cause.name for cause in found.verdict.causes), *ties)))

@@ -8,7 +8,7 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
 
-from lerobot_vtrefine.diagnose.indenters import trial_heights
+from lerobot_vtrefine.diagnose.pad.indenters import trial_heights
 from lerobot_vtrefine.diagnose.recordings import SCHEMA, Trial
 from lerobot_vtrefine.tactile.layout import PadLayout
 from lerobot_vtrefine.tactile.model import SensorModel

@@ -296,8 +296,8 @@ def _check_names(where: str, names: tuple[str, ...]) -> None:
 
 def _own_causes() -> tuple[str, ...]:
     """Causes that somebody added to a catalogue, which needs the simulator's stages."""
-    from lerobot_vtrefine.diagnose.candidates import CATALOGUE
     from lerobot_vtrefine.diagnose.joints.candidates import NAMES
+    from lerobot_vtrefine.diagnose.pad.candidates import CATALOGUE
     from lerobot_vtrefine.diagnose.servo.candidates import NAMES as SERVO_NAMES
 
     return (*(form.family for form in CATALOGUE), *NAMES, *SERVO_NAMES)

@@ -22,7 +22,7 @@ def scripts():
     sys.path.insert(0, str(SCRIPTS))
     import compare_reality
 
-    from lerobot_vtrefine.diagnose import stand_in_rig
+    from lerobot_vtrefine.diagnose.pad import stand_in_rig
 
     yield compare_reality, stand_in_rig
     sys.path.remove(str(SCRIPTS))
@@ -186,7 +186,7 @@ def test_a_failed_diagnosis_stops_its_own_policies_only(scripts, budget):
 
 
 def test_presses_follow_the_contract_and_the_hidden_pad(scripts, budget):
-    from lerobot_vtrefine.diagnose.prediction import predict_trial
+    from lerobot_vtrefine.diagnose.pad.prediction import predict_trial
     from lerobot_vtrefine.diagnose.quality import check_quality
     from lerobot_vtrefine.diagnose.recordings import read_recording_set
 

@@ -1,10 +1,12 @@
 """Diagnoses by hand, for tests of the report and of the command: no engine involved."""
 
+from dataclasses import fields, replace
+
 import numpy as np
 
 from lerobot_vtrefine.diagnose.core.diagnosis import Diagnosis
-from lerobot_vtrefine.diagnose.evidence import Evidence, ResidualView, Trace, TrialError
-from lerobot_vtrefine.diagnose.verdict import Cause, Heldout, Parameter, Unknown
+from lerobot_vtrefine.diagnose.evidence import Evidence, ResidualView, Trace, TrialError, not_tested
+from lerobot_vtrefine.diagnose.verdict import Cause, Heldout, Parameter, Unknown, Verdict
 from lerobot_vtrefine.tactile.model import SensorModel
 from lerobot_vtrefine.tactile.stages.contact import KelvinVoigt
 from lerobot_vtrefine.tactile.stages.mechanics import Hysteresis
@@ -67,6 +69,14 @@ def residuals(unit):
     return tuple(views)
 
 
+def _made(values):
+    """The verdict's fields go into the verdict."""
+    own = {field.name for field in fields(Verdict)}
+    verdict = Verdict(**{name: value for name, value in values.items() if name in own})
+    verdict = replace(verdict, not_tested=not_tested(values["evidence"]))
+    return Diagnosis(verdict, **{name: value for name, value in values.items() if name not in own})
+
+
 def pad_diagnosis(**changes):
     """Hysteresis and a gain map found, crosstalk rejected; pass fields to change them."""
     gains = (1.0 + 0.15 * np.random.default_rng(1).normal(size=(6, 8))).tolist()
@@ -98,7 +108,7 @@ def pad_diagnosis(**changes):
         ),
         "minimum_detectable": {"crosstalk": 0.004, "latency": 0.006, "contact_offset": 3e-5},
         "next_experiment": None,
-        "issues": (),
+        "data_issues": (),
         "baseline_model": BASELINE,
         "extended_model": EXTENDED,
         "baseline_params": {
@@ -128,7 +138,7 @@ def pad_diagnosis(**changes):
         "maps": {"rms residual before": np.full((6, 8), 4.0), "rms residual after": np.full((6, 8), 2.0)},
         "unit": "counts",
     }
-    return Diagnosis(**(values | changes))
+    return _made(values | changes)
 
 
 def robot_diagnosis(**changes):

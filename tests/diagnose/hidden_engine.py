@@ -31,7 +31,7 @@ def diagnose_folder(path: Path, seed: int = 0) -> tuple[dict[str, Any], Any]:
 
 def predictions(model: Any, path: Path) -> list[np.ndarray]:
     """The model's readings for every trial of a folder, in the folder's order."""
-    from lerobot_vtrefine.diagnose.prediction import predict_trial
+    from lerobot_vtrefine.diagnose.pad.prediction import predict_trial
     from lerobot_vtrefine.diagnose.recordings import read_recording_set
     from lerobot_vtrefine.tactile.layout import PadLayout
 

@@ -126,19 +126,21 @@ def run(kind, seed):
         made = make_set(rig, folder, seed)
         begun = time.process_time()
         found = diagnose(made)
-    held = found.heldout
+    held = found.verdict.heldout
     row = {
         "kind": kind,
         "seed": seed,
         "truth": sorted(names),
         "unknown": list(rig.unknown),
-        "status": found.status,
-        "found": sorted(cause.name for cause in found.causes),
-        "ambiguous": found.ambiguous_with,
-        "clue": found.unknown.clue,
+        "status": found.verdict.status,
+        "found": sorted(cause.name for cause in found.verdict.causes),
+        "ambiguous": found.verdict.ambiguous_with,
+        "clue": found.verdict.unknown.clue,
         "rmse": [held.baseline, held.extended, held.noise_floor],
         "cpu_s": round(time.process_time() - begun, 2),
-        "params": {f"{c.name}.{k}": (p.value, p.ci95) for c in found.causes for k, p in c.params.items()},
+        "params": {
+            f"{c.name}.{k}": (p.value, p.ci95) for c in found.verdict.causes for k, p in c.params.items()
+        },
         "sizes": truths(rig),
     }
     return {"grade": grade(row), **row}

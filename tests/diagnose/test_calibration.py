@@ -9,7 +9,7 @@ from hidden.session import Spec, run_session
 from hidden.writer import write_set
 
 from lerobot_vtrefine.diagnose.calibration import Calibration, Wanted, calibrate
-from lerobot_vtrefine.diagnose.prediction import predict_trial
+from lerobot_vtrefine.diagnose.pad.prediction import predict_trial
 from lerobot_vtrefine.diagnose.recordings import RecordingSet, read_recording_set
 from lerobot_vtrefine.tactile.layout import PadLayout
 from lerobot_vtrefine.tactile.model import SensorModel

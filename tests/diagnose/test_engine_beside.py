@@ -8,14 +8,15 @@ import numpy as np
 import pytest
 from test_engine_pad import COLS, ROWS, heights, linear, one_trial
 
-from lerobot_vtrefine.diagnose import alarms
-from lerobot_vtrefine.diagnose.alarms import Correlations, cleaned, left_over, pairs_alarm
-from lerobot_vtrefine.diagnose.baseline import Baseline, fit_baseline
-from lerobot_vtrefine.diagnose.beside import beside_alarm, taxel_alarm
-from lerobot_vtrefine.diagnose.presses import PressSet, prepare
+from lerobot_vtrefine.diagnose.core.suspicion import Suspicion
+from lerobot_vtrefine.diagnose.pad import repeatability
+from lerobot_vtrefine.diagnose.pad.baseline import Baseline, fit_baseline
+from lerobot_vtrefine.diagnose.pad.error_level import beside_the_indenter, one_taxel
+from lerobot_vtrefine.diagnose.pad.press_trials import PressSet, prepare
+from lerobot_vtrefine.diagnose.pad.problem import PadProblem
+from lerobot_vtrefine.diagnose.pad.repeatability import Correlations, cleaned, in_all_pairs, left_over
+from lerobot_vtrefine.diagnose.pad.suspicions import following
 from lerobot_vtrefine.diagnose.recordings import RecordingSet, Trial
-from lerobot_vtrefine.diagnose.search import start_search
-from lerobot_vtrefine.diagnose.unknowns import describe_residual
 
 COUNT = 16
 
@@ -30,6 +31,11 @@ def prepared(trials: list[Trial]) -> tuple[PressSet, Baseline]:
     held = RecordingSet(Path(), "pad", ROWS, COLS, 0.002, "adc_counts", 255.0, (), tuple(trials))
     presses = prepare(held, trials, list(range(COUNT)))
     return presses, fit_baseline(presses)
+
+
+def fires(suspicion: Suspicion) -> bool:
+    """Whether it is large enough for an alarm."""
+    return suspicion.share > suspicion.least
 
 
 def nothing(trial: Trial) -> np.ndarray:
@@ -49,9 +55,9 @@ def hot_corner(trial: Trial) -> np.ndarray:
 def test_a_taxel_that_answers_to_all_loads_stands_out(added, expected) -> None:
     presses, baseline = fitted(added)
     residuals = cleaned(baseline.fitted, presses, baseline.weights)
-    alarm = taxel_alarm(presses, residuals, baseline.weights)
+    alarm = one_taxel(presses, residuals, baseline.weights)
     assert alarm is not None
-    assert alarm.fired == expected
+    assert fires(alarm) == expected
     if expected:
         assert "(0, 0)" in alarm.clue
 
@@ -60,15 +66,17 @@ def test_a_taxel_that_answers_to_all_loads_stands_out(added, expected) -> None:
 def test_taxels_beside_the_indenter_read_nothing(added, expected) -> None:
     presses, baseline = fitted(added)
     residuals = cleaned(baseline.fitted, presses, baseline.weights)
-    alarm = beside_alarm(presses, residuals, baseline.fitted, baseline.weights)
+    alarm = beside_the_indenter(presses, residuals, baseline.fitted, baseline.weights)
     assert alarm is not None
-    assert alarm.fired == expected
+    assert fires(alarm) == expected
 
 
 def test_readings_that_follow_the_indenters_place_without_contact_are_described() -> None:
     presses, baseline = fitted(lambda trial: 1.5 * trial.x_m[:, None] / 1e-3)
-    found = describe_residual(start_search(baseline, presses, 0), baseline.fitted)
-    assert "place along the row" in found[0].descriptor.text
+    found = following(PadProblem(presses, weights=baseline.weights), baseline.fitted)
+    _, most = max(found, key=lambda item: item[1].share)
+    assert "place along the row" in most.clue
+    assert fires(most)
 
 
 def test_pairs_of_replicates_are_judged_by_what_names_leave() -> None:
@@ -85,12 +93,12 @@ def test_pairs_of_replicates_are_judged_by_what_names_leave() -> None:
     assert left_over(presses, much, some) == pytest.approx(1.35**2 / 3.0**2, rel=0.2)
     found = Correlations.of(presses, some)
     assert found is not None
-    assert pairs_alarm(presses, some, found, None).fired  # nothing is named: a sixth of the power repeats
-    assert pairs_alarm(presses, some, found, 0.5).fired  # names took half: they are symptoms
-    assert not pairs_alarm(presses, some, found, 0.1).fired  # names took nearly all: their form's misfit
+    assert fires(in_all_pairs(presses, some, found, None))  # nothing is named: a sixth of the power repeats
+    assert fires(in_all_pairs(presses, some, found, 0.5))  # names took half: they are symptoms
+    assert not fires(in_all_pairs(presses, some, found, 0.1))  # names took nearly all: their form's misfit
     silent = Correlations.of(presses, noise)
     assert silent is not None
-    assert not pairs_alarm(presses, noise, silent, 0.5).fired
+    assert not fires(in_all_pairs(presses, noise, silent, 0.5))
 
 
 def jerky(number: int) -> Trial:
@@ -116,8 +124,8 @@ def test_corners_between_two_frames_are_no_cause(monkeypatch) -> None:
         residuals = cleaned(baseline.fitted, presses, baseline.weights)
         found = Correlations.of(presses, residuals)
         assert found is not None
-        return pairs_alarm(presses, residuals, found, None).fired
+        return fires(in_all_pairs(presses, residuals, found, None))
 
     assert not fired()
-    monkeypatch.setattr(alarms, "CORNER", np.inf)
+    monkeypatch.setattr(repeatability, "CORNER", np.inf)
     assert fired()  # every replicate turns at the same moment

@@ -3,8 +3,8 @@
 import pytest
 from jittered_rig import EFFECTS, Rig
 
-from lerobot_vtrefine.diagnose.naming import with_form_spread
-from lerobot_vtrefine.diagnose.pad_engine import diagnose_pad
+from lerobot_vtrefine.diagnose.pad.account import with_form_spread
+from lerobot_vtrefine.diagnose.pad.engine import diagnose_pad
 from lerobot_vtrefine.diagnose.verdict import Parameter
 
 
@@ -25,8 +25,8 @@ def test_intervals_reach_as_far_as_forms_that_predict_as_well() -> None:
 def test_a_cover_that_never_pulls_is_told_by_its_own_form(name: str, parameter: str, strength: float) -> None:
     # Of two forms with the same number of coordinates the better one is taken: the other's fraction is 0.12.
     found = diagnose_pad(Rig(0, 6, 10).record([(EFFECTS[name], strength)]))
-    assert [cause.name for cause in found.causes] == ["viscoelastic_relaxation"]
-    low, high = found.causes[0].params[parameter].ci95
+    assert [cause.name for cause in found.verdict.causes] == ["viscoelastic_relaxation"]
+    low, high = found.verdict.causes[0].params[parameter].ci95
     assert low <= strength <= high
     assert high - low < 0.1
 
@@ -38,7 +38,7 @@ def test_intervals_of_fresh_sets_hold_the_truth() -> None:
     for seed in range(1000, 1005):
         for name, strength in strengths.items():
             found = diagnose_pad(Rig(seed, 6, 10).record([(EFFECTS[name], strength)]))
-            params = {key: item for cause in found.causes for key, item in cause.params.items()}
+            params = {key: item for cause in found.verdict.causes for key, item in cause.params.items()}
             if EFFECTS[name].parameter in params:
                 low, high = params[EFFECTS[name].parameter].ci95
                 held.append(low <= strength <= high)

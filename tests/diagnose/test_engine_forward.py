@@ -5,14 +5,14 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from lerobot_vtrefine.diagnose.baseline import describe
-from lerobot_vtrefine.diagnose.candidates import CATALOGUE
-from lerobot_vtrefine.diagnose.candidates.base import Form
-from lerobot_vtrefine.diagnose.composite import Composite, sensor_model
-from lerobot_vtrefine.diagnose.fitting import predict
-from lerobot_vtrefine.diagnose.memory_stages import delayed, low_passed, play
-from lerobot_vtrefine.diagnose.prediction import predict_trial
-from lerobot_vtrefine.diagnose.presses import PressSet, prepare
+from lerobot_vtrefine.diagnose.pad.baseline import describe
+from lerobot_vtrefine.diagnose.pad.candidates import CATALOGUE
+from lerobot_vtrefine.diagnose.pad.candidates.base import Form
+from lerobot_vtrefine.diagnose.pad.fitting import predict
+from lerobot_vtrefine.diagnose.pad.forward_model.memory_stages import delayed, low_passed, play
+from lerobot_vtrefine.diagnose.pad.model import Composite, sensor_model
+from lerobot_vtrefine.diagnose.pad.prediction import predict_trial
+from lerobot_vtrefine.diagnose.pad.press_trials import PressSet, prepare
 from lerobot_vtrefine.diagnose.recordings import RecordingSet, Trial
 from lerobot_vtrefine.tactile.model import SensorModel
 

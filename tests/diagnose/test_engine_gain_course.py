@@ -6,17 +6,18 @@ from pathlib import Path
 import numpy as np
 from test_engine_pad import COLS, ROWS, linear, one_trial
 
-from lerobot_vtrefine.diagnose.alarms import Alarm
-from lerobot_vtrefine.diagnose.baseline import fit_baseline
-from lerobot_vtrefine.diagnose.gain_course import course_alarm, own_gains
-from lerobot_vtrefine.diagnose.presses import prepare
+from lerobot_vtrefine.diagnose.core.rules import ORDER_ALPHA
+from lerobot_vtrefine.diagnose.core.suspicion import Suspicion
+from lerobot_vtrefine.diagnose.pad.baseline import fit_baseline
+from lerobot_vtrefine.diagnose.pad.gain_drift import gain_drift, own_gains
+from lerobot_vtrefine.diagnose.pad.press_trials import prepare
 from lerobot_vtrefine.diagnose.recordings import RecordingSet
 
 COUNT = 16
 SCATTER = np.random.default_rng(5).normal(0, 0.015, COUNT)
 
 
-def judged(gains: np.ndarray, warmth: np.ndarray | None = None, in_a_row: bool = False) -> Alarm | None:
+def judged(gains: np.ndarray, warmth: np.ndarray | None = None, in_a_row: bool = False) -> Suspicion | None:
     """The alarm on recordings with these relative gains and temperatures [deg C], in the order of time."""
     whole = np.arange(COUNT) if in_a_row else np.random.default_rng(3).permutation(COUNT)
     trials = []
@@ -30,12 +31,13 @@ def judged(gains: np.ndarray, warmth: np.ndarray | None = None, in_a_row: bool =
     presses = prepare(held, trials, list(range(COUNT)))
     baseline = fit_baseline(presses)
     assert np.corrcoef(own_gains(baseline.fitted, presses, baseline.weights), gains)[0, 1] > 0.95
-    return course_alarm(baseline.fitted, presses, baseline.weights)
+    return gain_drift(baseline.fitted, presses, baseline.weights)
 
 
-def fired(alarm: Alarm | None) -> bool:
+def fired(alarm: Suspicion | None) -> bool:
     assert alarm is not None
-    return alarm.fired
+    assert alarm.permuted is not None
+    return alarm.permuted < ORDER_ALPHA and alarm.share > alarm.least
 
 
 def test_gains_that_only_scatter_are_nothing() -> None:
@@ -48,7 +50,7 @@ def test_gains_that_swing_slowly_are_seen_without_a_thermometer() -> None:
     swing = 0.05 * np.cos(2 * np.pi * np.arange(COUNT) / COUNT)
     alarm = judged(SCATTER + swing)
     assert alarm is not None
-    assert alarm.fired
+    assert fired(alarm)
     assert "before and after" in alarm.clue
 
 
@@ -56,7 +58,7 @@ def test_gains_that_follow_the_temperature_are_said_to() -> None:
     warmth = 22.0 + np.random.default_rng(7).standard_normal(COUNT)
     alarm = judged(SCATTER - 0.02 * (warmth - 22.0), warmth)
     assert alarm is not None
-    assert alarm.fired
+    assert fired(alarm)
     assert "temperature" in alarm.clue
 
 

@@ -8,11 +8,11 @@ from scipy.signal import lfilter
 from test_engine_forward import trial
 from test_engine_pad import COLS, ROWS, linear, one_trial
 
-from lerobot_vtrefine.diagnose.baseline import describe
-from lerobot_vtrefine.diagnose.composite import Composite
-from lerobot_vtrefine.diagnose.idle import settled_idle
-from lerobot_vtrefine.diagnose.pad_engine import diagnose_pad
-from lerobot_vtrefine.diagnose.presses import prepare
+from lerobot_vtrefine.diagnose.pad.baseline import describe
+from lerobot_vtrefine.diagnose.pad.engine import diagnose_pad
+from lerobot_vtrefine.diagnose.pad.idle_level import settled_idle
+from lerobot_vtrefine.diagnose.pad.model import Composite
+from lerobot_vtrefine.diagnose.pad.press_trials import prepare
 from lerobot_vtrefine.diagnose.recordings import RecordingSet
 
 TRUE_IDLE = 20.0
@@ -42,5 +42,5 @@ def test_an_unexplained_verdict_hands_out_no_model_worse_than_the_baseline() -> 
     trials = tuple(one_trial(number, worn(number // 2), 12, 1.0, 0.0) for number in range(16))
     held = RecordingSet(Path(), "pad", ROWS, COLS, 0.002, "adc_counts", 255.0, (), trials)
     found = diagnose_pad(held)
-    assert found.heldout is not None
-    assert found.heldout.extended < 1.05 * found.heldout.baseline
+    assert found.verdict.heldout is not None
+    assert found.verdict.heldout.extended < 1.05 * found.verdict.heldout.baseline

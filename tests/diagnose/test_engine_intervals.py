@@ -8,15 +8,15 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from lerobot_vtrefine.diagnose import intervals
-from lerobot_vtrefine.diagnose.candidates.base import Form, Setting, Value
-from lerobot_vtrefine.diagnose.candidates.baseline_drift import FORMS as DRIFTS
-from lerobot_vtrefine.diagnose.candidates.sample_and_hold import undecided
-from lerobot_vtrefine.diagnose.intervals import LeftOut, _possible, _reporter
-from lerobot_vtrefine.diagnose.presses import prepare
+from lerobot_vtrefine.diagnose.pad import intervals
+from lerobot_vtrefine.diagnose.pad.candidates.base import Form, Setting, Value
+from lerobot_vtrefine.diagnose.pad.candidates.baseline_drift import FORMS as DRIFTS
+from lerobot_vtrefine.diagnose.pad.candidates.sample_and_hold import undecided
+from lerobot_vtrefine.diagnose.pad.intervals import LeftOut, _possible, _reporter
+from lerobot_vtrefine.diagnose.pad.motion import instants_of, motion
+from lerobot_vtrefine.diagnose.pad.press_trials import prepare
+from lerobot_vtrefine.diagnose.pad.whitening import Whitener
 from lerobot_vtrefine.diagnose.recordings import RecordingSet, Trial
-from lerobot_vtrefine.diagnose.refinement import instants_of, motion
-from lerobot_vtrefine.diagnose.whitening import Whitener
 from lerobot_vtrefine.tactile.layout import PadLayout
 
 
@@ -83,7 +83,7 @@ def test_a_parameter_that_overflows_is_taken_at_its_coordinates_end() -> None:
 def test_delays_are_known_to_a_part_of_a_frame_at_best(monkeypatch: pytest.MonkeyPatch) -> None:
     found = SimpleNamespace(best=None, alike=lambda motions: [])
     exact = LeftOut(np.array([0.03]), np.full((4, 1), 0.03), np.zeros((0, 1)), 8)
-    monkeypatch.setattr(intervals, "walk", lambda *given: found)
+    monkeypatch.setattr(intervals, "profile", lambda *given: found)
     monkeypatch.setattr(intervals, "leave_out", lambda *given: exact)
     monkeypatch.setattr(intervals, "motions_of", lambda presses: [])
     found.alike = lambda motions: [SimpleNamespace(model=SimpleNamespace(values=np.array([0.03])))]

@@ -4,12 +4,10 @@ import numpy as np
 import pytest
 from jittered_rig import EFFECTS, Rig
 
-from lerobot_vtrefine.diagnose.baseline import fit_baseline
-from lerobot_vtrefine.diagnose.fitting import movable
-from lerobot_vtrefine.diagnose.pad_engine import diagnose_pad
-from lerobot_vtrefine.diagnose.presses import prepare
-from lerobot_vtrefine.diagnose.screening import screen
-from lerobot_vtrefine.diagnose.search import all_probes, start_search
+from lerobot_vtrefine.diagnose.pad.engine import diagnose_pad
+from lerobot_vtrefine.diagnose.pad.fitting import movable
+from lerobot_vtrefine.diagnose.pad.press_trials import prepare
+from lerobot_vtrefine.diagnose.pad.problem import PadProblem
 
 
 def recorded(name: str, gain: float, seed: int):
@@ -21,11 +19,11 @@ def test_late_readings_show_although_damping_rests_on_its_bound() -> None:
     # Delays ask for a negative damping, which there is not: what leans on that bound is evidence for a delay.
     held = recorded("skew_rows", 0.4, 0)
     presses = prepare(held, list(held.trials), list(range(len(held.trials))))
-    baseline = fit_baseline(presses)
-    assert baseline.fitted.model.values[1] == 0.0
-    assert 1 in baseline.fitted.model.free
-    assert 1 not in movable(baseline.fitted)
-    found = screen(all_probes(start_search(baseline, presses, 0), baseline.fitted), len(presses.presses), 0)
+    problem, fitted = PadProblem(presses).weighed(None)
+    assert fitted.model.values[1] == 0.0
+    assert 1 in fitted.model.free
+    assert 1 not in movable(fitted)
+    found = {item.candidate.cause: item.tested for item in problem.screened(fitted)}
     assert found["scan_skew"].passed
     assert found["scan_skew"].probe.scores.min() > 0
 
@@ -33,7 +31,7 @@ def test_late_readings_show_although_damping_rests_on_its_bound() -> None:
 @pytest.mark.slow
 def test_first_load_softening_is_named() -> None:
     found = diagnose_pad(recorded("mullins", 0.5, 0))
-    assert [cause.name for cause in found.causes][:1] == ["first_load_softening"]
+    assert [cause.name for cause in found.verdict.causes][:1] == ["first_load_softening"]
 
 
 @pytest.mark.slow
@@ -50,5 +48,5 @@ def test_first_load_softening_is_named() -> None:
 )
 def test_kinds_that_were_missed_are_named(name: str, seed: int) -> None:
     found = diagnose_pad(recorded(name, 0.5, seed))
-    assert [cause.name for cause in found.causes][:1] == [EFFECTS[name].cause]
-    assert np.isfinite(found.heldout.gain)
+    assert [cause.name for cause in found.verdict.causes][:1] == [EFFECTS[name].cause]
+    assert np.isfinite(found.verdict.heldout.gain)

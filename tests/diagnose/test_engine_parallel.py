@@ -4,7 +4,7 @@ import threading
 
 import pytest
 
-from lerobot_vtrefine.diagnose.parallel import MOST, on_all_cores, threads
+from lerobot_vtrefine.diagnose.core.parallel import MOST, on_all_cores, threads
 
 
 def test_results_keep_their_order_and_work_inside_work_stays_where_it_is(

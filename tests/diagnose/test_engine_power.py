@@ -7,16 +7,15 @@ import pytest
 from jittered_rig import Rig
 from test_engine_pad import linear, recordings
 
-from lerobot_vtrefine.diagnose.baseline import fit_baseline
-from lerobot_vtrefine.diagnose.candidates import CATALOGUE
-from lerobot_vtrefine.diagnose.detectable import Power, power_of
 from lerobot_vtrefine.diagnose.evidence import not_tested
-from lerobot_vtrefine.diagnose.pad_engine import diagnose_pad
-from lerobot_vtrefine.diagnose.presses import prepare
+from lerobot_vtrefine.diagnose.pad.candidates import CATALOGUE
+from lerobot_vtrefine.diagnose.pad.detectable import Power, power_of
+from lerobot_vtrefine.diagnose.pad.engine import diagnose_pad
+from lerobot_vtrefine.diagnose.pad.press_trials import prepare
+from lerobot_vtrefine.diagnose.pad.problem import PadProblem
+from lerobot_vtrefine.diagnose.pad.screening import MAPS
 from lerobot_vtrefine.diagnose.recordings import RecordingSet
 from lerobot_vtrefine.diagnose.report.words import headline, power_line
-from lerobot_vtrefine.diagnose.search import start_search
-from lerobot_vtrefine.diagnose.selection import MAPS
 from lerobot_vtrefine.diagnose.verdict import Verdict
 
 FAMILIES = {form.family for form in CATALOGUE} | set(MAPS)
@@ -24,8 +23,7 @@ FAMILIES = {form.family for form in CATALOGUE} | set(MAPS)
 
 def power(held: RecordingSet) -> Power:
     presses = prepare(held, list(held.trials), list(range(len(held.trials))))
-    baseline = fit_baseline(presses)
-    return power_of(start_search(baseline, presses, 0), baseline.fitted)
+    return power_of(*PadProblem(presses).weighed(None))
 
 
 @pytest.fixture(scope="module")
@@ -42,13 +40,13 @@ def test_every_cause_of_the_catalogue_is_accounted_for(plain: Power) -> None:
 def test_what_would_have_shown_is_named_when_it_is_there(plain: Power) -> None:
     excess = 1.5 * plain.smallest["nonlinear_stiffness"]
     found = diagnose_pad(recordings(lambda d: 2.5e5 * d * (d / 5e-4) ** excess, count=16))
-    assert [cause.name for cause in found.causes] == ["nonlinear_stiffness"]
+    assert [cause.name for cause in found.verdict.causes] == ["nonlinear_stiffness"]
 
 
 def test_what_is_far_too_small_is_not(plain: Power) -> None:
     excess = 0.2 * plain.smallest["nonlinear_stiffness"]
     found = diagnose_pad(recordings(lambda d: 2.5e5 * d * (d / 5e-4) ** excess, count=16))
-    assert found.status == "adequate"
+    assert found.verdict.status == "adequate"
 
 
 def test_rows_pressed_one_taxel_at_a_time_say_nothing_of_row_sharing() -> None:
@@ -78,8 +76,8 @@ def test_adequate_says_what_was_not_tested() -> None:
 
 def test_the_verdict_accounts_for_every_cause() -> None:
     found = diagnose_pad(recordings(count=12))
-    assert found.status == "adequate"
-    assert set(not_tested(found.evidence)) | set(found.minimum_detectable) == FAMILIES
+    assert found.verdict.status == "adequate"
+    assert set(not_tested(found.evidence)) | set(found.verdict.minimum_detectable) == FAMILIES
 
 
 @pytest.mark.slow

@@ -8,7 +8,7 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
 
-from lerobot_vtrefine.diagnose.indenters import trial_forces, trial_heights
+from lerobot_vtrefine.diagnose.pad.indenters import trial_forces, trial_heights
 from lerobot_vtrefine.diagnose.recordings import read_recording_set
 from lerobot_vtrefine.tactile.layout import PadLayout
 

@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 import torch
 
-from lerobot_vtrefine.diagnose.candidates.sample_and_hold import held, irregular_periods
-from lerobot_vtrefine.diagnose.memory_stages import interpolated
-from lerobot_vtrefine.diagnose.rhythm import Rhythm, slots
+from lerobot_vtrefine.diagnose.pad.candidates.sample_and_hold import held, irregular_periods
+from lerobot_vtrefine.diagnose.pad.forward_model.memory_stages import interpolated
+from lerobot_vtrefine.diagnose.pad.repeated_frames import Rhythm, slots
 from lerobot_vtrefine.tactile.layout import PadLayout
 from lerobot_vtrefine.tactile.model import SensorModel
 from lerobot_vtrefine.tactile.stages.base import Frame

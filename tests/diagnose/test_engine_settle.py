@@ -5,11 +5,10 @@ from dataclasses import replace
 import numpy as np
 from test_engine_forward import composite, presses
 
-from lerobot_vtrefine.diagnose.baseline import plain_weights
-from lerobot_vtrefine.diagnose.fitting import predict
-from lerobot_vtrefine.diagnose.presses import PressSet
-from lerobot_vtrefine.diagnose.search import Search
-from lerobot_vtrefine.diagnose.selection import settle
+from lerobot_vtrefine.diagnose.pad.baseline import plain_weights
+from lerobot_vtrefine.diagnose.pad.fitting import predict
+from lerobot_vtrefine.diagnose.pad.form_fitting import settle
+from lerobot_vtrefine.diagnose.pad.press_trials import PressSet
 
 
 def uneven_pad() -> PressSet:
@@ -25,13 +24,11 @@ def uneven_pad() -> PressSet:
 
 def test_maps_of_gains_are_fitted_under_the_given_weights() -> None:
     held = uneven_pad()
-    plain = tuple(plain_weights(held))
+    plain = plain_weights(held)
     scales = (30.0, 1.0, 0.1)
-    uneven = tuple(replace(w, sigma=w.sigma / scale) for w, scale in zip(plain, scales, strict=True))
+    uneven = [replace(w, sigma=w.sigma / scale) for w, scale in zip(plain, scales, strict=True)]
     model = replace(composite(held), gain_map=np.ones((held.layout.rows, held.layout.cols)))
-    told = settle(Search(held, 0, uneven, []), model, plain)
-    own = settle(Search(held, 0, plain, []), model)
-    assert own.model.gain_map is not None
-    assert np.ptp(own.model.gain_map) > 0.1
-    np.testing.assert_array_equal(told.model.gain_map, own.model.gain_map)
-    np.testing.assert_array_equal(told.model.values, own.model.values)
+    one, other = (settle(model, held, weights) for weights in (plain, uneven))
+    assert one.model.gain_map is not None
+    assert np.ptp(one.model.gain_map) > 0.1
+    assert np.abs(np.asarray(one.model.gain_map) - np.asarray(other.model.gain_map)).max() > 1e-3

@@ -4,7 +4,7 @@ from types import SimpleNamespace
 
 import numpy as np
 
-from lerobot_vtrefine.diagnose.sliding import sliding_alarm
+from lerobot_vtrefine.diagnose.pad.sliding_errors import SLIDING, while_sliding
 
 
 def alarm_of(sliding: list[float], standing: list[float], share: list[float]):
@@ -20,17 +20,17 @@ def alarm_of(sliding: list[float], standing: list[float], share: list[float]):
         weights.append(SimpleNamespace(sigma=1.0, memory=SimpleNamespace(white=lambda error: error)))
     model = SimpleNamespace(setting=SimpleNamespace(top_counts=100.0))
     fitted = SimpleNamespace(signals=[np.full((400, 3), 50.0)] * len(presses), model=model)
-    return sliding_alarm(SimpleNamespace(presses=presses), residuals, fitted, weights)
+    return while_sliding(SimpleNamespace(presses=presses), residuals, fitted, weights)
 
 
 def test_errors_that_every_slide_shows_are_told() -> None:
     found = alarm_of([1.5] * 4 + [1.0] * 4, [1.0] * 8, [0.4] * 4 + [0.0] * 4)
-    assert found.fired
-    assert 2.0 < found.share < 2.5
+    assert found.share > found.least == 1 - 1 / SLIDING
+    assert 1 - 1 / 2.0 < found.share < 1 - 1 / 2.5
 
 
 def test_recordings_that_err_all_the_time_do_not_blame_their_slides() -> None:
     """They slide far, so that their errors weigh in what slides."""
     found = alarm_of([2.0] * 4 + [1.0] * 4, [2.0] * 4 + [1.0] * 4, [0.7] * 4 + [0.0] * 4)
-    assert found.share > 1.6
-    assert not found.fired
+    assert found.share == 0.0
+    assert float(found.clue.split(" are ")[1].split()[0]) ** 2 > SLIDING  # though errors are larger there

@@ -4,10 +4,9 @@ import numpy as np
 import pytest
 
 from lerobot_vtrefine.diagnose.core.heldout import lock
-from lerobot_vtrefine.diagnose.crossvalidation import paired_p
-from lerobot_vtrefine.diagnose.noise import Noise
-from lerobot_vtrefine.diagnose.screening import Probe, cleared, screen
-from lerobot_vtrefine.diagnose.weights import build_weights
+from lerobot_vtrefine.diagnose.core.score_test import Probe, cleared, screen
+from lerobot_vtrefine.diagnose.pad.noise import Noise
+from lerobot_vtrefine.diagnose.pad.weights import build_weights
 
 
 def probe(name: str, scores: np.ndarray, one_sided: bool = False) -> Probe:
@@ -69,13 +68,6 @@ def test_weights_are_the_inverse_covariance() -> None:
     inverse = flat @ np.linalg.inv(covariance) @ flat.T
     assert np.allclose(weight.gram(vectors), inverse)
     assert np.allclose(weight.products(vectors, vectors[0]), [*inverse[0], inverse[0, 0]])
-
-
-def test_paired_p_matches_counting_all_flips() -> None:
-    differences = np.array([0.5, 1.2, -0.3, 0.8, 0.9])
-    flips = np.array(np.meshgrid(*[[-1, 1]] * 5)).reshape(5, -1).T
-    exact = (flips @ differences >= differences.sum() - 1e-12).mean()
-    assert paired_p(differences, 0) == pytest.approx(exact, abs=0.02)
 
 
 @pytest.mark.parametrize(("conditions", "replicates"), [(8, 2), (12, 2), (4, 2), (24, 1), (2, 4)])

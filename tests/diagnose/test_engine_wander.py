@@ -6,12 +6,12 @@ from pathlib import Path
 import numpy as np
 from test_engine_pad import COLS, ROWS, linear, one_trial
 
-from lerobot_vtrefine.diagnose.baseline import fit_baseline
-from lerobot_vtrefine.diagnose.candidates.base import Setting
-from lerobot_vtrefine.diagnose.candidates.baseline_drift import CURVE, FORMS, WANDERING
-from lerobot_vtrefine.diagnose.presses import prepare
+from lerobot_vtrefine.diagnose.pad.baseline import fit_baseline
+from lerobot_vtrefine.diagnose.pad.candidates.base import Setting
+from lerobot_vtrefine.diagnose.pad.candidates.baseline_drift import CURVE, FORMS, WANDERING
+from lerobot_vtrefine.diagnose.pad.idle_drift import drift_probe
+from lerobot_vtrefine.diagnose.pad.press_trials import prepare
 from lerobot_vtrefine.diagnose.recordings import RecordingSet
-from lerobot_vtrefine.diagnose.wander import wander_probe
 from lerobot_vtrefine.tactile.layout import PadLayout
 
 
@@ -21,7 +21,7 @@ def p_of(levels: np.ndarray) -> float:
     moved = tuple(replace(t, raw=t.raw + level) for t, level in zip(trials, levels, strict=True))
     held = RecordingSet(Path(), "pad", ROWS, COLS, 0.002, "adc_counts", 255.0, (), moved)
     presses = prepare(held, list(held.trials), list(range(len(levels))))
-    probe = wander_probe(fit_baseline(presses).fitted, presses, FORMS[1], 0)
+    probe = drift_probe(fit_baseline(presses).fitted, presses, FORMS[1], 0)
     assert probe is not None
     assert probe.permuted is not None
     return probe.permuted

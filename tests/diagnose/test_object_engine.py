@@ -33,7 +33,7 @@ def plain():
 
 def test_parts_as_believed_are_adequate(plain) -> None:
     found, _ = plain
-    assert found.status == "adequate"
+    assert found.verdict.status == "adequate"
     assert decisions(found) == {
         "object_mass": "rejected",
         "object_friction": "not identifiable",
@@ -41,18 +41,18 @@ def test_parts_as_believed_are_adequate(plain) -> None:
     }
     reasons = {item.name: item.reason for item in found.evidence}
     assert "friction between pads and part: not identifiable" in reasons["object_friction"]
-    assert 0 < found.minimum_detectable["object_mass"] < 0.05
-    assert set(found.next_experiment["decides"]) == {"object_friction", "clearance"}
+    assert 0 < found.verdict.minimum_detectable["object_mass"] < 0.05
+    assert set(found.verdict.next_experiment["decides"]) == {"object_friction", "clearance"}
 
 
 def test_heavier_parts_are_weighed(plain) -> None:
     recorded = record(SceneConfig(pair="square", part_density=2200.0), EPISODES, seed=40)
     found, scene = diagnosed(recorded)
-    assert [cause.name for cause in found.causes] == ["object_mass"]
+    assert [cause.name for cause in found.verdict.causes] == ["object_mass"]
     # What the hidden simulation built, not what the engine believes.
     truth = 2.2 * assumed_masses(scene)
     for name, mass in zip(("socket_kg", "plug_kg"), truth, strict=True):
-        value = found.causes[0].params[name]
+        value = found.verdict.causes[0].params[name]
         assert value.value == pytest.approx(mass, rel=0.1)
         assert value.ci95[0] < mass < value.ci95[1]
 
@@ -60,29 +60,29 @@ def test_heavier_parts_are_weighed(plain) -> None:
 def test_a_joints_play_is_no_mass() -> None:
     faults = RobotFaults(control_latency_s=0.06, backlash_rad={"left_elbow": 0.02})
     found, _ = diagnosed(record(BELIEVED, EPISODES, seed=80, faults=faults))
-    assert "object_mass" not in [cause.name for cause in found.causes]
+    assert "object_mass" not in [cause.name for cause in found.verdict.causes]
 
 
 @pytest.mark.parametrize("hidden", [0.001, 0.0015])
 def test_tighter_hole_is_felt_by_wiggling(hidden) -> None:
     found, _ = diagnosed(record(SceneConfig(pair="square", clearance_m=hidden), EPISODES, "wiggle"))
-    assert [cause.name for cause in found.causes] == ["clearance"]
-    value = found.causes[0].params["clearance"]
+    assert [cause.name for cause in found.verdict.causes] == ["clearance"]
+    value = found.verdict.causes[0].params["clearance"]
     assert value.value == pytest.approx(hidden, abs=1e-4)
     assert value.ci95[0] < hidden < value.ci95[1]
 
 
 def test_wiggling_in_the_hole_as_believed_finds_nothing() -> None:
     found, _ = diagnosed(record(BELIEVED, EPISODES, "wiggle", seed=20))
-    assert found.status == "adequate"
+    assert found.verdict.status == "adequate"
     assert decisions(found)["clearance"] == "rejected"
 
 
 @pytest.mark.parametrize("hidden", [0.15, 0.5])
 def test_friction_is_felt_by_dragging(hidden) -> None:
     found, _ = diagnosed(record(SceneConfig(pair="square", part_friction=hidden), EPISODES, "drag"))
-    assert [cause.name for cause in found.causes] == ["object_friction"]
-    value = found.causes[0].params["friction"]
+    assert [cause.name for cause in found.verdict.causes] == ["object_friction"]
+    value = found.verdict.causes[0].params["friction"]
     assert value.value == pytest.approx(hidden, rel=0.12)
     assert value.ci95[0] < hidden < value.ci95[1]
 
@@ -90,4 +90,4 @@ def test_friction_is_felt_by_dragging(hidden) -> None:
 def test_dragging_parts_as_believed_finds_nothing() -> None:
     found, _ = diagnosed(record(BELIEVED, EPISODES, "drag", seed=20))
     assert decisions(found)["object_friction"] == "rejected"
-    assert np.isfinite(found.minimum_detectable["object_friction"])
+    assert np.isfinite(found.verdict.minimum_detectable["object_friction"])

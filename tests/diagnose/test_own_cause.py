@@ -15,8 +15,8 @@ import pytest
 from robot_rigs import Rig, make_set
 
 import lerobot_vtrefine
-from lerobot_vtrefine.diagnose import candidates
 from lerobot_vtrefine.diagnose.joints import candidates as joint_candidates
+from lerobot_vtrefine.diagnose.pad import candidates
 from lerobot_vtrefine.diagnose.verdict import ROBOT_CAUSES, SENSOR_CAUSES
 
 PACKAGE = Path(lerobot_vtrefine.__file__).parent
@@ -40,7 +40,7 @@ class ColumnSharing(Stage):
 '''
 CANDIDATE = '''"""column_sharing: a taxel's reading falls as others of its column are pressed."""
 
-from lerobot_vtrefine.diagnose.candidates.base import Form, Value
+from lerobot_vtrefine.diagnose.pad.candidates.base import Form, Value
 from lerobot_vtrefine.tactile.stages.readout import ColumnSharing
 
 FORMS = (
@@ -78,7 +78,10 @@ COGGING_RAD = 0.008
 
 
 def test_every_file_of_the_catalogue_is_asked_about() -> None:
-    files = {path.stem for path in (PACKAGE / "diagnose" / "candidates").glob("*.py")} - {"__init__", "base"}
+    files = {path.stem for path in (PACKAGE / "diagnose" / "pad" / "candidates").glob("*.py")} - {
+        "__init__",
+        "base",
+    }
     families = {form.family for form in candidates.CATALOGUE}
     assert families == files == set(SENSOR_CAUSES) - {"taxel_gain_spread", "dead_taxels"}
     assert all(candidates.MEANING[name] for name in files)
@@ -129,7 +132,7 @@ def test_a_cause_of_ones_own_is_named_reported_and_predicted(tmp_path: Path) -> 
     shutil.copytree(PACKAGE, copy, ignore=shutil.ignore_patterns("__pycache__", "assets"))
     with (copy / "tactile" / "stages" / "readout.py").open("a", encoding="utf-8") as file:
         file.write(STAGE)
-    (copy / "diagnose" / "candidates" / "column_sharing.py").write_text(CANDIDATE, encoding="utf-8")
+    (copy / "diagnose" / "pad" / "candidates" / "column_sharing.py").write_text(CANDIDATE, encoding="utf-8")
     (tmp_path / "reality.json").write_text(json.dumps(HIDDEN), encoding="utf-8")
 
     def run(*command: str) -> str:

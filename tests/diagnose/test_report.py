@@ -43,8 +43,11 @@ def robot_set(tmp_path_factory):
     return read_recording_set(write_set(tmp_path_factory.mktemp("robot") / "moves", *make_robot_set()))
 
 
+INVALID = Diagnosis(Verdict("invalid_data", data_issues=(ISSUE,)))
+
+
 def page(diagnosis, recordings, issues=(ISSUE,)):
-    found = replace(diagnosis, issues=tuple(issues))
+    found = diagnosis.noting(*issues)
     return render_report(found.verdict, found, recordings, len(recordings.trials) - 1, 0)
 
 
@@ -77,7 +80,7 @@ def test_page_is_well_formed_and_needs_no_network(kind, pad_set, robot_set):
     html = {
         "pad": lambda: page(pad_diagnosis(), pad_set),
         "robot": lambda: page(robot_diagnosis(), robot_set),
-        "invalid": lambda: page(Diagnosis("invalid_data"), pad_set),
+        "invalid": lambda: page(INVALID, pad_set, ()),
     }[kind]()
     balance = Balance()
     balance.feed(html)
@@ -121,7 +124,7 @@ def test_first_line_is_the_verdict_in_plain_words(pad_set, robot_set):
     )
     adequate = pad_diagnosis(status="adequate", causes=())
     assert "The simulation is adequate" in text_of(page(adequate, pad_set))[:120]
-    assert "allow no verdict" in text_of(page(Diagnosis("invalid_data"), pad_set))[:120]
+    assert "allow no verdict" in text_of(page(INVALID, pad_set, ()))[:120]
 
 
 def test_ties_are_told_once_whatever_their_order():
@@ -143,7 +146,8 @@ def test_nothing_wrong_is_said_without_an_extension(pad_set):
 
 def test_unknown_cause_demotes_names_to_symptoms(pad_set):
     symptoms = tuple(
-        type(c)(c.name, "symptom", c.params, c.p_value, c.heldout_gain) for c in pad_diagnosis().causes
+        type(c)(c.name, "symptom", c.params, c.p_value, c.heldout_gain)
+        for c in pad_diagnosis().verdict.causes
     )
     unknown = pad_diagnosis(
         status="unexplained", causes=symptoms, unknown=Unknown(True, "load × session time")
@@ -156,7 +160,8 @@ def test_unknown_cause_demotes_names_to_symptoms(pad_set):
     assert "vary one thing at a time" in text
     assert "a symptom: the name may be borrowed" in text
     assert "Added to the model, they take 66 % of the squared error away all the same." in text[:400]
-    unknown = replace(unknown, heldout=replace(unknown.heldout, gain=0.1, gain_ci95=(-0.1, 0.3)))
+    held = replace(unknown.verdict.heldout, gain=0.1, gain_ci95=(-0.1, 0.3))
+    unknown = replace(unknown, verdict=replace(unknown.verdict, heldout=held))
     assert "all the same" not in text_of(page(unknown, pad_set))
 
 
@@ -210,7 +215,7 @@ def test_text_from_files_is_escaped(pad_set):
 
 
 def test_sceptic_sees_weak_evidence(pad_set):
-    base = pad_diagnosis()
+    base = pad_diagnosis().verdict
     weak = type(base.heldout)("rmse", 4.1, 4.0, 2.3, 0.05, (-0.02, 0.1), base.heldout.trials[:3])
     text = text_of(page(pad_diagnosis(heldout=weak), pad_set))
     assert "interval of the gain includes zero" in text

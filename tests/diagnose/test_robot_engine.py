@@ -47,32 +47,41 @@ CASES = {
 def test_single_cause_is_named_and_measured(tmp_path, name) -> None:
     faults, parameter, value = CASES[name]
     found, recordings = diagnose(tmp_path, **faults)
-    assert found.status == "explained", (found.status, found.ambiguous_with, found.unknown)
-    assert [cause.name for cause in found.causes] == [name]
-    cause = found.causes[0]
+    assert found.verdict.status == "explained", (
+        found.verdict.status,
+        found.verdict.ambiguous_with,
+        found.verdict.unknown,
+    )
+    assert [cause.name for cause in found.verdict.causes] == [name]
+    cause = found.verdict.causes[0]
     assert set(cause.params) == {parameter}
     assert cause.params[parameter].value == pytest.approx(value, rel=0.15)
     low, high = cause.params[parameter].ci95
     assert low <= cause.params[parameter].value <= high
     assert cause.p_value < 0.02
-    assert found.heldout is not None
+    held = found.verdict.heldout
+    assert held is not None
     # What is left is what no model could undo.
-    assert found.heldout.extended < 1.15 * found.heldout.noise_floor < found.heldout.baseline
+    assert held.extended < 1.15 * held.noise_floor < held.baseline
     check_prediction(found, recordings)
 
 
 def check_prediction(found, recordings) -> None:
     """The saved model reaches the held-out error that the verdict claims."""
-    locked = [trial for trial in recordings.trials if trial.file in found.heldout.trials]
+    locked = [trial for trial in recordings.trials if trial.file in found.verdict.heldout.trials]
     errors = [np.square(predict_positions(found.extended_model, t) - t.position).mean() for t in locked]
-    assert np.sqrt(np.mean(errors)) == pytest.approx(found.heldout.extended, rel=1e-6)
+    assert np.sqrt(np.mean(errors)) == pytest.approx(found.verdict.heldout.extended, rel=1e-6)
 
 
 def test_gripper_that_meets_something_is_named_without_loads(tmp_path) -> None:
     found, _ = diagnose(tmp_path, holds={"gripper": (0.02, 0.1)}, joints=("elbow", "gripper"))
-    assert found.status == "explained", (found.status, found.ambiguous_with, found.unknown)
-    assert [cause.name for cause in found.causes] == ["gripper_compliance"]
-    params = found.causes[0].params
+    assert found.verdict.status == "explained", (
+        found.verdict.status,
+        found.verdict.ambiguous_with,
+        found.verdict.unknown,
+    )
+    assert [cause.name for cause in found.verdict.causes] == ["gripper_compliance"]
+    params = found.verdict.causes[0].params
     assert params["gripper_stop_m"].value == pytest.approx(0.02, abs=5e-4)
     assert params["gripper_give"].value == pytest.approx(0.1, abs=0.03)
     assert found.channel_gains["gripper"] > 0.9
@@ -80,18 +89,18 @@ def test_gripper_that_meets_something_is_named_without_loads(tmp_path) -> None:
 
 def test_nothing_is_found_where_nothing_is(tmp_path) -> None:
     found, _ = diagnose(tmp_path)
-    assert found.status == "adequate"
-    assert found.causes == ()
-    assert found.heldout.extended == found.heldout.baseline
-    assert 0 < found.minimum_detectable["backlash"] < 0.01
-    assert 0 < found.minimum_detectable["control_latency"] < 0.02
+    assert found.verdict.status == "adequate"
+    assert found.verdict.causes == ()
+    assert found.verdict.heldout.extended == found.verdict.heldout.baseline
+    assert 0 < found.verdict.minimum_detectable["backlash"] < 0.01
+    assert 0 < found.verdict.minimum_detectable["control_latency"] < 0.02
     assert {item.name for item in found.evidence} >= {"backlash", "gripper_compliance"}
 
 
 def test_two_causes_on_two_joints(tmp_path) -> None:
     found, _ = diagnose(tmp_path, offset={"shoulder": 0.02}, backlash={"elbow": 0.03})
-    assert found.status == "explained"
-    assert {cause.name for cause in found.causes} == {"encoder_offset", "backlash"}
+    assert found.verdict.status == "explained"
+    assert {cause.name for cause in found.verdict.causes} == {"encoder_offset", "backlash"}
 
 
 @pytest.mark.parametrize(
@@ -99,19 +108,21 @@ def test_two_causes_on_two_joints(tmp_path) -> None:
 )
 def test_what_no_name_covers_raises_the_alarm(tmp_path, unknown, word) -> None:
     found, _ = diagnose(tmp_path, unknown=unknown)
-    assert found.status == "unexplained"
-    assert found.unknown.alarm
-    assert any(piece in found.unknown.clue for piece in word.split("|"))
-    assert all(cause.role == "symptom" for cause in found.causes)
+    assert found.verdict.status == "unexplained"
+    assert found.verdict.unknown.alarm
+    assert any(piece in found.verdict.unknown.clue for piece in word.split("|"))
+    assert all(cause.role == "symptom" for cause in found.verdict.causes)
 
 
 def test_slow_motion_does_not_yield_a_wrong_name(tmp_path) -> None:
     found, _ = diagnose(tmp_path, friction={"elbow": 0.01}, motion="slow")
-    named = {cause.name for cause in found.causes} | {name for tie in found.ambiguous_with for name in tie}
+    named = {cause.name for cause in found.verdict.causes} | {
+        name for tie in found.verdict.ambiguous_with for name in tie
+    }
     assert "joint_friction" in named
     assert named <= {"joint_friction", "backlash"}
-    if found.status == "ambiguous":
-        assert set(found.next_experiment["decides"]) == {"joint_friction", "backlash"}
+    if found.verdict.status == "ambiguous":
+        assert set(found.verdict.next_experiment["decides"]) == {"joint_friction", "backlash"}
 
 
 def test_a_blocked_gripper_is_not_given_a_wrong_name(tmp_path) -> None:
@@ -125,17 +136,17 @@ def test_a_blocked_gripper_is_not_given_a_wrong_name(tmp_path) -> None:
         position[:, 1] = np.maximum(position[:, 1], 0.02)
         trials.append(dataclasses.replace(trial, position=position))
     found = diagnose_robot(dataclasses.replace(recordings, trials=tuple(trials)))
-    assert found.status == "explained"
-    assert [cause.name for cause in found.causes] == ["gripper_compliance"]
-    assert found.causes[0].params["gripper_stop_m"].value == pytest.approx(0.02, abs=5e-4)
+    assert found.verdict.status == "explained"
+    assert [cause.name for cause in found.verdict.causes] == ["gripper_compliance"]
+    assert found.verdict.causes[0].params["gripper_stop_m"].value == pytest.approx(0.02, abs=5e-4)
     reason = next(item.reason for item in found.evidence if item.name == "gripper_compliance")
     assert "load" in reason
 
 
 def test_few_trials_and_one_joint(tmp_path) -> None:
     found, _ = diagnose(tmp_path, joints=("joint_1",), conditions=2, replicates=1)
-    assert found.status == "adequate"
-    assert found.next_experiment is not None
+    assert found.verdict.status == "adequate"
+    assert found.verdict.next_experiment is not None
 
 
 def test_an_offset_that_servo_and_reading_share_is_said_to_be_invisible(tmp_path) -> None:
@@ -144,9 +155,9 @@ def test_an_offset_that_servo_and_reading_share_is_said_to_be_invisible(tmp_path
     told = {}
     for shared in (False, True):
         found = diagnose_problem(dataclasses.replace(plain, shared_encoders=shared))
-        assert found.status == "adequate"
+        assert found.verdict.status == "adequate"
         item = next(item for item in found.evidence if item.name == "encoder_offset")
-        told[shared] = ("encoder_offset" in found.minimum_detectable, item.decision, item.reason)
+        told[shared] = ("encoder_offset" in found.verdict.minimum_detectable, item.decision, item.reason)
     assert told[False][:2] == (True, "rejected")
     assert told[True][:2] == (False, "not identifiable")
     assert "known from outside" in told[True][2]
@@ -154,7 +165,7 @@ def test_an_offset_that_servo_and_reading_share_is_said_to_be_invisible(tmp_path
 
 def test_a_delay_is_never_known_better_than_the_servos_tick(tmp_path) -> None:
     found, _ = diagnose(tmp_path, latency_s=0.07, noise=0.05, quantum=1e-6)
-    low, high = found.causes[0].params["tau_s"].ci95
+    low, high = found.verdict.causes[0].params["tau_s"].ci95
     assert high - low > 2 * 1.9 * SERVO_TICK_S / np.sqrt(12)
     assert low < 0.07 < high
 

@@ -22,25 +22,25 @@ def diagnosed(rig, folder, seed):
 
 def test_play_that_is_taken_up_little_by_little_is_no_friction(tmp_path) -> None:
     found = diagnosed(replace(FAST, slack={"elbow": 0.03}, rounding=3.0), tmp_path, 1)
-    assert found.status == "explained"
-    assert [cause.name for cause in found.causes] == ["backlash"]
-    low, high = found.causes[0].params["elbow_rad"].ci95
+    assert found.verdict.status == "explained"
+    assert [cause.name for cause in found.verdict.causes] == ["backlash"]
+    low, high = found.verdict.causes[0].params["elbow_rad"].ci95
     assert low < 0.03 < high
 
 
 def test_friction_that_is_larger_at_rest_is_no_play(tmp_path) -> None:
     found = diagnosed(replace(SLOW, friction={"elbow": 0.03}, stribeck=0.8), tmp_path, 1)
-    assert found.status == "explained"
-    assert [cause.name for cause in found.causes] == ["joint_friction"]
-    assert found.causes[0].params["elbow_rad"].value == pytest.approx(0.03, rel=0.15)
+    assert found.verdict.status == "explained"
+    assert [cause.name for cause in found.verdict.causes] == ["joint_friction"]
+    assert found.verdict.causes[0].params["elbow_rad"].value == pytest.approx(0.03, rel=0.15)
     assert found.extended_model.joints[1].breakaway > 0.2
 
 
 def test_sag_of_an_upright_arm_is_told_at_full_reach(tmp_path) -> None:
     rig = replace(SLOW, conditions=12, noise=0.3, sag={"shoulder": 0.02}, sag_shape="upright")
     found = diagnosed(rig, tmp_path, 1)
-    assert [cause.name for cause in found.causes] == ["gravity_sag"]
-    size = found.causes[0].params["shoulder_rad"]
+    assert [cause.name for cause in found.verdict.causes] == ["gravity_sag"]
+    size = found.verdict.causes[0].params["shoulder_rad"]
     assert size.value == pytest.approx(0.02, rel=0.08)
     assert size.ci95[0] < 0.02 < size.ci95[1]
     # Trials agree to a tenth of a per cent; that the method is so exact nobody claims.
@@ -50,9 +50,9 @@ def test_sag_of_an_upright_arm_is_told_at_full_reach(tmp_path) -> None:
 def test_sag_where_the_arm_has_sagged_to_needs_no_offset(tmp_path) -> None:
     rig = replace(FAST, sag={"shoulder": 0.06, "elbow": 0.05}, sag_where="joints")
     found = diagnosed(rig, tmp_path, 0)
-    assert [cause.name for cause in found.causes] == ["gravity_sag"]
+    assert [cause.name for cause in found.verdict.causes] == ["gravity_sag"]
     for joint, size in (("shoulder", 0.06), ("elbow", 0.05)):
-        assert found.causes[0].params[f"{joint}_rad"].value == pytest.approx(size, rel=0.004)
+        assert found.verdict.causes[0].params[f"{joint}_rad"].value == pytest.approx(size, rel=0.004)
 
 
 def test_what_a_stopped_jaw_does_besides_is_not_named(tmp_path) -> None:
@@ -64,9 +64,9 @@ def test_what_a_stopped_jaw_does_besides_is_not_named(tmp_path) -> None:
         backlash={"gripper": 1.5e-4},
     )
     found = diagnosed(rig, tmp_path, 0)
-    assert found.status == "explained"
-    assert [cause.name for cause in found.causes] == ["gripper_compliance"]
-    assert found.causes[0].params["gripper_stop_m"].value == pytest.approx(0.022, abs=2e-4)
+    assert found.verdict.status == "explained"
+    assert [cause.name for cause in found.verdict.causes] == ["gripper_compliance"]
+    assert found.verdict.causes[0].params["gripper_stop_m"].value == pytest.approx(0.022, abs=2e-4)
 
 
 @pytest.mark.parametrize(
@@ -80,12 +80,12 @@ def test_what_a_stopped_jaw_does_besides_is_not_named(tmp_path) -> None:
 def test_a_gripper_that_gives_way_in_another_form_keeps_its_name(tmp_path, form) -> None:
     rig = replace(SLOW, joints=("gripper",), noise=0.5, compliance={"gripper": 2e-4}, compliance_form=form)
     found = diagnosed(rig, tmp_path, 1)
-    assert found.status == "explained", found.unknown
-    assert [cause.name for cause in found.causes] == ["gripper_compliance"]
-    size = found.causes[0].params["m_per_n"]
+    assert found.verdict.status == "explained", found.verdict.unknown
+    assert [cause.name for cause in found.verdict.causes] == ["gripper_compliance"]
+    size = found.verdict.causes[0].params["m_per_n"]
     assert size.value == pytest.approx(2e-4, rel=0.1)
     # The model that is handed out has the form, too.
-    assert found.heldout.extended < 1.15 * found.heldout.noise_floor
+    assert found.verdict.heldout.extended < 1.15 * found.verdict.heldout.noise_floor
 
 
 def test_widened_intervals_keep_signs_and_sides() -> None:

@@ -92,6 +92,6 @@ def test_trials_that_do_not_repeat_raise_an_alarm(recordings) -> None:
         )
         trials.append(replace(trial, position=trial.position + 0.03 * drop[:, None] * [1, 0]))
     found = diagnose_robot(replace(recordings, trials=tuple(trials)), seed=0)
-    assert found.status == "unexplained"
-    assert found.unknown.alarm
-    assert "shoulder" in (found.unknown.clue or "")
+    assert found.verdict.status == "unexplained"
+    assert found.verdict.unknown.alarm
+    assert "shoulder" in (found.verdict.unknown.clue or "")

@@ -21,9 +21,9 @@ def diagnosed(rig, folder, seed=0):
 
 def test_a_delay_that_changes_with_every_command_is_a_delay(tmp_path) -> None:
     found = diagnosed(replace(SMALL, rate_hz=30.0, latency_s=0.08, latency_spread=0.5), tmp_path)
-    assert found.status == "explained"
-    assert [cause.name for cause in found.causes] == ["control_latency"]
-    low, high = found.causes[0].params["tau_s"].ci95
+    assert found.verdict.status == "explained"
+    assert [cause.name for cause in found.verdict.causes] == ["control_latency"]
+    low, high = found.verdict.causes[0].params["tau_s"].ci95
     assert low < 0.08 < high
     reasons = [item.reason for item in found.evidence if item.name == "control_latency"]
     assert "changes from command to command" in reasons[0]
@@ -31,19 +31,19 @@ def test_a_delay_that_changes_with_every_command_is_a_delay(tmp_path) -> None:
 
 def test_commands_that_never_come_are_no_delay(tmp_path) -> None:
     found = diagnosed(replace(SMALL, unknown={"packet_loss": 1.0}), tmp_path)
-    assert found.status == "unexplained"
+    assert found.verdict.status == "unexplained"
 
 
 def test_servos_that_are_never_quite_the_same_are_no_fault(tmp_path) -> None:
     # Fine encoders see two per cent of stiffness from trial to trial.
     found = diagnosed(replace(SMALL, servo_scatter=0.02, noise=0.1, quantum=1e-5), tmp_path)
-    assert found.status == "adequate"
+    assert found.verdict.status == "adequate"
 
 
 def test_servos_that_weaken_through_the_session_are(tmp_path) -> None:
     found = diagnosed(replace(SMALL, unknown={"weak_servo": 0.15}), tmp_path)
-    assert found.status == "unexplained"
-    assert "servo's response changes through the session" in (found.unknown.clue or "")
+    assert found.verdict.status == "unexplained"
+    assert "servo's response changes through the session" in (found.verdict.unknown.clue or "")
 
 
 @pytest.fixture(scope="module")

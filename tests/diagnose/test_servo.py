@@ -186,9 +186,9 @@ def test_a_trial_without_its_servo_is_named(tmp_path: Path) -> None:
 @pytest.mark.slow
 def test_what_only_coulomb_and_viscous_friction_hold_back_is_adequate(tmp_path: Path) -> None:
     found = diagnose(make_set(tmp_path / "set", plain))
-    assert found.status == "adequate"
-    assert found.heldout is not None
-    assert found.heldout.extended < 5e-3
+    assert found.verdict.status == "adequate"
+    assert found.verdict.heldout is not None
+    assert found.verdict.heldout.extended < 5e-3
 
 
 @pytest.mark.slow
@@ -203,9 +203,9 @@ def test_a_hidden_law_is_named_and_sized(
     tmp_path: Path, cause: str, parameter: str, size: float, law: Law
 ) -> None:
     found = diagnose(make_set(tmp_path / "set", law))
-    assert found.heldout is not None
-    assert found.heldout.gain > 0.8
-    named = {item.name: item for item in found.causes}
+    assert found.verdict.heldout is not None
+    assert found.verdict.heldout.gain > 0.8
+    named = {item.name: item for item in found.verdict.causes}
     assert cause in named
     value = named[cause].params[parameter]
     assert value.value == pytest.approx(size, rel=0.3)

@@ -1,6 +1,5 @@
 """Which names survive: counted against an engine whose answers are known."""
 
-from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -22,15 +21,17 @@ def recordings(count: int) -> RecordingSet:
 
 def test_names_are_counted_over_draws_and_halves() -> None:
     found = pad_diagnosis()
-    gain_spread, hysteresis = found.causes
+    gain_spread, hysteresis = found.verdict.causes
     seen: list[tuple[int, int]] = []
 
     def again(given: RecordingSet, seed: int) -> Diagnosis:
         seen.append((len(given.trials), seed))
         if len(given.trials) < 9:
-            return replace(found, causes=(gain_spread,))
-        tie = (("latency", "scan_skew"),) if seed == 8 else ()
-        return replace(found, causes=(gain_spread, hysteresis), ambiguous_with=tie)
+            return pad_diagnosis(causes=(gain_spread,))
+        if seed == 8:
+            tie = (("latency", "scan_skew"),)
+            return pad_diagnosis(status="ambiguous", ambiguous_with=tie, next_experiment={"text": "more"})
+        return found
 
     survived = stability(recordings(9), found, 2, 7, again)
     assert seen == [(9, 8), (9, 9), (5, 7), (5, 7)]

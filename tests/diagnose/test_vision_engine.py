@@ -75,25 +75,25 @@ def frames_of(shift=(0, 0, 0), turn=(0, 0, 0), scale=1.0, noise_m=0.001, seed=0)
 
 def test_a_camera_where_it_says_is_adequate() -> None:
     found = diagnose_frames(frames_of())
-    assert found.status == "adequate"
+    assert found.verdict.status == "adequate"
     assert found.extended_model == CameraModel()
-    assert 0 < found.minimum_detectable["depth_scale"] < 0.02
+    assert 0 < found.verdict.minimum_detectable["depth_scale"] < 0.02
     assert {item.decision for item in found.evidence} == {"rejected"}
 
 
 def test_shifted_camera_is_named_and_measured() -> None:
     shift, turn = (0.012, -0.008, 0.01), (0.015, -0.01, 0.02)
     found = diagnose_frames(frames_of(shift, turn))
-    assert [cause.name for cause in found.causes] == ["camera_extrinsics"]
+    assert [cause.name for cause in found.verdict.causes] == ["camera_extrinsics"]
     np.testing.assert_allclose(found.extended_model.translation_m, shift, atol=0.002)
     np.testing.assert_allclose(found.extended_model.rotation_rad, turn, atol=0.002)
-    assert found.heldout.gain > 0.5
+    assert found.verdict.heldout.gain > 0.5
 
 
 def test_scaled_depth_is_named_and_measured() -> None:
     found = diagnose_frames(frames_of(scale=1.03))
-    assert [cause.name for cause in found.causes] == ["depth_scale"]
-    factor = found.causes[0].params["factor"]
+    assert [cause.name for cause in found.verdict.causes] == ["depth_scale"]
+    factor = found.verdict.causes[0].params["factor"]
     assert factor.value == pytest.approx(1.03, abs=0.003)
     assert factor.ci95[0] <= factor.value <= factor.ci95[1]
 

@@ -250,7 +250,9 @@ def test_diagnosis_finds_its_play_and_its_weight(faulty: Path, tmp_path: Path) -
     root = record(tmp_path / "faulty", environment(faulty), 8)
     options = diagnose_command.make_parser().parse_args([f"--dataset.root={root}", "--output_dir=unused"])
     found = diagnose_robot(diagnose_command.read(options), seed=0)
-    params = {cause.name: {key: item.value for key, item in cause.params.items()} for cause in found.causes}
+    params = {
+        cause.name: {key: item.value for key, item in cause.params.items()} for cause in found.verdict.causes
+    }
     assert set(params) == {"backlash", "gravity_sag"}
     assert params["backlash"] == pytest.approx({"only_alpha_rad": PLAY_RAD}, rel=0.05)
     # Weights [kg] times levers [m] of the stretched arm: forearm and finger, then upper arm as well.

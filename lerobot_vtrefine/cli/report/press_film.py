@@ -5,8 +5,8 @@ from pathlib import PurePath
 import numpy as np
 
 from lerobot_vtrefine.diagnose.core.diagnosis import Diagnosis
+from lerobot_vtrefine.diagnose.pad.prediction import predict_trial
 from lerobot_vtrefine.diagnose.predict import predict_frames
-from lerobot_vtrefine.diagnose.prediction import predict_trial
 from lerobot_vtrefine.diagnose.quality import in_si_units
 from lerobot_vtrefine.diagnose.recordings import RecordingSet, Trial
 from lerobot_vtrefine.pages.pads import colour_scale, pad_film

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from lerobot_vtrefine.diagnose.presses import Press, PressSet
+from lerobot_vtrefine.diagnose.pad.press_trials import Press, PressSet
 
 MIN_RECORDINGS = 4
 """Recordings that resampling needs to say anything about uncertainty."""

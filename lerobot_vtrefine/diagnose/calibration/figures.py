@@ -3,7 +3,7 @@
 import numpy as np
 
 from lerobot_vtrefine.diagnose.calibration.fit import Calibration
-from lerobot_vtrefine.diagnose.presses import Press
+from lerobot_vtrefine.diagnose.pad.press_trials import Press
 from lerobot_vtrefine.diagnose.report.numbers import scale_of
 from lerobot_vtrefine.pages.charts import Panel, drawing, label, span
 

@@ -11,14 +11,16 @@ from dataclasses import dataclass, replace
 import numpy as np
 from scipy import stats
 
-from lerobot_vtrefine.diagnose.baseline import Baseline, fit_baseline, weigh
 from lerobot_vtrefine.diagnose.calibration.excitation import Excitation, excitation, problems
-from lerobot_vtrefine.diagnose.candidates import saturation
-from lerobot_vtrefine.diagnose.composite import Composite, sensor_model
-from lerobot_vtrefine.diagnose.crossvalidation import cross_validate, folds_of, paired_p
-from lerobot_vtrefine.diagnose.fitting import Fit, bounded_step, fit
-from lerobot_vtrefine.diagnose.intervals import interval
-from lerobot_vtrefine.diagnose.presses import PressSet, prepare, usable
+from lerobot_vtrefine.diagnose.core.heldout import out_of_fold
+from lerobot_vtrefine.diagnose.core.resampling import one_sided
+from lerobot_vtrefine.diagnose.pad.baseline import Baseline, fit_baseline, weigh
+from lerobot_vtrefine.diagnose.pad.candidates import saturation
+from lerobot_vtrefine.diagnose.pad.fitting import Fit, bounded_step, fit
+from lerobot_vtrefine.diagnose.pad.intervals import interval
+from lerobot_vtrefine.diagnose.pad.model import Composite, sensor_model
+from lerobot_vtrefine.diagnose.pad.press_trials import PressSet, prepare, usable
+from lerobot_vtrefine.diagnose.pad.problem import PadProblem
 from lerobot_vtrefine.diagnose.quality import check_quality
 from lerobot_vtrefine.diagnose.recordings import RecordingSet
 from lerobot_vtrefine.diagnose.verdict import DataIssue, Parameter
@@ -149,9 +151,9 @@ def _with_saturation(baseline: Baseline, presses: PressSet, seed: int) -> tuple[
     richer = fit(plain.model.plus(saturation.FORMS[0], np.array([0.3])), presses, baseline.weights)
     if not richer.loss < plain.loss:
         return plain, None
-    folds = folds_of(presses, seed)
-    with_it, without = (cross_validate(item, presses, baseline.weights, folds) for item in (richer, plain))
-    p_value = paired_p(with_it.better_by(without), seed)
+    problem = PadProblem(presses, seed, baseline.weights)
+    with_it, without = (out_of_fold(problem, item, problem.folds) for item in (richer, plain))
+    p_value = float(one_sided(with_it.better_by(without)[:, None], seed)[0][0])
     if p_value > MAX_P or with_it.gain_over(without) < MIN_GAIN:
         return plain, p_value
     _, weights = weigh(richer, presses)

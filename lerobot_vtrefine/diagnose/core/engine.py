@@ -9,7 +9,9 @@ import numpy as np
 from lerobot_vtrefine.diagnose.core.heldout import lock
 from lerobot_vtrefine.diagnose.core.problem import Candidate, Fit, Problem
 from lerobot_vtrefine.diagnose.core.resampling import gain_interval
-from lerobot_vtrefine.diagnose.core.rivals import Rival, settled
+from lerobot_vtrefine.diagnose.core.rivals import Rival, find_rivals, settled
+from lerobot_vtrefine.diagnose.core.screened_rivals import screened_rivals
+from lerobot_vtrefine.diagnose.core.screened_search import ScreenedSearch
 from lerobot_vtrefine.diagnose.core.search import ALL, Search, Selection
 from lerobot_vtrefine.diagnose.core.suspicion import Alarm, raise_alarms
 
@@ -57,7 +59,8 @@ def infer[P: Problem[Any, Any]](
     count = len(whole.conditions)
     locked = np.array(lock(whole.conditions, seed) if locking else [], dtype=int)
     problem = whole.subset(np.setdiff1d(np.arange(count), locked))
-    selection = Search(problem, seed, _steps(tell)).run()
+    search: Any = ScreenedSearch if problem.screens else Search
+    selection = search(problem, seed, _steps(tell)).run()
     selection = selection.problem.reviewed(selection, seed)
     whole = whole.revised(selection.fit, [item for items in selection.chosen.values() for item in items])
     tell(f"{whole.subject}: looking for what is left", 0.6)
@@ -67,11 +70,13 @@ def infer[P: Problem[Any, Any]](
     if not alarms or selection.problem.can_settle:
         tell(f"{whole.subject}: looking for other explanations", 0.7)
         before = selection
-        selection, rivals = settled(selection, seed)
+        found = screened_rivals if problem.screens else find_rivals
+        selection, rivals = settled(selection, found(selection, seed), seed)
         if selection is not before:
             alarms = raise_alarms(selection, selection.problem.suspicions(selection, seed), seed)
     tell(f"{whole.subject}: settling the sizes", 0.8)
     selection, whole = _settled_finely(named_only(selection), whole)
+    selection = selection.problem.handed_out(selection, seed, doubtful=bool(alarms))
     test = whole.subset(locked) if len(locked) else selection.problem
     selection, refused = guarded(selection, test, seed)
     return Inference(
@@ -126,6 +131,11 @@ def guarded[P: Problem[Any, Any], F: Fit, C: Candidate](
             if gain >= 0:
                 break
             surely = gain_interval(base, extended, seed)[1] < 0
+            if selection.problem.screens and not surely:
+                # Scores found the name, and errors of a few locked trials do not disprove it: the model goes.
+                screened: Any = selection.problem
+                kept = screened.without_effect(selection.fit, selection.baseline)
+                return replace(selection, fit=kept), tuple(refused)
             refused.append(Refusal(candidate.cause, channel, gain, surely))
             selection = taken_back(selection, [candidate], channel)
     return selection, tuple(refused)

@@ -3,11 +3,12 @@
 import math
 from collections import defaultdict
 from collections.abc import Sequence
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 
-from lerobot_vtrefine.diagnose.core.problem import Fit, Problem
+from lerobot_vtrefine.diagnose.core.problem import Fit, ScoredFit, ScreenedProblem, SearchedProblem
 from lerobot_vtrefine.diagnose.core.resampling import gain_interval
 from lerobot_vtrefine.diagnose.core.rules import LOCKED_SHARE, MIN_DISCOVERY, WHOLE_CONDITIONS_FROM
 from lerobot_vtrefine.diagnose.verdict import Heldout
@@ -43,8 +44,36 @@ def lock(conditions: Sequence[str], seed: int) -> list[int]:
     return sorted(locked)
 
 
+@dataclass(frozen=True)
+class OutOfFold:
+    """How trials are predicted by fits that did not see them: mean squared errors, and log scores up to a
+    constant, (T, J) each."""
+
+    errors: Array
+    scores: Array
+
+    def gain_over(self, other: "OutOfFold") -> float:
+        """Part of the other's mean squared error that is gone."""
+        before = float(other.errors.sum())
+        return 1.0 - float(self.errors.sum()) / before if before > 0 else 0.0
+
+    def better_by(self, other: "OutOfFold") -> Array:
+        """Gain in log score of every trial (T,)."""
+        return (self.scores - other.scores).sum(1)
+
+
+def out_of_fold(problem: ScreenedProblem[Any, Any], fit: ScoredFit, folds: Array) -> OutOfFold:
+    """Every trial under a fit to the other folds, by one Newton step each."""
+    errors, scores = fit.mse.copy(), fit.scores.copy()
+    again = problem.reweighted(fit)
+    for fold in np.unique(folds) if len(set(folds)) > 1 else []:
+        held = np.flatnonzero(folds == fold)
+        errors[held], scores[held] = again.judged((folds != fold).astype(float), held)
+    return OutOfFold(errors, scores)
+
+
 def cross_validated(
-    problem: Problem[Any, Any],
+    problem: SearchedProblem[Any, Any],
     fit: Fit,
     folds: Array,
     known: Array | None = None,

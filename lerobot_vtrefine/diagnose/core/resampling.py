@@ -9,7 +9,7 @@ from collections.abc import Sequence
 import numpy as np
 from scipy.stats import t as student_t
 
-from lerobot_vtrefine.diagnose.core.rules import DRAWS, EXACT_UP_TO, FLIPS, FOLDS
+from lerobot_vtrefine.diagnose.core.rules import DRAWS, EXACT_UP_TO, FLIPS, FOLDS, MIN_CONDITIONS
 
 Array = np.ndarray
 
@@ -28,22 +28,18 @@ def sign_matrix(trials: int, seed: int) -> Array:
 
 def one_sided(scores: Array, seed: int) -> tuple[Array, Array]:
     """p (K,) that scores (T, K) are positive by accident: each alone, and adjusted for all K (max-T)."""
-    return _flipped(scores, np.zeros(scores.shape[1], dtype=bool), seed)
-
-
-def two_sided(scores: Array, seed: int) -> tuple[Array, Array]:
-    """The same for either sign."""
-    return _flipped(scores, np.ones(scores.shape[1], dtype=bool), seed)
-
-
-def _flipped(scores: Array, either_sign: Array, seed: int) -> tuple[Array, Array]:
     size = np.sqrt(np.square(scores).sum(0))
     flipped = sign_matrix(len(scores), seed) @ _of_unit_length(scores)
-    flipped[:, either_sign] = np.abs(flipped[:, either_sign])
     observed = flipped[0] - 1e-12
     alone = (flipped >= observed).mean(0)
     adjusted = _exceeding(flipped.max(1), observed)
     return np.where(size > 0, alone, 1.0), np.where(size > 0, adjusted, 1.0)
+
+
+def agree(differences: Array, seed: int, level: float) -> bool:
+    """Whether paired differences (T,) are positive at a level, or all are where T is too small for it."""
+    p_value = float(one_sided(differences[:, None], seed)[0][0])
+    return p_value <= max(level, 1.05 * 2.0 ** -len(differences) + 1e-3)
 
 
 def jointly_adjusted(hypotheses: Sequence[tuple[Array, Array | None, bool]], seed: int) -> Array:
@@ -82,6 +78,13 @@ def _exceeding(largest: Array, observed: Array) -> Array:
     return np.searchsorted(np.sort(-largest), -observed, side="right") / len(largest)
 
 
+def independent_units(conditions: Sequence[str]) -> list[str]:
+    """(T,) what varies independently: conditions, or single trials where there are too few conditions."""
+    if len(set(conditions)) >= MIN_CONDITIONS:
+        return list(conditions)
+    return [str(number) for number in range(len(conditions))]
+
+
 def folds_of(conditions: Sequence[str], seed: int) -> Array:
     """Fold (T,) of every trial: trials of one condition stay together."""
     names = sorted(set(conditions))
@@ -91,16 +94,16 @@ def folds_of(conditions: Sequence[str], seed: int) -> Array:
     return np.array([fold[condition] for condition in conditions])
 
 
-def jackknife(without: Array, value: float) -> tuple[float, float]:
-    """95 % interval of a value by what it becomes without each unit (G,).
+def jackknife(without: Array, value: float, centre: float | None = None) -> tuple[float, float]:
+    """95 % interval of a value by what it becomes without each unit (G,), around their mean unless given.
 
     Student's factor has the degrees of freedom that the contributions show: one unit that carries everything
     leaves two (Bell & McCaffrey 2002).
     """
-    moved = np.asarray(without) - np.mean(without)
+    moved = np.asarray(without) - (np.mean(without) if centre is None else centre)
     count, power = len(moved), moved**2
     total = float(power.sum())
-    if count < 2 or not total > 0:
+    if count < 2 or not 0 < total < np.inf:
         return value, value
     freedom = float(np.clip(3.0 * total**2 / (power**2).sum() - 1.0, _MIN_FREEDOM, count - 1))
     half = np.sqrt((count - 1) / count * total) * float(student_t.ppf(0.975, freedom))

@@ -1,5 +1,6 @@
 """What else would explain the trials as well: causes that these data cannot tell apart."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -122,11 +123,9 @@ def _if_tied[F: Fit, C: Candidate](
 
 
 def settled[F: Fit, C: Candidate](
-    selection: Selection[Any, F, C], seed: int
+    selection: Selection[Any, F, C], rivals: Sequence[Rival[F, C]], seed: int
 ) -> tuple[Selection[Any, F, C], tuple[Rival[F, C], ...]]:
     """The ties that remain after the problem has settled those that it can; the winners are adopted."""
-    left = []
-    rivals = find_rivals(selection, seed)
     decided = [(rival, selection.problem.settles(rival, selection, seed)) for rival in rivals]
     won = [rival for rival, winner in decided if winner > 0]
     for rival in won:

@@ -4,6 +4,8 @@ ALPHA = 0.02
 """Chance that trials without any effect yield a name, over all candidates and channels together."""
 SUSPICION_ALPHA = 0.01
 """Chance that trials without any effect raise an alarm, over all suspicions and channels together."""
+ORDER_ALPHA = 0.002
+"""The same by a suspicion that permutes the order of trials in its own way, beside the joint test."""
 LEAST_GAIN = 0.01
 """Smallest part of a channel's squared error that is worth a name: below, no user would notice."""
 LEAST_UNKNOWN = 0.02
@@ -49,3 +51,24 @@ UNSEEN = 0.05
 """Part of an effect that the baseline's own parameters must not be able to do for it to be identifiable."""
 FEW_TRIALS = 8
 """With fewer trials than this no sign flips can be significant over a catalogue of candidates."""
+
+SCREEN_ALPHA = 0.05
+"""Chance that any candidate passes a score test where none is there; it must then predict better, too."""
+SCREEN_SHARES = {"scores": 0.7, "products": 0.2, "order": 0.1}
+"""Parts of that error rate that kinds of score tests get; where one is missing, the others share its part."""
+FEW_FOR_SIGNS = 10
+"""With fewer trials than this, signs alone cannot pass a score test: size counts as well."""
+SIZE_DOUBT = 2.0
+"""Factor by which scores may stray more than the fitted noise says, where their size counts."""
+FITTED = 6
+"""Candidates that pass the score test and are fitted in a round, the most promising ones."""
+AGREEMENT_P = 0.05
+"""Chance that what passed the test predicts as many trials left out better, if there were nothing."""
+PROMISING = 0.4
+"""Part of the best candidate's gain that a cause's plain form must reach for its other forms to be tried."""
+RICH = 2
+"""Coordinates of a form from which on it imitates other causes."""
+NEARLY = 0.6
+"""Part of a named cause's gain that a rival's plain form must reach for its other forms to be tried."""
+DOUBTFUL_GAIN, DOUBTFUL_P = 0.03, 0.01
+"""What symptoms must take away of the cross-validated squared error, and how surely, to be handed out."""

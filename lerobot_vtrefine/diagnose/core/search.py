@@ -1,13 +1,13 @@
 """Which causes act on which channels: forward by cross-validated gain, then backward."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
 
 from lerobot_vtrefine.diagnose.core.heldout import cross_validated
-from lerobot_vtrefine.diagnose.core.problem import Candidate, Fit, Problem
+from lerobot_vtrefine.diagnose.core.problem import Candidate, Fit, Problem, SearchedProblem
 from lerobot_vtrefine.diagnose.core.resampling import folds_of, one_sided
 from lerobot_vtrefine.diagnose.core.rules import (
     ALPHA,
@@ -56,22 +56,38 @@ class Tried[F: Fit, C: Candidate]:
 
 
 @dataclass(frozen=True)
+class Examined:
+    """What became of one cause when it was tried alone, at its best."""
+
+    p_alone: float | None
+    p_adjusted: float | None
+    gain: float | None
+    """Cross-validated; None where it was not fitted."""
+    channel: int = 0
+    """Where it was strongest; `ALL` if it acts on all channels."""
+    observed: bool = False
+    """Seen in the readings themselves: nothing was tested."""
+
+
+@dataclass(frozen=True)
 class Selection[P: Problem[Any, Any], F: Fit, C: Candidate]:
     """What was accepted, and all that was tried."""
 
     problem: P
     baseline: F
-    baseline_errors: Array
-    """(T, J) cross-validated."""
     fit: F
     errors: Array
     """(T, J) cross-validated."""
     chosen: dict[int, tuple[C, ...]]
     """Channel -> candidates accepted there, in that order; `ALL` -> those that all channels share."""
-    p_values: dict[tuple[str, int], float]
-    """(cause, channel or `ALL`) -> adjusted p when it was accepted."""
+    p_values: Mapping[tuple[str, int], float | None]
+    """(cause, channel or `ALL`) -> adjusted p when it was accepted; None where it was observed."""
     first_round: tuple[Tried[F, C], ...] = field(repr=False, default=())
     """Every candidate alone on the baseline."""
+    examined: Mapping[str, Examined] = field(default_factory=dict)
+    """Every cause alone, at its best; decoys too."""
+    beside: Mapping[str, frozenset[str]] = field(default_factory=dict)
+    """Accepted cause -> others that passed a score test beside it."""
 
     def causes(self) -> dict[str, tuple[int, ...]]:
         """Named cause -> channels that it acts on."""
@@ -88,11 +104,16 @@ class Selection[P: Problem[Any, Any], F: Fit, C: Candidate]:
         return tuple(dict.fromkeys(found))
 
     def p_value(self, cause: str) -> float | None:
-        """The smallest of a cause's."""
-        return min((p for (name, _), p in self.p_values.items() if name == cause), default=None)
+        """The smallest of a cause's; None where it was observed, not tested."""
+        found = [p for (name, _), p in self.p_values.items() if name == cause and p is not None]
+        return min(found, default=None)
+
+    def observed(self, cause: str) -> bool:
+        """Whether an accepted cause was seen in the readings themselves."""
+        return self.p_value(cause) is None and any(name == cause for name, _ in self.p_values)
 
 
-class Search[P: Problem[Any, Any], F: Fit, C: Candidate]:
+class Search[P: SearchedProblem[Any, Any], F: Fit, C: Candidate]:
     """State of one search."""
 
     def __init__(self, problem: P, seed: int, tell: Callable[[str], None]) -> None:
@@ -101,7 +122,7 @@ class Search[P: Problem[Any, Any], F: Fit, C: Candidate]:
         tell(f"{problem.subject}: fitting the baseline")
         self.baseline: F = problem.baseline()
         self.now = self.baseline
-        self.errors = self.baseline_errors = cross_validated(problem, self.now, self.folds)
+        self.errors = cross_validated(problem, self.now, self.folds)
         self.chosen: dict[int, tuple[C, ...]] = {}
         self.p_values: dict[tuple[str, int], float] = {}
         self.changed = np.ones(len(problem.channels), dtype=bool)
@@ -122,12 +143,12 @@ class Search[P: Problem[Any, Any], F: Fit, C: Candidate]:
         return Selection(
             self.problem,
             self.baseline,
-            self.baseline_errors,
             self.now,
             self.errors,
             self.chosen,
             self.p_values,
             first,
+            examined_in(first),
         )
 
     @property
@@ -272,6 +293,22 @@ class Search[P: Problem[Any, Any], F: Fit, C: Candidate]:
         self.p_values.pop((candidate.cause, channel), None)
         if not self.chosen[channel]:
             del self.chosen[channel]
+
+
+def examined_in(tried: Sequence[Tried[Any, Any]]) -> dict[str, Examined]:
+    """Every cause by its best form and channel."""
+    out: dict[str, Examined] = {}
+    for item in tried:
+        channel = int(item.gain.argmax())
+        gain, best = float(item.gain[channel]), out.get(item.cause)
+        if best is None or best.gain is None or gain > best.gain:
+            assert item.p_alone is not None
+            assert item.p_adjusted is not None
+            place = ALL if item.candidate.shared else channel
+            out[item.cause] = Examined(
+                float(item.p_alone[channel]), float(item.p_adjusted[channel]), gain, place
+            )
+    return out
 
 
 def best_per_channel[F: Fit, C: Candidate](

@@ -10,11 +10,11 @@ from lerobot_vtrefine.diagnose.core.engine import Inference
 from lerobot_vtrefine.diagnose.core.heldout import heldout_gain
 from lerobot_vtrefine.diagnose.core.problem import Account
 from lerobot_vtrefine.diagnose.core.rivals import without_cause
-from lerobot_vtrefine.diagnose.core.rules import ALPHA, LEAST_GAIN
-from lerobot_vtrefine.diagnose.core.search import Tried
+from lerobot_vtrefine.diagnose.core.rules import ALPHA, LEAST_GAIN, SCREEN_ALPHA
+from lerobot_vtrefine.diagnose.core.search import ALL, Examined
 from lerobot_vtrefine.diagnose.core.suspicion import Alarm
-from lerobot_vtrefine.diagnose.evidence import Evidence, TrialError
-from lerobot_vtrefine.diagnose.verdict import Cause, Role, Status, Unknown
+from lerobot_vtrefine.diagnose.evidence import Evidence, TrialError, not_tested
+from lerobot_vtrefine.diagnose.verdict import Cause, Role, Status, Unknown, Verdict
 
 Array = np.ndarray
 Found = Inference[Any, Any, Any]
@@ -30,25 +30,37 @@ def tell(found: Found, account: Account[Any, Any]) -> Diagnosis:
     alarmed = bool(found.alarms)
     role: Role = "symptom" if alarmed else "cause"
     causes = tuple(
-        Cause(name, role, account.parameters(name, own), selection.p_value(name), _gain(found, name, own))
+        Cause(
+            name,
+            role,
+            account.parameters(name, own),
+            selection.p_value(name),
+            _gain(found, name, own),
+            "observed" if selection.observed(name) else "tested",
+        )
         for name, own in selection.causes().items()
     )
     ambiguous = () if alarmed else _pairs(found)
     traces, residuals = account.drawings(test, found.seed)
     gains = 1 - after.mean(0) / before.mean(0).clip(1e-300)
     held = heldout_gain(before, after, test.files, account.metric, account.noise_floor(), found.seed)
+    evidence = tuple(_evidence(found, account, name) for name in _names(found, account))
+    verdict = Verdict(
+        _status(bool(causes), bool(ambiguous), alarmed),
+        causes,
+        ambiguous,
+        _unknown(found.alarms, test.channels),
+        held if found.locked else None,
+        account.minimum_detectable(),
+        account.next_experiment(found.rivals, found.alarms),
+        not_tested=not_tested(evidence),
+    )
     return Diagnosis(
-        status=_status(bool(causes), bool(ambiguous), alarmed),
-        causes=causes,
-        ambiguous_with=ambiguous,
-        unknown=_unknown(found.alarms, test.channels),
-        heldout=held if found.locked else None,
-        minimum_detectable=account.minimum_detectable(),
-        next_experiment=account.next_experiment(found.rivals, found.alarms),
+        verdict,
         baseline_model=account.model(selection.baseline),
         extended_model=account.model(selection.fit),
         baseline_params=account.baseline_parameters(),
-        evidence=tuple(_evidence(found, account, name) for name in _names(found, account)),
+        evidence=evidence,
         traces=traces,
         residuals=residuals,
         trial_errors=_trial_errors(test, before, after),
@@ -82,6 +94,10 @@ def _gain(found: Found, cause: str, channels: tuple[int, ...]) -> float:
 def _unknown(alarms: Sequence[Alarm], channels: tuple[str, ...]) -> Unknown:
     if not alarms:
         return Unknown(alarm=False)
+    if len(channels) == 1:
+        clues = [alarm.clue for alarm in alarms]
+        more = "" if len(clues) <= _CLUES else f"; and {len(clues) - _CLUES} more"
+        return Unknown(True, "; ".join(clues[:_CLUES]) + more)
     told: dict[str, list[str]] = {}
     spoken_of: set[int] = set()
     for alarm in alarms:
@@ -94,59 +110,75 @@ def _unknown(alarms: Sequence[Alarm], channels: tuple[str, ...]) -> Unknown:
 
 
 def _names(found: Found, account: Account[Any, Any]) -> tuple[str, ...]:
-    """Every name that is told about, and decoys."""
-    tried = (item.cause for item in found.selection.first_round)
-    return tuple(dict.fromkeys((*account.causes(), *tried)))
+    """Every name that is told about, and decoys; the most promising first where scores were tested."""
+    return tuple(dict.fromkeys((*account.causes(), *found.selection.examined)))
 
 
 def _evidence(found: Found, account: Account[Any, Any], name: str) -> Evidence:
-    """About one name, by its best form and channel."""
+    """About one name."""
     selection = found.selection
-    tried = [item for item in selection.first_round if item.cause == name]
-    label = name if not tried or not tried[0].candidate.clue else "(no name)"
-    if not tried:
-        return Evidence(label, None, None, None, "not identifiable", account.not_identifiable(name))
-    alone, adjusted, gain, where = _strongest(tried, found.test.channels)
-    accepted, ties = selection.causes(), {item.name: item for item in found.rivals}
+    clues = {item.cause: item.candidate.clue for item in selection.first_round}
+    label = "(no name)" if clues.get(name) else name
+    seen = selection.examined.get(name, Examined(None, None, None))
+    p_adjusted = seen.p_adjusted
+    if name in selection.causes():
+        p_adjusted = selection.p_value(name)
+    decision, reason = _decision(found, account, name, seen)
+    if decision == "not identifiable":
+        return Evidence(label, None, None, None, decision, reason)
+    observed = selection.observed(name) or seen.observed
+    return Evidence(label, seen.p_alone, p_adjusted, seen.gain, decision, reason, observed)
+
+
+def _decision(found: Found, account: Account[Any, Any], name: str, seen: Examined) -> tuple[str, str]:
+    """What became of a name, and why."""
+    accepted, ties = found.selection.causes(), {item.name: item for item in found.rivals}
     if name in accepted:
-        decision = "symptom" if found.alarms else "accepted"
-        channels = accepted[name]
-        reason = f"on {_joined(found, channels)}{account.caveat(name, channels)}"
-    elif name in ties:
-        decision = "tie"
-        reason = f"explains {ties[name].cause} on {_joined(found, ties[name].channels)} as well"
-    elif refused := [item.gain for item in found.refused if item.cause == name]:
-        decision = "rejected"
-        reason = f"predicts worse than the baseline on trials left out (gain {min(refused):.2f})"
-    elif why := account.not_identifiable(name):
-        decision, reason = "not identifiable", why
-    else:
-        decision = "rejected"
-        reason = (
-            f"strongest on {where}; in such trials chance gives as much, or it is under "
-            f"{100 * LEAST_GAIN:.0f} % of error"
-        )
-        if adjusted < ALPHA:
-            reason = f"significant on {where} by itself, but another cause explains it better"
-    return Evidence(label, alone, adjusted, gain, decision, reason)
+        return _accepted(found, name, account.caveat(name, accepted[name]))
+    if name in ties:
+        return "tie", f"explains {ties[name].cause}{_where(found, ties[name].channels)} as well"
+    if refused := [item.gain for item in found.refused if item.cause == name]:
+        text = f"predicts worse than the baseline on trials left out (gain {min(refused):.2f})"
+        return "rejected", text
+    why, tried = account.not_identifiable(name), name in found.selection.examined
+    # A score test asks about everything; elsewhere, what was not tried could not be seen.
+    if why or not (tried or found.selection.problem.screens):
+        return "not identifiable", why
+    return "rejected", _why_rejected(found, seen)
 
 
-def _strongest(
-    tried: Sequence[Tried[Any, Any]], channels: tuple[str, ...]
-) -> tuple[float, float, float, str]:
-    item = max(tried, key=lambda one: float(one.gain.max()))
-    channel = int(item.gain.argmax())
-    assert item.p_alone is not None
-    assert item.p_adjusted is not None
-    where = "all channels" if item.candidate.shared else channels[channel]
-    return float(item.p_alone[channel]), float(item.p_adjusted[channel]), float(item.gain[channel]), where
+def _accepted(found: Found, name: str, caveat: str) -> tuple[str, str]:
+    where = _where(found, found.selection.causes()[name])
+    seen = "seen in the readings themselves, not tested; " if found.selection.observed(name) else ""
+    reason = f"{seen}predicts trials that its fit has not seen better{where}{caveat}"
+    if not found.alarms:
+        return "accepted", reason
+    return "symptom", f"{reason}; but something is left that no cause explains: the name may be borrowed"
 
 
-def _joined(found: Found, channels: tuple[int, ...]) -> str:
+def _why_rejected(found: Found, seen: Examined) -> str:
+    if seen.gain is None:
+        if seen.p_adjusted is None:
+            return "no sign of it"
+        if seen.p_adjusted > SCREEN_ALPHA:
+            return f"trials agree on it no more than by chance (adjusted p above {SCREEN_ALPHA:g})"
+        return "passed the score test, but others explained more and left nothing for it"
+    where = " on all channels" if seen.channel == ALL else _where(found, (seen.channel,))
+    if seen.gain > LEAST_GAIN and (seen.p_adjusted is None or seen.p_adjusted < ALPHA):
+        return f"significant{where} by itself, but another cause explains it better"
+    least = f"under {100 * LEAST_GAIN:.0f} % of error"
+    place = f"strongest{where}; " if where else ""
+    return f"{place}in such trials chance gives as much, or it is {least}"
+
+
+def _where(found: Found, channels: tuple[int, ...]) -> str:
+    """On which channels, where there are several."""
     names = found.test.channels
-    if len(channels) == len(names) > 1:
-        return f"all {len(names)}"
-    return ", ".join(names[channel] for channel in channels)
+    if len(names) == 1:
+        return ""
+    if len(channels) == len(names):
+        return f" on all {len(names)}"
+    return f" on {', '.join(names[channel] for channel in channels)}"
 
 
 def _trial_errors(test: Any, before: Array, after: Array) -> tuple[TrialError, ...]:

@@ -3,6 +3,7 @@
 from dataclasses import replace
 
 from lerobot_vtrefine.diagnose.core.diagnosis import Diagnosis
+from lerobot_vtrefine.diagnose.evidence import not_tested
 from lerobot_vtrefine.diagnose.verdict import Status
 
 _WORSE: tuple[Status, ...] = ("adequate", "explained", "ambiguous", "unexplained")
@@ -15,24 +16,26 @@ def merged(robot: Diagnosis, other: Diagnosis) -> Diagnosis:
     found; every cause's own gain stands with it. An alarm about joints says nothing about a camera, but a
     verdict that is unexplained holds symptoms only.
     """
-    if other.causes and robot.status == "adequate":
-        errors = {"heldout": other.heldout, "trial_errors": other.trial_errors, "unit": other.unit}
-        robot = replace(robot, **errors, traces=(), residuals=())
-    unknown = robot.unknown if robot.unknown.alarm else other.unknown
+    one, two = robot.verdict, other.verdict
+    if two.causes and one.status == "adequate":
+        robot = replace(robot, trial_errors=other.trial_errors, unit=other.unit, traces=(), residuals=())
+        one = replace(one, heldout=two.heldout)
+    unknown = one.unknown if one.unknown.alarm else two.unknown
     causes = [
-        replace(cause, role="symptom") if unknown.alarm else cause for cause in (*robot.causes, *other.causes)
+        replace(cause, role="symptom") if unknown.alarm else cause for cause in (*one.causes, *two.causes)
     ]
     evidence = [
         replace(item, decision="symptom") if unknown.alarm and item.decision == "accepted" else item
         for item in (*robot.evidence, *other.evidence)
     ]
-    return replace(
-        robot,
-        status=max(robot.status, other.status, key=_WORSE.index),
+    verdict = replace(
+        one,
+        status=max(one.status, two.status, key=_WORSE.index),
         causes=tuple(causes),
-        ambiguous_with=() if unknown.alarm else (*robot.ambiguous_with, *other.ambiguous_with),
+        ambiguous_with=() if unknown.alarm else (*one.ambiguous_with, *two.ambiguous_with),
         unknown=unknown,
-        minimum_detectable={**robot.minimum_detectable, **other.minimum_detectable},
-        next_experiment=robot.next_experiment or other.next_experiment,
-        evidence=tuple(evidence),
+        minimum_detectable={**one.minimum_detectable, **two.minimum_detectable},
+        next_experiment=one.next_experiment or two.next_experiment,
+        not_tested=not_tested(evidence),
     )
+    return replace(robot, verdict=verdict, evidence=tuple(evidence))

@@ -107,10 +107,6 @@ class ServoTrials:
             return self
         return replace(self, shapes=self.shapes | gravity.shapes(self.names, self.batch.command + push))
 
-    def finer(self) -> Self | None:
-        """The same trials with predictions for which the search is too slow; None where there are none."""
-        return None
-
     @property
     def weight(self) -> Array:
         """(J,) that makes the joints' squared errors comparable where they share the delay."""

@@ -24,8 +24,6 @@ TWO_TERM_FORM = "arm"
 FREE_FORM = "free"
 """Sines and cosines of the pitch of the own and the next link: any zero angle, any mass distribution."""
 FORMS = (*ONE_TERM_FORMS, TWO_TERM_FORM, FREE_FORM)
-DECOY_FORMS = ("gain", "square", "drift", "gain_drift")
-"""Shapes that are no cause's: proportional to position, to its square, to session time, to both."""
 
 _LEVEL_OR_SLIDING = re.compile(r"waist|base|pan|yaw|roll|rotat|twist|finger|grip|jaw|slide|prismatic|_x$|_y$")
 _SLIDING = re.compile(r"finger|grip|jaw|slide|prismatic")

@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from lerobot_vtrefine.diagnose.core.resampling import draws_of
+from lerobot_vtrefine.diagnose.core.residual_views import residual_view
 from lerobot_vtrefine.diagnose.evidence import ResidualView, Trace
 from lerobot_vtrefine.diagnose.joints.batch import Batch
 
@@ -10,8 +10,6 @@ Array = np.ndarray
 
 MAX_TRACES = 6
 MAX_CHANNELS = 4
-_BINS = 12
-_DRAWS = 300
 
 
 def traces(batch: Batch, names: tuple[str, ...], simulated: Array, extended: Array) -> tuple[Trace, ...]:
@@ -51,39 +49,9 @@ def residual_views(batch: Batch, simulated: Array, extended: Array, seed: int) -
     }
     if batch.load is not None:
         axes["load", "1"] = batch.load[..., joint]
-    views = [
-        _view(axis, unit, values, left[0][..., joint], left[1][..., joint], batch.valid, seed)
-        for (axis, unit), values in axes.items()
-    ]
+    views = []
+    for (axis, unit), values in axes.items():
+        before, after = (x[..., joint] for x in left)
+        trials = [(values[v, k], before[v, k], after[v, k]) for k, v in enumerate(batch.valid.T)]
+        views.append(residual_view(axis, unit, trials, seed))
     return tuple(view for view in views if view is not None)
-
-
-def _view(
-    axis: str, unit: str, values: Array, before: Array, after: Array, valid: Array, seed: int
-) -> ResidualView | None:
-    edges = np.unique(np.quantile(values[valid], np.linspace(0, 1, _BINS + 1)))
-    if len(edges) < 3:
-        return None
-    count = len(edges) - 1
-    place = np.clip(np.searchsorted(edges, values, side="right") - 1, 0, count - 1)
-    trials = values.shape[1]
-    flat = (place + count * np.arange(trials))[valid]
-
-    def per_trial(x: Array) -> Array:
-        return np.bincount(flat, x[valid], minlength=count * trials).reshape(trials, count)
-
-    sums = [per_trial(np.ones_like(values)), per_trial(before), per_trial(after)]
-    draws = draws_of(trials, seed, _DRAWS)
-    number = sums[0].sum(0)
-    drawn = sums[0][draws].sum(1).clip(1)
-    intervals = [np.percentile(x[draws].sum(1) / drawn, [2.5, 97.5], axis=0).T for x in sums[1:]]
-    return ResidualView(
-        axis=axis,
-        unit=unit,
-        x=per_trial(values).sum(0) / number.clip(1),
-        before=sums[1].sum(0) / number.clip(1),
-        after=sums[2].sum(0) / number.clip(1),
-        before_ci95=intervals[0],
-        after_ci95=intervals[1],
-        count=number,
-    )

@@ -12,14 +12,14 @@ from typing import Any
 import numpy as np
 
 from lerobot_vtrefine.diagnose.core.diagnosis import Diagnosis
-from lerobot_vtrefine.diagnose.evidence import Evidence
+from lerobot_vtrefine.diagnose.evidence import Evidence, not_tested
 from lerobot_vtrefine.diagnose.parts import friction as sliding
 from lerobot_vtrefine.diagnose.parts.clearance import clearance, contacts_of
 from lerobot_vtrefine.diagnose.parts.episodes import AssumedScene, HandledEpisode
 from lerobot_vtrefine.diagnose.parts.mass import PARTS, masses, remeasured
 from lerobot_vtrefine.diagnose.parts.payload import GRAVITY_M_S2, Arms, replay_loaded
 from lerobot_vtrefine.diagnose.parts.problem import Measured, Quantity, measure
-from lerobot_vtrefine.diagnose.verdict import Cause
+from lerobot_vtrefine.diagnose.verdict import Cause, Verdict
 from lerobot_vtrefine.sim.scene import build_scene
 
 Array = np.ndarray
@@ -39,7 +39,7 @@ PAD_FRICTION = (
 def unknown_parts() -> Diagnosis:
     """Of a dataset whose parts the twin does not know."""
     evidence = tuple(Evidence(name, None, None, None, "not identifiable", UNKNOWN_PARTS) for name in NAMES)
-    return Diagnosis("adequate", evidence=evidence)
+    return Diagnosis(Verdict("adequate", not_tested=not_tested(evidence)), evidence=evidence)
 
 
 def assumed_masses(scene: AssumedScene) -> Array:
@@ -63,7 +63,7 @@ def found_masses(arms: Arms, scene: AssumedScene, episodes: Sequence[HandledEpis
 
 def believed_masses(found: Diagnosis, scene: AssumedScene) -> Array:
     """(2,) the same, from a diagnosis."""
-    named = {key: item.value for cause in found.causes for key, item in cause.params.items()}
+    named = {key: item.value for cause in found.verdict.causes for key, item in cause.params.items()}
     return np.array(
         [named.get(f"{part}_kg", known) for part, known in zip(PARTS, assumed_masses(scene), strict=True)]
     )
@@ -98,13 +98,14 @@ def _summary(measured: Sequence[Measured]) -> Diagnosis:
             p_value = min(item.p_adjusted for item in found if item.p_adjusted is not None)
             # No episode is locked away, so that there is no gain on locked ones.
             causes.append(Cause(name, "cause", params, p_value, None))
-    return Diagnosis(
+    verdict = Verdict(
         "explained" if causes else "adequate",
         tuple(causes),
         minimum_detectable=detectable,
         next_experiment=_next(evidence),
-        evidence=tuple(evidence),
+        not_tested=not_tested(evidence),
     )
+    return Diagnosis(verdict, evidence=tuple(evidence))
 
 
 def _strongest(items: list[Evidence]) -> Evidence:

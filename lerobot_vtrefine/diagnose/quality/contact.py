@@ -4,7 +4,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from lerobot_vtrefine.diagnose.indenters import trial_forces, trial_heights
+from lerobot_vtrefine.diagnose.pad.indenters import trial_forces, trial_heights
 from lerobot_vtrefine.diagnose.recordings import RecordingSet, Trial
 from lerobot_vtrefine.tactile.layout import PadLayout
 

@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 
-from lerobot_vtrefine.diagnose.indenters import mesh_extent_m
+from lerobot_vtrefine.diagnose.pad.indenters import mesh_extent_m
 from lerobot_vtrefine.diagnose.quality.edits import NO_VERDICT, SET_ASIDE, Finding
 from lerobot_vtrefine.diagnose.recordings import RecordingSet
 

@@ -172,8 +172,8 @@ def meaning(name: str) -> Meaning:
     """What a cause is; one that was added to the catalogue says so in its file."""
     if name in MEANINGS:
         return MEANINGS[name]
-    from lerobot_vtrefine.diagnose import candidates
     from lerobot_vtrefine.diagnose.joints import candidates as joint_candidates
+    from lerobot_vtrefine.diagnose.pad import candidates
     from lerobot_vtrefine.diagnose.servo import candidates as servo_candidates
 
     catalogues = (candidates, joint_candidates, servo_candidates)

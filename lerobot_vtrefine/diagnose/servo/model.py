@@ -2,7 +2,7 @@
 
 import json
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Literal
 
@@ -47,7 +47,7 @@ class ServoModel:
 
     def predict(self, trial: RobotTrial) -> np.ndarray:
         """Positions (N, 1) of a trial from its commands and first position; ValueError without its load."""
-        hidden = RobotTrial(**{**vars(trial), "position": trial.position[:1].repeat(len(trial.time_s), 0)})
+        hidden = replace(trial, position=trial.position[:1].repeat(len(trial.time_s), 0))
         alone = RecordingSet(Path(), "robot", 0, 0, 0.0, "rad", 0.0, ("servo",), (hidden,))
         return simulate(Bench.of(alone), self.theta[None])[:, 0]
 

@@ -1,0 +1,64 @@
+"""Causes that these trials cannot tell apart, where a score test says which candidates are fitted."""
+
+from functools import partial
+from typing import Any
+
+import numpy as np
+
+from lerobot_vtrefine.diagnose.core.heldout import OutOfFold
+from lerobot_vtrefine.diagnose.core.parallel import on_all_cores
+from lerobot_vtrefine.diagnose.core.problem import FormCandidate, ScoredFit
+from lerobot_vtrefine.diagnose.core.resampling import agree, one_sided
+from lerobot_vtrefine.diagnose.core.rivals import Rival
+from lerobot_vtrefine.diagnose.core.rules import NEARLY, RICH, TIE_P
+from lerobot_vtrefine.diagnose.core.screened_search import CHANNEL, Ground, Step, folds_for
+from lerobot_vtrefine.diagnose.core.search import Selection
+
+
+def screened_rivals[F: ScoredFit, C: FormCandidate](
+    selection: Selection[Any, F, C], seed: int
+) -> list[Rival[F, C]]:
+    """All causes that tie with an accepted one, of those that passed the test beside it.
+
+    Both the log scores and the squared errors must not prefer what was named: weights forgive much that plain
+    errors do not.
+    """
+    problem, chosen = selection.problem, selection.chosen.get(CHANNEL, ())
+    folds = folds_for(problem.conditions, seed)
+    names = {item.cause for item in chosen}
+    whole = Ground(problem, selection.fit, folds, seed)
+    full = whole.judged(selection.fit)
+    found: list[Rival[F, C]] = []
+    for candidate in chosen:
+        others = sorted(selection.beside.get(candidate.cause, frozenset()) - names)
+        if not others:
+            continue
+        slim = problem.reduced(selection.fit, [candidate], np.ones(1, dtype=bool))
+        ground = Ground(problem, slim, folds, seed)
+        less = ground.judged(slim)
+        enough = NEARLY * full.gain_over(less)
+        # A rich form imitates much: a rival may have one only if what was named has.
+        richest = max(candidate.terms, RICH)
+        offered = [item.candidate for item in problem.screened(slim, others)]
+        best = partial(_in_place, ground, less, enough, richest)
+        for step in on_all_cores(best, offered):
+            if tied(full, step.held, seed):
+                found.append(_rival(candidate, step, full, seed))
+    return found
+
+
+def _in_place(ground: Ground[Any, Any], less: OutOfFold, enough: float, richest: int, other: Any) -> Step:
+    """The best fit with a rival; in other forms too if the plain one gains enough over none."""
+    plain = ground.plain(other)
+    return ground.refined(plain, richest) if plain.held.gain_over(less) > enough else plain
+
+
+def tied(full: OutOfFold, other: OutOfFold, seed: int) -> bool:
+    """Whether trials do not prefer what was named."""
+    measures = (full.better_by(other), (other.errors - full.errors).sum(1))
+    return not any(agree(differences, seed, TIE_P) for differences in measures)
+
+
+def _rival(candidate: Any, step: Step[Any, Any], full: OutOfFold, seed: int) -> Rival[Any, Any]:
+    p_value = float(one_sided(full.better_by(step.held)[:, None], seed)[0][0])
+    return Rival(candidate.cause, step.candidate, (CHANNEL,), False, p_value, step.fit, step.held.errors)

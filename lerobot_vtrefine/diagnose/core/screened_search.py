@@ -1,0 +1,240 @@
+"""Which causes act, where fits are slow: a score test says which candidates are worth a fit.
+
+One channel. A candidate is accepted if it passed the score test and predicts trials left out better: forward,
+one at a time, and backward after every step. Plain forms are fitted first, others where the plain one comes
+near the best.
+"""
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from lerobot_vtrefine.diagnose.core.heldout import OutOfFold, out_of_fold
+from lerobot_vtrefine.diagnose.core.parallel import on_all_cores
+from lerobot_vtrefine.diagnose.core.problem import FormCandidate, Promise, ScoredFit, ScreenedProblem
+from lerobot_vtrefine.diagnose.core.resampling import agree, folds_of, independent_units
+from lerobot_vtrefine.diagnose.core.rules import (
+    AGREEMENT_P,
+    FITTED,
+    LEAST_GAIN,
+    MAX_ROUNDS,
+    PROMISING,
+    RICH,
+)
+from lerobot_vtrefine.diagnose.core.search import Examined, Selection
+
+Array = np.ndarray
+CHANNEL = 0
+"""The only one."""
+_ONE = np.ones(1, dtype=bool)
+
+
+@dataclass(frozen=True)
+class Step[F: ScoredFit, C: FormCandidate]:
+    """A model with one candidate more, and how it predicts trials left out."""
+
+    candidate: C
+    fit: F
+    held: OutOfFold
+
+
+@dataclass(frozen=True)
+class Ground[P: ScreenedProblem[Any, Any], F: ScoredFit]:
+    """What candidates are added to: a problem under its weights, a fit, and the folds."""
+
+    problem: P
+    now: F
+    folds: Array
+    seed: int
+
+    def judged(self, fit: F) -> OutOfFold:
+        """A fit on trials left out."""
+        return out_of_fold(self.problem, fit, self.folds)
+
+    def plain(self, candidate: Any) -> Step[F, Any]:
+        """With a candidate in its plain form."""
+        fitted = self.problem.extended(self.now, candidate, _ONE)
+        return Step(candidate, fitted, self.judged(fitted))
+
+    def refined(self, plain: Step[F, Any], richest: float = np.inf) -> Step[F, Any]:
+        """The same in another form (of at most so many terms), where one predicts clearly better."""
+        best = plain
+        for other in self.problem.refinements(plain.candidate):
+            if other.terms > richest:
+                continue
+            fitted = self.problem.extended(self.now, other, _ONE, plain.fit)
+            step = Step(other, fitted, self.judged(fitted))
+            if preferable(other, step.held, best.held, self.seed):
+                best = step
+        return best
+
+
+def preferable(candidate: FormCandidate, held: OutOfFold, than: OutOfFold, seed: int) -> bool:
+    """Whether a form is to stand in for a plainer one."""
+    if candidate.peer:
+        return held.gain_over(than) > 0 and float(held.better_by(than).sum()) > 0
+    return clearly_better(held, than, seed)
+
+
+def clearly_better(held: OutOfFold, than: OutOfFold, seed: int, needed: float = LEAST_GAIN) -> bool:
+    """Whether a richer model pays: so much less error, in most trials."""
+    return held.gain_over(than) > needed and agree(held.better_by(than), seed, AGREEMENT_P)
+
+
+def folds_for(conditions: Sequence[str], seed: int) -> Array:
+    """(T,) fold of every trial; single trials are the units where conditions are too few."""
+    return folds_of(independent_units(conditions), seed)
+
+
+class ScreenedSearch[P: ScreenedProblem[Any, Any], F: ScoredFit, C: FormCandidate]:
+    """State of one search."""
+
+    def __init__(self, problem: P, seed: int, tell: Callable[[str], None]) -> None:
+        self.seed, self.tell = seed, tell
+        self.folds = folds_for(problem.conditions, seed)
+        tell(f"{problem.subject}: fitting the baseline")
+        self.baseline: F = problem.baseline()
+        self.problem, self.now = problem.weighed(None)
+        self.chosen: tuple[C, ...] = ()
+        self.p_values: dict[str, float | None] = {}
+        self.beside: dict[str, frozenset[str]] = {}
+        self.first: list[Promise[C]] = []
+        self.gains: dict[str, float] = {}
+        """Best cross-validated gain that each cause reached."""
+
+    def run(self) -> Selection[P, F, C]:
+        """Forward, and backward after every step."""
+        for number in range(MAX_ROUNDS):
+            self.tell(f"{self.problem.subject}: trying causes, round {number + 1}")
+            found, step = self._round(self.problem, self.now)
+            self.first = self.first or found
+            # What passes the test and yet predicts nothing may be a cause that weights forgive in part.
+            if step is None and (any(item.tested.passed for item in found) or self.problem.far_off(self.now)):
+                found, step = self._round(*self.problem.unweighed(self.now))
+            if step is None:
+                break
+            self._accept(step, found)
+            self._drop_needless()
+        return Selection(
+            self.problem,
+            self.baseline,
+            self.now,
+            out_of_fold(self.problem, self.now, self.folds).errors,
+            {CHANNEL: self.chosen} if self.chosen else {},
+            {(name, CHANNEL): p for name, p in self.p_values.items()},
+            examined=self._examined(),
+            beside=self.beside,
+        )
+
+    def _round(self, problem: P, now: F) -> tuple[list[Promise[C]], Step[F, C] | None]:
+        """All tests, and the best step from here, if any is worth it."""
+        found = problem.screened(now)
+        passed = sorted((item for item in found if item.tested.passed), key=_promise)[:FITTED]
+        steps = self._steps(Ground(problem, now, self.folds, self.seed), passed)
+        return found, self._first_of(steps)
+
+    def _steps(self, ground: Ground[P, F], passed: Sequence[Promise[C]]) -> list[tuple[float, Step[F, C]]]:
+        """Steps that predict trials left out better, by the log score that they gain, best first."""
+        base = ground.judged(ground.now)
+        needed = self._needed()
+        fitted = [ground.plain(item.candidate) for item in passed if item.candidate.disturbs]
+        taken = any(self._helps(step.held, base, needed) for step in fitted)
+        others = [] if taken else [item.candidate for item in passed if not item.candidate.disturbs]
+        fitted += on_all_cores(ground.plain, others)
+        steps = self._other_forms(ground, passed, fitted, base)
+        observed = {item.candidate.cause for item in passed if item.tested.p_adjusted is None}
+        out = []
+        for step in steps:
+            name, gain = step.candidate.cause, step.held.gain_over(base)
+            self.gains[name] = max(gain, self.gains.get(name, -np.inf))
+            # What is seen in the readings themselves is there, however little is predicted by it.
+            least = 0.0 if name in observed and step.candidate.terms else needed
+            sure = name in observed or agree(step.held.better_by(base), self.seed, AGREEMENT_P)
+            if sure and self._helps(step.held, base, least) and self._credible(ground, step):
+                out.append((float(step.held.better_by(base).sum()), step))
+        return sorted(out, key=lambda item: -item[0])
+
+    def _other_forms(
+        self, ground: Ground[P, F], passed: Sequence[Promise[C]], plain: list[Step[F, C]], base: OutOfFold
+    ) -> list[Step[F, C]]:
+        gains = {step.candidate.cause: step.held.gain_over(base) for step in plain}
+        worth = PROMISING * max([0.0, *gains.values()])
+        asked = {item.candidate.cause for item in passed if item.refine}
+
+        near = asked | {name for name, gain in gains.items() if gain >= worth}
+
+        def further(step: Step[F, C]) -> Step[F, C]:
+            return ground.refined(step) if step.candidate.cause in near else step
+
+        grown = on_all_cores(further, plain)
+        richest = max((step.candidate.terms for step in grown), default=0)
+        if richest <= RICH:
+            return grown
+        # What a rich form does, another cause may do with fewer terms.
+        slighted = {name for name, gain in gains.items() if gain > self._needed()} - near
+        return [
+            ground.refined(step, richest - 1) if step.candidate.cause in slighted else step for step in grown
+        ]
+
+    def _first_of(self, steps: list[tuple[float, Step[F, C]]]) -> Step[F, C] | None:
+        """The best one; of a rich form only where none with fewer terms predicts as well."""
+        if not steps:
+            return None
+        (_, best), *others = steps
+        if best.candidate.terms > RICH:
+            for _, step in others:
+                fewer = 0 < step.candidate.terms < best.candidate.terms
+                if fewer and not clearly_better(best.held, step.held, self.seed):
+                    return step
+        return best
+
+    def _needed(self) -> float:
+        return self.problem.further_gain if self.chosen else LEAST_GAIN
+
+    def _helps(self, held: OutOfFold, base: OutOfFold, needed: float) -> bool:
+        return held.gain_over(base) > needed and float(held.better_by(base).sum()) > 0
+
+    def _credible(self, ground: Ground[P, F], step: Step[F, C]) -> bool:
+        return bool(ground.problem.credible(self.baseline, ground.now, step.fit, step.candidate)[CHANNEL])
+
+    def _accept(self, step: Step[F, C], found: Sequence[Promise[C]]) -> None:
+        name = step.candidate.cause
+        self.p_values[name] = next(item.tested.p_adjusted for item in found if item.candidate.cause == name)
+        passed = {item.candidate.cause for item in found if item.tested.passed and item.candidate.terms}
+        self.beside[name] = frozenset(passed - {name}) if step.candidate.terms else frozenset()
+        self.chosen = (*self.chosen, step.candidate)
+        self.problem, self.now = self.problem.weighed(step.fit)
+
+    def _drop_needless(self) -> None:
+        """Take away what costs less than a further cause must gain; what is seen, if it costs nothing."""
+        while len(self.chosen) > 1:
+            full = out_of_fold(self.problem, self.now, self.folds)
+            slims = on_all_cores(lambda item: self.problem.reduced(self.now, [item], _ONE), self.chosen)
+            costs = [full.gain_over(out_of_fold(self.problem, slim, self.folds)) for slim in slims]
+            seen = [self.p_values[item.cause] is None for item in self.chosen]
+            costs = [np.inf if sure and cost > 0 else cost for sure, cost in zip(seen, costs, strict=True)]
+            least = int(np.argmin(costs))
+            if costs[least] >= self.problem.further_gain:
+                break
+            self.now = slims[least]
+            gone = self.chosen[least]
+            self.chosen = tuple(item for item in self.chosen if item is not gone)
+            del self.p_values[gone.cause]
+
+    def _examined(self) -> dict[str, Examined]:
+        """What the first round's tests and all rounds' fits said about every cause."""
+        return {
+            item.candidate.cause: Examined(
+                item.tested.p_value,
+                item.tested.p_adjusted,
+                self.gains.get(item.candidate.cause),
+                observed=item.tested.probe.observed,
+            )
+            for item in self.first
+        }
+
+
+def _promise(item: Promise[Any]) -> float:
+    return -item.tested.probe.explained

@@ -1,0 +1,184 @@
+"""The refitted baseline, and the noise that is left: where every comparison starts from."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from lerobot_vtrefine.diagnose.pad.candidates.base import Setting
+from lerobot_vtrefine.diagnose.pad.fitting import Fit, fit, predict, rest
+from lerobot_vtrefine.diagnose.pad.model import NOMINAL_K_N, Composite, stiffness_from_load
+from lerobot_vtrefine.diagnose.pad.noise import Noise, fit_frame_noise, fit_repeatability
+from lerobot_vtrefine.diagnose.pad.press_trials import PressSet
+from lerobot_vtrefine.diagnose.pad.weights import TrialWeights, build_weights
+from lerobot_vtrefine.diagnose.pad.whitening import Whitener
+
+START_DAMPING_S = 3e-3
+OFFSET_STEP_M = 5e-6
+TOUCH_M = 4e-5
+"""How well a recording's first touch is known [m]: two deviations of a good rig's repeatability."""
+JUMP_DAMPING_S = 3e-3
+"""Damping that readings at the touch are made allowance for, at least: k_d over k_n [s]."""
+PLAUSIBLE_LOG_GAIN = 0.7
+"""A weighted fit that moves the gain's logarithm further than this explains presses away as noise: readings
+that are very late, say, leave the baseline so wrong that its weights mislead."""
+
+
+@dataclass(frozen=True)
+class Baseline:
+    """A fit, the noise around it and the weights that follow from both.
+
+    `plain` is the unweighted least-squares fit: the baseline that foretells plain readings best, and so the
+    one that an extension is measured against.
+    """
+
+    fitted: Fit
+    plain: Fit
+    noise: Noise
+    weights: tuple[TrialWeights, ...]
+
+
+LEAST_C = 0.2
+"""Range of the recordings' temperatures from which on something may be seen to follow it."""
+
+
+def describe(presses: PressSet) -> Setting:
+    """What candidates may know; the largest signal is not known before the first fit."""
+    steps = np.concatenate([np.diff(press.time_s) for press in presses.presses])
+    spans = [float(press.time_s[-1] - press.time_s[0]) for press in presses.presses]
+    starts = [press.trial.start_s for press in presses.presses]
+    touched = np.zeros((presses.layout.rows, presses.layout.cols), dtype=bool)
+    depth, company = 0.0, 1
+    for press in presses.presses:
+        pressed = press.drive > 0
+        touched[press.layout.lines, press.layout.columns] |= pressed.any(axis=0)
+        company = max(company, int(pressed.sum(axis=-1).max(initial=0)))
+        depth = max(depth, float(press.drive.max()))
+    positive = steps[steps > 0]
+    return Setting(
+        layout=presses.layout,
+        top_counts=presses.full_scale,
+        full_scale=presses.full_scale,
+        frame_s=float(np.median(positive)) if len(positive) else 0.01,
+        duration_s=float(np.median(spans)),
+        session_s=float(np.ptp(starts)),
+        session_start_s=float(min(starts)),
+        top_depth_m=_reach(depth, presses.loaded),
+        loaded=presses.loaded,
+        touched_rows=int(touched.any(axis=1).sum()),
+        touched_cols=int(touched.any(axis=0).sum()),
+        rest_session_s=presses.idle.session_s,
+        temperature_c=_temperature(presses),
+        row_company=company,
+    )
+
+
+def _temperature(presses: PressSet) -> float | None:
+    """Mean over the recordings [degrees Celsius]."""
+    values = [press.trial.temperature_c for press in presses.presses]
+    known = [value for value in values if value is not None and np.isfinite(value).all()]
+    if len(known) < len(values) or np.ptp([value.mean() for value in known]) < LEAST_C:
+        return None
+    return float(np.mean([value.mean() for value in known]))
+
+
+def _reach(top: float, loaded: bool) -> float:
+    """Deepest press [m]; the load over the nominal stiffness where depth is not known."""
+    return max(top / NOMINAL_K_N if loaded else top, 1e-6)
+
+
+def first_guess(presses: PressSet, setting: Setting) -> Composite:
+    """Proportional to depth (or load), by least squares."""
+    top, bottom = 0.0, 0.0
+    for press in presses.presses:
+        depth = np.maximum(press.drive[:, press.scored], 0.0)
+        top, bottom = top + float((depth * press.signal).sum()), bottom + float((depth**2).sum())
+    gain = top / bottom if bottom > 0 and top > 0 else presses.full_scale / setting.top_depth_m
+    return Composite(setting, np.array([np.log(gain), 0.0 if setting.loaded else START_DAMPING_S]))
+
+
+def offset_tangents(
+    model: Composite, presses: PressSet, signals: Sequence[np.ndarray]
+) -> list[np.ndarray] | None:
+    """Change of the signal per metre of contact offset (T, n) per recording; None when driven by load."""
+    if presses.loaded:
+        return None
+    shifted = replace(presses, presses=tuple(press.sunk(OFFSET_STEP_M) for press in presses.presses))
+    return [(a - b) / OFFSET_STEP_M for a, b in zip(predict(model, shifted), signals, strict=True)]
+
+
+def touch_doubts(model: Composite, presses: PressSet) -> list[np.ndarray] | None:
+    """Deviation of readings (T, n) [counts] that may or may not be touched yet; None when driven by load.
+
+    Damping makes a reading jump at the touch. A recording's first touch is known to some micrometres only,
+    and whether a frame falls before or after the jump cannot be had from a linear change.
+    """
+    if presses.loaded:
+        return None
+    values = model.values.copy()
+    values[1] = max(float(values[1]), JUMP_DAMPING_S)
+    jumpy = model.at(values)
+    early, here, late = (
+        predict(jumpy, replace(presses, presses=tuple(press.sunk(by) for press in presses.presses)))
+        for by in (-TOUCH_M, 0.0, TOUCH_M)
+    )
+    return [0.5 * np.abs(a - 2.0 * s + b) for a, s, b in zip(early, here, late, strict=True)]
+
+
+def recording_deviations(fitted: Fit, presses: PressSet, noise: Noise) -> tuple[np.ndarray, np.ndarray]:
+    """Every recording's own relative gain and first touch, by least squares: (K,), (K,) [m]."""
+    offsets = offset_tangents(fitted.model, presses, fitted.signals)
+    gains, touches = [], []
+    for index, (press, signal) in enumerate(zip(presses.presses, fitted.signals, strict=True)):
+        sigma = noise.sigma(signal)
+        columns = [signal] if offsets is None else [signal, offsets[index]]
+        matrix = np.stack([(column / sigma).ravel() for column in columns], axis=1)
+        target = ((press.signal - signal) / sigma).ravel()
+        solution = np.linalg.lstsq(matrix, target, rcond=1e-6)[0]
+        gains.append(float(solution[0]))
+        touches.append(float(solution[1]) if len(solution) > 1 else 0.0)
+    return np.array(gains), np.array(touches)
+
+
+def weigh(
+    fitted: Fit, presses: PressSet, noise: Noise | None = None
+) -> tuple[Noise, tuple[TrialWeights, ...]]:
+    """Noise of a fit (within recordings unless given; between recordings always), and the weights."""
+    if noise is None:
+        noise = fit_frame_noise(presses, fitted.residuals(presses), fitted.signals)
+    gains, touches = recording_deviations(fitted, presses, noise)
+    noise = fit_repeatability(noise, gains, touches, presses.conditions)
+    tangents = offset_tangents(fitted.model, presses, fitted.signals)
+    return noise, tuple(build_weights(noise, fitted.signals, tangents, touch_doubts(fitted.model, presses)))
+
+
+def plain_weights(presses: PressSet) -> list[TrialWeights]:
+    """Every recording counts alike, every reading in it alike: what the plain mean squared error measures."""
+    weights = []
+    for press in presses.presses:
+        sigma = np.full(press.signal.shape, np.sqrt(press.signal.size))
+        weights.append(TrialWeights(sigma, Whitener(0.0), np.zeros((press.signal.size, 0)), np.zeros((0, 0))))
+    return weights
+
+
+def fit_baseline(presses: PressSet) -> Baseline:
+    """Refit gain, stiffness and damping, then the noise, then both again with the right weights."""
+    setting = describe(presses)
+    guess = first_guess(presses, setting)
+    fitted = plain = fit(guess, presses, plain_weights(presses))
+    k_n = stiffness_from_load(presses, fitted.model)
+    top = max((float(np.max(signal)) for signal in fitted.signals if signal.size), default=1.0)
+    gain = float(plain.model.values[0])
+    setting = replace(setting, top_counts=max(top, presses.full_scale / 255.0), log_gain=gain)
+    model = replace(fitted.model, setting=setting, k_n=k_n or NOMINAL_K_N)
+    fitted = replace(fitted, model=model)
+    noise, weights = weigh(fitted, presses)
+    refitted = fit(fitted.model, presses, weights)
+    if abs(refitted.model.values[0] - fitted.model.values[0]) < PLAUSIBLE_LOG_GAIN:
+        fitted = refitted
+        noise, weights = weigh(fitted, presses)
+    plain = fit(replace(plain.model, setting=setting, k_n=model.k_n), presses, plain_weights(presses), 2)
+    refitted = fit(fitted.model, presses, weights)
+    if abs(refitted.model.values[0] - plain.model.values[0]) >= PLAUSIBLE_LOG_GAIN:
+        refitted = rest(plain.model, presses, weights)
+    return Baseline(refitted, plain, noise, tuple(weights))

@@ -1,0 +1,106 @@
+"""What a candidate cause is: a family of simulator stages with parameters, starting points and a null."""
+
+from collections.abc import Callable
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from lerobot_vtrefine.diagnose.pad.press_trials import PressSet
+from lerobot_vtrefine.tactile.layout import PadLayout
+from lerobot_vtrefine.tactile.stages.base import Stage
+
+
+@dataclass(frozen=True)
+class Setting:
+    """What a candidate may know about the recordings and the fitted baseline."""
+
+    layout: PadLayout
+    top_counts: float
+    """Signal that the baseline predicts at most."""
+    full_scale: float
+    frame_s: float
+    """Median time between frames [s]."""
+    duration_s: float
+    """Median length of a recording [s]."""
+    session_s: float
+    """Span of the session [s]; 0 if it was not recorded."""
+    top_depth_m: float
+    loaded: bool
+    """Driven by the load: nothing before the force can be fitted."""
+    session_start_s: float
+    """Session time of the first recording [s]."""
+    touched_rows: int
+    touched_cols: int
+    rest_session_s: float
+    """Mean session time of the frames that the idle map rests on [s]."""
+    temperature_c: float | None = None
+    """Mean temperature; None where it was not recorded throughout, or did not change."""
+    row_company: int = 1
+    """Most taxels of a row that are pressed at once."""
+    log_gain: float | None = None
+    """Logarithm of the plain baseline's counts per metre (or newton); None before it is fitted."""
+
+
+@dataclass(frozen=True)
+class Value:
+    """One fitted coordinate of a form and its bounds."""
+
+    name: str
+    low: float
+    high: float
+    step: float
+    """Step of finite differences; 0 for a coordinate that is searched, not descended along."""
+
+
+Stages = tuple[Stage, ...]
+
+
+@dataclass(frozen=True)
+class Form:
+    """One functional form of a cause.
+
+    Attributes:
+        family: name of the cause (docs/verdict.md).
+        label: what form this is, for people.
+        values: fitted coordinates; coordinate vectors elsewhere follow their order.
+        build: coordinates and setting to stages.
+        report: coordinates and setting to the public parameters: name -> (value, unit).
+        probes: coordinates near the null, one row per guess of what the effect may look like.
+        amplitude: index of the coordinate that is the effect's size (0 is no effect), along which probes are
+            stretched; None if probes are taken as they are.
+        signed: whether the effect may go either way; otherwise screening is one-sided.
+    """
+
+    family: str
+    label: str
+    values: tuple[Value, ...]
+    build: Callable[[np.ndarray, Setting], Stages]
+    report: Callable[[np.ndarray, Setting], dict[str, tuple[float, str]]]
+    probes: Callable[[Setting], list[list[float]]]
+    amplitude: int | None = 0
+    signed: bool = False
+    possible: Callable[[Setting], bool] = field(default=lambda setting: True)
+    search: Callable[[PressSet, float], list[list[float]]] | None = None
+    """Starting points taken from the recordings and the frame time, instead of stretched probes."""
+    range: Callable[[np.ndarray, PressSet], dict[str, tuple[float, float]]] | None = None
+    """Intervals of parameters that no descent can tell: coordinates and recordings to name -> ends."""
+    twin: int | None = None
+    """Number of the coordinate that trades off against the baseline's damping, if one does."""
+    screened: bool = True
+    """Whether its probes take part in screening; fallbacks are only fitted where their family is named."""
+    peer: bool = False
+    """Whether it is no richer than the plain form: it need not foretell clearly better, only better."""
+    needs: str = "recordings in which it can act"
+    """What to record where the cause cannot show."""
+    grown: Callable[[np.ndarray, Setting], list[float]] | None = None
+    """The family's plain form, given by its coordinates, as this form has it: where descents start."""
+
+    @property
+    def low(self) -> np.ndarray:
+        """Lower bounds (p,)."""
+        return np.array([value.low for value in self.values])
+
+    @property
+    def high(self) -> np.ndarray:
+        """Upper bounds (p,)."""
+        return np.array([value.high for value in self.values])

@@ -1,0 +1,69 @@
+"""crosstalk: readings leak along row and column."""
+
+import numpy as np
+
+from lerobot_vtrefine.diagnose.pad.candidates.base import Form, Setting, Value
+from lerobot_vtrefine.tactile.stages.base import Stage
+from lerobot_vtrefine.tactile.stages.readout import Crosstalk
+
+MOST = 0.3
+LOG_REACH = Value("log_reach", float(np.log(0.2)), float(np.log(20.0)), 1e-2)
+FAR = float(np.log(1.5))
+"""Shortest reach of what leaks to both sides: what stays with the next taxels is spread by the cover."""
+
+
+def _fading(values: np.ndarray, setting: Setting) -> tuple[Stage, ...]:
+    return (Crosstalk(float(values[0]), float(values[1]), float(np.exp(values[2]))),)
+
+
+def _one_sided(values: np.ndarray, setting: Setting) -> tuple[Stage, ...]:
+    row, col, reach = float(values[0]), float(values[1]), float(np.exp(values[2]))
+    return (Crosstalk(abs(row), abs(col), reach, -1 if row < 0 else 1, -1 if col < 0 else 1),)
+
+
+def _report(values: np.ndarray, setting: Setting) -> dict[str, tuple[float, str]]:
+    row, col, reach = abs(float(values[0])), abs(float(values[1])), float(np.exp(values[2]))
+    return {"row": (row, "1"), "col": (col, "1"), "reach_taxels": (reach, "1")}
+
+
+FORMS = (
+    Form(
+        "crosstalk",
+        "along row and column",
+        (Value("row", 0.0, MOST, 2e-4), Value("col", 0.0, MOST, 2e-4)),
+        lambda v, s: (Crosstalk(float(v[0]), float(v[1])),),
+        lambda v, s: {"row": (float(v[0]), "1"), "col": (float(v[1]), "1")},
+        lambda s: [[0.002, 0.002], [0.002, 0.0], [0.0, 0.002]],
+        needs="press a few taxels of a pad that has others in their rows and columns",
+        amplitude=None,
+        possible=lambda s: s.layout.num_taxels > 1,
+    ),
+    Form(
+        "crosstalk",
+        "fading along row and column",
+        (
+            Value("row", 0.0, MOST, 2e-4),
+            Value("col", 0.0, MOST, 2e-4),
+            Value("log_reach", FAR, LOG_REACH.high, LOG_REACH.step),
+        ),
+        _fading,
+        _report,
+        lambda s: [[0.01, 0.01, 1.0]],
+        amplitude=None,
+        possible=lambda s: max(s.layout.rows, s.layout.cols) > 2,
+        screened=False,
+        grown=lambda v, s: [float(v[0]), float(v[1]), 1.4],
+    ),
+    Form(
+        "crosstalk",
+        "to one side",
+        (Value("row", -MOST, MOST, 2e-4), Value("col", -MOST, MOST, 2e-4), LOG_REACH),
+        _one_sided,
+        _report,
+        lambda s: [[side * 0.02, turn * 0.02, 0.0] for side in (1.0, -1.0) for turn in (1.0, -1.0)],
+        amplitude=None,
+        signed=True,
+        possible=lambda s: max(s.layout.rows, s.layout.cols) > 2,
+        screened=False,
+    ),
+)

@@ -1,0 +1,75 @@
+"""first_load_softening: below the largest load so far the pad reads less than on the first load."""
+
+from typing import Any
+
+import numpy as np
+
+from lerobot_vtrefine.diagnose.pad.candidates.base import Form, Setting, Value
+from lerobot_vtrefine.tactile.stages.base import Stage
+from lerobot_vtrefine.tactile.stages.softening import FirstLoadSoftening
+
+SOFTENING = Value("softening", -0.9, 2.0, 2e-3)
+LOG_SHARPNESS = Value("log_sharpness", float(np.log(0.05)), float(np.log(8.0)), 1e-2)
+GROWTH = Value("growth", 0.0, 2.0, 1e-2)
+LOG_RECOVERY = Value("log_recovery", float(np.log(0.3)), float(np.log(100.0)), 1e-2)
+
+
+def _plain(values: np.ndarray, setting: Setting) -> tuple[Stage, ...]:
+    return (FirstLoadSoftening(float(values[0])),)
+
+
+def _growing(values: np.ndarray, setting: Setting) -> tuple[Stage, ...]:
+    return (FirstLoadSoftening(float(values[0]), growth=1.0),)
+
+
+def _free(values: np.ndarray, setting: Setting) -> tuple[Stage, ...]:
+    softening, log_sharpness, growth, *recovery = (float(value) for value in values)
+    recovery_s = float(np.exp(recovery[0])) if recovery else 0.0
+    return (FirstLoadSoftening(softening, float(np.exp(log_sharpness)), growth, recovery_s),)
+
+
+def _report(values: np.ndarray, setting: Setting) -> dict[str, tuple[float, str]]:
+    """The softening, and what else the form has: how sharply it sets in, and how fast it is undone."""
+    found = {"softening": (float(values[0]), "1")}
+    if len(values) > 1:
+        found["sharpness"] = (float(np.exp(values[1])), "1")
+    if len(values) > 3:
+        found["recovery_s"] = (float(np.exp(values[3])), "s")
+    return found
+
+
+def _form(label: str, *more: Value, **rest: Any) -> Form:
+    return Form("first_load_softening", label, (SOFTENING, *more), report=_report, signed=True, **rest)
+
+
+FORMS = (
+    _form(
+        "by the part that was let go",
+        build=_plain,
+        probes=lambda s: [[0.05]],
+        needs="unload in part and load again at the same place, beyond the first load",
+    ),
+    _form(
+        "by the load that was let go",
+        build=_growing,
+        probes=lambda s: [[0.05]],
+        peer=True,
+    ),
+    _form(
+        "of free sharpness",
+        LOG_SHARPNESS,
+        GROWTH,
+        build=_free,
+        probes=lambda s: [[0.05, -1.0, 0.0], [0.05, 0.5, 0.5]],
+        screened=False,
+    ),
+    _form(
+        "of free sharpness, with recovery",
+        LOG_SHARPNESS,
+        GROWTH,
+        LOG_RECOVERY,
+        build=_free,
+        probes=lambda s: [[0.05, 0.0, 0.0, float(np.log(s.duration_s))]],
+        screened=False,
+    ),
+)

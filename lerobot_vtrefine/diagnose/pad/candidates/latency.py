@@ -1,0 +1,30 @@
+"""latency: readings are older than their time stamp."""
+
+from lerobot_vtrefine.diagnose.pad.candidates.base import Form, Value
+from lerobot_vtrefine.tactile.stages.host import Latency
+
+TAU_S = Value("tau_s", 0.0, 0.5, 1e-3)
+
+FORMS = (
+    Form(
+        "latency",
+        "pure delay",
+        (TAU_S,),
+        lambda v, s: (Latency(float(v[0])),),
+        lambda v, s: {"tau_s": (float(v[0]), "s")},
+        lambda s: [[0.5 * s.frame_s], [2.0 * s.frame_s]],
+        needs="press and release fast, at several speeds",
+        twin=0,
+    ),
+    Form(
+        "latency",
+        "a filter's lag and a delay",
+        (TAU_S, Value("smoothing", 0.0, 1.0, 1e-2)),
+        lambda v, s: (Latency(float(v[0]), float(v[1])),),
+        lambda v, s: {"tau_s": (float(v[0]), "s")},
+        lambda s: [[0.5 * s.frame_s, 0.8], [2.0 * s.frame_s, 0.8]],
+        twin=0,
+        screened=False,
+        grown=lambda v, s: [float(v[0]), 0.7],
+    ),
+)

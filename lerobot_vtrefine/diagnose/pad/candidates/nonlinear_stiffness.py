@@ -1,0 +1,61 @@
+"""nonlinear_stiffness: force grows faster than depth (hardening)."""
+
+import numpy as np
+
+from lerobot_vtrefine.diagnose.pad.candidates.base import Form, Setting, Value
+from lerobot_vtrefine.tactile.stages.base import Stage
+from lerobot_vtrefine.tactile.stages.mechanics import NonlinearStiffness
+from lerobot_vtrefine.tactile.stages.surface import StiffeningDepth
+
+SHALLOWEST = 0.25
+"""Least depth of a knee over the deepest press: what is soft above that is a contact felt late."""
+
+
+def _bottoming(values: np.ndarray, setting: Setting) -> tuple[Stage, ...]:
+    more, knee, width = (float(value) for value in values)
+    return (StiffeningDepth(more, knee * setting.top_depth_m, float(np.exp(width)) * setting.top_depth_m),)
+
+
+def _report_bottoming(values: np.ndarray, setting: Setting) -> dict[str, tuple[float, str]]:
+    """The exponent is that of a power law from the face to the deepest press with as much more at its end."""
+    more, knee = float(values[0]), float(values[1])
+    exponent = (1.0 + more) / (1.0 + more * (1.0 - knee))
+    top_m = setting.top_depth_m
+    return {"exponent": (exponent, "1"), "knee_m": (knee * top_m, "m"), "stiffening": (1.0 + more, "1")}
+
+
+FORMS = (
+    Form(
+        "nonlinear_stiffness",
+        "power law",
+        (Value("excess", 0.0, 2.0, 2e-3),),
+        lambda v, s: (NonlinearStiffness(1.0 + float(v[0])),),
+        lambda v, s: {"exponent": (1.0 + float(v[0]), "1")},
+        lambda s: [[0.05]],
+        needs="press to three depths or more, the deepest well beyond the others, with depth_m logged",
+        possible=lambda s: not s.loaded,
+    ),
+    Form(
+        "nonlinear_stiffness",
+        "linear plus power law",
+        (Value("share", 0.0, 1.0, 2e-3), Value("excess", 0.3, 4.0, 5e-3)),
+        lambda v, s: (NonlinearStiffness(1.0 + float(v[1]), float(v[0])),),
+        lambda v, s: {"exponent": (1.0 + float(v[1]), "1"), "share": (float(v[0]), "1")},
+        lambda s: [[0.1, 1.0], [0.1, 2.0]],
+        possible=lambda s: not s.loaded,
+        screened=False,
+    ),
+    Form(
+        "nonlinear_stiffness",
+        "stiffer beyond a depth",
+        (
+            Value("more", 0.0, 12.0, 2e-3),
+            Value("knee", SHALLOWEST, 0.95, 2e-3),
+            Value("log_width", float(np.log(0.01)), float(np.log(0.3)), 2e-2),
+        ),
+        _bottoming,
+        _report_bottoming,
+        lambda s: [[0.05, knee, float(np.log(0.05))] for knee in (0.4, 0.65)],
+        possible=lambda s: not s.loaded,
+    ),
+)

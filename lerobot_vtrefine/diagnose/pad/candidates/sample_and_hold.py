@@ -1,0 +1,259 @@
+"""sample_and_hold: readings repeat while time goes on."""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+
+from lerobot_vtrefine.diagnose.pad.candidates.base import Form, Value
+from lerobot_vtrefine.diagnose.pad.press_trials import Press, PressSet
+from lerobot_vtrefine.tactile.stages.host import SampleAndHold
+
+MAX_FRAMES = 12.0
+"""Longest period looked for, in frames."""
+RARITY = 0.08
+"""How far the mean time between new readings may be off as a period."""
+MIN_HELD, CHANCE = 0.04, 0.2
+"""Share of frames that must repeat the one before for readings to be held, and what part may be chance."""
+VISIBLE = 0.01
+"""Part of a press's deepest drive by which it must change for a repeat to tell."""
+MANY_TAXELS, MIN_TELLING, SURE_MOVE = 6, 10, 4.0
+MIN_REPEATED = 0.1
+"""Share of frames that must repeat the one before for a rhythm to be looked for."""
+CONTRADICTED = 0.1
+"""Share of changes where a rhythm wants none, up to which it is believed; of repeats where it wants a change,
+three times as much, for readings may stay what they were."""
+
+
+def repeated_share(presses: PressSet) -> float:
+    """Share of frames on the pad that repeat the one before, reading for reading."""
+    repeats = sum(int((press.rhythm.telling & ~press.rhythm.fresh).sum()) for press in presses.presses)
+    moves = sum(int(press.rhythm.telling.sum()) for press in presses.presses)
+    return repeats / moves if moves else 0.0
+
+
+def held(presses: PressSet) -> bool:
+    """Whether more frames repeat the one before than noise and rounding make by chance."""
+    shares = [share for press in presses.presses if (share := _repeats(press)) is not None]
+    if not shares:
+        return False
+    seen, by_chance = np.mean(shares, axis=0)
+    return bool(seen > MIN_HELD and by_chance < CHANCE * seen)
+
+
+def shortest_period(presses: PressSet, frame_s: float) -> float | None:
+    """Mean time between new readings from which on `held` sees it [s]; None where repeats tell nothing."""
+    shares = [share for press in presses.presses if (share := _repeats(press)) is not None]
+    if not shares:
+        return None
+    seen = max(MIN_HELD, float(np.mean([chance for _, chance in shares])) / CHANCE)
+    return frame_s / (1.0 - seen) if seen < 1.0 else None
+
+
+def _repeats(press: Press) -> tuple[float, float] | None:
+    """Share of frames under load that repeat the one before, and what share would by chance; None if unknown.
+
+    By chance all taxels repeat together as often as each does while others change. Few taxels say little of
+    each other: then frames count in which the motion alone changes readings by far more than noise.
+    """
+    changed = np.diff(press.signal, axis=0) != 0.0
+    use = press.rhythm.telling[1:] & _driven(press)
+    few = changed.shape[1] < MANY_TAXELS
+    if few:
+        use = use & _moving(press)
+    changed = changed[use]
+    fresh = changed.any(axis=1)
+    if len(fresh) < MIN_TELLING or not fresh.any():
+        return None
+    same = float(np.prod(1.0 - changed[fresh].mean(axis=0)))
+    return float(1.0 - fresh.mean()), 0.0 if few else same
+
+
+def _driven(press: Press) -> np.ndarray:
+    """Steps (T-1,) in which some drive changes visibly: readings under a still indenter may well repeat."""
+    drive = np.maximum(press.drive, 0.0)
+    steps = np.abs(np.diff(drive, axis=0)).max(axis=(1, 2))
+    return steps > VISIBLE * max(float(drive.max()), 1e-12)
+
+
+def _moving(press: Press) -> np.ndarray:
+    """Steps (T-1,) in which the drive moves so much that the reading must."""
+    steps = np.abs(np.diff(np.maximum(press.drive, 0.0).sum(axis=(1, 2))))
+    jumps = np.abs(np.diff(press.signal, axis=0)).max(axis=1)
+    still = steps < 1e-3 * max(float(steps.max()), 1e-12)
+    noise = float(np.std(jumps[still])) + float(np.mean(jumps[still])) if still.sum() > MIN_TELLING else 1.0
+    fast = (
+        steps > np.quantile(steps[steps > 0], 0.5) if (steps > 0).any() else np.zeros(len(steps), dtype=bool)
+    )
+    usual = float(np.median(jumps[fast & (jumps > 0)])) if (fast & (jumps > 0)).any() else 0.0
+    return fast if usual > SURE_MOVE * max(noise, 1e-9) else np.zeros(len(steps), dtype=bool)
+
+
+@dataclass(frozen=True)
+class Pattern:
+    """How readings repeat: seconds between new ones, and whether these come free of the trial's start."""
+
+    period_s: float
+    free: bool
+
+
+def pattern(presses: PressSet, frame_s: float) -> Pattern | None:
+    """The rhythm in which readings repeat bit for bit; None where none explains the repeats.
+
+    Readings with noise do not repeat by chance, and where a single quiet taxel's do, not in step.
+    """
+    if repeated_share(presses) < MIN_REPEATED:
+        return None
+    for free in (False, True):
+        period_s = float(np.mean(_best(presses, frame_s, free)))
+        if contradicted(presses, period_s, free) < CONTRADICTED:
+            return Pattern(period_s, free)
+    return None
+
+
+def _best(presses: PressSet, frame_s: float, free: bool) -> tuple[float, float]:
+    """Ends of the periods, about as long as new readings are rare, that are contradicted least [s]."""
+    guess = frame_s / max(1.0 - repeated_share(presses), 1.0 / MAX_FRAMES)
+    grid = guess * np.exp(np.linspace(-RARITY, RARITY, 160))
+    wrong = [contradicted(presses, float(period), free) for period in grid]
+    finer = grid[int(np.argmin(wrong))] * np.exp(np.linspace(-0.004, 0.004, 61))
+    return alike(presses, finer, free)
+
+
+def contradicted(presses: PressSet, period_s: float, free: bool) -> float:
+    """Largest share in which the frames speak against a period."""
+    counts = np.sum([press.rhythm.against(period_s, free) for press in presses.presses], axis=0)
+    due, changed, changes, repeats, late = np.maximum(counts, [1.0, 0.0, 1.0, 1.0, 0.0])
+    return float(max(changed / due, changed / changes, late / repeats / 3.0))
+
+
+def alike(presses: PressSet, grid: np.ndarray, free: bool = False) -> tuple[float, float]:
+    """Ends of the periods, of a rising grid, whose pattern of new readings fits the recorded one best [s]."""
+    sums = [sum(press.rhythm.against(float(period), free) for press in presses.presses) for period in grid]
+    error = np.array([float(np.asarray(counts)[[1, 4]].sum()) for counts in sums])
+    best = np.flatnonzero(error <= error.min() + 0.5)
+    spacing = grid[1] / grid[0]
+    return float(grid[best].min() / spacing), float(grid[best].max() * spacing)
+
+
+def periods(presses: PressSet, frame_s: float) -> list[list[float]]:
+    """Periods whose pattern of new readings fits the recorded one best, and whole numbers of frames [s]."""
+    plain = [[count * frame_s * 1.0001] for count in (2.0, 3.0, 4.0, 5.0)]
+    if repeated_share(presses) < 0.05:
+        return plain
+    grid = frame_s * np.exp(np.linspace(np.log(1.05), np.log(MAX_FRAMES), 1500))
+    return [*_between(*alike(presses, grid)), *plain]
+
+
+def frame_periods(presses: PressSet, frame_s: float) -> list[list[float]]:
+    """The same, as close as the frames of whole recordings tell: many periods go by in one [s]."""
+    coarse = periods(presses, frame_s)
+    if repeated_share(presses) < MIN_HELD:
+        return coarse
+    guess, _ = _best(presses, frame_s, False)
+    finer = guess * np.exp(np.linspace(-0.003, 0.003, 601))
+    return _between(*alike(presses, finer))
+
+
+def free_periods(presses: PressSet, frame_s: float) -> list[list[float]]:
+    """Periods that fit best if new readings come free of the trials' starts [s]."""
+    return _between(*_best(presses, frame_s, True))
+
+
+def _between(low: float, high: float) -> list[list[float]]:
+    """Periods that repeat the same frames differ in when, between them, the readings were taken."""
+    inside = [[float(period)] for period in np.linspace(low, high, 9)]
+    whole = [[round(end, digits)] for end in (low, high) for digits in (2, 3)]
+    return [*inside, *(period for period in whole if low <= period[0] <= high)]
+
+
+def irregular_periods(presses: PressSet, frame_s: float) -> list[list[float]]:
+    """Mean time between new readings and since the last one; read at the frame, or before it [s]."""
+    ages = [press.time_s - press.rhythm.taken_s(press.time_s) for press in presses.presses]
+    telling = [press.rhythm.telling for press in presses.presses]
+    age_s = float(
+        np.mean(np.concatenate([age[use] for age, use in zip(ages, telling, strict=True)] or [[0.0]]))
+    )
+    period_s = frame_s / max(1.0 - repeated_share(presses), 1.0 / MAX_FRAMES)
+    return [[period_s, age_s, lag] for lag in (0.0, 0.5 * frame_s)]
+
+
+def _mean_period(values: np.ndarray, presses: PressSet) -> dict[str, tuple[float, float]]:
+    """The mean period's own scatter between recordings."""
+    shares = []
+    for press in presses.presses:
+        telling = int(press.rhythm.telling.sum())
+        if telling >= MIN_TELLING:
+            shares.append(float((press.rhythm.telling & press.rhythm.fresh).sum()) / telling)
+    known = np.array(shares)
+    error = 1.96 * float(known.std(ddof=1)) / np.sqrt(len(known)) if len(known) > 1 else 0.5
+    part = min(error / max(float(known.mean()), 1e-3), 0.9) if len(known) else 0.9
+    return {"period_s": (float(values[0]) / (1.0 + part), float(values[0]) / (1.0 - part))}
+
+
+def undecided(free: bool) -> Callable[[np.ndarray, PressSet], dict[str, tuple[float, float]]]:
+    """Periods that repeat the same frames as the best one does: nothing recorded tells them apart."""
+
+    def ends(values: np.ndarray, presses: PressSet) -> dict[str, tuple[float, float]]:
+        best = float(values[0])
+        reach, count = (0.003, 121) if free else (0.05, 2001)
+        low, high = alike(presses, best * np.exp(np.linspace(-reach, reach, count)), free)
+        return {"period_s": (min(low, best), max(high, best))}
+
+    return ends
+
+
+FORMS = (
+    Form(
+        "sample_and_hold",
+        "fixed period",
+        (Value("period_s", 1e-3, 2.0, 0.0),),
+        lambda v, s: (SampleAndHold(float(v[0])),),
+        lambda v, s: {"period_s": (float(v[0]), "s")},
+        lambda s: [[2.0001 * s.frame_s], [3.0001 * s.frame_s], [5.0001 * s.frame_s]],
+        needs="record every frame with its own time, moving, with readings that carry noise",
+        amplitude=None,
+        search=periods,
+        range=undecided(False),
+    ),
+    Form(
+        "sample_and_hold",
+        "fixed period, free of the trial's start",
+        (Value("period_s", 1e-3, 2.0, 0.0),),
+        lambda v, s: (SampleAndHold(float(v[0]), free=True),),
+        lambda v, s: {"period_s": (float(v[0]), "s")},
+        lambda s: [[2.0001 * s.frame_s]],
+        amplitude=None,
+        search=free_periods,
+        range=undecided(True),
+        screened=False,
+    ),
+    Form(
+        "sample_and_hold",
+        "fixed period, read at the frames",
+        (Value("period_s", 1e-3, 2.0, 0.0),),
+        lambda v, s: (SampleAndHold(float(v[0]), frame_s=s.frame_s),),
+        lambda v, s: {"period_s": (float(v[0]), "s")},
+        lambda s: [[2.0001 * s.frame_s]],
+        amplitude=None,
+        search=frame_periods,
+        range=undecided(False),
+        screened=False,
+    ),
+    Form(
+        "sample_and_hold",
+        "irregular periods",
+        (Value("period_s", 1e-3, 2.0, 0.0), Value("age_s", 0.0, 2.0, 0.0), Value("lag_s", 0.0, 0.1, 1e-3)),
+        lambda v, s: (
+            SampleAndHold(
+                float(v[0]), free=True, irregular=True, age_s=float(v[1]), lag_s=max(float(v[2]), 0.0)
+            ),
+        ),
+        lambda v, s: {"period_s": (float(v[0]), "s")},
+        lambda s: [[2.0 * s.frame_s, 0.5 * s.frame_s, 0.0]],
+        amplitude=None,
+        search=irregular_periods,
+        range=_mean_period,
+        screened=False,
+    ),
+)

@@ -1,0 +1,37 @@
+"""saturation: readings level off.
+
+The fitted coordinate is the largest signal over the knee, which is 0 without saturation.
+"""
+
+import numpy as np
+
+from lerobot_vtrefine.diagnose.pad.candidates.base import Form, Setting, Value
+from lerobot_vtrefine.tactile.stages.readout import Saturation
+
+MIN_FULLNESS = 1e-3
+
+
+def _knee(values: np.ndarray, setting: Setting) -> float:
+    return setting.top_counts / max(float(values[0]), MIN_FULLNESS)
+
+
+FORMS = (
+    Form(
+        "saturation",
+        "tanh",
+        (Value("fullness", 0.0, 6.0, 2e-3),),
+        lambda v, s: (Saturation(_knee(v, s)),),
+        lambda v, s: {"knee_counts": (_knee(v, s), "counts")},
+        lambda s: [[0.3], [0.8]],
+        needs="press until readings come near the full scale",
+    ),
+    Form(
+        "saturation",
+        "of free sharpness",
+        (Value("fullness", 0.0, 8.0, 2e-3), Value("sharpness", 0.7, 12.0, 1e-2)),
+        lambda v, s: (Saturation(_knee(v, s), float(v[1])),),
+        lambda v, s: {"knee_counts": (_knee(v, s), "counts"), "sharpness": (float(v[1]), "1")},
+        lambda s: [[0.2, 1.0], [0.9, 6.0]],
+        screened=False,
+    ),
+)

@@ -1,0 +1,65 @@
+"""scan_skew: rows are read one after the other."""
+
+import numpy as np
+
+from lerobot_vtrefine.diagnose.pad.candidates.base import Form, Setting, Value
+from lerobot_vtrefine.tactile.stages.base import Stage
+from lerobot_vtrefine.tactile.stages.host import ScanSkew
+
+MAX_ROWS = 12
+"""Rows with delays of their own; a pad with more has them straight in between."""
+LONGEST_S = 0.4
+
+
+def _by_row(values: np.ndarray, setting: Setting) -> tuple[Stage, ...]:
+    return (ScanSkew(_slope(values), (0.0, *(float(value) for value in values))),)
+
+
+def _slope(values: np.ndarray) -> float:
+    """Seconds from the first row to the last of the straight line through all rows."""
+    delays = np.concatenate([[0.0], values])
+    return float(np.polyfit(np.linspace(0.0, 1.0, len(delays)), delays, 1)[0])
+
+
+def _rows_form(rows: int) -> Form:
+    """A delay for every row but the first, for pads of that many rows."""
+    return Form(
+        "scan_skew",
+        f"{rows} rows with delays of their own",
+        tuple(Value(f"row_{row}_s", -LONGEST_S, LONGEST_S, 1e-3) for row in range(1, rows)),
+        _by_row,
+        lambda v, s: {"skew_s": (_slope(v), "s")},
+        lambda s: [(0.5 * s.frame_s * np.arange(1, rows) / (rows - 1)).tolist()],
+        amplitude=None,
+        signed=True,
+        possible=lambda s: s.touched_rows > 1 and min(s.layout.rows, MAX_ROWS) == rows,
+        screened=False,
+        grown=lambda v, s: (float(v[0]) * np.arange(1, rows) / (rows - 1)).tolist(),
+    )
+
+
+FORMS = (
+    Form(
+        "scan_skew",
+        "linear in the row",
+        (Value("skew_s", -LONGEST_S, LONGEST_S, 1e-3),),
+        lambda v, s: (ScanSkew(float(v[0])),),
+        lambda v, s: {"skew_s": (float(v[0]), "s")},
+        lambda s: [[0.5 * s.frame_s]],
+        needs="press and release fast with an indenter that reaches several rows",
+        signed=True,
+        possible=lambda s: s.layout.rows > 1 and s.touched_rows > 1,
+    ),
+    Form(
+        "scan_skew",
+        "along the columns, too",
+        (Value("skew_s", -LONGEST_S, LONGEST_S, 1e-3), Value("cols_s", -LONGEST_S, LONGEST_S, 1e-3)),
+        lambda v, s: (ScanSkew(float(v[0]), cols_s=float(v[1])),),
+        lambda v, s: {"skew_s": (float(v[0]), "s"), "cols_s": (float(v[1]), "s")},
+        lambda s: [[0.0, 0.5 * s.frame_s], [0.25 * s.frame_s, 0.25 * s.frame_s]],
+        amplitude=None,
+        signed=True,
+        possible=lambda s: s.layout.cols > 1 and s.touched_cols > 1,
+    ),
+    *(_rows_form(rows) for rows in range(3, MAX_ROWS + 1)),
+)

@@ -1,0 +1,170 @@
+"""Generic descriptions of what readings may depend on; what beats named causes points at an unknown one.
+
+A descriptor that belongs to a named family's own kind of effect is called owned: where it still matters, the
+family's form is at fault, not its name.
+"""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+
+from lerobot_vtrefine.diagnose.pad.press_trials import Press
+
+Signal = np.ndarray
+
+
+@dataclass(frozen=True)
+class Descriptor:
+    """A direction in which readings may differ from the model: (press, expected signal (T, n)) to (T, n)."""
+
+    text: str
+    """What the residual then correlates with, for people."""
+    owners: tuple[str, ...]
+    direction: Callable[[Press, Signal], Signal]
+    session: bool = False
+    """Whether it differs between recordings of one command, so that what follows it does not repeat."""
+
+
+def _age(press: Press, signal: Signal) -> np.ndarray:
+    """Time since the present contact of the taxel began (T, n) [s]."""
+    time_s = press.trial.time_s[:, None]
+    touched = press.drive[:, press.scored] > 0
+    began = np.maximum.accumulate(np.where(touched, -np.inf, time_s), axis=0)
+    first = np.where(np.isfinite(began), began, time_s[0])
+    return np.where(touched, time_s - first, 0.0)
+
+
+def _depth_rate(press: Press, signal: Signal) -> np.ndarray:
+    return np.where(press.drive[:, press.scored] > 0, press.rate[:, press.scored], 0.0)
+
+
+def _sliding(press: Press) -> tuple[np.ndarray, np.ndarray]:
+    """Velocity along the pad (T, 1) each [m/s]."""
+    time_s = press.trial.time_s
+    step = np.maximum(np.gradient(time_s), 1e-6) if len(time_s) > 1 else np.ones(len(time_s))
+    return (np.gradient(press.trial.x_m) / step)[:, None], (np.gradient(press.trial.y_m) / step)[:, None]
+
+
+def _carriage(press: Press, signal: Signal, axis: int) -> np.ndarray:
+    """Where the indenter is, from the pad's centre (T, n) [m]."""
+    where = press.trial.x_m if axis == 0 else press.trial.y_m
+    return np.broadcast_to(where[:, None], signal.shape)
+
+
+def _place(press: Press, axis: int) -> np.ndarray:
+    """x or y of the scored taxels (n,) in half pads."""
+    cols = press.layout.full_cols
+    index, count = (
+        (press.taxels % cols, cols) if axis == 0 else (press.taxels // cols, press.layout.full_rows)
+    )
+    return (2.0 * index - (count - 1)) / max(count - 1, 1)
+
+
+def _line_sum(press: Press, signal: Signal, axis: int) -> np.ndarray:
+    """Sum of the other expected signals in the taxel's row (0) or column (1): (T, n)."""
+    cols = press.layout.full_cols
+    line = press.taxels // cols if axis == 0 else press.taxels % cols
+    total = np.zeros((len(signal), int(line.max()) + 1))
+    np.add.at(total.T, line, signal.T)
+    return total[:, line] - signal
+
+
+def _centred(values: np.ndarray) -> np.ndarray:
+    return values - values.mean()
+
+
+def _temperature(press: Press) -> np.ndarray:
+    values = press.trial.temperature_c
+    if values is None or not np.isfinite(values).all():
+        return np.zeros((len(press.trial.time_s), 1))
+    return values[:, None]
+
+
+def _parity(press: Press) -> np.ndarray:
+    return np.where(np.arange(len(press.trial.time_s)) % 2, 1.0, -1.0)[:, None]
+
+
+STIFFNESS = ("nonlinear_stiffness", "saturation", "row_sharing", "contact_offset")
+MEMORY = ("viscoelastic_relaxation", "hysteresis", "first_load_softening")
+PLACES = ("taxel_gain_spread", "pad_tilt", "dead_taxels", "contact_offset")
+LINES = ("row_sharing", "crosstalk", "mechanical_spreading")
+TIMING = ("latency", "scan_skew", "sample_and_hold")
+
+DESCRIPTORS = (
+    Descriptor("the square of the load", STIFFNESS, lambda p, s: s * s),
+    Descriptor("the cube of the load", STIFFNESS, lambda p, s: s**3),
+    Descriptor("light contact", STIFFNESS, lambda p, s: np.sqrt(np.maximum(s, 0.0))),
+    Descriptor(
+        "the largest load so far in the recording",
+        ("hysteresis", "first_load_softening"),
+        lambda p, s: s * np.maximum.accumulate(s, axis=0),
+    ),
+    Descriptor(
+        "load times session time",
+        (),
+        lambda p, s: s * (p.trial.start_s + p.trial.time_s)[:, None],
+        session=True,
+    ),
+    Descriptor("load times the recording's number", (), lambda p, s: s * p.trial.order, session=True),
+    Descriptor("load times time in the recording", (), lambda p, s: s * p.trial.time_s[:, None]),
+    Descriptor(
+        "load times the age of the contact", ("viscoelastic_relaxation",), lambda p, s: s * _age(p, s)
+    ),
+    Descriptor(
+        "load times the logarithm of the contact's age",
+        ("viscoelastic_relaxation",),
+        lambda p, s: s * np.log1p(_age(p, s) / 0.1),
+    ),
+    Descriptor("the rate of depth", (*TIMING, *MEMORY), _depth_rate),
+    Descriptor("load times the rate of depth", (*TIMING, *MEMORY), lambda p, s: s * _depth_rate(p, s)),
+    Descriptor("loading or unloading", (*MEMORY, *TIMING), lambda p, s: s * np.sign(_depth_rate(p, s))),
+    Descriptor("the speed of depth, either way", MEMORY, lambda p, s: s * np.abs(_depth_rate(p, s))),
+    Descriptor("the indenter's place along the row, at every taxel", (), lambda p, s: _carriage(p, s, 0)),
+    Descriptor("the indenter's place along the column, at every taxel", (), lambda p, s: _carriage(p, s, 1)),
+    Descriptor("the speed of sliding", (), lambda p, s: s * np.hypot(*_sliding(p))),
+    Descriptor("the direction of sliding along the row", TIMING, lambda p, s: s * np.sign(_sliding(p)[0])),
+    Descriptor("the direction of sliding along the column", TIMING, lambda p, s: s * np.sign(_sliding(p)[1])),
+    Descriptor("the column of the taxel", PLACES, lambda p, s: s * _place(p, 0)),
+    Descriptor("the row of the taxel", PLACES, lambda p, s: s * _place(p, 1)),
+    Descriptor(
+        "the distance from the pad's centre",
+        ("taxel_gain_spread",),
+        lambda p, s: s * (_place(p, 0) ** 2 + _place(p, 1) ** 2),
+    ),
+    Descriptor(
+        "touch at the distance from the pad's centre",
+        ("taxel_gain_spread",),
+        lambda p, s: (s > 0) * (_place(p, 0) ** 2 + _place(p, 1) ** 2),
+    ),
+    Descriptor("the other readings of the row", LINES, lambda p, s: _line_sum(p, s, 0)),
+    Descriptor("the other readings of the column", LINES, lambda p, s: _line_sum(p, s, 1)),
+    Descriptor("load times the row's other readings", LINES, lambda p, s: s * _line_sum(p, s, 0)),
+    Descriptor("load times the column's other readings", LINES, lambda p, s: s * _line_sum(p, s, 1)),
+    Descriptor("load times the total load", LINES, lambda p, s: s * s.sum(axis=1, keepdims=True)),
+    Descriptor(
+        "the total load, at every taxel",
+        LINES,
+        lambda p, s: np.broadcast_to(s.sum(axis=1, keepdims=True), s.shape),
+    ),
+    Descriptor(
+        "time in the recording",
+        ("baseline_drift", "viscoelastic_relaxation"),
+        lambda p, s: np.broadcast_to(_centred(p.trial.time_s)[:, None], s.shape),
+    ),
+    Descriptor(
+        "session time",
+        ("baseline_drift",),
+        lambda p, s: np.broadcast_to((p.trial.start_s + p.trial.time_s)[:, None], s.shape),
+        session=True,
+    ),
+    Descriptor(
+        "temperature",
+        ("baseline_drift",),
+        lambda p, s: np.broadcast_to(_temperature(p), s.shape),
+        session=True,
+    ),
+    Descriptor("load times temperature", (), lambda p, s: s * _temperature(p), session=True),
+    Descriptor("even and odd frames", (), lambda p, s: np.broadcast_to(_parity(p), s.shape)),
+    Descriptor("load in even and odd frames", (), lambda p, s: s * _parity(p)),
+)

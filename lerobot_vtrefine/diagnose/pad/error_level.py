@@ -1,0 +1,136 @@
+"""Errors far above the noise of single frames: under load, in one condition, beside the indenter, at a taxel.
+
+Noise without memory and single spikes do not count: products of errors a few frames apart do. Sizes are
+compared with what sound recordings have; nothing is tested. Shapes: K recordings.
+"""
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from lerobot_vtrefine.diagnose.core.suspicion import Suspicion
+from lerobot_vtrefine.diagnose.pad.fitting import Fit
+from lerobot_vtrefine.diagnose.pad.press_trials import PressSet
+from lerobot_vtrefine.diagnose.pad.weights import TrialWeights
+
+LAG = 3
+LOADED = 0.05
+"""Part of the largest signal from which on a taxel counts as loaded."""
+LEVEL = 4.0
+"""Mean square of slow errors under load, in variances of a frame's noise, that is no misfit of a form."""
+CONDITION_LEVEL, MIN_LOADED = 2.5, 200
+"""The same in all recordings of one condition, and the readings that each needs; clean ones reach 1."""
+BESIDE = 1.15
+"""Mean square of whitened errors of taxels beside a pressed indenter, over that at rest; 1.06 is usual."""
+TAXEL = 6.0
+"""Mean square of slow errors of one taxel while the pad is pressed, in variances of a frame's noise."""
+OTHERS = 4.0
+"""Factor by which it must exceed that of the taxel in the middle: errors of all are no taxel's."""
+MIN_READINGS = 200
+CLEAR_M = 1e-4
+"""Distance of the indenter from which on no recording's own first touch reaches a taxel [m]."""
+OUTLIER = 4.0
+"""Whitened errors, in standard deviations, that are cut to this size."""
+
+
+def beyond(ratio: float, usual: float, clue: str, *, also: bool = True) -> Suspicion:
+    """What a mean square is, over what is expected, against the largest such ratio that is usual.
+
+    Args:
+        also: what else must hold.
+    """
+    share = 1.0 - 1.0 / ratio if also and ratio > 1.0 else 0.0
+    return Suspicion(0, clue, share, 1.0 - 1.0 / usual)
+
+
+def slow_errors(
+    fitted: Fit, residuals: Sequence[np.ndarray], weights: Sequence[TrialWeights]
+) -> tuple[np.ndarray, np.ndarray]:
+    """Mean square of slow errors under load in variances of a frame's noise, per recording (K,), and the
+    number of readings that it rests on.
+
+    From products of errors a few frames apart: noise without memory and single spikes do not count.
+    """
+    sums, readings = np.zeros(len(weights)), np.zeros(len(weights))
+    for k, (residual, signal, weight) in enumerate(zip(residuals, fitted.signals, weights, strict=True)):
+        loaded = signal > LOADED * fitted.model.setting.top_counts
+        unit = np.where(loaded, residual / weight.sigma, 0.0)
+        sums[k] = float((unit[LAG:] * unit[:-LAG]).sum())
+        readings[k] = int((loaded[LAG:] & loaded[:-LAG]).sum())
+    return sums / np.maximum(readings, 1), readings
+
+
+def level(residuals: Sequence[np.ndarray], fitted: Fit, weights: Sequence[TrialWeights]) -> Suspicion:
+    """Slow errors far above the frames' own noise: recordings neither follow the model nor repeat, whatever
+    each one's gain and first touch."""
+    each, readings = slow_errors(fitted, residuals, weights)
+    ratio = float(each @ readings / max(readings.sum(), 1))
+    text = f"errors under load are {np.sqrt(max(ratio, 0.0)):.1f} times the noise of single frames"
+    return beyond(ratio, LEVEL, text)
+
+
+def level_of_a_condition(
+    presses: PressSet, residuals: Sequence[np.ndarray], fitted: Fit, weights: Sequence[TrialWeights]
+) -> Suspicion | None:
+    """The same in all recordings of one condition, which drowns among the others; None without replicates."""
+    each, readings = slow_errors(fitted, residuals, weights)
+    names = np.array(presses.conditions)
+    repeated = [name for name in sorted(set(names)) if (names == name).sum() > 1]
+    known = {name: each[names == name] for name in repeated if readings[names == name].min() >= MIN_LOADED}
+    if not known:
+        return None
+    worst = max(known, key=lambda name: float(known[name].min()))
+    ratio = float(known[worst].min())
+    text = f"errors in condition {worst} are {np.sqrt(max(ratio, 0.0)):.1f} times the noise of single frames"
+    return beyond(ratio, CONDITION_LEVEL, text + motion_of(presses, worst))
+
+
+def motion_of(presses: PressSet, condition: str) -> str:
+    """What is special about a condition's motion."""
+    trial = next(press.trial for press in presses.presses if press.trial.condition == condition)
+    slid = float(np.hypot(np.ptp(trial.x_m), np.ptp(trial.y_m)))
+    return ", in which the indenter slides" if slid > 0.5 * presses.layout.pitch_m else ""
+
+
+def beside_the_indenter(
+    presses: PressSet, residuals: Sequence[np.ndarray], fitted: Fit, weights: Sequence[TrialWeights]
+) -> Suspicion | None:
+    """Whether taxels that nothing should reach err more while the pad is pressed than at rest."""
+    sums, counts = np.zeros(2), np.zeros(2)
+    for press, residual, signal, weight in zip(
+        presses.presses, residuals, fitted.signals, weights, strict=True
+    ):
+        light = signal <= LOADED * fitted.model.setting.top_counts
+        light &= press.drive[:, press.scored] < (0.0 if press.loaded else -CLEAR_M) + 1e-12
+        square = np.minimum(weight.memory.white(residual / weight.sigma) ** 2, OUTLIER**2)
+        pressed = press.touching[:, None]
+        for index, mask in enumerate((light & pressed, light & ~pressed)):
+            sums[index] += float(square[mask].sum())
+            counts[index] += int(mask.sum())
+    if counts.min() < MIN_READINGS:
+        return None
+    ratio = float((sums[0] / counts[0]) / max(sums[1] / counts[1], 1e-12))
+    text = f"errors beside the pressed indenter are {np.sqrt(ratio):.1f} times those at rest"
+    return beyond(ratio, BESIDE, text)
+
+
+def one_taxel(
+    presses: PressSet, residuals: Sequence[np.ndarray], weights: Sequence[TrialWeights]
+) -> Suspicion | None:
+    """Whether one taxel errs far more than the others while the pad is pressed."""
+    sums, counts = np.zeros((2, presses.layout.num_taxels))
+    for press, residual, weight in zip(presses.presses, residuals, weights, strict=True):
+        unit = np.where(press.touching[:, None], residual / weight.sigma, 0.0)
+        sums[press.taxels] += (unit[LAG:] * unit[:-LAG]).sum(axis=0)
+        counts[press.taxels] += int((press.touching[LAG:] & press.touching[:-LAG]).sum())
+    known = np.flatnonzero(counts >= MIN_READINGS)
+    if len(known) < 4:
+        return None
+    ratios = sums[known] / counts[known]
+    worst, middle = int(np.argmax(ratios)), float(np.median(ratios))
+    ratio = float(ratios[worst])
+    row, col = divmod(int(known[worst]), presses.layout.cols)
+    text = (
+        f"errors of taxel ({row}, {col}) are {np.sqrt(max(ratio, 0.0)):.1f} times the noise of single frames"
+    )
+    return beyond(ratio, TAXEL, text, also=ratio > OTHERS * max(middle, 0.5))

@@ -1,0 +1,133 @@
+"""From what the search settled on to the model that users load, and its predictions.
+
+The search weighs readings; users get what predicts plain readings best.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from lerobot_vtrefine.diagnose.core.heldout import out_of_fold
+from lerobot_vtrefine.diagnose.core.resampling import agree
+from lerobot_vtrefine.diagnose.core.rules import DOUBTFUL_GAIN, DOUBTFUL_P
+from lerobot_vtrefine.diagnose.core.search import Selection
+from lerobot_vtrefine.diagnose.pad.fitting import Fit, fit, rest
+from lerobot_vtrefine.diagnose.pad.idle_level import settled_idle
+from lerobot_vtrefine.diagnose.pad.model import Composite, sensor_model
+from lerobot_vtrefine.diagnose.pad.prediction import predict_trial
+from lerobot_vtrefine.diagnose.pad.press_trials import IdleMap, Press, PressSet
+from lerobot_vtrefine.tactile.model import SensorModel
+
+if TYPE_CHECKING:
+    from lerobot_vtrefine.diagnose.pad.problem import PadProblem
+
+_SLIM_STEPS = 5
+"""Steps of the refit that tells what held-out recordings lose without a cause."""
+_KEPT = 4
+"""Models whose predictions are kept."""
+
+
+class Predictions:
+    """Readings (T, n) [counts] that users' models predict for a set's scored taxels."""
+
+    def __init__(self, presses: PressSet) -> None:
+        self.presses = presses
+        self._kept: list[tuple[SensorModel, list[np.ndarray]]] = []
+
+    def of(self, model: SensorModel) -> list[np.ndarray]:
+        """By the code that predicts for users; of the last few models they are kept."""
+        for known, readings in self._kept:
+            if known is model:
+                return readings
+        layout = self.presses.layout
+        readings = [
+            predict_trial(model, press.trial, layout)[:, press.taxels] for press in self.presses.presses
+        ]
+        self._kept = [*self._kept, (model, readings)][-_KEPT:]
+        return readings
+
+    def errors(self, model: SensorModel) -> np.ndarray:
+        """Mean squared error of every recording (K, 1) [counts^2]."""
+        pairs = zip(self.presses.presses, self.of(model), strict=True)
+        return np.array([float(np.mean((measured(press) - said) ** 2)) for press, said in pairs])[:, None]
+
+
+def measured(press: Press) -> np.ndarray:
+    """Readings of the scored taxels, idle level included (T, n) [counts]."""
+    return press.signal + press.idle
+
+
+@dataclass(frozen=True)
+class FinalFit:
+    """What is handed out of a fit."""
+
+    fit: Fit
+    """That the search settled on: names, sizes and intervals are told of it."""
+    sensor: SensorModel
+    """What users load."""
+    idle: IdleMap
+    noise_counts: float
+
+    @property
+    def mse(self) -> np.ndarray:
+        """(K, 1) of the search's fit."""
+        return self.fit.mse
+
+    @property
+    def scores(self) -> np.ndarray:
+        """(K, 1) of the search's fit."""
+        return self.fit.scores
+
+    def without(self, families: Sequence[str], problem: "PadProblem") -> "FinalFit":
+        """Without some causes, the others fitted to plain readings."""
+        model = self.fit.model
+        for family in families:
+            model = model.minus(family)
+        slim = fit(model, problem.presses, problem.even.weights, _SLIM_STEPS)
+        return replace(self, fit=slim, sensor=_sensor(slim.model, problem, self.idle, self.noise_counts))
+
+
+def _sensor(model: Composite, problem: "PadProblem", idle: IdleMap, noise_counts: float) -> SensorModel:
+    return sensor_model(model, idle, problem.presses.step_counts, noise_counts)
+
+
+def handed_out(
+    selection: Selection["PadProblem", Any, Any], seed: int, *, doubtful: bool
+) -> Selection["PadProblem", Any, Any]:
+    """The selection with models as users load them.
+
+    Frames that were held count only if readings are predicted better when nobody says which ones were, as for
+    new recordings.
+    """
+    problem, plain, fitted = selection.problem, selection.baseline, selection.fit
+    model = trusted(problem, plain, fitted, seed, doubtful=doubtful) if fitted.model.families else plain.model
+    idle = settled_idle(model, problem.presses)
+    noise = problem.noise.floor if problem.noise is not None else 0.0
+    before = FinalFit(plain, _sensor(plain.model, problem, idle, noise), idle, noise)
+    after = FinalFit(fitted, _sensor(model, problem, idle, noise), idle, noise)
+    if "sample_and_hold" in fitted.model.families:
+        errors = [problem.errors(item).mean() for item in (before, after)]
+        after = after if errors[1] < errors[0] else replace(after, sensor=before.sensor)
+    return replace(selection, baseline=before, fit=after)
+
+
+def trusted(problem: "PadProblem", plain: Fit, fitted: Fit, seed: int, *, doubtful: bool) -> Composite:
+    """What is handed out: never a model that predicts plain readings of recordings left out worse than the
+    baseline does.
+
+    Named causes are taken as they were weighed, or as plain errors have them where those are worse. Beside an
+    unknown cause (`doubtful`) the better one of both must do clearly better in nearly all recordings: names
+    are symptoms then, and what they stand in for may be otherwise next time.
+    """
+    even = problem.even
+    before = out_of_fold(even, rest(plain.model, problem.presses, even.weights), problem.folds)
+    found = [(fitted.model, out_of_fold(problem, fitted, problem.folds))]
+    if doubtful or found[0][1].gain_over(before) <= 0.0:
+        refitted = even.refitted(fitted)
+        found.append((refitted.model, out_of_fold(even, refitted, problem.folds)))
+    model, held = max(found, key=lambda item: item[1].gain_over(before))
+    needed = DOUBTFUL_GAIN if doubtful else 0.0
+    lucky = doubtful and not agree((before.errors - held.errors).sum(1), seed, DOUBTFUL_P)
+    return plain.model if held.gain_over(before) <= needed or lucky else model

@@ -1,0 +1,148 @@
+"""All presses side by side, a column per taxel that may answer: what models are run on while fitting."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property
+from itertools import pairwise
+
+import numpy as np
+
+from lerobot_vtrefine.diagnose.pad.motion import Kind, warmth
+from lerobot_vtrefine.diagnose.pad.press_trials import MARGIN_TAXELS, Press
+from lerobot_vtrefine.diagnose.pad.repeated_frames import Rhythm
+from lerobot_vtrefine.tactile.layout import PadLayout
+
+LONG = 1.3
+"""Presses with this many times the usual number of instants are kept apart from the others."""
+FAR_M = -1.0
+"""Height that pads the columns of shorter recordings [m]: nothing touches there."""
+
+
+@dataclass(frozen=True)
+class Sheet:
+    """Presses at a model's instants. Arrays (G, M): a line per instant, a column per press and taxel."""
+
+    layout: PadLayout
+    members: tuple[int, ...]
+    """Numbers of the presses (K)."""
+    blocks: tuple[slice, ...]
+    """Columns of every press (K)."""
+    taxels: np.ndarray
+    """Row-major number of every column's taxel in the pad (M,)."""
+    drive: np.ndarray
+    """Column heights [m], or force per taxel [N] if `loaded`; presses that end early are padded."""
+    rate: np.ndarray
+    times_s: tuple[np.ndarray, ...]
+    """Instants of every press, from its trial's start."""
+    starts_s: tuple[float, ...]
+    """Session time of every trial's start."""
+    frames: tuple[np.ndarray, ...]
+    """Numbers of the recorded frames among the instants, per press."""
+    scored: tuple[np.ndarray, ...]
+    """Columns of each press's scored taxels, in their order."""
+    idle: np.ndarray
+    """Idle level of every column's taxel (M,) [counts]."""
+    loaded: bool
+    rhythms: tuple[Rhythm, ...]
+    """When each press's readings were new."""
+    warmth_c: tuple[np.ndarray | None, ...]
+    """Temperature at every press's instants; None where it was not recorded."""
+
+    @cached_property
+    def rows(self) -> np.ndarray:
+        """Row in the pad of every column's taxel (M,)."""
+        return self.taxels // self.layout.cols
+
+    @cached_property
+    def cols(self) -> np.ndarray:
+        """Column in the pad of every column's taxel (M,)."""
+        return self.taxels % self.layout.cols
+
+    @cached_property
+    def touched(self) -> np.ndarray:
+        """Numbers of the columns that the indenter reaches as recorded."""
+        return np.flatnonzero((self.drive > 0).any(axis=0))
+
+    @cached_property
+    def pressed(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Drive of those columns, their numbers, and the drive's rate."""
+        # Picking columns leaves an array that lies column by column; instants are what is run through.
+        drive, rate = (np.ascontiguousarray(values[:, self.touched]) for values in (self.drive, self.rate))
+        return drive, self.touched, rate
+
+    @cached_property
+    def recorded(self) -> "Sheet":
+        """The same columns at the recorded frames only, for what comes after the last memory."""
+        if all(len(time_s) == len(frames) for time_s, frames in zip(self.times_s, self.frames, strict=True)):
+            return self
+        times_s = tuple(time_s[frames] for time_s, frames in zip(self.times_s, self.frames, strict=True))
+        frames = tuple(np.arange(len(time_s)) for time_s in times_s)
+        warmth_c = tuple(
+            None if warm is None else warm[kept]
+            for warm, kept in zip(self.warmth_c, self.frames, strict=True)
+        )
+        return replace(self, times_s=times_s, frames=frames, warmth_c=warmth_c)
+
+    @cached_property
+    def all_scored(self) -> np.ndarray:
+        """Numbers of all scored columns."""
+        return np.sort(np.concatenate(self.scored))
+
+
+def near(mask: np.ndarray) -> np.ndarray:
+    """Taxels (r, c) within MARGIN_TAXELS of those of a mask."""
+    wide = mask.copy()
+    for axis in (0, 1):
+        grown = wide.copy()
+        for step in range(1, MARGIN_TAXELS + 1):
+            ahead, behind = [slice(None)] * 2, [slice(None)] * 2
+            ahead[axis], behind[axis] = slice(step, None), slice(None, -step)
+            grown[tuple(ahead)] |= wide[tuple(behind)]
+            grown[tuple(behind)] |= wide[tuple(ahead)]
+        wide = grown
+    return wide
+
+
+def build_sheets(presses: Sequence[Press], idle: np.ndarray, kind: Kind) -> list[Sheet]:
+    """The presses at the instants of a kind, those of many instants apart; `idle` (R, C) [counts]."""
+    lengths = np.array([len(press.course(kind).time_s) for press in presses])
+    long = lengths > LONG * np.median(lengths)
+    groups = [np.flatnonzero(~long).tolist(), np.flatnonzero(long).tolist()]
+    return [_build(presses, members, idle, kind) for members in groups if members]
+
+
+def _build(everyone: Sequence[Press], members: list[int], idle: np.ndarray, kind: Kind) -> Sheet:
+    presses = [everyone[index] for index in members]
+    courses = [press.course(kind) for press in presses]
+    masks = [near(press.scored | (press.drive > 0).any(axis=0)) for press in presses]
+    ends = np.cumsum([0, *(int(mask.sum()) for mask in masks)]).tolist()
+    lines, width = max(len(course.time_s) for course in courses), ends[-1]
+    drive, rate = np.full((lines, width), FAR_M), np.zeros((lines, width))
+    loaded = presses[0].loaded
+    if loaded:
+        drive[:] = 0.0
+    taxels, scored = np.zeros(width, dtype=int), []
+    for press, course, mask, begin, end in zip(presses, courses, masks, ends[:-1], ends[1:], strict=True):
+        drive[: len(course.time_s), begin:end] = course.drive[:, mask]
+        rate[: len(course.time_s), begin:end] = course.rate[:, mask]
+        rows, cols = np.nonzero(mask)
+        layout = press.layout
+        taxels[begin:end] = (rows + layout.row0) * layout.full_cols + cols + layout.col0
+        scored.append(begin + np.flatnonzero(press.scored[mask]))
+    first = presses[0].layout
+    return Sheet(
+        PadLayout(first.full_rows, first.full_cols, first.pitch_m),
+        tuple(members),
+        tuple(slice(begin, end) for begin, end in pairwise(ends)),
+        taxels,
+        drive,
+        rate,
+        tuple(course.time_s for course in courses),
+        tuple(press.trial.start_s for press in presses),
+        tuple(course.frames for course in courses),
+        tuple(scored),
+        idle.ravel()[taxels],
+        loaded,
+        tuple(press.rhythm for press in presses),
+        tuple(warmth(press.trial, course.time_s) for press, course in zip(presses, courses, strict=True)),
+    )

@@ -1,0 +1,65 @@
+"""What passes from stage to stage while fitting: values of some of a sheet's columns."""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+
+from lerobot_vtrefine.diagnose.pad.forward_model.batches import Sheet
+
+
+@dataclass(frozen=True)
+class Field:
+    """Values (G, m) of some of a sheet's columns; all others are zero. Depths before the contact law."""
+
+    values: np.ndarray
+    columns: np.ndarray
+    """Numbers of the columns in the sheet (m,), rising."""
+    rate: np.ndarray | None = None
+
+    def within(self, sheet: Sheet, press: int) -> slice:
+        """Where a press's columns are among these."""
+        block = sheet.blocks[press]
+        return slice(*np.searchsorted(self.columns, (block.start, block.stop)).tolist())
+
+    def at_frames(self, sheet: Sheet) -> "Field":
+        """At the recorded frames only, as `sheet.recorded` has them."""
+        if sheet.recorded is sheet:
+            return self
+        out = np.zeros((max(len(frames) for frames in sheet.frames), len(self.columns)))
+        for press, frames in enumerate(sheet.frames):
+            part = self.within(sheet, press)
+            out[: len(frames), part] = self.values[frames, part]
+        return Field(out, self.columns)
+
+    def spread(self, columns: np.ndarray) -> "Field":
+        """At other columns, zero where these have none."""
+        if columns is self.columns:
+            return self
+        place = np.searchsorted(self.columns, columns).clip(max=max(len(self.columns) - 1, 0))
+        if not len(self.columns):
+            return Field(np.zeros((len(self.values), len(columns))), columns)
+        known = self.columns[place] == columns
+        return Field(np.where(known, self.values[:, place], 0.0), columns)
+
+
+@dataclass(frozen=True)
+class Context:
+    """What a fast stage may know: the presses, one taxel's stiffness [N/m], and where results are needed."""
+
+    sheet: Sheet
+    stiffness: float
+    wanted: np.ndarray | None = None
+    """Numbers of the columns in which a stage that mixes taxels should answer; None for all."""
+
+
+def by_press(
+    field: Field, sheet: Sheet, work: Callable[[np.ndarray, np.ndarray, np.ndarray], np.ndarray]
+) -> Field:
+    """work(values (T, m), times (T,), columns' rows in the pad (m,)) on every press."""
+    out = np.zeros_like(field.values)
+    for press, time_s in enumerate(sheet.times_s):
+        part = field.within(sheet, press)
+        rows = sheet.rows[field.columns[part]]
+        out[: len(time_s), part] = work(field.values[: len(time_s), part], time_s, rows)
+    return Field(out, field.columns)

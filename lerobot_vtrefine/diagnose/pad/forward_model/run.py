@@ -1,0 +1,217 @@
+"""Many presses through the simulator's stages at once, in double precision, for fitting.
+
+Every stage of the catalogue has a fast equal on sheets (a test holds each to the stage itself); a stage that
+is not listed runs its own code, press by press.
+"""
+
+import threading
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import torch
+
+from lerobot_vtrefine.diagnose.pad.forward_model.batches import Sheet, build_sheets
+from lerobot_vtrefine.diagnose.pad.forward_model.fields import Context, Field
+from lerobot_vtrefine.diagnose.pad.forward_model.memory_stages import MEMORY
+from lerobot_vtrefine.diagnose.pad.forward_model.momentary_stages import MIXING, SEPARATE
+from lerobot_vtrefine.diagnose.pad.motion import Kind, instants
+from lerobot_vtrefine.diagnose.pad.press_trials import Press
+from lerobot_vtrefine.tactile.stages.base import Frame, Stage
+from lerobot_vtrefine.tactile.stages.contact import ContactStage, KelvinVoigt
+from lerobot_vtrefine.tactile.stages.mechanics import NonlinearStiffness
+from lerobot_vtrefine.tactile.stages.readout import TaxelGainSpread
+
+FAST = MEMORY | SEPARATE | MIXING
+
+
+class Bench:
+    """Presses ready to be run through models; sheets are built once per set."""
+
+    def __init__(self, presses: Sequence[Press], idle: np.ndarray) -> None:
+        self.presses, self._idle = presses, idle
+        self._sheets: dict[Kind, list[Sheet]] = {}
+        self._building = threading.Lock()
+
+    def sheets(self, kind: Kind) -> list[Sheet]:
+        """The presses at a model's instants."""
+        with self._building:
+            if kind not in self._sheets:
+                self._sheets[kind] = build_sheets(self.presses, self._idle, kind)
+            return self._sheets[kind]
+
+
+@dataclass(frozen=True)
+class Plan:
+    """What a model's stages need of the fields between them.
+
+    Attributes:
+        mixed: per stage, whether a later one may mix a taxel with its neighbours.
+        remembered: per stage, whether a later one has memory, so that all instants count.
+    """
+
+    stages: Sequence[Stage]
+    kind: Kind
+    mixed: tuple[bool, ...]
+    remembered: tuple[bool, ...]
+
+    @classmethod
+    def of(cls, stages: Sequence[Stage]) -> "Plan":
+        """The plan of a model."""
+        rests = [tuple(stages[index + 1 :]) for index in range(len(stages))]
+        remembered = tuple(instants(rest) != "frames" for rest in rests)
+        return cls(stages, instants(tuple(stages)), tuple(mixes(rest) for rest in rests), remembered)
+
+    @property
+    def keys(self) -> list[Any]:
+        """What a stage's field depends on, beside the stages before it."""
+        steps = zip(self.stages, self.mixed, self.remembered, strict=True)
+        return [(self.kind, mixed, remembered, _key(stage)) for stage, mixed, remembered in steps]
+
+
+def run_stages(stages: Sequence[Stage], bench: Bench, cache: "Prefix | None" = None) -> list[np.ndarray]:
+    """Counts above idle that the stages predict for every press: (T, n) of its scored taxels.
+
+    With a cache, work that earlier stages did for the same parameters is not repeated.
+    """
+    if not bench.presses:
+        return []
+    plan = Plan.of(stages)
+    sheets = bench.sheets(plan.kind)
+    start, fields = cache.lookup(plan) if cache is not None else (0, None)
+    if fields is None:
+        fields = [_begin(stages, sheet) for sheet in sheets]
+    for index in range(start, len(stages)):
+        fields = [_step(plan, index, field, sheet) for field, sheet in zip(fields, sheets, strict=True)]
+        if cache is not None:
+            cache.store(index, fields)
+    found: list[np.ndarray] = [np.empty(0)] * len(bench.presses)
+    for field, sheet in zip(fields, sheets, strict=True):
+        _scatter(field, sheet.recorded, found)
+    return found
+
+
+def _begin(stages: Sequence[Stage], sheet: Sheet) -> Field:
+    if sheet.loaded or not any(stage.domain == "depth" for stage in stages):
+        return Field(*sheet.pressed)
+    return Field(sheet.drive, np.arange(len(sheet.taxels)), sheet.rate)
+
+
+def _step(plan: Plan, index: int, field: Field, sheet: Sheet) -> Field:
+    """Stage number `index`; once no later one has memory, only recorded frames are kept."""
+    stages = plan.stages
+    contact = next(stage for stage in stages if isinstance(stage, ContactStage))
+    before = plan.remembered[index - 1] if index else True
+    # What nothing mixes with others any more is needed at scored taxels only.
+    wanted = None if plan.mixed[index] else sheet.all_scored
+    place = sheet if before else sheet.recorded
+    field = _apply(stages[index], field, Context(place, float(contact.stiffness(sheet.layout)), wanted))
+    return field.at_frames(place) if before and not plan.remembered[index] else field
+
+
+def mixes(stages: Sequence[Stage]) -> bool:
+    """Whether any of the stages may mix a taxel with its neighbours."""
+    own = tuple(SEPARATE) + tuple(MEMORY)
+    return any(not isinstance(stage, own) and not isinstance(stage, ContactStage) for stage in stages)
+
+
+def _scatter(field: Field, sheet: Sheet, found: list[np.ndarray]) -> None:
+    """(T, n) of each press's scored taxels into its place among all presses."""
+    for press, (member, frames, scored) in enumerate(
+        zip(sheet.members, sheet.frames, sheet.scored, strict=True)
+    ):
+        part = field.within(sheet, press)
+        own = field.columns[part]
+        place = np.searchsorted(scored, own).clip(max=len(scored) - 1)
+        kept = scored[place] == own
+        found[member] = np.zeros((len(frames), len(scored)))
+        found[member][:, place[kept]] = field.values[: len(frames), part][:, kept]
+
+
+class Prefix:
+    """Fields after every stage of one reference model; a model that differs later starts from there."""
+
+    def __init__(self) -> None:
+        self.keys: list[Any] = []
+        self.fields: list[list[Field]] = []
+        self.frozen = False
+
+    def lookup(self, plan: Plan) -> tuple[int, list[Field] | None]:
+        """Number of leading stages already done at those instants, and their fields."""
+        keys = plan.keys
+        same = 0
+        while same < min(len(keys), len(self.keys)) and keys[same] == self.keys[same]:
+            same += 1
+        if not self.frozen:
+            self.keys = keys
+            self.fields = self.fields[:same]
+        return same, (self.fields[same - 1] if same else None)
+
+    def store(self, index: int, fields: list[Field]) -> None:
+        """Keep the fields after stage `index`, unless frozen."""
+        if not self.frozen:
+            self.fields[index:] = [fields]
+
+
+def _key(stage: Stage) -> Any:
+    if isinstance(stage, TaxelGainSpread):
+        return stage.name, _Same(stage.map)
+    return stage
+
+
+@dataclass(frozen=True, eq=False)
+class _Same:
+    """Equal only to the very same object, kept alive: the address of one that is gone may be used again."""
+
+    value: Any
+
+    def __eq__(self, other: object) -> bool:
+        return isinstance(other, _Same) and self.value is other.value
+
+    def __hash__(self) -> int:
+        return id(self.value)
+
+
+def _apply(stage: Stage, field: Field, context: Context) -> Field:
+    sheet = context.sheet
+    if sheet.loaded and (isinstance(stage, ContactStage) or stage.domain == "depth"):
+        return field
+    if isinstance(stage, ContactStage):
+        return _contact(stage, field, sheet)
+    fast = FAST.get(type(stage))
+    if fast is None or (sheet.loaded and isinstance(stage, NonlinearStiffness)):
+        return _own(stage, field, context)
+    return fast(stage, field, context)
+
+
+def _contact(stage: ContactStage, field: Field, sheet: Sheet) -> Field:
+    assert field.rate is not None
+    if isinstance(stage, KelvinVoigt):
+        force = stage.k_n * field.values
+        force += stage.k_d * field.rate
+        np.maximum(force, 0.0, out=force)
+        force *= field.values > 0
+    else:
+        depth, rate = (torch.from_numpy(np.ascontiguousarray(v)) for v in (field.values, field.rate))
+        force = stage.force(depth[:, None], rate[:, None], sheet.layout)[:, 0].numpy()
+    if field.columns is sheet.touched:
+        return Field(force, field.columns)
+    felt = force.any(axis=0)
+    return Field(np.ascontiguousarray(force[:, felt]), field.columns[felt])
+
+
+def _own(stage: Stage, field: Field, context: Context) -> Field:
+    """The stage's own code on whole images, press by press."""
+    sheet = context.sheet
+    columns = np.arange(len(sheet.taxels))
+    out = np.zeros((len(field.values), len(columns)))
+    shape = (-1, sheet.layout.rows, sheet.layout.cols)
+    for press, (block, time_s) in enumerate(zip(sheet.blocks, sheet.times_s, strict=True)):
+        part = field.within(sheet, press)
+        image = np.zeros((len(time_s), sheet.layout.num_taxels))
+        image[:, sheet.taxels[field.columns[part]]] = field.values[: len(time_s), part]
+        frame = Frame(sheet.layout, stiffness_n_per_m=context.stiffness, load_conserving=sheet.loaded)
+        result = stage.sequence(torch.from_numpy(image.reshape(shape)), torch.from_numpy(time_s), frame)
+        out[: len(time_s), block] = result.numpy().reshape(len(time_s), -1)[:, sheet.taxels[block]]
+    return Field(out, columns)

@@ -1,0 +1,354 @@
+"""Recorded presses as the engine works on them: cropped to the taxels that answer, above their idle level."""
+
+from dataclasses import dataclass, field, replace
+from functools import cached_property
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from lerobot_vtrefine.diagnose.pad.indenters import trial_forces
+from lerobot_vtrefine.diagnose.pad.motion import Kind, instants_of, motion
+from lerobot_vtrefine.diagnose.pad.repeated_frames import Rhythm, silent
+from lerobot_vtrefine.diagnose.recordings import RecordingSet, Trial
+from lerobot_vtrefine.tactile.layout import PadLayout
+
+if TYPE_CHECKING:
+    from lerobot_vtrefine.diagnose.pad.forward_model.run import Bench
+
+MARGIN_TAXELS = 2
+"""Untouched taxels kept around those that answer, so that spreading does not see the crop's edge."""
+CLEAR_M = 2e-4
+"""An indenter this far away cannot touch a pad whose face is a little off."""
+REST_S = 1.0
+"""After a release the idle level is trusted again after this time [s]."""
+MIN_IDLE_FRAMES = 30
+MIN_FRAMES = 8
+
+
+@dataclass(frozen=True)
+class CropLayout(PadLayout):
+    """A window of a pad: rows x cols taxels from (row0, col0) of a pad of full_rows x full_cols."""
+
+    row0: int = 0
+    col0: int = 0
+    full_rows: int = 1
+    full_cols: int = 1
+
+    def axes_m(self) -> tuple[np.ndarray, np.ndarray]:
+        """x of every column and y of every row of the window, in the whole pad's frame [m]."""
+        x, y = PadLayout(self.full_rows, self.full_cols, self.pitch_m).axes_m()
+        return x[self.columns], y[self.lines]
+
+    @property
+    def lines(self) -> slice:
+        """The window's rows in the pad."""
+        return slice(self.row0, self.row0 + self.rows)
+
+    @property
+    def columns(self) -> slice:
+        """The window's columns in the pad."""
+        return slice(self.col0, self.col0 + self.cols)
+
+    def cut(self, image: np.ndarray) -> np.ndarray:
+        """The window of images (..., R, C)."""
+        return image[..., self.lines, self.columns]
+
+
+@dataclass(frozen=True)
+class Course:
+    """A press as models are run through it: its drive at instants, some of which are the recorded frames."""
+
+    time_s: np.ndarray
+    """From the trial's start (G,) [s]."""
+    drive: np.ndarray
+    """Column heights [m] or force per taxel [N] (G, r, c)."""
+    rate: np.ndarray
+    """Rate of the heights (G, r, c) [m/s]."""
+    frames: np.ndarray
+    """Numbers of the recorded frames (T,)."""
+
+
+@dataclass(frozen=True)
+class Press:
+    """One trial, cropped. Arrays (T, r, c) belong to the window, (T, n) to its n scored taxels."""
+
+    trial: Trial
+    layout: CropLayout
+    drive: np.ndarray
+    """Column heights [m], or force per taxel [N] if `loaded`: (T, r, c)."""
+    rate: np.ndarray
+    """Rate of the heights [m/s] (T, r, c)."""
+    loaded: bool
+    scored: np.ndarray
+    """Taxels that are pressed or answer, (r, c) bool."""
+    signal: np.ndarray
+    """Readings above the idle level, of the scored taxels: (T, n) counts."""
+    idle: np.ndarray
+    """Idle level of the scored taxels (n,) counts."""
+    touching: np.ndarray
+    """Frames with the indenter on the pad (T,) bool."""
+    resting: np.ndarray
+    """Frames before the first touch or well after a release (T,) bool."""
+    sunk_m: float = 0.0
+    """How far the face was lowered from where the recording has it [m]."""
+
+    @property
+    def time_s(self) -> np.ndarray:
+        """Times of the frames, from the trial's start [s]."""
+        return self.trial.time_s
+
+    def course(self, kind: Kind) -> Course:
+        """The drive at a model's instants; kept with the press."""
+        if kind not in self._courses:
+            self._courses[kind] = self._course(kind)
+        return self._courses[kind]
+
+    @cached_property
+    def _courses(self) -> dict[Kind, Course]:
+        return {}
+
+    def _course(self, kind: Kind) -> Course:
+        if kind == "frames":
+            return Course(self.time_s, self.drive, self.rate, np.arange(len(self.time_s)))
+        whole = PadLayout(self.layout.full_rows, self.layout.full_cols, self.layout.pitch_m)
+        # Shares of a load need the whole pad; heights do not.
+        layout = whole if self.loaded else self.layout
+        times, frames = instants_of(self.trial, layout, kind)
+        drive, rate = motion(self.trial, layout, times)
+        if self.loaded:
+            drive, rate = self.layout.cut(drive), self.layout.cut(rate)
+        return Course(times, drive - self.sunk_m, rate, frames)
+
+    @cached_property
+    def rhythm(self) -> Rhythm:
+        """When readings were new."""
+        return Rhythm.of(self.time_s, self.signal, self.touching & ~silent(self.drive, self.signal))
+
+    def sunk(self, by_m: float) -> "Press":
+        """The same press with the face lowered."""
+        lower = replace(self, drive=self.drive - by_m, sunk_m=self.sunk_m + by_m)
+        lower._courses.update({k: replace(c, drive=c.drive - by_m) for k, c in self._courses.items()})
+        return lower
+
+    @property
+    def taxels(self) -> np.ndarray:
+        """Row-major numbers in the whole pad of the scored taxels (n,)."""
+        rows, cols = np.nonzero(self.scored)
+        return (rows + self.layout.row0) * self.layout.full_cols + cols + self.layout.col0
+
+
+@dataclass(frozen=True)
+class IdleMap:
+    """Reading of every taxel at rest (R, C) counts, and the mean session time of its frames [s]."""
+
+    level: np.ndarray
+    session_s: float
+    frames: int
+    """Number of frames without contact that it rests on."""
+
+
+@dataclass(frozen=True)
+class PressSet:
+    """Presses of one pad with what they share."""
+
+    layout: PadLayout
+    full_scale: float
+    idle: IdleMap
+    presses: tuple[Press, ...]
+    loaded: bool = False
+    """Whether the trials are driven by the load (no depth)."""
+    step_counts: float = field(default=0.0)
+    """Step of the converter, 0 if readings are not on a lattice."""
+
+    def subset(self, keep: list[int]) -> "PressSet":
+        """With the presses of those numbers; kept, so that what is built of it is built once."""
+        key = tuple(keep)
+        if key not in self._subsets:
+            self._subsets[key] = replace(self, presses=tuple(self.presses[index] for index in keep))
+        return self._subsets[key]
+
+    @cached_property
+    def _subsets(self) -> dict[tuple[int, ...], "PressSet"]:
+        return {}
+
+    @cached_property
+    def bench(self) -> "Bench":
+        """The presses grouped for running models."""
+        from lerobot_vtrefine.diagnose.pad.forward_model.run import Bench
+
+        return Bench(self.presses, self.idle.level)
+
+    @property
+    def conditions(self) -> list[str]:
+        """Condition of every press."""
+        return [press.trial.condition for press in self.presses]
+
+
+@dataclass(frozen=True)
+class _Motion:
+    """Drive of one whole pad."""
+
+    drive: np.ndarray
+    rate: np.ndarray
+    touching: np.ndarray
+    near: np.ndarray
+
+
+def usable(trial: Trial) -> Trial | None:
+    """The trial in order of time, without frames that hold no numbers; None if too few are left."""
+    columns = [trial.time_s, trial.x_m, trial.y_m, trial.tilt_x_rad, trial.tilt_y_rad]
+    drive = trial.depth_m if trial.depth_m is not None else trial.force_n
+    good = np.isfinite(trial.raw).all(axis=1)
+    for column in columns if drive is None else [*columns, drive]:
+        good &= np.isfinite(column)
+    order = np.flatnonzero(good)
+    if len(order) < MIN_FRAMES:
+        return None
+    order = order[np.argsort(trial.time_s[order], kind="stable")]
+    names = ("time_s", "x_m", "y_m", "depth_m", "tilt_x_rad", "tilt_y_rad", "force_n", "temperature_c", "raw")
+    values = {name: getattr(trial, name) for name in names}
+    return replace(trial, **{k: v if v is None else v[order] for k, v in values.items()})
+
+
+def prepare(recordings: RecordingSet, trials: list[Trial], learn: list[int]) -> PressSet:
+    """Presses of the trials, with the idle map learnt from those numbered in `learn` only.
+
+    Raises ValueError when a mesh cannot be used.
+    """
+    layout = PadLayout(recordings.rows, recordings.cols, recordings.pitch_m)
+    loaded = any(trial.depth_m is None for trial in trials)
+    motions = [_motion(trial, layout, loaded) for trial in trials]
+    count = min(1.0, recordings.full_scale / 255.0)
+    idle = idle_map([trials[i] for i in learn], [motions[i] for i in learn], layout)
+    presses = tuple(
+        _press(trial, motion, layout, idle.level, loaded, count)
+        for trial, motion in zip(trials, motions, strict=True)
+    )
+    return PressSet(layout, recordings.full_scale, idle, presses, loaded, _lattice(trials))
+
+
+def _lattice(trials: list[Trial]) -> float:
+    sample = np.concatenate([trial.raw[:200].ravel() for trial in trials[:4]])
+    return 1.0 if np.allclose(sample, np.round(sample), atol=1e-6) else 0.0
+
+
+def _motion(trial: Trial, layout: PadLayout, loaded: bool) -> _Motion:
+    if loaded:
+        force = trial_forces(trial, layout)
+        load = trial.force_n if trial.force_n is not None else np.zeros(len(force))
+        threshold = 0.01 * max(float(np.max(load)), 1e-9)
+        touching = load > threshold
+        return _Motion(force, np.zeros_like(force), touching, touching)
+    heights, rate = motion(trial, layout, trial.time_s)
+    top = heights.reshape(len(heights), -1).max(axis=1)
+    return _Motion(heights, rate, top > 0, top > -CLEAR_M)
+
+
+def _rest(trial: Trial, motion: _Motion) -> tuple[np.ndarray, np.ndarray]:
+    """Frames before the first touch, and those well after a release as well: (T,) bool each."""
+    near, time = motion.near, trial.time_s
+    first = int(np.argmax(near)) if near.any() else len(near)
+    before = np.arange(len(near)) < first
+    last_touch = np.where(near, time, -np.inf)
+    since = time - np.maximum.accumulate(last_touch)
+    return before, ~near & (since > REST_S)
+
+
+def idle_map(trials: list[Trial], motions: list[_Motion], layout: PadLayout) -> IdleMap:
+    """Mean reading of every taxel in frames without contact; low quantiles where there is no such frame."""
+    rests = [_rest(trial, motion) for trial, motion in zip(trials, motions, strict=True)]
+    for pick in (0, 1):
+        frames = [rest[pick] for rest in rests]
+        count = sum(int(mask.sum()) for mask in frames)
+        if count >= MIN_IDLE_FRAMES:
+            break
+    else:
+        frames = [~motion.touching for motion in motions]
+        count = sum(int(mask.sum()) for mask in frames)
+    shape = (layout.rows, layout.cols)
+    if count >= 3:
+        raw = np.concatenate([trial.raw[mask] for trial, mask in zip(trials, frames, strict=True)])
+        session = np.concatenate(
+            [(trial.time_s + trial.start_s)[mask] for trial, mask in zip(trials, frames, strict=True)]
+        )
+        return IdleMap(raw.mean(axis=0).reshape(shape), float(session.mean()), count)
+    session_s = float(np.mean([trial.start_s for trial in trials]))
+    return IdleMap(_idle_by_taxel(trials, motions).reshape(shape), session_s, 0)
+
+
+def _idle_by_taxel(trials: list[Trial], motions: list[_Motion]) -> np.ndarray:
+    """Means of each taxel's own free frames; where it has none, what a straight line leaves at no depth."""
+    raw = np.concatenate([trial.raw for trial in trials])
+    drives = np.concatenate([motion.drive.reshape(len(motion.drive), -1) for motion in motions])
+    depth = np.maximum(drives, 0.0)
+    free = depth == 0
+    mean = np.where(free, raw, 0.0).sum(axis=0) / np.maximum(free.sum(axis=0), 1)
+    off_depth, off_raw = depth - depth.mean(axis=0), raw - raw.mean(axis=0)
+    power = float((off_depth**2).sum())
+    slope = float((off_depth * off_raw).sum()) / power if power > 0 else 0.0
+    left = np.maximum(raw.mean(axis=0) - slope * depth.mean(axis=0), 0.0)
+    return np.where(free.sum(axis=0) >= 3, mean, left)
+
+
+def _answering(trial: Trial, motion: _Motion, count: float) -> np.ndarray:
+    """Taxels whose smoothed reading moves by over a count (and more than noise) from rest: (R*C,) bool."""
+    frames = len(trial.raw)
+    rest = _rest(trial, motion)[1]
+    base = trial.raw[rest] if rest.sum() >= 5 else trial.raw
+    centre = np.median(base, axis=0)
+    window = max(3, frames // 30)
+    total = np.cumsum(np.vstack([np.zeros(trial.raw.shape[1]), trial.raw - centre]), axis=0)
+    smooth = (total[window:] - total[:-window]) / window
+    spread = np.diff(trial.raw, axis=0).std(axis=0) / np.sqrt(2.0) if frames > 2 else 0.0
+    spread = np.maximum(spread, base.std(axis=0) if rest.sum() >= 5 else 0.0)
+    return np.abs(smooth).max(axis=0) > count + 4.0 * spread / np.sqrt(min(window, 4))
+
+
+def _press(
+    trial: Trial, motion: _Motion, layout: PadLayout, idle: np.ndarray, loaded: bool, count: float
+) -> Press:
+    shape = (layout.rows, layout.cols)
+    pressed = (motion.drive > 0).any(axis=0)
+    scored = pressed | _answering(trial, motion, count).reshape(shape)
+    if not scored.any():
+        scored = np.ones(shape, dtype=bool) if layout.num_taxels <= 16 else _nearest(trial, layout)
+    rows, cols = np.flatnonzero(scored.any(axis=1)), np.flatnonzero(scored.any(axis=0))
+    row0, row1 = max(rows[0] - MARGIN_TAXELS, 0), min(rows[-1] + MARGIN_TAXELS + 1, layout.rows)
+    col0, col1 = max(cols[0] - MARGIN_TAXELS, 0), min(cols[-1] + MARGIN_TAXELS + 1, layout.cols)
+    crop = CropLayout(
+        int(row1 - row0),
+        int(col1 - col0),
+        layout.pitch_m,
+        row0=int(row0),
+        col0=int(col0),
+        full_rows=layout.rows,
+        full_cols=layout.cols,
+    )
+    window = crop.cut(scored)
+    level = crop.cut(idle)[window]
+    raw = crop.cut(trial.raw.reshape(-1, *shape))[:, window]
+    return Press(
+        trial,
+        crop,
+        np.ascontiguousarray(crop.cut(motion.drive)),
+        np.ascontiguousarray(crop.cut(motion.rate)),
+        loaded,
+        window,
+        raw - level,
+        level,
+        motion.touching,
+        np.logical_or(*_rest(trial, motion)),
+    )
+
+
+def synthetic_press(trial: Trial, like: PressSet) -> Press:
+    """A press that was not recorded, as if with the readings in the trial's `raw`."""
+    motion = _motion(trial, like.layout, like.loaded)
+    return _press(trial, motion, like.layout, np.zeros_like(like.idle.level), like.loaded, 1.0)
+
+
+def _nearest(trial: Trial, layout: PadLayout) -> np.ndarray:
+    """Taxels around the indenter's mean position (R, C) bool."""
+    at = layout.positions()[:, :2] - [trial.x_m.mean(), trial.y_m.mean()]
+    near = np.hypot(*at.T)
+    return (near <= np.sort(near)[8]).reshape(layout.rows, layout.cols)

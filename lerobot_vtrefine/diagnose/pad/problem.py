@@ -1,0 +1,260 @@
+"""Presses of a pad as the core's problem: recordings are trials, and one channel holds all taxels.
+
+Fits weigh readings by the noise around the model, and forgive every recording a gain and a first touch of its
+own; what users get is judged by plain squared errors. Shapes: K recordings.
+"""
+
+from collections.abc import Collection, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from functools import cached_property
+from typing import Any
+
+import numpy as np
+
+from lerobot_vtrefine.diagnose.core.heldout import out_of_fold
+from lerobot_vtrefine.diagnose.core.problem import NothingBesides, PlainCandidate, Promise
+from lerobot_vtrefine.diagnose.core.rules import LEAST_GAIN
+from lerobot_vtrefine.diagnose.core.score_test import screen
+from lerobot_vtrefine.diagnose.core.screened_search import folds_for
+from lerobot_vtrefine.diagnose.core.search import Selection
+from lerobot_vtrefine.diagnose.core.suspicion import Suspicion
+from lerobot_vtrefine.diagnose.pad import final_model, review
+from lerobot_vtrefine.diagnose.pad.baseline import Baseline, fit_baseline, plain_weights, weigh
+from lerobot_vtrefine.diagnose.pad.candidates.base import Form
+from lerobot_vtrefine.diagnose.pad.error_level import slow_errors
+from lerobot_vtrefine.diagnose.pad.final_model import FinalFit
+from lerobot_vtrefine.diagnose.pad.fitting import Fit, losses_of, predict, refit_weighted, squared_errors
+from lerobot_vtrefine.diagnose.pad.form_fitting import Starts, grown, settle, starts_of, with_form, without
+from lerobot_vtrefine.diagnose.pad.noise import Noise
+from lerobot_vtrefine.diagnose.pad.press_trials import PressSet
+from lerobot_vtrefine.diagnose.pad.screening import DEAD, GAIN_MAP, all_probes, form_probes, forms_of
+from lerobot_vtrefine.diagnose.pad.suspicions import suspicions
+from lerobot_vtrefine.diagnose.pad.taxel_maps import MapEvidence, find_dead, map_evidence, map_of, with_map
+from lerobot_vtrefine.diagnose.pad.weights import TrialWeights
+
+Array = np.ndarray
+type Found = Fit | FinalFit
+type Selected = Selection["PadProblem", Any, "Candidate"]
+
+FURTHER_GAIN = 0.025
+"""Error that a cause beside the first must take away: patching the first's form gains a little, too."""
+_FORGIVEN = 1.5
+"""Factor by which weights may raise the plain squared error of a model."""
+_FAR_OFF = 4.0
+"""Mean square of slow errors under load, in variances of a frame's noise, that weights do not hide."""
+_TIMING = ("latency", "scan_skew")
+"""Causes that are imitated by what a motion did between two frames, which nobody saw."""
+
+
+@dataclass(frozen=True)
+class Candidate(PlainCandidate):
+    """One form of a cause, or a map, with the starting points that scores suggest for the cause's forms."""
+
+    form: Form | None = None
+    starts: Mapping[str, Starts] = field(default_factory=dict, compare=False)
+    others: tuple[Form, ...] = field(default=(), compare=False)
+    """Further forms of the cause that these recordings can show."""
+
+    @property
+    def terms(self) -> int:
+        """Coordinates; maps are shrunk, or found without any."""
+        return len(self.form.values) if self.form is not None else 0
+
+    @property
+    def peer(self) -> bool:
+        """Whether the form is no richer than the plain one."""
+        return self.form is not None and self.form.peer
+
+    @property
+    def disturbs(self) -> bool:
+        """Taxels without an answer disturb whatever else is fitted."""
+        return self.cause == DEAD
+
+
+@dataclass(frozen=True)
+class Refits:
+    """See `core.problem.Scored`."""
+
+    problem: "PadProblem"
+    fit: Fit
+
+    @cached_property
+    def _evidence(self) -> MapEvidence:
+        return map_evidence(self.fit, self.problem.presses, self.problem.weights)
+
+    def judged(self, weights: Array, trials: Array) -> tuple[Array, Array]:
+        """Errors and log scores, (trials, 1) each; the map comes from recordings that count."""
+        model, keep = refit_weighted(self.fit, weights), trials.tolist()
+        if self.fit.model.gain_map is not None:
+            model = map_of(model, self.fit, self._evidence, np.flatnonzero(weights).tolist())
+        part = self.problem.presses.subset(keep)
+        signals = predict(model, part)
+        losses = losses_of(signals, part, [self.problem.weights[k] for k in keep])
+        return squared_errors(signals, part)[:, None], -0.5 * losses[:, None]
+
+
+@dataclass(frozen=True)
+class PadProblem(NothingBesides):
+    """See `core.problem.ScreenedProblem`."""
+
+    presses: PressSet
+    seed: int = 0
+    weights: tuple[TrialWeights, ...] = ()
+    """Of the present fit; none before the baseline's."""
+    noise: Noise | None = None
+    """Around the present fit."""
+
+    subject = "pad"
+    channels = ("pad",)
+    screens = True
+    further_gain = FURTHER_GAIN
+
+    @property
+    def conditions(self) -> tuple[str, ...]:
+        """(K,)"""
+        return tuple(self.presses.conditions)
+
+    @property
+    def files(self) -> tuple[str, ...]:
+        """(K,)"""
+        return tuple(press.trial.file for press in self.presses.presses)
+
+    @cached_property
+    def folds(self) -> Array:
+        """(K,) as the search has them."""
+        return folds_for(self.conditions, self.seed)
+
+    @cached_property
+    def refitted_baseline(self) -> Baseline:
+        """Gain, stiffness and damping, and the noise around them."""
+        return fit_baseline(self.presses)
+
+    @cached_property
+    def even(self) -> "PadProblem":
+        """The same where all readings count alike."""
+        return replace(self, weights=tuple(plain_weights(self.presses)))
+
+    def subset(self, trials: Array) -> "PadProblem":
+        """Only some recordings."""
+        return PadProblem(self.presses.subset([int(k) for k in trials]), self.seed)
+
+    # Fits.
+
+    def baseline(self) -> Fit:
+        """The one that predicts plain readings best, and that an extension is measured against."""
+        return self.refitted_baseline.plain
+
+    def extended(self, now: Fit, candidate: Candidate, channels: Array, plainer: Fit | None = None) -> Fit:
+        """With a candidate; other forms grow from their plain one's fit, where they can."""
+        form = candidate.form
+        if candidate.cause == GAIN_MAP:
+            return self.settled(with_map(now, self.presses, self.weights))
+        if form is None:
+            return self.settled(replace(now.model, dead=find_dead(now, self.presses)))
+        if plainer is not None and form.grown is not None:
+            return grown(plainer, form, self.presses, self.weights)
+        return with_form(now, form, candidate.starts.get(form.label, ()), self.presses, self.weights)
+
+    def reduced(self, now: Found, candidates: Sequence[Candidate], channels: Array) -> Found:
+        """Without candidates."""
+        families = [item.cause for item in candidates]
+        if isinstance(now, FinalFit):
+            return now.without(families, self)
+        return without(now, families, self.presses, self.weights)
+
+    def settled(self, model: Any) -> Fit:
+        """A model's best coordinates under the present weights."""
+        return settle(model, self.presses, self.weights)
+
+    def refitted(self, now: Fit) -> Fit:
+        """Under the present weights."""
+        return self.settled(now.model)
+
+    def errors(self, fit: Found) -> Array:
+        """(K, 1) as users' predictions have them, where there is a model for users already."""
+        if isinstance(fit, FinalFit):
+            return self.predictions.errors(fit.sensor)
+        return squared_errors(predict(fit.model, self.presses), self.presses)[:, None]
+
+    @cached_property
+    def predictions(self) -> final_model.Predictions:
+        """What users' models say about these recordings."""
+        return final_model.Predictions(self.presses)
+
+    def reweighted(self, fit: Fit) -> Refits:
+        """By one Newton step."""
+        return Refits(self, fit)
+
+    def credible(self, baseline: Fit, now: Fit, best: Fit, candidate: Candidate) -> Array:
+        """(1,) Delays must predict better also where all readings count alike.
+
+        Weights trust fast changes most, and it is there that a course drawn between two frames is wrong.
+        """
+        if candidate.cause not in _TIMING:
+            return np.ones(1, dtype=bool)
+        even = self.even
+        before, after = (out_of_fold(even, even.refitted(fit), self.folds) for fit in (now, best))
+        return np.array([after.gain_over(before) > LEAST_GAIN])
+
+    # Weights and scores.
+
+    def weighed(self, now: Fit | None) -> tuple["PadProblem", Fit]:
+        """Noise and weights anew around a better model, and the model's fit with them.
+
+        Weights forgive recordings their own gain and touch; a model that is far off may use that to fit next
+        to nothing. Then all readings count alike until a better one is found.
+        """
+        if now is None:
+            start = self.refitted_baseline
+            return replace(self, weights=start.weights, noise=start.noise), start.fitted
+        _, weights = weigh(now, self.presses)
+        other = replace(self, weights=tuple(weights))
+        found = other.refitted(now)
+        if found.mse.sum() <= _FORGIVEN * now.mse.sum():
+            return other, found
+        return other.even, other.even.refitted(now)
+
+    def unweighed(self, now: Fit) -> tuple["PadProblem", Fit]:
+        """All readings count alike."""
+        return self.even, self.even.refitted(now)
+
+    def far_off(self, now: Fit) -> bool:
+        """Whether slow errors are far above noise: what weights forgive a recording hides what is wrong."""
+        each, readings = slow_errors(now, now.residuals(self.presses), self.weights)
+        return float(each @ readings) > _FAR_OFF * max(float(readings.sum()), 1.0)
+
+    def screened(self, now: Fit, only: Collection[str] | None = None) -> list[Promise[Candidate]]:
+        """Scores of all forms that are screened, of maps, of frames that repeat and of levels that wander."""
+        probes = all_probes(self, now) if only is None else form_probes(self, now, only)
+        out = []
+        for name, tested in screen(probes, len(self.weights), self.seed).items():
+            forms = tuple(forms_of(name, now))
+            starts = {form.label: starts_of(form, probes) for form in forms}
+            plain = Candidate(name, form=forms[0] if forms else None, starts=starts, others=forms[1:])
+            elsewhere = tested.probe.form not in (None, plain.form) or tested.probe.observed
+            out.append(Promise(plain, tested, elsewhere))
+        return out
+
+    def refinements(self, candidate: Candidate) -> list[Candidate]:
+        """The cause's other forms."""
+        return [replace(candidate, form=form, others=()) for form in candidate.others]
+
+    def without_effect(self, fit: FinalFit, baseline: FinalFit) -> FinalFit:
+        """Names and sizes stay; users get the baseline."""
+        return replace(fit, sensor=baseline.sensor)
+
+    # Between the steps of the method.
+
+    def reviewed(
+        self, selection: Selection[Any, Fit, Candidate], seed: int
+    ) -> Selection[Any, Fit, Candidate]:
+        """Two names where one stands in for them, forms as plain as they may be, and trade-offs resolved."""
+        return review.reviewed(selection, seed)
+
+    def suspicions(self, selection: Selected, seed: int) -> list[Suspicion]:
+        """What may be left."""
+        return suspicions(self, selection)
+
+    def handed_out(self, selection: Selected, seed: int, *, doubtful: bool) -> Selected:
+        """With models as users load them."""
+        return final_model.handed_out(selection, seed, doubtful=doubtful)

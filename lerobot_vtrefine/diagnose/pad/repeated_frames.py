@@ -1,0 +1,72 @@
+"""When a recording's readings were new: frames whose readings are those of the frame before, bit for bit."""
+
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+
+PHASES = 32
+
+
+def slots(time_s: np.ndarray, period_s: float, phase: float | np.ndarray = 0.0) -> np.ndarray:
+    """Number of the period that each time (T,) falls into; `phase` is in periods."""
+    return np.floor(time_s / period_s + phase + 1e-6)
+
+
+def silent(drive: np.ndarray, signal: np.ndarray) -> np.ndarray:
+    """Frames (T,) in which the indenter stands still, if readings (T, n) never change there: without noise
+    repeats say nothing.
+
+    Args:
+        drive: heights or loads (T, r, c).
+    """
+    still = np.concatenate([[False], (np.diff(drive, axis=0) == 0.0).all(axis=(1, 2))])
+    fresh = np.concatenate([[True], (np.diff(signal, axis=0) != 0.0).any(axis=1)])
+    return still & ~(still & fresh).any()
+
+
+@dataclass(frozen=True)
+class Rhythm:
+    """Frames with new readings (T,) bool, and those that may tell: on the pad, while time goes on."""
+
+    time_s: np.ndarray
+    fresh: np.ndarray
+    telling: np.ndarray
+
+    @classmethod
+    def of(cls, time_s: np.ndarray, signal: np.ndarray, touching: np.ndarray) -> "Rhythm":
+        """From times (T,), readings (T, n) and whether the indenter touches (T,)."""
+        changed = (np.diff(signal, axis=0) != 0.0).any(axis=1)
+        telling = touching & np.concatenate([[False], np.diff(time_s) > 0])
+        return cls(time_s, np.concatenate([[True], changed]), telling)
+
+    def taken_s(self, times_s: np.ndarray) -> np.ndarray:
+        """When the readings that are there at times (T,) were new: the last frame whose readings changed."""
+        fresh = self.time_s[self.fresh]
+        return fresh[np.maximum(np.searchsorted(fresh, times_s + 1e-9, "right") - 1, 0)]
+
+    def phase(self, period_s: float) -> float:
+        """Part of a period that had gone by at the trial's start, as far as new readings tell."""
+        if period_s not in self._phases:
+            phases = np.arange(PHASES) / PHASES
+            due = np.diff(slots(self.time_s, period_s, phases[:, None]), axis=1) != 0
+            wrong = ((due != self.fresh[1:]) & self.telling[1:]).sum(axis=1)
+            # Phases lie on a circle: the middle of those that fit best, seen from the worst one.
+            turned = np.roll(wrong, -int(np.argmax(wrong)))
+            best = np.flatnonzero(turned == turned.min())
+            self._phases[period_s] = float(
+                phases[(int(best[len(best) // 2]) + int(np.argmax(wrong))) % PHASES]
+            )
+        return self._phases[period_s]
+
+    @cached_property
+    def _phases(self) -> dict[float, float]:
+        return {}
+
+    def against(self, period_s: float, free: bool) -> np.ndarray:
+        """Counts (5,): repeats due, changes among them; changes; repeats, those where a change was due."""
+        phase = self.phase(period_s) if free else 0.0
+        due = np.diff(slots(self.time_s, period_s, phase)) != 0
+        fresh, use = self.fresh[1:], self.telling[1:]
+        sets = (~due, ~due & fresh, fresh, ~fresh, due & ~fresh)
+        return np.array([float((use & mask).sum()) for mask in sets])

@@ -1,0 +1,126 @@
+"""What adding single causes cannot find: two names behind one, plain forms behind rich ones, trade-offs."""
+
+from dataclasses import dataclass, replace
+from itertools import combinations
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from lerobot_vtrefine.diagnose.core.heldout import OutOfFold, out_of_fold
+from lerobot_vtrefine.diagnose.core.screened_search import CHANNEL, clearly_better, preferable
+from lerobot_vtrefine.diagnose.core.search import Selection
+from lerobot_vtrefine.diagnose.pad.damping_profile import profile
+from lerobot_vtrefine.diagnose.pad.fitting import Fit
+from lerobot_vtrefine.diagnose.pad.form_fitting import starts_of, without
+from lerobot_vtrefine.diagnose.pad.screening import MAPS, forms_of, probe_form, scorer_of
+
+if TYPE_CHECKING:
+    from lerobot_vtrefine.diagnose.pad.problem import Candidate, PadProblem
+
+BENDS = ("nonlinear_stiffness", "saturation", "contact_offset")
+"""All bend readings against depth: hardening with saturation is an S, whose lower part an offset fits."""
+_ALL = np.ones(1, dtype=bool)
+
+
+@dataclass(frozen=True)
+class _State:
+    """A fit under its weights."""
+
+    problem: "PadProblem"
+    fit: Fit
+    seed: int
+
+    def held(self, fit: Fit) -> OutOfFold:
+        return out_of_fold(self.problem, fit, self.problem.folds)
+
+    def weighed(self, fit: Fit) -> "_State":
+        return _State(*self.problem.weighed(fit), self.seed)
+
+    def with_plain(self, fit: Fit, name: str) -> Fit:
+        """A cause added in its plain form."""
+        form = forms_of(name, fit)[0]
+        starts = starts_of(form, probe_form(form, scorer_of(self.problem, fit)))
+        return self.problem.extended(fit, _candidate(name, form, {form.label: starts}), _ALL)
+
+    def without(self, name: str) -> Fit:
+        return without(self.fit, [name], self.problem.presses, self.problem.weights)
+
+
+def _candidate(name: str, form: Any, starts: dict[str, Any]) -> "Candidate":
+    from lerobot_vtrefine.diagnose.pad.problem import Candidate
+
+    return Candidate(name, form=form, starts=starts)
+
+
+def reviewed(selection: Selection["PadProblem", Fit, Any], seed: int) -> Selection["PadProblem", Fit, Any]:
+    """The selection after all three looks, with settled weights."""
+    if not selection.fit.model.families:
+        return selection
+    state = _State(selection.problem, selection.fit, seed)
+    named = set(selection.fit.model.families)
+    state = two_bends(state)
+    p_values, beside = dict(selection.p_values), dict(selection.beside)
+    for name in set(state.fit.model.families) - named:
+        bend = next(item for item in BENDS if item in named)
+        beside[name] = frozenset(BENDS) - {name}
+        p_values[name, CHANNEL] = p_values.get((bend, CHANNEL))
+    state = plain_forms(state)
+    state = state.weighed(state.fit)
+    best = resolved(state)
+    state = state if best is state.fit else state.weighed(best)
+    model = state.fit.model
+    chosen = tuple(_candidate(form.family, form, {}) for form in model.forms)
+    chosen += tuple(_candidate(name, None, {}) for name in MAPS if name in model.families)
+    return replace(
+        selection,
+        problem=state.problem,
+        fit=state.fit,
+        errors=state.held(state.fit).errors,
+        chosen={CHANNEL: chosen} if chosen else {},
+        p_values={key: p for key, p in p_values.items() if key[0] in model.families},
+        beside=beside,
+    )
+
+
+def two_bends(state: _State) -> _State:
+    """Where one of the bends was named, any two of them in its place, if these predict clearly better."""
+    named = [name for name in state.fit.model.families if name in BENDS]
+    if len(named) != 1:
+        return state
+    best, held = state.fit, state.held(state.fit)
+    slim = state.without(named[0])
+    for pair in combinations(BENDS, 2):
+        if not all(forms_of(name, slim) for name in pair):
+            continue
+        found = slim
+        for name in pair:
+            found = state.with_plain(found, name)
+        other = state.held(found)
+        if clearly_better(other, held, state.seed, state.problem.further_gain):
+            best, held = found, other
+    return state if best is state.fit else state.weighed(best)
+
+
+def plain_forms(state: _State) -> _State:
+    """Plain forms again where they do: a rich form may have stood in for a cause that was found after it."""
+    for form in state.fit.model.forms:
+        plain = forms_of(form.family, state.fit)[0]
+        if form is plain:
+            continue
+        found = state.with_plain(state.without(form.family), form.family)
+        rich = _candidate(form.family, form, {})
+        if not preferable(rich, state.held(state.fit), state.held(found), state.seed):
+            state = state.weighed(found)
+    return state
+
+
+def resolved(state: _State) -> Fit:
+    """The best fit along the trade-off of a delay against the damping, which descents cut short."""
+    fitted, problem = state.fit, state.problem
+    for index, form in enumerate(fitted.model.forms):
+        if form.twin is not None and not fitted.model.setting.loaded:
+            coordinate = fitted.model.place(index).start + form.twin
+            best = profile(fitted, problem.presses, problem.weights, coordinate).best
+            found = problem.settled(best.model)
+            fitted = found if found.loss < fitted.loss else fitted
+    return fitted

@@ -1,0 +1,149 @@
+"""What may be left on a pad: it repeats with the command, is far above noise, comes with sliding, has a line,
+follows the session's order, or follows something that the model does not know.
+"""
+
+from collections.abc import Sequence
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from lerobot_vtrefine.diagnose.core.search import Selection
+from lerobot_vtrefine.diagnose.core.suspicion import Suspicion
+from lerobot_vtrefine.diagnose.pad import error_level, repeatability
+from lerobot_vtrefine.diagnose.pad.baseline import weigh
+from lerobot_vtrefine.diagnose.pad.descriptors import DESCRIPTORS, Descriptor
+from lerobot_vtrefine.diagnose.pad.fitting import Fit, tangents
+from lerobot_vtrefine.diagnose.pad.gain_drift import gain_drift
+from lerobot_vtrefine.diagnose.pad.press_trials import PressSet
+from lerobot_vtrefine.diagnose.pad.repeatability import Correlations
+from lerobot_vtrefine.diagnose.pad.screening import Scorer
+from lerobot_vtrefine.diagnose.pad.sliding_errors import while_sliding
+from lerobot_vtrefine.diagnose.pad.spectrum import spectral_line
+
+if TYPE_CHECKING:
+    from lerobot_vtrefine.diagnose.pad.problem import PadProblem
+
+_FOLLOWS = 0.02
+"""Part of the squared error that a descriptor must take away on recordings left out."""
+_FOLLOWS_IF_OWNED = 0.1
+"""Part that no form of a family leaves to the descriptors of its own kind of effect."""
+_RIDGE = 1e-9
+_WORTH_A_LOOK = 2.5
+"""Standardised sum of scores from which on a descriptor's share is worked out; tests ask for over three."""
+
+
+def suspicions(problem: "PadProblem", selection: Selection[Any, Fit, Any]) -> list[Suspicion]:
+    """All of them; where names leave hardly anything, what repeats is their form's misfit and no cause.
+
+    Of what changes through the session, or comes with sliding alone, repeatable errors say nothing.
+    """
+    presses, fitted, plain = problem.presses, selection.fit, selection.baseline
+    _, weights = weigh(fitted, presses)
+    residuals = repeatability.cleaned(fitted, presses, weights)
+    descriptors = following(problem, fitted)
+    sure = [
+        spectral_line(presses, residuals),
+        error_level.level(residuals, fitted, weights),
+        while_sliding(presses, residuals, fitted, weights),
+        gain_drift(fitted, presses, weights),
+        *(item for descriptor, item in descriptors if descriptor.session),
+    ]
+    before, after = (fit.residuals(presses) for fit in (plain, fitted))
+    if fitted.model.families and repeatability.only_misfit(presses, before, after):
+        return [item for item in sure if item is not None]
+    found = [
+        *sure,
+        *_repeating(presses, fitted, before, residuals),
+        error_level.level_of_a_condition(presses, residuals, fitted, weights),
+        error_level.beside_the_indenter(presses, residuals, fitted, weights),
+        error_level.one_taxel(presses, residuals, weights),
+        *(item for descriptor, item in descriptors if not descriptor.session),
+    ]
+    return [item for item in found if item is not None]
+
+
+def _repeating(
+    presses: PressSet, fitted: Fit, before: Sequence[np.ndarray], residuals: Sequence[np.ndarray]
+) -> list[Suspicion | None]:
+    """Residuals of recordings of one command agree."""
+    found = [repeatability.in_all_conditions(presses, residuals)]
+    pairs = Correlations.of(presses, residuals)
+    if pairs is not None:
+        left = repeatability.left_over(presses, before, residuals) if fitted.model.families else None
+        found.append(repeatability.in_one_condition(presses, residuals, pairs))
+        found.append(repeatability.in_all_pairs(presses, residuals, pairs, left))
+    return found
+
+
+def following(problem: "PadProblem", fitted: Fit) -> list[tuple[Descriptor, Suspicion]]:
+    """What is left may follow a descriptor; what a named family's own kind of effect leaves must be more."""
+    presses, families = problem.presses, set(fitted.model.families)
+    _, columns = tangents(fitted.model, presses, fitted.model.free)
+    scorer = Scorer(fitted, presses, problem.weights, columns)
+    found = []
+    for descriptor in DESCRIPTORS:
+        change = _directions(descriptor, presses, fitted)
+        if change is None:
+            continue
+        scores, information = scorer.score(change)
+        size = float(np.sqrt((scores**2).sum()))
+        if information.sum() <= _RIDGE * max(size**2, 1.0):
+            continue
+        share = 0.0
+        if abs(float(scores.sum())) > _WORTH_A_LOOK * size:
+            share = left_out_share(fitted, presses, columns, change, problem.folds)
+        least = _FOLLOWS_IF_OWNED if families & set(descriptor.owners) else _FOLLOWS
+        text = f"the residual correlates with {descriptor.text} ({100 * share:.0f} % of its power)"
+        found.append((descriptor, Suspicion(0, text, share, least, scores, either_sign=True)))
+    return found
+
+
+def _directions(descriptor: Descriptor, presses: PressSet, fitted: Fit) -> list[np.ndarray] | None:
+    """The descriptor's direction in every recording, of unit mean square; None where it says nothing."""
+    pairs = zip(presses.presses, fitted.signals, strict=True)
+    raw = [np.array(descriptor.direction(press, signal), dtype=float) for press, signal in pairs]
+    power = float(np.mean([np.mean(image**2) for image in raw]))
+    if not np.isfinite(power) or power <= 1e-30:
+        return None
+    return [image / np.sqrt(power) for image in raw]
+
+
+def left_out_share(
+    fitted: Fit,
+    presses: PressSet,
+    columns: Sequence[Sequence[np.ndarray]],
+    change: Sequence[np.ndarray],
+    folds: np.ndarray,
+) -> float:
+    """Part of the squared error of recordings left out that the change takes away, in plain counts.
+
+    Coefficients of the change and of the model's own tangents come from the other recordings.
+    """
+    grams = []
+    for k, (press, signal) in enumerate(zip(presses.presses, fitted.signals, strict=True)):
+        vectors = [column[k].ravel() for column in columns]
+        vectors += [change[k].ravel(), (press.signal - signal).ravel()]
+        matrix = np.stack(vectors, axis=1) / np.sqrt(signal.size)
+        grams.append(matrix.T @ matrix)
+    every = np.array(grams)
+    before, after = 0.0, 0.0
+    for fold in np.unique(folds):
+        part = every[folds == fold].sum(axis=0)
+        rest = every.sum(axis=0) - part
+        before += _error(part, _coefficients(rest, list(range(len(rest) - 2))))
+        after += _error(part, _coefficients(rest, list(range(len(rest) - 1))))
+    return 1.0 - after / before if before > 0 else 0.0
+
+
+def _coefficients(gram: np.ndarray, use: list[int]) -> np.ndarray:
+    result = np.zeros(len(gram) - 1)
+    scale = np.sqrt(np.diag(gram)[use].clip(min=1e-30))
+    block = gram[np.ix_(use, use)] / np.outer(scale, scale)
+    result[use] = np.linalg.lstsq(block, gram[use, -1] / scale, rcond=1e-9)[0] / scale
+    return result
+
+
+def _error(gram: np.ndarray, coefficients: np.ndarray) -> float:
+    return float(
+        gram[-1, -1] - 2.0 * gram[:-1, -1] @ coefficients + coefficients @ gram[:-1, :-1] @ coefficients
+    )

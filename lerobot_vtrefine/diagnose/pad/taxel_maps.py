@@ -1,0 +1,182 @@
+"""Causes that are maps over taxels: gains of their own (shrunk towards one) and taxels that do not answer."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from lerobot_vtrefine.diagnose.pad.fitting import Fit, predict
+from lerobot_vtrefine.diagnose.pad.model import Composite
+from lerobot_vtrefine.diagnose.pad.press_trials import PressSet
+from lerobot_vtrefine.diagnose.pad.weights import TrialWeights
+
+STEP = 1e-3
+MAX_SIGMA, MIN_SIGMA = 0.8, 1e-3
+DEAD_BELOW = 0.12
+"""A taxel that answers with less than this part of what it should is dead."""
+DEAD_ERROR = 0.04
+"""Standard error that its gain must be known with."""
+BOUNDS = (0.05, 8.0)
+
+
+@dataclass(frozen=True)
+class MapEvidence:
+    """What every recording says about the logarithm of each taxel's gain.
+
+    Attributes:
+        scores: (K, R*C) derivative of the log likelihood.
+        information: (K, R*C) curvature; off-diagonal terms come from `shared`.
+        shared: per recording, (q, R*C) inner products of nuisance directions with the taxels' tangents.
+        coupling: per recording, (q, q).
+    """
+
+    scores: np.ndarray
+    information: np.ndarray
+    shared: list[np.ndarray]
+    coupling: list[np.ndarray]
+
+    def curvature(self, keep: Sequence[int], taxels: np.ndarray) -> np.ndarray:
+        """Sum over recordings for the taxels numbered `taxels`: (n, n)."""
+        total = np.diag(self.information[list(keep)][:, taxels].sum(axis=0))
+        for k in keep:
+            along = self.shared[k][:, taxels]
+            total = total - along.T @ self.coupling[k] @ along
+        return total
+
+
+def map_evidence(fitted: Fit, presses: PressSet, weights: Sequence[TrialWeights]) -> MapEvidence:
+    """Tangents of every taxel's gain against the residual, recording by recording."""
+    shape = (presses.layout.rows, presses.layout.cols)
+    present = fitted.model.gain_map if fitted.model.gain_map is not None else np.ones(shape)
+    moved = predict(replace(fitted.model, gain_map=present * (1.0 + STEP)), presses)
+    count = presses.layout.num_taxels
+    scores, information = np.zeros((len(weights), count)), np.zeros((len(weights), count))
+    shared = []
+    for k, (press, weight) in enumerate(zip(presses.presses, weights, strict=True)):
+        signal = fitted.signals[k]
+        tangent = weight.whiten((moved[k] - signal) / STEP)
+        error = weight.whiten(press.signal - signal)
+        width = signal.shape[1]
+        by_taxel = tangent.reshape(-1, width)
+        nuisance = weight.nuisance.reshape(len(by_taxel), width, -1)
+        along = np.einsum("tn,tnq->qn", by_taxel, nuisance)
+        pull = weight.coupling @ (weight.nuisance.T @ error)
+        taxels = press.taxels
+        scores[k, taxels] = (by_taxel * error.reshape(-1, width)).sum(axis=0) - along.T @ pull
+        information[k, taxels] = (by_taxel**2).sum(axis=0)
+        wide = np.zeros((along.shape[0], count))
+        wide[:, taxels] = along
+        shared.append(wide)
+    return MapEvidence(scores, information, shared, [weight.coupling for weight in weights])
+
+
+def solve_map(
+    evidence: MapEvidence, keep: Sequence[int], log_map: np.ndarray, sigma: float | None
+) -> tuple[np.ndarray, float, np.ndarray]:
+    """Shrunk log gains (R*C,), their deviation, and their variances, from the recordings in `keep`.
+
+    Args:
+        log_map: (R*C,) present log gains, at which the evidence was taken.
+        sigma: deviation between taxels; None to fit it (EM on the marginal likelihood).
+    """
+    informed = evidence.information[list(keep)].sum(axis=0)
+    taxels = np.flatnonzero(informed > 1e-6 * max(float(informed.max()), 1e-12))
+    result, variance = np.zeros(len(log_map)), np.full(len(log_map), np.inf)
+    if not len(taxels):
+        return result, sigma or 0.0, variance
+    curvature = evidence.curvature(keep, taxels)
+    target = evidence.scores[list(keep)][:, taxels].sum(axis=0) + curvature @ log_map[taxels]
+    spread = 0.1 if sigma is None else max(sigma, MIN_SIGMA)
+    for _ in range(12):
+        inverse = np.linalg.inv(curvature + np.eye(len(taxels)) / spread**2)
+        solution = inverse @ target
+        if sigma is not None:
+            break
+        # Taxels are exchangeable around a common level, which belongs to the gain.
+        level = float(solution.mean())
+        new = np.sqrt(
+            np.clip(np.mean((solution - level) ** 2 + np.diag(inverse)), MIN_SIGMA**2, MAX_SIGMA**2)
+        )
+        if abs(new - spread) < 1e-4:
+            break
+        spread = float(new)
+    result[taxels], variance[taxels] = solution, np.diag(inverse)
+    return result, spread, variance
+
+
+def with_map(fitted: Fit, presses: PressSet, weights: Sequence[TrialWeights], rounds: int = 2) -> Composite:
+    """The model with gains of every taxel that was pressed; the others keep one."""
+    model = fitted.model
+    shape = (presses.layout.rows, presses.layout.cols)
+    log_map = np.zeros(presses.layout.num_taxels)
+    if model.gain_map is not None:
+        log_map = np.log(np.asarray(model.gain_map)).ravel()
+    everyone = range(len(weights))
+    sigma = model.gain_sigma
+    for _ in range(rounds):
+        evidence = map_evidence(fitted, presses, weights)
+        log_map, sigma, _ = solve_map(evidence, everyone, log_map, None)
+        log_map = np.clip(log_map, *np.log(BOUNDS))
+        model = replace(model, gain_map=np.exp(log_map).reshape(shape), gain_sigma=sigma)
+        fitted = replace(fitted, model=model, signals=tuple(predict(model, presses)))
+    return normalised(model, evidence)
+
+
+def normalised(model: Composite, evidence: MapEvidence) -> Composite:
+    """With the map's geometric mean over pressed taxels moved into the gain."""
+    if model.gain_map is None:
+        return model
+    informed = (evidence.information.sum(axis=0) > 0).reshape(model.gain_map.shape)
+    level = float(np.log(model.gain_map[informed]).mean()) if informed.any() else 0.0
+    gain_map = np.where(informed, model.gain_map / np.exp(level), 1.0)
+    values = model.values.copy()
+    values[0] += level
+    return replace(model, gain_map=gain_map, values=values)
+
+
+def map_of(model: Composite, fitted: Fit, evidence: MapEvidence, keep: Sequence[int]) -> Composite:
+    """The model with its map taken from some recordings only."""
+    assert fitted.model.gain_map is not None
+    log_map = np.log(np.asarray(fitted.model.gain_map)).ravel()
+    fresh, _, _ = solve_map(evidence, keep, log_map, fitted.model.gain_sigma)
+    return replace(
+        model, gain_map=np.exp(np.clip(fresh, *np.log(BOUNDS))).reshape(fitted.model.gain_map.shape)
+    )
+
+
+def plain_gains(fitted: Fit, presses: PressSet) -> tuple[np.ndarray, np.ndarray]:
+    """Unshrunk gain of every taxel relative to what is expected of it, and its standard error (R*C,).
+
+    The error is taken from the scatter that is left at the taxel, memory included roughly; inf where the
+    taxel was never expected to answer.
+    """
+    count = presses.layout.num_taxels
+    top, bottom, power, frames = np.zeros(count), np.zeros(count), np.zeros(count), np.zeros(count)
+    for press, signal in zip(presses.presses, fitted.signals, strict=True):
+        top[press.taxels] += (signal * press.signal).sum(axis=0)
+        bottom[press.taxels] += (signal**2).sum(axis=0)
+        power[press.taxels] += (press.signal**2).sum(axis=0)
+        frames[press.taxels] += len(press.signal)
+    known = bottom > 0
+    gain = np.where(known, top / np.where(known, bottom, 1.0), np.nan)
+    left = np.maximum(power - np.where(known, top**2 / np.where(known, bottom, 1.0), 0.0), 0.0)
+    variance = left / np.maximum(frames, 1.0)
+    # Memory makes about ten frames worth one; a count is the least that a converter leaves open.
+    error = np.sqrt(np.maximum(variance, 0.1) * 10.0 / np.where(known, bottom, 1.0))
+    return gain, np.where(known, error, np.inf)
+
+
+def find_dead(fitted: Fit, presses: PressSet) -> tuple[tuple[int, int], ...]:
+    """Taxels that hardly answer although pressed well: ((row, col), ...)."""
+    gain, error = plain_gains(fitted, presses)
+    good = np.isfinite(error) & (error < DEAD_ERROR)
+    if good.sum() < 2:
+        return ()
+    typical = float(np.median(gain[good]))
+    if typical <= 0:
+        return ()
+    dead = good & (gain < DEAD_BELOW * typical)
+    if dead.sum() > 0.5 * good.sum():
+        return ()
+    cols = presses.layout.cols
+    return tuple((int(index) // cols, int(index) % cols) for index in np.flatnonzero(dead))
