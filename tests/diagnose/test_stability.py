@@ -1,6 +1,5 @@
 """Which names survive: counted against an engine whose answers are known."""
 
-from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -28,12 +27,11 @@ def test_names_are_counted_over_draws_and_halves() -> None:
     def again(given: RecordingSet, seed: int) -> Diagnosis:
         seen.append((len(given.trials), seed))
         if len(given.trials) < 9:
-            return replace(found, verdict=replace(found.verdict, causes=(gain_spread,)))
-        told = found.verdict
+            return pad_diagnosis(causes=(gain_spread,))
         if seed == 8:
-            tie, ask = (("latency", "scan_skew"),), {"drive": "sweeps"}
-            told = replace(told, status="ambiguous", ambiguous_with=tie, next_experiment=ask)
-        return replace(found, verdict=told)
+            tie = (("latency", "scan_skew"),)
+            return pad_diagnosis(status="ambiguous", ambiguous_with=tie, next_experiment={"text": "more"})
+        return found
 
     survived = stability(recordings(9), found, 2, 7, again)
     assert seen == [(9, 8), (9, 9), (5, 7), (5, 7)]
