@@ -24,6 +24,7 @@ from servo_rig import (
     swing,
 )
 
+from lerobot_vtrefine.cli.import_dataset import ImportConfig, import_dataset
 from lerobot_vtrefine.cli.predict import main as predict
 from lerobot_vtrefine.diagnose.api import diagnose
 from lerobot_vtrefine.diagnose.recordings import read_recording_set
@@ -236,3 +237,15 @@ def test_a_hidden_law_is_named_and_sized(
     assert cause in named
     value = named[cause].params[parameter]
     assert value.value == pytest.approx(size, rel=0.3)
+
+
+@pytest.mark.slow
+def test_a_real_servo_lacks_friction_that_grows_with_its_load(tmp_path: Path) -> None:
+    data = Path(__file__).parents[1] / "data" / "bam_xl330.npz"
+    import_dataset(ImportConfig(data, recording_dir=tmp_path / "set"))
+    found = diagnose(tmp_path / "set")
+    assert found.verdict.status in ("explained", "ambiguous")
+    assert found.verdict.heldout is not None
+    assert found.verdict.heldout.gain > 0.5
+    of_load = {"load_friction", "directional_friction", "load_stiction", "quadratic_friction"}
+    assert {item.name for item in found.verdict.causes} & of_load
