@@ -117,7 +117,7 @@ class DemoConfig:
     """Episodes of each test-time ablation; 0 skips them."""
     videos: int = 6
     """Episodes of each headline evaluation that are drawn; drawing without a GPU is slow."""
-    finetune_iterations: int = 16
+    finetune_iterations: int = 20
     """DPPO iterations of one episode in every environment."""
     finetune_envs: int = 128
     """Simulations that DPPO collects from."""
