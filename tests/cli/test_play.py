@@ -106,7 +106,7 @@ def test_pause_step_and_reset(tmp_path: Path) -> None:
     person = Person({"paused": True}, {"step": True}, {}, {"reset": True, "paused": False, "seed": 9})
     told: list[str] = []
     Session(world, ZeroAgent(), person, tmp_path, told.append).play(0, 1, record=False)
-    assert told == ["seed 9: time out after 3 steps"]
+    assert told == ["seed 9: time out after 3 steps (0 of 1 succeeded)"]
     assert person.seen[-1]
 
 

@@ -1,6 +1,7 @@
 """Runs a command on damaged input in a forked child, with limits, and says how it ended."""
 
 import contextlib
+import logging
 import os
 import resource
 import signal
@@ -62,6 +63,7 @@ def _run_child(action: Callable[[], int | None], log: Path, note: Path) -> None:
         os.dup2(descriptor, 2)
         sys.stdout = os.fdopen(1, "w", 1, encoding="utf-8", closefd=False)
         sys.stderr = os.fdopen(2, "w", 1, encoding="utf-8", errors="backslashreplace", closefd=False)
+        logging.getLogger().handlers.clear()  # a command starts without those that tests before it left
         os.setsid()
         limit = _data_bytes() + 2 * MEMORY_BYTES  # a net: what counts is the memory that is resident
         resource.setrlimit(resource.RLIMIT_DATA, (limit, limit))

@@ -131,7 +131,8 @@ def test_arrow_keys_point_away_from_the_operator_and_a_left_keyboard_is_gone(
     assert devices.read() == {}
 
 
-def test_a_phones_place_and_turn_come_in_the_operators_frame() -> None:
+def test_a_phones_place_and_turn_come_in_the_operators_frame(monkeypatch: pytest.MonkeyPatch) -> None:
+    watch_keys(monkeypatch)
     action = {
         "phone.pos": np.array([0.1, 0.2, 0.3]),
         "phone.rot": Rotation.from_rotvec(np.array([0.0, 0.0, 0.4])),

@@ -105,7 +105,7 @@ def jackknife(without: Array, value: float, centre: float | None = None) -> tupl
     total = float(power.sum())
     if count < 2 or not 0 < total < np.inf:
         return value, value
-    freedom = float(np.clip(3.0 * total**2 / (power**2).sum() - 1.0, _MIN_FREEDOM, count - 1))
+    freedom = float(np.clip(3.0 / np.square(power / total).sum() - 1.0, _MIN_FREEDOM, count - 1))
     half = np.sqrt((count - 1) / count * total) * float(student_t.ppf(0.975, freedom))
     return float(value - half), float(value + half)
 
