@@ -123,13 +123,9 @@ def start_stage(budget: Budget, seed: int) -> Stage:
 
 
 def finetune_stage(budget: Budget, world: str, seed: int) -> Stage:
-    """A copy of a seed's start goes on in one world, with the start's optimisers and on new episodes.
-
-    Success in another world is no collapse, so nothing returns to earlier weights.
-    """
+    """A copy of a seed's start goes on in one world, with the start's optimisers and on new episodes."""
     start, output = finetune_dir(budget, START, seed), finetune_dir(budget, world, seed)
     command = dppo_command(budget, world, world, seed, budget.start_iterations + budget.iterations)
-    command.append("--dppo.rollback_sigmas=0")
     begin = f"test -d {output} || (cp -R {start} {output}.part && mv {output}.part {output})"
     shell = ("sh", "-c", f"{begin} && exec {shlex.join([find_command(command[0]), *command[1:]])}")
     needs = [start.name, *([output_name(world.partition(":")[2])] if world != "plain" else [])]

@@ -99,7 +99,6 @@ def load_training_state(checkpoint: Path, state: TrainState) -> None:
     state.critic_optimizer.load_state_dict(saved["critic_optimizer"])
     state.reward_scaler.load_state_dict(saved["reward_scaler"])
     state.trust_region.load_state_dict(saved["trust_region"])
-    state.rollback.load_state_dict(saved["rollback"], state.generator.device)
     state.iteration, state.env_steps = saved["iteration"], saved["env_steps"]
     if rank_index() == 0:
         point_last_at(checkpoint)
@@ -114,7 +113,6 @@ def _state_dict(state: TrainState) -> dict[str, Any]:
         "actor_optimizer": state.actor_optimizer.state_dict(),
         "critic_optimizer": state.critic_optimizer.state_dict(),
         "reward_scaler": state.reward_scaler.state_dict(),
-        "rollback": state.rollback.state_dict(),
         "trust_region": state.trust_region.state_dict(),
         "iteration": state.iteration,
         "env_steps": state.env_steps,

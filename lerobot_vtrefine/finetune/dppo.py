@@ -47,7 +47,6 @@ from lerobot_vtrefine.finetune.protocols import (
     select,
     start,
 )
-from lerobot_vtrefine.finetune.rollback import Rollback
 from lerobot_vtrefine.finetune.seeds import TRAINING_SEEDS
 from lerobot_vtrefine.finetune.trust_region import TrustRegion
 from lerobot_vtrefine.policies.vt_dp3.diffusion import denoise_prefix
@@ -64,7 +63,6 @@ class TrainState:
     critic_optimizer: torch.optim.AdamW
     reward_scaler: RewardScaler
     generator: torch.Generator
-    rollback: Rollback
     trust_region: TrustRegion
     iteration: int = 0
     env_steps: int = 0
@@ -83,7 +81,6 @@ class TrainState:
             adamw(critic.parameters(), lr=cfg.critic_lr),
             RewardScaler(),
             torch.Generator(device).manual_seed(seed + 7919 * rank_index()),
-            Rollback(cfg.rollback_sigmas),
             TrustRegion(cfg),
         )
 
@@ -203,15 +200,13 @@ def policy_loss(log_ratio: Tensor, advantages: Tensor, cfg: DppoConfig) -> Tenso
     return torch.maximum(-advantages * ratio, -advantages * clipped)
 
 
-def update(
-    rollout: Rollout, agent: Agent, state: TrainState, cfg: DppoConfig, critic_only: bool = False
-) -> Metrics:
+def update(rollout: Rollout, agent: Agent, state: TrainState, cfg: DppoConfig) -> Metrics:
     """All epochs over one segment. Critic-only during the first ``cfg.critic_warmup`` iterations."""
     advantages, targets = decision_advantages(rollout, state, cfg)
     privileged = rollout.privileged[rollout.step, rollout.env]
-    train_actor = state.iteration >= cfg.critic_warmup and not critic_only
+    train_actor = state.iteration >= cfg.critic_warmup
     region = state.trust_region
-    actor_lr = region.actor_lr(state.iteration) * state.rollback.lr_scale
+    actor_lr = region.actor_lr(state.iteration)
     regulariser = Regulariser()
     if train_actor:
         regulariser = Regulariser.of(rollout.obs, rollout.latents, agent, cfg, state.generator)
@@ -222,7 +217,7 @@ def update(
     num_valid = len(advantages)
     # Ranks own different numbers of decisions: the same number of minibatches everywhere, of unequal sizes.
     most = max_over_ranks(num_valid, advantages.device)
-    num_minibatches = cfg.minibatches or math.ceil(most / cfg.minibatch_decisions)
+    num_minibatches = min(cfg.minibatches or math.ceil(most / cfg.minibatch_decisions), most)
     history: list[list[float]] = []
     initial_log_ratio, stopped = 0.0, False
 
@@ -329,13 +324,7 @@ def train(
         collected = time.perf_counter()
         state.critic.update_moments(rollout.privileged[:-1][rollout.active])
         metrics = rollout_metrics(rollout)
-        returned = state.rollback.watch(
-            metrics["success"],
-            env.num_envs * num_ranks(),
-            agent.trained_parameters(),
-            state.actor_optimizer,
-        )
-        metrics |= update(rollout, agent, state, cfg, critic_only=returned) | {"rolled_back": float(returned)}
+        metrics |= update(rollout, agent, state, cfg)
         decisions = sum_over_ranks(rollout.active.sum().double()).item()
         state.iteration += 1
         state.env_steps += int(decisions) * chunk

@@ -7,7 +7,7 @@ import torch
 from toy import BlindPeg, ToyActor, make_agent
 
 from lerobot_vtrefine.finetune.chains import chain_log_probs
-from lerobot_vtrefine.finetune.config import DppoConfig, PaperDppo, SmallDppo
+from lerobot_vtrefine.finetune.config import DppoConfig, PaperDppo
 from lerobot_vtrefine.finetune.dppo import (
     TrainState,
     collect,
@@ -20,11 +20,26 @@ from lerobot_vtrefine.finetune.evaluation import evaluate
 from lerobot_vtrefine.finetune.protocols import Agent, Transition
 
 CHUNK = (4, 2)
+SHORT = {
+    "num_envs": 12,
+    "iterations": 3,
+    "epochs": 2,
+    "minibatch_decisions": 20,
+    "min_sampling_std": 0.05,
+    "reward_scaling": False,
+    "clip": 0.02,
+    "clip_first": 0.02,
+    "actor_lr": 1e-4,
+    "actor_lr_final": 1e-5,
+    "lr_warmup": 1,
+    "max_grad_norm": 1.0,
+    "critic_width": 32,
+}
 
 
 def small_config(**changes) -> DppoConfig:
-    defaults = {"num_envs": 12, "iterations": 3, "minibatch_decisions": 20, "epochs": 2, "critic_width": 32}
-    return SmallDppo(**{**defaults, "encoder": "trained", **changes})
+    """The published update, without a trust region, on numbers that make a test short."""
+    return replace(PaperDppo(), **{**SHORT, **changes})
 
 
 def problem(cfg: DppoConfig, seed: int = 0, num_train_steps: int = 100):
@@ -165,6 +180,13 @@ def test_trained_encoder_runs_once_per_minibatch():
     metrics = update(rollout, agent, state, cfg)
     assert agent.actor.calls - calls == metrics["updates"] == 3 * -(-len(rollout.latents) // 10)
     assert changed(before, agent.actor.encoder)
+
+
+def test_fewer_decisions_than_minibatches_are_one_each():
+    cfg = small_config(num_envs=2, decisions=1, minibatches=4, epochs=1, critic_warmup=0)
+    env, agent, state = problem(cfg)
+    metrics = update(rollout_of(cfg, env, agent, state), agent, state, cfg)
+    assert metrics["updates"] == 2
 
 
 def test_batch_holds_exactly_the_decisions_that_were_made():

@@ -110,8 +110,13 @@ def test_records_and_checkpoint(finetune, tmp_path):
 def test_a_run_becomes_a_row_of_the_results(finetune, tmp_path):
     output, common = tmp_path / "run", {"table": "converges", "task": "reach"}
     assert finetune(output, "--seed=30000000", iterations=3) == 0
-    ((row, progress),) = run_rows(output, common, dict.fromkeys(("commit", "command", "machine")))
+    *earlier, (row, progress) = run_rows(output, common, dict.fromkeys(("commit", "command", "machine")))
     logged = read_progress(output)
+    told = [(row.variant, row.iterations, row.success, row.env_steps) for row, _ in earlier]
+    assert told == [
+        (variant, at, logged[at]["eval_success"], logged[at].get("env_steps", 0))
+        for variant, at in (("imitation", 0), ("half-way", 2))
+    ]
     assert progress == logged
     assert (row.task, row.policy, row.seed) == ("reach", "visuo_tactile", 30_000_000)
     assert (row.success, row.episodes) == (logged[-1]["eval_success"], 12)  # 8 in two batches of 6

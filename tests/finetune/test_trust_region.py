@@ -10,7 +10,7 @@ from test_dppo import problem, rollout_of, small_config
 from torch.distributions import MultivariateNormal, kl_divergence
 
 from lerobot_vtrefine.finetune.chains import chain_log_probs, decision_kl
-from lerobot_vtrefine.finetune.config import SmallDppo
+from lerobot_vtrefine.finetune.config import PaperDppo, SmallDppo
 from lerobot_vtrefine.finetune.dppo import train, update
 from lerobot_vtrefine.finetune.trust_region import TrustRegion
 from lerobot_vtrefine.policies.vt_dp3.diffusion import correlated_noise, slice_log_prob, whiten
@@ -85,7 +85,7 @@ def test_target_falls_geometrically_and_the_rate_follows_it_within_bounds():
 
 
 def test_without_a_trust_region_the_schedule_stands():
-    cfg = SmallDppo()
+    cfg = PaperDppo()
     region = TrustRegion(cfg)
     region.adapt([1e9], stopped=True, iteration=3)
     assert region.actor_lr(7) == cfg.actor_lr_at(7)
@@ -129,4 +129,4 @@ def test_an_iteration_ends_where_it_leaves_the_region():
 )
 def test_settings_out_of_range_are_named(wrong):
     with pytest.raises(ValueError, match=f"--dppo.{next(iter(wrong))}"):
-        SmallDppo(**wrong)
+        PaperDppo(**wrong)

@@ -43,7 +43,8 @@ def run_rows(
     if (results := read_json(folder / "results.json")) is not None:
         return pipeline_rows(folder, results, common, origin)
     if (settings := read_json(folder / CONFIG_NAME)) is not None:
-        return [finetune_row(folder, settings, common, origin)]
+        final, progress = finetune_row(folder, settings, common, origin)
+        return [*((row, []) for row in earlier_rows(final, progress)), (final, progress)]
     raise ValueError(
         f"{folder} holds neither results.json (vtrefine-demo) nor {CONFIG_NAME} (vtrefine-finetune)"
     )
@@ -121,6 +122,30 @@ def finetune_row(
         **origin_of(folder, **origin),
     )
     return row, progress
+
+
+def earlier_rows(final: Run, progress: Progress) -> list[Run]:
+    """The same run before its first iteration, and at the evaluation nearest to its middle, where it has
+    them.
+    """
+    evaluated = [row for row in progress[:-1] if "eval_success" in row]
+    first = [row for row in evaluated if row["iteration"] == 0]
+    middle = progress[-1]["iteration"] / 2
+    between = sorted(
+        (row for row in evaluated if row["iteration"] > 0), key=lambda row: abs(row["iteration"] - middle)
+    )
+    named = [(IMITATION, row) for row in first] + [("half-way", row) for row in between[:1]]
+    return [
+        replace_fields(
+            final,
+            variant=", ".join(filter(None, (final.variant, name))),
+            success=row["eval_success"],
+            iterations=int(row["iteration"]),
+            env_steps=int(row.get("env_steps", 0)),
+            extra={},
+        )
+        for name, row in named
+    ]
 
 
 def last_steps(progress: Progress) -> int | None:

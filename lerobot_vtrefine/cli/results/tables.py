@@ -16,6 +16,8 @@ BLOCK = re.compile(r"(<!-- table: (\w+) -->\n).*?(<!-- end -->)", re.DOTALL)
 LEADING_POINT = re.compile(r"(?<![\d.])\.(?=\d)")
 LABELS = {
     "demo": "demo: round pair, 2 mm clearance",
+    "round_grasped": "round pair, 2 mm, slip 2 mm / .05 rad",
+    "demo_schedule": "the demo, 128 environments on two cores",
     "tight": "tight: 1 mm clearance",
     "occluded": "occluded: camera above, the hole hidden",
     "slip": "slip: twice the pose error in the hand",
@@ -89,6 +91,14 @@ def pooled(rows: Sequence[Run], seeds: bool = True, bounds: bool = True, unit: s
     return f"{text} ({', '.join(single)})" if seeds and len(single) > 1 else text
 
 
+def over_seeds(rows: Sequence[Run], unit: str = "") -> str:
+    """Mean success over seeds with the t-interval, and each seed's; of one seed, as `pooled` tells it."""
+    if len(rows) < 2:
+        return pooled(rows, unit=unit)
+    middle, *bounds = mean_interval([row.success for row in rows])
+    return f"{percent(middle)}{unit} {interval(*bounds)} ({', '.join(percent(row.success) for row in rows)})"
+
+
 def difference(one: Sequence[Run], two: Sequence[Run]) -> str:
     """Two minus one over the seeds that both have, in points, with the t-interval."""
     before = {row.seed: row.success for row in one}
@@ -99,10 +109,15 @@ def difference(one: Sequence[Run], two: Sequence[Run]) -> str:
     return f"{100 * middle:+.0f}" + (f" {interval(*bounds)}" if len(changes) > 1 else "")
 
 
+def plural(noun: str, numbers: Sequence[object]) -> str:
+    """For example ``seed 0`` or ``seeds 0, 1``."""
+    return f"{noun}{'s' * (len(numbers) > 1)} {', '.join(map(str, numbers))}"
+
+
 def demo_table(rows: Sequence[Run]) -> str:
     """Imitation beside fine-tuning, with what is missed when a sense is taken away."""
     head = [
-        ", ".join(f"seed {seed}" for seed in values(pick(rows, variant=""), "seed")),
+        plural("seed", values(pick(rows, variant=""), "seed")),
         IMITATION,
         "after DPPO",
     ]
@@ -116,7 +131,7 @@ def demo_table(rows: Sequence[Run]) -> str:
             f", {count} unseen episodes [95 % interval]",
             f" with {words} replaced by its mean ({count} episodes)",
         )
-        body.append(["success" + (taken if words else plain), *(pooled(runs, unit=" %") for runs in both)])
+        body.append(["success" + (taken if words else plain), *(over_seeds(runs, " %") for runs in both)])
     for key, words, scale, unit in MEASURED:
         cells = []
         for stage in (IMITATION, ""):
@@ -191,10 +206,7 @@ def runs_table(rows: Sequence[Run]) -> str:
         for policy in values(pick(rows, task=task), "policy"):
             for variant in values(pick(rows, task=task, policy=policy), "variant"):
                 runs = pick(rows, task=task, policy=policy, variant=variant)
-                middle, *bounds = mean_interval([row.success for row in runs])
-                text = percent(middle) + (f" {interval(*bounds)}" if len(runs) > 1 else "")
-                cells = [f"{text} ({', '.join(percent(row.success) for row in runs)})"]
-                cells.append(percent(min(row.success for row in runs)))
+                cells = [over_seeds(runs), percent(min(row.success for row in runs))]
                 cells += [
                     average([getattr(row, name) for row in runs]) for name in ("iterations", "env_steps")
                 ]
@@ -247,7 +259,7 @@ def table(name: str, rows: Sequence[Row]) -> str:
     if not chosen:
         raise ValueError(f"table {name}: results/ hold no rows of it; tables: {', '.join(RENDERERS)}")
     origin = {field: dict.fromkeys(getattr(row, field) for row in chosen) for field in ("commit", "machine")}
-    known = [", ".join(filter(None, found)) or "not recorded" for found in origin.values()]
+    known = [" / ".join(filter(None, found)) or "not recorded" for found in origin.values()]
     return f"{RENDERERS[name](chosen)}\n\n<sub>Commit: {known[0]}; machine: {known[1]}.</sub>"
 
 
