@@ -3,7 +3,8 @@
 LeRobot's commands take the path of a file or a folder, which nobody who installed a wheel knows. So a name is
 replaced by its path in the command line itself, before anything parses it: when a command of this package
 starts, and in LeRobot's own when they discover the plugin. Configurations go by ``--config_path``, trained
-policies by ``--policy.path``.
+policies by ``--policy.path``. An encoder keeps its name, ``--policy.pretrained_encoder=vtrefine:NAME``, so
+that a checkpoint's configuration means the same on every machine; the policy looks it up.
 """
 
 import sys
@@ -31,14 +32,21 @@ def policies() -> dict[str, Path]:
     return {path.parent.name: path.parent for path in sorted(found)}
 
 
-FLAGS: Mapping[str, tuple[str, Callable[[], dict[str, Path]]]] = {
+def encoders() -> dict[str, Path]:
+    """Every pre-trained encoder's folder by its task's name; docs/learning.md says how they were made."""
+    return {path.name: path for path in sorted((Path(__file__).parent / "assets" / "encoders").iterdir())}
+
+
+KINDS: Mapping[str, tuple[str, Callable[[], dict[str, Path]]]] = {
     "--config_path": ("configuration", names),
     "--policy.path": ("policy", policies),
+    "--policy.pretrained_encoder": ("encoder", encoders),
 }
+EXPANDED = ("--config_path", "--policy.path")
 
 
 def expand(arguments: Sequence[str]) -> list[str]:
-    """A command line with every ``vtrefine:NAME`` behind one of `FLAGS` replaced by its path.
+    """A command line with every ``vtrefine:NAME`` behind one of `EXPANDED` replaced by its path.
 
     Raises:
         ValueError: nothing has this name; the message lists what there is.
@@ -46,9 +54,9 @@ def expand(arguments: Sequence[str]) -> list[str]:
     expanded = []
     for before, argument in zip(["", *arguments], arguments, strict=False):
         flag, equals, value = argument.partition("=")
-        if equals and flag in FLAGS and value.startswith(PREFIX):
+        if equals and flag in EXPANDED and value.startswith(PREFIX):
             argument = f"{flag}={find(flag, value)}"
-        elif before in FLAGS and argument.startswith(PREFIX):
+        elif before in EXPANDED and argument.startswith(PREFIX):
             argument = str(find(before, argument))
         expanded.append(argument)
     return expanded
@@ -68,7 +76,7 @@ def expand_command_line() -> None:
 
 def find(flag: str, name: str) -> Path:
     """What ``vtrefine:NAME`` stands for behind a flag; ValueError if there is no such thing."""
-    kind, list_known = FLAGS[flag]
+    kind, list_known = KINDS[flag]
     known = list_known()
     wanted = name.removeprefix(PREFIX)
     if wanted not in known:

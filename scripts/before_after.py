@@ -13,11 +13,11 @@ from itertools import zip_longest
 from pathlib import Path
 
 import draccus
-import numpy as np
 from PIL import Image, ImageDraw
 
 from lerobot_vtrefine.cli.errors import run_cli
 from lerobot_vtrefine.cli.playing.agents import PolicyAgent
+from lerobot_vtrefine.cli.report.gif import write_gif
 from lerobot_vtrefine.envs import VtRefineEnvConfig
 from lerobot_vtrefine.envs.live_world import LiveWorld
 from lerobot_vtrefine.files import read_yaml
@@ -26,7 +26,7 @@ from lerobot_vtrefine.sim.render import VideoRenderer
 
 GROUND, INK = (24, 26, 32), (226, 228, 232)
 TITLE_PX, FONT_PX, GAP_PX = 34, 20, 10
-FRAME_MS, LAST_MS = 200, 1500
+FRAME_MS = 200
 EVERY = 2
 """Control steps from one picture to the next."""
 
@@ -67,18 +67,6 @@ def side_by_side(left: Image.Image, right: Image.Image, titles: tuple[str, str],
     return joined.resize((width, round(joined.height * width / joined.width)), Image.Resampling.LANCZOS)
 
 
-def write_gif(episodes: list[list[Image.Image]], target: Path) -> None:
-    """A looping GIF that rests at the end of every episode."""
-    shown = np.concatenate([np.asarray(frames[-1]) for frames in episodes])  # outcomes have rare colours
-    palette = Image.fromarray(shown).quantize(256, Image.Quantize.MAXCOVERAGE)
-    images = [
-        frame.quantize(palette=palette, dither=Image.Dither.NONE) for frames in episodes for frame in frames
-    ]
-    durations = [duration for frames in episodes for duration in [*[FRAME_MS] * (len(frames) - 1), LAST_MS]]
-    target.parent.mkdir(parents=True, exist_ok=True)
-    images[0].save(target, save_all=True, append_images=images[1:], duration=durations, loop=0, optimize=True)
-
-
 @run_cli
 def main() -> None:
     """Console entry point."""
@@ -105,7 +93,7 @@ def main() -> None:
             last = (pair[0] or last[0], pair[1] or last[1])  # who is done waits for the other
             pairs.append(side_by_side(*last, tuple(flags.titles), flags.width))
         episodes.append(pairs)
-    write_gif(episodes, flags.output)
+    write_gif(episodes, FRAME_MS, flags.output)
     print(f"{flags.output}: {flags.output.stat().st_size / 1e3:.0f} kB")
 
 

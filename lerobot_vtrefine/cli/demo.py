@@ -54,11 +54,13 @@ def write_report(config: DemoConfig, records: Sequence[StageRecord]) -> Path:
 
 def make_gif(config: DemoConfig, videos: Sequence[dict[str, object]]) -> None:
     """A GIF of the first successful episode of the fine-tuned policy, for READMEs."""
-    from lerobot_vtrefine.cli.report.media import write_gif
+    from lerobot_vtrefine.cli.report.gif import write_gif
+    from lerobot_vtrefine.cli.report.media import shortened
 
     for video in videos:
         if video["success"] and Path(str(video["path"])).is_file():
-            write_gif(Path(str(video["path"])), config.output_dir / "demo.gif", GIF_WIDTH, GIF_EVERY)
+            frames, frame_ms = shortened(Path(str(video["path"])), GIF_WIDTH, GIF_EVERY)
+            write_gif([frames], frame_ms, config.output_dir / "demo.gif")
             return
 
 

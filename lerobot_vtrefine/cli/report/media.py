@@ -51,17 +51,12 @@ def strongest_contact(dataset_root: Path) -> dict[str, Array]:
     }
 
 
-def write_gif(video: Path, target: Path, width: int, every: int) -> None:
-    """A small looping GIF of ``video``, ``width`` pixels wide: every ``every``-th frame, and the last one."""
+def shortened(video: Path, width: int, every: int) -> tuple[list[Image.Image], int]:
+    """Every ``every``-th frame of a video and its last one, ``width`` pixels wide; milliseconds of each."""
     with av.open(str(video)) as container:
         stream = container.streams.video[0]
         rate = float(stream.average_rate or 10)
         frames = [frame.to_image() for frame in container.decode(stream)][::-every][::-1]
     height = round(frames[0].height * width / frames[0].width)
     small = [frame.resize((width, height), Image.Resampling.LANCZOS) for frame in frames]
-    # Few pixels have the colour of the outcome, and only at the end.
-    shown = np.concatenate([np.asarray(frame) for frame in (small[len(small) // 2], small[-1])])
-    palette = Image.fromarray(shown).quantize(256, Image.Quantize.MAXCOVERAGE)
-    images = [frame.quantize(palette=palette, dither=Image.Dither.NONE) for frame in small]
-    duration = [round(1000 * every / rate)] * (len(images) - 1) + [1500]
-    images[0].save(target, save_all=True, append_images=images[1:], duration=duration, loop=0, optimize=True)
+    return small, round(1000 * every / rate)

@@ -10,6 +10,7 @@ from safetensors import SafetensorError
 from safetensors.torch import load_file, save_file
 from torch import Tensor, nn
 
+from lerobot_vtrefine import shipped
 from lerobot_vtrefine.datasets.features import CLOUD_KEY, GRIDS_KEY, STATE_KEY
 from lerobot_vtrefine.embodiments import get_embodiment
 from lerobot_vtrefine.policies.vt_dp3.configuration_vt_dp3 import VtDp3Config
@@ -17,9 +18,7 @@ from lerobot_vtrefine.policies.vt_dp3.pad_encoder import PadEncoder
 from lerobot_vtrefine.policies.vt_dp3.point_encoder import PointEncoder
 
 STATE_FEATURES = 64
-SHIPPED_PREFIX = "vtrefine:"
-SHIPPED = Path(__file__).parents[2] / "assets" / "encoders"
-"""Encoders that come with this package, a folder per task; docs/learning.md says how they were made."""
+ENCODER_FLAG = "--policy.pretrained_encoder"
 
 
 class ObservationEncoder(nn.Module):
@@ -95,20 +94,21 @@ def save_encoder(encoder: ObservationEncoder, config: VtDp3Config, folder: Path)
 
 
 def load_encoder(encoder: ObservationEncoder, config: VtDp3Config) -> None:
-    """Start from the networks that ``save_encoder`` wrote to the folder ``config.pretrained_encoder``.
+    """Start from the networks that ``save_encoder`` wrote to the folder ``config.pretrained_encoder``, or
+    from those that come with the package under the name ``vtrefine:TASK``.
 
     Raises:
         FileNotFoundError: the folder holds no such encoder.
-        ValueError: it fits another policy, or is damaged.
+        ValueError: it fits another policy, is damaged, or nothing of this name comes with the package.
     """
     name = config.pretrained_encoder
-    folder = SHIPPED / name.removeprefix(SHIPPED_PREFIX) if name.startswith(SHIPPED_PREFIX) else Path(name)
+    folder = shipped.find(ENCODER_FLAG, name) if name.startswith(shipped.PREFIX) else Path(name)
     path = folder / encoder_file(config)
     if not path.is_file():
         held = sorted(item.name for item in folder.glob("encoder_*.safetensors"))
-        known = ", ".join(f"{SHIPPED_PREFIX}{item.name}" for item in sorted(SHIPPED.iterdir()))
+        known = ", ".join(shipped.PREFIX + task for task in shipped.encoders())
         raise FileNotFoundError(
-            f"--policy.pretrained_encoder={name} holds no {path.name}"
+            f"{ENCODER_FLAG}={name} holds no {path.name}"
             f" (but {', '.join(held) or 'no encoder'}): make it with vtrefine-information, or use {known}"
         )
     try:
