@@ -164,6 +164,26 @@ def draw_point_cloud(plt: Any, sim: Any, frames: list[dict[str, Any]]) -> None:
     figure.savefig(IMAGES / "point_cloud.png")
 
 
+def draw_depth_sensors(plt: Any) -> None:
+    """The same moment by an exact camera and by two stereo cameras."""
+    from lerobot_vtrefine.envs import VtRefineEnvConfig
+    from lerobot_vtrefine.envs.factory import make_simulation
+    from lerobot_vtrefine.sim.config import SceneConfig
+
+    titles = {"ideal": "ideal", "d435": "RealSense D435", "d405": "RealSense D405"}
+    figure, axes = plt.subplots(1, 3, figsize=(10.4, 2.9), layout="constrained")
+    for ax, (name, title) in zip(axes, titles.items(), strict=True):
+        scene = SceneConfig(start="grasped", depth_sensor=name)
+        sim = make_simulation(VtRefineEnvConfig(scene=scene, num_threads=1), 1)
+        sim.reset(np.array([0]), np.array([SEED]))
+        depth = sim.depth_mm()[0].astype(float)
+        picture = ax.imshow(np.where(depth > 0, depth, np.nan), cmap="viridis", vmin=430, vmax=640)
+        ax.set_title(title, loc="left")
+        ax.axis("off")
+    figure.colorbar(picture, ax=axes, label="depth [mm]", shrink=0.9)
+    figure.savefig(IMAGES / "depth_sensors.png")
+
+
 def draw_policy(plt: Any, sim: Any, frames: list[dict[str, Any]]) -> None:
     """A chunk of the expert's actions at several levels of noise, as diffusion sees it."""
     chunk = np.stack([frame["action"] for frame in frames])[:16, 7:13]
@@ -293,6 +313,7 @@ SIMULATED: dict[str, Callable[..., None]] = {
     "policy": draw_policy,
 }
 OTHERS: dict[str, Callable[..., None]] = {
+    "depth_sensors": draw_depth_sensors,
     "dppo": draw_dppo,
     "results": draw_results,
     "diagnosis": draw_diagnosis,

@@ -6,12 +6,14 @@ from pathlib import Path
 
 from lerobot_vtrefine.embodiments.camera_config import CameraConfig
 from lerobot_vtrefine.embodiments.embodiment import STARTS
+from lerobot_vtrefine.sim.depth_sensors import DEPTH_SENSORS
 
 PROCEDURAL_PAIRS = ("round", "square", "hexagon", "d_shape", "cross", "key")
 MESH_PAIR_PREFIX = "automate/"
 MAX_TABLE_HEIGHT_M = 0.2
 SOCKETS = ("held", "stands")
 BACKENDS = ("single", "batch", "warp")
+IDEAL_NOISE_LEVEL = 3.0
 CONTROL_HZ = (1, 100)
 """Slowest and fastest control rate: command rates, servo model and grasp are tried in between."""
 EPISODE_S = {"table": 24.0, "grasped": 4.8}
@@ -46,6 +48,9 @@ class SceneConfig:
     whole number of these, --env.fps shortens it."""
     camera: CameraConfig | None = None
     """By default the body's camera for `start`."""
+    depth_sensor: str = "ideal"
+    """What the camera makes of true depths: ideal (whole millimetres of them), or d405 or d435, with the
+    noise, edges and gaps of these stereo cameras."""
     servo_gain_scale: float = 1.0
     """Factor on the arms' servo stiffness; damping follows with its square root."""
     gravity_compensation: bool = True
@@ -61,6 +66,7 @@ class SceneConfig:
     def __post_init__(self) -> None:
         _check_choice("start", self.start, STARTS)
         _check_choice("socket", self.socket, SOCKETS)
+        _check_choice("depth_sensor", self.depth_sensor, tuple(DEPTH_SENSORS))
         if self.socket == "stands" and self.start != "table":
             raise ValueError(f"socket=stands needs start=table, not start={self.start}")
         if not 0.0 < self.timestep_s <= 0.005:
@@ -83,6 +89,13 @@ class SceneConfig:
         ):
             if not getattr(self, name) > 0.0:
                 raise ValueError(f"{name} must be above 0, got {getattr(self, name)}")
+
+    @property
+    def noise_level(self) -> float:
+        """Standard deviation of the depth noise that training adds to simulated clouds, in the paper's unit:
+        none where the image has a sensor's own.
+        """
+        return IDEAL_NOISE_LEVEL if DEPTH_SENSORS[self.depth_sensor] is None else 0.0
 
     @property
     def hole_clearance_m(self) -> float:

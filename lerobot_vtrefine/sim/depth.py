@@ -1,4 +1,4 @@
-"""The depth camera of all worlds: exact ray depths, computed only where a geom can be.
+"""The depth camera of all worlds: exact ray depths, computed only where a geom can be; a sensor may follow.
 
 Static geoms are rendered once per camera pose; each frame adds the moving ones. Equal to casting a ray
 through every pixel's centre with `mj_ray`, but some 30 times cheaper, and the same code for every backend.
@@ -15,8 +15,10 @@ from scipy.spatial import ConvexHull
 
 from lerobot_vtrefine.sim.camera import Camera
 from lerobot_vtrefine.sim.depth_kernels import MISS, Eye, Shapes, Slabs, Solids, View, ivec4, project, raster
+from lerobot_vtrefine.sim.depth_sensors import DepthSensor
 from lerobot_vtrefine.sim.host import start_copy, to_host
 from lerobot_vtrefine.sim.rotations import matrix_to_quat
+from lerobot_vtrefine.sim.stereo import Develop, StereoSensor
 from lerobot_vtrefine.tactile.contact_query import start_warp
 from lerobot_vtrefine.tactile.workers import Workers
 
@@ -24,7 +26,7 @@ Array = np.ndarray
 
 
 class DepthCamera:
-    """Depth images of N worlds.
+    """Depth images of N worlds, as `sensor` gives them, or exact ones.
 
     Shapes: m worlds of `ids`, G geoms of the model, H x W pixels.
     """
@@ -36,8 +38,10 @@ class DepthCamera:
         num_envs: int,
         device: str = "cpu",
         num_threads: int = 1,
+        sensor: DepthSensor | None = None,
     ) -> None:
         start_warp()
+        self._sensor = None if sensor is None else StereoSensor(sensor, camera, device)
         self._workers = Workers(num_threads if device == "cpu" else 1)
         self._camera, self._device = camera, device
         moving = model.body_weldid[model.geom_bodyid] != 0
@@ -86,7 +90,7 @@ class DepthCamera:
     def render(
         self, ids: Array, geom_position: Array | torch.Tensor, geom_rotation: Array | torch.Tensor
     ) -> Array:
-        """z-depth (m, H, W) float32 [m], -1 for a miss.
+        """True z-depth (m, H, W) float32 [m], -1 for a miss.
 
         Args:
             ids: (m,) worlds.
@@ -97,13 +101,24 @@ class DepthCamera:
         return to_host(torch.where(depth < float(MISS), depth, -1.0))
 
     def start_mm(
-        self, ids: Array, geom_position: Array | torch.Tensor, geom_rotation: Array | torch.Tensor
+        self,
+        ids: Array,
+        geom_position: Array | torch.Tensor,
+        geom_rotation: Array | torch.Tensor,
+        moments: Array | None = None,
     ) -> Callable[[], Array]:
-        """Begin the same as uint16 millimetres, 0 where nothing lies within 2 m; what is returned waits.
+        """Begin what the camera gives, uint16 millimetres, 0 where nothing is measured within 2 m; what is
+        returned waits. Until then the worlds' cameras and shapes must stay.
 
-        Until then the worlds' cameras and shapes must stay.
+        Args:
+            moments: (m, 2) int64 each world's seed and control step, on which a sensor's noise depends.
         """
-        _, pixels, wait = self._start(self._moving, ids, geom_position, geom_rotation, self._background)
+        develop = None
+        if self._sensor is not None:
+            moments = np.zeros((len(ids), 2), np.int64) if moments is None else moments
+            develop = self._sensor.start(moments, self._camera.height, self._camera.width)
+        geoms = geom_position, geom_rotation
+        _, pixels, wait = self._start(self._moving, ids, *geoms, self._background, develop)
         copied = start_copy(pixels)
 
         def finish() -> Array:
@@ -119,9 +134,10 @@ class DepthCamera:
         position: Array | torch.Tensor,
         rotation: Array | torch.Tensor,
         background: torch.Tensor,
+        develop: Develop | None = None,
     ) -> tuple[torch.Tensor, torch.Tensor, Callable[[], None]]:
         """Begin to draw solids before a background: images (m, H, W), float32 [m] with MISS for a miss and
-        int16 [mm], and what waits for them.
+        int16 [mm], which `develop` changes, and what waits for them.
         """
         device, size = self._device, (len(ids), self._camera.height, self._camera.width)
         depth = torch.empty(size, dtype=torch.float32, device=device)
@@ -139,6 +155,8 @@ class DepthCamera:
             count, options = end - begin, {"device": device, "record_tape": False}
             wp.launch(project, (count, len(solids.geom)), [begin, *seen, *poses, view], **options)
             wp.launch(raster, (count, size[1]), [begin, *seen, view, *images], **options)
+            if develop is not None:
+                develop(begin, end, depth, pixels)
 
         return depth, pixels, self._workers.start(len(ids), part)
 

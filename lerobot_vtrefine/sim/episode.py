@@ -104,6 +104,11 @@ class EpisodeState:
             getattr(self, item.name)[ids] = 0
         self.success_step[ids] = -1
 
+    def moments(self, ids: Array, after: Array | None = None) -> Array:
+        """(m, 2) int64 seed and control step of worlds `ids`, once the worlds `after` have done one more."""
+        more = 0 if after is None else np.isin(ids, after)
+        return np.stack([self.seed[ids], self.steps[ids] + more], 1)
+
     def seated_s(self, dt_s: float) -> Array:
         """(N,) for how long each plug has been seen seated at every control step; NaN where it is not."""
         return np.where(self.hold_steps > 0, (self.hold_steps - 1) * dt_s, np.nan)

@@ -28,6 +28,12 @@ def without_torch_threads[**P, R](work: Callable[P, R]) -> Callable[P, R]:
     return run
 
 
+def to_device(array: np.ndarray, device: str) -> torch.Tensor:
+    """An array on a device, any shape; a GPU's earlier work is not waited for."""
+    tensor = torch.from_numpy(array)
+    return tensor if device == "cpu" else tensor.pin_memory().to(device, non_blocking=True)
+
+
 def to_host(tensor: torch.Tensor) -> np.ndarray:
     """A tensor as an array of the host, any shape; no copy where it lies there already."""
     return start_copy(tensor)()

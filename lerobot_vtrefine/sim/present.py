@@ -30,14 +30,14 @@ class Present:
             self._seen = ids, Kinematics(self._scene, *(state or self._backend.read(ids)))
         return self._seen[1]
 
-    def start_images(self, ids: Array) -> None:
-        """Begin the depth images of worlds `ids`, for the next `images`."""
-        self._coming = ids, self._camera.start_mm(ids, *self._backend.geom_poses(ids))
+    def start_images(self, ids: Array, moments: Array) -> None:
+        """Begin the depth images of worlds `ids` at their moments (m, 2), for the next `images`."""
+        self._coming = ids, self._camera.start_mm(ids, *self._backend.geom_poses(ids), moments)
 
-    def images(self, ids: Array) -> Array:
-        """Depth images (m, H, W) uint16 [mm]."""
+    def images(self, ids: Array, moments: Array) -> Array:
+        """Depth images (m, H, W) uint16 [mm] of worlds `ids` at their moments (m, 2)."""
         if self._coming is None or not np.array_equal(self._coming[0], ids):
-            self.start_images(ids)
+            self.start_images(ids, moments)
         assert self._coming is not None
         finish, self._coming = self._coming[1], None
         return finish()

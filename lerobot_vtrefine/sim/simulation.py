@@ -24,6 +24,7 @@ from lerobot_vtrefine.sim.config import (
     WarpConfig,
 )
 from lerobot_vtrefine.sim.depth import DepthCamera
+from lerobot_vtrefine.sim.depth_sensors import DEPTH_SENSORS
 from lerobot_vtrefine.sim.drive import make_drive
 from lerobot_vtrefine.sim.episode import EpisodeState, Measured, update
 from lerobot_vtrefine.sim.host import without_torch_threads
@@ -42,9 +43,6 @@ from lerobot_vtrefine.tactile import SensorModel
 __all__ = ["FAILURES", "InsertionSim", "StepResult"]
 
 Array = np.ndarray
-
-NOISE_LEVEL = 3.0
-"""Standard deviation of the depth noise that training adds to simulated clouds, in the paper's unit."""
 
 
 @dataclass(frozen=True)
@@ -94,7 +92,7 @@ class InsertionSim:
         self.scene: Scene = build_scene(scene_config or SceneConfig())
         self.config = task.rules_in(self.scene.config, task_config or TaskConfig())
         self.num_envs = num_envs
-        self.noise_level = NOISE_LEVEL
+        self.noise_level = self.scene.config.noise_level
         self.substeps = _substeps(self.scene.config, self.config)
         """Physics steps per control step."""
         self._backend = get_backend(backend, self.scene.model, num_envs, num_threads, warp)
@@ -111,7 +109,8 @@ class InsertionSim:
         self._rates = task.rate_limits(self.embodiment, self.config)
         everyone = self._randomizer.draw(np.zeros(num_envs, np.int64))
         self._parameters = dict(everyone.values)
-        self._depth = DepthCamera(self.scene.model, self.scene.camera, num_envs, device, threads)
+        eye = DEPTH_SENSORS[self.scene.config.depth_sensor]
+        self._depth = DepthCamera(self.scene.model, self.scene.camera, num_envs, device, threads, eye)
         self._present = Present(self.scene, self._backend, self._depth)
         self._settler = Settler(self.scene, self.config, self._backend, self._touch)
         self._drive = make_drive(self._backend, self.embodiment, self.substeps, self.config, robot_faults)
@@ -203,7 +202,7 @@ class InsertionSim:
         state.command[ids] = after
         measured = self._start_measuring(ids, trace, earlier)
         if images is not None and len(images):
-            self._present.start_images(self._checked(images))
+            self._present.start_images(self._checked(images), state.moments(images, after=ids))
         reward = update(state, ids, measured(), self.config, self.scene)
         self._remember(ids)
         terminated = state.done[ids]
@@ -216,7 +215,7 @@ class InsertionSim:
 
         Returns:
             `state` (m, J) float32 [rad, m]; `tactile` and `tactile_baseline` (m, P, T) uint8 counts;
-            `depth_mm` (m, H, W) uint16, 0 where nothing lies within 2 m.
+            `depth_mm` (m, H, W) uint16, 0 where nothing is measured within 2 m.
         """
         ids = self._checked(ids)
         return {
@@ -259,7 +258,8 @@ class InsertionSim:
 
     def depth_mm(self, ids: Array | None = None) -> Array:
         """Depth images (m, H, W) uint16 [mm]."""
-        return self._present.images(self._checked(ids))
+        ids = self._checked(ids)
+        return self._present.images(ids, self._episode.moments(ids))
 
     def geometry(self, ids: Array) -> tuple[Array | torch.Tensor, Array | torch.Tensor, Array]:
         """Geoms as cameras see them: positions (m, G, 3), rotations (m, G, 3, 3), sizes (m, G, 3)."""
