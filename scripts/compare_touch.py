@@ -29,7 +29,7 @@ from typing import Any
 
 import torch
 
-from lerobot_vtrefine.cli.pipeline.demo_config import CLOUD_RECIPE, default_env, default_policy
+from lerobot_vtrefine.cli.pipeline.demo_config import default_env
 from lerobot_vtrefine.cli.report.statistics import mean_interval, proportion
 
 MODALITIES = ("visuo_tactile", "visual")
@@ -55,10 +55,13 @@ SETTINGS: dict[str, dict[str, dict[str, Any]]] = {
 """What differs from the demo: half the clearance, a hidden hole, twice the slip in the hand, or decisions
 twice as often."""
 
+FEW_WORLDS: dict[str, Any] = {"recipe": "cloud", "env": default_env(), "policy": {}}
+"""The demo with the paper's cloud, on CPU threads."""
 MANY_WORLDS: dict[str, Any] = {
     "env": {"start": "grasped", "backend": "warp"},
-    "policy": default_policy(),
-    "dppo": {"type": "trust_region", "encoder": "frozen"},
+    "recipe": "pads",
+    "policy": {},
+    "dppo": {"type": "trust_region"},
     "num_demos": 100,
     "pretrain_steps": 2000,
     "finetune_iterations": 36,
@@ -93,7 +96,7 @@ Run = tuple[str, str, int]
 
 def setting_flags(setting: str) -> list[str]:
     """The demo's flags that make a setting."""
-    defaults: dict[str, Any] = {"env": default_env(), **CLOUD_RECIPE} if setting in SETTINGS else MANY_WORLDS
+    defaults = FEW_WORLDS if setting in SETTINGS else MANY_WORLDS
     changes = (SETTINGS | WORLDS)[setting]
     return [f"--{name}={_value(values, changes.get(name, {}))}" for name, values in defaults.items()]
 

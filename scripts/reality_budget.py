@@ -7,7 +7,6 @@ from typing import Any
 from realities import of_robot
 
 from lerobot_vtrefine.cli.pipeline.demo_config import (
-    CLOUD_RECIPE,
     DemoConfig,
     default_env,
     flags,
@@ -57,8 +56,7 @@ def recipe(budget: Budget, seed: int) -> DemoConfig:
         eval_episodes=budget.eval_episodes,
         eval_envs=budget.eval_envs,
         env=default_env() | budget.env | plain,
-        policy=CLOUD_RECIPE["policy"],
-        dppo=CLOUD_RECIPE["dppo"],
+        recipe="cloud",
     )
 
 

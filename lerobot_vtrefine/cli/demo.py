@@ -3,7 +3,7 @@
 examples:
   vtrefine-demo --quick                        minutes: tiny numbers, to see that everything works
   vtrefine-demo                                a quarter of an hour on two cores
-  vtrefine-demo --config_path=vtrefine:kinova_round_grasped --output_dir=outputs/demo_kinova
+  vtrefine-demo --config_path=vtrefine:kinova_round_grasped --recipe=cloud --output_dir=outputs/demo_kinova
   vtrefine-demo --output_dir=outputs/square --env='{pair: square, clearance_m: 0.001, start: grasped}'
 
 Interrupted, the same command continues. --quick stands for tiny numbers; other flags still change them.

@@ -9,7 +9,7 @@ from types import ModuleType
 
 import pytest
 
-from lerobot_vtrefine.cli.pipeline.demo_config import DemoConfig
+from lerobot_vtrefine.cli import demo
 
 SCRIPT = Path(__file__).parents[2] / "scripts" / "compare_touch.py"
 
@@ -119,13 +119,10 @@ def test_runs_side_by_side_take_gpus_by_turns(
 
 
 def test_every_setting_is_a_task_that_the_demo_accepts(script: ModuleType) -> None:
-    for setting in script.SETTINGS:
-        flags = [flag.removeprefix("--").split("=", 1) for flag in script.setting_flags(setting)]
-        changes = {name: json.loads(values) for name, values in flags}
-        assert all(
-            values.items() <= changes[name].items() for name, values in script.SETTINGS[setting].items()
-        )
-        config = DemoConfig(**changes)  # parses the environment's and the policy's flags
+    for setting, changes in script.SETTINGS.items():
+        config = demo.parse_config(script.setting_flags(setting))  # parses the stages' flags too
+        for part, values in changes.items():
+            assert values.items() <= getattr(config, part).items()
         assert config.env["pair"] == "round"
         assert config.policy["preset"] == "small"
         assert "fusion" not in config.policy, "the paper's cloud is what is compared"
@@ -133,9 +130,7 @@ def test_every_setting_is_a_task_that_the_demo_accepts(script: ModuleType) -> No
 
 def test_many_worlds_are_the_recipe_of_the_docs(script: ModuleType) -> None:
     for setting in script.WORLDS:
-        flags = dict(flag.removeprefix("--").split("=", 1) for flag in script.setting_flags(setting))
-        values = {name: json.loads(text) for name, text in flags.items() if name != "device"}
-        config = DemoConfig(**values, device=flags["device"])
+        config = demo.parse_config(script.setting_flags(setting))
         assert (config.finetune_envs, config.finetune_iterations, config.device) == (1024, 36, "cuda")
         assert config.dppo == {"type": "trust_region", "encoder": "frozen"}
         assert config.policy["fusion"] == "pads"

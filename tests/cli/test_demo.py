@@ -83,14 +83,29 @@ def test_commands_are_those_of_users() -> None:
 
 
 def test_another_body_comes_by_its_environments_file() -> None:
-    config = demo.parse_config(["--quick", f"--config_path={ENV_FILES / 'kinova_round_grasped.yaml'}"])
+    kinova = f"--config_path={ENV_FILES / 'kinova_round_grasped.yaml'}"
+    config = demo.parse_config(["--quick", kinova, "--recipe=cloud"])
     record, pretrain, *_ = (stage.command for stage in demo_stages(config))
     assert "--env.scene.embodiment=kinova" in record
     assert "--policy.observation.embodiment=kinova" in pretrain
-    assert not [flag for flag in pretrain if "encoder" in flag]  # which has learnt with ALOHA
-    given = demo.parse_config(["--env={scene: {embodiment: kinova}}", "--policy={preset: small, horizon: 8}"])
-    assert "--policy.horizon=8" in demo_stages(given)[1].command
+    assert not [flag for flag in pretrain if "encoder" in flag]
     assert (config.num_demos, config.eval_episodes) == (4, 8)  # the file's eval: is lerobot-eval's
+    with pytest.raises(ValueError, match="was trained with aloha: with kinova add --recipe=cloud"):
+        DemoConfig(env={"scene": {"embodiment": "kinova"}})
+
+
+def test_flags_come_beside_the_recipes() -> None:
+    config = demo.parse_config(["--policy={horizon: 16}", "--dppo={epochs: 3}"])
+    assert (config.policy["horizon"], config.policy["fusion"]) == (16, "pads")
+    assert (config.dppo, config.finetune_iterations) == (
+        {"type": "small", "encoder": "frozen", "epochs": 3},
+        20,
+    )
+    cloud = demo.parse_config(["--recipe=cloud"])
+    assert (cloud.policy, cloud.finetune_iterations) == ({"preset": "small", "n_action_steps": 8}, 30)
+    assert demo.parse_config(["--recipe=cloud", "--finetune_iterations=7"]).finetune_iterations == 7
+    with pytest.raises(ValueError, match="--recipe=paper: choose from pads, cloud"):
+        DemoConfig(recipe="paper")
 
 
 def test_episodes_are_never_shared() -> None:

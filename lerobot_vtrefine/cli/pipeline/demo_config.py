@@ -64,39 +64,42 @@ def default_degradation() -> dict[str, Any]:
     }
 
 
-def default_policy() -> dict[str, Any]:
-    """A network that trains in minutes on a CPU; it has learnt to see and feel in simulation beforehand."""
-    return {
-        "preset": "small",
-        "fusion": "pads",
-        "pretrained_encoder": "vtrefine:round_grasped",
-        "freeze_encoder": True,
-        "n_action_steps": 4,
-        "horizon": 8,
-    }
-
-
-def default_dppo() -> dict[str, Any]:
-    """DPPO in minutes on two cores."""
-    return {"type": "small", "encoder": "frozen"}
-
-
-CLOUD_RECIPE: dict[str, Any] = {
-    "policy": {"preset": "small", "n_action_steps": 8},
-    "dppo": {"type": "small"},
-    "finetune_iterations": 30,
+RECIPES: dict[str, dict[str, Any]] = {
+    "pads": {
+        "policy": {
+            "preset": "small",
+            "fusion": "pads",
+            "pretrained_encoder": "vtrefine:round_grasped",
+            "freeze_encoder": True,
+            "n_action_steps": 4,
+            "horizon": 8,
+        },
+        "dppo": {"type": "small", "encoder": "frozen"},
+        "finetune_iterations": 20,
+    },
+    "cloud": {
+        "policy": {"preset": "small", "n_action_steps": 8},
+        "dppo": {"type": "small"},
+        "finetune_iterations": 30,
+    },
 }
-"""The paper's cloud, learnt from demonstrations alone: what scripts/compare_*.py compare."""
+"""What is trained, in minutes on two cores. ``pads``: a network that has learnt to see and feel in simulation
+beforehand, with ALOHA. ``cloud``: the paper's, learnt from demonstrations alone, for any body."""
 
 
 @dataclass(frozen=True)
 class DemoConfig:
-    """Numbers of the demo. ``env``, ``degradation``, ``policy`` and ``dppo`` are passed on as flags."""
+    """Numbers of the demo. ``env``, ``degradation``, ``policy`` and ``dppo`` are passed on as flags; the last
+    two, with those of the recipe that they do not name.
+    """
 
     output_dir: Path = Path("outputs/demo")
     """Folder of the dataset, the checkpoints, results.json and report.html."""
     seed: int = 0
     """Seed of the whole run; runs of different seeds share no episode."""
+    recipe: str = "pads"
+    """pads: sees and feels through an encoder that was trained in simulation, with ALOHA. cloud: learns from
+    the demonstrations alone, with any robot."""
     modalities: str = "visuo_tactile"
     """What the policy sees: visuo_tactile or visual."""
     device: str = "cpu"
@@ -117,22 +120,23 @@ class DemoConfig:
     """Episodes of each test-time ablation; 0 skips them."""
     videos: int = 6
     """Episodes of each headline evaluation that are drawn; drawing without a GPU is slow."""
-    finetune_iterations: int = 20
-    """DPPO iterations of one episode in every environment."""
+    finetune_iterations: int | None = None
+    """DPPO iterations of one episode in every environment; by default the recipe's."""
     finetune_envs: int = 128
     """Simulations that DPPO collects from."""
     env: dict[str, Any] = field(default_factory=default_env)
     """Flags of the environment, ``--env.KEY=VALUE``."""
     degradation: dict[str, Any] = field(default_factory=default_degradation)
     """Flags of the expert's imperfections, ``--degradation.KEY=VALUE``."""
-    policy: dict[str, Any] = field(default_factory=default_policy)
-    """Flags of the policy, ``--policy.KEY=VALUE``."""
-    dppo: dict[str, Any] = field(default_factory=default_dppo)
-    """Flags of DPPO, ``--dppo.KEY=VALUE``."""
+    policy: dict[str, Any] = field(default_factory=dict)
+    """Flags of the policy beside the recipe's, ``--policy.KEY=VALUE``."""
+    dppo: dict[str, Any] = field(default_factory=dict)
+    """Flags of DPPO beside the recipe's, ``--dppo.KEY=VALUE``."""
     eval: dict[str, Any] = field(default_factory=dict)
     """Unused; lets files of configs/env serve this command too."""
 
     def __post_init__(self) -> None:
+        self._follow_recipe()
         for name, lowest in LOWEST.items():
             if getattr(self, name) < lowest:
                 raise ValueError(f"--{name} must be at least {lowest}, got {getattr(self, name)}")
@@ -140,6 +144,7 @@ class DemoConfig:
             raise ValueError(f"--modalities={self.modalities}: choose from visuo_tactile, visual")
         if not 0 <= self.seed <= LARGEST_SEED:
             raise ValueError(f"--seed must lie in 0..{LARGEST_SEED}, got {self.seed}")
+        assert self.finetune_iterations is not None  # the recipe's at least
         if self.finetune_iterations * self.finetune_envs > TRAIN_SEEDS:
             raise ValueError(
                 f"--finetune_iterations times --finetune_envs must not exceed {TRAIN_SEEDS}:"
@@ -147,36 +152,34 @@ class DemoConfig:
             )
         self._check_children()
 
+    def _follow_recipe(self) -> None:
+        """Fill in what the recipe says and the flags do not; the policy sees with the environment's robot."""
+        if self.recipe not in RECIPES:
+            raise ValueError(f"--recipe={self.recipe}: choose from {', '.join(RECIPES)}")
+        recipe = RECIPES[self.recipe]
+        body = (self.env.get("scene") or {}).get("embodiment", HOME_BODY)
+        policy = recipe["policy"] | self.policy
+        if body != HOME_BODY:
+            if "pretrained_encoder" in recipe["policy"] and "pretrained_encoder" not in self.policy:
+                raise ValueError(
+                    f"--recipe={self.recipe} has an encoder that was trained with {HOME_BODY}: with {body}"
+                    " add --recipe=cloud, or an encoder by --policy='{pretrained_encoder: FOLDER}'"
+                )
+            policy["observation"] = {"embodiment": body} | policy.get("observation", {})
+        object.__setattr__(self, "policy", policy)
+        object.__setattr__(self, "dppo", recipe["dppo"] | self.dppo)
+        if self.finetune_iterations is None:
+            object.__setattr__(self, "finetune_iterations", recipe["finetune_iterations"])
+
     def _check_children(self) -> None:
         """Parse what the stages will parse. Imports LeRobot, which ``--help`` can do without."""
         from lerobot_vtrefine.cli.pipeline import child_configs
 
         child_configs.parse_degradation(self.degradation)
         numbers = {"iterations": self.finetune_iterations, "num_envs": self.finetune_envs}
-        child_configs.parse_dppo(self.dppo_flags | numbers)
+        child_configs.parse_dppo(self.dppo | numbers)
         child_configs.parse_env(self.env)
-        child_configs.parse_policy(self.policy_flags)
-
-    @property
-    def policy_flags(self) -> dict[str, Any]:
-        """``policy``, which sees with the environment's robot where it does not say with which.
-
-        The default's encoder has learnt with ALOHA: other robots get the cloud's recipe instead.
-        """
-        if self._body == HOME_BODY:
-            return self.policy
-        policy = CLOUD_RECIPE["policy"] if self.policy == default_policy() else self.policy
-        return policy | {"observation": {"embodiment": self._body} | policy.get("observation", {})}
-
-    @property
-    def dppo_flags(self) -> dict[str, Any]:
-        """``dppo``, or the cloud's recipe where the policy has that."""
-        other = self._body != HOME_BODY and self.dppo == default_dppo()
-        return CLOUD_RECIPE["dppo"] if other and self.policy == default_policy() else self.dppo
-
-    @property
-    def _body(self) -> str:
-        return (self.env.get("scene") or {}).get("embodiment", HOME_BODY)
+        child_configs.parse_policy(self.policy)
 
     @property
     def dataset_dir(self) -> Path:
@@ -240,7 +243,7 @@ def pretrain_stage(config: DemoConfig) -> Stage:
         "lerobot-train",
         f"--dataset.repo_id={REPO_ID}",
         f"--dataset.root={config.dataset_dir}",
-        *flags("policy", {"type": "vt_dp3"} | config.policy_flags),
+        *flags("policy", {"type": "vt_dp3"} | config.policy),
         f"--policy.modalities={config.modalities}",
         f"--policy.device={config.device}",
         "--policy.push_to_hub=false",
@@ -296,7 +299,7 @@ def finetune_stage(config: DemoConfig) -> Stage:
         f"--policy.path={config.checkpoint('pretrain')}",
         f"--policy.device={config.device}",
         *flags("env", {"type": "vtrefine"} | config.env),
-        *flags("dppo", config.dppo_flags),
+        *flags("dppo", config.dppo),
         f"--dppo.iterations={config.finetune_iterations}",
         f"--dppo.num_envs={config.finetune_envs}",
         f"--seed={config.seed * SEED_STRIDE + TRAIN_SEED_OFFSET}",
