@@ -25,6 +25,7 @@ from lerobot_vtrefine.extras import SIMULATOR, require
 PARTS = {
     "tactile": "lerobot_vtrefine.tactile.benchmark",
     "envs": "lerobot_vtrefine.envs.benchmark",
+    "dataset": "lerobot_vtrefine.lerobot_compat.benchmark",
     "finetune": "lerobot_vtrefine.finetune.benchmark",
     "drivers": "lerobot_vtrefine.drivers.benchmark",
     "busy": "lerobot_vtrefine.finetune.benchmark_busy",
@@ -52,7 +53,7 @@ class BenchConfig:
     """What to measure and where to write it."""
 
     parts: tuple[str, ...] = tuple(PARTS)
-    """Parts to measure, of tactile, envs, finetune, drivers, busy."""
+    """Parts to measure, of tactile, envs, dataset, finetune, drivers, busy."""
     limit_s: float = 60.0
     """Seconds that a part may take; a slower one is left out. No limit with --full."""
     full: bool = False

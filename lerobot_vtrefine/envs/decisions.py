@@ -9,13 +9,13 @@ from typing import Any, NamedTuple
 
 import numpy as np
 import torch
-from lerobot.envs.utils import preprocess_observation
 from torch import Tensor
 
-from lerobot_vtrefine.datasets.features import raw_to_env_observation
+from lerobot_vtrefine.datasets.features import DEPTH_KEY, columns
+from lerobot_vtrefine.embodiments import Embodiment
 from lerobot_vtrefine.envs.config import VtRefineEnvConfig
 from lerobot_vtrefine.envs.episodes import Array, Episodes
-from lerobot_vtrefine.envs.factory import make_episodes
+from lerobot_vtrefine.envs.factory import make_episodes_on_device
 from lerobot_vtrefine.sim.task import FAILURES, SIMULATION_FAILED
 
 Batch = dict[str, Tensor]
@@ -44,7 +44,8 @@ class LeRobotDecisionEnv:
 
     A chunk runs its actions in all unfinished environments; sensors are read only after the last
     ``n_obs_steps`` of them, the frames that the next decision sees. Environments that finish are skipped from
-    then on (also by the preprocessor) until they are reset.
+    then on (also by the preprocessor) until they are reset. What the simulation's device has of a frame stays
+    there until the preprocessor moves it.
 
     Args:
         episodes: The running simulation.
@@ -68,7 +69,7 @@ class LeRobotDecisionEnv:
         self.max_decisions = max_decisions
         self._preprocessor = preprocessor
         self._postprocessor = postprocessor
-        self._history: dict[str, Array] = {}
+        self._history: Batch = {}
         self._batch: Batch = {}
 
     @property
@@ -86,13 +87,11 @@ class LeRobotDecisionEnv:
         if len(seeds) != len(ids):
             raise ValueError(f"got {len(seeds)} seeds for {len(ids)} environments")
         self.episodes.reset(ids, np.asarray(seeds, np.int64))
-        if not self._history:
-            self._history = {
-                key: np.repeat(value[:, None], self.n_obs_steps, axis=1)
-                for key, value in self.episodes.raw.items()
-            }
-        for key, value in self.episodes.raw.items():
-            self._history[key][ids] = value[ids][:, None]
+        for key, frame in self._frames().items():
+            window = torch.stack([frame] * self.n_obs_steps, dim=1)
+            if len(ids) < self.num_envs:
+                window = _with_rows(self._history[key], ids, window[ids])
+            self._history[key] = window
         self._update_batch(ids)
         return self._batch, self._privileged()
 
@@ -102,11 +101,10 @@ class LeRobotDecisionEnv:
         length = targets.shape[1]
         reward = np.zeros(self.num_envs, np.float32)
         for step in range(length):
-            running = self.episodes.active
             read = step >= length - self.n_obs_steps
             reward += self.episodes.step(targets[:, step], reads=read).reward
             if read:
-                self._push(running)
+                self._push()
         self._update_batch(self.episodes.active)
         return Decision(
             self._batch,
@@ -134,30 +132,55 @@ class LeRobotDecisionEnv:
         }
         return {name: torch.from_numpy(np.array(values)) for name, values in columns.items()}
 
-    def _push(self, ids: Array) -> None:
-        """Shift the newest frames of ``ids`` into the observation window."""
-        for key, window in self._history.items():
-            window[ids, :-1] = window[ids, 1:]
-            window[ids, -1] = self.episodes.raw[key][ids]
+    def _frames(self) -> Batch:
+        """The latest raw frames (n, ...) as tensors, each where it lies."""
+        return {key: _tensor(value) for key, value in self.episodes.raw.items()}
+
+    def _push(self) -> None:
+        """Shift the newest frames into the windows; those of finished environments are not looked at."""
+        for key, frame in self._frames().items():
+            self._history[key] = torch.cat([self._history[key][:, 1:], frame[:, None]], dim=1)
 
     def _update_batch(self, ids: Array) -> None:
         """Preprocess the windows of ``ids`` and put them into the batch of all environments."""
         if len(ids) == 0:
             return
-        flat = {key: window[ids].reshape(-1, *window.shape[2:]) for key, window in self._history.items()}
-        frames = preprocess_observation(raw_to_env_observation(flat, self.episodes.body))
-        shape = (len(ids), self.n_obs_steps)
-        batch = self._preprocessor({key: value.unflatten(0, shape) for key, value in frames.items()})
+        everyone = len(ids) == self.num_envs
+        windows = self._history if everyone else {key: value[ids] for key, value in self._history.items()}
+        batch = self._preprocessor(policy_columns(windows, self.episodes.body))
         fresh = {
             key: value for key, value in batch.items() if isinstance(value, Tensor) and len(value) == len(ids)
         }
-        if len(ids) == self.num_envs:
-            self._batch = fresh
-            return
-        index = torch.as_tensor(ids)
-        self._batch = {
-            key: self._batch[key].index_copy(0, index.to(value.device), value) for key, value in fresh.items()
-        }
+        if not everyone:
+            fresh = {key: _with_rows(self._batch[key], ids, value) for key, value in fresh.items()}
+        self._batch = fresh
+
+
+def policy_columns(raw: Batch, body: Embodiment) -> Batch:
+    """Raw readings with any leading dimensions as a policy's preprocessor gets them from an environment.
+
+    The keys and values of LeRobot's ``preprocess_observation`` of ``raw_to_env_observation``, without a way
+    through the host: float32 columns, counts too, and depth (..., 1, H, W) in mm.
+    """
+    values = {source: value.float() for source, value in raw.items()}
+    batch = {
+        column.key: values[column.source] if column.pad is None else values[column.source][..., column.pad, :]
+        for column in columns(body)
+        if column.source in values
+    }
+    return batch | {DEPTH_KEY: values["depth_mm"].unsqueeze(-3)}
+
+
+def _tensor(value: Array | Tensor) -> Tensor:
+    """A raw frame as a tensor; depth [mm] as int16, which holds every camera's range."""
+    if isinstance(value, Tensor):
+        return value
+    return torch.from_numpy(value.view(np.int16) if value.dtype == np.uint16 else value)
+
+
+def _with_rows(values: Tensor, ids: Array, rows: Tensor) -> Tensor:
+    """A copy of values (n, ...) with other rows (m, ...) at ``ids`` (m,)."""
+    return values.index_copy(0, torch.as_tensor(ids, device=values.device), rows)
 
 
 def make_decision_env(
@@ -170,5 +193,5 @@ def make_decision_env(
 ) -> LeRobotDecisionEnv:
     """The decision environment of ``config`` for a policy with this observation window and chunk."""
     max_decisions = math.ceil(config.max_episode_steps / n_action_steps)
-    episodes = make_episodes(config, num_envs)
+    episodes = make_episodes_on_device(config, num_envs)
     return LeRobotDecisionEnv(episodes, preprocessor, postprocessor, n_obs_steps, max_decisions)

@@ -8,6 +8,7 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
+import torch
 
 from lerobot_vtrefine.envs.episode_log import EpisodeLog, episode_rows
 from lerobot_vtrefine.sim.task import FAILURES
@@ -16,7 +17,8 @@ if TYPE_CHECKING:
     from lerobot_vtrefine.sim.simulation import InsertionSim
 
 Array = np.ndarray[Any, np.dtype[Any]]
-Raw = dict[str, Array]
+Raw = dict[str, Any]
+"""Raw frames (m, ...) by name: arrays, or tensors."""
 
 
 @dataclass
@@ -43,6 +45,8 @@ class Episodes:
         ablate: Applied to every raw frame that is read (identity by default).
         log: Where a row per finished episode goes, if anywhere.
         colour: Colour images (m, H, W, 3) uint8 of environments (m,), for frames that hold them.
+        on_device: Whether frames hold what the simulation's device has as tensors there, for callers who
+            compute there, and not as arrays of the host.
     """
 
     def __init__(
@@ -51,6 +55,7 @@ class Episodes:
         ablate: Callable[[Raw], Raw] | None = None,
         log: EpisodeLog | None = None,
         colour: Callable[[Array], Array] | None = None,
+        on_device: bool = False,
     ) -> None:
         self.sim = sim
         self.num_envs = sim.num_envs
@@ -61,6 +66,7 @@ class Episodes:
         self.done = np.ones(self.num_envs, bool)
         self.raw: Raw = {}
         self.metrics: dict[str, Array] = {}
+        self._observe = sim.observe_tensors if on_device else sim.observe
         self._ablate = ablate
         self._log = log
         self._colour = colour
@@ -114,16 +120,14 @@ class Episodes:
         """Read the sensors of ``ids`` now -> their raw frames (m, ...), also kept in ``raw``."""
         frames = self._frames(ids)
         if not self.raw:
-            self.raw = {
-                key: np.zeros((self.num_envs, *value.shape[1:]), value.dtype) for key, value in frames.items()
-            }
+            self.raw = {key: _room(value, self.num_envs) for key, value in frames.items()}
         rows = slice(None) if len(ids) == self.num_envs else ids
         for key, value in frames.items():
             self.raw[key][rows] = value
         return frames
 
     def _frames(self, ids: Array) -> Raw:
-        frames = dict(self.sim.observe(ids))
+        frames: Raw = dict(self._observe(ids))
         count = len(ids)
         frames["camera_intrinsics"] = np.broadcast_to(
             np.asarray(self.sim.camera_intrinsics, np.float32), (count, 4)
@@ -160,3 +164,9 @@ class Episodes:
     def rows(self, ids: Array) -> list[dict[str, Any]]:
         """``summary`` as one plain dict per episode."""
         return episode_rows(self.summary(ids)) if len(ids) else []
+
+
+def _room(value: Array | torch.Tensor, count: int) -> Array | torch.Tensor:
+    """Zeros for as many frames of this kind."""
+    shape = (count, *value.shape[1:])
+    return value.new_zeros(shape) if isinstance(value, torch.Tensor) else np.zeros(shape, value.dtype)

@@ -12,7 +12,7 @@ from lerobot.envs.utils import _LazyAsyncVectorEnv, freeze_after_episode_end
 from lerobot_vtrefine.envs.ablation import make_ablation
 from lerobot_vtrefine.envs.config import VtRefineEnvConfig
 from lerobot_vtrefine.envs.episode_log import EpisodeLog
-from lerobot_vtrefine.envs.episodes import Episodes
+from lerobot_vtrefine.envs.episodes import Episodes, Raw
 from lerobot_vtrefine.envs.evaluation_note import write_note
 from lerobot_vtrefine.envs.rendering import EvalVideos
 
@@ -47,10 +47,26 @@ def make_simulation(config: VtRefineEnvConfig, num_envs: int) -> "InsertionSim":
 
 def make_episodes(config: VtRefineEnvConfig, num_envs: int) -> Episodes:
     """The simulation with ablation, metrics log and colour camera as configured."""
-    ablation = make_ablation(config.ablate, config.ablate_dataset, config.body)
-    log = EpisodeLog(config.metrics_path) if config.metrics_path is not None else None
     sim = make_simulation(config, num_envs)
-    return Episodes(sim, ablation, log, _colour_camera(config, sim))
+    return Episodes(sim, _ablation(config), _log(config), _colour_camera(config, sim))
+
+
+def make_episodes_on_device(config: VtRefineEnvConfig, num_envs: int) -> Episodes:
+    """The same for policies that compute where the simulation does, and see no colour.
+
+    An ablation takes frames of the host all the same.
+    """
+    ablation = _ablation(config)
+    sim = make_simulation(config, num_envs)
+    return Episodes(sim, ablation, _log(config), on_device=ablation is None)
+
+
+def _ablation(config: VtRefineEnvConfig) -> Callable[[Raw], Raw] | None:
+    return make_ablation(config.ablate, config.ablate_dataset, config.body)
+
+
+def _log(config: VtRefineEnvConfig) -> EpisodeLog | None:
+    return EpisodeLog(config.metrics_path) if config.metrics_path is not None else None
 
 
 def _colour_camera(

@@ -43,7 +43,15 @@ def run() -> list[Row]:
 
 
 def _row(encoder: str) -> Row:
-    cfg = SmallDppo(encoder=encoder, epochs=1, minibatch_decisions=DECISIONS // 2, critic_warmup=0)
+    cfg = SmallDppo(
+        encoder=encoder,
+        epochs=1,
+        minibatches=2,
+        minibatch_decisions=DECISIONS // 2,
+        critic_warmup=0,
+        kl_per_decision=0.0,  # both loops do all their steps
+        kl_per_decision_final=0.0,
+    )
     agent = _agent(cfg)
     state = TrainState.create(agent, cfg, PRIVILEGED, seed=0)
     rollout = _rollout(agent, cfg)

@@ -81,7 +81,7 @@ def _reverse_steps(
         agent.process.num_steps - steps, agent.process.num_steps, device=latents.device
     ).repeat(batch)
     rows = latents[:, :-1].flatten(0, 1)
-    eps = network.denoiser(rows, agent.process.times(positions), cond.repeat_interleave(steps, dim=0))
+    eps = network.denoiser(rows, agent.process.times(positions), cond)
     mean, std = agent.process.posterior(rows, eps, positions, eta)
     return mean.unflatten(0, (batch, steps)), std.unflatten(0, (batch, steps))
 

@@ -52,6 +52,11 @@ def sum_over_ranks(tensor: Tensor) -> Tensor:
     return tensor
 
 
+def total_over_ranks(value: int, device: torch.device) -> int:
+    """Sum of an integer over all ranks; on one rank nothing waits for the device."""
+    return int(sum_over_ranks(torch.tensor(value, device=device))) if num_ranks() > 1 else value
+
+
 def max_over_ranks(value: int, device: torch.device) -> int:
     """Largest value of an integer over all ranks."""
     if num_ranks() == 1:

@@ -23,6 +23,7 @@ from functools import partial
 
 import torch
 from torch import Tensor
+from torch.nn.utils import clip_grad_norm_
 
 from lerobot_vtrefine.finetune.chains import Regulariser, chain_log_probs, decision_kl, explore
 from lerobot_vtrefine.finetune.config import DppoConfig
@@ -34,6 +35,7 @@ from lerobot_vtrefine.finetune.distributed import (
     rank_index,
     sum_gradients,
     sum_over_ranks,
+    total_over_ranks,
 )
 from lerobot_vtrefine.finetune.gae import RewardScaler, generalised_advantages
 from lerobot_vtrefine.finetune.protocols import (
@@ -212,6 +214,7 @@ def update(rollout: Rollout, agent: Agent, state: TrainState, cfg: DppoConfig) -
         regulariser = Regulariser.of(rollout.obs, rollout.latents, agent, cfg, state.generator)
     state.actor_optimizer.param_groups[0]["lr"] = actor_lr
     state.critic_optimizer.param_groups[0]["lr"] = cfg.critic_lr_at(state.iteration)
+    max_norm = cfg.max_grad_norm or math.inf
     actor_parameters, critic_parameters = agent.trained_parameters(), list(state.critic.parameters())
     clip = advantages.new_tensor([cfg.clip_range(step) for step in range(cfg.ft_denoising_steps)])
     num_valid = len(advantages)
@@ -219,13 +222,14 @@ def update(rollout: Rollout, agent: Agent, state: TrainState, cfg: DppoConfig) -
     most = max_over_ranks(num_valid, advantages.device)
     num_minibatches = min(cfg.minibatches or math.ceil(most / cfg.minibatch_decisions), most)
     history: list[list[float]] = []
+    grad_norms: list[Tensor] = []  # nobody waits for them before the end
     initial_log_ratio, stopped = 0.0, False
 
     for _ in range(cfg.epochs):
         order = torch.randperm(num_valid, generator=state.generator, device=advantages.device)
         for minibatch in order.tensor_split(num_minibatches):
             # Sums over ranks, divided by the number of decisions in the minibatches of all ranks.
-            size = float(sum_over_ranks(torch.tensor(float(len(minibatch)), device=advantages.device)))
+            size = total_over_ranks(len(minibatch), advantages.device)
             rows = size * cfg.ft_denoising_steps
             sums = torch.zeros(6, dtype=torch.float64, device=advantages.device)
             state.actor_optimizer.zero_grad(set_to_none=True)
@@ -269,35 +273,30 @@ def update(rollout: Rollout, agent: Agent, state: TrainState, cfg: DppoConfig) -
                 stopped = True
                 break
             sum_gradients(critic_parameters)
-            _clip_gradients(critic_parameters, cfg.max_grad_norm)
+            clip_grad_norm_(critic_parameters, max_norm)
             state.critic_optimizer.step()
-            grad_norm = 0.0
             if train_actor:
                 sum_gradients(actor_parameters)
-                grad_norm = _clip_gradients(actor_parameters, cfg.max_grad_norm)
+                grad_norms.append(clip_grad_norm_(actor_parameters, max_norm))
                 state.actor_optimizer.step()
-            history.append([value_loss, loss_value, approx_kl, clip_fraction, grad_norm, kl])
+            history.append([value_loss, loss_value, approx_kl, clip_fraction, kl])
         if stopped:
             break
 
     if train_actor:
         region.adapt([row[-1] for row in history[-num_minibatches:]], stopped, state.iteration)
-    averages = torch.tensor(history or [[0.0] * 6], dtype=torch.float64).mean(0).tolist()
-    names = ("value_loss", "policy_loss", "approx_kl", "clip_fraction", "grad_norm", "decision_kl")
+    averages = torch.tensor(history or [[0.0] * 5], dtype=torch.float64).mean(0).tolist()
+    names = ("value_loss", "policy_loss", "approx_kl", "clip_fraction", "decision_kl")
     with torch.no_grad():
         explained = explained_variance(state.critic(privileged), targets)
     return dict(zip(names, averages, strict=True)) | {
+        "grad_norm": float(torch.stack(grad_norms).double().mean()) if grad_norms else 0.0,
         "explained_variance": explained,
         "initial_log_ratio": initial_log_ratio,
         "updates": float(len(history)),
         "stopped_early": float(stopped),
         "actor_lr": actor_lr,
     }
-
-
-def _clip_gradients(parameters: list[torch.nn.Parameter], max_norm: float) -> float:
-    """Gradient norm; clipped to ``max_norm`` if that is positive."""
-    return float(torch.nn.utils.clip_grad_norm_(parameters, max_norm or math.inf))
 
 
 def rollout_metrics(rollout: Rollout) -> Metrics:

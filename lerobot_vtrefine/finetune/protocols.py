@@ -21,7 +21,7 @@ class Actor(Protocol):
     """A diffusion policy's network: an ``nn.Module`` with two stages."""
 
     denoiser: nn.Module
-    """``(x (B, H, D), t (B,) long, cond (B, C)) -> eps (B, H, D)``."""
+    """``(x (B, H, D), t (B,) long, cond (b, C)) -> eps (B, H, D)``; B / b neighbours share a condition."""
 
     def encode(self, batch: Observation, /) -> Tensor:
         """Condition (B, C) of an observation: once per decision."""

@@ -63,7 +63,9 @@ class FastDatasetReader(DatasetReader):
         return item
 
     def get_batch(self, indices: Sequence[int]) -> dict[str, Any] | None:
-        """What a data loader would collate from the items, read at once; None where it must read items."""
+        """What a data loader would collate from the items, read at once, with counts as uint8; None where it
+        must read items.
+        """
         store = self._frame_store()
         if store is None or self._image_transforms is not None:  # these may be random, one draw per item
             return None

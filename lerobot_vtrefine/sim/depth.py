@@ -16,7 +16,7 @@ from scipy.spatial import ConvexHull
 from lerobot_vtrefine.sim.camera import Camera
 from lerobot_vtrefine.sim.depth_kernels import MISS, Eye, Shapes, Slabs, Solids, View, ivec4, project, raster
 from lerobot_vtrefine.sim.depth_sensors import DepthSensor
-from lerobot_vtrefine.sim.host import start_copy, to_host
+from lerobot_vtrefine.sim.host import to_host
 from lerobot_vtrefine.sim.rotations import matrix_to_quat
 from lerobot_vtrefine.sim.stereo import Develop, StereoSensor
 from lerobot_vtrefine.tactile.contact_query import start_warp
@@ -106,9 +106,10 @@ class DepthCamera:
         geom_position: Array | torch.Tensor,
         geom_rotation: Array | torch.Tensor,
         moments: Array | None = None,
-    ) -> Callable[[], Array]:
-        """Begin what the camera gives, uint16 millimetres, 0 where nothing is measured within 2 m; what is
-        returned waits. Until then the worlds' cameras and shapes must stay.
+    ) -> Callable[[], torch.Tensor]:
+        """Begin what the camera gives, int16 millimetres, 0 where nothing is measured within 2 m; what is
+        returned waits, and gives them on the camera's device. Until then the worlds' cameras and shapes must
+        stay.
 
         Args:
             moments: (m, 2) int64 each world's seed and control step, on which a sensor's noise depends.
@@ -119,11 +120,10 @@ class DepthCamera:
             develop = self._sensor.start(moments, self._camera.height, self._camera.width)
         geoms = geom_position, geom_rotation
         _, pixels, wait = self._start(self._moving, ids, *geoms, self._background, develop)
-        copied = start_copy(pixels)
 
-        def finish() -> Array:
+        def finish() -> torch.Tensor:
             wait()
-            return copied().view(np.uint16)
+            return pixels
 
         return finish
 

@@ -3,6 +3,7 @@
 from collections.abc import Callable
 
 import numpy as np
+import torch
 
 from lerobot_vtrefine.sim.backends import Backend
 from lerobot_vtrefine.sim.depth import DepthCamera
@@ -18,7 +19,7 @@ class Present:
     def __init__(self, scene: Scene, backend: Backend, camera: DepthCamera) -> None:
         self._scene, self._backend, self._camera = scene, backend, camera
         self._seen: tuple[Array, Kinematics] | None = None
-        self._coming: tuple[Array, Callable[[], Array]] | None = None
+        self._coming: tuple[Array, Callable[[], torch.Tensor]] | None = None
 
     def forget(self) -> None:
         """To be called before any change of state, cameras or shapes."""
@@ -34,8 +35,8 @@ class Present:
         """Begin the depth images of worlds `ids` at their moments (m, 2), for the next `images`."""
         self._coming = ids, self._camera.start_mm(ids, *self._backend.geom_poses(ids), moments)
 
-    def images(self, ids: Array, moments: Array) -> Array:
-        """Depth images (m, H, W) uint16 [mm] of worlds `ids` at their moments (m, 2)."""
+    def images(self, ids: Array, moments: Array) -> torch.Tensor:
+        """Depth images (m, H, W) int16 [mm] of worlds `ids` at their moments (m, 2), on their device."""
         if self._coming is None or not np.array_equal(self._coming[0], ids):
             self.start_images(ids, moments)
         assert self._coming is not None

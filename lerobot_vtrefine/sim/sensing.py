@@ -152,7 +152,9 @@ class Pads:
             skin = Shear(scene.config.pad_friction, shear.stiffness_n_per_m)
             self._shear = ShearSensors(self.layout, num_envs, held_bodies(scene.embodiment), skin, device)
         self._in_order = model.has_state
-        self._last = np.zeros((num_envs, pads, self.layout.num_taxels), np.uint8)
+        self._last = torch.zeros(
+            (num_envs, pads, self.layout.num_taxels), dtype=torch.uint8, device=self.sensors.device
+        )
 
     @property
     def remembers(self) -> bool:
@@ -178,9 +180,13 @@ class Pads:
         if self._in_order:
             self._last[ids] = self._read(ids, touch)
 
-    def counts(self, ids: Array, touch: "Touch") -> Array:
-        """Raw counts (m, P, T) uint8 at the worlds' present state."""
+    def counts(self, ids: Array, touch: "Touch") -> torch.Tensor:
+        """Raw counts (m, P, T) uint8 at the worlds' present state, on the pads' device."""
         return self._last[ids] if self._in_order else self._read(ids, touch)
+
+    def baseline(self, ids: Array) -> torch.Tensor:
+        """Counts of the untouched taxels (m, P, T) uint8, on the pads' device."""
+        return self.sensors.baseline_counts(ids)
 
     def shear(self, ids: Array) -> Array:
         """Tangential force per taxel (m, P, T, 2) float32 [N] as of the last control step.
@@ -194,7 +200,7 @@ class Pads:
 
     def get_state(self, env: int) -> dict[str, Any]:
         """Everything that world `env`'s readings depend on."""
-        state = {"sensors": self.sensors.get_state(env), "last": self._last[env].copy()}
+        state = {"sensors": self.sensors.get_state(env), "last": self._last[env].clone()}
         return state if self._shear is None else {**state, "shear": self._shear.get_state(env)}
 
     def set_state(self, env: int, state: dict[str, Any]) -> None:
@@ -204,9 +210,8 @@ class Pads:
         if self._shear is not None:
             self._shear.set_state(env, state["shear"])
 
-    def _read(self, ids: Array, touch: "Touch") -> Array:
-        counts = self.sensors.counts(ids, Poses(*touch.poses), self._dt_s, touch.load)
-        return to_host(counts) if isinstance(counts, torch.Tensor) else counts
+    def _read(self, ids: Array, touch: "Touch") -> torch.Tensor:
+        return torch.as_tensor(self.sensors.counts(ids, Poses(*touch.poses), self._dt_s, touch.load))
 
 
 def pad_layout(embodiment: Embodiment) -> PadLayout:

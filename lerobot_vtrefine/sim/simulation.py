@@ -27,7 +27,7 @@ from lerobot_vtrefine.sim.depth import DepthCamera
 from lerobot_vtrefine.sim.depth_sensors import DEPTH_SENSORS
 from lerobot_vtrefine.sim.drive import make_drive
 from lerobot_vtrefine.sim.episode import EpisodeState, Measured, update
-from lerobot_vtrefine.sim.host import without_torch_threads
+from lerobot_vtrefine.sim.host import start_copy, to_host, without_torch_threads
 from lerobot_vtrefine.sim.present import Present
 from lerobot_vtrefine.sim.privileged import Privileged, describe
 from lerobot_vtrefine.sim.randomization import Randomizer, WorldParameters
@@ -35,7 +35,7 @@ from lerobot_vtrefine.sim.reality import RobotFaults
 from lerobot_vtrefine.sim.scene import Scene, build_scene
 from lerobot_vtrefine.sim.sensing import Kinematics
 from lerobot_vtrefine.sim.settling import Settler
-from lerobot_vtrefine.sim.substeps import start_summary
+from lerobot_vtrefine.sim.substeps import count_substeps, start_summary
 from lerobot_vtrefine.sim.task import FAILURES
 from lerobot_vtrefine.sim.touch import Touch, touch_source
 from lerobot_vtrefine.tactile import SensorModel
@@ -93,7 +93,7 @@ class InsertionSim:
         self.config = task.rules_in(self.scene.config, task_config or TaskConfig())
         self.num_envs = num_envs
         self.noise_level = self.scene.config.noise_level
-        self.substeps = _substeps(self.scene.config, self.config)
+        self.substeps = count_substeps(self.scene.config.timestep_s, self.config)
         """Physics steps per control step."""
         self._backend = get_backend(backend, self.scene.model, num_envs, num_threads, warp)
         self._touch = touch_source(self.scene, self._backend)
@@ -217,24 +217,31 @@ class InsertionSim:
             `state` (m, J) float32 [rad, m]; `tactile` and `tactile_baseline` (m, P, T) uint8 counts;
             `depth_mm` (m, H, W) uint16, 0 where nothing is measured within 2 m.
         """
+        copied = {name: start_copy(values) for name, values in self.observe_tensors(ids).items()}
+        frames = {name: wait() for name, wait in copied.items()}
+        return frames | {"depth_mm": frames["depth_mm"].view(np.uint16)}
+
+    @without_torch_threads
+    def observe_tensors(self, ids: Array | None = None) -> dict[str, torch.Tensor]:
+        """The same as tensors on `device`, where cameras and pads leave them; `depth_mm` is int16."""
         ids = self._checked(ids)
         return {
-            "state": self.joint_state(ids),
-            "tactile": self.tactile(ids),
-            "tactile_baseline": self._pads.sensors.baseline[ids],
-            "depth_mm": self.depth_mm(ids),
+            "state": torch.as_tensor(self.joint_state(ids), device=self.device),
+            "tactile": self._pads.counts(ids, self._touch_at(ids)),
+            "tactile_baseline": self._pads.baseline(ids),
+            "depth_mm": self._present.images(ids, self._episode.moments(ids)),
         }
 
     def joint_state(self, ids: Array | None = None) -> Array:
         """The `state` part of `observe` alone: (m, J) float32."""
-        qpos, _ = self._backend.read(self._checked(ids))
-        return self._drive.readings(qpos[:, self.scene.addresses.qpos]).astype(np.float32)
+        joints = self._present.see(self._checked(ids)).joints
+        return self._drive.readings(joints).astype(np.float32)
 
     @without_torch_threads
     def tactile(self, ids: Array | None = None) -> Array:
         """The `tactile` part of `observe` alone: (m, P, T) uint8 counts."""
         ids = self._checked(ids)
-        return self._pads.counts(ids, self._touch_at(ids))
+        return to_host(self._pads.counts(ids, self._touch_at(ids)))
 
     def shear(self, ids: Array | None = None) -> Array:
         """Tangential forces on the taxels at the end of the last control step, (m, P, T, 2) float32 [N]:
@@ -259,7 +266,7 @@ class InsertionSim:
     def depth_mm(self, ids: Array | None = None) -> Array:
         """Depth images (m, H, W) uint16 [mm]."""
         ids = self._checked(ids)
-        return self._present.images(ids, self._episode.moments(ids))
+        return to_host(self._present.images(ids, self._episode.moments(ids))).view(np.uint16)
 
     def geometry(self, ids: Array) -> tuple[Array | torch.Tensor, Array | torch.Tensor, Array]:
         """Geoms as cameras see them: positions (m, G, 3), rotations (m, G, 3, 3), sizes (m, G, 3)."""
@@ -389,12 +396,3 @@ class InsertionSim:
 
     def _describe(self, ids: Array) -> Privileged:
         return describe(self.scene, self.config, self._episode, ids, self._present.see(ids), self._parameters)
-
-
-def _substeps(scene: SceneConfig, config: TaskConfig) -> int:
-    substeps = config.control_dt_s / scene.timestep_s
-    if abs(substeps - round(substeps)) > 1e-6:
-        raise ValueError(
-            f"control_hz = {config.control_hz} is not a whole number of physics steps of {scene.timestep_s} s"
-        )
-    return round(substeps)

@@ -10,6 +10,7 @@ import numpy as np
 import torch
 
 from lerobot_vtrefine.sim.backends import Trace
+from lerobot_vtrefine.sim.config import TaskConfig
 from lerobot_vtrefine.sim.host import start_copy
 from lerobot_vtrefine.sim.scene import Addresses
 
@@ -36,6 +37,19 @@ class Substeps:
     """(m, 3) plug's origin in the socket's frame at the end [m]."""
     rim_slide: Array
     """(m,) way that the plug slid on the socket's rim [m]."""
+
+
+def count_substeps(timestep_s: float, config: TaskConfig) -> int:
+    """Physics steps per control step.
+
+    Raises: ValueError where that is not a whole number.
+    """
+    substeps = config.control_dt_s / timestep_s
+    if abs(substeps - round(substeps)) > 1e-6:
+        raise ValueError(
+            f"control_hz = {config.control_hz} is not a whole number of physics steps of {timestep_s} s"
+        )
+    return round(substeps)
 
 
 def start_summary(

@@ -61,9 +61,19 @@ class PadSensors:
         self._parameters: dict[tuple[str, str], torch.Tensor] = {}
         self._state: dict[str, State] = {}
         self._engines: dict[bool, ContactEngine] = {}
-        self.baseline = np.zeros((num_envs, num_pads, layout.num_taxels), dtype=np.uint8)
-        """Counts of the untouched taxels (num_envs, P, N)."""
+        self._baseline = torch.zeros(
+            (num_envs, num_pads, layout.num_taxels), dtype=torch.uint8, device=self.device
+        )
         self.reset(np.arange(num_envs), seed)
+
+    @property
+    def baseline(self) -> np.ndarray:
+        """Counts of the untouched taxels (num_envs, P, N) uint8."""
+        return self._baseline.cpu().numpy()
+
+    def baseline_counts(self, ids: np.ndarray) -> torch.Tensor:
+        """The same of the named environments (m, P, N), on `device`."""
+        return self._baseline[torch.as_tensor(ids, device=self.device)]
 
     def reset(self, ids: np.ndarray, seed: int | np.ndarray | np.random.Generator = 0) -> None:
         """Start new episodes: clear the stages' memory and draw each sensor's own traits.
@@ -115,7 +125,7 @@ class PadSensors:
         return {
             "stages": stages,
             "parameters": {key: float(values[env]) for key, values in self._parameters.items()},
-            "baseline": self.baseline[env].copy(),
+            "baseline": self._baseline[env].clone(),
             **{name: float(values[env]) for name, values in scalars.items()},
         }
 
@@ -129,7 +139,7 @@ class PadSensors:
         self._time_s[env] = state["time_s"]
         self._stiffness_scale[env] = state["stiffness_scale"]
         self._gain_scale[env] = state["gain_scale"]
-        self.baseline[env] = state["baseline"]
+        self._baseline[env] = state["baseline"]
 
     def randomize(
         self,
@@ -228,7 +238,7 @@ class PadSensors:
             if not (stage.has_state or stage.stochastic):
                 state = {key: value[index] for key, value in self._state.get(stage.name, {}).items()}
                 x, _ = self._specialised(stage, index).step(x, state, frame)
-        self.baseline[ids] = x.flatten(2).clamp(0, 255).round().to(torch.uint8).cpu().numpy()
+        self._baseline[index] = x.flatten(2).clamp(0, 255).round().to(torch.uint8)
 
     def _tensor(self, array: ArrayLike) -> torch.Tensor:
         return torch.as_tensor(array, device=self.device).to(torch.float32)

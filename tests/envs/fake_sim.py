@@ -3,6 +3,7 @@
 from dataclasses import dataclass
 
 import numpy as np
+import torch
 
 from lerobot_vtrefine.embodiments import ALOHA
 
@@ -58,6 +59,12 @@ class FakeSim:
             "tactile": np.broadcast_to(stamp[:, None, None], (len(ids), 4, 384)).copy(),
             "tactile_baseline": np.zeros((len(ids), 4, 384), np.uint8),
             "depth_mm": np.full((len(ids), HEIGHT, WIDTH), 700, np.uint16) + stamp[:, None, None],
+        }
+
+    def observe_tensors(self, ids: np.ndarray) -> dict[str, torch.Tensor]:
+        frames = self.observe(ids)
+        return {key: torch.from_numpy(value) for key, value in frames.items() if key != "depth_mm"} | {
+            "depth_mm": torch.from_numpy(frames["depth_mm"].astype(np.int16))
         }
 
     def joint_state(self, ids: np.ndarray) -> np.ndarray:

@@ -2,9 +2,17 @@ import numpy as np
 import pytest
 import torch
 from fake_sim import HEIGHT, WIDTH, FakeSim
+from lerobot.envs.utils import preprocess_observation
 
-from lerobot_vtrefine.datasets.features import DEPTH_KEY, STATE_KEY, TACTILE_KEYS
-from lerobot_vtrefine.envs.decisions import LeRobotDecisionEnv
+from lerobot_vtrefine.datasets.features import (
+    AGE_KEY,
+    DEPTH_KEY,
+    STATE_KEY,
+    TACTILE_KEYS,
+    raw_to_env_observation,
+)
+from lerobot_vtrefine.embodiments import ALOHA
+from lerobot_vtrefine.envs.decisions import LeRobotDecisionEnv, _tensor, policy_columns
 from lerobot_vtrefine.envs.episodes import Episodes
 from lerobot_vtrefine.sim.task import FAILURES
 
@@ -18,15 +26,22 @@ def halve(actions: torch.Tensor) -> torch.Tensor:
     return actions / 2
 
 
-def make_env(num_envs: int, n_obs_steps: int = 2, preprocessor=keep_raw) -> LeRobotDecisionEnv:
-    return LeRobotDecisionEnv(Episodes(FakeSim(num_envs)), preprocessor, halve, n_obs_steps, max_decisions=3)
+@pytest.fixture(params=[False, True], ids=["host", "device"])
+def make_env(request):
+    """Makes environments whose frames are arrays of the host, or tensors."""
+
+    def make(num_envs: int, n_obs_steps: int = 2, preprocessor=keep_raw) -> LeRobotDecisionEnv:
+        episodes = Episodes(FakeSim(num_envs), on_device=request.param)
+        return LeRobotDecisionEnv(episodes, preprocessor, halve, n_obs_steps, max_decisions=3)
+
+    return make
 
 
 def chunk(num_envs: int, values: list[float]) -> torch.Tensor:
     return torch.tensor(values).view(1, -1, 1).expand(num_envs, -1, 16)
 
 
-def test_reset_fills_the_window_with_the_first_frame():
+def test_reset_fills_the_window_with_the_first_frame(make_env):
     env = make_env(3)
     batch, privileged = env.reset([4, 5, 6])
     assert batch[STATE_KEY].shape == (3, 2, 16)
@@ -38,7 +53,7 @@ def test_reset_fills_the_window_with_the_first_frame():
     assert privileged.dtype == torch.float32
 
 
-def test_chunk_runs_every_action_and_reads_only_the_window():
+def test_chunk_runs_every_action_and_reads_only_the_window(make_env):
     env = make_env(2)
     env.reset([1, 3])  # never succeed, time-out after 10 steps
     sim = env.episodes.sim
@@ -51,14 +66,14 @@ def test_chunk_runs_every_action_and_reads_only_the_window():
     assert step.privileged[:, 0].tolist() == [4.0, 4.0]
 
 
-def test_window_longer_than_a_chunk_keeps_older_frames():
+def test_window_longer_than_a_chunk_keeps_older_frames(make_env):
     env = make_env(1, n_obs_steps=3)
     env.reset([1])
     step = env.step_chunk(chunk(1, [2.0, 4.0]))
     assert step.obs[TACTILE_KEYS[0]][0, :, 0].tolist() == [1.0, 2.0, 3.0]
 
 
-def test_finished_environments_idle_until_they_are_reset():
+def test_finished_environments_idle_until_they_are_reset(make_env):
     env = make_env(3)
     env.reset([0, 1, 2])  # success after 3 steps, never, after 5
     first = env.step_chunk(chunk(3, [0.0] * 4))
@@ -79,7 +94,7 @@ def test_finished_environments_idle_until_they_are_reset():
     assert len(env.episodes.sim.stepped) == count  # nobody left to step
 
 
-def test_masked_reset_restarts_some_and_keeps_the_others_window():
+def test_masked_reset_restarts_some_and_keeps_the_others_window(make_env):
     env = make_env(2)
     env.reset([0, 1])
     before = env.step_chunk(chunk(2, [1.0] * 4))
@@ -90,7 +105,7 @@ def test_masked_reset_restarts_some_and_keeps_the_others_window():
         env.reset([8])
 
 
-def test_batches_of_earlier_decisions_stay_as_they_were():
+def test_batches_of_earlier_decisions_stay_as_they_were(make_env):
     env = make_env(2)
     env.reset([0, 1])
     first = env.step_chunk(chunk(2, [1.0] * 4)).obs
@@ -100,7 +115,7 @@ def test_batches_of_earlier_decisions_stay_as_they_were():
         assert torch.equal(first[key], value), key
 
 
-def test_preprocessor_sees_only_running_environments():
+def test_preprocessor_sees_only_running_environments(make_env):
     sizes = []
 
     def counting(batch: dict) -> dict:
@@ -117,9 +132,8 @@ def test_preprocessor_sees_only_running_environments():
 def test_decisions_see_the_same_cloud_as_lerobot_eval(monkeypatch, tiny_dataset):
     """The policy's own processors, on frames one at a time (lerobot-eval) and on windows (fine-tuning)."""
     from lerobot.datasets import LeRobotDatasetMetadata
-    from lerobot.envs.utils import preprocess_observation
 
-    from lerobot_vtrefine.datasets.features import CLOUD_KEY, raw_to_env_observation
+    from lerobot_vtrefine.datasets.features import CLOUD_KEY
     from lerobot_vtrefine.policies.vt_dp3.configuration_vt_dp3 import VtDp3Config
     from lerobot_vtrefine.policies.vt_dp3.processor_vt_dp3 import make_vt_dp3_pre_post_processors
 
@@ -135,7 +149,29 @@ def test_decisions_see_the_same_cloud_as_lerobot_eval(monkeypatch, tiny_dataset)
     assert torch.equal(batch[STATE_KEY][:, 1], single[STATE_KEY])
 
 
-def test_why_episodes_failed_is_told_by_reason(monkeypatch):
+def test_tensors_become_what_lerobot_makes_of_an_environments_arrays():
+    """LeRobot's own way through the host, as the reference."""
+    random = np.random.default_rng(0)
+    raw = {
+        "state": random.normal(size=(5, 16)).astype(np.float32),
+        "tactile": random.integers(0, 256, (5, 4, 384), np.uint8),
+        "tactile_baseline": random.integers(0, 256, (5, 4, 384), np.uint8),
+        "depth_mm": random.integers(0, 2001, (5, HEIGHT, WIDTH), np.uint16),
+        "camera_intrinsics": random.normal(size=(5, 4)).astype(np.float32),
+        "camera_pose": random.normal(size=(5, 7)).astype(np.float32),
+        "noise_level": np.full((5, 1), 3.0, np.float32),
+    }
+    expected = preprocess_observation(raw_to_env_observation(raw))
+    ages = expected.pop(AGE_KEY)  # of a robot's readings: no policy sees them, and a simulation has none
+    assert not ages.any()
+    ours = policy_columns({key: _tensor(value) for key, value in raw.items()}, ALOHA)
+    assert set(ours) == set(expected)
+    for key, value in expected.items():
+        assert ours[key].dtype == value.dtype, key
+        assert torch.equal(ours[key], value), key
+
+
+def test_why_episodes_failed_is_told_by_reason(make_env, monkeypatch):
     env = make_env(3)
     env.reset([1, 3, 5])
     sim = env.episodes.sim

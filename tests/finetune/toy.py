@@ -26,6 +26,7 @@ class ToyDenoiser(nn.Module):
     def forward(self, x: Tensor, t: Tensor, cond: Tensor) -> Tensor:
         frequencies = torch.exp(torch.linspace(0, -6, 8, dtype=x.dtype))
         angles = t.unsqueeze(1).to(x.dtype) * frequencies
+        cond = cond.repeat_interleave(len(x) // max(len(cond), 1), dim=0)
         features = torch.cat([x.flatten(1), angles.sin(), angles.cos(), cond], dim=1)
         return self.net(features).view_as(x)
 

@@ -13,7 +13,7 @@ from lerobot.datasets.dataset_reader import DatasetReader
 from lerobot.datasets.lerobot_dataset import LeRobotDataset
 from torch.utils.data import DataLoader
 
-from lerobot_vtrefine.datasets.features import RAW_KEYS, STATE_KEY
+from lerobot_vtrefine.datasets.features import BASELINE_KEYS, RAW_KEYS, STATE_KEY, TACTILE_KEYS
 from lerobot_vtrefine.lerobot_compat import fast_reader
 
 WINDOWS = {key: [-0.1, 0.0] for key in (*RAW_KEYS, STATE_KEY)} | {"action": [i / 10 for i in range(16)]}
@@ -35,6 +35,16 @@ def assert_same_item(first: dict[str, Any], second: dict[str, Any]) -> None:
             assert torch.equal(value, second[key]), key
         else:
             assert value == second[key], key
+
+
+def assert_same_batch(collated: dict[str, Any], at_once: dict[str, Any]) -> None:
+    """The same but for the type of counts, which stay bytes."""
+    for key in (*TACTILE_KEYS, *BASELINE_KEYS):
+        assert (collated[key].dtype, at_once[key].dtype) == (torch.int64, torch.uint8)
+    counts = {
+        key: value.long() for key, value in at_once.items() if getattr(value, "dtype", 0) == torch.uint8
+    }
+    assert_same_item(collated, at_once | counts)
 
 
 @pytest.mark.usefixtures("stock")
@@ -59,7 +69,7 @@ def test_items_are_bit_identical(tiny_dataset: Path, options: dict[str, Any]) ->
         fast[len(fast)]
     indices = [3, 0, len(slow) - 1, 11, 12]
     (slow_batch,), (fast_batch,) = (DataLoader(data, batch_sampler=[indices]) for data in (slow, fast))
-    assert_same_item(slow_batch, fast_batch)
+    assert_same_batch(slow_batch, fast_batch)
     assert len(fast.__getitems__(indices)) == 1, "a whole batch, not items"
     with pytest.raises(IndexError):
         fast.__getitems__([0, len(fast)])
@@ -76,7 +86,7 @@ def test_depth_that_does_not_fit_in_memory_is_decoded_per_item(
     for index in (0, 5, 35):
         assert_same_item(slow[index], fast[index])
     (slow_batch,), (fast_batch,) = (DataLoader(data, batch_sampler=[[5, 35]]) for data in (slow, fast))
-    assert_same_item(slow_batch, fast_batch)
+    assert_same_batch(slow_batch, fast_batch)
 
 
 @pytest.mark.usefixtures("stock")

@@ -6,6 +6,7 @@ import torch
 
 from lerobot_vtrefine.policies.vt_dp3.diffusion import (
     DiffusionProcess,
+    correlated_noise,
     denoise_prefix,
     deploy,
     sample_chain,
@@ -180,6 +181,33 @@ def test_chain_noise_is_floored_and_clipped():
         assert abs(noise.std() - 1) < 0.05
         density = torch.distributions.Normal(mean, std.clamp(min=0.1)).log_prob(chain.latents[:, step + 1])
         torch.testing.assert_close(chain.log_probs[:, step], density.clamp(-5, 2).flatten())
+
+
+def test_noise_of_all_steps_is_drawn_as_one_step_after_another_would():
+    process, correlation = DiffusionProcess(100, GRIDS["tail"]), 0.8
+    predict = oracle(process, torch.zeros(5, 8, 2))
+    latent = torch.randn(5, 8, 2)
+    floors = {"min_sampling_std": 0.03, "min_log_prob_std": 0.06}
+    generators = [torch.Generator().manual_seed(3) for _ in range(2)]
+    chain = sample_chain(
+        process,
+        predict,
+        latent,
+        num_tuned=10,
+        executed=slice(0, 4),
+        eta=1.0,
+        correlation=correlation,
+        generator=generators[0],
+        **floors,
+    )
+    for step in range(10):
+        mean, std = process.step(predict, latent, 5 + step, 1.0)
+        white = torch.randn(mean.shape, generator=generators[1]).clamp(-3, 3)
+        latent = mean + std.clamp(min=0.03) * correlated_noise(white, correlation)
+        log_prob = slice_log_prob(latent, mean, std.clamp(min=0.06), slice(0, 4), correlation)
+        assert torch.equal(chain.means[:, step], mean)
+        assert torch.equal(chain.latents[:, step + 1], latent)
+        assert torch.equal(chain.log_probs[:, step], log_prob)
 
 
 def test_log_prob_against_numpy_and_its_clamp():

@@ -1,5 +1,7 @@
 """Point encoder and denoisers: exact gradients, invariances, shapes."""
 
+import copy
+
 import pytest
 import torch
 from torch import nn
@@ -71,6 +73,42 @@ def test_denoisers_depend_on_all_inputs(denoiser: nn.Module) -> None:
         for other in (denoiser(x + 1, t, cond), denoiser(x, t + 1, cond), denoiser(x, t, cond + 1)):
             assert (other - eps).abs().flatten(1).amax(1).min() > 1e-4
         assert torch.allclose(denoiser(x[1:2], t[1:2], cond[1:2]), eps[1:2], atol=1e-5)
+
+
+@pytest.mark.parametrize(
+    "denoiser",
+    [UNetDenoiser(5, 12, (16, 32), 5, 16), MLPDenoiser(5, 16, 12, 32, 2, 16)],
+    ids=["unet", "mlp"],
+)
+@pytest.mark.parametrize("adapted", [False, True], ids=["plain", "adapted"])
+def test_neighbours_may_share_a_condition(denoiser: nn.Module, adapted: bool) -> None:
+    denoiser = copy.deepcopy(denoiser)
+    if adapted:  # as adapters do, a layer in place of the Linear, which adds to what that gives
+        for film in [part.film for part in denoiser.modules() if hasattr(part, "film")]:
+            film[1] = Adapted(film[1])
+    x, t, cond = torch.randn(6, 16, 5), torch.randint(100, (6,)), torch.randn(2, 12)
+    once, each = cond.clone().requires_grad_(), cond.clone().requires_grad_()
+    shared, whole = denoiser(x, t, once), denoiser(x, t, each.repeat_interleave(3, dim=0))
+    torch.testing.assert_close(shared, whole, atol=1e-5, rtol=1e-5)
+    for result in (shared, whole):
+        result.square().sum().backward()
+    torch.testing.assert_close(once.grad, each.grad, atol=1e-4, rtol=1e-4)
+
+
+class Adapted(nn.Module):
+    """A Linear and a matrix of low rank beside it."""
+
+    def __init__(self, linear: nn.Linear) -> None:
+        super().__init__()
+        self.linear = linear
+        self.low_rank = nn.Sequential(nn.Linear(linear.in_features, 1), nn.Linear(1, linear.out_features))
+
+    @property
+    def weight(self) -> torch.Tensor:
+        return self.linear.weight
+
+    def forward(self, x: torch.Tensor) -> torch.Tensor:
+        return self.linear(x) + self.low_rank(x)
 
 
 def test_unet_of_the_paper_has_the_size_that_was_counted() -> None:

@@ -13,7 +13,7 @@ from lerobot.envs.utils import preprocess_observation
 from lerobot.policies.factory import make_pre_post_processors
 from lerobot.policies.utils import prepare_observation_for_inference
 from lerobot.utils.feature_utils import dataset_to_policy_features
-from torch.utils.data import default_collate
+from torch.utils.data import DataLoader, default_collate
 
 from lerobot_vtrefine.datasets.features import (
     ACTION_KEY,
@@ -25,6 +25,7 @@ from lerobot_vtrefine.datasets.features import (
     raw_to_env_observation,
     raw_to_frame,
 )
+from lerobot_vtrefine.lerobot_compat import fast_reader
 from lerobot_vtrefine.observation import num_points
 from lerobot_vtrefine.policies.vt_dp3 import VtDp3Config, make_vt_dp3_pre_post_processors
 from lerobot_vtrefine.policies.vt_dp3.processor_vt_dp3 import MIN_RANGE, widen_narrow_ranges
@@ -46,6 +47,24 @@ def make_config(dataset: LeRobotDataset, **values: Any) -> VtDp3Config:
 def dataset(tiny_dataset: Path) -> LeRobotDataset:
     """The tiny dataset with the policy's windows."""
     return LeRobotDataset("local/tiny", root=tiny_dataset, delta_timestamps=WINDOWS)
+
+
+@pytest.mark.parametrize("fusion", ["cloud", "pads"])
+def test_batches_read_at_once_become_what_items_become(tiny_dataset: Path, fusion: str) -> None:
+    fast_reader.install()
+    dataset = LeRobotDataset("local/tiny", root=tiny_dataset, delta_timestamps=WINDOWS)
+    preprocess, _ = make_vt_dp3_pre_post_processors(make_config(dataset, fusion=fusion), dataset.meta.stats)
+    indices = [7, 0, 12]
+    (at_once,) = DataLoader(dataset, batch_sampler=[indices])
+    assert at_once[RAW_KEYS[0]].dtype == torch.uint8
+    batches = []
+    for frames in (default_collate([dataset[index] for index in indices]), at_once):
+        torch.manual_seed(5)
+        batches.append(preprocess(frames))
+    assert set(batches[0]) == set(batches[1])
+    for key, value in batches[0].items():
+        if isinstance(value, torch.Tensor):
+            assert torch.equal(value, batches[1][key]), key
 
 
 @pytest.mark.parametrize("noise_level", [0.0, 3.0])

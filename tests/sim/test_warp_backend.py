@@ -7,6 +7,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+import torch
 
 from lerobot_vtrefine.sim.backends import get_backend
 from lerobot_vtrefine.sim.config import (
@@ -77,6 +78,23 @@ def test_the_same_episode_gives_the_same_readings(pair):
     assert (away > 1).mean() < 1e-3
     np.testing.assert_allclose(ours["state"], truth["state"], atol=1e-5)
     np.testing.assert_allclose(warp.privileged(), single.privileged(), atol=5e-3)
+
+
+def test_frames_as_tensors_are_those_of_the_host(pair):
+    some = np.array([0, 2])
+
+    def start(sim):  # every reading has noise of its own
+        sim.reset(EVERYONE, EVERYONE)
+        sim.step(sim.command_targets() + 0.01)
+        return sim
+
+    for sim in pair:
+        host, tensors = start(sim).observe(some), start(sim).observe_tensors(some)
+        assert set(tensors) == set(host)
+        assert all(values.device == torch.device(sim.device) for values in tensors.values())
+        assert tensors["depth_mm"].dtype == torch.int16
+        for name, values in host.items():
+            np.testing.assert_array_equal(tensors[name].numpy(), values, err_msg=name)
 
 
 def test_the_same_state_gives_the_same_wrench_and_poses_on_every_pad(pair):

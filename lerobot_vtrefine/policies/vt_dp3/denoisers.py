@@ -1,13 +1,16 @@
 """Noise predictors eps(x, t, cond): the paper's FiLM U-Net and a small FiLM residual MLP.
 
 Shapes: ``B`` batch, ``H`` horizon, ``D`` action dimension, ``C`` condition. Both are called as
-``denoiser(x (B, H, D), t (B,) long, cond (B, C)) -> (B, H, D)``. FiLM is one Linear per block, as in DP3.
+``denoiser(x (B, H, D), t (B,) long, cond (b, C)) -> (B, H, D)``, where each condition belongs to ``B / b``
+neighbouring rows: noise draws of one observation, or denoising steps of one decision. FiLM is one Linear per
+block, as in DP3.
 """
 
 import math
 
 import torch
 from torch import Tensor, nn
+from torch.nn import functional
 
 GROUPS = 8
 DENOISERS = ("unet", "mlp")
@@ -30,9 +33,24 @@ class TimeEmbedding(nn.Module):
         return self.mlp(torch.cat([angle.sin(), angle.cos()], dim=-1))
 
 
-def _film_layer(cond_dim: int, channels: int) -> nn.Sequential:
-    """Condition -> scale and bias of ``channels`` features."""
-    return nn.Sequential(nn.Mish(), nn.Linear(cond_dim, 2 * channels))
+def _film_layer(cond_dim: int, time_dim: int, channels: int) -> nn.Sequential:
+    """Time features and condition side by side -> scale and bias of ``channels`` features."""
+    return nn.Sequential(nn.Mish(), nn.Linear(time_dim + cond_dim, 2 * channels))
+
+
+def _modulation(film: nn.Sequential, time: Tensor, cond: Tensor) -> Tensor:
+    """A FiLM layer of time (B, T) and cond (b, C) -> (B, 2 * channels); a condition's share is computed once
+    for the rows that it belongs to.
+    """
+    if len(cond) == len(time):
+        return film(torch.cat([time, cond], dim=-1))
+    linear, times = film[1], len(time) // len(cond)
+    if type(linear) is not nn.Linear:  # an adapter (--peft.*) takes whole rows
+        return film(torch.cat([time, cond.repeat_interleave(times, dim=0)], dim=-1))
+    of_time, of_cond = linear.weight.split([time.shape[1], cond.shape[1]], dim=1)
+    own = functional.linear(functional.mish(time), of_time, linear.bias)
+    shared = functional.linear(functional.mish(cond), of_cond)
+    return (own.unflatten(0, (-1, times)) + shared.unsqueeze(1)).flatten(0, 1)
 
 
 def _conv_block(channels_in: int, channels_out: int, kernel: int) -> nn.Sequential:
@@ -46,17 +64,19 @@ def _conv_block(channels_in: int, channels_out: int, kernel: int) -> nn.Sequenti
 class ResidualBlock1d(nn.Module):
     """Two convolutions with FiLM after the first, and a skip connection."""
 
-    def __init__(self, channels_in: int, channels_out: int, cond_dim: int, kernel: int) -> None:
+    def __init__(
+        self, channels_in: int, channels_out: int, cond_dim: int, time_dim: int, kernel: int
+    ) -> None:
         super().__init__()
         self.first = _conv_block(channels_in, channels_out, kernel)
         self.second = _conv_block(channels_out, channels_out, kernel)
-        self.film = _film_layer(cond_dim, channels_out)
+        self.film = _film_layer(cond_dim, time_dim, channels_out)
         same = channels_in == channels_out
         self.skip = nn.Identity() if same else nn.Conv1d(channels_in, channels_out, 1)
 
-    def forward(self, x: Tensor, cond: Tensor) -> Tensor:
-        """x (B, channels_in, H), cond (B, C) -> (B, channels_out, H)."""
-        scale, bias = self.film(cond).unsqueeze(-1).chunk(2, dim=1)
+    def forward(self, x: Tensor, time: Tensor, cond: Tensor) -> Tensor:
+        """x (B, channels_in, H), time (B, T), cond (b, C) -> (B, channels_out, H)."""
+        scale, bias = _modulation(self.film, time, cond).unsqueeze(-1).chunk(2, dim=1)
         return self.second(self.first(x) * scale + bias) + self.skip(x)
 
 
@@ -71,13 +91,12 @@ class UNetDenoiser(nn.Module):
     ) -> None:
         super().__init__()
         self.time = TimeEmbedding(time_dim)
-        context = cond_dim + time_dim
 
         def pair(channels_in: int, channels_out: int) -> nn.ModuleList:
             return nn.ModuleList(
                 [
-                    ResidualBlock1d(channels_in, channels_out, context, kernel),
-                    ResidualBlock1d(channels_out, channels_out, context, kernel),
+                    ResidualBlock1d(channels_in, channels_out, cond_dim, time_dim, kernel),
+                    ResidualBlock1d(channels_out, channels_out, cond_dim, time_dim, kernel),
                 ]
             )
 
@@ -96,38 +115,38 @@ class UNetDenoiser(nn.Module):
 
     def forward(self, x: Tensor, t: Tensor, cond: Tensor) -> Tensor:
         """See the module's docstring."""
-        context = torch.cat([self.time(t), cond], dim=-1)
+        time = self.time(t)
         x = x.transpose(1, 2)
         skips: list[Tensor] = []
         for index, stage in enumerate(self.down):
-            x = _apply(stage, x, context)
+            x = _apply(stage, x, time, cond)
             skips.append(x)
             if index < len(self.shrink):
                 x = self.shrink[index](x)
-        x = _apply(self.middle, x, context)
+        x = _apply(self.middle, x, time, cond)
         for stage, grow in zip(self.up, self.grow, strict=True):
-            x = grow(_apply(stage, torch.cat([x, skips.pop()], dim=1), context))
+            x = grow(_apply(stage, torch.cat([x, skips.pop()], dim=1), time, cond))
         return self.head(x).transpose(1, 2)
 
 
-def _apply(blocks: nn.Module, x: Tensor, context: Tensor) -> Tensor:
+def _apply(blocks: nn.Module, x: Tensor, time: Tensor, cond: Tensor) -> Tensor:
     for block in blocks.children():
-        x = block(x, context)
+        x = block(x, time, cond)
     return x
 
 
 class ResidualBlock(nn.Module):
     """Layer norm with FiLM, then a two-layer MLP, added to the input."""
 
-    def __init__(self, width: int, cond_dim: int) -> None:
+    def __init__(self, width: int, cond_dim: int, time_dim: int) -> None:
         super().__init__()
         self.norm = nn.LayerNorm(width)
-        self.film = _film_layer(cond_dim, width)
+        self.film = _film_layer(cond_dim, time_dim, width)
         self.mlp = nn.Sequential(nn.Linear(width, width), nn.Mish(), nn.Linear(width, width))
 
-    def forward(self, x: Tensor, cond: Tensor) -> Tensor:
-        """x (B, width), cond (B, C) -> (B, width)."""
-        scale, bias = self.film(cond).chunk(2, dim=-1)
+    def forward(self, x: Tensor, time: Tensor, cond: Tensor) -> Tensor:
+        """x (B, width), time (B, T), cond (b, C) -> (B, width)."""
+        scale, bias = _modulation(self.film, time, cond).chunk(2, dim=-1)
         return x + self.mlp(self.norm(x) * (1 + scale) + bias)
 
 
@@ -145,7 +164,7 @@ class MLPDenoiser(nn.Module):
         super().__init__()
         self.time = TimeEmbedding(time_dim)
         self.enter = nn.Linear(horizon * action_dim, width)
-        blocks = [ResidualBlock(width, cond_dim + time_dim) for _ in range(num_blocks)]
+        blocks = [ResidualBlock(width, cond_dim, time_dim) for _ in range(num_blocks)]
         self.blocks = nn.ModuleList(blocks)
         self.head = nn.Sequential(nn.LayerNorm(width), nn.Linear(width, horizon * action_dim))
         self.skip = nn.Linear(time_dim, horizon * action_dim)
@@ -153,5 +172,5 @@ class MLPDenoiser(nn.Module):
     def forward(self, x: Tensor, t: Tensor, cond: Tensor) -> Tensor:
         """See the module's docstring."""
         time = self.time(t)
-        hidden = _apply(self.blocks, self.enter(x.flatten(1)), torch.cat([time, cond], dim=-1))
+        hidden = _apply(self.blocks, self.enter(x.flatten(1)), time, cond)
         return (self.head(hidden) + self.skip(time) * x.flatten(1)).view_as(x)

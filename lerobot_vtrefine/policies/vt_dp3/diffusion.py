@@ -10,7 +10,7 @@ schedule), Ren et al. 2024 (DPPO, appendix on noise floors).
 """
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from typing import NamedTuple
 
@@ -98,7 +98,10 @@ class DiffusionProcess:
 
     def times(self, positions: Tensor) -> Tensor:
         """Training steps (B,) long of grid positions (B,) long."""
-        return torch.tensor(self.timesteps, device=positions.device)[positions]
+        key = (positions.device, torch.long)
+        if key not in self._cache:  # an upload would make every step wait for the device
+            self._cache[key] = torch.tensor(self.timesteps, device=positions.device)
+        return self._cache[key][positions]
 
     def posterior(self, x: Tensor, eps: Tensor, positions: Tensor, eta: float) -> tuple[Tensor, Tensor]:
         """Mean (B, H, D) and standard deviation (B, 1, 1) of the next latent.
@@ -187,15 +190,18 @@ def sample_chain(
     mean + max(sigma, min_sampling_std) * clip(N(0, 1), ±3); its log-probability uses
     max(sigma, min_log_prob_std). ``correlation`` of the noise from one action of the chunk to the next.
     """
-    latents, log_probs, means = [latent], [], []
-    for position in range(process.num_steps - num_tuned, process.num_steps):
+    white = clipped_noise((num_tuned, *latent.shape), latent, generator)
+    noise = correlated_noise(white.flatten(0, 1), correlation).view_as(white)
+    latents, means, stds = [latent], [], []
+    for step, position in enumerate(range(process.num_steps - num_tuned, process.num_steps)):
         mean, std = process.step(predict_noise, latent, position, eta)
-        noise = correlated_noise(_clipped_noise(mean, generator), correlation)
-        latent = mean + std.clamp(min=min_sampling_std) * noise
-        log_probs.append(slice_log_prob(latent, mean, std.clamp(min=min_log_prob_std), executed, correlation))
+        latent = mean + std.clamp(min=min_sampling_std) * noise[step]
         latents.append(latent)
         means.append(mean)
-    return Chain(torch.stack(latents, dim=1), torch.stack(log_probs, dim=1), torch.stack(means, dim=1))
+        stds.append(std.clamp(min=min_log_prob_std))
+    rows = [torch.cat(parts) for parts in (latents[1:], means, stds)]  # of all steps at once: few kernels
+    log_probs = slice_log_prob(*rows, executed, correlation).view(num_tuned, -1).T
+    return Chain(torch.stack(latents, dim=1), log_probs.contiguous(), torch.stack(means, dim=1))
 
 
 @torch.no_grad()
@@ -235,10 +241,11 @@ def deploy(
     for position in range(process.num_steps - num_tuned, process.num_steps):
         latent, std = process.step(predict_noise, latent, position, eta)
         if eta > 0:
-            latent = latent + std * _clipped_noise(latent, generator)
+            latent = latent + std * clipped_noise(latent.shape, latent, generator)
     return latent
 
 
-def _clipped_noise(like: Tensor, generator: torch.Generator | None) -> Tensor:
-    noise = torch.randn(like.shape, generator=generator, device=like.device, dtype=like.dtype)
+def clipped_noise(shape: Sequence[int], like: Tensor, generator: torch.Generator | None) -> Tensor:
+    """Standard normal noise of a shape, within ±``NOISE_CLIP``; device and type as of ``like``."""
+    noise = torch.randn(shape, generator=generator, device=like.device, dtype=like.dtype)
     return noise.clamp(-NOISE_CLIP, NOISE_CLIP)

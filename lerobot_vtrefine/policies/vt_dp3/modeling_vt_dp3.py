@@ -167,7 +167,7 @@ class VtDp3Policy(PreTrainedPolicy):
             )
         model = self.online or self.model
         draws = self.config.noise_draws if self.training else 1
-        cond = model.encode(batch).repeat_interleave(draws, dim=0)
+        cond = model.encode(batch)
         clean = batch[ACTION_KEY].repeat_interleave(draws, dim=0)
         noise = torch.randn_like(clean)
         t = torch.randint(self.config.num_train_timesteps, (len(clean),), device=clean.device)

@@ -1,0 +1,183 @@
+"""Where an iteration of DPPO spends its time, beside the environment alone.
+
+    python scripts/profile_finetuning.py --device=cuda --worlds=1024,4096
+
+The tuned policy that comes with the package plays its own task; --policy takes another checkpoint. It asks
+for nothing that is new, so that an earlier commit can be measured in the same run:
+
+    git worktree add /tmp/before COMMIT
+    PYTHONPATH=/tmp/before python scripts/profile_finetuning.py --device=cuda
+
+"environment" is an episode of holding still in all worlds, with every frame read at every control step. Parts
+are measured in a further rollout that waits for the device before and after each: they add up to more than a
+rollout.
+"""
+
+import argparse
+import dataclasses
+import functools
+import json
+import time
+from collections import defaultdict
+from collections.abc import Callable, Generator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import draccus
+import numpy as np
+import torch
+from lerobot.envs import EnvConfig
+from lerobot.policies.factory import make_pre_post_processors
+
+import lerobot_vtrefine
+from lerobot_vtrefine.cli.errors import run_cli
+from lerobot_vtrefine.envs import VtRefineEnvConfig
+from lerobot_vtrefine.envs.decisions import LeRobotDecisionEnv, make_decision_env
+from lerobot_vtrefine.envs.episodes import Episodes
+from lerobot_vtrefine.envs.factory import make_episodes
+from lerobot_vtrefine.files import read_yaml
+from lerobot_vtrefine.finetune import dppo
+from lerobot_vtrefine.finetune.config import TrustRegionDppo
+from lerobot_vtrefine.finetune.pipeline import make_agent
+from lerobot_vtrefine.finetune.protocols import Agent
+from lerobot_vtrefine.policies.vt_dp3.modeling_vt_dp3 import VtDp3Policy
+from lerobot_vtrefine.sim.simulation import InsertionSim
+
+ROOT = Path(__file__).parents[1]
+POLICY = ROOT / "lerobot_vtrefine" / "assets" / "policies" / "square_grasped_1mm"
+TASK = ROOT / "configs" / "env" / "square_grasped_1mm.yaml"
+PARTS: tuple[tuple[str, Any, str], ...] = (
+    ("reset", InsertionSim, "reset"),
+    ("control steps", Episodes, "step"),
+    ("of these, sensors", Episodes, "read"),
+    ("windows", LeRobotDecisionEnv, "_push"),
+    ("preprocessing", LeRobotDecisionEnv, "_update_batch"),
+    ("privileged state", LeRobotDecisionEnv, "_privileged"),
+    ("metrics", LeRobotDecisionEnv, "_info"),
+    ("encoder", Agent, "conditions"),
+    ("denoising, frozen", dppo, "denoise_prefix"),
+    ("denoising, tuned", dppo, "explore"),
+)
+
+
+@contextmanager
+def timed_parts(device: torch.device) -> Generator[dict[str, float]]:
+    """Seconds of every part while this lasts."""
+    seconds: dict[str, float] = defaultdict(float)
+
+    def watched(name: str, work: Callable[..., Any]) -> Callable[..., Any]:
+        @functools.wraps(work)
+        def run(*args: Any, **kwargs: Any) -> Any:
+            started = now(device)
+            try:
+                return work(*args, **kwargs)
+            finally:
+                seconds[name] += now(device) - started
+
+        return run
+
+    originals = [(owner, name, getattr(owner, name)) for _, owner, name in PARTS]
+    for (title, owner, name), (_, _, work) in zip(PARTS, originals, strict=True):
+        setattr(owner, name, watched(title, work))
+    try:
+        yield seconds
+    finally:
+        for owner, name, work in originals:
+            setattr(owner, name, work)
+
+
+def now(device: torch.device) -> float:
+    """Seconds, once the device has done all it was given."""
+    if device.type == "cuda":
+        torch.cuda.synchronize(device)
+    return time.perf_counter()
+
+
+def environment_seconds(task: VtRefineEnvConfig, worlds: int, device: torch.device) -> tuple[float, float]:
+    """Of a reset, and of an episode in which everyone holds still."""
+    episodes = make_episodes(task, worlds)
+    hold = np.zeros(0)
+    for first in (0, worlds):  # the first round compiles and records
+        started = now(device)
+        episodes.reset(episodes.ids, first + episodes.ids)
+        ready = now(device)
+        hold = episodes.sim.command_targets()
+        for _ in range(episodes.sim.episode_steps):
+            episodes.step(hold)
+        done = now(device)
+    return ready - started, done - ready
+
+
+def profile(args: argparse.Namespace, worlds: int) -> dict[str, Any]:
+    """One row."""
+    device = torch.device(args.device)
+    task = draccus.decode(EnvConfig, read_yaml(args.task)["env"])
+    assert isinstance(task, VtRefineEnvConfig)
+    task.backend, task.warp = "warp", dataclasses.replace(task.warp, device=args.device)
+    reset_s, env_s = environment_seconds(task, worlds, device)
+    policy = VtDp3Policy.from_pretrained(args.policy).to(device)
+    policy.config.device = str(device)
+    overrides = {"device_processor": {"device": str(device)}}
+    processors = make_pre_post_processors(policy.config, str(args.policy), preprocessor_overrides=overrides)
+    cfg = TrustRegionDppo(num_envs=worlds, encoder="frozen", critic_warmup=0, decisions=args.decisions)
+    agent = make_agent(policy, cfg)
+    windows = policy.config.n_obs_steps, policy.config.n_action_steps
+    env = make_decision_env(task, worlds, *processors, *windows)
+    state = dppo.TrainState.create(agent, cfg, env.privileged_dim, seed=0)
+    rollouts, updates, steps, count = [], [], [], 0
+    for iteration in range(args.iterations + 1):
+        first = iteration * worlds
+        started = now(device)
+        rollout = dppo.collect(env, agent, cfg, state.generator, range(first, first + worlds))
+        collected = now(device)
+        state.critic.update_moments(rollout.privileged[:-1][rollout.active])
+        count = int(dppo.update(rollout, agent, state, cfg)["updates"])
+        updates.append(now(device) - collected)
+        rollouts.append(collected - started)
+        steps.append(float(rollout.active.sum()) * windows[1])
+        state.iteration += 1
+    fresh = range((args.iterations + 1) * worlds, (args.iterations + 2) * worlds)
+    with timed_parts(device) as parts:
+        dppo.collect(env, agent, cfg, state.generator, fresh)
+    rollout_s, update_s = (float(np.median(times[1:])) for times in (rollouts, updates))
+    return {
+        "worlds": worlds,
+        "environment_s": env_s,
+        "environment_reset_s": reset_s,
+        "rollout_s": rollout_s,
+        "update_s": update_s,
+        "updates": count,
+        "iteration_s": rollout_s + update_s,
+        "valid_steps_per_s": float(np.median(steps[1:])) / (rollout_s + update_s),
+        "success": float(rollout.success.float().mean()),
+        "parts_s": {title: round(parts[title], 3) for title, _, _ in PARTS},
+    }
+
+
+@run_cli
+def main() -> int:
+    """Prints a JSON object per number of worlds."""
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument("--device", default="cpu", help="of simulation and policy: cpu or cuda")
+    parser.add_argument("--worlds", default="1024,4096", help="numbers of worlds")
+    parser.add_argument("--iterations", type=int, default=4, help="measured, after one to warm up")
+    parser.add_argument("--decisions", type=int, default=0, help="of a rollout; 0: whole episodes")
+    parser.add_argument("--policy", type=Path, default=POLICY, help="a vt_dp3 checkpoint's folder")
+    parser.add_argument("--task", type=Path, default=TASK, help="a file as in configs/env")
+    parser.add_argument("--json", type=Path, help="where to write the rows, too")
+    args = parser.parse_args()
+    print(f"measuring {Path(lerobot_vtrefine.__file__).parent}", flush=True)
+    rows = []
+    for worlds in args.worlds.split(","):
+        rows.append(profile(args, int(worlds)))
+        print(json.dumps(rows[-1], indent=2), flush=True)
+    if args.json is not None:
+        args.json.write_text(json.dumps(rows, indent=2) + "\n", encoding="utf-8")
+    return 0
+
+
+if __name__ == "__main__":
+    raise SystemExit(main())
