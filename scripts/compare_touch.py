@@ -4,9 +4,11 @@
     .venv/bin/python scripts/compare_touch.py --seeds 0 1 2 --settings demo tight occluded slip short_chunk
     .venv/bin/python scripts/compare_touch.py --seeds 1 2 3 --settings worlds_round worlds_square --jobs 4
 
-The settings worlds_* are the recipe of docs/learning.md and need GPUs; worlds_key needs an encoder of its own
-first, in outputs/information_key: ``vtrefine-information --config_path=vtrefine:key_grasped_1mm`` with the
-flags that docs/learning.md gives.
+The settings worlds_*, and the touch tasks of docs/task.md with their twins, are the recipe of
+docs/learning.md and need GPUs. All but worlds_round and worlds_square need an encoder of their own first:
+a touch task or twin in outputs/information_TASK, where scripts/judge_tasks.py leaves it, worlds_key in
+outputs/information_key: ``vtrefine-information --config_path=vtrefine:key_grasped_1mm`` with the flags that
+docs/learning.md gives.
 
 Every run is one ``vtrefine-demo`` in one of the settings below; flags that this script does not know are
 passed on to it, after the setting's, for example ``--num_demos=40``. On a machine with many cores ``--jobs``
@@ -28,6 +30,7 @@ from pathlib import Path
 from typing import Any
 
 import torch
+import yaml
 
 from lerobot_vtrefine.cli.pipeline.demo_config import default_env
 from lerobot_vtrefine.cli.report.statistics import mean_interval, proportion
@@ -87,6 +90,19 @@ WORLDS: dict[str, dict[str, dict[str, Any]]] = {
     },
 }
 """Tasks for MANY_WORLDS."""
+TOUCH_TASKS = ("key_turned", "cross_gentle", "d_occluded")
+"""Files of configs/env; each has a twin ``TASK_twin``, whose parts lie in the hands as the hands expect."""
+TASK_FILES = Path(__file__).parents[1] / "configs" / "env"
+
+
+def touch_setting(task: str) -> dict[str, dict[str, Any]]:
+    """A touch task or a twin for MANY_WORLDS, with the encoder of its own study."""
+    env = yaml.safe_load((TASK_FILES / f"{task}.yaml").read_text(encoding="utf-8"))["env"]
+    return {"env": env, "policy": {"pretrained_encoder": f"outputs/information_{task}"}}
+
+
+for _task in TOUCH_TASKS:
+    WORLDS |= {name: touch_setting(name) for name in (_task, f"{_task}_twin")}
 
 POLL_S = 0.5
 

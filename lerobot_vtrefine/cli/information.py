@@ -20,6 +20,7 @@ from lerobot_vtrefine.envs import VtRefineEnvConfig
 from lerobot_vtrefine.folders import beside, put_in_place
 from lerobot_vtrefine.information.estimator import SENSES
 from lerobot_vtrefine.information.page import render_page
+from lerobot_vtrefine.information.quantities import unit_of
 from lerobot_vtrefine.information.study import Effort, Study, save_keeper, study, write
 
 
@@ -59,21 +60,25 @@ class Bars:
         bar.update(done)
 
 
+SHOWN = ("plug_in_socket_y", "plug_in_hand_x", "plug_in_hand_rx")
+"""Quantities that the terminal shows: where the plug is over the hole, and how it lies in its hand."""
+
+
 def summary(found: Study) -> str:
     """A few lines for the terminal."""
-    lines = ["error of the plug's place in the socket across its axis, held-out episodes:"]
-    name = "plug_in_socket_y"
-    lines.append(f"  {'nothing seen':<32} {found.prior[name]:6.2f} mm")
+    heads = [f"{name.replace('_', ' ')} [{unit_of(name)[1]}]" for name in SHOWN]
+    lines = ["errors on held-out episodes (RMS):", "  " + " " * 32 + "".join(f"{head:>24}" for head in heads)]
+    lines.append(f"  {'nothing seen':<32}" + "".join(f"{found.prior[name]:>24.2f}" for name in SHOWN))
     for finding in found.findings:
-        value, low, high = finding.rms[name]
         label = f"{finding.senses}, {finding.history} frame{'s' * (finding.history > 1)}"
+        errors = ("{:.2f} [{:.2f}, {:.2f}]".format(*finding.rms[name]) for name in SHOWN)
         success = (
             "" if finding.success is None else f"   expert: {finding.success[0]} of {finding.success[1]}"
         )
-        lines.append(f"  {label:<32} {value:6.2f} mm [{low:.2f}, {high:.2f}]{success}")
+        lines.append(f"  {label:<32}" + "".join(f"{error:>24}" for error in errors) + success)
     if found.true_success is not None:
         lines.append(f"  expert that knows the truth: {found.true_success[0]} of {found.true_success[1]}")
-    return "\n".join([*lines, found.verdict])
+    return "\n".join([*lines, found.verdict.reason])
 
 
 @parser.wrap()

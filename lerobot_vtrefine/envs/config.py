@@ -24,7 +24,7 @@ from lerobot_vtrefine.sim.config import (
 from lerobot_vtrefine.sim.reality import Reality, load_reality
 
 VECTORIZATIONS = ("native", "gym")
-ABLATIONS = ("none", "touch", "vision")
+ABLATIONS = ("none", "touch", "touch_shuffled", "touch_other", "vision")
 RENDERER = "mujoco_warp"
 SMALLEST_PX = 16
 """Height and width that video encoders take."""
@@ -76,9 +76,10 @@ class VtRefineEnvConfig(EnvConfig):
     vectorization: str = "native"
     """native: one batched simulation. gym: one per environment, sync or async by --eval.use_async_envs."""
     ablate: str = "none"
-    """none, or touch or vision, replaced by its mean over ``ablate_dataset``."""
+    """none; touch or vision: replaced by its mean over ``ablate_dataset``; touch_other: touch of another
+    episode, out of ``ablate_dataset``; touch_shuffled: touch of the same episode, out of order."""
     ablate_dataset: Path | None = None
-    """Root of the LeRobot dataset whose mean frame the ablation shows."""
+    """Root of the LeRobot dataset whose mean frame, or touch, the ablation shows."""
     rgb: bool = False
     """Colour images of the camera's view too, as policies without a depth camera want them."""
     rgb_size: tuple[int, int] = (120, 160)
@@ -99,7 +100,7 @@ class VtRefineEnvConfig(EnvConfig):
         _check_choice("ablate", self.ablate, ABLATIONS)
         _check_choice("backend", self.backend, BACKENDS)
         check_control_rate("--env.fps", self.fps)
-        if self.ablate != "none" and self.ablate_dataset is None:
+        if self.ablate not in ("none", "touch_shuffled") and self.ablate_dataset is None:
             raise ValueError(
                 f"--env.ablate={self.ablate} needs --env.ablate_dataset, the policy's training data"
             )

@@ -19,6 +19,8 @@ if TYPE_CHECKING:
 Array = np.ndarray[Any, np.dtype[Any]]
 Raw = dict[str, Any]
 """Raw frames (m, ...) by name: arrays, or tensors."""
+Ablation = Callable[[Raw, Array, Array, Array], Raw]
+"""Raw frames (m, ...), their environments (m,), and their episodes' seeds and steps (m,) -> what is shown."""
 
 
 @dataclass
@@ -52,7 +54,7 @@ class Episodes:
     def __init__(
         self,
         sim: "InsertionSim",
-        ablate: Callable[[Raw], Raw] | None = None,
+        ablate: Ablation | None = None,
         log: EpisodeLog | None = None,
         colour: Callable[[Array], Array] | None = None,
         on_device: bool = False,
@@ -136,7 +138,9 @@ class Episodes:
         frames["noise_level"] = np.full((count, 1), self.sim.noise_level, np.float32)
         if self._colour is not None:
             frames["rgb"] = self._colour(ids)
-        return frames if self._ablate is None else self._ablate(frames)
+        if self._ablate is None:
+            return frames
+        return self._ablate(frames, ids, self.seeds[ids], self.steps[ids])
 
     def _collect(self, finished: Array) -> None:
         """Keep (and log) the metrics of episodes that just ended."""

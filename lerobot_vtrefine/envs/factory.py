@@ -12,7 +12,7 @@ from lerobot.envs.utils import _LazyAsyncVectorEnv, freeze_after_episode_end
 from lerobot_vtrefine.envs.ablation import make_ablation
 from lerobot_vtrefine.envs.config import VtRefineEnvConfig
 from lerobot_vtrefine.envs.episode_log import EpisodeLog
-from lerobot_vtrefine.envs.episodes import Episodes, Raw
+from lerobot_vtrefine.envs.episodes import Ablation, Episodes
 from lerobot_vtrefine.envs.evaluation_note import write_note
 from lerobot_vtrefine.envs.rendering import EvalVideos
 
@@ -61,7 +61,7 @@ def make_episodes_on_device(config: VtRefineEnvConfig, num_envs: int) -> Episode
     return Episodes(sim, ablation, _log(config), on_device=ablation is None)
 
 
-def _ablation(config: VtRefineEnvConfig) -> Callable[[Raw], Raw] | None:
+def _ablation(config: VtRefineEnvConfig) -> Ablation | None:
     return make_ablation(config.ablate, config.ablate_dataset, config.body)
 
 

@@ -1,13 +1,15 @@
 """Frames with the truth beside them: an expert that misjudges where things are, in many worlds.
 
 Its errors are larger than those of demonstrations, so that plugs land beside the hole, on its rim and askew:
-the contacts that a policy meets while it learns. Shapes: ``E`` episodes, ``T`` frames of the longest.
+the contacts that a policy meets while it learns. It also misjudges how the parts lie in the hands, by up to
+as much as they may have slipped: where it brings the hands would otherwise tell the joints what is hidden.
+Shapes: ``E`` episodes, ``T`` frames of the longest, ``m`` worlds.
 """
 
 from collections.abc import Callable
 from dataclasses import dataclass
 from math import radians
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import torch
@@ -22,6 +24,11 @@ from lerobot_vtrefine.information.quantities import NAMES, Grasps, Relative, obs
 from lerobot_vtrefine.policies.vt_dp3 import VisuoTactileProcessorStep
 from lerobot_vtrefine.sim.demonstrations import Degradation
 from lerobot_vtrefine.sim.expert import ScriptedExpert
+from lerobot_vtrefine.sim.ik import hand_poses
+from lerobot_vtrefine.sim.poses import Poses
+
+if TYPE_CHECKING:
+    from lerobot_vtrefine.sim.simulation import InsertionSim
 
 ERRORS = Degradation(
     lateral_std_m=2.5e-3,
@@ -67,6 +74,39 @@ class Frames:
         return episode, frame
 
 
+class MisjudgedHolds:
+    """Where parts seem to be to one who is wrong about how they lie in the hands, throughout an episode.
+
+    Each episode draws the size of its errors, from none to the range of the task's slip, and the errors.
+    """
+
+    STREAM = 0x401D
+
+    def __init__(self, sim: "InsertionSim") -> None:
+        self._sim = sim
+        self._error = Poses.identity(sim.num_envs, 2)
+
+    def draw(self, ids: np.ndarray) -> None:
+        """New errors for worlds ``ids`` (m,), a function of their episodes' seeds."""
+        start = self._sim.config.grasped
+        for env in ids:
+            rng = np.random.default_rng([int(self._sim.seeds[env]), self.STREAM])
+            ranges = np.array([*start.slip_xz_m, start.slip_rad])
+            x, z, turn = ranges[:, None] * rng.uniform() * rng.uniform(-1, 1, (3, 2))
+            none = np.zeros(2)
+            slip, turned = np.stack([x, none, z], -1), np.stack([none, turn, none], -1)
+            self._error.assign(env, Poses.from_vectors(slip, turned))
+
+    def part_poses(self, ids: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Believed poses of plug and socket, each (m, 7)."""
+        q = np.asarray(self._sim.joint_state(ids), float)
+        hands = Poses(*hand_poses(self._sim.scene.embodiment, q))
+        plug, socket = self._sim.part_poses(ids)
+        parts = Poses.from_quaternions(np.stack([socket, plug], 1))
+        socket, plug = (hands @ self._error[ids] @ hands.inverse() @ parts).quaternions().swapaxes(0, 1)
+        return plug, socket
+
+
 def view_columns(raw: dict[str, Any], views: Views, device: torch.device) -> dict[str, Tensor]:
     """``VIEW/column`` (m, ...) of a raw frame (m, ...), and ``state`` (m, J)."""
     frame = preprocess_observation(raw_to_env_observation(raw))
@@ -90,10 +130,11 @@ def collect_frames(
 ) -> Frames:
     """Frames of at least ``num_episodes`` episodes, ``num_envs`` at a time; ``told`` hears of every batch."""
     episodes = make_episodes(config, num_envs)
-    expert = ScriptedExpert(episodes.sim, ERRORS)
+    holds = MisjudgedHolds(episodes.sim)
+    expert = ScriptedExpert(episodes.sim, ERRORS, holds.part_poses)
     batches: list[_Batch] = []
     for first in range(0, num_episodes, num_envs):
-        batches.append(_one_batch(episodes, expert, FIRST_SEED + first, views, device))
+        batches.append(_one_batch(episodes, holds, expert, FIRST_SEED + first, views, device))
         told(num_envs)
     length = np.concatenate([batch.length for batch in batches])
     valid = np.arange(episode_frames(episodes)) < length[:, None]
@@ -115,10 +156,16 @@ class _Batch:
 
 
 def _one_batch(
-    episodes: Episodes, expert: ScriptedExpert, first_seed: int, views: Views, device: torch.device
+    episodes: Episodes,
+    holds: MisjudgedHolds,
+    expert: ScriptedExpert,
+    first_seed: int,
+    views: Views,
+    device: torch.device,
 ) -> _Batch:
     sim, ids, frames = episodes.sim, episodes.ids, episode_frames(episodes)
     episodes.reset(ids, first_seed + ids)
+    holds.draw(ids)
     expert.reset(ids)
     columns = {
         key: torch.zeros((len(ids), frames, *value.shape[1:]), device=device)

@@ -24,7 +24,7 @@ def render_page(found: Study, pair: str) -> str:
         "lerobot_vtrefine.information",
         "page.html",
         pair=pair,
-        verdict=found.verdict,
+        verdict=found.verdict.reason,
         keys=[(name.replace("_", "-"), style_of(name, senses)) for name in senses],
         history=sorted({finding.history for finding in found.findings}),
         errors=[error_chart(found, part, senses) for part in PARTS],

@@ -88,13 +88,5 @@ def part_poses(embodiment: "Embodiment", q: Array, quantities: Array, grasps: Gr
     held = quantities[:, :12].reshape(-1, 2, 6)
     turned = Poses.from_vectors(np.zeros(3), held[..., 3:]).rotation
     parts = hands @ Poses(held[..., :3], grasps.rotation[:2] @ turned)
-    rows = [
-        np.concatenate([parts.position[:, part], _quaternions(parts.rotation[:, part])], -1)
-        for part in range(2)
-    ]
-    return rows[1], rows[0]
-
-
-def _quaternions(rotation: Array) -> Array:
-    """Rotation matrices (m, 3, 3) -> quaternions (m, 4), w first."""
-    return Rotation.from_matrix(rotation).as_quat(scalar_first=True)
+    socket, plug = parts.quaternions().swapaxes(0, 1)
+    return plug, socket

@@ -15,6 +15,7 @@ from scipy.stats import binomtest
 
 from lerobot_vtrefine.datasets.features import STATE_KEY
 from lerobot_vtrefine.envs.config import VtRefineEnvConfig
+from lerobot_vtrefine.information.acceptance import Verdict, judge
 from lerobot_vtrefine.information.closed_loop import expert_success
 from lerobot_vtrefine.information.estimator import (
     SENSES,
@@ -29,8 +30,6 @@ from lerobot_vtrefine.information.frames import Frames, Views, collect_frames
 from lerobot_vtrefine.information.quantities import NAMES, unit_of
 from lerobot_vtrefine.policies.vt_dp3.observation_encoder import save_encoder
 
-TRUE_AT_LEAST, TOUCH_AT_LEAST, VISION_AT_MOST = 0.95, 0.90, 0.70
-"""A task needs touch if the expert succeeds this often on the truth, on both senses, and on vision."""
 TRAINING_SHARE = 0.85
 TRUTH = "truth"
 
@@ -96,18 +95,9 @@ class Study:
         return max(rates) if rates else None
 
     @property
-    def verdict(self) -> str:
-        """Whether this task can show that touch pays, in a sentence."""
-        truth, both, vision = (self.success_of(name) for name in (TRUTH, "visuo_tactile", "visual"))
-        if truth is None or both is None or vision is None:
-            return "Not judged: it needs the expert's success on the truth, on both senses and on vision."
-        if truth < TRUE_AT_LEAST:
-            return f"Not a touch task: the expert fails where it knows everything ({truth:.2f} succeed)."
-        if both < TOUCH_AT_LEAST:
-            return f"Not a touch task: touch and vision together do not suffice ({both:.2f} succeed)."
-        if vision > VISION_AT_MOST:
-            return f"Not a touch task: vision alone suffices ({vision:.2f} succeed)."
-        return f"A touch task: {both:.2f} succeed with touch and vision, {vision:.2f} with vision alone."
+    def verdict(self) -> Verdict:
+        """Whether this task can show that touch pays."""
+        return judge(*(self.success_of(name) for name in (TRUTH, "visuo_tactile", "visual")))
 
 
 def study(
@@ -211,7 +201,8 @@ def as_json(found: Study, effort: Effort) -> dict[str, Any]:
         return {"success": success[0], "episodes": success[1], "ci95": [round(low, 4), round(high, 4)]}
 
     return {
-        "verdict": found.verdict,
+        "verdict": found.verdict.reason,
+        "accepted": found.verdict.accepted,
         "units": {name: unit_of(name)[1] for name in NAMES},
         "prior": found.prior,
         "true_state": proportion(found.true_success),

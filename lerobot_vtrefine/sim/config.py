@@ -129,6 +129,9 @@ class GraspedStart:
     hand_yaw_rad: float = 0.03
     slip_m: float = 0.002
     """In-hand offset of each part along both axes of the pads."""
+    slip_z_m: float | None = None
+    """In-hand offset across the fingers, where it differs from the one along them (``slip_m``): the hand's
+    height at a part that stood on a table is known better than how far the hand reached."""
     slip_rad: float = 0.052
     """In-hand rotation of each part about the pads' normal."""
     left_pitch_rad: float = 0.45
@@ -138,6 +141,11 @@ class GraspedStart:
     squeeze_m: float = 0.010
     """Grippers' commands close by this much more than the part's width, per finger: about 20 N per pad."""
     settle_s: float = 0.25
+
+    @property
+    def slip_xz_m(self) -> tuple[float, float]:
+        """In-hand offsets along the fingers and across them."""
+        return self.slip_m, self.slip_m if self.slip_z_m is None else self.slip_z_m
 
 
 @dataclass(frozen=True)

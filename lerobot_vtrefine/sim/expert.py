@@ -58,6 +58,8 @@ class Pace:
     """The phase ends when the hands (ALIGN: the plug) are this close to the goal ..."""
     patience_s: float = 0.0
     """... or this long after they should have arrived."""
+    turn_m_per_rad: float = 0.1
+    """A turn takes as long as this way."""
 
 
 READY_M = 2e-4  # a plug this close to its aim may enter
@@ -67,10 +69,11 @@ PACES = {
     Phase.CLOSE: Pace(0.10, 0.7),
     Phase.LIFT: Pace(0.12, 0.8, 0.006, 0.4),
     Phase.CARRY: Pace(0.12, 0.6, 0.003, 0.5),
-    Phase.ALIGN: Pace(0.04, 0.7, 8e-4, 0.5),
+    Phase.ALIGN: Pace(0.04, 0.7, 8e-4, 0.5, turn_m_per_rad=0.2),
     Phase.INSERT: Pace(0.036, 0.5),
     Phase.HOLD: Pace(0.03, 0.5, 0.0, np.inf),
 }
+WRIST_RAD = 0.3  # a plug is turned towards its socket by so much; the socket comes to meet the rest
 RETREAT_M = 0.09  # hands come to a part from this far behind it
 CARRY_M = 0.040  # the plug is carried this high above the mouth
 STANDOFF_M = 0.009  # and brought over it at this height
@@ -84,7 +87,6 @@ PRESS_M = 0.008  # a blocked plug is pushed as if it should be this much lower: 
 SLOWDOWN = 0.35  # before the seat: largest share of the way left in one control step
 BOTTOM_M = 0.0005  # a seated plug is pushed this far beyond its seat
 TABLE_GAP_M = 0.003  # between fingertips and table
-TURN_M_PER_RAD = 0.1  # a turn takes as long as this way
 
 
 @dataclass(frozen=True)
@@ -223,10 +225,10 @@ class ScriptedExpert:
             rest = self._wanted[ids]
             goal.position[:, LEFT], goal.rotation[:, LEFT] = rest.position[:, LEFT], rest.rotation[:, LEFT]
         self._goal.assign(ids, goal)
-        way = _distance(self._start[ids], self._goal[ids])
+        pace = PACES[phase]
+        way = _distance(self._start[ids], self._goal[ids], pace.turn_m_per_rad)
         if phase == Phase.INSERT:
             way = self._height_m[ids] - self._pair.seated_z_m
-        pace = PACES[phase]
         self._duration[ids] = self._hz * np.maximum(way / pace.speed_m_s, pace.shortest_s)
 
     def _destination(self, ids: Ids, phase: Phase, view: View) -> Poses:
@@ -245,7 +247,10 @@ class ScriptedExpert:
             return stations @ self._held[ids]
         goal = self._wanted[ids]
         if phase == Phase.ALIGN:
-            goal.position[:, RIGHT] = self._aligned(ids, view).position
+            above = self._aligned(ids, view)
+            goal.position[:, RIGHT], goal.rotation[:, RIGHT] = above.position, above.rotation
+            met = _met_halfway(view) @ self._held[ids][:, LEFT]
+            goal.position[:, LEFT], goal.rotation[:, LEFT] = met.position, met.rotation
         return goal
 
     def _stations_now(self, view: View) -> Poses:
@@ -262,11 +267,11 @@ class ScriptedExpert:
         phases, goal = self.phase[ids], self._goal[ids]
         share = np.clip(self._phase_step[ids] / self._duration[ids], 0, 1)
         aligning, inserting = phases == Phase.ALIGN, phases >= Phase.INSERT
-        if aligning.any():
-            live = self._aligned(ids[aligning], view[aligning])
-            goal.position[aligning, RIGHT], goal.rotation[aligning, RIGHT] = live.position, live.rotation
         smooth = share * share * (3 - 2 * share)
         wanted = self._start[ids].towards(goal, np.repeat(smooth[:, None], 2, 1))
+        if aligning.any():
+            over = self._brought(ids[aligning], view[aligning], smooth[aligning])
+            wanted.position[aligning, RIGHT], wanted.rotation[aligning, RIGHT] = over.position, over.rotation
         if inserting.any():
             down = self._inserted(ids[inserting], view[inserting])
             wanted.position[inserting, RIGHT], wanted.rotation[inserting, RIGHT] = (
@@ -281,6 +286,14 @@ class ScriptedExpert:
         return (
             self._aim(ids, view.parts[:, LEFT], np.full(len(ids), self._pair.mouth_z_m + STANDOFF_M)) @ held
         )
+
+    def _brought(self, ids: Ids, view: View, share: Array) -> Poses:
+        """Right hand (m,) while it aligns: the plug's tip goes straight, so that a turn does not swing it
+        into the rim.
+        """
+        held = view.parts[:, RIGHT].inverse() @ view.hands[:, RIGHT]
+        start = self._start[ids][:, RIGHT] @ self._held[ids][:, RIGHT].inverse()
+        return start.towards(self._aligned(ids, view) @ held.inverse(), share) @ held
 
     def _inserted(self, ids: Ids, view: View) -> Poses:
         """Right hand (m,) on the way down: corrected until the plug enters, then straight on."""
@@ -316,6 +329,15 @@ class ScriptedExpert:
         lateral = np.hypot(error.position[:, 0], error.position[:, 1])
         tilt = np.linalg.norm(rotation_vector(error.rotation), axis=-1)
         return np.maximum(lateral, 0.02 * tilt)
+
+
+def _met_halfway(view: View) -> Poses:
+    """Sockets (m,) turned about their mouths by what is left of a plug's turn to them beyond `WRIST_RAD`."""
+    sockets, plugs = view.parts[:, LEFT], view.parts[:, RIGHT]
+    turn = rotation_vector(np.swapaxes(sockets.rotation, -1, -2) @ plugs.rotation)
+    angle = np.linalg.norm(turn, axis=-1, keepdims=True)
+    rest = turn * np.maximum(1.0 - WRIST_RAD / np.maximum(angle, 1e-9), 0.0)
+    return sockets @ Poses.from_vectors(np.zeros(3), rest)
 
 
 def _grasps(sim: "InsertionSim") -> tuple[Poses, Array]:
@@ -355,8 +377,8 @@ def _stations(sim: "InsertionSim") -> Poses:
     return Poses.from_vectors(np.stack([socket, plug]), np.zeros((2, 3)))
 
 
-def _distance(start: Poses, goal: Poses) -> Array:
+def _distance(start: Poses, goal: Poses, turn_m_per_rad: float = 0.1) -> Array:
     """Longer way of both hands (m,) [m], turns counted as ways."""
     way = np.linalg.norm(goal.position - start.position, axis=-1)
     turn = np.linalg.norm(rotation_vector(np.swapaxes(start.rotation, -1, -2) @ goal.rotation), axis=-1)
-    return np.maximum(way, TURN_M_PER_RAD * turn).max(-1)
+    return np.maximum(way, turn_m_per_rad * turn).max(-1)

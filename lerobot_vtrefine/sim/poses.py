@@ -49,6 +49,11 @@ class Poses:
         self.position[index] = poses.position  # ty: ignore[invalid-assignment]
         self.rotation[index] = poses.rotation  # ty: ignore[invalid-assignment]
 
+    def quaternions(self) -> Array:
+        """Rows x y z qw qx qy qz (..., 7)."""
+        flat = Rotation.from_matrix(self.rotation.reshape(-1, 3, 3)).as_quat(scalar_first=True)
+        return np.concatenate([self.position, flat.reshape(*self.position.shape[:-1], 4)], -1)
+
     def inverse(self) -> Self:
         """The inverse poses."""
         turned = np.swapaxes(self.rotation, -1, -2)

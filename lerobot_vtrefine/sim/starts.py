@@ -118,7 +118,7 @@ def _hand_and_part(
     rotation = turned @ hand_rotation
     # Slip, in the hand's frame: along its x and z, about its y, around the middle of the grip.
     slip = np.zeros((len(draws), 3))
-    slip[:, [0, 2]] = config.slip_m * draws[:, 4:6]
+    slip[:, [0, 2]] = np.asarray(config.slip_xz_m) * draws[:, 4:6]
     spin = rotation @ about_axis(1, config.slip_rad * draws[:, 6]) @ np.swapaxes(rotation, -1, -2)
     middle = expected + turn(turned, np.asarray(part.grip.centre_m)) + turn(rotation, slip)
     part_rotation = spin @ turned

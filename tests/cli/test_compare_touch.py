@@ -8,10 +8,12 @@ from pathlib import Path
 from types import ModuleType
 
 import pytest
+import yaml
 
 from lerobot_vtrefine.cli import demo
 
 SCRIPT = Path(__file__).parents[2] / "scripts" / "compare_touch.py"
+CONFIGS = Path(__file__).parents[2] / "configs" / "env"
 
 
 @pytest.fixture(scope="module")
@@ -135,7 +137,17 @@ def test_many_worlds_are_the_recipe_of_the_docs(script: ModuleType) -> None:
         assert config.dppo == {"type": "trust_region", "encoder": "frozen"}
         assert config.policy["fusion"] == "pads"
         assert config.env["backend"] == "warp"
-        assert config.env["pair"] == setting.removeprefix("worlds_")
+        assert config.env["start"] == "grasped"
+
+
+def test_touch_tasks_are_the_files_with_encoders_of_their_own(script: ModuleType) -> None:
+    tasks = [name for task in script.TOUCH_TASKS for name in (task, f"{task}_twin")]
+    assert set(tasks) == set(script.WORLDS) - {"worlds_round", "worlds_square", "worlds_key"}
+    for task in tasks:
+        flags = dict(flag.removeprefix("--").split("=", 1) for flag in script.setting_flags(task))
+        settings = yaml.safe_load((CONFIGS / f"{task}.yaml").read_text())["env"]
+        assert json.loads(flags["env"]) == settings | {"backend": "warp"}
+        assert json.loads(flags["policy"])["pretrained_encoder"] == f"outputs/information_{task}"
 
 
 def test_settings_are_compared_one_by_one(

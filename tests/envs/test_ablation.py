@@ -2,14 +2,17 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from draccus.utils import ParsingError
 from fake_sim import HEIGHT, WIDTH, FakeSim
 from lerobot.datasets import LeRobotDataset
 
 from lerobot_vtrefine.datasets.features import BASELINE_KEYS, DEPTH_KEY, TACTILE_KEYS
 from lerobot_vtrefine.embodiments import ALOHA
-from lerobot_vtrefine.envs import ablation
+from lerobot_vtrefine.envs import VtRefineEnvConfig, ablation
 from lerobot_vtrefine.envs.ablation import make_ablation, mean_frame
 from lerobot_vtrefine.envs.episodes import Episodes
+
+PADS = list(zip(TACTILE_KEYS, BASELINE_KEYS, strict=True))
 
 
 def test_mean_frame_is_the_mean_of_the_datasets_items(tiny_dataset: Path):
@@ -49,9 +52,79 @@ def test_none_changes_nothing():
     assert make_ablation("none", None, ALOHA) is None
 
 
-def test_missing_dataset_is_named(tmp_path):
+@pytest.mark.parametrize("part", ["touch", "touch_other", "vision"])
+def test_missing_dataset_is_named(part, tmp_path):
     with pytest.raises(FileNotFoundError, match="ablate_dataset"):
-        make_ablation("touch", tmp_path / "nothing", ALOHA)
+        make_ablation(part, tmp_path / "nothing", ALOHA)
+
+
+def played(ablate, num_envs: int, seeds: list[int], steps: int = 8) -> tuple[list, list]:
+    """What is shown where all taxels count step + 1, and what else is in the frames."""
+    episodes = Episodes(FakeSim(num_envs, episode_steps=steps), ablate)
+    episodes.reset(np.arange(num_envs), np.array(seeds))
+    touch, rest = [], []
+    for step in range(steps):
+        touch.append(episodes.raw["tactile"].copy())
+        rest.append({key: value.copy() for key, value in episodes.raw.items() if key != "tactile"})
+        if step < steps - 1:
+            episodes.step(np.zeros((num_envs, 16)))
+    return touch, rest
+
+
+def test_shuffled_touch_is_the_episodes_own_out_of_order():
+    seeds = [1, 3]  # neither ends early
+    shuffled, rest = played(make_ablation("touch_shuffled", None, ALOHA), 2, seeds)
+    plain, untouched = played(None, 2, seeds)
+    for step, (shown, real) in enumerate(zip(shuffled, plain, strict=True)):
+        assert (shown[:, 0, 0] <= real[:, 0, 0]).all()  # nothing from the future
+        assert (shown == shown[:, :1, :1]).all()  # whole frames
+        assert all(np.array_equal(value, untouched[step][key]) for key, value in rest[step].items())
+    order = np.array([shown[:, 0, 0] for shown in shuffled])
+    assert (order != np.array([real[:, 0, 0] for real in plain])).any(0).all()
+    assert (order[:, 0] != order[:, 1]).any()
+    alone, _ = played(make_ablation("touch_shuffled", None, ALOHA), 1, seeds[1:])
+    assert [shown[0, 0, 0] for shown in alone] == order[:, 1].tolist()  # a function of the seed
+
+
+def test_shuffled_touch_forgets_the_last_episode():
+    episodes = Episodes(FakeSim(1), make_ablation("touch_shuffled", None, ALOHA))
+    for _ in range(2):
+        episodes.reset(np.arange(1), np.array([1]))
+        assert episodes.raw["tactile"].max() == 1
+        for _ in range(5):
+            episodes.step(np.zeros((1, 16)))
+
+
+def test_touch_of_another_episode_lies_above_the_own_idle_level(tiny_dataset: Path):
+    dataset = LeRobotDataset("local/tiny", root=tiny_dataset)
+    items = [dataset[index] for index in range(len(dataset))]
+    pressed = np.array(
+        [
+            [item[key].numpy().astype(int) - item[idle].numpy().astype(int) for key, idle in PADS]
+            for item in items
+        ]
+    ).reshape(3, 12, 4, 384)
+    ablate = make_ablation("touch_other", tiny_dataset, ALOHA)
+    baseline = np.full((20, 4, 384), 9, np.uint8)
+    ids, seeds = np.arange(20), np.arange(20)
+    taken = {}
+    for step in (0, 5, 30):
+        raw = {"tactile": baseline + 50, "tactile_baseline": baseline, "state": np.ones(20)}
+        shown = ablate(raw, ids, seeds, np.full(20, step))
+        assert shown["state"] is raw["state"]
+        assert shown["tactile"].dtype == np.uint8
+        frames = np.clip(9 + pressed[:, min(step, 11)], 0, 255)
+        same = (shown["tactile"][:, None] == frames[None]).all((2, 3))
+        assert (same.sum(1) == 1).all()
+        taken[step] = same.argmax(1).tolist()
+    assert taken[0] == taken[5] == taken[30]  # one episode throughout
+    assert set(taken[0]) == {0, 1, 2}
+
+
+def test_shuffling_needs_no_dataset():
+    assert VtRefineEnvConfig(ablate="touch_shuffled").ablate_dataset is None
+    with pytest.raises(ParsingError, match=r"touch_other needs --env\.ablate_dataset"):
+        VtRefineEnvConfig(ablate="touch_other")
 
 
 def test_touch_ablation_hides_the_idle_level(monkeypatch):
@@ -61,8 +134,9 @@ def test_touch_ablation_hides_the_idle_level(monkeypatch):
     }
     monkeypatch.setattr(ablation, "mean_frame", lambda root, keys: {key: means[key] for key in keys})
     baseline = np.stack([np.full((4, 384), level, np.uint8) for level in (10, 40)])
+    ids = np.arange(2)
     raw = make_ablation("touch", Path("somewhere"), ALOHA)(
-        {"tactile": baseline + 50, "tactile_baseline": baseline}
+        {"tactile": baseline + 50, "tactile_baseline": baseline}, ids, ids, ids
     )
     assert np.array_equal(raw["tactile"] - baseline, np.full((2, 4, 384), 5))
     assert raw["tactile"].dtype == np.uint8

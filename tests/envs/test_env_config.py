@@ -1,3 +1,4 @@
+from dataclasses import replace
 from pathlib import Path
 
 import draccus
@@ -104,7 +105,24 @@ def test_environment_files_suit_policies_of_every_chunk_length(path: Path, monke
     assert stamps == list(range(2, 11))
 
 
+TWINS = [path for path in ENV_FILES if path.stem.endswith("_twin")]
+
+
+@pytest.mark.parametrize("path", TWINS, ids=lambda path: path.stem)
+def test_a_twin_differs_from_its_task_in_the_slip_alone(path: Path):
+    task, twin = (
+        draccus.parse(EvalPipelineConfig, config_path=file, args=[]).env
+        for file in (path.with_stem(path.stem.removesuffix("_twin")), path)
+    )
+    slip = twin.rules.grasped
+    assert slip.slip_m == slip.slip_z_m == slip.slip_rad == 0.0
+    assert min(task.rules.grasped.slip_m, task.rules.grasped.slip_rad) > 0.0
+    known = replace(task.rules.grasped, slip_m=0.0, slip_z_m=0.0, slip_rad=0.0)
+    assert twin == replace(task, rules=replace(task.rules, grasped=known))
+
+
 def test_there_are_environment_files():
+    assert len(TWINS) >= 3
     assert len(ENV_FILES) >= 3
 
 
@@ -116,7 +134,7 @@ def test_there_are_environment_files():
         ({"episode_steps": 0}, "episode_steps"),
         ({"vectorization": "magic"}, "native, gym"),
         ({"backend": "gpu"}, "single, batch, warp"),
-        ({"ablate": "smell"}, "none, touch, vision"),
+        ({"ablate": "smell"}, "none, touch, touch_shuffled, touch_other, vision"),
         ({"ablate": "touch"}, "--env.ablate_dataset"),
         ({"fps": 0}, "--env.fps must lie between 1 and 100 control steps a second, got 0"),
         ({"fps": 101}, "--env.fps must lie between 1 and 100 control steps a second, got 101"),

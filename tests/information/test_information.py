@@ -19,10 +19,13 @@ from lerobot_vtrefine.information.estimator import (
     rms_with_interval,
     train_estimator,
 )
-from lerobot_vtrefine.information.frames import Frames
+from lerobot_vtrefine.information.frames import Frames, MisjudgedHolds
 from lerobot_vtrefine.information.page import render_page
 from lerobot_vtrefine.information.quantities import NAMES, Grasps, observe, part_poses
 from lerobot_vtrefine.information.study import Effort, Finding, Study, as_json, save_keeper, study
+from lerobot_vtrefine.sim.config import GraspedStart, TaskConfig
+from lerobot_vtrefine.sim.ik import hand_poses
+from lerobot_vtrefine.sim.poses import Poses, rotation_vector
 
 EPISODES, LENGTH, JOINTS = 60, 9, 16
 
@@ -95,7 +98,8 @@ def test_verdicts(truth: float, both: float | None, vision: float, said: str) ->
         return Finding(senses, 1, {}, None if rate is None else (round(100 * rate), 100))
 
     found = Study({}, [finding("visuo_tactile", both), finding("visual", vision)], (round(100 * truth), 100))
-    assert said in found.verdict
+    assert said in found.verdict.reason
+    assert as_json(found, Effort())["accepted"] is {"A touch task": True, "Not judged": None}.get(said, False)
 
 
 def test_a_study_leaves_encoders_that_policies_start_from(tmp_path: Path) -> None:
@@ -133,6 +137,32 @@ def test_a_study_leaves_encoders_that_policies_start_from(tmp_path: Path) -> Non
         policy(tmp_path)
 
 
+def test_frames_do_not_tell_the_hold_by_where_the_hands_are_brought() -> None:
+    """Believed parts are off by up to the slip, in their hands, and remain so; right where there is none."""
+    for slip_m, slip_z_m, slip_rad in ((0.004, None, 0.3), (0.004, 0.001, 0.3), (0.0, 0.0, 0.0)):
+        start = GraspedStart(slip_m=slip_m, slip_z_m=slip_z_m, slip_rad=slip_rad, plug_height_m=0.03)
+        sim = make_simulation(VtRefineEnvConfig(start="grasped", rules=TaskConfig(grasped=start)), 12)
+        ids = np.arange(12)
+        sim.reset(ids, ids)
+        holds = MisjudgedHolds(sim)
+        holds.draw(ids)
+        hands = Poses(*hand_poses(sim.scene.embodiment, np.asarray(sim.joint_state(ids), float)))
+        believed, true = (
+            hands.inverse() @ Poses.from_quaternions(np.stack([socket, plug], 1))
+            for plug, socket in (holds.part_poses(ids), sim.part_poses(ids))
+        )
+        error = believed @ true.inverse()
+        turns = rotation_vector(error.rotation)
+        assert np.abs(turns[..., 1]).max() <= slip_rad + 1e-9
+        assert np.abs(error.position[..., 0]).max() <= slip_m + 1e-9
+        highest = np.abs(error.position[..., 2]).max()
+        assert 0.4 * start.slip_xz_m[1] <= highest <= start.slip_xz_m[1] + 1e-9
+        np.testing.assert_allclose(turns[..., [0, 2]], 0, atol=1e-9)  # about the pads' normal alone
+        assert (np.abs(turns[..., 1]).max(0) >= 0.4 * slip_rad).all()
+        again = hands.inverse() @ Poses.from_quaternions(np.stack(holds.part_poses(ids)[::-1], 1))
+        np.testing.assert_allclose(again.position, believed.position, atol=1e-12)
+
+
 def test_the_expert_succeeds_on_the_truth() -> None:
     env = VtRefineEnvConfig(start="grasped")
     done = expert_success(env, 4, 4, None, {}, Grasps(np.tile(np.eye(3), (3, 1, 1))), torch.device("cpu"))
@@ -144,7 +174,7 @@ def test_the_page_draws_every_error_as_a_share_of_the_unseen() -> None:
     rms = dict.fromkeys(NAMES, (1.0, 0.8, 1.2))
     found = Study(prior, [Finding("visual", 1, rms, (3, 8)), Finding("tactile", 10, rms, None)], (8, 8))
     page = render_page(found, "round")
-    assert found.verdict in html.unescape(page)
+    assert found.verdict.reason in html.unescape(page)
     assert page.count("<svg") == 3 + 1
     bars = re.findall(r'<rect class="bar (?:d|a faded)"[^>]*y="([0-9.]+)"[^>]*height="([0-9.]+)"', page)
     assert len(bars) == 3 * 6 * 2 + 1  # and the expert on what vision tells; what was not measured has no bar

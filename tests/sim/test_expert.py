@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from lerobot_vtrefine.embodiments import get_embodiment
-from lerobot_vtrefine.sim.config import PROCEDURAL_PAIRS, SceneConfig, TaskConfig
+from lerobot_vtrefine.sim.config import PROCEDURAL_PAIRS, GraspedStart, SceneConfig, TaskConfig
 from lerobot_vtrefine.sim.demonstrations import Degradation
 from lerobot_vtrefine.sim.expert import Phase, ScriptedExpert, _above_table
 from lerobot_vtrefine.sim.simulation import InsertionSim
@@ -50,6 +50,26 @@ def test_inserts_from_the_hand_at_a_persons_pace() -> None:
     assert metrics["time_to_success_s"].min() > 2.0
     assert metrics["time_to_success_s"].max() < 3.5
     assert metrics["rim_slide_m"].max() < 5e-4
+
+
+def test_undoes_turns_of_both_parts_that_one_wrist_cannot() -> None:
+    """At 0.35 rad the plug's tip must not swing into the rim, and the socket must come to meet the plug."""
+    start = GraspedStart(
+        slip_m=0.006, slip_rad=0.35, left_pitch_rad=0.3, right_pitch_rad=0.1, plug_height_m=0.03
+    )
+    rules = TaskConfig(episode_steps=60, grasped=start)
+    sim = InsertionSim(SceneConfig(pair="key", start="grasped"), rules, num_envs=6, num_threads=1)
+    ids, seeds = np.arange(6), 4_000_000 + np.array([3, 10, 12, 21, 26, 36])  # 0.42 to 0.63 rad apart
+    sim.reset(ids, seeds)
+    assert sim.insertion(ids).tilt_rad.min() > 0.4
+    expert = ScriptedExpert(sim)
+    expert.reset(ids)
+    while len(ids):
+        result = sim.step(expert.act(ids), ids)
+        ids = ids[~(result.terminated | result.truncated)]
+    metrics = sim.metrics()
+    assert metrics["success"].all()
+    _assert_gentle(metrics)
 
 
 @pytest.mark.slow

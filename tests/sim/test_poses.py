@@ -39,3 +39,13 @@ def test_assign_overwrites_only_its_rows() -> None:
     poses.assign(np.array([1]), _random(1))
     np.testing.assert_array_equal(poses.position[[0, 2]], 0)
     assert np.abs(poses.position[1]).max() > 0
+
+
+def test_quaternions_are_the_rows_that_poses_are_made_of() -> None:
+    rng = np.random.default_rng(0)
+    poses = Poses.from_vectors(rng.normal(size=(4, 2, 3)), rng.uniform(-1, 1, (4, 2, 3)))
+    rows = poses.quaternions()
+    assert rows.shape == (4, 2, 7)
+    again = Poses.from_quaternions(rows)
+    np.testing.assert_allclose(again.position, poses.position)
+    np.testing.assert_allclose(again.rotation, poses.rotation, atol=1e-12)

@@ -2,6 +2,7 @@ import guide
 import numpy as np
 import pytest
 
+from lerobot_vtrefine.information.quantities import observe
 from lerobot_vtrefine.sim.config import (
     GraspedStart,
     LimitsConfig,
@@ -63,6 +64,19 @@ def test_start_in_hand_holds_both_parts_above_each_other():
     assert np.abs(moved[:, 3:]).max() < 2e-3
     assert (sim.metrics()["in_hand_shift_m"] < 3e-4).all()
     assert (sim.observe()["tactile"].astype(int) > sim.observe()["tactile_baseline"]).any(-1).all()
+
+
+@pytest.mark.parametrize(("slip_z_m", "spread_m"), [(None, 0.004), (0.001, 0.001)])
+def test_slip_across_the_fingers_is_its_own(slip_z_m: float | None, spread_m: float):
+    rules = GraspedStart(slip_m=0.004, slip_z_m=slip_z_m, slip_rad=0.0)
+    sim = insertion_sim(24, rules=TaskConfig(grasped=rules))
+    ids = np.arange(24)
+    sim.reset(ids, ids)
+    held = observe(sim, ids).position[:, :2]  # socket and plug in their hands
+    for axis, spread in ((0, 0.004), (2, spread_m)):
+        lowest, highest = held[..., axis].min(0), held[..., axis].max(0)
+        assert (highest - lowest > 1.4 * spread).all()
+        assert (highest - lowest < 2.2 * spread).all()
 
 
 def test_start_on_the_table_rests_within_its_squares():

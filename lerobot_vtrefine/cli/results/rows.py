@@ -111,7 +111,16 @@ class Run(Row):
 class Line(Row):
     """One line of a benchmark's table, as the benchmark printed it."""
 
-    TABLES = ("diagnosis", "information", "ingredients", "servo", "step_size", "tactile", "worlds")
+    TABLES = (
+        "diagnosis",
+        "information",
+        "ingredients",
+        "servo",
+        "step_size",
+        "tactile",
+        "touch_tasks",
+        "worlds",
+    )
 
     cells: dict[str, str]
     """Text by column; the first one names the line."""

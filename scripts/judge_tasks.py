@@ -1,0 +1,96 @@
+#!/usr/bin/env python
+"""Which tasks need touch? ``vtrefine-information`` on each, its verdict as a row of results/touch_tasks.json.
+
+    python scripts/judge_tasks.py key_turned key_turned_twin --effort.device=cuda --env.backend=warp
+    make tables
+
+Flags that this script does not know go to ``vtrefine-information``. A study lies in outputs/information_TASK,
+where scripts/compare_touch.py finds its encoders; one that is there is not made again: remove the folder for
+that.
+"""
+
+import argparse
+import json
+import subprocess
+import sys
+from pathlib import Path
+from typing import Any
+
+from lerobot_vtrefine.cli.errors import run_cli
+from lerobot_vtrefine.cli.report.statistics import wilson_interval
+from lerobot_vtrefine.cli.results.collect import origin_of, save
+from lerobot_vtrefine.cli.results.rows import Line
+from lerobot_vtrefine.cli.results.tables import interval, percent
+
+TABLE = "touch_tasks"
+RESULTS = Path(__file__).parents[1] / "results"
+SENSES = {"vision and touch": "visuo_tactile", "vision": "visual", "joints alone": "joints"}
+TURN = "plug_in_hand_rx"
+"""The plug's turn about the pads' normal."""
+
+
+def study(task: str, folder: Path, extra: list[str]) -> None:
+    """Run the study of one task; one that fails ends this script with its status."""
+    command = [sys.executable, "-m", "lerobot_vtrefine.cli.information"]
+    command += [f"--config_path=vtrefine:{task}", f"--output_dir={folder}", *extra]
+    if status := subprocess.run(command, check=False).returncode:
+        sys.exit(status)
+
+
+def row(task: str, folder: Path) -> Line:
+    """What a study found, as a line of the table."""
+    found = json.loads((folder / "information.json").read_text(encoding="utf-8"))
+    best = {words: best_finding(found, senses) for words, senses in SENSES.items()}
+    turns = {words: item["rms"][TURN]["rms"] for words, item in best.items() if item}
+    shown = [
+        found["prior"][TURN],
+        *(turns[words] for words in ("vision and touch", "vision") if words in turns),
+    ]
+    accepted = {True: "needs touch", False: "does not need touch", None: "not judged"}
+    cells = {
+        "task": task,
+        "the expert knows the truth, %": counted(found["true_state"]),
+        **{f"{words}, %": counted(item.get("expert")) for words, item in best.items()},
+        "turn of the plug in its hand: nothing, vision and touch, vision, °": ", ".join(
+            f"{value:.1f}" for value in shown
+        ),
+        "": accepted[found["accepted"]],
+    }
+    return Line(table=TABLE, cells=cells, **origin_of(folder))
+
+
+def best_finding(found: dict[str, Any], senses: str) -> dict[str, Any]:
+    """Of all lengths of history the one on which the expert succeeds most; empty without that sense."""
+    made = [item for item in found["findings"] if item["senses"] == senses]
+    return max(made, key=lambda item: item["expert"]["success"] if item["expert"] else 0, default={})
+
+
+def counted(proportion: dict[str, Any] | None) -> str:
+    """Success in per cent with its interval; a dash where the expert did not act."""
+    if proportion is None:
+        return "-"
+    success, episodes = proportion["success"], proportion["episodes"]
+    return f"{percent(success / episodes)} {interval(*wilson_interval(success, episodes))}"
+
+
+@run_cli
+def main() -> None:
+    """Study what is missing, then keep all rows."""
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument("tasks", nargs="+", metavar="TASK", help="name of a file of configs/env")
+    parser.add_argument("--results", type=Path, default=RESULTS / f"{TABLE}.json")
+    parser.add_argument("--outputs", type=Path, default=Path("outputs"))
+    options, extra = parser.parse_known_args()
+    for task in options.tasks:
+        folder = options.outputs / f"information_{task}"
+        if not (folder / "information.json").is_file():
+            study(task, folder, extra)
+        line = row(task, folder)
+        save(options.results, TABLE, [(line, [])], replace=False)
+        print(" | ".join(line.cells.values()))
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,59 @@
+"""A study of a task becomes a line of the table, with the verdict that the study itself gives."""
+
+import importlib.util
+import json
+import sys
+from pathlib import Path
+from types import ModuleType
+
+import pytest
+
+from lerobot_vtrefine.cli.results.rows import read_rows
+from lerobot_vtrefine.information.quantities import NAMES
+from lerobot_vtrefine.information.study import Effort, Finding, Study, as_json
+
+SCRIPT = Path(__file__).parents[2] / "scripts" / "judge_tasks.py"
+
+
+@pytest.fixture
+def script() -> ModuleType:
+    spec = importlib.util.spec_from_file_location("judge_tasks", SCRIPT)
+    module = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    return module
+
+
+def finding(senses: str, history: int, error: float, successes: int) -> Finding:
+    return Finding(senses, history, dict.fromkeys(NAMES, (error, error, error)), (successes, 100))
+
+
+def write_study(folder: Path, vision: int) -> None:
+    found = Study(
+        dict.fromkeys(NAMES, 9.0),
+        [
+            finding("visual", 1, 4.0, vision - 20),
+            finding("visual", 10, 3.0, vision),
+            finding("visuo_tactile", 1, 0.5, 94),
+            finding("visuo_tactile", 10, 0.7, 91),
+        ],
+        (100, 100),
+    )
+    folder.mkdir(parents=True)
+    (folder / "information.json").write_text(json.dumps(as_json(found, Effort())))
+
+
+def test_rows_hold_the_best_of_each_sense_and_the_verdict(
+    script: ModuleType, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    write_study(tmp_path / "information_hard", vision=60)
+    write_study(tmp_path / "information_easy", vision=80)
+    results = tmp_path / "touch_tasks.json"
+    arguments = ["hard", "easy", f"--outputs={tmp_path}", f"--results={results}"]
+    monkeypatch.setattr(sys, "argv", ["judge_tasks.py", *arguments])
+    assert script.main() == 0
+    rows = {row.cells["task"]: row.cells for row in read_rows(results)}
+    assert rows["hard"]["vision and touch, %"].startswith("94 [")
+    assert rows["hard"]["vision, %"].startswith("60 [")
+    assert rows["hard"]["joints alone, %"] == "-"
+    assert "9.0, 0.5, 3.0" in rows["hard"].values()
+    assert (rows["hard"][""], rows["easy"][""]) == ("needs touch", "does not need touch")
