@@ -1,26 +1,25 @@
 """How good is vtrefine-diagnose on recordings with known causes? Prints the table of metrics and bars.
 
-The recordings come from tests/diagnose/hidden, which shares no code with the engine. Results are kept per set
-in the output folder, so that an interrupted run goes on where it stopped; delete the folder after a change of
-the engine. Seeds below 1000 are for tuning, reported figures come from 1000 and above.
+The recordings come from tests/diagnose/hidden, which shares no code with the engine. An interrupted run goes
+on where it stopped; delete its folder after a change of the engine. Seeds below 1000 are for tuning, reported
+figures come from 1000 and above. All sets take about 6600 s of one core:
+
+    python scripts/bench_diagnose.py --first_seed=20000 --naive_every=60 --jobs=22 --minutes=12 \\
+        --before=results/diagnosis.json
+    python scripts/collect_results.py diagnosis outputs/bench_diagnose/table.md --replace
+    make tables
 """
 
 import argparse
 import importlib
-import json
-import multiprocessing
-import os
 import sys
-from contextlib import ExitStack
-from functools import partial
 from pathlib import Path
 from typing import Any
 
-os.environ.setdefault("OMP_NUM_THREADS", "1")
-os.environ.setdefault("MKL_NUM_THREADS", "1")
+from bench_sets import add_arguments, run_sets, shuffled
 
-import numpy as np
-from tqdm import tqdm
+from lerobot_vtrefine.cli.errors import run_cli
+from lerobot_vtrefine.cli.results import rows as results
 
 ROOT = Path(__file__).parents[1]
 sys.path.insert(0, str(ROOT / "tests" / "diagnose"))
@@ -43,10 +42,9 @@ def arguments() -> argparse.Namespace:
     parser.add_argument(
         "--naive_every", type=int, default=12, help="run the naive analysts on every n-th set; 0: never"
     )
-    parser.add_argument("--jobs", type=int, default=os.cpu_count() or 1)
-    parser.add_argument("--output_dir", type=Path, default=ROOT / "outputs" / "bench_diagnose")
     parser.add_argument("--only", help="run sets whose name contains this")
-    parser.add_argument("--table", action="store_true", help="print what is there, run nothing")
+    parser.add_argument("--before", type=Path, help="earlier results/diagnosis.json, as a column of table.md")
+    add_arguments(parser, ROOT / "outputs" / "bench_diagnose")
     return parser.parse_args()
 
 
@@ -55,51 +53,44 @@ def chosen(args: argparse.Namespace) -> list[Any]:
     found = []
     for name in args.groups.split(","):
         if name not in cases.GROUPS:
-            sys.exit(f"--groups: unknown group {name!r}; valid: {', '.join(cases.GROUPS)}")
+            raise ValueError(f"--groups: unknown group {name!r}; valid: {', '.join(cases.GROUPS)}")
         make, count = cases.GROUPS[name]
         count = args.per_cell or (max(1, count // QUICK_DIVISOR) if args.quick else count)
         found += make(count, args.first_seed)
-    found = [case for case in found if not args.only or args.only in case.name]
-    # In a fixed random order, so that an interrupted run's table is a fair sample of the whole.
-    return [found[i] for i in np.random.default_rng(0).permutation(len(found))]
+    return shuffled([case for case in found if not args.only or args.only in case.name])
 
 
-def run(output_dir: Path, task: tuple[Any, bool]) -> dict[str, Any]:
-    """One set, from the cache where it is there."""
-    case, naive = task
-    path = output_dir / f"{case.name}.json"
-    if path.exists():
-        return json.loads(path.read_text(encoding="utf-8"))
-    row = importlib.import_module("hidden_engine").run_case(case, naive)
-    scratch = path.with_suffix(".part")
-    scratch.write_text(json.dumps(row), encoding="utf-8")
-    scratch.replace(path)
-    return row
+def run(task: tuple[Any, bool]) -> dict[str, Any]:
+    """One set."""
+    return importlib.import_module("hidden_engine").run_case(*task)
 
 
+def earlier(path: Path | None) -> dict[str, dict[str, str]]:
+    """Commit -> (line -> figures) of an earlier table."""
+    found: dict[str, dict[str, str]] = {}
+    for row in results.read_rows(path) if path else []:
+        if isinstance(row, results.Line):
+            found.setdefault(f"at {row.commit}", {})[row.cells[""]] = row.cells["engine"]
+    return found
+
+
+@run_cli
 def main() -> None:
     """Run what is missing and print the table."""
     args = arguments()
-    args.output_dir.mkdir(parents=True, exist_ok=True)
-    wanted = chosen(args)
-    naive = [
-        case.spec.rig == "4x4" and args.naive_every > 0 and i % args.naive_every == 0
+    wanted, before = chosen(args), earlier(args.before)
+    tasks = {
+        case.name: (case, case.spec.rig == "4x4" and args.naive_every > 0 and i % args.naive_every == 0)
         for i, case in enumerate(wanted)
-    ]
-    tasks = list(zip(wanted, naive, strict=True))
-    if args.table:
-        tasks = [task for task in tasks if (args.output_dir / f"{task[0].name}.json").exists()]
-    with ExitStack() as stack:
-        pool = None
-        if args.jobs > 1 and not args.table:
-            pool = stack.enter_context(multiprocessing.get_context("spawn").Pool(args.jobs))
-        results = (pool.imap_unordered if pool else map)(partial(run, args.output_dir), tasks)
-        rows = list(tqdm(results, total=len(tasks), unit="set", disable=args.table))
+    }
+    rows = run_sets(run, tasks, args)
     if not rows:
-        sys.exit(f"{args.output_dir}: no results yet; run without --table")
-    print(table.render(rows))
-    (args.output_dir / "failures.txt").write_text("\n".join(table.failures(rows)) + "\n", encoding="utf-8")
+        raise ValueError(f"{args.output_dir}: no results yet; run without --table")
+    document = table.document(rows, before)
+    (args.output_dir / "table.md").write_text(document + "\n", encoding="utf-8")
+    print(table.render(rows), *table.failures(rows), document, sep="\n\n")
+    print(f"{len(rows)} of {len(tasks)} sets, {sum(row['total_cpu_s'] for row in rows):.0f} s of one core")
 
 
 if __name__ == "__main__":
-    main()
+    sys.exit(main())

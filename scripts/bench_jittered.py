@@ -1,79 +1,99 @@
-"""Diagnose pads of the third, jittered rig: bench_jittered.py --effects mullins,clean --gains .3 --seeds 0:3.
+#!/usr/bin/env python
+"""How good is vtrefine-diagnose on the third rig? 12 x 32 taxels, 16 presses, jittered clocks.
 
-Seeds below 1000 are for tuning, from 1000 on for reporting. One line of JSON per set goes to --output.
+The recordings come from tests/diagnose/jittered_rig.py: laws in several forms, scaled to an achievable gain.
+An interrupted run goes on where it stopped; delete its folder after a change of the engine. Seeds below 1000
+are for tuning, reported figures come from 1000 and above. A set takes about 20 s of one core:
+
+    python scripts/bench_jittered.py --seeds=2000:2008 --jobs=22 --minutes=10
+    python scripts/collect_results.py jittered outputs/bench_jittered/table.md --replace
+    make tables
 """
 
 import argparse
 import importlib
-import json
 import sys
 import time
+from itertools import product
 from pathlib import Path
+from typing import Any
 
-from lerobot_vtrefine.diagnose.pad.engine import diagnose_pad
-from lerobot_vtrefine.diagnose.quality import check_quality
+from bench_sets import Row, add_arguments, run_sets, shuffled
 
-sys.path.insert(0, str(Path(__file__).parents[1] / "tests" / "diagnose"))
+from lerobot_vtrefine.cli.errors import run_cli
+
+ROOT = Path(__file__).parents[1]
+sys.path.insert(0, str(ROOT / "tests" / "diagnose"))
 jittered_rig = importlib.import_module("jittered_rig")
+grading = importlib.import_module("jittered_grading")
+CLEAN = "clean"
+CLEAN_PER_LAW = 2
 
 
-def run(name: str, gain: float, seed: int, rows: int, cols: int) -> dict:
+def run(task: tuple[str, float, int, int, int]) -> Row:
     """One set's row."""
+    from lerobot_vtrefine.diagnose.api import diagnose
+
+    name, gain, seed, rows, cols = task
     rig = jittered_rig.Rig(seed, rows, cols)
     effect = jittered_rig.EFFECTS.get(name)
     effects = [(effect, rig.strength_for(effect, gain))] if effect else []
-    recordings, issues = check_quality(rig.record(effects))
+    recordings = rig.record(effects)
+    row: Row = {"law": name, "gain_wanted": gain, "seed": seed, "hz": rig.rate_hz}
     begin = time.process_time()
-    found = diagnose_pad(recordings)
-    row = {"effect": name, "gain": gain, "seed": seed, "hz": rig.rate_hz, "status": found.verdict.status}
-    row["cause"] = effect.cause if effect else None
-    row["named"] = [cause.name for cause in found.verdict.causes]
-    row["ambiguous"] = [list(group) for group in found.verdict.ambiguous_with]
-    row["clue"] = found.verdict.unknown.clue
-    row["achievable"] = rig.achievable(effects) if effects else 0.0
-    row["heldout_gain"] = found.verdict.heldout.gain if found.verdict.heldout else None
+    try:
+        found = diagnose(recordings)
+    except Exception as error:
+        return row | {"kind": "error", "error": f"{type(error).__name__}: {error}"}
     row["cpu_s"] = round(time.process_time() - begin, 1)
-    row["issues"] = [issue.problem for issue in issues]
-    row["minimum_detectable"] = dict(found.verdict.minimum_detectable)
-    truth = {"k_d/k_n": rig.damping_s} | (
-        {effect.parameter: effects[0][1]} if effect and effect.parameter else {}
+    return row | grading.graded(rig, effects, found)
+
+
+def arguments() -> argparse.Namespace:
+    """The command line."""
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
-    params = {name: p for cause in found.verdict.causes for name, p in cause.params.items()}
-    row["truth"] = truth
-    row["params"] = {key: [params[key].value, params[key].ci95] for key in truth if key in params}
-    return row
-
-
-def main() -> None:
-    """Run the sets and print one line each."""
-    parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--effects", default="clean")
-    parser.add_argument("--gains", default="0.3")
-    parser.add_argument("--seeds", default="0:2")
+    laws = [CLEAN, *jittered_rig.EFFECTS]
+    parser.add_argument("--laws", default=",".join(laws), help="comma-separated: %(default)s")
+    parser.add_argument("--gains", default="0.2,0.4", help="achievable gains (default %(default)s)")
+    parser.add_argument("--seeds", default="0:2", help="first and last + 1 (default %(default)s, for tuning)")
     parser.add_argument("--pad", default="12x32", help="rows and columns (default %(default)s)")
-    parser.add_argument("--output", type=Path)
-    options = parser.parse_args()
-    first, last = (int(part) for part in options.seeds.split(":"))
-    rows, cols = (int(part) for part in options.pad.split("x"))
-    for name in options.effects.split(","):
-        for gain in (float(part) for part in options.gains.split(",")):
-            for seed in range(first, last):
-                row = run(name, gain, seed, rows, cols)
-                line = json.dumps(row, default=lambda value: value.tolist())
-                if options.output:
-                    with options.output.open("a") as file:
-                        file.write(line + "\n")
-                short = {
-                    key: row[key]
-                    for key in ("effect", "gain", "seed", "hz", "status", "named", "clue", "cpu_s")
-                }
-                print(
-                    json.dumps(short),
-                    f"{row['heldout_gain']:.3f}/{row['achievable']:.3f}",
-                    row["params"],
-                    flush=True,
-                )
+    add_arguments(parser, ROOT / "outputs" / "bench_jittered")
+    return parser.parse_args()
+
+
+def chosen(args: argparse.Namespace) -> dict[str, Any]:
+    """The sets of this run by their names; clean ones have no gain, and more seeds."""
+    first, last = (int(part) for part in args.seeds.split(":"))
+    rows, cols = (int(part) for part in args.pad.split("x"))
+    sets = []
+    for law in args.laws.split(","):
+        if law != CLEAN and law not in jittered_rig.EFFECTS:
+            raise ValueError(f"--laws: unknown {law!r}; valid: {CLEAN}, {', '.join(jittered_rig.EFFECTS)}")
+        clean = law == CLEAN
+        seeds = range(first, last + (CLEAN_PER_LAW - 1) * (last - first) * clean)
+        gains = [0.0] if clean else [float(part) for part in args.gains.split(",")]
+        sets += [(law, gain, seed, rows, cols) for gain, seed in product(gains, seeds)]
+    return {
+        f"{law}-{gain}-{seed}-{args.pad}": (law, gain, seed, *size)
+        for law, gain, seed, *size in shuffled(sets)
+    }
+
+
+@run_cli
+def main() -> None:
+    """Run what is missing and print the table."""
+    args = arguments()
+    sets = chosen(args)
+    rows = run_sets(run, sets, args)
+    if not rows:
+        raise ValueError(f"{args.output_dir}: no results yet; run without --table")
+    text = grading.document(rows)
+    (args.output_dir / "table.md").write_text(text + "\n", encoding="utf-8")
+    print(grading.by_law(rows), *grading.failures(rows), "", text, sep="\n")
+    print(f"{len(rows)} of {len(sets)} sets, {sum(row['total_cpu_s'] for row in rows):.0f} s of one core")
 
 
 if __name__ == "__main__":
-    main()
+    sys.exit(main())

@@ -9,6 +9,7 @@ variants that come; without it only rows of the same seed give way:
     python scripts/collect_results.py reality outputs/compare_reality --replace
     python scripts/collect_results.py converges outputs/square/*/ --task=square_1mm --replace
     python scripts/collect_results.py tactile outputs/bench/tactile.md --replace
+    python scripts/collect_results.py diagnosis outputs/bench_diagnose/table.md --replace
     make tables
 
 A source is the folder of a vtrefine-demo or of a vtrefine-finetune (judged by a lerobot-eval whose
@@ -54,7 +55,8 @@ def main() -> None:
     found = []
     for source in options.sources:
         if options.table in Line.TABLES:
-            found += [(row, []) for row in printed_lines(source, options.table, origin)]
+            recorded = origin_of(source.parent, **origin)
+            found += [(row, []) for row in printed_lines(source, options.table, recorded)]
         elif options.table == "reality":
             found += reality_rows(source, origin_of(source, **origin))
         else:

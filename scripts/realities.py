@@ -8,7 +8,7 @@ from lerobot_vtrefine.embodiments import ALOHA
 from lerobot_vtrefine.tactile.model import SensorModel
 from lerobot_vtrefine.tactile.stages.contact import KelvinVoigt
 from lerobot_vtrefine.tactile.stages.host import Latency
-from lerobot_vtrefine.tactile.stages.mechanics import Hysteresis
+from lerobot_vtrefine.tactile.stages.hysteresis import Hysteresis
 from lerobot_vtrefine.tactile.stages.readout import (
     Gain,
     Idle,

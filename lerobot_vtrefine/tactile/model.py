@@ -10,6 +10,7 @@ import lerobot_vtrefine.tactile.stages  # noqa: F401  registers every stage
 from lerobot_vtrefine.files import decode, read_json
 from lerobot_vtrefine.tactile.stages.base import DOMAINS, STAGES, Stage, stage_class
 from lerobot_vtrefine.tactile.stages.contact import Consistent, ContactStage, KelvinVoigt
+from lerobot_vtrefine.tactile.stages.hysteresis import without_loop
 from lerobot_vtrefine.tactile.stages.readout import Gain, Idle, Noise, Quantisation, RowSharing
 
 SCHEMA = "vtrefine/sensor-model@1"
@@ -156,6 +157,7 @@ class SensorModel:
 def _stage_from_dict(item: Any) -> Stage:
     if not isinstance(item, dict) or not isinstance(item.get("stage"), str):
         raise ValueError(f'every stage needs a "stage" name; valid names: {", ".join(sorted(STAGES))}')
+    item = without_loop(item)
     cls = stage_class(item["stage"])
     parameters = {key: value for key, value in item.items() if key != "stage"}
     return decode(cls, parameters, f"stage {cls.name!r}", f"{cls.name}.")

@@ -9,7 +9,7 @@ from lerobot_vtrefine.diagnose.evidence import Evidence, ResidualView, Trace, Tr
 from lerobot_vtrefine.diagnose.verdict import Cause, Heldout, Parameter, Unknown, Verdict
 from lerobot_vtrefine.tactile.model import SensorModel
 from lerobot_vtrefine.tactile.stages.contact import KelvinVoigt
-from lerobot_vtrefine.tactile.stages.mechanics import Hysteresis
+from lerobot_vtrefine.tactile.stages.hysteresis import Hysteresis
 from lerobot_vtrefine.tactile.stages.readout import Gain, Idle
 
 BASELINE = SensorModel((KelvinVoigt(k_n=380.0, k_d=1.0), Gain(500.0), Idle(25.0, 0.0)))

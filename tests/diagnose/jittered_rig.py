@@ -50,8 +50,9 @@ class Press:
 
 @dataclass(frozen=True)
 class Effect:
-    """Where it acts ("height", "force", "reading", "delay", "frames"), its law, and its parameter.
+    """Its cause (empty: no catalogue lists it), where it acts, its law, and the cause's parameter.
 
+    It acts on "height", "depth", "reading", "delay" or "frames".
     `law(press, x, strength)` gives the changed x; a delay's law gives seconds per taxel (n,).
     """
 
@@ -162,6 +163,13 @@ _LAWS: dict[str, tuple[str, str, Law, float, str | None]] = {
         "taxel_gain_spread", "reading",
         lambda p, x, s: x * np.exp(s * _SPECIMEN[p.taxels]), 0.1, "sigma",
     ),
+    "hum": (
+        "", "reading", lambda p, x, a: x + a * (x > 0) * np.sin(39.6 * p.time_s)[:, None], 5.0, None
+    ),
+    "breathing": (
+        "", "reading", lambda p, x, a: x * (1 + a * np.sin(2.2 * p.time_s))[:, None], 0.1, None
+    ),
+    "supply": ("", "reading", lambda p, x, c: x / (1 + c * x.sum(axis=1, keepdims=True)), 1e-4, None),
 }  # fmt: skip
 _SPECIMEN = np.random.default_rng(77).standard_normal(4096)
 EFFECTS = {name: Effect(*entry) for name, entry in _LAWS.items()}
@@ -194,11 +202,12 @@ def _courses(rng: np.random.Generator, rows: int, cols: int, number: int) -> tup
 
 @dataclass
 class Rig:
-    """A specimen, its rig and its session; everything follows from the seed."""
+    """A specimen, its rig and its session; everything follows from the seed and the session's number."""
 
     seed: int
     rows: int = 12
     cols: int = 32
+    session: int = 0
 
     def __post_init__(self) -> None:
         rng = np.random.default_rng([self.seed, 31])
@@ -211,11 +220,19 @@ class Rig:
         self.rho = float(rng.uniform(0.8, 0.95))
         self.idle = rng.uniform(8, 30, self.rows * self.cols)
         courses = [_courses(rng, self.rows, self.cols, k) for k in range(CONDITIONS)]
+        if self.session:  # other presses of the same specimen, at the same places
+            rng = np.random.default_rng([self.seed, 35, self.session])
+            sites = [(x[0], y[0]) for _, x, y, _ in courses]
+            courses = [_courses(rng, self.rows, self.cols, k) for k in range(CONDITIONS)]
+            courses = [
+                (time, x - x[0] + site[0], y - y[0] + site[1], depth)
+                for (time, x, y, depth), site in zip(courses, sites, strict=True)
+            ]
         order = rng.permutation(CONDITIONS * REPLICATES)
         self.presses = [self._press(*courses[k // REPLICATES], k // REPLICATES, int(k)) for k in order]
 
     def _press(self, time, x, y, depth, condition, number) -> Press:
-        rng = np.random.default_rng([self.seed, 32, number])
+        rng = np.random.default_rng([self.seed, 32, number + 1000 * self.session])
         east = (np.arange(self.cols) - (self.cols - 1) / 2) * PITCH_M
         north = (np.arange(self.rows) - (self.rows - 1) / 2) * PITCH_M
         grid_x, grid_y = (axis.ravel() for axis in np.meshgrid(east, north))
@@ -299,7 +316,7 @@ class Rig:
         for order, press in enumerate(self.presses):
             signal = self.readings(press, effects, True)
             taken, frames = press.__dict__["taken"], len(press.frames_s)
-            rng = np.random.default_rng([self.seed, 34, order])
+            rng = np.random.default_rng([self.seed, 34, order + 1000 * self.session])
             slow = rng.standard_normal((frames, self.rows * self.cols))
             for k in range(1, frames):
                 slow[k] = self.rho * slow[k - 1] + np.sqrt(1 - self.rho**2) * slow[k]

@@ -53,11 +53,13 @@ def commands(trials: int, rng: np.random.Generator) -> Array:
     return lift + fast
 
 
-def make_set(folder: Path, law: Law, trials: int = 12, seed: int = 0, wobble: float = 0.02) -> Path:
+def make_set(
+    folder: Path, law: Law, trials: int = 12, seed: int = 0, wobble: float = 0.02, replicates: int = 1
+) -> Path:
     """A recording set at three gains, whose supply and friction differ a little from trial to trial."""
     rng = np.random.default_rng(seed)
-    gain = np.resize(GAINS, trials)
-    command = commands(trials, rng)
+    gain = np.repeat(np.resize(GAINS, trials // replicates), replicates)
+    command = np.repeat(commands(trials // replicates, rng), replicates, 1)
     size = 1 + wobble * rng.normal(size=trials)
     position = swing(command, gain, lambda motor, load, speed: size * law(motor, load, speed))
     position = np.round((position + 3e-4 * rng.normal(size=position.shape)) / ENCODER_RAD) * ENCODER_RAD
@@ -72,7 +74,7 @@ def make_set(folder: Path, law: Law, trials: int = 12, seed: int = 0, wobble: fl
         }
         pq.write_table(pa.table(table), folder / name)
         servo = {"duty_per_rad": float(gain[trial]), "supply_v": SUPPLY_V}
-        entries.append({"file": name, "condition": f"c{trial}", "order": trial, "servo": servo})
+        entries.append({"file": name, "condition": f"c{trial // replicates}", "order": trial, "servo": servo})
     plant = {"shape": "pendulum", "mass_kg": MASS_KG, "length_m": LENGTH_M}
     header = {"schema": "vtrefine/recording-set@1", "kind": "robot", "joints": ["servo"], "plant": plant}
     (folder / "recording.json").write_text(json.dumps(header | {"trials": entries}))

@@ -9,7 +9,6 @@ from lerobot_vtrefine.diagnose.pad.baseline import describe
 from lerobot_vtrefine.diagnose.pad.candidates import CATALOGUE
 from lerobot_vtrefine.diagnose.pad.candidates.base import Form
 from lerobot_vtrefine.diagnose.pad.fitting import predict
-from lerobot_vtrefine.diagnose.pad.forward_model.memory_stages import delayed, low_passed, play
 from lerobot_vtrefine.diagnose.pad.model import Composite, sensor_model
 from lerobot_vtrefine.diagnose.pad.prediction import predict_trial
 from lerobot_vtrefine.diagnose.pad.press_trials import PressSet, prepare
@@ -92,30 +91,3 @@ def test_the_saved_model_predicts_the_same(tmp_path: Path) -> None:
     press = held.presses[1]
     again = predict_trial(SensorModel.load(tmp_path / "sensor_model.json"), press.trial, held.layout)
     assert np.array_equal(again, predict_trial(model, press.trial, held.layout))
-
-
-def test_low_pass_of_a_ramp_is_exact_over_any_length() -> None:
-    time_s = np.concatenate([np.linspace(0, 1, 11), np.linspace(1.5, 400, 90)])
-    tau_s = 0.25
-    exact = time_s - tau_s * (1 - np.exp(-time_s / tau_s))
-    assert np.allclose(low_passed(time_s[:, None], time_s, tau_s)[:, 0], exact, atol=1e-9)
-
-
-def test_delay_of_a_ramp_is_a_shift() -> None:
-    time_s = np.linspace(0, 1, 21)
-    late = delayed(time_s[:, None], time_s, 0.13)[:, 0]
-    assert np.allclose(late, np.maximum(time_s - 0.13, 0))
-
-
-def test_play_that_rests_keeps_half_its_width_without_contact() -> None:
-    touch = np.array([0.0, 1.0, 0.0, 0.0])[:, None]
-    assert play(touch, 0.2)[:, 0].tolist() == pytest.approx([0.0, 0.8, 0.0, 0.0])
-    assert play(touch, 0.2, resting=True)[:, 0].tolist() == pytest.approx([0.0, 0.8, 0.2, 0.2])
-
-
-def test_play_follows_behind_by_half_its_width() -> None:
-    up_down = np.concatenate([np.linspace(0, 1, 11), np.linspace(0.95, 0.5, 10)])[:, None]
-    out = play(up_down, 0.2)[:, 0]
-    assert out[10] == pytest.approx(0.8)  # loading: behind by 0.2
-    assert out[14] == pytest.approx(0.8)  # inside the dead band
-    assert out[-1] == pytest.approx(0.7)  # unloading: above by 0.2

@@ -7,12 +7,12 @@ import pytest
 import torch
 
 from lerobot_vtrefine.diagnose.pad.candidates.sample_and_hold import held, irregular_periods
-from lerobot_vtrefine.diagnose.pad.forward_model.memory_stages import interpolated
 from lerobot_vtrefine.diagnose.pad.repeated_frames import Rhythm, slots
 from lerobot_vtrefine.tactile.layout import PadLayout
 from lerobot_vtrefine.tactile.model import SensorModel
 from lerobot_vtrefine.tactile.stages.base import Frame
 from lerobot_vtrefine.tactile.stages.host import SampleAndHold, taken_at_frames
+from lerobot_vtrefine.tactile.stages.signals import sampled
 
 
 def held_recording(period_s: float, phase: float, seed: int) -> Rhythm:
@@ -143,5 +143,5 @@ def test_held_frames_show_what_the_model_said_at_the_last_new_one() -> None:
     np.testing.assert_allclose(rhythm.taken_s(rhythm.time_s), np.array([0, 0, 2, 2, 2, 5]) * 0.05)
     values = np.arange(12.0)[:, None]
     fine_s = np.arange(12) * 0.025
-    shown = interpolated(values, fine_s, rhythm.taken_s(fine_s))
+    shown = sampled(*(torch.from_numpy(item) for item in (values, fine_s, rhythm.taken_s(fine_s))))
     np.testing.assert_allclose(shown[:, 0], [0, 0, 0, 0, 4, 4, 4, 4, 4, 4, 10, 10], atol=1e-9)

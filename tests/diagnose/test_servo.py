@@ -27,6 +27,7 @@ from servo_rig import (
 from lerobot_vtrefine.cli.import_dataset import ImportConfig, import_dataset
 from lerobot_vtrefine.cli.predict import main as predict
 from lerobot_vtrefine.diagnose.api import diagnose
+from lerobot_vtrefine.diagnose.core.suspicion import raise_alarms
 from lerobot_vtrefine.diagnose.recordings import read_recording_set
 from lerobot_vtrefine.diagnose.servo import candidates
 from lerobot_vtrefine.diagnose.servo.bench import Bench
@@ -211,6 +212,27 @@ def test_thinned_frames_are_apart_and_those_that_were_recorded() -> None:
     assert np.isin(thin.command[:, 2], command[:, 2]).all()
 
 
+def one_sided(motor: Array, load: Array, speed: Array) -> Array:
+    """Larger in one direction than in the other, as no law of the catalogue is."""
+    return plain(motor, load, speed) * (1 + 0.4 * np.sign(speed))
+
+
+@pytest.mark.parametrize(("law", "left"), [(plain, False), (one_sided, True)])
+def test_what_repeats_with_the_command_is_an_alarm(tmp_path: Path, law: Law, left: bool) -> None:
+    folder = make_set(tmp_path / "set", law, seed=5, replicates=2)
+    problem = ServoProblem.of(Bench.of(read_recording_set(folder)))
+    fitted = problem.baseline()
+    now = SimpleNamespace(fit=fitted, baseline=fitted, chosen={}, p_values={}, causes=lambda: {"any": (0,)})
+    alarms = raise_alarms(now, problem.suspicions(now, 0), 0)
+    assert bool(alarms) == left
+    assert all("repeats when the command is repeated" in alarm.clue for alarm in alarms)
+
+
+def test_commands_that_come_once_say_nothing_about_what_is_left(tmp_path: Path) -> None:
+    problem = ServoProblem.of(Bench.of(read_recording_set(make_set(tmp_path / "set", one_sided))))
+    assert problem.suspicions(None, 0) == []
+
+
 @pytest.mark.slow
 def test_what_only_coulomb_and_viscous_friction_hold_back_is_adequate(tmp_path: Path) -> None:
     found = diagnose(make_set(tmp_path / "set", plain))
@@ -237,6 +259,13 @@ def test_a_hidden_law_is_named_and_sized(
     assert cause in named
     value = named[cause].params[parameter]
     assert value.value == pytest.approx(size, rel=0.3)
+
+
+@pytest.mark.slow
+def test_a_law_outside_the_catalogue_is_unexplained(tmp_path: Path) -> None:
+    found = diagnose(make_set(tmp_path / "set", one_sided, trials=16, seed=7, replicates=2))
+    assert found.verdict.status == "unexplained"
+    assert found.verdict.unknown.alarm
 
 
 @pytest.mark.slow

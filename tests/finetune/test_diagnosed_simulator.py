@@ -9,7 +9,7 @@ from lerobot_vtrefine.envs.factory import make_simulation
 from lerobot_vtrefine.finetune import pipeline
 from lerobot_vtrefine.tactile.model import SensorModel
 from lerobot_vtrefine.tactile.stages.contact import KelvinVoigt
-from lerobot_vtrefine.tactile.stages.mechanics import Hysteresis
+from lerobot_vtrefine.tactile.stages.hysteresis import Hysteresis
 from lerobot_vtrefine.tactile.stages.readout import Gain, Idle, Quantisation
 
 

@@ -17,7 +17,7 @@ from lerobot_vtrefine.sim.simulation import InsertionSim
 from lerobot_vtrefine.tactile.model import SensorModel
 from lerobot_vtrefine.tactile.stages.contact import KelvinVoigt
 from lerobot_vtrefine.tactile.stages.host import Latency
-from lerobot_vtrefine.tactile.stages.mechanics import Hysteresis
+from lerobot_vtrefine.tactile.stages.hysteresis import Hysteresis
 from lerobot_vtrefine.tactile.stages.readout import Gain, Idle, Quantisation, RowSharing, TaxelGainSpread
 
 ROBOT = get_embodiment("aloha")

@@ -12,7 +12,8 @@ from lerobot_vtrefine.tactile import BodyGeometry, Box, PadLayout, PadSensors, P
 from lerobot_vtrefine.tactile.stages.base import STAGES
 from lerobot_vtrefine.tactile.stages.contact import Depth, FlexitacIsaacSim, KelvinVoigt, TacSL
 from lerobot_vtrefine.tactile.stages.host import Latency, SampleAndHold
-from lerobot_vtrefine.tactile.stages.mechanics import Hysteresis, ViscoelasticRelaxation
+from lerobot_vtrefine.tactile.stages.hysteresis import Hysteresis
+from lerobot_vtrefine.tactile.stages.mechanics import ViscoelasticRelaxation
 from lerobot_vtrefine.tactile.stages.readout import TaxelGainSpread
 
 LAYOUT = PadLayout()

@@ -8,7 +8,7 @@ import pytest
 from lerobot_vtrefine.tactile import SensorModel
 from lerobot_vtrefine.tactile.stages.base import STAGES
 from lerobot_vtrefine.tactile.stages.contact import Consistent, KelvinVoigt
-from lerobot_vtrefine.tactile.stages.mechanics import Hysteresis
+from lerobot_vtrefine.tactile.stages.hysteresis import Hysteresis
 from lerobot_vtrefine.tactile.stages.readout import Crosstalk, Gain, Quantisation
 
 CONTRACT = [
@@ -106,3 +106,30 @@ def test_ranges_name_every_parameter_that_can_be_randomised() -> None:
     ranges = with_everything().ranges()
     assert ranges["row_sharing.conductance_per_count"][1] > 0
     assert {"consistent.foundation_n_per_m3", "hysteresis.width_m", "latency.tau_s"} <= set(ranges)
+
+
+@pytest.mark.parametrize(
+    ("loop", "name"),
+    [
+        ("even", "hysteresis"),
+        ("resting", "resting_hysteresis"),
+        ("behind", "loading_hysteresis"),
+        ("scaled", "proportional_hysteresis"),
+        ("peak", "peak_hysteresis"),
+    ],
+)
+def test_files_of_the_one_hysteresis_stage_are_read(loop: str, name: str) -> None:
+    data = SensorModel.paper().with_stage(Hysteresis(0.2, 3e-4)).to_dict()
+    old = next(item for item in data["stages"] if item["stage"] == "hysteresis")
+    old["loop"] = loop
+    stage = SensorModel.from_dict(data).find(name)
+    assert stage is not None
+    assert stage.fraction == 0.2
+    assert getattr(stage, "width_m", 3e-4) == 3e-4
+
+
+def test_a_loop_that_never_was_is_refused() -> None:
+    data = SensorModel.paper().with_stage(Hysteresis(0.2, 3e-4)).to_dict()
+    next(item for item in data["stages"] if item["stage"] == "hysteresis")["loop"] = "round"
+    with pytest.raises(ValueError, match=r"hysteresis\.loop must be one of even, .*, got 'round'"):
+        SensorModel.from_dict(data)

@@ -8,7 +8,8 @@ from lerobot_vtrefine.tactile import BodyGeometry, Box, PadLayout, PadSensors, P
 from lerobot_vtrefine.tactile.replay import column_heights, finite_rate, replay
 from lerobot_vtrefine.tactile.stages.contact import KelvinVoigt
 from lerobot_vtrefine.tactile.stages.host import Latency, SampleAndHold
-from lerobot_vtrefine.tactile.stages.mechanics import Hysteresis, MechanicalSpreading, ViscoelasticRelaxation
+from lerobot_vtrefine.tactile.stages.hysteresis import Hysteresis
+from lerobot_vtrefine.tactile.stages.mechanics import MechanicalSpreading, ViscoelasticRelaxation
 from lerobot_vtrefine.tactile.stages.readout import BaselineDrift, Crosstalk, Idle
 from lerobot_vtrefine.tactile.stages.surface import ContactOffset, PadTilt
 

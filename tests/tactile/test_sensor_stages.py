@@ -1,6 +1,7 @@
 """Every stage after the contact law against an analytic result or an independent computation."""
 
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -9,9 +10,15 @@ from scipy.ndimage import gaussian_filter
 
 from lerobot_vtrefine.tactile import PadLayout
 from lerobot_vtrefine.tactile.stages.base import STAGES, Frame, Stage
-from lerobot_vtrefine.tactile.stages.host import Latency, SampleAndHold, ScanSkew
-from lerobot_vtrefine.tactile.stages.mechanics import (
+from lerobot_vtrefine.tactile.stages.host import Delay, Latency, SampleAndHold, ScanSkew
+from lerobot_vtrefine.tactile.stages.hysteresis import (
     Hysteresis,
+    LoadingHysteresis,
+    PeakHysteresis,
+    ProportionalHysteresis,
+    RestingHysteresis,
+)
+from lerobot_vtrefine.tactile.stages.mechanics import (
     MechanicalSpreading,
     NonlinearStiffness,
     ViscoelasticRelaxation,
@@ -28,6 +35,7 @@ from lerobot_vtrefine.tactile.stages.readout import (
     Saturation,
     TaxelGainSpread,
 )
+from lerobot_vtrefine.tactile.stages.softening import FirstLoadSoftening
 from lerobot_vtrefine.tactile.stages.surface import ContactOffset, PadTilt
 
 LAYOUT = PadLayout(6, 10, 0.002)
@@ -265,3 +273,63 @@ def test_invalid_parameters_are_refused_by_name() -> None:
         STAGES["kelvin_voigt"](k_n=-1.0)
     with pytest.raises(ValueError, match=r"latency.tau_s must be a finite number"):
         Latency(tau_s=float("nan"))
+
+
+LOADS = np.array([0.0, 0.3, 0.8, 0.5, 0.9, 0.2, 0.0, 0.0, 0.4, 0.1])
+LOOPS = {
+    # Band 0.4 wide: by hand from the law. Play follows 0.2 (all 0.4 where it lies behind) and is reset at 0.
+    "hysteresis": (Hysteresis(0.5, 5e-4), [0, 0.1, 0.6, 0.6, 0.7, 0.4, 0, 0, 0.2, 0.2]),
+    "resting": (RestingHysteresis(0.5, 5e-4), [0, 0.1, 0.6, 0.6, 0.7, 0.4, 0.2, 0.2, 0.2, 0.2]),
+    "loading": (LoadingHysteresis(0.5, 5e-4), [0, 0, 0.4, 0.4, 0.5, 0.2, 0, 0, 0, 0]),
+}
+
+
+@pytest.mark.parametrize("name", LOOPS)
+def test_play_operators_by_hand(name: str) -> None:
+    stage, play = LOOPS[name]
+    times = torch.arange(len(LOADS), dtype=torch.float64)
+    found = stage.sequence(ramp(times, LOADS), times, FRAME)[:, 0, 0].numpy()
+    assert np.allclose(found, 0.5 * LOADS + 0.5 * np.array(play), atol=1e-6)
+
+
+def test_proportional_and_peak_loops_by_hand() -> None:
+    times = torch.arange(len(LOADS), dtype=torch.float64)
+    x = ramp(times, LOADS)
+    back = np.array([0, 0, 0, 0.75, 0, 1, 0, 0, 0, 0.75])
+    found = ProportionalHysteresis(0.5, 5e-4).sequence(x, times, FRAME)[:, 0, 0].numpy()
+    assert np.allclose(found, LOADS * (1 + 0.5 * back), atol=1e-6)
+    share = np.array([0, 1, 1, 5 / 8, 1, 2 / 9, 0, 0, 1, 1 / 4])
+    found = PeakHysteresis(0.5).sequence(x, times, FRAME)[:, 0, 0].numpy()
+    assert np.allclose(found, LOADS * (1 + 2 * share * (1 - share)), atol=1e-6)
+
+
+WITH_MEMORY = [
+    *(stage for stage, _ in LOOPS.values()),
+    Hysteresis((0.3, -0.2), (2e-4, 6e-4)),
+    ProportionalHysteresis(0.5, 5e-4),
+    PeakHysteresis(-0.4),
+    ViscoelasticRelaxation((0.3, 2.0), (0.3, 0.2)),
+    ViscoelasticRelaxation(0.3, 0.9, pushes_only=True),
+    FirstLoadSoftening(0.4, 1.5, 0.5, recovery_s=3.0),
+    Latency(0.12, smoothing=0.4),
+    ScanSkew(0.05, cols_s=0.02),
+    ScanSkew(0.0, rows_s=(0.0, 0.05, 0.02)),
+    SampleAndHold(0.13),
+]
+
+
+@pytest.mark.parametrize("stage", WITH_MEMORY, ids=lambda stage: stage.name)
+def test_a_recording_at_once_is_its_frames_one_by_one(stage: Stage) -> None:
+    rng = np.random.default_rng(4)
+    # Frames of even length: a delay's memory while simulating is of frames. All else takes any times.
+    steps = np.full(60, 0.04) if isinstance(stage, Delay) else rng.uniform(0.01, 0.06, 60)
+    times = torch.from_numpy(np.cumsum(steps))
+    walk = np.abs(np.cumsum(rng.normal(0, 0.15, (60, 6, 10)), axis=0)) - 0.1
+    x = torch.from_numpy(walk)
+    state = {key: torch.as_tensor(value[0]) for key, value in stage.initial(LAYOUT, 1).items()}
+    one_by_one = []
+    for k in range(60):
+        dt_s = float(times[k] - times[k - 1]) if k else 0.0
+        y, state = stage.step(x[k], state, replace(FRAME, time_s=times[k], dt_s=dt_s))
+        one_by_one.append(y)
+    assert torch.allclose(stage.sequence(x, times, FRAME), torch.stack(one_by_one), atol=1e-5)

@@ -115,6 +115,7 @@ class Line(Row):
         "diagnosis",
         "information",
         "ingredients",
+        "jittered",
         "servo",
         "step_size",
         "tactile",

@@ -8,11 +8,13 @@ import numpy as np
 from lerobot_vtrefine.diagnose.core.problem import NothingBesides
 from lerobot_vtrefine.diagnose.core.rivals import Rival
 from lerobot_vtrefine.diagnose.core.search import Selection
+from lerobot_vtrefine.diagnose.core.suspicion import Suspicion
 from lerobot_vtrefine.diagnose.servo.bench import Bench
 from lerobot_vtrefine.diagnose.servo.candidates import CATALOGUE
 from lerobot_vtrefine.diagnose.servo.candidates.base import Candidate
 from lerobot_vtrefine.diagnose.servo.fitting import Fit, Fitter, Refits
 from lerobot_vtrefine.diagnose.servo.parameters import INDEX
+from lerobot_vtrefine.diagnose.servo.suspicions import repeated, repeating
 
 Array = np.ndarray
 
@@ -25,7 +27,7 @@ _OF_A_STEP = 0.25
 
 
 class ServoProblem(NothingBesides):
-    """See `core.problem.Problem`. Nothing is said about what is left: trials are rarely repeated."""
+    """See `core.problem.Problem`."""
 
     subject = "servo"
     channels = ("position",)
@@ -94,6 +96,14 @@ class ServoProblem(NothingBesides):
     def reweighted(self, fit: Fit, channels: Array | None = None) -> Refits:
         """By one Newton step."""
         return Refits(self.bench, fit)
+
+    def suspicions(self, selection: Selection[Any, Fit, Candidate], seed: int) -> list[Suspicion]:
+        """See `servo.suspicions`; with all frames, for between fewer the simulation's steps leave as much."""
+        if not repeated(self.bench):
+            return []
+        fine = self.finer() or self
+        left = fine.refitted(selection.fit).residual
+        return repeating(fine.bench, left, float(selection.baseline.mse.mean()), encoder_step(fine.bench))
 
     can_settle = True
 

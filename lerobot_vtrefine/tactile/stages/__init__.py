@@ -1,6 +1,6 @@
 """Stages of the sensor model, by domain; importing this package registers them all."""
 
-from lerobot_vtrefine.tactile.stages import contact, host, mechanics, readout, softening, surface
+from lerobot_vtrefine.tactile.stages import contact, host, hysteresis, mechanics, readout, softening, surface
 from lerobot_vtrefine.tactile.stages.base import STAGES, Frame, Stage, register, stage_class
 
 __all__ = [
@@ -9,6 +9,7 @@ __all__ = [
     "Stage",
     "contact",
     "host",
+    "hysteresis",
     "mechanics",
     "readout",
     "register",

@@ -92,6 +92,10 @@ class Stage:
     has_state: ClassVar[bool] = False
     """Whether `step` needs its own previous state, so that frames must be processed in order."""
     stochastic: ClassVar[bool] = False
+    alike: ClassVar[bool] = False
+    """Whether every taxel follows the same law by itself: fits run it on the taxels that answer, alone."""
+    rate_free: ClassVar[bool] = False
+    """Whether a memory follows the order of the frames, whatever their times."""
 
     def __post_init__(self) -> None:
         for item in fields(self):
@@ -165,6 +169,15 @@ def stage_class(name: str) -> type[Stage]:
 def as_tuple(value: Any) -> Any:
     """Nested lists as nested tuples, so that stages stay hashable and comparable."""
     return tuple(as_tuple(item) for item in value) if isinstance(value, list | tuple | np.ndarray) else value
+
+
+def paired(stage: str, first: Any, second: Any, names: str = "tau_s and fraction") -> list[tuple[Any, Any]]:
+    """Numbers or equally long lists of them, branch by branch."""
+    firsts = first if isinstance(first, tuple) else (first,)
+    seconds = second if isinstance(second, tuple) else (second,)
+    if len(firsts) != len(seconds) or not firsts:
+        raise ValueError(f"{stage}: {names} need the same number of branches, got {firsts} and {seconds}")
+    return list(zip(firsts, seconds, strict=True))
 
 
 def as_map(name: str, values: Any) -> Any:

@@ -17,28 +17,12 @@ from lerobot_vtrefine.tactile.stages.base import (
     parameter,
     register,
 )
+from lerobot_vtrefine.tactile.stages.signals import delayed, followed, low_passed, sampled
 
 PHASES = 16
 """Instants over which the mean reading of a free-running board is taken."""
 HISTORY_FRAMES = 16
 """Frames that a delay remembers while simulating; replay has no such limit."""
-
-
-def delayed_sequence(x: torch.Tensor, times_s: torch.Tensor, delay_s: torch.Tensor) -> torch.Tensor:
-    """x (T, ..., R, C) as it was `delay_s`, (R,) or (T, R), earlier; linear between frames, held before the
-    first."""
-    if len(times_s) < 2:
-        return x
-    wanted = times_s[:, None] - delay_s.to(times_s)
-    after = torch.searchsorted(times_s, wanted.contiguous(), right=True).clamp(1, len(times_s) - 1)
-    span = (times_s[after] - times_s[after - 1]).clamp(min=1e-12)
-    weight = ((wanted - times_s[after - 1]) / span).clamp(0.0, 1.0).to(x.dtype)
-    middle = (1,) * (x.ndim - 3)
-    rows = torch.arange(x.shape[-2], device=x.device)
-    by_row = x.movedim(-2, 1)
-    weight = weight.view(*weight.shape, *middle, 1)
-    earlier, later = by_row[after - 1, rows], by_row[after, rows]
-    return (earlier + weight * (later - earlier)).movedim(1, -2)
 
 
 def taken_at_frames(times_s: np.ndarray, period_s: float, frame_s: float) -> np.ndarray:
@@ -88,8 +72,7 @@ class Delay(Stage):
 
     @override
     def sequence(self, x: torch.Tensor, times_s: torch.Tensor, frame: Frame) -> torch.Tensor:
-        delay = self.delay_s(x.shape[-2], x).reshape(-1)
-        return delayed_sequence(x, times_s, delay.expand(x.shape[-2]) if len(delay) == 1 else delay)
+        return delayed(x, times_s, self.delay_s(x.shape[-2], x))
 
 
 @register
@@ -102,6 +85,7 @@ class Latency(Delay):
 
     name: ClassVar[str] = "latency"
     rank: ClassVar[int] = 70
+    alike: ClassVar[bool] = True
     tau_s: float = parameter(0.01, "s", 0.0, 0.05)
     smoothing: float = parameter(0.0, "1", 0.0, 0.0, maximum=1.0)
 
@@ -135,28 +119,19 @@ class Latency(Delay):
         first = (state["frames"] == 0)[..., None, None]
         before = torch.where(first, late, state["before"])
         smooth = torch.where(first, late, state["smooth"])
-        smooth = self._followed(smooth, before, late, frame.dt_s)
+        smooth = followed(smooth, before, late, frame.dt_s, self._filter_s)
         return smooth, {**new, "before": late, "smooth": smooth}
 
-    def _followed(self, smooth: Any, before: Any, now: Any, dt_s: float) -> Any:
-        """The filter's reading after a step in which its input went straight from `before` to `now`."""
-        if dt_s <= 0.0:
-            return smooth
+    @property
+    def _filter_s(self) -> Any:
+        """Time constant of the filter [s]."""
         tau_s = self.smoothing * self.tau_s
-        tau_s = tau_s.clamp(min=1e-6) if isinstance(tau_s, torch.Tensor) else max(tau_s, 1e-6)
-        decay = torch.exp(-dt_s / tau_s) if isinstance(tau_s, torch.Tensor) else math.exp(-dt_s / tau_s)
-        ramp = 1.0 - (1.0 - decay) * (tau_s / dt_s)
-        return decay * smooth + (1.0 - decay) * before + ramp * (now - before)
+        return tau_s.clamp(min=1e-6) if isinstance(tau_s, torch.Tensor) else max(tau_s, 1e-6)
 
     @override
     def sequence(self, x: torch.Tensor, times_s: torch.Tensor, frame: Frame) -> torch.Tensor:
         late = super().sequence(x, times_s, frame)
-        if self._plain or not len(late):
-            return late
-        smooth = [late[0]]
-        for before, now, dt_s in zip(late[:-1], late[1:], times_s.diff().tolist(), strict=True):
-            smooth.append(self._followed(smooth[-1], before, now, dt_s))
-        return torch.stack(smooth)
+        return late if self._plain else late[:1] + low_passed(late - late[:1], times_s, float(self._filter_s))
 
 
 @register
@@ -182,33 +157,22 @@ class ScanSkew(Delay):
         if len(self.rows_s) == 1 or not all(math.isfinite(value) for value in self.rows_s):
             raise ValueError("scan_skew.rows_s needs at least two finite numbers")
 
-    def of_rows(self, rows: int) -> np.ndarray | None:
-        """Delay of each row where `rows_s` gives it, (R,) [s]."""
-        if not self.rows_s:
-            return None
-        return np.interp(np.linspace(0.0, 1.0, rows), np.linspace(0.0, 1.0, len(self.rows_s)), self.rows_s)
+    def late_s(self, row: torch.Tensor, col: torch.Tensor, rows: int, cols: int) -> torch.Tensor:
+        """Delay of taxels in these rows and columns of a rows x cols pad [s]."""
+        share = row / max(rows - 1, 1)
+        if self.rows_s:
+            known = np.interp(share.cpu().numpy(), np.linspace(0.0, 1.0, len(self.rows_s)), self.rows_s)
+            late = torch.as_tensor(known, dtype=row.dtype, device=row.device)
+        else:
+            late = self.skew_s * share
+        return late + self.cols_s * col / max(cols - 1, 1)
 
     @override
     def delay_s(self, rows: int, like: torch.Tensor) -> torch.Tensor:
-        own = self.of_rows(rows)
-        if own is not None:
-            late = torch.as_tensor(own, dtype=like.dtype, device=like.device)[:, None]
-        else:
-            share = torch.arange(rows, dtype=like.dtype, device=like.device)[:, None] / max(rows - 1, 1)
-            late = self.skew_s * share
-        if not isinstance(self.cols_s, torch.Tensor) and self.cols_s == 0.0:
-            return late
-        cols = like.shape[-1]
-        along = torch.arange(cols, dtype=like.dtype, device=like.device) / max(cols - 1, 1)
-        return late + self.cols_s * along
-
-    @override
-    def sequence(self, x: torch.Tensor, times_s: torch.Tensor, frame: Frame) -> torch.Tensor:
-        delay = self.delay_s(x.shape[-2], x)
-        if delay.shape[-1] == 1:
-            return super().sequence(x, times_s, frame)
-        columns = [delayed_sequence(x[..., c : c + 1], times_s, delay[:, c]) for c in range(x.shape[-1])]
-        return torch.cat(columns, dim=-1)
+        row, col = (torch.arange(n, dtype=like.dtype, device=like.device) for n in (rows, like.shape[-1]))
+        # Without a delay along them, the columns of a row are read as one.
+        along = isinstance(self.cols_s, torch.Tensor) or self.cols_s != 0.0
+        return self.late_s(row[:, None], col if along else col[:1], rows, like.shape[-1])
 
 
 @register
@@ -257,12 +221,10 @@ class SampleAndHold(Stage):
     def sequence(self, x: torch.Tensor, times_s: torch.Tensor, frame: Frame) -> torch.Tensor:
         """As `step` frame by frame; of a free board, whose instants nobody knows, the mean over them."""
         if self.frame_s:
-            held = taken_at_frames(times_s.numpy(), self.period_s, self.frame_s)
-            delay_s = times_s.to(torch.float64) - torch.from_numpy(held)
-            return delayed_sequence(x, times_s, delay_s[:, None].expand(-1, x.shape[-2]))
+            held = taken_at_frames(times_s.cpu().numpy(), self.period_s, self.frame_s)
+            return sampled(x, times_s, torch.from_numpy(held).to(times_s))
         if not self.free and not self.irregular:
             return super().sequence(x, times_s, frame)
-        rows, parts = x.shape[-2], (torch.arange(PHASES, dtype=torch.float64) + 0.5) / PHASES
+        parts = (torch.arange(PHASES, dtype=torch.float64) + 0.5) / PHASES
         ages = self.lag_s + 2.0 * self.age_s * parts if self.irregular else self.period_s * parts
-        delays = ages[:, None].expand(-1, rows)
-        return torch.stack([delayed_sequence(x, times_s, delay) for delay in delays]).mean(dim=0)
+        return torch.stack([sampled(x, times_s, times_s - age) for age in ages.tolist()]).mean(dim=0)

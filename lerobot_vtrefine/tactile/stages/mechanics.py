@@ -1,16 +1,25 @@
 """Stages that act on force: what the layers between the face and the electrodes do to it."""
 
-import math
 from dataclasses import dataclass
 from functools import lru_cache
-from typing import Any, ClassVar, override
+from typing import ClassVar, override
 
 import numpy as np
 import torch
 
 from lerobot_vtrefine.files import limits
 from lerobot_vtrefine.tactile.layout import PadLayout
-from lerobot_vtrefine.tactile.stages.base import Frame, Stage, State, Traits, as_tuple, parameter, register
+from lerobot_vtrefine.tactile.stages.base import (
+    Frame,
+    Stage,
+    State,
+    Traits,
+    as_tuple,
+    paired,
+    parameter,
+    register,
+)
+from lerobot_vtrefine.tactile.stages.signals import followed, low_passed
 
 REFERENCE_DEPTH_M = 1e-3
 """Depth at which a non-linear stiffness equals the linear one [m]."""
@@ -31,6 +40,7 @@ class NonlinearStiffness(Stage):
     name: ClassVar[str] = "nonlinear_stiffness"
     domain: ClassVar[str] = "force"
     rank: ClassVar[int] = 30
+    alike: ClassVar[bool] = True
     exponent: float = parameter(1.0, "1", 0.8, 1.6, minimum=1e-3, maximum=10.0)
     share: float = parameter(1.0, "1", 1.0, 1.0, maximum=1.0)
 
@@ -127,15 +137,6 @@ class MechanicalSpreading(Stage):
         return spreading_matrix(rows, sigma) @ x @ spreading_matrix(cols, sigma).transpose(-1, -2), state
 
 
-def _paired(stage: str, first: Any, second: Any, names: str = "tau_s and fraction") -> list[tuple[Any, Any]]:
-    """Numbers or equally long lists of them, branch by branch."""
-    firsts = first if isinstance(first, tuple) else (first,)
-    seconds = second if isinstance(second, tuple) else (second,)
-    if len(firsts) != len(seconds) or not firsts:
-        raise ValueError(f"{stage}: {names} need the same number of branches, got {firsts} and {seconds}")
-    return list(zip(firsts, seconds, strict=True))
-
-
 @register
 @dataclass(frozen=True)
 class ViscoelasticRelaxation(Stage):
@@ -150,6 +151,7 @@ class ViscoelasticRelaxation(Stage):
     domain: ClassVar[str] = "force"
     rank: ClassVar[int] = 34
     has_state: ClassVar[bool] = True
+    alike: ClassVar[bool] = True
     tau_s: float | tuple[float, ...] = parameter(1.0, "s", 0.3, 3.0, minimum=1e-6)
     fraction: float | tuple[float, ...] = parameter(0.15, "1", 0.0, 0.3, minimum=None)
     pushes_only: bool = False
@@ -158,99 +160,28 @@ class ViscoelasticRelaxation(Stage):
         for name in ("tau_s", "fraction"):
             object.__setattr__(self, name, as_tuple(getattr(self, name)))
         super().__post_init__()
-        _paired(self.name, self.tau_s, self.fraction)
+        paired(self.name, self.tau_s, self.fraction)
 
     @override
     def initial(self, layout: PadLayout, pads: int) -> Traits:
         names = [
             "previous",
-            *(f"slow_{j}" for j in range(len(_paired(self.name, self.tau_s, self.fraction)))),
+            *(f"slow_{j}" for j in range(len(paired(self.name, self.tau_s, self.fraction)))),
         ]
         return {name: np.zeros((pads, layout.rows, layout.cols), dtype=np.float32) for name in names}
 
     @override
     def step(self, x: torch.Tensor, state: State, frame: Frame) -> tuple[torch.Tensor, State]:
-        previous, dt_s = state["previous"], frame.dt_s
         new, relaxed = {**state, "previous": x}, x
-        for j, (tau_s, fraction) in enumerate(_paired(self.name, self.tau_s, self.fraction)):
-            slow = state[f"slow_{j}"]
-            if dt_s > 0.0:
-                ratio = -dt_s / tau_s
-                decay = torch.exp(ratio) if isinstance(ratio, torch.Tensor) else math.exp(ratio)
-                ramp = 1.0 - (1.0 - decay) * (tau_s / dt_s)
-                slow = decay * slow + (1.0 - decay) * previous + ramp * (x - previous)
+        for j, (tau_s, fraction) in enumerate(paired(self.name, self.tau_s, self.fraction)):
+            slow = followed(state[f"slow_{j}"], state["previous"], x, frame.dt_s, tau_s)
             new[f"slow_{j}"] = slow
             relaxed = relaxed - fraction * slow
         return (relaxed.clamp(min=0.0) if self.pushes_only else relaxed), new
 
-
-LOOPS = ("even", "resting", "behind", "scaled", "peak")
-
-
-@register
-@dataclass(frozen=True)
-class Hysteresis(Stage):
-    """Rate-free loop: f + sum_j fraction_j * (play_j(f) - f).
-
-    A play operator follows the depth f / stiffness with a dead band of full width `width_m`, so that loading
-    and
-    unloading at the same depth differ by fraction * width_m * stiffness. Without contact it returns to zero.
-    `fraction` and `width_m` are numbers or equally long lists (several operators make loops of any shape). A
-    positive
-    fraction reads less while loading, a negative one more, as a cover that dissipates energy does.
-
-    `loop` says where the band lies: "even" about f; "resting" too, but kept without contact, so that readings
-    rest above idle once they were let go; "behind" it, so that only loading differs from f, as sums
-    of relays have it; "scaled" is a loop as wide as the load is high: f (1 + fraction b), with b from 0 to 1
-    over `width_m` of unloading; "peak" follows f / (largest f of this contact) = s: f (1 + 4 fraction s (1 -
-    s)), so that loops close at both ends (`width_m` has no part in it).
-    """
-
-    name: ClassVar[str] = "hysteresis"
-    domain: ClassVar[str] = "force"
-    rank: ClassVar[int] = 36
-    has_state: ClassVar[bool] = True
-    fraction: float | tuple[float, ...] = parameter(0.15, "1", 0.0, 0.3, minimum=None)
-    width_m: float | tuple[float, ...] = parameter(2e-4, "m", 5e-5, 5e-4)
-    loop: str = "even"
-
-    def __post_init__(self) -> None:
-        for name in ("fraction", "width_m"):
-            object.__setattr__(self, name, as_tuple(getattr(self, name)))
-        super().__post_init__()
-        if self.loop not in LOOPS:
-            raise ValueError(f"hysteresis.loop must be one of {', '.join(LOOPS)}, got {self.loop!r}")
-        self._operators()
-
-    def _operators(self) -> list[tuple[str, Any, Any]]:
-        """State's name, fraction and width of every play operator."""
-        pairs = _paired(self.name, self.fraction, self.width_m, "fraction and width_m")
-        return [(f"play_{j}" if j else "play", fraction, width) for j, (fraction, width) in enumerate(pairs)]
-
     @override
-    def initial(self, layout: PadLayout, pads: int) -> Traits:
-        shape = (pads, layout.rows, layout.cols)
-        names = [name for name, _, _ in self._operators()] + (["before"] if self.loop == "scaled" else [])
-        return {name: np.zeros(shape, dtype=np.float32) for name in names}
-
-    @override
-    def step(self, x: torch.Tensor, state: State, frame: Frame) -> tuple[torch.Tensor, State]:
-        new, looped = dict(state), x
-        for name, fraction, width_m in self._operators():
-            width = width_m * frame.stiffness_n_per_m
-            if self.loop == "scaled":
-                tiny = torch.as_tensor(width, dtype=x.dtype, device=x.device).clamp(min=1e-12)
-                back = (state[name] - (x - state["before"]) / tiny).clamp(0.0, 1.0)
-                new |= {name: back * (x > 0), "before": x}
-                looped = looped + fraction * new[name] * x
-                continue
-            if self.loop == "peak":
-                new[name] = torch.maximum(state[name], x) * (x > 0)
-                share = x / new[name].clamp(min=1e-12)
-                looped = looped + 4.0 * fraction * share * (1.0 - share) * x.clamp(min=0.0)
-                continue
-            above = 0.0 * width if self.loop == "behind" else 0.5 * width
-            play = torch.maximum(torch.minimum(state[name], x + above), x + above - width).clamp(min=0.0)
-            new[name] = play if self.loop == "resting" else play * (x > 0)
-            looped = looped + fraction * (new[name] - x)
-        return looped.clamp(min=0.0), new
+    def sequence(self, x: torch.Tensor, times_s: torch.Tensor, frame: Frame) -> torch.Tensor:
+        relaxed = x
+        for tau_s, fraction in paired(self.name, self.tau_s, self.fraction):
+            relaxed = relaxed - fraction * low_passed(x, times_s, float(tau_s))
+        return relaxed.clamp(min=0.0) if self.pushes_only else relaxed

@@ -2,7 +2,7 @@
 
 from dataclasses import dataclass, field, replace
 from itertools import pairwise
-from typing import ClassVar, override
+from typing import Any, ClassVar, override
 
 import numpy as np
 import torch
@@ -33,6 +33,7 @@ class Gain(Stage):
     name: ClassVar[str] = "gain"
     domain: ClassVar[str] = "gain"
     rank: ClassVar[int] = 40
+    alike: ClassVar[bool] = True
     counts_per_n: float = parameter(500.0, "counts/N", 250.0, 1000.0)
 
     @override
@@ -126,6 +127,7 @@ class Saturation(Stage):
     name: ClassVar[str] = "saturation"
     domain: ClassVar[str] = "counts"
     rank: ClassVar[int] = 54
+    alike: ClassVar[bool] = True
     knee_counts: float = parameter(200.0, "counts", 120.0, 400.0, minimum=1e-6)
     sharpness: float | None = limits(above=0.0, maximum=100.0, default=None)
 
@@ -159,10 +161,13 @@ class RowSharing(Stage):
     conductance_per_count: float = parameter(4e-4, "1/counts", 0.0, 2e-3)
     own: float = parameter(1.0, "1", 1.0, 1.0, maximum=1.0)
 
+    def divided(self, x: Any, row_sum: Any) -> Any:
+        """Readings x whose rows add up to `row_sum`, after the divider."""
+        return x / (1.0 + self.conductance_per_count * (row_sum - (1.0 - self.own) * x))
+
     @override
     def step(self, x: torch.Tensor, state: State, frame: Frame) -> tuple[torch.Tensor, State]:
-        load = x.sum(dim=-1, keepdim=True) - (1.0 - self.own) * x
-        return x / (1.0 + self.conductance_per_count * load), state
+        return self.divided(x, x.sum(dim=-1, keepdim=True)), state
 
 
 @register

@@ -28,6 +28,7 @@ class FirstLoadSoftening(Stage):
     domain: ClassVar[str] = "force"
     rank: ClassVar[int] = 35
     has_state: ClassVar[bool] = True
+    alike: ClassVar[bool] = True
     softening: float = parameter(0.15, "1", 0.0, 0.3, minimum=None, maximum=1.0)
     sharpness: float = parameter(1.0, "1", 1.0, 1.0, minimum=1e-3, maximum=20.0)
     growth: float = parameter(0.0, "1", 0.0, 0.0, maximum=10.0)

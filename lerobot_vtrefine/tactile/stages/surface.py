@@ -25,6 +25,7 @@ class ContactOffset(Stage):
     name: ClassVar[str] = "contact_offset"
     domain: ClassVar[str] = "depth"
     rank: ClassVar[int] = 10
+    alike: ClassVar[bool] = True
     offset_m: float = parameter(0.0, "m", -2e-4, 2e-4, minimum=None)
     softness_m: float = parameter(0.0, "m", 0.0, 0.0)
 
@@ -53,6 +54,7 @@ class StiffeningDepth(Stage):
     name: ClassVar[str] = "stiffening_depth"
     domain: ClassVar[str] = "depth"
     rank: ClassVar[int] = 14
+    alike: ClassVar[bool] = True
     more: float = parameter(0.0, "1", 0.0, 2.0, minimum=-1.0)
     knee_m: float = parameter(5e-4, "m", 2e-4, 1e-3)
     width_m: float = parameter(5e-5, "m", 1e-5, 1e-4, minimum=1e-8)

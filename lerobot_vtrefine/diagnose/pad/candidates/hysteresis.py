@@ -4,7 +4,13 @@ import numpy as np
 
 from lerobot_vtrefine.diagnose.pad.candidates.base import Form, Setting, Value
 from lerobot_vtrefine.tactile.stages.base import Stage
-from lerobot_vtrefine.tactile.stages.mechanics import Hysteresis
+from lerobot_vtrefine.tactile.stages.hysteresis import (
+    Hysteresis,
+    LoadingHysteresis,
+    PeakHysteresis,
+    ProportionalHysteresis,
+    RestingHysteresis,
+)
 
 WIDE = 4.0
 """Widest play over the deepest press: beyond, the operator never moves."""
@@ -21,15 +27,15 @@ def _several(values: np.ndarray, setting: Setting) -> tuple[Stage, ...]:
 
 def _behind(values: np.ndarray, setting: Setting) -> tuple[Stage, ...]:
     widths = tuple(float(share * setting.top_depth_m) for share in SEVERAL_WIDTHS)
-    return (Hysteresis(tuple(float(value) for value in values), widths, "behind"),)
+    return (LoadingHysteresis(tuple(float(value) for value in values), widths),)
 
 
 def _resting(values: np.ndarray, setting: Setting) -> tuple[Stage, ...]:
-    return (Hysteresis(float(values[0]), float(np.exp(values[1]) * setting.top_depth_m), "resting"),)
+    return (RestingHysteresis(float(values[0]), float(np.exp(values[1]) * setting.top_depth_m)),)
 
 
 def _scaled(values: np.ndarray, setting: Setting) -> tuple[Stage, ...]:
-    return (Hysteresis(float(values[0]), float(np.exp(values[1]) * setting.top_depth_m), "scaled"),)
+    return (ProportionalHysteresis(float(values[0]), float(np.exp(values[1]) * setting.top_depth_m)),)
 
 
 def _report_one(values: np.ndarray, setting: Setting) -> dict[str, tuple[float, str]]:
@@ -103,7 +109,7 @@ FORMS = (
         "hysteresis",
         "a loop below the largest load of the contact",
         (Value("fraction", -0.9, 0.9, 2e-3),),
-        lambda v, s: (Hysteresis(float(v[0]), s.top_depth_m, "peak"),),
+        lambda v, s: (PeakHysteresis(float(v[0])),),
         lambda v, s: {"fraction": (float(v[0]), "1"), "width_m": (s.top_depth_m, "m")},
         lambda s: [[-0.05], [0.05]],
         signed=True,

@@ -1,6 +1,5 @@
 """What passes from stage to stage while fitting: values of some of a sheet's columns."""
 
-from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
@@ -51,15 +50,3 @@ class Context:
     stiffness: float
     wanted: np.ndarray | None = None
     """Numbers of the columns in which a stage that mixes taxels should answer; None for all."""
-
-
-def by_press(
-    field: Field, sheet: Sheet, work: Callable[[np.ndarray, np.ndarray, np.ndarray], np.ndarray]
-) -> Field:
-    """work(values (T, m), times (T,), columns' rows in the pad (m,)) on every press."""
-    out = np.zeros_like(field.values)
-    for press, time_s in enumerate(sheet.times_s):
-        part = field.within(sheet, press)
-        rows = sheet.rows[field.columns[part]]
-        out[: len(time_s), part] = work(field.values[: len(time_s), part], time_s, rows)
-    return Field(out, field.columns)

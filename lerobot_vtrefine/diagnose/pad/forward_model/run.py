@@ -1,8 +1,4 @@
-"""Many presses through the simulator's stages at once, in double precision, for fitting.
-
-Every stage of the catalogue has a fast equal on sheets (a test holds each to the stage itself); a stage that
-is not listed runs its own code, press by press.
-"""
+"""Many presses through the simulator's stages at once, in double precision, for fitting."""
 
 import threading
 from collections.abc import Sequence
@@ -10,20 +6,15 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-import torch
 
 from lerobot_vtrefine.diagnose.pad.forward_model.batches import Sheet, build_sheets
 from lerobot_vtrefine.diagnose.pad.forward_model.fields import Context, Field
-from lerobot_vtrefine.diagnose.pad.forward_model.memory_stages import MEMORY
-from lerobot_vtrefine.diagnose.pad.forward_model.momentary_stages import MIXING, SEPARATE
+from lerobot_vtrefine.diagnose.pad.forward_model.stages import run_stage, treats_each_alone
 from lerobot_vtrefine.diagnose.pad.motion import Kind, instants
 from lerobot_vtrefine.diagnose.pad.press_trials import Press
-from lerobot_vtrefine.tactile.stages.base import Frame, Stage
-from lerobot_vtrefine.tactile.stages.contact import ContactStage, KelvinVoigt
-from lerobot_vtrefine.tactile.stages.mechanics import NonlinearStiffness
+from lerobot_vtrefine.tactile.stages.base import Stage
+from lerobot_vtrefine.tactile.stages.contact import ContactStage
 from lerobot_vtrefine.tactile.stages.readout import TaxelGainSpread
-
-FAST = MEMORY | SEPARATE | MIXING
 
 
 class Bench:
@@ -106,14 +97,13 @@ def _step(plan: Plan, index: int, field: Field, sheet: Sheet) -> Field:
     # What nothing mixes with others any more is needed at scored taxels only.
     wanted = None if plan.mixed[index] else sheet.all_scored
     place = sheet if before else sheet.recorded
-    field = _apply(stages[index], field, Context(place, float(contact.stiffness(sheet.layout)), wanted))
+    field = run_stage(stages[index], field, Context(place, float(contact.stiffness(sheet.layout)), wanted))
     return field.at_frames(place) if before and not plan.remembered[index] else field
 
 
 def mixes(stages: Sequence[Stage]) -> bool:
     """Whether any of the stages may mix a taxel with its neighbours."""
-    own = tuple(SEPARATE) + tuple(MEMORY)
-    return any(not isinstance(stage, own) and not isinstance(stage, ContactStage) for stage in stages)
+    return not all(treats_each_alone(stage) for stage in stages)
 
 
 def _scatter(field: Field, sheet: Sheet, found: list[np.ndarray]) -> None:
@@ -171,47 +161,3 @@ class _Same:
 
     def __hash__(self) -> int:
         return id(self.value)
-
-
-def _apply(stage: Stage, field: Field, context: Context) -> Field:
-    sheet = context.sheet
-    if sheet.loaded and (isinstance(stage, ContactStage) or stage.domain == "depth"):
-        return field
-    if isinstance(stage, ContactStage):
-        return _contact(stage, field, sheet)
-    fast = FAST.get(type(stage))
-    if fast is None or (sheet.loaded and isinstance(stage, NonlinearStiffness)):
-        return _own(stage, field, context)
-    return fast(stage, field, context)
-
-
-def _contact(stage: ContactStage, field: Field, sheet: Sheet) -> Field:
-    assert field.rate is not None
-    if isinstance(stage, KelvinVoigt):
-        force = stage.k_n * field.values
-        force += stage.k_d * field.rate
-        np.maximum(force, 0.0, out=force)
-        force *= field.values > 0
-    else:
-        depth, rate = (torch.from_numpy(np.ascontiguousarray(v)) for v in (field.values, field.rate))
-        force = stage.force(depth[:, None], rate[:, None], sheet.layout)[:, 0].numpy()
-    if field.columns is sheet.touched:
-        return Field(force, field.columns)
-    felt = force.any(axis=0)
-    return Field(np.ascontiguousarray(force[:, felt]), field.columns[felt])
-
-
-def _own(stage: Stage, field: Field, context: Context) -> Field:
-    """The stage's own code on whole images, press by press."""
-    sheet = context.sheet
-    columns = np.arange(len(sheet.taxels))
-    out = np.zeros((len(field.values), len(columns)))
-    shape = (-1, sheet.layout.rows, sheet.layout.cols)
-    for press, (block, time_s) in enumerate(zip(sheet.blocks, sheet.times_s, strict=True)):
-        part = field.within(sheet, press)
-        image = np.zeros((len(time_s), sheet.layout.num_taxels))
-        image[:, sheet.taxels[field.columns[part]]] = field.values[: len(time_s), part]
-        frame = Frame(sheet.layout, stiffness_n_per_m=context.stiffness, load_conserving=sheet.loaded)
-        result = stage.sequence(torch.from_numpy(image.reshape(shape)), torch.from_numpy(time_s), frame)
-        out[: len(time_s), block] = result.numpy().reshape(len(time_s), -1)[:, sheet.taxels[block]]
-    return Field(out, columns)

@@ -1,0 +1,258 @@
+"""Stages on sheets: each runs its own code, on the columns that it concerns instead of on whole pads.
+
+What stands here is only how a stage that knows its taxels finds them among a sheet's columns. A stage that is
+neither `alike` nor listed runs on whole images, press by press.
+"""
+
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+import torch
+
+from lerobot_vtrefine.diagnose.pad.forward_model.batches import Sheet
+from lerobot_vtrefine.diagnose.pad.forward_model.fields import Context, Field
+from lerobot_vtrefine.diagnose.pad.repeated_frames import slots
+from lerobot_vtrefine.tactile.stages.base import Frame, Stage
+from lerobot_vtrefine.tactile.stages.contact import ContactStage
+from lerobot_vtrefine.tactile.stages.host import SampleAndHold, ScanSkew, taken_at_frames
+from lerobot_vtrefine.tactile.stages.mechanics import MechanicalSpreading, ring_matrix, spreading_matrix
+from lerobot_vtrefine.tactile.stages.readout import (
+    BaselineDrift,
+    Crosstalk,
+    DeadTaxels,
+    Idle,
+    Quantisation,
+    RowSharing,
+    TaxelGainSpread,
+)
+from lerobot_vtrefine.tactile.stages.signals import sampled
+from lerobot_vtrefine.tactile.stages.surface import PadTilt
+
+Work = Callable[[np.ndarray, np.ndarray, np.ndarray], np.ndarray]
+
+
+def run_stage(stage: Stage, field: Field, context: Context) -> Field:
+    """The field after a stage."""
+    sheet = context.sheet
+    if isinstance(stage, ContactStage):
+        return field if sheet.loaded else _contact(stage, field, sheet)
+    if sheet.loaded and stage.domain == "depth":
+        return field
+    if type(stage) in OWN_TAXELS:
+        return OWN_TAXELS[type(stage)](stage, field, context)
+    if not stage.alike or (sheet.loaded and stage.domain == "force" and not stage.has_state):
+        # Where the sum is a measured load, mechanics keep it, for which they need the whole pad.
+        return _whole(stage, field, context)
+    return _alike(stage, field, context)
+
+
+def treats_each_alone(stage: Stage) -> bool:
+    """Whether no taxel's reading depends on another's."""
+    return stage.alike or isinstance(stage, SEPARATE | ContactStage)
+
+
+def by_press(field: Field, sheet: Sheet, work: Work) -> Field:
+    """work(values (T, m), times (T,), columns' taxels (m,)) on every press."""
+    out = np.zeros_like(field.values)
+    for press, time_s in enumerate(sheet.times_s):
+        part = field.within(sheet, press)
+        taxels = sheet.taxels[field.columns[part]]
+        out[: len(time_s), part] = work(field.values[: len(time_s), part], time_s, taxels)
+    return Field(out, field.columns, field.rate)
+
+
+def _alike(stage: Stage, field: Field, context: Context) -> Field:
+    frame = Frame(context.sheet.layout, stiffness_n_per_m=context.stiffness)
+
+    def work(x: np.ndarray, time_s: np.ndarray, taxels: np.ndarray) -> np.ndarray:
+        line = torch.from_numpy(np.ascontiguousarray(x))[:, None]
+        return stage.sequence(line, torch.from_numpy(time_s), frame)[:, 0].numpy()
+
+    if not stage.has_state or stage.rate_free:  # then all presses are one
+        frames = np.arange(len(field.values), dtype=float)
+        return Field(work(field.values, frames, field.columns), field.columns, field.rate)
+    return by_press(field, context.sheet, work)
+
+
+def _contact(stage: ContactStage, field: Field, sheet: Sheet) -> Field:
+    assert field.rate is not None
+    depth, rate = (torch.from_numpy(np.ascontiguousarray(v))[:, None] for v in (field.values, field.rate))
+    force = stage.force(depth, rate, sheet.layout)[:, 0].numpy()
+    if field.columns is sheet.touched:
+        return Field(force, field.columns)
+    felt = force.any(axis=0)
+    return Field(np.ascontiguousarray(force[:, felt]), field.columns[felt])
+
+
+def _whole(stage: Stage, field: Field, context: Context) -> Field:
+    """On whole images, press by press."""
+    sheet = context.sheet
+    columns = np.arange(len(sheet.taxels))
+    out = np.zeros((len(field.values), len(columns)))
+    shape = (-1, sheet.layout.rows, sheet.layout.cols)
+    for press, (block, time_s) in enumerate(zip(sheet.blocks, sheet.times_s, strict=True)):
+        part = field.within(sheet, press)
+        image = np.zeros((len(time_s), sheet.layout.num_taxels))
+        image[:, sheet.taxels[field.columns[part]]] = field.values[: len(time_s), part]
+        frame = Frame(sheet.layout, stiffness_n_per_m=context.stiffness, load_conserving=sheet.loaded)
+        result = stage.sequence(torch.from_numpy(image.reshape(shape)), torch.from_numpy(time_s), frame)
+        out[: len(time_s), block] = result.numpy().reshape(len(time_s), -1)[:, sheet.taxels[block]]
+    return Field(out, columns)
+
+
+def _of_flat(stage: Stage, level: float, sheet: Sheet, columns: np.ndarray) -> np.ndarray:
+    """What a pad that reads `level` everywhere reads after the stage, at some of a sheet's columns."""
+    flat = torch.full((sheet.layout.rows, sheet.layout.cols), level, dtype=torch.float64)
+    return stage.step(flat, {}, Frame(sheet.layout))[0].numpy().ravel()[sheet.taxels[columns]]
+
+
+def _added(stage: PadTilt, field: Field, context: Context) -> Field:
+    """Every taxel is moved by an amount of its own."""
+    return Field(field.values + _of_flat(stage, 0.0, context.sheet, field.columns), field.columns, field.rate)
+
+
+def _multiplied(stage: TaxelGainSpread | DeadTaxels, field: Field, context: Context) -> Field:
+    """Every taxel has a factor of its own."""
+    return Field(field.values * _of_flat(stage, 1.0, context.sheet, field.columns), field.columns)
+
+
+def _everywhere(field: Field, context: Context) -> Field:
+    """At all columns that are asked for: untouched taxels move, too."""
+    return field.spread(
+        context.wanted if context.wanted is not None else np.arange(len(context.sheet.taxels))
+    )
+
+
+def _idle(stage: Idle, field: Field, context: Context) -> Field:
+    field = _everywhere(field, context)
+    return Field(field.values + _of_flat(stage, 0.0, context.sheet, field.columns), field.columns)
+
+
+def _drift(stage: BaselineDrift, field: Field, context: Context) -> Field:
+    sheet, field = context.sheet, _everywhere(field, context)
+    out = field.values.copy()
+    session_s = [time_s + start_s for time_s, start_s in zip(sheet.times_s, sheet.starts_s, strict=True)]
+    ends = np.cumsum([len(time_s) for time_s in session_s])[:-1]
+    # Drift knows the session's time alone: the presses one after the other are one recording.
+    known = [np.full(len(time_s), stage.reference_c) for time_s in session_s]
+    warm_c = [old if warm is None else warm for old, warm in zip(known, sheet.warmth_c, strict=True)]
+    frame = Frame(sheet.layout, temperature_c=torch.from_numpy(np.concatenate(warm_c)))
+    when = torch.from_numpy(np.concatenate(session_s))
+    moved = stage.sequence(torch.zeros((len(when), 1, 1), dtype=torch.float64), when, frame)
+    for press, part in enumerate(np.split(moved[:, 0].numpy(), ends)):
+        out[: len(part), field.within(sheet, press)] += part
+    return Field(out, field.columns)
+
+
+def _mixed(field: Field, context: Context, weights: Callable[[np.ndarray, np.ndarray], np.ndarray]) -> Field:
+    """Every reading a weighted sum over its press: weights(columns out, columns in) -> (out, in)."""
+    sheet = context.sheet
+    columns = context.wanted if context.wanted is not None else np.arange(len(sheet.taxels))
+    out = np.zeros((len(field.values), len(columns)))
+    for press, block in enumerate(sheet.blocks):
+        part = field.within(sheet, press)
+        to = slice(*np.searchsorted(columns, (block.start, block.stop)).tolist())
+        lines = len(sheet.times_s[press])
+        out[:lines, to] = field.values[:lines, part] @ weights(columns[to], field.columns[part]).T
+    return Field(out, columns)
+
+
+def _spreading(stage: MechanicalSpreading, field: Field, context: Context) -> Field:
+    sheet = context.sheet
+    if stage.rings:
+        matrix = ring_matrix(sheet.layout.rows, sheet.layout.cols, stage.rings, stage.kept)
+        return _mixed(field, context, lambda to, of: matrix[np.ix_(sheet.taxels[to], sheet.taxels[of])])
+    sigma = torch.full((1, 1), stage.sigma_m / sheet.layout.pitch_m, dtype=torch.float64)
+    down, along = (spreading_matrix(n, sigma).numpy() for n in (sheet.layout.rows, sheet.layout.cols))
+
+    def weights(to: np.ndarray, of: np.ndarray) -> np.ndarray:
+        return down[np.ix_(sheet.rows[to], sheet.rows[of])] * along[np.ix_(sheet.cols[to], sheet.cols[of])]
+
+    return _mixed(field, context, weights)
+
+
+def _crosstalk(stage: Crosstalk, field: Field, context: Context) -> Field:
+    sheet = context.sheet
+    along, down = stage.line(sheet.layout.cols, stage.row_side), stage.line(sheet.layout.rows, stage.col_side)
+
+    def weights(to: np.ndarray, of: np.ndarray) -> np.ndarray:
+        row = sheet.rows[to][:, None] == sheet.rows[of][None]
+        col = sheet.cols[to][:, None] == sheet.cols[of][None]
+        leaks = stage.row * row * along[np.ix_(sheet.cols[to], sheet.cols[of])]
+        leaks += stage.col * col * down[np.ix_(sheet.rows[to], sheet.rows[of])]
+        return np.where(row & col, 1.0, leaks)
+
+    return _mixed(field, context, weights)
+
+
+def _row_sharing(stage: RowSharing, field: Field, context: Context) -> Field:
+    cols = context.sheet.layout.cols
+
+    def work(x: np.ndarray, time_s: np.ndarray, taxels: np.ndarray) -> np.ndarray:
+        if not len(taxels):
+            return x
+        # Columns are in the order of their rows.
+        first = np.flatnonzero(np.diff(taxels // cols, prepend=-1))
+        row = np.repeat(np.arange(len(first)), np.diff(first, append=len(taxels)))
+        return stage.divided(x, np.add.reduceat(x, first, axis=1)[:, row])
+
+    return by_press(field, context.sheet, work)
+
+
+def _scan_skew(stage: ScanSkew, field: Field, context: Context) -> Field:
+    layout = context.sheet.layout
+
+    def work(x: np.ndarray, time_s: np.ndarray, taxels: np.ndarray) -> np.ndarray:
+        row, col = (torch.from_numpy(part.astype(float)) for part in np.divmod(taxels, layout.cols))
+        return _sampled(x, time_s, time_s[:, None] - stage.late_s(row, col, layout.rows, layout.cols).numpy())
+
+    return by_press(field, context.sheet, work)
+
+
+def _sampled(x: np.ndarray, time_s: np.ndarray, at_s: np.ndarray) -> np.ndarray:
+    return sampled(*(torch.from_numpy(np.ascontiguousarray(item)) for item in (x, time_s, at_s))).numpy()
+
+
+def _hold(stage: SampleAndHold, field: Field, context: Context) -> Field:
+    """A free board's instants are those that the recording itself shows."""
+    sheet, out = context.sheet, np.zeros_like(field.values)
+    for press, (time_s, rhythm) in enumerate(zip(sheet.times_s, sheet.rhythms, strict=True)):
+        part = field.within(sheet, press)
+        x = field.values[: len(time_s), part]
+        if stage.irregular:
+            out[: len(time_s), part] = _sampled(x, time_s, rhythm.taken_s(time_s) - stage.lag_s)
+        elif stage.frame_s:
+            taken_s = taken_at_frames(time_s, stage.period_s, stage.frame_s)
+            out[: len(time_s), part] = _sampled(x, time_s, taken_s)
+        else:
+            slot = slots(time_s, stage.period_s, rhythm.phase(stage.period_s) if stage.free else 0.0)
+            new = np.concatenate([[True], slot[1:] != slot[:-1]])
+            out[: len(time_s), part] = x[np.maximum.accumulate(np.where(new, np.arange(len(slot)), 0))]
+    return Field(out, field.columns)
+
+
+def _convert(stage: Quantisation, field: Field, context: Context) -> Field:
+    """Clipping alone: rounding is not differentiable, and the mean over noise is not rounded."""
+    idle = context.sheet.idle[field.columns]
+    return Field(field.values.clip(-idle, np.maximum(stage.full_scale_counts - idle, 0.0)), field.columns)
+
+
+OWN_TAXELS: dict[type, Callable[[Any, Field, Context], Field]] = {
+    PadTilt: _added,
+    MechanicalSpreading: _spreading,
+    TaxelGainSpread: _multiplied,
+    DeadTaxels: _multiplied,
+    RowSharing: _row_sharing,
+    Crosstalk: _crosstalk,
+    Idle: _idle,
+    BaselineDrift: _drift,
+    ScanSkew: _scan_skew,
+    SampleAndHold: _hold,
+    Quantisation: _convert,
+}
+"""Stages that know which taxel they act on, or what else the recording tells."""
+SEPARATE = (
+    PadTilt | TaxelGainSpread | DeadTaxels | Idle | BaselineDrift | ScanSkew | SampleAndHold | Quantisation
+)
+"""Of these, those that do not mix a taxel with others."""

@@ -1,0 +1,230 @@
+"""Rate-free loops: loading and unloading differ at the same depth, whatever the speed. One stage per law.
+
+A law is how a memory moves with every frame, and what reading goes with it. A simulation moves it frame by
+frame, a replay or a fit through all frames of a recording.
+"""
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any, ClassVar, override
+
+import numpy as np
+import torch
+
+from lerobot_vtrefine.tactile.layout import PadLayout
+from lerobot_vtrefine.tactile.stages.base import (
+    Frame,
+    Stage,
+    State,
+    Traits,
+    as_tuple,
+    paired,
+    parameter,
+    register,
+)
+
+
+def memories(follow: Callable[..., torch.Tensor], *inputs: torch.Tensor) -> torch.Tensor:
+    """A memory that is zero at first, after every frame: (T, ...); follow(memory, *the frame's inputs)."""
+    memory, out = torch.zeros_like(inputs[0][0]), []
+    for moment in zip(*(values.unbind() for values in inputs), strict=True):
+        memory = follow(memory, *moment)
+        out.append(memory)
+    return torch.stack(out)
+
+
+def kept_between(low: torch.Tensor, high: torch.Tensor) -> torch.Tensor:
+    """memories(torch.clamp, low, high), in NumPy, whose operations take a fraction of the time to begin."""
+    lower, upper = (bound.cpu().numpy().copy() for bound in (low, high))
+    memory = np.zeros_like(lower[:1].sum(axis=0))
+    for line, top in zip(lower, upper, strict=True):
+        np.maximum(np.minimum(memory, top, out=top), line, out=line)
+        memory = line
+    return torch.from_numpy(lower).to(low)
+
+
+@dataclass(frozen=True)
+class Loop(Stage):
+    """Base of the laws."""
+
+    domain: ClassVar[str] = "force"
+    rank: ClassVar[int] = 36
+    has_state: ClassVar[bool] = True
+    alike: ClassVar[bool] = True
+    rate_free: ClassVar[bool] = True
+
+
+@dataclass(frozen=True)
+class Play(Loop):
+    """Play operators (Prandtl-Ishlinskii): f + sum_j fraction_j * (play_j(f) - f).
+
+    A play operator follows the depth f / stiffness with a dead band of full width `width_m`, so that loading
+    and unloading at the same depth differ by fraction * width_m * stiffness. Without contact it returns to
+    zero. `fraction` and `width_m` are numbers or equally long lists (several operators make loops of any
+    shape). A positive fraction reads less while loading, a negative one more, as a cover that dissipates
+    energy does.
+    """
+
+    above: ClassVar[float] = 0.5
+    """Part of the band that lies above f."""
+    rests: ClassVar[bool] = False
+    """Whether the operator stays where it was let go."""
+    fraction: float | tuple[float, ...] = parameter(0.15, "1", 0.0, 0.3, minimum=None)
+    width_m: float | tuple[float, ...] = parameter(2e-4, "m", 5e-5, 5e-4)
+
+    def __post_init__(self) -> None:
+        for name in ("fraction", "width_m"):
+            object.__setattr__(self, name, as_tuple(getattr(self, name)))
+        super().__post_init__()
+        self._operators()
+
+    def _operators(self) -> list[tuple[str, Any, Any]]:
+        """State's name, fraction and width of every play operator."""
+        pairs = paired(self.name, self.fraction, self.width_m, "fraction and width_m")
+        return [(f"play_{j}" if j else "play", fraction, width) for j, (fraction, width) in enumerate(pairs)]
+
+    def _band(self, x: torch.Tensor, width: Any) -> tuple[torch.Tensor, torch.Tensor]:
+        """Between what the operator may lie at f = x [N]."""
+        low = (x + (self.above - 1.0) * width).clamp_(min=0.0)
+        high = (x + self.above * width).clamp_(min=0.0)
+        return low, high if self.rests else high.mul_(x > 0)
+
+    @override
+    def initial(self, layout: PadLayout, pads: int) -> Traits:
+        shape = (pads, layout.rows, layout.cols)
+        return {name: np.zeros(shape, dtype=np.float32) for name, _, _ in self._operators()}
+
+    @override
+    def step(self, x: torch.Tensor, state: State, frame: Frame) -> tuple[torch.Tensor, State]:
+        new, looped = dict(state), x
+        for name, fraction, width_m in self._operators():
+            new[name] = torch.clamp(state[name], *self._band(x, width_m * frame.stiffness_n_per_m))
+            looped = looped + fraction * (new[name] - x)
+        return looped.clamp(min=0.0), new
+
+    @override
+    def sequence(self, x: torch.Tensor, times_s: torch.Tensor, frame: Frame) -> torch.Tensor:
+        operators = self._operators()
+        looped = (1.0 - math.fsum(fraction for _, fraction, _ in operators)) * x
+        for _, fraction, width_m in operators:
+            band = self._band(x, width_m * frame.stiffness_n_per_m)
+            looped.add_(kept_between(*band), alpha=fraction)
+        return looped.clamp_(min=0.0)
+
+
+@register
+@dataclass(frozen=True)
+class Hysteresis(Play):
+    """Play operators whose band lies evenly about f."""
+
+    name: ClassVar[str] = "hysteresis"
+
+
+@register
+@dataclass(frozen=True)
+class RestingHysteresis(Play):
+    """The same, kept without contact: readings rest above idle once they were let go."""
+
+    name: ClassVar[str] = "resting_hysteresis"
+    rests: ClassVar[bool] = True
+
+
+@register
+@dataclass(frozen=True)
+class LoadingHysteresis(Play):
+    """The band lies behind f: only loading differs from f, as sums of relays have it."""
+
+    name: ClassVar[str] = "loading_hysteresis"
+    above: ClassVar[float] = 0.0
+
+
+@register
+@dataclass(frozen=True)
+class ProportionalHysteresis(Loop):
+    """A loop as wide as the load is high: f (1 + fraction b), with b from 0 to 1 over `width_m` of unloading.
+
+    Loading takes b back, and it is zero without contact.
+    """
+
+    name: ClassVar[str] = "proportional_hysteresis"
+    fraction: float = parameter(0.15, "1", 0.0, 0.3, minimum=None)
+    width_m: float = parameter(2e-4, "m", 5e-5, 5e-4)
+
+    @staticmethod
+    def _turned(back: torch.Tensor, unloaded: torch.Tensor, touching: torch.Tensor) -> torch.Tensor:
+        return (back + unloaded).clamp(0.0, 1.0) * touching
+
+    def _moves(
+        self, x: torch.Tensor, before: torch.Tensor, frame: Frame
+    ) -> tuple[torch.Tensor, torch.Tensor]:
+        """Unloading since the frame before as a part of the width, and whether there is contact."""
+        width = torch.as_tensor(self.width_m * frame.stiffness_n_per_m, dtype=x.dtype, device=x.device)
+        return (before - x) / width.clamp(min=1e-12), x > 0
+
+    @override
+    def initial(self, layout: PadLayout, pads: int) -> Traits:
+        shape = (pads, layout.rows, layout.cols)
+        return {name: np.zeros(shape, dtype=np.float32) for name in ("back", "before")}
+
+    @override
+    def step(self, x: torch.Tensor, state: State, frame: Frame) -> tuple[torch.Tensor, State]:
+        back = self._turned(state["back"], *self._moves(x, state["before"], frame))
+        return (x * (1.0 + self.fraction * back)).clamp(min=0.0), {**state, "back": back, "before": x}
+
+    @override
+    def sequence(self, x: torch.Tensor, times_s: torch.Tensor, frame: Frame) -> torch.Tensor:
+        before = torch.cat([torch.zeros_like(x[:1]), x[:-1]])
+        back = memories(self._turned, *self._moves(x, before, frame))
+        return (x * (1.0 + self.fraction * back)).clamp(min=0.0)
+
+
+@register
+@dataclass(frozen=True)
+class PeakHysteresis(Loop):
+    """A loop that closes at both ends: f (1 + 4 fraction s (1 - s)), s = f / (largest f of this contact)."""
+
+    name: ClassVar[str] = "peak_hysteresis"
+    fraction: float = parameter(0.15, "1", 0.0, 0.3, minimum=None)
+
+    @staticmethod
+    def _largest(peak: torch.Tensor, x: torch.Tensor) -> torch.Tensor:
+        return torch.maximum(peak, x) * (x > 0)
+
+    def _bent(self, x: torch.Tensor, peak: torch.Tensor) -> torch.Tensor:
+        share = x / peak.clamp(min=1e-12)
+        return (x * (1.0 + 4.0 * self.fraction * share * (1.0 - share))).clamp(min=0.0)
+
+    @override
+    def initial(self, layout: PadLayout, pads: int) -> Traits:
+        return {"peak": np.zeros((pads, layout.rows, layout.cols), dtype=np.float32)}
+
+    @override
+    def step(self, x: torch.Tensor, state: State, frame: Frame) -> tuple[torch.Tensor, State]:
+        peak = self._largest(state["peak"], x)
+        return self._bent(x, peak), {**state, "peak": peak}
+
+    @override
+    def sequence(self, x: torch.Tensor, times_s: torch.Tensor, frame: Frame) -> torch.Tensor:
+        return self._bent(x, memories(self._largest, x))
+
+
+BY_LOOP: dict[str, type[Loop]] = {
+    "even": Hysteresis,
+    "resting": RestingHysteresis,
+    "behind": LoadingHysteresis,
+    "scaled": ProportionalHysteresis,
+    "peak": PeakHysteresis,
+}
+"""`loop` in earlier files, which held all five as one stage -> the law's own."""
+
+
+def without_loop(item: dict[str, Any]) -> dict[str, Any]:
+    """A stage of a file in today's names; ValueError for a loop that there never was."""
+    if item.get("stage") != Hysteresis.name or "loop" not in item:
+        return item
+    loop = item["loop"]
+    if not isinstance(loop, str) or loop not in BY_LOOP:
+        raise ValueError(f"hysteresis.loop must be one of {', '.join(BY_LOOP)}, got {loop!r:.60}")
+    unused = ("loop", "width_m") if loop == "peak" else ("loop",)
+    return {key: value for key, value in item.items() if key not in unused} | {"stage": BY_LOOP[loop].name}

@@ -1,0 +1,66 @@
+"""Recordings as signals that are straight between their frames: at other instants, and through a filter."""
+
+import math
+from typing import Any
+
+import numpy as np
+import torch
+
+LARGEST_EXPONENT = 200.0
+LONGEST_EXPONENT = 600.0
+"""Of a single step, after which nothing is left of what was before."""
+
+
+def sampled(x: torch.Tensor, times_s: torch.Tensor, at_s: torch.Tensor) -> torch.Tensor:
+    """x (T, ...), known at times (T,), at other instants; the ends go on as they are.
+
+    Instants are (K,), or differ from column to column: (K, ...) that broadcasts against x's columns.
+    """
+    if len(times_s) < 2:
+        return x[:1].expand(len(at_s), *x.shape[1:])
+    at_s = at_s.to(times_s)
+    after = torch.searchsorted(times_s, at_s.contiguous(), right=True).clamp_(1, len(times_s) - 1)
+    before_s = times_s[after - 1]
+    weight = (at_s - before_s).div_((times_s[after] - before_s).clamp_(min=1e-12)).clamp_(0.0, 1.0)
+    weight = weight.to(x.dtype)
+    if at_s.ndim == 1:
+        return torch.lerp(x[after - 1], x[after], weight.view(-1, *(1,) * (x.ndim - 1)))
+    return torch.lerp(x.take_along_dim(after - 1, 0), x.take_along_dim(after, 0), weight)
+
+
+def delayed(x: torch.Tensor, times_s: torch.Tensor, delay_s: torch.Tensor) -> torch.Tensor:
+    """x (T, ..., R, C) as every taxel was `delay_s` earlier, which broadcasts against (R, C)."""
+    if delay_s.numel() == 1:
+        return sampled(x, times_s, times_s - delay_s.reshape(()))
+    at_s = times_s.view(-1, 1, 1) - delay_s
+    return sampled(x, times_s, at_s.view(len(times_s), *(1,) * (x.ndim - 3), *at_s.shape[1:]))
+
+
+def followed(slow: Any, before: Any, now: Any, dt_s: float, tau_s: Any) -> Any:
+    """A one-pole filter's state after a step in which its input went straight from `before` to `now`."""
+    if dt_s <= 0.0:
+        return slow
+    ratio = -dt_s / tau_s
+    decay = torch.exp(ratio) if isinstance(ratio, torch.Tensor) else math.exp(ratio)
+    ramp = 1.0 - (1.0 - decay) * (tau_s / dt_s)
+    return decay * slow + (1.0 - decay) * before + ramp * (now - before)
+
+
+def low_passed(x: torch.Tensor, times_s: torch.Tensor, tau_s: float) -> torch.Tensor:
+    """x (T, ...) through such a filter from rest at zero: `followed` frame by frame, at once."""
+    # In NumPy: recordings are short, and its operations take a third of the time to begin.
+    known, seconds = (item.to(torch.float64).cpu().numpy() for item in (x, times_s))
+    shape, dt = (-1, *(1,) * (x.ndim - 1)), np.diff(seconds)
+    decay = np.exp(-dt / tau_s)
+    ramp = 1.0 - np.where(dt > 0, (1.0 - decay) * tau_s / np.maximum(dt, 1e-12), 1.0)
+    push = (1.0 - decay).reshape(shape) * known[:-1] + ramp.reshape(shape) * np.diff(known, axis=0)
+    slow, begin = np.zeros_like(known), 0
+    while begin < len(dt):
+        # Growing exponentials instead of a recursion, in pieces short enough not to overflow.
+        reach = np.searchsorted(seconds, seconds[begin] + LARGEST_EXPONENT * tau_s, side="right") - 1
+        end = min(max(int(reach), begin + 1), len(dt))
+        ages = np.minimum((seconds[begin + 1 : end + 1] - seconds[begin]) / tau_s, LONGEST_EXPONENT)
+        grow = np.exp(ages).reshape(shape)
+        slow[begin + 1 : end + 1] = (slow[begin] + np.cumsum(grow * push[begin:end], axis=0)) / grow
+        begin = end
+    return torch.from_numpy(slow).to(x)

@@ -1,0 +1,41 @@
+"""Benchmarks go on where they stopped, begin nothing after their time, and grade what was diagnosed."""
+
+import argparse
+import json
+from pathlib import Path
+
+import pytest
+
+SCRIPTS = Path(__file__).parents[2] / "scripts"
+
+
+@pytest.fixture
+def bench_sets(monkeypatch):
+    monkeypatch.syspath_prepend(str(SCRIPTS))
+    monkeypatch.setenv("OMP_NUM_THREADS", "1")
+    import bench_sets
+
+    return bench_sets
+
+
+def options(folder: Path, **changes) -> argparse.Namespace:
+    return argparse.Namespace(**{"output_dir": folder, "jobs": 1, "minutes": 1.0, "table": False} | changes)
+
+
+def square(number: int) -> dict[str, int]:
+    return {"square": number**2}
+
+
+def test_a_run_that_was_cut_goes_on(bench_sets, tmp_path: Path) -> None:
+    done = json.dumps({"set": "two", "square": "as it was", "total_cpu_s": 0.0})
+    (tmp_path / bench_sets.ROWS).write_text(f'{done}\n{{"set": "three", "squ')
+    sets = {"two": 2, "three": 3, "four": 4}
+    rows = bench_sets.run_sets(square, sets, options(tmp_path))
+    assert [row["square"] for row in rows] == ["as it was", 9, 16]
+    assert list(bench_sets.read_rows(tmp_path)) == ["two", "three", "four"]
+    assert bench_sets.run_sets(square, sets, options(tmp_path, table=True)) == rows
+
+
+def test_nothing_begins_after_the_time(bench_sets, tmp_path: Path) -> None:
+    assert bench_sets.run_sets(square, {"two": 2}, options(tmp_path, minutes=-1.0)) == []
+    assert bench_sets.read_rows(tmp_path) == {}
