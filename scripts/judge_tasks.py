@@ -46,7 +46,6 @@ def row(task: str, folder: Path) -> Line:
         found["prior"][TURN],
         *(turns[words] for words in ("vision and touch", "vision") if words in turns),
     ]
-    accepted = {True: "needs touch", False: "does not need touch", None: "not judged"}
     cells = {
         "task": task,
         "the expert knows the truth, %": counted(found["true_state"]),
@@ -54,7 +53,7 @@ def row(task: str, folder: Path) -> Line:
         "turn of the plug in its hand: nothing, vision and touch, vision, °": ", ".join(
             f"{value:.1f}" for value in shown
         ),
-        "": accepted[found["accepted"]],
+        "": found["judged"],
     }
     return Line(table=TABLE, cells=cells, **origin_of(folder))
 

@@ -12,6 +12,8 @@ class Verdict:
 
     accepted: bool | None
     """None: not judged."""
+    short: str
+    """In two or three words, for tables."""
     reason: str
     """In a sentence."""
 
@@ -19,19 +21,17 @@ class Verdict:
 def judge(truth: float | None, both: float | None, vision: float | None) -> Verdict:
     """The verdict on shares of episodes in which the expert succeeded; None: not measured."""
     if truth is None or both is None or vision is None:
-        return Verdict(
-            None, "Not judged: it needs the expert's success on the truth, on both senses and on vision."
-        )
+        needed = "it needs the expert's success on the truth, on both senses and on vision"
+        return Verdict(None, "not judged", f"Not judged: {needed}.")
     if truth < TRUE_AT_LEAST:
-        return Verdict(
-            False, f"Not a touch task: the expert fails where it knows everything ({truth:.2f} succeed)."
-        )
+        reason = f"the expert fails where it knows everything ({truth:.2f} succeed)"
+        return Verdict(False, "too hard for the expert", f"Not a touch task: {reason}.")
     if both < TOUCH_AT_LEAST:
-        return Verdict(
-            False, f"Not a touch task: touch and vision together do not suffice ({both:.2f} succeed)."
-        )
+        reason = f"touch and vision together do not suffice ({both:.2f} succeed)"
+        return Verdict(False, "touch does not suffice", f"Not a touch task: {reason}.")
     if vision > VISION_AT_MOST:
-        return Verdict(False, f"Not a touch task: vision alone suffices ({vision:.2f} succeed).")
-    return Verdict(
-        True, f"A touch task: {both:.2f} succeed with touch and vision, {vision:.2f} with vision alone."
-    )
+        return Verdict(
+            False, "vision suffices", f"Not a touch task: vision alone suffices ({vision:.2f} succeed)."
+        )
+    reason = f"{both:.2f} succeed with touch and vision, {vision:.2f} with vision alone"
+    return Verdict(True, "needs touch", f"A touch task: {reason}.")

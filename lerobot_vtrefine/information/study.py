@@ -203,6 +203,7 @@ def as_json(found: Study, effort: Effort) -> dict[str, Any]:
     return {
         "verdict": found.verdict.reason,
         "accepted": found.verdict.accepted,
+        "judged": found.verdict.short,
         "units": {name: unit_of(name)[1] for name in NAMES},
         "prior": found.prior,
         "true_state": proportion(found.true_success),

@@ -56,4 +56,4 @@ def test_rows_hold_the_best_of_each_sense_and_the_verdict(
     assert rows["hard"]["vision, %"].startswith("60 [")
     assert rows["hard"]["joints alone, %"] == "-"
     assert "9.0, 0.5, 3.0" in rows["hard"].values()
-    assert (rows["hard"][""], rows["easy"][""]) == ("needs touch", "does not need touch")
+    assert (rows["hard"][""], rows["easy"][""]) == ("needs touch", "vision suffices")

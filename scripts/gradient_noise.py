@@ -1,0 +1,138 @@
+"""How much of DPPO's gradient is signal, on one task from one checkpoint?
+
+    python scripts/gradient_noise.py --policy=outputs/pretrain/checkpoints/last/pretrained_model \\
+        --task=configs/env/square_grasped_1mm.yaml --worlds=1024 --device=cuda
+
+Prints success of the policy as deployed and with exploration noise, the critic's explained variance on
+episodes that it has not seen, and the cosine between the policy gradients of two halves of the episodes: with
+as many episodes as an iteration has, a step along it is a step in the right direction with about that share.
+"""
+
+import argparse
+import dataclasses
+import itertools
+import json
+from pathlib import Path
+from typing import Any
+
+import draccus
+import numpy as np
+import torch
+from lerobot.envs import EnvConfig
+from lerobot.policies.factory import make_pre_post_processors
+from torch import Tensor
+
+from lerobot_vtrefine.cli.errors import run_cli
+from lerobot_vtrefine.envs import VtRefineEnvConfig
+from lerobot_vtrefine.envs.decisions import make_decision_env
+from lerobot_vtrefine.files import read_yaml
+from lerobot_vtrefine.finetune import dppo
+from lerobot_vtrefine.finetune.chains import chain_log_probs
+from lerobot_vtrefine.finetune.config import DppoConfig, TrustRegionDppo
+from lerobot_vtrefine.finetune.critic import explained_variance
+from lerobot_vtrefine.finetune.evaluation import evaluate
+from lerobot_vtrefine.finetune.pipeline import make_agent
+from lerobot_vtrefine.finetune.protocols import Agent, select
+from lerobot_vtrefine.policies.vt_dp3.modeling_vt_dp3 import VtDp3Policy
+
+GROUPS = 8
+"""Groups of episodes: the halves are made of them in all ways."""
+
+
+def halves_cosine(groups: Tensor) -> tuple[float, float]:
+    """Cosine between the mean gradients of two halves of the groups (G, P): mean over all ways to halve them,
+    and the standard deviation of these.
+    """
+    gram = (groups @ groups.T).double().numpy()
+    count, cosines = len(gram), []
+    for chosen in itertools.combinations(range(count), count // 2):
+        if 0 not in chosen:
+            continue  # each way once
+        one = np.isin(range(count), chosen)
+        a, b = one.astype(float), (~one).astype(float)
+        cosines.append(a @ gram @ b / np.sqrt((a @ gram @ a) * (b @ gram @ b)))
+    return float(np.mean(cosines)), float(np.std(cosines))
+
+
+def whole_cosine(half: float) -> float:
+    """Cosine of the whole gradient with the true one, from that of two halves (Spearman and Brown)."""
+    return float(np.sqrt(2 * half / (1 + half))) if half > 0 else 0.0
+
+
+def group_gradients(
+    rollout: dppo.Rollout, advantages: Tensor, agent: Agent, cfg: DppoConfig, worlds: int
+) -> Tensor:
+    """Policy gradients (G, P) of the groups of episodes, on the host."""
+    found, parameters = [], agent.trained_parameters()
+    for group in range(GROUPS):
+        for parameter in parameters:
+            parameter.grad = None
+        ids = (rollout.env * GROUPS // worlds == group).nonzero().squeeze(1)
+        for part in ids.split(1024):
+            obs = select(rollout.obs, part)
+            cond = obs["cond"] if agent.frozen_encoder else agent.actor.encode(obs)
+            log_probs, _, _ = chain_log_probs(agent, rollout.latents[part], cond, cfg)
+            loss = dppo.policy_loss(log_probs - rollout.log_probs[part], advantages[part], cfg)
+            (loss.sum() / len(ids)).backward()
+        found.append(torch.cat([p.grad.flatten() for p in parameters if p.grad is not None]).cpu())
+    return torch.stack(found)
+
+
+def measure(args: argparse.Namespace) -> dict[str, Any]:
+    """The figures of one task and checkpoint."""
+    task = draccus.decode(EnvConfig, read_yaml(args.task)["env"])
+    assert isinstance(task, VtRefineEnvConfig)
+    if args.device != "cpu":
+        task.backend, task.warp = "warp", dataclasses.replace(task.warp, device=args.device)
+    policy = VtDp3Policy.from_pretrained(args.policy).to(args.device)
+    policy.config.device = args.device
+    overrides = {"device_processor": {"device": args.device}}
+    processors = make_pre_post_processors(policy.config, str(args.policy), preprocessor_overrides=overrides)
+    cfg = TrustRegionDppo(num_envs=args.worlds, encoder="frozen", critic_warmup=1)
+    if args.std is not None:
+        cfg = dataclasses.replace(cfg, min_sampling_std=args.std)
+    agent = make_agent(policy, cfg)
+    windows = policy.config.n_obs_steps, policy.config.n_action_steps
+    env = make_decision_env(task, args.worlds, *processors, *windows)
+    state = dppo.TrainState.create(agent, cfg, env.privileged_dim, seed=args.seed)
+    deployed = evaluate(env, agent, args.worlds, args.seed) if args.deployed else {}
+    for first in (1, 2):  # the critic learns from the first round and is judged on the second
+        seeds = range(args.seed + first * args.worlds, args.seed + (first + 1) * args.worlds)
+        rollout = dppo.collect(env, agent, cfg, state.generator, seeds)
+        if first == 1:
+            state.critic.update_moments(rollout.privileged[:-1][rollout.active])
+            dppo.update(rollout, agent, state, cfg)  # of the critic alone: it is the warm-up
+    advantages, targets = dppo.decision_advantages(rollout, state, cfg)
+    values = state.critic(rollout.privileged[rollout.step, rollout.env])
+    half, spread = halves_cosine(group_gradients(rollout, advantages, agent, cfg, args.worlds))
+    return {
+        "episodes": args.worlds,
+        "deployed": deployed.get("eval_success"),
+        "exploring": float(rollout.success.float().mean()),
+        "explained_variance": explained_variance(values, targets),
+        "cosine_of_halves": half,
+        "spread_over_halvings": spread,
+        "cosine_with_truth": whole_cosine(half),
+        "std": cfg.min_sampling_std,
+    }
+
+
+@run_cli
+def main() -> int:
+    """Prints a JSON object."""
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument("--policy", type=Path, required=True, help="an imitation-learned vt_dp3's folder")
+    parser.add_argument("--task", type=Path, required=True, help="a file as in configs/env")
+    parser.add_argument("--worlds", type=int, default=1024, help="episodes of an iteration")
+    parser.add_argument("--device", default="cpu", help="of simulation and policy: cpu or cuda")
+    parser.add_argument("--std", type=float, help="of the exploration noise; default: the preset's")
+    parser.add_argument("--seed", type=int, default=0, help="of the first episode")
+    parser.add_argument("--deployed", action="store_true", help="judge the deployed policy too")
+    print(json.dumps(measure(parser.parse_args()), indent=2))
+    return 0
+
+
+if __name__ == "__main__":
+    raise SystemExit(main())
