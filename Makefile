@@ -21,7 +21,7 @@ play: setup ## a trained policy in the simulation, live in a browser
 	@$(VENV)/vtrefine-play $(ARGS)
 
 demo-quick: setup ## the same with tiny numbers, in minutes, to see that everything works
-	@$(VENV)/vtrefine-demo --quick --output_dir=outputs/demo_quick $(ARGS)
+	@$(VENV)/vtrefine-demo --quick $(ARGS)
 
 test: setup ## the test-suite, without slow, gpu and hardware tests
 	@OMP_NUM_THREADS=1 MKL_NUM_THREADS=1 $(VENV)/python -m pytest -q -n $(JOBS) --dist loadfile --no-loadscope-reorder $(ARGS)

@@ -9,11 +9,13 @@ simulator, Warp, serial port or plotting library at all.
 
 import sys
 
+from lerobot_vtrefine.lerobot_compat import decoder_notice
 from lerobot_vtrefine.lerobot_compat.registration import LEROBOT, register
 from lerobot_vtrefine.shipped import expand_command_line
 
 __all__ = ["register"]
 
+decoder_notice.install()
 if LEROBOT in sys.modules:  # LeRobot's commands import plugins just before they parse their command line
     register()
     expand_command_line()

@@ -2,9 +2,10 @@
 
 LeRobot's commands take the path of a file or a folder, which nobody who installed a wheel knows. So a name is
 replaced by its path in the command line itself, before anything parses it: when a command of this package
-starts, and in LeRobot's own when they discover the plugin. Configurations go by ``--config_path``, trained
-policies by ``--policy.path``. An encoder keeps its name, ``--policy.pretrained_encoder=vtrefine:NAME``, so
-that a checkpoint's configuration means the same on every machine; the policy looks it up.
+starts, and in LeRobot's own when they discover the plugin. Configurations go by ``--config_path`` and the
+simulated robot's ``--robot.env_file``, trained policies by ``--policy.path``. An encoder keeps its name,
+``--policy.pretrained_encoder=vtrefine:NAME``, so that a checkpoint's configuration means the same on every
+machine; the policy looks it up.
 """
 
 import sys
@@ -39,10 +40,11 @@ def encoders() -> dict[str, Path]:
 
 KINDS: Mapping[str, tuple[str, Callable[[], dict[str, Path]]]] = {
     "--config_path": ("configuration", names),
+    "--robot.env_file": ("configuration", names),
     "--policy.path": ("policy", policies),
     "--policy.pretrained_encoder": ("encoder", encoders),
 }
-EXPANDED = ("--config_path", "--policy.path")
+EXPANDED = ("--config_path", "--robot.env_file", "--policy.path")
 
 
 def expand(arguments: Sequence[str]) -> list[str]:

@@ -1,12 +1,13 @@
 """``vtrefine-demo``: run demonstrations, imitation, DPPO and evaluations, and write a report of them.
 
 examples:
-  vtrefine-demo --quick                        minutes: tiny numbers, to see that everything works
+  vtrefine-demo --quick                        minutes: tiny numbers, to see that everything works here
   vtrefine-demo                                a quarter of an hour on two cores
   vtrefine-demo --config_path=vtrefine:kinova_round_grasped --recipe=cloud --output_dir=outputs/demo_kinova
   vtrefine-demo --output_dir=outputs/square --env='{pair: square, clearance_m: 0.001, start: grasped}'
 
-Interrupted, the same command continues. --quick stands for tiny numbers; other flags still change them.
+Interrupted, the same command continues. --quick stands for tiny numbers and --output_dir=outputs/demo_quick;
+other flags still change them.
 """
 
 import json
@@ -80,7 +81,7 @@ def main() -> None:
     """Console entry point."""
     signal.signal(signal.SIGTERM, signal.default_int_handler)
     path = run_demo(parse_config(sys.argv[1:]))
-    print(f"Report: {path}")
+    print(f"report: {path}")
 
 
 if __name__ == "__main__":

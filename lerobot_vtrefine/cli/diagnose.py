@@ -146,7 +146,7 @@ def summarise(verdict: "Verdict", unit: str, output_dir: Path, survived: str) ->
     if verdict.data_issues:
         aside = sum(issue.action == "set aside" for issue in verdict.data_issues)
         print(f"data issues: {len(verdict.data_issues)}, {aside} recordings set aside")
-    print(f"read {output_dir / 'report.html'}")
+    print(f"report: {output_dir / 'report.html'}")
 
 
 if __name__ == "__main__":

@@ -1,11 +1,16 @@
 """One place that turns expected failures of a command into one clear line and an exit status."""
 
+import argparse
+import contextlib
 import errno
 import functools
 import os
+import re
 import sys
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Generator, Sequence
+from difflib import get_close_matches
 from pathlib import Path
+from typing import NoReturn
 
 from draccus.utils import DraccusException
 from yaml import YAMLError
@@ -44,7 +49,14 @@ def _message(error: BaseException) -> str:
     if isinstance(error, ModuleNotFoundError) and (advice := explain(error)) is not None:
         return advice
     message = " ".join(str(error).split())
-    return message or type(error).__name__
+    return _in_flags(message) or type(error).__name__
+
+
+def _in_flags(message: str) -> str:
+    """draccus speaks of Python classes; users type flags."""
+    if "Expected a dict with a 'type' key" in message and "EnvConfig" in message:
+        return f"say which environment: --env.type=vtrefine or --config_path=vtrefine:NAME ({message})"
+    return message
 
 
 def _is_wrapper(error: DraccusException) -> bool:
@@ -61,6 +73,24 @@ def _check_config_file(arguments: Sequence[str]) -> None:
             check_settings(given)
 
 
+@contextlib.contextmanager
+def _argparse_in_one_line() -> Generator[None]:
+    """draccus' parsers print a hundred lines of usage before they say which flag they do not know."""
+
+    def error(parser: argparse.ArgumentParser, message: str) -> NoReturn:
+        typed = re.findall(r"--[\w.]+", message.partition("unrecognized arguments")[2])
+        near = [get_close_matches(flag, parser._option_string_actions, 1) for flag in typed]
+        meant = "".join(f"; did you mean {name}?" for names in near for name in names)
+        raise ValueError(f"{message}{meant or '; --help lists the flags'}")
+
+    stock = argparse.ArgumentParser.error
+    argparse.ArgumentParser.error = error  # ty: ignore[invalid-assignment]
+    try:
+        yield
+    finally:
+        argparse.ArgumentParser.error = stock
+
+
 def run_cli[**P](main: Callable[P, int | None]) -> Callable[P, int]:
     """Wrap a console entry point so that expected errors end as ``error: ...`` with exit status 2.
 
@@ -74,7 +104,8 @@ def run_cli[**P](main: Callable[P, int | None]) -> Callable[P, int]:
         try:
             sys.argv[1:] = expand(sys.argv[1:])
             _check_config_file(sys.argv[1:])
-            return main(*args, **kwargs) or 0
+            with _argparse_in_one_line():
+                return main(*args, **kwargs) or 0
         except KeyboardInterrupt:
             print("interrupted", file=sys.stderr)
             return INTERRUPT_STATUS

@@ -31,7 +31,12 @@ def finetune(cfg: FinetunePipelineConfig) -> None:
     _check_sharing(cfg)
     run(cfg)
     write_provenance(cfg.output_dir)
-    if cfg.push_to_hub and os.environ.get("RANK", "0") == "0":
+    first = os.environ.get("RANK", "0") == "0"
+    if first:
+        checkpoint = cfg.output_dir / "checkpoints" / "last" / "pretrained_model"
+        print(f"policy: {checkpoint}")
+        print(f"evaluate it by lerobot-eval, see it by vtrefine-play, with --policy.path={checkpoint}")
+    if cfg.push_to_hub and first:
         from lerobot_vtrefine.cli.card_evaluation import evaluate_and_push
 
         evaluate_and_push(cfg)

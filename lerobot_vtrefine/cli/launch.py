@@ -66,6 +66,8 @@ def launch(command: str, module: str, config: str) -> int:
     if set(HELP_FLAGS) & set(sys.argv[1:]):
         print(help_text(name, module, config))
         return 0
+    if sys.stderr.isatty():
+        print("loading LeRobot and PyTorch (the first time takes longest) ...", file=sys.stderr, flush=True)
     return importlib.import_module(name).main()
 
 

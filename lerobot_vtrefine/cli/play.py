@@ -23,6 +23,7 @@ from lerobot_vtrefine.cli.playing.agents import Agent, PolicyAgent, recorded_age
 from lerobot_vtrefine.cli.playing.session import Session
 from lerobot_vtrefine.cli.report.statistics import wilson_interval
 from lerobot_vtrefine.envs import VtRefineEnvConfig
+from lerobot_vtrefine.extras import VIEW, require
 from lerobot_vtrefine.shipped import expand
 
 SHOWN = ("--config_path=vtrefine:square_grasped_1mm", "--policy.path=vtrefine:square_grasped_1mm")
@@ -93,6 +94,8 @@ def play(config: PlayConfig) -> list[dict]:
     """Play until everything asked for has been played; returns a row per episode, also after Ctrl-C."""
     from lerobot_vtrefine.envs.live_world import LiveWorld
 
+    if config.viewer == "browser":
+        require("the live view (--viewer=none does without)", VIEW)
     agent, env, seed = _choose(config)
     world = LiveWorld(env)
     world.reset(seed)

@@ -8,6 +8,7 @@ uploaded, with a card of its pads, its simulation and its seeds; repeated later,
 """
 
 import logging
+import shlex
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any
@@ -27,6 +28,8 @@ from lerobot_vtrefine.envs.demo_workers import demonstration_stream
 from lerobot_vtrefine.envs.recording_note import simulation_settings
 from lerobot_vtrefine.sim.demonstrations import Degradation
 
+ALOHA = "aloha"
+"""The robot whose pads the encoder that comes with the package knows."""
 HOPELESS_ATTEMPTS = 100
 """Attempts without a single success after which recording gives up."""
 
@@ -80,8 +83,8 @@ class RecordDemosConfig:
         }
 
 
-def record(config: RecordDemosConfig) -> None:
-    """Simulate and save until the dataset holds ``num_episodes`` episodes.
+def record(config: RecordDemosConfig) -> int:
+    """Simulate and save until the dataset holds ``num_episodes`` episodes; returns how many it holds.
 
     Raises:
         ValueError: if the first ``HOPELESS_ATTEMPTS`` attempts all fail.
@@ -102,8 +105,7 @@ def record(config: RecordDemosConfig) -> None:
         config.seed,
     ) as demos:
         if demos.num_episodes >= config.num_episodes:
-            logging.info("%s already holds %d episodes", config.root, demos.num_episodes)
-            return
+            return demos.num_episodes
         workers = demonstration_stream(
             env, config.degradation, config.num_envs, demos.next_seed, config.num_workers
         )
@@ -119,17 +121,33 @@ def record(config: RecordDemosConfig) -> None:
                 progress.set_postfix_str(f"{attempts} attempts", refresh=False)
                 progress.update(int(kept))
                 if demos.num_episodes >= config.num_episodes:
-                    return
+                    break
                 if demos.num_episodes == 0 and attempts >= HOPELESS_ATTEMPTS:
                     raise ValueError(
                         f"none of {attempts} attempts succeeded; use smaller --degradation.* errors,"
                         " a larger --env.clearance_m, or --include_failures=true"
                     )
+        return demos.num_episodes
+
+
+def next_steps(config: RecordDemosConfig) -> str:
+    """Commands that see the dataset and learn from it."""
+    env = config.env
+    assert isinstance(env, VtRefineEnvConfig)
+    root = shlex.quote(str(config.root))
+    train = f"lerobot-train --dataset.repo_id={config.repo_id} --dataset.root={root}"
+    if env.scene.embodiment == ALOHA:
+        train += " --config_path=vtrefine:vt_dp3_pads"
+    else:  # whose pads the shipped encoder has never felt
+        train += (
+            f" --config_path=vtrefine:vt_dp3_small --policy.observation.embodiment={env.scene.embodiment}"
+        )
+    return f"look: vtrefine-play --dataset.root={root} --dataset.episode=0\nlearn: {train}"
 
 
 @parser.wrap()
 def _main(config: RecordDemosConfig) -> None:
-    record(config)
+    print(f"{record(config)} episodes in {config.root}\n{next_steps(config)}")
     if config.push_to_hub:
         push_dataset(config.root, config.repo_id, private=config.private)
 

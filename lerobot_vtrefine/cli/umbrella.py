@@ -1,9 +1,10 @@
 """``vtrefine``: list this project's commands, or run one of them.
 
 examples:
-  vtrefine                        the list
-  vtrefine diagnose --help        the same as vtrefine-diagnose --help
+  vtrefine-play                   a good start: a trained policy, live in a browser
+  vtrefine-demo --quick           the whole chain with tiny numbers: record, imitate, improve, evaluate
   vtrefine configs                names that --config_path=vtrefine:NAME takes
+  vtrefine diagnose --help        the same as vtrefine-diagnose --help
 """
 
 import sys
@@ -11,10 +12,15 @@ from importlib.metadata import EntryPoint, distribution
 
 from lerobot_vtrefine.cli.errors import run_cli
 from lerobot_vtrefine.cli.flags import describe_module
-from lerobot_vtrefine.shipped import names
+from lerobot_vtrefine.shipped import PREFIX, names
 
 DISTRIBUTION = "lerobot_policy_vtrefine"
-PREFIX = "vtrefine-"
+COMMAND = "vtrefine-"
+KINDS_OF_FILES = {
+    "env": "tasks: --config_path= of lerobot-eval and of vtrefine-record-demos, -finetune, -play, -demo",
+    "policy": "policies: --config_path= of lerobot-train",
+}
+"""Folders of configuration files, and who reads them."""
 STOCK = """\
 Recording on robots, training and evaluation are LeRobot's own commands:
   lerobot-record, lerobot-teleoperate, lerobot-rollout    --robot.type=aloha_tactile_follower
@@ -25,7 +31,7 @@ Recording on robots, training and evaluation are LeRobot's own commands:
 def commands() -> dict[str, EntryPoint]:
     """Every other command of the installed distribution, by its name without ``vtrefine-``."""
     found = distribution(DISTRIBUTION).entry_points.select(group="console_scripts")
-    return {e.name.removeprefix(PREFIX): e for e in sorted(found, key=lambda e: e.name) if PREFIX in e.name}
+    return {e.name.removeprefix(COMMAND): e for e in sorted(found, key=lambda e: e.name) if COMMAND in e.name}
 
 
 def module_of(entry: EntryPoint) -> str:
@@ -36,17 +42,20 @@ def module_of(entry: EntryPoint) -> str:
 def overview() -> str:
     """The list of commands, a sentence each."""
     sentence, examples = describe_module(__name__)
-    rows = [f"  {PREFIX + name:<24} {describe_module(module_of(e))[0]}" for name, e in commands().items()]
+    rows = [f"  {COMMAND + name:<24} {describe_module(module_of(e))[0]}" for name, e in commands().items()]
     usage = "usage: vtrefine [--version | COMMAND [FLAGS ...]]"
     return "\n".join([usage, "", sentence, "", "commands:", *rows, "", STOCK, "", examples])
 
 
 def configurations() -> str:
-    """Names of configuration files and what their first line says."""
+    """Names of configuration files by their folder, and what their first line says."""
     lines = []
-    for name, path in names().items():
-        first = path.read_text(encoding="utf-8").partition("\n")[0].removeprefix("# ")
-        lines.append(f"  {'vtrefine:' + name:<36} {first}")
+    for kind, title in KINDS_OF_FILES.items():
+        lines += ["", title] if lines else [title]
+        for name, path in names().items():
+            if path.parent.name == kind:
+                first = path.read_text(encoding="utf-8").partition("\n")[0].removeprefix("# ")
+                lines.append(f"  {PREFIX + name:<36} {first}")
     return "\n".join(lines)
 
 
@@ -66,7 +75,7 @@ def main() -> int:
     known = commands()
     if name not in known:
         raise ValueError(f"unknown command {name!r}; choose from {', '.join(known)}, configs")
-    sys.argv = [PREFIX + name, *rest]
+    sys.argv = [COMMAND + name, *rest]
     return known[name].load()() or 0
 
 

@@ -1,5 +1,6 @@
 """``vtrefine-view-data``: show a dataset's pads, point cloud, depth and motion on one timeline in rerun."""
 
+import shlex
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any
@@ -34,6 +35,8 @@ def make_parser() -> OneLineParser:
 @run_cli
 def main(arguments: Sequence[str] | None = None) -> None:
     """Console entry point."""
+    from lerobot_vtrefine.datasets.episodes import open_episodes
+
     options = make_parser().parse_args(arguments)
     if (options.root is None) == (options.repo_id is None):
         raise ValueError("give either --dataset.root=DIR or --dataset.repo_id=NAME")
@@ -43,6 +46,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
         raise ImportError("vtrefine-view-data needs rerun: pip install 'lerobot[viz]'") from error
     root = options.root or downloaded(options.repo_id)
     shown = options.episodes or [0]
+    open_episodes(root).read(shown)  # before a viewer opens for nothing
     rr.init("vtrefine-view-data", spawn=options.save is None)
     if options.save is not None:
         options.save.parent.mkdir(parents=True, exist_ok=True)
@@ -51,6 +55,8 @@ def main(arguments: Sequence[str] | None = None) -> None:
     rr.rerun_shutdown()
     where = f" -> {options.save}" if options.save is not None else ""
     print(f"{len(shown)} episode{'' if len(shown) == 1 else 's'}, {frames} frames{where}")
+    if options.save is not None:
+        print(f"open it: rerun {shlex.quote(str(options.save))}")
 
 
 def downloaded(repo_id: str) -> Path:

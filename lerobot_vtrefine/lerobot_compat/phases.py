@@ -4,7 +4,8 @@ LeRobot 0.6.1's robots see observations and actions only. Real ones need no more
 parts back; a simulated one must know when to start anew, and can end an episode itself. `install` wraps the
 loops of ``lerobot-record`` and of the episodic strategy of ``lerobot-rollout``. Teleoperators that solve for
 joint positions themselves must know where the joints are when a loop begins, that of ``lerobot-teleoperate``
-included. Robots without ``phase`` and teleoperators without ``follow`` see nothing of it.
+included. A policy in ``lerobot-rollout`` without recording must forget what it planned for the last episode.
+Robots without ``phase`` and teleoperators without ``follow`` see nothing of it.
 """
 
 import functools
@@ -18,6 +19,7 @@ from lerobot_vtrefine.lerobot_compat.guard import is_supported
 LOOPS = (
     ("lerobot.scripts.lerobot_record", None, "record_loop"),
     ("lerobot.scripts.lerobot_teleoperate", None, "teleop_loop"),
+    ("lerobot.rollout.strategies.base", "BaseStrategy", "run"),
     ("lerobot.rollout.strategies.episodic", "EpisodicStrategy", "_policy_loop"),
     ("lerobot.rollout.strategies.episodic", "EpisodicStrategy", "_reset_loop"),
 )
@@ -74,7 +76,7 @@ def install() -> None:
     for owner, name in _loaded():
         loop = vars(owner)[name]
         if not hasattr(loop, "unphased"):
-            setattr(owner, name, _phased(loop))
+            setattr(owner, name, (_forgetting if name == "run" else _phased)(loop))
 
 
 def uninstall() -> None:
@@ -112,6 +114,29 @@ def _followed(robot: Any, teleop: FollowingTeleoperator, fps: float) -> Generato
         yield
     finally:
         robot.on_restart = None
+
+
+def _forgetting(run: Callable[..., None]) -> Callable[..., None]:
+    """A rollout whose policy is reset whenever the robot starts anew by itself."""
+
+    @functools.wraps(run)
+    def wrapper(strategy: Any, ctx: Any) -> None:
+        robot = getattr(ctx.hardware.robot_wrapper, "inner", ctx.hardware.robot_wrapper)
+        if not isinstance(robot, HoldingRobot):
+            return run(strategy, ctx)
+
+        def forget() -> None:
+            strategy._engine.reset()
+            strategy._interpolator.reset()
+
+        robot.on_restart = forget
+        try:
+            return run(strategy, ctx)
+        finally:
+            robot.on_restart = None
+
+    wrapper.unphased = run  # ty: ignore[missing-attribute]
+    return wrapper
 
 
 def _phased(loop: Callable[..., None]) -> Callable[..., None]:

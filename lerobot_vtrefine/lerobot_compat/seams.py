@@ -56,6 +56,13 @@ SEAMS = (
         "stays: it only raises another exception",
     ),
     Seam(
+        "decoder_notice",
+        (),
+        "where FFmpeg is missing, every dataset that is opened logs ninety lines of tracebacks",
+        "importing this package",
+        "stays: it only shortens that message",
+    ),
+    Seam(
         "fast_reader",
         ("lerobot.datasets.lerobot_dataset.DatasetReader", "lerobot.datasets.lerobot_dataset.LeRobotDataset"),
         "array columns are decoded through Python lists, 45 ms an item, and never a batch at once",
@@ -87,6 +94,7 @@ SEAMS = (
         (
             "lerobot.scripts.lerobot_record.record_loop",
             "lerobot.scripts.lerobot_teleoperate.teleop_loop",
+            "lerobot.rollout.strategies.base.BaseStrategy.run",
             "lerobot.rollout.strategies.episodic.EpisodicStrategy._policy_loop",
             "lerobot.rollout.strategies.episodic.EpisodicStrategy._reset_loop",
         ),

@@ -24,7 +24,7 @@ class VtRefineSimConfig(RobotConfig):
     """The simulation as a robot.
 
     Attributes:
-        env_file: Environment file, as lerobot-eval's --config_path takes it: configs/env/round_table.yaml.
+        env_file: Environment file, as lerobot-eval's --config_path takes it: vtrefine:round_table, or a path.
         env: Fields of --env.type=vtrefine that win over the file's, such as "{pair: square}".
         seed: Episode i of a dataset starts from seed + i: its parts stand where this seed puts them.
         fps: Control steps and observations per simulated second, 1 to 100; the command must run at the same
@@ -32,7 +32,9 @@ class VtRefineSimConfig(RobotConfig):
         episode_s: Time-out of an episode [s]: people take longer than what an environment gives a policy.
         end_episodes: End a recorded episode at success, failure or time-out; otherwise at LeRobot's keys and
             times only.
-        pause_s: Without recording, the next episode starts this long after one has ended [s].
+        pause_s: Without recording, the time between two episodes [s]: half of it the old one goes on, half of
+            it the new one stands still, and commands have no effect. Give at least twice the time for which
+            a policy decides at once.
         view: none, or browser: the live view of vtrefine-play.
         view_port: Port of the live view.
     """

@@ -70,7 +70,7 @@ class VtRefineSim(Robot):
         self._events: dict[str, bool] | None = None
         """LeRobot's keys, while an episode is recorded."""
         self.on_restart: Callable[[], None] | None = None
-        """Called when the next episode has begun without LeRobot's doing."""
+        """Called when the next episode has begun without LeRobot's doing, and when commands move it."""
         self._recorded: tuple[Any, int, dict[str, Any]] | None = None
         """Dataset, index and row of the last recorded episode, until it is known whether it was saved."""
 
@@ -170,11 +170,16 @@ class VtRefineSim(Robot):
         if not np.isfinite(wanted).all():
             wrong = [key for key in self.action_features if not np.isfinite(float(action[key]))]
             raise ValueError(f"the action's {', '.join(wrong)} must be finite: nothing was sent to the arms")
-        self.world.step(wanted)
+        waits = self._waiting_steps > 0
+        if not waits:
+            self.world.step(wanted)
         if self._viewer is not None:
             self._viewer.update()
         self._pace.step_done(time.perf_counter() - began + self._observing_s)
-        self._end_or_go_on()
+        if waits:
+            self._wait()
+        else:
+            self._end_or_go_on()
         return self.held_targets()
 
     def held_targets(self) -> RobotAction:
@@ -217,6 +222,7 @@ class VtRefineSim(Robot):
     def _start(self, seed: int) -> None:
         self._observing_s = 0.0
         self._ended_s: float | None = None
+        self._waiting_steps = 0
         self.world.reset(seed)
         self._pace.restart()
 
@@ -231,10 +237,22 @@ class VtRefineSim(Robot):
         if self._ended_s is None:
             self._ended_s = self.world.time_s
             logger.info("seed %d: %s", self.world.seed, describe(self.world.row()))
-        elif self.world.time_s - self._ended_s >= self.config.pause_s:
+        elif self.world.time_s - self._ended_s >= self.config.pause_s / 2:
             self._start(self.world.seed + 1)
-            if self.on_restart is not None:
-                self.on_restart()
+            # Half of the pause shows the end, half the new start: a policy that decides for several steps at
+            # once and is not told of episodes, as in lerobot-rollout, uses up what the old one called for.
+            self._waiting_steps = round(self.config.pause_s / 2 * self.config.fps)
+            self._tell_restart()
+
+    def _wait(self) -> None:
+        self._waiting_steps -= 1
+        if self._waiting_steps == 0:
+            self._pace.restart()
+            self._tell_restart()
+
+    def _tell_restart(self) -> None:
+        if self.on_restart is not None:
+            self.on_restart()
 
     def _note_outcome(self) -> None:
         """Note the last recorded episode beside its dataset, unless it was discarded."""

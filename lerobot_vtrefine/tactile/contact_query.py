@@ -1,6 +1,12 @@
 """Launches the geometry kernels on arrays of poses; owns the bodies' device copies. Imports warp."""
 
+import contextlib
+import ctypes
+import functools
+import os
+from collections.abc import Generator
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -33,11 +39,34 @@ POSES = {
 }
 
 
+@functools.cache
 def start_warp() -> None:
     """Initialise warp without its banner and without its complaint about a missing CUDA driver."""
     wp.config.log_level = wp.LOG_ERROR
-    wp.init()
+    with contextlib.nullcontext() if _has_cuda_driver() else _silent_native_stderr():
+        wp.init()
     wp.config.log_level = wp.LOG_WARNING
+
+
+def _has_cuda_driver() -> bool:
+    for name in ("libcuda.so", "libcuda.so.1", "nvcuda.dll"):
+        with contextlib.suppress(OSError):
+            ctypes.CDLL(name)
+            return True
+    return False
+
+
+@contextlib.contextmanager
+def _silent_native_stderr() -> Generator[None]:
+    """Warp's C++ writes to the process's stderr, which neither its log level nor `sys.stderr` reaches."""
+    kept = os.dup(2)
+    try:
+        with Path(os.devnull).open("wb") as nothing:
+            os.dup2(nothing.fileno(), 2)
+        yield
+    finally:
+        os.dup2(kept, 2)
+        os.close(kept)
 
 
 @dataclass(eq=False)

@@ -1,12 +1,14 @@
 """Expected failures of a command become one line and an exit status."""
 
 import errno
+from dataclasses import dataclass, field
 
 import draccus
 import pytest
 
 from lerobot_vtrefine.cli.errors import run_cli
 from lerobot_vtrefine.cli.pipeline.demo_config import DemoConfig
+from lerobot_vtrefine.cli.record_demos import RecordDemosConfig
 
 
 def failing(error: BaseException):
@@ -71,3 +73,32 @@ def test_wrong_flag_names_itself(flag: str, message: str, capsys: pytest.Capture
     error = capsys.readouterr().err
     assert message in error
     assert error.count("\n") == 1
+
+
+@dataclass
+class Flags:
+    num_episodes: int = 1
+    env: dict = field(default_factory=dict)
+
+
+@pytest.mark.parametrize(
+    ("config", "typed", "line"),
+    [
+        (
+            Flags,
+            ["--num_epsodes=3"],
+            "unrecognized arguments: --num_epsodes=3; did you mean --num_episodes?",
+        ),
+        (Flags, ["--zzz=3"], "unrecognized arguments: --zzz=3; --help lists the flags"),
+        (
+            RecordDemosConfig,
+            ["--root=x", "--env.pair=round"],
+            "say which environment: --env.type=vtrefine or --config_path=vtrefine:NAME",
+        ),
+    ],
+)
+def test_flags_that_are_misspelt_or_lack_their_type_are_one_line(config, typed, line, capsys) -> None:
+    assert run_cli(lambda: draccus.parse(config, args=typed) and None)() == 2
+    error = capsys.readouterr().err
+    assert error.count("\n") == 1
+    assert error.startswith(f"error: {line}")

@@ -82,7 +82,11 @@ def test_the_umbrella_lists_commands_and_configurations(monkeypatch, capsys) -> 
     assert "lerobot-train" in listed
     monkeypatch.setattr(sys, "argv", ["vtrefine", "configs"])
     assert umbrella.main() == 0
-    assert "vtrefine:round_grasped" in capsys.readouterr().out
+    listed = capsys.readouterr().out
+    assert "vtrefine:round_grasped" in listed
+    rows = [line for line in listed.splitlines() if line.startswith("  vtrefine:")]
+    assert len(rows) == len(shipped.names())
+    assert [row for row in rows if not row.endswith(".")] == []  # whole sentences, not a comment's first half
     monkeypatch.setattr(sys, "argv", ["vtrefine", "--version"])
     assert umbrella.main() == 0
     assert capsys.readouterr().out.startswith("lerobot_policy_vtrefine ")
@@ -102,6 +106,9 @@ def test_the_umbrella_runs_a_command_as_if_called_by_its_name(monkeypatch, capsy
 
 def test_stock_commands_get_the_path_when_they_discover_the_plugin(monkeypatch) -> None:
     monkeypatch.setattr(sys, "argv", ["lerobot-eval", "--config_path=vtrefine:round_table"])
+    shipped.expand_command_line()
+    assert Path(sys.argv[1].partition("=")[2]).is_file()
+    monkeypatch.setattr(sys, "argv", ["lerobot-record", "--robot.env_file=vtrefine:round_table"])
     shipped.expand_command_line()
     assert Path(sys.argv[1].partition("=")[2]).is_file()
     monkeypatch.setattr(sys, "argv", ["lerobot-eval", "--config_path=vtrefine:nothing"])

@@ -72,6 +72,12 @@ def config_errors_(_: Path) -> None:
 
 
 @probe
+def decoder_notice_(_: Path) -> None:
+    source = inspect.getsource(import_utils.get_safe_default_video_backend)
+    assert 'f"{e}\\n' in source  # the whole chain of tracebacks is part of the message
+
+
+@probe
 def fast_reader_(folder: Path) -> None:
     dataset = small_dataset(folder)
     dataset.finalize()

@@ -3,6 +3,7 @@
 import json
 from collections.abc import Generator
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -191,6 +192,37 @@ def test_a_rerecorded_episode_starts_from_the_same_seed_and_is_not_noted(tmp_pat
     assert [(row["episode_index"], row["seed"], row["failure"]) for row in noted(tmp_path)] == [
         (0, 5, "stopped")
     ]
+
+
+def test_a_rollouts_policy_forgets_the_last_episode() -> None:
+    robot, forgotten = connected(seed=5, pause_s=0.1), []
+    part = SimpleNamespace(reset=lambda: forgotten.append(robot.world.seed))
+    strategy = SimpleNamespace(_engine=part, _interpolator=part)
+
+    def run(_strategy: object, _ctx: object) -> None:
+        robot.world.outcome, robot.world._row = "success", {**robot.world.row(), "time_to_success_s": 1.0}
+        for _ in range(3):
+            robot.send_action(robot.held_targets())
+
+    wrapper = SimpleNamespace(inner=robot)
+    phases._forgetting(run)(strategy, SimpleNamespace(hardware=SimpleNamespace(robot_wrapper=wrapper)))
+    assert forgotten == [6, 6]
+    assert robot.on_restart is None
+    robot.disconnect()
+
+
+def test_what_the_last_episode_called_for_does_not_move_the_next_one() -> None:
+    """lerobot-rollout does not tell its policy of a new episode: a chunk that has begun is carried out."""
+    robot = connected(seed=5, pause_s=0.6)
+    robot.world.outcome, robot.world._row = "success", {**robot.world.row(), "time_to_success_s": 1.0}
+    stale = {name: value + 0.05 for name, value in robot.held_targets().items()}
+    while robot.world.seed == 5:
+        robot.send_action(stale)
+    start = robot.held_targets()
+    for _ in range(3):  # half of the pause at 10 Hz
+        assert robot.send_action(stale) == start
+    assert robot.send_action(stale) != start
+    robot.disconnect()
 
 
 def test_a_teleoperator_goes_on_from_where_the_next_episode_begins() -> None:

@@ -36,6 +36,7 @@ LOWEST = {
 }
 
 QUICK = (
+    "--output_dir=outputs/demo_quick",
     "--num_demos=4",
     "--demo_envs=4",
     "--pretrain_steps=20",
