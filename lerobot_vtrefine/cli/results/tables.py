@@ -18,6 +18,7 @@ LABELS = {
     "demo": "demo: round pair, 2 mm clearance",
     "round_grasped": "round pair, 2 mm, slip 2 mm / .05 rad",
     "demo_schedule": "the demo, 128 environments on two cores",
+    "kinova_round": "two Kinova Gen3, round pair, the paper's cloud, two cores",
     "cross_gentle": "cross, 2 mm, 5 N at most (cross_gentle)",
     "tight": "tight: 1 mm clearance",
     "occluded": "occluded: camera above, the hole hidden",
