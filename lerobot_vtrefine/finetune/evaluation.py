@@ -69,4 +69,4 @@ def _deployed_chunks(agent: Agent, obs: Observation, generator: torch.Generator)
         eta=agent.deploy_eta,
         generator=generator,
     )
-    return agent.to_actions(chunks[:, agent.executed], obs)
+    return chunks[:, agent.executed]

@@ -177,7 +177,6 @@ def make_agent(policy: VtDp3Policy, dppo: DppoConfig) -> Agent:
         executed=slice(0, config.n_action_steps),
         frozen_encoder=config.ft_freeze_encoder,
         deploy_eta=config.ft_eta,
-        to_actions=policy.to_actions,
     )
 
 

@@ -4,7 +4,7 @@ Shapes: ``n`` environments, ``H`` horizon of a predicted chunk, ``Ta`` executed 
 dimension, ``C`` condition, ``P`` privileged state.
 """
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from typing import NamedTuple, Protocol
 
@@ -50,8 +50,6 @@ class Agent:
     executed: slice
     frozen_encoder: bool
     deploy_eta: float
-    to_actions: Callable[[Tensor, Observation], Tensor] = lambda latent, obs: latent
-    """What was denoised (B, Ta, D) in an observation -> normalised actions for the environment."""
 
     @property
     def device(self) -> torch.device:

@@ -71,10 +71,6 @@ class VtDp3Config(PreTrainedConfig):
     horizon: int = 16
     n_action_steps: int = 8
     """Executed actions per decision; a chunk starts at the current observation."""
-    relative_actions: bool = False
-    """Denoise offsets from the joints measured at the decision, each step of the chunk in its own range, in
-    place of absolute targets. The actions that leave the policy are absolute in either case.
-    """
 
     observation: VisuoTactileConfig = field(default_factory=VisuoTactileConfig)
     point_dims: tuple[int, ...] = ()
@@ -178,9 +174,6 @@ class VtDp3Config(PreTrainedConfig):
             )
         if self.denoiser == "mlp" and len(set(self.down_dims)) > 1:
             raise ValueError(f"policy.down_dims must be one repeated width for the mlp, got {self.down_dims}")
-        modes = {self.normalization_mapping.get(kind) for kind in ("STATE", "ACTION")}
-        if self.relative_actions and modes != {NormalizationMode.MIN_MAX}:
-            raise ValueError("policy.relative_actions needs MIN_MAX for STATE and ACTION")
         if not 0.0 <= self.ft_eta <= 1.0:
             raise ValueError(f"policy.ft_eta must lie in [0, 1], got {self.ft_eta}")
         if not 0 <= self.ft_denoising_steps <= len(self.timesteps):
@@ -271,8 +264,3 @@ class VtDp3Config(PreTrainedConfig):
         action = (self.output_features or {}).get(ACTION_KEY)
         if action is None or action.type is not FeatureType.ACTION or len(action.shape) != 1:
             raise ValueError(f"vt_dp3 needs a vector feature '{ACTION_KEY}', got {action}")
-        if self.relative_actions and self.state_dim != self.action_dim:
-            raise ValueError(
-                "policy.relative_actions needs one target for every measured joint, but the data has "
-                f"{self.state_dim} joints and {self.action_dim} targets"
-            )

@@ -24,7 +24,6 @@ from lerobot_vtrefine.policies.vt_dp3.diffusion import DiffusionProcess, Predict
 from lerobot_vtrefine.policies.vt_dp3.ema import Ema
 from lerobot_vtrefine.policies.vt_dp3.observation_encoder import load_encoder, make_encoder
 from lerobot_vtrefine.policies.vt_dp3.processor_vt_dp3 import widen_narrow_ranges
-from lerobot_vtrefine.policies.vt_dp3.relative_targets import RelativeTargets, dataset_offsets
 
 Batch = dict[str, Tensor]
 
@@ -75,11 +74,9 @@ class VtDp3Policy(PreTrainedPolicy):
         config: VtDp3Config,
         dataset_stats: dict[str, Any] | None = None,
         dataset_meta: Any = None,
-        from_scratch: bool = True,
+        read_encoder: bool = True,
     ) -> None:
-        """``from_scratch``: start from ``config.pretrained_encoder`` and from the ranges of the dataset's
-        offsets; not where a checkpoint brings both.
-        """
+        """``read_encoder``: start from ``config.pretrained_encoder``; not where weights are loaded anyway."""
         if not isinstance(config, VtDp3Config):
             found = getattr(config, "type", type(config).__name__)
             raise ValueError(f"the checkpoint holds a policy of type '{found}', expected 'vt_dp3'")
@@ -90,15 +87,8 @@ class VtDp3Policy(PreTrainedPolicy):
             # hook.
             widen_narrow_ranges(dataset_stats)
         self.config: VtDp3Config = config
-        self.targets: RelativeTargets | None = None
-        if config.relative_actions:
-            self.targets = RelativeTargets(config.horizon, config.action_dim)
-            if dataset_stats:
-                self.targets.set_normaliser(dataset_stats)
-            if dataset_meta is not None and from_scratch:
-                self.targets.set_offsets(dataset_offsets(Path(dataset_meta.root), config.horizon))
         self.model = VtDp3Model(config, config.state_dim, config.action_dim)
-        if from_scratch and config.pretrained_encoder:
+        if read_encoder and config.pretrained_encoder:
             load_encoder(self.model.encoder, config)
         self.base: VtDp3Model | None = None
         self.online: VtDp3Model | None = None
@@ -123,11 +113,9 @@ class VtDp3Policy(PreTrainedPolicy):
         if path.is_dir() and not (path / "config.json").is_file():
             raise FileNotFoundError(f"{path} holds no policy; give the checkpoint's pretrained_model folder")
         try:
-            policy = super().from_pretrained(pretrained_name_or_path, from_scratch=False, **kwargs)
+            policy = super().from_pretrained(pretrained_name_or_path, read_encoder=False, **kwargs)
         except SafetensorError as error:
             raise ValueError(f"the weights of {pretrained_name_or_path} are damaged: {error}") from error
-        if policy.targets is not None and kwargs.get("dataset_stats"):
-            policy.targets.set_normaliser(kwargs["dataset_stats"])  # the processors follow the new data, too
         if policy.config.use_peft:  # the adapters that come next belong to the network that acts
             policy._stop_averaging()
         return policy
@@ -180,10 +168,7 @@ class VtDp3Policy(PreTrainedPolicy):
         model = self.online or self.model
         draws = self.config.noise_draws if self.training else 1
         cond = model.encode(batch)
-        clean = batch[ACTION_KEY]
-        if self.targets is not None:
-            clean = self.targets.to_latent(clean, batch[STATE_KEY][:, -1])
-        clean = clean.repeat_interleave(draws, dim=0)
+        clean = batch[ACTION_KEY].repeat_interleave(draws, dim=0)
         noise = torch.randn_like(clean)
         t = torch.randint(self.config.num_train_timesteps, (len(clean),), device=clean.device)
         predicted = model.denoiser(self.process.add_noise(clean, noise, t), t, cond)
@@ -285,7 +270,7 @@ class VtDp3Policy(PreTrainedPolicy):
         base: PredictNoise | None = None
         if self.base is not None:
             base = self.base.predictor(cond if self.config.ft_freeze_encoder else self.base.encode(batch))
-        latent = deploy(
+        return deploy(
             self.process,
             self.model.predictor(cond),
             noise,
@@ -294,8 +279,3 @@ class VtDp3Policy(PreTrainedPolicy):
             eta=self.config.ft_eta,
             generator=generator,
         )
-        return self.to_actions(latent, batch)
-
-    def to_actions(self, latent: Tensor, batch: Batch) -> Tensor:
-        """What was denoised (B, <= H, D), with stacked frames (B, To, ...) -> normalised targets."""
-        return latent if self.targets is None else self.targets.to_targets(latent, batch[STATE_KEY][:, -1])
