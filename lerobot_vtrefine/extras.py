@@ -10,6 +10,7 @@ EXTRA_OF = {
     "viser": "view",
     "mink": "teleop",
     "daqp": "teleop",
+    "pyspacemouse": "spacemouse",
     "grpc": "async",
     "serial": "hardware",
     "dynamixel_sdk": "hardware",
@@ -21,6 +22,7 @@ SIMULATOR = ("mujoco", "warp")
 VIEW = ("mujoco", "warp", "mjviser")
 ASYNCHRONOUS = ("grpc",)
 TELEOPERATION = ("mujoco", "warp", "mink", "daqp")
+SPACEMOUSE = ("pyspacemouse",)
 PADS = ("serial",)
 ARMS = ("serial", "dynamixel_sdk", "deepdiff")
 

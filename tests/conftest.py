@@ -61,7 +61,9 @@ def write_tiny_dataset(root: Path, episodes: int, frames: int, seed: int, noise_
         for _ in range(frames):
             raw = random_raw(rng, noise_level)
             action = raw["state"] + rng.normal(0, 0.01, 16).astype(np.float32)
-            dataset.add_frame({**raw_to_frame(raw), "action": action, "task": "insert"})
+            dataset.add_frame(
+                {**raw_to_frame(raw, get_embodiment("aloha")), "action": action, "task": "insert"}
+            )
         dataset.save_episode()
     dataset.finalize()
 

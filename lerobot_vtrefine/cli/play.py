@@ -101,9 +101,9 @@ def play(config: PlayConfig) -> list[dict]:
     world.reset(seed)
     view = None
     if config.viewer == "browser":
-        from lerobot_vtrefine.view.browser import CLOUD, BrowserView
+        from lerobot_vtrefine.view.browser import BrowserView
 
-        view = BrowserView(world, config.port, getattr(agent, "cloud", None) or CLOUD, controls=True)
+        view = BrowserView(world, config.port, getattr(agent, "cloud", None), controls=True)
         print(f"http://localhost:{view.port} shows it; Ctrl-C ends it", flush=True)
     one = config.viewer == "none" or config.dataset.root is not None
     session = Session(world, agent, view, config.video_dir, lambda line: print(line, flush=True))

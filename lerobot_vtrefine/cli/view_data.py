@@ -101,17 +101,20 @@ def log_episode(rr: Any, root: Path, index: int) -> int:
 
 def clouds_of(root: Path, index: int) -> Iterator[tuple[np.ndarray, np.ndarray]]:
     """Point cloud (N, 5) and depth image (H, W) [mm] of every frame; nothing for a dataset without depth."""
-    from lerobot_vtrefine.cli.report.cloud import NEEDED, build_cloud, depth_mm
+    import pyarrow.parquet as pq
+
+    from lerobot_vtrefine.cli.report.cloud import body_of, build_cloud, depth_mm, needed
     from lerobot_vtrefine.files.tables import read_table
 
     for path in sorted((root / "data").rglob("*.parquet")):
-        table = read_table(path, ["episode_index", "frame_index", *NEEDED])
-        if not set(NEEDED) <= set(table.column_names):
+        body = body_of(pq.read_schema(path).names)
+        if body is None:
             return
+        table = read_table(path, ["episode_index", "frame_index", *needed(body)])
         mine = np.flatnonzero(table["episode_index"].to_numpy() == index)
         for place in mine:
             row = table.slice(int(place), 1).to_pylist()[0]
-            yield build_cloud(row), depth_mm(row)
+            yield build_cloud(row, body), depth_mm(row)
 
 
 def above(counts: np.ndarray, idle: np.ndarray) -> np.ndarray:

@@ -131,7 +131,7 @@ TAXEL_INFO = taxel_info(ALOHA.pad_layout)
 
 
 def dataset_features(
-    camera_height: int, camera_width: int, body: Embodiment = ALOHA, colour: tuple[int, int] | None = None
+    camera_height: int, camera_width: int, body: Embodiment, colour: tuple[int, int] | None = None
 ) -> dict[str, dict[str, Any]]:
     """Features of a body's data for ``LeRobotDataset.create``; `colour` is a colour image's height and width.
 
@@ -173,7 +173,7 @@ def _columns_of(raw: Mapping[str, Array], body: Embodiment) -> dict[str, Array]:
     return {column.key: column.value(raw) for column in columns(body)}
 
 
-def raw_to_frame(raw: Mapping[str, Array], body: Embodiment = ALOHA) -> dict[str, Array]:
+def raw_to_frame(raw: Mapping[str, Array], body: Embodiment) -> dict[str, Array]:
     """One raw observation (no leading dimensions) as a frame for ``LeRobotDataset.add_frame``.
 
     The caller adds ``action`` (J,) float32 and ``task``.
@@ -185,7 +185,7 @@ def raw_to_frame(raw: Mapping[str, Array], body: Embodiment = ALOHA) -> dict[str
     return {**_columns_of(raw, body), DEPTH_KEY: depth, **colour}
 
 
-def raw_to_env_observation(raw: Mapping[str, Array], body: Embodiment = ALOHA) -> dict[str, Any]:
+def raw_to_env_observation(raw: Mapping[str, Array], body: Embodiment) -> dict[str, Any]:
     """A raw observation (leading dimensions allowed) as an environment observation.
 
     LeRobot's ``preprocess_observation`` turns its keys into the dataset's (``agent_pos`` becomes
@@ -205,7 +205,7 @@ def raw_to_env_observation(raw: Mapping[str, Array], body: Embodiment = ALOHA) -
 
 
 def env_observation_shapes(
-    camera_height: int, camera_width: int, body: Embodiment = ALOHA
+    camera_height: int, camera_width: int, body: Embodiment
 ) -> dict[str, tuple[tuple[int, ...], float]]:
     """Shape of every environment observation key, without leading dimensions, and the largest value of counts
     (infinite for everything else).
@@ -219,7 +219,7 @@ def env_observation_shapes(
     return shapes
 
 
-def env_key_map(body: Embodiment = ALOHA, *, colour: bool = False) -> dict[str, str]:
+def env_key_map(body: Embodiment, *, colour: bool = False) -> dict[str, str]:
     """Environment observation key -> dataset key (LeRobot's ``features_map``, the action included).
 
     Colour, which comes below ``pixels``, goes by the name that LeRobot gives it: ``lerobot-eval`` records

@@ -59,7 +59,8 @@ class Believer:
 
     def _frame(self, ids: np.ndarray) -> dict[str, Tensor]:
         raw = {key: value[ids] for key, value in self._episodes.raw.items()}
-        return {k: v.float() for k, v in view_columns(raw, self._views, self._device).items()}
+        columns = view_columns(raw, self._episodes.sim.scene.embodiment, self._views, self._device)
+        return {key: value.float() for key, value in columns.items()}
 
     @torch.no_grad()
     def _estimate(self, ids: np.ndarray) -> np.ndarray:

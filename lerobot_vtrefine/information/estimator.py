@@ -12,6 +12,7 @@ from torch import Tensor, nn
 
 from lerobot_vtrefine.datasets.features import STATE_KEY
 from lerobot_vtrefine.information.frames import Frames, Views
+from lerobot_vtrefine.observation import VisuoTactileConfig
 from lerobot_vtrefine.policies.vt_dp3 import VisuoTactileProcessorStep, VtDp3Config
 from lerobot_vtrefine.policies.vt_dp3.observation_encoder import ObservationEncoder, make_encoder
 
@@ -29,13 +30,14 @@ class Senses:
     """As of ``--policy.modalities``; empty for joint positions alone."""
     fusion: str = "pads"
 
-    def policy(self, preset: str, device: str, history: int) -> VtDp3Config:
-        """Settings of the policy whose encoder this is."""
+    def policy(self, body: str, preset: str, device: str, history: int) -> VtDp3Config:
+        """Settings of the policy whose encoder this is, for the robot of this name."""
         return VtDp3Config(
             preset=preset,
             modalities=self.modalities or "visual",
             fusion=self.fusion,
             n_obs_steps=history,
+            observation=VisuoTactileConfig(embodiment=body),
             device=device,
         )
 
@@ -53,11 +55,11 @@ SENSES = {
 """Every set of sensors that can be asked for."""
 
 
-def views_of(chosen: list[Senses], preset: str, device: str) -> Views:
+def views_of(chosen: list[Senses], body: str, preset: str, device: str) -> Views:
     """The preprocessing that regressors need: one view for every different cloud, and one with images."""
     views: Views = {}
     for senses in chosen:
-        config = senses.policy(preset, device, 1)
+        config = senses.policy(body, preset, device, 1)
         if not senses.modalities:
             continue
         if config.cloud_modalities:
@@ -77,9 +79,12 @@ class Estimator(nn.Module):
     state_mean: Tensor
     state_std: Tensor
 
-    def __init__(self, senses: Senses, frames: Frames, preset: str, device: str, history: int) -> None:
+    def __init__(
+        self, senses: Senses, frames: Frames, body: str, preset: str, device: str, history: int
+    ) -> None:
         super().__init__()
-        config = senses.policy(preset, device, history)
+        config = senses.policy(body, preset, device, history)
+        self.body = body
         self.sources = {
             key: f"{view}/{key}"
             for view, key in (

@@ -28,6 +28,7 @@ from lerobot_vtrefine.sim.ik import hand_poses
 from lerobot_vtrefine.sim.poses import Poses
 
 if TYPE_CHECKING:
+    from lerobot_vtrefine.embodiments import Embodiment
     from lerobot_vtrefine.sim.simulation import InsertionSim
 
 ERRORS = Degradation(
@@ -107,9 +108,11 @@ class MisjudgedHolds:
         return plug, socket
 
 
-def view_columns(raw: dict[str, Any], views: Views, device: torch.device) -> dict[str, Tensor]:
-    """``VIEW/column`` (m, ...) of a raw frame (m, ...), and ``state`` (m, J)."""
-    frame = preprocess_observation(raw_to_env_observation(raw))
+def view_columns(
+    raw: dict[str, Any], body: "Embodiment", views: Views, device: torch.device
+) -> dict[str, Tensor]:
+    """``VIEW/column`` (m, ...) of a body's raw frame (m, ...), and ``state`` (m, J)."""
+    frame = preprocess_observation(raw_to_env_observation(raw, body))
     frame = {key: value.to(device) for key, value in frame.items() if isinstance(value, Tensor)}
     made = {
         f"{name}/{key}": value
@@ -164,20 +167,21 @@ def _one_batch(
     device: torch.device,
 ) -> _Batch:
     sim, ids, frames = episodes.sim, episodes.ids, episode_frames(episodes)
+    body = sim.scene.embodiment
     episodes.reset(ids, first_seed + ids)
     holds.draw(ids)
     expert.reset(ids)
     columns = {
         key: torch.zeros((len(ids), frames, *value.shape[1:]), device=device)
-        for key, value in view_columns(_rows(episodes.raw, ids[:1]), views, device).items()
+        for key, value in view_columns(_rows(episodes.raw, ids[:1]), body, views, device).items()
     }
     truth = Relative(*(np.zeros((len(ids), frames, *part.shape[1:])) for part in observe(sim, ids[:1])))
     length = np.zeros(len(ids), np.int64)
-    targets = np.zeros((len(ids), sim.scene.embodiment.num_joints))
+    targets = np.zeros((len(ids), body.num_joints))
     running = ids
     for frame in range(frames):
         rows = torch.as_tensor(running, device=device)
-        for key, value in view_columns(_rows(episodes.raw, running), views, device).items():
+        for key, value in view_columns(_rows(episodes.raw, running), body, views, device).items():
             columns[key][rows, frame] = value.float()
         for whole, part in zip(truth, observe(sim, running), strict=True):
             whole[running, frame] = part

@@ -109,7 +109,8 @@ def study(
 ) -> Study:
     """Collect, train, test, and let the expert act; ``keep`` gets the regressors of the first history."""
     chosen = [SENSES[name] for name in senses]
-    views, device = views_of(chosen, effort.preset, effort.device), torch.device(effort.device)
+    body, device = config.body.name, torch.device(effort.device)
+    views = views_of(chosen, body, effort.preset, effort.device)
     count = effort.num_envs
     frames = collect_frames(
         config, effort.episodes, count, views, device, lambda n: told("frames", effort.episodes, n)
@@ -121,7 +122,7 @@ def study(
         result.true_success = (int(done.sum()), len(done))
     for history in effort.history:
         for item in chosen:
-            estimator = _trained(item, training, effort, history, told)
+            estimator = _trained(item, training, body, effort, history, told)
             if history == effort.history[0]:
                 keep(item, estimator)
             result.findings.append(_tested(item, estimator, held_out, config, effort, views))
@@ -129,9 +130,9 @@ def study(
     return result
 
 
-def _trained(item: Senses, frames: Frames, effort: Effort, history: int, told: Told) -> Estimator:
+def _trained(item: Senses, frames: Frames, body: str, effort: Effort, history: int, told: Told) -> Estimator:
     torch.manual_seed(effort.seed)
-    estimator = Estimator(item, frames, effort.preset, effort.device, history).to(effort.device)
+    estimator = Estimator(item, frames, body, effort.preset, effort.device, history).to(effort.device)
     label = f"{item.name}, {history} frame{'s' * (history > 1)}"
     train_estimator(
         estimator,
@@ -225,7 +226,8 @@ def save_keeper(folder: Path, effort: Effort) -> Callable[[Senses, Estimator], N
 
     def keep(senses: Senses, estimator: Estimator) -> None:
         if senses.modalities:
-            save_encoder(estimator.encoder, senses.policy(effort.preset, effort.device, 1), folder)
+            config = senses.policy(estimator.body, effort.preset, effort.device, 1)
+            save_encoder(estimator.encoder, config, folder)
 
     return keep
 

@@ -39,10 +39,11 @@ def run() -> list[Row]:
 
 def _record(root: Path) -> None:
     random = np.random.default_rng(0)
-    dataset = LeRobotDataset.create("local/frames", FPS, dataset_features(HEIGHT, WIDTH), root)
+    dataset = LeRobotDataset.create("local/frames", FPS, dataset_features(HEIGHT, WIDTH, ALOHA), root)
     for _ in range(EPISODES):
         for _ in range(FRAMES):
-            dataset.add_frame({**raw_to_frame(_raw(random)), ACTION_KEY: _joints(random), "task": "insert"})
+            frame = raw_to_frame(_raw(random), ALOHA)
+            dataset.add_frame({**frame, ACTION_KEY: _joints(random), "task": "insert"})
         dataset.save_episode()
     dataset.finalize()
 

@@ -146,7 +146,7 @@ class VtRefineSim(Robot):
     def get_observation(self) -> RobotObservation:
         """What the hardware's sensors would give at this moment."""
         began = time.perf_counter()
-        frame = raw_to_frame(self.world.observe())
+        frame = raw_to_frame(self.world.observe(), self.body)
         values: RobotObservation = dict(
             zip(self.action_features, map(float, frame.pop(STATE_KEY)), strict=True)
         )

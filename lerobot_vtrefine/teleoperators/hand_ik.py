@@ -7,6 +7,7 @@ from functools import cached_property
 from typing import Any
 
 import mink
+import mujoco
 import numpy as np
 import torch
 from numpy.typing import NDArray
@@ -14,6 +15,7 @@ from numpy.typing import NDArray
 from lerobot_vtrefine.sim.config import SceneConfig, TaskConfig
 from lerobot_vtrefine.sim.scene import build_arms
 from lerobot_vtrefine.teleoperators.hand_motion import Pose
+from lerobot_vtrefine.teleoperators.table_limit import TableLimit
 
 Array = NDArray[np.float64]
 
@@ -63,7 +65,7 @@ class TwoArmIk:
         self._limits: list[Any] = [
             mink.ConfigurationLimit(self.model),
             mink.VelocityLimit(self.model, limited),
-            self._collisions(),
+            *self._collisions(),
         ]
         self.restart(np.asarray(self.body.home, float))
 
@@ -92,7 +94,9 @@ class TwoArmIk:
         Returns:
             Joint targets (J,), no farther from the last ones than the rate limits allow, whatever is asked.
         """
-        before = self.joints.copy()
+        before, most = self.joints.copy(), self._rate * self._dt_s
+        fingers = before + np.clip(self._fingers(before, grips) - before, -most, most)
+        self.restart(fingers)  # the point between some grippers' pads moves as they close
         for hand, (task, pose, tcp) in enumerate(zip(self._tasks, wanted, self.hands(), strict=True)):
             position, rotation = self._in_hand(hand, tcp)
             turned = pose.rotation @ rotation.T
@@ -115,9 +119,8 @@ class TwoArmIk:
             solved = self._configuration.q[self._qpos]
         except mink.exceptions.MinkError:  # nothing satisfies all limits: stay
             solved = before
-        targets = np.where(self._is_finger, self._fingers(before, grips), solved)
+        targets = np.where(self._is_finger, fingers, solved)
         targets = np.where(np.isfinite(targets), targets, before)
-        most = self._rate * self._dt_s
         self.restart(before + np.clip(targets - before, -most, most))
         return self.joints
 
@@ -141,19 +144,21 @@ class TwoArmIk:
         turned = data.xmat[body].reshape(3, 3)
         return turned.T @ (tcp.position - data.xpos[body]), turned.T @ tcp.rotation
 
-    def _collisions(self) -> mink.CollisionAvoidanceLimit:
-        """The arms' solid parts against each other and against what does not move."""
+    def _collisions(self) -> list[mink.Limit]:
+        """The arms' solid parts against each other and against what does not move, which is the table."""
         solid = np.flatnonzero(self.model.geom_contype | self.model.geom_conaffinity)
         root = self.model.body_rootid[self.model.geom_bodyid]
         arms = self._joints.reshape(len(self.body.arms), -1)
         roots = [self.model.body_rootid[self.model.jnt_bodyid[joints[0]]] for joints in arms]
         sides = [[int(g) for g in solid if root[g] == side] for side in roots]
         fixed = [int(g) for g in solid if self.model.geom_bodyid[g] == 0]
-        pairs = [(side, fixed) for side in sides]
+        is_box = self.model.geom_type == mujoco.mjtGeom.mjGEOM_BOX
+        boxes = [g for side in sides for g in side if is_box[g]]
+        pairs = [([g for side in sides for g in side if not is_box[g]], fixed)]
         if len(sides) == 2:
             pairs.append((sides[0], sides[1]))
         step_s = self._dt_s / self._steps
-        return mink.CollisionAvoidanceLimit(
+        apart = mink.CollisionAvoidanceLimit(
             self.model,
             pairs,
             gain=APPROACH * step_s,  # mink 1.3 bounds a step's way by gain * distance / dt
@@ -161,3 +166,6 @@ class TwoArmIk:
             collision_detection_distance=LOOK_AHEAD_M,
             bound_relaxation=-PARTING_M_S * step_s,
         )
+        top_m = self.model.geom("table").pos[2] + self.model.geom("table").size[2]
+        table = TableLimit(self.model, boxes, top_m, HANDS_APART_M, LOOK_AHEAD_M, APPROACH, PARTING_M_S)
+        return [apart, table]

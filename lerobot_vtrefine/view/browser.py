@@ -6,7 +6,7 @@ buttons ask for is kept in `Wishes`, which whoever steps the simulation reads.
 
 import copy
 import time
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -45,18 +45,18 @@ class BrowserView:
     Args:
         world: what is shown; observe it before every update.
         port: the next free one is taken where it is in use.
-        cloud: how the shown point cloud is built; a policy's `observation`.
+        cloud: how the shown point cloud is built; a policy's `observation`, or densely by default.
         controls: whether the page has buttons to pause, step, reset and record.
     """
 
     def __init__(
-        self, world: LiveWorld, port: int, cloud: VisuoTactileConfig = CLOUD, controls: bool = False
+        self, world: LiveWorld, port: int, cloud: VisuoTactileConfig | None = None, controls: bool = False
     ) -> None:
         require("the live view", VIEW)
         import mjviser
         import viser
 
-        self._world, self._cloud = world, cloud
+        self._world, self._cloud = world, cloud or replace(CLOUD, embodiment=world.sim.embodiment.name)
         self.wishes = Wishes(seed=world.seed)
         self._server = viser.ViserServer(host="127.0.0.1", port=port, label="lerobot_vtrefine", verbose=False)
         self._server.initial_camera.position = EYE_M

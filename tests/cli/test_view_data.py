@@ -1,13 +1,21 @@
 """A dataset in rerun: pads, cloud and motion are in the file, under one timeline."""
 
+import io
 from pathlib import Path
 
 import numpy as np
 import pytest
+import torch
+from PIL import Image
 
 from lerobot_vtrefine.cli import view_data
-from lerobot_vtrefine.cli.report.cloud import recorded_cloud
+from lerobot_vtrefine.cli.report.cloud import body_of, build_cloud, recorded_cloud
 from lerobot_vtrefine.cli.view_data import cloud_colours, clouds_of, pad_picture
+from lerobot_vtrefine.datasets.features import DEPTH_KEY, STATE_KEY, raw_to_frame
+from lerobot_vtrefine.embodiments import KINOVA
+from lerobot_vtrefine.envs import VtRefineEnvConfig
+from lerobot_vtrefine.envs.live_world import LiveWorld
+from lerobot_vtrefine.sim.config import SceneConfig
 
 
 def test_pads_cloud_and_motion_are_saved(tiny_dataset: Path, tmp_path: Path, capsys) -> None:
@@ -27,6 +35,22 @@ def test_clouds_hold_what_was_seen_and_felt(tiny_dataset: Path) -> None:
     colours = cloud_colours(points)
     assert (colours[points[:, 4] == 0] == view_data.GREY).all()
     assert recorded_cloud(tiny_dataset).count("[") == len(points) + 1
+
+
+def test_what_is_felt_lies_on_the_bodys_own_pads() -> None:
+    world = LiveWorld(
+        VtRefineEnvConfig(start="grasped", num_threads=1, scene=SceneConfig(embodiment="kinova"))
+    )
+    world.reset(0)
+    frame = raw_to_frame(world.observe(), KINOVA)
+    stored = io.BytesIO()
+    Image.fromarray(frame[DEPTH_KEY][..., 0]).save(stored, "TIFF")
+    points = build_cloud({**frame, DEPTH_KEY: {"bytes": stored.getvalue()}}, body_of(frame))
+    felt = torch.from_numpy(points[points[:, 4] > 0.5, :3])
+    pads, _ = KINOVA.pad_poses(torch.from_numpy(frame[STATE_KEY]))
+    assert len(felt) == 4 * 384
+    assert torch.cdist(felt, pads).min(dim=1).values.max() < 0.04  # half of a pad's diagonal
+    assert body_of([key for key in frame if "left_pad" not in key]) is None
 
 
 def test_a_pressed_taxel_is_bright_at_its_place() -> None:

@@ -23,6 +23,7 @@ from lerobot_vtrefine.datasets.features import (
     raw_to_env_observation,
     raw_to_frame,
 )
+from lerobot_vtrefine.embodiments import ALOHA
 
 MakeRaw = Callable[[np.random.Generator, float], dict[str, Any]]
 
@@ -30,7 +31,9 @@ MakeRaw = Callable[[np.random.Generator, float], dict[str, Any]]
 def test_dataset_and_environment_hand_over_the_same_values(tiny_dataset: Path, make_raw: MakeRaw) -> None:
     item = LeRobotDataset("local/tiny", root=tiny_dataset)[0]
     raw = make_raw(np.random.default_rng(0), 3.0)  # what the fixture wrote first
-    batch = preprocess_observation(raw_to_env_observation({key: value[None] for key, value in raw.items()}))
+    batch = preprocess_observation(
+        raw_to_env_observation({key: value[None] for key, value in raw.items()}, ALOHA)
+    )
     assert set(batch) == {STATE_KEY, *RAW_KEYS}
     for key, value in batch.items():
         stored = item[key].float().reshape(value.shape)
@@ -46,29 +49,29 @@ def test_dataset_keeps_units_and_array_shapes(tiny_dataset: Path) -> None:
 
 
 def test_environment_spaces_match_the_observation(make_raw: MakeRaw) -> None:
-    observation = raw_to_env_observation(make_raw(np.random.default_rng(0), 3.0))
-    shapes = env_observation_shapes(24, 32)
+    observation = raw_to_env_observation(make_raw(np.random.default_rng(0), 3.0), ALOHA)
+    shapes = env_observation_shapes(24, 32, ALOHA)
     assert set(shapes) == set(observation)
     for key, (shape, highest) in shapes.items():
         assert observation[key].shape == shape
         assert observation[key].dtype == np.float32
         assert (highest == 255.0) == key.startswith(("tactile.", "tactile_baseline."))
-    assert set(env_key_map()) == {*shapes, "action"}
+    assert set(env_key_map(ALOHA)) == {*shapes, "action"}
 
 
 def test_hardware_needs_no_noise_level_and_simulation_no_age(make_raw: MakeRaw) -> None:
     raw = make_raw(np.random.default_rng(0), 3.0)
-    assert raw_to_frame(raw)[AGE_KEY].tolist() == [0.0] * 4
+    assert raw_to_frame(raw, ALOHA)[AGE_KEY].tolist() == [0.0] * 4
     raw["tactile_age"] = np.array([0.1, 0.2, 0.3, 0.4])
     del raw["noise_level"]
-    assert raw_to_frame(raw)[NOISE_LEVEL_KEY].tolist() == [0.0]
-    assert raw_to_frame(raw)[AGE_KEY].tolist() == raw["tactile_age"].astype(np.float32).tolist()
+    assert raw_to_frame(raw, ALOHA)[NOISE_LEVEL_KEY].tolist() == [0.0]
+    assert raw_to_frame(raw, ALOHA)[AGE_KEY].tolist() == raw["tactile_age"].astype(np.float32).tolist()
 
 
 def test_what_is_missing_is_named(make_raw: MakeRaw) -> None:
     raw = make_raw(np.random.default_rng(0), 3.0)
     del raw["tactile"]
     with pytest.raises(ValueError, match="lacks tactile"):
-        raw_to_frame(raw)
+        raw_to_frame(raw, ALOHA)
     with pytest.raises(ValueError, match="camera size"):
-        dataset_features(0, 32)
+        dataset_features(0, 32, ALOHA)

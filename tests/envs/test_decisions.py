@@ -143,7 +143,7 @@ def test_decisions_see_the_same_cloud_as_lerobot_eval(monkeypatch, tiny_dataset)
     env = LeRobotDecisionEnv(Episodes(FakeSim(2)), pre, post, 2, max_decisions=3)
     env.reset([1, 3])
     batch = env.step_chunk(torch.zeros(2, 4, 16)).obs
-    single = pre(preprocess_observation(raw_to_env_observation(env.episodes.raw)))
+    single = pre(preprocess_observation(raw_to_env_observation(env.episodes.raw, ALOHA)))
     assert batch[CLOUD_KEY].shape[:2] == (2, 2)
     assert torch.equal(batch[CLOUD_KEY][:, 1], single[CLOUD_KEY])
     assert torch.equal(batch[STATE_KEY][:, 1], single[STATE_KEY])
@@ -161,7 +161,7 @@ def test_tensors_become_what_lerobot_makes_of_an_environments_arrays():
         "camera_pose": random.normal(size=(5, 7)).astype(np.float32),
         "noise_level": np.full((5, 1), 3.0, np.float32),
     }
-    expected = preprocess_observation(raw_to_env_observation(raw))
+    expected = preprocess_observation(raw_to_env_observation(raw, ALOHA))
     ages = expected.pop(AGE_KEY)  # of a robot's readings: no policy sees them, and a simulation has none
     assert not ages.any()
     ours = policy_columns({key: _tensor(value) for key, value in raw.items()}, ALOHA)

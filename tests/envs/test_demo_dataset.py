@@ -43,7 +43,7 @@ def demonstration(seed: int, steps: int = 3) -> Demonstration:
     return Demonstration(raw, actions, {"seed": seed, "steps": steps, "success": True})
 
 
-FEATURES = dataset_features(HEIGHT, WIDTH)
+FEATURES = dataset_features(HEIGHT, WIDTH, ALOHA)
 
 
 def open_recording(root: Path, **changes) -> DemoDataset:

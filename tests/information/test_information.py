@@ -18,6 +18,7 @@ from lerobot_vtrefine.information.estimator import (
     episode_errors,
     rms_with_interval,
     train_estimator,
+    views_of,
 )
 from lerobot_vtrefine.information.frames import Frames, MisjudgedHolds
 from lerobot_vtrefine.information.page import render_page
@@ -45,9 +46,14 @@ def synthetic(seed: int) -> Frames:
 
 def trained(senses: str, frames: Frames, history: int = 1) -> Estimator:
     torch.manual_seed(0)
-    estimator = Estimator(SENSES[senses], frames, "small", "cpu", history)
+    estimator = Estimator(SENSES[senses], frames, "aloha", "small", "cpu", history)
     train_estimator(estimator, frames, steps=160, batch_size=64, seed=0)
     return estimator
+
+
+def test_frames_are_seen_with_the_environments_body() -> None:
+    views = views_of([SENSES["visuo_tactile"], SENSES["visuo_tactile_cloud"]], "kinova", "small", "cpu")
+    assert [view.observation_config.embodiment for view in views.values()] == ["kinova"] * 3
 
 
 def test_pads_tell_what_joints_do_not() -> None:
@@ -61,7 +67,7 @@ def test_pads_tell_what_joints_do_not() -> None:
 
 def test_windows_start_at_the_episodes_first_frame() -> None:
     frames = synthetic(0)
-    estimator = Estimator(SENSES["tactile"], frames, "small", "cpu", 3)
+    estimator = Estimator(SENSES["tactile"], frames, "aloha", "small", "cpu", 3)
     window = estimator.window(frames, torch.tensor([5, 5]), torch.tensor([0, 4]))
     state = frames.columns["state"][5]
     assert torch.equal(window["state"][0], state[[0, 0, 0]])

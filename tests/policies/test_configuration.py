@@ -17,6 +17,7 @@ from lerobot_vtrefine.datasets.features import (
     TACTILE_KEYS,
     dataset_features,
 )
+from lerobot_vtrefine.embodiments import ALOHA
 from lerobot_vtrefine.envs.config import VtRefineEnvConfig
 from lerobot_vtrefine.observation import VisuoTactileConfig
 from lerobot_vtrefine.policies.vt_dp3 import VtDp3Config
@@ -81,7 +82,7 @@ def policy_features(*without: str) -> dict[str, PolicyFeature]:
     """The dataset's input features, less some."""
     return {
         key: PolicyFeature(FeatureType.STATE, tuple(feature["shape"]))
-        for key, feature in dataset_features(24, 32).items()
+        for key, feature in dataset_features(24, 32, ALOHA).items()
         if key.startswith("observation") and key not in without
     }
 
@@ -121,7 +122,9 @@ def test_lerobots_policies_get_what_a_colour_recording_of_aloha_has(path: Path) 
     config = draccus.parse(TrainPipelineConfig, path, args=["--dataset.repo_id=local/tiny"])
     assert config.policy is not None
     assert config.policy.type == path.stem.removesuffix("_rgb")
-    recorded = dataset_to_policy_features(dataset_features(60, 80, colour=VtRefineEnvConfig().rgb_size))
+    recorded = dataset_to_policy_features(
+        dataset_features(60, 80, ALOHA, colour=VtRefineEnvConfig().rgb_size)
+    )
     assert config.policy.input_features == {key: recorded[key] for key in (STATE_KEY, RGB_KEY)}
 
 

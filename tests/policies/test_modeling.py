@@ -10,6 +10,7 @@ import torch
 from lerobot.configs import FeatureType, PolicyFeature
 
 from lerobot_vtrefine.datasets.features import ACTION_KEY, CLOUD_KEY, STATE_KEY, dataset_features
+from lerobot_vtrefine.embodiments import ALOHA
 from lerobot_vtrefine.policies.vt_dp3 import VtDp3Config
 from lerobot_vtrefine.policies.vt_dp3.modeling_vt_dp3 import VtDp3Policy
 
@@ -21,7 +22,7 @@ def make_policy(**values: Any) -> VtDp3Policy:
     torch.manual_seed(0)
     features = {
         key: PolicyFeature(FeatureType.STATE, tuple(feature["shape"]))
-        for key, feature in dataset_features(24, 32).items()
+        for key, feature in dataset_features(24, 32, ALOHA).items()
         if key.startswith("observation")
     }
     tiny: dict[str, Any] = {"preset": "small", "point_dims": (8, 16), "down_dims": (32, 32), **values}

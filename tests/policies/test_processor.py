@@ -25,6 +25,7 @@ from lerobot_vtrefine.datasets.features import (
     raw_to_env_observation,
     raw_to_frame,
 )
+from lerobot_vtrefine.embodiments import ALOHA
 from lerobot_vtrefine.lerobot_compat import fast_reader
 from lerobot_vtrefine.observation import num_points
 from lerobot_vtrefine.policies.vt_dp3 import VtDp3Config, make_vt_dp3_pre_post_processors
@@ -76,8 +77,8 @@ def test_same_frame_same_cloud_everywhere(
     preprocess, _ = make_vt_dp3_pre_post_processors(make_config(stored), stored.meta.stats)
     raw = make_raw(np.random.default_rng(3), noise_level)
     item = {key: value for key, value in stored[0].items() if key.startswith("observation")}
-    environment = preprocess_observation(raw_to_env_observation({k: v[None] for k, v in raw.items()}))
-    robot = prepare_observation_for_inference(raw_to_frame(raw), torch.device("cpu"))
+    environment = preprocess_observation(raw_to_env_observation({k: v[None] for k, v in raw.items()}, ALOHA))
+    robot = prepare_observation_for_inference(raw_to_frame(raw, ALOHA), torch.device("cpu"))
     clouds, states = [], []
     for frame in (default_collate([item]), item, environment, robot):
         torch.manual_seed(11)

@@ -4,10 +4,11 @@ import ctypes
 import enum
 import json
 import ssl
+import struct
 import threading
 import time
-from collections.abc import Generator
-from contextlib import contextmanager
+from collections.abc import Callable, Generator
+from contextlib import AbstractContextManager, contextmanager
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -75,8 +76,8 @@ def watch_keys(patch: pytest.MonkeyPatch) -> None:
 
 
 @contextmanager
-def raised_phone(port: int, speed_m_s: float) -> Generator[None]:
-    """A phone on the page that `teleop` serves: touched, and moved upwards; WebXR's y points up."""
+def page_client(port: int, message_at: Callable[[float], dict]) -> Generator[None]:
+    """A device on a page that `teleop` serves: every 20 ms it says what `message_at` makes of a time [s]."""
     websocket = pytest.importorskip("websocket")
     over = threading.Event()
 
@@ -87,18 +88,9 @@ def raised_phone(port: int, speed_m_s: float) -> Generator[None]:
                 if page is None:
                     options = {"cert_reqs": ssl.CERT_NONE, "check_hostname": False}
                     page = websocket.create_connection(f"wss://localhost:{port}/ws", sslopt=options)
-                height = 1.0 + speed_m_s * (time.monotonic() - began)
-                pose = {
-                    "position": {"x": 0.1, "y": height, "z": -0.2},
-                    "orientation": {"x": 0.0, "y": 0.0, "z": 0.0, "w": 1.0},
-                    "move": True,
-                    "scale": 1.0,
-                    "gripper": "open",
-                    "reservedButtonA": False,
-                    "reservedButtonB": False,
-                }
-                page.send(json.dumps({"type": "pose", "data": pose}))
-            except OSError:  # not served yet, or any more
+                message = message_at(time.monotonic() - began)
+                page.send(json.dumps({"type": "pose", "data": message}))
+            except (OSError, websocket.WebSocketException):  # not served yet, or any more
                 page = None
             time.sleep(0.02)
 
@@ -109,3 +101,70 @@ def raised_phone(port: int, speed_m_s: float) -> Generator[None]:
     finally:
         over.set()
         thread.join()
+
+
+def raised_phone(port: int, speed_m_s: float) -> AbstractContextManager[None]:
+    """A phone that is touched and moved upwards; WebXR's y points up."""
+
+    def message(seconds: float) -> dict:
+        return {
+            "position": {"x": 0.1, "y": 1.0 + speed_m_s * seconds, "z": -0.2},
+            "orientation": {"x": 0.0, "y": 0.0, "z": 0.0, "w": 1.0},
+            "move": True,
+            "scale": 1.0,
+            "gripper": "open",
+            "reservedButtonA": False,
+            "reservedButtonB": False,
+        }
+
+    return page_client(port, message)
+
+
+class HidApi:
+    """The C library hidapi with SpaceMouse Compacts plugged in, whose reports a test writes."""
+
+    COMPACT = (0x256F, 0xC635)
+
+    def __init__(self, patch: pytest.MonkeyPatch, mice: int = 1) -> None:
+        easyhid = pytest.importorskip("easyhid.easyhid")
+        self._ffi, self._paths = easyhid.ffi, [b"/dev/hidraw%d" % number for number in range(mice)]
+        self._kept: list[object] = []
+        self.reports: dict[bytes, list[bytes]] = {path: [] for path in self._paths}
+        self.unplugged = False
+        patch.setattr(easyhid, "hidapi", self)
+
+    def report(self, kind: int, *values: int, mouse: int = 0) -> None:
+        """Kind 1: the way (x right, y back, z down), 2: the turns about these, both as they go over USB."""
+        self.reports[self._paths[mouse]].append(struct.pack("<B3h", kind, *values))
+
+    def button(self, number: int, down: bool, mouse: int = 0) -> None:
+        self.reports[self._paths[mouse]].append(bytes([3, down << number]))
+
+    def hid_enumerate(self, _vendor: int, _product: int) -> object:
+        found = self._ffi.NULL
+        for path in reversed(self._paths):
+            name = self._ffi.new("char[]", path)
+            vendor, product = self.COMPACT
+            info = {"path": name, "vendor_id": vendor, "product_id": product, "next": found}
+            found = self._ffi.new("struct hid_device_info*", info)
+            self._kept += [name, found]
+        return found
+
+    def hid_free_enumeration(self, _found: object) -> None: ...
+
+    def hid_open_path(self, path: bytes) -> bytes:
+        return path
+
+    def hid_set_nonblocking(self, _device: bytes, _yes: bool) -> None: ...
+
+    def hid_read(self, device: bytes, into: object, size: int) -> int:
+        if self.unplugged:
+            return -1
+        waiting = self.reports[device]
+        if not waiting:
+            return 0
+        report = waiting.pop(0)
+        self._ffi.memmove(into, report, min(size, len(report)))
+        return len(report)
+
+    def hid_close(self, _device: bytes) -> None: ...

@@ -16,7 +16,7 @@ from lerobot_vtrefine.embodiments import get_embodiment
 from lerobot_vtrefine.envs import VtRefineEnvConfig
 from lerobot_vtrefine.envs.live_world import IDS, LiveWorld
 from lerobot_vtrefine.lerobot_compat import phases
-from lerobot_vtrefine.sim.config import TaskConfig
+from lerobot_vtrefine.sim.config import SceneConfig, TaskConfig
 from lerobot_vtrefine.sim.demonstrations import Degradation
 from lerobot_vtrefine.sim.expert import ScriptedExpert
 from lerobot_vtrefine.teleoperators import VtRefineEeConfig
@@ -26,6 +26,7 @@ from lerobot_vtrefine.teleoperators.inputs import gamepad, keyboard, webxr
 from lerobot_vtrefine.teleoperators.inputs.speed import Push, SpeedControllers
 from lerobot_vtrefine.teleoperators.vtrefine_ee import VtRefineEe
 
+BODIES = ("aloha", "kinova")
 BODY = get_embodiment("aloha")
 ARMS = [arm.name for arm in BODY.arms]
 FPS = 10
@@ -53,13 +54,15 @@ def expert_targets(env: VtRefineEnvConfig, seed: int) -> np.ndarray:
     return np.stack(targets)
 
 
-def as_controllers(targets: np.ndarray, tremor_m: float = 0.0, delay: int = 0) -> dict[str, np.ndarray]:
+def as_controllers(
+    targets: np.ndarray, tremor_m: float = 0.0, delay: int = 0, body: str = "aloha"
+) -> dict[str, np.ndarray]:
     """What controllers would say whose hands move so: anywhere in the room, turned anyhow."""
-    ik = TwoArmIk("aloha", 1 / FPS)
+    ik, body = TwoArmIk(body, 1 / FPS), get_embodiment(body)
     rng = np.random.default_rng(0)
-    hands = [ik.hands(row) for row in np.concatenate([np.repeat(targets[:1], 1 + delay, 0), targets[1:]])]
-    per_arm, travel = BODY.joints_per_arm, BODY.fingers.travel_m
-    fingers = np.concatenate([np.repeat(targets[:1], 1 + delay, 0), targets[1:]])
+    rows = np.concatenate([np.repeat(targets[:1], 1 + delay, 0), targets[1:]])
+    hands = [ik.hands(row) for row in rows]
+    closed = 1 - body.openings(rows) / body.fingers.travel_m
     arrays: dict[str, np.ndarray] = {}
     for index, arm in enumerate(ARMS):
         held = Rotation.from_euler("xyz", [0.3, -0.5, 0.8])  # how the controller lies in the person's hand
@@ -70,13 +73,16 @@ def as_controllers(targets: np.ndarray, tremor_m: float = 0.0, delay: int = 0) -
         arrays[f"{arm}_position"] = YAW.inv().apply([pose.position for pose in world]) + place + shaken
         arrays[f"{arm}_quaternion"] = np.stack([turn.as_quat(scalar_first=True) for turn in turned])
         arrays[f"{arm}_clutch"] = np.ones(len(world), bool)
-        arrays[f"{arm}_grip"] = 1 - fingers[:, index * per_arm + per_arm - 2] / travel
+        arrays[f"{arm}_grip"] = closed[:, index]
     return arrays
 
 
-def record(patch: pytest.MonkeyPatch, arrays: dict[str, np.ndarray], folder: Path, env: str) -> dict:
+def record(
+    patch: pytest.MonkeyPatch, arrays: dict[str, np.ndarray], folder: Path, env: str, body: str = "aloha"
+) -> dict:
     np.savez(folder / "people.npz", **arrays)
     teleop = flags(teleop__type="vtrefine_ee", teleop__input="recording", teleop__path=folder / "people.npz")
+    teleop += flags(teleop__embodiment=body)
     robot = flags(robot__type="vtrefine_sim", robot__env=env, robot__fps=FPS, robot__seed=3)
     root = folder / "recorded"
     run_command(patch, "record", [*robot, *teleop, *dataset_flags(root, 1, 30.0, FPS)])
@@ -93,14 +99,52 @@ def test_recorded_controllers_insert_through_stock_lerobot_record(
 
 
 @pytest.mark.slow
+@pytest.mark.parametrize("body", BODIES)
 @pytest.mark.parametrize(("tremor_m", "delay"), [(0.0, 0), (0.0003, 2)])
 def test_recorded_people_pick_and_insert_from_the_table(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, tremor_m: float, delay: int
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, tremor_m: float, delay: int, body: str
 ) -> None:
-    targets = expert_targets(VtRefineEnvConfig(start="table", num_threads=1), seed=3)
-    row = record(monkeypatch, as_controllers(targets, tremor_m, delay), tmp_path, "{num_threads: 1}")
-    print(tremor_m, delay, row)
+    scene = SceneConfig(embodiment=body)
+    targets = expert_targets(VtRefineEnvConfig(start="table", num_threads=1, scene=scene), seed=3)
+    env = f"{{num_threads: 1, scene: {{embodiment: {body}}}}}"
+    row = record(monkeypatch, as_controllers(targets, tremor_m, delay, body), tmp_path, env, body)
+    print(body, tremor_m, delay, row)
     assert row["success"]
+    robot_type = json.loads((tmp_path / "recorded" / "meta" / "info.json").read_text())["robot_type"]
+    assert robot_type == get_embodiment(body).robot_type
+
+
+def driven(env: VtRefineEnvConfig, seed: int, tremor_m: float, delay: int, file: Path) -> tuple[dict, list]:
+    """How an episode of recorded people ends, and how far commanded hands were from theirs [m]."""
+    body = env.body
+    targets = expert_targets(env, seed)
+    np.savez(file, **as_controllers(targets, tremor_m, delay, body.name))
+    world = LiveWorld(env)
+    world.reset(seed)
+    teleop = VtRefineEe(VtRefineEeConfig(input="recording", path=file, embodiment=body.name, fps=FPS))
+    teleop.connect()
+    teleop.follow(dict(zip(teleop.action_features, world.sim.command_targets()[0], strict=True)), FPS)
+    errors = []
+    while not world.outcome:
+        action = np.array(list(teleop.get_action().values()))
+        wanted = teleop._ik.hands(targets[min(max(world.steps - delay, 0), len(targets) - 1)])
+        pairs = zip(wanted, teleop._ik.hands(), strict=True)
+        errors += [np.linalg.norm(one.position - other.position) for one, other in pairs]
+        world.step(action)
+    teleop.disconnect()
+    return world.row(), errors
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("body", BODIES)
+@pytest.mark.parametrize(("tremor_m", "delay"), [(0.0, 0), (0.0003, 2)])
+def test_people_insert_from_many_starts(tmp_path: Path, body: str, tremor_m: float, delay: int) -> None:
+    env = VtRefineEnvConfig(start="grasped", num_threads=1, scene=SceneConfig(embodiment=body))
+    found = [driven(env, seed, tremor_m, delay, tmp_path / "p.npz") for seed in range(10)]
+    inserted, errors = sum(row["success"] for row, _ in found), np.concatenate([e for _, e in found])
+    print(f"{body}, tremor {1e3 * tremor_m} mm, {delay} steps late: {inserted} of 10; hands off by", end=" ")
+    print(f"{1e3 * np.median(errors):.2f} mm, 99 % within {1e3 * np.percentile(errors, 99):.2f} mm")
+    assert inserted >= 9
 
 
 def connected(samples: list[dict[str, HandSample]], **settings: object) -> VtRefineEe:
@@ -189,8 +233,9 @@ def test_in_the_tool_frame_forward_is_where_the_hand_points() -> None:
     np.testing.assert_allclose(way, 0.1 * HELD.rotation[:, 0], atol=1e-12)
 
 
-def test_both_arms_are_solved_a_hundred_times_a_second_and_track() -> None:
-    ik = TwoArmIk("aloha", 0.01)
+@pytest.mark.parametrize("body", BODIES)
+def test_both_arms_are_solved_a_hundred_times_a_second_and_track(body: str) -> None:
+    ik = TwoArmIk(body, 0.01)
     start, errors, took = ik.hands(), [], []
     for k in range(300):
         way = 0.02 * np.array([np.sin(k / 80), np.sin(k / 100), 1 - np.cos(k / 90)])
@@ -204,12 +249,26 @@ def test_both_arms_are_solved_a_hundred_times_a_second_and_track() -> None:
     assert max(errors) < 1e-4
 
 
-def test_hands_are_kept_apart_and_above_the_table() -> None:
-    ik = TwoArmIk("aloha", 0.1)
+def test_the_point_between_the_pads_stays_while_they_close() -> None:
+    """The pads of a four-bar gripper move along the hand as they close."""
+    ik = TwoArmIk("kinova", 1 / FPS)
+    start = ik.hands()
+    reaches = []
+    for _ in range(10):
+        ik.step(start, [1.0, 0.5])
+        reaches.append(ik.body.fingers.reach_m(ik.body.openings(ik.joints)))
+        for now, before in zip(ik.hands(), start, strict=True):
+            assert np.linalg.norm(now.position - before.position) < 1e-4
+    assert np.ptp(reaches) > 2e-3
+
+
+@pytest.mark.parametrize("body", BODIES)
+def test_hands_are_kept_apart_and_above_the_table(body: str) -> None:
+    ik = TwoArmIk(body, 0.1)
     middle = [Pose(np.array([0.0, 0.0, 0.15]), pose.rotation) for pose in ik.hands()]
     below = [Pose(pose.position * [1, 1, 0] - [0, 0, 0.1], pose.rotation) for pose in ik.hands()]
     for wanted in (middle, below):
-        ik.restart(np.asarray(BODY.home))
+        ik.restart(np.asarray(get_embodiment(body).home))
         for _ in range(60):
             ik.step(wanted, [0.0, 0.0])
         data = mujoco.MjData(ik.model)

@@ -4,6 +4,7 @@ import json
 from collections.abc import Generator
 from pathlib import Path
 from types import SimpleNamespace
+from urllib.request import urlopen
 
 import numpy as np
 import pytest
@@ -265,6 +266,20 @@ def test_the_robots_camera_gives_colour_where_the_environment_has_it(monkeypatch
     assert set(seen) == set(robot.observation_features)
     assert np.array_equal(seen["front"], painted[0])
     robot.disconnect()
+
+
+def test_it_hands_over_what_it_announces_and_shows_its_own_body() -> None:
+    env = {"start": "grasped", "num_threads": 1, "scene": {"embodiment": "kinova"}}
+    robot = VtRefineSim(VtRefineSimConfig(env=env, view="browser", view_port=8241))
+    robot.connect()
+    assert b"<html" in urlopen(f"http://127.0.0.1:{robot._viewer.port}", timeout=10).read().lower()
+    assert robot._viewer._cloud.embodiment == "kinova"
+    observation = robot.get_observation()
+    robot.send_action(robot.held_targets())
+    robot.disconnect()
+    assert set(observation) == set(robot.observation_features)
+    assert "tactile.left_gripper_left_pad" in observation
+    assert robot.name == "kinova_gen3_tactile_follower"
 
 
 def test_no_action_that_is_no_number_reaches_the_arms() -> None:

@@ -112,7 +112,7 @@ class PolicyAgent:
         from lerobot.envs.utils import preprocess_observation
 
         batched: dict[str, Any] = {key: value[None] for key, value in world.raw.items()}
-        observation = preprocess_observation(raw_to_env_observation(batched))
+        observation = preprocess_observation(raw_to_env_observation(batched, world.config.body))
         with torch.inference_mode():
             action = self.policy.select_action(self._preprocess({**observation, "task": [world.config.task]}))
             return self._postprocess(action)[0].cpu().numpy()

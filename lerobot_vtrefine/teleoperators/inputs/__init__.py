@@ -34,7 +34,7 @@ def make_source(config: VtRefineEeConfig, arms: list[str]) -> Source:
 
     Raises:
         ValueError: a recording cannot be read, or a device of LeRobot's is not configured rightly.
-        ImportError: LeRobot lacks the package that reads its device.
+        ImportError: the package that reads the device is missing.
     """
     if config.input == "recording":
         from lerobot_vtrefine.teleoperators.inputs.recording import RecordedControllers
@@ -45,17 +45,33 @@ def make_source(config: VtRefineEeConfig, arms: list[str]) -> Source:
         from lerobot_vtrefine.teleoperators.inputs.webxr import WebXrControllers
 
         return WebXrControllers({arm: config.webxr_ports[arm] for arm in arms}, config.timeout_s)
+    if config.input == "headset":
+        from lerobot_vtrefine.teleoperators.inputs.headset import HeadsetControllers
+
+        return HeadsetControllers(config.headset_port, arms, config.timeout_s)
     if config.input == "lerobot":
         from lerobot_vtrefine.teleoperators.inputs.lerobot_devices import LeRobotDevices
 
         return LeRobotDevices(config.devices, config.fps, config.key_speed_m_s)
-    from lerobot_vtrefine.teleoperators.inputs.speed import SpeedControllers
+    return _speed_controllers(config, arms)
 
-    step_m, step_rad = config.key_speed_m_s / config.fps, config.key_speed_rad_s / config.fps
+
+def _speed_controllers(config: VtRefineEeConfig, arms: list[str]) -> Source:
+    """Devices that say how fast, not where."""
+    from lerobot_vtrefine.teleoperators.inputs.speed import Pushes, SpeedControllers
+
+    device: Pushes
     if config.input == "gamepad":
         from lerobot_vtrefine.teleoperators.inputs.gamepad import Gamepad
 
-        return SpeedControllers(Gamepad(), arms, step_m, step_rad)
-    from lerobot_vtrefine.teleoperators.inputs.keyboard import Keyboard
+        device = Gamepad()
+    elif config.input == "spacemouse":
+        from lerobot_vtrefine.teleoperators.inputs.spacemouse import SpaceMice
 
-    return SpeedControllers(Keyboard(), arms, step_m, step_rad)
+        device = SpaceMice(config.spacemice, arms)
+    else:
+        from lerobot_vtrefine.teleoperators.inputs.keyboard import Keyboard
+
+        device = Keyboard()
+    step_m, step_rad = config.key_speed_m_s / config.fps, config.key_speed_rad_s / config.fps
+    return SpeedControllers(device, arms, step_m, step_rad)
