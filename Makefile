@@ -44,10 +44,10 @@ bench-diagnose: setup ## vtrefine-diagnose on recordings with known causes: the 
 	@$(VENV)/python scripts/bench_diagnose.py $(ARGS)
 
 docs: setup ## the documentation as a site, links checked strictly: outputs/site/index.html
-	@$(VENV)/mkdocs build --quiet --strict
+	@NO_MKDOCS_2_WARNING=1 $(VENV)/mkdocs build --quiet --strict
 
 docs-serve: setup ## the same, served while you write
-	@$(VENV)/mkdocs serve
+	@NO_MKDOCS_2_WARNING=1 $(VENV)/mkdocs serve
 
 release-check: setup ## build the wheel and try it, and the README's lines, in an empty environment
 	@$(VENV)/python scripts/release_check.py $(ARGS)

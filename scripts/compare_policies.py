@@ -1,18 +1,23 @@
 #!/usr/bin/env python
 """vt_dp3 beside LeRobot's ACT and diffusion policy, trained by imitation on the same demonstrations.
 
-    .venv/bin/python scripts/compare_policies.py --seeds 0 1 2 --device=cuda
+    .venv/bin/python scripts/compare_policies.py --seeds 0 1 2 --device=cuda --jobs 12 --backend=warp
     make tables
 
-Demonstrations of each seed are recorded once, with colour images; every policy is a configuration of
-configs/policy and trains on them as stock lerobot-train does, then stock lerobot-eval plays it on unseen
-seeds. Finished stages are not repeated: interrupted, or called again with more seeds or policies, it
-continues. Each evaluation becomes a row of results/policies.json. The diffusion policy needs
-pip install 'lerobot[diffusion]'.
+Demonstrations are recorded once, with colour images. A seed is one of training: every policy trains on these
+demonstrations as stock lerobot-train does, then stock lerobot-eval plays it on unseen episodes, the same for
+all. Each executes four actions a decision; ACT and the diffusion policy start from scratch, since LeRobot
+would download the weights of their image network, and ACT with a learning rate that suits that. Finished
+stages are not repeated: interrupted, or called again with more seeds or policies, it continues. Each
+evaluation becomes a row of results/policies.json. ``--jobs`` runs several policies side by side, on the GPUs
+by turns. The diffusion policy needs pip install 'lerobot[diffusion]'.
 """
 
 import argparse
+import sys
 from pathlib import Path
+
+from compare_touch import run_all
 
 from lerobot_vtrefine.cli.errors import run_cli
 from lerobot_vtrefine.cli.pipeline.stages import Stage, StageRunner
@@ -20,49 +25,64 @@ from lerobot_vtrefine.cli.report.results import load_evaluation
 from lerobot_vtrefine.cli.results.collect import save
 from lerobot_vtrefine.cli.results.provenance import provenance
 from lerobot_vtrefine.cli.results.rows import Run
-from lerobot_vtrefine.cli.results.tables import IMITATION
 from lerobot_vtrefine.shipped import PREFIX, find
 
 RESULTS = Path(__file__).parents[1] / "results" / "policies.json"
-POLICIES = ("vt_dp3_paper", "vt_dp3_visual", "act_rgb", "diffusion_rgb")
-SEED_STRIDE = 10_000_000
-"""Between the demonstrations of two seeds, which then share no episode."""
+FOUR_ACTIONS = "--policy.n_action_steps=4"
+SCRATCH = "--policy.pretrained_backbone_weights=null"
+POLICIES: dict[str, tuple[str, ...]] = {
+    "vt_dp3_pads": ("vt_dp3_pads",),
+    "vt_dp3_pads_visual": ("vt_dp3_pads", "--policy.modalities=visual"),
+    "act_rgb": (
+        "act_rgb",
+        FOUR_ACTIONS,
+        SCRATCH,
+        "--policy.optimizer_lr=1e-4",
+        "--policy.optimizer_lr_backbone=1e-4",
+    ),
+    "diffusion_rgb": ("diffusion_rgb", FOUR_ACTIONS, SCRATCH),
+}
+"""A file of configs/policy, and flags beside it. vt_dp3_pads executes four actions by itself."""
 FIRST_EVALUATION_SEED = 8_000_000
+"""Far beyond those of the demonstrations."""
 
 
-def record_stage(options: argparse.Namespace, seed: int) -> Stage:
-    """The demonstrations of a seed."""
-    root = options.output_dir / f"demos_{seed}"
+def record_stage(options: argparse.Namespace) -> Stage:
+    """The demonstrations."""
+    root = options.output_dir / "demos"
     command = (
         "vtrefine-record-demos",
         f"--config_path={PREFIX}{options.task}",
         "--env.rgb=true",
         f"--root={root}",
         f"--num_episodes={options.num_demos}",
-        f"--seed={seed * SEED_STRIDE}",
+        f"--num_workers={options.workers}",
+        "--seed=0",
         "--degradation.lateral_std_m=0.0008",
         "--degradation.tilt_std_rad=0.0175",
     )
-    name = f"record_{seed}"
-    return Stage(name, f"Record seed {seed}", command, root, root / "meta" / "info.json", resumable=True)
+    return Stage("record", "Record", command, root, root / "meta" / "info.json", resumable=True)
 
 
 def policy_stages(options: argparse.Namespace, policy: str, seed: int) -> list[Stage]:
-    """Training and evaluation of one policy on the demonstrations of a seed."""
+    """Training and evaluation of one policy."""
     name = f"{policy}_{seed}"
     out, judged = options.output_dir / name, options.output_dir / f"eval_{name}"
     checkpoint = out / "checkpoints" / "last" / "pretrained_model"
+    config, *flags = POLICIES[policy]
     train = (
         "lerobot-train",
-        f"--config_path={PREFIX}{policy}",
+        f"--config_path={PREFIX}{config}",
+        *flags,
         "--dataset.repo_id=local/vtrefine_demos",
-        f"--dataset.root={options.output_dir / f'demos_{seed}'}",
+        f"--dataset.root={options.output_dir / 'demos'}",
         f"--policy.device={options.device}",
         f"--output_dir={out}",
         f"--steps={options.steps}",
         f"--save_freq={options.steps}",
         f"--batch_size={options.batch_size}",
         f"--seed={seed}",
+        "--num_workers=0",  # items come from memory
         "--env_eval_freq=0",
     )
     evaluate = (
@@ -70,44 +90,37 @@ def policy_stages(options: argparse.Namespace, policy: str, seed: int) -> list[S
         f"--config_path={PREFIX}{options.task}",
         f"--policy.path={checkpoint}",
         f"--policy.device={options.device}",
-        f"--env.rgb={str(policy.endswith('_rgb')).lower()}",
-        "--env.video_episodes=3",
+        f"--env.backend={options.backend}",
+        f"--env.rgb={str(config.endswith('_rgb')).lower()}",
+        "--env.video_episodes=0",
         f"--env.metrics_path={judged / 'episodes.jsonl'}",
         f"--eval.n_episodes={options.episodes}",
-        f"--eval.batch_size={min(50, options.episodes)}",
-        f"--seed={seed * SEED_STRIDE + FIRST_EVALUATION_SEED}",
+        f"--eval.batch_size={min(options.eval_envs, options.episodes)}",
+        f"--seed={FIRST_EVALUATION_SEED}",
         f"--output_dir={judged}",
     )
-    trained, needs = f"train_{name}", (f"record_{seed}",)
+    trained, done = f"train_{name}", judged / "eval_info.json"
     return [
-        Stage(trained, f"Train {policy}, seed {seed}", train, out, checkpoint / "model.safetensors", needs),
-        Stage(
-            f"eval_{name}",
-            f"Evaluate {policy}, seed {seed}",
-            evaluate,
-            judged,
-            judged / "eval_info.json",
-            (trained,),
-        ),
+        Stage(trained, f"Train {name}", train, out, checkpoint / "model.safetensors", ("record",)),
+        Stage(f"eval_{name}", f"Evaluate {name}", evaluate, judged, done, (trained,)),
     ]
 
 
 def row(options: argparse.Namespace, policy: str, seed: int) -> Run:
     """What an evaluation found."""
-    first = seed * SEED_STRIDE + FIRST_EVALUATION_SEED
-    found = load_evaluation(options.output_dir / f"eval_{policy}_{seed}", first)
+    found = load_evaluation(options.output_dir / f"eval_{policy}_{seed}", FIRST_EVALUATION_SEED)
     origin = provenance()
     return Run(
         table="policies",
         task=options.task,
         policy=policy,
-        variant=f"{IMITATION}, {options.num_demos} demonstrations, {options.steps} steps",
+        variant=f"{options.num_demos} demonstrations, {options.steps} steps of {options.batch_size}",
         seed=seed,
         success=found["success"] / found["episodes"],
         episodes=found["episodes"],
         iterations=0,
         env_steps=0,
-        commit=origin["commit"],
+        commit=origin["commit"] or options.commit,
         command=origin["command"],
         machine=origin["machine"],
     )
@@ -119,29 +132,47 @@ def make_parser() -> argparse.ArgumentParser:
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
     parser.add_argument("--seeds", type=int, nargs="+", default=[0, 1, 2])
-    parser.add_argument("--policies", nargs="+", default=list(POLICIES), metavar="NAME")
+    parser.add_argument("--policies", nargs="+", choices=list(POLICIES), default=list(POLICIES))
     parser.add_argument("--task", default="round_grasped", help="a file of configs/env (default %(default)s)")
-    parser.add_argument("--num_demos", type=int, default=100)
-    parser.add_argument("--steps", type=int, default=20_000)
+    parser.add_argument("--num_demos", type=int, default=200)
+    parser.add_argument("--steps", type=int, default=5000)
     parser.add_argument("--batch_size", type=int, default=64)
-    parser.add_argument("--episodes", type=int, default=200)
+    parser.add_argument("--episodes", type=int, default=500)
     parser.add_argument("--device", default="cuda")
+    parser.add_argument("--backend", choices=["batch", "warp"], default="batch", help="of the evaluation")
+    parser.add_argument("--eval_envs", type=int, default=50, help="episodes evaluated at once")
+    parser.add_argument("--workers", type=int, default=0, help="processes that record (default none)")
+    parser.add_argument("--jobs", type=int, default=1, help="policies side by side (default 1)")
+    parser.add_argument("--commit", help="of the code, where no checkout tells it")
     parser.add_argument("--output_dir", type=Path, default=Path("outputs/compare_policies"))
     parser.add_argument("--results", type=Path, default=RESULTS)
     return parser
+
+
+def alone(options: argparse.Namespace, policy: str, seed: int) -> list[str]:
+    """This script's command line for one policy."""
+    chosen = vars(options) | {"policies": policy, "seeds": seed, "jobs": 1}
+    words = [
+        word for name, value in chosen.items() if value is not None for word in (f"--{name}", str(value))
+    ]
+    return [sys.executable, __file__, *words]
 
 
 @run_cli
 def main() -> None:
     """Run what is not done yet; every evaluation becomes a row as soon as it is there."""
     options = make_parser().parse_args()
-    for name in (options.task, *options.policies):
-        find("--config_path", name)  # a misspelt name is told now
-    for seed in options.seeds:
-        for policy in options.policies:
-            stages = [record_stage(options, seed), *policy_stages(options, policy, seed)]
-            StageRunner(options.output_dir, stages).run()
-            save(options.results, "policies", [(row(options, policy, seed), [])], replace=False)
+    find("--config_path", options.task)  # a misspelt name is told now
+    record = record_stage(options)
+    StageRunner(options.output_dir, [record]).run()
+    runs = [(policy, seed) for policy in options.policies for seed in options.seeds]  # GPUs by turns
+    if options.jobs > 1:
+        names = {run: options.output_dir / "_".join(map(str, run)) for run in runs}
+        run_all({folder: alone(options, *run) for run, folder in names.items()}, options.jobs)
+        return
+    for run in runs:
+        StageRunner(options.output_dir, [record, *policy_stages(options, *run)]).run()
+        save(options.results, "policies", [(row(options, *run), [])], replace=False)
 
 
 if __name__ == "__main__":

@@ -64,12 +64,20 @@ def _is_wrapper(error: DraccusException) -> bool:
     return "Couldn't instantiate class" in str(error)
 
 
+def config_files(arguments: Sequence[str]) -> list[str]:
+    """What the arguments give as ``--config_path``: files, or names on the Hub."""
+    split = [argument.partition("=") for argument in arguments]
+    return [
+        value if equals else "".join(arguments[index + 1 : index + 2])
+        for index, (flag, equals, value) in enumerate(split)
+        if flag == CONFIG_FLAG
+    ]
+
+
 def _check_config_file(arguments: Sequence[str]) -> None:
     """What draccus will read, before it does: it has no bounds. Names on the Hub are left to LeRobot."""
-    for index, argument in enumerate(arguments):
-        flag, equals, value = argument.partition("=")
-        given = value if equals else "".join(arguments[index + 1 : index + 2])
-        if flag == CONFIG_FLAG and Path(given).is_file():
+    for given in config_files(arguments):
+        if Path(given).is_file():
             check_settings(given)
 
 

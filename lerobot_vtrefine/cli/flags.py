@@ -4,7 +4,7 @@ LeRobot and PyTorch take ten seconds to import, and showing a command's help nee
 """
 
 import ast
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
@@ -19,19 +19,20 @@ STAND_INS = {"EnvConfig": ("lerobot_vtrefine.envs.config", "VtRefineEnvConfig")}
 class Flag:
     """One flag: its dotted name, type and default as they are written, and what it is for.
 
-    ``group`` is the (module, class) whose fields are flags below this one, None for a single value.
+    ``group`` is the (module, class) whose fields are flags below this one, None for a single value. A flag
+    without a default is ``required``.
     """
 
     name: str
     type: str
     default: str | None
     text: str
+    required: bool
     group: tuple[str, str] | None = None
 
-    @property
-    def required(self) -> bool:
-        """Whether there is neither a default nor a group of flags that have one."""
-        return self.default is None and self.group is None
+    def is_among(self, given: Iterable[str]) -> bool:
+        """Whether one of these names is the flag's, or lies below it."""
+        return any(name == self.name or name.startswith(f"{self.name}.") for name in given)
 
 
 def describe_module(module: str) -> tuple[str, str]:
@@ -70,7 +71,8 @@ def _fields(module: str, name: str, prefix: str) -> Iterator[Flag]:
             continue
         group = _defined_in(module, kind.removesuffix(" | None"))
         default = None if group is not None and entry.value is not None else _default(entry.value)
-        yield Flag(prefix + entry.target.id, kind.removesuffix(" | None"), default, text, group)
+        name = prefix + entry.target.id
+        yield Flag(name, kind.removesuffix(" | None"), default, text, entry.value is None, group)
 
 
 def _docstring(node: ast.stmt | None) -> str:

@@ -3,13 +3,19 @@
 import importlib
 import sys
 import textwrap
+from collections.abc import Sequence
+from pathlib import Path
 
-from lerobot_vtrefine.cli.errors import run_cli
+import yaml
+
+from lerobot_vtrefine.cli.errors import config_files, run_cli
 from lerobot_vtrefine.cli.flags import Flag, describe_module, flags_of
 
 HELP_FLAGS = ("-h", "--help")
 WIDTH = 100
 INDENT = 30
+WANTED = {"env": "say which task, --config_path=vtrefine:NAME or --env.type=vtrefine."}
+"""What to give for a group of flags."""
 
 
 @run_cli
@@ -61,14 +67,32 @@ def replay() -> int:
 
 
 def launch(command: str, module: str, config: str) -> int:
-    """Show help, or hand over to ``lerobot_vtrefine.cli.COMMAND``, whose flags are a dataclass's fields."""
+    """Show help, or hand over to ``lerobot_vtrefine.cli.COMMAND``, whose flags are a dataclass's fields.
+
+    Raises:
+        ValueError: a flag is missing; told before LeRobot is imported, which takes ten seconds.
+    """
     name = f"lerobot_vtrefine.cli.{command}"
     if set(HELP_FLAGS) & set(sys.argv[1:]):
         print(help_text(name, module, config))
         return 0
+    check_required(flags_of(module, config), sys.argv[1:])
     if sys.stderr.isatty():
         print("loading LeRobot and PyTorch (the first time takes longest) ...", file=sys.stderr, flush=True)
     return importlib.import_module(name).main()
+
+
+def check_required(flags: Sequence[Flag], arguments: Sequence[str]) -> None:
+    """Raises: ValueError naming the flags that neither the command line nor its configuration file gives."""
+    given = {argument.partition("=")[0].removeprefix("--") for argument in arguments}
+    for path in map(Path, config_files(arguments)):
+        if not path.is_file():
+            return  # LeRobot looks for it on the Hub, or says that there is none
+        given |= set(yaml.safe_load(path.read_text(encoding="utf-8")) or ())
+    missing = [flag for flag in flags if flag.required and not flag.is_among(given)]
+    if missing:
+        told = [WANTED.get(flag.name) or f"give --{flag.name}={flag.type}: {flag.text}" for flag in missing]
+        raise ValueError(" ".join([*told, "--help has an example"]))
 
 
 def help_text(command: str, module: str, config: str) -> str:

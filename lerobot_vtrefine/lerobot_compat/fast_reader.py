@@ -1,4 +1,4 @@
-"""Array columns and depth frames of LeRobot datasets from memory.
+"""Array columns, depth frames and small videos of LeRobot datasets from memory.
 
 LeRobot 0.6.1 decodes every column of every item from Arrow through Python lists: with eight pad columns and
 depth at two observation steps that costs about 45 ms per item, many times a training step of a small policy.
@@ -6,8 +6,9 @@ This module reads each column once into a numpy block and serves items and whole
 are bit-identical; in batches, pads' counts stay uint8, so that little has to reach a GPU.
 
 Scope: only datasets with the pad columns of ``features.py``; every other dataset, and every case that is not
-covered (videos, language columns, another LeRobot version), takes LeRobot's own path. ``install`` is called
-when a ``vt_dp3`` configuration is made.
+covered (videos too large for memory, depth as video, language columns, another LeRobot version), takes
+LeRobot's own path. ``install`` is called when the package is registered, so that LeRobot's own policies learn
+from the colour images of such data as fast, and when a ``vt_dp3`` configuration is made.
 """
 
 import io
@@ -33,6 +34,8 @@ logger = logging.getLogger(__name__)
 DATASET_MODULE = "lerobot.datasets.lerobot_dataset"
 MAX_DEPTH_BYTES = 1 << 30
 """Depth frames stay in memory up to this size; beyond it LeRobot decodes them per item."""
+MAX_VIDEO_BYTES = 2 << 30
+"""Decoded videos stay in memory up to this size; with larger ones LeRobot reads the items."""
 
 
 class NotCoveredError(Exception):
@@ -65,6 +68,25 @@ class Block:
         return {
             key: picked[..., first:end].reshape((*lead, *shape)) for key, first, end, shape in self.columns
         }
+
+
+@dataclass(frozen=True)
+class Video:
+    """The decoded frames of a colour video."""
+
+    frames: SharedArray
+    """(frames, 3, H, W) uint8"""
+    offsets: tuple[int, ...] | None
+    """As of a `Block`."""
+    raw: bool
+    """Whether LeRobot's loader yields the bytes; else float32 within 0..1."""
+
+    def read(self, rows: Any) -> Tensor:
+        """The frames at the given rows (...,); a window of one frame has no dimension of its own."""
+        picked = torch.from_numpy(self.frames.values.take(rows, axis=0))
+        if self.offsets is not None and len(self.offsets) == 1:
+            picked = picked.squeeze(-4)
+        return picked if self.raw else picked.float() / 255
 
 
 def _loaded_dtype(dtype: np.dtype[Any]) -> np.dtype[Any]:
@@ -117,8 +139,8 @@ class FrameStore:
         """Raises: NotCoveredError if any part of the dataset needs LeRobot's own path."""
         self._hf_dataset: Any = reader.hf_dataset
         self._meta: Any = reader._meta
-        if self._meta.video_keys or self._meta.has_language_columns:
-            raise NotCoveredError("videos or language columns")
+        if self._meta.has_language_columns:
+            raise NotCoveredError("language columns")
         if self._hf_dataset is None or self._hf_dataset._indices is not None or len(self._hf_dataset) == 0:
             raise NotCoveredError("an empty or re-indexed table")
         self._offsets = {key: tuple(value) for key, value in (reader.delta_indices or {}).items()}
@@ -126,8 +148,43 @@ class FrameStore:
         self.lazy_keys: list[str] = []
         self.blocks = self._make_blocks()
         self.first, self.last = self._episode_bounds()
+        self.videos = {key: self._decode_video(reader, key) for key in self._coverable_videos()}
         self.tasks = list(self._meta.tasks.index)
-        self.keys = list(self._hf_dataset.column_names)
+        self.keys = [*self.videos, *self._hf_dataset.column_names]
+
+    def _coverable_videos(self) -> list[str]:
+        """The keys of all videos."""
+        keys = self._meta.video_keys
+        shapes = [self._meta.features[key]["shape"] for key in keys]
+        if set(keys) & set(self._meta.depth_keys) or any(3 not in shape for shape in shapes):
+            raise NotCoveredError("videos other than colour")
+        if len(self._hf_dataset) * sum(int(np.prod(shape)) for shape in shapes) > MAX_VIDEO_BYTES:
+            raise NotCoveredError("videos too large for memory")
+        return keys
+
+    def _decode_video(self, reader: "DatasetReader", key: str) -> Video:
+        """All frames of a video, decoded episode by episode as LeRobot decodes an item's."""
+        from lerobot.datasets.video_utils import decode_video_frames
+
+        times = self._hf_dataset.data.column("timestamp").to_numpy()
+        episodes = self._hf_dataset.data.column("episode_index").to_numpy()
+        frames: Array | None = None
+        for start in np.unique(self.first).tolist():
+            rows = slice(start, self.last[start] + 1)
+            episode = int(episodes[start])
+            begin = self._meta.episodes[episode][f"videos/{key}/from_timestamp"]
+            found = decode_video_frames(
+                reader.root / self._meta.get_video_file_path(episode, key),
+                [begin + time for time in times[rows].tolist()],
+                reader._tolerance_s,
+                reader._video_backend,
+                return_uint8=True,
+            ).numpy()
+            if frames is None:
+                frames = np.empty((len(times), *found.shape[1:]), np.uint8)
+            frames[rows] = found
+        assert frames is not None  # the table is not empty
+        return Video(SharedArray(frames), self._offsets.get(key), reader._return_uint8)
 
     def _make_blocks(self) -> list[Block]:
         groups: dict[tuple[Any, ...], list[tuple[str, Array, tuple[int, ...]]]] = {}
@@ -186,6 +243,8 @@ class FrameStore:
                 found.update(block.read(row, (), block.dtype))
             else:
                 found.update(block.read(windows[block.offsets], (len(block.offsets),), block.dtype))
+        for key, video in self.videos.items():
+            found[key] = video.read(row if video.offsets is None else windows[video.offsets])
         for key in self.lazy_keys:
             found[key] = self._decode(key, row, windows)
         item = {key: found[key] for key in self.keys}
@@ -208,6 +267,8 @@ class FrameStore:
             picked = rows if block.offsets is None else windows[block.offsets]
             columns = block.read(picked.ravel(), picked.shape, block.batch_dtype)
             found |= {key: value.contiguous() for key, value in columns.items()}
+        for key, video in self.videos.items():
+            found[key] = video.read(rows if video.offsets is None else windows[video.offsets])
         for key in self.lazy_keys:
             found[key] = torch.stack([self._decode(key, row, self._windows(row)) for row in rows.tolist()])
         batch = {key: found[key] for key in self.keys}

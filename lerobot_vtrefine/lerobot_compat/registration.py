@@ -16,9 +16,14 @@ REGISTERING = (
     "lerobot_vtrefine.policies.vt_dp3",
 )
 """Packages whose import registers their types."""
+READER = "lerobot_vtrefine.lerobot_compat.fast_reader"
 
 
 def register() -> None:
-    """Register all types with LeRobot, which it imports; idempotent."""
+    """Register all types with LeRobot, which it imports; idempotent.
+
+    LeRobot's own policies train on this package's data, too, so its reader is installed for whatever comes.
+    """
     for name in REGISTERING:
         importlib.import_module(name)
+    importlib.import_module(READER).install()

@@ -66,7 +66,7 @@ SEAMS = (
         "fast_reader",
         ("lerobot.datasets.lerobot_dataset.DatasetReader", "lerobot.datasets.lerobot_dataset.LeRobotDataset"),
         "array columns are decoded through Python lists, 45 ms an item, and never a batch at once",
-        "configurations of vt_dp3, when they are made",
+        "LeRobot's commands, when they discover plugins; configurations of vt_dp3, when they are made",
         "warns and reads the slow way",
     ),
     Seam(

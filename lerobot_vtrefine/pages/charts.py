@@ -13,6 +13,8 @@ import numpy as np
 
 LEAST_SCALE = 0.82
 """How far a drawing shrinks on a narrow screen: 15 units then are 12.3 pixels."""
+MOST_SCALE = 1.2
+"""How far one grows on a wide one."""
 MAX_POINTS = 400
 """Lines are thinned to this many points, which is more than pixels show."""
 
@@ -157,5 +159,6 @@ def label(x: float, y: float, text: str, anchor: str, style: str = "tick") -> st
 def drawing(width: float, height: float, parts: Sequence[str], title: str) -> str:
     """The parts as one picture, with a title for those who cannot see it."""
     body = "".join(parts)
-    size = f'viewBox="0 0 {width:.0f} {height:.0f}" style="min-width: {LEAST_SCALE * width:.0f}px"'
+    least, most = f"min-width: {LEAST_SCALE * width:.0f}px", f"max-width: {MOST_SCALE * width:.0f}px"
+    size = f'viewBox="0 0 {width:.0f} {height:.0f}" style="{least}; {most}"'
     return f'<svg {size} role="img" aria-label="{escape(title, quote=True)}">{body}</svg>'

@@ -7,7 +7,7 @@ import numpy as np
 
 from lerobot_vtrefine.pages.charts import Panel, drawing, label, percent_tick
 
-WIDTH, HEIGHT = 440, 260
+WIDTH, HEIGHT = 340, 260
 LEFT, RIGHT, TOP, BOTTOM = 56, 14, 26, 46
 PER_BAR = 112
 """Width of a bar with its label; a chart of many bars is wider."""

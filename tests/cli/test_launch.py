@@ -65,6 +65,33 @@ def test_comments_document_flags_too() -> None:
     assert "--policy.path" in flags["policy"].text
 
 
+@pytest.mark.parametrize(
+    ("entry", "given", "line"),
+    [
+        (launch.record_demos, [], "give --root=Path: Folder of the dataset"),
+        (launch.record_demos, ["--config_path=vtrefine:round_grasped"], "give --root=Path: Folder"),
+        (launch.replay, ["--dataset.root=x"], "give --output_dir=Path"),
+        (launch.finetune, ["--seed=3"], "say which task, --config_path=vtrefine:NAME or --env.type=vtrefine"),
+    ],
+)
+def test_a_missing_flag_is_told_before_lerobot_is_loaded(entry, given, line, monkeypatch, capsys) -> None:
+    monkeypatch.setattr(sys, "argv", ["command", *given])
+    monkeypatch.setattr(launch.importlib, "import_module", None)
+    assert entry() == 2
+    error = capsys.readouterr().err
+    assert error.startswith(f"error: {line}")
+    assert error.endswith("--help has an example\n")
+
+
+def test_a_flag_may_stand_in_a_file_or_name_what_lies_below_it(tmp_path: Path) -> None:
+    file = tmp_path / "mine.yaml"
+    file.write_text("root: outputs/demos\nenv: {type: vtrefine}\n")
+    for module, name in (RECORD, ("lerobot_vtrefine.finetune.pipeline", "FinetunePipelineConfig")):
+        launch.check_required(flags_of(module, name), [f"--config_path={file}"])
+        launch.check_required(flags_of(module, name), ["--config_path", str(file)])
+        launch.check_required(flags_of(module, name), ["--root=x", "--env.type=vtrefine"])
+
+
 def test_help_is_text_without_markup(monkeypatch, capsys: pytest.CaptureFixture[str]) -> None:
     monkeypatch.setattr(sys, "argv", ["vtrefine-record-demos", "--help"])
     assert launch.record_demos() == 0

@@ -19,11 +19,13 @@ from lerobot_vtrefine.diagnose.core.diagnosis import Diagnosis
 from lerobot_vtrefine.diagnose.recordings import read_recording_set
 from lerobot_vtrefine.diagnose.report import render_report
 from lerobot_vtrefine.diagnose.report.effects import effect_drawing
+from lerobot_vtrefine.diagnose.report.figures import error_figure
 from lerobot_vtrefine.diagnose.report.numbers import digits, interval, percent, quantity
 from lerobot_vtrefine.diagnose.report.words import MEANINGS, ties
-from lerobot_vtrefine.diagnose.verdict import CAUSES, DataIssue, Unknown, Verdict
+from lerobot_vtrefine.diagnose.verdict import CAUSES, DataIssue, Heldout, Unknown, Verdict
 from lerobot_vtrefine.pages.charts import ticks
 from lerobot_vtrefine.pages.pads import GAP_TAXELS
+from lerobot_vtrefine.pages.rates import Bar, Series, bar_chart, line_chart
 from lerobot_vtrefine.tactile.model import SensorModel
 from lerobot_vtrefine.tactile.stages.contact import KelvinVoigt
 from lerobot_vtrefine.tactile.stages.readout import Gain
@@ -303,3 +305,16 @@ def test_screenshot(kind, pad_set, robot_set, tmp_path):
     assert orange[900:].sum() > 500  # its curves
     assert not drawn[:, :20].any()  # nothing runs out of the page on the left ...
     assert not drawn[:, -20:].any()  # ... or on the right
+
+
+def test_charts_of_results_fit_a_phone() -> None:
+    """A card leaves 288 of 360 pixels; a wider drawing is cut until somebody scrolls it."""
+    rates = [Bar("imitation", 0.6, 0.5, 0.7), Bar("after DPPO", 0.9, 0.8, 1.0)]
+    line = [Series("success", [(0, 0.1), (1, 0.2)])]
+    drawings = [
+        bar_chart(rates, "success"),
+        line_chart(line, "iteration", "success"),
+        error_figure(Heldout("rmse", 5.0, 1.0, 0.9, 0.95, (0.9, 0.97), ()), "counts"),
+    ]
+    widths = [int(re.search(r"min-width: (\d+)px", text)[1]) for text in drawings]
+    assert max(widths) <= 288

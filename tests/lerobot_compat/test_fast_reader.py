@@ -16,6 +16,7 @@ from torch.utils.data import DataLoader
 from lerobot_vtrefine.datasets.features import BASELINE_KEYS, RAW_KEYS, STATE_KEY, TACTILE_KEYS
 from lerobot_vtrefine.lerobot_compat import fast_reader
 
+COLOUR = "observation.images.front"
 WINDOWS = {key: [-0.1, 0.0] for key in (*RAW_KEYS, STATE_KEY)} | {"action": [i / 10 for i in range(16)]}
 
 
@@ -73,6 +74,61 @@ def test_items_are_bit_identical(tiny_dataset: Path, options: dict[str, Any]) ->
     assert len(fast.__getitems__(indices)) == 1, "a whole batch, not items"
     with pytest.raises(IndexError):
         fast.__getitems__([0, len(fast)])
+
+
+@pytest.fixture(scope="module")
+def coloured_dataset(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Two episodes of pads and a colour video, in one file."""
+    root = tmp_path_factory.mktemp("coloured") / "dataset"
+    colour = {"dtype": "video", "shape": (32, 48, 3), "names": ["height", "width", "channels"]}
+    touch = {"dtype": "uint8", "shape": (384,), "names": None}
+    features = {COLOUR: colour, TACTILE_KEYS[0]: touch}
+    dataset = LeRobotDataset.create("local/coloured", fps=10, root=root, features=features)
+    rng = np.random.default_rng(0)
+    for length in (5, 4):
+        for index in range(length):
+            image = np.full((32, 48, 3), 40 * index, np.uint8)
+            image[8:24, 4 * index : 4 * index + 8] = 10 * length
+            counts = rng.integers(0, 90, 384, dtype=np.uint8)
+            dataset.add_frame({COLOUR: image, TACTILE_KEYS[0]: counts, "task": "insert"})
+        dataset.save_episode()
+    dataset.finalize()
+    return root
+
+
+@pytest.mark.usefixtures("stock")
+@pytest.mark.parametrize(
+    "options",
+    [
+        {},
+        {"return_uint8": True},
+        {"return_uint8": True, "delta_timestamps": {COLOUR: [0.0]}},
+        {"return_uint8": True, "delta_timestamps": {COLOUR: [-0.1, 0.0], TACTILE_KEYS[0]: [0.0]}},
+        {"delta_timestamps": {COLOUR: [-0.1, 0.0]}, "episodes": [1]},
+    ],
+    ids=["single frames", "bytes", "a window of one", "windows", "one episode"],
+)
+def test_small_videos_come_from_memory(coloured_dataset: Path, options: dict[str, Any]) -> None:
+    slow = LeRobotDataset("local/coloured", root=coloured_dataset, **options)
+    fast_reader.install()
+    fast = LeRobotDataset("local/coloured", root=coloured_dataset, **options)
+    assert fast.reader._frame_store() is not None
+    for index in range(len(slow)):
+        assert_same_item(slow[index], fast[index])
+    indices = [len(slow) - 1, 0, 2]
+    (slow_batch,), (fast_batch,) = (DataLoader(data, batch_sampler=[indices]) for data in (slow, fast))
+    assert_same_item(slow_batch, fast_batch | {TACTILE_KEYS[0]: fast_batch[TACTILE_KEYS[0]].long()})
+
+
+@pytest.mark.usefixtures("stock")
+def test_videos_that_do_not_fit_in_memory_take_the_stock_path(
+    coloured_dataset: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    monkeypatch.setattr(fast_reader, "MAX_VIDEO_BYTES", 1000)
+    fast_reader.install()
+    dataset = LeRobotDataset("local/coloured", root=coloured_dataset)
+    assert dataset[3][COLOUR].shape == (3, 32, 48)
+    assert "too large for memory" in caplog.text
 
 
 @pytest.mark.usefixtures("stock")

@@ -1,8 +1,12 @@
 """Rows and learning curves from the folders that runs leave, and from printed tables."""
 
 import csv
+import fcntl
 import json
+import os
 import re
+from collections.abc import Generator
+from contextlib import contextmanager
 from dataclasses import replace as replace_fields
 from pathlib import Path
 from typing import Any
@@ -178,7 +182,27 @@ def printed_lines(path: Path, name: str, origin: dict[str, str | None]) -> list[
 
 
 def save(path: Path, name: str, found: list[tuple[Row, Progress]], *, replace: bool) -> None:
-    """Put rows and curves into a results file; ``replace`` drops their groups' earlier rows, of all seeds."""
+    """Put rows and curves into a results file; ``replace`` drops their groups' earlier rows, of all seeds.
+
+    Processes that end at the same time wait for each other.
+    """
+    path.parent.mkdir(parents=True, exist_ok=True)
+    with only_one_in(path.parent):
+        _save(path, name, found, replace)
+
+
+@contextmanager
+def only_one_in(folder: Path) -> Generator[None]:
+    """Wait until no other process is in here for this folder."""
+    descriptor = os.open(folder, os.O_RDONLY)
+    try:
+        fcntl.flock(descriptor, fcntl.LOCK_EX)
+        yield
+    finally:
+        os.close(descriptor)
+
+
+def _save(path: Path, name: str, found: list[tuple[Row, Progress]], replace: bool) -> None:
     old = read_rows(path) if path.is_file() else []
     rows = []
     for row, progress in found:

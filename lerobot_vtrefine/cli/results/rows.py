@@ -118,6 +118,7 @@ class Line(Row):
         "jittered",
         "servo",
         "step_size",
+        "sysid",
         "tactile",
         "touch_tasks",
         "worlds",

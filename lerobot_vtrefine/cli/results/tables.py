@@ -16,14 +16,14 @@ BLOCK = re.compile(r"(<!-- table: (\w+) -->\n).*?(<!-- end -->)", re.DOTALL)
 LEADING_POINT = re.compile(r"(?<![\d.])\.(?=\d)")
 LABELS = {
     "demo": "demo: round pair, 2 mm clearance",
-    "round_grasped": "round pair, 2 mm, slip 2 mm / .05 rad",
+    "round_grasped": "round pair, 2 mm, slip 2 mm / 0.05 rad",
     "demo_schedule": "the demo, 128 environments on two cores",
     "kinova_round": "two Kinova Gen3, round pair, the paper's cloud, two cores",
     "cross_gentle": "cross, 2 mm, 5 N at most (cross_gentle)",
     "tight": "tight: 1 mm clearance",
     "occluded": "occluded: camera above, the hole hidden",
     "slip": "slip: twice the pose error in the hand",
-    "square_1mm_slip": "square pair, 1 mm, slip 4 mm / .1 rad",
+    "square_1mm_slip": "square pair, 1 mm, slip 4 mm / 0.1 rad",
     "short_chunk": "short_chunk: decisions twice as often",
     "row_sharing+hysteresis": "row sharing, hysteresis",
     "latency+taxel_gain_spread": "latency 0.2 s, gain spread 0.5",
@@ -34,11 +34,10 @@ LABELS = {
     "kinova": "two Kinova Gen3",
     "table": "from the table",
     "grasped": "in hand",
-    "vt_dp3_paper": "vt_dp3, touch and depth",
-    "vt_dp3_visual": "vt_dp3, depth",
-    "act_rgb": "LeRobot's ACT, colour",
-    "diffusion_rgb": "LeRobot's diffusion policy, colour",
-    "smolvla_rgb": "LeRobot's SmolVLA, colour",
+    "vt_dp3_pads": "vt_dp3: touch and depth",
+    "vt_dp3_pads_visual": "vt_dp3: depth",
+    "act_rgb": "LeRobot's ACT: colour",
+    "diffusion_rgb": "LeRobot's diffusion policy: colour",
 }
 """Tasks and policies in words; others stand as they are."""
 MEASURED = (
@@ -229,6 +228,19 @@ def runs_table(rows: Sequence[Run]) -> str:
     return markdown([*head, "largest fall, last half"], body)
 
 
+def policies_table(rows: Sequence[Run]) -> str:
+    """Policies trained on the same demonstrations, beside each other."""
+    body = []
+    for task in values(rows, "task"):
+        for policy in values(pick(rows, task=task), "policy"):
+            for variant in values(pick(rows, task=task, policy=policy), "variant"):
+                runs = pick(rows, task=task, policy=policy, variant=variant)
+                shown = [LABELS.get(task, task), LABELS.get(policy, policy), variant, over_seeds(runs, " %")]
+                body.append([*shown, " / ".join(dict.fromkeys(str(row.episodes) for row in runs))])
+    head = ["task", "policy and what it sees", "trained on", "success: mean over seeds [t-interval] (each)"]
+    return markdown([*head, "episodes a seed"], body)
+
+
 def average(counts: Sequence[int | None]) -> str:
     """Mean of counts with thin groups of thousands; a dash where one was not recorded."""
     known = [count for count in counts if count is not None]
@@ -247,7 +259,7 @@ RENDERERS: dict[str, Callable[[Sequence], str]] = (
     dict.fromkeys(Run.TABLES, runs_table)
     | dict.fromkeys(Line.TABLES, lines_table)
     | {"demo": demo_table, "touch": touch_table, "twin": touch_table, "reality": reality_table}
-    | {"expert": expert_table}
+    | {"expert": expert_table, "policies": policies_table}
 )
 
 

@@ -11,7 +11,7 @@ from lerobot_vtrefine.pages.charts import Panel, drawing, label, span
 from lerobot_vtrefine.pages.pads import pad_image
 
 RECORDED, TWIN, COMMAND = "m", "b", "d"
-WIDTH, HEIGHT = 380.0, 190.0
+WIDTH, HEIGHT = 350.0, 190.0
 LEFT, RIGHT, TOP, BOTTOM = 62.0, 14.0, 26.0, 44.0
 NAMES_PX, BAR_PX, ROW_PX = 150.0, 11.0, 34.0
 LEAST_SPAN = {"rad": 0.05, "mm": 2.0}

@@ -63,7 +63,7 @@ def residual_figure(view: ResidualView, unit: str) -> str:
     panel = Panel(
         LEFT,
         26,
-        380 - LEFT - RIGHT,
+        350 - LEFT - RIGHT,
         150,
         span(view.x * factor),
         span(*[c * scale for c in curves], zero=True),
@@ -74,7 +74,7 @@ def residual_figure(view: ResidualView, unit: str) -> str:
         if band is not None:
             parts.append(panel.band(view.x * factor, band[:, 0] * scale, band[:, 1] * scale, style))
         parts.append(panel.line(view.x * factor, mean * scale, style))
-    return drawing(380, 222, parts, f"mean residual against {view.axis}")
+    return drawing(350, 222, parts, f"mean residual against {view.axis}")
 
 
 def error_figure(heldout: Heldout, unit: str) -> str:
@@ -85,11 +85,11 @@ def error_figure(heldout: Heldout, unit: str) -> str:
     longest = max(value for _, value, _ in rows) or 1.0
     parts = []
     for k, (name, value, style) in enumerate(rows):
-        y, length = 10 + 34 * k, 225 * value / longest
+        y, length = 10 + 34 * k, 130 * value / longest
         parts.append(label(96, y + 17, name, "end", "name"))
         parts.append(f'<rect class="bar {style}" x="106" y="{y}" width="{length:.1f}" height="24" rx="3"/>')
         parts.append(label(114 + length, y + 17, quantity(value, unit), "start", "value"))
-    return drawing(480, 16 + 34 * len(rows), parts, "root mean squared error on held-out recordings")
+    return drawing(350, 16 + 34 * len(rows), parts, "root mean squared error on held-out recordings")
 
 
 def trial_figure(errors: Sequence[TrialError], unit: str) -> str:
