@@ -15,25 +15,18 @@ import json
 from pathlib import Path
 from typing import Any
 
-import draccus
 import numpy as np
 import torch
-from lerobot.envs import EnvConfig
-from lerobot.policies.factory import make_pre_post_processors
 from torch import Tensor
 
 from lerobot_vtrefine.cli.errors import run_cli
-from lerobot_vtrefine.envs import VtRefineEnvConfig
-from lerobot_vtrefine.envs.decisions import make_decision_env
-from lerobot_vtrefine.files import read_yaml
 from lerobot_vtrefine.finetune import dppo
 from lerobot_vtrefine.finetune.chains import chain_log_probs
 from lerobot_vtrefine.finetune.config import DppoConfig, TrustRegionDppo
 from lerobot_vtrefine.finetune.critic import explained_variance
 from lerobot_vtrefine.finetune.evaluation import evaluate
-from lerobot_vtrefine.finetune.pipeline import make_agent
+from lerobot_vtrefine.finetune.pipeline import load_practice
 from lerobot_vtrefine.finetune.protocols import Agent, select
-from lerobot_vtrefine.policies.vt_dp3.modeling_vt_dp3 import VtDp3Policy
 
 GROUPS = 8
 """Groups of episodes: the halves are made of them in all ways."""
@@ -80,20 +73,11 @@ def group_gradients(
 
 def measure(args: argparse.Namespace) -> dict[str, Any]:
     """The figures of one task and checkpoint."""
-    task = draccus.decode(EnvConfig, read_yaml(args.task)["env"])
-    assert isinstance(task, VtRefineEnvConfig)
-    if args.device != "cpu":
-        task.backend, task.warp = "warp", dataclasses.replace(task.warp, device=args.device)
-    policy = VtDp3Policy.from_pretrained(args.policy).to(args.device)
-    policy.config.device = args.device
-    overrides = {"device_processor": {"device": args.device}}
-    processors = make_pre_post_processors(policy.config, str(args.policy), preprocessor_overrides=overrides)
     cfg = TrustRegionDppo(num_envs=args.worlds, encoder="frozen", critic_warmup=1)
     if args.std is not None:
         cfg = dataclasses.replace(cfg, min_sampling_std=args.std)
-    agent = make_agent(policy, cfg)
-    windows = policy.config.n_obs_steps, policy.config.n_action_steps
-    env = make_decision_env(task, args.worlds, *processors, *windows)
+    backend = None if args.device == "cpu" else "warp"
+    _, agent, env, _ = load_practice(args.policy, args.task, cfg, args.device, backend)
     state = dppo.TrainState.create(agent, cfg, env.privileged_dim, seed=args.seed)
     deployed = evaluate(env, agent, args.worlds, args.seed) if args.deployed else {}
     for first in (1, 2):  # the critic learns from the first round and is judged on the second

@@ -2,11 +2,11 @@
 
     python scripts/profile_finetuning.py --device=cuda --worlds=1024,4096
 
-The tuned policy that comes with the package plays its own task; --policy takes another checkpoint. It asks
-for nothing that is new, so that an earlier commit can be measured in the same run:
+The tuned policy that comes with the package plays its own task; --policy takes another checkpoint. An
+earlier commit is measured by its own copy of this script:
 
     git worktree add /tmp/before COMMIT
-    PYTHONPATH=/tmp/before python scripts/profile_finetuning.py --device=cuda
+    PYTHONPATH=/tmp/before python /tmp/before/scripts/profile_finetuning.py --device=cuda
 
 "environment" is an episode of holding still in all worlds, with every frame read at every control step. Parts
 are measured in a further rollout that waits for the device before and after each: they add up to more than a
@@ -14,7 +14,6 @@ rollout.
 """
 
 import argparse
-import dataclasses
 import functools
 import json
 import time
@@ -24,24 +23,17 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
-import draccus
 import numpy as np
 import torch
-from lerobot.envs import EnvConfig
-from lerobot.policies.factory import make_pre_post_processors
 
 import lerobot_vtrefine
 from lerobot_vtrefine.cli.errors import run_cli
-from lerobot_vtrefine.envs import VtRefineEnvConfig
-from lerobot_vtrefine.envs.decisions import LeRobotDecisionEnv, make_decision_env
+from lerobot_vtrefine.envs.decisions import LeRobotDecisionEnv
 from lerobot_vtrefine.envs.episodes import Episodes
-from lerobot_vtrefine.envs.factory import make_episodes
-from lerobot_vtrefine.files import read_yaml
 from lerobot_vtrefine.finetune import dppo
 from lerobot_vtrefine.finetune.config import TrustRegionDppo
-from lerobot_vtrefine.finetune.pipeline import make_agent
+from lerobot_vtrefine.finetune.pipeline import load_practice
 from lerobot_vtrefine.finetune.protocols import Agent
-from lerobot_vtrefine.policies.vt_dp3.modeling_vt_dp3 import VtDp3Policy
 from lerobot_vtrefine.sim.simulation import InsertionSim
 
 ROOT = Path(__file__).parents[1]
@@ -94,11 +86,10 @@ def now(device: torch.device) -> float:
     return time.perf_counter()
 
 
-def environment_seconds(task: VtRefineEnvConfig, worlds: int, device: torch.device) -> tuple[float, float]:
+def environment_seconds(episodes: Episodes, device: torch.device) -> tuple[float, float]:
     """Of a reset, and of an episode in which everyone holds still."""
-    episodes = make_episodes(task, worlds)
-    hold = np.zeros(0)
-    for first in (0, worlds):  # the first round compiles and records
+    started = ready = done = 0.0
+    for first in (0, episodes.num_envs):  # the first round compiles and records
         started = now(device)
         episodes.reset(episodes.ids, first + episodes.ids)
         ready = now(device)
@@ -112,18 +103,9 @@ def environment_seconds(task: VtRefineEnvConfig, worlds: int, device: torch.devi
 def profile(args: argparse.Namespace, worlds: int) -> dict[str, Any]:
     """One row."""
     device = torch.device(args.device)
-    task = draccus.decode(EnvConfig, read_yaml(args.task)["env"])
-    assert isinstance(task, VtRefineEnvConfig)
-    task.backend, task.warp = "warp", dataclasses.replace(task.warp, device=args.device)
-    reset_s, env_s = environment_seconds(task, worlds, device)
-    policy = VtDp3Policy.from_pretrained(args.policy).to(device)
-    policy.config.device = str(device)
-    overrides = {"device_processor": {"device": str(device)}}
-    processors = make_pre_post_processors(policy.config, str(args.policy), preprocessor_overrides=overrides)
     cfg = TrustRegionDppo(num_envs=worlds, encoder="frozen", critic_warmup=0, decisions=args.decisions)
-    agent = make_agent(policy, cfg)
-    windows = policy.config.n_obs_steps, policy.config.n_action_steps
-    env = make_decision_env(task, worlds, *processors, *windows)
+    policy, agent, env, _ = load_practice(args.policy, args.task, cfg, args.device, backend="warp")
+    reset_s, env_s = environment_seconds(env.episodes, device)
     state = dppo.TrainState.create(agent, cfg, env.privileged_dim, seed=0)
     rollouts, updates, steps, count = [], [], [], 0
     for iteration in range(args.iterations + 1):
@@ -135,7 +117,7 @@ def profile(args: argparse.Namespace, worlds: int) -> dict[str, Any]:
         count = int(dppo.update(rollout, agent, state, cfg)["updates"])
         updates.append(now(device) - collected)
         rollouts.append(collected - started)
-        steps.append(float(rollout.active.sum()) * windows[1])
+        steps.append(float(rollout.active.sum()) * policy.config.n_action_steps)
         state.iteration += 1
     fresh = range((args.iterations + 1) * worlds, (args.iterations + 2) * worlds)
     with timed_parts(device) as parts:

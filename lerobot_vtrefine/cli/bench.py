@@ -4,6 +4,7 @@ examples:
   vtrefine-bench
   vtrefine-bench --plot                        pressure images of the contact models, and their errors
   vtrefine-bench --device=cuda                 many worlds on a GPU
+  vtrefine-bench --device=cuda --solver=own,stock      beside mujoco_warp's own step
 """
 
 import importlib.util
@@ -14,12 +15,17 @@ import tempfile
 from collections.abc import Iterable, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import draccus
 
 from lerobot_vtrefine.cli.errors import run_cli
 from lerobot_vtrefine.cli.pipeline.stages import last_line, stop
 from lerobot_vtrefine.extras import SIMULATOR, require
+from lerobot_vtrefine.sim.config import WARP_SOLVERS, WarpConfig
+
+if TYPE_CHECKING:
+    from lerobot_vtrefine.sim.benchmark import WorldsRow
 
 # Every module offers run() -> [(what, ratio, explanation)].
 PARTS = {
@@ -65,6 +71,8 @@ class BenchConfig:
     """Instead, measure worlds of the warp backend on cuda or cpu; on cuda the contact models, too."""
     worlds: str = "1,64,1024,4096"
     """Numbers of worlds for --device."""
+    solver: str = "own"
+    """Of these worlds: own, stock (mujoco_warp's own step), or own,stock to compare the two."""
     steps: int = 40
     """Control steps measured for each number of worlds."""
     json: Path | None = None
@@ -78,7 +86,14 @@ class BenchConfig:
             raise ValueError(f"--limit_s must be above 0, got {self.limit_s}")
         if self.plot and self.device is not None:
             raise ValueError("--plot and --device are two different things to do; give one")
+        if not set(self.solvers) <= set(WARP_SOLVERS):
+            raise ValueError(f"--solver must be own, stock or own,stock, got {self.solver!r}")
         _ = self.world_counts
+
+    @property
+    def solvers(self) -> tuple[str, ...]:
+        """`solver`, one by one."""
+        return tuple(self.solver.split(","))
 
     @property
     def world_counts(self) -> tuple[int, ...]:
@@ -158,18 +173,41 @@ def table(rows: Sequence[Row]) -> str:
 
 
 def measure_device(config: BenchConfig, device: str) -> list[Row]:
-    """Prints a table of the warp backend's worlds; returns the contact models' rows, which need CUDA."""
-    from lerobot_vtrefine.sim.benchmark import measure_worlds
+    """Prints a table of the warp backend's worlds for each solver; returns the solvers' ratios, and the
+    contact models' rows, which need CUDA.
+    """
+    from lerobot_vtrefine.sim.benchmark import WorldsRow, measure_worlds
     from lerobot_vtrefine.sim.benchmark import table as worlds_table
-    from lerobot_vtrefine.sim.config import WarpConfig
     from lerobot_vtrefine.tactile.benchmark import run_cuda
 
-    worlds = []
-    for row in measure_worlds(WarpConfig(device=device), config.world_counts, config.steps):
-        print(f"{row.worlds} worlds: {row.worlds / row.mean_s:.4g} steps/s", file=sys.stderr, flush=True)
-        worlds.append(row)
-    print(worlds_table(worlds))
-    return [Row("tactile", *row) for row in run_cuda()] if device.startswith("cuda") else []
+    found: dict[str, list[WorldsRow]] = {}
+    for solver in config.solvers:
+        found[solver] = []
+        for row in measure_worlds(
+            WarpConfig(device=device, solver=solver), config.world_counts, config.steps
+        ):
+            print(f"{row.worlds} worlds: {row.worlds / row.mean_s:.4g} steps/s", file=sys.stderr, flush=True)
+            found[solver].append(row)
+        print(f"solver {solver}:\n{worlds_table(found[solver])}")
+    both = zip(found["own"], found["stock"], strict=True) if len(found) == 2 else ()
+    rows = [row for own, stock in both for row in _solver_rows(own, stock)]
+    return rows + ([Row("tactile", *row) for row in run_cuda()] if device.startswith("cuda") else [])
+
+
+def _solver_rows(own: "WorldsRow", stock: "WorldsRow") -> list[Row]:
+    """How many times as fast this package's step is as mujoco_warp's: control steps, and physics alone."""
+    return [
+        Row(
+            "solver",
+            f"{what} of {own.worlds} worlds, stock / own",
+            theirs / ours,
+            f"{1e3 * ours:.1f} ms against {1e3 * theirs:.1f} ms",
+        )
+        for what, ours, theirs in (
+            ("control step", own.mean_s, stock.mean_s),
+            ("physics", own.physics_s, stock.physics_s),
+        )
+    ]
 
 
 def plot(folder: Path) -> str:

@@ -18,8 +18,12 @@ from lerobot.utils.import_utils import register_third_party_plugins
 from lerobot.utils.utils import init_logging
 
 from lerobot_vtrefine.cli.errors import run_cli
+from lerobot_vtrefine.cli.report.results import verdict
+from lerobot_vtrefine.cli.report.statistics import proportion
+from lerobot_vtrefine.cli.results.collect import evaluated_episodes
 from lerobot_vtrefine.cli.results.provenance import write_provenance
 from lerobot_vtrefine.cli.sharing import check_repo_id
+from lerobot_vtrefine.finetune.logger import read_progress
 from lerobot_vtrefine.finetune.pipeline import FinetunePipelineConfig, run
 
 LEROBOTS_SHARING = ("--push_to_hub=true", "--repo_id=")
@@ -34,12 +38,23 @@ def finetune(cfg: FinetunePipelineConfig) -> None:
     first = os.environ.get("RANK", "0") == "0"
     if first:
         checkpoint = cfg.output_dir / "checkpoints" / "last" / "pretrained_model"
+        print(outcome(cfg))
         print(f"policy: {checkpoint}")
         print(f"evaluate it by lerobot-eval, see it by vtrefine-play, with --policy.path={checkpoint}")
     if cfg.push_to_hub and first:
         from lerobot_vtrefine.cli.card_evaluation import evaluate_and_push
 
         evaluate_and_push(cfg)
+
+
+def outcome(cfg: FinetunePipelineConfig) -> str:
+    """Held-out success before and after, in a sentence; DPPO can unlearn, too."""
+    rates = [row["eval_success"] for row in read_progress(cfg.output_dir) if "eval_success" in row]
+    if len(rates) < 2:
+        return "held-out success was not measured twice: --eval_freq"
+    episodes = evaluated_episodes(cfg.eval.n_episodes, cfg.dppo.num_envs)
+    before, after = (proportion(round(rate * episodes), episodes) for rate in (rates[0], rates[-1]))
+    return verdict(before, after)
 
 
 def _check_sharing(cfg: FinetunePipelineConfig) -> None:

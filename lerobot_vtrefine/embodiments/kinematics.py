@@ -5,7 +5,8 @@ Shapes: `...` leading batch, A arms, K revolute joints per arm, F joints and S p
 """
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from functools import lru_cache
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 import torch
@@ -55,7 +56,7 @@ class Hands:
         fingers = self.embodiment.fingers
         centre, rotation = self.tcp()
         faces = fingers.faces(self._grippers)
-        inward = self.joints.new_tensor([-SIGNS[side] for side in fingers.sides])
+        inward = _constants(self.embodiment, self.joints.device, self.joints.dtype).inward
         x, y, z = rotation.unsqueeze(-3).unbind(-1)  # each (..., A, 1, 3)
         position = centre.unsqueeze(-2) + faces.y.unsqueeze(-1) * y
         sign = inward.unsqueeze(-1)
@@ -94,13 +95,14 @@ class Hands:
 def hands(embodiment: "Embodiment", q: Tensor) -> Hands:
     """Run all chains for joint positions q (..., J)."""
     arm_q = _by_arm(embodiment, q)
-    columns = list(_base_rotation(embodiment, q).unbind(-1))
-    position = q.new_tensor([arm.base_pos_m for arm in embodiment.arms]).expand(*arm_q.shape[:-1], 3)
+    known = _constants(embodiment, q.device, q.dtype)
+    columns = list(known.base_rotation.unbind(-1))
+    position = known.base_position.expand(*arm_q.shape[:-1], 3)
     columns = [column.expand_as(position) for column in columns]
     axes, origins = [], []
     angles = arm_q[..., : len(embodiment.joints), None]
     if any(joint.reversed for joint in embodiment.joints):
-        angles = angles * q.new_tensor([joint.sign for joint in embodiment.joints])[:, None]
+        angles = angles * known.signs
     turns = zip(torch.cos(angles).unbind(-2), torch.sin(angles).unbind(-2), strict=True)
     for joint, (cos, sin) in zip(embodiment.joints, turns, strict=True):
         for axis, length in enumerate(joint.offset_m):
@@ -156,9 +158,26 @@ def _by_arm(embodiment: "Embodiment", values: Tensor) -> Tensor:
     return values.unflatten(-1, (embodiment.num_arms, embodiment.joints_per_arm))
 
 
-def _base_rotation(embodiment: "Embodiment", like: Tensor) -> Tensor:
-    rotation = np.stack([arm.base_rotation() for arm in embodiment.arms])
-    return torch.as_tensor(rotation, dtype=like.dtype, device=like.device)
+class _Constants(NamedTuple):
+    """Of an embodiment, on a device."""
+
+    base_position: Tensor  # (A, 3)
+    base_rotation: Tensor  # (A, 3, 3)
+    signs: Tensor  # (K, 1) of the revolute joints
+    inward: Tensor  # (S,) of the pads, along the hand's y
+
+
+@lru_cache(maxsize=32)
+def _constants(embodiment: "Embodiment", device: torch.device, dtype: torch.dtype) -> _Constants:
+    """Kept, since every upload would make a GPU's caller wait for it."""
+    values = (
+        [arm.base_pos_m for arm in embodiment.arms],
+        np.stack([arm.base_rotation() for arm in embodiment.arms]),
+        [[joint.sign] for joint in embodiment.joints],
+        [-SIGNS[side] for side in embodiment.fingers.sides],
+    )
+    with torch.inference_mode(False):  # others may differentiate through them
+        return _Constants(*(torch.tensor(value, device=device, dtype=dtype) for value in values))
 
 
 def _turn(columns: list[Tensor], axis: int, cos: Tensor, sin: Tensor) -> None:

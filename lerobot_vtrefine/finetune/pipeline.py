@@ -3,9 +3,9 @@
 import copy
 import logging
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import draccus
 import torch
@@ -20,7 +20,8 @@ from tqdm import tqdm
 from tqdm.contrib.logging import logging_redirect_tqdm
 
 from lerobot_vtrefine.envs.config import VtRefineEnvConfig
-from lerobot_vtrefine.envs.decisions import make_decision_env
+from lerobot_vtrefine.envs.decisions import LeRobotDecisionEnv, make_decision_env
+from lerobot_vtrefine.files import read_yaml
 from lerobot_vtrefine.finetune.checkpoint import (
     Saveable,
     last_checkpoint,
@@ -180,19 +181,43 @@ def make_agent(policy: VtDp3Policy, dppo: DppoConfig) -> Agent:
     )
 
 
-def make_env_for(
-    cfg: FinetunePipelineConfig, policy: VtDp3Policy, processors: tuple[Any, Any]
-) -> DecisionEnv:
-    """The environments of this rank.
+class Practice(NamedTuple):
+    """A policy made ready for DPPO, and where it practises."""
+
+    policy: VtDp3Policy
+    agent: Agent
+    env: LeRobotDecisionEnv
+    processors: tuple[Any, Any]
+
+
+def make_practice(policy: VtDp3Policy, path: Path, env: EnvConfig, dppo: DppoConfig) -> Practice:
+    """Agent, environments of this rank and the processors that were saved beside the policy in ``path``.
 
     Raises: ValueError for another environment type.
     """
-    if not isinstance(cfg.env, VtRefineEnvConfig):
-        raise ValueError(f"vtrefine-finetune needs --env.type=vtrefine, got {cfg.env.type}")
+    if not isinstance(env, VtRefineEnvConfig):
+        raise ValueError(f"vtrefine-finetune needs --env.type=vtrefine, got {env.type}")
     config = policy.config
-    return make_decision_env(
-        cfg.env, cfg.dppo.num_envs, *processors, config.n_obs_steps, config.n_action_steps
-    )
+    overrides = {"device_processor": {"device": config.device or "cpu"}}
+    processors = make_pre_post_processors(config, str(path), preprocessor_overrides=overrides)
+    agent = make_agent(policy, dppo)
+    windows = config.n_obs_steps, config.n_action_steps
+    return Practice(policy, agent, make_decision_env(env, dppo.num_envs, *processors, *windows), processors)
+
+
+def load_practice(
+    path: Path, task: Path, dppo: DppoConfig, device: str, backend: str | None = None
+) -> Practice:
+    """The same of a checkpoint's folder and a file as in configs/env; both on ``device`` (cpu, cuda).
+
+    ``backend`` of the simulation; default: the file's.
+    """
+    env = draccus.decode(EnvConfig, read_yaml(task)["env"])
+    if isinstance(env, VtRefineEnvConfig):
+        env.backend, env.warp = backend or env.backend, replace(env.warp, device=device)
+    policy = VtDp3Policy.from_pretrained(path).to(device)
+    policy.config.device = device
+    return make_practice(policy, path, env, dppo)
 
 
 class Recorder:
@@ -279,11 +304,8 @@ def run(cfg: FinetunePipelineConfig) -> None:
     device = torch.device(policy.config.device or "cpu")
     join_ranks(device)
     set_seed(cfg.seed + rank_index())
-    overrides = {"device_processor": {"device": str(device)}}
-    processors = make_pre_post_processors(policy.config, str(path), preprocessor_overrides=overrides)
-    agent = make_agent(policy, cfg.dppo)
+    policy, agent, env, processors = make_practice(policy, path, cfg.env, cfg.dppo)
     save_config(cfg, policy.config)
-    env = make_env_for(cfg, policy, processors)
     state = TrainState.create(agent, cfg.dppo, env.privileged_dim, cfg.seed)
     recorder = Recorder(cfg, env, agent, Saveable(policy, *processors, cfg))
     with logging_redirect_tqdm():

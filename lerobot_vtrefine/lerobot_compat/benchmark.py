@@ -28,7 +28,7 @@ def run() -> list[Row]:
     """(what, ratio, explanation) for windows of two frames of pads and depth, and eight actions."""
     with tempfile.TemporaryDirectory() as folder:
         root = Path(folder) / "frames"
-        _record(root)
+        record_noise(root, EPISODES, FRAMES)
         stock.DatasetReader = DatasetReader
         theirs = _seconds(_batches(root))
         fast_reader.install()
@@ -37,11 +37,12 @@ def run() -> list[Row]:
     return [("training batch, LeRobot's reader / read at once", theirs / ours, explanation)]
 
 
-def _record(root: Path) -> None:
+def record_noise(root: Path, episodes: int, frames: int) -> None:
+    """A dataset with the columns of a recording, and random numbers in them."""
     random = np.random.default_rng(0)
     dataset = LeRobotDataset.create("local/frames", FPS, dataset_features(HEIGHT, WIDTH, ALOHA), root)
-    for _ in range(EPISODES):
-        for _ in range(FRAMES):
+    for _ in range(episodes):
+        for _ in range(frames):
             frame = raw_to_frame(_raw(random), ALOHA)
             dataset.add_frame({**frame, ACTION_KEY: _joints(random), "task": "insert"})
         dataset.save_episode()

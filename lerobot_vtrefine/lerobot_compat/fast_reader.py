@@ -266,7 +266,7 @@ class FrameStore:
         for block in self.blocks:
             picked = rows if block.offsets is None else windows[block.offsets]
             columns = block.read(picked.ravel(), picked.shape, block.batch_dtype)
-            found |= {key: value.contiguous() for key, value in columns.items()}
+            found |= columns
         for key, video in self.videos.items():
             found[key] = video.read(rows if video.offsets is None else windows[video.offsets])
         for key in self.lazy_keys:

@@ -7,7 +7,6 @@ and that nothing imports LeRobot's dataset code before it is needed.
 import logging
 import sys
 from collections.abc import Sequence
-from dataclasses import dataclass
 from multiprocessing.context import get_spawning_popen
 from typing import Any, override
 
@@ -17,6 +16,7 @@ from torch.utils.data._utils.collate import default_collate_fn_map
 
 from lerobot_vtrefine.datasets.features import TACTILE_PREFIX
 from lerobot_vtrefine.lerobot_compat.fast_reader import DATASET_MODULE, FrameStore, NotCoveredError
+from lerobot_vtrefine.lerobot_compat.packed_batch import PackedBatch
 
 logger = logging.getLogger(__name__)
 
@@ -62,7 +62,7 @@ class FastDatasetReader(DatasetReader):
         item["task"] = store.tasks[int(item["task_index"])]
         return item
 
-    def get_batch(self, indices: Sequence[int]) -> dict[str, Any] | None:
+    def get_batch(self, indices: Sequence[int]) -> PackedBatch | None:
         """What a data loader would collate from the items, read at once, with counts as uint8; None where it
         must read items.
         """
@@ -72,7 +72,7 @@ class FastDatasetReader(DatasetReader):
         batch = store.batch(indices)
         self._finish(batch)
         batch["task"] = [store.tasks[index] for index in batch["task_index"].tolist()]
-        return batch
+        return PackedBatch.of(batch)
 
     def _finish(self, item: dict[str, Any]) -> None:
         """Image transforms, and depth in the unit that was asked for, in place."""
@@ -84,18 +84,11 @@ class FastDatasetReader(DatasetReader):
                 item[key] = item[key] * MM_PER_METRE if unit == "m" else item[key] / MM_PER_METRE
 
 
-@dataclass(frozen=True)
-class WholeBatch:
-    """A batch that needs no collating."""
-
-    columns: dict[str, Any]
-
-
 def serve_batches() -> None:
     """Let data loaders ask LeRobot's datasets for whole batches. Idempotent."""
     dataset_class: Any = sys.modules[DATASET_MODULE].LeRobotDataset
     dataset_class.__getitems__ = _items_at_once
-    default_collate_fn_map[WholeBatch] = _as_it_is
+    default_collate_fn_map[PackedBatch] = _as_it_is
 
 
 def _items_at_once(dataset: Any, indices: Sequence[int]) -> list[Any]:
@@ -104,8 +97,8 @@ def _items_at_once(dataset: Any, indices: Sequence[int]) -> list[Any]:
     batch = None
     if isinstance(reader, FastDatasetReader) and dataset.writer is None:
         batch = reader.get_batch(indices)
-    return [dataset[index] for index in indices] if batch is None else [WholeBatch(batch)]
+    return [dataset[index] for index in indices] if batch is None else [batch]
 
 
-def _as_it_is(batch: list[WholeBatch], *, collate_fn_map: Any = None) -> dict[str, Any]:
-    return batch[0].columns
+def _as_it_is(batch: list[PackedBatch], *, collate_fn_map: Any = None) -> PackedBatch:
+    return batch[0]

@@ -5,6 +5,8 @@ Shapes: ``B`` frames, ``H, W`` image, ``N`` point budget. All functions are pure
 ``B``.
 """
 
+from functools import lru_cache
+
 import torch
 from torch import Tensor
 
@@ -38,13 +40,9 @@ def deproject(depth_m: Tensor, intrinsics: Tensor, camera_pose: Tensor, pixel_st
     columns = torch.arange(0, width, pixel_stride, device=depth_m.device, dtype=depth_m.dtype)
     rows = torch.arange(0, height, pixel_stride, device=depth_m.device, dtype=depth_m.dtype)
     across, down = (columns - cx) / fx, (rows - cy) / fy
-    rotation = rotation_from_quaternion(camera_pose[:, 3:])
-    axes = []
-    for axis in range(3):  # the ray is separable in rows and columns: no (B, P, 3) ray image is needed
-        right, low, ahead = (rotation[:, axis, i, None] for i in range(3))
-        ray = (right * across)[:, None, :] + (low * down + ahead)[:, :, None]
-        axes.append((ray * depth_m + camera_pose[:, axis, None, None]).flatten(1))
-    return torch.stack(axes)
+    right, low, ahead = rotation_from_quaternion(camera_pose[:, 3:]).permute(2, 1, 0).unsqueeze(-1)
+    ray = (right * across).unsqueeze(-2) + (low * down + ahead).unsqueeze(-1)  # (3, B, rows, columns)
+    return (ray * depth_m + camera_pose[:, :3].T[..., None, None]).flatten(2)
 
 
 def select_evenly(mask: Tensor, budget: int) -> tuple[Tensor, Tensor]:
@@ -53,16 +51,12 @@ def select_evenly(mask: Tensor, budget: int) -> tuple[Tensor, Tensor]:
     mask (B, P) bool. Returns indices (B, budget) long and found (B,) bool. Rows with fewer true entries than
     the budget repeat them; rows without any get index 0 and ``found`` false.
     """
-    counts = mask.sum(dim=1)
-    flat = mask.flatten().nonzero().squeeze(1)
-    starts = counts.cumsum(0) - counts
-    last = (counts - 1).clamp(min=0)[:, None]
-    ranks = torch.arange(budget, device=mask.device) * last // max(budget - 1, 1)
+    ordinals = mask.cumsum(dim=1, dtype=torch.int32)  # of the true entries, from 1 on; no wait for a GPU
+    counts = ordinals[:, -1:]
+    ranks = torch.arange(budget, device=mask.device) * (counts - 1).clamp(min=0) // max(budget - 1, 1)
     found = counts > 0
-    if flat.numel() == 0:
-        return torch.zeros_like(ranks), found
-    positions = (starts[:, None] + ranks).clamp(max=flat.numel() - 1)
-    return torch.where(found[:, None], flat[positions] % mask.shape[1], 0), found
+    picks = torch.searchsorted(ordinals, (ranks + 1).to(ordinals.dtype))
+    return torch.where(found, picks, 0), found.squeeze(1)
 
 
 def add_depth_noise(points: Tensor, noise_level: Tensor, generator: torch.Generator | None = None) -> Tensor:
@@ -88,6 +82,14 @@ def check_millimetres(depth: Tensor) -> None:
         )
 
 
+@lru_cache(maxsize=8)
+def _corners(
+    crop_min_m: tuple[float, ...], crop_max_m: tuple[float, ...], device: torch.device, dtype: torch.dtype
+) -> Tensor:
+    """(2, 3) the box's lower and upper corner; uploading them would make every call wait for a GPU."""
+    return torch.tensor([crop_min_m, crop_max_m], device=device, dtype=dtype)
+
+
 def visual_points(
     depth_mm: Tensor,
     intrinsics: Tensor,
@@ -106,11 +108,10 @@ def visual_points(
     """
     check_millimetres(depth_mm)
     coordinates = deproject(depth_mm * METRES_PER_MM, intrinsics, camera_pose, pixel_stride)
-    mask = (depth_mm[:, ::pixel_stride, ::pixel_stride] > 0).flatten(1)
-    for axis, values in enumerate(coordinates):
-        mask &= (values >= crop_min_m[axis]) & (values <= crop_max_m[axis])
-    indices, found = select_evenly(mask, budget)
-    points = torch.stack([values.gather(1, indices) for values in coordinates], dim=-1)
-    centre = (points.new_tensor(crop_min_m) + points.new_tensor(crop_max_m)) / 2
-    points = torch.where(found[:, None, None], points, centre)
+    low, high = _corners(crop_min_m, crop_max_m, coordinates.device, coordinates.dtype)
+    inside = ((coordinates >= low[:, None, None]) & (coordinates <= high[:, None, None])).all(dim=0)
+    inside &= (depth_mm[:, ::pixel_stride, ::pixel_stride] > 0).flatten(1)
+    indices, found = select_evenly(inside, budget)
+    points = coordinates.gather(2, indices.expand(3, -1, -1)).permute(1, 2, 0)
+    points = torch.where(found[:, None, None], points, (low + high) / 2)
     return add_depth_noise(points, noise_level, generator)

@@ -13,6 +13,7 @@ MESH_PAIR_PREFIX = "automate/"
 MAX_TABLE_HEIGHT_M = 0.2
 SOCKETS = ("held", "stands")
 BACKENDS = ("single", "batch", "warp")
+WARP_SOLVERS = ("own", "stock")
 IDEAL_NOISE_LEVEL = 3.0
 CONTROL_HZ = (1, 100)
 """Slowest and fastest control rate: command rates, servo model and grasp are tried in between."""
@@ -242,12 +243,16 @@ class WarpConfig:
     """Rows of constraints in any one world: 4 per contact, of which a round plug on the rim makes 84."""
     solver_iterations: int = 10
     """Newton steps of the constraint solver at most: mostly one or two do, but worlds wait for each other."""
+    solver: str = "own"
+    """own (this package's order of kernels and constraint solver), or stock (mujoco_warp's own step)."""
     graph: bool = True
     """Record a substep as a CUDA graph, where the GPU and its driver can."""
 
     def __post_init__(self) -> None:
         if not re.fullmatch(r"auto|cpu|cuda(:\d+)?", self.device):
             raise ValueError(f"warp.device must be auto, cpu, cuda or cuda:0, not {self.device!r}")
+        if self.solver not in WARP_SOLVERS:
+            raise ValueError(f"warp.solver must be {' or '.join(WARP_SOLVERS)}, not {self.solver!r}")
         for name in ("contacts_per_world", "rows_per_world", "solver_iterations"):
             if getattr(self, name) < 1:
                 raise ValueError(f"warp.{name} must be at least 1, got {getattr(self, name)}")

@@ -74,6 +74,10 @@ def test_parts_are_shortened_unless_full(monkeypatch: pytest.MonkeyPatch, tmp_pa
         (["--plot", "--device=cpu"], "--plot and --device are two different things"),
         (["--device=tpu"], "warp.device must be auto, cpu, cuda or cuda:0, not 'tpu'"),
         (["--limit_s=0"], "--limit_s must be above 0"),
+        (
+            ["--device=cpu", "--solver=own,theirs"],
+            "--solver must be own, stock or own,stock, got 'own,theirs'",
+        ),
     ],
 )
 def test_bad_values_are_one_line(
@@ -86,15 +90,20 @@ def test_bad_values_are_one_line(
     assert message in said[0]
 
 
-def test_device_prints_a_row_per_number_of_worlds(
+def test_device_prints_a_row_per_number_of_worlds_and_compares_solvers(
     monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    flags = ["--device=cpu", "--worlds=1", "--steps=2"]
+    flags = ["--device=cpu", "--worlds=1", "--steps=2", "--solver=own,stock"]
     monkeypatch.setattr(sys, "argv", ["vtrefine-bench", *flags])
     assert bench.main() == 0
     lines = capsys.readouterr().out.strip().splitlines()
-    assert lines[0].split()[0] == "worlds"
-    assert lines[1].split()[0] == "1"
+    for solver, rows in (("own", lines[:3]), ("stock", lines[3:6])):
+        assert rows[0] == f"solver {solver}:"
+        assert rows[1].split()[0] == "worlds"
+        assert rows[2].split()[0] == "1"
+    whole, physics = lines[6:]
+    assert "control step of 1 worlds, stock / own" in whole
+    assert "physics of 1 worlds, stock / own" in physics
 
 
 def test_plot_writes_a_picture_and_a_table(

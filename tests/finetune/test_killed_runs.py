@@ -63,6 +63,15 @@ def run_and_die(arguments: list[str], folder: Path, when: int | tuple[str, str])
     os._exit(main())
 
 
+@pytest.fixture(autouse=True)
+def one_thread():
+    """A forked child has none of its parent's OpenMP threads, and would wait for them for ever."""
+    before = torch.get_num_threads()
+    torch.set_num_threads(1)
+    yield
+    torch.set_num_threads(before)
+
+
 @pytest.fixture
 def command(tmp_path, monkeypatch):
     """Runs the command into a folder, in this process; with an operation, in one that is killed before it.

@@ -2,6 +2,7 @@
 
 import json
 import pickle
+import re
 import shutil
 from pathlib import Path
 
@@ -86,10 +87,15 @@ def test_resumed_run_equals_the_uninterrupted_one(finetune, tmp_path, encoder):
     assert rows[0] == rows[1]
 
 
-def test_records_and_checkpoint(finetune, tmp_path):
+def test_records_and_checkpoint(finetune, tmp_path, capsys):
     output = tmp_path / "run"
     assert finetune(output, iterations=2) == 0
     rows = read_progress(output)
+    counts = [f"({round(12 * row['eval_success'])} of 12 episodes)" for row in (rows[0], rows[-1])]
+    said = capsys.readouterr().out
+    assert re.search(
+        rf"DPPO .*: success went from .*{re.escape(counts[0])} to .*{re.escape(counts[1])}", said
+    )
     assert [row["iteration"] for row in rows] == [0, 1, 2]
     assert {"success", "return", "approx_kl", "clip_fraction", "explained_variance", "steps_per_s"} <= rows[
         1

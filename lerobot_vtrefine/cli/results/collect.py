@@ -103,8 +103,8 @@ def finetune_row(
         outcomes = info["per_task"][0]["metrics"]["successes"]
         success, episodes = sum(map(bool, outcomes)) / len(outcomes), len(outcomes)
     elif "eval_success" in progress[-1]:
-        batch = settings["dppo"]["num_envs"]
-        success, episodes = progress[-1]["eval_success"], -(-settings["eval"]["n_episodes"] // batch) * batch
+        success = progress[-1]["eval_success"]
+        episodes = evaluated_episodes(settings["eval"]["n_episodes"], settings["dppo"]["num_envs"])
     else:
         raise ValueError(f"{folder} was not evaluated; run lerobot-eval with --output_dir={folder / 'eval'}")
     saved = read_json(folder / "checkpoints" / "last" / "pretrained_model" / "config.json")
@@ -126,6 +126,11 @@ def finetune_row(
         **origin_of(folder, **origin),
     )
     return row, progress
+
+
+def evaluated_episodes(wanted: int, num_envs: int) -> int:
+    """Episodes of a run's own evaluation: whole batches of all environments."""
+    return -(-wanted // num_envs) * num_envs
 
 
 def earlier_rows(final: Run, progress: Progress) -> list[Run]:

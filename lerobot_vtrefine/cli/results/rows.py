@@ -64,6 +64,7 @@ class Run(Row):
         "policies",
         "reality",
         "expert",
+        "reference",
     )
 
     task: str

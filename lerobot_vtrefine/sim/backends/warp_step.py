@@ -18,7 +18,7 @@ import mujoco
 import mujoco_warp as mjw
 import numpy as np
 import warp as wp
-from mujoco_warp._src import collision_convex, collision_driver, forward, smooth
+from mujoco_warp._src import collision_driver, forward, smooth
 from mujoco_warp._src.types import CollisionType
 
 from lerobot_vtrefine.sim.backends import warp_contact_kernels as kernels
@@ -28,8 +28,6 @@ from lerobot_vtrefine.sim.backends.warp_solve import solve
 APART = 32
 """Threads of a warp."""
 NET_FORCE = 3
-SIMPLEX = 5
-"""Vertices with which the search for a penetration begins at most; it adds one an iteration."""
 DATA = 1 | 2 | 4 | 16
 """found, force, torque, position of mjtConDataField."""
 
@@ -48,10 +46,6 @@ class WarpStep:
 
     def __init__(self, host: mujoco.MjModel, model: mjw.Model, data: mjw.Data, concurrent: bool) -> None:
         self._model, self._data = model, data
-        # Room for the edges that a new vertex sees: a convex polytope of V vertices has 3 V - 6 edges in all.
-        # mujoco_warp sets aside 24, which a round plug in its hole has needed more of.
-        edges = 3 * (SIMPLEX + host.opt.ccd_iterations) - 6
-        collision_convex.MJ_MAX_EPAHORIZON = max(collision_convex.MJ_MAX_EPAHORIZON, edges)
         names = ("forces", "rows", "convex") if concurrent else ()
         self._streams = {name: wp.Stream(wp.get_device()) for name in names}
         own, other = _sides(host)

@@ -5,12 +5,14 @@ Shapes: N worlds, K substeps, nq positions, nv velocities, nu servos, ns sensor 
 
 import copy
 from collections.abc import Callable
+from functools import partial
 
 import mujoco
 import mujoco_warp as mjw
 import numpy as np
 import torch
 import warp as wp
+from mujoco_warp._src import collision_convex as convex
 
 from lerobot_vtrefine.sim.backends import warp_kernels as kernels
 from lerobot_vtrefine.sim.backends.warp_memory import Recording, record
@@ -36,6 +38,8 @@ LOSSES = sum(int(flag) for flag in OVERFLOWS)
 
 LONGEST = 40
 """Substeps in one graph: those of a control step. Launches of their own would leave gaps between them."""
+SIMPLEX = 5
+"""Vertices with which the search for a penetration begins at most; it adds one an iteration."""
 LEAST_ROWS = 3
 """Rows of constraints that a contact takes at least: no contact sensor can match more contacts than fit."""
 
@@ -69,10 +73,15 @@ class WarpWorlds:
         with wp.ScopedDevice(self.device):
             self.model = mjw.put_model(_with_primitive_boxes(model))
             _set_options(self.model, config)
+            _make_room_for_edges(model.opt.ccd_iterations)
             self.data = mjw.make_data(
                 model, num_envs, nconmax=config.contacts_per_world, njmax=config.rows_per_world
             )
-            self.step = WarpStep(model, self.model, self.data, wp.get_device().is_cuda)
+            self.step: Callable[[], None]
+            if config.solver == "stock":
+                self.step = partial(mjw.step, self.model, self.data)
+            else:
+                self.step = WarpStep(model, self.model, self.data, wp.get_device().is_cuda)
         data = self.data
         self.qpos, self.qvel = wp.to_torch(data.qpos), wp.to_torch(data.qvel)
         self.warmstart, self.time = wp.to_torch(data.qacc_warmstart), wp.to_torch(data.time)
@@ -231,6 +240,14 @@ def _set_options(model: mjw.Model, config: WarpConfig) -> None:
     model.opt.run_qacc_smooth = False  # Newton's method starts from the last step's accelerations anyway
     if wp.get_device().is_cuda:
         model.opt.graph_conditional = wp.is_conditional_graph_supported()
+
+
+def _make_room_for_edges(iterations: int) -> None:
+    """Room for the edges that a new vertex sees: a convex polytope of V vertices has 3 V - 6 edges in all.
+    mujoco_warp sets aside 24, which a round plug in its hole has needed more of.
+    """
+    edges = 3 * (SIMPLEX + iterations) - 6
+    setattr(convex, "MJ_MAX_EPAHORIZON", max(convex.MJ_MAX_EPAHORIZON, edges))  # noqa: B010  no literal 24
 
 
 def _can_capture(device: str) -> bool:
