@@ -206,15 +206,17 @@ def make_practice(policy: VtDp3Policy, path: Path, env: EnvConfig, dppo: DppoCon
 
 
 def load_practice(
-    path: Path, task: Path, dppo: DppoConfig, device: str, backend: str | None = None
+    path: Path, task: Path, dppo: DppoConfig, device: str, backend: str | None = None, **fields: Any
 ) -> Practice:
     """The same of a checkpoint's folder and a file as in configs/env; both on ``device`` (cpu, cuda).
 
-    ``backend`` of the simulation; default: the file's.
+    ``backend`` of the simulation; default: the file's. ``fields`` of the environment that differ from it.
     """
     env = draccus.decode(EnvConfig, read_yaml(task)["env"])
     if isinstance(env, VtRefineEnvConfig):
-        env.backend, env.warp = backend or env.backend, replace(env.warp, device=device)
+        env = replace(
+            env, backend=backend or env.backend, warp=replace(env.warp, device=device), **fields
+        )
     policy = VtDp3Policy.from_pretrained(path).to(device)
     policy.config.device = device
     return make_practice(policy, path, env, dppo)
