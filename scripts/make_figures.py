@@ -34,7 +34,11 @@ CURVES = {
 }
 """Learning curves that show what the size of a step does, by their names in docs/step_size_curves.csv."""
 POLICIES = {"visuo_tactile": BLUE, "visual": ORANGE}
-HARD_TASK = "square_1mm_slip"
+LEARNED = {
+    "cross_gentle": "needs touch: cross, 5 N (GPU)",
+    "square_1mm_slip": "square, 1 mm (GPU)",
+}
+"""Tasks of the table ``converges`` whose stages are drawn."""
 STAGES = {"imitation": "imitation", "half-way": "half-way", "": "after DPPO"}
 TASKS = {
     "demo": "round,\n2 mm",
@@ -268,18 +272,14 @@ def rms(values: np.ndarray) -> float:
 
 
 def draw_results(plt: Any) -> None:
-    """Success with touch and without: a hard pair on a GPU, and the demo's recipe on five tasks."""
+    """Success with touch and without: a task that needs touch, a hard pair, and five with the paper's cloud."""
     rows = [row for row in read_all(ROOT / "results") if isinstance(row, Run)]
-    figure, (left, right) = plt.subplots(
-        1, 2, figsize=(11.5, 4.0), sharey=True, width_ratios=[3, 5], layout="constrained"
+    figure, (*left, right) = plt.subplots(
+        1, 3, figsize=(13.5, 4.0), sharey=True, width_ratios=[3, 3, 5], layout="constrained"
     )
-    hard = [row for row in rows if row.table == "converges" and row.task == HARD_TASK]
-    for place, variant in enumerate(STAGES):
-        for side, (policy, colour) in enumerate(POLICIES.items()):
-            found = [100 * r.success for r in hard if (r.policy, r.variant) == (policy, variant)]
-            draw_seeds(left, place + (side - 0.5) * 0.36, found, colour)
-    left.set_xticks(range(len(STAGES)), list(STAGES.values()))
-    left.set_title("square pair, 1 mm, parts askew (GPU)", loc="left")
+    for ax, (task, title) in zip(left, LEARNED.items(), strict=True):
+        draw_stages(ax, [row for row in rows if row.table == "converges" and row.task == task])
+        ax.set_title(title, loc="left")
     for place, task in enumerate(TASKS):
         for side, (policy, colour) in enumerate(POLICIES.items()):
             mine = [r for r in rows if (r.table, r.task, r.policy) == ("touch", task, policy)]
@@ -288,8 +288,8 @@ def draw_results(plt: Any) -> None:
             before = np.mean([100 * r.success for r in mine if r.variant == "imitation"])
             right.plot([x - 0.15, x + 0.15], [before] * 2, color="black", lw=1.5, zorder=3)
     right.set_xticks(range(len(TASKS)), list(TASKS.values()), fontsize=11)
-    right.set_title("the demo's recipe (laptop), after DPPO", loc="left")
-    left.set(ylabel="success [%]", ylim=(0, 100))
+    right.set_title("the paper's cloud, easier tasks, after DPPO", loc="left")
+    left[0].set(ylabel="success [%]", ylim=(0, 100))
     handles = [
         Patch(color=BLUE, alpha=0.45, label="vision and touch"),
         Patch(color=ORANGE, alpha=0.45, label="vision only"),
@@ -298,6 +298,16 @@ def draw_results(plt: Any) -> None:
     ]
     figure.legend(handles=handles, ncols=4, frameon=False, loc="outside lower center")
     figure.savefig(IMAGES / "results.png")
+
+
+def draw_stages(ax: Any, rows: list[Run]) -> None:
+    """One task's success in the stages of training that its rows have."""
+    stages = {name: title for name, title in STAGES.items() if any(row.variant == name for row in rows)}
+    for place, variant in enumerate(stages):
+        for side, (policy, colour) in enumerate(POLICIES.items()):
+            found = [100 * r.success for r in rows if (r.policy, r.variant) == (policy, variant)]
+            draw_seeds(ax, place + (side - 0.5) * 0.36, found, colour)
+    ax.set_xticks(range(len(stages)), list(stages.values()))
 
 
 def draw_seeds(ax: Any, x: float, found: list[float], colour: str) -> None:
