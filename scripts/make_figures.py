@@ -272,7 +272,7 @@ def rms(values: np.ndarray) -> float:
 
 
 def draw_results(plt: Any) -> None:
-    """Success with touch and without: a task that needs touch, a hard pair, and five with the paper's cloud."""
+    """Success with touch and without: where it is needed, on a hard pair, with the paper's cloud."""
     rows = [row for row in read_all(ROOT / "results") if isinstance(row, Run)]
     figure, (*left, right) = plt.subplots(
         1, 3, figsize=(13.5, 4.0), sharey=True, width_ratios=[3, 3, 5], layout="constrained"
