@@ -117,7 +117,7 @@ def test_too_few_recordings_and_other_kinds_are_refused(tmp_path: Path) -> None:
         calibrate(replace(recordings, kind="robot"), Wanted())
 
 
-def test_both_contact_stages_foretell_the_same(tmp_path: Path) -> None:
+def test_both_contact_stages_predict_the_same(tmp_path: Path) -> None:
     recordings = recorded(tmp_path / "set", 7)
     models = [calibrate(recordings, Wanted(contact=name)).model for name in ("kelvin_voigt", "consistent")]
     assert [model.contact.name for model in models] == ["kelvin_voigt", "consistent"]

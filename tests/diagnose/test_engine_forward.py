@@ -1,14 +1,16 @@
 """The engine's fast forward path equals what users' predictions are made with."""
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 
-from lerobot_vtrefine.diagnose.pad.baseline import describe
+from lerobot_vtrefine.diagnose.pad.baseline import describe, plain_weights
 from lerobot_vtrefine.diagnose.pad.candidates import CATALOGUE
 from lerobot_vtrefine.diagnose.pad.candidates.base import Form
-from lerobot_vtrefine.diagnose.pad.fitting import predict
+from lerobot_vtrefine.diagnose.pad.fitting import fit, predict
+from lerobot_vtrefine.diagnose.pad.forward_model.run import LoweredBench, run_stages
 from lerobot_vtrefine.diagnose.pad.model import Composite, sensor_model
 from lerobot_vtrefine.diagnose.pad.prediction import predict_trial
 from lerobot_vtrefine.diagnose.pad.press_trials import PressSet, prepare
@@ -91,3 +93,34 @@ def test_the_saved_model_predicts_the_same(tmp_path: Path) -> None:
     press = held.presses[1]
     again = predict_trial(SensorModel.load(tmp_path / "sensor_model.json"), press.trial, held.layout)
     assert np.array_equal(again, predict_trial(model, press.trial, held.layout))
+
+
+def test_a_lowered_face_is_a_press_less_deep() -> None:
+    held, by_m = presses(), 5e-5
+    lower = [replace(press.trial, depth_m=press.trial.depth_m - by_m) for press in held.presses]
+    recordings = RecordingSet(Path(), "pad", 5, 8, 0.002, "adc_counts", 255.0, (), tuple(lower))
+    again = prepare(recordings, lower, [0, 1, 2])
+    stages = composite(held).stages()
+    pairs = zip(held.presses, run_stages(stages, LoweredBench(held.bench, by_m)), strict=True)
+    for (press, signal), other, expected in zip(
+        pairs, again.presses, predict(composite(held), again), strict=True
+    ):
+        mine, theirs = np.isin(press.taxels, other.taxels), np.isin(other.taxels, press.taxels)
+        assert mine.any()
+        assert np.allclose(signal[:, mine], expected[:, theirs], atol=1e-9)
+
+
+def test_a_fit_goes_on_where_it_stopped() -> None:
+    held = presses()
+    raised = [
+        replace(press, signal=signal)
+        for press, signal in zip(held.presses, predict(composite(held), held), strict=True)
+    ]
+    held = replace(held, presses=tuple(raised))
+    start = composite(held).at(np.array([np.log(3e5), 1e-3]))
+    weights = plain_weights(held)
+    stopped = fit(start, held, weights, 1)
+    assert stopped.loss > 1e-6
+    on, anew = fit(stopped, held, weights), fit(stopped.model, held, weights)
+    assert np.array_equal(on.model.values, anew.model.values)
+    assert np.allclose(on.model.values, composite(held).values, rtol=1e-3)

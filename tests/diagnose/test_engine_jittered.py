@@ -28,6 +28,17 @@ def test_late_readings_show_although_damping_rests_on_its_bound() -> None:
     assert found["scan_skew"].probe.scores.min() > 0
 
 
+def test_an_early_touch_is_asked_about_by_a_face_that_lies_higher() -> None:
+    # A deeper face says nothing about frames and taxels that only a higher one reaches.
+    held = recorded("offset_early", 0.2, 1)
+    problem, fitted = PadProblem(prepare(held, list(held.trials), list(range(len(held.trials))))).weighed(
+        None
+    )
+    (found,) = problem.screened(fitted, ["contact_offset"])
+    assert found.tested.passed
+    assert found.tested.probe.values[0] < 0
+
+
 @pytest.mark.slow
 def test_first_load_softening_is_named() -> None:
     found = diagnose_pad(recorded("mullins", 0.5, 0))

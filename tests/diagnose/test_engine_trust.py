@@ -23,6 +23,7 @@ def fits(name, errors):
     ("weighed", "even", "doubtful", "handed_out"),
     [
         (BASELINE - 5, BASELINE - 4, False, "weighed"),
+        (BASELINE - 4, BASELINE - 5, False, "even"),
         (BASELINE + 1, BASELINE - 4, False, "even"),
         (BASELINE + 1, BASELINE + 2, False, "plain"),
         (BASELINE - 5, BASELINE - 4, True, "weighed"),
@@ -35,8 +36,8 @@ def test_the_best_trustworthy_model_is_handed_out(monkeypatch, weighed, even, do
     plain, found = fits("plain", BASELINE), fits("weighed", weighed)
     monkeypatch.setattr(final_model, "rest", lambda model, presses, weights: plain)
     monkeypatch.setattr(final_model, "out_of_fold", lambda problem, fit, folds: fit.held)
-    alike = SimpleNamespace(weights=(), refitted=lambda fit: fits("even", even))
-    problem = SimpleNamespace(presses=None, folds=None, even=alike)
+    monkeypatch.setattr(final_model, "fit", lambda model, presses, weights: fits("even", even))
+    problem = SimpleNamespace(presses=None, folds=None, even=SimpleNamespace(weights=()))
     assert final_model.trusted(problem, plain, found, 0, doubtful=doubtful) == handed_out
 
 

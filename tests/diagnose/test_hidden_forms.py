@@ -1,4 +1,4 @@
-"""Truths of other functional forms than a family's plain one: named once, without extras, and foretold."""
+"""Truths of other functional forms than a family's plain one: named once, without extras, and predicted."""
 
 import pytest
 from hidden.grading import names_of

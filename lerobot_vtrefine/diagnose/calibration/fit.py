@@ -1,7 +1,7 @@
 """Stiffness, damping and readout from press recordings, with intervals from resampling whole recordings.
 
 The model is the paper's (appendix, "Tactile Calibration"): f = max(0, k_n d + k_d d') per taxel, reading =
-gain f on an idle level; a saturation is added only if recordings that its fit has not seen are foretold
+gain f on an idle level; a saturation is added only if recordings that its fit has not seen are predicted
 better with it.
 """
 
@@ -146,7 +146,7 @@ def _presses(recordings: RecordingSet, wanted: Wanted) -> PressSet:
 
 
 def _with_saturation(baseline: Baseline, presses: PressSet, seed: int) -> tuple[Fit, float | None]:
-    """The fit with a saturation where it foretells recordings better, else as it is; and the p-value."""
+    """The fit with a saturation where it predicts recordings better, else as it is; and the p-value."""
     plain = baseline.fitted
     richer = fit(plain.model.plus(saturation.FORMS[0], np.array([0.3])), presses, baseline.weights)
     if not richer.loss < plain.loss:

@@ -28,7 +28,7 @@ from lerobot_vtrefine.diagnose.pad.intervals import (
 )
 from lerobot_vtrefine.diagnose.pad.problem import Candidate, PadProblem
 from lerobot_vtrefine.diagnose.pad.screening import DEAD, GAIN_MAP, MAPS, forms_of
-from lerobot_vtrefine.diagnose.pad.views import Foretold
+from lerobot_vtrefine.diagnose.pad.views import Predicted
 from lerobot_vtrefine.diagnose.verdict import Parameter
 from lerobot_vtrefine.tactile.model import SensorModel
 
@@ -61,10 +61,10 @@ class PadAccount:
         return power_of(self.problem, self.fit)
 
     @cached_property
-    def _foretold(self) -> list[Foretold]:
+    def _predicted(self) -> list[Predicted]:
         selection, predictions = self.found.selection, self.found.test.predictions
         before, after = (predictions.of(item.sensor) for item in (selection.baseline, selection.fit))
-        return views.foretold(self.found.test.presses, before, after)
+        return views.predicted(self.found.test.presses, before, after)
 
     def parameters(self, cause: str, channels: tuple[int, ...]) -> Mapping[str, Parameter]:
         """With intervals by leaving out every motion."""
@@ -132,11 +132,11 @@ class PadAccount:
 
     def drawings(self, test: PadProblem, seed: int) -> tuple[tuple[Trace, ...], tuple[ResidualView, ...]]:
         """Held-out recordings at the taxels that answer most, and what residuals may follow."""
-        return views.traces(self._foretold), views.residual_views(self._foretold, seed)
+        return views.traces(self._predicted), views.residual_views(self._predicted, seed)
 
     def maps(self) -> dict[str, np.ndarray]:
         """Title -> (R, C)."""
-        return views.residual_maps(self._foretold, self.whole.presses)
+        return views.residual_maps(self._predicted, self.whole.presses)
 
 
 def other_forms(problem: PadProblem, fitted: Fit, index: int) -> list[dict[str, tuple[float, str]]]:

@@ -6,7 +6,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from lerobot_vtrefine.diagnose.pad.candidates.base import Setting
-from lerobot_vtrefine.diagnose.pad.fitting import Fit, fit, predict, rest
+from lerobot_vtrefine.diagnose.pad.fitting import Fit, fit, rest
+from lerobot_vtrefine.diagnose.pad.forward_model.run import LoweredBench, run_stages
 from lerobot_vtrefine.diagnose.pad.model import NOMINAL_K_N, Composite, stiffness_from_load
 from lerobot_vtrefine.diagnose.pad.noise import Noise, fit_frame_noise, fit_repeatability
 from lerobot_vtrefine.diagnose.pad.press_trials import PressSet
@@ -28,7 +29,7 @@ that are very late, say, leave the baseline so wrong that its weights mislead.""
 class Baseline:
     """A fit, the noise around it and the weights that follow from both.
 
-    `plain` is the unweighted least-squares fit: the baseline that foretells plain readings best, and so the
+    `plain` is the unweighted least-squares fit: the baseline that predicts plain readings best, and so the
     one that an extension is measured against.
     """
 
@@ -103,8 +104,8 @@ def offset_tangents(
     """Change of the signal per metre of contact offset (T, n) per recording; None when driven by load."""
     if presses.loaded:
         return None
-    shifted = replace(presses, presses=tuple(press.sunk(OFFSET_STEP_M) for press in presses.presses))
-    return [(a - b) / OFFSET_STEP_M for a, b in zip(predict(model, shifted), signals, strict=True)]
+    shifted = run_stages(model.stages(), LoweredBench(presses.bench, OFFSET_STEP_M))
+    return [(a - b) / OFFSET_STEP_M for a, b in zip(shifted, signals, strict=True)]
 
 
 def touch_doubts(model: Composite, presses: PressSet) -> list[np.ndarray] | None:
@@ -119,15 +120,19 @@ def touch_doubts(model: Composite, presses: PressSet) -> list[np.ndarray] | None
     values[1] = max(float(values[1]), JUMP_DAMPING_S)
     jumpy = model.at(values)
     early, here, late = (
-        predict(jumpy, replace(presses, presses=tuple(press.sunk(by) for press in presses.presses)))
-        for by in (-TOUCH_M, 0.0, TOUCH_M)
+        run_stages(jumpy.stages(), LoweredBench(presses.bench, by)) for by in (-TOUCH_M, 0.0, TOUCH_M)
     )
     return [0.5 * np.abs(a - 2.0 * s + b) for a, s, b in zip(early, here, late, strict=True)]
 
 
-def recording_deviations(fitted: Fit, presses: PressSet, noise: Noise) -> tuple[np.ndarray, np.ndarray]:
-    """Every recording's own relative gain and first touch, by least squares: (K,), (K,) [m]."""
-    offsets = offset_tangents(fitted.model, presses, fitted.signals)
+def recording_deviations(
+    fitted: Fit, presses: PressSet, noise: Noise, offsets: Sequence[np.ndarray] | None
+) -> tuple[np.ndarray, np.ndarray]:
+    """Every recording's own relative gain and first touch, by least squares: (K,), (K,) [m].
+
+    Args:
+        offsets: `offset_tangents` of the fit.
+    """
     gains, touches = [], []
     for index, (press, signal) in enumerate(zip(presses.presses, fitted.signals, strict=True)):
         sigma = noise.sigma(signal)
@@ -146,10 +151,10 @@ def weigh(
     """Noise of a fit (within recordings unless given; between recordings always), and the weights."""
     if noise is None:
         noise = fit_frame_noise(presses, fitted.residuals(presses), fitted.signals)
-    gains, touches = recording_deviations(fitted, presses, noise)
+    offsets = offset_tangents(fitted.model, presses, fitted.signals)
+    gains, touches = recording_deviations(fitted, presses, noise, offsets)
     noise = fit_repeatability(noise, gains, touches, presses.conditions)
-    tangents = offset_tangents(fitted.model, presses, fitted.signals)
-    return noise, tuple(build_weights(noise, fitted.signals, tangents, touch_doubts(fitted.model, presses)))
+    return noise, tuple(build_weights(noise, fitted.signals, offsets, touch_doubts(fitted.model, presses)))
 
 
 def plain_weights(presses: PressSet) -> list[TrialWeights]:

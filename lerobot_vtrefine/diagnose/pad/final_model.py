@@ -117,16 +117,18 @@ def trusted(problem: "PadProblem", plain: Fit, fitted: Fit, seed: int, *, doubtf
     """What is handed out: never a model that predicts plain readings of recordings left out worse than the
     baseline does.
 
-    Named causes are taken as they were weighed, or as plain errors have them where those are worse. Beside an
-    unknown cause (`doubtful`) the better one of both must do clearly better in nearly all recordings: names
-    are symptoms then, and what they stand in for may be otherwise next time.
+    Named causes are taken as they were weighed or refitted to plain readings, whichever predicts better.
+    Beside an unknown cause (`doubtful`) that must be clearly better than the baseline in nearly all
+    recordings: names are symptoms then, and what they stand in for may be otherwise next time.
     """
     even = problem.even
     before = out_of_fold(even, rest(plain.model, problem.presses, even.weights), problem.folds)
-    found = [(fitted.model, out_of_fold(problem, fitted, problem.folds))]
-    if doubtful or found[0][1].gain_over(before) <= 0.0:
-        refitted = even.refitted(fitted)
-        found.append((refitted.model, out_of_fold(even, refitted, problem.folds)))
+    # A map's shrinkage needs the noise, which plain weights do not know: it stays.
+    refitted = fit(fitted.model, problem.presses, even.weights)
+    found = [
+        (fitted.model, out_of_fold(problem, fitted, problem.folds)),
+        (refitted.model, out_of_fold(even, refitted, problem.folds)),
+    ]
     model, held = max(found, key=lambda item: item[1].gain_over(before))
     needed = DOUBTFUL_GAIN if doubtful else 0.0
     lucky = doubtful and not agree((before.errors - held.errors).sum(1), seed, DOUBTFUL_P)

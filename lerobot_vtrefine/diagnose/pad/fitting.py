@@ -167,20 +167,27 @@ def rest(model: Composite, presses: PressSet, weights: Sequence[TrialWeights]) -
 
 
 def fit(
-    model: Composite,
+    start: Composite | Fit,
     presses: PressSet,
     weights: Sequence[TrialWeights],
     max_steps: int = MAX_STEPS,
     held: Sequence[int] = (),
 ) -> Fit:
-    """Least-squares coordinates near those of `model` (Levenberg-Marquardt within bounds).
+    """Least-squares coordinates near those of a model (Levenberg-Marquardt within bounds).
 
     Coordinates numbered in `held` stay; the fit's inner products are then those of the others alone.
+
+    Args:
+        start: a model, or a fit under the same weights with the same coordinates held, which goes on.
     """
+    model = start.model if isinstance(start, Fit) else start
     free = np.setdiff1d(model.free, np.array(held, dtype=int))
     damping = 1e-3
-    signals, columns = tangents(model, presses, free)
-    grams = grams_of(presses, weights, signals, columns)
+    if isinstance(start, Fit):
+        signals, grams = list(start.signals), start.grams
+    else:
+        signals, columns = tangents(model, presses, free)
+        grams = grams_of(presses, weights, signals, columns)
     loss = float(grams[:, -1, -1].sum())
     for _ in range(max_steps):
         moved = model.at(bounded_step(model, grams.sum(axis=0), free, damping))

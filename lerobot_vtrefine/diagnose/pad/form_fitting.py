@@ -22,10 +22,10 @@ Weights = Sequence[TrialWeights]
 Starts = tuple[np.ndarray, ...]
 
 
-def settle(model: Composite, presses: PressSet, weights: Weights) -> Fit:
+def settle(start: Composite | Fit, presses: PressSet, weights: Weights) -> Fit:
     """Fit a model's coordinates; if it holds a map of gains, in turns with the map."""
-    fitted = fit(model, presses, weights)
-    if model.gain_map is None:
+    fitted = fit(start, presses, weights)
+    if fitted.model.gain_map is None:
         return fitted
     for _ in range(2):
         before = fitted.loss
@@ -39,11 +39,11 @@ def with_form(fitted: Fit, form: Form, starts: Starts, presses: PressSet, weight
     """The best fit with a form added, over its starting points."""
     points = starts or _own_starts(fitted, form, presses, weights)
     models = [fitted.model.plus(form, values) for values in points]
-    if len(models) > 1:
-        # A few steps tell which start leads further down.
-        tried = [fit(model, presses, weights, _SCOUTING_STEPS) for model in models]
-        models = [min(tried, key=lambda found: found.loss).model]
-    return settle(models[0], presses, weights)
+    if len(models) == 1:
+        return settle(models[0], presses, weights)
+    # A few steps tell which start leads further down.
+    tried = [fit(model, presses, weights, _SCOUTING_STEPS) for model in models]
+    return settle(min(tried, key=lambda found: found.loss), presses, weights)
 
 
 def grown(plain: Fit, form: Form, presses: PressSet, weights: Weights) -> Fit:

@@ -6,7 +6,7 @@ import numpy as np
 
 from lerobot_vtrefine.diagnose.pad.fitting import predict
 from lerobot_vtrefine.diagnose.pad.model import Composite
-from lerobot_vtrefine.diagnose.pad.press_trials import IdleMap, PressSet
+from lerobot_vtrefine.diagnose.pad.press_trials import IdleMap, Press, PressSet
 
 QUIET_COUNTS = 0.3
 """Expected reading, of 255, up to which a taxel counts as idle."""
@@ -19,18 +19,29 @@ def settled_idle(model: Composite, presses: PressSet) -> IdleMap:
     """The idle map with what the model leaves over in quiet frames, taxel by taxel.
 
     Frames before the first touch are few, and noise with memory makes fewer of them; a taxel beside the
-    indenter is idle all the time.
+    indenter, or on other lines of the pad, is idle all the time.
     """
     signals = predict(model, presses)
     still = predict(model.minus("baseline_drift"), presses)
     limit = QUIET_COUNTS * presses.full_scale / 255.0
     sums = np.zeros((2, presses.layout.num_taxels))
     for press, signal, load in zip(presses.presses, signals, still, strict=True):
-        left = press.signal - signal
-        spread = max(float(np.std(left)), 1e-9)
-        quiet = (np.abs(load) < limit) & ~(press.drive[:, press.scored] > 0)
-        sums[0, press.taxels] += (np.clip(left, -OUTLIER * spread, OUTLIER * spread) * quiet).sum(axis=0)
-        sums[1, press.taxels] += quiet.sum(axis=0)
+        # All readings drift alike.
+        left = press.trial.raw - presses.idle.level.ravel() - np.median(signal - load, axis=1, keepdims=True)
+        left[:, press.taxels] = press.signal - signal
+        quiet = untouched(press)
+        quiet[:, press.taxels] = (np.abs(load) < limit) & ~(press.drive[:, press.scored] > 0)
+        spread = max(float(np.std(press.signal - signal)), 1e-9)
+        sums[0] += (np.clip(left, -OUTLIER * spread, OUTLIER * spread) * quiet).sum(axis=0)
+        sums[1] += quiet.sum(axis=0)
     known = sums[1] >= MIN_FRAMES
     shift = np.where(known, sums[0] / np.maximum(sums[1], 1.0), 0.0)
     return replace(presses.idle, level=presses.idle.level + shift.reshape(presses.idle.level.shape))
+
+
+def untouched(press: Press) -> np.ndarray:
+    """Readings (T, R*C) that nothing can reach: at rest, or on no row and no column with an answer."""
+    rows, cols = np.divmod(press.taxels, press.layout.full_cols)
+    busy = np.zeros((press.layout.full_rows, press.layout.full_cols), dtype=bool)
+    busy[rows], busy[:, cols] = True, True
+    return press.resting[:, None] | ~busy.ravel()

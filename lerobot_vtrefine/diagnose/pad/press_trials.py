@@ -5,6 +5,7 @@ from functools import cached_property
 from typing import TYPE_CHECKING
 
 import numpy as np
+from scipy.ndimage import binary_dilation
 
 from lerobot_vtrefine.diagnose.pad.indenters import trial_forces
 from lerobot_vtrefine.diagnose.pad.motion import Kind, instants_of, motion
@@ -21,6 +22,8 @@ CLEAR_M = 2e-4
 """An indenter this far away cannot touch a pad whose face is a little off."""
 REST_S = 1.0
 """After a release the idle level is trusted again after this time [s]."""
+NORMAL_MEDIAN = 0.6745
+"""Median size of a standard normal deviate."""
 MIN_IDLE_FRAMES = 30
 MIN_FRAMES = 8
 
@@ -89,8 +92,6 @@ class Press:
     """Frames with the indenter on the pad (T,) bool."""
     resting: np.ndarray
     """Frames before the first touch or well after a release (T,) bool."""
-    sunk_m: float = 0.0
-    """How far the face was lowered from where the recording has it [m]."""
 
     @property
     def time_s(self) -> np.ndarray:
@@ -117,18 +118,12 @@ class Press:
         drive, rate = motion(self.trial, layout, times)
         if self.loaded:
             drive, rate = self.layout.cut(drive), self.layout.cut(rate)
-        return Course(times, drive - self.sunk_m, rate, frames)
+        return Course(times, drive, rate, frames)
 
     @cached_property
     def rhythm(self) -> Rhythm:
         """When readings were new."""
         return Rhythm.of(self.time_s, self.signal, self.touching & ~silent(self.drive, self.signal))
-
-    def sunk(self, by_m: float) -> "Press":
-        """The same press with the face lowered."""
-        lower = replace(self, drive=self.drive - by_m, sunk_m=self.sunk_m + by_m)
-        lower._courses.update({k: replace(c, drive=c.drive - by_m) for k, c in self._courses.items()})
-        return lower
 
     @property
     def taxels(self) -> np.ndarray:
@@ -194,6 +189,14 @@ class _Motion:
     near: np.ndarray
 
 
+@dataclass(frozen=True)
+class _Doubt:
+    """How far readings may move without answering [counts]: one step, and a window's mean at rest."""
+
+    count: float
+    wander: float
+
+
 def usable(trial: Trial) -> Trial | None:
     """The trial in order of time, without frames that hold no numbers; None if too few are left."""
     columns = [trial.time_s, trial.x_m, trial.y_m, trial.tilt_x_rad, trial.tilt_y_rad]
@@ -220,8 +223,9 @@ def prepare(recordings: RecordingSet, trials: list[Trial], learn: list[int]) -> 
     motions = [_motion(trial, layout, loaded) for trial in trials]
     count = min(1.0, recordings.full_scale / 255.0)
     idle = idle_map([trials[i] for i in learn], [motions[i] for i in learn], layout)
+    wander = _wander([trials[i] for i in learn], [motions[i] for i in learn], idle)
     presses = tuple(
-        _press(trial, motion, layout, idle.level, loaded, count)
+        _press(trial, motion, layout, idle.level, loaded, _Doubt(count, wander))
         for trial, motion in zip(trials, motions, strict=True)
     )
     return PressSet(layout, recordings.full_scale, idle, presses, loaded, _lattice(trials))
@@ -290,26 +294,60 @@ def _idle_by_taxel(trials: list[Trial], motions: list[_Motion]) -> np.ndarray:
     return np.where(free.sum(axis=0) >= 3, mean, left)
 
 
-def _answering(trial: Trial, motion: _Motion, count: float) -> np.ndarray:
-    """Taxels whose smoothed reading moves by over a count (and more than noise) from rest: (R*C,) bool."""
-    frames = len(trial.raw)
+def near(mask: np.ndarray) -> np.ndarray:
+    """Taxels (r, c) within MARGIN_TAXELS of those of a mask."""
+    side = 2 * MARGIN_TAXELS + 1
+    return binary_dilation(mask, np.ones((side, side), dtype=bool))
+
+
+def _window(trial: Trial) -> int:
+    """Frames over which readings are averaged before they are asked whether they answer."""
+    return max(3, len(trial.raw) // 30)
+
+
+def _wander(trials: list[Trial], motions: list[_Motion], idle: IdleMap) -> float:
+    """Deviation of a window's mean reading from the idle level, of a typical taxel at rest [counts].
+
+    What noise with memory does in a recording's few frames at rest tells too little of how far it goes in the
+    whole recording; what it does from recording to recording does.
+    """
+    means = []
+    for trial, course in zip(trials, motions, strict=True):
+        rest = trial.raw[_rest(trial, course)[1]] - idle.level.ravel()
+        count = len(rest) // _window(trial)
+        if count:
+            blocks = rest[: count * _window(trial)].reshape(count, _window(trial), -1).mean(axis=1)
+            # What all taxels share is the converter's, or the session's.
+            means.append(blocks - np.median(blocks, axis=1, keepdims=True))
+    return float(np.median(np.abs(np.concatenate(means)))) / NORMAL_MEDIAN if means else 0.0
+
+
+def _answering(trial: Trial, motion: _Motion, doubt: _Doubt) -> np.ndarray:
+    """Taxels whose smoothed reading moves by over a count (and more than noise) from rest: (R, C) bool.
+
+    Far from the indenter hardly any does, and there it has to move by more than noise wanders.
+    """
+    pressed = np.any(motion.drive > 0, axis=0)
     rest = _rest(trial, motion)[1]
     base = trial.raw[rest] if rest.sum() >= 5 else trial.raw
     centre = np.median(base, axis=0)
-    window = max(3, frames // 30)
+    window = _window(trial)
     total = np.cumsum(np.vstack([np.zeros(trial.raw.shape[1]), trial.raw - centre]), axis=0)
     smooth = (total[window:] - total[:-window]) / window
-    spread = np.diff(trial.raw, axis=0).std(axis=0) / np.sqrt(2.0) if frames > 2 else 0.0
-    spread = np.maximum(spread, base.std(axis=0) if rest.sum() >= 5 else 0.0)
-    return np.abs(smooth).max(axis=0) > count + 4.0 * spread / np.sqrt(min(window, 4))
+    spread = np.diff(trial.raw, axis=0).std(axis=0) / np.sqrt(2.0)
+    if rest.sum() >= 5:
+        spread = np.maximum(spread, base.std(axis=0))
+    error = (spread / np.sqrt(min(window, 4))).reshape(pressed.shape)
+    error = np.where(near(pressed), error, np.maximum(error, doubt.wander))
+    return np.abs(smooth).max(axis=0).reshape(pressed.shape) > doubt.count + 4.0 * error
 
 
 def _press(
-    trial: Trial, motion: _Motion, layout: PadLayout, idle: np.ndarray, loaded: bool, count: float
+    trial: Trial, motion: _Motion, layout: PadLayout, idle: np.ndarray, loaded: bool, doubt: _Doubt
 ) -> Press:
     shape = (layout.rows, layout.cols)
     pressed = (motion.drive > 0).any(axis=0)
-    scored = pressed | _answering(trial, motion, count).reshape(shape)
+    scored = pressed | _answering(trial, motion, doubt)
     if not scored.any():
         scored = np.ones(shape, dtype=bool) if layout.num_taxels <= 16 else _nearest(trial, layout)
     rows, cols = np.flatnonzero(scored.any(axis=1)), np.flatnonzero(scored.any(axis=0))
@@ -344,7 +382,7 @@ def _press(
 def synthetic_press(trial: Trial, like: PressSet) -> Press:
     """A press that was not recorded, as if with the readings in the trial's `raw`."""
     motion = _motion(trial, like.layout, like.loaded)
-    return _press(trial, motion, like.layout, np.zeros_like(like.idle.level), like.loaded, 1.0)
+    return _press(trial, motion, like.layout, np.zeros_like(like.idle.level), like.loaded, _Doubt(1.0, 0.0))
 
 
 def _nearest(trial: Trial, layout: PadLayout) -> np.ndarray:

@@ -15,7 +15,7 @@ TRACE_CHANNELS = 6
 
 
 @dataclass(frozen=True)
-class Foretold:
+class Predicted:
     """One held-out recording with both models' readings, at its scored taxels (T, n) [counts]."""
 
     press: Press
@@ -24,12 +24,12 @@ class Foretold:
     extended: np.ndarray
 
 
-def foretold(
+def predicted(
     presses: PressSet, simulated: Sequence[np.ndarray], extended: Sequence[np.ndarray]
-) -> list[Foretold]:
+) -> list[Predicted]:
     """Recordings with what both models say about them (T, n)."""
     rows = zip(presses.presses, simulated, extended, strict=True)
-    return [Foretold(press, press.signal + press.idle, before, after) for press, before, after in rows]
+    return [Predicted(press, press.signal + press.idle, before, after) for press, before, after in rows]
 
 
 def noise_floor(everyone: PressSet, locked: PressSet, noise: Noise, signals: Sequence[np.ndarray]) -> float:
@@ -60,10 +60,10 @@ def _half_square(press: Press, other: Press) -> float | None:
     return 0.5 * float(np.mean((raw - again) ** 2))
 
 
-def traces(foretold: Sequence[Foretold]) -> tuple[Trace, ...]:
+def traces(predicted: Sequence[Predicted]) -> tuple[Trace, ...]:
     """Held-out recordings at the taxels that answer most."""
     found = []
-    for item in foretold:
+    for item in predicted:
         press = item.press
         strongest = np.argsort(-np.ptp(item.measured, axis=0), kind="stable")[:TRACE_CHANNELS]
         cols = press.layout.full_cols
@@ -88,20 +88,20 @@ def traces(foretold: Sequence[Foretold]) -> tuple[Trace, ...]:
     return tuple(found)
 
 
-def residual_views(foretold: Sequence[Foretold], seed: int) -> tuple[ResidualView, ...]:
+def residual_views(predicted: Sequence[Predicted], seed: int) -> tuple[ResidualView, ...]:
     """Mean residual against load, rate, history, position and time."""
-    axes = [_axes(item) for item in foretold]
+    axes = [_axes(item) for item in predicted]
     views = []
     for name, (unit, _) in axes[0].items():
         trials = [
             (own[name][1], item.measured - item.simulated, item.measured - item.extended)
-            for own, item in zip(axes, foretold, strict=True)
+            for own, item in zip(axes, predicted, strict=True)
         ]
         views.append(residual_view(name, unit, trials, seed))
     return tuple(view for view in views if view is not None)
 
 
-def _axes(item: Foretold) -> dict[str, tuple[str, np.ndarray]]:
+def _axes(item: Predicted) -> dict[str, tuple[str, np.ndarray]]:
     """Coordinates of every reading (T, n)."""
     press = item.press
     shape = item.measured.shape
@@ -123,11 +123,11 @@ def _axes(item: Foretold) -> dict[str, tuple[str, np.ndarray]]:
     return axes
 
 
-def residual_maps(foretold: Sequence[Foretold], presses: PressSet) -> dict[str, np.ndarray]:
+def residual_maps(predicted: Sequence[Predicted], presses: PressSet) -> dict[str, np.ndarray]:
     """Per taxel (R, C): RMS residual before and after, and the idle level."""
     shape = (presses.layout.rows, presses.layout.cols)
     sums = np.zeros((3, presses.layout.num_taxels))
-    for item in foretold:
+    for item in predicted:
         sums[0, item.press.taxels] += ((item.measured - item.simulated) ** 2).sum(axis=0)
         sums[1, item.press.taxels] += ((item.measured - item.extended) ** 2).sum(axis=0)
         sums[2, item.press.taxels] += len(item.measured)

@@ -32,6 +32,8 @@ class Whitener:
 
     def white(self, unit: np.ndarray) -> np.ndarray:
         """Innovations of unit variance (T, n); the first frame's own variance is one as well."""
+        if not self.rho:
+            return unit
         zero, scale = self._filter
         out = lfilter([1.0, -self.rho], [1.0, -zero], unit, axis=0)
         out[1:] /= scale

@@ -11,7 +11,7 @@ from lerobot_vtrefine.diagnose.recordings import RecordingSet
 STRANGE, USUAL = 0.5, 0.2
 """Part of a trial's readings that is not in proportion to its drive: in an odd one, and in most."""
 APART = 2.0
-"""A trial's replicates must be this many times better, for a motion may be hard to foretell by itself."""
+"""A trial's replicates must be this many times better, for a motion may be hard to predict by itself."""
 APART_GAIN, USUAL_GAIN = 0.3, 0.05
 """Logarithm by which a trial's reading per drive is off, and what that of its set usually is."""
 FEW = 0.1

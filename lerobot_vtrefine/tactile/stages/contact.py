@@ -48,8 +48,12 @@ class ContactStage(Stage):
 
     def force(self, depth: torch.Tensor, rate: torch.Tensor, layout: PadLayout) -> torch.Tensor:
         """Normal force per taxel for a prescribed depth: (..., R, C) [N]; zero where it is not positive."""
-        push = self.stiffness(layout) * depth + self.damping(layout) * rate
-        return torch.minimum(push.clamp(min=0.0), torch.as_tensor(self.ceiling())) * (depth > 0)
+        # In place: fits run this law on a million readings at once, and memory is what they wait for.
+        push = (self.stiffness(layout) * depth).add_(self.damping(layout) * rate).clamp_(min=0.0)
+        ceiling = self.ceiling()
+        if isinstance(ceiling, torch.Tensor) or ceiling < float("inf"):
+            push = torch.minimum(push, torch.as_tensor(ceiling))
+        return push.mul_(depth > 0)
 
 
 @register

@@ -89,7 +89,7 @@ class Form:
     screened: bool = True
     """Whether its probes take part in screening; fallbacks are only fitted where their family is named."""
     peer: bool = False
-    """Whether it is no richer than the plain form: it need not foretell clearly better, only better."""
+    """Whether it is no richer than the plain form: it need not predict clearly better, only better."""
     needs: str = "recordings in which it can act"
     """What to record where the cause cannot show."""
     grown: Callable[[np.ndarray, Setting], list[float]] | None = None

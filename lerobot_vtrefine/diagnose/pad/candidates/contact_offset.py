@@ -21,7 +21,8 @@ FORMS = (
         (Value("offset_m", -LARGEST_M, LARGEST_M, 2e-6),),
         lambda v, s: (ContactOffset(float(v[0])),),
         lambda v, s: {"offset_m": (float(v[0]), "m")},
-        lambda s: [[2e-5]],
+        # A face that lies higher is felt in frames, and by taxels, that a lower one does not reach.
+        lambda s: [[2e-5], [-2e-5]],
         needs="log depth_m, and press shallow and deep",
         signed=True,
         possible=lambda s: not s.loaded,

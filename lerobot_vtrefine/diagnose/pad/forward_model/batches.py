@@ -8,7 +8,7 @@ from itertools import pairwise
 import numpy as np
 
 from lerobot_vtrefine.diagnose.pad.motion import Kind, warmth
-from lerobot_vtrefine.diagnose.pad.press_trials import MARGIN_TAXELS, Press
+from lerobot_vtrefine.diagnose.pad.press_trials import Press, near
 from lerobot_vtrefine.diagnose.pad.repeated_frames import Rhythm
 from lerobot_vtrefine.tactile.layout import PadLayout
 
@@ -87,20 +87,6 @@ class Sheet:
     def all_scored(self) -> np.ndarray:
         """Numbers of all scored columns."""
         return np.sort(np.concatenate(self.scored))
-
-
-def near(mask: np.ndarray) -> np.ndarray:
-    """Taxels (r, c) within MARGIN_TAXELS of those of a mask."""
-    wide = mask.copy()
-    for axis in (0, 1):
-        grown = wide.copy()
-        for step in range(1, MARGIN_TAXELS + 1):
-            ahead, behind = [slice(None)] * 2, [slice(None)] * 2
-            ahead[axis], behind[axis] = slice(step, None), slice(None, -step)
-            grown[tuple(ahead)] |= wide[tuple(behind)]
-            grown[tuple(behind)] |= wide[tuple(ahead)]
-        wide = grown
-    return wide
 
 
 def build_sheets(presses: Sequence[Press], idle: np.ndarray, kind: Kind) -> list[Sheet]:

@@ -2,7 +2,7 @@
 
 import threading
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -34,6 +34,23 @@ class Bench:
 
 
 @dataclass(frozen=True)
+class LoweredBench:
+    """The same presses with the face lowered."""
+
+    bench: Bench
+    by_m: float
+
+    @property
+    def presses(self) -> Sequence[Press]:
+        """As recorded."""
+        return self.bench.presses
+
+    def sheets(self, kind: Kind) -> list[Sheet]:
+        """The presses at a model's instants."""
+        return [replace(sheet, drive=sheet.drive - self.by_m) for sheet in self.bench.sheets(kind)]
+
+
+@dataclass(frozen=True)
 class Plan:
     """What a model's stages need of the fields between them.
 
@@ -61,7 +78,9 @@ class Plan:
         return [(self.kind, mixed, remembered, _key(stage)) for stage, mixed, remembered in steps]
 
 
-def run_stages(stages: Sequence[Stage], bench: Bench, cache: "Prefix | None" = None) -> list[np.ndarray]:
+def run_stages(
+    stages: Sequence[Stage], bench: Bench | LoweredBench, cache: "Prefix | None" = None
+) -> list[np.ndarray]:
     """Counts above idle that the stages predict for every press: (T, n) of its scored taxels.
 
     With a cache, work that earlier stages did for the same parameters is not repeated.
@@ -113,6 +132,9 @@ def _scatter(field: Field, sheet: Sheet, found: list[np.ndarray]) -> None:
     ):
         part = field.within(sheet, press)
         own = field.columns[part]
+        if np.array_equal(own, scored):
+            found[member] = np.ascontiguousarray(field.values[: len(frames), part])
+            continue
         place = np.searchsorted(scored, own).clip(max=len(scored) - 1)
         kept = scored[place] == own
         found[member] = np.zeros((len(frames), len(scored)))
