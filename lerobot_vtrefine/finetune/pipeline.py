@@ -214,9 +214,7 @@ def load_practice(
     """
     env = draccus.decode(EnvConfig, read_yaml(task)["env"])
     if isinstance(env, VtRefineEnvConfig):
-        env = replace(
-            env, backend=backend or env.backend, warp=replace(env.warp, device=device), **fields
-        )
+        env = replace(env, backend=backend or env.backend, warp=replace(env.warp, device=device), **fields)
     policy = VtDp3Policy.from_pretrained(path).to(device)
     policy.config.device = device
     return make_practice(policy, path, env, dppo)
