@@ -63,7 +63,8 @@ class DppoConfig(draccus.ChoiceRegistry):
     target_kl: float = 1.0
     # Trust region: the actor's learning rate is adapted so that an iteration moves the policy by this KL
     # divergence per decision [nats], summed over executed actions and tuned steps. It falls geometrically to
-    # the final value. 0: the learning rate follows its own schedule.
+    # the final value. 0: the learning rate follows its own schedule. The same step is larger beside quieter
+    # exploration: with a third of min_sampling_std, aim at a ninth.
     kl_per_decision: float = 0.0
     kl_per_decision_final: float = 0.0
     # Penalty on the KL divergence to the frozen base network, per action element and tuned step.
