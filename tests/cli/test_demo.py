@@ -11,8 +11,16 @@ import numpy as np
 import pytest
 from PIL import Image
 
+from lerobot_vtrefine import shipped
 from lerobot_vtrefine.cli import demo
-from lerobot_vtrefine.cli.pipeline.demo_config import LARGEST_SEED, DemoConfig, demo_stages, flags
+from lerobot_vtrefine.cli.pipeline.demo_config import (
+    ENCODERS,
+    LARGEST_SEED,
+    DemoConfig,
+    default_env,
+    demo_stages,
+    flags,
+)
 from lerobot_vtrefine.cli.report.results import verdict
 from lerobot_vtrefine.cli.report.statistics import proportion, quantiles, wilson_interval
 from lerobot_vtrefine.finetune.seeds import EVALUATION_SEEDS, TRAINING_SEEDS
@@ -90,8 +98,17 @@ def test_another_body_comes_by_its_environments_file() -> None:
     assert "--policy.observation.embodiment=kinova" in pretrain
     assert not [flag for flag in pretrain if "encoder" in flag]
     assert (config.num_demos, config.eval_episodes) == (4, 8)  # the file's eval: is lerobot-eval's
-    with pytest.raises(ValueError, match="was trained with aloha: with kinova add --recipe=cloud"):
-        DemoConfig(env={"scene": {"embodiment": "kinova"}})
+
+
+def test_every_body_sees_through_an_encoder_of_its_own() -> None:
+    for body, encoder in ENCODERS.items():
+        env = default_env() | {"scene": {"embodiment": body}}
+        assert DemoConfig(env=env).policy["pretrained_encoder"] == encoder
+        assert encoder.removeprefix(shipped.PREFIX) in shipped.encoders()
+        mine = {"pretrained_encoder": "mine"}
+        assert DemoConfig(env=env, policy=mine).policy["pretrained_encoder"] == "mine"
+    with pytest.raises(ValueError, match="no encoder that was trained with toy: add --recipe=cloud"):
+        DemoConfig(env=default_env() | {"scene": {"embodiment": "toy"}})
 
 
 def test_flags_come_beside_the_recipes() -> None:

@@ -70,7 +70,6 @@ RECIPES: dict[str, dict[str, Any]] = {
         "policy": {
             "preset": "small",
             "fusion": "pads",
-            "pretrained_encoder": "vtrefine:round_grasped",
             "freeze_encoder": True,
             "n_action_steps": 4,
             "horizon": 8,
@@ -85,7 +84,9 @@ RECIPES: dict[str, dict[str, Any]] = {
     },
 }
 """What is trained, in minutes on two cores. ``pads``: a network that has learnt to see and feel in simulation
-beforehand, with ALOHA. ``cloud``: the paper's, learnt from demonstrations alone, for any body."""
+beforehand. ``cloud``: the paper's, learnt from demonstrations alone, for any body."""
+ENCODERS = {"aloha": "vtrefine:round_grasped", "kinova": "vtrefine:kinova_round_grasped"}
+"""What ``pads`` starts from: encoders that come with the package, each trained with its own robot."""
 
 
 @dataclass(frozen=True)
@@ -99,8 +100,8 @@ class DemoConfig:
     seed: int = 0
     """Seed of the whole run; runs of different seeds share no episode."""
     recipe: str = "pads"
-    """pads: sees and feels through an encoder that was trained in simulation, with ALOHA. cloud: learns from
-    the demonstrations alone, with any robot."""
+    """pads: sees and feels through an encoder that was trained in simulation, with the same robot. cloud:
+    learns from the demonstrations alone, with any robot."""
     modalities: str = "visuo_tactile"
     """What the policy sees: visuo_tactile or visual."""
     device: str = "cpu"
@@ -160,12 +161,14 @@ class DemoConfig:
         recipe = RECIPES[self.recipe]
         body = (self.env.get("scene") or {}).get("embodiment", HOME_BODY)
         policy = recipe["policy"] | self.policy
-        if body != HOME_BODY:
-            if "pretrained_encoder" in recipe["policy"] and "pretrained_encoder" not in self.policy:
+        if policy.get("freeze_encoder") and "pretrained_encoder" not in policy:
+            if body not in ENCODERS:
                 raise ValueError(
-                    f"--recipe={self.recipe} has an encoder that was trained with {HOME_BODY}: with {body}"
-                    " add --recipe=cloud, or an encoder by --policy='{pretrained_encoder: FOLDER}'"
+                    f"--recipe={self.recipe} has no encoder that was trained with {body}: add --recipe=cloud,"
+                    " or one of your own by --policy='{pretrained_encoder: FOLDER}'"
                 )
+            policy["pretrained_encoder"] = ENCODERS[body]
+        if body != HOME_BODY:
             policy["observation"] = {"embodiment": body} | policy.get("observation", {})
         object.__setattr__(self, "policy", policy)
         object.__setattr__(self, "dppo", recipe["dppo"] | self.dppo)

@@ -19,6 +19,7 @@ LABELS = {
     "round_grasped": "round pair, 2 mm, slip 2 mm / 0.05 rad",
     "demo_schedule": "the demo, 128 environments on two cores",
     "kinova_round": "two Kinova Gen3, round pair, the paper's cloud, two cores",
+    "kinova_pads": "two Kinova Gen3, round pair, pads as images, two cores",
     "cross_gentle": "cross, 2 mm, 5 N at most (cross_gentle)",
     "tight": "tight: 1 mm clearance",
     "occluded": "occluded: camera above, the hole hidden",
