@@ -23,6 +23,8 @@ log = logging.getLogger(__name__)
 GL_HELP = "install EGL (Debian: apt install libegl1 libgl1-mesa-dri) and start with MUJOCO_GL=egl"
 _BACKGROUND = (24, 26, 32)
 _SHADOW_PX, _SAMPLES = 1024, 2
+_GL_FAILURES: list[Exception] = []
+"""Why this process has no OpenGL. It is not asked for again: GLFW without a display would abort then."""
 
 
 @dataclass(frozen=True)
@@ -123,16 +125,22 @@ def _make_scene(
         raise ValueError(f"backend must be auto, gl or rays, not {backend!r}")
     if backend == "rays":
         return None
-    try:
-        return _GlScene(sim, env, view, size)
-    except (
-        Exception
-    ) as error:  # OpenGL libraries fail with AttributeError, ImportError, FatalError, RuntimeError, ...
-        message = f"no OpenGL to draw the scene with ({type(error).__name__}): {GL_HELP}"
-        if backend == "gl":
-            raise RuntimeError(message) from error
-        log.warning("%s; drawing the depth image instead", message)
-        return None
+    if not _GL_FAILURES:
+        try:
+            return _GlScene(sim, env, view, size)
+        except (
+            Exception
+        ) as error:  # OpenGL libraries fail with AttributeError, ImportError, FatalError, RuntimeError, ...
+            _GL_FAILURES.append(error)
+            if backend == "auto":
+                log.warning("%s; drawing the depth image instead", _no_gl(error))
+    if backend == "gl":
+        raise RuntimeError(_no_gl(_GL_FAILURES[0])) from _GL_FAILURES[0]
+    return None
+
+
+def _no_gl(error: Exception) -> str:
+    return f"no OpenGL to draw the scene with ({type(error).__name__}): {GL_HELP}"
 
 
 def shaded_depth(depth_mm: NDArray[np.uint16], intrinsics: NDArray) -> Frame:

@@ -67,6 +67,7 @@ def test_without_opengl_the_error_names_the_fix(sim: InsertionSim, monkeypatch: 
     def broken(*_: object) -> None:
         raise AttributeError("'NoneType' object has no attribute 'eglQueryString'")
 
+    monkeypatch.setattr(render, "_GL_FAILURES", [])
     monkeypatch.setattr(mujoco, "Renderer", broken)
     with pytest.raises(RuntimeError, match=r"no OpenGL .*install EGL .*MUJOCO_GL=egl") as error:
         VideoRenderer(sim, 0, backend="gl")
@@ -76,14 +77,19 @@ def test_without_opengl_the_error_names_the_fix(sim: InsertionSim, monkeypatch: 
 def test_without_opengl_videos_still_come(
     sim: InsertionSim, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
-    monkeypatch.setattr(render, "_GlScene", _raise)
+    asked = []
+
+    def fail(*_: object) -> None:
+        asked.append(True)
+        raise RuntimeError("no display")
+
+    monkeypatch.setattr(render, "_GL_FAILURES", [])
+    monkeypatch.setattr(render, "_GlScene", fail)
     frame = VideoRenderer(sim, 0).frame()
     assert "drawing the depth image instead" in caplog.text
     np.testing.assert_array_equal(frame, VideoRenderer(sim, 0, backend="rays").frame())
-
-
-def _raise(*_: object) -> None:
-    raise RuntimeError("no display")
+    VideoRenderer(sim, 0)
+    assert asked == [True], "GLFW that failed once aborts the process when it is asked again"
 
 
 def test_unknown_backend_lists_the_choices(sim: InsertionSim) -> None:
