@@ -1,5 +1,6 @@
 """Fixtures that several packages' tests share."""
 
+import gc
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -23,6 +24,16 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
     """Longest files first; the order within a file stays."""
     places = {Path(__file__).parent / name: place for place, name in enumerate(LONGEST)}
     items.sort(key=lambda item: places.get(item.path, len(places)))
+
+
+def pytest_collection_finish() -> None:
+    """Takes what exists by now out of the garbage collector's rounds.
+
+    A full round over a collected session's million objects takes half a second here and stops every thread:
+    emulated hardware then answers too late for a driver's time-out.
+    """
+    gc.collect()
+    gc.freeze()
 
 
 TINY_CAMERA = (24, 32)

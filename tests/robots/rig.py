@@ -63,8 +63,8 @@ def boards_of(
 
 
 def allow_slow_answers(patch: pytest.MonkeyPatch) -> None:
-    """Emulated motors share this machine's processors with everything else; the SDK waits 34 ms."""
-    patch.setattr("dynamixel_sdk.port_handler.LATENCY_TIMER", 120)
+    """Emulated motors share this process with everything else; the SDK waits 34 ms, here half a second."""
+    patch.setattr("dynamixel_sdk.port_handler.LATENCY_TIMER", 250)
 
 
 @contextmanager
