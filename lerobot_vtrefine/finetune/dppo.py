@@ -54,6 +54,7 @@ from lerobot_vtrefine.finetune.trust_region import TrustRegion
 from lerobot_vtrefine.policies.vt_dp3.diffusion import denoise_prefix
 
 Metrics = dict[str, float]
+MINIBATCH_METRICS = ("value_loss", "policy_loss", "approx_kl", "clip_fraction", "log_ratio", "decision_kl")
 
 
 @dataclass
@@ -202,95 +203,126 @@ def policy_loss(log_ratio: Tensor, advantages: Tensor, cfg: DppoConfig) -> Tenso
     return torch.maximum(-advantages * ratio, -advantages * clipped)
 
 
+class Minibatches:
+    """One iteration's data, prepared for both networks: gradients of minibatches, and the steps they make."""
+
+    def __init__(self, rollout: Rollout, agent: Agent, state: TrainState, cfg: DppoConfig) -> None:
+        self.rollout, self.agent, self.state, self.cfg = rollout, agent, state, cfg
+        self.advantages, self.targets = decision_advantages(rollout, state, cfg)
+        self.privileged = rollout.privileged[rollout.step, rollout.env]
+        self.train_actor = state.iteration >= cfg.critic_warmup
+        self.regulariser = Regulariser()
+        if self.train_actor:
+            self.regulariser = Regulariser.of(rollout.obs, rollout.latents, agent, cfg, state.generator)
+        steps = range(cfg.ft_denoising_steps)
+        self.clip = self.advantages.new_tensor([cfg.clip_range(step) for step in steps])
+        # Ranks own different numbers of decisions: as many minibatches everywhere, of unequal sizes.
+        most = max_over_ranks(len(self.advantages), self.advantages.device)
+        self.per_epoch = min(cfg.minibatches or math.ceil(most / cfg.minibatch_decisions), most)
+        self.trained = [(list(state.critic.parameters()), state.critic_optimizer)]
+        if self.train_actor:
+            self.trained.append((agent.trained_parameters(), state.actor_optimizer))
+
+    def epoch(self) -> Sequence[Tensor]:
+        """Decisions (b,) of every minibatch, shuffled."""
+        number, device = len(self.advantages), self.advantages.device
+        order = torch.randperm(number, generator=self.state.generator, device=device)
+        return order.tensor_split(self.per_epoch)
+
+    def gradients(self, minibatch: Tensor) -> Metrics:
+        """Both networks' gradients of this rank, and what all ranks' decisions say."""
+        # Sums over ranks, divided by the number of decisions in the minibatches of all ranks.
+        size = total_over_ranks(len(minibatch), self.advantages.device)
+        sums = torch.zeros(len(MINIBATCH_METRICS), dtype=torch.float64, device=self.advantages.device)
+        self.state.actor_optimizer.zero_grad(set_to_none=True)
+        self.state.critic_optimizer.zero_grad(set_to_none=True)
+        for ids in minibatch.split(self.cfg.micro_batch_decisions or max(len(minibatch), 1)):
+            value_error = (self.state.critic(self.privileged[ids]) - self.targets[ids]) ** 2
+            (self.cfg.value_coef * 0.5 * value_error.sum() / size).backward()
+            sums[0] += value_error.detach().sum() / size
+            if self.train_actor:
+                sums[1:] += self._actor_gradients(ids, size)
+        return dict(zip(MINIBATCH_METRICS, sum_over_ranks(sums).tolist(), strict=True))
+
+    def _actor_gradients(self, ids: Tensor, size: int) -> Tensor:
+        """Add the actor's gradients of decisions ``ids``; their share (5,) of the metrics after the first."""
+        rollout, agent, cfg = self.rollout, self.agent, self.cfg
+        rows = size * cfg.ft_denoising_steps
+        obs = select(rollout.obs, ids)
+        cond = obs["cond"] if agent.frozen_encoder else agent.actor.encode(obs)
+        log_probs, mean, std = chain_log_probs(agent, rollout.latents[ids], cond, cfg)
+        log_ratio = log_probs - rollout.log_probs[ids]
+        surrogate = policy_loss(log_ratio, self.advantages[ids], cfg).sum() / rows
+        loss = surrogate
+        if self.regulariser.means is not None:
+            shift = ((mean - self.regulariser.means[ids]) / std)[:, :, agent.executed]
+            loss = loss + cfg.kl_coef * 0.5 * (shift**2).mean(dim=(2, 3)).sum() / rows
+        if self.regulariser.latents is not None:
+            base_log_probs, _, _ = chain_log_probs(agent, self.regulariser.latents[ids], cond, cfg)
+            loss = loss - cfg.bc_coef * base_log_probs.sum() / rows
+        loss.backward()
+        with torch.no_grad():
+            exact = log_ratio.double()  # in float32, 1e-4's square is lost in exp's rounding
+            moved = decision_kl(rollout.means[ids], mean, std, agent.executed, cfg.noise_correlation)
+            sums = [
+                surrogate.detach().double(),
+                (exact.expm1() - exact).sum() / rows,  # Schulman's k3 estimator
+                (log_ratio.expm1().abs() > self.clip).double().sum() / rows,
+                log_ratio.abs().sum().double() / rows,
+                moved.sum().double() / size,
+            ]
+        return torch.stack(sums)
+
+    def step(self) -> list[Tensor]:
+        """One step of every network that is trained; the norms of their gradients, the actor's last."""
+        norms = []
+        for parameters, optimizer in self.trained:
+            sum_gradients(parameters)
+            norms.append(clip_grad_norm_(parameters, self.cfg.max_grad_norm or math.inf))
+            optimizer.step()
+        return norms
+
+
 def update(rollout: Rollout, agent: Agent, state: TrainState, cfg: DppoConfig) -> Metrics:
-    """All epochs over one segment. Critic-only during the first ``cfg.critic_warmup`` iterations."""
-    advantages, targets = decision_advantages(rollout, state, cfg)
-    privileged = rollout.privileged[rollout.step, rollout.env]
-    train_actor = state.iteration >= cfg.critic_warmup
-    region = state.trust_region
+    """All epochs over one segment. Critic-only during the first ``cfg.critic_warmup`` iterations.
+
+    Ends early where a minibatch finds the policy too far from where the iteration began.
+
+    Raises: FloatingPointError where the loss is not finite.
+    """
+    data, region = Minibatches(rollout, agent, state, cfg), state.trust_region
     actor_lr = region.actor_lr(state.iteration)
-    regulariser = Regulariser()
-    if train_actor:
-        regulariser = Regulariser.of(rollout.obs, rollout.latents, agent, cfg, state.generator)
     state.actor_optimizer.param_groups[0]["lr"] = actor_lr
     state.critic_optimizer.param_groups[0]["lr"] = cfg.critic_lr_at(state.iteration)
-    max_norm = cfg.max_grad_norm or math.inf
-    actor_parameters, critic_parameters = agent.trained_parameters(), list(state.critic.parameters())
-    clip = advantages.new_tensor([cfg.clip_range(step) for step in range(cfg.ft_denoising_steps)])
-    num_valid = len(advantages)
-    # Ranks own different numbers of decisions: the same number of minibatches everywhere, of unequal sizes.
-    most = max_over_ranks(num_valid, advantages.device)
-    num_minibatches = min(cfg.minibatches or math.ceil(most / cfg.minibatch_decisions), most)
-    history: list[list[float]] = []
+    history: list[Metrics] = []
     grad_norms: list[Tensor] = []  # nobody waits for them before the end
     initial_log_ratio, stopped = 0.0, False
 
-    for _ in range(cfg.epochs):
-        order = torch.randperm(num_valid, generator=state.generator, device=advantages.device)
-        for minibatch in order.tensor_split(num_minibatches):
-            # Sums over ranks, divided by the number of decisions in the minibatches of all ranks.
-            size = total_over_ranks(len(minibatch), advantages.device)
-            rows = size * cfg.ft_denoising_steps
-            sums = torch.zeros(6, dtype=torch.float64, device=advantages.device)
-            state.actor_optimizer.zero_grad(set_to_none=True)
-            state.critic_optimizer.zero_grad(set_to_none=True)
-            for ids in minibatch.split(cfg.micro_batch_decisions or max(len(minibatch), 1)):
-                value_error = (state.critic(privileged[ids]) - targets[ids]) ** 2
-                (cfg.value_coef * 0.5 * value_error.sum() / size).backward()
-                sums[0] += value_error.detach().sum() / size
-                if not train_actor:
-                    continue
-                obs = select(rollout.obs, ids)
-                cond = obs["cond"] if agent.frozen_encoder else agent.actor.encode(obs)
-                log_probs, mean, std = chain_log_probs(agent, rollout.latents[ids], cond, cfg)
-                log_ratio = log_probs - rollout.log_probs[ids]
-                loss = policy_loss(log_ratio, advantages[ids], cfg).sum() / rows
-                sums[1] += loss.detach()
-                if regulariser.means is not None:
-                    shift = ((mean - regulariser.means[ids]) / std)[:, :, agent.executed]
-                    loss = loss + cfg.kl_coef * 0.5 * (shift**2).mean(dim=(2, 3)).sum() / rows
-                if regulariser.latents is not None:
-                    base_log_probs, _, _ = chain_log_probs(agent, regulariser.latents[ids], cond, cfg)
-                    loss = loss - cfg.bc_coef * base_log_probs.sum() / rows
-                loss.backward()
-                with torch.no_grad():
-                    exact = log_ratio.double()  # in float32, 1e-4's square is lost in exp's rounding
-                    sums[2] += (exact.expm1() - exact).sum() / rows  # Schulman's k3 estimator
-                    sums[3] += (log_ratio.expm1().abs() > clip).double().sum() / rows
-                    sums[4] += log_ratio.abs().sum() / rows
-                    moved = decision_kl(rollout.means[ids], mean, std, agent.executed, cfg.noise_correlation)
-                    sums[5] += moved.sum() / size
-            value_loss, loss_value, approx_kl, clip_fraction, log_ratio_size, kl = sum_over_ranks(
-                sums
-            ).tolist()
-            if not math.isfinite(value_loss + loss_value):
-                raise FloatingPointError(
-                    f"loss is not finite in iteration {state.iteration}: lower --dppo.actor_lr"
-                )
-            if train_actor and not history:
-                initial_log_ratio = log_ratio_size  # zero up to rounding, or the stored chains are wrong
-            if train_actor and (approx_kl > cfg.target_kl or region.left(kl, state.iteration)):
-                stopped = True
-                break
-            sum_gradients(critic_parameters)
-            clip_grad_norm_(critic_parameters, max_norm)
-            state.critic_optimizer.step()
-            if train_actor:
-                sum_gradients(actor_parameters)
-                grad_norms.append(clip_grad_norm_(actor_parameters, max_norm))
-                state.actor_optimizer.step()
-            history.append([value_loss, loss_value, approx_kl, clip_fraction, kl])
-        if stopped:
+    for minibatch in (ids for _ in range(cfg.epochs) for ids in data.epoch()):
+        found = data.gradients(minibatch)
+        if not math.isfinite(found["value_loss"] + found["policy_loss"]):
+            raise FloatingPointError(
+                f"loss is not finite in iteration {state.iteration}: lower --dppo.actor_lr"
+            )
+        if not history:
+            initial_log_ratio = found["log_ratio"]  # zero up to rounding, or the stored chains are wrong
+        if found["approx_kl"] > cfg.target_kl or region.left(found["decision_kl"], state.iteration):
+            stopped = True
             break
+        grad_norms.append(data.step()[-1])
+        history.append(found)
 
-    if train_actor:
-        region.adapt([row[-1] for row in history[-num_minibatches:]], stopped, state.iteration)
-    averages = torch.tensor(history or [[0.0] * 5], dtype=torch.float64).mean(0).tolist()
-    names = ("value_loss", "policy_loss", "approx_kl", "clip_fraction", "decision_kl")
+    if data.train_actor:
+        last_epoch = [found["decision_kl"] for found in history[-data.per_epoch :]]
+        region.adapt(last_epoch, stopped, state.iteration)
     with torch.no_grad():
-        explained = explained_variance(state.critic(privileged), targets)
-    return dict(zip(names, averages, strict=True)) | {
-        "grad_norm": float(torch.stack(grad_norms).double().mean()) if grad_norms else 0.0,
+        explained = explained_variance(state.critic(data.privileged), data.targets)
+    averages = {
+        name: sum(found[name] for found in history) / max(len(history), 1) for name in MINIBATCH_METRICS
+    }
+    del averages["log_ratio"]
+    return averages | {
+        "grad_norm": float(torch.stack(grad_norms).double().mean()) if data.train_actor and history else 0.0,
         "explained_variance": explained,
         "initial_log_ratio": initial_log_ratio,
         "updates": float(len(history)),
