@@ -96,7 +96,7 @@ def put_in_place(work: Path, target: Path, whole: Sequence[str] = ()) -> None:
         target.rename(previous)
         work.rename(target)
         work = previous
-    _flush_entry(target.parent)
+    sync(target.parent)
     shutil.rmtree(work, ignore_errors=True)
 
 
@@ -105,7 +105,7 @@ def write_in_place(target: Path, name: Path, text: str) -> None:
     with beside(target) as work:
         part = work / name.name
         part.write_text(text, encoding="utf-8")
-        _flush_entry(part)
+        sync(part)
         part.replace(target / name)
 
 
@@ -159,11 +159,12 @@ def _flush(folder: Path) -> None:
     for path in folder.rglob("*"):
         status = path.lstat()
         if stat.S_ISDIR(status.st_mode) or (stat.S_ISREG(status.st_mode) and status.st_nlink == 1):
-            _flush_entry(path)
-    _flush_entry(folder)
+            sync(path)
+    sync(folder)
 
 
-def _flush_entry(path: Path) -> None:
+def sync(path: Path) -> None:
+    """Wait until a file's contents or a folder's names are on the disk."""
     descriptor = os.open(path, os.O_RDONLY)
     try:
         os.fsync(descriptor)

@@ -13,6 +13,7 @@ import json
 from pathlib import Path
 from typing import Any
 
+from lerobot_vtrefine.cli.arguments import CommandParser
 from lerobot_vtrefine.cli.errors import run_cli
 from lerobot_vtrefine.finetune.config import TrustRegionDppo
 from lerobot_vtrefine.finetune.evaluation import evaluate
@@ -38,9 +39,7 @@ def measure(args: argparse.Namespace, kind: str) -> dict[str, Any]:
 @run_cli
 def main() -> int:
     """Prints a JSON object a line."""
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
+    parser = CommandParser(description=__doc__)
     parser.add_argument("--policy", type=Path, required=True, help="a fine-tuned vt_dp3's folder")
     parser.add_argument("--task", type=Path, required=True, help="a file as in configs/env")
     parser.add_argument("--dataset", type=Path, help="recordings of the task, for the replaced touch")

@@ -7,7 +7,6 @@
 Episodes are those of the seeds 0, 1, 2 ... unless --seed says otherwise: nothing is picked.
 """
 
-import argparse
 from collections.abc import Iterator
 from itertools import zip_longest
 from pathlib import Path
@@ -15,13 +14,14 @@ from pathlib import Path
 import draccus
 from PIL import Image, ImageDraw
 
+from lerobot_vtrefine.cli.arguments import CommandParser
 from lerobot_vtrefine.cli.errors import run_cli
 from lerobot_vtrefine.cli.playing.agents import PolicyAgent
 from lerobot_vtrefine.cli.report.gif import write_gif
 from lerobot_vtrefine.envs import VtRefineEnvConfig
 from lerobot_vtrefine.envs.live_world import LiveWorld
 from lerobot_vtrefine.files import read_yaml
-from lerobot_vtrefine.sim.looks import PLUG_COLOUR, SOCKET_COLOUR
+from lerobot_vtrefine.sim.appearance import PLUG_COLOUR, SOCKET_COLOUR
 from lerobot_vtrefine.sim.render import VideoRenderer
 
 GROUND, INK = (24, 26, 32), (226, 228, 232)
@@ -70,9 +70,7 @@ def side_by_side(left: Image.Image, right: Image.Image, titles: tuple[str, str],
 @run_cli
 def main() -> None:
     """Console entry point."""
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
+    parser = CommandParser(description=__doc__)
     parser.add_argument("--config_path", type=Path, required=True, help="of the environment")
     parser.add_argument("--before", required=True, help="checkpoint on the left")
     parser.add_argument("--after", required=True, help="checkpoint on the right")

@@ -18,6 +18,7 @@ from typing import Any
 
 from bench_sets import add_arguments, run_sets, shuffled
 
+from lerobot_vtrefine.cli.arguments import CommandParser
 from lerobot_vtrefine.cli.errors import run_cli
 from lerobot_vtrefine.cli.results import rows as results
 
@@ -30,9 +31,7 @@ QUICK_DIVISOR = 5
 
 def arguments() -> argparse.Namespace:
     """The command line."""
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
+    parser = CommandParser(description=__doc__)
     parser.add_argument("--groups", default=",".join(cases.GROUPS), help="comma-separated: %(default)s")
     parser.add_argument("--per_cell", type=int, help="sets per cell in place of each group's own count")
     parser.add_argument("--quick", action="store_true", help="about a fifth of the sets")

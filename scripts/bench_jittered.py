@@ -20,6 +20,7 @@ from typing import Any
 
 from bench_sets import Row, add_arguments, run_sets, shuffled
 
+from lerobot_vtrefine.cli.arguments import CommandParser
 from lerobot_vtrefine.cli.errors import run_cli
 
 ROOT = Path(__file__).parents[1]
@@ -51,9 +52,7 @@ def run(task: tuple[str, float, int, int, int]) -> Row:
 
 def arguments() -> argparse.Namespace:
     """The command line."""
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
+    parser = CommandParser(description=__doc__)
     laws = [CLEAN, *jittered_rig.EFFECTS]
     parser.add_argument("--laws", default=",".join(laws), help="comma-separated: %(default)s")
     parser.add_argument("--gains", default="0.2,0.4", help="achievable gains (default %(default)s)")

@@ -10,7 +10,6 @@ it. What is done is kept in the output folder, so that an interrupted run goes o
     python scripts/collect_results.py servo outputs/bench_servo/servo.md --replace
 """
 
-import argparse
 import json
 import os
 import sys
@@ -24,6 +23,7 @@ os.environ.setdefault("OMP_NUM_THREADS", "1")
 import numpy as np
 from bam_ladder import LADDER, errors, fit, gridded
 
+from lerobot_vtrefine.cli.arguments import CommandParser
 from lerobot_vtrefine.cli.errors import run_cli
 from lerobot_vtrefine.diagnose.core.engine import infer
 from lerobot_vtrefine.diagnose.core.resampling import gain_interval
@@ -92,9 +92,7 @@ def render(found: list[dict[str, Any]], labels: list[str], seed: int) -> str:
 @run_cli
 def main() -> None:
     """Do what is missing and print the table."""
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
+    parser = CommandParser(description=__doc__)
     parser.add_argument("--recording", type=Path, required=True, help="folder with recording.json")
     parser.add_argument("--output_dir", type=Path, default=ROOT / "outputs" / "bench_servo")
     parser.add_argument("--seed", type=int, default=0)

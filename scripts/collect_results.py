@@ -19,12 +19,12 @@ Commit, command and machine are those that the run recorded; --commit, --command
 runs that could not (on a machine without git, say). What nobody says is null.
 """
 
-import argparse
 import sys
 from pathlib import Path
 
 from compare_reality import reality_rows
 
+from lerobot_vtrefine.cli.arguments import CommandParser
 from lerobot_vtrefine.cli.errors import run_cli
 from lerobot_vtrefine.cli.results.collect import ORIGIN, origin_of, printed_lines, run_rows, save
 from lerobot_vtrefine.cli.results.rows import Line, Run
@@ -35,9 +35,7 @@ RESULTS = Path(__file__).parents[1] / "results"
 @run_cli
 def main() -> None:
     """Collect every source, then write."""
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
+    parser = CommandParser(description=__doc__)
     parser.add_argument("table", choices=[*Run.TABLES, *Line.TABLES])
     parser.add_argument("sources", type=Path, nargs="+")
     parser.add_argument("--results", type=Path, help="file (default results/TABLE.json)")

@@ -19,6 +19,7 @@ from pathlib import Path
 
 from compare_touch import run_all
 
+from lerobot_vtrefine.cli.arguments import CommandParser
 from lerobot_vtrefine.cli.errors import run_cli
 from lerobot_vtrefine.cli.pipeline.stages import Stage, StageRunner
 from lerobot_vtrefine.cli.report.results import load_evaluation
@@ -126,11 +127,9 @@ def row(options: argparse.Namespace, policy: str, seed: int) -> Run:
     )
 
 
-def make_parser() -> argparse.ArgumentParser:
+def make_parser() -> CommandParser:
     """The command line."""
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
+    parser = CommandParser(description=__doc__)
     parser.add_argument("--seeds", type=int, nargs="+", default=[0, 1, 2])
     parser.add_argument("--policies", nargs="+", choices=list(POLICIES), default=list(POLICIES))
     parser.add_argument("--task", default="round_grasped", help="a file of configs/env (default %(default)s)")

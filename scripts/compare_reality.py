@@ -28,13 +28,9 @@ from realities import PLAIN, REALITIES, of_robot
 from reality_budget import Budget, env_flags, folder_name, real_env, recipe
 from reality_results import as_text, difference
 
-from lerobot_vtrefine.cli.pipeline.demo_config import (
-    SEED_STRIDE,
-    TRAIN_SEED_OFFSET,
-    flags,
-    pretrain_stage,
-    record_stage,
-)
+from lerobot_vtrefine.cli.arguments import CommandParser, flags
+from lerobot_vtrefine.cli.pipeline.demo_config import SEED_STRIDE, TRAIN_SEED_OFFSET
+from lerobot_vtrefine.cli.pipeline.demo_stages import pretrain_stage, record_stage
 from lerobot_vtrefine.cli.pipeline.stages import Stage, StageRunner, find_command
 from lerobot_vtrefine.cli.report.statistics import proportion
 from lerobot_vtrefine.cli.results.collect import Progress, last_steps, read_json
@@ -312,9 +308,7 @@ def reality_rows(folder: Path, origin: dict[str, str | None]) -> list[tuple[Run,
 
 def parse() -> tuple[argparse.Namespace, Budget]:
     """Options, and the budget among them."""
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
+    parser = CommandParser(description=__doc__)
     parser.add_argument("--output_dir", type=Path, default=Path("outputs/compare_reality"))
     parser.add_argument(
         "--seeds", type=int, nargs="+", default=[0, 1, 2], help="of fine-tuning and its episodes"

@@ -16,7 +16,6 @@ runs several side by side, each on cores of its own, and on the GPUs by turns. I
 it continues. The comparison is printed and saved as ``comparison.json`` and ``comparison.md``.
 """
 
-import argparse
 import json
 import os
 import shutil
@@ -32,6 +31,7 @@ from typing import Any
 import torch
 import yaml
 
+from lerobot_vtrefine.cli.arguments import CommandParser
 from lerobot_vtrefine.cli.pipeline.demo_config import default_env
 from lerobot_vtrefine.cli.report.statistics import mean_interval, proportion
 
@@ -267,9 +267,7 @@ def interval_text(value: float, interval: list[float]) -> str:
 
 def main() -> None:
     """Parse, run every pipeline, compare."""
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
+    parser = CommandParser(description=__doc__)
     parser.add_argument("--seeds", type=int, nargs="+", default=[0, 1, 2])
     parser.add_argument("--settings", nargs="+", choices=[*SETTINGS, *WORLDS], default=["demo"])
     parser.add_argument("--output_dir", type=Path, default=Path("outputs/compare_touch"))

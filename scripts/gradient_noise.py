@@ -19,6 +19,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from lerobot_vtrefine.cli.arguments import CommandParser
 from lerobot_vtrefine.cli.errors import run_cli
 from lerobot_vtrefine.finetune import dppo
 from lerobot_vtrefine.finetune.chains import chain_log_probs
@@ -104,9 +105,7 @@ def measure(args: argparse.Namespace) -> dict[str, Any]:
 @run_cli
 def main() -> int:
     """Prints a JSON object."""
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
+    parser = CommandParser(description=__doc__)
     parser.add_argument("--policy", type=Path, required=True, help="an imitation-learned vt_dp3's folder")
     parser.add_argument("--task", type=Path, required=True, help="a file as in configs/env")
     parser.add_argument("--worlds", type=int, default=1024, help="episodes of an iteration")

@@ -9,13 +9,13 @@ where scripts/compare_touch.py finds its encoders; one that is there is not made
 that.
 """
 
-import argparse
 import json
 import subprocess
 import sys
 from pathlib import Path
 from typing import Any
 
+from lerobot_vtrefine.cli.arguments import CommandParser
 from lerobot_vtrefine.cli.errors import run_cli
 from lerobot_vtrefine.cli.report.statistics import wilson_interval
 from lerobot_vtrefine.cli.results.collect import origin_of, save
@@ -75,9 +75,7 @@ def counted(proportion: dict[str, Any] | None) -> str:
 @run_cli
 def main() -> None:
     """Study what is missing, then keep all rows."""
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
+    parser = CommandParser(description=__doc__)
     parser.add_argument("tasks", nargs="+", metavar="TASK", help="name of a file of configs/env")
     parser.add_argument("--results", type=Path, default=RESULTS / f"{TABLE}.json")
     parser.add_argument("--outputs", type=Path, default=Path("outputs"))

@@ -27,7 +27,7 @@ ROOT = Path(__file__).parents[1]
 IMAGES = ROOT / "docs" / "img"
 PITCH_MM = 2.0
 SEED = 3
-BLUE, ORANGE, GREEN, GREY = "#2f6fb2", "#d9762b", "#2e8b57", "#8a8f98"
+BLUE, ORANGE, GREY = "#2f6fb2", "#d9762b", "#8a8f98"
 CURVES = {
     "round pair": {"R.c8.k12": "12 to 3 nats per decision", "R.g4.k24": "24 to 3"},
     "square pair, 1 mm, more slip": {"B.g8.k12": "12 to 3", "B.g8.k40": "40 to 2"},

@@ -10,7 +10,6 @@ stopped: it measures what has fewer episodes than asked for. To measure anew, re
 have a clearance of their own. Episode i has seed i.
 """
 
-import argparse
 import itertools
 import sys
 from collections import Counter
@@ -20,6 +19,7 @@ from pathlib import Path
 import numpy as np
 from tqdm import tqdm
 
+from lerobot_vtrefine.cli.arguments import CommandParser
 from lerobot_vtrefine.cli.errors import run_cli
 from lerobot_vtrefine.cli.results.collect import save
 from lerobot_vtrefine.cli.results.provenance import provenance
@@ -116,9 +116,7 @@ def is_done(setting: Setting, episodes: int, rows: list[Run]) -> bool:
 @run_cli
 def main() -> None:
     """Measure what is missing."""
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
+    parser = CommandParser(description=__doc__)
     parser.add_argument("--episodes", type=int, default=50, help="of each setting (default %(default)s)")
     parser.add_argument("--bodies", nargs="+", default=["aloha", "kinova"])
     parser.add_argument("--pairs", nargs="+", default=list(PROCEDURAL_PAIRS), help="or automate/ID")

@@ -27,6 +27,7 @@ import numpy as np
 import torch
 
 import lerobot_vtrefine
+from lerobot_vtrefine.cli.arguments import CommandParser
 from lerobot_vtrefine.cli.errors import run_cli
 from lerobot_vtrefine.envs.decisions import LeRobotDecisionEnv
 from lerobot_vtrefine.envs.episodes import Episodes
@@ -140,9 +141,7 @@ def profile(args: argparse.Namespace, worlds: int) -> dict[str, Any]:
 @run_cli
 def main() -> int:
     """Prints a JSON object per number of worlds."""
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
+    parser = CommandParser(description=__doc__)
     parser.add_argument("--device", default="cpu", help="of simulation and policy: cpu or cuda")
     parser.add_argument("--worlds", default="1024,4096", help="numbers of worlds")
     parser.add_argument("--iterations", type=int, default=4, help="measured, after one to warm up")

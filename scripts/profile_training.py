@@ -19,6 +19,7 @@ from typing import Any
 
 import numpy as np
 
+from lerobot_vtrefine.cli.arguments import CommandParser
 from lerobot_vtrefine.cli.errors import run_cli
 from lerobot_vtrefine.lerobot_compat.benchmark import record_noise
 
@@ -70,9 +71,7 @@ def train(name: str, root: Path, args: argparse.Namespace) -> dict[str, Any]:
 @run_cli
 def main() -> int:
     """Prints a JSON object per policy."""
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
+    parser = CommandParser(description=__doc__)
     parser.add_argument("--device", default="cpu", help="cpu or cuda")
     parser.add_argument("--policies", default=",".join(POLICIES), help=f"of {', '.join(POLICIES)}")
     parser.add_argument("--steps", type=int, default=1000)

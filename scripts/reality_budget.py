@@ -6,11 +6,8 @@ from typing import Any
 
 from realities import of_robot
 
-from lerobot_vtrefine.cli.pipeline.demo_config import (
-    DemoConfig,
-    default_env,
-    flags,
-)
+from lerobot_vtrefine.cli.arguments import flags
+from lerobot_vtrefine.cli.pipeline.demo_config import DemoConfig, default_env
 
 
 @dataclass(frozen=True)

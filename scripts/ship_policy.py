@@ -7,7 +7,6 @@ Weights are kept as 16-bit floats, those of the frozen network, which only does 
 steps, as 8-bit ones; PyTorch widens them when it loads them into the policy.
 """
 
-import argparse
 import json
 import shutil
 from pathlib import Path
@@ -16,6 +15,7 @@ from typing import Any
 import torch
 from safetensors.torch import load_file, save_file
 
+from lerobot_vtrefine.cli.arguments import CommandParser
 from lerobot_vtrefine.cli.errors import run_cli
 
 LARGEST_BYTES = 5_000_000
@@ -74,9 +74,7 @@ def _shortened(key: str, value: torch.Tensor) -> torch.Tensor:
 @run_cli
 def main() -> None:
     """Console entry point."""
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
+    parser = CommandParser(description=__doc__)
     parser.add_argument("checkpoint", type=Path, help="pretrained_model folder of a fine-tuned policy")
     parser.add_argument("folder", type=Path, help="where the package keeps it")
     arguments = parser.parse_args()

@@ -5,8 +5,8 @@
 Random targets, a trained policy with DPPO's exploration noise, or the scripted expert's targets with noise,
 over pairs and starts. Every pair and start gets its share of --control_steps, for each kind of actions. A row
 of JSON is added to --rows whenever one of them ends or the --minutes are over; the same command again goes on
-from there. Prints the sum of all rows. Status 1 where an exception ended a run or something that is no number
-came out, 3 where the time was over before the steps were.
+from there. Prints the sum of all rows. Status 1 where an exception ended a run or something other than a
+number came out, 3 where the time was over before the steps were.
 """
 
 import argparse
@@ -23,6 +23,7 @@ from typing import Any
 import numpy as np
 import torch
 
+from lerobot_vtrefine.cli.arguments import CommandParser
 from lerobot_vtrefine.cli.errors import run_cli
 from lerobot_vtrefine.embodiments.embodiment import STARTS
 from lerobot_vtrefine.envs import VtRefineEnvConfig
@@ -87,9 +88,7 @@ def main() -> int:
 
 def parse() -> argparse.Namespace:
     """The command line."""
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
+    parser = CommandParser(description=__doc__)
     parser.add_argument("--worlds", type=int, default=64)
     parser.add_argument("--control_steps", type=int, default=100_000, help="of each kind of actions, in all")
     parser.add_argument("--minutes", type=float, default=60.0, help="begin nothing new after these")
@@ -202,7 +201,7 @@ def play(episodes: Episodes, actions: str, seed: int) -> Iterator[Counter[str]]:
 
 
 def counted(episodes: Episodes, active: np.ndarray, finished: np.ndarray, reward: np.ndarray) -> Counter[str]:
-    """Ends of episodes by reason, and worlds with anything that is no finite number."""
+    """Ends of episodes by reason, and worlds with anything that is not a finite number."""
     counts = Counter(control_steps=len(active), episodes=len(finished))
     counts["success"] = int(episodes.success[finished].sum())
     failure = episodes.sim.metrics(finished)["failure"] if len(finished) else np.zeros(0, int)

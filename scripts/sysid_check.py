@@ -11,7 +11,6 @@ the reader of recordings. The motor's back-EMF acts as damping, so the baseline'
 back-EMF together. Two sets: a generated one, whose truth is known, and the real servo of tests/data.
 """
 
-import argparse
 import importlib
 import logging
 import sys
@@ -23,6 +22,7 @@ import mujoco
 import numpy as np
 
 from lerobot_vtrefine.cli import import_dataset
+from lerobot_vtrefine.cli.arguments import CommandParser
 from lerobot_vtrefine.cli.errors import run_cli
 from lerobot_vtrefine.diagnose.recordings import read_recording_set
 from lerobot_vtrefine.diagnose.servo.bench import GRAVITY_M_S2, Bench
@@ -224,9 +224,7 @@ def table(columns: dict[str, tuple[Values, float | None]]) -> str:
 @run_cli
 def main() -> None:
     """Fit both sets by both."""
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
+    parser = CommandParser(description=__doc__)
     parser.add_argument("--output", type=Path, default=Path("outputs/sysid.md"))
     options = parser.parse_args()
     logging.disable(logging.WARNING)

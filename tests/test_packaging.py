@@ -124,7 +124,9 @@ def test_entry_point_exists(name: str) -> None:
     module, function = PROJECT["scripts"][name].split(":")
     path = ROOT / Path(*module.split(".")).with_suffix(".py")
     tree = ast.parse(path.read_text(encoding="utf-8"))
-    assert function in [node.name for node in tree.body if isinstance(node, ast.FunctionDef)]
+    made = [target for node in tree.body if isinstance(node, ast.Assign) for target in node.targets]
+    names = [node.name for node in tree.body if isinstance(node, ast.FunctionDef)]
+    assert function in names + [target.id for target in made if isinstance(target, ast.Name)]
 
 
 @pytest.mark.slow

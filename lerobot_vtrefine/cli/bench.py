@@ -118,8 +118,8 @@ def measure(parts: Iterable[str], limit_s: float, full: bool = False) -> list[Ro
     """Measure the parts one after the other, each in a process of its own.
 
     With ``full`` there is no limit, and parts are as long as they are meant to be. A part without a
-    benchmark, one that fails and one that takes longer than ``limit_s`` seconds are each
-    named on one line; the others are measured all the same.
+    benchmark, one that fails and one that takes longer than ``limit_s`` seconds are each named on one line;
+    the others are measured all the same.
     """
     rows = []
     for part in parts:

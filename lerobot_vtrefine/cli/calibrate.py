@@ -6,7 +6,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from lerobot_vtrefine.cli.arguments import OneLineParser
+from lerobot_vtrefine.cli.arguments import CommandParser
 from lerobot_vtrefine.cli.errors import run_cli
 from lerobot_vtrefine.cli.outputs import staged
 
@@ -33,9 +33,9 @@ examples:
   vtrefine-calibrate --recording=presses --k_n=400 --output_dir=calibration      without a load cell"""
 
 
-def make_parser() -> OneLineParser:
+def make_parser() -> CommandParser:
     """Command line of ``vtrefine-calibrate``."""
-    parser = OneLineParser("vtrefine-calibrate", DESCRIPTION, EPILOG)
+    parser = CommandParser("vtrefine-calibrate", DESCRIPTION, EPILOG)
     parser.add_argument(
         "--recording", type=Path, required=True, metavar="DIR", help="folder with recording.json"
     )

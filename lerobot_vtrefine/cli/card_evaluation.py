@@ -4,7 +4,7 @@ from pathlib import Path
 
 from lerobot.utils.constants import CHECKPOINTS_DIR, LAST_CHECKPOINT_LINK, PRETRAINED_MODEL_DIR
 
-from lerobot_vtrefine.cli.pipeline.demo_config import flags
+from lerobot_vtrefine.cli.arguments import flags
 from lerobot_vtrefine.cli.pipeline.stages import Stage, StageRunner
 from lerobot_vtrefine.cli.sharing import EPISODES, push_policy
 from lerobot_vtrefine.envs.config import VtRefineEnvConfig

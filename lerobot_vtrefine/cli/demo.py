@@ -20,7 +20,8 @@ from pathlib import Path
 import draccus
 
 from lerobot_vtrefine.cli.errors import run_cli
-from lerobot_vtrefine.cli.pipeline.demo_config import QUICK, DemoConfig, demo_stages
+from lerobot_vtrefine.cli.pipeline.demo_config import QUICK, DemoConfig
+from lerobot_vtrefine.cli.pipeline.demo_stages import demo_stages
 from lerobot_vtrefine.cli.pipeline.stages import StageRecord, StageRunner
 
 QUICK_FLAG = "--quick"

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 
 from tqdm import tqdm
 
-from lerobot_vtrefine.cli.arguments import OneLineParser
+from lerobot_vtrefine.cli.arguments import CommandParser
 from lerobot_vtrefine.cli.errors import run_cli
 from lerobot_vtrefine.cli.formats import add_format_flags
 from lerobot_vtrefine.cli.outputs import staged
@@ -43,9 +43,9 @@ examples:
   vtrefine-diagnose --dataset.root=outputs/aloha --output_dir=diagnosis"""
 
 
-def make_parser() -> OneLineParser:
+def make_parser() -> CommandParser:
     """Command line of ``vtrefine-diagnose``."""
-    parser = OneLineParser("vtrefine-diagnose", DESCRIPTION, EPILOG)
+    parser = CommandParser("vtrefine-diagnose", DESCRIPTION, EPILOG)
     parser.add_argument("--recording", type=Path, metavar="DIR", help="folder with recording.json")
     parser.add_argument(
         "--dataset.repo_id", dest="repo_id", metavar="NAME", help="LeRobot dataset, by its name"

@@ -40,8 +40,8 @@ def _message(error: BaseException) -> str:
     if isinstance(error, OSError) and error.errno == errno.ENOSPC:
         where = f" while writing {error.filename}" if error.filename else ""
         return f"the disk is full{where}; free some space and run the command again"
-    if isinstance(error, UnicodeEncodeError):  # a flag's bytes that are no text, or half a pair of surrogates
-        return f"{error.object[:60]!a} is no text that a file or a terminal can have"
+    if isinstance(error, UnicodeEncodeError):  # a flag is not text, or half a pair of surrogates
+        return f"{error.object[:60]!a} is not text that a file or a terminal can hold"
     if isinstance(error, OSError) and error.errno is not None and error.filename:
         return f"{error.strerror}: {error.filename}"
     if isinstance(error, DraccusException) and isinstance(error.__cause__, ValueError) and _is_wrapper(error):

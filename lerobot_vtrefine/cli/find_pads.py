@@ -1,11 +1,11 @@
 """``vtrefine-find-pads``: find out which pad is on which serial port, by pressing one after the other."""
 
-import argparse
 from collections.abc import Sequence
 from contextlib import ExitStack
 from pathlib import Path
 
 from lerobot_vtrefine import extras
+from lerobot_vtrefine.cli.arguments import CommandParser
 from lerobot_vtrefine.cli.errors import run_cli
 from lerobot_vtrefine.datasets.features import PADS
 from lerobot_vtrefine.drivers.config import PadConfig
@@ -32,14 +32,9 @@ SLIDE_S = 5.0
 """How long a finger slides over a pad [s]."""
 
 
-def parse_arguments(arguments: Sequence[str] | None) -> argparse.Namespace:
+def make_parser() -> CommandParser:
     """Command line of `vtrefine-find-pads`."""
-    parser = argparse.ArgumentParser(
-        prog="vtrefine-find-pads",
-        description=DESCRIPTION,
-        formatter_class=argparse.RawDescriptionHelpFormatter,
-        epilog=EPILOG,
-    )
+    parser = CommandParser("vtrefine-find-pads", DESCRIPTION, EPILOG)
     parser.add_argument(
         "--output", type=Path, default=Path("pads.yaml"), help="file to write (default %(default)s)"
     )
@@ -61,13 +56,13 @@ def parse_arguments(arguments: Sequence[str] | None) -> argparse.Namespace:
         help="after each press, slide a finger over the pad's rows: tells rows that arrive shifted",
     )
     parser.add_argument("--list", action="store_true", help="only list the ports and what they send")
-    return parser.parse_args(arguments)
+    return parser
 
 
 @run_cli
 def main(arguments: Sequence[str] | None = None) -> None:
     """Entry point of `vtrefine-find-pads`."""
-    options = parse_arguments(arguments)
+    options = make_parser().parse_args(arguments)
     extras.require("vtrefine-find-pads", extras.PADS)
     if len(set(options.names)) < len(options.names):
         raise ValueError(f"--names must differ from each other, got {' '.join(options.names)}")

@@ -2,12 +2,17 @@
 
 import argparse
 import json
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any, override
 
 
-class _HelpFormat(argparse.Action):
-    """Print what a recording set holds, or the JSON Schema of a file."""
+class _Answer(argparse.Action):
+    """Print what `answer` makes of the flag's value, and leave."""
+
+    def __init__(self, *args: Any, answer: Callable[[Any], str], **kwargs: Any) -> None:
+        super().__init__(*args, **kwargs)
+        self.answer = answer
 
     @override
     def __call__(
@@ -17,28 +22,22 @@ class _HelpFormat(argparse.Action):
         values: Any,
         option_string: str | None = None,
     ) -> None:
-        from lerobot_vtrefine.diagnose.formats import describe_recording, schema_of
-
-        print(json.dumps(schema_of(values), indent=2) if values else describe_recording())
+        print(self.answer(values))
         parser.exit()
 
 
-class _Template(argparse.Action):
-    """Write an example recording set."""
+def _describe(name: str | None) -> str:
+    """What a recording set holds, or the JSON Schema of a file."""
+    from lerobot_vtrefine.diagnose.formats import describe_recording, schema_of
 
-    @override
-    def __call__(
-        self,
-        parser: argparse.ArgumentParser,
-        namespace: argparse.Namespace,
-        values: Any,
-        option_string: str | None = None,
-    ) -> None:
-        from lerobot_vtrefine.diagnose.template import write_template
+    return json.dumps(schema_of(name), indent=2) if name else describe_recording()
 
-        folder = write_template(Path(values))
-        print(f"wrote an example set; try vtrefine-diagnose --recording={folder} --output_dir=diagnosis")
-        parser.exit()
+
+def _write_template(folder: str) -> str:
+    from lerobot_vtrefine.diagnose.template import write_template
+
+    written = write_template(Path(folder))
+    return f"wrote an example set; try vtrefine-diagnose --recording={written} --output_dir=diagnosis"
 
 
 def add_format_flags(parser: argparse.ArgumentParser) -> None:
@@ -47,13 +46,15 @@ def add_format_flags(parser: argparse.ArgumentParser) -> None:
         "--help-format",
         nargs="?",
         metavar="NAME",
-        action=_HelpFormat,
+        action=_Answer,
+        answer=_describe,
         help="describe a recording set, or print the JSON Schema of recording.json, verdict.json, "
         "sensor_model.json or reality.json, and leave",
     )
     parser.add_argument(
         "--template",
         metavar="FOLDER",
-        action=_Template,
+        action=_Answer,
+        answer=_write_template,
         help="write an example recording set to imitate, and leave",
     )

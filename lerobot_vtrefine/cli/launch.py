@@ -3,7 +3,8 @@
 import importlib
 import sys
 import textwrap
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+from functools import partial
 from pathlib import Path
 
 import yaml
@@ -18,56 +19,8 @@ WANTED = {"env": "say which task, --config_path=vtrefine:NAME or --env.type=vtre
 """What to give for a group of flags."""
 
 
-@run_cli
-def demo() -> int:
-    """Console entry point of ``vtrefine-demo``."""
-    return launch("demo", "lerobot_vtrefine.cli.pipeline.demo_config", "DemoConfig")
-
-
-@run_cli
-def record_demos() -> int:
-    """Console entry point of ``vtrefine-record-demos``."""
-    return launch("record_demos", "lerobot_vtrefine.cli.record_demos", "RecordDemosConfig")
-
-
-@run_cli
-def finetune() -> int:
-    """Console entry point of ``vtrefine-finetune``."""
-    return launch("finetune", "lerobot_vtrefine.finetune.pipeline", "FinetunePipelineConfig")
-
-
-@run_cli
-def information() -> int:
-    """Console entry point of ``vtrefine-information``."""
-    return launch("information", "lerobot_vtrefine.cli.information", "InformationConfig")
-
-
-@run_cli
-def play() -> int:
-    """Console entry point of ``vtrefine-play``."""
-    return launch("play", "lerobot_vtrefine.cli.play", "PlayConfig")
-
-
-@run_cli
-def bench() -> int:
-    """Console entry point of ``vtrefine-bench``."""
-    return launch("bench", "lerobot_vtrefine.cli.bench", "BenchConfig")
-
-
-@run_cli
-def import_dataset() -> int:
-    """Console entry point of ``vtrefine-import``."""
-    return launch("import_dataset", "lerobot_vtrefine.cli.import_dataset", "ImportConfig")
-
-
-@run_cli
-def replay() -> int:
-    """Console entry point of ``vtrefine-replay``."""
-    return launch("replay", "lerobot_vtrefine.cli.replay", "ReplayConfig")
-
-
 def launch(command: str, module: str, config: str) -> int:
-    """Show help, or hand over to ``lerobot_vtrefine.cli.COMMAND``, whose flags are a dataclass's fields.
+    """Show help, or run ``lerobot_vtrefine.cli.COMMAND``, whose flags are the fields of ``module.config``.
 
     Raises:
         ValueError: a flag is missing; told before LeRobot is imported, which takes ten seconds.
@@ -80,6 +33,21 @@ def launch(command: str, module: str, config: str) -> int:
     if sys.stderr.isatty():
         print("loading LeRobot and PyTorch (the first time takes longest) ...", file=sys.stderr, flush=True)
     return importlib.import_module(name).main()
+
+
+def entry_point(command: str, module: str, config: str) -> Callable[[], int]:
+    """Console entry point of a command; its arguments are those of `launch`."""
+    return run_cli(partial(launch, command, module, config))
+
+
+demo = entry_point("demo", "lerobot_vtrefine.cli.pipeline.demo_config", "DemoConfig")
+record_demos = entry_point("record_demos", "lerobot_vtrefine.cli.record_demos", "RecordDemosConfig")
+finetune = entry_point("finetune", "lerobot_vtrefine.finetune.pipeline", "FinetunePipelineConfig")
+information = entry_point("information", "lerobot_vtrefine.cli.information", "InformationConfig")
+play = entry_point("play", "lerobot_vtrefine.cli.play", "PlayConfig")
+bench = entry_point("bench", "lerobot_vtrefine.cli.bench", "BenchConfig")
+import_dataset = entry_point("import_dataset", "lerobot_vtrefine.cli.import_dataset", "ImportConfig")
+replay = entry_point("replay", "lerobot_vtrefine.cli.replay", "ReplayConfig")
 
 
 def check_required(flags: Sequence[Flag], arguments: Sequence[str]) -> None:

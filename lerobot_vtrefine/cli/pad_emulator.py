@@ -10,7 +10,7 @@ from contextlib import ExitStack
 from dataclasses import dataclass
 from pathlib import Path
 
-from lerobot_vtrefine.cli.arguments import OneLineParser
+from lerobot_vtrefine.cli.arguments import CommandParser
 from lerobot_vtrefine.cli.errors import run_cli
 from lerobot_vtrefine.datasets.features import PADS
 from lerobot_vtrefine.drivers.diagnostic_emulator import DiagnosticEmulator
@@ -39,9 +39,9 @@ examples:
 SOURCES = ("contact", "noise", "press", "pattern", "recording")
 
 
-def parse_arguments(arguments: Sequence[str] | None) -> argparse.Namespace:
+def make_parser() -> CommandParser:
     """Command line of `vtrefine-pad-emulator`."""
-    parser = OneLineParser(
+    parser = CommandParser(
         "vtrefine-pad-emulator",
         "Emulate FlexiTac boards on pseudo-terminals. Prints their ports; runs until Ctrl-C.",
         EPILOG,
@@ -95,8 +95,8 @@ def parse_arguments(arguments: Sequence[str] | None) -> argparse.Namespace:
     add("--stall", type=float, default=1.0, help="length of a stall in seconds (%(default)s)")
     add("--unplug_at", type=float, default=0.0, help="seconds after the start at which the ports vanish")
     add("--replug_after", type=float, default=1.0, help="seconds until they are back (%(default)s)")
-    add("--markers", type=int, nargs="+", default=[], metavar="TAXEL", help="taxels that read AA 55 for ever")
-    return parser.parse_args(arguments)
+    add("--markers", type=int, nargs="+", default=[], metavar="TAXEL", help="taxels that always read AA 55")
+    return parser
 
 
 @dataclass(frozen=True)
@@ -205,7 +205,7 @@ def start_arms(folder: Path, stack: ExitStack) -> Callable[[float], None]:
 @run_cli
 def main(arguments: Sequence[str] | None = None) -> None:
     """Entry point of `vtrefine-pad-emulator`."""
-    options = parse_arguments(arguments)
+    options = make_parser().parse_args(arguments)
     shape = parse_shape(options.shape)
     faults = parse_faults(options)
     names = PADS if options.boards <= len(PADS) else tuple(f"pad_{i}" for i in range(options.boards))

@@ -2,7 +2,7 @@
 
 from collections.abc import Sequence
 
-from lerobot_vtrefine.cli.arguments import OneLineParser
+from lerobot_vtrefine.cli.arguments import CommandParser
 from lerobot_vtrefine.cli.errors import run_cli
 from lerobot_vtrefine.extras import ASYNCHRONOUS, require
 
@@ -20,9 +20,9 @@ and on the robot's computer LeRobot's own client:
 LARGEST_PORT = 65535
 
 
-def make_parser() -> OneLineParser:
+def make_parser() -> CommandParser:
     """Command line of ``vtrefine-policy-server``."""
-    parser = OneLineParser("vtrefine-policy-server", DESCRIPTION, EPILOG)
+    parser = CommandParser("vtrefine-policy-server", DESCRIPTION, EPILOG)
     parser.add_argument("--host", default="127.0.0.1", help="address to listen at (default %(default)s)")
     parser.add_argument("--port", type=int, default=8080, help="(default %(default)s)")
     parser.add_argument("--fps", type=int, default=10, help="actions per second (default %(default)s)")

@@ -6,7 +6,7 @@ from pathlib import Path
 
 from tqdm import tqdm
 
-from lerobot_vtrefine.cli.arguments import OneLineParser
+from lerobot_vtrefine.cli.arguments import CommandParser
 from lerobot_vtrefine.cli.errors import run_cli
 from lerobot_vtrefine.cli.outputs import staged
 
@@ -28,9 +28,9 @@ example:
       --output_dir=predicted"""
 
 
-def make_parser() -> OneLineParser:
+def make_parser() -> CommandParser:
     """Command line of ``vtrefine-predict``."""
-    parser = OneLineParser("vtrefine-predict", DESCRIPTION, EPILOG)
+    parser = CommandParser("vtrefine-predict", DESCRIPTION, EPILOG)
     parser.add_argument(
         "--recording", type=Path, required=True, metavar="DIR", help="folder with recording.json"
     )

@@ -3,7 +3,7 @@
 from collections.abc import Sequence
 from pathlib import Path
 
-from lerobot_vtrefine.cli.arguments import OneLineParser
+from lerobot_vtrefine.cli.arguments import CommandParser
 from lerobot_vtrefine.cli.errors import run_cli
 from lerobot_vtrefine.extras import SIMULATOR, require
 
@@ -18,9 +18,9 @@ examples:
 REPLICATES = 2
 
 
-def make_parser() -> OneLineParser:
+def make_parser() -> CommandParser:
     """Command line of ``vtrefine-press``."""
-    parser = OneLineParser("vtrefine-press", DESCRIPTION, EPILOG)
+    parser = CommandParser("vtrefine-press", DESCRIPTION, EPILOG)
     parser.add_argument(
         "--reality",
         type=Path,

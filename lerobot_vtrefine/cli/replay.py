@@ -13,6 +13,7 @@ from lerobot.configs.default import EvalConfig
 from lerobot.envs.configs import EnvConfig
 from lerobot.utils.utils import init_logging
 
+from lerobot_vtrefine.choices import check_choice
 from lerobot_vtrefine.cli.errors import run_cli
 from lerobot_vtrefine.cli.outputs import staged
 from lerobot_vtrefine.datasets.episodes import EpisodeFolder, open_episodes
@@ -65,14 +66,12 @@ class ReplayConfig:
     def __post_init__(self) -> None:
         if self.dataset.root is None and self.dataset.repo_id is None:
             raise ValueError("say what to replay: --dataset.root=FOLDER, or --dataset.repo_id=NAME")
-        if self.hold not in HOLDS:
-            raise ValueError(f"unknown --hold={self.hold}; choose from {', '.join(HOLDS)}")
-        if self.parts not in PARTS:
-            raise ValueError(f"unknown --parts={self.parts}; choose from {', '.join(PARTS)}")
+        check_choice("--hold", self.hold, HOLDS)
+        check_choice("--parts", self.parts, PARTS)
         if self.episodes is not None and not self.episodes:
             raise ValueError("--episodes is empty; leave it out to replay all of them")
         if self.env is not None and not isinstance(self.env, VtRefineEnvConfig):
-            raise ValueError(f"--env.type={self.env.type} is no twin; use --env.type=vtrefine")
+            raise ValueError(f"--env.type={self.env.type} cannot be the twin; use --env.type=vtrefine")
 
 
 def replay(config: ReplayConfig) -> Comparison:

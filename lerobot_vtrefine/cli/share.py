@@ -3,7 +3,7 @@
 from collections.abc import Sequence
 from pathlib import Path
 
-from lerobot_vtrefine.cli.arguments import OneLineParser
+from lerobot_vtrefine.cli.arguments import CommandParser
 from lerobot_vtrefine.cli.errors import run_cli
 
 DESCRIPTION = """\
@@ -17,9 +17,9 @@ examples:
       --evaluation=outputs/eval"""
 
 
-def make_parser() -> OneLineParser:
+def make_parser() -> CommandParser:
     """Command line of ``vtrefine-share``."""
-    parser = OneLineParser("vtrefine-share", DESCRIPTION, EPILOG)
+    parser = CommandParser("vtrefine-share", DESCRIPTION, EPILOG)
     add = parser.add_argument
     add("folder", type=Path, metavar="FOLDER", help="a dataset's root, or a checkpoint's pretrained_model")
     add("--repo_id", required=True, metavar="USER/NAME", help="its name on the Hub")

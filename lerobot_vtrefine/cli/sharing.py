@@ -7,7 +7,7 @@ from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
-from lerobot_vtrefine.cli.pipeline.demo_config import flags
+from lerobot_vtrefine.cli.arguments import flags
 from lerobot_vtrefine.cli.report.results import load_evaluation, percent
 from lerobot_vtrefine.envs.evaluation_note import read_note
 from lerobot_vtrefine.files import read_json, read_json_lines

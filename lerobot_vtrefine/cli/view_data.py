@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from lerobot_vtrefine.cli.arguments import OneLineParser
+from lerobot_vtrefine.cli.arguments import CommandParser
 from lerobot_vtrefine.cli.errors import run_cli
 
 DESCRIPTION = """\
@@ -21,9 +21,9 @@ POINT_RADIUS_M = 0.001
 GREY = (138, 143, 152)
 
 
-def make_parser() -> OneLineParser:
+def make_parser() -> CommandParser:
     """Command line of ``vtrefine-view-data``."""
-    parser = OneLineParser("vtrefine-view-data", DESCRIPTION, EPILOG)
+    parser = CommandParser("vtrefine-view-data", DESCRIPTION, EPILOG)
     add = parser.add_argument
     add("--dataset.root", dest="root", type=Path, metavar="DIR", help="LeRobot dataset, by its folder")
     add("--dataset.repo_id", dest="repo_id", metavar="NAME", help="LeRobot dataset, by its name on the Hub")

@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lerobot_vtrefine import extras
+from lerobot_vtrefine.cli.arguments import CommandParser
 from lerobot_vtrefine.cli.errors import run_cli
 from lerobot_vtrefine.drivers.board import PadReader, Status
 from lerobot_vtrefine.drivers.config import PadConfig
@@ -21,6 +22,7 @@ from lerobot_vtrefine.drivers.picture import colours
 from lerobot_vtrefine.drivers.ports import PortError
 from lerobot_vtrefine.drivers.serial_reader import RETRY_S
 
+DESCRIPTION = "Show FlexiTac pads live, row 0 at the top, column 0 at the left."
 EPILOG = """\
 examples:
   vtrefine-view-pads --pads_file=pads.yaml
@@ -28,14 +30,9 @@ examples:
 _HOME, _CLEAR, _RESET, _SHOW, _HIDE = "\x1b[H", "\x1b[2J", "\x1b[0m", "\x1b[?25h", "\x1b[?25l"
 
 
-def parse_arguments(arguments: Sequence[str] | None) -> argparse.Namespace:
+def make_parser() -> CommandParser:
     """Command line of `vtrefine-view-pads`."""
-    parser = argparse.ArgumentParser(
-        prog="vtrefine-view-pads",
-        description="Show FlexiTac pads live, row 0 at the top, column 0 at the left.",
-        formatter_class=argparse.RawDescriptionHelpFormatter,
-        epilog=EPILOG,
-    )
+    parser = CommandParser("vtrefine-view-pads", DESCRIPTION, EPILOG)
     add = parser.add_argument
     add("--pads_file", type=Path, help="file written by vtrefine-find-pads")
     add("--ports", nargs="+", default=[], metavar="PORT", help="ports to show instead of a pads file")
@@ -49,7 +46,7 @@ def parse_arguments(arguments: Sequence[str] | None) -> argparse.Namespace:
     group.add_argument("--diagnostic", metavar="PORT", help="show readings of one taxel, once a second")
     group.add_argument("--channel", type=int, default=4, help="multiplexer channel, 0..15 (%(default)s)")
     group.add_argument("--column", type=int, default=0, help="column, 0..31 (%(default)s)")
-    return parser.parse_args(arguments)
+    return parser
 
 
 def draw(counts: NDArray[np.uint8], idle: NDArray[np.uint8], *, stale: bool) -> list[str]:
@@ -94,7 +91,7 @@ def chosen_pads(options: argparse.Namespace) -> dict[str, PadConfig]:
 @run_cli
 def main(arguments: Sequence[str] | None = None) -> None:
     """Entry point of `vtrefine-view-pads`."""
-    options = parse_arguments(arguments)
+    options = make_parser().parse_args(arguments)
     extras.require("vtrefine-view-pads", extras.PADS)
     if options.hz <= 0:
         raise ValueError(f"--hz={options.hz} must be positive")

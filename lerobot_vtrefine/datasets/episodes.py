@@ -14,7 +14,7 @@ import pyarrow as pa
 
 from lerobot_vtrefine.datasets.features import ACTION_KEY, STATE_KEY, Array
 from lerobot_vtrefine.files import decode, limits, read_json
-from lerobot_vtrefine.files.tables import read_table
+from lerobot_vtrefine.files.tables import read_columns
 
 TACTILE_PREFIX = "observation.tactile."
 BASELINE_PREFIX = "observation.tactile_baseline."
@@ -93,12 +93,7 @@ class EpisodeFolder:
     def _table(self, path: Path) -> pa.Table:
         columns = ["episode_index", "frame_index", "timestamp", STATE_KEY, ACTION_KEY]
         columns += [f"{prefix}{pad}" for prefix in (TACTILE_PREFIX, BASELINE_PREFIX) for pad in self.pads]
-        try:
-            table = read_table(path, columns)
-        except ValueError as error:
-            raise ValueError(f"{path} cannot be read: {error}") from error
-        if missing := [name for name in columns if name not in table.column_names]:
-            raise ValueError(f"{path} has no column {missing[0]}")
+        table = read_columns(path, columns)
         for name in columns:
             _check_numbers(path, name, table[name])
         return table
@@ -149,7 +144,7 @@ def open_episodes(root: Path) -> EpisodeFolder:
     try:
         info = decode(_Info, data, "the dataset's description", others=True)
     except ValueError as error:
-        raise ValueError(f"{path} is no description of a LeRobot dataset: {error}") from error
+        raise ValueError(f"{path} does not describe a LeRobot dataset: {error}") from error
     features, version = info.features, info.codebase_version
     if version != "v3.0":
         raise ValueError(f"{path}: dataset version {version} is not v3.0; convert it with LeRobot first")

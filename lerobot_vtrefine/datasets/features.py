@@ -61,9 +61,6 @@ GRIDS_KEY = "observation.tactile_grids"
 VISUAL_KEYS = (DEPTH_KEY, INTRINSICS_KEY, CAMERA_POSE_KEY)
 TAXEL_UNIT = "adc_counts"
 
-DEFAULT_NOISE_LEVEL = 3.0
-"""The paper's depth noise level in simulation (appendix, vision alignment, step iv)."""
-
 
 def tactile_keys(body: Embodiment) -> tuple[str, ...]:
     """Columns of the pads' counts, in the order of the body's pads."""

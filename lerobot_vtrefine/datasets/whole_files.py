@@ -5,11 +5,12 @@ A file is written under another name, which no reader looks at, forced to the di
 
 import contextlib
 import json
-import os
 from collections.abc import Generator
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
+
+from lerobot_vtrefine.folders import sync
 
 PART = ".part"
 """What the names of unfinished files and folders end in."""
@@ -35,12 +36,3 @@ def write_json(path: Path, data: Any) -> None:
     """Writes ``data`` as LeRobot does, but whole."""
     with whole_file(path) as part:
         part.write_text(json.dumps(data, indent=4, ensure_ascii=False), encoding="utf-8")
-
-
-def sync(path: Path) -> None:
-    """Waits until a file's contents or a folder's names are on the disk."""
-    descriptor = os.open(path, os.O_RDONLY)
-    try:
-        os.fsync(descriptor)
-    finally:
-        os.close(descriptor)

@@ -7,6 +7,8 @@ from typing import Protocol
 
 import numpy as np
 
+from lerobot_vtrefine.choices import check_choice
+
 
 @dataclass(frozen=True)
 class Evidence:
@@ -28,8 +30,7 @@ class Evidence:
     observed: bool = False
 
     def __post_init__(self) -> None:
-        if self.decision not in DECISIONS:
-            raise ValueError(f"decision {self.decision!r} is unknown; choose from {', '.join(DECISIONS)}")
+        check_choice("decision", self.decision, DECISIONS)
 
 
 DECISIONS = ("accepted", "symptom", "tie", "rejected", "not identifiable")

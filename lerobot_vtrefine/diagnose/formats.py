@@ -8,6 +8,7 @@ import dataclasses
 from collections.abc import Callable
 from typing import Any
 
+from lerobot_vtrefine.choices import check_choice
 from lerobot_vtrefine.diagnose.recordings import SHAPES, Entry, Header
 from lerobot_vtrefine.diagnose.verdict import VerdictFile
 from lerobot_vtrefine.files.json_schema import DIALECT, json_schema
@@ -84,8 +85,7 @@ FORMATS = tuple(_MAKERS)
 
 def schema_of(name: str) -> dict[str, Any]:
     """The JSON Schema of one of FORMATS; ValueError lists them."""
-    if name not in _MAKERS:
-        raise ValueError(f"no format {name[:60]!r}; choose from {', '.join(FORMATS)}")
+    check_choice("format", name, FORMATS)
     return {"$schema": DIALECT, "title": name, **_MAKERS[name]()}
 
 

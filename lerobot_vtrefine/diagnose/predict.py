@@ -25,7 +25,7 @@ def load_predictor(path: str | Path, recordings: RecordingSet) -> Predict:
     """The model in a file, applied to trials of this set.
 
     Raises:
-        ValueError: the file is no model, or one of the other kind (pad, robot); names the file.
+        ValueError: the file is not a model, or one of the other kind (pad, robot); names the file.
     """
     data = read_json(path)
     schema = data.get("schema") if isinstance(data, dict) else None

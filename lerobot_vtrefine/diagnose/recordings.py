@@ -335,7 +335,7 @@ class _Table:
         except pa.ArrowException as error:
             raise self.fail(name, f"cannot be read as numbers, it holds {column.type}") from error
         if (huge := np.flatnonzero(np.isfinite(values) & (np.abs(values) > LARGEST_NUMBER))).size:
-            raise self.fail(name, f"holds {values[huge[0]]:g}, which is no measurement")
+            raise self.fail(name, f"holds {values[huge[0]]:g}, which is not a measurement")
         return values
 
     def meta(self) -> dict[str, Any]:

@@ -12,6 +12,7 @@ from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any, Literal, get_args
 
+from lerobot_vtrefine.choices import check_choice
 from lerobot_vtrefine.files import decode, limits, read_json
 
 SCHEMA = "vtrefine/verdict@1"
@@ -99,8 +100,8 @@ class Cause:
 
     def __post_init__(self) -> None:
         _check_names("cause", (self.name,))
-        _check_choice("role", self.role, get_args(Role))
-        _check_choice("basis", self.basis, get_args(Basis))
+        check_choice("role", self.role, get_args(Role))
+        check_choice("basis", self.basis, get_args(Basis))
         if self.basis == "observed" and self.p_value is not None:
             raise ValueError(f"{self.name} was observed, not tested: it has no p_value, got {self.p_value}")
         if self.p_value is not None and not 0.0 <= self.p_value <= 1.0:
@@ -167,7 +168,7 @@ class Verdict:
         object.__setattr__(self, "causes", tuple(by_gain))
         object.__setattr__(self, "ambiguous_with", tuple(tuple(names) for names in self.ambiguous_with))
         object.__setattr__(self, "data_issues", tuple(self.data_issues))
-        _check_choice("status", self.status, get_args(Status))
+        check_choice("status", self.status, get_args(Status))
         for names in self.ambiguous_with:
             _check_names("ambiguous_with", names)
         _check_names("minimum_detectable", tuple(self.minimum_detectable))
@@ -281,11 +282,6 @@ def _parameter(entry: _ParameterEntry) -> Parameter:
     return Parameter(
         entry.value, (ci95[0], ci95[1]) if ci95 is not None and is_interval else ci95, entry.unit
     )
-
-
-def _check_choice(name: str, value: str, choices: tuple[str, ...]) -> None:
-    if value not in choices:
-        raise ValueError(f"{name} {value!r} is unknown; choose from {', '.join(choices)}")
 
 
 def _check_names(where: str, names: tuple[str, ...]) -> None:

@@ -32,7 +32,7 @@ class LineBuffer:
         """Complete lines, CR and LF removed."""
         *lines, self._rest = (self._rest + data).split(b"\n")
         if len(self._rest) > _MAX_LINE:
-            self._rest = b"?"  # not a text stream; keep one byte so that the remainder is no valid line
+            self._rest = b"?"  # not a text stream; keep one byte so that the remainder is not a valid line
         return [line.rstrip(b"\r") for line in lines]
 
 

@@ -30,11 +30,14 @@ SILENCE_S = 0.0015
 """A line on which nothing came for this long was silent (at 2 Mbaud: the time of 300 bytes)."""
 
 COALESCE_S = 0.001
-"""Pause after the first bytes of a burst that are no whole frame, so that a frame costs one or two wake-ups
+"""Pause after the first bytes of a burst, less than a whole frame, so that a frame costs one or two wake-ups
 instead of one per USB packet."""
 
 RATE_WINDOW_S = 2.0
 """Time over which the frame rate is measured."""
+
+IDLE_TIMEOUT_S = 5.0
+"""How long the frames of the idle counts may take to come."""
 
 
 class Status(StrEnum):
@@ -127,14 +130,14 @@ class PadReader(SerialReader):
             arrived = self._changed.wait_for(lambda: self._seq - 1 > seq and bool(self._history), timeout_s)
             return self._history[-1] if arrived else None
 
-    def idle_counts(self, frames: int = 30, timeout_s: float = 5.0) -> NDArray[np.uint8]:
+    def idle_counts(self, frames: int = 30) -> NDArray[np.uint8]:
         """Idle counts, uint8 (pad rows, cols): the median of new frames. The pad must not be touched.
 
         Raises:
             PortError: the frames did not come in time.
         """
         seen = self._seq - 1
-        deadline = time.monotonic() + timeout_s
+        deadline = time.monotonic() + IDLE_TIMEOUT_S
         while len(taken := self.frames_after(seen)) < frames:
             if (
                 self.wait_after(taken[-1].seq if taken else seen, max(0.0, deadline - time.monotonic()))

@@ -3,6 +3,7 @@
 from dataclasses import dataclass
 from typing import Literal
 
+from lerobot_vtrefine.choices import check_choice
 from lerobot_vtrefine.drivers.frames import STREAM_BAUD, FrameShape
 from lerobot_vtrefine.drivers.orientation import Orientation
 from lerobot_vtrefine.files import limits
@@ -43,8 +44,7 @@ class PadConfig:
     def __post_init__(self) -> None:
         if not self.port or not self.port.isprintable():
             raise ValueError("a pad needs a port; vtrefine-find-pads finds it and writes the pads file")
-        if self.protocol not in PROTOCOLS:
-            raise ValueError(f"protocol {self.protocol!r} does not exist; choose from {', '.join(PROTOCOLS)}")
+        check_choice("protocol", self.protocol, PROTOCOLS)
         if not self.stale_after_s > 0:
             raise ValueError(f"stale_after_s={self.stale_after_s} must be positive")
         self.orientation.check(self.board_shape)

@@ -27,8 +27,8 @@ START_TIMEOUT_S = 6.0
 class DiagnosticReader(SerialReader):
     """Reads one board that runs the diagnostic firmware, in its own thread; all methods are thread-safe."""
 
-    def __init__(self, port: str, baud: int = DIAGNOSTIC_BAUD) -> None:
-        super().__init__(port, baud, "diagnostic board", READ_TIMEOUT_S)
+    def __init__(self, port: str) -> None:
+        super().__init__(port, DIAGNOSTIC_BAUD, "diagnostic board", READ_TIMEOUT_S)
         self._samples: deque[DiagnosticSample] = deque(maxlen=KEPT_SAMPLES)
         self._received = b""
 

@@ -121,7 +121,7 @@ class DynamixelArm:
     def _talking(self) -> Generator[None]:
         """Errors of the bus as one that names arm and port.
 
-        LeRobot raises RuntimeError where a motor answers with an error, an overload say.
+        LeRobot raises RuntimeError where a motor answers with an error, such as an overload.
         """
         try:
             yield
@@ -190,7 +190,7 @@ class DynamixelArm:
             raise PortError(f"{where}: torque may still be on in {', '.join(failed)}: {why}")
 
     def _close(self) -> None:
-        self.bus.port_handler.is_using = False  # or the SDK calls the port busy for ever after an error
+        self.bus.port_handler.is_using = False  # otherwise the SDK calls the port busy from an error on
         if self.is_connected:
             self.bus.port_handler.closePort()
 

@@ -19,7 +19,7 @@ ERROR_ACCESS = 0x07
 """Status error: the register is read-only or locked."""
 
 ALERT = 0x80
-"""Bit of every status error of a motor that shut down, after an overload say."""
+"""Bit of every status error of a motor that shut down, for example after an overload."""
 
 _EEPROM_END = 64
 _MODEL, _ID, _SECONDARY_ID, _HOMING_OFFSET = 0, 7, 12, 20
@@ -124,7 +124,6 @@ class DynamixelEmulator(EmulatedPort):
     def __init__(self, motors: list[EmulatedMotor], link: Path) -> None:
         super().__init__(link)
         self.motors = {motor.motor_id: motor for motor in motors}
-        self.bad_packets = 0
         self._buffer = bytearray()
 
     def _run(self) -> None:
@@ -148,7 +147,6 @@ class DynamixelEmulator(EmulatedPort):
             if crc16(whole[:-2]) == int.from_bytes(whole[-2:], "little"):
                 body = whole[7:-2].replace(b"\xff\xff\xfd\xfd", b"\xff\xff\xfd")
                 return whole[4], body[0], body[1:]
-            self.bad_packets += 1
         return None
 
     def answer(self, motor_id: int, instruction: int, parameters: bytes) -> bytes:

@@ -11,6 +11,7 @@ from pathlib import Path
 
 import numpy as np
 
+from lerobot_vtrefine.choices import check_choice
 from lerobot_vtrefine.drivers.emulated_port import EmulatedPort
 from lerobot_vtrefine.drivers.frames import MARKER, FrameShape
 from lerobot_vtrefine.drivers.sources import Source
@@ -92,8 +93,7 @@ class PadEmulator(EmulatedPort):
         super().__init__(link)
         if rate_hz <= 0:
             raise ValueError(f"rate_hz={rate_hz} must be positive")
-        if protocol not in ENCODERS:
-            raise ValueError(f"protocol {protocol!r} does not exist; choose from {', '.join(ENCODERS)}")
+        check_choice("protocol", protocol, ENCODERS)
         self.source = source
         self.shape = shape
         self.faults = faults or Faults()

@@ -65,6 +65,6 @@ def explain_stream(sample: bytes, wanted: StreamKind, baud: int) -> str:
         )
     other = STREAM_BAUD if baud != STREAM_BAUD else DIAGNOSTIC_BAUD
     return (
-        f"{len(sample)} bytes came that are no FlexiTac frames: wrong baud rate ({baud}; try {other}), "
+        f"{len(sample)} bytes came that are not FlexiTac frames: wrong baud rate ({baud}; try {other}), "
         "or another device"
     )

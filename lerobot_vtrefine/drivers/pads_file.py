@@ -59,9 +59,7 @@ def decode_pads(entries: dict[str, Any], where: str) -> dict[str, PadConfig]:
     pads: dict[str, PadConfig] = {}
     for name, entry in entries.items():
         if not isinstance(name, str) or not _NAME.fullmatch(name):
-            raise ValueError(
-                f"{where}: {str(name)[:60]!r} is no name of a pad: letters, digits, _ . and - make one"
-            )
+            raise ValueError(f"{where}: {str(name)[:60]!r} cannot name a pad: use letters, digits, _ . and -")
         if isinstance(entry, PadConfig):
             pads[name] = entry
             continue

@@ -20,6 +20,9 @@ Source = Callable[[int], NDArray[np.uint8]]
 REST_COUNTS = (10, 40)
 """Range of idle readings (PyFlexiTac's documentation)."""
 
+PEAK_COUNTS = 180.0
+"""What the simulated fingertip adds where it presses most."""
+
 PATTERN_BYTES = 32
 """Taxels at the start of a test-pattern frame that carry its number, send time and checksum, a nibble
 each."""
@@ -43,9 +46,7 @@ def noise_source(shape: FrameShape, seed: int = 0, std_counts: float = 1.0) -> S
     return frame
 
 
-def contact_source(
-    shape: FrameShape, seed: int = 0, period_frames: int = 400, peak_counts: float = 180.0
-) -> Source:
+def contact_source(shape: FrameShape, seed: int = 0, period_frames: int = 400) -> Source:
     """A fingertip (2 taxels wide) that presses, wanders over the pad and lets go, once per period."""
     idle = noise_source(shape, seed)
     rows, cols = np.mgrid[: shape.rows, : shape.cols]
@@ -54,7 +55,7 @@ def contact_source(
         phase = 2 * np.pi * (number % period_frames) / period_frames
         row = (shape.rows - 1) * (0.5 + 0.5 * np.sin(phase))
         col = (shape.cols - 1) * (0.5 + 0.5 * np.sin(2 * phase))
-        press = peak_counts * max(0.0, np.sin(phase / 2)) ** 2
+        press = PEAK_COUNTS * max(0.0, np.sin(phase / 2)) ** 2
         blob = press * np.exp(-((rows - row) ** 2 + (cols - col) ** 2) / (2 * 2.0**2))
         return np.clip(idle(number) + np.rint(blob), 0, 255).astype(np.uint8)
 

@@ -7,6 +7,7 @@ from typing import Any
 from lerobot.configs import FeatureType, PolicyFeature
 from lerobot.envs.configs import EnvConfig
 
+from lerobot_vtrefine.choices import check_choice
 from lerobot_vtrefine.datasets.features import ACTION_KEY, RGB_KEY, env_key_map, env_observation_shapes
 from lerobot_vtrefine.embodiments import Embodiment, get_embodiment
 from lerobot_vtrefine.extras import SIMULATOR, require
@@ -95,10 +96,10 @@ class VtRefineEnvConfig(EnvConfig):
 
     @told_by_lerobot
     def __post_init__(self) -> None:
-        require("--env.type=vtrefine", SIMULATOR)  # now, not when a training first evaluates
-        _check_choice("vectorization", self.vectorization, VECTORIZATIONS)
-        _check_choice("ablate", self.ablate, ABLATIONS)
-        _check_choice("backend", self.backend, BACKENDS)
+        require("--env.type=vtrefine", SIMULATOR)  # now, rather than when training first evaluates
+        check_choice("--env.vectorization", self.vectorization, VECTORIZATIONS)
+        check_choice("--env.ablate", self.ablate, ABLATIONS)
+        check_choice("--env.backend", self.backend, BACKENDS)
         check_control_rate("--env.fps", self.fps)
         if self.ablate not in ("none", "touch_shuffled") and self.ablate_dataset is None:
             raise ValueError(
@@ -181,7 +182,7 @@ def policy_features(
 ) -> dict[str, PolicyFeature]:
     """LeRobot features under environment keys; `colour` is the colour image's height and width.
 
-    Depth is no VISUAL feature here: ``lerobot-eval --eval.recording=true`` makes videos of these, and
+    Depth is not a VISUAL feature here: ``lerobot-eval --eval.recording=true`` makes videos of these, and
     millimetres do not fit into one.
     """
     shapes = env_observation_shapes(camera_height, camera_width, body)
@@ -189,8 +190,3 @@ def policy_features(
     if colour is not None:
         features[RGB_KEY] = PolicyFeature(type=FeatureType.VISUAL, shape=(*colour, 3))
     return {ACTION_KEY: PolicyFeature(type=FeatureType.ACTION, shape=(body.num_joints,)), **features}
-
-
-def _check_choice(name: str, value: str, choices: tuple[str, ...]) -> None:
-    if value not in choices:
-        raise ValueError(f"--env.{name}={value} is unknown; choose from {', '.join(choices)}")

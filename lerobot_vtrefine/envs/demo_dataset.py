@@ -240,7 +240,7 @@ def _read_ledger(root: Path) -> dict[str, Any]:
     path = root / LEDGER
     if not path.is_file():
         raise FileExistsError(
-            f"{root} exists and is no recording of this command; choose another --root or remove it"
+            f"{root} exists and is not a recording of this command; choose another --root or remove it"
         )
     try:
         ledger = json.loads(path.read_text(encoding="utf-8"))

@@ -66,6 +66,6 @@ def read_episode_log(path: Path, first_seed: int, num_episodes: int) -> list[dic
             by_seed[decode(_Episode, row, "it", others=True).seed] = row
             decode(_Values, {"values": row}, "it")
         except ValueError as error:
-            raise ValueError(f"{path}: entry {number} is no episode: {error}") from error
+            raise ValueError(f"{path}: entry {number} is not an episode: {error}") from error
     wanted = range(first_seed, first_seed + num_episodes)
     return [by_seed[seed] for seed in wanted if seed in by_seed]

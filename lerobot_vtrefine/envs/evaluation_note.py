@@ -55,5 +55,5 @@ def read_note(metrics_path: Path) -> dict[str, Any] | None:
         return None
     note = read_json(path)
     if not (isinstance(note, dict) and isinstance(note.get("env"), dict) and note.get("batch_size")):
-        raise ValueError(f"{path} is no note of an evaluation's environment")
+        raise ValueError(f"{path} is not a note of an evaluation's environment")
     return note

@@ -24,8 +24,7 @@ class VtRefineVectorEnv(gym.vector.VectorEnv[Observation, Array, Array]):
     """``num_envs`` insertion episodes stepped together.
 
     - ``reset(seed=[...])``: each episode is a pure function of its seed; ``options={"reset_mask": (n,)
-    bool}``
-      restarts only those environments.
+      bool}`` restarts only those environments.
     - There is no autoreset: a finished environment costs nothing, repeats its last observation and flags with
       reward 0, and waits for a reset. This is what ``lerobot-eval`` needs.
     - ``info["is_success"]`` is (n,) bool; ``info["final_info"]`` appears in steps in which an episode ends

@@ -32,10 +32,10 @@ def read_arrays(path: Path, kinds: Mapping[str, str] | str) -> dict[str, NDArray
 
     Raises:
         OSError: the file is not there or cannot be read.
-        ValueError: it is no such file, or an array is of another kind; names file and array.
+        ValueError: it is not such a file, or an array is of another kind; names file and array.
     """
     if path.exists() and not path.is_file():
-        raise ValueError(f"{path} is no regular file")
+        raise ValueError(f"{path} is not a regular file")
     with path.open("rb") as file:
         try:
             return dict(_archived(file, kinds) if zipfile.is_zipfile(file) else _alone(file, kinds))

@@ -35,6 +35,22 @@ def read_table(path: Path, columns: Sequence[str] | None = None, *, without: Seq
         raise ValueError(reason) from error
 
 
+def read_columns(path: Path, columns: Sequence[str], *, others: bool = False) -> pa.Table:
+    """These columns of a table, all of which must be there; with `others`, what else it has, too.
+
+    Raises:
+        ValueError: names the file, and why it cannot be read or which column it lacks.
+        OSError: there is no such file.
+    """
+    try:
+        table = read_table(path, None if others else columns)
+    except ValueError as error:
+        raise ValueError(f"{path} cannot be read: {error}") from error
+    if missing := [name for name in columns if name not in table.column_names]:
+        raise ValueError(f"{path} has no column {missing[0]}")
+    return table
+
+
 def _check_size(metadata: pq.FileMetaData, columns: Sequence[str], file_bytes: int) -> None:
     values = 0
     for group in range(metadata.num_row_groups):

@@ -31,7 +31,7 @@ def read_text(path: str | Path, max_bytes: int = MAX_JSON_BYTES) -> str:
     """UTF-8 text of a regular file, without a byte order mark."""
     path = Path(path)
     if path.exists() and not path.is_file():
-        raise ValueError(f"{path} is no regular file")
+        raise ValueError(f"{path} is not a regular file")
     with path.open("rb") as file:
         data = file.read(max_bytes + 1)
     if len(data) > max_bytes:
@@ -108,7 +108,7 @@ def check_settings(path: str | Path) -> None:
 
 def _lines(path: Path) -> Iterator[tuple[int, str]]:
     if path.exists() and not path.is_file():
-        raise ValueError(f"{path} is no regular file")
+        raise ValueError(f"{path} is not a regular file")
     with path.open("rb") as file:
         for number in range(1, MAX_LINES + 2):
             line = file.readline(MAX_LINE_BYTES + 1)
@@ -156,7 +156,7 @@ def _distinct(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
 def _finite(text: str) -> float:
     number = float(text)
     if not math.isfinite(number):
-        raise ValueError(f"{text[:40]} is no finite number")
+        raise ValueError(f"{text[:40]} is not a finite number")
     return number
 
 

@@ -190,13 +190,19 @@ class Practice(NamedTuple):
     processors: tuple[Any, Any]
 
 
+def checked_env(env: EnvConfig) -> VtRefineEnvConfig:
+    """The environment, if it is one that DPPO can run; else ValueError."""
+    if not isinstance(env, VtRefineEnvConfig):
+        raise ValueError(f"vtrefine-finetune needs --env.type=vtrefine, got {env.type}")
+    return env
+
+
 def make_practice(policy: VtDp3Policy, path: Path, env: EnvConfig, dppo: DppoConfig) -> Practice:
     """Agent, environments of this rank and the processors that were saved beside the policy in ``path``.
 
     Raises: ValueError for another environment type.
     """
-    if not isinstance(env, VtRefineEnvConfig):
-        raise ValueError(f"vtrefine-finetune needs --env.type=vtrefine, got {env.type}")
+    env = checked_env(env)
     config = policy.config
     overrides = {"device_processor": {"device": config.device or "cpu"}}
     processors = make_pre_post_processors(config, str(path), preprocessor_overrides=overrides)
@@ -211,10 +217,11 @@ def load_practice(
     """The same of a checkpoint's folder and a file as in configs/env; both on ``device`` (cpu, cuda).
 
     ``backend`` of the simulation; default: the file's. ``fields`` of the environment that differ from it.
+
+    Raises: ValueError for another environment type.
     """
-    env = draccus.decode(EnvConfig, read_yaml(task)["env"])
-    if isinstance(env, VtRefineEnvConfig):
-        env = replace(env, backend=backend or env.backend, warp=replace(env.warp, device=device), **fields)
+    env = checked_env(draccus.decode(EnvConfig, read_yaml(task)["env"]))
+    env = replace(env, backend=backend or env.backend, warp=replace(env.warp, device=device), **fields)
     policy = VtDp3Policy.from_pretrained(path).to(device)
     policy.config.device = device
     return make_practice(policy, path, env, dppo)

@@ -1,7 +1,5 @@
 """How often the expert succeeds when it acts on estimates in place of the truth: no actions are learnt."""
 
-from collections.abc import Callable
-
 import numpy as np
 import torch
 from torch import Tensor
@@ -78,7 +76,6 @@ def expert_success(
     views: Views,
     grasps: Grasps,
     device: torch.device,
-    told: Callable[[int], None] = lambda _: None,
 ) -> np.ndarray:
     """Success (at least ``num_episodes``,) bool of the clean expert on estimates; None: on the truth."""
     episodes = make_episodes(config, num_envs)
@@ -97,5 +94,4 @@ def expert_success(
             if believer is not None and len(episodes.active):
                 believer.look(episodes.active)
         successes.append(episodes.success.copy())
-        told(num_envs)
     return np.concatenate(successes)

@@ -19,6 +19,9 @@ from lerobot_vtrefine.policies.vt_dp3.observation_encoder import ObservationEnco
 HEAD_WIDTH = 256
 LEARNING_RATE = 1e-3
 WEIGHT_DECAY = 1e-3
+JUDGED_FRAMES = 4096
+"""Estimated at once when a regressor is judged."""
+RESAMPLES = 400
 
 
 @dataclass(frozen=True)
@@ -160,22 +163,22 @@ def train_estimator(
 
 
 @torch.no_grad()
-def episode_errors(estimator: Estimator, frames: Frames, batch_size: int = 4096) -> Tensor:
+def episode_errors(estimator: Estimator, frames: Frames) -> Tensor:
     """Mean squared error per episode and quantity (E, K), in SI units squared."""
     episode, frame = frames.index()
     sums = torch.zeros_like(frames.truth[:, 0])
-    for rows in torch.arange(len(episode), device=episode.device).split(batch_size):
+    for rows in torch.arange(len(episode), device=episode.device).split(JUDGED_FRAMES):
         error = estimator(estimator.window(frames, episode[rows], frame[rows]))
         error = error - frames.truth[episode[rows], frame[rows]]
         sums.index_add_(0, episode[rows], error.square())
     return sums / frames.length[:, None]
 
 
-def rms_with_interval(squares: Tensor, seed: int = 0, draws: int = 400) -> Tensor:
+def rms_with_interval(squares: Tensor, seed: int = 0) -> Tensor:
     """RMS error and the ends of its 95 % interval (3, K), by a bootstrap over episodes (E, K)."""
     generator = torch.Generator().manual_seed(seed)
     squares = squares.cpu()
-    rows = torch.randint(len(squares), (draws, len(squares)), generator=generator)
+    rows = torch.randint(len(squares), (RESAMPLES, len(squares)), generator=generator)
     drawn = torch.stack([squares[row].mean(0) for row in rows])
     ends = drawn.quantile(torch.tensor([0.025, 0.975]), dim=0)
     return torch.cat([squares.mean(0, keepdim=True), ends]).sqrt()

@@ -60,7 +60,7 @@ def check_steps(cls: type[DataProcessorPipeline], steps: list[dict[str, Any]], f
         step_class, name = cls._resolve_step_class(step)
         reason = None
         if not (isinstance(step_class, type) and issubclass(step_class, ProcessorStep)):
-            reason = f"names {step.get('class', name)!r}, which is no processor step"
+            reason = f"names {step.get('class', name)!r}, which is not a processor step"
         elif _restricted:
             reason = forbidden_class(step_class)
         if reason is not None:
@@ -71,13 +71,13 @@ def forbidden_entry(step: dict[str, Any]) -> str | None:
     """Why a step of a ``vt_dp3`` checkpoint must not even be imported, from what the file says; or None."""
     state_file = step.get("state_file")
     if state_file is not None and not _is_plain_state_file(state_file):
-        return f"names the state file {state_file!r}, which is no {STATE_SUFFIX} file beside this one"
+        return f"names the state file {state_file!r}, which is not a {STATE_SUFFIX} file beside this one"
     if not isinstance(step.get("config", {}), dict):
-        return "has a config that is no mapping of argument names to values"
+        return "has a config that is not a mapping of argument names to values"
     if "registry_name" in step:
         name = step["registry_name"]
         known = isinstance(name, str) and name in ProcessorStepRegistry.list()
-        return None if known else f"names {name!r}, which is no registered processor step"
+        return None if known else f"names {name!r}, which is not a registered processor step"
     path = step["class"]
     is_path = isinstance(path, str) and all(part.isidentifier() for part in path.split("."))
     if is_path and any(path.startswith(f"{package}.") for package in OPEN_PACKAGES):

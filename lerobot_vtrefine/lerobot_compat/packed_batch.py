@@ -39,7 +39,7 @@ class PackedBatch(dict[str, Any]):
     """
 
     def __init__(self, buffer: Tensor, groups: tuple[Group, ...], columns: Mapping[str, Any]) -> None:
-        """``columns``: in their order, those that are no tensors with their values, the others with None."""
+        """``columns``: in their order, those that are not tensors with their values, the others with None."""
         super().__init__(columns)
         for group in groups:
             self.update(group.tensors(buffer))

@@ -30,7 +30,7 @@ from numpy.typing import NDArray
 
 from lerobot_vtrefine.datasets.footers import read_without_footer
 from lerobot_vtrefine.datasets.whole_files import PART, whole_file
-from lerobot_vtrefine.lerobot_compat.describing import Row, describe_episodes, video_keys, video_length_s
+from lerobot_vtrefine.lerobot_compat.episode_rows import Row, describe_episodes, video_keys, video_length_s
 from lerobot_vtrefine.lerobot_compat.safe_recording import write_info, write_stats
 
 logger = logging.getLogger(__name__)

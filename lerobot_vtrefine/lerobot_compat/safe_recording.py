@@ -41,7 +41,8 @@ from lerobot.datasets.utils import (
 from lerobot.utils.constants import HF_LEROBOT_HOME
 from lerobot.utils.utils import flatten_dict
 
-from lerobot_vtrefine.datasets.whole_files import PART, sync, whole_file, write_json
+from lerobot_vtrefine.datasets.whole_files import PART, whole_file, write_json
+from lerobot_vtrefine.folders import sync
 from lerobot_vtrefine.lerobot_compat.guard import is_supported
 
 logger = logging.getLogger(__name__)

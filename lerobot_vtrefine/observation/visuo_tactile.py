@@ -13,6 +13,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from lerobot_vtrefine.choices import check_choice
 from lerobot_vtrefine.embodiments import get_embodiment
 from lerobot_vtrefine.observation.depth import visual_points
 from lerobot_vtrefine.observation.taxels import (
@@ -83,10 +84,7 @@ class VisuoTactileConfig:
             raise ValueError(f"observation.scale_m must be positive, got {self.scale_m}")
         if not 0 < self.threshold_counts <= self.full_scale_counts:
             raise ValueError("observation.threshold_counts must be within 0..observation.full_scale_counts")
-        if self.normalization not in RULES:
-            raise ValueError(
-                f"unknown observation.normalization {self.normalization!r}; choose one of {', '.join(RULES)}"
-            )
+        check_choice("observation.normalization", self.normalization, RULES)
 
 
 def num_points(cfg: VisuoTactileConfig, modalities: str = "visuo_tactile") -> int:

@@ -131,7 +131,7 @@ def device_intrinsics(name: str, camera: Any) -> list[float]:
     """fx, fy, cx, cy of a connected RealSense's depth images as LeRobot hands them out [px].
 
     Raises:
-        ValueError: the camera is no RealSense.
+        ValueError: the camera is not a RealSense.
     """
     profile = getattr(camera, "rs_profile", None)
     if profile is None:

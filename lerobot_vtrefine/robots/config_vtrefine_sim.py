@@ -9,6 +9,7 @@ from draccus.utils import DraccusException
 from lerobot.envs.configs import EnvConfig
 from lerobot.robots.config import RobotConfig
 
+from lerobot_vtrefine.choices import check_choice
 from lerobot_vtrefine.envs.config import VtRefineEnvConfig
 from lerobot_vtrefine.files import read_yaml
 from lerobot_vtrefine.lerobot_compat.config_errors import told_by_lerobot
@@ -52,8 +53,7 @@ class VtRefineSimConfig(RobotConfig):
     @told_by_lerobot
     def __post_init__(self) -> None:
         super().__post_init__()
-        if self.view not in VIEWS:
-            raise ValueError(f"--robot.view={self.view} is unknown; choose from {', '.join(VIEWS)}")
+        check_choice("--robot.view", self.view, VIEWS)
         if self.seed < 0:
             raise ValueError(f"--robot.seed must not be negative, got {self.seed}")
         check_control_rate("--robot.fps", self.fps)
@@ -75,7 +75,7 @@ class VtRefineSimConfig(RobotConfig):
         except (DraccusException, ValueError, TypeError) as error:
             raise ValueError(f"--robot.env: {error}") from error
         if not isinstance(env, VtRefineEnvConfig):
-            raise ValueError(f"--robot.env: type {env.type} is no simulation of this package; use {TYPE}")
+            raise ValueError(f"--robot.env: type {env.type} is not a simulation of this package; use {TYPE}")
         return env
 
 

@@ -57,7 +57,6 @@ def measure_worlds(
     warp: WarpConfig,
     worlds: Sequence[int] = WORLDS,
     steps: int = STEPS,
-    scene: SceneConfig | None = None,
 ) -> Iterator[WorldsRow]:
     """A row per number of worlds, on `warp.device`.
 
@@ -67,7 +66,7 @@ def measure_worlds(
     if steps < 2:
         raise ValueError(f"steps must be at least 2, got {steps}")
     for count in worlds:
-        yield _measure(warp, count, steps, scene or SceneConfig(start="grasped"))
+        yield _measure(warp, count, steps)
 
 
 def table(rows: Sequence[WorldsRow]) -> str:
@@ -101,12 +100,12 @@ COLUMNS: tuple[tuple[str, str, Callable[[WorldsRow], float]], ...] = (
 )
 
 
-def _measure(warp: WarpConfig, count: int, steps: int, scene: SceneConfig) -> WorldsRow:
+def _measure(warp: WarpConfig, count: int, steps: int) -> WorldsRow:
     device = warp.device
     _give_back()
     before, ids = _memory_gib(device), np.arange(count)
     start = time.perf_counter()
-    sim = InsertionSim(scene, num_envs=count, backend="warp", warp=warp)
+    sim = InsertionSim(SceneConfig(start="grasped"), num_envs=count, backend="warp", warp=warp)
     sim.reset(ids, ids)
     observation = sim.observe()
     started = time.perf_counter() - start

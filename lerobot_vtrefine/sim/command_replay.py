@@ -4,13 +4,14 @@ Shapes: E episodes of T frames, J joints, P pads. Frame t of an episode is what 
 t is issued; the command acts until frame t + 1.
 """
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
 import mujoco
 import numpy as np
 import torch
 
+from lerobot_vtrefine.choices import check_choice
 from lerobot_vtrefine.embodiments import Embodiment
 from lerobot_vtrefine.sim import task
 from lerobot_vtrefine.sim.backends import get_backend
@@ -54,7 +55,6 @@ def replay_commands(
     config: SceneConfig | None = None,
     *,
     hold: str = "zero_order",
-    fields: Mapping[str, Array] | None = None,
     num_threads: int = 0,
 ) -> list[Array]:
     """Joint positions of the twin's arms under recorded commands, without parts and contacts.
@@ -67,7 +67,6 @@ def replay_commands(
         dt_s: time between frames.
         config: servo gains, gravity compensation and time step; the latter is shortened to divide `dt_s`.
         hold: see `HOLDS`.
-        fields: MjModel fields of each episode's own, (E, ...): other gains, frictions, dampings.
         num_threads: 0 uses all cores.
 
     Returns:
@@ -76,8 +75,7 @@ def replay_commands(
     Raises:
         ValueError: shapes that disagree, or an unknown `hold`.
     """
-    if hold not in HOLDS:
-        raise ValueError(f"unknown hold {hold!r}: use one of {', '.join(HOLDS)}")
+    check_choice("hold", hold, HOLDS)
     if not dt_s > 0.0:
         raise ValueError(f"the time between frames must be above 0, got {dt_s}")
     config = config or SceneConfig()
@@ -88,8 +86,6 @@ def replay_commands(
     lengths = _checked_lengths(commands, starts, embodiment)
     backend = get_backend("batch", model, len(lengths), num_threads)
     ids = np.arange(len(lengths))
-    if fields:
-        backend.set_fields(ids, dict(fields))
     qpos = np.zeros((len(ids), model.nq))
     joints.write(qpos, np.clip(starts, embodiment.lower, embodiment.upper))
     backend.write(ids, qpos, np.zeros((len(ids), model.nv)))

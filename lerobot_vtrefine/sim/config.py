@@ -4,6 +4,7 @@ import re
 from dataclasses import dataclass, field
 from pathlib import Path
 
+from lerobot_vtrefine.choices import check_choice
 from lerobot_vtrefine.embodiments.camera_config import CameraConfig
 from lerobot_vtrefine.embodiments.embodiment import STARTS
 from lerobot_vtrefine.sim.depth_sensors import DEPTH_SENSORS
@@ -65,9 +66,9 @@ class SceneConfig:
     """Contact time constant of the pads: about 0.6 mm compression at 20 N."""
 
     def __post_init__(self) -> None:
-        _check_choice("start", self.start, STARTS)
-        _check_choice("socket", self.socket, SOCKETS)
-        _check_choice("depth_sensor", self.depth_sensor, tuple(DEPTH_SENSORS))
+        check_choice("start", self.start, STARTS)
+        check_choice("socket", self.socket, SOCKETS)
+        check_choice("depth_sensor", self.depth_sensor, DEPTH_SENSORS)
         if self.socket == "stands" and self.start != "table":
             raise ValueError(f"socket=stands needs start=table, not start={self.start}")
         if not 0.0 < self.timestep_s <= 0.005:
@@ -311,8 +312,3 @@ def fitting_timestep(longest_s: float, control_hz: float) -> float:
     """The longest physics step up to `longest_s` [s] of which a control step is a whole number."""
     steps = 1.0 / (control_hz * longest_s)
     return longest_s if abs(steps - round(steps)) < 1e-6 else 1.0 / (control_hz * (int(steps) + 1))
-
-
-def _check_choice(flag: str, value: str, choices: tuple[str, ...]) -> None:
-    if value not in choices:
-        raise ValueError(f"unknown {flag} {value!r}: use one of {', '.join(choices)}")

@@ -138,12 +138,12 @@ class Measured:
     pad_load: Array
     """(m, P, LOAD_SIZE)"""
     diverged: Array
-    """(m,) whether the state blew up: everything else then says nothing and may be no number."""
+    """(m,) whether the state blew up: everything else then means nothing and may be NaN."""
     overflowed: Array
     """(m,) whether contacts were lost for want of room."""
 
     def checked(self) -> "Measured":
-        """The same, with zeros for the forces of worlds that blew up, and those whose forces are no numbers
+        """The same, with zeros for the forces of worlds that blew up, and those whose forces are NaN
         among them: what an episode remembers stays finite.
         """
         forces = {item.name: getattr(self.substeps, item.name) for item in fields(self.substeps)}

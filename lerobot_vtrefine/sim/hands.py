@@ -6,9 +6,9 @@ import numpy as np
 from lerobot_vtrefine.embodiments import Fingers, FourBarFingers, SlidingFingers
 from lerobot_vtrefine.embodiments.fingers import SIGNS
 from lerobot_vtrefine.embodiments.shapes import box, capsule
+from lerobot_vtrefine.sim.appearance import DARK, GREY, PAD
 from lerobot_vtrefine.sim.config import SceneConfig
 from lerobot_vtrefine.sim.links import add_servo, add_shape, add_solid
-from lerobot_vtrefine.sim.looks import DARK, GREY, PAD
 
 PLATE_M = 0.004
 """Half thickness of the plate that carries a pad."""
@@ -109,7 +109,7 @@ def _add_swinging_finger(
     _add_hinge(knuckle, driver, -sign, (0.0, fingers.closed_rad), fingers)
     add_shape(knuckle, capsule(0.010, (0.0, 0.0, 0.0), (ahead, sign * out, 0.0), "grey"))
 
-    # All joints at 0 is a state of the linkage: what the finger is turned by there is no angle of its hinge.
+    # With all joints at 0 the finger is turned already: that turn is not an angle of its hinge.
     turn = list(fingers.turn_terms)
     half = -sign * turn[0] / 2
     rest = [np.cos(half), 0, 0, np.sin(half)]
@@ -127,7 +127,7 @@ def _add_swinging_finger(
     add_solid(finger, index, f"{arm}_{side}_plate", plate, [pad_ahead, back, 0], GREY)
     add_shape(finger, capsule(0.008, (0.0, 0.0, 0.0), (pad_ahead - length / 2, back, 0.0)))
 
-    # The finger's turn is told in the hand's frame, the hinge's angle is to the knuckle.
+    # The finger's turn is given in the hand's frame, the hinge's angle from the knuckle.
     _couple(spec, hinge, hinge, driver, [0.0, turn[1] - 1.0, *turn[2:]], config).solimp = _STIFF
     return driver
 

@@ -12,7 +12,7 @@ def prefer_headless_gl() -> None:
 
     MuJoCo reads the variable when it is first imported and fails outright for a back-end that is missing,
     hence the check. A value that the user has set is left alone. PyOpenGL's remark that it could be faster is
-    none that a user can act on.
+    not one that a user can act on.
     """
     logging.getLogger("OpenGL").setLevel(logging.WARNING)
     if "MUJOCO_GL" in os.environ or not sys.platform.startswith("linux"):

@@ -18,7 +18,8 @@ def solve_hands(
         position_m: wanted TCP positions (m, 2, 3).
         rotation: wanted TCP rotations (m, 2, 3, 3).
         initial: joint positions to start from (m, J); a few steps suffice from the previous control step's
-        solution. iterations: number of steps.
+            solution.
+        iterations: number of steps.
 
     Returns:
         Joint positions (m, J), and what is left of the error: position (m, 2) [m] and angle (m, 2) [rad],

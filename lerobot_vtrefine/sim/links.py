@@ -4,7 +4,7 @@ import mujoco
 import numpy as np
 
 from lerobot_vtrefine.embodiments.shapes import Shape
-from lerobot_vtrefine.sim.looks import DARK, GREY, Rgba
+from lerobot_vtrefine.sim.appearance import DARK, GREY, Rgba
 
 # Collision classes as bits: each geom carries its own, and is tested against those it names.
 TABLE, PLUG, SOCKET, FIRST_HAND, SECOND_HAND = (1 << bit for bit in range(5))

@@ -25,10 +25,9 @@ class MeshFit:
     """Geometry of the assembly; lengths in metres.
 
     `travel_m`: retreat along the exit axis after which the plug is free sideways, i.e. the depth of a seated
-    plug.
-    `play_m`: free lateral travel per side at the assembled pose. `slack_m`: how far the plug can be pushed
-    beyond the assembled pose before it meets a stop (the search ends at `travel_m` where there is none:
-    `has_stop` is 0).
+    plug. `play_m`: free lateral travel per side at the assembled pose. `slack_m`: how far the plug can be
+    pushed beyond the assembled pose before it meets a stop (the search ends at `travel_m` where there is
+    none: `has_stop` is 0).
     `exit_sign`: +1 when the plug leaves along +z of the files' frame, -1 along -z.
     """
 

@@ -17,7 +17,7 @@ import tempfile
 import zipfile
 import zlib
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -65,6 +65,9 @@ class Decomposition:
     seed: int = 0
 
 
+DECOMPOSITION = Decomposition()
+
+
 @dataclass(frozen=True)
 class Hull:
     """One convex piece: vertices (V, 3) m, faces (F, 3) with outward winding."""
@@ -110,15 +113,13 @@ def load_mesh_pair(
     name: str,
     mesh_dir: Path | str | None,
     scale: str | float = "flexitac",
-    decomposition: Decomposition | None = None,
     progress: bool = True,
 ) -> MeshPair:
     """Load `automate/ID` from `mesh_dir`, decomposed (or from the cache) and measured.
 
     `scale` is "flexitac" (the table above), "unit", or one factor for both parts. Raises FileNotFoundError
-    for a missing folder or ID, ValueError for a mesh that is not solid or of an implausible size,
-    ImportError without the
-    `assets` extra; each with one line that says what to do.
+    for a missing folder or ID, ValueError for a mesh that is not solid or of an implausible size, ImportError
+    without the `assets` extra; each with one line that says what to do.
     """
     mesh_id = name.removeprefix(PREFIX)
     if mesh_dir is None:
@@ -127,15 +128,12 @@ def load_mesh_pair(
         )
     paths = _part_paths(mesh_id, Path(mesh_dir).expanduser())
     factors = part_scales(mesh_id, scale)
-    settings = decomposition or Decomposition()
     if factors.swap:
         paths = {"plug": paths["socket"], "socket": paths["plug"]}
-    missing = [
-        role for role in ROLES if not (cache_dir() / f"{_pieces_key(paths[role], settings)}.npz").exists()
-    ]
+    missing = [role for role in ROLES if not _cache_file(_pieces_key(paths[role])).exists()]
     for role in tqdm(missing, desc=f"{name}: convex pieces", disable=not (progress and missing), leave=False):
-        _load_part(paths[role], settings)
-    parts = {role: _load_part(paths[role], settings) for role in ROLES}
+        _load_part(paths[role])
+    parts = {role: _load_part(paths[role]) for role in ROLES}
     parts = {
         role: _scaled(part, np.asarray(getattr(factors, role)), paths[role]) for role, part in parts.items()
     }
@@ -208,7 +206,7 @@ def _part_paths(mesh_id: str, folder: Path) -> dict[str, Path]:
     return {role: folder / f"{mesh_id}_{role}.obj" for role in ROLES}
 
 
-def _load_part(path: Path, settings: Decomposition) -> MeshPart:
+def _load_part(path: Path) -> MeshPart:
     """Load, check and cut one file; metres, unscaled."""
     trimesh = _optional("trimesh")
     try:
@@ -218,27 +216,23 @@ def _load_part(path: Path, settings: Decomposition) -> MeshPart:
     check_solid(mesh, path)
     unit = raw_unit_m(mesh.extents, path)
     vertices, faces = np.asarray(mesh.vertices, float) * unit, np.asarray(mesh.faces, np.int64)
-    key = _digest(
-        np.frombuffer(path.read_bytes(), np.uint8), np.frombuffer(repr(settings).encode(), np.uint8)
-    )
-    arrays = _cached(f"coacd-{key}", lambda: _decompose(vertices, faces, settings))
+    arrays = _cached(_pieces_key(path), lambda: _decompose(vertices, faces))
     hulls = (Hull(arrays[f"vertices_{i}"], arrays[f"faces_{i}"]) for i in range(len(arrays) // 2))
     return MeshPart(vertices, faces, tuple(hulls))
 
 
-def _pieces_key(path: Path, settings: Decomposition) -> str:
-    content = np.frombuffer(path.read_bytes(), np.uint8)
-    return f"coacd-{_digest(content, np.frombuffer(repr(settings).encode(), np.uint8))}"
+def _pieces_key(path: Path) -> str:
+    """Cache key of a file's convex pieces: its content and how it is cut."""
+    texts = path.read_bytes(), repr(DECOMPOSITION).encode()
+    return f"coacd-{_digest(*(np.frombuffer(text, np.uint8) for text in texts))}"
 
 
-def _decompose(vertices: Array, faces: Triangles, settings: Decomposition) -> dict[str, NDArray[Any]]:
+def _decompose(vertices: Array, faces: Triangles) -> dict[str, NDArray[Any]]:
     coacd = _optional("coacd")
     coacd.set_log_level("error")
     pieces = coacd.run_coacd(
         coacd.Mesh(vertices, faces),
-        threshold=settings.threshold,
-        resolution=settings.resolution,
-        seed=settings.seed,
+        **asdict(DECOMPOSITION),
     )
     arrays: dict[str, NDArray[Any]] = {}
     for index, (points, triangles) in enumerate(pieces):
@@ -271,9 +265,13 @@ def _pieces(part: MeshPart) -> list[Array]:
     return [hull.vertices for hull in part.pieces]
 
 
+def _cache_file(key: str) -> Path:
+    return cache_dir() / f"{key}.npz"
+
+
 def _cached(key: str, compute: Callable[[], dict[str, NDArray[Any]]]) -> dict[str, NDArray[Any]]:
     """Return `compute()`'s arrays, kept as one npz in the cache; a damaged entry is made again."""
-    path = cache_dir() / f"{key}.npz"
+    path = _cache_file(key)
     try:
         with np.load(path) as stored:
             return {name: stored[name] for name in stored.files}

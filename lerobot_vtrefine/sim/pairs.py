@@ -9,6 +9,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from lerobot_vtrefine.choices import check_choice
 from lerobot_vtrefine.sim.config import MESH_PAIR_PREFIX, PROCEDURAL_PAIRS, SceneConfig
 from lerobot_vtrefine.sim.profiles import Primitive, make_profile, offset_outline, wall_boxes
 from lerobot_vtrefine.tactile.geometry import Box, TriangleMesh
@@ -72,9 +73,7 @@ def load_pair(config: SceneConfig) -> PartPair:
         from lerobot_vtrefine.sim.mesh_pairs import load_mesh_parts  # trimesh and CoACD are optional
 
         return load_mesh_parts(config.pair, config.mesh_dir, config.mesh_scale)
-    if config.pair not in PROCEDURAL_PAIRS:
-        choices = f"{', '.join(PROCEDURAL_PAIRS)} or {MESH_PAIR_PREFIX}ID"
-        raise ValueError(f"unknown pair {config.pair!r}: use one of {choices}")
+    check_choice("pair", config.pair, PROCEDURAL_PAIRS, f" or {MESH_PAIR_PREFIX}ID")
     return procedural_pair(config.pair, config.hole_clearance_m)
 
 

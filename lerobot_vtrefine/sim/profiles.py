@@ -9,6 +9,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from lerobot_vtrefine.choices import check_choice
 from lerobot_vtrefine.sim.config import PROCEDURAL_PAIRS
 from lerobot_vtrefine.tactile.geometry import Box, ConvexHull, Cylinder
 
@@ -55,9 +56,8 @@ def make_profile(name: str, length_m: float) -> Profile:
         corners = [(a, -b), (a, b), (b, b), (b, a), (-b, a), (-b, b)]
         outline = np.array([*corners, *((-x, -y) for x, y in corners)])
         return Profile((Box((a, b, half), pos), Box((b, a, half), pos)), outline, 2 * b)
-    if name == "key":
-        return _key(half, pos, length_m)
-    raise ValueError(f"unknown pair {name!r}: use one of {', '.join(PROCEDURAL_PAIRS)}")
+    check_choice("pair", name, PROCEDURAL_PAIRS)
+    return _key(half, pos, length_m)
 
 
 def offset_outline(outline: np.ndarray, distance_m: float) -> np.ndarray:

@@ -128,10 +128,9 @@ def _make_scene(
     if not _GL_FAILURES:
         try:
             return _GlScene(sim, env, view, size)
-        except (
-            Exception
-        ) as error:  # OpenGL libraries fail with AttributeError, ImportError, FatalError, RuntimeError, ...
-            _GL_FAILURES.append(error)
+        # OpenGL libraries fail with AttributeError, ImportError, FatalError, RuntimeError, ...
+        except Exception as error:
+            _GL_FAILURES.append(error.with_traceback(None))  # a traceback would keep the simulation alive
             if backend == "auto":
                 log.warning("%s; drawing the depth image instead", _no_gl(error))
     if backend == "gl":

@@ -84,7 +84,7 @@ class RgbCamera:
         rows.copy_(torch.as_tensor(values).reshape(rows.shape))
 
     def _put_lights(self, model: mujoco.MjModel) -> None:
-        """Lights hang in the world: the same place in every world, for ever."""
+        """Put the lights at the same place in every world; they never move."""
         data = mujoco.MjData(model)
         mujoco.mj_kinematics(model, data)
         mujoco.mj_camlight(model, data)

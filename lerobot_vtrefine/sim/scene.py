@@ -7,11 +7,11 @@ import mujoco
 import numpy as np
 
 from lerobot_vtrefine.embodiments import Embodiment, get_embodiment
+from lerobot_vtrefine.sim.appearance import PLUG_COLOUR, SOCKET_COLOUR, Rgba, add_appearance
 from lerobot_vtrefine.sim.arms import add_arms
 from lerobot_vtrefine.sim.camera import Camera, make_camera
 from lerobot_vtrefine.sim.config import SceneConfig
 from lerobot_vtrefine.sim.links import FIRST_HAND, PLUG, SECOND_HAND, SOCKET, TABLE
-from lerobot_vtrefine.sim.looks import PLUG_COLOUR, SOCKET_COLOUR, Rgba, add_looks
 from lerobot_vtrefine.sim.pairs import Part, PartPair, load_pair
 from lerobot_vtrefine.sim.profiles import Primitive
 from lerobot_vtrefine.sim.rotations import matrix_to_quat
@@ -53,7 +53,7 @@ class Addresses:
 
 @dataclass(frozen=True)
 class JointMap:
-    """A body's joints in qpos, and those that are none of its state but follow them: a linkage's hinges."""
+    """A body's joints in qpos, and the hinges of linkages, which follow them and are not in its state."""
 
     qpos: np.ndarray
     """(J,) joints in the embodiment's order."""
@@ -130,7 +130,7 @@ def build_scene(config: SceneConfig) -> Scene:
     camera = make_camera(config, embodiment)
     spec = mujoco.MjSpec()
     _set_options(spec, config)
-    add_looks(spec)
+    add_appearance(spec)
     _add_table(spec, config)
     add_arms(spec, embodiment, config)
     # One hand holds the plug and one the socket, but either part may brush against any hand.
@@ -153,7 +153,7 @@ def build_scene(config: SceneConfig) -> Scene:
 
 
 def _warn_of_close_hands(pair: PartPair, embodiment: Embodiment) -> None:
-    """Tell of pairs whose hands would have to be in the same place once the plug is seated."""
+    """Warn of pairs whose hands would be in each other's way once the plug is seated."""
     width_m = embodiment.fingers.pad_size_m[1]
     apart_m = pair.seated_z_m + pair.plug.grip.centre_m[2] - pair.socket.grip.centre_m[2]
     if apart_m < width_m:
@@ -175,7 +175,7 @@ def build_arms(config: SceneConfig) -> tuple[mujoco.MjModel, Embodiment, np.ndar
     embodiment = get_embodiment(config.embodiment)
     spec = mujoco.MjSpec()
     _set_options(spec, config)
-    add_looks(spec)
+    add_appearance(spec)
     _add_table(spec, config)
     add_arms(spec, embodiment, config)
     model = spec.compile()

@@ -28,13 +28,13 @@ from lerobot_vtrefine.sim.depth_sensors import DEPTH_SENSORS
 from lerobot_vtrefine.sim.drive import make_drive
 from lerobot_vtrefine.sim.episode import EpisodeState, Measured, update
 from lerobot_vtrefine.sim.host import start_copy, to_host, without_torch_threads
-from lerobot_vtrefine.sim.present import Present
 from lerobot_vtrefine.sim.privileged import Privileged, describe
 from lerobot_vtrefine.sim.randomization import Randomizer, WorldParameters
 from lerobot_vtrefine.sim.reality import RobotFaults
 from lerobot_vtrefine.sim.scene import Scene, build_scene
 from lerobot_vtrefine.sim.sensing import Kinematics
 from lerobot_vtrefine.sim.settling import Settler
+from lerobot_vtrefine.sim.state_cache import StateCache
 from lerobot_vtrefine.sim.substeps import count_substeps, start_summary
 from lerobot_vtrefine.sim.task import FAILURES
 from lerobot_vtrefine.sim.touch import Touch, touch_source
@@ -111,7 +111,7 @@ class InsertionSim:
         self._parameters = dict(everyone.values)
         eye = DEPTH_SENSORS[self.scene.config.depth_sensor]
         self._depth = DepthCamera(self.scene.model, self.scene.camera, num_envs, device, threads, eye)
-        self._present = Present(self.scene, self._backend, self._depth)
+        self._cache = StateCache(self.scene, self._backend, self._depth)
         self._settler = Settler(self.scene, self.config, self._backend, self._touch)
         self._drive = make_drive(self._backend, self.embodiment, self.substeps, self.config, robot_faults)
 
@@ -161,7 +161,7 @@ class InsertionSim:
         where one is given in place of the seed's.
         """
         ids = self._checked(ids)
-        self._present.forget()
+        self._cache.forget()
         seeds = np.broadcast_to(np.asarray(seeds, np.int64), ids.shape)
         drawn = self._randomizer.draw(seeds)
         self._apply(ids, drawn)
@@ -172,7 +172,7 @@ class InsertionSim:
         state.command[ids] = self._drive.reset(ids, command)
         state.pad_force[ids] = state.pad_load[ids][..., 0]
         self._pads.reset(ids, seeds, drawn.values)
-        seen = self._present.see(ids)
+        seen = self._cache.see(ids)
         measured = self._grip_points(seen)
         in_hand = self.scene.config.start == "grasped"
         state.grasped[ids] = in_hand
@@ -197,12 +197,12 @@ class InsertionSim:
         wanted = task.servo_commands(self.scene.embodiment, action)
         after = np.clip(wanted, before - self._rates, before + self._rates)
         earlier = [torch.as_tensor(item[ids], device=self.device) for item in (state.tip, state.force_tail)]
-        self._present.forget()
+        self._cache.forget()
         trace = self._drive.advance(ids, before, after)
         state.command[ids] = after
         measured = self._start_measuring(ids, trace, earlier)
         if images is not None and len(images):
-            self._present.start_images(self._checked(images), state.moments(images, after=ids))
+            self._cache.start_images(self._checked(images), state.moments(images, after=ids))
         reward = update(state, ids, measured(), self.config, self.scene)
         self._remember(ids)
         terminated = state.done[ids]
@@ -229,12 +229,12 @@ class InsertionSim:
             "state": torch.as_tensor(self.joint_state(ids), device=self.device),
             "tactile": self._pads.counts(ids, self._touch_at(ids)),
             "tactile_baseline": self._pads.baseline(ids),
-            "depth_mm": self._present.images(ids, self._episode.moments(ids)),
+            "depth_mm": self._cache.images(ids, self._episode.moments(ids)),
         }
 
     def joint_state(self, ids: Array | None = None) -> Array:
         """The `state` part of `observe` alone: (m, J) float32."""
-        joints = self._present.see(self._checked(ids)).joints
+        joints = self._cache.see(self._checked(ids)).joints
         return self._drive.readings(joints).astype(np.float32)
 
     @without_torch_threads
@@ -259,14 +259,14 @@ class InsertionSim:
         """Let the physics of one control step pass under the present commands, and nothing else."""
         command = self._episode.command
         everyone = np.arange(self.num_envs)
-        self._present.forget()
+        self._cache.forget()
         self._backend.advance_linearly(everyone, command, command, self.substeps)
         self._backend.diverged(everyone)  # waits for it
 
     def depth_mm(self, ids: Array | None = None) -> Array:
         """Depth images (m, H, W) uint16 [mm]."""
         ids = self._checked(ids)
-        return to_host(self._present.images(ids, self._episode.moments(ids))).view(np.uint16)
+        return to_host(self._cache.images(ids, self._episode.moments(ids))).view(np.uint16)
 
     def geometry(self, ids: Array) -> tuple[Array | torch.Tensor, Array | torch.Tensor, Array]:
         """Geoms as cameras see them: positions (m, G, 3), rotations (m, G, 3, 3), sizes (m, G, 3)."""
@@ -283,7 +283,7 @@ class InsertionSim:
 
     def insertion(self, ids: Array | None = None) -> task.Insertion:
         """Where each plug is with respect to its socket."""
-        return self._insertion(self._present.see(self._checked(ids)))
+        return self._insertion(self._cache.see(self._checked(ids)))
 
     def privileged(self, ids: Array | None = None) -> Array:
         """State for a critic, (m, P) float32, columns named by `privileged_names`."""
@@ -324,7 +324,7 @@ class InsertionSim:
         """Continue world `env` from a state taken by `get_state`."""
         values = {name: np.atleast_1d(value) for name, value in state["parameters"].items()}
         position, rotation = state["camera"]
-        self._present.forget()
+        self._cache.forget()
         self._apply(np.array([env]), WorldParameters(values, position[None], rotation[None]))
         self._backend.set_rows(np.array([env]), state["row"][None])
         self._episode.set_row(env, state["episode"])
@@ -354,7 +354,7 @@ class InsertionSim:
                 self._depth.set_shapes(ids, fields["geom_size"], fields["geom_aabb"])
 
     def _touch_at(self, ids: Array) -> Touch:
-        return self._touch(ids, lambda: self._present.see(ids), self._episode.pad_load[ids])
+        return self._touch(ids, lambda: self._cache.see(ids), self._episode.pad_load[ids])
 
     def _remember(self, ids: Array) -> None:
         if self._pads.remembers:
@@ -374,11 +374,11 @@ class InsertionSim:
         """Ask for all that follows from a trace before waiting for any of it: a GPU then never idles."""
         scene, pair = self.scene, self.scene.pair
         summary = start_summary(trace, scene.addresses, scene.config.timestep_s, *earlier, pair.mouth_z_m)
-        load = self._touch.start_load(ids, trace, lambda: self._present.see(ids))
+        load = self._touch.start_load(ids, trace, lambda: self._cache.see(ids))
         state = self._backend.start_read(ids)
 
         def wait() -> Measured:
-            seen = self._present.see(ids, state())
+            seen = self._cache.see(ids, state())
             rest = np.array([pair.socket.rest_height_m, pair.plug.rest_height_m])
             positions = seen.parts[0][:, ::-1]
             return Measured(
@@ -395,4 +395,4 @@ class InsertionSim:
         return wait
 
     def _describe(self, ids: Array) -> Privileged:
-        return describe(self.scene, self.config, self._episode, ids, self._present.see(ids), self._parameters)
+        return describe(self.scene, self.config, self._episode, ids, self._cache.see(ids), self._parameters)

@@ -141,13 +141,13 @@ def start_row() -> Row:
     return f"tactile start: {START_S:g} s / its time", START_S / seconds[-1], text
 
 
-def run_cuda(num_envs: int = CUDA_ENVS) -> Iterator[Row]:
+def run_cuda() -> Iterator[Row]:
     """Rows (name, 1e9 taxels per second, explanation) on the present CUDA device, as they are measured."""
-    for where, scene in body_scenes(num_envs, "cuda").items():
+    for where, scene in body_scenes(CUDA_ENVS, "cuda").items():
         for captured in (False, True):
             for law in LAWS:
                 how = "one graph launch each" if captured else "launches queued"
-                text = f"G taxels/s, {num_envs} environments of {NUM_PADS} pads pressed on {where}, {how}"
+                text = f"G taxels/s, {CUDA_ENVS} environments of {NUM_PADS} pads pressed on {where}, {how}"
                 yield f"tactile {law} on CUDA, {where}", cuda_rate(scene, law, captured) / 1e9, text
         if isinstance(scene.body, TriangleMesh):
             rate = three_ray_rate(scene, "cuda")

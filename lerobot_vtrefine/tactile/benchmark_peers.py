@@ -59,7 +59,7 @@ def _mujoco_seconds(mesh: TriangleMesh, sensor: bool) -> float:
 
 
 def mujoco_rate(mesh: TriangleMesh) -> float:
-    """Taxels per second of MuJoCo's C tactile sensor: forward dynamics with it less those without."""
+    """Taxels per second of MuJoCo's C tactile sensor: time of forward dynamics with it minus that without."""
     return 384 / (_mujoco_seconds(mesh, sensor=True) - _mujoco_seconds(mesh, sensor=False))
 
 

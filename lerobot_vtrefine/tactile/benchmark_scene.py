@@ -15,6 +15,7 @@ PRESS_M = 2e-4
 LOAD_N = 5.0
 LONGEST_S = 2.0
 """After this long, a measurement is not repeated any more [s]."""
+REPEATS = 40
 OUTER_M = 0.012
 
 
@@ -60,7 +61,7 @@ def make_scene(body: Primitive, lowest_m: float, num_envs: int, device: str) -> 
     return Scene(body, [pose.to(device).contiguous() for pose in poses], load.to(device))
 
 
-def best_seconds(call: Callable[[], object], on_gpu: bool = False, repeats: int = 40) -> float:
+def best_seconds(call: Callable[[], object], on_gpu: bool = False) -> float:
     """Shortest of several runs [s]: processor time of this thread, or on a GPU time by the clock.
 
     The minimum, and processor time, are what other load on the machine disturbs least.
@@ -68,7 +69,7 @@ def best_seconds(call: Callable[[], object], on_gpu: bool = False, repeats: int 
     clock = time.perf_counter if on_gpu else time.thread_time
     call()
     times, end = [], time.perf_counter() + LONGEST_S
-    while len(times) < 3 or (len(times) < repeats and time.perf_counter() < end):
+    while len(times) < 3 or (len(times) < REPEATS and time.perf_counter() < end):
         begin = clock()
         call()
         times.append(clock() - begin)

@@ -100,7 +100,6 @@ class ContactQuery:
         self.block_dim = kernels_lanes.BLOCK if self.lanes > 1 else CPU_BLOCK
         self.rows, self.cols = layout.rows * subdivision, layout.cols * subdivision
         self.subdivision, self.pitch_m, self.reach_m = subdivision, layout.pitch_m / subdivision, reach_m
-        self.num_bodies = len(bodies)
         self._packed = pack_bodies(bodies)
         self._num_primitives, self._num_planes = len(self._packed.kind), len(self._packed.planes)
         self.bodies = kernels.Bodies()
@@ -177,9 +176,8 @@ class ContactQuery:
 
         Args:
             mode: "closest" gives the penetration into the nearest surface (0 outside); "column" the signed
-                height of
-                the body's lower surface below the face along the pad's normal (negative: gap; -1 m: nothing
-                there).
+                height of the body's lower surface below the face along the pad's normal (negative: gap; -1 m:
+                nothing there).
             pad_pos: (m, P, 3) origins of the pads in the world [m].
             pad_rot: (m, P, 3, 3) pad frame to world.
             pad_vel: (m, P, 6) velocity of the pad's origin, then angular velocity [m/s, rad/s].

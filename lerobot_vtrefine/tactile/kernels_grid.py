@@ -110,7 +110,7 @@ def nearest_of(
     for i in range(begin + 1, end):
         t = items[i]
         a = corners[3 * t]
-        # The slack spares neighbours in the same plane, which are no nearer but for rounding.
+        # The slack spares neighbours in the same plane, which only rounding makes seem nearer.
         if wp.abs(wp.dot(normals[t], a - p)) < PLANE_SLACK * best.distance:
             other = on_triangle(t, a, corners[3 * t + 1], corners[3 * t + 2], p)
             if other.distance < best.distance:

@@ -13,8 +13,7 @@ class PadLayout:
     """A lattice of rows x cols taxels on a flat face.
 
     The pad frame has its origin at the centre of the undeformed face, +x along increasing column, +y along
-    increasing
-    row and +z outward. Taxel (r, c) sits at ((c - (C-1)/2) pitch, (r - (R-1)/2) pitch, 0).
+    increasing row and +z outward. Taxel (r, c) sits at ((c - (C-1)/2) pitch, (r - (R-1)/2) pitch, 0).
     """
 
     rows: int = 12
@@ -136,8 +135,7 @@ def layout_from_mesh(
     """Find the taxels on a pad's mesh as in the paper's appendix ("Sampling Tactile Points").
 
     The shortest bounding-box axis is the thickness; a centred lattice of spacing `pitch_m` is laid on the
-    face with at
-    least `margin_m` to its edges, and rays along the inward normal put every taxel on the mesh.
+    face with at least `margin_m` to its edges, and rays along the inward normal put every taxel on the mesh.
 
     Args:
         vertices: (V, 3) [m].

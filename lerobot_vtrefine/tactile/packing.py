@@ -22,7 +22,6 @@ class PackedBodies:
     """K primitives, Q planes, T triangles in C clusters; a primitive's frame has its origin at its bounding
     box's centre."""
 
-    num_bodies: int
     owner: np.ndarray
     """(K,) int32 body of each primitive."""
     kind: np.ndarray
@@ -169,7 +168,6 @@ def pack_bodies(bodies: list[BodyGeometry]) -> PackedBodies:
     frames = [_frame(primitive) for primitive in primitives]
     planes = [_planes(primitive) for primitive in primitives]
     return PackedBodies(
-        num_bodies=len(bodies),
         owner=np.repeat(np.arange(len(bodies)), [len(body.primitives) for body in bodies]).astype(np.int32),
         kind=np.array([primitive.kind for primitive in primitives], dtype=np.int32),
         position=np.array([frame[0] for frame in frames], dtype=np.float32),

@@ -18,6 +18,8 @@ from lerobot_vtrefine.tactile.layout import PadLayout
 
 Array = np.ndarray
 NO_BODY_M = -1.0
+FINENESS = 10
+"""Points along each side of a taxel over which its exact force is averaged."""
 
 
 def _slab(inside: Array, slope: Array, half: float) -> tuple[Array, Array]:
@@ -120,11 +122,10 @@ def exact_forces(
     rotation: Array,
     foundation_n_per_m3: float,
     load: Array,
-    fineness: int = 10,
 ) -> Array:
-    """Winkler forces (R, C) [N] of every taxel under a load, averaged over `fineness`^2 points per taxel."""
-    fine = PadLayout(layout.rows * fineness, layout.cols * fineness, layout.pitch_m / fineness)
+    """Winkler forces (R, C) [N] of every taxel under a load, averaged over `FINENESS`^2 points per taxel."""
+    fine = PadLayout(layout.rows * FINENESS, layout.cols * FINENESS, layout.pitch_m / FINENESS)
     points = fine.positions()[:, :2]
     heights = exact_heights(body, position_m, rotation, points)
     forces = winkler_forces(heights, points, foundation_n_per_m3 * fine.taxel_area_m2, load)
-    return forces.reshape(layout.rows, fineness, layout.cols, fineness).sum((1, 3))
+    return forces.reshape(layout.rows, FINENESS, layout.cols, FINENESS).sum((1, 3))

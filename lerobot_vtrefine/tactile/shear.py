@@ -1,7 +1,7 @@
 """Tangential force per taxel: the solver's tangential force on a pad, shared out with stick and slip.
 
-FlexiTac measures pressure only, so this is no part of the counts: it is a channel of its own, for sensors
-that measure shear and for whoever wants to see slip.
+FlexiTac measures pressure only, so shear does not enter the counts: it is a channel of its own, for sensors
+that measure shear and for those who want to see slip.
 
 Shapes: m environments of n, P pads, B bodies, R x C taxels; x, y in the pad's frame, forces on the pad.
 """

@@ -2,33 +2,22 @@
 
 import json
 import sys
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from functools import partial
 from pathlib import Path
-from types import ModuleType
 
+import compare_policies as script
 import pytest
 
 from lerobot_vtrefine.cli.results import collect
 from lerobot_vtrefine.cli.results.rows import Run, read_rows
 from lerobot_vtrefine.cli.results.tables import table
 
-SCRIPTS = Path(__file__).parents[2] / "scripts"
-
-
-@pytest.fixture(scope="module")
-def script() -> Iterator[ModuleType]:
-    sys.path.insert(0, str(SCRIPTS))
-    import compare_policies
-
-    yield compare_policies
-    sys.path.remove(str(SCRIPTS))
-
 
 @pytest.fixture
 def run(
-    script: ModuleType, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> Callable[..., str]:
     """Run the script with these arguments beside the common ones; what it reported."""
     results = tmp_path / "results" / "policies.json"
@@ -68,7 +57,7 @@ def test_rows_grow_and_nothing_is_done_twice(run: Callable[..., str], tmp_path: 
     assert "--env.rgb=false" in logs["eval_vt_dp3_pads_visual_0"]
 
 
-def test_one_policy_alone_has_the_options_of_all(script: ModuleType) -> None:
+def test_one_policy_alone_has_the_options_of_all() -> None:
     given = ["--seeds", "0", "1", "--jobs", "4", "--steps", "7", "--backend", "warp", "--commit", "abcdef1"]
     options = script.make_parser().parse_args(given)
     words = script.alone(options, "act_rgb", 1)
@@ -101,7 +90,7 @@ def test_rows_that_come_together_are_all_kept(tmp_path: Path) -> None:
 
 
 def test_a_misspelt_task_is_told_before_anything_runs(
-    script: ModuleType, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     monkeypatch.setattr(
         sys, "argv", ["compare_policies.py", "--task", "rund", f"--output_dir={tmp_path / 'out'}"]

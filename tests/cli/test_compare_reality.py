@@ -2,35 +2,21 @@
 
 import json
 import shlex
-import sys
-from pathlib import Path
 
+import compare_reality as compare
 import numpy as np
 import pytest
 
 from lerobot_vtrefine.cli.results.tables import table
 from lerobot_vtrefine.diagnose.joints.model import RobotModel
+from lerobot_vtrefine.diagnose.pad import stand_in_rig as press
 from lerobot_vtrefine.embodiments import ALOHA
 from lerobot_vtrefine.finetune.logger import ProgressLog
 from lerobot_vtrefine.tactile.model import SensorModel
 
-SCRIPTS = Path(__file__).parents[2] / "scripts"
-
-
-@pytest.fixture(scope="module")
-def scripts():
-    sys.path.insert(0, str(SCRIPTS))
-    import compare_reality
-
-    from lerobot_vtrefine.diagnose.pad import stand_in_rig
-
-    yield compare_reality, stand_in_rig
-    sys.path.remove(str(SCRIPTS))
-
 
 @pytest.fixture
-def budget(scripts, tmp_path):
-    compare, _ = scripts
+def budget(tmp_path):
     budget = compare.Budget(tmp_path, tuple(compare.REALITIES), (3, 4), "cpu", 4, 20, 2, 1, 4, 4, 4, 8, 3, {})
     compare.write_worlds(budget)
     for name in budget.realities:  # as if diagnosed
@@ -48,8 +34,7 @@ def flags_of(stage):
     return dict(word[2:].partition("=")[::2] for word in shlex.split(line)[1:] if word.startswith("--"))
 
 
-def test_fine_tunings_differ_in_the_simulator_alone(scripts, budget):
-    compare, _ = scripts
+def test_fine_tunings_differ_in_the_simulator_alone(budget):
     _, starts, policies = compare.lanes(budget)
     stages = {
         stage.name: stage
@@ -78,10 +63,9 @@ def test_fine_tunings_differ_in_the_simulator_alone(scripts, budget):
     assert len({flags_of(stage)["seed"] for stage in stages.values()}) == 2
 
 
-def test_evaluations_use_the_same_episodes_and_valid_environments(scripts, budget):
+def test_evaluations_use_the_same_episodes_and_valid_environments(budget):
     from lerobot_vtrefine.cli.pipeline.child_configs import parse_env
 
-    compare, _ = scripts
     policies = compare.lanes(budget)[2]
     stages = [stage for lane in policies.values() for stage in lane if stage.name.startswith("eval")]
     assert len(stages) == 2 * len(compare.evaluations(budget)) == 28
@@ -97,8 +81,7 @@ def test_evaluations_use_the_same_episodes_and_valid_environments(scripts, budge
         assert bool(config.hidden.robot.backlash_rad) == ("in_real_control_latency" in stage.name)
 
 
-def test_every_lane_can_run_on_its_own(scripts, budget):
-    compare, _ = scripts
+def test_every_lane_can_run_on_its_own(budget):
     before, starts, policies = compare.lanes(budget)
     assert [len(lanes) for lanes in (before, starts, policies)] == [4, 2, 10]
     assert len(before | starts | policies) == 16
@@ -123,8 +106,7 @@ def leave_results(compare, budget, rates, seeds):
         (budget.diagnosis(name) / "verdict.json").write_text(json.dumps(verdict))
 
 
-def test_results_say_what_reality_costs_and_what_diagnosis_brings_back(scripts, budget):
-    compare, _ = scripts
+def test_results_say_what_reality_costs_and_what_diagnosis_brings_back(budget):
     name = "control_latency+backlash"
     rates = {("plain", "plain"): 3, (f"diagnosed:{name}", f"real:{name}"): 2}
     leave_results(compare, budget, rates, budget.seeds)
@@ -138,8 +120,7 @@ def test_results_say_what_reality_costs_and_what_diagnosis_brings_back(scripts, 
     assert text.count("makes no difference that these seeds can show") == 2
 
 
-def test_comparison_becomes_rows_of_the_results(scripts, budget):
-    compare, _ = scripts
+def test_comparison_becomes_rows_of_the_results(budget):
     name = "control_latency+backlash"
     leave_results(compare, budget, {("plain", "plain"): 3}, budget.seeds)
     folder = compare.finetune_dir(budget, "plain", 4)
@@ -157,8 +138,7 @@ def test_comparison_becomes_rows_of_the_results(scripts, budget):
     assert "| | | then the plain simulator | 25 [7, 59] (25, 25) | 75 [41, 93] |" in text
 
 
-def test_unfinished_seeds_are_left_out(scripts, budget):
-    compare, _ = scripts
+def test_unfinished_seeds_are_left_out(budget):
     leave_results(compare, budget, {}, budget.seeds)
     first, *others = budget.realities
     compare.results_path(budget, "start", f"real:{first}", 4).unlink()
@@ -170,8 +150,7 @@ def test_unfinished_seeds_are_left_out(scripts, budget):
     assert compare.compare(budget) == {}
 
 
-def test_a_failed_diagnosis_stops_its_own_policies_only(scripts, budget):
-    compare, _ = scripts
+def test_a_failed_diagnosis_stops_its_own_policies_only(budget):
     before, starts, policies = compare.lanes(budget)
     done = before | starts
     for stage in (stage for stages in done.values() for stage in stages):
@@ -185,12 +164,11 @@ def test_a_failed_diagnosis_stops_its_own_policies_only(scripts, budget):
     assert not any(name.endswith("_3") for name in compare.runnable(done, policies))
 
 
-def test_presses_follow_the_contract_and_the_hidden_pad(scripts, budget):
+def test_presses_follow_the_contract_and_the_hidden_pad(budget):
     from lerobot_vtrefine.diagnose.pad.prediction import predict_trial
     from lerobot_vtrefine.diagnose.quality import check_quality
     from lerobot_vtrefine.diagnose.recordings import read_recording_set
 
-    compare, press = scripts
     reality = budget.output_dir / compare.folder_name(budget.realities[0]) / "reality.json"
     press.record(reality, budget.output_dir / "presses", trials=4, seed=1)
     recordings = read_recording_set(budget.output_dir / "presses")
@@ -210,8 +188,7 @@ def test_presses_follow_the_contract_and_the_hidden_pad(scripts, budget):
         assert error < 0.5 * plain_error
 
 
-def test_a_reality_without_sensor_model_cannot_be_pressed(scripts, tmp_path):
-    _, press = scripts
+def test_a_reality_without_sensor_model_cannot_be_pressed(tmp_path):
     (tmp_path / "reality.json").write_text(json.dumps({"schema": "vtrefine/reality@1"}))
     with pytest.raises(ValueError, match="has no sensor model"):
         press.record(tmp_path / "reality.json", tmp_path / "presses", 4, 0)

@@ -1,27 +1,17 @@
 """The comparison pools episodes, pairs seeds, and says only what its interval shows."""
 
-import importlib.util
 import json
 import subprocess
 import sys
 from pathlib import Path
-from types import ModuleType
 
+import compare_touch as script
 import pytest
 import yaml
 
 from lerobot_vtrefine.cli import demo
 
-SCRIPT = Path(__file__).parents[2] / "scripts" / "compare_touch.py"
 CONFIGS = Path(__file__).parents[2] / "configs" / "env"
-
-
-@pytest.fixture(scope="module")
-def script() -> ModuleType:
-    spec = importlib.util.spec_from_file_location("compare_touch", SCRIPT)
-    module = importlib.util.module_from_spec(spec)
-    spec.loader.exec_module(module)
-    return module
 
 
 def run_of(pretrain: int, finetune: int) -> dict:
@@ -31,7 +21,7 @@ def run_of(pretrain: int, finetune: int) -> dict:
     }
 
 
-def test_pools_and_pairs(script: ModuleType) -> None:
+def test_pools_and_pairs() -> None:
     touch = {seed: run_of(20, 80 + seed) for seed in range(3)}
     sight = {seed: run_of(20, 50 + seed) for seed in range(3)}
     comparison = script.compare({"visuo_tactile": touch, "visual": sight})
@@ -41,7 +31,7 @@ def test_pools_and_pairs(script: ModuleType) -> None:
     assert "touch pays" in script.as_text({"demo": comparison})
 
 
-def test_noise_is_called_noise(script: ModuleType) -> None:
+def test_noise_is_called_noise() -> None:
     touch = {0: run_of(20, 90), 1: run_of(20, 40), 2: run_of(20, 60)}
     sight = {0: run_of(20, 50), 1: run_of(20, 60), 2: run_of(20, 55)}
     text = script.as_text({"demo": script.compare({"visuo_tactile": touch, "visual": sight})})
@@ -77,7 +67,7 @@ def fake_demo(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
 
 @pytest.mark.parametrize("jobs", [1, 2])
 def test_passes_flags_on_and_saves(
-    script: ModuleType, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, fake_demo: None, jobs: int
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, fake_demo: None, jobs: int
 ) -> None:
     out = tmp_path / "out"
     arguments = ["--seeds", "3", "4", f"--output_dir={out}", "--num_demos=9", f"--jobs={jobs}"]
@@ -99,7 +89,7 @@ def test_passes_flags_on_and_saves(
 
 @pytest.mark.parametrize("jobs", [1, 2])
 def test_a_failed_run_ends_the_comparison(
-    script: ModuleType, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, fake_demo: None, jobs: int
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, fake_demo: None, jobs: int
 ) -> None:
     out = tmp_path / "out"
     arguments = ["--seeds", "3", "4", f"--output_dir={out}", "--fail=4", f"--jobs={jobs}"]
@@ -111,7 +101,7 @@ def test_a_failed_run_ends_the_comparison(
 
 
 def test_runs_side_by_side_take_gpus_by_turns(
-    script: ModuleType, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, fake_demo: None
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, fake_demo: None
 ) -> None:
     monkeypatch.setenv("CUDA_VISIBLE_DEVICES", "5,7")
     monkeypatch.setattr(sys, "argv", ["compare_touch.py", f"--output_dir={tmp_path}", "--jobs=6"])
@@ -120,7 +110,7 @@ def test_runs_side_by_side_take_gpus_by_turns(
     assert sorted(run["gpu"] for run in runs) == ["5", "5", "5", "7", "7", "7"]
 
 
-def test_every_setting_is_a_task_that_the_demo_accepts(script: ModuleType) -> None:
+def test_every_setting_is_a_task_that_the_demo_accepts() -> None:
     for setting, changes in script.SETTINGS.items():
         config = demo.parse_config(script.setting_flags(setting))  # parses the stages' flags too
         for part, values in changes.items():
@@ -130,7 +120,7 @@ def test_every_setting_is_a_task_that_the_demo_accepts(script: ModuleType) -> No
         assert "fusion" not in config.policy, "the paper's cloud is what is compared"
 
 
-def test_many_worlds_are_the_recipe_of_the_docs(script: ModuleType) -> None:
+def test_many_worlds_are_the_recipe_of_the_docs() -> None:
     for setting in script.WORLDS:
         config = demo.parse_config(script.setting_flags(setting))
         assert (config.finetune_envs, config.finetune_iterations, config.device) == (1024, 36, "cuda")
@@ -140,7 +130,7 @@ def test_many_worlds_are_the_recipe_of_the_docs(script: ModuleType) -> None:
         assert config.env["start"] == "grasped"
 
 
-def test_touch_tasks_are_the_files_with_encoders_of_their_own(script: ModuleType) -> None:
+def test_touch_tasks_are_the_files_with_encoders_of_their_own() -> None:
     tasks = [name for task in script.TOUCH_TASKS for name in (task, f"{task}_twin")]
     assert set(tasks) == set(script.WORLDS) - {"worlds_round", "worlds_square", "worlds_key"}
     for task in tasks:
@@ -151,7 +141,7 @@ def test_touch_tasks_are_the_files_with_encoders_of_their_own(script: ModuleType
 
 
 def test_settings_are_compared_one_by_one(
-    script: ModuleType, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, fake_demo: None
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, fake_demo: None
 ) -> None:
     out = tmp_path / "out"
     arguments = ["--seeds", "0", "--settings", "slip", "short_chunk", f"--output_dir={out}"]
@@ -167,7 +157,7 @@ def test_settings_are_compared_one_by_one(
     ("error", "status"),
     [(subprocess.CalledProcessError(3, ["vtrefine-demo"]), 3), (KeyboardInterrupt(), 130)],
 )
-def test_a_failure_is_the_scripts_status(script: ModuleType, error: BaseException, status: int) -> None:
+def test_a_failure_is_the_scripts_status(error: BaseException, status: int) -> None:
     def entry() -> None:
         raise error
 

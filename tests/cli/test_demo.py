@@ -13,14 +13,9 @@ from PIL import Image
 
 from lerobot_vtrefine import shipped
 from lerobot_vtrefine.cli import demo
-from lerobot_vtrefine.cli.pipeline.demo_config import (
-    ENCODERS,
-    LARGEST_SEED,
-    DemoConfig,
-    default_env,
-    demo_stages,
-    flags,
-)
+from lerobot_vtrefine.cli.arguments import flags
+from lerobot_vtrefine.cli.pipeline.demo_config import ENCODERS, LARGEST_SEED, DemoConfig, default_env
+from lerobot_vtrefine.cli.pipeline.demo_stages import demo_stages
 from lerobot_vtrefine.cli.report.results import verdict
 from lerobot_vtrefine.cli.report.statistics import proportion, quantiles, wilson_interval
 from lerobot_vtrefine.finetune.seeds import EVALUATION_SEEDS, TRAINING_SEEDS
@@ -121,7 +116,7 @@ def test_flags_come_beside_the_recipes() -> None:
     cloud = demo.parse_config(["--recipe=cloud"])
     assert (cloud.policy, cloud.finetune_iterations) == ({"preset": "small", "n_action_steps": 8}, 30)
     assert demo.parse_config(["--recipe=cloud", "--finetune_iterations=7"]).finetune_iterations == 7
-    with pytest.raises(ValueError, match="--recipe=paper: choose from pads, cloud"):
+    with pytest.raises(ValueError, match="--recipe=paper is unknown; choose from pads, cloud"):
         DemoConfig(recipe="paper")
 
 

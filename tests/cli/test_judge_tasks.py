@@ -1,26 +1,15 @@
 """A study of a task becomes a line of the table, with the verdict that the study itself gives."""
 
-import importlib.util
 import json
 import sys
 from pathlib import Path
-from types import ModuleType
 
+import judge_tasks as script
 import pytest
 
 from lerobot_vtrefine.cli.results.rows import read_rows
 from lerobot_vtrefine.information.quantities import NAMES
 from lerobot_vtrefine.information.study import Effort, Finding, Study, as_json
-
-SCRIPT = Path(__file__).parents[2] / "scripts" / "judge_tasks.py"
-
-
-@pytest.fixture
-def script() -> ModuleType:
-    spec = importlib.util.spec_from_file_location("judge_tasks", SCRIPT)
-    module = importlib.util.module_from_spec(spec)
-    spec.loader.exec_module(module)
-    return module
 
 
 def finding(senses: str, history: int, error: float, successes: int) -> Finding:
@@ -43,7 +32,7 @@ def write_study(folder: Path, vision: int) -> None:
 
 
 def test_rows_hold_the_best_of_each_sense_and_the_verdict(
-    script: ModuleType, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     write_study(tmp_path / "information_hard", vision=60)
     write_study(tmp_path / "information_easy", vision=80)

@@ -121,8 +121,8 @@ def test_another_robot_and_another_order_are_refused(tmp_path: Path) -> None:
     ("arguments", "message"),
     [
         ({"dataset": SourceConfig()}, "say what to replay"),
-        ({"parts": "some"}, "unknown --parts=some"),
-        ({"hold": "spline"}, "unknown --hold=spline; choose from zero_order, linear"),
+        ({"parts": "some"}, "--parts=some is unknown"),
+        ({"hold": "spline"}, "--hold=spline is unknown; choose from zero_order, linear"),
         ({"episodes": []}, "--episodes is empty"),
     ],
 )
@@ -151,7 +151,7 @@ def test_broken_folders(joints_only: Path, tmp_path: Path) -> None:
     with pytest.raises(ValueError, match="data files lack episode 0"):
         replay(ReplayConfig(tmp_path / "out", SourceConfig(copy)))
     damage(copy, "info.json", lambda text: text.replace('"features"', '"columns"'))
-    with pytest.raises(ValueError, match=r"no description of a LeRobot dataset: .* lacks 'features'"):
+    with pytest.raises(ValueError, match=r"does not describe a LeRobot dataset: .* lacks 'features'"):
         replay(ReplayConfig(tmp_path / "out", SourceConfig(copy)))
     damage(copy, "info.json", lambda text: text.replace('"columns"', '"features"'))
     damage(copy, "info.json", lambda text: text.replace('"v3.0"', '"v2.1"'))
@@ -183,8 +183,8 @@ def test_notes_of_other_recordings_are_refused(demos: Path, tmp_path: Path) -> N
     refuse({**whole, "episodes": whole["episodes"][:1]}, "notes 1 episodes, the dataset has 2: it was edited")
     edited = ReplayConfig(tmp_path / "arms", SourceConfig(copy), parts="none")
     assert replay(edited).touch == []  # the arms alone need no starts
-    refuse({"episodes": []}, "is no note of vtrefine-record-demos")
-    refuse([1, 2], "is no note of vtrefine-record-demos")
+    refuse({"episodes": []}, "is not a note of vtrefine-record-demos")
+    refuse([1, 2], "is not a note of vtrefine-record-demos")
     other = {**whole["settings"], "scene": {**whole["settings"]["scene"], "gravity_m_s2": 3.7}}
     refuse({**whole, "settings": other}, "written by another version")
     del other["rules"]

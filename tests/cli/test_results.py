@@ -7,6 +7,8 @@ import sys
 from dataclasses import asdict, replace
 from pathlib import Path
 
+import collect_results
+import make_tables
 import numpy as np
 import pytest
 
@@ -20,16 +22,6 @@ from lerobot_vtrefine.cli.results.tables import BLOCK, difference, fill, pooled,
 ROOT = Path(__file__).parents[2]
 RESULTS = ROOT / "results"
 ORIGIN = {"commit": "0123abc", "command": "vtrefine-demo", "machine": "2 cores"}
-
-
-@pytest.fixture(scope="module")
-def scripts():
-    sys.path.insert(0, str(ROOT / "scripts"))
-    import collect_results
-    import make_tables
-
-    yield collect_results, make_tables
-    sys.path.remove(str(ROOT / "scripts"))
 
 
 def run_of(success: float, seed: int | None = 0, **changes) -> Run:
@@ -47,9 +39,8 @@ def run_of(success: float, seed: int | None = 0, **changes) -> Run:
     return replace(row, **changes)
 
 
-def test_documents_hold_the_tables_of_the_files(scripts) -> None:
+def test_documents_hold_the_tables_of_the_files() -> None:
     """After a change of results/*.json: make tables."""
-    _, make_tables = scripts
     rows = read_all(RESULTS)
     shown = set()
     for path in make_tables.documents():
@@ -97,11 +88,11 @@ def test_decimals_have_a_zero_before_the_point() -> None:
         ({"seed": True}, "seed must be a whole number or null, got True"),
         ({"seed": -1}, "seed must not be negative, got -1"),
         ({"episodes": 0}, "episodes must be at least 1, got 0"),
-        ({"table": "tuoch"}, "table 'tuoch' is none of converges, demo, touch"),
+        ({"table": "tuoch"}, "table=tuoch is unknown; choose from converges, demo, touch"),
         ({"commit": "yesterday"}, "commit must be a hash, got 'yesterday'"),
         ({"extra": {"seconds": [1]}}, "extra must map names to a number or text"),
         ({"sucess": 0.5}, "has unknown sucess"),
-        ({"curve": "curves/none.csv"}, "curve curves/none.csv is no file"),
+        ({"curve": "curves/none.csv"}, "curve curves/none.csv is not a file"),
         ({"cells": {"a": "b"}}, "has unknown"),
     ],
 )
@@ -204,13 +195,13 @@ def test_a_fall_counts_in_the_last_half_alone() -> None:
 
 
 @pytest.fixture
-def collect(scripts, tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+def collect(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     """Run the script on a results file of the test's own -> exit status, rows."""
     path = tmp_path / "results" / "rows.json"
 
     def run(*arguments: str) -> tuple[int, list[Row]]:
         monkeypatch.setattr(sys, "argv", ["collect_results.py", *arguments, f"--results={path}"])
-        return scripts[0].main(), read_rows(path) if path.is_file() else []
+        return collect_results.main(), read_rows(path) if path.is_file() else []
 
     return run
 

@@ -6,22 +6,12 @@ import sys
 from pathlib import Path
 
 import pytest
+import ship_policy as script
 import torch
 from safetensors.torch import load_file, save_file
 
 from lerobot_vtrefine import shipped
 from lerobot_vtrefine.cli.play import SHOWN, with_something_to_play
-
-SCRIPTS = Path(__file__).parents[2] / "scripts"
-
-
-@pytest.fixture
-def script(monkeypatch: pytest.MonkeyPatch):
-    monkeypatch.syspath_prepend(str(SCRIPTS))
-    import ship_policy
-
-    yield ship_policy
-    sys.modules.pop("ship_policy")
 
 
 def test_a_policy_is_named_as_the_environment_it_was_trained_in() -> None:
@@ -51,7 +41,7 @@ def test_the_policy_inserts(monkeypatch: pytest.MonkeyPatch, capsys: pytest.Capt
     assert re.search(r"\n[23] of 3 succeeded \(", capsys.readouterr().out)
 
 
-def test_weights_are_shortened_and_nothing_else(script, tmp_path: Path) -> None:
+def test_weights_are_shortened_and_nothing_else(tmp_path: Path) -> None:
     checkpoint = tmp_path / "pretrained_model"
     checkpoint.mkdir()
     weights = {"model.a": torch.randn(40), "base.denoiser.b": torch.randn(30), "count": torch.arange(3)}
@@ -72,7 +62,7 @@ def test_weights_are_shortened_and_nothing_else(script, tmp_path: Path) -> None:
     assert processor["steps"][0]["config"]["device"] == "cpu"
 
 
-def test_what_cannot_be_shipped_leaves_nothing(script, tmp_path: Path) -> None:
+def test_what_cannot_be_shipped_leaves_nothing(tmp_path: Path) -> None:
     with pytest.raises(FileNotFoundError, match=r"holds no model\.safetensors"):
         script.ship(tmp_path, tmp_path / "small")
     save_file({"model.a": torch.zeros(2_600_000)}, tmp_path / "model.safetensors")

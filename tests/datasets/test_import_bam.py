@@ -61,7 +61,7 @@ def test_runs_become_trials_with_their_plant_and_gain(tmp_path: Path, kind: str)
 @pytest.mark.parametrize(
     ("changed", "said"),
     [
-        ({"motor": "mg90"}, r"bam\.npz: run0: motor 'mg90' is none whose gain is known: xl330"),
+        ({"motor": "mg90"}, r"bam\.npz: run0: motor 'mg90' has no known gain; choose from xl330"),
         ({"mass": "heavy"}, r"bam\.npz: run0: mass must be a number"),
         ({"name": "other"}, r"bam\.npz: no array 'other' of 8 columns"),
     ],

@@ -106,7 +106,7 @@ def test_numbers_that_json_does_not_know_are_refused(change, tmp_path):
 @pytest.mark.parametrize(
     ("change", "match"),
     [
-        ({"status": "fine"}, "status 'fine' is unknown"),
+        ({"status": "fine"}, "status=fine is unknown"),
         ({"status": "adequate"}, "contradicts"),
         ({"status": "adequate", "causes": (), "unknown": Unknown(True, "load")}, "contradicts"),
         ({"causes": ()}, "contradicts"),

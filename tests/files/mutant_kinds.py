@@ -238,7 +238,7 @@ def reading_pads(folder: Path) -> None:
     """What the robots and ``vtrefine-view-pads`` do before they open ports."""
     path = folder / "pads.yaml"
     first = configured_pads({}, path)
-    second = view_pads.chosen_pads(view_pads.parse_arguments(["--pads_file", str(path)]))
+    second = view_pads.chosen_pads(view_pads.make_parser().parse_args(["--pads_file", str(path)]))
     assert first == second
     for pad in first.values():
         assert np.zeros(pad.pad_shape).size <= 64 * 64

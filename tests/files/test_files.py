@@ -96,8 +96,8 @@ def test_what_is_wrong_is_named(change: dict, message: str) -> None:
         (b"[" * 10**6, "nested more than 32 levels deep"),
         (b'"' + b'\\"' * 10**6, "not valid JSON"),
         (b'{"a": 1, "a": 2}', "'a' is given twice"),
-        (b'{"a": NaN}', "NaN is no finite number"),
-        (b'{"a": 1e999}', "1e999 is no finite number"),
+        (b'{"a": NaN}', "NaN is not a finite number"),
+        (b'{"a": 1e999}', "1e999 is not a finite number"),
         (b"9" * 1000, "too large a number"),
         (b" " * (9 << 20), "larger than the 8,388,608 bytes"),
     ],
@@ -113,7 +113,7 @@ def test_json_has_bounds(tmp_path: Path, text: bytes, message: str) -> None:
 def test_a_byte_order_mark_is_no_fault_and_a_device_is(tmp_path: Path) -> None:
     (tmp_path / "x.json").write_bytes(b"\xef\xbb\xbf" + json.dumps({"a": ["}", '"']}).encode())
     assert read_json(tmp_path / "x.json") == {"a": ["}", '"']}
-    with pytest.raises(ValueError, match="no regular file"):
+    with pytest.raises(ValueError, match="not a regular file"):
         read_json("/dev/zero")
     with pytest.raises(FileNotFoundError):
         read_json(tmp_path / "nowhere.json")
@@ -176,7 +176,7 @@ def test_names_stay_in_their_folder(tmp_path: Path) -> None:
         with pytest.raises(ValueError, match="lies outside of the folder"):
             inside(folder, name)
     for name in ("", "a\0b"):
-        with pytest.raises(ValueError, match="is no name of a file"):
+        with pytest.raises(ValueError, match="is not a file's name"):
             inside(folder, name)
 
 

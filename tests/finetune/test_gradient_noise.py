@@ -1,25 +1,13 @@
 """The share of signal in a gradient, against noise of known size."""
 
-import importlib.util
-from pathlib import Path
-
+import gradient_noise as script
 import numpy as np
 import pytest
 import torch
 
-SCRIPT = Path(__file__).parents[2] / "scripts" / "gradient_noise.py"
-
-
-@pytest.fixture(scope="module")
-def script():
-    spec = importlib.util.spec_from_file_location("gradient_noise", SCRIPT)
-    module = importlib.util.module_from_spec(spec)
-    spec.loader.exec_module(module)
-    return module
-
 
 @pytest.mark.parametrize("noise", [0.3, 1.0, 3.0])
-def test_cosines_are_those_of_signal_and_noise(script, noise):
+def test_cosines_are_those_of_signal_and_noise(noise):
     """Groups are a unit vector and white noise of length ``noise``: E|mean of n|^2 = 1 + noise^2 / n."""
     generator = torch.Generator().manual_seed(0)
     size = 200_000
@@ -32,7 +20,7 @@ def test_cosines_are_those_of_signal_and_noise(script, noise):
     assert script.whole_cosine(half) == pytest.approx(true_cosine, abs=0.02)
 
 
-def test_noise_alone_points_nowhere(script):
+def test_noise_alone_points_nowhere():
     groups = torch.randn(script.GROUPS, 100_000, generator=torch.Generator().manual_seed(1))
     half, spread = script.halves_cosine(groups)
     assert abs(half) < 0.02

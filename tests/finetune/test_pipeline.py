@@ -18,6 +18,7 @@ from lerobot_vtrefine.cli.results.collect import run_rows
 from lerobot_vtrefine.cli.results.provenance import commit, machine
 from lerobot_vtrefine.envs.decisions import make_decision_env
 from lerobot_vtrefine.finetune import pipeline
+from lerobot_vtrefine.finetune.config import PaperDppo
 from lerobot_vtrefine.finetune.logger import CLOCK, read_progress
 from lerobot_vtrefine.finetune.seeds import EVALUATION_SEEDS
 from lerobot_vtrefine.finetune.state_file import load_state, save_state
@@ -260,6 +261,13 @@ def test_policy_of_another_type_is_refused(finetune, tmp_path, capsys):
     ACTConfig(device="cpu").save_pretrained(other)
     assert finetune(tmp_path / "run", policy=other) == 2
     assert "holds a policy of type act; vtrefine-finetune needs vt_dp3" in capsys.readouterr().err
+
+
+def test_a_task_of_another_environment_is_refused_before_the_policy_is_loaded(tmp_path):
+    task = tmp_path / "task.yaml"
+    task.write_text("env: {type: pusht}")
+    with pytest.raises(ValueError, match=r"needs --env\.type=vtrefine, got pusht"):
+        pipeline.load_practice(tmp_path / "no policy", task, PaperDppo(), "cpu", ablate="touch")
 
 
 def test_training_state_comes_back_exactly_and_is_no_pickle(tmp_path):

@@ -1,18 +1,16 @@
-"""What the reference DPPO's agent is shown of our environments (scripts/compare_reference_dppo.py)."""
+"""What the reference DPPO's agent is shown of our environments (scripts/reference_dppo.py)."""
 
 import argparse
-import importlib.util
-from pathlib import Path
 
 import numpy as np
 import pytest
+import reference_dppo as script
 import torch
 from toy import BlindPeg, ToyActor, make_agent
 
 from lerobot_vtrefine.finetune.config import PaperDppo
 from lerobot_vtrefine.finetune.seeds import EVALUATION_SEEDS, TRAINING_SEEDS
 
-SCRIPT = Path(__file__).parents[2] / "scripts" / "compare_reference_dppo.py"
 CHUNK = (4, 2)
 
 
@@ -24,16 +22,8 @@ class Pegs(BlindPeg):
         return super().reset(seeds)
 
 
-@pytest.fixture(scope="module")
-def script():
-    spec = importlib.util.spec_from_file_location("compare_reference_dppo", SCRIPT)
-    module = importlib.util.module_from_spec(spec)
-    spec.loader.exec_module(module)
-    return module
-
-
 @pytest.fixture
-def envs(script):
+def envs():
     pegs = Pegs(3, feel=True, max_decisions=2)
     agent = make_agent(ToyActor(3, *CHUNK, width=8), PaperDppo(encoder="frozen"), CHUNK)
     args = argparse.Namespace(seed=7, val_freq=2, minutes=1.0)
@@ -79,12 +69,12 @@ def test_the_state_is_condition_and_standardised_privileged_state(envs):
     np.testing.assert_allclose(state[:, 0, 32:], (privileged / 1e-3).clamp(-5, 5), rtol=1e-6)
 
 
-def test_a_run_ends_when_its_time_is_up(script, envs):
+def test_a_run_ends_when_its_time_is_up(envs):
     envs.seconds = 0.0
     with pytest.raises(script.TimeIsUpError):
         envs.reset_arg(None)
 
 
-def test_a_folder_without_the_reference_is_told(script, tmp_path):
-    with pytest.raises(FileNotFoundError, match="no checkout of irom-princeton/dppo"):
+def test_a_folder_without_the_reference_is_told(tmp_path):
+    with pytest.raises(FileNotFoundError, match="not a checkout of irom-princeton/dppo"):
         script.Reference(tmp_path)

@@ -148,7 +148,7 @@ def test_other_policies_keep_their_own_steps_but_call_nothing_that_is_no_step(tm
     load(own)
     assert marker.exists()
     for folder in commands:
-        with pytest.raises(ValueError, match="is no processor step"):
+        with pytest.raises(ValueError, match="is not a processor step"):
             load(folder)
     assert not (tmp_path / "called").exists()
     with pytest.raises(ValueError, match=r"[Tt]okenizer_?[Pp]rocessor"):  # LeRobot's own words

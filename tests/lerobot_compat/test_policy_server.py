@@ -14,6 +14,7 @@ import numpy as np
 import pytest
 import torch
 from lerobot.configs import FeatureType, PolicyFeature
+from ports import free_port
 
 from lerobot_vtrefine.cli.policy_server import main
 from lerobot_vtrefine.datasets.features import ACTION_KEY, STATE_KEY
@@ -64,12 +65,6 @@ def in_a_folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Generator[No
     monkeypatch.chdir(tmp_path)
     yield
     arrays.uninstall()
-
-
-def free_port() -> int:
-    with socket.socket() as probe:
-        probe.bind(("localhost", 0))
-        return probe.getsockname()[1]
 
 
 def waited(until: object, seconds: float) -> bool:

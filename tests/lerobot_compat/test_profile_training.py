@@ -1,17 +1,10 @@
 """``scripts/profile_training.py`` reads LeRobot's log: its format must be the one that LeRobot writes."""
 
-import importlib.util
-from pathlib import Path
-
+import profile_training as script
 from lerobot.utils.logging_utils import AverageMeter, MetricsTracker
-
-SCRIPT = Path(__file__).parents[2] / "scripts" / "profile_training.py"
 
 
 def test_times_are_found_in_lerobots_own_line():
-    spec = importlib.util.spec_from_file_location("profile_training", SCRIPT)
-    script = importlib.util.module_from_spec(spec)
-    spec.loader.exec_module(script)
     names = {"update_s": "updt_s", "dataloading_s": "data_s"}
     meters = {name: AverageMeter(title, ":.3f") for name, title in names.items()}
     meters["samples_per_s"] = AverageMeter("smp/s", ":.0f")

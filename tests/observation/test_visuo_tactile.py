@@ -60,7 +60,7 @@ def test_modalities_drop_points() -> None:
         ({"pool_rows": 5}, "pool_rows=5 must divide 12"),
         ({"num_visual_points": 0}, "num_visual_points must be at least 1"),
         ({"crop_min_m": (0.0, 0.0, 0.5)}, "must be below crop_max_m"),
-        ({"normalization": "zscore"}, "choose one of two_stage, fixed"),
+        ({"normalization": "zscore"}, "choose from two_stage, fixed"),
         ({"threshold_counts": 70.0}, "threshold_counts"),
         ({"scale_m": 0.0}, "scale_m"),
     ],

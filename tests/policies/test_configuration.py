@@ -63,13 +63,13 @@ def test_chunks_start_at_the_current_observation() -> None:
 @pytest.mark.parametrize(
     ("values", "message"),
     [
-        ({"preset": "huge"}, "choose one of paper, small"),
-        ({"modalities": "sound"}, "choose one of visuo_tactile, visual, tactile"),
-        ({"denoiser": "rnn"}, "choose one of unet, mlp"),
+        ({"preset": "huge"}, "choose from paper, small"),
+        ({"modalities": "sound"}, "choose from visuo_tactile, visual, tactile"),
+        ({"denoiser": "rnn"}, "choose from unet, mlp"),
         ({"horizon": 15}, "divisible by 4"),
         ({"n_action_steps": 17}, "within 1..16"),
         ({"preset": "small", "down_dims": (64, 32)}, "one repeated width"),
-        ({"sampler": "euler"}, "choose one of"),
+        ({"sampler": "euler"}, "choose from"),
         ({"ft_denoising_steps": 11}, "within 0..10"),
     ],
 )

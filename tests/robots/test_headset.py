@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 from commands import dataset_flags, flags, run_command, train
 from emulated_devices import page_client
+from ports import free_port
 from scipy.spatial.transform import Rotation
 from test_vtrefine_ee import as_controllers, expert_targets
 
@@ -37,9 +38,7 @@ def restored() -> Generator[None]:
 @pytest.fixture
 def port() -> int:
     pytest.importorskip("teleop")
-    with socket.socket() as probe:
-        probe.bind(("localhost", 0))
-        return probe.getsockname()[1]
+    return free_port()
 
 
 def hand(place: object, turn: object = UPRIGHT, squeeze: bool = True, trigger: bool = False) -> dict:

@@ -1,6 +1,5 @@
 """Each of vtrefine_ee's own inputs raises the right hand's plug through stock lerobot-record."""
 
-import socket
 import sys
 from collections.abc import Generator
 from contextlib import ExitStack
@@ -12,6 +11,7 @@ import pytest
 from commands import dataset_flags, flags, run_command
 from emulated_devices import HidApi, Listener, SdlGamepad, page_client, raised_phone
 from lerobot.datasets.lerobot_dataset import LeRobotDataset
+from ports import free_port
 from test_headset import hand, message
 from test_lerobot_devices import assert_raises_the_plug
 
@@ -27,12 +27,6 @@ RIGHT_STICK_BACK, RIGHT_SHOULDER = 4, 5
 def restored() -> Generator[None]:
     yield
     phases.uninstall()
-
-
-def free_port() -> int:
-    with socket.socket() as probe:
-        probe.bind(("localhost", 0))
-        return probe.getsockname()[1]
 
 
 def keyboard(patch: pytest.MonkeyPatch, _stack: ExitStack) -> list[str]:

@@ -229,7 +229,7 @@ def test_a_sensor_changes_nothing_but_the_depth_image():
 
 
 def test_unknown_sensors_are_named():
-    with pytest.raises(ValueError, match="unknown depth_sensor 'd999': use one of ideal, d405, d435"):
+    with pytest.raises(ValueError, match="depth_sensor=d999 is unknown; choose from ideal, d405, d435"):
         SceneConfig(depth_sensor="d999")
 
 

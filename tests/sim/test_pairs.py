@@ -58,7 +58,7 @@ def test_shapes_hinder_turning(name, yaw):
 
 
 def test_unknown_profile_is_refused_with_the_known_ones():
-    with pytest.raises(ValueError, match=r"unknown pair 'star': use one of round, square, .*, key$"):
+    with pytest.raises(ValueError, match=r"pair=star is unknown; choose from round, square, .*, key$"):
         make_profile("star", 0.02)
 
 
@@ -83,7 +83,7 @@ def test_parts_stand_on_the_table_without_touching_through_it():
 
 
 def test_bad_pairs_and_clearances_are_named():
-    with pytest.raises(ValueError, match=r"unknown pair 'oval'.*round.*automate/ID"):
+    with pytest.raises(ValueError, match=r"pair=oval is unknown; .*round.*automate/ID"):
         build_scene(SceneConfig(pair="oval"))
     with pytest.raises(ValueError, match="clearance_m must be above 0"):
         SceneConfig(clearance_m=0.0)

@@ -72,6 +72,7 @@ def test_without_opengl_the_error_names_the_fix(sim: InsertionSim, monkeypatch: 
     with pytest.raises(RuntimeError, match=r"no OpenGL .*install EGL .*MUJOCO_GL=egl") as error:
         VideoRenderer(sim, 0, backend="gl")
     assert "\n" not in str(error.value)
+    assert render._GL_FAILURES[0].__traceback__ is None, "it would keep the simulation"
 
 
 def test_without_opengl_videos_still_come(

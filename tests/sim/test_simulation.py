@@ -249,8 +249,11 @@ def test_success_must_be_held():
         (lambda: insertion_sim(0), "num_envs must be at least 1"),
         (lambda: WarpConfig(device="gpu"), "warp.device must be auto, cpu, cuda or cuda:0, not 'gpu'"),
         (lambda: WarpConfig(rows_per_world=0), "warp.rows_per_world must be at least 1"),
-        (lambda: insertion_sim(1, backend="cuda"), "unknown backend 'cuda': use one of single, batch, warp"),
-        (lambda: SceneConfig(start="floor"), "unknown start 'floor': use one of table, grasped"),
+        (
+            lambda: insertion_sim(1, backend="cuda"),
+            "backend=cuda is unknown; choose from single, batch, warp",
+        ),
+        (lambda: SceneConfig(start="floor"), "start=floor is unknown; choose from table, grasped"),
         (lambda: insertion_sim(1, rules=TaskConfig(control_hz=30)), "whole number of physics steps"),
         (lambda: TaskConfig(episode_steps=0), "episode_steps must be at least 1"),
         (lambda: RandomizationConfig(clearance_m=(0.0, 0.001)), "randomization.clearance_m needs 0 < lowest"),

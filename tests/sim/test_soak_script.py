@@ -1,22 +1,17 @@
 """``scripts/soak_worlds.py`` goes on where its rows end, and tells what failed."""
 
-import importlib.util
 import json
 from collections import Counter
-from pathlib import Path
 
 import pytest
+import soak_worlds as script
 
-SCRIPT = Path(__file__).parents[2] / "scripts" / "soak_worlds.py"
 COMBINATIONS = 2 * 2
 
 
 @pytest.fixture
 def soak(tmp_path, monkeypatch):
     """Runs the script with players that yield ten control steps at a time; returns status, rows and sums."""
-    spec = importlib.util.spec_from_file_location("soak_worlds", SCRIPT)
-    script = importlib.util.module_from_spec(spec)
-    spec.loader.exec_module(script)
     rows = tmp_path / "rows.jsonl"
     seeds = []
 

@@ -145,7 +145,7 @@ def test_other_sensors_are_refused():
     spec = mujoco.MjSpec()
     spec.worldbody.add_geom(name="ball", size=[0.1, 0, 0])
     spec.add_sensor(name="clock", type=mujoco.mjtSensor.mjSENS_CLOCK)
-    with pytest.raises(ValueError, match="sensor 'clock' is no net force of contacts"):
+    with pytest.raises(ValueError, match="sensor 'clock' is not a net force of contacts"):
         _sides(spec.compile())
 
 

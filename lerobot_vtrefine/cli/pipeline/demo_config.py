@@ -1,11 +1,10 @@
-"""The demo's recipe: every number it uses, and the command lines that they make."""
+"""The demo's recipe: every number it uses."""
 
-from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-from lerobot_vtrefine.cli.pipeline.stages import Stage
+from lerobot_vtrefine.choices import check_choice
 from lerobot_vtrefine.finetune.seeds import TRAINING_SEEDS
 
 REPO_ID = "local/vtrefine_demo"
@@ -142,8 +141,7 @@ class DemoConfig:
         for name, lowest in LOWEST.items():
             if getattr(self, name) < lowest:
                 raise ValueError(f"--{name} must be at least {lowest}, got {getattr(self, name)}")
-        if self.modalities not in ("visuo_tactile", "visual"):
-            raise ValueError(f"--modalities={self.modalities}: choose from visuo_tactile, visual")
+        check_choice("--modalities", self.modalities, ("visuo_tactile", "visual"))
         if not 0 <= self.seed <= LARGEST_SEED:
             raise ValueError(f"--seed must lie in 0..{LARGEST_SEED}, got {self.seed}")
         assert self.finetune_iterations is not None  # the recipe's at least
@@ -156,8 +154,7 @@ class DemoConfig:
 
     def _follow_recipe(self) -> None:
         """Fill in what the recipe says and the flags do not; the policy sees with the environment's robot."""
-        if self.recipe not in RECIPES:
-            raise ValueError(f"--recipe={self.recipe}: choose from {', '.join(RECIPES)}")
+        check_choice("--recipe", self.recipe, RECIPES)
         recipe = RECIPES[self.recipe]
         body = (self.env.get("scene") or {}).get("embodiment", HOME_BODY)
         policy = recipe["policy"] | self.policy
@@ -209,126 +206,3 @@ class DemoConfig:
             return []
         modalities = ABLATIONS if self.modalities == "visuo_tactile" else ("vision",)
         return [(policy, modality) for policy in POLICIES for modality in modalities]
-
-
-def flags(prefix: str, values: Mapping[str, Any]) -> list[str]:
-    """``--prefix.key=value`` for every entry; nested mappings become dotted keys."""
-    result = []
-    for key, value in values.items():
-        if isinstance(value, Mapping):
-            result += flags(f"{prefix}.{key}", value)
-        else:
-            text = str(value).lower() if isinstance(value, bool) else str(value)
-            result.append(f"--{prefix}.{key}={text}")
-    return result
-
-
-def record_stage(config: DemoConfig) -> Stage:
-    """Scripted, imperfect demonstrations -> LeRobot dataset."""
-    command = [
-        "vtrefine-record-demos",
-        f"--root={config.dataset_dir}",
-        f"--repo_id={REPO_ID}",
-        f"--num_episodes={config.num_demos}",
-        f"--num_envs={config.demo_envs}",
-        f"--seed={config.seed * SEED_STRIDE}",
-        *flags("env", {"type": "vtrefine"} | config.env),
-        *flags("degradation", config.degradation),
-    ]
-    product = config.dataset_dir / "meta" / "info.json"
-    return Stage(
-        "record", "Record demonstrations", tuple(command), config.dataset_dir, product, resumable=True
-    )
-
-
-def pretrain_stage(config: DemoConfig) -> Stage:
-    """Imitation learning with LeRobot's own trainer."""
-    command = [
-        "lerobot-train",
-        f"--dataset.repo_id={REPO_ID}",
-        f"--dataset.root={config.dataset_dir}",
-        *flags("policy", {"type": "vt_dp3"} | config.policy),
-        f"--policy.modalities={config.modalities}",
-        f"--policy.device={config.device}",
-        "--policy.push_to_hub=false",
-        f"--output_dir={config.output_dir / 'pretrain'}",
-        f"--steps={config.pretrain_steps}",
-        f"--save_freq={config.pretrain_steps}",
-        f"--batch_size={config.pretrain_batch}",
-        "--num_workers=0",
-        "--log_freq=100",
-        "--env_eval_freq=0",
-        f"--seed={config.seed}",
-    ]
-    product = config.checkpoint("pretrain") / "model.safetensors"
-    return Stage(
-        "pretrain",
-        "Imitation learning (lerobot-train)",
-        tuple(command),
-        config.output_dir / "pretrain",
-        product,
-        ("record",),
-    )
-
-
-def evaluation_stage(config: DemoConfig, policy: str, ablation: str = "none") -> Stage:
-    """LeRobot's own evaluation on unseen seeds, optionally with one sense replaced by its mean."""
-    output = config.evaluation_dir(policy, ablation)
-    episodes = config.eval_episodes if ablation == "none" else config.ablation_episodes
-    command = [
-        "lerobot-eval",
-        f"--policy.path={config.checkpoint(policy)}",
-        f"--policy.device={config.device}",
-        *flags("env", {"type": "vtrefine"} | config.env),
-        f"--env.metrics_path={output / 'episodes.jsonl'}",
-        f"--env.video_episodes={config.videos if ablation == 'none' else 0}",
-        f"--eval.n_episodes={episodes}",
-        f"--eval.batch_size={min(config.eval_envs, episodes)}",
-        f"--seed={config.eval_seed}",
-        f"--output_dir={output}",
-    ]
-    title = {"pretrain": "Evaluate imitation", "finetune": "Evaluate DPPO"}[policy]
-    needs = [policy]
-    if ablation != "none":
-        command += [f"--env.ablate={ablation}", f"--env.ablate_dataset={config.dataset_dir}"]
-        title += f" without {ablation}"
-        needs.append("record")
-    return Stage(output.name, title, tuple(command), output, output / "eval_info.json", tuple(needs))
-
-
-def finetune_stage(config: DemoConfig) -> Stage:
-    """DPPO from the pre-trained checkpoint."""
-    command = [
-        "vtrefine-finetune",
-        f"--policy.path={config.checkpoint('pretrain')}",
-        f"--policy.device={config.device}",
-        *flags("env", {"type": "vtrefine"} | config.env),
-        *flags("dppo", config.dppo),
-        f"--dppo.iterations={config.finetune_iterations}",
-        f"--dppo.num_envs={config.finetune_envs}",
-        f"--seed={config.seed * SEED_STRIDE + TRAIN_SEED_OFFSET}",
-        f"--output_dir={config.output_dir / 'finetune'}",
-        "--resume=true",
-    ]
-    product = config.checkpoint("finetune") / "model.safetensors"
-    return Stage(
-        "finetune",
-        "DPPO fine-tuning",
-        tuple(command),
-        config.output_dir / "finetune",
-        product,
-        ("pretrain",),
-        resumable=True,
-    )
-
-
-def demo_stages(config: DemoConfig) -> list[Stage]:
-    """All stages in the order in which they run."""
-    return [
-        record_stage(config),
-        pretrain_stage(config),
-        evaluation_stage(config, "pretrain"),
-        finetune_stage(config),
-        evaluation_stage(config, "finetune"),
-        *(evaluation_stage(config, policy, modality) for policy, modality in config.ablations()),
-    ]

@@ -6,6 +6,7 @@ from typing import Any, Protocol
 import numpy as np
 import torch
 
+from lerobot_vtrefine.choices import check_choice
 from lerobot_vtrefine.datasets.episodes import EpisodeFolder, open_episodes
 from lerobot_vtrefine.datasets.features import raw_to_env_observation
 from lerobot_vtrefine.diagnose.episode_replay.twin import read_ledger, recorded_seeds, recorded_twin
@@ -16,8 +17,6 @@ from lerobot_vtrefine.observation import VisuoTactileConfig
 from lerobot_vtrefine.sim.demonstrations import Degradation
 
 Array = np.ndarray
-
-AGENTS = ("expert", "zero", "random")
 
 
 class Agent(Protocol):
@@ -136,8 +135,7 @@ class RecordedAgent:
 def scripted_agent(name: str) -> Agent:
     """The agent of ``--agent``. Raises: ValueError for another name."""
     agents = {"expert": ExpertAgent, "zero": ZeroAgent, "random": RandomAgent}
-    if name not in agents:
-        raise ValueError(f"--agent={name} is unknown; choose from {', '.join(AGENTS)}")
+    check_choice("--agent", name, agents)
     return agents[name]()
 
 

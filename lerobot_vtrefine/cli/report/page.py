@@ -8,7 +8,7 @@ from typing import Any
 from matplotlib import colormaps
 from matplotlib.colors import to_hex
 
-from lerobot_vtrefine.cli.pipeline.demo_config import flags
+from lerobot_vtrefine.cli.arguments import flags
 from lerobot_vtrefine.cli.pipeline.progress import clock
 from lerobot_vtrefine.cli.report.cloud import recorded_cloud
 from lerobot_vtrefine.cli.report.media import data_uri, strongest_contact

@@ -63,7 +63,7 @@ def load_evaluation(directory: Path, first_seed: int) -> dict[str, Any]:
         if len(info.per_task) != 1:
             raise ValueError(f"per_task must hold one task, got {len(info.per_task)}")
     except ValueError as error:
-        raise ValueError(f"{path} is no result of lerobot-eval: {error}") from error
+        raise ValueError(f"{path} is not a result of lerobot-eval: {error}") from error
     task = info.per_task[0].metrics
     successes = list(task.successes)
     rows = read_episode_log(directory / "episodes.jsonl", first_seed, len(successes))

@@ -10,6 +10,8 @@ from dataclasses import MISSING, asdict, dataclass, field, fields
 from pathlib import Path
 from typing import Any, ClassVar, get_type_hints
 
+from lerobot_vtrefine.choices import check_choice
+
 COMMIT = re.compile(r"[0-9a-f]{7,40}\+?")
 
 
@@ -33,8 +35,7 @@ class Row:
             value = getattr(self, name)
             if isinstance(value, bool) or not isinstance(value, kind | int if kind is float else kind):
                 raise ValueError(f"{name} must be {_words(kind)}, got {value!r}")
-        if self.table not in self.TABLES:
-            raise ValueError(f"table {self.table!r} is none of {', '.join(self.TABLES)}")
+        check_choice("table", self.table, self.TABLES)
         if self.commit is not None and not COMMIT.fullmatch(self.commit):
             raise ValueError(f"commit must be a hash, got {self.commit!r}")
 
@@ -164,7 +165,7 @@ def read_rows(path: Path) -> list[Row]:
             if row.key in rows:
                 raise ValueError(f"stands for the same as an earlier one: {row.key}")
             if isinstance(row, Run) and row.curve and not (path.parent / row.curve).is_file():
-                raise ValueError(f"curve {row.curve} is no file")
+                raise ValueError(f"curve {row.curve} is not a file")
         except ValueError as error:
             raise ValueError(f"{path}: row {number}: {error}") from error
         rows[row.key] = row

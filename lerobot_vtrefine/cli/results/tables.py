@@ -5,7 +5,7 @@ Wilson's over pooled episodes or Student's t over seeds; parentheses hold each s
 """
 
 import re
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from statistics import mean, median
 
 from lerobot_vtrefine.cli.report.statistics import mean_interval, wilson_interval
@@ -54,6 +54,11 @@ WORLDS = (
 )
 
 
+def label(name: str) -> str:
+    """A task or policy in words."""
+    return LABELS.get(name, name)
+
+
 def pick(rows: Sequence[Run], **wanted: str) -> list[Run]:
     """The rows with these values, by seed."""
     found = [row for row in rows if all(getattr(row, name) == value for name, value in wanted.items())]
@@ -63,6 +68,16 @@ def pick(rows: Sequence[Run], **wanted: str) -> list[Run]:
 def values(rows: Sequence[Run], name: str) -> list[str]:
     """What a field takes on, in the rows' order."""
     return list(dict.fromkeys(getattr(row, name) for row in rows))
+
+
+def groups(rows: Sequence[Run]) -> Iterator[list[Run]]:
+    """The runs of every task, policy and variant, by seed; groups in the rows' order."""
+    for task in values(rows, "task"):
+        of_task = pick(rows, task=task)
+        for policy in values(of_task, "policy"):
+            of_policy = pick(of_task, policy=policy)
+            for variant in values(of_policy, "variant"):
+                yield pick(of_policy, variant=variant)
 
 
 def markdown(head: Sequence[str], body: Sequence[Sequence[str]]) -> str:
@@ -151,7 +166,7 @@ def touch_table(rows: Sequence[Run]) -> str:
         before = [pooled(pick(kind, variant=IMITATION), False, False) for kind in (touch, sight)]
         after = [pick(kind, variant="") for kind in (touch, sight)]
         cells = [pooled(runs, bounds=False) for runs in after]
-        body.append([LABELS.get(task, task), " / ".join(before), *cells, difference(after[1], after[0])])
+        body.append([label(task), " / ".join(before), *cells, difference(after[1], after[0])])
     head = [
         "setting",
         "imitation, touch / vision only",
@@ -171,7 +186,7 @@ def reality_table(rows: Sequence[Run]) -> str:
         for world, words in WORLDS:
             home = "the plain simulator" if world == "start" else "its own simulator"
             away = pooled(pick(chosen, variant=f"{world} in reality"), seeds=world != "start")
-            first = [LABELS.get(task, task), named] if world == "start" else ["", ""]
+            first = [label(task), named] if world == "start" else ["", ""]
             body.append(
                 [*first, words, away, pooled(pick(chosen, variant=f"{world} in {home}"), seeds=False)]
             )
@@ -188,7 +203,7 @@ def expert_table(rows: Sequence[Run]) -> str:
     ]
     head = [
         "pair, diametral clearance",
-        *(f"{LABELS.get(name, name)}, {LABELS[start]}" for name, start in places),
+        *(f"{label(name)}, {LABELS[start]}" for name, start in places),
     ]
     return markdown(head, body)
 
@@ -204,19 +219,12 @@ def _counted(rows: Sequence[Run]) -> str:
 def runs_table(rows: Sequence[Run]) -> str:
     """Every task, policy and variant: mean over seeds, worst seed, what it took."""
     body = []
-    for task in values(rows, "task"):
-        for policy in values(pick(rows, task=task), "policy"):
-            for variant in values(pick(rows, task=task, policy=policy), "variant"):
-                runs = pick(rows, task=task, policy=policy, variant=variant)
-                cells = [over_seeds(runs), percent(min(row.success for row in runs))]
-                cells += [
-                    average([getattr(row, name) for row in runs]) for name in ("iterations", "env_steps")
-                ]
-                falls = [float(row.extra["largest_fall"]) for row in runs if "largest_fall" in row.extra]
-                cells.append(percent(max(falls)) if falls else "-")
-                body.append(
-                    [LABELS.get(task, task), LABELS.get(policy, policy), variant or "after DPPO", *cells]
-                )
+    for runs in groups(rows):
+        effort = [average([getattr(row, name) for row in runs]) for name in ("iterations", "env_steps")]
+        falls = [float(row.extra["largest_fall"]) for row in runs if "largest_fall" in row.extra]
+        cells = [over_seeds(runs), percent(min(row.success for row in runs)), *effort]
+        named = [label(runs[0].task), label(runs[0].policy), runs[0].variant or "after DPPO"]
+        body.append([*named, *cells, percent(max(falls)) if falls else "-"])
     head = [
         "task",
         "policy",
@@ -232,12 +240,10 @@ def runs_table(rows: Sequence[Run]) -> str:
 def policies_table(rows: Sequence[Run]) -> str:
     """Policies trained on the same demonstrations, beside each other."""
     body = []
-    for task in values(rows, "task"):
-        for policy in values(pick(rows, task=task), "policy"):
-            for variant in values(pick(rows, task=task, policy=policy), "variant"):
-                runs = pick(rows, task=task, policy=policy, variant=variant)
-                shown = [LABELS.get(task, task), LABELS.get(policy, policy), variant, over_seeds(runs, " %")]
-                body.append([*shown, " / ".join(dict.fromkeys(str(row.episodes) for row in runs))])
+    for runs in groups(rows):
+        named = [label(runs[0].task), label(runs[0].policy), runs[0].variant]
+        episodes = " / ".join(dict.fromkeys(str(row.episodes) for row in runs))
+        body.append([*named, over_seeds(runs, " %"), episodes])
     head = ["task", "policy and what it sees", "trained on", "success: mean over seeds [t-interval] (each)"]
     return markdown([*head, "episodes a seed"], body)
 

@@ -23,7 +23,7 @@ def read_aloha_npz(path: Path) -> list[JointEpisode]:
     """Episodes with their columns in the order of the embodiment's joints.
 
     Raises:
-        ValueError: the file is no npz of this format; says in which respect.
+        ValueError: the file is not an npz of this format; says in which respect.
     """
     arrays = read_arrays(path, KINDS | dict.fromkeys(NORMALISED_KEYS, NUMBERS))
     if set(NORMALISED_KEYS) <= set(arrays):

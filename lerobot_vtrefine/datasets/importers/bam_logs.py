@@ -100,7 +100,7 @@ def read_bam(path: Path) -> list[Run]:
     try:
         entries = json.loads(str(arrays["meta"]))
     except json.JSONDecodeError as error:
-        raise ValueError(f"{path}: meta is no JSON: {error}") from error
+        raise ValueError(f"{path}: meta is not JSON: {error}") from error
     if not isinstance(entries, list) or not all(isinstance(item, dict) for item in entries):
         raise ValueError(f"{path}: meta must be a list of objects")
     runs = []
@@ -168,7 +168,7 @@ def _run(where: str, name: str, entry: Mapping[str, Any], columns: Mapping[str, 
         raise ValueError(f"{where}: {error}") from error
     if setting.motor not in DUTY_PER_RAD_AND_KP:
         known = ", ".join(DUTY_PER_RAD_AND_KP)
-        raise ValueError(f"{where}: motor {setting.motor[:60]!r} is none whose gain is known: {known}")
+        raise ValueError(f"{where}: motor {setting.motor[:60]!r} has no known gain; choose from {known}")
     if missing := [column for column in COLUMNS if column not in columns]:
         raise ValueError(f"{where}: has no column {missing[0]!r}; needs {', '.join(COLUMNS)}")
     if not all(np.isfinite(columns[column]).all() for column in COLUMNS):

@@ -25,7 +25,7 @@ from lerobot_vtrefine.datasets.importers.flexitac_counts import HostRule, Unknow
 from lerobot_vtrefine.datasets.importers.new_folder import new_folder
 from lerobot_vtrefine.datasets.importers.source_checks import check_frames, read_stats
 from lerobot_vtrefine.files import decode, limits, read_json
-from lerobot_vtrefine.files.tables import read_table
+from lerobot_vtrefine.files.tables import read_columns
 
 PREFIX = "observation.tactile."
 ONLY_PAD = "primary"
@@ -143,7 +143,7 @@ def import_leflexitac(source: Path, root: Path, pads: Mapping[str, str]) -> Impo
     with new_folder(root) as work:
         with tqdm(total=content.total_frames, unit="frame", desc="import") as progress:
             for path in sorted((source / "data").rglob("*.parquet")):
-                table = _read_columns(path, None)
+                table = _read_frames(path)
                 check_frames(path, table)
                 arrays = _counts(table, columns, summary)
                 _write_data(table, arrays, features, work / path.relative_to(source))
@@ -241,7 +241,7 @@ def _largest_readings(source: Path, shapes: Mapping[str, tuple[int, int]]) -> di
     if not files:
         raise ValueError(f"{source} has no data files below {source / 'data'}")
     for path in files:
-        table = _read_columns(path, list(shapes))
+        table = read_columns(path, list(shapes))
         for key, shape in shapes.items():
             values = _flat(table[key])
             if values.dtype.kind not in "fiu":
@@ -254,15 +254,10 @@ def _largest_readings(source: Path, shapes: Mapping[str, tuple[int, int]]) -> di
     return largest
 
 
-def _read_columns(path: Path, columns: list[str] | None) -> pa.Table:
-    try:
-        table = read_table(path, columns)
-    except ValueError as error:
-        raise ValueError(f"{path} cannot be read: {error}") from error
-    wanted = INDEX_COLUMNS if columns is None else columns
-    if missing := [name for name in wanted if name not in table.column_names]:
-        raise ValueError(f"{path} has no column {missing[0]}")
-    for name in set(INDEX_COLUMNS) & set(table.column_names):
+def _read_frames(path: Path) -> pa.Table:
+    """A data file, with all of its columns."""
+    table = read_columns(path, INDEX_COLUMNS, others=True)
+    for name in INDEX_COLUMNS:
         if not pa.types.is_integer(table[name].type) or table[name].null_count:
             raise ValueError(f"{path}: column {name} must hold whole numbers, not {table[name].type}")
     return table
@@ -348,10 +343,8 @@ def _write_episode_rows(
     old = tuple(f"stats/{column.source}/" for column in columns)
     unlisted = set(episode_stats)
     for path in sorted((source / "meta" / "episodes").rglob("*.parquet")):
-        table = read_table(path)
+        table = read_columns(path, ("episode_index",), others=True)
         check_frames(path, table, "stats/")
-        if "episode_index" not in table.column_names:
-            raise ValueError(f"{path} has no column episode_index")
         table = table.select([name for name in table.column_names if not name.startswith(old)])
         listed = table["episode_index"].to_pylist()
         absent = [index for index in listed if index not in episode_stats]

@@ -19,7 +19,7 @@ def read_stats(root: Path, features: Sequence[str]) -> dict[str, dict[str, Array
     """``meta/stats.json`` of the features that there are; nothing where there is no such file.
 
     Raises:
-        ValueError: names the feature whose statistics are missing, or are no numbers.
+        ValueError: names the feature whose statistics are missing, or are not numbers.
     """
     path = root / "meta" / "stats.json"
     if not path.is_file():
@@ -55,7 +55,7 @@ def check_frames(path: Path, table: pa.Table, only: str = "") -> None:
         if only and not number:
             raise ValueError(f"{path}: column {name[:60]!a} must hold numbers, not {values.type}")
         if number and (values.null_count or not np.isfinite(values.to_numpy(zero_copy_only=False)).all()):
-            raise ValueError(f"{path}: column {name[:60]!a} holds what is no finite number")
+            raise ValueError(f"{path}: column {name[:60]!a} holds a value that is not a finite number")
 
 
 def _numbers(where: str, value: Any) -> Array:

@@ -112,13 +112,13 @@ def resampled(calibration: Calibration) -> list[str]:
     return drawings
 
 
-def presses_over_time(calibration: Calibration, number: int = 3) -> list[str]:
+def presses_over_time(calibration: Calibration) -> list[str]:
     """Mean of the pressed taxels over time, measured and modelled: best, typical and worst recording."""
     errors = [
         float(np.sqrt(np.mean(values**2))) for values in calibration.fitted.residuals(calibration.presses)
     ]
     order = np.argsort(errors)
-    chosen = order[np.unique(np.linspace(0, len(order) - 1, number).round().astype(int))].tolist()
+    chosen = order[np.unique(np.linspace(0, len(order) - 1, 3).round().astype(int))].tolist()
     means = []
     for index in chosen:
         press, model = calibration.presses.presses[index], calibration.fitted.signals[index]

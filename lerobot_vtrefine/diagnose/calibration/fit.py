@@ -11,6 +11,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from scipy import stats
 
+from lerobot_vtrefine.choices import check_choice
 from lerobot_vtrefine.diagnose.calibration.excitation import Excitation, excitation, problems
 from lerobot_vtrefine.diagnose.core.heldout import out_of_fold
 from lerobot_vtrefine.diagnose.core.resampling import one_sided
@@ -57,8 +58,7 @@ class Wanted:
     def __post_init__(self) -> None:
         if self.k_n is not None and not (np.isfinite(self.k_n) and self.k_n > 0):
             raise ValueError(f"--k_n must be a positive number of N/m, got {self.k_n}")
-        if self.contact not in CONTACTS:
-            raise ValueError(f"unknown --contact={self.contact}; choose from {', '.join(CONTACTS)}")
+        check_choice("--contact", self.contact, CONTACTS)
 
 
 @dataclass(frozen=True)

@@ -53,7 +53,7 @@ class CameraAccount:
         self.problem, self.fit, self.seed = found.selection.problem, found.selection.fit, found.seed
 
     def parameters(self, cause: str, channels: tuple[int, ...]) -> Mapping[str, Parameter]:
-        """With intervals by drawing whole episodes."""
+        """What the cause sets, with intervals by drawing whole episodes."""
         registration, place = self.fit.registration, self.problem.place
         draws = draws_of(len(self.problem.episodes), self.seed, _DRAWS)
         counts = np.stack([np.bincount(row, minlength=len(self.problem.episodes)) for row in draws])
@@ -69,16 +69,16 @@ class CameraAccount:
         }
 
     def baseline_parameters(self) -> Mapping[str, Parameter]:
-        """The stated camera has none."""
+        """Empty: the stated camera has none."""
         return {}
 
     def model(self, fit: Fit) -> CameraModel:
-        """Shift, turn and scale."""
+        """The fitted shift, turn and scale."""
         x, y, z, rx, ry, rz, scale = (float(value) for value in fit.registration.theta)
         return CameraModel((x, y, z), (rx, ry, rz), float(np.exp(scale)))
 
     def minimum_detectable(self) -> Mapping[str, float]:
-        """By the scatter between episodes: the largest shift [m], and the scale's deviation from 1."""
+        """Smallest shift [m] and deviation of the scale from 1 that stand out from the episodes' scatter."""
         total, slope = self.fit.registration.normal.sum(0), self.fit.registration.slope
         score = np.stack([np.bincount(self.problem.place, column) for column in slope.T], 1)
         out = {}
@@ -91,25 +91,25 @@ class CameraAccount:
         return out
 
     def noise_floor(self) -> float | None:
-        """Nothing is imaged twice."""
+        """None: no view is recorded twice."""
         return None
 
     def causes(self) -> Sequence[str]:
-        """Pose and scale."""
+        """Names of the catalogue: pose and scale."""
         return tuple(item.cause for item in CANDIDATES)
 
     def caveat(self, cause: str, channels: tuple[int, ...]) -> str:
-        """Nothing is left open."""
+        """Empty: neither cause leaves anything open."""
         return ""
 
     def not_identifiable(self, cause: str) -> str:
-        """Images always show both."""
+        """Empty: images always show both causes."""
         return ""
 
     def next_experiment(self, rivals: Sequence[Any], alarms: Sequence[Any]) -> Mapping[str, Any] | None:
-        """What separates pose and scale."""
+        """What to record where pose and scale tie."""
         return _NEXT if rivals else None
 
     def drawings(self, test: CameraProblem, seed: int) -> tuple[tuple[Trace, ...], tuple[ResidualView, ...]]:
-        """Images are not drawn."""
+        """Nothing: images are not drawn."""
         return (), ()

@@ -12,7 +12,7 @@ from PIL import Image
 
 from lerobot_vtrefine.datasets.features import CAMERA_POSE_KEY, DEPTH_KEY, INTRINSICS_KEY, STATE_KEY
 from lerobot_vtrefine.files import inside
-from lerobot_vtrefine.files.tables import read_table
+from lerobot_vtrefine.files.tables import read_columns
 
 Array = np.ndarray
 
@@ -65,12 +65,7 @@ def read_frames(root: Path, per_episode: int = FRAMES_PER_EPISODE) -> DepthFrame
     columns = ["episode_index", "frame_index", STATE_KEY, INTRINSICS_KEY, CAMERA_POSE_KEY, DEPTH_KEY]
     parts = []
     for path in sorted((root / "data").rglob("*.parquet")):
-        try:
-            table = read_table(path, columns)
-        except ValueError as error:
-            raise ValueError(f"{path} cannot be read: {error}") from error
-        if missing := [name for name in columns if name not in table.column_names]:
-            raise ValueError(f"{path} has no column {missing[0]}")
+        table = read_columns(path, columns)
         parts.append(table.take(pa.array(_chosen(table, per_episode))))
     table = pa.concat_tables(parts)
     intrinsics = _matrix(table[INTRINSICS_KEY])

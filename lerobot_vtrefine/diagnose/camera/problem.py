@@ -58,11 +58,11 @@ class Refits:
 
     @property
     def channels(self) -> Array:
-        """The one, if anything is free."""
+        """Indices of channels with free parameters: channel 0, if there are any."""
         return np.arange(int(self.registration.free.any()))
 
     def errors(self, weights: Array, trials: Array) -> Array:
-        """(trials, 1)"""
+        """Mean squared errors (trials, 1) [m^2] if every trial counted `weights` (T,) times."""
         theta = self.registration.reweighted(weights[self.problem.place])
         return self.problem.mse(theta)[trials][:, self.channels]
 
@@ -82,7 +82,7 @@ class CameraProblem(NothingBesides):
 
     @cached_property
     def twin(self) -> Twin:
-        """Renders these frames."""
+        """The twin rendered for these frames."""
         return Twin(self.frames)
 
     def mse(self, theta: Array) -> Array:
@@ -91,7 +91,7 @@ class CameraProblem(NothingBesides):
         return (sums / np.bincount(self.place))[:, None]
 
     def subset(self, trials: Array) -> "CameraProblem":
-        """Only some episodes."""
+        """The problem of these episodes alone."""
         return CameraProblem(self.frames.of(self.episodes[trials]))
 
     def baseline(self) -> Fit:
@@ -107,32 +107,32 @@ class CameraProblem(NothingBesides):
         return np.array([not (now.registration.free & candidate.free).any()])
 
     def extended(self, now: Fit, candidate: Candidate, channels: Array, plainer: Fit | None = None) -> Fit:
-        """With the candidate's parameters, too."""
+        """The fit with the candidate's parameters free, too."""
         return self._fit(now.registration.free | candidate.free)
 
     def reduced(self, now: Fit, candidates: Sequence[Candidate], channels: Array) -> Fit:
-        """Without the candidates' parameters."""
+        """The fit without the candidates' parameters."""
         gone = np.any([candidate.free for candidate in candidates], axis=0)
         return self._fit(now.registration.free & ~gone)
 
     def refitted(self, now: Fit) -> Fit:
-        """It is at its optimum already."""
+        """The same fit: every registration ends at its optimum."""
         return now
 
     def merged(self, one: Fit, other: Fit, take_other: Array) -> Fit:
-        """There is one channel."""
+        """One of the fits as a whole, for there is one channel."""
         return other if take_other[0] else one
 
     def errors(self, fit: Fit) -> Array:
-        """(T, 1)"""
+        """Mean squared errors (T, 1) [m^2]."""
         return self.mse(fit.registration.theta)
 
     def reweighted(self, fit: Fit, channels: Array | None = None) -> Refits:
-        """By one Newton step."""
+        """Fits under other weights of the trials, by one Newton step."""
         return Refits(self, fit.registration)
 
     def credible(self, baseline: Fit, now: Fit, best: Fit, candidate: Candidate) -> Array:
-        """(1,) Any size is."""
+        """(1,) True: a camera may be off by any size."""
         return np.ones(1, dtype=bool)
 
     def _fit(self, free: Array) -> Fit:

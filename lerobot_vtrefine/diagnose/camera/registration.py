@@ -37,9 +37,9 @@ _ITERATIONS = 8
 class Twin:
     """Renders the twin's arms and table for recorded frames."""
 
-    def __init__(self, frames: DepthFrames, config: SceneConfig | None = None) -> None:
+    def __init__(self, frames: DepthFrames) -> None:
         self.frames = frames
-        self.model, _, address = build_arms(config or SceneConfig())
+        self.model, _, address = build_arms(SceneConfig())
         count, height, width = frames.depth_m.shape
         fx, fy, cx, cy = (float(value) for value in frames.intrinsics)
         eye = Camera(width, height, fx, fy, cx, cy, frames.position_m[0], frames.rotation[0])
@@ -89,10 +89,10 @@ class Registration:
         return self.theta + _step(self.normal, self.slope, weights, self.free)
 
 
-def register(twin: Twin, free: Array, weights: Array | None = None) -> Registration:
-    """Fit the free parameters (7,) bool to the frames, each counted by its weight (F,)."""
+def register(twin: Twin, free: Array) -> Registration:
+    """Fit the free parameters (7,) bool to the frames."""
     theta = np.zeros(PARAMETERS)
-    weights = np.ones(len(twin.frames.depth_m)) if weights is None else weights
+    weights = np.ones(len(twin.frames.depth_m))
     for iteration in range(_ITERATIONS):
         cut = max(_CUT_M, _FIRST_CUT_M * 0.6**iteration)
         normal, slope = _equations(twin, theta, cut)

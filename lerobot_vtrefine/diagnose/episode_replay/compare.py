@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from tqdm import tqdm
 
+from lerobot_vtrefine.choices import check_choice
 from lerobot_vtrefine.datasets.episodes import EpisodeFolder, RecordedEpisode
 from lerobot_vtrefine.datasets.features import JOINT_SUFFIX, Array
 from lerobot_vtrefine.diagnose.episode_replay.reach import (
@@ -152,8 +153,7 @@ def write_summary(comparison: Comparison, path: Path) -> None:
 
 
 def _choose_parts(parts: str, ledger: dict[str, Any] | None, folder: EpisodeFolder) -> str:
-    if parts not in PARTS:
-        raise ValueError(f"unknown --parts={parts}; choose from {', '.join(PARTS)}")
+    check_choice("--parts", parts, PARTS)
     if parts == "recorded" and ledger is None:
         raise ValueError(f"--parts=recorded needs seeds, but {folder.root} was not simulated by this project")
     if parts != "auto":

@@ -44,7 +44,6 @@ def joint_tracking(
     recorded: Sequence[Array],
     twin: Sequence[Array],
     dt_s: float,
-    seed: int = 0,
 ) -> list[JointTracking]:
     """Compare E episodes of (T, J) each.
 
@@ -56,7 +55,7 @@ def joint_tracking(
     error = [theirs - ours for theirs, ours in zip(twin, recorded, strict=True)]
     lack = [ours - command for ours, command in zip(recorded, commands, strict=True)]
     everything, reference = np.concatenate(error), np.concatenate(lack)
-    intervals = rmse_intervals(error, seed)
+    intervals = rmse_intervals(error)
     return [
         JointTracking(
             joint=name,
@@ -73,13 +72,13 @@ def joint_tracking(
     ]
 
 
-def rmse_intervals(error: Sequence[Array], seed: int = 0) -> Array | None:
+def rmse_intervals(error: Sequence[Array]) -> Array | None:
     """95 % intervals (2, J) of the RMSE by resampling whole episodes; None for a single one."""
     if len(error) < 2:
         return None
     sums = np.stack([(item**2).sum(0) for item in error])
     counts = np.array([len(item) for item in error])
-    picks = np.random.default_rng(seed).integers(0, len(error), (RESAMPLES, len(error)))
+    picks = np.random.default_rng(0).integers(0, len(error), (RESAMPLES, len(error)))
     drawn = np.sqrt(sums[picks].sum(1) / counts[picks].sum(1)[:, None])
     return np.quantile(drawn, [0.025, 0.975], axis=0)
 

@@ -52,7 +52,7 @@ def read_ledger(folder: EpisodeFolder) -> dict[str, Any] | None:
     try:
         decode(_Ledger, ledger, "it", others=True)
     except ValueError as error:
-        raise ValueError(f"{path} is no note of vtrefine-record-demos: {error}") from error
+        raise ValueError(f"{path} is not a note of vtrefine-record-demos: {error}") from error
     return ledger
 
 

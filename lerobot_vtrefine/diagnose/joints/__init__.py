@@ -1,1 +1,1 @@
-"""What the simulation gets wrong about a robot's joints: servo model, causes, evidence (contract §1, §4)."""
+"""What the simulation gets wrong about a robot's joints: servo model, causes, evidence."""

@@ -174,7 +174,7 @@ class Fit:
 
     @property
     def total(self) -> Array:
-        """(J,) mean over trials of the mean squared error: the contract's metric, per joint."""
+        """(J,) mean over trials of the mean squared error: the verdict's metric, per joint."""
         return self.mse.mean(0)
 
 

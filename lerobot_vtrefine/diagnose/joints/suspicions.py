@@ -215,7 +215,7 @@ def _following(selection: "Selected") -> list[Suspicion]:
 
 
 def _ringing(selection: "Selected") -> list[Suspicion]:
-    """A line in the mean spectrum of what is left that is no broad bump."""
+    """A line in the mean spectrum of what is left that is not a broad bump."""
     batch, left = selection.problem.batch, selection.fit.residual
     frame = frame_s(batch)
     length = int(np.median(batch.frames))

@@ -111,7 +111,7 @@ def in_si_units(recordings: RecordingSet) -> tuple[RecordingSet, list[DataIssue]
 
 
 def too_little(checked: RecordingSet, recorded: RecordingSet) -> DataIssue | None:
-    """Why what quality control left of a set is no basis for a verdict, or None if it is one."""
+    """Why what quality control left of a set does not suffice for a verdict; None if it does."""
     left, total = len(checked.trials), len(recorded.trials)
     if left < MIN_TRIALS:
         return DataIssue(

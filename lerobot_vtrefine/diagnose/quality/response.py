@@ -12,7 +12,7 @@ from lerobot_vtrefine.diagnose.recordings import RecordingSet
 DRIVEN, LOADED = 0.1, 0.2
 """Parts of a trial's peak, in drive and in readings, that are too much for its first frame."""
 TINY_M = 5e-5
-"""Touching this lightly is no loaded start: rigs find the face with that error."""
+"""Touching this lightly is not a loaded start: rigs find the face with that error."""
 NO_ANSWER = 0.03
 DEAD, ALIVE = 0.05, 0.5
 """Slopes of reading over drive, relative to the usual one, of channels that do not and that do answer."""

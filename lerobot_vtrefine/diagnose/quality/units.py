@@ -14,9 +14,9 @@ from lerobot_vtrefine.diagnose.quality.edits import MINORITY, SET_ASIDE, Finding
 from lerobot_vtrefine.diagnose.recordings import RecordingSet
 
 SPIKES = 0.02
-"""Values that only this part of the frames, or less, exceeds are no other unit."""
+"""Values that only this part of the frames, or less, exceeds do not tell of another unit."""
 STILL_M = 2e-5
-"""A depth that varies less than this in a whole trial is no press: it was no other unit, but another zero."""
+"""A depth that varies less than this in a whole trial is not a press: its zero was wrong, not its unit."""
 SLOWEST_STEP_S, SHORT_STEP_S = 3.0, 1.0
 """Frames further apart are taken for another unit of time; in the right one they are not as far apart."""
 CROWDED, CROWDED_STEP_S = 1.5, 0.3

@@ -38,12 +38,12 @@ class ServoAccount:
         self.without = _leave_one_out(self.problem, self.fit)
 
     def parameters(self, cause: str, channels: tuple[int, ...]) -> Mapping[str, Parameter]:
-        """All that its form frees, with intervals by leaving trials out."""
+        """All that the cause's form frees, with intervals by leaving trials out."""
         names = [name for form in self.selection.candidates_of(cause, channels) for name in form.parameters]
         return {name: self._parameter(name) for name in names}
 
     def baseline_parameters(self) -> Mapping[str, Parameter]:
-        """Of motor and friction, in their units."""
+        """Those of motor and friction, in their units."""
         fitted = self.selection.baseline
         out = {}
         for name in BASELINE:
@@ -53,7 +53,7 @@ class ServoAccount:
         return out
 
     def model(self, fit: Fit) -> ServoModel:
-        """The file that is written."""
+        """The model that is written to a file."""
         return ServoModel.of(fit.theta)
 
     def minimum_detectable(self) -> Mapping[str, float]:
@@ -83,11 +83,11 @@ class ServoAccount:
         return encoder_step(self.problem.bench) / np.sqrt(12)
 
     def causes(self) -> Sequence[str]:
-        """The catalogue."""
+        """Names of the catalogue."""
         return NAMES
 
     def caveat(self, cause: str, channels: tuple[int, ...]) -> str:
-        """Nothing is left open."""
+        """Empty: no cause leaves anything open."""
         return ""
 
     def not_identifiable(self, cause: str) -> str:
@@ -99,7 +99,7 @@ class ServoAccount:
     def next_experiment(
         self, rivals: Sequence[Rival[Fit, Candidate]], alarms: Sequence[Alarm]
     ) -> Mapping[str, Any] | None:
-        """What separates laws of friction that tie."""
+        """What to record where laws of friction tie."""
         if not rivals:
             return None
         return {

@@ -49,7 +49,7 @@ class ServoProblem(NothingBesides):
         return None if self.fine is None else type(self)(self.fine)
 
     def subset(self, trials: Array) -> Self:
-        """Only some trials."""
+        """The problem of these trials alone."""
         fine = None if self.fine is None else self.fine.subset(trials)
         return type(self)(self.bench.subset(trials), fine)
 
@@ -86,7 +86,7 @@ class ServoProblem(NothingBesides):
         return self.fitter.fit(now.theta[None], now.free)
 
     def merged(self, one: Fit, other: Fit, take_other: Array) -> Fit:
-        """There is one channel."""
+        """One of the fits as a whole, for there is one channel."""
         return other if take_other[0] else one
 
     def errors(self, fit: Fit) -> Array:
@@ -94,7 +94,7 @@ class ServoProblem(NothingBesides):
         return self.fitter.evaluate(fit.theta, fit.free).mse
 
     def reweighted(self, fit: Fit, channels: Array | None = None) -> Refits:
-        """By one Newton step."""
+        """Fits under other weights of the trials, by one Newton step."""
         return Refits(self.bench, fit)
 
     def suspicions(self, selection: Selection[Any, Fit, Candidate], seed: int) -> list[Suspicion]:
@@ -110,7 +110,7 @@ class ServoProblem(NothingBesides):
     def settles(
         self, rival: Rival[Fit, Candidate], selection: Selection[Any, Fit, Candidate], seed: int
     ) -> int:
-        """A law that contains another is no rival of it, unless it predicts better by its handicap."""
+        """A law that contains another is not its rival, unless it predicts better by its handicap."""
         better = rival.errors.mean() < (1 - rival.candidate.handicap) * selection.errors.mean()
         return -1 if rival.cause in rival.candidate.contains and not better else 0
 

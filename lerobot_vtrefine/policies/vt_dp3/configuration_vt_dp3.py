@@ -9,6 +9,7 @@ from lerobot.configs import FeatureType, NormalizationMode, PreTrainedConfig
 from lerobot.optim import AdamWConfig
 from lerobot.optim.schedulers import CosineAnnealingWithWarmupSchedulerConfig
 
+from lerobot_vtrefine.choices import check_choice
 from lerobot_vtrefine.datasets.features import (
     ACTION_KEY,
     STATE_KEY,
@@ -137,8 +138,7 @@ class VtDp3Config(PreTrainedConfig):
     def __post_init__(self) -> None:
         super().__post_init__()
         checkpoint_guard.restrict()
-        if self.preset not in PRESETS:
-            raise ValueError(f"unknown policy.preset {self.preset!r}; choose one of {', '.join(PRESETS)}")
+        check_choice("policy.preset", self.preset, PRESETS)
         values = dict(PRESETS[self.preset])
         points = values.pop("observation")
         unset = {name: value for name, value in points.items() if not getattr(self.observation, name)}
@@ -151,19 +151,11 @@ class VtDp3Config(PreTrainedConfig):
 
     def _validate(self) -> None:
         self.observation.validate()
-        if self.modalities not in MODALITIES:
-            raise ValueError(
-                f"unknown policy.modalities {self.modalities!r}; choose one of {', '.join(MODALITIES)}"
-            )
-        if self.fusion not in FUSIONS:
-            raise ValueError(f"unknown policy.fusion {self.fusion!r}; choose one of {', '.join(FUSIONS)}")
+        for name, choices in (("modalities", MODALITIES), ("fusion", FUSIONS), ("denoiser", DENOISERS)):
+            check_choice(f"policy.{name}", getattr(self, name), choices)
         if self.freeze_encoder and not self.pretrained_encoder:
             raise ValueError(
                 "policy.freeze_encoder=true needs policy.pretrained_encoder: an untrained one sees nothing"
-            )
-        if self.denoiser not in DENOISERS:
-            raise ValueError(
-                f"unknown policy.denoiser {self.denoiser!r}; choose one of {', '.join(DENOISERS)}"
             )
         if not 1 <= self.n_action_steps <= self.horizon:
             raise ValueError(f"policy.n_action_steps={self.n_action_steps} must be within 1..{self.horizon}")

@@ -17,6 +17,8 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
+from lerobot_vtrefine.choices import check_choice
+
 SAMPLERS = ("ddpm", "ddim", "tail")
 """``ddpm``: every training step; ``ddim``: evenly spaced; ``tail``: coarse prefix, then the last steps."""
 
@@ -53,8 +55,7 @@ def step_grid(sampler: str, num_train_steps: int, num_steps: int, prefix_steps: 
     if sampler == "ddim":
         stride = num_train_steps // num_steps
         return tuple(stride * i for i in range(num_steps - 1, -1, -1))
-    if sampler != "tail":
-        raise ValueError(f"unknown sampler {sampler!r}; choose one of {', '.join(SAMPLERS)}")
+    check_choice("sampler", sampler, SAMPLERS)
     if not 0 <= prefix_steps <= num_train_steps - num_steps:
         raise ValueError(f"prefix steps must be within 0..{num_train_steps - num_steps}, got {prefix_steps}")
     coarse = torch.linspace(num_train_steps - 1, num_steps - 1, prefix_steps + 1, dtype=torch.float64)

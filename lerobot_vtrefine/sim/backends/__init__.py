@@ -6,6 +6,7 @@ from contextlib import suppress
 
 import mujoco
 
+from lerobot_vtrefine.choices import check_choice
 from lerobot_vtrefine.sim.backends.base import Backend, Trace
 from lerobot_vtrefine.sim.backends.batch import BatchBackend
 from lerobot_vtrefine.sim.backends.single import SingleBackend
@@ -15,7 +16,7 @@ __all__ = ["Backend", "Trace", "get_backend"]
 
 INSTALL = "pip install 'lerobot_policy_vtrefine[gpu]'"
 RELEASE = "4.0."
-"""Of mujoco_warp: its parts, which are no public interface, are put together anew in `warp_step`."""
+"""Of mujoco_warp: `warp_step` builds a step of its own from functions of it that are not public."""
 
 
 def get_backend(
@@ -26,16 +27,15 @@ def get_backend(
     Raises:
         ValueError: unknown backend, one that is not installed, or no GPU where one is asked for.
     """
+    check_choice("backend", name, BACKENDS)
     if name == "single":
         return SingleBackend(model, num_envs)
     if name == "batch":
         return BatchBackend(model, num_envs, num_threads)
-    if name == "warp":
-        _check_mujoco_warp()
-        from lerobot_vtrefine.sim.backends.warp import WarpBackend  # seconds to import
+    _check_mujoco_warp()
+    from lerobot_vtrefine.sim.backends.warp import WarpBackend  # seconds to import
 
-        return WarpBackend(model, num_envs, warp or WarpConfig())
-    raise ValueError(f"unknown backend {name!r}: use one of {', '.join(BACKENDS)}")
+    return WarpBackend(model, num_envs, warp or WarpConfig())
 
 
 def _check_mujoco_warp() -> None:

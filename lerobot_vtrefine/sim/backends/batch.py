@@ -68,7 +68,7 @@ class BatchBackend(Backend):
     def set_rows(self, ids: Array, rows: Array) -> None:
         """See `Backend.set_rows`."""
         self._batch.state[ids] = rows
-        self._batch.warning[ids] = 0  # else a world that once diverged would count as diverged for ever
+        self._batch.warning[ids] = 0  # otherwise a world that diverged once would always count as diverged
 
     def instance(self, env: int) -> tuple[mujoco.MjModel, mujoco.MjData]:
         """See `Backend.instance`."""

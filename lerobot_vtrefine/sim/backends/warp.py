@@ -25,7 +25,7 @@ if TYPE_CHECKING:
 logger = logging.getLogger(__name__)
 
 HOST_FIELDS = ("bvh_aabb",)
-"""Fields of MuJoCo's that mujoco_warp has no use for."""
+"""Fields of MuJoCo's that mujoco_warp does not use."""
 
 
 class WarpBackend(Backend):

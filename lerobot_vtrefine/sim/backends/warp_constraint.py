@@ -14,7 +14,7 @@ from lerobot_vtrefine.sim.backends import warp_jacobian_kernels as kernels
 
 
 def rows_without_contacts(model: mjw.Model, data: mjw.Data) -> None:
-    """Rows of equalities, dry friction and limits, and none else."""
+    """Rows of equalities, dry friction and limits only."""
     without = copy.copy(model)
     without.opt = copy.copy(model.opt)
     without.opt.disableflags = model.opt.disableflags | mjw.DisableBit.CONTACT

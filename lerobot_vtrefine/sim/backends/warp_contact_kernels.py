@@ -13,7 +13,6 @@ MESH = wp.constant(7)
 CONSTRAINT = wp.constant(1)
 """Flag of contacts that the solver sees."""
 TINY = wp.constant(1.0e-15)
-SENSOR_SIZE = wp.constant(10)
 """Readings of a contact sensor: found, force, torque, position."""
 
 

@@ -213,7 +213,7 @@ def _sides(model: mujoco.MjModel) -> tuple[np.ndarray, np.ndarray]:
     for sensor in range(model.nsensor):
         spec = tuple(model.sensor_intprm[sensor][:3])
         if model.sensor_type[sensor] != mujoco.mjtSensor.mjSENS_CONTACT or spec != (DATA, NET_FORCE, 1):
-            raise ValueError(f"sensor {model.sensor(sensor).name!r} is no net force of contacts")
+            raise ValueError(f"sensor {model.sensor(sensor).name!r} is not a net force of contacts")
         own[sensor] = _geoms(model, model.sensor_objtype[sensor], model.sensor_objid[sensor])
         other[sensor] = _geoms(model, model.sensor_reftype[sensor], model.sensor_refid[sensor])
     return own, other

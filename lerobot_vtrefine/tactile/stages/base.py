@@ -1,10 +1,8 @@
 """What a stage of the sensor model is, and the registry of their names.
 
 A stage maps a batch of pad images (..., R, C) to another. It is a frozen dataclass of parameters in SI units
-with one
-pure function `step`; memory between frames is passed in and out explicitly. Parameters may be tensors that
-broadcast
-against (..., R, C), which is how each environment gets its own value.
+with one pure function `step`; memory between frames is passed in and out explicitly. Parameters may be
+tensors that broadcast against (..., R, C), which is how each environment gets its own value.
 """
 
 import math

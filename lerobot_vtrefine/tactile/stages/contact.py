@@ -126,10 +126,9 @@ class Consistent(ContactStage):
     """Elastic foundation whose taxels add up to the physics solver's force on the pad, and balance at its
     centre.
 
-    Column heights along the pad's normal, a Winkler foundation with offset and two tilts solved for the
-    load, pressure
-    averaged over 2 x 2 points per taxel. Without a load (replay of prescribed depths) it is the plain
-    Winkler foundation.
+    Column heights along the pad's normal, a Winkler foundation with offset and two tilts solved for the load,
+    pressure averaged over 2 x 2 points per taxel. Without a load (replay of prescribed depths) it is the
+    plain Winkler foundation.
     """
 
     name: ClassVar[str] = "consistent"

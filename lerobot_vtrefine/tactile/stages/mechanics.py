@@ -31,10 +31,8 @@ class NonlinearStiffness(Stage):
     """Hardening (exponent > 1) or softening: f_ref (f / f_ref)^exponent with f_ref = stiffness * 1 mm.
 
     For a linear contact law this is k d_ref (d / d_ref)^exponent. Where the taxels' sum is the load itself,
-    the sum is
-    kept and only its distribution changes. With `share` below 1 only that part of the force follows the power
-    law, as in
-    k (d + c d^3).
+    the sum is kept and only its distribution changes. With `share` below 1 only that part of the force
+    follows the power law, as in k (d + c d^3).
     """
 
     name: ClassVar[str] = "nonlinear_stiffness"

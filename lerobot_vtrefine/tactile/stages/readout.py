@@ -76,8 +76,7 @@ class TaxelGainSpread(Stage):
 @dataclass(frozen=True)
 class DeadTaxels(Stage):
     """Taxels that no longer answer: those in `taxels` ((r, c) pairs), whole `rows` and `cols`, and each
-    further one
-    with `probability`, drawn per episode."""
+    further one with `probability`, drawn per episode."""
 
     name: ClassVar[str] = "dead_taxels"
     domain: ClassVar[str] = "counts"
@@ -120,8 +119,7 @@ class Saturation(Stage):
     """The reading levels off at `knee_counts`: knee * tanh(s / knee), slope 1 at zero.
 
     With a `sharpness` n it is s / (1 + (s / knee)^n)^(1/n) instead: n = 1 bends from the start, as a divider
-    does, a large n
-    cuts off.
+    does, a large n cuts off.
     """
 
     name: ClassVar[str] = "saturation"
@@ -224,8 +222,7 @@ class Crosstalk(Stage):
 @dataclass(frozen=True)
 class Idle(Stage):
     """Reading of an untouched taxel, added: `level_counts` (a number or (R, C)), spread uniformly by
-    +-`spread_counts`
-    between taxels, drawn per episode."""
+    +-`spread_counts` between taxels, drawn per episode."""
 
     name: ClassVar[str] = "idle"
     domain: ClassVar[str] = "counts"

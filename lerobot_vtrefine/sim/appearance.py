@@ -11,7 +11,7 @@ PLUG_COLOUR: Rgba = (0.93, 0.47, 0.13, 1.0)
 SOCKET_COLOUR: Rgba = (0.16, 0.38, 0.72, 1.0)
 
 
-def add_looks(spec: mujoco.MjSpec) -> None:
+def add_appearance(spec: mujoco.MjSpec) -> None:
     """Sky, materials, lights and off-screen size for rendering."""
     spec.visual.global_.offwidth, spec.visual.global_.offheight = 1280, 960
     spec.visual.headlight.ambient = [0.35, 0.35, 0.35]

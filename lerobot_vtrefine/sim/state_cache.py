@@ -1,4 +1,4 @@
-"""What was found out about the worlds' present state, or is being found out: forgotten when it changes."""
+"""What was computed from the worlds' state, or is being computed: forgotten when the state changes."""
 
 from collections.abc import Callable
 
@@ -13,8 +13,8 @@ from lerobot_vtrefine.sim.sensing import Kinematics
 Array = np.ndarray
 
 
-class Present:
-    """The present state of a backend's worlds, m of them addressed by sorted ids."""
+class StateCache:
+    """Kinematics and depth images of a backend's worlds, m of them addressed by sorted ids."""
 
     def __init__(self, scene: Scene, backend: Backend, camera: DepthCamera) -> None:
         self._scene, self._backend, self._camera = scene, backend, camera

@@ -1,0 +1,13 @@
+"""One check, and one line, for values that must come from a list."""
+
+from collections.abc import Iterable
+
+
+def check_choice(name: str, value: object, choices: Iterable[str], others: str = "") -> None:
+    """Raise ValueError with the choices unless ``value`` is one of them.
+
+    ``name`` is what a user calls the setting, such as ``--view``; ``others`` says what else may be given.
+    """
+    known = list(choices)
+    if value not in known:
+        raise ValueError(f"{name}={str(value)[:60]} is unknown; choose from {', '.join(known)}{others}")
