@@ -22,14 +22,13 @@ from tqdm import tqdm
 from lerobot_vtrefine.cli.errors import run_cli
 from lerobot_vtrefine.cli.sharing import check_repo_id, push_dataset
 from lerobot_vtrefine.datasets.features import dataset_features
+from lerobot_vtrefine.embodiments import DEFAULT_BODY
 from lerobot_vtrefine.envs import VtRefineEnvConfig
 from lerobot_vtrefine.envs.demo_dataset import DemoDataset
 from lerobot_vtrefine.envs.demo_workers import demonstration_stream
 from lerobot_vtrefine.envs.recording_note import simulation_settings
 from lerobot_vtrefine.sim.demonstrations import Degradation
 
-ALOHA = "aloha"
-"""The robot whose pads the encoder that comes with the package knows."""
 HOPELESS_ATTEMPTS = 100
 """Attempts without a single success after which recording gives up."""
 
@@ -136,7 +135,7 @@ def next_steps(config: RecordDemosConfig) -> str:
     assert isinstance(env, VtRefineEnvConfig)
     root = shlex.quote(str(config.root))
     train = f"lerobot-train --dataset.repo_id={config.repo_id} --dataset.root={root}"
-    if env.scene.embodiment == ALOHA:
+    if env.scene.embodiment == DEFAULT_BODY:
         train += " --config_path=vtrefine:vt_dp3_pads"
     else:  # whose pads the shipped encoder has never felt
         train += (

@@ -9,6 +9,8 @@ import numpy as np
 
 from lerobot_vtrefine.cli.arguments import CommandParser
 from lerobot_vtrefine.cli.errors import run_cli
+from lerobot_vtrefine.embodiments import pad_layout_of
+from lerobot_vtrefine.tactile.layout import PadLayout
 
 DESCRIPTION = """\
 Show a tactile dataset on one timeline in the rerun viewer: pads, the point cloud that the policy gets, depth,
@@ -82,7 +84,7 @@ def log_episode(rr: Any, root: Path, index: int) -> int:
     for k, time_s in enumerate(episode.time_s):
         rr.set_time("time", duration=float(time_s))
         for pad, counts in episode.counts.items():
-            picture = pad_picture(counts[k], episode.baselines[pad])
+            picture = pad_picture(counts[k], episode.baselines[pad], pad_layout_of(pad))
             rr.log(f"{prefix}/pads/{pad}", rr.Image(picture))
             rr.log(f"{prefix}/pad_sums/{pad}", rr.Scalars(above(counts[k], episode.baselines[pad]).sum()))
         for name, position, command in zip(joints, episode.state[k], episode.action[k], strict=True):
@@ -122,12 +124,11 @@ def above(counts: np.ndarray, idle: np.ndarray) -> np.ndarray:
     return np.clip(counts.astype(float) - idle, 0.0, None)
 
 
-def pad_picture(counts: np.ndarray, idle: np.ndarray) -> np.ndarray:
-    """A pad as it is drawn live, RGB (R, C, 3); one that is not ALOHA's 12 x 32 as a single row."""
-    from lerobot_vtrefine.datasets.features import PAD_COLS, PAD_ROWS
+def pad_picture(counts: np.ndarray, idle: np.ndarray, layout: PadLayout) -> np.ndarray:
+    """A pad as it is drawn live, RGB (R, C, 3); one that has not the layout's taxels as a single row."""
     from lerobot_vtrefine.drivers.picture import colours
 
-    shape = (PAD_ROWS, PAD_COLS) if counts.size == PAD_ROWS * PAD_COLS else (1, counts.size)
+    shape = (layout.rows, layout.cols) if counts.size == layout.num_taxels else (1, counts.size)
     return colours(counts.reshape(shape), idle.reshape(shape))
 
 

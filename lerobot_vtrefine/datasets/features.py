@@ -31,7 +31,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from lerobot_vtrefine.embodiments import ALOHA, Embodiment
+from lerobot_vtrefine.embodiments import DEFAULT_BODY, Embodiment, get_embodiment
 from lerobot_vtrefine.tactile.layout import PadLayout
 
 Array = np.ndarray[Any, np.dtype[Any]]
@@ -77,11 +77,12 @@ def raw_keys(body: Embodiment) -> tuple[str, ...]:
     return (*tactile_keys(body), *baseline_keys(body), AGE_KEY, *VISUAL_KEYS, NOISE_LEVEL_KEY)
 
 
-# What the paper's robot and FlexiTac's standard pad have, for code that is about these.
-PADS = ALOHA.pad_names
-PAD_ROWS, PAD_COLS = ALOHA.pad_layout.rows, ALOHA.pad_layout.cols
-NUM_JOINTS = ALOHA.num_joints
-TACTILE_KEYS, BASELINE_KEYS, RAW_KEYS = tactile_keys(ALOHA), baseline_keys(ALOHA), raw_keys(ALOHA)
+# What the default body has, for benchmarks and for commands that ask for no body.
+_BODY = get_embodiment(DEFAULT_BODY)
+PADS = _BODY.pad_names
+PAD_ROWS, PAD_COLS = _BODY.pad_layout.rows, _BODY.pad_layout.cols
+NUM_JOINTS = _BODY.num_joints
+TACTILE_KEYS, BASELINE_KEYS, RAW_KEYS = tactile_keys(_BODY), baseline_keys(_BODY), raw_keys(_BODY)
 
 
 class Column(NamedTuple):
@@ -124,7 +125,7 @@ def taxel_info(layout: PadLayout) -> dict[str, Any]:
     return {"array_shape": [layout.rows, layout.cols], "unit": TAXEL_UNIT}
 
 
-TAXEL_INFO = taxel_info(ALOHA.pad_layout)
+TAXEL_INFO = taxel_info(_BODY.pad_layout)
 
 
 def dataset_features(

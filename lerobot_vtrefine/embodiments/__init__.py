@@ -11,6 +11,7 @@ from lerobot_vtrefine.tactile.layout import PadLayout
 
 __all__ = [
     "ALOHA",
+    "DEFAULT_BODY",
     "KINOVA",
     "Arm",
     "CameraConfig",
@@ -26,6 +27,9 @@ __all__ = [
     "pad_layout_of",
     "register_embodiment",
 ]
+
+DEFAULT_BODY = ALOHA.name
+"""The robot where no other is named."""
 
 _EMBODIMENTS = {body.name: body for body in (ALOHA, KINOVA)}
 

@@ -9,7 +9,7 @@ hand frame: x towards the fingertips, y from the right finger to the left one.
 
 from abc import ABC, abstractmethod
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Any, NamedTuple, override
+from typing import TYPE_CHECKING, Any, ClassVar, NamedTuple, override
 
 import numpy as np
 
@@ -76,6 +76,8 @@ class Fingers(ABC):
     """A hand that points down by less would touch the table with its palm before its fingertips get there."""
     sides: tuple[str, ...] = SIDES
     """Fingers that the hand has; those of `SIDES`, in their order."""
+    slide: ClassVar[bool] = False
+    """Whether the joints are lengths [m]; else they are angles [rad]."""
 
     @property
     def pad_size_m(self) -> tuple[float, float, float]:
@@ -169,6 +171,7 @@ class SlidingFingers(Fingers):
     """Finger's centre of mass: along x, and how far behind its frame, away from the middle."""
     finger_inertia: tuple[float, float, float] = field(kw_only=True)
     """About the centre of mass, along the hand's axes [kg m^2]."""
+    slide: ClassVar[bool] = True
 
     @property
     @override

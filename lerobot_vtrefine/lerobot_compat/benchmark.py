@@ -12,13 +12,14 @@ from lerobot.datasets.lerobot_dataset import LeRobotDataset
 from torch.utils.data import DataLoader
 
 from lerobot_vtrefine.datasets.features import ACTION_KEY, RAW_KEYS, STATE_KEY, dataset_features, raw_to_frame
-from lerobot_vtrefine.embodiments import ALOHA
+from lerobot_vtrefine.embodiments import DEFAULT_BODY, get_embodiment
 from lerobot_vtrefine.lerobot_compat import fast_reader
 
 HEIGHT, WIDTH, FPS = 60, 80, 10
 EPISODES, FRAMES = 2, 40
 BATCH = 32
 ROUNDS = 2
+BODY = get_embodiment(DEFAULT_BODY)
 WINDOWS = {key: [-0.1, 0.0] for key in (*RAW_KEYS, STATE_KEY)} | {ACTION_KEY: [i / FPS for i in range(8)]}
 
 Row = tuple[str, float, str]
@@ -40,17 +41,17 @@ def run() -> list[Row]:
 def record_noise(root: Path, episodes: int, frames: int) -> None:
     """A dataset with the columns of a recording, and random numbers in them."""
     random = np.random.default_rng(0)
-    dataset = LeRobotDataset.create("local/frames", FPS, dataset_features(HEIGHT, WIDTH, ALOHA), root)
+    dataset = LeRobotDataset.create("local/frames", FPS, dataset_features(HEIGHT, WIDTH, BODY), root)
     for _ in range(episodes):
         for _ in range(frames):
-            frame = raw_to_frame(_raw(random), ALOHA)
+            frame = raw_to_frame(_raw(random), BODY)
             dataset.add_frame({**frame, ACTION_KEY: _joints(random), "task": "insert"})
         dataset.save_episode()
     dataset.finalize()
 
 
 def _raw(random: np.random.Generator) -> dict[str, np.ndarray]:
-    pads = (len(ALOHA.pad_names), ALOHA.pad_layout.num_taxels)
+    pads = (len(BODY.pad_names), BODY.pad_layout.num_taxels)
     return {
         "state": _joints(random),
         "tactile": random.integers(0, 256, pads, np.uint8),
@@ -62,7 +63,7 @@ def _raw(random: np.random.Generator) -> dict[str, np.ndarray]:
 
 
 def _joints(random: np.random.Generator) -> np.ndarray:
-    return random.normal(size=ALOHA.num_joints).astype(np.float32)
+    return random.normal(size=BODY.num_joints).astype(np.float32)
 
 
 def _batches(root: Path) -> Callable[[], object]:

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from lerobot_vtrefine.datasets.features import ACTION_KEY, AGE_KEY, NOISE_LEVEL_KEY, STATE_KEY, TAXEL_INFO
+from lerobot_vtrefine.datasets.features import ACTION_KEY, AGE_KEY, NOISE_LEVEL_KEY, STATE_KEY, TAXEL_UNIT
 from lerobot_vtrefine.datasets.simulation_card import describe_simulation
 from lerobot_vtrefine.lerobot_compat.guard import is_supported
 
@@ -112,7 +112,7 @@ def _layout(features: Features) -> str:
 def _calibration(features: Features, stats: Stats) -> str:
     lines = ["### Units and calibration", ""]
     units = {(features[PAD_PREFIX + name].get("info") or {}).get("unit") for name in pad_names(features)}
-    if units == {TAXEL_INFO["unit"]}:
+    if units == {TAXEL_UNIT}:
         lines.append(
             "Counts are what a board sends: 8-bit readings of a voltage divider, monotonic in pressure but "
             "not linear, and not newtons. Nothing was filtered, clipped or normalised."

@@ -35,6 +35,13 @@ SEAMS = (
         "refuses to record",
     ),
     Seam(
+        "arrow_keys",
+        ("lerobot.utils.keyboard_input._PYNPUT_KEY_NAMES",),
+        "the arrow keys by which keyboard_ee moves a hand also end an episode or start it anew",
+        "vtrefine_ee with keyboard_ee, while it is connected",
+        "warns and leaves the arrows to LeRobot",
+    ),
+    Seam(
         "card",
         ("lerobot.datasets.lerobot_dataset.LeRobotDataset.push_to_hub",),
         "a dataset's card says nothing of what its columns hold",

@@ -14,7 +14,7 @@ import torch
 from torch import Tensor
 
 from lerobot_vtrefine.choices import check_choice
-from lerobot_vtrefine.embodiments import get_embodiment
+from lerobot_vtrefine.embodiments import DEFAULT_BODY, get_embodiment
 from lerobot_vtrefine.observation.depth import visual_points
 from lerobot_vtrefine.observation.taxels import (
     RULES,
@@ -37,7 +37,7 @@ class VisuoTactileConfig:
     Fields that are 0 are filled in by the policy's preset.
     """
 
-    embodiment: str = "aloha"
+    embodiment: str = DEFAULT_BODY
     """The robot whose joints, pads and taxels the readings are, see `embodiments`."""
     crop_min_m: tuple[float, float, float] = (-0.20, -0.25, 0.005)
     """Lower corner of the workspace box in the world frame; z above 0 leaves the table out."""

@@ -5,6 +5,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 from lerobot_vtrefine.choices import check_choice
+from lerobot_vtrefine.embodiments import DEFAULT_BODY
 from lerobot_vtrefine.embodiments.camera_config import CameraConfig
 from lerobot_vtrefine.embodiments.embodiment import STARTS
 from lerobot_vtrefine.sim.depth_sensors import DEPTH_SENSORS
@@ -36,7 +37,7 @@ class SceneConfig:
     """table: both parts stand on the table. grasped: both are in hand."""
     socket: str = "held"
     """held: a hand lifts the socket, and the plug goes in in air. stands: the socket stays on the table."""
-    embodiment: str = "aloha"
+    embodiment: str = DEFAULT_BODY
     """The robot, see `embodiments`."""
     table_height_m: float = 0.0
     """Height of the table's top in the world, in which the arms' bases have fixed places. A lab's arms may

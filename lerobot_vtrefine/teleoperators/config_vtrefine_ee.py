@@ -7,7 +7,7 @@ from typing import Any
 
 from lerobot.teleoperators.config import TeleoperatorConfig
 
-from lerobot_vtrefine.embodiments import get_embodiment
+from lerobot_vtrefine.embodiments import DEFAULT_BODY, get_embodiment
 from lerobot_vtrefine.lerobot_compat.config_errors import told_by_lerobot
 
 INPUTS = ("keyboard", "gamepad", "spacemouse", "headset", "webxr", "lerobot", "recording")
@@ -43,7 +43,7 @@ class VtRefineEeConfig(TeleoperatorConfig):
         key_speed_rad_s: The same for turns.
     """
 
-    embodiment: str = "aloha"
+    embodiment: str = DEFAULT_BODY
     input: str = "keyboard"
     devices: dict[str, Any] = field(default_factory=dict)
     path: Path | None = None
@@ -79,6 +79,8 @@ class VtRefineEeConfig(TeleoperatorConfig):
                 raise ValueError(
                     f"--teleop.{flag}: no arm is called {unknown[0]}; choose from {', '.join(arms)}"
                 )
+        if self.input == "webxr" and (unserved := [name for name in arms if name not in self.webxr_ports]):
+            raise ValueError(f"--teleop.webxr_ports names no port for the arm {unserved[0]}")
         if min(self.spacemice.values(), default=0) < 0:
             raise ValueError(f"--teleop.spacemice counts from 0, got {self.spacemice}")
         for name in ("fps", "scale", "jump_m", "jump_rad", "timeout_s", "key_speed_m_s", "key_speed_rad_s"):

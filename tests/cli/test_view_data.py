@@ -16,6 +16,7 @@ from lerobot_vtrefine.embodiments import KINOVA
 from lerobot_vtrefine.envs import VtRefineEnvConfig
 from lerobot_vtrefine.envs.live_world import LiveWorld
 from lerobot_vtrefine.sim.config import SceneConfig
+from lerobot_vtrefine.tactile.layout import PadLayout
 
 
 def test_pads_cloud_and_motion_are_saved(tiny_dataset: Path, tmp_path: Path, capsys) -> None:
@@ -56,7 +57,7 @@ def test_what_is_felt_lies_on_the_bodys_own_pads() -> None:
 def test_a_pressed_taxel_is_bright_at_its_place() -> None:
     counts, idle = np.full(384, 4, np.uint8), np.full(384, 4, np.uint8)
     counts[2 * 32 + 5] = 200
-    picture = pad_picture(counts, idle)
+    picture = pad_picture(counts, idle, PadLayout())
     assert picture.shape == (12, 32, 3)
     assert tuple(np.unravel_index(picture.sum(axis=2).argmax(), (12, 32))) == (2, 5)
 

@@ -16,14 +16,14 @@ from PIL import Image
 from lerobot_vtrefine.datasets.episodes import RecordedEpisode
 from lerobot_vtrefine.datasets.features import (
     ACTION_KEY,
-    BASELINE_KEYS,
     CAMERA_POSE_KEY,
     DEPTH_KEY,
     INTRINSICS_KEY,
     STATE_KEY,
-    TACTILE_KEYS,
+    baseline_keys,
+    tactile_keys,
 )
-from lerobot_vtrefine.embodiments import ALOHA
+from lerobot_vtrefine.embodiments import Embodiment, get_embodiment
 from lerobot_vtrefine.sim.config import RandomizationConfig, TaskConfig
 from lerobot_vtrefine.sim.demonstrations import Degradation
 from lerobot_vtrefine.sim.expert import Phase, ScriptedExpert
@@ -36,6 +36,7 @@ DRAG_M, PRESS_M, DRAG_STEPS = 0.03, 0.018, 60
 
 @dataclass(frozen=True)
 class Recorded:
+    body: Embodiment
     episodes: list
     rules: TaskConfig
     depth_mm: np.ndarray | None
@@ -44,7 +45,7 @@ class Recorded:
 
 def record(scene, count, what="pick", seed=0, degradation=None, faults=None, depth=False):
     """what: pick (the expert's episode), wiggle (then sideways in the socket), drag (along the table)."""
-    rules = TaskConfig(episode_steps=400)
+    body, rules = get_embodiment(scene.embodiment), TaskConfig(episode_steps=400)
     sim = InsertionSim(scene, rules, num_envs=count, robot_faults=faults)
     expert = ScriptedExpert(sim, degradation or Degradation())
     ids = np.arange(count)
@@ -52,7 +53,7 @@ def record(scene, count, what="pick", seed=0, degradation=None, faults=None, dep
     expert.reset(ids)
     takes = {"pick": None, "wiggle": Phase.HOLD, "drag": Phase.LIFT}[what]
     steps = {"pick": 90, "wiggle": 90 + WIGGLE_STEPS, "drag": 40 + DRAG_STEPS}[what]
-    since, base, target = np.full(count, -1), [None] * count, np.zeros((count, 16))
+    since, base, target = np.full(count, -1), [None] * count, np.zeros((count, body.num_joints))
     rows, images = {"state": [], "tactile": [], "action": []}, []
     for _ in range(steps):
         seen = {"state": sim.joint_state(ids), "tactile": sim.tactile(ids)}
@@ -62,21 +63,21 @@ def record(scene, count, what="pick", seed=0, degradation=None, faults=None, dep
         for k in ids if takes is not None else ():
             if since[k] < 0 and expert.phase[k] >= takes:
                 since[k], target[k] = 0, action[k]
-                base[k] = [x.numpy()[0] for x in ALOHA.tcp_poses(torch.as_tensor(action[k][None]))]
+                base[k] = [x.numpy()[0] for x in body.tcp_poses(torch.as_tensor(action[k][None]))]
             if since[k] >= 0:
-                action[k] = target[k] = moved(base[k], target[k], what, since[k])
+                action[k] = target[k] = moved(body, base[k], target[k], what, since[k])
                 since[k] += 1
         sim.step(action, ids)
         for key, value in {**seen, "action": action}.items():
             rows[key].append(np.asarray(value).copy())
     idle = sim.observe(ids)["tactile_baseline"]
     stacked = {key: np.stack(values, 1) for key, values in rows.items()}
-    episodes = [episode(k, stacked, idle, rules) for k in ids]
+    episodes = [episode(body, k, stacked, idle, rules) for k in ids]
     camera = sim.camera_intrinsics, sim.camera_pose[0]
-    return Recorded(episodes, rules, np.stack(images, 1) if depth else None, camera)
+    return Recorded(body, episodes, rules, np.stack(images, 1) if depth else None, camera)
 
 
-def moved(base, q, what, step):
+def moved(body, base, q, what, step):
     """Joint targets of the right hand's next place, from where it was when it was taken over."""
     position, rotation = base[0].copy(), base[1]
     if what == "wiggle":
@@ -84,15 +85,14 @@ def moved(base, q, what, step):
     else:
         position[1, 2] -= PRESS_M * min(step / 8, 1.0)
         position[1, 0] += DRAG_M * np.sin(2 * np.pi * max(step - 8, 0) / ((DRAG_STEPS - 8) / 2))
-    new, _, _ = solve_hands(ALOHA, position[None], rotation[None], q[None])
-    new[0, [6, 7, 14, 15]] = q[[6, 7, 14, 15]]
-    new[0, :8] = q[:8]
-    return new[0]
+    new, _, _ = solve_hands(body, position[None], rotation[None], q[None])
+    body.set_grippers(new, q[None])
+    return np.concatenate([q[: body.joints_per_arm], new[0, body.joints_per_arm :]])
 
 
-def episode(index, rows, idle, rules):
-    counts = {name: rows["tactile"][index, :, pad] for pad, name in enumerate(ALOHA.pad_names)}
-    baselines = {name: idle[index, pad] for pad, name in enumerate(ALOHA.pad_names)}
+def episode(body, index, rows, idle, rules):
+    counts = {name: rows["tactile"][index, :, pad] for pad, name in enumerate(body.pad_names)}
+    baselines = {name: idle[index, pad] for pad, name in enumerate(body.pad_names)}
     time_s = rules.control_dt_s * np.arange(rows["state"].shape[1])
     state, action = (rows[key][index].astype(np.float32).astype(float) for key in ("state", "action"))
     return RecordedEpisode(index, time_s, state, action, counts, baselines)
@@ -104,9 +104,11 @@ def write_dataset(root, recorded, believed, pose=None, depth_scale=1.0):
     (root / "data").mkdir(parents=True)
     (root / "meta").mkdir()
     pq.write_table(pa.concat_tables(tables), root / "data" / "file-000.parquet")
-    joints = {"dtype": "float32", "shape": [16], "names": list(ALOHA.joint_names)}
-    pad = {"dtype": "uint8", "shape": [384], "names": None}
-    features = {STATE_KEY: joints, ACTION_KEY: joints} | dict.fromkeys((*TACTILE_KEYS, *BASELINE_KEYS), pad)
+    body = recorded.body
+    joints = {"dtype": "float32", "shape": [body.num_joints], "names": list(body.joint_names)}
+    pad = {"dtype": "uint8", "shape": [body.pad_layout.num_taxels], "names": None}
+    touches = dict.fromkeys((*tactile_keys(body), *baseline_keys(body)), pad)
+    features = {STATE_KEY: joints, ACTION_KEY: joints} | touches
     info = {"codebase_version": "v3.0", "fps": 10, "total_episodes": len(tables), "features": features}
     (root / "meta" / "info.json").write_text(json.dumps(info))
     settings = {
@@ -122,7 +124,7 @@ def write_dataset(root, recorded, believed, pose=None, depth_scale=1.0):
 
 
 def _table(recorded, index, pose, depth_scale):
-    one = recorded.episodes[index]
+    one, body = recorded.episodes[index], recorded.body
     count = len(one.time_s)
     columns = {
         "episode_index": pa.array([index] * count),
@@ -131,9 +133,9 @@ def _table(recorded, index, pose, depth_scale):
         STATE_KEY: pa.array(one.state.astype(np.float32).tolist(), pa.list_(pa.float32())),
         ACTION_KEY: pa.array(one.action.astype(np.float32).tolist(), pa.list_(pa.float32())),
     }
-    for keys, values in ((TACTILE_KEYS, one.counts), (BASELINE_KEYS, one.baselines)):
-        for key, name in zip(keys, ALOHA.pad_names, strict=True):
-            rows = np.broadcast_to(values[name], (count, 384)).tolist()
+    for keys, values in ((tactile_keys(body), one.counts), (baseline_keys(body), one.baselines)):
+        for key, name in zip(keys, body.pad_names, strict=True):
+            rows = np.broadcast_to(values[name], (count, body.pad_layout.num_taxels)).tolist()
             columns[key] = pa.array(rows, pa.list_(pa.uint8()))
     if recorded.depth_mm is not None:
         intrinsics, true_pose = recorded.camera

@@ -63,7 +63,7 @@ def test_a_joints_play_is_no_mass() -> None:
     assert "object_mass" not in [cause.name for cause in found.verdict.causes]
 
 
-@pytest.mark.parametrize("hidden", [0.001, 0.0015])
+@pytest.mark.parametrize("hidden", [0.001, pytest.param(0.0015, marks=pytest.mark.slow)])
 def test_tighter_hole_is_felt_by_wiggling(hidden) -> None:
     found, _ = diagnosed(record(SceneConfig(pair="square", clearance_m=hidden), EPISODES, "wiggle"))
     assert [cause.name for cause in found.verdict.causes] == ["clearance"]
@@ -78,7 +78,7 @@ def test_wiggling_in_the_hole_as_believed_finds_nothing() -> None:
     assert decisions(found)["clearance"] == "rejected"
 
 
-@pytest.mark.parametrize("hidden", [0.15, 0.5])
+@pytest.mark.parametrize("hidden", [0.15, pytest.param(0.5, marks=pytest.mark.slow)])
 def test_friction_is_felt_by_dragging(hidden) -> None:
     found, _ = diagnosed(record(SceneConfig(pair="square", part_friction=hidden), EPISODES, "drag"))
     assert [cause.name for cause in found.verdict.causes] == ["object_friction"]

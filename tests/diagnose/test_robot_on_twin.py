@@ -15,7 +15,7 @@ from lerobot_vtrefine.diagnose.joints.parameters import INDEX
 from lerobot_vtrefine.diagnose.joints.twin_problem import COARSE_S, FINE_S, TwinProblem
 from lerobot_vtrefine.diagnose.parts.engine import assumed_masses
 from lerobot_vtrefine.diagnose.parts.episodes import AssumedScene, handled, lately
-from lerobot_vtrefine.diagnose.parts.payload import GRAVITY_M_S2, Arms, given, replay_loaded
+from lerobot_vtrefine.diagnose.parts.payload import Arms, given, replay_loaded
 from lerobot_vtrefine.diagnose.recordings import RobotTrial
 from lerobot_vtrefine.embodiments import ALOHA
 from lerobot_vtrefine.sim.config import SceneConfig
@@ -51,7 +51,7 @@ def error_of(problem, point):
 def test_loaded_replay_is_the_simulation_itself() -> None:
     arms, scene, episodes = handled_episodes(None)
     mass = assumed_masses(scene)
-    paths = replay_loaded(arms, episodes, [e.hanging * mass * GRAVITY_M_S2 for e in episodes])
+    paths = replay_loaded(arms, episodes, scene.weights_n(episodes, mass))
     empty = replay_loaded(arms, episodes)
     for episode, path, bare in zip(episodes, paths, empty, strict=True):
         error = np.abs(episode.position - path)[:, ANGLES]
@@ -85,7 +85,7 @@ def late_problem(step_s):
 def late_episodes():
     faults = RobotFaults(control_latency_s=LATE_S, backlash_rad={"left_elbow": PLAY_RAD})
     arms, scene, episodes = handled_episodes(faults)
-    weights = [e.hanging * assumed_masses(scene) * GRAVITY_M_S2 for e in episodes]
+    weights = scene.weights_n(episodes, assumed_masses(scene))
     paths, through = (replay_loaded(arms, episodes, weights, contacts=c) for c in (True, False))
     usable = []
     for episode, path, other in zip(episodes, paths, through, strict=True):

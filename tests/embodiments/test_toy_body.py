@@ -21,6 +21,9 @@ from lerobot_vtrefine.datasets.episodes import open_episodes
 from lerobot_vtrefine.datasets.features import ACTION_KEY, STATE_KEY, dataset_features, raw_keys
 from lerobot_vtrefine.diagnose.episode_replay.compare import compare_episodes
 from lerobot_vtrefine.diagnose.joints.engine import diagnose_robot
+from lerobot_vtrefine.diagnose.parts.engine import diagnose_parts
+from lerobot_vtrefine.diagnose.parts.episodes import assumed_scene, read_episodes
+from lerobot_vtrefine.diagnose.parts.payload import Arms
 from lerobot_vtrefine.embodiments import (
     ALOHA,
     Arm,
@@ -260,6 +263,20 @@ def test_diagnosis_finds_its_play_and_its_weight(faulty: Path, tmp_path: Path) -
     both = 0.5 * 0.1 + 0.5 * 0.3 + 0.05 * 0.43
     sag = {"only_beta_rad": both * g / stiffness, "only_gamma_rad": forearm * g / stiffness}
     assert params["gravity_sag"] == pytest.approx(sag, rel=0.03)
+
+
+def test_diagnosis_says_what_it_lacks_to_weigh_parts(dataset: Path) -> None:
+    """In a line: its hand has one pad, and whether a hand holds something takes two that face each other."""
+    scene = assumed_scene(open_episodes(dataset))
+    assert scene is not None
+    arms = Arms(scene.scene, scene.rules, scene.rules.control_dt_s, "linear")
+    found = diagnose_parts(arms, scene, read_episodes(dataset, scene))
+    assert found.verdict.status == "adequate"
+    reasons = {item.name: (item.decision, item.reason) for item in found.evidence}
+    assert {decision for decision, _ in reasons.values()} == {"not identifiable"}
+    assert "toy has no hand that holds the socket" in reasons["clearance"][1]
+    assert "toy has one pad per hand" in reasons["object_friction"][1]
+    assert "toy has one pad per hand" in reasons["object_mass"][1]
 
 
 def test_bodies_differ_in_the_names_of_their_pads() -> None:

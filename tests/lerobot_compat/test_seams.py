@@ -16,7 +16,7 @@ from lerobot.datasets import compute_stats, io_utils
 from lerobot.datasets.lerobot_dataset import LeRobotDataset
 from lerobot.datasets.utils import create_lerobot_dataset_card
 from lerobot.processor.pipeline import DataProcessorPipeline
-from lerobot.utils import feature_utils, import_utils, visualization_utils
+from lerobot.utils import feature_utils, import_utils, keyboard_input, visualization_utils
 
 from lerobot_vtrefine import lerobot_compat
 from lerobot_vtrefine.lerobot_compat import arrays, card, checkpoint_guard, live_view, phases, safe_recording
@@ -41,6 +41,13 @@ def stock() -> None:
 def arrays_(_: Path) -> None:
     with pytest.raises(ValueError, match="3-tuple"):
         feature_utils.hw_to_dataset_features({"tactile.left": (384,)}, "observation")
+
+
+@probe
+def arrow_keys_(_: Path) -> None:
+    source = inspect.getsource(keyboard_input)
+    assert 'key in ("right", "n")' in source
+    assert 'key in ("left", "r")' in source
 
 
 @probe

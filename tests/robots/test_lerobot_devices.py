@@ -8,6 +8,7 @@ import pytest
 from commands import dataset_flags, flags, run_command
 from emulated_devices import Key, Listener, SdlGamepad, raised_phone, watch_keys
 from lerobot.datasets.lerobot_dataset import LeRobotDataset
+from lerobot.utils import keyboard_input
 from lerobot.utils.rotation import Rotation
 
 from lerobot_vtrefine.datasets.features import ACTION_KEY
@@ -129,6 +130,22 @@ def test_arrow_keys_point_away_from_the_operator_and_a_left_keyboard_is_gone(
     assert devices.read()["left"].grip == pytest.approx(0.2)
     Listener.latest.release(Key.esc)
     assert devices.read() == {}
+
+
+def test_lerobot_record_leaves_the_arrows_to_a_keyboard_that_drives_a_hand(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    watch_keys(monkeypatch)
+    names = {Key.left: "left", Key.right: "right", Key.esc: "esc"}
+    monkeypatch.setattr(keyboard_input, "_PYNPUT_KEY_NAMES", dict(names))
+    heard = [keyboard_input._resolve_pynput_key(key) for key in names]
+    assert heard == ["left", "right", "esc"]
+    devices = LeRobotDevices({"left": {"type": "keyboard_ee"}}, FPS, speed_m_s=0.1)
+    devices.connect()
+    heard = [keyboard_input._resolve_pynput_key(key) for key in names]
+    devices.disconnect()
+    assert heard == [None, None, "esc"]
+    assert names == keyboard_input._PYNPUT_KEY_NAMES
 
 
 def test_a_phones_place_and_turn_come_in_the_operators_frame(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -1,6 +1,8 @@
 """End-effector teleoperation: recorded controllers insert in simulation, and nothing they do is dangerous."""
 
+import inspect
 import json
+import re
 import time
 from collections.abc import Generator
 from dataclasses import replace
@@ -9,9 +11,15 @@ from pathlib import Path
 import mujoco
 import numpy as np
 import pytest
-from commands import dataset_flags, flags, run_command
+from commands import dataset_flags, flags, follower_flags, run_command
+from lerobot.datasets.lerobot_dataset import LeRobotDataset
+from lerobot.utils import keyboard_input
+from rig import Rig
 from scipy.spatial.transform import Rotation
 
+from lerobot_vtrefine.datasets.features import STATE_KEY
+from lerobot_vtrefine.drivers.arm_models import VIPERX_300S
+from lerobot_vtrefine.drivers.dynamixel_arm import rad_to_counts
 from lerobot_vtrefine.embodiments import get_embodiment
 from lerobot_vtrefine.envs import VtRefineEnvConfig
 from lerobot_vtrefine.envs.live_world import IDS, LiveWorld
@@ -114,6 +122,42 @@ def test_recorded_people_pick_and_insert_from_the_table(
     assert robot_type == get_embodiment(body).robot_type
 
 
+def stand_at_home(rig: Rig) -> None:
+    for arm in BODY.arms:
+        angles = dict(zip((joint.name for joint in BODY.joints), arm.home_rad, strict=True))
+        motors = [(number, name) for name, number, _ in VIPERX_300S.motors if name in angles]
+        motors += [(number, joint) for _, number, _, joint in VIPERX_300S.shadows]
+        for number, joint in motors:
+            rig.motor("follower", arm.name, number).shaft = float(rad_to_counts(np.array(angles[joint])))
+
+
+@pytest.mark.slow
+def test_motors_are_moved_as_the_simulation_is(
+    rig: Rig, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The robot class of the real arms, on emulated motors: hands start from where the joints are read."""
+    stand_at_home(rig)
+    rising = np.concatenate([np.zeros(5), np.linspace(0.0, 0.05, 12), np.full(8, 0.05)])
+    samples: dict[str, np.ndarray] = {}
+    for arm, way in (("left", 0.0 * rising), ("right", rising)):
+        samples[f"{arm}_position"] = np.outer(way, [0.0, 0.0, 1.0])
+        samples[f"{arm}_quaternion"] = np.tile([1.0, 0.0, 0.0, 0.0], (len(way), 1))
+        samples[f"{arm}_clutch"] = np.ones(len(way), bool)
+        samples[f"{arm}_grip"] = np.zeros(len(way))
+    np.savez(tmp_path / "people.npz", **samples)
+    teleop = flags(
+        teleop__type="vtrefine_ee", teleop__input="recording", teleop__path=tmp_path / "people.npz"
+    )
+    root = tmp_path / "recorded"
+    run_command(monkeypatch, "record", [*follower_flags(rig), *teleop, *dataset_flags(root, 1, 3.0, FPS)])
+    frames = LeRobotDataset("local/x", root=root).hf_dataset.with_format("numpy")
+    ik = TwoArmIk("aloha", 1 / FPS)
+    first, last = (ik.hands(np.array(frames[STATE_KEY])[k]) for k in (0, -1))
+    left, right = (after.position - before.position for before, after in zip(first, last, strict=True))
+    np.testing.assert_allclose(right, [0.0, 0.0, 0.05], atol=0.004)
+    np.testing.assert_allclose(left, 0.0, atol=0.004)
+
+
 def driven(env: VtRefineEnvConfig, seed: int, tremor_m: float, delay: int, file: Path) -> tuple[dict, list]:
     """How an episode of recorded people ends, and how far commanded hands were from theirs [m]."""
     body = env.body
@@ -184,19 +228,22 @@ FAULTS = {
 }
 
 
+@pytest.mark.parametrize("name", BODIES)
 @pytest.mark.parametrize("fault", FAULTS)
-def test_nothing_moves_an_arm_faster_than_its_rate_limit(fault: str) -> None:
-    teleop = connected([{arm: s for arm in ARMS if s is not None} for s in FAULTS[fault]])
+def test_nothing_moves_an_arm_faster_than_its_rate_limit(fault: str, name: str) -> None:
+    body = get_embodiment(name)
+    teleop = connected([{arm: s for arm in ARMS if s is not None} for s in FAULTS[fault]], embodiment=name)
     rules = TaskConfig()
-    slides = np.array(["finger" in joint for joint in BODY.joint_names])
-    most = np.where(slides, rules.finger_rate, rules.joint_rate) / FPS
-    actions = [np.asarray(BODY.home)]
+    gripper = body.fingers.command_rate(rules.finger_rate)
+    arms = np.isin(np.arange(body.num_joints), body.arm_columns)
+    most = np.where(arms, rules.joint_rate, gripper) / FPS
+    actions = [np.asarray(body.home)]
     actions += [np.array(list(teleop.get_action().values())) for _ in range(len(FAULTS[fault]) + 3)]
     steps = np.abs(np.diff(actions, axis=0))
     assert np.isfinite(actions).all()
     assert (steps <= most + 1e-9).all()
-    assert (np.array(actions) >= BODY.lower - 1e-9).all()
-    assert (np.array(actions) <= BODY.upper + 1e-9).all()
+    assert (np.array(actions) >= body.lower - 1e-9).all()
+    assert (np.array(actions) <= body.upper + 1e-9).all()
     if fault in ("a jump", "lost tracking", "a released clutch"):
         reached = teleop._ik.hands(actions[-1])[0].position - teleop._ik.hands(actions[0])[0].position
         assert np.linalg.norm(reached) < 0.04  # the good samples' way alone
@@ -277,6 +324,15 @@ def test_hands_are_kept_apart_and_above_the_table(body: str) -> None:
         own = [tuple(sorted(c.geom)) for c in data.contact if c.dist < 0]
         root = ik.model.body_rootid[ik.model.geom_bodyid]
         assert [pair for pair in own if root[pair[0]] != root[pair[1]]] == []
+
+
+def test_no_hand_is_moved_by_a_key_that_lerobot_record_takes() -> None:
+    """It ends a recording by Q and an episode by N."""
+    taken = set(re.findall(r'key in \("\w+", "(\w)"\)', inspect.getsource(keyboard_input)))
+    assert taken == {"n", "r", "q"}
+    left, right = (set(keys.values()) for keys in keyboard.KEYS)
+    assert len(left | right) == sum(len(keys) for keys in keyboard.KEYS)
+    assert not taken & (left | right)
 
 
 def test_keys_and_sticks_move_imaginary_controllers() -> None:

@@ -5,11 +5,10 @@ from pathlib import Path
 from typing import Any
 
 from lerobot_vtrefine.choices import check_choice
+from lerobot_vtrefine.embodiments import DEFAULT_BODY
 from lerobot_vtrefine.finetune.seeds import TRAINING_SEEDS
 
 REPO_ID = "local/vtrefine_demo"
-HOME_BODY = "aloha"
-"""The robot with which the demo's encoder has learnt."""
 POLICIES = ("pretrain", "finetune")
 ABLATIONS = ("touch", "vision")
 
@@ -156,7 +155,7 @@ class DemoConfig:
         """Fill in what the recipe says and the flags do not; the policy sees with the environment's robot."""
         check_choice("--recipe", self.recipe, RECIPES)
         recipe = RECIPES[self.recipe]
-        body = (self.env.get("scene") or {}).get("embodiment", HOME_BODY)
+        body = (self.env.get("scene") or {}).get("embodiment", DEFAULT_BODY)
         policy = recipe["policy"] | self.policy
         if policy.get("freeze_encoder") and "pretrained_encoder" not in policy:
             if body not in ENCODERS:
@@ -165,7 +164,7 @@ class DemoConfig:
                     " or one of your own by --policy='{pretrained_encoder: FOLDER}'"
                 )
             policy["pretrained_encoder"] = ENCODERS[body]
-        if body != HOME_BODY:
+        if body != DEFAULT_BODY:
             policy["observation"] = {"embodiment": body} | policy.get("observation", {})
         object.__setattr__(self, "policy", policy)
         object.__setattr__(self, "dppo", recipe["dppo"] | self.dppo)

@@ -32,11 +32,10 @@ from lerobot_vtrefine.diagnose.parts.episodes import (
     AssumedScene,
     HandledEpisode,
     assumed_scene,
-    is_twins_robot,
     lately,
     read_episodes,
 )
-from lerobot_vtrefine.diagnose.parts.payload import GRAVITY_M_S2, Arms, given, replay_loaded
+from lerobot_vtrefine.diagnose.parts.payload import Arms, given, replay_loaded
 from lerobot_vtrefine.diagnose.recordings import RecordingSet
 
 Array = np.ndarray
@@ -52,13 +51,15 @@ def diagnose_dataset(recordings: RecordingSet, seed: int = 0, progress: Progress
     """Judge a dataset; `recordings` are its episodes after quality control.
 
     Raises:
-        ValueError: commands that are not finite, or a damaged note of the assumed scene.
+        ValueError: commands that are not finite, or a note of the assumed scene that is damaged or names
+            another robot.
     """
     tell = progress or (lambda text, done: None)
-    scene = assumed_scene(open_episodes(recordings.path)) if is_twins_robot(recordings.joints) else None
+    scene = assumed_scene(open_episodes(recordings.path))
     if scene is None:
         found, objects = diagnose_robot(recordings, seed, progress), unknown_parts()
     else:
+        _check_joints(recordings, scene)
         found, objects = _on_twin(recordings, scene, seed, progress)
     found = merged(found, objects)
     if not has_depth(recordings.path):
@@ -78,7 +79,7 @@ class _Session:
 
     def twin(self, mass_kg: Array) -> dict[str, TwinTrial]:
         """What the twin does in every episode with parts of those masses (2,)."""
-        weights = [episode.hanging * mass_kg * GRAVITY_M_S2 for episode in self.episodes]
+        weights = self.scene.weights_n(self.episodes, mass_kg)
         touching, free = (
             replay_loaded(self.arms, self.episodes, weights, contacts=contacts) for contacts in (True, False)
         )
@@ -89,6 +90,15 @@ class _Session:
             usable = (episode.free | episode.carried).all(1) & ~bumped
             out[episode_name(episode.index)] = TwinTrial(given(self.arms, episode), path, usable)
         return out
+
+
+def _check_joints(recordings: RecordingSet, scene: AssumedScene) -> None:
+    """Raises: ValueError for another robot than the assumed scene's."""
+    if recordings.joints != scene.body.joint_names:
+        raise ValueError(
+            f"{recordings.path}: its note names the robot {scene.body.name}, but its joints are "
+            f"{', '.join(recordings.joints)}"
+        )
 
 
 def _on_twin(

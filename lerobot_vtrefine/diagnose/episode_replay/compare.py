@@ -188,7 +188,7 @@ def _reach(pairs: list[EpisodePair], config: VtRefineEnvConfig, fps: float, own:
     from lerobot_vtrefine.sim.pairs import load_pair
 
     parts = load_pair(scene)
-    tops = part_top_m(parts.socket), part_top_m(parts.plug)
+    tops = [part_top_m(getattr(parts, arm.holds)) for arm in robot.arms]
     touches = [pad_peaks(pair.counts, pair.baselines) for pair in pairs]
     return hand_reaches(robot, states, scene.table_height_m, tops, touches, fps)
 

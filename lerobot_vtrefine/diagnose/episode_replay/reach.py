@@ -43,7 +43,7 @@ class HandReach:
 
 
 def lowest_edges(embodiment: Embodiment, joints: Array) -> Array:
-    """Height in the world of each hand's lowest pad edge: (T, J) -> (T, 2) [m]."""
+    """Height in the world of each hand's lowest pad edge: (T, J) -> (T, A) [m]."""
     position, rotation = embodiment.pad_poses(torch.as_tensor(joints, dtype=torch.float64))
     length, width, _ = embodiment.fingers.pad_size_m
     along, across = rotation[..., 2, 0].abs(), rotation[..., 2, 1].abs()
@@ -55,7 +55,7 @@ def hand_reaches(
     embodiment: Embodiment,
     states: Sequence[Array],
     table_height_m: float,
-    part_tops_m: tuple[float, float] | None = None,
+    part_tops_m: Sequence[float] | None = None,
     touches: Sequence[Array] = (),
     fps: float = 1.0,
 ) -> list[HandReach]:
@@ -65,8 +65,8 @@ def hand_reaches(
         embodiment: The robot.
         states: Recorded positions (T, J) of every episode.
         table_height_m: Of the twin's table.
-        part_tops_m: Upper ends of the parts that the left and the right hand grip, above the twin's table.
-        touches: Largest counts above idle of the twin's pads (T, 4) of every episode, where it was replayed
+        part_tops_m: (A,) upper end of the part that each hand grips, above the twin's table.
+        touches: Largest counts above idle of the twin's pads (T, P) of every episode, where it was replayed
             with parts.
         fps: Frames per second.
     """
@@ -81,7 +81,8 @@ def hand_reaches(
         heights = [lowest_edges(embodiment, states[index])[:, arm] - table_height_m for index in closing]
         at_grasp = float(np.median([h[moments[i]] for h, i in zip(heights, closing, strict=True)]))
         window = round(HOLDING_S * fps)
-        held = [_holds(touches[i][moments[i] :][:window], arm) for i in closing] if touches else None
+        own = slice(embodiment.pads_per_arm * arm, embodiment.pads_per_arm * (arm + 1))
+        held = [_holds(touches[i][moments[i] :][:window], own) for i in closing] if touches else None
         rows.append(
             HandReach(
                 arm=name,
@@ -113,9 +114,9 @@ def pad_peaks(counts: dict[str, Array], baselines: dict[str, Array]) -> Array:
     return np.stack(peaks, 1)
 
 
-def _holds(touch: Array, arm: int) -> bool:
-    """Whether both pads of a hand feel something in most frames of (T, 4), by the paper's threshold."""
-    felt = np.median(touch[:, 2 * arm : 2 * arm + 2], axis=0) >= VisuoTactileConfig().threshold_counts
+def _holds(touch: Array, own: slice) -> bool:
+    """Whether all of a hand's own pads feel something in most frames of (T, P), by the paper's threshold."""
+    felt = np.median(touch[:, own], axis=0) >= VisuoTactileConfig().threshold_counts
     return bool(felt.all())
 
 

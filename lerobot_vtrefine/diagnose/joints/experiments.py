@@ -10,7 +10,7 @@ from lerobot_vtrefine.diagnose.core.rivals import Rival
 from lerobot_vtrefine.diagnose.core.suspicion import Alarm
 from lerobot_vtrefine.diagnose.joints.batch import frame_s, make_batch
 from lerobot_vtrefine.diagnose.joints.fitting import ServoTrials
-from lerobot_vtrefine.diagnose.joints.gravity import is_sliding
+from lerobot_vtrefine.diagnose.joints.gravity import is_gripper, is_sliding
 from lerobot_vtrefine.diagnose.recordings import RobotTrial
 
 if TYPE_CHECKING:
@@ -100,7 +100,8 @@ def _gap(selection: "Selected", rival: Rival[Any, Any], name: str) -> float:
     middle = np.median(problem.batch.command.reshape(-1, problem.batch.joints), 0)
     command = np.repeat(middle[None], len(time_s), 0)
     for joint in rival.channels:
-        wide = (-1.2, 1.2) if not is_sliding(problem.names[joint]) else (low[joint], high[joint])
+        bounded = is_sliding(problem.names[joint]) or is_gripper(problem.names[joint])
+        wide = (low[joint], high[joint]) if bounded else (-1.2, 1.2)
         command[:, joint] = _drive(name, time_s, low[joint], high[joint], wide, problem.names[joint])
     trial = RobotTrial("", "", 0, 0, 0.0, time_s, command, command[:1].repeat(len(time_s), 0), None)
     there = ServoTrials.of(problem.names, make_batch([trial]))

@@ -31,12 +31,19 @@ _PITCHING = re.compile(r"shoulder|elbow|wrist|pitch|lift|flex|tilt")
 
 
 def is_sliding(joint: str) -> bool:
-    """Whether a joint's positions are lengths [m] or a gripper's opening, judged by its name."""
+    """Whether a joint's positions are lengths [m]. A known body says so; of another's, grippers and what is
+    called a slide are taken for that."""
+    body = embodiment_of((joint,))
+    if body is not None:
+        return is_gripper(joint) and body.fingers.slide
     return bool(_SLIDING.search(joint.lower()))
 
 
 def is_gripper(joint: str) -> bool:
-    """Whether a joint opens and closes a gripper, judged by its name."""
+    """Whether a joint opens and closes a gripper: a known body says so, else its name."""
+    body = embodiment_of((joint,))
+    if body is not None:
+        return body.joint_of(joint.removesuffix(".pos")) is None
     return bool(re.search(r"finger|grip|jaw", joint.lower()))
 
 

@@ -19,12 +19,11 @@ from lerobot_vtrefine.diagnose.core.engine import Progress
 from lerobot_vtrefine.diagnose.evidence import Trace
 from lerobot_vtrefine.diagnose.joints.batch import make_batch
 from lerobot_vtrefine.diagnose.joints.engine import diagnose_problem
-from lerobot_vtrefine.diagnose.joints.gravity import is_sliding
 from lerobot_vtrefine.diagnose.joints.model import RobotModel, from_model
 from lerobot_vtrefine.diagnose.joints.twin_problem import COARSE_S, FINE_S, NOMINAL, TwinProblem
 from lerobot_vtrefine.diagnose.recordings import RecordingSet, RobotTrial
 from lerobot_vtrefine.diagnose.verdict import Parameter
-from lerobot_vtrefine.embodiments import ALOHA
+from lerobot_vtrefine.embodiments import Embodiment, get_embodiment
 from lerobot_vtrefine.sim.config import SceneConfig
 
 Array = np.ndarray
@@ -64,7 +63,7 @@ def diagnose_on_twin(
     problem = replace(problem, fine=fine, floor=max(problem.floor, floor))
     found = diagnose_problem(problem, seed, progress)
     traces = tuple(_absolute(trace, recordings.joints, extra, twin) for trace in found.traces)
-    return replace(found, traces=traces, baseline_params=_servos(found))
+    return replace(found, traces=traces, baseline_params=_servos(found, get_embodiment(config.embodiment)))
 
 
 def posed(
@@ -115,14 +114,14 @@ def _absolute(
     return replace(trace, measured=shifted[0], simulated=shifted[1], extended=shifted[2])
 
 
-def _servos(found: Diagnosis) -> dict[str, Parameter]:
+def _servos(found: Diagnosis, body: Embodiment) -> dict[str, Parameter]:
     """The refitted servo gains and dampings of the twin's revolute joints."""
     out: dict[str, Parameter] = {}
     assert isinstance(found.baseline_model, RobotModel)
     for joint in found.baseline_model.joints:
-        if is_sliding(joint.name):
+        known = body.joint_of(joint.name)
+        if known is None:
             continue
-        known = next(item for item in ALOHA.joints if joint.name.removesuffix(".pos").endswith(item.name))
         speed = joint.natural_frequency_rad_s / NOMINAL[0]
         damping = known.damping * speed * joint.damping_ratio / NOMINAL[1]
         out[f"{joint.name}.stiffness"] = Parameter(known.stiffness * speed**2, None, "N*m/rad")

@@ -24,6 +24,7 @@ from lerobot_vtrefine.diagnose.joints.batch import Batch
 from lerobot_vtrefine.diagnose.joints.fitting import Point
 from lerobot_vtrefine.diagnose.joints.parameters import INDEX, PARAMETERS, SAG
 from lerobot_vtrefine.diagnose.joints.problem import JointProblem
+from lerobot_vtrefine.embodiments import get_embodiment
 from lerobot_vtrefine.sim import task
 from lerobot_vtrefine.sim.backends.batch import usable_cores
 from lerobot_vtrefine.sim.config import SceneConfig
@@ -94,8 +95,10 @@ class TwinProblem(JointProblem):
     def weight(self) -> Array:
         """See `JointProblem.weight`. Fingers tell nothing about a delay: where they hold something, their
         commands are their own positions."""
-        slides = np.array([gravity.is_sliding(name) for name in self.names])
-        return np.where(slides, 0.0, super().weight)
+        out = np.zeros(self.batch.joints)
+        arms = get_embodiment(self.config.embodiment).arm_columns
+        out[arms] = super().weight[arms]
+        return out
 
     def start(self) -> Point:
         """The twin as it comes."""
@@ -183,7 +186,7 @@ class _Arms:
         ahead = min(config.timestep_s * self.substeps / dt_s, 1.0)
         self.weight = (np.arange(self.substeps) + ahead) / self.substeps
         self.model.opt.disableflags |= int(mujoco.mjtDisableBit.mjDSBL_CONTACT)
-        self.columns = [k for k, name in enumerate(self.robot.joint_names) if not gravity.is_sliding(name)]
+        self.columns = self.robot.arm_columns.tolist()
         named = [self.robot.joint_names[k] for k in self.columns]
         self.servo = [int(self.model.actuator(name).id) for name in named]
         self.dof = [int(self.model.joint(name).dofadr[0]) for name in named]
@@ -224,14 +227,19 @@ class _Arms:
         servo = np.stack([task.servo_commands(self.robot, row) for row in flat], 1)
         rest = task.servo_commands(self.robot, first)[:, None]
         wanted = self._between(rest, servo, way.hold)
-        half = np.abs(np.repeat(_per_servo(way.play * self.side), trials, 0)) / 2
+        half = np.abs(np.repeat(self._per_servo(way.play * self.side), trials, 0)) / 2
         out, state = np.empty_like(wanted), rest[:, 0]
         for k in range(wanted.shape[1]):
             out[:, k] = state = np.clip(state, wanted[:, k] - half, wanted[:, k] + half)
         if way.push.any():
-            push = _per_servo(way.push).transpose(0, 2, 1, 3).reshape(sheets * trials, frames, -1)
+            push = self._per_servo(way.push).transpose(0, 2, 1, 3).reshape(sheets * trials, frames, -1)
             out += self._between(push[:, :1], push, way.hold)
         return _late(out, rest[:, 0], way.tau_s / self.model.opt.timestep)
+
+    def _per_servo(self, values: Array) -> Array:
+        """Changes of joints (..., J) as changes of servos (..., nu)."""
+        flat = task.servo_values(self.robot, values.reshape(-1, values.shape[-1]))
+        return flat.reshape(*values.shape[:-1], -1)
 
     def _between(self, first: Array, values: Array, hold: str) -> Array:
         """Values (W, N, nu) of frames, after `first` (W, 1, nu), at every step but the last frame's."""
@@ -256,13 +264,6 @@ class _Arms:
         field.reshape(len(sets), self.model.nv, -1)[:, self.dof, 0] = damping
         friction = self.model.dof_frictionloss[self.dof] + gain * sets[:, self.columns, INDEX["friction"]]
         worlds.expand("dof_frictionloss")[:, self.dof] = friction
-
-
-def _per_servo(values: Array) -> Array:
-    """Changes of joints (..., J) as changes of servos (..., nu), see `task.servo_commands`."""
-    arms = values.reshape(*values.shape[:-1], 2, -1)
-    opening = (arms[..., -2:-1] - arms[..., -1:]) / 2
-    return np.concatenate([arms[..., :-2], opening], -1).reshape(*values.shape[:-1], -1)
 
 
 def _late(controls: Array, first: Array, steps: float) -> Array:

@@ -3,6 +3,7 @@
 Fingers centre their parts across the pads, so both hands' encoders tell where the plug is in the hole along
 that axis, and the arms' give tells when a wall pushes. In frames with a push, place = zero -+ half the
 clearance - give x force, the sign being the force's. The zero is fitted, too: walls on both sides are needed.
+So is the give, from what is known of it beforehand: arms whose servos are soft push too evenly to show it.
 """
 
 from collections.abc import Sequence
@@ -30,8 +31,10 @@ INSERTED_M = 0.006
 """The plug's tip is this far below the mouth; how high a part is held may be off by half of it."""
 RESTS_M_S = 0.003
 """A plug at a wall moves no faster; on its way between the walls arms lag, which is no push."""
-GIVE_M_PER_N = 3.3e-5
-"""How far four pads, preloaded, let the parts give way: 0.6 mm per pad at 20 N."""
+GIVE_M_PER_N = 8e-5
+"""How far preloaded pads let the parts give way: on the twins 7.5e-5 (ALOHA) and 8.6e-5 (Kinova) ..."""
+GIVE_WEIGHT_N = 3.0
+"""... and how much an episode counts that: places err by 3e-5 m, so that it is known to 1e-5 m/N."""
 FEWEST = 3
 """Episodes, and frames on each wall."""
 
@@ -41,9 +44,9 @@ class Contact:
     """Forces on the hands and where the parts are in one episode."""
 
     force_n: Array
-    """(T, 2, 3) on the mouth and on the tip, world axes."""
+    """(T, A, 3) on the mouth and on the tip, world axes."""
     place_m: Array
-    """(T, 2, 3) of mouth and tip, if the hands hold their parts ideally."""
+    """(T, A, 3) of mouth and tip, if the hands hold their parts ideally."""
 
 
 def contacts_of(
@@ -53,10 +56,10 @@ def contacts_of(
     out = []
     for episode, path in zip(episodes, untouched, strict=True):
         held = np.flatnonzero(episode.held.all(1))
-        turns = hands(episode.position[held[:1]] if len(held) else episode.position[:1])[1]
+        turns = hands(scene.body, episode.position[held[:1]] if len(held) else episode.position[:1])[1]
         points = tip_and_mouth(scene, pitches(turns)[0])
         force = point_forces(arms, episode, path, points)
-        out.append(Contact(force, places(episode.position, points)))
+        out.append(Contact(force, places(scene.body, episode.position, points)))
     return out
 
 
@@ -65,6 +68,8 @@ def clearance(
 ) -> Quantity:
     """The hole's, across the pads."""
     known = scene.scene.hole_clearance_m
+    if reason := scene.unheld("socket") or scene.unheld("plug"):
+        return Quantity("clearance", "clearance", known, "m", FORM, None, reason)
     blocks, reason = _blocks(known, episodes, contacts)
     round_hole = blocks is not None and scene.pair.name == "round"
     if round_hole and blocks.solve(np.ones(len(blocks.rows)), slope=True)[-1] < 0:
@@ -88,8 +93,10 @@ def _blocks(
         side, force, place = np.sign(push[use]), push[use], offset[use, 0]
         walls += [int((side > 0).sum()), int((side < 0).sum())]
         # A wall pushes the plug back: the force on it points away from the wall.
-        error = place + GIVE_M_PER_N * force + side * assumed / 2
-        blocks.append((error[:, None], -side[:, None] / 2, np.ones((len(side), 1, 1))))
+        error = np.append(place + side * assumed / 2, -GIVE_WEIGHT_N * GIVE_M_PER_N)
+        effect = np.append(-side / 2, 0.0)
+        zero, give = np.append(np.ones_like(side), 0.0), np.append(force, GIVE_WEIGHT_N)
+        blocks.append((error[:, None], effect[:, None], np.stack([zero, give], -1)[:, None]))
     if len(blocks) < FEWEST or walls.min() < FEWEST:
         return None, (
             "the inserted plug is not pushed against both walls across the pads in three episodes; insert it "

@@ -16,18 +16,19 @@ from lerobot_vtrefine.diagnose.evidence import Evidence, not_tested
 from lerobot_vtrefine.diagnose.parts import friction as sliding
 from lerobot_vtrefine.diagnose.parts.clearance import clearance, contacts_of
 from lerobot_vtrefine.diagnose.parts.episodes import AssumedScene, HandledEpisode
-from lerobot_vtrefine.diagnose.parts.mass import PARTS, masses, remeasured
-from lerobot_vtrefine.diagnose.parts.payload import GRAVITY_M_S2, Arms, replay_loaded
+from lerobot_vtrefine.diagnose.parts.mass import masses, remeasured
+from lerobot_vtrefine.diagnose.parts.payload import Arms, replay_loaded
 from lerobot_vtrefine.diagnose.parts.problem import Measured, Quantity, measure
 from lerobot_vtrefine.diagnose.verdict import Cause, Verdict
+from lerobot_vtrefine.embodiments.embodiment import PARTS
 from lerobot_vtrefine.sim.scene import build_scene
 
 Array = np.ndarray
 
 NAMES = ("object_mass", "object_friction", "clearance")
 UNKNOWN_PARTS = (
-    "the parts are not known: datasets of vtrefine-record-demos note the assumed scene, others hold no part "
-    "that the twin could carry"
+    "the parts are not known: datasets of vtrefine-record-demos and of the simulated robot note the assumed "
+    "scene, others hold no part that the twin could carry"
 )
 PAD_FRICTION = (
     "friction between pads and part: not identifiable, because pads tell how hard they are pressed but not "
@@ -52,8 +53,8 @@ def weighed(
     arms: Arms, scene: AssumedScene, episodes: Sequence[HandledEpisode], seed: int
 ) -> tuple[Measured, ...]:
     """Socket and plug, as far as episodes show them."""
-    found = measure(masses(arms, episodes, assumed_masses(scene), seed), seed)
-    return remeasured(arms, episodes, found, seed)
+    found = measure(masses(arms, scene, episodes, assumed_masses(scene), seed), seed)
+    return remeasured(arms, scene, episodes, found, seed)
 
 
 def found_masses(arms: Arms, scene: AssumedScene, episodes: Sequence[HandledEpisode], seed: int) -> Array:
@@ -75,8 +76,7 @@ def diagnose_parts(
     """Judge the parts of episodes whose encoders are trusted (what robots get wrong taken off before)."""
     found = list(weighed(arms, scene, episodes, seed))
     mass = np.array([item.believed for item in found])
-    weights = [episode.hanging * mass * GRAVITY_M_S2 for episode in episodes]
-    untouched = replay_loaded(arms, episodes, weights, contacts=False)
+    untouched = replay_loaded(arms, episodes, scene.weights_n(episodes, mass), contacts=False)
     contacts = contacts_of(arms, scene, episodes, untouched)
     found += measure([sliding.friction(scene, episodes, contacts)], seed)
     known = scene.scene.pad_friction

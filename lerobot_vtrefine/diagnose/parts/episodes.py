@@ -1,9 +1,11 @@
 """Episodes of the twin's own robot, with what the pads tell about when parts are held and when they meet.
 
-Shapes: T frames, J joints, 2 hands (left, right). Nothing here reads what only a simulator knows: a simulated
-dataset's note tells which scene was *assumed*, not how its episodes began nor what was hidden in them.
+Shapes: T frames, J joints, A hands in the order of the body's arms. Nothing here reads what only a simulator
+knows: a simulated dataset's note tells which scene was *assumed*, not how its episodes began nor what was
+hidden in them.
 """
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -12,9 +14,10 @@ import torch
 
 from lerobot_vtrefine.datasets.episodes import EpisodeFolder, RecordedEpisode, open_episodes
 from lerobot_vtrefine.diagnose.episode_replay.twin import read_ledger, recorded_twin
-from lerobot_vtrefine.embodiments import ALOHA
+from lerobot_vtrefine.embodiments import Embodiment, get_embodiment
+from lerobot_vtrefine.embodiments.embodiment import PARTS
 from lerobot_vtrefine.sim.config import SceneConfig, TaskConfig
-from lerobot_vtrefine.sim.pairs import PartPair, load_pair
+from lerobot_vtrefine.sim.pairs import Part, PartPair, load_pair
 
 Array = np.ndarray
 
@@ -31,6 +34,7 @@ APART_M = 0.012
 _SIDEWAYS_M = 0.04
 _SETTLE_S = 1.0
 """Time after a touch, or after a part has left the table, in which servos are still recovering."""
+GRAVITY_M_S2 = 9.81
 
 
 @dataclass(frozen=True)
@@ -40,6 +44,35 @@ class AssumedScene:
     scene: SceneConfig
     rules: TaskConfig
     pair: PartPair
+
+    @property
+    def body(self) -> Embodiment:
+        """The robot."""
+        return get_embodiment(self.scene.embodiment)
+
+    @property
+    def parts(self) -> tuple[Part, ...]:
+        """(A,) the part that is every hand's."""
+        return tuple(getattr(self.pair, arm.holds) for arm in self.body.arms)
+
+    def hand_of(self, part: str) -> int | None:
+        """Which hand holds the part in this scene; None if none does, see `unheld`."""
+        return None if self.unheld(part) else self.body.holders[PARTS.index(part)]
+
+    def unheld(self, part: str) -> str:
+        """Why no hand holds the part; empty where one does."""
+        if part == "socket" and self.scene.socket == "stands":
+            return "the socket stands on the table, and no hand feels it"
+        if self.body.holders[PARTS.index(part)] is None:
+            return f"{self.body.name} has no hand that holds the {part}"
+        if self.body.pads_per_arm < 2:
+            return f"{self.body.name} has one pad per hand: whether it holds the {part} takes two that face"
+        return ""
+
+    def weights_n(self, episodes: "Sequence[HandledEpisode]", mass_kg: Array) -> list[Array]:
+        """Per episode (T, A): the weight that hangs in each hand, for masses (2,) of socket and plug."""
+        own = mass_kg[[PARTS.index(arm.holds) for arm in self.body.arms]]
+        return [episode.hanging * own * GRAVITY_M_S2 for episode in episodes]
 
 
 @dataclass(frozen=True)
@@ -54,17 +87,17 @@ class HandledEpisode:
     command: Array
     """(T, J)"""
     touched: Array
-    """(T, 2) bool: some taxel of the hand is pressed."""
+    """(T, A) bool: some taxel of the hand is pressed."""
     held: Array
-    """(T, 2) bool: both pads of the hand are pressed."""
+    """(T, A) bool: both pads of the hand are pressed."""
     hanging: Array
-    """(T, 2) bool: the hand bears a part's weight."""
+    """(T, A) bool: the hand bears a part's weight."""
     carried: Array
-    """(T, 2) bool: and has done so for a while, and nothing else touches the part."""
+    """(T, A) bool: and has done so for a while, and nothing else touches the part."""
     free: Array
-    """(T, 2) bool: the hand is empty and has been so for a while."""
+    """(T, A) bool: the hand is empty and has been so for a while."""
     together: Array
-    """(T,) bool: both hold their parts, so near that these may touch."""
+    """(T,) bool: all hands hold their parts, so near that these may touch."""
 
 
 def assumed_scene(folder: EpisodeFolder) -> AssumedScene | None:
@@ -76,35 +109,23 @@ def assumed_scene(folder: EpisodeFolder) -> AssumedScene | None:
     return AssumedScene(env.scene_config, env.task_config, load_pair(env.scene_config))
 
 
-def is_twins_robot(joints: tuple[str, ...]) -> bool:
-    """Whether joints are those of the MuJoCo twin, in its order."""
-    return tuple(name.removesuffix(".pos") for name in joints) == ALOHA.joint_names
+def read_episodes(root: Path, scene: AssumedScene) -> tuple[HandledEpisode, ...]:
+    """All episodes of a dataset of the scene's robot; without pads nothing counts as held."""
+    return tuple(handled(episode, scene) for episode in open_episodes(root).read())
 
 
-def read_episodes(root: Path, scene: AssumedScene | None) -> tuple[HandledEpisode, ...]:
-    """All episodes of a dataset of the twin's robot; without pads nothing counts as held.
-
-    Raises:
-        ValueError: the dataset's joints are not the twin's.
-    """
-    folder = open_episodes(root)
-    names = folder.joints or (ALOHA.joint_names if folder.num_joints == ALOHA.num_joints else ())
-    if not is_twins_robot(names):
-        raise ValueError(f"{root}: its joints are not those of the twin")
-    return tuple(handled(episode, scene) for episode in folder.read())
-
-
-def handled(episode: RecordedEpisode, scene: AssumedScene | None) -> HandledEpisode:
+def handled(episode: RecordedEpisode, scene: AssumedScene) -> HandledEpisode:
     """Tell an episode's phases by its pads and by where its hands are."""
-    count = len(episode.state)
-    pressed = np.zeros((count, 4), dtype=int)
-    for place, name in enumerate(ALOHA.pad_names):
+    body, count = scene.body, len(episode.state)
+    pressed = np.zeros((count, len(body.pad_names)), dtype=int)
+    for place, name in enumerate(body.pad_names):
         if name in episode.counts:
             above = episode.counts[name].astype(int) - episode.baselines[name].astype(int)
             pressed[:, place] = (above > TOUCHED_COUNTS).sum(1)
-    pressed = pressed.reshape(count, 2, 2)
-    touched, held = pressed.max(2) > 0, pressed.min(2) >= HELD_TAXELS
-    tip, _ = hands(episode.state)
+    pressed = pressed.reshape(count, body.num_arms, body.pads_per_arm)
+    touched = pressed.max(2) > 0
+    held = (pressed.min(2) >= HELD_TAXELS) & (body.pads_per_arm > 1)
+    tip, _ = hands(body, episode.state)
     apart, hanging = _apart(tip, held, scene), _raised(tip[..., 2], held, LIFTED_M)
     clear = _raised(tip[..., 2], held, CLEAR_M)
     settle = max(1, round(_SETTLE_S / max(float(np.median(np.diff(episode.time_s))), 1e-3)))
@@ -122,28 +143,25 @@ def handled(episode: RecordedEpisode, scene: AssumedScene | None) -> HandledEpis
     )
 
 
-def hands(joints: Array) -> tuple[Array, Array]:
-    """TCP positions (T, 2, 3) [m] and rotations (T, 2, 3, 3) at joints (T, J)."""
-    position, rotation = ALOHA.tcp_poses(torch.as_tensor(np.asarray(joints, dtype=float)))
+def hands(body: Embodiment, joints: Array) -> tuple[Array, Array]:
+    """TCP positions (T, A, 3) [m] and rotations (T, A, 3, 3) at joints (T, J)."""
+    position, rotation = body.tcp_poses(torch.as_tensor(np.asarray(joints, dtype=float)))
     return position.numpy(), rotation.numpy()
 
 
-def without_hands(episode: HandledEpisode) -> Array:
+def without_hands(body: Embodiment, episode: HandledEpisode) -> Array:
     """(T, J) commands under which the twin's empty fingers stand where the real ones hold their parts."""
     command = episode.command.copy()
-    per_arm = ALOHA.joints_per_arm
-    for hand in range(2):
-        fingers = slice(per_arm * (hand + 1) - 2, per_arm * (hand + 1))
-        command[:, fingers] = np.where(
-            episode.held[:, hand, None], episode.position[:, fingers], command[:, fingers]
-        )
+    fingers = body.by_arm(command)[..., len(body.joints) :]
+    recorded = body.by_arm(episode.position)[..., len(body.joints) :]
+    fingers[...] = np.where(episode.held[..., None], recorded, fingers)
     return command
 
 
 def _raised(height: Array, held: Array, least_m: float) -> Array:
-    """(T, 2): held, and higher than where the hand took hold; parts held from the start hang already."""
+    """(T, A): held, and higher than where the hand took hold; parts held from the start hang already."""
     out = np.zeros_like(held)
-    for hand in range(2):
+    for hand in range(held.shape[1]):
         frames = np.flatnonzero(held[:, hand])
         if not len(frames):
             continue
@@ -154,7 +172,7 @@ def _raised(height: Array, held: Array, least_m: float) -> Array:
 
 
 def lately(event: Array, frames: int) -> Array:
-    """(T, 2): now, in the next frame, or within the last few ones."""
+    """(T, A): now, in the next frame, or within the last few ones."""
     out = event.copy()
     out[:-1] |= event[1:]
     for lag in range(1, min(frames, len(event) - 1) + 1):
@@ -162,12 +180,18 @@ def lately(event: Array, frames: int) -> Array:
     return out
 
 
-def _apart(tip: Array, held: Array, scene: AssumedScene | None) -> Array:
-    """(T,): the parts, held ideally, are too far from each other to touch; true where parts are unknown."""
-    if scene is None or not held.all(1).any():
+def _apart(tip: Array, held: Array, scene: AssumedScene) -> Array:
+    """(T,): the parts, held ideally, are too far from each other to touch."""
+    socket, plug = (scene.hand_of(part) for part in PARTS)
+    if plug is None or not held[:, plug].any():
         return np.ones(len(tip), dtype=bool)
-    grips = scene.pair.plug.grip.centre_m[2] - scene.pair.socket.grip.centre_m[2]
-    between = tip[:, 1] - tip[:, 0]
-    gap = between[:, 2] - grips - scene.pair.mouth_z_m
+    lower_end = tip[:, plug] - [0.0, 0.0, scene.pair.plug.grip.centre_m[2]]
+    if socket is None:
+        mouth_m = scene.scene.table_height_m + scene.pair.socket.rest_height_m + scene.pair.mouth_z_m
+        return lower_end[:, 2] - mouth_m > APART_M
+    if not held.all(1).any():
+        return np.ones(len(tip), dtype=bool)
+    mouth = tip[:, socket] + [0.0, 0.0, scene.pair.mouth_z_m - scene.pair.socket.grip.centre_m[2]]
+    between = lower_end - mouth
     sideways = np.hypot(between[:, 0], between[:, 1]) > _SIDEWAYS_M
-    return sideways | (gap > APART_M)
+    return sideways | (between[:, 2] > APART_M)

@@ -1,64 +1,54 @@
 """Forces on the hands, read from how far the arms stand from where the twin's arms, untouched, would stand.
 
 A position servo is a spring: held back by a force it lags by that force's torque over its stiffness. Joints
-with dry friction tell little and are weighed accordingly; rolls about the hand's own axis are left out, since
-they depend on where exactly a part is touched. Valid for slow motion.
+with dry friction tell little and are weighed accordingly, and so are those whose axis passes close to the
+point, since where exactly a part is touched is not known. Valid for slow motion.
 
-Shapes: T frames, 2 hands.
+Shapes: T frames, A hands, K revolute joints of an arm.
 """
 
 import numpy as np
 import torch
 
-from lerobot_vtrefine.diagnose.parts.episodes import HandledEpisode
+from lerobot_vtrefine.diagnose.parts.episodes import HandledEpisode, hands
 from lerobot_vtrefine.diagnose.parts.payload import Arms
-from lerobot_vtrefine.embodiments import ALOHA
+from lerobot_vtrefine.embodiments import Embodiment
 
 Array = np.ndarray
 
-JOINTS = ("waist", "shoulder", "elbow", "wrist_angle")
-_NOISE_RAD = 5e-4
-_STEP_RAD = 1e-5
+_NOISE_RAD = 1e-4
+"""Of an encoder, averaged over the frames of a push or a slide; what is touched beside the point does not
+average out."""
+_BESIDE_NM = 0.1
+"""Torque of 10 N that act 10 mm beside the point."""
 
 
 def point_forces(arms: Arms, episode: HandledEpisode, untouched: Array, points: Array) -> Array:
-    """Forces (T, 2, 3) [N], world axes, on points (2, 3) fixed in the hands' TCP frames.
+    """Forces (T, A, 3) [N], world axes, on points (A, 3) fixed in the hands' TCP frames.
 
     Args:
         untouched: (T, J) positions of the twin's arms under the same commands and weights, nothing touching.
     """
-    scale = arms.config.servo_gain_scale
-    out = np.zeros((len(untouched), 2, 3))
-    for hand in range(2):
-        first = ALOHA.joints_per_arm * hand
-        places = [k for k, joint in enumerate(ALOHA.joints) if joint.name in JOINTS]
-        columns = [first + k for k in places]
-        stiffness = np.array([ALOHA.joints[k].stiffness * scale for k in places])
-        friction = np.array([ALOHA.joints[k].friction_loss for k in places])
-        torque = (episode.position - untouched)[:, columns] * stiffness
-        weight = 1.0 / np.hypot(friction, _NOISE_RAD * stiffness)
-        jacobian = _jacobian(episode.position, columns, points[hand], hand)
-        design = np.swapaxes(jacobian, 1, 2) * weight[:, None]
-        normal = np.swapaxes(design, 1, 2) @ design
-        right = np.swapaxes(design, 1, 2) @ (torque * weight)[..., None]
-        ridge = 1e-6 * np.trace(normal, axis1=1, axis2=2)[:, None, None] * np.eye(3)
-        out[:, hand] = np.linalg.solve(normal + ridge, right)[..., 0]
-    return out
+    body = arms.body
+    stiffness = np.array([joint.stiffness for joint in body.joints]) * arms.config.servo_gain_scale
+    friction = np.array([joint.friction_loss for joint in body.joints])
+    information = 1.0 / (friction**2 + (_NOISE_RAD * stiffness) ** 2 + _BESIDE_NM**2)
+    torque = body.by_arm(episode.position - untouched)[..., : len(body.joints)] * stiffness
+    jacobian = _jacobian(body, episode.position, points)
+    normal = np.einsum("k,taki,takj->taij", information, jacobian, jacobian)
+    right = np.einsum("k,taki,tak->tai", information, jacobian, torque)
+    ridge = 1e-6 * np.trace(normal, axis1=-2, axis2=-1)[..., None, None] * np.eye(3)
+    return np.linalg.solve(normal + ridge, right[..., None])[..., 0]
 
 
-def places(joints: Array, points: Array) -> Array:
-    """World positions (T, 2, 3) of points (2, 3) fixed in the TCP frames, at joints (T, J)."""
-    position, rotation = ALOHA.tcp_poses(torch.as_tensor(np.asarray(joints, dtype=float)))
-    return position.numpy() + np.einsum("thij,hj->thi", rotation.numpy(), points)
+def places(body: Embodiment, joints: Array, points: Array) -> Array:
+    """World positions (T, A, 3) of points (A, 3) fixed in the TCP frames, at joints (T, J)."""
+    position, rotation = hands(body, joints)
+    return position + np.einsum("taij,aj->tai", rotation, points)
 
 
-def _jacobian(joints: Array, columns: list[int], point: Array, hand: int) -> Array:
-    """(T, 3, len(columns)) of the point's position."""
-    points = np.zeros((2, 3))
-    points[hand] = point
-    out = []
-    for column in columns:
-        moved = joints.astype(float).copy()
-        moved[:, column] += _STEP_RAD
-        out.append((places(moved, points) - places(joints, points))[:, hand] / _STEP_RAD)
-    return np.stack(out, -1)
+def _jacobian(body: Embodiment, joints: Array, points: Array) -> Array:
+    """(T, A, K, 3): how the points move with each joint of their arm."""
+    chain = body.hands(torch.as_tensor(np.asarray(joints, dtype=float)))
+    lever = places(body, joints, points)[:, :, None] - chain.origins.numpy()
+    return np.cross(chain.axes.numpy(), lever)

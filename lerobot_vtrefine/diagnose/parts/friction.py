@@ -1,7 +1,7 @@
 """Friction of the plug, from the pull against sliding while it is pressed down on the table.
 
-The arm's give tells both forces. Only slides across the pads count: there the joints that tell them have next
-to no dry friction of their own.
+The arm's give tells both forces. Only slides across the pads count: there the joints of ALOHA that tell them
+have next to no dry friction of their own.
 """
 
 from collections.abc import Sequence
@@ -29,20 +29,27 @@ def friction(
 ) -> Quantity:
     """The plug's coefficient."""
     known = scene.scene.part_friction
-    blocks, reason = _blocks(known, episodes, contacts)
+    hand = scene.hand_of("plug")
+    if hand is None:
+        return Quantity("object_friction", "friction", known, "1", FORM, None, scene.unheld("plug"))
+    blocks, reason = _blocks(known, hand, scene.scene.table_height_m, episodes, contacts)
     return Quantity("object_friction", "friction", known, "1", FORM, blocks, reason)
 
 
 def _blocks(
-    assumed: float, episodes: Sequence[HandledEpisode], contacts: Sequence[Contact]
+    assumed: float,
+    hand: int,
+    table_m: float,
+    episodes: Sequence[HandledEpisode],
+    contacts: Sequence[Contact],
 ) -> tuple[Blocks | None, str]:
     """None with the reason where nothing slides under load."""
     blocks = []
     for episode, contact in zip(episodes, contacts, strict=True):
         step_s = float(np.median(np.diff(episode.time_s)))
-        speed = np.gradient(contact.place_m[:, 1], step_s, axis=0)
-        force = contact.force_n[:, 1]
-        use = episode.held[:, 1] & ~episode.together & (np.abs(contact.place_m[:, 1, 2]) < FLAT_M)
+        place, force = contact.place_m[:, hand], contact.force_n[:, hand]
+        speed = np.gradient(place, step_s, axis=0)
+        use = episode.held[:, hand] & ~episode.together & (np.abs(place[:, 2] - table_m) < FLAT_M)
         use &= (force[:, 2] > PRESS_N) & (np.abs(speed[:, 0]) > SLIDES_M_S)
         use &= np.abs(speed[:, 0]) > 2 * np.hypot(speed[:, 1], speed[:, 2])
         if use.sum() < FEWEST_FRAMES:

@@ -13,13 +13,13 @@ Array = np.ndarray
 
 
 def tip_and_mouth(scene: AssumedScene, pitch_rad: Array) -> Array:
-    """(2, 3) [m]: the mouth in the left TCP's frame, the tip in the right one's.
+    """(A, 3) [m]: the mouth, or the tip, in the TCP's frame of the hand that holds the socket, or the plug.
 
     Args:
-        pitch_rad: (2,) how far each hand points down while its part stands upright.
+        pitch_rad: (A,) how far each hand points down while its part stands upright.
     """
-    out = np.zeros((2, 3))
-    for hand, part in enumerate((scene.pair.socket, scene.pair.plug)):
+    out = np.zeros((len(scene.parts), 3))
+    for hand, part in enumerate(scene.parts):
         # In a frame at the TCP whose z is up: ahead to the part's axis, down (or up) to its origin.
         level = np.array([HAND_RETREAT_M, 0.0, -part.grip.centre_m[2]])
         cos, sin = np.cos(pitch_rad[hand]), np.sin(pitch_rad[hand])

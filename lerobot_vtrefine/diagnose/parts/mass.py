@@ -12,16 +12,15 @@ from dataclasses import replace
 
 import numpy as np
 
-from lerobot_vtrefine.diagnose.parts.episodes import HandledEpisode
-from lerobot_vtrefine.diagnose.parts.payload import GRAVITY_M_S2, Arms, replay_loaded
+from lerobot_vtrefine.diagnose.parts.episodes import AssumedScene, HandledEpisode
+from lerobot_vtrefine.diagnose.parts.payload import Arms, replay_loaded
 from lerobot_vtrefine.diagnose.parts.problem import Measured, Quantity
 from lerobot_vtrefine.diagnose.parts.regression import Blocks, Line, slope_of
-from lerobot_vtrefine.embodiments import ALOHA
+from lerobot_vtrefine.embodiments import Embodiment
+from lerobot_vtrefine.embodiments.embodiment import PARTS
 
 Array = np.ndarray
 
-PARTS = ("socket", "plug")
-"""In the order of the hands that hold them."""
 FORM = (0.06, 0.004)
 """What the method errs by on the twin's own recordings: part of the value, and at least so much [kg]."""
 _HEAVIER_KG = 0.05
@@ -39,23 +38,27 @@ chance."""
 
 
 def masses(
-    arms: Arms, episodes: Sequence[HandledEpisode], assumed_kg: Array, seed: int
+    arms: Arms, scene: AssumedScene, episodes: Sequence[HandledEpisode], assumed_kg: Array, seed: int
 ) -> tuple[Quantity, ...]:
     """Of socket and plug, from episodes in which they are picked up; `assumed_kg` is (2,)."""
-    lines = _lines(arms, episodes, assumed_kg)
+    lines = _lines(arms, scene, episodes, assumed_kg)
     out = []
     for part, known, item in zip(PARTS, assumed_kg, lines, strict=True):
         name = f"{part}_kg"
         if isinstance(item, str):
             out.append(Quantity("object_mass", name, float(known), "kg", FORM, None, item))
             continue
-        reason = _disagreement(item, slope_of(Blocks.of(item), seed), seed)
+        reason = _disagreement(arms.body, item, slope_of(Blocks.of(item), seed), seed)
         out.append(Quantity("object_mass", name, float(known), "kg", FORM, Blocks.of(item), reason))
     return tuple(out)
 
 
 def remeasured(
-    arms: Arms, episodes: Sequence[HandledEpisode], found: Sequence[Measured], seed: int
+    arms: Arms,
+    scene: AssumedScene,
+    episodes: Sequence[HandledEpisode],
+    found: Sequence[Measured],
+    seed: int,
 ) -> tuple[Measured, ...]:
     """Masses that are far off, taken anew where they were found: with friction in the joints the weight's
     effect is no straight line. What was found stays found."""
@@ -65,7 +68,8 @@ def remeasured(
     if not (np.abs(near) > _AGAIN * assumed).any():
         return tuple(found)
     out = []
-    for item, lines, step in zip(found, _lines(arms, episodes, assumed + near), near.tolist(), strict=True):
+    again_lines = _lines(arms, scene, episodes, assumed + near)
+    for item, lines, step in zip(found, again_lines, near.tolist(), strict=True):
         if item.line is None or isinstance(lines, str):
             out.append(item)
             continue
@@ -77,14 +81,17 @@ def remeasured(
 
 
 def _lines(
-    arms: Arms, episodes: Sequence[HandledEpisode], assumed_kg: Array
+    arms: Arms, scene: AssumedScene, episodes: Sequence[HandledEpisode], assumed_kg: Array
 ) -> list[list[tuple[Array, Array, Array]] | str]:
-    """Of either hand: blocks for `Blocks.of`, or why there are none."""
-    light = [episode.hanging * assumed_kg * GRAVITY_M_S2 for episode in episodes]
-    heavy = [episode.hanging * (assumed_kg + _HEAVIER_KG) * GRAVITY_M_S2 for episode in episodes]
-    replays = [replay_loaded(arms, episodes, weights) for weights in (light, heavy)]
+    """Of either part: blocks for `Blocks.of`, or why there are none."""
+    masses_kg = assumed_kg, assumed_kg + _HEAVIER_KG
+    replays = [replay_loaded(arms, episodes, scene.weights_n(episodes, mass)) for mass in masses_kg]
     out: list[list[tuple[Array, Array, Array]] | str] = []
-    for hand, part in enumerate(PARTS):
+    for part in PARTS:
+        hand = scene.hand_of(part)
+        if hand is None:
+            out.append(f"{scene.unheld(part)}: its mass is not told")
+            continue
         seen = [bool(e.free[:, hand].any() and e.carried[:, hand].any()) for e in episodes]
         if sum(seen) < _LEAST_EPISODES:
             out.append(
@@ -92,14 +99,15 @@ def _lines(
                 "tell its weight from offsets; record picking it up from the table"
             )
         else:
-            out.append([_block(e, *item, hand) for e, *item in zip(episodes, *replays, strict=True)])
+            paths = zip(episodes, *replays, strict=True)
+            out.append([_block(arms.body, e, *item, hand) for e, *item in paths])
     return out
 
 
-def _disagreement(blocks: list[tuple[Array, Array, Array]], line: Line, seed: int) -> str:
+def _disagreement(body: Embodiment, blocks: list[tuple[Array, Array, Array]], line: Line, seed: int) -> str:
     """Why it is not the mass, although it helps: a mass pulls at every pitching joint, a fault at its own."""
     agree, differ = 0, []
-    for channel, joint in enumerate(ALOHA.joints):
+    for channel, joint in enumerate(body.joints):
         own = [(item[0][:, [channel]], item[1][:, [channel]], item[2][:, [channel]]) for item in blocks]
         if not any(effect.any() for _, effect, _ in own):
             continue
@@ -117,9 +125,12 @@ def _disagreement(blocks: list[tuple[Array, Array, Array]], line: Line, seed: in
     )
 
 
-def _block(episode: HandledEpisode, light: Array, heavy: Array, hand: int) -> tuple[Array, Array, Array]:
-    """Per joint: error (N, 6), the mass's effect (N, 6) per kg, and nuisances (N, 6, 2)."""
-    joints = slice(ALOHA.joints_per_arm * hand, ALOHA.joints_per_arm * hand + len(ALOHA.joints))
+def _block(
+    body: Embodiment, episode: HandledEpisode, light: Array, heavy: Array, hand: int
+) -> tuple[Array, Array, Array]:
+    """Per revolute joint of the arm: error (N, K), the mass's effect (N, K) per kg, nuisances (N, K, 2)."""
+    first = body.joints_per_arm * hand
+    joints = slice(first, first + len(body.joints))
     use = episode.free[:, hand] | episode.carried[:, hand]
     error = (episode.position - light)[use, joints]
     effect = ((heavy - light) / _HEAVIER_KG)[use, joints]

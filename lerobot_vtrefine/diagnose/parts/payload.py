@@ -1,6 +1,6 @@
 """The twin's arms under recorded commands, with weights that hang in their hands for part of an episode.
 
-Shapes: E episodes of T frames, J joints, 2 hands.
+Shapes: E episodes of T frames, J joints, A hands.
 """
 
 from collections.abc import Sequence
@@ -12,7 +12,7 @@ import torch
 from mujoco.batch import Batch
 
 from lerobot_vtrefine.diagnose.parts.episodes import HandledEpisode, without_hands
-from lerobot_vtrefine.embodiments import ALOHA
+from lerobot_vtrefine.embodiments import Embodiment, get_embodiment
 from lerobot_vtrefine.sim import task
 from lerobot_vtrefine.sim.backends.base import ramp
 from lerobot_vtrefine.sim.backends.batch import usable_cores
@@ -21,8 +21,6 @@ from lerobot_vtrefine.sim.scene import build_arms
 from lerobot_vtrefine.sim.starts import HAND_RETREAT_M
 
 Array = np.ndarray
-
-GRAVITY_M_S2 = 9.81
 
 
 @dataclass(frozen=True)
@@ -36,6 +34,11 @@ class Arms:
     hold: str
     """linear (as `InsertionSim`) or zero_order (as motors)."""
 
+    @property
+    def body(self) -> Embodiment:
+        """The robot."""
+        return get_embodiment(self.config.embodiment)
+
 
 def replay_loaded(
     arms: Arms,
@@ -47,7 +50,7 @@ def replay_loaded(
     """Joint positions (T, J) of the twin's arms in every episode, from its first position at rest.
 
     Args:
-        weight_n: per episode (T, 2), the weight in each hand while frame t + 1 comes about, at the place
+        weight_n: per episode (T, A), the weight in each hand while frame t + 1 comes about, at the place
             where hands hold parts ideally; none by default.
         contacts: whether hands stop at the table and at each other.
     """
@@ -58,7 +61,7 @@ def replay_loaded(
         model.opt.disableflags |= int(mujoco.mjtDisableBit.mjDSBL_CONTACT)
     lengths = [len(episode.command) for episode in episodes]
     commands = np.stack([_padded(given(arms, item), max(lengths)) for item in episodes], 1)
-    weights = np.zeros((max(lengths), len(episodes), 2))
+    weights = np.zeros((max(lengths), len(episodes), robot.num_arms))
     for place, values in enumerate(weight_n or []):
         weights[: len(values), place] = values
     worlds = Batch(model, nsim=len(episodes), nthread=usable_cores())
@@ -68,12 +71,13 @@ def replay_loaded(
     qpos[:] = 0.0
     qpos[:, joints] = np.clip(start, robot.lower, robot.upper)
     qvel[:] = 0.0
-    hand_bodies = [model.body(f"{arm.name}_wrist_rotate").id for arm in robot.arms]
+    last = robot.joints[-1].name
+    hand_bodies = [model.body(f"{arm.name}_{last}").id for arm in robot.arms]
     before, path = task.servo_commands(robot, start), [qpos[:, joints].copy()]
     for command, weight in zip(commands[:-1], weights[:-1], strict=True):
         after = task.servo_commands(robot, command)
         if weight.any() or push[:, hand_bodies].any():
-            push[:, hand_bodies] = _wrenches(path[-1], weight)
+            push[:, hand_bodies] = _wrenches(robot, path[-1], weight)
         if arms.hold == "linear":
             controls = ramp(before, after, substeps)
         else:
@@ -87,24 +91,24 @@ def replay_loaded(
 
 def given(arms: Arms, episode: HandledEpisode) -> Array:
     """(T, J) commands as the servos get them: within limits and rates, fingers where they hold something."""
-    wanted = task.servo_commands(ALOHA, without_hands(episode))
+    body = arms.body
+    wanted = task.servo_commands(body, without_hands(body, episode))
     if arms.rules is None:
-        return task.joint_targets(ALOHA, wanted)
-    rates = task.rate_limits(ALOHA, arms.rules)
-    now, out = task.servo_commands(ALOHA, episode.position[:1])[0], []
+        return task.joint_targets(body, wanted)
+    rates = task.rate_limits(body, arms.rules)
+    now, out = task.servo_commands(body, episode.position[:1])[0], []
     for row in wanted:
         now = np.clip(row, now - rates, now + rates)
         out.append(now)
-    return task.joint_targets(ALOHA, np.array(out))
+    return task.joint_targets(body, np.array(out))
 
 
-def _wrenches(joints: Array, weight: Array) -> Array:
-    """(E, 2, 6) force and torque on the hands' centres of mass of weights (E, 2) where parts are held."""
-    _, rotation = ALOHA.tcp_poses(torch.as_tensor(joints))
-    turn = rotation.numpy()
-    com = np.asarray(next(item for item in ALOHA.joints if item.name == "wrist_rotate").com_m)
-    lever = turn @ (np.array([ALOHA.tcp_offset_m, 0.0, 0.0]) - com)
-    ahead = turn[..., 0] * [1.0, 1.0, 0.0]
+def _wrenches(body: Embodiment, joints: Array, weight: Array) -> Array:
+    """(E, A, 6) force and torque on the last links' centres of mass: weights (E, A) where parts are held."""
+    chain = body.hands(torch.as_tensor(joints))
+    position, rotation = (item.numpy() for item in chain.tcp())
+    lever = position - chain.position.numpy() - rotation @ np.asarray(body.joints[-1].com_m)
+    ahead = rotation[..., 0] * [1.0, 1.0, 0.0]
     lever = lever + HAND_RETREAT_M * ahead / np.linalg.norm(ahead, axis=-1, keepdims=True).clip(1e-9)
     force = np.zeros((*weight.shape, 3))
     force[..., 2] = -weight

@@ -17,6 +17,8 @@ from lerobot_vtrefine.teleoperators.inputs.heard import HeardHands
 from lerobot_vtrefine.teleoperators.inputs.webxr import Message, serve_page
 
 PAGE = Path(__file__).parents[2] / "assets" / "headset"
+HANDS = ("left", "right")
+"""What the page calls the controllers; they drive the arms in their order."""
 OPERATOR = np.array([[0.0, 0.0, -1.0], [-1.0, 0.0, 0.0], [0.0, 1.0, 0.0]])
 """WebXR's axes (x right, y up, z back) in the operator's (x forward, y left, z up)."""
 
@@ -33,7 +35,7 @@ def pose_of(hand: Mapping[str, Any]) -> np.ndarray:
 
 
 class HeadsetControllers:
-    """Serves one page; the controllers of the left and the right hand drive the arms of these names.
+    """Serves one page; the controllers of the left and the right hand drive the arms, in their order.
 
     Args:
         port: of the page.
@@ -58,11 +60,11 @@ class HeadsetControllers:
     def hear(self, _pose: np.ndarray, message: Message) -> None:
         """The page has spoken; a controller that it does not mention is not tracked."""
         hands = message.get("hands", {})
-        for arm in self._arms:
-            if arm not in hands:
+        for arm, name in zip(self._arms, HANDS, strict=False):
+            if name not in hands:
                 self._hands.lose(arm)
                 continue
-            hand = hands[arm]
+            hand = hands[name]
             pulled = bool(hand["trigger"])
             pressed, self._pulled[arm] = pulled and not self._pulled[arm], pulled
             self._hands.hear(arm, pose_of(hand), bool(hand["squeeze"]), pressed)

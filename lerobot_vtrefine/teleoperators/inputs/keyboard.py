@@ -9,12 +9,13 @@ import numpy as np
 from lerobot_vtrefine.teleoperators.inputs.speed import Push
 
 KEYS = (
-    {"forward": "w", "back": "s", "left": "a", "right": "d", "up": "e", "down": "q", "grip": "f"}
-    | {"turn_left": "z", "turn_right": "x", "tip_up": "c", "tip_down": "v"},
-    {"forward": "i", "back": "k", "left": "j", "right": "l", "up": "o", "down": "u", "grip": "h"}
-    | {"turn_left": "n", "turn_right": "m", "tip_up": ",", "tip_down": "."},
+    {"forward": "w", "back": "s", "left": "a", "right": "d", "up": "e", "down": "c", "grip": "f"}
+    | {"turn_left": "z", "turn_right": "x", "tip_up": "t", "tip_down": "g"},
+    {"forward": "i", "back": "k", "left": "j", "right": "l", "up": "o", "down": ".", "grip": "h"}
+    | {"turn_left": "m", "turn_right": ",", "tip_up": "p", "tip_down": "u"},
 )
-"""Left hand, right hand."""
+"""First arm, second arm. N, R and Q are LeRobot's: its recording goes on, starts an episode anew, and ends by
+them."""
 WAYS = (("forward", "back"), ("left", "right"), ("up", "down"))
 TURNS = ((None, None), ("tip_down", "tip_up"), ("turn_left", "turn_right"))
 

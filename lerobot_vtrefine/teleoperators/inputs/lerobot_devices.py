@@ -17,6 +17,7 @@ from lerobot.teleoperators.teleoperator import Teleoperator
 from lerobot.teleoperators.utils import make_teleoperator_from_config
 from lerobot.utils.errors import DeviceNotConnectedError
 
+from lerobot_vtrefine.lerobot_compat import arrow_keys
 from lerobot_vtrefine.teleoperators.hand_motion import HandSample, moved, still
 
 TYPES = ("gamepad", "keyboard_ee", "phone")
@@ -56,6 +57,8 @@ class LeRobotDevices:
                 raise ValueError(
                     f"--teleop.devices: the {device.name} for the {arm} hand cannot be read here"
                 )
+            if isinstance(device, keyboard.KeyboardEndEffectorTeleop):
+                arrow_keys.install()
 
     def restart(self, grips: Mapping[str, float]) -> None:
         """The devices are at rest, and the hands closed as they are."""
@@ -78,6 +81,7 @@ class LeRobotDevices:
 
     def disconnect(self) -> None:
         """Close all of them."""
+        arrow_keys.uninstall()
         for device in self._devices.values():
             if device.is_connected:
                 device.disconnect()

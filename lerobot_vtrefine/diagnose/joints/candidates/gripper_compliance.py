@@ -31,8 +31,8 @@ def _loaded(problem: ServoTrials) -> Array:
 
 def _may_meet(problem: ServoTrials) -> Array:
     """(J,) bool: grippers that may be stopped; no load is needed to see that."""
-    slides = [gravity.is_gripper(name) and gravity.is_sliding(name) for name in problem.names]
-    return moving(problem) & np.array(slides) & (problem.batch.load is None)
+    grippers = [gravity.is_gripper(name) for name in problem.names]
+    return moving(problem) & np.array(grippers) & (problem.batch.load is None)
 
 
 def _where_it_stops(problem: ServoTrials, joints: Array) -> Array:
@@ -86,12 +86,13 @@ def sizes(estimates: Estimates, joints: tuple[int, ...]) -> dict[str, Parameter]
     loaded = tuple(joint for joint in joints if free[joint, [INDEX["bend"], INDEX["flex"]]].any())
     out = {"m_per_n": _compliance(estimates, loaded)} if loaded else {}
     for joint in joints:
-        for parameter, unit in (("stop", "m"), ("give", "1")):
+        name = estimates.selection.problem.names[joint]
+        length = "m" if gravity.is_sliding(name) else "rad"
+        for parameter, unit in (("stop", length), ("give", "1")):
             column = INDEX[parameter]
             if free[joint, column]:
                 value = float(theta[joint, column])
-                name = estimates.selection.problem.names[joint]
-                key = f"{name}_{parameter}" + ("_m" if unit == "m" else "")
+                key = f"{name}_{parameter}" + ("" if unit == "1" else f"_{unit}")
                 out[key] = Parameter(value, jackknife(estimates.theta[:, joint, column], value), unit)
     return out
 

@@ -1,0 +1,34 @@
+"""The arrow keys move a hand, and no longer end an episode, while `keyboard_ee` drives one.
+
+``lerobot-record`` takes the right arrow for the next episode and the left one for an episode anew. N and R do
+the same, and stay.
+"""
+
+import logging
+
+from lerobot.utils import keyboard_input
+
+from lerobot_vtrefine.lerobot_compat.guard import is_supported
+
+logger = logging.getLogger(__name__)
+
+NAMES = ("left", "right")
+
+
+def install() -> None:
+    """LeRobot's key listeners no longer hear the left and the right arrow."""
+    if not is_supported():
+        logger.warning("this LeRobot may take the arrow keys for itself: use --teleop.input=keyboard")
+        return
+    known = keyboard_input._PYNPUT_KEY_NAMES
+    for key in [key for key, name in known.items() if name in NAMES]:
+        _unheard[key] = known.pop(key)
+
+
+def uninstall() -> None:
+    """They hear them again."""
+    keyboard_input._PYNPUT_KEY_NAMES.update(_unheard)
+    _unheard.clear()
+
+
+_unheard: dict[object, str] = {}
