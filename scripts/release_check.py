@@ -35,7 +35,7 @@ def build(uv: str) -> Path:
     """Wheel and source archive in a new folder; the wheel's path."""
     shutil.rmtree(FOLDER, ignore_errors=True)
     dist = FOLDER / "dist"
-    run([uv, "build", "--quiet", "--out-dir", str(dist), str(ROOT)])
+    run([uv, "build", "--quiet", "--python", sys.executable, "--out-dir", str(dist), str(ROOT)])
     archives = sorted(str(path) for path in dist.glob("*.*") if path.suffix in (".whl", ".gz"))
     run([uv, "tool", "run", "--quiet", "twine", "check", "--strict", *archives])
     return next(dist.glob("*.whl"))

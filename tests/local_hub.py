@@ -48,6 +48,7 @@ def use_folder_as_hub(patch: pytest.MonkeyPatch, hub: Path) -> None:
     def push_card(card: DatasetCard, repo_id: str, **_: Any) -> None:
         card.save(hub / repo_id / "README.md")
 
+    patch.setenv("HF_TOKEN", "of nobody")
     api = type("Api", (FolderApi,), {"hub": hub})
     patch.setattr(huggingface_hub, "HfApi", api)
     patch.setattr(lerobot_dataset, "HfApi", api)

@@ -2,6 +2,7 @@
 
 import argparse
 import json
+import shlex
 from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -26,11 +27,11 @@ Results in the output folder:
   report.html        response curves, uncertainty, presses over time, on one page that needs no network
 
 What to record: at least 4 presses (better 16), each beginning above the pad; at least three depths and three
-speeds; depth and load cell (depth_m and force_n in docs/recording-format.md).
+speeds; depth and load cell (depth_m and force_n: vtrefine-diagnose --help_format).
 
 examples:
   vtrefine-calibrate --recording=presses --output_dir=calibration
-  vtrefine-calibrate --recording=presses --k_n=400 --output_dir=calibration      without a load cell"""
+  vtrefine-calibrate --recording=presses --k_n=400 --output_dir=calibration      # without a load cell"""
 
 
 def make_parser() -> CommandParser:
@@ -55,7 +56,7 @@ def make_parser() -> CommandParser:
         default=CONTACTS[0],
         help="stage that gets the stiffness: the paper's, or the simulator's load-consistent foundation",
     )
-    parser.add_argument("--seed", type=int, default=0, help="of resampling (default %(default)s)")
+    parser.add_argument("--seed", type=int, default=0, help="of resampling (default: %(default)s)")
     parser.add_argument("--overwrite", action="store_true", help="replace results that are there already")
     return parser
 
@@ -91,7 +92,8 @@ def run(options: argparse.Namespace, folder: Path) -> "Calibration":
     calibration.model.save(folder / FILES[0])
     text = json.dumps(summary(calibration, source), indent=2)
     (folder / FILES[1]).write_text(text + "\n", encoding="utf-8")
-    (folder / FILES[2]).write_text(render_page(calibration, source), encoding="utf-8")
+    page = render_page(calibration, source, shlex.quote(str(options.output_dir / FILES[0])))
+    (folder / FILES[2]).write_text(page, encoding="utf-8")
     return calibration
 
 

@@ -1,8 +1,8 @@
 """``vtrefine-demo``: run demonstrations, imitation, DPPO and evaluations, and write a report of them.
 
 examples:
-  vtrefine-demo --quick                        minutes: tiny numbers, to see that everything works here
-  vtrefine-demo                                a quarter of an hour on two cores
+  vtrefine-demo --quick                        # minutes: tiny numbers, to see that everything works here
+  vtrefine-demo                                # a quarter of an hour on two cores
   vtrefine-demo --config_path=vtrefine:kinova_round_grasped --recipe=cloud --output_dir=outputs/demo_kinova
   vtrefine-demo --output_dir=outputs/square --env='{pair: square, clearance_m: 0.001, start: grasped}'
 
@@ -67,7 +67,16 @@ def make_gif(config: DemoConfig, videos: Sequence[dict[str, object]]) -> None:
 
 
 def run_demo(config: DemoConfig) -> Path:
-    """Run every stage that is not done yet and write the report; return the page's path."""
+    """Run every stage that is not done yet and write the report; return the page's path.
+
+    Raises:
+        ValueError: a GPU is asked for and there is none; the stages would take the processor and not say so.
+    """
+    if config.device.startswith("cuda"):
+        import torch
+
+        if not torch.cuda.is_available():
+            raise ValueError(f"--device={config.device}: PyTorch finds no NVIDIA GPU; leave the flag out")
     config.output_dir.mkdir(parents=True, exist_ok=True)
     runner = StageRunner(config.output_dir, demo_stages(config))
     print(

@@ -1,6 +1,7 @@
 """``vtrefine-diagnose``: name what the simulation gets wrong, repair its model and measure the gain."""
 
 import argparse
+import shlex
 from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -18,6 +19,8 @@ if TYPE_CHECKING:
 
 FILES = ("baseline_model.json", "sensor_model.json", "report.html", "verdict.json")
 """What a run leaves in the output folder; the verdict last, so that it stands for a whole run."""
+SHOWN_ISSUES = 4
+"""Problems of the data that the terminal tells; the report tells all."""
 DESCRIPTION = """\
 Compare measured recordings with the simulation, name what the simulation gets wrong, extend its model
 by that and measure the gain on recordings that no fit and no choice has seen.
@@ -57,7 +60,7 @@ def make_parser() -> CommandParser:
         "--output_dir", type=Path, required=True, metavar="DIR", help="folder for the results"
     )
     parser.add_argument(
-        "--seed", type=int, default=0, help="of resampling and of what is held out (default %(default)s)"
+        "--seed", type=int, default=0, help="of resampling and of what is held out (default: %(default)s)"
     )
     parser.add_argument(
         "--stability",
@@ -65,7 +68,7 @@ def make_parser() -> CommandParser:
         default=0,
         metavar="N",
         help="diagnose 2 N times more, with other recordings held out and with halves of them, and say which "
-        "names survive (default %(default)s)",
+        "names survive (default: %(default)s)",
     )
     parser.add_argument("--overwrite", action="store_true", help="replace results that are there already")
     add_format_flags(parser)
@@ -78,7 +81,9 @@ def main(arguments: Sequence[str] | None = None) -> None:
     options = make_parser().parse_args(arguments)
     check(options)
     with staged(options.output_dir, FILES, overwrite=options.overwrite) as folder:
-        verdict, unit, survived = run(read(options), folder, options.seed, options.stability)
+        verdict, unit, survived = run(
+            read(options), folder, options.seed, options.stability, options.output_dir
+        )
     summarise(verdict, unit, options.output_dir, survived)
 
 
@@ -105,10 +110,10 @@ def read(options: argparse.Namespace) -> "RecordingSet":
 
 
 def run(
-    recordings: "RecordingSet", folder: Path, seed: int, repetitions: int = 0
+    recordings: "RecordingSet", folder: Path, seed: int, repetitions: int = 0, final: Path | None = None
 ) -> tuple["Verdict", str, str]:
     """Diagnose, and write all result files into ``folder``; the verdict, its unit of error, and what survives
-    repetitions in one line."""
+    repetitions in one line. The page names files in ``final``, where the results will be."""
     from lerobot_vtrefine.cli.report.press_film import press_film
     from lerobot_vtrefine.diagnose.api import diagnose
     from lerobot_vtrefine.diagnose.report import render_report
@@ -127,8 +132,9 @@ def run(
     for model, name in zip((found.baseline_model, found.extended_model), FILES[:2], strict=True):
         if model is not None:
             model.save(folder / name)
+    model = shlex.quote(str((final or folder) / FILES[1]))
     film = press_film(found, recordings)
-    page = render_report(found.verdict, found, recordings, found.checked, seed, film, survived)
+    page = render_report(found.verdict, found, recordings, found.checked, seed, film, survived, model)
     (folder / "report.html").write_text(page, encoding="utf-8")
     write_verdict(found.verdict, folder / "verdict.json")
     return found.verdict, found.unit, survived
@@ -143,9 +149,10 @@ def summarise(verdict: "Verdict", unit: str, output_dir: Path, survived: str) ->
         print(power)
     if survived:
         print(f"stability: {survived}")
-    if verdict.data_issues:
-        aside = sum(issue.action == "set aside" for issue in verdict.data_issues)
-        print(f"data issues: {len(verdict.data_issues)}, {aside} recordings set aside")
+    for issue in verdict.data_issues[:SHOWN_ISSUES]:
+        print(f"{issue.trial or 'all recordings'}: {issue.problem} ({issue.action})")
+    if (more := len(verdict.data_issues) - SHOWN_ISSUES) > 0:
+        print(f"{more} more problems of the data are in the report")
     print(f"report: {output_dir / 'report.html'}")
 
 

@@ -7,7 +7,7 @@ import functools
 import os
 import re
 import sys
-from collections.abc import Callable, Generator, Sequence
+from collections.abc import Callable, Generator, Iterable, Sequence
 from difflib import get_close_matches
 from pathlib import Path
 from typing import NoReturn
@@ -49,14 +49,42 @@ def _message(error: BaseException) -> str:
     if isinstance(error, ModuleNotFoundError) and (advice := explain(error)) is not None:
         return advice
     message = " ".join(str(error).split())
+    if isinstance(error, _weights_errors()) and os.strerror(errno.ENOSPC) in message:
+        return _message(OSError(errno.ENOSPC, ""))
+    if isinstance(error, _network_errors()) and not isinstance(error, OSError):
+        return f"the network did not answer ({message}); nothing is lost: go online and repeat the command"
     return _in_flags(message) or type(error).__name__
+
+
+def _of_library(module: str, name: str) -> tuple[type[Exception], ...]:
+    """An exception of a library that nobody imports here only to catch it; nothing where it is not in use."""
+    library = sys.modules.get(module)
+    return () if library is None else (getattr(library, name),)
+
+
+def _network_errors() -> tuple[type[Exception], ...]:
+    """What the Hub's client raises where no server answers."""
+    return _of_library("httpx", "HTTPError")
+
+
+def _weights_errors() -> tuple[type[Exception], ...]:
+    """What is raised where weights cannot be written or read; a full disk, too."""
+    return _of_library("safetensors", "SafetensorError")
 
 
 def _in_flags(message: str) -> str:
     """draccus speaks of Python classes; users type flags."""
     if "Expected a dict with a 'type' key" in message and "EnvConfig" in message:
-        return f"say which environment: --env.type=vtrefine or --config_path=vtrefine:NAME ({message})"
+        return "say which environment: --env.type=vtrefine or --config_path=vtrefine:NAME"
     return message
+
+
+def meant(message: str, known: Iterable[str]) -> str:
+    """Which flags were meant, for argparse's message about unknown ones; else where they are listed."""
+    known = list(known)
+    typed = re.findall(r"--[\w.-]+", message.partition("unrecognized arguments")[2])
+    found = [name for flag in typed for name in get_close_matches(flag, known, 1)]
+    return "".join(f"; did you mean {name}?" for name in found) or "; --help lists the flags"
 
 
 def _is_wrapper(error: DraccusException) -> bool:
@@ -64,19 +92,19 @@ def _is_wrapper(error: DraccusException) -> bool:
     return "Couldn't instantiate class" in str(error)
 
 
-def config_files(arguments: Sequence[str]) -> list[str]:
-    """What the arguments give as ``--config_path``: files, or names on the Hub."""
+def values_of(wanted: str, arguments: Sequence[str]) -> list[str]:
+    """What the arguments give for a flag, as ``--flag=value`` or ``--flag value``."""
     split = [argument.partition("=") for argument in arguments]
     return [
         value if equals else "".join(arguments[index + 1 : index + 2])
         for index, (flag, equals, value) in enumerate(split)
-        if flag == CONFIG_FLAG
+        if flag == wanted
     ]
 
 
 def _check_config_file(arguments: Sequence[str]) -> None:
     """What draccus will read, before it does: it has no bounds. Names on the Hub are left to LeRobot."""
-    for given in config_files(arguments):
+    for given in values_of(CONFIG_FLAG, arguments):
         if Path(given).is_file():
             check_settings(given)
 
@@ -86,10 +114,7 @@ def _argparse_in_one_line() -> Generator[None]:
     """draccus' parsers print a hundred lines of usage before they say which flag they do not know."""
 
     def error(parser: argparse.ArgumentParser, message: str) -> NoReturn:
-        typed = re.findall(r"--[\w.]+", message.partition("unrecognized arguments")[2])
-        near = [get_close_matches(flag, parser._option_string_actions, 1) for flag in typed]
-        meant = "".join(f"; did you mean {name}?" for names in near for name in names)
-        raise ValueError(f"{message}{meant or '; --help lists the flags'}")
+        raise ValueError(f"{message}{meant(message, parser._option_string_actions)}")
 
     stock = argparse.ArgumentParser.error
     argparse.ArgumentParser.error = error  # ty: ignore[invalid-assignment]
@@ -97,6 +122,15 @@ def _argparse_in_one_line() -> Generator[None]:
         yield
     finally:
         argparse.ArgumentParser.error = stock
+
+
+@contextlib.contextmanager
+def after_interrupt(advice: str) -> Generator[None]:
+    """Ctrl-C within is told together with how to go on."""
+    try:
+        yield
+    except KeyboardInterrupt:
+        raise KeyboardInterrupt(advice) from None
 
 
 def run_cli[**P](main: Callable[P, int | None]) -> Callable[P, int]:
@@ -114,10 +148,10 @@ def run_cli[**P](main: Callable[P, int | None]) -> Callable[P, int]:
             _check_config_file(sys.argv[1:])
             with _argparse_in_one_line():
                 return main(*args, **kwargs) or 0
-        except KeyboardInterrupt:
-            print("interrupted", file=sys.stderr)
+        except KeyboardInterrupt as stopped:
+            print(f"interrupted{f': {stopped}' if stopped.args else ''}", file=sys.stderr)
             return INTERRUPT_STATUS
-        except EXPECTED as error:
+        except (*EXPECTED, *_network_errors(), *_weights_errors()) as error:
             if os.environ.get(DEBUG_VARIABLE) == "1":
                 raise
             print(f"error: {describe(error)}", file=sys.stderr)

@@ -26,7 +26,7 @@ it, and the answer is written with stable USB paths."""
 EPILOG = """\
 examples:
   vtrefine-find-pads --output=pads.yaml
-  vtrefine-pad-emulator --source=press &          without hardware
+  vtrefine-pad-emulator --source=press &          # without hardware
   vtrefine-find-pads --ports outputs/pads/* --output=pads.yaml"""
 SLIDE_S = 5.0
 """How long a finger slides over a pad [s]."""
@@ -36,7 +36,7 @@ def make_parser() -> CommandParser:
     """Command line of `vtrefine-find-pads`."""
     parser = CommandParser("vtrefine-find-pads", DESCRIPTION, EPILOG)
     parser.add_argument(
-        "--output", type=Path, default=Path("pads.yaml"), help="file to write (default %(default)s)"
+        "--output", type=Path, default=Path("pads.yaml"), help="file to write (default: %(default)s)"
     )
     parser.add_argument(
         "--names", nargs="+", default=list(PADS), metavar="NAME", help="pads to ask for, in this order"
@@ -48,7 +48,7 @@ def make_parser() -> CommandParser:
         help="ports to look at (default: every USB serial port of this machine)",
     )
     parser.add_argument(
-        "--timeout", type=float, default=60.0, help="seconds to wait for each press (%(default)s)"
+        "--timeout", type=float, default=60.0, help="seconds to wait for each press (default: %(default)s)"
     )
     parser.add_argument(
         "--check_rows",

@@ -17,12 +17,12 @@ from lerobot.configs import parser
 from lerobot.utils.import_utils import register_third_party_plugins
 from lerobot.utils.utils import init_logging
 
-from lerobot_vtrefine.cli.errors import run_cli
+from lerobot_vtrefine.cli.errors import after_interrupt, run_cli
+from lerobot_vtrefine.cli.hub import check_upload
 from lerobot_vtrefine.cli.report.results import verdict
 from lerobot_vtrefine.cli.report.statistics import proportion
 from lerobot_vtrefine.cli.results.collect import evaluated_episodes
 from lerobot_vtrefine.cli.results.provenance import write_provenance
-from lerobot_vtrefine.cli.sharing import check_repo_id
 from lerobot_vtrefine.finetune.logger import read_progress
 from lerobot_vtrefine.finetune.pipeline import FinetunePipelineConfig, run
 
@@ -33,7 +33,8 @@ LEROBOTS_SHARING = ("--push_to_hub=true", "--repo_id=")
 def finetune(cfg: FinetunePipelineConfig) -> None:
     """Parse the command line as LeRobot's commands do, and run."""
     _check_sharing(cfg)
-    run(cfg)
+    with after_interrupt("the same command with --resume=true goes on from the last checkpoint"):
+        run(cfg)
     write_provenance(cfg.output_dir)
     first = os.environ.get("RANK", "0") == "0"
     if first:
@@ -51,7 +52,7 @@ def outcome(cfg: FinetunePipelineConfig) -> str:
     """Held-out success before and after, in a sentence; DPPO can unlearn, too."""
     rates = [row["eval_success"] for row in read_progress(cfg.output_dir) if "eval_success" in row]
     if len(rates) < 2:
-        return "held-out success was not measured twice: --eval_freq"
+        return "success was not measured before and after; --eval_freq=10 does so"
     episodes = evaluated_episodes(cfg.eval.n_episodes, cfg.dppo.num_envs)
     before, after = (proportion(round(rate * episodes), episodes) for rate in (rates[0], rates[-1]))
     return verdict(before, after)
@@ -64,7 +65,7 @@ def _check_sharing(cfg: FinetunePipelineConfig) -> None:
             "share the result with --push_to_hub=true --repo_id=USER/NAME, without policy. before them"
         )
     if cfg.push_to_hub:
-        check_repo_id(cfg.repo_id or "")
+        check_upload(cfg.repo_id or "")
 
 
 @run_cli

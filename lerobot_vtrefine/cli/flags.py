@@ -42,10 +42,19 @@ def describe_module(module: str) -> tuple[str, str]:
     return sentence[:1].upper() + sentence[1:], rest.replace("::\n", ":\n").strip()
 
 
-def flags_of(module: str, name: str, prefix: str = "", *, nested: bool = False) -> list[Flag]:
-    """The fields of a dataclass as flags; with ``nested``, also those of the dataclasses that it holds."""
+def flags_of(
+    module: str, name: str, prefix: str = "", *, nested: bool = False, unused: bool = False
+) -> list[Flag]:
+    """The fields of a dataclass as flags.
+
+    Args:
+        nested: also those of the dataclasses that it holds.
+        unused: also those that a command takes and does nothing with.
+    """
     found = []
     for flag in _fields(module, name, prefix):
+        if flag.text.startswith("Unused") and not unused:
+            continue
         found.append(flag)
         if nested and flag.group is not None:
             found += flags_of(*flag.group, f"{flag.name}.", nested=True)
@@ -67,8 +76,6 @@ def _fields(module: str, name: str, prefix: str) -> Iterator[Flag]:
         if kind.startswith("ClassVar"):
             continue
         text = _docstring(following) or _comment(lines, entry.lineno - 1)
-        if text.startswith("Unused"):
-            continue
         group = _defined_in(module, kind.removesuffix(" | None"))
         default = None if group is not None and entry.value is not None else _default(entry.value)
         name = prefix + entry.target.id

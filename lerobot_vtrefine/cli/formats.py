@@ -41,9 +41,9 @@ def _write_template(folder: str) -> str:
 
 
 def add_format_flags(parser: argparse.ArgumentParser) -> None:
-    """Add --help-format and --template."""
+    """Add --help_format and --template."""
     parser.add_argument(
-        "--help-format",
+        "--help_format",
         nargs="?",
         metavar="NAME",
         action=_Answer,

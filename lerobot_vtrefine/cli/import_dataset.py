@@ -1,7 +1,7 @@
 """``vtrefine-import``: turn datasets of others into LeRobotDatasets with this project's features.
 
 examples:
-  vtrefine-import --source=aloha_31_episodes.npz --root=outputs/aloha        the VT-Refine authors' file
+  vtrefine-import --source=aloha_31_episodes.npz --root=outputs/aloha        # the VT-Refine authors' file
   vtrefine-import --source=LEFLEXITAC_DATASET --root=outputs/pads --pads='{primary: left_arm_left_finger}'
   vtrefine-import --source=bam_xl330.npz --recording_dir=outputs/xl330       BAM's logs of a servo
 """

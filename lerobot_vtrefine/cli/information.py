@@ -31,6 +31,7 @@ class InformationConfig:
     output_dir: Path = Path("outputs/information")
     """Folder of information.json, report.html and the trained encoders; replaced as a whole."""
     env: EnvConfig = field(default_factory=VtRefineEnvConfig)
+    """The task that is looked into."""
     senses: tuple[str, ...] = ("joints", "visual", "tactile", "visuo_tactile")
     """Of joints, visual, tactile, visuo_tactile, visuo_tactile_cloud (paper: taxels as points)."""
     effort: Effort = field(default_factory=Effort)

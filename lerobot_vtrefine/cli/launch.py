@@ -3,36 +3,39 @@
 import importlib
 import sys
 import textwrap
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from functools import partial
-from pathlib import Path
 
-import yaml
-
-from lerobot_vtrefine.cli.errors import config_files, run_cli
+from lerobot_vtrefine.cli.checks import check_arguments
+from lerobot_vtrefine.cli.errors import run_cli
 from lerobot_vtrefine.cli.flags import Flag, describe_module, flags_of
 
 HELP_FLAGS = ("-h", "--help")
 WIDTH = 100
 INDENT = 30
-WANTED = {"env": "say which task, --config_path=vtrefine:NAME or --env.type=vtrefine."}
-"""What to give for a group of flags."""
 
 
 def launch(command: str, module: str, config: str) -> int:
     """Show help, or run ``lerobot_vtrefine.cli.COMMAND``, whose flags are the fields of ``module.config``.
 
     Raises:
-        ValueError: a flag is missing; told before LeRobot is imported, which takes ten seconds.
+        ValueError: a flag is missing or unknown. OSError: a file or a folder is not there. Told before
+            LeRobot is imported, which takes ten seconds.
     """
     name = f"lerobot_vtrefine.cli.{command}"
     if set(HELP_FLAGS) & set(sys.argv[1:]):
-        print(help_text(name, module, config))
+        groups = [argument.removeprefix("--") for argument in sys.argv[1:] if argument not in HELP_FLAGS]
+        below = [line for group in groups for line in group_help(module, config, group)]
+        print("\n".join(below) or help_text(name, module, config))
         return 0
-    check_required(flags_of(module, config), sys.argv[1:])
+    check_arguments(flags_of(module, config, unused=True), sys.argv[1:])
     if sys.stderr.isatty():
         print("loading LeRobot and PyTorch (the first time takes longest) ...", file=sys.stderr, flush=True)
-    return importlib.import_module(name).main()
+    main = importlib.import_module(name).main
+    from lerobot_vtrefine.lerobot_compat.config_errors import undecoded_values_raise
+
+    with undecoded_values_raise():
+        return main()
 
 
 def entry_point(command: str, module: str, config: str) -> Callable[[], int]:
@@ -50,17 +53,12 @@ import_dataset = entry_point("import_dataset", "lerobot_vtrefine.cli.import_data
 replay = entry_point("replay", "lerobot_vtrefine.cli.replay", "ReplayConfig")
 
 
-def check_required(flags: Sequence[Flag], arguments: Sequence[str]) -> None:
-    """Raises: ValueError naming the flags that neither the command line nor its configuration file gives."""
-    given = {argument.partition("=")[0].removeprefix("--") for argument in arguments}
-    for path in map(Path, config_files(arguments)):
-        if not path.is_file():
-            return  # LeRobot looks for it on the Hub, or says that there is none
-        given |= set(yaml.safe_load(path.read_text(encoding="utf-8")) or ())
-    missing = [flag for flag in flags if flag.required and not flag.is_among(given)]
-    if missing:
-        told = [WANTED.get(flag.name) or f"give --{flag.name}={flag.type}: {flag.text}" for flag in missing]
-        raise ValueError(" ".join([*told, "--help has an example"]))
+def group_help(module: str, config: str, group: str) -> list[str]:
+    """The flags below a group such as ``env.scene``; nothing where there is no such group."""
+    every = flags_of(module, config, nested=True)
+    prefix = f"{group.removesuffix('.*')}."
+    below = [flag for flag in every if flag.name.startswith(prefix) and flag.group is None]
+    return [f"flags of --{prefix[:-1]}:", *(line for flag in below for line in _lines(flag))] if below else []
 
 
 def help_text(command: str, module: str, config: str) -> str:
@@ -74,8 +72,12 @@ def help_text(command: str, module: str, config: str) -> str:
             shown += ["", f"flags of --{flag.name}:"]
             shown += [line for inner in flags_of(*flag.group, f"{flag.name}.") for line in _lines(inner)]
     usage = f"usage: {called} [--config_path=FILE] [--FLAG=VALUE ...]"
-    files = "FILE is a YAML file of flags; vtrefine:NAME takes one that comes with the package."
-    return "\n".join([usage, "", sentence, "", rest, "", "flags:", *shown, "", files])
+    closing = ["FILE is a YAML file of flags; vtrefine:NAME takes one that comes with the package."]
+    if any(line.startswith("  --env.scene.*") for line in shown):
+        closing.append(
+            "--help env.scene lists the flags below --env.scene with their defaults; so for every group."
+        )
+    return "\n".join([usage, "", sentence, "", rest, "", "flags:", *shown, "", *closing])
 
 
 def _lines(flag: Flag) -> list[str]:

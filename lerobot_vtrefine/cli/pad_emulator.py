@@ -34,8 +34,8 @@ MAX_BOARDS = 64
 """Each is a pseudo-terminal and a thread; a system lends some hundreds to a user."""
 EPILOG = """\
 examples:
-  vtrefine-pad-emulator --source=press            then, elsewhere: vtrefine-find-pads --ports outputs/pads/*
-  vtrefine-pad-emulator --arms=outputs/arms       four emulated arms beside the pads"""
+  vtrefine-pad-emulator --source=press            # then, elsewhere: vtrefine-find-pads --ports outputs/pads/*
+  vtrefine-pad-emulator --arms=outputs/arms       # four emulated arms beside the pads"""
 SOURCES = ("contact", "noise", "press", "pattern", "recording")
 
 
@@ -51,23 +51,24 @@ def make_parser() -> CommandParser:
         "--folder",
         type=Path,
         default=Path("outputs/pads"),
-        help="where the ports appear (default %(default)s)",
+        help="where the ports appear (default: %(default)s)",
     )
-    add("--boards", type=int, default=len(PADS), help="number of boards (%(default)s)")
-    add("--shape", default="12x32", help="rows x columns that the boards send (%(default)s)")
+    add("--boards", type=int, default=len(PADS), help="number of boards (default: %(default)s)")
+    add("--shape", default="12x32", help="rows x columns that the boards send (default: %(default)s)")
     add(
         "--protocol",
         choices=(*ENCODERS, "diagnostic"),
         default="binary",
-        help="firmware variant (%(default)s)",
+        help="firmware variant (default: %(default)s)",
     )
-    add("--rate", type=float, default=100.0, help="frames per second (%(default)s)")
+    add("--rate", type=float, default=100.0, help="frames per second (default: %(default)s)")
     add(
         "--source",
         choices=SOURCES,
         default="contact",
         help="what the pads feel: contact = a wandering fingertip; press = one pad after another is pressed "
-        "for 2 s while all are read; pattern = frames with a checksum; recording = a file (%(default)s)",
+        "for 2 s while all are read; pattern = frames with a checksum; recording = a file "
+        "(default: %(default)s)",
     )
     add(
         "--recording",
@@ -80,8 +81,8 @@ def make_parser() -> CommandParser:
         metavar="FOLDER",
         help="also emulate ALOHA's four arms there; the leaders wave, and LeRobot's flags are printed",
     )
-    add("--seconds", type=float, default=0.0, help="stop after this time; 0 = run until Ctrl-C (%(default)s)")
-    add("--seed", type=int, default=0, help="seed of noise and faults (%(default)s)")
+    add("--seconds", type=float, default=0.0, help="0: until Ctrl-C (default: %(default)s)")
+    add("--seed", type=int, default=0, help="seed of noise and faults (default: %(default)s)")
     faults = parser.add_argument_group("faults")
     add = faults.add_argument
     add("--loss", type=float, default=0.0, help="probability that a byte is lost")
@@ -92,9 +93,9 @@ def make_parser() -> CommandParser:
         help="probability per frame that 2..62 bytes in a row are lost",
     )
     add("--stall_every", type=float, default=0.0, help="seconds between stalls")
-    add("--stall", type=float, default=1.0, help="length of a stall in seconds (%(default)s)")
+    add("--stall", type=float, default=1.0, help="length of a stall in seconds (default: %(default)s)")
     add("--unplug_at", type=float, default=0.0, help="seconds after the start at which the ports vanish")
-    add("--replug_after", type=float, default=1.0, help="seconds until they are back (%(default)s)")
+    add("--replug_after", type=float, default=1.0, help="seconds until they are back (default: %(default)s)")
     add("--markers", type=int, nargs="+", default=[], metavar="TAXEL", help="taxels that always read AA 55")
     return parser
 

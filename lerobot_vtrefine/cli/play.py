@@ -1,9 +1,9 @@
 """``vtrefine-play``: show the simulation live in a browser, moved by a policy, an expert or a recording.
 
 examples:
-  vtrefine-play                                        the trained policy that comes with the package
-  vtrefine-play --viewer=none --episodes=20            how often it succeeds
-  vtrefine-play --config_path=vtrefine:round_table     the scripted expert, both parts from the table
+  vtrefine-play                                        # the trained policy that comes with the package
+  vtrefine-play --viewer=none --episodes=20            # how often it succeeds
+  vtrefine-play --config_path=vtrefine:round_table     # the scripted expert, both parts from the table
   vtrefine-play --config_path=vtrefine:round_grasped --policy.path=CHECKPOINT
 """
 
@@ -51,6 +51,7 @@ class EpisodeSource:
     root: Path | None = None
     """The dataset's folder."""
     episode: int = 0
+    """Which episode, from 0."""
 
 
 @dataclass
@@ -63,18 +64,21 @@ class PlayConfig:
     agent: str = "expert"
     """expert, zero (the arms hold still) or random; a policy or a dataset comes first."""
     policy: PolicySource = field(default_factory=PolicySource)
+    """A trained policy that moves the arms."""
     dataset: EpisodeSource = field(default_factory=EpisodeSource)
+    """A recorded episode that is played again."""
     viewer: str = "browser"
     """browser, or none: as fast as the machine can, for counting successes."""
     port: int = 8080
-    """Of the page, on this machine only."""
+    """Port of the page, which only this machine can open."""
     episodes: int | None = None
     """Stop after so many; by default never with a viewer, after one without, after the dataset's episode."""
     seed: int | None = None
-    """Of the first episode, later ones count up; by default 0, or the recorded episode's."""
+    """Seed of the first episode, later ones count up; by default 0, or the recorded episode's."""
     record: bool = False
     """Write a video of every episode; the page has a box for it, too."""
     video_dir: Path = Path("outputs/play")
+    """Folder of these videos."""
     eval: EvalConfig = field(default_factory=EvalConfig)
     """Unused; lets files of configs/env serve this command too."""
 
@@ -160,6 +164,7 @@ def main() -> None:
     """Console entry point."""
     init_logging()
     logging.getLogger("PIL").setLevel(logging.INFO)
+    logging.getLogger("websockets").setLevel(logging.WARNING)
     sys.argv[1:] = with_something_to_play(sys.argv[1:])
     _main()
 

@@ -23,9 +23,9 @@ LARGEST_PORT = 65535
 def make_parser() -> CommandParser:
     """Command line of ``vtrefine-policy-server``."""
     parser = CommandParser("vtrefine-policy-server", DESCRIPTION, EPILOG)
-    parser.add_argument("--host", default="127.0.0.1", help="address to listen at (default %(default)s)")
-    parser.add_argument("--port", type=int, default=8080, help="(default %(default)s)")
-    parser.add_argument("--fps", type=int, default=10, help="actions per second (default %(default)s)")
+    parser.add_argument("--host", default="127.0.0.1", help="address to listen at (default: %(default)s)")
+    parser.add_argument("--port", type=int, default=8080, help="(default: %(default)s)")
+    parser.add_argument("--fps", type=int, default=10, help="actions per second (default: %(default)s)")
     return parser
 
 

@@ -5,6 +5,7 @@ from pathlib import Path
 
 from lerobot_vtrefine.cli.arguments import CommandParser
 from lerobot_vtrefine.cli.errors import run_cli
+from lerobot_vtrefine.cli.outputs import staged
 from lerobot_vtrefine.extras import SIMULATOR, require
 
 DESCRIPTION = """\
@@ -29,9 +30,10 @@ def make_parser() -> CommandParser:
     )
     parser.add_argument("--output_dir", type=Path, required=True, metavar="DIR", help="folder to write")
     parser.add_argument(
-        "--trials", type=int, default=16, help="recordings, two of every motion (default %(default)s)"
+        "--trials", type=int, default=16, help="recordings, two of every motion (default: %(default)s)"
     )
-    parser.add_argument("--seed", type=int, default=0, help="of motions and noise (default %(default)s)")
+    parser.add_argument("--seed", type=int, default=0, help="of motions and noise (default: %(default)s)")
+    parser.add_argument("--overwrite", action="store_true", help="replace recordings that are there already")
     return parser
 
 
@@ -46,7 +48,8 @@ def main(arguments: Sequence[str] | None = None) -> None:
     require("vtrefine-press", SIMULATOR)
     from lerobot_vtrefine.diagnose.pad.stand_in_rig import record
 
-    record(options.reality, options.output_dir, options.trials, options.seed)
+    with staged(options.output_dir, ("recording.json",), overwrite=options.overwrite) as folder:
+        record(options.reality, folder, options.trials, options.seed)
     print(f"{options.trials} recordings in {options.output_dir}")
     print(f"next: vtrefine-diagnose --recording={options.output_dir} --output_dir=diagnosis")
 

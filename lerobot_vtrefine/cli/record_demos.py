@@ -19,8 +19,9 @@ from lerobot.envs.configs import EnvConfig
 from lerobot.utils.utils import init_logging
 from tqdm import tqdm
 
-from lerobot_vtrefine.cli.errors import run_cli
-from lerobot_vtrefine.cli.sharing import check_repo_id, push_dataset
+from lerobot_vtrefine.cli.errors import after_interrupt, run_cli
+from lerobot_vtrefine.cli.hub import check_upload
+from lerobot_vtrefine.cli.sharing import push_dataset
 from lerobot_vtrefine.datasets.features import dataset_features
 from lerobot_vtrefine.embodiments import DEFAULT_BODY
 from lerobot_vtrefine.envs import VtRefineEnvConfig
@@ -67,7 +68,7 @@ class RecordDemosConfig:
             if getattr(self, name) < lowest:
                 raise ValueError(f"--{name} must be at least {lowest}, got {getattr(self, name)}")
         if self.push_to_hub:
-            check_repo_id(self.repo_id)
+            check_upload(self.repo_id)
         if not isinstance(self.env, VtRefineEnvConfig):
             raise ValueError(f"--env.type={self.env.type} has no scripted expert; use --env.type=vtrefine")
 
@@ -146,9 +147,12 @@ def next_steps(config: RecordDemosConfig) -> str:
 
 @parser.wrap()
 def _main(config: RecordDemosConfig) -> None:
-    print(f"{record(config)} episodes in {config.root}\n{next_steps(config)}")
+    with after_interrupt("what was recorded is kept; the same command goes on"):
+        count = record(config)
+    print(f"{count} episode{'s' * (count != 1)} in {config.root}\n{next_steps(config)}")
     if config.push_to_hub:
         push_dataset(config.root, config.repo_id, private=config.private)
+        print(f"{config.root} -> {config.repo_id}")
 
 
 @run_cli

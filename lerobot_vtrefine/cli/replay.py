@@ -110,8 +110,10 @@ def _folder(source: SourceConfig) -> EpisodeFolder:
 def describe(comparison: Comparison) -> list[str]:
     """The result in a few lines of text."""
     from lerobot_vtrefine.diagnose.episode_replay.figures import unit_of
+    from lerobot_vtrefine.diagnose.episode_replay.page import verdict
 
-    lines = [f"{len(comparison.pairs)} episodes; {comparison.twin}"]
+    count = len(comparison.pairs)
+    lines = [verdict(comparison), f"{count} episode{'s' * (count != 1)}; {comparison.twin}"]
     for row in comparison.tracking:
         unit, explained = unit_of(row.joint), ""
         if row.explained is not None:

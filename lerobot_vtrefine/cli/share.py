@@ -5,6 +5,7 @@ from pathlib import Path
 
 from lerobot_vtrefine.cli.arguments import CommandParser
 from lerobot_vtrefine.cli.errors import run_cli
+from lerobot_vtrefine.cli.hub import check_upload, is_checkpoint
 
 DESCRIPTION = """\
 Upload a dataset or a policy to the Hugging Face Hub. A policy goes with its processors, without which nobody
@@ -37,19 +38,21 @@ def make_parser() -> CommandParser:
 def main(arguments: Sequence[str] | None = None) -> None:
     """Console entry point."""
     options = make_parser().parse_args(arguments)
-    from lerobot_vtrefine.cli.sharing import check_repo_id, is_checkpoint, push_dataset, push_policy
+    folder = options.folder
+    if not folder.is_dir():
+        raise FileNotFoundError(f"{folder}: no such folder")
+    policy = is_checkpoint(folder)
+    if not policy and not (folder / "meta" / "info.json").is_file():
+        raise ValueError(f"{folder} is neither a LeRobotDataset (meta/info.json) nor a checkpoint")
+    if not policy and options.evaluation is not None:
+        raise ValueError("--evaluation is about policies; leave it out for a dataset")
+    check_upload(options.repo_id)
+    from lerobot_vtrefine.cli.sharing import push_dataset, push_policy  # which imports LeRobot
 
-    check_repo_id(options.repo_id)
-    if not options.folder.is_dir():
-        raise FileNotFoundError(f"{options.folder}: no such folder")
-    if is_checkpoint(options.folder):
-        push_policy(options.folder, options.repo_id, options.evaluation, private=options.private)
-    elif (options.folder / "meta" / "info.json").is_file():
-        if options.evaluation is not None:
-            raise ValueError("--evaluation is about policies; leave it out for a dataset")
-        push_dataset(options.folder, options.repo_id, private=options.private)
+    if policy:
+        push_policy(folder, options.repo_id, options.evaluation, private=options.private)
     else:
-        raise ValueError(f"{options.folder} is neither a LeRobotDataset (meta/info.json) nor a checkpoint")
+        push_dataset(folder, options.repo_id, private=options.private)
     print(f"{options.folder} -> {options.repo_id}")
 
 

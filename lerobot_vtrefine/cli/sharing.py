@@ -20,7 +20,6 @@ CHECKPOINT_FILES = (
     "policy_postprocessor.json",
 )
 """What another machine needs to run a policy; the processors hold the point cloud's settings."""
-LOCAL = "local"
 TRAIN_CONFIG = "train_config.json"
 CARD, EPISODES = "README.md", "episodes.jsonl"
 TASK_FIELDS = ("pair", "clearance_m", "start", "backend")
@@ -29,18 +28,6 @@ MEASURED = (
     ("peak_force_n", "peak contact force", 1.0, "N"),
     ("time_to_success_s", "time to success", 1.0, "s"),
 )
-
-
-def check_repo_id(repo_id: str) -> None:
-    """ValueError unless it is a name on the Hub."""
-    user, slash, name = repo_id.partition("/")
-    if not (user and slash and name) or "/" in name or user == LOCAL:
-        raise ValueError(f"--repo_id={repo_id}: give a name on the Hub, such as USER/insertion")
-
-
-def is_checkpoint(folder: Path) -> bool:
-    """Whether the folder holds a policy rather than a dataset."""
-    return (folder / "config.json").is_file() and not (folder / "meta" / "info.json").is_file()
 
 
 def push_dataset(root: Path, repo_id: str, *, private: bool) -> None:

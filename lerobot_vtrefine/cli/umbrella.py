@@ -1,10 +1,10 @@
 """``vtrefine``: list this project's commands, or run one of them.
 
 examples:
-  vtrefine-play                   a good start: a trained policy, live in a browser
-  vtrefine-demo --quick           the whole chain with tiny numbers: record, imitate, improve, evaluate
-  vtrefine configs                names that --config_path=vtrefine:NAME takes
-  vtrefine diagnose --help        the same as vtrefine-diagnose --help
+  vtrefine-play                   # a good start: a trained policy, live in a browser
+  vtrefine-demo --quick           # the whole chain with tiny numbers: record, imitate, improve, evaluate
+  vtrefine configs                # names that --config_path=vtrefine:NAME takes
+  vtrefine diagnose --help        # the same as vtrefine-diagnose --help
 """
 
 import sys

@@ -1,11 +1,16 @@
 """``vtrefine-view-data``: show a dataset's pads, point cloud, depth and motion on one timeline in rerun."""
 
+import argparse
+import errno
+import os
 import shlex
+import shutil
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+import yaml
 
 from lerobot_vtrefine.cli.arguments import CommandParser
 from lerobot_vtrefine.cli.errors import run_cli
@@ -18,8 +23,10 @@ joint positions and commands. lerobot-dataset-viz shows no touch. Needs rerun: p
 EPILOG = """\
 examples:
   vtrefine-view-data --dataset.root=outputs/demos
-  vtrefine-view-data --dataset.root=outputs/demos --episodes 0 2 --save=demos.rrd"""
+  vtrefine-view-data --dataset.root=outputs/demos --episodes='[0, 2]' --save=demos.rrd"""
 POINT_RADIUS_M = 0.001
+LEAST_FREE_BYTES = 64 * 1024
+"""With less than this left on the disk, the file is not whole."""
 GREY = (138, 143, 152)
 
 
@@ -29,9 +36,22 @@ def make_parser() -> CommandParser:
     add = parser.add_argument
     add("--dataset.root", dest="root", type=Path, metavar="DIR", help="LeRobot dataset, by its folder")
     add("--dataset.repo_id", dest="repo_id", metavar="NAME", help="LeRobot dataset, by its name on the Hub")
-    add("--episodes", type=int, nargs="+", metavar="N", help="episodes to show (default: the first)")
+    add("--episodes", type=episodes, metavar="LIST", help="episodes to show (default: '[0]')")
     add("--save", type=Path, metavar="FILE", help="write a rerun file (.rrd) instead of opening the viewer")
     return parser
+
+
+def episodes(text: str) -> list[int]:
+    """``[0, 2]`` or ``2``, as LeRobot's commands take them; ArgumentTypeError for anything else."""
+    try:
+        given = yaml.safe_load(text)
+    except yaml.YAMLError:
+        given = None
+    every = given if isinstance(given, list) else [given]
+    listed = [index for index in every if type(index) is int]
+    if not listed or listed != every:
+        raise argparse.ArgumentTypeError(f"give a list such as '[0, 2]', got {text!r}")
+    return listed
 
 
 @run_cli
@@ -55,6 +75,8 @@ def main(arguments: Sequence[str] | None = None) -> None:
         rr.save(options.save)
     frames = sum(log_episode(rr, root, index) for index in shown)
     rr.rerun_shutdown()
+    if options.save is not None and shutil.disk_usage(options.save.parent).free < LEAST_FREE_BYTES:
+        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC), str(options.save))  # rerun only logs it
     where = f" -> {options.save}" if options.save is not None else ""
     print(f"{len(shown)} episode{'' if len(shown) == 1 else 's'}, {frames} frames{where}")
     if options.save is not None:

@@ -36,16 +36,23 @@ def make_parser() -> CommandParser:
     add = parser.add_argument
     add("--pads_file", type=Path, help="file written by vtrefine-find-pads")
     add("--ports", nargs="+", default=[], metavar="PORT", help="ports to show instead of a pads file")
-    add("--rows", type=int, default=12, help="rows that the boards on --ports send (%(default)s)")
-    add("--cols", type=int, default=32, help="columns that the boards on --ports send (%(default)s)")
-    add("--hz", type=float, default=15.0, help="pictures per second (%(default)s)")
-    add("--seconds", type=float, default=0.0, help="stop after this time; 0 = until Ctrl-C (%(default)s)")
+    add("--rows", type=int, default=12, help="rows that the boards on --ports send (default: %(default)s)")
+    add("--cols", type=int, default=32, help="columns that the boards on --ports send (default: %(default)s)")
+    add("--hz", type=float, default=15.0, help="pictures per second (default: %(default)s)")
+    add(
+        "--seconds",
+        type=float,
+        default=0.0,
+        help="stop after this time; 0: Ctrl-C ends it (default: %(default)s)",
+    )
     add("--rerun", action="store_true", help="show in the rerun viewer instead of the terminal")
     add("--save", type=Path, metavar="FILE", help="write a rerun file (.rrd) instead of showing anything")
     group = parser.add_argument_group("a board with the diagnostic text firmware")
     group.add_argument("--diagnostic", metavar="PORT", help="show readings of one taxel, once a second")
-    group.add_argument("--channel", type=int, default=4, help="multiplexer channel, 0..15 (%(default)s)")
-    group.add_argument("--column", type=int, default=0, help="column, 0..31 (%(default)s)")
+    group.add_argument(
+        "--channel", type=int, default=4, help="multiplexer channel, 0 to 15 (default: %(default)s)"
+    )
+    group.add_argument("--column", type=int, default=0, help="column, 0 to 31 (default: %(default)s)")
     return parser
 
 

@@ -1,7 +1,7 @@
 """The public files in one place: their JSON Schemas, and what a recording's columns mean.
 
 Schemas follow from the dataclasses that files are read by; `schemas/` holds them for programs that are not
-ours, as written by `vtrefine-diagnose --help-format=NAME`.
+ours, as written by `vtrefine-diagnose --help_format=NAME`.
 """
 
 import dataclasses
@@ -110,7 +110,7 @@ def describe_recording() -> str:
     lines += [
         "",
         "Record 16 trials or more: 8 conditions (same motion, same place), each twice, in mixed order.",
-        "vtrefine-diagnose --template=FOLDER writes an example; docs/recording-format.md says more;",
-        f"--help-format=NAME prints the JSON Schema of {', '.join(FORMATS)}.",
+        "vtrefine-diagnose --template=FOLDER writes an example,",
+        f"--help_format=NAME prints the JSON Schema of {', '.join(FORMATS)}.",
     ]
     return "\n".join(lines)

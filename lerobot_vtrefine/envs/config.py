@@ -67,7 +67,8 @@ class VtRefineEnvConfig(EnvConfig):
     shear: ShearConfig = field(default_factory=ShearConfig)
     """Tangential force per taxel, as ``info["shear"]``: off unless ``--env.shear.on=true``."""
     reality: Path | None = None
-    """JSON file of hidden physics: the environment then stands in for reality (sim/reality.py)."""
+    """JSON file of hidden physics: the environment then stands in for reality; its format:
+    vtrefine-diagnose --help_format=reality.json."""
     backend: str = "batch"
     """single, batch (threads) or warp."""
     num_threads: int = 0

@@ -21,6 +21,7 @@ class DppoConfig(draccus.ChoiceRegistry):
 
     # Amount of data: iterations of one episode in each environment (per rank).
     iterations: int = 200
+    # Environments that are simulated side by side.
     num_envs: int = 1024
     # Decisions per iteration; 0 means a whole episode. Shorter segments cut episodes, whose rest is
     # bootstrapped.
@@ -37,27 +38,32 @@ class DppoConfig(draccus.ChoiceRegistry):
     ft_denoising_steps: int = 10
     # Stochasticity of the tuned steps in rollouts (1: DDPM posterior).
     eta: float = 1.0
-    # Floors of the standard deviation when sampling, and in the log-probability [normalised action units].
+    # Floor of the standard deviation when sampling [normalised action units].
     min_sampling_std: float = 0.01
+    # The same in the log-probability.
     min_log_prob_std: float = 0.1
     # Correlation of the exploration noise between neighbouring actions of a chunk; 0 is white noise.
     noise_correlation: float = 0.0
 
-    # Discount and GAE parameter, per decision.
+    # Discount per decision.
     gamma: float = 0.999
+    # Lambda of generalised advantage estimation (GAE), per decision.
     gae_lambda: float = 0.95
     # Advantage discount per denoising step before the last.
     gamma_denoising: float = 0.99
     # A time-out ends the episode with value zero ("terminal"; the critic must see the time), or keeps the
     # value of the last state ("bootstrap").
     timeout: str = "terminal"
+    # Divide rewards by the running deviation of returns.
     reward_scaling: bool = True
 
-    # PPO clip range at the last tuned step and at the first; the exponent's rate between them.
+    # PPO clip range at the last tuned step.
     # Log-probabilities are averaged over the executed slice: the range of a mean-action shift shrinks with
     # sqrt(Ta * Da).
     clip: float = 1e-3
+    # PPO clip range at the first tuned step.
     clip_first: float = 1e-3
+    # Rate of the exponential between the two.
     clip_rate: float = 3.0
     # Stop the iteration's update when a minibatch's approximate KL divergence exceeds this.
     target_kl: float = 1.0
@@ -66,6 +72,7 @@ class DppoConfig(draccus.ChoiceRegistry):
     # the final value. 0: the learning rate follows its own schedule. The same step is larger beside quieter
     # exploration: with a third of min_sampling_std, aim at a ninth.
     kl_per_decision: float = 0.0
+    # What kl_per_decision falls to by the last iteration.
     kl_per_decision_final: float = 0.0
     # Penalty on the KL divergence to the frozen base network, per action element and tuned step.
     kl_coef: float = 0.0
@@ -74,6 +81,7 @@ class DppoConfig(draccus.ChoiceRegistry):
     # The critic has its own optimiser; this only matters for its gradient clipping.
     value_coef: float = 0.5
 
+    # Passes over an iteration's data.
     epochs: int = 10
     # Minibatches hold whole decisions: all their tuned steps together. The paper's rows / K'.
     minibatch_decisions: int = 1024
@@ -83,18 +91,25 @@ class DppoConfig(draccus.ChoiceRegistry):
     micro_batch_decisions: int = 0
     # Iterations at the start in which only the critic learns.
     critic_warmup: int = 2
+    # Learning rate of the policy at the start.
     actor_lr: float = 1e-5
+    # The same at the end.
     actor_lr_final: float = 1e-6
+    # Learning rate of the critic at the start.
     critic_lr: float = 1e-3
+    # The same at the end.
     critic_lr_final: float = 1e-3
     # Actor updates over which its learning rate rises linearly.
     lr_warmup: int = 10
+    # Of both optimisers.
     weight_decay: float = 0.0
     # Clip the gradient norm of actor and critic; 0 does not clip.
     max_grad_norm: float = 0.0
     # "trained": the observation encoder is fine-tuned too. "frozen": its features are computed once and kept.
     encoder: str = "trained"
+    # Features of the critic's layers.
     critic_width: int = 512
+    # Residual blocks of the critic.
     critic_blocks: int = 1
 
     @classmethod

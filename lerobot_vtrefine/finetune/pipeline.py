@@ -57,7 +57,7 @@ class FinetunePipelineConfig:
     ``policy.pretrained_path`` is the one that the run started from.
     """
 
-    # Where the policy practises: --env.type=vtrefine, or a file of configs/env.
+    # Where the policy practises: --config_path=vtrefine:NAME, or --env.type=vtrefine.
     env: EnvConfig
     # The checkpoint to start from: --policy.path=FOLDER; --policy.device=cpu or cuda; its other settings too.
     policy: PreTrainedConfig | None = None
@@ -76,7 +76,7 @@ class FinetunePipelineConfig:
     eval_freq: int = 10
     # Write a checkpoint every so many iterations, and after the last.
     save_freq: int = 10
-    # n_episodes counts, and batch_size with push_to_hub; the rest lets files of configs/env serve this too.
+    # n_episodes counts, and batch_size with push_to_hub; the rest, which files of tasks hold, is not used.
     eval: EvalConfig = field(default_factory=EvalConfig)
     # Evaluate the result by lerobot-eval and upload it to the Hugging Face Hub with a card of what was found.
     push_to_hub: bool = False

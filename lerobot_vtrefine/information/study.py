@@ -44,9 +44,11 @@ class Effort:
     episodes: int = 1024
     """Episodes of frames; the last of them, three of twenty, are held out."""
     num_envs: int = 64
+    """Simulations side by side."""
     steps: int = 2000
     """Training steps of each regressor."""
     batch_size: int = 256
+    """Frames in a training batch."""
     history: tuple[int, ...] = (1, 10)
     """Frames that a regressor sees; encoders are saved for the first entry."""
     closed_loop_episodes: int = 256
@@ -54,7 +56,9 @@ class Effort:
     preset: str = "small"
     """Whose encoder: ``--policy.preset``."""
     device: str = "cpu"
+    """Where the regressors are trained, cpu or cuda."""
     seed: int = 0
+    """Seed of the first episode, and of the training."""
 
     def __post_init__(self) -> None:
         for name in ("episodes", "num_envs", "steps", "batch_size"):

@@ -1,7 +1,8 @@
-"""Why a configuration refuses its values, as the last line of LeRobot's own commands, too."""
+"""Why a configuration refuses its values: the last line of LeRobot's own commands, the only one of ours."""
 
+import contextlib
 import functools
-from collections.abc import Callable
+from collections.abc import Callable, Generator
 
 from draccus.utils import ParsingError
 
@@ -22,3 +23,16 @@ def told_by_lerobot[Config](check: Callable[[Config], None]) -> Callable[[Config
             raise ParsingError(str(error)) from error
 
     return wrapper
+
+
+@contextlib.contextmanager
+def undecoded_values_raise() -> Generator[None]:
+    """draccus' DecodingError passes through LeRobot's parser, which prints several lines of it and leaves."""
+    from lerobot.configs import parser
+
+    stock = parser.DecodingError
+    parser.DecodingError = ()  # ty: ignore[invalid-assignment]
+    try:
+        yield
+    finally:
+        parser.DecodingError = stock

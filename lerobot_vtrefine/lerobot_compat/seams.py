@@ -57,9 +57,10 @@ SEAMS = (
     ),
     Seam(
         "config_errors",
-        (),
-        "the parser replaces a configuration's own reason by \"Couldn't instantiate class\"",
-        "configurations of this package",
+        ("lerobot.configs.parser.DecodingError",),
+        "the parser replaces a configuration's own reason by \"Couldn't instantiate class\", and prints"
+        " several lines about a value that it cannot decode",
+        "configurations and commands of this package",
         "stays: it only raises another exception",
     ),
     Seam(

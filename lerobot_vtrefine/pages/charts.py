@@ -109,10 +109,16 @@ class Panel:
         y_title: str,
         *,
         x_ticks: bool = True,
+        x_least: float = 0.0,
         y_count: int = 4,
         y_text: Callable[[float], str] = digits,
     ) -> str:
-        """Grid lines with numbers, and titles of both axes; no grid for ``y_count`` 0."""
+        """Grid lines with numbers, and titles of both axes.
+
+        Args:
+            x_least: smallest distance of ticks.
+            y_count: number of ticks; 0 draws no grid.
+        """
         right, bottom = self.left + self.width, self.top + self.height
         parts = []
         for tick in ticks(*self.y_range, y_count) if y_count else ():
@@ -121,7 +127,7 @@ class Panel:
             parts.append(f'<path class="{style}" d="M{self.left:.1f} {place:.1f}H{right:.1f}"/>')
             parts.append(label(self.left - 6, place + 5, y_text(tick), "end"))
         if x_ticks:
-            for tick in ticks(*self.x_range, 6):
+            for tick in ticks(*self.x_range, 6, x_least):
                 place = self.x(tick)
                 parts.append(f'<path class="grid" d="M{place:.1f} {bottom:.1f}v4"/>')
                 parts.append(label(place, bottom + 19, digits(tick), "middle"))
@@ -142,9 +148,9 @@ def span(*arrays: np.ndarray, margin: float = 0.05, zero: bool = False) -> tuple
     return low - pad, high + pad
 
 
-def ticks(low: float, high: float, count: int) -> list[float]:
-    """Round numbers within a range, about `count` of them."""
-    raw = (high - low) / max(count, 1)
+def ticks(low: float, high: float, count: int, least: float = 0.0) -> list[float]:
+    """Round numbers within a range, about `count` of them and at least `least` apart."""
+    raw = max((high - low) / max(count, 1), least)
     size = 10.0 ** math.floor(math.log10(raw))
     step = next(size * factor for factor in (1, 2, 5, 10) if size * factor >= raw)
     first = math.ceil(low / step)

@@ -37,12 +37,12 @@ class Bar:
 
 
 def line_chart(series: Sequence[Series], x_title: str, y_title: str) -> str:
-    """Lines over a common x axis; y is a rate from 0 to 1. Empty text without any point."""
+    """Lines over whole numbers, such as iterations; y is a rate from 0 to 1. Empty text without any point."""
     xs = [x for line in series for x, _ in line.points]
     if not xs:
         return ""
     panel = _panel(WIDTH, (min(xs), max(max(xs), min(xs) + 1)))
-    parts = [panel.frame(x_title, "", y_count=5, y_text=percent_tick)]
+    parts = [panel.frame(x_title, "", x_least=1.0, y_count=5, y_text=percent_tick)]
     for line in series:
         points = np.array(line.points, float).reshape(-1, 2)
         draw = panel.dots if line.markers else panel.line

@@ -4,7 +4,9 @@ MuJoCo's geometry is drawn by mjviser, everything beside it by viser. Browsers o
 buttons ask for is kept in `Wishes`, which whoever steps the simulation reads.
 """
 
+import contextlib
 import copy
+import io
 import time
 from dataclasses import dataclass, replace
 from typing import Any
@@ -25,7 +27,7 @@ POINT_M = 0.0022
 CLOUD = VisuoTactileConfig(num_visual_points=512, pixel_stride=1, pool_rows=2, pool_cols=2)
 """Drawn where no policy says what it sees."""
 SEEN, FELT = np.array([120, 170, 235]), np.array([255, 96, 32])
-EYE_M, LOOK_AT_M = (0.5, 0.06, 0.34), (0.0, 0.06, 0.10)  # left arm on the left
+EYE_M, LOOK_AT_M = (0.36, 0.06, 0.27), (0.0, 0.06, 0.10)  # left arm on the left
 
 
 @dataclass
@@ -58,7 +60,10 @@ class BrowserView:
 
         self._world, self._cloud = world, cloud or replace(CLOUD, embodiment=world.sim.embodiment.name)
         self.wishes = Wishes(seed=world.seed)
-        self._server = viser.ViserServer(host="127.0.0.1", port=port, label="lerobot_vtrefine", verbose=False)
+        with contextlib.redirect_stdout(io.StringIO()):  # whoever opens the view says its address
+            self._server = viser.ViserServer(
+                host="127.0.0.1", port=port, label="lerobot_vtrefine", verbose=False
+            )
         self._server.initial_camera.position = EYE_M
         self._server.initial_camera.look_at = LOOK_AT_M
         model, _ = world.sim.mj_data(0)
@@ -99,7 +104,7 @@ class BrowserView:
 
     def describe(self) -> str:
         """How many pictures were drawn, and what one costs the simulation."""
-        return f"{len(self.drawing_s)} pictures, {1e3 * np.median(self.drawing_s):.0f} ms each"
+        return f"drew {len(self.drawing_s)} pictures, {1e3 * np.median(self.drawing_s):.0f} ms each"
 
     def close(self) -> None:
         """Take the page away."""

@@ -31,7 +31,7 @@ def test_rows_are_printed_and_written(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     target = tmp_path / "new" / "bench.json"
-    parts = "--parts=[absent, broken, fine]"
+    parts = "--parts=absent,broken,fine"
     monkeypatch.setattr(sys, "argv", ["vtrefine-bench", parts, f"--json={target}"])
     assert bench.main() == 0
     output = capsys.readouterr()
@@ -54,7 +54,7 @@ def test_slow_part_is_ended(capsys: pytest.CaptureFixture[str]) -> None:
 
 @pytest.mark.usefixtures("fake_parts")
 def test_nothing_measured_is_a_failure(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(sys, "argv", ["vtrefine-bench", "--parts=[absent]"])
+    monkeypatch.setattr(sys, "argv", ["vtrefine-bench", "--parts=absent"])
     assert bench.main() == 1
 
 
@@ -121,6 +121,6 @@ def test_plot_writes_a_picture_and_a_table(
 
 
 def test_unknown_part(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
-    monkeypatch.setattr(sys, "argv", ["vtrefine-bench", "--parts=[physics]"])
+    monkeypatch.setattr(sys, "argv", ["vtrefine-bench", "--parts=physics"])
     assert bench.main() == 2
     assert "unknown physics; choose from tactile, envs, dataset, finetune, drivers" in capsys.readouterr().err

@@ -4,9 +4,11 @@ import errno
 from dataclasses import dataclass, field
 
 import draccus
+import httpx
 import pytest
+import safetensors
 
-from lerobot_vtrefine.cli.errors import run_cli
+from lerobot_vtrefine.cli.errors import after_interrupt, run_cli
 from lerobot_vtrefine.cli.pipeline.demo_config import DemoConfig
 from lerobot_vtrefine.cli.record_demos import RecordDemosConfig
 
@@ -102,3 +104,30 @@ def test_flags_that_are_misspelt_or_lack_their_type_are_one_line(config, typed, 
     error = capsys.readouterr().err
     assert error.count("\n") == 1
     assert error.startswith(f"error: {line}")
+
+
+def test_a_network_that_does_not_answer_is_one_line(capsys) -> None:
+    def upload() -> None:
+        raise httpx.ConnectError("[Errno -2] Name or service not known")
+
+    assert run_cli(upload)() == 2
+    error = capsys.readouterr().err
+    assert error.startswith("error: the network did not answer ([Errno -2] Name or service not known)")
+    assert error.count("\n") == 1
+
+
+def test_an_interrupt_says_how_to_go_on(capsys) -> None:
+    def long_work() -> None:
+        with after_interrupt("the same command goes on"):
+            raise KeyboardInterrupt
+
+    assert run_cli(long_work)() == 130
+    assert capsys.readouterr().err == "interrupted: the same command goes on\n"
+
+
+def test_weights_on_a_full_disk_are_one_line(capsys) -> None:
+    def save() -> None:
+        raise safetensors.SafetensorError("Error while serializing: No space left on device (os error 28)")
+
+    assert run_cli(save)() == 2
+    assert capsys.readouterr().err.startswith("error: the disk is full; free some space")

@@ -8,6 +8,7 @@ import pytest
 
 from lerobot_vtrefine import shipped
 from lerobot_vtrefine.cli import launch, umbrella
+from lerobot_vtrefine.cli.checks import check_arguments
 from lerobot_vtrefine.cli.flags import flags_of
 from lerobot_vtrefine.cli.pipeline.demo_config import DemoConfig
 
@@ -59,6 +60,25 @@ def test_nested_flags_are_followed_into_their_modules() -> None:
     assert [flag.name for flag in top if not flag.text] == []
 
 
+CONFIGS = (
+    RECORD,
+    ("lerobot_vtrefine.cli.pipeline.demo_config", "DemoConfig"),
+    ("lerobot_vtrefine.finetune.pipeline", "FinetunePipelineConfig"),
+    ("lerobot_vtrefine.cli.information", "InformationConfig"),
+    ("lerobot_vtrefine.cli.play", "PlayConfig"),
+    ("lerobot_vtrefine.cli.bench", "BenchConfig"),
+    ("lerobot_vtrefine.cli.import_dataset", "ImportConfig"),
+    ("lerobot_vtrefine.cli.replay", "ReplayConfig"),
+)
+
+
+@pytest.mark.parametrize(("module", "name"), CONFIGS)
+def test_every_flag_that_help_shows_says_what_it_is_for(module: str, name: str) -> None:
+    flags = flags_of(module, name)
+    below = [inner for flag in flags if flag.group for inner in flags_of(*flag.group, f"{flag.name}.")]
+    assert [flag.name for flag in [*flags, *below] if not flag.text] == []
+
+
 def test_comments_document_flags_too() -> None:
     flags = {f.name: f for f in flags_of("lerobot_vtrefine.finetune.pipeline", "FinetunePipelineConfig")}
     assert flags["resume"].text.startswith("Continue from the last checkpoint")
@@ -70,7 +90,7 @@ def test_comments_document_flags_too() -> None:
     [
         (launch.record_demos, [], "give --root=Path: Folder of the dataset"),
         (launch.record_demos, ["--config_path=vtrefine:round_grasped"], "give --root=Path: Folder"),
-        (launch.replay, ["--dataset.root=x"], "give --output_dir=Path"),
+        (launch.replay, ["--dataset.root=."], "give --output_dir=Path"),
         (launch.finetune, ["--seed=3"], "say which task, --config_path=vtrefine:NAME or --env.type=vtrefine"),
     ],
 )
@@ -86,10 +106,64 @@ def test_a_missing_flag_is_told_before_lerobot_is_loaded(entry, given, line, mon
 def test_a_flag_may_stand_in_a_file_or_name_what_lies_below_it(tmp_path: Path) -> None:
     file = tmp_path / "mine.yaml"
     file.write_text("root: outputs/demos\nenv: {type: vtrefine}\n")
-    for module, name in (RECORD, ("lerobot_vtrefine.finetune.pipeline", "FinetunePipelineConfig")):
-        launch.check_required(flags_of(module, name), [f"--config_path={file}"])
-        launch.check_required(flags_of(module, name), ["--config_path", str(file)])
-        launch.check_required(flags_of(module, name), ["--root=x", "--env.type=vtrefine"])
+    tune = ("lerobot_vtrefine.finetune.pipeline", "FinetunePipelineConfig")
+    for (module, name), root in ((RECORD, ["--root=x"]), (tune, [])):
+        check_arguments(flags_of(module, name), [f"--config_path={file}"])
+        check_arguments(flags_of(module, name), ["--config_path", str(file)])
+        check_arguments(flags_of(module, name), [*root, "--env.type=vtrefine"])
+
+
+@pytest.mark.parametrize(
+    ("entry", "given", "line"),
+    [
+        (launch.play, ["--epsiodes=3"], "unrecognized arguments: --epsiodes=3; did you mean --episodes?"),
+        (
+            launch.record_demos,
+            ["--num-envs=3"],
+            "unrecognized arguments: --num-envs=3; did you mean --num_envs?",
+        ),
+        (launch.demo, ["--quik"], "unrecognized arguments: --quik; did you mean --quick?"),
+        (launch.play, ["--pair=round"], "unrecognized arguments: --pair=round; did you mean --env.pair?"),
+        (launch.play, ["--xyzzy"], "unrecognized arguments: --xyzzy; --help lists the flags"),
+        (launch.play, ["--policy.path=a/b/c"], "No such file or directory: --policy.path=a/b/c"),
+        (launch.play, ["--config_path", "no.yaml"], "No such file or directory: --config_path=no.yaml"),
+        (launch.replay, ["--dataset.root=a/b"], "No such file or directory: --dataset.root=a/b"),
+    ],
+)
+def test_what_is_wrong_with_a_command_line_is_told_before_lerobot_is_loaded(
+    entry, given, line, monkeypatch, capsys
+) -> None:
+    monkeypatch.setattr(sys, "argv", ["command", *given])
+    monkeypatch.setattr(launch.importlib, "import_module", None)
+    assert entry() == 2
+    assert capsys.readouterr().err == f"error: {line}\n"
+
+
+def test_a_checkpoints_folder_is_pointed_to_one_level_down(tmp_path: Path) -> None:
+    inside = tmp_path / "pretrained_model"
+    inside.mkdir()
+    (inside / "config.json").write_text("{}")
+    flags = flags_of("lerobot_vtrefine.cli.play", "PlayConfig", unused=True)
+    with pytest.raises(ValueError, match=f"is one folder too high: take {inside}"):
+        check_arguments(flags, [f"--policy.path={tmp_path}"])
+    for fine in (f"--policy.path={inside}", "--policy.path=USER/insertion", "--eval.n_episodes=3"):
+        check_arguments(flags, [fine])
+
+
+def test_a_value_that_cannot_be_decoded_is_one_line(monkeypatch, capsys, tmp_path: Path) -> None:
+    monkeypatch.setattr(sys, "argv", ["command", f"--root={tmp_path}", "--env.pair=round"])
+    assert launch.record_demos() == 2
+    error = capsys.readouterr().err
+    assert error.startswith("error: say which environment: --env.type=vtrefine")
+    assert error.count("\n") == 1
+
+
+def test_help_goes_as_deep_as_one_asks(monkeypatch, capsys) -> None:
+    monkeypatch.setattr(sys, "argv", ["command", "--help", "env.scene"])
+    assert launch.play() == 0
+    shown = capsys.readouterr().out
+    assert "--env.scene.clearance_m=float" in shown
+    assert "--agent" not in shown
 
 
 def test_help_is_text_without_markup(monkeypatch, capsys: pytest.CaptureFixture[str]) -> None:

@@ -14,6 +14,7 @@ from lerobot.scripts import lerobot_eval
 from local_hub import use_folder_as_hub
 
 from lerobot_vtrefine.cli import finetune, share, sharing
+from lerobot_vtrefine.cli.record_demos import RecordDemosConfig
 from lerobot_vtrefine.cli.report.results import load_evaluation, percent
 from lerobot_vtrefine.embodiments import CameraConfig
 from lerobot_vtrefine.envs.config import VtRefineEnvConfig
@@ -181,3 +182,14 @@ def test_finetuning_refuses_to_share_under_no_name_before_it_begins(
         assert finetune.main() == 2
         assert message in capsys.readouterr().err
         assert not output.exists()
+
+
+def test_who_is_not_logged_in_is_told_before_anything_is_made(monkeypatch, tmp_path: Path, capsys) -> None:
+    monkeypatch.delenv("HF_TOKEN", raising=False)
+    monkeypatch.setattr("huggingface_hub.get_token", lambda: None)
+    (tmp_path / "meta").mkdir()
+    (tmp_path / "meta" / "info.json").write_text("{}")
+    assert share.main([str(tmp_path), "--repo_id=me/demos"]) == 2
+    assert "run hf auth login first" in capsys.readouterr().err
+    with pytest.raises(ValueError, match="hf auth login"):
+        RecordDemosConfig(root=tmp_path / "x", env=VtRefineEnvConfig(), push_to_hub=True, repo_id="me/demos")

@@ -2,6 +2,7 @@
 
 import io
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -67,7 +68,8 @@ def test_a_pressed_taxel_is_bright_at_its_place() -> None:
     [
         ([], "give either --dataset.root=DIR or --dataset.repo_id=NAME"),
         (["--dataset.root=nowhere"], "nowhere"),
-        (["--dataset.root=TINY", "--episodes", "99"], "episode 99 was asked for"),
+        (["--dataset.root=TINY", "--episodes=[0, 99]"], "episode 99 was asked for"),
+        (["--dataset.root=TINY", "--episodes=first"], "argument --episodes: give a list such as '[0, 2]'"),
     ],
 )
 def test_bad_flags_are_one_line(arguments, message, tiny_dataset: Path, tmp_path: Path, capsys) -> None:
@@ -77,3 +79,12 @@ def test_bad_flags_are_one_line(arguments, message, tiny_dataset: Path, tmp_path
     error = capsys.readouterr().err
     assert message in error
     assert error.count("\n") == 1
+
+
+def test_a_file_that_a_full_disk_cut_off_is_told(
+    tiny_dataset: Path, tmp_path: Path, monkeypatch, capsys
+) -> None:
+    pytest.importorskip("rerun")
+    monkeypatch.setattr(view_data.shutil, "disk_usage", lambda _: SimpleNamespace(free=0))
+    assert view_data.main([f"--dataset.root={tiny_dataset}", f"--save={tmp_path / 'x.rrd'}"]) == 2
+    assert "error: the disk is full while writing" in capsys.readouterr().err

@@ -151,11 +151,11 @@ def test_the_template_diagnoses_cleanly(tmp_path: Path, capsys: pytest.CaptureFi
 
 def test_help_format_describes_and_prints_schemas(capsys: pytest.CaptureFixture[str]) -> None:
     with pytest.raises(SystemExit) as left:
-        main(["--help-format"])
+        main(["--help_format"])
     assert left.value.code == 0
     assert all(name in capsys.readouterr().out for name in ("recording.json",))
     with pytest.raises(SystemExit):
-        main(["--help-format=verdict.json"])
+        main(["--help_format=verdict.json"])
     assert json.loads(capsys.readouterr().out)["title"] == "verdict.json"
-    assert main(["--help-format=weather.json"]) == 2
+    assert main(["--help_format=weather.json"]) == 2
     assert "choose from recording.json" in capsys.readouterr().err

@@ -1,11 +1,13 @@
 """Drawings of a calibration: response curves, load cell, resampled parameters, presses over time."""
 
+from pathlib import PurePath
+
 import numpy as np
 
 from lerobot_vtrefine.diagnose.calibration.fit import Calibration
 from lerobot_vtrefine.diagnose.pad.press_trials import Press
 from lerobot_vtrefine.diagnose.report.numbers import scale_of
-from lerobot_vtrefine.pages.charts import Panel, drawing, label, span
+from lerobot_vtrefine.pages.charts import Panel, drawing, span
 
 MEASURED, MODEL, FAST = "m", "b", "a"
 BINS = 14
@@ -112,8 +114,12 @@ def resampled(calibration: Calibration) -> list[str]:
     return drawings
 
 
-def presses_over_time(calibration: Calibration) -> list[str]:
-    """Mean of the pressed taxels over time, measured and modelled: best, typical and worst recording."""
+def presses_over_time(calibration: Calibration) -> list[tuple[str, str]]:
+    """Mean of the pressed taxels over time, measured and modelled: best, typical and worst recording.
+
+    Returns:
+        captions and drawings.
+    """
     errors = [
         float(np.sqrt(np.mean(values**2))) for values in calibration.fitted.residuals(calibration.presses)
     ]
@@ -133,9 +139,10 @@ def presses_over_time(calibration: Calibration) -> list[str]:
             panel.frame("time [s]", "mean counts above idle"),
             panel.line(time_s, measured, MEASURED),
             panel.line(time_s, model, MODEL),
-            label(SMALL_WIDTH - RIGHT, TOP - 7, f"RMS {errors[index]:.1f} counts", "end"),
         ]
-        drawings.append(drawing(SMALL_WIDTH, SMALL_HEIGHT + 20, parts, f"{press.trial.file} over time"))
+        picture = drawing(SMALL_WIDTH, SMALL_HEIGHT + 20, parts, f"{press.trial.file} over time")
+        caption = f"{PurePath(press.trial.file).stem}, missed by {errors[index]:.1f} counts RMS"
+        drawings.append((caption, picture))
     return drawings
 
 

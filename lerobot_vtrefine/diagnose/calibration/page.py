@@ -71,8 +71,8 @@ def remarks(calibration: Calibration) -> list[str]:
     return said
 
 
-def render_page(calibration: Calibration, source: str) -> str:
-    """The page as HTML text; figures are embedded."""
+def render_page(calibration: Calibration, source: str, model: str) -> str:
+    """The page as HTML text; figures are embedded. `model` is where the fitted sensor model is."""
     rows = [
         (name, WORDS.get(name, name.replace("_", " ")), *interval(item.value, item.ci95, item.unit))
         for name, item in calibration.parameters.items()
@@ -82,6 +82,7 @@ def render_page(calibration: Calibration, source: str) -> str:
         "lerobot_vtrefine.diagnose.calibration",
         "page.html",
         source=source,
+        model=model,
         calibration=calibration,
         rows=rows,
         remarks=remarks(calibration),

@@ -55,6 +55,7 @@ def render_report(
     seed: int,
     film: dict[str, str] | None = None,
     survived: str = "",
+    model: str = "sensor_model.json",
 ) -> str:
     """The page as HTML text.
 
@@ -64,6 +65,7 @@ def render_report(
         sound: number of trials that passed it.
         film: a press in motion: its source, caption and colour scale.
         survived: which names other draws and halves of the recordings give, in one line.
+        model: where the extended model is, as the reader would type it.
     """
     unit = diagnosis.unit if diagnosis is not None else "counts"
     of_pad = recordings.kind == "pad"
@@ -86,14 +88,14 @@ def render_report(
             for name, size in verdict.minimum_detectable.items()
         ],
         drawings={cause.name: effect_drawing(cause.name) for cause in verdict.causes},
-        use=_use(verdict, recordings),
+        use=_use(verdict, recordings, model),
         film=film,
         not_tested=[{"title": title(name), "needs": what} for name, what in verdict.not_tested.items()],
         **(_nothing() if diagnosis is None else _findings(verdict, diagnosis, unit, of_pad)),
     )
 
 
-def _use(verdict: Verdict, recordings: RecordingSet) -> dict[str, str] | None:
+def _use(verdict: Verdict, recordings: RecordingSet, model: str) -> dict[str, str] | None:
     """What to do with the extended model, and the commands; None where it adds nothing."""
     if not verdict.causes or verdict.heldout is None:
         return None
@@ -105,14 +107,15 @@ def _use(verdict: Verdict, recordings: RecordingSet) -> dict[str, str] | None:
     else:
         said += " Record, fine-tune and evaluate with it, and predict other recordings to see that it holds."
     in_simulation = [
-        f"vtrefine-record-demos {task} --root=outputs/demos {flag}=sensor_model.json",
-        f"vtrefine-finetune {task} --policy.path=CHECKPOINT {flag}=sensor_model.json",
+        f"vtrefine-record-demos {task} \\\n    --root=outputs/repaired_demos {flag}={model}",
+        f"vtrefine-finetune {task} --policy.path=CHECKPOINT \\\n"
+        f"    --output_dir=outputs/repaired {flag}={model}",
     ]
     lines = [
         *(() if on_bench(recordings) else in_simulation),
-        "vtrefine-predict --recording=OTHERS --sensor_model=sensor_model.json --output_dir=predicted",
+        f"vtrefine-predict --recording=OTHERS \\\n    --sensor_model={model} --output_dir=predicted",
     ]
-    return {"words": said, "commands": "\n".join(lines)}
+    return {"words": said, "commands": "\n\n".join(lines)}
 
 
 def _nothing() -> dict[str, Any]:

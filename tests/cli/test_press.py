@@ -1,0 +1,30 @@
+"""``vtrefine-press``: a recording set is there as a whole or not at all."""
+
+from pathlib import Path
+
+import pytest
+
+from lerobot_vtrefine.cli import press
+from lerobot_vtrefine.diagnose.pad import stand_in_rig
+
+
+def test_an_interrupted_rig_leaves_no_half_set(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    def stopped(_: object, folder: Path, *__: int) -> None:
+        (folder / "trial_0000.parquet").write_text("a press")
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(stand_in_rig, "record", stopped)
+    assert press.main([f"--output_dir={tmp_path / 'presses'}"]) == 130
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_a_set_is_replaced_only_when_asked_to(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    folder = tmp_path / "presses"
+    arguments = [f"--output_dir={folder}", "--trials=2"]
+    assert press.main(arguments) == 0
+    first = (folder / "trial_0000.parquet").read_bytes()
+    assert press.main([*arguments, "--seed=1"]) == 2
+    assert "recording.json exists; choose another --output_dir or add --overwrite" in capsys.readouterr().err
+    assert (folder / "trial_0000.parquet").read_bytes() == first
+    assert press.main([*arguments, "--seed=1", "--overwrite"]) == 0
+    assert (folder / "trial_0000.parquet").read_bytes() != first
