@@ -116,8 +116,8 @@ KINOVA = Embodiment(
         capsule(0.045, (0.0, 0.0, 0.0), (0.15643, 0.0, 0.0), "grey"),
         box((0.04, 0.06, 0.25), (-0.08, 0.0, -0.2)),
     ),
-    cameras={
-        "grasped": CameraConfig(80, 60, 0.33, (0.44, 0.0, 0.55), (0.0, 0.0, 0.145)),
-        "table": CameraConfig(160, 120, 0.48, (0.44, 0.0, 0.60), (0.0, 0.0, 0.09)),
+    cameras={  # before the chest: on the torso's top, every ray would end there
+        "grasped": CameraConfig(80, 60, 0.33, (0.38, 0.0, 0.55), (0.0, 0.0, 0.145)),
+        "table": CameraConfig(160, 120, 0.48, (0.38, 0.0, 0.60), (0.0, 0.0, 0.09)),
     },
 )
