@@ -10,6 +10,7 @@ from lerobot.configs import FeatureType, PolicyFeature
 
 from lerobot_vtrefine.datasets.features import ACTION_KEY, STATE_KEY, dataset_features, raw_keys
 from lerobot_vtrefine.embodiments import ALOHA, KINOVA, get_embodiment, register_embodiment
+from lerobot_vtrefine.observation.depth import deproject
 from lerobot_vtrefine.policies.vt_dp3.configuration_vt_dp3 import VtDp3Config
 from lerobot_vtrefine.sim.config import SceneConfig
 from lerobot_vtrefine.sim.scene import build_scene
@@ -81,6 +82,19 @@ def test_alohas_observation_is_what_it_was() -> None:
     np.testing.assert_allclose(seen["tactile"].astype(int).sum((0, 2)), COUNTS, atol=20)
     assert seen["tactile_baseline"].astype(int).sum((0, 2)).tolist() == BASELINE
     assert int(seen["depth_mm"].astype(int).sum()) == pytest.approx(DEPTH_SUM, rel=1e-5)
+
+
+@pytest.mark.parametrize("start", ["grasped", "table"])
+@pytest.mark.parametrize("body", ["aloha", "kinova"])
+def test_every_bodys_camera_sees_both_parts(body: str, start: str) -> None:
+    """Points that its depth image measures lie on the plug and on the socket."""
+    sim = InsertionSim(SceneConfig(embodiment=body, start=start), num_envs=1, num_threads=1)
+    sim.reset(np.zeros(1, np.int64), np.array([5]))
+    views = sim.depth_mm() / 1000, sim.camera_intrinsics[None], sim.camera_pose.reshape(1, 7)
+    points = deproject(*(torch.as_tensor(np.asarray(values), dtype=torch.float64) for values in views))
+    for pose in sim.part_poses():
+        distance = (points[:, 0].T - torch.as_tensor(pose[0, :3])).norm(dim=1)
+        assert (distance < 0.03).sum() >= 20
 
 
 def test_every_body_stands_in_its_scene_as_its_kinematics_say() -> None:
