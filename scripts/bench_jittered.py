@@ -3,9 +3,9 @@
 
 The recordings come from tests/diagnose/jittered_rig.py: laws in several forms, scaled to an achievable gain.
 An interrupted run goes on where it stopped; delete its folder after a change of the engine. Seeds below 1000
-are for tuning, reported figures come from 1000 and above. All 384 sets take about 4000 s of one core:
+are for tuning, reported figures come from 1000 and above. All 400 sets take about 4500 s of one core:
 
-    python scripts/bench_jittered.py --seeds=4000:4008 --jobs=22 --minutes=10
+    python scripts/bench_jittered.py --seeds=5000:5008 --jobs=22 --minutes=10
     python scripts/collect_results.py jittered outputs/bench_jittered/table.md --replace
     make tables
 """

@@ -30,6 +30,7 @@ SENSOR_CAUSES = (
     "taxel_gain_spread",
     "dead_taxels",
     "row_sharing",
+    "supply_droop",
     "crosstalk",
     "mechanical_spreading",
     "baseline_drift",

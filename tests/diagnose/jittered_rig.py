@@ -94,10 +94,11 @@ def _healing(press: Press, x: np.ndarray, a: float) -> np.ndarray:
     return x * (1 - a * (1 - x / np.maximum(top, 1e-12)))
 
 
-def _row_load(press: Press, x: np.ndarray, own: float) -> np.ndarray:
+def _line_load(line: np.ndarray, x: np.ndarray, own: float) -> np.ndarray:
+    """Load of every taxel's row or column, by the numbers of these (n,); `own` is the taxel's own weight."""
     total = np.zeros_like(x)
-    for row in np.unique(press.row):
-        mine = press.row == row
+    for number in np.unique(line):
+        mine = line == number
         total[:, mine] = x[:, mine].sum(axis=1, keepdims=True) - (1 - own) * x[:, mine]
     return total
 
@@ -129,11 +130,11 @@ _LAWS: dict[str, tuple[str, str, Law, float, str | None]] = {
     "mullins_damage": ("first_load_softening", "depth", _damage, 0.2, None),
     "mullins_healing": ("first_load_softening", "depth", _healing, 0.3, None),
     "row_all": (
-        "row_sharing", "reading", lambda p, x, c: x / (1 + c * _row_load(p, x, 1.0)), 1e-3,
+        "row_sharing", "reading", lambda p, x, c: x / (1 + c * _line_load(p.row, x, 1.0)), 1e-3,
         "conductance_per_count",
     ),
     "row_others": (
-        "row_sharing", "reading", lambda p, x, c: x / (1 + c * _row_load(p, x, 0.0)), 1e-3,
+        "row_sharing", "reading", lambda p, x, c: x / (1 + c * _line_load(p.row, x, 0.0)), 1e-3,
         "conductance_per_count",
     ),
     "skew_rows": (
@@ -169,7 +170,11 @@ _LAWS: dict[str, tuple[str, str, Law, float, str | None]] = {
     "breathing": (
         "", "reading", lambda p, x, a: x * (1 + a * np.sin(2.2 * p.time_s))[:, None], 0.1, None
     ),
-    "supply": ("", "reading", lambda p, x, c: x / (1 + c * x.sum(axis=1, keepdims=True)), 1e-4, None),
+    "supply": (
+        "supply_droop", "reading", lambda p, x, c: x / (1 + c * x.sum(axis=1, keepdims=True)), 1e-4,
+        "droop_per_count",
+    ),
+    "columns": ("", "reading", lambda p, x, c: x / (1 + c * _line_load(p.col, x, 1.0)), 1e-3, None),
 }  # fmt: skip
 _SPECIMEN = np.random.default_rng(77).standard_normal(4096)
 EFFECTS = {name: Effect(*entry) for name, entry in _LAWS.items()}

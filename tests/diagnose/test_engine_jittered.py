@@ -4,8 +4,12 @@ import numpy as np
 import pytest
 from jittered_rig import EFFECTS, Rig
 
+from lerobot_vtrefine.diagnose.pad.candidates import CATALOGUE
 from lerobot_vtrefine.diagnose.pad.engine import diagnose_pad
 from lerobot_vtrefine.diagnose.pad.fitting import movable
+from lerobot_vtrefine.diagnose.pad.form_fitting import with_form
+from lerobot_vtrefine.diagnose.pad.intervals import leave_out
+from lerobot_vtrefine.diagnose.pad.own_touch import with_own_touch
 from lerobot_vtrefine.diagnose.pad.press_trials import prepare
 from lerobot_vtrefine.diagnose.pad.problem import PadProblem
 
@@ -37,6 +41,50 @@ def test_an_early_touch_is_asked_about_by_a_face_that_lies_higher() -> None:
     (found,) = problem.screened(fitted, ["contact_offset"])
     assert found.tested.passed
     assert found.tested.probe.values[0] < 0
+
+
+def own_touches(rig: Rig) -> np.ndarray:
+    """How much later each press of a rig met the face (K,) [m], as `Rig.readings` draws it."""
+    touches = []
+    for press in rig.presses:
+        rng = np.random.default_rng([rig.seed, 33, *np.ravel(press.frames_s[:2] * 1e6).astype(int)])
+        rng.standard_normal()
+        touches.append(1e-5 * rng.standard_normal())
+    return np.array(touches)
+
+
+def test_every_recording_has_its_own_touch_and_the_offset_is_their_mean() -> None:
+    # Fits that linearise where the model touches lean towards the earliest recordings, by micrometres.
+    rig = Rig(3, 8, 12)
+    held = rig.record([(EFFECTS["offset_late"], 3e-5)])
+    presses = prepare(held, list(held.trials), list(range(len(held.trials))))
+    problem, fitted = PadProblem(presses).weighed(None)
+    (form,) = (form for form in CATALOGUE if (form.family, form.label) == ("contact_offset", "constant"))
+    extended = with_form(fitted, form, (), problem.presses, problem.weights)
+    problem, extended = problem.weighed(extended)
+    around, found = with_own_touch(problem, extended)
+    own = own_touches(rig)
+    assert found.model.values[2] == pytest.approx(3e-5 + own.mean(), abs=5e-7)
+    assert np.abs(np.array(around.presses.touches_m) - (own - own.mean())).max() < 2e-6
+    low, high = leave_out(found, around.presses).interval(lambda values: float(values[2]))
+    # Recordings that differ know their mean no better for each of them knowing its own touch well.
+    assert high - low > 2 * 1.9 * own.std() / np.sqrt(len(own))
+    assert low < 3e-5 < high
+
+
+@pytest.mark.slow
+def test_a_supply_that_droops_is_told_from_rows_that_share() -> None:
+    for law, name in (("supply", "supply_droop"), ("row_all", "row_sharing")):
+        found = diagnose_pad(recorded(law, 0.3, 2))
+        assert [cause.name for cause in found.verdict.causes] == [name]
+        assert found.verdict.status == "explained"
+
+
+@pytest.mark.slow
+def test_columns_that_load_each_other_are_no_row_sharing() -> None:
+    # No catalogue lists them: what is left along columns is nothing that rows or the pad's load account for.
+    found = diagnose_pad(recorded("columns", 0.4, 2))
+    assert found.verdict.status == "unexplained"
 
 
 @pytest.mark.slow

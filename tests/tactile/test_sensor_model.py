@@ -19,6 +19,7 @@ CONTRACT = [
     "taxel_gain_spread",
     "dead_taxels",
     "row_sharing",
+    "supply_droop",
     "crosstalk",
     "mechanical_spreading",
     "baseline_drift",

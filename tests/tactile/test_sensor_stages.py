@@ -33,6 +33,7 @@ from lerobot_vtrefine.tactile.stages.readout import (
     Quantisation,
     RowSharing,
     Saturation,
+    SupplyDroop,
     TaxelGainSpread,
 )
 from lerobot_vtrefine.tactile.stages.softening import FirstLoadSoftening
@@ -175,6 +176,26 @@ def test_row_sharing_lowers_the_row_and_leaves_the_column() -> None:
     assert float(once(RowSharing(), x)[2, 3]) < alone
     x[2, 7], x[4, 3] = 0.0, 100.0
     assert float(once(RowSharing(), x)[2, 3]) == alone
+
+
+def test_supply_droop_is_a_supply_with_resistance_that_sees_the_scans_mean_current() -> None:
+    """Columns are driven in turn; the mean of their currents lowers the voltage that drives them."""
+    conductance = np.random.default_rng(0).uniform(0.0, 0.01, (6, 10))
+    source_ohm, voltage = 10.0, 5.0
+    for _ in range(200):
+        current = np.mean([voltage * conductance[:, col].sum() for col in range(10)])
+        voltage = 5.0 - source_ohm * current
+    stiff = torch.from_numpy(1000.0 * 5.0 * conductance)[None]
+    drooping = once(SupplyDroop(droop_per_count=source_ohm / 10 / 5000.0), stiff)
+    assert np.allclose(drooping[0].numpy(), 1000.0 * voltage * conductance, rtol=1e-6)
+
+
+def test_supply_droop_reaches_taxels_of_other_rows_and_columns() -> None:
+    x = torch.zeros(6, 10)
+    x[2, 3] = 100.0
+    alone = float(once(SupplyDroop(), x)[2, 3])
+    x[4, 7] = 100.0
+    assert float(once(SupplyDroop(), x)[2, 3]) < alone
 
 
 def test_crosstalk_leaks_to_the_row_and_column_only() -> None:

@@ -116,6 +116,8 @@ class ScreenedSearch[P: ScreenedProblem[Any, Any], F: ScoredFit, C: FormCandidat
             if step is None:
                 break
             self._accept(step, found)
+            if not self._stands(step.candidate):
+                break
             self._drop_needless()
         return Selection(
             self.problem,
@@ -206,6 +208,19 @@ class ScreenedSearch[P: ScreenedProblem[Any, Any], F: ScoredFit, C: FormCandidat
         self.beside[name] = frozenset(passed - {name}) if step.candidate.terms else frozenset()
         self.chosen = (*self.chosen, step.candidate)
         self.problem, self.now = self.problem.weighed(step.fit)
+
+    def _stands(self, candidate: C) -> bool:
+        """Whether a cause predicts better under its own weights, too; if not, it is taken away again.
+
+        Found where all readings count alike, it may have stood in for what weights then forgive.
+        """
+        slim = self.problem.reduced(self.now, [candidate], _ONE)
+        full, less = (out_of_fold(self.problem, fit, self.folds) for fit in (self.now, slim))
+        if self.p_values[candidate.cause] is None or self._helps(full, less, 0.0):
+            return True
+        self.now, self.chosen = slim, self.chosen[:-1]
+        del self.p_values[candidate.cause]
+        return False
 
     def _drop_needless(self) -> None:
         """Take away what costs less than a further cause must gain; what is seen, if it costs nothing."""

@@ -48,7 +48,7 @@ class PadAccount:
 
     def __init__(self, found: Inference[PadProblem, Any, Candidate], whole: PadProblem) -> None:
         self.found, self.whole = found, whole
-        self.problem = found.selection.problem
+        self.problem = found.selection.fit.problem
         self.fit: Fit = found.selection.fit.fit
         self.plain: Fit = found.selection.baseline.fit
 
@@ -128,7 +128,8 @@ class PadAccount:
         rival = rivals[0]
         names = (rival.cause, rival.name)
         models = (self.fit.model, rival.fit.model)
-        return next_experiment(*models, self.problem.presses, self.problem.noise, names)
+        recorded = self.found.selection.problem.presses
+        return next_experiment(*models, recorded, self.problem.noise, names)
 
     def drawings(self, test: PadProblem, seed: int) -> tuple[tuple[Trace, ...], tuple[ResidualView, ...]]:
         """Held-out recordings at the taxels that answer most, and what residuals may follow."""

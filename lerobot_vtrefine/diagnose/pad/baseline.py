@@ -49,11 +49,12 @@ def describe(presses: PressSet) -> Setting:
     spans = [float(press.time_s[-1] - press.time_s[0]) for press in presses.presses]
     starts = [press.trial.start_s for press in presses.presses]
     touched = np.zeros((presses.layout.rows, presses.layout.cols), dtype=bool)
-    depth, company = 0.0, 1
+    depth, company, row_company = 0.0, 1, 1
     for press in presses.presses:
         pressed = press.drive > 0
         touched[press.layout.lines, press.layout.columns] |= pressed.any(axis=0)
-        company = max(company, int(pressed.sum(axis=-1).max(initial=0)))
+        company = max(company, int(pressed.sum(axis=(1, 2)).max(initial=0)))
+        row_company = max(row_company, int(pressed.sum(axis=-1).max(initial=0)))
         depth = max(depth, float(press.drive.max()))
     positive = steps[steps > 0]
     return Setting(
@@ -70,7 +71,8 @@ def describe(presses: PressSet) -> Setting:
         touched_cols=int(touched.any(axis=0).sum()),
         rest_session_s=presses.idle.session_s,
         temperature_c=_temperature(presses),
-        row_company=company,
+        row_company=row_company,
+        company=company,
     )
 
 
@@ -99,13 +101,13 @@ def first_guess(presses: PressSet, setting: Setting) -> Composite:
 
 
 def offset_tangents(
-    model: Composite, presses: PressSet, signals: Sequence[np.ndarray]
+    model: Composite, presses: PressSet, signals: Sequence[np.ndarray], step_m: float = OFFSET_STEP_M
 ) -> list[np.ndarray] | None:
     """Change of the signal per metre of contact offset (T, n) per recording; None when driven by load."""
     if presses.loaded:
         return None
-    shifted = run_stages(model.stages(), LoweredBench(presses.bench, OFFSET_STEP_M))
-    return [(a - b) / OFFSET_STEP_M for a, b in zip(shifted, signals, strict=True)]
+    shifted = run_stages(model.stages(), LoweredBench(presses.bench, step_m))
+    return [(a - b) / step_m for a, b in zip(shifted, signals, strict=True)]
 
 
 def touch_doubts(model: Composite, presses: PressSet) -> list[np.ndarray] | None:

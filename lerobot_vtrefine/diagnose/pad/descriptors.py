@@ -85,10 +85,12 @@ def _parity(press: Press) -> np.ndarray:
     return np.where(np.arange(len(press.trial.time_s)) % 2, 1.0, -1.0)[:, None]
 
 
-STIFFNESS = ("nonlinear_stiffness", "saturation", "row_sharing", "contact_offset")
+STIFFNESS = ("nonlinear_stiffness", "saturation", "row_sharing", "supply_droop", "contact_offset")
 MEMORY = ("viscoelastic_relaxation", "hysteresis", "first_load_softening")
 PLACES = ("taxel_gain_spread", "pad_tilt", "dead_taxels", "contact_offset")
-LINES = ("row_sharing", "crosstalk", "mechanical_spreading")
+ROWS = ("row_sharing", "crosstalk", "mechanical_spreading")
+COLUMNS = ("crosstalk", "mechanical_spreading")
+PAD = ("supply_droop", "crosstalk", "mechanical_spreading")
 TIMING = ("latency", "scan_skew", "sample_and_hold")
 
 DESCRIPTORS = (
@@ -137,14 +139,14 @@ DESCRIPTORS = (
         ("taxel_gain_spread",),
         lambda p, s: (s > 0) * (_place(p, 0) ** 2 + _place(p, 1) ** 2),
     ),
-    Descriptor("the other readings of the row", LINES, lambda p, s: _line_sum(p, s, 0)),
-    Descriptor("the other readings of the column", LINES, lambda p, s: _line_sum(p, s, 1)),
-    Descriptor("load times the row's other readings", LINES, lambda p, s: s * _line_sum(p, s, 0)),
-    Descriptor("load times the column's other readings", LINES, lambda p, s: s * _line_sum(p, s, 1)),
-    Descriptor("load times the total load", LINES, lambda p, s: s * s.sum(axis=1, keepdims=True)),
+    Descriptor("the other readings of the row", ROWS, lambda p, s: _line_sum(p, s, 0)),
+    Descriptor("the other readings of the column", COLUMNS, lambda p, s: _line_sum(p, s, 1)),
+    Descriptor("load times the row's other readings", ROWS, lambda p, s: s * _line_sum(p, s, 0)),
+    Descriptor("load times the column's other readings", COLUMNS, lambda p, s: s * _line_sum(p, s, 1)),
+    Descriptor("load times the total load", PAD, lambda p, s: s * s.sum(axis=1, keepdims=True)),
     Descriptor(
         "the total load, at every taxel",
-        LINES,
+        PAD,
         lambda p, s: np.broadcast_to(s.sum(axis=1, keepdims=True), s.shape),
     ),
     Descriptor(

@@ -11,11 +11,12 @@ import numpy as np
 
 from lerobot_vtrefine.diagnose.core.heldout import out_of_fold
 from lerobot_vtrefine.diagnose.core.resampling import agree
-from lerobot_vtrefine.diagnose.core.rules import DOUBTFUL_GAIN, DOUBTFUL_P
+from lerobot_vtrefine.diagnose.core.rules import AGREEMENT_P, DOUBTFUL_GAIN, DOUBTFUL_P, LEAST_GAIN
 from lerobot_vtrefine.diagnose.core.search import Selection
 from lerobot_vtrefine.diagnose.pad.fitting import Fit, fit, rest
 from lerobot_vtrefine.diagnose.pad.idle_level import settled_idle
 from lerobot_vtrefine.diagnose.pad.model import Composite, sensor_model
+from lerobot_vtrefine.diagnose.pad.own_touch import with_own_touch
 from lerobot_vtrefine.diagnose.pad.prediction import predict_trial
 from lerobot_vtrefine.diagnose.pad.press_trials import IdleMap, Press, PressSet
 from lerobot_vtrefine.tactile.model import SensorModel
@@ -64,7 +65,9 @@ class FinalFit:
     """What is handed out of a fit."""
 
     fit: Fit
-    """That the search settled on: names, sizes and intervals are told of it."""
+    """Sizes and intervals are told of it."""
+    problem: "PadProblem"
+    """In which the fit stands."""
     sensor: SensorModel
     """What users load."""
     idle: IdleMap
@@ -86,7 +89,9 @@ class FinalFit:
         for family in families:
             model = model.minus(family)
         slim = fit(model, problem.presses, problem.even.weights, _SLIM_STEPS)
-        return replace(self, fit=slim, sensor=_sensor(slim.model, problem, self.idle, self.noise_counts))
+        return replace(
+            self, fit=slim, problem=problem, sensor=_sensor(slim.model, problem, self.idle, self.noise_counts)
+        )
 
 
 def _sensor(model: Composite, problem: "PadProblem", idle: IdleMap, noise_counts: float) -> SensorModel:
@@ -102,11 +107,14 @@ def handed_out(
     new recordings.
     """
     problem, plain, fitted = selection.problem, selection.baseline, selection.fit
-    model = trusted(problem, plain, fitted, seed, doubtful=doubtful) if fitted.model.families else plain.model
+    around, model = problem, plain.model
+    if fitted.model.families:
+        around, fitted = with_own_touch(problem, fitted)
+        model = trusted(problem, plain, fitted, seed, doubtful=doubtful)
     idle = settled_idle(model, problem.presses)
     noise = problem.noise.floor if problem.noise is not None else 0.0
-    before = FinalFit(plain, _sensor(plain.model, problem, idle, noise), idle, noise)
-    after = FinalFit(fitted, _sensor(model, problem, idle, noise), idle, noise)
+    before = FinalFit(plain, problem, _sensor(plain.model, problem, idle, noise), idle, noise)
+    after = FinalFit(fitted, around, _sensor(model, problem, idle, noise), idle, noise)
     if "sample_and_hold" in fitted.model.families:
         errors = [problem.errors(item).mean() for item in (before, after)]
         after = after if errors[1] < errors[0] else replace(after, sensor=before.sensor)
@@ -117,7 +125,8 @@ def trusted(problem: "PadProblem", plain: Fit, fitted: Fit, seed: int, *, doubtf
     """What is handed out: never a model that predicts plain readings of recordings left out worse than the
     baseline does.
 
-    Named causes are taken as they were weighed or refitted to plain readings, whichever predicts better.
+    Named causes are taken as they were weighed, or refitted to plain readings where that predicts clearly
+    better: where a form is not quite right, weights trust what it gets wrong.
     Beside an unknown cause (`doubtful`) that must be clearly better than the baseline in nearly all
     recordings: names are symptoms then, and what they stand in for may be otherwise next time.
     """
@@ -125,11 +134,10 @@ def trusted(problem: "PadProblem", plain: Fit, fitted: Fit, seed: int, *, doubtf
     before = out_of_fold(even, rest(plain.model, problem.presses, even.weights), problem.folds)
     # A map's shrinkage needs the noise, which plain weights do not know: it stays.
     refitted = fit(fitted.model, problem.presses, even.weights)
-    found = [
-        (fitted.model, out_of_fold(problem, fitted, problem.folds)),
-        (refitted.model, out_of_fold(even, refitted, problem.folds)),
-    ]
-    model, held = max(found, key=lambda item: item[1].gain_over(before))
+    model, held = fitted.model, out_of_fold(problem, fitted, problem.folds)
+    other = out_of_fold(even, refitted, problem.folds)
+    if other.gain_over(held) > LEAST_GAIN and agree((held.errors - other.errors).sum(1), seed, AGREEMENT_P):
+        model, held = refitted.model, other
     needed = DOUBTFUL_GAIN if doubtful else 0.0
     lucky = doubtful and not agree((before.errors - held.errors).sum(1), seed, DOUBTFUL_P)
     return plain.model if held.gain_over(before) <= needed or lucky else model

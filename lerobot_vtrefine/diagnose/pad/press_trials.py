@@ -14,7 +14,7 @@ from lerobot_vtrefine.diagnose.recordings import RecordingSet, Trial
 from lerobot_vtrefine.tactile.layout import PadLayout
 
 if TYPE_CHECKING:
-    from lerobot_vtrefine.diagnose.pad.forward_model.run import Bench
+    from lerobot_vtrefine.diagnose.pad.forward_model.run import Bench, LoweredBench
 
 MARGIN_TAXELS = 2
 """Untouched taxels kept around those that answer, so that spreading does not see the crop's edge."""
@@ -154,12 +154,18 @@ class PressSet:
     """Whether the trials are driven by the load (no depth)."""
     step_counts: float = field(default=0.0)
     """Step of the converter, 0 if readings are not on a lattice."""
+    recorded: "PressSet | None" = None
+    """The same presses without touches of their own, where they have any."""
+    touches_m: tuple[float, ...] = ()
+    """How much later than recorded each press meets the face, where that is allowed for [m]."""
 
     def subset(self, keep: list[int]) -> "PressSet":
         """With the presses of those numbers; kept, so that what is built of it is built once."""
-        key = tuple(keep)
-        if key not in self._subsets:
-            self._subsets[key] = replace(self, presses=tuple(self.presses[index] for index in keep))
+        if (key := tuple(keep)) not in self._subsets:
+            presses = tuple(self.presses[index] for index in keep)
+            touches_m = tuple(self.touches_m[index] for index in keep if self.touches_m)
+            recorded = self.recorded and self.recorded.subset(keep)
+            self._subsets[key] = replace(self, presses=presses, recorded=recorded, touches_m=touches_m)
         return self._subsets[key]
 
     @cached_property
@@ -167,10 +173,12 @@ class PressSet:
         return {}
 
     @cached_property
-    def bench(self) -> "Bench":
+    def bench(self) -> "Bench | LoweredBench":
         """The presses grouped for running models."""
-        from lerobot_vtrefine.diagnose.pad.forward_model.run import Bench
+        from lerobot_vtrefine.diagnose.pad.forward_model.run import Bench, LoweredBench
 
+        if self.recorded is not None:
+            return LoweredBench(self.recorded.bench, np.array(self.touches_m))
         return Bench(self.presses, self.idle.level)
 
     @property

@@ -26,6 +26,7 @@ from lerobot_vtrefine.diagnose.pad.final_model import FinalFit
 from lerobot_vtrefine.diagnose.pad.fitting import Fit, losses_of, predict, refit_weighted, squared_errors
 from lerobot_vtrefine.diagnose.pad.form_fitting import Starts, grown, settle, starts_of, with_form, without
 from lerobot_vtrefine.diagnose.pad.noise import Noise
+from lerobot_vtrefine.diagnose.pad.own_touch import allowed, losses_at_own_touch
 from lerobot_vtrefine.diagnose.pad.press_trials import PressSet
 from lerobot_vtrefine.diagnose.pad.screening import DEAD, GAIN_MAP, all_probes, form_probes, forms_of
 from lerobot_vtrefine.diagnose.pad.suspicions import suspicions
@@ -89,7 +90,11 @@ class Refits:
             model = map_of(model, self.fit, self._evidence, np.flatnonzero(weights).tolist())
         part = self.problem.presses.subset(keep)
         signals = predict(model, part)
-        losses = losses_of(signals, part, [self.problem.weights[k] for k in keep])
+        noise = self.problem.noise
+        if noise is not None and allowed(part, self.problem.weights):
+            losses = losses_at_own_touch(model, part, noise)
+        else:
+            losses = losses_of(signals, part, [self.problem.weights[k] for k in keep])
         return squared_errors(signals, part)[:, None], -0.5 * losses[:, None]
 
 

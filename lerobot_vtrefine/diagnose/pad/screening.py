@@ -15,6 +15,7 @@ from lerobot_vtrefine.diagnose.pad.candidates.sample_and_hold import held, irreg
 from lerobot_vtrefine.diagnose.pad.fitting import Fit, movable, predict, tangents
 from lerobot_vtrefine.diagnose.pad.forward_model.run import Prefix
 from lerobot_vtrefine.diagnose.pad.idle_drift import drift_probe
+from lerobot_vtrefine.diagnose.pad.own_touch import allowed, touches_of
 from lerobot_vtrefine.diagnose.pad.press_trials import PressSet
 from lerobot_vtrefine.diagnose.pad.taxel_maps import find_dead, map_evidence
 from lerobot_vtrefine.diagnose.pad.weights import TrialWeights
@@ -107,6 +108,8 @@ def form_probes(problem: "PadProblem", fitted: Fit, families: Collection[str] | 
 def all_probes(problem: "PadProblem", fitted: Fit) -> list[Probe]:
     """Probes of forms, of maps, of frames that repeat and of levels that wander."""
     probes = [*form_probes(problem, fitted), *map_probes(problem, fitted)]
+    touch = touch_probe(problem, fitted)
+    probes += [touch] if touch is not None else []
     repeats = hold_probe(problem, fitted)
     if repeats is not None:
         probes = [*(probe for probe in probes if probe.name != repeats.name), repeats]
@@ -151,6 +154,22 @@ def map_probes(problem: "PadProblem", fitted: Fit) -> list[Probe]:
         # Answers that fail by a factor of eight at many times their error are seen, not tested.
         found.append(_observed(DEAD, None, np.zeros(0)))
     return found
+
+
+def touch_probe(problem: "PadProblem", fitted: Fit) -> Probe | None:
+    """Recordings' own touches, which all lie on one side if the face is not where it was assumed.
+
+    Between that and recordings that differ, a change of the readings near the touch cannot tell: the earliest
+    recordings decide its score.
+    """
+    forms, noise = forms_of("contact_offset", fitted), problem.noise
+    if not forms or forms[0].family in fitted.model.families or noise is None:
+        return None
+    if not allowed(problem.presses, problem.weights):
+        return None
+    late = touches_of(fitted.model, problem.presses, noise) / noise.offset_m
+    size = np.array([noise.offset_m])
+    return Probe(forms[0].family, forms[0], size, late, np.ones(len(late)), one_sided=False)
 
 
 def hold_probe(problem: "PadProblem", fitted: Fit) -> Probe | None:

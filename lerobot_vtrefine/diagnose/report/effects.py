@@ -16,6 +16,7 @@ SHAPES: dict[str, tuple[str, str, str]] = {
     "taxel_gain_spread": (FLAT, "M8 36H20V24H36V46H52V30H68V52H84V28H100V38H112", "gain over taxels"),
     "dead_taxels": (FLAT, "M8 36H44V62H60V36H84V62H92V36H112", "reading over taxels"),
     "row_sharing": (PEAK, "M8 60H46V34H74V60H112", "reading along a row"),
+    "supply_droop": (RAMP, "M8 60C44 42 80 32 112 28", "reading over the pad's load"),
     "crosstalk": (PEAK, "M8 52H46V14H74V52H112", "reading along a row"),
     "mechanical_spreading": (PEAK, "M8 60C36 60 44 18 60 18S84 60 112 60", "reading along a row"),
     "baseline_drift": (FLAT, "M8 50C40 44 80 28 112 16", "idle level over time"),

@@ -55,6 +55,12 @@ MEANINGS = {
         "conductance",
         "1/counts",
     ),
+    "supply_droop": Meaning(
+        "supply droop",
+        "The supply's voltage falls with the load of the whole pad, and every reading with it.",
+        "droop",
+        "1/counts",
+    ),
     "crosstalk": Meaning(
         "crosstalk", "A reading leaks into the others of its row and column.", "fraction", "1"
     ),

@@ -144,6 +144,31 @@ class Saturation(Stage):
 
 @register
 @dataclass(frozen=True)
+class SupplyDroop(Stage):
+    """The drive voltage falls with the whole pad's load: s_rc / (1 + k * sum of all s).
+
+    Lines are driven one after the other, but a supply that is slower than a scan gives the mean of a frame's
+    currents, and its resistance lowers the voltage of every line alike. (The driver's own resistance would
+    lower that of its line alone: Kim, Kwon & Choi 2016, Sensors 16(2), 155.) A converter whose reference is
+    the drive voltage itself does not see it.
+    """
+
+    name: ClassVar[str] = "supply_droop"
+    domain: ClassVar[str] = "counts"
+    rank: ClassVar[int] = 55
+    droop_per_count: float = parameter(5e-5, "1/counts", 0.0, 5e-4)
+
+    def lowered(self, x: Any, pad_sum: Any) -> Any:
+        """Readings x of pads that add up to `pad_sum`, at the lower voltage."""
+        return x / (1.0 + self.droop_per_count * pad_sum)
+
+    @override
+    def step(self, x: torch.Tensor, state: State, frame: Frame) -> tuple[torch.Tensor, State]:
+        return self.lowered(x, x.sum(dim=(-2, -1), keepdim=True)), state
+
+
+@register
+@dataclass(frozen=True)
 class RowSharing(Stage):
     """The row's voltage divider: s_rc / (1 + k * sum_j s_rj), the sum over the whole row with the taxel
     itself.

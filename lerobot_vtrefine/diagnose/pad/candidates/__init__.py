@@ -16,6 +16,7 @@ LISTED = (
     "hysteresis",
     "first_load_softening",
     "row_sharing",
+    "supply_droop",
     "crosstalk",
     "mechanical_spreading",
     "baseline_drift",

@@ -37,6 +37,8 @@ class Setting:
     """Mean temperature; None where it was not recorded throughout, or did not change."""
     row_company: int = 1
     """Most taxels of a row that are pressed at once."""
+    company: int = 1
+    """Most taxels that are pressed at once."""
     log_gain: float | None = None
     """Logarithm of the plain baseline's counts per metre (or newton); None before it is fitted."""
 

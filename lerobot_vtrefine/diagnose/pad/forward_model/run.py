@@ -35,10 +35,10 @@ class Bench:
 
 @dataclass(frozen=True)
 class LoweredBench:
-    """The same presses with the face lowered."""
+    """The same presses with the face lowered, in all of them alike or in each by its own amount (K,)."""
 
-    bench: Bench
-    by_m: float
+    bench: "Bench | LoweredBench"
+    by_m: float | np.ndarray
 
     @property
     def presses(self) -> Sequence[Press]:
@@ -47,7 +47,15 @@ class LoweredBench:
 
     def sheets(self, kind: Kind) -> list[Sheet]:
         """The presses at a model's instants."""
-        return [replace(sheet, drive=sheet.drive - self.by_m) for sheet in self.bench.sheets(kind)]
+        return [
+            replace(sheet, drive=sheet.drive - self._of_columns(sheet)) for sheet in self.bench.sheets(kind)
+        ]
+
+    def _of_columns(self, sheet: Sheet) -> float | np.ndarray:
+        if not isinstance(self.by_m, np.ndarray):
+            return self.by_m
+        widths = [block.stop - block.start for block in sheet.blocks]
+        return np.repeat(self.by_m[list(sheet.members)], widths)
 
 
 @dataclass(frozen=True)

@@ -24,6 +24,7 @@ from lerobot_vtrefine.tactile.stages.readout import (
     Idle,
     Quantisation,
     RowSharing,
+    SupplyDroop,
     TaxelGainSpread,
 )
 from lerobot_vtrefine.tactile.stages.signals import sampled
@@ -200,6 +201,13 @@ def _row_sharing(stage: RowSharing, field: Field, context: Context) -> Field:
     return by_press(field, context.sheet, work)
 
 
+def _supply_droop(stage: SupplyDroop, field: Field, context: Context) -> Field:
+    def work(x: np.ndarray, time_s: np.ndarray, taxels: np.ndarray) -> np.ndarray:
+        return stage.lowered(x, x.sum(axis=1, keepdims=True))
+
+    return by_press(field, context.sheet, work)
+
+
 def _scan_skew(stage: ScanSkew, field: Field, context: Context) -> Field:
     layout = context.sheet.layout
 
@@ -244,6 +252,7 @@ OWN_TAXELS: dict[type, Callable[[Any, Field, Context], Field]] = {
     TaxelGainSpread: _multiplied,
     DeadTaxels: _multiplied,
     RowSharing: _row_sharing,
+    SupplyDroop: _supply_droop,
     Crosstalk: _crosstalk,
     Idle: _idle,
     BaselineDrift: _drift,
