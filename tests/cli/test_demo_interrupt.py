@@ -28,7 +28,7 @@ def stage(name, code, **options):
     product = folder / name / "product"
     return Stage(name, name, ("python", "-c", code, str(product)), product.parent, product, **options)
 
-demo.parse_config = lambda arguments: SimpleNamespace(output_dir=folder)
+demo.parse_config = lambda arguments: SimpleNamespace(output_dir=folder, device="cpu")
 demo.demo_stages = lambda config: [stage("a", first), stage("b", second, needs=("a",), resumable=True)]
 demo.write_report = lambda config, records: folder / "report.html"
 raise SystemExit(demo.main())
