@@ -114,7 +114,7 @@ def test_the_gain_is_what_locked_recordings_say(hardened: Diagnosis) -> None:
 
 def test_every_candidate_has_a_row_of_evidence(hardened: Diagnosis) -> None:
     rows = {row.name: row for row in hardened.evidence}
-    assert len(rows) == 16
+    assert len(rows) == 17
     assert rows["nonlinear_stiffness"].decision == "accepted"
     assert rows["latency"].decision == "rejected"
 
