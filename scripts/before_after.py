@@ -34,7 +34,7 @@ EVERY = 2
 def filmed(policy: str, env: VtRefineEnvConfig, seeds: range) -> Iterator[list[Image.Image]]:
     """The pictures of every episode of a policy, its last one always among them."""
     world, agent = LiveWorld(env), PolicyAgent(policy, env, "cpu")
-    renderer = VideoRenderer(world.sim)
+    renderer = VideoRenderer(world.sim, menagerie_dir=world.config.menagerie_dir)
     for seed in seeds:
         world.reset(seed)
         agent.reset(world)

@@ -3,10 +3,12 @@
 
 MUJOCO_GL=egl python scripts/make_figures.py            # all, about two minutes
 python scripts/make_figures.py results dppo             # some
+MENAGERIE_DIR=mujoco_menagerie python scripts/make_figures.py looks    # needs MuJoCo Menagerie
 """
 
 import csv
 import json
+import os
 import subprocess
 import sys
 import tempfile
@@ -55,6 +57,11 @@ NAMES = (
     ("fingers with a pad\non each inner face", (0.28, 0.14), (0.56, 0.30)),
 )
 """What is called what in the picture of the task: words, their place and what they point at, as shares."""
+LOOKS: dict[str, dict[str, Any]] = {
+    "aloha": {"lookat_m": (0.0, 0.0, 0.16), "distance_m": 1.25, "azimuth_deg": 165.0},
+    "kinova": {"lookat_m": (0.15, 0.0, 0.27), "distance_m": 1.35, "azimuth_deg": 145.0},
+}
+"""Where each robot is looked at from."""
 STYLE: dict[str, Any] = {
     "font.size": 12,
     "axes.spines.top": False,
@@ -134,6 +141,27 @@ def draw_task(plt: Any, sim: Any, frames: list[dict[str, Any]]) -> None:
         box = {"boxstyle": "round,pad=0.25", "fc": "white", "ec": "none", "alpha": 0.85}
         ax.annotate(words, target, place, ha="center", va="center", arrowprops=arrow, bbox=box)
     figure.savefig(IMAGES / "task.png")
+
+
+def draw_looks(plt: Any) -> None:
+    """Both robots by this package's shapes and by MuJoCo Menagerie's meshes."""
+    from lerobot_vtrefine.sim.config import SceneConfig
+    from lerobot_vtrefine.sim.render import CameraView, VideoRenderer
+    from lerobot_vtrefine.sim.simulation import InsertionSim
+
+    folders = {"this package's shapes": None, "Menagerie's meshes": Path(os.environ["MENAGERIE_DIR"])}
+    figure, axes = plt.subplots(2, 2, figsize=(8.6, 4.6), layout="constrained")
+    for row, (body, view) in zip(axes, LOOKS.items(), strict=True):
+        sim = InsertionSim(SceneConfig(embodiment=body, start="grasped"), num_envs=1)
+        sim.reset(np.arange(1), np.arange(1))
+        for ax, (title, folder) in zip(row, folders.items(), strict=True):
+            renderer = VideoRenderer(sim, 0, CameraView(**view), 640, "gl", folder)
+            scene = renderer.frame()[:, :640]
+            renderer.close()
+            ax.imshow(scene[40:-40])
+            ax.set_title(f"{body}, {title}", loc="left")
+            ax.axis("off")
+    figure.savefig(IMAGES / "looks.png")
 
 
 def draw_point_cloud(plt: Any, sim: Any, frames: list[dict[str, Any]]) -> None:
@@ -327,6 +355,7 @@ OTHERS: dict[str, Callable[..., None]] = {
     "dppo": draw_dppo,
     "results": draw_results,
     "diagnosis": draw_diagnosis,
+    "looks": draw_looks,
 }
 
 
@@ -336,7 +365,8 @@ def main() -> int:
     mpl.rcParams.update(STYLE)  # ty: ignore[no-matching-overload]
     import matplotlib.pyplot as plt
 
-    wanted = sys.argv[1:] or [*SIMULATED, *OTHERS]
+    drawn = [name for name in (*SIMULATED, *OTHERS) if name != "looks" or "MENAGERIE_DIR" in os.environ]
+    wanted = sys.argv[1:] or drawn
     if unknown := set(wanted) - SIMULATED.keys() - OTHERS.keys():
         print(f"error: unknown {', '.join(sorted(unknown))}; choose from {', '.join([*SIMULATED, *OTHERS])}")
         return 2

@@ -1,6 +1,6 @@
 """Where an iteration of DPPO spends its time, beside the environment alone.
 
-    python scripts/profile_finetuning.py --device=cuda --worlds=1024,4096
+    python scripts/profile_finetuning.py --device=cuda --worlds='[1024, 4096]'
 
 The tuned policy that comes with the package plays its own task; --policy takes another checkpoint. An
 earlier commit is measured by its own copy of this script:
@@ -27,7 +27,7 @@ import numpy as np
 import torch
 
 import lerobot_vtrefine
-from lerobot_vtrefine.cli.arguments import CommandParser
+from lerobot_vtrefine.cli.arguments import CommandParser, read_list
 from lerobot_vtrefine.cli.errors import run_cli
 from lerobot_vtrefine.envs.decisions import LeRobotDecisionEnv
 from lerobot_vtrefine.envs.episodes import Episodes
@@ -143,7 +143,7 @@ def main() -> int:
     """Prints a JSON object per number of worlds."""
     parser = CommandParser(description=__doc__)
     parser.add_argument("--device", default="cpu", help="of simulation and policy: cpu or cuda")
-    parser.add_argument("--worlds", default="1024,4096", help="numbers of worlds")
+    parser.add_argument("--worlds", type=read_list, default=[1024, 4096], help="numbers of worlds")
     parser.add_argument("--iterations", type=int, default=4, help="measured, after one to warm up")
     parser.add_argument("--decisions", type=int, default=0, help="of a rollout; 0: whole episodes")
     parser.add_argument("--policy", type=Path, default=POLICY, help="a vt_dp3 checkpoint's folder")
@@ -152,7 +152,7 @@ def main() -> int:
     args = parser.parse_args()
     print(f"measuring {Path(lerobot_vtrefine.__file__).parent}", flush=True)
     rows = []
-    for worlds in args.worlds.split(","):
+    for worlds in args.worlds:
         rows.append(profile(args, int(worlds)))
         print(json.dumps(rows[-1], indent=2), flush=True)
     if args.json is not None:

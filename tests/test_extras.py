@@ -94,7 +94,7 @@ def test_what_simulates_names_the_extra(tiny_dataset: Path, tmp_path: Path) -> N
         ["replay", dataset, out],
         ["bench", "--plot"],
         ["press", out],
-        ["bench", "--parts=tactile,envs"],
+        ["bench", "--parts=[tactile, envs]"],
     ]
     for command, (status, _, lines) in zip(commands, run_commands(SIMULATORS, commands), strict=True):
         assert status in (1, 2), command

@@ -4,7 +4,7 @@ examples:
   vtrefine-bench
   vtrefine-bench --plot                        # pressure images of the contact models, and their errors
   vtrefine-bench --device=cuda                 # many worlds on a GPU
-  vtrefine-bench --device=cuda --solver=own,stock      # beside mujoco_warp's own step
+  vtrefine-bench --device=cuda --solver='[own, stock]'      # beside mujoco_warp's own step
 """
 
 import importlib.util
@@ -19,6 +19,7 @@ from typing import TYPE_CHECKING
 
 import draccus
 
+from lerobot_vtrefine.choices import check_choice
 from lerobot_vtrefine.cli.errors import run_cli
 from lerobot_vtrefine.cli.pipeline.stages import last_line, stop
 from lerobot_vtrefine.extras import SIMULATOR, require
@@ -58,8 +59,8 @@ SWITCHES = ("--full", "--plot")
 class BenchConfig:
     """What to measure and where to write it."""
 
-    parts: str = ",".join(PARTS)
-    """Parts to measure; all are tactile,envs,dataset,finetune,drivers,busy."""
+    parts: tuple[str, ...] = tuple(PARTS)
+    """Parts to measure, e.g. '[envs, drivers]'; all by default."""
     limit_s: float = 60.0
     """Seconds that a part may take; a slower one is left out. No limit with --full."""
     full: bool = False
@@ -69,44 +70,29 @@ class BenchConfig:
     speeds, into outputs/bench."""
     device: str | None = None
     """Instead, measure worlds of the warp backend on cuda or cpu; on cuda the contact models, too."""
-    worlds: str = "1,64,1024,4096"
+    worlds: tuple[int, ...] = (1, 64, 1024, 4096)
     """Numbers of worlds for --device."""
-    solver: str = "own"
-    """Of these worlds: own, stock (mujoco_warp's own step), or own,stock to compare the two."""
+    solver: tuple[str, ...] = ("own",)
+    """Of these worlds: '[own]', '[stock]' (mujoco_warp's own step), or '[own, stock]' to compare the two."""
     steps: int = 40
     """Control steps measured for each number of worlds."""
     json: Path | None = None
     """File for the rows as JSON, beside the table."""
 
     def __post_init__(self) -> None:
-        unknown = sorted(set(self.chosen_parts) - set(PARTS))
+        unknown = sorted(set(self.parts) - set(PARTS))
         if unknown:
             raise ValueError(f"--parts: unknown {', '.join(unknown)}; choose from {', '.join(PARTS)}")
         if not self.limit_s > 0:
             raise ValueError(f"--limit_s must be above 0, got {self.limit_s}")
         if self.plot and self.device is not None:
             raise ValueError("--plot and --device are two different things to do; give one")
-        if not set(self.solvers) <= set(WARP_SOLVERS):
-            raise ValueError(f"--solver must be own, stock or own,stock, got {self.solver!r}")
-        _ = self.world_counts
-
-    @property
-    def chosen_parts(self) -> tuple[str, ...]:
-        """`parts`, one by one."""
-        return tuple(self.parts.split(","))
-
-    @property
-    def solvers(self) -> tuple[str, ...]:
-        """`solver`, one by one."""
-        return tuple(self.solver.split(","))
-
-    @property
-    def world_counts(self) -> tuple[int, ...]:
-        """`worlds` as numbers; ValueError for anything else."""
-        counts = self.worlds.strip("[]() ").split(",")
-        if not all(count.strip().isdigit() and int(count) > 0 for count in counts):
-            raise ValueError(f"--worlds must be numbers such as 1,64,1024, got {self.worlds!r}")
-        return tuple(int(count) for count in counts)
+        for solver in self.solver:
+            check_choice("--solver", solver, WARP_SOLVERS)
+        if min(self.worlds, default=0) < 1:
+            raise ValueError(
+                f"--worlds must be numbers from 1 on, such as '[1, 64]', got {list(self.worlds)}"
+            )
 
 
 @dataclass(frozen=True)
@@ -186,11 +172,9 @@ def measure_device(config: BenchConfig, device: str) -> list[Row]:
     from lerobot_vtrefine.tactile.benchmark import run_cuda
 
     found: dict[str, list[WorldsRow]] = {}
-    for solver in config.solvers:
+    for solver in config.solver:
         found[solver] = []
-        for row in measure_worlds(
-            WarpConfig(device=device, solver=solver), config.world_counts, config.steps
-        ):
+        for row in measure_worlds(WarpConfig(device=device, solver=solver), config.worlds, config.steps):
             print(f"{row.worlds} worlds: {row.worlds / row.mean_s:.4g} steps/s", file=sys.stderr, flush=True)
             found[solver].append(row)
         print(f"solver {solver}:\n{worlds_table(found[solver])}")
@@ -242,7 +226,7 @@ def main() -> int:
         print(table(rows))
         found = True
     else:
-        rows = measure(config.chosen_parts, config.limit_s, config.full)
+        rows = measure(config.parts, config.limit_s, config.full)
         print(table(rows))
         found = bool(rows)
     if config.json is not None:

@@ -5,7 +5,7 @@ from contextlib import ExitStack
 from pathlib import Path
 
 from lerobot_vtrefine import extras
-from lerobot_vtrefine.cli.arguments import CommandParser
+from lerobot_vtrefine.cli.arguments import CommandParser, ListAction
 from lerobot_vtrefine.cli.errors import run_cli
 from lerobot_vtrefine.datasets.features import PADS
 from lerobot_vtrefine.drivers.config import PadConfig
@@ -39,13 +39,17 @@ def make_parser() -> CommandParser:
         "--output", type=Path, default=Path("pads.yaml"), help="file to write (default: %(default)s)"
     )
     parser.add_argument(
-        "--names", nargs="+", default=list(PADS), metavar="NAME", help="pads to ask for, in this order"
+        "--names",
+        action=ListAction,
+        default=list(PADS),
+        metavar="NAME",
+        help="pads to ask for, in this order: '[NAME, NAME]'",
     )
     parser.add_argument(
         "--ports",
-        nargs="+",
+        action=ListAction,
         metavar="PORT",
-        help="ports to look at (default: every USB serial port of this machine)",
+        help="ports to look at: '[PORT, PORT]', or in a row (default: every USB serial port of this machine)",
     )
     parser.add_argument(
         "--timeout", type=float, default=60.0, help="seconds to wait for each press (default: %(default)s)"

@@ -30,6 +30,11 @@ class Flag:
     required: bool
     group: tuple[str, str] | None = None
 
+    @property
+    def is_list(self) -> bool:
+        """Whether it takes ``[a, b]``."""
+        return self.type.startswith(("list[", "["))
+
     def is_among(self, given: Iterable[str]) -> bool:
         """Whether one of these names is the flag's, or lies below it."""
         return any(name == self.name or name.startswith(f"{self.name}.") for name in given)
@@ -79,7 +84,7 @@ def _fields(module: str, name: str, prefix: str) -> Iterator[Flag]:
         group = _defined_in(module, kind.removesuffix(" | None"))
         default = None if group is not None and entry.value is not None else _default(entry.value)
         name = prefix + entry.target.id
-        yield Flag(name, kind.removesuffix(" | None"), default, text, entry.value is None, group)
+        yield Flag(name, _kind(kind), default, text, entry.value is None, group)
 
 
 def _docstring(node: ast.stmt | None) -> str:
@@ -100,6 +105,15 @@ def _comment(lines: list[str], index: int) -> str:
     return " ".join(above)
 
 
+def _kind(annotation: str) -> str:
+    """A type as users write its values: ``list[int]`` for any number of them, ``[int, int]`` for two."""
+    kind = annotation.removesuffix(" | None")
+    if not kind.startswith("tuple["):
+        return kind
+    items = kind.removeprefix("tuple")
+    return f"list{items.replace(', ...', '')}" if items.endswith(", ...]") else items
+
+
 def _default(value: ast.expr | None) -> str | None:
     """A default as a user would type it; empty for what only code can say, None for no default."""
     if value is None:
@@ -110,6 +124,8 @@ def _default(value: ast.expr | None) -> str | None:
         literal = ast.literal_eval(value)
     except ValueError:
         return ""
+    if isinstance(literal, tuple | list):
+        return f"[{', '.join(map(str, literal))}]"
     return "" if literal is None else str(literal).lower() if isinstance(literal, bool) else str(literal)
 
 

@@ -6,6 +6,7 @@ import textwrap
 from collections.abc import Callable
 from functools import partial
 
+from lerobot_vtrefine.cli.arguments import with_brackets
 from lerobot_vtrefine.cli.checks import check_arguments
 from lerobot_vtrefine.cli.errors import run_cli
 from lerobot_vtrefine.cli.flags import Flag, describe_module, flags_of
@@ -29,6 +30,8 @@ def launch(command: str, module: str, config: str) -> int:
         print("\n".join(below) or help_text(name, module, config))
         return 0
     check_arguments(flags_of(module, config, unused=True), sys.argv[1:])
+    lists = {flag.name for flag in flags_of(module, config, nested=True) if flag.is_list}
+    sys.argv[1:] = with_brackets(sys.argv[1:], lists)
     if sys.stderr.isatty():
         print("loading LeRobot and PyTorch (the first time takes longest) ...", file=sys.stderr, flush=True)
     main = importlib.import_module(name).main

@@ -10,7 +10,7 @@ from contextlib import ExitStack
 from dataclasses import dataclass
 from pathlib import Path
 
-from lerobot_vtrefine.cli.arguments import CommandParser
+from lerobot_vtrefine.cli.arguments import CommandParser, ListAction
 from lerobot_vtrefine.cli.errors import run_cli
 from lerobot_vtrefine.datasets.features import PADS
 from lerobot_vtrefine.drivers.diagnostic_emulator import DiagnosticEmulator
@@ -96,7 +96,7 @@ def make_parser() -> CommandParser:
     add("--stall", type=float, default=1.0, help="length of a stall in seconds (default: %(default)s)")
     add("--unplug_at", type=float, default=0.0, help="seconds after the start at which the ports vanish")
     add("--replug_after", type=float, default=1.0, help="seconds until they are back (default: %(default)s)")
-    add("--markers", type=int, nargs="+", default=[], metavar="TAXEL", help="taxels that always read AA 55")
+    add("--markers", action=ListAction, kind=int, default=[], metavar="TAXEL", help="these read AA 55")
     return parser
 
 

@@ -23,6 +23,7 @@ from lerobot_vtrefine.cli.errors import run_cli
 from lerobot_vtrefine.cli.playing.agents import Agent, PolicyAgent, recorded_agent, scripted_agent
 from lerobot_vtrefine.cli.playing.session import Session
 from lerobot_vtrefine.cli.report.statistics import wilson_interval
+from lerobot_vtrefine.embodiments.menagerie import FLAG as LOOKS
 from lerobot_vtrefine.envs import VtRefineEnvConfig
 from lerobot_vtrefine.extras import VIEW, require
 from lerobot_vtrefine.shipped import expand
@@ -30,7 +31,7 @@ from lerobot_vtrefine.shipped import expand
 SHOWN = ("--config_path=vtrefine:square_grasped_1mm", "--policy.path=vtrefine:square_grasped_1mm")
 """What is played where nothing is said about it."""
 CHOICES = ("--config_path", "--env", "--agent", "--policy.path", "--dataset")
-"""Flags that say what is played."""
+"""Flags that say what is played; how it looks (`LOOKS`) does not."""
 VIEWERS = ("browser", "none")
 
 
@@ -141,7 +142,7 @@ def _choose(config: PlayConfig) -> tuple[Agent, VtRefineEnvConfig, int]:
 
 def with_something_to_play(arguments: Sequence[str]) -> list[str]:
     """A command line that says what is played: `SHOWN` where it does not."""
-    chosen = any(argument.startswith(CHOICES) for argument in arguments)
+    chosen = any(argument.startswith(CHOICES) and not argument.startswith(LOOKS) for argument in arguments)
     return list(arguments) if chosen else expand([*SHOWN, *arguments])
 
 

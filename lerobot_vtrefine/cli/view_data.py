@@ -10,9 +10,8 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import yaml
 
-from lerobot_vtrefine.cli.arguments import CommandParser
+from lerobot_vtrefine.cli.arguments import CommandParser, read_list
 from lerobot_vtrefine.cli.errors import run_cli
 from lerobot_vtrefine.embodiments import pad_layout_of
 from lerobot_vtrefine.tactile.layout import PadLayout
@@ -43,15 +42,10 @@ def make_parser() -> CommandParser:
 
 def episodes(text: str) -> list[int]:
     """``[0, 2]`` or ``2``, as LeRobot's commands take them; ArgumentTypeError for anything else."""
-    try:
-        given = yaml.safe_load(text)
-    except yaml.YAMLError:
-        given = None
-    every = given if isinstance(given, list) else [given]
-    listed = [index for index in every if type(index) is int]
-    if not listed or listed != every:
+    given = read_list(text)
+    if any(type(index) is not int for index in given):
         raise argparse.ArgumentTypeError(f"give a list such as '[0, 2]', got {text!r}")
-    return listed
+    return given
 
 
 @run_cli

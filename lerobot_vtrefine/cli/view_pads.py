@@ -5,14 +5,21 @@ import sys
 import time
 from collections.abc import Sequence
 from contextlib import ExitStack
+from functools import lru_cache
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+from rich.color import Color
+from rich.console import Console, Group
+from rich.live import Live
+from rich.segment import Segment, Segments
+from rich.style import Style
+from rich.text import Text
 
 from lerobot_vtrefine import extras
-from lerobot_vtrefine.cli.arguments import CommandParser
+from lerobot_vtrefine.cli.arguments import CommandParser, ListAction
 from lerobot_vtrefine.cli.errors import run_cli
 from lerobot_vtrefine.drivers.board import PadReader, Status
 from lerobot_vtrefine.drivers.config import PadConfig
@@ -26,8 +33,11 @@ DESCRIPTION = "Show FlexiTac pads live, row 0 at the top, column 0 at the left."
 EPILOG = """\
 examples:
   vtrefine-view-pads --pads_file=pads.yaml
-  vtrefine-view-pads --ports /dev/ttyUSB0 --rerun"""
-_HOME, _CLEAR, _RESET, _SHOW, _HIDE = "\x1b[H", "\x1b[2J", "\x1b[0m", "\x1b[?25h", "\x1b[?25l"
+  vtrefine-view-pads --ports='[/dev/ttyUSB0, /dev/ttyUSB1]' --rerun"""
+SHADE = 16
+"""Colours this close are drawn alike: idle taxels, whose counts flicker, then cost a slow terminal little."""
+PLAIN_S = 1.0
+"""Without colours, pads are told this often."""
 
 
 def make_parser() -> CommandParser:
@@ -35,7 +45,13 @@ def make_parser() -> CommandParser:
     parser = CommandParser("vtrefine-view-pads", DESCRIPTION, EPILOG)
     add = parser.add_argument
     add("--pads_file", type=Path, help="file written by vtrefine-find-pads")
-    add("--ports", nargs="+", default=[], metavar="PORT", help="ports to show instead of a pads file")
+    add(
+        "--ports",
+        action=ListAction,
+        default=[],
+        metavar="PORT",
+        help="ports to show instead of a pads file: '[PORT, PORT]', or in a row",
+    )
     add("--rows", type=int, default=12, help="rows that the boards on --ports send (default: %(default)s)")
     add("--cols", type=int, default=32, help="columns that the boards on --ports send (default: %(default)s)")
     add("--hz", type=float, default=15.0, help="pictures per second (default: %(default)s)")
@@ -56,19 +72,25 @@ def make_parser() -> CommandParser:
     return parser
 
 
-def draw(counts: NDArray[np.uint8], idle: NDArray[np.uint8], *, stale: bool) -> list[str]:
-    """Terminal lines of one pad, two rows a line; grey while its frame is stale."""
-    rgb = colours(counts, idle, stale=stale)
+def draw(counts: NDArray[np.uint8], idle: NDArray[np.uint8], *, stale: bool) -> Segments:
+    """One pad in half blocks, two rows a line; grey while its frame is stale."""
+    rgb = colours(counts, idle, stale=stale) // SHADE * SHADE
     if len(rgb) % 2:
         rgb = np.concatenate([rgb, np.zeros_like(rgb[:1])])
-    lines = []
-    for upper, lower in zip(rgb[::2], rgb[1::2], strict=True):
-        cells = (
-            f"\x1b[38;2;{a[0]};{a[1]};{a[2]}m\x1b[48;2;{b[0]};{b[1]};{b[2]}m▀"
-            for a, b in zip(upper.tolist(), lower.tolist(), strict=True)
-        )
-        lines.append("".join(cells) + _RESET)
-    return lines
+    segments: list[Segment] = []
+    for cells in np.concatenate([rgb[::2], rgb[1::2]], axis=-1):
+        changes = np.flatnonzero((cells[1:] != cells[:-1]).any(axis=-1)) + 1
+        starts = [0, *changes.tolist()]
+        for start, stop in zip(starts, [*starts[1:], len(cells)], strict=True):
+            segments.append(Segment("▀" * (stop - start), _style(cells[start].tobytes())))
+        segments.append(Segment.line())
+    return Segments(segments)
+
+
+@lru_cache(maxsize=4096)
+def _style(cell: bytes) -> Style:
+    """Red, green and blue of the upper half, then of the lower one."""
+    return Style(color=Color.from_rgb(*cell[:3]), bgcolor=Color.from_rgb(*cell[3:]))
 
 
 def status_line(reader: PadReader) -> str:
@@ -143,21 +165,48 @@ def view_taxel(port: str, channel: int, column: int, seconds: float) -> None:
 
 
 def terminal_view(stack: ExitStack) -> Any:
-    """A function that draws all pads in place."""
-    sys.stdout.write(_CLEAR + _HIDE)
-    stack.callback(sys.stdout.write, _SHOW + "\n")
+    """A function that draws all pads in place, in the colours that the terminal has; a line a pad and second
+    where there are none, as in a pipe.
+    """
+    console = Console()
+    if console.color_system is None or console.no_color:
+        return plain_view()
+    _style.cache_clear()  # a style remembers the codes of the terminal that it was first written to
+    live = stack.enter_context(Live(console=console, auto_refresh=False, vertical_overflow="crop"))
 
     def show(readers: list[PadReader], idle: dict[str, NDArray[np.uint8]]) -> None:
-        lines = []
+        shown: list[Text | Segments] = []
         for reader in readers:
-            lines.append(status_line(reader))
+            shown.append(Text(status_line(reader)))
             frame = reader.latest()
             stale = reader.health().status is not Status.STREAMING
-            lines += draw(frame.counts, idle[reader.name], stale=stale) if frame is not None else []
-        sys.stdout.write(_HOME + "".join(f"{line}\x1b[K\n" for line in lines))
-        sys.stdout.flush()
+            shown += [draw(frame.counts, idle[reader.name], stale=stale)] if frame is not None else []
+        live.update(Group(*shown), refresh=True)
 
     return show
+
+
+def plain_view() -> Any:
+    """A function that tells every pad's health and strongest reading, once a second."""
+    told_s = -np.inf
+
+    def show(readers: list[PadReader], idle: dict[str, NDArray[np.uint8]]) -> None:
+        nonlocal told_s
+        if time.monotonic() - told_s < PLAIN_S:
+            return
+        told_s = time.monotonic()
+        for reader in readers:
+            frame = reader.latest()
+            strongest = "" if frame is None else f", {_strongest(frame.counts, idle[reader.name])}"
+            print(f"{status_line(reader)}{strongest}", flush=True)
+
+    return show
+
+
+def _strongest(counts: NDArray[np.uint8], idle: NDArray[np.uint8]) -> str:
+    above = counts.astype(int) - idle
+    row, column = np.unravel_index(above.argmax(), above.shape)
+    return f"at most {above.max()} counts above idle (row {row}, column {column})"
 
 
 def rerun_view(save: Path | None, stack: ExitStack) -> Any:

@@ -7,6 +7,7 @@ from lerobot_vtrefine.embodiments.camera_config import CameraConfig
 from lerobot_vtrefine.embodiments.embodiment import Arm, Embodiment, Joint
 from lerobot_vtrefine.embodiments.fingers import Fingers, FourBarFingers, Pad, SlidingFingers
 from lerobot_vtrefine.embodiments.kinova import KINOVA
+from lerobot_vtrefine.embodiments.menagerie import MenagerieArm, menagerie_file
 from lerobot_vtrefine.tactile.layout import PadLayout
 
 __all__ = [
@@ -19,11 +20,13 @@ __all__ = [
     "Fingers",
     "FourBarFingers",
     "Joint",
+    "MenagerieArm",
     "Pad",
     "SlidingFingers",
     "embodiment_of",
     "embodiment_with_pads",
     "get_embodiment",
+    "menagerie_file",
     "pad_layout_of",
     "register_embodiment",
 ]

@@ -12,6 +12,7 @@ import math
 from lerobot_vtrefine.embodiments.camera_config import CameraConfig
 from lerobot_vtrefine.embodiments.embodiment import PITCH, ROLL, YAW, Arm, Embodiment, Joint
 from lerobot_vtrefine.embodiments.fingers import Pad, SlidingFingers
+from lerobot_vtrefine.embodiments.menagerie import MenagerieArm
 from lerobot_vtrefine.embodiments.shapes import box, capsule, cylinder
 
 _HALF_TURN = math.pi
@@ -154,14 +155,18 @@ ALOHA = Embodiment(
     ),
     joints=JOINTS,
     fingers=FINGERS,
-    base=(
-        cylinder(0.055, 0.035, (0.0, 0.0, 0.015)),
-        box((0.075, 0.055, 0.01), (-0.02, 0.0, -0.01)),
-    ),
+    base=(cylinder(0.055, 0.035, (0.0, 0.0, 0.015)),),
+    stand=(box((0.075, 0.055, 0.01), (-0.02, 0.0, -0.01)),),
     cameras={
         # grasped: a narrow region of interest around the insertion, so that most pixels show parts and hands.
         # table: the picking areas of both arms and the insertion above them.
         "grasped": CameraConfig(80, 60, 0.384, (-0.44, 0.0, 0.42), (0.0, 0.0, 0.145)),
         "table": CameraConfig(160, 120, 0.56, (-0.46, 0.0, 0.46), (0.0, 0.0, 0.09)),
     },
+    menagerie=MenagerieArm(
+        "aloha/aloha.xml",
+        tuple(f"left/{joint.name}" for joint in JOINTS),
+        shows_palm=True,
+        carriages=(box((0.012, 0.012, 0.012), (-0.012, 0.0153, 0.0)),),
+    ),
 )

@@ -22,6 +22,7 @@ import numpy as np
 
 from lerobot_vtrefine.embodiments.camera_config import CameraConfig
 from lerobot_vtrefine.embodiments.fingers import Fingers
+from lerobot_vtrefine.embodiments.menagerie import MenagerieArm
 from lerobot_vtrefine.embodiments.shapes import Shape, Vector
 from lerobot_vtrefine.tactile.layout import PadLayout
 
@@ -111,9 +112,13 @@ class Embodiment:
     """Revolute joints of one arm."""
     fingers: Fingers
     base: tuple[Shape, ...]
-    """What an arm stands on, in the base's frame."""
+    """What an arm's first link looks like, in the base's frame."""
     cameras: Mapping[str, CameraConfig]
     """The depth camera's set-up for each start of an episode."""
+    stand: tuple[Shape, ...] = ()
+    """What an arm stands on, in the base's frame."""
+    menagerie: MenagerieArm | None = None
+    """None where Menagerie has no such arm."""
     joint_names: tuple[str, ...] = field(init=False)
     pad_names: tuple[str, ...] = field(init=False)
     lower: np.ndarray = field(init=False, repr=False)

@@ -16,6 +16,7 @@ import math
 from lerobot_vtrefine.embodiments.camera_config import CameraConfig
 from lerobot_vtrefine.embodiments.embodiment import PITCH, ROLL, Arm, Embodiment, Joint
 from lerobot_vtrefine.embodiments.fingers import FourBarFingers, Pad
+from lerobot_vtrefine.embodiments.menagerie import MenagerieArm
 from lerobot_vtrefine.embodiments.shapes import Vector, box, capsule
 
 TURN = 2 * math.pi
@@ -112,12 +113,12 @@ KINOVA = Embodiment(
     ),
     joints=JOINTS,
     fingers=FINGERS,
-    base=(
-        capsule(0.045, (0.0, 0.0, 0.0), (0.15643, 0.0, 0.0), "grey"),
-        box((0.04, 0.06, 0.25), (-0.08, 0.0, -0.2)),
-    ),
+    base=(capsule(0.045, (0.0, 0.0, 0.0), (0.15643, 0.0, 0.0), "grey"),),
+    stand=(box((0.04, 0.06, 0.25), (-0.08, 0.0, -0.2)),),
     cameras={  # before the chest: on the torso's top, every ray would end there
         "grasped": CameraConfig(80, 60, 0.33, (0.38, 0.0, 0.55), (0.0, 0.0, 0.145)),
         "table": CameraConfig(160, 120, 0.48, (0.38, 0.0, 0.60), (0.0, 0.0, 0.09)),
     },
+    # Menagerie has no 2F-140: the gripper stays as it is.
+    menagerie=MenagerieArm("kinova_gen3/gen3.xml", tuple(joint.name for joint in JOINTS), shows_palm=False),
 )

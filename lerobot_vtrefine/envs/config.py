@@ -88,6 +88,9 @@ class VtRefineEnvConfig(EnvConfig):
     """Height and width of the colour images in pixels."""
     video_episodes: int = 10
     """Episodes that ``lerobot-eval`` makes videos of: the first ones, at most its ten; 0 draws nothing."""
+    menagerie_dir: Path | None = None
+    """Folder of MuJoCo Menagerie: videos and the live view then show the arms by its meshes. What is
+    simulated, touched and observed stays the same."""
     metrics_path: Path | None = None
     """JSON-lines file; every finished episode appends seed, success, in-hand shift, peak force, ..."""
     features: dict[str, PolicyFeature] = field(default_factory=dict)

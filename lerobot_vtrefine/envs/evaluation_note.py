@@ -10,7 +10,7 @@ import draccus
 from lerobot_vtrefine.envs.config import VtRefineEnvConfig
 from lerobot_vtrefine.files import read_json
 
-NOT_SETTINGS = ("features", "features_map", "metrics_path", "video_episodes", "num_threads")
+NOT_SETTINGS = ("features", "features_map", "metrics_path", "video_episodes", "menagerie_dir", "num_threads")
 """Fields that follow from others, or change nothing of an episode."""
 
 

@@ -9,6 +9,7 @@ import numpy as np
 from gymnasium.vector import AutoresetMode
 from lerobot.envs.utils import _LazyAsyncVectorEnv, freeze_after_episode_end
 
+from lerobot_vtrefine.embodiments import menagerie_file
 from lerobot_vtrefine.envs.ablation import make_ablation
 from lerobot_vtrefine.envs.config import VtRefineEnvConfig
 from lerobot_vtrefine.envs.episode_log import EpisodeLog
@@ -25,8 +26,10 @@ def make_simulation(config: VtRefineEnvConfig, num_envs: int) -> "InsertionSim":
 
     Raises:
         ValueError: for zero environments, an unknown pair, clearance, start or backend.
-        FileNotFoundError: if the mesh folder or the sensor model file is missing.
+        FileNotFoundError: if a mesh folder or the sensor model file is missing.
     """
+    if config.menagerie_dir is not None:  # now, rather than when the first frame is drawn
+        menagerie_file(config.body.menagerie, config.body.name, config.menagerie_dir)
     if num_envs < 1:
         raise ValueError(f"need at least one environment, got {num_envs} (--eval.batch_size)")
     from lerobot_vtrefine.sim.simulation import InsertionSim

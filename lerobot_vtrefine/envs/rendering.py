@@ -1,6 +1,7 @@
 """Video frames of single environments, drawn on first use, and those that make ``lerobot-eval``'s videos."""
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
+from pathlib import Path
 from typing import TYPE_CHECKING, Any, SupportsIndex, overload
 
 import gymnasium as gym
@@ -15,8 +16,8 @@ if TYPE_CHECKING:
 class FrameSource:
     """Draws the environments of ``episodes``; a frame is drawn again only after its environment moved."""
 
-    def __init__(self, episodes: Episodes) -> None:
-        self._episodes = episodes
+    def __init__(self, episodes: Episodes, menagerie_dir: Path | None) -> None:
+        self._episodes, self._menagerie_dir = episodes, menagerie_dir
         self._renderers: dict[int, VideoRenderer] = {}
         self._drawn: dict[int, tuple[tuple[int, int], Array]] = {}
 
@@ -37,7 +38,9 @@ class FrameSource:
         if index not in self._renderers:
             from lerobot_vtrefine.sim.render import VideoRenderer
 
-            self._renderers[index] = VideoRenderer(self._episodes.sim, index)
+            self._renderers[index] = VideoRenderer(
+                self._episodes.sim, index, menagerie_dir=self._menagerie_dir
+            )
         return self._renderers[index]
 
 

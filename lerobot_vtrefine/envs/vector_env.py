@@ -108,7 +108,7 @@ class VtRefineVectorEnv(gym.vector.VectorEnv[Observation, Array, Array]):
     def render_env(self, index: int) -> Array:
         """The frame of one environment."""
         if self._frames is None:
-            self._frames = FrameSource(self.episodes)
+            self._frames = FrameSource(self.episodes, self.config.menagerie_dir)
         return self._frames.frame(index)
 
     def _eval_frame(self, index: int) -> EvalFrame:

@@ -18,7 +18,7 @@ def add_arms(spec: mujoco.MjSpec, embodiment: Embodiment, config: SceneConfig) -
 
 def _add_arm(spec: mujoco.MjSpec, embodiment: Embodiment, arm: Arm, index: int, config: SceneConfig) -> None:
     base = spec.worldbody.add_body(name=f"{arm.name}_base", pos=arm.base_pos_m, quat=_base_quat(arm))
-    for shape in embodiment.base:
+    for shape in (*embodiment.base, *embodiment.stand):
         add_shape(base, shape)
     body = base
     scale = config.servo_gain_scale

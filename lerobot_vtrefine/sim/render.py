@@ -5,13 +5,16 @@ that videos exist on any machine.
 """
 
 import logging
+from collections.abc import Callable
 from dataclasses import dataclass
+from pathlib import Path
 from typing import TYPE_CHECKING, Literal
 
 import numpy as np
 from numpy.typing import NDArray
 from PIL import Image
 
+from lerobot_vtrefine.sim.looks import DrawnWorld
 from lerobot_vtrefine.sim.pad_panel import Frame, Progress, pad_panel, panel_size
 from lerobot_vtrefine.sim.task import FAILURES
 
@@ -41,7 +44,8 @@ class VideoRenderer:
     """Draws environment `env` of `sim`.
 
     `backend` "auto" takes OpenGL when it works; "gl" raises RuntimeError with the fix when it does not;
-    "rays" draws the depth image.
+    "rays" draws the depth image. With OpenGL, arms look as in MuJoCo Menagerie where its folder
+    `menagerie_dir` is given.
     """
 
     def __init__(
@@ -51,12 +55,15 @@ class VideoRenderer:
         view: CameraView | None = None,
         width: int = 480,
         backend: Literal["auto", "gl", "rays"] = "auto",
+        menagerie_dir: Path | None = None,
     ) -> None:
         self._sim = sim
         self._env = env
         self._pads = sim.embodiment.pad_names, sim.embodiment.pad_layout
         self._size = (panel_size(*self._pads)[0], width)
-        self._scene = _make_scene(sim, env, view or CameraView(), self._size, backend)
+        self._scene = _make_scene(
+            lambda: DrawnWorld(sim, env, menagerie_dir), view or CameraView(), self._size, backend
+        )
 
     def frame(self) -> Frame:
         """Return the current frame, uint8 (H, W, 3); H and W are even, as video encoders want."""
@@ -91,11 +98,10 @@ class VideoRenderer:
 class _GlScene:
     """The scene through `mujoco.Renderer`."""
 
-    def __init__(self, sim: "InsertionSim", env: int, view: CameraView, size: tuple[int, int]) -> None:
+    def __init__(self, world: DrawnWorld, view: CameraView, size: tuple[int, int]) -> None:
         import mujoco
 
-        self._sim, self._env = sim, env
-        model, _ = sim.mj_data(env)
+        self._world, model = world, world.model
         # The off-screen buffer must hold the frame; enlarging it in the model costs memory only here.
         model.vis.global_.offheight = max(model.vis.global_.offheight, size[0])
         model.vis.global_.offwidth = max(model.vis.global_.offwidth, size[1])
@@ -110,8 +116,7 @@ class _GlScene:
         self._camera.azimuth, self._camera.elevation = view.azimuth_deg, view.elevation_deg
 
     def draw(self) -> Frame:
-        _, data = self._sim.mj_data(self._env)
-        self._renderer.update_scene(data, self._camera)
+        self._renderer.update_scene(self._world.data(), self._camera)
         return self._renderer.render()
 
     def close(self) -> None:
@@ -119,15 +124,16 @@ class _GlScene:
 
 
 def _make_scene(
-    sim: "InsertionSim", env: int, view: CameraView, size: tuple[int, int], backend: str
+    make_world: Callable[[], DrawnWorld], view: CameraView, size: tuple[int, int], backend: str
 ) -> _GlScene | None:
     if backend not in ("auto", "gl", "rays"):
         raise ValueError(f"backend must be auto, gl or rays, not {backend!r}")
     if backend == "rays":
         return None
     if not _GL_FAILURES:
+        world = make_world()
         try:
-            return _GlScene(sim, env, view, size)
+            return _GlScene(world, view, size)
         # OpenGL libraries fail with AttributeError, ImportError, FatalError, RuntimeError, ...
         except Exception as error:
             _GL_FAILURES.append(error.with_traceback(None))  # a traceback would keep the simulation alive

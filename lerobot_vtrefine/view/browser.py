@@ -18,6 +18,7 @@ from lerobot_vtrefine.drivers.picture import colours
 from lerobot_vtrefine.envs.live_world import LiveWorld
 from lerobot_vtrefine.extras import VIEW, require
 from lerobot_vtrefine.observation import VisuoTactileConfig, build_visuo_tactile
+from lerobot_vtrefine.sim.looks import DrawnWorld
 from lerobot_vtrefine.sim.sensing import pad_layout
 
 TAXEL_PX, GAP_PX = 5, 8
@@ -66,8 +67,9 @@ class BrowserView:
             )
         self._server.initial_camera.position = EYE_M
         self._server.initial_camera.look_at = LOOK_AT_M
-        model, _ = world.sim.mj_data(0)
-        self._scene = mjviser.ViserMujocoScene(self._server, copy.deepcopy(model), num_envs=1)
+        self._drawn = DrawnWorld(world.sim, 0, world.config.menagerie_dir)
+        model = copy.deepcopy(self._drawn.model)
+        self._scene = mjviser.ViserMujocoScene(self._server, model, num_envs=1)
         self._scene.camera_tracking_enabled = False
         layout = pad_layout(world.sim.embodiment)
         self._pad_shape = (layout.rows, layout.cols)
@@ -95,7 +97,7 @@ class BrowserView:
             return
         self._drawn_s = began
         with self._server.atomic():
-            self._scene.update_from_mjdata(self._world.sim.mj_data(0)[1])
+            self._scene.update_from_mjdata(self._drawn.data())
             self._draw_cloud()
             self._pads.image = self._pad_picture()
             self._tell()

@@ -31,7 +31,7 @@ def test_rows_are_printed_and_written(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     target = tmp_path / "new" / "bench.json"
-    parts = "--parts=absent,broken,fine"
+    parts = "--parts=[absent, broken, fine]"
     monkeypatch.setattr(sys, "argv", ["vtrefine-bench", parts, f"--json={target}"])
     assert bench.main() == 0
     output = capsys.readouterr()
@@ -54,7 +54,7 @@ def test_slow_part_is_ended(capsys: pytest.CaptureFixture[str]) -> None:
 
 @pytest.mark.usefixtures("fake_parts")
 def test_nothing_measured_is_a_failure(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(sys, "argv", ["vtrefine-bench", "--parts=absent"])
+    monkeypatch.setattr(sys, "argv", ["vtrefine-bench", "--parts=[absent]"])
     assert bench.main() == 1
 
 
@@ -70,13 +70,14 @@ def test_parts_are_shortened_unless_full(monkeypatch: pytest.MonkeyPatch, tmp_pa
 @pytest.mark.parametrize(
     ("flags", "message"),
     [
-        (["--worlds=1,many"], "--worlds must be numbers such as 1,64,1024, got '1,many'"),
+        (["--worlds=[1, 0]"], "--worlds must be numbers from 1 on, such as '[1, 64]', got [1, 0]"),
+        (["--worlds=[1, many]"], "`worlds.1`: Couldn't parse 'many' into an int"),
         (["--plot", "--device=cpu"], "--plot and --device are two different things"),
         (["--device=tpu"], "warp.device must be auto, cpu, cuda or cuda:0, not 'tpu'"),
         (["--limit_s=0"], "--limit_s must be above 0"),
         (
-            ["--device=cpu", "--solver=own,theirs"],
-            "--solver must be own, stock or own,stock, got 'own,theirs'",
+            ["--device=cpu", "--solver=[own, theirs]"],
+            "--solver=theirs is unknown; choose from own, stock",
         ),
     ],
 )
@@ -93,7 +94,7 @@ def test_bad_values_are_one_line(
 def test_device_prints_a_row_per_number_of_worlds_and_compares_solvers(
     monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    flags = ["--device=cpu", "--worlds=1", "--steps=2", "--solver=own,stock"]
+    flags = ["--device=cpu", "--worlds=[1]", "--steps=2", "--solver=[own, stock]"]
     monkeypatch.setattr(sys, "argv", ["vtrefine-bench", *flags])
     assert bench.main() == 0
     lines = capsys.readouterr().out.strip().splitlines()
@@ -121,6 +122,6 @@ def test_plot_writes_a_picture_and_a_table(
 
 
 def test_unknown_part(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
-    monkeypatch.setattr(sys, "argv", ["vtrefine-bench", "--parts=physics"])
+    monkeypatch.setattr(sys, "argv", ["vtrefine-bench", "--parts=[physics]"])
     assert bench.main() == 2
     assert "unknown physics; choose from tactile, envs, dataset, finetune, drivers" in capsys.readouterr().err

@@ -8,6 +8,7 @@ import pytest
 
 from lerobot_vtrefine import shipped
 from lerobot_vtrefine.cli import launch, umbrella
+from lerobot_vtrefine.cli.arguments import with_brackets
 from lerobot_vtrefine.cli.checks import check_arguments
 from lerobot_vtrefine.cli.flags import flags_of
 from lerobot_vtrefine.cli.pipeline.demo_config import DemoConfig
@@ -101,6 +102,27 @@ def test_a_missing_flag_is_told_before_lerobot_is_loaded(entry, given, line, mon
     error = capsys.readouterr().err
     assert error.startswith(f"error: {line}")
     assert error.endswith("--help has an example\n")
+
+
+@pytest.mark.parametrize("given", ["nix", "tactile,nix", "[tactile, nix]", "tactile, nix"])
+def test_lists_are_spelt_in_brackets_and_understood_without(
+    given: str, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setattr(sys, "argv", ["vtrefine-bench", f"--parts={given}"])
+    assert launch.bench() == 2
+    assert capsys.readouterr().err.startswith("error: --parts: unknown nix; choose from tactile, envs")
+    monkeypatch.setattr(sys, "argv", ["vtrefine-bench", "--help"])
+    launch.bench()
+    shown = capsys.readouterr().out
+    assert "--worlds=list[int]" in shown
+    assert "(default: [1, 64, 1024, 4096])" in shown
+
+
+def test_only_lists_get_brackets() -> None:
+    given = ["--env.rgb_size=3,4", "--episodes=null", "--parts=auto", "--overwrite", "--episodes=1"]
+    wanted = ["--env.rgb_size=[3,4]", *given[1:4], "--episodes=[1]"]
+    flags = flags_of("lerobot_vtrefine.cli.replay", "ReplayConfig", nested=True)
+    assert with_brackets(given, {flag.name for flag in flags if flag.is_list}) == wanted
 
 
 def test_a_flag_may_stand_in_a_file_or_name_what_lies_below_it(tmp_path: Path) -> None:

@@ -12,7 +12,7 @@ from urllib.request import urlopen
 import numpy as np
 import pytest
 
-from lerobot_vtrefine.cli.play import EpisodeSource, PlayConfig, PolicySource, play
+from lerobot_vtrefine.cli.play import EpisodeSource, PlayConfig, PolicySource, play, with_something_to_play
 from lerobot_vtrefine.cli.playing.agents import ExpertAgent, ZeroAgent
 from lerobot_vtrefine.cli.playing.session import Session
 from lerobot_vtrefine.cli.record_demos import RecordDemosConfig, record
@@ -65,6 +65,12 @@ def test_wrong_flags_are_one_line(settings: dict, words: str, monkeypatch: pytes
     monkeypatch.setenv("HF_HUB_OFFLINE", "1")
     with pytest.raises((ValueError, OSError), match=re.escape(words)):
         played(**settings)
+
+
+def test_looks_alone_do_not_choose_what_is_played() -> None:
+    looks = "--env.menagerie_dir=there"
+    assert with_something_to_play([looks]) == [*with_something_to_play([]), looks]
+    assert with_something_to_play(["--env.pair=key"]) == ["--env.pair=key"]
 
 
 def test_an_untrained_policy_plays(tmp_path: Path) -> None:

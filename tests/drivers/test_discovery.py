@@ -10,11 +10,13 @@ from pathlib import Path
 import numpy as np
 import pytest
 from boards import PAD, emulated, pressable_source, reading, wait_until
+from rich.segment import Segment
 
 from lerobot_vtrefine.cli import find_pads as find_pads_module
 from lerobot_vtrefine.cli.find_pads import main as find_pads
 from lerobot_vtrefine.cli.pad_emulator import Turns
 from lerobot_vtrefine.cli.pad_emulator import main as pad_emulator
+from lerobot_vtrefine.cli.view_pads import SHADE, draw
 from lerobot_vtrefine.cli.view_pads import main as view_pads
 from lerobot_vtrefine.drivers import ports
 from lerobot_vtrefine.drivers.board import PadReader
@@ -22,6 +24,7 @@ from lerobot_vtrefine.drivers.config import PadConfig
 from lerobot_vtrefine.drivers.discovery import open_board, probe_port, wait_for_press
 from lerobot_vtrefine.drivers.frames import FrameShape
 from lerobot_vtrefine.drivers.pads_file import load_pads, save_pads
+from lerobot_vtrefine.drivers.picture import colours
 from lerobot_vtrefine.drivers.ports import PortError
 from lerobot_vtrefine.drivers.sources import contact_source, noise_source
 
@@ -191,13 +194,44 @@ def test_bad_pads_files_are_explained(tmp_path: Path, text: str, message: str) -
         load_pads(tmp_path / "other.yaml")
 
 
-def test_view_pads_draws_and_names_the_rate(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+@pytest.mark.parametrize("terminal", ["truecolor", "linux", ""])
+def test_view_pads_draws_and_names_the_rate(
+    terminal: str, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """With every colour, with the few of a console, and in a pipe, where no code belongs."""
+    for name in ("NO_COLOR", "FORCE_COLOR"):
+        monkeypatch.delenv(name, raising=False)
+    if terminal:
+        monkeypatch.setenv("FORCE_COLOR", "1")
+        monkeypatch.setenv("TERM", terminal)
+        monkeypatch.setenv("COLORTERM", terminal)
     with emulated(tmp_path, "thumb") as board:
         assert view_pads(["--ports", board.port, "--seconds", "0.5"]) == 0
     shown = capsys.readouterr().out
     assert "thumb: " in shown
     assert "frames/s" in shown
-    assert shown.count("▀") >= 6 * 32
+    assert (shown.count("▀") >= 6 * 32) == bool(terminal)
+    assert ("\x1b[38;2;" in shown) == (terminal == "truecolor")
+    assert ("\x1b" in shown) == bool(terminal)
+    assert ("counts above idle (row" in shown) == (not terminal)
+
+
+def test_pads_in_a_terminal_are_what_was_read() -> None:
+    """Every taxel is half a block of its own colour; alike neighbours share a code."""
+    idle = np.full((3, 4), 20, np.uint8)
+    counts = idle + np.array([[0, 0, 120, 0], [0, 60, 0, 0], [120, 0, 0, 0]], np.uint8)
+    lines = list(Segment.split_lines(draw(counts, idle, stale=False).segments))
+    assert [line.text for line in lines[0]] == ["▀", "▀", "▀", "▀"]
+    assert [line.text for line in lines[1]] == ["▀", "▀▀▀"]
+    wanted = colours(counts, idle)
+    for row, line in enumerate(lines):
+        styles = [segment.style for segment in line for _ in segment.text]
+        for half, colour in ((0, "color"), (1, "bgcolor")):
+            if 2 * row + half < len(wanted):
+                shown = [tuple(getattr(style, colour).triplet) for style in styles]
+                assert np.abs(np.array(shown) - wanted[2 * row + half]).max() < SHADE
+    grey = draw(counts, idle, stale=True).segments[0].style.color.triplet
+    assert grey.red == grey.green == grey.blue
 
 
 def test_emulator_command_prints_its_ports(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
@@ -241,6 +275,11 @@ def test_terminated_emulator_removes_its_ports(tmp_path: Path) -> None:
         (find_pads, ["--ports", "/nowhere/pty"], "/nowhere/pty does not exist"),
         (find_pads, ["--ports", "x", "--names", "a", "a"], "must differ"),
         (view_pads, [], "give either --pads_file"),
+        (view_pads, ["--ports=[/nowhere/a, /nowhere/b]"], "/nowhere/a does not exist"),
+        (view_pads, ["--ports=[/nowhere/a"], "argument --ports: give a list such as"),
+        (find_pads, ["--ports", "x", "--names=[a, a]"], "--names must differ"),
+        (pad_emulator, ["--markers=[999]"], "taxel 999"),
+        (pad_emulator, ["--markers", "1", "x"], "argument --markers: invalid literal"),
     ],
 )
 def test_bad_usage_is_one_line_and_status_2(

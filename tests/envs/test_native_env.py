@@ -241,7 +241,7 @@ def test_bad_calls_are_named(make_env):
 class FakeRenderer:
     drawn: list[int] = []  # noqa: RUF012
 
-    def __init__(self, sim: FakeSim, env: int) -> None:
+    def __init__(self, sim: FakeSim, env: int, menagerie_dir: None) -> None:
         self.env = env
 
     def frame(self) -> np.ndarray:

@@ -116,7 +116,8 @@ class Session:
         if self._renderer is None:
             from lerobot_vtrefine.sim.render import VideoRenderer
 
-            self._renderer = VideoRenderer(self._world.sim)
+            world = self._world
+            self._renderer = VideoRenderer(world.sim, menagerie_dir=world.config.menagerie_dir)
         self._frames.append(self._renderer.frame())
 
     def _save_video(self) -> None:

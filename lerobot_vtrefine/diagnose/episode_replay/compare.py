@@ -2,9 +2,10 @@
 
 import json
 from collections.abc import Sequence
+from contextlib import closing
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 from tqdm import tqdm
@@ -24,11 +25,6 @@ from lerobot_vtrefine.diagnose.episode_replay.tracking import JointTracking, joi
 from lerobot_vtrefine.diagnose.episode_replay.twin import read_ledger, recorded_seeds, recorded_twin
 from lerobot_vtrefine.embodiments import get_embodiment
 from lerobot_vtrefine.envs.config import VtRefineEnvConfig
-
-if TYPE_CHECKING:
-    from lerobot_vtrefine.sim.command_replay import SceneReplay
-    from lerobot_vtrefine.sim.simulation import InsertionSim
-    from lerobot_vtrefine.sim.starts import Start
 
 HOLDS = {"zero_order": "held over the frame", "linear": "approached linearly"}
 DENSITIES = ("reading_density", "count_density")
@@ -212,6 +208,7 @@ def _replay_scenes(
     frames: list[Array] | None,
 ) -> tuple[list[EpisodePair], dict[int, str]]:
     """The pairs, and why others were left out; `frames`, if given, takes a film of the first pair's twin."""
+    from lerobot_vtrefine.diagnose.episode_replay.film import TwinFilm
     from lerobot_vtrefine.envs.factory import make_simulation
     from lerobot_vtrefine.sim.command_replay import grasp_start, replay_scene
 
@@ -233,7 +230,9 @@ def _replay_scenes(
                 continue
         seed = seeds[episode.index] if seeds else episode.index
         if frames is not None and not pairs:
-            replayed = _filmed(sim, episode, seed, start, frames)
+            with closing(TwinFilm(sim, config.menagerie_dir)) as film:
+                replayed = replay_scene(sim, episode.action, seed, start, film.watch)
+            frames += film.frames
         else:
             replayed = replay_scene(sim, episode.action, seed, start)
         counts = {pad: replayed.counts[:, i] for i, pad in enumerate(sim.embodiment.pad_names)}
@@ -242,20 +241,6 @@ def _replay_scenes(
     if not pairs:
         raise ValueError(f"none of {len(recorded)} episodes can be replayed: {next(iter(skipped.values()))}")
     return pairs, skipped
-
-
-def _filmed(
-    sim: "InsertionSim", episode: RecordedEpisode, seed: int, start: "Start | None", frames: list[Array]
-) -> "SceneReplay":
-    from lerobot_vtrefine.diagnose.episode_replay.film import TwinFilm
-    from lerobot_vtrefine.sim.command_replay import replay_scene
-
-    film = TwinFilm(sim)
-    try:
-        return replay_scene(sim, episode.action, seed, start, film.watch)
-    finally:
-        film.close()
-        frames += film.frames
 
 
 def _compare_touch(pairs: list[EpisodePair]) -> list[PadTouch]:

@@ -14,10 +14,10 @@ if TYPE_CHECKING:
 class TwinFilm:
     """Frames (H, W, 3) uint8 of world 0 of a simulation: the scene beside its pads, one per control step."""
 
-    def __init__(self, sim: "InsertionSim") -> None:
+    def __init__(self, sim: "InsertionSim", menagerie_dir: Path | None) -> None:
         from lerobot_vtrefine.sim.render import VideoRenderer
 
-        self._renderer = VideoRenderer(sim, 0)
+        self._renderer = VideoRenderer(sim, 0, menagerie_dir=menagerie_dir)
         self.frames: list[Array] = []
 
     def watch(self) -> None:
