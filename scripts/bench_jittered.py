@@ -5,7 +5,7 @@ The recordings come from tests/diagnose/jittered_rig.py: laws in several forms, 
 An interrupted run goes on where it stopped; delete its folder after a change of the engine. Seeds below 1000
 are for tuning, reported figures come from 1000 and above. All 400 sets take about 4500 s of one core:
 
-    python scripts/bench_jittered.py --seeds=5000:5008 --jobs=22 --minutes=10
+    python scripts/bench_jittered.py --seeds=6000:6008 --jobs=22 --minutes=10
     python scripts/collect_results.py jittered outputs/bench_jittered/table.md --replace
     make tables
 """

@@ -59,6 +59,7 @@ class Toy(NothingBesides):
     channels: tuple[str, ...] = ("y",)
     screens: bool = True
     further_gain: float = 0.025
+    scatter: float = 0.0
 
     @property
     def files(self):
@@ -131,6 +132,13 @@ class Toy(NothingBesides):
 
     def without_effect(self, fit, baseline):
         return replace(fit, told=False)
+
+    def log_scores(self, fit):
+        """Trials have gains of their own, which log scores allow for."""
+        theta = fit.theta if fit.told else np.array([1.0, 0, 0, 0])
+        left = self.y - self.columns() @ theta
+        shared = self.scatter**2 / (NOISE**2 + self.scatter**2 * np.square(self.x).sum(1))
+        return -0.5 * (np.square(left).sum(1) - shared * (left * self.x).sum(1) ** 2) / NOISE**2
 
 
 def toy(effect=0.0, seed=0, **changes):
@@ -206,6 +214,21 @@ def test_names_stay_where_locked_trials_leave_it_open_and_the_model_goes() -> No
     gone, refused = guarded(selection, against, 0)
     assert names_of(gone) == []
     assert [item.surely for item in refused] == [True]
+
+
+def test_the_model_stays_where_only_the_gains_of_locked_trials_speak_against_it() -> None:
+    # Half of the trials have a gain that is too low, which the effect would make up for.
+    problem = toy(0.1)
+    selection = ScreenedSearch(problem, 0, lambda text: None).run()
+    rng = np.random.default_rng(5)
+    x = rng.uniform(-0.3, 1, (6, FRAMES))
+    gain = np.array([0.87, 0.87, 0.87, 1.02, 1.02, 1.02])[:, None]
+    y = gain * x + 0.1 * np.abs(x) + 0.01 * rng.normal(size=x.shape)
+    locked = replace(problem, x=x, y=y, conditions=CONDITIONS[:6], scatter=0.1)
+    before, after = (locked.errors(fit).mean() for fit in (selection.baseline, selection.fit))
+    assert after > before
+    assert guarded(selection, locked, 0)[0].fit.told
+    assert not guarded(selection, replace(locked, scatter=0.0), 0)[0].fit.told
 
 
 @dataclass(frozen=True)

@@ -36,8 +36,8 @@ def judged(gains: np.ndarray, warmth: np.ndarray | None = None, in_a_row: bool =
 
 def fired(alarm: Suspicion | None) -> bool:
     assert alarm is not None
-    assert alarm.permuted is not None
-    return alarm.permuted < ORDER_ALPHA and alarm.share > alarm.least
+    assert alarm.p_alone is not None
+    return alarm.p_alone < ORDER_ALPHA and alarm.share > alarm.least
 
 
 def test_gains_that_only_scatter_are_nothing() -> None:

@@ -4,7 +4,10 @@ import numpy as np
 import pytest
 from jittered_rig import EFFECTS, Rig
 
+from lerobot_vtrefine.diagnose.pad.baseline import fit_baseline
 from lerobot_vtrefine.diagnose.pad.candidates import CATALOGUE
+from lerobot_vtrefine.diagnose.pad.decoys import in_place_of_names
+from lerobot_vtrefine.diagnose.pad.descriptors import errors_left_out
 from lerobot_vtrefine.diagnose.pad.engine import diagnose_pad
 from lerobot_vtrefine.diagnose.pad.fitting import movable
 from lerobot_vtrefine.diagnose.pad.form_fitting import with_form
@@ -12,6 +15,7 @@ from lerobot_vtrefine.diagnose.pad.intervals import leave_out
 from lerobot_vtrefine.diagnose.pad.own_touch import with_own_touch
 from lerobot_vtrefine.diagnose.pad.press_trials import prepare
 from lerobot_vtrefine.diagnose.pad.problem import PadProblem
+from lerobot_vtrefine.diagnose.pad.screening import forms_of
 
 
 def recorded(name: str, gain: float, seed: int):
@@ -70,6 +74,44 @@ def test_every_recording_has_its_own_touch_and_the_offset_is_their_mean() -> Non
     # Recordings that differ know their mean no better for each of them knowing its own touch well.
     assert high - low > 2 * 1.9 * own.std() / np.sqrt(len(own))
     assert low < 3e-5 < high
+
+
+@pytest.mark.parametrize(("law", "borrowed"), [("columns", True), ("supply", False)])
+def test_a_borrowed_name_predicts_worse_than_what_no_name_covers(law: str, borrowed: bool) -> None:
+    # A supply that droops takes away most of what columns that load each other do.
+    held = recorded(law, 0.4, 2)
+    problem, fitted = PadProblem(prepare(held, list(held.trials), list(range(len(held.trials))))).weighed(
+        None
+    )
+    (form,) = forms_of("supply_droop", fitted)
+    problem, named = problem.weighed(with_form(fitted, form, (), problem.presses, problem.weights))
+    (found,) = in_place_of_names(problem, named)
+    assert found.p_alone is not None
+    assert (found.p_alone < found.level and found.share > found.least) == borrowed
+    assert ("column" in found.clue) == borrowed
+
+
+def test_frames_that_repeat_do_not_count_as_noise() -> None:
+    # Of 0.8 of all frames nothing is new: differences that are zero would make the noise look half as large.
+    floors = {}
+    for effects in ((), ((EFFECTS["drop_outs"], 0.8),)):
+        held = Rig(1, 8, 12).record(effects)
+        presses = prepare(held, list(held.trials), list(range(len(held.trials))))
+        floors[bool(effects)] = fit_baseline(presses).noise.floor
+    assert floors[True] == pytest.approx(floors[False], rel=0.15)
+
+
+def test_errors_of_recordings_left_out_are_those_of_a_fit_to_the_others() -> None:
+    rng = np.random.default_rng(0)
+    columns, y = rng.normal(size=(6, 20, 3)), rng.normal(size=(6, 20))
+    table = np.concatenate([columns, y[..., None]], axis=-1)
+    folds = np.array([0, 0, 1, 1, 2, 2])
+    found = errors_left_out(np.einsum("kni,knj->kij", table, table), folds, 2)
+    for fold in range(3):
+        others = columns[folds != fold][..., :2].reshape(-1, 2)
+        taken = np.linalg.lstsq(others, y[folds != fold].ravel(), rcond=None)[0]
+        left = y[folds == fold] - columns[folds == fold][..., :2] @ taken
+        assert found[folds == fold] == pytest.approx(np.square(left).sum(axis=1))
 
 
 @pytest.mark.slow

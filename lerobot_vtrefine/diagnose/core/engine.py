@@ -2,7 +2,7 @@
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 
@@ -117,7 +117,8 @@ def guarded[P: Problem[Any, Any], F: Fit, C: Candidate](
     """No channel's model that predicts worse than the baseline is handed out, whatever chose it.
 
     On each channel where it does, what was accepted last is taken back first. What all channels share is
-    judged by all of them together, each in units of its baseline's error.
+    judged by all of them together, each in units of its baseline's error. Where a score test chose, log
+    scores decide what plain errors leave open.
     """
     before = test.errors(selection.baseline)
     refused = []
@@ -132,13 +133,24 @@ def guarded[P: Problem[Any, Any], F: Fit, C: Candidate](
                 break
             surely = gain_interval(base, extended, seed)[1] < 0
             if selection.problem.screens and not surely:
-                # Scores found the name, and errors of a few locked trials do not disprove it: the model goes.
-                screened: Any = selection.problem
-                kept = screened.without_effect(selection.fit, selection.baseline)
-                return replace(selection, fit=kept), tuple(refused)
+                # Scores found the name, and errors of a few locked trials do not disprove it.
+                return _if_likelier(selection, test), tuple(refused)
             refused.append(Refusal(candidate.cause, channel, gain, surely))
             selection = taken_back(selection, [candidate], channel)
     return selection, tuple(refused)
+
+
+def _if_likelier[P: Problem[Any, Any], F: Fit, C: Candidate](
+    selection: Selection[P, F, C], test: P
+) -> Selection[P, F, C]:
+    """The model only where trials prefer it to the baseline by their log scores.
+
+    Plain errors of a few trials hang on how each of them differs from the others; log scores allow for that.
+    """
+    screened, scored = (cast("Any", problem) for problem in (selection.problem, test))
+    if scored.log_scores(selection.fit).sum() > scored.log_scores(selection.baseline).sum():
+        return selection
+    return replace(selection, fit=screened.without_effect(selection.fit, selection.baseline))
 
 
 def _with_refused(alarms: tuple[Alarm, ...], refused: tuple[Refusal, ...]) -> tuple[Alarm, ...]:

@@ -252,6 +252,10 @@ class ScreenedProblem[F: ScoredFit, C: FormCandidate](Problem[F, C], Protocol):
     def without_effect(self, fit: F, baseline: F) -> F:
         """A fit that keeps its names, and is handed out with the baseline's predictions."""
 
+    def log_scores(self, fit: F) -> Array:
+        """(T,) of trials that took no part in a fit, under the noise and the scatter between trials that it
+        knows, up to a constant."""
+
     def reweighted(self, fit: F) -> Scored:
         """For cross-validation."""
 

@@ -32,7 +32,7 @@ TIE_LEAD, SURE_P = 0.03, 0.01
 """Where two models' cross-validated errors differ by less, trials must prefer one of them more surely: forms
 that are not quite right differ by as much."""
 SHARE_OF_GAIN = 0.9
-"""Part of a cause's gain that another must reach to be its rival."""
+"""Part of a cause's gain that another must reach to be its rival, and of a decoy's that a name must reach."""
 DECOY_LEAD, DECOY_P = 0.05, 0.01
 """By how much, and how surely, a decoy must beat every name: names are believed first."""
 HELPED = 0.5

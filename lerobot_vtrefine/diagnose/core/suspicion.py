@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 
 from lerobot_vtrefine.diagnose.core.resampling import jointly_adjusted
-from lerobot_vtrefine.diagnose.core.rules import FEW_TRIALS, ORDER_ALPHA, SUSPICION_ALPHA
+from lerobot_vtrefine.diagnose.core.rules import FEW_TRIALS, SUSPICION_ALPHA
 from lerobot_vtrefine.diagnose.core.search import Selection
 
 Array = np.ndarray
@@ -39,8 +39,10 @@ class Suspicion:
     along: Array | None = None
     """(T,) what the scores may follow, standardised: under the null its order is arbitrary; None: their sum
     is what tells, and under the null their signs are arbitrary."""
-    permuted: float | None = None
-    """p found by permuting the order of trials in a way that `along` does not describe; tested by itself."""
+    p_alone: float | None = None
+    """p found by a test of its own, beside the joint one."""
+    level: float = SUSPICION_ALPHA
+    """p below which it is an alarm."""
     decisive: bool = False
     """Whether it explains whatever else is odd about its channel."""
 
@@ -70,7 +72,7 @@ def raise_alarms(
     fired = [
         (item.decisive, Alarm(item.channel, item.clue, item.share, p))
         for item, p in zip(suspicions, p_values, strict=True)
-        if item.share > item.least and (p is None or p < _level(item))
+        if item.share > item.least and (p is None or p < item.level)
     ]
     found += [alarm for decisive, alarm in fired if not decisive]
     found.sort(key=lambda alarm: -alarm.share)
@@ -80,19 +82,15 @@ def raise_alarms(
     return (*first, *(alarm for alarm in found if alarm.channel not in settled))
 
 
-def _level(item: Suspicion) -> float:
-    return SUSPICION_ALPHA if item.permuted is None else ORDER_ALPHA
-
-
 def _tested(suspicions: Sequence[Suspicion], seed: int) -> list[float | None]:
     """Adjusted p of each; one max-T test over all that have scores."""
     tested = [item for item in suspicions if item.scores is not None]
     if not tested:
-        return [item.permuted for item in suspicions]
+        return [item.p_alone for item in suspicions]
     hypotheses = [(item.scores, item.along, item.either_sign) for item in tested if item.scores is not None]
     adjusted = jointly_adjusted(hypotheses, seed)
     of = {id(item): float(p) for item, p in zip(tested, adjusted, strict=True)}
-    return [of.get(id(item), item.permuted) for item in suspicions]
+    return [of.get(id(item), item.p_alone) for item in suspicions]
 
 
 def _too_few(selection: Selection[Any, Any, Any]) -> list[Alarm]:

@@ -4,12 +4,12 @@ A descriptor that belongs to a named family's own kind of effect is called owned
 family's form is at fault, not its name.
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
 
-from lerobot_vtrefine.diagnose.pad.press_trials import Press
+from lerobot_vtrefine.diagnose.pad.press_trials import Press, PressSet
 
 Signal = np.ndarray
 
@@ -170,3 +170,35 @@ DESCRIPTORS = (
     Descriptor("even and odd frames", (), lambda p, s: np.broadcast_to(_parity(p), s.shape)),
     Descriptor("load in even and odd frames", (), lambda p, s: s * _parity(p)),
 )
+
+
+def directions(
+    descriptor: Descriptor, presses: PressSet, signals: Sequence[Signal]
+) -> list[np.ndarray] | None:
+    """The descriptor's direction in every recording, of unit mean square; None where it says nothing."""
+    pairs = zip(presses.presses, signals, strict=True)
+    raw = [np.array(descriptor.direction(press, signal), dtype=float) for press, signal in pairs]
+    power = float(np.mean([np.mean(image**2) for image in raw]))
+    if not np.isfinite(power) or power <= 1e-30:
+        return None
+    return [image / np.sqrt(power) for image in raw]
+
+
+def errors_left_out(grams: np.ndarray, folds: np.ndarray, terms: int) -> np.ndarray:
+    """Squared error of every recording (K,) where the first columns are fitted to the other folds.
+
+    Args:
+        grams: (K, q, q) inner products of columns and, last, what is to be explained.
+        folds: (K,)
+        terms: number of columns in use.
+    """
+    errors, total = np.empty(len(grams)), grams.sum(axis=0)
+    for fold in np.unique(folds):
+        held = folds == fold
+        gram = total - grams[held].sum(axis=0)
+        scale = np.sqrt(np.diag(gram)[:terms].clip(min=1e-30))
+        block = gram[:terms, :terms] / np.outer(scale, scale)
+        taken = np.linalg.lstsq(block, gram[:terms, -1] / scale, rcond=1e-9)[0] / scale
+        along, own = grams[held, :terms, -1], grams[held, :terms, :terms]
+        errors[held] = grams[held, -1, -1] - 2.0 * along @ taken + (own @ taken) @ taken
+    return errors

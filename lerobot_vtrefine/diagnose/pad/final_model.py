@@ -5,6 +5,7 @@ The search weighs readings; users get what predicts plain readings best.
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -68,10 +69,16 @@ class FinalFit:
     """Sizes and intervals are told of it."""
     problem: "PadProblem"
     """In which the fit stands."""
-    sensor: SensorModel
-    """What users load."""
+    model: Composite
+    """What users get: the fit's, or another."""
     idle: IdleMap
-    noise_counts: float
+
+    @cached_property
+    def sensor(self) -> SensorModel:
+        """What users load."""
+        noise = self.problem.noise
+        step_counts = self.problem.presses.step_counts
+        return sensor_model(self.model, self.idle, step_counts, noise.floor if noise is not None else 0.0)
 
     @property
     def mse(self) -> np.ndarray:
@@ -89,13 +96,7 @@ class FinalFit:
         for family in families:
             model = model.minus(family)
         slim = fit(model, problem.presses, problem.even.weights, _SLIM_STEPS)
-        return replace(
-            self, fit=slim, problem=problem, sensor=_sensor(slim.model, problem, self.idle, self.noise_counts)
-        )
-
-
-def _sensor(model: Composite, problem: "PadProblem", idle: IdleMap, noise_counts: float) -> SensorModel:
-    return sensor_model(model, idle, problem.presses.step_counts, noise_counts)
+        return replace(self, fit=slim, problem=problem, model=slim.model)
 
 
 def handed_out(
@@ -112,12 +113,11 @@ def handed_out(
         around, fitted = with_own_touch(problem, fitted)
         model = trusted(problem, plain, fitted, seed, doubtful=doubtful)
     idle = settled_idle(model, problem.presses)
-    noise = problem.noise.floor if problem.noise is not None else 0.0
-    before = FinalFit(plain, problem, _sensor(plain.model, problem, idle, noise), idle, noise)
-    after = FinalFit(fitted, around, _sensor(model, problem, idle, noise), idle, noise)
+    before = FinalFit(plain, problem, plain.model, idle)
+    after = FinalFit(fitted, around, model, idle)
     if "sample_and_hold" in fitted.model.families:
         errors = [problem.errors(item).mean() for item in (before, after)]
-        after = after if errors[1] < errors[0] else replace(after, sensor=before.sensor)
+        after = after if errors[1] < errors[0] else replace(after, model=before.model)
     return replace(selection, baseline=before, fit=after)
 
 

@@ -86,7 +86,8 @@ def _judge(gains: np.ndarray, levels: np.ndarray, starts: np.ndarray, warmth: np
     seen = float(found[best][0])
     size = np.sqrt(max(seen, 0.0) / len(gains)) if best == NEIGHBOURS else seen / np.sqrt(len(gains))
     text = f"gains of recordings follow {best} ({100 * size:.1f} % of the load)"
-    return Suspicion(0, text, float(size), MIN_COURSE, permuted=p_asked if warm else p_session)
+    p_value = p_asked if warm else p_session
+    return Suspicion(0, text, float(size), MIN_COURSE, p_alone=p_value, level=ORDER_ALPHA)
 
 
 def _clipped(values: np.ndarray) -> np.ndarray:

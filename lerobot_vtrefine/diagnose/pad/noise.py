@@ -9,6 +9,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from scipy.optimize import nnls
 
+from lerobot_vtrefine.diagnose.pad.candidates.sample_and_hold import held
 from lerobot_vtrefine.diagnose.pad.press_trials import PressSet
 from lerobot_vtrefine.diagnose.pad.whitening import Whitener
 
@@ -61,13 +62,17 @@ def fit_frame_noise(
     """Noise within recordings, from residuals (T, n) and expected signals (T, n) of a fitted model.
 
     Level and growth come from differences between frames, which slow misfit does not touch; memory comes
-    from frames without contact.
+    from frames without contact. Readings that a board holds have the noise of one: only new ones count.
     """
-    rho, slow = _memory(presses, residuals)
+    repeat = held(presses)
+    new = [press.rhythm.fresh | (not repeat) for press in presses.presses]
+    rho, slow = _memory(presses, residuals, new)
     squares, sizes = [], []
-    for residual, signal in zip(residuals, signals, strict=True):
-        squares.append((0.5 / (1.0 - slow * rho) * np.diff(residual, axis=0) ** 2).ravel())
-        sizes.append((0.5 * (signal[1:] + signal[:-1])).ravel())
+    for residual, signal, own in zip(residuals, signals, new, strict=True):
+        frames = np.flatnonzero(own)
+        apart = np.diff(frames)[:, None]
+        squares.append((0.5 / (1.0 - slow * rho**apart) * np.diff(residual[frames], axis=0) ** 2).ravel())
+        sizes.append((0.5 * (signal[frames[1:]] + signal[frames[:-1]])).ravel())
     square, size = np.concatenate(squares), np.abs(np.concatenate(sizes))
     if not len(square):
         return Noise(1.0, 0.0, 0.0, DEFAULT_GAIN, DEFAULT_OFFSET_M)
@@ -100,7 +105,9 @@ def _strata(square: np.ndarray, size: np.ndarray) -> tuple[float, float]:
     return _trimmed_mean(square[quiet]), _trimmed_mean(square[size > 0.5 * top])
 
 
-def _memory(presses: PressSet, residuals: Sequence[np.ndarray]) -> tuple[float, float]:
+def _memory(
+    presses: PressSet, residuals: Sequence[np.ndarray], new: Sequence[np.ndarray]
+) -> tuple[float, float]:
     """Memory of the slow part of the noise, and its share of the variance, in frames at rest.
 
     From the mean square of differences over 1, 2, ... frames (the variogram), which short stretches do not
@@ -110,11 +117,12 @@ def _memory(presses: PressSet, residuals: Sequence[np.ndarray]) -> tuple[float, 
     if sum(int(rest.sum()) for rest in rests) < MIN_REST_FRAMES:
         rests = [~press.touching for press in presses.presses]
     sums, counts = np.zeros(MAX_LAG), np.zeros(MAX_LAG)
-    for rest, residual in zip(rests, residuals, strict=True):
+    for rest, residual, own in zip(rests, residuals, new, strict=True):
         frames = np.flatnonzero(rest)
         for run in np.split(frames, np.flatnonzero(np.diff(frames) > 1) + 1):
             for lag in range(1, min(MAX_LAG, len(run) - 1) + 1):
-                change = residual[run[lag:]] - residual[run[:-lag]]
+                both = own[run[lag:]] & own[run[:-lag]]
+                change = residual[run[lag:][both]] - residual[run[:-lag][both]]
                 sums[lag - 1] += 0.5 * float((change**2).sum())
                 counts[lag - 1] += change.size
     known = counts >= MIN_PAIRS

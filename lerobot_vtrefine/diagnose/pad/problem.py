@@ -246,7 +246,14 @@ class PadProblem(NothingBesides):
 
     def without_effect(self, fit: FinalFit, baseline: FinalFit) -> FinalFit:
         """Names and sizes stay; users get the baseline."""
-        return replace(fit, sensor=baseline.sensor)
+        return replace(fit, model=baseline.model)
+
+    def log_scores(self, fit: FinalFit) -> Array:
+        """(K,) with every recording's own gain and touch; by plain errors where these are not known."""
+        noise = fit.problem.noise
+        if noise is None or not allowed(self.presses, fit.problem.weights):
+            return -self.errors(fit)[:, 0]
+        return -0.5 * losses_at_own_touch(fit.model, self.presses, noise)
 
     # Between the steps of the method.
 

@@ -1,5 +1,5 @@
 """What may be left on a pad: it repeats with the command, is far above noise, comes with sliding, has a line,
-follows the session's order, or follows something that the model does not know.
+follows the session's order, follows something that the model does not know, or has borrowed a name.
 """
 
 from collections.abc import Sequence
@@ -11,7 +11,8 @@ from lerobot_vtrefine.diagnose.core.search import Selection
 from lerobot_vtrefine.diagnose.core.suspicion import Suspicion
 from lerobot_vtrefine.diagnose.pad import error_level, repeatability
 from lerobot_vtrefine.diagnose.pad.baseline import weigh
-from lerobot_vtrefine.diagnose.pad.descriptors import DESCRIPTORS, Descriptor
+from lerobot_vtrefine.diagnose.pad.decoys import in_place_of_names
+from lerobot_vtrefine.diagnose.pad.descriptors import DESCRIPTORS, Descriptor, directions, errors_left_out
 from lerobot_vtrefine.diagnose.pad.fitting import Fit, tangents
 from lerobot_vtrefine.diagnose.pad.gain_drift import gain_drift
 from lerobot_vtrefine.diagnose.pad.press_trials import PressSet
@@ -47,6 +48,7 @@ def suspicions(problem: "PadProblem", selection: Selection[Any, Fit, Any]) -> li
         while_sliding(presses, residuals, fitted, weights),
         gain_drift(fitted, presses, weights),
         *(item for descriptor, item in descriptors if descriptor.session),
+        *in_place_of_names(problem, fitted),
     ]
     before, after = (fit.residuals(presses) for fit in (plain, fitted))
     if fitted.model.families and repeatability.only_misfit(presses, before, after):
@@ -82,7 +84,7 @@ def following(problem: "PadProblem", fitted: Fit) -> list[tuple[Descriptor, Susp
     scorer = Scorer(fitted, presses, problem.weights, columns)
     found = []
     for descriptor in DESCRIPTORS:
-        change = _directions(descriptor, presses, fitted)
+        change = directions(descriptor, presses, fitted.signals)
         if change is None:
             continue
         scores, information = scorer.score(change)
@@ -96,16 +98,6 @@ def following(problem: "PadProblem", fitted: Fit) -> list[tuple[Descriptor, Susp
         text = f"the residual correlates with {descriptor.text} ({100 * share:.0f} % of its power)"
         found.append((descriptor, Suspicion(0, text, share, least, scores, either_sign=True)))
     return found
-
-
-def _directions(descriptor: Descriptor, presses: PressSet, fitted: Fit) -> list[np.ndarray] | None:
-    """The descriptor's direction in every recording, of unit mean square; None where it says nothing."""
-    pairs = zip(presses.presses, fitted.signals, strict=True)
-    raw = [np.array(descriptor.direction(press, signal), dtype=float) for press, signal in pairs]
-    power = float(np.mean([np.mean(image**2) for image in raw]))
-    if not np.isfinite(power) or power <= 1e-30:
-        return None
-    return [image / np.sqrt(power) for image in raw]
 
 
 def left_out_share(
@@ -125,25 +117,6 @@ def left_out_share(
         vectors += [change[k].ravel(), (press.signal - signal).ravel()]
         matrix = np.stack(vectors, axis=1) / np.sqrt(signal.size)
         grams.append(matrix.T @ matrix)
-    every = np.array(grams)
-    before, after = 0.0, 0.0
-    for fold in np.unique(folds):
-        part = every[folds == fold].sum(axis=0)
-        rest = every.sum(axis=0) - part
-        before += _error(part, _coefficients(rest, list(range(len(rest) - 2))))
-        after += _error(part, _coefficients(rest, list(range(len(rest) - 1))))
+    every, last = np.array(grams), len(columns) + 1
+    before, after = (float(errors_left_out(every, folds, terms).sum()) for terms in (last - 1, last))
     return 1.0 - after / before if before > 0 else 0.0
-
-
-def _coefficients(gram: np.ndarray, use: list[int]) -> np.ndarray:
-    result = np.zeros(len(gram) - 1)
-    scale = np.sqrt(np.diag(gram)[use].clip(min=1e-30))
-    block = gram[np.ix_(use, use)] / np.outer(scale, scale)
-    result[use] = np.linalg.lstsq(block, gram[use, -1] / scale, rcond=1e-9)[0] / scale
-    return result
-
-
-def _error(gram: np.ndarray, coefficients: np.ndarray) -> float:
-    return float(
-        gram[-1, -1] - 2.0 * gram[:-1, -1] @ coefficients + coefficients @ gram[:-1, :-1] @ coefficients
-    )
