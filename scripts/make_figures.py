@@ -23,7 +23,7 @@ from matplotlib.lines import Line2D
 from matplotlib.patches import Patch
 
 from lerobot_vtrefine.cli.results.rows import Run, read_all
-from lerobot_vtrefine.datasets.features import PADS
+from lerobot_vtrefine.embodiments import ALOHA
 
 ROOT = Path(__file__).parents[1]
 IMAGES = ROOT / "docs" / "img"
@@ -113,7 +113,7 @@ def draw_pads(plt: Any, sim: Any, frames: list[dict[str, Any]]) -> None:
     counts = pressed(hardest(frames)["raw"])
     figure, axes = plt.subplots(2, 2, figsize=(8.6, 4.2), layout="constrained")
     extent = (0.0, 32 * PITCH_MM, 12 * PITCH_MM, 0.0)
-    for ax, pad, image in zip(axes.flat, PADS, counts, strict=True):
+    for ax, pad, image in zip(axes.flat, ALOHA.pad_names, counts, strict=True):
         picture = ax.imshow(image, cmap="viridis", vmin=0, vmax=counts.max(), extent=extent)
         ax.set_title(pad.replace("_", " "), loc="left")
     for ax in axes[1]:

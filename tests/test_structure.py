@@ -5,6 +5,8 @@ import re
 import shutil
 import subprocess
 import sys
+from collections.abc import Mapping
+from graphlib import CycleError, TopologicalSorter
 from pathlib import Path
 
 import pytest
@@ -105,6 +107,73 @@ def test_packages_import_only_from_layers_above() -> None:
 def test_every_package_has_a_layer() -> None:
     unknown = {layer for path in SOURCES if (layer := layer_of(path)) and layer not in RANK}
     assert unknown == set()
+
+
+# Imports that point back, inside functions; without these, no module needs itself by way of others.
+BACK = {
+    # LeRobot asks a configuration for its environments.
+    "envs.config": {"envs.vectorization"},
+    # Whether a name is a cause is asked of the catalogues, which hold causes of one's own, too.
+    "diagnose.verdict": {"diagnose.joints.candidates", "diagnose.servo.candidates"},
+    "diagnose.pad.press_trials": {"diagnose.pad.forward_model.run"},
+    "diagnose.pad.problem": {"diagnose.pad.review"},
+}
+
+
+def without_type_imports(tree: ast.Module) -> ast.Module:
+    """The tree without ``if TYPE_CHECKING:`` blocks, which import nothing when the program runs."""
+    kept = [node for node in tree.body if not (isinstance(node, ast.If) and is_type_checking(node.test))]
+    return ast.Module(kept, tree.type_ignores)
+
+
+def is_type_checking(test: ast.expr) -> bool:
+    return isinstance(test, ast.Name) and test.id == "TYPE_CHECKING"
+
+
+def module_of(path: Path) -> str:
+    parts = path.relative_to(PACKAGE).with_suffix("").parts
+    return ".".join(parts[:-1] if parts[-1] == "__init__" else parts)
+
+
+def needed_modules(tree: ast.AST, known: set[str]) -> set[str]:
+    """Modules among ``known`` that a file imports; of ``from package import module`` the module alone."""
+    needed = set()
+    for node in ast.walk(tree):
+        if isinstance(node, ast.ImportFrom):
+            package = (node.module or "").removeprefix("lerobot_vtrefine").removeprefix(".")
+            inside = {f"{package}.{alias.name}".removeprefix(".") for alias in node.names}
+            needed |= (inside & known) or {package}
+    return needed & known
+
+
+def import_circle(imports: Mapping[str, set[str]]) -> list[str]:
+    """Modules that import one another in a ring; empty where there is none."""
+    try:
+        TopologicalSorter(imports).prepare()
+    except CycleError as error:
+        return error.args[1]
+    return []
+
+
+def test_circle_is_found() -> None:
+    assert import_circle({"a": {"b"}, "b": {"c"}, "c": {"a"}})
+    assert not import_circle({"a": {"b", "c"}, "b": {"c"}})
+
+
+def test_imports_make_no_circle() -> None:
+    known = {module_of(path) for path in SOURCES}
+    imports = {
+        module_of(path): needed_modules(without_type_imports(tree_of(path)), known) for path in SOURCES
+    }
+    rest = {module: needed - BACK.get(module, set()) - {module} for module, needed in imports.items()}
+    assert import_circle(rest) == []
+
+
+def test_contributors_are_told_the_same_layers() -> None:
+    text = (ROOT / "CONTRIBUTING.md").read_text(encoding="utf-8")
+    listed = text.partition("checks it:")[2].partition(".\n")[0]
+    told = tuple(tuple(re.findall(r"`(\w+)`", part)) for part in listed.split(","))
+    assert told == LAYERS
 
 
 def test_files_are_short() -> None:

@@ -40,7 +40,7 @@ class FlexitacCamera(Camera):
 
     @check_if_already_connected
     def connect(self, warmup: bool = True) -> None:
-        """Starts reading; a frame has arrived when this returns.
+        """Start reading; a frame has arrived when this returns.
 
         Raises:
             PortError: the board cannot be read; the message names port and fix.
@@ -50,7 +50,7 @@ class FlexitacCamera(Camera):
 
     @check_if_not_connected
     def read(self) -> NDArray[Any]:
-        """The next frame.
+        """The next frame, uint16 (rows, cols, 1) [counts].
 
         Raises:
             TimeoutError: none came within a second.
@@ -60,7 +60,7 @@ class FlexitacCamera(Camera):
 
     @check_if_not_connected
     def async_read(self, timeout_ms: float = 200) -> NDArray[Any]:
-        """The newest frame that was not read yet.
+        """The newest frame that was not read yet, as of `read`.
 
         Raises:
             TimeoutError: none came in time.
@@ -69,7 +69,7 @@ class FlexitacCamera(Camera):
 
     @check_if_not_connected
     def read_latest_depth(self, max_age_ms: int = 500) -> NDArray[Any]:
-        """The newest frame, read before or not.
+        """The newest frame, read before or not, as of `read`.
 
         Raises:
             TimeoutError: it is older than `max_age_ms`; the message says what is wrong with the board.
@@ -92,7 +92,7 @@ class FlexitacCamera(Camera):
         return frame
 
     def disconnect(self) -> None:
-        """Stops reading."""
+        """Stop reading."""
         self._reader.stop()
         self._connected = False
 

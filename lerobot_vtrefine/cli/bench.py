@@ -164,7 +164,7 @@ def table(rows: Sequence[Row]) -> str:
 
 
 def measure_device(config: BenchConfig, device: str) -> list[Row]:
-    """Prints a table of the warp backend's worlds for each solver; returns the solvers' ratios, and the
+    """Print a table of the warp backend's worlds for each solver; return the solvers' ratios, and the
     contact models' rows, which need CUDA.
     """
     from lerobot_vtrefine.sim.benchmark import WorldsRow, measure_worlds
@@ -200,7 +200,7 @@ def _solver_rows(own: "WorldsRow", stock: "WorldsRow") -> list[Row]:
 
 
 def plot(folder: Path) -> str:
-    """Draws `tactile.png` in the folder; returns the table beside it as Markdown, also written there."""
+    """Draw `tactile.png` in the folder; return the table beside it as Markdown, also written there."""
     from lerobot_vtrefine.cli.bench_picture import draw, measure_cases
     from lerobot_vtrefine.cli.bench_picture import table as models_table
     from lerobot_vtrefine.tactile.benchmark import measure_rates

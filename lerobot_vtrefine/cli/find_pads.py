@@ -7,7 +7,6 @@ from pathlib import Path
 from lerobot_vtrefine import extras
 from lerobot_vtrefine.cli.arguments import CommandParser, ListAction
 from lerobot_vtrefine.cli.errors import run_cli
-from lerobot_vtrefine.datasets.features import PADS
 from lerobot_vtrefine.drivers.config import PadConfig
 from lerobot_vtrefine.drivers.discovery import (
     FoundBoard,
@@ -19,6 +18,7 @@ from lerobot_vtrefine.drivers.discovery import (
 )
 from lerobot_vtrefine.drivers.pads_file import save_pads
 from lerobot_vtrefine.drivers.ports import PortError, stable_path, stable_ports
+from lerobot_vtrefine.embodiments import DEFAULT_BODY, get_embodiment
 
 DESCRIPTION = """\
 Find out which FlexiTac pad is on which serial port: the command asks for one pad after the other, you press
@@ -41,7 +41,7 @@ def make_parser() -> CommandParser:
     parser.add_argument(
         "--names",
         action=ListAction,
-        default=list(PADS),
+        default=list(get_embodiment(DEFAULT_BODY).pad_names),
         metavar="NAME",
         help="pads to ask for, in this order: '[NAME, NAME]'",
     )
@@ -83,7 +83,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
 
 
 def find_boards(ports: Sequence[str], stack: ExitStack, *, only_list: bool) -> list[FoundBoard]:
-    """Probes ports and starts readers on those that stream."""
+    """Probe ports and start readers on those that stream."""
     boards: list[FoundBoard] = []
     failures: list[str] = []
     print("leave every pad untouched for a moment")
@@ -112,7 +112,7 @@ def find_boards(ports: Sequence[str], stack: ExitStack, *, only_list: bool) -> l
 def ask(
     boards: list[FoundBoard], names: Sequence[str], timeout_s: float, *, check_rows: bool = False
 ) -> dict[str, PadConfig]:
-    """Asks for one press per name; returns the configuration of each named pad.
+    """Ask for one press per name; return the configuration of each named pad.
 
     Raises:
         PortError: too few boards, or no press in time.
@@ -139,7 +139,7 @@ def ask(
 
 
 def check_first_row(name: str, board: FoundBoard) -> None:
-    """Asks for a finger to slide over all rows, and corrects the pad's row offset where rows are shifted."""
+    """Ask for a finger to slide over all rows, and correct the pad's row offset where rows are shifted."""
     print(f"slide one finger over all rows of {name}, slowly, for {SLIDE_S:g} s ... ", end="", flush=True)
     first = first_row(board, SLIDE_S)
     if first is None:

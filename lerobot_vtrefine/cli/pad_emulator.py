@@ -12,7 +12,6 @@ from pathlib import Path
 
 from lerobot_vtrefine.cli.arguments import CommandParser, ListAction
 from lerobot_vtrefine.cli.errors import run_cli
-from lerobot_vtrefine.datasets.features import PADS
 from lerobot_vtrefine.drivers.diagnostic_emulator import DiagnosticEmulator
 from lerobot_vtrefine.drivers.emulator import ENCODERS, LONGEST_S, Faults, PadEmulator
 from lerobot_vtrefine.drivers.frames import FrameShape
@@ -25,7 +24,11 @@ from lerobot_vtrefine.drivers.sources import (
     recording_source,
     with_markers,
 )
+from lerobot_vtrefine.embodiments import DEFAULT_BODY, get_embodiment
 from lerobot_vtrefine.files import decode, limits
+
+NAMES = get_embodiment(DEFAULT_BODY).pad_names
+"""Of boards, if there are no more than this."""
 
 TURN_S = 4.0
 """With --source=press each pad is pressed for half of this time, one after the other [s]."""
@@ -53,7 +56,7 @@ def make_parser() -> CommandParser:
         default=Path("outputs/pads"),
         help="where the ports appear (default: %(default)s)",
     )
-    add("--boards", type=int, default=len(PADS), help="number of boards (default: %(default)s)")
+    add("--boards", type=int, default=len(NAMES), help="number of boards (default: %(default)s)")
     add("--shape", default="12x32", help="rows x columns that the boards send (default: %(default)s)")
     add(
         "--protocol",
@@ -195,7 +198,7 @@ def make_board(
 
 
 def start_arms(folder: Path, stack: ExitStack) -> Callable[[float], None]:
-    """Starts ALOHA's arms and prints their flags; returns what moves the leaders, given the time [s]."""
+    """Start ALOHA's arms and print their flags; return what moves the leaders, given the time [s]."""
     from lerobot_vtrefine.drivers.aloha_emulator import AlohaEmulator  # imports LeRobot's motors
 
     arms = stack.enter_context(AlohaEmulator(folder))
@@ -209,7 +212,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     options = make_parser().parse_args(arguments)
     shape = parse_shape(options.shape)
     faults = parse_faults(options)
-    names = PADS if options.boards <= len(PADS) else tuple(f"pad_{i}" for i in range(options.boards))
+    names = NAMES if options.boards <= len(NAMES) else tuple(f"pad_{i}" for i in range(options.boards))
     turns = Turns()
     with ExitStack() as stack:
         if threading.current_thread() is threading.main_thread():  # a killed emulator removes its ports, too

@@ -142,7 +142,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
 
 
 def view_taxel(port: str, channel: int, column: int, seconds: float) -> None:
-    """Prints readings of one taxel of a board with the diagnostic firmware; 0 seconds: until Ctrl-C."""
+    """Print readings of one taxel of a board with the diagnostic firmware; 0 seconds: until Ctrl-C."""
     with DiagnosticReader(port) as board:
         started = time.monotonic()
         trouble = ""

@@ -12,12 +12,10 @@ from typing import Any
 import numpy as np
 import pyarrow as pa
 
-from lerobot_vtrefine.datasets.features import ACTION_KEY, STATE_KEY, Array
+from lerobot_vtrefine.datasets.features import ACTION_KEY, BASELINE_PREFIX, STATE_KEY, TACTILE_PREFIX, Array
+from lerobot_vtrefine.embodiments import embodiment_of_robot
 from lerobot_vtrefine.files import decode, limits, read_json
 from lerobot_vtrefine.files.tables import read_columns
-
-TACTILE_PREFIX = "observation.tactile."
-BASELINE_PREFIX = "observation.tactile_baseline."
 
 
 @dataclass(frozen=True)
@@ -37,6 +35,7 @@ class _Info:
     codebase_version: str
     fps: float = limits(above=0.0, maximum=1e5)
     total_episodes: int = limits(0, 1e7)
+    robot_type: str | None = None
 
 
 @dataclass(frozen=True)
@@ -63,7 +62,7 @@ class EpisodeFolder:
     root: Path
     fps: float
     joints: tuple[str, ...]
-    """Names of state and action; empty where the dataset has none."""
+    """Names of state and action; empty where neither the dataset nor its robot type tells them."""
     num_joints: int
     pads: tuple[str, ...]
     """Pads that have raw and idle counts."""
@@ -100,17 +99,27 @@ class EpisodeFolder:
 
     def _episode(self, index: int, table: pa.Table) -> RecordedEpisode:
         table = table.sort_by("frame_index")
-        pads = {pad: _matrix(table[f"{TACTILE_PREFIX}{pad}"]) for pad in self.pads}
-        idle = {pad: _matrix(table[f"{BASELINE_PREFIX}{pad}"])[0] for pad in self.pads}
-        state, action = (self._numbers(index, key, table[key]) for key in (STATE_KEY, ACTION_KEY))
-        time_s = self._numbers(index, "timestamp", table["timestamp"])[:, 0]
+        pads = {pad: self._matrix(index, f"{TACTILE_PREFIX}{pad}", table) for pad in self.pads}
+        idle = {pad: self._matrix(index, f"{BASELINE_PREFIX}{pad}", table)[0] for pad in self.pads}
+        state, action = (self._numbers(index, key, table) for key in (STATE_KEY, ACTION_KEY))
+        time_s = self._numbers(index, "timestamp", table)[:, 0]
         if (np.diff(time_s) <= 0).any():
             raise ValueError(f"{self.root}: episode {index}: timestamp does not rise from frame to frame")
         return RecordedEpisode(index, time_s, state, action, pads, idle)
 
-    def _numbers(self, index: int, key: str, column: pa.ChunkedArray) -> Array:
+    def _matrix(self, index: int, key: str, table: pa.Table) -> Array:
+        """A column of equally long lists, or of numbers, as (T, K)."""
+        column = table[key]
+        lists = column.chunks if pa.types.is_nested(column.type) else []
+        lengths = np.unique([length for chunk in lists for length in np.unique(chunk.value_lengths())])
+        flat = np.concatenate([_flat(chunk).to_numpy(zero_copy_only=False) for chunk in column.chunks])
+        if len(lengths) > 1 or flat.size % max(len(column), 1):
+            raise ValueError(f"{self.root}: episode {index}: {key} has frames of different lengths")
+        return flat.reshape(len(column), -1)
+
+    def _numbers(self, index: int, key: str, table: pa.Table) -> Array:
         width = 1 if key == "timestamp" else self.num_joints
-        values = _matrix(column).astype(np.float64)
+        values = self._matrix(index, key, table).astype(np.float64)
         if values.shape[1] != width:
             raise ValueError(f"{self.root}: episode {index}: {key} has {values.shape[1]} values, not {width}")
         if not np.isfinite(values).all():
@@ -155,9 +164,16 @@ def open_episodes(root: Path) -> EpisodeFolder:
     if len(state) != 1 or state != action:
         raise ValueError(f"{path}: {STATE_KEY} is {state}, {ACTION_KEY} is {action}: they must match")
     check_names(path, features)
-    names = features[STATE_KEY].names
-    joints = tuple(names) if isinstance(names, list) else ()
+    joints = _joint_names(features[STATE_KEY], info.robot_type)
     return EpisodeFolder(root, info.fps, joints, state[0], _pads(features), info.total_episodes)
+
+
+def _joint_names(state: FeatureInfo, robot_type: str | None) -> tuple[str, ...]:
+    """The dataset's own names; without any, those of the body that its robot type is."""
+    if isinstance(state.names, list):
+        return tuple(state.names)
+    body = embodiment_of_robot(robot_type)
+    return body.joint_names if body is not None and state.shape == (body.num_joints,) else ()
 
 
 def _pads(features: dict[str, FeatureInfo]) -> tuple[str, ...]:
@@ -192,14 +208,6 @@ def _split(table: pa.Table, wanted: set[int]) -> list[tuple[int, pa.Table]]:
         for start, stop in pairwise(edges)
         if int(index[start]) in wanted
     ]
-
-
-def _matrix(column: pa.ChunkedArray) -> Array:
-    """A column of equally long lists, or of numbers, as (T, K)."""
-    flat = np.concatenate([_flat(chunk).to_numpy(zero_copy_only=False) for chunk in column.chunks])
-    if flat.size % max(len(column), 1):
-        raise ValueError(f"a column of {len(column)} frames holds {flat.size} numbers: some are missing")
-    return flat.reshape(len(column), -1)
 
 
 def _flat(values: pa.Array) -> pa.Array:

@@ -31,8 +31,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from lerobot_vtrefine.embodiments import DEFAULT_BODY, Embodiment, get_embodiment
-from lerobot_vtrefine.tactile.layout import PadLayout
+from lerobot_vtrefine.embodiments import Embodiment
 
 Array = np.ndarray[Any, np.dtype[Any]]
 
@@ -42,17 +41,22 @@ CAMERA = "front"
 """The depth camera that sees the workspace, on every body, so that policies find it."""
 
 OBS_PREFIX = "observation."
-TACTILE_PREFIX = "observation.tactile."
-BASELINE_PREFIX = "observation.tactile_baseline."
+"""What LeRobot puts before the names of a robot's readings."""
+TACTILE, BASELINE, TACTILE_AGE = "tactile", "tactile_baseline", "tactile_age"
+"""A robot's names of pads' readings: ``tactile.<pad>``, ``tactile_baseline.<pad>``, and all their ages."""
+TACTILE_PREFIX = f"{OBS_PREFIX}{TACTILE}."
+BASELINE_PREFIX = f"{OBS_PREFIX}{BASELINE}."
+CAMERA_PREFIX = f"{OBS_PREFIX}camera."
+IMAGE_PREFIX = f"{OBS_PREFIX}images."
 STATE_KEY = "observation.state"
 ACTION_KEY = "action"
-DEPTH_KEY = f"observation.images.{CAMERA}_depth"
-RGB_KEY = f"observation.images.{CAMERA}"
+DEPTH_KEY = f"{IMAGE_PREFIX}{CAMERA}_depth"
+RGB_KEY = f"{IMAGE_PREFIX}{CAMERA}"
 """Only where colour is recorded; both names are those of LeRobot's cameras with colour and depth."""
-INTRINSICS_KEY = f"observation.camera.{CAMERA}.intrinsics"
-CAMERA_POSE_KEY = f"observation.camera.{CAMERA}.pose"
-NOISE_LEVEL_KEY = f"observation.camera.{CAMERA}.noise_level"
-AGE_KEY = "observation.tactile_age"
+INTRINSICS_KEY = f"{CAMERA_PREFIX}{CAMERA}.intrinsics"
+CAMERA_POSE_KEY = f"{CAMERA_PREFIX}{CAMERA}.pose"
+NOISE_LEVEL_KEY = f"{CAMERA_PREFIX}{CAMERA}.noise_level"
+AGE_KEY = f"{OBS_PREFIX}{TACTILE_AGE}"
 CLOUD_KEY = "observation.visuo_tactile"
 """Built by the policy's preprocessor from the raw columns; never stored."""
 GRIDS_KEY = "observation.tactile_grids"
@@ -75,14 +79,6 @@ def baseline_keys(body: Embodiment) -> tuple[str, ...]:
 def raw_keys(body: Embodiment) -> tuple[str, ...]:
     """What comes with the joint positions, to build the cloud from; the preprocessor drops it afterwards."""
     return (*tactile_keys(body), *baseline_keys(body), AGE_KEY, *VISUAL_KEYS, NOISE_LEVEL_KEY)
-
-
-# What the default body has, for benchmarks and for commands that ask for no body.
-_BODY = get_embodiment(DEFAULT_BODY)
-PADS = _BODY.pad_names
-PAD_ROWS, PAD_COLS = _BODY.pad_layout.rows, _BODY.pad_layout.cols
-NUM_JOINTS = _BODY.num_joints
-TACTILE_KEYS, BASELINE_KEYS, RAW_KEYS = tactile_keys(_BODY), baseline_keys(_BODY), raw_keys(_BODY)
 
 
 class Column(NamedTuple):
@@ -108,24 +104,18 @@ def columns(body: Embodiment) -> tuple[Column, ...]:
     taxels = (body.pad_layout.num_taxels,)
     return (
         Column(STATE_KEY, "state", "float32", (body.num_joints,)),
-        *(Column(key, "tactile", "uint8", taxels, pad) for pad, key in enumerate(tactile_keys(body))),
-        *(
-            Column(key, "tactile_baseline", "uint8", taxels, pad)
-            for pad, key in enumerate(baseline_keys(body))
-        ),
-        Column(AGE_KEY, "tactile_age", "float32", (len(body.pad_names),)),
+        *(Column(key, TACTILE, "uint8", taxels, pad) for pad, key in enumerate(tactile_keys(body))),
+        *(Column(key, BASELINE, "uint8", taxels, pad) for pad, key in enumerate(baseline_keys(body))),
+        Column(AGE_KEY, TACTILE_AGE, "float32", (len(body.pad_names),)),
         Column(INTRINSICS_KEY, "camera_intrinsics", "float32", (4,)),
         Column(CAMERA_POSE_KEY, "camera_pose", "float32", (7,)),
         Column(NOISE_LEVEL_KEY, "noise_level", "float32", (1,)),
     )
 
 
-def taxel_info(layout: PadLayout) -> dict[str, Any]:
-    """What datasets say of a pad's column."""
-    return {"array_shape": [layout.rows, layout.cols], "unit": TAXEL_UNIT}
-
-
-TAXEL_INFO = taxel_info(_BODY.pad_layout)
+def taxel_info(rows: int, cols: int) -> dict[str, Any]:
+    """What datasets say of the flat column of a pad with so many taxels."""
+    return {"array_shape": [rows, cols], "unit": TAXEL_UNIT}
 
 
 def dataset_features(
@@ -139,11 +129,12 @@ def dataset_features(
     """
     if camera_height < 1 or camera_width < 1:
         raise ValueError(f"camera size must be positive, got {camera_height} x {camera_width}")
+    layout = body.pad_layout
     features: dict[str, dict[str, Any]] = {}
     for column in columns(body):
         features[column.key] = {"dtype": column.dtype, "shape": column.shape}
-        if column.source in ("tactile", "tactile_baseline"):
-            features[column.key]["info"] = taxel_info(body.pad_layout)
+        if column.source in (TACTILE, BASELINE):
+            features[column.key]["info"] = taxel_info(layout.rows, layout.cols)
     names = {"names": [f"{name}{JOINT_SUFFIX}" for name in body.joint_names]}
     features[STATE_KEY] |= names
     features[DEPTH_KEY] = {
@@ -162,7 +153,7 @@ def dataset_features(
 def _columns_of(raw: Mapping[str, Array], body: Embodiment) -> dict[str, Array]:
     """All array columns of a raw observation; what may be missing becomes 0."""
     lead = raw["state"].shape[:-1] if "state" in raw else ()
-    may_be_missing = {"noise_level": 1, "tactile_age": len(body.pad_names)}
+    may_be_missing = {"noise_level": 1, TACTILE_AGE: len(body.pad_names)}
     absent = {key: width for key, width in may_be_missing.items() if key not in raw}
     raw = {**raw, **{key: np.zeros((*lead, width), np.float32) for key, width in absent.items()}}
     missing = {column.source for column in columns(body)} - set(raw)

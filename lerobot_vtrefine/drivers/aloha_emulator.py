@@ -79,7 +79,7 @@ class AlohaEmulator:
         self._stack.close()
 
     def wave(self, elapsed_s: float) -> None:
-        """Moves the leaders as an operator might: waists swing, grippers close and open."""
+        """Move the leaders as an operator might: waists swing, grippers close and open."""
         phase = 2 * math.pi * elapsed_s / WAVE_S
         closed, opened = GRIPPER_ENDS[ARMS["leader"]]
         for side, sign in zip(SIDES, (1.0, -1.0), strict=True):

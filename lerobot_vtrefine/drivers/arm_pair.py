@@ -21,7 +21,7 @@ class ArmPair:
     """A left and a right arm of one model, sixteen values: eight of the left arm, then eight of the right."""
 
     def __init__(self, left_port: str, right_port: str, model: ArmModel, travel_m: float) -> None:
-        """Raises ValueError where both arms are on one port."""
+        """Raise ValueError where both arms are on one port."""
         if left_port == right_port:
             raise ValueError(f"left_port and right_port are both {left_port}")
         ports = {"left": left_port, "right": right_port}
@@ -54,7 +54,7 @@ class ArmPair:
             arm.calibration = {k.removeprefix(prefix): v for k, v in entries.items() if k.startswith(prefix)}
 
     def connect(self) -> None:
-        """Opens both ports and checks the motors.
+        """Open both ports and check the motors.
 
         Raises:
             PortError: a port cannot be used; the message names it and the fix. Neither stays open.
@@ -68,17 +68,17 @@ class ArmPair:
         self._readers = ThreadPoolExecutor(len(self.arms), thread_name_prefix="arm")
 
     def calibrate(self, ask: Ask, lower: Floats, upper: Floats) -> None:
-        """Calibrates both arms by hand; `lower` and `upper` are the joint limits of one arm (6,) [rad]."""
+        """Calibrate both arms by hand; `lower` and `upper` are the joint limits of one arm (6,) [rad]."""
         for arm in self.arms.values():
             arm.calibrate(ask, lower, upper)
 
     def write_calibration(self) -> None:
-        """Writes the loaded calibration to the motors, with torque off."""
+        """Write the loaded calibration to the motors, with torque off."""
         for arm in self.arms.values():
             arm.write_calibration()
 
     def setup_motors(self, ask: Ask) -> None:
-        """Gives every motor its id and baud rate, one after the other."""
+        """Give every motor its id and baud rate, one after the other."""
         for arm in self.arms.values():
             arm.setup_motors(ask)
 
@@ -93,7 +93,7 @@ class ArmPair:
         return np.concatenate(list(self._readers.map(DynamixelArm.read, self.arms.values())))
 
     def release(self, *, torque_off: bool) -> None:
-        """Closes both ports, also after failures, which are logged."""
+        """Close both ports, also after failures, which are logged."""
         if self._readers is not None:
             self._readers.shutdown()  # where one arm failed, the other may still be reading
             self._readers = None

@@ -66,7 +66,7 @@ class AsciiFramer:
         return self._lines.buffered + sum(map(len, self._rows or []))
 
     def reset(self) -> None:
-        """Forgets the stream (after a reconnection); statistics stay."""
+        """Forget the stream (after a reconnection); statistics stay."""
         self._lines = LineBuffer()
         self._rows = None
 

@@ -111,7 +111,7 @@ def _ports(process: "subprocess.Popen[str]", folder: Path, boards: int) -> list[
 
 
 def read_ours(ports: list[str], seconds: float, look_s: float) -> list[Tally]:
-    """Reads boards for a while, looking at the latest frames every `look_s`."""
+    """Read boards for a while, looking at the latest frames every `look_s`."""
     with ExitStack() as stack:
         readers = [PadReader(PadConfig(port), Path(port).name) for port in ports]
         for reader in readers:
@@ -136,7 +136,7 @@ def read_ours(ports: list[str], seconds: float, look_s: float) -> list[Tally]:
 
 
 def read_reference(port: str, seconds: float, method: str) -> Tally:
-    """Reads one board with `flexitac`, by its method "read" (every frame) or "read_latest"."""
+    """Read one board with `flexitac`, by its method "read" (every frame) or "read_latest"."""
     flexitac: Any = importlib.import_module("flexitac")
 
     sensor: Any = flexitac.FlexiTacSensor(port, baseline=20.0)
@@ -248,7 +248,7 @@ def parser_row() -> Row:
 
 
 def main(seconds: float) -> None:
-    """Writes the rows and the machine's load to standard output."""
+    """Write the rows and the machine's load to standard output."""
     before = os.getloadavg()[0]
     for name, value, explanation in run(seconds):
         sys.stdout.write(f"{name}: {value:.3g} ({explanation})\n")

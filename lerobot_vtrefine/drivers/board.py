@@ -125,7 +125,7 @@ class PadReader(SerialReader):
         return newer[::-1]
 
     def wait_after(self, seq: int, timeout_s: float) -> PadFrame | None:
-        """Waits for a frame newer than `seq`; returns the newest, or None after the timeout."""
+        """Wait for a frame newer than `seq`; return the newest, or None after the timeout."""
         with self._changed:
             arrived = self._changed.wait_for(lambda: self._seq - 1 > seq and bool(self._history), timeout_s)
             return self._history[-1] if arrived else None

@@ -33,7 +33,7 @@ class DiagnosticReader(SerialReader):
         self._received = b""
 
     def connect(self, timeout_s: float = START_TIMEOUT_S) -> DiagnosticSample:
-        """Opens the port and waits for the first sample.
+        """Open the port and wait for the first sample.
 
         Raises:
             PortError: the port cannot be used or sends something else; the message says what to do.
@@ -46,7 +46,7 @@ class DiagnosticReader(SerialReader):
             raise
 
     def send(self, name: str, value: int | None = None) -> None:
-        """Sends a command: m (multiplexer channel), c (column), e (enable), d (drive) or h (help).
+        """Send a command: m (multiplexer channel), c (column), e (enable), d (drive) or h (help).
 
         Raises:
             PortError: the port is closed or gone.
@@ -62,7 +62,7 @@ class DiagnosticReader(SerialReader):
                 raise PortError(f"{self.port}: {UNPLUGGED}") from error
 
     def measure(self, channel: int, column: int, timeout_s: float = 4.0) -> DiagnosticSample:
-        """Selects a taxel and returns its first sample.
+        """Select a taxel and return its first sample.
 
         Args:
             channel: Multiplexer channel, 0..15; a 12-row pad is on 4..15.

@@ -26,7 +26,7 @@ class DiagnosticEmulator(EmulatedPort):
         self.selected = dict(RESTARTED)
 
     def plug(self) -> None:
-        """Makes the port appear; the board restarts with its first channel and column."""
+        """Make the port appear; the board restarts with its first channel and column."""
         self.selected = dict(RESTARTED)
         super().plug()
 

@@ -91,7 +91,7 @@ class FoundBoard:
 
 
 def open_board(port: str, kind: StreamKind) -> FoundBoard:
-    """Starts reading a probed board, takes its idle counts, and looks for dead lines.
+    """Start reading a probed board, take its idle counts, and look for dead lines.
 
     Raises:
         PortError: the frames stopped coming.
@@ -131,7 +131,7 @@ def wait_for_press(boards: list[FoundBoard], timeout_s: float) -> FoundBoard | N
 
 
 def wait_for_release(boards: list[FoundBoard], timeout_s: float) -> bool:
-    """Waits until no pad is pressed; False after the timeout."""
+    """Wait until no pad is pressed; False after the timeout."""
     deadline = time.monotonic() + timeout_s
     while time.monotonic() < deadline:
         if all(board.rise() < PRESS_COUNTS / 2 for board in boards):

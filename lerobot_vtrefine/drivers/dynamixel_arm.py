@@ -87,7 +87,7 @@ class DynamixelArm:
     # --- connection ---------------------------------------------------------------------------------
 
     def connect(self) -> None:
-        """Opens the port and checks that every motor answers and is of the right model.
+        """Open the port and check that every motor answers and is of the right model.
 
         Raises:
             PortError: the message names the port, the motors and the fix.
@@ -105,7 +105,7 @@ class DynamixelArm:
             raise
 
     def _open(self) -> None:
-        """Opens the port, for this program alone."""
+        """Open the port, for this program alone."""
         try:
             self.bus.connect(handshake=False)
             device = self.bus.port_handler.ser
@@ -163,7 +163,7 @@ class DynamixelArm:
         return ""
 
     def disconnect(self, *, torque_off: bool) -> None:
-        """Closes the port; torque goes off before where wanted.
+        """Close the port; torque goes off before where wanted.
 
         Raises:
             PortError: torque may still be on; the message names the motors. The port is closed.
@@ -176,7 +176,7 @@ class DynamixelArm:
             self.holding = False
 
     def _torque_off(self) -> None:
-        """Switches off motor by motor: one that does not answer must not keep the others driven."""
+        """Switch off motor by motor: one that does not answer must not keep the others driven."""
         failed: dict[str, Exception] = {}
         for motor in self.bus.motors:
             self.bus.port_handler.is_using = False  # an interrupted read leaves it set
@@ -208,7 +208,7 @@ class DynamixelArm:
     def calibrate(
         self, ask: Callable[[str], str], lower: Floats, upper: Floats
     ) -> dict[str, MotorCalibration]:
-        """Finds the joints' zero and the gripper's two ends, by hand, with torque off; writes them to the
+        """Find the joints' zero and the gripper's two ends, by hand, with torque off; write them to the
         motors.
 
         Args:
@@ -244,7 +244,7 @@ class DynamixelArm:
         return self.calibration
 
     def write_calibration(self) -> None:
-        """Switches torque off, and writes the loaded calibration's homing offsets to the motors."""
+        """Switch torque off, and write the loaded calibration's homing offsets to the motors."""
         with self._talking():
             self.bus.disable_torque(num_retry=RETRIES)
         self._write_offsets({name: entry.homing_offset for name, entry in self.calibration.items()})
@@ -260,7 +260,7 @@ class DynamixelArm:
     # --- set-up -------------------------------------------------------------------------------------
 
     def setup_motors(self, ask: Callable[[str], str]) -> None:
-        """Gives every motor its id and baud rate, the last one first; each must be alone on the bus.
+        """Give every motor its id and baud rate, the last one first; each must be alone on the bus.
 
         Args:
             ask: Shows a text, returns what the operator typed.
@@ -272,7 +272,7 @@ class DynamixelArm:
         self.disconnect(torque_off=False)
 
     def set_up(self) -> None:
-        """Switches torque off and sets what leader and follower share: shadows, and answers without delay."""
+        """Switch torque off and set what leader and follower share: shadows, and answers without delay."""
         with self._talking():
             self.bus.disable_torque(num_retry=RETRIES)
             for shadow, _, _, motor in self.model.shadows:
@@ -281,7 +281,7 @@ class DynamixelArm:
                 self.bus.write("Return_Delay_Time", motor, 0, num_retry=RETRIES)
 
     def configure(self, gripper_current_ma: float, torque_limit: float) -> None:
-        """Sets shadows, modes and limits of a driven arm, with torque off.
+        """Set shadows, modes and limits of a driven arm, with torque off.
 
         Joints are held by the motors themselves within the calibrated limits (position mode), with a torque
         that their PWM limit bounds. The gripper's force is limited by its current.
@@ -307,14 +307,14 @@ class DynamixelArm:
         bus.write("Goal_Current", GRIPPER, round(gripper_current_ma / _X540_MA), num_retry=RETRIES)
 
     def hold(self) -> None:
-        """Switches torque on where the arm is: goals become the present positions first, nothing jumps."""
+        """Switch torque on where the arm is: goals become the present positions first, nothing jumps."""
         self.write(self.read())
         with self._talking():
             self.bus.enable_torque(self._names, num_retry=RETRIES)
         self.holding = True
 
     def move_to(self, target: Floats, seconds: float) -> None:
-        """Moves slowly along a straight line in joint space, (8,) [rad, m]."""
+        """Move slowly along a straight line in joint space, (8,) [rad, m]."""
         start = self.read()
         steps = max(1, round(seconds * MOVE_RATE_HZ))
         for step in range(1, steps + 1):
@@ -339,7 +339,7 @@ class DynamixelArm:
         return state if time.monotonic() - read_s <= max_age_s else self.read()
 
     def write(self, target: Floats) -> None:
-        """Sends targets (8,); the gripper follows the left finger, the right one mirrors it."""
+        """Send targets (8,); the gripper follows the left finger, the right one mirrors it."""
         ends = self._gripper_ends()
         gripper = ends.range_min + target[6] / self.travel_m * (ends.range_max - ends.range_min)
         goals = dict(zip(self.model.joints, rad_to_counts(target[:6]).astype(int).tolist(), strict=True))

@@ -86,7 +86,7 @@ class EmulatedMotor:
         return int.from_bytes(self.memory[address : address + length], "little", signed=length == 4)
 
     def store(self, address: int, value: int, length: int) -> None:
-        """Sets a register, whatever the torque."""
+        """Set a register, whatever the torque."""
         self.memory[address : address + length] = value.to_bytes(length, "little", signed=value < 0)
 
     @property
@@ -101,7 +101,7 @@ class EmulatedMotor:
         return bytes(self.memory[address : address + length])
 
     def write(self, address: int, data: bytes) -> int:
-        """Writes registers; returns the status error."""
+        """Write registers; return the status error."""
         if address < _EEPROM_END and self.torque:
             return ERROR_ACCESS
         self.move()
@@ -109,7 +109,7 @@ class EmulatedMotor:
         return 0
 
     def move(self) -> None:
-        """Moves the shaft towards its goal, as far as it gets since the last call."""
+        """Move the shaft towards its goal, as far as it gets since the last call."""
         now = time.monotonic()
         reach = self.speed * (now - self.moved_at_s)
         self.moved_at_s = now
@@ -179,7 +179,7 @@ class DynamixelEmulator(EmulatedPort):
             self._write(records[at], address, records[at + 1 : at + 1 + length])
 
     def _write(self, motor_id: int, address: int, data: bytes) -> int:
-        """Writes to a motor and to those that shadow it; returns the motor's own status error."""
+        """Write to a motor and to those that shadow it; return the motor's own status error."""
         for motor in self.motors.values():
             if motor.memory[_SECONDARY_ID] == motor_id and motor.motor_id != motor_id:
                 motor.write(address, data)

@@ -29,7 +29,7 @@ class EmulatedPort(ABC):
         return str(self.link)
 
     def start(self) -> Self:
-        """Plugs the hardware in and starts its thread; does nothing where it runs."""
+        """Plug the hardware in and start its thread; do nothing where it runs."""
         if self._thread is None:
             self.plug()
             self._stop.clear()
@@ -38,7 +38,7 @@ class EmulatedPort(ABC):
         return self
 
     def stop(self) -> None:
-        """Ends the thread and removes the port."""
+        """End the thread and remove the port."""
         self._stop.set()
         if self._thread is not None:
             self._thread.join()
@@ -52,14 +52,14 @@ class EmulatedPort(ABC):
         self.stop()
 
     def plug(self) -> None:
-        """Makes the port appear; does nothing where it is there."""
+        """Make the port appear; do nothing where it is there."""
         with self._guard:
             if self._terminal is None:
                 self._terminal = plug_in(self.link)
                 os.set_blocking(self._terminal[0], False)
 
     def unplug(self) -> None:
-        """Makes the port vanish, open or not; does nothing where it is not there."""
+        """Make the port vanish, open or not; do nothing where it is not there."""
         self._pulling.set()
         with self._guard:
             self._pulling.clear()
@@ -83,7 +83,7 @@ class EmulatedPort(ABC):
         return b""
 
     def _transmit(self, data: bytes) -> bool:
-        """Sends as much as fits, and loses the rest as a UART does; whether all of it went out."""
+        """Send as much as fits, and lose the rest as a UART does; whether all of it went out."""
         written = 0
         with self._guard, contextlib.suppress(BlockingIOError):
             if self._terminal is not None:

@@ -111,7 +111,7 @@ class PadEmulator(EmulatedPort):
         return time.monotonic() - self._read_s < READ_WITHIN_S
 
     def stall(self, seconds: float) -> None:
-        """Sends nothing for a while from now on."""
+        """Send nothing for a while from now on."""
         self._stalled_until = time.monotonic() + seconds
 
     def _run(self) -> None:

@@ -102,7 +102,7 @@ class BinaryFramer:
         self._begin()
 
     def _begin(self) -> None:
-        """Starts anew at the end of the bytes so far."""
+        """Start anew at the end of the bytes so far."""
         self._buf.clear()
         self._base = self.stats.bytes_in  # stream position of self._buf[0]
         self._chains = MarkerChains(self._period, self._base)
@@ -138,12 +138,12 @@ class BinaryFramer:
         return len(self._buf)
 
     def reset(self) -> None:
-        """Forgets the stream (after a reconnection), not the pad: statistics, stream positions and the places
+        """Forget the stream (after a reconnection), not the pad: statistics, stream positions and the places
         of motionless `AA 55` stay."""
         self._begin()
 
     def feed(self, data: bytes, *, after_silence: bool = False, then_quiet: bool = False) -> list[Framed]:
-        """Takes the next bytes of the stream and returns the payloads that became certain, oldest first.
+        """Take the next bytes of the stream and return the payloads that became certain, oldest first.
 
         Args:
             data: Any number of bytes; none, with `after_silence`, where the line turned out to be silent.
@@ -176,7 +176,7 @@ class BinaryFramer:
     # --- bytes ------------------------------------------------------------------------------------
 
     def _advance(self) -> list[Framed]:
-        """Scans new bytes for markers; locks, unlocks and releases as they show."""
+        """Scan new bytes for markers; lock, unlock and release as they show."""
         chains = self._chains
         began = chains.scan(np.frombuffer(self._buf[chains.scanned - self._base :], np.uint8))
         out: list[Framed] = []
@@ -201,7 +201,7 @@ class BinaryFramer:
         return self._seen > self._delivered - CAUTIOUS_FRAMES * self._period
 
     def _try_lock(self) -> None:
-        """Locks on the chain that is older than any other, or on the one that motionless places point out."""
+        """Lock on the chain that is older than any other, or on the one that motionless places point out."""
         chains = self._chains
         alive, ages = chains.alive(), chains.ages()
         oldest = int(np.where(alive, chains.last - chains.first, -1).argmax())
@@ -220,7 +220,7 @@ class BinaryFramer:
             self._lock_by_pattern(chains.recurring())
 
     def _lock_by_pattern(self, recurring: NDArray[np.int64]) -> None:
-        """Locks on the one recurring chain from which the others stand just where motionless `AA 55` did."""
+        """Lock on the one recurring chain from which the others stand just where motionless `AA 55` did."""
         static = np.flatnonzero(self._static)
         if not 0 < len(static) <= MAX_STATIC or len(recurring) != len(static) + 1:
             return
@@ -237,7 +237,7 @@ class BinaryFramer:
         self._next = first + behind * self._period
 
     def _unlock(self, lock: int) -> list[Framed]:
-        """Gives the broken lock up; releases what only waited for the marker that did not come."""
+        """Give the broken lock up; release what only waited for the marker that did not come."""
         out: list[Framed] = []
         last = int(self._chains.last[lock])
         while self._next + self._period <= last and self._contest(lock) >= self._next + self._period:
@@ -349,7 +349,7 @@ class BinaryFramer:
         return out
 
     def _trim(self) -> None:
-        """Drops bytes that can no longer be part of a frame to hand out."""
+        """Drop bytes that can no longer be part of a frame to hand out."""
         end = self._base + len(self._buf)
         if self._lock is not None:
             keep_from = self._next

@@ -31,8 +31,8 @@ class MarkerChains:
         self.scanned = start
 
     def scan(self, octets: NDArray[np.uint8]) -> NDArray[np.int64]:
-        """Takes the bytes from `scanned` on, at most a period and one more, of which the last may be half a
-        marker; returns the phases at which chains began."""
+        """Take the bytes from `scanned` on, at most a period and one more, of which the last may be half a
+        marker; return the phases at which chains began."""
         if len(octets) < 2:
             return np.empty(0, np.int64)
         at = np.flatnonzero((octets[:-1] == MARKER[0]) & (octets[1:] == MARKER[1])) + self.scanned

@@ -26,7 +26,7 @@ class Orientation:
     flip_cols: bool = False
 
     def check(self, shape: FrameShape) -> None:
-        """Raises ValueError where a board of this shape cannot carry the pad."""
+        """Raise ValueError where a board of this shape cannot carry the pad."""
         if not 1 <= self.pad_rows <= shape.rows:
             raise ValueError(
                 f"pad_rows={self.pad_rows} must lie within 1 .. {shape.rows}, the rows the board sends"

@@ -54,7 +54,7 @@ class PadSet:
         return self._connected
 
     def connect(self) -> None:
-        """Starts all boards at once and takes the pads' idle counts; no pad may be touched meanwhile.
+        """Start all boards at once and take the pads' idle counts; no pad may be touched meanwhile.
 
         Raises:
             PortError: a pad cannot be read; every pad is released again.
@@ -73,11 +73,11 @@ class PadSet:
         logger.info("pads are connected and their idle counts taken")
 
     def measure_baselines(self) -> None:
-        """Takes the idle counts anew: the median of 30 frames; no pad may be touched."""
+        """Take the idle counts anew: the median of 30 frames; no pad may be touched."""
         self.baselines = {name: reader.idle_counts() for name, reader in self._readers.items()}
 
     def disconnect(self) -> None:
-        """Stops all boards."""
+        """Stop all boards."""
         for reader in self._readers.values():
             reader.stop()
         self._connected = False

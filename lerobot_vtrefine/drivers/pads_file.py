@@ -15,7 +15,7 @@ _HEADER = "# FlexiTac pads by name, from vtrefine-find-pads. Ports name USB sock
 
 
 def save_pads(pads: dict[str, PadConfig], path: Path) -> None:
-    """Writes the pads file; only what differs from the defaults."""
+    """Write the pads file; only what differs from the defaults."""
     defaults = asdict(PadConfig(port="-"))
     entries = {
         name: {key: value for key, value in asdict(pad).items() if key == "port" or value != defaults[key]}
@@ -26,7 +26,7 @@ def save_pads(pads: dict[str, PadConfig], path: Path) -> None:
 
 
 def load_pads(path: Path) -> dict[str, PadConfig]:
-    """Reads the pads file.
+    """Read the pads file.
 
     Raises:
         FileNotFoundError: no such file.
@@ -74,7 +74,7 @@ def decode_pads(entries: dict[str, Any], where: str) -> dict[str, PadConfig]:
 
 
 def check_distinct_ports(pads: dict[str, PadConfig], where: str) -> None:
-    """Raises ValueError where two pads claim one port."""
+    """Raise ValueError where two pads claim one port."""
     owners: dict[str, str] = {}
     for name, pad in pads.items():
         other = owners.setdefault(str(Path(pad.port).resolve()), name)

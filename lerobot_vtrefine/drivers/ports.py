@@ -38,7 +38,7 @@ class PortError(ConnectionError):
 
 
 def open_port(port: str, baud: int, timeout_s: float) -> "serial.Serial":
-    """Opens a port exclusively, with input flushed.
+    """Open a port exclusively, with input flushed.
 
     Raises:
         PortError: missing, not permitted, busy, or not a serial port.
@@ -61,7 +61,7 @@ def open_port(port: str, baud: int, timeout_s: float) -> "serial.Serial":
 
 
 def ask_for_low_latency(device: "serial.Serial") -> None:
-    """Sets an FTDI adapter's timer to 1 ms where the driver allows it (else see `latency_advice`)."""
+    """Set an FTDI adapter's timer to 1 ms where the driver allows it (else see `latency_advice`)."""
     try:
         device.set_low_latency_mode(True)
     except (AttributeError, NotImplementedError, ValueError, OSError):

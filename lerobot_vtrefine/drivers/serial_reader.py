@@ -33,7 +33,7 @@ class SerialReader(ABC):
         self._thread: threading.Thread | None = None
 
     def start(self) -> None:
-        """Opens the port and starts reading; does nothing where it is being read.
+        """Open the port and start reading; do nothing where it is being read.
 
         Raises:
             PortError: the port cannot be opened.
@@ -51,7 +51,7 @@ class SerialReader(ABC):
         self._thread.start()
 
     def stop(self) -> None:
-        """Stops reading and closes the port; what was read so far stays accessible."""
+        """Stop reading and close the port; what was read so far stays accessible."""
         self._stop.set()
         if self._thread is not None:
             self._thread.join()
@@ -71,11 +71,11 @@ class SerialReader(ABC):
 
     @abstractmethod
     def _begin(self) -> None:
-        """Forgets the stream so far: the port was opened, or is lost. Called with `_changed` held."""
+        """Forget the stream so far: the port was opened, or is lost. Called with `_changed` held."""
 
     @abstractmethod
     def _pump(self, device: "serial.Serial") -> None:
-        """Reads until told to stop; raises one of `LOST` when the port goes away."""
+        """Read until told to stop; raise one of `LOST` when the port goes away."""
 
     def _run(self) -> None:
         try:

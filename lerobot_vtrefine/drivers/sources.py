@@ -88,7 +88,7 @@ def press_in_turn_source(
 
 
 def recording_source(path: Path, shape: FrameShape) -> Source:
-    """Plays frames of a file in a loop: .npy, or .npz with one uint8 array of (T, R, C) or (T, R*C).
+    """Play frames of a file in a loop: .npy, or .npz with one uint8 array of (T, R, C) or (T, R*C).
 
     Raises:
         FileNotFoundError: no such file.

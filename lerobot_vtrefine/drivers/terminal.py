@@ -9,7 +9,7 @@ Terminal = tuple[int, int]
 
 
 def plug_in(link: Path) -> Terminal:
-    """Opens a raw pseudo-terminal that `link` names."""
+    """Open a raw pseudo-terminal that `link` names."""
     link.parent.mkdir(parents=True, exist_ok=True)
     link.unlink(missing_ok=True)
     hardware, reader = os.openpty()
@@ -24,7 +24,7 @@ def plug_in(link: Path) -> Terminal:
 
 
 def pull_out(link: Path, terminal: Terminal) -> None:
-    """Removes the name and closes the terminal, open or not on the other side."""
+    """Remove the name and close the terminal, open or not on the other side."""
     link.unlink(missing_ok=True)
     for descriptor in terminal:
         os.close(descriptor)

@@ -79,7 +79,7 @@ def seam_row(pressed: NDArray[np.uint8], idle: NDArray[np.uint8]) -> int | None:
 
 
 def inspect_wiring(frames: NDArray[np.uint8]) -> WiringReport:
-    """Judges the wiring from frames of one board in board order.
+    """Judge the wiring from frames of one board in board order.
 
     Args:
         frames: uint8 (T, R, C), about a second, pad idle or pressed.

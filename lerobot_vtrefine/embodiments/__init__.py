@@ -24,6 +24,7 @@ __all__ = [
     "Pad",
     "SlidingFingers",
     "embodiment_of",
+    "embodiment_of_robot",
     "embodiment_with_pads",
     "get_embodiment",
     "menagerie_file",
@@ -67,6 +68,11 @@ def pad_layout_of(pad: str) -> PadLayout:
 def embodiment_with_pads(pads: Collection[str]) -> Embodiment | None:
     """The body whose pads all have names among these; None if none is known."""
     return next((body for body in _EMBODIMENTS.values() if set(body.pad_names) <= set(pads)), None)
+
+
+def embodiment_of_robot(robot_type: str | None) -> Embodiment | None:
+    """The body that LeRobot knows by this robot type; None if none is known."""
+    return next((body for body in _EMBODIMENTS.values() if body.robot_type == robot_type), None)
 
 
 def embodiment_of(joints: tuple[str, ...]) -> Embodiment | None:

@@ -186,10 +186,6 @@ class Embodiment:
         """Columns of the state that hold revolute joints of arms, in order."""
         return np.flatnonzero(np.arange(self.num_joints) % self.joints_per_arm < len(self.joints))
 
-    def arm_of(self, joint: str) -> int:
-        """Index of the arm to which the joint of this full name belongs."""
-        return self.joint_names.index(joint) // self.joints_per_arm
-
     def joint_of(self, name: str) -> Joint | None:
         """The revolute joint of this full name; None for one of a gripper, or of no arm."""
         place = self.joint_names.index(name) % self.joints_per_arm if name in self.joint_names else -1

@@ -176,7 +176,7 @@ class VtRefineEnvConfig(EnvConfig):
 
     def create_envs(self, n_envs: int, use_async_envs: bool = False) -> dict[str, dict[int, Any]]:
         """LeRobot's factory: ``{"vtrefine": {0: vector environment}}``."""
-        from lerobot_vtrefine.envs.factory import make_vector_env
+        from lerobot_vtrefine.envs.vectorization import make_vector_env
 
         return {self.type: {0: make_vector_env(self, n_envs, use_async_envs)}}
 

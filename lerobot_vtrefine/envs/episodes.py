@@ -24,7 +24,7 @@ Ablation = Callable[[Raw, Array, Array, Array], Raw]
 
 
 @dataclass
-class Transition:
+class ControlStep:
     """One control step of all ``n`` environments; finished ones repeat their flags with reward 0."""
 
     reward: Array
@@ -76,7 +76,7 @@ class Episodes:
 
     @property
     def active(self) -> Array:
-        """Ids of the environments whose episode still runs."""
+        """Ids (m,) of the environments whose episode still runs."""
         return np.flatnonzero(~self.done)
 
     def reset(self, ids: Array, seeds: Array) -> None:
@@ -91,7 +91,7 @@ class Episodes:
             flag[ids] = False
         self.read(ids)
 
-    def step(self, actions: Array, reads: bool = True) -> Transition:
+    def step(self, actions: Array, reads: bool = True) -> ControlStep:
         """One control step of the unfinished environments.
 
         Args:
@@ -116,7 +116,7 @@ class Episodes:
                 self.read(ids)
             self._collect(finished)
         flags = (self.terminated.copy(), self.truncated.copy(), self.success.copy())
-        return Transition(reward, *flags, finished)
+        return ControlStep(reward, *flags, finished)
 
     def read(self, ids: Array) -> Raw:
         """Read the sensors of ``ids`` now -> their raw frames (m, ...), also kept in ``raw``."""

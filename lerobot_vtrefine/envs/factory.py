@@ -1,21 +1,15 @@
-"""From the configuration to running environments; the simulator is imported here, on first use."""
+"""From the configuration to a running simulation and its episodes; the simulator is imported on first use."""
 
 from collections.abc import Callable
-from functools import partial
 from typing import TYPE_CHECKING
 
-import gymnasium as gym
 import numpy as np
-from gymnasium.vector import AutoresetMode
-from lerobot.envs.utils import _LazyAsyncVectorEnv, freeze_after_episode_end
 
 from lerobot_vtrefine.embodiments import menagerie_file
 from lerobot_vtrefine.envs.ablation import make_ablation
 from lerobot_vtrefine.envs.config import VtRefineEnvConfig
 from lerobot_vtrefine.envs.episode_log import EpisodeLog
 from lerobot_vtrefine.envs.episodes import Ablation, Episodes
-from lerobot_vtrefine.envs.evaluation_note import write_note
-from lerobot_vtrefine.envs.rendering import EvalVideos
 
 if TYPE_CHECKING:
     from lerobot_vtrefine.sim.simulation import InsertionSim
@@ -80,29 +74,3 @@ def _colour_camera(
     from lerobot_vtrefine.sim.rgb import RgbCamera
 
     return RgbCamera(sim, *config.colour_size).images
-
-
-def make_vector_env(
-    config: VtRefineEnvConfig, num_envs: int, use_async: bool
-) -> gym.vector.VectorEnv | _LazyAsyncVectorEnv:
-    """The native batched environment, or Gymnasium's sync or async one around single environments."""
-    from lerobot_vtrefine.envs.vector_env import VtRefineVectorEnv
-
-    write_note(config, num_envs)
-    if config.vectorization == "native":
-        return VtRefineVectorEnv(config, num_envs)
-    makers: list[Callable[[], gym.Env]] = [
-        partial(_make_single, config, position, num_envs) for position in range(num_envs)
-    ]
-    if use_async and num_envs > 1:
-        env = _make_single(config, 0, num_envs)
-        # LeRobot's own stand-in for a vector env: worker processes start at the first reset.
-        return _LazyAsyncVectorEnv(makers, env.observation_space, env.action_space, env.metadata)
-    frozen = [freeze_after_episode_end(make) for make in makers]
-    return gym.vector.SyncVectorEnv(frozen, autoreset_mode=AutoresetMode.NEXT_STEP)
-
-
-def _make_single(config: VtRefineEnvConfig, position: int, total: int) -> gym.Env:
-    from lerobot_vtrefine.envs.single_env import VtRefineEnv
-
-    return EvalVideos(VtRefineEnv(config), config.video_episodes, position, total)

@@ -11,7 +11,7 @@ from gymnasium.vector.utils import batch_space
 
 from lerobot_vtrefine.datasets.features import raw_to_env_observation
 from lerobot_vtrefine.envs.config import VtRefineEnvConfig
-from lerobot_vtrefine.envs.episodes import Array, Episodes, Transition
+from lerobot_vtrefine.envs.episodes import Array, ControlStep, Episodes
 from lerobot_vtrefine.envs.factory import make_episodes
 from lerobot_vtrefine.envs.rendering import EvalFrame, FrameSource, LazyFrames, eval_frame
 from lerobot_vtrefine.envs.spaces import action_space, observation_space
@@ -141,7 +141,7 @@ class VtRefineVectorEnv(gym.vector.VectorEnv[Observation, Array, Array]):
     def _shear(self) -> dict[str, Array]:
         return {"shear": self.episodes.sim.shear()} if self.config.shear.on else {}
 
-    def _info(self, result: Transition) -> dict[str, Any]:
+    def _info(self, result: ControlStep) -> dict[str, Any]:
         info: dict[str, Any] = {"is_success": result.success, **self._shear()}
         if len(result.finished):
             summary = self.episodes.summary(self.episodes.ids)

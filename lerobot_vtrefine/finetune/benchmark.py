@@ -14,7 +14,8 @@ import torch
 from lerobot.configs import FeatureType, PolicyFeature
 from torch import Tensor
 
-from lerobot_vtrefine.datasets.features import ACTION_KEY, CLOUD_KEY, NUM_JOINTS, STATE_KEY
+from lerobot_vtrefine.datasets.features import ACTION_KEY, CLOUD_KEY, STATE_KEY
+from lerobot_vtrefine.embodiments import DEFAULT_BODY, get_embodiment
 from lerobot_vtrefine.finetune.chains import chain_log_probs
 from lerobot_vtrefine.finetune.config import SmallDppo
 from lerobot_vtrefine.finetune.dppo import (
@@ -32,6 +33,7 @@ from lerobot_vtrefine.policies.vt_dp3.modeling_vt_dp3 import VtDp3Model
 
 DECISIONS = 64
 PRIVILEGED = 60
+NUM_JOINTS = get_embodiment(DEFAULT_BODY).num_joints
 ROUNDS = 3
 
 Row = tuple[str, float, str]

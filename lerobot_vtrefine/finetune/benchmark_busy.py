@@ -15,7 +15,8 @@ from dataclasses import dataclass
 import torch
 from lerobot.configs import FeatureType, PolicyFeature
 
-from lerobot_vtrefine.datasets.features import ACTION_KEY, NUM_JOINTS, STATE_KEY
+from lerobot_vtrefine.datasets.features import ACTION_KEY, STATE_KEY
+from lerobot_vtrefine.embodiments import DEFAULT_BODY, get_embodiment
 from lerobot_vtrefine.envs.config import VtRefineEnvConfig
 from lerobot_vtrefine.envs.decisions import LeRobotDecisionEnv, make_decision_env
 from lerobot_vtrefine.finetune.config import SmallDppo
@@ -29,6 +30,7 @@ from lerobot_vtrefine.policies.vt_dp3.processor_vt_dp3 import make_vt_dp3_pre_po
 Row = tuple[str, float, str]
 
 CORES = 2
+NUM_JOINTS = get_embodiment(DEFAULT_BODY).num_joints
 LOWEST_PRIORITY = 19
 SPIN = f"import os; os.nice({LOWEST_PRIORITY})\nwhile True: pass"
 SETTLE_S = 0.5

@@ -61,7 +61,10 @@ class Critic(nn.Module):
 
 
 def explained_variance(values: Tensor, targets: Tensor) -> float:
-    """1 - Var[target - value] / Var[target]; over all ranks; zero where the targets do not vary."""
+    """1 - Var[target - value] / Var[target] for values and targets (N,) of all ranks.
+
+    Zero where the targets do not vary.
+    """
     error = (targets - values).double()
     targets = targets.double()
     sums = torch.stack([torch.ones_like(error), error, error**2, targets, targets**2]).sum(1)

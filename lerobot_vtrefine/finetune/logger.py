@@ -9,6 +9,7 @@ from lerobot.configs.default import WandBConfig
 
 from lerobot_vtrefine.files import read_number_rows
 from lerobot_vtrefine.finetune.plots import draw_curves
+from lerobot_vtrefine.whole_files import whole_file
 
 CSV_NAME = "progress.csv"
 CURVES_NAME = "curves.png"
@@ -41,12 +42,10 @@ class ProgressLog:
         """Append a row and rewrite the files."""
         self.rows.append({"iteration": iteration, **metrics})
         columns = list(dict.fromkeys(key for row in self.rows for key in row))
-        partial = self.output_dir / f"{CSV_NAME}.partial"
-        with partial.open("w", newline="") as file:
+        with whole_file(self.output_dir / CSV_NAME) as part, part.open("w", newline="") as file:
             writer = csv.DictWriter(file, columns)
             writer.writeheader()
             writer.writerows({**row, "iteration": int(row["iteration"])} for row in self.rows)
-        partial.replace(self.output_dir / CSV_NAME)
         if self._wandb_run is not None:
             self._wandb_run.log(metrics, step=iteration)
 

@@ -36,6 +36,7 @@ from lerobot_vtrefine.finetune.logger import ProgressLog, start_wandb
 from lerobot_vtrefine.finetune.protocols import Agent, DecisionEnv
 from lerobot_vtrefine.policies.vt_dp3.configuration_vt_dp3 import VtDp3Config
 from lerobot_vtrefine.policies.vt_dp3.modeling_vt_dp3 import VtDp3Policy
+from lerobot_vtrefine.whole_files import whole_file
 
 CONFIG_NAME = "finetune_config.json"
 SHOWN = (
@@ -89,7 +90,7 @@ class FinetunePipelineConfig:
 
     @classmethod
     def __get_path_fields__(cls) -> list[str]:
-        """Lets LeRobot's parser take ``--policy.path``."""
+        """Let LeRobot's parser take ``--policy.path``."""
         return ["policy"]
 
     @classmethod
@@ -293,10 +294,8 @@ def save_config(cfg: FinetunePipelineConfig, policy: VtDp3Config) -> None:
 
 def write_config(cfg: FinetunePipelineConfig, path: Path) -> None:
     """Write all settings as JSON, complete or not at all."""
-    partial = path.with_name(f"{path.name}.partial")
-    with draccus.config_type("json"), partial.open("w") as file:
+    with whole_file(path) as part, draccus.config_type("json"), part.open("w") as file:
         draccus.dump(cfg, file, indent=2)
-    partial.replace(path)
 
 
 def run(cfg: FinetunePipelineConfig) -> None:

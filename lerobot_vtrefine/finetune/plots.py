@@ -2,6 +2,8 @@
 
 from pathlib import Path
 
+from lerobot_vtrefine.whole_files import whole_file
+
 PANELS: tuple[tuple[str, dict[str, str]], ...] = (
     ("success", {"success": "training (noisy sampler)", "eval_success": "held-out seeds (deployed sampler)"}),
     ("return", {"return": "training", "eval_return": "held-out seeds"}),
@@ -33,6 +35,5 @@ def draw_curves(rows: list[dict[str, float]], path: Path) -> None:
             axes.legend(fontsize=8)
         if title == "success":
             axes.set_ylim(-0.02, 1.02)
-    partial = path.with_name(f"{path.name}.partial")
-    figure.savefig(partial, dpi=110, format="png")
-    partial.replace(path)
+    with whole_file(path) as part:
+        figure.savefig(part, dpi=110, format="png")

@@ -6,11 +6,12 @@ dimension, ``C`` condition, ``P`` privileged state.
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
-from typing import NamedTuple, Protocol
+from typing import Protocol
 
 import torch
 from torch import Tensor, nn
 
+from lerobot_vtrefine.envs.decisions import Decision
 from lerobot_vtrefine.policies.vt_dp3.diffusion import DiffusionProcess, PredictNoise
 
 Observation = dict[str, Tensor]
@@ -72,25 +73,12 @@ def predictor(network: Actor, cond: Tensor) -> PredictNoise:
     return lambda x, t: network.denoiser(x, t, cond)
 
 
-class Transition(NamedTuple):
-    """What executing one chunk in every environment returned.
-
-    Environments that had finished before are left alone: their entries hold anything finite. ``privileged``
-    of an environment that finishes in this chunk is its final state (there is no automatic reset).
-    """
-
-    obs: Observation
-    privileged: Tensor  # (n, P)
-    reward: Tensor  # (n,) sum over the chunk
-    terminated: Tensor  # (n,) bool: the task ended (success or failure)
-    truncated: Tensor  # (n,) bool: the time was over
-    info: dict[str, Tensor]
-    """"success" (n,) bool, further (n,) metrics of the episode so far; "void" (n,) bool where the simulation
-    failed: such episodes are left out of what is learnt from."""
-
-
 class DecisionEnv(Protocol):
-    """Environments that take one action chunk per decision and pause once finished, until the next reset."""
+    """Environments that take one action chunk per decision and pause once finished, until the next reset.
+
+    What a decision tells of those that had finished before it may be anything finite. Of ``Decision.info``,
+    "success" must be there; episodes that are "void" at the end are left out of what is learnt from.
+    """
 
     @property
     def num_envs(self) -> int:
@@ -111,10 +99,8 @@ class DecisionEnv(Protocol):
         """Start all environments, each from its own seed. Returns observation and privileged state (n, P)."""
         ...
 
-    def step_chunk(
-        self, actions: Tensor
-    ) -> tuple[Observation, Tensor, Tensor, Tensor, Tensor, dict[str, Tensor]]:
-        """Execute (n, Ta, D) normalised actions, as the policy predicts them; a ``Transition``."""
+    def step_chunk(self, actions: Tensor) -> Decision:
+        """Execute (n, Ta, D) normalised actions, as the policy predicts them."""
         ...
 
 
@@ -140,13 +126,13 @@ def start(env: DecisionEnv, seeds: Sequence[int], device: torch.device) -> tuple
     return {key: value.to(device) for key, value in obs.items()}, privileged.to(device)
 
 
-def execute(env: DecisionEnv, chunks: Tensor, ids: Tensor) -> Transition:
+def execute(env: DecisionEnv, chunks: Tensor, ids: Tensor) -> Decision:
     """Step environments ``ids`` with chunks (len(ids), Ta, D); the others receive ignored zeros."""
     actions = chunks.new_zeros((env.num_envs, *chunks.shape[1:]))
     actions[ids] = chunks
     obs, privileged, reward, terminated, truncated, info = env.step_chunk(actions)
     device = chunks.device
-    return Transition(
+    return Decision(
         {key: value.to(device) for key, value in obs.items()},
         privileged.to(device),
         reward.to(device, torch.float32),

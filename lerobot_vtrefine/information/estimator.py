@@ -10,7 +10,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor, nn
 
-from lerobot_vtrefine.datasets.features import STATE_KEY
+from lerobot_vtrefine.datasets.features import CLOUD_KEY, GRIDS_KEY, STATE_KEY
 from lerobot_vtrefine.information.frames import Frames, Views
 from lerobot_vtrefine.observation import VisuoTactileConfig
 from lerobot_vtrefine.policies.vt_dp3 import VisuoTactileProcessorStep, VtDp3Config
@@ -91,8 +91,8 @@ class Estimator(nn.Module):
         self.sources = {
             key: f"{view}/{key}"
             for view, key in (
-                (config.cloud_modalities, "observation.visuo_tactile"),
-                ("grids", "observation.tactile_grids"),
+                (config.cloud_modalities, CLOUD_KEY),
+                ("grids", GRIDS_KEY),
             )
         }
         state = frames.columns["state"]

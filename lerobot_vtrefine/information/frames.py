@@ -16,7 +16,7 @@ import torch
 from lerobot.envs.utils import preprocess_observation
 from torch import Tensor
 
-from lerobot_vtrefine.datasets.features import raw_to_env_observation
+from lerobot_vtrefine.datasets.features import STATE_KEY, raw_to_env_observation
 from lerobot_vtrefine.envs.config import VtRefineEnvConfig
 from lerobot_vtrefine.envs.episodes import Episodes
 from lerobot_vtrefine.envs.factory import make_episodes
@@ -120,7 +120,7 @@ def view_columns(
         for key, value in view.observation(dict(frame)).items()
         if key not in frame
     }
-    return {**made, "state": frame["observation.state"].float()}
+    return {**made, "state": frame[STATE_KEY].float()}
 
 
 def collect_frames(

@@ -11,7 +11,7 @@ from lerobot.datasets.dataset_reader import DatasetReader
 from lerobot.datasets.lerobot_dataset import LeRobotDataset
 from torch.utils.data import DataLoader
 
-from lerobot_vtrefine.datasets.features import ACTION_KEY, RAW_KEYS, STATE_KEY, dataset_features, raw_to_frame
+from lerobot_vtrefine.datasets.features import ACTION_KEY, STATE_KEY, dataset_features, raw_keys, raw_to_frame
 from lerobot_vtrefine.embodiments import DEFAULT_BODY, get_embodiment
 from lerobot_vtrefine.lerobot_compat import fast_reader
 
@@ -20,7 +20,9 @@ EPISODES, FRAMES = 2, 40
 BATCH = 32
 ROUNDS = 2
 BODY = get_embodiment(DEFAULT_BODY)
-WINDOWS = {key: [-0.1, 0.0] for key in (*RAW_KEYS, STATE_KEY)} | {ACTION_KEY: [i / FPS for i in range(8)]}
+WINDOWS = {key: [-0.1, 0.0] for key in (*raw_keys(BODY), STATE_KEY)} | {
+    ACTION_KEY: [i / FPS for i in range(8)]
+}
 
 Row = tuple[str, float, str]
 

@@ -12,7 +12,16 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from lerobot_vtrefine.datasets.features import ACTION_KEY, AGE_KEY, NOISE_LEVEL_KEY, STATE_KEY, TAXEL_UNIT
+from lerobot_vtrefine.datasets.features import (
+    ACTION_KEY,
+    AGE_KEY,
+    BASELINE_PREFIX,
+    CAMERA_PREFIX,
+    NOISE_LEVEL_KEY,
+    STATE_KEY,
+    TACTILE_PREFIX,
+    TAXEL_UNIT,
+)
 from lerobot_vtrefine.datasets.simulation_card import describe_simulation
 from lerobot_vtrefine.lerobot_compat.guard import is_supported
 
@@ -22,9 +31,6 @@ if TYPE_CHECKING:
 logger = logging.getLogger(__name__)
 
 TAGS = ("tactile", "flexitac")
-PAD_PREFIX = "observation.tactile."
-BASELINE_PREFIX = "observation.tactile_baseline."
-CAMERA_PREFIX = "observation.camera."
 PITCH_MM = 2.0
 """Distance of neighbouring taxels of a FlexiTac pad."""
 
@@ -34,7 +40,7 @@ Stats = Mapping[str, Mapping[str, Any]]
 
 def pad_names(features: Features) -> list[str]:
     """Pads of a dataset, in the order of its columns."""
-    return [key.removeprefix(PAD_PREFIX) for key in features if key.startswith(PAD_PREFIX)]
+    return [key.removeprefix(TACTILE_PREFIX) for key in features if key.startswith(TACTILE_PREFIX)]
 
 
 def describe(meta: "LeRobotDatasetMetadata") -> str:
@@ -80,14 +86,14 @@ def _pads(features: Features, stats: Stats) -> str:
         "|---|---|---|---|---|---|",
     ]
     for name in pad_names(features):
-        feature = features[PAD_PREFIX + name]
+        feature = features[TACTILE_PREFIX + name]
         info = feature.get("info") or {}
         shape = info.get("array_shape", list(feature["shape"]))
         idle = _range(stats.get(BASELINE_PREFIX + name), "mean")
-        highest = stats.get(PAD_PREFIX + name, {}).get("max")
+        highest = stats.get(TACTILE_PREFIX + name, {}).get("max")
         most = f"{float(np.max(highest)):g}" if highest is not None else "-"
         size, unit = " x ".join(map(str, shape)), str(info.get("unit", "-")).replace("_", " ")
-        rows.append(f"| `{PAD_PREFIX}{name}` | {size} | {feature['dtype']} | {unit} | {idle} | {most} |")
+        rows.append(f"| `{TACTILE_PREFIX}{name}` | {size} | {feature['dtype']} | {unit} | {idle} | {most} |")
     return "\n".join(rows)
 
 
@@ -99,8 +105,8 @@ def _range(stats: Mapping[str, Any] | None, key: str) -> str:
 
 
 def _layout(features: Features) -> str:
-    info = features[PAD_PREFIX + pad_names(features)[0]].get("info") or {}
-    shape = tuple(info.get("array_shape", features[PAD_PREFIX + pad_names(features)[0]]["shape"]))
+    info = features[TACTILE_PREFIX + pad_names(features)[0]].get("info") or {}
+    shape = tuple(info.get("array_shape", features[TACTILE_PREFIX + pad_names(features)[0]]["shape"]))
     return (
         "### Layout\n\n"
         f"Columns are flat, row-major: `frame[key].reshape{shape}`. Taxels are {PITCH_MM:g} mm apart. In a "
@@ -111,7 +117,7 @@ def _layout(features: Features) -> str:
 
 def _calibration(features: Features, stats: Stats) -> str:
     lines = ["### Units and calibration", ""]
-    units = {(features[PAD_PREFIX + name].get("info") or {}).get("unit") for name in pad_names(features)}
+    units = {(features[TACTILE_PREFIX + name].get("info") or {}).get("unit") for name in pad_names(features)}
     if units == {TAXEL_UNIT}:
         lines.append(
             "Counts are what a board sends: 8-bit readings of a voltage divider, monotonic in pressure but "
@@ -179,7 +185,7 @@ def _constant(stats: Mapping[str, Any] | None) -> str:
 
 
 def install() -> None:
-    """Lets `LeRobotDataset.push_to_hub` describe tactile datasets; idempotent.
+    """Let `LeRobotDataset.push_to_hub` describe tactile datasets; idempotent.
 
     On a LeRobot version that was not tested it logs a warning and leaves LeRobot as it is.
     """
@@ -210,7 +216,7 @@ def install() -> None:
 
 
 def uninstall() -> None:
-    """Restores LeRobot's own function."""
+    """Restore LeRobot's own function."""
     from lerobot.datasets.lerobot_dataset import LeRobotDataset
 
     original = getattr(LeRobotDataset.push_to_hub, "undescribed", None)

@@ -14,7 +14,7 @@ from lerobot.datasets.utils import DatasetInfo, update_chunk_file_indices
 from lerobot.datasets.video_utils import decode_video_frames_pyav, get_video_duration_in_s
 from PIL import Image
 
-from lerobot_vtrefine.lerobot_compat.safe_recording import SafeMetadata
+from lerobot_vtrefine.lerobot_compat.safe_metadata import SafeMetadata
 
 Row = dict[str, Any]
 
@@ -33,7 +33,7 @@ def video_length_s(path: Path) -> float:
 
 
 def describe_episodes(root: Path, total: int, last: Row | None, files: Mapping[int, Path]) -> int:
-    """Announces the episodes that follow as far as their data and videos go.
+    """Announce the episodes that follow as far as their data and videos go.
 
     Args:
         root: The dataset, in order up to ``total``.

@@ -5,17 +5,17 @@ and that nothing imports LeRobot's dataset code before it is needed.
 """
 
 import logging
-import sys
 from collections.abc import Sequence
 from multiprocessing.context import get_spawning_popen
 from typing import Any, override
 
 from lerobot.datasets.dataset_reader import DatasetReader
 from lerobot.datasets.depth_utils import MM_PER_METRE
+from lerobot.datasets.lerobot_dataset import LeRobotDataset
 from torch.utils.data._utils.collate import default_collate_fn_map
 
 from lerobot_vtrefine.datasets.features import TACTILE_PREFIX
-from lerobot_vtrefine.lerobot_compat.fast_reader import DATASET_MODULE, FrameStore, NotCoveredError
+from lerobot_vtrefine.lerobot_compat.frame_store import FrameStore, NotCoveredError
 from lerobot_vtrefine.lerobot_compat.packed_batch import PackedBatch
 
 logger = logging.getLogger(__name__)
@@ -86,7 +86,7 @@ class FastDatasetReader(DatasetReader):
 
 def serve_batches() -> None:
     """Let data loaders ask LeRobot's datasets for whole batches. Idempotent."""
-    dataset_class: Any = sys.modules[DATASET_MODULE].LeRobotDataset
+    dataset_class: Any = LeRobotDataset
     dataset_class.__getitems__ = _items_at_once
     default_collate_fn_map[PackedBatch] = _as_it_is
 

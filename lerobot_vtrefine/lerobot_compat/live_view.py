@@ -11,17 +11,16 @@ from typing import Any
 
 import numpy as np
 
+from lerobot_vtrefine.datasets.features import BASELINE, CAMERA_PREFIX, OBS_PREFIX, TACTILE, TACTILE_AGE
 from lerobot_vtrefine.drivers.config import PadConfig
 from lerobot_vtrefine.drivers.picture import colours
 from lerobot_vtrefine.lerobot_compat.guard import is_supported
-from lerobot_vtrefine.lerobot_compat.pad_features import BASELINE, PAD_AGE, TACTILE
 
 logger = logging.getLogger(__name__)
 
 LOGGERS = ("log_rerun_data", "log_foxglove_data")
-OBSERVATION = "observation."
-CONSTANT = ("camera.",)
-"""Beginnings of keys whose values never change during a session."""
+CONSTANT = CAMERA_PREFIX.removeprefix(OBS_PREFIX)
+"""What keys begin with whose values never change during a session."""
 
 Observation = Mapping[str, Any]
 
@@ -33,9 +32,9 @@ def drawable(observation: Observation, pads: Mapping[str, PadConfig]) -> dict[st
         observation: Keys with or without `observation.`; a pad that is missing is left out.
         pads: The robot's pads, in the order of its ages.
     """
-    plain = {key.removeprefix(OBSERVATION): value for key, value in observation.items()}
-    ages = np.atleast_1d(plain.get(PAD_AGE, np.zeros(len(pads))))
-    shown = {key: value for key, value in plain.items() if not key.startswith((*CONSTANT, f"{BASELINE}."))}
+    plain = {key.removeprefix(OBS_PREFIX): value for key, value in observation.items()}
+    ages = np.atleast_1d(plain.get(TACTILE_AGE, np.zeros(len(pads))))
+    shown = {key: value for key, value in plain.items() if not key.startswith((CONSTANT, f"{BASELINE}."))}
     for (name, pad), age_s in zip(pads.items(), ages, strict=False):
         key = f"{TACTILE}.{name}"
         if key not in plain:
@@ -47,7 +46,7 @@ def drawable(observation: Observation, pads: Mapping[str, PadConfig]) -> dict[st
 
 
 def install(pads: Mapping[str, PadConfig]) -> None:
-    """Shows these pads as pictures from now on; again with other pads, those are shown.
+    """Show these pads as pictures from now on; again with other pads, those are shown.
 
     On a LeRobot version that was not tested it logs a warning and leaves LeRobot as it is.
     """
@@ -62,7 +61,7 @@ def install(pads: Mapping[str, PadConfig]) -> None:
 
 
 def uninstall() -> None:
-    """Restores LeRobot's own functions."""
+    """Restore LeRobot's own functions."""
     import lerobot.utils.visualization_utils as dispatch
 
     for name in LOGGERS:

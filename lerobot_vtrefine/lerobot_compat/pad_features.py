@@ -5,18 +5,10 @@ from typing import Any
 
 import numpy as np
 
+from lerobot_vtrefine.datasets.features import BASELINE, TACTILE, TACTILE_AGE, taxel_info
 from lerobot_vtrefine.drivers.config import PadConfig
 from lerobot_vtrefine.drivers.pads_file import load_pads
 from lerobot_vtrefine.lerobot_compat.arrays import ArraySpec
-
-TACTILE = "tactile"
-"""Counts of a pad are `tactile.<pad>`."""
-
-BASELINE = "tactile_baseline"
-"""Idle counts of a pad are `tactile_baseline.<pad>`."""
-
-PAD_AGE = "tactile_age"
-"""Age of every pad's frame [s], in the order of the pads; beyond the pad's `stale_after_s` it is stale."""
 
 Observation = dict[str, Any]
 
@@ -40,7 +32,7 @@ def pad_features(pads: dict[str, PadConfig]) -> dict[str, ArraySpec]:
     features: dict[str, ArraySpec] = {}
     for kind in (TACTILE, BASELINE):
         for name, pad in pads.items():
-            info = {"array_shape": list(pad.pad_shape), "unit": "adc_counts"}
-            features[f"{kind}.{name}"] = ArraySpec((int(np.prod(pad.pad_shape)),), "uint8", info)
-    features[PAD_AGE] = ArraySpec((len(pads),), "float32")
+            shape = (int(np.prod(pad.pad_shape)),)
+            features[f"{kind}.{name}"] = ArraySpec(shape, "uint8", taxel_info(*pad.pad_shape))
+    features[TACTILE_AGE] = ArraySpec((len(pads),), "float32")
     return features

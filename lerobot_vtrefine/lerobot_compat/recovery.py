@@ -29,9 +29,9 @@ from lerobot.datasets.utils import DATA_DIR, EPISODES_DIR, INFO_PATH, STATS_PATH
 from numpy.typing import NDArray
 
 from lerobot_vtrefine.datasets.footers import read_without_footer
-from lerobot_vtrefine.datasets.whole_files import PART, whole_file
 from lerobot_vtrefine.lerobot_compat.episode_rows import Row, describe_episodes, video_keys, video_length_s
-from lerobot_vtrefine.lerobot_compat.safe_recording import write_info, write_stats
+from lerobot_vtrefine.lerobot_compat.safe_metadata import write_info, write_stats
+from lerobot_vtrefine.whole_files import PART, whole_file
 
 logger = logging.getLogger(__name__)
 
@@ -65,7 +65,7 @@ class Recovery:
 
 
 def recover(root: Path) -> Recovery:
-    """Puts the dataset at ``root`` in order.
+    """Put the dataset at ``root`` in order.
 
     Raises:
         ValueError: its description is missing or damaged; the message says what to do.
@@ -145,7 +145,7 @@ def _is_readable(path: Path) -> bool:
 
 
 def _mend_data(root: Path, info: DatasetInfo) -> int:
-    """Reads what is complete in data files without footers; returns how many files were moved aside."""
+    """Read what is complete in data files without footers; return how many files were moved aside."""
     broken = [path for path in _tables(root / DATA_DIR) if not _is_readable(path)]
     for path in broken:
         table = read_without_footer(path, info.features)
@@ -252,7 +252,7 @@ def _has_video(root: Path, info: DatasetInfo, row: Row, key: str, announced: boo
 
 
 def _keep_episodes(root: Path, files: dict[Path, NDArray[np.int64]], total: int, announced: int) -> int:
-    """Drops what belongs to episodes from ``total`` on; returns how many files were kept aside for it."""
+    """Drop what belongs to episodes from ``total`` on; return how many files were kept aside for it."""
     aside = 0
     for path, episodes in sorted(files.items(), reverse=True):
         kept = episodes < total
@@ -272,7 +272,7 @@ def _keep_episodes(root: Path, files: dict[Path, NDArray[np.int64]], total: int,
 
 
 def _count(root: Path, info: DatasetInfo, rows: list[Row]) -> None:
-    """Lets ``stats.json`` and ``info.json`` say what the rows say."""
+    """Let ``stats.json`` and ``info.json`` say what the rows say."""
     frames = rows[-1]["dataset_to_index"] if rows else 0
     if not rows:
         (root / STATS_PATH).unlink(missing_ok=True)
@@ -310,7 +310,7 @@ def _aggregated(rows: list[Row], frames: int) -> dict[str, Any] | None:
 
 
 def _clear_pictures(root: Path, info: DatasetInfo, rows: list[Row]) -> int:
-    """Removes images and videos of no episode; returns how many of announced ones were moved aside."""
+    """Remove images and videos of no episode; return how many of announced ones were moved aside."""
     aside = 0
     for folder in sorted(root.glob("images/*/episode-*")):
         if len(rows) <= int(folder.name.rsplit("-", 1)[1]) < info.total_episodes and video_keys(info):

@@ -8,7 +8,6 @@ announces the episode. What is announced can be read at any moment; ``recovery``
 recording is resumed. Reading needs no plugin: LeRobot reads any number of files.
 """
 
-import dataclasses
 import errno
 import functools
 import logging
@@ -20,97 +19,29 @@ from typing import Any
 
 import datasets
 import numpy as np
-import pandas as pd
-import pyarrow as pa
-import pyarrow.parquet as pq
 from lerobot.datasets import dataset_metadata, dataset_writer, image_writer, lerobot_dataset
-from lerobot.datasets.compute_stats import aggregate_stats
 from lerobot.datasets.dataset_metadata import LeRobotDatasetMetadata
 from lerobot.datasets.dataset_writer import DatasetWriter
 from lerobot.datasets.feature_utils import get_hf_features_from_features
 from lerobot.datasets.lerobot_dataset import LeRobotDataset
 from lerobot.datasets.utils import (
-    DEFAULT_EPISODES_PATH,
-    DEFAULT_TASKS_PATH,
-    INFO_PATH,
-    STATS_PATH,
-    DatasetInfo,
-    serialize_dict,
     update_chunk_file_indices,
 )
-from lerobot.utils.constants import HF_LEROBOT_HOME
-from lerobot.utils.utils import flatten_dict
 
-from lerobot_vtrefine.datasets.whole_files import PART, whole_file, write_json
 from lerobot_vtrefine.folders import sync
 from lerobot_vtrefine.lerobot_compat.guard import is_supported
+from lerobot_vtrefine.lerobot_compat.recovery import recover
+from lerobot_vtrefine.lerobot_compat.safe_metadata import (
+    SafeMetadata,
+    write_info,
+    write_stats,
+    write_table,
+    write_tasks,
+)
 
 logger = logging.getLogger(__name__)
 
 _originals: dict[tuple[Any, str], Any] = {}
-
-
-class SafeMetadata(LeRobotDatasetMetadata):
-    """A dataset's metadata, with a file of its own for every episode's row."""
-
-    data_files_size_in_mb = 0  # every file has reached its size, so LeRobot goes on with the next
-    video_files_size_in_mb = 0
-
-    @classmethod
-    def create(
-        cls, repo_id: str, *args: Any, root: str | Path | None = None, **kwargs: Any
-    ) -> LeRobotDatasetMetadata:
-        """As LeRobot's, but the folder appears with its description in it.
-
-        Raises:
-            FileExistsError: there is a dataset already.
-        """
-        home = HF_LEROBOT_HOME / repo_id if root is None else Path(root)
-        if home.exists():
-            raise FileExistsError(
-                f"{home} exists: go on with --resume=true --dataset.root={home},"
-                " or choose another --dataset.root"
-            )
-        part = home.with_name(home.name + PART)
-        shutil.rmtree(part, ignore_errors=True)
-        meta = super().create(repo_id, *args, root=part, **kwargs)
-        part.replace(home)
-        sync(home.parent)
-        meta.root, meta._requested_root = home, None if root is None else home
-        return meta
-
-    def save_episode(
-        self,
-        episode_index: int,
-        episode_length: int,
-        episode_tasks: list[str],
-        episode_stats: dict[str, dict],
-        episode_metadata: dict,
-    ) -> None:
-        """Writes the episode's row, then the statistics, then the count that announces it."""
-        row = {"episode_index": episode_index, "tasks": episode_tasks, "length": episode_length}
-        self._save_episode_metadata(row | episode_metadata | flatten_dict({"stats": episode_stats}))
-        self._flush_metadata_buffer()
-        stats = aggregate_stats([self.stats, episode_stats]) if self.stats else episode_stats
-        write_stats(stats, self.root)
-        count = self.info.total_episodes + 1
-        info = dataclasses.replace(
-            self.info,
-            total_episodes=count,
-            total_frames=self.info.total_frames + episode_length,
-            total_tasks=0 if self.tasks is None else len(self.tasks),
-            splits={"train": f"0:{count}"},
-        )
-        write_info(info, self.root)
-        self.info, self.stats = info, stats
-
-    def _flush_metadata_buffer(self) -> None:
-        for row in self._metadata_buffer:
-            plain = {key: [_plain(values[0])] for key, values in row.items()}
-            chunk, file = (row[f"meta/episodes/{kind}_index"][0] for kind in ("chunk", "file"))
-            path = self.root / DEFAULT_EPISODES_PATH.format(chunk_index=chunk, file_index=file)
-            write_table(pa.Table.from_pydict(plain), path)
-        self._metadata_buffer.clear()
 
 
 class SafeWriter(DatasetWriter):
@@ -122,7 +53,7 @@ class SafeWriter(DatasetWriter):
         super().__init__(*args, batch_encoding_size=1, **kwargs)
 
     def save_episode(self, episode_data: dict | None = None, parallel_encoding: bool = True) -> None:
-        """Saves the episode; after an error nothing of it is left.
+        """Save the episode; after an error nothing of it is left.
 
         Raises:
             OSError: the disk is full, or an image could not be written.
@@ -138,8 +69,6 @@ class SafeWriter(DatasetWriter):
             raise
 
     def _take_back(self) -> None:
-        from lerobot_vtrefine.lerobot_compat.recovery import recover
-
         self._meta._metadata_buffer.clear()
         with suppress(OSError):  # the disk may be full: resuming the recording tries again
             recover(self._root)
@@ -202,32 +131,6 @@ def _disk_is_full(meta: LeRobotDatasetMetadata) -> str:
     )
 
 
-def _plain(value: Any) -> Any:
-    return value.tolist() if isinstance(value, np.ndarray) else value
-
-
-def write_table(table: pa.Table, path: Path) -> None:
-    """Writes a Parquet file that readers see whole."""
-    with whole_file(path) as part:
-        pq.write_table(table, part, compression="snappy", use_dictionary=True)
-
-
-def write_info(info: DatasetInfo, root: Path) -> None:
-    """As LeRobot's function of this name, whole."""
-    write_json(root / INFO_PATH, info.to_dict())
-
-
-def write_stats(stats: dict[str, Any], root: Path) -> None:
-    """As LeRobot's function of this name, whole."""
-    write_json(root / STATS_PATH, serialize_dict(stats))
-
-
-def write_tasks(tasks: pd.DataFrame, root: Path) -> None:
-    """As LeRobot's function of this name, whole."""
-    with whole_file(root / DEFAULT_TASKS_PATH) as part:
-        tasks.to_parquet(part)
-
-
 def write_image(image: Any, fpath: Path, compress_level: int = 1) -> None:
     """As LeRobot's function of this name, but a failed image leaves no file."""
     try:
@@ -253,8 +156,6 @@ def _resuming(original: Callable[..., LeRobotDataset]) -> Callable[..., LeRobotD
     def resume(
         cls: type[LeRobotDataset], repo_id: str, root: str | Path | None = None, *args: Any, **kwargs: Any
     ) -> LeRobotDataset:
-        from lerobot_vtrefine.lerobot_compat.recovery import recover
-
         if root and Path(root).is_dir() and any(Path(root).iterdir()):  # else it is fetched from the Hub
             logger.info("%s", recover(Path(root)))
         with _safe_classes():
@@ -265,7 +166,7 @@ def _resuming(original: Callable[..., LeRobotDataset]) -> Callable[..., LeRobotD
 
 @contextmanager
 def _safe_classes() -> Generator[None]:
-    """What LeRobot makes meanwhile is made of the classes above."""
+    """Whatever LeRobot makes meanwhile is made of `SafeWriter` and `SafeMetadata`."""
     lent = {"DatasetWriter": SafeWriter, "LeRobotDatasetMetadata": SafeMetadata}
     originals = {name: getattr(lerobot_dataset, name) for name in lent}
     try:
@@ -278,7 +179,7 @@ def _safe_classes() -> Generator[None]:
 
 
 def install() -> None:
-    """Lets LeRobot's commands record safely; idempotent.
+    """Let LeRobot's commands record safely; idempotent.
 
     On a LeRobot version that was not tested it logs a warning and leaves LeRobot as it is.
     """
@@ -303,7 +204,7 @@ def install() -> None:
 
 
 def uninstall() -> None:
-    """Restores LeRobot's own functions."""
+    """Restore LeRobot's own functions."""
     for (owner, name), original in _originals.items():
         setattr(owner, name, original)
     _originals.clear()

@@ -11,7 +11,7 @@ from lerobot.lerobot_types import RobotAction, RobotObservation
 from lerobot.robots.robot import Robot
 from lerobot.utils.decorators import check_if_already_connected, check_if_not_connected
 
-from lerobot_vtrefine.datasets.features import JOINT_SUFFIX, PAD_COLS, PAD_ROWS, PADS
+from lerobot_vtrefine.datasets.features import JOINT_SUFFIX
 from lerobot_vtrefine.drivers.arm_models import VIPERX_300S
 from lerobot_vtrefine.drivers.arm_pair import ArmPair
 from lerobot_vtrefine.drivers.dynamixel_arm import Floats
@@ -101,7 +101,7 @@ class AlohaTactileFollower(Robot):
 
     @check_if_already_connected
     def connect(self, calibrate: bool = True) -> None:
-        """Connects everything, calibrates where needed, and holds calibrated arms where they are.
+        """Connect everything, calibrate where needed, and hold calibrated arms where they are.
 
         Raises:
             PortError: a port cannot be used; the message names it and the fix. Nothing stays connected.
@@ -125,13 +125,13 @@ class AlohaTactileFollower(Robot):
         logger.info("%s connected", self)
 
     def configure(self) -> None:
-        """Sets modes and limits, then holds the arms where they are; they must be calibrated."""
+        """Set modes and limits, then hold the arms where they are; they must be calibrated."""
         for arm in self.pair.arms.values():
             arm.configure(self.config.gripper_current_ma, self.config.torque_limit)
             arm.hold()
 
     def disconnect(self) -> None:
-        """Moves the arms to rest, switches torque off, releases everything, also after failures."""
+        """Move the arms to rest, switch torque off, release everything, also after failures."""
         try:
             if self.config.rest_on_disconnect:
                 self._rest()
@@ -161,7 +161,7 @@ class AlohaTactileFollower(Robot):
         return self.pair.is_calibrated
 
     def calibrate(self) -> None:
-        """Calibrates both arms by hand, or writes the calibration file's values to the motors."""
+        """Calibrate both arms by hand, or write the calibration file's values to the motors."""
         if self.calibration and not self._asked_anew():
             self.pair.write_calibration()
             return
@@ -171,7 +171,7 @@ class AlohaTactileFollower(Robot):
         logger.info("calibration saved to %s", self.calibration_fpath)
 
     def setup_motors(self) -> None:
-        """Gives new motors their ids and baud rates, for `lerobot-setup-motors`."""
+        """Give new motors their ids and baud rates, for `lerobot-setup-motors`."""
         self.pair.setup_motors(input)
 
     def _asked_anew(self) -> bool:
@@ -194,7 +194,7 @@ class AlohaTactileFollower(Robot):
 
     @check_if_not_connected
     def send_action(self, action: RobotAction) -> RobotAction:
-        """Sends joint targets, cut to the joints' limits and to `max_step_rad` from where the joints are.
+        """Send joint targets, cut to the joints' limits and to `max_step_rad` from where the joints are.
 
         Returns:
             The targets sent; each right finger mirrors its left finger.
@@ -229,13 +229,15 @@ def aloha_pads(config: AlohaTactileFollowerConfig) -> dict[str, Any]:
         ValueError: pads are missing, unknown, or not 12 x 32.
     """
     pads = configured_pads(config.pads, config.pads_file)
-    if set(pads) != set(PADS):
+    names, layout = BODY.pad_names, BODY.pad_layout
+    if set(pads) != set(names):
         raise ValueError(
-            f"{AlohaTactileFollower.name} needs the pads {', '.join(PADS)}; got {', '.join(pads)}"
+            f"{AlohaTactileFollower.name} needs the pads {', '.join(names)}; got {', '.join(pads)}"
         )
-    wrong = [f"{name} {pad.pad_shape}" for name, pad in pads.items() if pad.pad_shape != (PAD_ROWS, PAD_COLS)]
+    shape = (layout.rows, layout.cols)
+    wrong = [f"{name} {pad.pad_shape}" for name, pad in pads.items() if pad.pad_shape != shape]
     if wrong:
         raise ValueError(
-            f"pads must be {PAD_ROWS} x {PAD_COLS} (set pad_rows, row_offset): {', '.join(wrong)}"
+            f"pads must be {layout.rows} x {layout.cols} (set pad_rows, row_offset): {', '.join(wrong)}"
         )
-    return {name: pads[name] for name in PADS}
+    return {name: pads[name] for name in names}

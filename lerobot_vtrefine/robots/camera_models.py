@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from lerobot_vtrefine.datasets.features import CAMERA_PREFIX, OBS_PREFIX
 from lerobot_vtrefine.lerobot_compat.arrays import ArraySpec
 
 logger = logging.getLogger(__name__)
@@ -20,6 +21,9 @@ NO_NOISE = 0.0
 
 MILLIMETRE_M = 1e-3
 """What LeRobot takes one count of a uint16 depth image for [m]."""
+
+CAMERA = CAMERA_PREFIX.removeprefix(OBS_PREFIX)
+"""What the names of a camera model's columns begin with."""
 
 WIDTHS = {"intrinsics": 4, "pose": 7, "noise_level": 1}
 """Columns of one camera and their lengths."""
@@ -53,7 +57,7 @@ class CameraModels:
     """The camera models of one robot: their features, their values, and depth in millimetres."""
 
     def __init__(self, models: dict[str, CameraModel], cameras: dict[str, Any]) -> None:
-        """Raises ValueError where a model belongs to no camera; warns where a depth camera has no model."""
+        """Raise ValueError where a model belongs to no camera; warn where a depth camera has no model."""
         if unknown := sorted(set(models) - set(cameras)):
             raise ValueError(
                 f"--robot.camera_models names {', '.join(unknown)}, but the robot's cameras are: "
@@ -76,13 +80,13 @@ class CameraModels:
     def features(self) -> dict[str, ArraySpec]:
         """Constant columns of all models."""
         return {
-            f"camera.{name}.{part}": ArraySpec((width,), "float32")
+            f"{CAMERA}{name}.{part}": ArraySpec((width,), "float32")
             for name in self._models
             for part, width in WIDTHS.items()
         }
 
     def connected(self) -> None:
-        """Reads what the devices know; to be called when the cameras are connected.
+        """Read what the devices know; to be called when the cameras are connected.
 
         Raises:
             ValueError: intrinsics are neither configured nor known to the device.
@@ -91,9 +95,9 @@ class CameraModels:
         for name, model in self._models.items():
             camera = self._cameras[name]
             intrinsics = model.intrinsics or device_intrinsics(name, camera)
-            self._values[f"camera.{name}.intrinsics"] = np.array(intrinsics, np.float32)
-            self._values[f"camera.{name}.pose"] = np.array(model.pose, np.float32)
-            self._values[f"camera.{name}.noise_level"] = np.array([NO_NOISE], np.float32)
+            self._values[f"{CAMERA}{name}.intrinsics"] = np.array(intrinsics, np.float32)
+            self._values[f"{CAMERA}{name}.pose"] = np.array(model.pose, np.float32)
+            self._values[f"{CAMERA}{name}.noise_level"] = np.array([NO_NOISE], np.float32)
             self._scales[name] = depth_scale_m(camera)
 
     def observe(self, observation: Observation) -> Observation:

@@ -45,6 +45,8 @@ class AlohaTactileFollowerConfig(RobotConfig):
         super().__post_init__()
         for name in ("gripper_current_ma", "max_step_rad", "rest_s"):
             if not getattr(self, name) > 0:
-                raise ValueError(f"{name}={getattr(self, name)} must be positive")
+                raise ValueError(f"--robot.{name} must be positive, got {getattr(self, name)}")
         if not 0 < self.torque_limit <= 1:
-            raise ValueError(f"torque_limit={self.torque_limit} must lie within 0 .. 1, and above 0")
+            raise ValueError(
+                f"--robot.torque_limit must lie within 0 .. 1, and above 0, got {self.torque_limit}"
+            )

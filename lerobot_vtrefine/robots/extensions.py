@@ -7,7 +7,7 @@ from lerobot_vtrefine.lerobot_compat import arrays, card, live_view, safe_record
 
 
 def extend_lerobot(pads: Mapping[str, PadConfig]) -> None:
-    """Lets stock commands record array columns, lose no saved episode, describe pads on cards and show them.
+    """Let stock commands record array columns, lose no saved episode, describe pads on cards and show them.
 
     Raises:
         RuntimeError: a LeRobot version whose recorder was not tested with array columns.

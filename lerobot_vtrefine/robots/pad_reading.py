@@ -2,8 +2,9 @@
 
 import numpy as np
 
+from lerobot_vtrefine.datasets.features import BASELINE, TACTILE, TACTILE_AGE
 from lerobot_vtrefine.drivers.pad_set import PadSet
-from lerobot_vtrefine.lerobot_compat.pad_features import BASELINE, PAD_AGE, TACTILE, Observation
+from lerobot_vtrefine.lerobot_compat.pad_features import Observation
 
 
 def pad_observation(pads: PadSet) -> Observation:
@@ -13,5 +14,5 @@ def pad_observation(pads: PadSet) -> Observation:
         f"{TACTILE}.{name}": np.array(reading.counts).reshape(-1) for name, reading in readings.items()
     }
     values |= {f"{BASELINE}.{name}": pads.baselines[name].reshape(-1) for name in readings}
-    values[PAD_AGE] = np.array([reading.age_s for reading in readings.values()], np.float32)
+    values[TACTILE_AGE] = np.array([reading.age_s for reading in readings.values()], np.float32)
     return values

@@ -62,7 +62,7 @@ class Tactile(Robot):
 
     @check_if_already_connected
     def connect(self, calibrate: bool = True) -> None:
-        """Connects the pads, which must not be touched meanwhile, then the robot.
+        """Connect the pads, which must not be touched meanwhile, then the robot.
 
         Raises:
             PortError: a pad cannot be read; the message names port and fix.
@@ -81,17 +81,17 @@ class Tactile(Robot):
         return self.base.is_calibrated
 
     def calibrate(self) -> None:
-        """Calibrates the base robot, and takes the pads' idle counts anew."""
+        """Calibrate the base robot, and take the pads' idle counts anew."""
         self.base.calibrate()
         if self.pads.is_connected:
             self.pads.measure_baselines()
 
     def configure(self) -> None:
-        """Configures the base robot."""
+        """Configure the base robot."""
         self.base.configure()
 
     def setup_motors(self) -> None:
-        """Sets up the base robot's motors.
+        """Set up the base robot's motors.
 
         Raises:
             NotImplementedError: the base robot has no motor set-up.
@@ -110,11 +110,11 @@ class Tactile(Robot):
 
     @check_if_not_connected
     def send_action(self, action: RobotAction) -> RobotAction:
-        """Forwards to the base robot."""
+        """Forward to the base robot."""
         return self.base.send_action(action)
 
     def disconnect(self) -> None:
-        """Disconnects the robot, then the pads, also after a failure in between."""
+        """Disconnect the robot, then the pads, also after a failure in between."""
         try:
             if self.base.is_connected:
                 self.base.disconnect()

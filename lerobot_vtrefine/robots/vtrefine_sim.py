@@ -20,6 +20,7 @@ from lerobot.utils.decorators import check_if_already_connected, check_if_not_co
 
 from lerobot_vtrefine.datasets.features import (
     CAMERA,
+    IMAGE_PREFIX,
     JOINT_SUFFIX,
     OBS_PREFIX,
     STATE_KEY,
@@ -41,7 +42,7 @@ if TYPE_CHECKING:
 
 logger = logging.getLogger(__name__)
 
-IMAGES = "images."
+IMAGES = IMAGE_PREFIX.removeprefix(OBS_PREFIX)
 
 
 class VtRefineSim(Robot):

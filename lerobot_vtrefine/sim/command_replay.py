@@ -17,7 +17,7 @@ from lerobot_vtrefine.sim import task
 from lerobot_vtrefine.sim.backends import get_backend
 from lerobot_vtrefine.sim.backends.base import ramp
 from lerobot_vtrefine.sim.config import SceneConfig
-from lerobot_vtrefine.sim.pairs import Part, PartPair
+from lerobot_vtrefine.sim.parts import Part, PartPair
 from lerobot_vtrefine.sim.rotations import about_axis, matrix_to_quat
 from lerobot_vtrefine.sim.scene import build_arms, map_joints
 from lerobot_vtrefine.sim.simulation import InsertionSim

@@ -54,10 +54,6 @@ class DepthSensor:
         """f B: disparity [pixels] times depth [m]."""
         return self.focal_px * self.baseline_m
 
-    def noise_m(self, depth_m: float) -> float:
-        """RMS noise of a depth [m]."""
-        return depth_m**2 * self.noise_px / self.pixel_metres
-
 
 def systematic_px(share: float, depth_m: float, pixel_metres: float) -> float:
     """Disparity error of which two make the specified bound: this share of the depth, at this depth."""

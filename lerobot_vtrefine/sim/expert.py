@@ -77,9 +77,7 @@ WRIST_RAD = 0.3  # a plug is turned towards its socket by so much; the socket co
 RETREAT_M = 0.09  # hands come to a part from this far behind it
 CARRY_M = 0.040  # the plug is carried this high above the mouth
 STANDOFF_M = 0.009  # and brought over it at this height
-CLOSING_M_S = (
-    0.012  # speed of the last way to the mouth: steady, since friction's direction then stays the same
-)
+CLOSING_M_S = 0.012  # on the last way to the mouth: steady, so that friction keeps its direction
 HOVER_M = 0.0012  # a plug that the descent has pushed off its aim waits here, at most so long
 HOVER_S = 1.5
 ENTRY_M = 0.0006  # below this height over the mouth nothing is corrected any more

@@ -59,7 +59,7 @@ def add_hand(
 def _add_sliding_finger(
     hand: mujoco.MjsBody, fingers: SlidingFingers, arm: str, index: int, side: str, config: SceneConfig
 ) -> str:
-    """Returns the finger's joint."""
+    """Return the finger's joint."""
     inward = -SIGNS[side]
     name = f"{arm}_{side}_finger"
     body = hand.add_body(name=name, pos=[fingers.slide_offset_m, 0, 0])

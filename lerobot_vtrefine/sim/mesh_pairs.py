@@ -5,7 +5,7 @@ from pathlib import Path
 import numpy as np
 
 from lerobot_vtrefine.sim.meshes import MeshPair, MeshPart, load_mesh_pair
-from lerobot_vtrefine.sim.pairs import Grip, Part, PartPair
+from lerobot_vtrefine.sim.parts import Grip, Part, PartPair
 from lerobot_vtrefine.tactile.geometry import ConvexHull, TriangleMesh
 
 MIN_GRIP_M = 0.020  # a free stretch shorter than this is not worth gripping

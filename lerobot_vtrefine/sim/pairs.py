@@ -1,65 +1,19 @@
-"""Plug-socket pairs: what the scene, the task, the expert and the touch sensors need to know about one.
-
-Frames: the plug's origin is its tip, the socket's the centre of its mouth, z along the insertion axis, up. A
-seated plug stands at (0, 0, `seated_z_m`) of the socket's frame. Mesh pairs have both frames coincide when
-assembled (`seated_z_m` = 0).
-"""
-
-from dataclasses import dataclass
+"""Plug-socket pairs by name: procedural ones from primitives here, those of meshes from `mesh_pairs`."""
 
 import numpy as np
 
 from lerobot_vtrefine.choices import check_choice
 from lerobot_vtrefine.sim.config import MESH_PAIR_PREFIX, PROCEDURAL_PAIRS, SceneConfig
-from lerobot_vtrefine.sim.profiles import Primitive, make_profile, offset_outline, wall_boxes
-from lerobot_vtrefine.tactile.geometry import Box, TriangleMesh
+from lerobot_vtrefine.sim.parts import Grip, Part, PartPair
+from lerobot_vtrefine.sim.profiles import make_profile, offset_outline, wall_boxes
+from lerobot_vtrefine.tactile.geometry import Box
 
 HOLE_DEPTH_M = 0.025
-PEG_SURPLUS_M = (
-    0.002  # the peg is longer than the hole, so that it seats on the base and the handle misses the rim
-)
+PEG_SURPLUS_M = 0.002
+"""The peg is longer than the hole, so that it seats on the base and the handle misses the rim."""
 WALL_M = 0.006
 HANDLE_M = (0.034, 0.034, 0.040)
 BASE_M = (0.044, 0.044, 0.050)
-
-
-@dataclass(frozen=True)
-class Grip:
-    """The block that a hand takes hold of, axis-aligned in the part's frame; pads close along x."""
-
-    centre_m: tuple[float, float, float]
-    half_size_m: tuple[float, float, float]
-
-
-@dataclass(frozen=True)
-class Part:
-    """One rigid part."""
-
-    pieces: tuple[Primitive, ...]
-    """Convex pieces: collision, mass and looks."""
-    grip: Grip
-    rest_height_m: float
-    """Height of the part's origin above the table when it stands upright."""
-    surface: TriangleMesh | None = None
-    """Exact surface for touch, where the pieces only approximate it."""
-
-
-@dataclass(frozen=True)
-class PartPair:
-    """A plug and the socket it belongs into."""
-
-    name: str
-    plug: Part
-    socket: Part
-    seated_z_m: float
-    """z of the plug's origin in the socket's frame when fully seated."""
-    travel_m: float
-    """Way from first entry to fully seated."""
-
-    @property
-    def mouth_z_m(self) -> float:
-        """z of the plug's origin in the socket's frame at first entry."""
-        return self.seated_z_m + self.travel_m
 
 
 def load_pair(config: SceneConfig) -> PartPair:

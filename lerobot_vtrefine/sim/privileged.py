@@ -4,12 +4,11 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from lerobot_vtrefine.sim import task
 from lerobot_vtrefine.sim.config import RANGES, TaskConfig
 from lerobot_vtrefine.sim.episode import EpisodeState
+from lerobot_vtrefine.sim.kinematics import Kinematics
 from lerobot_vtrefine.sim.rotations import turn_back
 from lerobot_vtrefine.sim.scene import Scene
-from lerobot_vtrefine.sim.sensing import Kinematics
 
 Array = np.ndarray
 
@@ -48,7 +47,7 @@ def describe(
     `time_left` and `hold` are fractions; `shift` and `force` fractions of the limits that end the episode.
     """
     m = len(ids)
-    insertion = task.insertion(scene.pair, seen.plug, seen.socket, scene.config.table_height_m)
+    insertion = seen.insertion
     velocity = seen.part_velocities[:, 0] - seen.part_velocities[:, 1]
     relative = turn_back(seen.socket[1], velocity[:, :3])
     spin = turn_back(seen.socket[1], velocity[:, 3:])
@@ -61,7 +60,7 @@ def describe(
         "plug_in_socket_velocity": relative,
         "plug_in_socket_spin": spin,
     }
-    hand_position, hand_rotation = task.holding_hands(scene.holders, seen.hands)
+    hand_position, hand_rotation = seen.holding_hands
     for hand, (name, part) in enumerate((("socket", seen.socket), ("plug", seen.plug))):
         if scene.holders[hand] is None:
             continue

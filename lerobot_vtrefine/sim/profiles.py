@@ -79,7 +79,10 @@ def edge_frames(outline: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 
 def wall_boxes(outline: np.ndarray, thickness_m: float, low_m: float, high_m: float) -> tuple[Box, ...]:
-    """One box outside each edge; at convex corners boxes run on, so that no gap opens between them."""
+    """One box outside each edge of an outline (V, 2) [m], from z = `low_m` to `high_m`.
+
+    At convex corners boxes run on, so that no gap opens between them.
+    """
     direction, normal = edge_frames(outline)
     length = np.linalg.norm(np.roll(outline, -1, 0) - outline, axis=1)
     turn = np.arctan2(
@@ -101,7 +104,7 @@ def wall_boxes(outline: np.ndarray, thickness_m: float, low_m: float, high_m: fl
 
 
 def prism(outline: np.ndarray, length_m: float) -> ConvexHull:
-    """Convex prism over a counter-clockwise convex outline, from z = 0 to `length_m`."""
+    """Convex prism over a counter-clockwise convex outline (V, 2) [m], from z = 0 to `length_m`."""
     count = len(outline)
     vertices = np.concatenate([np.c_[outline, np.zeros(count)], np.c_[outline, np.full(count, length_m)]])
     low, high = np.arange(count), np.arange(count) + count

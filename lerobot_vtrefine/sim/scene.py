@@ -12,7 +12,8 @@ from lerobot_vtrefine.sim.arms import add_arms
 from lerobot_vtrefine.sim.camera import Camera, make_camera
 from lerobot_vtrefine.sim.config import SceneConfig
 from lerobot_vtrefine.sim.links import FIRST_HAND, PLUG, SECOND_HAND, SOCKET, TABLE
-from lerobot_vtrefine.sim.pairs import Part, PartPair, load_pair
+from lerobot_vtrefine.sim.pairs import load_pair
+from lerobot_vtrefine.sim.parts import Part, PartPair
 from lerobot_vtrefine.sim.profiles import Primitive
 from lerobot_vtrefine.sim.rotations import matrix_to_quat
 from lerobot_vtrefine.tactile.geometry import Box, Cylinder

@@ -11,8 +11,8 @@ from lerobot_vtrefine.sim import starts, task
 from lerobot_vtrefine.sim.backends import Backend
 from lerobot_vtrefine.sim.backends.base import LOAD_SIZE
 from lerobot_vtrefine.sim.config import TaskConfig
+from lerobot_vtrefine.sim.kinematics import Kinematics
 from lerobot_vtrefine.sim.scene import Scene
-from lerobot_vtrefine.sim.sensing import Kinematics
 from lerobot_vtrefine.sim.touch import TouchSource
 
 Array = np.ndarray

@@ -12,7 +12,7 @@ import numpy as np
 import torch
 
 from lerobot_vtrefine.embodiments import Embodiment
-from lerobot_vtrefine.sim import sensing, starts, task
+from lerobot_vtrefine.sim import starts, task
 from lerobot_vtrefine.sim.backends import Trace, get_backend
 from lerobot_vtrefine.sim.backends.batch import usable_cores
 from lerobot_vtrefine.sim.config import (
@@ -28,11 +28,11 @@ from lerobot_vtrefine.sim.depth_sensors import DEPTH_SENSORS
 from lerobot_vtrefine.sim.drive import make_drive
 from lerobot_vtrefine.sim.episode import EpisodeState, Measured, update
 from lerobot_vtrefine.sim.host import start_copy, to_host, without_torch_threads
+from lerobot_vtrefine.sim.pads import Pads
 from lerobot_vtrefine.sim.privileged import Privileged, describe
 from lerobot_vtrefine.sim.randomization import Randomizer, WorldParameters
 from lerobot_vtrefine.sim.reality import RobotFaults
 from lerobot_vtrefine.sim.scene import Scene, build_scene
-from lerobot_vtrefine.sim.sensing import Kinematics
 from lerobot_vtrefine.sim.settling import Settler
 from lerobot_vtrefine.sim.state_cache import StateCache
 from lerobot_vtrefine.sim.substeps import count_substeps, start_summary
@@ -101,9 +101,7 @@ class InsertionSim:
         model = SensorModel.named(sensor) if isinstance(sensor, str) else sensor
         device = self._backend.device
         threads = (num_threads or usable_cores()) if backend == "batch" else 1
-        self._pads = sensing.Pads(
-            self.scene, model, num_envs, self.config.control_dt_s, device, threads, shear
-        )
+        self._pads = Pads(self.scene, model, num_envs, self.config.control_dt_s, device, threads, shear)
         window = max(1, round(self.config.limits.force_window_s / self.scene.config.timestep_s))
         self._episode = EpisodeState.empty(self.scene, num_envs, window)
         self._rates = task.rate_limits(self.embodiment, self.config)
@@ -173,11 +171,11 @@ class InsertionSim:
         state.pad_force[ids] = state.pad_load[ids][..., 0]
         self._pads.reset(ids, seeds, drawn.values)
         seen = self._cache.see(ids)
-        measured = self._grip_points(seen)
+        measured = seen.grip_points
         in_hand = self.scene.config.start == "grasped"
         state.grasped[ids] = in_hand
         state.reference[ids] = measured
-        state.tip[ids] = self._insertion(seen).position_m
+        state.tip[ids] = seen.insertion.position_m
         self._remember(ids)
 
     @without_torch_threads
@@ -283,7 +281,7 @@ class InsertionSim:
 
     def insertion(self, ids: Array | None = None) -> task.Insertion:
         """Where each plug is with respect to its socket."""
-        return self._insertion(self._cache.see(self._checked(ids)))
+        return self._cache.see(self._checked(ids)).insertion
 
     def privileged(self, ids: Array | None = None) -> Array:
         """State for a critic, (m, P) float32, columns named by `privileged_names`."""
@@ -360,14 +358,6 @@ class InsertionSim:
         if self._pads.remembers:
             self._pads.advance(ids, self._touch_at(ids))
 
-    def _insertion(self, seen: Kinematics) -> task.Insertion:
-        return task.insertion(self.scene.pair, seen.plug, seen.socket, self.scene.config.table_height_m)
-
-    def _grip_points(self, seen: Kinematics) -> Array:
-        grips = self.scene.pair.socket.grip, self.scene.pair.plug.grip
-        hands = task.holding_hands(self.scene.holders, seen.hands)
-        return task.grip_points(grips, (seen.socket, seen.plug), hands)
-
     def _start_measuring(
         self, ids: Array, trace: Trace, earlier: list[torch.Tensor]
     ) -> Callable[[], Measured]:
@@ -382,8 +372,8 @@ class InsertionSim:
             rest = np.array([pair.socket.rest_height_m, pair.plug.rest_height_m])
             positions = seen.parts[0][:, ::-1]
             return Measured(
-                insertion=self._insertion(seen),
-                grip_points=self._grip_points(seen),
+                insertion=seen.insertion,
+                grip_points=seen.grip_points,
                 part_heights=positions[..., 2] - rest - scene.config.table_height_m,
                 part_positions=positions,
                 substeps=summary(),

@@ -10,7 +10,7 @@ import torch
 
 from lerobot_vtrefine.embodiments import Embodiment
 from lerobot_vtrefine.sim.config import GraspedStart, TableStart
-from lerobot_vtrefine.sim.pairs import Part, PartPair
+from lerobot_vtrefine.sim.parts import Part, PartPair
 from lerobot_vtrefine.sim.rotations import about_axis, matrix_to_quat, turn
 
 Array = np.ndarray

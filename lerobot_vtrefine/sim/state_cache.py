@@ -7,8 +7,8 @@ import torch
 
 from lerobot_vtrefine.sim.backends import Backend
 from lerobot_vtrefine.sim.depth import DepthCamera
+from lerobot_vtrefine.sim.kinematics import Kinematics
 from lerobot_vtrefine.sim.scene import Scene
-from lerobot_vtrefine.sim.sensing import Kinematics
 
 Array = np.ndarray
 

@@ -10,7 +10,7 @@ import numpy as np
 
 from lerobot_vtrefine.embodiments import Embodiment
 from lerobot_vtrefine.sim.config import SceneConfig, SuccessConfig, TaskConfig
-from lerobot_vtrefine.sim.pairs import Grip, PartPair
+from lerobot_vtrefine.sim.parts import Grip, PartPair
 from lerobot_vtrefine.sim.rotations import turn, turn_back
 
 __all__ = ["FAILURES", "TaskConfig"]

@@ -6,6 +6,7 @@ Shapes: m worlds, P pads, B = 2 bodies (plug, socket).
 from abc import ABC, abstractmethod
 from collections.abc import Callable
 from dataclasses import dataclass
+from typing import override
 
 import numpy as np
 import torch
@@ -13,8 +14,8 @@ import torch
 from lerobot_vtrefine.sim.backends import Backend, Trace
 from lerobot_vtrefine.sim.backends.base import TouchReader
 from lerobot_vtrefine.sim.host import start_copy
+from lerobot_vtrefine.sim.kinematics import Kinematics, pad_loads
 from lerobot_vtrefine.sim.scene import Scene
-from lerobot_vtrefine.sim.sensing import Kinematics, pad_loads
 
 Array = np.ndarray
 ArrayLike = np.ndarray | torch.Tensor
@@ -59,13 +60,13 @@ class HostTouch(TouchSource):
     def __init__(self, scene: Scene) -> None:
         self._at = scene.addresses
 
+    @override
     def start_load(self, ids: Array, trace: Trace, see: See) -> Callable[[], Array]:
-        """See `TouchSource.start_load`."""
         contacts = np.asarray(trace.sensors[:, -1][:, self._at.pad_contacts])
         return lambda: pad_loads(see().pads, contacts)
 
+    @override
     def __call__(self, ids: Array, see: See, load: Array) -> Touch:
-        """See `TouchSource.__call__`."""
         seen = see()
         poses = (*seen.pads, seen.pad_velocities, *seen.parts, seen.part_velocities)
         return Touch(poses, load[..., :3], load[..., 3:])
@@ -77,13 +78,13 @@ class DeviceTouch(TouchSource):
     def __init__(self, reader: TouchReader) -> None:
         self._reader = reader
 
+    @override
     def start_load(self, ids: Array, trace: Trace, see: See) -> Callable[[], Array]:
-        """See `TouchSource.start_load`."""
         copied = start_copy(torch.cat(self._reader(ids)[1:], -1))
         return lambda: copied().astype(float)
 
+    @override
     def __call__(self, ids: Array, see: See, load: Array) -> Touch:
-        """See `TouchSource.__call__`."""
         return Touch(*self._reader(ids))
 
 

@@ -54,7 +54,7 @@ print(time.process_time() - imported)
 
 
 def model_call(scene: Scene, law: str, device: str) -> Callable[[], object]:
-    """Computes the forces of a contact stage, by name, on a scene."""
+    """Compute the forces of a contact stage, by name, on a scene."""
     contact = STAGES[law]()
     if not isinstance(contact, ContactStage):
         raise ValueError(f"{law!r} is not a contact stage")

@@ -51,7 +51,7 @@ class AlohaLeader(Teleoperator):
 
     @check_if_already_connected
     def connect(self, calibrate: bool = True) -> None:
-        """Connects both arms, and calibrates them where needed.
+        """Connect both arms, and calibrate them where needed.
 
         Raises:
             PortError: a port cannot be used; the message names it and the fix. Nothing stays connected.
@@ -66,7 +66,7 @@ class AlohaLeader(Teleoperator):
             raise
 
     def configure(self) -> None:
-        """Switches torque off, so that the arms can be moved by hand."""
+        """Switch torque off, so that the arms can be moved by hand."""
         for arm in self.pair.arms.values():
             arm.set_up()
 
@@ -76,7 +76,7 @@ class AlohaLeader(Teleoperator):
         return self.pair.is_calibrated
 
     def calibrate(self) -> None:
-        """Calibrates both arms by hand."""
+        """Calibrate both arms by hand."""
         count = len(self.body.joints)
         self.pair.calibrate(input, self.body.lower[:count], self.body.upper[:count])
         self.calibration = self.pair.calibration
@@ -84,7 +84,7 @@ class AlohaLeader(Teleoperator):
         logger.info("calibration saved to %s", self.calibration_fpath)
 
     def setup_motors(self) -> None:
-        """Gives new motors their ids and baud rates, for `lerobot-setup-motors`."""
+        """Give new motors their ids and baud rates, for `lerobot-setup-motors`."""
         self.pair.setup_motors(input)
 
     @check_if_not_connected
@@ -94,8 +94,8 @@ class AlohaLeader(Teleoperator):
         return dict(zip(self.action_features, map(float, target), strict=True))
 
     def send_feedback(self, feedback: dict[str, Any]) -> None:
-        """Does nothing: the leaders are not driven."""
+        """Do nothing: the leaders are not driven."""
 
     def disconnect(self) -> None:
-        """Releases both arms."""
+        """Release both arms."""
         self.pair.release(torque_off=False)

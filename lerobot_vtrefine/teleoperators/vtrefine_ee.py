@@ -131,7 +131,7 @@ class VtRefineEe(Teleoperator):
         return dict(zip(self.action_features, map(float, targets), strict=True))
 
     def send_feedback(self, feedback: dict[str, Any]) -> None:
-        """Does nothing: nothing is driven."""
+        """Do nothing: nothing is driven."""
 
     def disconnect(self) -> None:
         """Close the input."""

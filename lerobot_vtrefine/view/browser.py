@@ -19,7 +19,7 @@ from lerobot_vtrefine.envs.live_world import LiveWorld
 from lerobot_vtrefine.extras import VIEW, require
 from lerobot_vtrefine.observation import VisuoTactileConfig, build_visuo_tactile
 from lerobot_vtrefine.sim.looks import DrawnWorld
-from lerobot_vtrefine.sim.sensing import pad_layout
+from lerobot_vtrefine.sim.pads import pad_layout
 
 TAXEL_PX, GAP_PX = 5, 8
 MOST_PICTURES_HZ = 20.0

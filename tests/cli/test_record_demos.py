@@ -5,18 +5,12 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from aloha_columns import TACTILE_KEYS
 from conftest import finish, lerobot, record
 from lerobot.datasets import LeRobotDataset
 from local_hub import use_folder_as_hub
 
-from lerobot_vtrefine.datasets.features import (
-    ACTION_KEY,
-    DEPTH_KEY,
-    NOISE_LEVEL_KEY,
-    RGB_KEY,
-    STATE_KEY,
-    TACTILE_KEYS,
-)
+from lerobot_vtrefine.datasets.features import ACTION_KEY, DEPTH_KEY, NOISE_LEVEL_KEY, RGB_KEY, STATE_KEY
 from lerobot_vtrefine.lerobot_compat import card
 from lerobot_vtrefine.sim.simulation import InsertionSim
 

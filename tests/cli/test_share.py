@@ -19,7 +19,7 @@ from lerobot_vtrefine.cli.report.results import load_evaluation, percent
 from lerobot_vtrefine.embodiments import CameraConfig
 from lerobot_vtrefine.envs.config import VtRefineEnvConfig
 from lerobot_vtrefine.envs.evaluation_note import changed_settings
-from lerobot_vtrefine.envs.factory import make_vector_env
+from lerobot_vtrefine.envs.vectorization import make_vector_env
 from lerobot_vtrefine.files import read_json_lines
 from lerobot_vtrefine.sim.config import SceneConfig
 

@@ -1,5 +1,7 @@
 """The feature table: one raw frame through dataset and environment gives the same tensors."""
 
+import ast
+import re
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -7,23 +9,24 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
+from aloha_columns import BASELINE_KEYS, RAW_KEYS, TACTILE_KEYS
 from lerobot.datasets.lerobot_dataset import LeRobotDataset
 from lerobot.envs.utils import preprocess_observation
 
+from lerobot_vtrefine.datasets import features as table
 from lerobot_vtrefine.datasets.features import (
+    ACTION_KEY,
     AGE_KEY,
     DEPTH_KEY,
     NOISE_LEVEL_KEY,
-    RAW_KEYS,
     STATE_KEY,
-    TACTILE_KEYS,
     dataset_features,
     env_key_map,
     env_observation_shapes,
     raw_to_env_observation,
     raw_to_frame,
 )
-from lerobot_vtrefine.embodiments import ALOHA
+from lerobot_vtrefine.embodiments import ALOHA, KINOVA, Embodiment
 
 MakeRaw = Callable[[np.random.Generator, float], dict[str, Any]]
 
@@ -39,13 +42,24 @@ def test_dataset_and_environment_hand_over_the_same_values(tiny_dataset: Path, m
         stored = item[key].float().reshape(value.shape)
         assert torch.equal(stored, value), key
     assert item[DEPTH_KEY].shape == (1, 24, 32)
-    assert item[TACTILE_KEYS[2]].tolist() == raw["tactile"][2].tolist()
+    for keys, source in ((TACTILE_KEYS, "tactile"), (BASELINE_KEYS, "tactile_baseline")):
+        for pad, key in enumerate(keys):
+            assert item[key].tolist() == raw[source][pad].tolist(), key
 
 
 def test_dataset_keeps_units_and_array_shapes(tiny_dataset: Path) -> None:
     features = LeRobotDataset("local/tiny", root=tiny_dataset).meta.features
     assert features[TACTILE_KEYS[0]]["info"] == {"array_shape": [12, 32], "unit": "adc_counts"}
     assert features[DEPTH_KEY]["info"]["depth_unit"] == "mm"
+
+
+@pytest.mark.parametrize("body", [ALOHA, KINOVA], ids=lambda body: body.name)
+def test_state_and_action_name_the_bodys_joints_as_lerobots_robots_do(body: Embodiment) -> None:
+    """Otherwise LeRobot refuses to merge simulated with recorded data."""
+    features = dataset_features(24, 32, body)
+    for key in (STATE_KEY, ACTION_KEY):
+        assert features[key]["names"] == [f"{joint}.pos" for joint in body.joint_names]
+        assert features[key]["shape"] == (body.num_joints,)
 
 
 def test_environment_spaces_match_the_observation(make_raw: MakeRaw) -> None:
@@ -66,6 +80,21 @@ def test_hardware_needs_no_noise_level_and_simulation_no_age(make_raw: MakeRaw) 
     del raw["noise_level"]
     assert raw_to_frame(raw, ALOHA)[NOISE_LEVEL_KEY].tolist() == [0.0]
     assert raw_to_frame(raw, ALOHA)[AGE_KEY].tolist() == raw["tactile_age"].astype(np.float32).tolist()
+
+
+def test_columns_are_spelt_in_one_module_only() -> None:
+    """Other modules import the names; what docstrings and messages say is no column."""
+    package = Path(table.__file__).parents[1]
+    kinds = r"(state|visuo_tactile|tactile_grids|tactile_age|(tactile|tactile_baseline|camera|images)\.\S*)"
+    column = re.compile(rf"observation\.{kinds}|(tactile|tactile_baseline|camera|images)\.|tactile_age")
+    spelt = {
+        f"{path.relative_to(package)}: {node.value}"
+        for path in sorted(package.rglob("*.py"))
+        if path != Path(table.__file__)
+        for node in ast.walk(ast.parse(path.read_text(encoding="utf-8")))
+        if isinstance(node, ast.Constant) and isinstance(node.value, str) and column.fullmatch(node.value)
+    }
+    assert spelt == set()
 
 
 def test_what_is_missing_is_named(make_raw: MakeRaw) -> None:

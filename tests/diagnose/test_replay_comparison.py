@@ -4,9 +4,9 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from aloha_columns import PADS
 
 from lerobot_vtrefine.datasets.episodes import RecordedEpisode
-from lerobot_vtrefine.datasets.features import PADS
 from lerobot_vtrefine.diagnose.episode_replay.compare import Comparison, EpisodePair
 from lerobot_vtrefine.diagnose.episode_replay.page import render_page
 from lerobot_vtrefine.diagnose.episode_replay.touch import compare_pad, pressed, readings, telling_frames

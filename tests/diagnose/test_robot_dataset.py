@@ -12,6 +12,7 @@ from PIL import Image
 from lerobot_vtrefine.datasets.features import CAMERA_POSE_KEY, DEPTH_KEY, INTRINSICS_KEY
 from lerobot_vtrefine.diagnose.camera.frames import has_depth, read_frames
 from lerobot_vtrefine.diagnose.joints.dataset import read_dataset
+from lerobot_vtrefine.embodiments import ALOHA, KINOVA
 
 LENGTHS = (5, 8)
 
@@ -22,11 +23,11 @@ def encoded(value):
     return {"bytes": file.getvalue(), "path": None}
 
 
-def write_dataset(root, names=("left_waist.pos", "gripper.pos"), depth=True):
+def write_dataset(root, names=("left_waist.pos", "gripper.pos"), depth=True, robot=None, joints=2):
     frames = sum(LENGTHS)
     episode = np.repeat(np.arange(len(LENGTHS)), LENGTHS)
     frame = np.concatenate([np.arange(n) for n in LENGTHS])
-    state = np.arange(frames * 2, dtype=np.float32).reshape(-1, 2)
+    state = np.arange(frames * joints, dtype=np.float32).reshape(-1, joints)
     columns = {
         "episode_index": pa.array(episode),
         "frame_index": pa.array(frame),
@@ -41,8 +42,8 @@ def write_dataset(root, names=("left_waist.pos", "gripper.pos"), depth=True):
     (root / "data").mkdir(parents=True)
     (root / "meta").mkdir()
     pq.write_table(pa.table(columns), root / "data" / "file-000.parquet")
-    feature = {"dtype": "float32", "shape": [2], "names": list(names) if names else None}
-    info = {"codebase_version": "v3.0", "fps": 10, "total_episodes": len(LENGTHS)}
+    feature = {"dtype": "float32", "shape": [joints], "names": list(names) if names else None}
+    info = {"codebase_version": "v3.0", "fps": 10, "total_episodes": len(LENGTHS), "robot_type": robot}
     features = {"observation.state": feature, "action": feature}
     (root / "meta" / "info.json").write_text(json.dumps({**info, "features": features}))
     return root, state
@@ -63,6 +64,31 @@ def test_episodes_are_trials(tmp_path) -> None:
 def test_joints_without_names_are_numbered(tmp_path) -> None:
     root, _ = write_dataset(tmp_path / "ds", names=None, depth=False)
     assert read_dataset(root=root).joints == ("joint_0", "joint_1")
+
+
+@pytest.mark.parametrize("body", [ALOHA, KINOVA], ids=lambda body: body.name)
+def test_joints_without_names_are_those_of_the_robot_type(tmp_path, body) -> None:
+    told = {"names": None, "depth": False, "joints": body.num_joints}
+    known, _ = write_dataset(tmp_path / "known", robot=body.robot_type, **told)
+    assert read_dataset(root=known).joints == body.joint_names
+    other, _ = write_dataset(tmp_path / "other", robot="someone_elses", **told)
+    assert read_dataset(root=other).joints[:2] == ("joint_0", "joint_1")
+    fewer, _ = write_dataset(tmp_path / "fewer", names=None, depth=False, robot=body.robot_type)
+    assert read_dataset(root=fewer).joints == ("joint_0", "joint_1")
+
+
+def test_frames_of_different_lengths_are_not_joined_to_equal_ones(tmp_path) -> None:
+    root, state = write_dataset(tmp_path / "ds", depth=False)
+    path = root / "data" / "file-000.parquet"
+    table, ragged = pq.read_table(path), state.tolist()
+    ragged[6], ragged[7] = ragged[6] + ragged[7][:1], ragged[7][1:]  # as many numbers as before
+    index = table.column_names.index("observation.state")
+    column = pa.array(ragged, pa.list_(pa.float32()))
+    pq.write_table(table.set_column(index, "observation.state", column), path)
+    with pytest.raises(
+        ValueError, match=r"ds: episode 1: observation\.state has frames of different lengths"
+    ):
+        read_dataset(root=root)
 
 
 def test_missing_dataset_is_not_downloaded(tmp_path, monkeypatch) -> None:

@@ -1,5 +1,6 @@
 """The documentation: the site builds with every link checked, notebooks run, the README's promises hold."""
 
+import ast
 import json
 import os
 import re
@@ -69,6 +70,48 @@ def test_commands_that_pages_name_exist() -> None:
 def test_notebooks_are_stored_without_outputs(path: Path) -> None:
     cells = json.loads(path.read_text(encoding="utf-8"))["cells"]
     assert [cell for cell in cells if cell.get("outputs") or cell.get("execution_count")] == []
+
+
+MADE_BY_THE_READER = {"ColumnSharing"}
+"""What docs/own-cause.md lets its reader write."""
+
+
+def code_of(path: Path) -> str:
+    """The Python in a page or a notebook."""
+    text = path.read_text(encoding="utf-8")
+    if path.suffix == ".ipynb":
+        return "\n".join("".join(c["source"]) for c in json.loads(text)["cells"] if c["cell_type"] == "code")
+    return "\n".join(re.findall(r"```python\n(.*?)```", text, re.DOTALL))
+
+
+def names_in(module: str) -> set[str]:
+    """What can be imported from a module, read from its source: importing it takes seconds."""
+    path = ROOT.joinpath(*module.split("."))
+    if path.is_dir():
+        below = {item.stem for item in path.iterdir()}
+        return below | names_in(f"{module}.__init__")
+    names = set()
+    for node in ast.parse(path.with_suffix(".py").read_text(encoding="utf-8")).body:
+        if isinstance(node, ast.FunctionDef | ast.ClassDef):
+            names.add(node.name)
+        elif isinstance(node, ast.ImportFrom):
+            names |= {alias.asname or alias.name for alias in node.names}
+        elif isinstance(node, ast.Assign | ast.AnnAssign):
+            names |= {part.id for part in ast.walk(node) if isinstance(part, ast.Name)}
+    return names
+
+
+def test_names_that_pages_import_exist() -> None:
+    statement = re.compile(r"^\s*from (lerobot_vtrefine[\w.]*) import ([\w, ]+)$", re.MULTILINE)
+    imported = [
+        (page.name, module, name.strip())
+        for page in (*PAGES, *NOTEBOOKS)
+        for module, names in statement.findall(code_of(page))
+        for name in names.split(",")
+    ]
+    assert len(imported) > 10
+    missing = [found for found in imported if found[2] not in names_in(found[1]) | MADE_BY_THE_READER]
+    assert missing == []
 
 
 @pytest.mark.slow

@@ -2,11 +2,12 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from aloha_columns import BASELINE_KEYS, TACTILE_KEYS
 from draccus.utils import ParsingError
 from fake_sim import HEIGHT, WIDTH, FakeSim
 from lerobot.datasets import LeRobotDataset
 
-from lerobot_vtrefine.datasets.features import BASELINE_KEYS, DEPTH_KEY, TACTILE_KEYS
+from lerobot_vtrefine.datasets.features import DEPTH_KEY
 from lerobot_vtrefine.embodiments import ALOHA
 from lerobot_vtrefine.envs import VtRefineEnvConfig, ablation
 from lerobot_vtrefine.envs.ablation import make_ablation, mean_frame

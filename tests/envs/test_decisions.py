@@ -1,16 +1,11 @@
 import numpy as np
 import pytest
 import torch
+from aloha_columns import TACTILE_KEYS
 from fake_sim import HEIGHT, WIDTH, FakeSim
 from lerobot.envs.utils import preprocess_observation
 
-from lerobot_vtrefine.datasets.features import (
-    AGE_KEY,
-    DEPTH_KEY,
-    STATE_KEY,
-    TACTILE_KEYS,
-    raw_to_env_observation,
-)
+from lerobot_vtrefine.datasets.features import AGE_KEY, DEPTH_KEY, STATE_KEY, raw_to_env_observation
 from lerobot_vtrefine.embodiments import ALOHA
 from lerobot_vtrefine.envs.decisions import LeRobotDecisionEnv, _tensor, policy_columns
 from lerobot_vtrefine.envs.episodes import Episodes
@@ -176,11 +171,13 @@ def test_why_episodes_failed_is_told_by_reason(make_env, monkeypatch):
     env.reset([1, 3, 5])
     sim = env.episodes.sim
     plain = sim.metrics(np.arange(3))
-    codes = np.array([FAILURES.index(name) for name in ("none", "overflow", "unstable")])
+    codes = np.array([FAILURES.index(name) for name in ("dropped", "overflow", "unstable")])
     monkeypatch.setattr(sim, "metrics", lambda ids: {**plain, "failure": codes})
     info = env.step_chunk(chunk(3, [0.0])).info
     assert "failure" not in info
     told = {
         name: values.tolist() for name, values in info.items() if name.startswith("failed_") and any(values)
     }
-    assert told == {"failed_overflow": [False, True, False], "failed_unstable": [False, False, True]}
+    first, second, third = np.eye(3, dtype=bool).tolist()
+    assert told == {"failed_dropped": first, "failed_overflow": second, "failed_unstable": third}
+    assert info["void"].tolist() == [False, True, True]  # the simulation's own failures, no one else's

@@ -8,17 +8,11 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
+from aloha_columns import TACTILE_KEYS
 from file_faults import contents, in_fork, killed_at_each
 from lerobot.datasets import LeRobotDataset
 
-from lerobot_vtrefine.datasets.features import (
-    ACTION_KEY,
-    AGE_KEY,
-    DEPTH_KEY,
-    STATE_KEY,
-    TACTILE_KEYS,
-    dataset_features,
-)
+from lerobot_vtrefine.datasets.features import ACTION_KEY, AGE_KEY, DEPTH_KEY, STATE_KEY, dataset_features
 from lerobot_vtrefine.embodiments import ALOHA
 from lerobot_vtrefine.envs import demo_dataset
 from lerobot_vtrefine.envs.demo_dataset import DemoDataset

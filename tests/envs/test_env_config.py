@@ -5,6 +5,7 @@ import draccus
 import numpy as np
 import pytest
 import yaml
+from aloha_columns import TACTILE_KEYS
 from draccus.utils import ParsingError
 from fake_sim import FakeSim
 from lerobot.configs import FeatureType
@@ -13,7 +14,7 @@ from lerobot.envs.configs import EnvConfig
 from lerobot.envs.factory import make_env
 from lerobot.envs.utils import env_to_policy_features
 
-from lerobot_vtrefine.datasets.features import DEPTH_KEY, TACTILE_KEYS
+from lerobot_vtrefine.datasets.features import DEPTH_KEY
 from lerobot_vtrefine.embodiments import get_embodiment
 from lerobot_vtrefine.envs import VtRefineEnvConfig, vector_env
 from lerobot_vtrefine.envs.episodes import Episodes

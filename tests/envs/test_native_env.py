@@ -4,6 +4,7 @@ from functools import partial
 import numpy as np
 import pytest
 import torch
+from aloha_columns import TACTILE_KEYS
 from draccus.utils import ParsingError
 from fake_sim import FakeSim
 from lerobot.configs import FeatureType, PolicyFeature
@@ -11,7 +12,7 @@ from lerobot.envs.utils import env_to_policy_features, preprocess_observation
 from lerobot.scripts import lerobot_eval
 
 from lerobot_vtrefine import embodiments
-from lerobot_vtrefine.datasets.features import DEPTH_KEY, RGB_KEY, STATE_KEY, TACTILE_KEYS
+from lerobot_vtrefine.datasets.features import DEPTH_KEY, RGB_KEY, STATE_KEY
 from lerobot_vtrefine.embodiments import get_embodiment
 from lerobot_vtrefine.envs import VtRefineEnvConfig
 from lerobot_vtrefine.envs.episode_log import EpisodeLog, read_episode_log

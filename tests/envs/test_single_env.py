@@ -10,8 +10,8 @@ from gymnasium.utils.env_checker import check_env
 
 from lerobot_vtrefine.envs import VtRefineEnvConfig
 from lerobot_vtrefine.envs.episodes import Episodes
-from lerobot_vtrefine.envs.factory import make_vector_env
 from lerobot_vtrefine.envs.single_env import VtRefineEnv
+from lerobot_vtrefine.envs.vectorization import make_vector_env
 from lerobot_vtrefine.sim.config import CameraConfig, SceneConfig
 
 TINY = SceneConfig(camera=CameraConfig(16, 12, 0.384, (-0.44, 0.0, 0.42), (0.0, 0.0, 0.145)))

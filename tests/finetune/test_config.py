@@ -57,6 +57,13 @@ def test_actor_learning_rate_waits_rises_and_decays_over_this_run():
     assert rates[100] == pytest.approx(1e-6)
 
 
+def test_critics_learning_rate_decays_over_all_iterations():
+    cfg = PaperDppo(iterations=100, critic_lr=1e-3, critic_lr_final=1e-4)
+    rates = [cfg.critic_lr_at(iteration) for iteration in (0, 25, 50, 100)]
+    half_turn = 0.5 * (1 + math.cos(math.pi / 4))
+    assert rates == pytest.approx([1e-3, 1e-4 + 9e-4 * half_turn, 5.5e-4, 1e-4])
+
+
 @pytest.mark.parametrize(
     ("change", "words"),
     [

@@ -6,6 +6,7 @@ import pytest
 import torch
 from toy import BlindPeg, ToyActor, make_agent
 
+from lerobot_vtrefine.envs.decisions import Decision
 from lerobot_vtrefine.finetune.chains import chain_log_probs
 from lerobot_vtrefine.finetune.config import DppoConfig, PaperDppo
 from lerobot_vtrefine.finetune.dppo import (
@@ -17,7 +18,7 @@ from lerobot_vtrefine.finetune.dppo import (
     update,
 )
 from lerobot_vtrefine.finetune.evaluation import evaluate
-from lerobot_vtrefine.finetune.protocols import Agent, Transition
+from lerobot_vtrefine.finetune.protocols import Agent
 
 CHUNK = (4, 2)
 SHORT = {
@@ -258,7 +259,7 @@ class Clock:
     def step_chunk(self, actions):
         over = torch.ones(4, dtype=torch.bool)
         obs, privileged = self.reset(None)
-        return Transition(obs, privileged + 100, torch.arange(4.0), ~over, over, {"success": ~over})
+        return Decision(obs, privileged + 100, torch.arange(4.0), ~over, over, {"success": ~over})
 
 
 @pytest.mark.parametrize("timeout", ["terminal", "bootstrap"])

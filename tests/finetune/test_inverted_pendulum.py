@@ -9,10 +9,11 @@ import torch
 from torch import Tensor
 from toy import ToyActor, clone_behaviour, make_agent
 
+from lerobot_vtrefine.envs.decisions import Decision
 from lerobot_vtrefine.finetune.config import SmallDppo
 from lerobot_vtrefine.finetune.dppo import TrainState, train
 from lerobot_vtrefine.finetune.evaluation import evaluate
-from lerobot_vtrefine.finetune.protocols import Observation, Transition
+from lerobot_vtrefine.finetune.protocols import Observation
 
 pytest.importorskip("imageio", reason="Gymnasium's MuJoCo environments import it")
 
@@ -39,7 +40,7 @@ class Pendulum:
         state = torch.tensor(self.rows, dtype=torch.float32)
         return {"state": state}, state
 
-    def step_chunk(self, actions: Tensor) -> Transition:
+    def step_chunk(self, actions: Tensor) -> Decision:
         reward, ended, over = (np.zeros(self.num_envs) for _ in range(3))
         for index in np.flatnonzero(~self.done):
             for action in actions[index].numpy() * SCALE:
@@ -51,7 +52,7 @@ class Pendulum:
                     break
         obs, privileged = self.observe()
         flags = (torch.tensor(ended > 0), torch.tensor((over > 0) & (ended == 0)))
-        return Transition(obs, privileged, torch.tensor(reward), *flags, {"success": flags[1]})
+        return Decision(obs, privileged, torch.tensor(reward), *flags, {"success": flags[1]})
 
 
 def demonstrations(episodes: int, seed: int) -> tuple[Tensor, Tensor]:

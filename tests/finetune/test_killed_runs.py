@@ -149,7 +149,7 @@ def check_resumed(command, uninterrupted, monkeypatch):
         found = weights(killed)
         assert expected.keys() == found.keys()
         assert all(torch.equal(expected[key], found[key]) for key in expected), when
-        assert not list(killed.rglob("*.partial")), when
+        assert not list(killed.rglob("*.part*")), when
 
     return check
 
@@ -157,7 +157,7 @@ def check_resumed(command, uninterrupted, monkeypatch):
 @pytest.mark.parametrize(
     ("checkpoints", "when"),
     [
-        (0, ("open", "progress.csv.partial")),
+        (0, ("open", "progress.csv.part")),
         (0, ("os.mkdir", "checkpoints")),  # with two rows recorded
         (0, ("os.rename", "000001.partial")),
         (0, ("os.symlink", "last.partial")),

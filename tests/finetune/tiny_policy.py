@@ -8,7 +8,8 @@ from lerobot.configs import FeatureType, PolicyFeature
 from torch import Tensor
 
 from lerobot_vtrefine.datasets.features import ACTION_KEY, CLOUD_KEY, STATE_KEY
-from lerobot_vtrefine.finetune.protocols import Observation, Transition
+from lerobot_vtrefine.envs.decisions import Decision
+from lerobot_vtrefine.finetune.protocols import Observation
 from lerobot_vtrefine.observation import VisuoTactileConfig, num_points
 from lerobot_vtrefine.policies.vt_dp3.configuration_vt_dp3 import VtDp3Config
 from lerobot_vtrefine.policies.vt_dp3.modeling_vt_dp3 import VtDp3Policy
@@ -71,7 +72,7 @@ class ReachEnv:
         privileged = torch.stack([self.goal, self.decision, self.done.float()], dim=1)
         return {STATE_KEY: state, CLOUD_KEY: cloud}, privileged
 
-    def step_chunk(self, actions: Tensor) -> Transition:
+    def step_chunk(self, actions: Tensor) -> Decision:
         error = (actions[:, :, 0].mean(1) - self.goal).abs()
         reached = (error < 0.3) & ~self.done
         self.decision = self.decision + 1
@@ -79,4 +80,4 @@ class ReachEnv:
         self.done = self.done | reached | truncated
         obs, privileged = self.observe()
         info = {"success": reached, "error": error, "time": torch.where(reached, self.decision, torch.nan)}
-        return Transition(obs, privileged, reached.float(), reached, truncated, info)
+        return Decision(obs, privileged, reached.float(), reached, truncated, info)

@@ -5,8 +5,9 @@ from collections.abc import Sequence
 import torch
 from torch import Tensor, nn
 
+from lerobot_vtrefine.envs.decisions import Decision
 from lerobot_vtrefine.finetune.config import DppoConfig
-from lerobot_vtrefine.finetune.protocols import Agent, Observation, Transition, no_gradient
+from lerobot_vtrefine.finetune.protocols import Agent, Observation, no_gradient
 from lerobot_vtrefine.policies.vt_dp3.diffusion import DiffusionProcess, step_grid
 
 
@@ -111,7 +112,7 @@ class BlindPeg:
         privileged = torch.stack([self.x - self.slot, self.estimate - self.slot, self.z, time], dim=1)
         return {"state": state}, privileged
 
-    def step_chunk(self, actions: Tensor) -> Transition:
+    def step_chunk(self, actions: Tensor) -> Decision:
         reached = torch.zeros(self.num_envs, dtype=torch.bool)
         for action in actions.clamp(-1, 1).unbind(1):
             moving = ~self.done & ~reached
@@ -131,7 +132,7 @@ class BlindPeg:
         truncated = (self.decision >= self.max_decisions) & ~reached
         self.done = self.done | reached | truncated
         obs, privileged = self.observe()
-        return Transition(obs, privileged, reached.float(), reached, truncated, {"success": reached})
+        return Decision(obs, privileged, reached.float(), reached, truncated, {"success": reached})
 
 
 def blind_peg_demonstrations(num_envs: int, seed: int) -> tuple[Tensor, Tensor]:

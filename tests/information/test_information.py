@@ -109,9 +109,10 @@ def test_verdicts(truth: float, both: float | None, vision: float, said: str) ->
 
 
 def test_a_study_leaves_encoders_that_policies_start_from(tmp_path: Path) -> None:
+    from aloha_columns import BASELINE_KEYS, TACTILE_KEYS
     from lerobot.configs import FeatureType, PolicyFeature
 
-    from lerobot_vtrefine.datasets.features import ACTION_KEY, BASELINE_KEYS, STATE_KEY, TACTILE_KEYS
+    from lerobot_vtrefine.datasets.features import ACTION_KEY, STATE_KEY
     from lerobot_vtrefine.policies.vt_dp3 import VtDp3Config
     from lerobot_vtrefine.policies.vt_dp3.modeling_vt_dp3 import VtDp3Policy
 

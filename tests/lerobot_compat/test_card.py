@@ -8,11 +8,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 import yaml
+from aloha_columns import BASELINE_KEYS, PADS, TACTILE_KEYS
 from lerobot.datasets import remove_feature
 from lerobot.datasets.lerobot_dataset import LeRobotDataset
 from local_hub import use_folder_as_hub
 
-from lerobot_vtrefine.datasets.features import BASELINE_KEYS, PADS, TACTILE_KEYS
 from lerobot_vtrefine.lerobot_compat import card
 
 

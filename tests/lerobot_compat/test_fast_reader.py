@@ -9,12 +9,13 @@ import lerobot.datasets.lerobot_dataset as stock_module
 import numpy as np
 import pytest
 import torch
+from aloha_columns import BASELINE_KEYS, RAW_KEYS, TACTILE_KEYS
 from lerobot.datasets.dataset_reader import DatasetReader
 from lerobot.datasets.lerobot_dataset import LeRobotDataset
 from torch.utils.data import DataLoader
 
-from lerobot_vtrefine.datasets.features import BASELINE_KEYS, RAW_KEYS, STATE_KEY, TACTILE_KEYS
-from lerobot_vtrefine.lerobot_compat import fast_reader
+from lerobot_vtrefine.datasets.features import STATE_KEY
+from lerobot_vtrefine.lerobot_compat import fast_reader, frame_store
 
 COLOUR = "observation.images.front"
 WINDOWS = {key: [-0.1, 0.0] for key in (*RAW_KEYS, STATE_KEY)} | {"action": [i / 10 for i in range(16)]}
@@ -124,7 +125,7 @@ def test_small_videos_come_from_memory(coloured_dataset: Path, options: dict[str
 def test_videos_that_do_not_fit_in_memory_take_the_stock_path(
     coloured_dataset: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
-    monkeypatch.setattr(fast_reader, "MAX_VIDEO_BYTES", 1000)
+    monkeypatch.setattr(frame_store, "MAX_VIDEO_BYTES", 1000)
     fast_reader.install()
     dataset = LeRobotDataset("local/coloured", root=coloured_dataset)
     assert dataset[3][COLOUR].shape == (3, 32, 48)
@@ -136,7 +137,7 @@ def test_depth_that_does_not_fit_in_memory_is_decoded_per_item(
     tiny_dataset: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     slow = LeRobotDataset("local/tiny", root=tiny_dataset, delta_timestamps=WINDOWS)
-    monkeypatch.setattr(fast_reader, "MAX_DEPTH_BYTES", 1000)
+    monkeypatch.setattr(frame_store, "MAX_DEPTH_BYTES", 1000)
     fast_reader.install()
     fast = LeRobotDataset("local/tiny", root=tiny_dataset, delta_timestamps=WINDOWS)
     for index in (0, 5, 35):

@@ -67,6 +67,16 @@ def test_empty_frames_and_missing_returns_give_finite_points() -> None:
     assert torch.allclose(points[1, :, 2], torch.tensor(0.3), atol=1e-6)
 
 
+def test_pixels_without_a_return_are_left_out() -> None:
+    """They would lie in the camera itself, which may be in the box."""
+    intrinsics, pose = camera(1, 6, 8)
+    pose = torch.cat([pose[:, :2], torch.tensor([[0.8]]), pose[:, 3:]], dim=1)
+    depth = torch.zeros(1, 6, 8)
+    depth[:, 2:4, 3:5] = 500.0
+    points = visual_points(depth, intrinsics, pose, torch.zeros(1), budget=32, pixel_stride=1, **BOX)
+    assert torch.allclose(points[..., 2], torch.tensor(0.3), atol=1e-6)
+
+
 def test_crop_leaves_the_table_out() -> None:
     intrinsics, pose = camera(1, 6, 8)
     depth = torch.full((1, 6, 8), 1000.0)  # the table, z = 0
@@ -87,9 +97,9 @@ def test_noise_scales_points_by_one_factor_each_and_is_off_on_hardware() -> None
     assert torch.equal(noisy, again)
 
 
-def test_depth_in_metres_is_refused() -> None:
+@pytest.mark.parametrize("farthest_m", [0.7, 19.0])
+def test_depth_in_metres_is_refused(farthest_m: float) -> None:
     intrinsics, pose = camera(1, 6, 8)
+    depth = torch.full((1, 6, 8), farthest_m)
     with pytest.raises(ValueError, match="depth_output_unit=mm"):
-        visual_points(
-            torch.full((1, 6, 8), 0.7), intrinsics, pose, torch.zeros(1), budget=4, pixel_stride=1, **BOX
-        )
+        visual_points(depth, intrinsics, pose, torch.zeros(1), budget=4, pixel_stride=1, **BOX)

@@ -54,6 +54,27 @@ def test_modalities_drop_points() -> None:
         build_visuo_tactile(state, None, None, None, None, None, CFG)
 
 
+def test_default_crop_leaves_the_table_out() -> None:
+    state, _, _, _, intrinsics, pose = raw(1)
+    table_mm = torch.full((1, 1, 12, 16), 800)  # from the camera's height of 0.8 m
+    above_mm = table_mm.clone()
+    above_mm[..., 5:7, 6:10] = 780
+    empty = build_visuo_tactile(state, None, None, table_mm, intrinsics, pose, CFG)
+    assert torch.allclose(empty[..., :3], torch.tensor(CFG.center_m))
+    seen = build_visuo_tactile(state, None, None, above_mm, intrinsics, pose, CFG)
+    assert torch.allclose(seen[..., 2], torch.tensor(0.02), atol=1e-6)
+
+
+def test_chosen_rule_normalises_the_readings() -> None:
+    state, _, baseline, *_ = raw(1)
+    tactile = baseline + 2 + 30  # half of the full scale above idle and floor
+    settings = {"noise_floor_counts": 2.0, "full_scale_counts": 60.0}
+    for rule, reading in (("fixed", 0.5), ("two_stage", 1.0)):
+        cfg = replace(CFG, normalization=rule, **settings)
+        cloud = build_visuo_tactile(state, tactile, baseline, None, None, None, cfg)
+        assert torch.allclose(cloud[..., 3], torch.tensor(reading)), rule
+
+
 @pytest.mark.parametrize(
     ("change", "message"),
     [

@@ -5,18 +5,13 @@ from typing import Any
 
 import draccus
 import pytest
+from aloha_columns import TACTILE_KEYS
 from draccus.utils import ParsingError
 from lerobot.configs import FeatureType, PolicyFeature, PreTrainedConfig
 from lerobot.configs.train import TrainPipelineConfig
 from lerobot.utils.feature_utils import dataset_to_policy_features
 
-from lerobot_vtrefine.datasets.features import (
-    DEPTH_KEY,
-    RGB_KEY,
-    STATE_KEY,
-    TACTILE_KEYS,
-    dataset_features,
-)
+from lerobot_vtrefine.datasets.features import DEPTH_KEY, RGB_KEY, STATE_KEY, dataset_features
 from lerobot_vtrefine.embodiments import ALOHA
 from lerobot_vtrefine.envs.config import VtRefineEnvConfig
 from lerobot_vtrefine.observation import VisuoTactileConfig

@@ -95,6 +95,18 @@ def test_loss_per_sample_averages_to_the_loss() -> None:
     assert torch.allclose(each.mean(), mean)
 
 
+def test_every_noise_draw_counts_for_its_own_sample(monkeypatch: pytest.MonkeyPatch) -> None:
+    draws, wrong = 3, torch.tensor([0.0, 10.0, 20.0])
+    policy = make_policy(noise_draws=draws).train()
+
+    def predict(x: torch.Tensor, t: torch.Tensor, cond: torch.Tensor) -> torch.Tensor:
+        return wrong.repeat_interleave(draws).view(-1, 1, 1).expand_as(x)
+
+    monkeypatch.setattr(policy.online.denoiser, "forward", predict)
+    each, _ = policy(make_batch(), reduction="none")  # noise of unit variance, so 1 + wrong**2
+    assert torch.allclose(each, 1 + wrong**2, rtol=0.1, atol=0.2)
+
+
 def test_select_action_samples_once_per_chunk_from_the_last_two_frames() -> None:
     policy, batch = make_policy(), make_batch()
     noise = torch.randn(3, 16, 16)
@@ -133,6 +145,15 @@ def test_checkpoint_keeps_actions_average_and_its_age(tmp_path: Path) -> None:
     assert int(loaded.ema.step) == 5
     noise = torch.randn(3, 16, 16)
     assert torch.equal(policy.sample_actions(make_batch(), noise), loaded.sample_actions(make_batch(), noise))
+
+
+def test_tuned_steps_act_as_stochastically_as_asked() -> None:
+    noise, batch = torch.randn(3, 16, 16), make_batch()
+    for eta in (0.0, 1.0):
+        policy = make_policy()
+        policy.prepare_finetuning("tail", 4, 3, 4, eta=eta)
+        first, second = (policy.sample_actions(batch, noise) for _ in range(2))
+        assert torch.equal(first, second) is (eta == 0.0)
 
 
 @pytest.mark.parametrize("freeze_encoder", [False, True])

@@ -49,6 +49,15 @@ def test_one_metric_scale_for_all_axes() -> None:
     assert points.offset.tolist() == pytest.approx([0.1, 0.0, 0.2, 0, 0])
 
 
+def test_pads_share_a_network_but_for_an_offset_of_their_own() -> None:
+    torch.manual_seed(0)
+    pads, grids = PadEncoder(2, (12, 32), 8, 5), torch.rand(1, 1, 12, 32).expand(1, 2, -1, -1)
+    with torch.no_grad():
+        pads.offset.copy_(torch.randn(2, 8))
+        hidden = pads.shared(grids[0].unsqueeze(1)) + pads.offset
+        assert torch.allclose(pads(grids), pads.join(hidden.flatten()[None]), atol=1e-6)
+
+
 def test_condition_keeps_frames_apart() -> None:
     encode = ObservationEncoder(encoder(), PadEncoder(4, (12, 32), 8, 5), state_dim=3, n_obs_steps=2)
     batch = {CLOUD_KEY: torch.randn(2, 2, 20, 5), GRIDS_KEY: torch.rand(2, 2, 4, 12, 32)}

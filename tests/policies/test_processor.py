@@ -7,6 +7,7 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
+from aloha_columns import RAW_KEYS
 from lerobot.configs import PreTrainedConfig
 from lerobot.datasets.lerobot_dataset import LeRobotDataset
 from lerobot.envs.utils import preprocess_observation
@@ -17,17 +18,22 @@ from torch.utils.data import DataLoader, default_collate
 
 from lerobot_vtrefine.datasets.features import (
     ACTION_KEY,
+    CAMERA_POSE_KEY,
     CLOUD_KEY,
     DEPTH_KEY,
+    GRIDS_KEY,
+    INTRINSICS_KEY,
     NOISE_LEVEL_KEY,
-    RAW_KEYS,
     STATE_KEY,
+    baseline_keys,
     raw_to_env_observation,
     raw_to_frame,
+    tactile_keys,
 )
 from lerobot_vtrefine.embodiments import ALOHA
 from lerobot_vtrefine.lerobot_compat import fast_reader
-from lerobot_vtrefine.observation import num_points
+from lerobot_vtrefine.observation import build_visuo_tactile, num_points
+from lerobot_vtrefine.observation.grids import pad_grids
 from lerobot_vtrefine.policies.vt_dp3 import VtDp3Config, make_vt_dp3_pre_post_processors
 from lerobot_vtrefine.policies.vt_dp3.processor_vt_dp3 import MIN_RANGE, widen_narrow_ranges
 
@@ -93,6 +99,32 @@ def test_same_frame_same_cloud_everywhere(
     torch.manual_seed(12)
     again = preprocess(dict(environment))[CLOUD_KEY]
     assert torch.equal(again, clouds[0]) is (noise_level == 0.0)
+
+
+def test_cloud_and_images_are_built_of_the_raw_frame_and_only_state_is_normalised(
+    dataset: LeRobotDataset,
+) -> None:
+    """Against the functions that build them: joint positions must still be in rad and m there."""
+    preprocess, _ = make_vt_dp3_pre_post_processors(
+        config := make_config(dataset, fusion="pads"), dataset.meta.stats
+    )
+    batch = default_collate([dataset[4]])
+    del batch[NOISE_LEVEL_KEY]
+    tactile, baseline = (
+        torch.stack([batch[key] for key in keys(ALOHA)], dim=-2) for keys in (tactile_keys, baseline_keys)
+    )
+    camera = [batch[key] for key in (DEPTH_KEY, INTRINSICS_KEY, CAMERA_POSE_KEY)]
+    got = preprocess(dict(batch))
+    cfg, state = config.observation, batch[STATE_KEY]
+    assert torch.equal(got[CLOUD_KEY], build_visuo_tactile(state, None, None, *camera, cfg))
+    assert torch.equal(got[GRIDS_KEY], pad_grids(tactile, baseline, (12, 32), cfg))
+
+    whole, _ = make_vt_dp3_pre_post_processors(config := make_config(dataset), dataset.meta.stats)
+    got = whole(dict(batch))
+    cloud = build_visuo_tactile(state, tactile, baseline, *camera, config.observation)
+    assert torch.equal(got[CLOUD_KEY], cloud)
+    low, high = (torch.as_tensor(dataset.meta.stats[STATE_KEY][name]) for name in ("min", "max"))
+    assert torch.allclose(got[STATE_KEY], (2 * (state - low) / (high - low) - 1).float(), atol=1e-5)
 
 
 def test_training_batches_keep_masks_and_windows(dataset: LeRobotDataset) -> None:

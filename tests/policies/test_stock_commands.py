@@ -149,9 +149,8 @@ def test_two_processes_train_one_policy(tiny_dataset: Path, tmp_path: Path) -> N
 
 
 def test_training_without_pads_says_what_is_missing(tiny_dataset: Path, tmp_path: Path) -> None:
+    from aloha_columns import TACTILE_KEYS
     from lerobot.datasets import remove_feature
-
-    from lerobot_vtrefine.datasets.features import TACTILE_KEYS
 
     tiny = LeRobotDataset("local/tiny", root=tiny_dataset)
     remove_feature(tiny, list(TACTILE_KEYS), output_dir=tmp_path / "blind", repo_id="local/tiny")

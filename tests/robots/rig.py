@@ -9,8 +9,8 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import pytest
+from aloha_columns import PADS
 
-from lerobot_vtrefine.datasets.features import PADS
 from lerobot_vtrefine.drivers.aloha_emulator import SIDES, AlohaEmulator
 from lerobot_vtrefine.drivers.config import PadConfig
 from lerobot_vtrefine.drivers.dynamixel_emulator import DynamixelEmulator, EmulatedMotor

@@ -7,11 +7,12 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from aloha_columns import PADS, TACTILE_KEYS
 from commands import dataset_flags, flags, follower_flags, leader_flags, run_command
 from lerobot.datasets.lerobot_dataset import LeRobotDataset
 from rig import Rig, allow_slow_answers, emulated_elsewhere
 
-from lerobot_vtrefine.datasets.features import ACTION_KEY, PADS, STATE_KEY, TACTILE_KEYS
+from lerobot_vtrefine.datasets.features import ACTION_KEY, STATE_KEY
 from lerobot_vtrefine.drivers import arm_pair, pad_set
 from lerobot_vtrefine.drivers.sources import check_pattern
 

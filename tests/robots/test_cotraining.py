@@ -5,6 +5,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from aloha_columns import TACTILE_KEYS
 from commands import dataset_flags, flags, follower_flags, leader_flags, run_command, train
 from lerobot.datasets.lerobot_dataset import LeRobotDataset
 from realsense import FakeDepthCamera, camera_flag, plug_in
@@ -12,14 +13,7 @@ from rig import Rig, allow_slow_answers, aloha_rig
 
 from lerobot_vtrefine.cli.record_demos import RecordDemosConfig
 from lerobot_vtrefine.cli.record_demos import record as simulate
-from lerobot_vtrefine.datasets.features import (
-    ACTION_KEY,
-    AGE_KEY,
-    DEPTH_KEY,
-    NOISE_LEVEL_KEY,
-    STATE_KEY,
-    TACTILE_KEYS,
-)
+from lerobot_vtrefine.datasets.features import ACTION_KEY, AGE_KEY, DEPTH_KEY, NOISE_LEVEL_KEY, STATE_KEY
 from lerobot_vtrefine.embodiments import get_embodiment
 from lerobot_vtrefine.envs import VtRefineEnvConfig
 from lerobot_vtrefine.robots.aloha_tactile_follower import AlohaTactileFollower

@@ -9,11 +9,11 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from aloha_columns import TACTILE_KEYS
 from commands import dataset_flags, follower_flags, leader_flags, run_command
 from lerobot.datasets.lerobot_dataset import LeRobotDataset
 from rig import Rig
 
-from lerobot_vtrefine.datasets.features import TACTILE_KEYS
 from lerobot_vtrefine.drivers.sources import check_pattern
 from lerobot_vtrefine.lerobot_compat import safe_recording
 

@@ -7,11 +7,11 @@ from typing import Any
 import lerobot.utils.visualization_utils as dispatch
 import numpy as np
 import pytest
+from aloha_columns import PADS
 from commands import follower_flags, leader_flags, run_command
 from rig import Rig
 
 from lerobot_vtrefine.cli.view_pads import main as view_pads
-from lerobot_vtrefine.datasets.features import PADS
 from lerobot_vtrefine.drivers.config import PadConfig
 from lerobot_vtrefine.lerobot_compat import live_view
 

@@ -7,18 +7,13 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from aloha_columns import TACTILE_KEYS
 from commands import dataset_flags, flags, follower_flags, leader_flags, run_command, train
 from lerobot.datasets.lerobot_dataset import LeRobotDataset
 from realsense import INTRINSICS, FakeDepthCamera, camera_flag, plug_in
 from rig import Rig, allow_slow_answers, aloha_rig
 
-from lerobot_vtrefine.datasets.features import (
-    CAMERA_POSE_KEY,
-    DEPTH_KEY,
-    INTRINSICS_KEY,
-    STATE_KEY,
-    TACTILE_KEYS,
-)
+from lerobot_vtrefine.datasets.features import CAMERA_POSE_KEY, DEPTH_KEY, INTRINSICS_KEY, STATE_KEY
 from lerobot_vtrefine.drivers.sources import check_pattern
 from lerobot_vtrefine.robots.aloha_tactile_follower import AlohaTactileFollower
 

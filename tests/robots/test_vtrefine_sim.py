@@ -8,12 +8,13 @@ from urllib.request import urlopen
 
 import numpy as np
 import pytest
+from aloha_columns import TACTILE_KEYS
 from commands import dataset_flags, flags, leader_flags, run_command, train
 from lerobot.datasets.lerobot_dataset import LeRobotDataset
 from rig import Rig
 
 from lerobot_vtrefine.cli.record_demos import RecordDemosConfig, record
-from lerobot_vtrefine.datasets.features import ACTION_KEY, DEPTH_KEY, STATE_KEY, TACTILE_KEYS
+from lerobot_vtrefine.datasets.features import ACTION_KEY, DEPTH_KEY, STATE_KEY
 from lerobot_vtrefine.envs import VtRefineEnvConfig
 from lerobot_vtrefine.lerobot_compat import phases
 from lerobot_vtrefine.robots import VtRefineSimConfig

@@ -51,7 +51,6 @@ def only(sensor, **kept):
 def test_noise_of_a_flat_wall_grows_with_the_square_of_its_distance(sensor, depth_m):
     images = look(wall(depth_m), only(sensor, noise_px=0.08), range(64))
     expected = 1e3 * depth_m**2 * 0.08 / (sensor.focal_px * sensor.baseline_m)
-    assert 1e3 * sensor.noise_m(depth_m) == pytest.approx(expected)
     expected = np.hypot(expected, 1 / np.sqrt(12))  # rounded to millimetres
     assert images.std() == pytest.approx(expected, rel=0.03)
 

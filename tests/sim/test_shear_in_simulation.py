@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from lerobot_vtrefine.sim.config import RandomizationConfig, SceneConfig, ShearConfig, TaskConfig
-from lerobot_vtrefine.sim.sensing import held_bodies
+from lerobot_vtrefine.sim.pads import held_bodies
 from lerobot_vtrefine.sim.simulation import InsertionSim
 from lerobot_vtrefine.tactile import Poses
 

@@ -6,7 +6,8 @@ from lerobot_vtrefine.embodiments import get_embodiment
 from lerobot_vtrefine.sim import substeps, task
 from lerobot_vtrefine.sim.backends.base import ramp
 from lerobot_vtrefine.sim.config import SuccessConfig, TaskConfig
-from lerobot_vtrefine.sim.pairs import Grip, procedural_pair
+from lerobot_vtrefine.sim.pairs import procedural_pair
+from lerobot_vtrefine.sim.parts import Grip
 from lerobot_vtrefine.sim.rotations import about_axis, matrix_to_quat, quat_to_matrix
 
 ALOHA = get_embodiment("aloha")

@@ -20,9 +20,9 @@ from lerobot_vtrefine.sim.config import (
     WarpConfig,
 )
 from lerobot_vtrefine.sim.expert import ScriptedExpert
+from lerobot_vtrefine.sim.kinematics import Kinematics
 from lerobot_vtrefine.sim.randomization import GEOMETRY_FIELDS
 from lerobot_vtrefine.sim.scene import build_scene
-from lerobot_vtrefine.sim.sensing import Kinematics
 from lerobot_vtrefine.sim.simulation import FAILURES, InsertionSim
 
 pytest.importorskip("mujoco_warp")

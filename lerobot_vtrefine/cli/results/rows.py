@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import Any, ClassVar, get_type_hints
 
 from lerobot_vtrefine.choices import check_choice
+from lerobot_vtrefine.whole_files import whole_file
 
 COMMIT = re.compile(r"[0-9a-f]{7,40}\+?")
 
@@ -217,7 +218,5 @@ def write_rows(path: Path, rows: Iterable[Row]) -> None:
         shown = {name: value for name, value in asdict(row).items() if value != unset[name]}
         origin = {name: shown.pop(name) for name in ("commit", "command", "machine")}
         lines.append(json.dumps(shown | origin, ensure_ascii=False))
-    part = path.with_name(f"{path.name}.partial")
-    path.parent.mkdir(parents=True, exist_ok=True)
-    part.write_text('{"rows": [\n' + ",\n".join(lines) + "\n]}\n", encoding="utf-8")
-    part.replace(path)
+    with whole_file(path) as part:
+        part.write_text('{"rows": [\n' + ",\n".join(lines) + "\n]}\n", encoding="utf-8")

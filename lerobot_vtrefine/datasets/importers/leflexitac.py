@@ -20,17 +20,15 @@ import pyarrow.parquet as pq
 from tqdm import tqdm
 
 from lerobot_vtrefine.datasets.episodes import FeatureInfo, check_names
-from lerobot_vtrefine.datasets.features import Array
+from lerobot_vtrefine.datasets.features import BASELINE_PREFIX, TACTILE_PREFIX, Array, taxel_info
 from lerobot_vtrefine.datasets.importers.flexitac_counts import HostRule, UnknownRuleError, recover_counts
 from lerobot_vtrefine.datasets.importers.new_folder import new_folder
 from lerobot_vtrefine.datasets.importers.source_checks import check_frames, read_stats
 from lerobot_vtrefine.files import decode, limits, read_json
 from lerobot_vtrefine.files.tables import read_columns
 
-PREFIX = "observation.tactile."
 ONLY_PAD = "primary"
 """LeFlexiTac's name of a single pad, whose column had none in earlier versions."""
-BASELINE_PREFIX = "observation.tactile_baseline."
 DRIVER_DEFAULTS = {"threshold": 25.0, "noise_scale": 30.0}
 """What the host software uses when a dataset does not say."""
 
@@ -83,9 +81,9 @@ class PadColumn:
 
     def features(self) -> dict[str, dict[str, Any]]:
         """Features of raw counts and idle counts."""
-        info = {"array_shape": list(self.shape), "unit": "adc_counts"}
-        feature = {"dtype": "uint8", "shape": (int(np.prod(self.shape)),), "info": info}
-        return {f"{PREFIX}{self.pad}": feature, f"{BASELINE_PREFIX}{self.pad}": feature}
+        shape = (int(np.prod(self.shape)),)
+        feature = {"dtype": "uint8", "shape": shape, "info": taxel_info(*self.shape)}
+        return {f"{TACTILE_PREFIX}{self.pad}": feature, f"{BASELINE_PREFIX}{self.pad}": feature}
 
 
 @dataclass
@@ -170,7 +168,7 @@ def import_leflexitac(source: Path, root: Path, pads: Mapping[str, str]) -> Impo
 
 
 def _is_pad(key: str, feature: FeatureInfo) -> bool:
-    named = key == PREFIX.removesuffix(".") or key.startswith(PREFIX)
+    named = key == TACTILE_PREFIX.removesuffix(".") or key.startswith(TACTILE_PREFIX)
     return named and len(feature.shape) == 2 and feature.dtype == "float32"
 
 
@@ -194,7 +192,7 @@ def _read_info(source: Path) -> tuple[dict[str, Any], _Info]:
 
 def _pad_columns(source: Path, info: _Info, pads: Mapping[str, str]) -> list[PadColumn]:
     keys = [key for key, feature in info.features.items() if _is_pad(key, feature)]
-    sources = {key[len(PREFIX) :] or ONLY_PAD: key for key in keys}
+    sources = {key[len(TACTILE_PREFIX) :] or ONLY_PAD: key for key in keys}
     found = {}
     for name, key in sources.items():
         rows, cols = found[name] = info.features[key].shape
@@ -214,20 +212,22 @@ def _pad_columns(source: Path, info: _Info, pads: Mapping[str, str]) -> list[Pad
     for name, shape in found.items():
         given = asdict(sensors.get(name) or _Sensor())
         sensor = {key: value for key, value in given.items() if value is not None}
-        rule = _host_rule(sensor, shape, largest[sources[name]])
+        rule = _host_rule(name, sensor, shape, largest[sources[name]])
         known = rule is not None and "baseline" in sensor
         columns.append(PadColumn(sources[name], pads.get(name, name), shape, rule, known))
     return columns
 
 
-def _host_rule(sensor: Mapping[str, Any], shape: tuple[int, int], largest: float) -> HostRule | None:
+def _host_rule(
+    pad: str, sensor: Mapping[str, Any], shape: tuple[int, int], largest: float
+) -> HostRule | None:
     """The rule behind a pad's readings; None for counts, which exceed 1."""
     if largest > 1.0 + 1e-6:
         return None
     baseline = sensor.get("baseline", 0.0)
     if isinstance(baseline, tuple) and (len(baseline), *{len(row) for row in baseline}) != shape:
         raise ValueError(
-            f"meta/info.json: a pad's baseline is not {shape[0]} x {shape[1]}, as its frames are"
+            f"meta/info.json: the baseline of pad {pad!r} is not {shape[0]} x {shape[1]}, as its frames are"
         )
     baseline = np.asarray(baseline, float)
     threshold, scale = (float(sensor.get(name, default)) for name, default in DRIVER_DEFAULTS.items())
@@ -292,7 +292,7 @@ def _counts(table: pa.Table, columns: list[PadColumn], summary: ImportSummary) -
             counts, idle = found.counts, np.rint(column.rule.baseline).clip(0, 255).astype(np.uint8)
             index = table["index"].to_numpy()
             summary.ambiguous.setdefault(column.pad, []).extend(index[list(found.ambiguous)].tolist())
-        arrays[f"{PREFIX}{column.pad}"] = counts.reshape(len(table), -1)
+        arrays[f"{TACTILE_PREFIX}{column.pad}"] = counts.reshape(len(table), -1)
         arrays[f"{BASELINE_PREFIX}{column.pad}"] = np.tile(idle.reshape(1, -1), (len(table), 1))
     return arrays
 

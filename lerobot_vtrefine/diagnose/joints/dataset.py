@@ -7,7 +7,6 @@ from huggingface_hub.constants import HF_HOME
 
 from lerobot_vtrefine.datasets.episodes import EpisodeFolder, open_episodes
 from lerobot_vtrefine.diagnose.recordings import RecordingSet, RobotTrial
-from lerobot_vtrefine.embodiments import DEFAULT_BODY, get_embodiment
 
 PAUSE_S = 20.0
 """Taken between episodes: datasets do not note when an episode was recorded."""
@@ -31,8 +30,8 @@ def dataset_root(repo_id: str | None, root: str | Path | None) -> Path:
 def read_dataset(repo_id: str | None = None, root: str | Path | None = None) -> RecordingSet:
     """Actions and joint positions of every episode, as a set of kind "robot".
 
-    Joints without names are the default body's if there are as many, else numbered. Episodes follow one
-    another with `PAUSE_S` between them.
+    Joints without names are numbered, unless the robot type tells them. Episodes follow one another with
+    `PAUSE_S` between them.
 
     Raises:
         FileNotFoundError: no dataset there.
@@ -69,7 +68,4 @@ def joint_names(folder: EpisodeFolder) -> tuple[str, ...]:
     """Names of the columns of state and action."""
     if folder.joints:
         return tuple(name.removesuffix(".pos") for name in folder.joints)
-    usual = get_embodiment(DEFAULT_BODY).joint_names
-    if folder.num_joints == len(usual):
-        return usual
     return tuple(f"joint_{index}" for index in range(folder.num_joints))

@@ -1,6 +1,7 @@
 """Worlds on a pool of CPU threads, by `mujoco.batch`."""
 
 import os
+from typing import override
 
 import mujoco
 import numpy as np
@@ -26,52 +27,52 @@ class BatchBackend(Backend):
             self._batch.bind("geom_xmat"),
         )  # a field bound later would read zero at first
 
+    @override
     def read(self, ids: Array) -> tuple[Array, Array]:
-        """See `Backend.read`."""
         return self._qpos[ids], self._qvel[ids]
 
+    @override
     def write(self, ids: Array, qpos: Array, qvel: Array) -> None:
-        """See `Backend.write`."""
         self._batch.reset(self._subset(ids), stage=mujoco.mjtStage.mjSTAGE_NONE.value)
         self._qpos[ids], self._qvel[ids] = qpos, qvel
         self._batch.warning[ids] = 0
 
+    @override
     def advance(self, ids: Array, controls: Array) -> Trace:
-        """See `Backend.advance`."""
         out = self._batch.rollout(
             controls.shape[1], control=controls, record=("qpos", "sensordata"), ids=self._subset(ids)
         )
         return Trace(out["qpos"], out["sensordata"])
 
+    @override
     def geom_poses(self, ids: Array) -> tuple[Array, Array]:
-        """See `Backend.geom_poses`."""
         # After stepping, derived fields lag the state by one substep.
         self._batch.forward(self._subset(ids), stage=mujoco.mjtStage.mjSTAGE_POS.value)
         rotation = self._batch.bind("geom_xmat")[ids]
         return self._batch.bind("geom_xpos")[ids], rotation.reshape(len(ids), -1, 3, 3)
 
+    @override
     def set_fields(self, ids: Array, fields: dict[str, Array]) -> None:
-        """See `Backend.set_fields`."""
         for name, values in fields.items():
             self._batch.expand(name)[ids] = values
         self._batch.set_const(self._subset(ids))
 
+    @override
     def diverged(self, ids: Array) -> Array:
-        """See `Backend.diverged`."""
         numbers = self._batch.warning[ids][:, [int(w) for w in BAD_STATE_WARNINGS], 1]
         return (numbers > 0).any(1)
 
+    @override
     def get_rows(self, ids: Array) -> Array:
-        """See `Backend.get_rows`."""
         return self._batch.state[ids].copy()
 
+    @override
     def set_rows(self, ids: Array, rows: Array) -> None:
-        """See `Backend.set_rows`."""
         self._batch.state[ids] = rows
         self._batch.warning[ids] = 0  # otherwise a world that diverged once would always count as diverged
 
+    @override
     def instance(self, env: int) -> tuple[mujoco.MjModel, mujoco.MjData]:
-        """See `Backend.instance`."""
         model, data = self._batch.get_model(env), self._batch.get_data(env)
         mujoco.mj_forward(model, data)
         return model, data

@@ -1,6 +1,7 @@
 """Worlds one after the other with plain `mj_step`: the reference that other backends are compared with."""
 
 import copy
+from typing import override
 
 import mujoco
 import numpy as np
@@ -18,18 +19,18 @@ class SingleBackend(Backend):
         self._models = [copy.copy(model) for _ in range(num_envs)]
         self._data = [mujoco.MjData(item) for item in self._models]
 
+    @override
     def read(self, ids: Array) -> tuple[Array, Array]:
-        """See `Backend.read`."""
         return np.stack([self._data[i].qpos for i in ids]), np.stack([self._data[i].qvel for i in ids])
 
+    @override
     def write(self, ids: Array, qpos: Array, qvel: Array) -> None:
-        """See `Backend.write`."""
         for row, i in enumerate(ids):
             mujoco.mj_resetData(self._models[i], self._data[i])
             self._data[i].qpos[:], self._data[i].qvel[:] = qpos[row], qvel[row]
 
+    @override
     def advance(self, ids: Array, controls: Array) -> Trace:
-        """See `Backend.advance`."""
         model = self._models[0]
         steps = controls.shape[1]
         qpos = np.empty((len(ids), steps, model.nq))
@@ -42,8 +43,8 @@ class SingleBackend(Backend):
                 qpos[row, step], sensors[row, step] = data.qpos, data.sensordata
         return Trace(qpos, sensors)
 
+    @override
     def geom_poses(self, ids: Array) -> tuple[Array, Array]:
-        """See `Backend.geom_poses`."""
         poses = []
         for i in ids:
             scratch = self._copy(int(i))
@@ -51,34 +52,34 @@ class SingleBackend(Backend):
             poses.append((scratch.geom_xpos, scratch.geom_xmat.reshape(-1, 3, 3)))
         return np.stack([pose[0] for pose in poses]), np.stack([pose[1] for pose in poses])
 
+    @override
     def set_fields(self, ids: Array, fields: dict[str, Array]) -> None:
-        """See `Backend.set_fields`."""
         for row, i in enumerate(ids):
             for name, values in fields.items():
                 # Bounding volumes of bodies are a prefix of the model's array.
                 getattr(self._models[i], name)[: len(values[row])] = values[row]
             mujoco.mj_setConst(self._models[i], mujoco.MjData(self._models[i]))
 
+    @override
     def diverged(self, ids: Array) -> Array:
-        """See `Backend.diverged`."""
         return np.array([any(self._data[i].warning[w].number for w in BAD_STATE_WARNINGS) for i in ids], bool)
 
+    @override
     def get_rows(self, ids: Array) -> Array:
-        """See `Backend.get_rows`."""
         rows = np.empty((len(ids), mujoco.mj_stateSize(self._models[0], _STATE)))
         for row, i in zip(rows, ids, strict=True):
             mujoco.mj_getState(self._models[i], self._data[i], row, _STATE)
         return rows
 
+    @override
     def set_rows(self, ids: Array, rows: Array) -> None:
-        """See `Backend.set_rows`."""
         for row, i in zip(rows, ids, strict=True):
             mujoco.mj_setState(self._models[i], self._data[i], row, _STATE)
             for warning in self._data[i].warning:
                 warning.number = 0
 
+    @override
     def instance(self, env: int) -> tuple[mujoco.MjModel, mujoco.MjData]:
-        """See `Backend.instance`."""
         data = self._copy(env)
         mujoco.mj_forward(self._models[env], data)
         return self._models[env], data

@@ -6,7 +6,7 @@ A call for some worlds steps all of them and puts the others back: on a GPU that
 import copy
 import logging
 from collections.abc import Callable
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, override
 
 import mujoco
 import numpy as np
@@ -43,12 +43,12 @@ class WarpBackend(Backend):
         self._flags: tuple[Array, Callable[[], Array]] | None = None
         self._told = 0
 
+    @override
     def read(self, ids: Array) -> tuple[Array, Array]:
-        """See `Backend.read`."""
         return self.start_read(ids)()
 
+    @override
     def start_read(self, ids: Array) -> Callable[[], tuple[Array, Array]]:
-        """See `Backend.start_read`."""
         index = self.index(ids)
         copied = start_copy(torch.cat([self.worlds.qpos[index], self.worlds.qvel[index]], 1))
 
@@ -58,23 +58,23 @@ class WarpBackend(Backend):
 
         return wait
 
+    @override
     def write(self, ids: Array, qpos: Array, qvel: Array) -> None:
-        """See `Backend.write`."""
         index, worlds, self._flags = self.index(ids), self.worlds, None
         worlds.qpos[index], worlds.qvel[index] = self._tensor(qpos), self._tensor(qvel)
         for rest in (worlds.warmstart, worlds.sensors, worlds.time, worlds.diverged, worlds.lost):
             rest[index] = 0
         worlds.moved()
 
+    @override
     def advance(self, ids: Array, controls: Array) -> Trace:
-        """See `Backend.advance`."""
         self.worlds.reserve(controls.shape[1])
         given = wp.to_torch(self.worlds.controls)
         given[self.index(ids), : controls.shape[1]] = self._tensor(controls)
         return self._run(ids, controls.shape[1])
 
+    @override
     def advance_linearly(self, ids: Array, start: Array, stop: Array, substeps: int) -> Trace:
-        """See `Backend.advance_linearly`."""
         self.worlds.reserve(substeps)
         ends = [wp.from_torch(self._tensor(end)) for end in (start, stop)]
         inputs = [wp.from_torch(self.index(ids)), *ends, substeps, self.worlds.controls]
@@ -107,14 +107,14 @@ class WarpBackend(Backend):
         index, data = self.index(ids), self.worlds.data
         return wp.to_torch(data.geom_xpos)[index], wp.to_torch(data.geom_xmat)[index]
 
+    @override
     def touch_reader(self, scene: "Scene") -> TouchReader:
-        """See `Backend.touch_reader`."""
         from lerobot_vtrefine.sim.backends.warp_touch import WarpTouch
 
         return WarpTouch(scene, self.worlds)
 
+    @override
     def set_fields(self, ids: Array, fields: dict[str, Array]) -> None:
-        """See `Backend.set_fields`."""
         for name, values in fields.items():
             if name not in HOST_FIELDS:
                 self.worlds.set_field(name, self.index(ids), self._tensor(values))
@@ -125,8 +125,8 @@ class WarpBackend(Backend):
             self._fields[name][ids] = values
         self.worlds.derive()
 
+    @override
     def diverged(self, ids: Array) -> Array:
-        """See `Backend.diverged`."""
         return self._failures(ids)[:, 0] > 0
 
     def overflowed(self, ids: Array) -> Array:
@@ -139,12 +139,12 @@ class WarpBackend(Backend):
             logger.warning("%s", message)
         return lost > 0
 
+    @override
     def get_rows(self, ids: Array) -> Array:
-        """See `Backend.get_rows`."""
         return to_host(self._rows(ids))
 
+    @override
     def set_rows(self, ids: Array, rows: Array) -> None:
-        """See `Backend.set_rows`."""
         self._put_rows(ids, self._tensor(rows))
         self._flags = None
 

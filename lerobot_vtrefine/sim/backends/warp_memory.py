@@ -70,7 +70,7 @@ class Arena:
         return self._block.ptr + start
 
     def deallocate(self, ptr: int, size_in_bytes: int) -> None:
-        """Does nothing: `rewind` frees all at once."""
+        """Do nothing: `rewind` frees all at once."""
 
 
 @dataclass(frozen=True)

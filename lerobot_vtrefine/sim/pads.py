@@ -1,21 +1,19 @@
-"""From the state of worlds to what the robot's sensors would give: joint positions, raw pad counts, depth.
+"""The pads of simulated worlds: what touches them, as raw counts.
 
-Shapes: m worlds, A hands, P pads of T taxels, B = 2 bodies (plug, socket).
+Shapes: m worlds, P pads of T taxels.
 """
 
-from functools import cached_property
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 import torch
 
 from lerobot_vtrefine.embodiments import Embodiment
-from lerobot_vtrefine.embodiments.kinematics import Hands
 from lerobot_vtrefine.sim.config import ShearConfig
 from lerobot_vtrefine.sim.host import to_host
-from lerobot_vtrefine.sim.pairs import Part
-from lerobot_vtrefine.sim.rotations import quat_to_matrix, turn, turn_back
+from lerobot_vtrefine.sim.parts import Part
 from lerobot_vtrefine.sim.scene import Scene
+from lerobot_vtrefine.sim.touch import Touch
 from lerobot_vtrefine.tactile import (
     BodyGeometry,
     PadLayout,
@@ -26,105 +24,7 @@ from lerobot_vtrefine.tactile import (
 )
 from lerobot_vtrefine.tactile.shear import Shear, ShearSensors
 
-if TYPE_CHECKING:
-    from lerobot_vtrefine.sim.touch import Touch
-
 Array = np.ndarray
-
-
-def held_bodies(embodiment: Embodiment) -> tuple[int, ...]:
-    """What each pad holds, of (plug, socket): (P,) indices."""
-    return tuple(
-        ("plug", "socket").index(arm.holds) for arm in embodiment.arms for _ in embodiment.fingers.sides
-    )
-
-
-class Kinematics:
-    """Where everything is in m worlds with positions (m, nq) and velocities (m, nv); what is asked for is
-    computed once.
-    """
-
-    def __init__(self, scene: Scene, qpos: Array, qvel: Array) -> None:
-        self._scene, self._qpos, self._qvel = scene, qpos, qvel
-
-    @cached_property
-    def joints(self) -> Array:
-        """(m, J)"""
-        return self._qpos[:, self._scene.addresses.qpos]
-
-    @cached_property
-    def joint_velocities(self) -> Array:
-        """(m, J)"""
-        return self._qvel[:, self._scene.addresses.dof]
-
-    @cached_property
-    def hands(self) -> tuple[Array, Array]:
-        """Positions (m, A, 3) and rotations (m, A, 3, 3) of the TCPs."""
-        position, rotation = self._arms.tcp()
-        return position.numpy(), rotation.numpy()
-
-    @cached_property
-    def pads(self) -> tuple[Array, Array]:
-        """Positions (m, P, 3) and rotations (m, P, 3, 3) of the pads."""
-        position, rotation = self._arms.pads()
-        return position.numpy(), rotation.numpy()
-
-    @cached_property
-    def pad_velocities(self) -> Array:
-        """(m, P, 6) linear velocity of the origin, then angular, world frame; the same of the parts."""
-        return self._arms.pad_twists(torch.from_numpy(self.joint_velocities)).numpy()
-
-    @cached_property
-    def parts(self) -> tuple[Array, Array]:
-        """Positions (m, B, 3) and rotations (m, B, 3, 3) of the plug and the socket."""
-        at = self._scene.addresses
-        return part_pose(np.stack([self._qpos[:, at.plug_qpos], self._qpos[:, at.socket_qpos]], 1))
-
-    @cached_property
-    def part_velocities(self) -> Array:
-        """(m, B, 6)"""
-        at = self._scene.addresses
-        velocity = np.stack([self._qvel[:, at.plug_dof], self._qvel[:, at.socket_dof]], 1)
-        # A free joint's velocity has its angular part in the body's frame.
-        return np.concatenate([velocity[..., :3], turn(self.parts[1], velocity[..., 3:])], -1)
-
-    @property
-    def plug(self) -> tuple[Array, Array]:
-        """Position (m, 3) and rotation (m, 3, 3)."""
-        return self.parts[0][:, 0], self.parts[1][:, 0]
-
-    @property
-    def socket(self) -> tuple[Array, Array]:
-        """Position (m, 3) and rotation (m, 3, 3)."""
-        return self.parts[0][:, 1], self.parts[1][:, 1]
-
-    @cached_property
-    def _arms(self) -> Hands:
-        return self._scene.embodiment.hands(torch.from_numpy(self.joints))
-
-
-def part_pose(pose: Array) -> tuple[Array, Array]:
-    """(..., 7) position and quaternion -> position (..., 3) and rotation (..., 3, 3)."""
-    return pose[..., :3], quat_to_matrix(pose[..., 3:])
-
-
-def pad_loads(pads: tuple[Array, Array], contacts: Array) -> Array:
-    """Contact sensors' wrenches as loads on the pads.
-
-    Args:
-        pads: their positions (m, P, 3) and rotations (m, P, 3, 3).
-        contacts: (m, P, 10) found, force of the pad on its counterpart, torque, centre; world frame.
-
-    Returns:
-        (m, P, LOAD_SIZE): normal force pressing on the pad [N], its centre's x and y [m], the tangential
-        force on the pad along x and y [N]; in the pad's frame, zeros where nothing touches.
-    """
-    position, rotation = pads
-    force = turn_back(rotation, contacts[..., 1:4])
-    centre = turn_back(rotation, contacts[..., 7:10] - position)[..., :2]
-    touched = contacts[..., 0] > 0
-    load = np.concatenate([np.maximum(force[..., 2:], 0.0), centre, -force[..., :2]], -1)
-    return np.where(touched[..., None], load, 0.0)
 
 
 class Pads:
@@ -171,7 +71,7 @@ class Pads:
         if self._shear is not None:
             self._shear.reset(ids, drawn["pad_friction"])
 
-    def advance(self, ids: Array, touch: "Touch") -> None:
+    def advance(self, ids: Array, touch: Touch) -> None:
         """Let one control step pass, for readings that remember."""
         if self._shear is not None:
             poses = Poses(*touch.poses)
@@ -180,7 +80,7 @@ class Pads:
         if self._in_order:
             self._last[ids] = self._read(ids, touch)
 
-    def counts(self, ids: Array, touch: "Touch") -> torch.Tensor:
+    def counts(self, ids: Array, touch: Touch) -> torch.Tensor:
         """Raw counts (m, P, T) uint8 at the worlds' present state, on the pads' device."""
         return self._last[ids] if self._in_order else self._read(ids, touch)
 
@@ -210,8 +110,15 @@ class Pads:
         if self._shear is not None:
             self._shear.set_state(env, state["shear"])
 
-    def _read(self, ids: Array, touch: "Touch") -> torch.Tensor:
+    def _read(self, ids: Array, touch: Touch) -> torch.Tensor:
         return torch.as_tensor(self.sensors.counts(ids, Poses(*touch.poses), self._dt_s, touch.load))
+
+
+def held_bodies(embodiment: Embodiment) -> tuple[int, ...]:
+    """What each pad holds, of (plug, socket): (P,) indices."""
+    return tuple(
+        ("plug", "socket").index(arm.holds) for arm in embodiment.arms for _ in embodiment.fingers.sides
+    )
 
 
 def pad_layout(embodiment: Embodiment) -> PadLayout:

@@ -18,7 +18,7 @@ PART = ".part"
 
 @contextmanager
 def whole_file(path: Path) -> Generator[Path]:
-    """Lends a name to write to; the file takes its place at the end, or nothing does after an error."""
+    """Lend a name to write to; the file takes its place at the end, or nothing does after an error."""
     part = path.with_name(path.name + PART)
     path.parent.mkdir(parents=True, exist_ok=True)
     try:
@@ -33,6 +33,6 @@ def whole_file(path: Path) -> Generator[Path]:
 
 
 def write_json(path: Path, data: Any) -> None:
-    """Writes ``data`` as LeRobot does, but whole."""
+    """Write ``data`` as LeRobot does, but whole."""
     with whole_file(path) as part:
         part.write_text(json.dumps(data, indent=4, ensure_ascii=False), encoding="utf-8")
