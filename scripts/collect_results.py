@@ -56,7 +56,7 @@ def main() -> None:
             recorded = origin_of(source.parent, **origin)
             found += [(row, []) for row in printed_lines(source, options.table, recorded)]
         elif options.table == "reality":
-            found += reality_rows(source, origin_of(source, **origin))
+            found += reality_rows(source, origin_of(source, **origin), options.task)
         else:
             task = options.task or source.resolve().parent.name
             found += run_rows(source, {"table": options.table, "task": task} | given, origin)

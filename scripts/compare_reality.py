@@ -3,6 +3,8 @@
 
     .venv/bin/python scripts/compare_reality.py --seeds 0 1 2
     .venv/bin/python scripts/compare_reality.py --seeds 0 1 2 3 4 5 --jobs 24 --device=cuda
+    .venv/bin/python scripts/compare_reality.py --task=cross_gentle --recipe=pads --num_demos=300 \\
+        --realities row_sharing+hysteresis+drift --device=cuda --env='{"backend": "warp"}'
 
 A simulation with hidden physics stands in for reality (``--env.reality``); nothing is ever trained in it.
 A policy is imitation-learned and fine-tuned by DPPO for a while in the plain simulator. From there DPPO goes
@@ -19,6 +21,7 @@ import json
 import shlex
 import subprocess
 import sys
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -29,14 +32,16 @@ from reality_budget import Budget, env_flags, folder_name, real_env, recipe
 from reality_results import as_text, difference
 
 from lerobot_vtrefine.cli.arguments import CommandParser, flags
-from lerobot_vtrefine.cli.pipeline.demo_config import SEED_STRIDE, TRAIN_SEED_OFFSET
+from lerobot_vtrefine.cli.pipeline.demo_config import RECIPES, SEED_STRIDE, TRAIN_SEED_OFFSET
 from lerobot_vtrefine.cli.pipeline.demo_stages import pretrain_stage, record_stage
 from lerobot_vtrefine.cli.pipeline.stages import Stage, StageRunner, find_command
 from lerobot_vtrefine.cli.report.statistics import proportion
 from lerobot_vtrefine.cli.results.collect import Progress, last_steps, read_json
 from lerobot_vtrefine.cli.results.provenance import write_provenance
 from lerobot_vtrefine.cli.results.rows import Run
+from lerobot_vtrefine.files import read_yaml
 from lerobot_vtrefine.finetune.logger import read_progress
+from lerobot_vtrefine.shipped import find
 from lerobot_vtrefine.sim.reality import SCHEMA
 
 MOTION_SEED_OFFSET = 500_000
@@ -47,7 +52,30 @@ START = "start"
 def imitation_stages(budget: Budget) -> list[Stage]:
     """Demonstrations in the plain simulator, and the policy learned from them."""
     config = recipe(budget, budget.seeds[0])
-    return [record_stage(config), pretrain_stage(config)]
+    record, pretrain = record_stage(config), pretrain_stage(config)
+    if not budget.own_encoder:
+        return [record, pretrain]
+    encoder = encoder_stage(budget)
+    return [encoder, record, replace(pretrain, needs=(*pretrain.needs, encoder.name))]
+
+
+def encoder_stage(budget: Budget) -> Stage:
+    """What the policy sees and feels with, trained in the plain simulator."""
+    command = (
+        "vtrefine-information",
+        *env_flags(budget, "plain"),
+        "--senses=[visuo_tactile]",
+        f"--effort.device={budget.device}",
+        f"--effort.episodes={budget.encoder_episodes}",
+        f"--effort.num_envs={min(budget.envs, budget.encoder_episodes // 2)}",
+        f"--effort.steps={budget.encoder_steps}",
+        "--effort.history=[1]",
+        "--effort.closed_loop_episodes=0",
+        "--effort.tolerance_episodes=0",
+        f"--output_dir={budget.encoder}",
+    )
+    product = budget.encoder / "information.json"
+    return Stage("encoder", "Train the encoder in the plain simulator", command, budget.encoder, product)
 
 
 def diagnosis_stages(budget: Budget, name: str) -> list[Stage]:
@@ -273,15 +301,20 @@ def compare_one(budget: Budget, name: str, seeds: list[int]) -> dict[str, Any]:
     return row
 
 
-def reality_rows(folder: Path, origin: dict[str, str | None]) -> list[tuple[Run, Progress]]:
-    """Rows of the results file from a comparison's folder: every policy in every world, by seed."""
+def reality_rows(
+    folder: Path, origin: dict[str, str | None], task: str | None = None
+) -> list[tuple[Run, Progress]]:
+    """Rows of the results file from a comparison's folder: every policy in every world, by seed.
+
+    ``task``: what --task was, if anything.
+    """
     rows = []
     for name in REALITIES:
         verdict = read_json(folder / folder_name(name) / "diagnosis" / "verdict.json") or {"causes": []}
         causes = ", ".join(cause["name"] for cause in verdict["causes"]) or "nothing"
         for title, (trained, world) in cells(name).items():
             prefix = folder_name("eval", trained, "in", world, "")
-            for path in sorted(folder.glob(f"{prefix}*/eval_info.json")):
+            for path in sorted(folder.glob(f"{prefix}[0-9]*/eval_info.json")):
                 seed = path.parent.name.removeprefix(prefix)
                 tuning = folder_name("finetune", trained, seed)
                 progress, stamp = (
@@ -291,7 +324,7 @@ def reality_rows(folder: Path, origin: dict[str, str | None]) -> list[tuple[Run,
                 outcomes = read_json(path)["per_task"][0]["metrics"]["successes"]
                 row = Run(
                     table="reality",
-                    task=name,
+                    task=": ".join(filter(None, (task, name))),
                     policy="visuo_tactile",
                     variant=title,
                     seed=int(seed),
@@ -332,9 +365,18 @@ def parse() -> tuple[argparse.Namespace, Budget]:
     ):
         parser.add_argument(f"--{name}", type=int, default=default, help=f"default {default}")
     parser.add_argument("--lane", help=argparse.SUPPRESS)
+    parser.add_argument("--task", help="a file of configs/env (default: the demo's task)")
+    parser.add_argument("--recipe", choices=list(RECIPES), default="cloud", help="as vtrefine-demo's")
+    for name, words in (("policy", "policy"), ("dppo", "update")):
+        parser.add_argument(f"--{name}", type=json.loads, default={}, help=f"flags of the {words}, as JSON")
+    for name, default in (("encoder_episodes", 6144), ("encoder_steps", 3000)):
+        parser.add_argument(f"--{name}", type=int, default=default, help=f"of recipe pads; default {default}")
     options = parser.parse_args()
     if options.jobs < 1:
         parser.error(f"--jobs must be at least 1, got {options.jobs}")
+    if options.task:
+        own = read_yaml(find("--config_path", options.task))["env"]
+        options.env = {name: value for name, value in own.items() if name != "type"} | options.env
     fields: dict[str, Any] = {name: getattr(options, name) for name in Budget.__dataclass_fields__}
     fields["realities"], fields["seeds"] = tuple(options.realities), tuple(options.seeds)
     return options, Budget(**fields)

@@ -29,7 +29,7 @@ from torch import Tensor, nn
 
 from lerobot_vtrefine.cli.arguments import CommandParser
 from lerobot_vtrefine.cli.errors import run_cli
-from lerobot_vtrefine.cli.results.collect import largest_fall, read_json, save
+from lerobot_vtrefine.cli.results.collect import largest_fall, read_json, save, steps_to
 from lerobot_vtrefine.cli.results.provenance import provenance
 from lerobot_vtrefine.cli.results.rows import Row, Run
 from lerobot_vtrefine.finetune import dppo
@@ -86,7 +86,11 @@ def row_of(variant: str, practice: Practice, curve: list[dict[str, float]], args
         episodes=args.worlds,
         iterations=int(last["iteration"]),
         env_steps=int(last["env_steps"]),
-        extra={"largest_fall": largest_fall(curve), "seconds": round(curve[-1]["seconds"], 1)},
+        extra={
+            "largest_fall": largest_fall(curve),
+            "seconds": round(curve[-1]["seconds"], 1),
+            **steps_to(curve),
+        },
         **provenance(),
     )
 

@@ -18,9 +18,9 @@ from typing import Any
 from lerobot_vtrefine.cli.arguments import CommandParser
 from lerobot_vtrefine.cli.errors import run_cli
 from lerobot_vtrefine.cli.report.statistics import wilson_interval
+from lerobot_vtrefine.cli.results.cells import interval, percent
 from lerobot_vtrefine.cli.results.collect import origin_of, save
 from lerobot_vtrefine.cli.results.rows import Line
-from lerobot_vtrefine.cli.results.tables import interval, percent
 
 TABLE = "touch_tasks"
 RESULTS = Path(__file__).parents[1] / "results"

@@ -10,6 +10,7 @@ from lerobot_vtrefine.tactile.stages.contact import KelvinVoigt
 from lerobot_vtrefine.tactile.stages.host import Latency
 from lerobot_vtrefine.tactile.stages.hysteresis import Hysteresis
 from lerobot_vtrefine.tactile.stages.readout import (
+    BaselineDrift,
     Gain,
     Idle,
     Noise,
@@ -35,6 +36,18 @@ def latency_and_gain_spread() -> dict[str, Any]:
     return {"sensor_model": pad.to_dict()}
 
 
+def pads_as_built() -> dict[str, Any]:
+    """Row sharing of a plain pull-down resistor, a loop of 17 % as piezoresistive gloves have, and an idle
+    level that has risen by 5 counts since the last zeroing.
+    """
+    loop = Hysteresis(fraction=0.17, width_m=2e-4)
+    drift = BaselineDrift(
+        knots_s=(0.0, 4.8), knot_counts=(0.0, 5.0)
+    )  # within an episode, which starts at zero
+    pad = PLAIN.with_stage(RowSharing(1 / 255)).with_stage(loop).with_stage(drift)
+    return {"sensor_model": pad.to_dict()}
+
+
 def control_latency_and_backlash() -> dict[str, Any]:
     """Worn arms: commands arrive a control step late, and every joint has a degree of play."""
     fingers = ("_left_finger", "_right_finger")
@@ -45,6 +58,7 @@ def control_latency_and_backlash() -> dict[str, Any]:
 REALITIES = {
     "row_sharing+hysteresis": row_sharing_and_hysteresis,
     "latency+taxel_gain_spread": latency_and_gain_spread,
+    "row_sharing+hysteresis+drift": pads_as_built,
     "control_latency+backlash": control_latency_and_backlash,
 }
 """What is hidden: the pads' sensor model, or faults of the robot, as a reality file holds it."""

@@ -1,6 +1,6 @@
 """What every run of ``compare_reality.py`` may spend, and the flags of the worlds that it runs in."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -27,7 +27,24 @@ class Budget:
     eval_envs: int
     presses: int
     motions: int
-    env: dict[str, str]
+    env: dict[str, Any]
+    recipe: str = "cloud"
+    policy: dict[str, Any] = field(default_factory=dict)
+    dppo: dict[str, Any] = field(default_factory=dict)
+    encoder_episodes: int = 6144
+    encoder_steps: int = 3000
+
+    @property
+    def own_encoder(self) -> bool:
+        """Whether the policy's encoder is trained first, in the plain simulator: what others have learnt was
+        with other pads.
+        """
+        return self.recipe == "pads" and "pretrained_encoder" not in self.policy
+
+    @property
+    def encoder(self) -> Path:
+        """Folder of that encoder."""
+        return self.output_dir / "encoder"
 
     @property
     def imitation(self) -> Path:
@@ -53,7 +70,9 @@ def recipe(budget: Budget, seed: int) -> DemoConfig:
         eval_episodes=budget.eval_episodes,
         eval_envs=budget.eval_envs,
         env=default_env() | budget.env | plain,
-        recipe="cloud",
+        recipe=budget.recipe,
+        policy=budget.policy | ({"pretrained_encoder": str(budget.encoder)} if budget.own_encoder else {}),
+        dppo=budget.dppo,
     )
 
 

@@ -90,7 +90,9 @@ def information(cfg: InformationConfig) -> None:
     with beside(cfg.output_dir) as folder:
         found = study(env, cfg.senses, cfg.effort, Bars(), save_keeper(folder, cfg.effort))
         write(found, cfg.effort, folder)
-        (folder / "report.html").write_text(render_page(found, env.scene_config.pair), encoding="utf-8")
+        scene = env.scene_config
+        page = render_page(found, scene.pair, scene.clearance_m)
+        (folder / "report.html").write_text(page, encoding="utf-8")
         write_provenance(folder)
         put_in_place(folder, cfg.output_dir)
     print(summary(found))

@@ -81,16 +81,23 @@ def expert_success(
     episodes = make_episodes(config, num_envs)
     believer = None if estimator is None else Believer(episodes, estimator, views, grasps, device)
     expert = ScriptedExpert(episodes.sim, part_poses=None if believer is None else believer.part_poses)
+    return play(episodes, expert, num_episodes, believer)
+
+
+def play(
+    episodes: Episodes, expert: ScriptedExpert, num_episodes: int, believer: Believer | None = None
+) -> np.ndarray:
+    """Success (at least ``num_episodes``,) bool of an expert; sensors are read for a believer alone."""
     successes = []
-    for first in range(0, num_episodes, num_envs):
+    for first in range(0, num_episodes, episodes.num_envs):
         episodes.reset(episodes.ids, FIRST_SEED + first + episodes.ids)
         if believer is not None:
             believer.start()
         expert.reset(episodes.ids)
-        targets = np.zeros((num_envs, episodes.sim.scene.embodiment.num_joints))
+        targets = np.zeros((episodes.num_envs, episodes.sim.scene.embodiment.num_joints))
         while len(running := episodes.active):
             targets[running] = expert.act(running)
-            episodes.step(targets)
+            episodes.step(targets, reads=believer is not None)
             if believer is not None and len(episodes.active):
                 believer.look(episodes.active)
         successes.append(episodes.success.copy())

@@ -3,21 +3,21 @@
 import numpy as np
 from scipy.stats import binomtest
 
+from lerobot_vtrefine.information.curves import STYLES, clearance_charts, known_error_chart
 from lerobot_vtrefine.information.quantities import AXES, PARTS, unit_of
 from lerobot_vtrefine.information.study import Finding, Study
+from lerobot_vtrefine.information.tolerance import LATERAL, TILT
 from lerobot_vtrefine.pages.charts import Panel, digits, drawing, label, percent_tick
 from lerobot_vtrefine.pages.rates import Bar, bar_chart
 from lerobot_vtrefine.pages.render import render
 
-STYLES = ("d", "a", "m", "b")
-"""Of the senses, in the order of the study."""
 WIDTH, HEIGHT = 520.0, 260.0
 LEFT, RIGHT, TOP, BOTTOM = 62.0, 14.0, 26.0, 52.0
 MOST = 1.1
 """Errors are shown up to this many times what they are before anything is seen."""
 
 
-def render_page(found: Study, pair: str) -> str:
+def render_page(found: Study, pair: str, clearance_m: float) -> str:
     """The page as HTML text."""
     senses = list(dict.fromkeys(finding.senses for finding in found.findings))
     return render(
@@ -25,19 +25,16 @@ def render_page(found: Study, pair: str) -> str:
         "page.html",
         pair=pair,
         verdict=found.verdict.reason,
-        keys=[(name.replace("_", "-"), style_of(name, senses)) for name in senses],
+        keys=[(name.replace("_", "-"), STYLES[name]) for name in senses],
         history=sorted({finding.history for finding in found.findings}),
-        errors=[error_chart(found, part, senses) for part in PARTS],
-        success=success_chart(found, senses),
+        errors=[error_chart(found, part) for part in PARTS],
+        success=success_chart(found),
+        known=[chart for kind in (LATERAL, TILT) if (chart := known_error_chart(found, kind))],
+        clearances=clearance_charts(found, clearance_m, senses),
     )
 
 
-def style_of(senses: str, known: list[str]) -> str:
-    """The colour of a set of senses."""
-    return STYLES[known.index(senses) % len(STYLES)]
-
-
-def error_chart(found: Study, part: str, senses: list[str]) -> str:
+def error_chart(found: Study, part: str) -> str:
     """Errors of every finding in the six quantities of a part, as shares of what they are unseen."""
     names = [f"{part}_{axis}" for axis in AXES]
     panel = Panel(
@@ -57,14 +54,14 @@ def error_chart(found: Study, part: str, senses: list[str]) -> str:
                 x,
                 step,
                 [value / max(prior, 1e-12) for value in finding.rms[name]],
-                _style(finding, found, senses),
+                _style(finding, found),
             )
     return drawing(WIDTH, HEIGHT, parts, f"errors of {part.replace('_', ' ')}")
 
 
-def _style(finding: Finding, found: Study, senses: list[str]) -> str:
+def _style(finding: Finding, found: Study) -> str:
     faded = " faded" if finding.history > min(other.history for other in found.findings) else ""
-    return style_of(finding.senses, senses) + faded
+    return STYLES[finding.senses] + faded
 
 
 def _bar(panel: Panel, x: float, step: float, values: list[float], style: str) -> list[str]:
@@ -78,11 +75,11 @@ def _bar(panel: Panel, x: float, step: float, values: list[float], style: str) -
     ]
 
 
-def success_chart(found: Study, senses: list[str]) -> str:
+def success_chart(found: Study) -> str:
     """The expert that acts on the truth and on each set of senses; empty where it did not act."""
     shown = [("truth", found.true_success, "m")]
     shown += [
-        (f"{item.senses.replace('_', '-')}, {item.history}", item.success, style_of(item.senses, senses))
+        (f"{item.senses.replace('_', '-')}, {item.history}", item.success, STYLES[item.senses])
         for item in found.findings
     ]
     bars = []

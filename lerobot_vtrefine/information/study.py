@@ -5,7 +5,7 @@ What comes out is a ``Study``; ``save`` writes it with the trained encoders.
 
 import json
 from collections.abc import Callable, Sequence
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -28,7 +28,9 @@ from lerobot_vtrefine.information.estimator import (
 )
 from lerobot_vtrefine.information.frames import Frames, Views, collect_frames
 from lerobot_vtrefine.information.quantities import NAMES, unit_of
+from lerobot_vtrefine.information.tolerance import SIZES, Tolerated, tolerance
 from lerobot_vtrefine.policies.vt_dp3.observation_encoder import save_encoder
+from lerobot_vtrefine.sim.config import PROCEDURAL_PAIRS
 
 TRAINING_SHARE = 0.85
 TRUTH = "truth"
@@ -53,6 +55,10 @@ class Effort:
     """Frames that a regressor sees; encoders are saved for the first entry."""
     closed_loop_episodes: int = 256
     """Episodes of the expert per set of senses; 0: none."""
+    tolerance_episodes: int = 64
+    """Episodes of the expert per size of an error that it is given, for the page's curves; 0: none."""
+    clearances_m: tuple[float, ...] = ()
+    """More clearances to study in the same way, for the page's curves; each takes as long as the first."""
     preset: str = "small"
     """Whose encoder: ``--policy.preset``."""
     device: str = "cpu"
@@ -66,6 +72,8 @@ class Effort:
                 raise ValueError(f"--{name} must be at least 1, got {getattr(self, name)}")
         if not self.history or min(self.history) < 1:
             raise ValueError(f"--history must hold numbers of frames from 1, got {self.history}")
+        if self.clearances_m and min(self.clearances_m) <= 0:
+            raise ValueError(f"--clearances_m must hold lengths above 0, got {self.clearances_m}")
         if self.episodes < 2 * self.num_envs:
             raise ValueError(f"--episodes={self.episodes} must be at least twice --num_envs={self.num_envs}")
 
@@ -90,6 +98,10 @@ class Study:
     """Standard deviation of each quantity in the held-out frames: the error of one who sees nothing."""
     findings: list[Finding] = field(default_factory=list)
     true_success: tuple[int, int] | None = None
+    tolerated: list[Tolerated] = field(default_factory=list)
+    """The expert with errors of known sizes."""
+    at_clearance: dict[float, "Study"] = field(default_factory=dict)
+    """The same task with other clearances [m]."""
 
     def success_of(self, senses: str) -> float | None:
         """Best success over lengths of history; None where it was not measured."""
@@ -111,7 +123,13 @@ def study(
     told: Told = lambda *_: None,
     keep: Callable[[Senses, Estimator], None] = lambda *_: None,
 ) -> Study:
-    """Collect, train, test, and let the expert act; ``keep`` gets the regressors of the first history."""
+    """Collect, train, test, and let the expert act; ``keep`` gets the regressors of the first history.
+
+    Raises:
+        ValueError: other clearances of a pair of meshes.
+    """
+    if effort.clearances_m and config.scene_config.pair not in PROCEDURAL_PAIRS:
+        raise ValueError(f"--effort.clearances_m: {config.scene_config.pair} has the clearance of its meshes")
     chosen = [SENSES[name] for name in senses]
     body, device = config.body.name, torch.device(effort.device)
     views = views_of(chosen, body, effort.preset, effort.device)
@@ -131,6 +149,16 @@ def study(
                 keep(item, estimator)
             result.findings.append(_tested(item, estimator, held_out, config, effort, views))
             told("senses", len(chosen) * len(effort.history), 1)
+    if effort.tolerance_episodes:
+        sizes = sum(map(len, SIZES.values()))
+        result.tolerated = tolerance(
+            config, effort.tolerance_episodes, count, lambda n: told("errors of known size", sizes, n)
+        )
+    for clearance_m in effort.clearances_m:
+        again = replace(effort, clearances_m=(), tolerance_episodes=0)
+        result.at_clearance[clearance_m] = study(
+            replace(config, clearance_m=clearance_m), senses, again, told
+        )
     return result
 
 
@@ -199,30 +227,44 @@ def _rate(success: tuple[int, int]) -> float:
 def as_json(found: Study, effort: Effort) -> dict[str, Any]:
     """Everything, with units and Wilson's intervals."""
 
-    def proportion(success: tuple[int, int] | None) -> dict[str, Any] | None:
-        if success is None:
-            return None
-        low, high = binomtest(*success).proportion_ci(method="wilson")
-        return {"success": success[0], "episodes": success[1], "ci95": [round(low, 4), round(high, 4)]}
-
     return {
         "verdict": found.verdict.reason,
         "accepted": found.verdict.accepted,
         "judged": found.verdict.short,
+        **_found(found),
+        "tolerance": [
+            {"error": item.error, "size": item.size, "expert": _proportion(item.success)}
+            for item in found.tolerated
+        ],
+        "at_clearance_m": {str(clearance): _found(other) for clearance, other in found.at_clearance.items()},
+        "effort": asdict(effort),
+    }
+
+
+def _found(found: Study) -> dict[str, Any]:
+    """Errors and successes at one clearance."""
+    return {
         "units": {name: unit_of(name)[1] for name in NAMES},
         "prior": found.prior,
-        "true_state": proportion(found.true_success),
+        "true_state": _proportion(found.true_success),
         "findings": [
             {
                 "senses": finding.senses,
                 "history": finding.history,
                 "rms": {name: {"rms": v[0], "ci95": list(v[1:])} for name, v in finding.rms.items()},
-                "expert": proportion(finding.success),
+                "expert": _proportion(finding.success),
             }
             for finding in found.findings
         ],
-        "effort": asdict(effort),
     }
+
+
+def _proportion(success: tuple[int, int] | None) -> dict[str, Any] | None:
+    """Counts with Wilson's interval."""
+    if success is None:
+        return None
+    low, high = binomtest(*success).proportion_ci(method="wilson")
+    return {"success": success[0], "episodes": success[1], "ci95": [round(low, 4), round(high, 4)]}
 
 
 def save_keeper(folder: Path, effort: Effort) -> Callable[[Senses, Estimator], None]:

@@ -7,6 +7,7 @@ import compare_reality as compare
 import numpy as np
 import pytest
 
+from lerobot_vtrefine.cli.results.collect import ORIGIN
 from lerobot_vtrefine.cli.results.tables import table
 from lerobot_vtrefine.diagnose.joints.model import RobotModel
 from lerobot_vtrefine.diagnose.pad import stand_in_rig as press
@@ -51,7 +52,7 @@ def test_fine_tunings_differ_in_the_simulator_alone(budget):
         assert flags_of(stage)["resume"] == "true"  # so that episodes go on from the start's last one
         assert flags_of(stage)["seed"] == flags_of(start)["seed"]
         assert (flags_of(start)["dppo.iterations"], flags_of(stage)["dppo.iterations"]) == ("2", "3")
-    assert len(stages) == 8  # four simulators, two seeds
+    assert len(stages) == 10  # five simulators, two seeds
     kept, differ = [], ("env.sensor_model", "env.reality", "output_dir", "seed")
     for stage in stages.values():
         flags = flags_of(stage)
@@ -59,7 +60,7 @@ def test_fine_tunings_differ_in_the_simulator_alone(budget):
         kept.append({k: v for k, v in flags.items() if k not in differ})
     assert all(flags == kept[0] for flags in kept)
     models = {(flags_of(s)["env.sensor_model"], flags_of(s).get("env.reality")) for s in stages.values()}
-    assert len(models) == 4
+    assert len(models) == 5
     assert len({flags_of(stage)["seed"] for stage in stages.values()}) == 2
 
 
@@ -68,7 +69,7 @@ def test_evaluations_use_the_same_episodes_and_valid_environments(budget):
 
     policies = compare.lanes(budget)[2]
     stages = [stage for lane in policies.values() for stage in lane if stage.name.startswith("eval")]
-    assert len(stages) == 2 * len(compare.evaluations(budget)) == 28
+    assert len(stages) == 2 * len(compare.evaluations(budget)) == 36
     seeds = {(flags_of(stage)["seed"], stage.name[-1]) for stage in stages}
     assert len(seeds) == 2
     for stage in stages:
@@ -83,8 +84,8 @@ def test_evaluations_use_the_same_episodes_and_valid_environments(budget):
 
 def test_every_lane_can_run_on_its_own(budget):
     before, starts, policies = compare.lanes(budget)
-    assert [len(lanes) for lanes in (before, starts, policies)] == [4, 2, 10]
-    assert len(before | starts | policies) == 16
+    assert [len(lanes) for lanes in (before, starts, policies)] == [5, 2, 12]
+    assert len(before | starts | policies) == 19
     for stages in (before | starts | policies).values():
         names = [stage.name for stage in stages]
         assert len(set(names)) == len(names)
@@ -117,7 +118,7 @@ def test_results_say_what_reality_costs_and_what_diagnosis_brings_back(budget):
     assert row["diagnosed_minus_plain"] == {"mean": 0.25, "ci95": [0.25, 0.25]}
     text = compare.as_text(results)
     assert "(explained: backlash) pays, 25 % [25, 25] over 2 seeds of 4 episodes" in text
-    assert text.count("makes no difference that these seeds can show") == 2
+    assert text.count("makes no difference that these seeds can show") == 3
 
 
 def test_comparison_becomes_rows_of_the_results(budget):
@@ -128,7 +129,7 @@ def test_comparison_becomes_rows_of_the_results(budget):
     ProgressLog(folder, 0, None).add(3, {"success": 0.5, "env_steps": 400.0})
     origin = {"commit": "0123abc", "command": None, "machine": "2 cores"}
     rows = [row for row, _ in compare.reality_rows(budget.output_dir, origin)]
-    assert len({row.key for row in rows}) == len(rows) == 3 * 6 * 2
+    assert len({row.key for row in rows}) == len(rows) == 4 * 6 * 2
     (row,) = (r for r in rows if r.task == name and r.seed == 4 and r.variant == "plain in its own simulator")
     assert (row.success, row.episodes, row.iterations, row.env_steps) == (0.75, 4, 3, 400)
     assert row.extra == {"diagnosis": "backlash"}
@@ -136,6 +137,25 @@ def test_comparison_becomes_rows_of_the_results(budget):
     hidden = "commands 0.1 s late, 20 mrad of play in all arm joints"
     assert f"| {hidden} | backlash | the start | 25 [7, 59] | 25 [7, 59] |" in text
     assert "| | | then the plain simulator | 25 [7, 59] (25, 25) | 75 [41, 93] |" in text
+
+
+def test_a_task_of_its_own_brings_its_encoder_and_its_name(budget, tmp_path, monkeypatch):
+    flags = ["--task=cross_gentle", "--recipe=pads", '--dppo={"encoder": "trained"}', "--jobs=2"]
+    monkeypatch.setattr("sys.argv", ["compare_reality.py", f"--output_dir={tmp_path}", *flags])
+    _, own = compare.parse()
+    encoder, record, pretrain = compare.imitation_stages(own)
+    for stage in (encoder, record, pretrain):
+        assert flags_of(stage).get("env.pair", "cross") == "cross"
+    assert flags_of(record)["env.randomization.part_friction"] == "[0.2, 0.45]"
+    assert flags_of(encoder)["env.sensor_model"].endswith("plain/sensor_model.json")
+    assert flags_of(pretrain)["policy.pretrained_encoder"] == str(encoder.output)
+    assert set(pretrain.needs) == {"record", "encoder"}
+    assert flags_of(compare.start_stage(own, 0))["dppo.encoder"] == "trained"
+    leave_results(compare, budget, {}, budget.seeds)
+    rows = [row for row, _ in compare.reality_rows(budget.output_dir, dict.fromkeys(ORIGIN), "cross_gentle")]
+    assert "| cross, 2 mm, 5 N at most (cross_gentle): row sharing, hysteresis | backlash |" in table(
+        "reality", rows
+    )
 
 
 def test_unfinished_seeds_are_left_out(budget):

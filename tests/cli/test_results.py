@@ -6,6 +6,7 @@ import re
 import sys
 from dataclasses import asdict, replace
 from pathlib import Path
+from statistics import mean
 
 import collect_results
 import make_tables
@@ -15,9 +16,13 @@ import pytest
 from lerobot_vtrefine.cli import demo
 from lerobot_vtrefine.cli.report.statistics import mean_interval, wilson_interval
 from lerobot_vtrefine.cli.results import provenance
-from lerobot_vtrefine.cli.results.collect import largest_fall
+from lerobot_vtrefine.cli.results.cells import difference, pooled
+from lerobot_vtrefine.cli.results.collect import largest_fall, run_rows, steps_to
+from lerobot_vtrefine.cli.results.published import IMITATION, PAIRS, TUNED, with_demonstrations
 from lerobot_vtrefine.cli.results.rows import Line, Row, Run, merge, read_all, read_rows, write_rows
-from lerobot_vtrefine.cli.results.tables import BLOCK, difference, fill, pooled, table
+from lerobot_vtrefine.cli.results.tables import BLOCK, fill, table
+from lerobot_vtrefine.finetune.logger import ProgressLog
+from lerobot_vtrefine.finetune.pipeline import CONFIG_NAME
 
 ROOT = Path(__file__).parents[2]
 RESULTS = ROOT / "results"
@@ -49,7 +54,7 @@ def test_documents_hold_the_tables_of_the_files() -> None:
         shown |= {block[1] for block in BLOCK.findall(text)}
         outside = re.sub(r"```.*?```", "", BLOCK.sub("", text), flags=re.DOTALL)
         assert [line for line in outside.splitlines() if line.startswith("|")] == [], path.name
-    assert shown == {row.table for row in rows}
+    assert shown == {row.table for row in rows} | {"handling"}
 
 
 def test_curves_are_small_and_belong_to_rows() -> None:
@@ -175,6 +180,86 @@ def test_converging_runs_show_mean_worst_seed_and_cost() -> None:
     expected = "| square_1mm | vision only | after DPPO | 95 [82, 108] (96, 94) | 94 | 150 | 123 456 | 8 |"
     assert expected in table("converges", rows)
     assert "| 150 | - | 8 |" in table("converges", [replace(row, env_steps=None) for row in rows])
+
+
+def test_handling_stands_beside_success_and_touch_is_compared_seed_by_seed() -> None:
+    rows = [
+        run_of(0.9, seed, table="converges", task="cross", policy=policy, extra={"mean_peak_force_n": force})
+        for policy, forces in (("visual", (4.0, 5.0)), ("visuo_tactile", (3.0, 4.4)))
+        for seed, force in enumerate(forces)
+    ]
+    text = table("handling", [*rows, run_of(0.5, 9, table="converges", task="never measured")])
+    assert "| cross | after DPPO | vision only | - | - | 4.5 [-1.9, 10.9] | - | - |" in text
+    assert "| cross | after DPPO | touch minus vision | - | - | -0.8 [-3.3, 1.7] | - | - |" in text
+    assert "never measured" not in text
+
+
+def test_samples_stand_beside_the_references() -> None:
+    curve = [
+        {"iteration": 0.0, "env_steps": 0.0, "eval_success": 0.4},
+        {"iteration": 1.0, "env_steps": 5_000.0},
+        {"iteration": 2.0, "env_steps": 10_000.0, "eval_success": 0.8},
+        {"iteration": 3.0, "env_steps": 20_000.0, "eval_success": 0.7},
+    ]
+    assert steps_to(curve) == {"steps_to_0.5": 10_000.0, "steps_to_0.75": 10_000.0}
+    rows = [run_of(0.7, None, table="reference", variant="reference DPPO", extra=steps_to(curve))]
+    end = "| reference DPPO | 70 [63, 76] | 123 456 | 10 000 | 10 000 | - |"
+    assert end in table("reference", rows)
+
+
+def test_a_runs_own_evaluations_bring_what_they_measured(tmp_path: Path) -> None:
+    """Before its first iteration, and after its last."""
+    log = ProgressLog(tmp_path, 0, None)
+    for iteration, success, force in ((0, 0.4, 1.23456), (2, 0.9, 2.0)):
+        log.add(iteration, {"eval_success": success, "eval_peak_force_n": force, "env_steps": 100.0})
+    settings = {"dppo": {"iterations": 2, "num_envs": 8}, "eval": {"n_episodes": 8}, "seed": 3}
+    (tmp_path / CONFIG_NAME).write_text(json.dumps(settings))
+    named = {"table": "converges", "task": "cross", "policy": "visual"}
+    before, after = (row for row, _ in run_rows(tmp_path, named, ORIGIN))
+    assert before.extra == {"mean_peak_force_n": 1.235}
+    assert after.extra["mean_peak_force_n"] == 2.0
+    assert "| cross | imitation | vision only | - | - | 1.2 | - | - |" in table("handling", [before, after])
+
+
+def test_the_papers_numbers_are_the_papers() -> None:
+    """Its text: fine-tuning with touch reaches .856 over the five pairs, with vision .602."""
+    for name, expected in (("visuo_tactile", 0.856), ("visual", 0.602)):
+        assert mean(pair[name][TUNED] for pair in PAIRS.values()) == pytest.approx(expected)
+
+
+def test_pairs_stand_beside_the_papers_and_their_mean_counts_seeds_that_all_have() -> None:
+    rows = [
+        run_of(rate, seed, table="paper", task=f"automate/{pair}", policy=policy, episodes=100)
+        for pair, policy, rates in (
+            ("00186", "visual", (0.5, 0.7)),
+            ("00186", "visuo_tactile", (0.9, 0.8)),
+            ("00446", "visual", (0.6, 0.6)),
+            ("00446", "visuo_tactile", (0.8, 0.9, 1.0)),
+            ("00007", "visuo_tactile", (1.0,)),
+        )
+        for seed, rate in enumerate(rates)
+    ]
+    lines = table("paper", rows).splitlines()
+    assert lines[2] == (
+        "| DPPO after imitation | automate/00186 | 60 [-67, 187] (50, 70) | 72 | 85 [21, 149] (90, 80) | 94"
+        " | +25 [-166, 216] | +22 |"
+    )
+    assert lines[3].startswith("| DPPO after imitation | automate/00007 | - | 84 | 100 [96, 100] | 98 | - |")
+    assert lines[5] == (
+        "| DPPO after imitation | mean of 2 | 60 [-4, 124] (55, 65) | 54 | 85 [85, 85] (85, 85) | 85"
+        " | +25 [-39, 89] | +31 |"
+    )
+
+
+def test_fewer_demonstrations_stand_beside_the_papers() -> None:
+    named = {"table": "demonstrations", "task": "automate/00186", "policy": "visuo_tactile", "episodes": 100}
+    rows = [
+        run_of(rate, 0, **named, variant=with_demonstrations(count, kind))
+        for count, kind, rate in ((10, TUNED, 0.8), (30, IMITATION, 0.5))
+    ]
+    lines = table("demonstrations", rows).splitlines()
+    assert lines[2] == "| DPPO after imitation | 10 | - | 21 | 80 [71, 87] | 34 | - | +13 |"
+    assert lines[3] == "| imitation | 30 | - | 40 | 50 [40, 60] | 48 | - | +8 |"
 
 
 def test_the_experts_table_lays_bodies_and_starts_beside_each_other() -> None:

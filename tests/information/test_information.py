@@ -2,6 +2,7 @@
 
 import html
 import re
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -24,6 +25,7 @@ from lerobot_vtrefine.information.frames import Frames, MisjudgedHolds
 from lerobot_vtrefine.information.page import render_page
 from lerobot_vtrefine.information.quantities import NAMES, Grasps, observe, part_poses
 from lerobot_vtrefine.information.study import Effort, Finding, Study, as_json, save_keeper, study
+from lerobot_vtrefine.information.tolerance import LATERAL, SIZES, TILT, Tolerated, tolerance
 from lerobot_vtrefine.sim.config import GraspedStart, TaskConfig
 from lerobot_vtrefine.sim.ik import hand_poses
 from lerobot_vtrefine.sim.poses import Poses, rotation_vector
@@ -118,7 +120,11 @@ def test_a_study_leaves_encoders_that_policies_start_from(tmp_path: Path) -> Non
 
     env = VtRefineEnvConfig(start="grasped", episode_steps=3)
     effort = Effort(episodes=8, num_envs=4, steps=2, batch_size=8, history=(1,), closed_loop_episodes=4)
+    effort = replace(effort, tolerance_episodes=4, clearances_m=(0.001,))
     found = study(env, ["tactile"], effort, keep=save_keeper(tmp_path, effort))
+    assert list(found.at_clearance) == [0.001]
+    assert found.at_clearance[0.001].prior != found.prior
+    assert [item.success[1] for item in found.tolerated] == [4] * 12
     told = as_json(found, effort)
     assert told["true_state"]["episodes"] == told["findings"][0]["expert"]["episodes"] == 4
     assert set(told["findings"][0]["rms"]) == set(NAMES) == set(told["prior"])
@@ -180,10 +186,43 @@ def test_the_page_draws_every_error_as_a_share_of_the_unseen() -> None:
     prior = dict.fromkeys(NAMES, 2.0)
     rms = dict.fromkeys(NAMES, (1.0, 0.8, 1.2))
     found = Study(prior, [Finding("visual", 1, rms, (3, 8)), Finding("tactile", 10, rms, None)], (8, 8))
-    page = render_page(found, "round")
+    page = render_page(found, "round", 0.002)
     assert found.verdict.reason in html.unescape(page)
     assert page.count("<svg") == 3 + 1
-    bars = re.findall(r'<rect class="bar (?:d|a faded)"[^>]*y="([0-9.]+)"[^>]*height="([0-9.]+)"', page)
+    bars = re.findall(r'<rect class="bar (?:a|m faded)"[^>]*y="([0-9.]+)"[^>]*height="([0-9.]+)"', page)
     assert len(bars) == 3 * 6 * 2 + 1  # and the expert on what vision tells; what was not measured has no bar
     heights = {float(height) for _, height in bars[: 3 * 6 * 2]}
     assert sorted(heights) == pytest.approx([182 * 0.5 / 1.1], abs=0.1)
+
+
+def test_an_error_of_known_size_costs_success(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(SIZES, LATERAL, (0.0, 0.004))
+    monkeypatch.setitem(SIZES, TILT, ())
+    none, large = tolerance(VtRefineEnvConfig(start="grasped"), 6, 6)
+    assert (none.size, none.success) == (0.0, (6, 6))
+    assert large.success[0] <= 2  # beside a hole that leaves 1 mm on each side
+
+
+def test_the_page_draws_curves_where_they_were_measured() -> None:
+    """A set of senses stands at its own error; the line of errors ends at the largest clearance."""
+    rms = {name: (3.0 if name.endswith("_x") else 1.0, 0.8, 1.2) for name in NAMES}
+    findings = [Finding("visual", 1, rms, (6, 8))]
+    found = Study(
+        dict.fromkeys(NAMES, 2.0),
+        findings,
+        (8, 8),
+        [Tolerated(LATERAL, 0.0, (8, 8)), Tolerated(LATERAL, 0.002, (2, 8)), Tolerated(TILT, 0.1, (4, 8))],
+        {0.001: Study({}, findings, (7, 8))},
+    )
+    page = render_page(found, "cross", 0.002)
+    assert page.count("<svg") == 3 + 1 + 2 + 2
+    pictures = re.findall(r'<svg[^>]*aria-label="([^"]*)"(.*?)</svg>', page, re.DOTALL)
+    drawn = dict(pictures)["success against error of where the hole is, per axis"]
+    (place,) = re.findall(r'class="dot a" cx="([0-9.]+)" cy="([0-9.]+)"', drawn)
+    end = np.hypot(3.0, 1.0) / np.sqrt(2)  # RMS over both axes, beyond the sizes
+    assert float(place[0]) == pytest.approx(62 + 440 / 1.05, abs=0.1)
+    assert f">{end:.0f}<" in drawn
+    assert float(place[1]) == pytest.approx(28 + 220 * 0.25, abs=0.1)
+    both = dict(pictures)["error against clearance"]
+    assert len(re.findall('class="dot a"', both)) == 2
+    assert "Other clearances" not in render_page(replace(found, at_clearance={}), "cross", 0.002)

@@ -12,8 +12,9 @@ from pathlib import Path
 from typing import Any
 
 from lerobot_vtrefine.cli.results.provenance import FILE_NAME
+from lerobot_vtrefine.cli.results.published import IMITATION
 from lerobot_vtrefine.cli.results.rows import Line, Row, Run, merge, read_rows, write_rows
-from lerobot_vtrefine.cli.results.tables import IMITATION, MEASURED
+from lerobot_vtrefine.cli.results.tables import HANDLING, MEASURED, REACHED
 from lerobot_vtrefine.finetune.logger import read_progress
 from lerobot_vtrefine.finetune.pipeline import CONFIG_NAME
 
@@ -122,7 +123,8 @@ def finetune_row(
         extra={
             "largest_fall": largest_fall(progress),
             "seconds": round(sum(row.get("seconds", 0.0) for row in progress), 1),
-        },
+        }
+        | handling(progress[-1]),
         **origin_of(folder, **origin),
     )
     return row, progress
@@ -151,10 +153,16 @@ def earlier_rows(final: Run, progress: Progress) -> list[Run]:
             success=row["eval_success"],
             iterations=int(row["iteration"]),
             env_steps=int(row.get("env_steps", 0)),
-            extra={},
+            extra=handling(row),
         )
         for name, row in named
     ]
+
+
+def handling(row: dict[str, float]) -> dict[str, float]:
+    """What an evaluation of a run's own measured beside success: means over its episodes, in four digits."""
+    names = {f"mean_{key}": f"eval_{key}" for key, *_ in HANDLING}
+    return {name: float(f"{row[column]:.4g}") for name, column in names.items() if column in row}
 
 
 def last_steps(progress: Progress) -> int | None:
@@ -171,6 +179,15 @@ def largest_fall(progress: Progress) -> float:
         if 2 * row["iteration"] > progress[-1]["iteration"]:
             falls.append(best - success)
     return round(max(falls), 4)
+
+
+def steps_to(progress: Progress) -> dict[str, float]:
+    """Environment steps at the first evaluation that found at least these successes, by ``steps_to_RATE``."""
+    found = {}
+    for rate in REACHED:
+        steps = [row["env_steps"] for row in progress if row.get("eval_success", -1.0) >= rate]
+        found |= {f"steps_to_{rate}": float(steps[0])} if steps else {}
+    return found
 
 
 def printed_lines(path: Path, name: str, origin: dict[str, str | None]) -> list[Row]:

@@ -120,9 +120,11 @@ class Line(Row):
         "ingredients",
         "jittered",
         "servo",
+        "step_mm",
         "step_size",
         "sysid",
         "tactile",
+        "tolerance",
         "touch_tasks",
         "worlds",
     )

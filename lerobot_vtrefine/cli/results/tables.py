@@ -5,131 +5,52 @@ Wilson's over pooled episodes or Student's t over seeds; parentheses hold each s
 """
 
 import re
-from collections.abc import Callable, Iterator, Sequence
-from statistics import mean, median
+from collections.abc import Callable, Mapping, Sequence
+from statistics import median
 
 from lerobot_vtrefine.cli.report.statistics import mean_interval, wilson_interval
+from lerobot_vtrefine.cli.results.cells import (
+    LABELS,
+    average,
+    difference,
+    groups,
+    interval,
+    label,
+    markdown,
+    over_seeds,
+    percent,
+    pick,
+    plural,
+    pooled,
+    values,
+)
+from lerobot_vtrefine.cli.results.paper_tables import demonstrations_table, paper_table
+from lerobot_vtrefine.cli.results.published import IMITATION, TUNED
 from lerobot_vtrefine.cli.results.rows import Line, Row, Run
 
-IMITATION = "imitation"
 BLOCK = re.compile(r"(<!-- table: (\w+) -->\n).*?(<!-- end -->)", re.DOTALL)
 LEADING_POINT = re.compile(r"(?<![\d.])\.(?=\d)")
-LABELS = {
-    "demo": "demo: round pair, 2 mm clearance",
-    "round_grasped": "round pair, 2 mm, slip 2 mm / 0.05 rad",
-    "demo_schedule": "the demo, 128 environments on two cores",
-    "kinova_blind_cloud": "two Kinova Gen3, round pair, the paper's cloud, camera blocked, two cores",
-    "kinova_blind": "two Kinova Gen3, round pair, pads as images, camera blocked, two cores",
-    "kinova_pads": "two Kinova Gen3, round pair, pads as images, two cores",
-    "cross_gentle": "cross, 2 mm, 5 N at most (cross_gentle)",
-    "tight": "tight: 1 mm clearance",
-    "occluded": "occluded: camera above, the hole hidden",
-    "slip": "slip: twice the pose error in the hand",
-    "square_1mm_slip": "square pair, 1 mm, slip 4 mm / 0.1 rad",
-    "short_chunk": "short_chunk: decisions twice as often",
-    "row_sharing+hysteresis": "row sharing, hysteresis",
-    "latency+taxel_gain_spread": "latency 0.2 s, gain spread 0.5",
-    "control_latency+backlash": "commands 0.1 s late, 20 mrad of play in all arm joints",
-    "visuo_tactile": "touch",
-    "visual": "vision only",
-    "aloha": "ALOHA",
-    "kinova": "two Kinova Gen3",
-    "table": "from the table",
-    "grasped": "in hand",
-    "vt_dp3_pads": "vt_dp3: touch and depth",
-    "vt_dp3_pads_visual": "vt_dp3: depth",
-    "act_rgb": "LeRobot's ACT: colour",
-    "diffusion_rgb": "LeRobot's diffusion policy: colour",
-}
-"""Tasks and policies in words; others stand as they are."""
 MEASURED = (
     ("in_hand_shift_m", "in-hand shift of successes, median", 1e3, "mm"),
     ("rim_slide_m", "sliding on the rim, median", 1e3, "mm"),
     ("peak_force_n", "peak force, median", 1.0, "N"),
     ("time_to_success_s", "time to success, median (1 s of it is the hold)", 1.0, "s"),
 )
+HANDLING = (
+    ("in_hand_shift_m", "in-hand shift, mm", 1e3, 2),
+    ("rim_slide_m", "sliding on the rim, mm", 1e3, 1),
+    ("peak_force_n", "peak force, N", 1.0, 1),
+    ("failed_contact_force", "ended by force, %", 100.0, 0),
+    ("time_to_success_s", "time to success, s", 1.0, 1),
+)
+"""What fine-tuning's own evaluations measure beside success, over all episodes (the time: over successes)."""
+REACHED = (0.5, 0.75, 0.9)
+"""Successes whose price in environment steps is told."""
 WORLDS = (
     ("start", "the start"),
     ("plain", "then the plain simulator"),
     ("diagnosed", "then the diagnosed one"),
 )
-
-
-def label(name: str) -> str:
-    """A task or policy in words."""
-    return LABELS.get(name, name)
-
-
-def pick(rows: Sequence[Run], **wanted: str) -> list[Run]:
-    """The rows with these values, by seed."""
-    found = [row for row in rows if all(getattr(row, name) == value for name, value in wanted.items())]
-    return sorted(found, key=lambda row: -1 if row.seed is None else row.seed)
-
-
-def values(rows: Sequence[Run], name: str) -> list[str]:
-    """What a field takes on, in the rows' order."""
-    return list(dict.fromkeys(getattr(row, name) for row in rows))
-
-
-def groups(rows: Sequence[Run]) -> Iterator[list[Run]]:
-    """The runs of every task, policy and variant, by seed; groups in the rows' order."""
-    for task in values(rows, "task"):
-        of_task = pick(rows, task=task)
-        for policy in values(of_task, "policy"):
-            of_policy = pick(of_task, policy=policy)
-            for variant in values(of_policy, "variant"):
-                yield pick(of_policy, variant=variant)
-
-
-def markdown(head: Sequence[str], body: Sequence[Sequence[str]]) -> str:
-    """A Markdown table."""
-    lines = [f"|{'|'.join(f' {cell} ' if cell else ' ' for cell in cells)}|" for cells in (head, *body)]
-    return "\n".join([lines[0], "|" + "---|" * len(head), *lines[1:]])
-
-
-def percent(value: float) -> str:
-    """A share in per cent, without the sign."""
-    return f"{100 * value:.0f}"
-
-
-def interval(low: float, high: float) -> str:
-    """For example ``[62, 75]``."""
-    return f"[{percent(low)}, {percent(high)}]"
-
-
-def pooled(rows: Sequence[Run], seeds: bool = True, bounds: bool = True, unit: str = "") -> str:
-    """Success over all episodes with Wilson's interval, and each seed's; a dash without rows."""
-    if not rows:
-        return "-"
-    whole = [row for row in rows if row.seed is None] or rows
-    successes, episodes = sum(row.successes for row in whole), sum(row.episodes for row in whole)
-    text = percent(successes / episodes) + unit
-    text += " " + interval(*wilson_interval(successes, episodes)) if bounds else ""
-    single = [percent(row.success) for row in rows if row.seed is not None]
-    return f"{text} ({', '.join(single)})" if seeds and len(single) > 1 else text
-
-
-def over_seeds(rows: Sequence[Run], unit: str = "") -> str:
-    """Mean success over seeds with the t-interval, and each seed's; of one seed, as `pooled` tells it."""
-    if len(rows) < 2:
-        return pooled(rows, unit=unit)
-    middle, *bounds = mean_interval([row.success for row in rows])
-    return f"{percent(middle)}{unit} {interval(*bounds)} ({', '.join(percent(row.success) for row in rows)})"
-
-
-def difference(one: Sequence[Run], two: Sequence[Run]) -> str:
-    """Two minus one over the seeds that both have, in points, with the t-interval."""
-    before = {row.seed: row.success for row in one}
-    changes = [row.success - before[row.seed] for row in two if row.seed in before and row.seed is not None]
-    if not changes:
-        return "-"
-    middle, *bounds = mean_interval(changes)
-    return f"{100 * middle:+.0f}" + (f" {interval(*bounds)}" if len(changes) > 1 else "")
-
-
-def plural(noun: str, numbers: Sequence[object]) -> str:
-    """For example ``seed 0`` or ``seeds 0, 1``."""
-    return f"{noun}{'s' * (len(numbers) > 1)} {', '.join(map(str, numbers))}"
 
 
 def demo_table(rows: Sequence[Run]) -> str:
@@ -187,7 +108,8 @@ def reality_table(rows: Sequence[Run]) -> str:
         for world, words in WORLDS:
             home = "the plain simulator" if world == "start" else "its own simulator"
             away = pooled(pick(chosen, variant=f"{world} in reality"), seeds=world != "start")
-            first = [label(task), named] if world == "start" else ["", ""]
+            hidden = ": ".join(map(label, task.split(": ")))
+            first = [hidden, named] if world == "start" else ["", ""]
             body.append(
                 [*first, words, away, pooled(pick(chosen, variant=f"{world} in {home}"), seeds=False)]
             )
@@ -238,6 +160,68 @@ def runs_table(rows: Sequence[Run]) -> str:
     return markdown([*head, "largest fall, last half"], body)
 
 
+def reference_table(rows: Sequence[Run]) -> str:
+    """The reference DPPO beside ours: where each ends, and how many environment steps a success cost."""
+    body = []
+    for runs in groups(rows):
+        costs = [[row.extra.get(f"steps_to_{rate}") for row in runs] for rate in REACHED]
+        cells = [average([None if cost is None else round(float(cost)) for cost in found]) for found in costs]
+        named = [label(runs[0].task), label(runs[0].policy), runs[0].variant]
+        body.append([*named, over_seeds(runs), average([row.env_steps for row in runs]), *cells])
+    head = ["task", "policy", "learnt by", "held out, at the end", "environment steps"]
+    return markdown([*head, *(f"to the first {percent(rate)} %" for rate in REACHED)], body)
+
+
+def measured(rows: Sequence[Row]) -> list[Run]:
+    """The runs of ``converges`` whose own evaluation measured more than success."""
+    runs = [row for row in rows if isinstance(row, Run) and row.table == "converges"]
+    return [row for row in runs if any(f"mean_{key}" in row.extra for key, *_ in HANDLING)]
+
+
+def handling_table(rows: Sequence[Run]) -> str:
+    """How gently policies handle the parts: before and after DPPO, and what touch changes, over seeds."""
+    body = []
+    for task in values(rows, "task"):
+        for variant, words in ((IMITATION, IMITATION), (TUNED, "after DPPO")):
+            touch, sight = (
+                pick(rows, task=task, policy=name, variant=variant) for name in ("visuo_tactile", "visual")
+            )
+            for runs in (touch, sight):
+                if runs:
+                    cells = [_spread(_extra(runs, key), scale, digits) for key, _, scale, digits in HANDLING]
+                    body.append([label(task), words, label(runs[0].policy), *cells])
+            if touch and sight:
+                cells = [
+                    _spread(_changes(_extra(sight, key), _extra(touch, key)), scale, digits, "+")
+                    for key, _, scale, digits in HANDLING
+                ]
+                body.append([label(task), words, "touch minus vision", *cells])
+    return markdown(["task", "", "policy", *(words for _, words, *_ in HANDLING)], body)
+
+
+def _extra(rows: Sequence[Run], key: str) -> dict[int | None, float]:
+    """A measured mean by seed."""
+    return {row.seed: float(row.extra[f"mean_{key}"]) for row in rows if f"mean_{key}" in row.extra}
+
+
+def _changes(
+    before: Mapping[int | None, float], after: Mapping[int | None, float]
+) -> dict[int | None, float]:
+    """After minus before, of the seeds that both have."""
+    return {seed: value - before[seed] for seed, value in after.items() if seed in before}
+
+
+def _spread(found: Mapping[int | None, float], scale: float, digits: int, sign: str = "") -> str:
+    """Mean over seeds with its t-interval; a dash without any."""
+    if not found:
+        return "-"
+    numbers = [round(scale * value, digits) + 0.0 for value in mean_interval(list(found.values()))]
+    middle, low, high = (
+        f"{value:{sign if place == 0 else ''}.{digits}f}" for place, value in enumerate(numbers)
+    )
+    return f"{middle} [{low}, {high}]" if len(found) > 1 else middle
+
+
 def policies_table(rows: Sequence[Run]) -> str:
     """Policies trained on the same demonstrations, beside each other."""
     body = []
@@ -247,12 +231,6 @@ def policies_table(rows: Sequence[Run]) -> str:
         body.append([*named, over_seeds(runs, " %"), episodes])
     head = ["task", "policy and what it sees", "trained on", "success: mean over seeds [t-interval] (each)"]
     return markdown([*head, "episodes a seed"], body)
-
-
-def average(counts: Sequence[int | None]) -> str:
-    """Mean of counts with thin groups of thousands; a dash where one was not recorded."""
-    known = [count for count in counts if count is not None]
-    return f"{mean(known):,.0f}".replace(",", " ") if known and len(known) == len(counts) else "-"
 
 
 def lines_table(rows: Sequence[Line]) -> str:
@@ -268,6 +246,8 @@ RENDERERS: dict[str, Callable[[Sequence], str]] = (
     | dict.fromkeys(Line.TABLES, lines_table)
     | {"demo": demo_table, "touch": touch_table, "twin": touch_table, "reality": reality_table}
     | {"expert": expert_table, "policies": policies_table}
+    | {"paper": paper_table, "demonstrations": demonstrations_table, "handling": handling_table}
+    | {"reference": reference_table}
 )
 
 
@@ -277,7 +257,7 @@ def table(name: str, rows: Sequence[Row]) -> str:
     Raises:
         ValueError: there is no such table, or no row of it.
     """
-    chosen = [row for row in rows if row.table == name]
+    chosen = measured(rows) if name == "handling" else [row for row in rows if row.table == name]
     if not chosen:
         raise ValueError(f"table {name}: results/ hold no rows of it; tables: {', '.join(RENDERERS)}")
     origin = {field: dict.fromkeys(getattr(row, field) for row in chosen) for field in ("commit", "machine")}

@@ -1,0 +1,360 @@
+#!/usr/bin/env python
+"""The paper's tables in simulation: AutoMate pairs from the table, with vision and with touch, by DPPO.
+
+    python scripts/compare_paper.py --mesh_dir=MESHES --seeds 0 1 2 --jobs 12
+    python scripts/compare_paper.py --mesh_dir=MESHES --pairs 00186 --demonstrations 10 30 50 --jobs 12
+    make tables
+
+MESHES holds ID_plug.obj and ID_socket.obj. Per pair and seed demonstrations are recorded once, from the
+table. Policies with touch and with vision only learn from them by stock lerobot-train and are fine-tuned by
+DPPO, once more from random weights (one step of imitation); stock lerobot-eval judges each, always from the
+table, on episodes that are the same for all. --tune_start=grasped lets DPPO practise with both parts in hand,
+which takes a fifth of the time, where a pair can be put into the hands.
+
+Every policy becomes rows of results/paper.json, or of results/demonstrations.json, as soon as it is judged.
+The same command again goes on where it was: finished stages are not repeated, nor policies whose rows are
+there with these numbers of episodes and iterations, so that it may go on on another machine.
+
+The encoder of --recipe=pads knows parts in the hands, and no table; to tune it on:
+--policy='{"freeze_encoder": false}' --dppo='{"encoder": "trained"}'.
+"""
+
+import argparse
+import json
+import sys
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from compare_touch import MODALITIES, run_all
+
+from lerobot_vtrefine.cli.arguments import CommandParser, flags
+from lerobot_vtrefine.cli.errors import run_cli
+from lerobot_vtrefine.cli.pipeline.demo_config import (
+    EVAL_SEED_OFFSET,
+    RECIPES,
+    SEED_STRIDE,
+    TRAIN_SEED_OFFSET,
+    default_degradation,
+)
+from lerobot_vtrefine.cli.pipeline.stages import Stage, StageRunner
+from lerobot_vtrefine.cli.report.results import load_evaluation
+from lerobot_vtrefine.cli.results.collect import Progress, largest_fall, last_steps, save
+from lerobot_vtrefine.cli.results.provenance import provenance
+from lerobot_vtrefine.cli.results.published import (
+    DEMONSTRATIONS,
+    IMITATION,
+    SCRATCH,
+    TUNED,
+    with_demonstrations,
+)
+from lerobot_vtrefine.cli.results.rows import Row, Run, read_rows
+from lerobot_vtrefine.cli.results.tables import MEASURED
+from lerobot_vtrefine.finetune.logger import read_progress
+from lerobot_vtrefine.shipped import PREFIX
+
+RESULTS = Path(__file__).parents[1] / "results"
+TASKS = {
+    "00081": "automate_00081",
+    "00186": "automate_00186",
+    "00007": "automate_00007",
+    "00446": "automate_00446",
+    "00581": "automate_00581_stands",
+}
+"""Files of configs/env. The shaft of 00581 stays on the table, as the paper's robot leaves it."""
+NEVER_IN_HAND = ("00446", "00581")
+"""Pairs that the hands cannot hold above each other at the start."""
+
+
+@dataclass(frozen=True)
+class Trained:
+    """One policy: pair, senses, seed, and how many demonstrations it learnt from; 0: random weights."""
+
+    pair: str
+    senses: str
+    seed: int
+    demonstrations: int
+
+    @property
+    def learnt_from(self) -> int:
+        """Demonstrations in its dataset, from which random weights take the scale of actions alone."""
+        return self.demonstrations or DEMONSTRATIONS
+
+    @property
+    def name(self) -> str:
+        """For folders and stages."""
+        return f"{self.pair}_{self.senses}_{self.seed}_{self.demonstrations}"
+
+
+def chosen(options: argparse.Namespace) -> list[Trained]:
+    """Every policy; seeds side by side share the GPUs by turns."""
+    counts = [*options.demonstrations, *([] if options.no_scratch else [0])]
+    return [
+        Trained(pair, senses, seed, count)
+        for pair in options.pairs
+        for count in counts
+        for seed in options.seeds
+        for senses in MODALITIES
+    ]
+
+
+def task_flags(options: argparse.Namespace, pair: str) -> list[str]:
+    """The pair's task, from the table."""
+    meshes = [f"--env.mesh_dir={options.mesh_dir}"]
+    return [f"--config_path={PREFIX}{TASKS[pair]}", *meshes, *flags("env", options.env)]
+
+
+def dataset(options: argparse.Namespace, policy: Trained) -> Path:
+    """Demonstrations of a pair and seed; fewer are the first of more."""
+    return options.output_dir / f"demos_{policy.pair}_{policy.seed}_{policy.learnt_from}"
+
+
+def record_stage(options: argparse.Namespace, policy: Trained) -> Stage:
+    """The demonstrations, which policies share."""
+    root = dataset(options, policy)
+    command = (
+        "vtrefine-record-demos",
+        *task_flags(options, policy.pair),
+        f"--root={root}",
+        f"--num_episodes={policy.learnt_from}",
+        f"--num_envs={options.demo_envs}",
+        f"--seed={policy.seed * SEED_STRIDE}",
+        *flags("degradation", default_degradation()),
+    )
+    product = root / "meta" / "info.json"
+    return Stage(root.name, f"Record {root.name}", command, root, product, resumable=True)
+
+
+def imitation_stage(options: argparse.Namespace, policy: Trained) -> Stage:
+    """Stock lerobot-train on the first demonstrations, or one step of it: random weights."""
+    out = options.output_dir / f"imitation_{policy.name}"
+    recipe: dict[str, Any] = RECIPES[options.recipe]["policy"] | options.policy
+    if options.recipe == "pads":
+        recipe = {"pretrained_encoder": options.encoder.format(pair=policy.pair)} | recipe
+    steps = options.steps if policy.demonstrations else 1
+    command = (
+        "lerobot-train",
+        "--dataset.repo_id=local/vtrefine_demos",
+        f"--dataset.root={dataset(options, policy)}",
+        *flags("policy", {"type": "vt_dp3"} | recipe),
+        f"--policy.modalities={policy.senses}",
+        f"--policy.device={options.device}",
+        "--policy.push_to_hub=false",
+        f"--output_dir={out}",
+        f"--steps={steps}",
+        f"--save_freq={steps}",
+        f"--batch_size={options.batch_size}",
+        f"--seed={policy.seed}",
+        "--num_workers=0",  # items come from memory
+        "--env_eval_freq=0",
+    )
+    product = checkpoint(out) / "model.safetensors"
+    needs = (dataset(options, policy).name,)
+    return Stage(out.name, f"Imitation {policy.name}", command, out, product, needs)
+
+
+def finetune_stage(options: argparse.Namespace, policy: Trained) -> Stage:
+    """DPPO, in a folder from which an interrupted run goes on."""
+    out = options.output_dir / f"finetune_{policy.name}"
+    grasped = options.tune_start == "grasped" and policy.pair not in NEVER_IN_HAND
+    start = options.output_dir / f"imitation_{policy.name}"
+    command = (
+        "vtrefine-finetune",
+        *task_flags(options, policy.pair),
+        *(["--env.start=grasped"] if grasped else []),
+        f"--env.backend={options.backend}",
+        f"--policy.path={checkpoint(start)}",
+        f"--policy.device={options.device}",
+        *flags("dppo", dppo_settings(options)),
+        f"--dppo.iterations={iterations_of(options, policy)}",
+        f"--dppo.num_envs={options.worlds}",
+        "--eval_freq=0",
+        f"--seed={policy.seed * SEED_STRIDE + TRAIN_SEED_OFFSET}",
+        f"--output_dir={out}",
+        "--resume=true",
+    )
+    product = checkpoint(out) / "model.safetensors"
+    return Stage(out.name, f"DPPO {policy.name}", command, out, product, (start.name,), resumable=True)
+
+
+def dppo_settings(options: argparse.Namespace) -> dict[str, Any]:
+    """The recipe's, with the preset for many worlds on a GPU."""
+    preset = {"type": "trust_region"} if options.backend == "warp" else {}
+    return RECIPES[options.recipe]["dppo"] | preset | options.dppo
+
+
+def iterations_of(options: argparse.Namespace, policy: Trained) -> int:
+    """DPPO iterations: what never succeeds learns nothing, and may be stopped earlier."""
+    return options.iterations if policy.demonstrations else options.scratch_iterations
+
+
+def evaluation_stage(options: argparse.Namespace, policy: Trained, stage: str) -> Stage:
+    """Stock lerobot-eval of ``imitation`` or ``finetune``, from the table."""
+    trained = options.output_dir / f"{stage}_{policy.name}"
+    out = options.output_dir / f"eval_{trained.name}"
+    command = (
+        "lerobot-eval",
+        *task_flags(options, policy.pair),
+        f"--env.backend={options.backend}",
+        f"--policy.path={checkpoint(trained)}",
+        f"--policy.device={options.device}",
+        "--env.video_episodes=0",
+        f"--env.metrics_path={out / 'episodes.jsonl'}",
+        f"--eval.n_episodes={options.episodes}",
+        f"--eval.batch_size={min(options.eval_envs, options.episodes)}",
+        f"--seed={first_seed(policy)}",
+        f"--output_dir={out}",
+    )
+    return Stage(out.name, f"Evaluate {trained.name}", command, out, out / "eval_info.json", (trained.name,))
+
+
+def checkpoint(folder: Path) -> Path:
+    """What --policy.path takes."""
+    return folder / "checkpoints" / "last" / "pretrained_model"
+
+
+def first_seed(policy: Trained) -> int:
+    """Of the evaluation; the same for all policies of a seed."""
+    return policy.seed * SEED_STRIDE + EVAL_SEED_OFFSET
+
+
+def stages(options: argparse.Namespace, policy: Trained) -> list[Stage]:
+    """All of one policy's. Random weights are not judged before DPPO."""
+    before = [record_stage(options, policy), imitation_stage(options, policy)]
+    if policy.demonstrations:
+        before.append(evaluation_stage(options, policy, "imitation"))
+    return [*before, finetune_stage(options, policy), evaluation_stage(options, policy, "finetune")]
+
+
+def variants(policy: Trained) -> dict[str, str]:
+    """What its rows are called, by the stage that is judged."""
+    if not policy.demonstrations:
+        return {"finetune": SCRATCH}
+    return {"imitation": IMITATION, "finetune": TUNED}
+
+
+def tables(policy: Trained) -> list[str]:
+    """Tables that it belongs to."""
+    paper = ["paper"] if policy.demonstrations in (0, DEMONSTRATIONS) else []
+    return [*paper, *(["demonstrations"] if policy.demonstrations else [])]
+
+
+def rows(options: argparse.Namespace, policy: Trained, table: str) -> list[tuple[Row, Progress]]:
+    """What was found, with the learning curve beside the tuned policy."""
+    found: list[tuple[Row, Progress]] = []
+    progress = read_progress(options.output_dir / f"finetune_{policy.name}")
+    for stage, kind in variants(policy).items():
+        tuned = stage == "finetune"
+        judged = load_evaluation(options.output_dir / f"eval_{stage}_{policy.name}", first_seed(policy))
+        medians = judged["metrics"]["successes"]
+        extra = {key: medians[key]["median"] for key, *_ in MEASURED if medians.get(key)}
+        if tuned:
+            extra |= {"largest_fall": largest_fall(progress)}
+        row = Run(
+            **key(policy, table, kind),
+            success=judged["success"] / judged["episodes"],
+            episodes=judged["episodes"],
+            iterations=iterations_of(options, policy) if tuned else 0,
+            env_steps=last_steps(progress) if tuned else 0,
+            extra=extra,
+            **provenance() | {"commit": provenance()["commit"] or options.commit},
+        )
+        found.append((row, progress if tuned else []))
+    return found
+
+
+def key(policy: Trained, table: str, kind: str) -> dict[str, Any]:
+    """Table, task, policy, variant and seed of a row."""
+    named = with_demonstrations(policy.demonstrations, kind) if table == "demonstrations" else kind
+    identity = {"table": table, "task": f"automate/{policy.pair}", "policy": policy.senses}
+    return identity | {"variant": named, "seed": policy.seed}
+
+
+def is_done(options: argparse.Namespace, policy: Trained) -> bool:
+    """Whether all rows of a policy are there, with these numbers of episodes and iterations."""
+    for table in tables(policy):
+        path = options.results / f"{table}.json"
+        there = {row.key: row for row in (read_rows(path) if path.is_file() else []) if isinstance(row, Run)}
+        for stage, kind in variants(policy).items():
+            row = there.get(tuple(key(policy, table, kind).values()))
+            wanted = iterations_of(options, policy) if stage == "finetune" else 0
+            if row is None or (row.episodes, row.iterations) != (options.episodes, wanted):
+                return False
+    return True
+
+
+def make_parser() -> CommandParser:
+    """The command line."""
+    parser = CommandParser(description=__doc__)
+    parser.add_argument("--mesh_dir", type=Path, required=True, help="folder of the meshes")
+    parser.add_argument("--pairs", nargs="+", choices=list(TASKS), default=list(TASKS))
+    parser.add_argument("--seeds", type=int, nargs="+", default=[0, 1, 2])
+    parser.add_argument("--demonstrations", type=int, nargs="+", default=[DEMONSTRATIONS])
+    parser.add_argument("--no_scratch", action="store_true", help="leave out DPPO without pre-training")
+    parser.add_argument("--recipe", choices=list(RECIPES), default="pads", help="as vtrefine-demo's")
+    parser.add_argument(
+        "--encoder",
+        default=f"{PREFIX}square_grasped_1mm",
+        help="of --recipe=pads; {pair} stands for the pair's number (default %(default)s)",
+    )
+    parser.add_argument("--steps", type=int, default=6000, help="of imitation")
+    parser.add_argument("--batch_size", type=int, default=128)
+    parser.add_argument("--iterations", type=int, default=60, help="of DPPO")
+    parser.add_argument("--scratch_iterations", type=int, default=20, help="of DPPO without pre-training")
+    parser.add_argument("--worlds", type=int, default=512, help="of DPPO")
+    parser.add_argument("--tune_start", choices=["table", "grasped"], default="table", help="of DPPO")
+    parser.add_argument("--episodes", type=int, default=512, help="of an evaluation")
+    parser.add_argument("--eval_envs", type=int, default=512, help="episodes evaluated at once")
+    parser.add_argument("--demo_envs", type=int, default=16, help="episodes recorded at once")
+    for name, words in (("env", "environment"), ("policy", "policy"), ("dppo", "update")):
+        parser.add_argument(
+            f"--{name}", type=json.loads, default={}, help=f"more flags of the {words}, as JSON"
+        )
+    parser.add_argument("--device", default="cuda", help="of the networks")
+    parser.add_argument("--backend", choices=["batch", "warp"], help="default: warp on cuda, else batch")
+    parser.add_argument("--jobs", type=int, default=1, help="policies side by side (default 1)")
+    parser.add_argument("--commit", help="of the code, where no checkout tells it")
+    parser.add_argument("--output_dir", type=Path, default=Path("outputs/compare_paper"))
+    parser.add_argument("--results", type=Path, default=RESULTS, help="folder of paper.json")
+    parser.add_argument("--only", help=argparse.SUPPRESS)
+    return parser
+
+
+def side_by_side(options: argparse.Namespace, names: list[str]) -> None:
+    """This script again for each of these stages or policies."""
+    again = [sys.executable, __file__, *sys.argv[1:]]
+    commands = {options.output_dir / "runs" / name: [*again, f"--only={name}"] for name in names}
+    if commands:
+        run_all(commands, min(options.jobs, len(commands)))
+
+
+@run_cli
+def main() -> None:
+    """Demonstrations first, then every policy that has no rows yet."""
+    options = make_parser().parse_args()
+    options.backend = options.backend or ("warp" if options.device == "cuda" else "batch")
+    left = [policy for policy in chosen(options) if not is_done(options, policy)]
+    records = {stage.name: stage for stage in (record_stage(options, policy) for policy in left)}
+    if options.only in records:
+        StageRunner(options.output_dir, [records[options.only]]).run()
+    elif options.only is not None:
+        (policy,) = (policy for policy in left if policy.name == options.only)
+        finish(options, policy)
+    elif options.jobs > 1:
+        side_by_side(options, list(records))
+        side_by_side(options, [policy.name for policy in left])
+    else:
+        for policy in left:
+            finish(options, policy)
+
+
+def finish(options: argparse.Namespace, policy: Trained) -> None:
+    """One policy's stages, and its rows."""
+    StageRunner(options.output_dir, stages(options, policy)).run()
+    for table in tables(policy):
+        found = rows(options, policy, table)
+        save(options.results / f"{table}.json", table, found, replace=False)
+
+
+if __name__ == "__main__":
+    raise SystemExit(main())

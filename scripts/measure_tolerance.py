@@ -1,0 +1,67 @@
+#!/usr/bin/env python
+"""How precisely must one know where things are? Rows of results/tolerance.json, task by task.
+
+    python scripts/measure_tolerance.py round_grasped square_grasped_1mm cross_gentle --episodes=256
+    make tables
+
+The scripted expert knows the truth but for an error of a known size, as information/tolerance.py says.
+No sensors, no training: minutes on a CPU. vtrefine-information draws the same as curves, and on them what
+the senses know.
+"""
+
+import sys
+from dataclasses import replace
+from pathlib import Path
+
+import draccus
+import numpy as np
+from lerobot.envs import EnvConfig
+from tqdm import tqdm
+
+from lerobot_vtrefine.cli.arguments import CommandParser
+from lerobot_vtrefine.cli.errors import run_cli
+from lerobot_vtrefine.cli.report.statistics import wilson_interval
+from lerobot_vtrefine.cli.results.cells import interval, percent
+from lerobot_vtrefine.cli.results.collect import save
+from lerobot_vtrefine.cli.results.provenance import provenance
+from lerobot_vtrefine.cli.results.rows import Line
+from lerobot_vtrefine.files import read_yaml
+from lerobot_vtrefine.finetune.pipeline import checked_env
+from lerobot_vtrefine.information.tolerance import LATERAL, SIZES, Tolerated, tolerance
+from lerobot_vtrefine.shipped import find
+
+RESULTS = Path(__file__).parents[1] / "results"
+TABLE = "tolerance"
+
+
+def row(task: str, found: list[Tolerated]) -> Line:
+    """A line of the table: success with Wilson's interval at every size."""
+    cells = {"expert's error, per axis": task}
+    for item in found:
+        size = f"{1e3 * item.size:g} mm" if item.error == LATERAL else f"{np.degrees(item.size):.0f}°"
+        cells[size] = (
+            f"{percent(item.success[0] / item.success[1])} {interval(*wilson_interval(*item.success))}"
+        )
+    return Line(table=TABLE, cells=cells, **provenance())
+
+
+@run_cli
+def main() -> None:
+    """Task by task; each is a row as soon as it is measured."""
+    parser = CommandParser(description=__doc__)
+    parser.add_argument("tasks", nargs="+", help="files of configs/env")
+    parser.add_argument("--episodes", type=int, default=256, help="per size of an error")
+    parser.add_argument("--num_envs", type=int, default=64, help="simulations side by side")
+    parser.add_argument("--backend", choices=["batch", "warp"], default="batch")
+    parser.add_argument("--results", type=Path, default=RESULTS / f"{TABLE}.json")
+    options = parser.parse_args()
+    for task in options.tasks:
+        env = checked_env(draccus.decode(EnvConfig, read_yaml(find("--config_path", task))["env"]))
+        config = replace(env, backend=options.backend)
+        with tqdm(total=sum(map(len, SIZES.values())), desc=task) as bar:
+            found = tolerance(config, options.episodes, options.num_envs, bar.update)
+        save(options.results, TABLE, [(row(task, found), [])], replace=False)
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,83 @@
+"""The paper's tables: policies share demonstrations, become rows, and are not made twice."""
+
+import argparse
+import shutil
+import sys
+from collections.abc import Callable
+from pathlib import Path
+
+import compare_paper as script
+import pytest
+
+from lerobot_vtrefine.cli.results.rows import Run, read_rows
+from lerobot_vtrefine.cli.results.tables import table
+
+PAIRS = ("00007", "00581")
+
+
+def common(folder: Path) -> list[str]:
+    few = ["--episodes=8", "--device=cpu", "--seeds=0", "--mesh_dir=meshes"]
+    return [*few, f"--output_dir={folder / 'out'}", f"--results={folder}"]
+
+
+@pytest.fixture
+def run(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> Callable[..., str]:
+    """Run the script with these arguments beside the common ones; what it reported."""
+
+    def run(*arguments: str) -> str:
+        monkeypatch.setattr(sys, "argv", ["compare_paper.py", *common(tmp_path), *arguments])
+        assert script.main() == 0
+        return capsys.readouterr().err
+
+    return run
+
+
+def of(path: Path) -> dict[str, Run]:
+    return {row.variant: row for row in read_rows(path) if isinstance(row, Run)}
+
+
+def parse(arguments: list[str]) -> argparse.Namespace:
+    return script.make_parser().parse_args(arguments)
+
+
+@pytest.mark.usefixtures("fake_commands")
+def test_policies_become_rows_of_both_tables_and_are_not_made_twice(
+    run: Callable[..., str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(script, "MODALITIES", ("visuo_tactile",))
+    told = run("--pairs", "00186")
+    assert told.count("done before") == 1  # the demonstrations, which random weights share
+    paper, fewer = of(tmp_path / "paper.json"), of(tmp_path / "demonstrations.json")
+    assert set(paper) == {"imitation", "", "without pre-training"}
+    assert (paper[""].success, paper[""].iterations) == (0.75, 60)
+    assert paper["without pre-training"].iterations == 20
+    assert paper["imitation"].extra["peak_force_n"] == 8.0
+    assert set(fewer) == {"30 demonstrations, imitation", "30 demonstrations"}
+    shown = table("paper", [*paper.values()])
+    assert "| DPPO after imitation | automate/00186 | - | 72 | 75 [41, 93] | 94 | - | +22 |" in shown
+    shutil.rmtree(tmp_path / "out")  # another machine
+    assert run("--pairs", "00186") == ""
+    for change, left in ((["--episodes=12"], 2), (["--scratch_iterations=21"], 1), (["--seeds=1"], 2)):
+        options = parse([*common(tmp_path), "--pairs=00186", *change])
+        assert sum(not script.is_done(options, policy) for policy in script.chosen(options)) == left
+
+
+def test_dppo_may_start_in_hand_where_hands_can_hold_and_is_judged_from_the_table() -> None:
+    options = parse(
+        [
+            "--mesh_dir=meshes",
+            "--tune_start=grasped",
+            '--policy={"freeze_encoder": false}',
+            "--encoder=outputs/{pair}",
+            "--pairs",
+            *PAIRS,
+        ]
+    )
+    for policy in script.chosen(options):
+        lines = {stage.name.split("_")[0]: stage.line for stage in script.stages(options, policy)}
+        assert ("--env.start=grasped" in lines.pop("finetune")) == (policy.pair == "00007")
+        assert not any("--env.start" in line for line in lines.values())
+        assert f"--policy.pretrained_encoder=outputs/{policy.pair}" in lines["imitation"]
+        assert f"--config_path=vtrefine:{script.TASKS[policy.pair]}" in lines["eval"]
