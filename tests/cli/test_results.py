@@ -16,7 +16,7 @@ import pytest
 from lerobot_vtrefine.cli import demo
 from lerobot_vtrefine.cli.report.statistics import mean_interval, wilson_interval
 from lerobot_vtrefine.cli.results import provenance
-from lerobot_vtrefine.cli.results.cells import difference, pooled
+from lerobot_vtrefine.cli.results.cells import difference, over_seeds, pooled
 from lerobot_vtrefine.cli.results.collect import largest_fall, run_rows, steps_to
 from lerobot_vtrefine.cli.results.published import IMITATION, PAIRS, TUNED, with_demonstrations
 from lerobot_vtrefine.cli.results.rows import Line, Row, Run, merge, read_all, read_rows, write_rows
@@ -165,6 +165,7 @@ def test_figures_of_a_cell() -> None:
         == "71 (60, 80)"
     )
     assert pooled([]) == "-"
+    assert over_seeds([run_of(0.9, 0), run_of(1.0, 1)]) == "95 [31, 100] (90, 100)"  # no success above all
     one, two = (
         [run_of(rate, seed) for seed, rate in rates] for rates in (((0, 0.5), (1, 0.6)), ((1, 0.7), (2, 0.9)))
     )
