@@ -178,7 +178,7 @@ def test_converging_runs_show_mean_worst_seed_and_cost() -> None:
         run_of(rate, seed, table="converges", task="square_1mm", iterations=150, extra={"largest_fall": fall})
         for seed, rate, fall in ((0, 0.96, 0.02), (1, 0.94, 0.075))
     ]
-    expected = "| square_1mm | vision only | after DPPO | 95 [82, 108] (96, 94) | 94 | 150 | 123 456 | 8 |"
+    expected = "| square_1mm | vision only | after DPPO | 95 [82, 100] (96, 94) | 94 | 150 | 123 456 | 8 |"
     assert expected in table("converges", rows)
     assert "| 150 | - | 8 |" in table("converges", [replace(row, env_steps=None) for row in rows])
 

@@ -98,8 +98,10 @@ def pooled(rows: Sequence[Run], seeds: bool = True, bounds: bool = True, unit: s
 
 
 def over_seeds(rows: Sequence[Run], unit: str = "") -> str:
-    """Mean success over seeds with the part of its t-interval that a success can have, and each seed's; of one
-    seed, as `pooled` tells it."""
+    """Mean success over seeds with its t-interval, as far as a success can lie in it, and each seed's.
+
+    Of one seed, as `pooled` tells it.
+    """
     if len(rows) < 2:
         return pooled(rows, unit=unit)
     middle, *bounds = mean_interval([row.success for row in rows])
