@@ -242,7 +242,7 @@ def test_pairs_stand_beside_the_papers_and_their_mean_counts_seeds_that_all_have
     ]
     lines = table("paper", rows).splitlines()
     assert lines[2] == (
-        "| DPPO after imitation | automate/00186 | 60 [-67, 187] (50, 70) | 72 | 85 [21, 149] (90, 80) | 94"
+        "| DPPO after imitation | automate/00186 | 60 [0, 100] (50, 70) | 72 | 85 [21, 100] (90, 80) | 94"
         " | +25 [-166, 216] | +22 |"
     )
     assert lines[3].startswith("| DPPO after imitation | automate/00007 | - | 84 | 100 [96, 100] | 98 | - |")
