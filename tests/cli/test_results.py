@@ -247,7 +247,7 @@ def test_pairs_stand_beside_the_papers_and_their_mean_counts_seeds_that_all_have
     )
     assert lines[3].startswith("| DPPO after imitation | automate/00007 | - | 84 | 100 [96, 100] | 98 | - |")
     assert lines[5] == (
-        "| DPPO after imitation | mean of 2 | 60 [-4, 124] (55, 65) | 54 | 85 [85, 85] (85, 85) | 85"
+        "| DPPO after imitation | mean of 2 | 60 [0, 100] (55, 65) | 54 | 85 [85, 85] (85, 85) | 85"
         " | +25 [-39, 89] | +31 |"
     )
 
