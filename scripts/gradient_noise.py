@@ -6,6 +6,12 @@
 Prints success of the policy as deployed and with exploration noise, the critic's explained variance on
 episodes that it has not seen, and the cosine between the policy gradients of two halves of the episodes: with
 as many episodes as an iteration has, a step along it is a step in the right direction with about that share.
+
+Then an iteration is made of these episodes, and at its end the gradient is taken apart. PPO's ratio is here
+of probabilities averaged over action elements, whose mean over the sampling policy falls below one as the
+policy moves. So even advantages that are all alike give a gradient: towards the old policy where they are
+positive, and where they are negative away from it, in whatever direction it has moved. "ratio_bias" is the
+length of that part, "gradient" that of the rest.
 """
 
 import argparse
@@ -28,6 +34,7 @@ from lerobot_vtrefine.finetune.critic import explained_variance
 from lerobot_vtrefine.finetune.evaluation import evaluate
 from lerobot_vtrefine.finetune.pipeline import load_practice
 from lerobot_vtrefine.finetune.protocols import Agent, select
+from lerobot_vtrefine.policies.vt_dp3.diffusion import whiten
 
 GROUPS = 8
 """Groups of episodes: the halves are made of them in all ways."""
@@ -72,11 +79,39 @@ def group_gradients(
     return torch.stack(found)
 
 
+def moved_gradients(
+    rollout: dppo.Rollout, advantages: Tensor, agent: Agent, cfg: DppoConfig
+) -> tuple[Tensor, Tensor]:
+    """Policy gradients (P,) at the actor's present weights: with a ratio whose mean is one, and what DPPO's
+    ratio adds.
+
+    The mean of DPPO's is exp(-kl / n) for Gaussian steps and many averaged elements n.
+    """
+    parameters, found = agent.trained_parameters(), []
+    for centred in (True, False):
+        total = [torch.zeros_like(parameter) for parameter in parameters]
+        for part in torch.arange(len(advantages)).split(1024):
+            obs = select(rollout.obs, part)
+            cond = obs["cond"] if agent.frozen_encoder else agent.actor.encode(obs)
+            log_probs, mean, std = chain_log_probs(agent, rollout.latents[part], cond, cfg)
+            log_ratio = log_probs - rollout.log_probs[part]
+            if centred:
+                shift = ((mean - rollout.means[part]) / std)[:, :, agent.executed]
+                log_ratio = log_ratio + 0.5 * whiten(shift, cfg.noise_correlation).square().mean(dim=(2, 3))
+            loss = dppo.policy_loss(log_ratio, advantages[part], cfg).sum() / len(advantages)
+            gradients = torch.autograd.grad(loss, parameters, allow_unused=True)
+            total = [a if b is None else a + b for a, b in zip(total, gradients, strict=True)]
+        found.append(torch.cat([gradient.flatten() for gradient in total]))
+    return found[0], found[1] - found[0]
+
+
 def measure(args: argparse.Namespace) -> dict[str, Any]:
     """The figures of one task and checkpoint."""
     cfg = TrustRegionDppo(num_envs=args.worlds, encoder="frozen", critic_warmup=1)
     if args.std is not None:
         cfg = dataclasses.replace(cfg, min_sampling_std=args.std)
+    if args.nats is not None:
+        cfg = dataclasses.replace(cfg, kl_per_decision=args.nats, kl_per_decision_final=args.nats)
     backend = None if args.device == "cpu" else "warp"
     _, agent, env, _ = load_practice(args.policy, args.task, cfg, args.device, backend)
     state = dppo.TrainState.create(agent, cfg, env.privileged_dim, seed=args.seed)
@@ -90,6 +125,8 @@ def measure(args: argparse.Namespace) -> dict[str, Any]:
     advantages, targets = dppo.decision_advantages(rollout, state, cfg)
     values = state.critic(rollout.privileged[rollout.step, rollout.env])
     half, spread = halves_cosine(group_gradients(rollout, advantages, agent, cfg, args.worlds))
+    moved = dppo.update(rollout, agent, dataclasses.replace(state, iteration=cfg.critic_warmup), cfg)
+    gradient, bias = moved_gradients(rollout, advantages, agent, cfg)
     return {
         "episodes": args.worlds,
         "deployed": deployed.get("eval_success"),
@@ -99,6 +136,9 @@ def measure(args: argparse.Namespace) -> dict[str, Any]:
         "spread_over_halvings": spread,
         "cosine_with_truth": whole_cosine(half),
         "std": cfg.min_sampling_std,
+        "nats_moved": moved["decision_kl"],
+        "gradient": float(gradient.norm()),
+        "ratio_bias": float(bias.norm()),
     }
 
 
@@ -111,6 +151,7 @@ def main() -> int:
     parser.add_argument("--worlds", type=int, default=1024, help="episodes of an iteration")
     parser.add_argument("--device", default="cpu", help="of simulation and policy: cpu or cuda")
     parser.add_argument("--std", type=float, help="of the exploration noise; default: the preset's")
+    parser.add_argument("--nats", type=float, help="an iteration's way, per decision; default: the preset's")
     parser.add_argument("--seed", type=int, default=0, help="of the first episode")
     parser.add_argument("--deployed", action="store_true", help="judge the deployed policy too")
     print(json.dumps(measure(parser.parse_args()), indent=2))
