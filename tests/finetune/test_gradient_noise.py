@@ -34,7 +34,7 @@ def test_noise_alone_points_nowhere():
 
 
 def test_advantages_that_are_all_alike_move_a_policy_by_the_ratios_bias_alone():
-    """The ratio averages over n elements, each shifted by s deviations: its mean over samples of the old policy
+    """The ratio averages over n elements, each shifted by s deviations: its mean over the old policy
     is exp(-(1 - 1/n) s^2 / 2), and exp(s^2 / (2 n)) once it is centred.
     """
     count, elements, std = 400_000, 8, torch.tensor(0.1)
