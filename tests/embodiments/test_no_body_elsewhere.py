@@ -20,7 +20,7 @@ ITS_OWN_HARDWARE = (
     "teleoperators/config_aloha_leader.py",
 )
 ITS_OWN_DATA = ("datasets/importers/aloha_npz.py", "cli/import_dataset.py")
-WHAT_SHIPS_FOR_IT = ("cli/pipeline/demo_config.py", "cli/results/tables.py")
+WHAT_SHIPS_FOR_IT = ("cli/pipeline/demo_config.py", "cli/results/cells.py")
 """The encoder of each body, and what tables call it."""
 
 
