@@ -6,6 +6,7 @@ import errno
 import functools
 import os
 import re
+import select
 import sys
 from collections.abc import Callable, Generator, Iterable, Sequence
 from difflib import get_close_matches
@@ -22,6 +23,8 @@ from lerobot_vtrefine.shipped import expand
 DEBUG_VARIABLE = "VTREFINE_DEBUG"
 USAGE_STATUS = 2
 INTERRUPT_STATUS = 130
+UNREAD_STATUS = 141
+"""As a shell's tools end that write to ``head`` once it has seen enough."""
 
 EXPECTED = (ValueError, OSError, ImportError, DraccusException, YAMLError)
 CONFIG_FLAG = "--config_path"
@@ -133,12 +136,29 @@ def after_interrupt(advice: str) -> Generator[None]:
         raise KeyboardInterrupt(advice) from None
 
 
+def _nobody_reads() -> bool:
+    """Whether standard output goes to a program that has ended; nothing more is written to it then."""
+    try:
+        output = sys.stdout.fileno()
+    except OSError:  # a notebook's
+        return False
+    if not hasattr(select, "poll"):  # Windows
+        return False
+    watched = select.poll()
+    watched.register(output, 0)
+    gone = any(event & (select.POLLERR | select.POLLHUP) for _, event in watched.poll(0))
+    if gone:
+        os.dup2(os.open(os.devnull, os.O_WRONLY), output)  # Python flushes once more at its end
+    return gone
+
+
 def run_cli[**P](main: Callable[P, int | None]) -> Callable[P, int]:
     """Wrap a console entry point so that expected errors end as ``error: ...`` with exit status 2.
 
     ``ValueError``, ``OSError`` (missing files, full disk), ``ImportError`` (an extra is not installed) and
     draccus' parsing errors are expected; anything else is a defect and keeps its traceback. Ctrl-C exits with
-    130. With ``VTREFINE_DEBUG=1`` in the environment every error keeps its traceback.
+    130; where ``head`` has seen enough, a command ends without a word. With ``VTREFINE_DEBUG=1`` in the
+    environment every error keeps its traceback.
     """
 
     @functools.wraps(main)
@@ -147,11 +167,15 @@ def run_cli[**P](main: Callable[P, int | None]) -> Callable[P, int]:
             sys.argv[1:] = expand(sys.argv[1:])
             _check_config_file(sys.argv[1:])
             with _argparse_in_one_line():
-                return main(*args, **kwargs) or 0
+                status = main(*args, **kwargs) or 0
+            sys.stdout.flush()
+            return status
         except KeyboardInterrupt as stopped:
             print(f"interrupted{f': {stopped}' if stopped.args else ''}", file=sys.stderr)
             return INTERRUPT_STATUS
         except (*EXPECTED, *_network_errors(), *_weights_errors()) as error:
+            if isinstance(error, BrokenPipeError) and _nobody_reads():
+                return UNREAD_STATUS
             if os.environ.get(DEBUG_VARIABLE) == "1":
                 raise
             print(f"error: {describe(error)}", file=sys.stderr)

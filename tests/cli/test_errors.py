@@ -1,6 +1,8 @@
 """Expected failures of a command become one line and an exit status."""
 
 import errno
+import subprocess
+import sys
 from dataclasses import dataclass, field
 
 import draccus
@@ -131,3 +133,23 @@ def test_weights_on_a_full_disk_are_one_line(capsys) -> None:
 
     assert run_cli(save)() == 2
     assert capsys.readouterr().err.startswith("error: the disk is full; free some space")
+
+
+@pytest.mark.parametrize("lines", [1, 100_000], ids=["at its end", "while it writes"])
+def test_a_command_whose_reader_has_seen_enough_ends_without_a_word(lines) -> None:
+    command = (
+        "import sys; from lerobot_vtrefine.cli.errors import run_cli;"
+        f"sys.exit(run_cli(lambda: sys.stdin.read() and print('line\\n' * {lines}))())"
+    )
+    pipes = {"stdin": subprocess.PIPE, "stdout": subprocess.PIPE, "stderr": subprocess.PIPE}
+    with subprocess.Popen([sys.executable, "-c", command], text=True, **pipes) as process:
+        process.stdout.close()
+        process.stdin.write("go on")
+        process.stdin.close()
+        told = process.stderr.read()
+    assert (process.returncode, told) == (141, "")
+
+
+def test_another_pipe_that_breaks_is_told(capsys) -> None:
+    assert failing(BrokenPipeError(errno.EPIPE, "Broken pipe"))() == 2
+    assert capsys.readouterr().err == "error: [Errno 32] Broken pipe\n"
