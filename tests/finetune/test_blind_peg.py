@@ -2,6 +2,7 @@
 
 from functools import cache
 
+import pytest
 import torch
 from toy import BlindPeg, ToyActor, blind_peg_demonstrations, clone_behaviour, make_agent
 
@@ -48,6 +49,7 @@ def test_search_is_learnt_when_the_rim_can_be_felt():
     assert after > before + 0.15
 
 
+@pytest.mark.slow
 def test_touch_is_what_makes_the_difference():
     _, felt = success_before_and_after(feel=True, seed=0)
     before, blind = success_before_and_after(feel=False, seed=0)
