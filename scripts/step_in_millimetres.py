@@ -29,9 +29,9 @@ from lerobot_vtrefine.cli.results.rows import Line
 from lerobot_vtrefine.finetune import dppo
 from lerobot_vtrefine.finetune.chains import chain_log_probs, decision_kl
 from lerobot_vtrefine.finetune.config import DppoConfig, TrustRegionDppo
+from lerobot_vtrefine.finetune.evaluation import deployed_chunks
 from lerobot_vtrefine.finetune.pipeline import Practice, load_practice
-from lerobot_vtrefine.finetune.protocols import Agent, predictor
-from lerobot_vtrefine.policies.vt_dp3.diffusion import deploy
+from lerobot_vtrefine.finetune.protocols import Agent
 
 UNBOUND = 1e9
 """Nats that no update reaches."""
@@ -50,17 +50,8 @@ def ways(practice: Practice, cond: Tensor, seed: int) -> Tensor:
     found = []
     for number, part in enumerate(cond.split(PART)):
         generator = torch.Generator(agent.device).manual_seed(seed + number)
-        noise = torch.randn((len(part), *agent.action_shape), generator=generator, device=agent.device)
-        chunks = deploy(
-            agent.process,
-            predictor(agent.actor, part),
-            noise,
-            num_tuned=agent.num_tuned,
-            predict_noise_base=predictor(agent.base, part),
-            eta=agent.deploy_eta,
-            generator=generator,
-        )
-        targets = practice.processors[1](chunks[:, agent.executed]).cpu().double()
+        chunks = deployed_chunks(agent, part, part, generator)
+        targets = practice.processors[1](chunks).cpu().double()
         hands, _ = body.tcp_poses(targets[:, -1])
         found.append(hands[:, plug_hand] - hands[:, socket_hand])
     return torch.cat(found)

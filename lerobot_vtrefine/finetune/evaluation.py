@@ -7,7 +7,6 @@ from lerobot_vtrefine.finetune.distributed import mean_over_ranks, num_ranks, ra
 from lerobot_vtrefine.finetune.protocols import (
     Agent,
     DecisionEnv,
-    Observation,
     execute,
     latest,
     predictor,
@@ -44,7 +43,7 @@ def _evaluate(env: DecisionEnv, agent: Agent, num_episodes: int, first_seed: int
         total, info = torch.zeros(env.num_envs, device=device), {}
         for _ in range(env.max_decisions):
             ids = running.nonzero().squeeze(1)
-            chunks = _deployed_chunks(agent, select(obs, ids), generator)
+            chunks = deployed_chunks(agent, *agent.conditions(select(obs, ids)), generator)
             obs, _, reward, terminated, truncated, news = execute(env, chunks, ids)
             total += reward * running
             info = latest(info, news, running)
@@ -56,9 +55,8 @@ def _evaluate(env: DecisionEnv, agent: Agent, num_episodes: int, first_seed: int
     return mean_over_ranks({key: torch.cat(parts) for key, parts in columns.items()})
 
 
-def _deployed_chunks(agent: Agent, obs: Observation, generator: torch.Generator) -> Tensor:
-    """Executed actions (B, Ta, D) of the deployment sampler."""
-    cond, cond_base = agent.conditions(obs)
+def deployed_chunks(agent: Agent, cond: Tensor, cond_base: Tensor, generator: torch.Generator) -> Tensor:
+    """Executed actions (B, Ta, D) of the deployment sampler, from the actor's and the base's conditions (B, C)."""
     noise = torch.randn((len(cond), *agent.action_shape), generator=generator, device=cond.device)
     chunks = deploy(
         agent.process,
