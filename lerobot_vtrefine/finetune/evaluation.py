@@ -56,7 +56,7 @@ def _evaluate(env: DecisionEnv, agent: Agent, num_episodes: int, first_seed: int
 
 
 def deployed_chunks(agent: Agent, cond: Tensor, cond_base: Tensor, generator: torch.Generator) -> Tensor:
-    """Executed actions (B, Ta, D) of the deployment sampler on the actor's and the base's conditions (B, C)."""
+    """Executed actions (B, Ta, D) of the deployment sampler; conditions (B, C) of actor and base."""
     noise = torch.randn((len(cond), *agent.action_shape), generator=generator, device=cond.device)
     chunks = deploy(
         agent.process,
