@@ -1,7 +1,9 @@
 """Fixtures that several packages' tests share."""
 
 import gc
-from collections.abc import Callable
+import os
+from collections.abc import Callable, Generator
+from functools import cache
 from pathlib import Path
 from typing import Any
 
@@ -34,6 +36,25 @@ def pytest_collection_finish() -> None:
     """
     gc.collect()
     gc.freeze()
+
+
+@pytest.fixture(scope="session", autouse=True)
+def _docstrings_are_read_once() -> None:
+    """For every setting of every parser, draccus looks through the source of its class: half of a parse."""
+    from draccus.wrappers import docstring
+
+    docstring.get_attribute_docstring = cache(docstring.get_attribute_docstring)
+
+
+@pytest.fixture(autouse=True)
+def _ordinary_priority() -> Generator[None]:
+    """SVT-AV1, LeRobot's video codec, gives the thread that starts it real-time priority where root runs it.
+
+    What is started later inherits it; other workers, and the emulated hardware there, get what is left.
+    """
+    yield
+    if hasattr(os, "SCHED_FIFO") and os.sched_getscheduler(0) == os.SCHED_FIFO:
+        os.sched_setscheduler(0, os.SCHED_OTHER, os.sched_param(0))
 
 
 TINY_CAMERA = (24, 32)

@@ -1,3 +1,4 @@
+import importlib
 import os
 import subprocess
 import sys
@@ -44,6 +45,15 @@ def finish(process: subprocess.Popen[str]) -> str:
     return output
 
 
+def lerobot_here(command: str, *arguments: str) -> None:
+    """Run a stock LeRobot command in this process, which has imported LeRobot; raises what it raises."""
+    module = importlib.import_module(f"lerobot.scripts.lerobot_{command}")
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setenv("HF_HUB_OFFLINE", "1")
+        patch.setattr(sys, "argv", [f"lerobot-{command}", *arguments])
+        module.main()
+
+
 def record(root: Path, *arguments: str) -> int:
     """Run ``vtrefine-record-demos`` in this process -> its exit status."""
     from lerobot_vtrefine.cli import record_demos
@@ -82,22 +92,19 @@ def demos(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def checkpoint(demos: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A policy that stock ``lerobot-train`` trained for two steps on ``demos``."""
     out = tmp_path_factory.mktemp("trained") / "run"
-    finish(
-        lerobot(
-            "train",
-            "--policy.type=vt_dp3",
-            "--policy.preset=small",
-            "--policy.device=cpu",
-            "--policy.push_to_hub=false",
-            "--dataset.repo_id=local/vtrefine_demos",
-            f"--dataset.root={demos}",
-            f"--output_dir={out}",
-            "--steps=2",
-            "--save_freq=2",
-            "--batch_size=4",
-            "--num_workers=0",
-            "--wandb.enable=false",
-            cache=out.parent / "hf",
-        )
+    lerobot_here(
+        "train",
+        "--policy.type=vt_dp3",
+        "--policy.preset=small",
+        "--policy.device=cpu",
+        "--policy.push_to_hub=false",
+        "--dataset.repo_id=local/vtrefine_demos",
+        f"--dataset.root={demos}",
+        f"--output_dir={out}",
+        "--steps=2",
+        "--save_freq=2",
+        "--batch_size=4",
+        "--num_workers=0",
+        "--wandb.enable=false",
     )
     return out / "checkpoints" / "last" / "pretrained_model"

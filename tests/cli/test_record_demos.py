@@ -6,7 +6,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from aloha_columns import TACTILE_KEYS
-from conftest import finish, lerobot, record
+from conftest import lerobot_here, record
 from lerobot.datasets import LeRobotDataset
 from local_hub import use_folder_as_hub
 
@@ -73,37 +73,32 @@ def test_failures_are_kept_on_request(tmp_path: Path):
 
 def test_stock_tools_accept_the_dataset(demos: Path, tmp_path: Path):
     shutil.copytree(demos, tmp_path / "copy")
-    delete = lerobot(
-        "edit-dataset",
+    lerobot_here(
+        "edit_dataset",
         "--repo_id=local/vtrefine_demos",
         f"--root={demos}",
         "--new_repo_id=local/fewer",
         f"--new_root={tmp_path / 'fewer'}",
         "--operation.type=delete_episodes",
         "--operation.episode_indices=[1]",
-        cache=tmp_path / "hf1",
     )
-    merge = lerobot(
-        "edit-dataset",
+    lerobot_here(
+        "edit_dataset",
         "--new_repo_id=local/merged",
         f"--new_root={tmp_path / 'merged'}",
         "--operation.type=merge",
         "--operation.repo_ids=['local/vtrefine_demos', 'local/copy']",
         f"--operation.roots=['{demos}', '{tmp_path / 'copy'}']",
-        cache=tmp_path / "hf2",
     )
-    view = lerobot(
-        "dataset-viz",
+    lerobot_here(
+        "dataset_viz",
         "--repo-id=local/vtrefine_demos",
         f"--root={demos}",
         "--episode-index=0",
         "--num-workers=0",
         "--save=1",
         f"--output-dir={tmp_path / 'viz'}",
-        cache=tmp_path / "hf3",
     )
-    for process in (delete, merge, view):
-        finish(process)
     whole, fewer, merged = read(demos), read(tmp_path / "fewer"), read(tmp_path / "merged")
     assert (fewer.num_episodes, merged.num_episodes) == (2, 6)
     assert len(merged) == 2 * len(whole)

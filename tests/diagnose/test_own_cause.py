@@ -95,6 +95,16 @@ def test_every_file_of_the_joints_catalogue_is_asked_about() -> None:
     assert all(joint_candidates.MEANING[name] for name in files)
 
 
+def run(script: str, folder: Path) -> str:
+    """What a script prints that imports the package from a folder, and is run there."""
+    env = os.environ | {"PYTHONPATH": str(folder)}
+    done = subprocess.run(
+        [sys.executable, "-c", script], cwd=folder, env=env, capture_output=True, text=True, check=False
+    )
+    assert done.returncode == 0, done.stderr[-2000:]
+    return done.stdout
+
+
 def test_a_joints_cause_of_ones_own_is_named_reported_and_predicted(tmp_path: Path) -> None:
     copy = tmp_path / "lerobot_vtrefine"
     shutil.copytree(PACKAGE, copy, ignore=shutil.ignore_patterns("__pycache__", "assets"))
@@ -113,12 +123,7 @@ def test_a_joints_cause_of_ones_own_is_named_reported_and_predicted(tmp_path: Pa
         "diagnose.main(['--recording=moves', '--output_dir=out'])\n"
         "predict.main(['--recording=moves', '--sensor_model=out/sensor_model.json', '--output_dir=p'])"
     )
-    env = os.environ | {"PYTHONPATH": str(tmp_path)}
-    done = subprocess.run(
-        [sys.executable, "-c", script], cwd=tmp_path, env=env, capture_output=True, text=True, check=False
-    )
-    assert done.returncode == 0, done.stderr[-2000:]
-    assert "explained: The simulation lacks cogging." in done.stdout
+    assert "explained: The simulation lacks cogging." in run(script, tmp_path)
     (cause,) = json.loads((tmp_path / "out" / "verdict.json").read_text())["causes"]
     size = cause["params"]["elbow_rad"]
     assert size["value"] == pytest.approx(COGGING_RAD, rel=0.05)
@@ -135,16 +140,13 @@ def test_a_cause_of_ones_own_is_named_reported_and_predicted(tmp_path: Path) -> 
     (copy / "diagnose" / "pad" / "candidates" / "column_sharing.py").write_text(CANDIDATE, encoding="utf-8")
     (tmp_path / "reality.json").write_text(json.dumps(HIDDEN), encoding="utf-8")
 
-    def run(*command: str) -> str:
-        env = os.environ | {"PYTHONPATH": str(tmp_path)}
-        done = subprocess.run(
-            [sys.executable, *command], cwd=tmp_path, env=env, capture_output=True, text=True, check=False
-        )
-        assert done.returncode == 0, done.stderr[-2000:]
-        return done.stdout
-
-    run("-m", "lerobot_vtrefine.cli.press", "--reality=reality.json", "--output_dir=presses")
-    said = run("-m", "lerobot_vtrefine.cli.diagnose", "--recording=presses", "--output_dir=out")
+    script = (
+        "from lerobot_vtrefine.cli import diagnose, predict, press\n"
+        "press.main(['--reality=reality.json', '--output_dir=presses'])\n"
+        "diagnose.main(['--recording=presses', '--output_dir=out'])\n"
+        "predict.main(['--recording=presses', '--sensor_model=out/sensor_model.json', '--output_dir=p'])"
+    )
+    said = run(script, tmp_path)
     assert "explained: The simulation lacks column sharing." in said
     verdict = json.loads((tmp_path / "out" / "verdict.json").read_text())
     (cause,) = verdict["causes"]
@@ -154,6 +156,4 @@ def test_a_cause_of_ones_own_is_named_reported_and_predicted(tmp_path: Path) -> 
     assert "A taxel&#39;s reading falls as others of its column are pressed" in (
         tmp_path / "out" / "report.html"
     ).read_text(encoding="utf-8")
-    model = "--sensor_model=out/sensor_model.json"
-    run("-m", "lerobot_vtrefine.cli.predict", "--recording=presses", model, "--output_dir=predicted")
-    assert len(list((tmp_path / "predicted").glob("*.parquet"))) == 16
+    assert len(list((tmp_path / "p").glob("*.parquet"))) == 16

@@ -1,4 +1,5 @@
 from dataclasses import replace
+from functools import cache
 from pathlib import Path
 
 import draccus
@@ -26,6 +27,12 @@ ENV_FILES = sorted((Path(__file__).parents[2] / "configs" / "env").glob("*.yaml"
 
 def parse(*arguments: str) -> VtRefineEnvConfig:
     return draccus.parse(EvalPipelineConfig, args=["--env.type=vtrefine", *arguments]).env
+
+
+@cache
+def read(path: Path) -> EvalPipelineConfig:
+    """What LeRobot's own parser makes of a file, which takes it most of a second; do not change it."""
+    return draccus.parse(EvalPipelineConfig, config_path=path, args=[])
 
 
 def test_type_is_registered():
@@ -89,7 +96,7 @@ def test_policy_features_have_the_datasets_keys_and_shapes():
 @pytest.mark.parametrize("path", ENV_FILES, ids=lambda path: path.stem)
 def test_environment_files_parse_and_hold_only_env_and_eval(path: Path):
     assert set(yaml.safe_load(path.read_text())) <= {"env", "eval"}
-    config = draccus.parse(EvalPipelineConfig, config_path=path, args=[])
+    config = read(path)
     assert isinstance(config.env, VtRefineEnvConfig)
     assert config.env.scene_config.start == config.env.start
 
@@ -97,7 +104,7 @@ def test_environment_files_parse_and_hold_only_env_and_eval(path: Path):
 @pytest.mark.parametrize("path", ENV_FILES, ids=lambda path: path.stem)
 def test_environment_files_suit_policies_of_every_chunk_length(path: Path, monkeypatch: pytest.MonkeyPatch):
     """A policy may decide at any step: each must hand out its own frame."""
-    config = draccus.parse(EvalPipelineConfig, config_path=path, args=[]).env
+    config = read(path).env
     monkeypatch.setattr(vector_env, "make_episodes", lambda config, n: Episodes(FakeSim(n)))
     env = vector_env.VtRefineVectorEnv(config, 1)
     env.reset(seed=[1])
@@ -111,10 +118,7 @@ TWINS = [path for path in ENV_FILES if path.stem.endswith("_twin")]
 
 @pytest.mark.parametrize("path", TWINS, ids=lambda path: path.stem)
 def test_a_twin_differs_from_its_task_in_the_slip_alone(path: Path):
-    task, twin = (
-        draccus.parse(EvalPipelineConfig, config_path=file, args=[]).env
-        for file in (path.with_stem(path.stem.removesuffix("_twin")), path)
-    )
+    task, twin = (read(file).env for file in (path.with_stem(path.stem.removesuffix("_twin")), path))
     slip = twin.rules.grasped
     assert slip.slip_m == slip.slip_z_m == slip.slip_rad == 0.0
     assert min(task.rules.grasped.slip_m, task.rules.grasped.slip_rad) > 0.0

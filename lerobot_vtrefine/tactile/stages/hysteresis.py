@@ -25,17 +25,21 @@ from lerobot_vtrefine.tactile.stages.base import (
 )
 
 
-def memories(follow: Callable[..., torch.Tensor], *inputs: torch.Tensor) -> torch.Tensor:
-    """A memory that is zero at first, after every frame: (T, ...); follow(memory, *the frame's inputs)."""
-    memory, out = torch.zeros_like(inputs[0][0]), []
-    for moment in zip(*(values.unbind() for values in inputs), strict=True):
-        memory = follow(memory, *moment)
-        out.append(memory)
-    return torch.stack(out)
+def memories(follow: Callable[..., np.ndarray], *inputs: torch.Tensor) -> torch.Tensor:
+    """A memory that is zero at first, after every frame: (T, ...); follow(memory, *the frame's inputs).
+
+    In NumPy, whose operations take a fraction of the time to begin.
+    """
+    moments = [values.cpu().numpy() for values in inputs]
+    out = np.empty_like(moments[0])
+    memory = np.zeros_like(out[:1].sum(axis=0))
+    for frame, now in enumerate(zip(*moments, strict=True)):
+        out[frame] = memory = follow(memory, *now)
+    return torch.from_numpy(out).to(inputs[0])
 
 
 def kept_between(low: torch.Tensor, high: torch.Tensor) -> torch.Tensor:
-    """memories(torch.clamp, low, high), in NumPy, whose operations take a fraction of the time to begin."""
+    """memories(torch.clamp, low, high), without a new array for every frame."""
     lower, upper = (bound.cpu().numpy().copy() for bound in (low, high))
     memory = np.zeros_like(lower[:1].sum(axis=0))
     for line, top in zip(lower, upper, strict=True):
@@ -152,8 +156,9 @@ class ProportionalHysteresis(Loop):
     width_m: float = parameter(2e-4, "m", 5e-5, 5e-4)
 
     @staticmethod
-    def _turned(back: torch.Tensor, unloaded: torch.Tensor, touching: torch.Tensor) -> torch.Tensor:
-        return (back + unloaded).clamp(0.0, 1.0) * touching
+    def _turned(back: Any, unloaded: Any, touching: Any) -> Any:
+        """Of tensors or arrays."""
+        return (back + unloaded).clip(0.0, 1.0) * touching
 
     def _moves(
         self, x: torch.Tensor, before: torch.Tensor, frame: Frame
@@ -187,10 +192,6 @@ class PeakHysteresis(Loop):
     name: ClassVar[str] = "peak_hysteresis"
     fraction: float = parameter(0.15, "1", 0.0, 0.3, minimum=None)
 
-    @staticmethod
-    def _largest(peak: torch.Tensor, x: torch.Tensor) -> torch.Tensor:
-        return torch.maximum(peak, x) * (x > 0)
-
     def _bent(self, x: torch.Tensor, peak: torch.Tensor) -> torch.Tensor:
         share = x / peak.clamp(min=1e-12)
         return (x * (1.0 + 4.0 * self.fraction * share * (1.0 - share))).clamp(min=0.0)
@@ -201,12 +202,13 @@ class PeakHysteresis(Loop):
 
     @override
     def step(self, x: torch.Tensor, state: State, frame: Frame) -> tuple[torch.Tensor, State]:
-        peak = self._largest(state["peak"], x)
+        peak = torch.maximum(state["peak"], x) * (x > 0)
         return self._bent(x, peak), {**state, "peak": peak}
 
     @override
     def sequence(self, x: torch.Tensor, times_s: torch.Tensor, frame: Frame) -> torch.Tensor:
-        return self._bent(x, memories(self._largest, x))
+        touching = x.clamp(min=0.0)
+        return self._bent(x, kept_between(touching, torch.where(x > 0, torch.inf, touching)))
 
 
 BY_LOOP: dict[str, type[Loop]] = {
