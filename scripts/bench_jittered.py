@@ -2,10 +2,11 @@
 """How good is vtrefine-diagnose on the third rig? 12 x 32 taxels, 16 presses, jittered clocks.
 
 The recordings come from tests/diagnose/jittered_rig.py: laws in several forms, scaled to an achievable gain.
-An interrupted run goes on where it stopped; delete its folder after a change of the engine. Seeds below 1000
-are for tuning, reported figures come from 1000 and above. All 400 sets take about 4500 s of one core:
+An interrupted run goes on where it stopped; delete its folder after a change of the engine. It needs the
+installed package, this folder and tests/diagnose beside it. Seeds below 8000 have been used for tuning. All
+400 sets take about 6000 s of one core:
 
-    python scripts/bench_jittered.py --seeds=6000:6008 --jobs=22 --minutes=10
+    python scripts/bench_jittered.py --seeds=8000:8008 --jobs=16
     python scripts/collect_results.py jittered outputs/bench_jittered/table.md --replace
     make tables
 """

@@ -151,7 +151,8 @@ class Verdict:
 
     ``minimum_detectable`` says from which size on a cause would have been named, ``not_tested`` which causes
     these recordings cannot show, and what to record for each. ``next_experiment`` is a JSON object (a
-    protocol that the rig can run, with what it decides) or None.
+    protocol that the rig can run, with what it decides) or None. ``models_saw_locked`` tells whether the
+    models beside the verdict were fitted to locked recordings, too, once ``heldout`` was measured.
     """
 
     status: Status
@@ -163,6 +164,7 @@ class Verdict:
     next_experiment: Mapping[str, Any] | None = None
     data_issues: tuple[DataIssue, ...] = ()
     not_tested: Mapping[str, str] = field(default_factory=dict)
+    models_saw_locked: bool = False
 
     def __post_init__(self) -> None:
         by_gain = sorted(self.causes, key=lambda cause: -(cause.heldout_gain or 0.0))
@@ -210,6 +212,7 @@ class Verdict:
             content.next_experiment,
             content.data_issues,
             content.not_tested,
+            content.models_saw_locked,
         )
 
 
@@ -244,6 +247,7 @@ class VerdictFile:
     next_experiment: dict[str, Any] | None
     data_issues: tuple[DataIssue, ...]
     not_tested: dict[str, str] = field(default_factory=dict)
+    models_saw_locked: bool = False
 
 
 def write_verdict(verdict: Verdict, path: str | Path) -> None:

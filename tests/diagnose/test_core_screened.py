@@ -232,6 +232,43 @@ def test_the_model_stays_where_only_the_gains_of_locked_trials_speak_against_it(
 
 
 @dataclass(frozen=True)
+class Refitting(Toy):
+    """Users get fits to all trials."""
+
+    def completed(self, selection):
+        return self.baseline(), self.fit(selection.fit.free)
+
+
+def test_users_may_get_a_refit_to_all_trials_and_what_is_measured_stays_with_the_fit_from_before() -> None:
+    measured = infer(toy(0.3))
+    assert not measured.refitted
+    assert measured.models[1] is measured.selection.fit
+    problem = Refitting(**vars(toy(0.3)))
+    found = infer(problem)
+    assert found.refitted
+    np.testing.assert_array_equal(found.models[1].theta, problem.solved((0, 1), np.ones(TRIALS)))
+    np.testing.assert_array_equal(found.selection.fit.theta, measured.selection.fit.theta)
+    assert abs(found.models[1].theta - measured.selection.fit.theta).max() > 0
+
+
+def test_where_few_pairs_of_trials_have_a_say_the_size_of_their_products_counts() -> None:
+    # Of five pairs, whatever their products, no flip of signs is rarer than one in 32.
+    def passes(size, pairs):
+        products = np.zeros((TRIALS, TRIALS))
+        for k in range(pairs):
+            products[2 * k, 2 * k + 1] = products[2 * k + 1, 2 * k] = size
+        total, one = np.array([products.sum()]), np.ones(TRIALS)
+        own = {"products": products, "products_scatter": np.sqrt(2.0 * pairs)}
+        probe = Probe("map", None, np.zeros(0), total, total, True, **own)
+        nothing = Probe("bend", None, np.zeros(0), one * (-1.0) ** np.arange(TRIALS), one, False)
+        return screen([probe, nothing], TRIALS, 0)["map"].passed
+
+    assert passes(20.0, 5)
+    assert not passes(2.0, 5)
+    assert passes(2.0, 12)
+
+
+@dataclass(frozen=True)
 class Forgiving(Toy):
     """Weights forgive what is there where all readings count alike."""
 

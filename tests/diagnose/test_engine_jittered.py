@@ -1,21 +1,26 @@
 """Effects that were once missed, on the third rig: each kind is named, and its first name is right."""
 
+import jittered_rig
 import numpy as np
 import pytest
 from jittered_rig import EFFECTS, Rig
 
+from lerobot_vtrefine.diagnose.core.search import Selection
+from lerobot_vtrefine.diagnose.pad import review
 from lerobot_vtrefine.diagnose.pad.baseline import fit_baseline
 from lerobot_vtrefine.diagnose.pad.candidates import CATALOGUE
 from lerobot_vtrefine.diagnose.pad.decoys import in_place_of_names
 from lerobot_vtrefine.diagnose.pad.descriptors import errors_left_out
 from lerobot_vtrefine.diagnose.pad.engine import diagnose_pad
+from lerobot_vtrefine.diagnose.pad.final_model import FinalFit
 from lerobot_vtrefine.diagnose.pad.fitting import movable
 from lerobot_vtrefine.diagnose.pad.form_fitting import with_form
 from lerobot_vtrefine.diagnose.pad.intervals import leave_out
 from lerobot_vtrefine.diagnose.pad.own_touch import with_own_touch
 from lerobot_vtrefine.diagnose.pad.press_trials import prepare
-from lerobot_vtrefine.diagnose.pad.problem import PadProblem
+from lerobot_vtrefine.diagnose.pad.problem import Candidate, PadProblem
 from lerobot_vtrefine.diagnose.pad.screening import forms_of
+from lerobot_vtrefine.diagnose.pad.taxel_maps import with_map
 
 
 def recorded(name: str, gain: float, seed: int):
@@ -89,6 +94,43 @@ def test_a_borrowed_name_predicts_worse_than_what_no_name_covers(law: str, borro
     assert found.p_alone is not None
     assert (found.p_alone < found.level and found.share > found.least) == borrowed
     assert ("column" in found.clue) == borrowed
+
+
+@pytest.mark.parametrize(
+    ("law", "label"), [("offset_toe", "felt softly before"), ("offset_late", "constant")]
+)
+def test_a_settled_name_takes_the_form_that_recordings_left_out_are_likeliest_under(
+    law: str, label: str
+) -> None:
+    # Their plain errors do not tell: each touches micrometres from where it should.
+    held = recorded(law, 0.4, 4)
+    problem, fitted = PadProblem(prepare(held, list(held.trials), list(range(len(held.trials))))).weighed(
+        None
+    )
+    plain, *_ = forms_of("contact_offset", fitted)
+    problem, fitted = problem.weighed(with_form(fitted, plain, (), problem.presses, problem.weights))
+    found = review.likeliest_forms(review.State(problem, fitted, 0))
+    assert [form.label for form in found.fit.model.forms] == [label]
+
+
+def test_a_map_that_users_get_knows_places_that_were_only_pressed_in_locked_recordings() -> None:
+    held = recorded("gains", 0.4, 0)
+    whole = PadProblem(prepare(held, list(held.trials), list(range(len(held.trials)))))
+    # Seven taxels are pressed in this condition only.
+    problem, fitted = whole.subset(np.flatnonzero(np.array(whole.conditions) != "c7")).weighed(None)
+    fitted = problem.settled(with_map(fitted, problem.presses, problem.weights))
+    before = FinalFit(problem.baseline(), problem, problem.baseline().model, whole.presses.idle)
+    after = FinalFit(fitted, problem, fitted.model, whole.presses.idle)
+    chosen = {0: (Candidate("taxel_gain_spread"),)}
+    selection = Selection(problem, before, after, np.zeros((1, 1)), chosen, {})
+    baseline, completed = whole.completed(selection)
+    known, late = (np.log(fit.model.gain_map).ravel() for fit in (after, completed))
+    late_only = (known == 0) & (late != 0)
+    assert late_only.sum() >= 5
+    truth = jittered_rig._SPECIMEN[: len(late)][late_only]
+    assert np.corrcoef(late[late_only], truth)[0, 1] > 0.7
+    assert completed.model.families == ("taxel_gain_spread",)
+    assert baseline.model.families == ()
 
 
 def test_frames_that_repeat_do_not_count_as_noise() -> None:

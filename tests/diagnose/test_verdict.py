@@ -27,6 +27,7 @@ EXPLAINED = Verdict(
     heldout=HELDOUT,
     minimum_detectable={"crosstalk": 0.004},
     data_issues=(DataIssue("trial_0003.parquet", "starts loaded", "set aside"),),
+    models_saw_locked=True,
 )
 
 
@@ -61,6 +62,7 @@ def test_file_has_the_contracts_keys_and_values(tmp_path):
         "next_experiment": None,
         "data_issues": [{"trial": "trial_0003.parquet", "problem": "starts loaded", "action": "set aside"}],
         "not_tested": {},
+        "models_saw_locked": True,
     }
     assert [path.name for path in tmp_path.iterdir()] == ["verdict.json"]
 

@@ -20,7 +20,7 @@ IDLE_FRAMES = 3
 
 def press_film(diagnosis: Diagnosis, recordings: RecordingSet) -> dict[str, str] | None:
     """The film of the typical held-out trial, its caption and scale; None where there is nothing to show."""
-    models = (diagnosis.baseline_model, diagnosis.extended_model)
+    models = diagnosis.measured_models
     shown = typical_trial(diagnosis, recordings)
     if shown is None or not all(isinstance(model, SensorModel) for model in models):
         return None

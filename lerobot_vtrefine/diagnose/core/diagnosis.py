@@ -17,6 +17,8 @@ class Diagnosis:
     Attributes:
         verdict: what ``verdict.json`` holds.
         baseline_model, extended_model: what ``vtrefine-predict`` loads; None where nothing was fitted.
+        measured_models: the same two as they were when errors on locked trials were measured; users may get
+            refits to all trials.
         baseline_params: the refitted parameters of the baseline, name -> value with interval.
         evidence: every candidate that was examined, rejected ones too.
         traces, residuals, trial_errors: about locked trials only.
@@ -30,6 +32,7 @@ class Diagnosis:
     verdict: Verdict
     baseline_model: Savable | None = None
     extended_model: Savable | None = None
+    measured_models: tuple[Savable | None, Savable | None] = (None, None)
     baseline_params: Mapping[str, Parameter] = field(default_factory=dict)
     evidence: tuple[Evidence, ...] = ()
     traces: tuple[Trace, ...] = ()

@@ -42,7 +42,14 @@ class Inference[P: Problem[Any, Any], F: Fit, C: Candidate]:
     """The locked trials; those of the search where none could be locked."""
     locked: bool
     refused: tuple[Refusal, ...]
+    models: tuple[F, F]
+    """Baseline and extension that users load; they may know the locked trials, so nothing is measured."""
     seed: int
+
+    @property
+    def refitted(self) -> bool:
+        """Whether these are others than those that were measured."""
+        return self.models[1] is not self.selection.fit
 
 
 def infer[P: Problem[Any, Any]](
@@ -86,6 +93,7 @@ def infer[P: Problem[Any, Any]](
         test,
         bool(len(locked)),
         refused,
+        whole.completed(selection) if len(locked) else (selection.baseline, selection.fit),
         seed,
     )
 

@@ -117,6 +117,10 @@ class NothingBesides(Protocol):
         """The selection with fits as users get them; `doubtful`: beside something that has no name."""
         return selection
 
+    def completed(self, selection: "Selection[Any, Any, Any]") -> tuple[Any, Any]:
+        """Baseline and fit for users, once all is decided and measured: it may be fitted to all trials."""
+        return selection.baseline, selection.fit
+
     def suspicions(self, selection: "Selection[Any, Any, Any]", seed: int) -> "Sequence[Suspicion]":
         """What may be left, as scores of trials."""
         return ()

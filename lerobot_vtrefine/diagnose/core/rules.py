@@ -64,6 +64,8 @@ FITTED = 6
 """Candidates that pass the score test and are fitted in a round, the most promising ones."""
 AGREEMENT_P = 0.05
 """Chance that what passed the test predicts as many trials left out better, if there were nothing."""
+FORM_P = 0.01
+"""Chance that another form of a settled name predicts trials left out likelier, if it were no better."""
 PROMISING = 0.4
 """Part of the best candidate's gain that a cause's plain form must reach for its other forms to be tried."""
 RICH = 2

@@ -136,7 +136,8 @@ def screen(probes: Sequence[Probe], count: int, seed: int) -> dict[str, Tested]:
         names = len({probe.name for probe in tested})
         p_values, adjusted = _order_p(tested) if kind == "order" else _flip_p(tested, signs)
         for probe, p_value, together in zip(tested, p_values, adjusted, strict=True):
-            if kind != "order" and count < FEW_FOR_SIGNS and p_value <= 2.5 * 2.0 ** (1 - count):
+            few = _signs_that_count(probe)
+            if kind != "order" and few < FEW_FOR_SIGNS and p_value <= 2.5 * 2.0 ** (1 - few):
                 together = min(together, names * size_p(probe))
             _keep(best, Tested(probe, p_value, min(1.0, together * whole / SCREEN_SHARES[kind])))
     for probe in observed:
@@ -164,6 +165,15 @@ def _order_p(probes: Sequence[Probe]) -> tuple[list[float], list[float]]:
     """The same of probes that were permuted already, each by itself."""
     p_values = [probe.permuted for probe in probes if probe.permuted is not None]
     return p_values, [min(1.0, len(probes) * p_value) for p_value in p_values]
+
+
+def _signs_that_count(probe: Probe) -> float:
+    """Signs that a probe's statistic hangs on: those of all trials; where it is a sum of products, one more
+    than there are pairs of trials, each counted by its part in the sum."""
+    if probe.products is None:
+        return len(probe.scores)
+    sizes = np.abs(probe.products)
+    return 1.0 + 0.5 * float(sizes.sum() ** 2 / max(np.square(sizes).sum(), 1e-300))
 
 
 def size_p(probe: Probe) -> float:

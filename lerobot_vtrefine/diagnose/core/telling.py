@@ -54,11 +54,13 @@ def tell(found: Found, account: Account[Any, Any]) -> Diagnosis:
         account.minimum_detectable(),
         account.next_experiment(found.rivals, found.alarms),
         not_tested=not_tested(evidence),
+        models_saw_locked=found.refitted,
     )
     return Diagnosis(
         verdict,
-        baseline_model=account.model(selection.baseline),
-        extended_model=account.model(selection.fit),
+        baseline_model=account.model(found.models[0]),
+        extended_model=account.model(found.models[1]),
+        measured_models=(account.model(selection.baseline), account.model(selection.fit)),
         baseline_params=account.baseline_parameters(),
         evidence=evidence,
         traces=traces,

@@ -27,13 +27,11 @@ from lerobot_vtrefine.diagnose.pad.intervals import (
     map_parameters,
 )
 from lerobot_vtrefine.diagnose.pad.problem import Candidate, PadProblem
+from lerobot_vtrefine.diagnose.pad.review import MORE_COORDINATES
 from lerobot_vtrefine.diagnose.pad.screening import DEAD, GAIN_MAP, MAPS, forms_of
 from lerobot_vtrefine.diagnose.pad.views import Predicted
 from lerobot_vtrefine.diagnose.verdict import Parameter
 from lerobot_vtrefine.tactile.model import SensorModel
-
-_MORE_COORDINATES = 2
-"""Coordinates that another form may have beyond the named one's, for its parameters to be heard."""
 
 
 class PadAccount:
@@ -151,7 +149,7 @@ def other_forms(problem: PadProblem, fitted: Fit, index: int) -> list[dict[str, 
     others = [
         other
         for other in forms_of(form.family, fitted)
-        if other is not form and 0 < len(other.values) <= len(form.values) + _MORE_COORDINATES
+        if other is not form and 0 < len(other.values) <= len(form.values) + MORE_COORDINATES
     ]
     full = out_of_fold(problem, fitted, problem.folds)
     reports = []

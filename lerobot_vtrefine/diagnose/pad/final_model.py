@@ -121,6 +121,24 @@ def handed_out(
     return replace(selection, baseline=before, fit=after)
 
 
+def completed(selection: Selection["PadProblem", Any, Any], whole: "PadProblem") -> tuple[FinalFit, FinalFit]:
+    """Both models fitted anew to all recordings; causes, forms and kind of fit stay as they were decided."""
+    before, after = selection.baseline, selection.fit
+    problem, _ = whole.weighed(None)
+    plain = whole.refitted_baseline.plain
+    fitted, model = plain, plain.model
+    around = problem
+    if after.fit.model.families:
+        problem, fitted = problem.weighed(rest(after.fit.model, problem.presses, problem.weights))
+        around, fitted = with_own_touch(problem, fitted)
+        if after.model is after.fit.model:
+            model = fitted.model
+        elif after.model is not before.model:
+            model = fit(fitted.model, problem.presses, problem.even.weights).model
+    idle = settled_idle(model, problem.presses)
+    return FinalFit(plain, problem, plain.model, idle), FinalFit(fitted, around, model, idle)
+
+
 def trusted(problem: "PadProblem", plain: Fit, fitted: Fit, seed: int, *, doubtful: bool) -> Composite:
     """What is handed out: never a model that predicts plain readings of recordings left out worse than the
     baseline does.

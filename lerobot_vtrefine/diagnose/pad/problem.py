@@ -270,3 +270,7 @@ class PadProblem(NothingBesides):
     def handed_out(self, selection: Selected, seed: int, *, doubtful: bool) -> Selected:
         """With models as users load them."""
         return final_model.handed_out(selection, seed, doubtful=doubtful)
+
+    def completed(self, selection: Selected) -> tuple[FinalFit, FinalFit]:
+        """Fitted to all presses: one site in four may have been pressed in locked ones only."""
+        return final_model.completed(selection, self)

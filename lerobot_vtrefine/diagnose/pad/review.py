@@ -1,4 +1,4 @@
-"""What adding single causes cannot find: two names behind one, plain forms behind rich ones, trade-offs."""
+"""What adding single causes cannot find: two names behind one, better forms, trade-offs."""
 
 from dataclasses import dataclass, replace
 from itertools import combinations
@@ -7,8 +7,11 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from lerobot_vtrefine.diagnose.core.heldout import OutOfFold, out_of_fold
+from lerobot_vtrefine.diagnose.core.resampling import agree
+from lerobot_vtrefine.diagnose.core.rules import FORM_P
 from lerobot_vtrefine.diagnose.core.screened_search import CHANNEL, clearly_better, preferable
 from lerobot_vtrefine.diagnose.core.search import Selection
+from lerobot_vtrefine.diagnose.pad.candidates.base import Form
 from lerobot_vtrefine.diagnose.pad.damping_profile import profile
 from lerobot_vtrefine.diagnose.pad.fitting import Fit
 from lerobot_vtrefine.diagnose.pad.form_fitting import starts_of, without
@@ -19,11 +22,13 @@ if TYPE_CHECKING:
 
 BENDS = ("nonlinear_stiffness", "saturation", "contact_offset")
 """All bend readings against depth: hardening with saturation is an S, whose lower part an offset fits."""
+MORE_COORDINATES = 2
+"""Coordinates that another form may have beyond the named one's, to be heard once names are settled."""
 _ALL = np.ones(1, dtype=bool)
 
 
 @dataclass(frozen=True)
-class _State:
+class State:
     """A fit under its weights."""
 
     problem: "PadProblem"
@@ -31,18 +36,42 @@ class _State:
     seed: int
 
     def held(self, fit: Fit) -> OutOfFold:
+        """A fit on trials left out."""
         return out_of_fold(self.problem, fit, self.problem.folds)
 
-    def weighed(self, fit: Fit) -> "_State":
-        return _State(*self.problem.weighed(fit), self.seed)
+    def weighed(self, fit: Fit) -> "State":
+        """A fit under weights of its own."""
+        return State(*self.problem.weighed(fit), self.seed)
 
     def with_plain(self, fit: Fit, name: str) -> Fit:
         """A cause added in its plain form."""
-        form = forms_of(name, fit)[0]
-        starts = starts_of(form, probe_form(form, scorer_of(self.problem, fit)))
-        return self.problem.extended(fit, _candidate(name, form, {form.label: starts}), _ALL)
+        return self.with_form(fit, forms_of(name, fit)[0])
+
+    def with_form(self, fit: Fit, form: Form, plain: Fit | None = None) -> Fit:
+        """A cause added in a form, which may grow from the fit of its plain one."""
+        probes = probe_form(form, scorer_of(self.problem, fit)) if form.screened else []
+        candidate = _candidate(form.family, form, {form.label: starts_of(form, probes)})
+        return self.problem.extended(fit, candidate, _ALL, plain)
+
+    def in_likeliest_form(self, form: Form) -> Fit:
+        """The fit, or another with that cause in a form of hardly more coordinates than the best so far."""
+        possible = forms_of(form.family, self.fit)
+        best, held, terms = self.fit, self.held(self.fit), len(form.values)
+        if form.range is not None or len(possible) == 1:
+            return best
+        slim = self.without(form.family)
+        plain = self.with_form(slim, possible[0])
+        for other in possible:
+            if other is form or len(other.values) > terms + MORE_COORDINATES:
+                continue
+            found = plain if other is possible[0] else self.with_form(slim, other, plain)
+            judged = self.held(found)
+            if agree(judged.better_by(held), self.seed, FORM_P):
+                best, held, terms = found, judged, len(other.values)
+        return best
 
     def without(self, name: str) -> Fit:
+        """The fit without a cause."""
         return without(self.fit, [name], self.problem.presses, self.problem.weights)
 
 
@@ -53,10 +82,10 @@ def _candidate(name: str, form: Any, starts: dict[str, Any]) -> "Candidate":
 
 
 def reviewed(selection: Selection["PadProblem", Fit, Any], seed: int) -> Selection["PadProblem", Fit, Any]:
-    """The selection after all three looks, with settled weights."""
+    """The selection after all four looks, with settled weights."""
     if not selection.fit.model.families:
         return selection
-    state = _State(selection.problem, selection.fit, seed)
+    state = State(selection.problem, selection.fit, seed)
     named = set(selection.fit.model.families)
     state = two_bends(state)
     p_values, beside = dict(selection.p_values), dict(selection.beside)
@@ -65,7 +94,7 @@ def reviewed(selection: Selection["PadProblem", Fit, Any], seed: int) -> Selecti
         beside[name] = frozenset(BENDS) - {name}
         p_values[name, CHANNEL] = p_values.get((bend, CHANNEL))
     state = plain_forms(state)
-    state = state.weighed(state.fit)
+    state = likeliest_forms(state.weighed(state.fit))
     best = resolved(state)
     state = state if best is state.fit else state.weighed(best)
     model = state.fit.model
@@ -82,7 +111,7 @@ def reviewed(selection: Selection["PadProblem", Fit, Any], seed: int) -> Selecti
     )
 
 
-def two_bends(state: _State) -> _State:
+def two_bends(state: State) -> State:
     """Where one of the bends was named, any two of them in its place, if these predict clearly better."""
     named = [name for name in state.fit.model.families if name in BENDS]
     if len(named) != 1:
@@ -101,7 +130,7 @@ def two_bends(state: _State) -> _State:
     return state if best is state.fit else state.weighed(best)
 
 
-def plain_forms(state: _State) -> _State:
+def plain_forms(state: State) -> State:
     """Plain forms again where they do: a rich form may have stood in for a cause that was found after it."""
     for form in state.fit.model.forms:
         plain = forms_of(form.family, state.fit)[0]
@@ -114,7 +143,20 @@ def plain_forms(state: _State) -> _State:
     return state
 
 
-def resolved(state: _State) -> Fit:
+def likeliest_forms(state: State) -> State:
+    """Every settled name in the form under which recordings left out are surely likeliest.
+
+    While names compete, another form must take away squared error, for a rich one imitates other causes. Once
+    they are settled, that would only hide the right one: squared errors hang on how hard and where each
+    recording happened to touch, which log scores allow for.
+    """
+    for form in state.fit.model.forms:
+        found = state.in_likeliest_form(form)
+        state = state if found is state.fit else state.weighed(found)
+    return state
+
+
+def resolved(state: State) -> Fit:
     """The best fit along the trade-off of a delay against the damping, which descents cut short."""
     fitted, problem = state.fit, state.problem
     for index, form in enumerate(fitted.model.forms):

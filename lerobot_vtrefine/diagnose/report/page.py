@@ -101,7 +101,8 @@ def _use(verdict: Verdict, recordings: RecordingSet, model: str) -> dict[str, st
         return None
     flag = "--env.sensor_model" if recordings.kind == "pad" else "--env.reality"
     task = "--config_path=vtrefine:round_grasped"
-    said = "sensor_model.json beside this page holds the repaired model."
+    again = ", fitted anew to all recordings once the errors above were measured"
+    said = f"sensor_model.json beside this page holds the repaired model{again * verdict.models_saw_locked}."
     if verdict.status in ("unexplained", "ambiguous"):
         said += " Its names are not settled, so check first that it predicts other recordings better."
     else:
