@@ -90,7 +90,7 @@ WORLDS: dict[str, dict[str, dict[str, Any]]] = {
     },
 }
 """Tasks for MANY_WORLDS."""
-TOUCH_TASKS = ("key_turned", "cross_gentle", "d_occluded")
+TOUCH_TASKS = ("key_turned", "cross_gentle", "cross_limited", "d_occluded")
 """Files of configs/env; each has a twin ``TASK_twin``, whose parts lie in the hands as the hands expect."""
 TASK_FILES = Path(__file__).parents[1] / "configs" / "env"
 

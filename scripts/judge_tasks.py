@@ -4,7 +4,9 @@
     python scripts/judge_tasks.py key_turned key_turned_twin --effort.device=cuda --env.backend=warp
     make tables
 
-Flags that this script does not know go to ``vtrefine-information``. A study lies in outputs/information_TASK,
+Regressors are the policy's own encoder and a larger network (--effort.networks='[policy]' leaves that one
+out); what counts for each set of senses is the better one. Flags that this script does not know go to
+``vtrefine-information``. A study lies in outputs/information_TASK,
 where scripts/compare_touch.py finds its encoders; one that is there is not made again: remove the folder for
 that.
 """
@@ -21,10 +23,13 @@ from lerobot_vtrefine.cli.report.statistics import wilson_interval
 from lerobot_vtrefine.cli.results.cells import interval, percent
 from lerobot_vtrefine.cli.results.collect import origin_of, save
 from lerobot_vtrefine.cli.results.rows import Line
+from lerobot_vtrefine.information import estimator
+from lerobot_vtrefine.information.contact import SIDE
 
 TABLE = "touch_tasks"
 RESULTS = Path(__file__).parents[1] / "results"
 SENSES = {"vision and touch": "visuo_tactile", "vision": "visual", "joints alone": "joints"}
+NETWORKS = f"[{', '.join(estimator.NETWORKS)}]"
 TURN = "plug_in_hand_rx"
 """The plug's turn about the pads' normal."""
 
@@ -32,7 +37,8 @@ TURN = "plug_in_hand_rx"
 def study(task: str, folder: Path, extra: list[str]) -> None:
     """Run the study of one task; one that fails ends this script with its status."""
     command = [sys.executable, "-m", "lerobot_vtrefine.cli.information"]
-    command += [f"--config_path=vtrefine:{task}", f"--output_dir={folder}", *extra]
+    command += [f"--config_path=vtrefine:{task}", f"--output_dir={folder}", f"--effort.networks={NETWORKS}"]
+    command += extra  # what is given twice counts the last time
     if status := subprocess.run(command, check=False).returncode:
         sys.exit(status)
 
@@ -41,17 +47,19 @@ def row(task: str, folder: Path) -> Line:
     """What a study found, as a line of the table."""
     found = json.loads((folder / "information.json").read_text(encoding="utf-8"))
     best = {words: best_finding(found, senses) for words, senses in SENSES.items()}
-    turns = {words: item["rms"][TURN]["rms"] for words, item in best.items() if item}
-    shown = [
-        found["prior"][TURN],
-        *(turns[words] for words in ("vision and touch", "vision") if words in turns),
-    ]
+    compared = [best[words] for words in ("vision and touch", "vision") if best[words]]
+    turns = [found["prior"][TURN], *(item["rms"][TURN]["rms"] for item in compared)]
+    unseen = found["contact_unseen"].get(SIDE)
+    sides = [] if unseen is None else [unseen, *(item["contact"][SIDE]["share"] for item in compared)]
     cells = {
         "task": task,
         "the expert knows the truth, %": counted(found["true_state"]),
         **{f"{words}, %": counted(item.get("expert")) for words, item in best.items()},
         "turn of the plug in its hand: nothing, vision and touch, vision, °": ", ".join(
-            f"{value:.1f}" for value in shown
+            f"{value:.1f}" for value in turns
+        ),
+        "side of the contact told rightly: nothing, vision and touch, vision, %": ", ".join(
+            map(percent, sides)
         ),
         "": found["judged"],
     }
@@ -59,7 +67,7 @@ def row(task: str, folder: Path) -> Line:
 
 
 def best_finding(found: dict[str, Any], senses: str) -> dict[str, Any]:
-    """Of all lengths of history the one on which the expert succeeds most; empty without that sense."""
+    """Of all networks and lengths of history the one on which the expert succeeds most; empty without any."""
     made = [item for item in found["findings"] if item["senses"] == senses]
     return max(made, key=lambda item: item["expert"]["success"] if item["expert"] else 0, default={})
 

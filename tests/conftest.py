@@ -1,7 +1,6 @@
 """Fixtures that several packages' tests share."""
 
 import gc
-import os
 from collections.abc import Callable, Generator
 from functools import cache
 from pathlib import Path
@@ -48,13 +47,11 @@ def _docstrings_are_read_once() -> None:
 
 @pytest.fixture(autouse=True)
 def _ordinary_priority() -> Generator[None]:
-    """SVT-AV1, LeRobot's video codec, gives the thread that starts it real-time priority where root runs it.
+    """LeRobot's own commands do not give it back, and other workers, with emulated hardware, would starve."""
+    from lerobot_vtrefine.lerobot_compat.codec_priority import ordinary_priority
 
-    What is started later inherits it; other workers, and the emulated hardware there, get what is left.
-    """
-    yield
-    if hasattr(os, "SCHED_FIFO") and os.sched_getscheduler(0) == os.SCHED_FIFO:
-        os.sched_setscheduler(0, os.SCHED_OTHER, os.sched_param(0))
+    with ordinary_priority():
+        yield
 
 
 TINY_CAMERA = (24, 32)

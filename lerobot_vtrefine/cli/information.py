@@ -18,7 +18,8 @@ from lerobot_vtrefine.cli.errors import run_cli
 from lerobot_vtrefine.cli.results.provenance import write_provenance
 from lerobot_vtrefine.envs import VtRefineEnvConfig
 from lerobot_vtrefine.folders import beside, put_in_place
-from lerobot_vtrefine.information.estimator import SENSES
+from lerobot_vtrefine.information.contact import SIDE, TOUCHING
+from lerobot_vtrefine.information.estimator import POLICY, SENSES
 from lerobot_vtrefine.information.page import render_page
 from lerobot_vtrefine.information.quantities import unit_of
 from lerobot_vtrefine.information.study import Effort, Study, save_keeper, study, write
@@ -65,14 +66,22 @@ SHOWN = ("plug_in_socket_y", "plug_in_hand_x", "plug_in_hand_rx")
 """Quantities that the terminal shows: where the plug is over the hole, and how it lies in its hand."""
 
 
+CONTACT_SHOWN = {TOUCHING: "do they touch [right]", SIDE: "on which side [right]"}
+
+
 def summary(found: Study) -> str:
     """A few lines for the terminal."""
     heads = [f"{name.replace('_', ' ')} [{unit_of(name)[1]}]" for name in SHOWN]
+    contact = [name for name in CONTACT_SHOWN if name in found.contact_unseen]
+    heads += [CONTACT_SHOWN[name] for name in contact]
+    unseen = [*(found.prior[name] for name in SHOWN), *(found.contact_unseen[name] for name in contact)]
     lines = ["errors on held-out episodes (RMS):", "  " + " " * 32 + "".join(f"{head:>24}" for head in heads)]
-    lines.append(f"  {'nothing seen':<32}" + "".join(f"{found.prior[name]:>24.2f}" for name in SHOWN))
+    lines.append(f"  {'nothing seen':<32}" + "".join(f"{value:>24.2f}" for value in unseen))
     for finding in found.findings:
-        label = f"{finding.senses}, {finding.history} frame{'s' * (finding.history > 1)}"
-        errors = ("{:.2f} [{:.2f}, {:.2f}]".format(*finding.rms[name]) for name in SHOWN)
+        network = "" if finding.network == POLICY else f" {finding.network}"
+        label = f"{finding.senses}{network}, {finding.history} frame{'s' * (finding.history > 1)}"
+        known = [*(finding.rms[name] for name in SHOWN), *(finding.contact[name] for name in contact)]
+        errors = ("{:.2f} [{:.2f}, {:.2f}]".format(*values) for values in known)
         success = (
             "" if finding.success is None else f"   expert: {finding.success[0]} of {finding.success[1]}"
         )

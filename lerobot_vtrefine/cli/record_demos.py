@@ -29,6 +29,7 @@ from lerobot_vtrefine.envs.demo_dataset import DemoDataset
 from lerobot_vtrefine.envs.demo_workers import demonstration_stream
 from lerobot_vtrefine.envs.recording_note import simulation_settings
 from lerobot_vtrefine.sim.demonstrations import Degradation
+from lerobot_vtrefine.sim.truth import TRUTH_SIZE
 
 HOPELESS_ATTEMPTS = 100
 """Attempts without a single success after which recording gives up."""
@@ -56,6 +57,8 @@ class RecordDemosConfig:
     """Simulation processes beside the one that writes; 0 simulates in this one."""
     include_failures: bool = False
     """Keep failed episodes too."""
+    truth: bool = False
+    """Record how the parts lie in their hands and touch, for --policy.auxiliary_weight."""
     env: EnvConfig = field(default_factory=VtRefineEnvConfig)
     """The task that the expert demonstrates."""
     degradation: Degradation = field(default_factory=Degradation)
@@ -76,11 +79,16 @@ class RecordDemosConfig:
         """What determines the episodes."""
         env = self.env
         assert isinstance(env, VtRefineEnvConfig)
-        return simulation_settings(env) | {
-            "degradation": asdict(self.degradation),
-            "seed": self.seed,
-            "include_failures": self.include_failures,
-        }
+        more = {"truth": True} if self.truth else {}
+        return (
+            simulation_settings(env)
+            | more
+            | {
+                "degradation": asdict(self.degradation),
+                "seed": self.seed,
+                "include_failures": self.include_failures,
+            }
+        )
 
 
 def record(config: RecordDemosConfig) -> int:
@@ -93,7 +101,9 @@ def record(config: RecordDemosConfig) -> int:
     env = config.env
     assert isinstance(env, VtRefineEnvConfig)
     robot = env.body
-    features = dataset_features(*env.camera_size, robot, env.colour_size)
+    features = dataset_features(
+        *env.camera_size, robot, env.colour_size, env.limited, TRUTH_SIZE * config.truth
+    )
     with DemoDataset(
         config.root,
         config.repo_id,
@@ -107,7 +117,7 @@ def record(config: RecordDemosConfig) -> int:
         if demos.num_episodes >= config.num_episodes:
             return demos.num_episodes
         workers = demonstration_stream(
-            env, config.degradation, config.num_envs, demos.next_seed, config.num_workers
+            env, config.degradation, config.num_envs, demos.next_seed, config.num_workers, config.truth
         )
         bar = {"total": config.num_episodes, "initial": demos.num_episodes, "unit": "episode"}
         with workers as stream, tqdm(**bar) as progress:

@@ -18,9 +18,12 @@ key                  shape              dtype    meaning
 ``camera_pose``      (..., 7)           float32  x y z in m, qw qx qy qz: optical frame (OpenCV) in the world
 ``noise_level``      (..., 1)           float32  depth noise to add when the cloud is built; 0 on hardware
 ``tactile_age``      (..., P)           float32  age of the pads' frames in s; 0 in simulation
+``limits``           (..., 2)           float32  what the parts bear: contact force in N, shift in the hand in
+                                                 m; of a task that says so
 ===================  =================  =======  ==========================================================
 
-``noise_level`` (hardware) and ``tactile_age`` (simulation) may be missing; they then count as 0.
+``noise_level`` (hardware) and ``tactile_age`` (simulation) may be missing; they then count as 0. With
+``limits`` comes one more column.
 
 Datasets of both kinds have the same columns, joint names and robot type, because LeRobot merges only such.
 """
@@ -56,11 +59,23 @@ RGB_KEY = f"{IMAGE_PREFIX}{CAMERA}"
 INTRINSICS_KEY = f"{CAMERA_PREFIX}{CAMERA}.intrinsics"
 CAMERA_POSE_KEY = f"{CAMERA_PREFIX}{CAMERA}.pose"
 NOISE_LEVEL_KEY = f"{CAMERA_PREFIX}{CAMERA}.noise_level"
+LIMITS = "limits"
+LIMITS_KEY = "observation.environment_state"
+"""LeRobot's name for what is known and no joint: environments and datasets pass it on, and its ACT, diffusion
+policy and TD-MPC read it. In ``observation.state`` limits would be taken for joints. There are two of them
+also because LeRobot's loader makes a number, without a dimension, of a column of one.
+"""
+TRUTH_KEY = "observation.truth"
+"""What only a simulation knows (``sim.truth``), where it was recorded for an auxiliary loss; none acts on it.
+Below ``observation.``, because LeRobot's pipelines drop what is elsewhere.
+"""
 AGE_KEY = f"{OBS_PREFIX}{TACTILE_AGE}"
 CLOUD_KEY = "observation.visuo_tactile"
 """Built by the policy's preprocessor from the raw columns; never stored."""
 GRIDS_KEY = "observation.tactile_grids"
 """Readings of the pads as images, built likewise."""
+SURFACE_KEY = "observation.surface"
+"""The depth image as an image of points, built likewise: what the larger network of `information` reads."""
 
 VISUAL_KEYS = (DEPTH_KEY, INTRINSICS_KEY, CAMERA_POSE_KEY)
 TAXEL_UNIT = "adc_counts"
@@ -99,8 +114,11 @@ class Column(NamedTuple):
 
 
 @cache
-def columns(body: Embodiment) -> tuple[Column, ...]:
-    """Every array column; the depth image comes on top because LeRobot stores it as an image."""
+def columns(body: Embodiment, limited: bool = False) -> tuple[Column, ...]:
+    """Every array column; the depth image comes on top because LeRobot stores it as an image.
+
+    ``limited``: of a task that states its limits.
+    """
     taxels = (body.pad_layout.num_taxels,)
     return (
         Column(STATE_KEY, "state", "float32", (body.num_joints,)),
@@ -110,6 +128,7 @@ def columns(body: Embodiment) -> tuple[Column, ...]:
         Column(INTRINSICS_KEY, "camera_intrinsics", "float32", (4,)),
         Column(CAMERA_POSE_KEY, "camera_pose", "float32", (7,)),
         Column(NOISE_LEVEL_KEY, "noise_level", "float32", (1,)),
+        *([Column(LIMITS_KEY, LIMITS, "float32", (2,))] if limited else []),
     )
 
 
@@ -119,9 +138,15 @@ def taxel_info(rows: int, cols: int) -> dict[str, Any]:
 
 
 def dataset_features(
-    camera_height: int, camera_width: int, body: Embodiment, colour: tuple[int, int] | None = None
+    camera_height: int,
+    camera_width: int,
+    body: Embodiment,
+    colour: tuple[int, int] | None = None,
+    limited: bool = False,
+    truth_size: int = 0,
 ) -> dict[str, dict[str, Any]]:
-    """Features of a body's data for ``LeRobotDataset.create``; `colour` is a colour image's height and width.
+    """Features of a body's data for ``LeRobotDataset.create``; `colour` is a colour image's height and width,
+    `limited` as in ``columns``, `truth_size` how much of the truth is recorded.
 
     Colour is a video, depth is kept exactly (TIFF, uint16 mm). Calibration is stored in
     columns, not in ``info``: LeRobot refuses to merge datasets whose ``info`` differs. Array columns carry no
@@ -131,7 +156,7 @@ def dataset_features(
         raise ValueError(f"camera size must be positive, got {camera_height} x {camera_width}")
     layout = body.pad_layout
     features: dict[str, dict[str, Any]] = {}
-    for column in columns(body):
+    for column in columns(body, limited):
         features[column.key] = {"dtype": column.dtype, "shape": column.shape}
         if column.source in (TACTILE, BASELINE):
             features[column.key]["info"] = taxel_info(layout.rows, layout.cols)
@@ -143,6 +168,8 @@ def dataset_features(
         "names": ["height", "width", "channels"],
         "info": {"is_depth_map": True},
     }
+    if truth_size:
+        features[TRUTH_KEY] = {"dtype": "float32", "shape": (truth_size,)}
     if colour is not None:
         channels = ["height", "width", "channels"]
         features[RGB_KEY] = {"dtype": "video", "shape": (*colour, 3), "names": channels}
@@ -156,10 +183,11 @@ def _columns_of(raw: Mapping[str, Array], body: Embodiment) -> dict[str, Array]:
     may_be_missing = {"noise_level": 1, TACTILE_AGE: len(body.pad_names)}
     absent = {key: width for key, width in may_be_missing.items() if key not in raw}
     raw = {**raw, **{key: np.zeros((*lead, width), np.float32) for key, width in absent.items()}}
-    missing = {column.source for column in columns(body)} - set(raw)
+    chosen = columns(body, LIMITS in raw)
+    missing = {column.source for column in chosen} - set(raw)
     if missing:
         raise ValueError(f"raw observation lacks {', '.join(sorted(missing))}")
-    return {column.key: column.value(raw) for column in columns(body)}
+    return {column.key: column.value(raw) for column in chosen}
 
 
 def raw_to_frame(raw: Mapping[str, Array], body: Embodiment) -> dict[str, Array]:
@@ -170,8 +198,8 @@ def raw_to_frame(raw: Mapping[str, Array], body: Embodiment) -> dict[str, Array]
     if raw["state"].shape != (body.num_joints,):
         raise ValueError(f"a frame needs state of shape ({body.num_joints},), got {raw['state'].shape}")
     depth = np.ascontiguousarray(raw["depth_mm"], np.uint16)[..., None]
-    colour = {RGB_KEY: raw["rgb"]} if "rgb" in raw else {}
-    return {**_columns_of(raw, body), DEPTH_KEY: depth, **colour}
+    more = {key: raw[source] for key, source in ((RGB_KEY, "rgb"), (TRUTH_KEY, "truth")) if source in raw}
+    return {**_columns_of(raw, body), DEPTH_KEY: depth, **more}
 
 
 def raw_to_env_observation(raw: Mapping[str, Array], body: Embodiment) -> dict[str, Any]:
@@ -194,27 +222,27 @@ def raw_to_env_observation(raw: Mapping[str, Array], body: Embodiment) -> dict[s
 
 
 def env_observation_shapes(
-    camera_height: int, camera_width: int, body: Embodiment
+    camera_height: int, camera_width: int, body: Embodiment, limited: bool = False
 ) -> dict[str, tuple[tuple[int, ...], float]]:
     """Shape of every environment observation key, without leading dimensions, and the largest value of counts
     (infinite for everything else).
     """
     shapes = {
         column.key.removeprefix(OBS_PREFIX): (column.shape, 255.0 if column.dtype == "uint8" else np.inf)
-        for column in columns(body)
+        for column in columns(body, limited)
     }
     shapes["agent_pos"] = shapes.pop("state")
     shapes[DEPTH_KEY.removeprefix(OBS_PREFIX)] = ((1, camera_height, camera_width), np.inf)
     return shapes
 
 
-def env_key_map(body: Embodiment, *, colour: bool = False) -> dict[str, str]:
+def env_key_map(body: Embodiment, *, colour: bool = False, limited: bool = False) -> dict[str, str]:
     """Environment observation key -> dataset key (LeRobot's ``features_map``, the action included).
 
     Colour, which comes below ``pixels``, goes by the name that LeRobot gives it: ``lerobot-eval`` records
     only such images.
     """
     pixels = {RGB_KEY: RGB_KEY} if colour else {}
-    keys = [*(column.key for column in columns(body) if column.key != STATE_KEY), DEPTH_KEY]
+    keys = [*(column.key for column in columns(body, limited) if column.key != STATE_KEY), DEPTH_KEY]
     own = {"agent_pos": STATE_KEY, "action": ACTION_KEY, **pixels}
     return own | {key.removeprefix(OBS_PREFIX): key for key in keys}

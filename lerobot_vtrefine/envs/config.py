@@ -8,7 +8,14 @@ from lerobot.configs import FeatureType, PolicyFeature
 from lerobot.envs.configs import EnvConfig
 
 from lerobot_vtrefine.choices import check_choice
-from lerobot_vtrefine.datasets.features import ACTION_KEY, RGB_KEY, env_key_map, env_observation_shapes
+from lerobot_vtrefine.datasets.features import (
+    ACTION_KEY,
+    LIMITS_KEY,
+    OBS_PREFIX,
+    RGB_KEY,
+    env_key_map,
+    env_observation_shapes,
+)
 from lerobot_vtrefine.embodiments import Embodiment, get_embodiment
 from lerobot_vtrefine.extras import SIMULATOR, require
 from lerobot_vtrefine.lerobot_compat.config_errors import told_by_lerobot
@@ -121,8 +128,8 @@ class VtRefineEnvConfig(EnvConfig):
                 raise ValueError(f"--env.rgb_size must be at least {SMALLEST_PX} pixels, got {self.rgb_size}")
             if self.ablate == "vision":
                 raise ValueError("--env.ablate=vision hides the depth image only: leave out --env.rgb=true")
-        self.features = policy_features(*self.camera_size, self.body, self.colour_size)
-        self.features_map = env_key_map(self.body, colour=self.rgb)
+        self.features = policy_features(*self.camera_size, self.body, self.colour_size, self.limited)
+        self.features_map = env_key_map(self.body, colour=self.rgb, limited=self.limited)
         _ = self.task_config  # its own checks, now rather than in a worker process
 
     @property
@@ -165,6 +172,11 @@ class VtRefineEnvConfig(EnvConfig):
         return self.rgb_size if self.rgb else None
 
     @property
+    def limited(self) -> bool:
+        """Whether every episode has a limit on force of its own; observations then hold the limits."""
+        return self.randomization.contact_force_n is not None
+
+    @property
     def max_episode_steps(self) -> int:
         """Control steps until the time-out."""
         return self.task_config.steps_of(self.scene_config.start)
@@ -182,15 +194,24 @@ class VtRefineEnvConfig(EnvConfig):
 
 
 def policy_features(
-    camera_height: int, camera_width: int, body: Embodiment, colour: tuple[int, int] | None = None
+    camera_height: int,
+    camera_width: int,
+    body: Embodiment,
+    colour: tuple[int, int] | None = None,
+    limited: bool = False,
 ) -> dict[str, PolicyFeature]:
-    """LeRobot features under environment keys; `colour` is the colour image's height and width.
+    """LeRobot features under environment keys; `colour` is the colour image's height and width, `limited`
+    whether they hold limits.
 
     Depth is not a VISUAL feature here: ``lerobot-eval --eval.recording=true`` makes videos of these, and
     millimetres do not fit into one.
     """
-    shapes = env_observation_shapes(camera_height, camera_width, body)
-    features = {key: PolicyFeature(type=FeatureType.STATE, shape=shape) for key, (shape, _) in shapes.items()}
+    shapes = env_observation_shapes(camera_height, camera_width, body, limited)
+    kinds = {LIMITS_KEY.removeprefix(OBS_PREFIX): FeatureType.ENV}
+    features = {
+        key: PolicyFeature(type=kinds.get(key, FeatureType.STATE), shape=shape)
+        for key, (shape, _) in shapes.items()
+    }
     if colour is not None:
         features[RGB_KEY] = PolicyFeature(type=FeatureType.VISUAL, shape=(*colour, 3))
     return {ACTION_KEY: PolicyFeature(type=FeatureType.ACTION, shape=(body.num_joints,)), **features}

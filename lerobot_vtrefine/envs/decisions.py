@@ -11,7 +11,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from lerobot_vtrefine.datasets.features import DEPTH_KEY, columns
+from lerobot_vtrefine.datasets.features import DEPTH_KEY, LIMITS, columns
 from lerobot_vtrefine.embodiments import Embodiment
 from lerobot_vtrefine.envs.config import VtRefineEnvConfig
 from lerobot_vtrefine.envs.episodes import Array, Episodes
@@ -165,7 +165,7 @@ def policy_columns(raw: Batch, body: Embodiment) -> Batch:
     values = {source: value.float() for source, value in raw.items()}
     batch = {
         column.key: values[column.source] if column.pad is None else values[column.source][..., column.pad, :]
-        for column in columns(body)
+        for column in columns(body, LIMITS in values)
         if column.source in values
     }
     return batch | {DEPTH_KEY: values["depth_mm"].unsqueeze(-3)}

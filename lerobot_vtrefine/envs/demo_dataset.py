@@ -31,6 +31,7 @@ from lerobot_vtrefine.folders import (
     working_folder,
     write_in_place,
 )
+from lerobot_vtrefine.lerobot_compat.codec_priority import ordinary_priority
 from lerobot_vtrefine.lerobot_compat.fast_saving import fast_saving
 
 LEDGER = NOTE
@@ -109,7 +110,7 @@ class DemoDataset:
         for step, action in enumerate(demonstration.actions):
             raw = {key: value[step] for key, value in demonstration.raw.items()}
             dataset.add_frame({**raw_to_frame(raw, self._body), ACTION_KEY: action, "task": self._task})
-        with fast_saving(), SuppressProgressBars():
+        with fast_saving(), ordinary_priority(), SuppressProgressBars():
             dataset.save_episode()
         row = {"episode_index": self.num_episodes, **demonstration.row}
         self._ledger["episodes"].append(row)

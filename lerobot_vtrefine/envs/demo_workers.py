@@ -22,7 +22,12 @@ POLL_S = 1.0
 
 @contextmanager
 def demonstration_stream(
-    config: VtRefineEnvConfig, degradation: Degradation, num_envs: int, first_seed: int, num_workers: int
+    config: VtRefineEnvConfig,
+    degradation: Degradation,
+    num_envs: int,
+    first_seed: int,
+    num_workers: int,
+    with_truth: bool = False,
 ) -> Generator[Iterator[Demonstration]]:
     """Expert episodes of ``first_seed``, ``first_seed + 1``, ... without end, whatever ``num_workers``.
 
@@ -30,7 +35,7 @@ def demonstration_stream(
     ``first_seed + w`` in a process of its own, so that simulation and the caller's writing overlap.
     """
     if num_workers == 0:
-        yield expert_episodes(config, degradation, num_envs, itertools.count(first_seed))
+        yield expert_episodes(config, degradation, num_envs, itertools.count(first_seed), with_truth)
         return
     threads = config.num_threads or max(1, (os.cpu_count() or 1) // num_workers)
     config = replace(config, num_threads=threads)
@@ -39,7 +44,15 @@ def demonstration_stream(
     processes = [
         context.Process(
             target=_simulate,
-            args=(config, degradation, num_envs, first_seed + worker, num_workers, queues[worker]),
+            args=(
+                config,
+                degradation,
+                num_envs,
+                first_seed + worker,
+                num_workers,
+                with_truth,
+                queues[worker],
+            ),
             daemon=True,
         )
         for worker in range(num_workers)
@@ -56,13 +69,19 @@ def demonstration_stream(
 
 
 def _simulate(
-    config: VtRefineEnvConfig, degradation: Degradation, num_envs: int, first_seed: int, stride: int, out: Any
+    config: VtRefineEnvConfig,
+    degradation: Degradation,
+    num_envs: int,
+    first_seed: int,
+    stride: int,
+    with_truth: bool,
+    out: Any,
 ) -> None:
     """Body of a worker process; an error travels to the reader."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C is the parent's to handle
     try:
         for demonstration in expert_episodes(
-            config, degradation, num_envs, itertools.count(first_seed, stride)
+            config, degradation, num_envs, itertools.count(first_seed, stride), with_truth
         ):
             out.put(demonstration)
     except Exception as error:

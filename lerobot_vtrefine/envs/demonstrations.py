@@ -10,6 +10,7 @@ from lerobot_vtrefine.envs.config import VtRefineEnvConfig
 from lerobot_vtrefine.envs.episodes import Array, Episodes, Raw
 from lerobot_vtrefine.envs.factory import make_episodes
 from lerobot_vtrefine.sim.demonstrations import Degradation
+from lerobot_vtrefine.sim.truth import truth
 
 if TYPE_CHECKING:
     from lerobot_vtrefine.sim.expert import ScriptedExpert
@@ -28,19 +29,26 @@ class Demonstration:
 
 
 def expert_episodes(
-    config: VtRefineEnvConfig, degradation: Degradation, num_envs: int, seeds: Iterable[int]
+    config: VtRefineEnvConfig,
+    degradation: Degradation,
+    num_envs: int,
+    seeds: Iterable[int],
+    with_truth: bool = False,
 ) -> Iterator[Demonstration]:
-    """Expert episodes of ``seeds``, in their order; each is a pure function of its seed."""
+    """Expert episodes of ``seeds``, in their order; each is a pure function of its seed.
+
+    ``with_truth``: their frames hold ``sim.truth``, too.
+    """
     from lerobot_vtrefine.sim.expert import ScriptedExpert
 
     episodes = make_episodes(config, num_envs)
     expert = ScriptedExpert(episodes.sim, degradation)
     seeds = list(seeds) if isinstance(seeds, range) else seeds
-    return in_seed_order(rollouts(episodes, expert, iter(seeds)))
+    return in_seed_order(rollouts(episodes, expert, iter(seeds), with_truth))
 
 
 def rollouts(
-    episodes: Episodes, expert: "ScriptedExpert", seeds: Iterator[int]
+    episodes: Episodes, expert: "ScriptedExpert", seeds: Iterator[int], with_truth: bool = False
 ) -> Iterator[tuple[int, Demonstration]]:
     """(position of its seed, episode) as episodes end; their environments go on with the next seed."""
     numbered = enumerate(seeds)
@@ -60,12 +68,14 @@ def rollouts(
             return
         targets = np.zeros((episodes.num_envs, episodes.raw["state"].shape[1]), np.float32)
         targets[active] = expert.act(active)
+        known = {"truth": truth(episodes.sim, episodes.ids)} if with_truth else {}
+        seen = episodes.raw | known
         for env in active.tolist():
-            frames[env].append({key: value[env].copy() for key, value in episodes.raw.items()})
+            frames[env].append({key: value[env].copy() for key, value in seen.items()})
             actions[env].append(targets[env])
         idle = episodes.step(targets).finished
         for env, row in zip(idle.tolist(), episodes.rows(idle), strict=True):
-            raw = {key: np.stack([frame[key] for frame in frames[env]]) for key in episodes.raw}
+            raw = {key: np.stack([frame[key] for frame in frames[env]]) for key in seen}
             yield int(positions[env]), Demonstration(raw, np.stack(actions[env]), row)
             frames[env], actions[env] = [], []
 

@@ -5,6 +5,7 @@ from collections.abc import Sequence
 import numpy as np
 from scipy.stats import binomtest
 
+from lerobot_vtrefine.information.estimator import POLICY
 from lerobot_vtrefine.information.quantities import SHOWN_UNITS
 from lerobot_vtrefine.information.study import Finding, Study
 from lerobot_vtrefine.information.tolerance import LATERAL, TILT
@@ -20,6 +21,11 @@ KNOWN = {
 
 STYLES = {"joints": "d", "visual": "a", "tactile": "m", "visuo_tactile": "b", "visuo_tactile_cloud": "b"}
 """Colours of the senses."""
+
+
+def style_of(finding: Finding) -> str:
+    """The senses' colour, with an outline where the network is not the policy's."""
+    return STYLES[finding.senses] + ("" if finding.network == POLICY else f" {finding.network}")
 
 
 def known_error_chart(found: Study, error: str) -> str:
@@ -42,7 +48,7 @@ def known_error_chart(found: Study, error: str) -> str:
     for place, item in marks:
         rate, *ends = _rates([item.success])
         at = np.array([place])
-        parts += [panel.whiskers(at, *ends), panel.dots(at, rate, STYLES[item.senses])]
+        parts += [panel.whiskers(at, *ends), panel.dots(at, rate, style_of(item))]
     return drawing(WIDTH, HEIGHT, parts, f"success against {words}")
 
 

@@ -6,10 +6,10 @@ as much as they may have slipped: where it brings the hands would otherwise tell
 Shapes: ``E`` episodes, ``T`` frames of the longest, ``m`` worlds.
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from math import radians
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Protocol
 
 import numpy as np
 import torch
@@ -21,7 +21,6 @@ from lerobot_vtrefine.envs.config import VtRefineEnvConfig
 from lerobot_vtrefine.envs.episodes import Episodes
 from lerobot_vtrefine.envs.factory import make_episodes
 from lerobot_vtrefine.information.quantities import NAMES, Grasps, Relative, observe
-from lerobot_vtrefine.policies.vt_dp3 import VisuoTactileProcessorStep
 from lerobot_vtrefine.sim.demonstrations import Degradation
 from lerobot_vtrefine.sim.expert import ScriptedExpert
 from lerobot_vtrefine.sim.ik import hand_poses
@@ -43,7 +42,16 @@ ERRORS = Degradation(
 FIRST_SEED = 3_000_000
 """Apart from the seeds of demonstrations, training and evaluation."""
 
-Views = dict[str, VisuoTactileProcessorStep]
+
+class View(Protocol):
+    """What makes new columns of raw ones, such as ``VisuoTactileProcessorStep``."""
+
+    def observation(self, observation: dict[str, Any]) -> dict[str, Any]:
+        """A frame (m, ...) with the new columns."""
+        ...
+
+
+Views = Mapping[str, View]
 """How frames are seen; the name of a view is the prefix of its columns."""
 
 
@@ -58,6 +66,8 @@ class Frames:
     length: Tensor
     """(E,) frames of each episode."""
     grasps: Grasps
+    contact: Tensor
+    """(E, T, 4) as of ``InsertionSim.part_touch``."""
 
     def split(self, share: float) -> tuple["Frames", "Frames"]:
         """The first episodes for training, a ``share`` of them, and the others."""
@@ -66,7 +76,7 @@ class Frames:
 
     def _part(self, rows: slice) -> "Frames":
         columns = {key: value[rows] for key, value in self.columns.items()}
-        return Frames(columns, self.truth[rows], self.length[rows], self.grasps)
+        return Frames(columns, self.truth[rows], self.length[rows], self.grasps, self.contact[rows])
 
     def index(self) -> tuple[Tensor, Tensor]:
         """Episode and frame number of every frame, (N,) each."""
@@ -148,13 +158,16 @@ def collect_frames(
         Relative(*(part[valid] for part in relative)).quantities(grasps)
     ).float()
     columns = {key: torch.cat([batch.columns[key] for batch in batches]) for key in batches[0].columns}
-    return Frames(columns, truth.to(device), torch.from_numpy(length).to(device), grasps)
+    contact = torch.from_numpy(np.concatenate([batch.contact for batch in batches])).float()
+    ends = torch.from_numpy(length).to(device)
+    return Frames(columns, truth.to(device), ends, grasps, contact.to(device))
 
 
 @dataclass
 class _Batch:
     columns: dict[str, Tensor]  # (n, T, ...)
     truth: Relative  # (n, T, ...)
+    contact: np.ndarray  # (n, T, 4)
     length: np.ndarray  # (n,)
 
 
@@ -172,26 +185,27 @@ def _one_batch(
     holds.draw(ids)
     expert.reset(ids)
     columns = {
-        key: torch.zeros((len(ids), frames, *value.shape[1:]), device=device)
+        key: torch.zeros((len(ids), frames, *value.shape[1:]), dtype=value.dtype, device=device)
         for key, value in view_columns(_rows(episodes.raw, ids[:1]), body, views, device).items()
     }
     truth = Relative(*(np.zeros((len(ids), frames, *part.shape[1:])) for part in observe(sim, ids[:1])))
-    length = np.zeros(len(ids), np.int64)
+    contact, length = np.zeros((len(ids), frames, 4)), np.zeros(len(ids), np.int64)
     targets = np.zeros((len(ids), body.num_joints))
     running = ids
     for frame in range(frames):
         rows = torch.as_tensor(running, device=device)
         for key, value in view_columns(_rows(episodes.raw, running), body, views, device).items():
-            columns[key][rows, frame] = value.float()
+            columns[key][rows, frame] = value
         for whole, part in zip(truth, observe(sim, running), strict=True):
             whole[running, frame] = part
+        contact[running, frame] = sim.part_touch(running)
         length[running] += 1
         targets[running] = expert.act(running)
         episodes.step(targets)
         running = episodes.active
         if len(running) == 0:
             break
-    return _Batch(columns, truth, length)
+    return _Batch(columns, truth, contact, length)
 
 
 def episode_frames(episodes: Episodes) -> int:

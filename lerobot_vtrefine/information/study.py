@@ -17,10 +17,14 @@ from lerobot_vtrefine.datasets.features import STATE_KEY
 from lerobot_vtrefine.envs.config import VtRefineEnvConfig
 from lerobot_vtrefine.information.acceptance import Verdict, judge
 from lerobot_vtrefine.information.closed_loop import expert_success
+from lerobot_vtrefine.information.contact import SHARES
 from lerobot_vtrefine.information.estimator import (
-    SENSES,
+    NETWORKS,
+    POLICY,
     Estimator,
     Senses,
+    asked,
+    contact_known,
     episode_errors,
     rms_with_interval,
     train_estimator,
@@ -29,7 +33,7 @@ from lerobot_vtrefine.information.estimator import (
 from lerobot_vtrefine.information.frames import Frames, Views, collect_frames
 from lerobot_vtrefine.information.quantities import NAMES, unit_of
 from lerobot_vtrefine.information.tolerance import SIZES, Tolerated, tolerance
-from lerobot_vtrefine.policies.vt_dp3.observation_encoder import save_encoder
+from lerobot_vtrefine.policies.vt_dp3.observation_encoder import ObservationEncoder, save_encoder
 from lerobot_vtrefine.sim.config import PROCEDURAL_PAIRS
 
 TRAINING_SHARE = 0.85
@@ -61,6 +65,9 @@ class Effort:
     """More clearances to study in the same way, for the page's curves; each takes as long as the first."""
     preset: str = "small"
     """Whose encoder: ``--policy.preset``."""
+    networks: tuple[str, ...] = (POLICY,)
+    """policy (the policy's own encoder), strong (a larger network on whole images, to tell what the sensors
+    know from what that encoder keeps of it), or both."""
     device: str = "cpu"
     """Where the regressors are trained, cpu or cuda."""
     seed: int = 0
@@ -72,6 +79,9 @@ class Effort:
                 raise ValueError(f"--{name} must be at least 1, got {getattr(self, name)}")
         if not self.history or min(self.history) < 1:
             raise ValueError(f"--history must hold numbers of frames from 1, got {self.history}")
+        unknown = [name for name in self.networks if name not in NETWORKS]
+        if unknown or not self.networks:
+            raise ValueError(f"--networks={','.join(self.networks)}: choose from {', '.join(NETWORKS)}")
         if self.clearances_m and min(self.clearances_m) <= 0:
             raise ValueError(f"--clearances_m must hold lengths above 0, got {self.clearances_m}")
         if self.episodes < 2 * self.num_envs:
@@ -88,6 +98,10 @@ class Finding:
     """Error on held-out episodes and its 95 % interval, in the units of ``unit_of``."""
     success: tuple[int, int] | None = None
     """Of episodes in which the expert acted on the estimates."""
+    network: str = POLICY
+    """One of ``NETWORKS``."""
+    contact: dict[str, tuple[float, float, float]] = field(default_factory=dict)
+    """As in ``contact.Known.told``."""
 
 
 @dataclass
@@ -102,9 +116,11 @@ class Study:
     """The expert with errors of known sizes."""
     at_clearance: dict[float, "Study"] = field(default_factory=dict)
     """The same task with other clearances [m]."""
+    contact_unseen: dict[str, float] = field(default_factory=dict)
+    """As in ``contact.Known.unseen``."""
 
     def success_of(self, senses: str) -> float | None:
-        """Best success over lengths of history; None where it was not measured."""
+        """Best success over networks and lengths of history; None where it was not measured."""
         if senses == TRUTH:
             return None if self.true_success is None else _rate(self.true_success)
         rates = [_rate(f.success) for f in self.findings if f.senses == senses and f.success is not None]
@@ -130,7 +146,7 @@ def study(
     """
     if effort.clearances_m and config.scene_config.pair not in PROCEDURAL_PAIRS:
         raise ValueError(f"--effort.clearances_m: {config.scene_config.pair} has the clearance of its meshes")
-    chosen = [SENSES[name] for name in senses]
+    chosen = asked(senses, effort.networks)
     body, device = config.body.name, torch.device(effort.device)
     views = views_of(chosen, body, effort.preset, effort.device)
     count = effort.num_envs
@@ -147,7 +163,9 @@ def study(
             estimator = _trained(item, training, body, effort, history, told)
             if history == effort.history[0]:
                 keep(item, estimator)
-            result.findings.append(_tested(item, estimator, held_out, config, effort, views))
+            known = contact_known(estimator, held_out, effort.seed)
+            result.contact_unseen = known.unseen
+            result.findings.append(_tested(item, estimator, held_out, config, effort, views, known.told))
             told("senses", len(chosen) * len(effort.history), 1)
     if effort.tolerance_episodes:
         sizes = sum(map(len, SIZES.values()))
@@ -165,7 +183,7 @@ def study(
 def _trained(item: Senses, frames: Frames, body: str, effort: Effort, history: int, told: Told) -> Estimator:
     torch.manual_seed(effort.seed)
     estimator = Estimator(item, frames, body, effort.preset, effort.device, history).to(effort.device)
-    label = f"{item.name}, {history} frame{'s' * (history > 1)}"
+    label = f"{item.words}, {history} frame{'s' * (history > 1)}"
     train_estimator(
         estimator,
         frames,
@@ -184,6 +202,7 @@ def _tested(
     config: VtRefineEnvConfig,
     effort: Effort,
     views: Views,
+    contact: dict[str, tuple[float, float, float]],
 ) -> Finding:
     ends = rms_with_interval(episode_errors(estimator, held_out), effort.seed)
     columns = [_shown(row) for row in ends.numpy()]
@@ -191,6 +210,8 @@ def _tested(
         item.name,
         estimator.history,
         {name: (columns[0][name], columns[1][name], columns[2][name]) for name in NAMES},
+        network=item.network,
+        contact=contact,
     )
     if effort.closed_loop_episodes:
         read = [estimator.sources[key].split("/")[0] for key in estimator.encoder.keys if key != STATE_KEY]
@@ -246,12 +267,18 @@ def _found(found: Study) -> dict[str, Any]:
     return {
         "units": {name: unit_of(name)[1] for name in NAMES},
         "prior": found.prior,
+        "contact_unseen": found.contact_unseen,
         "true_state": _proportion(found.true_success),
         "findings": [
             {
                 "senses": finding.senses,
+                "network": finding.network,
                 "history": finding.history,
                 "rms": {name: {"rms": v[0], "ci95": list(v[1:])} for name, v in finding.rms.items()},
+                "contact": {
+                    name: {("share" if name in SHARES else "rms"): v[0], "ci95": list(v[1:])}
+                    for name, v in finding.contact.items()
+                },
                 "expert": _proportion(finding.success),
             }
             for finding in found.findings
@@ -271,7 +298,7 @@ def save_keeper(folder: Path, effort: Effort) -> Callable[[Senses, Estimator], N
     """A ``keep`` that writes encoders to ``folder``, where ``--policy.pretrained_encoder`` finds them."""
 
     def keep(senses: Senses, estimator: Estimator) -> None:
-        if senses.modalities:
+        if senses.modalities and isinstance(estimator.encoder, ObservationEncoder):
             config = senses.policy(estimator.body, effort.preset, effort.device, 1)
             save_encoder(estimator.encoder, config, folder)
 

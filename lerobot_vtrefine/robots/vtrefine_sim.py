@@ -87,7 +87,7 @@ class VtRefineSim(Robot):
     @cached_property
     def observation_features(self) -> dict[str, Any]:
         """Joints, depth, colour if it is on, raw and idle pad counts, their age, the camera's model."""
-        features = dataset_features(*self.env.camera_size, self.body, self.env.colour_size)
+        features = dataset_features(*self.env.camera_size, self.body, self.env.colour_size, self.env.limited)
         found: dict[str, Any] = dict(self.action_features)
         for key, feature in features.items():
             if not key.startswith(OBS_PREFIX) or key == STATE_KEY:

@@ -275,13 +275,16 @@ class RandomizationConfig:
     pad_stiffness_scale: tuple[float, float] | None = None
     """Factor on the pads' stiffness, in the contact and in the sensor model alike."""
     sensor_gain_scale: tuple[float, float] | None = None
+    contact_force_n: tuple[float, float] | None = None
+    """The limit on force (`LimitsConfig.contact_force_n`). It is no secret: policy, critic and expert are
+    told."""
     camera_position_m: float = 0.0
     """Half range of the camera's displacement along each axis."""
     camera_rotation_rad: float = 0.0
     """Half range of its rotation about each of its axes."""
 
     def __post_init__(self) -> None:
-        for name in RANGES:
+        for name in (*RANGES, "contact_force_n"):
             bounds = getattr(self, name)
             if bounds is not None and not 0.0 < bounds[0] <= bounds[1]:
                 raise ValueError(f"randomization.{name} needs 0 < lowest <= highest, got {bounds}")

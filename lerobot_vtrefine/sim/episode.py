@@ -30,6 +30,8 @@ class EpisodeState:
     seed: Array
     steps: Array
     """Control steps done."""
+    force_limit: Array
+    """(N,) contact force that ends the episode [N]."""
     command: Array
     """(N, nu) servo command at the end of the last control step."""
     hold_steps: Array
@@ -50,6 +52,8 @@ class EpisodeState:
     """(N, w - 1, 3) last contact forces, for the moving average."""
     part_force: Array
     """(N, 3) force of the plug on the socket at the last substep, world frame [N]."""
+    touch: Array
+    """(N, 4) whether the parts touch at the last substep, 0 or 1, and where, in the socket's frame [m]."""
     pad_force: Array
     """(N, P) normal force on each pad at the last substep [N]."""
     pad_load: Array
@@ -75,6 +79,7 @@ class EpisodeState:
         shapes: dict[str, tuple[tuple[int, ...], type]] = {
             "seed": ((n,), np.int64),
             "steps": ((n,), np.int64),
+            "force_limit": ((n,), float),
             "command": ((n, scene.model.nu), float),
             "hold_steps": ((n,), np.int64),
             "held_steps": ((n, 2), np.int64),
@@ -85,6 +90,7 @@ class EpisodeState:
             "largest_shift": ((n, 2), float),
             "force_tail": ((n, window - 1, 3), float),
             "part_force": ((n, 3), float),
+            "touch": ((n, 4), float),
             "pad_force": ((n, pads), float),
             "pad_load": ((n, pads, LOAD_SIZE), float),
             "step_force": ((n,), float),
@@ -108,6 +114,11 @@ class EpisodeState:
         """(m, 2) int64 seed and control step of worlds `ids`, once the worlds `after` have done one more."""
         more = 0 if after is None else np.isin(ids, after)
         return np.stack([self.seed[ids], self.steps[ids] + more], 1)
+
+    def limits(self, ids: Array, config: LimitsConfig) -> Array:
+        """(m, 2) float32 what ends the episodes of worlds `ids`: contact force [N], shift in the hand [m]."""
+        force = self.force_limit[ids]
+        return np.stack([force, np.full_like(force, config.in_hand_shift_m)], 1).astype(np.float32)
 
     def seated_s(self, dt_s: float) -> Array:
         """(N,) for how long each plug has been seen seated at every control step; NaN where it is not."""
@@ -180,7 +191,7 @@ def _update_forces(state: EpisodeState, ids: Array, seen: Measured) -> None:
     peak = seen.substeps.force_peak
     state.force_tail[ids], state.step_force[ids] = seen.substeps.force_tail, peak
     state.peak_force[ids] = np.maximum(state.peak_force[ids], peak)
-    state.part_force[ids] = seen.substeps.force
+    state.part_force[ids], state.touch[ids] = seen.substeps.force, seen.substeps.touch
     state.pad_load[ids], state.pad_force[ids] = seen.pad_load, seen.pad_load[..., 0]
 
 
@@ -226,7 +237,7 @@ def _update_failure(
         (task.UNSTABLE, seen.diverged),
         (task.OVERFLOWED, seen.overflowed),
         (task.SHIFTED, (state.shift[ids] > config.in_hand_shift_m).any(1)),
-        (task.FORCED, state.step_force[ids] > config.contact_force_n),
+        (task.FORCED, state.step_force[ids] > state.force_limit[ids]),
         (task.DROPPED, (dropped | lost).any(1)),
     )
     failure = state.failure[ids]

@@ -82,6 +82,9 @@ HOVER_M = 0.0012  # a plug that the descent has pushed off its aim waits here, a
 HOVER_S = 1.5
 ENTRY_M = 0.0006  # below this height over the mouth nothing is corrected any more
 PRESS_M = 0.008  # a blocked plug is pushed as if it should be this much lower: a few newtons
+PRESS_N_PER_M = 820.0  # what that comes to on a rim, at most (a cross, friction 0.1 to 0.6)
+PRESS_SHARE = 0.5  # of a limit on force that is told
+RIM_M = 0.002  # a plug that is not this deep may stand on the rim
 SLOWDOWN = 0.35  # before the seat: largest share of the way left in one control step
 BOTTOM_M = 0.0005  # a seated plug is pushed this far beyond its seat
 TABLE_GAP_M = 0.003  # between fingertips and table
@@ -148,6 +151,7 @@ class ScriptedExpert:
         self._socket = Poses.identity(count)  # where it was when the phase began, or the plug entered
         self._height_m = np.zeros(count)  # wanted height of the plug over the socket, while inserting
         self._entered = np.zeros(count, bool)
+        self._press_m = np.full(count, PRESS_M)
 
     def reset(self, ids: Ids, seeds: Ids | None = None) -> None:
         """Start new episodes of environments `ids` (m,) after the simulation was reset, by its seeds."""
@@ -156,6 +160,9 @@ class ScriptedExpert:
         view = self._observe(ids)
         self._step[ids] = 0
         self._target[ids] = view.q
+        if self._sim.tells_force_limit:
+            gentle = PRESS_SHARE * self._sim.force_limits_n[ids] / PRESS_N_PER_M
+            self._press_m[ids] = np.minimum(gentle, PRESS_M)
         self._servos.reset(ids, view.q, self._sim.command_targets(ids))
         self._wanted.assign(ids, view.hands)
         self._opening[ids] = self._robot.fingers.travel_m if self._from_table else self._grip_m
@@ -298,7 +305,11 @@ class ScriptedExpert:
         free = ~self._entered[ids]
         self._held.assign(ids[free], view.parts[free].inverse() @ view.hands[free])
         self._socket.assign(ids[free], view.parts[free, LEFT])
-        height = np.maximum(self._height_m[ids], view.height_m - PRESS_M)
+        on_rim = ~free & (view.height_m > self._pair.mouth_z_m - RIM_M)
+        press = np.where(on_rim, self._press_m[ids], PRESS_M)
+        height = np.maximum(self._height_m[ids], view.height_m - press)
+        gentle = press < PRESS_M
+        self._height_m[ids[gentle]] = height[gentle]  # a plug that then slips in need not catch up with it
         return self._aim(ids, self._socket[ids], height) @ self._held[ids][:, RIGHT]
 
     def _descend(self, ids: Ids, view: View, moving: NDArray[np.bool_]) -> None:

@@ -41,10 +41,12 @@ def describe(
     ids: Array,
     seen: Kinematics,
     parameters: dict[str, Array],
+    tells_force_limit: bool,
 ) -> Privileged:
     """State of worlds `ids`. Rotations are given by their first two columns.
 
     `time_left` and `hold` are fractions; `shift` and `force` fractions of the limits that end the episode.
+    The one on force [N] is a column where it differs between episodes.
     """
     m = len(ids)
     insertion = seen.insertion
@@ -73,12 +75,14 @@ def describe(
         "contact_force": turn_back(seen.socket[1], episode.part_force[ids]),
         "pad_force": episode.pad_force[ids],
         "shift": episode.shift[ids] / limits.in_hand_shift_m,
-        "force": episode.step_force[ids][:, None] / limits.contact_force_n,
+        "force": episode.step_force[ids][:, None] / episode.force_limit[ids][:, None],
         "grasped": episode.grasped[ids].astype(float),
         "hold": episode.hold_steps[ids][:, None] / hold_steps,
         "time_left": 1.0 - episode.steps[ids][:, None] / config.steps_of(scene.config.start),
     }
     columns |= {name: parameters[name][ids][:, None] for name in RANGES}
+    if tells_force_limit:
+        columns["force_limit"] = episode.force_limit[ids][:, None]
     return Privileged({name: np.reshape(block, (m, -1)) for name, block in columns.items()})
 
 

@@ -14,7 +14,7 @@ from lerobot_vtrefine.sim.starts import uniform_draws
 
 Array = np.ndarray
 
-_STREAM = 1
+_STREAM, _LIMIT_STREAM = 1, 0xF0
 CLEARANCE_LEVELS = 9
 # All that a hole's size changes in a compiled model; the constants derived from them are recomputed per
 # world.
@@ -82,6 +82,18 @@ class Randomizer:
             camera.position_m + self._config.camera_position_m * offset[:, :3],
             rotation @ about_axis(2, turns[:, 2]),
         )
+
+    @property
+    def varies_force_limit(self) -> bool:
+        """Whether the limit on force differs between episodes."""
+        return self._config.contact_force_n is not None
+
+    def force_limits(self, seeds: Array, nominal_n: float) -> Array:
+        """Limits on force [N] for episodes with these seeds (m,): a stream of their own, so that they change
+        nothing else of an episode.
+        """
+        low, high = self._config.contact_force_n or (nominal_n, nominal_n)
+        return low + (high - low) * (uniform_draws(seeds, _LIMIT_STREAM, 1)[:, 0] + 1.0) / 2
 
     def model_fields(self, parameters: WorldParameters) -> dict[str, Array]:
         """Values (m, ...) of every MjModel field that these worlds have of their own."""

@@ -104,9 +104,12 @@ class InsertionSim:
         self._pads = Pads(self.scene, model, num_envs, self.config.control_dt_s, device, threads, shear)
         window = max(1, round(self.config.limits.force_window_s / self.scene.config.timestep_s))
         self._episode = EpisodeState.empty(self.scene, num_envs, window)
+        self._episode.force_limit[:] = self.config.limits.contact_force_n
+        self.force_limits_n = self._episode.force_limit
+        """(N,) contact force [N] that ends every world's present episode."""
+        self.tells_force_limit = self._randomizer.varies_force_limit
         self._rates = task.rate_limits(self.embodiment, self.config)
-        everyone = self._randomizer.draw(np.zeros(num_envs, np.int64))
-        self._parameters = dict(everyone.values)
+        self._parameters = dict(self._randomizer.draw(np.zeros(num_envs, np.int64)).values)
         eye = DEPTH_SENSORS[self.scene.config.depth_sensor]
         self._depth = DepthCamera(self.scene.model, self.scene.camera, num_envs, device, threads, eye)
         self._cache = StateCache(self.scene, self._backend, self._depth)
@@ -166,15 +169,14 @@ class InsertionSim:
         state = self._episode
         state.clear(ids)
         state.seed[ids] = seeds
+        state.force_limit[ids] = self._randomizer.force_limits(seeds, self.config.limits.contact_force_n)
         command, state.pad_load[ids] = self._settler.settle(ids, seeds, start)
         state.command[ids] = self._drive.reset(ids, command)
         state.pad_force[ids] = state.pad_load[ids][..., 0]
         self._pads.reset(ids, seeds, drawn.values)
         seen = self._cache.see(ids)
-        measured = seen.grip_points
-        in_hand = self.scene.config.start == "grasped"
-        state.grasped[ids] = in_hand
-        state.reference[ids] = measured
+        state.grasped[ids] = self.scene.config.start == "grasped"
+        state.reference[ids] = seen.grip_points
         state.tip[ids] = seen.insertion.position_m
         self._remember(ids)
 
@@ -213,7 +215,8 @@ class InsertionSim:
 
         Returns:
             `state` (m, J) float32 [rad, m]; `tactile` and `tactile_baseline` (m, P, T) uint8 counts;
-            `depth_mm` (m, H, W) uint16, 0 where nothing is measured within 2 m.
+            `depth_mm` (m, H, W) uint16, 0 where nothing is measured within 2 m. And what a person would say:
+            `limits` (m, 2) float32 on force [N] and shift in the hand [m], where these differ.
         """
         copied = {name: start_copy(values) for name, values in self.observe_tensors(ids).items()}
         frames = {name: wait() for name, wait in copied.items()}
@@ -223,7 +226,9 @@ class InsertionSim:
     def observe_tensors(self, ids: Array | None = None) -> dict[str, torch.Tensor]:
         """The same as tensors on `device`, where cameras and pads leave them; `depth_mm` is int16."""
         ids = self._checked(ids)
+        limits = self._episode.limits(ids, self.config.limits)
         return {
+            **({"limits": torch.as_tensor(limits, device=self.device)} if self.tells_force_limit else {}),
             "state": torch.as_tensor(self.joint_state(ids), device=self.device),
             "tactile": self._pads.counts(ids, self._touch_at(ids)),
             "tactile_baseline": self._pads.baseline(ids),
@@ -282,6 +287,10 @@ class InsertionSim:
     def insertion(self, ids: Array | None = None) -> task.Insertion:
         """Where each plug is with respect to its socket."""
         return self._cache.see(self._checked(ids)).insertion
+
+    def part_touch(self, ids: Array | None = None) -> Array:
+        """Whether plug and socket touch, 0 or 1, and where in the socket's frame [m]: (m, 4)."""
+        return self._episode.touch[self._checked(ids)]
 
     def privileged(self, ids: Array | None = None) -> Array:
         """State for a critic, (m, P) float32, columns named by `privileged_names`."""
@@ -385,4 +394,5 @@ class InsertionSim:
         return wait
 
     def _describe(self, ids: Array) -> Privileged:
-        return describe(self.scene, self.config, self._episode, ids, self._cache.see(ids), self._parameters)
+        seen, told = self._cache.see(ids), self.tells_force_limit
+        return describe(self.scene, self.config, self._episode, ids, seen, self._parameters, told)

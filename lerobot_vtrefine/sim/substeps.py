@@ -37,6 +37,9 @@ class Substeps:
     """(m, 3) plug's origin in the socket's frame at the end [m]."""
     rim_slide: Array
     """(m,) way that the plug slid on the socket's rim [m]."""
+    touch: Array
+    """(m, 4) whether the parts touch at the last substep, 0 or 1, and where [m]: the centre of the contact's
+    forces in the socket's frame, zeros where they do not touch."""
 
 
 def count_substeps(timestep_s: float, config: TaskConfig) -> int:
@@ -74,7 +77,14 @@ def start_summary(
     forces = contact[..., 1:4]
     peak, new_tail = windowed_peak(forces, tail.to(forces))
     slide = rim_slide(torch.cat([start[:, None], tips], 1), touching, mouth_z_m)
-    parts = (peak, new_tail, forces[:, -1], tips[:, -1], slide)
+    parts = (
+        peak,
+        new_tail,
+        forces[:, -1],
+        tips[:, -1],
+        slide,
+        touch(contact[:, -1], qpos[:, -2:, at.socket_qpos]),
+    )
     copied = start_copy(torch.cat([part.reshape(len(part), -1) for part in parts], 1))
 
     def wait() -> Substeps:
@@ -83,6 +93,18 @@ def start_summary(
         return Substeps(*(piece.reshape(part.shape) for piece, part in zip(pieces, parts, strict=True)))
 
     return wait
+
+
+def touch(contact: Tensor, sockets: Tensor) -> Tensor:
+    """Where parts touch, (m, 4) as in `Substeps.touch`, out of the contact sensor's last reading (m, 10) and
+    the socket's last poses (m, 1 or 2, 7).
+
+    A reading is of the state before its substep, so the pose is the last but one, where there are two.
+    """
+    socket = sockets[:, 0]
+    centre = turn_back(socket[:, 3:], contact[:, 7:10] - socket[:, :3])
+    touching = (contact[:, :1] > 0) & (contact[:, 1:4] != 0).any(-1, keepdim=True)
+    return torch.cat([touching.to(centre), torch.where(touching, centre, 0.0)], -1)
 
 
 def turn_back(quat: Tensor, vector: Tensor) -> Tensor:

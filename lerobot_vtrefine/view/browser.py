@@ -176,13 +176,13 @@ class BrowserView:
     def _tell(self) -> None:
         world, sim = self._world, self._world.sim
         named = dict(zip(sim.privileged_names, sim.privileged()[0], strict=True))
-        force_n = named["force"] * sim.config.limits.contact_force_n
+        force_n = named["force"] * sim.force_limits_n[0]
         held_s, hold_s = np.nan_to_num(sim.seated_s[0]), sim.config.success.hold_s
         outcome = world.outcome.replace("_", " ").upper() or "running"
         self._status.content = (
             f"**{outcome}** · seed {world.seed} · {world.time_s:.1f} s of "
             f"{sim.episode_steps * sim.config.control_dt_s:.0f} s\n\n"
-            f"plug on socket **{force_n:.1f} N** (limit {sim.config.limits.contact_force_n:.0f} N)\n\n"
+            f"plug on socket **{force_n:.1f} N** (limit {sim.force_limits_n[0]:.0f} N)\n\n"
             f"seated {held_s:.1f} of {hold_s:.1f} s"
         )
         self._clock.value = 100.0 * min(1.0, held_s / hold_s)

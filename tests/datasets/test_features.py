@@ -10,8 +10,11 @@ import numpy as np
 import pytest
 import torch
 from aloha_columns import BASELINE_KEYS, RAW_KEYS, TACTILE_KEYS
+from lerobot.configs import FeatureType, PolicyFeature
 from lerobot.datasets.lerobot_dataset import LeRobotDataset
-from lerobot.envs.utils import preprocess_observation
+from lerobot.envs.utils import env_to_policy_features, preprocess_observation
+from lerobot.utils.constants import OBS_ENV_STATE
+from lerobot.utils.feature_utils import dataset_to_policy_features
 
 from lerobot_vtrefine.datasets import features as table
 from lerobot_vtrefine.datasets.features import (
@@ -27,6 +30,9 @@ from lerobot_vtrefine.datasets.features import (
     raw_to_frame,
 )
 from lerobot_vtrefine.embodiments import ALOHA, KINOVA, Embodiment
+from lerobot_vtrefine.envs import VtRefineEnvConfig
+from lerobot_vtrefine.envs.decisions import _tensor, policy_columns
+from lerobot_vtrefine.sim.config import RandomizationConfig
 
 MakeRaw = Callable[[np.random.Generator, float], dict[str, Any]]
 
@@ -73,6 +79,32 @@ def test_environment_spaces_match_the_observation(make_raw: MakeRaw) -> None:
     assert set(env_key_map(ALOHA)) == {*shapes, "action"}
 
 
+def test_limits_are_one_more_column_that_lerobot_knows(make_raw: MakeRaw) -> None:
+    """They stand beside the joints, in LeRobot's own column for it, and nothing else changes.
+
+    There are two: a column of one reaches policies without its dimension.
+    """
+    raw = make_raw(np.random.default_rng(0), 3.0)
+    told = {**raw, "limits": np.array([4.5, 0.25], np.float32)}
+    plain, frame = raw_to_frame(raw, ALOHA), raw_to_frame(told, ALOHA)
+    assert frame.pop(OBS_ENV_STATE).tolist() == [4.5, 0.25]
+    assert plain.keys() == frame.keys()
+    features = dataset_features(24, 32, ALOHA, limited=True)
+    assert dataset_to_policy_features(features)[OBS_ENV_STATE] == PolicyFeature(FeatureType.ENV, (2,))
+    assert {key for key in features if key != OBS_ENV_STATE} == set(dataset_features(24, 32, ALOHA))
+    observation = raw_to_env_observation({key: value[None] for key, value in told.items()}, ALOHA)
+    batch = preprocess_observation(dict(observation))
+    assert batch[OBS_ENV_STATE].tolist() == [[4.5, 0.25]]
+    window = {key: _tensor(value[None, None]) for key, value in told.items()}
+    assert torch.equal(policy_columns(window, ALOHA)[OBS_ENV_STATE][0], batch[OBS_ENV_STATE])
+    shapes = env_observation_shapes(24, 32, ALOHA, limited=True)
+    assert shapes.keys() == observation.keys()
+    assert env_key_map(ALOHA, limited=True)["environment_state"] == OBS_ENV_STATE
+    config = VtRefineEnvConfig(randomization=RandomizationConfig(contact_force_n=(2.0, 8.0)))
+    assert env_to_policy_features(config)[OBS_ENV_STATE] == PolicyFeature(FeatureType.ENV, (2,))
+    assert OBS_ENV_STATE not in env_to_policy_features(VtRefineEnvConfig())
+
+
 def test_hardware_needs_no_noise_level_and_simulation_no_age(make_raw: MakeRaw) -> None:
     raw = make_raw(np.random.default_rng(0), 3.0)
     assert raw_to_frame(raw, ALOHA)[AGE_KEY].tolist() == [0.0] * 4
@@ -85,7 +117,8 @@ def test_hardware_needs_no_noise_level_and_simulation_no_age(make_raw: MakeRaw) 
 def test_columns_are_spelt_in_one_module_only() -> None:
     """Other modules import the names; what docstrings and messages say is no column."""
     package = Path(table.__file__).parents[1]
-    kinds = r"(state|visuo_tactile|tactile_grids|tactile_age|(tactile|tactile_baseline|camera|images)\.\S*)"
+    built = "surface|visuo_tactile|tactile_grids"
+    kinds = rf"(state|environment_state|{built}|tactile_age|(tactile|tactile_baseline|camera|images)\.\S*)"
     column = re.compile(rf"observation\.{kinds}|(tactile|tactile_baseline|camera|images)\.|tactile_age")
     spelt = {
         f"{path.relative_to(package)}: {node.value}"

@@ -4,8 +4,12 @@ import numpy as np
 import pytest
 from fake_sim import FakeSim
 
-from lerobot_vtrefine.envs.demonstrations import in_seed_order, rollouts
+from lerobot_vtrefine.datasets.features import ACTION_KEY, TRUTH_KEY, dataset_features, raw_to_frame
+from lerobot_vtrefine.envs import VtRefineEnvConfig
+from lerobot_vtrefine.envs.demonstrations import expert_episodes, in_seed_order, rollouts
 from lerobot_vtrefine.envs.episodes import Episodes
+from lerobot_vtrefine.sim.demonstrations import Degradation
+from lerobot_vtrefine.sim.truth import TRUTH_SIZE
 
 
 class FakeExpert:
@@ -53,3 +57,17 @@ def test_endless_seeds_yield_as_they_are_asked_for():
     sim = FakeSim(4)
     stream = in_seed_order(rollouts(Episodes(sim), FakeExpert(sim), itertools.count(100, 3)))
     assert [next(stream).row["seed"] for _ in range(6)] == [100, 103, 106, 109, 112, 115]
+
+
+def test_the_truth_is_recorded_where_it_is_asked_for() -> None:
+    config = VtRefineEnvConfig(start="grasped", episode_steps=2)
+    plain, known = (
+        next(iter(expert_episodes(config, Degradation(), 1, [3], with_truth))) for with_truth in (False, True)
+    )
+    assert known.raw["truth"].shape == (2, TRUTH_SIZE)
+    frame = raw_to_frame({key: value[0] for key, value in known.raw.items()}, config.body)
+    assert frame[TRUTH_KEY].tolist() == known.raw["truth"][0].tolist()
+    features = dataset_features(*config.camera_size, config.body, truth_size=TRUTH_SIZE)
+    assert {key for key in features if key != ACTION_KEY} == frame.keys()
+    for key, value in plain.raw.items():
+        np.testing.assert_array_equal(known.raw[key], value)

@@ -1,6 +1,7 @@
 """What a study of a task's information says, and the encoders that it leaves."""
 
 import html
+import json
 import re
 from dataclasses import replace
 from pathlib import Path
@@ -9,13 +10,17 @@ import numpy as np
 import pytest
 import torch
 
-from lerobot_vtrefine.datasets.features import GRIDS_KEY
+from lerobot_vtrefine.datasets.features import GRIDS_KEY, SURFACE_KEY
 from lerobot_vtrefine.envs import VtRefineEnvConfig
 from lerobot_vtrefine.envs.factory import make_simulation
 from lerobot_vtrefine.information.closed_loop import expert_success
+from lerobot_vtrefine.information.contact import SIDE, TOUCHING, has_side, side_of
 from lerobot_vtrefine.information.estimator import (
+    POLICY,
     SENSES,
+    STRONG,
     Estimator,
+    contact_known,
     episode_errors,
     rms_with_interval,
     train_estimator,
@@ -24,6 +29,7 @@ from lerobot_vtrefine.information.estimator import (
 from lerobot_vtrefine.information.frames import Frames, MisjudgedHolds
 from lerobot_vtrefine.information.page import render_page
 from lerobot_vtrefine.information.quantities import NAMES, Grasps, observe, part_poses
+from lerobot_vtrefine.information.strong import SurfaceStep
 from lerobot_vtrefine.information.study import Effort, Finding, Study, as_json, save_keeper, study
 from lerobot_vtrefine.information.tolerance import LATERAL, SIZES, TILT, Tolerated, tolerance
 from lerobot_vtrefine.sim.config import GraspedStart, TaskConfig
@@ -31,31 +37,84 @@ from lerobot_vtrefine.sim.ik import hand_poses
 from lerobot_vtrefine.sim.poses import Poses, rotation_vector
 
 EPISODES, LENGTH, JOINTS = 60, 9, 16
+PRESSED, SEEN = 0, 1
+"""Quantities of ``synthetic`` that pads and the depth image tell."""
 
 
-def synthetic(seed: int) -> Frames:
-    """Frames whose first quantity is where a pad is pressed; joints tell nothing."""
+def synthetic(seed: int, pads: int = 4, rows: int = 12) -> Frames:
+    """Frames whose first quantity is where a pad is pressed, and whose second one is where the depth image
+    has a bump; joints tell nothing. Whether and where parts touch follows from the pads.
+    """
     rng = torch.Generator().manual_seed(seed)
     place = torch.randint(32, (EPISODES, LENGTH), generator=rng)
-    grids = torch.zeros(EPISODES, LENGTH, 4, 12, 32)
-    grids.scatter_(-1, place[..., None, None, None].expand(-1, -1, 4, 12, 1), 1.0)
+    grids = torch.zeros(EPISODES, LENGTH, pads, rows, 32)
+    grids.scatter_(-1, place[..., None, None, None].expand(-1, -1, pads, rows, 1), 1.0)
     truth = torch.zeros(EPISODES, LENGTH, len(NAMES))
-    truth[..., 0] = 1e-3 * (place - 16)
+    truth[..., PRESSED] = 1e-3 * (place - 16)
     columns = {"state": torch.randn(EPISODES, LENGTH, JOINTS, generator=rng), f"grids/{GRIDS_KEY}": grids}
     length = torch.randint(3, LENGTH + 1, (EPISODES,), generator=rng)
-    return Frames(columns, truth, length, Grasps(np.tile(np.eye(3), (3, 1, 1))))
+    bump = torch.randint(16, (EPISODES, LENGTH), generator=rng)
+    surface = torch.zeros(EPISODES, LENGTH, 3, 8, 16)
+    surface.scatter_(-1, bump[..., None, None, None].expand(-1, -1, 3, 8, 1), 1.0)
+    truth[..., SEEN] = 1e-3 * (bump - 7.5)
+    columns[f"surface/{SURFACE_KEY}"] = surface.half()
+    contact = torch.zeros(EPISODES, LENGTH, 4)
+    contact[..., 0] = place >= 12
+    contact[..., 1] = contact[..., 0] * torch.where(place >= 22, 0.004, -0.004)
+    return Frames(columns, truth, length, Grasps(np.tile(np.eye(3), (3, 1, 1))), contact)
 
 
-def trained(senses: str, frames: Frames, history: int = 1) -> Estimator:
+def trained(senses: str, frames: Frames, network: str = POLICY, steps: int = 160) -> Estimator:
     torch.manual_seed(0)
-    estimator = Estimator(SENSES[senses], frames, "aloha", "small", "cpu", history)
-    train_estimator(estimator, frames, steps=160, batch_size=64, seed=0)
+    estimator = Estimator(replace(SENSES[senses], network=network), frames, "aloha", "small", "cpu", 1)
+    train_estimator(estimator, frames, steps, batch_size=64, seed=0)
     return estimator
 
 
 def test_frames_are_seen_with_the_environments_body() -> None:
     views = views_of([SENSES["visuo_tactile"], SENSES["visuo_tactile_cloud"]], "kinova", "small", "cpu")
     assert [view.observation_config.embodiment for view in views.values()] == ["kinova"] * 3
+
+
+def test_the_larger_network_tells_what_its_senses_determine_and_nothing_else() -> None:
+    frames, held_out = (synthetic(seed, pads=1, rows=4) for seed in (0, 1))  # small ones, for speed
+    prior = held_out.truth[held_out.index()].std(0)
+    for senses, tells in (("tactile", {PRESSED}), ("visual", {SEEN}), ("visuo_tactile", {PRESSED, SEEN})):
+        estimator = trained(senses, frames, STRONG, steps=80)
+        errors = episode_errors(estimator, held_out).mean(0).sqrt() / prior
+        for quantity in (PRESSED, SEEN):
+            assert (errors[quantity] < 0.4) if quantity in tells else (errors[quantity] > 0.9), senses
+        told, unseen = contact_known(estimator, held_out, 0)
+        for name in (TOUCHING, SIDE):  # which the pads tell
+            assert (told[name][0] > 0.9) if PRESSED in tells else (told[name][0] < unseen[name] + 0.06)
+
+
+def test_contacts_are_told_by_pads_and_not_by_joints() -> None:
+    frames, held_out = synthetic(0), synthetic(1)
+    told, unseen = contact_known(trained("tactile", frames), held_out, 0)
+    guessed, _ = contact_known(trained("joints", frames), held_out, 0)
+    for name in (TOUCHING, SIDE):
+        assert told[name][0] > 0.9 > unseen[name] + 0.2
+        assert guessed[name][0] < unseen[name] + 0.06
+        assert guessed[name][1] < guessed[name][0] < guessed[name][2]
+    assert told["contact_x"][0] < 0.5 * unseen["contact_x"]
+    assert guessed["contact_x"][0] > 0.9 * unseen["contact_x"]
+
+
+def test_contacts_do_not_shape_the_encoder_that_policies_start_from() -> None:
+    frames, other = synthetic(0), synthetic(0)
+    other.contact = other.contact.roll(1, 0)
+    for network, same in ((POLICY, True), (STRONG, False)):
+        first, second = (trained("tactile", item, network, steps=2).encoder for item in (frames, other))
+        pairs = zip(first.parameters(), second.parameters(), strict=True)
+        assert all(torch.equal(a, b) for a, b in pairs) == same
+
+
+def test_sides_are_the_four_directions_and_the_middle_has_none() -> None:
+    places = torch.tensor([[3.0, 1.0], [-1.0, 2.0], [-3.0, -2.0], [0.5, -4.0], [0.3, 0.2]]) * 1e-3
+    assert side_of(places).tolist()[:4] == [0, 1, 2, 3]
+    contact = torch.cat([torch.ones(5, 1), places, torch.zeros(5, 1)], 1)
+    assert has_side(contact).tolist() == [True] * 4 + [False]
 
 
 def test_pads_tell_what_joints_do_not() -> None:
@@ -75,6 +134,33 @@ def test_windows_start_at_the_episodes_first_frame() -> None:
     assert torch.equal(window["state"][0], state[[0, 0, 0]])
     assert torch.equal(window["state"][1], state[[2, 3, 4]])
     assert estimator(window).shape == (2, len(NAMES))
+
+
+def test_the_depth_image_becomes_points_of_the_workspace() -> None:
+    """A pixel's point lies on the surface that the camera sees; what is outside of the box is left out."""
+    sim = make_simulation(VtRefineEnvConfig(start="grasped"), 2)
+    ids = np.arange(2)
+    sim.reset(ids, ids)
+    frame = {
+        "observation.images.front_depth": torch.from_numpy(sim.depth_mm(ids).astype(np.float32))[:, None],
+        "observation.camera.front.pose": torch.from_numpy(sim.camera_pose),
+        "observation.camera.front.intrinsics": torch.from_numpy(sim.camera_intrinsics).expand(2, -1),
+        "observation.camera.front.noise_level": torch.zeros(2, 1),
+    }
+    config = SENSES["visual"].policy("aloha", "small", "cpu", 1).observation
+    image = SurfaceStep(config).observation(frame)[SURFACE_KEY].float()
+    points = image.movedim(1, -1)[(image != 0).any(1)] * config.scale_m + torch.tensor(config.center_m)
+    assert 100 < len(points) < 2 * 4800
+    low, high = torch.tensor(config.crop_min_m), torch.tensor(config.crop_max_m)
+    assert ((points > low - 1e-3) & (points < high + 1e-3)).all()
+    plug, _ = sim.part_poses(ids)
+    nearest = torch.cdist(points, torch.from_numpy(plug[:, :3]).float()).min(0).values
+    assert (nearest < 0.03).all()  # the plug in its hand is in view
+    noisy = SurfaceStep(config).observation(
+        frame | {"observation.camera.front.noise_level": torch.full((2, 1), 3.0)}
+    )
+    moved = (noisy[SURFACE_KEY].float() - image).abs().mean()
+    assert 0.001 < moved < 0.2
 
 
 def test_quantities_say_where_the_parts_are() -> None:
@@ -120,7 +206,7 @@ def test_a_study_leaves_encoders_that_policies_start_from(tmp_path: Path) -> Non
 
     env = VtRefineEnvConfig(start="grasped", episode_steps=3)
     effort = Effort(episodes=8, num_envs=4, steps=2, batch_size=8, history=(1,), closed_loop_episodes=4)
-    effort = replace(effort, tolerance_episodes=4, clearances_m=(0.001,))
+    effort = replace(effort, tolerance_episodes=4, clearances_m=(0.001,), networks=(POLICY, STRONG))
     found = study(env, ["tactile"], effort, keep=save_keeper(tmp_path, effort))
     assert list(found.at_clearance) == [0.001]
     assert found.at_clearance[0.001].prior != found.prior
@@ -128,6 +214,9 @@ def test_a_study_leaves_encoders_that_policies_start_from(tmp_path: Path) -> Non
     told = as_json(found, effort)
     assert told["true_state"]["episodes"] == told["findings"][0]["expert"]["episodes"] == 4
     assert set(told["findings"][0]["rms"]) == set(NAMES) == set(told["prior"])
+    assert [item["network"] for item in told["findings"]] == [POLICY, STRONG]
+    json.dumps(told, allow_nan=False)
+    assert {path.name for path in tmp_path.iterdir()} == {"encoder_tactile_pads.safetensors"}
 
     def policy(folder: Path, **changes: object) -> VtDp3Policy:
         settings = {"preset": "small", "device": "cpu", "modalities": "tactile", "fusion": "pads"}
@@ -180,6 +269,38 @@ def test_the_expert_succeeds_on_the_truth() -> None:
     env = VtRefineEnvConfig(start="grasped")
     done = expert_success(env, 4, 4, None, {}, Grasps(np.tile(np.eye(3), (3, 1, 1))), torch.device("cpu"))
     assert done.tolist() == [True] * 4
+
+
+def test_the_verdict_is_on_the_best_network() -> None:
+    """A task on which the policy's encoder alone is blind needs no touch."""
+    findings = [
+        Finding("visuo_tactile", 1, {}, (95, 100)),
+        Finding("visual", 1, {}, (50, 100)),
+        Finding("visual", 1, {}, (80, 100), STRONG),
+    ]
+    assert "vision alone suffices" in Study({}, findings, (99, 100)).verdict.reason
+
+
+def test_the_page_shows_contacts_and_outlines_the_larger_network() -> None:
+    rms = dict.fromkeys(NAMES, (1.0, 0.8, 1.2))
+    findings = [
+        Finding(
+            "tactile", 1, rms, None, network, {TOUCHING: (share, 0.8, 0.99), "contact_x": (1.0, 0.9, 1.1)}
+        )
+        for network, share in ((POLICY, 0.9), (STRONG, 0.95))
+    ]
+    unseen = {TOUCHING: 0.7, "contact_x": 4.0}
+    found = Study(dict.fromkeys(NAMES, 2.0), findings, None, contact_unseen=unseen)
+    page = render_page(found, "round", 0.002)
+    pictures = dict(re.findall(r'<svg[^>]*aria-label="([^"]*)"(.*?)</svg>', page, re.DOTALL))
+    heights = {
+        name: [float(h) for h in re.findall(r'<rect class="bar m[^"]*"[^>]*height="([0-9.]+)"', picture)]
+        for name, picture in pictures.items()
+    }
+    assert heights["told rightly contact"] == pytest.approx([182 * 0.9 / 1.1, 182 * 0.95 / 1.1], abs=0.1)
+    assert heights["errors of place of the contact"] == pytest.approx([182 * 0.25 / 1.1] * 2, abs=0.1)
+    assert page.count('class="bar m strong"') == 3 * 6 + 2
+    assert "outlined: a larger network" in page
 
 
 def test_the_page_draws_every_error_as_a_share_of_the_unseen() -> None:

@@ -7,9 +7,17 @@ from typing import Any
 
 import pytest
 import torch
+from draccus import ParsingError
 from lerobot.configs import FeatureType, PolicyFeature
 
-from lerobot_vtrefine.datasets.features import ACTION_KEY, CLOUD_KEY, STATE_KEY, dataset_features
+from lerobot_vtrefine.datasets.features import (
+    ACTION_KEY,
+    CLOUD_KEY,
+    LIMITS_KEY,
+    STATE_KEY,
+    TRUTH_KEY,
+    dataset_features,
+)
 from lerobot_vtrefine.embodiments import ALOHA
 from lerobot_vtrefine.policies.vt_dp3 import VtDp3Config
 from lerobot_vtrefine.policies.vt_dp3.modeling_vt_dp3 import VtDp3Policy
@@ -17,12 +25,12 @@ from lerobot_vtrefine.policies.vt_dp3.modeling_vt_dp3 import VtDp3Policy
 Batch = dict[str, torch.Tensor]
 
 
-def make_policy(**values: Any) -> VtDp3Policy:
-    """A tiny policy with a fixed seed."""
+def make_policy(limited: bool = False, truth_size: int = 0, **values: Any) -> VtDp3Policy:
+    """A tiny policy with a fixed seed; `limited`: for data with limits, `truth_size`: with the truth."""
     torch.manual_seed(0)
     features = {
         key: PolicyFeature(FeatureType.STATE, tuple(feature["shape"]))
-        for key, feature in dataset_features(24, 32, ALOHA).items()
+        for key, feature in dataset_features(24, 32, ALOHA, None, limited, truth_size).items()
         if key.startswith("observation")
     }
     tiny: dict[str, Any] = {"preset": "small", "point_dims": (8, 16), "down_dims": (32, 32), **values}
@@ -74,6 +82,58 @@ def test_training_learns_and_the_average_that_acts_follows() -> None:
     policy.model.load_state_dict(before)
     untrained = (policy.sample_actions(batch, noise) - batch[ACTION_KEY]).square().mean()
     assert error < 0.3 * untrained
+
+
+def test_limits_are_seen_where_the_data_states_them_and_nowhere_else() -> None:
+    plain, limited = make_policy(), make_policy(limited=True)
+    batch, noise = make_batch(), torch.randn(3, 16, 16)
+    low, high = ({**batch, LIMITS_KEY: torch.full((3, 2, 2), value)} for value in (-1.0, 1.0))
+    assert torch.equal(plain.sample_actions(low, noise), plain.sample_actions(batch, noise))
+    assert not torch.equal(limited.sample_actions(low, noise), limited.sample_actions(high, noise))
+    shapes = [{name: value.shape for name, value in p.state_dict().items()} for p in (plain, limited)]
+    differ = {name for name, shape in shapes[0].items() if shape != shapes[1][name]}
+    assert all(name.endswith("encoder.state.0.weight") for name in differ)
+    assert [shape["model.encoder.state.0.weight"][1] for shape in shapes] == [16, 18]
+    with pytest.raises(ValueError, match=r"lacks observation.environment_state.*contact_force_n='\[5, 5\]'"):
+        limited.sample_actions(batch, noise)
+    limited.reset()
+    limited.select_action({key: value[:, 0] for key, value in low.items() if key != ACTION_KEY})
+
+
+def test_the_auxiliary_loss_is_learned_and_shapes_the_encoder() -> None:
+    """Without a weight nothing of it is there; with one, the truth is told by what the policy sees."""
+    without, given = make_policy(truth_size=2), make_policy(truth_size=2, auxiliary_weight=1.0)
+    assert without.state_dict().keys() == make_policy().state_dict().keys()
+    assert all(torch.equal(value, given.state_dict()[name]) for name, value in without.state_dict().items())
+    batch = make_batch(32)
+    cloud = batch[CLOUD_KEY]
+    batch[TRUTH_KEY] = torch.stack([cloud[..., 0].amax(-1), cloud[..., 1].amax(-1)], -1) - 2.0
+    optimizer = torch.optim.AdamW(given.train().get_optim_params(), lr=3e-3)
+    told = []
+    for _ in range(150):
+        loss, parts = given(batch)
+        assert loss.item() == pytest.approx(parts["noise_loss"] + parts["auxiliary_loss"])
+        optimizer.zero_grad()
+        loss.backward()
+        optimizer.step()
+        told.append(parts["auxiliary_loss"])
+    assert sum(told[-10:]) < 0.2 * sum(told[:10])
+    online = given.online
+    assert online is not None
+    assert online.auxiliary is not None
+    assert online.encoder.points is not None
+    missed = online.auxiliary.loss(online.encode(batch), batch[TRUTH_KEY]).sum()
+    (gradient,) = torch.autograd.grad(missed, online.encoder.points.last.weight)
+    assert gradient.abs().max() > 0
+    assert given(batch, reduction="none")[0].shape == (32,)
+    given.eval().sample_actions(make_batch(), torch.zeros(3, 16, 16))  # which needs no truth
+
+
+def test_an_auxiliary_loss_without_the_truth_is_told() -> None:
+    with pytest.raises(ValueError, match=r"auxiliary_weight=0.5 needs observation.truth.*--truth=true"):
+        make_policy(auxiliary_weight=0.5)
+    with pytest.raises(ParsingError, match="must not be negative"):
+        make_policy(truth_size=2, auxiliary_weight=-1.0)
 
 
 def test_only_the_trained_network_gets_gradients() -> None:

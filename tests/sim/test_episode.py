@@ -44,7 +44,8 @@ def measured(
     )
     grips = np.zeros((1, 2, 2, 3))
     grips[0, 1, :, 2] = shift_m
-    summary = Substeps(np.array([force_n]), np.zeros((1, 3, 3)), np.zeros((1, 3)), np.zeros((1, 3)), zero)
+    none, nowhere = np.zeros((1, 3)), np.zeros((1, 4))
+    summary = Substeps(np.array([force_n]), np.zeros((1, 3, 3)), none, none, zero, nowhere)
     return Measured(
         insertion,
         grips,
@@ -62,6 +63,7 @@ def begun() -> EpisodeState:
     state = EpisodeState.empty(SCENE, 1, 4)
     state.clear(ONE)
     state.grasped[:] = True
+    state.force_limit[:] = RULES.limits.contact_force_n
     return state
 
 
@@ -166,6 +168,7 @@ def test_peaks_are_of_the_episode_and_tails_of_the_step() -> None:
 
 def test_worlds_that_are_not_addressed_stay_as_they_are() -> None:
     state = EpisodeState.empty(SCENE, 2, 4)
+    state.force_limit[:] = RULES.limits.contact_force_n
     update(state, np.array([1]), measured(force_n=50.0), RULES, SCENE)
     assert state.steps.tolist() == [0, 1]
     assert state.done.tolist() == [False, True]

@@ -1,4 +1,5 @@
 import guide
+import mujoco
 import numpy as np
 import pytest
 
@@ -12,6 +13,7 @@ from lerobot_vtrefine.sim.config import (
     TaskConfig,
     WarpConfig,
 )
+from lerobot_vtrefine.sim.expert import ScriptedExpert
 from lerobot_vtrefine.sim.simulation import FAILURES, InsertionSim
 
 IN_HAND = SceneConfig(start="grasped")
@@ -281,3 +283,39 @@ def test_bad_calls_are_refused():
         sim.step(np.where(np.arange(16) == 3, np.nan, action))
     with pytest.raises(ValueError, match=r"action must have shape \(2, 16\), got \(2, 14\)"):
         sim.step(action[:, :14])
+
+
+def contact_centre(sim: InsertionSim, env: int) -> np.ndarray:
+    """Centre of the forces between plug and socket in the socket's frame [m], contact by contact."""
+    model, data = sim.mj_data(env)
+    bodies = {model.body(name).id for name in ("plug", "socket")}
+    weights, places = [], []
+    for index, contact in enumerate(data.contact):
+        if {int(model.geom_bodyid[geom]) for geom in contact.geom} == bodies:
+            force = np.zeros(6)
+            mujoco.mj_contactForce(model, data, index, force)
+            weights.append(np.linalg.norm(force[:3]))
+            places.append(contact.pos.copy())
+    centre = np.average(places, axis=0, weights=weights)
+    socket = data.body("socket")
+    return socket.xmat.reshape(3, 3).T @ (centre - socket.xpos)
+
+
+def test_a_touch_is_where_the_contacts_are() -> None:
+    """A plug that is brought down beside the hole touches the rim on the side that it missed it."""
+    for side in (0.005, -0.005):
+        sim = insertion_sim(1, rules=TaskConfig(grasped=GraspedStart(plug_height_m=0.006)))
+        sim.reset(np.arange(1), np.arange(1))
+        assert (sim.part_touch() == 0).all()
+        expert = ScriptedExpert(sim)
+        expert.reset(np.arange(1))
+        expert._errors.lateral_m[:] = (side, 0.0)
+        for _ in range(25):
+            sim.step(expert.act(np.arange(1)))
+            if sim.part_touch()[0, 0]:
+                break
+        touching, x, y, z = sim.part_touch()[0]
+        assert touching == 1
+        np.testing.assert_allclose([x, y, z], contact_centre(sim, 0), atol=5e-4)
+        assert x * side > 0
+        assert abs(z - sim.scene.pair.mouth_z_m) < 2e-3

@@ -19,6 +19,8 @@ LABELS = {
     "kinova_pads": "two Kinova Gen3, round pair, pads as images, two cores",
     "cross_gentle": "cross, 2 mm, 5 N at most (cross_gentle)",
     "cross_gentle_twin": "its twin: parts lie as expected",
+    "cross_limited": "cross, 2 mm, a limit of 1.5 to 10 N that is told (cross_limited)",
+    "cross_limited_twin": "its twin: parts lie as expected, one friction",
     "key_1mm": "key pair, 1 mm, slip 2 mm / 0.05 rad",
     "tight": "tight: 1 mm clearance",
     "occluded": "occluded: camera above, the hole hidden",

@@ -235,7 +235,7 @@ def policies_table(rows: Sequence[Run]) -> str:
 
 def lines_table(rows: Sequence[Line]) -> str:
     """A benchmark's table as it was printed, with a zero before every decimal point."""
-    head = list(rows[0].cells)
+    head = list(max(rows, key=lambda row: len(row.cells)).cells)  # older rows may lack a column
     rows_of_cells = [head, *([row.cells.get(name, "") for name in head] for row in rows)]
     head, *body = [[LEADING_POINT.sub("0.", cell) for cell in cells] for cells in rows_of_cells]
     return markdown(head, body)

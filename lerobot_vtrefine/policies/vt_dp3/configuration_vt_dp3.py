@@ -12,8 +12,10 @@ from lerobot.optim.schedulers import CosineAnnealingWithWarmupSchedulerConfig
 from lerobot_vtrefine.choices import check_choice
 from lerobot_vtrefine.datasets.features import (
     ACTION_KEY,
+    LIMITS_KEY,
     STATE_KEY,
     TACTILE_PREFIX,
+    TRUTH_KEY,
     VISUAL_KEYS,
     baseline_keys,
     tactile_keys,
@@ -87,6 +89,10 @@ class VtDp3Config(PreTrainedConfig):
     """
     freeze_encoder: bool = False
     """Behaviour cloning leaves the encoder as it is; needs ``pretrained_encoder``."""
+    auxiliary_weight: float = 0.0
+    """Weight of an auxiliary loss while cloning: to tell, from what the policy sees, how the parts lie in
+    their hands and touch, as ``vtrefine-record-demos --truth=true`` recorded it. 0: none.
+    """
     denoiser: str = ""
     """``unet`` (paper) or ``mlp``."""
     down_dims: tuple[int, ...] = ()
@@ -124,6 +130,7 @@ class VtDp3Config(PreTrainedConfig):
     normalization_mapping: dict[str, NormalizationMode] = field(
         default_factory=lambda: {
             "STATE": NormalizationMode.MIN_MAX,
+            "ENV": NormalizationMode.MIN_MAX,
             "ACTION": NormalizationMode.MIN_MAX,
             "VISUAL": NormalizationMode.IDENTITY,
         }
@@ -157,6 +164,8 @@ class VtDp3Config(PreTrainedConfig):
             raise ValueError(
                 "policy.freeze_encoder=true needs policy.pretrained_encoder: an untrained one sees nothing"
             )
+        if self.auxiliary_weight < 0.0:
+            raise ValueError(f"policy.auxiliary_weight must not be negative, got {self.auxiliary_weight}")
         if not 1 <= self.n_action_steps <= self.horizon:
             raise ValueError(f"policy.n_action_steps={self.n_action_steps} must be within 1..{self.horizon}")
         if self.denoiser == "unet" and self.horizon % 2 ** (len(self.down_dims) - 1):
@@ -189,6 +198,18 @@ class VtDp3Config(PreTrainedConfig):
     def state_dim(self) -> int:
         """Joint positions per frame; known once the features are."""
         return (self.input_features or {})[STATE_KEY].shape[0]
+
+    @property
+    def limits_dim(self) -> int:
+        """How many limits the data states, which are then seen beside the joints."""
+        limits = (self.input_features or {}).get(LIMITS_KEY)
+        return 0 if limits is None else limits.shape[0]
+
+    @property
+    def truth_dim(self) -> int:
+        """Values that the auxiliary loss is about; 0 where there is none."""
+        truth = (self.input_features or {}).get(TRUTH_KEY)
+        return 0 if truth is None or not self.auxiliary_weight else truth.shape[0]
 
     @property
     def action_dim(self) -> int:
@@ -252,6 +273,11 @@ class VtDp3Config(PreTrainedConfig):
             raise ValueError(
                 f"vt_dp3 with policy.modalities={self.modalities} needs columns that the data lacks: "
                 f"{shown}; {self._way_out()}"
+            )
+        if self.auxiliary_weight and not self.truth_dim:
+            raise ValueError(
+                f"policy.auxiliary_weight={self.auxiliary_weight:g} needs {TRUTH_KEY}, which the data lacks:"
+                " record with vtrefine-record-demos --truth=true"
             )
         action = (self.output_features or {}).get(ACTION_KEY)
         if action is None or action.type is not FeatureType.ACTION or len(action.shape) != 1:

@@ -17,7 +17,7 @@ from safetensors import SafetensorError
 from torch import Tensor, nn
 from torch.nn import functional
 
-from lerobot_vtrefine.datasets.features import ACTION_KEY, STATE_KEY
+from lerobot_vtrefine.datasets.features import ACTION_KEY, STATE_KEY, TRUTH_KEY
 from lerobot_vtrefine.policies.vt_dp3.configuration_vt_dp3 import VtDp3Config
 from lerobot_vtrefine.policies.vt_dp3.denoisers import MLPDenoiser, UNetDenoiser
 from lerobot_vtrefine.policies.vt_dp3.diffusion import DiffusionProcess, PredictNoise, deploy
@@ -48,6 +48,8 @@ class VtDp3Model(nn.Module):
                 len(config.down_dims),
                 config.time_dim,
             )
+        # Last, so that all else begins the same with it and without.
+        self.auxiliary = AuxiliaryHead(cond_dim, config.truth_dim) if config.truth_dim else None
 
     def encode(self, batch: Batch) -> Tensor:
         """Columns ``encoder.keys`` (B, To, ...) of a processed batch -> condition (B, C)."""
@@ -56,6 +58,19 @@ class VtDp3Model(nn.Module):
     def predictor(self, cond: Tensor) -> PredictNoise:
         """The noise predictor with its condition bound."""
         return lambda x, t: self.denoiser(x, t, cond)
+
+
+class AuxiliaryHead(nn.Sequential):
+    """What a condition (B, C) tells of the truth (B, K), normalised; of no use once cloning is over."""
+
+    WIDTH = 128
+
+    def __init__(self, cond_dim: int, truth_dim: int) -> None:
+        super().__init__(nn.Linear(cond_dim, self.WIDTH), nn.ReLU(), nn.Linear(self.WIDTH, truth_dim))
+
+    def loss(self, cond: Tensor, truth: Tensor) -> Tensor:
+        """Mean square (B,) of what is told wrongly of the newest frame's truth, out of (B, To, K)."""
+        return (self(cond) - truth[:, -1]).square().mean(-1)
 
 
 class VtDp3Policy(PreTrainedPolicy):
@@ -174,7 +189,12 @@ class VtDp3Policy(PreTrainedPolicy):
         predicted = model.denoiser(self.process.add_noise(clean, noise, t), t, cond)
         error = functional.mse_loss(predicted, noise, reduction="none").mean(dim=(1, 2))
         loss = error.view(-1, draws).mean(dim=1)
-        return (loss if reduction == "none" else loss.mean()), {}
+        told: dict[str, float] = {}
+        if model.auxiliary is not None:
+            missed = model.auxiliary.loss(cond, batch[TRUTH_KEY])
+            told = {"auxiliary_loss": missed.mean().item(), "noise_loss": loss.mean().item()}
+            loss = loss + self.config.auxiliary_weight * missed
+        return (loss if reduction == "none" else loss.mean()), told
 
     def update(self) -> None:
         """Called by the trainer after every optimiser step: move the average."""
@@ -226,7 +246,7 @@ class VtDp3Policy(PreTrainedPolicy):
 
     def _observe(self, batch: Batch) -> None:
         """Append processed frames (B, ...) to the history; the first one fills it."""
-        frame = {key: batch[key] for key in self.model.encoder.keys}
+        frame = self.model.encoder.inputs(batch)
         missing = self.config.n_obs_steps - len(self._frames)
         self._frames.extend([frame] * (missing if len(self._frames) == 0 else 1))
 

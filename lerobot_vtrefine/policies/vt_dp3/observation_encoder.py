@@ -11,7 +11,7 @@ from safetensors.torch import load_file, save_file
 from torch import Tensor, nn
 
 from lerobot_vtrefine import shipped
-from lerobot_vtrefine.datasets.features import CLOUD_KEY, GRIDS_KEY, STATE_KEY
+from lerobot_vtrefine.datasets.features import CLOUD_KEY, GRIDS_KEY, LIMITS_KEY, STATE_KEY
 from lerobot_vtrefine.embodiments import get_embodiment
 from lerobot_vtrefine.policies.vt_dp3.configuration_vt_dp3 import VtDp3Config
 from lerobot_vtrefine.policies.vt_dp3.pad_encoder import PadEncoder
@@ -24,7 +24,7 @@ ENCODER_FLAG = "--policy.pretrained_encoder"
 class ObservationEncoder(nn.Module):
     """To frames -> condition (B, ``cond_dim``): the features of every frame, side by side.
 
-    ``points`` or ``pads`` may be None; joint positions are always seen.
+    ``points`` or ``pads`` may be None; joint positions are always seen, limits where they are told.
     """
 
     def __init__(
@@ -33,13 +33,17 @@ class ObservationEncoder(nn.Module):
         pads: PadEncoder | None,
         state_dim: int,
         n_obs_steps: int,
+        limits_dim: int = 0,
     ) -> None:
         super().__init__()
         self.points = points
         self.pads = pads
         self.state = nn.Sequential(
-            nn.Linear(state_dim, STATE_FEATURES), nn.ReLU(), nn.Linear(STATE_FEATURES, STATE_FEATURES)
+            nn.Linear(state_dim + limits_dim, STATE_FEATURES),
+            nn.ReLU(),
+            nn.Linear(STATE_FEATURES, STATE_FEATURES),
         )
+        self.limits_dim = limits_dim
         seen = sum(part.out_dim for part in (points, pads) if part is not None)
         self.cond_dim = n_obs_steps * (seen + STATE_FEATURES)
 
@@ -52,16 +56,37 @@ class ObservationEncoder(nn.Module):
     def keys(self) -> tuple[str, ...]:
         """Columns of a processed batch that are read."""
         read = ((CLOUD_KEY, self.points), (GRIDS_KEY, self.pads))
-        return (*(key for key, part in read if part is not None), STATE_KEY)
+        limit = [LIMITS_KEY] if self.limits_dim else []
+        return (*(key for key, part in read if part is not None), *limit, STATE_KEY)
+
+    def inputs(self, batch: dict[str, Tensor]) -> dict[str, Tensor]:
+        """What is read of a processed batch.
+
+        Raises:
+            ValueError: it lacks a column.
+        """
+        if missing := [key for key in self.keys if key not in batch]:
+            hint = (
+                ": --env.randomization.contact_force_n='[5, 5]' states limits"
+                if LIMITS_KEY in missing
+                else ""
+            )
+            raise ValueError(f"the policy's input lacks {', '.join(missing)}, which it learned with{hint}")
+        return {key: batch[key] for key in self.keys}
 
     def forward(self, batch: dict[str, Tensor]) -> Tensor:
-        """Cloud (B, To, N, 5) in metres, readings (B, To, P, R, C), normalised state (B, To, Ds)."""
+        """Cloud (B, To, N, 5) in metres, readings (B, To, P, R, C), normalised state (B, To, Ds) and limits
+        (B, To, 2).
+        """
+        batch = self.inputs(batch)
         state = batch[STATE_KEY]
         frames = [
             part(batch[key].flatten(0, 1)).unflatten(0, state.shape[:2])
             for key, part in ((CLOUD_KEY, self.points), (GRIDS_KEY, self.pads))
             if part is not None
         ]
+        if self.limits_dim:
+            state = torch.cat([state, batch[LIMITS_KEY]], dim=-1)
         return torch.cat([*frames, self.state(state)], dim=-1).flatten(1)
 
 
@@ -78,7 +103,7 @@ def make_encoder(config: VtDp3Config, state_dim: int) -> ObservationEncoder:
         body = get_embodiment(view.embodiment)
         shape = body.pad_layout.rows, body.pad_layout.cols
         pads = PadEncoder(len(body.pad_names), shape, config.pad_width, config.pad_features)
-    return ObservationEncoder(points, pads, state_dim, config.n_obs_steps)
+    return ObservationEncoder(points, pads, state_dim, config.n_obs_steps, config.limits_dim)
 
 
 def encoder_file(config: VtDp3Config) -> str:

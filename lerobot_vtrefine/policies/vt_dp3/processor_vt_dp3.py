@@ -32,8 +32,10 @@ from lerobot_vtrefine.datasets.features import (
     DEPTH_KEY,
     GRIDS_KEY,
     INTRINSICS_KEY,
+    LIMITS_KEY,
     NOISE_LEVEL_KEY,
     STATE_KEY,
+    TRUTH_KEY,
     baseline_keys,
     raw_keys,
     tactile_keys,
@@ -45,7 +47,7 @@ from lerobot_vtrefine.observation.visuo_tactile import POINT_CHANNELS
 from lerobot_vtrefine.policies.vt_dp3.configuration_vt_dp3 import VtDp3Config
 
 MIN_RANGE = 0.02
-"""Smallest range [rad or m] that min-max normalisation stretches to [-1, 1]."""
+"""Smallest range [rad, m or N] that min-max normalisation stretches to [-1, 1]."""
 
 Stats = dict[str, dict[str, Any]]
 Pipelines = tuple[
@@ -55,11 +57,11 @@ Pipelines = tuple[
 
 
 def widen_narrow_ranges(stats: Stats) -> None:
-    """Give joints that hardly moved in the data a range of ``MIN_RANGE`` around their middle, in place.
+    """Give what hardly moved or differed in the data a range of ``MIN_RANGE`` around their middle, in place.
 
     Without it a joint that stayed within 1e-6 rad would turn the servo's noise into huge inputs. Idempotent.
     """
-    for key in (STATE_KEY, ACTION_KEY):
+    for key in (STATE_KEY, LIMITS_KEY, TRUTH_KEY, ACTION_KEY):
         if key not in stats or "min" not in stats[key]:
             continue
         low, high = torch.as_tensor(stats[key]["min"]), torch.as_tensor(stats[key]["max"])
@@ -177,16 +179,20 @@ def _pads(observation: dict[str, Any], keys: tuple[str, ...], lead: Sequence[int
 def make_vt_dp3_pre_post_processors(
     config: VtDp3Config, dataset_stats: Stats | None = None, dataset_meta: Any = None
 ) -> Pipelines:
-    """Pre- and postprocessor; only joint positions and actions are normalised (min-max to [-1, 1])."""
+    """Pre- and postprocessor; joint positions, actions, limits and an auxiliary loss's truth are normalised
+    (min-max to [-1, 1]), and nothing else.
+    """
+    more = ((LIMITS_KEY, config.limits_dim), (TRUTH_KEY, config.truth_dim))
+    seen = (STATE_KEY, *(key for key, size in more if size))
     if dataset_stats:
         widen_narrow_ranges(dataset_stats)
-        dataset_stats = {key: dataset_stats[key] for key in (STATE_KEY, ACTION_KEY) if key in dataset_stats}
+        dataset_stats = {key: dataset_stats[key] for key in (*seen, ACTION_KEY) if key in dataset_stats}
     norm_map = {FeatureType(kind): mode for kind, mode in config.normalization_mapping.items()}
     normalizer = NormalizerProcessorStep(
         features={**(config.input_features or {}), **(config.output_features or {})},
         norm_map=norm_map,
         stats=dataset_stats,
-        normalize_observation_keys={STATE_KEY},
+        normalize_observation_keys=set(seen),
     )
     unnormalizer = UnnormalizerProcessorStep(
         features=config.output_features or {}, norm_map=norm_map, stats=dataset_stats
