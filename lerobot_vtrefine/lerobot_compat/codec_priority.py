@@ -11,7 +11,7 @@ from contextlib import contextmanager
 
 @contextmanager
 def ordinary_priority() -> Generator[None]:
-    """Give the calling thread its scheduling policy back once the codec has run; on Linux, elsewhere nothing."""
+    """Give the calling thread its scheduling policy back once the codec has run; Linux only."""
     before = os.sched_getscheduler(0) if hasattr(os, "sched_getscheduler") else None
     try:
         yield
