@@ -18,6 +18,8 @@ from lerobot_vtrefine.policies.vt_dp3.pad_encoder import PadEncoder
 from lerobot_vtrefine.policies.vt_dp3.point_encoder import PointEncoder
 
 STATE_FEATURES = 64
+PERCEIVED_KEY = "perceived"
+"""Of a batch whose frames a frozen encoder has seen before."""
 ENCODER_FLAG = "--policy.pretrained_encoder"
 
 
@@ -74,20 +76,27 @@ class ObservationEncoder(nn.Module):
             raise ValueError(f"the policy's input lacks {', '.join(missing)}, which it learned with{hint}")
         return {key: batch[key] for key in self.keys}
 
-    def forward(self, batch: dict[str, Tensor]) -> Tensor:
-        """Cloud (B, To, N, 5) in metres, readings (B, To, P, R, C), normalised state (B, To, Ds) and limits
-        (B, To, 2).
-        """
-        batch = self.inputs(batch)
-        state = batch[STATE_KEY]
+    def perceive(self, batch: dict[str, Tensor]) -> Tensor:
+        """Features (B, To, F) of cloud (B, To, N, 5) in metres and of readings (B, To, P, R, C)."""
         frames = [
-            part(batch[key].flatten(0, 1)).unflatten(0, state.shape[:2])
+            part(batch[key].flatten(0, 1)).unflatten(0, batch[STATE_KEY].shape[:2])
             for key, part in ((CLOUD_KEY, self.points), (GRIDS_KEY, self.pads))
             if part is not None
         ]
+        return torch.cat(frames, dim=-1)
+
+    def forward(self, batch: dict[str, Tensor]) -> Tensor:
+        """Cloud (B, To, N, 5) in metres, readings (B, To, P, R, C), normalised state (B, To, Ds) and limits
+        (B, To, 2); with ``PERCEIVED_KEY``, what ``perceive`` made of cloud and readings, these are not read.
+        """
+        known = batch.get(PERCEIVED_KEY)
+        if known is None:
+            batch = self.inputs(batch)
+            known = self.perceive(batch)
+        state = batch[STATE_KEY]
         if self.limits_dim:
             state = torch.cat([state, batch[LIMITS_KEY]], dim=-1)
-        return torch.cat([*frames, self.state(state)], dim=-1).flatten(1)
+        return torch.cat([known, self.state(state)], dim=-1).flatten(1)
 
 
 def make_encoder(config: VtDp3Config, state_dim: int) -> ObservationEncoder:
