@@ -2,7 +2,7 @@
 
 examples:
   vtrefine-demo --quick                        # minutes: tiny numbers, to see that everything works here
-  vtrefine-demo                                # eight minutes on two cores
+  vtrefine-demo                                # about ten minutes on two cores
   vtrefine-demo --config_path=vtrefine:kinova_round_grasped --recipe=cloud --output_dir=outputs/demo_kinova
   vtrefine-demo --output_dir=outputs/square --env='{pair: square, clearance_m: 0.001, start: grasped}'
 
