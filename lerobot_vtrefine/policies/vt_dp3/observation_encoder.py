@@ -77,7 +77,7 @@ class ObservationEncoder(nn.Module):
         return {key: batch[key] for key in self.keys}
 
     def perceive(self, batch: dict[str, Tensor]) -> Tensor:
-        """Features (B, To, F) of cloud (B, To, N, 5) in metres and of readings (B, To, P, R, C); F may be 0."""
+        """Features (B, To, F) of cloud (B, To, N, 5) in metres and readings (B, To, P, R, C); F may be 0."""
         frames = [
             part(batch[key].flatten(0, 1)).unflatten(0, batch[STATE_KEY].shape[:2])
             for key, part in ((CLOUD_KEY, self.points), (GRIDS_KEY, self.pads))
