@@ -28,7 +28,7 @@ from tqdm import trange
 
 from lerobot_vtrefine.cli.arguments import CommandParser
 from lerobot_vtrefine.cli.errors import run_cli
-from lerobot_vtrefine.datasets.features import ACTION_KEY, LIMITS_KEY, STATE_KEY
+from lerobot_vtrefine.datasets.features import ACTION_KEY, LIMITS_KEY, STATE_KEY, TRUTH_KEY
 from lerobot_vtrefine.files.text import read_yaml
 from lerobot_vtrefine.policies.vt_dp3.modeling_vt_dp3 import VtDp3Policy
 from lerobot_vtrefine.policies.vt_dp3.observation_encoder import PERCEIVED_KEY
@@ -41,8 +41,8 @@ ENCODED_AT_ONCE = 512
 def perceived(
     policy: VtDp3Policy, preprocessor: Any, dataset: LeRobotDataset, passes: int
 ) -> list[dict[str, Tensor]]:
-    """Every pass's frames (N, ...): features, state, limits if there are any, and the actions that follow."""
-    kept = (STATE_KEY, LIMITS_KEY, ACTION_KEY)
+    """Every pass's frames (N, ...): features, state, limits and truth if any, and actions to come."""
+    kept = (STATE_KEY, LIMITS_KEY, TRUTH_KEY, ACTION_KEY)
     found = []
     for _ in range(passes):
         parts: dict[str, list[Tensor]] = {}

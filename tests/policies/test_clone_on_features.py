@@ -5,7 +5,7 @@ import pytest
 import torch
 from lerobot.policies.factory import make_pre_post_processors
 
-from lerobot_vtrefine.datasets.features import ACTION_KEY, STATE_KEY
+from lerobot_vtrefine.datasets.features import ACTION_KEY, STATE_KEY, TRUTH_KEY
 from lerobot_vtrefine.policies.vt_dp3.modeling_vt_dp3 import VtDp3Policy
 from lerobot_vtrefine.policies.vt_dp3.observation_encoder import PERCEIVED_KEY
 
@@ -34,6 +34,17 @@ def test_the_loss_on_features_is_that_on_frames(arguments):
         torch.manual_seed(0)
         losses.append(policy.forward(seen)[0])
     torch.testing.assert_close(*losses)
+
+
+def test_what_the_auxiliary_loss_needs_is_kept(arguments):
+    policy, (preprocessor, _), dataset = script.load(arguments)
+
+    def with_truth(raw):
+        batch = preprocessor(raw)
+        return batch | {TRUTH_KEY: batch[STATE_KEY][:, -1, :2]}
+
+    (frames,) = script.perceived(policy, with_truth, dataset, passes=1)
+    torch.testing.assert_close(frames[TRUTH_KEY], frames[STATE_KEY][:, -1, :2])
 
 
 def test_it_clones_and_leaves_a_policy_with_its_processors(arguments, monkeypatch, capsys):
