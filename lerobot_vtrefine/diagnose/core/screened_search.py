@@ -74,8 +74,13 @@ class Ground[P: ScreenedProblem[Any, Any], F: ScoredFit]:
 def preferable(candidate: FormCandidate, held: OutOfFold, than: OutOfFold, seed: int) -> bool:
     """Whether a form is to stand in for a plainer one."""
     if candidate.peer:
-        return held.gain_over(than) > 0 and float(held.better_by(than).sum()) > 0
+        return better(held, than)
     return clearly_better(held, than, seed)
+
+
+def better(held: OutOfFold, than: OutOfFold, needed: float = 0.0) -> bool:
+    """Whether a model that is no richer has both less error and the higher log score."""
+    return held.gain_over(than) > needed and float(held.better_by(than).sum()) > 0
 
 
 def clearly_better(held: OutOfFold, than: OutOfFold, seed: int, needed: float = LEAST_GAIN) -> bool:
@@ -142,7 +147,7 @@ class ScreenedSearch[P: ScreenedProblem[Any, Any], F: ScoredFit, C: FormCandidat
         base = ground.judged(ground.now)
         needed = self._needed()
         fitted = [ground.plain(item.candidate) for item in passed if item.candidate.disturbs]
-        taken = any(self._helps(step.held, base, needed) for step in fitted)
+        taken = any(better(step.held, base, needed) for step in fitted)
         others = [] if taken else [item.candidate for item in passed if not item.candidate.disturbs]
         fitted += on_all_cores(ground.plain, others)
         steps = self._other_forms(ground, passed, fitted, base)
@@ -154,7 +159,7 @@ class ScreenedSearch[P: ScreenedProblem[Any, Any], F: ScoredFit, C: FormCandidat
             # What is seen in the readings themselves is there, however little is predicted by it.
             least = 0.0 if name in observed and step.candidate.terms else needed
             sure = name in observed or agree(step.held.better_by(base), self.seed, AGREEMENT_P)
-            if sure and self._helps(step.held, base, least) and self._credible(ground, step):
+            if sure and better(step.held, base, least) and self._credible(ground, step):
                 out.append((float(step.held.better_by(base).sum()), step))
         return sorted(out, key=lambda item: -item[0])
 
@@ -195,9 +200,6 @@ class ScreenedSearch[P: ScreenedProblem[Any, Any], F: ScoredFit, C: FormCandidat
     def _needed(self) -> float:
         return self.problem.further_gain if self.chosen else LEAST_GAIN
 
-    def _helps(self, held: OutOfFold, base: OutOfFold, needed: float) -> bool:
-        return held.gain_over(base) > needed and float(held.better_by(base).sum()) > 0
-
     def _credible(self, ground: Ground[P, F], step: Step[F, C]) -> bool:
         return bool(ground.problem.credible(self.baseline, ground.now, step.fit, step.candidate)[CHANNEL])
 
@@ -216,7 +218,7 @@ class ScreenedSearch[P: ScreenedProblem[Any, Any], F: ScoredFit, C: FormCandidat
         """
         slim = self.problem.reduced(self.now, [candidate], _ONE)
         full, less = (out_of_fold(self.problem, fit, self.folds) for fit in (self.now, slim))
-        if self.p_values[candidate.cause] is None or self._helps(full, less, 0.0):
+        if self.p_values[candidate.cause] is None or better(full, less, 0.0):
             return True
         self.now, self.chosen = slim, self.chosen[:-1]
         del self.p_values[candidate.cause]

@@ -4,6 +4,8 @@ A name that is right predicts recordings left out better than such a direction d
 one of them predicts better, the name is borrowed: it took the part of something else's effect that it could.
 """
 
+from collections.abc import Iterator, Sequence
+from dataclasses import replace
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -12,13 +14,15 @@ from lerobot_vtrefine.diagnose.core.heldout import out_of_fold
 from lerobot_vtrefine.diagnose.core.resampling import one_sided
 from lerobot_vtrefine.diagnose.core.rules import DECOY_P, SHARE_OF_GAIN
 from lerobot_vtrefine.diagnose.core.suspicion import Suspicion
-from lerobot_vtrefine.diagnose.pad.descriptors import DESCRIPTORS, directions, errors_left_out
-from lerobot_vtrefine.diagnose.pad.fitting import Fit
+from lerobot_vtrefine.diagnose.pad.descriptors import DESCRIPTORS, Descriptor, directions, errors_left_out
+from lerobot_vtrefine.diagnose.pad.fitting import Fit, bounded_step, movable
 from lerobot_vtrefine.diagnose.pad.form_fitting import without
 from lerobot_vtrefine.diagnose.pad.screening import scorer_of
 
 if TYPE_CHECKING:
     from lerobot_vtrefine.diagnose.pad.problem import PadProblem
+
+Array = np.ndarray
 
 
 def in_place_of_names(problem: "PadProblem", fitted: Fit) -> list[Suspicion]:
@@ -29,19 +33,12 @@ def in_place_of_names(problem: "PadProblem", fitted: Fit) -> list[Suspicion]:
 
 
 def _in_place(problem: "PadProblem", fitted: Fit, name: str) -> Suspicion | None:
-    presses, folds = problem.presses, problem.folds
-    slim = without(fitted, [name], presses, problem.weights)
-    held = out_of_fold(problem, fitted, folds)
-    own = held.better_by(out_of_fold(problem, slim, folds))
-    scorer, best, text = scorer_of(problem, slim), np.zeros(len(own)), ""
-    for decoy in DESCRIPTORS:
-        change = directions(decoy, presses, slim.signals)
-        if change is None or decoy.session or name in decoy.owners:
-            continue
-        grams = scorer.grams(change)
-        last = grams.shape[1] - 1
-        less, more = (errors_left_out(grams, folds, terms) for terms in (last - 1, last))
-        gains = 0.5 * (less - more)
+    slim = without(fitted, [name], problem.presses, problem.weights)
+    before = out_of_fold(problem, slim, problem.folds)
+    own = out_of_fold(problem, fitted, problem.folds).better_by(before)
+    best, text = np.zeros(len(own)), ""
+    for decoy, image, grams in _promising(problem, slim, name, SHARE_OF_GAIN * float(own.sum())):
+        gains = _left_out(problem, slim, image, grams) - before.scores[:, 0]
         if gains.sum() > best.sum():
             best, text = gains, decoy.text
     if not text:
@@ -52,3 +49,47 @@ def _in_place(problem: "PadProblem", fitted: Fit, name: str) -> Suspicion | None
     lead = 1.0 - float(own.sum() / best.sum())
     clue = f"in the place of {name}, {text} predicts trials left out better"
     return Suspicion(0, clue, lead, 1.0 - SHARE_OF_GAIN, p_alone=p_value, level=DECOY_P)
+
+
+def _promising(
+    problem: "PadProblem", slim: Fit, name: str, enough: float
+) -> Iterator[tuple[Descriptor, list[Array], Array]]:
+    """Decoys that would gain enough where the model touches, with their directions and inner products.
+
+    That is a lot more than they gain at the recordings' own touches where they resemble a touch.
+    """
+    scorer = scorer_of(problem, slim)
+    for decoy in DESCRIPTORS:
+        image = directions(decoy, problem.presses, slim.signals)
+        if image is None or decoy.session or name in decoy.owners:
+            continue
+        grams = scorer.grams(image)
+        last = grams.shape[1] - 1
+        less, more = (float(errors_left_out(grams, problem.folds, terms).sum()) for terms in (last - 1, last))
+        if 0.5 * (less - more) > max(enough, 0.0):
+            yield decoy, image, grams
+
+
+def _left_out(problem: "PadProblem", slim: Fit, image: Sequence[Array], grams: Array) -> Array:
+    """Log score (K,) of every recording under a fit to the other folds with a direction as one more coordinate.
+
+    Names are judged by one bounded step and at the recordings' own touches; so is what stands in for them.
+
+    Args:
+        grams: (K, q, q) inner products of the movable coordinates' tangents, the direction and the residual.
+    """
+    scores, free, again = np.empty(len(image)), movable(slim), problem.reweighted(slim)
+    for fold in np.unique(problem.folds):
+        held = problem.folds == fold
+        gram = grams[~held].sum(axis=0)
+        along = np.delete(gram[-2], -2)
+        power = max(float(gram[-2, -2]), 1e-30)
+        rest = np.delete(np.delete(gram, -2, 0), -2, 1) - np.outer(along, along) / power
+        model = slim.model.at(bounded_step(slim.model, rest, free, 1e-6))
+        much = (along[-1] - along[:-1] @ (model.values - slim.model.values)[free]) / power
+        trials = np.flatnonzero(held)
+        part = problem.presses.subset(trials.tolist())
+        pressed = zip(part.presses, trials, strict=True)
+        part = replace(part, presses=tuple(replace(p, signal=p.signal - much * image[k]) for p, k in pressed))
+        scores[held] = again.judging(model, part, (~held).astype(float), trials)[1][:, 0]
+    return scores

@@ -25,6 +25,7 @@ from lerobot_vtrefine.diagnose.pad.error_level import slow_errors
 from lerobot_vtrefine.diagnose.pad.final_model import FinalFit
 from lerobot_vtrefine.diagnose.pad.fitting import Fit, losses_of, predict, refit_weighted, squared_errors
 from lerobot_vtrefine.diagnose.pad.form_fitting import Starts, grown, settle, starts_of, with_form, without
+from lerobot_vtrefine.diagnose.pad.model import Composite
 from lerobot_vtrefine.diagnose.pad.noise import Noise
 from lerobot_vtrefine.diagnose.pad.own_touch import allowed, losses_at_own_touch
 from lerobot_vtrefine.diagnose.pad.press_trials import PressSet
@@ -84,17 +85,20 @@ class Refits:
         return map_evidence(self.fit, self.problem.presses, self.problem.weights)
 
     def judged(self, weights: Array, trials: Array) -> tuple[Array, Array]:
-        """Errors and log scores, (trials, 1) each; the map comes from recordings that count."""
-        model, keep = refit_weighted(self.fit, weights), trials.tolist()
+        """Errors and log scores, (trials, 1) each."""
+        part = self.problem.presses.subset(trials.tolist())
+        return self.judging(refit_weighted(self.fit, weights), part, weights, trials)
+
+    def judging(self, model: Composite, part: PressSet, weights: Array, trials: Array) -> tuple[Array, Array]:
+        """The same of a model's coordinates on these trials' presses; the map comes from recordings that count."""
         if self.fit.model.gain_map is not None:
             model = map_of(model, self.fit, self._evidence, np.flatnonzero(weights).tolist())
-        part = self.problem.presses.subset(keep)
         signals = predict(model, part)
         noise = self.problem.noise
         if noise is not None and allowed(part, self.problem.weights):
             losses = losses_at_own_touch(model, part, noise)
         else:
-            losses = losses_of(signals, part, [self.problem.weights[k] for k in keep])
+            losses = losses_of(signals, part, [self.problem.weights[k] for k in trials])
         return squared_errors(signals, part)[:, None], -0.5 * losses[:, None]
 
 

@@ -1,5 +1,6 @@
 """What adding single causes cannot find: two names behind one, better forms, trade-offs."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from itertools import combinations
 from typing import TYPE_CHECKING, Any
@@ -9,7 +10,7 @@ import numpy as np
 from lerobot_vtrefine.diagnose.core.heldout import OutOfFold, out_of_fold
 from lerobot_vtrefine.diagnose.core.resampling import agree
 from lerobot_vtrefine.diagnose.core.rules import FORM_P
-from lerobot_vtrefine.diagnose.core.screened_search import CHANNEL, clearly_better, preferable
+from lerobot_vtrefine.diagnose.core.screened_search import CHANNEL, better, clearly_better, preferable
 from lerobot_vtrefine.diagnose.core.search import Selection
 from lerobot_vtrefine.diagnose.pad.candidates.base import Form
 from lerobot_vtrefine.diagnose.pad.damping_profile import profile
@@ -70,9 +71,9 @@ class State:
                 best, held, terms = found, judged, len(other.values)
         return best
 
-    def without(self, name: str) -> Fit:
-        """The fit without a cause."""
-        return without(self.fit, [name], self.problem.presses, self.problem.weights)
+    def without(self, *names: str) -> Fit:
+        """The fit without some causes."""
+        return without(self.fit, names, self.problem.presses, self.problem.weights)
 
 
 def _candidate(name: str, form: Any, starts: dict[str, Any]) -> "Candidate":
@@ -112,22 +113,38 @@ def reviewed(selection: Selection["PadProblem", Fit, Any], seed: int) -> Selecti
 
 
 def two_bends(state: State) -> State:
-    """Where one of the bends was named, any two of them in its place, if these predict clearly better."""
-    named = [name for name in state.fit.model.families if name in BENDS]
-    if len(named) != 1:
+    """Where bends were named, another two of them in their place, if these are the better explanation.
+
+    An offset that is felt softly has as many coordinates as plain hardening with plain saturation, and its fit to
+    an S is good enough that little squared error is left for a second name.
+    """
+    named = [form for form in state.fit.model.forms if form.family in BENDS]
+    if not 1 <= len(named) <= 2:
         return state
     best, held = state.fit, state.held(state.fit)
-    slim = state.without(named[0])
-    for pair in combinations(BENDS, 2):
-        if not all(forms_of(name, slim) for name in pair):
+    slim = state.without(*(form.family for form in named))
+    for names in combinations(BENDS, 2):
+        if {form.family for form in named} == set(names) or not all(forms_of(name, slim) for name in names):
             continue
         found = slim
-        for name in pair:
+        for name in names:
             found = state.with_plain(found, name)
-        other = state.held(found)
-        if clearly_better(other, held, state.seed, state.problem.further_gain):
-            best, held = found, other
+        other, pair = state.held(found), [forms_of(name, slim)[0] for name in names]
+        if _takes_place(pair, other, named, held, state):
+            best, held, named = found, other, pair
     return state if best is state.fit else state.weighed(best)
+
+
+def _takes_place(
+    pair: Sequence[Form], other: OutOfFold, named: Sequence[Form], held: OutOfFold, state: State
+) -> bool:
+    """Whether two bends are to stand for what was named: by coordinates, as forms of one name are compared."""
+    more = sum(len(form.values) for form in pair) - sum(len(form.values) for form in named)
+    if more > 0:
+        return clearly_better(other, held, state.seed, state.problem.further_gain)
+    if more < 0 and len(named) == len(pair):
+        return not clearly_better(held, other, state.seed)
+    return better(other, held)
 
 
 def plain_forms(state: State) -> State:
