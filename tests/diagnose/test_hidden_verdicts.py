@@ -61,6 +61,16 @@ def test_two_causes_at_once_are_both_named(tmp_path, names):
     assert gains["gain"] > 0.85 * gains["oracle_gain"]
 
 
+@pytest.mark.parametrize("seed", [70250001, 70250006])
+def test_hardening_with_saturation_is_no_contact_felt_softly(tmp_path, seed):
+    # Such a contact, alone or with a saturation in another form, leaves no more squared error than noise.
+    names = ("nonlinear_stiffness", "saturation")
+    spec = Spec("4x4", tuple(first_form(name, 1.5) for name in names))
+    _, verdict, _ = verdict_on(tmp_path, spec, seed, locked=6)
+    assert verdict["status"] == "explained"
+    assert set(names_of(verdict)) == set(names)
+
+
 @pytest.mark.parametrize(("form", "size"), [("mains_hum", 2.0), ("bowl", 2.0), ("aging", 2.0)])
 def test_what_no_list_holds_is_said_to_be_unknown(tmp_path, form, size):
     _, verdict, _ = verdict_on(tmp_path, Spec("4x4", (("outside", form, size),), changes=SMALL))

@@ -54,9 +54,9 @@ def _in_place(problem: "PadProblem", fitted: Fit, name: str) -> Suspicion | None
 def _promising(
     problem: "PadProblem", slim: Fit, name: str, enough: float
 ) -> Iterator[tuple[Descriptor, list[Array], Array]]:
-    """Decoys that would gain enough where the model touches, with their directions and inner products.
+    """Decoys that gain enough where the model touches, with their directions and inner products.
 
-    That is a lot more than they gain at the recordings' own touches where they resemble a touch.
+    One that resembles a touch gains far less once every recording has its own.
     """
     scorer = scorer_of(problem, slim)
     for decoy in DESCRIPTORS:
@@ -71,9 +71,9 @@ def _promising(
 
 
 def _left_out(problem: "PadProblem", slim: Fit, image: Sequence[Array], grams: Array) -> Array:
-    """Log score (K,) of every recording under a fit to the other folds with a direction as one more coordinate.
+    """Log score (K,) of every recording under fits to the other folds, a direction being one more coordinate.
 
-    Names are judged by one bounded step and at the recordings' own touches; so is what stands in for them.
+    Names are judged after one bounded step and at the recordings' own touches; so is what stands in for them.
 
     Args:
         grams: (K, q, q) inner products of the movable coordinates' tangents, the direction and the residual.

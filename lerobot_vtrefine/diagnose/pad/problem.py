@@ -90,7 +90,7 @@ class Refits:
         return self.judging(refit_weighted(self.fit, weights), part, weights, trials)
 
     def judging(self, model: Composite, part: PressSet, weights: Array, trials: Array) -> tuple[Array, Array]:
-        """The same of a model's coordinates on these trials' presses; the map comes from recordings that count."""
+        """The same of other coordinates and presses of those trials; maps come from recordings that count."""
         if self.fit.model.gain_map is not None:
             model = map_of(model, self.fit, self._evidence, np.flatnonzero(weights).tolist())
         signals = predict(model, part)

@@ -113,10 +113,10 @@ def reviewed(selection: Selection["PadProblem", Fit, Any], seed: int) -> Selecti
 
 
 def two_bends(state: State) -> State:
-    """Where bends were named, another two of them in their place, if these are the better explanation.
+    """Where bends were named, another two of them in their place, if these explain the recordings better.
 
-    An offset that is felt softly has as many coordinates as plain hardening with plain saturation, and its fit to
-    an S is good enough that little squared error is left for a second name.
+    An offset that is felt softly fits an S so well that two names in its place take away little more of the
+    squared error. Plain hardening with plain saturation has no more coordinates, and need not.
     """
     named = [form for form in state.fit.model.forms if form.family in BENDS]
     if not 1 <= len(named) <= 2:
@@ -138,13 +138,13 @@ def two_bends(state: State) -> State:
 def _takes_place(
     pair: Sequence[Form], other: OutOfFold, named: Sequence[Form], held: OutOfFold, state: State
 ) -> bool:
-    """Whether two bends are to stand for what was named: by coordinates, as forms of one name are compared."""
+    """Whether two bends are to stand for what was named, compared by coordinates, as forms of a name are."""
     more = sum(len(form.values) for form in pair) - sum(len(form.values) for form in named)
     if more > 0:
         return clearly_better(other, held, state.seed, state.problem.further_gain)
     if more < 0 and len(named) == len(pair):
         return not clearly_better(held, other, state.seed)
-    return better(other, held)
+    return better(other, held) or agree(other.better_by(held), state.seed, FORM_P)
 
 
 def plain_forms(state: State) -> State:
