@@ -119,7 +119,7 @@ def two_bends(state: State) -> State:
     squared error. Plain hardening with plain saturation has no more coordinates, and need not.
     """
     named = [form for form in state.fit.model.forms if form.family in BENDS]
-    if not 1 <= len(named) <= 2:
+    if not named:
         return state
     best, held = state.fit, state.held(state.fit)
     slim = state.without(*(form.family for form in named))
@@ -142,7 +142,7 @@ def _takes_place(
     more = sum(len(form.values) for form in pair) - sum(len(form.values) for form in named)
     if more > 0:
         return clearly_better(other, held, state.seed, state.problem.further_gain)
-    if more < 0 and len(named) == len(pair):
+    if more < 0 and len(named) >= len(pair):
         return not clearly_better(held, other, state.seed)
     return better(other, held) or agree(other.better_by(held), state.seed, FORM_P)
 
