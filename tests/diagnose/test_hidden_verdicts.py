@@ -61,9 +61,9 @@ def test_two_causes_at_once_are_both_named(tmp_path, names):
     assert gains["gain"] > 0.85 * gains["oracle_gain"]
 
 
-@pytest.mark.parametrize("seed", [70250001, 70250006])
+@pytest.mark.parametrize("seed", [70250001, 70250006, 70261002])
 def test_hardening_with_saturation_is_no_contact_felt_softly(tmp_path, seed):
-    # Such a contact, alone or with a saturation in another form, leaves no more squared error than noise.
+    # Such a contact, alone or with other bends in rich forms, leaves hardly more squared error than noise.
     names = ("nonlinear_stiffness", "saturation")
     spec = Spec("4x4", tuple(first_form(name, 1.5) for name in names))
     _, verdict, _ = verdict_on(tmp_path, spec, seed, locked=6)
