@@ -37,8 +37,10 @@ CURVES = {
 """Learning curves that show what the size of a step does, by their names in docs/step_size_curves.csv."""
 POLICIES = {"visuo_tactile": BLUE, "visual": ORANGE}
 LEARNED = {
-    "cross_gentle": "needs touch: cross, 5 N (GPU)",
-    "square_1mm_slip": "square, 1 mm (GPU)",
+    "cross_gentle": "needs touch: cross, 5 N",
+    "cross_gentle_twin": "its twin needs none",
+    "cross_limited": "needs touch: told limit",
+    "square_1mm_slip": "square, 1 mm",
 }
 """Tasks of the table ``converges`` whose stages are drawn."""
 STAGES = {"imitation": "imitation", "half-way": "half-way", "": "after DPPO"}
@@ -300,10 +302,15 @@ def rms(values: np.ndarray) -> float:
 
 
 def draw_results(plt: Any) -> None:
-    """Success with touch and without: where it is needed, on a hard pair, with the paper's cloud."""
+    """Success with touch and without: where it is needed and where not, with the paper's cloud."""
     rows = [row for row in read_all(ROOT / "results") if isinstance(row, Run)]
     figure, (*left, right) = plt.subplots(
-        1, 3, figsize=(13.5, 4.0), sharey=True, width_ratios=[3, 3, 5], layout="constrained"
+        1,
+        len(LEARNED) + 1,
+        figsize=(16.5, 4.0),
+        sharey=True,
+        width_ratios=[*(2 + (task == "square_1mm_slip") for task in LEARNED), 5],
+        layout="constrained",
     )
     for ax, (task, title) in zip(left, LEARNED.items(), strict=True):
         draw_stages(ax, [row for row in rows if row.table == "converges" and row.task == task])
@@ -317,7 +324,7 @@ def draw_results(plt: Any) -> None:
             right.plot([x - 0.15, x + 0.15], [before] * 2, color="black", lw=1.5, zorder=3)
     right.set_xticks(range(len(TASKS)), list(TASKS.values()), fontsize=11)
     right.set_title("the paper's cloud, easier tasks, after DPPO", loc="left")
-    left[0].set(ylabel="success [%]", ylim=(0, 100))
+    left[0].set(ylabel="success [%]", ylim=(0, 103))
     handles = [
         Patch(color=BLUE, alpha=0.45, label="vision and touch"),
         Patch(color=ORANGE, alpha=0.45, label="vision only"),

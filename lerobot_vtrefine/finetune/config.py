@@ -209,7 +209,7 @@ class SeedLiteralDppo(DppoConfig):
 class TrustRegionDppo(DppoConfig):
     """Many environments on a GPU, stable without supervision: a trust region in nats per decision.
 
-    Measured on the round and square pairs with 1024 worlds, one seed a run (docs/learning.md): 12 nats that
+    Measured on the round and square pairs, 1024 worlds, one seed a run (docs/learning-tried.md): 12 nats that
     fall to 3 learn fast and without a fall; 40 collapse on the tighter task; 4 and less are as stable and
     slower. Exploration is small and smooth in time, so that success while training is near the success of
     the deployed policy.
@@ -239,7 +239,7 @@ class SmallDppo(TrustRegionDppo):
     """The trust region in minutes on two CPU cores: few environments, so smaller steps.
 
     128 episodes an iteration tell less than 1024: steps of 4 nats that fall to 1. On six seeds of the demo
-    (docs/learning.md) no iteration of the last half fell by more than 12 points; the schedule that it
+    (docs/learning-tried.md) no iteration of the last half fell by more than 12 points; the schedule that it
     replaced, which had no bound and returned to its best weights when it fell, fell by up to 41.
     """
 

@@ -67,6 +67,7 @@ class Run(Row):
         "reality",
         "expert",
         "reference",
+        "tried",
     )
 
     task: str

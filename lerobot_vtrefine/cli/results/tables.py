@@ -172,10 +172,27 @@ def reference_table(rows: Sequence[Run]) -> str:
     return markdown([*head, *(f"to the first {percent(rate)} %" for rate in REACHED)], body)
 
 
+def converging(rows: Sequence[Row]) -> list[Run]:
+    """The runs of ``converges``."""
+    return [row for row in rows if isinstance(row, Run) and row.table == "converges"]
+
+
 def measured(rows: Sequence[Row]) -> list[Run]:
-    """The runs of ``converges`` whose own evaluation measured more than success."""
-    runs = [row for row in rows if isinstance(row, Run) and row.table == "converges"]
-    return [row for row in runs if any(f"mean_{key}" in row.extra for key, *_ in HANDLING)]
+    """Those of them whose own evaluation measured more than success."""
+    return [row for row in converging(rows) if any(f"mean_{key}" in row.extra for key, *_ in HANDLING)]
+
+
+def senses_table(rows: Sequence[Run]) -> str:
+    """What touch gives, task by task: before and after DPPO, paired over the seeds that both have."""
+    body = []
+    for task in values(rows, "task"):
+        both = [pick(rows, task=task, policy=name) for name in ("visuo_tactile", "visual")]
+        stages = [[pick(runs, variant=variant) for runs in both] for variant in (IMITATION, TUNED)]
+        if all(stages[0]):
+            cells = [[*map(over_seeds, stage), difference(stage[1], stage[0])] for stage in stages]
+            body.append([label(task), *cells[0], *cells[1]])
+    head = ["touch", "vision only", "difference"]
+    return markdown(["task", *(f"{stage}, {name}" for stage in ("imitation", "DPPO") for name in head)], body)
 
 
 def handling_table(rows: Sequence[Run]) -> str:
@@ -247,8 +264,12 @@ RENDERERS: dict[str, Callable[[Sequence], str]] = (
     | {"demo": demo_table, "touch": touch_table, "twin": touch_table, "reality": reality_table}
     | {"expert": expert_table, "policies": policies_table}
     | {"paper": paper_table, "demonstrations": demonstrations_table, "handling": handling_table}
+    | {"senses": senses_table}
     | {"reference": reference_table}
 )
+
+DERIVED: dict[str, Callable[[Sequence[Row]], list[Run]]] = {"handling": measured, "senses": converging}
+"""Tables that show rows of another one."""
 
 
 def table(name: str, rows: Sequence[Row]) -> str:
@@ -257,7 +278,7 @@ def table(name: str, rows: Sequence[Row]) -> str:
     Raises:
         ValueError: there is no such table, or no row of it.
     """
-    chosen = measured(rows) if name == "handling" else [row for row in rows if row.table == name]
+    chosen = DERIVED[name](rows) if name in DERIVED else [row for row in rows if row.table == name]
     if not chosen:
         raise ValueError(f"table {name}: results/ hold no rows of it; tables: {', '.join(RENDERERS)}")
     origin = {field: dict.fromkeys(getattr(row, field) for row in chosen) for field in ("commit", "machine")}
