@@ -5,10 +5,8 @@
     .venv/bin/python scripts/compare_touch.py --seeds 1 2 3 --settings worlds_round worlds_square --jobs 4
 
 The settings worlds_*, and the touch tasks of docs/task.md with their twins, are the recipe of
-docs/learning.md and need GPUs. All but worlds_round and worlds_square need an encoder of their own first:
-a touch task or twin in outputs/information_TASK, where scripts/judge_tasks.py leaves it, worlds_key in
-outputs/information_key: ``vtrefine-information --config_path=vtrefine:key_grasped_1mm`` with the flags that
-docs/learning.md gives.
+docs/learning.md and need GPUs. Their encoders come with the package, but for key_turned's, which is taken
+from outputs/information_key_turned, where scripts/judge_tasks.py leaves it; a twin takes its task's.
 
 Every run is one ``vtrefine-demo`` in one of the settings below; flags that this script does not know are
 passed on to it, after the setting's, for example ``--num_demos=40``. On a machine with many cores ``--jobs``
@@ -34,6 +32,7 @@ import yaml
 from lerobot_vtrefine.cli.arguments import CommandParser
 from lerobot_vtrefine.cli.pipeline.demo_config import default_env
 from lerobot_vtrefine.cli.report.statistics import mean_interval, proportion
+from lerobot_vtrefine.shipped import PREFIX, encoders
 
 MODALITIES = ("visuo_tactile", "visual")
 POLICIES = {"pretrain": "imitation", "finetune": "after DPPO"}
@@ -86,7 +85,7 @@ WORLDS: dict[str, dict[str, dict[str, Any]]] = {
     },
     "worlds_key": {
         "env": {"pair": "key", **_TIGHT},
-        "policy": {"pretrained_encoder": "outputs/information_key"},
+        "policy": {"pretrained_encoder": "vtrefine:key_grasped_1mm"},
     },
 }
 """Tasks for MANY_WORLDS."""
@@ -96,9 +95,11 @@ TASK_FILES = Path(__file__).parents[1] / "configs" / "env"
 
 
 def touch_setting(task: str) -> dict[str, dict[str, Any]]:
-    """A touch task or a twin for MANY_WORLDS, with the encoder of its own study."""
+    """A touch task or a twin for MANY_WORLDS, with the encoder of the task."""
     env = yaml.safe_load((TASK_FILES / f"{task}.yaml").read_text(encoding="utf-8"))["env"]
-    return {"env": env, "policy": {"pretrained_encoder": f"outputs/information_{task}"}}
+    name = task.removesuffix("_twin")
+    encoder = f"{PREFIX}{name}" if name in encoders() else f"outputs/information_{name}"
+    return {"env": env, "policy": {"pretrained_encoder": encoder}}
 
 
 for _task in TOUCH_TASKS:

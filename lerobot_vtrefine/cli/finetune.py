@@ -4,8 +4,9 @@ example:
   vtrefine-finetune --config_path=vtrefine:round_grasped --policy.device=cpu --dppo.type=small \\
       --policy.path=outputs/pretrain/checkpoints/last/pretrained_model --output_dir=outputs/finetune
 
---policy.path=FOLDER names the checkpoint to start from, --dppo.type a preset: paper, seed_literal,
-trust_region (many worlds on a GPU) or small (a laptop). --resume=true continues an interrupted run exactly.
+--policy.path=FOLDER names the checkpoint to start from, --dppo.type a preset: trust_region (many
+worlds on a GPU), fine (the same for tight or gentle tasks and imitations that often succeed), small (a
+laptop) or paper. --resume=true continues an interrupted run exactly.
 With --push_to_hub=true --repo_id=USER/NAME the result is evaluated by lerobot-eval on unseen seeds and
 uploaded, with its processors and a card that says what was found; a finished run is shared by repeating its
 command with --resume=true.

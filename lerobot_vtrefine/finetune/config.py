@@ -1,6 +1,6 @@
 """DPPO settings: ``paper`` holds the defaults, the other presets state only what differs.
 
-Choose with ``--dppo.type=paper|seed_literal|trust_region|small``, then change single fields, e.g.
+Choose with ``--dppo.type=paper|trust_region|fine|small``, then change single fields, e.g.
 ``--dppo.epochs=5``.
 """
 
@@ -195,15 +195,6 @@ class PaperDppo(DppoConfig):
     """The paper's setting, with this project's choices where the paper is silent."""
 
 
-@DppoConfig.register_subclass("seed_literal")
-@dataclass(frozen=True)
-class SeedLiteralDppo(DppoConfig):
-    """The paper's table taken literally: stable, and slow to improve."""
-
-    clip: float = 2e-4
-    clip_first: float = 2e-4
-
-
 @DppoConfig.register_subclass("trust_region")
 @dataclass(frozen=True)
 class TrustRegionDppo(DppoConfig):
@@ -231,6 +222,22 @@ class TrustRegionDppo(DppoConfig):
     actor_lr: float = 1e-4
     max_grad_norm: float = 1.0
     critic_width: int = 256
+
+
+@DppoConfig.register_subclass("fine")
+@dataclass(frozen=True)
+class FineDppo(TrustRegionDppo):
+    """The trust region for tight or gentle tasks and imitations that often succeed: it explores quietly.
+
+    With touch, on six fresh seeds each of ``cross_gentle`` and of the square pair (18 iterations), it ends at
+    97 and 95 %, and no iteration of the last half falls by more than 7 points (docs/learning.md).
+    """
+
+    iterations: int = 12
+    min_sampling_std: float = 0.01
+    kl_per_decision: float = 5.2
+    kl_per_decision_final: float = 1.3
+    kl_coef: float = 0.02
 
 
 @DppoConfig.register_subclass("small")

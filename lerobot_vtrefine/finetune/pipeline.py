@@ -62,7 +62,7 @@ class FinetunePipelineConfig:
     env: EnvConfig
     # The checkpoint to start from: --policy.path=FOLDER; --policy.device=cpu or cuda; its other settings too.
     policy: PreTrainedConfig | None = None
-    # The update; --dppo.type=paper|seed_literal|trust_region|small chooses a preset.
+    # The update; --dppo.type=paper|trust_region|fine|small chooses a preset.
     dppo: DppoConfig = field(default_factory=PaperDppo)
     # Folder of checkpoints/, progress.csv and curves.png.
     output_dir: Path = Path("outputs/finetune")

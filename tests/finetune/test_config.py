@@ -4,7 +4,7 @@ from dataclasses import dataclass, field
 import draccus
 import pytest
 
-from lerobot_vtrefine.finetune.config import DppoConfig, PaperDppo, SeedLiteralDppo, SmallDppo
+from lerobot_vtrefine.finetune.config import DppoConfig, FineDppo, PaperDppo, SmallDppo, TrustRegionDppo
 
 
 @dataclass
@@ -20,10 +20,17 @@ def test_presets_are_chosen_by_type_and_single_fields_changed():
     assert cfg.clip == SmallDppo().clip
 
 
-def test_seed_literal_differs_from_paper_only_in_the_clip_range():
-    paper, literal = vars(PaperDppo()), vars(SeedLiteralDppo())
-    assert {key for key in paper if paper[key] != literal[key]} == {"clip", "clip_first"}
-    assert literal["clip"] == 2e-4
+def test_the_fine_preset_is_the_trust_region_with_less_noise_and_a_pull_to_the_imitation():
+    coarse, fine = TrustRegionDppo(), FineDppo()
+    changed = {key for key in vars(coarse) if vars(coarse)[key] != vars(fine)[key]}
+    assert changed == {
+        "iterations",
+        "min_sampling_std",
+        "kl_per_decision",
+        "kl_per_decision_final",
+        "kl_coef",
+    }
+    assert fine.kl_per_decision / fine.min_sampling_std > coarse.kl_per_decision / coarse.min_sampling_std
 
 
 def test_one_tuned_step_has_a_finite_clip_range():
