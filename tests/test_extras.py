@@ -14,6 +14,8 @@ from typing import Any
 
 import pytest
 
+from lerobot_vtrefine.extras import EXTRA_OF
+
 ROOT = Path(__file__).parents[1]
 SIMULATORS = ("mujoco", "warp", "mujoco_warp", "trimesh", "coacd", "manifold3d")
 DEVICES = ("serial", "dynamixel_sdk", "deepdiff", "evdev", "pynput", "rerun", "foxglove")
@@ -67,6 +69,18 @@ def test_the_core_leaves_the_simulator_to_an_extra() -> None:
     assert {re.split("[<>]", line)[0] for line in extras["sim"]} == {"mujoco", "warp-lang"}
     for built_on_it in ("gpu", "assets", "dev"):
         assert any(re.match(r"lerobot_policy_vtrefine\[.*\bsim\b", line) for line in extras[built_on_it])
+
+
+def test_every_package_of_an_extra_is_known_by_what_is_imported() -> None:
+    project = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"]
+    imported_as = {"warp-lang": "warp", "mujoco-warp": "mujoco_warp", "pyserial": "serial"}
+    brought = {
+        imported_as.get(name, name): extra
+        for extra, lines in project["optional-dependencies"].items()
+        for name in (re.split(r"[\[<>=~! ;]", line)[0] for line in lines)
+        if extra not in ("docs", "dev") and not name.startswith("lerobot")
+    }
+    assert {module: EXTRA_OF.get(module) for module in brought} == brought
 
 
 @pytest.mark.timeout(900)

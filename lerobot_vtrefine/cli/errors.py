@@ -32,6 +32,11 @@ CONFIG_FLAG = "--config_path"
 
 LONGEST_LINE = 1500
 
+_OPTIONAL_VALUE = re.compile(
+    r"`([\w.]+)`: Could not decode the value into any of the given types: [\w\[\], .]+: (?:`([\w.]+)`: )?"
+)
+"""How draccus begins where a flag may be left out, as if there were several types that it may have."""
+
 
 def describe(error: BaseException) -> str:
     """Return one printable line that tells a user what went wrong, without the traceback."""
@@ -79,7 +84,7 @@ def _in_flags(message: str) -> str:
     """draccus speaks of Python classes; users type flags."""
     if "Expected a dict with a 'type' key" in message and "EnvConfig" in message:
         return "say which environment: --env.type=vtrefine or --config_path=vtrefine:NAME"
-    return message
+    return _OPTIONAL_VALUE.sub(lambda found: f"`{'.'.join(filter(None, found.groups()))}`: ", message)
 
 
 def meant(message: str, known: Iterable[str]) -> str:

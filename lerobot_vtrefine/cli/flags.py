@@ -35,6 +35,11 @@ class Flag:
         """Whether it takes ``[a, b]``."""
         return self.type.startswith(("list[", "["))
 
+    @property
+    def has_flags_below(self) -> bool:
+        """Whether it takes no value itself: a class of ours, or one of LeRobot's, has its flags."""
+        return self.group is not None or self.type.endswith("Config")
+
     def is_among(self, given: Iterable[str]) -> bool:
         """Whether one of these names is the flag's, or lies below it."""
         return any(name == self.name or name.startswith(f"{self.name}.") for name in given)

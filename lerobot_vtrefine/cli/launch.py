@@ -84,7 +84,7 @@ def help_text(command: str, module: str, config: str) -> str:
 
 
 def _lines(flag: Flag) -> list[str]:
-    head = f"  --{flag.name}.*" if flag.group is not None else f"  --{flag.name}={flag.type}"
+    head = f"  --{flag.name}.*" if flag.has_flags_below else f"  --{flag.name}={flag.type}"
     said = flag.text
     if flag.required:
         said = f"{said} (required)"

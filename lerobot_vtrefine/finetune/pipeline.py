@@ -77,7 +77,8 @@ class FinetunePipelineConfig:
     eval_freq: int = 10
     # Write a checkpoint every so many iterations, and after the last.
     save_freq: int = 10
-    # n_episodes counts, and batch_size with push_to_hub; the rest, which files of tasks hold, is not used.
+    # --eval.n_episodes counts, and --eval.batch_size with push_to_hub; the rest, which files of tasks hold,
+    # is not used.
     eval: EvalConfig = field(default_factory=EvalConfig)
     # Evaluate the result by lerobot-eval and upload it to the Hugging Face Hub with a card of what was found.
     push_to_hub: bool = False
@@ -85,7 +86,8 @@ class FinetunePipelineConfig:
     repo_id: str | None = None
     # Upload it for those only whom you invite.
     private: bool = False
-    # Curves and settings only: no artifacts are uploaded, so disable_artifact changes nothing.
+    # --wandb.enable=true and its other settings, as lerobot-train takes them. Curves and settings only: no
+    # artifacts are uploaded, so disable_artifact changes nothing.
     wandb: WandBConfig = field(default_factory=WandBConfig)
 
     @classmethod

@@ -32,7 +32,7 @@ Triangles = NDArray[np.int64]
 
 ROLES = ("plug", "socket")
 PREFIX = "automate/"
-EXTENT_RANGE_M = (0.005, 0.25)  # largest side of a part that two ALOHA hands can hold
+EXTENT_RANGE_M = (0.005, 0.25)  # largest side of a part that two hands can hold
 _UNIT_RANGES = {1.0: (0.002, 0.5), 1e-3: (2.0, 500.0)}  # raw extents that read as metres, as millimetres
 
 

@@ -12,7 +12,9 @@ import safetensors
 
 from lerobot_vtrefine.cli.errors import after_interrupt, run_cli
 from lerobot_vtrefine.cli.pipeline.demo_config import DemoConfig
+from lerobot_vtrefine.cli.play import PlayConfig
 from lerobot_vtrefine.cli.record_demos import RecordDemosConfig
+from lerobot_vtrefine.cli.replay import ReplayConfig
 
 
 def failing(error: BaseException):
@@ -99,6 +101,9 @@ class Flags:
             ["--root=x", "--env.pair=round"],
             "say which environment: --env.type=vtrefine or --config_path=vtrefine:NAME",
         ),
+        (PlayConfig, ["--seed=many"], "`seed`: Couldn't parse 'many' into an int"),
+        (PlayConfig, ["--env.type=vtrefine", "--env.fps=x"], "`env.fps`: Couldn't parse 'x' into an int"),
+        (ReplayConfig, ["--episodes=[one]"], "`episodes.0`: Couldn't parse 'one' into an int"),
     ],
 )
 def test_flags_that_are_misspelt_or_lack_their_type_are_one_line(config, typed, line, capsys) -> None:

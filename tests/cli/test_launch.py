@@ -13,6 +13,7 @@ from lerobot_vtrefine.cli.checks import check_arguments
 from lerobot_vtrefine.cli.flags import flags_of
 from lerobot_vtrefine.cli.pipeline.demo_config import DemoConfig
 
+FINETUNE = ("lerobot_vtrefine.finetune.pipeline", "FinetunePipelineConfig")
 RECORD = ("lerobot_vtrefine.cli.record_demos", "RecordDemosConfig")
 
 
@@ -64,7 +65,7 @@ def test_nested_flags_are_followed_into_their_modules() -> None:
 CONFIGS = (
     RECORD,
     ("lerobot_vtrefine.cli.pipeline.demo_config", "DemoConfig"),
-    ("lerobot_vtrefine.finetune.pipeline", "FinetunePipelineConfig"),
+    FINETUNE,
     ("lerobot_vtrefine.cli.information", "InformationConfig"),
     ("lerobot_vtrefine.cli.play", "PlayConfig"),
     ("lerobot_vtrefine.cli.bench", "BenchConfig"),
@@ -81,9 +82,15 @@ def test_every_flag_that_help_shows_says_what_it_is_for(module: str, name: str) 
 
 
 def test_comments_document_flags_too() -> None:
-    flags = {f.name: f for f in flags_of("lerobot_vtrefine.finetune.pipeline", "FinetunePipelineConfig")}
+    flags = {f.name: f for f in flags_of(*FINETUNE)}
     assert flags["resume"].text.startswith("Continue from the last checkpoint")
     assert "--policy.path" in flags["policy"].text
+
+
+def test_help_names_flags_and_no_classes_of_lerobots() -> None:
+    shown = launch.help_text("lerobot_vtrefine.cli.finetune", *FINETUNE)
+    assert "Config" not in shown
+    assert "\n  --eval.*  " in shown
 
 
 @pytest.mark.parametrize(
