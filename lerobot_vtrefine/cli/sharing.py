@@ -51,9 +51,9 @@ def push_policy(folder: Path, repo_id: str, evaluation: Path | None, *, private:
     if missing := [name for name in CHECKPOINT_FILES if not (folder / name).is_file()]:
         raise FileNotFoundError(f"{folder} lacks {missing[0]}: name a folder such as .../pretrained_model")
     text = policy_card(folder, repo_id, evaluation)
-    (folder / CARD).write_text(text, encoding="utf-8")
     api = HfApi()
     api.create_repo(repo_id=repo_id, private=private, exist_ok=True)
+    (folder / CARD).write_text(text, encoding="utf-8")  # not before: without a network nothing is left behind
     api.upload_folder(repo_id=repo_id, folder_path=folder, allow_patterns=None, ignore_patterns=None)
 
 
@@ -148,7 +148,7 @@ def _use(repo_id: str, policy: Mapping[str, Any], evaluation: Path | None) -> st
     repeats = (
         "The same episodes and, on the same kind of machine, the same successes"
         if "--seed" in command
-        else "An evaluation"
+        else "An evaluation, in the task that `NAME` stands for (`vtrefine configs` lists them)"
     )
     return (
         f"## Use\n\n```bash\npip install 'lerobot_policy_vtrefine[sim]'\n{command}\n```\n\n"
@@ -157,11 +157,12 @@ def _use(repo_id: str, policy: Mapping[str, Any], evaluation: Path | None) -> st
 
 
 def evaluation_command(repo_id: str, policy: Mapping[str, Any], evaluation: Path | None) -> str:
-    """``lerobot-eval`` of a shared policy: as it was evaluated, where that was noted beside the episodes."""
+    """``lerobot-eval`` of a shared policy: as it was evaluated, where that was noted beside the episodes;
+    a policy does not know its task."""
     begin = f"lerobot-eval --policy.path={repo_id} --policy.device={policy.get('device') or 'cpu'}"
     note = None if evaluation is None else read_note(evaluation / EPISODES)
     if evaluation is None or note is None:
-        return f"{begin} --config_path=vtrefine:round_grasped"
+        return f"{begin} --config_path=vtrefine:NAME"
     found = load_evaluation(evaluation, first := first_seed(evaluation / EPISODES))
     sizes = (
         f"--eval.n_episodes={found['episodes']}",

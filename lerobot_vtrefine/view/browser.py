@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 import torch
 
-from lerobot_vtrefine.drivers.picture import colours
+from lerobot_vtrefine.drivers.picture import FULL_SCALE, colours
 from lerobot_vtrefine.envs.live_world import LiveWorld
 from lerobot_vtrefine.extras import VIEW, require
 from lerobot_vtrefine.observation import VisuoTactileConfig, build_visuo_tactile
@@ -119,7 +119,8 @@ class BrowserView:
             self._add_controls(gui)
         self._show_cloud = gui.add_checkbox("point cloud", True)
         gui.add_markdown(
-            "Pads: a row per arm (left, right), each with its left and its right finger; fingertips are left."
+            "Pads: a row per arm (left, right), each with its left and its right finger; fingertips are "
+            f"left. Yellow is {FULL_SCALE:.0f} counts above idle or more."
         )
         self._pads = gui.add_image(self._pad_picture())
 

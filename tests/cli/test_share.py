@@ -7,6 +7,8 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import draccus
+import httpx
+import huggingface_hub
 import pytest
 from conftest import TINY_ENV
 from lerobot.envs.configs import EnvConfig
@@ -109,7 +111,21 @@ def test_the_card_repeats_the_evaluation_where_its_environment_was_noted(
 
 def test_without_an_evaluation_nothing_is_claimed(hub: Path, policy: Path) -> None:
     assert share.main([str(policy), NAME]) == 0
-    assert "Not evaluated: nothing is claimed." in (hub / "me" / "insertion" / "README.md").read_text()
+    card = (hub / "me" / "insertion" / "README.md").read_text()
+    assert "Not evaluated: nothing is claimed." in card
+    assert "--config_path=vtrefine:NAME" in card  # not just any task
+
+
+def test_a_network_that_does_not_answer_leaves_no_card_behind(
+    hub: Path, policy: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    def unreachable(*_: object, **__: object) -> None:
+        raise httpx.ConnectError("no route")
+
+    monkeypatch.setattr(huggingface_hub.HfApi, "create_repo", unreachable)
+    assert share.main([str(policy), NAME]) == 2
+    assert "the network did not answer" in capsys.readouterr().err
+    assert not (policy / "README.md").exists()
 
 
 def test_bad_input_is_one_line_and_nothing_is_pushed(
