@@ -5,18 +5,19 @@ from functools import partial
 
 import gymnasium as gym
 from gymnasium.vector import AutoresetMode
-from lerobot.envs.utils import _LazyAsyncVectorEnv, freeze_after_episode_end
+from lerobot.envs.utils import freeze_after_episode_end
 
 from lerobot_vtrefine.envs.config import VtRefineEnvConfig
 from lerobot_vtrefine.envs.evaluation_note import write_note
 from lerobot_vtrefine.envs.rendering import EvalVideos
 from lerobot_vtrefine.envs.single_env import VtRefineEnv
 from lerobot_vtrefine.envs.vector_env import VtRefineVectorEnv
+from lerobot_vtrefine.lerobot_compat.lazy_workers import LazyAsyncVectorEnv
 
 
 def make_vector_env(
     config: VtRefineEnvConfig, num_envs: int, use_async: bool
-) -> gym.vector.VectorEnv | _LazyAsyncVectorEnv:
+) -> gym.vector.VectorEnv | LazyAsyncVectorEnv:
     """The native batched environment, or Gymnasium's sync or async one around single environments."""
     write_note(config, num_envs)
     if config.vectorization == "native":
@@ -26,8 +27,7 @@ def make_vector_env(
     ]
     if use_async and num_envs > 1:
         env = _make_single(config, 0, num_envs)
-        # LeRobot's own stand-in for a vector env: worker processes start at the first reset.
-        return _LazyAsyncVectorEnv(makers, env.observation_space, env.action_space, env.metadata)
+        return LazyAsyncVectorEnv(makers, env.observation_space, env.action_space, env.metadata)
     frozen = [freeze_after_episode_end(make) for make in makers]
     return gym.vector.SyncVectorEnv(frozen, autoreset_mode=AutoresetMode.NEXT_STEP)
 

@@ -88,6 +88,13 @@ SEAMS = (
         "replaces only the functions that it knows",
     ),
     Seam(
+        "lazy_workers",
+        (),
+        "asynchronous environments whose workers wait for the first reset have no public name",
+        "--env.vectorization=gym and what else makes vector environments",
+        "stays: it only imports",
+    ),
+    Seam(
         "live_view",
         (
             "lerobot.utils.visualization_utils.log_rerun_data",
