@@ -44,6 +44,7 @@ def add_format_flags(parser: argparse.ArgumentParser) -> None:
     """Add --help_format and --template."""
     parser.add_argument(
         "--help_format",
+        "--help-format",
         nargs="?",
         metavar="NAME",
         action=_Answer,

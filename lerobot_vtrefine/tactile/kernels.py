@@ -315,7 +315,7 @@ def keep_planes(lattice: Lattice, bodies: Bodies, views: Views, env: int, pad: i
 def far_away(
     lattice: Lattice, bodies: Bodies, k: int, from_body: wp.vec3, body_rot: wp.mat33, pad_rot: wp.mat33
 ) -> bool:
-    """Whether the ball around a primitive is out of reach: what most of many are spared the rest by."""
+    """Whether the ball around a primitive is out of reach, as most are of many: nothing else is computed."""
     radius = wp.length(bodies.extent[k])
     centre = wp.transpose(pad_rot) * (body_rot * bodies.position[k] - from_body)
     if centre[2] - radius > lattice.reach * float(lattice.mode) or centre[2] + radius < 0.0:

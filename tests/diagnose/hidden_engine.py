@@ -25,7 +25,7 @@ def diagnose_folder(path: Path, seed: int = 0) -> tuple[dict[str, Any], Any]:
     with tempfile.TemporaryDirectory() as scratch:
         file = Path(scratch) / "verdict.json"
         write_verdict(found.verdict, file)
-        read_verdict(file)  # the contract's own checks
+        read_verdict(file)  # the format's own checks
         return json.loads(file.read_text(encoding="utf-8")), found.extended_model
 
 

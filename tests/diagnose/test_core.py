@@ -9,6 +9,7 @@ from lerobot_vtrefine.diagnose.core.engine import infer
 from lerobot_vtrefine.diagnose.core.heldout import lock
 from lerobot_vtrefine.diagnose.core.problem import NothingBesides, PlainCandidate
 from lerobot_vtrefine.diagnose.core.resampling import folds_of, jackknife, jointly_adjusted, one_sided
+from lerobot_vtrefine.diagnose.core.rivals import Rival, adopt
 from lerobot_vtrefine.diagnose.core.search import ALL
 from lerobot_vtrefine.diagnose.core.suspicion import Suspicion, raise_alarms
 
@@ -176,6 +177,18 @@ def test_a_model_worse_than_the_baseline_on_locked_trials_is_not_handed_out() ->
     # What is significant and yet predicts worse is something else than its name.
     assert [alarm.channel for alarm in found.alarms] == [1]
     assert "worse" in found.alarms[0].clue
+
+
+@pytest.mark.parametrize("shared", [False, True])
+def test_a_rival_that_is_adopted_has_the_p_value_of_what_it_replaces(shared: bool) -> None:
+    selection = infer(toy(effects=(0.0, 0.3))).selection
+    (known,) = selection.p_values.values()
+    other = PlainCandidate("2", shared=shared)
+    rival = Rival("1", other, (1,), shared, 0.5, selection.fit, selection.errors)
+    found = adopt(selection, rival)
+    assert found.p_values == {("2", ALL if shared else 1): known}
+    back = Rival("2", PlainCandidate("1"), (1,), shared, 0.5, selection.fit, selection.errors)
+    assert adopt(found, back).p_values == {("1", 1): known}
 
 
 def test_the_guard_leaves_other_channels_alone() -> None:

@@ -12,32 +12,36 @@ from lerobot_vtrefine.diagnose.core.score_test import Probe, screen
 from lerobot_vtrefine.diagnose.verdict import Cause
 
 FOLDER = Path(package.__file__).parent
-FILES = sorted(path for room in ("core", "pad") for path in (FOLDER / room).rglob("*.py"))
+FILES = sorted(FOLDER.rglob("*.py"))
 KNOWN = {"Probe": 7, "Alarm": 3, "Tested": 1, "Examined": 0, "Evidence": 1, "Cause": 3}
 """Class -> place of its p-value among the arguments."""
 
 
 def typed_in(tree: ast.AST) -> list[str]:
-    """Calls that hand over a constant (or one of two constants) for a p-value."""
+    """Calls and entries of `p_values` that hold a constant (or one of two constants) for a p-value."""
 
     def constant(node: ast.expr) -> bool:
         if isinstance(node, ast.IfExp):
             return constant(node.body) or constant(node.orelse)
         return isinstance(node, ast.Constant) and isinstance(node.value, float | int)
 
-    return [
-        ast.unparse(node)
-        for node in ast.walk(tree)
-        if isinstance(node, ast.Call)
-        and isinstance(node.func, ast.Name)
-        and node.func.id in KNOWN
-        and len(node.args) > KNOWN[node.func.id]
-        and constant(node.args[KNOWN[node.func.id]])
-    ]
+    def given(node: ast.AST) -> list[ast.expr]:
+        """What a node hands over as p-values."""
+        if isinstance(node, ast.Assign):
+            return [node.value for target in node.targets if ast.unparse(target).startswith("p_values[")]
+        if not isinstance(node, ast.Call):
+            return []
+        place = KNOWN.get(ast.unparse(node.func), len(node.args))
+        named = [item.value for item in node.keywords if item.arg in ("p_value", "p_alone", "p_adjusted")]
+        return [*node.args[place : place + 1], *named]
+
+    return [ast.unparse(node) for node in ast.walk(tree) if any(constant(item) for item in given(node))]
 
 
 def test_the_rule_sees_a_typed_in_p_value() -> None:
     assert typed_in(ast.parse('Alarm("level", fired, ratio, 1e-4 if fired else 1.0, text)'))
+    assert typed_in(ast.parse("p_values[name, channel] = 1.0 if p_value is None else p_value"))
+    assert typed_in(ast.parse("Suspicion(0, clue, size, LEAST, p_alone=0.0)"))
     assert not typed_in(ast.parse('Alarm("level", fired, ratio, None, text)'))
 
 

@@ -149,9 +149,10 @@ def test_the_template_diagnoses_cleanly(tmp_path: Path, capsys: pytest.CaptureFi
     assert errors("verdict.json", verdict) == []
 
 
-def test_help_format_describes_and_prints_schemas(capsys: pytest.CaptureFixture[str]) -> None:
+@pytest.mark.parametrize("flag", ["--help_format", "--help-format"])
+def test_help_format_describes_and_prints_schemas(capsys: pytest.CaptureFixture[str], flag: str) -> None:
     with pytest.raises(SystemExit) as left:
-        main(["--help_format"])
+        main([flag])
     assert left.value.code == 0
     assert all(name in capsys.readouterr().out for name in ("recording.json",))
     with pytest.raises(SystemExit):

@@ -7,6 +7,7 @@ import pytest
 from robot_rigs import Rig, make_set
 
 from lerobot_vtrefine.diagnose.joints.batch import make_batch
+from lerobot_vtrefine.diagnose.joints.candidates import NAMES
 from lerobot_vtrefine.diagnose.joints.engine import diagnose_problem, diagnose_robot
 from lerobot_vtrefine.diagnose.joints.estimates import widened
 from lerobot_vtrefine.diagnose.joints.fitting import SERVO_TICK_S
@@ -95,6 +96,15 @@ def test_nothing_is_found_where_nothing_is(tmp_path) -> None:
     assert 0 < found.verdict.minimum_detectable["backlash"] < 0.01
     assert 0 < found.verdict.minimum_detectable["control_latency"] < 0.02
     assert {item.name for item in found.evidence} >= {"backlash", "gripper_compliance"}
+
+
+@pytest.mark.parametrize("joints", [("shoulder", "elbow"), ("elbow", "gripper")])
+def test_every_cause_of_the_catalogue_has_a_size_or_what_to_record(tmp_path, joints) -> None:
+    verdict = diagnose(tmp_path, joints=joints)[0].verdict
+    assert verdict.status == "adequate"
+    assert {*verdict.minimum_detectable, *verdict.not_tested} == set(NAMES)
+    assert not {*verdict.minimum_detectable} & {*verdict.not_tested}
+    assert "record the column load" in verdict.not_tested["gripper_compliance"]
 
 
 def test_two_causes_on_two_joints(tmp_path) -> None:

@@ -5,30 +5,12 @@ from pathlib import Path
 
 import pytest
 
+from lerobot_vtrefine.diagnose.verdict import SENSOR_CAUSES
 from lerobot_vtrefine.tactile import SensorModel
 from lerobot_vtrefine.tactile.stages.base import STAGES
 from lerobot_vtrefine.tactile.stages.contact import Consistent, KelvinVoigt
 from lerobot_vtrefine.tactile.stages.hysteresis import Hysteresis
 from lerobot_vtrefine.tactile.stages.readout import Crosstalk, Gain, Quantisation
-
-CONTRACT = [
-    "nonlinear_stiffness",
-    "saturation",
-    "viscoelastic_relaxation",
-    "hysteresis",
-    "taxel_gain_spread",
-    "dead_taxels",
-    "row_sharing",
-    "supply_droop",
-    "crosstalk",
-    "mechanical_spreading",
-    "baseline_drift",
-    "latency",
-    "scan_skew",
-    "sample_and_hold",
-    "contact_offset",
-    "pad_tilt",
-]
 
 
 def with_everything() -> SensorModel:
@@ -40,7 +22,7 @@ def with_everything() -> SensorModel:
 
 
 def test_every_named_cause_is_a_stage() -> None:
-    assert set(CONTRACT) <= set(STAGES)
+    assert set(SENSOR_CAUSES) <= set(STAGES)
 
 
 def test_paper_is_the_papers_law_alone() -> None:

@@ -136,15 +136,18 @@ def settled[F: Fit, C: Candidate](
 
 
 def adopt[F: Fit, C: Candidate](selection: Selection[Any, F, C], rival: Rival[F, C]) -> Selection[Any, F, C]:
-    """The selection with the rival in the cause's place."""
+    """The selection with the rival in the cause's place, under the p-value that something acts there."""
     chosen, p_values = dict(selection.chosen), dict(selection.p_values)
-    for channel in (*rival.channels, ALL):
+    places = (*rival.channels, ALL)
+    known = {channel: p_values.pop((rival.cause, channel), None) for channel in places}
+    tested = min((p_value for p_value in known.values() if p_value is not None), default=None)
+    for channel in places:
         kept = tuple(item for item in chosen.get(channel, ()) if item.cause != rival.cause)
         here = (channel == ALL) == rival.candidate.shared
         chosen[channel] = (*kept, rival.candidate) if here else kept
-        p_value = p_values.pop((rival.cause, channel), None)
         if here:
-            p_values[rival.name, channel] = 1.0 if p_value is None else p_value
+            p_value = known[channel]
+            p_values[rival.name, channel] = tested if p_value is None else p_value
     mask = np.isin(np.arange(selection.errors.shape[1]), rival.channels) | rival.shared
     return replace(
         selection,

@@ -1,6 +1,6 @@
 """From what the method found to the diagnosis that is handed out."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -21,6 +21,7 @@ Found = Inference[Any, Any, Any]
 
 _CLUES = 4
 """Clues that are told; more are counted."""
+_RECORD_MORE = "no size of it would have shown: record more conditions, slower and faster, each twice"
 
 
 def tell(found: Found, account: Account[Any, Any]) -> Diagnosis:
@@ -44,14 +45,15 @@ def tell(found: Found, account: Account[Any, Any]) -> Diagnosis:
     traces, residuals = account.drawings(test, found.seed)
     gains = 1 - after.mean(0) / before.mean(0).clip(1e-300)
     held = heldout_gain(before, after, test.files, account.metric, account.noise_floor(), found.seed)
-    evidence = tuple(_evidence(found, account, name) for name in _names(found, account))
+    detectable = account.minimum_detectable()
+    evidence = tuple(_evidence(found, account, name, detectable) for name in _names(found, account))
     verdict = Verdict(
         _status(bool(causes), bool(ambiguous), alarmed),
         causes,
         ambiguous,
         _unknown(found.alarms, test.channels),
         held if found.locked else None,
-        account.minimum_detectable(),
+        detectable,
         account.next_experiment(found.rivals, found.alarms),
         not_tested=not_tested(evidence),
         models_saw_locked=found.refitted,
@@ -116,7 +118,9 @@ def _names(found: Found, account: Account[Any, Any]) -> tuple[str, ...]:
     return tuple(dict.fromkeys((*account.causes(), *found.selection.examined)))
 
 
-def _evidence(found: Found, account: Account[Any, Any], name: str) -> Evidence:
+def _evidence(
+    found: Found, account: Account[Any, Any], name: str, detectable: Mapping[str, float]
+) -> Evidence:
     """About one name."""
     selection = found.selection
     clues = {item.cause: item.candidate.clue for item in selection.first_round}
@@ -126,6 +130,8 @@ def _evidence(found: Found, account: Account[Any, Any], name: str) -> Evidence:
     if name in selection.causes():
         p_adjusted = selection.p_value(name)
     decision, reason = _decision(found, account, name, seen)
+    if decision == "rejected" and name in account.causes() and name not in {*detectable, *_refused(found)}:
+        decision, reason = "not identifiable", account.not_identifiable(name) or _RECORD_MORE
     if decision == "not identifiable":
         return Evidence(label, None, None, None, decision, reason)
     observed = selection.observed(name) or seen.observed
@@ -139,14 +145,15 @@ def _decision(found: Found, account: Account[Any, Any], name: str, seen: Examine
         return _accepted(found, name, account.caveat(name, accepted[name]))
     if name in ties:
         return "tie", f"explains {ties[name].cause}{_where(found, ties[name].channels)} as well"
-    if refused := [item.gain for item in found.refused if item.cause == name]:
-        text = f"predicts worse than the baseline on trials left out (gain {min(refused):.2f})"
+    if name in (refused := _refused(found)):
+        text = f"predicts worse than the baseline on trials left out (gain {refused[name]:.2f})"
         return "rejected", text
-    why, tried = account.not_identifiable(name), name in found.selection.examined
-    # A score test asks about everything; elsewhere, what was not tried could not be seen.
-    if why or not (tried or found.selection.problem.screens):
-        return "not identifiable", why
     return "rejected", _why_rejected(found, seen)
+
+
+def _refused(found: Found) -> dict[str, float]:
+    """Names that were taken back, with their least gain on locked trials."""
+    return {item.cause: item.gain for item in sorted(found.refused, key=lambda item: -item.gain)}
 
 
 def _accepted(found: Found, name: str, caveat: str) -> tuple[str, str]:

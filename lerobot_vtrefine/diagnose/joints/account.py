@@ -69,10 +69,8 @@ class JointAccount:
         )
 
     def not_identifiable(self, cause: str) -> str:
-        """Why no joint can show it."""
-        tried = [item.candidate for item in self.selection.first_round if item.cause == cause]
-        hidden = self.selection.problem.shared_encoders and all(item.in_shared_encoders for item in tried)
-        return NOT_SHOWN.get(cause, "") if hidden or not tried else ""
+        """What to record where no joint shows it."""
+        return "" if cause in self.detectable else NOT_SHOWN[cause]
 
     def next_experiment(
         self, rivals: Sequence[Rival[Fit, Candidate]], alarms: Sequence[Alarm]

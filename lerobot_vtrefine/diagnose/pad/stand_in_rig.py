@@ -1,4 +1,4 @@
-"""A rig that presses the pad of a stand-in reality: recordings as a user would make them, in contract format.
+"""A rig that presses the pad of a stand-in reality: recordings as users make them, in the public format.
 
 A sphere and a square punch press, hold, let go in part and slide over the whole pad at several speeds, each
 motion twice. The readings come from the reality's sensor model, run on a finer clock than the recorded

@@ -1,4 +1,4 @@
-"""Causes between the indenter and the electrodes: the first form of each is the contract's, no other is."""
+"""Causes between the indenter and the electrodes: each one's first form is the catalogue's plain one."""
 
 import numpy as np
 from scipy.signal import lfilter
@@ -55,7 +55,7 @@ def tilt_wobble(pad: Pad, size: float, rng: Draw) -> Effect:
 
 def power(pad: Pad, size: float, rng: Draw) -> Effect:
     p, ref = 1 + 0.15 * size, pad.soft_m
-    # In the contract's form the reference depth is 1 mm; here the scale is part of the stiffness.
+    # In the catalogue's form the reference depth is 1 mm; here the scale is part of the stiffness.
     return Effect(
         "nonlinear_stiffness", "power", "law", lambda s, d: pad.k_n * ref * (d / ref) ** p, {"exponent": p}
     )

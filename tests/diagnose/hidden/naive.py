@@ -1,8 +1,8 @@
 """What a hurried analyst would do: every parameter free at once, or terms added while BIC falls.
 
 Both see the recording set's files only, hold the usual likelihood (frames independent, noise white), and know
-the contract's causes in the contract's own forms. They are fair in what they can express, not in how they
-decide: that is the point of printing them beside the engine.
+the causes of docs/verdict.md in the catalogue's plain forms. They are fair in what they can express, not in
+how they decide: that is the point of printing them beside the engine.
 """
 
 import json
@@ -200,7 +200,7 @@ def fit(bench: Bench, terms: tuple[str, ...], start: Fit | None = None) -> Fit:
 
 
 def verdict_of(names: list[str]) -> dict:
-    """A naive answer in the shape of the contract's verdict."""
+    """A naive answer in the shape of verdict.json."""
     causes = [
         {"name": n, "role": "cause", "params": {}, "p_value": None, "heldout_gain": None} for n in names
     ]

@@ -1,4 +1,4 @@
-"""Effects that the contract's list does not contain: a verdict must say that it does not know them."""
+"""Effects that docs/verdict.md does not list: a verdict must say that it does not know them."""
 
 import numpy as np
 

@@ -7,7 +7,7 @@ import numpy as np
 
 @dataclass(frozen=True)
 class Indenter:
-    """Shape of the contract's `object`; lengths in metres."""
+    """Shape of recording.json's `object`; lengths in metres."""
 
     shape: str
     radius_m: float = 0.0

@@ -6,7 +6,7 @@ from lerobot_vtrefine.diagnose.joints.parameters import INDEX
 from lerobot_vtrefine.diagnose.verdict import Parameter
 
 METHOD = MethodError(0.005, 0.2)
-NOT_SHOWN = "no joint moves"
+NOT_SHOWN = "move every joint to and fro, over more than its encoder's steps"
 _SHAPE_LEAD = 0.02
 """By how much play that is taken up little by little must beat sharp play."""
 _ROUNDING_VAGUE = 0.08

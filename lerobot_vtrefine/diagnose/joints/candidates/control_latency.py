@@ -8,7 +8,7 @@ from lerobot_vtrefine.diagnose.joints.estimates import Estimates, MethodError, w
 from lerobot_vtrefine.diagnose.verdict import Parameter
 
 METHOD = MethodError(0.01, 0.0)
-NOT_SHOWN = "no joint moves"
+NOT_SHOWN = "move every joint, at several speeds"
 FORMS = (
     Candidate(
         "control_latency", (), shared=True, possible=lambda problem: np.ones(problem.batch.joints, dtype=bool)

@@ -16,7 +16,10 @@ from lerobot_vtrefine.diagnose.verdict import Parameter
 Array = np.ndarray
 
 METHOD = MethodError(0.012, 0.03)
-NOT_SHOWN = "no joint here is loaded by gravity as far as its name tells"
+NOT_SHOWN = (
+    "no joint here is loaded by gravity as far as its name tells: name joints by what they move (shoulder, "
+    "elbow), and hold the arm in eight postures from hanging to stretched out"
+)
 _LEAD = {gravity.TWO_TERM_FORM: 0.02, gravity.FREE_FORM: 0.05}
 """By how much shapes with more terms must beat those with one."""
 _AS_GOOD = 1.03

@@ -15,7 +15,7 @@ from lerobot_vtrefine.diagnose.verdict import Parameter
 Array = np.ndarray
 
 METHOD = MethodError(0.015, 0.0)
-NOT_SHOWN = "needs the column load on a gripper"
+NOT_SHOWN = "record the column load while a gripper closes on something"
 _PRESSED = 0.15
 """Part of the largest load from which on slack is taken up."""
 _SURELY_STOPPED = 0.1

@@ -12,7 +12,7 @@ from lerobot_vtrefine.diagnose.verdict import Parameter
 from lerobot_vtrefine.embodiments import embodiment_of
 
 METHOD = MethodError(0.012, 0.1)
-NOT_SHOWN = "no joint shows enough for it to matter"
+NOT_SHOWN = "move every joint slowly, with reversals, over more than its encoder's steps"
 _SHAPE_LEAD = 0.02
 """By how much friction that is larger at rest must beat one that is the same throughout."""
 _STICKING_VAGUE = 0.12
