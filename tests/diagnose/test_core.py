@@ -7,7 +7,7 @@ import pytest
 
 from lerobot_vtrefine.diagnose.core.engine import infer
 from lerobot_vtrefine.diagnose.core.heldout import lock
-from lerobot_vtrefine.diagnose.core.problem import NothingBesides, PlainCandidate
+from lerobot_vtrefine.diagnose.core.problem import OptionalSteps, PlainCandidate
 from lerobot_vtrefine.diagnose.core.resampling import folds_of, jackknife, jointly_adjusted, one_sided
 from lerobot_vtrefine.diagnose.core.rivals import Rival, adopt
 from lerobot_vtrefine.diagnose.core.search import ALL
@@ -36,7 +36,7 @@ class Refits:
 
 
 @dataclass(frozen=True)
-class Toy(NothingBesides):
+class Toy(OptionalSteps):
     """y (T, N, J) against x (T, N): the baseline is a line, candidates add columns."""
 
     x: np.ndarray

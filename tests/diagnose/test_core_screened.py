@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from lerobot_vtrefine.diagnose.core.engine import guarded, infer
-from lerobot_vtrefine.diagnose.core.problem import NothingBesides, PlainCandidate, Promise
+from lerobot_vtrefine.diagnose.core.problem import OptionalSteps, PlainCandidate, Promise
 from lerobot_vtrefine.diagnose.core.score_test import Probe, cleared, screen
 from lerobot_vtrefine.diagnose.core.screened_search import ScreenedSearch
 
@@ -47,7 +47,7 @@ class Refits:
 
 
 @dataclass(frozen=True)
-class Toy(NothingBesides):
+class Toy(OptionalSteps):
     """y (T, N) against x (T, N): the baseline is a line, candidates add columns."""
 
     x: np.ndarray

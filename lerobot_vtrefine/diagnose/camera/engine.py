@@ -13,7 +13,7 @@ from lerobot_vtrefine.diagnose.core.diagnosis import Diagnosis
 from lerobot_vtrefine.diagnose.core.engine import Inference, Progress, infer
 from lerobot_vtrefine.diagnose.core.resampling import draws_of
 from lerobot_vtrefine.diagnose.core.rules import SURE
-from lerobot_vtrefine.diagnose.core.telling import tell
+from lerobot_vtrefine.diagnose.core.summary import tell
 from lerobot_vtrefine.diagnose.evidence import ResidualView, Trace
 from lerobot_vtrefine.diagnose.verdict import Parameter
 

@@ -19,7 +19,7 @@ from lerobot_vtrefine.diagnose.camera.registration import (
     errors,
     register,
 )
-from lerobot_vtrefine.diagnose.core.problem import NothingBesides, PlainCandidate
+from lerobot_vtrefine.diagnose.core.problem import OptionalSteps, PlainCandidate
 
 Array = np.ndarray
 
@@ -67,7 +67,7 @@ class Refits:
         return self.problem.mse(theta)[trials][:, self.channels]
 
 
-class CameraProblem(NothingBesides):
+class CameraProblem(OptionalSteps):
     """See `core.problem.Problem`; parts that the twin does not hold are in every image, so that nothing can
     be said about what is left."""
 

@@ -1,4 +1,4 @@
-"""The method: lock, baseline, search, suspicion, rivals, guard. `telling` makes a diagnosis of its result."""
+"""The method: lock, baseline, search, suspicion, rivals, guard. `summary` makes a diagnosis of its result."""
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace

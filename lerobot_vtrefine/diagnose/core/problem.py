@@ -82,8 +82,8 @@ class Reweighted(Protocol):
         """Mean squared errors of some trials on `channels` if every trial counted `weights` (T,) times."""
 
 
-class NothingBesides(Protocol):
-    """What only the instrument knows, between the steps of the method: nothing, unless it says so."""
+class OptionalSteps(Protocol):
+    """Steps that an instrument may add between those of the method; each does nothing by default."""
 
     @property
     def screens(self) -> bool:
@@ -126,7 +126,7 @@ class NothingBesides(Protocol):
         return ()
 
 
-class Problem[F: Fit, C: Candidate](NothingBesides, Protocol):
+class Problem[F: Fit, C: Candidate](OptionalSteps, Protocol):
     """Trials to be explained, and fits to them."""
 
     @property

@@ -2,7 +2,7 @@
 
 from lerobot_vtrefine.diagnose.core.diagnosis import Diagnosis
 from lerobot_vtrefine.diagnose.core.engine import Progress, infer
-from lerobot_vtrefine.diagnose.core.telling import tell
+from lerobot_vtrefine.diagnose.core.summary import tell
 from lerobot_vtrefine.diagnose.joints.account import JointAccount
 from lerobot_vtrefine.diagnose.joints.batch import make_batch
 from lerobot_vtrefine.diagnose.joints.problem import JointProblem

@@ -6,7 +6,7 @@ from typing import Any, Self
 
 import numpy as np
 
-from lerobot_vtrefine.diagnose.core.problem import NothingBesides
+from lerobot_vtrefine.diagnose.core.problem import OptionalSteps
 from lerobot_vtrefine.diagnose.core.rivals import Rival
 from lerobot_vtrefine.diagnose.core.rules import LEAST_GAIN
 from lerobot_vtrefine.diagnose.core.search import Selection
@@ -34,7 +34,7 @@ _ITERATIONS = 12
 
 
 @dataclass(frozen=True)
-class JointProblem(ServoTrials, NothingBesides):
+class JointProblem(ServoTrials, OptionalSteps):
     """See `core.problem.Problem`."""
 
     delay_spread_s: float = 0.0

@@ -5,7 +5,7 @@ from dataclasses import replace
 from lerobot_vtrefine.diagnose.core.diagnosis import Diagnosis
 from lerobot_vtrefine.diagnose.core.engine import Progress, infer
 from lerobot_vtrefine.diagnose.core.heldout import lock
-from lerobot_vtrefine.diagnose.core.telling import tell
+from lerobot_vtrefine.diagnose.core.summary import tell
 from lerobot_vtrefine.diagnose.pad.account import PadAccount
 from lerobot_vtrefine.diagnose.pad.press_trials import prepare, usable
 from lerobot_vtrefine.diagnose.pad.problem import PadProblem

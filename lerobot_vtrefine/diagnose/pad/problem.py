@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 
 from lerobot_vtrefine.diagnose.core.heldout import out_of_fold
-from lerobot_vtrefine.diagnose.core.problem import NothingBesides, PlainCandidate, Promise
+from lerobot_vtrefine.diagnose.core.problem import OptionalSteps, PlainCandidate, Promise
 from lerobot_vtrefine.diagnose.core.rules import LEAST_GAIN
 from lerobot_vtrefine.diagnose.core.score_test import screen
 from lerobot_vtrefine.diagnose.core.screened_search import folds_for
@@ -103,7 +103,7 @@ class Refits:
 
 
 @dataclass(frozen=True)
-class PadProblem(NothingBesides):
+class PadProblem(OptionalSteps):
     """See `core.problem.ScreenedProblem`."""
 
     presses: PressSet

@@ -11,7 +11,7 @@ from typing import Self
 import numpy as np
 
 from lerobot_vtrefine.diagnose.core.engine import infer
-from lerobot_vtrefine.diagnose.core.problem import NothingBesides, PlainCandidate
+from lerobot_vtrefine.diagnose.core.problem import OptionalSteps, PlainCandidate
 from lerobot_vtrefine.diagnose.core.rules import SURE
 from lerobot_vtrefine.diagnose.evidence import Evidence
 from lerobot_vtrefine.diagnose.parts.regression import Blocks, Line, slope_of
@@ -116,7 +116,7 @@ class Refits:
 
 
 @dataclass(frozen=True)
-class PartProblem(NothingBesides):
+class PartProblem(OptionalSteps):
     """See `core.problem.Problem`."""
 
     quantities: tuple[Quantity, ...]

@@ -2,7 +2,7 @@
 
 from lerobot_vtrefine.diagnose.core.diagnosis import Diagnosis
 from lerobot_vtrefine.diagnose.core.engine import Progress, infer
-from lerobot_vtrefine.diagnose.core.telling import tell
+from lerobot_vtrefine.diagnose.core.summary import tell
 from lerobot_vtrefine.diagnose.recordings import RecordingSet
 from lerobot_vtrefine.diagnose.servo.account import ServoAccount
 from lerobot_vtrefine.diagnose.servo.bench import Bench

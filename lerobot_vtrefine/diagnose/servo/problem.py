@@ -5,7 +5,7 @@ from typing import Any, Self
 
 import numpy as np
 
-from lerobot_vtrefine.diagnose.core.problem import NothingBesides
+from lerobot_vtrefine.diagnose.core.problem import OptionalSteps
 from lerobot_vtrefine.diagnose.core.rivals import Rival
 from lerobot_vtrefine.diagnose.core.search import Selection
 from lerobot_vtrefine.diagnose.core.suspicion import Suspicion
@@ -26,7 +26,7 @@ _OF_A_STEP = 0.25
 """Means over many readings tell a quarter of the encoder's step."""
 
 
-class ServoProblem(NothingBesides):
+class ServoProblem(OptionalSteps):
     """See `core.problem.Problem`."""
 
     subject = "servo"
