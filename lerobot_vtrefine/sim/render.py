@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 from PIL import Image
 
-from lerobot_vtrefine.sim.looks import DrawnWorld
+from lerobot_vtrefine.sim.menagerie_meshes import DrawnWorld
 from lerobot_vtrefine.sim.pad_panel import Frame, Progress, pad_panel, panel_size
 from lerobot_vtrefine.sim.task import FAILURES
 

@@ -18,7 +18,7 @@ from lerobot_vtrefine.drivers.picture import FULL_SCALE, colours
 from lerobot_vtrefine.envs.live_world import LiveWorld
 from lerobot_vtrefine.extras import VIEW, require
 from lerobot_vtrefine.observation import VisuoTactileConfig, build_visuo_tactile
-from lerobot_vtrefine.sim.looks import DrawnWorld
+from lerobot_vtrefine.sim.menagerie_meshes import DrawnWorld
 from lerobot_vtrefine.sim.pads import pad_layout
 
 TAXEL_PX, GAP_PX = 5, 8

@@ -21,7 +21,7 @@ from lerobot_vtrefine.envs.live_world import LiveWorld
 from lerobot_vtrefine.envs.vector_env import VtRefineVectorEnv
 from lerobot_vtrefine.sim import render
 from lerobot_vtrefine.sim.config import RandomizationConfig, SceneConfig
-from lerobot_vtrefine.sim.looks import DrawnWorld, dressed, fit_meshes
+from lerobot_vtrefine.sim.menagerie_meshes import DrawnWorld, dressed, fit_meshes
 from lerobot_vtrefine.sim.scene import Scene, build_scene
 from lerobot_vtrefine.sim.simulation import InsertionSim
 
