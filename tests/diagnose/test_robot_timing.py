@@ -6,9 +6,13 @@ import numpy as np
 import pytest
 from robot_rigs import Rig, make_set
 
+from lerobot_vtrefine.diagnose.core.engine import infer
 from lerobot_vtrefine.diagnose.core.resampling import jointly_adjusted
+from lerobot_vtrefine.diagnose.core.search import ALL
+from lerobot_vtrefine.diagnose.joints import timing
 from lerobot_vtrefine.diagnose.joints.batch import make_batch
 from lerobot_vtrefine.diagnose.joints.engine import diagnose_robot
+from lerobot_vtrefine.diagnose.joints.problem import JointProblem
 from lerobot_vtrefine.diagnose.joints.session_trends import trends
 from lerobot_vtrefine.diagnose.recordings import read_recording_set
 
@@ -27,6 +31,19 @@ def test_a_delay_that_changes_with_every_command_is_a_delay(tmp_path) -> None:
     assert low < 0.08 < high
     reasons = [item.reason for item in found.evidence if item.name == "control_latency"]
     assert "changes from command to command" in reasons[0]
+
+
+def test_a_delay_that_is_tried_last_has_a_p_value_for_all_that_was_tried_before_it(
+    tmp_path, monkeypatch
+) -> None:
+    rig = replace(SMALL, rate_hz=30.0, latency_s=0.08, latency_spread=0.5)
+    recordings = read_recording_set(make_set(rig, tmp_path, 0))
+    found = infer(JointProblem.of(recordings.joints, make_batch(recordings.trials))).selection
+    monkeypatch.setattr(timing, "_delayed", lambda selection, seed: (found.fit, found.errors, 1e-4))
+    again = timing.with_changing_delay(replace(found, chosen={}, p_values={}), 0)
+    assert again.chosen[ALL][0].cause == "control_latency"
+    forms = {item.candidate for item in found.first_round}
+    assert 1e-4 * len(forms) <= again.p_values["control_latency", ALL] <= 1e-4 * len(forms) * len(rig.joints)
 
 
 def test_commands_that_never_come_are_no_delay(tmp_path) -> None:

@@ -67,9 +67,13 @@ def with_changing_delay(selection: "Selected", seed: int) -> "Selected":
     delay = next(item for item in CATALOGUE if item.shared)
     if _distinct(problem.batch) < 3:
         return selection
-    fitted, errors, p_value = selection.fit, selection.errors, selection.p_values.get((delay.cause, ALL))
-    if p_value is None:
+    fitted, errors, adjusted = selection.fit, selection.errors, selection.p_values.get((delay.cause, ALL))
+    p_value = adjusted
+    if p_value is None or adjusted is None:
         fitted, errors, p_value = _delayed(selection, seed)
+        # Everything else was asked about before it (Bonferroni).
+        asked = sum(1 if item.candidate.shared else item.gain.size for item in selection.first_round)
+        adjusted = min(1.0, asked * p_value)
     if p_value >= _ALPHA or fitted.point.tau_s <= 0:
         return selection
     lag, tau = common_lag(problem, fitted), fitted.point.tau_s
@@ -82,7 +86,7 @@ def with_changing_delay(selection: "Selected", seed: int) -> "Selected":
         fit=fitted,
         errors=errors,
         chosen={**selection.chosen, ALL: (delay,)},
-        p_values={**selection.p_values, (delay.cause, ALL): p_value},
+        p_values={**selection.p_values, (delay.cause, ALL): adjusted},
     )
 
 
