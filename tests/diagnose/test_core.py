@@ -5,7 +5,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 import pytest
 
-from lerobot_vtrefine.diagnose.core.engine import infer
+from lerobot_vtrefine.diagnose.core.engine import guarded, infer
 from lerobot_vtrefine.diagnose.core.heldout import lock
 from lerobot_vtrefine.diagnose.core.problem import OptionalSteps, PlainCandidate
 from lerobot_vtrefine.diagnose.core.resampling import folds_of, jackknife, jointly_adjusted, one_sided
@@ -177,6 +177,19 @@ def test_a_model_worse_than_the_baseline_on_locked_trials_is_not_handed_out() ->
     # What is significant and yet predicts worse is something else than its name.
     assert [alarm.channel for alarm in found.alarms] == [1]
     assert "worse" in found.alarms[0].clue
+
+
+def test_what_is_shared_goes_where_it_makes_the_whole_error_larger() -> None:
+    problem = toy(effects=(0.3, 0.3), offered=(PlainCandidate("1", shared=True),))
+    selection = infer(problem).selection
+    assert names(infer(problem)) == {ALL: ["1"]}
+    # New trials in which it helps a small error much, and makes a large one larger.
+    rng = np.random.default_rng(3)
+    bent = np.abs(problem.x)[..., None] * np.array([-0.3, 0.3])
+    y = problem.x[..., None] + bent + np.array([2.0, 0.1]) * rng.normal(size=problem.y.shape)
+    kept, refused = guarded(selection, replace(problem, y=y), 0)
+    assert kept.chosen == {}
+    assert [(item.cause, item.channel) for item in refused] == [("1", ALL)]
 
 
 @pytest.mark.parametrize("shared", [False, True])

@@ -125,8 +125,8 @@ def guarded[P: Problem[Any, Any], F: Fit, C: Candidate](
     """No channel's model that predicts worse than the baseline is handed out, whatever chose it.
 
     On each channel where it does, what was accepted last is taken back first. What all channels share is
-    judged by all of them together, each in units of its baseline's error. Where a score test chose, log
-    scores decide what plain errors leave open.
+    judged by all of them together, each in units of its baseline's error, and by their plain sum. Where a
+    score test chose, log scores decide what plain errors leave open.
     """
     before = test.errors(selection.baseline)
     refused = []
@@ -136,10 +136,12 @@ def guarded[P: Problem[Any, Any], F: Fit, C: Candidate](
         for candidate in reversed(selection.chosen.get(channel, ())):
             after = test.errors(selection.fit)
             base, extended = ((errors[:, part] / scale).mean(1) for errors in (before, after))
-            gain = float(1 - extended.mean() / base.mean())
+            pairs = [(base, extended), (before[:, part].mean(1), after[:, part].mean(1))]
+            gains = [float(1 - one.mean() / max(base.mean(), 1e-300)) for base, one in pairs]
+            gain = min(gains)
             if gain >= 0:
                 break
-            surely = gain_interval(base, extended, seed)[1] < 0
+            surely = gain_interval(*pairs[gains.index(gain)], seed)[1] < 0
             if selection.problem.screens and not surely:
                 # Scores found the name, and errors of a few locked trials do not disprove it.
                 return _if_likelier(selection, test), tuple(refused)
