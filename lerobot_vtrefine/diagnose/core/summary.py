@@ -130,12 +130,18 @@ def _evidence(
     if name in selection.causes():
         p_adjusted = selection.p_value(name)
     decision, reason = _decision(found, account, name, seen)
-    if decision == "rejected" and name in account.causes() and name not in {*detectable, *_refused(found)}:
+    showed = name in {*detectable, *_refused(found)} or _superseded(found, seen)
+    if decision == "rejected" and name in account.causes() and not showed:
         decision, reason = "not identifiable", account.not_identifiable(name) or _RECORD_MORE
     if decision == "not identifiable":
         return Evidence(label, None, None, None, decision, reason)
     observed = selection.observed(name) or seen.observed
     return Evidence(label, seen.p_alone, p_adjusted, seen.gain, decision, reason, observed)
+
+
+def _superseded(found: Found, seen: Examined) -> bool:
+    """Whether a name showed alone, before others that were accepted explained the same."""
+    return bool(found.selection.causes()) and seen.p_adjusted is not None and seen.p_adjusted < ALPHA
 
 
 def _decision(found: Found, account: Account[Any, Any], name: str, seen: Examined) -> tuple[str, str]:
