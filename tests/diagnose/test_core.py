@@ -9,7 +9,7 @@ from lerobot_vtrefine.diagnose.core.engine import guarded, infer
 from lerobot_vtrefine.diagnose.core.heldout import lock
 from lerobot_vtrefine.diagnose.core.problem import OptionalSteps, PlainCandidate
 from lerobot_vtrefine.diagnose.core.resampling import folds_of, jackknife, jointly_adjusted, one_sided
-from lerobot_vtrefine.diagnose.core.rivals import Rival, adopt
+from lerobot_vtrefine.diagnose.core.rivals import Rival, adopt, if_tied
 from lerobot_vtrefine.diagnose.core.search import ALL
 from lerobot_vtrefine.diagnose.core.suspicion import Suspicion, raise_alarms
 
@@ -202,6 +202,22 @@ def test_a_rival_that_is_adopted_has_the_p_value_of_what_it_replaces(shared: boo
     assert found.p_values == {("2", ALL if shared else 1): known}
     back = Rival("2", PlainCandidate("1"), (1,), shared, 0.5, selection.fit, selection.errors)
     assert adopt(found, back).p_values == {("1", 1): known}
+
+
+def test_a_tie_ends_where_the_gain_falls_short_surely() -> None:
+    """Not where a trial or two that count most make it short."""
+    selection = infer(toy(effects=(0.0, 0.3))).selection
+    without, now = np.ones((9, 1)), np.full((9, 1), 0.3)
+    by_accident = now + np.where(np.arange(9) % 2, 0.01, -0.01)[:, None]
+    by_accident[0] += 1.0
+    # Five trials count and all say so; what the small ones say in parts of their errors is the contrary.
+    surely = now + np.array([0.2] * 5 + [0.0] * 4)[:, None]
+    now_small, small = (
+        np.where(np.arange(9)[:, None] < 5, errors, tiny) for errors, tiny in ((now, 0.01), (surely, 0.001))
+    )
+    for errors, other, tied in ((now, by_accident, True), (now_small, small, False)):
+        rival = Rival("1", PlainCandidate("2"), (0,), False, 0.0, selection.fit, other)
+        assert bool(if_tied(rival, errors, without, seed=0)) is tied
 
 
 def test_the_guard_leaves_other_channels_alone() -> None:

@@ -273,8 +273,7 @@ def test_a_real_servo_lacks_friction_that_grows_with_its_load(tmp_path: Path) ->
     data = Path(__file__).parents[1] / "data" / "bam_xl330.npz"
     import_dataset(ImportConfig(data, recording_dir=tmp_path / "set"))
     found = diagnose(tmp_path / "set")
-    assert found.verdict.status in ("explained", "ambiguous")
     assert found.verdict.heldout is not None
     assert found.verdict.heldout.gain > 0.5
-    of_load = {"load_friction", "directional_friction", "load_stiction", "quadratic_friction"}
-    assert {item.name for item in found.verdict.causes} & of_load
+    assert found.verdict.status == "ambiguous", "BAM's M5 and M6 predict alike"
+    assert ["directional_friction", "quadratic_friction"] in map(list, found.verdict.ambiguous_with)

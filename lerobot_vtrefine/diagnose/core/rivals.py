@@ -73,7 +73,7 @@ def _rivals_on[F: Fit, C: Candidate](
         rival = Rival(
             cause, candidates[place], channels, shared or candidates[place].shared, 0.0, best[0], best[1]
         )
-        found += _if_tied(rival, selection.errors, without, seed)
+        found += if_tied(rival, selection.errors, without, seed)
     return found
 
 
@@ -104,9 +104,13 @@ def _swapped[F: Fit, C: Candidate](
     return fitted, cross_validated(problem, fitted, folds, selection.errors, np.array(channels))
 
 
-def _if_tied[F: Fit, C: Candidate](
+def if_tied[F: Fit, C: Candidate](
     rival: Rival[F, C], errors: Array, without: Array, seed: int
 ) -> list[Rival[F, C]]:
+    """The rival with its p-value, where trials do not prefer the cause; else nothing.
+
+    ``errors`` (T, J) are those with the cause, ``without`` those with neither of the two.
+    """
     # What is shared moves all channels; whatever else is compared concerns its own.
     where = np.arange(without.shape[1]) if rival.shared else np.array(rival.channels)
     now, other, none = errors[:, where], rival.errors[:, where], without[:, where]
