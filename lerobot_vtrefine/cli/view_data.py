@@ -142,7 +142,7 @@ def above(counts: np.ndarray, idle: np.ndarray) -> np.ndarray:
 
 def pad_picture(counts: np.ndarray, idle: np.ndarray, layout: PadLayout) -> np.ndarray:
     """A pad as it is drawn live, RGB (R, C, 3); one that has not the layout's taxels as a single row."""
-    from lerobot_vtrefine.drivers.picture import colours
+    from lerobot_vtrefine.tactile.picture import colours
 
     shape = (layout.rows, layout.cols) if counts.size == layout.num_taxels else (1, counts.size)
     return colours(counts.reshape(shape), idle.reshape(shape))

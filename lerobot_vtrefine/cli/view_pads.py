@@ -25,9 +25,9 @@ from lerobot_vtrefine.drivers.board import PadReader, Status
 from lerobot_vtrefine.drivers.config import PadConfig
 from lerobot_vtrefine.drivers.diagnostic import DiagnosticReader
 from lerobot_vtrefine.drivers.pads_file import check_distinct_ports, load_pads
-from lerobot_vtrefine.drivers.picture import colours
 from lerobot_vtrefine.drivers.ports import PortError
 from lerobot_vtrefine.drivers.serial_reader import RETRY_S
+from lerobot_vtrefine.tactile.picture import colours
 
 DESCRIPTION = "Show FlexiTac pads live, row 0 at the top, column 0 at the left."
 EPILOG = """\

@@ -13,8 +13,8 @@ import numpy as np
 
 from lerobot_vtrefine.datasets.features import BASELINE, CAMERA_PREFIX, OBS_PREFIX, TACTILE, TACTILE_AGE
 from lerobot_vtrefine.drivers.config import PadConfig
-from lerobot_vtrefine.drivers.picture import colours
 from lerobot_vtrefine.lerobot_compat.guard import is_supported
+from lerobot_vtrefine.tactile.picture import colours
 
 logger = logging.getLogger(__name__)
 

@@ -2,21 +2,21 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from functools import cache
 
 import numpy as np
 from numpy.typing import NDArray
 from PIL import Image, ImageDraw
 
 from lerobot_vtrefine.tactile.layout import PadLayout
+from lerobot_vtrefine.tactile.picture import FULL_SCALE, colours
 
 Frame = NDArray[np.uint8]
 
-FULL_SCALE_COUNTS = 160  # counts above the idle level that get the brightest colour
 _TAXEL_PX = 6
 _TEXT_PX = 14
 _GAP_PX = 6
 _TEXT_WIDTH_PX = 160
+_SCALE_TAXELS = 12
 _BACKGROUND = (24, 26, 32)
 _INK = (226, 228, 232)
 _GOOD, _BAD, _FAINT = (96, 214, 132), (240, 110, 96), (78, 82, 92)
@@ -43,14 +43,15 @@ class Progress:
 
 def panel_size(names: Sequence[str], layout: PadLayout) -> tuple[int, int]:
     """Return (height, width) in pixels of the panel for pads of these names and this layout."""
-    height = len(names) * (layout.rows * _TAXEL_PX + _TEXT_PX + _GAP_PX) + 2 * _TEXT_PX + _GAP_PX
+    height = len(names) * (layout.rows * _TAXEL_PX + _TEXT_PX + _GAP_PX) + 3 * _TEXT_PX + _GAP_PX
     return height, max(layout.cols * _TAXEL_PX, _TEXT_WIDTH_PX) + 2 * _GAP_PX
 
 
 def pad_panel(
     counts: NDArray, baseline: NDArray, names: Sequence[str], layout: PadLayout, progress: Progress
 ) -> Frame:
-    """Draw `counts` - `baseline`, both (pads, taxels) uint8, below each other, with the progress above.
+    """Draw `counts` above `baseline`, both (pads, taxels) uint8, below each other; above them the progress,
+    below them what the colours mean.
 
     Row 0 of a pad is drawn at the top and column 0, the fingertip, on the left. Returns uint8 (H, W, 3).
     """
@@ -60,12 +61,12 @@ def pad_panel(
     _draw_progress(draw, width, progress)
     top = 2 * _TEXT_PX + _GAP_PX
     for name, reading, idle in zip(names, counts, baseline, strict=True):
-        above = np.clip(reading.astype(float) - idle, 0, None)
-        draw.text((_GAP_PX, top), f"{_label(name)}   sum {above.sum():.0f}", fill=_INK)
-        image.paste(
-            Image.fromarray(_heat_map(above.reshape(layout.rows, layout.cols))), (_GAP_PX, top + _TEXT_PX)
-        )
+        total = np.clip(reading.astype(float) - idle, 0, None).sum()
+        draw.text((_GAP_PX, top), f"{_label(name)}   sum {total:.0f}", fill=_INK)
+        picture = colours(*(value.reshape(layout.rows, layout.cols) for value in (reading, idle)))
+        image.paste(_enlarged(picture), (_GAP_PX, top + _TEXT_PX))
         top += layout.rows * _TAXEL_PX + _TEXT_PX + _GAP_PX
+    _draw_scale(image, draw, top)
     return np.asarray(image)
 
 
@@ -88,14 +89,12 @@ def _draw_progress(draw: ImageDraw.ImageDraw, width: int, progress: Progress) ->
         draw.arc(ring, -90, -90 + 360 * progress.held, fill=colour, width=_RING_PX)
 
 
-def _heat_map(above: NDArray) -> Frame:
-    level = np.clip(above / FULL_SCALE_COUNTS, 0, 1) ** 0.5  # light touch must be visible too
-    colours = _viridis()[(255 * level).astype(np.uint8)]
-    return colours.repeat(_TAXEL_PX, axis=0).repeat(_TAXEL_PX, axis=1)
+def _draw_scale(image: Image.Image, draw: ImageDraw.ImageDraw, top: int) -> None:
+    """The colours from none to the brightest, and its counts."""
+    counts = np.linspace(0, FULL_SCALE, _SCALE_TAXELS).astype(np.uint8)[None]
+    image.paste(_enlarged(colours(counts, np.zeros_like(counts))), (_GAP_PX, top + _TAXEL_PX // 2))
+    draw.text((2 * _GAP_PX + _SCALE_TAXELS * _TAXEL_PX, top), f"{FULL_SCALE:.0f} counts", fill=_INK)
 
 
-@cache
-def _viridis() -> Frame:
-    from matplotlib import colormaps  # slow to import, needed for videos only
-
-    return (255 * colormaps["viridis"](np.linspace(0, 1, 256))[:, :3]).astype(np.uint8)
+def _enlarged(picture: Frame) -> Image.Image:
+    return Image.fromarray(picture.repeat(_TAXEL_PX, axis=0).repeat(_TAXEL_PX, axis=1))

@@ -14,12 +14,12 @@ from typing import Any
 import numpy as np
 import torch
 
-from lerobot_vtrefine.drivers.picture import FULL_SCALE, colours
 from lerobot_vtrefine.envs.live_world import LiveWorld
 from lerobot_vtrefine.extras import VIEW, require
 from lerobot_vtrefine.observation import VisuoTactileConfig, build_visuo_tactile
 from lerobot_vtrefine.sim.menagerie_meshes import DrawnWorld
 from lerobot_vtrefine.sim.pads import pad_layout
+from lerobot_vtrefine.tactile.picture import FULL_SCALE, colours
 
 TAXEL_PX, GAP_PX = 5, 8
 MOST_PICTURES_HZ = 20.0

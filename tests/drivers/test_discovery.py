@@ -24,9 +24,9 @@ from lerobot_vtrefine.drivers.config import PadConfig
 from lerobot_vtrefine.drivers.discovery import open_board, probe_port, wait_for_press
 from lerobot_vtrefine.drivers.frames import FrameShape
 from lerobot_vtrefine.drivers.pads_file import load_pads, save_pads
-from lerobot_vtrefine.drivers.picture import colours
 from lerobot_vtrefine.drivers.ports import PortError
 from lerobot_vtrefine.drivers.sources import contact_source, noise_source
+from lerobot_vtrefine.tactile.picture import colours
 
 
 class Operator(io.StringIO):
