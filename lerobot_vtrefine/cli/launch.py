@@ -4,6 +4,7 @@ import importlib
 import sys
 import textwrap
 from collections.abc import Callable
+from difflib import get_close_matches
 from functools import partial
 
 from lerobot_vtrefine.cli.arguments import with_brackets
@@ -57,11 +58,21 @@ replay = entry_point("replay", "lerobot_vtrefine.cli.replay", "ReplayConfig")
 
 
 def group_help(module: str, config: str, group: str) -> list[str]:
-    """The flags below a group such as ``env.scene``; nothing where there is no such group."""
+    """The flags below a group such as ``env.scene``; nothing for what is no group's name.
+
+    Raises: ValueError for a name below a group that is not there.
+    """
     every = flags_of(module, config, nested=True)
     prefix = f"{group.removesuffix('.*')}."
     below = [flag for flag in every if flag.name.startswith(prefix) and flag.group is None]
-    return [f"flags of --{prefix[:-1]}:", *(line for flag in below for line in _lines(flag))] if below else []
+    if below:
+        return [f"flags of --{prefix[:-1]}:", *(line for flag in below for line in _lines(flag))]
+    groups = {flag.name.rpartition(".")[0] for flag in every} - {""}
+    known = groups | {flag.name for flag in every}
+    if "=" in group or group in known or group.partition(".")[0] not in groups:
+        return []
+    close = "".join(f"; did you mean {name}?" for name in get_close_matches(group, groups, 1))
+    raise ValueError(f"--help {group}: there is no such group of flags{close}; --help alone names them")
 
 
 def help_text(command: str, module: str, config: str) -> str:

@@ -195,6 +195,15 @@ def test_help_goes_as_deep_as_one_asks(monkeypatch, capsys) -> None:
     assert "--agent" not in shown
 
 
+def test_help_on_a_group_that_is_not_there_names_the_one_that_was_meant(monkeypatch, capsys) -> None:
+    monkeypatch.setattr(sys, "argv", ["command", "--help", "env.sceen"])
+    assert launch.play() != 0
+    assert (
+        "--help env.sceen: there is no such group of flags; did you mean env.scene?"
+        in capsys.readouterr().err
+    )
+
+
 def test_help_is_text_without_markup(monkeypatch, capsys: pytest.CaptureFixture[str]) -> None:
     monkeypatch.setattr(sys, "argv", ["vtrefine-record-demos", "--help"])
     assert launch.record_demos() == 0
