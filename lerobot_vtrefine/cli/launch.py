@@ -49,6 +49,7 @@ def entry_point(command: str, module: str, config: str) -> Callable[[], int]:
 
 demo = entry_point("demo", "lerobot_vtrefine.cli.pipeline.demo_config", "DemoConfig")
 record_demos = entry_point("record_demos", "lerobot_vtrefine.cli.record_demos", "RecordDemosConfig")
+record_starts = entry_point("record_starts", "lerobot_vtrefine.cli.record_starts", "RecordStartsConfig")
 finetune = entry_point("finetune", "lerobot_vtrefine.finetune.pipeline", "FinetunePipelineConfig")
 information = entry_point("information", "lerobot_vtrefine.cli.information", "InformationConfig")
 play = entry_point("play", "lerobot_vtrefine.cli.play", "PlayConfig")

@@ -59,6 +59,9 @@ class VtRefineEnvConfig(EnvConfig):
     """Diametral clearance of procedural pairs [m]."""
     start: str | None = None
     """table (both parts stand on the table) or grasped (both are in hand)."""
+    start_bank: Path | None = None
+    """File of vtrefine-record-starts: episodes start where it has both parts in the hands, with the time that
+    is left from the table."""
     mesh_dir: Path | None = None
     """Folder of meshes for automate/ID."""
     episode_steps: int | None = None

@@ -49,6 +49,7 @@ class Episodes:
         colour: Colour images (m, H, W, 3) uint8 of environments (m,), for frames that hold them.
         on_device: Whether frames hold what the simulation's device has as tensors there, for callers who
             compute there, and not as arrays of the host.
+        start: What starts environments (m,) from seeds (m,) in place of the simulation's reset.
     """
 
     def __init__(
@@ -58,6 +59,7 @@ class Episodes:
         log: EpisodeLog | None = None,
         colour: Callable[[Array], Array] | None = None,
         on_device: bool = False,
+        start: Callable[[Array, Array], None] | None = None,
     ) -> None:
         self.sim = sim
         self.num_envs = sim.num_envs
@@ -68,6 +70,7 @@ class Episodes:
         self.done = np.ones(self.num_envs, bool)
         self.raw: Raw = {}
         self.metrics: dict[str, Array] = {}
+        self._start = start or sim.reset
         self._observe = sim.observe_tensors if on_device else sim.observe
         self._ablate = ablate
         self._log = log
@@ -83,13 +86,17 @@ class Episodes:
         """Start new episodes in ``ids`` (m,) from ``seeds`` (m,) and read their first frames."""
         if len(ids) == 0:
             return
-        self.sim.reset(ids, seeds)
+        self._start(ids, seeds)
         self.seeds[ids] = seeds
         self.steps[ids] = 0
         self.done[ids] = False
         for flag in (self.terminated, self.truncated, self.success):
             flag[ids] = False
         self.read(ids)
+
+    def leave(self, ids: Array) -> None:
+        """End the episodes of ``ids`` (m,) where they are: neither a success nor a failure."""
+        self.done[ids] = True
 
     def step(self, actions: Array, reads: bool = True) -> ControlStep:
         """One control step of the unfinished environments.

@@ -1,6 +1,7 @@
 """From the configuration to a running simulation and its episodes; the simulator is imported on first use."""
 
 from collections.abc import Callable
+from functools import partial
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -9,7 +10,8 @@ from lerobot_vtrefine.embodiments import menagerie_file
 from lerobot_vtrefine.envs.ablation import make_ablation
 from lerobot_vtrefine.envs.config import VtRefineEnvConfig
 from lerobot_vtrefine.envs.episode_log import EpisodeLog
-from lerobot_vtrefine.envs.episodes import Ablation, Episodes
+from lerobot_vtrefine.envs.episodes import Ablation, Array, Episodes
+from lerobot_vtrefine.envs.start_bank import StartBank
 
 if TYPE_CHECKING:
     from lerobot_vtrefine.sim.simulation import InsertionSim
@@ -45,7 +47,8 @@ def make_simulation(config: VtRefineEnvConfig, num_envs: int) -> "InsertionSim":
 def make_episodes(config: VtRefineEnvConfig, num_envs: int) -> Episodes:
     """The simulation with ablation, metrics log and colour camera as configured."""
     sim = make_simulation(config, num_envs)
-    return Episodes(sim, _ablation(config), _log(config), _colour_camera(config, sim))
+    colour = _colour_camera(config, sim)
+    return Episodes(sim, _ablation(config), _log(config), colour, start=_start(config, sim))
 
 
 def make_episodes_on_device(config: VtRefineEnvConfig, num_envs: int) -> Episodes:
@@ -55,7 +58,7 @@ def make_episodes_on_device(config: VtRefineEnvConfig, num_envs: int) -> Episode
     """
     ablation = _ablation(config)
     sim = make_simulation(config, num_envs)
-    return Episodes(sim, ablation, _log(config), on_device=ablation is None)
+    return Episodes(sim, ablation, _log(config), on_device=ablation is None, start=_start(config, sim))
 
 
 def _ablation(config: VtRefineEnvConfig) -> Ablation | None:
@@ -64,6 +67,12 @@ def _ablation(config: VtRefineEnvConfig) -> Ablation | None:
 
 def _log(config: VtRefineEnvConfig) -> EpisodeLog | None:
     return EpisodeLog(config.metrics_path) if config.metrics_path is not None else None
+
+
+def _start(config: VtRefineEnvConfig, sim: "InsertionSim") -> Callable[[Array, Array], None] | None:
+    if config.start_bank is None:
+        return None
+    return partial(StartBank.load(config.start_bank, config).start, sim)
 
 
 def _colour_camera(

@@ -12,12 +12,18 @@ from lerobot_vtrefine.files import read_json
 from lerobot_vtrefine.folders import write_in_place
 
 
+def fingerprint(path: Path) -> str:
+    """Of a file's content."""
+    return hashlib.sha256(path.read_bytes()).hexdigest()
+
+
 def simulation_settings(env: VtRefineEnvConfig) -> dict[str, Any]:
-    """What decides how an episode comes out beside its seed (JSON values); of a reality's hidden physics only
-    a fingerprint.
+    """What decides how an episode comes out beside its seed (JSON values); of a reality's hidden physics and
+    of a bank's states only a fingerprint.
     """
     known = replace(env, reality=None)
-    hidden = {} if env.reality is None else {"reality": hashlib.sha256(env.reality.read_bytes()).hexdigest()}
+    files = {"reality": env.reality, "start_bank": env.start_bank}
+    hidden = {name: fingerprint(path) for name, path in files.items() if path is not None}
     colour = {} if env.colour_size is None else {"colour": list(env.colour_size)}
     return (
         hidden

@@ -132,12 +132,13 @@ def start_path(cfg: FinetunePipelineConfig) -> tuple[Path, Path | None]:
     return cfg.start, None
 
 
-def load_policy(path: Path) -> VtDp3Policy:
-    """Load a ``vt_dp3`` checkpoint, with ``--policy.*`` overrides from the command line.
+def load_policy(path: Path, overrides: list[str] | None = None) -> VtDp3Policy:
+    """Load a ``vt_dp3`` checkpoint with these flags, by default the command line's ``--policy.*``.
 
     Raises: ValueError for a checkpoint of another policy type, FileNotFoundError where there is none.
     """
-    overrides = parser.get_yaml_overrides("policy") + (parser.get_cli_overrides("policy") or [])
+    if overrides is None:
+        overrides = parser.get_yaml_overrides("policy") + (parser.get_cli_overrides("policy") or [])
     try:
         config = PreTrainedConfig.from_pretrained(path, cli_overrides=overrides)
     except (OSError, ValueError) as error:  # what the Hub says of a folder that is not there is no help

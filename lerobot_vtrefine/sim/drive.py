@@ -41,8 +41,8 @@ class Drive:
         """What world `env` remembers."""
         return None
 
-    def set_state(self, env: int, state: Any) -> None:
-        """Continue from a state taken by `get_state`."""
+    def set_state(self, env: int | Array, state: Any) -> None:
+        """Continue from a state taken by `get_state`; of several worlds (m,), values are (m, ...)."""
 
 
 class FaultyDrive(Drive):
@@ -104,7 +104,7 @@ class FaultyDrive(Drive):
         return self._history[env].copy(), self._servo[env].copy()
 
     @override
-    def set_state(self, env: int, state: Any) -> None:
+    def set_state(self, env: int | Array, state: Any) -> None:
         self._history[env], self._servo[env] = state
 
 

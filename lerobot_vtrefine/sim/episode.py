@@ -42,6 +42,8 @@ class EpisodeState:
     """(N, part) control steps for which a lifted part has not been held."""
     grasped: Array
     """(N, part) whether `reference` holds."""
+    lifted: Array
+    """(N, part) whether the part is well above the height at which it rests."""
     reference: Array
     """(N, part, 2, 3) grip points in the hand's frame at the grasp."""
     shift: Array
@@ -85,6 +87,7 @@ class EpisodeState:
             "held_steps": ((n, 2), np.int64),
             "unheld_steps": ((n, 2), np.int64),
             "grasped": ((n, 2), bool),
+            "lifted": ((n, 2), bool),
             "reference": ((n, 2, 2, 3), float),
             "shift": ((n, 2), float),
             "largest_shift": ((n, 2), float),
@@ -124,12 +127,24 @@ class EpisodeState:
         """(N,) for how long each plug has been seen seated at every control step; NaN where it is not."""
         return np.where(self.hold_steps > 0, (self.hold_steps - 1) * dt_s, np.nan)
 
+    def metrics(self, ids: Array, dt_s: float) -> dict[str, Array]:
+        """How the episodes of worlds `ids` went so far, (m,) each; no success has time NaN."""
+        steps = np.where(self.success[ids], self.success_step[ids], np.nan)
+        return {
+            "success": self.success[ids],
+            "failure": self.failure[ids],
+            "in_hand_shift_m": self.largest_shift[ids].max(1),
+            "rim_slide_m": self.rim_slide[ids],
+            "peak_force_n": self.peak_force[ids],
+            "time_to_success_s": steps * dt_s,
+        }
+
     def row(self, env: int) -> dict[str, Array]:
         """A copy of one world's row."""
         return {item.name: getattr(self, item.name)[env].copy() for item in fields(self)}
 
-    def set_row(self, env: int, row: dict[str, Array]) -> None:
-        """Write back a row taken by `row`."""
+    def set_row(self, env: int | Array, row: dict[str, Array]) -> None:
+        """Write back a row taken by `row`; of several worlds (m,), rows (m, ...)."""
         for name, value in row.items():
             getattr(self, name)[env] = value
 
@@ -201,7 +216,7 @@ def _update_grasp(state: EpisodeState, ids: Array, seen: Measured, scene: Scene,
     From then on the shift counts, also while the part is being lifted: starts in hand begin with a reference.
     """
     held = task.held_parts(scene.holders, scene.embodiment.num_arms, state.pad_force[ids])
-    lifted = seen.part_heights > LIFT_M
+    state.lifted[ids] = lifted = seen.part_heights > LIFT_M
     state.held_steps[ids] = np.where(held, state.held_steps[ids] + 1, 0)
     state.unheld_steps[ids] = np.where(held | ~lifted, 0, state.unheld_steps[ids] + 1)
     grasped = state.grasped[ids]

@@ -35,7 +35,7 @@ LEFT, RIGHT = 0, 1
 
 
 class Phase(IntEnum):
-    """What the expert does; start=grasped begins with ALIGN."""
+    """What the expert does; start=grasped begins with ALIGN, parts that have been picked up with LIFT."""
 
     REACH = 0
     APPROACH = 1
@@ -165,8 +165,12 @@ class ScriptedExpert:
             self._press_m[ids] = np.minimum(gentle, PRESS_M)
         self._servos.reset(ids, view.q, self._sim.command_targets(ids))
         self._wanted.assign(ids, view.hands)
-        self._opening[ids] = self._robot.fingers.travel_m if self._from_table else self._grip_m
-        self._enter(ids, Phase.REACH if self._from_table else Phase.ALIGN, view)
+        held = self._sim.in_hand[ids] | (not self._from_table)
+        self._opening[ids] = np.where(held[:, None], self._grip_m, self._robot.fingers.travel_m)
+        if not held.all():
+            self._enter(ids[~held], Phase.REACH, view[~held])
+        if held.any():
+            self._enter(ids[held], Phase.LIFT if self._from_table else Phase.ALIGN, view[held])
 
     def act(self, ids: Ids) -> Array:
         """Return absolute joint targets (m, J) for the next control step of environments `ids` (m,)."""

@@ -103,10 +103,10 @@ class Pads:
         state = {"sensors": self.sensors.get_state(env), "last": self._last[env].clone()}
         return state if self._shear is None else {**state, "shear": self._shear.get_state(env)}
 
-    def set_state(self, env: int, state: dict[str, Any]) -> None:
-        """Continue from a state taken by `get_state`."""
+    def set_state(self, env: int | Array, state: dict[str, Any]) -> None:
+        """Continue from a state taken by `get_state`; of several worlds (m,), values are (m, ...)."""
         self.sensors.set_state(env, state["sensors"])
-        self._last[env] = state["last"]
+        self._last[env] = torch.as_tensor(state["last"], device=self._last.device)
         if self._shear is not None:
             self._shear.set_state(env, state["shear"])
 

@@ -147,6 +147,12 @@ class InsertionSim:
         return self._episode.seated_s(self.config.control_dt_s)
 
     @property
+    def in_hand(self) -> Array:
+        """(N,) whether all parts that hands are to take are grasped, and lifted off what they stood on."""
+        taken = [arm is not None for arm in self.scene.holders]
+        return (self._episode.grasped & self._episode.lifted)[:, taken].all(1)
+
+    @property
     def camera_intrinsics(self) -> Array:
         """(4,) float32 fx, fy, cx, cy [pixels]."""
         return self.scene.camera.intrinsics
@@ -304,17 +310,8 @@ class InsertionSim:
     def metrics(self, ids: Array | None = None) -> dict[str, Array]:
         """How the episodes went so far, (m,) each; `failure` indexes `FAILURES`, no success has time NaN."""
         ids = self._checked(ids)
-        state = self._episode
-        steps = np.where(state.success[ids], state.success_step[ids], np.nan)
-        return {
-            "success": state.success[ids],
-            "failure": state.failure[ids],
-            "in_hand_shift_m": state.largest_shift[ids].max(1),
-            "rim_slide_m": state.rim_slide[ids],
-            "peak_force_n": state.peak_force[ids],
-            "time_to_success_s": steps * self.config.control_dt_s,
-            "depth_m": self.insertion(ids).depth_m,
-        }
+        found = self._episode.metrics(ids, self.config.control_dt_s)
+        return found | {"depth_m": self.insertion(ids).depth_m}
 
     def get_state(self, env: int) -> dict[str, Any]:
         """Everything that world `env`'s future depends on."""
@@ -327,13 +324,17 @@ class InsertionSim:
             "drive": self._drive.get_state(env),
         }
 
-    def set_state(self, env: int, state: dict[str, Any]) -> None:
-        """Continue world `env` from a state taken by `get_state`."""
+    @without_torch_threads
+    def set_state(self, env: int | Array, state: dict[str, Any]) -> None:
+        """Continue world `env` from a state taken by `get_state`; of several worlds (m,), every value of the
+        state is (m, ...).
+        """
+        ids = np.atleast_1d(env)
         values = {name: np.atleast_1d(value) for name, value in state["parameters"].items()}
-        position, rotation = state["camera"]
+        position, rotation = (np.reshape(part, (-1, *part.shape[np.ndim(env) :])) for part in state["camera"])
         self._cache.forget()
-        self._apply(np.array([env]), WorldParameters(values, position[None], rotation[None]))
-        self._backend.set_rows(np.array([env]), state["row"][None])
+        self._apply(ids, WorldParameters(values, position, rotation))
+        self._backend.set_rows(ids, np.reshape(state["row"], (len(ids), -1)))
         self._episode.set_row(env, state["episode"])
         self._pads.set_state(env, state["pads"])
         self._drive.set_state(env, state["drive"])

@@ -129,17 +129,22 @@ class PadSensors:
             **{name: float(values[env]) for name, values in scalars.items()},
         }
 
-    def set_state(self, env: int, state: dict[str, Any]) -> None:
-        """Inverse of `get_state`, for any environment of a `PadSensors` with the same layout and model."""
+    def set_state(self, env: int | np.ndarray, state: dict[str, Any]) -> None:
+        """Inverse of `get_state`, for any environment of a `PadSensors` with the same layout and model; of
+        several environments (m,), values are (m, ...).
+        """
         for name, values in state["stages"].items():
             for key, value in values.items():
-                self._state[name][key][env] = value
+                self._put(self._state[name][key], env, value)
         for (stage, parameter), value in state["parameters"].items():
-            self._own_parameter(f"{stage}.{parameter}")[env] = value
-        self._time_s[env] = state["time_s"]
-        self._stiffness_scale[env] = state["stiffness_scale"]
-        self._gain_scale[env] = state["gain_scale"]
-        self._baseline[env] = state["baseline"]
+            self._put(self._own_parameter(f"{stage}.{parameter}"), env, value)
+        self._put(self._time_s, env, state["time_s"])
+        self._put(self._stiffness_scale, env, state["stiffness_scale"])
+        self._put(self._gain_scale, env, state["gain_scale"])
+        self._put(self._baseline, env, state["baseline"])
+
+    def _put(self, own: torch.Tensor, env: int | np.ndarray, value: Any) -> None:
+        own[env] = torch.as_tensor(value, dtype=own.dtype, device=self.device)
 
     def randomize(
         self,

@@ -150,10 +150,10 @@ class ShearSensors:
         parts = {"strain": self._strain, "force": self._force, "friction": self._friction}
         return {name: part[env].clone() for name, part in parts.items()}
 
-    def set_state(self, env: int, state: dict[str, torch.Tensor]) -> None:
-        """Inverse of `get_state`."""
-        self._strain[env], self._force[env] = state["strain"], state["force"]
-        self._friction[env] = state["friction"]
+    def set_state(self, env: int | ArrayLike, state: dict[str, ArrayLike]) -> None:
+        """Inverse of `get_state`; of several environments (m,), values are (m, ...)."""
+        for name, own in (("strain", self._strain), ("force", self._force), ("friction", self._friction)):
+            own[env] = torch.as_tensor(state[name], device=self._device)
 
     def _index(self, ids: ArrayLike) -> torch.Tensor:
         return torch.as_tensor(ids, dtype=torch.long, device=self._device)
