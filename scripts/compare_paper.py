@@ -8,8 +8,10 @@
 MESHES holds ID_plug.obj and ID_socket.obj. Per pair and seed demonstrations are recorded once, from the
 table. Policies with touch and with vision only learn from them by stock lerobot-train and are fine-tuned by
 DPPO, once more from random weights (one step of imitation); stock lerobot-eval judges each, always from the
-table, on episodes that are the same for all. --tune_start=grasped lets DPPO practise with both parts in hand,
-which takes a fifth of the time, where a pair can be put into the hands.
+table, on episodes that are the same for all. Where DPPO practises is --tune_start: on whole episodes (table);
+from states that the imitation reached with both parts in hand, or the expert where it reaches too few (bank);
+or with parts that are put into the hands (grasped), where a pair can be. Random weights, which never get that
+far, practise on whole episodes in place of a bank.
 
 Every policy becomes rows of results/paper.json, or of results/demonstrations.json, as soon as it is judged.
 The same command again goes on where it was: finished stages are not repeated, nor policies whose rows are
@@ -62,6 +64,8 @@ TASKS = {
     "00581": "automate_00581_stands",
 }
 """Files of configs/env. The shaft of 00581 stays on the table, as the paper's robot leaves it."""
+BANK_SEED_OFFSET = EVAL_SEED_OFFSET + 1_000_000
+"""Past the episodes of an evaluation, which no bank may have seen."""
 NEVER_IN_HAND = ("00446", "00581")
 """Pairs that the hands cannot hold above each other at the start."""
 
@@ -153,15 +157,42 @@ def imitation_stage(options: argparse.Namespace, policy: Trained) -> Stage:
     return Stage(out.name, f"Imitation {policy.name}", command, out, product, needs)
 
 
+def uses_bank(options: argparse.Namespace, policy: Trained) -> bool:
+    """Whether DPPO starts from states of a bank."""
+    return options.tune_start == "bank" and policy.demonstrations > 0
+
+
+def bank_stage(options: argparse.Namespace, policy: Trained) -> Stage:
+    """States with both parts in hand: the imitation's own, then the expert's."""
+    out = options.output_dir / f"starts_{policy.name}"
+    start = options.output_dir / f"imitation_{policy.name}"
+    product = out / "starts.npz"
+    command = (
+        "vtrefine-record-starts",
+        *task_flags(options, policy.pair),
+        f"--env.backend={options.backend}",
+        f"--path={product}",
+        f"--policy.path={checkpoint(start)}",
+        f"--policy.device={options.device}",
+        f"--num_starts={options.starts}",
+        f"--num_envs={options.eval_envs}",
+        f"--seed={policy.seed * SEED_STRIDE + BANK_SEED_OFFSET}",
+        *flags("degradation", default_degradation()),
+    )
+    return Stage(out.name, f"Grasps of {policy.name}", command, out, product, (start.name,))
+
+
 def finetune_stage(options: argparse.Namespace, policy: Trained) -> Stage:
     """DPPO, in a folder from which an interrupted run goes on."""
     out = options.output_dir / f"finetune_{policy.name}"
     grasped = options.tune_start == "grasped" and policy.pair not in NEVER_IN_HAND
     start = options.output_dir / f"imitation_{policy.name}"
+    bank = [bank_stage(options, policy)] if uses_bank(options, policy) else []
     command = (
         "vtrefine-finetune",
         *task_flags(options, policy.pair),
         *(["--env.start=grasped"] if grasped else []),
+        *(f"--env.start_bank={stage.product}" for stage in bank),
         f"--env.backend={options.backend}",
         f"--policy.path={checkpoint(start)}",
         f"--policy.device={options.device}",
@@ -174,7 +205,8 @@ def finetune_stage(options: argparse.Namespace, policy: Trained) -> Stage:
         "--resume=true",
     )
     product = checkpoint(out) / "model.safetensors"
-    return Stage(out.name, f"DPPO {policy.name}", command, out, product, (start.name,), resumable=True)
+    needs = (start.name, *(stage.name for stage in bank))
+    return Stage(out.name, f"DPPO {policy.name}", command, out, product, needs, resumable=True)
 
 
 def dppo_settings(options: argparse.Namespace) -> dict[str, Any]:
@@ -223,6 +255,8 @@ def stages(options: argparse.Namespace, policy: Trained) -> list[Stage]:
     before = [record_stage(options, policy), imitation_stage(options, policy)]
     if policy.demonstrations:
         before.append(evaluation_stage(options, policy, "imitation"))
+    if uses_bank(options, policy):
+        before.append(bank_stage(options, policy))
     return [*before, finetune_stage(options, policy), evaluation_stage(options, policy, "finetune")]
 
 
@@ -302,7 +336,8 @@ def make_parser() -> CommandParser:
     parser.add_argument("--iterations", type=int, default=60, help="of DPPO")
     parser.add_argument("--scratch_iterations", type=int, default=20, help="of DPPO without pre-training")
     parser.add_argument("--worlds", type=int, default=512, help="of DPPO")
-    parser.add_argument("--tune_start", choices=["table", "grasped"], default="table", help="of DPPO")
+    parser.add_argument("--tune_start", choices=["table", "bank", "grasped"], default="table", help="of DPPO")
+    parser.add_argument("--starts", type=int, default=512, help="states in a bank")
     parser.add_argument("--episodes", type=int, default=512, help="of an evaluation")
     parser.add_argument("--eval_envs", type=int, default=512, help="episodes evaluated at once")
     parser.add_argument("--demo_envs", type=int, default=16, help="episodes recorded at once")

@@ -66,9 +66,9 @@ class StartBank:
 
     def save(self, path: Path) -> None:
         """Write the file, whole or not at all."""
+        arrays: dict[str, Any] = {SETTINGS: np.array(json.dumps(self.settings)), SOURCE: self.source}
         with whole_file(path) as part, part.open("wb") as file:
-            named = {SETTINGS: np.array(json.dumps(self.settings)), SOURCE: self.source}
-            np.savez_compressed(file, **named, **self.leaves)
+            np.savez_compressed(file, **arrays, **self.leaves)
 
     def chosen(self, seeds: Array) -> Array:
         """(m,) the state from which each seed (m,) starts: one after the other, so that many seeds use all
@@ -93,20 +93,21 @@ def bank_settings(config: VtRefineEnvConfig) -> dict[str, Any]:
     scene = {key: value for key, value in settings.pop("scene").items() if key != "mesh_dir"}
     for unused in ("task", "start_bank", "colour"):
         settings.pop(unused, None)
-    changed: dict[str, Any] = {"scene": scene, "physics": "warp" if config.backend == "warp" else "mujoco"}
+    physics = "warp" if config.backend == "warp" else "mujoco"
     if (model := Path(config.sensor_model)).is_file():
-        changed["sensor_model"] = fingerprint(model)
-    return json.loads(json.dumps(settings | changed))
+        settings["sensor_model"] = fingerprint(model)
+    return json.loads(json.dumps({"physics": physics, "scene": scene} | settings))
 
 
 def _check_task(path: Path, found: Any, wanted: dict[str, Any]) -> None:
     there, here = (
-        {name: str(value) for name, value in _leaves("", settings)} for settings in (found, wanted)
+        {path[1:].replace("/", "."): str(value) for path, value in _leaves("", settings)}
+        for settings in (found, wanted)
     )
-    for name in sorted(there.keys() | here.keys()):
+    for name in there | here:
         if there.get(name) != here.get(name):
             raise ValueError(
-                f"{path} holds states of another task: {name[1:]} is {there.get(name)} there and"
+                f"{path} holds states of another task: {name} is {there.get(name)} there and"
                 f" {here.get(name)} here; make a bank for this one with vtrefine-record-starts"
             )
 

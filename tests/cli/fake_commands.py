@@ -79,10 +79,16 @@ def evaluate(options: dict[str, str]) -> None:
     Path(options["env.metrics_path"]).write_text("".join(json.dumps(row) + "\n" for row in rows))
 
 
+def record_starts(options: dict[str, str]) -> None:
+    Path(options["path"]).parent.mkdir(parents=True)
+    Path(options["path"]).write_bytes(b"")
+
+
 COMMANDS = {
     "vtrefine-record-demos": record,
     "lerobot-train": write_checkpoint,
     "lerobot-eval": evaluate,
+    "vtrefine-record-starts": record_starts,
     "vtrefine-finetune": finetune,
 }
 

@@ -81,3 +81,28 @@ def test_dppo_may_start_in_hand_where_hands_can_hold_and_is_judged_from_the_tabl
         assert not any("--env.start" in line for line in lines.values())
         assert f"--policy.pretrained_encoder=outputs/{policy.pair}" in lines["imitation"]
         assert f"--config_path=vtrefine:{script.TASKS[policy.pair]}" in lines["eval"]
+
+
+@pytest.mark.usefixtures("fake_commands")
+def test_dppo_may_start_from_a_bank_of_the_imitations_own_grasps(
+    run: Callable[..., str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(script, "MODALITIES", ("visuo_tactile",))
+    told = run("--pairs", "00581", "--tune_start=bank", "--starts=64")
+    assert told.count("Grasps of") == 1  # random weights never get that far
+    bank = tmp_path / "out" / "starts_00581_visuo_tactile_0_30" / "starts.npz"
+    assert bank.is_file()
+    options = parse([*common(tmp_path), "--pairs=00581", "--tune_start=bank", "--starts=64"])
+    for policy in script.chosen(options):
+        stages = script.stages(options, policy)
+        lines = [stage.line for stage in stages]
+        practised = [line for line in lines if "--env.start_bank" in line]
+        if not policy.demonstrations:
+            assert not practised
+            continue
+        assert [line.split()[0] for line in practised] == ["vtrefine-finetune"]
+        assert f"--env.start_bank={bank}" in practised[0]
+        (recorded,) = (line for line in lines if "record-starts" in line)
+        assert "imitation_00581_visuo_tactile_0_30/checkpoints/last" in recorded
+        assert "--num_starts=64" in recorded
+        assert f"starts_{policy.name}" in next(s for s in stages if "finetune" in s.name).needs
