@@ -14,6 +14,7 @@ from lerobot_vtrefine.envs.recording_note import simulation_settings
 from lerobot_vtrefine.envs.single_env import VtRefineEnv
 from lerobot_vtrefine.envs.start_bank import HELD_OUT_BELOW, HELD_OUT_EVERY, StartBank, bank_settings
 from lerobot_vtrefine.envs.vector_env import VtRefineVectorEnv
+from lerobot_vtrefine.finetune.seeds import EVALUATION_SEEDS, TRAINING_SEEDS
 from lerobot_vtrefine.sim.config import CameraConfig, RandomizationConfig, SceneConfig, WarpConfig
 from lerobot_vtrefine.sim.demonstrations import Degradation
 from lerobot_vtrefine.sim.expert import Phase, ScriptedExpert
@@ -208,3 +209,7 @@ def test_parts_that_stand_on_the_table_are_not_in_hand(socket: str):
         held.append((int(expert.phase[0]), bool(sim.in_hand[0])))
     assert not any(held_now for phase, held_now in held if phase <= Phase.CLOSE)
     assert held[-1][1]
+
+
+def test_no_seed_that_training_uses_is_held_out():
+    assert TRAINING_SEEDS == HELD_OUT_BELOW > EVALUATION_SEEDS
