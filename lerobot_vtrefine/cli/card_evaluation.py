@@ -1,5 +1,6 @@
 """What a fine-tuned policy's card reports: one run of ``lerobot-eval`` that anybody can repeat."""
 
+from dataclasses import replace
 from pathlib import Path
 
 from lerobot.utils.constants import CHECKPOINTS_DIR, LAST_CHECKPOINT_LINK, PRETRAINED_MODEL_DIR
@@ -16,7 +17,10 @@ FIRST_SEED = 9_000_000
 
 
 def evaluation_stage(cfg: FinetunePipelineConfig, checkpoint: Path) -> Stage:
-    """``lerobot-eval`` of a run's checkpoint in the environment that it was tuned in, on seeds of its own."""
+    """``lerobot-eval`` of a run's checkpoint in the environment that it was tuned in, on seeds of its own.
+
+    A policy that practised from a bank of states is judged from the table.
+    """
     assert isinstance(cfg.env, VtRefineEnvConfig)
     assert cfg.policy is not None
     output = cfg.output_dir / f"evaluation_{checkpoint.name}"
@@ -24,7 +28,7 @@ def evaluation_stage(cfg: FinetunePipelineConfig, checkpoint: Path) -> Stage:
         "lerobot-eval",
         f"--policy.path={checkpoint / PRETRAINED_MODEL_DIR}",
         f"--policy.device={cfg.policy.device}",
-        *flags("env", {"type": cfg.env.type} | changed_settings(cfg.env)),
+        *flags("env", {"type": cfg.env.type} | changed_settings(replace(cfg.env, start_bank=None))),
         f"--env.metrics_path={output / EPISODES}",
         f"--eval.n_episodes={cfg.eval.n_episodes}",
         f"--eval.batch_size={cfg.eval.batch_size}",

@@ -30,6 +30,7 @@ HELD_OUT_EVERY = 8
 """Every so many states of a bank are held out."""
 SETTINGS, SOURCE = "settings", "source"
 STATE = "state"
+STEPS = f"{STATE}/episode/steps"
 
 
 @dataclass(frozen=True)
@@ -62,6 +63,12 @@ class StartBank:
             raise ValueError(f"{path} is no bank of states: vtrefine-record-starts makes one")
         bank = cls(json.loads(str(arrays.pop(SETTINGS))), arrays.pop(SOURCE), arrays)
         _check_task(path, bank.settings, bank_settings(config))
+        latest = int(bank.leaves[STEPS].max())
+        if latest >= config.max_episode_steps:
+            raise ValueError(
+                f"{path} holds a state of control step {latest}, and episodes end after"
+                f" {config.max_episode_steps}: raise --env.episode_steps"
+            )
         return bank
 
     def save(self, path: Path) -> None:
@@ -88,8 +95,11 @@ class StartBank:
 
 
 def bank_settings(config: VtRefineEnvConfig) -> dict[str, Any]:
-    """What a state depends on (JSON values); folders may differ between machines."""
+    """What a state depends on (JSON values): not when episodes end, nor folders, which differ between
+    machines.
+    """
     settings = simulation_settings(config)
+    settings["rules"].pop("episode_steps")
     scene = {key: value for key, value in settings.pop("scene").items() if key != "mesh_dir"}
     for unused in ("task", "start_bank", "colour"):
         settings.pop(unused, None)

@@ -16,6 +16,7 @@ from lerobot.scripts import lerobot_eval
 from local_hub import use_folder_as_hub
 
 from lerobot_vtrefine.cli import finetune, share, sharing
+from lerobot_vtrefine.cli.card_evaluation import evaluation_stage
 from lerobot_vtrefine.cli.record_demos import RecordDemosConfig
 from lerobot_vtrefine.cli.report.results import load_evaluation, percent
 from lerobot_vtrefine.embodiments import CameraConfig
@@ -23,6 +24,8 @@ from lerobot_vtrefine.envs.config import VtRefineEnvConfig
 from lerobot_vtrefine.envs.evaluation_note import changed_settings
 from lerobot_vtrefine.envs.vectorization import make_vector_env
 from lerobot_vtrefine.files import read_json_lines
+from lerobot_vtrefine.finetune.pipeline import FinetunePipelineConfig
+from lerobot_vtrefine.policies.vt_dp3.configuration_vt_dp3 import VtDp3Config
 from lerobot_vtrefine.sim.config import SceneConfig
 
 NAME = "--repo_id=me/insertion"
@@ -209,3 +212,11 @@ def test_who_is_not_logged_in_is_told_before_anything_is_made(monkeypatch, tmp_p
     assert "run hf auth login first" in capsys.readouterr().err
     with pytest.raises(ValueError, match="hf auth login"):
         RecordDemosConfig(root=tmp_path / "x", env=VtRefineEnvConfig(), push_to_hub=True, repo_id="me/demos")
+
+
+def test_a_policy_that_practised_from_a_bank_is_judged_from_the_table(tmp_path: Path) -> None:
+    env = VtRefineEnvConfig(start="table", fps=20, start_bank=tmp_path / "starts.npz")
+    run = FinetunePipelineConfig(env, VtDp3Config(device="cpu"), output_dir=tmp_path)
+    line = evaluation_stage(run, tmp_path / "checkpoints" / "000001").line
+    assert "--env.fps=20" in line
+    assert "start_bank" not in line

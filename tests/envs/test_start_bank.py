@@ -183,7 +183,14 @@ def test_what_is_no_bank_is_refused_and_what_does_not_matter_is_not(
         make_episodes(dataclasses.replace(picked, start_bank=wrong), 1)
     assert picked.start_bank is not None
     elsewhere = dataclasses.replace(picked, mesh_dir=tmp_path, backend="single", task="other words")
-    assert len(StartBank.load(picked.start_bank, elsewhere).source) == 9
+    bank = StartBank.load(picked.start_bank, elsewhere)
+    assert len(bank.source) == 9
+    latest = int(bank.leaves["state/episode/steps"].max())
+    StartBank.load(picked.start_bank, dataclasses.replace(picked, episode_steps=latest + 1))
+    with pytest.raises(
+        ValueError, match=f"a state of control step {latest}, and episodes end after {latest}:"
+    ):
+        StartBank.load(picked.start_bank, dataclasses.replace(picked, episode_steps=latest))
 
 
 def test_notes_of_recordings_tell_banks_apart(picked: VtRefineEnvConfig):
