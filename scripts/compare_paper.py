@@ -11,7 +11,8 @@ DPPO, once more from random weights (one step of imitation); stock lerobot-eval 
 table, on episodes that are the same for all. Where DPPO practises is --tune_start: on whole episodes (table);
 from states that the imitation reached with both parts in hand, or the expert where it reaches too few (bank);
 or with parts that are put into the hands (grasped), where a pair can be. Random weights, which never get that
-far, practise on whole episodes in place of a bank.
+far, practise on whole episodes in place of a bank. On a GPU worlds wait for the one that runs out of time:
+--tune_steps=120 ends episodes from a bank earlier, counted from the table.
 
 Every policy becomes rows of results/paper.json, or of results/demonstrations.json, as soon as it is judged.
 The same command again goes on where it was: finished stages are not repeated, nor policies whose rows are
@@ -193,6 +194,7 @@ def finetune_stage(options: argparse.Namespace, policy: Trained) -> Stage:
         *task_flags(options, policy.pair),
         *(["--env.start=grasped"] if grasped else []),
         *(f"--env.start_bank={stage.product}" for stage in bank),
+        *([f"--env.episode_steps={options.tune_steps}"] if bank and options.tune_steps else []),
         f"--env.backend={options.backend}",
         f"--policy.path={checkpoint(start)}",
         f"--policy.device={options.device}",
@@ -337,6 +339,7 @@ def make_parser() -> CommandParser:
     parser.add_argument("--scratch_iterations", type=int, default=20, help="of DPPO without pre-training")
     parser.add_argument("--worlds", type=int, default=512, help="of DPPO")
     parser.add_argument("--tune_start", choices=["table", "bank", "grasped"], default="table", help="of DPPO")
+    parser.add_argument("--tune_steps", type=int, help="control step at which episodes from a bank end")
     parser.add_argument("--starts", type=int, default=512, help="states in a bank")
     parser.add_argument("--episodes", type=int, default=512, help="of an evaluation")
     parser.add_argument("--eval_envs", type=int, default=512, help="episodes evaluated at once")

@@ -92,13 +92,16 @@ def test_dppo_may_start_from_a_bank_of_the_imitations_own_grasps(
     assert told.count("Grasps of") == 1  # random weights never get that far
     bank = tmp_path / "out" / "starts_00581_visuo_tactile_0_30" / "starts.npz"
     assert bank.is_file()
-    options = parse([*common(tmp_path), "--pairs=00581", "--tune_start=bank", "--starts=64"])
+    start = ["--tune_start=bank", "--starts=64", "--tune_steps=120"]
+    options = parse([*common(tmp_path), "--pairs=00581", *start])
     for policy in script.chosen(options):
         stages = script.stages(options, policy)
         lines = [stage.line for stage in stages]
         practised = [line for line in lines if "--env.start_bank" in line]
+        shorter = [line.split()[0] for line in lines if "--env.episode_steps=120" in line]
+        assert shorter == ["vtrefine-finetune"]
         if not policy.demonstrations:
-            assert not practised
+            assert not practised + shorter
             continue
         assert [line.split()[0] for line in practised] == ["vtrefine-finetune"]
         assert f"--env.start_bank={bank}" in practised[0]
