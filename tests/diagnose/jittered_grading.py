@@ -35,7 +35,11 @@ def graded(rig: Rig, effects: list[tuple[Effect, float]], found) -> Row:
 
 def later_gains(rig: Rig, effects: list[tuple[Effect, float]], found) -> Row:
     """Gains over the baseline on presses that the diagnosis has not seen, of the models that users get and of
-    the true law: with the true gain and damping, and the face where presses touch on average."""
+    the true law: with the true gain and damping, and the face where presses touch on average.
+
+    What is drawn anew for every press, the true law knows by its mean: no model can know which frames of a
+    press will drop out. Any one draw of them is a worse prediction, or tells what only the press can tell.
+    """
     from lerobot_vtrefine.diagnose.pad.prediction import predict_trial
     from lerobot_vtrefine.tactile.layout import PadLayout
 
@@ -45,7 +49,7 @@ def later_gains(rig: Rig, effects: list[tuple[Effect, float]], found) -> Row:
         later = Rig(rig.seed, rig.rows, rig.cols, session)
         for press, trial in zip(later.presses, later.record(effects).trials, strict=True):
             truth = np.tile(rig.idle, (len(trial.time_s), 1))
-            truth[:, press.taxels] += later.readings(press, effects, deviate=False)
+            truth[:, press.taxels] += later.expected(press, effects)
             keep = press.taxels[(press.heights > 0).any(axis=0)]
             predicted = {"truth": truth.clip(0, FULL_SCALE)}
             predicted["baseline"] = predict_trial(found.baseline_model, trial, layout)

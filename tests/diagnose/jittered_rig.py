@@ -285,10 +285,21 @@ class Rig:
         press.__dict__["taken"] = taken
         return out
 
+    def expected(self, press: Press, effects) -> np.ndarray:
+        """Mean readings (F, n) [counts] over what nobody knows of a press before it is recorded: how its gain
+        and touch deviate, and which of its frames drop out."""
+        mean = self.readings(press, [item for item in effects if item[0].where != "frames"], False)
+        for chance in [strength for effect, strength in effects if effect.where == "frames"]:
+            for k in range(1, len(mean)):
+                mean[k] = chance * mean[k - 1] + (1 - chance) * mean[k]
+        return mean
+
     def achievable(self, effects) -> float:
         """Part of the squared error of the best spring and damper that the true law takes away.
 
-        Both are judged on recordings with deviations and noise of their own, which neither knows.
+        Both are judged on recordings with deviations and noise of their own, which neither knows. Frames that
+        drop out are the recording's own, but for a shift by two frames: for them it is a scale, and no model
+        can reach it.
         """
         gram, along, power, left, count = np.zeros((2, 2)), np.zeros(2), 0.0, 0.0, 0
         for press in self.presses:

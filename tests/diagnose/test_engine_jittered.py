@@ -1,8 +1,11 @@
 """Effects that were once missed, on the third rig: each kind is named, and its first name is right."""
 
+from types import SimpleNamespace
+
 import jittered_rig
 import numpy as np
 import pytest
+from jittered_grading import later_gains
 from jittered_rig import EFFECTS, Rig
 
 from lerobot_vtrefine.diagnose.core.search import Selection
@@ -16,6 +19,7 @@ from lerobot_vtrefine.diagnose.pad.final_model import FinalFit
 from lerobot_vtrefine.diagnose.pad.fitting import movable
 from lerobot_vtrefine.diagnose.pad.form_fitting import with_form
 from lerobot_vtrefine.diagnose.pad.intervals import leave_out
+from lerobot_vtrefine.diagnose.pad.model import sensor_model
 from lerobot_vtrefine.diagnose.pad.own_touch import with_own_touch
 from lerobot_vtrefine.diagnose.pad.press_trials import prepare
 from lerobot_vtrefine.diagnose.pad.problem import Candidate, PadProblem
@@ -156,6 +160,37 @@ def test_frames_that_repeat_do_not_count_as_noise() -> None:
         presses = prepare(held, list(held.trials), list(range(len(held.trials))))
         floors[bool(effects)] = fit_baseline(presses).noise.floor
     assert floors[True] == pytest.approx(floors[False], rel=0.15)
+
+
+def test_the_true_law_knows_the_mean_of_a_new_press_and_not_which_frames_it_will_hold() -> None:
+    rig, effects = Rig(1, 8, 12), [(EFFECTS["drop_outs"], 0.8)]
+    (press, *_), drawn = rig.presses, []
+    expected = rig.expected(press, effects)
+    for rig.seed in range(600):
+        drawn.append(rig.readings(press, effects, deviate=True))
+    scatter = np.std(drawn, axis=0)
+    assert np.abs(np.mean(drawn, axis=0) - expected).max() < 5 * scatter.max() / np.sqrt(len(drawn))
+    # A draw of its own errs twice as much where it knows nothing, and less where it leaks.
+    assert np.mean((drawn[0] - drawn[1]) ** 2) > 1.5 * np.mean((drawn[0] - expected) ** 2)
+
+
+@pytest.mark.parametrize("seed", [1, 2])
+def test_frames_that_drop_out_are_predicted_in_new_presses_as_well_as_by_their_law(seed: int) -> None:
+    # As if readings of all ages up to twice the mean were as likely, 0.8 of its gain was reached.
+    rig, effects = Rig(seed, 8, 12), [(EFFECTS["drop_outs"], 0.75)]
+    held = rig.record(effects)
+    problem, fitted = PadProblem(prepare(held, list(held.trials), list(range(len(held.trials))))).weighed(
+        None
+    )
+    named = with_form(fitted, forms_of("sample_and_hold", fitted)[-1], (), problem.presses, problem.weights)
+    models = [
+        sensor_model(item.model, problem.presses.idle, problem.presses.step_counts)
+        for item in (problem.baseline(), named)
+    ]
+    found = SimpleNamespace(baseline_model=models[0], extended_model=models[1])
+    gains = later_gains(rig, effects, found)
+    assert gains["oracle_gain"] > 0.2
+    assert gains["gain"] > 0.95 * gains["oracle_gain"]
 
 
 def test_errors_of_recordings_left_out_are_those_of_a_fit_to_the_others() -> None:

@@ -7,7 +7,7 @@ import pytest
 import torch
 
 from lerobot_vtrefine.diagnose.pad.candidates.sample_and_hold import held, irregular_periods
-from lerobot_vtrefine.diagnose.pad.repeated_frames import Rhythm, slots
+from lerobot_vtrefine.diagnose.pad.repeated_frames import Rhythm, ages_s, slots
 from lerobot_vtrefine.tactile.layout import PadLayout
 from lerobot_vtrefine.tactile.model import SensorModel
 from lerobot_vtrefine.tactile.stages.base import Frame
@@ -80,15 +80,30 @@ def test_a_board_read_at_the_frames_holds_what_the_first_frame_of_a_period_showe
     np.testing.assert_allclose(frames[:, 0, 0], 3.0 * held, atol=1e-9)
 
 
-def test_irregular_readings_are_as_old_on_average_as_was_seen() -> None:
+def test_irregular_readings_are_the_mean_over_the_ages_that_were_seen() -> None:
     time_s = torch.arange(100, dtype=torch.float64) * 0.05
-    stage = SampleAndHold(0.1, free=True, irregular=True, age_s=0.04, lag_s=0.01)
-    mean = stage.sequence((2.0 * time_s)[:, None, None], time_s, Frame(PadLayout(1, 1, 0.002)))
-    assert torch.allclose(mean[50:, 0, 0], 2.0 * (time_s[50:] - 0.05))
+    ages_s = (0.0, 0.0, 0.05, 0.15)
+    stage = SampleAndHold(0.1, free=True, ages_s=ages_s, lag_s=0.01)
+    mean = stage.sequence((time_s**2)[:, None, None], time_s, Frame(PadLayout(1, 1, 0.002)))
+    at = [(time_s - age - 0.01).clamp(min=0.0) for age in ages_s]
+    expected = torch.stack([sampled(time_s**2, time_s, when) for when in at]).mean(dim=0)
+    assert torch.allclose(mean[:, 0, 0], expected)
     assert (
         SensorModel.from_dict(SensorModel.paper().with_stage(stage).to_dict()).find("sample_and_hold")
         == stage
     )
+    with pytest.raises(ValueError, match="ages_s"):
+        SampleAndHold(0.1, ages_s=(-0.1,))
+
+
+def test_ages_of_frames_that_drop_out_are_those_of_their_law() -> None:
+    # At random a frame is k frames old with chance 0.4 * 0.6^k: a few are very old, most are new.
+    rng = np.random.default_rng(7)
+    lost = [dropped(rng.standard_normal((2000, 2)), 0.6, rng) for _ in range(4)]
+    found = ages_s([press.rhythm for press in press_set(lost).presses])
+    parts = (np.arange(len(found)) + 0.5) / len(found)
+    np.testing.assert_allclose(found, 0.05 * np.floor(np.log(1 - parts) / np.log(0.6)), atol=0.051)
+    assert np.mean(found) == pytest.approx(0.05 * 0.6 / 0.4, rel=0.1)
 
 
 def press_set(signals: list[np.ndarray]) -> SimpleNamespace:
@@ -117,9 +132,8 @@ def test_frames_that_repeat_at_random_are_held_and_chance_repeats_are_not(taxels
     lost = [dropped(signal, 0.25, rng) for signal in whole]
     assert held(press_set(lost))
     assert not held(press_set(whole))
-    period_s, age_s, _ = irregular_periods(press_set(lost), 0.05)[0]
+    period_s, _ = irregular_periods(press_set(lost), 0.05)[0]
     assert period_s == pytest.approx(0.05 / 0.75, rel=0.1)
-    assert age_s == pytest.approx(0.05 * 0.25 / 0.75, rel=0.3)
 
 
 def test_a_still_pad_of_one_taxel_that_repeats_is_not_held() -> None:

@@ -11,6 +11,7 @@ from lerobot_vtrefine.diagnose.pad.forward_model.run import LoweredBench, run_st
 from lerobot_vtrefine.diagnose.pad.model import NOMINAL_K_N, Composite, stiffness_from_load
 from lerobot_vtrefine.diagnose.pad.noise import Noise, fit_frame_noise, fit_repeatability
 from lerobot_vtrefine.diagnose.pad.press_trials import PressSet
+from lerobot_vtrefine.diagnose.pad.repeated_frames import ages_s
 from lerobot_vtrefine.diagnose.pad.weights import TrialWeights, build_weights
 from lerobot_vtrefine.diagnose.pad.whitening import Whitener
 
@@ -73,6 +74,7 @@ def describe(presses: PressSet) -> Setting:
         temperature_c=_temperature(presses),
         row_company=row_company,
         company=company,
+        ages_s=ages_s([press.rhythm for press in presses.presses]),
     )
 
 

@@ -181,9 +181,9 @@ class SampleAndHold(Stage):
     """A new reading reaches the host every `period_s`; between, the last one is repeated.
 
     Periods are counted from the episode's start or, where the board runs `free` of the host, from an instant
-    drawn for every episode. Where they are `irregular` (`period_s` is their mean), readings are `lag_s` to
-    `lag_s` + 2 `age_s` old. With `frame_s` the reading is that of the first frame, of frames this far apart,
-    after the period began.
+    drawn for every episode. Where they are irregular (`period_s` is their mean), readings are `lag_s` older
+    than one of `ages_s`, each of which is as likely. With `frame_s` the reading is that of the first frame,
+    of frames this far apart, after the period began.
     """
 
     name: ClassVar[str] = "sample_and_hold"
@@ -192,14 +192,19 @@ class SampleAndHold(Stage):
     has_state: ClassVar[bool] = True
     period_s: float = parameter(0.043, "s", 0.01, 0.1, minimum=1e-6)
     free: bool = False
-    irregular: bool = False
-    age_s: float = parameter(0.0, "s", 0.0, 0.0)
+    ages_s: tuple[float, ...] = ()
     lag_s: float = parameter(0.0, "s", 0.0, 0.0)
     frame_s: float = parameter(0.0, "s", 0.0, 0.0)
 
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        object.__setattr__(self, "ages_s", as_tuple(self.ages_s))
+        if not all(math.isfinite(age) and age >= 0 for age in self.ages_s):
+            raise ValueError("sample_and_hold.ages_s needs finite numbers that are not negative")
+
     @override
     def traits(self, layout: PadLayout, pads: int, rng: np.random.Generator) -> Traits:
-        return {"phase": rng.uniform(0.0, 1.0, (pads, 1, 1))} if self.free or self.irregular else {}
+        return {"phase": rng.uniform(0.0, 1.0, (pads, 1, 1))} if self.free else {}
 
     @override
     def initial(self, layout: PadLayout, pads: int) -> Traits:
@@ -223,8 +228,8 @@ class SampleAndHold(Stage):
         if self.frame_s:
             held = taken_at_frames(times_s.cpu().numpy(), self.period_s, self.frame_s)
             return sampled(x, times_s, torch.from_numpy(held).to(times_s))
-        if not self.free and not self.irregular:
+        if not self.free:
             return super().sequence(x, times_s, frame)
-        parts = (torch.arange(PHASES, dtype=torch.float64) + 0.5) / PHASES
-        ages = self.lag_s + 2.0 * self.age_s * parts if self.irregular else self.period_s * parts
-        return torch.stack([sampled(x, times_s, times_s - age) for age in ages.tolist()]).mean(dim=0)
+        even = [self.period_s * (k + 0.5) / PHASES for k in range(PHASES)]
+        ages = [self.lag_s + age for age in self.ages_s] or even
+        return torch.stack([sampled(x, times_s, times_s - age) for age in ages]).mean(dim=0)

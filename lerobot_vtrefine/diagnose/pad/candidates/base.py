@@ -39,6 +39,8 @@ class Setting:
     """Most taxels of a row that are pressed at once."""
     company: int = 1
     """Most taxels that are pressed at once."""
+    ages_s: tuple[float, ...] = (0.0,)
+    """How old readings were in frames on the pad, each as likely: the middles of equal parts [s]."""
     log_gain: float | None = None
     """Logarithm of the plain baseline's counts per metre (or newton); None before it is fitted."""
 

@@ -168,14 +168,9 @@ def _between(low: float, high: float) -> list[list[float]]:
 
 
 def irregular_periods(presses: PressSet, frame_s: float) -> list[list[float]]:
-    """Mean time between new readings and since the last one; read at the frame, or before it [s]."""
-    ages = [press.time_s - press.rhythm.taken_s(press.time_s) for press in presses.presses]
-    telling = [press.rhythm.telling for press in presses.presses]
-    age_s = float(
-        np.mean(np.concatenate([age[use] for age, use in zip(ages, telling, strict=True)] or [[0.0]]))
-    )
+    """Mean time between new readings; read at the frame, or before it [s]."""
     period_s = frame_s / max(1.0 - repeated_share(presses), 1.0 / MAX_FRAMES)
-    return [[period_s, age_s, lag] for lag in (0.0, 0.5 * frame_s)]
+    return [[period_s, lag] for lag in (0.0, 0.5 * frame_s)]
 
 
 def _mean_period(values: np.ndarray, presses: PressSet) -> dict[str, tuple[float, float]]:
@@ -243,14 +238,10 @@ FORMS = (
     Form(
         "sample_and_hold",
         "irregular periods",
-        (Value("period_s", 1e-3, 2.0, 0.0), Value("age_s", 0.0, 2.0, 0.0), Value("lag_s", 0.0, 0.1, 1e-3)),
-        lambda v, s: (
-            SampleAndHold(
-                float(v[0]), free=True, irregular=True, age_s=float(v[1]), lag_s=max(float(v[2]), 0.0)
-            ),
-        ),
+        (Value("period_s", 1e-3, 2.0, 0.0), Value("lag_s", 0.0, 0.1, 1e-3)),
+        lambda v, s: (SampleAndHold(float(v[0]), free=True, ages_s=s.ages_s, lag_s=max(float(v[1]), 0.0)),),
         lambda v, s: {"period_s": (float(v[0]), "s")},
-        lambda s: [[2.0 * s.frame_s, 0.5 * s.frame_s, 0.0]],
+        lambda s: [[2.0 * s.frame_s, 0.0]],
         amplitude=None,
         search=irregular_periods,
         range=_mean_period,

@@ -228,7 +228,7 @@ def _hold(stage: SampleAndHold, field: Field, context: Context) -> Field:
     for press, (time_s, rhythm) in enumerate(zip(sheet.times_s, sheet.rhythms, strict=True)):
         part = field.within(sheet, press)
         x = field.values[: len(time_s), part]
-        if stage.irregular:
+        if stage.ages_s:
             out[: len(time_s), part] = _sampled(x, time_s, rhythm.taken_s(time_s) - stage.lag_s)
         elif stage.frame_s:
             taken_s = taken_at_frames(time_s, stage.period_s, stage.frame_s)
