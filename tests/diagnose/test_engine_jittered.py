@@ -8,6 +8,7 @@ import pytest
 from jittered_grading import later_gains
 from jittered_rig import EFFECTS, Rig
 
+from lerobot_vtrefine.diagnose.core.heldout import lock, out_of_fold
 from lerobot_vtrefine.diagnose.core.search import Selection
 from lerobot_vtrefine.diagnose.pad import review
 from lerobot_vtrefine.diagnose.pad.baseline import fit_baseline
@@ -150,6 +151,35 @@ def test_a_map_that_users_get_knows_places_that_were_only_pressed_in_locked_reco
     assert np.corrcoef(late[late_only], truth)[0, 1] > 0.7
     assert completed.model.families == ("taxel_gain_spread",)
     assert baseline.model.families == ()
+
+
+def judged_map(problem: PadProblem, fitted) -> tuple[float, float]:
+    """Gain in squared error and in log score on recordings left out, of a map of gains over none."""
+    mapped = problem.settled(with_map(fitted, problem.presses, problem.weights))
+    before, after = (out_of_fold(problem, fit, problem.folds) for fit in (fitted, mapped))
+    return after.gain_over(before), float(after.better_by(before).sum())
+
+
+def test_a_map_is_worth_what_it_gains_at_places_that_were_pressed_before() -> None:
+    # One taxel in five is pressed by two commands: where only the one left out presses, no map can gain.
+    rig = Rig(9203)
+    held = rig.record([(EFFECTS["gains"], rig.strength_for(EFFECTS["gains"], 0.2))])
+    whole = PadProblem(prepare(held, list(held.trials), list(range(len(held.trials)))))
+    kept = np.setdiff1d(np.arange(len(held.trials)), lock(whole.conditions, 0))
+    problem, fitted = whole.subset(kept).weighed(None)
+    gain, likelier = judged_map(problem, fitted)
+    assert gain > 0.1
+    assert likelier > 100
+
+
+@pytest.mark.parametrize("law", ["mullins", "relaxation", "hysteresis"])
+def test_a_map_of_what_repeats_within_commands_is_contradicted_by_others(law: str) -> None:
+    held = recorded(law, 0.3, 0)
+    problem, fitted = PadProblem(prepare(held, list(held.trials), list(range(len(held.trials))))).weighed(
+        None
+    )
+    _, likelier = judged_map(problem, fitted)
+    assert likelier < -40
 
 
 def test_frames_that_repeat_do_not_count_as_noise() -> None:

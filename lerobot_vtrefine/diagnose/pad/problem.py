@@ -90,16 +90,30 @@ class Refits:
         return self.judging(refit_weighted(self.fit, weights), part, weights, trials)
 
     def judging(self, model: Composite, part: PressSet, weights: Array, trials: Array) -> tuple[Array, Array]:
-        """The same of other coordinates and presses of those trials; maps come from recordings that count."""
-        if self.fit.model.gain_map is not None:
-            model = map_of(model, self.fit, self._evidence, np.flatnonzero(weights).tolist())
-        signals = predict(model, part)
+        """The same of other coordinates and presses of those trials.
+
+        Where a map is there, log scores tell whether it belongs to the taxels: it comes from recordings that
+        count, so that other commands must agree on it. Errors tell what it is worth, which shows at places
+        that it knows: it comes from all recordings but the one that is judged.
+        """
+        mapped = self.fit.model.gain_map is not None
+        counting = self._with_map_of(model, np.flatnonzero(weights)) if mapped else model
+        signals = predict(counting, part)
         noise = self.problem.noise
         if noise is not None and allowed(part, self.problem.weights):
-            losses = losses_at_own_touch(model, part, noise)
+            losses = losses_at_own_touch(counting, part, noise)
         else:
             losses = losses_of(signals, part, [self.problem.weights[k] for k in trials])
+        if mapped:
+            every = np.arange(len(weights))
+            signals = [
+                predict(self._with_map_of(model, every[every != k]), part.subset([place]))[0]
+                for place, k in enumerate(trials)
+            ]
         return squared_errors(signals, part)[:, None], -0.5 * losses[:, None]
+
+    def _with_map_of(self, model: Composite, trials: Array) -> Composite:
+        return map_of(model, self.fit, self._evidence, trials.tolist())
 
 
 @dataclass(frozen=True)
