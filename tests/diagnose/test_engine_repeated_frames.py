@@ -83,7 +83,7 @@ def test_a_board_read_at_the_frames_holds_what_the_first_frame_of_a_period_showe
 def test_irregular_readings_are_the_mean_over_the_ages_that_were_seen() -> None:
     time_s = torch.arange(100, dtype=torch.float64) * 0.05
     ages_s = (0.0, 0.0, 0.05, 0.15)
-    stage = SampleAndHold(0.1, free=True, ages_s=ages_s, lag_s=0.01)
+    stage = SampleAndHold(0.1, ages_s=ages_s, lag_s=0.01)
     mean = stage.sequence((time_s**2)[:, None, None], time_s, Frame(PadLayout(1, 1, 0.002)))
     at = [(time_s - age - 0.01).clamp(min=0.0) for age in ages_s]
     expected = torch.stack([sampled(time_s**2, time_s, when) for when in at]).mean(dim=0)

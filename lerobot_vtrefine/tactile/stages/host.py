@@ -204,7 +204,7 @@ class SampleAndHold(Stage):
 
     @override
     def traits(self, layout: PadLayout, pads: int, rng: np.random.Generator) -> Traits:
-        return {"phase": rng.uniform(0.0, 1.0, (pads, 1, 1))} if self.free else {}
+        return {"phase": rng.uniform(0.0, 1.0, (pads, 1, 1))} if self.free or self.ages_s else {}
 
     @override
     def initial(self, layout: PadLayout, pads: int) -> Traits:
@@ -228,7 +228,7 @@ class SampleAndHold(Stage):
         if self.frame_s:
             held = taken_at_frames(times_s.cpu().numpy(), self.period_s, self.frame_s)
             return sampled(x, times_s, torch.from_numpy(held).to(times_s))
-        if not self.free:
+        if not self.free and not self.ages_s:
             return super().sequence(x, times_s, frame)
         even = [self.period_s * (k + 0.5) / PHASES for k in range(PHASES)]
         ages = [self.lag_s + age for age in self.ages_s] or even

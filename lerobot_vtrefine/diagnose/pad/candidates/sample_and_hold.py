@@ -239,7 +239,7 @@ FORMS = (
         "sample_and_hold",
         "irregular periods",
         (Value("period_s", 1e-3, 2.0, 0.0), Value("lag_s", 0.0, 0.1, 1e-3)),
-        lambda v, s: (SampleAndHold(float(v[0]), free=True, ages_s=s.ages_s, lag_s=max(float(v[1]), 0.0)),),
+        lambda v, s: (SampleAndHold(float(v[0]), ages_s=s.ages_s, lag_s=max(float(v[1]), 0.0)),),
         lambda v, s: {"period_s": (float(v[0]), "s")},
         lambda s: [[2.0 * s.frame_s, 0.0]],
         amplitude=None,
