@@ -10,9 +10,8 @@ from lerobot_vtrefine.datasets.features import CLOUD_KEY, GRIDS_KEY, STATE_KEY
 from lerobot_vtrefine.policies.vt_dp3.denoisers import MLPDenoiser, UNetDenoiser
 from lerobot_vtrefine.policies.vt_dp3.ema import Ema
 from lerobot_vtrefine.policies.vt_dp3.observation_encoder import ObservationEncoder
-from lerobot_vtrefine.policies.vt_dp3.pad_encoder import PadEncoder, PadMoments
+from lerobot_vtrefine.policies.vt_dp3.pad_encoder import PadEncoder
 from lerobot_vtrefine.policies.vt_dp3.point_encoder import PointEncoder
-from lerobot_vtrefine.tactile.layout import PadLayout
 
 
 def encoder() -> PointEncoder:
@@ -68,25 +67,6 @@ def test_condition_keeps_frames_apart() -> None:
     assert cond.shape == (2, encode.cond_dim) == (2, 2 * (6 + 5 + 64))
     swapped = encode({key: value.flip(1) for key, value in batch.items()})
     assert torch.allclose(cond.view(2, 2, -1).flip(1), swapped.view(2, 2, -1), atol=1e-6)
-
-
-def test_moments_stand_beside_what_the_images_give() -> None:
-    """And have no weights, so that encoders from before serve with them."""
-    parts, sizes = (None, PadEncoder(4, (12, 32), 8, 5)), {"state_dim": 3, "n_obs_steps": 2}
-    plain = ObservationEncoder(*parts, **sizes)
-    with_moments = ObservationEncoder(*parts, **sizes, moments=PadMoments(PadLayout(), 4))
-    with_moments.load_state_dict(plain.state_dict())
-    pressed = torch.zeros(2, 2, 4, 12, 32)
-    pressed[:, 0, 1, 3, 20], pressed[:, 1, 1, 3, 21] = 5.0, 10.0
-    batch = {GRIDS_KEY: pressed, STATE_KEY: torch.randn(2, 2, 3)}
-    seen = with_moments.perceive(batch)
-    assert torch.equal(seen[..., :5], plain.perceive(batch))
-    moments = seen[..., 5:].unflatten(-1, (4, 3))
-    assert not moments[:, :, [0, 2, 3]].any()
-    x, y = 9e-3 / 5e-3, -5e-3 / 5e-3  # of taxel (3, 20), in units of 5 mm; readings in units of 10
-    expected = [[0.5, x, y], [1.0, x + 0.4, y]]
-    torch.testing.assert_close(moments[:, :, 1], torch.tensor([expected] * 2))
-    assert with_moments(batch).shape == (2, with_moments.cond_dim)
 
 
 @pytest.mark.parametrize(

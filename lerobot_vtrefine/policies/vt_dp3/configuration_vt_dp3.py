@@ -83,8 +83,6 @@ class VtDp3Config(PreTrainedConfig):
     """Features of one pad (``fusion=pads``)."""
     pad_features: int = 64
     """Features of all pads together (``fusion=pads``)."""
-    pad_moments: bool = False
-    """Each pad's force and centre of pressure are seen beside the images, as they are (``fusion=pads``)."""
     pretrained_encoder: str = ""
     """Start from the encoder that ``vtrefine-information`` trained on simulated contacts: its --output_dir,
     or ``vtrefine:NAME`` for one that comes with this package. Empty: from scratch.
@@ -166,8 +164,6 @@ class VtDp3Config(PreTrainedConfig):
             raise ValueError(
                 "policy.freeze_encoder=true needs policy.pretrained_encoder: an untrained one sees nothing"
             )
-        if self.pad_moments and not self.sees_grids:
-            raise ValueError("policy.pad_moments=true needs pads as images: policy.fusion=pads, and touch")
         if self.auxiliary_weight < 0.0:
             raise ValueError(f"policy.auxiliary_weight must not be negative, got {self.auxiliary_weight}")
         if not 1 <= self.n_action_steps <= self.horizon:

@@ -14,7 +14,7 @@ from lerobot_vtrefine import shipped
 from lerobot_vtrefine.datasets.features import CLOUD_KEY, GRIDS_KEY, LIMITS_KEY, STATE_KEY
 from lerobot_vtrefine.embodiments import get_embodiment
 from lerobot_vtrefine.policies.vt_dp3.configuration_vt_dp3 import VtDp3Config
-from lerobot_vtrefine.policies.vt_dp3.pad_encoder import PadEncoder, PadMoments
+from lerobot_vtrefine.policies.vt_dp3.pad_encoder import PadEncoder
 from lerobot_vtrefine.policies.vt_dp3.point_encoder import PointEncoder
 
 STATE_FEATURES = 64
@@ -36,19 +36,17 @@ class ObservationEncoder(nn.Module):
         state_dim: int,
         n_obs_steps: int,
         limits_dim: int = 0,
-        moments: PadMoments | None = None,
     ) -> None:
         super().__init__()
         self.points = points
         self.pads = pads
-        self.moments = moments
         self.state = nn.Sequential(
             nn.Linear(state_dim + limits_dim, STATE_FEATURES),
             nn.ReLU(),
             nn.Linear(STATE_FEATURES, STATE_FEATURES),
         )
         self.limits_dim = limits_dim
-        seen = sum(part.out_dim for part in (points, pads, moments) if part is not None)
+        seen = sum(part.out_dim for part in (points, pads) if part is not None)
         self.cond_dim = n_obs_steps * (seen + STATE_FEATURES)
 
     @property
@@ -82,11 +80,7 @@ class ObservationEncoder(nn.Module):
         """Features (B, To, F) of cloud (B, To, N, 5) in metres and readings (B, To, P, R, C); F may be 0."""
         frames = [
             part(batch[key].flatten(0, 1)).unflatten(0, batch[STATE_KEY].shape[:2])
-            for key, part in (
-                (CLOUD_KEY, self.points),
-                (GRIDS_KEY, self.pads),
-                (GRIDS_KEY, self.moments),
-            )
+            for key, part in ((CLOUD_KEY, self.points), (GRIDS_KEY, self.pads))
             if part is not None
         ]
         return torch.cat(frames, dim=-1) if frames else batch[STATE_KEY][..., :0]
@@ -111,15 +105,14 @@ def make_encoder(config: VtDp3Config, state_dim: int) -> ObservationEncoder:
     With ``fusion=pads`` the cloud holds visual points only, and is missing where the policy sees touch only.
     """
     view = config.observation
-    points = pads = moments = None
+    points = pads = None
     if config.cloud_modalities:
         points = PointEncoder(config.point_dims, config.point_features, view.center_m, view.scale_m)
     if config.sees_grids:
         body = get_embodiment(view.embodiment)
-        layout, count = body.pad_layout, len(body.pad_names)
-        pads = PadEncoder(count, (layout.rows, layout.cols), config.pad_width, config.pad_features)
-        moments = PadMoments(layout, count) if config.pad_moments else None
-    return ObservationEncoder(points, pads, state_dim, config.n_obs_steps, config.limits_dim, moments)
+        shape = body.pad_layout.rows, body.pad_layout.cols
+        pads = PadEncoder(len(body.pad_names), shape, config.pad_width, config.pad_features)
+    return ObservationEncoder(points, pads, state_dim, config.n_obs_steps, config.limits_dim)
 
 
 def encoder_file(config: VtDp3Config) -> str:

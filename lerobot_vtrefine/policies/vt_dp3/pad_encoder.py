@@ -6,9 +6,6 @@ Shapes: ``F`` frames, ``P`` pads, ``R`` x ``C`` taxels, ``W`` features of one pa
 import torch
 from torch import Tensor, nn
 
-from lerobot_vtrefine.observation.moments import pad_moments
-from lerobot_vtrefine.tactile.layout import PadLayout
-
 
 class PadEncoder(nn.Module):
     """Readings (F, P, R, C) of one frame's pads -> (F, out_dim).
@@ -47,27 +44,3 @@ class PadEncoder(nn.Module):
         frames, pads = grids.shape[:2]
         each = self.shared(grids.flatten(0, 1).unsqueeze(1)).view(frames, pads, -1) + self.offset
         return self.join(each.flatten(1))
-
-
-class PadMoments(nn.Module):
-    """Force and centre of pressure of every pad, as they are: no weights, so an encoder that was trained
-    without them serves with them, too.
-
-    Frames lie side by side in a condition, so a linear layer after it sees their changes.
-    """
-
-    READING, PLACE_M = 10.0, 5e-3
-    """Units of the features."""
-
-    unit: Tensor
-
-    def __init__(self, layout: PadLayout, num_pads: int) -> None:
-        super().__init__()
-        self.layout = layout
-        self.out_dim = 3 * num_pads
-        unit = torch.tensor([self.READING, self.PLACE_M, self.PLACE_M])
-        self.register_buffer("unit", unit, persistent=False)
-
-    def forward(self, grids: Tensor) -> Tensor:
-        """(F, P, R, C) -> (F, 3 P)."""
-        return (pad_moments(grids, self.layout) / self.unit).flatten(1)
