@@ -68,6 +68,13 @@ def test_window_longer_than_a_chunk_keeps_older_frames(make_env):
     assert step.obs[TACTILE_KEYS[0]][0, :, 0].tolist() == [1.0, 2.0, 3.0]
 
 
+def test_decisions_at_every_step_see_every_frame(make_env):
+    env = make_env(1)
+    env.reset([1])
+    seen = [env.step_chunk(chunk(1, [value])).obs[TACTILE_KEYS[0]][0, :, 0].tolist() for value in (2.0, 4.0)]
+    assert seen == [[1.0, 2.0], [2.0, 3.0]]
+
+
 def test_finished_environments_idle_until_they_are_reset(make_env):
     env = make_env(3)
     env.reset([0, 1, 2])  # success after 3 steps, never, after 5

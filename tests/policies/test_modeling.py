@@ -185,6 +185,20 @@ def test_select_action_samples_once_per_chunk_from_the_last_two_frames() -> None
     assert torch.allclose(action, policy.sample_actions(batch, noise)[:, 0], atol=1e-6)
 
 
+@pytest.mark.parametrize("every", [1, 2])
+def test_it_decides_as_often_as_it_is_asked_to(every: int) -> None:
+    """From the newest two frames each time: a chunk of one action reacts to every reading."""
+    policy, noise = make_policy(n_action_steps=every), torch.randn(3, 16, 16)
+    batches = [make_batch(seed=seed) for seed in range(5)]
+    actions = [policy.select_action(frame(batch, 0), noise=noise) for batch in batches]
+    for step, action in enumerate(actions):
+        decided = step - step % every
+        seen = [batches[max(decided - 1, 0)], batches[decided]]
+        window = {key: torch.stack([one[key][:, 0] for one in seen], 1) for key in (CLOUD_KEY, STATE_KEY)}
+        expected = policy.sample_actions(window, noise)[:, step - decided]
+        assert torch.allclose(action, expected, atol=1e-6), step
+
+
 def test_predict_action_chunk_takes_windows_and_frames() -> None:
     policy, batch = make_policy(), make_batch()
     noise = torch.randn(3, 16, 16)
