@@ -126,6 +126,7 @@ class Line(Row):
         "sysid",
         "tactile",
         "tolerance",
+        "touch_inputs",
         "touch_tasks",
         "worlds",
     )
