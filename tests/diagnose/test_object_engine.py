@@ -6,7 +6,6 @@ from object_rigs import record
 
 from lerobot_vtrefine.diagnose.parts.engine import assumed_masses, diagnose_parts
 from lerobot_vtrefine.diagnose.parts.episodes import AssumedScene, handled
-from lerobot_vtrefine.diagnose.parts.payload import Arms
 from lerobot_vtrefine.sim.config import SceneConfig
 from lerobot_vtrefine.sim.pairs import load_pair
 from lerobot_vtrefine.sim.reality import RobotFaults
@@ -18,8 +17,7 @@ EPISODES = 6
 def diagnosed(recorded):
     scene = AssumedScene(BELIEVED, recorded.rules, load_pair(BELIEVED))
     episodes = [handled(episode, scene) for episode in recorded.episodes]
-    arms = Arms(BELIEVED, recorded.rules, recorded.rules.control_dt_s, "linear")
-    return diagnose_parts(arms, scene, episodes), scene
+    return diagnose_parts(scene, episodes), scene
 
 
 def decisions(found):

@@ -15,7 +15,7 @@ from lerobot_vtrefine.diagnose.joints.parameters import INDEX
 from lerobot_vtrefine.diagnose.joints.twin_problem import COARSE_S, FINE_S, TwinProblem
 from lerobot_vtrefine.diagnose.parts.engine import assumed_masses
 from lerobot_vtrefine.diagnose.parts.episodes import AssumedScene, handled, lately
-from lerobot_vtrefine.diagnose.parts.payload import Arms, given, replay_loaded
+from lerobot_vtrefine.diagnose.parts.payload import given, replay_loaded
 from lerobot_vtrefine.diagnose.recordings import RobotTrial
 from lerobot_vtrefine.embodiments import ALOHA
 from lerobot_vtrefine.sim.config import SceneConfig
@@ -31,16 +31,15 @@ ANGLES = [k for k, name in enumerate(ALOHA.joint_names) if not is_sliding(name)]
 def handled_episodes(faults):
     recorded = record(SCENE, 4, faults=faults)
     scene = AssumedScene(SCENE, recorded.rules, load_pair(SCENE))
-    arms = Arms(SCENE, recorded.rules, recorded.rules.control_dt_s, "linear")
-    return arms, scene, [handled(episode, scene) for episode in recorded.episodes]
+    return scene, [handled(episode, scene) for episode in recorded.episodes]
 
 
-def problem_of(arms, episodes, positions, step_s=COARSE_S):
+def problem_of(scene, episodes, positions, step_s=COARSE_S):
     trials = [
-        RobotTrial(str(e.index), str(e.index), 0, 0, 0.0, e.time_s, given(arms, e), q, None)
+        RobotTrial(str(e.index), str(e.index), 0, 0, 0.0, e.time_s, given(scene, e), q, None)
         for e, q in zip(episodes, positions, strict=True)
     ]
-    return TwinProblem.on(ALOHA.joint_names, make_batch(trials), SCENE, "linear", step_s)
+    return TwinProblem.on(ALOHA.joint_names, make_batch(trials), SCENE, step_s)
 
 
 def error_of(problem, point):
@@ -49,10 +48,10 @@ def error_of(problem, point):
 
 
 def test_loaded_replay_is_the_simulation_itself() -> None:
-    arms, scene, episodes = handled_episodes(None)
+    scene, episodes = handled_episodes(None)
     mass = assumed_masses(scene)
-    paths = replay_loaded(arms, episodes, scene.weights_n(episodes, mass))
-    empty = replay_loaded(arms, episodes)
+    paths = replay_loaded(scene, episodes, scene.weights_n(episodes, mass))
+    empty = replay_loaded(scene, episodes, scene.weights_n(episodes, np.zeros(2)))
     for episode, path, bare in zip(episodes, paths, empty, strict=True):
         error = np.abs(episode.position - path)[:, ANGLES]
         free, carried = episode.free.all(1), episode.carried.all(1)
@@ -71,29 +70,29 @@ def late(request):
 
 @cache
 def late_problem(step_s):
-    arms, episodes, paths, usable = late_episodes()
-    bare = problem_of(arms, episodes, paths, step_s)
+    scene, episodes, paths, usable = late_episodes()
+    bare = problem_of(scene, episodes, paths, step_s)
     extra = bare.residual(bare.predict(bare.start()))
     positions = []
     for k, episode in enumerate(episodes):
         values = episode.position - extra[: len(episode.time_s), k]
         positions.append(np.where(usable[k][:, None], values, np.nan))
-    return problem_of(arms, episodes, positions, step_s)
+    return problem_of(scene, episodes, positions, step_s)
 
 
 @cache
 def late_episodes():
     faults = RobotFaults(control_latency_s=LATE_S, backlash_rad={"left_elbow": PLAY_RAD})
-    arms, scene, episodes = handled_episodes(faults)
+    scene, episodes = handled_episodes(faults)
     weights = scene.weights_n(episodes, assumed_masses(scene))
-    paths, through = (replay_loaded(arms, episodes, weights, contacts=c) for c in (True, False))
+    paths, through = (replay_loaded(scene, episodes, weights, contacts=c) for c in (True, False))
     usable = []
     for episode, path, other in zip(episodes, paths, through, strict=True):
         bumped = lately((np.abs(path - other).max(1) > 5e-5)[:, None], 6)[:, 0]
         use = (episode.free | episode.carried).all(1) & ~bumped
         use[0] = True
         usable.append(use)
-    return arms, episodes, paths, usable
+    return scene, episodes, paths, usable
 
 
 def test_the_true_faults_explain_what_the_twin_lacks(late) -> None:

@@ -35,7 +35,7 @@ from lerobot_vtrefine.diagnose.parts.episodes import (
     lately,
     read_episodes,
 )
-from lerobot_vtrefine.diagnose.parts.payload import Arms, given, replay_loaded
+from lerobot_vtrefine.diagnose.parts.payload import given, replay_loaded
 from lerobot_vtrefine.diagnose.recordings import RecordingSet
 
 Array = np.ndarray
@@ -73,7 +73,6 @@ class _Session:
     """What robot and parts are judged from."""
 
     recordings: RecordingSet
-    arms: Arms
     scene: AssumedScene
     episodes: tuple[HandledEpisode, ...]
 
@@ -81,14 +80,14 @@ class _Session:
         """What the twin does in every episode with parts of those masses (2,)."""
         weights = self.scene.weights_n(self.episodes, mass_kg)
         touching, free = (
-            replay_loaded(self.arms, self.episodes, weights, contacts=contacts) for contacts in (True, False)
+            replay_loaded(self.scene, self.episodes, weights, contacts=contacts) for contacts in (True, False)
         )
-        frames = max(1, round(_RECOVERS_S / self.arms.dt_s))
+        frames = max(1, round(_RECOVERS_S / self.scene.rules.control_dt_s))
         out = {}
         for episode, path, other in zip(self.episodes, touching, free, strict=True):
             bumped = lately((np.abs(path - other).max(1) > BUMP_RAD)[:, None], frames)[:, 0]
             usable = (episode.free | episode.carried).all(1) & ~bumped
-            out[episode_name(episode.index)] = TwinTrial(given(self.arms, episode), path, usable)
+            out[episode_name(episode.index)] = TwinTrial(given(self.scene, episode), path, usable)
         return out
 
 
@@ -107,11 +106,10 @@ def _on_twin(
     kept = {trial.file for trial in recordings.trials}
     episodes = read_episodes(recordings.path, scene)
     episodes = tuple(item for item in episodes if episode_name(item.index) in kept)
-    arms = Arms(scene.scene, scene.rules, scene.rules.control_dt_s, "linear")
-    session = _Session(recordings, arms, scene, episodes)
-    mass = found_masses(arms, scene, episodes, seed)
+    session = _Session(recordings, scene, episodes)
+    mass = found_masses(scene, episodes, seed)
     found = _robot(session, mass, seed, progress)
-    objects = diagnose_parts(arms, scene, _corrected(session, found, mass), seed)
+    objects = diagnose_parts(scene, _corrected(session, found, mass), seed)
     now = believed_masses(objects, scene)
     if np.abs(now - mass).max() > 0.1 * assumed_masses(scene).min():
         found = _robot(session, now, seed, progress)
@@ -122,17 +120,14 @@ def _robot(session: _Session, mass_kg: Array, seed: int, progress: Progress | No
     twin, empty = session.twin(mass_kg), session.twin(np.zeros(2))
     bent = [np.abs(one.path - empty[name].path)[one.usable] for name, one in twin.items()]
     floor = WEIGHT_KNOWN * max(float(np.max(item, initial=0.0)) for item in bent)
-    arms = session.arms
-    return diagnose_on_twin(
-        session.recordings, twin, arms.config, arms.hold, seed=seed, floor=floor, progress=progress
-    )
+    return diagnose_on_twin(session.recordings, twin, session.scene.scene, seed, floor, progress)
 
 
 def _corrected(session: _Session, found: Diagnosis, mass_kg: Array) -> Sequence[HandledEpisode]:
     """Episodes as the twin's own encoders would have read them, had the robot none of what was found."""
-    twin, arms = session.twin(mass_kg), session.arms
+    twin = session.twin(mass_kg)
     assert isinstance(found.extended_model, RobotModel)
-    more = beyond_twin(session.recordings, twin, arms.config, arms.hold, found.extended_model)
+    more = beyond_twin(session.recordings, twin, session.scene.scene, found.extended_model)
     return [
         replace(episode, position=episode.position - more[episode_name(episode.index)])
         for episode in session.episodes

@@ -80,16 +80,16 @@ def make_batch(trials: Sequence[RobotTrial]) -> Batch:
     longest = max(len(trial.time_s) for trial in trials)
     for trial in trials:
         _check(trial)
-    position = np.stack([_padded(trial.position, longest) for trial in trials], 1)
+    position = np.stack([padded(trial.position, longest) for trial in trials], 1)
     length = np.array([len(trial.time_s) for trial in trials])
     valid = np.arange(longest)[:, None] < length
     valid &= np.isfinite(position).all(2)
     load = None
     if all(trial.load is not None and np.isfinite(trial.load).all() for trial in trials):
-        load = np.stack([_padded(trial.load, longest) for trial in trials if trial.load is not None], 1)
+        load = np.stack([padded(trial.load, longest) for trial in trials if trial.load is not None], 1)
     return Batch(
-        time_s=np.stack([_padded(trial.time_s, longest) for trial in trials], 1),
-        command=np.stack([_padded(trial.command, longest) for trial in trials], 1),
+        time_s=np.stack([padded(trial.time_s, longest) for trial in trials], 1),
+        command=np.stack([padded(trial.command, longest) for trial in trials], 1),
         first_position=position[0].copy(),
         position=np.where(valid[..., None], position, 0.0),
         load=load,
@@ -108,7 +108,8 @@ def frame_s(batch: Batch) -> float:
     return float(np.median(dt)) if len(dt) else 1.0
 
 
-def _padded(values: Array, length: int) -> Array:
+def padded(values: Array, length: int) -> Array:
+    """Rows (N, ...) and, up to a length, their last one again."""
     return np.concatenate([values, np.repeat(values[-1:], length - len(values), 0)])
 
 

@@ -45,7 +45,6 @@ def diagnose_on_twin(
     recordings: RecordingSet,
     twin: Mapping[str, TwinTrial],
     config: SceneConfig,
-    hold: str,
     seed: int = 0,
     floor: float = 0.0,
     progress: Progress | None = None,
@@ -58,8 +57,8 @@ def diagnose_on_twin(
     Raises:
         KeyError: a trial that the twin did not follow.
     """
-    problem, _ = posed(recordings, twin, config, hold, COARSE_S)
-    fine, extra = posed(recordings, twin, config, hold, FINE_S)
+    problem, _ = posed(recordings, twin, config, COARSE_S)
+    fine, extra = posed(recordings, twin, config, FINE_S)
     problem = replace(problem, fine=fine, floor=max(problem.floor, floor))
     found = diagnose_problem(problem, seed, progress)
     traces = tuple(_absolute(trace, recordings.joints, extra, twin) for trace in found.traces)
@@ -67,30 +66,30 @@ def diagnose_on_twin(
 
 
 def posed(
-    recordings: RecordingSet, twin: Mapping[str, TwinTrial], config: SceneConfig, hold: str, step_s: float
+    recordings: RecordingSet, twin: Mapping[str, TwinTrial], config: SceneConfig, step_s: float
 ) -> tuple[TwinProblem, dict[str, Array]]:
     """The problem in steps of that length; by trial file (T, J) that was taken from the positions for it."""
-    extra = beyond_bare(recordings, twin, config, hold, step_s)
+    extra = beyond_bare(recordings, twin, config, step_s)
     trials = [_relative(trial, twin[trial.file], extra[trial.file]) for trial in recordings.trials]
-    return TwinProblem.on(recordings.joints, make_batch(trials), config, hold, step_s), extra
+    return TwinProblem.on(recordings.joints, make_batch(trials), config, step_s), extra
 
 
 def beyond_bare(
-    recordings: RecordingSet, twin: Mapping[str, TwinTrial], config: SceneConfig, hold: str, step_s: float
+    recordings: RecordingSet, twin: Mapping[str, TwinTrial], config: SceneConfig, step_s: float
 ) -> dict[str, Array]:
     """By trial file: (T, J) that the whole twin does beyond the bare arms in steps of that length."""
     copies = [replace(t, command=twin[t.file].command, position=twin[t.file].path) for t in recordings.trials]
-    problem = TwinProblem.on(recordings.joints, make_batch(copies), config, hold, step_s)
+    problem = TwinProblem.on(recordings.joints, make_batch(copies), config, step_s)
     left = problem.residual(problem.predict(problem.start()))
     return {trial.file: left[: len(trial.time_s), k] for k, trial in enumerate(copies)}
 
 
 def beyond_twin(
-    recordings: RecordingSet, twin: Mapping[str, TwinTrial], config: SceneConfig, hold: str, model: RobotModel
+    recordings: RecordingSet, twin: Mapping[str, TwinTrial], config: SceneConfig, model: RobotModel
 ) -> dict[str, Array]:
     """By trial file: (T, J) that a model found by `diagnose_on_twin` adds to the twin."""
     trials = [replace(trial, command=twin[trial.file].command) for trial in recordings.trials]
-    problem = TwinProblem.on(recordings.joints, make_batch(trials), config, hold, FINE_S)
+    problem = TwinProblem.on(recordings.joints, make_batch(trials), config, FINE_S)
     more = problem.predict(from_model(model)) - problem.predict(problem.start())
     return {trial.file: more[: len(trial.time_s), k] for k, trial in enumerate(trials)}
 

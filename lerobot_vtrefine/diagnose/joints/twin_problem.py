@@ -45,8 +45,6 @@ class TwinProblem(JointProblem):
     """A `JointProblem` whose predictions are replays; trials are those of the twin's own robot,
     evenly spaced."""
 
-    hold: str = "linear"
-    """linear or zero_order, see `command_replay.HOLDS`."""
     config: SceneConfig = SceneConfig()  # noqa: RUF009  frozen
 
     step_s: float = COARSE_S
@@ -62,17 +60,12 @@ class TwinProblem(JointProblem):
 
     @classmethod
     def on(
-        cls,
-        names: tuple[str, ...],
-        batch: Batch,
-        config: SceneConfig,
-        hold: str,
-        step_s: float = COARSE_S,
+        cls, names: tuple[str, ...], batch: Batch, config: SceneConfig, step_s: float = COARSE_S
     ) -> "TwinProblem":
         """From the joints' names and their trials."""
         plain = JointProblem.of(names, batch)
         parts = plain.names, plain.batch, plain.shapes, plain.scale
-        return cls(*parts, hold=hold, config=config, step_s=step_s)
+        return cls(*parts, config=config, step_s=step_s)
 
     @override
     def subset(self, trials: Array) -> "TwinProblem":
@@ -132,7 +125,6 @@ class TwinProblem(JointProblem):
             np.stack([np.zeros_like(self.batch.command) if push is None else push for push in pushes]),
             sets[..., INDEX["play"]],
             self.batch.first_position - sets[:, None, :, INDEX["offset"]],
-            self.hold,
             point.tau_s,
         )
         replayed = arms.replay(way, sets)
@@ -167,7 +159,6 @@ class _Way:
     """(S, J) full widths."""
     start: Array
     """(S, T, J) where joints rest at first."""
-    hold: str
     tau_s: float
 
 
@@ -226,14 +217,14 @@ class _Arms:
         flat = way.target.transpose(1, 0, 2, 3).reshape(frames, sheets * trials, count)
         servo = np.stack([task.servo_commands(self.robot, row) for row in flat], 1)
         rest = task.servo_commands(self.robot, first)[:, None]
-        wanted = self._between(rest, servo, way.hold)
+        wanted = self._between(rest, servo)
         half = np.abs(np.repeat(self._per_servo(way.play * self.side), trials, 0)) / 2
         out, state = np.empty_like(wanted), rest[:, 0]
         for k in range(wanted.shape[1]):
             out[:, k] = state = np.clip(state, wanted[:, k] - half, wanted[:, k] + half)
         if way.push.any():
             push = self._per_servo(way.push).transpose(0, 2, 1, 3).reshape(sheets * trials, frames, -1)
-            out += self._between(push[:, :1], push, way.hold)
+            out += self._between(push[:, :1], push)
         return _late(out, rest[:, 0], way.tau_s / self.model.opt.timestep)
 
     def _per_servo(self, values: Array) -> Array:
@@ -241,11 +232,11 @@ class _Arms:
         flat = task.servo_values(self.robot, values.reshape(-1, values.shape[-1]))
         return flat.reshape(*values.shape[:-1], -1)
 
-    def _between(self, first: Array, values: Array, hold: str) -> Array:
-        """Values (W, N, nu) of frames, after `first` (W, 1, nu), at every step but the last frame's."""
+    def _between(self, first: Array, values: Array) -> Array:
+        """Values (W, N, nu) of frames, after `first` (W, 1, nu), at every step but the last frame's: targets
+        ramp over a frame, as `InsertionSim` has it."""
         before = np.concatenate([first, values[:, :-1]], 1)[:, :-1, None]
-        weight = self.weight if hold == "linear" else np.ones_like(self.weight)
-        between = before + weight[:, None] * (values[:, :-1, None] - before)
+        between = before + self.weight[:, None] * (values[:, :-1, None] - before)
         return between.reshape(len(values), -1, values.shape[-1])
 
     def _prepared(self, count: int) -> Worlds:

@@ -14,7 +14,6 @@ import numpy as np
 from lerobot_vtrefine.diagnose.parts.episodes import AssumedScene, HandledEpisode, hands
 from lerobot_vtrefine.diagnose.parts.forces import places, point_forces
 from lerobot_vtrefine.diagnose.parts.grasp_geometry import pitches, tip_and_mouth
-from lerobot_vtrefine.diagnose.parts.payload import Arms
 from lerobot_vtrefine.diagnose.parts.problem import Quantity
 from lerobot_vtrefine.diagnose.parts.regression import Blocks
 
@@ -50,7 +49,7 @@ class Contact:
 
 
 def contacts_of(
-    arms: Arms, scene: AssumedScene, episodes: Sequence[HandledEpisode], untouched: Sequence[Array]
+    scene: AssumedScene, episodes: Sequence[HandledEpisode], untouched: Sequence[Array]
 ) -> list[Contact]:
     """Of every episode; `untouched` are the twin's positions (T, J) with the parts' weights."""
     out = []
@@ -58,7 +57,7 @@ def contacts_of(
         held = np.flatnonzero(episode.held.all(1))
         turns = hands(scene.body, episode.position[held[:1]] if len(held) else episode.position[:1])[1]
         points = tip_and_mouth(scene, pitches(turns)[0])
-        force = point_forces(arms, episode, path, points)
+        force = point_forces(scene, episode, path, points)
         out.append(Contact(force, places(scene.body, episode.position, points)))
     return out
 

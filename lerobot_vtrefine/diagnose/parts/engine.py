@@ -17,7 +17,7 @@ from lerobot_vtrefine.diagnose.parts import friction as sliding
 from lerobot_vtrefine.diagnose.parts.clearance import clearance, contacts_of
 from lerobot_vtrefine.diagnose.parts.episodes import AssumedScene, HandledEpisode
 from lerobot_vtrefine.diagnose.parts.mass import masses, remeasured
-from lerobot_vtrefine.diagnose.parts.payload import Arms, replay_loaded
+from lerobot_vtrefine.diagnose.parts.payload import replay_loaded
 from lerobot_vtrefine.diagnose.parts.problem import Measured, Quantity, measure
 from lerobot_vtrefine.diagnose.verdict import Cause, Verdict
 from lerobot_vtrefine.embodiments.embodiment import PARTS
@@ -49,17 +49,15 @@ def assumed_masses(scene: AssumedScene) -> Array:
     return np.array([built.model.body_mass[built.socket_body], built.model.body_mass[built.plug_body]])
 
 
-def weighed(
-    arms: Arms, scene: AssumedScene, episodes: Sequence[HandledEpisode], seed: int
-) -> tuple[Measured, ...]:
+def weighed(scene: AssumedScene, episodes: Sequence[HandledEpisode], seed: int) -> tuple[Measured, ...]:
     """Socket and plug, as far as episodes show them."""
-    found = measure(masses(arms, scene, episodes, assumed_masses(scene), seed), seed)
-    return remeasured(arms, scene, episodes, found, seed)
+    found = measure(masses(scene, episodes, assumed_masses(scene), seed), seed)
+    return remeasured(scene, episodes, found, seed)
 
 
-def found_masses(arms: Arms, scene: AssumedScene, episodes: Sequence[HandledEpisode], seed: int) -> Array:
+def found_masses(scene: AssumedScene, episodes: Sequence[HandledEpisode], seed: int) -> Array:
     """(2,) of socket and plug as episodes show them, as assumed where they show nothing else."""
-    return np.array([item.believed for item in weighed(arms, scene, episodes, seed)])
+    return np.array([item.believed for item in weighed(scene, episodes, seed)])
 
 
 def believed_masses(found: Diagnosis, scene: AssumedScene) -> Array:
@@ -70,14 +68,12 @@ def believed_masses(found: Diagnosis, scene: AssumedScene) -> Array:
     )
 
 
-def diagnose_parts(
-    arms: Arms, scene: AssumedScene, episodes: Sequence[HandledEpisode], seed: int = 0
-) -> Diagnosis:
+def diagnose_parts(scene: AssumedScene, episodes: Sequence[HandledEpisode], seed: int = 0) -> Diagnosis:
     """Judge the parts of episodes whose encoders are trusted (what robots get wrong taken off before)."""
-    found = list(weighed(arms, scene, episodes, seed))
+    found = list(weighed(scene, episodes, seed))
     mass = np.array([item.believed for item in found])
-    untouched = replay_loaded(arms, episodes, scene.weights_n(episodes, mass), contacts=False)
-    contacts = contacts_of(arms, scene, episodes, untouched)
+    untouched = replay_loaded(scene, episodes, scene.weights_n(episodes, mass), contacts=False)
+    contacts = contacts_of(scene, episodes, untouched)
     found += measure([sliding.friction(scene, episodes, contacts)], seed)
     known = scene.scene.pad_friction
     pads = Quantity("object_friction", "pad_friction", known, "1", sliding.FORM, None, PAD_FRICTION)

@@ -10,8 +10,7 @@ Shapes: T frames, A hands, K revolute joints of an arm.
 import numpy as np
 import torch
 
-from lerobot_vtrefine.diagnose.parts.episodes import HandledEpisode, hands
-from lerobot_vtrefine.diagnose.parts.payload import Arms
+from lerobot_vtrefine.diagnose.parts.episodes import AssumedScene, HandledEpisode, hands
 from lerobot_vtrefine.embodiments import Embodiment
 
 Array = np.ndarray
@@ -23,14 +22,14 @@ _BESIDE_NM = 0.1
 """Torque of 10 N that act 10 mm beside the point."""
 
 
-def point_forces(arms: Arms, episode: HandledEpisode, untouched: Array, points: Array) -> Array:
+def point_forces(scene: AssumedScene, episode: HandledEpisode, untouched: Array, points: Array) -> Array:
     """Forces (T, A, 3) [N], world axes, on points (A, 3) fixed in the hands' TCP frames.
 
     Args:
         untouched: (T, J) positions of the twin's arms under the same commands and weights, nothing touching.
     """
-    body = arms.body
-    stiffness = np.array([joint.stiffness for joint in body.joints]) * arms.config.servo_gain_scale
+    body = scene.body
+    stiffness = np.array([joint.stiffness for joint in body.joints]) * scene.scene.servo_gain_scale
     friction = np.array([joint.friction_loss for joint in body.joints])
     information = 1.0 / (friction**2 + (_NOISE_RAD * stiffness) ** 2 + _BESIDE_NM**2)
     torque = body.by_arm(episode.position - untouched)[..., : len(body.joints)] * stiffness

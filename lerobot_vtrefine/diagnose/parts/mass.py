@@ -13,7 +13,7 @@ from dataclasses import replace
 import numpy as np
 
 from lerobot_vtrefine.diagnose.parts.episodes import AssumedScene, HandledEpisode
-from lerobot_vtrefine.diagnose.parts.payload import Arms, replay_loaded
+from lerobot_vtrefine.diagnose.parts.payload import replay_loaded
 from lerobot_vtrefine.diagnose.parts.problem import Measured, Quantity
 from lerobot_vtrefine.diagnose.parts.regression import Blocks, Line, slope_of
 from lerobot_vtrefine.embodiments import Embodiment
@@ -38,23 +38,22 @@ chance."""
 
 
 def masses(
-    arms: Arms, scene: AssumedScene, episodes: Sequence[HandledEpisode], assumed_kg: Array, seed: int
+    scene: AssumedScene, episodes: Sequence[HandledEpisode], assumed_kg: Array, seed: int
 ) -> tuple[Quantity, ...]:
     """Of socket and plug, from episodes in which they are picked up; `assumed_kg` is (2,)."""
-    lines = _lines(arms, scene, episodes, assumed_kg)
+    lines = _lines(scene, episodes, assumed_kg)
     out = []
     for part, known, item in zip(PARTS, assumed_kg, lines, strict=True):
         name = f"{part}_kg"
         if isinstance(item, str):
             out.append(Quantity("object_mass", name, float(known), "kg", FORM, None, item))
             continue
-        reason = _disagreement(arms.body, item, slope_of(Blocks.of(item), seed), seed)
+        reason = _disagreement(scene.body, item, slope_of(Blocks.of(item), seed), seed)
         out.append(Quantity("object_mass", name, float(known), "kg", FORM, Blocks.of(item), reason))
     return tuple(out)
 
 
 def remeasured(
-    arms: Arms,
     scene: AssumedScene,
     episodes: Sequence[HandledEpisode],
     found: Sequence[Measured],
@@ -68,7 +67,7 @@ def remeasured(
     if not (np.abs(near) > _AGAIN * assumed).any():
         return tuple(found)
     out = []
-    again_lines = _lines(arms, scene, episodes, assumed + near)
+    again_lines = _lines(scene, episodes, assumed + near)
     for item, lines, step in zip(found, again_lines, near.tolist(), strict=True):
         if item.line is None or isinstance(lines, str):
             out.append(item)
@@ -81,11 +80,11 @@ def remeasured(
 
 
 def _lines(
-    arms: Arms, scene: AssumedScene, episodes: Sequence[HandledEpisode], assumed_kg: Array
+    scene: AssumedScene, episodes: Sequence[HandledEpisode], assumed_kg: Array
 ) -> list[list[tuple[Array, Array, Array]] | str]:
     """Of either part: blocks for `Blocks.of`, or why there are none."""
     masses_kg = assumed_kg, assumed_kg + _HEAVIER_KG
-    replays = [replay_loaded(arms, episodes, scene.weights_n(episodes, mass)) for mass in masses_kg]
+    replays = [replay_loaded(scene, episodes, scene.weights_n(episodes, mass)) for mass in masses_kg]
     out: list[list[tuple[Array, Array, Array]] | str] = []
     for part in PARTS:
         hand = scene.hand_of(part)
@@ -100,7 +99,7 @@ def _lines(
             )
         else:
             paths = zip(episodes, *replays, strict=True)
-            out.append([_block(arms.body, e, *item, hand) for e, *item in paths])
+            out.append([_block(scene.body, e, *item, hand) for e, *item in paths])
     return out
 
 

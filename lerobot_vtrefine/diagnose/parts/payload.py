@@ -4,46 +4,28 @@ Shapes: E episodes of T frames, J joints, A hands.
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 
 import mujoco
 import numpy as np
 import torch
 from mujoco.batch import Batch
 
-from lerobot_vtrefine.diagnose.parts.episodes import HandledEpisode, without_hands
-from lerobot_vtrefine.embodiments import Embodiment, get_embodiment
+from lerobot_vtrefine.diagnose.joints.batch import padded
+from lerobot_vtrefine.diagnose.parts.episodes import AssumedScene, HandledEpisode, without_hands
+from lerobot_vtrefine.embodiments import Embodiment
 from lerobot_vtrefine.sim import task
 from lerobot_vtrefine.sim.backends.base import ramp
 from lerobot_vtrefine.sim.backends.batch import usable_cores
-from lerobot_vtrefine.sim.config import SceneConfig, TaskConfig
 from lerobot_vtrefine.sim.scene import build_arms
 from lerobot_vtrefine.sim.starts import HAND_RETREAT_M
 
 Array = np.ndarray
 
 
-@dataclass(frozen=True)
-class Arms:
-    """The twin's arms and how commands reach their servos."""
-
-    config: SceneConfig
-    rules: TaskConfig | None
-    """Clamps of the commanded rates; None: commands are taken as they are."""
-    dt_s: float
-    hold: str
-    """linear (as `InsertionSim`) or zero_order (as motors)."""
-
-    @property
-    def body(self) -> Embodiment:
-        """The robot."""
-        return get_embodiment(self.config.embodiment)
-
-
 def replay_loaded(
-    arms: Arms,
+    scene: AssumedScene,
     episodes: Sequence[HandledEpisode],
-    weight_n: Sequence[Array] | None = None,
+    weight_n: Sequence[Array],
     *,
     contacts: bool = True,
 ) -> list[Array]:
@@ -51,18 +33,19 @@ def replay_loaded(
 
     Args:
         weight_n: per episode (T, A), the weight in each hand while frame t + 1 comes about, at the place
-            where hands hold parts ideally; none by default.
+            where hands hold parts ideally.
         contacts: whether hands stop at the table and at each other.
     """
-    substeps = int(np.ceil(arms.dt_s / arms.config.timestep_s - 1e-6))
-    model, robot, joints = build_arms(arms.config)
-    model.opt.timestep = arms.dt_s / substeps
+    dt_s = scene.rules.control_dt_s
+    substeps = int(np.ceil(dt_s / scene.scene.timestep_s - 1e-6))
+    model, robot, joints = build_arms(scene.scene)
+    model.opt.timestep = dt_s / substeps
     if not contacts:
         model.opt.disableflags |= int(mujoco.mjtDisableBit.mjDSBL_CONTACT)
     lengths = [len(episode.command) for episode in episodes]
-    commands = np.stack([_padded(given(arms, item), max(lengths)) for item in episodes], 1)
+    commands = np.stack([padded(given(scene, item), max(lengths)) for item in episodes], 1)
     weights = np.zeros((max(lengths), len(episodes), robot.num_arms))
-    for place, values in enumerate(weight_n or []):
+    for place, values in enumerate(weight_n):
         weights[: len(values), place] = values
     worlds = Batch(model, nsim=len(episodes), nthread=usable_cores())
     qpos, qvel, push = (worlds.bind(name) for name in ("qpos", "qvel", "xfrc_applied"))
@@ -78,24 +61,18 @@ def replay_loaded(
         after = task.servo_commands(robot, command)
         if weight.any() or push[:, hand_bodies].any():
             push[:, hand_bodies] = _wrenches(robot, path[-1], weight)
-        if arms.hold == "linear":
-            controls = ramp(before, after, substeps)
-        else:
-            controls = np.repeat(after[:, None], substeps, 1)
-        out = worlds.rollout(substeps, control=controls, record=("qpos",), ids=None)
+        out = worlds.rollout(substeps, control=ramp(before, after, substeps), record=("qpos",), ids=None)
         path.append(out["qpos"][:, -1][:, joints])
         before = after
     stacked = np.stack(path, 1)
     return [stacked[place, :length] for place, length in enumerate(lengths)]
 
 
-def given(arms: Arms, episode: HandledEpisode) -> Array:
+def given(scene: AssumedScene, episode: HandledEpisode) -> Array:
     """(T, J) commands as the servos get them: within limits and rates, fingers where they hold something."""
-    body = arms.body
+    body = scene.body
     wanted = task.servo_commands(body, without_hands(body, episode))
-    if arms.rules is None:
-        return task.joint_targets(body, wanted)
-    rates = task.rate_limits(body, arms.rules)
+    rates = task.rate_limits(body, scene.rules)
     now, out = task.servo_commands(body, episode.position[:1])[0], []
     for row in wanted:
         now = np.clip(row, now - rates, now + rates)
@@ -113,7 +90,3 @@ def _wrenches(body: Embodiment, joints: Array, weight: Array) -> Array:
     force = np.zeros((*weight.shape, 3))
     force[..., 2] = -weight
     return np.concatenate([force, np.cross(lever, force)], -1)
-
-
-def _padded(values: Array, length: int) -> Array:
-    return np.concatenate([values, np.repeat(values[-1:], length - len(values), 0)])
