@@ -102,11 +102,11 @@ def test_missing_dataset_is_not_downloaded(tmp_path, monkeypatch) -> None:
 def test_depth_frames(tmp_path) -> None:
     root, state = write_dataset(tmp_path / "ds")
     assert has_depth(root)
-    frames = read_frames(root, per_episode=2)
-    assert frames.episode.tolist() == [0, 0, 1, 1]
-    # First and last frame of every episode, in metres.
-    np.testing.assert_allclose(frames.depth_m[:, 0, 0], [0.7, 0.704, 0.705, 0.712])
-    np.testing.assert_array_equal(frames.joints[1], state[4])
+    frames = read_frames(root)
+    assert frames.episode.tolist() == [0, 0, 0, 1, 1, 1]
+    # First, middle and last frame of every episode, in metres.
+    np.testing.assert_allclose(frames.depth_m[:, 0, 0], [0.7, 0.702, 0.704, 0.705, 0.709, 0.712])
+    np.testing.assert_array_equal(frames.joints[2], state[4])
     np.testing.assert_allclose(frames.rotation[0], [[1, 0, 0], [0, 0, -1], [0, 1, 0]], atol=1e-12)
     np.testing.assert_allclose(frames.position_m[0], [0.1, 0.2, 0.3])
 

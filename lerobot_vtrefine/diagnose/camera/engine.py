@@ -7,7 +7,6 @@ from typing import Any
 import numpy as np
 
 from lerobot_vtrefine.diagnose.camera.frames import DepthFrames, read_frames
-from lerobot_vtrefine.diagnose.camera.model import CameraModel
 from lerobot_vtrefine.diagnose.camera.problem import CANDIDATES, CameraProblem, Candidate, Fit
 from lerobot_vtrefine.diagnose.core.diagnosis import Diagnosis
 from lerobot_vtrefine.diagnose.core.engine import Inference, Progress, infer
@@ -72,10 +71,8 @@ class CameraAccount:
         """Empty: the stated camera has none."""
         return {}
 
-    def model(self, fit: Fit) -> CameraModel:
-        """The fitted shift, turn and scale."""
-        x, y, z, rx, ry, rz, scale = (float(value) for value in fit.registration.theta)
-        return CameraModel((x, y, z), (rx, ry, rz), float(np.exp(scale)))
+    def model(self, fit: Fit) -> None:
+        """None: simulations take the camera's place and scale from their own settings."""
 
     def minimum_detectable(self) -> Mapping[str, float]:
         """Smallest shift [m] and deviation of the scale from 1 that stand out from the episodes' scatter."""

@@ -13,6 +13,7 @@ from PIL import Image
 from lerobot_vtrefine.datasets.features import CAMERA_POSE_KEY, DEPTH_KEY, INTRINSICS_KEY, STATE_KEY
 from lerobot_vtrefine.files import inside
 from lerobot_vtrefine.files.tables import read_columns
+from lerobot_vtrefine.sim.rotations import quat_to_matrix
 
 Array = np.ndarray
 
@@ -53,7 +54,7 @@ def has_depth(root: Path) -> bool:
     return bool(files) and wanted <= set(pq.read_schema(files[0]).names)
 
 
-def read_frames(root: Path, per_episode: int = FRAMES_PER_EPISODE) -> DepthFrames:
+def read_frames(root: Path) -> DepthFrames:
     """Frames spread evenly over every episode.
 
     Raises ValueError if the dataset lacks depth, the camera's pose or its intrinsics, or these change.
@@ -66,7 +67,7 @@ def read_frames(root: Path, per_episode: int = FRAMES_PER_EPISODE) -> DepthFrame
     parts = []
     for path in sorted((root / "data").rglob("*.parquet")):
         table = read_columns(path, columns)
-        parts.append(table.take(pa.array(_chosen(table, per_episode))))
+        parts.append(table.take(pa.array(_chosen(table))))
     table = pa.concat_tables(parts)
     intrinsics = _matrix(table[INTRINSICS_KEY])
     if np.abs(intrinsics - intrinsics[0]).max() > 1e-3:
@@ -78,17 +79,17 @@ def read_frames(root: Path, per_episode: int = FRAMES_PER_EPISODE) -> DepthFrame
         depth_m=np.stack(images) * MILLIMETRES,
         intrinsics=intrinsics[0],
         position_m=pose[:, :3],
-        rotation=_rotations(pose[:, 3:]),
+        rotation=quat_to_matrix(pose[:, 3:] / np.linalg.norm(pose[:, 3:], axis=1, keepdims=True)),
         joints=_matrix(table[STATE_KEY]),
     )
 
 
-def _chosen(table: pa.Table, per_episode: int) -> Array:
+def _chosen(table: pa.Table) -> Array:
     episode = table["episode_index"].to_numpy()
     rows = []
     for index in np.unique(episode):
         own = np.flatnonzero(episode == index)
-        rows.append(own[np.linspace(0, len(own) - 1, min(per_episode, len(own))).round().astype(int)])
+        rows.append(own[np.linspace(0, len(own) - 1, min(FRAMES_PER_EPISODE, len(own))).round().astype(int)])
     return np.concatenate(rows)
 
 
@@ -100,13 +101,3 @@ def _image(root: Path, row: dict[str, bytes | str | None]) -> Array:
     data = row.get("bytes")
     source = io.BytesIO(data) if isinstance(data, bytes) else inside(root, str(row.get("path")))
     return np.asarray(Image.open(source), dtype=float)
-
-
-def _rotations(quat_wxyz: Array) -> Array:
-    w, x, y, z = (quat_wxyz / np.linalg.norm(quat_wxyz, axis=1, keepdims=True)).T
-    rows = [
-        [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
-        [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
-        [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
-    ]
-    return np.array(rows).transpose(2, 0, 1)

@@ -67,10 +67,8 @@ class Twin:
 
 def rotation_of(vector: Array) -> Array:
     """Rotation (3, 3) by small angles about x, then y, then z."""
-    out = np.eye(3)
-    for axis in range(3):
-        out = out @ about_axis(axis, vector[axis : axis + 1])[0]
-    return out
+    x, y, z = vector
+    return about_axis(0, x) @ about_axis(1, y) @ about_axis(2, z)
 
 
 @dataclass(frozen=True)
