@@ -14,6 +14,7 @@ import mujoco
 import numpy as np
 
 from lerobot_vtrefine.diagnose.camera.frames import DepthFrames
+from lerobot_vtrefine.diagnose.core.normal_equations import solved
 from lerobot_vtrefine.sim.camera import Camera
 from lerobot_vtrefine.sim.config import SceneConfig
 from lerobot_vtrefine.sim.depth import DepthCamera
@@ -146,9 +147,6 @@ def _equations(twin: Twin, theta: Array, cut: float) -> tuple[Array, Array]:
 
 def _step(normal: Array, slope: Array, weights: Array, free: Array) -> Array:
     total, right = np.tensordot(weights, normal, 1)[np.ix_(free, free)], (weights @ slope)[free]
-    diagonal = np.diag(total)
-    scale = 1 / np.sqrt(np.where(diagonal > 0, diagonal, 1.0))
-    matrix = total * scale[:, None] * scale + 1e-9 * np.eye(len(total))
     out = np.zeros(PARAMETERS)
-    out[free] = scale * np.linalg.solve(matrix, scale * right)
+    out[free] = solved(total, right, 1e-9)
     return out

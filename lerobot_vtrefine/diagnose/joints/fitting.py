@@ -9,6 +9,7 @@ from typing import Self
 
 import numpy as np
 
+from lerobot_vtrefine.diagnose.core.normal_equations import solved
 from lerobot_vtrefine.diagnose.joints import gravity, stages
 from lerobot_vtrefine.diagnose.joints.batch import Batch, frame_s
 from lerobot_vtrefine.diagnose.joints.parameters import INDEX, PARAMETERS, POSITIVE, RATIOS, SAG
@@ -30,6 +31,7 @@ _START_OMEGA = (4.0, 10.0, 25.0, 60.0)
 _START_ZETA = (0.4, 1.0, 2.0)
 _TOLERANCE = 1e-5
 _RIDGE = (1e-4, 3e-3)  # where commands are repeated, and where nothing tells misfit from sag
+_LEAST_DAMPING = 1e-9
 _SHORTEST = 1e5
 """Damping beyond which a joint has nowhere better to go."""
 
@@ -305,7 +307,7 @@ class _Fitter:
         else:
             for joint in np.flatnonzero(~self.settled):
                 normal, slope = self._normal(now, derivative, joint)
-                theta[joint, self.free[joint]] += _solve(normal, slope, self.damping[joint])
+                theta[joint, self.free[joint]] += solved(normal, slope, self.damping[joint] + _LEAST_DAMPING)
         return _bounded(self.problem, replace(now.point, theta=theta, tau_s=tau), self.free)
 
     def _tau_step(self, now: Fit, derivative: "Derivatives", theta: Array) -> float:
@@ -318,7 +320,7 @@ class _Fitter:
             index = [*range(end - sizes[joint], end), ends[-1]]
             normal[np.ix_(index, index)] += self.weight[joint] * block
             slope[index] += self.weight[joint] * right
-        change = _solve(normal, slope, float(self.damping[0]))
+        change = solved(normal, slope, self.damping[0] + _LEAST_DAMPING)
         theta[self.free] += change[:-1]
         return float(change[-1])
 
@@ -367,14 +369,6 @@ def derivatives(problem: ServoTrials, now: Fit) -> Derivatives:
         later = problem.predict(replace(now.point, tau_s=now.point.tau_s + step))
         tau = np.where(problem.batch.valid[..., None], later - here, 0.0) / step
     return Derivatives(columns, tau)
-
-
-def _solve(normal: Array, slope: Array, damping: float) -> Array:
-    diagonal = np.diag(normal).copy()
-    diagonal = np.where(diagonal > 0, diagonal, 1.0)
-    scale = 1 / np.sqrt(diagonal)
-    matrix = normal * scale[:, None] * scale + (damping + 1e-9) * np.eye(len(normal))
-    return scale * np.linalg.solve(matrix, scale * slope)
 
 
 def _bounded(problem: ServoTrials, point: Point, free: Array) -> Point:

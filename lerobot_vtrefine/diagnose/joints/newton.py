@@ -8,6 +8,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from lerobot_vtrefine.diagnose.core.normal_equations import solved
 from lerobot_vtrefine.diagnose.core.rules import MIN_CONDITIONS
 from lerobot_vtrefine.diagnose.joints.fitting import TAU_BOUND_S, Fit, Point, ServoTrials, derivatives, ridge
 from lerobot_vtrefine.diagnose.joints.parameters import INDEX, POSITIVE
@@ -52,7 +53,7 @@ class Curvature:
         else:
             for joint in np.flatnonzero(self.fit.free.any(1)):
                 normal, slope = self._reweighted(joint, weights)
-                theta[joint, self.fit.free[joint]] += _solve(normal, slope)
+                theta[joint, self.fit.free[joint]] += solved(normal, slope, _RIDGE)
         for name in POSITIVE:
             theta[:, INDEX[name]] = theta[:, INDEX[name]].clip(min=0.0)
         theta[:, :2] = theta[:, :2].clip(self.fit.point.theta[:, :2] - 1.0, self.fit.point.theta[:, :2] + 1.0)
@@ -69,19 +70,19 @@ class Curvature:
 
     def _shared(self, weights: Array, theta: Array) -> float:
         """Moves all joints' parameters and returns the step of the delay (Schur complement)."""
-        top, bottom, solved = 0.0, 1e-12, []
+        top, bottom, eliminated = 0.0, 1e-12, []
         for joint in range(len(theta)):
             normal, slope = (self.weight[joint] * item for item in self._reweighted(joint, weights))
             own, cross = normal[:-1, :-1], normal[:-1, -1]
             if len(cross):
-                local, coupled = _solve(own, slope[:-1]), _solve(own, cross)
+                local, coupled = solved(own, slope[:-1], _RIDGE), solved(own, cross, _RIDGE)
                 top += slope[-1] - cross @ local
                 bottom += normal[-1, -1] - cross @ coupled
-                solved.append((joint, local, coupled))
+                eliminated.append((joint, local, coupled))
             else:
                 top, bottom = top + slope[-1], bottom + normal[-1, -1]
         step = top / bottom
-        for joint, local, coupled in solved:
+        for joint, local, coupled in eliminated:
             theta[joint, self.fit.free[joint]] += local - coupled * step
         return float(step)
 
@@ -129,10 +130,3 @@ def without_ridge(problem: ServoTrials, fit: Fit) -> Array:
     curvature = Curvature.at(problem, fit)
     bare = replace(curvature, ridge=np.zeros_like(curvature.ridge))
     return bare.moved(np.ones(problem.batch.trials)).theta
-
-
-def _solve(normal: Array, slope: Array) -> Array:
-    diagonal = np.diag(normal)
-    scale = 1 / np.sqrt(np.where(diagonal > 0, diagonal, 1.0))
-    matrix = normal * scale[:, None] * scale + _RIDGE * np.eye(len(normal))
-    return scale * np.linalg.solve(matrix, scale * slope)

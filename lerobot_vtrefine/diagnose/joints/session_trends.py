@@ -9,6 +9,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from lerobot_vtrefine.diagnose.core.normal_equations import solved
 from lerobot_vtrefine.diagnose.joints.batch import Batch
 
 Array = np.ndarray
@@ -66,10 +67,6 @@ def _by_trial(batch: Batch, residual: Array, own: Array, tau: Array, joint: int)
         command = batch.command[valid, trial, joint]
         parts = [np.ones(len(command)), command, *own[valid, trial, :2].T, tau[valid, trial, joint]]
         design = np.stack(parts, 1)
-        norm = np.square(design).sum(0).clip(1e-300)
-        scaled = design / np.sqrt(norm)
-        normal = scaled.T @ scaled + _RIDGE * np.eye(len(norm))
-        solved = np.linalg.solve(normal, scaled.T @ residual[valid, trial, joint])
-        sizes.append(solved / np.sqrt(norm))
-        power.append(norm)
+        sizes.append(solved(design.T @ design, design.T @ residual[valid, trial, joint], _RIDGE))
+        power.append(np.square(design).sum(0))
     return np.array(sizes), np.array(power)

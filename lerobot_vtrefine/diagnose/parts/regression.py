@@ -9,6 +9,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.stats import t as student_t
 
+from lerobot_vtrefine.diagnose.core.normal_equations import solved
 from lerobot_vtrefine.diagnose.core.resampling import draws_of
 
 Array = np.ndarray
@@ -55,10 +56,8 @@ class Blocks:
         """Coefficients (P,) with every episode counted by its weight (E,); without slope it stays zero."""
         own = np.arange(self.normal.shape[1] - (not slope))
         normal, right = np.tensordot(weights, self.normal, 1), weights @ self.right
-        size = np.sqrt(np.diag(normal)).clip(1e-150)[own]
-        matrix = normal[np.ix_(own, own)] / (size[:, None] * size) + _RIDGE * np.eye(len(own))
         out = np.zeros(len(normal))
-        out[own] = np.linalg.solve(matrix, right[own] / size) / size
+        out[own] = solved(normal[np.ix_(own, own)], right[own], _RIDGE)
         return out
 
     def errors(self, theta: Array) -> Array:
