@@ -134,7 +134,7 @@ def run(
             model.save(folder / name)
     model = shlex.quote(str((final or folder) / FILES[1]))
     film = press_film(found, recordings)
-    page = render_report(found.verdict, found, recordings, found.checked, seed, film, survived, model)
+    page = render_report(found, recordings, seed, film, survived, model)
     (folder / "report.html").write_text(page, encoding="utf-8")
     write_verdict(found.verdict, folder / "verdict.json")
     return found.verdict, found.unit, survived

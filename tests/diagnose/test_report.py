@@ -50,7 +50,7 @@ INVALID = Diagnosis(Verdict("invalid_data", data_issues=(ISSUE,)))
 
 def page(diagnosis, recordings, issues=(ISSUE,)):
     found = diagnosis.noting(*issues)
-    return render_report(found.verdict, found, recordings, len(recordings.trials) - 1, 0)
+    return render_report(replace(found, checked=len(recordings.trials) - 1), recordings, 0)
 
 
 def text_of(html):

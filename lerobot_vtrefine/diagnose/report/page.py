@@ -48,10 +48,8 @@ DECISIONS = {
 
 
 def render_report(
-    verdict: Verdict,
-    diagnosis: Diagnosis | None,
+    diagnosis: Diagnosis,
     recordings: RecordingSet,
-    sound: int,
     seed: int,
     film: dict[str, str] | None = None,
     survived: str = "",
@@ -60,14 +58,12 @@ def render_report(
     """The page as HTML text.
 
     Args:
-        diagnosis: None when the data allowed none (``invalid_data``).
         recordings: as they were read, before quality control.
-        sound: number of trials that passed it.
         film: a press in motion: its source, caption and colour scale.
         survived: which names other draws and halves of the recordings give, in one line.
         model: where the extended model is, as the reader would type it.
     """
-    unit = diagnosis.unit if diagnosis is not None else "counts"
+    verdict, unit, sound = diagnosis.verdict, diagnosis.unit, diagnosis.checked
     of_pad = recordings.kind == "pad"
     return render(
         "lerobot_vtrefine.diagnose.report",
@@ -91,7 +87,7 @@ def render_report(
         use=_use(verdict, recordings, model),
         film=film,
         not_tested=[{"title": title(name), "needs": what} for name, what in verdict.not_tested.items()],
-        **(_nothing() if diagnosis is None else _findings(verdict, diagnosis, unit, of_pad)),
+        **_findings(diagnosis, of_pad),
     )
 
 
@@ -119,25 +115,8 @@ def _use(verdict: Verdict, recordings: RecordingSet, model: str) -> dict[str, st
     return {"words": said, "commands": "\n\n".join(lines)}
 
 
-def _nothing() -> dict[str, Any]:
-    names = (
-        "error_chart",
-        "trial_chart",
-        "trial_note",
-        "traces",
-        "more_traces",
-        "residuals",
-        "worst_joint",
-        "evidence",
-        "not_found",
-        "parameters",
-        "baseline",
-        "maps",
-    )
-    return dict.fromkeys(names, ())
-
-
-def _findings(verdict: Verdict, diagnosis: Diagnosis, unit: str, of_pad: bool) -> dict[str, Any]:
+def _findings(diagnosis: Diagnosis, of_pad: bool) -> dict[str, Any]:
+    verdict, unit = diagnosis.verdict, diagnosis.unit
     traces = [{"caption": text, "figure": trace_figure(t, unit)} for t, text in _ordered(diagnosis.traces)]
     groups = [(title(cause.name), cause.params) for cause in verdict.causes]
     axes = AXES if of_pad else ROBOT_AXES

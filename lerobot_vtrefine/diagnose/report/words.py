@@ -9,9 +9,8 @@ from lerobot_vtrefine.diagnose.verdict import Verdict
 
 @dataclass(frozen=True)
 class Meaning:
-    """A cause for people: its title, what it is, and the unit of its main parameter (docs/verdict.md)."""
+    """A cause for people: what it is, its main parameter, and that one's unit (docs/verdict.md)."""
 
-    title: str
     what: str
     parameter: str
     unit: str
@@ -19,134 +18,86 @@ class Meaning:
 
 MEANINGS = {
     "nonlinear_stiffness": Meaning(
-        "non-linear stiffness",
-        "The cover gets harder, or softer, the deeper it is pressed.",
-        "exponent − 1",
-        "1",
+        "The cover gets harder, or softer, the deeper it is pressed.", "exponent − 1", "1"
     ),
-    "saturation": Meaning(
-        "saturation", "High readings level off before the converter's full scale.", "knee", "counts"
-    ),
+    "saturation": Meaning("High readings level off before the converter's full scale.", "knee", "counts"),
     "viscoelastic_relaxation": Meaning(
-        "viscoelastic relaxation",
-        "Under a held load the reading creeps, and after it a rest remains.",
-        "fraction",
-        "1",
+        "Under a held load the reading creeps, and after it a rest remains.", "fraction", "1"
     ),
     "hysteresis": Meaning(
-        "hysteresis",
-        "At the same depth the pad reads differently while it is loaded and unloaded.",
-        "fraction",
-        "1",
+        "At the same depth the pad reads differently while it is loaded and unloaded.", "fraction", "1"
     ),
     "first_load_softening": Meaning(
-        "first-load softening",
-        "Below the largest load so far the pad reads less than it did on the first load.",
-        "softening",
-        "1",
+        "Below the largest load so far the pad reads less than it did on the first load.", "softening", "1"
     ),
-    "taxel_gain_spread": Meaning(
-        "taxel gain spread", "Every taxel has a sensitivity of its own.", "spread", "1"
-    ),
-    "dead_taxels": Meaning("dead taxels", "Some taxels never answer.", "taxels", "1"),
+    "taxel_gain_spread": Meaning("Every taxel has a sensitivity of its own.", "spread", "1"),
+    "dead_taxels": Meaning("Some taxels never answer.", "taxels", "1"),
     "row_sharing": Meaning(
-        "row sharing",
         "The readout's voltage divider: a taxel's reading falls as others of its row are pressed.",
         "conductance",
         "1/counts",
     ),
     "supply_droop": Meaning(
-        "supply droop",
         "The supply's voltage falls with the load of the whole pad, and every reading with it.",
         "droop",
         "1/counts",
     ),
-    "crosstalk": Meaning(
-        "crosstalk", "A reading leaks into the others of its row and column.", "fraction", "1"
-    ),
-    "mechanical_spreading": Meaning(
-        "mechanical spreading", "The cover spreads a press over neighbouring taxels.", "sigma", "m"
-    ),
-    "baseline_drift": Meaning(
-        "baseline drift", "The idle level moves during the session.", "rate", "counts/s"
-    ),
-    "latency": Meaning("latency", "Readings reach the host late.", "delay", "s"),
-    "scan_skew": Meaning(
-        "scan skew", "Rows are read one after the other, not at once.", "first to last row", "s"
-    ),
-    "sample_and_hold": Meaning(
-        "sample and hold", "The host repeats old frames until a new one is there.", "period", "s"
-    ),
-    "contact_offset": Meaning(
-        "contact offset", "The pad's face lies deeper, or higher, than assumed.", "offset", "m"
-    ),
-    "pad_tilt": Meaning("pad tilt", "The pad's face is not parallel to the assumed one.", "tilt", "rad"),
-    "encoder_offset": Meaning("encoder offset", "A joint's encoder is off by a constant.", "offset", "rad"),
-    "backlash": Meaning(
-        "backlash", "A joint has play: after a reversal it first does not follow.", "width", "rad"
-    ),
-    "control_latency": Meaning("control latency", "Commands take effect late.", "delay", "s"),
-    "joint_friction": Meaning("joint friction", "Dry friction holds a joint back.", "friction", "N*m"),
-    "gravity_sag": Meaning(
-        "gravity sag", "The arm's weight pulls joints away from their command.", "sag", "rad"
-    ),
+    "crosstalk": Meaning("A reading leaks into the others of its row and column.", "fraction", "1"),
+    "mechanical_spreading": Meaning("The cover spreads a press over neighbouring taxels.", "sigma", "m"),
+    "baseline_drift": Meaning("The idle level moves during the session.", "rate", "counts/s"),
+    "latency": Meaning("Readings reach the host late.", "delay", "s"),
+    "scan_skew": Meaning("Rows are read one after the other, not at once.", "first to last row", "s"),
+    "sample_and_hold": Meaning("The host repeats old frames until a new one is there.", "period", "s"),
+    "contact_offset": Meaning("The pad's face lies deeper, or higher, than assumed.", "offset", "m"),
+    "pad_tilt": Meaning("The pad's face is not parallel to the assumed one.", "tilt", "rad"),
+    "encoder_offset": Meaning("A joint's encoder is off by a constant.", "offset", "rad"),
+    "backlash": Meaning("A joint has play: after a reversal it first does not follow.", "width", "rad"),
+    "control_latency": Meaning("Commands take effect late.", "delay", "s"),
+    "joint_friction": Meaning("Dry friction holds a joint back.", "friction", "N*m"),
+    "gravity_sag": Meaning("The arm's weight pulls joints away from their command.", "sag", "rad"),
     "gripper_compliance": Meaning(
-        "gripper compliance",
-        "The gripper gives way under load, or is blocked by what it holds.",
-        "compliance",
-        "m/N",
+        "The gripper gives way under load, or is blocked by what it holds.", "compliance", "m/N"
     ),
-    "load_friction": Meaning(
-        "load friction", "Friction grows with the torque that the gears carry.", "part of the load", "1"
-    ),
+    "load_friction": Meaning("Friction grows with the torque that the gears carry.", "part of the load", "1"),
     "directional_friction": Meaning(
-        "directional friction",
         "Friction grows with the load, and otherwise when the motor drives it than when it drives the motor.",
         "part of the motor's torque",
         "1",
     ),
     "stribeck_friction": Meaning(
-        "Stribeck friction", "At rest and at low speed friction is larger than in motion.", "stiction", "N*m"
+        "At rest and at low speed friction is larger than in motion.", "stiction", "N*m"
     ),
     "load_stiction": Meaning(
-        "load stiction",
         "The torque that the gears carry holds them at rest and at low speed.",
         "part of the motor's torque",
         "1",
     ),
-    "quadratic_friction": Meaning(
-        "quadratic friction", "Friction grows with the square of the load.", "coefficient", "1/(N*m)"
-    ),
+    "quadratic_friction": Meaning("Friction grows with the square of the load.", "coefficient", "1/(N*m)"),
     "supply_sag": Meaning(
-        "supply sag",
         "The more the drive puts on the motor, the more of it is lost in the supply.",
         "resistance over the winding's",
         "1",
     ),
     "motor_heating": Meaning(
-        "motor heating",
-        "The winding's resistance changes with its temperature.",
-        "change per kelvin",
-        "1/K",
+        "The winding's resistance changes with its temperature.", "change per kelvin", "1/K"
     ),
     "voltage_limit": Meaning(
-        "voltage limit",
-        "The drive puts less of its supply on the motor than it should.",
-        "missing part",
-        "1",
+        "The drive puts less of its supply on the motor than it should.", "missing part", "1"
     ),
     "camera_extrinsics": Meaning(
-        "camera extrinsics", "The camera does not stand where the simulation puts it.", "displacement", "m"
+        "The camera does not stand where the simulation puts it.", "displacement", "m"
     ),
-    "depth_scale": Meaning(
-        "depth scale", "The depth camera's distances are off by a factor.", "factor − 1", "1"
-    ),
-    "object_mass": Meaning("object mass", "The object weighs more, or less, than simulated.", "mass", "kg"),
-    "object_friction": Meaning(
-        "object friction", "The object slides more, or less, easily than simulated.", "coefficient", "1"
-    ),
-    "clearance": Meaning("clearance", "The socket is tighter, or wider, than simulated.", "clearance", "m"),
+    "depth_scale": Meaning("The depth camera's distances are off by a factor.", "factor − 1", "1"),
+    "object_mass": Meaning("The object weighs more, or less, than simulated.", "mass", "kg"),
+    "object_friction": Meaning("The object slides more, or less, easily than simulated.", "coefficient", "1"),
+    "clearance": Meaning("The socket is tighter, or wider, than simulated.", "clearance", "m"),
 }
+SPELLED = {
+    "nonlinear_stiffness": "non-linear stiffness",
+    "first_load_softening": "first-load softening",
+    "stribeck_friction": "Stribeck friction",
+}
+"""Titles of causes that are not their names with spaces."""
 
 
 AXES = {
@@ -171,7 +122,7 @@ LONGEST_CLUE = 130
 
 def title(name: str) -> str:
     """A cause's name for people; evidence may be about something that no list of causes holds."""
-    return MEANINGS[name].title if name in MEANINGS else name.replace("_", " ")
+    return SPELLED.get(name, name.replace("_", " "))
 
 
 def meaning(name: str) -> Meaning:
@@ -184,7 +135,7 @@ def meaning(name: str) -> Meaning:
 
     catalogues = (candidates, joint_candidates, servo_candidates)
     text = next((item.MEANING[name] for item in catalogues if item.MEANING.get(name)), "")
-    return Meaning(title(name), text[:1].upper() + text[1:], "size", "1")
+    return Meaning(text[:1].upper() + text[1:], "size", "1")
 
 
 def listing(items: Sequence[str], last: str = "and") -> str:
