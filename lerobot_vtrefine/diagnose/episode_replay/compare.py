@@ -5,7 +5,7 @@ from collections.abc import Sequence
 from contextlib import closing
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from tqdm import tqdm
@@ -26,8 +26,12 @@ from lerobot_vtrefine.diagnose.episode_replay.twin import read_ledger, recorded_
 from lerobot_vtrefine.embodiments import get_embodiment
 from lerobot_vtrefine.envs.config import VtRefineEnvConfig
 
+if TYPE_CHECKING:
+    from lerobot_vtrefine.sim.command_replay import SceneReplay
+    from lerobot_vtrefine.sim.simulation import InsertionSim
+    from lerobot_vtrefine.sim.starts import Start
+
 HOLDS = {"zero_order": "held over the frame", "linear": "approached linearly"}
-DENSITIES = ("reading_density", "count_density")
 
 PARTS = ("auto", "none", "recorded", "grasp")
 """none: arms alone. recorded: starts from the seeds that a simulated dataset kept. grasp: parts stand where
@@ -83,7 +87,7 @@ class Comparison:
             "skipped": {str(index): reason for index, reason in self.skipped.items()},
             "success": [pair.success for pair in self.pairs],
             "tracking": [asdict(row) for row in self.tracking],
-            "touch": [_plain(pad) for pad in self.touch],
+            "touch": [asdict(pad) for pad in self.touch],
             "reach": [asdict(row) for row in self.reach],
             "remarks": self.remarks,
         }
@@ -116,11 +120,11 @@ def compare_episodes(
     config = config or VtRefineEnvConfig()
     _require_same_robot(folder, config)
     recorded = folder.read(episodes)
-    frames: list[Array] = []
+    skipped, frames = {}, []
     if parts == "none":
-        pairs, skipped = _replay_arms(folder, recorded, config, hold), {}
+        pairs = _replay_arms(folder, recorded, config, hold)
     else:
-        pairs, skipped = _replay_scenes(folder, recorded, config, parts, ledger, frames if film else None)
+        pairs, skipped, frames = _replay_scenes(folder, recorded, config, parts, ledger, film)
     reach = _reach(pairs, config, folder.fps, own)
     return Comparison(
         root=folder.root,
@@ -205,10 +209,9 @@ def _replay_scenes(
     config: VtRefineEnvConfig,
     parts: str,
     ledger: dict[str, Any] | None,
-    frames: list[Array] | None,
-) -> tuple[list[EpisodePair], dict[int, str]]:
-    """The pairs, and why others were left out; `frames`, if given, takes a film of the first pair's twin."""
-    from lerobot_vtrefine.diagnose.episode_replay.film import TwinFilm
+    film: bool,
+) -> tuple[list[EpisodePair], dict[int, str], list[Array]]:
+    """The pairs, why others were left out, and a film of the first pair's twin, if that is wanted."""
     from lerobot_vtrefine.envs.factory import make_simulation
     from lerobot_vtrefine.sim.command_replay import grasp_start, replay_scene
 
@@ -218,7 +221,7 @@ def _replay_scenes(
         raise ValueError(f"{folder.root} has {folder.fps:g} frames/s, the twin --env.fps={config.fps}")
     sim = make_simulation(config, 1)
     seeds = recorded_seeds(ledger, folder) if ledger is not None and parts == "recorded" else {}
-    pairs, skipped = [], {}
+    pairs, skipped, frames = [], {}, []
     for episode in tqdm(recorded, unit="episode", desc="replay"):
         start = None
         if parts == "grasp":
@@ -229,10 +232,8 @@ def _replay_scenes(
                 skipped[episode.index] = "a gripper never closes"
                 continue
         seed = seeds[episode.index] if seeds else episode.index
-        if frames is not None and not pairs:
-            with closing(TwinFilm(sim, config.menagerie_dir)) as film:
-                replayed = replay_scene(sim, episode.action, seed, start, film.watch)
-            frames += film.frames
+        if film and not pairs:
+            replayed, frames = _filmed(sim, config.menagerie_dir, episode.action, seed, start)
         else:
             replayed = replay_scene(sim, episode.action, seed, start)
         counts = {pad: replayed.counts[:, i] for i, pad in enumerate(sim.embodiment.pad_names)}
@@ -240,7 +241,20 @@ def _replay_scenes(
         pairs.append(EpisodePair(episode, replayed.position, counts, baselines, replayed.success))
     if not pairs:
         raise ValueError(f"none of {len(recorded)} episodes can be replayed: {next(iter(skipped.values()))}")
-    return pairs, skipped
+    return pairs, skipped, frames
+
+
+def _filmed(
+    sim: "InsertionSim", menagerie_dir: Path | None, commands: Array, seed: int, start: "Start | None"
+) -> tuple["SceneReplay", list[Array]]:
+    """What `replay_scene` gives, as if nobody had looked, and frames (H, W, 3) uint8."""
+    from lerobot_vtrefine.sim.command_replay import replay_scene
+    from lerobot_vtrefine.sim.render import VideoRenderer
+
+    film: list[Array] = []
+    with closing(VideoRenderer(sim, menagerie_dir=menagerie_dir)) as renderer:
+        replayed = replay_scene(sim, commands, seed, start, lambda: film.append(renderer.frame()))
+    return replayed, film
 
 
 def _compare_touch(pairs: list[EpisodePair]) -> list[PadTouch]:
@@ -252,20 +266,11 @@ def _compare_touch(pairs: list[EpisodePair]) -> list[PadTouch]:
             continue
         recorded = np.concatenate([pair.recorded.counts[pad] for pair in both])
         twin = np.concatenate([pair.counts[pad] for pair in both])
-        idle = [
-            np.concatenate([np.tile(side[pad], (len(pair.position), 1)) for pair, side in sides])
-            for sides in (
-                [(pair, pair.recorded.baselines) for pair in both],
-                [(pair, pair.baselines) for pair in both],
-            )
-        ]
-        rows.append(compare_pad(pad, recorded, twin, (idle[0], idle[1])))
+        frames = [len(pair.position) for pair in both]
+        idle = np.repeat([pair.recorded.baselines[pad] for pair in both], frames, axis=0)
+        twins_idle = np.repeat([pair.baselines[pad] for pair in both], frames, axis=0)
+        rows.append(compare_pad(pad, recorded, twin, (idle, twins_idle)))
     return rows
-
-
-def _plain(pad: PadTouch) -> dict[str, Any]:
-    densities = {name: [side.tolist() for side in getattr(pad, name)] for name in DENSITIES}
-    return {**asdict(pad), **densities}
 
 
 def _describe(config: VtRefineEnvConfig, parts: str, hold: str, own: bool) -> str:

@@ -1,15 +1,17 @@
 """``report.html`` of a replay: one self-contained page."""
 
+import tempfile
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 
+from lerobot_vtrefine.datasets.features import Array
 from lerobot_vtrefine.diagnose.episode_replay import figures
 from lerobot_vtrefine.diagnose.episode_replay.compare import Comparison, EpisodePair
-from lerobot_vtrefine.diagnose.episode_replay.film import video_uri
 from lerobot_vtrefine.diagnose.episode_replay.touch import telling_frames
 from lerobot_vtrefine.embodiments import pad_layout_of
-from lerobot_vtrefine.pages.pads import colour_scale, pad_film
+from lerobot_vtrefine.pages.pads import colour_scale, encode, pad_film
 from lerobot_vtrefine.pages.render import render
 
 FRAMES_SHOWN = 4
@@ -27,7 +29,7 @@ def render_page(comparison: Comparison) -> str:
         "lerobot_vtrefine.diagnose.episode_replay",
         "page.html",
         verdict=verdict(comparison),
-        twin=video_uri(comparison.film, comparison.fps) if comparison.film else None,
+        twin=_video(comparison.film, comparison.fps) if comparison.film else None,
         filmed=comparison.pairs[0].recorded.index,
         films=_films(pads_pair, comparison.fps) if pads_pair else [],
         comparison=comparison,
@@ -69,6 +71,16 @@ def verdict(comparison: Comparison) -> str:
     if ended:
         said += f" In the twin {sum(ended)} of {len(ended)} episodes ended with the plug seated and held."
     return said
+
+
+def _video(frames: list[Array], fps: float) -> str:
+    """Frames as an MP4 data URI."""
+    from lerobot.utils.io_utils import write_video
+
+    with tempfile.TemporaryDirectory() as folder:
+        path = Path(folder) / "twin.mp4"
+        write_video(path, frames, round(fps))
+        return encode(path.read_bytes(), "video/mp4")
 
 
 def _films(pair: EpisodePair, fps: float) -> list[dict[str, str]]:

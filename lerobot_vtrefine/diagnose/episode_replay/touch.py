@@ -31,9 +31,9 @@ class PadTouch:
     """Of raw counts."""
     touched: tuple[float, float]
     """Share of readings above idle level and noise floor: recorded, twin."""
-    reading_density: tuple[Array, Array]
+    reading_density: tuple[list[float], list[float]]
     """Shares of the touched readings in `READING_BINS`: recorded, twin."""
-    count_density: tuple[Array, Array]
+    count_density: tuple[list[float], list[float]]
     """The same in `COUNT_BINS`."""
     overlap: float | None
     """Common area of both reading histograms, 0 to 1; None where a side feels nothing."""
@@ -97,10 +97,10 @@ def telling_frames(above: Array, number: int) -> list[int]:
     return sorted({int(total.argmax()), *map(int, spread[: number - 1])})
 
 
-def _shares(values: Array, bins: Array) -> Array:
+def _shares(values: Array, bins: Array) -> list[float]:
     """Shares of values in bins, larger ones in the last."""
     histogram = np.histogram(np.minimum(values, bins[-1]), bins)[0]
-    return histogram / max(len(values), 1)
+    return (histogram / max(len(values), 1)).tolist()
 
 
 def _correlation(a: Array, b: Array) -> float | None:

@@ -85,14 +85,10 @@ def recorded_seeds(ledger: Mapping[str, Any], folder: EpisodeFolder) -> dict[int
     Raises:
         ValueError: the note belongs to other episodes.
     """
-    seeds = _seeds(ledger)
+    seeds = {int(row["episode_index"]): int(row["seed"]) for row in ledger["episodes"]}
     if sorted(seeds) != list(range(folder.num_episodes)):
         raise ValueError(
             f"{folder.root / LEDGER} notes {len(seeds)} episodes, the dataset has {folder.num_episodes}:"
             " it was edited since, so the starts are not known; use --parts=none or --parts=grasp"
         )
     return seeds
-
-
-def _seeds(ledger: Mapping[str, Any]) -> dict[int, int]:
-    return {int(row["episode_index"]): int(row["seed"]) for row in ledger["episodes"]}
