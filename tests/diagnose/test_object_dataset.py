@@ -7,7 +7,7 @@ import pytest
 from object_rigs import record, write_dataset
 
 from lerobot_vtrefine.cli.diagnose import main
-from lerobot_vtrefine.diagnose.dataset.merge import merged
+from lerobot_vtrefine.diagnose.dataset.engine import merged
 from lerobot_vtrefine.diagnose.joints.dataset import read_dataset
 from lerobot_vtrefine.diagnose.joints.engine import diagnose_robot
 from lerobot_vtrefine.diagnose.parts.engine import unknown_parts

@@ -16,7 +16,7 @@ from lerobot_vtrefine.diagnose.camera.engine import diagnose_camera
 from lerobot_vtrefine.diagnose.camera.frames import has_depth
 from lerobot_vtrefine.diagnose.core.diagnosis import Diagnosis
 from lerobot_vtrefine.diagnose.core.engine import Progress
-from lerobot_vtrefine.diagnose.dataset.merge import merged
+from lerobot_vtrefine.diagnose.evidence import not_tested
 from lerobot_vtrefine.diagnose.joints.dataset import episode_name
 from lerobot_vtrefine.diagnose.joints.engine import diagnose_robot
 from lerobot_vtrefine.diagnose.joints.model import RobotModel
@@ -37,6 +37,7 @@ from lerobot_vtrefine.diagnose.parts.episodes import (
 )
 from lerobot_vtrefine.diagnose.parts.payload import given, replay_loaded
 from lerobot_vtrefine.diagnose.recordings import RecordingSet
+from lerobot_vtrefine.diagnose.verdict import Status
 
 Array = np.ndarray
 
@@ -45,6 +46,8 @@ BUMP_RAD = 5e-5
 _RECOVERS_S = 0.6
 WEIGHT_KNOWN = 0.05
 """Part of what the carried weight does to the joints that may be wrong without the robot being so."""
+_WORSE: tuple[Status, ...] = ("adequate", "explained", "ambiguous", "unexplained")
+"""From best to worst."""
 
 
 def diagnose_dataset(recordings: RecordingSet, seed: int = 0, progress: Progress | None = None) -> Diagnosis:
@@ -66,6 +69,38 @@ def diagnose_dataset(recordings: RecordingSet, seed: int = 0, progress: Progress
         return found
     tell("camera: comparing depth images", 0.9)
     return merged(found, diagnose_camera(recordings.path, seed, progress))
+
+
+def merged(robot: Diagnosis, other: Diagnosis) -> Diagnosis:
+    """The robot's diagnosis with other causes beside its own.
+
+    Held-out errors are those of the joints where something was found about these, else those of what was
+    found; every cause's own gain stands with it. An alarm about joints says nothing about a camera, but a
+    verdict that is unexplained holds symptoms only.
+    """
+    one, two = robot.verdict, other.verdict
+    if two.causes and one.status == "adequate":
+        robot = replace(robot, trial_errors=other.trial_errors, unit=other.unit, traces=(), residuals=())
+        one = replace(one, heldout=two.heldout)
+    unknown = one.unknown if one.unknown.alarm else two.unknown
+    causes = [
+        replace(cause, role="symptom") if unknown.alarm else cause for cause in (*one.causes, *two.causes)
+    ]
+    evidence = [
+        replace(item, decision="symptom") if unknown.alarm and item.decision == "accepted" else item
+        for item in (*robot.evidence, *other.evidence)
+    ]
+    verdict = replace(
+        one,
+        status=max(one.status, two.status, key=_WORSE.index),
+        causes=tuple(causes),
+        ambiguous_with=() if unknown.alarm else (*one.ambiguous_with, *two.ambiguous_with),
+        unknown=unknown,
+        minimum_detectable={**one.minimum_detectable, **two.minimum_detectable},
+        next_experiment=one.next_experiment or two.next_experiment,
+        not_tested=not_tested(evidence),
+    )
+    return replace(robot, verdict=verdict, evidence=tuple(evidence))
 
 
 @dataclass(frozen=True)

@@ -13,9 +13,9 @@ import numpy as np
 
 from lerobot_vtrefine.diagnose.parts.episodes import AssumedScene, HandledEpisode, hands
 from lerobot_vtrefine.diagnose.parts.forces import places, point_forces
-from lerobot_vtrefine.diagnose.parts.grasp_geometry import pitches, tip_and_mouth
 from lerobot_vtrefine.diagnose.parts.problem import Quantity
 from lerobot_vtrefine.diagnose.parts.regression import Blocks
+from lerobot_vtrefine.sim.starts import HAND_RETREAT_M
 
 Array = np.ndarray
 
@@ -56,9 +56,29 @@ def contacts_of(
     for episode, path in zip(episodes, untouched, strict=True):
         held = np.flatnonzero(episode.held.all(1))
         turns = hands(scene.body, episode.position[held[:1]] if len(held) else episode.position[:1])[1]
-        points = tip_and_mouth(scene, pitches(turns)[0])
+        points = _tip_and_mouth(scene, turns[0])
         force = point_forces(scene, episode, path, points)
         out.append(Contact(force, places(scene.body, episode.position, points)))
+    return out
+
+
+def _tip_and_mouth(scene: AssumedScene, rotation: Array) -> Array:
+    """(A, 3) [m]: the mouth, or the tip, in the TCP's frame of the hand that holds the socket, or the plug.
+
+    Fingers centre a part between them: across the pads (the hand's y) the part is where this says, whatever
+    its slip along the fingers.
+
+    Args:
+        rotation: (A, 3, 3) of the hands while their parts stand upright.
+    """
+    out = np.zeros((len(scene.parts), 3))
+    pitch_rad = np.arcsin(np.clip(-rotation[..., 2, 0], -1.0, 1.0))
+    for hand, part in enumerate(scene.parts):
+        # In a frame at the TCP whose z is up: ahead to the part's axis, down (or up) to its origin.
+        ahead, up = HAND_RETREAT_M, -part.grip.centre_m[2]
+        cos, sin = np.cos(pitch_rad[hand]), np.sin(pitch_rad[hand])
+        # Pitch about y tips the hand's x down.
+        out[hand] = [cos * ahead - sin * up, 0.0, sin * ahead + cos * up]
     return out
 
 

@@ -13,6 +13,7 @@ from lerobot_vtrefine.diagnose.quality.frames import (
     check_numbers,
     check_optional,
     check_repeats,
+    check_spikes,
 )
 from lerobot_vtrefine.diagnose.quality.joints import (
     check_commands,
@@ -25,9 +26,7 @@ from lerobot_vtrefine.diagnose.quality.readings import check_readings, check_wra
 from lerobot_vtrefine.diagnose.quality.response import check_answers, check_start, check_stuck
 from lerobot_vtrefine.diagnose.quality.session import check_conditions, check_session
 from lerobot_vtrefine.diagnose.quality.sizes import check_sizes
-from lerobot_vtrefine.diagnose.quality.spikes import check_spikes
-from lerobot_vtrefine.diagnose.quality.temperature import check_temperature
-from lerobot_vtrefine.diagnose.quality.units import check_units
+from lerobot_vtrefine.diagnose.quality.units import check_temperature, check_units
 from lerobot_vtrefine.diagnose.quality.wiring import check_wiring
 from lerobot_vtrefine.diagnose.recordings import RecordingSet
 from lerobot_vtrefine.diagnose.verdict import DataIssue

@@ -1,4 +1,4 @@
-"""Checks of single frames and their times: missing numbers, repeated or missing frames, clocks, lengths."""
+"""Checks of single frames and their times: missing numbers, spikes, repeats, gaps, clocks, lengths."""
 
 from collections.abc import Iterator
 from dataclasses import replace
@@ -18,6 +18,11 @@ GAP = 1.75
 MAX_GAP_S = 0.5
 """Over a longer gap what happened to the pad is unknown; frames were lost, or the clock was set."""
 MAX_MISSING = 0.2
+FEW_SPIKES = 0.02
+"""Part of the frames that may be spikes; more are a motion."""
+SPIKE_FAR = 1.0
+"""A spike lies beyond all other frames by this many times their whole range."""
+LEAST_MOTION_M = 1e-4
 
 
 def check_optional(recordings: RecordingSet) -> Iterator[Finding]:
@@ -94,6 +99,39 @@ def check_repeats(recordings: RecordingSet) -> Iterator[Finding]:
         if not keep.all():
             problem = f"{plural(int((~keep).sum()), 'duplicated frame')} of {len(rows)}"
             yield Finding(index, problem, "repaired: repeats dropped", take(trial, keep))
+
+
+def check_spikes(recordings: RecordingSet) -> Iterator[Finding]:
+    """A few frames whose place no motion reaches are dropped."""
+    for index, trial in enumerate(recordings.trials if recordings.kind == "pad" else ()):
+        found = {
+            name: wrong
+            for name in ("x_m", "y_m", "depth_m")
+            if (values := getattr(trial, name)) is not None and (wrong := _spikes(values)).any()
+        }
+        if found:
+            frames = np.any(list(found.values()), axis=0)
+            problem = (
+                f"{plural(int(frames.sum()), 'frame')} of {len(frames)} far off in {' and '.join(found)}"
+            )
+            yield Finding(index, problem, "repaired: frames dropped", take(trial, ~frames))
+
+
+def _spikes(values: np.ndarray) -> np.ndarray:
+    """Frames (N,) far beyond all others; none where these are more than a few."""
+    known = np.isfinite(values)
+    count = int(FEW_SPIKES * len(values))
+    none = np.zeros(len(values), dtype=bool)
+    if known.sum() < 3 or count < 1:
+        return none
+    ordered = np.sort(values[known])
+    # Up to `count` of the lowest and of the highest frames may be spikes: the others give the range.
+    core = ordered[count : len(ordered) - count]
+    if len(core) < 3:
+        return none
+    margin = SPIKE_FAR * max(float(np.ptp(core)), LEAST_MOTION_M)
+    wrong = known & ((values < core[0] - margin) | (values > core[-1] + margin))
+    return wrong if wrong.sum() <= count else none
 
 
 def check_clock(recordings: RecordingSet) -> Iterator[Finding]:

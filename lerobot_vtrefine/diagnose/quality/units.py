@@ -1,4 +1,4 @@
-"""Checks of units: millimetres, milliseconds and degrees where the format wants SI units.
+"""Checks of units: millimetres, milliseconds, degrees and kelvin where the format wants others.
 
 A column is repaired only where nothing else fits: its values are impossible in the unit that they should
 have, or a clear factor away from the other trials', and usual after the division.
@@ -40,6 +40,8 @@ class Mistake:
     limit: float
 
 
+ZERO_C_IN_K = 273.15
+ROOM_C = (-60.0, 150.0)
 PLACES_M = 0.3
 """No indenter that presses a pad is further than this from its centre."""
 SMALL_LENGTHS = (("millimetres", 1e3), ("micrometres", 1e6))
@@ -129,6 +131,21 @@ def _times(recordings: RecordingSet, trials: dict[int, Any]) -> Iterator[Finding
             trial = replace(trial, time_s=trial.time_s - first)
             problem = f"time_s begins at {first:.6g} s instead of at the trial's start"
             yield Finding(index, problem, "repaired: counted from the first frame", trial)
+
+
+def check_temperature(recordings: RecordingSet) -> Iterator[Finding]:
+    """Temperatures in kelvin are repaired, those that no room has not used."""
+    for index, trial in enumerate(recordings.trials if recordings.kind == "pad" else ()):
+        if trial.temperature_c is None or not np.isfinite(trial.temperature_c).any():
+            continue
+        usual = float(np.nanmedian(trial.temperature_c))
+        if ROOM_C[0] <= usual <= ROOM_C[1]:
+            continue
+        kelvin = ROOM_C[0] <= usual - ZERO_C_IN_K <= ROOM_C[1]
+        values = trial.temperature_c - ZERO_C_IN_K if kelvin else None
+        problem = f"temperature_c is {usual:.3g}" + (": kelvin" if kelvin else ", which no room has")
+        action = f"repaired: {ZERO_C_IN_K} taken away" if kelvin else "repaired: not used"
+        yield Finding(index, problem, action, replace(trial, temperature_c=values))
 
 
 def _crowded(recordings: RecordingSet) -> bool:
