@@ -1,4 +1,4 @@
-"""Pads files, camera models, and what the emulator of pads is given."""
+"""Pads files, and what the emulator of pads is given."""
 
 import json
 import random
@@ -6,11 +6,10 @@ from pathlib import Path
 
 import mutants
 import numpy as np
-from mutant_kind import Kind, of_json
+from mutant_kind import Kind
 
 from lerobot_vtrefine.cli import pad_emulator, view_pads
 from lerobot_vtrefine.cli.errors import run_cli
-from lerobot_vtrefine.diagnose.camera.model import CameraModel
 from lerobot_vtrefine.lerobot_compat.pad_features import configured_pads
 
 PADS = {
@@ -42,16 +41,6 @@ def reading_pads(folder: Path) -> None:
     for pad in first.values():
         assert np.zeros(pad.pad_shape).size <= 64 * 64
         pad.orientation.apply(np.zeros((pad.rows, pad.cols), np.uint8))
-
-
-def camera_file(folder: Path) -> None:
-    CameraModel((0.01, 0.0, 0.0), (0.0, 0.1, 0.0), 1.01).save(folder / "camera.json")
-
-
-@run_cli
-def reading_camera(folder: Path) -> None:
-    model = CameraModel.load(folder / "camera.json")
-    assert np.isfinite([*model.translation_m, *model.rotation_rad, model.depth_scale]).all()
 
 
 def emulator_flags(rng: random.Random) -> list[str]:
@@ -131,7 +120,6 @@ def mutated_play(folder: Path, rng: random.Random) -> str:
 
 KINDS = (
     Kind("pads file", pads_file, mutated_pads, reading_pads, 4),
-    Kind("camera model", camera_file, of_json("camera.json"), reading_camera, 2),
     Kind("emulator flags", None, mutated_flags, emulating, 4),
     Kind("emulator recording", None, mutated_play, emulating, 2),
 )
