@@ -73,14 +73,16 @@ class Parameter:
     """
 
     value: float | list[Any]
-    ci95: tuple[float, float] | list[Any] | None
+    ci95: list[Any] | tuple[float, float] | None
     unit: str
 
     def __post_init__(self) -> None:
         ci95 = self.ci95
-        scalar = isinstance(self.value, (int, float))
-        if ci95 is not None and scalar and not (len(ci95) == 2 and ci95[0] <= ci95[1]):
+        if ci95 is None or not isinstance(self.value, (int, float)):
+            return
+        if not (len(ci95) == 2 and ci95[0] <= ci95[1]):
             raise ValueError(f"ci95 must be (low, high) with low <= high, got {ci95}")
+        object.__setattr__(self, "ci95", tuple(ci95))  # JSON has lists only
 
 
 @dataclass(frozen=True)
@@ -95,8 +97,8 @@ class Cause:
     name: str
     role: Role
     params: Mapping[str, Parameter]
-    p_value: float | None
-    heldout_gain: float | None
+    p_value: float | None = limits(0.0, 1.0)
+    heldout_gain: float | None = limits(maximum=1.0)
     basis: Basis = "tested"
 
     def __post_init__(self) -> None:
@@ -190,47 +192,8 @@ class Verdict:
         """Inverse of `to_dict`; ValueError names the field and what is wrong with it."""
         if not isinstance(data, Mapping) or data.get("schema") != SCHEMA:
             raise ValueError(f'verdict must hold "schema": "{SCHEMA}"')
-        content = decode(VerdictFile, data, "verdict", others=True)
-        causes = tuple(
-            Cause(
-                entry.name,
-                entry.role,
-                {name: _parameter(item) for name, item in entry.params.items()},
-                entry.p_value,
-                entry.heldout_gain,
-                entry.basis,
-            )
-            for entry in content.causes
-        )
-        return cls(
-            content.status,
-            causes,
-            content.ambiguous_with,
-            content.unknown,
-            content.heldout,
-            content.minimum_detectable,
-            content.next_experiment,
-            content.data_issues,
-            content.not_tested,
-            content.models_saw_locked,
-        )
-
-
-@dataclass(frozen=True)
-class _ParameterEntry:
-    value: float | list[Any]
-    ci95: list[Any] | None
-    unit: str
-
-
-@dataclass(frozen=True)
-class _CauseEntry:
-    name: str
-    role: Role
-    params: dict[str, _ParameterEntry]
-    p_value: float | None = limits(0.0, 1.0)
-    heldout_gain: float | None = limits(maximum=1.0)
-    basis: Basis = "tested"
+        content = vars(decode(VerdictFile, data, "verdict", others=True))
+        return cls(**{name: value for name, value in content.items() if name != "schema"})
 
 
 @dataclass(frozen=True)
@@ -239,7 +202,7 @@ class VerdictFile:
 
     schema: Literal["vtrefine/verdict@1"]
     status: Status
-    causes: tuple[_CauseEntry, ...]
+    causes: tuple[Cause, ...]
     ambiguous_with: tuple[tuple[str, ...], ...]
     unknown: Unknown
     heldout: Heldout | None
@@ -278,15 +241,6 @@ def _plain(value: Any) -> Any:
     if hasattr(value, "tolist"):
         return value.tolist()
     raise TypeError(f"verdict.json cannot hold {type(value).__name__}")
-
-
-def _parameter(entry: _ParameterEntry) -> Parameter:
-    """With JSON's list of two numbers as the tuple that was written."""
-    ci95 = entry.ci95
-    is_interval = ci95 is not None and len(ci95) == 2 and not isinstance(ci95[0], list)
-    return Parameter(
-        entry.value, (ci95[0], ci95[1]) if ci95 is not None and is_interval else ci95, entry.unit
-    )
 
 
 def _check_names(where: str, names: tuple[str, ...]) -> None:
