@@ -8,9 +8,9 @@ from robot_rigs import Rig, make_set
 
 from lerobot_vtrefine.diagnose.joints.batch import make_batch
 from lerobot_vtrefine.diagnose.joints.candidates import NAMES
+from lerobot_vtrefine.diagnose.joints.candidates.control_latency import SERVO_TICK_S
 from lerobot_vtrefine.diagnose.joints.engine import diagnose_problem, diagnose_robot
 from lerobot_vtrefine.diagnose.joints.estimates import widened
-from lerobot_vtrefine.diagnose.joints.fitting import SERVO_TICK_S
 from lerobot_vtrefine.diagnose.joints.model import predict_positions
 from lerobot_vtrefine.diagnose.joints.problem import JointProblem
 from lerobot_vtrefine.diagnose.recordings import read_recording_set

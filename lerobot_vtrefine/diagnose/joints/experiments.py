@@ -1,7 +1,6 @@
 """What to record next, so that two explanations come apart: protocols tried on both, the widest gap wins."""
 
 from collections.abc import Sequence
-from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -105,8 +104,7 @@ def _gap(selection: "Selected", rival: Rival[Any, Any], name: str) -> float:
         command[:, joint] = _drive(name, time_s, low[joint], high[joint], wide, problem.names[joint])
     trial = RobotTrial("", "", 0, 0, 0.0, time_s, command, command[:1].repeat(len(time_s), 0), None)
     there = ServoTrials.of(problem.names, make_batch([trial]))
-    here = replace(selection.fit.point)
-    difference = there.predict(here) - there.predict(rival.fit.point)
+    difference = there.predict(selection.fit.point) - there.predict(rival.fit.point)
     joints = list(rival.channels)
     noise = np.sqrt(selection.fit.total[joints]).clip(1e-9)
     return float((np.sqrt(np.square(difference[:, 0, joints]).mean(0)) / noise).max())

@@ -24,9 +24,6 @@ _RADIANS_PER_FRAME = (6.0, 3.0)
 """Fastest servo that frames can tell, well damped and swinging: beyond, oscillations alias."""
 TAU_BOUND_S = 1.0
 _LARGEST = {"round": 1.0, "stick": 3.0}
-SERVO_TICK_S = 2e-3
-"""Servos look at their command once in one or two milliseconds, and encoders are read as much beside their
-frame's time. When, no recording tells: a delay is known up to a uniform error of this width."""
 _START_OMEGA = (4.0, 10.0, 25.0, 60.0)
 _START_ZETA = (0.4, 1.0, 2.0)
 _TOLERANCE = 1e-5
@@ -76,8 +73,6 @@ class ServoTrials:
     shared_encoders: bool = False
     """Servos close their loop on the encoders that are read: an offset of these moves commands and readings
     alike, and only one that comes behind the servo shows."""
-    tick_s: float = SERVO_TICK_S
-    """How long a command may wait for the servo."""
     vague: float = 0.0
     """Part of a play's width that 95 % intervals allow for the method's own error."""
     iterations: int = 20
@@ -115,12 +110,18 @@ class ServoTrials:
         return 1.0 / self.scale**2
 
     def start(self) -> Point:
-        """Where fits of the baseline begin."""
-        return first_point(self)
-
-    def offers(self, parameters: tuple[str, ...], form: str | None) -> bool:
-        """Whether predictions know such parameters, and the form of sag, so that they may be tried."""
-        return True
+        """Where fits of the baseline begin: the best of a few plain servos per joint."""
+        count = self.batch.joints
+        theta = np.zeros((count, len(PARAMETERS)))
+        grid = [(np.log(omega), np.log(zeta)) for omega in _START_OMEGA for zeta in _START_ZETA]
+        columns = np.tile(np.arange(count), len(grid))
+        many = theta[columns].copy()
+        many[:, :2] = np.repeat(np.array(grid), count, 0)
+        point = Point(theta, (gravity.ONE_TERM_FORMS[0],) * count)
+        left = self.residual(self.predict(point, columns, many), columns)
+        cost = (left**2).sum((0, 1)).reshape(len(grid), count)
+        point.theta[:, :2] = np.array(grid)[cost.argmin(0)]
+        return point
 
     def predict(self, point: Point, joint: Array | None = None, theta: Array | None = None) -> Array:
         """Positions (N, T, C) of columns: joints (C,) under parameters (C, P); by default all joints."""
@@ -190,21 +191,6 @@ def ridge(problem: ServoTrials, free: Array) -> Array:
     alone = len(set(problem.batch.conditions)) == problem.batch.trials
     out[np.ix_(several, columns)] = _RIDGE[alone] * problem.batch.valid.sum()
     return out
-
-
-def first_point(problem: ServoTrials) -> Point:
-    """The best of a few plain servos per joint."""
-    count = problem.batch.joints
-    theta = np.zeros((count, len(PARAMETERS)))
-    grid = [(np.log(omega), np.log(zeta)) for omega in _START_OMEGA for zeta in _START_ZETA]
-    columns = np.tile(np.arange(count), len(grid))
-    many = theta[columns].copy()
-    many[:, :2] = np.repeat(np.array(grid), count, 0)
-    point = Point(theta, (gravity.ONE_TERM_FORMS[0],) * count)
-    left = problem.residual(problem.predict(point, columns, many), columns)
-    cost = (left**2).sum((0, 1)).reshape(len(grid), count)
-    point.theta[:, :2] = np.array(grid)[cost.argmin(0)]
-    return point
 
 
 def servo_only(problem: ServoTrials) -> Array:

@@ -65,8 +65,8 @@ class JointProblem(ServoTrials, OptionalSteps):
         return fit(self, self.start(), servo_only(self))
 
     def candidates(self) -> tuple[Candidate, ...]:
-        """Those that predictions know."""
-        return tuple(item for item in CATALOGUE if self.offers(item.parameters, item.form))
+        """The catalogue."""
+        return CATALOGUE
 
     def applicable(self, candidate: Candidate, now: Fit) -> Array:
         """(J,) bool: joints on which these trials could show it, and which do not have it yet."""

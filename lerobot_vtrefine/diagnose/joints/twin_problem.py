@@ -20,7 +20,9 @@ import numpy as np
 from mujoco.batch import Batch as Worlds
 
 from lerobot_vtrefine.diagnose.joints import gravity
-from lerobot_vtrefine.diagnose.joints.batch import Batch
+from lerobot_vtrefine.diagnose.joints.batch import Batch, frame_s
+from lerobot_vtrefine.diagnose.joints.candidates import CATALOGUE
+from lerobot_vtrefine.diagnose.joints.candidates.base import Candidate
 from lerobot_vtrefine.diagnose.joints.fitting import Point
 from lerobot_vtrefine.diagnose.joints.parameters import INDEX, PARAMETERS, SAG
 from lerobot_vtrefine.diagnose.joints.problem import JointProblem
@@ -69,97 +71,58 @@ class TwinProblem(JointProblem):
 
     @override
     def subset(self, trials: Array) -> "TwinProblem":
-        """See `JointProblem.subset`."""
         part = super().subset(trials)
         assert isinstance(part, TwinProblem)
         return part if self.fine is None else replace(part, fine=self.fine.subset(trials))
 
     @override
     def bent(self, point: Point) -> "TwinProblem":
-        """See `JointProblem.bent`; the twin's own gravity does that, and what it lacks is small."""
+        """Itself: the twin's own gravity does that, and what it lacks is small."""
         return self
 
     @override
     def finer(self) -> "TwinProblem | None":
-        """See `JointProblem.finer`."""
         return None if self.fine is None else replace(self.fine, iterations=_SETTLING)
 
     @property
+    @override
     def weight(self) -> Array:
-        """See `JointProblem.weight`. Fingers tell nothing about a delay: where they hold something, their
+        """Fingers tell nothing about a delay: where they hold something, their
         commands are their own positions."""
         out = np.zeros(self.batch.joints)
         arms = get_embodiment(self.config.embodiment).arm_columns
         out[arms] = super().weight[arms]
         return out
 
+    @override
     def start(self) -> Point:
         """The twin as it comes."""
         theta = np.zeros((self.batch.joints, len(PARAMETERS)))
         theta[:, :2] = np.log(NOMINAL)
         return Point(theta, (gravity.ONE_TERM_FORMS[0],) * self.batch.joints)
 
-    def offers(self, parameters: tuple[str, ...], form: str | None) -> bool:
+    @override
+    def candidates(self) -> tuple[Candidate, ...]:
         """Replays are slow: one form of each cause, and the decoys that are not forms of it."""
-        return set(parameters) <= {"offset", "play", "friction", *SAG} and form in (
-            None,
-            "mass",
-            "gain",
-            "drift",
-        )
+        known, forms = {"offset", "play", "friction", *SAG}, (None, "mass", "gain", "drift")
+        return tuple(item for item in CATALOGUE if set(item.parameters) <= known and item.form in forms)
 
+    @override
     def predict(self, point: Point, joint: Array | None = None, theta: Array | None = None) -> Array:
-        """See `JointProblem.predict`."""
         if joint is None:
             joint = np.arange(self.batch.joints)
         if not len(joint):
             return np.zeros((*self.batch.time_s.shape, 0))
         theta = point.theta[joint] if theta is None else theta
-        sheet = _occurrence(joint)
+        # How often each column's joint came before.
+        sheet = np.tril(joint[:, None] == joint, -1).sum(1)
         sets = np.repeat(point.theta[None], int(sheet.max()) + 1, 0)
         sets[sheet, joint] = theta
-        arms = _Arms.of(self.config, self.dt_s, self.step_s)
+        arms = _Arms.of(self.config, frame_s(self.batch), self.step_s)
         pushes = [self._push(point.forms, np.arange(self.batch.joints), values) for values in sets]
-        way = _Way(
-            np.broadcast_to(self.batch.command, (len(sets), *self.batch.command.shape)),
-            np.stack([np.zeros_like(self.batch.command) if push is None else push for push in pushes]),
-            sets[..., INDEX["play"]],
-            self.batch.first_position - sets[:, None, :, INDEX["offset"]],
-            point.tau_s,
-        )
-        replayed = arms.replay(way, sets)
+        push = np.stack([np.zeros_like(self.batch.command) if item is None else item for item in pushes])
+        replayed = arms.replay(self.batch, push, sets, point.tau_s)
         return replayed[sheet, :, :, joint].transpose(1, 2, 0) + theta[:, INDEX["offset"]]
-
-    @property
-    def dt_s(self) -> float:
-        """Time between frames [s]."""
-        dt = np.diff(self.batch.time_s, axis=0)
-        return float(np.median(dt[dt > 0]))
-
-
-def _occurrence(joint: Array) -> Array:
-    """(C,) how often each column's joint came before."""
-    seen: dict[int, int] = {}
-    out = np.empty(len(joint), dtype=int)
-    for place, index in enumerate(joint.tolist()):
-        out[place] = seen.get(index, 0)
-        seen[index] = out[place] + 1
-    return out
-
-
-@dataclass(frozen=True)
-class _Way:
-    """How targets reach the servos, S sheets."""
-
-    target: Array
-    """(S, N, T, J)"""
-    push: Array
-    """(S, N, T, J) added behind the play."""
-    play: Array
-    """(S, J) full widths."""
-    start: Array
-    """(S, T, J) where joints rest at first."""
-    tau_s: float
 
 
 class _Arms:
@@ -194,38 +157,43 @@ class _Arms:
             cls._known = {**same, key: cls(config, dt_s, step_s)}
         return cls._known[key]
 
-    def replay(self, way: _Way, sets: Array) -> Array:
-        """Positions (S, N, T, J) under the parameters (S, J, P)."""
-        sheets, frames, trials, _ = way.target.shape
+    def replay(self, batch: Batch, push: Array, sets: Array, tau_s: float) -> Array:
+        """Positions (S, N, T, J) under the parameters (S, J, P).
+
+        Args:
+            push: (S, N, T, J) added to commands behind the play.
+        """
+        sheets, frames, trials = len(sets), *batch.time_s.shape
         worlds = self._prepared(sheets * trials)
         self._set_fields(worlds, np.repeat(sets, trials, 0))
-        first = way.start.reshape(sheets * trials, -1).clip(self.robot.lower, self.robot.upper)
+        start = batch.first_position - sets[:, None, :, INDEX["offset"]]
+        first = start.reshape(sheets * trials, -1).clip(self.robot.lower, self.robot.upper)
         qpos, qvel = worlds.bind("qpos"), worlds.bind("qvel")
         worlds.reset(None, stage=mujoco.mjtStage.mjSTAGE_NONE.value)
         qpos[:] = 0.0
         qpos[:, self.joints] = first
         qvel[:] = 0.0
-        controls = self._controls(way, first)
+        controls = self._controls(batch.command, push, sets[..., INDEX["play"]], first, tau_s)
         out = worlds.rollout(controls.shape[1], control=controls, record=("qpos",), ids=None)["qpos"]
         moved = out[:, self.substeps - 1 :: self.substeps][:, :, self.joints]
         path = np.concatenate([first[:, None], moved], 1)
         return path.reshape(sheets, trials, frames, -1).transpose(0, 2, 1, 3)
 
-    def _controls(self, way: _Way, first: Array) -> Array:
-        """Servo targets (W, K, nu) of all steps; play acts on the way between frames, too."""
-        sheets, frames, trials, count = way.target.shape
-        flat = way.target.transpose(1, 0, 2, 3).reshape(frames, sheets * trials, count)
-        servo = np.stack([task.servo_commands(self.robot, row) for row in flat], 1)
+    def _controls(self, command: Array, push: Array, play: Array, first: Array, tau_s: float) -> Array:
+        """Servo targets (W, K, nu) of all steps; play (S, J) acts on the way between frames, too."""
+        frames, trials, _ = command.shape
+        every = np.tile(command, (1, len(play), 1))
+        servo = np.stack([task.servo_commands(self.robot, row) for row in every], 1)
         rest = task.servo_commands(self.robot, first)[:, None]
         wanted = self._between(rest, servo)
-        half = np.abs(np.repeat(self._per_servo(way.play * self.side), trials, 0)) / 2
+        half = np.abs(np.repeat(self._per_servo(play * self.side), trials, 0)) / 2
         out, state = np.empty_like(wanted), rest[:, 0]
         for k in range(wanted.shape[1]):
             out[:, k] = state = np.clip(state, wanted[:, k] - half, wanted[:, k] + half)
-        if way.push.any():
-            push = self._per_servo(way.push).transpose(0, 2, 1, 3).reshape(sheets * trials, frames, -1)
-            out += self._between(push[:, :1], push)
-        return _late(out, rest[:, 0], way.tau_s / self.model.opt.timestep)
+        if push.any():
+            added = self._per_servo(push).transpose(0, 2, 1, 3).reshape(len(first), frames, -1)
+            out += self._between(added[:, :1], added)
+        return _late(out, rest[:, 0], tau_s / self.model.opt.timestep)
 
     def _per_servo(self, values: Array) -> Array:
         """Changes of joints (..., J) as changes of servos (..., nu)."""

@@ -8,6 +8,9 @@ from lerobot_vtrefine.diagnose.joints.estimates import Estimates, MethodError, w
 from lerobot_vtrefine.diagnose.verdict import Parameter
 
 METHOD = MethodError(0.01, 0.0)
+SERVO_TICK_S = 2e-3
+"""Servos look at their command once in one or two milliseconds, and encoders are read as much beside their
+frame's time. When, no recording tells: a delay is known up to a uniform error of this width."""
 NOT_SHOWN = "move every joint, at several speeds"
 FORMS = (
     Candidate(
@@ -20,7 +23,7 @@ def sizes(estimates: Estimates, joints: tuple[int, ...]) -> dict[str, Parameter]
     """One delay of all joints."""
     problem, value = estimates.selection.problem, estimates.selection.fit.point.tau_s
     # A uniform error of width w has the standard deviation w / sqrt(12).
-    tick = 1.96 * problem.tick_s / np.sqrt(12)
+    tick = 1.96 * SERVO_TICK_S / np.sqrt(12)
     method = estimates.method_error(METHOD, value)
     own = float(np.hypot(np.hypot(tick, problem.delay_spread_s), method))
     return {"tau_s": Parameter(value, widened(jackknife(estimates.tau, value), value, own), "s")}
