@@ -77,8 +77,8 @@ def test_trends_follow_the_order_of_trials_and_nothing_else(batch) -> None:
     ordered = noise.copy()
     ordered[..., 1] += 0.004 * tau[..., 1] * (batch.order / batch.trials)
     ordered[..., 2] += 0.004 * tau[..., 2] * drawn
-    assert [(t.joint, t.kind) for t in surely(trends(batch, ordered, own, tau))] == [(1, "delay")]
     (found,) = surely(trends(batch, ordered, own, tau))
+    assert (found.channel, found.clue) == (1, "the delay changes through the session")
     # Variance of a uniform number beside its mean square, noise included.
     assert found.share == pytest.approx((16 / 12) / (16 / 3 + 1), rel=0.25)
     assert surely(trends(batch, noise, own, tau)) == []
@@ -86,5 +86,5 @@ def test_trends_follow_the_order_of_trials_and_nothing_else(batch) -> None:
 
 def surely(found):
     """Trends that the joint test of all of them does not take for an accident of the order."""
-    p_values = jointly_adjusted([(t.change, t.place, True) for t in found], 0)
+    p_values = jointly_adjusted([(t.scores, t.along, True) for t in found], 0)
     return [trend for trend, p in zip(found, p_values, strict=True) if p < 0.01]

@@ -55,6 +55,16 @@ class Wanted:
     readout_only: bool = False
     contact: str = "kelvin_voigt"
 
+    @property
+    def damping(self) -> bool:
+        """Whether k_d is fitted."""
+        return not (self.static or self.readout_only)
+
+    @property
+    def stiffness(self) -> bool:
+        """Whether k_n is fitted."""
+        return self.k_n is None and not self.readout_only
+
     def __post_init__(self) -> None:
         if self.k_n is not None and not (np.isfinite(self.k_n) and self.k_n > 0):
             raise ValueError(f"--k_n must be a positive number of N/m, got {self.k_n}")
@@ -100,9 +110,7 @@ def calibrate(recordings: RecordingSet, wanted: Wanted, seed: int = 0) -> Calibr
     sound, issues = check_quality(recordings)
     presses = _presses(sound, wanted)
     found = excitation(presses)
-    damping = not (wanted.static or wanted.readout_only)
-    stiffness = wanted.k_n is None and not wanted.readout_only
-    said = problems(found, damping=damping, stiffness=stiffness)
+    said = problems(found, damping=wanted.damping, stiffness=wanted.stiffness)
     if said:
         raise ValueError(f"{recordings.path} cannot be calibrated from: " + "; ".join(said))
     baseline = fit_baseline(presses)
@@ -110,7 +118,7 @@ def calibrate(recordings: RecordingSet, wanted: Wanted, seed: int = 0) -> Calibr
         model = replace(baseline.fitted.model, k_n=wanted.k_n)
         baseline = replace(baseline, fitted=replace(baseline.fitted, model=model))
     fitted, p_value = _with_saturation(baseline, presses, seed)
-    draws = _draws(fitted, presses, seed, damping=damping, stiffness=stiffness)
+    draws = _draws(fitted, presses, wanted, seed)
     residual = np.concatenate([values.ravel() for values in fitted.residuals(presses)])
     parameters = _parameters(fitted.model, draws, presses, baseline.noise.floor, wanted)
     return Calibration(
@@ -160,9 +168,7 @@ def _with_saturation(baseline: Baseline, presses: PressSet, seed: int) -> tuple[
     return fit(richer.model, presses, weights), p_value
 
 
-def _draws(
-    fitted: Fit, presses: PressSet, seed: int, *, damping: bool, stiffness: bool
-) -> dict[str, np.ndarray]:
+def _draws(fitted: Fit, presses: PressSet, wanted: Wanted, seed: int) -> dict[str, np.ndarray]:
     """Parameters under resampled recordings (DRAWS,).
 
     Draws are spread by Student's factor, and to the jackknife's deviation where that is larger: with few
@@ -171,10 +177,9 @@ def _draws(
     count, free = len(fitted.grams), fitted.model.free
     rng = np.random.default_rng([seed, 11])
     shares = rng.multinomial(count, np.full(count, 1.0 / count), DRAWS).astype(float)
-    kinds = {"damping": damping, "stiffness": stiffness}
-    drawn = _refitted(fitted, presses, shares, **kinds)
-    without_one = _refitted(fitted, presses, 1.0 - np.eye(count), **kinds)
-    (best,) = _rows(_refitted(fitted, presses, np.ones((1, count)), **kinds))
+    drawn = _refitted(fitted, presses, wanted, shares)
+    without_one = _refitted(fitted, presses, wanted, 1.0 - np.eye(count))
+    best = _refitted(fitted, presses, wanted, np.ones((1, count)))
     freedom = max(count - len(free), 2)
     student = float(stats.t.ppf(0.975, freedom)) / 1.96
     spread = {}
@@ -186,14 +191,7 @@ def _draws(
     return spread
 
 
-def _rows(columns: dict[str, np.ndarray]) -> list[dict[str, float]]:
-    count = len(next(iter(columns.values())))
-    return [{name: float(values[row]) for name, values in columns.items()} for row in range(count)]
-
-
-def _refitted(
-    fitted: Fit, presses: PressSet, shares: np.ndarray, *, damping: bool, stiffness: bool
-) -> dict[str, np.ndarray]:
+def _refitted(fitted: Fit, presses: PressSet, wanted: Wanted, shares: np.ndarray) -> dict[str, np.ndarray]:
     """Parameters (D,) when recordings count `shares` (D, K) times: one Gauss-Newton step from the fit."""
     model = fitted.model
     grams = np.tensordot(shares, fitted.grams, axes=1)
@@ -201,10 +199,10 @@ def _refitted(
     found: dict[str, np.ndarray] = {"gain": np.exp(values[:, 0])}
     if not presses.loaded:
         k_n = np.full(len(shares), model.k_n)
-        if stiffness:
+        if wanted.stiffness:
             k_n = found["k_n"] = _stiffness(presses, shares, values[:, 1])
         found["gain"] = found["gain"] / k_n
-        if damping:
+        if wanted.damping:
             found["k_d"] = k_n * values[:, 1]
     for form in model.forms:
         own = values[:, -len(form.values) :].clip(form.low, form.high)

@@ -5,36 +5,23 @@ Trials differ a little, and that is nothing; that they differ in the order in wh
 Shapes: N frames, T trials, J joints.
 """
 
-from dataclasses import dataclass
-
 import numpy as np
 
 from lerobot_vtrefine.diagnose.core.normal_equations import solved
+from lerobot_vtrefine.diagnose.core.suspicion import Suspicion
 from lerobot_vtrefine.diagnose.joints.batch import Batch
 
 Array = np.ndarray
 
 KINDS = ("zero", "scale", "servo's response", "servo's response", "delay")
 FEWEST_TRIALS = 6
+_LEAST = 0.1
+"""Part of a joint's squared error that a straight line over the session must take away."""
 _RIDGE = 1e-6
 
 
-@dataclass(frozen=True)
-class Trend:
-    """One quantity of one joint that follows the order of the trials."""
-
-    joint: int
-    kind: str
-    share: float
-    """Part of the joint's squared error that a straight line over the session would take away."""
-    change: Array
-    """(T,) the quantity of every trial, about its mean."""
-    place: Array
-    """(T,) every trial's place in the session, standardised."""
-
-
-def trends(batch: Batch, residual: Array, columns: dict[int, Array], tau: Array) -> list[Trend]:
-    """How every quantity follows the session.
+def trends(batch: Batch, residual: Array, columns: dict[int, Array], tau: Array) -> list[Suspicion]:
+    """That each quantity follows the session, by its change about its mean in every trial.
 
     Args:
         residual: (N, T, J) what the model leaves.
@@ -53,7 +40,15 @@ def trends(batch: Batch, residual: Array, columns: dict[int, Array], tau: Array)
     total = np.square(residual[batch.valid]).sum(0).clip(1e-300)
     share = slope**2 * np.einsum("t,jtk->jk", place**2, power) / total[:, None]
     return [
-        Trend(joint, kind, float(share[joint, k]), change[:, joint, k], place)
+        Suspicion(
+            joint,
+            f"the {kind} changes through the session",
+            float(share[joint, k]),
+            _LEAST,
+            change[:, joint, k],
+            either_sign=True,
+            along=place,
+        )
         for joint in range(batch.joints)
         for k, kind in enumerate(KINDS)
     ]

@@ -38,8 +38,6 @@ _MOVING = 1.6
 """How much larger such a difference is over all frames than over slow ones, if it comes with motion."""
 _SERVOS_DIFFER = 0.04
 """Part by which a servo's frequency may differ from trial to trial: batteries and oil, no fault."""
-_TREND = 0.1
-"""Least part of what is left that must follow the session."""
 _FOLLOWS, _FOLLOWS_IF_OWNED = 0.1, 0.4
 """Least part of what is left that must follow a descriptor; more where an accepted form may be off."""
 _LINE = 0.1
@@ -133,18 +131,7 @@ def _through_the_session(selection: "Selected") -> list[Suspicion]:
     problem, fitted = selection.problem, selection.fit
     later = derivatives(problem, replace(fitted, tau_free=True))
     assert later.tau is not None
-    return [
-        Suspicion(
-            item.joint,
-            f"the {item.kind} changes through the session",
-            item.share,
-            _TREND,
-            item.change,
-            either_sign=True,
-            along=item.place,
-        )
-        for item in trends(problem.batch, fitted.residual, later.columns, later.tau)
-    ]
+    return trends(problem.batch, fitted.residual, later.columns, later.tau)
 
 
 def descriptors(selection: "Selected", joint: int) -> dict[str, Array]:

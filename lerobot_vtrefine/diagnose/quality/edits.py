@@ -66,6 +66,16 @@ def take(trial: Any, frames: np.ndarray) -> Any:
     return dataclasses.replace(trial, **{name: value[frames] for name, value in columns(trial).items()})
 
 
+def place(taxel: int, cols: int) -> str:
+    """A taxel by row and column, "(2, 7)"."""
+    return f"({taxel // cols}, {taxel % cols})"
+
+
+def few(names: list[str], most: int) -> str:
+    """The first names, and how many more there are."""
+    return ", ".join(names[:most]) + (f" and {len(names) - most} more" if len(names) > most else "")
+
+
 def plural(count: int, noun: str) -> str:
     """ "1 frame", "2 frames"."""
     return f"{count} {noun}" if count == 1 else f"{count} {noun}s"

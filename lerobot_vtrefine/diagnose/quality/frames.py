@@ -6,7 +6,16 @@ from typing import Any
 
 import numpy as np
 
-from lerobot_vtrefine.diagnose.quality.edits import KEPT, SET_ASIDE, Finding, columns, plural, take
+from lerobot_vtrefine.diagnose.quality.edits import (
+    KEPT,
+    SET_ASIDE,
+    Finding,
+    columns,
+    few,
+    place,
+    plural,
+    take,
+)
 from lerobot_vtrefine.diagnose.recordings import RecordingSet
 
 MAX_BROKEN = 0.1
@@ -76,10 +85,8 @@ def _channels(recordings: RecordingSet, name: str, wrong: np.ndarray) -> str:
     """Which taxels or joints are meant; the first few."""
     which = np.flatnonzero(wrong.any(axis=0))
     if name == "raw":
-        names = [f"taxel ({k // recordings.cols}, {k % recordings.cols})" for k in which]
-    else:
-        names = [recordings.joints[k] for k in which]
-    return ", ".join(names[:3]) + (f" and {len(names) - 3} more" if len(names) > 3 else "")
+        return few([f"taxel {place(k, recordings.cols)}" for k in which], 3)
+    return few([recordings.joints[k] for k in which], 3)
 
 
 def check_repeats(recordings: RecordingSet) -> Iterator[Finding]:

@@ -6,7 +6,7 @@ from itertools import pairwise
 import numpy as np
 
 from lerobot_vtrefine.diagnose.quality.contact import Press, presses
-from lerobot_vtrefine.diagnose.quality.edits import KEPT, MINORITY, SET_ASIDE, Finding, plural
+from lerobot_vtrefine.diagnose.quality.edits import KEPT, MINORITY, SET_ASIDE, Finding, few, place, plural
 from lerobot_vtrefine.diagnose.recordings import RecordingSet
 
 DRIVEN, LOADED = 0.1, 0.2
@@ -81,11 +81,8 @@ def check_answers(recordings: RecordingSet) -> Iterator[Finding]:
     alive = ((slope > ALIVE * usual) & pressed)[~silent].sum(axis=0)
     dead = (slope < DEAD * usual) & pressed & (alive >= 2)
     for index in np.flatnonzero(dead.any(axis=1) & ~silent):
-        taxels = [f"({k // recordings.cols}, {k % recordings.cols})" for k in np.flatnonzero(dead[index])]
-        problem = f"dead in this trial only: taxel {', '.join(taxels[:4])}"
-        if len(taxels) > 4:
-            problem += f" and {len(taxels) - 4} more"
-        yield Finding(int(index), problem, SET_ASIDE)
+        taxels = [place(k, recordings.cols) for k in np.flatnonzero(dead[index])]
+        yield Finding(int(index), f"dead in this trial only: taxel {few(taxels, 4)}", SET_ASIDE)
 
 
 def _outlined(recordings: RecordingSet) -> bool:
@@ -118,17 +115,13 @@ def check_stuck(recordings: RecordingSet) -> Iterator[Finding]:
     )
     always = full.mean(axis=0) >= MINORITY
     if always.any():
-        names = ", ".join(
-            f"({k // recordings.cols}, {k % recordings.cols})" for k in np.flatnonzero(always)[:4]
-        )
+        names = ", ".join(place(k, recordings.cols) for k in np.flatnonzero(always)[:4])
         problem = f"saturated in most trials: {plural(int(always.sum()), 'taxel')} at full scale: {names}"
         yield Finding(None, problem, f"{KEPT}: they carry no information, as dead taxels")
     for index in np.flatnonzero((full & ~always).any(axis=1)):
-        taxel = int(np.flatnonzero(full[index] & ~always)[0])
-        where = f"({taxel // recordings.cols}, {taxel % recordings.cols})"
-        yield Finding(
-            int(index), f"saturated: taxel {where} stays at full scale in this trial only", SET_ASIDE
-        )
+        where = place(np.flatnonzero(full[index] & ~always)[0], recordings.cols)
+        problem = f"saturated: taxel {where} stays at full scale in this trial only"
+        yield Finding(int(index), problem, SET_ASIDE)
     if recordings.rows * recordings.cols == 1:
         return  # one quantised reading may well repeat
     for index, press in enumerate(presses(recordings)):
