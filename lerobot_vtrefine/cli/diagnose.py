@@ -14,8 +14,8 @@ from lerobot_vtrefine.cli.formats import add_format_flags
 from lerobot_vtrefine.cli.outputs import staged
 
 if TYPE_CHECKING:
+    from lerobot_vtrefine.diagnose.core.diagnosis import Diagnosis
     from lerobot_vtrefine.diagnose.recordings import RecordingSet
-    from lerobot_vtrefine.diagnose.verdict import Verdict
 
 FILES = ("baseline_model.json", "sensor_model.json", "report.html", "verdict.json")
 """What a run leaves in the output folder; the verdict last, so that it stands for a whole run."""
@@ -81,10 +81,8 @@ def main(arguments: Sequence[str] | None = None) -> None:
     options = make_parser().parse_args(arguments)
     check(options)
     with staged(options.output_dir, FILES, overwrite=options.overwrite) as folder:
-        verdict, unit, survived = run(
-            read(options), folder, options.seed, options.stability, options.output_dir
-        )
-    summarise(verdict, unit, options.output_dir, survived)
+        found, survived = run(read(options), folder, options.seed, options.stability, options.output_dir)
+    summarise(found, options.output_dir, survived)
 
 
 def check(options: argparse.Namespace) -> None:
@@ -111,9 +109,9 @@ def read(options: argparse.Namespace) -> "RecordingSet":
 
 def run(
     recordings: "RecordingSet", folder: Path, seed: int, repetitions: int = 0, final: Path | None = None
-) -> tuple["Verdict", str, str]:
-    """Diagnose, and write all result files into ``folder``; the verdict, its unit of error, and what survives
-    repetitions in one line. The page names files in ``final``, where the results will be."""
+) -> tuple["Diagnosis", str]:
+    """Diagnose, and write all result files into ``folder``; the diagnosis, and what survives repetitions in
+    one line. The page names files in ``final``, where the results will be."""
     from lerobot_vtrefine.cli.report.press_film import press_film
     from lerobot_vtrefine.diagnose.api import diagnose
     from lerobot_vtrefine.diagnose.report import render_report
@@ -137,14 +135,15 @@ def run(
     page = render_report(found, recordings, seed, film, survived, model)
     (folder / "report.html").write_text(page, encoding="utf-8")
     write_verdict(found.verdict, folder / "verdict.json")
-    return found.verdict, found.unit, survived
+    return found, survived
 
 
-def summarise(verdict: "Verdict", unit: str, output_dir: Path, survived: str) -> None:
+def summarise(found: "Diagnosis", output_dir: Path, survived: str) -> None:
     """The verdict and where to read about it, in a few lines."""
     from lerobot_vtrefine.diagnose.report.words import headline, power_line
 
-    print(f"{verdict.status}: {headline(verdict, unit)}")
+    verdict = found.verdict
+    print(f"{verdict.status}: {headline(verdict, found.unit)}")
     if power := power_line(verdict):
         print(power)
     if survived:

@@ -93,7 +93,6 @@ def write_prediction(
 ) -> None:
     """A Parquet file with ``time_s`` and the predicted ``raw`` (pads) or ``position`` (robots)."""
     name = "position" if recordings.kind == "robot" else "raw"
-    flat = pa.array(values.ravel(), type=pa.float64())
-    rows = pa.FixedSizeListArray.from_arrays(flat, values.shape[1]).cast(pa.list_(pa.float64()))
+    rows = pa.array(values.tolist(), type=pa.list_(pa.float64()))
     path.parent.mkdir(parents=True, exist_ok=True)
     pq.write_table(pa.table({"time_s": trial.time_s, name: rows}), path)

@@ -43,11 +43,12 @@ SENSOR_CAUSES = (
 ROBOT_CAUSES = (
     "encoder_offset",
     "backlash",
-    "control_latency",
     "joint_friction",
     "gravity_sag",
     "gripper_compliance",
+    "control_latency",
 )
+"""In the order in which they are tried."""
 SERVO_CAUSES = (
     "load_friction",
     "directional_friction",

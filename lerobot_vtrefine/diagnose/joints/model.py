@@ -13,16 +13,22 @@ from lerobot_vtrefine.diagnose.joints.fitting import Point, ServoTrials
 from lerobot_vtrefine.diagnose.joints.parameters import PARAMETERS, SAG
 from lerobot_vtrefine.diagnose.recordings import RobotTrial
 from lerobot_vtrefine.diagnose.verdict import write_atomically
-from lerobot_vtrefine.embodiments.robot_file import (
-    SCHEMA,
-    JointModel,
-    RobotFile,
-    SagForm,
-    decode_robot,
-    read_robot_file,
-)
+from lerobot_vtrefine.embodiments.robot_file import SCHEMA, JointModel, SagForm, read_robot_file
 
 __all__ = ["SCHEMA", "JointModel", "RobotModel", "predict_positions"]
+
+_FIELDS = {
+    "encoder_offset": "offset",
+    "backlash_command": "play",
+    "backlash_output": "loose",
+    "friction": "friction",
+    "compliance": "bend",
+    "stop": "stop",
+    "give": "give",
+    "backlash_rounding": "round",
+    "breakaway": "stick",
+}
+"""What the file calls parameters that stand in it as they are."""
 
 
 @dataclass(frozen=True)
@@ -56,11 +62,6 @@ class RobotModel:
             "joints": [asdict(joint) for joint in self.joints],
         }
 
-    @classmethod
-    def from_dict(cls, data: Any) -> "RobotModel":
-        """Inverse of `to_dict`; ValueError says what is missing or wrong."""
-        return cls._of(decode_robot(data))
-
     def save(self, path: str | Path) -> None:
         """Write the file, whole or not at all."""
         write_atomically(path, json.dumps(self.to_dict(), indent=2, allow_nan=False) + "\n")
@@ -68,20 +69,11 @@ class RobotModel:
     @classmethod
     def load(cls, path: str | Path) -> "RobotModel":
         """Read the file; ValueError names it and what is wrong with it."""
-        content = read_robot_file(path)
-        try:
-            return cls._of(content)
-        except ValueError as error:
-            raise ValueError(f"{path}: {error}") from error
-
-    @classmethod
-    def _of(cls, content: RobotFile) -> "RobotModel":
-        known = stages.parameters()
+        content, known = read_robot_file(path), stages.parameters()
         for joint in content.joints:
             if unknown := sorted(set(joint.laws) - set(known)):
-                raise ValueError(
-                    f"joint {joint.name[:60]!r} has no law {unknown[0][:60]!r}; valid: {', '.join(known)}"
-                )
+                told = f"joint {joint.name[:60]!r} has no law {unknown[0][:60]!r}; valid: {', '.join(known)}"
+                raise ValueError(f"{path}: {told}")
         return cls(content.joints, content.control_latency_s)
 
 
@@ -108,18 +100,10 @@ def to_model(names: tuple[str, ...], point: Point) -> RobotModel:
                 name=name,
                 natural_frequency_rad_s=float(np.exp(value["log_omega"])),
                 damping_ratio=float(np.exp(value["log_zeta"])),
-                encoder_offset=value["offset"],
-                backlash_command=value["play"],
-                backlash_output=value["loose"],
-                friction=value["friction"],
                 sag_form=cast("SagForm", point.forms[index]),
                 sag_terms=tuple(value[name] for name in SAG),
-                compliance=value["bend"],
-                stop=value["stop"],
-                give=value["give"],
-                backlash_rounding=value["round"],
-                breakaway=value["stick"],
                 laws={name: value[name] for name in stages.parameters() if value[name]},
+                **{field: value[name] for field, name in _FIELDS.items()},
             )
         )
     return RobotModel(tuple(joints), point.tau_s)
@@ -127,22 +111,10 @@ def to_model(names: tuple[str, ...], point: Point) -> RobotModel:
 
 def from_model(model: RobotModel) -> Point:
     """Inverse of `to_model`."""
-    rows = [
-        (
-            np.log(joint.natural_frequency_rad_s),
-            np.log(joint.damping_ratio),
-            joint.encoder_offset,
-            joint.backlash_command,
-            joint.backlash_output,
-            joint.friction,
-            *joint.sag_terms,
-            joint.compliance,
-            joint.stop,
-            joint.give,
-            joint.backlash_rounding,
-            joint.breakaway,
-            *(joint.laws.get(name, 0.0) for name in stages.parameters()),
-        )
-        for joint in model.joints
-    ]
+    rows = []
+    for joint in model.joints:
+        value = {name: getattr(joint, field) for field, name in _FIELDS.items()}
+        value |= {"log_omega": np.log(joint.natural_frequency_rad_s), "log_zeta": np.log(joint.damping_ratio)}
+        value |= dict(zip(SAG, joint.sag_terms, strict=True)) | dict(joint.laws)
+        rows.append([value.get(name, 0.0) for name in PARAMETERS])
     return Point(np.array(rows), tuple(joint.sag_form for joint in model.joints), model.control_latency_s)

@@ -11,7 +11,6 @@ SCALES = {
     "s": ((1.0, "s"), (1e3, "ms")),
     "rad": ((1e3, "mrad"),),
     "rad/s": ((1.0, "rad/s"), (1e3, "mrad/s")),
-    "counts": ((1.0, "counts"),),
     "counts/s": ((1.0, "counts/s"), (60.0, "counts/min")),
     "m/N": ((1e3, "mm/N"),),
     "Nm": ((1.0, "N·m"),),

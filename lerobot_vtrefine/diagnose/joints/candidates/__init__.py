@@ -8,22 +8,14 @@ import pkgutil
 from importlib import import_module
 
 from lerobot_vtrefine.diagnose.joints.candidates.base import Candidate, Sizes
+from lerobot_vtrefine.diagnose.verdict import ROBOT_CAUSES
 
-LISTED = (
-    "encoder_offset",
-    "backlash",
-    "joint_friction",
-    "gravity_sag",
-    "gripper_compliance",
-    "control_latency",
-)
-"""In the order in which they are tried; files beyond these follow, decoys come last."""
 _OTHERS = {"base", "decoys"}
 
 
 def _files() -> list[str]:
     found = {module.name for module in pkgutil.iter_modules(__path__)} - _OTHERS
-    return [*LISTED, *sorted(found - set(LISTED))]
+    return [*ROBOT_CAUSES, *sorted(found - set(ROBOT_CAUSES))]  # decoys come last
 
 
 NAMES = tuple(_files())
