@@ -100,7 +100,7 @@ def repeatability(problem: ServoTrials, residual: Array) -> float | None:
     without repeated commands."""
     batch = problem.batch
     found = []
-    for condition in set(batch.conditions):
+    for condition in sorted(set(batch.conditions)):
         trials = [index for index, name in enumerate(batch.conditions) if name == condition]
         for a, b in pairwise(trials):
             valid = batch.valid[:, a] & batch.valid[:, b]
