@@ -6,12 +6,15 @@ them.
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import numpy as np
 
 from lerobot_vtrefine.diagnose.recordings import RobotTrial
 
 Array = np.ndarray
+
+_FEWEST_VALUES, _FINEST, _OFF_LATTICE = 8, 2e-6, 0.05
 
 
 @dataclass(frozen=True)
@@ -51,6 +54,16 @@ class Batch:
     def frames(self) -> Array:
         """Valid frames per trial (T,)."""
         return self.valid.sum(0)
+
+    @cached_property
+    def resolution(self) -> Array:
+        """(J,) smallest step between different readings: the encoder's, or nearly zero."""
+        steps = np.empty(self.joints)
+        for joint in range(self.joints):
+            values = np.unique(self.position[..., joint][self.valid].round(9))
+            coarse = 1 < len(values) < 0.25 * self.valid.sum()
+            steps[joint] = np.median(np.diff(values)) if coarse else _lattice(values)
+        return np.maximum(steps, 1e-9)
 
     def subset(self, trials: Array | Sequence[int]) -> "Batch":
         """Only the trials of those indices."""
@@ -111,6 +124,15 @@ def frame_s(batch: Batch) -> float:
 def padded(values: Array, length: int) -> Array:
     """Rows (N, ...) and, up to a length, their last one again."""
     return np.concatenate([values, np.repeat(values[-1:], length - len(values), 0)])
+
+
+def _lattice(values: Array) -> float:
+    """The step of which all values are multiples, beside a constant; 0 where there is none."""
+    if len(values) < _FEWEST_VALUES:
+        return 0.0
+    step = float(np.diff(values).min())
+    places = (values - values[0]) / step
+    return step if step > _FINEST and np.abs(places - places.round()).max() < _OFF_LATTICE else 0.0
 
 
 def _check(trial: RobotTrial) -> None:

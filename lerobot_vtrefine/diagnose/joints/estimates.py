@@ -8,7 +8,6 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from lerobot_vtrefine.diagnose.core.resampling import jackknife
-from lerobot_vtrefine.diagnose.joints.encoder_steps import resolution
 from lerobot_vtrefine.diagnose.joints.fitting import ServoTrials
 from lerobot_vtrefine.diagnose.joints.gravity import is_sliding
 from lerobot_vtrefine.diagnose.joints.newton import leave_out, without_ridge
@@ -39,7 +38,7 @@ class Estimates:
         self.selection, self.seed = selection, seed
         self.theta, self.tau = leave_out(selection.problem, selection.fit)
         """(G, J, P) and (G,) without each of G conditions."""
-        self.steps = resolution(selection.problem)
+        self.steps = selection.problem.batch.resolution
         self.unheld = without_ridge(selection.problem, selection.fit)
         """(J, P)"""
 

@@ -14,12 +14,16 @@ from lerobot_vtrefine.diagnose.core.suspicion import Suspicion
 from lerobot_vtrefine.diagnose.joints import gravity
 from lerobot_vtrefine.diagnose.joints.candidates import CATALOGUE
 from lerobot_vtrefine.diagnose.joints.candidates.base import Candidate
-from lerobot_vtrefine.diagnose.joints.encoder_steps import LEAST_EFFECT_M, LEAST_EFFECT_RAD, resolution
 from lerobot_vtrefine.diagnose.joints.fitting import Fit, Point, ServoTrials, evaluate, fit, refit, servo_only
 from lerobot_vtrefine.diagnose.joints.friction_load import load_prefers
 from lerobot_vtrefine.diagnose.joints.newton import Refits, refits
 from lerobot_vtrefine.diagnose.joints.parameters import INDEX, SAG
-from lerobot_vtrefine.diagnose.joints.suspicions import not_repeating, suspicions
+from lerobot_vtrefine.diagnose.joints.suspicions import (
+    LEAST_EFFECT_M,
+    LEAST_EFFECT_RAD,
+    not_repeating,
+    suspicions,
+)
 from lerobot_vtrefine.diagnose.joints.timing import delay_starts, with_changing_delay
 
 Array = np.ndarray
@@ -130,7 +134,9 @@ class JointProblem(ServoTrials, OptionalSteps):
     def credible(self, baseline: Fit, now: Fit, best: Fit, candidate: Candidate) -> Array:
         """(J,) bool."""
         sliding = np.array([gravity.is_sliding(name) for name in self.names])
-        least = np.maximum(np.where(sliding, LEAST_EFFECT_M, LEAST_EFFECT_RAD), _OF_A_STEP * resolution(self))
+        least = np.maximum(
+            np.where(sliding, LEAST_EFFECT_M, LEAST_EFFECT_RAD), _OF_A_STEP * self.batch.resolution
+        )
         own = np.maximum(self.misfit * np.sqrt(baseline.total), np.where(sliding, 0.1, 1) * self.floor)
         effect = np.sqrt(np.square(best.residual - now.residual).sum((0, 1)) / self.batch.valid.sum())
         # What a jaw does where it stops no form follows exactly: another cause there must explain more.

@@ -13,7 +13,6 @@ from lerobot_vtrefine.diagnose.core.rules import LEAST_UNKNOWN
 from lerobot_vtrefine.diagnose.core.search import ALL
 from lerobot_vtrefine.diagnose.core.suspicion import Suspicion
 from lerobot_vtrefine.diagnose.joints.batch import frame_s
-from lerobot_vtrefine.diagnose.joints.encoder_steps import LEAST_EFFECT_RAD, resolution
 from lerobot_vtrefine.diagnose.joints.fitting import derivatives
 from lerobot_vtrefine.diagnose.joints.gravity import is_gripper
 from lerobot_vtrefine.diagnose.joints.repeatability import common_part, repeated, scatter
@@ -25,6 +24,8 @@ if TYPE_CHECKING:
 
 Array = np.ndarray
 
+LEAST_EFFECT_RAD, LEAST_EFFECT_M = 1e-4, 1e-5
+"""Smallest change of the prediction (root mean square) that is worth a name."""
 _REPEATS, _REPEATS_ALL = 0.3, 0.6
 """Least part of what is left that must repeat; where it is this much, and in every condition, the conditions
 need not be enough for a small p."""
@@ -73,7 +74,7 @@ def _worth_speaking_of(selection: "Selected") -> Array:
     problem, left = selection.problem, selection.fit.total.clip(1e-300)
     floor = max(LEAST_EFFECT_RAD, problem.floor)
     size = np.array([floor * (0.1 if is_gripper(name) else 1.0) for name in problem.names])
-    size = np.maximum(size, 0.5 * resolution(problem))
+    size = np.maximum(size, 0.5 * problem.batch.resolution)
     return np.maximum(size**2, LEAST_UNKNOWN * selection.baseline.total) / left
 
 
@@ -105,7 +106,7 @@ def not_repeating(selection: "Selected") -> list[Suspicion]:
     seen = scatter(problem.batch, fitted.residual, derivatives(problem, fitted).columns)
     if seen is None:
         return []
-    white = np.maximum(seen.white, 0.5 * resolution(problem))
+    white = np.maximum(seen.white, 0.5 * problem.batch.resolution)
     with_motion = seen.shape > _MOVING * np.maximum(seen.resting, white)
     shapes = seen.shape > np.where(with_motion, _SHAPES_DIFFER, _FAR) * white
     servos = (seen.servo > _SERVOS_DIFFER) & (seen.servo_effect > _SHAPES_DIFFER * white)

@@ -7,7 +7,6 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from lerobot_vtrefine.diagnose.core.problem import Candidate as AnyCandidate
-from lerobot_vtrefine.diagnose.joints.encoder_steps import moving
 from lerobot_vtrefine.diagnose.joints.fitting import Point, ServoTrials
 from lerobot_vtrefine.diagnose.joints.parameters import INDEX, RATIOS
 from lerobot_vtrefine.diagnose.verdict import Parameter
@@ -19,6 +18,11 @@ Array = np.ndarray
 Possible = Callable[[ServoTrials], Array]
 Start = Callable[[ServoTrials, Point, Array, float], Point]
 Sizes = Callable[["Estimates", tuple[int, ...]], dict[str, Parameter]]
+
+
+def moving(problem: ServoTrials) -> Array:
+    """(J,) bool: joints that are commanded to move by more than their encoder can tell."""
+    return np.ptp(problem.batch.command, axis=(0, 1)) > 4 * problem.batch.resolution
 
 
 @dataclass(frozen=True)

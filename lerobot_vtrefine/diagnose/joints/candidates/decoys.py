@@ -2,9 +2,8 @@
 
 from functools import partial
 
-from lerobot_vtrefine.diagnose.joints.candidates.base import Candidate
+from lerobot_vtrefine.diagnose.joints.candidates.base import Candidate, moving
 from lerobot_vtrefine.diagnose.joints.candidates.gravity_sag import shaped, shows
-from lerobot_vtrefine.diagnose.joints.encoder_steps import moving
 from lerobot_vtrefine.diagnose.joints.parameters import SAG
 
 DECOY = "unknown"

@@ -6,8 +6,7 @@ from functools import partial
 import numpy as np
 
 from lerobot_vtrefine.diagnose.joints import gravity
-from lerobot_vtrefine.diagnose.joints.candidates.base import Candidate
-from lerobot_vtrefine.diagnose.joints.encoder_steps import moving
+from lerobot_vtrefine.diagnose.joints.candidates.base import Candidate, moving
 from lerobot_vtrefine.diagnose.joints.estimates import Estimates, MethodError
 from lerobot_vtrefine.diagnose.joints.fitting import Point, ServoTrials
 from lerobot_vtrefine.diagnose.joints.parameters import INDEX, SAG

@@ -4,8 +4,7 @@ import numpy as np
 
 from lerobot_vtrefine.diagnose.core.resampling import jackknife
 from lerobot_vtrefine.diagnose.joints import gravity
-from lerobot_vtrefine.diagnose.joints.candidates.base import Candidate, at_zero
-from lerobot_vtrefine.diagnose.joints.encoder_steps import moving
+from lerobot_vtrefine.diagnose.joints.candidates.base import Candidate, at_zero, moving
 from lerobot_vtrefine.diagnose.joints.estimates import Estimates, MethodError, widened
 from lerobot_vtrefine.diagnose.joints.fitting import Point, ServoTrials
 from lerobot_vtrefine.diagnose.joints.parameters import INDEX
