@@ -1,33 +1,18 @@
 """All checks in their order."""
 
-from lerobot_vtrefine.diagnose.quality.drive import (
-    check_contact,
-    check_drives,
-    check_forces,
-    check_signs,
+from lerobot_vtrefine.diagnose.quality import (
+    drive,
+    frames,
+    joints,
+    outliers,
+    readings,
+    response,
+    session,
+    sizes,
+    units,
+    wiring,
 )
 from lerobot_vtrefine.diagnose.quality.edits import Check, apply
-from lerobot_vtrefine.diagnose.quality.frames import (
-    check_clock,
-    check_length,
-    check_numbers,
-    check_optional,
-    check_repeats,
-    check_spikes,
-)
-from lerobot_vtrefine.diagnose.quality.joints import (
-    check_commands,
-    check_encoders,
-    check_joint_order,
-    check_jumps,
-)
-from lerobot_vtrefine.diagnose.quality.outliers import check_gain, check_odd
-from lerobot_vtrefine.diagnose.quality.readings import check_readings, check_wraps
-from lerobot_vtrefine.diagnose.quality.response import check_answers, check_start, check_stuck
-from lerobot_vtrefine.diagnose.quality.session import check_conditions, check_session
-from lerobot_vtrefine.diagnose.quality.sizes import check_sizes
-from lerobot_vtrefine.diagnose.quality.units import check_temperature, check_units
-from lerobot_vtrefine.diagnose.quality.wiring import check_wiring
 from lerobot_vtrefine.diagnose.recordings import RecordingSet
 from lerobot_vtrefine.diagnose.verdict import DataIssue
 
@@ -39,42 +24,42 @@ MIN_PART = 1 / 3
 # Each check sees what the ones before it left: first frames and times, then what the pad says. Frames without
 # numbers are dropped after the clock was checked, which would take them for lost ones; all other checks need
 # numbers.
-UNIT_CHECKS: tuple[Check, ...] = (check_sizes, check_units)
+UNIT_CHECKS: tuple[Check, ...] = (sizes.check_sizes, units.check_units)
 """What a prediction has to mend as well; none of these looks at readings."""
 FRAME_CHECKS: tuple[Check, ...] = (
-    check_repeats,
-    check_spikes,
+    frames.check_repeats,
+    frames.check_spikes,
     *UNIT_CHECKS,
-    check_clock,
-    check_temperature,
-    check_optional,
-    check_numbers,
-    check_length,
-    check_session,
+    frames.check_clock,
+    units.check_temperature,
+    frames.check_optional,
+    frames.check_numbers,
+    frames.check_length,
+    session.check_session,
 )
 PAD_CHECKS: tuple[Check, ...] = (
-    check_drives,
-    check_readings,
-    check_signs,
-    check_forces,
-    check_contact,
-    check_stuck,
-    check_wraps,
-    check_wiring,
-    check_start,
-    check_answers,
-    check_odd,
-    check_gain,
-    check_conditions,
+    drive.check_drives,
+    readings.check_readings,
+    drive.check_signs,
+    drive.check_forces,
+    drive.check_contact,
+    response.check_stuck,
+    readings.check_wraps,
+    wiring.check_wiring,
+    response.check_start,
+    response.check_answers,
+    outliers.check_odd,
+    outliers.check_gain,
+    session.check_conditions,
 )
-PLACED_CHECKS: tuple[Check, ...] = (check_answers, check_odd, check_gain)
+PLACED_CHECKS: tuple[Check, ...] = (response.check_answers, outliers.check_odd, outliers.check_gain)
 """With lines in the wrong place, these would find every trial at fault."""
 ROBOT_CHECKS: tuple[Check, ...] = (
-    check_jumps,
-    check_commands,
-    check_encoders,
-    check_joint_order,
-    check_conditions,
+    joints.check_jumps,
+    joints.check_commands,
+    joints.check_encoders,
+    joints.check_joint_order,
+    session.check_conditions,
 )
 
 
@@ -91,7 +76,7 @@ def check_quality(recordings: RecordingSet) -> tuple[RecordingSet, list[DataIssu
         if not recordings.trials or (check in PLACED_CHECKS and miswired):
             continue
         recordings, found = apply(recordings, list(check(recordings)))
-        miswired |= check is check_wiring and any(issue.trial is None for issue in found)
+        miswired |= check is wiring.check_wiring and any(issue.trial is None for issue in found)
         issues += found
     return recordings, issues
 
