@@ -10,6 +10,7 @@ import numpy as np
 from lerobot_vtrefine.diagnose.core.diagnosis import Diagnosis
 from lerobot_vtrefine.diagnose.evidence import Evidence, Trace
 from lerobot_vtrefine.diagnose.recordings import RecordingSet
+from lerobot_vtrefine.diagnose.report import words
 from lerobot_vtrefine.diagnose.report.effects import effect_drawing
 from lerobot_vtrefine.diagnose.report.figures import (
     SHOWN_TRIALS,
@@ -19,17 +20,6 @@ from lerobot_vtrefine.diagnose.report.figures import (
     trial_figure,
 )
 from lerobot_vtrefine.diagnose.report.numbers import interval, nested, p_text, percent, quantity
-from lerobot_vtrefine.diagnose.report.words import (
-    AXES,
-    MEANINGS,
-    ROBOT_AXES,
-    doubts,
-    headline,
-    meaning,
-    size_text,
-    ties,
-    title,
-)
 from lerobot_vtrefine.diagnose.servo.bench import on_bench
 from lerobot_vtrefine.diagnose.verdict import Parameter, Verdict
 from lerobot_vtrefine.pages.pads import colour_scale, pad_image
@@ -68,25 +58,25 @@ def render_report(
     return render(
         "lerobot_vtrefine.diagnose.report",
         "report.html",
-        headline=headline(verdict, unit),
+        headline=words.headline(verdict, unit),
         verdict=verdict,
         verdict_of_pad=of_pad,
-        meaning=meaning,
+        meaning=words.meaning,
         percent=percent,
         p_text=p_text,
-        title=title,
-        ties=ties(verdict),
-        doubts=doubts(verdict, len(recordings.trials), sound),
+        title=words.title,
+        ties=words.ties(verdict),
+        doubts=words.doubts(verdict, len(recordings.trials), sound),
         facts=_facts(verdict, recordings, sound, seed) + ([("stability", survived)] if survived else []),
         next_experiment=_experiment(verdict.next_experiment),
         detectable=[
-            {"title": title(name), "size": size_text(name, size)}
+            {"title": words.title(name), "size": words.size_text(name, size)}
             for name, size in verdict.minimum_detectable.items()
         ],
         drawings={cause.name: effect_drawing(cause.name) for cause in verdict.causes},
         use=_use(verdict, recordings, model),
         film=film,
-        not_tested=[{"title": title(name), "needs": what} for name, what in verdict.not_tested.items()],
+        not_tested=[{"title": words.title(name), "needs": what} for name, what in verdict.not_tested.items()],
         **_findings(diagnosis, of_pad),
     )
 
@@ -118,8 +108,8 @@ def _use(verdict: Verdict, recordings: RecordingSet, model: str) -> dict[str, st
 def _findings(diagnosis: Diagnosis, of_pad: bool) -> dict[str, Any]:
     verdict, unit = diagnosis.verdict, diagnosis.unit
     traces = [{"caption": text, "figure": trace_figure(t, unit)} for t, text in _ordered(diagnosis.traces)]
-    groups = [(title(cause.name), cause.params) for cause in verdict.causes]
-    axes = AXES if of_pad else ROBOT_AXES
+    groups = [(words.title(cause.name), cause.params) for cause in verdict.causes]
+    axes = words.AXES if of_pad else words.ROBOT_AXES
     found = [item for item in diagnosis.evidence if item.decision != NOT_FOUND]
     not_found = [item for item in diagnosis.evidence if item.decision == NOT_FOUND]
     return {
@@ -201,8 +191,8 @@ def _by_decision(evidence: Sequence[Evidence]) -> list[Evidence]:
 def _evidence_row(item: Evidence) -> dict[str, Any]:
     gain = item.cv_gain
     return {
-        "title": title(item.name),
-        "name": item.name if item.name in MEANINGS else "",
+        "title": words.title(item.name),
+        "name": item.name if item.name in words.MEANINGS else "",
         "p": p_text(item.p_value),
         "p_adjusted": "observed" if item.observed else p_text(item.p_adjusted),
         "gain": "–" if gain is None else percent(gain),
@@ -260,6 +250,6 @@ def _experiment(protocol: Mapping[str, Any] | None) -> dict[str, Any] | None:
     rest = {key: value for key, value in protocol.items() if key not in ("text", "decides")}
     return {
         "text": protocol.get("text", ""),
-        "decides": [title(str(name)) for name in protocol.get("decides", ())],
+        "decides": [words.title(str(name)) for name in protocol.get("decides", ())],
         "protocol": json.dumps(rest, indent=2, default=str) if rest else "",
     }
