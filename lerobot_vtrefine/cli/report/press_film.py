@@ -20,14 +20,13 @@ IDLE_FRAMES = 3
 
 def press_film(diagnosis: Diagnosis, recordings: RecordingSet) -> dict[str, str] | None:
     """The film of the typical held-out trial, its caption and scale; None where there is nothing to show."""
-    models = diagnosis.measured_models
+    models = [model for model in diagnosis.measured_models if isinstance(model, SensorModel)]
     shown = typical_trial(diagnosis, recordings)
-    if shown is None or not all(isinstance(model, SensorModel) for model in models):
+    if shown is None or len(models) < 2:
         return None
     layout = PadLayout(recordings.rows, recordings.cols, recordings.pitch_m)
     sides = [shown.raw]
     for model in models:
-        assert isinstance(model, SensorModel)
         sides.append(predict_frames(shown, lambda trial, model=model: predict_trial(model, trial, layout)))
     stride = -(-len(shown.time_s) // MOST_FRAMES)
     films = [

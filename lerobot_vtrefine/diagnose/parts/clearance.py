@@ -87,9 +87,9 @@ def clearance(
 ) -> Quantity:
     """The hole's, across the pads."""
     known = scene.scene.hole_clearance_m
-    if reason := scene.unheld("socket") or scene.unheld("plug"):
-        return Quantity("clearance", "clearance", known, "m", FORM, None, reason)
-    blocks, reason = _blocks(known, episodes, contacts)
+    blocks, reason = None, scene.unheld("socket") or scene.unheld("plug")
+    if not reason:
+        blocks, reason = _blocks(known, episodes, contacts)
     round_hole = blocks is not None and scene.pair.name == "round"
     if round_hole and blocks.solve(np.ones(len(blocks.rows)), slope=True)[-1] < 0:
         reason = _ROUND
