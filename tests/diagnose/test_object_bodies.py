@@ -8,7 +8,7 @@ from object_rigs import record, write_dataset
 from lerobot_vtrefine.diagnose.dataset.engine import diagnose_dataset
 from lerobot_vtrefine.diagnose.joints.dataset import read_dataset
 from lerobot_vtrefine.diagnose.joints.gravity import is_gripper, is_sliding
-from lerobot_vtrefine.diagnose.parts.engine import assumed_masses, diagnose_parts
+from lerobot_vtrefine.diagnose.parts.engine import assumed_masses, diagnose_parts, weigh
 from lerobot_vtrefine.diagnose.parts.episodes import AssumedScene, handled
 from lerobot_vtrefine.sim.config import SceneConfig, TaskConfig
 from lerobot_vtrefine.sim.pairs import load_pair
@@ -21,7 +21,7 @@ def diagnosed(believed, count=6, what="pick", seed=0, **hidden):
     recorded = record(replace(believed, **hidden), count, what, seed=seed)
     scene = AssumedScene(believed, recorded.rules, load_pair(believed))
     episodes = [handled(episode, scene) for episode in recorded.episodes]
-    return diagnose_parts(scene, episodes), scene
+    return diagnose_parts(scene, episodes, weigh(scene, episodes)), scene
 
 
 def test_the_kinova_weighs_heavier_parts() -> None:

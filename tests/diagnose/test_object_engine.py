@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from object_rigs import record
 
-from lerobot_vtrefine.diagnose.parts.engine import assumed_masses, diagnose_parts
+from lerobot_vtrefine.diagnose.parts.engine import assumed_masses, diagnose_parts, weigh
 from lerobot_vtrefine.diagnose.parts.episodes import AssumedScene, handled
 from lerobot_vtrefine.sim.config import SceneConfig
 from lerobot_vtrefine.sim.pairs import load_pair
@@ -17,7 +17,7 @@ EPISODES = 6
 def diagnosed(recorded):
     scene = AssumedScene(BELIEVED, recorded.rules, load_pair(BELIEVED))
     episodes = [handled(episode, scene) for episode in recorded.episodes]
-    return diagnose_parts(scene, episodes), scene
+    return diagnose_parts(scene, episodes, weigh(scene, episodes)), scene
 
 
 def decisions(found):

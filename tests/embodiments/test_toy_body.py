@@ -21,7 +21,7 @@ from lerobot_vtrefine.datasets.episodes import open_episodes
 from lerobot_vtrefine.datasets.features import ACTION_KEY, STATE_KEY, dataset_features, raw_keys
 from lerobot_vtrefine.diagnose.episode_replay.compare import compare_episodes
 from lerobot_vtrefine.diagnose.joints.engine import diagnose_robot
-from lerobot_vtrefine.diagnose.parts.engine import diagnose_parts
+from lerobot_vtrefine.diagnose.parts.engine import diagnose_parts, weigh
 from lerobot_vtrefine.diagnose.parts.episodes import assumed_scene, read_episodes
 from lerobot_vtrefine.embodiments import (
     ALOHA,
@@ -269,7 +269,8 @@ def test_diagnosis_says_what_it_lacks_to_weigh_parts(dataset: Path) -> None:
     """In a line: its hand has one pad, and whether a hand holds something takes two that face each other."""
     scene = assumed_scene(open_episodes(dataset))
     assert scene is not None
-    found = diagnose_parts(scene, read_episodes(dataset, scene))
+    episodes = read_episodes(dataset, scene)
+    found = diagnose_parts(scene, episodes, weigh(scene, episodes))
     assert found.verdict.status == "adequate"
     reasons = {item.name: (item.decision, item.reason) for item in found.evidence}
     assert {decision for decision, _ in reasons.values()} == {"not identifiable"}

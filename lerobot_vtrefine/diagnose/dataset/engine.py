@@ -23,10 +23,10 @@ from lerobot_vtrefine.diagnose.joints.model import RobotModel
 from lerobot_vtrefine.diagnose.joints.twin_diagnosis import TwinTrial, beyond_twin, diagnose_on_twin
 from lerobot_vtrefine.diagnose.parts.engine import (
     assumed_masses,
-    believed_masses,
     diagnose_parts,
-    found_masses,
+    masses_kg,
     unknown_parts,
+    weigh,
 )
 from lerobot_vtrefine.diagnose.parts.episodes import (
     AssumedScene,
@@ -142,10 +142,11 @@ def _on_twin(
     episodes = read_episodes(recordings.path, scene)
     episodes = tuple(item for item in episodes if episode_name(item.index) in kept)
     session = _Session(recordings, scene, episodes)
-    mass = found_masses(scene, episodes, seed)
+    mass = masses_kg(weigh(scene, episodes, seed))
     found = _robot(session, mass, seed, progress)
-    objects = diagnose_parts(scene, _corrected(session, found, mass), seed)
-    now = believed_masses(objects, scene)
+    trusted = _corrected(session, found, mass)
+    weighed = weigh(scene, trusted, seed)
+    objects, now = diagnose_parts(scene, trusted, weighed, seed), masses_kg(weighed)
     if np.abs(now - mass).max() > 0.1 * assumed_masses(scene).min():
         found = _robot(session, now, seed, progress)
     return found, objects

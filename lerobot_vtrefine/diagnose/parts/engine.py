@@ -20,7 +20,6 @@ from lerobot_vtrefine.diagnose.parts.mass import masses, remeasured
 from lerobot_vtrefine.diagnose.parts.payload import replay_loaded
 from lerobot_vtrefine.diagnose.parts.problem import Measured, Quantity, measure
 from lerobot_vtrefine.diagnose.verdict import Cause, Verdict
-from lerobot_vtrefine.embodiments.embodiment import PARTS
 from lerobot_vtrefine.sim.scene import build_scene
 
 Array = np.ndarray
@@ -49,30 +48,27 @@ def assumed_masses(scene: AssumedScene) -> Array:
     return np.array([built.model.body_mass[built.socket_body], built.model.body_mass[built.plug_body]])
 
 
-def weighed(scene: AssumedScene, episodes: Sequence[HandledEpisode], seed: int) -> tuple[Measured, ...]:
+def weigh(scene: AssumedScene, episodes: Sequence[HandledEpisode], seed: int = 0) -> tuple[Measured, ...]:
     """Socket and plug, as far as episodes show them."""
     found = measure(masses(scene, episodes, assumed_masses(scene), seed), seed)
     return remeasured(scene, episodes, found, seed)
 
 
-def found_masses(scene: AssumedScene, episodes: Sequence[HandledEpisode], seed: int) -> Array:
+def masses_kg(found: Sequence[Measured]) -> Array:
     """(2,) of socket and plug as episodes show them, as assumed where they show nothing else."""
-    return np.array([item.believed for item in weighed(scene, episodes, seed)])
+    return np.array([item.believed for item in found])
 
 
-def believed_masses(found: Diagnosis, scene: AssumedScene) -> Array:
-    """(2,) the same, from a diagnosis."""
-    named = {key: item.value for cause in found.verdict.causes for key, item in cause.params.items()}
-    return np.array(
-        [named.get(f"{part}_kg", known) for part, known in zip(PARTS, assumed_masses(scene), strict=True)]
-    )
+def diagnose_parts(
+    scene: AssumedScene, episodes: Sequence[HandledEpisode], weighed: Sequence[Measured], seed: int = 0
+) -> Diagnosis:
+    """Judge the parts of episodes whose encoders are trusted (what robots get wrong taken off before).
 
-
-def diagnose_parts(scene: AssumedScene, episodes: Sequence[HandledEpisode], seed: int = 0) -> Diagnosis:
-    """Judge the parts of episodes whose encoders are trusted (what robots get wrong taken off before)."""
-    found = list(weighed(scene, episodes, seed))
-    mass = np.array([item.believed for item in found])
-    untouched = replay_loaded(scene, episodes, scene.weights_n(episodes, mass), contacts=False)
+    Args:
+        weighed: the masses as `weigh` finds them in these episodes.
+    """
+    found = list(weighed)
+    untouched = replay_loaded(scene, episodes, scene.weights_n(episodes, masses_kg(found)), contacts=False)
     contacts = contacts_of(scene, episodes, untouched)
     found += measure([sliding.friction(scene, episodes, contacts)], seed)
     known = scene.scene.pad_friction
