@@ -8,7 +8,13 @@ import pytest
 from lerobot_vtrefine.diagnose.core.engine import guarded, infer
 from lerobot_vtrefine.diagnose.core.heldout import lock
 from lerobot_vtrefine.diagnose.core.problem import OptionalSteps, PlainCandidate
-from lerobot_vtrefine.diagnose.core.resampling import folds_of, jackknife, jointly_adjusted, one_sided
+from lerobot_vtrefine.diagnose.core.resampling import (
+    Hypothesis,
+    folds_of,
+    jackknife,
+    jointly_adjusted,
+    one_sided,
+)
 from lerobot_vtrefine.diagnose.core.rivals import Rival, adopt, if_tied
 from lerobot_vtrefine.diagnose.core.search import ALL
 from lerobot_vtrefine.diagnose.core.suspicion import Suspicion, raise_alarms
@@ -228,18 +234,49 @@ def test_the_guard_leaves_other_channels_alone() -> None:
     assert names(infer(replace(problem, y=y, offered=offered)))[0] == ["1"]
 
 
+CHAIN = np.eye(18, k=1)
+PLACE = (np.arange(18) - 8.5) / np.arange(18).std()
+
+
+def of_all_kinds(rng: np.random.Generator) -> list[Suspicion]:
+    """Forty suspicions of which none holds: signs, orders, neighbours, and scores that few trials carry."""
+    found = []
+    for k, row in enumerate(rng.standard_t(3, (40, 18))):
+        along = (None, PLACE, None, CHAIN)[k % 4]
+        # A trial's score scatters as its own size; the last kind of three trials only.
+        size = np.where(np.arange(18) < 3, 1.0, 1e-3) if k % 4 == 2 else np.ones(18)
+        scatter = float(np.sqrt(3.0 * np.square(size).sum()))
+        found.append(Suspicion(0, "", 1.0, 0.1, row * size, along is not CHAIN, along, scatter))
+    return found
+
+
 def test_suspicions_have_one_error_rate() -> None:
-    rng, alarms, sets = np.random.default_rng(0), 0, 10
+    rng, alarms = np.random.default_rng(0), 0
     selection = infer(toy()).selection
-    place = (np.arange(18) - 8.5) / np.arange(18).std()
-    for number in range(sets):
-        scores = rng.standard_t(3, (40, 18))
-        found = [
-            Suspicion(0, "", 1.0, 0.1, row, either_sign=True, along=place if k % 2 else None)
-            for k, row in enumerate(scores)
-        ]
-        alarms += bool(raise_alarms(selection, found, number))
-    assert alarms <= 1  # of 10 sets with forty suspicions each, at one in a hundred
+    for number in range(40):
+        alarms += bool(raise_alarms(selection, of_all_kinds(rng), number))
+    assert alarms <= 3  # of 40 sets with forty suspicions each, at one in a hundred: one time in a thousand
+
+
+def test_a_sum_that_few_trials_dominate_tells_where_all_trials_agree() -> None:
+    # Its largest possible value is that of three equal trials, which sums of many pass by accident.
+    rng = np.random.default_rng(5)
+    many = [Hypothesis(row, either_sign=True) for row in rng.normal(size=(30, 18))]
+    agreeing = np.where(np.arange(18) < 6, 1.0, 0.1) * rng.uniform(0.8, 1.2, 18)
+    split = agreeing * np.where(np.arange(18) == 0, -1.0, 1.0)
+    assert jointly_adjusted([*many, Hypothesis(agreeing, either_sign=True)], 0)[-1] < 0.01
+    assert jointly_adjusted([*many, Hypothesis(split, either_sign=True)], 0)[-1] > 0.05
+
+
+@pytest.mark.parametrize(("trials", "size", "told"), [(4, 15.0, True), (4, 4.0, False), (18, 15.0, False)])
+def test_where_few_trials_carry_a_sum_its_size_tells(trials: int, size: float, told: bool) -> None:
+    rng = np.random.default_rng(6)
+    many = [Hypothesis(row, either_sign=True) for row in rng.normal(size=(30, 18))]
+    scores = np.where(np.arange(18) < trials, 1.0, 0.0)
+    # As many trials as there are have signs: these decide, whatever the noise should be.
+    scores[: trials // 3] *= -1.0
+    hypothesis = Hypothesis(scores, either_sign=True, scatter=abs(float(scores.sum())) / size)
+    assert bool(jointly_adjusted([*many, hypothesis], 0)[-1] < 0.01) is told
 
 
 def test_suspicions_that_hold_are_told_and_what_was_observed_has_no_p_value() -> None:
@@ -273,7 +310,7 @@ def test_flips_are_exact_where_trials_are_few() -> None:
     alone, adjusted = one_sided(np.array([[1.0, -1.0], [1.0, 1.0], [1.0, 1.0], [1.0, -1.0]]), 0)
     np.testing.assert_allclose(alone, [1 / 16, 11 / 16])
     assert adjusted[0] >= alone[0]
-    few = jointly_adjusted([(np.ones(5), None, False)], 0)
+    few = jointly_adjusted([Hypothesis(np.ones(5))], 0)
     assert few[0] == pytest.approx(1 / 32, abs=0.01)
 
 

@@ -10,6 +10,7 @@ from jittered_rig import EFFECTS, Rig
 
 from lerobot_vtrefine.diagnose.core.heldout import lock, out_of_fold
 from lerobot_vtrefine.diagnose.core.search import Selection
+from lerobot_vtrefine.diagnose.core.suspicion import raise_alarms
 from lerobot_vtrefine.diagnose.pad import review
 from lerobot_vtrefine.diagnose.pad.baseline import fit_baseline
 from lerobot_vtrefine.diagnose.pad.candidates import CATALOGUE
@@ -25,6 +26,7 @@ from lerobot_vtrefine.diagnose.pad.own_touch import with_own_touch
 from lerobot_vtrefine.diagnose.pad.press_trials import prepare
 from lerobot_vtrefine.diagnose.pad.problem import Candidate, PadProblem
 from lerobot_vtrefine.diagnose.pad.screening import forms_of
+from lerobot_vtrefine.diagnose.pad.suspicions import suspicions
 from lerobot_vtrefine.diagnose.pad.taxel_maps import with_map
 
 
@@ -95,13 +97,11 @@ def test_a_borrowed_name_predicts_worse_than_what_no_name_covers(law: str, borro
     )
     (form,) = forms_of("supply_droop", fitted)
     problem, named = problem.weighed(with_form(fitted, form, (), problem.presses, problem.weights))
-    alarms = [
-        item.clue
-        for item in in_place_of_names(problem, named)
-        if item.p_alone is not None and item.p_alone < item.level and item.share > item.least
-    ]
-    assert bool(alarms) == borrowed
-    assert all("column" in clue for clue in alarms)
+    selection = Selection(problem, named, named, {}, {}, np.zeros((0, 1)))
+    alarms = raise_alarms(selection, suspicions(problem, selection), 0)
+    clues = [alarm.clue for alarm in alarms if "in the place" in alarm.clue]
+    assert bool(clues) == borrowed
+    assert all("column" in clue for clue in clues)
 
 
 @pytest.mark.parametrize(("law", "seed"), [("offset_late", 3), ("offset_early", 3)])

@@ -7,7 +7,7 @@ import pytest
 from robot_rigs import Rig, make_set
 
 from lerobot_vtrefine.diagnose.core.engine import infer
-from lerobot_vtrefine.diagnose.core.resampling import jointly_adjusted
+from lerobot_vtrefine.diagnose.core.resampling import Hypothesis, jointly_adjusted
 from lerobot_vtrefine.diagnose.core.search import ALL
 from lerobot_vtrefine.diagnose.joints import timing
 from lerobot_vtrefine.diagnose.joints.batch import make_batch
@@ -86,5 +86,5 @@ def test_trends_follow_the_order_of_trials_and_nothing_else(batch) -> None:
 
 def surely(found):
     """Trends that the joint test of all of them does not take for an accident of the order."""
-    p_values = jointly_adjusted([(t.scores, t.along, True) for t in found], 0)
+    p_values = jointly_adjusted([Hypothesis(t.scores, t.along, either_sign=True) for t in found], 0)
     return [trend for trend, p in zip(found, p_values, strict=True) if p < 0.01]

@@ -5,11 +5,21 @@ as likely negative as positive, whatever its variance (Hemerik et al. 2020). Sha
 """
 
 from collections.abc import Sequence
+from dataclasses import dataclass
 
 import numpy as np
 from scipy.stats import t as student_t
 
-from lerobot_vtrefine.diagnose.core.rules import DRAWS, EXACT_UP_TO, FLIPS, FOLDS, MIN_CONDITIONS
+from lerobot_vtrefine.diagnose.core.rules import (
+    BALANCED_AT,
+    DRAWS,
+    EXACT_UP_TO,
+    FEW_FOR_SIGNS,
+    FLIPS,
+    FOLDS,
+    MIN_CONDITIONS,
+    SIZE_DOUBT,
+)
 
 Array = np.ndarray
 
@@ -42,30 +52,75 @@ def agree(differences: Array, seed: int, level: float) -> bool:
     return p_value <= max(level, 1.05 * 2.0 ** -len(differences) + 1e-3)
 
 
-def jointly_adjusted(hypotheses: Sequence[tuple[Array, Array | None, bool]], seed: int) -> Array:
-    """p (K,) adjusted over hypotheses of two kinds together (max-T).
+@dataclass(frozen=True)
+class Hypothesis:
+    """What one suspicion's scores (T,) would be without an effect; zero for trials that say nothing."""
 
-    Args:
-        hypotheses: scores (T,); what they may follow (T,), standardised, whose order is then permuted, or
-            None, and their signs are flipped; whether either sign tells.
+    scores: Array
+    along: Array | None = None
+    """(T,) what they may follow, standardised, or (T, T) which of them may agree: their order is arbitrary.
+    None: their signs are."""
+    either_sign: bool = False
+    """Whether either sign tells."""
+    scatter: float | None = None
+    """Standard deviation of their sum by the noise alone, as it was fitted; None: not known."""
+
+    @property
+    def few(self) -> bool:
+        """Whether so few trials carry the sum that their signs cannot tell."""
+        size = np.abs(self.scores)
+        return float(size.sum() ** 2) < FEW_FOR_SIGNS * float((size**2).sum())
+
+
+def jointly_adjusted(hypotheses: Sequence[Hypothesis], seed: int) -> Array:
+    """p (K,) adjusted over all hypotheses together (max-T).
+
+    Signs are flipped, or orders permuted. Where few trials carry a sum whose scatter is known, its size is
+    one more hypothesis: as likely as among normal numbers that scatter `SIZE_DOUBT` times as far.
+
+    Every statistic is told in units of the upper tail of its own resampled values (balanced: Beran 1988,
+    Romano & Wolf 2010). A sum that a few trials dominate stays small even where all trials agree, and would
+    drown among sums of many.
     """
-    scores = _of_unit_length(np.stack([item[0] for item in hypotheses], 1))
+    scores = _of_unit_length(np.stack([item.scores for item in hypotheses], 1))
     signs = sign_matrix(len(scores), seed)
     rng = np.random.default_rng([seed, 1])
     if len(signs) < FLIPS:
         signs = signs[np.r_[0, rng.integers(0, len(signs), FLIPS)]]
+    flipped = [k for k, item in enumerate(hypotheses) if item.along is None]
     drawn = np.empty((len(signs), len(hypotheses)))
-    ordered = [k for k, item in enumerate(hypotheses) if item[1] is not None]
-    plain = np.setdiff1d(np.arange(len(hypotheses)), ordered)
-    drawn[:, plain] = signs @ scores[:, plain]
-    if ordered:
-        order = rng.permuted(np.tile(np.arange(len(scores)), (len(signs), 1)), axis=1)
-        order[0] = np.arange(len(scores))
-        for k in ordered:
-            drawn[:, k] = np.asarray(hypotheses[k][1])[order] @ scores[:, k]
-    either = np.array([item[2] for item in hypotheses])
+    drawn[:, flipped] = signs @ scores[:, flipped]
+    places = rng.random((len(signs), len(scores)))
+    places[0] = np.arange(len(scores))
+    orders: dict[bytes, Array] = {}
+    for k, item in enumerate(hypotheses):
+        if item.along is None:
+            continue
+        told = np.flatnonzero(scores[:, k])
+        if told.tobytes() not in orders:
+            orders[told.tobytes()] = places[:, told].argsort(axis=1)
+        drawn[:, k] = _in_orders(scores[told, k], item.along, told, orders[told.tobytes()])
+    sized = [k for k, item in enumerate(hypotheses) if item.scatter and item.few]
+    sizes = rng.standard_normal((len(signs), len(sized)))
+    sizes[0] = [hypotheses[k].scores.sum() / (SIZE_DOUBT * (hypotheses[k].scatter or 1.0)) for k in sized]
+    of = np.concatenate([np.arange(len(hypotheses)), sized]).astype(int)
+    drawn = np.concatenate([drawn, sizes], axis=1)
+    either = np.array([hypotheses[k].either_sign for k in of])
     drawn[:, either] = np.abs(drawn[:, either])
-    return np.where(np.any(scores, axis=0), _exceeding(drawn.max(1), drawn[0] - 1e-12), 1.0)
+    drawn /= np.quantile(drawn, 1.0 - BALANCED_AT, axis=0).clip(1e-300)
+    found = np.where(np.any(scores, axis=0)[of], _exceeding(drawn.max(1), drawn[0] - 1e-12), 1.0)
+    p_values = np.ones(len(hypotheses))
+    np.minimum.at(p_values, of, found)
+    return p_values
+
+
+def _in_orders(scores: Array, along: Array, told: Array, order: Array) -> Array:
+    """Standardised statistic (B,) of the scores (n,) of some trials in every order (B, n)."""
+    if along.ndim == 1:
+        return along[told][order] @ scores
+    moved = scores[order]
+    drawn = ((moved @ along[np.ix_(told, told)]) * moved).sum(axis=1)
+    return (drawn - drawn.mean()) / max(float(drawn.std()), 1e-300)
 
 
 def _of_unit_length(scores: Array) -> Array:

@@ -4,8 +4,9 @@ ALPHA = 0.02
 """Chance that trials without any effect yield a name, over all candidates and channels together."""
 SUSPICION_ALPHA = 0.01
 """Chance that trials without any effect raise an alarm, over all suspicions and channels together."""
-ORDER_ALPHA = 0.002
-"""The same by a suspicion that permutes the order of trials in its own way, beside the joint test."""
+BALANCED_AT = 0.001
+"""Tail of every suspicion's own resampled values that is its unit: far out, where the joint test decides, and
+still ten of `FLIPS`."""
 LEAST_GAIN = 0.01
 """Smallest part of a channel's squared error that is worth a name: below, no user would notice."""
 LEAST_UNKNOWN = 0.02

@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 
-from lerobot_vtrefine.diagnose.core.resampling import jointly_adjusted
+from lerobot_vtrefine.diagnose.core.resampling import Hypothesis, jointly_adjusted
 from lerobot_vtrefine.diagnose.core.rules import FEW_TRIALS, SUSPICION_ALPHA
 from lerobot_vtrefine.diagnose.core.search import Selection
 
@@ -33,16 +33,10 @@ class Suspicion:
     """Smallest such part that is worth an alarm."""
     scores: Array | None = None
     """(T,), as likely negative as positive under the null; zero for trials that say nothing.
-    None: observed."""
+    None: observed. What follows is as in `Hypothesis`."""
     either_sign: bool = False
-    """Whether scores that are negative throughout are as telling."""
     along: Array | None = None
-    """(T,) what the scores may follow, standardised: under the null its order is arbitrary; None: their sum
-    is what tells, and under the null their signs are arbitrary."""
-    p_alone: float | None = None
-    """p found by a test of its own, beside the joint one."""
-    level: float = SUSPICION_ALPHA
-    """p below which it is an alarm."""
+    scatter: float | None = None
     decisive: bool = False
     """Whether it explains whatever else is odd about its channel."""
 
@@ -72,7 +66,7 @@ def raise_alarms(
     fired = [
         (item.decisive, Alarm(item.channel, item.clue, item.share, p))
         for item, p in zip(suspicions, p_values, strict=True)
-        if item.share > item.least and (p is None or p < item.level)
+        if item.share > item.least and (p is None or p < SUSPICION_ALPHA)
     ]
     found += [alarm for decisive, alarm in fired if not decisive]
     found.sort(key=lambda alarm: -alarm.share)
@@ -84,13 +78,15 @@ def raise_alarms(
 
 def _tested(suspicions: Sequence[Suspicion], seed: int) -> list[float | None]:
     """Adjusted p of each; one max-T test over all that have scores."""
-    tested = [item for item in suspicions if item.scores is not None]
-    if not tested:
-        return [item.p_alone for item in suspicions]
-    hypotheses = [(item.scores, item.along, item.either_sign) for item in tested if item.scores is not None]
-    adjusted = jointly_adjusted(hypotheses, seed)
-    of = {id(item): float(p) for item, p in zip(tested, adjusted, strict=True)}
-    return [of.get(id(item), item.p_alone) for item in suspicions]
+    told = {
+        place: Hypothesis(item.scores, item.along, item.either_sign, item.scatter)
+        for place, item in enumerate(suspicions)
+        if item.scores is not None
+    }
+    if not told:
+        return [None] * len(suspicions)
+    adjusted = dict(zip(told, jointly_adjusted(list(told.values()), seed), strict=True))
+    return [float(adjusted[place]) if place in adjusted else None for place in range(len(suspicions))]
 
 
 def _too_few(selection: Selection[Any, Any, Any]) -> list[Alarm]:

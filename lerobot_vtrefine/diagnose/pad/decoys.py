@@ -11,8 +11,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from lerobot_vtrefine.diagnose.core.heldout import out_of_fold
-from lerobot_vtrefine.diagnose.core.resampling import one_sided
-from lerobot_vtrefine.diagnose.core.rules import DECOY_P, SHARE_OF_GAIN
+from lerobot_vtrefine.diagnose.core.rules import SHARE_OF_GAIN
 from lerobot_vtrefine.diagnose.core.suspicion import Suspicion
 from lerobot_vtrefine.diagnose.pad.descriptors import DESCRIPTORS, Descriptor, directions, errors_left_out
 from lerobot_vtrefine.diagnose.pad.fitting import Fit, bounded_step, movable
@@ -36,19 +35,28 @@ def _in_place(problem: "PadProblem", fitted: Fit, name: str) -> Suspicion | None
     slim = without(fitted, [name], problem.presses, problem.weights)
     before = out_of_fold(problem, slim, problem.folds)
     own = out_of_fold(problem, fitted, problem.folds).better_by(before)
-    best, text = np.zeros(len(own)), ""
-    for decoy, image, grams in _promising(problem, slim, name, SHARE_OF_GAIN * float(own.sum())):
-        gains = _left_out(problem, slim, image, grams) - before.scores[:, 0]
-        if gains.sum() > best.sum():
-            best, text = gains, decoy.text
-    if not text:
+    promising = list(_promising(problem, slim, name, SHARE_OF_GAIN * float(own.sum())))
+    gains = [_left_out(problem, slim, image, grams) - before.scores[:, 0] for _, image, grams in promising]
+    if not gains:
+        return None
+    best = _chosen_by_others(np.array(gains), problem.folds)
+    if best.sum() <= 0:
         return None
     # As rivals are compared: trials count alike, however long or hard they press.
     preference = (best - own) / (np.abs(best) + np.abs(own)).clip(min=1e-12)
-    p_value = float(one_sided(preference[:, None], problem.seed)[0][0])
-    lead = 1.0 - float(own.sum() / best.sum())
+    text = promising[int(np.argmax(np.sum(gains, axis=1)))][0].text
     clue = f"in the place of {name}, {text} predicts trials left out better"
-    return Suspicion(0, clue, lead, 1.0 - SHARE_OF_GAIN, p_alone=p_value, level=DECOY_P)
+    return Suspicion(0, clue, 1.0 - float(own.sum() / best.sum()), 1.0 - SHARE_OF_GAIN, preference)
+
+
+def _chosen_by_others(gains: Array, folds: Array) -> Array:
+    """Gain (K,) of every recording by the decoy that the other folds gain most by, of gains (D, K): one that
+    it chose itself would look better than it is."""
+    found = np.empty(len(folds))
+    for fold in np.unique(folds):
+        held = folds == fold
+        found[held] = gains[gains[:, ~held].sum(axis=1).argmax(), held]
+    return found
 
 
 def _promising(

@@ -8,7 +8,6 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from lerobot_vtrefine.diagnose.core.rules import ORDER_ALPHA
 from lerobot_vtrefine.diagnose.core.suspicion import Suspicion
 from lerobot_vtrefine.diagnose.pad.fitting import Fit
 from lerobot_vtrefine.diagnose.pad.press_trials import PressSet
@@ -18,7 +17,6 @@ NEIGHBOURS = "those of the recordings before and after"
 MIN_COURSE = 0.005
 """Deviation of gains along their course that is worth a word."""
 MIN_RECORDINGS = 8
-ORDERS = 9999
 OUTLIER = 3.0
 """Deviations from the median, in robust standard deviations, that gains are cut to."""
 BLOCKED = 0.9
@@ -47,47 +45,70 @@ def own_gains(fitted: Fit, presses: PressSet, weights: Sequence[TrialWeights]) -
     return np.array(gains)
 
 
-def gain_drift(fitted: Fit, presses: PressSet, weights: Sequence[TrialWeights]) -> Suspicion | None:
-    """Whether gains follow the temperature or the session; None where too few recordings can tell."""
+def gain_drift(fitted: Fit, presses: PressSet, weights: Sequence[TrialWeights]) -> list[Suspicion]:
+    """Whether gains follow the temperature, the session or their neighbours; none where too few recordings
+    can tell."""
     gains = own_gains(fitted, presses, weights)
     starts = np.array([press.trial.start_s for press in presses.presses])
-    levels = np.array([float(signal.max(initial=0.0)) for signal in fitted.signals])
-    known = np.isfinite(gains)
-    if known.sum() < MIN_RECORDINGS or np.ptp(starts[known]) <= 0:
-        return None
-    names = np.array(presses.conditions)[known]
-    table = [_clipped(gains[known]), levels[known], starts[known], _temperatures(presses)[known]]
-    if _in_a_row(names, starts[known]):
+    known = np.flatnonzero(np.isfinite(gains))
+    if len(known) < MIN_RECORDINGS or np.ptp(starts[known]) <= 0:
+        return []
+    names = np.array(presses.conditions)
+    if _in_a_row(names[known], starts[known]):
         # Replicates share whatever their condition does to the gain: their mean is the unit.
-        table = [np.array([column[names == name].mean() for name in np.unique(names)]) for column in table]
-    gains, levels, starts, warmth = table
-    return _judge(gains, levels, starts, warmth) if len(gains) >= MIN_RECORDINGS else None
+        units = [known[names[known] == name] for name in np.unique(names[known])]
+    else:
+        units = [np.array([trial]) for trial in known]
+    if len(units) < MIN_RECORDINGS:
+        return []
+    units.sort(key=lambda unit: float(starts[unit].mean()))
+    levels = np.array([float(signal.max(initial=0.0)) for signal in fitted.signals])
+    gains[known] = _clipped(gains[known])
+    table = [[column[unit].mean() for unit in units] for column in (levels, gains, starts, _heat(presses))]
+    first = np.array([unit[0] for unit in units])
+    return _courses(first, len(names), *(np.array(column) for column in table))
 
 
-def _judge(gains: np.ndarray, levels: np.ndarray, starts: np.ndarray, warmth: np.ndarray) -> Suspicion:
-    """The suspicion from one gain, largest signal, start [s] and temperature (K,) per unit."""
-    order = np.argsort(starts, kind="stable")
-    table, levels = (gains[order], starts[order], warmth[order]), levels[order]
+def _courses(
+    first: np.ndarray,
+    count: int,
+    levels: np.ndarray,
+    gains: np.ndarray,
+    starts: np.ndarray,
+    heat: np.ndarray,
+) -> list[Suspicion]:
+    """Suspicions from one largest signal, gain, start [s] and temperature (n,) per unit, in order of time.
+
+    Args:
+        first: number of every unit's first recording, whose score is the unit's gain.
+        count: number of recordings.
+    """
     # What depends on how hard a recording presses is the law's misfit.
     load = np.stack([np.ones(len(levels)), levels / max(float(levels.max()), 1e-12)], axis=1)
-    gains, starts, warmth = (column - load @ np.linalg.lstsq(load, column, rcond=1e-9)[0] for column in table)
-    courses = {"the session's time": _unit(starts), "the temperature": _unit(warmth)}
-    rng = np.random.default_rng([len(gains), 13])
-    series = np.vstack([gains, rng.permuted(np.tile(gains, (ORDERS, 1)), axis=1)])
-    found = {text: np.abs(series @ course) for text, course in courses.items() if course.any()}
-    found[NEIGHBOURS] = (series[:, 1:] * series[:, :-1]).sum(axis=1)
-    shares = {text: _tails(values) for text, values in found.items()}
-    # Somebody who logs the temperature asks about it: a question of its own, at twice the session's level.
-    asked = 0.5 * shares.pop("the temperature", np.full(1, 2.0))
-    smallest = np.min(list(shares.values()), axis=0)
-    p_session, p_asked = float((smallest <= smallest[0]).mean()), float(asked[0])
-    warm = p_asked < ORDER_ALPHA and (p_session >= ORDER_ALPHA or p_asked <= p_session)
-    best = "the temperature" if warm else min(shares, key=lambda text: float(shares[text][0]))
-    seen = float(found[best][0])
-    size = np.sqrt(max(seen, 0.0) / len(gains)) if best == NEIGHBOURS else seen / np.sqrt(len(gains))
-    text = f"gains of recordings follow {best} ({100 * size:.1f} % of the load)"
-    p_value = p_asked if warm else p_session
-    return Suspicion(0, text, float(size), MIN_COURSE, p_alone=p_value, level=ORDER_ALPHA)
+    gains, starts, heat = (
+        column - load @ np.linalg.lstsq(load, column, rcond=1e-9)[0] for column in (gains, starts, heat)
+    )
+    scores = np.zeros(count)
+    scores[first] = gains
+    found = []
+    for text, course in (("the session's time", _unit(starts)), ("the temperature", _unit(heat))):
+        if not course.any():
+            continue
+        along = np.zeros(count)
+        along[first] = np.sqrt(len(first)) * course
+        size = abs(float(gains @ course)) / np.sqrt(len(first))
+        found.append(_suspicion(text, size, scores, along, either_sign=True))
+    neighbours = np.zeros((count, count))
+    neighbours[first[1:], first[:-1]] = 1.0
+    size = np.sqrt(max(float(gains[1:] @ gains[:-1]), 0.0) / len(first))
+    return [*found, _suspicion(NEIGHBOURS, size, scores, neighbours)]
+
+
+def _suspicion(
+    text: str, size: float, scores: np.ndarray, along: np.ndarray, *, either_sign: bool = False
+) -> Suspicion:
+    clue = f"gains of recordings follow {text} ({100 * size:.1f} % of the load)"
+    return Suspicion(0, clue, size, MIN_COURSE, scores, either_sign, along)
 
 
 def _clipped(values: np.ndarray) -> np.ndarray:
@@ -96,7 +117,7 @@ def _clipped(values: np.ndarray) -> np.ndarray:
     return np.clip(values, middle - OUTLIER * spread, middle + OUTLIER * spread)
 
 
-def _temperatures(presses: PressSet) -> np.ndarray:
+def _heat(presses: PressSet) -> np.ndarray:
     """Mean temperature of every recording (K,) [deg C]; the same for all where one is not known."""
     logged = [press.trial.temperature_c for press in presses.presses]
     means = np.array([np.nan if values is None else float(values.mean()) for values in logged])
@@ -116,9 +137,3 @@ def _unit(values: np.ndarray) -> np.ndarray:
     centred = values - values.mean()
     norm = float(np.linalg.norm(centred))
     return centred / norm if norm > 1e-9 * max(float(np.abs(values).max()), 1.0) else np.zeros(len(values))
-
-
-def _tails(values: np.ndarray) -> np.ndarray:
-    """Share of entries at least as large as each, same shape."""
-    rounded = np.round(values / max(float(np.abs(values).max()), 1e-300), 9)
-    return (len(rounded) - np.searchsorted(np.sort(rounded), rounded, side="left")) / len(rounded)

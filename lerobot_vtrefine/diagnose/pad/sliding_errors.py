@@ -5,13 +5,12 @@ from collections.abc import Sequence
 import numpy as np
 
 from lerobot_vtrefine.diagnose.core.suspicion import Suspicion
+from lerobot_vtrefine.diagnose.pad.descriptors import sliding_velocity
 from lerobot_vtrefine.diagnose.pad.error_level import LOADED, beyond
 from lerobot_vtrefine.diagnose.pad.fitting import Fit
 from lerobot_vtrefine.diagnose.pad.press_trials import Press, PressSet
 from lerobot_vtrefine.diagnose.pad.weights import TrialWeights
 
-SLIDES_M_S = 3e-4
-"""Speed along the pad from which on a pressed indenter slides."""
 SLIDING = 1.6
 """Mean square of whitened errors while sliding, over that of other readings under load; 1.2 is usual."""
 AGREED = 1.2
@@ -24,12 +23,7 @@ OUTLIER = 4.0
 
 def sliding(press: Press) -> np.ndarray:
     """Frames (T,) in which the indenter moves along the pad while it presses."""
-    time_s = press.trial.time_s
-    if len(time_s) < 2:
-        return np.zeros(len(time_s), dtype=bool)
-    step = np.maximum(np.gradient(time_s), 1e-6)
-    speed = np.hypot(np.gradient(press.trial.x_m), np.gradient(press.trial.y_m)) / step
-    return press.touching & (speed > SLIDES_M_S)
+    return press.touching & np.any(sliding_velocity(press), axis=(0, 2))
 
 
 def while_sliding(

@@ -29,8 +29,6 @@ _FOLLOWS = 0.02
 _FOLLOWS_IF_OWNED = 0.1
 """Part that no form of a family leaves to the descriptors of its own kind of effect."""
 _RIDGE = 1e-9
-_WORTH_A_LOOK = 2.5
-"""Standardised sum of scores from which on a descriptor's share is worked out; tests ask for over three."""
 
 
 def suspicions(problem: "PadProblem", selection: Selection[Any, Fit, Any]) -> list[Suspicion]:
@@ -46,7 +44,7 @@ def suspicions(problem: "PadProblem", selection: Selection[Any, Fit, Any]) -> li
         spectral_line(presses, residuals),
         error_level.level(residuals, fitted, weights),
         while_sliding(presses, residuals, fitted, weights),
-        gain_drift(fitted, presses, weights),
+        *gain_drift(fitted, presses, weights),
         *(item for descriptor, item in descriptors if descriptor.session),
         *in_place_of_names(problem, fitted),
     ]
@@ -91,12 +89,12 @@ def following(problem: "PadProblem", fitted: Fit) -> list[tuple[Descriptor, Susp
         size = float(np.sqrt((scores**2).sum()))
         if information.sum() <= _RIDGE * max(size**2, 1.0):
             continue
-        share = 0.0
-        if abs(float(scores.sum())) > _WORTH_A_LOOK * size:
-            share = left_out_share(fitted, presses, columns, change, problem.folds)
+        share = left_out_share(fitted, presses, columns, change, problem.folds)
         least = _FOLLOWS_IF_OWNED if families & set(descriptor.owners) else _FOLLOWS
         text = f"the residual correlates with {descriptor.text} ({100 * share:.0f} % of its power)"
-        found.append((descriptor, Suspicion(0, text, share, least, scores, either_sign=True)))
+        scatter = float(np.sqrt(information.sum()))
+        item = Suspicion(0, text, share, least, scores, either_sign=True, scatter=scatter)
+        found.append((descriptor, item))
     return found
 
 
