@@ -4,7 +4,8 @@ from types import SimpleNamespace
 
 import numpy as np
 
-from lerobot_vtrefine.diagnose.pad.sliding_errors import SLIDING, while_sliding
+from lerobot_vtrefine.diagnose.pad.rules import SLIDING
+from lerobot_vtrefine.diagnose.pad.sliding_errors import while_sliding
 
 
 def alarm_of(sliding: list[float], standing: list[float], share: list[float]):

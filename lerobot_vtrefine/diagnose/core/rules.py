@@ -52,6 +52,8 @@ UNSEEN = 0.05
 """Part of an effect that the baseline's own parameters must not be able to do for it to be identifiable."""
 FEW_TRIALS = 8
 """With fewer trials than this no sign flips can be significant over a catalogue of candidates."""
+CLEARLY_HELPS = 0.25
+"""Gain on trials left out by which a cause is spoken of where trials are too few for any test."""
 
 SCREEN_ALPHA = 0.05
 """Chance that any candidate passes a score test where none is there; it must then predict better, too."""

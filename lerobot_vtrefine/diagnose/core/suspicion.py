@@ -12,13 +12,10 @@ from typing import Any
 import numpy as np
 
 from lerobot_vtrefine.diagnose.core.resampling import Hypothesis, jointly_adjusted
-from lerobot_vtrefine.diagnose.core.rules import FEW_TRIALS, SUSPICION_ALPHA
+from lerobot_vtrefine.diagnose.core.rules import CLEARLY_HELPS, FEW_TRIALS, SUSPICION_ALPHA
 from lerobot_vtrefine.diagnose.core.search import Selection
 
 Array = np.ndarray
-
-_HELPS = 0.25
-"""Gain on trials left out by which a cause is spoken of where trials are too few for any test."""
 
 
 @dataclass(frozen=True)
@@ -97,7 +94,7 @@ def _too_few(selection: Selection[Any, Any, Any]) -> list[Alarm]:
     for channel in range(len(selection.problem.channels)):
         gains: dict[str, float] = {}
         for item in selection.first_round:
-            if not item.candidate.clue and item.eligible[channel] and item.gain[channel] > _HELPS:
+            if not item.candidate.clue and item.eligible[channel] and item.gain[channel] > CLEARLY_HELPS:
                 gains[item.cause] = max(gains.get(item.cause, 0.0), float(item.gain[channel]))
         names = sorted(gains, key=lambda name: -gains[name])[:3]
         if names:

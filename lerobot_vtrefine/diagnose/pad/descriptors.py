@@ -10,11 +10,10 @@ from dataclasses import dataclass
 import numpy as np
 
 from lerobot_vtrefine.diagnose.pad.press_trials import Press, PressSet
+from lerobot_vtrefine.diagnose.pad.sliding_errors import SLIDES_M_S
 
 Signal = np.ndarray
 
-SLIDES_M_S = 3e-4
-"""Speed along the pad from which on a pressed indenter slides."""
 RESTS = 0.05
 """Part of a recording's typical rate of depth up to which it rests."""
 
@@ -41,23 +40,18 @@ def _age(press: Press, signal: Signal) -> np.ndarray:
 
 
 def _depth_rate(press: Press, signal: Signal) -> np.ndarray:
-    return np.where(press.drive[:, press.scored] > 0, press.rate[:, press.scored], 0.0)
+    """(T, n) [m/s]; zero at rest, where rates differ by rounding only and their signs would be noise."""
+    rate = np.where(press.drive[:, press.scored] > 0, press.rate[:, press.scored], 0.0)
+    return np.where(np.abs(rate) > RESTS * np.sqrt(np.mean(rate**2)), rate, 0.0)
 
 
-def sliding_velocity(press: Press) -> tuple[np.ndarray, np.ndarray]:
-    """Along the pad, (T, 1) each [m/s]; zero at rest, where positions differ by rounding only."""
+def _sliding(press: Press) -> tuple[np.ndarray, np.ndarray]:
+    """Velocity along the pad (T, 1) each [m/s]; zero at rest, too."""
     time_s = press.trial.time_s
-    if len(time_s) < 2:
-        return np.zeros((len(time_s), 1)), np.zeros((len(time_s), 1))
-    step = np.maximum(np.gradient(time_s), 1e-6)
+    step = np.maximum(np.gradient(time_s), 1e-6) if len(time_s) > 1 else np.ones(len(time_s))
     along = np.stack([np.gradient(press.trial.x_m), np.gradient(press.trial.y_m)]) / step
     along = np.where(np.hypot(*along) > SLIDES_M_S, along, 0.0)
     return along[0][:, None], along[1][:, None]
-
-
-def _way(rate: np.ndarray) -> np.ndarray:
-    """Sign of a rate; zero at rest, where only rounding has one."""
-    return np.where(np.abs(rate) > RESTS * np.sqrt(np.mean(rate**2)), np.sign(rate), 0.0)
 
 
 def _carriage(press: Press, signal: Signal, axis: int) -> np.ndarray:
@@ -134,17 +128,13 @@ DESCRIPTORS = (
     ),
     Descriptor("the rate of depth", (*TIMING, *MEMORY), _depth_rate),
     Descriptor("load times the rate of depth", (*TIMING, *MEMORY), lambda p, s: s * _depth_rate(p, s)),
-    Descriptor("loading or unloading", (*MEMORY, *TIMING), lambda p, s: s * _way(_depth_rate(p, s))),
+    Descriptor("loading or unloading", (*MEMORY, *TIMING), lambda p, s: s * np.sign(_depth_rate(p, s))),
     Descriptor("the speed of depth, either way", MEMORY, lambda p, s: s * np.abs(_depth_rate(p, s))),
     Descriptor("the indenter's place along the row, at every taxel", (), lambda p, s: _carriage(p, s, 0)),
     Descriptor("the indenter's place along the column, at every taxel", (), lambda p, s: _carriage(p, s, 1)),
-    Descriptor("the speed of sliding", (), lambda p, s: s * np.hypot(*sliding_velocity(p))),
-    Descriptor(
-        "the direction of sliding along the row", TIMING, lambda p, s: s * np.sign(sliding_velocity(p)[0])
-    ),
-    Descriptor(
-        "the direction of sliding along the column", TIMING, lambda p, s: s * np.sign(sliding_velocity(p)[1])
-    ),
+    Descriptor("the speed of sliding", (), lambda p, s: s * np.hypot(*_sliding(p))),
+    Descriptor("the direction of sliding along the row", TIMING, lambda p, s: s * np.sign(_sliding(p)[0])),
+    Descriptor("the direction of sliding along the column", TIMING, lambda p, s: s * np.sign(_sliding(p)[1])),
     Descriptor("the column of the taxel", PLACES, lambda p, s: s * _place(p, 0)),
     Descriptor("the row of the taxel", PLACES, lambda p, s: s * _place(p, 1)),
     Descriptor(

@@ -11,22 +11,12 @@ import numpy as np
 from lerobot_vtrefine.diagnose.core.suspicion import Suspicion
 from lerobot_vtrefine.diagnose.pad.fitting import Fit
 from lerobot_vtrefine.diagnose.pad.press_trials import PressSet
+from lerobot_vtrefine.diagnose.pad.rules import BESIDE, CONDITION_LEVEL, LEVEL, MIN_READINGS, OTHERS, TAXEL
 from lerobot_vtrefine.diagnose.pad.weights import TrialWeights
 
 LAG = 3
 LOADED = 0.05
 """Part of the largest signal from which on a taxel counts as loaded."""
-LEVEL = 4.0
-"""Mean square of slow errors under load, in variances of a frame's noise, that is no misfit of a form."""
-CONDITION_LEVEL, MIN_LOADED = 2.5, 200
-"""The same in all recordings of one condition, and the readings that each needs; clean ones reach 1."""
-BESIDE = 1.15
-"""Mean square of whitened errors of taxels beside a pressed indenter, over that at rest; 1.06 is usual."""
-TAXEL = 6.0
-"""Mean square of slow errors of one taxel while the pad is pressed, in variances of a frame's noise."""
-OTHERS = 4.0
-"""Factor by which it must exceed that of the taxel in the middle: errors of all are no taxel's."""
-MIN_READINGS = 200
 CLEAR_M = 1e-4
 """Distance of the indenter from which on no recording's own first touch reaches a taxel [m]."""
 OUTLIER = 4.0
@@ -76,7 +66,7 @@ def level_of_a_condition(
     each, readings = slow_errors(fitted, residuals, weights)
     names = np.array(presses.conditions)
     repeated = [name for name in sorted(set(names)) if (names == name).sum() > 1]
-    known = {name: each[names == name] for name in repeated if readings[names == name].min() >= MIN_LOADED}
+    known = {name: each[names == name] for name in repeated if readings[names == name].min() >= MIN_READINGS}
     if not known:
         return None
     worst = max(known, key=lambda name: float(known[name].min()))

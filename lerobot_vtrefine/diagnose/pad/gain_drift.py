@@ -11,12 +11,10 @@ import numpy as np
 from lerobot_vtrefine.diagnose.core.suspicion import Suspicion
 from lerobot_vtrefine.diagnose.pad.fitting import Fit
 from lerobot_vtrefine.diagnose.pad.press_trials import PressSet
+from lerobot_vtrefine.diagnose.pad.rules import MIN_COURSE, MIN_RECORDINGS
 from lerobot_vtrefine.diagnose.pad.weights import TrialWeights
 
 NEIGHBOURS = "those of the recordings before and after"
-MIN_COURSE = 0.005
-"""Deviation of gains along their course that is worth a word."""
-MIN_RECORDINGS = 8
 OUTLIER = 3.0
 """Deviations from the median, in robust standard deviations, that gains are cut to."""
 BLOCKED = 0.9

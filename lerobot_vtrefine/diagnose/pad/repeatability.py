@@ -11,26 +11,25 @@ from lerobot_vtrefine.diagnose.core.suspicion import Suspicion
 from lerobot_vtrefine.diagnose.pad.error_level import motion_of
 from lerobot_vtrefine.diagnose.pad.fitting import Fit
 from lerobot_vtrefine.diagnose.pad.press_trials import Press, PressSet
+from lerobot_vtrefine.diagnose.pad.rules import (
+    LEFT,
+    MIN_AGREEING,
+    MIN_RMS,
+    MIN_STRANGERS,
+    MISFIT,
+    MISFIT_NOISE,
+    PAIR_CORRELATION,
+    PAIR_DEVIATIONS,
+    PAIRS,
+    PAIRS_LEFT,
+    PAIRS_MISFIT,
+    REPEATABLE_SHARE,
+)
 from lerobot_vtrefine.diagnose.pad.weights import TrialWeights
 from lerobot_vtrefine.tactile.replay import NO_BODY_M
 
-REPEATABLE_SHARE = 0.15
-MIN_AGREEING = 4
-"""Conditions that must agree without exception for what repeats to be believed without a test."""
-MIN_RMS = 0.4 / 255.0
-"""Repeatable residual below this part of full scale may be the converter's rounding."""
-MISFIT, MISFIT_NOISE = 0.1, 1.0 / 3.0
-"""Parts of the baseline's repeatable squared error, and of the squared error that is left, up to which what
-still repeats is laid to the names' form. Effects outside the catalogue that borrow names leave a fifth."""
 CORNER = 0.4
 """Doubt about the damping's part, in a frame's noise, from which on a reading says nothing about causes."""
-PAIR_CORRELATION, PAIR_DEVIATIONS, MIN_STRANGERS = 0.2, 6.0, 30
-PAIRS, PAIRS_LEFT, PAIRS_MISFIT = (0.15, 5.0), (0.1, 2.8), (0.2, 5.0)
-"""Mean correlation of all replicates, and its distance from strangers' in standard errors, that mean an
-unknown cause: without a name, beside names that leave much, and beside names that leave little. Site effects
-that replicates share bring .08 and 3.5, three times the usual scatter .13."""
-LEFT = 0.25
-"""Part of what repeats that names of true causes, in whatever form, do not leave."""
 
 
 def cleaned(fitted: Fit, presses: PressSet, weights: Sequence[TrialWeights]) -> list[np.ndarray]:

@@ -5,25 +5,26 @@ from collections.abc import Sequence
 import numpy as np
 
 from lerobot_vtrefine.diagnose.core.suspicion import Suspicion
-from lerobot_vtrefine.diagnose.pad.descriptors import sliding_velocity
 from lerobot_vtrefine.diagnose.pad.error_level import LOADED, beyond
 from lerobot_vtrefine.diagnose.pad.fitting import Fit
 from lerobot_vtrefine.diagnose.pad.press_trials import Press, PressSet
+from lerobot_vtrefine.diagnose.pad.rules import AGREED, MIN_OWN, MIN_SLIDING, SLIDING
 from lerobot_vtrefine.diagnose.pad.weights import TrialWeights
 
-SLIDING = 1.6
-"""Mean square of whitened errors while sliding, over that of other readings under load; 1.2 is usual."""
-AGREED = 1.2
-"""The same within recordings, in their geometric mean."""
-MIN_READINGS, MIN_OWN = 60, 20
-"""Sliding and still readings that there must be, in all and in a recording that is compared with itself."""
+SLIDES_M_S = 3e-4
+"""Speed along the pad from which on a pressed indenter slides."""
 OUTLIER = 4.0
 """Whitened errors, in standard deviations, that are cut to this size: spikes are no sliding."""
 
 
 def sliding(press: Press) -> np.ndarray:
     """Frames (T,) in which the indenter moves along the pad while it presses."""
-    return press.touching & np.any(sliding_velocity(press), axis=(0, 2))
+    time_s = press.trial.time_s
+    if len(time_s) < 2:
+        return np.zeros(len(time_s), dtype=bool)
+    step = np.maximum(np.gradient(time_s), 1e-6)
+    speed = np.hypot(np.gradient(press.trial.x_m), np.gradient(press.trial.y_m)) / step
+    return press.touching & (speed > SLIDES_M_S)
 
 
 def while_sliding(
@@ -44,7 +45,7 @@ def while_sliding(
         for index, mask in enumerate((loaded & moves, loaded & ~moves)):
             sums[number, index] = float(square[mask].sum())
             counts[number, index] = int(mask.sum())
-    if counts.sum(axis=0).min() < MIN_READINGS:
+    if counts.sum(axis=0).min() < MIN_SLIDING:
         return None
     means = sums.sum(axis=0) / counts.sum(axis=0)
     ratio = float(means[0] / max(float(means[1]), 1e-12))

@@ -7,9 +7,8 @@ import numpy as np
 from lerobot_vtrefine.diagnose.core.suspicion import Suspicion
 from lerobot_vtrefine.diagnose.pad.error_level import beyond
 from lerobot_vtrefine.diagnose.pad.press_trials import PressSet
+from lerobot_vtrefine.diagnose.pad.rules import LINE_RATIO
 
-LINE_RATIO = 8.0
-"""Power of a line over that around it, in the median of recordings, that noise does not reach."""
 LINE_FROM = 8
 """Slowest line looked for, in periods per recording."""
 

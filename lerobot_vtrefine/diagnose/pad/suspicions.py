@@ -17,6 +17,7 @@ from lerobot_vtrefine.diagnose.pad.fitting import Fit, tangents
 from lerobot_vtrefine.diagnose.pad.gain_drift import gain_drift
 from lerobot_vtrefine.diagnose.pad.press_trials import PressSet
 from lerobot_vtrefine.diagnose.pad.repeatability import Correlations
+from lerobot_vtrefine.diagnose.pad.rules import FOLLOWS, FOLLOWS_IF_OWNED
 from lerobot_vtrefine.diagnose.pad.screening import Scorer
 from lerobot_vtrefine.diagnose.pad.sliding_errors import while_sliding
 from lerobot_vtrefine.diagnose.pad.spectrum import spectral_line
@@ -24,10 +25,6 @@ from lerobot_vtrefine.diagnose.pad.spectrum import spectral_line
 if TYPE_CHECKING:
     from lerobot_vtrefine.diagnose.pad.problem import PadProblem
 
-_FOLLOWS = 0.02
-"""Part of the squared error that a descriptor must take away on recordings left out."""
-_FOLLOWS_IF_OWNED = 0.1
-"""Part that no form of a family leaves to the descriptors of its own kind of effect."""
 _RIDGE = 1e-9
 
 
@@ -90,7 +87,7 @@ def following(problem: "PadProblem", fitted: Fit) -> list[tuple[Descriptor, Susp
         if information.sum() <= _RIDGE * max(size**2, 1.0):
             continue
         share = left_out_share(fitted, presses, columns, change, problem.folds)
-        least = _FOLLOWS_IF_OWNED if families & set(descriptor.owners) else _FOLLOWS
+        least = FOLLOWS_IF_OWNED if families & set(descriptor.owners) else FOLLOWS
         text = f"the residual correlates with {descriptor.text} ({100 * share:.0f} % of its power)"
         scatter = float(np.sqrt(information.sum()))
         item = Suspicion(0, text, share, least, scores, either_sign=True, scatter=scatter)
