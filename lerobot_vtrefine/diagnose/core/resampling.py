@@ -82,17 +82,25 @@ def jointly_adjusted(hypotheses: Sequence[Hypothesis], seed: int) -> Array:
     Romano & Wolf 2010). A sum that a few trials dominate stays small even where all trials agree, and would
     drown among sums of many.
     """
+    drawn, of = _statistics(hypotheses, seed)
+    drawn /= np.quantile(drawn, 1.0 - BALANCED_AT, axis=0).clip(1e-300)
+    told = np.array([item.scores.any() for item in hypotheses])
+    p_values = np.ones(len(hypotheses))
+    np.minimum.at(p_values, of, np.where(told[of], _exceeding(drawn.max(1), drawn[0] - 1e-12), 1.0))
+    return p_values
+
+
+def _statistics(hypotheses: Sequence[Hypothesis], seed: int) -> tuple[Array, Array]:
+    """Statistics (B, M) of the hypotheses, drawn under the null, the observed ones first; and whose they are
+    (M,)."""
     scores = _of_unit_length(np.stack([item.scores for item in hypotheses], 1))
     signs = sign_matrix(len(scores), seed)
     rng = np.random.default_rng([seed, 1])
     if len(signs) < FLIPS:
         signs = signs[np.r_[0, rng.integers(0, len(signs), FLIPS)]]
-    flipped = [k for k, item in enumerate(hypotheses) if item.along is None]
-    drawn = np.empty((len(signs), len(hypotheses)))
-    drawn[:, flipped] = signs @ scores[:, flipped]
     places = rng.random((len(signs), len(scores)))
     places[0] = np.arange(len(scores))
-    orders: dict[bytes, Array] = {}
+    drawn, orders = signs @ scores, {}
     for k, item in enumerate(hypotheses):
         if item.along is None:
             continue
@@ -100,18 +108,14 @@ def jointly_adjusted(hypotheses: Sequence[Hypothesis], seed: int) -> Array:
         if told.tobytes() not in orders:
             orders[told.tobytes()] = places[:, told].argsort(axis=1)
         drawn[:, k] = _in_orders(scores[told, k], item.along, told, orders[told.tobytes()])
-    sized = [k for k, item in enumerate(hypotheses) if item.scatter and item.few]
-    sizes = rng.standard_normal((len(signs), len(sized)))
-    sizes[0] = [hypotheses[k].scores.sum() / (SIZE_DOUBT * (hypotheses[k].scatter or 1.0)) for k in sized]
-    of = np.concatenate([np.arange(len(hypotheses)), sized]).astype(int)
+    few = [k for k, item in enumerate(hypotheses) if item.scatter and item.few]
+    sizes = rng.standard_normal((len(signs), len(few)))
+    sizes[0] = [hypotheses[k].scores.sum() / (SIZE_DOUBT * (hypotheses[k].scatter or 1.0)) for k in few]
+    of = np.array([*range(len(hypotheses)), *few])
     drawn = np.concatenate([drawn, sizes], axis=1)
     either = np.array([hypotheses[k].either_sign for k in of])
     drawn[:, either] = np.abs(drawn[:, either])
-    drawn /= np.quantile(drawn, 1.0 - BALANCED_AT, axis=0).clip(1e-300)
-    found = np.where(np.any(scores, axis=0)[of], _exceeding(drawn.max(1), drawn[0] - 1e-12), 1.0)
-    p_values = np.ones(len(hypotheses))
-    np.minimum.at(p_values, of, found)
-    return p_values
+    return drawn, of
 
 
 def _in_orders(scores: Array, along: Array, told: Array, order: Array) -> Array:
