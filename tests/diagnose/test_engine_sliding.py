@@ -4,6 +4,7 @@ from types import SimpleNamespace
 
 import numpy as np
 
+from lerobot_vtrefine.diagnose.pad.descriptors import DESCRIPTORS
 from lerobot_vtrefine.diagnose.pad.rules import SLIDING
 from lerobot_vtrefine.diagnose.pad.sliding_errors import while_sliding
 
@@ -35,3 +36,25 @@ def test_recordings_that_err_all_the_time_do_not_blame_their_slides() -> None:
     found = alarm_of([2.0] * 4 + [1.0] * 4, [2.0] * 4 + [1.0] * 4, [0.7] * 4 + [0.0] * 4)
     assert found.share == 0.0
     assert float(found.clue.split(" are ")[1].split()[0]) ** 2 > SLIDING  # though errors are larger there
+
+
+def test_rest_has_no_direction() -> None:
+    # Positions and rates at rest differ by rounding, whose sign filled whole recordings with directions.
+    rng, frames = np.random.default_rng(6), np.arange(200)
+    dust = 1e-12 * rng.standard_normal((3, 200))
+    slides, sinks = frames >= 150, frames < 50
+    trial = SimpleNamespace(
+        time_s=frames * 0.05, x_m=dust[0] + np.cumsum(slides * 1e-4), y_m=dust[1], temperature_c=None
+    )
+    press = SimpleNamespace(
+        trial=trial, drive=np.full((200, 1), 1e-3), rate=(dust[2] + sinks * 2e-3)[:, None], scored=[0]
+    )
+    wanted = ("the direction of sliding along the row", "loading or unloading")
+    signal = np.ones((200, 1))
+    way, depth = (
+        item.direction(press, signal)[:, 0] for text in wanted for item in DESCRIPTORS if item.text == text
+    )
+    assert set(way[slides][1:]) == {1.0}
+    assert not way[:149].any()
+    assert set(depth[sinks]) == {1.0}
+    assert not depth[~sinks].any()
