@@ -41,7 +41,7 @@ def typed_in(tree: ast.AST) -> list[str]:
 def test_the_rule_sees_a_typed_in_p_value() -> None:
     assert typed_in(ast.parse('Alarm("level", fired, ratio, 1e-4 if fired else 1.0, text)'))
     assert typed_in(ast.parse("p_values[name, channel] = 1.0 if p_value is None else p_value"))
-    assert typed_in(ast.parse("Suspicion(0, clue, size, LEAST, p_alone=0.0)"))
+    assert typed_in(ast.parse("Examined(p_alone=0.0, p_adjusted=adjusted)"))
     assert not typed_in(ast.parse('Alarm("level", fired, ratio, None, text)'))
 
 
