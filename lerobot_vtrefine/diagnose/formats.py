@@ -9,8 +9,11 @@ from collections.abc import Callable
 from typing import Any
 
 from lerobot_vtrefine.choices import check_choice
+from lerobot_vtrefine.diagnose.joints import stages as joint_stages
 from lerobot_vtrefine.diagnose.recordings import SHAPES, Entry, Header
+from lerobot_vtrefine.diagnose.servo.model import ServoFile
 from lerobot_vtrefine.diagnose.verdict import VerdictFile
+from lerobot_vtrefine.embodiments.robot_file import MAX_JOINTS, RobotFile
 from lerobot_vtrefine.files.json_schema import DIALECT, json_schema
 from lerobot_vtrefine.sim.reality import RealityFile
 from lerobot_vtrefine.tactile.model import SCHEMA as SENSOR_MODEL_SCHEMA
@@ -57,6 +60,16 @@ def _indenter(shape: str) -> dict[str, Any]:
 
 
 def _sensor_model() -> dict[str, Any]:
+    """One kind of model for each kind of recordings; its "schema" says which."""
+    kinds = {
+        "of a pad": _pad_model(),
+        "of a robot's joints": _robot_model(),
+        "of a servo with a known load": json_schema(ServoFile),
+    }
+    return {"oneOf": [{"title": title, **kind} for title, kind in kinds.items()]}
+
+
+def _pad_model() -> dict[str, Any]:
     return {
         "type": "object",
         "properties": {
@@ -72,6 +85,19 @@ def _stage(cls: type[Stage]) -> dict[str, Any]:
     found = json_schema(cls)
     found["properties"] = {"stage": {"const": cls.name}, **found["properties"]}
     return found | {"title": cls.name, "required": ["stage", *found["required"]]}
+
+
+def _robot_model() -> dict[str, Any]:
+    found = json_schema(RobotFile)
+    joints = found["properties"]["joints"]
+    joints |= {"minItems": 1, "maxItems": MAX_JOINTS}
+    laws = joints["items"]["properties"]["laws"]
+    number = laws["additionalProperties"]
+    laws |= {
+        "properties": dict.fromkeys(joint_stages.parameters(), number),
+        "additionalProperties": False,
+    }
+    return found
 
 
 _MAKERS: dict[str, Callable[[], dict[str, Any]]] = {
@@ -111,6 +137,7 @@ def describe_recording() -> str:
         "",
         "Record 16 trials or more: 8 conditions (same motion, same place), each twice, in mixed order.",
         "vtrefine-diagnose --template=FOLDER writes an example,",
-        f"--help_format=NAME prints the JSON Schema of {', '.join(FORMATS)}.",
+        f"--help_format=NAME prints the JSON Schema of {', '.join(FORMATS)};",
+        "that of sensor_model.json holds one kind each for pads, robots' joints and servos.",
     ]
     return "\n".join(lines)

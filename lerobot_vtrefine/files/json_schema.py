@@ -68,4 +68,6 @@ def _array(parts: tuple[Any, ...], ends: Mapping[str, Any], others: bool) -> dic
 
 def _limits(ends: Mapping[str, Any]) -> dict[str, Any]:
     names = {"minimum": "minimum", "maximum": "maximum", "above": "exclusiveMinimum"}
-    return {word: ends[name] for name, word in names.items() if ends.get(name) is not None}
+    found = {word: ends[name] for name, word in names.items() if ends.get(name) is not None}
+    # What has only an upper end keeps to it on either side of zero.
+    return {"minimum": -found["maximum"], **found} if set(found) == {"maximum"} else found

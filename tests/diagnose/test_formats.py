@@ -12,8 +12,11 @@ from test_verdict import EXPLAINED
 
 from lerobot_vtrefine.cli.diagnose import main
 from lerobot_vtrefine.diagnose.formats import FORMATS, PAD_COLUMNS, ROBOT_COLUMNS, schema_of
+from lerobot_vtrefine.diagnose.joints.model import RobotModel
 from lerobot_vtrefine.diagnose.quality import check_quality
 from lerobot_vtrefine.diagnose.recordings import read_recording_set
+from lerobot_vtrefine.diagnose.servo.model import ServoModel
+from lerobot_vtrefine.diagnose.servo.parameters import LIMITS
 from lerobot_vtrefine.diagnose.template import write_template
 from lerobot_vtrefine.diagnose.verdict import CAUSES, Verdict
 from lerobot_vtrefine.sim.reality import load_reality
@@ -41,7 +44,10 @@ def test_what_is_written_fits_its_schema(tmp_path: Path) -> None:
     write_set(tmp_path / "set", header, columns)
     assert errors("recording.json", header) == []
     assert errors("verdict.json", EXPLAINED.to_dict()) == []
-    for model in (SensorModel.default(), SensorModel.paper()):
+    joint = RobotModel.default(("waist", "elbow")).joints[0]
+    bent = RobotModel((replace(joint, encoder_offset=-0.1, laws={"flex": -0.2}),), 0.03)
+    servo = ServoModel({name: item.start for name, item in LIMITS.items()})
+    for model in (SensorModel.default(), SensorModel.paper(), bent, servo, ServoModel.default()):
         assert errors("sensor_model.json", model.to_dict()) == []
     reality = {"schema": "vtrefine/reality@1", "scene": {"clearance_m": 0.0015}}
     assert errors("reality.json", reality) == []
@@ -67,6 +73,37 @@ def broken_model(folder: Path) -> None:
     data["stages"][0]["k_n"] = "stiff"
     assert errors("sensor_model.json", json.loads(json.dumps(data)))
     SensorModel.from_dict(data)
+
+
+BROKEN_MODELS = [
+    (RobotModel, ("joints", 0, "damping_ratio"), 0.0, r"joints\[0\]\.damping_ratio must be above 0"),
+    (RobotModel, ("joints", 0, "encoder_offset"), -1e5, r"joints\[0\]\.encoder_offset must be at most"),
+    (RobotModel, ("joints", 0, "laws"), {"cogging": 0.1}, r"joint 'waist' has no law 'cogging'; valid: flex"),
+    (RobotModel, ("joints", 0, "sag_terms"), [0.1], r"joints\[0\]\.sag_terms must hold 4 values"),
+    (RobotModel, ("joints",), [], 'a list "joints" of 1 to'),
+    (ServoModel, ("parameters", "coulomb"), -0.1, r"parameters\.coulomb must not be negative"),
+    (ServoModel, ("parameters", "delay"), 2.0, r"parameters\.delay must be at most 0.2"),
+    (ServoModel, ("parameters", "weather"), 1.0, r"parameters has no 'weather'; valid: log_torque"),
+    (ServoModel, ("parameters",), {}, r"parameters lacks 'log_torque'"),
+]
+
+
+@pytest.mark.parametrize(("kind", "place", "value", "message"), BROKEN_MODELS)
+def test_models_of_robots_are_refused_by_schema_and_reader_alike(
+    tmp_path: Path, kind, place: tuple, value: object, message: str
+) -> None:
+    sound = {RobotModel: RobotModel.default(("waist",)), ServoModel: ServoModel.default()}
+    data = json.loads(json.dumps(sound[kind].to_dict()))
+    assert errors("sensor_model.json", data) == []
+    inner = data
+    for key in place[:-1]:
+        inner = inner[key]
+    inner[place[-1]] = value
+    path = tmp_path / "sensor_model.json"
+    path.write_text(json.dumps(data))
+    assert errors("sensor_model.json", data)
+    with pytest.raises(ValueError, match=rf"sensor_model\.json: .*{message}"):
+        kind.load(path)
 
 
 def broken_reality(folder: Path) -> None:
@@ -110,6 +147,12 @@ def test_the_pages_name_every_field_column_and_cause() -> None:
     asked = [*fields, *fields["causes"]["items"]["properties"]]
     assert [name for name in asked if f'"{name}"' not in verdict] == []
     assert [name for name in CAUSES if f"`{name}`" not in verdict] == []
+    for kind in schema_of("sensor_model.json")["oneOf"][1:]:
+        inner = kind["properties"].get("joints", {}).get("items") or kind["properties"].get(
+            "parameters", kind
+        )
+        asked = [*kind["properties"], *inner["properties"]]
+        assert [name for name in asked if f"`{name}`" not in verdict] == []
 
 
 def test_examples_on_the_pages_are_valid() -> None:

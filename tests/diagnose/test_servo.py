@@ -174,7 +174,7 @@ def test_a_model_is_read_back_and_predicts_from_the_first_position_alone(tmp_pat
     data = json.loads((tmp_path / "model.json").read_text())
     data["parameters"]["weather"] = 1.0
     (tmp_path / "model.json").write_text(json.dumps(data))
-    with pytest.raises(ValueError, match=r"model\.json: servo model has no parameter 'weather'"):
+    with pytest.raises(ValueError, match=r"model\.json: parameters has no 'weather'"):
         ServoModel.load(tmp_path / "model.json")
 
 

@@ -2,7 +2,7 @@
 
 import json
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from dataclasses import asdict, dataclass, make_dataclass, replace
 from pathlib import Path
 from typing import Any, Literal
 
@@ -10,35 +10,47 @@ import numpy as np
 
 from lerobot_vtrefine.diagnose.recordings import RecordingSet, RobotTrial
 from lerobot_vtrefine.diagnose.servo.bench import Bench
-from lerobot_vtrefine.diagnose.servo.parameters import INDEX, LIMITS, PARAMETERS
+from lerobot_vtrefine.diagnose.servo.parameters import INDEX, LIMITS, PARAMETERS, WEIGHT_POWER
 from lerobot_vtrefine.diagnose.servo.simulation import simulate
 from lerobot_vtrefine.diagnose.verdict import write_atomically
-from lerobot_vtrefine.files import decode, read_json
+from lerobot_vtrefine.files import decode, limits, read_json
 
 SCHEMA = "vtrefine/servo-model@1"
 
 
-@dataclass(frozen=True)
-class _ServoFile:
-    schema: Literal["vtrefine/servo-model@1"]
-    parameters: dict[str, float]
+_MOTOR = PARAMETERS[:3]
+"""Logarithms, which no servo is without."""
+
+
+def _field(name: str) -> tuple[str, type, Any]:
+    """Of a parameter; no upper end where that depends on the load. All but the motor's are zero if absent."""
+    item = LIMITS[name]
+    high = None if item.unit in WEIGHT_POWER else item.high
+    return name, float, limits(item.low, high, **({} if name in _MOTOR else {"default": 0.0}))
+
+
+_Parameters = make_dataclass("_Parameters", map(_field, PARAMETERS), frozen=True)
+ServoFile: type[Any] = make_dataclass(
+    "ServoFile", [("schema", Literal["vtrefine/servo-model@1"]), ("parameters", _Parameters)], frozen=True
+)
+"""Content of the file."""
 
 
 @dataclass(frozen=True)
 class ServoModel:
-    """Values of the parameters that are not zero; logarithms as such."""
+    """Values of the motor's parameters and of all others that are not zero; logarithms as such."""
 
     parameters: Mapping[str, float]
 
     @classmethod
     def default(cls) -> "ServoModel":
         """A small servo that nothing was fitted to."""
-        return cls({name: LIMITS[name].start for name in PARAMETERS[:3]})
+        return cls({name: LIMITS[name].start for name in _MOTOR})
 
     @classmethod
     def of(cls, theta: np.ndarray) -> "ServoModel":
         """From parameters (P,)."""
-        return cls({name: float(theta[place]) for name, place in INDEX.items() if theta[place]})
+        return cls(_told({name: float(theta[place]) for name, place in INDEX.items()}))
 
     @property
     def theta(self) -> np.ndarray:
@@ -63,11 +75,11 @@ class ServoModel:
     def load(cls, path: str | Path) -> "ServoModel":
         """Read the file; ValueError names it and what is wrong with it."""
         try:
-            content = decode(_ServoFile, read_json(path), "servo model")
-            if unknown := sorted(set(content.parameters) - set(PARAMETERS)):
-                raise ValueError(
-                    f"servo model has no parameter {unknown[0][:60]!r}; valid: {', '.join(PARAMETERS)}"
-                )
+            content = decode(ServoFile, read_json(path), "servo model")
         except ValueError as error:
             raise ValueError(f"{path}: {error}") from error
-        return cls(content.parameters)
+        return cls(_told(asdict(content.parameters)))
+
+
+def _told(parameters: Mapping[str, float]) -> dict[str, float]:
+    return {name: value for name, value in parameters.items() if value or name in _MOTOR}

@@ -22,6 +22,8 @@ LIMITS: dict[str, Limits] = BASELINE | {
     name: limits for stage in STAGES for name, limits in stage.parameters.items()
 }
 PARAMETERS = tuple(LIMITS)
+WEIGHT_POWER = {"Nm": 1, "Nm s/rad": 1, "1/Nm": -1}
+"""Unit -> power of the load's weight by which limits grow; other units do not depend on it."""
 INDEX = {name: place for place, name in enumerate(PARAMETERS)}
 
 
@@ -29,7 +31,7 @@ def bounds(weight: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Ends and starts (P,) for a load of that weight [Nm], by which torques are measured."""
     rows = []
     for item in LIMITS.values():
-        power = {"Nm": 1, "Nm s/rad": 1, "1/Nm": -1}.get(item.unit, 0)
+        power = WEIGHT_POWER.get(item.unit, 0)
         rows.append([end * weight**power for end in (item.low, item.high, item.start)])
     low, high, start = np.array(rows).T
     return low, high, start
