@@ -151,6 +151,24 @@ def test_laws_of_friction_are_those_of_the_paper(name: str) -> None:
     assert not values or error < 0.2 * effect
 
 
+def test_a_supply_with_resistance_lets_a_driven_motor_hold_less() -> None:
+    """At rest motor and load balance, under pulses that put duty (supply - current source) on the motor."""
+    gain = np.array(GAINS)
+    bench = bench_of(np.full((600, 3), 0.8), gain, np.zeros(3))
+    q = simulate(bench, theta(source_resistance=0.5, coulomb=0.0, viscous=0.05)[None])[-1, 0]
+    duty = gain * (0.8 - q)
+    assert KT * duty * 7.4 / (OHM * (1 + 0.5 * duty)) == pytest.approx(WEIGHT * np.sin(q), rel=1e-3)
+
+
+def test_users_get_a_servo_fitted_to_all_trials_and_numbers_of_one_that_was_not(tmp_path: Path) -> None:
+    problem = ServoProblem.of(Bench.of(read_recording_set(make_set(tmp_path / "set", plain, trials=6))))
+    part = problem.subset(np.arange(3))
+    fitted = part.baseline()
+    baseline, extended = problem.completed(SimpleNamespace(baseline=fitted, fit=fitted))
+    assert (baseline.theta == extended.theta).all()
+    assert baseline.mse.mean() < problem.errors(fitted).mean()
+
+
 def test_every_file_of_the_servos_catalogue_is_asked_about() -> None:
     folder = Path(candidates.__file__).parent
     files = {path.stem for path in folder.glob("*.py")} - {"__init__", "base"}

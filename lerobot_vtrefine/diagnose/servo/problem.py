@@ -105,6 +105,10 @@ class ServoProblem(OptionalSteps):
         left = fine.refitted(selection.fit).residual
         return repeating(fine.bench, left, float(selection.baseline.mse.mean()), encoder_step(fine.bench))
 
+    def completed(self, selection: Selection[Any, Fit, Candidate]) -> tuple[Fit, Fit]:
+        """Both fitted once more, to all trials: of few settings, one that is locked is missed."""
+        return self.refitted(selection.baseline), self.refitted(selection.fit)
+
     can_settle = True
 
     def settles(

@@ -119,7 +119,9 @@ STAGES: list[Stage] = [
     ),
     Stage(
         "resistance",
-        lambda now, v: v["source_resistance"] * np.square(now.duty),
+        # Current passes the source only while a pulse is on: the motor gets duty (supply - current source). A
+        # capacitor that averages the pulses would make the duty a square.
+        lambda now, v: v["source_resistance"] * np.abs(now.duty),
         {"source_resistance": Limits(0.0, 10.0, 0.1, "1")},
     ),
     Stage(
