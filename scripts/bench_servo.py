@@ -1,9 +1,11 @@
 #!/usr/bin/env python
 """How well are runs at a gain predicted that was never fitted? Prints the table of results/servo.json.
 
-Every setting (gain, supply, load) of a recording set of a servo is left out in turn: the diagnosis, and BAM's
-friction models M1 to M6 (arXiv 2410.08650, see bam_ladder.py), are fitted to the other settings and judged on
-it. What is done is kept in the output folder, so that an interrupted run goes on where it stopped:
+Every setting (gain, supply, load) of a recording set of a servo is left out in turn. The other recordings go
+through the door that users take, `diagnose`, and the files that it hands out predict the setting as
+``vtrefine-predict`` does. BAM's friction models M1 to M6 (arXiv 2410.08650, see bam_ladder.py) are fitted to
+the same recordings. What is done is kept in the output folder, so that an interrupted run goes on where it
+stopped:
 
     vtrefine-import --source=bam_xl330.npz --recording_dir=outputs/xl330
     python scripts/bench_servo.py --recording=outputs/xl330
@@ -14,6 +16,7 @@ import json
 import os
 import sys
 from collections.abc import Callable
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -25,12 +28,13 @@ from bam_ladder import LADDER, errors, fit, gridded
 
 from lerobot_vtrefine.cli.arguments import CommandParser
 from lerobot_vtrefine.cli.errors import run_cli
-from lerobot_vtrefine.diagnose.core.engine import infer
+from lerobot_vtrefine.cli.results.provenance import write_provenance
+from lerobot_vtrefine.diagnose.api import diagnose
 from lerobot_vtrefine.diagnose.core.resampling import gain_interval
-from lerobot_vtrefine.diagnose.recordings import read_recording_set
+from lerobot_vtrefine.diagnose.predict import load_predictor, predict_frames
+from lerobot_vtrefine.diagnose.recordings import RecordingSet, RobotTrial, read_recording_set
 from lerobot_vtrefine.diagnose.report.words import title
 from lerobot_vtrefine.diagnose.servo.bench import Bench
-from lerobot_vtrefine.diagnose.servo.problem import ServoProblem
 
 ROOT = Path(__file__).parents[1]
 Array = np.ndarray
@@ -46,15 +50,30 @@ def kept(path: Path, make: Callable[[], dict[str, Any]]) -> dict[str, Any]:
     return json.loads(path.read_text(encoding="utf-8"))
 
 
-def diagnosed(whole: ServoProblem, fitted: Array, held: Array, seed: int) -> dict[str, Any]:
-    """Names found on some trials, and errors on the others."""
-    found = infer(whole.subset(fitted), seed, locking=False)
-    part = whole.subset(held)
-    test = part.finer() or part
-    fits = {"baseline": found.selection.baseline, "engine": found.selection.fit}
-    squared = {name: test.errors(item)[:, 0].tolist() for name, item in fits.items()}
-    ties = sorted({item.name for item in found.rivals})
-    return squared | {"causes": list(found.selection.causes()), "ties": ties}
+def diagnosed(whole: RecordingSet, fitted: Array, held: Array, seed: int, folder: Path) -> dict[str, Any]:
+    """Names found on some trials, and errors on the others of the models that were handed out."""
+    found = diagnose(chosen(whole, fitted), seed)
+    test, squared = chosen(whole, held), {}
+    folder.mkdir(exist_ok=True)
+    models = {"baseline": found.baseline_model, "engine": found.extended_model}
+    for name, model in models.items():
+        assert model is not None
+        model.save(folder / f"{name}.json")
+        predict = load_predictor(folder / f"{name}.json", test)
+        squared[name] = [mean_squared(trial, predict_frames(trial, predict)) for trial in test.trials]
+    verdict = found.verdict
+    told = {"status": verdict.status, "causes": [cause.name for cause in verdict.causes]}
+    return squared | told | {"ties": sorted({name for pair in verdict.ambiguous_with for name in pair})}
+
+
+def chosen(recordings: RecordingSet, trials: Array) -> RecordingSet:
+    """Only some recordings."""
+    return replace(recordings, trials=tuple(recordings.trials[number] for number in trials))
+
+
+def mean_squared(trial: RobotTrial, predicted: Array) -> float:
+    """Over the frames that were measured [rad^2]."""
+    return float(np.nanmean(np.square(trial.position - predicted)))
 
 
 def ladder(bench: Bench, fitted: Array, held: Array, rung: str, lower: dict[str, Any]) -> dict[str, Any]:
@@ -98,8 +117,8 @@ def main() -> None:
     parser.add_argument("--seed", type=int, default=0)
     options = parser.parse_args()
     options.output_dir.mkdir(parents=True, exist_ok=True)
-    bench = Bench.of(read_recording_set(options.recording))
-    whole = ServoProblem.of(bench)
+    whole = read_recording_set(options.recording)
+    bench = Bench.of(whole)
     settings = np.array(bench.settings)
     found, labels, said = [], [], []
     for number, name in enumerate(dict.fromkeys(bench.settings)):
@@ -109,15 +128,18 @@ def main() -> None:
             path = options.output_dir / f"{number}_{rung}.json"
             own[rung] = kept(path, partial(ladder, bench, fitted, held, rung, own))
         path = options.output_dir / f"{number}_diagnosis.json"
-        own["diagnosis"] = kept(path, partial(diagnosed, whole, fitted, held, options.seed))
+        handed_out = options.output_dir / f"{number}_models"
+        own["diagnosis"] = kept(path, partial(diagnosed, whole, fitted, held, options.seed, handed_out))
         duty = bench.duty_per_rad[held[0]]
         labels.append(f"{duty:.2f}/rad left out [mrad]")
         names = ", ".join(title(item) for item in own["diagnosis"]["causes"]) or "nothing"
         ties = ", ".join(title(item) for item in own["diagnosis"]["ties"])
-        said.append(f"without {duty:.2f}/rad: {names}" + (f"; ties with {ties}" if ties else ""))
+        status = own["diagnosis"]["status"]
+        said.append(f"without {duty:.2f}/rad: {status}, {names}" + (f"; ties of {ties}" if ties else ""))
         found.append(own)
     text = render(found, labels, options.seed)
     (options.output_dir / "servo.md").write_text(text + "\n", encoding="utf-8")
+    write_provenance(options.output_dir)
     print(text, *said, sep="\n")
 
 
