@@ -1,5 +1,6 @@
 """A cause of one's own, added as docs/own-cause.md says, is screened, named, reported and predicted."""
 
+import ast
 import json
 import os
 import re
@@ -17,6 +18,7 @@ from robot_rigs import Rig, make_set
 import lerobot_vtrefine
 from lerobot_vtrefine.diagnose.joints import candidates as joint_candidates
 from lerobot_vtrefine.diagnose.pad import candidates
+from lerobot_vtrefine.diagnose.servo import candidates as servo_candidates
 from lerobot_vtrefine.diagnose.verdict import ROBOT_CAUSES, SENSOR_CAUSES
 
 PACKAGE = Path(lerobot_vtrefine.__file__).parent
@@ -93,6 +95,34 @@ def test_every_file_of_the_joints_catalogue_is_asked_about() -> None:
     assert set(joint_candidates.NAMES) == files == set(ROBOT_CAUSES)
     assert {item.cause for item in joint_candidates.CATALOGUE if not item.clue} == files
     assert all(joint_candidates.MEANING[name] for name in files)
+
+
+NAMED_ELSEWHERE = {
+    "verdict.py": "the public list of names",
+    "report/words.py": "titles",
+    "report/effects.py": "drawings",
+    "joints/experiments.py": "what slow recordings cannot show",
+    "pad/detectable.py": "a period is no size that grows",
+    "pad/final_model.py": "frames that repeat",
+    "pad/idle_drift.py": "its own probe",
+    "pad/idle_level.py": "idle levels are learnt without their drift",
+    "pad/screening.py": "what is seen in the readings themselves, and touches",
+}
+"""Files outside of the catalogues that name a cause, and why."""
+
+
+def test_what_holds_for_a_cause_stands_in_its_own_file() -> None:
+    """Elsewhere a cause is asked for by what its candidate says of it, so that a new one needs no list."""
+    names = {*candidates.PLAIN, *joint_candidates.NAMES, *servo_candidates.NAMES}
+    folder = PACKAGE / "diagnose"
+    found = {
+        str(path.relative_to(folder))
+        for path in folder.rglob("*.py")
+        if "candidates" not in path.parts
+        for node in ast.walk(ast.parse(path.read_text(encoding="utf-8")))
+        if isinstance(node, ast.Constant) and node.value in names and not path.match("servo/stages.py")
+    }
+    assert found == set(NAMED_ELSEWHERE)
 
 
 def run(script: str, folder: Path) -> str:

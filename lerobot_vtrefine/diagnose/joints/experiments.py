@@ -8,6 +8,7 @@ import numpy as np
 from lerobot_vtrefine.diagnose.core.rivals import Rival
 from lerobot_vtrefine.diagnose.core.suspicion import Alarm
 from lerobot_vtrefine.diagnose.joints.batch import frame_s, make_batch
+from lerobot_vtrefine.diagnose.joints.candidates import PLAIN, told_by_load
 from lerobot_vtrefine.diagnose.joints.fitting import ServoTrials
 from lerobot_vtrefine.diagnose.joints.gravity import is_gripper, is_sliding
 from lerobot_vtrefine.diagnose.recordings import RobotTrial
@@ -44,11 +45,12 @@ def for_rivals(selection: "Selected", rivals: Sequence[Rival[Any, Any]]) -> dict
         "predicted_gap_in_noise": round(gaps[best], 2),
     }
     text = f"Record {ENOUGH_TRIALS} trials of {where}: {PROTOCOLS[best]}."
-    if {rival.cause, rival.name} == {"backlash", "joint_friction"} and selection.problem.batch.load is None:
+    more = next((PLAIN[name].decided_by for name in decides if PLAIN[name].decided_by), "")
+    if told_by_load(*decides) and selection.problem.batch.load is None:
         protocol["columns"] = ["load"]
         text += " Record the servos' torque or current as `load`: friction takes torque, play takes none."
-    elif "gripper_compliance" in decides:
-        text += " Close it on nothing in half of the trials and on a stiff block in the others."
+    elif more:
+        text += f" {more}"
     elif gaps[best] < _TELLING:
         text += " Commands and encoders alone hardly tell these apart: measure the joint from outside too."
     return {"decides": decides, "text": text, "protocol": protocol}

@@ -12,7 +12,7 @@ from lerobot_vtrefine.diagnose.core.rules import LEAST_GAIN
 from lerobot_vtrefine.diagnose.core.search import Selection
 from lerobot_vtrefine.diagnose.core.suspicion import Suspicion
 from lerobot_vtrefine.diagnose.joints import gravity
-from lerobot_vtrefine.diagnose.joints.candidates import CATALOGUE
+from lerobot_vtrefine.diagnose.joints.candidates import CATALOGUE, told_by_load
 from lerobot_vtrefine.diagnose.joints.candidates.base import Candidate
 from lerobot_vtrefine.diagnose.joints.fitting import Fit, Point, ServoTrials, evaluate, fit, refit, servo_only
 from lerobot_vtrefine.diagnose.joints.friction_load import load_prefers
@@ -177,8 +177,8 @@ class JointProblem(ServoTrials, OptionalSteps):
     def settles(
         self, rival: Rival[Fit, Candidate], selection: Selection[Any, Fit, Candidate], seed: int
     ) -> int:
-        """Between play and friction: the servo pulls against friction only."""
-        if self.batch.load is None or {rival.cause, rival.name} != {"backlash", "joint_friction"}:
+        """Between what the servo pulls against, such as friction, and what takes no force, such as play."""
+        if self.batch.load is None or not told_by_load(rival.cause, rival.name):
             return 0
         return load_prefers(self, rival.fit, selection.fit, rival.channels[0], seed)
 

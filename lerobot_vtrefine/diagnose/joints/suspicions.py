@@ -13,6 +13,7 @@ from lerobot_vtrefine.diagnose.core.rules import LEAST_UNKNOWN
 from lerobot_vtrefine.diagnose.core.search import ALL
 from lerobot_vtrefine.diagnose.core.suspicion import Suspicion
 from lerobot_vtrefine.diagnose.joints.batch import frame_s
+from lerobot_vtrefine.diagnose.joints.candidates import PLAIN
 from lerobot_vtrefine.diagnose.joints.fitting import derivatives
 from lerobot_vtrefine.diagnose.joints.gravity import is_gripper
 from lerobot_vtrefine.diagnose.joints.repeatability import common_part, repeated, scatter
@@ -44,17 +45,6 @@ _FOLLOWS, _FOLLOWS_IF_OWNED = 0.1, 0.4
 _LINE = 0.1
 _STOPPED = 0.4
 """Part of the baseline's squared error in frames where a gripper stands far from its command."""
-_MOTION = {"backlash", "joint_friction", "control_latency"}
-_POSTURE = {"gravity_sag", "encoder_offset"}
-_OWNED = {
-    "speed": _MOTION,
-    "direction": _MOTION,
-    "acceleration": _MOTION,
-    "position": _POSTURE,
-    "squared position": _POSTURE,
-    "load": {"gripper_compliance"},
-}
-"""Causes whose other forms follow a descriptor, too."""
 
 
 def suspicions(selection: "Selected") -> list[Suspicion]:
@@ -194,9 +184,10 @@ def _following(selection: "Selected") -> list[Suspicion]:
         z = np.where(power > 1e-12 * len(z), z, 0.0)
         scores = np.stack([np.bincount(trial, z[:, k] * left) for k in range(z.shape[1])], 1)
         shares = scores.sum(0) ** 2 / np.maximum(power * (left @ left), 1e-300)
-        here = {item.cause for item in (*selection.chosen.get(joint, ()), *selection.chosen.get(ALL, ()))}
+        here = (*selection.chosen.get(joint, ()), *selection.chosen.get(ALL, ()))
+        owned = {signal for item in here for signal in PLAIN[item.cause].follows}
         for k, name in enumerate(items):
-            least = _FOLLOWS_IF_OWNED if _OWNED.get(name, set()) & here else _FOLLOWS
+            least = _FOLLOWS_IF_OWNED if name in owned else _FOLLOWS
             clue = f"what is left follows {name}"
             found.append(Suspicion(joint, clue, float(shares[k]), least, scores[:, k], either_sign=True))
     return found
@@ -235,8 +226,8 @@ def _stopped(selection: "Selected") -> list[Suspicion]:
     """A gripper that stands still while its command goes on: it holds something, or is blocked."""
     found = []
     for joint, name in enumerate(selection.problem.names):
-        used = {candidate.cause for candidate in selection.chosen.get(joint, ())}
-        if is_gripper(name) and "gripper_compliance" not in used:
+        accounted = any(PLAIN[item.cause].stops for item in selection.chosen.get(joint, ()))
+        if is_gripper(name) and not accounted:
             clue = "stands still while its command goes on: it closes on something"
             share = _stopped_share(selection, joint)
             found.append(Suspicion(joint, clue, share, _STOPPED, decisive=True))

@@ -9,6 +9,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from lerobot_vtrefine.diagnose.pad.candidates import causes_like
 from lerobot_vtrefine.diagnose.pad.press_trials import Press, PressSet
 from lerobot_vtrefine.diagnose.pad.sliding_errors import SLIDES_M_S
 
@@ -93,13 +94,9 @@ def _parity(press: Press) -> np.ndarray:
     return np.where(np.arange(len(press.trial.time_s)) % 2, 1.0, -1.0)[:, None]
 
 
-STIFFNESS = ("nonlinear_stiffness", "saturation", "row_sharing", "supply_droop", "contact_offset")
-MEMORY = ("viscoelastic_relaxation", "hysteresis", "first_load_softening")
-PLACES = ("taxel_gain_spread", "pad_tilt", "dead_taxels", "contact_offset")
-ROWS = ("row_sharing", "crosstalk", "mechanical_spreading")
-COLUMNS = ("crosstalk", "mechanical_spreading")
-PAD = ("supply_droop", "crosstalk", "mechanical_spreading")
-TIMING = ("latency", "scan_skew", "sample_and_hold")
+STIFFNESS, MEMORY = causes_like("load"), causes_like("memory")
+PLACES, ROWS, COLUMNS, PAD = (causes_like(kind) for kind in ("place", "row", "column", "pad"))
+TIMING = causes_like("timing")
 
 DESCRIPTORS = (
     Descriptor("the square of the load", STIFFNESS, lambda p, s: s * s),
@@ -107,7 +104,7 @@ DESCRIPTORS = (
     Descriptor("light contact", STIFFNESS, lambda p, s: np.sqrt(np.maximum(s, 0.0))),
     Descriptor(
         "the largest load so far in the recording",
-        ("hysteresis", "first_load_softening"),
+        causes_like("peak"),
         lambda p, s: s * np.maximum.accumulate(s, axis=0),
     ),
     Descriptor(
@@ -118,12 +115,10 @@ DESCRIPTORS = (
     ),
     Descriptor("load times the recording's number", (), lambda p, s: s * p.trial.order, session=True),
     Descriptor("load times time in the recording", (), lambda p, s: s * p.trial.time_s[:, None]),
-    Descriptor(
-        "load times the age of the contact", ("viscoelastic_relaxation",), lambda p, s: s * _age(p, s)
-    ),
+    Descriptor("load times the age of the contact", causes_like("age"), lambda p, s: s * _age(p, s)),
     Descriptor(
         "load times the logarithm of the contact's age",
-        ("viscoelastic_relaxation",),
+        causes_like("age"),
         lambda p, s: s * np.log1p(_age(p, s) / 0.1),
     ),
     Descriptor("the rate of depth", (*TIMING, *MEMORY), _depth_rate),
@@ -139,12 +134,12 @@ DESCRIPTORS = (
     Descriptor("the row of the taxel", PLACES, lambda p, s: s * _place(p, 1)),
     Descriptor(
         "the distance from the pad's centre",
-        ("taxel_gain_spread",),
+        causes_like("centre"),
         lambda p, s: s * (_place(p, 0) ** 2 + _place(p, 1) ** 2),
     ),
     Descriptor(
         "touch at the distance from the pad's centre",
-        ("taxel_gain_spread",),
+        causes_like("centre"),
         lambda p, s: (s > 0) * (_place(p, 0) ** 2 + _place(p, 1) ** 2),
     ),
     Descriptor("the other readings of the row", ROWS, lambda p, s: _line_sum(p, s, 0)),
@@ -159,18 +154,18 @@ DESCRIPTORS = (
     ),
     Descriptor(
         "time in the recording",
-        ("baseline_drift", "viscoelastic_relaxation"),
+        causes_like("time"),
         lambda p, s: np.broadcast_to(_centred(p.trial.time_s)[:, None], s.shape),
     ),
     Descriptor(
         "session time",
-        ("baseline_drift",),
+        causes_like("session"),
         lambda p, s: np.broadcast_to((p.trial.start_s + p.trial.time_s)[:, None], s.shape),
         session=True,
     ),
     Descriptor(
         "temperature",
-        ("baseline_drift",),
+        causes_like("session"),
         lambda p, s: np.broadcast_to(_temperature(p), s.shape),
         session=True,
     ),

@@ -20,7 +20,7 @@ from lerobot_vtrefine.diagnose.core.rules import (
     SURE,
 )
 from lerobot_vtrefine.diagnose.core.score_test import Probe, flip_statistics, size_p, tail_shares
-from lerobot_vtrefine.diagnose.pad.candidates import CATALOGUE
+from lerobot_vtrefine.diagnose.pad.candidates import CATALOGUE, PLAIN
 from lerobot_vtrefine.diagnose.pad.candidates.base import Form
 from lerobot_vtrefine.diagnose.pad.candidates.sample_and_hold import shortest_period
 from lerobot_vtrefine.diagnose.pad.fitting import Fit, movable, squared_errors, tangents
@@ -32,10 +32,6 @@ if TYPE_CHECKING:
 
 TRIALS = 5
 """Sizes tried per effect, each corrected in proportion from the one before."""
-MAIN = {"viscoelastic_relaxation": "fraction", "hysteresis": "fraction"}
-"""Parameter in which the smallest effect is given, where it is not the first that a form reports."""
-NULL = {"nonlinear_stiffness": 1.0}
-"""Value that means no effect, where it is not 0; an exponent's excess is given."""
 NEEDS = {
     "taxel_gain_spread": "press the same taxels in several conditions, each of them twice",
     "dead_taxels": "press every taxel, to half of the full scale or more",
@@ -60,7 +56,7 @@ def power_of(problem: "PadProblem", fitted: Fit) -> Power:
     """The power of a search's recordings for every cause that the model does not hold."""
     setting, held = fitted.model.setting, set(fitted.model.families)
     bench = _Injection(problem, fitted)
-    plain = {form.family: form for form in reversed(CATALOGUE) if form.family not in held}
+    plain = {name: form for name, form in PLAIN.items() if name not in held}
     asked = [form for form in plain.values() if form.screened and form.possible(setting)]
     sizes = dict(zip((form.family for form in asked), on_all_cores(bench.smallest, asked), strict=True))
     sizes |= {name: None for name in plain if name not in sizes}
@@ -71,7 +67,7 @@ def power_of(problem: "PadProblem", fitted: Fit) -> Power:
     if "dead_taxels" not in held:
         _, error = plain_gains(fitted, problem.presses)
         sizes["dead_taxels"] = 1.0 if (error < DEAD_ERROR).sum() > 1 else None
-    needs = {form.family: form.needs for form in reversed(CATALOGUE)} | NEEDS
+    needs = {name: form.needs for name, form in PLAIN.items()} | NEEDS
     return Power(
         {name: size for name, size in sizes.items() if size is not None},
         {name: needs[name] for name in (*plain, *MAPS) if name in sizes and sizes[name] is None},
@@ -128,7 +124,7 @@ class _Injection:
         """Size of a form's main parameter that just shows; None if none does."""
         guesses = self._guessed[form]
         reached = [self._reach(form, e) / max(self._public(form, e.values), 1e-12) for e in guesses]
-        better = max if form.family == "saturation" else min
+        better = max if form.shrinks else min
         best = sorted(range(len(guesses)), key=lambda index: -reached[index])[:2]
         sizes = [self._grown(form, guesses[index]) for index in best]
         return better((self._public(form, size) for size in sizes if size is not None), default=None)
@@ -171,10 +167,8 @@ class _Injection:
 
     def _public(self, form: Form, values: np.ndarray) -> float:
         report = form.report(values, self.fitted.model.setting)
-        value = report[MAIN.get(form.family, next(iter(report)))][0]
-        if value == 0.0 and form.family in ("crosstalk", "pad_tilt"):
-            value = max((abs(item[0]) for item in report.values()), default=0.0)
-        return float(abs(value - NULL.get(form.family, 0.0)))
+        names = form.sizes or (next(iter(report)),)
+        return float(max(abs(report[name][0] - form.none) for name in names))
 
 
 def _probe(form: Form, effect: _Effect, scores: np.ndarray) -> Probe:

@@ -20,6 +20,7 @@ from lerobot_vtrefine.diagnose.core.search import Selection
 from lerobot_vtrefine.diagnose.core.suspicion import Suspicion
 from lerobot_vtrefine.diagnose.pad import final_model, review
 from lerobot_vtrefine.diagnose.pad.baseline import Baseline, fit_baseline, plain_weights, weigh
+from lerobot_vtrefine.diagnose.pad.candidates import PLAIN
 from lerobot_vtrefine.diagnose.pad.candidates.base import Form
 from lerobot_vtrefine.diagnose.pad.error_level import slow_errors
 from lerobot_vtrefine.diagnose.pad.final_model import FinalFit
@@ -44,8 +45,6 @@ _FORGIVEN = 1.5
 """Factor by which weights may raise the plain squared error of a model."""
 _FAR_OFF = 4.0
 """Mean square of slow errors under load, in variances of a frame's noise, that weights do not hide."""
-_TIMING = ("latency", "scan_skew")
-"""Causes that are imitated by what a motion did between two frames, which nobody saw."""
 
 
 @dataclass(frozen=True)
@@ -213,7 +212,8 @@ class PadProblem(OptionalSteps):
 
         Weights trust fast changes most, and it is there that a course drawn between two frames is wrong.
         """
-        if candidate.cause not in _TIMING:
+        plain = PLAIN.get(candidate.cause)
+        if plain is None or not plain.between_frames:
             return np.ones(1, dtype=bool)
         even = self.even
         before, after = (out_of_fold(even, even.refitted(fit), self.folds) for fit in (now, best))

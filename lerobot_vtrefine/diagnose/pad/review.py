@@ -12,6 +12,7 @@ from lerobot_vtrefine.diagnose.core.resampling import agree
 from lerobot_vtrefine.diagnose.core.rules import FORM_P
 from lerobot_vtrefine.diagnose.core.screened_search import CHANNEL, better, clearly_better, preferable
 from lerobot_vtrefine.diagnose.core.search import Selection
+from lerobot_vtrefine.diagnose.pad.candidates import causes_like
 from lerobot_vtrefine.diagnose.pad.candidates.base import Form
 from lerobot_vtrefine.diagnose.pad.damping_profile import profile
 from lerobot_vtrefine.diagnose.pad.fitting import Fit
@@ -21,7 +22,7 @@ from lerobot_vtrefine.diagnose.pad.screening import MAPS, forms_of, probe_form, 
 if TYPE_CHECKING:
     from lerobot_vtrefine.diagnose.pad.problem import Candidate, PadProblem
 
-BENDS = ("nonlinear_stiffness", "saturation", "contact_offset")
+BENDS = causes_like("bend")
 """All bend readings against depth: hardening with saturation is an S, whose lower part an offset fits."""
 MORE_COORDINATES = 2
 """Coordinates that another form may have beyond the named one's, to be heard once names are settled."""

@@ -24,8 +24,15 @@ CATALOGUE: tuple[Candidate, ...] = (
     *(form for module in _MODULES.values() for form in module.FORMS),
     *import_module(f"{__name__}.decoys").FORMS,
 )
+PLAIN: dict[str, Candidate] = {item.cause: item for item in reversed(CATALOGUE)}
+"""Cause -> its plain form, with which stands what holds for all forms."""
 SIZES: dict[str, Sizes] = {name: module.sizes for name, module in _MODULES.items()}
 MEANING = {name: (module.__doc__ or "").partition(": ")[2].strip() for name, module in _MODULES.items()}
 """What every cause is, in the words of its file."""
 NOT_SHOWN: dict[str, str] = {name: getattr(module, "NOT_SHOWN", "") for name, module in _MODULES.items()}
 """Why trials show nothing of a cause where no joint can."""
+
+
+def told_by_load(one: str, other: str) -> bool:
+    """Whether measured loads tell two causes apart: the servo pulls against one of them only."""
+    return {PLAIN[one].pulls, PLAIN[other].pulls} == {True, False}

@@ -1,6 +1,6 @@
 """backlash: a joint has play, and after a reversal first does not follow."""
 
-from lerobot_vtrefine.diagnose.joints.candidates.base import Candidate
+from lerobot_vtrefine.diagnose.joints.candidates.base import MOTION, Candidate
 from lerobot_vtrefine.diagnose.joints.estimates import Estimates, MethodError
 from lerobot_vtrefine.diagnose.joints.parameters import INDEX
 from lerobot_vtrefine.diagnose.verdict import Parameter
@@ -14,7 +14,7 @@ _ROUNDING_VAGUE = 0.08
 
 FORMS = (
     # Between command and servo, or between servo and encoder.
-    Candidate("backlash", ("play",), (0.5, 2.0)),
+    Candidate("backlash", ("play",), (0.5, 2.0), follows=MOTION, pulls=False),
     Candidate("backlash", ("loose",), sized=False),
     *(
         Candidate("backlash", (width, "round"), (0.4,), handicap=_SHAPE_LEAD, sized=False)

@@ -27,7 +27,7 @@ def moving(problem: ServoTrials) -> Array:
 
 @dataclass(frozen=True)
 class Candidate:
-    """One form of one cause."""
+    """One form of one cause. What holds for all forms stands with the plain one, from `follows` on."""
 
     cause: str
     parameters: tuple[str, ...]
@@ -52,6 +52,14 @@ class Candidate:
     """By how much its size is moved to see what it does, in units of the noise."""
     in_shared_encoders: bool = False
     """Whether it does not show where servos close their loop on the encoders that are read."""
+    follows: tuple[str, ...] = ()
+    """Signals (`joints.suspicions`) that what is left by another form of this cause follows."""
+    pulls: bool | None = None
+    """Whether the servo pulls against it; None where a measured load does not tell."""
+    stops: bool = False
+    """Whether it is why a gripper stands still while its command goes on."""
+    decided_by: str = ""
+    """What to record to tell it from others, as a sentence."""
 
     @property
     def plain(self) -> tuple[str, ...] | None:
@@ -93,6 +101,11 @@ class Candidate:
     def clashes(self, free: Array) -> Array:
         """(J,) joints where its parameters are in use already."""
         return np.any(free[:, [INDEX[name] for name in self.parameters]], axis=1)
+
+
+MOTION = ("speed", "direction", "acceleration")
+POSTURE = ("position", "squared position")
+"""Signals of `follows`."""
 
 
 def at_zero(problem: ServoTrials, point: Point, joints: Array, multiple: float) -> Point:

@@ -3,7 +3,7 @@
 import numpy as np
 
 from lerobot_vtrefine.diagnose.core.resampling import jackknife
-from lerobot_vtrefine.diagnose.joints.candidates.base import Candidate
+from lerobot_vtrefine.diagnose.joints.candidates.base import MOTION, Candidate
 from lerobot_vtrefine.diagnose.joints.estimates import Estimates, MethodError, widened
 from lerobot_vtrefine.diagnose.verdict import Parameter
 
@@ -14,7 +14,11 @@ frame's time. When, no recording tells: a delay is known up to a uniform error o
 NOT_SHOWN = "move every joint, at several speeds"
 FORMS = (
     Candidate(
-        "control_latency", (), shared=True, possible=lambda problem: np.ones(problem.batch.joints, dtype=bool)
+        "control_latency",
+        (),
+        shared=True,
+        possible=lambda problem: np.ones(problem.batch.joints, dtype=bool),
+        follows=MOTION,
     ),
 )
 

@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from lerobot_vtrefine.diagnose.joints.candidates.base import Candidate, at_zero
+from lerobot_vtrefine.diagnose.joints.candidates.base import POSTURE, Candidate, at_zero
 from lerobot_vtrefine.diagnose.joints.estimates import Estimates, MethodError
 from lerobot_vtrefine.diagnose.verdict import Parameter
 
@@ -19,6 +19,7 @@ FORMS = (
         possible=lambda problem: np.ones(problem.batch.joints, dtype=bool),
         start=at_zero,
         in_shared_encoders=True,
+        follows=POSTURE,
     ),
 )
 

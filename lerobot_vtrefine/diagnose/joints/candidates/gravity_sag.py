@@ -6,7 +6,7 @@ from functools import partial
 import numpy as np
 
 from lerobot_vtrefine.diagnose.joints import gravity
-from lerobot_vtrefine.diagnose.joints.candidates.base import Candidate, moving
+from lerobot_vtrefine.diagnose.joints.candidates.base import POSTURE, Candidate, moving
 from lerobot_vtrefine.diagnose.joints.estimates import Estimates, MethodError
 from lerobot_vtrefine.diagnose.joints.fitting import Point, ServoTrials
 from lerobot_vtrefine.diagnose.joints.parameters import INDEX, SAG
@@ -50,6 +50,7 @@ def _form(form: str, terms: int) -> Candidate:
         form=form,
         handicap=_LEAD.get(form, 0.0),
         sized=form not in _LEAD,
+        follows=POSTURE,
     )
 
 

@@ -60,7 +60,16 @@ _CURVE_LEAD = 0.02
 FORMS = (
     # Before the servo, which then follows, or behind it, at once.
     # A newton bends by far less than the noise is long.
-    Candidate("gripper_compliance", ("bend",), possible=_loaded, start=at_zero, step=0.1),
+    Candidate(
+        "gripper_compliance",
+        ("bend",),
+        possible=_loaded,
+        start=at_zero,
+        step=0.1,
+        follows=("load",),
+        stops=True,
+        decided_by="Close it on nothing in half of the trials and on a stiff block in the others.",
+    ),
     Candidate("gripper_compliance", ("flex",), possible=_loaded, start=at_zero, sized=False),
     *(
         Candidate(

@@ -3,7 +3,7 @@
 import numpy as np
 
 from lerobot_vtrefine.diagnose.core.resampling import jackknife
-from lerobot_vtrefine.diagnose.joints.candidates.base import Candidate
+from lerobot_vtrefine.diagnose.joints.candidates.base import MOTION, Candidate
 from lerobot_vtrefine.diagnose.joints.estimates import Estimates, MethodError, widened
 from lerobot_vtrefine.diagnose.joints.friction_load import friction_in_load, stiffness_in_load
 from lerobot_vtrefine.diagnose.joints.gravity import is_sliding
@@ -20,7 +20,7 @@ _STICKING_VAGUE = 0.12
 
 # Slow to simulate, and to first order the same as play: only where play helps at all.
 FORMS = (
-    Candidate("joint_friction", ("friction",), (0.5,), only_where="backlash"),
+    Candidate("joint_friction", ("friction",), (0.5,), only_where="backlash", follows=MOTION, pulls=True),
     Candidate(
         "joint_friction",
         ("friction", "stick"),

@@ -7,7 +7,7 @@ To add a cause, write its stage in `tactile/stages`, and a file here with its `F
 import pkgutil
 from importlib import import_module
 
-from lerobot_vtrefine.diagnose.pad.candidates.base import Form
+from lerobot_vtrefine.diagnose.pad.candidates.base import Form, Kind
 
 LISTED = (
     "nonlinear_stiffness",
@@ -37,5 +37,19 @@ def _files() -> list[str]:
 _MODULES = tuple(import_module(f"{__name__}.{name}") for name in _files())
 CATALOGUE: tuple[Form, ...] = tuple(form for module in _MODULES for form in module.FORMS)
 """Causes with a handful of parameters; maps (taxel_gain_spread, dead_taxels) are fitted in `maps`."""
+PLAIN: dict[str, Form] = {form.family: form for form in reversed(CATALOGUE)}
+"""Cause -> its plain form, with which stands what holds for all forms."""
+KINDS: dict[str, tuple[Kind, ...]] = {
+    **{name: form.kinds for name, form in PLAIN.items()},
+    "taxel_gain_spread": ("place", "centre"),
+    "dead_taxels": ("place",),
+}
+"""Cause -> what it is like; maps have no forms that could say it."""
 MEANING = {module.FORMS[0].family: (module.__doc__ or "").partition(": ")[2].strip() for module in _MODULES}
 """What every cause is, in the words of its file."""
+
+
+def causes_like(*kinds: Kind) -> tuple[str, ...]:
+    """Causes of any of those kinds, in the order of the catalogue."""
+    names = [*dict.fromkeys(form.family for form in CATALOGUE), *KINDS]
+    return tuple(name for name in dict.fromkeys(names) if not set(kinds).isdisjoint(KINDS[name]))

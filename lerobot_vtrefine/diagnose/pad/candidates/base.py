@@ -2,6 +2,7 @@
 
 from collections.abc import Callable
 from dataclasses import dataclass, field
+from typing import Literal
 
 import numpy as np
 
@@ -57,6 +58,22 @@ class Value:
 
 
 Stages = tuple[Stage, ...]
+Kind = Literal[
+    "bend",  # of readings against depth
+    "load",  # otherwise than in proportion to it
+    "memory",  # of the contact
+    "peak",  # of its largest load
+    "age",  # of how long it has lasted
+    "time",  # drifts within a recording
+    "session",  # and from recording to recording
+    "place",  # differs over the pad
+    "centre",  # with the distance from it
+    "row",  # depends on its other readings
+    "column",
+    "pad",
+    "timing",
+]
+"""What a cause is like."""
 
 
 @dataclass(frozen=True)
@@ -73,6 +90,8 @@ class Form:
         amplitude: index of the coordinate that is the effect's size (0 is no effect), along which probes are
             stretched; None if probes are taken as they are.
         signed: whether the effect may go either way; otherwise screening is one-sided.
+
+    What holds for the cause as a whole (`kinds`, `needs`, `between_frames`) stands with its plain form.
     """
 
     family: str
@@ -98,6 +117,16 @@ class Form:
     """What to record where the cause cannot show."""
     grown: Callable[[np.ndarray, Setting], list[float]] | None = None
     """The family's plain form, given by its coordinates, as this form has it: where descents start."""
+    kinds: tuple[Kind, ...] = ()
+    """Signals of these kinds are the family's own: what follows them may be the fault of its form."""
+    between_frames: bool = False
+    """Whether what a motion did between two frames, which nobody saw, imitates it."""
+    sizes: tuple[str, ...] = ()
+    """Parameters of which the largest is its size; the first that is reported unless given."""
+    none: float = 0.0
+    """Value of that parameter without the effect."""
+    shrinks: bool = False
+    """Whether that parameter falls as the effect grows."""
 
     @property
     def low(self) -> np.ndarray:

@@ -70,6 +70,7 @@ FORMS = (
         _linear,
         lambda v, s: {"rate_counts_per_s": (float(v[0]) * UNIT, "counts/s")},
         lambda s: [[1.0]],
+        kinds=("time", "session"),
         needs="log start_s, and record over some minutes with frames at rest in every trial",
         signed=True,
     ),

@@ -23,6 +23,7 @@ FORMS = (
         lambda v, s: {"offset_m": (float(v[0]), "m")},
         # A face that lies higher is felt in frames, and by taxels, that a lower one does not reach.
         lambda s: [[2e-5], [-2e-5]],
+        kinds=("bend", "load", "place"),
         needs="log depth_m, and press shallow and deep",
         signed=True,
         possible=lambda s: not s.loaded,

@@ -34,6 +34,8 @@ FORMS = (
         lambda v, s: (Crosstalk(float(v[0]), float(v[1])),),
         lambda v, s: {"row": (float(v[0]), "1"), "col": (float(v[1]), "1")},
         lambda s: [[0.002, 0.002], [0.002, 0.0], [0.0, 0.002]],
+        kinds=("row", "column", "pad"),
+        sizes=("row", "col"),
         needs="press a few taxels of a pad that has others in their rows and columns",
         amplitude=None,
         possible=lambda s: s.layout.num_taxels > 1,

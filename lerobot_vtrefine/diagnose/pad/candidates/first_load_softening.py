@@ -47,6 +47,7 @@ FORMS = (
         "by the part that was let go",
         build=_plain,
         probes=lambda s: [[0.05]],
+        kinds=("memory", "peak"),
         needs="unload in part and load again at the same place, beyond the first load",
     ),
     _form(

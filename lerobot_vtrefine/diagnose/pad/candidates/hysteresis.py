@@ -61,6 +61,8 @@ FORMS = (
         _report_one,
         lambda s: [[0.05, float(np.log(share))] for share in (0.1, 0.25, 0.5, 1.0, 1.8)],
         signed=True,
+        kinds=("memory", "peak"),
+        sizes=("fraction",),
         needs="unload in part and load again at the same place",
     ),
     Form(

@@ -13,6 +13,8 @@ FORMS = (
         lambda v, s: (Latency(float(v[0])),),
         lambda v, s: {"tau_s": (float(v[0]), "s")},
         lambda s: [[0.5 * s.frame_s], [2.0 * s.frame_s]],
+        kinds=("timing",),
+        between_frames=True,
         needs="press and release fast, at several speeds",
         twin=0,
     ),

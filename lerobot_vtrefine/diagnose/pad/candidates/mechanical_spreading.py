@@ -56,6 +56,7 @@ FORMS = (
         lambda v, s: (MechanicalSpreading(float(v[0]) * s.layout.pitch_m),),
         lambda v, s: {"sigma_m": (float(v[0]) * s.layout.pitch_m, "m")},
         lambda s: [[0.35], [0.7]],
+        kinds=("row", "column", "pad"),
         needs="press with an indenter smaller than a few taxels",
         amplitude=None,
         possible=lambda s: s.layout.num_taxels > 1,

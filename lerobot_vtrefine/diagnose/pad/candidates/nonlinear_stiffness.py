@@ -32,6 +32,8 @@ FORMS = (
         lambda v, s: (NonlinearStiffness(1.0 + float(v[0])),),
         lambda v, s: {"exponent": (1.0 + float(v[0]), "1")},
         lambda s: [[0.05]],
+        kinds=("bend", "load"),
+        none=1.0,
         needs="press to three depths or more, the deepest well beyond the others, with depth_m logged",
         possible=lambda s: not s.loaded,
     ),

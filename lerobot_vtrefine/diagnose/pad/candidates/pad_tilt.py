@@ -18,6 +18,8 @@ FORMS = (
             if lines > 1
         ],
         amplitude=None,
+        kinds=("place",),
+        sizes=("tilt_x_rad", "tilt_y_rad"),
         needs="log depth_m, and press at three places or more that are not on a line",
         signed=True,
         possible=lambda s: not s.loaded and max(s.touched_rows, s.touched_cols) > 1,

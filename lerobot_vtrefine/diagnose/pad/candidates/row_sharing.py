@@ -27,6 +27,7 @@ FORMS = tuple(
         build,
         _report,
         lambda s: [[0.05]],
+        kinds=("load", "row"),
         needs="press two taxels of a row or more at once, with a wider indenter",
         possible=lambda s: s.row_company > 1,
         peer=build is _others,

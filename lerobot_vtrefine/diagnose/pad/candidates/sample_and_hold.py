@@ -206,6 +206,7 @@ FORMS = (
         lambda v, s: (SampleAndHold(float(v[0])),),
         lambda v, s: {"period_s": (float(v[0]), "s")},
         lambda s: [[2.0001 * s.frame_s], [3.0001 * s.frame_s], [5.0001 * s.frame_s]],
+        kinds=("timing",),
         needs="record every frame with its own time, moving, with readings that carry noise",
         amplitude=None,
         search=periods,

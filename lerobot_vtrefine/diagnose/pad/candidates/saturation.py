@@ -23,6 +23,8 @@ FORMS = (
         lambda v, s: (Saturation(_knee(v, s)),),
         lambda v, s: {"knee_counts": (_knee(v, s), "counts")},
         lambda s: [[0.3], [0.8]],
+        kinds=("bend", "load"),
+        shrinks=True,
         needs="press until readings come near the full scale",
     ),
     Form(

@@ -46,6 +46,8 @@ FORMS = (
         lambda v, s: (ScanSkew(float(v[0])),),
         lambda v, s: {"skew_s": (float(v[0]), "s")},
         lambda s: [[0.5 * s.frame_s]],
+        kinds=("timing",),
+        between_frames=True,
         needs="press and release fast with an indenter that reaches several rows",
         signed=True,
         possible=lambda s: s.layout.rows > 1 and s.touched_rows > 1,

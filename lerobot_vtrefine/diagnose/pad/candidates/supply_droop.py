@@ -11,6 +11,7 @@ FORMS = (
         lambda v, s: (SupplyDroop(float(v[0]) / s.top_counts),),
         lambda v, s: {"droop_per_count": (float(v[0]) / s.top_counts, "1/counts")},
         lambda s: [[0.05]],
+        kinds=("load", "pad"),
         needs="press taxels of two rows or more at once, with a wider indenter",
         # Where one row is pressed at a time the pad's load is the row's.
         possible=lambda s: s.company > s.row_company,
