@@ -50,7 +50,7 @@ def diagnose(
         source: a folder with ``recording.json``, a LeRobot dataset or its folder (one episode is one trial),
             or recordings that were read already.
         seed: of resampling and of what is locked away.
-        progress: told what is being done and the fraction done.
+        progress: called with what is being done and the fraction done.
 
     Raises:
         FileNotFoundError: nothing is there.

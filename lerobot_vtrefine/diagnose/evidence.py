@@ -1,4 +1,4 @@
-"""What an engine hands to the report beside its verdict: evidence per candidate, traces, residuals."""
+"""What an engine hands to the report together with its verdict: evidence per candidate, traces, residuals."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass

@@ -13,7 +13,7 @@ from lerobot_vtrefine.files.tables import read_table
 
 SCHEMA = "vtrefine/recording-set@1"
 LARGEST_LENGTH = 1e4
-"""Lengths may be in millimetres, which `quality` tells; none is larger than this in any unit."""
+"""Lengths may be in millimetres, which `quality` detects; none is larger than this in any unit."""
 MAX_TAXELS_A_SIDE = 256
 
 

@@ -33,14 +33,14 @@ class Stability:
     def line(self, title: Callable[[str], str]) -> str:
         """For people."""
         names = dict.fromkeys((*self.named, *self.draws, *self.halves))
-        told = [
+        counts = [
             f"{title(name)}{'' if name in self.named else ' (not in the verdict)'} "
             f"{self.draws.get(name, 0)} and {self.halves.get(name, 0)}"
             for name in names
         ]
         kinds = ", ".join(f"{status} {count}" for status, count in Counter(self.statuses).items())
-        told = told or ["no name in any"]
-        return f"of {self.count} other draws and {self.count} halves: {'; '.join(told)} ({kinds})"
+        counts = counts or ["no name in any"]
+        return f"of {self.count} other draws and {self.count} halves: {'; '.join(counts)} ({kinds})"
 
 
 def stability(

@@ -143,7 +143,7 @@ def test_nothing_wrong_is_said_without_an_extension(pad_set):
     text = text_of(page(pad_diagnosis(status="adequate", causes=()), pad_set))
     assert text.index("The simulation is adequate") < 60
     assert "Nothing was added to the model, so extended and simulated are the same" in text
-    assert "More recordings would show smaller effects than those listed" in text
+    assert "More recordings would reveal smaller effects than those listed" in text
     assert "Nothing was added" not in text_of(page(pad_diagnosis(), pad_set))
 
 
@@ -156,16 +156,14 @@ def test_unknown_cause_demotes_names_to_symptoms(pad_set):
         status="unexplained", causes=symptoms, unknown=Unknown(True, "load × session time")
     )
     text = text_of(page(unknown, pad_set))
-    assert (
-        "wrong in a way that no known cause explains. What is known of it: load × session time." in text[:240]
-    )
+    assert "wrong in a way that no known cause explains. Clue: load × session time." in text[:240]
     assert "What looks wrong" in text
-    assert "vary one thing at a time" in text
-    assert "a symptom: the name may be borrowed" in text
-    assert "Added to the model, they take 66 % of the squared error away all the same." in text[:400]
+    assert "Vary one thing at a time" in text
+    assert "a symptom: its real cause may be another" in text
+    assert "Adding them to the model still removes 66 % of the squared error." in text[:400]
     held = replace(unknown.verdict.heldout, gain=0.1, gain_ci95=(-0.1, 0.3))
     unknown = replace(unknown, verdict=replace(unknown.verdict, heldout=held))
-    assert "all the same" not in text_of(page(unknown, pad_set))
+    assert "still removes" not in text_of(page(unknown, pad_set))
 
 
 def test_residuals_say_what_they_are_drawn_against(pad_set, robot_set):
@@ -182,7 +180,7 @@ def test_residuals_say_what_they_are_drawn_against(pad_set, robot_set):
 def test_headline_tells_the_first_of_several_clues(robot_set):
     clues = Unknown(True, f"left_waist: too few trials; {'; '.join(['right_elbow: too few trials'] * 9)}")
     text = text_of(page(robot_diagnosis(status="unexplained", causes=(), unknown=clues), robot_set))
-    assert text.count("What is known of it: left_waist: too few trials.") == 1
+    assert text.count("Clue: left_waist: too few trials.") == 1
 
 
 def test_everything_found_and_not_found_is_there(pad_set):
@@ -191,7 +189,7 @@ def test_everything_found_and_not_found_is_there(pad_set):
         "trial_0003.parquet starts loaded set aside",
         "crosstalk 0.4 0.99 0.1 % no more than chance gives",
         "Not found, ",
-        "baseline drift baseline_drift – – – cannot be told here",
+        "baseline drift baseline_drift – – – not identifiable here",
         "hysteresis width_m 0.21 mm 0.18 to 0.24 mm",
         "baseline k_n 380 N/m 371 to 390 N/m",
         "latency delay: 6 ms",

@@ -26,14 +26,14 @@ class Refusal:
     cause: str
     channel: int
     gain: float
-    """On locked trials, beside the baseline."""
+    """On locked trials, over the baseline."""
     surely: bool
     """Whether the gain's 95 % interval lies below zero."""
 
 
 @dataclass(frozen=True)
 class Inference[P: Problem[Any, Any], F: Fit, C: Candidate]:
-    """What the method found; everything that is told follows from it."""
+    """What the method found; everything that is reported follows from it."""
 
     selection: Selection[P, F, C]
     rivals: tuple[Rival[F, C], ...]
@@ -59,7 +59,7 @@ def infer[P: Problem[Any, Any]](
 
     Args:
         seed: of the locked trials, folds, sign flips and resampling.
-        progress: told what is being done and the fraction done.
+        progress: called with what is being done and the fraction done.
         locking: False where all trials are needed to see anything.
     """
     tell = progress or (lambda text, done: None)
@@ -167,9 +167,7 @@ def _with_refused(alarms: tuple[Alarm, ...], refused: tuple[Refusal, ...]) -> tu
     """What was significant and yet surely predicts worse is something else than its name; a small effect that
     locked trials happen to show the other way is not."""
     more = [
-        Alarm(
-            max(item.channel, 0), f"what looks like {item.cause} predicts worse on trials left out", 1.0, None
-        )
+        Alarm(max(item.channel, 0), f"what looks like {item.cause} predicts held-out trials worse", 1.0, None)
         for item in refused
         if item.surely
     ]

@@ -16,9 +16,9 @@ _place = threading.local()
 
 def threads() -> int:
     """Threads to use: what OMP_NUM_THREADS allows, or the cores that this process may run on."""
-    told = os.environ.get("OMP_NUM_THREADS", "")
-    if told.isdigit() and int(told) > 0:
-        return min(int(told), MOST)
+    wanted = os.environ.get("OMP_NUM_THREADS", "")
+    if wanted.isdigit() and int(wanted) > 0:
+        return min(int(wanted), MOST)
     if hasattr(os, "sched_getaffinity"):
         return min(len(os.sched_getaffinity(0)), MOST)
     return min(os.cpu_count() or 1, MOST)

@@ -114,7 +114,7 @@ class OptionalSteps(Protocol):
     def handed_out(
         self, selection: "Selection[Any, Any, Any]", seed: int, *, doubtful: bool
     ) -> "Selection[Any, Any, Any]":
-        """The selection with fits as users get them; `doubtful`: beside something that has no name."""
+        """The selection with fits as users get them; `doubtful`: an alarm was raised."""
         return selection
 
     def completed(self, selection: "Selection[Any, Any, Any]") -> tuple[Any, Any]:
@@ -236,7 +236,7 @@ class ScreenedProblem[F: ScoredFit, C: FormCandidate](Problem[F, C], Protocol):
 
     @property
     def further_gain(self) -> float:
-        """Part of the error that a cause beside others must take away: patching their form gains some."""
+        """Part of the error that a further cause must take away: correcting the form of others gains some."""
 
     def weighed(self, now: F | None) -> tuple[Self, F]:
         """The problem with the noise around a fit (None: the baseline's) for weights, and the fit anew."""
@@ -265,7 +265,7 @@ class ScreenedProblem[F: ScoredFit, C: FormCandidate](Problem[F, C], Protocol):
 
 
 class Account[F: Fit, C: Candidate](Protocol):
-    """How an instrument tells what was found: sizes, models, sentences, drawings."""
+    """How an instrument reports what was found: sizes, models, sentences, drawings."""
 
     unit: str
     metric: str
@@ -286,7 +286,7 @@ class Account[F: Fit, C: Candidate](Protocol):
         """Root mean square error that no model could undo."""
 
     def causes(self) -> Sequence[str]:
-        """Names that are told about, found or not."""
+        """Names that are reported, found or not."""
 
     def caveat(self, cause: str, channels: tuple[int, ...]) -> str:
         """What an accepted cause leaves open."""

@@ -1,4 +1,4 @@
-"""What else would explain the trials as well: causes that these data cannot tell apart."""
+"""Alternative explanations: causes that these data cannot distinguish."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -121,7 +121,7 @@ def if_tied[F: Fit, C: Candidate](
     p_value = float(one_sided(preference, seed)[0][0])
     lead = float(1 - (now.mean(0) / other.mean(0).clip(1e-300)).mean())
     tied = p_value > (SURE_P if lead < TIE_LEAD else TIE_P)
-    # A gain that falls short in a few trials only, which count most, does not tell two causes apart.
+    # A gain that falls short in a few trials only, which count most, does not distinguish two causes.
     short = gain_other < SHARE_OF_GAIN * gain_now
     surely_short = short and one_sided(((other - now) / scale).mean(1, keepdims=True), seed)[0][0] <= TIE_P
     if not tied or surely_short:

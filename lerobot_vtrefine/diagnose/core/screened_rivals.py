@@ -18,7 +18,7 @@ from lerobot_vtrefine.diagnose.core.search import Selection
 def screened_rivals[F: ScoredFit, C: FormCandidate](
     selection: Selection[Any, F, C], seed: int
 ) -> list[Rival[F, C]]:
-    """All causes that tie with an accepted one, of those that passed the test beside it.
+    """All causes that tie with an accepted one, of those that passed the test together with it.
 
     Both the log scores and the squared errors must not prefer what was named: weights forgive much that plain
     errors do not.
@@ -30,7 +30,7 @@ def screened_rivals[F: ScoredFit, C: FormCandidate](
     full = whole.judged(selection.fit)
     found: list[Rival[F, C]] = []
     for candidate in chosen:
-        others = sorted(selection.beside.get(candidate.cause, frozenset()) - names)
+        others = sorted(selection.alternatives.get(candidate.cause, frozenset()) - names)
         if not others:
             continue
         slim = problem.reduced(selection.fit, [candidate], np.ones(1, dtype=bool))

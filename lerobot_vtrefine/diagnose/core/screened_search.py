@@ -104,7 +104,7 @@ class ScreenedSearch[P: ScreenedProblem[Any, Any], F: ScoredFit, C: FormCandidat
         self.problem, self.now = problem.weighed(None)
         self.chosen: tuple[C, ...] = ()
         self.p_values: dict[str, float | None] = {}
-        self.beside: dict[str, frozenset[str]] = {}
+        self.alternatives: dict[str, frozenset[str]] = {}
         self.first: list[Promise[C]] = []
         self.gains: dict[str, float] = {}
         """Best cross-validated gain that each cause reached."""
@@ -132,7 +132,7 @@ class ScreenedSearch[P: ScreenedProblem[Any, Any], F: ScoredFit, C: FormCandidat
             {CHANNEL: self.chosen} if self.chosen else {},
             {(name, CHANNEL): p for name, p in self.p_values.items()},
             examined=self._examined(),
-            beside=self.beside,
+            alternatives=self.alternatives,
         )
 
     def _round(self, problem: P, now: F) -> tuple[list[Promise[C]], Step[F, C] | None]:
@@ -207,7 +207,7 @@ class ScreenedSearch[P: ScreenedProblem[Any, Any], F: ScoredFit, C: FormCandidat
         name = step.candidate.cause
         self.p_values[name] = next(item.tested.p_adjusted for item in found if item.candidate.cause == name)
         passed = {item.candidate.cause for item in found if item.tested.passed and item.candidate.terms}
-        self.beside[name] = frozenset(passed - {name}) if step.candidate.terms else frozenset()
+        self.alternatives[name] = frozenset(passed - {name}) if step.candidate.terms else frozenset()
         self.chosen = (*self.chosen, step.candidate)
         self.problem, self.now = self.problem.weighed(step.fit)
 

@@ -86,8 +86,8 @@ class Selection[P: Problem[Any, Any], F: Fit, C: Candidate]:
     """Every candidate alone on the baseline."""
     examined: Mapping[str, Examined] = field(default_factory=dict)
     """Every cause alone, at its best; decoys too."""
-    beside: Mapping[str, frozenset[str]] = field(default_factory=dict)
-    """Accepted cause -> others that passed a score test beside it."""
+    alternatives: Mapping[str, frozenset[str]] = field(default_factory=dict)
+    """Accepted cause -> others that passed a score test at the same time."""
 
     def causes(self) -> dict[str, tuple[int, ...]]:
         """Named cause -> channels that it acts on."""

@@ -20,8 +20,8 @@ Array = np.ndarray
 Found = Inference[Any, Any, Any]
 
 _CLUES = 4
-"""Clues that are told; more are counted."""
-_RECORD_MORE = "no size of it would have shown: record more conditions, slower and faster, each twice"
+"""Clues that are listed; further ones are only counted."""
+_RECORD_MORE = "no size of it would have been detected: record more conditions, slower and faster, each twice"
 
 
 def tell(found: Found, account: Account[Any, Any]) -> Diagnosis:
@@ -102,19 +102,19 @@ def _unknown(alarms: Sequence[Alarm], channels: tuple[str, ...]) -> Unknown:
         clues = [alarm.clue for alarm in alarms]
         more = "" if len(clues) <= _CLUES else f"; and {len(clues) - _CLUES} more"
         return Unknown(True, "; ".join(clues[:_CLUES]) + more)
-    told: dict[str, list[str]] = {}
-    spoken_of: set[int] = set()
+    channels_of: dict[str, list[str]] = {}
+    reported: set[int] = set()
     for alarm in alarms:
-        if alarm.channel not in spoken_of:
-            told.setdefault(alarm.clue, []).append(channels[alarm.channel])
-        spoken_of.add(alarm.channel)
-    clues = [f"{', '.join(names)}: {clue}" for clue, names in told.items()]
+        if alarm.channel not in reported:
+            channels_of.setdefault(alarm.clue, []).append(channels[alarm.channel])
+        reported.add(alarm.channel)
+    clues = [f"{', '.join(names)}: {clue}" for clue, names in channels_of.items()]
     more = "" if len(clues) <= _CLUES else f"; and {len(clues) - _CLUES} more"
     return Unknown(True, "; ".join(clues[:_CLUES]) + more)
 
 
 def _names(found: Found, account: Account[Any, Any]) -> tuple[str, ...]:
-    """Every name that is told about, and decoys; the most promising first where scores were tested."""
+    """Every name that is reported, and decoys; the most promising first where scores were tested."""
     return tuple(dict.fromkeys((*account.causes(), *found.selection.examined)))
 
 
@@ -150,9 +150,9 @@ def _decision(found: Found, account: Account[Any, Any], name: str, seen: Examine
     if name in accepted:
         return _accepted(found, name, account.caveat(name, accepted[name]))
     if name in ties:
-        return "tie", f"explains {ties[name].cause}{_where(found, ties[name].channels)} as well"
+        return "tie", f"explains as much as {ties[name].cause}{_where(found, ties[name].channels)}"
     if name in (refused := _refused(found)):
-        text = f"predicts worse than the baseline on trials left out (gain {refused[name]:.2f})"
+        text = f"predicts held-out trials worse than the baseline (gain {refused[name]:.2f})"
         return "rejected", text
     return "rejected", _why_rejected(found, seen)
 
@@ -164,26 +164,26 @@ def _refused(found: Found) -> dict[str, float]:
 
 def _accepted(found: Found, name: str, caveat: str) -> tuple[str, str]:
     where = _where(found, found.selection.causes()[name])
-    seen = "seen in the readings themselves, not tested; " if found.selection.observed(name) else ""
-    reason = f"{seen}predicts trials that its fit has not seen better{where}{caveat}"
+    seen = "observed in the readings, not tested; " if found.selection.observed(name) else ""
+    reason = f"{seen}improves the prediction of trials left out of the fit{where}{caveat}"
     if not found.alarms:
         return "accepted", reason
-    return "symptom", f"{reason}; but something is left that no cause explains: the name may be borrowed"
+    return "symptom", f"{reason}; but part of the error has no known cause: this may be a symptom of it"
 
 
 def _why_rejected(found: Found, seen: Examined) -> str:
     if seen.gain is None:
         if seen.p_adjusted is None:
-            return "no sign of it"
+            return "no evidence of it"
         if seen.p_adjusted > SCREEN_ALPHA:
-            return f"trials agree on it no more than by chance (adjusted p above {SCREEN_ALPHA:g})"
-        return "passed the score test, but others explained more and left nothing for it"
+            return f"not significant (adjusted p above {SCREEN_ALPHA:g})"
+        return "passed the score test, but explains nothing beyond the causes that were accepted"
     where = " on all channels" if seen.channel == ALL else _where(found, (seen.channel,))
     if seen.gain > LEAST_GAIN and (seen.p_adjusted is None or seen.p_adjusted < ALPHA):
         return f"significant{where} by itself, but another cause explains it better"
-    least = f"under {100 * LEAST_GAIN:.0f} % of error"
+    least = f"it removes less than {100 * LEAST_GAIN:.0f} % of the error"
     place = f"strongest{where}; " if where else ""
-    return f"{place}in such trials chance gives as much, or it is {least}"
+    return f"{place}not significant, or {least}"
 
 
 def _where(found: Found, channels: tuple[int, ...]) -> str:

@@ -29,7 +29,7 @@ def diagnose_robot(recordings: RecordingSet, seed: int = 0, progress: Progress |
     Args:
         recordings: a set of kind "robot" after quality control, or episodes of a dataset.
         seed: of the locked trials, folds, sign flips and resampling.
-        progress: told what is being done and the fraction done.
+        progress: called with what is being done and the fraction done.
 
     Raises:
         ValueError: a trial with commands or times that are not finite.

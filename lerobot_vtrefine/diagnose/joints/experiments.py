@@ -52,7 +52,7 @@ def for_rivals(selection: "Selected", rivals: Sequence[Rival[Any, Any]]) -> dict
     elif more:
         text += f" {more}"
     elif gaps[best] < _TELLING:
-        text += " Commands and encoders alone hardly tell these apart: measure the joint from outside too."
+        text += " Commands and encoders hardly distinguish these: measure the joint from outside, too."
     return {"decides": decides, "text": text, "protocol": protocol}
 
 

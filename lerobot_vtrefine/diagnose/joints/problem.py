@@ -30,7 +30,7 @@ Array = np.ndarray
 type Selected = Selection["JointProblem", Fit, Candidate]
 
 _OF_A_STEP = 0.25
-"""The same, as a part of the encoder's step: means over many readings tell a quarter of it."""
+"""The same, as a part of the encoder's step: means over many readings resolve a quarter of it."""
 _EXTRAPOLATION = (4.0, 8.0)
 """Largest size of a cause over the largest error seen: of several that may cancel, and of one alone."""
 _ITERATIONS = 12

@@ -1,4 +1,4 @@
-"""How far trials of one command differ, beside the encoders' own scatter.
+"""How far trials of one command differ, compared with the encoders' own scatter.
 
 Shapes: N frames, T trials, J joints.
 """

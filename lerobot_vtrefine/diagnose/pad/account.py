@@ -1,4 +1,4 @@
-"""How a pad's diagnosis is told: sizes with intervals, power, models, drawings."""
+"""How a pad's diagnosis is reported: sizes with intervals, power, models, drawings."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
@@ -141,7 +141,7 @@ class PadAccount:
 def other_forms(problem: PadProblem, fitted: Fit, index: int) -> list[dict[str, tuple[float, str]]]:
     """Parameters in other forms of a cause that predict about as well as form number `index`.
 
-    Recordings that cannot tell two laws apart do not know what only one of them says.
+    Recordings that cannot distinguish two laws do not determine what only one of them says.
     """
     form, setting = fitted.model.forms[index], fitted.model.setting
     if form.range is not None:

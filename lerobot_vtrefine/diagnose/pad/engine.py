@@ -37,8 +37,8 @@ def diagnose_pad(recordings: RecordingSet, seed: int = 0, progress: Progress | N
     whole = PadProblem(presses, seed)
     found = infer(whole, seed, progress)
     account = PadAccount(found, whole)
-    told = tell(found, account)
-    return replace(told, maps=account.maps()).noting(*issues, *_little_data(len(trials), len(locked)))
+    diagnosis = tell(found, account)
+    return replace(diagnosis, maps=account.maps()).noting(*issues, *_little_data(len(trials), len(locked)))
 
 
 def _invalid(issues: list[DataIssue], problem: str) -> Diagnosis:

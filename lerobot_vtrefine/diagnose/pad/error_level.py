@@ -1,4 +1,4 @@
-"""Errors far above the noise of single frames: under load, in one condition, beside the indenter, at a taxel.
+"""Errors far above the noise of single frames: under load, in one condition, around the indenter, at a taxel.
 
 Noise without memory and single spikes do not count: products of errors a few frames apart do. Sizes are
 compared with what sound recordings have; nothing is tested. Shapes: K recordings.
@@ -100,7 +100,7 @@ def beside_the_indenter(
     if counts.min() < MIN_READINGS:
         return None
     ratio = float((sums[0] / counts[0]) / max(sums[1] / counts[1], 1e-12))
-    text = f"errors beside the pressed indenter are {np.sqrt(ratio):.1f} times those at rest"
+    text = f"errors around the pressed indenter are {np.sqrt(ratio):.1f} times those at rest"
     return beyond(ratio, BESIDE, text)
 
 

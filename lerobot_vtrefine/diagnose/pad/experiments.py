@@ -172,7 +172,7 @@ def distance(one: Composite, other: Composite, press: Press, presses: PressSet, 
 def next_experiment(
     one: Composite, other: Composite, presses: PressSet, noise: Noise, names: Sequence[str]
 ) -> dict[str, Any]:
-    """The protocol that tells two models apart best, ready for JSON."""
+    """The protocol that distinguishes two models best, ready for JSON."""
     rig = rig_of(presses)
     best: tuple[float, Protocol] | None = None
     for protocol in protocols(rig):

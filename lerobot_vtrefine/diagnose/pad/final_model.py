@@ -26,7 +26,7 @@ if TYPE_CHECKING:
     from lerobot_vtrefine.diagnose.pad.problem import PadProblem
 
 _SLIM_STEPS = 5
-"""Steps of the refit that tells what held-out recordings lose without a cause."""
+"""Steps of the refit that measures what held-out recordings lose without a cause."""
 _KEPT = 4
 """Models whose predictions are kept."""
 
@@ -66,7 +66,7 @@ class FinalFit:
     """What is handed out of a fit."""
 
     fit: Fit
-    """Sizes and intervals are told of it."""
+    """Sizes and intervals are those of this fit."""
     problem: "PadProblem"
     """In which the fit stands."""
     model: Composite

@@ -135,8 +135,8 @@ def in_all_conditions(presses: PressSet, residuals: Sequence[np.ndarray]) -> Sus
     rms = np.sqrt(max(seen, 0.0) / max(found.readings, 1))
     share = seen / power if rms > MIN_RMS * presses.full_scale else 0.0
     text = f"{100 * seen / power:.0f} % of the residual repeats between recordings of the same command"
-    told = scores[scores != 0]
-    agreed = len(told) >= MIN_AGREEING and bool((told > 0).all())
+    known = scores[scores != 0]
+    agreed = len(known) >= MIN_AGREEING and bool((known > 0).all())
     return Suspicion(0, text, share, REPEATABLE_SHARE, None if agreed else scores)
 
 

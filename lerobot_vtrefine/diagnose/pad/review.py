@@ -90,10 +90,10 @@ def reviewed(selection: Selection["PadProblem", Fit, Any], seed: int) -> Selecti
     state = State(selection.problem, selection.fit, seed)
     named = set(selection.fit.model.families)
     state = two_bends(state)
-    p_values, beside = dict(selection.p_values), dict(selection.beside)
+    p_values, alternatives = dict(selection.p_values), dict(selection.alternatives)
     for name in set(state.fit.model.families) - named:
         bend = next(item for item in BENDS if item in named)
-        beside[name] = frozenset(BENDS) - {name}
+        alternatives[name] = frozenset(BENDS) - {name}
         p_values[name, CHANNEL] = p_values.get((bend, CHANNEL))
     state = plain_forms(state)
     state = likeliest_forms(state.weighed(state.fit))
@@ -109,7 +109,7 @@ def reviewed(selection: Selection["PadProblem", Fit, Any], seed: int) -> Selecti
         errors=state.held(state.fit).errors,
         chosen={CHANNEL: chosen} if chosen else {},
         p_values={key: p for key, p in p_values.items() if key[0] in model.families},
-        beside=beside,
+        alternatives=alternatives,
     )
 
 

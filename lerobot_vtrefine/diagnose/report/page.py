@@ -33,7 +33,7 @@ DECISIONS = {
     "symptom": "symptom",
     "tie": "tied",
     "rejected": "not found",
-    "not identifiable": "cannot be told here",
+    "not identifiable": "not identifiable here",
 }
 
 

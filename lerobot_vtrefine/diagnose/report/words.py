@@ -117,7 +117,7 @@ ROBOT_AXES = AXES | {
     "rate": "Against the commanded speed",
 }
 LONGEST_CLUE = 130
-"""Longer clues are told below the headline only, and of several the first one."""
+"""Longer clues appear below the headline only; of several, the headline has the first."""
 
 
 def title(name: str) -> str:
@@ -171,7 +171,7 @@ def headline(verdict: Verdict, unit: str) -> str:
         beside = f" It surely lacks {listing(sure)}." if sure else ""
         return f"The simulation is wrong, but these recordings cannot tell whether it lacks {pairs}.{beside}"
     clue = (verdict.unknown.clue or "").split(";")[0]
-    clue = f" What is known of it: {clue}." if 0 < len(clue) <= LONGEST_CLUE else ""
+    clue = f" Clue: {clue}." if 0 < len(clue) <= LONGEST_CLUE else ""
     symptoms = f" What looks like {names} may be a symptom of it.{_all_the_same(verdict)}" if names else ""
     return f"The simulation is wrong in a way that no known cause explains.{clue}{symptoms}"
 
@@ -199,12 +199,12 @@ def size_text(name: str, size: float) -> str:
 
 
 def _all_the_same(verdict: Verdict) -> str:
-    """What symptoms are good for, where they are good for something."""
+    """What symptoms gain, where they gain anything."""
     held = verdict.heldout
     if held is None or held.gain <= 0 or (held.gain_ci95 is not None and held.gain_ci95[0] <= 0):
         return ""
-    it_takes = "it takes" if len(verdict.causes) == 1 else "they take"
-    return f" Added to the model, {it_takes} {percent(held.gain)} of the squared error away all the same."
+    pronoun = "it" if len(verdict.causes) == 1 else "them"
+    return f" Adding {pronoun} to the model still removes {percent(held.gain)} of the squared error."
 
 
 def repaired(verdict: Verdict, unit: str) -> str:
@@ -222,7 +222,7 @@ def repaired(verdict: Verdict, unit: str) -> str:
         floor = f" Noise alone is {quantity(held.noise_floor, unit)}."
     added = "it" if len(verdict.causes) == 1 else "these"
     return (
-        f"With {added} added, its error on recordings that it had never seen falls {change}; "
+        f"With {added} added, its error on held-out recordings falls {change}; "
         f"{percent(held.gain)} of the squared error is gone{interval}.{floor}"
     )
 
@@ -246,7 +246,7 @@ def doubts(verdict: Verdict, recorded: int, checked: int) -> list[str]:
         if excess > 0.1:
             found.append(
                 f"{percent(excess)} of the baseline's squared error is neither repaired nor noise: the form "
-                "of the repair is not right, or recordings differ in ways that the model does not know."
+                "of the repair is not right, or recordings differ in ways that the model does not describe."
             )
         elif excess < -0.02:
             found.append("The error is below the estimated noise floor, so that floor is estimated too high.")

@@ -1,4 +1,4 @@
-"""How a servo's diagnosis is told: sizes, the model file, what to record next, what to draw."""
+"""How a servo's diagnosis is reported: sizes, the model file, what to record next, what to draw."""
 
 from collections.abc import Mapping, Sequence
 from typing import Any
@@ -79,7 +79,7 @@ class ServoAccount:
         return out
 
     def noise_floor(self) -> float | None:
-        """What rounding by the encoder leaves; more could be told only from trials that are repeated."""
+        """The rounding error of the encoder; more noise could be seen only in repeated trials."""
         return encoder_step(self.problem.bench) / np.sqrt(12)
 
     def causes(self) -> Sequence[str]:

@@ -23,7 +23,7 @@ _SETTINGS = 3
 COARSE_STEP_S = 0.01
 """Between the frames that a search needs."""
 _OF_A_STEP = 0.25
-"""Means over many readings tell a quarter of the encoder's step."""
+"""Means over many readings resolve a quarter of the encoder's step."""
 
 
 class ServoProblem(OptionalSteps):

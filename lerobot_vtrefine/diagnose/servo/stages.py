@@ -75,7 +75,7 @@ def _quadratic(now: Now, values: Values) -> Array:
 
 
 _SPEED = Limits(0.01, 3.0, 0.5, "rad/s")
-"""Beyond some rad/s, what fades with speed is no longer told from what does not."""
+"""Beyond some rad/s, what fades with speed cannot be distinguished from what does not."""
 
 STAGES: list[Stage] = [
     Stage(

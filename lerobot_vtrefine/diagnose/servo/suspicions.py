@@ -14,7 +14,7 @@ _REPEATS, _REPEATS_ALL = 0.3, 0.6
 """Least part of what is left that must repeat; where it is this much, and in every condition, the conditions
 need not be enough for a small p."""
 _FEWEST = 4
-"""Repeated conditions that can tell."""
+"""Fewest repeated conditions for a test."""
 _OF_A_STEP = 0.5
 """Part of the encoder's step below which nothing that repeats is worth an alarm."""
 

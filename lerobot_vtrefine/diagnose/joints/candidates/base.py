@@ -46,7 +46,7 @@ class Candidate:
     handicap: float = 0.0
     only_where: str = ""
     sized: bool = True
-    """Whether the smallest size that would have been seen is told by this form."""
+    """Whether the smallest detectable size is reported for this form."""
 
     step: float = 2.0
     """By how much its size is moved to see what it does, in units of the noise."""
@@ -59,7 +59,7 @@ class Candidate:
     stops: bool = False
     """Whether it is why a gripper stands still while its command goes on."""
     decided_by: str = ""
-    """What to record to tell it from others, as a sentence."""
+    """What to record to distinguish it from others, as a sentence."""
 
     @property
     def plain(self) -> tuple[str, ...] | None:

@@ -22,7 +22,7 @@ NOT_SHOWN = (
 _LEAD = {gravity.TWO_TERM_FORM: 0.02, gravity.FREE_FORM: 0.05}
 """By how much shapes with more terms must beat those with one."""
 _AS_GOOD = 1.03
-"""Cross-validated error of a form over the least one, up to which it tells the trials as well."""
+"""Cross-validated error of a form over the least one, up to which it explains the trials as well."""
 _COLUMNS = [INDEX[name] for name in SAG]
 
 
@@ -77,8 +77,8 @@ def _size(estimates: Estimates, joint: int) -> tuple[str, Parameter]:
 
 
 def _among_forms(estimates: Estimates, joint: int, value: float) -> float:
-    """How far a sag's size at full reach is off by forms that tell the trials as well: where all of them do,
-    the postures seen do not reach as far as the number does."""
+    """How far a sag's size at full reach differs between forms that explain the trials as well: where all of
+    them do, the postures seen do not reach as far as the number does."""
     tried = [item for item in estimates.selection.first_round if item.cause == "gravity_sag"]
     errors = [float(item.errors.mean(0)[joint]) for item in tried]
     least, found = min(errors, default=0.0), [value]

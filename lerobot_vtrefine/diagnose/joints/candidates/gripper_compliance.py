@@ -49,7 +49,7 @@ def _stopped(problem: ServoTrials, point: Point, joints: Array, multiple: float)
 
 
 def _nearly_linear(problem: ServoTrials, point: Point, joints: Array, multiple: float) -> Point:
-    """A linear spring whose other terms are told by the largest load."""
+    """A linear spring whose other terms are in units of the largest load."""
     assert problem.batch.load is not None
     return point.with_values("full_load", np.abs(problem.batch.load).max((0, 1))[joints], joints)
 

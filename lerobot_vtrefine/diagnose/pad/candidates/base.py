@@ -106,7 +106,7 @@ class Form:
     search: Callable[[PressSet, float], list[list[float]]] | None = None
     """Starting points taken from the recordings and the frame time, instead of stretched probes."""
     range: Callable[[np.ndarray, PressSet], dict[str, tuple[float, float]]] | None = None
-    """Intervals of parameters that no descent can tell: coordinates and recordings to name -> ends."""
+    """Intervals of parameters that no descent can estimate: coordinates and recordings to name -> ends."""
     twin: int | None = None
     """Number of the coordinate that trades off against the baseline's damping, if one does."""
     screened: bool = True
