@@ -252,6 +252,15 @@ def test_commands_that_come_once_say_nothing_about_what_is_left(tmp_path: Path) 
 
 
 @pytest.mark.slow
+def test_of_few_runs_none_is_locked_and_a_law_is_found(tmp_path: Path) -> None:
+    found = diagnose(make_set(tmp_path / "set", LAWS["M3"][1], trials=8))
+    assert [cause.name for cause in found.verdict.causes] == ["load_friction"]
+    assert found.verdict.heldout is None
+    assert found.verdict.causes[0].heldout_gain is None
+    assert found.traces == found.trial_errors == ()
+
+
+@pytest.mark.slow
 def test_what_only_coulomb_and_viscous_friction_hold_back_is_adequate(tmp_path: Path) -> None:
     found = diagnose(make_set(tmp_path / "set", plain))
     assert found.verdict.status == "adequate"

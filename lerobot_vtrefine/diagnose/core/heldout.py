@@ -10,7 +10,12 @@ import numpy as np
 
 from lerobot_vtrefine.diagnose.core.problem import Fit, ScoredFit, ScreenedProblem, SearchedProblem
 from lerobot_vtrefine.diagnose.core.resampling import gain_interval
-from lerobot_vtrefine.diagnose.core.rules import LOCKED_SHARE, MIN_DISCOVERY, WHOLE_CONDITIONS_FROM
+from lerobot_vtrefine.diagnose.core.rules import (
+    FEW_TRIALS,
+    LOCKED_SHARE,
+    MIN_DISCOVERY,
+    WHOLE_CONDITIONS_FROM,
+)
 from lerobot_vtrefine.diagnose.verdict import Heldout
 
 Array = np.ndarray
@@ -42,6 +47,11 @@ def lock(conditions: Sequence[str], seed: int) -> list[int]:
         name = max((n for n in names if groups.get(n)), key=lambda n: len(groups[n]))
         locked.append(groups[name].pop(int(rng.integers(len(groups[name])))))
     return sorted(locked)
+
+
+def affordable(count: int) -> bool:
+    """Whether a quarter of so many can be locked and sign flips still find anything in the rest."""
+    return count - math.ceil(LOCKED_SHARE * count) >= FEW_TRIALS
 
 
 @dataclass(frozen=True)

@@ -36,13 +36,13 @@ def tell(found: Found, account: Account[Any, Any]) -> Diagnosis:
             role,
             account.parameters(name, own),
             selection.p_value(name),
-            _gain(found, name, own),
+            _gain(found, name, own) if found.locked else None,
             "observed" if selection.observed(name) else "tested",
         )
         for name, own in selection.causes().items()
     )
     ambiguous = () if alarmed else _pairs(found)
-    traces, residuals = account.drawings(test, found.seed)
+    traces, residuals = account.drawings(test, found.seed) if found.locked else ((), ())
     gains = 1 - after.mean(0) / before.mean(0).clip(1e-300)
     held = heldout_gain(before, after, test.files, account.metric, account.noise_floor(), found.seed)
     detectable = account.minimum_detectable()
@@ -67,7 +67,7 @@ def tell(found: Found, account: Account[Any, Any]) -> Diagnosis:
         evidence=evidence,
         traces=traces,
         residuals=residuals,
-        trial_errors=_trial_errors(test, before, after),
+        trial_errors=_trial_errors(test, before, after) if found.locked else (),
         channel_gains={name: float(gain) for name, gain in zip(test.channels, gains, strict=True)},
         alarms=found.alarms,
         unit=account.unit,
