@@ -102,6 +102,7 @@ NAMED_ELSEWHERE = {
     "report/words.py": "titles",
     "report/effects.py": "drawings",
     "joints/experiments.py": "what slow recordings cannot show",
+    "joints/model.py": "fields of the file, which have names of their own",
     "pad/detectable.py": "a period is no size that grows",
     "pad/final_model.py": "frames that repeat",
     "pad/idle_drift.py": "its own probe",
