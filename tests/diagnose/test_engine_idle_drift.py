@@ -31,6 +31,11 @@ def test_a_random_walk_of_the_idle_level_is_seen() -> None:
     assert p_of(np.cumsum(np.random.default_rng(1).normal(0, 2.0, 16))) < 0.004
 
 
+def test_a_line_in_noise_is_seen_in_few_recordings() -> None:
+    rng = np.random.default_rng(4)
+    assert np.median([p_of(np.linspace(-5.0, 5.0, 12) + rng.normal(0, 2.0, 12)) for _ in range(5)]) < 0.002
+
+
 def test_levels_without_an_order_are_not() -> None:
     rng = np.random.default_rng(2)
     assert np.median([p_of(rng.normal(0, 2.0, 16)) for _ in range(3)]) > 0.05
