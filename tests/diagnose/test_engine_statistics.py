@@ -1,5 +1,9 @@
 """The engine's statistics against tiny independent references."""
 
+import os
+import subprocess
+import sys
+
 import numpy as np
 import pytest
 
@@ -89,3 +93,27 @@ def test_a_quarter_is_locked_partly_from_conditions_never_discovered(
 def test_few_recordings_lock_few() -> None:
     assert lock(["a", "b", "c"], 0) == []
     assert len(lock(["a", "b", "c", "d"], 0)) == 1
+
+
+WITHIN = """
+import numpy as np
+from lerobot_vtrefine.diagnose.pad.noise import Noise, fit_repeatability
+
+names = [f"press {k // 2}" for k in range(600)]
+gains = np.random.default_rng(0).normal(size=600) * 0.03
+print(fit_repeatability(Noise(1.0, 0.0, 0.5, 0.02, 1e-4), gains, 1e-4 * gains, names))
+"""
+
+
+def test_sums_over_conditions_do_not_depend_on_how_names_are_hashed() -> None:
+    said = {
+        subprocess.run(
+            [sys.executable, "-c", WITHIN],
+            env={**os.environ, "PYTHONHASHSEED": str(seed)},
+            capture_output=True,
+            text=True,
+            check=True,
+        ).stdout
+        for seed in (1, 2)
+    }
+    assert len(said) == 1

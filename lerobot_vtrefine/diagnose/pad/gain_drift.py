@@ -125,10 +125,9 @@ def _heat(presses: PressSet) -> np.ndarray:
 def _in_a_row(names: np.ndarray, starts: np.ndarray) -> bool:
     """Whether recordings of one condition were made one after the other."""
     ranks = np.argsort(np.argsort(starts)).astype(float)
-    within = sum(float(((ranks[names == n] - ranks[names == n].mean()) ** 2).sum()) for n in set(names))
-    return len(set(names)) < len(names) and within < (1.0 - BLOCKED) * float(
-        ((ranks - ranks.mean()) ** 2).sum()
-    )
+    groups = [ranks[names == name] for name in dict.fromkeys(names)]
+    within = sum(float(((group - group.mean()) ** 2).sum()) for group in groups)
+    return len(groups) < len(names) and within < (1.0 - BLOCKED) * float(((ranks - ranks.mean()) ** 2).sum())
 
 
 def _unit(values: np.ndarray) -> np.ndarray:

@@ -153,7 +153,7 @@ def fit_repeatability(noise: Noise, gains: np.ndarray, offsets_m: np.ndarray, co
 
 def _within(values: np.ndarray, conditions: list[str], default: float, limit: float) -> float:
     total, freedom = 0.0, 0
-    for name in set(conditions):
+    for name in dict.fromkeys(conditions):
         group = values[[condition == name for condition in conditions]]
         group = group[np.isfinite(group)]
         if len(group) > 1:

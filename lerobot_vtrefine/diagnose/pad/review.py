@@ -88,13 +88,14 @@ def reviewed(selection: Selection["PadProblem", Fit, Any], seed: int) -> Selecti
     if not selection.fit.model.families:
         return selection
     state = State(selection.problem, selection.fit, seed)
-    named = set(selection.fit.model.families)
+    named = selection.fit.model.families
     state = two_bends(state)
     p_values, alternatives = dict(selection.p_values), dict(selection.alternatives)
-    for name in set(state.fit.model.families) - named:
-        bend = next(item for item in BENDS if item in named)
-        alternatives[name] = frozenset(BENDS) - {name}
-        p_values[name, CHANNEL] = p_values.get((bend, CHANNEL))
+    for name in state.fit.model.families:
+        if name not in named:
+            bend = next(item for item in BENDS if item in named)
+            alternatives[name] = frozenset(BENDS) - {name}
+            p_values[name, CHANNEL] = p_values.get((bend, CHANNEL))
     state = plain_forms(state)
     state = likeliest_forms(state.weighed(state.fit))
     best = resolved(state)
