@@ -218,7 +218,7 @@ class ScreenedSearch[P: ScreenedProblem[Any, Any], F: ScoredFit, C: FormCandidat
         """
         slim = self.problem.reduced(self.now, [candidate], _ONE)
         full, less = (out_of_fold(self.problem, fit, self.folds) for fit in (self.now, slim))
-        if self.p_values[candidate.cause] is None or better(full, less, 0.0):
+        if self.p_values[candidate.cause] is None or better(full, less):
             return True
         self.now, self.chosen = slim, self.chosen[:-1]
         del self.p_values[candidate.cause]
