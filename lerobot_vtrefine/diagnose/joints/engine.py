@@ -51,7 +51,7 @@ class JointAccount:
 
     def __init__(self, found: Inference[JointProblem, Fit, Candidate]) -> None:
         self.selection = found.selection
-        self.estimates = Estimates(found.selection, found.seed)
+        self.estimates = Estimates(found.selection)
         self.detectable = minimum_detectable(found.selection)
 
     def parameters(self, cause: str, channels: tuple[int, ...]) -> Mapping[str, Parameter]:

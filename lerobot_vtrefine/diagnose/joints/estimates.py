@@ -34,8 +34,8 @@ class MethodError:
 class Estimates:
     """Fitted values of a selection, and what they become without each condition."""
 
-    def __init__(self, selection: "Selected", seed: int) -> None:
-        self.selection, self.seed = selection, seed
+    def __init__(self, selection: "Selected") -> None:
+        self.selection = selection
         self.theta, self.tau = leave_out(selection.problem, selection.fit)
         """(G, J, P) and (G,) without each of G conditions."""
         self.steps = selection.problem.batch.resolution

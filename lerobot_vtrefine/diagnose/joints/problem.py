@@ -15,9 +15,9 @@ from lerobot_vtrefine.diagnose.joints import gravity
 from lerobot_vtrefine.diagnose.joints.candidates import CATALOGUE, told_by_load
 from lerobot_vtrefine.diagnose.joints.candidates.base import Candidate
 from lerobot_vtrefine.diagnose.joints.fitting import Fit, Point, ServoTrials, evaluate, fit, refit, servo_only
-from lerobot_vtrefine.diagnose.joints.friction_load import load_prefers
 from lerobot_vtrefine.diagnose.joints.newton import Refits, refits
 from lerobot_vtrefine.diagnose.joints.parameters import INDEX, SAG
+from lerobot_vtrefine.diagnose.joints.servo_load import load_prefers
 from lerobot_vtrefine.diagnose.joints.suspicions import (
     LEAST_EFFECT_M,
     LEAST_EFFECT_RAD,

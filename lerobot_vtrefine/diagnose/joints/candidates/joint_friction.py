@@ -5,9 +5,9 @@ import numpy as np
 from lerobot_vtrefine.diagnose.core.resampling import jackknife
 from lerobot_vtrefine.diagnose.joints.candidates.base import MOTION, Candidate
 from lerobot_vtrefine.diagnose.joints.estimates import Estimates, MethodError, widened
-from lerobot_vtrefine.diagnose.joints.friction_load import friction_in_load, stiffness_in_load
 from lerobot_vtrefine.diagnose.joints.gravity import is_sliding
 from lerobot_vtrefine.diagnose.joints.parameters import INDEX
+from lerobot_vtrefine.diagnose.joints.servo_load import stiffness_in_load
 from lerobot_vtrefine.diagnose.verdict import Parameter
 from lerobot_vtrefine.embodiments import embodiment_of
 
@@ -33,7 +33,7 @@ FORMS = (
 
 
 def sizes(estimates: Estimates, joints: tuple[int, ...]) -> dict[str, Parameter]:
-    """In Nm where loads or the robot's known servo gains give the scale; else as the servo's error."""
+    """As torque or force where loads or the known robot's servo gains give the scale; else as servo error."""
     return dict(_size(estimates, joint) for joint in joints)
 
 
@@ -46,12 +46,7 @@ def _size(estimates: Estimates, joint: int) -> tuple[str, Parameter]:
     own = _STICKING_VAGUE * value if fitted.free[joint, INDEX["stick"]] else 0.0
     own = float(np.hypot(own, estimates.method_error(METHOD, value, joint)))
     low, high = widened(jackknife(estimates.theta[:, joint, column], value), value, own)
-    stiffness = stiffness_in_load(problem, fitted, joint)
-    if stiffness is None and problem.batch.load is not None:
-        seen = friction_in_load(problem, fitted, joint, estimates.seed)
-        if seen.seen:
-            return f"{name}_{force.lower()}", Parameter(seen.torque, seen.ci95, force)
-    stiffness = stiffness or _known_stiffness(name)
+    stiffness = stiffness_in_load(problem, fitted, joint) or _known_stiffness(name)
     if stiffness is None:
         return f"{name}_{length}", Parameter(value, (low, high), f"{length} of servo error")
     return f"{name}_{force.lower()}", Parameter(value * stiffness, (low * stiffness, high * stiffness), force)

@@ -1,10 +1,8 @@
-"""Dry friction as measured loads show it: torque that changes sign with the motion."""
-
-from dataclasses import dataclass
+"""What measured loads say of a servo: how hard it pulls per unit of error, and which model has its pull."""
 
 import numpy as np
 
-from lerobot_vtrefine.diagnose.core.resampling import draws_of, one_sided
+from lerobot_vtrefine.diagnose.core.resampling import one_sided
 from lerobot_vtrefine.diagnose.joints.fitting import Fit, ServoTrials
 
 Array = np.ndarray
@@ -12,28 +10,10 @@ Array = np.ndarray
 _ALPHA = 0.02
 _LEAST_SHARE = 0.05
 _SERVO_SHARE = 0.7
-_CREEP = 0.05
-"""Speeds below this part of the typical one say little about direction."""
-
-
-@dataclass(frozen=True)
-class LoadFriction:
-    """Friction in units of load, and whether the trials agree on it."""
-
-    torque: float
-    ci95: tuple[float, float]
-    p_value: float
-    share: float
-    """Part of the load's variance, after inertia, damping and gravity, that it explains."""
-
-    @property
-    def seen(self) -> bool:
-        """Whether there is friction."""
-        return self.p_value < _ALPHA and self.share > _LEAST_SHARE and self.torque > 0
 
 
 def stiffness_in_load(problem: ServoTrials, fitted: Fit, joint: int) -> float | None:
-    """Load per unit of servo error [Nm/rad, N/m]: what turns a fitted friction into torque.
+    """Load per unit of servo error [Nm/rad, N/m]: what turns a fitted friction into torque or force.
 
     None unless the load is mostly the servo's own pull, as far as the model knows it.
     """
@@ -90,41 +70,3 @@ def pull_target(command: Array, width: float, start: Array) -> Array:
         state = np.clip(state, row - width / 2, row + width / 2)
         out[k] = state
     return out
-
-
-def friction_in_load(problem: ServoTrials, fitted: Fit, joint: int, seed: int) -> LoadFriction:
-    """Regress a joint's load on inertia, damping, gravity and the motion's direction, trial by trial.
-
-    Raises ValueError without loads.
-    """
-    batch = problem.batch
-    if batch.load is None:
-        raise ValueError("the trials have no loads")
-    q = batch.position[..., joint] - fitted.residual[..., joint]
-    blocks, scores, power = [], [], []
-    for trial in range(batch.trials):
-        valid = batch.valid[:, trial]
-        t, x = batch.time_s[valid, trial], q[valid, trial]
-        if len(t) < 8:
-            continue
-        speed = np.gradient(x, t)
-        blocks.append((t, x, speed, np.gradient(speed, t), batch.load[valid, trial, joint]))
-    typical = np.sqrt(np.mean(np.concatenate([block[2] for block in blocks]) ** 2)) + 1e-12
-    direction = [np.tanh(block[2] / (_CREEP * typical)) for block in blocks]
-    known = [np.stack([np.ones_like(x), np.cos(x), np.sin(x), v, a], 1) for _, x, v, a, _ in blocks]
-    stacked, sign = np.concatenate(known), np.concatenate(direction)
-    load = np.concatenate([block[4] for block in blocks])
-    clear = sign - stacked @ np.linalg.lstsq(stacked, sign, rcond=None)[0]
-    left = load - stacked @ np.linalg.lstsq(stacked, load, rcond=None)[0]
-    ends = np.cumsum([len(block[0]) for block in blocks])
-    for part, rest in zip(np.split(clear, ends[:-1]), np.split(left, ends[:-1]), strict=True):
-        scores.append(part @ rest)
-        power.append(part @ part)
-    scores, power = np.array(scores), np.array(power)
-    torque = float(scores.sum() / max(power.sum(), 1e-12))
-    share = float(scores.sum() ** 2 / max(power.sum() * (left @ left), 1e-30))
-    p_value = float(one_sided(scores[:, None], seed)[0][0])
-    draws = draws_of(len(scores), seed, 1000)
-    spread = scores[draws].sum(1) / power[draws].sum(1).clip(1e-12)
-    low, high = np.percentile(spread, [2.5, 97.5])
-    return LoadFriction(torque, (float(low), float(high)), p_value, share)
