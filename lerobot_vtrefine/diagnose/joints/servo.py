@@ -123,19 +123,21 @@ def _play(command: Array, columns: Columns, start: Array) -> Array:
 
 def _worn(x: Array, width: Array, rounding: Array | None, first: Array) -> Array:
     """Play of mean full width `width` (C,), sharp or rounded."""
-    sharp = _dragged(x, width, first)
+    sharp = play_operator(x, width, first)
     if rounding is None or not (rounding > 0).any():
         return sharp
     out, some = sharp.copy(), rounding > 0
     part = [
-        _dragged(x[..., some], width[some] * (1 + rounding[some] * at), first[..., some]) for at in _SPREAD
+        play_operator(x[..., some], width[some] * (1 + rounding[some] * at), first[..., some])
+        for at in _SPREAD
     ]
     out[..., some] = np.mean(part, 0)
     return out
 
 
-def _dragged(x: Array, width: Array, first: Array) -> Array:
-    """The play operator along frames: the output moves only when the input leaves a window of that width."""
+def play_operator(x: Array, width: Array | float, first: Array) -> Array:
+    """The play operator along frames: outputs (N, ...) start from `first` (...) and move only when inputs
+    leave a window of full width `width` (...) around them."""
     half = width / 2
     out = np.empty_like(x)
     state = first

@@ -4,6 +4,7 @@ import numpy as np
 
 from lerobot_vtrefine.diagnose.core.resampling import one_sided
 from lerobot_vtrefine.diagnose.joints.fitting import Fit, ServoTrials
+from lerobot_vtrefine.diagnose.joints.servo import play_operator
 
 Array = np.ndarray
 
@@ -42,7 +43,7 @@ def _explained(problem: ServoTrials, fitted: Fit, joint: int) -> tuple[Array, Ar
     assert batch.load is not None
     q = np.where(batch.valid, batch.position[..., joint] - fitted.residual[..., joint], 0.0)
     width = float(fitted.point.value("play")[joint])
-    target = pull_target(batch.command[..., joint], width, q[0])
+    target = play_operator(batch.command[..., joint], width, q[0])
     best: tuple[Array, Array, float] | None = None
     # A frame's load may have been read before or after its command was sent.
     for before in (0, 1):
@@ -60,13 +61,3 @@ def _explained(problem: ServoTrials, fitted: Fit, joint: int) -> tuple[Array, Ar
             best = left, np.square(load).sum(0), slope
     assert best is not None
     return best
-
-
-def pull_target(command: Array, width: float, start: Array) -> Array:
-    """What the servo pulls towards: commands (N, T) through play of that width."""
-    out = np.empty_like(command)
-    state = start
-    for k, row in enumerate(command):
-        state = np.clip(state, row - width / 2, row + width / 2)
-        out[k] = state
-    return out

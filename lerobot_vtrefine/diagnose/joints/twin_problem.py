@@ -26,6 +26,7 @@ from lerobot_vtrefine.diagnose.joints.candidates.base import Candidate
 from lerobot_vtrefine.diagnose.joints.fitting import Point
 from lerobot_vtrefine.diagnose.joints.parameters import INDEX, PARAMETERS, SAG
 from lerobot_vtrefine.diagnose.joints.problem import JointProblem
+from lerobot_vtrefine.diagnose.joints.servo import play_operator
 from lerobot_vtrefine.embodiments import get_embodiment
 from lerobot_vtrefine.sim import task
 from lerobot_vtrefine.sim.backends.batch import usable_cores
@@ -186,10 +187,8 @@ class _Arms:
         servo = np.stack([task.servo_commands(self.robot, row) for row in every], 1)
         rest = task.servo_commands(self.robot, first)[:, None]
         wanted = self._between(rest, servo)
-        half = np.abs(np.repeat(self._per_servo(play * self.side), trials, 0)) / 2
-        out, state = np.empty_like(wanted), rest[:, 0]
-        for k in range(wanted.shape[1]):
-            out[:, k] = state = np.clip(state, wanted[:, k] - half, wanted[:, k] + half)
+        width = np.abs(np.repeat(self._per_servo(play * self.side), trials, 0))
+        out = play_operator(wanted.swapaxes(0, 1), width, rest[:, 0]).swapaxes(0, 1)
         if push.any():
             added = self._per_servo(push).transpose(0, 2, 1, 3).reshape(len(first), frames, -1)
             out += self._between(added[:, :1], added)
