@@ -74,7 +74,6 @@ class ResidualView:
         axis: "load", "rate", "history", "position", "time", ...; ``unit`` is the axis' unit.
         x: (B,) centres of the bins.
         before, after: (B,) mean residual; ``before_ci95``, ``after_ci95`` (B, 2) by resampling trials.
-        count: (B,) readings in each bin.
     """
 
     axis: str
@@ -84,7 +83,6 @@ class ResidualView:
     after: np.ndarray
     before_ci95: np.ndarray | None
     after_ci95: np.ndarray | None
-    count: np.ndarray
 
 
 @dataclass(frozen=True)

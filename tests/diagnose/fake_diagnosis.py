@@ -63,7 +63,6 @@ def residuals(unit):
                 after,
                 np.column_stack([slope - band, slope + band]),
                 np.column_stack([after - band, after + band]),
-                np.full(12, 200),
             )
         )
     return tuple(views)

@@ -85,7 +85,7 @@ def test_gripper_that_meets_something_is_named_without_loads(tmp_path) -> None:
     params = found.verdict.causes[0].params
     assert params["gripper_stop_m"].value == pytest.approx(0.02, abs=5e-4)
     assert params["gripper_give"].value == pytest.approx(0.1, abs=0.03)
-    assert found.channel_gains["gripper"] > 0.9
+    assert found.verdict.causes[0].heldout_gain > 0.9
 
 
 def test_nothing_is_found_where_nothing_is(tmp_path) -> None:

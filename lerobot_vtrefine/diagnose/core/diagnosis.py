@@ -22,7 +22,6 @@ class Diagnosis:
         baseline_params: the refitted parameters of the baseline, name -> value with interval.
         evidence: every candidate that was examined, rejected ones too.
         traces, residuals, trial_errors: about locked trials only.
-        channel_gains: channel -> its gain on locked trials.
         alarms: everything behind `verdict.unknown`.
         maps: title -> (R, C); of pads only.
         unit: of readings or positions: "counts", "rad", "m".
@@ -38,7 +37,6 @@ class Diagnosis:
     traces: tuple[Trace, ...] = ()
     residuals: tuple[ResidualView, ...] = ()
     trial_errors: tuple[TrialError, ...] = ()
-    channel_gains: Mapping[str, float] = field(default_factory=dict)
     alarms: tuple[Alarm, ...] = ()
     maps: Mapping[str, np.ndarray] = field(default_factory=dict)
     unit: str = "rad"

@@ -43,4 +43,4 @@ def residual_view(
     number = sums[0].sum(0)
     bands = [np.percentile(x / drawn[0].clip(1), (2.5, 97.5), axis=0).T for x in drawn[1:]]
     means = [x.sum(0) / number for x in sums[1:]]
-    return ResidualView(axis, unit, centres, *means, *bands, number)
+    return ResidualView(axis, unit, centres, *means, *bands)

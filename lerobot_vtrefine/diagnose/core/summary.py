@@ -43,7 +43,6 @@ def tell(found: Found, account: Account[Any, Any]) -> Diagnosis:
     )
     ambiguous = () if alarmed else _pairs(found)
     traces, residuals = account.drawings(test, found.seed) if found.locked else ((), ())
-    gains = 1 - after.mean(0) / before.mean(0).clip(1e-300)
     held = heldout_gain(before, after, test.files, account.metric, account.noise_floor(), found.seed)
     detectable = account.minimum_detectable()
     evidence = tuple(_evidence(found, account, name, detectable) for name in _names(found, account))
@@ -68,7 +67,6 @@ def tell(found: Found, account: Account[Any, Any]) -> Diagnosis:
         traces=traces,
         residuals=residuals,
         trial_errors=_trial_errors(test, before, after) if found.locked else (),
-        channel_gains={name: float(gain) for name, gain in zip(test.channels, gains, strict=True)},
         alarms=found.alarms,
         unit=account.unit,
     )
