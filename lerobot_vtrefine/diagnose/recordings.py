@@ -128,7 +128,6 @@ class Trial:
 
     file: str
     condition: str
-    replicate: int
     order: int
     start_s: float
     """Session time of the first frame [s]."""
@@ -154,7 +153,6 @@ class RobotTrial:
 
     file: str
     condition: str
-    replicate: int
     order: int
     start_s: float
     time_s: np.ndarray
@@ -172,14 +170,13 @@ class RobotTrial:
 
 @dataclass(frozen=True)
 class RecordingSet:
-    """Trials of one pad (rows x cols, readings in `unit` up to `full_scale`) or of one robot (`joints`)."""
+    """Trials of one pad (rows x cols, readings up to `full_scale`) or of one robot (`joints`)."""
 
     path: Path
     kind: str
     rows: int
     cols: int
     pitch_m: float
-    unit: str
     full_scale: float
     joints: tuple[str, ...]
     trials: tuple[Any, ...]
@@ -207,7 +204,7 @@ def read_recording_set(path: str | Path, *, measured: bool = True) -> RecordingS
     if header.object is not None:
         _check_object(str(header_path), header.object, folder)
     rows, cols, pitch_m = (pad.rows, pad.cols, pad.pitch_m) if is_pad else (0, 0, 0.0)
-    unit, full_scale = (reading.unit, reading.full_scale) if is_pad and reading else ("rad", 0.0)
+    full_scale = reading.full_scale if is_pad and reading else 0.0
     trials: list[Trial | RobotTrial] = []
     for index, entry in enumerate(header.trials):
         table = _Table(folder, header_path, index, entry, without=() if measured else ("raw",))
@@ -218,7 +215,7 @@ def read_recording_set(path: str | Path, *, measured: bool = True) -> RecordingS
             trial = _robot_trial(table, len(joints), entry.plant or header.plant, entry.servo or header.servo)
             first = np.repeat(trial.position[:1], len(trial.position), axis=0)
             trials.append(trial if measured else replace(trial, position=first))
-    return RecordingSet(folder, header.kind, rows, cols, pitch_m, unit, full_scale, joints, tuple(trials))
+    return RecordingSet(folder, header.kind, rows, cols, pitch_m, full_scale, joints, tuple(trials))
 
 
 def _read_header(path: Path) -> Header:
@@ -345,7 +342,6 @@ class _Table:
         return {
             "file": entry.file,
             "condition": condition if isinstance(condition, str) else f"{condition:g}",
-            "replicate": entry.replicate,
             "order": self.index if entry.order is None else entry.order,
             "start_s": entry.start_s,
             "time_s": self.scalar("time_s"),

@@ -77,7 +77,7 @@ def _recorded(
     deeper = motion | {"depth_m": motion["depth_m"] + rng.normal(0.0, HEIGHT_ERROR_M)}
     frames = len(motion["time_s"])
     zeros, unread = np.zeros(frames), np.zeros((frames, 0))
-    trial = Trial("", "", 0, 0, start_s, SPHERE, **deeper, tilt_x_rad=zeros, tilt_y_rad=zeros,
+    trial = Trial("", "", 0, start_s, SPHERE, **deeper, tilt_x_rad=zeros, tilt_y_rad=zeros,
                   force_n=None, temperature_c=None, raw=unread)  # fmt: skip
     heights = trial_heights(trial, LAYOUT)
     expected = replay(MODEL, trial.time_s, heights, layout=LAYOUT, start_s=start_s).numpy()

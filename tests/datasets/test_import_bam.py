@@ -55,7 +55,8 @@ def test_runs_become_trials_with_their_plant_and_gain(tmp_path: Path, kind: str)
     assert trial.plant.rod_kg == (0.02 if kind == "json" else 0.0)
     # One encoder step of 4096 a turn is 400 / 256 of the firmware's 885 steps of duty.
     assert trial.servo.duty_per_rad == pytest.approx(400 / 256 / 885 * 4096 / (2 * math.pi))
-    assert [item.replicate for item in found.trials] == [0, 1, 2, 3]
+    listed = json.loads((tmp_path / "set" / "recording.json").read_text())["trials"]
+    assert [item["replicate"] for item in listed] == [0, 1, 2, 3]
 
 
 @pytest.mark.parametrize(

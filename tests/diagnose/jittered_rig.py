@@ -347,11 +347,9 @@ class Rig:
             column = [np.interp(at, press.time_s, values) for values in (press.x_m, press.y_m, press.depth_m)]
             trials.append(
                 Trial(
-                    f"p{order:02d}.parquet", f"c{press.condition}", 0, order, start_s, self.shape, at,
+                    f"p{order:02d}.parquet", f"c{press.condition}", order, start_s, self.shape, at,
                     *column, zeros, zeros, None, None, raw,
                 )
             )  # fmt: skip
             start_s += float(at[-1]) + 8.0
-        return RecordingSet(
-            Path(), "pad", self.rows, self.cols, PITCH_M, "adc_counts", FULL_SCALE, (), tuple(trials)
-        )
+        return RecordingSet(Path(), "pad", self.rows, self.cols, PITCH_M, FULL_SCALE, (), tuple(trials))

@@ -28,7 +28,7 @@ def fitted(added: Callable[[Trial], np.ndarray]) -> tuple[PressSet, Baseline]:
 
 
 def prepared(trials: list[Trial]) -> tuple[PressSet, Baseline]:
-    held = RecordingSet(Path(), "pad", ROWS, COLS, 0.002, "adc_counts", 255.0, (), tuple(trials))
+    held = RecordingSet(Path(), "pad", ROWS, COLS, 0.002, 255.0, (), tuple(trials))
     presses = prepare(held, trials, list(range(COUNT)))
     return presses, fit_baseline(presses)
 

@@ -26,7 +26,6 @@ def trial(number: int, rng: np.random.Generator, frames: int = 60) -> Trial:
     return Trial(
         f"t{number}.parquet",
         f"c{number}",
-        0,
         number,
         20.0 * number,
         {"shape": "sphere", "radius_m": 0.01},
@@ -45,7 +44,7 @@ def trial(number: int, rng: np.random.Generator, frames: int = 60) -> Trial:
 def presses(rows: int = 5, cols: int = 8) -> PressSet:
     rng = np.random.default_rng(3)
     trials = [trial(number, rng, 60 + 7 * number) for number in range(3)]
-    recordings = RecordingSet(Path(), "pad", rows, cols, 0.002, "adc_counts", 255.0, (), tuple(trials))
+    recordings = RecordingSet(Path(), "pad", rows, cols, 0.002, 255.0, (), tuple(trials))
     return prepare(recordings, trials, [0, 1, 2])
 
 
@@ -98,7 +97,7 @@ def test_the_saved_model_predicts_the_same(tmp_path: Path) -> None:
 def test_a_lowered_face_is_a_press_less_deep() -> None:
     held, by_m = presses(), 5e-5
     lower = [replace(press.trial, depth_m=press.trial.depth_m - by_m) for press in held.presses]
-    recordings = RecordingSet(Path(), "pad", 5, 8, 0.002, "adc_counts", 255.0, (), tuple(lower))
+    recordings = RecordingSet(Path(), "pad", 5, 8, 0.002, 255.0, (), tuple(lower))
     again = prepare(recordings, lower, [0, 1, 2])
     stages = composite(held).stages()
     pairs = zip(held.presses, run_stages(stages, LoweredBench(held.bench, by_m)), strict=True)

@@ -31,7 +31,7 @@ def alarms(gains: np.ndarray, warmth: np.ndarray | None = None, in_a_row: bool =
         heat = None if warmth is None else np.full(len(plain.time_s), warmth[place])
         raw = idle + (plain.raw - idle) * (1 + gains[place])
         trials.append(replace(plain, order=place, start_s=30.0 * place, raw=raw, temperature_c=heat))
-    held = RecordingSet(Path(), "pad", ROWS, COLS, 0.002, "adc_counts", 255.0, (), tuple(trials))
+    held = RecordingSet(Path(), "pad", ROWS, COLS, 0.002, 255.0, (), tuple(trials))
     presses = prepare(held, trials, list(range(COUNT)))
     baseline = fit_baseline(presses)
     assert np.corrcoef(own_gains(baseline.fitted, presses, baseline.weights), gains)[0, 1] > 0.95

@@ -33,7 +33,7 @@ def test_quiet_frames_tell_idle_levels_better_than_those_before_the_touch() -> N
     rng = np.random.default_rng(5)
     trials = [trial(number, rng, 120) for number in range(8)]
     trials = [replace(t, raw=TRUE_IDLE + wandering(120, 40, rng)) for t in trials]
-    held = RecordingSet(Path(), "pad", 5, 8, 0.002, "adc_counts", 255.0, (), tuple(trials))
+    held = RecordingSet(Path(), "pad", 5, 8, 0.002, 255.0, (), tuple(trials))
     presses = prepare(held, trials, list(range(8)))
     silent = Composite(describe(presses), np.array([-50.0, 0.0]))
     found = settled_idle(silent, presses)
@@ -46,7 +46,7 @@ def test_an_unexplained_verdict_hands_out_no_model_worse_than_the_baseline() -> 
         return lambda depth: linear(depth) * (1.0 + 0.3 * np.sin(2.1 * number))
 
     trials = tuple(one_trial(number, worn(number // 2), 12, 1.0, 0.0) for number in range(16))
-    held = RecordingSet(Path(), "pad", ROWS, COLS, 0.002, "adc_counts", 255.0, (), trials)
+    held = RecordingSet(Path(), "pad", ROWS, COLS, 0.002, 255.0, (), trials)
     found = diagnose_pad(held)
     assert found.verdict.heldout is not None
     assert found.verdict.heldout.extended < 1.05 * found.verdict.heldout.baseline
@@ -61,7 +61,7 @@ def test_untouched_rows_and_columns_tell_idle_levels_of_taxels_that_one_recordin
         raw = TRUE_IDLE + wandering(120, 384, rng)
         x_m, y_m = made.x_m - 0.028 + 0.008 * number, made.y_m + 0.016 * (number % 2 - 0.5)
         trials.append(replace(made, x_m=x_m, y_m=y_m, raw=raw))
-    held = RecordingSet(Path(), "pad", 12, 32, 0.002, "adc_counts", 255.0, (), tuple(trials))
+    held = RecordingSet(Path(), "pad", 12, 32, 0.002, 255.0, (), tuple(trials))
     presses = prepare(held, trials, list(range(8)))
     silent = Composite(describe(presses), np.array([-50.0, 0.0]))
     pressed = np.zeros(384, dtype=bool)
@@ -82,7 +82,7 @@ def test_noise_that_wanders_is_no_answer() -> None:
         raw = TRUE_IDLE + noise + 0.8 * rng.standard_normal((200, 384))
         raw[:, 3] += 20.0 * (made.depth_m > 1e-4)
         trials.append(replace(made, raw=raw))
-    held = RecordingSet(Path(), "pad", 12, 32, 0.002, "adc_counts", 255.0, (), tuple(trials))
+    held = RecordingSet(Path(), "pad", 12, 32, 0.002, 255.0, (), tuple(trials))
     presses = prepare(held, trials, list(range(8)))
     for press in presses.presses:
         assert 3 in press.taxels

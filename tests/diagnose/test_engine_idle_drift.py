@@ -19,7 +19,7 @@ def p_of(levels: np.ndarray) -> float:
     """The probe's p-value for a session whose recordings rest at these levels [counts]."""
     trials = [one_trial(number, linear, 21, 1.0, 1.0) for number in range(len(levels))]
     moved = tuple(replace(t, raw=t.raw + level) for t, level in zip(trials, levels, strict=True))
-    held = RecordingSet(Path(), "pad", ROWS, COLS, 0.002, "adc_counts", 255.0, (), moved)
+    held = RecordingSet(Path(), "pad", ROWS, COLS, 0.002, 255.0, (), moved)
     presses = prepare(held, list(held.trials), list(range(len(levels))))
     probe = drift_probe(fit_baseline(presses).fitted, presses, FORMS[1], 0)
     assert probe is not None

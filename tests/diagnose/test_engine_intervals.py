@@ -24,9 +24,7 @@ def press(depth: np.ndarray, time_s: np.ndarray, raw: np.ndarray | None = None) 
     zero = np.zeros(len(depth))
     readings = np.zeros((len(depth), 9)) if raw is None else raw
     ball = {"shape": "sphere", "radius_m": 0.01}
-    return Trial(
-        "t.parquet", "c", 0, 0, 0.0, ball, time_s, zero, zero, depth, zero, zero, None, None, readings
-    )
+    return Trial("t.parquet", "c", 0, 0.0, ball, time_s, zero, zero, depth, zero, zero, None, None, readings)
 
 
 @pytest.mark.parametrize(("rho", "slow"), [(0.4, 1.0), (0.9, 0.5), (0.95, 0.2), (0.0, 1.0), (0.7, 0.0)])
@@ -132,7 +130,7 @@ def test_periods_that_repeat_the_same_frames_are_the_interval() -> None:
     first = np.concatenate([[True], slot[1:] != slot[:-1]])
     raw = fresh[np.maximum.accumulate(np.where(first, np.arange(200), 0))]
     trials = [press(depth, time_s, raw)]
-    pad = RecordingSet(Path(), "pad", 3, 3, 0.002, "adc_counts", 255.0, (), tuple(trials))
+    pad = RecordingSet(Path(), "pad", 3, 3, 0.002, 255.0, (), tuple(trials))
     low, high = undecided(False)(np.array([0.1231]), prepare(pad, trials, [0]))["period_s"]
     assert low <= 0.123 <= high
     assert 0 < high - low < 0.003

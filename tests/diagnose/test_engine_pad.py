@@ -41,7 +41,6 @@ def one_trial(number: int, counts_of, seed: int, noise: float, jitter: float) ->
     return Trial(
         f"t{number:02}.parquet",
         f"c{number // 2}",
-        number % 2,
         number,
         30.0 * number,
         spec,
@@ -67,7 +66,7 @@ def hardening(depth: np.ndarray) -> np.ndarray:
 
 def recordings(counts_of=linear, seed: int = 0, count: int = 16, noise: float = 1.0, jitter: float = 1.0):
     trials = tuple(one_trial(number, counts_of, seed, noise, jitter) for number in range(count))
-    return RecordingSet(Path(), "pad", ROWS, COLS, PITCH, "adc_counts", 255.0, (), trials)
+    return RecordingSet(Path(), "pad", ROWS, COLS, PITCH, 255.0, (), trials)
 
 
 def names(diagnosis: Diagnosis) -> list[str]:
@@ -141,7 +140,7 @@ def test_nothing_to_fit_is_invalid() -> None:
     assert diagnose_pad(recordings(count=1)).verdict.status == "invalid_data"
     above = recordings()
     far = [t.__class__(**{**t.__dict__, "depth_m": t.depth_m - 0.01}) for t in above.trials]
-    found = diagnose_pad(RecordingSet(Path(), "pad", ROWS, COLS, PITCH, "", 255.0, (), tuple(far)))
+    found = diagnose_pad(RecordingSet(Path(), "pad", ROWS, COLS, PITCH, 255.0, (), tuple(far)))
     assert found.verdict.status == "invalid_data"
     assert found.verdict.data_issues
 

@@ -36,7 +36,7 @@ def handled_episodes(faults):
 
 def problem_of(scene, episodes, positions, step_s=COARSE_S):
     trials = [
-        RobotTrial(str(e.index), str(e.index), 0, 0, 0.0, e.time_s, given(scene, e), q, None)
+        RobotTrial(str(e.index), str(e.index), 0, 0.0, e.time_s, given(scene, e), q, None)
         for e, q in zip(episodes, positions, strict=True)
     ]
     return TwinProblem.on(ALOHA.joint_names, make_batch(trials), SCENE, step_s)

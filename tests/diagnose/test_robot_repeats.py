@@ -39,7 +39,8 @@ def test_scatter_tells_noise_from_shape_and_zero(recordings) -> None:
 
 def test_what_repeats_is_a_part_of_the_repeated_trials_alone(recordings) -> None:
     batch = make_batch(recordings.trials)
-    keep = [place for place, trial in enumerate(recordings.trials) if trial.replicate == 0 or trial.order % 2]
+    first = [batch.conditions.index(name) for name in batch.conditions]
+    keep = [place for place, trial in enumerate(recordings.trials) if place in first or trial.order % 2]
     fewer = batch.subset(keep)
     # All trials repeat exactly; those whose command came once err most.
     once = np.array([fewer.conditions.count(name) == 1 for name in fewer.conditions])
@@ -78,8 +79,8 @@ def test_scatter_tells_what_comes_with_motion_and_what_is_the_servos(recordings)
 
 
 def test_no_scatter_without_repeated_commands(recordings) -> None:
-    once = [trial for trial in recordings.trials if trial.replicate == 0]
-    batch = make_batch(once)
+    once = {trial.condition: trial for trial in recordings.trials}
+    batch = make_batch(tuple(once.values()))
     assert scatter(batch, np.zeros_like(batch.position)) is None
 
 

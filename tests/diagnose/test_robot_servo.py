@@ -13,7 +13,7 @@ from lerobot_vtrefine.diagnose.recordings import RobotTrial
 
 
 def trial_of(t, u, q=None, load=None, file="a.parquet"):
-    return RobotTrial(file, "c", 0, 0, 0.0, t, u, u.copy() if q is None else q, load)
+    return RobotTrial(file, "c", 0, 0.0, t, u, u.copy() if q is None else q, load)
 
 
 def random_trial(frames=16, joints=1, seed=0):

@@ -13,10 +13,8 @@ from lerobot_vtrefine.diagnose.stability import half, stability
 
 def recordings(count: int) -> RecordingSet:
     one = np.zeros((3, 1))
-    trials = tuple(
-        RobotTrial(str(k), f"c{k}", 0, k, 0.0, np.arange(3.0), one, one, None) for k in range(count)
-    )
-    return RecordingSet(Path(), "robot", 0, 0, 0.0, "rad", 0.0, ("a",), trials)
+    trials = tuple(RobotTrial(str(k), f"c{k}", k, 0.0, np.arange(3.0), one, one, None) for k in range(count))
+    return RecordingSet(Path(), "robot", 0, 0, 0.0, 0.0, ("a",), trials)
 
 
 def test_names_are_counted_over_draws_and_halves() -> None:

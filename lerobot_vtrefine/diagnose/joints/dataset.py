@@ -46,7 +46,6 @@ def read_dataset(repo_id: str | None = None, root: str | Path | None = None) -> 
             RobotTrial(
                 file=episode_name(episode.index),
                 condition=f"episode {episode.index}",
-                replicate=0,
                 order=episode.index,
                 start_s=start_s,
                 time_s=time_s,
@@ -56,7 +55,7 @@ def read_dataset(repo_id: str | None = None, root: str | Path | None = None) -> 
             )
         )
         start_s += float(time_s[-1]) + PAUSE_S
-    return RecordingSet(folder.root, "robot", 0, 0, 0.0, "rad", 0.0, names, tuple(trials))
+    return RecordingSet(folder.root, "robot", 0, 0, 0.0, 0.0, names, tuple(trials))
 
 
 def episode_name(index: int) -> str:

@@ -104,7 +104,7 @@ def _gap(selection: "Selected", rival: Rival[Any, Any], name: str) -> float:
         bounded = is_sliding(problem.names[joint]) or is_gripper(problem.names[joint])
         wide = (low[joint], high[joint]) if bounded else (-1.2, 1.2)
         command[:, joint] = _drive(name, time_s, low[joint], high[joint], wide, problem.names[joint])
-    trial = RobotTrial("", "", 0, 0, 0.0, time_s, command, command[:1].repeat(len(time_s), 0), None)
+    trial = RobotTrial("", "", 0, 0.0, time_s, command, command[:1].repeat(len(time_s), 0), None)
     there = ServoTrials.of(problem.names, make_batch([trial]))
     difference = there.predict(selection.fit.point) - there.predict(rival.fit.point)
     joints = list(rival.channels)

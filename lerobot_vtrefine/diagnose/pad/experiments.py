@@ -142,7 +142,6 @@ def as_trial(protocol: Protocol, loaded: bool, taxels: int) -> Trial:
     return Trial(
         file=protocol.text,
         condition=protocol.text,
-        replicate=0,
         order=0,
         start_s=0.0,
         object=protocol.indenter,

@@ -61,7 +61,6 @@ def readings(
     trial = Trial(
         file="",
         condition="",
-        replicate=0,
         order=0,
         start_s=start_s,
         object=shape,

@@ -60,7 +60,7 @@ class ServoModel:
     def predict(self, trial: RobotTrial) -> np.ndarray:
         """Positions (N, 1) of a trial from its commands and first position; ValueError without its load."""
         hidden = replace(trial, position=trial.position[:1].repeat(len(trial.time_s), 0))
-        alone = RecordingSet(Path(), "robot", 0, 0, 0.0, "rad", 0.0, ("servo",), (hidden,))
+        alone = RecordingSet(Path(), "robot", 0, 0, 0.0, 0.0, ("servo",), (hidden,))
         return simulate(Bench.of(alone), self.theta[None])[:, 0]
 
     def to_dict(self) -> dict[str, Any]:
