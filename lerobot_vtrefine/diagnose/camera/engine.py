@@ -10,10 +10,10 @@ from lerobot_vtrefine.diagnose.camera.frames import DepthFrames, read_frames
 from lerobot_vtrefine.diagnose.camera.problem import CANDIDATES, CameraProblem, Candidate, Fit
 from lerobot_vtrefine.diagnose.core.diagnosis import Diagnosis
 from lerobot_vtrefine.diagnose.core.engine import Inference, Progress, infer
+from lerobot_vtrefine.diagnose.core.problem import OptionalRemarks
 from lerobot_vtrefine.diagnose.core.resampling import draws_of
 from lerobot_vtrefine.diagnose.core.rules import SURE
 from lerobot_vtrefine.diagnose.core.summary import tell
-from lerobot_vtrefine.diagnose.evidence import ResidualView, Trace
 from lerobot_vtrefine.diagnose.verdict import Parameter
 
 Array = np.ndarray
@@ -42,8 +42,9 @@ def diagnose_frames(frames: DepthFrames, seed: int = 0, progress: Progress | Non
     return tell(found, CameraAccount(found))
 
 
-class CameraAccount:
-    """See `core.problem.Account`; errors are depths in metres."""
+class CameraAccount(OptionalRemarks):
+    """See `core.problem.Account`; errors are depths in metres. No view is recorded twice, so that
+    the noise is unknown; images always show both causes."""
 
     unit = "m"
     metric = "rmse of depth [m]"
@@ -87,26 +88,10 @@ class CameraAccount:
             out[candidate.cause] = float(SURE * error[:3].max())
         return out
 
-    def noise_floor(self) -> float | None:
-        """None: no view is recorded twice."""
-        return None
-
     def causes(self) -> Sequence[str]:
         """Names of the catalogue: pose and scale."""
         return tuple(item.cause for item in CANDIDATES)
 
-    def caveat(self, cause: str, channels: tuple[int, ...]) -> str:
-        """Empty: neither cause leaves anything open."""
-        return ""
-
-    def not_identifiable(self, cause: str) -> str:
-        """Empty: images always show both causes."""
-        return ""
-
     def next_experiment(self, rivals: Sequence[Any], alarms: Sequence[Any]) -> Mapping[str, Any] | None:
         """What to record where pose and scale tie."""
         return _NEXT if rivals else None
-
-    def drawings(self, test: CameraProblem, seed: int) -> tuple[tuple[Trace, ...], tuple[ResidualView, ...]]:
-        """Nothing: images are not drawn."""
-        return (), ()

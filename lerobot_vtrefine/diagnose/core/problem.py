@@ -264,7 +264,27 @@ class ScreenedProblem[F: ScoredFit, C: FormCandidate](Problem[F, C], Protocol):
         """For cross-validation."""
 
 
-class Account[F: Fit, C: Candidate](Protocol):
+class OptionalRemarks(Protocol):
+    """What an account may add; nothing by default."""
+
+    def noise_floor(self) -> float | None:
+        """Root mean square error that no model could undo; None where it is not known."""
+        return None
+
+    def caveat(self, cause: str, channels: tuple[int, ...]) -> str:
+        """What an accepted cause leaves open."""
+        return ""
+
+    def not_identifiable(self, cause: str) -> str:
+        """Why these trials cannot show a cause; empty where they can."""
+        return ""
+
+    def drawings(self, test: Any, seed: int) -> tuple[tuple[Trace, ...], tuple[ResidualView, ...]]:
+        """What the report draws about locked trials."""
+        return (), ()
+
+
+class Account[F: Fit, C: Candidate](OptionalRemarks, Protocol):
     """How an instrument reports what was found: sizes, models, sentences, drawings."""
 
     unit: str
@@ -282,22 +302,10 @@ class Account[F: Fit, C: Candidate](Protocol):
     def minimum_detectable(self) -> Mapping[str, float]:
         """Cause -> smallest size that these trials would have shown."""
 
-    def noise_floor(self) -> float | None:
-        """Root mean square error that no model could undo."""
-
     def causes(self) -> Sequence[str]:
         """Names that are reported, found or not."""
-
-    def caveat(self, cause: str, channels: tuple[int, ...]) -> str:
-        """What an accepted cause leaves open."""
-
-    def not_identifiable(self, cause: str) -> str:
-        """Why these trials cannot show a cause; empty where they can."""
 
     def next_experiment(
         self, rivals: "Sequence[Rival[F, C]]", alarms: "Sequence[Alarm]"
     ) -> Mapping[str, Any] | None:
         """What to record next."""
-
-    def drawings(self, test: Any, seed: int) -> tuple[tuple[Trace, ...], tuple[ResidualView, ...]]:
-        """What the report draws about locked trials."""

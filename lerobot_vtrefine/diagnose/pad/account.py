@@ -9,6 +9,7 @@ import numpy as np
 
 from lerobot_vtrefine.diagnose.core.engine import Inference
 from lerobot_vtrefine.diagnose.core.heldout import out_of_fold
+from lerobot_vtrefine.diagnose.core.problem import OptionalRemarks
 from lerobot_vtrefine.diagnose.core.rivals import Rival
 from lerobot_vtrefine.diagnose.core.screened_search import clearly_better
 from lerobot_vtrefine.diagnose.evidence import ResidualView, Trace
@@ -34,7 +35,7 @@ from lerobot_vtrefine.diagnose.verdict import Parameter
 from lerobot_vtrefine.tactile.model import SensorModel
 
 
-class PadAccount:
+class PadAccount(OptionalRemarks):
     """See `core.problem.Account`.
 
     Args:
@@ -108,10 +109,6 @@ class PadAccount:
             return -gain, p_adjusted
 
         return sorted(names, key=promise)
-
-    def caveat(self, cause: str, channels: tuple[int, ...]) -> str:
-        """Nothing is left open."""
-        return ""
 
     def not_identifiable(self, cause: str) -> str:
         """What to record to see it."""

@@ -7,6 +7,7 @@ import numpy as np
 
 from lerobot_vtrefine.diagnose.core.detectable import smallest
 from lerobot_vtrefine.diagnose.core.engine import Inference
+from lerobot_vtrefine.diagnose.core.problem import OptionalRemarks
 from lerobot_vtrefine.diagnose.core.resampling import jackknife
 from lerobot_vtrefine.diagnose.core.rivals import Rival
 from lerobot_vtrefine.diagnose.core.suspicion import Alarm
@@ -26,7 +27,7 @@ _FIRST_STEP = 2e-3
 """Of finite differences, as a part of a parameter's size."""
 
 
-class ServoAccount:
+class ServoAccount(OptionalRemarks):
     """See `core.problem.Account`."""
 
     unit = "rad"
@@ -85,10 +86,6 @@ class ServoAccount:
     def causes(self) -> Sequence[str]:
         """Names of the catalogue."""
         return NAMES
-
-    def caveat(self, cause: str, channels: tuple[int, ...]) -> str:
-        """Empty: no cause leaves anything open."""
-        return ""
 
     def not_identifiable(self, cause: str) -> str:
         """What to record so that trials can show it."""
