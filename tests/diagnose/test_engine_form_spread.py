@@ -1,11 +1,17 @@
 """Intervals know the law's form no better than the recordings do."""
 
+import numpy as np
 import pytest
+import torch
 from jittered_rig import EFFECTS, Rig
 
 from lerobot_vtrefine.diagnose.pad.account import with_form_spread
+from lerobot_vtrefine.diagnose.pad.candidates.base import Setting
+from lerobot_vtrefine.diagnose.pad.candidates.nonlinear_stiffness import FORMS
 from lerobot_vtrefine.diagnose.pad.engine import diagnose_pad
 from lerobot_vtrefine.diagnose.verdict import Parameter
+from lerobot_vtrefine.tactile.layout import PadLayout
+from lerobot_vtrefine.tactile.stages.base import Frame
 
 
 def test_intervals_reach_as_far_as_forms_that_predict_as_well() -> None:
@@ -44,3 +50,15 @@ def test_intervals_of_fresh_sets_hold_the_truth() -> None:
                 held.append(low <= strength <= high)
     assert len(held) >= 15
     assert sum(held) >= 0.8 * len(held)
+
+
+def test_forms_of_hardening_report_the_same_exponent() -> None:
+    """The local exponent of force over depth at the deepest press, against the stages themselves."""
+    setting = Setting(PadLayout(4, 4, 0.002), 100.0, 255.0, 0.033, 10.0, 700.0, 7e-4, False, 0.0, 4, 4, 300.0)
+    frame = Frame(setting.layout, stiffness_n_per_m=1000.0)
+    for form, values in zip(FORMS, ([0.4], [0.3, 1.5], [2.0, 0.4, np.log(0.01)]), strict=True):
+        depth = setting.top_depth_m * torch.tensor([[1.0 - 1e-4, 1.0 + 1e-4]], dtype=torch.float64)
+        (stage,) = form.build(np.array(values), setting)
+        force = stage.step(depth if stage.domain == "depth" else 1000.0 * depth, {}, frame)[0]
+        slope = float(torch.diff(force.log()) / torch.diff(depth.log()))
+        assert form.report(np.array(values), setting)["exponent"][0] == pytest.approx(slope, rel=0.02)

@@ -1,14 +1,25 @@
-"""nonlinear_stiffness: force grows faster than depth (hardening)."""
+"""nonlinear_stiffness: force grows faster than depth (hardening).
+
+All forms report as `exponent` how fast force grows at the deepest press, d ln f / d ln d; a power law's is
+its own.
+"""
 
 import numpy as np
 
 from lerobot_vtrefine.diagnose.pad.candidates.base import Form, Setting, Value
 from lerobot_vtrefine.tactile.stages.base import Stage
-from lerobot_vtrefine.tactile.stages.mechanics import NonlinearStiffness
+from lerobot_vtrefine.tactile.stages.mechanics import REFERENCE_DEPTH_M, NonlinearStiffness
 from lerobot_vtrefine.tactile.stages.surface import StiffeningDepth
 
 SHALLOWEST = 0.25
 """Least depth of a knee over the deepest press: what is soft above that is a contact felt late."""
+
+
+def _report_mixed(values: np.ndarray, setting: Setting) -> dict[str, tuple[float, str]]:
+    share, excess = float(values[0]), float(values[1])
+    bent = share * (setting.top_depth_m / REFERENCE_DEPTH_M) ** excess
+    part = bent / (1.0 - share + bent)
+    return {"exponent": (1.0 + excess * part, "1"), "share": (share, "1")}
 
 
 def _bottoming(values: np.ndarray, setting: Setting) -> tuple[Stage, ...]:
@@ -17,7 +28,6 @@ def _bottoming(values: np.ndarray, setting: Setting) -> tuple[Stage, ...]:
 
 
 def _report_bottoming(values: np.ndarray, setting: Setting) -> dict[str, tuple[float, str]]:
-    """The exponent is that of a power law from the face to the deepest press with as much more at its end."""
     more, knee = float(values[0]), float(values[1])
     exponent = (1.0 + more) / (1.0 + more * (1.0 - knee))
     top_m = setting.top_depth_m
@@ -42,7 +52,7 @@ FORMS = (
         "linear plus power law",
         (Value("share", 0.0, 1.0, 2e-3), Value("excess", 0.3, 4.0, 5e-3)),
         lambda v, s: (NonlinearStiffness(1.0 + float(v[1]), float(v[0])),),
-        lambda v, s: {"exponent": (1.0 + float(v[1]), "1"), "share": (float(v[0]), "1")},
+        _report_mixed,
         lambda s: [[0.1, 1.0], [0.1, 2.0]],
         possible=lambda s: not s.loaded,
         screened=False,
