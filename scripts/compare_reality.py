@@ -32,7 +32,12 @@ from reality_budget import Budget, env_flags, folder_name, real_env, recipe
 from reality_results import as_text, difference
 
 from lerobot_vtrefine.cli.arguments import CommandParser, flags
-from lerobot_vtrefine.cli.pipeline.demo_config import RECIPES, SEED_STRIDE, TRAIN_SEED_OFFSET
+from lerobot_vtrefine.cli.pipeline.demo_config import (
+    RECIPES,
+    SEED_STRIDE,
+    TRAIN_SEED_OFFSET,
+    default_degradation,
+)
 from lerobot_vtrefine.cli.pipeline.demo_stages import pretrain_stage, record_stage
 from lerobot_vtrefine.cli.pipeline.stages import Stage, StageRunner, find_command
 from lerobot_vtrefine.cli.report.statistics import proportion
@@ -369,6 +374,12 @@ def parse() -> tuple[argparse.Namespace, Budget]:
     parser.add_argument("--recipe", choices=list(RECIPES), default="cloud", help="as vtrefine-demo's")
     for name, words in (("policy", "policy"), ("dppo", "update")):
         parser.add_argument(f"--{name}", type=json.loads, default={}, help=f"flags of the {words}, as JSON")
+    parser.add_argument(
+        "--degradation",
+        type=json.loads,
+        default=default_degradation(),
+        help="the expert's imperfections, as JSON; {} for none (default %(default)s)",
+    )
     for name, default in (("encoder_episodes", 6144), ("encoder_steps", 3000)):
         parser.add_argument(f"--{name}", type=int, default=default, help=f"of recipe pads; default {default}")
     options = parser.parse_args()

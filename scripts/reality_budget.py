@@ -7,7 +7,7 @@ from typing import Any
 from realities import of_robot
 
 from lerobot_vtrefine.cli.arguments import flags
-from lerobot_vtrefine.cli.pipeline.demo_config import DemoConfig, default_env
+from lerobot_vtrefine.cli.pipeline.demo_config import DemoConfig, default_degradation, default_env
 
 
 @dataclass(frozen=True)
@@ -31,6 +31,7 @@ class Budget:
     recipe: str = "cloud"
     policy: dict[str, Any] = field(default_factory=dict)
     dppo: dict[str, Any] = field(default_factory=dict)
+    degradation: dict[str, Any] = field(default_factory=default_degradation)
     encoder_episodes: int = 6144
     encoder_steps: int = 3000
 
@@ -70,6 +71,7 @@ def recipe(budget: Budget, seed: int) -> DemoConfig:
         eval_episodes=budget.eval_episodes,
         eval_envs=budget.eval_envs,
         env=default_env() | budget.env | plain,
+        degradation=budget.degradation,
         recipe=budget.recipe,
         policy=budget.policy | ({"pretrained_encoder": str(budget.encoder)} if budget.own_encoder else {}),
         dppo=budget.dppo,
