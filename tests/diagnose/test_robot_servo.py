@@ -1,12 +1,20 @@
 """The servo model against small Euler steps, and what its file must keep."""
 
 import json
+from dataclasses import replace
 
 import numpy as np
 import pytest
 
 from lerobot_vtrefine.diagnose.joints.batch import make_batch
-from lerobot_vtrefine.diagnose.joints.model import JointModel, RobotModel, predict_positions
+from lerobot_vtrefine.diagnose.joints.candidates import decoys
+from lerobot_vtrefine.diagnose.joints.model import (
+    JointModel,
+    RobotModel,
+    from_model,
+    predict_positions,
+    to_model,
+)
 from lerobot_vtrefine.diagnose.joints.servo import Columns, simulate
 from lerobot_vtrefine.diagnose.joints.stages import spring
 from lerobot_vtrefine.diagnose.recordings import RobotTrial
@@ -144,6 +152,15 @@ def test_file_round_trip(tmp_path) -> None:
     model = RobotModel((JointModel("left_waist", 12.5, 0.7, friction=0.01, sag_form="free"),), 0.03)
     model.save(tmp_path / "m.json")
     assert RobotModel.load(tmp_path / "m.json") == model
+
+
+def test_a_decoy_that_was_taken_back_leaves_a_file_that_can_be_read(tmp_path) -> None:
+    """Verdicts "unexplained" hand out what has a name; the shape that won has none, and is no sag."""
+    point = from_model(RobotModel.default(("left_waist", "left_elbow")))
+    for form in (candidate.form for candidate in decoys.FORMS):
+        model = to_model(("left_waist", "left_elbow"), replace(point, forms=("mass", form)))
+        model.save(tmp_path / "robot.json")
+        assert RobotModel.load(tmp_path / "robot.json").joints[1].sag_form == "mass"
 
 
 JOINT = {"name": "a", "natural_frequency_rad_s": 20.0, "damping_ratio": 1.0}

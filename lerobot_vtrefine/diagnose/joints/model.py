@@ -95,13 +95,16 @@ def to_model(names: tuple[str, ...], point: Point) -> RobotModel:
     joints = []
     for index, name in enumerate(names):
         value = dict(zip(PARAMETERS, point.theta[index].tolist(), strict=True))
+        terms = tuple(value[name] for name in SAG)
+        # Without terms there is no sag: the form may be a decoy's, which was taken back and has no name.
+        form = cast("SagForm", point.forms[index]) if any(terms) else JointModel.sag_form
         joints.append(
             JointModel(
                 name=name,
                 natural_frequency_rad_s=float(np.exp(value["log_omega"])),
                 damping_ratio=float(np.exp(value["log_zeta"])),
-                sag_form=cast("SagForm", point.forms[index]),
-                sag_terms=tuple(value[name] for name in SAG),
+                sag_form=form,
+                sag_terms=terms,
                 laws={name: value[name] for name in stages.parameters() if value[name]},
                 **{field: value[name] for field, name in _FIELDS.items()},
             )
