@@ -1,24 +1,23 @@
 #!/usr/bin/env python
-"""Does diagnosis pay where it matters, in the policy? Fine-tune in the plain and in the diagnosed simulator.
+"""Does diagnosis pay where it matters, in the policy? Train in the plain and in the diagnosed simulator.
 
     .venv/bin/python scripts/compare_reality.py --seeds 0 1 2
     .venv/bin/python scripts/compare_reality.py --seeds 0 1 2 3 4 5 --jobs 24 --device=cuda
     .venv/bin/python scripts/compare_reality.py --task=cross_gentle --recipe=pads --num_demos=300 \\
         --realities row_sharing+hysteresis+drift --device=cuda --env='{"backend": "warp"}'
 
-A simulation with hidden physics stands in for reality (``--env.reality``); nothing is ever trained in it.
-A policy is imitation-learned and fine-tuned by DPPO for a while in the plain simulator. From there DPPO goes
-on, with the same budget and seeds, in the plain simulator and in the one that ``vtrefine-diagnose`` made from
-recordings: presses of the hidden pad, or episodes of the hidden robot. All policies are then evaluated in the
-stand-in reality and in their own simulator, on the same episodes. Every stage is a command that users run;
-interrupted and started again, it continues. With ``--jobs`` several run side by side, each on cores of its
-own and on the GPUs by turns; one that fails does not stop the others, and the comparison is of the seeds that
-are whole. Results: ``comparison.json`` and ``comparison.md``.
+A simulation with hidden physics stands in for reality (``--env.reality``); nothing is ever trained in it. The
+same recipe (an encoder where the policy has one, demonstrations by the scripted expert, imitation, DPPO) is
+followed in the plain simulator and in the one that ``vtrefine-diagnose`` made from recordings: presses of the
+hidden pad, or episodes of the hidden robot. Budgets and seeds are the same. All policies are then evaluated
+in the stand-in reality and in their own simulator, on the same episodes. Every stage is a command that users
+run; interrupted and started again, it continues. With ``--jobs`` several run side by side, each on cores of
+its own and on the GPUs by turns; one that fails does not stop the others, and the comparison is of the seeds
+that are whole. Results: ``comparison.json`` and ``comparison.md``.
 """
 
 import argparse
 import json
-import shlex
 import subprocess
 import sys
 from dataclasses import replace
@@ -28,7 +27,7 @@ from typing import Any
 import numpy as np
 from compare_touch import run_all, run_script, save
 from realities import PLAIN, REALITIES, of_robot
-from reality_budget import Budget, env_flags, folder_name, real_env, recipe
+from reality_budget import Budget, folder_name, recipe, world_env
 from reality_results import as_text, difference
 
 from lerobot_vtrefine.cli.arguments import CommandParser, flags
@@ -39,7 +38,7 @@ from lerobot_vtrefine.cli.pipeline.demo_config import (
     default_degradation,
 )
 from lerobot_vtrefine.cli.pipeline.demo_stages import pretrain_stage, record_stage
-from lerobot_vtrefine.cli.pipeline.stages import Stage, StageRunner, find_command
+from lerobot_vtrefine.cli.pipeline.stages import Stage, StageRunner
 from lerobot_vtrefine.cli.report.statistics import proportion
 from lerobot_vtrefine.cli.results.collect import Progress, last_steps, read_json
 from lerobot_vtrefine.cli.results.provenance import write_provenance
@@ -51,24 +50,38 @@ from lerobot_vtrefine.sim.reality import SCHEMA
 
 MOTION_SEED_OFFSET = 500_000
 """Between the seeds of demonstrations and those of fine-tuning."""
-START = "start"
 
 
-def imitation_stages(budget: Budget) -> list[Stage]:
-    """Demonstrations in the plain simulator, and the policy learned from them."""
-    config = recipe(budget, budget.seeds[0])
-    record, pretrain = record_stage(config), pretrain_stage(config)
-    if not budget.own_encoder:
-        return [record, pretrain]
-    encoder = encoder_stage(budget)
-    return [encoder, record, replace(pretrain, needs=(*pretrain.needs, encoder.name))]
+def env_flags(budget: Budget, world: str) -> list[str]:
+    """The environment's flags of a world."""
+    return flags("env", {"type": "vtrefine"} | world_env(budget, world))
 
 
-def encoder_stage(budget: Budget) -> Stage:
-    """What the policy sees and feels with, trained in the plain simulator."""
+def imitation_stages(budget: Budget, world: str) -> list[Stage]:
+    """What fine-tuning in a simulator starts from: its encoder, demonstrations, and the policy they teach."""
+    config = recipe(budget, budget.seeds[0], world)
+    encoder = [encoder_stage(budget, world)] if budget.own_encoder else []
+    record = replace(record_stage(config), name=folder_name("record", world), needs=diagnosis_needed(world))
+    needs = (record.name, *(stage.name for stage in encoder))
+    return [
+        *encoder,
+        record,
+        replace(pretrain_stage(config), name=folder_name("pretrain", world), needs=needs),
+    ]
+
+
+def diagnosis_needed(world: str) -> tuple[str, ...]:
+    """The stage that makes a simulator, where one does."""
+    name = world.partition(":")[2]
+    return (output_name(name),) if name else ()
+
+
+def encoder_stage(budget: Budget, world: str) -> Stage:
+    """What the policy sees and feels with."""
+    output = budget.encoder(world)
     command = (
         "vtrefine-information",
-        *env_flags(budget, "plain"),
+        *env_flags(budget, world),
         "--senses=[visuo_tactile]",
         f"--effort.device={budget.device}",
         f"--effort.episodes={budget.encoder_episodes}",
@@ -77,10 +90,10 @@ def encoder_stage(budget: Budget) -> Stage:
         "--effort.history=[1]",
         "--effort.closed_loop_episodes=0",
         "--effort.tolerance_episodes=0",
-        f"--output_dir={budget.encoder}",
+        f"--output_dir={output}",
     )
-    product = budget.encoder / "information.json"
-    return Stage("encoder", "Train the encoder in the plain simulator", command, budget.encoder, product)
+    title = f"Train the encoder ({world})"
+    return Stage(output.name, title, command, output, output / "information.json", diagnosis_needed(world))
 
 
 def diagnosis_stages(budget: Budget, name: str) -> list[Stage]:
@@ -110,7 +123,6 @@ def motion_stage(budget: Budget, name: str) -> Stage:
     It takes the parts from the table: motions that are wide beside any play.
     """
     config = recipe(budget, budget.seeds[0])
-    env = config.env | {"start": "table"}
     output = budget.output_dir / folder_name(name) / "motions"
     command = [
         "vtrefine-record-demos",
@@ -120,7 +132,7 @@ def motion_stage(budget: Budget, name: str) -> Stage:
         f"--num_envs={budget.motions}",
         "--include_failures=true",
         f"--seed={config.seed * SEED_STRIDE + MOTION_SEED_OFFSET}",
-        *flags("env", {"type": "vtrefine"} | real_env(budget, name, env)),
+        *flags("env", {"type": "vtrefine"} | world_env(budget, f"real:{name}") | {"start": "table"}),
         *flags("degradation", config.degradation),
     ]
     stage, title = f"record_{folder_name(name)}", f"Record the robot of {name}"
@@ -132,53 +144,34 @@ def output_name(name: str) -> str:
     return f"diagnose_{folder_name(name)}"
 
 
-def finetune_dir(budget: Budget, name: str, seed: int) -> Path:
-    """Folder of one fine-tuning: the start, or what goes on from it in a world."""
-    return budget.output_dir / folder_name("finetune", name, str(seed))
+def finetune_dir(budget: Budget, world: str, seed: int) -> Path:
+    """Folder of one fine-tuning."""
+    return budget.output_dir / folder_name("finetune", world, str(seed))
 
 
-def tuned_policy(budget: Budget, name: str, seed: int) -> Path:
+def tuned_policy(budget: Budget, world: str, seed: int) -> Path:
     """The checkpoint that a fine-tuning leaves."""
-    return finetune_dir(budget, name, seed) / "checkpoints" / "last" / "pretrained_model"
-
-
-def start_stage(budget: Budget, seed: int) -> Stage:
-    """DPPO from imitation in the plain simulator, which all policies of a seed share."""
-    command = dppo_command(budget, START, "plain", seed, budget.start_iterations)
-    output = finetune_dir(budget, START, seed)
-    product = tuned_policy(budget, START, seed) / "model.safetensors"
-    title = f"Fine-tune the start, seed {seed}"
-    return Stage(output.name, title, tuple(command), output, product, ("pretrain",), resumable=True)
+    return finetune_dir(budget, world, seed) / "checkpoints" / "last" / "pretrained_model"
 
 
 def finetune_stage(budget: Budget, world: str, seed: int) -> Stage:
-    """A copy of a seed's start goes on in one world, with the start's optimisers and on new episodes."""
-    start, output = finetune_dir(budget, START, seed), finetune_dir(budget, world, seed)
-    command = dppo_command(budget, world, world, seed, budget.start_iterations + budget.iterations)
-    begin = f"test -d {output} || (cp -R {start} {output}.part && mv {output}.part {output})"
-    shell = ("sh", "-c", f"{begin} && exec {shlex.join([find_command(command[0]), *command[1:]])}")
-    needs = [start.name, *([output_name(world.partition(":")[2])] if world != "plain" else [])]
-    more = budget.start_iterations + budget.iterations
-    product = output / "checkpoints" / f"{more:06d}" / "pretrained_model" / "model.safetensors"
-    title = f"Fine-tune in {world}, seed {seed}"
-    return Stage(output.name, title, shell, output, product, tuple(needs), resumable=True)
-
-
-def dppo_command(budget: Budget, name: str, world: str, seed: int, iterations: int) -> list[str]:
-    """DPPO in a world, from imitation or from where its folder has come to."""
-    config = recipe(budget, seed)
-    return [
+    """DPPO in a simulator, from the imitation learned there."""
+    config, output = recipe(budget, seed, world), finetune_dir(budget, world, seed)
+    command = (
         "vtrefine-finetune",
-        f"--policy.path={budget.imitation}",
+        f"--policy.path={budget.imitation(world)}",
         f"--policy.device={budget.device}",
         *env_flags(budget, world),
         *flags("dppo", config.dppo),
-        f"--dppo.iterations={iterations}",
+        f"--dppo.iterations={budget.iterations}",
         f"--dppo.num_envs={budget.envs}",
         f"--seed={seed * SEED_STRIDE + TRAIN_SEED_OFFSET}",
-        f"--output_dir={finetune_dir(budget, name, seed)}",
+        f"--output_dir={output}",
         "--resume=true",
-    ]
+    )
+    product = tuned_policy(budget, world, seed) / "model.safetensors"
+    title, needs = f"Fine-tune in {world}, seed {seed}", (folder_name("pretrain", world),)
+    return Stage(output.name, title, command, output, product, needs, resumable=True)
 
 
 def evaluation_dir(budget: Budget, trained: str, world: str, seed: int) -> Path:
@@ -210,8 +203,6 @@ def cells(name: str) -> dict[str, tuple[str, str]]:
     """The comparison's cells for a reality: pairs (trained in, evaluated in) by what they are called."""
     real, model = f"real:{name}", f"diagnosed:{name}"
     return {
-        "start in reality": (START, real),
-        "start in the plain simulator": (START, "plain"),
         "plain in reality": ("plain", real),
         "plain in its own simulator": ("plain", "plain"),
         "diagnosed in reality": (model, real),
@@ -228,23 +219,19 @@ Lanes = dict[str, list[Stage]]
 """Stages that run one after the other, by name."""
 
 
-def lanes(budget: Budget) -> tuple[Lanes, Lanes, Lanes]:
-    """What runs side by side: preparation first, then every seed's start, then the policies."""
-    before = {"imitation": imitation_stages(budget)}
-    before |= {output_name(name): diagnosis_stages(budget, name) for name in budget.realities}
-    starts, policies = {}, {}
-    for seed in budget.seeds:
-        begun = [*before["imitation"], start_stage(budget, seed)]
-        starts[folder_name(START, str(seed))] = begun
-        for trained in ("plain", *(f"diagnosed:{name}" for name in budget.realities), START):
-            name = trained.partition(":")[2]
-            diagnosed = before[output_name(name)] if name else []
-            tuning = [] if trained == START else [finetune_stage(budget, trained, seed)]
-            worlds = [world for policy, world in evaluations(budget) if policy == trained]
-            judged = [evaluation_stage(budget, trained, world, seed) for world in worlds]
-            lane = folder_name("policy", trained, str(seed))
-            policies[lane] = [*begun, *diagnosed, *tuning, *judged]
-    return before, starts, policies
+def lanes(budget: Budget) -> tuple[Lanes, Lanes]:
+    """What runs side by side: every simulator's preparation first, then its policies, by seed."""
+    before, policies = {"plain": imitation_stages(budget, "plain")}, {}
+    for name in budget.realities:
+        world = f"diagnosed:{name}"
+        before[folder_name(world)] = [*diagnosis_stages(budget, name), *imitation_stages(budget, world)]
+    for world in ("plain", *(f"diagnosed:{name}" for name in budget.realities)):
+        pairs = [pair for pair in evaluations(budget) if pair[0] == world]
+        for seed in budget.seeds:
+            judged = [evaluation_stage(budget, *pair, seed) for pair in pairs]
+            lane = folder_name("policy", world, str(seed))
+            policies[lane] = [*before[folder_name(world)], finetune_stage(budget, world, seed), *judged]
+    return before, policies
 
 
 def runnable(done: Lanes, waiting: Lanes) -> Lanes:
@@ -360,7 +347,6 @@ def parse() -> tuple[argparse.Namespace, Budget]:
     for name, default in (
         ("num_demos", 80),
         ("pretrain_steps", 1000),
-        ("start_iterations", 20),
         ("iterations", 20),
         ("envs", 128),
         ("eval_episodes", 200),
@@ -396,15 +382,13 @@ def parse() -> tuple[argparse.Namespace, Budget]:
 def main() -> None:
     """Prepare, run every policy, compare."""
     options, budget = parse()
-    before, starts, policies = lanes(budget)
+    before, policies = lanes(budget)
     if options.lane is not None:
-        StageRunner(budget.output_dir, (before | starts | policies)[options.lane]).run()
+        StageRunner(budget.output_dir, (before | policies)[options.lane]).run()
         return
     write_worlds(budget)
     failed = run_lanes(budget, before, options.jobs)
-    ready = runnable({"imitation": before["imitation"]}, starts)
-    failed = run_lanes(budget, ready, options.jobs) or failed
-    failed = run_lanes(budget, runnable(before | starts, policies), options.jobs) or failed
+    failed = run_lanes(budget, runnable(before, policies), options.jobs) or failed
     results = compare(budget)
     save(budget.output_dir, results, as_text(results))
     write_provenance(budget.output_dir)

@@ -6,7 +6,6 @@ from typing import Any
 
 from realities import of_robot
 
-from lerobot_vtrefine.cli.arguments import flags
 from lerobot_vtrefine.cli.pipeline.demo_config import DemoConfig, default_degradation, default_env
 
 
@@ -20,7 +19,6 @@ class Budget:
     device: str
     num_demos: int
     pretrain_steps: int
-    start_iterations: int
     iterations: int
     envs: int
     eval_episodes: int
@@ -37,31 +35,27 @@ class Budget:
 
     @property
     def own_encoder(self) -> bool:
-        """Whether the policy's encoder is trained first, in the plain simulator: what others have learnt was
-        with other pads.
-        """
+        """Whether every simulator trains an encoder first: what comes with the package felt other pads."""
         return self.recipe == "pads" and "pretrained_encoder" not in self.policy
 
-    @property
-    def encoder(self) -> Path:
+    def encoder(self, world: str) -> Path:
         """Folder of that encoder."""
-        return self.output_dir / "encoder"
+        return self.output_dir / folder_name("encoder", world)
 
-    @property
-    def imitation(self) -> Path:
+    def imitation(self, world: str) -> Path:
         """The imitation-learned policy that every seed starts from."""
-        return recipe(self, self.seeds[0]).checkpoint("pretrain")
+        return recipe(self, self.seeds[0], world).checkpoint("pretrain")
 
     def diagnosis(self, name: str) -> Path:
         """Folder of a reality's diagnosis."""
         return self.output_dir / folder_name(name) / "diagnosis"
 
 
-def recipe(budget: Budget, seed: int) -> DemoConfig:
-    """The demo's recipe with this budget, in the plain simulator."""
-    plain = {"sensor_model": str(budget.output_dir / "plain" / "sensor_model.json")}
+def recipe(budget: Budget, seed: int, world: str = "plain") -> DemoConfig:
+    """The demo's recipe with this budget, in one of the simulators."""
+    encoder = {"pretrained_encoder": str(budget.encoder(world))} if budget.own_encoder else {}
     return DemoConfig(
-        output_dir=budget.output_dir / "imitation",
+        output_dir=budget.output_dir / folder_name("imitation", world),
         seed=seed,
         device=budget.device,
         num_demos=budget.num_demos,
@@ -70,10 +64,10 @@ def recipe(budget: Budget, seed: int) -> DemoConfig:
         finetune_envs=budget.envs,
         eval_episodes=budget.eval_episodes,
         eval_envs=budget.eval_envs,
-        env=default_env() | budget.env | plain,
+        env=world_env(budget, world),
         degradation=budget.degradation,
         recipe=budget.recipe,
-        policy=budget.policy | ({"pretrained_encoder": str(budget.encoder)} if budget.own_encoder else {}),
+        policy=budget.policy | encoder,
         dppo=budget.dppo,
     )
 
@@ -83,20 +77,19 @@ def folder_name(*parts: str) -> str:
     return "_".join(part.replace(":", "_").replace("+", "_and_") for part in parts)
 
 
-def env_flags(budget: Budget, world: str) -> list[str]:
-    """Flags of a world: plain, diagnosed:NAME or real:NAME."""
-    env = dict(recipe(budget, budget.seeds[0]).env)
+def world_env(budget: Budget, world: str) -> dict[str, Any]:
+    """An environment's flags in a world: plain, diagnosed:NAME or real:NAME.
+
+    The pads of a reality are the plain ones unless it hides others.
+    """
+    plain = {"sensor_model": str(budget.output_dir / "plain" / "sensor_model.json")}
+    env = default_env() | budget.env | plain
     kind, _, name = world.partition(":")
     if kind == "diagnosed":
-        env["reality" if of_robot(name) else "sensor_model"] = str(
-            budget.diagnosis(name) / "sensor_model.json"
-        )
+        model = budget.diagnosis(name) / "sensor_model.json"
+        env["reality" if of_robot(name) else "sensor_model"] = str(model)
     elif kind == "real":
-        env = real_env(budget, name, env)
-    return flags("env", {"type": "vtrefine"} | env)
-
-
-def real_env(budget: Budget, name: str, env: dict[str, Any]) -> dict[str, Any]:
-    """An environment's flags in a stand-in reality; its pads are the plain ones unless it hides others."""
-    kept = env if of_robot(name) else {key: value for key, value in env.items() if key != "sensor_model"}
-    return kept | {"reality": str(budget.output_dir / folder_name(name) / "reality.json")}
+        env["reality"] = str(budget.output_dir / folder_name(name) / "reality.json")
+        if not of_robot(name):
+            del env["sensor_model"]
+    return env

@@ -18,17 +18,14 @@ def difference(row: dict[str, Any], one: str, two: str) -> dict[str, Any]:
 def as_text(results: dict[str, Any]) -> str:
     """The comparison as a Markdown table, and a sentence per reality."""
     lines = [
-        "| stand-in reality | fine-tuned in | success in reality | in its own simulator |",
+        "| stand-in reality | trained in | success in reality | in its own simulator |",
         "|---|---|---|---|",
     ]
     words = []
     for name, row in results.items():
-        for title, real, own in (
-            ("the shared start (plain)", "start in reality", "start in the plain simulator"),
-            ("then the plain one", "plain in reality", "plain in its own simulator"),
-            ("then the diagnosed one", "diagnosed in reality", "diagnosed in its own simulator"),
-        ):
-            lines.append(f"| {name} | {title} | {rate_text(row[real])} | {rate_text(row[own])} |")
+        for world in ("plain", "diagnosed"):
+            real, own = (rate_text(row[f"{world} in {where}"]) for where in ("reality", "its own simulator"))
+            lines.append(f"| {name} | the {world} simulator | {real} | {own} |")
         words.append(sentence(name, row))
     return "\n".join([*lines, "", *words])
 
@@ -41,7 +38,7 @@ def sentence(name: str, row: dict[str, Any]) -> str:
     found = ", ".join(row["verdict"]["causes"]) or "nothing"
     return (
         f"{name}: the plain simulator's policy changes by {interval_text(gap['mean'], gap['ci95'])} in the"
-        f" stand-in reality; fine-tuning in the diagnosed simulator ({row['verdict']['status']}: {found})"
+        f" stand-in reality; training in the diagnosed simulator ({row['verdict']['status']}: {found})"
         f" {effect}, {interval_text(gain['mean'], gain['ci95'])} over {len(row['seeds'])} seeds of"
         f" {row['plain in reality']['episodes'] // len(row['seeds'])} episodes."
     )

@@ -1,7 +1,6 @@
 """Comparing simulators: equal budgets, nothing trained in the stand-in reality, honest differences."""
 
 import json
-import shlex
 
 import compare_reality as compare
 import numpy as np
@@ -18,7 +17,7 @@ from lerobot_vtrefine.tactile.model import SensorModel
 
 @pytest.fixture
 def budget(tmp_path):
-    budget = compare.Budget(tmp_path, tuple(compare.REALITIES), (3, 4), "cpu", 4, 20, 2, 1, 4, 4, 4, 8, 3, {})
+    budget = compare.Budget(tmp_path, tuple(compare.REALITIES), (3, 4), "cpu", 4, 20, 1, 4, 4, 4, 8, 3, {})
     compare.write_worlds(budget)
     for name in budget.realities:  # as if diagnosed
         budget.diagnosis(name).mkdir(parents=True)
@@ -31,45 +30,40 @@ def budget(tmp_path):
 
 
 def flags_of(stage):
-    line = stage.command[-1] if stage.command[0] == "sh" else stage.line
-    return dict(word[2:].partition("=")[::2] for word in shlex.split(line)[1:] if word.startswith("--"))
+    return dict(word[2:].partition("=")[::2] for word in stage.command[1:] if word.startswith("--"))
 
 
-def test_fine_tunings_differ_in_the_simulator_alone(budget):
-    _, starts, policies = compare.lanes(budget)
-    stages = {
-        stage.name: stage
-        for lane in policies.values()
-        for stage in lane
-        if stage.name.startswith("finetune") and "start" not in stage.name
-    }
-    begun = {stage.name: stage for lane in starts.values() for stage in lane if "start" in stage.name}
-    assert len(begun) == 2
-    for stage in stages.values():
-        start = begun[f"finetune_start_{stage.name[-1]}"]
-        assert stage.needs[0] == start.name
-        assert f"cp -R {start.output} {stage.output}.part" in stage.command[-1]
-        assert flags_of(stage)["resume"] == "true"  # so that episodes go on from the start's last one
-        assert flags_of(stage)["seed"] == flags_of(start)["seed"]
-        assert (flags_of(start)["dppo.iterations"], flags_of(stage)["dppo.iterations"]) == ("2", "3")
-    assert len(stages) == 10  # five simulators, two seeds
-    kept, differ = [], ("env.sensor_model", "env.reality", "output_dir", "seed")
-    for stage in stages.values():
-        flags = flags_of(stage)
-        assert "/diagnosis/" in flags.get("env.reality", "/diagnosis/")  # never the hidden one
-        kept.append({k: v for k, v in flags.items() if k not in differ})
-    assert all(flags == kept[0] for flags in kept)
+def test_what_is_learnt_differs_in_the_simulator_alone(budget):
+    _, policies = compare.lanes(budget)
+    for kind, count in (("record", 5), ("pretrain", 5), ("finetune", 10)):  # five simulators, two seeds
+        stages = {
+            s.name: s
+            for lane in policies.values()
+            for s in lane
+            if s.name.startswith((f"{kind}_plain", f"{kind}_diagnosed"))
+        }
+        assert len(stages) == count
+        differ = ("env.sensor_model", "env.reality", "output_dir", "root", "dataset.root", "policy.path")
+        kept = []
+        for stage in stages.values():
+            flags = flags_of(stage)
+            assert "/diagnosis/" in flags.get("env.reality", "/diagnosis/")  # never the hidden one
+            world = stage.name.removeprefix(f"{kind}_").removesuffix("_3").removesuffix("_4")
+            own = (flags.get(name, world) for name in ("dataset.root", "policy.path", "root"))
+            assert all(world in path for path in own)
+            kept.append({k: v for k, v in flags.items() if k not in differ})
+        assert len({flags["seed"] for flags in kept}) == count // 5
+        assert all({**flags, "seed": 0} == {**kept[0], "seed": 0} for flags in kept)
     models = {(flags_of(s)["env.sensor_model"], flags_of(s).get("env.reality")) for s in stages.values()}
     assert len(models) == 5
-    assert len({flags_of(stage)["seed"] for stage in stages.values()}) == 2
 
 
 def test_evaluations_use_the_same_episodes_and_valid_environments(budget):
     from lerobot_vtrefine.cli.pipeline.child_configs import parse_env
 
-    policies = compare.lanes(budget)[2]
+    policies = compare.lanes(budget)[1]
     stages = [stage for lane in policies.values() for stage in lane if stage.name.startswith("eval")]
-    assert len(stages) == 2 * len(compare.evaluations(budget)) == 36
+    assert len(stages) == 2 * len(compare.evaluations(budget)) == 26
     seeds = {(flags_of(stage)["seed"], stage.name[-1]) for stage in stages}
     assert len(seeds) == 2
     for stage in stages:
@@ -83,10 +77,10 @@ def test_evaluations_use_the_same_episodes_and_valid_environments(budget):
 
 
 def test_every_lane_can_run_on_its_own(budget):
-    before, starts, policies = compare.lanes(budget)
-    assert [len(lanes) for lanes in (before, starts, policies)] == [5, 2, 12]
-    assert len(before | starts | policies) == 19
-    for stages in (before | starts | policies).values():
+    before, policies = compare.lanes(budget)
+    assert [len(lanes) for lanes in (before, policies)] == [5, 10]
+    assert len(before | policies) == 15
+    for stages in (before | policies).values():
         names = [stage.name for stage in stages]
         assert len(set(names)) == len(names)
         for index, stage in enumerate(stages):
@@ -129,28 +123,34 @@ def test_comparison_becomes_rows_of_the_results(budget):
     ProgressLog(folder, 0, None).add(3, {"success": 0.5, "env_steps": 400.0})
     origin = {"commit": "0123abc", "command": None, "machine": "2 cores"}
     rows = [row for row, _ in compare.reality_rows(budget.output_dir, origin)]
-    assert len({row.key for row in rows}) == len(rows) == 4 * 6 * 2
+    assert len({row.key for row in rows}) == len(rows) == 4 * 4 * 2
     (row,) = (r for r in rows if r.task == name and r.seed == 4 and r.variant == "plain in its own simulator")
     assert (row.success, row.episodes, row.iterations, row.env_steps) == (0.75, 4, 3, 400)
     assert row.extra == {"diagnosis": "backlash"}
     text = table("reality", rows)
     hidden = "commands 0.1 s late, 20 mrad of play in all arm joints"
-    assert f"| {hidden} | backlash | the start | 25 [7, 59] | 25 [7, 59] |" in text
-    assert "| | | then the plain simulator | 25 [7, 59] (25, 25) | 75 [41, 93] |" in text
+    assert f"| {hidden} | backlash | the plain simulator | 25 [7, 59] (25, 25) | 75 [41, 93] |" in text
+    assert "| | | the diagnosed simulator | 25 [7, 59] (25, 25) | 25 [7, 59] |" in text
 
 
 def test_a_task_of_its_own_brings_its_encoder_and_its_name(budget, tmp_path, monkeypatch):
     flags = ["--task=cross_gentle", "--recipe=pads", '--dppo={"encoder": "trained"}', "--jobs=2"]
     monkeypatch.setattr("sys.argv", ["compare_reality.py", f"--output_dir={tmp_path}", *flags])
     _, own = compare.parse()
-    encoder, record, pretrain = compare.imitation_stages(own)
+    encoder, record, pretrain = compare.imitation_stages(own, "plain")
     for stage in (encoder, record, pretrain):
         assert flags_of(stage).get("env.pair", "cross") == "cross"
     assert flags_of(record)["env.randomization.part_friction"] == "[0.2, 0.45]"
     assert flags_of(encoder)["env.sensor_model"].endswith("plain/sensor_model.json")
     assert flags_of(pretrain)["policy.pretrained_encoder"] == str(encoder.output)
-    assert set(pretrain.needs) == {"record", "encoder"}
-    assert flags_of(compare.start_stage(own, 0))["dppo.encoder"] == "trained"
+    assert set(pretrain.needs) == {record.name, encoder.name}
+    assert flags_of(compare.finetune_stage(own, "plain", 0))["dppo.encoder"] == "trained"
+    other = f"diagnosed:{own.realities[0]}"
+    encoder, record, pretrain = compare.imitation_stages(own, other)
+    assert encoder.needs == record.needs == (compare.output_name(own.realities[0]),)
+    model = str(own.diagnosis(own.realities[0]) / "sensor_model.json")
+    assert flags_of(encoder)["env.sensor_model"] == flags_of(record)["env.sensor_model"] == model
+    assert flags_of(pretrain)["policy.pretrained_encoder"] == str(encoder.output)
     leave_results(compare, budget, {}, budget.seeds)
     rows = [row for row, _ in compare.reality_rows(budget.output_dir, dict.fromkeys(ORIGIN), "cross_gentle")]
     assert "| cross, 2 mm, 5 N at most (cross_gentle): row sharing, hysteresis | backlash |" in table(
@@ -161,7 +161,7 @@ def test_a_task_of_its_own_brings_its_encoder_and_its_name(budget, tmp_path, mon
 def test_unfinished_seeds_are_left_out(budget):
     leave_results(compare, budget, {}, budget.seeds)
     first, *others = budget.realities
-    compare.results_path(budget, "start", f"real:{first}", 4).unlink()
+    compare.results_path(budget, f"diagnosed:{first}", f"real:{first}", 4).unlink()
     results = compare.compare(budget)
     assert results[first]["seeds"] == [3]
     assert all(results[name]["seeds"] == [3, 4] for name in others)
@@ -171,17 +171,14 @@ def test_unfinished_seeds_are_left_out(budget):
 
 
 def test_a_failed_diagnosis_stops_its_own_policies_only(budget):
-    before, starts, policies = compare.lanes(budget)
-    done = before | starts
-    for stage in (stage for stages in done.values() for stage in stages):
+    before, policies = compare.lanes(budget)
+    for stage in (stage for stages in before.values() for stage in stages):
         stage.product.parent.mkdir(parents=True, exist_ok=True)
         stage.product.touch()
-    assert compare.runnable(done, policies) == policies
-    before[compare.output_name(budget.realities[0])][-1].product.unlink()
-    left = set(policies) - set(compare.runnable(done, policies))
+    assert compare.runnable(before, policies) == policies
+    (budget.diagnosis(budget.realities[0]) / "verdict.json").unlink()
+    left = set(policies) - set(compare.runnable(before, policies))
     assert left == {f"policy_diagnosed_row_sharing_and_hysteresis_{seed}" for seed in budget.seeds}
-    starts["start_3"][-1].product.unlink()
-    assert not any(name.endswith("_3") for name in compare.runnable(done, policies))
 
 
 def test_presses_follow_the_contract_and_the_hidden_pad(budget):

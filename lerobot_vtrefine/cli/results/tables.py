@@ -46,11 +46,6 @@ HANDLING = (
 """What fine-tuning's own evaluations measure beside success, over all episodes (the time: over successes)."""
 REACHED = (0.5, 0.75, 0.9)
 """Successes whose price in environment steps is told."""
-WORLDS = (
-    ("start", "the start"),
-    ("plain", "then the plain simulator"),
-    ("diagnosed", "then the diagnosed one"),
-)
 
 
 def demo_table(rows: Sequence[Run]) -> str:
@@ -100,20 +95,18 @@ def touch_table(rows: Sequence[Run]) -> str:
 
 
 def reality_table(rows: Sequence[Run]) -> str:
-    """Policies tuned in the plain and in the diagnosed simulator, in the stand-in reality and at home."""
+    """Policies trained in the plain and in the diagnosed simulator, in the stand-in reality and at home."""
     body = []
     for task in values(rows, "task"):
         chosen = pick(rows, task=task)
         named = next((str(row.extra["diagnosis"]) for row in chosen if "diagnosis" in row.extra), "-")
-        for world, words in WORLDS:
-            home = "the plain simulator" if world == "start" else "its own simulator"
-            away = pooled(pick(chosen, variant=f"{world} in reality"), seeds=world != "start")
+        for world in ("plain", "diagnosed"):
+            away = pooled(pick(chosen, variant=f"{world} in reality"), seeds=True)
+            home = pooled(pick(chosen, variant=f"{world} in its own simulator"), seeds=False)
             hidden = ": ".join(map(label, task.split(": ")))
-            first = [hidden, named] if world == "start" else ["", ""]
-            body.append(
-                [*first, words, away, pooled(pick(chosen, variant=f"{world} in {home}"), seeds=False)]
-            )
-    head = ["hidden in the stand-in reality", "diagnosis", "fine-tuned in"]
+            first = [hidden, named] if world == "plain" else ["", ""]
+            body.append([*first, f"the {world} simulator", away, home])
+    head = ["hidden in the stand-in reality", "diagnosis", "trained in"]
     return markdown([*head, "success in the stand-in reality", "in its own simulator"], body)
 
 
