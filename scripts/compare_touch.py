@@ -15,6 +15,7 @@ it continues. The comparison is printed and saved as ``comparison.json`` and ``c
 """
 
 import json
+import math
 import os
 import shutil
 import subprocess
@@ -262,7 +263,9 @@ def rate_text(row: dict) -> str:
 
 
 def interval_text(value: float, interval: list[float]) -> str:
-    """For example ``36 % [29, 42]``."""
+    """For example ``36 % [29, 42]``; one seed has no interval."""
+    if not all(map(math.isfinite, interval)):
+        return f"{100 * value:.0f} % (one seed)"
     return f"{100 * value:.0f} % [{100 * interval[0]:.0f}, {100 * interval[1]:.0f}]"
 
 

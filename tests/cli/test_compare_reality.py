@@ -113,6 +113,8 @@ def test_results_say_what_reality_costs_and_what_diagnosis_brings_back(budget):
     text = compare.as_text(results)
     assert "(explained: backlash) pays, 25 % [25, 25] over 2 seeds of 4 episodes" in text
     assert text.count("makes no difference that these seeds can show") == 3
+    alone = compare.as_text({name: compare.compare_one(budget, name, [3])})
+    assert "changes by -50 % (one seed) in the stand-in reality" in alone
 
 
 def test_comparison_becomes_rows_of_the_results(budget):

@@ -20,6 +20,8 @@ LABELS = {
     "kinova_1024": "two Kinova Gen3, round pair, 1024 worlds",
     "cross_gentle": "cross, 2 mm, 5 N at most (cross_gentle)",
     "cross_gentle_twin": "its twin: parts lie as expected (cross_gentle_twin)",
+    "cross_gentle_tuned": "the same, DPPO alone in the simulator named, all before it in the plain one",
+    "cross_gentle_imitation": "cross_gentle, imitation alone, encoder and all in the simulator named",
     "d_occluded": "D shape, hidden by the hands, 5 N at most (d_occluded)",
     "d_occluded_twin": "its twin: parts lie as expected (d_occluded_twin)",
     "cross_limited": "cross, 2 mm, a limit of 1.5 to 10 N that is told (cross_limited)",
