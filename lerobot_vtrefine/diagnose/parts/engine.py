@@ -19,6 +19,7 @@ from lerobot_vtrefine.diagnose.parts.episodes import AssumedScene, HandledEpisod
 from lerobot_vtrefine.diagnose.parts.mass import masses, remeasured
 from lerobot_vtrefine.diagnose.parts.payload import replay_loaded
 from lerobot_vtrefine.diagnose.parts.problem import Measured, Quantity, measure
+from lerobot_vtrefine.diagnose.parts.rules import FRICTION_ERROR
 from lerobot_vtrefine.diagnose.verdict import Cause, Verdict
 from lerobot_vtrefine.sim.scene import build_scene
 
@@ -72,7 +73,7 @@ def diagnose_parts(
     contacts = contacts_of(scene, episodes, untouched)
     found += measure([sliding.friction(scene, episodes, contacts)], seed)
     known = scene.scene.pad_friction
-    pads = Quantity("object_friction", "pad_friction", known, "1", sliding.FORM, None, PAD_FRICTION)
+    pads = Quantity("object_friction", "pad_friction", known, "1", FRICTION_ERROR, None, PAD_FRICTION)
     found.append(Measured(pads))
     found += measure([clearance(scene, episodes, contacts)], seed)
     return _summary(found)

@@ -14,6 +14,15 @@ import torch
 
 from lerobot_vtrefine.datasets.episodes import EpisodeFolder, RecordedEpisode, open_episodes
 from lerobot_vtrefine.diagnose.episode_replay.twin import read_ledger, recorded_twin
+from lerobot_vtrefine.diagnose.parts.rules import (
+    APART_M,
+    CLEAR_M,
+    HELD_TAXELS,
+    LIFTED_M,
+    SETTLE_S,
+    SIDEWAYS_M,
+    TOUCHED_COUNTS,
+)
 from lerobot_vtrefine.embodiments import Embodiment, get_embodiment
 from lerobot_vtrefine.embodiments.embodiment import PARTS
 from lerobot_vtrefine.sim.config import SceneConfig, TaskConfig
@@ -21,19 +30,6 @@ from lerobot_vtrefine.sim.pairs import Part, PartPair, load_pair
 
 Array = np.ndarray
 
-TOUCHED_COUNTS = 8
-"""A taxel this much above its idle level is pressed."""
-HELD_TAXELS = 6
-"""A pad with at least so many pressed taxels holds something, if its opposite does, too."""
-LIFTED_M = 0.0015
-"""A part raised this far hangs in the hand ..."""
-CLEAR_M = 0.02
-"""... and raised this far it surely touches nothing else."""
-APART_M = 0.012
-"""Parts whose mouths are further apart than this do not touch."""
-_SIDEWAYS_M = 0.04
-_SETTLE_S = 1.0
-"""Time after a touch, or after a part has left the table, in which servos are still recovering."""
 GRAVITY_M_S2 = 9.81
 
 
@@ -128,7 +124,7 @@ def handled(episode: RecordedEpisode, scene: AssumedScene) -> HandledEpisode:
     tip, _ = hands(body, episode.state)
     apart, hanging = _apart(tip, held, scene), _raised(tip[..., 2], held, LIFTED_M)
     clear = _raised(tip[..., 2], held, CLEAR_M)
-    settle = max(1, round(_SETTLE_S / max(float(np.median(np.diff(episode.time_s))), 1e-3)))
+    settle = max(1, round(SETTLE_S / max(float(np.median(np.diff(episode.time_s))), 1e-3)))
     return HandledEpisode(
         index=episode.index,
         time_s=episode.time_s.astype(float) - float(episode.time_s[0]),
@@ -193,5 +189,5 @@ def _apart(tip: Array, held: Array, scene: AssumedScene) -> Array:
         return np.ones(len(tip), dtype=bool)
     mouth = tip[:, socket] + [0.0, 0.0, scene.pair.mouth_z_m - scene.pair.socket.grip.centre_m[2]]
     between = lower_end - mouth
-    sideways = np.hypot(between[:, 0], between[:, 1]) > _SIDEWAYS_M
+    sideways = np.hypot(between[:, 0], between[:, 1]) > SIDEWAYS_M
     return sideways | (between[:, 2] > APART_M)

@@ -16,25 +16,22 @@ from lerobot_vtrefine.diagnose.parts.episodes import AssumedScene, HandledEpisod
 from lerobot_vtrefine.diagnose.parts.payload import replay_loaded
 from lerobot_vtrefine.diagnose.parts.problem import Measured, Quantity
 from lerobot_vtrefine.diagnose.parts.regression import Blocks, Line, slope_of
+from lerobot_vtrefine.diagnose.parts.rules import (
+    AGAIN,
+    DISAGREE,
+    MASS_ERROR,
+    MIN_EPISODES,
+    MIN_JOINTS,
+    TELLING_KG,
+)
 from lerobot_vtrefine.embodiments import Embodiment
 from lerobot_vtrefine.embodiments.embodiment import PARTS
 
 Array = np.ndarray
 
-FORM = (0.06, 0.004)
-"""What the method errs by on the twin's own recordings: part of the value, and at least so much [kg]."""
 _HEAVIER_KG = 0.05
 _LIGHTEST_KG = 0.005
-_AGAIN = 0.2
-"""A mass that is off by more than this part is estimated again from where it was found."""
 _MOVES_RAD_S = 0.02
-_LEAST_EPISODES = 3
-_TELLING_KG = 0.04
-"""A joint has a say in the mass if its own estimate's standard error is below this."""
-_FEWEST_JOINTS = 2
-_APART = 0.25
-"""Joints agree where their estimates differ from the common one by less than this part of it, or by
-chance."""
 
 
 def masses(
@@ -46,10 +43,10 @@ def masses(
     for part, known, item in zip(PARTS, assumed_kg, lines, strict=True):
         name = f"{part}_kg"
         if isinstance(item, str):
-            out.append(Quantity("object_mass", name, float(known), "kg", FORM, None, item))
+            out.append(Quantity("object_mass", name, float(known), "kg", MASS_ERROR, None, item))
             continue
         reason = _disagreement(scene.body, item, slope_of(Blocks.of(item), seed), seed)
-        out.append(Quantity("object_mass", name, float(known), "kg", FORM, Blocks.of(item), reason))
+        out.append(Quantity("object_mass", name, float(known), "kg", MASS_ERROR, Blocks.of(item), reason))
     return tuple(out)
 
 
@@ -64,7 +61,7 @@ def remeasured(
     assumed = np.array([item.quantity.assumed for item in found])
     change = np.array([item.line.value if item.line and not item.quantity.reason else 0.0 for item in found])
     near = np.maximum(assumed + change, _LIGHTEST_KG) - assumed
-    if not (np.abs(near) > _AGAIN * assumed).any():
+    if not (np.abs(near) > AGAIN * assumed).any():
         return tuple(found)
     out = []
     again_lines = _lines(scene, episodes, assumed + near)
@@ -92,7 +89,7 @@ def _lines(
             out.append(f"{scene.unheld(part)}: its mass is not told")
             continue
         seen = [bool(e.free[:, hand].any() and e.carried[:, hand].any()) for e in episodes]
-        if sum(seen) < _LEAST_EPISODES:
+        if sum(seen) < MIN_EPISODES:
             out.append(
                 f"the {part} is not picked up in sight of the encoders: a hand that always holds it cannot "
                 "tell its weight from offsets; record picking it up from the table"
@@ -111,13 +108,13 @@ def _disagreement(body: Embodiment, blocks: list[tuple[Array, Array, Array]], li
         if not any(effect.any() for _, effect, _ in own):
             continue
         alone = slope_of(Blocks.of(own), seed)
-        if alone.error > _TELLING_KG:
+        if alone.error > TELLING_KG:
             continue
         chance = 3 * np.hypot(alone.error, line.error)
-        near = abs(alone.value - line.value) < max(_APART * abs(line.value), chance)
+        near = abs(alone.value - line.value) < max(DISAGREE * abs(line.value), chance)
         agree += near and alone.value * line.value > 0
         differ += [] if near else [joint.name]
-    if agree >= _FEWEST_JOINTS and len(differ) < agree:
+    if agree >= MIN_JOINTS and len(differ) < agree:
         return ""
     return (
         f"joints contradict each other about it ({', '.join(differ) or 'too few can tell'}): it is the robot"

@@ -15,12 +15,10 @@ from lerobot_vtrefine.diagnose.core.problem import OptionalSteps, PlainCandidate
 from lerobot_vtrefine.diagnose.core.rules import SURE
 from lerobot_vtrefine.diagnose.evidence import Evidence
 from lerobot_vtrefine.diagnose.parts.regression import Blocks, Line, slope_of
+from lerobot_vtrefine.diagnose.parts.rules import BEYOND
 from lerobot_vtrefine.diagnose.verdict import Parameter
 
 Array = np.ndarray
-
-_BEYOND = 2.0
-"""By how many standard errors, and by how many times the method's own error, a number must differ."""
 
 
 @dataclass(frozen=True)
@@ -76,7 +74,7 @@ class Measured:
         """Smallest difference that these episodes would have shown."""
         if self.line is None:
             return None
-        return max(SURE * self.line.error, _BEYOND * self.quantity.slack(self.line.value))
+        return max(SURE * self.line.error, BEYOND * self.quantity.slack(self.line.value))
 
     @property
     def evidence(self) -> Evidence:
@@ -195,7 +193,7 @@ class PartProblem(OptionalSteps):
         pairs = zip(self.quantities, self.lines, strict=True)
         return np.array(
             [
-                not item.reason and abs(line.value) > _BEYOND * max(line.error, item.slack(line.value))
+                not item.reason and abs(line.value) > BEYOND * max(line.error, item.slack(line.value))
                 for item, line in pairs
             ]
         )

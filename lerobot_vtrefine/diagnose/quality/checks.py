@@ -13,13 +13,9 @@ from lerobot_vtrefine.diagnose.quality import (
     wiring,
 )
 from lerobot_vtrefine.diagnose.quality.edits import Check, apply
+from lerobot_vtrefine.diagnose.quality.rules import MIN_PART, MIN_TRIALS
 from lerobot_vtrefine.diagnose.recordings import RecordingSet
 from lerobot_vtrefine.diagnose.verdict import DataIssue
-
-MIN_TRIALS = 4
-"""Fewer leave none for choosing beside those that are held out."""
-MIN_PART = 1 / 3
-"""If less than this part of a set is sound, the rest is not trusted either."""
 
 # Each check sees what the ones before it left: first frames and times, then what the pad says. Frames without
 # numbers are dropped after the clock was checked, which would take them for lost ones; all other checks need

@@ -5,13 +5,9 @@ from dataclasses import dataclass
 import numpy as np
 
 from lerobot_vtrefine.diagnose.pad.indenters import trial_forces, trial_heights
+from lerobot_vtrefine.diagnose.quality.rules import CLEAR_M, TOUCH_FORCE
 from lerobot_vtrefine.diagnose.recordings import RecordingSet, Trial
 from lerobot_vtrefine.tactile.layout import PadLayout
-
-CLEAR_M = 2e-4
-"""An indenter this far above the face surely does not touch it."""
-TOUCH_FORCE = 0.05
-"""Part of a trial's peak force above which it counts as loaded."""
 
 
 @dataclass(frozen=True)

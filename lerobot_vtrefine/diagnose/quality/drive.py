@@ -6,21 +6,21 @@ from dataclasses import replace
 import numpy as np
 
 from lerobot_vtrefine.diagnose.quality.contact import Press, presses
-from lerobot_vtrefine.diagnose.quality.edits import KEPT, MINORITY, NO_VERDICT, SET_ASIDE, Finding
+from lerobot_vtrefine.diagnose.quality.edits import KEPT, NO_VERDICT, SET_ASIDE, Finding
+from lerobot_vtrefine.diagnose.quality.rules import (
+    ALONG,
+    CLEAR_PART,
+    CLEAR_SIZE,
+    CLEARLY,
+    HEAVY_N,
+    LATE_S,
+    MINORITY,
+    TARE,
+    UNRELATED,
+)
 from lerobot_vtrefine.diagnose.recordings import RecordingSet, Trial
 
-ALONG, CLEARLY, NONE = 0.5, 0.3, 0.2
-"""Correlation with the answer that depth or force must reach when turned round, and by how much more than as
-recorded; and what is no correlation."""
-LATE_S = 0.5
-"""Readings that come this late still follow the press."""
-CLEAR_SIZE, CLEAR_PART = 8.0, 0.02
-"""An answer is clear if it is this many deviations of a frame's noise and this part of full scale."""
 GRAMS_PER_NEWTON = 1e3 / 9.80665
-HEAVY_N = 150.0
-"""Pads and their indenters are pressed with some tens of newtons."""
-TARE = 0.1
-"""Part of the peak force that a load cell shows at rest if nobody set it to zero."""
 
 
 def check_drives(recordings: RecordingSet) -> Iterator[Finding]:
@@ -106,7 +106,7 @@ def _cells(recordings: RecordingSet) -> Iterator[tuple[int, str, str, np.ndarray
         if _turned(trial, force, answer):
             yield index, "force_n falls as the readings rise", "repaired: its sign turned round", -force
             continue
-        if _follows(trial, force, answer) < NONE:
+        if _follows(trial, force, answer) < UNRELATED:
             yield index, "force_n does not follow the press", "repaired: not used", None
             continue
         rest = float(np.median(force[press.untouched])) if press.untouched.sum() >= 3 else 0.0

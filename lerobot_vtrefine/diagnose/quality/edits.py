@@ -14,8 +14,6 @@ SET_ASIDE = "set aside"
 KEPT = "kept"
 NO_VERDICT = "no verdict"
 """Nothing in the set can be judged before its maker has mended this."""
-MINORITY = 0.5
-"""A fault of fewer trials than this part of the set is theirs; of more, it is a property of the rig."""
 
 
 @dataclass(frozen=True)

@@ -16,22 +16,17 @@ from lerobot_vtrefine.diagnose.quality.edits import (
     plural,
     take,
 )
+from lerobot_vtrefine.diagnose.quality.rules import (
+    FEW_SPIKES,
+    GAP,
+    LEAST_MOTION_M,
+    MAX_BROKEN,
+    MAX_GAP_S,
+    MAX_MISSING,
+    MIN_FRAMES,
+    SPIKE_FAR,
+)
 from lerobot_vtrefine.diagnose.recordings import RecordingSet
-
-MAX_BROKEN = 0.1
-"""A trial with a larger part of frames without numbers is set aside."""
-MIN_FRAMES = 10
-"""Shorter trials carry no rates and no history."""
-GAP = 1.75
-"""A step longer than this times the usual one has lost frames."""
-MAX_GAP_S = 0.5
-"""Over a longer gap what happened to the pad is unknown; frames were lost, or the clock was set."""
-MAX_MISSING = 0.2
-FEW_SPIKES = 0.02
-"""Part of the frames that may be spikes; more are a motion."""
-SPIKE_FAR = 1.0
-"""A spike lies beyond all other frames by this many times their whole range."""
-LEAST_MOTION_M = 1e-4
 
 
 def check_optional(recordings: RecordingSet) -> Iterator[Finding]:

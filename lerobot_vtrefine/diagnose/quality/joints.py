@@ -5,17 +5,9 @@ from collections.abc import Iterator
 import numpy as np
 from scipy.optimize import linear_sum_assignment
 
-from lerobot_vtrefine.diagnose.quality.edits import KEPT, MINORITY, SET_ASIDE, Finding
+from lerobot_vtrefine.diagnose.quality.edits import KEPT, SET_ASIDE, Finding
+from lerobot_vtrefine.diagnose.quality.rules import BETTER_ORDER, EXCHANGED, JUMP_RAD, MINORITY, MOVES, STILL
 from lerobot_vtrefine.diagnose.recordings import RecordingSet, RobotTrial
-
-MOVES = 0.1
-"""A joint moves in a trial if its command's range is this part of its largest range in the set."""
-STILL = 1e-3
-"""An encoder sticks if its range is below this part of the command's."""
-JUMP_RAD = 1.0
-"""No joint moves further between two frames, unless its command does."""
-WRONG, BETTER = 0.5, 0.4
-"""1 − correlation with the own command that is suspicious, and what part of it another order must leave."""
 
 
 def check_encoders(recordings: RecordingSet) -> Iterator[Finding]:
@@ -87,6 +79,6 @@ def _exchanged(trial: RobotTrial, recordings: RecordingSet) -> str | None:
     if len(moved) == 0:
         return None
     own, other = np.diag(cost)[moved].mean(), cost[moved, order[moved]].mean()
-    if own < WRONG or other > BETTER * own:
+    if own < EXCHANGED or other > BETTER_ORDER * own:
         return None
     return " and ".join(recordings.joints[joint] for joint in joints[moved])

@@ -6,21 +6,24 @@ from dataclasses import replace
 import numpy as np
 
 from lerobot_vtrefine.diagnose.quality.contact import presses
-from lerobot_vtrefine.diagnose.quality.edits import KEPT, MINORITY, NO_VERDICT, SET_ASIDE, Finding
+from lerobot_vtrefine.diagnose.quality.edits import KEPT, NO_VERDICT, SET_ASIDE, Finding
+from lerobot_vtrefine.diagnose.quality.rules import (
+    ALWAYS,
+    BELOW,
+    BEYOND,
+    HARDLY,
+    LIGHT,
+    MIN_WRAPS,
+    MINORITY,
+    ONE_TAXEL,
+    TOUCHED_BELOW,
+    WRAP,
+)
 from lerobot_vtrefine.diagnose.recordings import RecordingSet
 
 CONVERTERS = (1.0, 3.3, 5.0, 10.0, 255.0, 1023.0, 4095.0, 16383.0, 65535.0, 16777215.0)
 """Full scales in use: normalised readings, volts, and converters of 8 to 24 bits."""
-HARDLY = 0.02
-"""Readings that stay below this part of full scale through a whole set are in another unit."""
-BEYOND = 1.01
-BELOW, TOUCHED_BELOW = 0.05, 0.5 / 255.0
-"""Parts of full scale below zero that mean an idle level taken away, and that no converter gives."""
 BYTE = 128
-WRAP, MIN_WRAPS = 0.7, 2
-"""Fall within a frame, in parts of full scale, that no release under rising load makes, and how often."""
-LIGHT, ALWAYS, ONE_TAXEL = 0.05, 0.95, 0.7
-"""Frames of more than this load, nearly all with the same largest reading, which is not one stuck taxel's."""
 
 
 def check_readings(recordings: RecordingSet) -> Iterator[Finding]:

@@ -6,17 +6,18 @@ from itertools import pairwise
 import numpy as np
 
 from lerobot_vtrefine.diagnose.quality.contact import Press, presses
-from lerobot_vtrefine.diagnose.quality.edits import KEPT, MINORITY, SET_ASIDE, Finding, few, place, plural
+from lerobot_vtrefine.diagnose.quality.edits import KEPT, SET_ASIDE, Finding, few, place, plural
+from lerobot_vtrefine.diagnose.quality.rules import (
+    ALIVE,
+    DEAD,
+    DRIVEN,
+    LOADED,
+    MINORITY,
+    NO_ANSWER,
+    STUCK,
+    TINY_M,
+)
 from lerobot_vtrefine.diagnose.recordings import RecordingSet
-
-DRIVEN, LOADED = 0.1, 0.2
-"""Parts of a trial's peak, in drive and in readings, that are too much for its first frame."""
-TINY_M = 5e-5
-"""Touching this lightly is not a loaded start: rigs find the face with that error."""
-NO_ANSWER = 0.03
-DEAD, ALIVE = 0.05, 0.5
-"""Slopes of reading over drive, relative to the usual one, of channels that do not and that do answer."""
-STUCK = 0.98
 
 
 def check_start(recordings: RecordingSet) -> Iterator[Finding]:

@@ -6,15 +6,18 @@ from typing import Any
 
 import numpy as np
 
-from lerobot_vtrefine.diagnose.quality.edits import KEPT, MINORITY, Finding
+from lerobot_vtrefine.diagnose.quality.edits import KEPT, Finding
+from lerobot_vtrefine.diagnose.quality.rules import (
+    ALIKE,
+    LONG_PAUSE,
+    MINORITY,
+    OVERLAP,
+    OVERLAP_S,
+    SAME_PLACE_M,
+)
 from lerobot_vtrefine.diagnose.recordings import RecordingSet, RobotTrial
 
-OVERLAP_S, OVERLAP = 0.5, 0.02
-"""Trials may seem to overlap by this much, and this part of their length, from rounding."""
-HOUR_S, LONG_PAUSE = 3600.0, 100.0
-ALIKE = 0.25
-"""Root mean square difference, in parts of the range, of trials that were not driven alike."""
-SAME_PLACE_M = 1e-3
+HOUR_S = 3600.0
 
 
 def check_session(recordings: RecordingSet) -> Iterator[Finding]:

@@ -10,20 +10,20 @@ from typing import Any
 
 import numpy as np
 
-from lerobot_vtrefine.diagnose.quality.edits import MINORITY, SET_ASIDE, Finding
+from lerobot_vtrefine.diagnose.quality.edits import SET_ASIDE, Finding
+from lerobot_vtrefine.diagnose.quality.rules import (
+    CROWDED,
+    CROWDED_STEP_S,
+    FAR_START_S,
+    FEW_SPIKES,
+    MINORITY,
+    PLACES_M,
+    ROOM_C,
+    SHORT_STEP_S,
+    SLOWEST_STEP_S,
+    STILL_M,
+)
 from lerobot_vtrefine.diagnose.recordings import RecordingSet
-
-SPIKES = 0.02
-"""Values that only this part of the frames, or less, exceeds do not tell of another unit."""
-STILL_M = 2e-5
-"""A depth that varies less than this in a whole trial is not a press: its zero was wrong, not its unit."""
-SLOWEST_STEP_S, SHORT_STEP_S = 3.0, 1.0
-"""Frames further apart are taken for another unit of time; in the right one they are not as far apart."""
-CROWDED, CROWDED_STEP_S = 1.5, 0.3
-"""Trials that last longer than so many times the time between their starts cannot be in seconds, if their
-frames are further apart than this."""
-FAR_START_S = 10.0
-"""A first frame later than this, and than the trial is long, was not timed from the trial's start."""
 
 
 @dataclass(frozen=True)
@@ -41,9 +41,6 @@ class Mistake:
 
 
 ZERO_C_IN_K = 273.15
-ROOM_C = (-60.0, 150.0)
-PLACES_M = 0.3
-"""No indenter that presses a pad is further than this from its centre."""
 SMALL_LENGTHS = (("millimetres", 1e3), ("micrometres", 1e6))
 DEGREES = (("degrees", 180 / np.pi),)
 SHORT_TIMES = (("milliseconds", 1e3), ("microseconds", 1e6), ("nanoseconds", 1e9))
@@ -100,7 +97,7 @@ def _largest(values: np.ndarray) -> float:
 def _unit(values: np.ndarray, mistake: Mistake) -> tuple[str, float] | None:
     """The unit that values are in, with its factor; None where none explains them."""
     beyond = np.abs(values) > mistake.limit
-    if 0 < beyond.reshape(len(values), -1).any(1).mean() < SPIKES:
+    if 0 < beyond.reshape(len(values), -1).any(1).mean() < FEW_SPIKES:
         return None
     for unit, factor in mistake.units:
         if _largest(values) / factor <= mistake.limit:

@@ -13,19 +13,17 @@ import numpy as np
 from scipy.optimize import linear_sum_assignment
 
 from lerobot_vtrefine.diagnose.quality.contact import Press, presses
-from lerobot_vtrefine.diagnose.quality.edits import KEPT, MINORITY, SET_ASIDE, Finding
+from lerobot_vtrefine.diagnose.quality.edits import KEPT, SET_ASIDE, Finding
+from lerobot_vtrefine.diagnose.quality.rules import (
+    BETTER_ORDER,
+    BEYOND_NOISE,
+    MIN_IDLE_SPREAD,
+    MINORITY,
+    MISWIRED,
+    STRAY,
+)
 from lerobot_vtrefine.diagnose.recordings import RecordingSet
 
-BETTER = 0.4
-"""Another order of the lines must leave less than this part of the squared error ..."""
-WRONG = 0.1
-"""... and the recorded order more than this part of the signal unexplained."""
-MIN_IDLE_SPREAD = 3.0
-"""Idle maps identify lines only if taxels differ by this many deviations of the map's own noise ..."""
-BEYOND_NOISE = 3.0
-"""... and a map is another one's only if it differs by this many times the square that noise makes."""
-STRAY = 0.1
-"""Misplaced lines show at least this part of the signal where nothing presses; dead ones do not."""
 MAX_FRAMES = 100
 
 
@@ -79,7 +77,7 @@ class Costs:
             (self.transposed, "rows and columns exchanged"),
         ]
         error, text = min(options)
-        clear = error < BETTER * self.recorded and self.recorded > WRONG * self.signal
+        clear = error < BETTER_ORDER * self.recorded and self.recorded > MISWIRED * self.signal
         return text if text and clear else None
 
 
