@@ -1,9 +1,9 @@
 """The hole's clearance, from how far the plug goes sideways in it before the walls push back.
 
-Fingers centre their parts across the pads, so both hands' encoders tell where the plug is in the hole along
-that axis, and the arms' give tells when a wall pushes. In frames with a push, place = zero -+ half the
+Fingers centre their parts across the pads, so both hands' encoders measure the plug's place in the hole along
+that axis, and the arms' deflection shows when a wall pushes. In frames with a push, place = zero -+ half the
 clearance - give x force, the sign being the force's. The zero is fitted, too: walls on both sides are needed.
-So is the give, from what is known of it beforehand: arms whose servos are soft push too evenly to show it.
+So is the give, with a prior: arms with soft servos push too evenly to show it.
 """
 
 from collections.abc import Sequence
@@ -98,7 +98,7 @@ def clearance(
 def _blocks(
     assumed: float, episodes: Sequence[HandledEpisode], contacts: Sequence[Contact]
 ) -> tuple[Blocks | None, str]:
-    """None with the reason where walls are not felt."""
+    """None with the reason where there is no contact with the walls."""
     blocks, walls = [], np.zeros(2, dtype=int)
     for episode, contact in zip(episodes, contacts, strict=True):
         offset = contact.place_m[:, 1] - contact.place_m[:, 0]

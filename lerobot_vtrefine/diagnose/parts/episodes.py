@@ -1,8 +1,8 @@
-"""Episodes of the twin's own robot, with what the pads tell about when parts are held and when they meet.
+"""Episodes of the twin's own robot, with what the pads say about when parts are held and when they meet.
 
-Shapes: T frames, J joints, A hands in the order of the body's arms. Nothing here reads what only a simulator
-knows: a simulated dataset's note tells which scene was *assumed*, not how its episodes began nor what was
-hidden in them.
+Shapes: T frames, J joints, A hands in the order of the body's arms. Nothing here uses what only a simulator
+knows: a simulated dataset's note says which scene was *assumed*, not how its episodes began or which faults
+were hidden in them.
 """
 
 from collections.abc import Sequence
@@ -58,11 +58,13 @@ class AssumedScene:
     def unheld(self, part: str) -> str:
         """Why no hand holds the part; empty where one does."""
         if part == "socket" and self.scene.socket == "stands":
-            return "the socket stands on the table, and no hand feels it"
+            return "the socket stands on the table, and no hand holds it"
         if self.body.holders[PARTS.index(part)] is None:
             return f"{self.body.name} has no hand that holds the {part}"
         if self.body.pads_per_arm < 2:
-            return f"{self.body.name} has one pad per hand: whether it holds the {part} takes two that face"
+            return (
+                f"{self.body.name} has one pad per hand: whether it holds the {part} takes two opposite ones"
+            )
         return ""
 
     def weights_n(self, episodes: "Sequence[HandledEpisode]", mass_kg: Array) -> list[Array]:
@@ -87,13 +89,13 @@ class HandledEpisode:
     held: Array
     """(T, A) bool: both pads of the hand are pressed."""
     hanging: Array
-    """(T, A) bool: the hand bears a part's weight."""
+    """(T, A) bool: the hand carries a part's weight."""
     carried: Array
     """(T, A) bool: and has done so for a while, and nothing else touches the part."""
     free: Array
     """(T, A) bool: the hand is empty and has been so for a while."""
     together: Array
-    """(T,) bool: all hands hold their parts, so near that these may touch."""
+    """(T,) bool: all hands hold their parts, so close that these may touch."""
 
 
 def assumed_scene(folder: EpisodeFolder) -> AssumedScene | None:
@@ -111,7 +113,7 @@ def read_episodes(root: Path, scene: AssumedScene) -> tuple[HandledEpisode, ...]
 
 
 def handled(episode: RecordedEpisode, scene: AssumedScene) -> HandledEpisode:
-    """Tell an episode's phases by its pads and by where its hands are."""
+    """An episode's phases, by its pads and the positions of its hands."""
     body, count = scene.body, len(episode.state)
     pressed = np.zeros((count, len(body.pad_names)), dtype=int)
     for place, name in enumerate(body.pad_names):
@@ -155,7 +157,7 @@ def without_hands(body: Embodiment, episode: HandledEpisode) -> Array:
 
 
 def _raised(height: Array, held: Array, least_m: float) -> Array:
-    """(T, A): held, and higher than where the hand took hold; parts held from the start hang already."""
+    """(T, A): held, and higher than where it was grasped; parts held from the start count as raised."""
     out = np.zeros_like(held)
     for hand in range(held.shape[1]):
         frames = np.flatnonzero(held[:, hand])

@@ -1,7 +1,7 @@
 """Friction of the plug, from the pull against sliding while it is pressed down on the table.
 
-The arm's give tells both forces. Only slides across the pads count: there the joints of ALOHA that tell them
-have next to no dry friction of their own.
+The arm's deflection measures both forces. Only slides across the pads count: there, the joints of ALOHA that
+measure them have almost no dry friction of their own.
 """
 
 from collections.abc import Sequence

@@ -1,10 +1,10 @@
-"""The parts' masses, by how much further the servos give way under them than in the twin.
+"""The parts' masses, by how much further the servos deflect under them than in the twin.
 
 The twin's arms are replayed twice with weights in the hands while these carry parts: as assumed, and heavier.
 What the recorded joints do beyond the first replay is explained by a multiple of the difference of both, one
-number per hand for all its joints, beside what the robot itself may get wrong: an offset and a pull against
-the direction of motion for every joint. Only if the mass lessens the error of episodes
-that the fit has not seen, all of them together saying so, is it the parts that are heavier or lighter.
+number per hand for all its joints, beside what the robot itself may add: an offset and a friction against
+the direction of motion for every joint. Only if the mass reduces the error on episodes
+left out of the fit, tested over all of them together, are the parts called heavier or lighter.
 """
 
 from collections.abc import Sequence
@@ -57,7 +57,7 @@ def remeasured(
     seed: int,
 ) -> tuple[Measured, ...]:
     """Masses that are far off, taken anew where they were found: with friction in the joints the weight's
-    effect is no straight line. What was found stays found."""
+    effect is not linear. What was found stays found."""
     assumed = np.array([item.quantity.assumed for item in found])
     change = np.array([item.line.value if item.line and not item.quantity.reason else 0.0 for item in found])
     near = np.maximum(assumed + change, _LIGHTEST_KG) - assumed
@@ -86,13 +86,13 @@ def _lines(
     for part in PARTS:
         hand = scene.hand_of(part)
         if hand is None:
-            out.append(f"{scene.unheld(part)}: its mass is not told")
+            out.append(f"{scene.unheld(part)}: its mass is not measured")
             continue
         seen = [bool(e.free[:, hand].any() and e.carried[:, hand].any()) for e in episodes]
         if sum(seen) < MIN_EPISODES:
             out.append(
-                f"the {part} is not picked up in sight of the encoders: a hand that always holds it cannot "
-                "tell its weight from offsets; record picking it up from the table"
+                f"the {part} is never picked up: for a hand that always holds it, its weight cannot be "
+                "distinguished from encoder offsets; record picking it up from the table"
             )
         else:
             paths = zip(episodes, *replays, strict=True)
@@ -101,7 +101,7 @@ def _lines(
 
 
 def _disagreement(body: Embodiment, blocks: list[tuple[Array, Array, Array]], line: Line, seed: int) -> str:
-    """Why it is not the mass, although it helps: a mass pulls at every pitching joint, a fault at its own."""
+    """Why it is not the mass, although it helps: a mass loads every pitching joint, a fault only its own."""
     agree, differ = 0, []
     for channel, joint in enumerate(body.joints):
         own = [(item[0][:, [channel]], item[1][:, [channel]], item[2][:, [channel]]) for item in blocks]
@@ -116,9 +116,8 @@ def _disagreement(body: Embodiment, blocks: list[tuple[Array, Array, Array]], li
         differ += [] if near else [joint.name]
     if agree >= MIN_JOINTS and len(differ) < agree:
         return ""
-    return (
-        f"joints contradict each other about it ({', '.join(differ) or 'too few can tell'}): it is the robot"
-    )
+    those = ", ".join(differ) or "too few are sensitive to it"
+    return f"joints contradict each other about it ({those}): it is the robot"
 
 
 def _block(

@@ -4,7 +4,7 @@
 BEYOND = 2.0
 """Standard errors, and multiples of the method's own error, by which a number must differ."""
 MASS_ERROR, FRICTION_ERROR, CLEARANCE_ERROR = (0.06, 0.004), (0.1, 0.02), (0.03, 6e-5)
-"""What the method errs by on the twin's own recordings: part of the value, and at least so much [kg, 1,
+"""The method's error on the twin's own recordings: part of the value, and at least so much [kg, 1,
 m]."""
 MIN_EPISODES = 3
 """Episodes that must show a number: two that disagree would not say which is right."""

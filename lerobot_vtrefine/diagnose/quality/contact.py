@@ -1,4 +1,4 @@
-"""What quality control needs to know about contact: when a trial is untouched, and where it should answer."""
+"""Contact as quality control needs it: when a pad is untouched, and where it should respond."""
 
 from dataclasses import dataclass
 
@@ -12,7 +12,7 @@ from lerobot_vtrefine.tactile.layout import PadLayout
 
 @dataclass(frozen=True)
 class Press:
-    """A trial as seen by the checks.
+    """A trial as the checks use it.
 
     Attributes:
         drive: (N, R*C) what presses each taxel: penetration [m], or its share of the force [N].

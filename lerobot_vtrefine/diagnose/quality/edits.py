@@ -13,7 +13,7 @@ from lerobot_vtrefine.diagnose.verdict import DataIssue
 SET_ASIDE = "set aside"
 KEPT = "kept"
 NO_VERDICT = "no verdict"
-"""Nothing in the set can be judged before its maker has mended this."""
+"""The set cannot be judged before this is corrected in the recordings."""
 
 
 @dataclass(frozen=True)

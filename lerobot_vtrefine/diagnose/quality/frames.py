@@ -104,7 +104,7 @@ def check_repeats(recordings: RecordingSet) -> Iterator[Finding]:
 
 
 def check_spikes(recordings: RecordingSet) -> Iterator[Finding]:
-    """A few frames whose place no motion reaches are dropped."""
+    """A few frames at implausible positions are dropped."""
     for index, trial in enumerate(recordings.trials if recordings.kind == "pad" else ()):
         found = {
             name: wrong
@@ -113,14 +113,13 @@ def check_spikes(recordings: RecordingSet) -> Iterator[Finding]:
         }
         if found:
             frames = np.any(list(found.values()), axis=0)
-            problem = (
-                f"{plural(int(frames.sum()), 'frame')} of {len(frames)} far off in {' and '.join(found)}"
-            )
+            count = plural(int(frames.sum()), "frame")
+            problem = f"{count} of {len(frames)} with implausible {' and '.join(found)}"
             yield Finding(index, problem, "repaired: frames dropped", take(trial, ~frames))
 
 
 def _spikes(values: np.ndarray) -> np.ndarray:
-    """Frames (N,) far beyond all others; none where these are more than a few."""
+    """Frames (N,) far beyond all others; none if there are more than a few."""
     known = np.isfinite(values)
     count = int(FEW_SPIKES * len(values))
     none = np.zeros(len(values), dtype=bool)

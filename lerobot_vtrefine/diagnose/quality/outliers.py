@@ -1,4 +1,4 @@
-"""Checks of single trials that are unlike all others: files that were mixed up, supplies that were low."""
+"""Checks of single trials that differ from all others: files that were mixed up, low supply voltages."""
 
 from collections.abc import Iterator
 
@@ -34,7 +34,9 @@ def check_odd(recordings: RecordingSet) -> Iterator[Finding]:
         others = strange[(conditions == conditions[index]) & (np.arange(len(strange)) != index)]
         if not (APART * others[np.isfinite(others)] > strange[index]).any():
             part = f"{100 * strange[index]:.0f} %"
-            problem = f"{part} of the readings' power is not of the recorded motion, unlike in other trials"
+            problem = (
+                f"{part} of the readings' power does not follow the recorded motion, unlike in other trials"
+            )
             yield Finding(int(index), problem, SET_ASIDE)
 
 
@@ -61,7 +63,7 @@ def check_gain(recordings: RecordingSet) -> Iterator[Finding]:
     if 0 < len(worst) <= max(1.0, FEW * len(gains)):
         for index in worst.values():
             part = f"{100 * np.exp(offsets[index]):.0f} %"
-            yield Finding(index, f"reads {part} of what the same motion gives in other trials", SET_ASIDE)
+            yield Finding(index, f"reads {part} of what other trials of the same motion read", SET_ASIDE)
 
 
 def _gain(press: Press) -> float:

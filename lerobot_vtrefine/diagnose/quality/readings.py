@@ -1,4 +1,4 @@
-"""Checks of the scale of readings: normalised, beyond full scale, below zero, turned round."""
+"""Checks of the scale of readings: normalised, beyond full scale, below zero, inverted."""
 
 from collections.abc import Iterator
 from dataclasses import replace
@@ -46,7 +46,7 @@ def check_readings(recordings: RecordingSet) -> Iterator[Finding]:
         yield from _raised(recordings, usual_low, float(top.max()))
         negative = bottom < usual_low - BELOW * recordings.full_scale
     elif (bottom < -TOUCHED_BELOW * recordings.full_scale).mean() >= MINORITY:
-        problem = f"raw falls below 0 in most trials, to {bottom.min():.3g}: an idle level was taken away"
+        problem = f"raw falls below 0 in most trials, to {bottom.min():.3g}: an idle level was subtracted"
         yield Finding(None, problem, f"{KEPT}: predictions never fall below 0")
     usual = float(np.median(top))
     for index, reading in enumerate(top):
@@ -60,10 +60,10 @@ def check_readings(recordings: RecordingSet) -> Iterator[Finding]:
 
 
 def _other_scale(recordings: RecordingSet, top: np.ndarray, above: bool) -> Iterator[Finding]:
-    """Full scale as the readings have it, where that of `recording.json` cannot be theirs."""
+    """Full scale as the readings suggest, where that of `recording.json` cannot be right."""
     full = recordings.full_scale
     if not top.max() > 0:
-        return  # no answer at all, which other checks say
+        return  # no response at all, which other checks report
     scale = next((value for value in CONVERTERS if value >= np.median(top) / BEYOND), float(top.max()))
     if above:
         problem = f"raw reaches {np.median(top):.4g}, above full_scale {full:g}, in most trials"
@@ -77,7 +77,7 @@ def _other_scale(recordings: RecordingSet, top: np.ndarray, above: bool) -> Iter
 
 
 def _raised(recordings: RecordingSet, lowest: float, highest: float) -> Iterator[Finding]:
-    """Readings of which something was taken away, or that a signed byte wrapped."""
+    """Readings from which something was subtracted, or that wrapped as signed bytes."""
     wrapped = _whole(recordings) and -BYTE <= lowest < -0.75 * BYTE and 0.75 * BYTE < highest < BYTE
     for index, trial in enumerate(recordings.trials):
         if wrapped:

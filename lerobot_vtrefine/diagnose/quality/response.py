@@ -1,4 +1,4 @@
-"""Checks of what the pad answers: loaded starts, trials without an answer, dead and stuck channels."""
+"""Checks of the pad's response: loaded starts, trials without a response, dead and stuck channels."""
 
 from collections.abc import Iterator
 from itertools import pairwise
@@ -35,7 +35,7 @@ def check_start(recordings: RecordingSet) -> Iterator[Finding]:
         if driven[index] and not rig:
             part = 100 * press.load[0] / press.load.max()
             yield Finding(
-                index, f"starts loaded: the first frame carries {part:.0f} % of the peak", SET_ASIDE
+                index, f"starts loaded: the first frame has {part:.0f} % of the peak load", SET_ASIDE
             )
         elif reading[index] > LOADED and not rig and (reading > LOADED).mean() < MINORITY:
             problem = (
@@ -67,7 +67,7 @@ def _reading_at_start(found: list[Press]) -> np.ndarray:
 
 
 def check_answers(recordings: RecordingSet) -> Iterator[Finding]:
-    """Trials, and channels within a trial, that do not answer although other trials do."""
+    """Trials, and channels within a trial, that do not respond although others do."""
     slope, covered = _slopes(presses(recordings))
     whole = np.array([_weighted(slope[k], covered[k]) for k in range(len(slope))])
     usual = np.nanmedian(whole) if np.isfinite(whole).any() else np.nan
@@ -75,7 +75,7 @@ def check_answers(recordings: RecordingSet) -> Iterator[Finding]:
         return
     silent = whole < NO_ANSWER * usual
     for index in np.flatnonzero(silent):
-        yield Finding(int(index), "does not answer: the readings ignore the press", SET_ASIDE)
+        yield Finding(int(index), "no response: the readings do not follow the press", SET_ASIDE)
     if not _outlined(recordings):
         return
     pressed = covered > 0.3 * np.nanmax(covered, initial=1e-30)
@@ -87,7 +87,7 @@ def check_answers(recordings: RecordingSet) -> Iterator[Finding]:
 
 
 def _outlined(recordings: RecordingSet) -> bool:
-    """Whether it is known which taxels are pressed: a load alone tells only under flat-ended indenters."""
+    """Whether it is known which taxels are pressed: a load alone says so only under flat-ended indenters."""
     flat = all(trial.object["shape"] in ("flat", "cylinder") for trial in recordings.trials)
     return flat or all(trial.depth_m is not None for trial in recordings.trials)
 

@@ -25,8 +25,8 @@ frames by this many times their whole range, which counts as this long at least.
 
 # Units.
 PITCH_M, INDENTER_M = (5e-5, 0.1), (5e-5, 0.5)
-"""Smallest and largest distance of taxels that is believed (skins of chips, and mats to stand on), and radii,
-sides and meshes of indenters."""
+"""Smallest and largest distance of taxels that is plausible (skins of chips, and mats to stand on), and of
+radii, sides and meshes of indenters."""
 COARSEST_MM = 0.4
 """Numbers between the limit in metres and this one may be centimetres as well as millimetres."""
 PLACES_M = 0.3
@@ -58,37 +58,37 @@ CLEAR_M = 2e-4
 TOUCH_FORCE = 0.05
 """Part of a trial's peak force above which it counts as loaded."""
 ALONG, CLEARLY, UNRELATED = 0.5, 0.3, 0.2
-"""Correlation with the answer that depth or force must reach with its sign turned round, and by how much more
+"""Correlation with the response that depth or force must reach with its sign inverted, and by how much more
 than as recorded; and below which a force does not follow the press."""
 LATE_S = 0.5
 """Readings that come this late still follow the press."""
 CLEAR_SIZE, CLEAR_PART = 8.0, 0.02
-"""An answer is clear if it is this many deviations of a frame's noise and this part of full scale."""
+"""A response is clear if it is this many deviations of a frame's noise and this part of full scale."""
 HEAVY_N = 150.0
 """Pads and their indenters are pressed with some tens of newtons."""
 TARE = 0.1
-"""Part of the peak force that a load cell shows at rest if nobody set it to zero."""
+"""Part of the peak force that a load cell shows at rest if it was not zeroed."""
 
 # Scale of readings.
 HARDLY, BEYOND = 0.02, 1.01
 """Parts of full scale: readings that stay below the first through a whole set, or exceed the second (rounding
 aside), are in another unit."""
 BELOW, TOUCHED_BELOW = 0.05, 0.5 / 255.0
-"""Parts of full scale below zero that mean an idle level taken away, and that no converter gives."""
+"""Parts of full scale below zero that mean that an idle level was subtracted, and that no converter gives."""
 WRAP, MIN_WRAPS = 0.7, 2
 """Fall within a frame, in parts of full scale, that no release under rising load makes, and how often."""
 LIGHT, ALWAYS, ONE_TAXEL = 0.05, 0.95, 0.7
 """Readings are scaled frame by frame where of the frames above the first part of the peak load the second
 part has the same largest reading, unless one stuck taxel has it in the third part of them."""
 
-# What a pad answers.
+# The pad's response.
 DRIVEN, LOADED, TINY_M = 0.1, 0.2, 5e-5
 """Parts of a trial's peak, in drive and in readings, that are too much for its first frame; rigs find the
 face with an error of the last number, so that touching so lightly is not a loaded start."""
 NO_ANSWER = 0.03
-"""Slope of reading over drive, relative to the usual one, below which a trial ignores the press."""
+"""Slope of reading over drive, relative to the usual one, below which a trial shows no response."""
 DEAD, ALIVE = 0.05, 0.5
-"""The same of channels that do not answer in a trial and that do in others."""
+"""The same of channels that do not respond in a trial, and that do in others."""
 STUCK = 0.98
 """Part of a trial's frames at full scale."""
 
@@ -105,7 +105,7 @@ BEYOND_NOISE = 3.0
 STRAY = 0.1
 """Misplaced lines show at least this part of the signal where nothing presses; dead ones do not."""
 
-# Trials unlike all others.
+# Trials that differ from all others.
 STRANGE, USUAL = 0.5, 0.2
 """Part of a trial's readings that is not in proportion to its drive: in an odd one, and in most."""
 APART = 2.0
@@ -117,7 +117,7 @@ FEW = 0.1
 MIN_KNOWN = 6
 """Trials with replicates that it takes to know what is usual."""
 MIN_SHARE = 0.1
-"""Trials that answer less than this part of the usual power say too little."""
+"""Trials with less than this part of the usual power say too little."""
 
 # Encoders.
 MOVES, STILL = 0.1, 1e-3

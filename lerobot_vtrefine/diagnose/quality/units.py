@@ -28,7 +28,7 @@ from lerobot_vtrefine.diagnose.recordings import RecordingSet
 
 @dataclass(frozen=True)
 class Mistake:
-    """Units that people write instead of the format's.
+    """Units that are often used instead of the format's.
 
     ``limit`` is the largest plausible value in the right unit; a column above it is repaired when dividing by
     one of the ``units``' factors brings it below.
@@ -69,7 +69,7 @@ def check_units(recordings: RecordingSet) -> Iterator[Finding]:
                 continue
             found = _unit(values, mistake)
             if found is None:
-                text = f"{mistake.column} reaches {size:.3g}, which no unit explains"
+                text = f"{mistake.column} reaches {size:.3g}, which no known unit explains"
                 yield Finding(index, text, SET_ASIDE)
                 continue
             unit, factor = found
@@ -95,7 +95,7 @@ def _largest(values: np.ndarray) -> float:
 
 
 def _unit(values: np.ndarray, mistake: Mistake) -> tuple[str, float] | None:
-    """The unit that values are in, with its factor; None where none explains them."""
+    """The unit that values are in, with its factor; None where none is plausible."""
     beyond = np.abs(values) > mistake.limit
     if 0 < beyond.reshape(len(values), -1).any(1).mean() < FEW_SPIKES:
         return None
@@ -131,7 +131,7 @@ def _times(recordings: RecordingSet, trials: dict[int, Any]) -> Iterator[Finding
 
 
 def check_temperature(recordings: RecordingSet) -> Iterator[Finding]:
-    """Temperatures in kelvin are repaired, those that no room has not used."""
+    """Temperatures in kelvin are converted; implausible ones are not used."""
     for index, trial in enumerate(recordings.trials if recordings.kind == "pad" else ()):
         if trial.temperature_c is None or not np.isfinite(trial.temperature_c).any():
             continue
@@ -140,8 +140,8 @@ def check_temperature(recordings: RecordingSet) -> Iterator[Finding]:
             continue
         kelvin = ROOM_C[0] <= usual - ZERO_C_IN_K <= ROOM_C[1]
         values = trial.temperature_c - ZERO_C_IN_K if kelvin else None
-        problem = f"temperature_c is {usual:.3g}" + (": kelvin" if kelvin else ", which no room has")
-        action = f"repaired: {ZERO_C_IN_K} taken away" if kelvin else "repaired: not used"
+        problem = f"temperature_c is {usual:.3g}" + (": kelvin" if kelvin else ", which is not plausible")
+        action = f"repaired: {ZERO_C_IN_K} subtracted" if kelvin else "repaired: not used"
         yield Finding(index, problem, action, replace(trial, temperature_c=values))
 
 
