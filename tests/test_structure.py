@@ -350,6 +350,48 @@ def test_rooms_of_the_diagnosis_import_only_from_rooms_above() -> None:
     assert wrong == {}
 
 
+# Where decisions have all their thresholds in one file.
+RULED_ROOMS = ("camera", "joints", "parts", "quality", "servo")
+SOLVERS = ("joints/fitting.py", "joints/servo.py", "servo/fitting.py")
+UNITS = {"BYTE", "HOUR_S", "MM_PER_M", "ZERO_C_IN_K"}
+
+
+def is_number(node: ast.AST) -> bool:
+    """Whether a part of an expression belongs to plain arithmetic or to a tuple."""
+    if isinstance(node, ast.Constant):
+        return isinstance(node.value, int | float)
+    return isinstance(node, ast.BinOp | ast.UnaryOp | ast.operator | ast.unaryop | ast.Tuple | ast.Load)
+
+
+def numbers_compared_with(tree: ast.Module) -> set[str]:
+    """Names of a module's own numbers, or tuples of them, that stand in one of its comparisons."""
+    numbers = set()
+    for node in tree.body:
+        if isinstance(node, ast.Assign) and all(is_number(part) for part in ast.walk(node.value)):
+            numbers |= {part.id for part in ast.walk(node.targets[0]) if isinstance(part, ast.Name)}
+    compared = [node for node in ast.walk(tree) if isinstance(node, ast.Compare)]
+    return numbers & {part.id for node in compared for part in ast.walk(node) if isinstance(part, ast.Name)}
+
+
+def test_compared_numbers_are_found() -> None:
+    found = numbers_compared_with(
+        ast.parse("A, B = 0.1, 2\nC = -1 / 3\nD = 'd'\nx = y > 2 * A or z <= f(C) or u == D")
+    )
+    assert found == {"A", "C"}
+
+
+def test_thresholds_stand_in_rules() -> None:
+    """A cause's own may stand in the cause's file."""
+    folder = PACKAGE / "diagnose"
+    paths = [path for room in RULED_ROOMS for path in sorted((folder / room).glob("*.py"))]
+    found = {
+        name: numbers_compared_with(tree_of(path)) - UNITS
+        for path in paths
+        if (name := path.relative_to(folder).as_posix()) not in SOLVERS
+    }
+    assert {name: numbers for name, numbers in found.items() if numbers} == {}
+
+
 def test_the_core_knows_no_instrument_and_names_no_cause() -> None:
     from lerobot_vtrefine.diagnose.verdict import CAUSES
 

@@ -23,7 +23,7 @@ SHOWN_ISSUES = 4
 """Problems of the data that the terminal tells; the report tells all."""
 DESCRIPTION = """\
 Compare measured recordings with the simulation, name what the simulation gets wrong, extend its model
-by that and measure the gain on recordings that no fit and no choice has seen.
+by that and measure the gain on recordings used neither for fitting nor for selection.
 
 Give a recording set (a folder with recording.json and a Parquet file per trial), or a LeRobot dataset
 of a robot's commands and positions, an episode being a trial."""

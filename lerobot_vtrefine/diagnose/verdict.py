@@ -122,7 +122,7 @@ class Unknown:
 
 @dataclass(frozen=True)
 class Heldout:
-    """Errors on trials that no fit and no choice has seen; ``gain`` = 1 − extended² / baseline²."""
+    """Errors on trials used neither for fitting nor for selection; ``gain`` = 1 − extended² / baseline²."""
 
     metric: str
     baseline: float

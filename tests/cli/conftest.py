@@ -15,6 +15,15 @@ TINY_ENV = (
     " target_m: [0.0, 0.0, 0.145]}",
 )
 """Flags of a task that is quick to simulate."""
+TINY_DPPO = (
+    "--dppo.type=small",
+    "--dppo.num_envs=2",
+    "--dppo.epochs=1",
+    "--dppo.minibatch_decisions=2",
+    "--dppo.critic_width=16",
+    "--dppo.iterations=1",
+)
+"""Flags of one iteration of fine-tuning that is quick to run."""
 
 Lerobot = Callable[..., subprocess.Popen[str]]
 

@@ -85,7 +85,7 @@ def test_too_little_sound_data_is_a_verdict_and_no_error(tmp_path, engine, capsy
     assert verdict.status == "invalid_data"
     assert len(verdict.data_issues) == 7
     assert "2 sound trials of 8" in verdict.data_issues[-1].problem
-    assert "allow no verdict" in capsys.readouterr().out
+    assert "No verdict is possible" in capsys.readouterr().out
     model = tmp_path / "out" / "sensor_model.json"
     arguments = [f"--recording={folder}", f"--sensor_model={model}", f"--output_dir={tmp_path / 'p'}"]
     assert predict.main(arguments) == 0

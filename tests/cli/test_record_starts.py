@@ -5,7 +5,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from conftest import TINY_ENV
+from conftest import TINY_DPPO, TINY_ENV
 
 from lerobot_vtrefine.files.arrays import read_arrays
 from lerobot_vtrefine.finetune.logger import read_progress
@@ -64,21 +64,13 @@ def test_dppo_practises_from_the_bank_and_stays_within_the_time_from_the_table(
 
     path, out = tmp_path / "starts.npz", tmp_path / "tuned"
     assert record(path, monkeypatch, "--num_starts=3", "--num_envs=3") == 0
-    dppo = (
-        "type=small",
-        "num_envs=2",
-        "epochs=1",
-        "minibatch_decisions=2",
-        "critic_width=16",
-        "iterations=1",
-    )
     named = (
         f"--policy.path={checkpoint}",
         f"--output_dir={out}",
         f"--env.start_bank={path}",
         "--eval_freq=0",
     )
-    flags = [*named, "--policy.device=cpu", *TABLE, *(f"--dppo.{item}" for item in dppo)]
+    flags = [*named, "--policy.device=cpu", *TABLE, *TINY_DPPO]
     monkeypatch.setattr(sys, "argv", ["vtrefine-finetune", *flags])
     assert finetune.main() == 0
     (row,) = read_progress(out)

@@ -10,7 +10,7 @@ import draccus
 import httpx
 import huggingface_hub
 import pytest
-from conftest import TINY_ENV
+from conftest import TINY_DPPO, TINY_ENV
 from lerobot.envs.configs import EnvConfig
 from lerobot.scripts import lerobot_eval
 from local_hub import use_folder_as_hub
@@ -163,9 +163,8 @@ def test_a_fine_tuned_policy_on_the_hub_repeats_what_its_card_claims(
     hub: Path, checkpoint: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     task = (*TINY_ENV, "--env.episode_steps=8", "--eval.n_episodes=6", "--eval.batch_size=3")
-    dppo = ("--dppo.type=small", "--dppo.iterations=1", "--dppo.num_envs=2", "--dppo.critic_width=16")
     start = (f"--policy.path={checkpoint}", "--policy.device=cpu", f"--output_dir={tmp_path / 'run'}")
-    arguments = ["vtrefine-finetune", *start, *task, *dppo, "--eval_freq=0"]
+    arguments = ["vtrefine-finetune", *start, *task, *TINY_DPPO, "--eval_freq=0"]
     monkeypatch.setattr(sys, "argv", [*arguments, "--push_to_hub=true", NAME])
     assert finetune.main() == 0
     pushed = hub / "me" / "insertion"

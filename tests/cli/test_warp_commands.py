@@ -6,7 +6,7 @@ from importlib.util import find_spec
 from pathlib import Path
 
 import pytest
-from conftest import TINY_ENV
+from conftest import TINY_DPPO, TINY_ENV
 
 pytestmark = [
     pytest.mark.slow,
@@ -23,17 +23,9 @@ def test_finetuning_and_evaluating_on_mujoco_warp(checkpoint: Path, tmp_path: Pa
     from lerobot_vtrefine.cli import finetune
 
     tuned, evaluated = tmp_path / "tuned", tmp_path / "evaluated"
-    dppo = (
-        "type=small",
-        "num_envs=2",
-        "epochs=1",
-        "minibatch_decisions=2",
-        "critic_width=16",
-        "iterations=1",
-    )
     sizes = ("--eval.n_episodes=2", "--eval.batch_size=2")
     named = (f"--policy.path={checkpoint}", f"--output_dir={tuned}", "--eval_freq=1", "--save_freq=1")
-    flags = [*named, *sizes, *WARP, *(f"--dppo.{item}" for item in dppo)]
+    flags = [*named, *sizes, *WARP, *TINY_DPPO]
     monkeypatch.setenv("HF_HUB_OFFLINE", "1")
     monkeypatch.setattr(sys, "argv", ["vtrefine-finetune", *flags])
     assert finetune.main() == 0

@@ -317,7 +317,7 @@ def test_sound_robot_set_is_left_alone(tmp_path):
         (with_values("command", slice(20, 150), np.inf), "without a number in command", "set aside"),
         (with_values("position", slice(0, 1), np.nan), "without a number in position", "repaired"),
         (lambda t: frames(t, np.r_[0:60, 110:200]), "missing frames", "set aside"),
-        (with_values("position", (slice(60, 62), 0), 10.0), "which no unit explains", "set aside"),
+        (with_values("position", (slice(60, 62), 0), 10.0), "which no known unit explains", "set aside"),
         (with_values("position", (slice(60, 62), 0), 3.0), "position jumps by", "set aside"),
         (lambda t: t | {"position": t["position"] + turned_after(t, 100)}, "jumps by 6.", "set aside"),
         (with_values("command", (slice(None), 1), 0.3), "command stays constant", "set aside"),

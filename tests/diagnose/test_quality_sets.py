@@ -156,11 +156,11 @@ PER_TRIAL = {
     "pulling load cell": (everywhere(scaled("force_n", -1)), "force_n falls as the readings rise", 8),
     "unplugged load cell": (everywhere(scaled("force_n", 0)), "force_n does not follow the press", 8),
     "load cell not set to zero": (everywhere(lambda t: {"force_n": t["force_n"] + 40.0}), "N at rest", 8),
-    "depth that jumps": (in_one(spiked), "1 frame of 150 far off in depth_m", 1),
+    "depth that jumps": (in_one(spiked), "1 frame of 150 with implausible depth_m", 1),
     "kelvin": (everywhere(lambda t: {"temperature_c": np.full(150, 297.0)}), "kelvin", 8),
     "thermometer unplugged": (
         everywhere(lambda t: {"temperature_c": np.full(150, -999.0)}),
-        "no room has",
+        "which is not plausible",
         8,
     ),
 }
@@ -187,7 +187,7 @@ def test_columns_that_are_wrong_in_one_or_in_all_trials_are_mended(tmp_path, nam
 SET_ASIDE = {
     "pressed beside the pad": (
         in_one(lambda t: {"x_m": t["x_m"] + 0.03}),
-        "readings answer although the indenter",
+        "the pad responds although the indenter",
     ),
     "never touching": (in_one(lambda t: {"depth_m": np.full(150, -1e-3)}), "never gets below the face"),
     "turned readings": (in_one(lambda t: {"raw": 255 - t["raw"]}), "readings fall"),
@@ -210,7 +210,7 @@ def test_readings_of_another_trial_are_found(tmp_path):
     columns[BAD] = columns[BAD] | {"raw": columns[BAD + 2]["raw"][::-1].copy()}
     left, issues = checked(tmp_path, header, columns)
     assert {(issue.trial, issue.action) for issue in issues} == {(FILE, "set aside")}
-    assert "not of the recorded motion" in issues[-1].problem
+    assert "does not follow the recorded motion" in issues[-1].problem
     assert len(left.trials) == 7
 
 
@@ -228,7 +228,7 @@ def replicated():
 def test_a_trial_that_reads_half_as_much_is_set_aside(tmp_path):
     left, issues = checked(tmp_path, *in_one(scaled("raw", 0.5))(*replicated()))
     assert [(issue.trial, issue.action) for issue in issues] == [(FILE, "set aside")]
-    assert "of what the same motion gives" in issues[0].problem
+    assert "of what other trials of the same motion read" in issues[0].problem
     assert len(left.trials) == 7
 
 
@@ -275,7 +275,7 @@ def test_trials_of_one_condition_that_were_driven_in_other_ways_are_told_apart(t
     header, columns = labelled(lambda k: {"condition": "same" if k < 4 else f"c{k}"})(header, columns)
     left, issues = checked(tmp_path, header, columns)
     assert [issue.trial for issue in issues] == ["trial_0002.parquet", "trial_0003.parquet"]
-    assert all("is not driven like trial_0000.parquet" in issue.problem for issue in issues)
+    assert all("is not driven in the same way as trial_0000.parquet" in issue.problem for issue in issues)
     assert [trial.condition for trial in left.trials][:4] == ["same", "same", "same (2)", "same (3)"]
 
 

@@ -19,12 +19,10 @@ from lerobot_vtrefine.diagnose.camera.registration import (
     errors,
     register,
 )
+from lerobot_vtrefine.diagnose.camera.rules import POSE_LEAD
 from lerobot_vtrefine.diagnose.core.problem import OptionalSteps, PlainCandidate
 
 Array = np.ndarray
-
-_POSE_LEAD = 0.02
-"""A scale is one number, a pose six: by how much a pose must do better."""
 
 
 @dataclass(frozen=True)
@@ -35,7 +33,7 @@ class Candidate(PlainCandidate):
 
 
 CANDIDATES = (
-    Candidate("camera_extrinsics", _POSE_LEAD, free=tuple(EXTRINSICS)),
+    Candidate("camera_extrinsics", POSE_LEAD, free=tuple(EXTRINSICS)),
     Candidate("depth_scale", free=tuple(SCALE)),
 )
 

@@ -14,6 +14,7 @@ import mujoco
 import numpy as np
 
 from lerobot_vtrefine.diagnose.camera.frames import DepthFrames
+from lerobot_vtrefine.diagnose.camera.rules import CUT_M, EDGE_M, FIRST_CUT_M, GRAZING
 from lerobot_vtrefine.diagnose.core.normal_equations import solved
 from lerobot_vtrefine.sim.camera import Camera
 from lerobot_vtrefine.sim.config import SceneConfig
@@ -26,12 +27,6 @@ Array = np.ndarray
 PARAMETERS = 7
 EXTRINSICS = np.array([True] * 6 + [False])
 SCALE = ~EXTRINSICS
-_CUT_M = 0.02
-"""Larger differences are something else than the camera, such as parts on the table."""
-_FIRST_CUT_M = 0.08
-_EDGE_M = 0.004
-"""Depth bends by more than this from pixel to pixel only where one surface ends."""
-_GRAZING = 0.2
 _ITERATIONS = 8
 
 
@@ -93,7 +88,7 @@ def register(twin: Twin, free: Array) -> Registration:
     theta = np.zeros(PARAMETERS)
     weights = np.ones(len(twin.frames.depth_m))
     for iteration in range(_ITERATIONS):
-        cut = max(_CUT_M, _FIRST_CUT_M * 0.6**iteration)
+        cut = max(CUT_M, FIRST_CUT_M * 0.6**iteration)
         normal, slope = _equations(twin, theta, cut)
         if not free.any():
             break
@@ -101,14 +96,14 @@ def register(twin: Twin, free: Array) -> Registration:
         theta = theta + step
         if np.abs(step).max() < 1e-6:
             break
-    normal, slope = _equations(twin, theta, _CUT_M)
+    normal, slope = _equations(twin, theta, CUT_M)
     return Registration(theta, free, normal, slope)
 
 
 def errors(twin: Twin, theta: Array) -> Array:
     """Mean squared depth error (F,) [m^2] of every frame; differences beyond the cut count as the cut."""
     left, _ = _residual(twin, theta)
-    return np.nanmean(np.minimum(left**2, _CUT_M**2), axis=(1, 2))
+    return np.nanmean(np.minimum(left**2, CUT_M**2), axis=(1, 2))
 
 
 def _residual(twin: Twin, theta: Array) -> tuple[Array, Array]:
@@ -133,7 +128,7 @@ def _equations(twin: Twin, theta: Array, cut: float) -> tuple[Array, Array]:
         np.abs(depth[:, 1:-1, 2:] + depth[:, 1:-1, :-2] - 2 * depth[:, 1:-1, 1:-1]),
         np.abs(depth[:, 2:, 1:-1] + depth[:, :-2, 1:-1] - 2 * depth[:, 1:-1, 1:-1]),
     )
-    good = (bend < _EDGE_M) & (np.abs(facing) > _GRAZING) & (np.abs(left) < cut) & np.isfinite(left)
+    good = (bend < EDGE_M) & (np.abs(facing) > GRAZING) & (np.abs(left) < cut) & np.isfinite(left)
     scale = np.exp(theta[6])
     jacobian = np.zeros((*left.shape, PARAMETERS))
     safe = np.where(good, facing, 1.0)[..., None]

@@ -77,3 +77,10 @@ NEARLY = 0.6
 """Part of a named cause's gain that a rival's plain form must reach for its other forms to be tried."""
 DOUBTFUL_GAIN, DOUBTFUL_P = 0.03, 0.01
 """What symptoms must take away of the cross-validated squared error, and how surely, to be handed out."""
+
+# Positions that encoders read, of joints and of single servos.
+REPEATS, REPEATS_ALL = 0.3, 0.6
+"""Part of what is left that must repeat with the command; where it is the larger one, in every condition,
+these need not be enough for a small p."""
+RESOLVED = 0.25
+"""Part of an encoder's step that means over many readings resolve."""

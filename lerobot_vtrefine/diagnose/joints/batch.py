@@ -10,11 +10,10 @@ from functools import cached_property
 
 import numpy as np
 
+from lerobot_vtrefine.diagnose.joints.rules import FEWEST_VALUES, FINEST_STEP, OFF_LATTICE
 from lerobot_vtrefine.diagnose.recordings import RobotTrial
 
 Array = np.ndarray
-
-_FEWEST_VALUES, _FINEST, _OFF_LATTICE = 8, 2e-6, 0.05
 
 
 @dataclass(frozen=True)
@@ -128,11 +127,11 @@ def padded(values: Array, length: int) -> Array:
 
 def _lattice(values: Array) -> float:
     """The step of which all values are multiples, beside a constant; 0 where there is none."""
-    if len(values) < _FEWEST_VALUES:
+    if len(values) < FEWEST_VALUES:
         return 0.0
     step = float(np.diff(values).min())
     places = (values - values[0]) / step
-    return step if step > _FINEST and np.abs(places - places.round()).max() < _OFF_LATTICE else 0.0
+    return step if step > FINEST_STEP and np.abs(places - places.round()).max() < OFF_LATTICE else 0.0
 
 
 def _check(trial: RobotTrial) -> None:

@@ -11,6 +11,7 @@ from lerobot_vtrefine.diagnose.joints.batch import frame_s, make_batch
 from lerobot_vtrefine.diagnose.joints.candidates import PLAIN, told_by_load
 from lerobot_vtrefine.diagnose.joints.fitting import ServoTrials
 from lerobot_vtrefine.diagnose.joints.gravity import is_gripper, is_sliding
+from lerobot_vtrefine.diagnose.joints.rules import ENOUGH_TRIALS, TELLING
 from lerobot_vtrefine.diagnose.recordings import RobotTrial
 
 if TYPE_CHECKING:
@@ -18,10 +19,7 @@ if TYPE_CHECKING:
 
 Array = np.ndarray
 
-ENOUGH_TRIALS = 8
 _SECONDS = 8.0
-_TELLING = 3.0
-"""Gap between two predictions, in units of the noise, that a handful of trials shows beyond doubt."""
 PROTOCOLS = {
     "slow reversals": "a triangle at 0.1 rad/s (2 mm/s for a gripper) over a tenth of the range",
     "fast reversals": "a triangle at 1 rad/s (20 mm/s) over a tenth of the range",
@@ -51,7 +49,7 @@ def for_rivals(selection: "Selected", rivals: Sequence[Rival[Any, Any]]) -> dict
         text += " Record the servos' torque or current as `load`: friction takes torque, play takes none."
     elif more:
         text += f" {more}"
-    elif gaps[best] < _TELLING:
+    elif gaps[best] < TELLING:
         text += " Commands and encoders hardly distinguish these: measure the joint from outside, too."
     return {"decides": decides, "text": text, "protocol": protocol}
 

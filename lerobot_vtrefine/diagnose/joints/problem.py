@@ -8,7 +8,7 @@ import numpy as np
 
 from lerobot_vtrefine.diagnose.core.problem import OptionalSteps
 from lerobot_vtrefine.diagnose.core.rivals import Rival
-from lerobot_vtrefine.diagnose.core.rules import LEAST_GAIN
+from lerobot_vtrefine.diagnose.core.rules import LEAST_GAIN, RESOLVED
 from lerobot_vtrefine.diagnose.core.search import Selection
 from lerobot_vtrefine.diagnose.core.suspicion import Suspicion
 from lerobot_vtrefine.diagnose.joints import gravity
@@ -17,10 +17,9 @@ from lerobot_vtrefine.diagnose.joints.candidates.base import Candidate
 from lerobot_vtrefine.diagnose.joints.fitting import Fit, Point, ServoTrials, evaluate, fit, refit, servo_only
 from lerobot_vtrefine.diagnose.joints.newton import Refits, refits
 from lerobot_vtrefine.diagnose.joints.parameters import INDEX, SAG
+from lerobot_vtrefine.diagnose.joints.rules import EXTRAPOLATION, LEAST_EFFECT_M, LEAST_EFFECT_RAD
 from lerobot_vtrefine.diagnose.joints.servo_load import load_prefers
 from lerobot_vtrefine.diagnose.joints.suspicions import (
-    LEAST_EFFECT_M,
-    LEAST_EFFECT_RAD,
     not_repeating,
     suspicions,
 )
@@ -29,10 +28,6 @@ from lerobot_vtrefine.diagnose.joints.timing import delay_starts, with_changing_
 Array = np.ndarray
 type Selected = Selection["JointProblem", Fit, Candidate]
 
-_OF_A_STEP = 0.25
-"""The same, as a part of the encoder's step: means over many readings resolve a quarter of it."""
-_EXTRAPOLATION = (4.0, 8.0)
-"""Largest size of a cause over the largest error seen: of several that may cancel, and of one alone."""
 _ITERATIONS = 12
 """Of the fit of a candidate, which starts from the fit without it."""
 
@@ -135,7 +130,7 @@ class JointProblem(ServoTrials, OptionalSteps):
         """(J,) bool."""
         sliding = np.array([gravity.is_sliding(name) for name in self.names])
         least = np.maximum(
-            np.where(sliding, LEAST_EFFECT_M, LEAST_EFFECT_RAD), _OF_A_STEP * self.batch.resolution
+            np.where(sliding, LEAST_EFFECT_M, LEAST_EFFECT_RAD), RESOLVED * self.batch.resolution
         )
         own = np.maximum(self.misfit * np.sqrt(baseline.total), np.where(sliding, 0.1, 1) * self.floor)
         effect = np.sqrt(np.square(best.residual - now.residual).sum((0, 1)) / self.batch.valid.sum())
@@ -155,7 +150,7 @@ class JointProblem(ServoTrials, OptionalSteps):
         largest = np.quantile(left, 0.995, axis=0)
         sag = point.theta[:, [INDEX[name] for name in SAG]]
         several = np.count_nonzero(sag, axis=1) + (point.value("offset") != 0) > 1
-        limit = np.where(several, *_EXTRAPOLATION) * largest
+        limit = np.where(several, *EXTRAPOLATION) * largest
         reach = [abs(gravity.full_reach(form, row)) for form, row in zip(point.forms, sag, strict=True)]
         return (np.array(reach) <= limit) & (np.abs(point.value("offset")) <= limit)
 

@@ -9,15 +9,12 @@ from itertools import combinations
 import numpy as np
 
 from lerobot_vtrefine.diagnose.joints.batch import Batch
+from lerobot_vtrefine.diagnose.joints.rules import FEWEST_FRAMES, LEAST_PAIRS, SETTLES, SLOWEST
 
 Array = np.ndarray
 
-LEAST_PAIRS = 2
-_FEWEST_FRAMES = 8
 _TO_SIGMA = 0.6745 * np.sqrt(6)
 """Median size of second differences of white noise, in its standard deviations."""
-_SLOWEST, _SETTLES = 0.2, 8
-"""Part of the frames that count as slow; frames for which a motion is felt."""
 _TRIMMED = 0.95
 
 
@@ -88,7 +85,7 @@ def alike(batch: Batch, a: int, b: int) -> bool:
     """Whether two trials had the same commands."""
     valid = batch.valid[:, a] & batch.valid[:, b]
     change = batch.command[valid][:, a] - batch.command[valid][:, b]
-    return bool(valid.sum() > _FEWEST_FRAMES and np.abs(change).max() < 1e-6)
+    return bool(valid.sum() > FEWEST_FRAMES and np.abs(change).max() < 1e-6)
 
 
 def _of_pair(difference: Array, command: Array, servo: list[Array]) -> Array:
@@ -114,6 +111,6 @@ def _of_pair(difference: Array, command: Array, servo: list[Array]) -> Array:
 def _slow(command: Array) -> Array:
     """The frames in and before which a command (n,) moved least."""
     speed = np.abs(np.gradient(command))
-    lately = np.max([np.roll(speed, lag) for lag in range(_SETTLES)], 0)
-    lately[: _SETTLES - 1] = np.maximum.accumulate(speed[: _SETTLES - 1])
-    return lately <= np.quantile(lately, _SLOWEST)
+    lately = np.max([np.roll(speed, lag) for lag in range(SETTLES)], 0)
+    lately[: SETTLES - 1] = np.maximum.accumulate(speed[: SETTLES - 1])
+    return lately <= np.quantile(lately, SLOWEST)

@@ -3,14 +3,12 @@
 import numpy as np
 
 from lerobot_vtrefine.diagnose.core.resampling import one_sided
+from lerobot_vtrefine.diagnose.core.rules import ALPHA
 from lerobot_vtrefine.diagnose.joints.fitting import Fit, ServoTrials
+from lerobot_vtrefine.diagnose.joints.rules import LOAD_TELLS, SERVO_SHARE
 from lerobot_vtrefine.diagnose.joints.servo import play_operator
 
 Array = np.ndarray
-
-_ALPHA = 0.02
-_LEAST_SHARE = 0.05
-_SERVO_SHARE = 0.7
 
 
 def stiffness_in_load(problem: ServoTrials, fitted: Fit, joint: int) -> float | None:
@@ -22,7 +20,7 @@ def stiffness_in_load(problem: ServoTrials, fitted: Fit, joint: int) -> float | 
         return None
     left, total, slope = _explained(problem, fitted, joint)
     share = 1 - left.sum() / max(total.sum(), 1e-300)
-    return slope if share > _SERVO_SHARE and slope > 0 else None
+    return slope if share > SERVO_SHARE and slope > 0 else None
 
 
 def load_prefers(problem: ServoTrials, one: Fit, other: Fit, joint: int, seed: int) -> int:
@@ -30,11 +28,11 @@ def load_prefers(problem: ServoTrials, one: Fit, other: Fit, joint: int, seed: i
     left_one, total, _ = _explained(problem, one, joint)
     left_other, _, _ = _explained(problem, other, joint)
     lead = ((left_other - left_one) / (left_other + left_one).clip(1e-300))[:, None]
-    if min(left_one.sum(), left_other.sum()) > (1 - _LEAST_SHARE) * total.sum():
+    if min(left_one.sum(), left_other.sum()) > (1 - LOAD_TELLS) * total.sum():
         return 0
-    if one_sided(lead, seed)[0][0] < _ALPHA:
+    if one_sided(lead, seed)[0][0] < ALPHA:
         return 1
-    return -1 if one_sided(-lead, seed)[0][0] < _ALPHA else 0
+    return -1 if one_sided(-lead, seed)[0][0] < ALPHA else 0
 
 
 def _explained(problem: ServoTrials, fitted: Fit, joint: int) -> tuple[Array, Array, float]:

@@ -10,13 +10,11 @@ import numpy as np
 from lerobot_vtrefine.diagnose.core.normal_equations import solved
 from lerobot_vtrefine.diagnose.core.suspicion import Suspicion
 from lerobot_vtrefine.diagnose.joints.batch import Batch
+from lerobot_vtrefine.diagnose.joints.rules import FEWEST_TRIALS, SESSION_TREND
 
 Array = np.ndarray
 
 KINDS = ("zero", "scale", "servo's response", "servo's response", "delay")
-FEWEST_TRIALS = 6
-_LEAST = 0.1
-"""Part of a joint's squared error that a straight line over the session must take away."""
 _RIDGE = 1e-6
 
 
@@ -44,7 +42,7 @@ def trends(batch: Batch, residual: Array, columns: dict[int, Array], tau: Array)
             joint,
             f"the {kind} changes through the session",
             float(share[joint, k]),
-            _LEAST,
+            SESSION_TREND,
             change[:, joint, k],
             either_sign=True,
             along=place,

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from lerobot_vtrefine.diagnose.core.rules import LEAST_UNKNOWN
+from lerobot_vtrefine.diagnose.core.rules import LEAST_UNKNOWN, REPEATS, REPEATS_ALL
 from lerobot_vtrefine.diagnose.core.search import ALL
 from lerobot_vtrefine.diagnose.core.suspicion import Suspicion
 from lerobot_vtrefine.diagnose.joints.batch import frame_s
@@ -17,6 +17,21 @@ from lerobot_vtrefine.diagnose.joints.candidates import PLAIN
 from lerobot_vtrefine.diagnose.joints.fitting import derivatives
 from lerobot_vtrefine.diagnose.joints.gravity import is_gripper
 from lerobot_vtrefine.diagnose.joints.repeatability import common_part, repeated, scatter
+from lerobot_vtrefine.diagnose.joints.rules import (
+    FEW_REPEATED,
+    FOLLOWS,
+    FOLLOWS_IF_OWNED,
+    LEAST_EFFECT_RAD,
+    MIN_REPEATED,
+    NEARLY_ALL,
+    RESTING_SHAPES_DIFFER,
+    RINGS,
+    SERVOS_DIFFER,
+    SHAPES_DIFFER,
+    STANDS_STILL,
+    WITH_MOTION,
+    ZEROS_DIFFER,
+)
 from lerobot_vtrefine.diagnose.joints.session_trends import trends
 from lerobot_vtrefine.diagnose.joints.timing import mirrored
 
@@ -24,27 +39,6 @@ if TYPE_CHECKING:
     from lerobot_vtrefine.diagnose.joints.problem import Selected
 
 Array = np.ndarray
-
-LEAST_EFFECT_RAD, LEAST_EFFECT_M = 1e-4, 1e-5
-"""Smallest change of the prediction (root mean square) that is worth a name."""
-_REPEATS, _REPEATS_ALL = 0.3, 0.6
-"""Least part of what is left that must repeat; where it is this much, and in every condition, the conditions
-need not be enough for a small p."""
-_LEAST_CONDITIONS, _FEW_CONDITIONS = 4, 2
-_NEARLY_ALL = 0.8
-"""Part of what is left that must repeat in each of few conditions."""
-_SHAPES_DIFFER, _FAR, _ZEROS_DIFFER = 5.0, 20.0, 12.0
-"""Difference of trials of one command, in scatters from frame to frame: noise that wanders makes up to three,
-a robot that is zeroed anew before every trial up to eight. Up to `_FAR`, motion must have to do with it."""
-_MOVING = 1.6
-"""How much larger such a difference is over all frames than over slow ones, if it comes with motion."""
-_SERVOS_DIFFER = 0.04
-"""Part by which a servo's frequency may differ from trial to trial: batteries and oil, no fault."""
-_FOLLOWS, _FOLLOWS_IF_OWNED = 0.1, 0.4
-"""Least part of what is left that must follow a descriptor; more where an accepted form may be off."""
-_LINE = 0.1
-_STOPPED = 0.4
-"""Part of the baseline's squared error in frames where a gripper stands far from its command."""
 
 
 def suspicions(selection: "Selected") -> list[Suspicion]:
@@ -72,18 +66,18 @@ def _repeating(selection: "Selected") -> list[Suspicion]:
     """Residuals of trials of one condition, multiplied frame by frame: noise cancels, causes do not."""
     batch = selection.problem.batch
     rows, squares = common_part(batch, selection.fit.residual)
-    if len(rows) < _FEW_CONDITIONS:
+    if len(rows) < FEW_REPEATED:
         return []
     scores = np.zeros((batch.trials, batch.joints))
     scores[[pairs[0][0] for pairs in repeated(batch)]] = rows
     # Of what those trials leave: others, whose command came once, say nothing about it.
     shares = np.mean(rows, 0) / np.mean(squares, 0).clip(1e-300)
-    alone = _REPEATS_ALL if len(rows) >= _LEAST_CONDITIONS else _NEARLY_ALL
+    alone = REPEATS_ALL if len(rows) >= MIN_REPEATED else NEARLY_ALL
     clue = "what is left repeats when the command is repeated"
     return [
         Suspicion(joint, clue, float(share), alone)
         if share > alone and rows[:, joint].min() > 0
-        else Suspicion(joint, clue, float(share), _REPEATS, scores[:, joint])
+        else Suspicion(joint, clue, float(share), REPEATS, scores[:, joint])
         for joint, share in enumerate(shares)
     ]
 
@@ -97,10 +91,10 @@ def not_repeating(selection: "Selected") -> list[Suspicion]:
     if seen is None:
         return []
     white = np.maximum(seen.white, 0.5 * problem.batch.resolution)
-    with_motion = seen.shape > _MOVING * np.maximum(seen.resting, white)
-    shapes = seen.shape > np.where(with_motion, _SHAPES_DIFFER, _FAR) * white
-    servos = (seen.servo > _SERVOS_DIFFER) & (seen.servo_effect > _SHAPES_DIFFER * white)
-    zeros = seen.zero > _ZEROS_DIFFER * white
+    with_motion = seen.shape > WITH_MOTION * np.maximum(seen.resting, white)
+    shapes = seen.shape > np.where(with_motion, SHAPES_DIFFER, RESTING_SHAPES_DIFFER) * white
+    servos = (seen.servo > SERVOS_DIFFER) & (seen.servo_effect > SHAPES_DIFFER * white)
+    zeros = seen.zero > ZEROS_DIFFER * white
     # What differs in shape has a mean and a likeness to slower servos, too.
     servos, zeros = servos & (seen.servo_effect > seen.shape), zeros & (seen.zero > seen.shape)
     least, clue = (
@@ -111,8 +105,8 @@ def not_repeating(selection: "Selected") -> list[Suspicion]:
     for joint in range(problem.batch.joints):
         for size, far in ((seen.shape, shapes), (seen.servo_effect, servos), (seen.zero, zeros)):
             share = float(min(size[joint] ** 2 / max(fitted.total[joint], 1e-300), 1.0))
-            if far[joint] and share > max(_REPEATS, least[joint]):
-                found.append(Suspicion(joint, clue, share, _REPEATS))
+            if far[joint] and share > max(REPEATS, least[joint]):
+                found.append(Suspicion(joint, clue, share, REPEATS))
                 break
     return found
 
@@ -187,7 +181,7 @@ def _following(selection: "Selected") -> list[Suspicion]:
         here = (*selection.chosen.get(joint, ()), *selection.chosen.get(ALL, ()))
         owned = {signal for item in here for signal in PLAIN[item.cause].follows}
         for k, name in enumerate(items):
-            least = _FOLLOWS_IF_OWNED if name in owned else _FOLLOWS
+            least = FOLLOWS_IF_OWNED if name in owned else FOLLOWS
             clue = f"what is left follows {name}"
             found.append(Suspicion(joint, clue, float(shares[k]), least, scores[:, k], either_sign=True))
     return found
@@ -218,7 +212,7 @@ def _ringing(selection: "Selected") -> list[Suspicion]:
         driven = drive[line, joint] > 0.02 * drive[1:, joint].max()
         sharp = spectrum[line] > 6 * np.max(around) if len(around) else False
         if sharp and not driven:
-            found.append(Suspicion(joint, f"what is left rings at {frequency[line]:.2g} Hz", share, _LINE))
+            found.append(Suspicion(joint, f"what is left rings at {frequency[line]:.2g} Hz", share, RINGS))
     return found
 
 
@@ -230,7 +224,7 @@ def _stopped(selection: "Selected") -> list[Suspicion]:
         if is_gripper(name) and not accounted:
             clue = "stands still while its command goes on: it closes on something"
             share = _stopped_share(selection, joint)
-            found.append(Suspicion(joint, clue, share, _STOPPED, decisive=True))
+            found.append(Suspicion(joint, clue, share, STANDS_STILL, decisive=True))
     return found
 
 

@@ -20,6 +20,15 @@ from lerobot_vtrefine.diagnose.core.search import ALL
 from lerobot_vtrefine.diagnose.joints.batch import Batch, frame_s
 from lerobot_vtrefine.diagnose.joints.candidates import CATALOGUE
 from lerobot_vtrefine.diagnose.joints.fitting import Fit, ServoTrials, derivatives, fit
+from lerobot_vtrefine.diagnose.joints.rules import (
+    DELAY_P,
+    EARLIEST,
+    FURTHEST,
+    LASTING,
+    LASTS_S,
+    NOT_AGAINST,
+    SHARED,
+)
 
 if TYPE_CHECKING:
     from lerobot_vtrefine.diagnose.joints.problem import Selected
@@ -28,17 +37,6 @@ Array = np.ndarray
 
 _USUAL_LAG_S = 0.05
 """Lags are small beside this, as far as is known beforehand."""
-_SHARED, _NOT_AGAINST = 0.2, -0.1
-"""Least part of a joint's error that the other joints' lag must explain: of one in four joints, and of half.
-Noise that joints do not share is made worse by each other's lag. Commands may come so rarely that joints of
-unequal speed show little of one another's lag."""
-_FURTHEST = 2.5
-"""Latest of a hundred commands, in mean delays beyond the mean: of lost ones it is many."""
-_EARLIEST = 1.25
-_LASTS_S, _LASTING = 0.8, 0.5
-"""Lags this far apart must not be alike, or it is the servo that is slow for a while."""
-_ALPHA = 0.05
-"""Chance that a delay helps by accident, where all joints lag together anyhow."""
 
 
 @dataclass(frozen=True)
@@ -52,13 +50,13 @@ class CommonLag:
     """One in a hundred moving frames is earlier, or later."""
     spread_s: float
     lasting: float
-    """Correlation of lags `_LASTS_S` apart."""
+    """Correlation of lags `LASTS_S` apart."""
 
     @property
     def shared(self) -> bool:
         """Whether joints lag together at all."""
         best, middle = np.quantile(self.share, [0.75, 0.5])
-        return bool(best > _SHARED and middle > _NOT_AGAINST)
+        return bool(best > SHARED and middle > NOT_AGAINST)
 
 
 def with_changing_delay(selection: "Selected", seed: int) -> "Selected":
@@ -74,11 +72,11 @@ def with_changing_delay(selection: "Selected", seed: int) -> "Selected":
         # Everything else was asked about before it (Bonferroni).
         asked = sum(1 if item.candidate.shared else item.gain.size for item in selection.first_round)
         adjusted = min(1.0, asked * p_value)
-    if p_value >= _ALPHA or fitted.point.tau_s <= 0:
+    if p_value >= DELAY_P or fitted.point.tau_s <= 0:
         return selection
     lag, tau = common_lag(problem, fitted), fitted.point.tau_s
-    alike = -_EARLIEST * tau < lag.earliest_s and lag.latest_s < _FURTHEST * tau
-    if not (lag.shared and alike and lag.lasting < _LASTING):
+    alike = -EARLIEST * tau < lag.earliest_s and lag.latest_s < FURTHEST * tau
+    if not (lag.shared and alike and lag.lasting < LASTING):
         return selection
     return replace(
         selection,
@@ -133,7 +131,7 @@ def common_lag(problem: ServoTrials, fitted: Fit) -> CommonLag:
 
 
 def _lasting(batch: Batch, lag: Array, moving: Array) -> float:
-    apart = max(1, round(_LASTS_S / frame_s(batch)))
+    apart = max(1, round(LASTS_S / frame_s(batch)))
     if apart >= len(lag):
         return 0.0
     both = moving[:-apart] & moving[apart:]

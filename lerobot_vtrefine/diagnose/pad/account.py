@@ -28,7 +28,7 @@ from lerobot_vtrefine.diagnose.pad.intervals import (
     map_parameters,
 )
 from lerobot_vtrefine.diagnose.pad.problem import Candidate, PadProblem
-from lerobot_vtrefine.diagnose.pad.review import MORE_COORDINATES
+from lerobot_vtrefine.diagnose.pad.rules import MORE_COORDINATES
 from lerobot_vtrefine.diagnose.pad.screening import DEAD, GAIN_MAP, MAPS, forms_of
 from lerobot_vtrefine.diagnose.pad.views import Predicted
 from lerobot_vtrefine.diagnose.verdict import Parameter

@@ -30,6 +30,7 @@ from lerobot_vtrefine.diagnose.pad.model import Composite
 from lerobot_vtrefine.diagnose.pad.noise import Noise
 from lerobot_vtrefine.diagnose.pad.own_touch import allowed, losses_at_own_touch
 from lerobot_vtrefine.diagnose.pad.press_trials import PressSet
+from lerobot_vtrefine.diagnose.pad.rules import FAR_OFF, FORGIVEN, FURTHER_GAIN
 from lerobot_vtrefine.diagnose.pad.screening import DEAD, GAIN_MAP, all_probes, form_probes, forms_of
 from lerobot_vtrefine.diagnose.pad.suspicions import suspicions
 from lerobot_vtrefine.diagnose.pad.taxel_maps import MapEvidence, find_dead, map_evidence, map_of, with_map
@@ -38,13 +39,6 @@ from lerobot_vtrefine.diagnose.pad.weights import TrialWeights
 Array = np.ndarray
 type Found = Fit | FinalFit
 type Selected = Selection["PadProblem", Any, "Candidate"]
-
-FURTHER_GAIN = 0.025
-"""Error that a cause beside the first must take away: patching the first's form gains a little, too."""
-_FORGIVEN = 1.5
-"""Factor by which weights may raise the plain squared error of a model."""
-_FAR_OFF = 4.0
-"""Mean square of slow errors under load, in variances of a frame's noise, that weights do not hide."""
 
 
 @dataclass(frozen=True)
@@ -233,7 +227,7 @@ class PadProblem(OptionalSteps):
         _, weights = weigh(now, self.presses)
         other = replace(self, weights=tuple(weights))
         found = other.refitted(now)
-        if found.mse.sum() <= _FORGIVEN * now.mse.sum():
+        if found.mse.sum() <= FORGIVEN * now.mse.sum():
             return other, found
         return other.even, other.even.refitted(now)
 
@@ -244,7 +238,7 @@ class PadProblem(OptionalSteps):
     def far_off(self, now: Fit) -> bool:
         """Whether slow errors are far above noise: what weights forgive a recording hides what is wrong."""
         each, readings = slow_errors(now, now.residuals(self.presses), self.weights)
-        return float(each @ readings) > _FAR_OFF * max(float(readings.sum()), 1.0)
+        return float(each @ readings) > FAR_OFF * max(float(readings.sum()), 1.0)
 
     def screened(self, now: Fit, only: Collection[str] | None = None) -> list[Promise[Candidate]]:
         """Scores of all forms that are screened, of maps, of frames that repeat and of levels that wander."""

@@ -17,6 +17,7 @@ from lerobot_vtrefine.diagnose.pad.candidates.base import Form
 from lerobot_vtrefine.diagnose.pad.damping_profile import profile
 from lerobot_vtrefine.diagnose.pad.fitting import Fit
 from lerobot_vtrefine.diagnose.pad.form_fitting import starts_of, without
+from lerobot_vtrefine.diagnose.pad.rules import MORE_COORDINATES
 from lerobot_vtrefine.diagnose.pad.screening import MAPS, forms_of, probe_form, scorer_of
 
 if TYPE_CHECKING:
@@ -24,8 +25,6 @@ if TYPE_CHECKING:
 
 BENDS = causes_like("bend")
 """All bend readings against depth: hardening with saturation is an S, whose lower part an offset fits."""
-MORE_COORDINATES = 2
-"""Coordinates that another form may have beyond the named one's, to be heard once names are settled."""
 _ALL = np.ones(1, dtype=bool)
 
 

@@ -1,7 +1,41 @@
-"""Every threshold by which a pad's alarms are raised, once, with its reason: sizes of what is left.
+"""Every threshold by which a pad's causes are accepted and its alarms are raised, once, with its reason.
 
-How sure it must be is in `core.rules`. What has no scores is observed, and compared with sound recordings.
+How sure a decision must be is in `core.rules`. Alarms are raised by the size of what is left; what has no
+scores is observed, and compared with sound recordings.
 """
+
+# A cause is accepted.
+FURTHER_GAIN = 0.025
+"""Part of the squared error that a cause beside the first must take away: patching the first's form gains a
+little, too."""
+MORE_COORDINATES = 2
+"""Coordinates that another form may have beyond the named one's, to be tried once names are settled."""
+FORGIVEN = 1.5
+"""Factor by which weights may raise the plain squared error of a model; beyond, all readings count alike."""
+FAR_OFF = 4.0
+"""Mean square of slow errors under load, in variances of a frame's noise, that weights must not hide."""
+DEAD_BELOW, DEAD_ERROR = 0.12, 0.04
+"""Part of the median gain below which a taxel is dead, and the standard error its gain must be known to."""
+
+# Readings are held.
+MIN_HELD, CHANCE = 0.04, 0.2
+"""Share of frames that must repeat the one before for readings to be held, and the part of it that may be
+chance."""
+VISIBLE = 0.01
+"""Part of a press's deepest drive by which it must change for a repeat to tell."""
+MANY_TAXELS = 6
+"""Taxels from which on each says how often the others repeat by chance."""
+SURE_MOVE = 4.0
+"""Deviations of noise by which the motion alone must change readings of fewer taxels for a repeat to tell."""
+MIN_TELLING = 10
+"""Frames that such a share must rest on."""
+MIN_REPEATED = 0.1
+"""Share of frames that must repeat the one before for a rhythm to be looked for."""
+RARITY = 0.08
+"""Part by which the mean time between new readings may be off as a period."""
+CONTRADICTED = 0.1
+"""Share of changes where a rhythm wants none, up to which it is believed; of repeats where it wants a change,
+three times as much, for readings may stay what they were."""
 
 # What is left follows something.
 FOLLOWS = 0.02

@@ -8,14 +8,11 @@ import numpy as np
 from lerobot_vtrefine.diagnose.pad.fitting import Fit, predict
 from lerobot_vtrefine.diagnose.pad.model import Composite
 from lerobot_vtrefine.diagnose.pad.press_trials import PressSet
+from lerobot_vtrefine.diagnose.pad.rules import DEAD_BELOW, DEAD_ERROR
 from lerobot_vtrefine.diagnose.pad.weights import TrialWeights
 
 STEP = 1e-3
 MAX_SIGMA, MIN_SIGMA = 0.8, 1e-3
-DEAD_BELOW = 0.12
-"""A taxel that answers with less than this part of what it should is dead."""
-DEAD_ERROR = 0.04
-"""Standard error that its gain must be known with."""
 BOUNDS = (0.05, 8.0)
 
 

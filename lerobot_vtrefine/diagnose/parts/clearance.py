@@ -1,9 +1,9 @@
 """The hole's clearance, from how far the plug goes sideways in it before the walls push back.
 
-Fingers centre their parts across the pads, so both hands' encoders tell where the plug is in the hole along
-that axis, and the arms' give tells when a wall pushes. In frames with a push, place = zero -+ half the
+Fingers centre their parts across the pads, so both hands' encoders measure the plug's place in the hole along
+that axis, and the arms' deflection shows when a wall pushes. In frames with a push, place = zero -+ half the
 clearance - give x force, the sign being the force's. The zero is fitted, too: walls on both sides are needed.
-So is the give, from what is known of it beforehand: arms whose servos are soft push too evenly to show it.
+So is the give, with a prior: arms with soft servos push too evenly to show it.
 """
 
 from collections.abc import Sequence
@@ -15,27 +15,26 @@ from lerobot_vtrefine.diagnose.parts.episodes import AssumedScene, HandledEpisod
 from lerobot_vtrefine.diagnose.parts.forces import places, point_forces
 from lerobot_vtrefine.diagnose.parts.problem import Quantity
 from lerobot_vtrefine.diagnose.parts.regression import Blocks
+from lerobot_vtrefine.diagnose.parts.rules import (
+    CLEARANCE_ERROR,
+    INSERTED_M,
+    MIN_EPISODES,
+    MIN_ON_A_WALL,
+    PUSH_N,
+    RESTS_M_S,
+)
 from lerobot_vtrefine.sim.starts import HAND_RETREAT_M
 
 Array = np.ndarray
 
-FORM = (0.03, 6e-5)
-"""What the method errs by on the twin's own recordings: part of the value, and at least so much [m]."""
 _ROUND = (
     "pads close along one axis only, and along that axis a round hole is as wide as assumed only where the "
     "plug is in its middle: use a pair with flat walls"
 )
-PUSH_N = 0.12
-INSERTED_M = 0.006
-"""The plug's tip is this far below the mouth; how high a part is held may be off by half of it."""
-RESTS_M_S = 0.003
-"""A plug at a wall moves no faster; on its way between the walls arms lag, which is no push."""
 GIVE_M_PER_N = 8e-5
 """How far preloaded pads let the parts give way: on the twins 7.5e-5 (ALOHA) and 8.6e-5 (Kinova) ..."""
 GIVE_WEIGHT_N = 3.0
 """... and how much an episode counts that: places err by 3e-5 m, so that it is known to 1e-5 m/N."""
-FEWEST = 3
-"""Episodes, and frames on each wall."""
 
 
 @dataclass(frozen=True)
@@ -93,13 +92,13 @@ def clearance(
     round_hole = blocks is not None and scene.pair.name == "round"
     if round_hole and blocks.solve(np.ones(len(blocks.rows)), slope=True)[-1] < 0:
         reason = _ROUND
-    return Quantity("clearance", "clearance", known, "m", FORM, blocks, reason)
+    return Quantity("clearance", "clearance", known, "m", CLEARANCE_ERROR, blocks, reason)
 
 
 def _blocks(
     assumed: float, episodes: Sequence[HandledEpisode], contacts: Sequence[Contact]
 ) -> tuple[Blocks | None, str]:
-    """None with the reason where walls are not felt."""
+    """None with the reason where there is no contact with the walls."""
     blocks, walls = [], np.zeros(2, dtype=int)
     for episode, contact in zip(episodes, contacts, strict=True):
         offset = contact.place_m[:, 1] - contact.place_m[:, 0]
@@ -116,7 +115,7 @@ def _blocks(
         effect = np.append(-side / 2, 0.0)
         zero, give = np.append(np.ones_like(side), 0.0), np.append(force, GIVE_WEIGHT_N)
         blocks.append((error[:, None], effect[:, None], np.stack([zero, give], -1)[:, None]))
-    if len(blocks) < FEWEST or walls.min() < FEWEST:
+    if len(blocks) < MIN_EPISODES or walls.min() < MIN_ON_A_WALL:
         return None, (
             "the inserted plug is not pushed against both walls across the pads in three episodes; insert it "
             "and move the hand 10 mm to either side across the pads, twice, slowly"

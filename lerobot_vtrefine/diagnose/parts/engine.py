@@ -1,8 +1,8 @@
 """The diagnosis of parts: episodes of the twin's robot in, object_mass, object_friction and clearance out.
 
-Each is named only where episodes show it: the estimate lessens the error of episodes left out of the fit, all
-of them saying so together, and differs from what the simulation assumes by more than the method errs. Where
-the recordings cannot tell, the evidence says what to record.
+Each is named only where episodes show it: the estimate reduces the error on episodes left out of the fit,
+tested over all of them together, and differs from what the simulation assumes by more than the method's own
+error. Where the recordings do not determine a number, the evidence says what to record.
 """
 
 from collections.abc import Sequence
@@ -19,6 +19,7 @@ from lerobot_vtrefine.diagnose.parts.episodes import AssumedScene, HandledEpisod
 from lerobot_vtrefine.diagnose.parts.mass import masses, remeasured
 from lerobot_vtrefine.diagnose.parts.payload import replay_loaded
 from lerobot_vtrefine.diagnose.parts.problem import Measured, Quantity, measure
+from lerobot_vtrefine.diagnose.parts.rules import FRICTION_ERROR
 from lerobot_vtrefine.diagnose.verdict import Cause, Verdict
 from lerobot_vtrefine.sim.scene import build_scene
 
@@ -27,11 +28,11 @@ Array = np.ndarray
 NAMES = ("object_mass", "object_friction", "clearance")
 UNKNOWN_PARTS = (
     "the parts are not known: datasets of vtrefine-record-demos and of the simulated robot note the assumed "
-    "scene, others hold no part that the twin could carry"
+    "scene, others have no part that the twin could carry"
 )
 PAD_FRICTION = (
-    "friction between pads and part: not identifiable, because pads tell how hard they are pressed but not "
-    "when the part slips, and no joint's load tells the pull; close the hand on a part that is clamped to "
+    "friction between pads and part: not identifiable, because pads measure how hard they are pressed but "
+    "not when the part slips, and no joint's load measures the pull; close the hand on a part clamped to "
     "the table, pull until it slips at two closing forces, five times each, and record the joints' load"
 )
 
@@ -49,20 +50,20 @@ def assumed_masses(scene: AssumedScene) -> Array:
 
 
 def weigh(scene: AssumedScene, episodes: Sequence[HandledEpisode], seed: int = 0) -> tuple[Measured, ...]:
-    """Socket and plug, as far as episodes show them."""
+    """The masses of socket and plug, as far as episodes determine them."""
     found = measure(masses(scene, episodes, assumed_masses(scene), seed), seed)
     return remeasured(scene, episodes, found, seed)
 
 
 def masses_kg(found: Sequence[Measured]) -> Array:
-    """(2,) of socket and plug as episodes show them, as assumed where they show nothing else."""
+    """(2,) of socket and plug as episodes show them, or as assumed where they do not."""
     return np.array([item.believed for item in found])
 
 
 def diagnose_parts(
     scene: AssumedScene, episodes: Sequence[HandledEpisode], weighed: Sequence[Measured], seed: int = 0
 ) -> Diagnosis:
-    """Judge the parts of episodes whose encoders are trusted (what robots get wrong taken off before).
+    """Judge the parts of episodes whose encoders are trusted (the robot's own errors having been removed).
 
     Args:
         weighed: the masses as `weigh` finds them in these episodes.
@@ -72,7 +73,7 @@ def diagnose_parts(
     contacts = contacts_of(scene, episodes, untouched)
     found += measure([sliding.friction(scene, episodes, contacts)], seed)
     known = scene.scene.pad_friction
-    pads = Quantity("object_friction", "pad_friction", known, "1", sliding.FORM, None, PAD_FRICTION)
+    pads = Quantity("object_friction", "pad_friction", known, "1", FRICTION_ERROR, None, PAD_FRICTION)
     found.append(Measured(pads))
     found += measure([clearance(scene, episodes, contacts)], seed)
     return _summary(found)
@@ -101,7 +102,7 @@ def _summary(measured: Sequence[Measured]) -> Diagnosis:
 
 
 def _strongest(items: list[Evidence]) -> Evidence:
-    """One line per cause: the strongest of its parts', with every part's sentence."""
+    """One line per cause: its strongest evidence, with the sentences of all."""
     order = ("accepted", "rejected", "not identifiable")
     best = min(items, key=lambda item: (order.index(item.decision), item.p_value or 0.0))
     reason = "; ".join(dict.fromkeys(item.reason for item in items))
@@ -109,7 +110,7 @@ def _strongest(items: list[Evidence]) -> Evidence:
 
 
 def _next(evidence: list[Evidence]) -> dict[str, Any] | None:
-    """What to record so that everything about the parts can be told."""
+    """What to record so that everything about the parts can be identified."""
     missing = [item for item in evidence if item.decision == "not identifiable"]
     if not missing:
         return None

@@ -1,8 +1,8 @@
-"""Episodes of the twin's own robot, with what the pads tell about when parts are held and when they meet.
+"""Episodes of the twin's own robot, with what the pads say about when parts are held and when they meet.
 
-Shapes: T frames, J joints, A hands in the order of the body's arms. Nothing here reads what only a simulator
-knows: a simulated dataset's note tells which scene was *assumed*, not how its episodes began nor what was
-hidden in them.
+Shapes: T frames, J joints, A hands in the order of the body's arms. Nothing here uses what only a simulator
+knows: a simulated dataset's note says which scene was *assumed*, not how its episodes began or which faults
+were hidden in them.
 """
 
 from collections.abc import Sequence
@@ -14,6 +14,15 @@ import torch
 
 from lerobot_vtrefine.datasets.episodes import EpisodeFolder, RecordedEpisode, open_episodes
 from lerobot_vtrefine.diagnose.episode_replay.twin import read_ledger, recorded_twin
+from lerobot_vtrefine.diagnose.parts.rules import (
+    APART_M,
+    CLEAR_M,
+    HELD_TAXELS,
+    LIFTED_M,
+    SETTLE_S,
+    SIDEWAYS_M,
+    TOUCHED_COUNTS,
+)
 from lerobot_vtrefine.embodiments import Embodiment, get_embodiment
 from lerobot_vtrefine.embodiments.embodiment import PARTS
 from lerobot_vtrefine.sim.config import SceneConfig, TaskConfig
@@ -21,19 +30,6 @@ from lerobot_vtrefine.sim.pairs import Part, PartPair, load_pair
 
 Array = np.ndarray
 
-TOUCHED_COUNTS = 8
-"""A taxel this much above its idle level is pressed."""
-HELD_TAXELS = 6
-"""A pad with at least so many pressed taxels holds something, if its opposite does, too."""
-LIFTED_M = 0.0015
-"""A part raised this far hangs in the hand ..."""
-CLEAR_M = 0.02
-"""... and raised this far it surely touches nothing else."""
-APART_M = 0.012
-"""Parts whose mouths are further apart than this do not touch."""
-_SIDEWAYS_M = 0.04
-_SETTLE_S = 1.0
-"""Time after a touch, or after a part has left the table, in which servos are still recovering."""
 GRAVITY_M_S2 = 9.81
 
 
@@ -62,11 +58,13 @@ class AssumedScene:
     def unheld(self, part: str) -> str:
         """Why no hand holds the part; empty where one does."""
         if part == "socket" and self.scene.socket == "stands":
-            return "the socket stands on the table, and no hand feels it"
+            return "the socket stands on the table, and no hand holds it"
         if self.body.holders[PARTS.index(part)] is None:
             return f"{self.body.name} has no hand that holds the {part}"
         if self.body.pads_per_arm < 2:
-            return f"{self.body.name} has one pad per hand: whether it holds the {part} takes two that face"
+            return (
+                f"{self.body.name} has one pad per hand: whether it holds the {part} takes two opposite ones"
+            )
         return ""
 
     def weights_n(self, episodes: "Sequence[HandledEpisode]", mass_kg: Array) -> list[Array]:
@@ -91,13 +89,13 @@ class HandledEpisode:
     held: Array
     """(T, A) bool: both pads of the hand are pressed."""
     hanging: Array
-    """(T, A) bool: the hand bears a part's weight."""
+    """(T, A) bool: the hand carries a part's weight."""
     carried: Array
     """(T, A) bool: and has done so for a while, and nothing else touches the part."""
     free: Array
     """(T, A) bool: the hand is empty and has been so for a while."""
     together: Array
-    """(T,) bool: all hands hold their parts, so near that these may touch."""
+    """(T,) bool: all hands hold their parts, so close that these may touch."""
 
 
 def assumed_scene(folder: EpisodeFolder) -> AssumedScene | None:
@@ -115,7 +113,7 @@ def read_episodes(root: Path, scene: AssumedScene) -> tuple[HandledEpisode, ...]
 
 
 def handled(episode: RecordedEpisode, scene: AssumedScene) -> HandledEpisode:
-    """Tell an episode's phases by its pads and by where its hands are."""
+    """An episode's phases, by its pads and the positions of its hands."""
     body, count = scene.body, len(episode.state)
     pressed = np.zeros((count, len(body.pad_names)), dtype=int)
     for place, name in enumerate(body.pad_names):
@@ -128,7 +126,7 @@ def handled(episode: RecordedEpisode, scene: AssumedScene) -> HandledEpisode:
     tip, _ = hands(body, episode.state)
     apart, hanging = _apart(tip, held, scene), _raised(tip[..., 2], held, LIFTED_M)
     clear = _raised(tip[..., 2], held, CLEAR_M)
-    settle = max(1, round(_SETTLE_S / max(float(np.median(np.diff(episode.time_s))), 1e-3)))
+    settle = max(1, round(SETTLE_S / max(float(np.median(np.diff(episode.time_s))), 1e-3)))
     return HandledEpisode(
         index=episode.index,
         time_s=episode.time_s.astype(float) - float(episode.time_s[0]),
@@ -159,7 +157,7 @@ def without_hands(body: Embodiment, episode: HandledEpisode) -> Array:
 
 
 def _raised(height: Array, held: Array, least_m: float) -> Array:
-    """(T, A): held, and higher than where the hand took hold; parts held from the start hang already."""
+    """(T, A): held, and higher than where it was grasped; parts held from the start count as raised."""
     out = np.zeros_like(held)
     for hand in range(held.shape[1]):
         frames = np.flatnonzero(held[:, hand])
@@ -193,5 +191,5 @@ def _apart(tip: Array, held: Array, scene: AssumedScene) -> Array:
         return np.ones(len(tip), dtype=bool)
     mouth = tip[:, socket] + [0.0, 0.0, scene.pair.mouth_z_m - scene.pair.socket.grip.centre_m[2]]
     between = lower_end - mouth
-    sideways = np.hypot(between[:, 0], between[:, 1]) > _SIDEWAYS_M
+    sideways = np.hypot(between[:, 0], between[:, 1]) > SIDEWAYS_M
     return sideways | (between[:, 2] > APART_M)

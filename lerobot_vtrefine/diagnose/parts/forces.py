@@ -1,7 +1,7 @@
 """Forces on the hands, read from how far the arms stand from where the twin's arms, untouched, would stand.
 
 A position servo is a spring: held back by a force it lags by that force's torque over its stiffness. Joints
-with dry friction tell little and are weighed accordingly, and so are those whose axis passes close to the
+with dry friction say little and are weighted accordingly, and so are those whose axis passes close to the
 point, since where exactly a part is touched is not known. Valid for slow motion.
 
 Shapes: T frames, A hands, K revolute joints of an arm.

@@ -1,7 +1,7 @@
 """Friction of the plug, from the pull against sliding while it is pressed down on the table.
 
-The arm's give tells both forces. Only slides across the pads count: there the joints of ALOHA that tell them
-have next to no dry friction of their own.
+The arm's deflection measures both forces. Only slides across the pads count: there, the joints of ALOHA that
+measure them have almost no dry friction of their own.
 """
 
 from collections.abc import Sequence
@@ -12,16 +12,16 @@ from lerobot_vtrefine.diagnose.parts.clearance import Contact
 from lerobot_vtrefine.diagnose.parts.episodes import AssumedScene, HandledEpisode
 from lerobot_vtrefine.diagnose.parts.problem import Quantity
 from lerobot_vtrefine.diagnose.parts.regression import Blocks
+from lerobot_vtrefine.diagnose.parts.rules import (
+    FLAT_M,
+    FRICTION_ERROR,
+    MIN_EPISODES,
+    MIN_SLIDING,
+    PRESS_N,
+    SLIDES_M_S,
+)
 
 Array = np.ndarray
-
-FORM = (0.1, 0.02)
-"""What the method errs by on the twin's own recordings: part of the value, and at least so much."""
-PRESS_N = 1.5
-SLIDES_M_S = 0.02
-FLAT_M = 0.008
-"""The plug's tip is this close to the table."""
-FEWEST_FRAMES, FEWEST_EPISODES = 5, 3
 
 
 def friction(
@@ -31,9 +31,9 @@ def friction(
     known = scene.scene.part_friction
     hand = scene.hand_of("plug")
     if hand is None:
-        return Quantity("object_friction", "friction", known, "1", FORM, None, scene.unheld("plug"))
+        return Quantity("object_friction", "friction", known, "1", FRICTION_ERROR, None, scene.unheld("plug"))
     blocks, reason = _blocks(known, hand, scene.scene.table_height_m, episodes, contacts)
-    return Quantity("object_friction", "friction", known, "1", FORM, blocks, reason)
+    return Quantity("object_friction", "friction", known, "1", FRICTION_ERROR, blocks, reason)
 
 
 def _blocks(
@@ -52,12 +52,12 @@ def _blocks(
         use = episode.held[:, hand] & ~episode.together & (np.abs(place[:, 2] - table_m) < FLAT_M)
         use &= (force[:, 2] > PRESS_N) & (np.abs(speed[:, 0]) > SLIDES_M_S)
         use &= np.abs(speed[:, 0]) > 2 * np.hypot(speed[:, 1], speed[:, 2])
-        if use.sum() < FEWEST_FRAMES:
+        if use.sum() < MIN_SLIDING:
             continue
         normal, pull = force[use, 2], -force[use, 0] * np.sign(speed[use, 0])
         error = pull - assumed * normal
         blocks.append((error[:, None], normal[:, None], np.zeros((len(normal), 1, 0))))
-    if len(blocks) < FEWEST_EPISODES:
+    if len(blocks) < MIN_EPISODES:
         return None, (
             "no held part slides under load in three episodes; press the plug on the table with 5 N or more "
             "and drag it 30 mm to either side across the pads, twice, slowly"

@@ -1,10 +1,10 @@
-"""The parts' masses, by how much further the servos give way under them than in the twin.
+"""The parts' masses, by how much further the servos deflect under them than in the twin.
 
 The twin's arms are replayed twice with weights in the hands while these carry parts: as assumed, and heavier.
 What the recorded joints do beyond the first replay is explained by a multiple of the difference of both, one
-number per hand for all its joints, beside what the robot itself may get wrong: an offset and a pull against
-the direction of motion for every joint. Only if the mass lessens the error of episodes
-that the fit has not seen, all of them together saying so, is it the parts that are heavier or lighter.
+number per hand for all its joints, beside what the robot itself may add: an offset and a friction against
+the direction of motion for every joint. Only if the mass reduces the error on episodes
+left out of the fit, tested over all of them together, are the parts called heavier or lighter.
 """
 
 from collections.abc import Sequence
@@ -16,25 +16,22 @@ from lerobot_vtrefine.diagnose.parts.episodes import AssumedScene, HandledEpisod
 from lerobot_vtrefine.diagnose.parts.payload import replay_loaded
 from lerobot_vtrefine.diagnose.parts.problem import Measured, Quantity
 from lerobot_vtrefine.diagnose.parts.regression import Blocks, Line, slope_of
+from lerobot_vtrefine.diagnose.parts.rules import (
+    AGAIN,
+    DISAGREE,
+    MASS_ERROR,
+    MIN_EPISODES,
+    MIN_JOINTS,
+    TELLING_KG,
+)
 from lerobot_vtrefine.embodiments import Embodiment
 from lerobot_vtrefine.embodiments.embodiment import PARTS
 
 Array = np.ndarray
 
-FORM = (0.06, 0.004)
-"""What the method errs by on the twin's own recordings: part of the value, and at least so much [kg]."""
 _HEAVIER_KG = 0.05
 _LIGHTEST_KG = 0.005
-_AGAIN = 0.2
-"""A mass that is off by more than this part is estimated again from where it was found."""
 _MOVES_RAD_S = 0.02
-_LEAST_EPISODES = 3
-_TELLING_KG = 0.04
-"""A joint has a say in the mass if its own estimate's standard error is below this."""
-_FEWEST_JOINTS = 2
-_APART = 0.25
-"""Joints agree where their estimates differ from the common one by less than this part of it, or by
-chance."""
 
 
 def masses(
@@ -46,10 +43,10 @@ def masses(
     for part, known, item in zip(PARTS, assumed_kg, lines, strict=True):
         name = f"{part}_kg"
         if isinstance(item, str):
-            out.append(Quantity("object_mass", name, float(known), "kg", FORM, None, item))
+            out.append(Quantity("object_mass", name, float(known), "kg", MASS_ERROR, None, item))
             continue
         reason = _disagreement(scene.body, item, slope_of(Blocks.of(item), seed), seed)
-        out.append(Quantity("object_mass", name, float(known), "kg", FORM, Blocks.of(item), reason))
+        out.append(Quantity("object_mass", name, float(known), "kg", MASS_ERROR, Blocks.of(item), reason))
     return tuple(out)
 
 
@@ -60,11 +57,11 @@ def remeasured(
     seed: int,
 ) -> tuple[Measured, ...]:
     """Masses that are far off, taken anew where they were found: with friction in the joints the weight's
-    effect is no straight line. What was found stays found."""
+    effect is not linear. What was found stays found."""
     assumed = np.array([item.quantity.assumed for item in found])
     change = np.array([item.line.value if item.line and not item.quantity.reason else 0.0 for item in found])
     near = np.maximum(assumed + change, _LIGHTEST_KG) - assumed
-    if not (np.abs(near) > _AGAIN * assumed).any():
+    if not (np.abs(near) > AGAIN * assumed).any():
         return tuple(found)
     out = []
     again_lines = _lines(scene, episodes, assumed + near)
@@ -89,13 +86,13 @@ def _lines(
     for part in PARTS:
         hand = scene.hand_of(part)
         if hand is None:
-            out.append(f"{scene.unheld(part)}: its mass is not told")
+            out.append(f"{scene.unheld(part)}: its mass is not measured")
             continue
         seen = [bool(e.free[:, hand].any() and e.carried[:, hand].any()) for e in episodes]
-        if sum(seen) < _LEAST_EPISODES:
+        if sum(seen) < MIN_EPISODES:
             out.append(
-                f"the {part} is not picked up in sight of the encoders: a hand that always holds it cannot "
-                "tell its weight from offsets; record picking it up from the table"
+                f"the {part} is never picked up: for a hand that always holds it, its weight cannot be "
+                "distinguished from encoder offsets; record picking it up from the table"
             )
         else:
             paths = zip(episodes, *replays, strict=True)
@@ -104,24 +101,23 @@ def _lines(
 
 
 def _disagreement(body: Embodiment, blocks: list[tuple[Array, Array, Array]], line: Line, seed: int) -> str:
-    """Why it is not the mass, although it helps: a mass pulls at every pitching joint, a fault at its own."""
+    """Why it is not the mass, although it helps: a mass loads every pitching joint, a fault only its own."""
     agree, differ = 0, []
     for channel, joint in enumerate(body.joints):
         own = [(item[0][:, [channel]], item[1][:, [channel]], item[2][:, [channel]]) for item in blocks]
         if not any(effect.any() for _, effect, _ in own):
             continue
         alone = slope_of(Blocks.of(own), seed)
-        if alone.error > _TELLING_KG:
+        if alone.error > TELLING_KG:
             continue
         chance = 3 * np.hypot(alone.error, line.error)
-        near = abs(alone.value - line.value) < max(_APART * abs(line.value), chance)
+        near = abs(alone.value - line.value) < max(DISAGREE * abs(line.value), chance)
         agree += near and alone.value * line.value > 0
         differ += [] if near else [joint.name]
-    if agree >= _FEWEST_JOINTS and len(differ) < agree:
+    if agree >= MIN_JOINTS and len(differ) < agree:
         return ""
-    return (
-        f"joints contradict each other about it ({', '.join(differ) or 'too few can tell'}): it is the robot"
-    )
+    those = ", ".join(differ) or "too few are sensitive to it"
+    return f"joints contradict each other about it ({those}): it is the robot"
 
 
 def _block(

@@ -15,12 +15,10 @@ from lerobot_vtrefine.diagnose.core.problem import OptionalSteps, PlainCandidate
 from lerobot_vtrefine.diagnose.core.rules import SURE
 from lerobot_vtrefine.diagnose.evidence import Evidence
 from lerobot_vtrefine.diagnose.parts.regression import Blocks, Line, slope_of
+from lerobot_vtrefine.diagnose.parts.rules import BEYOND
 from lerobot_vtrefine.diagnose.verdict import Parameter
 
 Array = np.ndarray
-
-_BEYOND = 2.0
-"""By how many standard errors, and by how many times the method's own error, a number must differ."""
 
 
 @dataclass(frozen=True)
@@ -32,14 +30,14 @@ class Quantity:
     assumed: float
     unit: str
     form: tuple[float, float]
-    """What the method errs by: part of the value, and at least so much."""
+    """The method's own error: part of the value, and at least so much."""
     blocks: Blocks | None
     """Errors, of which the slope is the number beyond what is assumed; None where episodes do not show it."""
     reason: str = ""
-    """Why it cannot be told, or is not believed."""
+    """Why it is not identifiable, or not credible."""
 
     def slack(self, change: float) -> float:
-        """What the method may err by."""
+        """The method's own error for such a difference."""
         return max(self.form[0] * abs(self.assumed + change), self.form[1])
 
 
@@ -76,7 +74,7 @@ class Measured:
         """Smallest difference that these episodes would have shown."""
         if self.line is None:
             return None
-        return max(SURE * self.line.error, _BEYOND * self.quantity.slack(self.line.value))
+        return max(SURE * self.line.error, BEYOND * self.quantity.slack(self.line.value))
 
     @property
     def evidence(self) -> Evidence:
@@ -191,11 +189,11 @@ class PartProblem(OptionalSteps):
         return Refits(self, fit.free, np.arange(len(self.blocks)) if channels is None else channels)
 
     def credible(self, baseline: Fit, now: Fit, best: Fit, candidate: PlainCandidate) -> Array:
-        """(J,) whether it differs by more than the method errs, and nothing speaks against it."""
+        """(J,) whether it differs by more than the method's own error, and nothing contradicts it."""
         pairs = zip(self.quantities, self.lines, strict=True)
         return np.array(
             [
-                not item.reason and abs(line.value) > _BEYOND * max(line.error, item.slack(line.value))
+                not item.reason and abs(line.value) > BEYOND * max(line.error, item.slack(line.value))
                 for item, line in pairs
             ]
         )
@@ -212,7 +210,7 @@ def measure(quantities: Sequence[Quantity], seed: int) -> tuple[Measured, ...]:
     known: dict[str, Measured] = {}
     if shown:
         lines = tuple(slope_of(item, seed) for item in blocks)
-        # Episodes are few and none can be spared: gains are cross-validated ones.
+        # There are too few episodes to lock any: gains are cross-validated.
         selection = infer(PartProblem(tuple(shown), blocks, lines), seed, locking=False).selection
         for channel, (item, line) in enumerate(zip(shown, lines, strict=True)):
             tried = next(one for one in selection.first_round if one.cause == item.cause)

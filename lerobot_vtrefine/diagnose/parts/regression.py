@@ -31,7 +31,7 @@ class Blocks:
     rows: Array
     """(E,)"""
     scale: Array
-    """(C,) typical size of every channel's error, which weighs it."""
+    """(C,) typical size of every channel's error, which weights it."""
 
     @classmethod
     def of(cls, blocks: Sequence[tuple[Array, Array, Array]]) -> "Blocks":
@@ -53,7 +53,7 @@ class Blocks:
         return Blocks(*(part[episodes] for part in parts), self.scale)
 
     def solve(self, weights: Array, slope: bool) -> Array:
-        """Coefficients (P,) with every episode counted by its weight (E,); without slope it stays zero."""
+        """Coefficients (P,) with episodes weighted (E,); the slope is zero unless asked for."""
         own = np.arange(self.normal.shape[1] - (not slope))
         normal, right = np.tensordot(weights, self.normal, 1), weights @ self.right
         out = np.zeros(len(normal))
@@ -61,7 +61,7 @@ class Blocks:
         return out
 
     def errors(self, theta: Array) -> Array:
-        """(E,) mean squared error, channels weighed, of every episode."""
+        """(E,) mean squared error, channels weighted, of every episode."""
         total = self.power - 2 * self.right @ theta + np.einsum("p,epq,q->e", theta, self.normal, theta)
         return total.clip(0.0) / np.maximum(self.rows, 1)
 
@@ -100,7 +100,7 @@ def _design(effect: Array, nuisance: Array) -> Array:
 
 
 def _scale(blocks: Sequence[tuple[Array, Array, Array]]) -> Array:
-    """(C,) error that nuisances of each channel leave, so that noisy channels count less."""
+    """(C,) residual error of each channel, so that noisy channels count less."""
     error = np.concatenate([item[0] for item in blocks])
     effect = np.concatenate([item[1] for item in blocks])
     nuisance = np.concatenate([item[2] for item in blocks])

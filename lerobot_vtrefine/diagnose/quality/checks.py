@@ -13,19 +13,14 @@ from lerobot_vtrefine.diagnose.quality import (
     wiring,
 )
 from lerobot_vtrefine.diagnose.quality.edits import Check, apply
+from lerobot_vtrefine.diagnose.quality.rules import MIN_PART, MIN_TRIALS
 from lerobot_vtrefine.diagnose.recordings import RecordingSet
 from lerobot_vtrefine.diagnose.verdict import DataIssue
 
-MIN_TRIALS = 4
-"""Fewer leave none for choosing beside those that are held out."""
-MIN_PART = 1 / 3
-"""If less than this part of a set is sound, the rest is not trusted either."""
-
-# Each check sees what the ones before it left: first frames and times, then what the pad says. Frames without
-# numbers are dropped after the clock was checked, which would take them for lost ones; all other checks need
-# numbers.
+# Each check gets what the ones before it left: first frames and times, then readings. Frames without numbers
+# are dropped after the clock was checked, which would take them for lost ones; all other checks need numbers.
 UNIT_CHECKS: tuple[Check, ...] = (sizes.check_sizes, units.check_units)
-"""What a prediction has to mend as well; none of these looks at readings."""
+"""Also applied before a prediction; none of these uses readings."""
 FRAME_CHECKS: tuple[Check, ...] = (
     frames.check_repeats,
     frames.check_spikes,
@@ -53,7 +48,7 @@ PAD_CHECKS: tuple[Check, ...] = (
     session.check_conditions,
 )
 PLACED_CHECKS: tuple[Check, ...] = (response.check_answers, outliers.check_odd, outliers.check_gain)
-"""With lines in the wrong place, these would find every trial at fault."""
+"""With miswired rows or columns, these would reject every trial."""
 ROBOT_CHECKS: tuple[Check, ...] = (
     joints.check_jumps,
     joints.check_commands,
@@ -95,7 +90,7 @@ def in_si_units(recordings: RecordingSet) -> tuple[RecordingSet, list[DataIssue]
 
 
 def too_little(checked: RecordingSet, recorded: RecordingSet) -> DataIssue | None:
-    """Why what quality control left of a set does not suffice for a verdict; None if it does."""
+    """Why too little of a set passed quality control for a verdict; None if enough did."""
     left, total = len(checked.trials), len(recorded.trials)
     if left < MIN_TRIALS:
         return DataIssue(

@@ -1,22 +1,18 @@
-"""What quality control needs to know about contact: when a trial is untouched, and where it should answer."""
+"""Contact as quality control needs it: when a pad is untouched, and where it should respond."""
 
 from dataclasses import dataclass
 
 import numpy as np
 
 from lerobot_vtrefine.diagnose.pad.indenters import trial_forces, trial_heights
+from lerobot_vtrefine.diagnose.quality.rules import CLEAR_M, TOUCH_FORCE
 from lerobot_vtrefine.diagnose.recordings import RecordingSet, Trial
 from lerobot_vtrefine.tactile.layout import PadLayout
-
-CLEAR_M = 2e-4
-"""An indenter this far above the face surely does not touch it."""
-TOUCH_FORCE = 0.05
-"""Part of a trial's peak force above which it counts as loaded."""
 
 
 @dataclass(frozen=True)
 class Press:
-    """A trial as seen by the checks.
+    """A trial as the checks use it.
 
     Attributes:
         drive: (N, R*C) what presses each taxel: penetration [m], or its share of the force [N].

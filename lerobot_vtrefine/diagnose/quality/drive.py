@@ -1,4 +1,4 @@
-"""Checks of what drives a pad against what it answers: signs, useless forces, presses beside the pad."""
+"""Checks of what drives a pad against its response: signs, unusable forces, presses beside the pad."""
 
 from collections.abc import Iterator
 from dataclasses import replace
@@ -6,21 +6,21 @@ from dataclasses import replace
 import numpy as np
 
 from lerobot_vtrefine.diagnose.quality.contact import Press, presses
-from lerobot_vtrefine.diagnose.quality.edits import KEPT, MINORITY, NO_VERDICT, SET_ASIDE, Finding
+from lerobot_vtrefine.diagnose.quality.edits import KEPT, NO_VERDICT, SET_ASIDE, Finding
+from lerobot_vtrefine.diagnose.quality.rules import (
+    ALONG,
+    CLEAR_PART,
+    CLEAR_SIZE,
+    CLEARLY,
+    HEAVY_N,
+    LATE_S,
+    MINORITY,
+    TARE,
+    UNRELATED,
+)
 from lerobot_vtrefine.diagnose.recordings import RecordingSet, Trial
 
-ALONG, CLEARLY, NONE = 0.5, 0.3, 0.2
-"""Correlation with the answer that depth or force must reach when turned round, and by how much more than as
-recorded; and what is no correlation."""
-LATE_S = 0.5
-"""Readings that come this late still follow the press."""
-CLEAR_SIZE, CLEAR_PART = 8.0, 0.02
-"""An answer is clear if it is this many deviations of a frame's noise and this part of full scale."""
 GRAMS_PER_NEWTON = 1e3 / 9.80665
-HEAVY_N = 150.0
-"""Pads and their indenters are pressed with some tens of newtons."""
-TARE = 0.1
-"""Part of the peak force that a load cell shows at rest if nobody set it to zero."""
 
 
 def check_drives(recordings: RecordingSet) -> Iterator[Finding]:
@@ -51,7 +51,7 @@ def check_signs(recordings: RecordingSet) -> Iterator[Finding]:
         trial = recordings.trials[index]
         name = "force_n" if trial.depth_m is None else "depth_m"
         mended = replace(trial, **{name: -getattr(trial, name)})
-        yield Finding(index, f"{name} falls as the readings rise", "repaired: its sign turned round", mended)
+        yield Finding(index, f"{name} falls as the readings rise", "repaired: its sign inverted", mended)
 
 
 def _answer(trial: Trial) -> np.ndarray:
@@ -69,7 +69,7 @@ def _clear(trial: Trial, full_scale: float) -> bool:
 
 
 def _turned(trial: Trial, drive: np.ndarray, answer: np.ndarray) -> bool:
-    """Whether the answer follows a drive (N,) only when that is turned round."""
+    """Whether the answer follows a drive (N,) only with its sign inverted."""
     other = _follows(trial, -drive, answer)
     return other > ALONG and other > _follows(trial, drive, answer) + CLEARLY
 
@@ -88,7 +88,7 @@ def _follows(trial: Trial, drive: np.ndarray, answer: np.ndarray) -> float:
 
 
 def check_forces(recordings: RecordingSet) -> Iterator[Finding]:
-    """Load cells beside a known depth: turned round, unplugged, not set to zero, or in another unit."""
+    """Load cells beside a known depth: sign inverted, unplugged, not zeroed, or in another unit."""
     trials = dict(enumerate(recordings.trials))
     for index, problem, action, force in _cells(recordings):
         trials[index] = replace(trials[index], force_n=force)
@@ -104,14 +104,14 @@ def _cells(recordings: RecordingSet) -> Iterator[tuple[int, str, str, np.ndarray
             continue
         answer = _answer(trial)
         if _turned(trial, force, answer):
-            yield index, "force_n falls as the readings rise", "repaired: its sign turned round", -force
+            yield index, "force_n falls as the readings rise", "repaired: its sign inverted", -force
             continue
-        if _follows(trial, force, answer) < NONE:
+        if _follows(trial, force, answer) < UNRELATED:
             yield index, "force_n does not follow the press", "repaired: not used", None
             continue
         rest = float(np.median(force[press.untouched])) if press.untouched.sum() >= 3 else 0.0
         if abs(rest) > TARE * max(float((force - rest).max()), 1e-9):
-            yield index, f"force_n shows {rest:.3g} N at rest", "repaired: taken away", force - rest
+            yield index, f"force_n shows {rest:.3g} N at rest", "repaired: subtracted", force - rest
 
 
 def _force_units(recordings: RecordingSet, trials: list[Trial]) -> Iterator[Finding]:
@@ -135,11 +135,11 @@ def _force_units(recordings: RecordingSet, trials: list[Trial]) -> Iterator[Find
     loads = [np.abs(trial.force_n).max() for trial in trials if trial.force_n is not None]
     if loads and np.median(loads) > HEAVY_N:
         problem = f"force_n reaches {np.median(loads):.3g} N in the median trial, which looks like grams"
-        yield Finding(None, problem, f"{KEPT}: stiffness and gain absorb the scale")
+        yield Finding(None, problem, f"{KEPT}: the fitted stiffness and gain absorb the scale")
 
 
 def check_contact(recordings: RecordingSet) -> Iterator[Finding]:
-    """Readings that answer although the indenter, as recorded, is not on the pad."""
+    """Readings that respond although the indenter, as recorded, is not on the pad."""
     missed = {
         index: _why(trial, press, recordings)
         for index, (trial, press) in enumerate(zip(recordings.trials, presses(recordings), strict=True))
@@ -147,14 +147,14 @@ def check_contact(recordings: RecordingSet) -> Iterator[Finding]:
     }
     felt = [index for index in missed if _clear(recordings.trials[index], recordings.full_scale)]
     if felt and len(felt) >= MINORITY * len(recordings.trials):
-        problem = f"readings answer in most trials although {missed[felt[0]]}"
+        problem = f"the pad responds in most trials although {missed[felt[0]]}"
         yield Finding(None, problem, NO_VERDICT)
         return
     for index, why in missed.items():
         if index in felt:
-            yield Finding(index, f"readings answer although {why}", SET_ASIDE)
+            yield Finding(index, f"the pad responds although {why}", SET_ASIDE)
         elif len(missed) < len(recordings.trials):
-            yield Finding(index, why, f"{KEPT}: it tells about idle levels only")
+            yield Finding(index, why, f"{KEPT}: used for idle levels only")
 
 
 def _why(trial: Trial, press: Press, recordings: RecordingSet) -> str:

@@ -13,9 +13,7 @@ from lerobot_vtrefine.diagnose.verdict import DataIssue
 SET_ASIDE = "set aside"
 KEPT = "kept"
 NO_VERDICT = "no verdict"
-"""Nothing in the set can be judged before its maker has mended this."""
-MINORITY = 0.5
-"""A fault of fewer trials than this part of the set is theirs; of more, it is a property of the rig."""
+"""The set cannot be judged before this is corrected in the recordings."""
 
 
 @dataclass(frozen=True)

@@ -16,22 +16,17 @@ from lerobot_vtrefine.diagnose.quality.edits import (
     plural,
     take,
 )
+from lerobot_vtrefine.diagnose.quality.rules import (
+    FEW_SPIKES,
+    GAP,
+    LEAST_MOTION_M,
+    MAX_BROKEN,
+    MAX_GAP_S,
+    MAX_MISSING,
+    MIN_FRAMES,
+    SPIKE_FAR,
+)
 from lerobot_vtrefine.diagnose.recordings import RecordingSet
-
-MAX_BROKEN = 0.1
-"""A trial with a larger part of frames without numbers is set aside."""
-MIN_FRAMES = 10
-"""Shorter trials carry no rates and no history."""
-GAP = 1.75
-"""A step longer than this times the usual one has lost frames."""
-MAX_GAP_S = 0.5
-"""Over a longer gap what happened to the pad is unknown; frames were lost, or the clock was set."""
-MAX_MISSING = 0.2
-FEW_SPIKES = 0.02
-"""Part of the frames that may be spikes; more are a motion."""
-SPIKE_FAR = 1.0
-"""A spike lies beyond all other frames by this many times their whole range."""
-LEAST_MOTION_M = 1e-4
 
 
 def check_optional(recordings: RecordingSet) -> Iterator[Finding]:
@@ -109,7 +104,7 @@ def check_repeats(recordings: RecordingSet) -> Iterator[Finding]:
 
 
 def check_spikes(recordings: RecordingSet) -> Iterator[Finding]:
-    """A few frames whose place no motion reaches are dropped."""
+    """A few frames at implausible positions are dropped."""
     for index, trial in enumerate(recordings.trials if recordings.kind == "pad" else ()):
         found = {
             name: wrong
@@ -118,14 +113,13 @@ def check_spikes(recordings: RecordingSet) -> Iterator[Finding]:
         }
         if found:
             frames = np.any(list(found.values()), axis=0)
-            problem = (
-                f"{plural(int(frames.sum()), 'frame')} of {len(frames)} far off in {' and '.join(found)}"
-            )
+            count = plural(int(frames.sum()), "frame")
+            problem = f"{count} of {len(frames)} with implausible {' and '.join(found)}"
             yield Finding(index, problem, "repaired: frames dropped", take(trial, ~frames))
 
 
 def _spikes(values: np.ndarray) -> np.ndarray:
-    """Frames (N,) far beyond all others; none where these are more than a few."""
+    """Frames (N,) far beyond all others; none if there are more than a few."""
     known = np.isfinite(values)
     count = int(FEW_SPIKES * len(values))
     none = np.zeros(len(values), dtype=bool)

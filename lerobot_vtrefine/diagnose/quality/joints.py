@@ -5,17 +5,9 @@ from collections.abc import Iterator
 import numpy as np
 from scipy.optimize import linear_sum_assignment
 
-from lerobot_vtrefine.diagnose.quality.edits import KEPT, MINORITY, SET_ASIDE, Finding
+from lerobot_vtrefine.diagnose.quality.edits import KEPT, SET_ASIDE, Finding
+from lerobot_vtrefine.diagnose.quality.rules import BETTER_ORDER, EXCHANGED, JUMP_RAD, MINORITY, MOVES, STILL
 from lerobot_vtrefine.diagnose.recordings import RecordingSet, RobotTrial
-
-MOVES = 0.1
-"""A joint moves in a trial if its command's range is this part of its largest range in the set."""
-STILL = 1e-3
-"""An encoder sticks if its range is below this part of the command's."""
-JUMP_RAD = 1.0
-"""No joint moves further between two frames, unless its command does."""
-WRONG, BETTER = 0.5, 0.4
-"""1 − correlation with the own command that is suspicious, and what part of it another order must leave."""
 
 
 def check_encoders(recordings: RecordingSet) -> Iterator[Finding]:
@@ -29,14 +21,14 @@ def check_encoders(recordings: RecordingSet) -> Iterator[Finding]:
         problem = (
             f"position of {recordings.joints[joint]} stays constant in most trials while its command moves"
         )
-        yield Finding(None, problem, f"{KEPT}: nothing can be said about this joint")
+        yield Finding(None, problem, f"{KEPT}: this joint cannot be judged")
     for index in np.flatnonzero((stuck & ~always).any(axis=1)):
         names = [recordings.joints[joint] for joint in np.flatnonzero(stuck[index] & ~always)]
         yield Finding(int(index), f"position stays constant: {', '.join(names)}", SET_ASIDE)
 
 
 def check_jumps(recordings: RecordingSet) -> Iterator[Finding]:
-    """Encoders that jump where their command does not: turns that were lost, frames that were garbled."""
+    """Encoders that jump where their command does not: lost turns, corrupted frames."""
     for index, trial in enumerate(recordings.trials):
         step = np.abs(np.diff(trial.position, axis=0)).max(axis=0, initial=0.0)
         commanded = np.ptp(trial.command, axis=0)
@@ -66,15 +58,15 @@ def check_joint_order(recordings: RecordingSet) -> Iterator[Finding]:
         if (names := _exchanged(trial, recordings))
     }
     if len(found) > MINORITY * len(recordings.trials):
-        problem = f"positions of {found[min(found)]} are exchanged in most trials"
+        problem = f"positions of {found[min(found)]} are swapped in most trials"
         yield Finding(None, problem, f"{KEPT}: check the order of the joints")
         return
     for index, names in found.items():
-        yield Finding(index, f"positions of {names} are exchanged", SET_ASIDE)
+        yield Finding(index, f"positions of {names} are swapped", SET_ASIDE)
 
 
 def _exchanged(trial: RobotTrial, recordings: RecordingSet) -> str | None:
-    """Names of joints whose encoders are exchanged in a trial, or None."""
+    """Names of joints whose encoders are swapped in a trial, or None."""
     command, position = trial.command, trial.position
     joints = np.flatnonzero((np.ptp(command, axis=0) > 1e-3) & (np.ptp(position, axis=0) > 1e-6))
     if len(joints) < 2:
@@ -87,6 +79,6 @@ def _exchanged(trial: RobotTrial, recordings: RecordingSet) -> str | None:
     if len(moved) == 0:
         return None
     own, other = np.diag(cost)[moved].mean(), cost[moved, order[moved]].mean()
-    if own < WRONG or other > BETTER * own:
+    if own < EXCHANGED or other > BETTER_ORDER * own:
         return None
     return " and ".join(recordings.joints[joint] for joint in joints[moved])

@@ -1,4 +1,4 @@
-"""Checks of single trials that are unlike all others: files that were mixed up, supplies that were low."""
+"""Checks of single trials that differ from all others: files that were mixed up, low supply voltages."""
 
 from collections.abc import Iterator
 
@@ -6,20 +6,17 @@ import numpy as np
 
 from lerobot_vtrefine.diagnose.quality.contact import Press, presses
 from lerobot_vtrefine.diagnose.quality.edits import SET_ASIDE, Finding
+from lerobot_vtrefine.diagnose.quality.rules import (
+    APART,
+    APART_GAIN,
+    FEW,
+    MIN_KNOWN,
+    MIN_SHARE,
+    STRANGE,
+    USUAL,
+    USUAL_GAIN,
+)
 from lerobot_vtrefine.diagnose.recordings import RecordingSet
-
-STRANGE, USUAL = 0.5, 0.2
-"""Part of a trial's readings that is not in proportion to its drive: in an odd one, and in most."""
-APART = 2.0
-"""A trial's replicates must be this many times better, for a motion may be hard to predict by itself."""
-APART_GAIN, USUAL_GAIN = 0.3, 0.05
-"""Logarithm by which a trial's reading per drive is off, and what that of its set usually is."""
-FEW = 0.1
-"""Part of the trials that may be off; more are a property of the rig."""
-MIN_KNOWN = 6
-"""Trials with replicates that it takes to know what is usual."""
-MIN_SHARE = 0.1
-"""Trials that answer less than this part of the usual power say too little."""
 
 
 def check_odd(recordings: RecordingSet) -> Iterator[Finding]:
@@ -37,7 +34,9 @@ def check_odd(recordings: RecordingSet) -> Iterator[Finding]:
         others = strange[(conditions == conditions[index]) & (np.arange(len(strange)) != index)]
         if not (APART * others[np.isfinite(others)] > strange[index]).any():
             part = f"{100 * strange[index]:.0f} %"
-            problem = f"{part} of the readings' power is not of the recorded motion, unlike in other trials"
+            problem = (
+                f"{part} of the readings' power does not follow the recorded motion, unlike in other trials"
+            )
             yield Finding(int(index), problem, SET_ASIDE)
 
 
@@ -64,7 +63,7 @@ def check_gain(recordings: RecordingSet) -> Iterator[Finding]:
     if 0 < len(worst) <= max(1.0, FEW * len(gains)):
         for index in worst.values():
             part = f"{100 * np.exp(offsets[index]):.0f} %"
-            yield Finding(index, f"reads {part} of what the same motion gives in other trials", SET_ASIDE)
+            yield Finding(index, f"reads {part} of what other trials of the same motion read", SET_ASIDE)
 
 
 def _gain(press: Press) -> float:

@@ -1,4 +1,4 @@
-"""Checks of the scale of readings: normalised, beyond full scale, below zero, turned round."""
+"""Checks of the scale of readings: normalised, beyond full scale, below zero, inverted."""
 
 from collections.abc import Iterator
 from dataclasses import replace
@@ -6,21 +6,24 @@ from dataclasses import replace
 import numpy as np
 
 from lerobot_vtrefine.diagnose.quality.contact import presses
-from lerobot_vtrefine.diagnose.quality.edits import KEPT, MINORITY, NO_VERDICT, SET_ASIDE, Finding
+from lerobot_vtrefine.diagnose.quality.edits import KEPT, NO_VERDICT, SET_ASIDE, Finding
+from lerobot_vtrefine.diagnose.quality.rules import (
+    ALWAYS,
+    BELOW,
+    BEYOND,
+    HARDLY,
+    LIGHT,
+    MIN_WRAPS,
+    MINORITY,
+    ONE_TAXEL,
+    TOUCHED_BELOW,
+    WRAP,
+)
 from lerobot_vtrefine.diagnose.recordings import RecordingSet
 
 CONVERTERS = (1.0, 3.3, 5.0, 10.0, 255.0, 1023.0, 4095.0, 16383.0, 65535.0, 16777215.0)
 """Full scales in use: normalised readings, volts, and converters of 8 to 24 bits."""
-HARDLY = 0.02
-"""Readings that stay below this part of full scale through a whole set are in another unit."""
-BEYOND = 1.01
-BELOW, TOUCHED_BELOW = 0.05, 0.5 / 255.0
-"""Parts of full scale below zero that mean an idle level taken away, and that no converter gives."""
 BYTE = 128
-WRAP, MIN_WRAPS = 0.7, 2
-"""Fall within a frame, in parts of full scale, that no release under rising load makes, and how often."""
-LIGHT, ALWAYS, ONE_TAXEL = 0.05, 0.95, 0.7
-"""Frames of more than this load, nearly all with the same largest reading, which is not one stuck taxel's."""
 
 
 def check_readings(recordings: RecordingSet) -> Iterator[Finding]:
@@ -43,7 +46,7 @@ def check_readings(recordings: RecordingSet) -> Iterator[Finding]:
         yield from _raised(recordings, usual_low, float(top.max()))
         negative = bottom < usual_low - BELOW * recordings.full_scale
     elif (bottom < -TOUCHED_BELOW * recordings.full_scale).mean() >= MINORITY:
-        problem = f"raw falls below 0 in most trials, to {bottom.min():.3g}: an idle level was taken away"
+        problem = f"raw falls below 0 in most trials, to {bottom.min():.3g}: an idle level was subtracted"
         yield Finding(None, problem, f"{KEPT}: predictions never fall below 0")
     usual = float(np.median(top))
     for index, reading in enumerate(top):
@@ -57,10 +60,10 @@ def check_readings(recordings: RecordingSet) -> Iterator[Finding]:
 
 
 def _other_scale(recordings: RecordingSet, top: np.ndarray, above: bool) -> Iterator[Finding]:
-    """Full scale as the readings have it, where that of `recording.json` cannot be theirs."""
+    """Full scale as the readings suggest, where that of `recording.json` cannot be right."""
     full = recordings.full_scale
     if not top.max() > 0:
-        return  # no answer at all, which other checks say
+        return  # no response at all, which other checks report
     scale = next((value for value in CONVERTERS if value >= np.median(top) / BEYOND), float(top.max()))
     if above:
         problem = f"raw reaches {np.median(top):.4g}, above full_scale {full:g}, in most trials"
@@ -74,7 +77,7 @@ def _other_scale(recordings: RecordingSet, top: np.ndarray, above: bool) -> Iter
 
 
 def _raised(recordings: RecordingSet, lowest: float, highest: float) -> Iterator[Finding]:
-    """Readings of which something was taken away, or that a signed byte wrapped."""
+    """Readings from which something was subtracted, or that wrapped as signed bytes."""
     wrapped = _whole(recordings) and -BYTE <= lowest < -0.75 * BYTE and 0.75 * BYTE < highest < BYTE
     for index, trial in enumerate(recordings.trials):
         if wrapped:

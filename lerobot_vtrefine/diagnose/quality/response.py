@@ -1,4 +1,4 @@
-"""Checks of what the pad answers: loaded starts, trials without an answer, dead and stuck channels."""
+"""Checks of the pad's response: loaded starts, trials without a response, dead and stuck channels."""
 
 from collections.abc import Iterator
 from itertools import pairwise
@@ -6,17 +6,18 @@ from itertools import pairwise
 import numpy as np
 
 from lerobot_vtrefine.diagnose.quality.contact import Press, presses
-from lerobot_vtrefine.diagnose.quality.edits import KEPT, MINORITY, SET_ASIDE, Finding, few, place, plural
+from lerobot_vtrefine.diagnose.quality.edits import KEPT, SET_ASIDE, Finding, few, place, plural
+from lerobot_vtrefine.diagnose.quality.rules import (
+    ALIVE,
+    DEAD,
+    DRIVEN,
+    LOADED,
+    MINORITY,
+    NO_ANSWER,
+    STUCK,
+    TINY_M,
+)
 from lerobot_vtrefine.diagnose.recordings import RecordingSet
-
-DRIVEN, LOADED = 0.1, 0.2
-"""Parts of a trial's peak, in drive and in readings, that are too much for its first frame."""
-TINY_M = 5e-5
-"""Touching this lightly is not a loaded start: rigs find the face with that error."""
-NO_ANSWER = 0.03
-DEAD, ALIVE = 0.05, 0.5
-"""Slopes of reading over drive, relative to the usual one, of channels that do not and that do answer."""
-STUCK = 0.98
 
 
 def check_start(recordings: RecordingSet) -> Iterator[Finding]:
@@ -34,7 +35,7 @@ def check_start(recordings: RecordingSet) -> Iterator[Finding]:
         if driven[index] and not rig:
             part = 100 * press.load[0] / press.load.max()
             yield Finding(
-                index, f"starts loaded: the first frame carries {part:.0f} % of the peak", SET_ASIDE
+                index, f"starts loaded: the first frame has {part:.0f} % of the peak load", SET_ASIDE
             )
         elif reading[index] > LOADED and not rig and (reading > LOADED).mean() < MINORITY:
             problem = (
@@ -66,7 +67,7 @@ def _reading_at_start(found: list[Press]) -> np.ndarray:
 
 
 def check_answers(recordings: RecordingSet) -> Iterator[Finding]:
-    """Trials, and channels within a trial, that do not answer although other trials do."""
+    """Trials, and channels within a trial, that do not respond although others do."""
     slope, covered = _slopes(presses(recordings))
     whole = np.array([_weighted(slope[k], covered[k]) for k in range(len(slope))])
     usual = np.nanmedian(whole) if np.isfinite(whole).any() else np.nan
@@ -74,7 +75,7 @@ def check_answers(recordings: RecordingSet) -> Iterator[Finding]:
         return
     silent = whole < NO_ANSWER * usual
     for index in np.flatnonzero(silent):
-        yield Finding(int(index), "does not answer: the readings ignore the press", SET_ASIDE)
+        yield Finding(int(index), "no response: the readings do not follow the press", SET_ASIDE)
     if not _outlined(recordings):
         return
     pressed = covered > 0.3 * np.nanmax(covered, initial=1e-30)
@@ -86,7 +87,7 @@ def check_answers(recordings: RecordingSet) -> Iterator[Finding]:
 
 
 def _outlined(recordings: RecordingSet) -> bool:
-    """Whether it is known which taxels are pressed: a load alone tells only under flat-ended indenters."""
+    """Whether it is known which taxels are pressed: a load alone says so only under flat-ended indenters."""
     flat = all(trial.object["shape"] in ("flat", "cylinder") for trial in recordings.trials)
     return flat or all(trial.depth_m is not None for trial in recordings.trials)
 

@@ -6,15 +6,18 @@ from typing import Any
 
 import numpy as np
 
-from lerobot_vtrefine.diagnose.quality.edits import KEPT, MINORITY, Finding
+from lerobot_vtrefine.diagnose.quality.edits import KEPT, Finding
+from lerobot_vtrefine.diagnose.quality.rules import (
+    ALIKE,
+    LONG_PAUSE,
+    MINORITY,
+    OVERLAP,
+    OVERLAP_S,
+    SAME_PLACE_M,
+)
 from lerobot_vtrefine.diagnose.recordings import RecordingSet, RobotTrial
 
-OVERLAP_S, OVERLAP = 0.5, 0.02
-"""Trials may seem to overlap by this much, and this part of their length, from rounding."""
-HOUR_S, LONG_PAUSE = 3600.0, 100.0
-ALIKE = 0.25
-"""Root mean square difference, in parts of the range, of trials that were not driven alike."""
-SAME_PLACE_M = 1e-3
+HOUR_S = 3600.0
 
 
 def check_session(recordings: RecordingSet) -> Iterator[Finding]:
@@ -25,7 +28,7 @@ def check_session(recordings: RecordingSet) -> Iterator[Finding]:
         return
     if np.ptp(starts) == 0:
         problem = "start_s is missing, or the same in all trials"
-        yield Finding(None, problem, f"{KEPT}: drift through the session cannot be seen")
+        yield Finding(None, problem, f"{KEPT}: drift during the session cannot be seen")
         return
     orders = np.array([trial.order for trial in trials])
     if len(set(orders.tolist())) < len(trials) or (np.argsort(starts) != np.argsort(orders)).any():
@@ -45,10 +48,10 @@ def _overlaps(trials: tuple[Any, ...], starts: np.ndarray) -> Iterator[Finding]:
     elif early.any():
         first, second = (trials[order[np.flatnonzero(early)[0] + k]].file for k in (0, 1))
         problem = f"{second} starts before {first} ends: start_s is wrong or missing"
-        yield Finding(None, problem, f"{KEPT}: drift through the session is uncertain")
+        yield Finding(None, problem, f"{KEPT}: drift during the session is uncertain")
     elif np.median(gaps) > max(HOUR_S, LONG_PAUSE * np.median(lengths)):
         problem = f"trials of {np.median(lengths):.3g} s start every {np.median(gaps) / HOUR_S:.3g} h"
-        yield Finding(None, problem, f"{KEPT}: if start_s is in milliseconds, rates of drift are wrong")
+        yield Finding(None, problem, f"{KEPT}: if start_s is in milliseconds, drift rates are wrong")
 
 
 def check_conditions(recordings: RecordingSet) -> Iterator[Finding]:
@@ -67,11 +70,10 @@ def check_conditions(recordings: RecordingSet) -> Iterator[Finding]:
         kinds.sort(key=len, reverse=True)
         for number, kind in enumerate(kinds[1:], start=2):
             for index in kind:
-                problem = (
-                    f"is not driven like {recordings.trials[kinds[0][0]].file}, of the same condition {name}"
-                )
+                first = recordings.trials[kinds[0][0]].file
+                problem = f"is not driven in the same way as {first}, of the same condition {name}"
                 mended = replace(recordings.trials[index], condition=f"{name} ({number})")
-                yield Finding(index, problem, "repaired: taken as another condition", mended)
+                yield Finding(index, problem, "repaired: treated as another condition", mended)
 
 
 def _alike(recordings: RecordingSet, one: int, two: int) -> bool:

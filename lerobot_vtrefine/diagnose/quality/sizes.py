@@ -8,15 +8,10 @@ import numpy as np
 
 from lerobot_vtrefine.diagnose.pad.indenters import mesh_extent_m
 from lerobot_vtrefine.diagnose.quality.edits import NO_VERDICT, SET_ASIDE, Finding
+from lerobot_vtrefine.diagnose.quality.rules import COARSEST_MM, INDENTER_M, PITCH_M
 from lerobot_vtrefine.diagnose.recordings import RecordingSet
 
 MM_PER_M = 1e3
-PITCH_M = (5e-5, 0.1)
-"""Smallest and largest distance of taxels that is believed: skins of chips, and mats to stand on."""
-INDENTER_M = (5e-5, 0.5)
-"""The same for radii, sides and meshes of indenters."""
-COARSEST_MM = 0.4
-"""Numbers between the limit in metres and this one may be centimetres as well as millimetres."""
 
 
 def check_sizes(recordings: RecordingSet) -> Iterator[Finding]:

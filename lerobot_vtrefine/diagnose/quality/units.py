@@ -10,25 +10,25 @@ from typing import Any
 
 import numpy as np
 
-from lerobot_vtrefine.diagnose.quality.edits import MINORITY, SET_ASIDE, Finding
+from lerobot_vtrefine.diagnose.quality.edits import SET_ASIDE, Finding
+from lerobot_vtrefine.diagnose.quality.rules import (
+    CROWDED,
+    CROWDED_STEP_S,
+    FAR_START_S,
+    FEW_SPIKES,
+    MINORITY,
+    PLACES_M,
+    ROOM_C,
+    SHORT_STEP_S,
+    SLOWEST_STEP_S,
+    STILL_M,
+)
 from lerobot_vtrefine.diagnose.recordings import RecordingSet
-
-SPIKES = 0.02
-"""Values that only this part of the frames, or less, exceeds do not tell of another unit."""
-STILL_M = 2e-5
-"""A depth that varies less than this in a whole trial is not a press: its zero was wrong, not its unit."""
-SLOWEST_STEP_S, SHORT_STEP_S = 3.0, 1.0
-"""Frames further apart are taken for another unit of time; in the right one they are not as far apart."""
-CROWDED, CROWDED_STEP_S = 1.5, 0.3
-"""Trials that last longer than so many times the time between their starts cannot be in seconds, if their
-frames are further apart than this."""
-FAR_START_S = 10.0
-"""A first frame later than this, and than the trial is long, was not timed from the trial's start."""
 
 
 @dataclass(frozen=True)
 class Mistake:
-    """Units that people write instead of the format's.
+    """Units that are often used instead of the format's.
 
     ``limit`` is the largest plausible value in the right unit; a column above it is repaired when dividing by
     one of the ``units``' factors brings it below.
@@ -41,9 +41,6 @@ class Mistake:
 
 
 ZERO_C_IN_K = 273.15
-ROOM_C = (-60.0, 150.0)
-PLACES_M = 0.3
-"""No indenter that presses a pad is further than this from its centre."""
 SMALL_LENGTHS = (("millimetres", 1e3), ("micrometres", 1e6))
 DEGREES = (("degrees", 180 / np.pi),)
 SHORT_TIMES = (("milliseconds", 1e3), ("microseconds", 1e6), ("nanoseconds", 1e9))
@@ -72,7 +69,7 @@ def check_units(recordings: RecordingSet) -> Iterator[Finding]:
                 continue
             found = _unit(values, mistake)
             if found is None:
-                text = f"{mistake.column} reaches {size:.3g}, which no unit explains"
+                text = f"{mistake.column} reaches {size:.3g}, which no known unit explains"
                 yield Finding(index, text, SET_ASIDE)
                 continue
             unit, factor = found
@@ -98,9 +95,9 @@ def _largest(values: np.ndarray) -> float:
 
 
 def _unit(values: np.ndarray, mistake: Mistake) -> tuple[str, float] | None:
-    """The unit that values are in, with its factor; None where none explains them."""
+    """The unit that values are in, with its factor; None where none is plausible."""
     beyond = np.abs(values) > mistake.limit
-    if 0 < beyond.reshape(len(values), -1).any(1).mean() < SPIKES:
+    if 0 < beyond.reshape(len(values), -1).any(1).mean() < FEW_SPIKES:
         return None
     for unit, factor in mistake.units:
         if _largest(values) / factor <= mistake.limit:
@@ -134,7 +131,7 @@ def _times(recordings: RecordingSet, trials: dict[int, Any]) -> Iterator[Finding
 
 
 def check_temperature(recordings: RecordingSet) -> Iterator[Finding]:
-    """Temperatures in kelvin are repaired, those that no room has not used."""
+    """Temperatures in kelvin are converted; implausible ones are not used."""
     for index, trial in enumerate(recordings.trials if recordings.kind == "pad" else ()):
         if trial.temperature_c is None or not np.isfinite(trial.temperature_c).any():
             continue
@@ -143,8 +140,8 @@ def check_temperature(recordings: RecordingSet) -> Iterator[Finding]:
             continue
         kelvin = ROOM_C[0] <= usual - ZERO_C_IN_K <= ROOM_C[1]
         values = trial.temperature_c - ZERO_C_IN_K if kelvin else None
-        problem = f"temperature_c is {usual:.3g}" + (": kelvin" if kelvin else ", which no room has")
-        action = f"repaired: {ZERO_C_IN_K} taken away" if kelvin else "repaired: not used"
+        problem = f"temperature_c is {usual:.3g}" + (": kelvin" if kelvin else ", which is not plausible")
+        action = f"repaired: {ZERO_C_IN_K} subtracted" if kelvin else "repaired: not used"
         yield Finding(index, problem, action, replace(trial, temperature_c=values))
 
 

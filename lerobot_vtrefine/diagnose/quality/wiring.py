@@ -1,7 +1,7 @@
 """Checks of wiring: rows or columns that are swapped, mirrored or shifted, in one trial or in all of them.
 
-Two witnesses: the idle map, which each taxel carries as a signature, betrays a trial that differs from the
-others; the indenter's footprint betrays a set in which all trials are wired alike but wrongly.
+Two sources of evidence: the idle map, a signature of every taxel, shows a trial that differs from the others;
+the indenter's footprint shows a set in which all trials are wired alike but wrongly.
 """
 
 from collections.abc import Iterator
@@ -13,19 +13,17 @@ import numpy as np
 from scipy.optimize import linear_sum_assignment
 
 from lerobot_vtrefine.diagnose.quality.contact import Press, presses
-from lerobot_vtrefine.diagnose.quality.edits import KEPT, MINORITY, SET_ASIDE, Finding
+from lerobot_vtrefine.diagnose.quality.edits import KEPT, SET_ASIDE, Finding
+from lerobot_vtrefine.diagnose.quality.rules import (
+    BETTER_ORDER,
+    BEYOND_NOISE,
+    MIN_IDLE_SPREAD,
+    MINORITY,
+    MISWIRED,
+    STRAY,
+)
 from lerobot_vtrefine.diagnose.recordings import RecordingSet
 
-BETTER = 0.4
-"""Another order of the lines must leave less than this part of the squared error ..."""
-WRONG = 0.1
-"""... and the recorded order more than this part of the signal unexplained."""
-MIN_IDLE_SPREAD = 3.0
-"""Idle maps identify lines only if taxels differ by this many deviations of the map's own noise ..."""
-BEYOND_NOISE = 3.0
-"""... and a map is another one's only if it differs by this many times the square that noise makes."""
-STRAY = 0.1
-"""Misplaced lines show at least this part of the signal where nothing presses; dead ones do not."""
 MAX_FRAMES = 100
 
 
@@ -79,7 +77,7 @@ class Costs:
             (self.transposed, "rows and columns exchanged"),
         ]
         error, text = min(options)
-        clear = error < BETTER * self.recorded and self.recorded > WRONG * self.signal
+        clear = error < BETTER_ORDER * self.recorded and self.recorded > MISWIRED * self.signal
         return text if text and clear else None
 
 
@@ -133,11 +131,11 @@ def check_wiring(recordings: RecordingSet) -> Iterator[Finding]:
     common = reduce(Costs.plus, felt).best_order() if felt else None
     if common is not None:
         action = f"{KEPT}: check the wiring and the orientation of the pad"
-        yield Finding(None, f"{common} in every trial, judging by where the presses are felt", action)
+        yield Finding(None, f"{common} in every trial, judging by where the pad responds", action)
 
 
 def _footprint(press: Press, shape: tuple[int, int]) -> Costs | None:
-    """Where the press was felt against where it was; None if it was felt there, or not at all."""
+    """Where the pad responded against where it was pressed; None if both agree, or without a response."""
     frames = np.unique(np.linspace(0, len(press.drive) - 1, MAX_FRAMES).astype(int))
     measured, expected = (values[frames].reshape(-1, *shape) for values in (press.answer, press.drive))
     sizes = np.linalg.norm(measured), np.linalg.norm(expected)
@@ -147,7 +145,7 @@ def _footprint(press: Press, shape: tuple[int, int]) -> Costs | None:
 
 
 def _idle_order(press: Press, found: list[Press], shape: tuple[int, int]) -> str | None:
-    """What was done to the lines, judging by the other trials' idle maps; None where these tell nothing."""
+    """What was done to the lines, judging by the other trials' idle maps; None where these do not say."""
     if press.untouched.sum() < 2:
         return None
     others = np.array([other.idle - np.median(other.idle) for other in found if other is not press])

@@ -1,4 +1,4 @@
-"""A small drawing of every effect that can be named: dashed as simulated, solid as it is."""
+"""A small drawing of every cause that can be named: dashed as simulated, solid as measured."""
 
 from html import escape
 
@@ -12,7 +12,11 @@ SHAPES: dict[str, tuple[str, str, str]] = {
     "nonlinear_stiffness": (RAMP, "M8 60C60 56 92 40 112 8", "reading over depth"),
     "saturation": (RAMP, "M8 60L66 33C80 27 90 26 112 26", "reading over force"),
     "viscoelastic_relaxation": (STEP, "M8 58H40V30C60 18 80 14 112 13", "reading over time"),
-    "hysteresis": (RAMP, "M8 60C60 60 92 40 112 12C80 12 40 30 8 60", "reading over depth, there and back"),
+    "hysteresis": (
+        RAMP,
+        "M8 60C60 60 92 40 112 12C80 12 40 30 8 60",
+        "reading over depth, loading and unloading",
+    ),
     "taxel_gain_spread": (FLAT, "M8 36H20V24H36V46H52V30H68V52H84V28H100V38H112", "gain over taxels"),
     "dead_taxels": (FLAT, "M8 36H44V62H60V36H84V62H92V36H112", "reading over taxels"),
     "row_sharing": (PEAK, "M8 60H46V34H74V60H112", "reading along a row"),

@@ -93,7 +93,7 @@ def error_figure(heldout: Heldout, unit: str) -> str:
 
 
 def trial_figure(errors: Sequence[TrialError], unit: str) -> str:
-    """Errors of held-out trials, from simulated to extended; the worst predicted ones of many."""
+    """Errors of held-out trials, from simulated to extended; the worst predicted ones if there are many."""
     ordered = sorted(errors, key=lambda error: -error.extended)[:SHOWN_TRIALS]
     factor, name = scale_of(max(max(e.baseline, e.extended) for e in ordered), unit)
     numbers = np.array([[e.baseline, e.extended] for e in ordered]) * factor

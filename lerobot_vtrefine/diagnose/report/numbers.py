@@ -24,7 +24,7 @@ SCALES = {
 
 
 def scale_of(size: float, unit: str) -> tuple[float, str]:
-    """Factor and name of the unit in which a number of this size reads well."""
+    """Factor and name of the unit in which a number of this size is easy to read."""
     options = SCALES.get(unit, ((1.0, unit),))
     for factor, name in options:
         if abs(size) * factor >= 0.1:
@@ -55,7 +55,7 @@ def percent(part: float) -> str:
 
 
 def p_text(value: float | None) -> str:
-    """A p-value with the digits that mean something."""
+    """A p-value with its significant digits."""
     if value is None:
         return "–"
     return "< 0.0001" if value < 1e-4 else f"{value:.2g}"

@@ -26,7 +26,7 @@ from lerobot_vtrefine.pages.pads import colour_scale, pad_image
 from lerobot_vtrefine.pages.render import render
 
 SHOWN_TRACES = 4
-"""Trials drawn at once; the others are folded away."""
+"""Trials that are shown; the others are in a section that is closed at first."""
 NOT_FOUND = "rejected"
 DECISIONS = {
     "accepted": "found",
@@ -50,7 +50,7 @@ def render_report(
     Args:
         recordings: as they were read, before quality control.
         film: a press in motion: its source, caption and colour scale.
-        survived: which names other draws and halves of the recordings give, in one line.
+        survived: how often other locked draws and halves of the recordings give each name, in one line.
         model: where the extended model is, as the reader would type it.
     """
     verdict, unit, sound = diagnosis.verdict, diagnosis.unit, diagnosis.checked
@@ -87,12 +87,12 @@ def _use(verdict: Verdict, recordings: RecordingSet, model: str) -> dict[str, st
         return None
     flag = "--env.sensor_model" if recordings.kind == "pad" else "--env.reality"
     task = "--config_path=vtrefine:round_grasped"
-    again = ", fitted anew to all recordings once the errors above were measured"
+    again = ", refitted to all recordings after the errors above had been measured"
     said = f"sensor_model.json beside this page holds the repaired model{again * verdict.models_saw_locked}."
     if verdict.status in ("unexplained", "ambiguous"):
-        said += " Its names are not settled, so check first that it predicts other recordings better."
+        said += " Its causes are not settled, so check first that it predicts other recordings better."
     else:
-        said += " Record, fine-tune and evaluate with it, and predict other recordings to see that it holds."
+        said += " Record, fine-tune and evaluate with it, and predict other recordings to verify it."
     in_simulation = [
         f"vtrefine-record-demos {task} \\\n    --root=outputs/repaired_demos {flag}={model}",
         f"vtrefine-finetune {task} --policy.path=CHECKPOINT \\\n"
@@ -156,13 +156,16 @@ def _facts(verdict: Verdict, recordings: RecordingSet, sound: int, seed: int) ->
     ]
     if verdict.heldout is not None:
         facts.append(
-            ("held out", f"{len(verdict.heldout.trials)} recordings that no fit and no choice has seen")
+            (
+                "held out",
+                f"{len(verdict.heldout.trials)} recordings, used neither for fitting nor for selection",
+            )
         )
     return [*facts, ("seed", str(seed))]
 
 
 def _ordered(traces: Sequence[Trace]) -> list[tuple[Trace, str]]:
-    """Traces with captions: the typical one and the worst first, so that nobody sees only the best."""
+    """Traces with captions: the typical and the worst first, so that the best are not all that is seen."""
 
     def error(trace: Trace) -> float:
         return float(np.sqrt(np.nanmean((trace.measured - trace.extended) ** 2)))
@@ -183,7 +186,7 @@ def _caption(trace: Trace, remark: str) -> str:
 
 
 def _by_decision(evidence: Sequence[Evidence]) -> list[Evidence]:
-    """Found ones first, each group by what it gains in cross-validation."""
+    """Found ones first, each group by its cross-validated gain."""
     order = list(DECISIONS)
     return sorted(evidence, key=lambda item: (order.index(item.decision), -(item.cv_gain or 0.0)))
 

@@ -18,63 +18,65 @@ class Meaning:
 
 MEANINGS = {
     "nonlinear_stiffness": Meaning(
-        "The cover gets harder, or softer, the deeper it is pressed.", "exponent − 1", "1"
+        "The cover gets stiffer, or softer, the deeper it is pressed.", "exponent − 1", "1"
     ),
     "saturation": Meaning("High readings level off before the converter's full scale.", "knee", "counts"),
     "viscoelastic_relaxation": Meaning(
-        "Under a held load the reading creeps, and after it a rest remains.", "fraction", "1"
+        "Under a constant load the reading creeps, and after unloading part of it remains.", "fraction", "1"
     ),
     "hysteresis": Meaning(
-        "At the same depth the pad reads differently while it is loaded and unloaded.", "fraction", "1"
+        "At the same depth, the pad reads differently during loading and unloading.", "fraction", "1"
     ),
     "first_load_softening": Meaning(
-        "Below the largest load so far the pad reads less than it did on the first load.", "softening", "1"
+        "Below the largest load so far, the pad reads less than it did under the first load.",
+        "softening",
+        "1",
     ),
-    "taxel_gain_spread": Meaning("Every taxel has a sensitivity of its own.", "spread", "1"),
-    "dead_taxels": Meaning("Some taxels never answer.", "taxels", "1"),
+    "taxel_gain_spread": Meaning("Taxels differ in sensitivity.", "spread", "1"),
+    "dead_taxels": Meaning("Some taxels never respond.", "taxels", "1"),
     "row_sharing": Meaning(
-        "The readout's voltage divider: a taxel's reading falls as others of its row are pressed.",
+        "The readout's voltage divider: a taxel's reading falls when others in its row are pressed.",
         "conductance",
         "1/counts",
     ),
     "supply_droop": Meaning(
-        "The supply's voltage falls with the load of the whole pad, and every reading with it.",
+        "The supply voltage drops as the load on the whole pad rises, and every reading with it.",
         "droop",
         "1/counts",
     ),
-    "crosstalk": Meaning("A reading leaks into the others of its row and column.", "fraction", "1"),
+    "crosstalk": Meaning("A reading leaks into the others in its row and column.", "fraction", "1"),
     "mechanical_spreading": Meaning("The cover spreads a press over neighbouring taxels.", "sigma", "m"),
-    "baseline_drift": Meaning("The idle level moves during the session.", "rate", "counts/s"),
+    "baseline_drift": Meaning("The idle level drifts during the session.", "rate", "counts/s"),
     "latency": Meaning("Readings reach the host late.", "delay", "s"),
-    "scan_skew": Meaning("Rows are read one after the other, not at once.", "first to last row", "s"),
-    "sample_and_hold": Meaning("The host repeats old frames until a new one is there.", "period", "s"),
+    "scan_skew": Meaning("Rows are read one after the other, not simultaneously.", "first to last row", "s"),
+    "sample_and_hold": Meaning("The host repeats old frames until a new one arrives.", "period", "s"),
     "contact_offset": Meaning("The pad's face lies deeper, or higher, than assumed.", "offset", "m"),
     "pad_tilt": Meaning("The pad's face is not parallel to the assumed one.", "tilt", "rad"),
     "encoder_offset": Meaning("A joint's encoder is off by a constant.", "offset", "rad"),
-    "backlash": Meaning("A joint has play: after a reversal it first does not follow.", "width", "rad"),
+    "backlash": Meaning("A joint has play: after a reversal it does not follow at first.", "width", "rad"),
     "control_latency": Meaning("Commands take effect late.", "delay", "s"),
     "joint_friction": Meaning("Dry friction holds a joint back.", "friction", "N*m"),
     "gravity_sag": Meaning("The arm's weight pulls joints away from their command.", "sag", "rad"),
     "gripper_compliance": Meaning(
-        "The gripper gives way under load, or is blocked by what it holds.", "compliance", "m/N"
+        "The gripper yields under load, or is blocked by what it holds.", "compliance", "m/N"
     ),
     "load_friction": Meaning("Friction grows with the torque that the gears carry.", "part of the load", "1"),
     "directional_friction": Meaning(
-        "Friction grows with the load, and otherwise when the motor drives it than when it drives the motor.",
+        "Friction grows with the load, and differently when driving it than when back-driven.",
         "part of the motor's torque",
         "1",
     ),
     "stribeck_friction": Meaning(
-        "At rest and at low speed friction is larger than in motion.", "stiction", "N*m"
+        "Friction is larger at rest and at low speed than in motion.", "stiction", "N*m"
     ),
     "load_stiction": Meaning(
-        "The torque that the gears carry holds them at rest and at low speed.",
+        "At rest and at low speed, friction grows with the torque that the gears carry.",
         "part of the motor's torque",
         "1",
     ),
     "quadratic_friction": Meaning("Friction grows with the square of the load.", "coefficient", "1/(N*m)"),
     "supply_sag": Meaning(
-        "The more the drive puts on the motor, the more of it is lost in the supply.",
+        "The supply sags under the motor's current, the more the higher the duty cycle.",
         "resistance over the winding's",
         "1",
     ),
@@ -82,14 +84,12 @@ MEANINGS = {
         "The winding's resistance changes with its temperature.", "change per kelvin", "1/K"
     ),
     "voltage_limit": Meaning(
-        "The drive puts less of its supply on the motor than it should.", "missing part", "1"
+        "The drive limits the motor's voltage more than it should.", "missing part", "1"
     ),
-    "camera_extrinsics": Meaning(
-        "The camera does not stand where the simulation puts it.", "displacement", "m"
-    ),
+    "camera_extrinsics": Meaning("The camera is not where the simulation places it.", "displacement", "m"),
     "depth_scale": Meaning("The depth camera's distances are off by a factor.", "factor − 1", "1"),
     "object_mass": Meaning("The object weighs more, or less, than simulated.", "mass", "kg"),
-    "object_friction": Meaning("The object slides more, or less, easily than simulated.", "coefficient", "1"),
+    "object_friction": Meaning("The object has more, or less, friction than simulated.", "coefficient", "1"),
     "clearance": Meaning("The socket is tighter, or wider, than simulated.", "clearance", "m"),
 }
 SPELLED = {
@@ -102,9 +102,9 @@ SPELLED = {
 
 AXES = {
     "load": "Against load: the reading above idle that the simulation expects",
-    "history": "Against history: how far the load is below the largest one so far",
-    "rate": "Against the rate at which it is driven; into the pad is above zero",
-    "depth": "Against depth; below zero nothing touches the taxel",
+    "history": "Against history: how far the load is below the largest so far",
+    "rate": "Against the rate of indentation; positive is into the pad",
+    "depth": "Against depth; below zero there is no contact",
     "column": "Against the position along the columns",
     "row": "Against the position along the rows",
     "position": "Against the commanded position",
@@ -121,12 +121,12 @@ LONGEST_CLUE = 130
 
 
 def title(name: str) -> str:
-    """A cause's name for people; evidence may be about something that no list of causes holds."""
+    """A cause's name for people; evidence may be about something that is in no list of causes."""
     return SPELLED.get(name, name.replace("_", " "))
 
 
 def meaning(name: str) -> Meaning:
-    """What a cause is; one that was added to the catalogue says so in its file."""
+    """What a cause is; the file of one that was added to the catalogue says so."""
     if name in MEANINGS:
         return MEANINGS[name]
     from lerobot_vtrefine.diagnose.joints import candidates as joint_candidates
@@ -147,7 +147,7 @@ def listing(items: Sequence[str], last: str = "and") -> str:
 
 
 def ties(verdict: Verdict) -> list[str]:
-    """Names that cannot be told apart, "a or b"; joints that tie the other way round add nothing."""
+    """Names that cannot be distinguished, "a or b"; the same names in another order add nothing."""
     groups = {frozenset(group): group for group in reversed(verdict.ambiguous_with)}
     return [listing([title(name) for name in group], "or") for group in reversed(groups.values())]
 
@@ -157,7 +157,7 @@ def headline(verdict: Verdict, unit: str) -> str:
     names = listing([title(cause.name) for cause in verdict.causes])
     pairs = listing(ties(verdict))
     if verdict.status == "invalid_data":
-        return "These recordings allow no verdict: too little of them is sound."
+        return "No verdict is possible: too few of these recordings are usable."
     if verdict.status == "adequate":
         fitted = "stiffness, damping and gain" if unit == "counts" else "servo constants"
         scope = " for what was tested" if verdict.not_tested else ""
@@ -168,16 +168,16 @@ def headline(verdict: Verdict, unit: str) -> str:
         return f"The simulation lacks {names}. {repaired(verdict, unit)}"
     if verdict.status == "ambiguous":
         sure = [title(c.name) for c in verdict.causes if not any(c.name in g for g in verdict.ambiguous_with)]
-        beside = f" It surely lacks {listing(sure)}." if sure else ""
+        beside = f" It certainly lacks {listing(sure)}." if sure else ""
         return f"The simulation is wrong, but these recordings cannot tell whether it lacks {pairs}.{beside}"
     clue = (verdict.unknown.clue or "").split(";")[0]
     clue = f" Clue: {clue}." if 0 < len(clue) <= LONGEST_CLUE else ""
-    symptoms = f" What looks like {names} may be a symptom of it.{_all_the_same(verdict)}" if names else ""
+    symptoms = f" What looks like {names} may be a symptom of it.{_still_helps(verdict)}" if names else ""
     return f"The simulation is wrong in a way that no known cause explains.{clue}{symptoms}"
 
 
 def power_line(verdict: Verdict) -> str:
-    """What an adequate verdict would have shown, and what it could not have; empty for others."""
+    """What recordings with an adequate verdict would have shown, and what not; empty for other verdicts."""
     if verdict.status != "adequate":
         return ""
     shown = listing(
@@ -194,12 +194,12 @@ def size_text(name: str, size: float) -> str:
     """A cause's main parameter at some size, for example "delay: 4 ms"."""
     about = meaning(name)
     if name == "dead_taxels":
-        return "one of those pressed hard enough"
+        return "any one that is pressed hard enough"
     return f"{about.parameter}: {quantity(size, about.unit)}"
 
 
-def _all_the_same(verdict: Verdict) -> str:
-    """What symptoms gain, where they gain anything."""
+def _still_helps(verdict: Verdict) -> str:
+    """How much symptoms improve predictions, where they do."""
     held = verdict.heldout
     if held is None or held.gain <= 0 or (held.gain_ci95 is not None and held.gain_ci95[0] <= 0):
         return ""
@@ -208,7 +208,7 @@ def _all_the_same(verdict: Verdict) -> str:
 
 
 def repaired(verdict: Verdict, unit: str) -> str:
-    """What the extension gains on held-out recordings, in one sentence."""
+    """How much the extension improves predictions of held-out recordings, in one sentence."""
     held = verdict.heldout
     if held is None:
         return ""
@@ -223,12 +223,12 @@ def repaired(verdict: Verdict, unit: str) -> str:
     added = "it" if len(verdict.causes) == 1 else "these"
     return (
         f"With {added} added, its error on held-out recordings falls {change}; "
-        f"{percent(held.gain)} of the squared error is gone{interval}.{floor}"
+        f"{percent(held.gain)} of the squared error is removed{interval}.{floor}"
     )
 
 
 def doubts(verdict: Verdict, recorded: int, checked: int) -> list[str]:
-    """What a sceptic should hold against this verdict, judging by its own numbers."""
+    """Reasons for caution that follow from the verdict's own numbers."""
     found = []
     held = verdict.heldout
     if checked < recorded:
@@ -237,7 +237,7 @@ def doubts(verdict: Verdict, recorded: int, checked: int) -> list[str]:
         return found
     if len(held.trials) < 6:
         found.append(
-            f"Only {len(held.trials)} recordings were held out, so the interval of the gain is rough."
+            f"Only {len(held.trials)} recordings were held out, so the interval of the gain is imprecise."
         )
     if held.gain_ci95 is not None and held.gain_ci95[0] <= 0 and verdict.causes:
         found.append("The interval of the gain includes zero: the repair may not help on other recordings.")
@@ -246,14 +246,14 @@ def doubts(verdict: Verdict, recorded: int, checked: int) -> list[str]:
         if excess > 0.1:
             found.append(
                 f"{percent(excess)} of the baseline's squared error is neither repaired nor noise: the form "
-                "of the repair is not right, or recordings differ in ways that the model does not describe."
+                "of the repair is wrong, or recordings differ in ways that the model does not describe."
             )
         elif excess < -0.02:
             found.append("The error is below the estimated noise floor, so that floor is estimated too high.")
     tested = [cause for cause in verdict.causes if cause.basis == "tested"]
     weak = [title(c.name) for c in tested if c.p_value is None or c.p_value > 0.01]
     if weak:
-        found.append(f"The evidence for {listing(weak)} is thin (p above 0.01, or none).")
+        found.append(f"The evidence for {listing(weak)} is weak (p above 0.01, or none).")
     if verdict.unknown.alarm and verdict.causes:
-        found.append("The names given are symptoms: an unknown effect often borrows a known one's name.")
+        found.append("The names given are symptoms: an unknown effect is often mistaken for a known one.")
     return found

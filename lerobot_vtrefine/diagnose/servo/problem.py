@@ -7,6 +7,7 @@ import numpy as np
 
 from lerobot_vtrefine.diagnose.core.problem import OptionalSteps
 from lerobot_vtrefine.diagnose.core.rivals import Rival
+from lerobot_vtrefine.diagnose.core.rules import RESOLVED
 from lerobot_vtrefine.diagnose.core.search import Selection
 from lerobot_vtrefine.diagnose.core.suspicion import Suspicion
 from lerobot_vtrefine.diagnose.servo.bench import Bench
@@ -14,16 +15,13 @@ from lerobot_vtrefine.diagnose.servo.candidates import CATALOGUE
 from lerobot_vtrefine.diagnose.servo.candidates.base import Candidate
 from lerobot_vtrefine.diagnose.servo.fitting import Fit, Fitter, Refits
 from lerobot_vtrefine.diagnose.servo.parameters import INDEX
+from lerobot_vtrefine.diagnose.servo.rules import MIN_SETTINGS
 from lerobot_vtrefine.diagnose.servo.suspicions import repeated, repeating
 
 Array = np.ndarray
 
-_SETTINGS = 3
-"""With so many settings (gain, supply, load), folds are settings: a simulation is to predict new ones."""
 COARSE_STEP_S = 0.01
 """Between the frames that a search needs."""
-_OF_A_STEP = 0.25
-"""Means over many readings resolve a quarter of the encoder's step."""
 
 
 class ServoProblem(OptionalSteps):
@@ -35,7 +33,7 @@ class ServoProblem(OptionalSteps):
     def __init__(self, bench: Bench, fine: Bench | None = None) -> None:
         self.bench, self.fine = bench, fine
         self.fitter = Fitter(bench)
-        self.conditions = bench.settings if len(set(bench.settings)) >= _SETTINGS else bench.recorded
+        self.conditions = bench.settings if len(set(bench.settings)) >= MIN_SETTINGS else bench.recorded
         self.files = bench.files
 
     @classmethod
@@ -121,7 +119,7 @@ class ServoProblem(OptionalSteps):
     def credible(self, baseline: Fit, now: Fit, best: Fit, candidate: Candidate) -> Array:
         """(1,) whether what it does is large enough for the encoder to see."""
         effect = np.sqrt(np.square(best.residual - now.residual).sum() / self.bench.valid.sum())
-        return np.array([effect > _OF_A_STEP * encoder_step(self.bench)])
+        return np.array([effect > RESOLVED * encoder_step(self.bench)])
 
 
 def encoder_step(bench: Bench) -> float:

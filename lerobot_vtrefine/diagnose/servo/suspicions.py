@@ -4,19 +4,12 @@ from itertools import combinations
 
 import numpy as np
 
-from lerobot_vtrefine.diagnose.core.rules import LEAST_UNKNOWN
+from lerobot_vtrefine.diagnose.core.rules import LEAST_UNKNOWN, REPEATS, REPEATS_ALL
 from lerobot_vtrefine.diagnose.core.suspicion import Suspicion
 from lerobot_vtrefine.diagnose.servo.bench import Bench
+from lerobot_vtrefine.diagnose.servo.rules import ALARM_STEP, MIN_REPEATED
 
 Array = np.ndarray
-
-_REPEATS, _REPEATS_ALL = 0.3, 0.6
-"""Least part of what is left that must repeat; where it is this much, and in every condition, the conditions
-need not be enough for a small p."""
-_FEWEST = 4
-"""Fewest repeated conditions for a test."""
-_OF_A_STEP = 0.5
-"""Part of the encoder's step below which nothing that repeats is worth an alarm."""
 
 
 def repeating(bench: Bench, residual: Array, baseline_mse: float, encoder_step: float) -> list[Suspicion]:
@@ -27,15 +20,15 @@ def repeating(bench: Bench, residual: Array, baseline_mse: float, encoder_step: 
         scores[pairs[0][0]] = np.mean(products)
         squares.append(np.mean(sizes))
     rows = scores[scores != 0]
-    if len(rows) < _FEWEST:
+    if len(rows) < MIN_REPEATED:
         return []
     left = float(np.mean(squares))
     share = float(rows.mean()) / max(left, 1e-300)
-    worth = max((_OF_A_STEP * encoder_step) ** 2, LEAST_UNKNOWN * baseline_mse) / max(left, 1e-300)
+    worth = max((ALARM_STEP * encoder_step) ** 2, LEAST_UNKNOWN * baseline_mse) / max(left, 1e-300)
     clue = "what is left repeats when the command is repeated"
-    if share > _REPEATS_ALL and rows.min() > 0:
-        return [Suspicion(0, clue, share, max(_REPEATS_ALL, worth))]
-    return [Suspicion(0, clue, share, max(_REPEATS, worth), scores)]
+    if share > REPEATS_ALL and rows.min() > 0:
+        return [Suspicion(0, clue, share, max(REPEATS_ALL, worth))]
+    return [Suspicion(0, clue, share, max(REPEATS, worth), scores)]
 
 
 def repeated(bench: Bench) -> list[list[tuple[int, int]]]:

@@ -2,7 +2,7 @@
 
 from dataclasses import dataclass
 from functools import lru_cache
-from typing import ClassVar, override
+from typing import Any, ClassVar, override
 
 import numpy as np
 import torch
@@ -158,28 +158,32 @@ class ViscoelasticRelaxation(Stage):
         for name in ("tau_s", "fraction"):
             object.__setattr__(self, name, as_tuple(getattr(self, name)))
         super().__post_init__()
-        paired(self.name, self.tau_s, self.fraction)
+        self._branches()
+
+    def _branches(self) -> list[tuple[Any, Any]]:
+        """Time constant and fraction of every branch."""
+        return paired(self.name, self.tau_s, self.fraction)
+
+    def _relaxed(self, x: torch.Tensor, slow: list[torch.Tensor]) -> torch.Tensor:
+        """The force without what its low-passed forms, one a branch, take from it."""
+        for (_, fraction), part in zip(self._branches(), slow, strict=True):
+            x = x - fraction * part
+        return x.clamp(min=0.0) if self.pushes_only else x
 
     @override
     def initial(self, layout: PadLayout, pads: int) -> Traits:
-        names = [
-            "previous",
-            *(f"slow_{j}" for j in range(len(paired(self.name, self.tau_s, self.fraction)))),
-        ]
+        names = ["previous", *(f"slow_{j}" for j in range(len(self._branches())))]
         return {name: np.zeros((pads, layout.rows, layout.cols), dtype=np.float32) for name in names}
 
     @override
     def step(self, x: torch.Tensor, state: State, frame: Frame) -> tuple[torch.Tensor, State]:
-        new, relaxed = {**state, "previous": x}, x
-        for j, (tau_s, fraction) in enumerate(paired(self.name, self.tau_s, self.fraction)):
-            slow = followed(state[f"slow_{j}"], state["previous"], x, frame.dt_s, tau_s)
-            new[f"slow_{j}"] = slow
-            relaxed = relaxed - fraction * slow
-        return (relaxed.clamp(min=0.0) if self.pushes_only else relaxed), new
+        slow = [
+            followed(state[f"slow_{j}"], state["previous"], x, frame.dt_s, tau_s)
+            for j, (tau_s, _) in enumerate(self._branches())
+        ]
+        new = {f"slow_{j}": part for j, part in enumerate(slow)}
+        return self._relaxed(x, slow), {**state, "previous": x, **new}
 
     @override
     def sequence(self, x: torch.Tensor, times_s: torch.Tensor, frame: Frame) -> torch.Tensor:
-        relaxed = x
-        for tau_s, fraction in paired(self.name, self.tau_s, self.fraction):
-            relaxed = relaxed - fraction * low_passed(x, times_s, float(tau_s))
-        return relaxed.clamp(min=0.0) if self.pushes_only else relaxed
+        return self._relaxed(x, [low_passed(x, times_s, float(tau_s)) for tau_s, _ in self._branches()])

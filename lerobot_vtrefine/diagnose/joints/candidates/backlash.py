@@ -3,12 +3,11 @@
 from lerobot_vtrefine.diagnose.joints.candidates.base import MOTION, Candidate
 from lerobot_vtrefine.diagnose.joints.estimates import Estimates, MethodError
 from lerobot_vtrefine.diagnose.joints.parameters import INDEX
+from lerobot_vtrefine.diagnose.joints.rules import FORM_LEAD
 from lerobot_vtrefine.diagnose.verdict import Parameter
 
 METHOD = MethodError(0.005, 0.2)
 NOT_SHOWN = "move every joint to and fro, over more than its encoder's steps"
-_SHAPE_LEAD = 0.02
-"""By how much play that is taken up little by little must beat sharp play."""
 _ROUNDING_VAGUE = 0.08
 """Where a play ends that is taken up bit by bit depends on its form: part of its width, per rounding."""
 
@@ -17,7 +16,7 @@ FORMS = (
     Candidate("backlash", ("play",), (0.5, 2.0), follows=MOTION, pulls=False),
     Candidate("backlash", ("loose",), sized=False),
     *(
-        Candidate("backlash", (width, "round"), (0.4,), handicap=_SHAPE_LEAD, sized=False)
+        Candidate("backlash", (width, "round"), (0.4,), handicap=FORM_LEAD, sized=False)
         for width in ("play", "loose")
     ),
 )

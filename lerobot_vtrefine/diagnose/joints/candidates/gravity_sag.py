@@ -10,6 +10,7 @@ from lerobot_vtrefine.diagnose.joints.candidates.base import POSTURE, Candidate,
 from lerobot_vtrefine.diagnose.joints.estimates import Estimates, MethodError
 from lerobot_vtrefine.diagnose.joints.fitting import Point, ServoTrials
 from lerobot_vtrefine.diagnose.joints.parameters import INDEX, SAG
+from lerobot_vtrefine.diagnose.joints.rules import FORM_LEAD
 from lerobot_vtrefine.diagnose.verdict import Parameter
 
 Array = np.ndarray
@@ -19,7 +20,7 @@ NOT_SHOWN = (
     "no joint here is loaded by gravity as far as its name tells: name joints by what they move (shoulder, "
     "elbow), and hold the arm in eight postures from hanging to stretched out"
 )
-_LEAD = {gravity.TWO_TERM_FORM: 0.02, gravity.FREE_FORM: 0.05}
+_LEAD = {gravity.TWO_TERM_FORM: FORM_LEAD, gravity.FREE_FORM: 0.05}
 """By how much shapes with more terms must beat those with one."""
 _AS_GOOD = 1.03
 """Cross-validated error of a form over the least one, up to which it explains the trials as well."""

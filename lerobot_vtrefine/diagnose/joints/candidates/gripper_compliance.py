@@ -8,6 +8,7 @@ from lerobot_vtrefine.diagnose.joints.candidates.base import Candidate, at_zero,
 from lerobot_vtrefine.diagnose.joints.estimates import Estimates, MethodError, widened
 from lerobot_vtrefine.diagnose.joints.fitting import Point, ServoTrials
 from lerobot_vtrefine.diagnose.joints.parameters import INDEX
+from lerobot_vtrefine.diagnose.joints.rules import FORM_LEAD
 from lerobot_vtrefine.diagnose.joints.stages import parameters, spring
 from lerobot_vtrefine.diagnose.verdict import Parameter
 
@@ -54,9 +55,6 @@ def _nearly_linear(problem: ServoTrials, point: Point, joints: Array, multiple: 
     return point.with_values("full_load", np.abs(problem.batch.load).max((0, 1))[joints], joints)
 
 
-_CURVE_LEAD = 0.02
-"""By how much a spring that is not linear must beat a linear one."""
-
 FORMS = (
     # Before the servo, which then follows, or behind it, at once.
     # A newton bends by far less than the noise is long.
@@ -77,7 +75,7 @@ FORMS = (
             (size, "back", "slack", "curve"),
             possible=_loaded,
             start=_nearly_linear,
-            handicap=_CURVE_LEAD,
+            handicap=FORM_LEAD,
             sized=False,
         )
         for size in ("bend", "flex")

@@ -7,14 +7,13 @@ from lerobot_vtrefine.diagnose.joints.candidates.base import MOTION, Candidate
 from lerobot_vtrefine.diagnose.joints.estimates import Estimates, MethodError, widened
 from lerobot_vtrefine.diagnose.joints.gravity import is_sliding
 from lerobot_vtrefine.diagnose.joints.parameters import INDEX
+from lerobot_vtrefine.diagnose.joints.rules import FORM_LEAD
 from lerobot_vtrefine.diagnose.joints.servo_load import stiffness_in_load
 from lerobot_vtrefine.diagnose.verdict import Parameter
 from lerobot_vtrefine.embodiments import embodiment_of
 
 METHOD = MethodError(0.012, 0.1)
 NOT_SHOWN = "move every joint slowly, with reversals, over more than its encoder's steps"
-_SHAPE_LEAD = 0.02
-"""By how much friction that is larger at rest must beat one that is the same throughout."""
 _STICKING_VAGUE = 0.12
 """How friction falls from rest to motion is not resolved: part of it that intervals allow for."""
 
@@ -25,7 +24,7 @@ FORMS = (
         "joint_friction",
         ("friction", "stick"),
         (0.25, 0.75),
-        handicap=_SHAPE_LEAD,
+        handicap=FORM_LEAD,
         only_where="backlash",
         sized=False,
     ),

@@ -7,22 +7,21 @@ import numpy as np
 
 from lerobot_vtrefine.diagnose.pad.candidates.base import Form, Value
 from lerobot_vtrefine.diagnose.pad.press_trials import Press, PressSet
+from lerobot_vtrefine.diagnose.pad.rules import (
+    CHANCE,
+    CONTRADICTED,
+    MANY_TAXELS,
+    MIN_HELD,
+    MIN_REPEATED,
+    MIN_TELLING,
+    RARITY,
+    SURE_MOVE,
+    VISIBLE,
+)
 from lerobot_vtrefine.tactile.stages.host import SampleAndHold
 
 MAX_FRAMES = 12.0
 """Longest period looked for, in frames."""
-RARITY = 0.08
-"""How far the mean time between new readings may be off as a period."""
-MIN_HELD, CHANCE = 0.04, 0.2
-"""Share of frames that must repeat the one before for readings to be held, and what part may be chance."""
-VISIBLE = 0.01
-"""Part of a press's deepest drive by which it must change for a repeat to tell."""
-MANY_TAXELS, MIN_TELLING, SURE_MOVE = 6, 10, 4.0
-MIN_REPEATED = 0.1
-"""Share of frames that must repeat the one before for a rhythm to be looked for."""
-CONTRADICTED = 0.1
-"""Share of changes where a rhythm wants none, up to which it is believed; of repeats where it wants a change,
-three times as much, for readings may stay what they were."""
 
 
 def repeated_share(presses: PressSet) -> float:

@@ -1,4 +1,4 @@
-"""supply_sag: the more the drive puts on the motor, the more of it is lost in the supply."""
+"""supply_sag: the supply sags under the motor's current, the more the higher the duty cycle."""
 
 from lerobot_vtrefine.diagnose.servo.candidates.base import Candidate
 
