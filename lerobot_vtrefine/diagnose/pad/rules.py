@@ -75,12 +75,15 @@ CONDITION_LEVEL = 2.5
 """The same in all recordings of one condition; clean ones reach 1."""
 BESIDE = 1.15
 """Mean square of whitened errors of taxels beside a pressed indenter, over that at rest; 1.06 is usual."""
-TAXEL = 6.0
-"""Mean square of slow errors of one taxel while the pad is pressed, in variances of a frame's noise."""
+TAXEL = 12.0
+"""Mean square of slow errors of one taxel in one recording under pressure, in variances of a frame's noise:
+three times what noise that wanders for seconds reaches."""
 OTHERS = 4.0
 """Factor by which it must exceed that of the taxel in the middle: errors of all are no taxel's."""
 MIN_READINGS = 200
 """Readings that such a mean square must rest on."""
+MIN_PRESSED = 50
+"""Frames that one taxel's must rest on."""
 
 # What is left comes with sliding, or has a line.
 SLIDING = 1.6

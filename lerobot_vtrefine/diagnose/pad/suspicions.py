@@ -3,6 +3,7 @@ follows the session's order, follows something that the model does not know, or 
 """
 
 from collections.abc import Sequence
+from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -13,12 +14,14 @@ from lerobot_vtrefine.diagnose.pad import error_level, repeatability
 from lerobot_vtrefine.diagnose.pad.baseline import weigh
 from lerobot_vtrefine.diagnose.pad.decoys import in_place_of_names
 from lerobot_vtrefine.diagnose.pad.descriptors import DESCRIPTORS, Descriptor, directions, errors_left_out
-from lerobot_vtrefine.diagnose.pad.fitting import Fit, tangents
+from lerobot_vtrefine.diagnose.pad.fitting import Fit, predict, tangents
 from lerobot_vtrefine.diagnose.pad.gain_drift import gain_drift
 from lerobot_vtrefine.diagnose.pad.press_trials import PressSet
+from lerobot_vtrefine.diagnose.pad.recording_scatter import recording_scatter
 from lerobot_vtrefine.diagnose.pad.repeatability import Correlations
 from lerobot_vtrefine.diagnose.pad.rules import FOLLOWS, FOLLOWS_IF_OWNED
 from lerobot_vtrefine.diagnose.pad.screening import Scorer
+from lerobot_vtrefine.diagnose.pad.shared_errors import shared_errors
 from lerobot_vtrefine.diagnose.pad.sliding_errors import while_sliding
 from lerobot_vtrefine.diagnose.pad.spectrum import spectral_line
 
@@ -41,6 +44,8 @@ def suspicions(problem: "PadProblem", selection: Selection[Any, Fit, Any]) -> li
         spectral_line(presses, residuals),
         error_level.level(residuals, fitted, weights),
         while_sliding(presses, residuals, fitted, weights),
+        *recording_scatter(presses, fitted, problem.seed),
+        *shared_errors(presses, residuals, fitted, weights, problem.seed),
         *gain_drift(fitted, presses, weights),
         *(item for descriptor, item in descriptors if descriptor.session),
         *in_place_of_names(problem, fitted),
@@ -57,6 +62,14 @@ def suspicions(problem: "PadProblem", selection: Selection[Any, Fit, Any]) -> li
         *(item for descriptor, item in descriptors if not descriptor.session),
     ]
     return [item for item in found if item is not None]
+
+
+def surprises(problem: "PadProblem", fitted: Fit, presses: PressSet) -> list[Suspicion]:
+    """What fails now and then may have failed in recordings that no fit has seen, and in these alone."""
+    there = replace(fitted, signals=tuple(predict(fitted.model, presses)))
+    _, weights = weigh(there, presses, problem.noise)
+    item = error_level.one_taxel(presses, repeatability.cleaned(there, presses, weights), weights)
+    return [] if item is None else [item]
 
 
 def _repeating(

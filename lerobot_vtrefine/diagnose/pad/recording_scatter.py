@@ -1,0 +1,84 @@
+"""Gains, touches, places and clocks that differ between recordings by more than those of a sound rig.
+
+Fits forgive every recording such deviations, and neither their signs nor their order mean anything. But all
+together they may not be larger than those of a sound rig, taken to scatter twice as far.
+"""
+
+import numpy as np
+
+from lerobot_vtrefine.diagnose.core.rules import FLIPS, LEAST_UNKNOWN, SIZE_DOUBT
+from lerobot_vtrefine.diagnose.core.suspicion import Suspicion
+from lerobot_vtrefine.diagnose.pad.baseline import offset_tangents, touch_doubts
+from lerobot_vtrefine.diagnose.pad.descriptors import from_indenter
+from lerobot_vtrefine.diagnose.pad.fitting import Fit
+from lerobot_vtrefine.diagnose.pad.noise import DEFAULT_GAIN, DEFAULT_OFFSET_M, fit_frame_noise
+from lerobot_vtrefine.diagnose.pad.press_trials import Press, PressSet
+from lerobot_vtrefine.diagnose.pad.weights import whiten
+
+LEAN_RAD = 1e-3
+"""Repeatability of the indenter's lean, or of a round one's place: 10 um at a radius of 10 mm."""
+CLOCK_S = 1e-3
+"""Repeatability of a recording's start [s]."""
+KINDS = (
+    ("gains", 100 * DEFAULT_GAIN, "%"),
+    ("starts", 1e3 * CLOCK_S, "ms"),
+    ("first touches", 1e6 * DEFAULT_OFFSET_M, "um"),
+    ("leans or places along the row", 1e3 * LEAN_RAD, "mrad"),
+    ("leans or places along the column", 1e3 * LEAN_RAD, "mrad"),
+)
+"""What differs, how far in sound recordings, and its unit; the last three where depth is known."""
+
+
+def recording_scatter(presses: PressSet, fitted: Fit, seed: int) -> list[Suspicion]:
+    """Whether recordings differ by more; under the null their deviations are normal numbers."""
+    residuals = fitted.residuals(presses)
+    noise = fit_frame_noise(presses, residuals, fitted.signals)
+    slopes = offset_tangents(fitted.model, presses, fitted.signals)
+    doubts = touch_doubts(fitted.model, presses)
+    found, powers = [], []
+    for k, (press, signal, residual) in enumerate(
+        zip(presses.presses, fitted.signals, residuals, strict=True)
+    ):
+        sigma = noise.sigma(signal) if doubts is None else np.hypot(noise.sigma(signal), doubts[k])
+        images = _deviations(press, signal, None if slopes is None else slopes[k])
+        white = np.stack([whiten(image, sigma, noise.memory) for image in images], axis=1)
+        coupling = np.linalg.inv(np.eye(len(images)) + white.T @ white)
+        own = coupling @ (white.T @ whiten(residual, sigma, noise.memory))
+        # The most probable deviations, in those of a sound rig, have this variance.
+        variance = 1.0 - np.diag(coupling)
+        found.append(np.divide(own, np.sqrt(variance), out=np.zeros_like(own), where=variance > 0.01))
+        powers.append([np.mean((size * image) ** 2) for size, image in zip(own, images, strict=True)])
+    left = max(sum(float(np.mean(residual**2)) for residual in residuals), 1e-12)
+    shares = np.sum(powers, axis=0) / left
+    rng = np.random.default_rng([seed, 7])
+    return [
+        _scatter(kind, scores, float(share), rng)
+        for kind, scores, share in zip(KINDS, np.transpose(found), shares, strict=False)
+    ]
+
+
+def _deviations(press: Press, signal: np.ndarray, slope: np.ndarray | None) -> list[np.ndarray]:
+    """What the deviations of a sound rig do to a recording's signal, (T, n) each, in the order of `KINDS`.
+
+    Args:
+        slope: change of the signal per metre of first touch (T, n).
+    """
+    step = np.maximum(np.gradient(press.time_s), 1e-6)[:, None]
+    images = [signal * DEFAULT_GAIN, np.gradient(signal, axis=0) / step * CLOCK_S]
+    if slope is not None:
+        lean = slope * LEAN_RAD * press.layout.pitch_m
+        images += [slope * DEFAULT_OFFSET_M, *(lean * from_indenter(press, axis) for axis in (0, 1))]
+    return images
+
+
+def _scatter(
+    kind: tuple[str, float, str], scores: np.ndarray, share: float, rng: np.random.Generator
+) -> Suspicion:
+    """From deviations (K,) in those of sound recordings, and their part of the squared error that is left."""
+    name, unit, symbol = kind
+    known = np.count_nonzero(scores)
+    total = float(np.square(scores).sum())
+    drawn = np.concatenate([[total / SIZE_DOUBT**2], rng.chisquare(max(known, 1), FLIPS)])
+    size = unit * np.sqrt(total / max(known, 1))
+    clue = f"{name} differ between recordings by {size:.2g} {symbol}, where {unit:.2g} is usual"
+    return Suspicion(0, clue, share, LEAST_UNKNOWN, scores, drawn=drawn)
