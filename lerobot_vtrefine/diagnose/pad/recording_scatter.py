@@ -19,6 +19,8 @@ LEAN_RAD = 1e-3
 """Repeatability of the indenter's lean, or of a round one's place: 10 um at a radius of 10 mm."""
 CLOCK_S = 1e-3
 """Repeatability of a recording's start [s]."""
+DOUBT = 0.1
+"""Part of the noise up to which it may not matter whether a reading is touched yet."""
 KINDS = (
     ("gains", 100 * DEFAULT_GAIN, "%"),
     ("starts", 1e3 * CLOCK_S, "ms"),
@@ -39,15 +41,17 @@ def recording_scatter(presses: PressSet, fitted: Fit, seed: int) -> list[Suspici
     for k, (press, signal, residual) in enumerate(
         zip(presses.presses, fitted.signals, residuals, strict=True)
     ):
-        sigma = noise.sigma(signal) if doubts is None else np.hypot(noise.sigma(signal), doubts[k])
+        sigma = noise.sigma(signal)
+        # A jump at the touch has no tangent that holds for micrometres: what may lie before it says nothing.
+        sure = np.ones(signal.shape) if doubts is None else (doubts[k] < DOUBT * sigma).astype(float)
         images = _deviations(press, signal, None if slopes is None else slopes[k])
-        white = np.stack([whiten(image, sigma, noise.memory) for image in images], axis=1)
+        white = np.stack([whiten(image * sure, sigma, noise.memory) for image in images], axis=1)
         coupling = np.linalg.inv(np.eye(len(images)) + white.T @ white)
-        own = coupling @ (white.T @ whiten(residual, sigma, noise.memory))
+        own = coupling @ (white.T @ whiten(residual * sure, sigma, noise.memory))
         # The most probable deviations, in those of a sound rig, have this variance.
         variance = 1.0 - np.diag(coupling)
         found.append(np.divide(own, np.sqrt(variance), out=np.zeros_like(own), where=variance > 0.01))
-        powers.append([np.mean((size * image) ** 2) for size, image in zip(own, images, strict=True)])
+        powers.append([np.mean((size * image * sure) ** 2) for size, image in zip(own, images, strict=True)])
     left = max(sum(float(np.mean(residual**2)) for residual in residuals), 1e-12)
     shares = np.sum(powers, axis=0) / left
     rng = np.random.default_rng([seed, 7])
