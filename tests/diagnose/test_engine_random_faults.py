@@ -13,8 +13,7 @@ from lerobot_vtrefine.diagnose.core.resampling import Hypothesis, jointly_adjust
 from lerobot_vtrefine.diagnose.core.rules import FLIPS, SUSPICION_ALPHA
 from lerobot_vtrefine.diagnose.core.suspicion import Suspicion, observed
 from lerobot_vtrefine.diagnose.pad.problem import PadProblem
-from lerobot_vtrefine.diagnose.pad.recording_scatter import recording_scatter
-from lerobot_vtrefine.diagnose.pad.repeatability import cleaned
+from lerobot_vtrefine.diagnose.pad.recording_scatter import own_deviations, recording_scatter
 from lerobot_vtrefine.diagnose.pad.shared_errors import shared_errors
 from lerobot_vtrefine.diagnose.pad.suspicions import following
 from lerobot_vtrefine.diagnose.recordings import Trial
@@ -58,7 +57,7 @@ def wandering(trial: Trial) -> np.ndarray:
 )
 def test_what_all_taxels_do_at_once_is_told_from_noise_that_wanders(added, expected) -> None:
     presses, baseline = fitted(added)
-    left = cleaned(baseline.fitted, presses, baseline.weights)
+    left = own_deviations(presses, baseline.fitted).left
     clues = raised(shared_errors(presses, left, baseline.fitted, baseline.weights, 0))
     assert bool(clues) == (expected is not None)
     assert expected is None or any(expected in clue for clue in clues)
@@ -81,7 +80,7 @@ def scattered(change: Callable[[Trial, float], np.ndarray]) -> list[str]:
     """Clues where every recording's readings deviate by their own normal number."""
     numbers = np.random.default_rng(12).standard_normal(COUNT)
     presses, baseline = fitted(lambda trial: change(trial, numbers[trial.order % COUNT]) - trial.raw)
-    return raised(recording_scatter(presses, baseline.fitted, 0))
+    return raised(recording_scatter(own_deviations(presses, baseline.fitted), 0))
 
 
 def other_gain(size: float) -> Callable[[Trial, float], np.ndarray]:
@@ -123,7 +122,10 @@ def test_an_indenter_that_lands_beside_its_place_is_seen() -> None:
     assert fires(most)
     numbers = np.random.default_rng(13).standard_normal(10 * COUNT)
     presses, baseline = fitted(shifted(lambda order: 1e-4 * numbers[order % len(numbers)]))
-    assert any("along the row" in clue for clue in raised(recording_scatter(presses, baseline.fitted, 0)))
+    assert any(
+        "along the row" in clue
+        for clue in raised(recording_scatter(own_deviations(presses, baseline.fitted), 0))
+    )
 
 
 def failing(trial: Trial) -> np.ndarray:

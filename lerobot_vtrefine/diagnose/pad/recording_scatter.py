@@ -4,6 +4,8 @@ Fits forgive every recording such deviations, and neither their signs nor their 
 together they may not be larger than those of a sound rig, taken to scatter twice as far.
 """
 
+from dataclasses import dataclass
+
 import numpy as np
 
 from lerobot_vtrefine.diagnose.core.rules import FLIPS, LEAST_UNKNOWN, SIZE_DOUBT
@@ -13,6 +15,7 @@ from lerobot_vtrefine.diagnose.pad.descriptors import from_indenter
 from lerobot_vtrefine.diagnose.pad.fitting import Fit
 from lerobot_vtrefine.diagnose.pad.noise import DEFAULT_GAIN, DEFAULT_OFFSET_M, fit_frame_noise
 from lerobot_vtrefine.diagnose.pad.press_trials import Press, PressSet
+from lerobot_vtrefine.diagnose.pad.repeatability import unsure
 from lerobot_vtrefine.diagnose.pad.weights import whiten
 
 LEAN_RAD = 1e-3
@@ -31,34 +34,55 @@ KINDS = (
 """What differs, how far in sound recordings, and its unit; the last three where depth is known."""
 
 
-def recording_scatter(presses: PressSet, fitted: Fit, seed: int) -> list[Suspicion]:
-    """Whether recordings differ by more; under the null their deviations are normal numbers."""
+@dataclass(frozen=True)
+class Deviations:
+    """What recordings deviate by, in those of a sound rig, in the order of `KINDS`.
+
+    Attributes:
+        scores: (K, q) of unit variance in sound recordings; zero where a recording cannot tell.
+        shares: (q,) parts of the squared error that they account for.
+        left: residuals (T, n) without them, zero where no recording can be sure [counts].
+    """
+
+    scores: np.ndarray
+    shares: np.ndarray
+    left: list[np.ndarray]
+
+
+def own_deviations(presses: PressSet, fitted: Fit) -> Deviations:
+    """The most probable ones, all together, with the scatter of a sound rig as their prior."""
     residuals = fitted.residuals(presses)
     noise = fit_frame_noise(presses, residuals, fitted.signals)
     slopes = offset_tangents(fitted.model, presses, fitted.signals)
     doubts = touch_doubts(fitted.model, presses)
-    found, powers = [], []
-    for k, (press, signal, residual) in enumerate(
-        zip(presses.presses, fitted.signals, residuals, strict=True)
-    ):
+    scores, powers, left = [], [], []
+    for k, (press, signal) in enumerate(zip(presses.presses, fitted.signals, strict=True)):
         sigma = noise.sigma(signal)
-        # A jump at the touch has no tangent that holds for micrometres: what may lie before it says nothing.
-        sure = np.ones(signal.shape) if doubts is None else (doubts[k] < DOUBT * sigma).astype(float)
-        images = _deviations(press, signal, None if slopes is None else slopes[k])
-        white = np.stack([whiten(image * sure, sigma, noise.memory) for image in images], axis=1)
+        sure = ~unsure(press, fitted, sigma)
+        if doubts is not None:
+            # A jump at the touch has no tangent that holds for micrometres.
+            sure &= doubts[k] < DOUBT * sigma
+        residual = residuals[k] * sure
+        slope = None if slopes is None else slopes[k]
+        images = [image * sure for image in _deviations(press, signal, slope)]
+        white = np.stack([whiten(image, sigma, noise.memory) for image in images], axis=1)
         coupling = np.linalg.inv(np.eye(len(images)) + white.T @ white)
-        own = coupling @ (white.T @ whiten(residual * sure, sigma, noise.memory))
-        # The most probable deviations, in those of a sound rig, have this variance.
+        own = coupling @ (white.T @ whiten(residual, sigma, noise.memory))
+        # In a sound rig's own units the most probable deviations have this variance.
         variance = 1.0 - np.diag(coupling)
-        found.append(np.divide(own, np.sqrt(variance), out=np.zeros_like(own), where=variance > 0.01))
-        powers.append([np.mean((size * image * sure) ** 2) for size, image in zip(own, images, strict=True)])
-    left = max(sum(float(np.mean(residual**2)) for residual in residuals), 1e-12)
-    shares = np.sum(powers, axis=0) / left
+        scores.append(np.divide(own, np.sqrt(variance), out=np.zeros_like(own), where=variance > 0.01))
+        parts = [size * image for size, image in zip(own, images, strict=True)]
+        powers.append([np.mean(part**2) for part in parts])
+        left.append(residual - np.sum(parts, axis=0))
+    total = max(sum(float(np.mean(residual**2)) for residual in residuals), 1e-12)
+    return Deviations(np.array(scores), np.sum(powers, axis=0) / total, left)
+
+
+def recording_scatter(own: Deviations, seed: int) -> list[Suspicion]:
+    """Whether recordings differ by more; under the null their deviations are normal numbers."""
     rng = np.random.default_rng([seed, 7])
-    return [
-        _scatter(kind, scores, float(share), rng)
-        for kind, scores, share in zip(KINDS, np.transpose(found), shares, strict=False)
-    ]
+    every = zip(KINDS, own.scores.T, own.shares, strict=False)
+    return [_scatter(kind, scores, float(share), rng) for kind, scores, share in every]
 
 
 def _deviations(press: Press, signal: np.ndarray, slope: np.ndarray | None) -> list[np.ndarray]:

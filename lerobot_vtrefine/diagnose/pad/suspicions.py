@@ -17,7 +17,7 @@ from lerobot_vtrefine.diagnose.pad.descriptors import DESCRIPTORS, Descriptor, d
 from lerobot_vtrefine.diagnose.pad.fitting import Fit, predict, tangents
 from lerobot_vtrefine.diagnose.pad.gain_drift import gain_drift
 from lerobot_vtrefine.diagnose.pad.press_trials import PressSet
-from lerobot_vtrefine.diagnose.pad.recording_scatter import recording_scatter
+from lerobot_vtrefine.diagnose.pad.recording_scatter import own_deviations, recording_scatter
 from lerobot_vtrefine.diagnose.pad.repeatability import Correlations
 from lerobot_vtrefine.diagnose.pad.rules import FOLLOWS, FOLLOWS_IF_OWNED
 from lerobot_vtrefine.diagnose.pad.screening import Scorer
@@ -39,13 +39,13 @@ def suspicions(problem: "PadProblem", selection: Selection[Any, Fit, Any]) -> li
     presses, fitted, plain = problem.presses, selection.fit, selection.baseline
     _, weights = weigh(fitted, presses)
     residuals = repeatability.cleaned(fitted, presses, weights)
-    descriptors = following(problem, fitted)
+    descriptors, own = following(problem, fitted), own_deviations(presses, fitted)
     sure = [
         spectral_line(presses, residuals),
         error_level.level(residuals, fitted, weights),
         while_sliding(presses, residuals, fitted, weights),
-        *recording_scatter(presses, fitted, problem.seed),
-        *shared_errors(presses, residuals, fitted, weights, problem.seed),
+        *recording_scatter(own, problem.seed),
+        *shared_errors(presses, own.left, fitted, weights, problem.seed),
         *gain_drift(fitted, presses, weights),
         *(item for descriptor, item in descriptors if descriptor.session),
         *in_place_of_names(problem, fitted),
