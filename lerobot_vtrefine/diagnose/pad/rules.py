@@ -85,12 +85,10 @@ MIN_READINGS = 200
 MIN_PRESSED = 50
 """Frames that one taxel's must rest on."""
 
-# What is left comes with sliding, or has a line.
+# What is left comes with sliding.
 SLIDING = 1.6
 """Mean square of whitened errors while sliding, over that of other readings under load; 1.2 is usual."""
 AGREED = 1.2
 """The same within recordings, in their geometric mean: one that slides far may err more all the time."""
 MIN_SLIDING, MIN_OWN = 60, 20
 """Sliding and still readings that there must be, in all and in a recording that is compared with itself."""
-LINE_RATIO = 8.0
-"""Power of a line over that around it, in the median of recordings, that noise does not reach."""

@@ -50,5 +50,6 @@ def _shared(text: str, units: Sequence[Array], pattern: Sequence[Array], seed: i
         drawn += ((signs @ products) * signs).sum(axis=1)
         scores[k] = products.sum()
     part = float(scores.sum()) / max(sum(float((unit**2).sum()) for unit in units), 1e-12)
-    clue = f"errors come and go together in {text} ({100 * part:.0f} % of what is left)"
-    return Suspicion(0, clue, part, LEAST_UNKNOWN, scores, drawn=drawn)
+    clue = f"errors come and go together in {text} ({100 * abs(part):.0f} % of what is left)"
+    # What rings may have turned over a few frames later.
+    return Suspicion(0, clue, abs(part), LEAST_UNKNOWN, scores, drawn=np.abs(drawn))

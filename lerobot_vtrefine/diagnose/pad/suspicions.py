@@ -1,5 +1,6 @@
-"""What may be left on a pad: it repeats with the command, is far above noise, comes with sliding, has a line,
-follows the session's order, follows something that the model does not know, or has borrowed a name.
+"""What may be left on a pad: it repeats with the command, is far above noise, comes with sliding, is shared
+by taxels, differs from recording to recording, follows the session's order, follows something that the model
+does not know, or has borrowed a name.
 """
 
 from collections.abc import Sequence
@@ -23,7 +24,6 @@ from lerobot_vtrefine.diagnose.pad.rules import FOLLOWS, FOLLOWS_IF_OWNED
 from lerobot_vtrefine.diagnose.pad.screening import Scorer
 from lerobot_vtrefine.diagnose.pad.shared_errors import shared_errors
 from lerobot_vtrefine.diagnose.pad.sliding_errors import while_sliding
-from lerobot_vtrefine.diagnose.pad.spectrum import spectral_line
 
 if TYPE_CHECKING:
     from lerobot_vtrefine.diagnose.pad.problem import PadProblem
@@ -41,7 +41,6 @@ def suspicions(problem: "PadProblem", selection: Selection[Any, Fit, Any]) -> li
     residuals = repeatability.cleaned(fitted, presses, weights)
     descriptors, own = following(problem, fitted), own_deviations(presses, fitted)
     sure = [
-        spectral_line(presses, residuals),
         error_level.level(residuals, fitted, weights),
         while_sliding(presses, residuals, fitted, weights),
         *recording_scatter(own, problem.seed),
