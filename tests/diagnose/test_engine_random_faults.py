@@ -15,7 +15,6 @@ from lerobot_vtrefine.diagnose.core.suspicion import Suspicion, observed
 from lerobot_vtrefine.diagnose.pad.problem import PadProblem
 from lerobot_vtrefine.diagnose.pad.recording_scatter import own_deviations, recording_scatter
 from lerobot_vtrefine.diagnose.pad.shared_errors import shared_errors
-from lerobot_vtrefine.diagnose.pad.suspicions import following
 from lerobot_vtrefine.diagnose.recordings import Trial
 
 OTHERS = 30
@@ -99,8 +98,8 @@ def other_start(trial: Trial, number: float) -> np.ndarray:
 def test_recordings_may_differ_as_those_of_a_sound_rig_and_no_further() -> None:
     assert not scattered(lambda trial, number: trial.raw)
     assert not scattered(other_gain(0.015))
-    assert any(clue.startswith("gains differ") for clue in scattered(other_gain(0.06)))
-    assert any(clue.startswith("starts differ") for clue in scattered(other_start))
+    assert any(clue.startswith("gains of recordings") for clue in scattered(other_gain(0.06)))
+    assert any(clue.startswith("starts of recordings") for clue in scattered(other_start))
 
 
 def shifted(to: Callable[[int], float]) -> Callable[[Trial], np.ndarray]:
@@ -114,18 +113,13 @@ def shifted(to: Callable[[int], float]) -> Callable[[Trial], np.ndarray]:
     return added
 
 
-def test_an_indenter_that_lands_beside_its_place_is_seen() -> None:
-    presses, baseline = fitted(shifted(lambda order: 1e-4))
-    found = following(PadProblem(presses, weights=baseline.weights), baseline.fitted)
-    _, most = max(found, key=lambda item: item[1].share)
-    assert "shift of the indenter along the row" in most.clue
-    assert fires(most)
-    numbers = np.random.default_rng(13).standard_normal(10 * COUNT)
-    presses, baseline = fitted(shifted(lambda order: 1e-4 * numbers[order % len(numbers)]))
-    assert any(
-        "along the row" in clue
-        for clue in raised(recording_scatter(own_deviations(presses, baseline.fitted), 0))
-    )
+@pytest.mark.parametrize("alike", [True, False])
+def test_an_indenter_that_lands_beside_its_place_is_seen(alike) -> None:
+    numbers = np.ones(COUNT) if alike else np.random.default_rng(13).standard_normal(COUNT)
+    presses, baseline = fitted(shifted(lambda order: 1e-4 * numbers[order % COUNT]))
+    clues = raised(recording_scatter(own_deviations(presses, baseline.fitted), 0))
+    assert any("along the row" in clue for clue in clues)
+    assert not any("along the column" in clue for clue in clues)
 
 
 def failing(trial: Trial) -> np.ndarray:

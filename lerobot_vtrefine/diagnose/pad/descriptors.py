@@ -70,16 +70,6 @@ def _place(press: Press, axis: int) -> np.ndarray:
     return (2.0 * index - (count - 1)) / max(count - 1, 1)
 
 
-def from_indenter(press: Press, axis: int) -> np.ndarray:
-    """Where the scored taxels lie from the indenter (T, n), along the row (0) or the column (1) [pitch].
-
-    A shift of a round indenter changes depths in proportion to that, and so does a lean of any.
-    """
-    layout, where = press.layout, press.trial.x_m if axis == 0 else press.trial.y_m
-    count = layout.full_cols if axis == 0 else layout.full_rows
-    return 0.5 * (count - 1) * _place(press, axis) - where[:, None] / layout.pitch_m
-
-
 def _line_sum(press: Press, signal: Signal, axis: int) -> np.ndarray:
     """Sum of the other expected signals in the taxel's row (0) or column (1): (T, n)."""
     cols = press.layout.full_cols
@@ -151,10 +141,6 @@ DESCRIPTORS = (
         "touch at the distance from the pad's centre",
         causes_like("centre"),
         lambda p, s: (s > 0) * (_place(p, 0) ** 2 + _place(p, 1) ** 2),
-    ),
-    Descriptor("a shift of the indenter along the row", PLACES, lambda p, s: (s > 0) * from_indenter(p, 0)),
-    Descriptor(
-        "a shift of the indenter along the column", PLACES, lambda p, s: (s > 0) * from_indenter(p, 1)
     ),
     Descriptor("the other readings of the row", ROWS, lambda p, s: _line_sum(p, s, 0)),
     Descriptor("the other readings of the column", COLUMNS, lambda p, s: _line_sum(p, s, 1)),

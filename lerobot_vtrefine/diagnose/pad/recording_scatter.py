@@ -1,4 +1,4 @@
-"""Gains, touches, places and clocks that differ between recordings by more than those of a sound rig.
+"""Gains, touches, places and clocks of recordings that deviate by more than those of a sound rig.
 
 Fits forgive every recording such deviations, and neither their signs nor their order mean anything. But all
 together they may not be larger than those of a sound rig, taken to scatter twice as far.
@@ -11,7 +11,6 @@ import numpy as np
 from lerobot_vtrefine.diagnose.core.rules import FLIPS, LEAST_UNKNOWN, SIZE_DOUBT
 from lerobot_vtrefine.diagnose.core.suspicion import Suspicion
 from lerobot_vtrefine.diagnose.pad.baseline import offset_tangents, touch_doubts
-from lerobot_vtrefine.diagnose.pad.descriptors import from_indenter
 from lerobot_vtrefine.diagnose.pad.fitting import Fit
 from lerobot_vtrefine.diagnose.pad.noise import DEFAULT_GAIN, DEFAULT_OFFSET_M, fit_frame_noise
 from lerobot_vtrefine.diagnose.pad.press_trials import Press, PressSet
@@ -31,7 +30,7 @@ KINDS = (
     ("leans or places along the row", 1e3 * LEAN_RAD, "mrad"),
     ("leans or places along the column", 1e3 * LEAN_RAD, "mrad"),
 )
-"""What differs, how far in sound recordings, and its unit; the last three where depth is known."""
+"""What deviates, how far in sound recordings, and its unit; the last three where depth is known."""
 
 
 @dataclass(frozen=True)
@@ -79,7 +78,7 @@ def own_deviations(presses: PressSet, fitted: Fit) -> Deviations:
 
 
 def recording_scatter(own: Deviations, seed: int) -> list[Suspicion]:
-    """Whether recordings differ by more; under the null their deviations are normal numbers."""
+    """Whether recordings deviate by more; under the null their deviations are normal numbers."""
     rng = np.random.default_rng([seed, 7])
     every = zip(KINDS, own.scores.T, own.shares, strict=False)
     return [_scatter(kind, scores, float(share), rng) for kind, scores, share in every]
@@ -95,8 +94,21 @@ def _deviations(press: Press, signal: np.ndarray, slope: np.ndarray | None) -> l
     images = [signal * DEFAULT_GAIN, np.gradient(signal, axis=0) / step * CLOCK_S]
     if slope is not None:
         lean = slope * LEAN_RAD * press.layout.pitch_m
-        images += [slope * DEFAULT_OFFSET_M, *(lean * from_indenter(press, axis) for axis in (0, 1))]
+        images += [slope * DEFAULT_OFFSET_M, *(lean * where for where in _from_indenter(press))]
     return images
+
+
+def _from_indenter(press: Press) -> tuple[np.ndarray, np.ndarray]:
+    """Where the scored taxels lie from the indenter (T, n), along the row and along the column [pitch].
+
+    A shift of a round indenter changes depths in proportion to that, and so does a lean of any.
+    """
+    layout, trial = press.layout, press.trial
+    row, col = np.divmod(press.taxels, layout.full_cols)
+    return (
+        col - 0.5 * (layout.full_cols - 1) - trial.x_m[:, None] / layout.pitch_m,
+        row - 0.5 * (layout.full_rows - 1) - trial.y_m[:, None] / layout.pitch_m,
+    )
 
 
 def _scatter(
@@ -108,5 +120,5 @@ def _scatter(
     total = float(np.square(scores).sum())
     drawn = np.concatenate([[total / SIZE_DOUBT**2], rng.chisquare(max(known, 1), FLIPS)])
     size = unit * np.sqrt(total / max(known, 1))
-    clue = f"{name} differ between recordings by {size:.2g} {symbol}, where {unit:.2g} is usual"
+    clue = f"{name} of recordings deviate by {size:.2g} {symbol}, where {unit:.2g} is usual"
     return Suspicion(0, clue, share, LEAST_UNKNOWN, scores, drawn=drawn)
