@@ -1,6 +1,7 @@
 """Alarms for what comes at random: in moments, in single recordings, or in each by another amount."""
 
 from collections.abc import Callable, Sequence
+from dataclasses import replace
 from types import SimpleNamespace
 
 import numpy as np
@@ -57,8 +58,12 @@ def wandering(trial: Trial) -> np.ndarray:
 def test_what_all_taxels_do_at_once_is_told_from_noise_that_wanders(added, expected) -> None:
     presses, baseline = fitted(added)
     left = own_deviations(presses, baseline.fitted).left
-    clues = raised(shared_errors(presses, left, baseline.fitted, baseline.weights, 0))
+    found = shared_errors(presses, left, baseline.fitted, baseline.weights, 0)
+    clues = raised(found)
     assert bool(clues) == (expected is not None)
+    named = SimpleNamespace(signals=baseline.fitted.signals, model=SimpleNamespace(families=("hysteresis",)))
+    strict = shared_errors(presses, left, named, baseline.weights, 0)
+    assert strict[0].least > 2 * found[0].least  # forms that are not quite right err in all loaded taxels
     assert expected is None or any(expected in clue for clue in clues)
 
 
@@ -70,7 +75,13 @@ def test_independent_taxels_share_nothing_as_often_as_said() -> None:
     signals = [np.abs(np.sin(np.linspace(0, 6, 200)))[:, None] * np.linspace(0.2, 1, 6)] * 12
     for seed in range(60):
         noise = [lfilter([1.0], [1.0, -0.87], rng.standard_t(4, (200, 6)), axis=0) for _ in range(12)]
-        for item in shared_errors(presses, noise, SimpleNamespace(signals=signals), weights, seed):
+        for item in shared_errors(
+            presses,
+            noise,
+            SimpleNamespace(signals=signals, model=SimpleNamespace(families=())),
+            weights,
+            seed,
+        ):
             low += np.mean(item.drawn >= item.drawn[0]) < 0.1
     assert 3 <= low <= 24  # 12 of 120 are expected
 
@@ -136,6 +147,8 @@ def test_a_taxel_that_fails_in_a_locked_recording_alone_is_an_alarm(added, expec
     problem, now = seen.weighed(None)
     alarms = observed(problem.surprises(now, locked))
     assert len(alarms) == expected
+    mapped = replace(now, model=replace(now.model, gain_map=np.ones((ROWS, COLS))))
+    assert not problem.surprises(mapped, locked)  # it may not know what they press
     if expected:
         assert alarms[0].clue.startswith(f"errors of taxel (1, 1) in t{COUNT - 1:02}.parquet")
 

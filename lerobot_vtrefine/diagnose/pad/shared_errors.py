@@ -13,6 +13,7 @@ from lerobot_vtrefine.diagnose.core.suspicion import Suspicion
 from lerobot_vtrefine.diagnose.pad.error_level import LAG
 from lerobot_vtrefine.diagnose.pad.fitting import Fit
 from lerobot_vtrefine.diagnose.pad.press_trials import PressSet
+from lerobot_vtrefine.diagnose.pad.rules import FOLLOWS_IF_OWNED
 from lerobot_vtrefine.diagnose.pad.weights import TrialWeights
 
 Array = np.ndarray
@@ -30,13 +31,17 @@ def shared_errors(
         return []
     units = [residual / weight.sigma for residual, weight in zip(residuals, weights, strict=True)]
     loads = [signal / weight.sigma for signal, weight in zip(fitted.signals, weights, strict=True)]
+    # A form that is not quite right errs in all loaded taxels at once.
+    least = FOLLOWS_IF_OWNED if fitted.model.families else LEAST_UNKNOWN
     return [
-        _shared("all taxels", units, [np.ones(unit.shape) for unit in units], seed),
-        _shared("loaded taxels, in proportion", units, loads, seed),
+        _shared("all taxels", units, [np.ones(unit.shape) for unit in units], least, seed),
+        _shared("loaded taxels, in proportion", units, loads, least, seed),
     ]
 
 
-def _shared(text: str, units: Sequence[Array], pattern: Sequence[Array], seed: int) -> Suspicion:
+def _shared(
+    text: str, units: Sequence[Array], pattern: Sequence[Array], least: float, seed: int
+) -> Suspicion:
     """From errors in units of noise (T, n), and what of them would be shared (T, n)."""
     rng = np.random.default_rng([seed, 6])
     drawn, scores = np.zeros(FLIPS + 1), np.zeros(len(units))
@@ -52,4 +57,4 @@ def _shared(text: str, units: Sequence[Array], pattern: Sequence[Array], seed: i
     part = float(scores.sum()) / max(sum(float((unit**2).sum()) for unit in units), 1e-12)
     clue = f"errors come and go together in {text} ({100 * abs(part):.0f} % of what is left)"
     # What rings may have turned over a few frames later.
-    return Suspicion(0, clue, abs(part), LEAST_UNKNOWN, scores, drawn=np.abs(drawn))
+    return Suspicion(0, clue, abs(part), least, scores, drawn=np.abs(drawn))

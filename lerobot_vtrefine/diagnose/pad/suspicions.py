@@ -64,7 +64,12 @@ def suspicions(problem: "PadProblem", selection: Selection[Any, Fit, Any]) -> li
 
 
 def surprises(problem: "PadProblem", fitted: Fit, presses: PressSet) -> list[Suspicion]:
-    """What fails now and then may have failed in recordings that no fit has seen, and in these alone."""
+    """What fails now and then may have failed in recordings that no fit has seen, and in these alone.
+
+    A map of gains knows too little of what other recordings pressed to tell.
+    """
+    if fitted.model.gain_map is not None:
+        return []
     there = replace(fitted, signals=tuple(predict(fitted.model, presses)))
     _, weights = weigh(there, presses, problem.noise)
     item = error_level.one_taxel(presses, repeatability.cleaned(there, presses, weights), weights)
