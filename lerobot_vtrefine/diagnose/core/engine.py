@@ -13,7 +13,7 @@ from lerobot_vtrefine.diagnose.core.rivals import Rival, find_rivals, settled
 from lerobot_vtrefine.diagnose.core.screened_rivals import screened_rivals
 from lerobot_vtrefine.diagnose.core.screened_search import ScreenedSearch
 from lerobot_vtrefine.diagnose.core.search import ALL, Search, Selection
-from lerobot_vtrefine.diagnose.core.suspicion import Alarm, raise_alarms
+from lerobot_vtrefine.diagnose.core.suspicion import Alarm, observed, raise_alarms
 
 Array = np.ndarray
 Progress = Callable[[str, float], None]
@@ -83,13 +83,15 @@ def infer[P: Problem[Any, Any]](
             alarms = raise_alarms(selection, selection.problem.suspicions(selection, seed), seed)
     tell(f"{whole.subject}: settling the sizes", 0.8)
     selection, whole = _settled_finely(named_only(selection), whole)
-    selection = selection.problem.handed_out(selection, seed, doubtful=bool(alarms))
     test = whole.subset(locked) if len(locked) else selection.problem
+    # Asked before models are handed out, told after: what locked trials show decides nothing but the verdict.
+    surprises = selection.problem.surprises(selection.fit, test) if len(locked) else ()
+    selection = selection.problem.handed_out(selection, seed, doubtful=bool(alarms))
     selection, refused = guarded(selection, test, seed)
     return Inference(
         selection,
         tuple(item for item in rivals if item.cause in selection.causes()),
-        _with_refused(alarms, refused),
+        _with_refused((*alarms, *observed(surprises)), refused),
         test,
         bool(len(locked)),
         refused,

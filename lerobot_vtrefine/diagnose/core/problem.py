@@ -125,6 +125,10 @@ class OptionalSteps(Protocol):
         """What may be left, as scores of trials."""
         return ()
 
+    def surprises(self, fit: Any, locked: Self) -> "Sequence[Suspicion]":
+        """What a fit leaves in locked trials that is beyond anything sound trials have; nothing is tested."""
+        return ()
+
 
 class Problem[F: Fit, C: Candidate](OptionalSteps, Protocol):
     """Trials to be explained, and fits to them."""

@@ -64,6 +64,9 @@ class Hypothesis:
     """Whether either sign tells."""
     scatter: float | None = None
     """Standard deviation of their sum by the noise alone, as it was fitted; None: not known."""
+    drawn: Array | None = None
+    """(`FLIPS` + 1,) what the scores' statistic is, and then what it would be under a null of its own; None:
+    their sum, under flipped signs or permuted orders."""
 
     @property
     def few(self) -> bool:
@@ -75,8 +78,9 @@ class Hypothesis:
 def jointly_adjusted(hypotheses: Sequence[Hypothesis], seed: int) -> Array:
     """p (K,) adjusted over all hypotheses together (max-T).
 
-    Signs are flipped, or orders permuted. Where few trials carry a sum whose scatter is known, its size is
-    one more hypothesis: as likely as among normal numbers that scatter `SIZE_DOUBT` times as far.
+    Signs are flipped, orders permuted, or a null of its own is drawn from. Where few trials carry a sum whose
+    scatter is known, its size is one more hypothesis: as likely as among normal numbers that scatter
+    `SIZE_DOUBT` times as far.
 
     Every statistic is told in units of the upper tail of its own resampled values (balanced: Beran 1988,
     Romano & Wolf 2010). A sum that a few trials dominate stays small even where all trials agree, and would
@@ -102,6 +106,8 @@ def _statistics(hypotheses: Sequence[Hypothesis], seed: int) -> tuple[Array, Arr
     places[0] = np.arange(len(scores))
     drawn, orders = signs @ scores, {}
     for k, item in enumerate(hypotheses):
+        if item.drawn is not None:
+            drawn[:, k] = item.drawn
         if item.along is None:
             continue
         told = np.flatnonzero(scores[:, k])

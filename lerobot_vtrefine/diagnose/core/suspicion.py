@@ -34,6 +34,7 @@ class Suspicion:
     either_sign: bool = False
     along: Array | None = None
     scatter: float | None = None
+    drawn: Array | None = None
     decisive: bool = False
     """Whether it explains whatever else is odd about its channel."""
 
@@ -73,10 +74,17 @@ def raise_alarms(
     return (*first, *(alarm for alarm in found if alarm.channel not in settled))
 
 
+def observed(suspicions: Sequence[Suspicion]) -> list[Alarm]:
+    """Alarms by size alone."""
+    return [
+        Alarm(item.channel, item.clue, item.share, None) for item in suspicions if item.share > item.least
+    ]
+
+
 def _tested(suspicions: Sequence[Suspicion], seed: int) -> list[float | None]:
     """Adjusted p of each; one max-T test over all that have scores."""
     told = {
-        place: Hypothesis(item.scores, item.along, item.either_sign, item.scatter)
+        place: Hypothesis(item.scores, item.along, item.either_sign, item.scatter, item.drawn)
         for place, item in enumerate(suspicions)
         if item.scores is not None
     }

@@ -11,7 +11,15 @@ import numpy as np
 from lerobot_vtrefine.diagnose.core.suspicion import Suspicion
 from lerobot_vtrefine.diagnose.pad.fitting import Fit
 from lerobot_vtrefine.diagnose.pad.press_trials import PressSet
-from lerobot_vtrefine.diagnose.pad.rules import BESIDE, CONDITION_LEVEL, LEVEL, MIN_READINGS, OTHERS, TAXEL
+from lerobot_vtrefine.diagnose.pad.rules import (
+    BESIDE,
+    CONDITION_LEVEL,
+    LEVEL,
+    MIN_PRESSED,
+    MIN_READINGS,
+    OTHERS,
+    TAXEL,
+)
 from lerobot_vtrefine.diagnose.pad.weights import TrialWeights
 
 LAG = 3
@@ -107,20 +115,22 @@ def beside_the_indenter(
 def one_taxel(
     presses: PressSet, residuals: Sequence[np.ndarray], weights: Sequence[TrialWeights]
 ) -> Suspicion | None:
-    """Whether one taxel errs far more than the others while the pad is pressed."""
-    sums, counts = np.zeros((2, presses.layout.num_taxels))
+    """Whether one taxel errs far more than the others in a recording, while the pad is pressed: it may fail
+    now and then."""
+    found = []
     for press, residual, weight in zip(presses.presses, residuals, weights, strict=True):
-        unit = np.where(press.touching[:, None], residual / weight.sigma, 0.0)
-        sums[press.taxels] += (unit[LAG:] * unit[:-LAG]).sum(axis=0)
-        counts[press.taxels] += int((press.touching[LAG:] & press.touching[:-LAG]).sum())
-    known = np.flatnonzero(counts >= MIN_READINGS)
-    if len(known) < 4:
+        pressed = press.touching[LAG:] & press.touching[:-LAG]
+        if pressed.sum() >= MIN_PRESSED:
+            unit = residual / weight.sigma
+            found.append(((unit[LAG:] * unit[:-LAG])[pressed].mean(axis=0), press))
+    if sum(len(ratios) for ratios, _ in found) < 4:
         return None
-    ratios = sums[known] / counts[known]
-    worst, middle = int(np.argmax(ratios)), float(np.median(ratios))
-    ratio = float(ratios[worst])
-    row, col = divmod(int(known[worst]), presses.layout.cols)
+    middle = float(np.median(np.concatenate([ratios for ratios, _ in found])))
+    ratios, press = max(found, key=lambda item: float(item[0].max()))
+    ratio, taxel = float(ratios.max()), int(press.taxels[ratios.argmax()])
+    row, col = divmod(taxel, presses.layout.cols)
     text = (
-        f"errors of taxel ({row}, {col}) are {np.sqrt(max(ratio, 0.0)):.1f} times the noise of single frames"
+        f"errors of taxel ({row}, {col}) in {press.trial.file} are {np.sqrt(max(ratio, 0.0)):.1f} times "
+        "the noise of single frames"
     )
     return beyond(ratio, TAXEL, text, also=ratio > OTHERS * max(middle, 0.5))

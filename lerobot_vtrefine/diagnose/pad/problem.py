@@ -32,7 +32,7 @@ from lerobot_vtrefine.diagnose.pad.own_touch import allowed, losses_at_own_touch
 from lerobot_vtrefine.diagnose.pad.press_trials import PressSet
 from lerobot_vtrefine.diagnose.pad.rules import FAR_OFF, FORGIVEN, FURTHER_GAIN
 from lerobot_vtrefine.diagnose.pad.screening import DEAD, GAIN_MAP, all_probes, form_probes, forms_of
-from lerobot_vtrefine.diagnose.pad.suspicions import suspicions
+from lerobot_vtrefine.diagnose.pad.suspicions import surprises, suspicions
 from lerobot_vtrefine.diagnose.pad.taxel_maps import MapEvidence, find_dead, map_evidence, map_of, with_map
 from lerobot_vtrefine.diagnose.pad.weights import TrialWeights
 
@@ -278,6 +278,10 @@ class PadProblem(OptionalSteps):
     def suspicions(self, selection: Selected, seed: int) -> list[Suspicion]:
         """What may be left."""
         return suspicions(self, selection)
+
+    def surprises(self, fit: Fit, locked: "PadProblem") -> list[Suspicion]:
+        """Errors of single taxels in locked recordings."""
+        return surprises(self, fit, locked.presses)
 
     def handed_out(self, selection: Selected, seed: int, *, doubtful: bool) -> Selected:
         """With models as users load them."""

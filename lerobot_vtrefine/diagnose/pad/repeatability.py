@@ -42,9 +42,13 @@ def cleaned(fitted: Fit, presses: PressSet, weights: Sequence[TrialWeights]) -> 
         # Undo whitening of the nuisance part: its directions were whitened the same way.
         unit = (weight.nuisance @ size).reshape(residual.shape)
         plain = weight.memory.coloured(unit)
-        unsure = _under_edge(press) | (_rate_doubt(press, fitted) > CORNER * weight.sigma)
-        result.append(np.where(unsure, 0.0, residual - plain * weight.sigma))
+        result.append(np.where(unsure(press, fitted, weight.sigma), 0.0, residual - plain * weight.sigma))
     return result
+
+
+def unsure(press: Press, fitted: Fit, sigma: np.ndarray) -> np.ndarray:
+    """Readings (T, n) at edges and corners, which hang on what no recording knows."""
+    return _under_edge(press) | (_rate_doubt(press, fitted) > CORNER * sigma)
 
 
 def _rate_doubt(press: Press, fitted: Fit) -> np.ndarray:

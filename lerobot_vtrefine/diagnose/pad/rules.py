@@ -75,19 +75,20 @@ CONDITION_LEVEL = 2.5
 """The same in all recordings of one condition; clean ones reach 1."""
 BESIDE = 1.15
 """Mean square of whitened errors of taxels beside a pressed indenter, over that at rest; 1.06 is usual."""
-TAXEL = 6.0
-"""Mean square of slow errors of one taxel while the pad is pressed, in variances of a frame's noise."""
+TAXEL = 12.0
+"""Mean square of slow errors of one taxel in one recording under pressure, in variances of a frame's noise:
+three times what noise that wanders for seconds reaches."""
 OTHERS = 4.0
 """Factor by which it must exceed that of the taxel in the middle: errors of all are no taxel's."""
 MIN_READINGS = 200
 """Readings that such a mean square must rest on."""
+MIN_PRESSED = 50
+"""Frames that one taxel's must rest on."""
 
-# What is left comes with sliding, or has a line.
+# What is left comes with sliding.
 SLIDING = 1.6
 """Mean square of whitened errors while sliding, over that of other readings under load; 1.2 is usual."""
 AGREED = 1.2
 """The same within recordings, in their geometric mean: one that slides far may err more all the time."""
 MIN_SLIDING, MIN_OWN = 60, 20
 """Sliding and still readings that there must be, in all and in a recording that is compared with itself."""
-LINE_RATIO = 8.0
-"""Power of a line over that around it, in the median of recordings, that noise does not reach."""

@@ -1,8 +1,10 @@
-"""What may be left on a pad: it repeats with the command, is far above noise, comes with sliding, has a line,
-follows the session's order, follows something that the model does not know, or has borrowed a name.
+"""What may be left on a pad: it repeats with the command, is far above noise, comes with sliding, is shared
+by taxels, differs from recording to recording, follows the session's order, follows something that the model
+does not know, or has borrowed a name.
 """
 
 from collections.abc import Sequence
+from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -13,14 +15,15 @@ from lerobot_vtrefine.diagnose.pad import error_level, repeatability
 from lerobot_vtrefine.diagnose.pad.baseline import weigh
 from lerobot_vtrefine.diagnose.pad.decoys import in_place_of_names
 from lerobot_vtrefine.diagnose.pad.descriptors import DESCRIPTORS, Descriptor, directions, errors_left_out
-from lerobot_vtrefine.diagnose.pad.fitting import Fit, tangents
+from lerobot_vtrefine.diagnose.pad.fitting import Fit, predict, tangents
 from lerobot_vtrefine.diagnose.pad.gain_drift import gain_drift
 from lerobot_vtrefine.diagnose.pad.press_trials import PressSet
+from lerobot_vtrefine.diagnose.pad.recording_scatter import own_deviations, recording_scatter
 from lerobot_vtrefine.diagnose.pad.repeatability import Correlations
 from lerobot_vtrefine.diagnose.pad.rules import FOLLOWS, FOLLOWS_IF_OWNED
 from lerobot_vtrefine.diagnose.pad.screening import Scorer
+from lerobot_vtrefine.diagnose.pad.shared_errors import shared_errors
 from lerobot_vtrefine.diagnose.pad.sliding_errors import while_sliding
-from lerobot_vtrefine.diagnose.pad.spectrum import spectral_line
 
 if TYPE_CHECKING:
     from lerobot_vtrefine.diagnose.pad.problem import PadProblem
@@ -36,11 +39,12 @@ def suspicions(problem: "PadProblem", selection: Selection[Any, Fit, Any]) -> li
     presses, fitted, plain = problem.presses, selection.fit, selection.baseline
     _, weights = weigh(fitted, presses)
     residuals = repeatability.cleaned(fitted, presses, weights)
-    descriptors = following(problem, fitted)
+    descriptors, own = following(problem, fitted), own_deviations(presses, fitted)
     sure = [
-        spectral_line(presses, residuals),
         error_level.level(residuals, fitted, weights),
         while_sliding(presses, residuals, fitted, weights),
+        *recording_scatter(own, problem.seed),
+        *shared_errors(presses, own.left, fitted, weights, problem.seed),
         *gain_drift(fitted, presses, weights),
         *(item for descriptor, item in descriptors if descriptor.session),
         *in_place_of_names(problem, fitted),
@@ -57,6 +61,19 @@ def suspicions(problem: "PadProblem", selection: Selection[Any, Fit, Any]) -> li
         *(item for descriptor, item in descriptors if not descriptor.session),
     ]
     return [item for item in found if item is not None]
+
+
+def surprises(problem: "PadProblem", fitted: Fit, presses: PressSet) -> list[Suspicion]:
+    """What fails now and then may have failed in recordings that no fit has seen, and in these alone.
+
+    A map of gains knows too little of what other recordings pressed to tell.
+    """
+    if fitted.model.gain_map is not None:
+        return []
+    there = replace(fitted, signals=tuple(predict(fitted.model, presses)))
+    _, weights = weigh(there, presses, problem.noise)
+    item = error_level.one_taxel(presses, repeatability.cleaned(there, presses, weights), weights)
+    return [] if item is None else [item]
 
 
 def _repeating(
