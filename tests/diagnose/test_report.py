@@ -131,6 +131,16 @@ def test_first_line_is_the_verdict_in_plain_words(pad_set, robot_set):
     assert "No verdict is possible" in text_of(page(INVALID, pad_set, ()))[:120]
 
 
+def test_first_line_says_which_names_held_out_recordings_do_not_confirm(pad_set):
+    found = pad_diagnosis()
+    assert "do not confirm" not in text_of(page(found, pad_set))
+    first, second = found.verdict.causes
+    doubted = replace(found.verdict, causes=(first, replace(second, heldout_gain=-0.04)))
+    text = text_of(page(replace(found, verdict=doubted), pad_set))
+    words = "Held-out recordings do not confirm hysteresis: without it they are predicted better."
+    assert words in text[:600]
+
+
 def test_ties_are_told_once_whatever_their_order():
     groups = (("backlash", "joint_friction"), ("joint_friction", "backlash"), ("latency", "crosstalk"))
     verdict = Verdict("ambiguous", ambiguous_with=groups, next_experiment={"text": "drag it"})

@@ -165,7 +165,7 @@ def headline(verdict: Verdict, unit: str) -> str:
             f"The simulation is adequate{scope}: once its {fitted} are refitted, nothing significant is left."
         )
     if verdict.status == "explained":
-        return f"The simulation lacks {names}. {repaired(verdict, unit)}"
+        return f"The simulation lacks {names}. {repaired(verdict, unit)}{_unconfirmed(verdict)}"
     if verdict.status == "ambiguous":
         sure = [title(c.name) for c in verdict.causes if not any(c.name in g for g in verdict.ambiguous_with)]
         beside = f" It certainly lacks {listing(sure)}." if sure else ""
@@ -224,6 +224,17 @@ def repaired(verdict: Verdict, unit: str) -> str:
     return (
         f"With {added} added, its error on held-out recordings falls {change}; "
         f"{percent(held.gain)} of the squared error is removed{interval}.{floor}"
+    )
+
+
+def _unconfirmed(verdict: Verdict) -> str:
+    """Names that were significant where the model was fitted, and do not help on held-out recordings."""
+    names = [title(item.name) for item in verdict.causes if (item.heldout_gain or 0.0) < 0]
+    if not names:
+        return ""
+    pronoun = "it" if len(names) == 1 else "either" if len(names) == 2 else "any of them"
+    return (
+        f" Held-out recordings do not confirm {listing(names)}: without {pronoun} they are predicted better."
     )
 
 
