@@ -13,6 +13,7 @@ from torch import Tensor, nn
 from lerobot_vtrefine.datasets.features import CLOUD_KEY, GRIDS_KEY, STATE_KEY, SURFACE_KEY
 from lerobot_vtrefine.information import contact
 from lerobot_vtrefine.information.frames import Frames, View, Views
+from lerobot_vtrefine.information.scale import HeldScale
 from lerobot_vtrefine.information.strong import StrongEncoder, SurfaceStep
 from lerobot_vtrefine.observation import VisuoTactileConfig
 from lerobot_vtrefine.policies.vt_dp3 import VisuoTactileProcessorStep, VtDp3Config
@@ -104,8 +105,6 @@ def views_of(chosen: list[Senses], body: str, preset: str, device: str) -> Views
 class Estimator(nn.Module):
     """Encoder and head: history of processed frames -> ``NAMES`` (B, K) in SI units."""
 
-    mean: Tensor
-    std: Tensor
     state_mean: Tensor
     state_std: Tensor
 
@@ -131,16 +130,16 @@ class Estimator(nn.Module):
         else:
             self.encoder = ObservationEncoder(None, None, state.shape[-1], history)
         episode, frame = frames.index()
-        seen, truth = state[episode, frame], frames.truth[episode, frame]
-        for name, values in (("state_", seen), ("", truth)):
-            self.register_buffer(f"{name}mean", values.mean(0))
-            self.register_buffer(f"{name}std", values.std(0).clamp(min=1e-6))
+        seen = state[episode, frame]
+        self.register_buffer("state_mean", seen.mean(0))
+        self.register_buffer("state_std", seen.std(0).clamp(min=1e-6))
+        self.scale = HeldScale(frames.truth[frames.held_index()])
         self.head = nn.Sequential(
             nn.Linear(self.encoder.cond_dim, HEAD_WIDTH),
             nn.ReLU(),
             nn.Linear(HEAD_WIDTH, HEAD_WIDTH),
             nn.ReLU(),
-            nn.Linear(HEAD_WIDTH, truth.shape[-1]),
+            nn.Linear(HEAD_WIDTH, frames.truth.shape[-1]),
         )
         self.history = history
         # Contacts are read off the policy's encoder without shaping it: policies start from this one.
@@ -155,14 +154,14 @@ class Estimator(nn.Module):
 
     def forward(self, window: dict[str, Tensor]) -> Tensor:
         """Estimates (B, K) in SI units."""
-        return self.head(self.features(window)) * self.std + self.mean
+        return self.scale.expand(self.head(self.features(window)))
 
     def loss(self, window: dict[str, Tensor], truth: Tensor, touch: Tensor) -> Tensor:
         """Squares [standard deviations] of quantities (B, K), and what contacts (B, 4) add."""
         features = self.features(window)
-        known = (truth - self.mean) / self.std
         read = features if self.shaped_by_contact else features.detach()
-        return (self.head(features) - known).square().mean() + self.contact.loss(read, touch)
+        missed = (self.head(features) - self.scale.compress(truth)).square().mean()
+        return missed + self.contact.loss(read, touch)
 
     def window(self, frames: Frames, episode: Tensor, frame: Tensor) -> dict[str, Tensor]:
         """The last To frames (B, To, ...) up to ``frame`` (B,); the first one fills the window."""
@@ -217,20 +216,23 @@ def train_estimator(
 
 @torch.no_grad()
 def episode_errors(estimator: Estimator, frames: Frames) -> Tensor:
-    """Mean squared error per episode and quantity (E, K), in SI units squared."""
-    episode, frame = frames.index()
+    """Mean squared error per episode and quantity (E, K), in SI units squared, over frames with both parts in
+    hand, of the episodes that have one.
+    """
+    episode, frame = frames.held_index()
     sums = torch.zeros_like(frames.truth[:, 0])
     for rows in torch.arange(len(episode), device=episode.device).split(JUDGED_FRAMES):
         error = estimator(estimator.window(frames, episode[rows], frame[rows]))
         error = error - frames.truth[episode[rows], frame[rows]]
         sums.index_add_(0, episode[rows], error.square())
-    return sums / frames.length[:, None]
+    counts = frames.held.sum(1)
+    return sums[counts > 0] / counts[counts > 0, None]
 
 
 @torch.no_grad()
 def contact_known(estimator: Estimator, frames: Frames, seed: int) -> contact.Known:
-    """What the regressor tells of contacts in held-out frames."""
-    episode, frame = frames.index()
+    """What the regressor tells of contacts in held-out frames with both parts in hand."""
+    episode, frame = frames.held_index()
     sums: dict[str, tuple[Tensor, Tensor]] = {}
     for rows in torch.arange(len(episode), device=episode.device).split(JUDGED_FRAMES):
         at = episode[rows], frame[rows]

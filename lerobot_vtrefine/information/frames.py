@@ -68,6 +68,8 @@ class Frames:
     grasps: Grasps
     contact: Tensor
     """(E, T, 4) as of ``InsertionSim.part_touch``."""
+    held: Tensor
+    """(E, T) bool: both parts are in their hands. From the table this comes later, or never."""
 
     def split(self, share: float) -> tuple["Frames", "Frames"]:
         """The first episodes for training, a ``share`` of them, and the others."""
@@ -76,12 +78,18 @@ class Frames:
 
     def _part(self, rows: slice) -> "Frames":
         columns = {key: value[rows] for key, value in self.columns.items()}
-        return Frames(columns, self.truth[rows], self.length[rows], self.grasps, self.contact[rows])
+        truth, length, contact = self.truth[rows], self.length[rows], self.contact[rows]
+        return Frames(columns, truth, length, self.grasps, contact, self.held[rows])
 
     def index(self) -> tuple[Tensor, Tensor]:
         """Episode and frame number of every frame, (N,) each."""
         frames = torch.arange(self.truth.shape[1], device=self.length.device)
         episode, frame = (frames < self.length[:, None]).nonzero(as_tuple=True)
+        return episode, frame
+
+    def held_index(self) -> tuple[Tensor, Tensor]:
+        """Episode and frame number of every frame with both parts in hand, (N,) each."""
+        episode, frame = self.held.nonzero(as_tuple=True)
         return episode, frame
 
 
@@ -150,9 +158,12 @@ def collect_frames(
         batches.append(_one_batch(episodes, holds, expert, FIRST_SEED + first, views, device))
         told(num_envs)
     length = np.concatenate([batch.length for batch in batches])
+    held = np.concatenate([batch.held for batch in batches])
+    if not held.any():
+        raise ValueError(f"no episode of {num_episodes} got both parts into the hands")
     valid = np.arange(episode_frames(episodes)) < length[:, None]
     relative = Relative(*(np.concatenate(parts) for parts in zip(*(b.truth for b in batches), strict=True)))
-    grasps = Grasps.mean(Relative(*(part[valid] for part in relative)))
+    grasps = Grasps.mean(Relative(*(part[held] for part in relative)))
     truth = torch.zeros((*valid.shape, len(NAMES)))
     truth[torch.from_numpy(valid)] = torch.from_numpy(
         Relative(*(part[valid] for part in relative)).quantities(grasps)
@@ -160,7 +171,8 @@ def collect_frames(
     columns = {key: torch.cat([batch.columns[key] for batch in batches]) for key in batches[0].columns}
     contact = torch.from_numpy(np.concatenate([batch.contact for batch in batches])).float()
     ends = torch.from_numpy(length).to(device)
-    return Frames(columns, truth.to(device), ends, grasps, contact.to(device))
+    in_hand = torch.from_numpy(held).to(device)
+    return Frames(columns, truth.to(device), ends, grasps, contact.to(device), in_hand)
 
 
 @dataclass
@@ -169,6 +181,7 @@ class _Batch:
     truth: Relative  # (n, T, ...)
     contact: np.ndarray  # (n, T, 4)
     length: np.ndarray  # (n,)
+    held: np.ndarray  # (n, T)
 
 
 def _one_batch(
@@ -190,6 +203,8 @@ def _one_batch(
     }
     truth = Relative(*(np.zeros((len(ids), frames, *part.shape[1:])) for part in observe(sim, ids[:1])))
     contact, length = np.zeros((len(ids), frames, 4)), np.zeros(len(ids), np.int64)
+    held = np.zeros((len(ids), frames), bool)
+    in_hand_from_start = sim.scene.config.start == "grasped"
     targets = np.zeros((len(ids), body.num_joints))
     running = ids
     for frame in range(frames):
@@ -199,13 +214,14 @@ def _one_batch(
         for whole, part in zip(truth, observe(sim, running), strict=True):
             whole[running, frame] = part
         contact[running, frame] = sim.part_touch(running)
+        held[running, frame] = sim.in_hand[running] | in_hand_from_start
         length[running] += 1
         targets[running] = expert.act(running)
         episodes.step(targets)
         running = episodes.active
         if len(running) == 0:
             break
-    return _Batch(columns, truth, contact, length)
+    return _Batch(columns, truth, contact, length, held)
 
 
 def episode_frames(episodes: Episodes) -> int:

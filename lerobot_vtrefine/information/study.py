@@ -109,7 +109,9 @@ class Study:
     """All findings on one task."""
 
     prior: dict[str, float]
-    """Standard deviation of each quantity in the held-out frames: the error of one who sees nothing."""
+    """Standard deviation of each quantity in the held-out frames with both parts in hand: the error of one
+    who sees nothing.
+    """
     findings: list[Finding] = field(default_factory=list)
     true_success: tuple[int, int] | None = None
     tolerated: list[Tolerated] = field(default_factory=list)
@@ -230,8 +232,7 @@ def _tested(
 
 
 def _spread(frames: Frames) -> np.ndarray:
-    episode, frame = frames.index()
-    return frames.truth[episode, frame].std(0).cpu().numpy()
+    return frames.truth[frames.held_index()].std(0).cpu().numpy()
 
 
 def _shown(values: np.ndarray) -> dict[str, float]:

@@ -26,9 +26,10 @@ from lerobot_vtrefine.information.estimator import (
     train_estimator,
     views_of,
 )
-from lerobot_vtrefine.information.frames import Frames, MisjudgedHolds
+from lerobot_vtrefine.information.frames import Frames, MisjudgedHolds, collect_frames
 from lerobot_vtrefine.information.page import render_page
 from lerobot_vtrefine.information.quantities import NAMES, Grasps, observe, part_poses
+from lerobot_vtrefine.information.scale import HeldScale
 from lerobot_vtrefine.information.strong import SurfaceStep
 from lerobot_vtrefine.information.study import Effort, Finding, Study, as_json, save_keeper, study
 from lerobot_vtrefine.information.tolerance import LATERAL, SIZES, TILT, Tolerated, tolerance
@@ -61,7 +62,8 @@ def synthetic(seed: int, pads: int = 4, rows: int = 12) -> Frames:
     contact = torch.zeros(EPISODES, LENGTH, 4)
     contact[..., 0] = place >= 12
     contact[..., 1] = contact[..., 0] * torch.where(place >= 22, 0.004, -0.004)
-    return Frames(columns, truth, length, Grasps(np.tile(np.eye(3), (3, 1, 1))), contact)
+    held = torch.arange(truth.shape[1]) < length[:, None]
+    return Frames(columns, truth, length, Grasps(np.tile(np.eye(3), (3, 1, 1))), contact, held)
 
 
 def trained(senses: str, frames: Frames, network: str = POLICY, steps: int = 160) -> Estimator:
@@ -347,3 +349,27 @@ def test_the_page_draws_curves_where_they_were_measured() -> None:
     both = dict(pictures)["error against clearance"]
     assert len(re.findall('class="dot a"', both)) == 2
     assert "Other clearances" not in render_page(replace(found, at_clearance={}), "cross", 0.002)
+
+
+def test_the_scale_is_linear_in_the_hands_and_logarithmic_beyond() -> None:
+    held = torch.randn(500, 2, dtype=torch.float64) * torch.tensor([0.002, 0.05])
+    scale = HeldScale(held)
+    torch.testing.assert_close(scale.compress(held), (held - held.mean(0)) / held.std(0))
+    far = torch.tensor([[0.2, 0.5], [-0.4, -1.0]], dtype=torch.float64)
+    torch.testing.assert_close(scale.expand(scale.compress(far)), far)
+    near, twice = scale.compress(torch.tensor([[0.1], [0.2]], dtype=torch.float64).expand(2, 2))[:, 0]
+    assert float(twice - near) == pytest.approx(np.log(2), rel=0.1)
+    assert torch.isfinite(scale.expand(torch.full((1, 2), 1e6, dtype=torch.float64))).all()
+
+
+def test_from_the_table_errors_are_told_of_parts_in_the_hands() -> None:
+    """Frames before the grasp train the encoder and count for no error: there parts are far away."""
+    frames = collect_frames(VtRefineEnvConfig(start="table"), 4, 4, {}, torch.device("cpu"))
+    assert frames.held.any()
+    first = frames.held.int().argmax(1)
+    assert (first[frames.held.any(1)] > 10).all()  # reaching comes before
+    assert not frames.held[:, 0].any()
+    episode, frame = frames.held_index()
+    plug = NAMES.index("plug_in_hand_x")
+    in_hand, all_frames = frames.truth[episode, frame, plug], frames.truth[frames.index()][:, plug]
+    assert float(in_hand.std()) < 0.004 < 0.02 < float(all_frames.std())
