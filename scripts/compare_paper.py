@@ -5,8 +5,9 @@
     python scripts/compare_paper.py --mesh_dir=MESHES --pairs 00186 --demonstrations 10 30 50 --jobs 12
     make tables
 
-MESHES holds ID_plug.obj and ID_socket.obj. Per pair and seed demonstrations are recorded once, from the
-table. Policies with touch and with vision only learn from them by stock lerobot-train and are fine-tuned by
+MESHES holds ID_plug.obj and ID_socket.obj. Per pair an encoder learns to see and feel, from the table on; per
+pair and seed demonstrations are recorded once. Policies with touch and with vision only learn from them (on
+features that are computed once; where the encoder is trained, by stock lerobot-train) and are fine-tuned by
 DPPO, once more from random weights (one step of imitation); stock lerobot-eval judges each, always from the
 table, on episodes that are the same for all. Where DPPO practises is --tune_start: on whole episodes (table);
 from states that the imitation reached with both parts in hand, or the expert where it reaches too few (bank);
@@ -17,9 +18,6 @@ far, practise on whole episodes in place of a bank. On a GPU worlds wait for the
 Every policy becomes rows of results/paper.json, or of results/demonstrations.json, as soon as it is judged.
 The same command again goes on where it was: finished stages are not repeated, nor policies whose rows are
 there with these numbers of episodes and iterations, so that it may go on on another machine.
-
-The encoder of --recipe=pads knows parts in the hands, and no table; to tune it on:
---policy='{"freeze_encoder": false}' --dppo='{"encoder": "trained"}'.
 """
 
 import argparse
@@ -57,6 +55,7 @@ from lerobot_vtrefine.finetune.logger import read_progress
 from lerobot_vtrefine.shipped import PREFIX
 
 RESULTS = Path(__file__).parents[1] / "results"
+CLONE = Path(__file__).with_name("clone_on_features.py")
 TASKS = {
     "00081": "automate_00081",
     "00186": "automate_00186",
@@ -130,14 +129,78 @@ def record_stage(options: argparse.Namespace, policy: Trained) -> Stage:
     return Stage(root.name, f"Record {root.name}", command, root, product, resumable=True)
 
 
-def imitation_stage(options: argparse.Namespace, policy: Trained) -> Stage:
-    """Stock lerobot-train on the first demonstrations, or one step of it: random weights."""
-    out = options.output_dir / f"imitation_{policy.name}"
+def trains_encoder(options: argparse.Namespace) -> bool:
+    """Whether each pair's encoder is trained here."""
+    return options.recipe == "pads" and not options.encoder and "pretrained_encoder" not in options.policy
+
+
+def encoder_stage(options: argparse.Namespace, pair: str) -> Stage:
+    """What a pair's policies see and feel with, from the table on."""
+    out = options.output_dir / f"encoder_{pair}"
+    command = (
+        "vtrefine-information",
+        *task_flags(options, pair),
+        f"--env.backend={options.backend}",
+        f"--senses=[{','.join(MODALITIES)}]",
+        f"--effort.device={options.device}",
+        f"--effort.episodes={options.encoder_episodes}",
+        f"--effort.num_envs={min(options.eval_envs, options.encoder_episodes // 2)}",
+        f"--effort.steps={options.encoder_steps}",
+        "--effort.batch_size=1024",
+        "--effort.history=[1]",
+        "--effort.closed_loop_episodes=0",
+        "--effort.tolerance_episodes=0",
+        f"--output_dir={out}",
+    )
+    return Stage(out.name, f"Encoder of {pair}", command, out, out / "information.json")
+
+
+def policy_settings(options: argparse.Namespace, policy: Trained) -> dict[str, Any]:
+    """Of vt_dp3."""
     recipe: dict[str, Any] = RECIPES[options.recipe]["policy"] | options.policy
+    if trains_encoder(options):
+        return recipe | {"pretrained_encoder": str(encoder_stage(options, policy.pair).output)}
     if options.recipe == "pads":
         recipe = {"pretrained_encoder": options.encoder.format(pair=policy.pair)} | recipe
+    return recipe
+
+
+def imitation_stage(options: argparse.Namespace, policy: Trained) -> Stage:
+    """Imitation of the first demonstrations, or one step of it: random weights."""
+    out = options.output_dir / f"imitation_{policy.name}"
+    recipe = policy_settings(options, policy)
     steps = options.steps if policy.demonstrations else 1
-    command = (
+    frozen = recipe.get("freeze_encoder", False)
+    command = (clone_command if frozen else train_command)(options, policy, recipe, steps, out)
+    encoder = [encoder_stage(options, policy.pair).name] if trains_encoder(options) else []
+    needs = (dataset(options, policy).name, *encoder)
+    return Stage(
+        out.name, f"Imitation {policy.name}", command, out, checkpoint(out) / "model.safetensors", needs
+    )
+
+
+def clone_command(
+    options: argparse.Namespace, policy: Trained, recipe: dict[str, Any], steps: int, out: Path
+) -> tuple[str, ...]:
+    """What a frozen encoder makes of a frame is computed once."""
+    return (
+        "python",
+        str(CLONE),
+        f"--dataset={dataset(options, policy)}",
+        f"--policy={json.dumps(recipe | {'modalities': policy.senses})}",
+        f"--device={options.device}",
+        f"--output_dir={checkpoint(out).parent}",
+        f"--steps={steps}",
+        f"--batch_size={options.batch_size}",
+        f"--seed={policy.seed}",
+    )
+
+
+def train_command(
+    options: argparse.Namespace, policy: Trained, recipe: dict[str, Any], steps: int, out: Path
+) -> tuple[str, ...]:
+    """Stock lerobot-train."""
+    return (
         "lerobot-train",
         "--dataset.repo_id=local/vtrefine_demos",
         f"--dataset.root={dataset(options, policy)}",
@@ -153,9 +216,6 @@ def imitation_stage(options: argparse.Namespace, policy: Trained) -> Stage:
         "--num_workers=0",  # items come from memory
         "--env_eval_freq=0",
     )
-    product = checkpoint(out) / "model.safetensors"
-    needs = (dataset(options, policy).name,)
-    return Stage(out.name, f"Imitation {policy.name}", command, out, product, needs)
 
 
 def uses_bank(options: argparse.Namespace, policy: Trained) -> bool:
@@ -252,9 +312,15 @@ def first_seed(policy: Trained) -> int:
     return policy.seed * SEED_STRIDE + EVAL_SEED_OFFSET
 
 
+def shared_stages(options: argparse.Namespace, policy: Trained) -> list[Stage]:
+    """What several policies use."""
+    encoder = [encoder_stage(options, policy.pair)] if trains_encoder(options) else []
+    return [*encoder, record_stage(options, policy)]
+
+
 def stages(options: argparse.Namespace, policy: Trained) -> list[Stage]:
     """All of one policy's. Random weights are not judged before DPPO."""
-    before = [record_stage(options, policy), imitation_stage(options, policy)]
+    before = [*shared_stages(options, policy), imitation_stage(options, policy)]
     if policy.demonstrations:
         before.append(evaluation_stage(options, policy, "imitation"))
     if uses_bank(options, policy):
@@ -330,9 +396,10 @@ def make_parser() -> CommandParser:
     parser.add_argument("--recipe", choices=list(RECIPES), default="pads", help="as vtrefine-demo's")
     parser.add_argument(
         "--encoder",
-        default=f"{PREFIX}square_grasped_1mm",
-        help="of --recipe=pads; {pair} stands for the pair's number (default %(default)s)",
+        help="of --recipe=pads, in place of one trained here; {pair} stands for the pair's number",
     )
+    parser.add_argument("--encoder_episodes", type=int, default=4096, help="that an encoder learns from")
+    parser.add_argument("--encoder_steps", type=int, default=4000, help="of an encoder's training")
     parser.add_argument("--steps", type=int, default=6000, help="of imitation")
     parser.add_argument("--batch_size", type=int, default=128)
     parser.add_argument("--iterations", type=int, default=60, help="of DPPO")
@@ -368,18 +435,18 @@ def side_by_side(options: argparse.Namespace, names: list[str]) -> None:
 
 @run_cli
 def main() -> None:
-    """Demonstrations first, then every policy that has no rows yet."""
+    """Encoders and demonstrations first, then every policy that has no rows yet."""
     options = make_parser().parse_args()
     options.backend = options.backend or ("warp" if options.device == "cuda" else "batch")
     left = [policy for policy in chosen(options) if not is_done(options, policy)]
-    records = {stage.name: stage for stage in (record_stage(options, policy) for policy in left)}
-    if options.only in records:
-        StageRunner(options.output_dir, [records[options.only]]).run()
+    shared = {stage.name: stage for policy in left for stage in shared_stages(options, policy)}
+    if options.only in shared:
+        StageRunner(options.output_dir, [shared[options.only]]).run()
     elif options.only is not None:
         (policy,) = (policy for policy in left if policy.name == options.only)
         finish(options, policy)
     elif options.jobs > 1:
-        side_by_side(options, list(records))
+        side_by_side(options, list(shared))
         side_by_side(options, [policy.name for policy in left])
     else:
         for policy in left:

@@ -30,6 +30,18 @@ def write_checkpoint(options: dict[str, str]) -> None:
     (folder / "model.safetensors").write_bytes(b"")
 
 
+def information(options: dict[str, str]) -> None:
+    folder = Path(options["output_dir"])
+    folder.mkdir(parents=True)
+    (folder / "information.json").write_text("{}")
+
+
+def clone_on_features(options: dict[str, str]) -> None:
+    folder = Path(options["output_dir"]) / "pretrained_model"
+    folder.mkdir(parents=True)
+    (folder / "model.safetensors").write_bytes(b"")
+
+
 def finetune(options: dict[str, str]) -> None:
     write_checkpoint(options)
     lines = ["iteration,success", *(f"{index},{0.1 * index}" for index in range(5))]
@@ -87,6 +99,8 @@ def record_starts(options: dict[str, str]) -> None:
 COMMANDS = {
     "vtrefine-record-demos": record,
     "lerobot-train": write_checkpoint,
+    "vtrefine-information": information,
+    "python": clone_on_features,
     "lerobot-eval": evaluate,
     "vtrefine-record-starts": record_starts,
     "vtrefine-finetune": finetune,
@@ -94,5 +108,5 @@ COMMANDS = {
 
 
 if __name__ == "__main__":
-    pairs = (argument.removeprefix("--").split("=", 1) for argument in sys.argv[2:])
+    pairs = (argument.removeprefix("--").split("=", 1) for argument in sys.argv[2:] if "=" in argument)
     COMMANDS[sys.argv[1]](dict(pairs))

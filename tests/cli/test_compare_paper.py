@@ -48,7 +48,7 @@ def test_policies_become_rows_of_both_tables_and_are_not_made_twice(
 ) -> None:
     monkeypatch.setattr(script, "MODALITIES", ("visuo_tactile",))
     told = run("--pairs", "00186")
-    assert told.count("done before") == 1  # the demonstrations, which random weights share
+    assert told.count("done before") == 2  # encoder and demonstrations, which random weights share
     paper, fewer = of(tmp_path / "paper.json"), of(tmp_path / "demonstrations.json")
     assert set(paper) == {"imitation", "", "without pre-training"}
     assert (paper[""].success, paper[""].iterations) == (0.75, 60)
@@ -108,3 +108,15 @@ def test_dppo_may_start_from_a_bank_of_the_imitations_own_grasps(
         assert "imitation_00581_visuo_tactile_0_30/checkpoints/last" in recorded
         assert "--num_starts=64" in recorded
         assert f"starts_{policy.name}" in next(s for s in stages if "finetune" in s.name).needs
+
+
+def test_every_pair_trains_an_encoder_from_the_table_and_policies_learn_on_its_features() -> None:
+    options = parse(["--mesh_dir=meshes", "--pairs=00446", "--seeds=0", "--output_dir=out"])
+    for policy in script.chosen(options):
+        encoder, record, imitation, *_ = script.stages(options, policy)
+        assert "--config_path=vtrefine:automate_00446" in encoder.line
+        assert "--env.start" not in encoder.line
+        assert imitation.needs == (record.name, encoder.name)
+        assert imitation.command[1].endswith("clone_on_features.py")
+        assert '"pretrained_encoder": "out/encoder_00446"' in imitation.line
+        assert f'"modalities": "{policy.senses}"' in imitation.line
