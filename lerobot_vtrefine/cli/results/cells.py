@@ -21,7 +21,6 @@ LABELS = {
     "cross_gentle": "cross, 2 mm, 5 N at most (cross_gentle)",
     "cross_gentle_twin": "its twin: parts lie as expected (cross_gentle_twin)",
     "cross_gentle_tuned": "cross_gentle, DPPO in the simulator named, all before it in the plain one",
-    "cross_gentle_imitation": "cross_gentle, encoder and imitation in the simulator named, no DPPO",
     "d_occluded": "D shape, hidden by the hands, 5 N at most (d_occluded)",
     "d_occluded_twin": "its twin: parts lie as expected (d_occluded_twin)",
     "cross_limited": "cross, 2 mm, a limit of 1.5 to 10 N that is told (cross_limited)",
@@ -107,13 +106,14 @@ def pooled(rows: Sequence[Run], seeds: bool = True, bounds: bool = True, unit: s
 def over_seeds(rows: Sequence[Run], unit: str = "") -> str:
     """Mean success over seeds with its t-interval, as far as a success can lie in it, and each seed's.
 
-    Of one seed, as `pooled` tells it.
+    Of one seed, or of all without a row each, as `pooled` tells it.
     """
-    if len(rows) < 2:
+    rates = [row.success for row in rows if row.seed is not None]
+    if len(rates) < 2:
         return pooled(rows, unit=unit)
-    middle, *bounds = mean_interval([row.success for row in rows])
+    middle, *bounds = mean_interval(rates)
     bounds = [min(max(bound, 0.0), 1.0) for bound in bounds]
-    return f"{percent(middle)}{unit} {interval(*bounds)} ({', '.join(percent(row.success) for row in rows)})"
+    return f"{percent(middle)}{unit} {interval(*bounds)} ({', '.join(map(percent, rates))})"
 
 
 def difference(one: Sequence[Run], two: Sequence[Run]) -> str:

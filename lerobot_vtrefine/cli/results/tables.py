@@ -101,8 +101,10 @@ def reality_table(rows: Sequence[Run]) -> str:
         chosen = pick(rows, task=task)
         named = next((str(row.extra["diagnosis"]) for row in chosen if "diagnosis" in row.extra), "-")
         for world in ("plain", "diagnosed"):
-            away = pooled(pick(chosen, variant=f"{world} in reality"), seeds=True)
-            home = pooled(pick(chosen, variant=f"{world} in its own simulator"), seeds=False)
+            away, home = (
+                over_seeds(pick(chosen, variant=f"{world} in {where}"))
+                for where in ("reality", "its own simulator")
+            )
             hidden = ": ".join(map(label, task.split(": ")))
             first = [hidden, named] if world == "plain" else ["", ""]
             body.append([*first, f"the {world} simulator", away, home])
