@@ -127,16 +127,11 @@ class Play(Bounded):
         fractions = [fraction for _, fraction, _ in self._operators()]
         looped = (1.0 - sum(fractions)) * x
         for fraction, play in zip(fractions, kept, strict=True):
-            looped.add_(play, alpha=fraction)
+            if isinstance(fraction, torch.Tensor):
+                looped.add_(fraction * play)
+            else:
+                looped.add_(play, alpha=fraction)
         return looped.clamp_(min=0.0)
-
-    @override
-    def step(self, x: torch.Tensor, state: State, frame: Frame) -> tuple[torch.Tensor, State]:
-        _, new = super().step(x, state, frame)
-        looped = x
-        for name, fraction, _ in self._operators():
-            looped = looped + fraction * (new[name] - x)
-        return looped.clamp(min=0.0), new
 
 
 @register
