@@ -114,7 +114,7 @@ BACK = {
     # LeRobot asks a configuration for its environments.
     "envs.config": {"envs.vectorization"},
     # Whether a name is a cause is asked of the catalogues, which hold causes of one's own, too.
-    "diagnose.verdict": {"diagnose.joints.candidates", "diagnose.servo.candidates"},
+    "diagnose.verdict": {f"diagnose.{kind}.candidates" for kind in ("joints", "pad", "servo")},
     "diagnose.pad.press_trials": {"diagnose.pad.forward_model.run"},
     "diagnose.pad.problem": {"diagnose.pad.review"},
 }

@@ -26,7 +26,7 @@ NOISE_COUNTS, GAIN_ERROR, HEIGHT_ERROR_M = 1.0, 0.01, 5e-6
 """What rigs add: noise of every reading, and small differences between recordings of one command."""
 
 
-def write_template(folder: Path, seed: int = 0) -> Path:
+def write_template(folder: Path) -> Path:
     """Write recording.json and a Parquet file per trial into a new or empty folder; returns the folder.
 
     Raises ValueError where the folder holds something already.
@@ -34,7 +34,7 @@ def write_template(folder: Path, seed: int = 0) -> Path:
     if folder.exists() and (not folder.is_dir() or any(folder.iterdir())):
         raise ValueError(f"{folder} holds something already; give the name of a new folder")
     folder.mkdir(parents=True, exist_ok=True)
-    rng = np.random.default_rng(seed)
+    rng = np.random.default_rng(0)
     motions = [_motion(rng) for _ in range(CONDITIONS)]
     entries = []
     for order, number in enumerate(rng.permutation(CONDITIONS * REPLICATES)):

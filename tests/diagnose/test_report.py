@@ -21,7 +21,7 @@ from lerobot_vtrefine.diagnose.report import render_report
 from lerobot_vtrefine.diagnose.report.effects import effect_drawing
 from lerobot_vtrefine.diagnose.report.figures import error_figure
 from lerobot_vtrefine.diagnose.report.numbers import digits, interval, percent, quantity
-from lerobot_vtrefine.diagnose.report.words import MEANINGS, ties
+from lerobot_vtrefine.diagnose.report.words import MAIN_PARAMETERS, meaning, ties
 from lerobot_vtrefine.diagnose.verdict import CAUSES, DataIssue, Heldout, Unknown, Verdict
 from lerobot_vtrefine.pages.charts import ticks
 from lerobot_vtrefine.pages.pads import GAP_TAXELS
@@ -255,7 +255,8 @@ def test_empty_findings_do_not_break_the_page(pad_set):
 
 
 def test_every_cause_has_words():
-    assert set(MEANINGS) == set(CAUSES)
+    assert set(MAIN_PARAMETERS) == set(CAUSES)
+    assert all(meaning(name) for name in CAUSES)
 
 
 @pytest.mark.parametrize(

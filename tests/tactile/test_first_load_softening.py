@@ -44,6 +44,14 @@ def test_what_was_softened_recovers() -> None:
     assert late[-1] > softened(FirstLoadSoftening(0.4), values)[-1]
 
 
+@pytest.mark.parametrize("recovery_s", [0.0, 3.0])
+def test_a_first_load_is_virgin_whatever_the_sharpness(recovery_s: float) -> None:
+    # A share of rounding, 1e-16, would be 0.16 to the power of 0.05.
+    rising = np.linspace(0.1, 1.0, 60).tolist()
+    found = softened(FirstLoadSoftening(0.3, sharpness=0.05, recovery_s=recovery_s), rising, 0.033)
+    assert found.tolist() == rising
+
+
 @pytest.mark.parametrize("recovery_s", [0.0, 0.7])
 def test_a_recording_is_what_single_frames_give(recovery_s: float) -> None:
     stage = FirstLoadSoftening(0.3, 0.6, 0.5, recovery_s)

@@ -16,8 +16,6 @@ from lerobot_vtrefine.diagnose.core.rules import SURE
 from lerobot_vtrefine.diagnose.core.summary import tell
 from lerobot_vtrefine.diagnose.verdict import Parameter
 
-Array = np.ndarray
-
 _NAMES = ("x_m", "y_m", "z_m", "rx_rad", "ry_rad", "rz_rad")
 _DRAWS = 1000
 _NEXT = {

@@ -9,6 +9,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from lerobot_vtrefine.datasets.features import Array
+from lerobot_vtrefine.diagnose.core.resampling import draws_of
 
 MAX_LAG_S = 0.6
 LAG_STEP_S = 0.01
@@ -78,7 +79,7 @@ def rmse_intervals(error: Sequence[Array]) -> Array | None:
         return None
     sums = np.stack([(item**2).sum(0) for item in error])
     counts = np.array([len(item) for item in error])
-    picks = np.random.default_rng(0).integers(0, len(error), (RESAMPLES, len(error)))
+    picks = draws_of(len(error), 0, RESAMPLES)
     drawn = np.sqrt(sums[picks].sum(1) / counts[picks].sum(1)[:, None])
     return np.quantile(drawn, [0.025, 0.975], axis=0)
 

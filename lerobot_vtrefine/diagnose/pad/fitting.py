@@ -160,10 +160,12 @@ def bounded_step(model: Composite, gram: np.ndarray, free: np.ndarray, damping: 
 def rest(model: Composite, presses: PressSet, weights: Sequence[TrialWeights]) -> Fit:
     """A model as it stands, with its losses and tangents under these weights."""
     signals, columns = tangents(model, presses, model.free)
-    grams = grams_of(presses, weights, signals, columns)
-    return Fit(
-        model, grams[:, -1, -1].copy(), grams, tuple(signals), squared_errors(signals, presses)[:, None]
-    )
+    return _ended(model, presses, signals, grams_of(presses, weights, signals, columns))
+
+
+def _ended(model: Composite, presses: PressSet, signals: Sequence[np.ndarray], grams: np.ndarray) -> Fit:
+    errors = squared_errors(signals, presses)[:, None]
+    return Fit(model, grams[:, -1, -1].copy(), grams, tuple(signals), errors)
 
 
 def fit(
@@ -205,9 +207,7 @@ def fit(
         grams = grams_of(presses, weights, signals, columns)
         if settled:
             break
-    return Fit(
-        model, grams[:, -1, -1].copy(), grams, tuple(signals), squared_errors(signals, presses)[:, None]
-    )
+    return _ended(model, presses, signals, grams)
 
 
 def refit_weighted(fitted: Fit, counts: np.ndarray) -> Composite:

@@ -6,6 +6,8 @@ from functools import cached_property
 
 import numpy as np
 
+from lerobot_vtrefine.tactile.stages.host import periods_gone
+
 PHASES = 32
 AGES = 16
 """Ages that stand for all: their mean reading is within 1 % of the squared error of the mean over all."""
@@ -13,7 +15,7 @@ AGES = 16
 
 def slots(time_s: np.ndarray, period_s: float, phase: float | np.ndarray = 0.0) -> np.ndarray:
     """Number of the period that each time (T,) falls into; `phase` is in periods."""
-    return np.floor(time_s / period_s + phase + 1e-6)
+    return np.floor(periods_gone(time_s, period_s, phase))
 
 
 def silent(drive: np.ndarray, signal: np.ndarray) -> np.ndarray:

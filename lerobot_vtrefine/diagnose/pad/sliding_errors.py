@@ -5,7 +5,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from lerobot_vtrefine.diagnose.core.suspicion import Suspicion
-from lerobot_vtrefine.diagnose.pad.error_level import LOADED, beyond
+from lerobot_vtrefine.diagnose.pad.error_level import LOADED, OUTLIER, beyond
 from lerobot_vtrefine.diagnose.pad.fitting import Fit
 from lerobot_vtrefine.diagnose.pad.press_trials import Press, PressSet
 from lerobot_vtrefine.diagnose.pad.rules import AGREED, MIN_OWN, MIN_SLIDING, SLIDING
@@ -13,8 +13,6 @@ from lerobot_vtrefine.diagnose.pad.weights import TrialWeights
 
 SLIDES_M_S = 3e-4
 """Speed along the pad from which on a pressed indenter slides."""
-OUTLIER = 4.0
-"""Whitened errors, in standard deviations, that are cut to this size: spikes are no sliding."""
 
 
 def sliding(press: Press) -> np.ndarray:

@@ -101,7 +101,7 @@ def solve_map(
     return result, spread, variance
 
 
-def with_map(fitted: Fit, presses: PressSet, weights: Sequence[TrialWeights], rounds: int = 2) -> Composite:
+def with_map(fitted: Fit, presses: PressSet, weights: Sequence[TrialWeights]) -> Composite:
     """The model with gains of every taxel that was pressed; the others keep one."""
     model = fitted.model
     shape = (presses.layout.rows, presses.layout.cols)
@@ -110,7 +110,7 @@ def with_map(fitted: Fit, presses: PressSet, weights: Sequence[TrialWeights], ro
         log_map = np.log(np.asarray(model.gain_map)).ravel()
     everyone = range(len(weights))
     sigma = model.gain_sigma
-    for _ in range(rounds):
+    for _ in range(2):
         evidence = map_evidence(fitted, presses, weights)
         log_map, sigma, _ = solve_map(evidence, everyone, log_map, None)
         log_map = np.clip(log_map, *np.log(BOUNDS))

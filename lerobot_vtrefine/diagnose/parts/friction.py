@@ -21,8 +21,6 @@ from lerobot_vtrefine.diagnose.parts.rules import (
     SLIDES_M_S,
 )
 
-Array = np.ndarray
-
 
 def friction(
     scene: AssumedScene, episodes: Sequence[HandledEpisode], contacts: Sequence[Contact]

@@ -5,7 +5,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from lerobot_vtrefine.diagnose.quality.contact import Press, presses
+from lerobot_vtrefine.diagnose.quality.contact import presses
 from lerobot_vtrefine.diagnose.quality.edits import KEPT, NO_VERDICT, SET_ASIDE, Finding
 from lerobot_vtrefine.diagnose.quality.rules import (
     ALONG,
@@ -93,7 +93,7 @@ def check_forces(recordings: RecordingSet) -> Iterator[Finding]:
     for index, problem, action, force in _cells(recordings):
         trials[index] = replace(trials[index], force_n=force)
         yield Finding(index, problem, action, trials[index])
-    yield from _force_units(recordings, list(trials.values()))
+    yield from _force_units(list(trials.values()))
 
 
 def _cells(recordings: RecordingSet) -> Iterator[tuple[int, str, str, np.ndarray | None]]:
@@ -114,7 +114,7 @@ def _cells(recordings: RecordingSet) -> Iterator[tuple[int, str, str, np.ndarray
             yield index, f"force_n shows {rest:.3g} N at rest", "repaired: subtracted", force - rest
 
 
-def _force_units(recordings: RecordingSet, trials: list[Trial]) -> Iterator[Finding]:
+def _force_units(trials: list[Trial]) -> Iterator[Finding]:
     """Force against reading, trial by trial: about 100 times the usual is grams, 1000 times millinewtons."""
     ratios = np.full(len(trials), np.nan)
     for index, trial in enumerate(trials):
@@ -141,7 +141,7 @@ def _force_units(recordings: RecordingSet, trials: list[Trial]) -> Iterator[Find
 def check_contact(recordings: RecordingSet) -> Iterator[Finding]:
     """Readings that respond although the indenter, as recorded, is not on the pad."""
     missed = {
-        index: _why(trial, press, recordings)
+        index: _why(trial, recordings)
         for index, (trial, press) in enumerate(zip(recordings.trials, presses(recordings), strict=True))
         if not press.load.max() > 0
     }
@@ -157,7 +157,7 @@ def check_contact(recordings: RecordingSet) -> Iterator[Finding]:
             yield Finding(index, why, f"{KEPT}: used for idle levels only")
 
 
-def _why(trial: Trial, press: Press, recordings: RecordingSet) -> str:
+def _why(trial: Trial, recordings: RecordingSet) -> str:
     """Why a trial has no contact."""
     if trial.depth_m is None:
         return "force_n shows no load"

@@ -195,7 +195,7 @@ def _evidence_row(item: Evidence) -> dict[str, Any]:
     gain = item.cv_gain
     return {
         "title": words.title(item.name),
-        "name": item.name if item.name in words.MEANINGS else "",
+        "name": item.name if item.name in words.MAIN_PARAMETERS else "",
         "p": p_text(item.p_value),
         "p_adjusted": "observed" if item.observed else p_text(item.p_adjusted),
         "gain": "–" if gain is None else percent(gain),

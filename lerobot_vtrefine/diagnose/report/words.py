@@ -1,97 +1,60 @@
 """The verdict in plain words."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from importlib import import_module
 
 from lerobot_vtrefine.diagnose.report.numbers import digits, percent, quantity, scale_of
 from lerobot_vtrefine.diagnose.verdict import Verdict
 
-
-@dataclass(frozen=True)
-class Meaning:
-    """A cause for people: what it is, its main parameter, and that one's unit (docs/verdict.md)."""
-
-    what: str
-    parameter: str
-    unit: str
-
-
-MEANINGS = {
-    "nonlinear_stiffness": Meaning(
-        "The cover gets stiffer, or softer, the deeper it is pressed.", "exponent − 1", "1"
-    ),
-    "saturation": Meaning("High readings level off before the converter's full scale.", "knee", "counts"),
-    "viscoelastic_relaxation": Meaning(
-        "Under a constant load the reading creeps, and after unloading part of it remains.", "fraction", "1"
-    ),
-    "hysteresis": Meaning(
-        "At the same depth, the pad reads differently during loading and unloading.", "fraction", "1"
-    ),
-    "first_load_softening": Meaning(
-        "Below the largest load so far, the pad reads less than it did under the first load.",
-        "softening",
-        "1",
-    ),
-    "taxel_gain_spread": Meaning("Taxels differ in sensitivity.", "spread", "1"),
-    "dead_taxels": Meaning("Some taxels never respond.", "taxels", "1"),
-    "row_sharing": Meaning(
-        "The readout's voltage divider: a taxel's reading falls when others in its row are pressed.",
-        "conductance",
-        "1/counts",
-    ),
-    "supply_droop": Meaning(
-        "The supply voltage drops as the load on the whole pad rises, and every reading with it.",
-        "droop",
-        "1/counts",
-    ),
-    "crosstalk": Meaning("A reading leaks into the others in its row and column.", "fraction", "1"),
-    "mechanical_spreading": Meaning("The cover spreads a press over neighbouring taxels.", "sigma", "m"),
-    "baseline_drift": Meaning("The idle level drifts during the session.", "rate", "counts/s"),
-    "latency": Meaning("Readings reach the host late.", "delay", "s"),
-    "scan_skew": Meaning("Rows are read one after the other, not simultaneously.", "first to last row", "s"),
-    "sample_and_hold": Meaning("The host repeats old frames until a new one arrives.", "period", "s"),
-    "contact_offset": Meaning("The pad's face lies deeper, or higher, than assumed.", "offset", "m"),
-    "pad_tilt": Meaning("The pad's face is not parallel to the assumed one.", "tilt", "rad"),
-    "encoder_offset": Meaning("A joint's encoder is off by a constant.", "offset", "rad"),
-    "backlash": Meaning("A joint has play: after a reversal it does not follow at first.", "width", "rad"),
-    "control_latency": Meaning("Commands take effect late.", "delay", "s"),
-    "joint_friction": Meaning("Dry friction holds a joint back.", "friction", "N*m"),
-    "gravity_sag": Meaning("The arm's weight pulls joints away from their command.", "sag", "rad"),
-    "gripper_compliance": Meaning(
-        "The gripper yields under load, or is blocked by what it holds.", "compliance", "m/N"
-    ),
-    "load_friction": Meaning("Friction grows with the torque that the gears carry.", "part of the load", "1"),
-    "directional_friction": Meaning(
-        "Friction grows with the load, and differently when driving it than when back-driven.",
-        "part of the motor's torque",
-        "1",
-    ),
-    "stribeck_friction": Meaning(
-        "Friction is larger at rest and at low speed than in motion.", "stiction", "N*m"
-    ),
-    "load_stiction": Meaning(
-        "At rest and at low speed, friction grows with the torque that the gears carry.",
-        "part of the motor's torque",
-        "1",
-    ),
-    "quadratic_friction": Meaning("Friction grows with the square of the load.", "coefficient", "1/(N*m)"),
-    "supply_sag": Meaning(
-        "The supply sags under the motor's current, the more the higher the duty cycle.",
-        "resistance over the winding's",
-        "1",
-    ),
-    "motor_heating": Meaning(
-        "The winding's resistance changes with its temperature.", "change per kelvin", "1/K"
-    ),
-    "voltage_limit": Meaning(
-        "The drive limits the motor's voltage more than it should.", "missing part", "1"
-    ),
-    "camera_extrinsics": Meaning("The camera is not where the simulation places it.", "displacement", "m"),
-    "depth_scale": Meaning("The depth camera's distances are off by a factor.", "factor − 1", "1"),
-    "object_mass": Meaning("The object weighs more, or less, than simulated.", "mass", "kg"),
-    "object_friction": Meaning("The object has more, or less, friction than simulated.", "coefficient", "1"),
-    "clearance": Meaning("The socket is tighter, or wider, than simulated.", "clearance", "m"),
+MAIN_PARAMETERS = {
+    "nonlinear_stiffness": ("exponent − 1", "1"),
+    "saturation": ("knee", "counts"),
+    "viscoelastic_relaxation": ("fraction", "1"),
+    "hysteresis": ("fraction", "1"),
+    "first_load_softening": ("softening", "1"),
+    "taxel_gain_spread": ("spread", "1"),
+    "dead_taxels": ("taxels", "1"),
+    "row_sharing": ("conductance", "1/counts"),
+    "supply_droop": ("droop", "1/counts"),
+    "crosstalk": ("fraction", "1"),
+    "mechanical_spreading": ("sigma", "m"),
+    "baseline_drift": ("rate", "counts/s"),
+    "latency": ("delay", "s"),
+    "scan_skew": ("first to last row", "s"),
+    "sample_and_hold": ("period", "s"),
+    "contact_offset": ("offset", "m"),
+    "pad_tilt": ("tilt", "rad"),
+    "encoder_offset": ("offset", "rad"),
+    "backlash": ("width", "rad"),
+    "control_latency": ("delay", "s"),
+    "joint_friction": ("friction", "N*m"),
+    "gravity_sag": ("sag", "rad"),
+    "gripper_compliance": ("compliance", "m/N"),
+    "load_friction": ("part of the load", "1"),
+    "directional_friction": ("part of the motor's torque", "1"),
+    "stribeck_friction": ("stiction", "N*m"),
+    "load_stiction": ("part of the motor's torque", "1"),
+    "quadratic_friction": ("coefficient", "1/(N*m)"),
+    "supply_sag": ("resistance over the winding's", "1"),
+    "motor_heating": ("change per kelvin", "1/K"),
+    "voltage_limit": ("missing part", "1"),
+    "camera_extrinsics": ("displacement", "m"),
+    "depth_scale": ("factor − 1", "1"),
+    "object_mass": ("mass", "kg"),
+    "object_friction": ("coefficient", "1"),
+    "clearance": ("clearance", "m"),
 }
+"""Every cause's for people, with its unit (docs/verdict.md)."""
+MEANINGS = {
+    "taxel_gain_spread": "Taxels differ in sensitivity.",
+    "dead_taxels": "Some taxels never respond.",
+    "camera_extrinsics": "The camera is not where the simulation places it.",
+    "depth_scale": "The depth camera's distances are off by a factor.",
+    "object_mass": "The object weighs more, or less, than simulated.",
+    "object_friction": "The object has more, or less, friction than simulated.",
+    "clearance": "The socket is tighter, or wider, than simulated.",
+}
+"""What a cause is that no file of a catalogue stands for; the others' docstrings say so."""
 SPELLED = {
     "nonlinear_stiffness": "non-linear stiffness",
     "first_load_softening": "first-load softening",
@@ -125,17 +88,15 @@ def title(name: str) -> str:
     return SPELLED.get(name, name.replace("_", " "))
 
 
-def meaning(name: str) -> Meaning:
-    """What a cause is; the file of one that was added to the catalogue says so."""
+def meaning(name: str) -> str:
+    """What a cause is, in one sentence."""
     if name in MEANINGS:
         return MEANINGS[name]
-    from lerobot_vtrefine.diagnose.joints import candidates as joint_candidates
-    from lerobot_vtrefine.diagnose.pad import candidates
-    from lerobot_vtrefine.diagnose.servo import candidates as servo_candidates
-
-    catalogues = (candidates, joint_candidates, servo_candidates)
-    text = next((item.MEANING[name] for item in catalogues if item.MEANING.get(name)), "")
-    return Meaning(text[:1].upper() + text[1:], "size", "1")
+    for instrument in ("joints", "servo", "pad"):  # those that import quickly first
+        told = import_module(f"lerobot_vtrefine.diagnose.{instrument}.candidates").MEANING.get(name, "")
+        if told:
+            return told[:1].upper() + told[1:]
+    return ""
 
 
 def listing(items: Sequence[str], last: str = "and") -> str:
@@ -192,10 +153,10 @@ def power_line(verdict: Verdict) -> str:
 
 def size_text(name: str, size: float) -> str:
     """A cause's main parameter at some size, for example "delay: 4 ms"."""
-    about = meaning(name)
     if name == "dead_taxels":
         return "any one that is pressed hard enough"
-    return f"{about.parameter}: {quantity(size, about.unit)}"
+    parameter, unit = MAIN_PARAMETERS.get(name, ("size", "1"))
+    return f"{parameter}: {quantity(size, unit)}"
 
 
 def _still_helps(verdict: Verdict) -> str:

@@ -17,7 +17,7 @@ from lerobot_vtrefine.tactile.stages.base import (
     parameter,
     register,
 )
-from lerobot_vtrefine.tactile.stages.signals import delayed, followed, low_passed, sampled
+from lerobot_vtrefine.tactile.stages.signals import delayed, followed, low_passed, sampled, share_gone
 
 PHASES = 16
 """Instants over which the mean reading of a free-running board is taken."""
@@ -25,9 +25,14 @@ HISTORY_FRAMES = 16
 """Frames that a delay remembers while simulating; replay has no such limit."""
 
 
+def periods_gone(time_s: Any, period_s: Any, phase: Any = 0.0) -> Any:
+    """Periods that have gone by; a time at a period's very end, but for rounding, is in the next."""
+    return time_s / period_s + phase + 1e-6
+
+
 def taken_at_frames(times_s: np.ndarray, period_s: float, frame_s: float) -> np.ndarray:
     """When what is held at times (T,) was read: at the first frame after the present period began [s]."""
-    begun = np.floor(times_s / period_s + 1e-6) * period_s
+    begun = np.floor(periods_gone(times_s, period_s)) * period_s
     return np.minimum(np.ceil(begun / frame_s - 1e-3) * frame_s, times_s)
 
 
@@ -65,8 +70,7 @@ class Delay(Stage):
         )
         value = x
         for k in range(HISTORY_FRAMES - 1):
-            begin, end = age[..., k, None, None], age[..., k + 1, None, None]
-            weight = ((delay - begin) / (end - begin).clamp(min=1e-9)).clamp(0.0, 1.0)
+            weight = share_gone(delay, age[..., k, None, None], age[..., k + 1, None, None])
             value = value + weight * (history[..., k + 1, :, :] - history[..., k, :, :])
         return value, {"history": history, "age_s": age, "frames": state["frames"] + 1}
 
@@ -217,7 +221,7 @@ class SampleAndHold(Stage):
     def step(self, x: torch.Tensor, state: State, frame: Frame) -> tuple[torch.Tensor, State]:
         time_s = torch.as_tensor(frame.time_s, dtype=torch.float64, device=x.device)
         phase = state.get("phase", 0.0)
-        slot = torch.floor(time_s / self.period_s + phase + 1e-6)
+        slot = torch.floor(periods_gone(time_s, self.period_s, phase))
         slot = slot.to(torch.int64).expand(state["slot"].shape).clone()
         held = torch.where(slot != state["slot"], x, state["held"])
         return held, {**state, "held": held, "slot": slot}
@@ -225,11 +229,18 @@ class SampleAndHold(Stage):
     @override
     def sequence(self, x: torch.Tensor, times_s: torch.Tensor, frame: Frame) -> torch.Tensor:
         """As `step` frame by frame; of a free board, whose instants nobody knows, the mean over them."""
-        if self.frame_s:
-            held = taken_at_frames(times_s.cpu().numpy(), self.period_s, self.frame_s)
-            return sampled(x, times_s, torch.from_numpy(held).to(times_s))
-        if not self.free and not self.ages_s:
-            return super().sequence(x, times_s, frame)
+        if self.frame_s or not (self.free or self.ages_s):
+            return self.held(x, times_s)
         even = [self.period_s * (k + 0.5) / PHASES for k in range(PHASES)]
         ages = [self.lag_s + age for age in self.ages_s] or even
         return torch.stack([sampled(x, times_s, times_s - age) for age in ages]).mean(dim=0)
+
+    def held(self, x: torch.Tensor, times_s: torch.Tensor, phase: float = 0.0) -> torch.Tensor:
+        """x (T, ...) as a board of regular periods repeats it, `phase` of one gone by at time zero."""
+        if self.frame_s:
+            taken_s = taken_at_frames(times_s.cpu().numpy(), self.period_s, self.frame_s)
+            return sampled(x, times_s, torch.from_numpy(taken_s).to(times_s))
+        slot = torch.floor(periods_gone(times_s, self.period_s, phase))
+        begun = torch.ones_like(slot, dtype=torch.bool)
+        begun[1:] = slot[1:] != slot[:-1]
+        return x[begun.nonzero()[begun.cumsum(0) - 1, 0]]

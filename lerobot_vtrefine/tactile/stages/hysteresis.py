@@ -4,8 +4,7 @@ A law is how a memory moves with every frame, and what reading goes with it. A s
 frame, a replay or a fit through all frames of a recording.
 """
 
-import math
-from collections.abc import Callable
+from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass
 from typing import Any, ClassVar, override
 
@@ -60,7 +59,29 @@ class Loop(Stage):
 
 
 @dataclass(frozen=True)
-class Play(Loop):
+class Bounded(Loop):
+    """Base of the laws whose memories rest unless the force's bounds push them: low <= memory <= high."""
+
+    def _bounds(self, x: torch.Tensor, frame: Frame) -> Iterator[tuple[str, torch.Tensor, torch.Tensor]]:
+        """Name of every memory, and between what it may lie at f = x [N]."""
+        raise NotImplementedError
+
+    def _reading(self, x: torch.Tensor, kept: Iterable[torch.Tensor]) -> torch.Tensor:
+        """What the pad feels of the force x with its memories where they are kept [N]."""
+        raise NotImplementedError
+
+    @override
+    def step(self, x: torch.Tensor, state: State, frame: Frame) -> tuple[torch.Tensor, State]:
+        kept = {name: torch.clamp(state[name], low, high) for name, low, high in self._bounds(x, frame)}
+        return self._reading(x, kept.values()), {**state, **kept}
+
+    @override
+    def sequence(self, x: torch.Tensor, times_s: torch.Tensor, frame: Frame) -> torch.Tensor:
+        return self._reading(x, (kept_between(low, high) for _, low, high in self._bounds(x, frame)))
+
+
+@dataclass(frozen=True)
+class Play(Bounded):
     """Play operators (Prandtl-Ishlinskii): f + sum_j fraction_j * (play_j(f) - f).
 
     A play operator follows the depth f / stiffness with a dead band of full width `width_m`, so that loading
@@ -88,32 +109,28 @@ class Play(Loop):
         pairs = paired(self.name, self.fraction, self.width_m, "fraction and width_m")
         return [(f"play_{j}" if j else "play", fraction, width) for j, (fraction, width) in enumerate(pairs)]
 
-    def _band(self, x: torch.Tensor, width: Any) -> tuple[torch.Tensor, torch.Tensor]:
-        """Between what the operator may lie at f = x [N]."""
-        low = (x + (self.above - 1.0) * width).clamp_(min=0.0)
-        high = (x + self.above * width).clamp_(min=0.0)
-        return low, high if self.rests else high.mul_(x > 0)
-
     @override
     def initial(self, layout: PadLayout, pads: int) -> Traits:
         shape = (pads, layout.rows, layout.cols)
         return {name: np.zeros(shape, dtype=np.float32) for name, _, _ in self._operators()}
 
     @override
-    def step(self, x: torch.Tensor, state: State, frame: Frame) -> tuple[torch.Tensor, State]:
-        new, looped = dict(state), x
-        for name, fraction, width_m in self._operators():
-            new[name] = torch.clamp(state[name], *self._band(x, width_m * frame.stiffness_n_per_m))
-            looped = looped + fraction * (new[name] - x)
-        return looped.clamp(min=0.0), new
+    def _bounds(self, x: torch.Tensor, frame: Frame) -> Iterator[tuple[str, torch.Tensor, torch.Tensor]]:
+        for name, _, width_m in self._operators():
+            width = width_m * frame.stiffness_n_per_m
+            low = (x + (self.above - 1.0) * width).clamp_(min=0.0)
+            high = (x + self.above * width).clamp_(min=0.0)
+            yield name, low, high if self.rests else high.mul_(x > 0)
 
     @override
-    def sequence(self, x: torch.Tensor, times_s: torch.Tensor, frame: Frame) -> torch.Tensor:
-        operators = self._operators()
-        looped = (1.0 - math.fsum(fraction for _, fraction, _ in operators)) * x
-        for _, fraction, width_m in operators:
-            band = self._band(x, width_m * frame.stiffness_n_per_m)
-            looped.add_(kept_between(*band), alpha=fraction)
+    def _reading(self, x: torch.Tensor, kept: Iterable[torch.Tensor]) -> torch.Tensor:
+        fractions = [fraction for _, fraction, _ in self._operators()]
+        looped = (1.0 - sum(fractions)) * x
+        for fraction, play in zip(fractions, kept, strict=True):
+            if isinstance(fraction, torch.Tensor):
+                looped.add_(fraction * play)
+            else:
+                looped.add_(play, alpha=fraction)
         return looped.clamp_(min=0.0)
 
 
@@ -186,29 +203,26 @@ class ProportionalHysteresis(Loop):
 
 @register
 @dataclass(frozen=True)
-class PeakHysteresis(Loop):
+class PeakHysteresis(Bounded):
     """A loop that closes at both ends: f (1 + 4 fraction s (1 - s)), s = f / (largest f of this contact)."""
 
     name: ClassVar[str] = "peak_hysteresis"
     fraction: float = parameter(0.15, "1", 0.0, 0.3, minimum=None)
-
-    def _bent(self, x: torch.Tensor, peak: torch.Tensor) -> torch.Tensor:
-        share = x / peak.clamp(min=1e-12)
-        return (x * (1.0 + 4.0 * self.fraction * share * (1.0 - share))).clamp(min=0.0)
 
     @override
     def initial(self, layout: PadLayout, pads: int) -> Traits:
         return {"peak": np.zeros((pads, layout.rows, layout.cols), dtype=np.float32)}
 
     @override
-    def step(self, x: torch.Tensor, state: State, frame: Frame) -> tuple[torch.Tensor, State]:
-        peak = torch.maximum(state["peak"], x) * (x > 0)
-        return self._bent(x, peak), {**state, "peak": peak}
+    def _bounds(self, x: torch.Tensor, frame: Frame) -> Iterator[tuple[str, torch.Tensor, torch.Tensor]]:
+        # Without contact there is no peak but f itself.
+        yield "peak", x, torch.where(x > 0, torch.inf, x)
 
     @override
-    def sequence(self, x: torch.Tensor, times_s: torch.Tensor, frame: Frame) -> torch.Tensor:
-        touching = x.clamp(min=0.0)
-        return self._bent(x, kept_between(touching, torch.where(x > 0, torch.inf, touching)))
+    def _reading(self, x: torch.Tensor, kept: Iterable[torch.Tensor]) -> torch.Tensor:
+        (peak,) = kept
+        share = x / peak.clamp(min=1e-12)
+        return (x * (1.0 + 4.0 * self.fraction * share * (1.0 - share))).clamp(min=0.0)
 
 
 BY_LOOP: dict[str, type[Loop]] = {

@@ -11,6 +11,11 @@ LONGEST_EXPONENT = 600.0
 """Of a single step, after which nothing is left of what was before."""
 
 
+def share_gone(at_s: torch.Tensor, before_s: torch.Tensor, after_s: torch.Tensor) -> torch.Tensor:
+    """Where instants lie between two others, from 0 at the first to 1 at the second; beyond, the nearer's."""
+    return (at_s - before_s).div_((after_s - before_s).clamp_(min=1e-12)).clamp_(0.0, 1.0)
+
+
 def sampled(x: torch.Tensor, times_s: torch.Tensor, at_s: torch.Tensor) -> torch.Tensor:
     """x (T, ...), known at times (T,), at other instants; the ends go on as they are.
 
@@ -20,9 +25,7 @@ def sampled(x: torch.Tensor, times_s: torch.Tensor, at_s: torch.Tensor) -> torch
         return x[:1].expand(len(at_s), *x.shape[1:])
     at_s = at_s.to(times_s)
     after = torch.searchsorted(times_s, at_s.contiguous(), right=True).clamp_(1, len(times_s) - 1)
-    before_s = times_s[after - 1]
-    weight = (at_s - before_s).div_((times_s[after] - before_s).clamp_(min=1e-12)).clamp_(0.0, 1.0)
-    weight = weight.to(x.dtype)
+    weight = share_gone(at_s, times_s[after - 1], times_s[after]).to(x.dtype)
     if at_s.ndim == 1:
         return torch.lerp(x[after - 1], x[after], weight.view(-1, *(1,) * (x.ndim - 1)))
     return torch.lerp(x.take_along_dim(after - 1, 0), x.take_along_dim(after, 0), weight)

@@ -60,7 +60,10 @@ class FirstLoadSoftening(Stage):
             # Growing exponentials instead of a recursion; what is older than that has faded anyway.
             age = ((times_s - times_s[0]) / self.recovery_s).to(torch.float64).clamp(max=600.0)
             grow = torch.exp(age).view(-1, *(1,) * (x.ndim - 1))
-            largest = torch.cummax(load * grow, dim=0).values / grow
+            grown = load * grow
+            most = torch.cummax(grown, dim=0).values
+            # A first load is its own largest to the last bit, or a low sharpness makes much of rounding.
+            largest = torch.where(grown == most, load, most.div_(grow))
         else:
             largest = torch.cummax(load, dim=0).values
         return self._softened(x, largest.to(x.dtype), frame)

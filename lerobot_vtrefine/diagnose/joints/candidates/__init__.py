@@ -4,32 +4,22 @@ To add a cause, write its stage in `joints/stages.py`, and a file here with its 
 whose docstring says "name: what it is"; it is found by itself.
 """
 
-import pkgutil
-from importlib import import_module
-
+from lerobot_vtrefine.diagnose.core.catalogue import files_of, meaning
+from lerobot_vtrefine.diagnose.joints.candidates import decoys
 from lerobot_vtrefine.diagnose.joints.candidates.base import Candidate, Sizes
 from lerobot_vtrefine.diagnose.verdict import ROBOT_CAUSES
 
-_OTHERS = {"base", "decoys"}
-
-
-def _files() -> list[str]:
-    found = {module.name for module in pkgutil.iter_modules(__path__)} - _OTHERS
-    return [*ROBOT_CAUSES, *sorted(found - set(ROBOT_CAUSES))]  # decoys come last
-
-
-NAMES = tuple(_files())
-_MODULES = {name: import_module(f"{__name__}.{name}") for name in NAMES}
+_FILES = files_of(__name__, __path__, ROBOT_CAUSES, ("decoys",))
+NAMES = tuple(_FILES)
 CATALOGUE: tuple[Candidate, ...] = (
-    *(form for module in _MODULES.values() for form in module.FORMS),
-    *import_module(f"{__name__}.decoys").FORMS,
+    *(form for file in _FILES.values() for form in file.FORMS),
+    *decoys.FORMS,  # last
 )
 PLAIN: dict[str, Candidate] = {item.cause: item for item in reversed(CATALOGUE)}
 """Cause -> its plain form, with which stands what holds for all forms."""
-SIZES: dict[str, Sizes] = {name: module.sizes for name, module in _MODULES.items()}
-MEANING = {name: (module.__doc__ or "").partition(": ")[2].strip() for name, module in _MODULES.items()}
-"""What every cause is, in the words of its file."""
-NOT_SHOWN: dict[str, str] = {name: getattr(module, "NOT_SHOWN", "") for name, module in _MODULES.items()}
+SIZES: dict[str, Sizes] = {name: file.sizes for name, file in _FILES.items()}
+MEANING = {name: meaning(file) for name, file in _FILES.items()}
+NOT_SHOWN: dict[str, str] = {name: getattr(file, "NOT_SHOWN", "") for name, file in _FILES.items()}
 """Why trials show nothing of a cause where no joint can."""
 
 

@@ -1,4 +1,4 @@
-"""backlash: a joint has play, and after a reversal first does not follow."""
+"""backlash: a joint has play: after a reversal it does not follow at first."""
 
 from lerobot_vtrefine.diagnose.joints.candidates.base import MOTION, Candidate
 from lerobot_vtrefine.diagnose.joints.estimates import Estimates, MethodError

@@ -1,4 +1,4 @@
-"""gripper_compliance: the gripper gives way under load, or is blocked by what it holds."""
+"""gripper_compliance: the gripper yields under load, or is blocked by what it holds."""
 
 import numpy as np
 

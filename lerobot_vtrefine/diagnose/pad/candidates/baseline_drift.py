@@ -1,4 +1,4 @@
-"""baseline_drift: the idle level moves with session time."""
+"""baseline_drift: the idle level drifts during the session."""
 
 import numpy as np
 

@@ -1,4 +1,4 @@
-"""contact_offset: the face lies deeper (or higher) than assumed."""
+"""contact_offset: the pad's face lies deeper, or higher, than assumed."""
 
 import numpy as np
 

@@ -1,4 +1,4 @@
-"""crosstalk: readings leak along row and column."""
+"""crosstalk: a reading leaks into the others in its row and column."""
 
 import numpy as np
 

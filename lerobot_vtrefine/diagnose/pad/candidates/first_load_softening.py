@@ -1,4 +1,6 @@
-"""first_load_softening: below the largest load so far the pad reads less than on the first load."""
+"""first_load_softening: below the largest load so far, the pad reads less than it did under the first
+load.
+"""
 
 from typing import Any
 

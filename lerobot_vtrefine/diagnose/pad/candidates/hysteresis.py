@@ -1,4 +1,7 @@
-"""hysteresis: loading and unloading differ at the same depth, whatever the speed, either way."""
+"""hysteresis: at the same depth, the pad reads differently during loading and unloading."""
+
+from collections.abc import Callable
+from typing import Any
 
 import numpy as np
 
@@ -8,34 +11,15 @@ from lerobot_vtrefine.tactile.stages.hysteresis import (
     Hysteresis,
     LoadingHysteresis,
     PeakHysteresis,
+    Play,
     ProportionalHysteresis,
     RestingHysteresis,
 )
 
 WIDE = 4.0
 """Widest play over the deepest press: beyond, the operator never moves."""
-
-
-def _one(values: np.ndarray, setting: Setting) -> tuple[Stage, ...]:
-    return (Hysteresis(float(values[0]), float(np.exp(values[1]) * setting.top_depth_m)),)
-
-
-def _several(values: np.ndarray, setting: Setting) -> tuple[Stage, ...]:
-    widths = tuple(float(share * setting.top_depth_m) for share in SEVERAL_WIDTHS)
-    return (Hysteresis(tuple(float(value) for value in values), widths),)
-
-
-def _behind(values: np.ndarray, setting: Setting) -> tuple[Stage, ...]:
-    widths = tuple(float(share * setting.top_depth_m) for share in SEVERAL_WIDTHS)
-    return (LoadingHysteresis(tuple(float(value) for value in values), widths),)
-
-
-def _resting(values: np.ndarray, setting: Setting) -> tuple[Stage, ...]:
-    return (RestingHysteresis(float(values[0]), float(np.exp(values[1]) * setting.top_depth_m)),)
-
-
-def _scaled(values: np.ndarray, setting: Setting) -> tuple[Stage, ...]:
-    return (ProportionalHysteresis(float(values[0]), float(np.exp(values[1]) * setting.top_depth_m)),)
+SEVERAL_WIDTHS = (0.1, 0.3, 0.9, 1.8)
+LOG_WIDTH = Value("log_width", float(np.log(0.03)), float(np.log(WIDE)), 1e-2)
 
 
 def _report_one(values: np.ndarray, setting: Setting) -> dict[str, tuple[float, str]]:
@@ -49,64 +33,73 @@ def _report_several(values: np.ndarray, setting: Setting) -> dict[str, tuple[flo
     return {"fraction": (float(values.sum()), "1"), "width_m": (mean, "m")}
 
 
-SEVERAL_WIDTHS = (0.1, 0.3, 0.9, 1.8)
-LOG_WIDTH = Value("log_width", float(np.log(0.03)), float(np.log(WIDE)), 1e-2)
+def _one(
+    label: str,
+    law: Callable[[float, float], Stage],
+    most: float,
+    start: float,
+    widths: tuple[float, ...],
+    **rest: Any,
+) -> Form:
+    """A loop of one width, of fractions up to `most`; probes of a fraction `start` at widths of the press."""
+
+    def build(values: np.ndarray, setting: Setting) -> tuple[Stage, ...]:
+        return (law(float(values[0]), float(np.exp(values[1]) * setting.top_depth_m)),)
+
+    return Form(
+        "hysteresis",
+        label,
+        (Value("fraction", -0.9, most, 2e-3), LOG_WIDTH),
+        build,
+        _report_one,
+        lambda s: [[start, float(np.log(share))] for share in widths],
+        signed=True,
+        **rest,
+    )
+
+
+def _several(label: str, law: type[Play]) -> Form:
+    """Play operators of fixed widths, side by side."""
+
+    def build(values: np.ndarray, setting: Setting) -> tuple[Stage, ...]:
+        widths = tuple(float(share * setting.top_depth_m) for share in SEVERAL_WIDTHS)
+        return (law(tuple(float(value) for value in values), widths),)
+
+    return Form(
+        "hysteresis",
+        label,
+        tuple(Value(f"fraction_{j}", -0.6, 0.6, 2e-3) for j in range(len(SEVERAL_WIDTHS))),
+        build,
+        _report_several,
+        lambda s: [[0.03] * len(SEVERAL_WIDTHS)],
+        amplitude=None,
+        signed=True,
+        screened=False,
+    )
+
 
 FORMS = (
-    Form(
-        "hysteresis",
+    _one(
         "one play operator",
-        (Value("fraction", -0.9, 0.9, 2e-3), LOG_WIDTH),
-        _one,
-        _report_one,
-        lambda s: [[0.05, float(np.log(share))] for share in (0.1, 0.25, 0.5, 1.0, 1.8)],
-        signed=True,
+        Hysteresis,
+        0.9,
+        0.05,
+        (0.1, 0.25, 0.5, 1.0, 1.8),
         kinds=("memory", "peak"),
         sizes=("fraction",),
         needs="unload in part and load again at the same place",
     ),
-    Form(
-        "hysteresis",
-        "four play operators",
-        tuple(Value(f"fraction_{j}", -0.6, 0.6, 2e-3) for j in range(len(SEVERAL_WIDTHS))),
-        _several,
-        _report_several,
-        lambda s: [[0.03] * len(SEVERAL_WIDTHS)],
-        amplitude=None,
-        signed=True,
-        screened=False,
-    ),
-    Form(
-        "hysteresis",
-        "four play operators behind the load",
-        tuple(Value(f"fraction_{j}", -0.6, 0.6, 2e-3) for j in range(len(SEVERAL_WIDTHS))),
-        _behind,
-        _report_several,
-        lambda s: [[0.03] * len(SEVERAL_WIDTHS)],
-        amplitude=None,
-        signed=True,
-        screened=False,
-    ),
-    Form(
-        "hysteresis",
+    _several("four play operators", Hysteresis),
+    _several("four play operators behind the load", LoadingHysteresis),
+    _one(
         "one play operator that rests where it was let go",
-        (Value("fraction", -0.9, 0.9, 2e-3), LOG_WIDTH),
-        _resting,
-        _report_one,
-        lambda s: [[0.1, float(np.log(share))] for share in (0.25, 0.6)],
-        signed=True,
+        RestingHysteresis,
+        0.9,
+        0.1,
+        (0.25, 0.6),
         screened=False,
     ),
-    Form(
-        "hysteresis",
-        "a loop as wide as the load is high",
-        (Value("fraction", -0.9, 2.0, 2e-3), LOG_WIDTH),
-        _scaled,
-        _report_one,
-        lambda s: [[0.1, float(np.log(share))] for share in (0.1, 0.4)],
-        signed=True,
-        screened=False,
-    ),
+    _one("a loop as wide as the load is high", ProportionalHysteresis, 2.0, 0.1, (0.1, 0.4), screened=False),
     Form(
         "hysteresis",
         "a loop below the largest load of the contact",

@@ -1,4 +1,4 @@
-"""latency: readings are older than their time stamp."""
+"""latency: readings reach the host late."""
 
 from lerobot_vtrefine.diagnose.pad.candidates.base import Form, Value
 from lerobot_vtrefine.tactile.stages.host import Latency

@@ -1,4 +1,4 @@
-"""mechanical_spreading: the cover layer spreads force over neighbours."""
+"""mechanical_spreading: the cover spreads a press over neighbouring taxels."""
 
 from collections.abc import Sequence
 

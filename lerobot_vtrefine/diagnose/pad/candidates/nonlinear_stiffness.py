@@ -1,4 +1,4 @@
-"""nonlinear_stiffness: force grows faster than depth (hardening).
+"""nonlinear_stiffness: the cover gets stiffer, or softer, the deeper it is pressed.
 
 All forms report as `exponent` how fast force grows at the deepest press, d ln f / d ln d; a power law's is
 its own.

@@ -1,4 +1,4 @@
-"""pad_tilt: the pad is turned about its +x and +y."""
+"""pad_tilt: the pad's face is not parallel to the assumed one."""
 
 from lerobot_vtrefine.diagnose.pad.candidates.base import Form, Value
 from lerobot_vtrefine.tactile.stages.surface import PadTilt

@@ -1,4 +1,4 @@
-"""row_sharing: a taxel's reading falls as others of its row are pressed."""
+"""row_sharing: the readout's voltage divider: a taxel's reading falls when others in its row are pressed."""
 
 import numpy as np
 

@@ -1,4 +1,4 @@
-"""sample_and_hold: readings repeat while time goes on."""
+"""sample_and_hold: the host repeats old frames until a new one arrives."""
 
 from collections.abc import Callable
 from dataclasses import dataclass

@@ -1,4 +1,4 @@
-"""saturation: readings level off.
+"""saturation: high readings level off before the converter's full scale.
 
 The fitted coordinate is the largest signal over the knee, which is 0 without saturation.
 """

@@ -1,4 +1,4 @@
-"""scan_skew: rows are read one after the other."""
+"""scan_skew: rows are read one after the other, not simultaneously."""
 
 import numpy as np
 

@@ -1,4 +1,4 @@
-"""supply_droop: a taxel's reading falls with the load of the whole pad."""
+"""supply_droop: the supply voltage drops as the load on the whole pad rises, and every reading with it."""
 
 from lerobot_vtrefine.diagnose.pad.candidates.base import Form, Value
 from lerobot_vtrefine.tactile.stages.readout import SupplyDroop

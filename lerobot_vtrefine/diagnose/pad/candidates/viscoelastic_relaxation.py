@@ -1,4 +1,6 @@
-"""viscoelastic_relaxation: a held load's reading decays (or creeps upwards, with a negative fraction)."""
+"""viscoelastic_relaxation: under a constant load the reading creeps, and after unloading part of it
+remains.
+"""
 
 from collections.abc import Callable
 from dataclasses import replace

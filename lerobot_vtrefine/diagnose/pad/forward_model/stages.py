@@ -12,10 +12,9 @@ import torch
 
 from lerobot_vtrefine.diagnose.pad.forward_model.batches import Sheet
 from lerobot_vtrefine.diagnose.pad.forward_model.fields import Context, Field
-from lerobot_vtrefine.diagnose.pad.repeated_frames import slots
 from lerobot_vtrefine.tactile.stages.base import Frame, Stage
 from lerobot_vtrefine.tactile.stages.contact import ContactStage
-from lerobot_vtrefine.tactile.stages.host import SampleAndHold, ScanSkew, taken_at_frames
+from lerobot_vtrefine.tactile.stages.host import SampleAndHold, ScanSkew
 from lerobot_vtrefine.tactile.stages.mechanics import MechanicalSpreading, ring_matrix, spreading_matrix
 from lerobot_vtrefine.tactile.stages.readout import (
     BaselineDrift,
@@ -230,13 +229,9 @@ def _hold(stage: SampleAndHold, field: Field, context: Context) -> Field:
         x = field.values[: len(time_s), part]
         if stage.ages_s:
             out[: len(time_s), part] = _sampled(x, time_s, rhythm.taken_s(time_s) - stage.lag_s)
-        elif stage.frame_s:
-            taken_s = taken_at_frames(time_s, stage.period_s, stage.frame_s)
-            out[: len(time_s), part] = _sampled(x, time_s, taken_s)
         else:
-            slot = slots(time_s, stage.period_s, rhythm.phase(stage.period_s) if stage.free else 0.0)
-            new = np.concatenate([[True], slot[1:] != slot[:-1]])
-            out[: len(time_s), part] = x[np.maximum.accumulate(np.where(new, np.arange(len(slot)), 0))]
+            phase = rhythm.phase(stage.period_s) if stage.free else 0.0
+            out[: len(time_s), part] = stage.held(torch.from_numpy(x), torch.from_numpy(time_s), phase)
     return Field(out, field.columns)
 
 

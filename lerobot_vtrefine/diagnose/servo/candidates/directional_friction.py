@@ -1,5 +1,7 @@
-"""directional_friction: friction grows with the load otherwise when driven than when driven back (M5 of arXiv
-2410.08650)."""
+"""directional_friction: friction grows with the load, and differently when driving it than when back-driven.
+
+M5 of arXiv 2410.08650.
+"""
 
 from lerobot_vtrefine.diagnose.servo.candidates.base import Candidate
 

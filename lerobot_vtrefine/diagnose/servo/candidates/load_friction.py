@@ -1,4 +1,7 @@
-"""load_friction: friction grows with the torque that the gears carry (M3 of arXiv 2410.08650)."""
+"""load_friction: friction grows with the torque that the gears carry.
+
+M3 of arXiv 2410.08650.
+"""
 
 from lerobot_vtrefine.diagnose.servo.candidates.base import Candidate
 

@@ -1,5 +1,7 @@
-"""load_stiction: the torque that the gears carry holds them at rest and at low speed (M4 and M5 of arXiv
-2410.08650)."""
+"""load_stiction: at rest and at low speed, friction grows with the torque that the gears carry.
+
+M4 and M5 of arXiv 2410.08650.
+"""
 
 from lerobot_vtrefine.diagnose.servo.candidates.base import Candidate
 

@@ -1,4 +1,7 @@
-"""quadratic_friction: friction grows with the square of the load (M6 of arXiv 2410.08650)."""
+"""quadratic_friction: friction grows with the square of the load.
+
+M6 of arXiv 2410.08650.
+"""
 
 from lerobot_vtrefine.diagnose.servo.candidates.base import Candidate
 

@@ -1,4 +1,7 @@
-"""stribeck_friction: at rest and at low speed friction is larger than in motion (M2 of arXiv 2410.08650)."""
+"""stribeck_friction: friction is larger at rest and at low speed than in motion.
+
+M2 of arXiv 2410.08650.
+"""
 
 from lerobot_vtrefine.diagnose.servo.candidates.base import Candidate
 

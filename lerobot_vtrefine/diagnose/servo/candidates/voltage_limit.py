@@ -1,4 +1,4 @@
-"""voltage_limit: the drive puts less of its supply on the motor than it should."""
+"""voltage_limit: the drive limits the motor's voltage more than it should."""
 
 import numpy as np
 
