@@ -2,7 +2,7 @@
 
 One channel. A candidate is accepted if it passed the score test and predicts trials left out better: forward,
 one at a time, and backward after every step. Plain forms are fitted first, others where the plain one comes
-near the best.
+near the best. Names in their final forms must pass the score test again.
 """
 
 from collections.abc import Callable, Sequence
@@ -258,11 +258,11 @@ class ScreenedSearch[P: ScreenedProblem[Any, Any], F: ScoredFit, C: FormCandidat
 def still_found[P: ScreenedProblem[Any, Any], F: ScoredFit, C: FormCandidate](
     selection: Selection[P, F, C], seed: int
 ) -> Selection[P, F, C]:
-    """Only names that the score test would find once more beside all the others, the least sure dropped first.
+    """Only names that the score test finds once more beside all the others, the least sure dropped first.
 
     A name may have been accepted beside a form of another that was not right yet, and stand in for what the
-    right one does. What its removal costs does not tell: weights around a model that has it suit no model that
-    has not, and any further coordinate predicts better where a form is not quite right.
+    right one does. What its removal costs does not tell: weights around a model that has it suit no model
+    that has not, and any further coordinate predicts better where a form is not quite right.
     """
     while len(chosen := selection.chosen.get(CHANNEL, ())) > 1:
         tested = [item for item in chosen if not selection.observed(item.cause)]
