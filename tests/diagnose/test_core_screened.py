@@ -10,7 +10,7 @@ from lerobot_vtrefine.diagnose.core.problem import OptionalSteps, PlainCandidate
 from lerobot_vtrefine.diagnose.core.score_test import Probe, cleared, screen
 from lerobot_vtrefine.diagnose.core.screened_search import ScreenedSearch
 
-TRIALS, FRAMES, NOISE = 24, 60, 0.1
+TRIALS, FRAMES, NOISE, COLUMNS = 24, 60, 0.1, 5
 CONDITIONS = tuple(f"c{k // 2}" for k in range(TRIALS))
 
 
@@ -66,16 +66,16 @@ class Toy(OptionalSteps):
         return tuple(str(k) for k in range(len(self.x)))
 
     def columns(self):
-        """x, |x|, x^2, and nearly |x| again."""
+        """x, |x|, x^2, nearly |x| again, and x^4."""
         x = self.x
-        return np.stack([x, np.abs(x), x**2, np.sqrt(x**2 + 1e-3)], -1)
+        return np.stack([x, np.abs(x), x**2, np.sqrt(x**2 + 1e-3), x**4], -1)
 
     def subset(self, trials):
         conditions = tuple(self.conditions[k] for k in trials)
         return replace(self, x=self.x[trials], y=self.y[trials], conditions=conditions)
 
     def solved(self, free, weights):
-        theta = np.zeros(4)
+        theta = np.zeros(COLUMNS)
         root = np.sqrt(weights)[:, None]
         design = (root[..., None] * self.columns()[..., list(free)]).reshape(-1, len(free))
         theta[list(free)] = np.linalg.lstsq(design, (root * self.y).ravel(), rcond=None)[0]
@@ -122,7 +122,7 @@ class Toy(OptionalSteps):
         return self.fit([k for k in now.free if k not in [item.column for item in candidates]])
 
     def errors(self, fit):
-        return self.mse(fit.theta if fit.told else np.array([1.0, 0, 0, 0]))
+        return self.mse(fit.theta if fit.told else np.eye(COLUMNS)[0])
 
     def reweighted(self, fit):
         return Refits(self, fit)
@@ -135,7 +135,7 @@ class Toy(OptionalSteps):
 
     def log_scores(self, fit):
         """Trials have gains of their own, which log scores allow for."""
-        theta = fit.theta if fit.told else np.array([1.0, 0, 0, 0])
+        theta = fit.theta if fit.told else np.eye(COLUMNS)[0]
         left = self.y - self.columns() @ theta
         shared = self.scatter**2 / (NOISE**2 + self.scatter**2 * np.square(self.x).sum(1))
         return -0.5 * (np.square(left).sum(1) - shared * (left * self.x).sum(1) ** 2) / NOISE**2
@@ -298,3 +298,34 @@ def test_what_weights_forgive_is_no_cause() -> None:
         assert bool(found.chosen) == bool(found.p_values) == (found.fit.free != (0,))
         kept += bool(found.chosen)
     assert kept <= 5
+
+
+@dataclass(frozen=True)
+class Late(Toy):
+    """The right form of a cause, |x| in place of x^2, is only tried once names are settled."""
+
+    def reviewed(self, selection, seed):
+        right = {"curve": Form("curve", column=1)}
+        chosen = tuple(right.get(item.cause, item) for item in selection.chosen[0])
+        fitted = self.fit((0, *(item.column for item in chosen)))
+        return replace(selection, fit=fitted, chosen={0: chosen})
+
+
+def test_a_name_that_only_patched_the_form_of_another_is_dropped_once_that_form_is_right() -> None:
+    problem = Late(**vars(toy(0.6, offered=(Form("curve", column=2), Form("patch", column=4)))))
+    searched = ScreenedSearch(problem, 0, lambda text: None).run()
+    assert names_of(searched) == ["curve", "patch"]
+    assert searched.p_value("patch") < 0.02
+    assert names_of(problem.reviewed(searched, 0)) == ["curve", "patch"]
+    found = infer(problem)
+    assert names(found) == ["curve"]
+    assert found.selection.p_value("patch") is None
+    np.testing.assert_array_equal(found.selection.fit.theta[[2, 3, 4]], 0.0)
+
+
+def test_names_that_both_act_are_found_again_beside_each_other() -> None:
+    problem = Late(**vars(toy(0.6, offered=(Form("curve", column=2), Form("patch", column=4)))))
+    both = replace(problem, y=problem.y - 0.5 * problem.x**4)
+    found = infer(both)
+    assert names(found) == ["curve", "patch"]
+    assert found.selection.p_value("patch") is not None

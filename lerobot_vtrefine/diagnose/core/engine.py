@@ -11,7 +11,7 @@ from lerobot_vtrefine.diagnose.core.problem import Candidate, Fit, Problem
 from lerobot_vtrefine.diagnose.core.resampling import gain_interval
 from lerobot_vtrefine.diagnose.core.rivals import Rival, find_rivals, settled
 from lerobot_vtrefine.diagnose.core.screened_rivals import screened_rivals
-from lerobot_vtrefine.diagnose.core.screened_search import ScreenedSearch
+from lerobot_vtrefine.diagnose.core.screened_search import ScreenedSearch, still_found
 from lerobot_vtrefine.diagnose.core.search import ALL, Search, Selection
 from lerobot_vtrefine.diagnose.core.suspicion import Alarm, observed, raise_alarms
 
@@ -69,6 +69,8 @@ def infer[P: Problem[Any, Any]](
     search: Any = ScreenedSearch if problem.screens else Search
     selection = search(problem, seed, _steps(tell)).run()
     selection = selection.problem.reviewed(selection, seed)
+    if problem.screens:
+        selection = still_found(selection, seed)
     whole = whole.revised(selection.fit, [item for items in selection.chosen.values() for item in items])
     tell(f"{whole.subject}: looking for what is left", 0.6)
     alarms = raise_alarms(selection, selection.problem.suspicions(selection, seed), seed)

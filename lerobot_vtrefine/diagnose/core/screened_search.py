@@ -2,11 +2,12 @@
 
 One channel. A candidate is accepted if it passed the score test and predicts trials left out better: forward,
 one at a time, and backward after every step. Plain forms are fitted first, others where the plain one comes
-near the best.
+near the best. Names in their final forms must pass the score test again.
 """
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -22,6 +23,7 @@ from lerobot_vtrefine.diagnose.core.rules import (
     MAX_ROUNDS,
     PROMISING,
     RICH,
+    SCREEN_ALPHA,
 )
 from lerobot_vtrefine.diagnose.core.search import Examined, Selection
 
@@ -251,6 +253,47 @@ class ScreenedSearch[P: ScreenedProblem[Any, Any], F: ScoredFit, C: FormCandidat
             )
             for item in self.first
         }
+
+
+def still_found[P: ScreenedProblem[Any, Any], F: ScoredFit, C: FormCandidate](
+    selection: Selection[P, F, C], seed: int
+) -> Selection[P, F, C]:
+    """Only names that the score test finds once more beside all the others, the least sure dropped first.
+
+    A name may have been accepted beside a form of another that was not right yet, and stand in for what the
+    right one does. What its removal costs does not tell: weights around a model that has it suit no model
+    that has not, and any further coordinate predicts better where a form is not quite right.
+    """
+    while len(chosen := selection.chosen.get(CHANNEL, ())) > 1:
+        tested = [item for item in chosen if not selection.observed(item.cause)]
+        without = on_all_cores(partial(_without, selection), tested)
+        p_values = [_p_beside(*slim, item.cause) for slim, item in zip(without, tested, strict=True)]
+        worst = int(np.argmax(p_values)) if tested else 0
+        if not tested or p_values[worst] <= SCREEN_ALPHA:
+            break
+        (problem, fit), gone = without[worst], tested[worst]
+        selection = replace(
+            selection,
+            problem=problem,
+            fit=fit,
+            errors=out_of_fold(problem, fit, folds_for(problem.conditions, seed)).errors,
+            chosen={CHANNEL: tuple(item for item in chosen if item is not gone)},
+            p_values={key: p for key, p in selection.p_values.items() if key[0] != gone.cause},
+        )
+    return selection
+
+
+def _without(selection: Selection[Any, Any, Any], candidate: Any) -> tuple[Any, Any]:
+    """Problem and fit without a candidate, under weights of their own."""
+    return selection.problem.weighed(selection.problem.reduced(selection.fit, [candidate], _ONE))
+
+
+def _p_beside(problem: Any, now: Any, cause: str) -> float:
+    """Adjusted over all candidates that a fit does not hold; 0 where the cause is seen in the readings."""
+    found = next((item for item in problem.screened(now) if item.candidate.cause == cause), None)
+    if found is None:
+        return 1.0
+    return found.tested.p_adjusted or 0.0
 
 
 def _promise(item: Promise[Any]) -> float:
