@@ -9,7 +9,7 @@
 A simulation with hidden physics stands in for reality (``--env.reality``); nothing is ever trained in it. The
 same recipe (an encoder where the policy has one, demonstrations by the scripted expert, imitation, DPPO) is
 followed in the plain simulator and in the one that ``vtrefine-diagnose`` made from recordings: presses of the
-hidden pad, or episodes of the hidden robot. Budgets and seeds are the same. All policies are then evaluated
+hidden pad, or motions of the hidden robot. Budgets and seeds are the same. All policies are then evaluated
 in the stand-in reality and in their own simulator, on the same episodes. Every stage is a command that users
 run; interrupted and started again, it continues. With ``--jobs`` several run side by side, each on cores of
 its own and on the GPUs by turns; one that fails does not stop the others, and the comparison is of the seeds
@@ -49,6 +49,7 @@ from lerobot_vtrefine.shipped import find
 from lerobot_vtrefine.sim.reality import SCHEMA
 
 MOTION_SEED_OFFSET = 500_000
+MOTION_S = 14
 """Between the seeds of demonstrations and those of fine-tuning."""
 
 
@@ -118,25 +119,29 @@ def press_stage(budget: Budget, name: str) -> Stage:
 
 
 def motion_stage(budget: Budget, name: str) -> Stage:
-    """Episodes of the scripted expert on a hidden robot, whether they succeed or not.
-
-    It takes the parts from the table: motions that are wide beside any play.
-    """
-    config = recipe(budget, budget.seeds[0])
+    """Motions of a hidden robot, recorded as a real one's are: by stock lerobot-record, in real time."""
     output = budget.output_dir / folder_name(name) / "motions"
-    command = [
-        "vtrefine-record-demos",
-        f"--root={output}",
-        "--repo_id=local/motions",
-        f"--num_episodes={budget.motions}",
-        f"--num_envs={budget.motions}",
-        "--include_failures=true",
-        f"--seed={config.seed * SEED_STRIDE + MOTION_SEED_OFFSET}",
-        *flags("env", {"type": "vtrefine"} | world_env(budget, f"real:{name}") | {"start": "table"}),
-        *flags("degradation", config.degradation),
-    ]
+    env = world_env(budget, f"real:{name}") | {"start": "table"}
+    command = (
+        "lerobot-record",
+        "--robot.type=vtrefine_sim",
+        f"--robot.env={json.dumps({key: value for key, value in env.items() if key != 'backend'})}",
+        f"--robot.seed={budget.seeds[0] * SEED_STRIDE + MOTION_SEED_OFFSET}",
+        "--teleop.type=vtrefine_ee",
+        "--teleop.input=excitation",
+        "--dataset.repo_id=local/motions",
+        f"--dataset.root={output}",
+        f"--dataset.num_episodes={budget.motions}",
+        f"--dataset.episode_time_s={MOTION_S}",
+        "--dataset.reset_time_s=0",
+        "--dataset.fps=10",
+        "--dataset.single_task=move",
+        "--dataset.video=false",
+        "--dataset.push_to_hub=false",
+        "--play_sounds=false",
+    )
     stage, title = f"record_{folder_name(name)}", f"Record the robot of {name}"
-    return Stage(stage, title, tuple(command), output, output / "meta" / "info.json", resumable=True)
+    return Stage(stage, title, command, output, output / "meta" / "info.json")
 
 
 def output_name(name: str) -> str:

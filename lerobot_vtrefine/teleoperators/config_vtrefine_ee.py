@@ -10,7 +10,7 @@ from lerobot.teleoperators.config import TeleoperatorConfig
 from lerobot_vtrefine.embodiments import DEFAULT_BODY, get_embodiment
 from lerobot_vtrefine.lerobot_compat.config_errors import told_by_lerobot
 
-INPUTS = ("keyboard", "gamepad", "spacemouse", "headset", "webxr", "lerobot", "recording")
+INPUTS = ("keyboard", "gamepad", "spacemouse", "headset", "webxr", "lerobot", "recording", "excitation")
 FRAMES = ("world", "tool")
 
 
@@ -22,7 +22,8 @@ class VtRefineEeConfig(TeleoperatorConfig):
     Attributes:
         embodiment: Whose arms: the name of a robot of this package.
         input: keyboard, gamepad, spacemouse, headset (its two controllers, in its browser), webxr (a phone
-            per hand, in its browser), lerobot (its own teleoperators, see devices) or recording.
+            per hand, in its browser), lerobot (its own teleoperators, see devices), recording, or excitation
+            (nobody: the hands sway so that every joint moves back and forth, for vtrefine-diagnose).
         devices: For input=lerobot, by the arm's name: one of LeRobot's end-effector teleoperators with its
             fields, such as "{right: {type: gamepad}}". An arm without one stays where it is.
         path: The recorded controllers, for input=recording: an .npz file, see docs/teleoperation.md.

@@ -1,10 +1,12 @@
 """Comparing simulators: equal budgets, nothing trained in the stand-in reality, honest differences."""
 
 import json
+from dataclasses import replace
 
 import compare_reality as compare
 import numpy as np
 import pytest
+import yaml
 
 from lerobot_vtrefine.cli.results.collect import ORIGIN
 from lerobot_vtrefine.cli.results.tables import table
@@ -12,6 +14,7 @@ from lerobot_vtrefine.diagnose.joints.model import RobotModel
 from lerobot_vtrefine.diagnose.pad import stand_in_rig as press
 from lerobot_vtrefine.embodiments import ALOHA
 from lerobot_vtrefine.finetune.logger import ProgressLog
+from lerobot_vtrefine.robots.config_vtrefine_sim import VtRefineSimConfig
 from lerobot_vtrefine.tactile.model import SensorModel
 
 
@@ -212,3 +215,15 @@ def test_a_reality_without_sensor_model_cannot_be_pressed(tmp_path):
     (tmp_path / "reality.json").write_text(json.dumps({"schema": "vtrefine/reality@1"}))
     with pytest.raises(ValueError, match="has no sensor model"):
         press.record(tmp_path / "reality.json", tmp_path / "presses", 4, 0)
+
+
+def test_a_hidden_robot_is_moved_by_the_stock_recorder(budget):
+    """In its own world, which the simulated robot accepts: without the back end of many worlds."""
+    own = replace(budget, env={**budget.env, "backend": "warp"})
+    flags = flags_of(compare.motion_stage(own, "control_latency+backlash"))
+    robot = VtRefineSimConfig(env=yaml.safe_load(flags["robot.env"]), seed=int(flags["robot.seed"]))
+    env = robot.simulation()
+    assert env.hidden.robot is not None
+    assert env.hidden.robot.control_latency_s == 0.1
+    assert env.scene_config.start == "table"
+    assert (flags["teleop.input"], flags["dataset.num_episodes"]) == ("excitation", str(own.motions))

@@ -41,6 +41,10 @@ def make_source(config: VtRefineEeConfig, arms: list[str]) -> Source:
 
         assert config.path is not None
         return RecordedControllers(config.path, arms)
+    if config.input == "excitation":
+        from lerobot_vtrefine.teleoperators.inputs.excitation import Excitation
+
+        return Excitation(arms, config.fps)
     if config.input == "webxr":
         from lerobot_vtrefine.teleoperators.inputs.webxr import WebXrControllers
 
