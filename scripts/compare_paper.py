@@ -160,7 +160,7 @@ def policy_settings(options: argparse.Namespace, policy: Trained) -> dict[str, A
     recipe: dict[str, Any] = RECIPES[options.recipe]["policy"] | options.policy
     if trains_encoder(options):
         return recipe | {"pretrained_encoder": str(encoder_stage(options, policy.pair).output)}
-    if options.recipe == "pads":
+    if options.recipe == "pads" and options.encoder:
         recipe = {"pretrained_encoder": options.encoder.format(pair=policy.pair)} | recipe
     return recipe
 

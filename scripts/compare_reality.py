@@ -49,8 +49,9 @@ from lerobot_vtrefine.shipped import find
 from lerobot_vtrefine.sim.reality import SCHEMA
 
 MOTION_SEED_OFFSET = 500_000
-MOTION_S = 14
 """Between the seeds of demonstrations and those of fine-tuning."""
+MOTION_S = 14
+"""Of one motion of a hidden robot."""
 
 
 def env_flags(budget: Budget, world: str) -> list[str]:

@@ -120,3 +120,12 @@ def test_every_pair_trains_an_encoder_from_the_table_and_policies_learn_on_its_f
         assert imitation.command[1].endswith("clone_on_features.py")
         assert '"pretrained_encoder": "out/encoder_00446"' in imitation.line
         assert f'"modalities": "{policy.senses}"' in imitation.line
+
+
+def test_an_encoder_that_is_named_is_taken_in_place_of_one_trained_here() -> None:
+    for given in ("--encoder=mine", '--policy={"pretrained_encoder": "mine"}'):
+        options = parse(["--mesh_dir=meshes", "--pairs=00446", "--seeds=0", given])
+        for policy in script.chosen(options):
+            record, imitation, *_ = script.stages(options, policy)
+            assert imitation.needs == (record.name,)
+            assert '"pretrained_encoder": "mine"' in imitation.line
