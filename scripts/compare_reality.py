@@ -63,7 +63,11 @@ def imitation_stages(budget: Budget, world: str) -> list[Stage]:
     """What fine-tuning in a simulator starts from: its encoder, demonstrations, and the policy they teach."""
     config = recipe(budget, budget.seeds[0], world)
     encoder = [encoder_stage(budget, world)] if budget.own_encoder else []
-    record = replace(record_stage(config), name=folder_name("record", world), needs=diagnosis_needed(world))
+    record = record_stage(config)
+    command = (*(word for word in record.command if not word.startswith("--env.")), *env_flags(budget, world))
+    record = replace(
+        record, name=folder_name("record", world), command=command, needs=diagnosis_needed(world)
+    )
     needs = (record.name, *(stage.name for stage in encoder))
     return [
         *encoder,

@@ -52,7 +52,11 @@ class Budget:
 
 
 def recipe(budget: Budget, seed: int, world: str = "plain") -> DemoConfig:
-    """The demo's recipe with this budget, in one of the simulators."""
+    """The demo's recipe with this budget, in one of the simulators; its environment is the plain one.
+
+    A `DemoConfig` reads the files that its environment names, and a diagnosis' are not there yet when the
+    stages after it are planned: these get them as flags, from `world_env`.
+    """
     encoder = {"pretrained_encoder": str(budget.encoder(world))} if budget.own_encoder else {}
     return DemoConfig(
         output_dir=budget.output_dir / folder_name("imitation", world),
@@ -64,7 +68,7 @@ def recipe(budget: Budget, seed: int, world: str = "plain") -> DemoConfig:
         finetune_envs=budget.envs,
         eval_episodes=budget.eval_episodes,
         eval_envs=budget.eval_envs,
-        env=world_env(budget, world),
+        env=world_env(budget, "plain"),
         degradation=budget.degradation,
         recipe=budget.recipe,
         policy=budget.policy | encoder,

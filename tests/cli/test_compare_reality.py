@@ -227,3 +227,18 @@ def test_a_hidden_robot_is_moved_by_the_stock_recorder(budget):
     assert env.hidden.robot.control_latency_s == 0.1
     assert env.scene_config.start == "table"
     assert (flags["teleop.input"], flags["dataset.num_episodes"]) == ("excitation", str(own.motions))
+
+
+def test_a_run_is_planned_before_anything_is_diagnosed(tmp_path):
+    """And its demonstrations are recorded in the simulator that the diagnosis will leave."""
+    budget = compare.Budget(tmp_path, tuple(compare.REALITIES), (3,), "cpu", 4, 20, 1, 4, 4, 4, 8, 3, {})
+    compare.write_worlds(budget)
+    before, policies = compare.lanes(budget)
+    assert len(policies) == 1 + len(budget.realities)
+    for name in budget.realities:
+        world = f"diagnosed:{name}"
+        lane = {stage.name: flags_of(stage) for stage in before[compare.folder_name(world)]}
+        given = "env.reality" if compare.of_robot(name) else "env.sensor_model"
+        record = lane[compare.folder_name("record", world)]
+        assert record[given] == str(budget.diagnosis(name) / "sensor_model.json")
+        assert record["root"] == str(compare.recipe(budget, 3, world).dataset_dir)
