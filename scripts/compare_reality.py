@@ -50,7 +50,7 @@ from lerobot_vtrefine.sim.reality import SCHEMA
 
 MOTION_SEED_OFFSET = 500_000
 """Between the seeds of demonstrations and those of fine-tuning."""
-MOTION_S = 14
+MOTION_S, MOTION_HZ = 14, 10
 """Of one motion of a hidden robot."""
 
 
@@ -126,7 +126,8 @@ def press_stage(budget: Budget, name: str) -> Stage:
 def motion_stage(budget: Budget, name: str) -> Stage:
     """Motions of a hidden robot, recorded as a real one's are: by stock lerobot-record, in real time."""
     output = budget.output_dir / folder_name(name) / "motions"
-    env = world_env(budget, f"real:{name}") | {"start": "table"}
+    whole = {"start": "table", "episode_steps": MOTION_S * MOTION_HZ}  # the recorder stops where episodes end
+    env = world_env(budget, f"real:{name}") | whole
     command = (
         "lerobot-record",
         "--robot.type=vtrefine_sim",
@@ -139,7 +140,7 @@ def motion_stage(budget: Budget, name: str) -> Stage:
         f"--dataset.num_episodes={budget.motions}",
         f"--dataset.episode_time_s={MOTION_S}",
         "--dataset.reset_time_s=0",
-        "--dataset.fps=10",
+        f"--dataset.fps={MOTION_HZ}",
         "--dataset.single_task=move",
         "--dataset.video=false",
         "--dataset.push_to_hub=false",

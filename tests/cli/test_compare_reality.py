@@ -219,13 +219,14 @@ def test_a_reality_without_sensor_model_cannot_be_pressed(tmp_path):
 
 def test_a_hidden_robot_is_moved_by_the_stock_recorder(budget):
     """In its own world, which the simulated robot accepts: without the back end of many worlds."""
-    own = replace(budget, env={**budget.env, "backend": "warp"})
+    own = replace(budget, env={**budget.env, "backend": "warp", "episode_steps": 41})
     flags = flags_of(compare.motion_stage(own, "control_latency+backlash"))
     robot = VtRefineSimConfig(env=yaml.safe_load(flags["robot.env"]), seed=int(flags["robot.seed"]))
     env = robot.simulation()
     assert env.hidden.robot is not None
     assert env.hidden.robot.control_latency_s == 0.1
     assert env.scene_config.start == "table"
+    assert env.task_config.episode_steps / env.fps == float(flags["dataset.episode_time_s"])
     assert (flags["teleop.input"], flags["dataset.num_episodes"]) == ("excitation", str(own.motions))
 
 
