@@ -223,6 +223,11 @@ def uses_bank(options: argparse.Namespace, policy: Trained) -> bool:
     return options.tune_start == "bank" and policy.demonstrations > 0
 
 
+def practice_steps(options: argparse.Namespace) -> list[str]:
+    """When episodes end that start from a bank; grasps that come later are none of its states."""
+    return [f"--env.episode_steps={options.tune_steps}"] if options.tune_steps else []
+
+
 def bank_stage(options: argparse.Namespace, policy: Trained) -> Stage:
     """States with both parts in hand: the imitation's own, then the expert's."""
     out = options.output_dir / f"starts_{policy.name}"
@@ -232,6 +237,7 @@ def bank_stage(options: argparse.Namespace, policy: Trained) -> Stage:
         "vtrefine-record-starts",
         *task_flags(options, policy.pair),
         f"--env.backend={options.backend}",
+        *practice_steps(options),
         f"--path={product}",
         f"--policy.path={checkpoint(start)}",
         f"--policy.device={options.device}",
@@ -254,7 +260,7 @@ def finetune_stage(options: argparse.Namespace, policy: Trained) -> Stage:
         *task_flags(options, policy.pair),
         *(["--env.start=grasped"] if grasped else []),
         *(f"--env.start_bank={stage.product}" for stage in bank),
-        *([f"--env.episode_steps={options.tune_steps}"] if bank and options.tune_steps else []),
+        *(practice_steps(options) if bank else []),
         f"--env.backend={options.backend}",
         f"--policy.path={checkpoint(start)}",
         f"--policy.device={options.device}",

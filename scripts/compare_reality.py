@@ -313,7 +313,9 @@ def reality_rows(
     """
     rows = []
     for name in REALITIES:
-        verdict = read_json(folder / folder_name(name) / "diagnosis" / "verdict.json") or {"causes": []}
+        verdict = read_json(folder / folder_name(name) / "diagnosis" / "verdict.json")
+        if verdict is None:  # this reality was not among --realities
+            continue
         causes = ", ".join(cause["name"] for cause in verdict["causes"]) or "nothing"
         for title, (trained, world) in cells(name).items():
             prefix = folder_name("eval", trained, "in", world, "")

@@ -3,12 +3,10 @@
 Shapes: N worlds of which m are addressed by ids, nu servos, J joints.
 """
 
-import copy
 from collections.abc import Mapping
 from typing import Any, override
 
 import numpy as np
-import torch
 
 from lerobot_vtrefine.embodiments import Embodiment
 from lerobot_vtrefine.sim import task
@@ -80,20 +78,21 @@ class FaultyDrive(Drive):
     def advance(self, ids: Array, before: Array, after: Array) -> Trace:
         history = np.concatenate([(after - self._offset)[:, None], self._history[ids, :-1]], axis=1)
         self._history[ids] = history
-        traces = []
-        for target, substeps in self._pieces(history):
-            start = self._servo[ids]
-            stop = start.clip(target - self._half_play, target + self._half_play)
-            traces.append(_copied(self._backend.advance_linearly(ids, start, stop, substeps)))
-            self._servo[ids] = stop
-        return Trace(_joined([trace.qpos for trace in traces]), _joined([trace.sensors for trace in traces]))
+        controls = self._late(history)
+        servo = self._servo[ids]
+        for step in range(self._substeps):
+            target = controls[:, step]
+            servo = controls[:, step] = servo.clip(target - self._half_play, target + self._half_play)
+        self._servo[ids] = servo
+        return self._backend.advance(ids, controls)
 
-    def _pieces(self, history: Array) -> list[tuple[Array, int]]:
-        """Stretches of substeps with the command (m, nu) at their end: a late one turns within the step."""
-        new, middle = history[:, self._whole], history[:, self._whole + 1]
-        last = self._substeps - self._rest
-        pieces = [(middle, self._rest), (middle + last / self._substeps * (new - middle), last)]
-        return [piece for piece in pieces if piece[1] > 0]
+    def _late(self, history: Array) -> Array:
+        """What reaches the servos in the substeps of one control step (m, K, nu): a late command turns within
+        the step.
+        """
+        new, turn, old = (history[:, self._whole + back, None] for back in range(3))
+        past = ((np.arange(self._substeps) + 1.0 - self._rest) / self._substeps)[:, None]
+        return turn + past * np.where(past > 0, new - turn, turn - old)
 
     @override
     def readings(self, joints: Array) -> Array:
@@ -106,16 +105,6 @@ class FaultyDrive(Drive):
     @override
     def set_state(self, env: int | Array, state: Any) -> None:
         self._history[env], self._servo[env] = state
-
-
-def _copied(trace: Trace) -> Trace:
-    """A trace is valid until the backend's next call only."""
-    return Trace(copy.deepcopy(trace.qpos), copy.deepcopy(trace.sensors))
-
-
-def _joined(parts: list[Any]) -> Any:
-    """One stretch of substeps after the other (m, K, n), where they lie."""
-    return torch.cat(parts, 1) if isinstance(parts[0], torch.Tensor) else np.concatenate(parts, 1)
 
 
 def make_drive(

@@ -51,6 +51,21 @@ def test_commands_that_never_come_are_no_delay(tmp_path) -> None:
     assert found.verdict.status == "unexplained"
 
 
+def test_a_delay_is_fitted_beside_the_play_of_every_joint(tmp_path) -> None:
+    # Play has kinks; where one joint's makes a step of the shared delay worse, the other joints must still move.
+    joints = ("waist", "shoulder", "elbow", "forearm_roll", "wrist_angle", "wrist_rotate")
+    play = dict.fromkeys(joints, 0.02)
+    rig = Rig(joints=joints, rate_hz=10.0, replicates=1, latency_s=0.1, backlash=play, noise=1.0)
+    found = diagnosed(rig, tmp_path, seed=1).verdict
+    assert found.status == "explained"
+    params = {cause.name: cause.params for cause in found.causes}
+    assert set(params) == {"control_latency", "backlash"}
+    (tau,) = params["control_latency"].values()
+    assert tau.ci95[0] <= 0.1 <= tau.ci95[1]
+    assert len(params["backlash"]) == len(joints)
+    assert all(width.value == pytest.approx(0.02, rel=0.05) for width in params["backlash"].values())
+
+
 def test_servos_that_are_never_quite_the_same_are_no_fault(tmp_path) -> None:
     # Fine encoders see two per cent of stiffness from trial to trial.
     found = diagnosed(replace(SMALL, servo_scatter=0.02, noise=0.1, quantum=1e-5), tmp_path)

@@ -21,6 +21,7 @@ from lerobot_vtrefine.datasets.features import (
 from lerobot_vtrefine.embodiments import ALOHA
 from lerobot_vtrefine.policies.vt_dp3 import VtDp3Config
 from lerobot_vtrefine.policies.vt_dp3.modeling_vt_dp3 import VtDp3Policy
+from lerobot_vtrefine.policies.vt_dp3.observation_encoder import PERCEIVED_KEY
 
 Batch = dict[str, torch.Tensor]
 
@@ -274,3 +275,24 @@ def test_other_checkpoints_are_refused_in_one_line(tmp_path: Path) -> None:
     (tmp_path / "empty").mkdir()
     with pytest.raises(FileNotFoundError, match="pretrained_model folder"):
         VtDp3Policy.from_pretrained(tmp_path / "empty")
+
+
+def test_feature_noise_blurs_what_cloning_sees_and_nothing_else(monkeypatch: pytest.MonkeyPatch) -> None:
+    policy, batch = make_policy(feature_noise=0.5), make_batch(256)
+    model = policy.online
+    assert model is not None
+    clear = model.encoder.perceive(batch)
+    seen: list[Batch] = []
+    encode = model.encode
+    monkeypatch.setattr(model, "encode", lambda known: seen.append(known) or encode(known))
+    policy.eval()(batch)
+    policy.train()(batch)
+    policy.train()(batch | {PERCEIVED_KEY: clear})
+    assert PERCEIVED_KEY not in seen[0]
+    for known in seen[1:]:
+        noise = known[PERCEIVED_KEY] - clear
+        torch.testing.assert_close(noise[:, 0], noise[:, 1], rtol=1e-3, atol=1e-5)
+        ratio = noise[:, 0].std(0) / clear.flatten(0, 1).std(0).clamp(min=1e-9)
+        assert ratio[clear.flatten(0, 1).std(0) > 1e-3].mean().item() == pytest.approx(0.5, rel=0.05)
+    with pytest.raises(ParsingError, match=r"policy\.feature_noise must not be negative"):
+        make_policy(feature_noise=-1.0)

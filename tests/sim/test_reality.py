@@ -34,11 +34,13 @@ class Recorder:
     def __init__(self):
         self.commands = []
 
+    def advance(self, ids, controls):
+        self.commands.append(controls)
+        return Trace(controls, controls)
+
     def advance_linearly(self, ids, start, stop, substeps):
         weight = ((np.arange(substeps) + 1) / substeps)[None, :, None]
-        rows = start[:, None] + weight * (stop - start)[:, None]
-        self.commands.append(rows)
-        return Trace(rows, rows)
+        return self.advance(ids, start[:, None] + weight * (stop - start)[:, None])
 
     def series(self):
         return np.concatenate(self.commands, axis=1)
@@ -82,6 +84,9 @@ def test_play_swallows_reversals_of_its_joint_only():
     ends = seen[0, SUBSTEPS - 1 :: SUBSTEPS]
     np.testing.assert_allclose(ends[:, ELBOW], [0.185, 0.185, 0.015])
     assert not np.delete(seen, ELBOW, axis=2).any()
+    # On the way there nothing moves until the play is taken up, half of its width on that side.
+    way = seen[0, :SUBSTEPS, ELBOW]
+    np.testing.assert_allclose(way, (np.linspace(0, 0.2, SUBSTEPS + 1)[1:] - 0.015).clip(0), atol=1e-12)
 
 
 def test_encoder_offset_shifts_readings_and_commands_alike():

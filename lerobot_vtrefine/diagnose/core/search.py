@@ -217,7 +217,8 @@ class Search[P: SearchedProblem[Any, Any], F: Fit, C: Candidate]:
                 self._take(item, ALL)
                 self.changed = np.ones_like(self.changed)
                 return True
-        self.changed = np.isin(np.arange(len(self.changed)), list(best))
+        # What all share changes with every cause that is accepted, and so do all channels.
+        self.changed = np.isin(np.arange(len(self.changed)), list(best)) | bool(best and self.shared)
         for channel, item in best.items():
             self._take(item, channel)
         if best:

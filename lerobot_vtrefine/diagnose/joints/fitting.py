@@ -254,6 +254,7 @@ class _Fitter:
     def __init__(self, problem: ServoTrials, free: Array, tau_free: bool) -> None:
         self.problem, self.free, self.tau_free = problem, free, tau_free
         self.damping = np.full(len(free), 1e-3)
+        self.damping_of_delay = 1e-3
         self.weight = problem.weight
         self.ridge = ridge(problem, free)
         self.settled: Array = ~np.any(free, axis=1)
@@ -266,14 +267,26 @@ class _Fitter:
         then = evaluate(self.problem, proposed, self.free, self.tau_free, now, open_joints)
         before, after = self._cost(now), self._cost(then)
         if self.tau_free:
-            before, after = (np.full(len(before), (x * self.weight).sum()) for x in (before, after))
+            return self._judged_together(now, then, before * self.weight, after * self.weight)
         better = (after < before) & ~self.settled
         gained = np.where(better, (before - after) / np.maximum(before, 1e-300), 0.0)
         self.damping = np.where(better, self.damping * 0.2, self.damping * 8).clip(1e-9, 1e9)
         self.settled |= (better & (gained < _TOLERANCE)) | (self.damping > _SHORTEST)
         if better.all():
             return then, bool(self.settled.all())
-        return _merged(now, then, better, self.tau_free), bool(self.settled.all())
+        return _merged(now, then, better), bool(self.settled.all())
+
+    def _judged_together(self, now: Fit, then: Fit, before: Array, after: Array) -> tuple[Fit, bool]:
+        """Joints meet in the delay: all of a step or nothing, by their costs (J,). One that it would harm
+        takes a shorter one next, and does not hold the others up.
+        """
+        better = bool(after.sum() < before.sum())
+        grown = np.where(after > before, 8.0, 0.2 if better else 1.0)
+        self.damping = (self.damping * grown).clip(1e-9, 1e9)
+        self.damping_of_delay = float(np.clip(self.damping_of_delay * (0.2 if better else 8.0), 1e-9, 1e9))
+        gained = 1 - after.sum() / max(before.sum(), 1e-300)
+        done = gained < _TOLERANCE if better else self.damping_of_delay > _SHORTEST
+        return (then if better else now), done
 
     def _cost(self, item: Fit) -> Array:
         return (item.residual**2).sum((0, 1)) + (self.ridge * item.point.theta**2).sum(1)
@@ -306,15 +319,14 @@ class _Fitter:
             index = [*range(end - sizes[joint], end), ends[-1]]
             normal[np.ix_(index, index)] += self.weight[joint] * block
             slope[index] += self.weight[joint] * right
-        change = solved(normal, slope, self.damping[0] + _LEAST_DAMPING)
+        damping = np.append(np.repeat(self.damping, sizes), self.damping_of_delay)
+        change = solved(normal, slope, damping + _LEAST_DAMPING)
         theta[self.free] += change[:-1]
         return float(change[-1])
 
 
-def _merged(now: Fit, then: Fit, better: Array, tau_free: bool) -> Fit:
+def _merged(now: Fit, then: Fit, better: Array) -> Fit:
     """Joints that improved as they are then, the others as they are now."""
-    if tau_free:  # joints meet in the delay: all or none
-        return then if better.any() else now
     point = replace(now.point, theta=np.where(better[:, None], then.point.theta, now.point.theta))
     mse = np.where(better, then.mse, now.mse)
     return replace(now, point=point, mse=mse, residual=np.where(better, then.residual, now.residual))

@@ -85,7 +85,11 @@ class JointProblem(ServoTrials, OptionalSteps):
         best, *others = (fit(self, start, free, iterations=_ITERATIONS, known=now) for start in starts)
         for other in others:
             best = self.merged(best, other, other.total < best.total)
-        return self.merged(now, best, channels)
+        best = self.merged(now, best, channels)
+        if not now.tau_free or 2 * np.count_nonzero(channels) <= len(channels):
+            return best
+        # What most joints lack the delay may have made up for: they must be able to move it together.
+        return fit(self, best.point, best.free, tau_free=True, iterations=_ITERATIONS)
 
     def _delayed(self, now: Fit, *, thorough: bool) -> Fit:
         starts = delay_starts(self)[: None if thorough else 1]

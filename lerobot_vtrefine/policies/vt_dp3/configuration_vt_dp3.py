@@ -93,6 +93,10 @@ class VtDp3Config(PreTrainedConfig):
     """Weight of an auxiliary loss while cloning: to tell, from what the policy sees, how the parts lie in
     their hands and touch, as ``vtrefine-record-demos --truth=true`` recorded it. 0: none.
     """
+    feature_noise: float = 0.0
+    """Noise on what cloud and pads are seen as while cloning, in standard deviations over the batch, the same
+    for all frames of a sample. From few demonstrations a policy otherwise learns by heart how each one felt.
+    """
     denoiser: str = ""
     """``unet`` (paper) or ``mlp``."""
     down_dims: tuple[int, ...] = ()
@@ -166,6 +170,8 @@ class VtDp3Config(PreTrainedConfig):
             )
         if self.auxiliary_weight < 0.0:
             raise ValueError(f"policy.auxiliary_weight must not be negative, got {self.auxiliary_weight}")
+        if self.feature_noise < 0.0:
+            raise ValueError(f"policy.feature_noise must not be negative, got {self.feature_noise}")
         if not 1 <= self.n_action_steps <= self.horizon:
             raise ValueError(f"policy.n_action_steps={self.n_action_steps} must be within 1..{self.horizon}")
         if self.denoiser == "unet" and self.horizon % 2 ** (len(self.down_dims) - 1):

@@ -22,7 +22,7 @@ from lerobot_vtrefine.policies.vt_dp3.configuration_vt_dp3 import VtDp3Config
 from lerobot_vtrefine.policies.vt_dp3.denoisers import MLPDenoiser, UNetDenoiser
 from lerobot_vtrefine.policies.vt_dp3.diffusion import DiffusionProcess, PredictNoise, deploy
 from lerobot_vtrefine.policies.vt_dp3.ema import Ema
-from lerobot_vtrefine.policies.vt_dp3.observation_encoder import load_encoder, make_encoder
+from lerobot_vtrefine.policies.vt_dp3.observation_encoder import PERCEIVED_KEY, load_encoder, make_encoder
 from lerobot_vtrefine.policies.vt_dp3.processor_vt_dp3 import widen_narrow_ranges
 
 Batch = dict[str, Tensor]
@@ -182,7 +182,7 @@ class VtDp3Policy(PreTrainedPolicy):
             )
         model = self.online or self.model
         draws = self.config.noise_draws if self.training else 1
-        cond = model.encode(batch)
+        cond = model.encode(self._blurred(model, batch) if self.training else batch)
         clean = batch[ACTION_KEY].repeat_interleave(draws, dim=0)
         noise = torch.randn_like(clean)
         t = torch.randint(self.config.num_train_timesteps, (len(clean),), device=clean.device)
@@ -195,6 +195,16 @@ class VtDp3Policy(PreTrainedPolicy):
             told = {"auxiliary_loss": missed.mean().item(), "noise_loss": loss.mean().item()}
             loss = loss + self.config.auxiliary_weight * missed
         return (loss if reduction == "none" else loss.mean()), told
+
+    def _blurred(self, model: VtDp3Model, batch: Batch) -> Batch:
+        """With ``config.feature_noise`` on the features of cloud and pads."""
+        if not self.config.feature_noise:
+            return batch
+        known = batch.get(PERCEIVED_KEY)
+        if known is None:
+            known = model.encoder.perceive(model.encoder.inputs(batch))
+        noise = torch.randn_like(known[:, :1]) * known.detach().flatten(0, 1).std(0)
+        return batch | {PERCEIVED_KEY: known + self.config.feature_noise * noise}
 
     def update(self) -> None:
         """Called by the trainer after every optimiser step: move the average."""
