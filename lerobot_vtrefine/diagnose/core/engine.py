@@ -67,10 +67,11 @@ def infer[P: Problem[Any, Any]](
     locked = np.array(lock(whole.conditions, seed) if locking else [], dtype=int)
     problem = whole.subset(np.setdiff1d(np.arange(count), locked))
     search: Any = ScreenedSearch if problem.screens else Search
-    selection = search(problem, seed, _steps(tell)).run()
+    selection = search(problem.thinned(), seed, _steps(tell)).run()
     selection = selection.problem.reviewed(selection, seed)
     if problem.screens:
         selection = still_found(selection, seed)
+    selection = problem.with_all_frames(selection)
     whole = whole.revised(selection.fit, [item for items in selection.chosen.values() for item in items])
     tell(f"{whole.subject}: looking for what is left", 0.6)
     alarms = raise_alarms(selection, selection.problem.suspicions(selection, seed), seed)

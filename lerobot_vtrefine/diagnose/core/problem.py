@@ -103,6 +103,14 @@ class OptionalSteps(Protocol):
         """The selection after a look at what candidates cannot say."""
         return selection
 
+    def thinned(self) -> Self:
+        """The same trials as the search sees them: with fewer readings, where there are more than it needs."""
+        return self
+
+    def with_all_frames(self, selection: "Selection[Any, Any, Any]") -> "Selection[Any, Any, Any]":
+        """What was selected on thinned trials, on whole ones."""
+        return selection
+
     def settles(self, rival: "Rival[Any, Any]", selection: "Selection[Any, Any, Any]", seed: int) -> int:
         """What else than the errors decides a tie: 1 for the rival, -1 for the cause, 0 for neither."""
         return 0

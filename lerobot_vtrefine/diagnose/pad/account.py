@@ -57,7 +57,11 @@ class PadAccount(OptionalRemarks):
 
     @cached_property
     def _power(self) -> Power:
-        return power_of(self.problem, self.fit)
+        searched = self.found.selection.problem
+        thin = searched.thinned()
+        if thin is searched:
+            return power_of(self.problem, self.fit)
+        return power_of(*thin.fitted_as(self.fit.model))
 
     @cached_property
     def _predicted(self) -> list[Predicted]:

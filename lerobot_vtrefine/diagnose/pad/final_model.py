@@ -129,7 +129,7 @@ def completed(selection: Selection["PadProblem", Any, Any], whole: "PadProblem")
     fitted, model = plain, plain.model
     around = problem
     if after.fit.model.families:
-        problem, fitted = problem.weighed(rest(after.fit.model, problem.presses, problem.weights))
+        problem, fitted = whole.fitted_as(after.fit.model)
         around, fitted = with_own_touch(problem, fitted)
         if after.model is after.fit.model:
             model = fitted.model

@@ -125,6 +125,12 @@ class Press:
         """When readings were new."""
         return Rhythm.of(self.time_s, self.signal, self.touching & ~silent(self.drive, self.signal))
 
+    def every(self, step: int) -> "Press":
+        """Only every so many frames."""
+        kept = slice(None, None, step)
+        images = ("drive", "rate", "signal", "touching", "resting")
+        return replace(self, trial=_cut(self.trial, kept), **{name: getattr(self, name)[kept] for name in images})
+
     @property
     def taxels(self) -> np.ndarray:
         """Row-major numbers in the whole pad of the scored taxels (n,)."""
@@ -172,6 +178,21 @@ class PressSet:
     def _subsets(self) -> dict[tuple[int, ...], "PressSet"]:
         return {}
 
+    def every(self, step: int) -> "PressSet":
+        """With every so many frames of each press."""
+        return replace(self, presses=tuple(press.every(step) for press in self.presses))
+
+    @property
+    def readings(self) -> int:
+        """Number of scored readings."""
+        return sum(press.signal.size for press in self.presses)
+
+    @property
+    def rate_hz(self) -> float:
+        """Frames per second of a typical press."""
+        steps = np.concatenate([np.diff(press.time_s) for press in self.presses])
+        return 1.0 / max(float(np.median(steps)), 1e-6) if len(steps) else 0.0
+
     @cached_property
     def bench(self) -> "Bench | LoweredBench":
         """The presses grouped for running models."""
@@ -216,9 +237,16 @@ def usable(trial: Trial) -> Trial | None:
     if len(order) < MIN_FRAMES:
         return None
     order = order[np.argsort(trial.time_s[order], kind="stable")]
-    names = ("time_s", "x_m", "y_m", "depth_m", "tilt_x_rad", "tilt_y_rad", "force_n", "temperature_c", "raw")
-    values = {name: getattr(trial, name) for name in names}
-    return replace(trial, **{k: v if v is None else v[order] for k, v in values.items()})
+    return _cut(trial, order)
+
+
+COLUMNS = ("time_s", "x_m", "y_m", "depth_m", "tilt_x_rad", "tilt_y_rad", "force_n", "temperature_c", "raw")
+
+
+def _cut(trial: Trial, frames: np.ndarray | slice) -> Trial:
+    """Some frames of a trial."""
+    values = {name: getattr(trial, name) for name in COLUMNS}
+    return replace(trial, **{k: v if v is None else v[frames] for k, v in values.items()})
 
 
 def prepare(recordings: RecordingSet, trials: list[Trial], learn: list[int]) -> PressSet:

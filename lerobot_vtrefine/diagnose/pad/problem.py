@@ -22,15 +22,30 @@ from lerobot_vtrefine.diagnose.pad import final_model, review
 from lerobot_vtrefine.diagnose.pad.baseline import Baseline, fit_baseline, plain_weights, weigh
 from lerobot_vtrefine.diagnose.pad.candidates import PLAIN
 from lerobot_vtrefine.diagnose.pad.candidates.base import Form
+from lerobot_vtrefine.diagnose.pad.candidates.sample_and_hold import repeated_share
 from lerobot_vtrefine.diagnose.pad.error_level import slow_errors
 from lerobot_vtrefine.diagnose.pad.final_model import FinalFit
-from lerobot_vtrefine.diagnose.pad.fitting import Fit, losses_of, predict, refit_weighted, squared_errors
+from lerobot_vtrefine.diagnose.pad.fitting import (
+    Fit,
+    losses_of,
+    predict,
+    refit_weighted,
+    rest,
+    squared_errors,
+)
 from lerobot_vtrefine.diagnose.pad.form_fitting import Starts, grown, settle, starts_of, with_form, without
 from lerobot_vtrefine.diagnose.pad.model import Composite
 from lerobot_vtrefine.diagnose.pad.noise import Noise
 from lerobot_vtrefine.diagnose.pad.own_touch import allowed, losses_at_own_touch
 from lerobot_vtrefine.diagnose.pad.press_trials import PressSet
-from lerobot_vtrefine.diagnose.pad.rules import FAR_OFF, FORGIVEN, FURTHER_GAIN
+from lerobot_vtrefine.diagnose.pad.rules import (
+    ENOUGH_HZ,
+    ENOUGH_READINGS,
+    FAR_OFF,
+    FEW_REPEATS,
+    FORGIVEN,
+    FURTHER_GAIN,
+)
 from lerobot_vtrefine.diagnose.pad.screening import DEAD, GAIN_MAP, all_probes, form_probes, forms_of
 from lerobot_vtrefine.diagnose.pad.suspicions import surprises, suspicions
 from lerobot_vtrefine.diagnose.pad.taxel_maps import MapEvidence, find_dead, map_evidence, map_of, with_map
@@ -119,6 +134,8 @@ class PadProblem(OptionalSteps):
     """Of the present fit; none before the baseline's."""
     noise: Noise | None = None
     """Around the present fit."""
+    whole: "PadProblem | None" = field(default=None, repr=False)
+    """The same recordings with all their frames, where these are some of them."""
 
     subject = "pad"
     channels = ("pad",)
@@ -153,6 +170,31 @@ class PadProblem(OptionalSteps):
     def subset(self, trials: Array) -> "PadProblem":
         """Only some recordings."""
         return PadProblem(self.presses.subset([int(k) for k in trials]), self.seed)
+
+    def thinned(self) -> "PadProblem":
+        """With fewer frames, where there are more than a search needs.
+
+        What recordings are told apart by is how they differ from each other, and not the noise of frames that
+        follow each other by a hundredth of a second. Held frames show only where all are there.
+        """
+        step = min(int(self.presses.rate_hz / ENOUGH_HZ), self.presses.readings // ENOUGH_READINGS)
+        if step < 2 or repeated_share(self.presses) > FEW_REPEATS:
+            return self
+        return PadProblem(self.presses.every(step), self.seed, whole=self)
+
+    def with_all_frames(self, selection: Selection[Any, Fit, Candidate]) -> Selection[Any, Fit, Candidate]:
+        """What was selected on some frames, fitted to all."""
+        whole = selection.problem.whole
+        if whole is None:
+            return selection
+        problem, fitted = whole.fitted_as(selection.fit.model)
+        return replace(
+            selection,
+            problem=problem,
+            baseline=whole.baseline(),
+            fit=fitted,
+            errors=out_of_fold(problem, fitted, problem.folds).errors,
+        )
 
     # Fits.
 
@@ -230,6 +272,12 @@ class PadProblem(OptionalSteps):
         if found.mse.sum() <= FORGIVEN * now.mse.sum():
             return other, found
         return other.even, other.even.refitted(now)
+
+    def fitted_as(self, model: Composite) -> tuple["PadProblem", Fit]:
+        """The problem with the noise around a model that was found on other frames or recordings for weights,
+        and the model's fit with them."""
+        problem, _ = self.weighed(None)
+        return problem.weighed(rest(model, self.presses, problem.weights))
 
     def unweighed(self, now: Fit) -> tuple["PadProblem", Fit]:
         """All readings count alike."""

@@ -4,6 +4,14 @@ How sure a decision must be is in `core.rules`. Alarms are raised by the size of
 scores is observed, and compared with sound recordings.
 """
 
+# A search sees some of the frames.
+ENOUGH_HZ = 30.0
+"""Frames per second that a search sees at least, where there are as many."""
+ENOUGH_READINGS = 40_000
+"""Readings from which on frames are left out: more cost time, and tell the search nothing new."""
+FEW_REPEATS = 0.02
+"""Share of repeated frames up to which they repeat by chance."""
+
 # A cause is accepted.
 FURTHER_GAIN = 0.025
 """Part of the squared error that a cause beside the first must take away: patching the first's form gains a
