@@ -1,6 +1,7 @@
 """What a saved model predicts for recordings whose readings it has not seen (``vtrefine-predict``)."""
 
 from collections.abc import Callable, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -10,12 +11,14 @@ import pyarrow.parquet as pq
 
 from lerobot_vtrefine.diagnose.joints import model as robot_model
 from lerobot_vtrefine.diagnose.pad.prediction import predict_trial
+from lerobot_vtrefine.diagnose.pad.session_load import drive_of, with_session
 from lerobot_vtrefine.diagnose.recordings import RecordingSet, RobotTrial, Trial
 from lerobot_vtrefine.diagnose.servo import model as servo_model
 from lerobot_vtrefine.diagnose.servo.bench import on_bench
 from lerobot_vtrefine.files import read_json
 from lerobot_vtrefine.tactile import model as sensor_model
 from lerobot_vtrefine.tactile.layout import PadLayout
+from lerobot_vtrefine.tactile.stages.softening import FirstLoadSoftening
 
 Predict = Callable[[Any], np.ndarray]
 """From a trial to its prediction, a row per frame."""
@@ -45,7 +48,24 @@ def load_predictor(path: str | Path, recordings: RecordingSet) -> Predict:
         return lambda trial: robot_model.predict_positions(robot, trial)
     sensor = sensor_model.SensorModel.load(path)
     layout = PadLayout(recordings.rows, recordings.cols, recordings.pitch_m)
-    return lambda trial: predict_trial(sensor, trial, layout)
+    softening = sensor.find(FirstLoadSoftening.name)
+    if not isinstance(softening, FirstLoadSoftening) or not softening.session:
+        return lambda trial: predict_trial(sensor, trial, layout)
+    made = [_sound(trial) for trial in recordings.trials if isinstance(trial, Trial)]
+    made = with_session(made, [drive_of(trial, layout) for trial in made])
+    borne = {trial.file: trial.borne for trial in made}
+    return lambda trial: predict_trial(sensor, replace(trial, borne=borne.get(trial.file)), layout)
+
+
+def _sound[T: Trial | RobotTrial](trial: T) -> T:
+    """Its sound frames."""
+    sound = sound_frames(trial)
+    kept = {
+        name: value[sound]
+        for name, value in vars(trial).items()
+        if isinstance(value, np.ndarray) and len(value) == len(sound)
+    }
+    return replace(trial, **kept)
 
 
 def _plain_names(joints: Sequence[str]) -> list[str]:
@@ -78,12 +98,7 @@ def predict_frames(trial: Trial | RobotTrial, predict: Predict) -> np.ndarray:
     if not sound.any():
         columns = "command" if isinstance(trial, RobotTrial) else "depth_m or force_n"
         raise ValueError(f"{trial.file}: columns time_s and {columns}: no frame has numbers in all of them")
-    shared = {
-        name: value[sound]
-        for name, value in vars(trial).items()
-        if isinstance(value, np.ndarray) and len(value) == len(sound)
-    }
-    values = predict(type(trial)(**{**vars(trial), **shared}))
+    values = predict(_sound(trial))
     before = np.maximum(np.cumsum(sound) - 1, 0)
     return values[before]
 

@@ -145,6 +145,20 @@ class Trial:
     temperature_c: np.ndarray | None
     raw: np.ndarray
     """Readings (N, R*C), row-major."""
+    borne: "Borne | None" = None
+
+
+@dataclass(frozen=True)
+class Borne:
+    """How hard every taxel was pressed in J recordings that were made before another, and how long before.
+
+    Attributes:
+        drive: (J, R, C) greatest column height [m], or force per taxel [N] where no depth is known.
+        age_s: (J, R, C) from then to the other recording's first frame [s].
+    """
+
+    drive: np.ndarray
+    age_s: np.ndarray
 
 
 @dataclass(frozen=True)

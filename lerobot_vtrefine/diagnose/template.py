@@ -74,7 +74,7 @@ def _recorded(
     motion: dict[str, np.ndarray], start_s: float, rng: np.random.Generator
 ) -> dict[str, np.ndarray]:
     """Columns of one recording of a motion."""
-    deeper = motion | {"depth_m": motion["depth_m"] + rng.normal(0.0, HEIGHT_ERROR_M)}
+    deeper: dict[str, Any] = motion | {"depth_m": motion["depth_m"] + rng.normal(0.0, HEIGHT_ERROR_M)}
     frames = len(motion["time_s"])
     zeros, unread = np.zeros(frames), np.zeros((frames, 0))
     trial = Trial("", "", 0, start_s, SPHERE, **deeper, tilt_x_rad=zeros, tilt_y_rad=zeros,

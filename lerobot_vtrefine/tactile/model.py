@@ -10,6 +10,7 @@ import lerobot_vtrefine.tactile.stages  # noqa: F401  registers every stage
 from lerobot_vtrefine.files import decode, read_json
 from lerobot_vtrefine.tactile.stages.base import DOMAINS, STAGES, Stage, stage_class
 from lerobot_vtrefine.tactile.stages.contact import Consistent, ContactStage, KelvinVoigt
+from lerobot_vtrefine.tactile.stages.cover import on_springs
 from lerobot_vtrefine.tactile.stages.hysteresis import without_loop
 from lerobot_vtrefine.tactile.stages.readout import Gain, Idle, Noise, Quantisation, RowSharing
 
@@ -75,6 +76,11 @@ class SensorModel:
     def has_state(self) -> bool:
         """Whether frames must be processed in order, each once."""
         return any(stage.has_state for stage in self.stages)
+
+    @property
+    def parts_forces(self) -> bool:
+        """Whether a stage must know which part of the contact's force damping bears."""
+        return any(on_springs(stage) for stage in self.stages)
 
     @property
     def contact(self) -> ContactStage:

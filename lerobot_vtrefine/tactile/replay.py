@@ -1,6 +1,7 @@
 """Run a sensor model over a recorded press, with the code that the simulator runs."""
 
 from collections.abc import Collection
+from functools import partial
 
 import numpy as np
 import torch
@@ -9,6 +10,7 @@ from lerobot_vtrefine.tactile.geometry import BodyGeometry
 from lerobot_vtrefine.tactile.layout import PadLayout
 from lerobot_vtrefine.tactile.model import SensorModel
 from lerobot_vtrefine.tactile.stages.base import Frame
+from lerobot_vtrefine.tactile.stages.cover import passed
 
 ArrayLike = np.ndarray | torch.Tensor
 
@@ -61,6 +63,17 @@ def finite_rate(times_s: torch.Tensor, depth_m: torch.Tensor) -> torch.Tensor:
     return torch.cat([slope[:1], 0.5 * (slope[1:] + slope[:-1]), slope[-1:]])
 
 
+def _spread_over_trials(
+    borne: tuple[ArrayLike, ArrayLike], x: torch.Tensor
+) -> tuple[torch.Tensor, torch.Tensor] | None:
+    """(J, R, C) each as (J, ..., R, C) beside x (T, ..., R, C); None if nothing was borne."""
+    drive, age_s = (torch.as_tensor(values, device=x.device).to(torch.float64) for values in borne)
+    if not len(drive):
+        return None
+    shape = (len(drive), *(1,) * (x.ndim - 3), *drive.shape[-2:])
+    return drive.reshape(shape), age_s.reshape(shape)
+
+
 def replay(
     model: SensorModel,
     times_s: ArrayLike,
@@ -71,6 +84,7 @@ def replay(
     layout: PadLayout | None = None,
     start_s: float = 0.0,
     temperature_c: ArrayLike | None = None,
+    borne: tuple[ArrayLike, ArrayLike] | None = None,
     skip: Collection[str] = ("noise", "quantisation"),
     device: str = "cpu",
 ) -> torch.Tensor:
@@ -87,6 +101,8 @@ def replay(
         force_n: (T, ..., R, C) force per taxel [N].
         start_s: session time of the trial's first frame, for drift [s].
         temperature_c: (T,) where it was recorded, for drift [degrees Celsius].
+        borne: what earlier recordings pressed the taxels with, and how long before, where that is known:
+            drive and age (J, R, C) each, as `Frame.borne` has them.
         skip: stages left out; by default those that only add noise to a prediction.
 
     Raises:
@@ -105,18 +121,24 @@ def replay(
         raise ValueError(f"replay got {tuple(x.shape[-2:])} taxels for a {layout.rows} x {layout.cols} pad")
     contact = model.contact
     warmth = None if temperature_c is None else torch.as_tensor(temperature_c, device=device)
-    stiffness = contact.stiffness(layout)
     frame = Frame(
-        layout, stiffness_n_per_m=stiffness, temperature_c=warmth, load_conserving=force_n is not None
+        layout,
+        stiffness_n_per_m=contact.stiffness(layout),
+        temperature_c=warmth,
+        load_conserving=force_n is not None,
+        borne=None if borne is None else _spread_over_trials(borne, x),
     )
+    damping = None
     if force_n is None:
         given = None if rate_m_s is None else torch.as_tensor(rate_m_s, device=device).to(x.dtype)
         rate = finite_rate(times, x) if given is None else given
         for stage in model.depth_stages:
             x = stage.sequence(x, times, frame) if stage.name not in skip else x
+        springs = contact.undamped().force(x, rate, layout) if model.parts_forces else None
         x = contact.force(x, rate, layout)
+        damping = None if springs is None else x - springs
     for stage in model.force_stages:
         if stage.name not in skip and not stage.stochastic:
             session = times + start_s if stage.name == "baseline_drift" else times
-            x = stage.sequence(x, session, frame)
+            x, damping = passed(stage, x, damping, partial(stage.sequence, times_s=session, frame=frame))
     return x

@@ -13,6 +13,7 @@ from lerobot_vtrefine.tactile.model import SensorModel
 from lerobot_vtrefine.tactile.poses import ArrayLike, Poses
 from lerobot_vtrefine.tactile.stages.base import Frame, Stage, State
 from lerobot_vtrefine.tactile.stages.contact import ContactStage
+from lerobot_vtrefine.tactile.stages.cover import passed
 from lerobot_vtrefine.tactile.stages.readout import Gain
 
 if TYPE_CHECKING:
@@ -218,15 +219,23 @@ class PadSensors:
         )
 
     def _run(
-        self, stages: Sequence[Stage], x: torch.Tensor, index: torch.Tensor, frame: Frame
+        self, x: torch.Tensor, damping: torch.Tensor | None, index: torch.Tensor, frame: Frame
     ) -> torch.Tensor:
+        """Counts from the contact's force and the part of it that damping bears, where that is asked for."""
         everyone = len(index) == self.num_envs and bool(
             (index == torch.arange(self.num_envs, device=self.device)).all()
         )
-        for stage in stages:
+        for stage in self.model.force_stages:
             state = self._state.get(stage.name, {})
             mine = state if everyone else {key: value[index] for key, value in state.items()}
-            x, new = self._specialised(stage, index).step(x, mine, frame)
+            own, new = self._specialised(stage, index), mine
+
+            def work(force: torch.Tensor, own: Stage = own, mine: State = mine) -> torch.Tensor:
+                nonlocal new
+                force, new = own.step(force, mine, frame)
+                return force
+
+            x, damping = passed(stage, x, damping, work)
             if everyone:
                 self._state[stage.name] = new
                 continue
@@ -249,11 +258,9 @@ class PadSensors:
         return torch.as_tensor(array, device=self.device).to(torch.float32)
 
     def _contact_forces(
-        self, index: torch.Tensor, poses: Poses, dt_s: float, load: ArrayLike | None
-    ) -> tuple[torch.Tensor, Frame]:
-        """Forces per taxel (m, P, R, C) [N], and what later stages may know of the frame."""
-        contact = self._contact_stage(index)
-        frame = self._frame(index, dt_s, contact, load)
+        self, contact: ContactStage, poses: Poses, load: ArrayLike | None, frame: Frame
+    ) -> torch.Tensor:
+        """Forces per taxel (m, P, R, C) [N]."""
         solved = contact.load_conserving and load is not None
         if solved not in self._engines:
             from lerobot_vtrefine.tactile.engine import ContactEngine  # warp is slow to import
@@ -263,14 +270,14 @@ class PadSensors:
             )
         loads = None if load is None else self._tensor(load)
         # The engine reuses its buffers, while callers and stages with memory may keep what they get.
-        force = self._engines[solved](contact, [self._tensor(pose) for pose in poses], loads, frame)
-        return force.clone(), frame
+        return self._engines[solved](contact, [self._tensor(pose) for pose in poses], loads, frame).clone()
 
     def forces(self, ids: np.ndarray, poses: Poses, dt_s: float, load: ArrayLike | None = None) -> ArrayLike:
         """Contact force per taxel before mechanics and readout: (m, P, N) float32 [N]; arguments as in
         `counts`."""
         index = torch.as_tensor(np.atleast_1d(ids), dtype=torch.long, device=self.device)
-        force = self._contact_forces(index, poses, dt_s, load)[0].flatten(2)
+        contact = self._contact_stage(index)
+        force = self._contact_forces(contact, poses, load, self._frame(index, dt_s, contact, load)).flatten(2)
         return force if isinstance(poses.pad_pos, torch.Tensor) else force.cpu().numpy()
 
     def counts(self, ids: np.ndarray, poses: Poses, dt_s: float, load: ArrayLike | None = None) -> ArrayLike:
@@ -285,8 +292,12 @@ class PadSensors:
         Returns numpy for numpy poses, a tensor on `device` for tensors.
         """
         index = torch.as_tensor(np.atleast_1d(ids), dtype=torch.long, device=self.device)
-        force, frame = self._contact_forces(index, poses, dt_s, load)
-        counts = self._run(self.model.force_stages, force, index, frame)
+        contact = self._contact_stage(index)
+        frame = self._frame(index, dt_s, contact, load)
+        force, damping = self._contact_forces(contact, poses, load, frame), None
+        if self.model.parts_forces:
+            damping = force - self._contact_forces(contact.undamped(), poses, load, frame)
+        counts = self._run(force, damping, index, frame)
         self._time_s[index] += dt_s
         counts = counts.flatten(2).clamp(0.0, 255.0).to(torch.uint8)
         return counts if isinstance(poses.pad_pos, torch.Tensor) else counts.cpu().numpy()

@@ -104,7 +104,7 @@ class OptionalSteps(Protocol):
         return selection
 
     def thinned(self) -> Self:
-        """The same trials as the search sees them: with fewer readings, where there are more than it needs."""
+        """The trials as the search sees them: with fewer readings, where there are more than it needs."""
         return self
 
     def with_all_frames(self, selection: "Selection[Any, Any, Any]") -> "Selection[Any, Any, Any]":

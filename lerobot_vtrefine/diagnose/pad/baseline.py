@@ -10,7 +10,7 @@ from lerobot_vtrefine.diagnose.pad.fitting import Fit, fit, rest
 from lerobot_vtrefine.diagnose.pad.forward_model.run import LoweredBench, run_stages
 from lerobot_vtrefine.diagnose.pad.model import NOMINAL_K_N, Composite, stiffness_from_load
 from lerobot_vtrefine.diagnose.pad.noise import Noise, fit_frame_noise, fit_repeatability
-from lerobot_vtrefine.diagnose.pad.press_trials import PressSet
+from lerobot_vtrefine.diagnose.pad.press_trials import Press, PressSet
 from lerobot_vtrefine.diagnose.pad.repeated_frames import ages_s
 from lerobot_vtrefine.diagnose.pad.weights import TrialWeights, build_weights
 from lerobot_vtrefine.diagnose.pad.whitening import Whitener
@@ -40,6 +40,8 @@ class Baseline:
     weights: tuple[TrialWeights, ...]
 
 
+DAMPED = 0.01
+"""Part of the springs' from which on damping's is visible."""
 LEAST_C = 0.2
 """Range of the recordings' temperatures from which on something may be seen to follow it."""
 
@@ -75,7 +77,17 @@ def describe(presses: PressSet) -> Setting:
         row_company=row_company,
         company=company,
         ages_s=ages_s([press.rhythm for press in presses.presses]),
+        returned=any(_returned(press) for press in presses.presses),
     )
+
+
+def _returned(press: Press) -> bool:
+    """Whether it presses taxels that an earlier recording pressed."""
+    borne, layout = press.trial.borne, press.layout
+    if borne is None or not len(borne.drive):
+        return False
+    before = layout.cut(borne.drive.max(axis=0) > 0)
+    return bool((before & (press.drive > 0).any(axis=0)).any())
 
 
 def _temperature(presses: PressSet) -> float | None:
@@ -85,6 +97,15 @@ def _temperature(presses: PressSet) -> float | None:
     if len(known) < len(values) or np.ptp([value.mean() for value in known]) < LEAST_C:
         return None
     return float(np.mean([value.mean() for value in known]))
+
+
+def _damping_share(model: Composite, presses: PressSet) -> float:
+    """Mean size of damping's part over that of the springs', of what the baseline predicts under pressure."""
+    if presses.loaded:
+        return 0.0
+    pressed = [(press.drive[press.drive > 0], press.rate[press.drive > 0]) for press in presses.presses]
+    depth, rate = (sum(float(np.abs(pair[k]).sum()) for pair in pressed) for k in (0, 1))
+    return float(model.values[1]) * rate / max(depth, 1e-12)
 
 
 def _reach(top: float, loaded: bool) -> float:
@@ -178,7 +199,12 @@ def fit_baseline(presses: PressSet) -> Baseline:
     k_n = stiffness_from_load(presses, fitted.model)
     top = max((float(np.max(signal)) for signal in fitted.signals if signal.size), default=1.0)
     gain = float(plain.model.values[0])
-    setting = replace(setting, top_counts=max(top, presses.full_scale / 255.0), log_gain=gain)
+    setting = replace(
+        setting,
+        top_counts=max(top, presses.full_scale / 255.0),
+        log_gain=gain,
+        damped=_damping_share(plain.model, presses) > DAMPED,
+    )
     model = replace(fitted.model, setting=setting, k_n=k_n or NOMINAL_K_N)
     fitted = replace(fitted, model=model)
     noise, weights = weigh(fitted, presses)

@@ -20,6 +20,7 @@ from lerobot_vtrefine.diagnose.pad.model import Composite, sensor_model
 from lerobot_vtrefine.diagnose.pad.own_touch import with_own_touch
 from lerobot_vtrefine.diagnose.pad.prediction import predict_trial
 from lerobot_vtrefine.diagnose.pad.press_trials import IdleMap, Press, PressSet
+from lerobot_vtrefine.diagnose.pad.taxel_maps import with_all_dead
 from lerobot_vtrefine.tactile.model import SensorModel
 
 if TYPE_CHECKING:
@@ -130,6 +131,9 @@ def completed(selection: Selection["PadProblem", Any, Any], whole: "PadProblem")
     around = problem
     if after.fit.model.families:
         problem, fitted = whole.fitted_as(after.fit.model)
+        if fitted.model.dead:
+            # Some may have been pressed in locked recordings only.
+            fitted = problem.settled(with_all_dead(fitted, problem.presses).model)
         around, fitted = with_own_touch(problem, fitted)
         if after.model is after.fit.model:
             model = fitted.model

@@ -18,11 +18,18 @@ def predict_trial(model: SensorModel, trial: Trial, layout: PadLayout) -> np.nda
     """
     times, frames = instants_of(trial, layout, instants(tuple(model.stages)))
     drive, rate = motion(trial, layout, times)
-    warm, start_s = warmth(trial, times), trial.start_s
-    if trial.depth_m is None:
-        fine = replay(model, times, force_n=drive, layout=layout, start_s=start_s, temperature_c=warm)
-    else:
-        fine = replay(model, times, drive, rate, layout=layout, start_s=start_s, temperature_c=warm)
+    loaded, borne = trial.depth_m is None, trial.borne
+    fine = replay(
+        model,
+        times,
+        None if loaded else drive,
+        None if loaded else rate,
+        force_n=drive if loaded else None,
+        layout=layout,
+        start_s=trial.start_s,
+        temperature_c=warmth(trial, times),
+        borne=None if borne is None else (borne.drive, borne.age_s),
+    )
     converter = model.find("quantisation")
     limit = converter.full_scale_counts if isinstance(converter, Quantisation) else np.inf
     predicted = fine[frames].numpy().astype(float)

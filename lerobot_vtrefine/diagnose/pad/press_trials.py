@@ -10,6 +10,7 @@ from scipy.ndimage import binary_dilation
 from lerobot_vtrefine.diagnose.pad.indenters import trial_forces
 from lerobot_vtrefine.diagnose.pad.motion import Kind, instants_of, motion
 from lerobot_vtrefine.diagnose.pad.repeated_frames import Rhythm, silent
+from lerobot_vtrefine.diagnose.pad.session_load import with_session
 from lerobot_vtrefine.diagnose.recordings import RecordingSet, Trial
 from lerobot_vtrefine.tactile.layout import PadLayout
 
@@ -129,7 +130,9 @@ class Press:
         """Only every so many frames."""
         kept = slice(None, None, step)
         images = ("drive", "rate", "signal", "touching", "resting")
-        return replace(self, trial=_cut(self.trial, kept), **{name: getattr(self, name)[kept] for name in images})
+        return replace(
+            self, trial=_cut(self.trial, kept), **{name: getattr(self, name)[kept] for name in images}
+        )
 
     @property
     def taxels(self) -> np.ndarray:
@@ -257,6 +260,7 @@ def prepare(recordings: RecordingSet, trials: list[Trial], learn: list[int]) -> 
     layout = PadLayout(recordings.rows, recordings.cols, recordings.pitch_m)
     loaded = any(trial.depth_m is None for trial in trials)
     motions = [_motion(trial, layout, loaded) for trial in trials]
+    trials = with_session(trials, [motion.drive for motion in motions])
     count = min(1.0, recordings.full_scale / 255.0)
     idle = idle_map([trials[i] for i in learn], [motions[i] for i in learn], layout)
     wander = _wander([trials[i] for i in learn], [motions[i] for i in learn], idle)

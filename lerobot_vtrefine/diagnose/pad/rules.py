@@ -9,7 +9,7 @@ ENOUGH_HZ = 30.0
 """Frames per second that a search sees at least, where there are as many."""
 ENOUGH_READINGS = 40_000
 """Readings from which on frames are left out: more cost time, and tell the search nothing new."""
-FEW_REPEATS = 0.02
+FEW_REPEATS = 0.01
 """Share of repeated frames up to which they repeat by chance."""
 
 # A cause is accepted.
@@ -22,13 +22,17 @@ FORGIVEN = 1.5
 """Factor by which weights may raise the plain squared error of a model; beyond, all readings count alike."""
 FAR_OFF = 4.0
 """Mean square of slow errors under load, in variances of a frame's noise, that weights must not hide."""
-DEAD_BELOW, DEAD_ERROR = 0.12, 0.04
+DEAD_BELOW, DEAD_ERROR = 0.2, 0.04
 """Part of the median gain below which a taxel is dead, and the standard error its gain must be known to."""
+MAYBE_DEAD_ERROR = 0.1
+"""Standard error of a gain up to which a taxel may be one more dead one, where others are."""
 
 # Readings are held.
-MIN_HELD, CHANCE = 0.04, 0.2
+MIN_HELD, CHANCE = 0.015, 0.2
 """Share of frames that must repeat the one before for readings to be held, and the part of it that may be
 chance."""
+HELD_ROWS = 0.05
+"""The same share of single rows, where whole frames are not held."""
 VISIBLE = 0.01
 """Part of a press's deepest drive by which it must change for a repeat to tell."""
 MANY_TAXELS = 6

@@ -7,6 +7,7 @@ frames, with what rigs add: noise, rounding, and small errors of gain and contac
 
 import json
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pyarrow as pa
@@ -57,7 +58,7 @@ def readings(
 ) -> np.ndarray:
     """Counts (T, 384) that the pad gives on the fine clock."""
     zeros = np.zeros(len(columns["time_s"]))
-    felt = columns | {"depth_m": columns["depth_m"] + rng.normal(0.0, HEIGHT_ERROR_M)}
+    felt: dict[str, Any] = columns | {"depth_m": columns["depth_m"] + rng.normal(0.0, HEIGHT_ERROR_M)}
     trial = Trial(
         file="",
         condition="",

@@ -13,6 +13,7 @@ from lerobot_vtrefine.diagnose.core.search import Selection
 from lerobot_vtrefine.diagnose.core.suspicion import Suspicion
 from lerobot_vtrefine.diagnose.pad import error_level, repeatability
 from lerobot_vtrefine.diagnose.pad.baseline import weigh
+from lerobot_vtrefine.diagnose.pad.candidates.sample_and_hold import HOLD, held_rows
 from lerobot_vtrefine.diagnose.pad.decoys import in_place_of_names
 from lerobot_vtrefine.diagnose.pad.descriptors import DESCRIPTORS, Descriptor, directions, errors_left_out
 from lerobot_vtrefine.diagnose.pad.fitting import Fit, predict, tangents
@@ -20,10 +21,11 @@ from lerobot_vtrefine.diagnose.pad.gain_drift import gain_drift
 from lerobot_vtrefine.diagnose.pad.press_trials import PressSet
 from lerobot_vtrefine.diagnose.pad.recording_scatter import own_deviations, recording_scatter
 from lerobot_vtrefine.diagnose.pad.repeatability import Correlations
-from lerobot_vtrefine.diagnose.pad.rules import FOLLOWS, FOLLOWS_IF_OWNED
+from lerobot_vtrefine.diagnose.pad.rules import FOLLOWS, FOLLOWS_IF_OWNED, MAYBE_DEAD_ERROR
 from lerobot_vtrefine.diagnose.pad.screening import Scorer
 from lerobot_vtrefine.diagnose.pad.shared_errors import shared_errors
 from lerobot_vtrefine.diagnose.pad.sliding_errors import while_sliding
+from lerobot_vtrefine.diagnose.pad.taxel_maps import with_all_dead
 
 if TYPE_CHECKING:
     from lerobot_vtrefine.diagnose.pad.problem import PadProblem
@@ -37,11 +39,14 @@ def suspicions(problem: "PadProblem", selection: Selection[Any, Fit, Any]) -> li
     Of what changes through the session, or comes with sliding alone, repeatable errors say nothing.
     """
     presses, fitted, plain = problem.presses, selection.fit, selection.baseline
+    if fitted.model.dead:
+        fitted = with_all_dead(fitted, presses, MAYBE_DEAD_ERROR)
     _, weights = weigh(fitted, presses)
     residuals = repeatability.cleaned(fitted, presses, weights)
     descriptors, own = following(problem, fitted), own_deviations(presses, fitted)
     sure = [
         error_level.level(residuals, fitted, weights),
+        held_rows(presses) if HOLD not in fitted.model.families else None,
         while_sliding(presses, residuals, fitted, weights),
         *recording_scatter(own, problem.seed),
         *shared_errors(presses, own.left, fitted, weights, problem.seed),
@@ -66,11 +71,13 @@ def suspicions(problem: "PadProblem", selection: Selection[Any, Fit, Any]) -> li
 def surprises(problem: "PadProblem", fitted: Fit, presses: PressSet) -> list[Suspicion]:
     """What fails now and then may have failed in recordings that no fit has seen, and in these alone.
 
-    A map of gains knows too little of what other recordings pressed to tell.
+    A map of gains knows too little of what other recordings pressed to tell; and where taxels are known to be
+    dead, others may be that hardly anything had pressed before.
     """
     if fitted.model.gain_map is not None:
         return []
     there = replace(fitted, signals=tuple(predict(fitted.model, presses)))
+    there = with_all_dead(there, presses, MAYBE_DEAD_ERROR) if fitted.model.dead else there
     _, weights = weigh(there, presses, problem.noise)
     item = error_level.one_taxel(presses, repeatability.cleaned(there, presses, weights), weights)
     return [] if item is None else [item]

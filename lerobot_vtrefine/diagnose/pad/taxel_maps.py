@@ -163,10 +163,21 @@ def plain_gains(fitted: Fit, presses: PressSet) -> tuple[np.ndarray, np.ndarray]
     return gain, np.where(known, error, np.inf)
 
 
-def find_dead(fitted: Fit, presses: PressSet) -> tuple[tuple[int, int], ...]:
-    """Taxels that hardly answer although pressed well: ((row, col), ...)."""
+def with_all_dead(fitted: Fit, presses: PressSet, least_sure: float = DEAD_ERROR) -> Fit:
+    """The fit with those taxels, too, that hardly answer in these presses."""
+    dead = {*fitted.model.dead, *find_dead(fitted, presses, least_sure)}
+    model = replace(fitted.model, dead=tuple(sorted(dead)))
+    return replace(fitted, model=model, signals=tuple(predict(model, presses)))
+
+
+def find_dead(fitted: Fit, presses: PressSet, least_sure: float = DEAD_ERROR) -> tuple[tuple[int, int], ...]:
+    """Taxels that hardly answer although pressed well: ((row, col), ...).
+
+    Args:
+        least_sure: standard error that their gain must be known to.
+    """
     gain, error = plain_gains(fitted, presses)
-    good = np.isfinite(error) & (error < DEAD_ERROR)
+    good = np.isfinite(error) & (error < least_sure)
     if good.sum() < 2:
         return ()
     typical = float(np.median(gain[good]))

@@ -38,6 +38,9 @@ class Frame:
     """Temperature, broadcastable to (..., R, C); None where nobody measured it [degrees Celsius]."""
     load_conserving: bool = False
     """Whether the taxels' sum is a measured or solved load, which mechanics must not change."""
+    borne: tuple[torch.Tensor, torch.Tensor] | None = None
+    """What each of J earlier recordings pressed a taxel with at most (J, ..., R, C) [m; N where the load is
+    known], and how long before this recording's first frame [s]; None where nobody knows."""
 
 
 LARGEST = {
@@ -94,6 +97,8 @@ class Stage:
     """Whether every taxel follows the same law by itself: fits run it on the taxels that answer, alone."""
     rate_free: ClassVar[bool] = False
     """Whether a memory follows the order of the frames, whatever their times."""
+    spreads: ClassVar[bool] = False
+    """Whether it moves force from taxel to taxel, in proportion."""
 
     def __post_init__(self) -> None:
         for item in fields(self):

@@ -46,6 +46,10 @@ class ContactStage(Stage):
         own = {item.name: getattr(self, item.name) for item in fields(self) if item.name in self.scalable}
         return replace(self, **{name: value * factor for name, value in own.items()})
 
+    def undamped(self) -> "ContactStage":
+        """Its springs alone."""
+        return self
+
     def force(self, depth: torch.Tensor, rate: torch.Tensor, layout: PadLayout) -> torch.Tensor:
         """Normal force per taxel for a prescribed depth: (..., R, C) [N]; zero where it is not positive."""
         # In place: fits run this law on a million readings at once, and memory is what they wait for.
@@ -75,6 +79,10 @@ class KelvinVoigt(ContactStage):
     @override
     def damping(self, layout: PadLayout) -> torch.Tensor | float:
         return self.k_d
+
+    @override
+    def undamped(self) -> ContactStage:
+        return replace(self, k_d=0.0)
 
 
 @register
@@ -149,6 +157,10 @@ class Consistent(ContactStage):
     @override
     def lead_s(self) -> torch.Tensor | float:
         return self.damping_s
+
+    @override
+    def undamped(self) -> ContactStage:
+        return replace(self, damping_s=0.0)
 
     @override
     def force(self, depth: torch.Tensor, rate: torch.Tensor, layout: PadLayout) -> torch.Tensor:

@@ -14,7 +14,6 @@ import torch
 from lerobot_vtrefine.tactile.layout import PadLayout
 from lerobot_vtrefine.tactile.stages.base import (
     Frame,
-    Stage,
     State,
     Traits,
     as_tuple,
@@ -22,6 +21,7 @@ from lerobot_vtrefine.tactile.stages.base import (
     parameter,
     register,
 )
+from lerobot_vtrefine.tactile.stages.cover import CoverLaw
 
 
 def memories(follow: Callable[..., np.ndarray], *inputs: torch.Tensor) -> torch.Tensor:
@@ -48,13 +48,11 @@ def kept_between(low: torch.Tensor, high: torch.Tensor) -> torch.Tensor:
 
 
 @dataclass(frozen=True)
-class Loop(Stage):
+class Loop(CoverLaw):
     """Base of the laws."""
 
-    domain: ClassVar[str] = "force"
     rank: ClassVar[int] = 36
     has_state: ClassVar[bool] = True
-    alike: ClassVar[bool] = True
     rate_free: ClassVar[bool] = True
 
 

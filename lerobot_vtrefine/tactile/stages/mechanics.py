@@ -19,6 +19,7 @@ from lerobot_vtrefine.tactile.stages.base import (
     parameter,
     register,
 )
+from lerobot_vtrefine.tactile.stages.cover import CoverLaw
 from lerobot_vtrefine.tactile.stages.signals import followed, low_passed
 
 REFERENCE_DEPTH_M = 1e-3
@@ -27,7 +28,7 @@ REFERENCE_DEPTH_M = 1e-3
 
 @register
 @dataclass(frozen=True)
-class NonlinearStiffness(Stage):
+class NonlinearStiffness(CoverLaw):
     """Hardening (exponent > 1) or softening: f_ref (f / f_ref)^exponent with f_ref = stiffness * 1 mm.
 
     For a linear contact law this is k d_ref (d / d_ref)^exponent. Where the taxels' sum is the load itself,
@@ -36,9 +37,7 @@ class NonlinearStiffness(Stage):
     """
 
     name: ClassVar[str] = "nonlinear_stiffness"
-    domain: ClassVar[str] = "force"
     rank: ClassVar[int] = 30
-    alike: ClassVar[bool] = True
     exponent: float = parameter(1.0, "1", 0.8, 1.6, minimum=1e-3, maximum=10.0)
     share: float = parameter(1.0, "1", 1.0, 1.0, maximum=1.0)
 
@@ -111,6 +110,7 @@ class MechanicalSpreading(Stage):
     """
 
     name: ClassVar[str] = "mechanical_spreading"
+    spreads: ClassVar[bool] = True
     domain: ClassVar[str] = "force"
     rank: ClassVar[int] = 32
     sigma_m: float = parameter(1.0e-3, "m", 0.0, 3.0e-3)
@@ -137,7 +137,7 @@ class MechanicalSpreading(Stage):
 
 @register
 @dataclass(frozen=True)
-class ViscoelasticRelaxation(Stage):
+class ViscoelasticRelaxation(CoverLaw):
     """Prony series: f - sum_j fraction_j * (f low-passed with tau_j); a held load decays to 1 -
     sum(fraction).
 
@@ -146,10 +146,8 @@ class ViscoelasticRelaxation(Stage):
     """
 
     name: ClassVar[str] = "viscoelastic_relaxation"
-    domain: ClassVar[str] = "force"
     rank: ClassVar[int] = 34
     has_state: ClassVar[bool] = True
-    alike: ClassVar[bool] = True
     tau_s: float | tuple[float, ...] = parameter(1.0, "s", 0.3, 3.0, minimum=1e-6)
     fraction: float | tuple[float, ...] = parameter(0.15, "1", 0.0, 0.3, minimum=None)
     pushes_only: bool = False

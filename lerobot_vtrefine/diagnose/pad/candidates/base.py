@@ -1,7 +1,8 @@
 """What a candidate cause is: a family of simulator stages with parameters, starting points and a null."""
 
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
+from functools import cache
 from typing import Literal
 
 import numpy as np
@@ -9,6 +10,7 @@ import numpy as np
 from lerobot_vtrefine.diagnose.pad.press_trials import PressSet
 from lerobot_vtrefine.tactile.layout import PadLayout
 from lerobot_vtrefine.tactile.stages.base import Stage
+from lerobot_vtrefine.tactile.stages.cover import CoverLaw
 
 
 @dataclass(frozen=True)
@@ -44,6 +46,10 @@ class Setting:
     """How old readings were in frames on the pad, each as likely: the middles of equal parts [s]."""
     log_gain: float | None = None
     """Logarithm of the plain baseline's counts per metre (or newton); None before it is fitted."""
+    damped: bool = False
+    """Whether damping bears a visible part of what the plain baseline predicts."""
+    returned: bool = False
+    """Whether recordings press where others of the session have pressed before."""
 
 
 @dataclass(frozen=True)
@@ -137,3 +143,24 @@ class Form:
     def high(self) -> np.ndarray:
         """Upper bounds (p,)."""
         return np.array([value.high for value in self.values])
+
+
+@cache
+def beside_damping(form: Form) -> Form:
+    """The same law of what the contact's springs bear alone, where damping bears something as well."""
+
+    def build(values: np.ndarray, setting: Setting) -> Stages:
+        stages = form.build(values, setting)
+        return tuple(
+            replace(stage, elastic=True) if isinstance(stage, CoverLaw) else stage for stage in stages
+        )
+
+    return replace(
+        form,
+        label=f"{form.label}, beside damping",
+        build=build,
+        possible=lambda setting: setting.damped and form.possible(setting),
+        screened=False,
+        peer=True,
+        grown=lambda values, setting: values.tolist(),
+    )

@@ -2,18 +2,19 @@
 load.
 """
 
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
 
-from lerobot_vtrefine.diagnose.pad.candidates.base import Form, Setting, Value
+from lerobot_vtrefine.diagnose.pad.candidates.base import Form, Setting, Value, beside_damping
 from lerobot_vtrefine.tactile.stages.base import Stage
 from lerobot_vtrefine.tactile.stages.softening import FirstLoadSoftening
 
 SOFTENING = Value("softening", -0.9, 2.0, 2e-3)
 LOG_SHARPNESS = Value("log_sharpness", float(np.log(0.05)), float(np.log(8.0)), 1e-2)
 GROWTH = Value("growth", 0.0, 2.0, 1e-2)
-LOG_RECOVERY = Value("log_recovery", float(np.log(0.3)), float(np.log(100.0)), 1e-2)
+LOG_RECOVERY = Value("log_recovery", float(np.log(0.3)), float(np.log(3000.0)), 1e-2)
 
 
 def _plain(values: np.ndarray, setting: Setting) -> tuple[Stage, ...]:
@@ -44,35 +45,51 @@ def _form(label: str, *more: Value, **rest: Any) -> Form:
     return Form("first_load_softening", label, (SOFTENING, *more), report=_report, signed=True, **rest)
 
 
+def _through_session(form: Form) -> Form:
+    """The same of a cover that remembers what earlier recordings of the session pressed it with."""
+
+    def build(values: np.ndarray, setting: Setting) -> tuple[Stage, ...]:
+        return tuple(replace(stage, session=True) for stage in form.build(values, setting))
+
+    return replace(
+        form,
+        label=f"{form.label}, through the session",
+        build=build,
+        possible=lambda setting: setting.returned and form.possible(setting),
+        peer=len(form.values) == 1,
+    )
+
+
+PLAIN = _form(
+    "by the part that was let go",
+    build=_plain,
+    probes=lambda s: [[0.05]],
+    kinds=("memory", "peak"),
+    needs="unload in part and load again at the same place, beyond the first load",
+)
+GROWING = _form("by the load that was let go", build=_growing, probes=lambda s: [[0.05]], peer=True)
+FREE = _form(
+    "of free sharpness",
+    LOG_SHARPNESS,
+    GROWTH,
+    build=_free,
+    probes=lambda s: [[0.05, -1.0, 0.0], [0.05, 0.5, 0.5]],
+    screened=False,
+)
+RECOVERING = _form(
+    "of free sharpness, with recovery",
+    LOG_SHARPNESS,
+    GROWTH,
+    LOG_RECOVERY,
+    build=_free,
+    probes=lambda s: [[0.05, 0.0, 0.0, float(np.log(s.duration_s))]],
+    screened=False,
+)
 FORMS = (
-    _form(
-        "by the part that was let go",
-        build=_plain,
-        probes=lambda s: [[0.05]],
-        kinds=("memory", "peak"),
-        needs="unload in part and load again at the same place, beyond the first load",
-    ),
-    _form(
-        "by the load that was let go",
-        build=_growing,
-        probes=lambda s: [[0.05]],
-        peer=True,
-    ),
-    _form(
-        "of free sharpness",
-        LOG_SHARPNESS,
-        GROWTH,
-        build=_free,
-        probes=lambda s: [[0.05, -1.0, 0.0], [0.05, 0.5, 0.5]],
-        screened=False,
-    ),
-    _form(
-        "of free sharpness, with recovery",
-        LOG_SHARPNESS,
-        GROWTH,
-        LOG_RECOVERY,
-        build=_free,
-        probes=lambda s: [[0.05, 0.0, 0.0, float(np.log(s.duration_s))]],
-        screened=False,
-    ),
+    PLAIN,
+    beside_damping(PLAIN),
+    GROWING,
+    FREE,
+    RECOVERING,
+    *(_through_session(form) for form in (PLAIN, beside_damping(PLAIN), GROWING, FREE, RECOVERING)),
 )

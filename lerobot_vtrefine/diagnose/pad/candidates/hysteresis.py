@@ -5,7 +5,7 @@ from typing import Any
 
 import numpy as np
 
-from lerobot_vtrefine.diagnose.pad.candidates.base import Form, Setting, Value
+from lerobot_vtrefine.diagnose.pad.candidates.base import Form, Setting, Value, beside_damping
 from lerobot_vtrefine.tactile.stages.base import Stage
 from lerobot_vtrefine.tactile.stages.hysteresis import (
     Hysteresis,
@@ -78,17 +78,19 @@ def _several(label: str, law: type[Play]) -> Form:
     )
 
 
+PLAY = _one(
+    "one play operator",
+    Hysteresis,
+    0.9,
+    0.05,
+    (0.1, 0.25, 0.5, 1.0, 1.8),
+    kinds=("memory", "peak"),
+    sizes=("fraction",),
+    needs="unload in part and load again at the same place",
+)
 FORMS = (
-    _one(
-        "one play operator",
-        Hysteresis,
-        0.9,
-        0.05,
-        (0.1, 0.25, 0.5, 1.0, 1.8),
-        kinds=("memory", "peak"),
-        sizes=("fraction",),
-        needs="unload in part and load again at the same place",
-    ),
+    PLAY,
+    beside_damping(PLAY),
     _several("four play operators", Hysteresis),
     _several("four play operators behind the load", LoadingHysteresis),
     _one(

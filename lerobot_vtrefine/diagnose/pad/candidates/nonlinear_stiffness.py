@@ -6,7 +6,7 @@ its own.
 
 import numpy as np
 
-from lerobot_vtrefine.diagnose.pad.candidates.base import Form, Setting, Value
+from lerobot_vtrefine.diagnose.pad.candidates.base import Form, Setting, Value, beside_damping
 from lerobot_vtrefine.tactile.stages.base import Stage
 from lerobot_vtrefine.tactile.stages.mechanics import REFERENCE_DEPTH_M, NonlinearStiffness
 from lerobot_vtrefine.tactile.stages.surface import StiffeningDepth
@@ -34,19 +34,21 @@ def _report_bottoming(values: np.ndarray, setting: Setting) -> dict[str, tuple[f
     return {"exponent": (exponent, "1"), "knee_m": (knee * top_m, "m"), "stiffening": (1.0 + more, "1")}
 
 
+POWER = Form(
+    "nonlinear_stiffness",
+    "power law",
+    (Value("excess", 0.0, 2.0, 2e-3),),
+    lambda v, s: (NonlinearStiffness(1.0 + float(v[0])),),
+    lambda v, s: {"exponent": (1.0 + float(v[0]), "1")},
+    lambda s: [[0.05]],
+    kinds=("bend", "load"),
+    none=1.0,
+    needs="press to three depths or more, the deepest well beyond the others, with depth_m logged",
+    possible=lambda s: not s.loaded,
+)
 FORMS = (
-    Form(
-        "nonlinear_stiffness",
-        "power law",
-        (Value("excess", 0.0, 2.0, 2e-3),),
-        lambda v, s: (NonlinearStiffness(1.0 + float(v[0])),),
-        lambda v, s: {"exponent": (1.0 + float(v[0]), "1")},
-        lambda s: [[0.05]],
-        kinds=("bend", "load"),
-        none=1.0,
-        needs="press to three depths or more, the deepest well beyond the others, with depth_m logged",
-        possible=lambda s: not s.loaded,
-    ),
+    POWER,
+    beside_damping(POWER),
     Form(
         "nonlinear_stiffness",
         "linear plus power law",

@@ -5,11 +5,13 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from lerobot_vtrefine.diagnose.core.suspicion import Suspicion
 from lerobot_vtrefine.diagnose.pad.candidates.base import Form, Value
 from lerobot_vtrefine.diagnose.pad.press_trials import Press, PressSet
 from lerobot_vtrefine.diagnose.pad.rules import (
     CHANCE,
     CONTRADICTED,
+    HELD_ROWS,
     MANY_TAXELS,
     MIN_HELD,
     MIN_REPEATED,
@@ -20,6 +22,7 @@ from lerobot_vtrefine.diagnose.pad.rules import (
 )
 from lerobot_vtrefine.tactile.stages.host import SampleAndHold
 
+HOLD = "sample_and_hold"
 MAX_FRAMES = 12.0
 """Longest period looked for, in frames."""
 
@@ -49,13 +52,34 @@ def shortest_period(presses: PressSet, frame_s: float) -> float | None:
     return frame_s / (1.0 - seen) if seen < 1.0 else None
 
 
-def _repeats(press: Press) -> tuple[float, float] | None:
+def held_rows(presses: PressSet) -> Suspicion | None:
+    """Whether rows repeat by themselves, while others change: a board that refreshes them in turn. None where
+    no row has taxels enough to tell."""
+    found = [
+        share
+        for press in presses.presses
+        for row in np.unique(press.taxels // press.layout.full_cols)
+        if (mask := press.taxels // press.layout.full_cols == row).sum() >= MANY_TAXELS
+        if (share := _repeats(press, mask)) is not None
+    ]
+    if not found:
+        return None
+    seen, by_chance = np.mean(found, axis=0)
+    sure = by_chance < CHANCE * seen
+    text = f"rows repeat the frame before in {100 * seen:.0f} % of their frames while others change"
+    return Suspicion(0, text, float(seen) if sure else 0.0, HELD_ROWS)
+
+
+def _repeats(press: Press, taxels: np.ndarray | None = None) -> tuple[float, float] | None:
     """Share of frames under load that repeat the one before, and what share would by chance; None if unknown.
+
+    Of all scored taxels, or of those in a mask (n,).
 
     By chance all taxels repeat together as often as each does while others change. Few taxels say little of
     each other: then frames count in which the motion alone changes readings by far more than noise.
     """
     changed = np.diff(press.signal, axis=0) != 0.0
+    changed = changed if taxels is None else changed[:, taxels]
     use = press.rhythm.telling[1:] & _driven(press)
     few = changed.shape[1] < MANY_TAXELS
     if few:
@@ -199,7 +223,7 @@ def undecided(free: bool) -> Callable[[np.ndarray, PressSet], dict[str, tuple[fl
 
 FORMS = (
     Form(
-        "sample_and_hold",
+        HOLD,
         "fixed period",
         (Value("period_s", 1e-3, 2.0, 0.0),),
         lambda v, s: (SampleAndHold(float(v[0])),),
@@ -212,7 +236,7 @@ FORMS = (
         range=undecided(False),
     ),
     Form(
-        "sample_and_hold",
+        HOLD,
         "fixed period, free of the trial's start",
         (Value("period_s", 1e-3, 2.0, 0.0),),
         lambda v, s: (SampleAndHold(float(v[0]), free=True),),
@@ -224,7 +248,7 @@ FORMS = (
         screened=False,
     ),
     Form(
-        "sample_and_hold",
+        HOLD,
         "fixed period, read at the frames",
         (Value("period_s", 1e-3, 2.0, 0.0),),
         lambda v, s: (SampleAndHold(float(v[0]), frame_s=s.frame_s),),
@@ -236,7 +260,7 @@ FORMS = (
         screened=False,
     ),
     Form(
-        "sample_and_hold",
+        HOLD,
         "irregular periods",
         (Value("period_s", 1e-3, 2.0, 0.0), Value("lag_s", 0.0, 0.1, 1e-3)),
         lambda v, s: (SampleAndHold(float(v[0]), ages_s=s.ages_s, lag_s=max(float(v[1]), 0.0)),),

@@ -7,7 +7,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from lerobot_vtrefine.diagnose.pad.candidates.base import Form, Setting, Value
+from lerobot_vtrefine.diagnose.pad.candidates.base import Form, Setting, Value, beside_damping
 from lerobot_vtrefine.tactile.stages.base import Stage
 from lerobot_vtrefine.tactile.stages.mechanics import ViscoelasticRelaxation
 
@@ -87,6 +87,7 @@ FORMS = (
         peer=True,
         grown=lambda v, s: v.tolist(),
     ),
+    beside_damping(ONE),
     SEVERAL,
     replace(SEVERAL, label="three branches, never pulling", build=_pushing(_several)),
 )

@@ -47,6 +47,8 @@ class Sheet:
     """When each press's readings were new."""
     warmth_c: tuple[np.ndarray | None, ...]
     """Temperature at every press's instants; None where it was not recorded."""
+    borne: tuple[tuple[np.ndarray, np.ndarray] | None, ...]
+    """Drive and age (J, n) of what earlier recordings pressed every press's columns with; see `Borne`."""
 
     @cached_property
     def rows(self) -> np.ndarray:
@@ -131,4 +133,16 @@ def _build(everyone: Sequence[Press], members: list[int], idle: np.ndarray, kind
         loaded,
         tuple(press.rhythm for press in presses),
         tuple(warmth(press.trial, course.time_s) for press, course in zip(presses, courses, strict=True)),
+        tuple(
+            _borne(press, taxels[begin:end])
+            for press, (begin, end) in zip(presses, pairwise(ends), strict=True)
+        ),
     )
+
+
+def _borne(press: Press, taxels: np.ndarray) -> tuple[np.ndarray, np.ndarray] | None:
+    known = press.trial.borne
+    if known is None or not len(known.drive):
+        return None
+    drive, age_s = (values.reshape(len(values), -1)[:, taxels] for values in (known.drive, known.age_s))
+    return drive, age_s

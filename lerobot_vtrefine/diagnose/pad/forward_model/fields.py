@@ -15,6 +15,8 @@ class Field:
     columns: np.ndarray
     """Numbers of the columns in the sheet (m,), rising."""
     rate: np.ndarray | None = None
+    damping: np.ndarray | None = None
+    """Part of forces that damping bears, where a stage asks for it [N]."""
 
     def within(self, sheet: Sheet, press: int) -> slice:
         """Where a press's columns are among these."""
@@ -25,11 +27,17 @@ class Field:
         """At the recorded frames only, as `sheet.recorded` has them."""
         if sheet.recorded is sheet:
             return self
-        out = np.zeros((max(len(frames) for frames in sheet.frames), len(self.columns)))
-        for press, frames in enumerate(sheet.frames):
-            part = self.within(sheet, press)
-            out[: len(frames), part] = self.values[frames, part]
-        return Field(out, self.columns)
+
+        def kept(values: np.ndarray) -> np.ndarray:
+            out = np.zeros((max(len(frames) for frames in sheet.frames), len(self.columns)))
+            for press, frames in enumerate(sheet.frames):
+                part = self.within(sheet, press)
+                out[: len(frames), part] = values[frames, part]
+            return out
+
+        return Field(
+            kept(self.values), self.columns, damping=None if self.damping is None else kept(self.damping)
+        )
 
     def spread(self, columns: np.ndarray) -> "Field":
         """At other columns, zero where these have none."""
@@ -50,3 +58,5 @@ class Context:
     stiffness: float
     wanted: np.ndarray | None = None
     """Numbers of the columns in which a stage that mixes taxels should answer; None for all."""
+    in_parts: bool = False
+    """Whether a later stage asks which part of a force damping bears."""

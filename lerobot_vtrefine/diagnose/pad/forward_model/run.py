@@ -14,6 +14,7 @@ from lerobot_vtrefine.diagnose.pad.motion import Kind, instants
 from lerobot_vtrefine.diagnose.pad.press_trials import Press
 from lerobot_vtrefine.tactile.stages.base import Stage
 from lerobot_vtrefine.tactile.stages.contact import ContactStage
+from lerobot_vtrefine.tactile.stages.cover import on_springs
 from lerobot_vtrefine.tactile.stages.readout import TaxelGainSpread
 
 
@@ -65,25 +66,31 @@ class Plan:
     Attributes:
         mixed: per stage, whether a later one may mix a taxel with its neighbours.
         remembered: per stage, whether a later one has memory, so that all instants count.
+        in_parts: whether a stage asks which part of a force damping bears.
     """
 
     stages: Sequence[Stage]
     kind: Kind
     mixed: tuple[bool, ...]
     remembered: tuple[bool, ...]
+    in_parts: bool
 
     @classmethod
     def of(cls, stages: Sequence[Stage]) -> "Plan":
         """The plan of a model."""
         rests = [tuple(stages[index + 1 :]) for index in range(len(stages))]
         remembered = tuple(instants(rest) != "frames" for rest in rests)
-        return cls(stages, instants(tuple(stages)), tuple(mixes(rest) for rest in rests), remembered)
+        in_parts = any(on_springs(stage) for stage in stages)
+        return cls(
+            stages, instants(tuple(stages)), tuple(mixes(rest) for rest in rests), remembered, in_parts
+        )
 
     @property
     def keys(self) -> list[Any]:
         """What a stage's field depends on, beside the stages before it."""
         steps = zip(self.stages, self.mixed, self.remembered, strict=True)
-        return [(self.kind, mixed, remembered, _key(stage)) for stage, mixed, remembered in steps]
+        common = (self.kind, self.in_parts)
+        return [(common, mixed, remembered, _key(stage)) for stage, mixed, remembered in steps]
 
 
 def run_stages(
@@ -124,7 +131,8 @@ def _step(plan: Plan, index: int, field: Field, sheet: Sheet) -> Field:
     # What nothing mixes with others any more is needed at scored taxels only.
     wanted = None if plan.mixed[index] else sheet.all_scored
     place = sheet if before else sheet.recorded
-    field = run_stage(stages[index], field, Context(place, float(contact.stiffness(sheet.layout)), wanted))
+    stiffness = float(contact.stiffness(sheet.layout))
+    field = run_stage(stages[index], field, Context(place, stiffness, wanted, plan.in_parts))
     return field.at_frames(place) if before and not plan.remembered[index] else field
 
 

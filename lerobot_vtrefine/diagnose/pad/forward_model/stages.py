@@ -5,6 +5,7 @@ neither `alike` nor listed runs on whole images, press by press.
 """
 
 from collections.abc import Callable
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -14,6 +15,7 @@ from lerobot_vtrefine.diagnose.pad.forward_model.batches import Sheet
 from lerobot_vtrefine.diagnose.pad.forward_model.fields import Context, Field
 from lerobot_vtrefine.tactile.stages.base import Frame, Stage
 from lerobot_vtrefine.tactile.stages.contact import ContactStage
+from lerobot_vtrefine.tactile.stages.cover import on_springs
 from lerobot_vtrefine.tactile.stages.host import SampleAndHold, ScanSkew
 from lerobot_vtrefine.tactile.stages.mechanics import MechanicalSpreading, ring_matrix, spreading_matrix
 from lerobot_vtrefine.tactile.stages.readout import (
@@ -27,6 +29,7 @@ from lerobot_vtrefine.tactile.stages.readout import (
     TaxelGainSpread,
 )
 from lerobot_vtrefine.tactile.stages.signals import sampled
+from lerobot_vtrefine.tactile.stages.softening import FirstLoadSoftening
 from lerobot_vtrefine.tactile.stages.surface import PadTilt
 
 Work = Callable[[np.ndarray, np.ndarray, np.ndarray], np.ndarray]
@@ -36,9 +39,29 @@ def run_stage(stage: Stage, field: Field, context: Context) -> Field:
     """The field after a stage."""
     sheet = context.sheet
     if isinstance(stage, ContactStage):
-        return field if sheet.loaded else _contact(stage, field, sheet)
+        return field if sheet.loaded else _contact(stage, field, context)
     if sheet.loaded and stage.domain == "depth":
         return field
+    if field.damping is not None and (on_springs(stage) or stage.spreads):
+        return _in_parts(stage, field, context)
+    out = _passed(stage, field, context)
+    return out if out.columns is not field.columns else replace(out, damping=field.damping)
+
+
+def _in_parts(stage: Stage, field: Field, context: Context) -> Field:
+    """What springs bear and what damping bears, apart (see `stages.cover.passed`)."""
+    damping = replace(field, values=field.damping, damping=None)
+    if stage.spreads:
+        moved = _passed(stage, replace(field, damping=None), context)
+        return replace(moved, damping=_passed(stage, damping, context).values)
+    springs = replace(field, values=field.values - damping.values, damping=None)
+    sprung = _passed(stage, springs, context).values
+    values = np.maximum(sprung + damping.values, 0.0) * (field.values > 0)
+    return replace(field, values=values)
+
+
+def _passed(stage: Stage, field: Field, context: Context) -> Field:
+    sheet = context.sheet
     if type(stage) in OWN_TAXELS:
         return OWN_TAXELS[type(stage)](stage, field, context)
     if not stage.alike or (sheet.loaded and stage.domain == "force" and not stage.has_state):
@@ -75,14 +98,18 @@ def _alike(stage: Stage, field: Field, context: Context) -> Field:
     return by_press(field, context.sheet, work)
 
 
-def _contact(stage: ContactStage, field: Field, sheet: Sheet) -> Field:
+def _contact(stage: ContactStage, field: Field, context: Context) -> Field:
     assert field.rate is not None
+    sheet = context.sheet
     depth, rate = (torch.from_numpy(np.ascontiguousarray(v))[:, None] for v in (field.values, field.rate))
-    force = stage.force(depth, rate, sheet.layout)[:, 0].numpy()
+    force, damping = stage.force(depth, rate, sheet.layout)[:, 0].numpy(), None
+    if context.in_parts:
+        damping = force - stage.undamped().force(depth, rate, sheet.layout)[:, 0].numpy()
     if field.columns is sheet.touched:
-        return Field(force, field.columns)
+        return Field(force, field.columns, damping=damping)
     felt = force.any(axis=0)
-    return Field(np.ascontiguousarray(force[:, felt]), field.columns[felt])
+    damping = None if damping is None else np.ascontiguousarray(damping[:, felt])
+    return Field(np.ascontiguousarray(force[:, felt]), field.columns[felt], damping=damping)
 
 
 def _whole(stage: Stage, field: Field, context: Context) -> Field:
@@ -122,6 +149,28 @@ def _everywhere(field: Field, context: Context) -> Field:
     return field.spread(
         context.wanted if context.wanted is not None else np.arange(len(context.sheet.taxels))
     )
+
+
+def _softened(stage: FirstLoadSoftening, field: Field, context: Context) -> Field:
+    """What earlier recordings pressed is each press's own."""
+    if not stage.session:
+        return _alike(stage, field, context)
+    sheet, out = context.sheet, np.zeros_like(field.values)
+    for press, (time_s, block, borne) in enumerate(
+        zip(sheet.times_s, sheet.blocks, sheet.borne, strict=True)
+    ):
+        part = field.within(sheet, press)
+        known = None
+        if borne is not None:
+            mine = field.columns[part] - block.start
+            drive, age_s = (torch.from_numpy(values[:, None, mine]) for values in borne)
+            known = (drive, age_s)
+        frame = Frame(
+            sheet.layout, stiffness_n_per_m=context.stiffness, load_conserving=sheet.loaded, borne=known
+        )
+        line = torch.from_numpy(np.ascontiguousarray(field.values[: len(time_s), part]))[:, None]
+        out[: len(time_s), part] = stage.sequence(line, torch.from_numpy(time_s), frame)[:, 0].numpy()
+    return Field(out, field.columns, field.rate)
 
 
 def _idle(stage: Idle, field: Field, context: Context) -> Field:
@@ -244,6 +293,7 @@ def _convert(stage: Quantisation, field: Field, context: Context) -> Field:
 OWN_TAXELS: dict[type, Callable[[Any, Field, Context], Field]] = {
     PadTilt: _added,
     MechanicalSpreading: _spreading,
+    FirstLoadSoftening: _softened,
     TaxelGainSpread: _multiplied,
     DeadTaxels: _multiplied,
     RowSharing: _row_sharing,
