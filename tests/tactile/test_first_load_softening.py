@@ -1,5 +1,7 @@
 """First-load softening and element-by-element scanning, against closed forms."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 import torch
@@ -66,6 +68,36 @@ def test_a_recording_is_what_single_frames_give(recovery_s: float) -> None:
         one, state = stage.step(value, state, frame)
         previous = time
         assert torch.allclose(one, whole)
+
+
+def in_session(stage: FirstLoadSoftening, values: list[float], borne_m: float, age_s: float) -> np.ndarray:
+    """After an earlier recording that pressed so deep, so long ago."""
+    earlier = (torch.tensor([[[borne_m]]]), torch.tensor([[[age_s]]]))
+    frame = replace(FRAME, borne=earlier)
+    times = 0.1 * torch.arange(len(values), dtype=torch.float64)
+    return stage.sequence(course(values), times, frame).numpy().ravel()
+
+
+def test_a_session_remembers_what_earlier_recordings_pressed() -> None:
+    # 1 mm bore 1 N here: below that even the first load of this recording is a second one.
+    found = in_session(FirstLoadSoftening(0.4, session=True), [0.0, 0.5, 1.5, 0.5], 1e-3, 50.0)
+    assert np.allclose(found, [0.0, 0.5 * (1 - 0.4 * 0.5), 1.5, 0.5 * (1 - 0.4 * 2 / 3)])
+
+
+def test_what_a_session_remembers_fades() -> None:
+    stage = FirstLoadSoftening(0.4, recovery_s=20.0, session=True)
+    largest = np.exp(-(10.0 + 0.1) / 20.0)
+    assert in_session(stage, [0.0, 0.5], 1e-3, 10.0)[1] == pytest.approx(
+        0.5 * (1 - 0.4 * (1 - 0.5 / largest))
+    )
+    assert in_session(stage, [0.0, 0.5], 1e-3, 1e4)[1] == pytest.approx(0.5)
+
+
+def test_a_virgin_cover_remembers_no_session() -> None:
+    values = [0.0, 0.5, 0.2]
+    assert np.array_equal(
+        in_session(FirstLoadSoftening(0.4), values, 1e-3, 1.0), softened(FirstLoadSoftening(0.4), values)
+    )
 
 
 def test_a_board_may_scan_along_the_columns_too() -> None:

@@ -14,7 +14,7 @@ class CoverLaw(Stage):
     """Base of the laws that make another force of the contact's, taxel by taxel.
 
     They act on the whole force; with `elastic` on what the springs of the contact bear alone, beside which
-    its dashpots push as before: k_n d becomes k_n d^p, say, and k_d d' stays.
+    its dashpots push as before: k_n d becomes k_n d^p, say, and k_d d' stays; together they never pull.
     """
 
     domain: ClassVar[str] = "force"
