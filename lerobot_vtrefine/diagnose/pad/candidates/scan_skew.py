@@ -12,13 +12,17 @@ LONGEST_S = 0.4
 
 
 def _by_row(values: np.ndarray, setting: Setting) -> tuple[Stage, ...]:
-    return (ScanSkew(_slope(values), (0.0, *(float(value) for value in values))),)
+    slope, late = _line(values)
+    # The line through all rows begins at none: what they share is latency.
+    return (ScanSkew(slope, (-late, *(float(value) - late for value in values))),)
 
 
-def _slope(values: np.ndarray) -> float:
-    """Seconds from the first row to the last of the straight line through all rows."""
+def _line(values: np.ndarray) -> tuple[float, float]:
+    """Straight line through all rows, the first one's delay being zero: seconds from the first row to the
+    last, and at the first."""
     delays = np.concatenate([[0.0], values])
-    return float(np.polyfit(np.linspace(0.0, 1.0, len(delays)), delays, 1)[0])
+    slope, late = np.polyfit(np.linspace(0.0, 1.0, len(delays)), delays, 1)
+    return float(slope), float(late)
 
 
 def _rows_form(rows: int) -> Form:
@@ -28,7 +32,7 @@ def _rows_form(rows: int) -> Form:
         f"{rows} rows with delays of their own",
         tuple(Value(f"row_{row}_s", -LONGEST_S, LONGEST_S, 1e-3) for row in range(1, rows)),
         _by_row,
-        lambda v, s: {"skew_s": (_slope(v), "s")},
+        lambda v, s: {"skew_s": (_line(v)[0], "s")},
         lambda s: [(0.5 * s.frame_s * np.arange(1, rows) / (rows - 1)).tolist()],
         amplitude=None,
         signed=True,
