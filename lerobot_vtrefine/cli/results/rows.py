@@ -120,6 +120,7 @@ class Line(Row):
         "information",
         "ingredients",
         "jittered",
+        "outsider",
         "servo",
         "step_mm",
         "step_size",
