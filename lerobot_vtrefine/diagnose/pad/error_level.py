@@ -17,6 +17,7 @@ from lerobot_vtrefine.diagnose.pad.rules import (
     LEVEL,
     MIN_PRESSED,
     MIN_READINGS,
+    MOST,
     OTHERS,
     TAXEL,
 )
@@ -116,7 +117,11 @@ def one_taxel(
     presses: PressSet, residuals: Sequence[np.ndarray], weights: Sequence[TrialWeights]
 ) -> Suspicion | None:
     """Whether one taxel errs far more than the others in a recording, while the pad is pressed: it may fail
-    now and then."""
+    now and then.
+
+    Noise that wanders for longer than a recording leaves each taxel a level of its own there, whose square is
+    large in one of hundreds; so it must stand out from those that err most.
+    """
     found = []
     for press, residual, weight in zip(presses.presses, residuals, weights, strict=True):
         pressed = press.touching[LAG:] & press.touching[:-LAG]
@@ -125,7 +130,7 @@ def one_taxel(
             found.append(((unit[LAG:] * unit[:-LAG])[pressed].mean(axis=0), press))
     if sum(len(ratios) for ratios, _ in found) < 4:
         return None
-    middle = float(np.median(np.concatenate([ratios for ratios, _ in found])))
+    high = float(np.quantile(np.concatenate([ratios for ratios, _ in found]), MOST))
     ratios, press = max(found, key=lambda item: float(item[0].max()))
     ratio, taxel = float(ratios.max()), int(press.taxels[ratios.argmax()])
     row, col = divmod(taxel, presses.layout.cols)
@@ -133,4 +138,4 @@ def one_taxel(
         f"errors of taxel ({row}, {col}) in {press.trial.file} are {np.sqrt(max(ratio, 0.0)):.1f} times "
         "the noise of single frames"
     )
-    return beyond(ratio, TAXEL, text, also=ratio > OTHERS * max(middle, 0.5))
+    return beyond(ratio, TAXEL, text, also=ratio > OTHERS * max(high, 0.5))

@@ -37,11 +37,12 @@ def _report_bottoming(values: np.ndarray, setting: Setting) -> dict[str, tuple[f
 POWER = Form(
     "nonlinear_stiffness",
     "power law",
-    (Value("excess", 0.0, 2.0, 2e-3),),
+    (Value("excess", -0.7, 2.0, 2e-3),),
     lambda v, s: (NonlinearStiffness(1.0 + float(v[0])),),
     lambda v, s: {"exponent": (1.0 + float(v[0]), "1")},
     lambda s: [[0.05]],
     kinds=("bend", "load"),
+    signed=True,
     none=1.0,
     needs="press to three depths or more, the deepest well beyond the others, with depth_m logged",
     possible=lambda s: not s.loaded,
