@@ -74,6 +74,26 @@ def _spread_over_trials(
     return drive.reshape(shape), age_s.reshape(shape)
 
 
+def _checked_layout(x: torch.Tensor, count: int, layout: PadLayout | None) -> PadLayout:
+    """The layout, or that of the arrays' shape; ValueError where they disagree."""
+    if x.ndim < 3 or len(x) != count:
+        raise ValueError(f"replay needs arrays (T, ..., R, C) with T = {count} times, got {tuple(x.shape)}")
+    layout = layout or PadLayout(x.shape[-2], x.shape[-1])
+    if (layout.rows, layout.cols) != tuple(x.shape[-2:]):
+        raise ValueError(f"replay got {tuple(x.shape[-2:])} taxels for a {layout.rows} x {layout.cols} pad")
+    return layout
+
+
+def _forces(
+    model: SensorModel, depth: torch.Tensor, rate: torch.Tensor, layout: PadLayout
+) -> tuple[torch.Tensor, torch.Tensor | None]:
+    """The contact's force, and the part of it that damping bears, where a stage asks for it."""
+    force = model.contact.force(depth, rate, layout)
+    if not model.parts_forces:
+        return force, None
+    return force, force - model.contact.undamped().force(depth, rate, layout)
+
+
 def replay(
     model: SensorModel,
     times_s: ArrayLike,
@@ -112,19 +132,11 @@ def replay(
         raise ValueError("replay needs exactly one of depth_m and force_n")
     times = torch.as_tensor(np.asarray(times_s), dtype=torch.float64, device=device)
     x = torch.as_tensor(depth_m if force_n is None else force_n, device=device).to(torch.float32)
-    if x.ndim < 3 or len(x) != len(times):
-        raise ValueError(
-            f"replay needs arrays (T, ..., R, C) with T = {len(times)} times, got {tuple(x.shape)}"
-        )
-    layout = layout or PadLayout(x.shape[-2], x.shape[-1])
-    if (layout.rows, layout.cols) != tuple(x.shape[-2:]):
-        raise ValueError(f"replay got {tuple(x.shape[-2:])} taxels for a {layout.rows} x {layout.cols} pad")
-    contact = model.contact
-    warmth = None if temperature_c is None else torch.as_tensor(temperature_c, device=device)
+    layout = _checked_layout(x, len(times), layout)
     frame = Frame(
         layout,
-        stiffness_n_per_m=contact.stiffness(layout),
-        temperature_c=warmth,
+        stiffness_n_per_m=model.contact.stiffness(layout),
+        temperature_c=None if temperature_c is None else torch.as_tensor(temperature_c, device=device),
         load_conserving=force_n is not None,
         borne=None if borne is None else _spread_over_trials(borne, x),
     )
@@ -134,9 +146,7 @@ def replay(
         rate = finite_rate(times, x) if given is None else given
         for stage in model.depth_stages:
             x = stage.sequence(x, times, frame) if stage.name not in skip else x
-        springs = contact.undamped().force(x, rate, layout) if model.parts_forces else None
-        x = contact.force(x, rate, layout)
-        damping = None if springs is None else x - springs
+        x, damping = _forces(model, x, rate, layout)
     for stage in model.force_stages:
         if stage.name not in skip and not stage.stochastic:
             session = times + start_s if stage.name == "baseline_drift" else times

@@ -120,22 +120,24 @@ def one_taxel(
     now and then.
 
     Noise that wanders for longer than a recording leaves each taxel a level of its own there, whose square is
-    large in one of hundreds; so it must stand out from those that err most.
+    large in one of hundreds; so it must stand out from those of the others that err most.
     """
-    found = []
+    taxels, ratios, files = [], [], []
     for press, residual, weight in zip(presses.presses, residuals, weights, strict=True):
         pressed = press.touching[LAG:] & press.touching[:-LAG]
         if pressed.sum() >= MIN_PRESSED:
             unit = residual / weight.sigma
-            found.append(((unit[LAG:] * unit[:-LAG])[pressed].mean(axis=0), press))
-    if sum(len(ratios) for ratios, _ in found) < 4:
+            ratios += (unit[LAG:] * unit[:-LAG])[pressed].mean(axis=0).tolist()
+            taxels += press.taxels.tolist()
+            files += [press.trial.file] * len(press.taxels)
+    if len(ratios) < 4:
         return None
-    high = float(np.quantile(np.concatenate([ratios for ratios, _ in found]), MOST))
-    ratios, press = max(found, key=lambda item: float(item[0].max()))
-    ratio, taxel = float(ratios.max()), int(press.taxels[ratios.argmax()])
-    row, col = divmod(taxel, presses.layout.cols)
+    worst = int(np.argmax(ratios))
+    ratio, others = ratios[worst], np.array(taxels) != taxels[worst]
+    high = float(np.quantile(np.array(ratios)[others], MOST)) if others.any() else 0.0
+    row, col = divmod(taxels[worst], presses.layout.cols)
     text = (
-        f"errors of taxel ({row}, {col}) in {press.trial.file} are {np.sqrt(max(ratio, 0.0)):.1f} times "
+        f"errors of taxel ({row}, {col}) in {files[worst]} are {np.sqrt(max(ratio, 0.0)):.1f} times "
         "the noise of single frames"
     )
     return beyond(ratio, TAXEL, text, also=ratio > OTHERS * max(high, 0.5))

@@ -5,8 +5,9 @@ from dataclasses import replace
 import numpy as np
 
 from lerobot_vtrefine.diagnose.pad.fitting import predict
+from lerobot_vtrefine.diagnose.pad.idle_map import IdleMap
 from lerobot_vtrefine.diagnose.pad.model import Composite
-from lerobot_vtrefine.diagnose.pad.press_trials import IdleMap, Press, PressSet
+from lerobot_vtrefine.diagnose.pad.press_trials import Press, PressSet
 
 QUIET_COUNTS = 0.3
 """Expected reading, of 255, up to which a taxel counts as idle."""

@@ -5,7 +5,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from lerobot_vtrefine.diagnose.pad.candidates.base import Form, Setting, Value
-from lerobot_vtrefine.diagnose.pad.press_trials import IdleMap, PressSet
+from lerobot_vtrefine.diagnose.pad.idle_map import IdleMap
+from lerobot_vtrefine.diagnose.pad.press_trials import PressSet
 from lerobot_vtrefine.tactile.model import SensorModel
 from lerobot_vtrefine.tactile.stages.base import Stage
 from lerobot_vtrefine.tactile.stages.contact import KelvinVoigt

@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from scipy.ndimage import binary_dilation
 
+from lerobot_vtrefine.diagnose.pad.idle_map import IdleMap, WholeMotion, idle_map, resting
 from lerobot_vtrefine.diagnose.pad.indenters import trial_forces
 from lerobot_vtrefine.diagnose.pad.motion import Kind, instants_of, motion
 from lerobot_vtrefine.diagnose.pad.repeated_frames import Rhythm, silent
@@ -21,11 +22,8 @@ MARGIN_TAXELS = 2
 """Untouched taxels kept around those that answer, so that spreading does not see the crop's edge."""
 CLEAR_M = 2e-4
 """An indenter this far away cannot touch a pad whose face is a little off."""
-REST_S = 1.0
-"""After a release the idle level is trusted again after this time [s]."""
 NORMAL_MEDIAN = 0.6745
 """Median size of a standard normal deviate."""
-MIN_IDLE_FRAMES = 30
 MIN_FRAMES = 8
 
 
@@ -142,16 +140,6 @@ class Press:
 
 
 @dataclass(frozen=True)
-class IdleMap:
-    """Reading of every taxel at rest (R, C) counts, and the mean session time of its frames [s]."""
-
-    level: np.ndarray
-    session_s: float
-    frames: int
-    """Number of frames without contact that it rests on."""
-
-
-@dataclass(frozen=True)
 class PressSet:
     """Presses of one pad with what they share."""
 
@@ -212,16 +200,6 @@ class PressSet:
 
 
 @dataclass(frozen=True)
-class _Motion:
-    """Drive of one whole pad."""
-
-    drive: np.ndarray
-    rate: np.ndarray
-    touching: np.ndarray
-    near: np.ndarray
-
-
-@dataclass(frozen=True)
 class _Doubt:
     """How far readings may move without answering [counts]: one step, and a window's mean at rest."""
 
@@ -276,62 +254,16 @@ def _lattice(trials: list[Trial]) -> float:
     return 1.0 if np.allclose(sample, np.round(sample), atol=1e-6) else 0.0
 
 
-def _motion(trial: Trial, layout: PadLayout, loaded: bool) -> _Motion:
+def _motion(trial: Trial, layout: PadLayout, loaded: bool) -> WholeMotion:
     if loaded:
         force = trial_forces(trial, layout)
         load = trial.force_n if trial.force_n is not None else np.zeros(len(force))
         threshold = 0.01 * max(float(np.max(load)), 1e-9)
         touching = load > threshold
-        return _Motion(force, np.zeros_like(force), touching, touching)
+        return WholeMotion(force, np.zeros_like(force), touching, touching)
     heights, rate = motion(trial, layout, trial.time_s)
     top = heights.reshape(len(heights), -1).max(axis=1)
-    return _Motion(heights, rate, top > 0, top > -CLEAR_M)
-
-
-def _rest(trial: Trial, motion: _Motion) -> tuple[np.ndarray, np.ndarray]:
-    """Frames before the first touch, and those well after a release as well: (T,) bool each."""
-    near, time = motion.near, trial.time_s
-    first = int(np.argmax(near)) if near.any() else len(near)
-    before = np.arange(len(near)) < first
-    last_touch = np.where(near, time, -np.inf)
-    since = time - np.maximum.accumulate(last_touch)
-    return before, ~near & (since > REST_S)
-
-
-def idle_map(trials: list[Trial], motions: list[_Motion], layout: PadLayout) -> IdleMap:
-    """Mean reading of every taxel in frames without contact; low quantiles where there is no such frame."""
-    rests = [_rest(trial, motion) for trial, motion in zip(trials, motions, strict=True)]
-    for pick in (0, 1):
-        frames = [rest[pick] for rest in rests]
-        count = sum(int(mask.sum()) for mask in frames)
-        if count >= MIN_IDLE_FRAMES:
-            break
-    else:
-        frames = [~motion.touching for motion in motions]
-        count = sum(int(mask.sum()) for mask in frames)
-    shape = (layout.rows, layout.cols)
-    if count >= 3:
-        raw = np.concatenate([trial.raw[mask] for trial, mask in zip(trials, frames, strict=True)])
-        session = np.concatenate(
-            [(trial.time_s + trial.start_s)[mask] for trial, mask in zip(trials, frames, strict=True)]
-        )
-        return IdleMap(raw.mean(axis=0).reshape(shape), float(session.mean()), count)
-    session_s = float(np.mean([trial.start_s for trial in trials]))
-    return IdleMap(_idle_by_taxel(trials, motions).reshape(shape), session_s, 0)
-
-
-def _idle_by_taxel(trials: list[Trial], motions: list[_Motion]) -> np.ndarray:
-    """Means of each taxel's own free frames; where it has none, what a straight line leaves at no depth."""
-    raw = np.concatenate([trial.raw for trial in trials])
-    drives = np.concatenate([motion.drive.reshape(len(motion.drive), -1) for motion in motions])
-    depth = np.maximum(drives, 0.0)
-    free = depth == 0
-    mean = np.where(free, raw, 0.0).sum(axis=0) / np.maximum(free.sum(axis=0), 1)
-    off_depth, off_raw = depth - depth.mean(axis=0), raw - raw.mean(axis=0)
-    power = float((off_depth**2).sum())
-    slope = float((off_depth * off_raw).sum()) / power if power > 0 else 0.0
-    left = np.maximum(raw.mean(axis=0) - slope * depth.mean(axis=0), 0.0)
-    return np.where(free.sum(axis=0) >= 3, mean, left)
+    return WholeMotion(heights, rate, top > 0, top > -CLEAR_M)
 
 
 def near(mask: np.ndarray) -> np.ndarray:
@@ -345,7 +277,7 @@ def _window(trial: Trial) -> int:
     return max(3, len(trial.raw) // 30)
 
 
-def _wander(trials: list[Trial], motions: list[_Motion], idle: IdleMap) -> float:
+def _wander(trials: list[Trial], motions: list[WholeMotion], idle: IdleMap) -> float:
     """Deviation of a window's mean reading from the idle level, of a typical taxel at rest [counts].
 
     What noise with memory does in a recording's few frames at rest tells too little of how far it goes in the
@@ -353,7 +285,7 @@ def _wander(trials: list[Trial], motions: list[_Motion], idle: IdleMap) -> float
     """
     means = []
     for trial, course in zip(trials, motions, strict=True):
-        rest = trial.raw[_rest(trial, course)[1]] - idle.level.ravel()
+        rest = trial.raw[resting(trial, course)[1]] - idle.level.ravel()
         count = len(rest) // _window(trial)
         if count:
             blocks = rest[: count * _window(trial)].reshape(count, _window(trial), -1).mean(axis=1)
@@ -362,13 +294,13 @@ def _wander(trials: list[Trial], motions: list[_Motion], idle: IdleMap) -> float
     return float(np.median(np.abs(np.concatenate(means)))) / NORMAL_MEDIAN if means else 0.0
 
 
-def _answering(trial: Trial, motion: _Motion, doubt: _Doubt) -> np.ndarray:
+def _answering(trial: Trial, motion: WholeMotion, doubt: _Doubt) -> np.ndarray:
     """Taxels whose smoothed reading moves by over a count (and more than noise) from rest: (R, C) bool.
 
     Far from the indenter hardly any does, and there it has to move by more than noise wanders.
     """
     pressed = np.any(motion.drive > 0, axis=0)
-    rest = _rest(trial, motion)[1]
+    rest = resting(trial, motion)[1]
     base = trial.raw[rest] if rest.sum() >= 5 else trial.raw
     centre = np.median(base, axis=0)
     window = _window(trial)
@@ -383,7 +315,7 @@ def _answering(trial: Trial, motion: _Motion, doubt: _Doubt) -> np.ndarray:
 
 
 def _press(
-    trial: Trial, motion: _Motion, layout: PadLayout, idle: np.ndarray, loaded: bool, doubt: _Doubt
+    trial: Trial, motion: WholeMotion, layout: PadLayout, idle: np.ndarray, loaded: bool, doubt: _Doubt
 ) -> Press:
     shape = (layout.rows, layout.cols)
     pressed = (motion.drive > 0).any(axis=0)
@@ -415,7 +347,7 @@ def _press(
         raw - level,
         level,
         motion.touching,
-        np.logical_or(*_rest(trial, motion)),
+        np.logical_or(*resting(trial, motion)),
     )
 
 

@@ -106,7 +106,8 @@ class MechanicalSpreading(Stage):
 
     `rings`, weights at the shortest distances of the lattice over that at the centre (`ring_matrix`), stand
     in for the Gaussian where a cover spreads otherwise; `sigma_m` is then their deviation alone. With them,
-    a cover that reaches beyond the taxels keeps only the part `kept` of what would leave the pad.
+    a cover that reaches beyond the taxels keeps only the part `kept` of what would leave the pad. A stiff
+    skin over a soft layer spreads only a `share` of the force, and widely.
     """
 
     name: ClassVar[str] = "mechanical_spreading"
@@ -116,6 +117,7 @@ class MechanicalSpreading(Stage):
     sigma_m: float = parameter(1.0e-3, "m", 0.0, 3.0e-3)
     rings: tuple[float, ...] = limits(0.0, 1.0, default=())
     kept: float = parameter(1.0, "1", 1.0, 1.0, maximum=1.0)
+    share: float = parameter(1.0, "1", 1.0, 1.0, maximum=1.0)
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -125,14 +127,20 @@ class MechanicalSpreading(Stage):
 
     @override
     def step(self, x: torch.Tensor, state: State, frame: Frame) -> tuple[torch.Tensor, State]:
+        spread = self._spread(x, frame.layout.pitch_m)
+        if not isinstance(self.share, torch.Tensor) and self.share == 1.0:
+            return spread, state
+        return x + self.share * (spread - x), state
+
+    def _spread(self, x: torch.Tensor, pitch_m: float) -> torch.Tensor:
         if self.rings:
             weights = ring_matrix(*x.shape[-2:], self.rings, self.kept)
             matrix = torch.as_tensor(weights, dtype=x.dtype, device=x.device)
-            return (x.flatten(-2) @ matrix.T).view(x.shape), state
-        sigma = torch.as_tensor(self.sigma_m, dtype=x.dtype, device=x.device) / frame.layout.pitch_m
+            return (x.flatten(-2) @ matrix.T).view(x.shape)
+        sigma = torch.as_tensor(self.sigma_m, dtype=x.dtype, device=x.device) / pitch_m
         sigma = sigma.view(1, 1) if sigma.ndim == 0 else sigma
         rows, cols = x.shape[-2:]
-        return spreading_matrix(rows, sigma) @ x @ spreading_matrix(cols, sigma).transpose(-1, -2), state
+        return spreading_matrix(rows, sigma) @ x @ spreading_matrix(cols, sigma).transpose(-1, -2)
 
 
 @register

@@ -42,6 +42,11 @@ def _lost(values: np.ndarray, setting: Setting) -> tuple[Stage, ...]:
     return (MechanicalSpreading(taxels * setting.layout.pitch_m, rings, kept),)
 
 
+def _partly(values: np.ndarray, setting: Setting) -> tuple[Stage, ...]:
+    taxels, share = (float(value) for value in values)
+    return (MechanicalSpreading(taxels * setting.layout.pitch_m, share=share),)
+
+
 def _as_rings(values: np.ndarray, setting: Setting) -> list[float]:
     """The Gaussian's weights, each over the one before; not quite zero, where slopes vanish."""
     weights = _gaussian(max(float(values[0]), 0.3))
@@ -72,6 +77,17 @@ FORMS = (
         possible=lambda s: min(s.layout.rows, s.layout.cols) > 1,
         screened=False,
         grown=lambda v, s: [float(v[0]), 0.2],
+    ),
+    Form(
+        "mechanical_spreading",
+        "Gaussian, of a part of the load",
+        (Value("taxels", 0.5, 4.0, 1e-2), Value("share", 0.0, 1.0, 2e-3)),
+        _partly,
+        lambda v, s: {"sigma_m": (float(v[0]) * s.layout.pitch_m, "m"), "share": (float(v[1]), "1")},
+        lambda s: [[1.5, 0.1]],
+        amplitude=None,
+        possible=lambda s: min(s.layout.rows, s.layout.cols) > 2,
+        screened=False,
     ),
     Form(
         "mechanical_spreading",

@@ -216,7 +216,8 @@ def _spreading(stage: MechanicalSpreading, field: Field, context: Context) -> Fi
     down, along = (spreading_matrix(n, sigma).numpy() for n in (sheet.layout.rows, sheet.layout.cols))
 
     def weights(to: np.ndarray, of: np.ndarray) -> np.ndarray:
-        return down[np.ix_(sheet.rows[to], sheet.rows[of])] * along[np.ix_(sheet.cols[to], sheet.cols[of])]
+        spread = down[np.ix_(sheet.rows[to], sheet.rows[of])] * along[np.ix_(sheet.cols[to], sheet.cols[of])]
+        return spread * stage.share + (1.0 - stage.share) * (sheet.taxels[to][:, None] == sheet.taxels[of])
 
     return _mixed(field, context, weights)
 
