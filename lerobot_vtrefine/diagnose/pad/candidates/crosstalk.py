@@ -7,9 +7,9 @@ from lerobot_vtrefine.tactile.stages.base import Stage
 from lerobot_vtrefine.tactile.stages.readout import Crosstalk
 
 MOST = 0.3
-LOG_REACH = Value("log_reach", float(np.log(0.2)), float(np.log(20.0)), 1e-2)
-FAR = float(np.log(1.5))
-"""Shortest reach of what leaks to both sides: what stays with the next taxels is spread by the cover."""
+NEXT = 0.2
+"""Reach of what leaks to the next taxels only [taxels]: to those after them, by less than a hundredth."""
+LOG_REACH = Value("log_reach", float(np.log(NEXT)), float(np.log(20.0)), 1e-2)
 
 
 def _fading(values: np.ndarray, setting: Setting) -> tuple[Stage, ...]:
@@ -42,11 +42,21 @@ FORMS = (
     ),
     Form(
         "crosstalk",
+        "to the next taxels of row and column",
+        (Value("row", 0.0, MOST, 2e-4), Value("col", 0.0, MOST, 2e-4)),
+        lambda v, s: (Crosstalk(float(v[0]), float(v[1]), NEXT),),
+        lambda v, s: {"row": (float(v[0]), "1"), "col": (float(v[1]), "1")},
+        lambda s: [[0.01, 0.01]],
+        amplitude=None,
+        possible=lambda s: max(s.layout.rows, s.layout.cols) > 2,
+    ),
+    Form(
+        "crosstalk",
         "fading along row and column",
         (
             Value("row", 0.0, MOST, 2e-4),
             Value("col", 0.0, MOST, 2e-4),
-            Value("log_reach", FAR, LOG_REACH.high, LOG_REACH.step),
+            LOG_REACH,
         ),
         _fading,
         _report,
