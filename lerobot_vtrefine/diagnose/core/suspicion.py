@@ -1,8 +1,9 @@
 """Signs that something acts which no accepted cause accounts for, under one error rate.
 
 A suspicion that can be tested is a score per trial, as likely negative as positive (or in any order) if
-nothing is there; all of them together are one max-T test. What can only be observed (a size beyond any that
-sound recordings have, in trials too few to test) has no p-value and says so.
+nothing is there. Those of what changes from trial to trial are one max-T test, all others another: among
+dozens of views of what happens within trials, the few that follow the session would drown. What can only be
+observed (a size beyond any that sound recordings have, in trials too few to test) has no p-value and says so.
 """
 
 from collections.abc import Sequence
@@ -37,6 +38,8 @@ class Suspicion:
     drawn: Array | None = None
     decisive: bool = False
     """Whether it explains whatever else is odd about its channel."""
+    between_trials: bool = False
+    """Whether it concerns what changes from trial to trial, so that it is tested together with such alone."""
 
 
 @dataclass(frozen=True)
@@ -82,16 +85,18 @@ def observed(suspicions: Sequence[Suspicion]) -> list[Alarm]:
 
 
 def _tested(suspicions: Sequence[Suspicion], seed: int) -> list[float | None]:
-    """Adjusted p of each; one max-T test over all that have scores."""
-    told = {
-        place: Hypothesis(item.scores, item.along, item.either_sign, item.scatter, item.drawn)
-        for place, item in enumerate(suspicions)
-        if item.scores is not None
-    }
-    if not told:
-        return [None] * len(suspicions)
-    adjusted = dict(zip(told, jointly_adjusted(list(told.values()), seed), strict=True))
-    return [float(adjusted[place]) if place in adjusted else None for place in range(len(suspicions))]
+    """Adjusted p of each that has scores; one max-T test between trials, and one within."""
+    p_values: list[float | None] = [None] * len(suspicions)
+    for between in (False, True):
+        told = {
+            place: Hypothesis(item.scores, item.along, item.either_sign, item.scatter, item.drawn)
+            for place, item in enumerate(suspicions)
+            if item.scores is not None and item.between_trials == between
+        }
+        if told:
+            for place, p_value in zip(told, jointly_adjusted(list(told.values()), seed), strict=True):
+                p_values[place] = float(p_value)
+    return p_values
 
 
 def _too_few(selection: Selection[Any, Any, Any]) -> list[Alarm]:

@@ -44,14 +44,17 @@ def suspicions(problem: "PadProblem", selection: Selection[Any, Fit, Any]) -> li
     _, weights = weigh(fitted, presses)
     residuals = repeatability.cleaned(fitted, presses, weights)
     descriptors, own = following(problem, fitted), own_deviations(presses, fitted)
+    between = [
+        *recording_scatter(own, problem.seed),
+        *gain_drift(fitted, presses, weights),
+        *(item for descriptor, item in descriptors if descriptor.session),
+    ]
     sure = [
         error_level.level(residuals, fitted, weights),
         held_rows(presses) if HOLD not in fitted.model.families else None,
         while_sliding(presses, residuals, fitted, weights),
-        *recording_scatter(own, problem.seed),
+        *(replace(item, between_trials=True) for item in between),
         *shared_errors(presses, own.left, fitted, weights, problem.seed),
-        *gain_drift(fitted, presses, weights),
-        *(item for descriptor, item in descriptors if descriptor.session),
         *in_place_of_names(problem, fitted),
     ]
     before, after = (fit.residuals(presses) for fit in (plain, fitted))
