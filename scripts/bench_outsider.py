@@ -77,8 +77,12 @@ def first_right(row: Row) -> bool:
 
 
 def wrong(row: Row) -> bool:
-    """Whether a name that does not act was told first, with confidence."""
-    return bool(row["named"]) and row["status"] in ("explained", "ambiguous") and not first_right(row)
+    """Whether a name that does not act was told first, with confidence: without saying that one that does may
+    stand in its place."""
+    said = (
+        {row["named"][0], *(name for group in row["ambiguous"] for name in group)} if row["named"] else set()
+    )
+    return row["status"] in ("explained", "ambiguous") and bool(said) and not said & hidden(row)
 
 
 def document(rows: list[Row]) -> str:

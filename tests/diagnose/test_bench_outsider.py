@@ -36,7 +36,7 @@ def test_a_set_is_what_was_planned(kind: str, effect: str | None, tmp_path: Path
 
 def row(**given) -> dict:
     plain = {"kind": "single", "effect": "latency", "status": "explained", "named": ["latency"]}
-    return plain | {"achievable": 0.4, "cpu_s": 1.0} | given
+    return plain | {"achievable": 0.4, "cpu_s": 1.0, "ambiguous": []} | given
 
 
 def test_verdicts_are_graded_as_their_author_would() -> None:
@@ -47,6 +47,9 @@ def test_verdicts_are_graded_as_their_author_would() -> None:
     assert bench_outsider.exact(row(kind="clean", effect=None, status="adequate", named=[]))
     assert bench_outsider.wrong(row(named=["hysteresis"]))
     assert not bench_outsider.wrong(row(named=["hysteresis"], status="unexplained"))
+    tie = {"named": ["hysteresis"], "status": "ambiguous"}
+    assert not bench_outsider.wrong(row(ambiguous=[["hysteresis", "latency"]], **tie))
+    assert bench_outsider.wrong(row(ambiguous=[["hysteresis", "saturation"]], **tie))
     text = bench_outsider.document([row(), row(named=["hysteresis"]), row(cpu_s=70.0)])
     assert "| one cause in its plain form: exact verdict | 3 | 0.667" in text
     assert "| more than 60 s of one core | 3 | 0.333" in text
