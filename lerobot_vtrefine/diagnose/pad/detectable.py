@@ -24,9 +24,8 @@ from lerobot_vtrefine.diagnose.pad.candidates import CATALOGUE, PLAIN
 from lerobot_vtrefine.diagnose.pad.candidates.base import Form
 from lerobot_vtrefine.diagnose.pad.candidates.sample_and_hold import shortest_period
 from lerobot_vtrefine.diagnose.pad.fitting import Fit, movable, squared_errors, tangents
-from lerobot_vtrefine.diagnose.pad.rules import DEAD_ERROR
 from lerobot_vtrefine.diagnose.pad.screening import MAPS, Scorer
-from lerobot_vtrefine.diagnose.pad.taxel_maps import MAX_SIGMA, map_evidence, plain_gains
+from lerobot_vtrefine.diagnose.pad.taxel_maps import MAX_SIGMA, could_be_dead, map_evidence, plain_gains
 
 if TYPE_CHECKING:
     from lerobot_vtrefine.diagnose.pad.problem import PadProblem
@@ -67,7 +66,7 @@ def power_of(problem: "PadProblem", fitted: Fit) -> Power:
         sizes["taxel_gain_spread"] = _smallest_spread(bench)
     if "dead_taxels" not in held:
         _, error = plain_gains(fitted, problem.presses)
-        sizes["dead_taxels"] = 1.0 if (error < DEAD_ERROR).sum() > 1 else None
+        sizes["dead_taxels"] = 1.0 if could_be_dead(error).sum() > 1 else None
     needs = {name: form.needs for name, form in PLAIN.items()} | NEEDS
     return Power(
         {name: size for name, size in sizes.items() if size is not None},

@@ -22,10 +22,11 @@ FORGIVEN = 1.5
 """Factor by which weights may raise the plain squared error of a model; beyond, all readings count alike."""
 FAR_OFF = 4.0
 """Mean square of slow errors under load, in variances of a frame's noise, that weights must not hide."""
-DEAD_BELOW, DEAD_ERROR = 0.2, 0.04
-"""Part of the median gain below which a taxel is dead, and the standard error its gain must be known to."""
-MAYBE_DEAD_ERROR = 0.1
-"""Standard error of a gain up to which a taxel may be one more dead one, where others are."""
+DEAD_BELOW, DEAD_ERRORS = 1 / 3, 2.0
+"""Part of the median gain below which a taxel is dead (that it reads nothing takes away three quarters of its
+squared error), and the standard errors by which its gain must lie below."""
+MAYBE_DEAD_ERRORS = 1.0
+"""Standard errors that are enough for one more dead taxel, where others are."""
 
 # Readings are held.
 MIN_HELD, CHANCE = 0.015, 0.2

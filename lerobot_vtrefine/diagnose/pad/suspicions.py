@@ -21,7 +21,7 @@ from lerobot_vtrefine.diagnose.pad.gain_drift import gain_drift
 from lerobot_vtrefine.diagnose.pad.press_trials import PressSet
 from lerobot_vtrefine.diagnose.pad.recording_scatter import own_deviations, recording_scatter
 from lerobot_vtrefine.diagnose.pad.repeatability import Correlations
-from lerobot_vtrefine.diagnose.pad.rules import FOLLOWS, FOLLOWS_IF_OWNED, MAYBE_DEAD_ERROR
+from lerobot_vtrefine.diagnose.pad.rules import FOLLOWS, FOLLOWS_IF_OWNED, MAYBE_DEAD_ERRORS
 from lerobot_vtrefine.diagnose.pad.screening import Scorer
 from lerobot_vtrefine.diagnose.pad.shared_errors import shared_errors
 from lerobot_vtrefine.diagnose.pad.sliding_errors import while_sliding
@@ -40,7 +40,7 @@ def suspicions(problem: "PadProblem", selection: Selection[Any, Fit, Any]) -> li
     """
     presses, fitted, plain = problem.presses, selection.fit, selection.baseline
     if fitted.model.dead:
-        fitted = with_all_dead(fitted, presses, MAYBE_DEAD_ERROR)
+        fitted = with_all_dead(fitted, presses, MAYBE_DEAD_ERRORS)
     _, weights = weigh(fitted, presses)
     residuals = repeatability.cleaned(fitted, presses, weights)
     descriptors, own = following(problem, fitted), own_deviations(presses, fitted)
@@ -80,7 +80,7 @@ def surprises(problem: "PadProblem", fitted: Fit, presses: PressSet) -> list[Sus
     if fitted.model.gain_map is not None:
         return []
     there = replace(fitted, signals=tuple(predict(fitted.model, presses)))
-    there = with_all_dead(there, presses, MAYBE_DEAD_ERROR) if fitted.model.dead else there
+    there = with_all_dead(there, presses, MAYBE_DEAD_ERRORS) if fitted.model.dead else there
     _, weights = weigh(there, presses, problem.noise)
     item = error_level.one_taxel(presses, repeatability.cleaned(there, presses, weights), weights)
     return [] if item is None else [item]

@@ -8,7 +8,7 @@ import numpy as np
 from lerobot_vtrefine.diagnose.pad.fitting import Fit, predict
 from lerobot_vtrefine.diagnose.pad.model import Composite
 from lerobot_vtrefine.diagnose.pad.press_trials import PressSet
-from lerobot_vtrefine.diagnose.pad.rules import DEAD_BELOW, DEAD_ERROR
+from lerobot_vtrefine.diagnose.pad.rules import DEAD_BELOW, DEAD_ERRORS
 from lerobot_vtrefine.diagnose.pad.weights import TrialWeights
 
 STEP = 1e-3
@@ -163,27 +163,33 @@ def plain_gains(fitted: Fit, presses: PressSet) -> tuple[np.ndarray, np.ndarray]
     return gain, np.where(known, error, np.inf)
 
 
-def with_all_dead(fitted: Fit, presses: PressSet, least_sure: float = DEAD_ERROR) -> Fit:
+def with_all_dead(fitted: Fit, presses: PressSet, errors: float = DEAD_ERRORS) -> Fit:
     """The fit with those taxels, too, that hardly answer in these presses."""
-    dead = {*fitted.model.dead, *find_dead(fitted, presses, least_sure)}
+    dead = {*fitted.model.dead, *find_dead(fitted, presses, errors)}
     model = replace(fitted.model, dead=tuple(sorted(dead)))
     return replace(fitted, model=model, signals=tuple(predict(model, presses)))
 
 
-def find_dead(fitted: Fit, presses: PressSet, least_sure: float = DEAD_ERROR) -> tuple[tuple[int, int], ...]:
+def could_be_dead(error: np.ndarray, errors: float = DEAD_ERRORS) -> np.ndarray:
+    """Which taxels are pressed so well that a gain of nothing, known to ``error``, would make them dead."""
+    return np.isfinite(error) & (errors * error < DEAD_BELOW)
+
+
+def find_dead(fitted: Fit, presses: PressSet, errors: float = DEAD_ERRORS) -> tuple[tuple[int, int], ...]:
     """Taxels that hardly answer although pressed well: ((row, col), ...).
 
     Args:
-        least_sure: standard error that their gain must be known to.
+        errors: standard errors by which a gain must lie below that of a dead taxel.
     """
     gain, error = plain_gains(fitted, presses)
-    good = np.isfinite(error) & (error < least_sure)
-    if good.sum() < 2:
+    sure = could_be_dead(error)
+    if sure.sum() < 2:
         return ()
-    typical = float(np.median(gain[good]))
+    typical = float(np.median(gain[sure]))
     if typical <= 0:
         return ()
-    dead = good & (gain < DEAD_BELOW * typical)
+    good = could_be_dead(error, errors)
+    dead = good & (gain + errors * error < DEAD_BELOW * typical)
     if dead.sum() > 0.5 * good.sum():
         return ()
     cols = presses.layout.cols
