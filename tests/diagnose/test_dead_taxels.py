@@ -30,10 +30,8 @@ def test_a_taxel_is_dead_whose_gain_is_surely_below_a_third() -> None:
     squares = FRAMES / 2 * LOADS**2
     np.testing.assert_allclose(error, np.sqrt(10 / squares), rtol=0.1)
     assert np.all(np.abs(gain - GAINS)[LOADS > 1] < error[LOADS > 1])
-    assert find_dead(fitted, presses) == (
-        (1, 0),
-        (1, 1),
-    )  # pressed lightly, but surely; a quarter left
+    # The first is pressed lightly, but surely; the second has a quarter left.
+    assert find_dead(fitted, presses) == ((1, 0), (1, 1))
     assert not could_be_dead(error)[7]
 
 

@@ -188,10 +188,8 @@ def test_both_commands_over_localhost(checkpoint: Path, tmp_path: Path) -> None:
             client.send_signal(signal.SIGINT)
             try:
                 client.wait(30)
-            except (
-                subprocess.TimeoutExpired
-            ):  # LeRobot's client may hang in closing its channel; our server is asked below
-                client.kill()
+            except subprocess.TimeoutExpired:
+                client.kill()  # LeRobot's own client may hang in closing its channel
     finally:
         server.send_signal(signal.SIGINT)
         assert server.wait(60) == 130

@@ -172,7 +172,7 @@ def with_all_dead(fitted: Fit, presses: PressSet, errors: float = DEAD_ERRORS) -
 
 def could_be_dead(error: np.ndarray, errors: float = DEAD_ERRORS) -> np.ndarray:
     """Which taxels are pressed so well that a gain of nothing, known to ``error``, would make them dead."""
-    return np.isfinite(error) & (errors * error < DEAD_BELOW)
+    return errors * error < DEAD_BELOW
 
 
 def find_dead(fitted: Fit, presses: PressSet, errors: float = DEAD_ERRORS) -> tuple[tuple[int, int], ...]:
