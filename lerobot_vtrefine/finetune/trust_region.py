@@ -1,11 +1,14 @@
 """How far one iteration may move the policy, in units of behaviour: KL divergence per decision [nats].
 
-PPO's clip range does not bind in DPPO's small presets, since log-probabilities are averaged over all action
-elements; what then decides is the learning rate, and the right one depends on batch, network and task. Here
-the rate follows from the divergence that the last iteration reached, and the target falls geometrically, so
+Log-probabilities are averaged over all action elements, so PPO's clip range binds late; what decides before is
+the learning rate, and the right one depends on batch, network and task. Here the rate follows from the divergence that the last iteration reached, and the target falls geometrically, so
 that learning starts fast and settles.
+
+Where clipping does hold the policy nearer than the target, no rate reaches it: the rate would wind up by half
+in every iteration, and shake the network without moving the policy further. ``actor_lr_max`` ends that.
 """
 
+import math
 from collections.abc import Sequence
 
 from lerobot_vtrefine.finetune.config import DppoConfig
@@ -47,7 +50,8 @@ class TrustRegion:
             return
         target = self.target(iteration)
         furthest = (TOO_FAR + 1) * target if stopped else max(reached)
-        self.rate *= min(max((target / max(furthest, 1e-9)) ** 0.5, SLOWEST), FASTEST)
+        change = min(max((target / max(furthest, 1e-9)) ** 0.5, SLOWEST), FASTEST)
+        self.rate = min(self.rate * change, self.cfg.actor_lr_max or math.inf)
 
     def state_dict(self) -> dict[str, float]:
         """The present rate."""
