@@ -1,8 +1,9 @@
 """How far one iteration may move the policy, in units of behaviour: KL divergence per decision [nats].
 
-Log-probabilities are averaged over all action elements, so PPO's clip range binds late; what decides before is
-the learning rate, and the right one depends on batch, network and task. Here the rate follows from the divergence that the last iteration reached, and the target falls geometrically, so
-that learning starts fast and settles.
+Log-probabilities are averaged over all action elements, so PPO's clip range binds late; what decides before
+is the learning rate, and the right one depends on batch, network and task. Here the rate follows from the
+divergence that the last iteration reached, and the target falls geometrically, so that learning starts fast
+and settles.
 
 Where clipping does hold the policy nearer than the target, no rate reaches it: the rate would wind up by half
 in every iteration, and shake the network without moving the policy further. ``actor_lr_max`` ends that.
