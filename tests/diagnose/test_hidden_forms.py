@@ -11,17 +11,22 @@ SEED = 7011
 @pytest.mark.parametrize(
     ("family", "form"),
     [
-        ("scan_skew", "blocks"),
-        ("latency", "filter"),
         ("nonlinear_stiffness", "densification"),
         ("contact_offset", "soft"),
         ("mechanical_spreading", "box"),
         ("crosstalk", "one_sided"),
-        ("hysteresis", "branch"),
-        ("hysteresis", "below_peak"),
-        ("hysteresis", "resting"),
-        ("viscoelastic_relaxation", "power_creep"),
         ("baseline_drift", "temperature"),
+        *(
+            pytest.param(*truth, marks=pytest.mark.slow)
+            for truth in (
+                ("scan_skew", "blocks"),
+                ("latency", "filter"),
+                ("hysteresis", "branch"),
+                ("hysteresis", "below_peak"),
+                ("hysteresis", "resting"),
+                ("viscoelastic_relaxation", "power_creep"),
+            )
+        ),
     ],
     ids=lambda name: name,
 )
@@ -33,6 +38,7 @@ def test_a_family_has_a_form_for_it(tmp_path, family, form):
     assert gains["gain"] > 0.93 * gains["oracle_gain"]
 
 
+@pytest.mark.slow
 def test_a_cause_that_weights_forgive_in_part_is_found_by_plain_errors(tmp_path):
     names = ("viscoelastic_relaxation", "hysteresis")
     spec = Spec("4x4", (("viscoelastic_relaxation", "prony", 1.5), ("hysteresis", "play", 1.5)))

@@ -1,7 +1,7 @@
 """Effects hidden in recordings by other code: the verdict must name them, and only them.
 
-One plain instance of everything; `make bench-diagnose` is the measurement. Seeds are neither the benchmark's
-nor those that the engine was tuned on.
+One plain instance of everything; `make test-slow` has more, and `make bench-diagnose` is the measurement.
+Seeds are neither the benchmark's nor those that the engine was tuned on.
 """
 
 import pytest
@@ -51,7 +51,9 @@ def test_every_cause_is_named_and_its_gain_had(tmp_path, name):
 
 
 @pytest.mark.parametrize(
-    "names", [("hysteresis", "row_sharing"), ("latency", "taxel_gain_spread")], ids="+".join
+    "names",
+    [pytest.param(("hysteresis", "row_sharing"), marks=pytest.mark.slow), ("latency", "taxel_gain_spread")],
+    ids="+".join,
 )
 def test_two_causes_at_once_are_both_named(tmp_path, names):
     spec = Spec("4x4", tuple(first_form(name, 2.0) for name in names))
@@ -61,7 +63,14 @@ def test_two_causes_at_once_are_both_named(tmp_path, names):
     assert gains["gain"] > 0.85 * gains["oracle_gain"]
 
 
-@pytest.mark.parametrize("seed", [70250001, 70250006, 70261002])
+@pytest.mark.parametrize(
+    "seed",
+    [
+        70250001,
+        pytest.param(70250006, marks=pytest.mark.slow),
+        pytest.param(70261002, marks=pytest.mark.slow),
+    ],
+)
 def test_hardening_with_saturation_is_no_contact_felt_softly(tmp_path, seed):
     # Such a contact, alone or with other bends in rich forms, leaves hardly more squared error than noise.
     names = ("nonlinear_stiffness", "saturation")
