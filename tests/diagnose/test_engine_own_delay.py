@@ -17,7 +17,7 @@ from lerobot_vtrefine.diagnose.pad.review import with_own_delays
 from lerobot_vtrefine.diagnose.recordings import RecordingSet
 from lerobot_vtrefine.diagnose.verdict import Parameter
 
-COUNT = 12
+COUNT = 8
 OWN_S = np.random.default_rng(4).permutation(np.linspace(-0.016, 0.016, COUNT))
 
 
