@@ -6,7 +6,11 @@ import numpy as np
 import pytest
 import torch
 
-from lerobot_vtrefine.diagnose.pad.candidates.sample_and_hold import held, irregular_periods
+from lerobot_vtrefine.diagnose.pad.candidates.sample_and_hold import (
+    could_be_held,
+    held,
+    irregular_periods,
+)
 from lerobot_vtrefine.diagnose.pad.repeated_frames import Rhythm, ages_s, slots
 from lerobot_vtrefine.tactile.layout import PadLayout
 from lerobot_vtrefine.tactile.model import SensorModel
@@ -113,7 +117,12 @@ def press_set(signals: list[np.ndarray]) -> SimpleNamespace:
         time_s = np.arange(len(signal)) * 0.05
         drive = np.abs(np.sin(2.0 * time_s))[:, None, None]
         rhythm = Rhythm.of(time_s, signal, np.ones(len(signal), dtype=bool))
-        presses.append(SimpleNamespace(time_s=time_s, signal=signal, drive=drive, rhythm=rhythm))
+        taxels, layout = np.arange(signal.shape[1]), SimpleNamespace(full_cols=10)
+        presses.append(
+            SimpleNamespace(
+                time_s=time_s, signal=signal, drive=drive, rhythm=rhythm, taxels=taxels, layout=layout
+            )
+        )
     return SimpleNamespace(presses=tuple(presses))
 
 
@@ -134,6 +143,18 @@ def test_frames_that_repeat_at_random_are_held_and_chance_repeats_are_not(taxels
     assert not held(press_set(whole))
     period_s, _ = irregular_periods(press_set(lost), 0.05)[0]
     assert period_s == pytest.approx(0.05 / 0.75, rel=0.1)
+
+
+def test_readings_that_never_repeat_are_not_held_however_late() -> None:
+    rng = np.random.default_rng(5)
+    motion = 80.0 * np.abs(np.sin(2.0 * np.arange(200) * 0.05 - 0.3))[:, None]
+    late = [np.round(motion + rng.standard_normal((200, 20))) for _ in range(6)]
+    assert not could_be_held(press_set(late))
+    assert could_be_held(press_set([dropped(signal, 0.1, rng) for signal in late]))
+    rows = [np.hstack([signal[:, :10], dropped(signal[:, 10:], 0.3, rng)]) for signal in late]
+    assert could_be_held(press_set(rows))
+    # Readings under an indenter that hardly moves say nothing.
+    assert could_be_held(press_set([signal[:5] for signal in late]))
 
 
 def test_a_still_pad_of_one_taxel_that_repeats_is_not_held() -> None:

@@ -27,12 +27,14 @@ from lerobot_vtrefine.diagnose.pad.intervals import (
     leave_out,
     map_parameters,
 )
+from lerobot_vtrefine.diagnose.pad.own_delay import with_spread
 from lerobot_vtrefine.diagnose.pad.problem import Candidate, PadProblem
 from lerobot_vtrefine.diagnose.pad.rules import MORE_COORDINATES
 from lerobot_vtrefine.diagnose.pad.screening import DEAD, GAIN_MAP, MAPS, forms_of
 from lerobot_vtrefine.diagnose.pad.views import Predicted
 from lerobot_vtrefine.diagnose.verdict import Parameter
 from lerobot_vtrefine.tactile.model import SensorModel
+from lerobot_vtrefine.tactile.stages.host import Latency
 
 
 class PadAccount(OptionalRemarks):
@@ -78,7 +80,8 @@ class PadAccount(OptionalRemarks):
             return {"taxels": Parameter([list(taxel) for taxel in self.fit.model.dead], None, "1")}
         index = [form.family for form in self.fit.model.forms].index(cause)
         found = form_parameters(self.fit, index, self._left_out, presses, weights)
-        return with_form_spread(found, other_forms(self.problem, self.fit, index))
+        found = with_form_spread(found, other_forms(self.problem, self.fit, index))
+        return with_spread(found, presses.delays_s) if cause == Latency.name and presses.delays_s else found
 
     def baseline_parameters(self) -> Mapping[str, Parameter]:
         """k_n, k_d and gain."""
@@ -117,6 +120,13 @@ class PadAccount(OptionalRemarks):
     def not_identifiable(self, cause: str) -> str:
         """What to record to see it."""
         return self._power.not_tested.get(cause, "")
+
+    def caveat(self, cause: str, channels: tuple[int, ...]) -> str:
+        """What an accepted cause leaves open."""
+        if cause != Latency.name or not self.problem.presses.delays_s:
+            return ""
+        spread_ms = 1e3 * float(np.std(self.problem.presses.delays_s, ddof=1))
+        return f", which changes from recording to recording by about {spread_ms:.0f} ms"
 
     def next_experiment(
         self, rivals: Sequence[Rival[Fit, Candidate]], alarms: Sequence[Any]

@@ -6,6 +6,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from lerobot_vtrefine.diagnose.pad.candidates.base import Setting
+from lerobot_vtrefine.diagnose.pad.candidates.sample_and_hold import could_be_held
 from lerobot_vtrefine.diagnose.pad.fitting import Fit, fit, rest
 from lerobot_vtrefine.diagnose.pad.forward_model.run import LoweredBench, run_stages
 from lerobot_vtrefine.diagnose.pad.model import NOMINAL_K_N, Composite, stiffness_from_load
@@ -77,6 +78,7 @@ def describe(presses: PressSet) -> Setting:
         row_company=row_company,
         company=company,
         ages_s=ages_s([press.rhythm for press in presses.presses]),
+        repeats=could_be_held(presses),
         returned=any(_returned(press) for press in presses.presses),
     )
 

@@ -18,6 +18,7 @@ from lerobot_vtrefine.diagnose.pad.fitting import Fit, fit, rest
 from lerobot_vtrefine.diagnose.pad.idle_level import settled_idle
 from lerobot_vtrefine.diagnose.pad.idle_map import IdleMap
 from lerobot_vtrefine.diagnose.pad.model import Composite, sensor_model
+from lerobot_vtrefine.diagnose.pad.own_delay import timed
 from lerobot_vtrefine.diagnose.pad.own_touch import with_own_touch
 from lerobot_vtrefine.diagnose.pad.prediction import predict_trial
 from lerobot_vtrefine.diagnose.pad.press_trials import Press, PressSet
@@ -113,7 +114,7 @@ def handed_out(
     around, model = problem, plain.model
     if fitted.model.families:
         around, fitted = with_own_touch(problem, fitted)
-        model = trusted(problem, plain, fitted, seed, doubtful=doubtful)
+        model = trusted(problem.as_recorded, plain, fitted, seed, doubtful=doubtful)
     idle = settled_idle(model, problem.presses)
     before = FinalFit(plain, problem, plain.model, idle)
     after = FinalFit(fitted, around, model, idle)
@@ -132,6 +133,8 @@ def completed(selection: Selection["PadProblem", Any, Any], whole: "PadProblem")
     around = problem
     if after.fit.model.families:
         problem, fitted = whole.fitted_as(after.fit.model)
+        if after.problem.presses.delays_s:
+            problem, fitted = timed(problem, fitted)
         if fitted.model.dead:
             # Some may have been pressed in locked recordings only.
             fitted = problem.settled(with_all_dead(fitted, problem.presses).model)
@@ -139,7 +142,7 @@ def completed(selection: Selection["PadProblem", Any, Any], whole: "PadProblem")
         if after.model is after.fit.model:
             model = fitted.model
         elif after.model is not before.model:
-            model = fit(fitted.model, problem.presses, problem.even.weights).model
+            model = fit(fitted.model, whole.presses, whole.even.weights).model
     idle = settled_idle(model, problem.presses)
     return FinalFit(plain, problem, plain.model, idle), FinalFit(fitted, around, model, idle)
 

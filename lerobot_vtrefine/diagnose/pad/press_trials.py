@@ -155,6 +155,8 @@ class PressSet:
     """The same presses without touches of their own, where they have any."""
     touches_m: tuple[float, ...] = ()
     """How much later than recorded each press meets the face, where that is allowed for [m]."""
+    delays_s: tuple[float, ...] = ()
+    """How much later than the others each press was read, where that is allowed for [s]."""
 
     def subset(self, keep: list[int]) -> "PressSet":
         """With the presses of those numbers; kept, so that what is built of it is built once."""
@@ -162,7 +164,10 @@ class PressSet:
             presses = tuple(self.presses[index] for index in keep)
             touches_m = tuple(self.touches_m[index] for index in keep if self.touches_m)
             recorded = self.recorded and self.recorded.subset(keep)
-            self._subsets[key] = replace(self, presses=presses, recorded=recorded, touches_m=touches_m)
+            delays_s = tuple(self.delays_s[index] for index in keep if self.delays_s)
+            self._subsets[key] = replace(
+                self, presses=presses, recorded=recorded, touches_m=touches_m, delays_s=delays_s
+            )
         return self._subsets[key]
 
     @cached_property

@@ -36,6 +36,7 @@ from lerobot_vtrefine.diagnose.pad.fitting import (
 from lerobot_vtrefine.diagnose.pad.form_fitting import Starts, grown, settle, starts_of, with_form, without
 from lerobot_vtrefine.diagnose.pad.model import Composite
 from lerobot_vtrefine.diagnose.pad.noise import Noise
+from lerobot_vtrefine.diagnose.pad.own_delay import moved
 from lerobot_vtrefine.diagnose.pad.own_touch import allowed, losses_at_own_touch
 from lerobot_vtrefine.diagnose.pad.press_trials import PressSet
 from lerobot_vtrefine.diagnose.pad.rules import (
@@ -136,6 +137,8 @@ class PadProblem(OptionalSteps):
     """Around the present fit."""
     whole: "PadProblem | None" = field(default=None, repr=False)
     """The same recordings with all their frames, where these are some of them."""
+    together: "PadProblem | None" = field(default=None, repr=False)
+    """The same recordings as they are, where these were moved by delays of their own."""
 
     subject = "pad"
     channels = ("pad",)
@@ -180,7 +183,22 @@ class PadProblem(OptionalSteps):
         step = min(int(self.presses.rate_hz / ENOUGH_HZ), self.presses.readings // ENOUGH_READINGS)
         if step < 2 or repeated_share(self.presses) > FEW_REPEATS:
             return self
-        return PadProblem(self.presses.every(step), self.seed, whole=self)
+        together = self.together and self.together.thinned()
+        return PadProblem(self.presses.every(step), self.seed, whole=self, together=together)
+
+    def with_delays(self, delays_s: Array) -> "PadProblem":
+        """Each recording moved by a delay of its own (K,) [s]; without weights."""
+        if self.whole is not None:
+            return self.whole.with_delays(delays_s).thinned()
+        together = self.together or self
+        return PadProblem(moved(together.presses, delays_s), self.seed, together=together)
+
+    @property
+    def as_recorded(self) -> "PadProblem":
+        """The same under the same weights, with no recording moved."""
+        if self.together is None:
+            return self
+        return replace(self.together, weights=self.weights, noise=self.noise)
 
     def with_all_frames(self, selection: Selection[Any, Fit, Candidate]) -> Selection[Any, Fit, Candidate]:
         """What was selected on some frames, fitted to all."""
@@ -200,7 +218,7 @@ class PadProblem(OptionalSteps):
 
     def baseline(self) -> Fit:
         """The one that predicts plain readings best, and that an extension is measured against."""
-        return self.refitted_baseline.plain
+        return (self.together or self).refitted_baseline.plain
 
     def extended(self, now: Fit, candidate: Candidate, channels: Array, plainer: Fit | None = None) -> Fit:
         """With a candidate; other forms grow from their plain one's fit, where they can."""
@@ -217,7 +235,7 @@ class PadProblem(OptionalSteps):
         """Without candidates."""
         families = [item.cause for item in candidates]
         if isinstance(now, FinalFit):
-            return now.without(families, self)
+            return now.without(families, self.as_recorded)
         return without(now, families, self.presses, self.weights)
 
     def settled(self, model: Any) -> Fit:
@@ -320,7 +338,8 @@ class PadProblem(OptionalSteps):
     def reviewed(
         self, selection: Selection[Any, Fit, Candidate], seed: int
     ) -> Selection[Any, Fit, Candidate]:
-        """Two names where one stands in for them, forms as plain as they may be, and trade-offs resolved."""
+        """Two names where one stands in for them, forms as plain as they may be, trade-offs resolved, and
+        recordings with delays of their own."""
         return review.reviewed(selection, seed)
 
     def suspicions(self, selection: Selected, seed: int) -> list[Suspicion]:

@@ -7,8 +7,9 @@ together they may not be larger than those of a sound rig, taken to scatter twic
 from dataclasses import dataclass
 
 import numpy as np
+from scipy.stats import chi2
 
-from lerobot_vtrefine.diagnose.core.rules import FLIPS, LEAST_UNKNOWN, SIZE_DOUBT
+from lerobot_vtrefine.diagnose.core.rules import FLIPS, LEAST_UNKNOWN, SIZE_DOUBT, SUSPICION_ALPHA
 from lerobot_vtrefine.diagnose.core.suspicion import Suspicion
 from lerobot_vtrefine.diagnose.pad.baseline import offset_tangents, touch_doubts
 from lerobot_vtrefine.diagnose.pad.fitting import Fit
@@ -82,6 +83,15 @@ def recording_scatter(own: Deviations, seed: int) -> list[Suspicion]:
     rng = np.random.default_rng([seed, 7])
     every = zip(KINDS, own.scores.T, own.shares, strict=False)
     return [_scatter(kind, scores, float(share), rng) for kind, scores, share in every]
+
+
+def starts_deviate(own: Deviations) -> bool:
+    """Whether starts surely do, so that it is worth an alarm."""
+    place = [name for name, _, _ in KINDS].index("starts")
+    scores, share = own.scores[:, place], float(own.shares[place])
+    known = np.count_nonzero(scores)
+    p_value = chi2.sf(float(np.square(scores).sum()) / SIZE_DOUBT**2, max(known, 1))
+    return share > LEAST_UNKNOWN and p_value < SUSPICION_ALPHA
 
 
 def _deviations(press: Press, signal: np.ndarray, slope: np.ndarray | None) -> list[np.ndarray]:

@@ -1,4 +1,5 @@
-"""What adding single causes cannot find: two names behind one, better forms, trade-offs."""
+"""What adding single causes cannot find: two names behind one, better forms, trade-offs, and a delay that
+differs from recording to recording."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -10,15 +11,24 @@ import numpy as np
 from lerobot_vtrefine.diagnose.core.heldout import OutOfFold, out_of_fold
 from lerobot_vtrefine.diagnose.core.resampling import agree
 from lerobot_vtrefine.diagnose.core.rules import FORM_P
-from lerobot_vtrefine.diagnose.core.screened_search import CHANNEL, better, clearly_better, preferable
+from lerobot_vtrefine.diagnose.core.screened_search import (
+    CHANNEL,
+    ScreenedSearch,
+    better,
+    clearly_better,
+    preferable,
+)
 from lerobot_vtrefine.diagnose.core.search import Selection
 from lerobot_vtrefine.diagnose.pad.candidates import causes_like
 from lerobot_vtrefine.diagnose.pad.candidates.base import Form
 from lerobot_vtrefine.diagnose.pad.damping_profile import profile
 from lerobot_vtrefine.diagnose.pad.fitting import Fit
 from lerobot_vtrefine.diagnose.pad.form_fitting import starts_of, without
+from lerobot_vtrefine.diagnose.pad.own_delay import timed
+from lerobot_vtrefine.diagnose.pad.recording_scatter import own_deviations, starts_deviate
 from lerobot_vtrefine.diagnose.pad.rules import MORE_COORDINATES
 from lerobot_vtrefine.diagnose.pad.screening import MAPS, forms_of, probe_form, scorer_of
+from lerobot_vtrefine.tactile.stages.host import Latency
 
 if TYPE_CHECKING:
     from lerobot_vtrefine.diagnose.pad.problem import Candidate, PadProblem
@@ -83,7 +93,29 @@ def _candidate(name: str, form: Any, starts: dict[str, Any]) -> "Candidate":
 
 
 def reviewed(selection: Selection["PadProblem", Fit, Any], seed: int) -> Selection["PadProblem", Fit, Any]:
-    """The selection after all four looks, with settled weights."""
+    """The selection after all looks."""
+    found = _looked_over(selection, seed)
+    if not starts_deviate(own_deviations(found.problem.presses, found.fit)):
+        return found
+    return with_own_delays(found, seed) or found
+
+
+def with_own_delays(
+    selection: Selection["PadProblem", Fit, Any], seed: int
+) -> Selection["PadProblem", Fit, Any] | None:
+    """What is selected beside delays of the recordings' own; None where that is no latency."""
+    around, _ = timed(selection.problem, selection.fit)
+    found = _looked_over(ScreenedSearch(around, seed, lambda text: None).run(), seed)
+    if Latency.name not in found.fit.model.families:
+        return None
+    around, fitted = timed(found.problem, found.fit)
+    return replace(found, problem=around, fit=fitted, errors=State(around, fitted, seed).held(fitted).errors)
+
+
+def _looked_over(
+    selection: Selection["PadProblem", Fit, Any], seed: int
+) -> Selection["PadProblem", Fit, Any]:
+    """After the first four looks, with settled weights."""
     if not selection.fit.model.families:
         return selection
     state = State(selection.problem, selection.fit, seed)

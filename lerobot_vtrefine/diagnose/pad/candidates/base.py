@@ -48,6 +48,8 @@ class Setting:
     """Logarithm of the plain baseline's counts per metre (or newton); None before it is fitted."""
     damped: bool = False
     """Whether damping bears a visible part of what the plain baseline predicts."""
+    repeats: bool = True
+    """Whether readings repeat in frames on the pad, or nothing says that they do not."""
     returned: bool = False
     """Whether recordings press where others of the session have pressed before."""
 

@@ -43,6 +43,17 @@ def held(presses: PressSet) -> bool:
     return bool(seen > MIN_HELD and by_chance < CHANCE * seen)
 
 
+def could_be_held(presses: PressSet) -> bool:
+    """Whether frames or rows repeat, or would without showing it: what never repeats is not held, however
+    late it is."""
+    frames = [share for press in presses.presses if (share := _repeats(press)) is not None]
+    rows = [share for press in presses.presses for mask in _rows(press) if (share := _repeats(press, mask))]
+    if not frames:
+        return True
+    seen = [float(np.mean([share for share, _ in shares])) if shares else 0.0 for shares in (frames, rows)]
+    return seen[0] > MIN_HELD or seen[1] > HELD_ROWS
+
+
 def shortest_period(presses: PressSet, frame_s: float) -> float | None:
     """Mean time between new readings from which on `held` sees it [s]; None where repeats tell nothing."""
     shares = [share for press in presses.presses if (share := _repeats(press)) is not None]
@@ -58,9 +69,8 @@ def held_rows(presses: PressSet) -> Suspicion | None:
     found = [
         share
         for press in presses.presses
-        for row in np.unique(press.taxels // press.layout.full_cols)
-        if (mask := press.taxels // press.layout.full_cols == row).sum() >= MANY_TAXELS
-        if (share := _repeats(press, mask)) is not None
+        for mask in _rows(press)
+        if mask.sum() >= MANY_TAXELS and (share := _repeats(press, mask)) is not None
     ]
     if not found:
         return None
@@ -68,6 +78,12 @@ def held_rows(presses: PressSet) -> Suspicion | None:
     sure = by_chance < CHANCE * seen
     text = f"rows repeat the frame before in {100 * seen:.0f} % of their frames while others change"
     return Suspicion(0, text, float(seen) if sure else 0.0, HELD_ROWS)
+
+
+def _rows(press: Press) -> list[np.ndarray]:
+    """Masks (n,) of the scored taxels of every row."""
+    row = press.taxels // press.layout.full_cols
+    return [row == number for number in np.unique(row)]
 
 
 def _repeats(press: Press, taxels: np.ndarray | None = None) -> tuple[float, float] | None:
@@ -232,6 +248,7 @@ FORMS = (
         kinds=("timing",),
         needs="record every frame with its own time, moving, with readings that carry noise",
         amplitude=None,
+        possible=lambda s: s.repeats,
         search=periods,
         range=undecided(False),
     ),
@@ -243,6 +260,7 @@ FORMS = (
         lambda v, s: {"period_s": (float(v[0]), "s")},
         lambda s: [[2.0001 * s.frame_s]],
         amplitude=None,
+        possible=lambda s: s.repeats,
         search=free_periods,
         range=undecided(True),
         screened=False,
@@ -255,6 +273,7 @@ FORMS = (
         lambda v, s: {"period_s": (float(v[0]), "s")},
         lambda s: [[2.0001 * s.frame_s]],
         amplitude=None,
+        possible=lambda s: s.repeats,
         search=frame_periods,
         range=undecided(False),
         screened=False,
@@ -267,6 +286,7 @@ FORMS = (
         lambda v, s: {"period_s": (float(v[0]), "s")},
         lambda s: [[2.0 * s.frame_s, 0.0]],
         amplitude=None,
+        possible=lambda s: s.repeats,
         search=irregular_periods,
         range=_mean_period,
         screened=False,
