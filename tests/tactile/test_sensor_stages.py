@@ -30,11 +30,11 @@ from lerobot_vtrefine.tactile.stages.readout import (
     DeadTaxels,
     Gain,
     Idle,
+    LaggingDroop,
     Noise,
     Quantisation,
     RowSharing,
     Saturation,
-    LaggingDroop,
     SupplyDroop,
     TaxelGainSpread,
 )
