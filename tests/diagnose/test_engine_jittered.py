@@ -95,7 +95,7 @@ def test_a_borrowed_name_predicts_worse_than_what_no_name_covers(law: str, borro
     problem, fitted = PadProblem(prepare(held, list(held.trials), list(range(len(held.trials))))).weighed(
         None
     )
-    (form,) = forms_of("supply_droop", fitted)
+    form, *_ = forms_of("supply_droop", fitted)
     problem, named = problem.weighed(with_form(fitted, form, (), problem.presses, problem.weights))
     selection = Selection(problem, named, named, {}, {}, np.zeros((0, 1)))
     alarms = raise_alarms(selection, suspicions(problem, selection), 0)

@@ -7,15 +7,17 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 from scipy.signal import lfilter
-from test_engine_error_level import COUNT, fires, fitted, nothing
+from test_engine_error_level import COUNT, fires, fitted, load_of, nothing
 from test_engine_pad import COLS, ROWS
 
 from lerobot_vtrefine.diagnose.core.resampling import Hypothesis, jointly_adjusted
 from lerobot_vtrefine.diagnose.core.rules import FLIPS, SUSPICION_ALPHA
 from lerobot_vtrefine.diagnose.core.suspicion import Suspicion, observed
+from lerobot_vtrefine.diagnose.pad.failing_taxels import failing_taxel
 from lerobot_vtrefine.diagnose.pad.problem import PadProblem
 from lerobot_vtrefine.diagnose.pad.recording_scatter import own_deviations, recording_scatter
-from lerobot_vtrefine.diagnose.pad.shared_errors import shared_errors
+from lerobot_vtrefine.diagnose.pad.shared_errors import noise_in_bursts, shared_errors
+from lerobot_vtrefine.diagnose.pad.taxel_maps import with_map
 from lerobot_vtrefine.diagnose.recordings import Trial
 
 OTHERS = 30
@@ -65,6 +67,53 @@ def test_what_all_taxels_do_at_once_is_told_from_noise_that_wanders(added, expec
     strict = shared_errors(presses, left, named, baseline.weights, 0)
     assert strict[0].least > 2 * found[0].least  # forms that are not quite right err in all loaded taxels
     assert expected is None or any(expected in clue for clue in clues)
+
+
+def bursts(trial: Trial) -> np.ndarray:
+    """White noise of every taxel's own, now and then."""
+    return 3.0 * moments(trial) * np.random.default_rng([10, trial.order]).standard_normal(trial.raw.shape)
+
+
+@pytest.mark.parametrize(
+    ("added", "expected"), [(nothing, False), (wandering, False), (dips, False), (bursts, True)]
+)
+def test_noise_that_grows_in_all_taxels_at_once_is_a_cable(added, expected) -> None:
+    presses, baseline = fitted(added)
+    left = own_deviations(presses, baseline.fitted).left
+    assert bool(raised(noise_in_bursts(presses, left, baseline.fitted, baseline.weights, 0))) == expected
+    held = SimpleNamespace(
+        signals=baseline.fitted.signals, model=SimpleNamespace(families=("sample_and_hold",))
+    )
+    assert not noise_in_bursts(presses, left, held, baseline.weights, 0)
+
+
+def bad_joint(trial: Trial) -> np.ndarray:
+    """The taxel beside the middle loses a third of its signal for moments."""
+    return -0.35 * moments(trial) * (np.arange(ROWS * COLS) == 5) * (trial.raw - np.median(trial.raw, axis=0))
+
+
+def bent(trial: Trial) -> np.ndarray:
+    """The same taxel has a law of its own, in all recordings."""
+    return -0.35 * load_of(trial) * (np.arange(ROWS * COLS) == 5) * (trial.raw - np.median(trial.raw, axis=0))
+
+
+@pytest.mark.parametrize(
+    ("added", "expected"), [(nothing, False), (wandering, False), (bent, False), (bad_joint, True)]
+)
+def test_a_taxel_that_fails_for_moments_is_told_from_one_with_a_law_of_its_own(added, expected) -> None:
+    presses, baseline = fitted(added)
+    problem = PadProblem(presses, weights=baseline.weights, noise=baseline.noise)
+    now = problem.settled(with_map(baseline.fitted, presses, baseline.weights))
+    left = own_deviations(presses, now).left
+    found = failing_taxel(presses, left, now, baseline.weights, 0)
+    assert found is not None
+    assert bool(raised([found])) == expected
+    assert not expected or "(1, 1)" in found.clue
+    names = [replace(press.trial, condition=press.trial.file) for press in presses.presses]
+    alone = replace(
+        presses, presses=tuple(replace(p, trial=t) for p, t in zip(presses.presses, names, strict=True))
+    )
+    assert failing_taxel(alone, left, now, baseline.weights, 0) is None
 
 
 def test_independent_taxels_share_nothing_as_often_as_said() -> None:

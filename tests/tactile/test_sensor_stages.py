@@ -30,6 +30,7 @@ from lerobot_vtrefine.tactile.stages.readout import (
     DeadTaxels,
     Gain,
     Idle,
+    LaggingDroop,
     Noise,
     Quantisation,
     RowSharing,
@@ -197,6 +198,19 @@ def test_supply_droop_reaches_taxels_of_other_rows_and_columns() -> None:
     alone = float(once(SupplyDroop(), x)[2, 3])
     x[4, 7] = 100.0
     assert float(once(SupplyDroop(), x)[2, 3]) < alone
+
+
+def test_a_supply_that_lags_sags_as_a_capacitor_discharges() -> None:
+    x = torch.zeros(401, 6, 10)
+    x[1:, 2, 3] = 100.0
+    times = torch.arange(401, dtype=torch.float64) * 1e-3
+    stage = LaggingDroop(droop_per_count=1e-3, tau_s=0.05)
+    found = stage.sequence(x, times, FRAME)[:, 2, 3].numpy()
+    # The load rises within the first millisecond.
+    seen = 100.0 * -np.expm1(-(times.numpy()[1:] - 5e-4) / 0.05)
+    assert np.allclose(found[1:], 100.0 / (1.0 + 1e-3 * seen), atol=1e-3)
+    by_frames = Stage.sequence(stage, x, times, FRAME)
+    assert torch.allclose(by_frames, stage.sequence(x, times, FRAME), atol=1e-4)
 
 
 def test_crosstalk_leaks_to_the_row_and_column_only() -> None:

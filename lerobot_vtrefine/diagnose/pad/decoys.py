@@ -11,24 +11,73 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from lerobot_vtrefine.diagnose.core.heldout import out_of_fold
-from lerobot_vtrefine.diagnose.core.rules import SHARE_OF_GAIN
+from lerobot_vtrefine.diagnose.core.rules import FLIPS, SHARE_OF_GAIN, SIZE_DOUBT
 from lerobot_vtrefine.diagnose.core.suspicion import Suspicion
+from lerobot_vtrefine.diagnose.pad.baseline import offset_tangents
 from lerobot_vtrefine.diagnose.pad.descriptors import DESCRIPTORS, Descriptor, directions, errors_left_out
 from lerobot_vtrefine.diagnose.pad.fitting import Fit, bounded_step, movable
 from lerobot_vtrefine.diagnose.pad.form_fitting import without
-from lerobot_vtrefine.diagnose.pad.screening import scorer_of
+from lerobot_vtrefine.diagnose.pad.screening import GAIN_MAP, scorer_of
+from lerobot_vtrefine.diagnose.pad.taxel_maps import gain_tangents, map_evidence, maps_left_out
 
 if TYPE_CHECKING:
     from lerobot_vtrefine.diagnose.pad.problem import PadProblem
 
 Array = np.ndarray
+FACE_M = 1e-4
+"""Unit of a face's unevenness: maps are shrunk within deviations of .001 to .8 of it [m]."""
 
 
 def in_place_of_names(problem: "PadProblem", fitted: Fit) -> list[Suspicion]:
     """For every named cause the best direction in its place; one that belongs to the cause's own kind of
     effect says something about its form, not about its name."""
-    found = (_in_place(problem, fitted, name) for name in fitted.model.families)
+    found = [_in_place(problem, fitted, name) for name in fitted.model.families]
+    if fitted.model.gain_map is not None:
+        found.append(_in_place_of_gains(problem, fitted))
     return [item for item in found if item is not None]
+
+
+def _in_place_of_gains(problem: "PadProblem", fitted: Fit) -> Suspicion | None:
+    """A map of first touches in the place of one of gains: a face that is uneven, or lies on something, reads
+    more or less at some taxels, too.
+
+    Both are linear around the model that has neither. What recordings prefer together has a deviation of its
+    own under the noise: how far apart the two predict (Cox 1962).
+    """
+    presses, weights = problem.presses, problem.weights
+    slim = without(fitted, [GAIN_MAP], presses, weights)
+    slopes = offset_tangents(slim.model, presses, slim.signals)
+    if slopes is None:
+        return None
+    images = [
+        _mapped(slim, problem, tangents)
+        for tangents in (gain_tangents(slim, presses), [slope * FACE_M for slope in slopes])
+    ]
+    own, best, apart = np.zeros((3, len(weights)))
+    for k, (weight, left) in enumerate(zip(weights, slim.residuals(presses), strict=True)):
+        vectors = np.stack([weight.whiten(image) for image in (left, *(image[k] for image in images))])
+        gram = weight.gram(vectors)
+        own[k], best[k] = gram[0, 1:] - 0.5 * np.diag(gram)[1:]
+        apart[k] = gram[1, 1] + gram[2, 2] - 2.0 * gram[1, 2]
+    if best.sum() <= 0:
+        return None
+    far = float((best - own).sum() / np.sqrt(max(float(apart.sum()), 1e-12))) / SIZE_DOUBT
+    drawn = np.r_[far, np.random.default_rng([problem.seed, 9]).standard_normal(FLIPS)]
+    clue = f"in the place of {GAIN_MAP}, first touches of the taxels' own predict trials left out better"
+    return Suspicion(0, clue, *_lead(best, own), best - own, drawn=drawn)
+
+
+def _mapped(slim: Fit, problem: "PadProblem", tangents: Sequence[Array]) -> list[Array]:
+    """What a map along those tangents, told by the other folds, adds to every recording: (T, n)."""
+    evidence = map_evidence(slim, problem.presses, problem.weights, tangents)
+    maps = maps_left_out(evidence, problem.folds)
+    every = zip(problem.presses.presses, tangents, maps, strict=True)
+    return [tangent * own[press.taxels] for press, tangent, own in every]
+
+
+def _lead(best: Array, own: Array) -> tuple[float, float]:
+    """Part by which a decoy's gain exceeds the name's, and the least such part that counts."""
+    return 1.0 - float(own.sum() / best.sum()), 1.0 - SHARE_OF_GAIN
 
 
 def _in_place(problem: "PadProblem", fitted: Fit, name: str) -> Suspicion | None:
@@ -42,11 +91,11 @@ def _in_place(problem: "PadProblem", fitted: Fit, name: str) -> Suspicion | None
     best = _chosen_by_others(np.array(gains), problem.folds)
     if best.sum() <= 0:
         return None
-    # As rivals are compared: trials count alike, however long or hard they press.
-    preference = (best - own) / (np.abs(best) + np.abs(own)).clip(min=1e-12)
     text = promising[int(np.argmax(np.sum(gains, axis=1)))][0].text
     clue = f"in the place of {name}, {text} predicts trials left out better"
-    return Suspicion(0, clue, 1.0 - float(own.sum() / best.sum()), 1.0 - SHARE_OF_GAIN, preference)
+    # As rivals are compared: trials count alike, however long or hard they press.
+    preference = (best - own) / (np.abs(best) + np.abs(own)).clip(min=1e-12)
+    return Suspicion(0, clue, *_lead(best, own), preference)
 
 
 def _chosen_by_others(gains: Array, folds: Array) -> Array:

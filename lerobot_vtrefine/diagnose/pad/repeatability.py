@@ -98,7 +98,7 @@ def _replicated(presses: PressSet, residuals: Sequence[np.ndarray]) -> _Replicat
     names = presses.conditions
     pairs, products, powers, readings = [], [], [], 0
     for i, j in combinations(range(len(names)), 2):
-        both = _aligned(presses, residuals, i, j) if names[i] == names[j] else None
+        both = aligned(presses, residuals, i, j) if names[i] == names[j] else None
         if both is None:
             continue
         pairs.append((i, j))
@@ -164,7 +164,7 @@ class Correlations:
         alike: dict[str, list[float]] = defaultdict(list)
         strangers = []
         for i, j in combinations(range(len(names)), 2):
-            both = _aligned(presses, residuals, i, j)
+            both = aligned(presses, residuals, i, j)
             if both is None:
                 continue
             power = np.sqrt(float((both[0] ** 2).sum()) * float((both[1] ** 2).sum()))
@@ -221,7 +221,7 @@ def in_all_pairs(
     return Suspicion(0, text, seen if sure else 0.0, least)
 
 
-def _aligned(
+def aligned(
     presses: PressSet, residuals: Sequence[np.ndarray], i: int, j: int
 ) -> tuple[np.ndarray, np.ndarray] | None:
     """Residuals of two recordings at their common taxels and the first one's times."""

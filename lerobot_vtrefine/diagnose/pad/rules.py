@@ -94,6 +94,9 @@ three times what noise that wanders for seconds reaches."""
 MOST, OTHERS = 0.9, 6.0
 """Quantile of all such mean squares, and the factor by which a failing taxel's exceeds it: errors of all are
 no taxel's. Of squares of normal numbers the largest of 600 is 4 times as large."""
+FAILING = 0.25
+"""Product of the differences of a taxel's white errors in replicates, a few frames apart, in variances of
+noise, that is worth an alarm: taxels that fail now and then reach .4 to 3, others .3 in a single pair."""
 MIN_READINGS = 200
 """Readings that such a mean square must rest on."""
 MIN_PRESSED = 50

@@ -10,7 +10,8 @@ import numpy as np
 
 from lerobot_vtrefine.diagnose.core.rules import FLIPS, LEAST_UNKNOWN
 from lerobot_vtrefine.diagnose.core.suspicion import Suspicion
-from lerobot_vtrefine.diagnose.pad.error_level import LAG
+from lerobot_vtrefine.diagnose.pad.candidates.sample_and_hold import HOLD
+from lerobot_vtrefine.diagnose.pad.error_level import LAG, OUTLIER
 from lerobot_vtrefine.diagnose.pad.fitting import Fit
 from lerobot_vtrefine.diagnose.pad.press_trials import PressSet
 from lerobot_vtrefine.diagnose.pad.rules import FOLLOWS_IF_OWNED
@@ -34,9 +35,39 @@ def shared_errors(
     # A form that is not quite right errs in all loaded taxels at once.
     least = FOLLOWS_IF_OWNED if fitted.model.families else LEAST_UNKNOWN
     return [
-        _shared("all taxels", units, [np.ones(unit.shape) for unit in units], least, seed),
-        _shared("loaded taxels, in proportion", units, loads, least, seed),
+        _shared(
+            "errors come and go together in all taxels",
+            units,
+            [np.ones(unit.shape) for unit in units],
+            least,
+            seed,
+        ),
+        _shared("errors come and go together in loaded taxels, in proportion", units, loads, least, seed),
     ]
+
+
+def noise_in_bursts(
+    presses: PressSet, residuals: Sequence[Array], fitted: Fit, weights: Sequence[TrialWeights], seed: int
+) -> list[Suspicion]:
+    """Whether the noise of taxels at rest grows and falls together: a bad cable; none where frames are held,
+    in which all of it stands still.
+
+    Bursts may be white in time and each taxel's own, so that only their size is shared. Under load, a form
+    that is not quite right errs in all taxels at once.
+
+    Args:
+        residuals: (T, n) without each recording's own gain and touch, zero where unsure [counts].
+    """
+    if presses.layout.num_taxels < 2 or HOLD in fitted.model.families:
+        return []
+    sizes = []
+    for residual, signal, weight in zip(residuals, fitted.signals, weights, strict=True):
+        size = np.minimum(np.abs(weight.memory.white(residual / weight.sigma)), OUTLIER)
+        rests = (signal <= 0.0) & (residual != 0.0)
+        usual = np.where(rests, size, 0.0).sum(axis=0) / np.maximum(rests.sum(axis=0), 1)
+        sizes.append(np.where(rests, size - usual, 0.0))
+    even = [np.ones(size.shape) for size in sizes]
+    return [_shared("bursts of noise come in all taxels at rest together", sizes, even, LEAST_UNKNOWN, seed)]
 
 
 def _shared(
@@ -55,6 +86,6 @@ def _shared(
         drawn += ((signs @ products) * signs).sum(axis=1)
         scores[k] = products.sum()
     part = float(scores.sum()) / max(sum(float((unit**2).sum()) for unit in units), 1e-12)
-    clue = f"errors come and go together in {text} ({100 * abs(part):.0f} % of what is left)"
+    clue = f"{text} ({100 * abs(part):.0f} % of what is left)"
     # What rings may have turned over a few frames later.
     return Suspicion(0, clue, abs(part), least, scores, drawn=np.abs(drawn))

@@ -16,6 +16,7 @@ from lerobot_vtrefine.diagnose.pad.baseline import weigh
 from lerobot_vtrefine.diagnose.pad.candidates.sample_and_hold import HOLD, held_rows
 from lerobot_vtrefine.diagnose.pad.decoys import in_place_of_names
 from lerobot_vtrefine.diagnose.pad.descriptors import DESCRIPTORS, Descriptor, directions, errors_left_out
+from lerobot_vtrefine.diagnose.pad.failing_taxels import failing_taxel
 from lerobot_vtrefine.diagnose.pad.fitting import Fit, predict, tangents
 from lerobot_vtrefine.diagnose.pad.gain_drift import gain_drift
 from lerobot_vtrefine.diagnose.pad.press_trials import PressSet
@@ -23,7 +24,7 @@ from lerobot_vtrefine.diagnose.pad.recording_scatter import own_deviations, reco
 from lerobot_vtrefine.diagnose.pad.repeatability import Correlations
 from lerobot_vtrefine.diagnose.pad.rules import FOLLOWS, FOLLOWS_IF_OWNED, MAYBE_DEAD_ERRORS
 from lerobot_vtrefine.diagnose.pad.screening import Scorer
-from lerobot_vtrefine.diagnose.pad.shared_errors import shared_errors
+from lerobot_vtrefine.diagnose.pad.shared_errors import noise_in_bursts, shared_errors
 from lerobot_vtrefine.diagnose.pad.sliding_errors import while_sliding
 from lerobot_vtrefine.diagnose.pad.taxel_maps import with_all_dead
 
@@ -55,6 +56,8 @@ def suspicions(problem: "PadProblem", selection: Selection[Any, Fit, Any]) -> li
         while_sliding(presses, residuals, fitted, weights),
         *(replace(item, between_trials=True) for item in between),
         *shared_errors(presses, own.left, fitted, weights, problem.seed),
+        *noise_in_bursts(presses, own.left, fitted, weights, problem.seed),
+        failing_taxel(presses, own.left, fitted, weights, problem.seed),
         *in_place_of_names(problem, fitted),
     ]
     before, after = (fit.residuals(presses) for fit in (plain, fitted))

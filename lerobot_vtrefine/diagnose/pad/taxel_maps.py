@@ -41,17 +41,25 @@ class MapEvidence:
         return total
 
 
-def map_evidence(fitted: Fit, presses: PressSet, weights: Sequence[TrialWeights]) -> MapEvidence:
-    """Tangents of every taxel's gain against the residual, recording by recording."""
-    shape = (presses.layout.rows, presses.layout.cols)
-    present = fitted.model.gain_map if fitted.model.gain_map is not None else np.ones(shape)
-    moved = predict(replace(fitted.model, gain_map=present * (1.0 + STEP)), presses)
+def map_evidence(
+    fitted: Fit,
+    presses: PressSet,
+    weights: Sequence[TrialWeights],
+    tangents: Sequence[np.ndarray] | None = None,
+) -> MapEvidence:
+    """Tangents of every taxel's gain against the residual, recording by recording.
+
+    Args:
+        tangents: change of the signals (T, n) by another coordinate that every taxel has of its own.
+    """
+    if tangents is None:
+        tangents = gain_tangents(fitted, presses)
     count = presses.layout.num_taxels
     scores, information = np.zeros((len(weights), count)), np.zeros((len(weights), count))
     shared = []
     for k, (press, weight) in enumerate(zip(presses.presses, weights, strict=True)):
         signal = fitted.signals[k]
-        tangent = weight.whiten((moved[k] - signal) / STEP)
+        tangent = weight.whiten(tangents[k])
         error = weight.whiten(press.signal - signal)
         width = signal.shape[1]
         by_taxel = tangent.reshape(-1, width)
@@ -65,6 +73,24 @@ def map_evidence(fitted: Fit, presses: PressSet, weights: Sequence[TrialWeights]
         wide[:, taxels] = along
         shared.append(wide)
     return MapEvidence(scores, information, shared, [weight.coupling for weight in weights])
+
+
+def gain_tangents(fitted: Fit, presses: PressSet) -> list[np.ndarray]:
+    """Change of the signals (T, n) by the logarithm of the taxels' own gains."""
+    shape = (presses.layout.rows, presses.layout.cols)
+    present = fitted.model.gain_map if fitted.model.gain_map is not None else np.ones(shape)
+    moved = predict(replace(fitted.model, gain_map=present * (1.0 + STEP)), presses)
+    return [(there - here) / STEP for there, here in zip(moved, fitted.signals, strict=True)]
+
+
+def maps_left_out(evidence: MapEvidence, folds: np.ndarray) -> np.ndarray:
+    """For every recording the map (K, R*C) that the other folds tell, where the evidence is of none."""
+    maps = np.zeros(evidence.scores.shape)
+    _, sigma, _ = solve_map(evidence, range(len(folds)), maps[0], None)
+    for fold in np.unique(folds):
+        held = folds == fold
+        maps[held], _, _ = solve_map(evidence, np.flatnonzero(~held).tolist(), np.zeros(maps.shape[1]), sigma)
+    return maps
 
 
 def solve_map(

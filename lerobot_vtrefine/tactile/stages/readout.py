@@ -22,6 +22,7 @@ from lerobot_vtrefine.tactile.stages.base import (
     register,
     taxel_map,
 )
+from lerobot_vtrefine.tactile.stages.signals import followed, low_passed
 
 
 @register
@@ -165,6 +166,31 @@ class SupplyDroop(Stage):
     @override
     def step(self, x: torch.Tensor, state: State, frame: Frame) -> tuple[torch.Tensor, State]:
         return self.lowered(x, x.sum(dim=(-2, -1), keepdim=True)), state
+
+
+@register
+@dataclass(frozen=True)
+class LaggingDroop(SupplyDroop):
+    """The same of a supply whose voltage follows the load late, as that of a slow regulator or a charged
+    capacitor does: the load goes through a one-pole filter of time constant `tau_s`."""
+
+    name: ClassVar[str] = "lagging_droop"
+    has_state: ClassVar[bool] = True
+    tau_s: float = parameter(0.1, "s", 0.02, 0.3, minimum=1e-6)
+
+    @override
+    def initial(self, layout: PadLayout, pads: int) -> Traits:
+        return {name: np.zeros((pads, 1, 1), dtype=np.float32) for name in ("load", "followed")}
+
+    @override
+    def step(self, x: torch.Tensor, state: State, frame: Frame) -> tuple[torch.Tensor, State]:
+        load = x.sum(dim=(-2, -1), keepdim=True)
+        slow = followed(state["followed"], state["load"], load, frame.dt_s, self.tau_s)
+        return self.lowered(x, slow), {**state, "load": load, "followed": slow}
+
+    @override
+    def sequence(self, x: torch.Tensor, times_s: torch.Tensor, frame: Frame) -> torch.Tensor:
+        return self.lowered(x, low_passed(x.sum(dim=(-2, -1), keepdim=True), times_s, self.tau_s))
 
 
 @register

@@ -23,12 +23,13 @@ from lerobot_vtrefine.tactile.stages.readout import (
     Crosstalk,
     DeadTaxels,
     Idle,
+    LaggingDroop,
     Quantisation,
     RowSharing,
     SupplyDroop,
     TaxelGainSpread,
 )
-from lerobot_vtrefine.tactile.stages.signals import sampled
+from lerobot_vtrefine.tactile.stages.signals import low_passed, sampled
 from lerobot_vtrefine.tactile.stages.softening import FirstLoadSoftening
 from lerobot_vtrefine.tactile.stages.surface import PadTilt
 
@@ -252,7 +253,10 @@ def _row_sharing(stage: RowSharing, field: Field, context: Context) -> Field:
 
 def _supply_droop(stage: SupplyDroop, field: Field, context: Context) -> Field:
     def work(x: np.ndarray, time_s: np.ndarray, taxels: np.ndarray) -> np.ndarray:
-        return stage.lowered(x, x.sum(axis=1, keepdims=True))
+        load = x.sum(axis=1, keepdims=True)
+        if isinstance(stage, LaggingDroop):
+            load = low_passed(torch.from_numpy(load), torch.from_numpy(time_s), stage.tau_s).numpy()
+        return stage.lowered(x, load)
 
     return by_press(field, context.sheet, work)
 
@@ -299,6 +303,7 @@ OWN_TAXELS: dict[type, Callable[[Any, Field, Context], Field]] = {
     DeadTaxels: _multiplied,
     RowSharing: _row_sharing,
     SupplyDroop: _supply_droop,
+    LaggingDroop: _supply_droop,
     Crosstalk: _crosstalk,
     Idle: _idle,
     BaselineDrift: _drift,
