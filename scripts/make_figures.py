@@ -35,6 +35,14 @@ CURVES = {
     "square pair, 1 mm, more slip": {"B.g8.k12": "12 to 3", "B.g8.k40": "40 to 2"},
 }
 """Learning curves that show what the size of a step does, by their names in docs/step_size_curves.csv."""
+LIMITS = {
+    "limited to 2e-4": (
+        ("rate limited to 2e-4, seeds it was chosen on", "rate limited to 2e-4, other seeds"),
+        BLUE,
+    ),
+    "without a limit": (("rate without a limit, 108 iterations",), ORANGE),
+}
+"""Runs on the square pair, vision only, by the variants of their rows."""
 POLICIES = {"visuo_tactile": BLUE, "visual": ORANGE}
 LEARNED = {
     "cross_gentle": "needs touch: cross, 5 N",
@@ -255,6 +263,25 @@ def draw_dppo(plt: Any) -> None:
     figure.savefig(IMAGES / "dppo.png")
 
 
+def draw_rate(plt: Any) -> None:
+    """Success and learning rate over iterations, with a limit of the rate and without."""
+    rows = [row for row in read_all(ROOT / "results") if isinstance(row, Run) and row.curve]
+    figure, (above, below) = plt.subplots(1, 2, figsize=(8.8, 3.2), layout="constrained")
+    for words, (variants, colour) in LIMITS.items():
+        label: str | None = words
+        for row in (row for row in rows if row.task == "square_1mm_slip" and row.variant in variants):
+            with (ROOT / "results" / str(row.curve)).open(encoding="utf-8") as file:
+                points = [point for point in csv.DictReader(file) if point["success"]]
+            at = [int(point["iteration"]) for point in points]
+            above.plot(at, [100 * float(p["success"]) for p in points], color=colour, lw=1, label=label)
+            below.semilogy(at, [float(p["actor_lr"]) for p in points], color=colour, lw=1)
+            label = None
+    above.set(title="success while exploring [%]", xlabel="iteration of 1024 episodes", ylim=(0, 100))
+    below.set(title="learning rate", xlabel="iteration of 1024 episodes")
+    above.legend(frameon=False, loc="lower right")
+    figure.savefig(IMAGES / "rate.png")
+
+
 def draw_diagnosis(plt: Any) -> None:
     """One press as it was measured, as the plain model has it, and as the repaired one has it."""
     import pyarrow.parquet as pq
@@ -361,6 +388,7 @@ SIMULATED: dict[str, Callable[..., None]] = {
 OTHERS: dict[str, Callable[..., None]] = {
     "depth_sensors": draw_depth_sensors,
     "dppo": draw_dppo,
+    "rate": draw_rate,
     "results": draw_results,
     "diagnosis": draw_diagnosis,
     "looks": draw_looks,

@@ -18,7 +18,7 @@ from lerobot_vtrefine.cli.results.tables import HANDLING, MEASURED, REACHED
 from lerobot_vtrefine.finetune.logger import read_progress
 from lerobot_vtrefine.finetune.pipeline import CONFIG_NAME
 
-CURVE_COLUMNS = ("iteration", "env_steps", "success", "eval_success", "seconds")
+CURVE_COLUMNS = ("iteration", "env_steps", "success", "eval_success", "seconds", "actor_lr", "decision_kl")
 ORIGIN = ("commit", "command", "machine")
 
 Progress = list[dict[str, float]]
