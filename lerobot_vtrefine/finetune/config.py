@@ -209,7 +209,7 @@ class TrustRegionDppo(DppoConfig):
 
     Measured on the round and square pairs, 1024 worlds, one seed a run (docs/learning-tried.md): 12 nats that
     fall to 3 learn fast and without a fall; 40 collapse on the tighter task; 4 and less are as stable and
-    slower. On vision alone clipping holds an iteration to 7 nats, whatever the rate: without its limit the
+    slower. On vision alone clipping holds an iteration to 10 nats, whatever the rate: without its limit the
     rate winds up to 1e-2, and success ends 5 points lower (docs/learning-tried.md). Exploration is small and
     smooth in time, so that success while training is near the success of the deployed policy.
     """
