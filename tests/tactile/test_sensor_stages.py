@@ -66,6 +66,9 @@ def test_pad_tilt_moves_taxels_as_a_rotation_does() -> None:
     lifted = once(PadTilt(tilt_x_rad=tilt_x, tilt_y_rad=tilt_y), torch.zeros(6, 10, dtype=torch.float64))
     turned = np.cross([tilt_x, tilt_y, 0.0], LAYOUT.positions())[:, 2]
     assert np.allclose(lifted.numpy().ravel(), turned, atol=1e-12)
+    hinged = PadTilt(tilt_x, tilt_y, pivot_x_m=LAYOUT.positions()[9, 0], pivot_y_m=LAYOUT.positions()[9, 1])
+    moved = once(hinged, torch.zeros(6, 10, dtype=torch.float64)).numpy().ravel()
+    assert np.allclose(moved, turned - turned[9], atol=1e-12)
 
 
 def test_nonlinear_stiffness_is_a_power_law_of_depth() -> None:

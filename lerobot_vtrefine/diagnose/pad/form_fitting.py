@@ -63,7 +63,7 @@ def starts_of(form: Form, probes: Sequence[Probe]) -> Starts:
         if form.amplitude is not None:
             values[form.amplitude] *= probe.size
         elif form.signed:
-            values = values * probe.size
+            values[form.moves] *= probe.size
         points.append(np.clip(values, form.low, form.high))
     return tuple(points)
 

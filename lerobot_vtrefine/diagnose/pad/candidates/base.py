@@ -137,6 +137,11 @@ class Form:
     """Whether that parameter falls as the effect grows."""
 
     @property
+    def moves(self) -> np.ndarray:
+        """Which coordinates a descent changes (p,) bool."""
+        return np.array([value.step > 0 for value in self.values], dtype=bool)
+
+    @property
     def low(self) -> np.ndarray:
         """Lower bounds (p,)."""
         return np.array([value.low for value in self.values])
