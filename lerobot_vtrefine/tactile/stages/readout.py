@@ -303,7 +303,8 @@ class BaselineDrift(Stage):
     """The idle level moves with session time: counts += rate_counts_per_s * t.
 
     `knots_s` and `knot_counts`, equally long, add a curve that is straight between its knots and level beyond
-    them; `counts_per_c` follows the temperature around `reference_c`, where a recording knows it.
+    them; `counts_per_c` follows the temperature around `reference_c`, where a recording knows it. With `anew`
+    time counts from each recording's start, as where a board warms up whenever its scan is switched on.
     """
 
     name: ClassVar[str] = "baseline_drift"
@@ -315,6 +316,7 @@ class BaselineDrift(Stage):
     knot_counts: tuple[float, ...] = ()
     counts_per_c: float = parameter(0.0, "counts/degC", 0.0, 0.0, minimum=None)
     reference_c: float = 22.0
+    anew: bool = False
 
     def __post_init__(self) -> None:
         super().__post_init__()

@@ -52,6 +52,8 @@ class Setting:
     """Whether readings repeat in frames on the pad, or nothing says that they do not."""
     returned: bool = False
     """Whether recordings press where others of the session have pressed before."""
+    rest_time_s: float = 0.0
+    """Mean time in their recordings of the frames that the idle map rests on [s]."""
 
 
 @dataclass(frozen=True)

@@ -182,9 +182,10 @@ def _idle(stage: Idle, field: Field, context: Context) -> Field:
 def _drift(stage: BaselineDrift, field: Field, context: Context) -> Field:
     sheet, field = context.sheet, _everywhere(field, context)
     out = field.values.copy()
-    session_s = [time_s + start_s for time_s, start_s in zip(sheet.times_s, sheet.starts_s, strict=True)]
+    starts_s = np.zeros(len(sheet.starts_s)) if stage.anew else sheet.starts_s
+    session_s = [time_s + start_s for time_s, start_s in zip(sheet.times_s, starts_s, strict=True)]
     ends = np.cumsum([len(time_s) for time_s in session_s])[:-1]
-    # Drift knows the session's time alone: the presses one after the other are one recording.
+    # Drift knows the time alone: the presses one after the other are one recording.
     known = [np.full(len(time_s), stage.reference_c) for time_s in session_s]
     warm_c = [old if warm is None else warm for old, warm in zip(known, sheet.warmth_c, strict=True)]
     frame = Frame(sheet.layout, temperature_c=torch.from_numpy(np.concatenate(warm_c)))
