@@ -203,6 +203,14 @@ def test_supply_droop_reaches_taxels_of_other_rows_and_columns() -> None:
     assert float(once(SupplyDroop(), x)[2, 3]) < alone
 
 
+def test_what_taxels_read_at_rest_sags_with_them() -> None:
+    level = np.random.default_rng(1).uniform(10.0, 40.0, (6, 10))
+    x = torch.zeros(6, 10, dtype=torch.float64)
+    x[2, 3] = 100.0
+    total = once(SupplyDroop(droop_per_count=1e-3, idle_counts=tuple(map(tuple, level))), x) + level
+    assert np.allclose(total, (x.numpy() + level) / 1.1, rtol=1e-6)
+
+
 def test_a_supply_that_lags_sags_as_a_capacitor_discharges() -> None:
     x = torch.zeros(401, 6, 10)
     x[1:, 2, 3] = 100.0

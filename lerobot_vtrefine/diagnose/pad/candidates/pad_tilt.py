@@ -74,5 +74,6 @@ FORMS = (
         amplitude=None,
         signed=True,
         possible=_possible,
+        grown=lambda v, s: [[*v.tolist(), number] for number in range(len(EDGES))],
     ),
 )

@@ -253,11 +253,16 @@ def _row_sharing(stage: RowSharing, field: Field, context: Context) -> Field:
 
 
 def _supply_droop(stage: SupplyDroop, field: Field, context: Context) -> Field:
+    idle = np.asarray(stage.idle_counts, dtype=float)
+    if idle.any():
+        # Untouched taxels move, and touched ones count, whether or not they are asked for.
+        field = field.spread(np.union1d(field.columns, _everywhere(field, context).columns))
+
     def work(x: np.ndarray, time_s: np.ndarray, taxels: np.ndarray) -> np.ndarray:
         load = x.sum(axis=1, keepdims=True)
         if isinstance(stage, LaggingDroop):
             load = low_passed(torch.from_numpy(load), torch.from_numpy(time_s), stage.tau_s).numpy()
-        return stage.lowered(x, load)
+        return stage.lowered(x, load, idle.ravel()[taxels] if idle.ndim else idle)
 
     return by_press(field, context.sheet, work)
 
