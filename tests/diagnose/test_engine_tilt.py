@@ -55,6 +55,14 @@ def test_a_turn_about_the_middle_is_no_hinge() -> None:
     assert plain.loss < 0.05 * hinged.loss
 
 
+def test_a_strip_of_presses_tells_no_hinge_from_an_offset() -> None:
+    setting = composite(presses()).setting
+    assert HINGED.possible(replace(setting, touched_rows=4, touched_cols=6))
+    for rows, cols in ((1, 8), (5, 1), (2, 8), (5, 4)):
+        assert not HINGED.possible(replace(setting, touched_rows=rows, touched_cols=cols))
+        assert PLAIN.possible(replace(setting, touched_rows=rows, touched_cols=cols))
+
+
 def test_scores_stretch_the_turn_and_leave_the_edge() -> None:
     probe = Probe(HINGED.family, HINGED, np.array([2e-3, 0.0, 3.0]), np.full(8, 3.0), np.ones(8), False)
     (start,) = starts_of(HINGED, [probe])

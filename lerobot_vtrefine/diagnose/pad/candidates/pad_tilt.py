@@ -3,6 +3,7 @@
 import numpy as np
 
 from lerobot_vtrefine.diagnose.pad.candidates.base import Form, Setting, Value
+from lerobot_vtrefine.diagnose.pad.rules import HINGE_REACH
 from lerobot_vtrefine.tactile.stages.base import Stage
 from lerobot_vtrefine.tactile.stages.surface import PadTilt
 
@@ -49,6 +50,12 @@ def _possible(setting: Setting) -> bool:
     return not setting.loaded and max(setting.touched_rows, setting.touched_cols) > 1
 
 
+def _spans(setting: Setting) -> bool:
+    """Whether presses reach far enough both ways for a hinge to be no offset."""
+    lines = (setting.touched_rows, setting.layout.rows), (setting.touched_cols, setting.layout.cols)
+    return not setting.loaded and all(touched > max(1, HINGE_REACH * count) for touched, count in lines)
+
+
 FORMS = (
     Form(
         "pad_tilt",
@@ -73,7 +80,7 @@ FORMS = (
         _small_hinged,
         amplitude=None,
         signed=True,
-        possible=_possible,
+        possible=_spans,
         grown=lambda v, s: [[*v.tolist(), number] for number in range(len(EDGES))],
     ),
 )
