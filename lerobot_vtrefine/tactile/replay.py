@@ -11,6 +11,7 @@ from lerobot_vtrefine.tactile.layout import PadLayout
 from lerobot_vtrefine.tactile.model import SensorModel
 from lerobot_vtrefine.tactile.stages.base import Frame
 from lerobot_vtrefine.tactile.stages.cover import passed
+from lerobot_vtrefine.tactile.stages.readout import BaselineDrift
 
 ArrayLike = np.ndarray | torch.Tensor
 
@@ -149,6 +150,6 @@ def replay(
         x, damping = _forces(model, x, rate, layout)
     for stage in model.force_stages:
         if stage.name not in skip and not stage.stochastic:
-            session = times + start_s if stage.name == "baseline_drift" else times
+            session = times + start_s if isinstance(stage, BaselineDrift) and not stage.anew else times
             x, damping = passed(stage, x, damping, partial(stage.sequence, times_s=session, frame=frame))
     return x

@@ -86,6 +86,9 @@ def test_drift_runs_on_session_time() -> None:
     model = SensorModel.paper().with_stage(BaselineDrift(rate_counts_per_s=0.1))
     predicted = replay(model, np.array([0.0, 10.0]), np.full((2, 4, 8), -1.0), start_s=100.0)
     assert np.allclose(predicted[:, 0, 0], [10.0, 11.0])
+    anew = model.with_stage(BaselineDrift(rate_counts_per_s=0.1, anew=True))
+    again = replay(anew, np.array([0.0, 10.0]), np.full((2, 4, 8), -1.0), start_s=100.0)
+    assert np.allclose(again[:, 0, 0], [0.0, 1.0])
 
 
 def test_rate_is_exact_for_quadratic_depth_and_survives_repeated_times() -> None:

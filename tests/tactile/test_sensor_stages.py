@@ -66,6 +66,9 @@ def test_pad_tilt_moves_taxels_as_a_rotation_does() -> None:
     lifted = once(PadTilt(tilt_x_rad=tilt_x, tilt_y_rad=tilt_y), torch.zeros(6, 10, dtype=torch.float64))
     turned = np.cross([tilt_x, tilt_y, 0.0], LAYOUT.positions())[:, 2]
     assert np.allclose(lifted.numpy().ravel(), turned, atol=1e-12)
+    hinged = PadTilt(tilt_x, tilt_y, pivot_x_m=LAYOUT.positions()[9, 0], pivot_y_m=LAYOUT.positions()[9, 1])
+    moved = once(hinged, torch.zeros(6, 10, dtype=torch.float64)).numpy().ravel()
+    assert np.allclose(moved, turned - turned[9], atol=1e-12)
 
 
 def test_nonlinear_stiffness_is_a_power_law_of_depth() -> None:
@@ -198,6 +201,14 @@ def test_supply_droop_reaches_taxels_of_other_rows_and_columns() -> None:
     alone = float(once(SupplyDroop(), x)[2, 3])
     x[4, 7] = 100.0
     assert float(once(SupplyDroop(), x)[2, 3]) < alone
+
+
+def test_what_taxels_read_at_rest_sags_with_them() -> None:
+    level = np.random.default_rng(1).uniform(10.0, 40.0, (6, 10))
+    x = torch.zeros(6, 10, dtype=torch.float64)
+    x[2, 3] = 100.0
+    total = once(SupplyDroop(droop_per_count=1e-3, idle_counts=tuple(map(tuple, level))), x) + level
+    assert np.allclose(total, (x.numpy() + level) / 1.1, rtol=1e-6)
 
 
 def test_a_supply_that_lags_sags_as_a_capacitor_discharges() -> None:

@@ -20,6 +20,7 @@ from lerobot_vtrefine.diagnose.pad.detectable import Power, power_of
 from lerobot_vtrefine.diagnose.pad.experiments import next_experiment
 from lerobot_vtrefine.diagnose.pad.final_model import FinalFit
 from lerobot_vtrefine.diagnose.pad.fitting import Fit, predict
+from lerobot_vtrefine.diagnose.pad.form_fitting import lowest
 from lerobot_vtrefine.diagnose.pad.intervals import (
     LeftOut,
     baseline_parameters,
@@ -165,24 +166,24 @@ def other_forms(problem: PadProblem, fitted: Fit, index: int) -> list[dict[str, 
     full = out_of_fold(problem, fitted, problem.folds)
     reports = []
     for other in others:
-        found = problem.settled(
-            fitted.model.plus(other, _start(other, form, fitted.model.own(index), setting))
-        )
+        starts = _starts(other, form, fitted.model.own(index), setting)
+        models = [fitted.model.plus(other, start) for start in starts]
+        found = lowest(models, problem.presses, problem.weights)
         if not clearly_better(full, out_of_fold(problem, found, problem.folds), problem.seed):
             place = found.model.forms.index(other)
             reports.append(other.report(found.model.own(place), setting))
     return reports
 
 
-def _start(other: Form, form: Form, values: np.ndarray, setting: Setting) -> np.ndarray:
-    """Where the descent of another form starts: at the same values, where it has the same coordinates."""
+def _starts(other: Form, form: Form, values: np.ndarray, setting: Setting) -> np.ndarray:
+    """Where descents of another form start (s, p): at the same values, where it has the same coordinates."""
     if other.values == form.values:
-        return values
+        return values[None]
     if other.grown is not None and len(values) < len(other.values):
-        start = other.grown(values, setting)
+        starts = other.grown(values, setting)
     else:
-        start = other.probes(setting)[0]
-    return np.clip(np.asarray(start, dtype=float), other.low, other.high)
+        starts = other.probes(setting)[0]
+    return np.clip(np.atleast_2d(starts), other.low, other.high)
 
 
 def with_form_spread(

@@ -38,11 +38,14 @@ def settle(start: Composite | Fit, presses: PressSet, weights: Weights) -> Fit:
 def with_form(fitted: Fit, form: Form, starts: Starts, presses: PressSet, weights: Weights) -> Fit:
     """The best fit with a form added, over its starting points."""
     points = starts or _own_starts(fitted, form, presses, weights)
-    models = [fitted.model.plus(form, values) for values in points]
-    if len(models) == 1:
-        return settle(models[0], presses, weights)
-    # A few steps tell which start leads further down.
-    tried = [fit(model, presses, weights, _SCOUTING_STEPS) for model in models]
+    return lowest([fitted.model.plus(form, values) for values in points], presses, weights)
+
+
+def lowest(starts: Sequence[Composite], presses: PressSet, weights: Weights) -> Fit:
+    """The fit from the start that leads furthest down, as a few steps tell."""
+    if len(starts) == 1:
+        return settle(starts[0], presses, weights)
+    tried = [fit(model, presses, weights, _SCOUTING_STEPS) for model in starts]
     return settle(min(tried, key=lambda found: found.loss), presses, weights)
 
 
@@ -50,8 +53,9 @@ def grown(plain: Fit, form: Form, presses: PressSet, weights: Weights) -> Fit:
     """The best fit with another form of a family, from where its plain form has come to rest."""
     assert form.grown is not None
     index = plain.model.families.index(form.family)
-    values = np.asarray(form.grown(plain.model.own(index), plain.model.setting), dtype=float)
-    return settle(plain.model.plus(form, np.clip(values, form.low, form.high)), presses, weights)
+    points = np.atleast_2d(form.grown(plain.model.own(index), plain.model.setting))
+    models = [plain.model.plus(form, np.clip(values, form.low, form.high)) for values in points]
+    return lowest(models, presses, weights)
 
 
 def starts_of(form: Form, probes: Sequence[Probe]) -> Starts:
@@ -63,7 +67,7 @@ def starts_of(form: Form, probes: Sequence[Probe]) -> Starts:
         if form.amplitude is not None:
             values[form.amplitude] *= probe.size
         elif form.signed:
-            values = values * probe.size
+            values[form.moves] *= probe.size
         points.append(np.clip(values, form.low, form.high))
     return tuple(points)
 

@@ -25,10 +25,12 @@ class WholeMotion:
 
 @dataclass(frozen=True)
 class IdleMap:
-    """Reading of every taxel at rest (R, C) counts, and the mean session time of its frames [s]."""
+    """Reading of every taxel at rest (R, C) counts, and the mean time of its frames in the session and in
+    their recordings [s]."""
 
     level: np.ndarray
     session_s: float
+    time_s: float
     frames: int
     """Number of frames without contact that it rests on."""
 
@@ -57,12 +59,12 @@ def idle_map(trials: Sequence[Trial], motions: Sequence[WholeMotion], layout: Pa
     shape = (layout.rows, layout.cols)
     if count >= 3:
         raw = np.concatenate([trial.raw[mask] for trial, mask in zip(trials, frames, strict=True)])
-        session = np.concatenate(
-            [(trial.time_s + trial.start_s)[mask] for trial, mask in zip(trials, frames, strict=True)]
-        )
-        return IdleMap(raw.mean(axis=0).reshape(shape), float(session.mean()), count)
+        times = [trial.time_s[mask] for trial, mask in zip(trials, frames, strict=True)]
+        session = [time_s + trial.start_s for time_s, trial in zip(times, trials, strict=True)]
+        session_s, time_s = (float(np.concatenate(each).mean()) for each in (session, times))
+        return IdleMap(raw.mean(axis=0).reshape(shape), session_s, time_s, count)
     session_s = float(np.mean([trial.start_s for trial in trials]))
-    return IdleMap(_idle_by_taxel(trials, motions).reshape(shape), session_s, 0)
+    return IdleMap(_idle_by_taxel(trials, motions).reshape(shape), session_s, 0.0, 0)
 
 
 def _idle_by_taxel(trials: Sequence[Trial], motions: Sequence[WholeMotion]) -> np.ndarray:

@@ -101,7 +101,7 @@ def interval(values: np.ndarray) -> tuple[float, float]:
 def form_parameters(
     fitted: Fit, index: int, left_out: LeftOut, presses: PressSet, weights: Sequence[TrialWeights]
 ) -> dict[str, Parameter]:
-    """Public parameters of form number `index` with intervals."""
+    """Public parameters of form number `index` with intervals; what was chosen, and not fitted, has none."""
     model, form = fitted.model, fitted.model.forms[index]
     own = model.place(index)
     best = form.report(model.own(index), model.setting)
@@ -113,8 +113,13 @@ def form_parameters(
         bounds = _along_damping(fitted, presses, weights, own.start + form.twin, reporters)
     else:
         bounds = {name: left_out.interval(reporter) for name, reporter in reporters.items()}
+    known = {name for name, (low, high) in bounds.items() if low < high}
     return {
-        name: Parameter(float(value), _possible(form, model.setting, name, float(value), bounds[name]), unit)
+        name: Parameter(
+            float(value),
+            _possible(form, model.setting, name, float(value), bounds[name]) if name in known else None,
+            unit,
+        )
         for name, (value, unit) in best.items()
     }
 

@@ -18,6 +18,9 @@ FURTHER_GAIN = 0.025
 little, too."""
 MORE_COORDINATES = 2
 """Coordinates that another form may have beyond the named one's, to be tried once names are settled."""
+HINGE_REACH = 0.5
+"""Part of the rows, and of the columns, that must be pressed for a hinge to be tried: along a strip it lifts
+all places alike, as an offset does."""
 FORGIVEN = 1.5
 """Factor by which weights may raise the plain squared error of a model; beyond, all readings count alike."""
 FAR_OFF = 4.0

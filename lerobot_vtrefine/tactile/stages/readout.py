@@ -152,20 +152,30 @@ class SupplyDroop(Stage):
     currents, and its resistance lowers the voltage of every line alike. (The driver's own resistance would
     lower that of its line alone: Kim, Kwon & Choi 2016, Sensors 16(2), 155.) A converter whose reference is
     the drive voltage itself does not see it.
+
+    What a taxel reads at rest, which is added later, falls as well where it is a current of the same lines:
+    `idle_counts` (a number or (R, C)) says how much of it does.
     """
 
     name: ClassVar[str] = "supply_droop"
     domain: ClassVar[str] = "counts"
     rank: ClassVar[int] = 55
     droop_per_count: float = parameter(5e-5, "1/counts", 0.0, 5e-4)
+    idle_counts: float | tuple[tuple[float, ...], ...] = field(
+        default=0.0, metadata={"range": (0.0, 0.0), "maximum": LARGEST["counts"]}
+    )
 
-    def lowered(self, x: Any, pad_sum: Any) -> Any:
-        """Readings x of pads that add up to `pad_sum`, at the lower voltage."""
-        return x / (1.0 + self.droop_per_count * pad_sum)
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        object.__setattr__(self, "idle_counts", as_map(f"{self.name}.idle_counts", self.idle_counts))
+
+    def lowered(self, x: Any, pad_sum: Any, idle: Any) -> Any:
+        """Readings x above idle levels, of pads that add up to `pad_sum`, at the lower voltage."""
+        return (x + idle) / (1.0 + self.droop_per_count * pad_sum) - idle
 
     @override
     def step(self, x: torch.Tensor, state: State, frame: Frame) -> tuple[torch.Tensor, State]:
-        return self.lowered(x, x.sum(dim=(-2, -1), keepdim=True)), state
+        return self.lowered(x, x.sum(dim=(-2, -1), keepdim=True), taxel_map(self.idle_counts, x)), state
 
 
 @register
@@ -186,11 +196,13 @@ class LaggingDroop(SupplyDroop):
     def step(self, x: torch.Tensor, state: State, frame: Frame) -> tuple[torch.Tensor, State]:
         load = x.sum(dim=(-2, -1), keepdim=True)
         slow = followed(state["followed"], state["load"], load, frame.dt_s, self.tau_s)
-        return self.lowered(x, slow), {**state, "load": load, "followed": slow}
+        lowered = self.lowered(x, slow, taxel_map(self.idle_counts, x))
+        return lowered, {**state, "load": load, "followed": slow}
 
     @override
     def sequence(self, x: torch.Tensor, times_s: torch.Tensor, frame: Frame) -> torch.Tensor:
-        return self.lowered(x, low_passed(x.sum(dim=(-2, -1), keepdim=True), times_s, self.tau_s))
+        slow = low_passed(x.sum(dim=(-2, -1), keepdim=True), times_s, self.tau_s)
+        return self.lowered(x, slow, taxel_map(self.idle_counts, x))
 
 
 @register
@@ -303,7 +315,8 @@ class BaselineDrift(Stage):
     """The idle level moves with session time: counts += rate_counts_per_s * t.
 
     `knots_s` and `knot_counts`, equally long, add a curve that is straight between its knots and level beyond
-    them; `counts_per_c` follows the temperature around `reference_c`, where a recording knows it.
+    them; `counts_per_c` follows the temperature around `reference_c`, where a recording knows it. With `anew`
+    time counts from each recording's start, as where a board warms up whenever its scan is switched on.
     """
 
     name: ClassVar[str] = "baseline_drift"
@@ -315,6 +328,7 @@ class BaselineDrift(Stage):
     knot_counts: tuple[float, ...] = ()
     counts_per_c: float = parameter(0.0, "counts/degC", 0.0, 0.0, minimum=None)
     reference_c: float = 22.0
+    anew: bool = False
 
     def __post_init__(self) -> None:
         super().__post_init__()

@@ -68,15 +68,22 @@ class StiffeningDepth(Stage):
 @dataclass(frozen=True)
 class PadTilt(Stage):
     """The pad is turned about its +x and +y by small angles, which lifts the taxel at (x, y): d + y tilt_x -
-    x tilt_y."""
+    x tilt_y.
+
+    What it turns about is its centre, or another point of its face, from which x and y are then counted: a
+    pad that is hinged at an edge lies deeper, or higher, in the middle as well.
+    """
 
     name: ClassVar[str] = "pad_tilt"
     domain: ClassVar[str] = "depth"
     rank: ClassVar[int] = 12
     tilt_x_rad: float = parameter(0.0, "rad", -0.02, 0.02, minimum=None)
     tilt_y_rad: float = parameter(0.0, "rad", -0.02, 0.02, minimum=None)
+    pivot_x_m: float = parameter(0.0, "m", 0.0, 0.0, minimum=None)
+    pivot_y_m: float = parameter(0.0, "m", 0.0, 0.0, minimum=None)
 
     @override
     def step(self, x: torch.Tensor, state: State, frame: Frame) -> tuple[torch.Tensor, State]:
         columns_m, rows_m = (taxel_map(axis, x) for axis in frame.layout.axes_m())
-        return x + self.tilt_x_rad * rows_m[:, None] - self.tilt_y_rad * columns_m[None, :], state
+        along, across = columns_m - self.pivot_x_m, rows_m - self.pivot_y_m
+        return x + self.tilt_x_rad * across[:, None] - self.tilt_y_rad * along[None, :], state

@@ -52,6 +52,10 @@ class Setting:
     """Whether readings repeat in frames on the pad, or nothing says that they do not."""
     returned: bool = False
     """Whether recordings press where others of the session have pressed before."""
+    idle_counts: tuple[tuple[float, ...], ...] = ()
+    """What every taxel reads at rest (R, C)."""
+    rest_time_s: float = 0.0
+    """Mean time in their recordings of the frames that the idle map rests on [s]."""
 
 
 @dataclass(frozen=True)
@@ -123,8 +127,9 @@ class Form:
     """Whether it is no richer than the plain form: it need not predict clearly better, only better."""
     needs: str = "recordings in which it can act"
     """What to record where the cause cannot show."""
-    grown: Callable[[np.ndarray, Setting], list[float]] | None = None
-    """The family's plain form, given by its coordinates, as this form has it: where descents start."""
+    grown: Callable[[np.ndarray, Setting], list[float] | list[list[float]]] | None = None
+    """The family's plain form, given by its coordinates, as this form has it: where descents start, one or
+    several."""
     kinds: tuple[Kind, ...] = ()
     """Signals of these kinds are the family's own: what follows them may be the fault of its form."""
     between_frames: bool = False
@@ -135,6 +140,11 @@ class Form:
     """Value of that parameter without the effect."""
     shrinks: bool = False
     """Whether that parameter falls as the effect grows."""
+
+    @property
+    def moves(self) -> np.ndarray:
+        """Which coordinates a descent changes (p,) bool."""
+        return np.array([value.step > 0 for value in self.values], dtype=bool)
 
     @property
     def low(self) -> np.ndarray:

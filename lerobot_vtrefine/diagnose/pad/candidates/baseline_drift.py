@@ -1,4 +1,4 @@
-"""baseline_drift: the idle level drifts during the session."""
+"""baseline_drift: the idle level drifts during the session, or anew in every recording."""
 
 import numpy as np
 
@@ -14,6 +14,16 @@ def _linear(values: np.ndarray, setting: Setting) -> tuple[Stage, ...]:
     """Around the mean time of the frames that the idle map was taken from."""
     rate = float(values[0]) * UNIT
     return (Idle(-rate * setting.rest_session_s, 0.0), BaselineDrift(rate))
+
+
+def _anew(values: np.ndarray, setting: Setting) -> tuple[Stage, ...]:
+    """Around their mean time in their recordings."""
+    rate = float(values[0]) * UNIT
+    return (Idle(-rate * setting.rest_time_s, 0.0), BaselineDrift(rate, anew=True))
+
+
+def _report(values: np.ndarray, setting: Setting) -> dict[str, tuple[float, str]]:
+    return {"rate_counts_per_s": (float(values[0]) * UNIT, "counts/s")}
 
 
 KNOTS, MANY_KNOTS = 6, 16
@@ -62,13 +72,14 @@ CURVE = _curve_of("curve over session time", KNOTS, 2.0)
 WANDERING = _curve_of("wandering over session time", MANY_KNOTS, MANY_KNOTS)
 """What wanders keeps its level for a recording or two only."""
 
+RATE = Value("rate", -5e4, 5e4, 1e-2)
 FORMS = (
     Form(
         "baseline_drift",
         "linear in session time",
-        (Value("rate", -5e4, 5e4, 1e-2),),
+        (RATE,),
         _linear,
-        lambda v, s: {"rate_counts_per_s": (float(v[0]) * UNIT, "counts/s")},
+        _report,
         lambda s: [[1.0]],
         kinds=("time", "session"),
         needs="log start_s, and record over some minutes with frames at rest in every trial",
@@ -85,6 +96,16 @@ FORMS = (
         lambda s: [[0.1, 0.0]],
         signed=True,
         possible=lambda s: s.temperature_c is not None,
+        peer=True,
+    ),
+    Form(
+        "baseline_drift",
+        "linear in every recording's own time",
+        (RATE,),
+        _anew,
+        _report,
+        lambda s: [[1.0]],
+        signed=True,
         peer=True,
     ),
 )

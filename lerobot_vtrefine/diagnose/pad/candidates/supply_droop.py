@@ -16,6 +16,10 @@ def _lagging(values: np.ndarray, setting: Setting) -> tuple[Stage, ...]:
     return (LaggingDroop(float(values[0]) / setting.top_counts, float(np.exp(values[1]))),)
 
 
+def _with_idle(values: np.ndarray, setting: Setting) -> tuple[Stage, ...]:
+    return (SupplyDroop(float(values[0]) / setting.top_counts, setting.idle_counts),)
+
+
 def _report(values: np.ndarray, setting: Setting) -> dict[str, tuple[float, str]]:
     droop = {"droop_per_count": (float(values[0]) / setting.top_counts, "1/counts")}
     return droop if len(values) == 1 else {**droop, "tau_s": (float(np.exp(values[1])), "s")}
@@ -47,5 +51,16 @@ FORMS = (
         lambda s: [[0.05, float(np.log(LAG_S))]],
         possible=_possible,
         grown=lambda v, s: [float(v[0]), float(np.log(LAG_S))],
+    ),
+    Form(
+        "supply_droop",
+        "of idle levels, too",
+        (LOAD,),
+        _with_idle,
+        _report,
+        lambda s: [[0.05]],
+        possible=lambda s: _possible(s) and any(any(row) for row in s.idle_counts),
+        peer=True,
+        grown=lambda v, s: [float(v[0])],
     ),
 )

@@ -182,9 +182,10 @@ def _idle(stage: Idle, field: Field, context: Context) -> Field:
 def _drift(stage: BaselineDrift, field: Field, context: Context) -> Field:
     sheet, field = context.sheet, _everywhere(field, context)
     out = field.values.copy()
-    session_s = [time_s + start_s for time_s, start_s in zip(sheet.times_s, sheet.starts_s, strict=True)]
+    starts_s = np.zeros(len(sheet.starts_s)) if stage.anew else sheet.starts_s
+    session_s = [time_s + start_s for time_s, start_s in zip(sheet.times_s, starts_s, strict=True)]
     ends = np.cumsum([len(time_s) for time_s in session_s])[:-1]
-    # Drift knows the session's time alone: the presses one after the other are one recording.
+    # Drift knows the time alone: the presses one after the other are one recording.
     known = [np.full(len(time_s), stage.reference_c) for time_s in session_s]
     warm_c = [old if warm is None else warm for old, warm in zip(known, sheet.warmth_c, strict=True)]
     frame = Frame(sheet.layout, temperature_c=torch.from_numpy(np.concatenate(warm_c)))
@@ -252,11 +253,16 @@ def _row_sharing(stage: RowSharing, field: Field, context: Context) -> Field:
 
 
 def _supply_droop(stage: SupplyDroop, field: Field, context: Context) -> Field:
+    idle = np.asarray(stage.idle_counts, dtype=float)
+    if idle.any():
+        # Untouched taxels move, and touched ones count, whether or not they are asked for.
+        field = field.spread(np.union1d(field.columns, _everywhere(field, context).columns))
+
     def work(x: np.ndarray, time_s: np.ndarray, taxels: np.ndarray) -> np.ndarray:
         load = x.sum(axis=1, keepdims=True)
         if isinstance(stage, LaggingDroop):
             load = low_passed(torch.from_numpy(load), torch.from_numpy(time_s), stage.tau_s).numpy()
-        return stage.lowered(x, load)
+        return stage.lowered(x, load, idle.ravel()[taxels] if idle.ndim else idle)
 
     return by_press(field, context.sheet, work)
 
