@@ -38,7 +38,7 @@ from lerobot_vtrefine.tactile.stages.readout import (
     SupplyDroop,
     TaxelGainSpread,
 )
-from lerobot_vtrefine.tactile.stages.softening import FirstLoadSoftening
+from lerobot_vtrefine.tactile.stages.softening import FirstLoadSoftening, PathSoftening
 from lerobot_vtrefine.tactile.stages.surface import ContactOffset, PadTilt
 
 LAYOUT = PadLayout(6, 10, 0.002)
@@ -347,6 +347,7 @@ WITH_MEMORY = [
     ViscoelasticRelaxation((0.3, 2.0), (0.3, 0.2)),
     ViscoelasticRelaxation(0.3, 0.9, pushes_only=True),
     FirstLoadSoftening(0.4, 1.5, 0.5, recovery_s=3.0),
+    PathSoftening(0.4, 1e-3),
     Latency(0.12, smoothing=0.4),
     ScanSkew(0.05, cols_s=0.02),
     ScanSkew(0.0, rows_s=(0.0, 0.05, 0.02)),
