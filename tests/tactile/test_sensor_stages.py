@@ -356,6 +356,7 @@ WITH_MEMORY = [
     FirstLoadSoftening(0.4, 1.5, 0.5, recovery_s=3.0),
     PathSoftening(0.4, 1e-3),
     Latency(0.12, smoothing=0.4),
+    Latency(0.1, growth=0.05),
     ScanSkew(0.05, cols_s=0.02),
     ScanSkew(0.0, rows_s=(0.0, 0.05, 0.02)),
     SampleAndHold(0.13),
