@@ -18,7 +18,7 @@ from lerobot_vtrefine.diagnose.servo.bench import on_bench
 from lerobot_vtrefine.files import read_json
 from lerobot_vtrefine.tactile import model as sensor_model
 from lerobot_vtrefine.tactile.layout import PadLayout
-from lerobot_vtrefine.tactile.stages.softening import FirstLoadSoftening
+from lerobot_vtrefine.tactile.stages.softening import Remembering
 
 Predict = Callable[[Any], np.ndarray]
 """From a trial to its prediction, a row per frame."""
@@ -48,8 +48,7 @@ def load_predictor(path: str | Path, recordings: RecordingSet) -> Predict:
         return lambda trial: robot_model.predict_positions(robot, trial)
     sensor = sensor_model.SensorModel.load(path)
     layout = PadLayout(recordings.rows, recordings.cols, recordings.pitch_m)
-    softening = sensor.find(FirstLoadSoftening.name)
-    if not isinstance(softening, FirstLoadSoftening) or not softening.session:
+    if not any(isinstance(stage, Remembering) and stage.session for stage in sensor.stages):
         return lambda trial: predict_trial(sensor, trial, layout)
     made = [_sound(trial) for trial in recordings.trials if isinstance(trial, Trial)]
     made = with_session(made, [drive_of(trial, layout) for trial in made])

@@ -155,10 +155,12 @@ class Borne:
     Attributes:
         drive: (J, R, C) greatest column height [m], or force per taxel [N] where no depth is known.
         age_s: (J, R, C) from then to the other recording's first frame [s].
+        path: (J, R, C) all rises of that drive together.
     """
 
     drive: np.ndarray
     age_s: np.ndarray
+    path: np.ndarray
 
 
 @dataclass(frozen=True)

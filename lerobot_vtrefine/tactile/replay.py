@@ -65,14 +65,14 @@ def finite_rate(times_s: torch.Tensor, depth_m: torch.Tensor) -> torch.Tensor:
 
 
 def _spread_over_trials(
-    borne: tuple[ArrayLike, ArrayLike], x: torch.Tensor
-) -> tuple[torch.Tensor, torch.Tensor] | None:
+    borne: tuple[ArrayLike, ArrayLike, ArrayLike], x: torch.Tensor
+) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor] | None:
     """(J, R, C) each as (J, ..., R, C) beside x (T, ..., R, C); None if nothing was borne."""
-    drive, age_s = (torch.as_tensor(values, device=x.device).to(torch.float64) for values in borne)
+    drive, age_s, path = (torch.as_tensor(values, device=x.device).to(torch.float64) for values in borne)
     if not len(drive):
         return None
     shape = (len(drive), *(1,) * (x.ndim - 3), *drive.shape[-2:])
-    return drive.reshape(shape), age_s.reshape(shape)
+    return drive.reshape(shape), age_s.reshape(shape), path.reshape(shape)
 
 
 def _checked_layout(x: torch.Tensor, count: int, layout: PadLayout | None) -> PadLayout:
@@ -105,7 +105,7 @@ def replay(
     layout: PadLayout | None = None,
     start_s: float = 0.0,
     temperature_c: ArrayLike | None = None,
-    borne: tuple[ArrayLike, ArrayLike] | None = None,
+    borne: tuple[ArrayLike, ArrayLike, ArrayLike] | None = None,
     skip: Collection[str] = ("noise", "quantisation"),
     device: str = "cpu",
 ) -> torch.Tensor:
@@ -122,8 +122,8 @@ def replay(
         force_n: (T, ..., R, C) force per taxel [N].
         start_s: session time of the trial's first frame, for drift [s].
         temperature_c: (T,) where it was recorded, for drift [degrees Celsius].
-        borne: what earlier recordings pressed the taxels with, and how long before, where that is known:
-            drive and age (J, R, C) each, as `Frame.borne` has them.
+        borne: what earlier recordings pressed the taxels with, how long before, and along what path, where
+            that is known: drive, age and path (J, R, C) each, as `Frame.borne` has them.
         skip: stages left out; by default those that only add noise to a prediction.
 
     Raises:

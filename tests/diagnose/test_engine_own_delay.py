@@ -8,10 +8,10 @@ import numpy as np
 import pytest
 from test_engine_pad import COLS, ROWS, linear, one_trial
 
-from lerobot_vtrefine.diagnose.pad.candidates import PLAIN
+from lerobot_vtrefine.diagnose.pad.candidates import CATALOGUE, PLAIN
 from lerobot_vtrefine.diagnose.pad.own_delay import moved, timed, with_spread
 from lerobot_vtrefine.diagnose.pad.press_trials import PressSet, prepare
-from lerobot_vtrefine.diagnose.pad.problem import PadProblem
+from lerobot_vtrefine.diagnose.pad.problem import Candidate, PadProblem
 from lerobot_vtrefine.diagnose.pad.recording_scatter import own_deviations, starts_deviate
 from lerobot_vtrefine.diagnose.pad.review import with_own_delays
 from lerobot_vtrefine.diagnose.recordings import RecordingSet
@@ -21,13 +21,14 @@ COUNT = 8
 OWN_S = np.random.default_rng(4).permutation(np.linspace(-0.016, 0.016, COUNT))
 
 
-def presses(delays_s: np.ndarray) -> PressSet:
-    """Recordings whose readings come so late (COUNT,) [s]."""
+def presses(delays_s: np.ndarray, growth: float = 0.0) -> PressSet:
+    """Recordings whose readings come so late (COUNT,) at first [s], and later by `growth` every second."""
     rng = np.random.default_rng(8)
     trials = []
     for number, delay_s in enumerate(delays_s):
         sound = one_trial(number, linear, 21, 0.0, 0.0)
-        late = [np.interp(sound.time_s - delay_s, sound.time_s, column) for column in sound.raw.T]
+        taken_s = sound.time_s * (1.0 - growth) - delay_s
+        late = [np.interp(taken_s, sound.time_s, column) for column in sound.raw.T]
         raw = np.round(np.stack(late, axis=1) + 0.5 * rng.standard_normal(sound.raw.shape)).clip(0, 255)
         trials.append(replace(sound, raw=raw))
     held = RecordingSet(Path(), "pad", ROWS, COLS, 0.002, 255.0, (), tuple(trials))
@@ -62,6 +63,17 @@ def test_a_latency_that_differs_is_named(late: PadProblem) -> None:
     assert found.fit.model.families == ("latency",)
     assert found.fit.model.own(0)[0] == pytest.approx(0.02, abs=6e-3)
     assert np.std(found.problem.presses.delays_s) == pytest.approx(np.std(OWN_S), rel=0.15)
+
+
+def test_a_queue_that_grows_is_sized() -> None:
+    problem, fitted = PadProblem(presses(np.full(COUNT, 0.01), 0.01)).weighed(None)
+    queue = next(form for form in CATALOGUE if form.label == "a queue that grows through the recording")
+    plain = problem.extended(fitted, Candidate("latency", form=PLAIN["latency"]), np.ones(1, dtype=bool))
+    grown = problem.extended(fitted, Candidate("latency", form=queue), np.ones(1, dtype=bool), plain)
+    middle_s, growth = grown.model.own(0)
+    assert growth == pytest.approx(0.01, rel=0.1)
+    assert middle_s == pytest.approx(0.01 + 0.01 * 0.5 * fitted.model.setting.duration_s, abs=3e-3)
+    assert grown.loss < 0.9 * plain.loss
 
 
 def test_a_moved_press_was_made_later(late: PadProblem) -> None:

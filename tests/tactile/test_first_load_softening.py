@@ -9,7 +9,7 @@ import torch
 from lerobot_vtrefine.tactile.layout import PadLayout
 from lerobot_vtrefine.tactile.stages.base import Frame
 from lerobot_vtrefine.tactile.stages.host import ScanSkew
-from lerobot_vtrefine.tactile.stages.softening import FirstLoadSoftening
+from lerobot_vtrefine.tactile.stages.softening import FirstLoadSoftening, PathSoftening, Remembering
 
 FRAME = Frame(PadLayout(1, 1, 0.002), stiffness_n_per_m=1000.0)
 
@@ -18,7 +18,7 @@ def course(values: list[float]) -> torch.Tensor:
     return torch.tensor(values, dtype=torch.float64).view(-1, 1, 1)
 
 
-def softened(stage: FirstLoadSoftening, values: list[float], step_s: float = 0.1) -> np.ndarray:
+def softened(stage: Remembering, values: list[float], step_s: float = 0.1) -> np.ndarray:
     times = step_s * torch.arange(len(values), dtype=torch.float64)
     return stage.sequence(course(values), times, FRAME).numpy().ravel()
 
@@ -70,9 +70,9 @@ def test_a_recording_is_what_single_frames_give(recovery_s: float) -> None:
         assert torch.allclose(one, whole)
 
 
-def in_session(stage: FirstLoadSoftening, values: list[float], borne_m: float, age_s: float) -> np.ndarray:
+def in_session(stage: Remembering, values: list[float], borne_m: float, age_s: float) -> np.ndarray:
     """After an earlier recording that pressed so deep, so long ago."""
-    earlier = (torch.tensor([[[borne_m]]]), torch.tensor([[[age_s]]]))
+    earlier = (torch.tensor([[[borne_m]]]), torch.tensor([[[age_s]]]), torch.tensor([[[borne_m]]]))
     frame = replace(FRAME, borne=earlier)
     times = 0.1 * torch.arange(len(values), dtype=torch.float64)
     return stage.sequence(course(values), times, frame).numpy().ravel()
@@ -98,6 +98,18 @@ def test_a_virgin_cover_remembers_no_session() -> None:
     assert np.array_equal(
         in_session(FirstLoadSoftening(0.4), values, 1e-3, 1.0), softened(FirstLoadSoftening(0.4), values)
     )
+
+
+def test_every_rise_of_the_load_softens_and_letting_go_does_not() -> None:
+    # A path of 2 mm is 2 N here.
+    stage, values = PathSoftening(0.4, 2e-3), [0.0, 1.0, 0.5, 0.0, 1.0, 1.5]
+    path = np.array([0.0, 1.0, 1.0, 1.0, 2.0, 2.5])
+    left = 1 - 0.4 * (1 - np.exp(-path / 2))
+    assert np.allclose(softened(stage, values), values * left)
+    # The earlier recording went 2 mm.
+    session = PathSoftening(0.4, 2e-3, session=True)
+    assert in_session(session, [0.0, 1.0], 2e-3, 5.0)[1] == pytest.approx(1 - 0.4 * (1 - np.exp(-3 / 2)))
+    assert in_session(stage, [0.0, 1.0], 2e-3, 5.0)[1] == pytest.approx(left[1])
 
 
 def test_a_board_may_scan_along_the_columns_too() -> None:

@@ -28,7 +28,7 @@ def predict_trial(model: SensorModel, trial: Trial, layout: PadLayout) -> np.nda
         layout=layout,
         start_s=trial.start_s,
         temperature_c=warmth(trial, times),
-        borne=None if borne is None else (borne.drive, borne.age_s),
+        borne=None if borne is None else (borne.drive, borne.age_s, borne.path),
     )
     converter = model.find("quantisation")
     limit = converter.full_scale_counts if isinstance(converter, Quantisation) else np.inf

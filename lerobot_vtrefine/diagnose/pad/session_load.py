@@ -1,4 +1,4 @@
-"""What a cover has borne before a recording: how hard earlier recordings pressed every taxel."""
+"""What a cover has borne before a recording: how hard, and how often, earlier ones pressed every taxel."""
 
 from collections.abc import Sequence
 from dataclasses import replace
@@ -29,11 +29,19 @@ def with_session(trials: Sequence[Trial], drives: Sequence[np.ndarray]) -> list[
         trial.start_s + trial.time_s[drive.argmax(axis=0)]
         for trial, drive in zip(trials, drives, strict=True)
     ]
+    paths = [_path(drive) for drive in drives]
     known = []
     for trial, place in zip(trials, places, strict=True):
         earlier = [k for k, other in enumerate(places) if other < place]
         shape = (len(earlier), *peaks[0].shape)
         drive = np.array([peaks[k] for k in earlier]).reshape(shape)
         age_s = np.array([trial.start_s + trial.time_s[0] - when[k] for k in earlier]).reshape(shape)
-        known.append(replace(trial, borne=Borne(drive, np.maximum(age_s, 0.0))))
+        path = np.array([paths[k] for k in earlier]).reshape(shape)
+        known.append(replace(trial, borne=Borne(drive, np.maximum(age_s, 0.0), path)))
     return known
+
+
+def _path(drive: np.ndarray) -> np.ndarray:
+    """All rises of a drive together: (T, R, C) to (R, C)."""
+    pressed = np.maximum(drive, 0.0)
+    return np.maximum(np.diff(pressed, axis=0, prepend=0.0), 0.0).sum(axis=0)

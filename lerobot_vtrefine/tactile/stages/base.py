@@ -38,9 +38,10 @@ class Frame:
     """Temperature, broadcastable to (..., R, C); None where nobody measured it [degrees Celsius]."""
     load_conserving: bool = False
     """Whether the taxels' sum is a measured or solved load, which mechanics must not change."""
-    borne: tuple[torch.Tensor, torch.Tensor] | None = None
+    borne: tuple[torch.Tensor, torch.Tensor, torch.Tensor] | None = None
     """What each of J earlier recordings pressed a taxel with at most (J, ..., R, C) [m; N where the load is
-    known], and how long before this recording's first frame [s]; None where nobody knows."""
+    known], how long before this recording's first frame [s], and all its loading together [m; N]; None where
+    nobody knows."""
 
 
 LARGEST = {

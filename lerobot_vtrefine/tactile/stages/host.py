@@ -43,8 +43,8 @@ class Delay(Stage):
     domain: ClassVar[str] = "counts"
     has_state: ClassVar[bool] = True
 
-    def delay_s(self, rows: int, like: torch.Tensor) -> torch.Tensor:
-        """Delay of each row, (..., R, 1) [s]."""
+    def delay_s(self, rows: int, like: torch.Tensor, frame: Frame) -> torch.Tensor:
+        """Delay of each row at a frame, (..., R, 1) [s]."""
         raise NotImplementedError
 
     @override
@@ -57,7 +57,7 @@ class Delay(Stage):
 
     @override
     def step(self, x: torch.Tensor, state: State, frame: Frame) -> tuple[torch.Tensor, State]:
-        delay = self.delay_s(x.shape[-2], x)
+        delay = self.delay_s(x.shape[-2], x, frame)
         # The oldest remembered frame is HISTORY_FRAMES - 1 steps old: a longer delay would silently be cut.
         if frame.dt_s > 0.0 and float(delay.max()) > (HISTORY_FRAMES - 1) * frame.dt_s:
             limit = f"{HISTORY_FRAMES - 1} frames of {frame.dt_s:g} s"
@@ -76,7 +76,7 @@ class Delay(Stage):
 
     @override
     def sequence(self, x: torch.Tensor, times_s: torch.Tensor, frame: Frame) -> torch.Tensor:
-        return delayed(x, times_s, self.delay_s(x.shape[-2], x))
+        return delayed(x, times_s, self.delay_s(x.shape[-2], x, frame))
 
 
 @register
@@ -85,6 +85,7 @@ class Latency(Delay):
     """Readings are `tau_s` old when the host stamps them.
 
     The part `smoothing` of that age is a one-pole filter's (of the board or its driver), the rest a delay.
+    Where readings queue up, the delay grows by `growth` with every second of the recording, or falls to zero.
     """
 
     name: ClassVar[str] = "latency"
@@ -92,6 +93,7 @@ class Latency(Delay):
     alike: ClassVar[bool] = True
     tau_s: float = parameter(0.01, "s", 0.0, 0.05)
     smoothing: float = parameter(0.0, "1", 0.0, 0.0, maximum=1.0)
+    growth: float = parameter(0.0, "1", 0.0, 0.0, minimum=None, maximum=1.0)
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -102,9 +104,18 @@ class Latency(Delay):
     def _plain(self) -> bool:
         return not isinstance(self.smoothing, torch.Tensor) and self.smoothing == 0.0
 
+    @property
+    def _grows(self) -> bool:
+        return isinstance(self.growth, torch.Tensor) or self.growth != 0.0
+
+    def _late_s(self, time_s: Any) -> Any:
+        """Delay so long after the recording's start [s]."""
+        late = (1.0 - self.smoothing) * self.tau_s
+        return (late + self.growth * torch.as_tensor(time_s)).clamp(min=0.0) if self._grows else late
+
     @override
-    def delay_s(self, rows: int, like: torch.Tensor) -> torch.Tensor:
-        delay = torch.as_tensor((1.0 - self.smoothing) * self.tau_s, dtype=like.dtype, device=like.device)
+    def delay_s(self, rows: int, like: torch.Tensor, frame: Frame) -> torch.Tensor:
+        delay = torch.as_tensor(self._late_s(frame.time_s), dtype=like.dtype, device=like.device)
         return delay.reshape(-1, *(1,) * (like.ndim - 1))
 
     @override
@@ -134,7 +145,10 @@ class Latency(Delay):
 
     @override
     def sequence(self, x: torch.Tensor, times_s: torch.Tensor, frame: Frame) -> torch.Tensor:
-        late = super().sequence(x, times_s, frame)
+        if self._grows:
+            late = sampled(x, times_s, times_s - self._late_s(times_s))
+        else:
+            late = super().sequence(x, times_s, frame)
         return late if self._plain else late[:1] + low_passed(late - late[:1], times_s, float(self._filter_s))
 
 
@@ -172,7 +186,7 @@ class ScanSkew(Delay):
         return late + self.cols_s * col / max(cols - 1, 1)
 
     @override
-    def delay_s(self, rows: int, like: torch.Tensor) -> torch.Tensor:
+    def delay_s(self, rows: int, like: torch.Tensor, frame: Frame) -> torch.Tensor:
         row, col = (torch.arange(n, dtype=like.dtype, device=like.device) for n in (rows, like.shape[-1]))
         # Without a delay along them, the columns of a row are read as one.
         along = isinstance(self.cols_s, torch.Tensor) or self.cols_s != 0.0

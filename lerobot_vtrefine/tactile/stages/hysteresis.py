@@ -4,6 +4,7 @@ A law is how a memory moves with every frame, and what reading goes with it. A s
 frame, a replay or a fit through all frames of a recording.
 """
 
+import math
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass
 from typing import Any, ClassVar, override
@@ -197,6 +198,23 @@ class ProportionalHysteresis(Loop):
         before = torch.cat([torch.zeros_like(x[:1]), x[:-1]])
         back = memories(self._turned, *self._moves(x, before, frame))
         return (x * (1.0 + self.fraction * back)).clamp(min=0.0)
+
+
+@register
+@dataclass(frozen=True)
+class DuhemHysteresis(ProportionalHysteresis):
+    """The same where b turns gradually, by a part of what is left of its way for every bit of load (Duhem's
+    and Dahl's models): 63 % of it over `width_m`.
+    """
+
+    name: ClassVar[str] = "duhem_hysteresis"
+
+    @override
+    @staticmethod
+    def _turned(back: Any, unloaded: Any, touching: Any) -> Any:
+        """Of tensors or arrays."""
+        end = 1.0 * (unloaded > 0)
+        return (end + (back - end) * math.e ** -abs(unloaded)) * touching
 
 
 @register

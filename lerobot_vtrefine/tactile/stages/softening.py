@@ -1,7 +1,9 @@
-"""First-load softening (the Mullins effect): a memory of the largest load so far, and its recovery."""
+"""First-load softening (the Mullins effect): a memory of the largest load so far, which may fade, or of all
+loading so far.
+"""
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any, ClassVar, override
 
 import numpy as np
@@ -13,9 +15,21 @@ from lerobot_vtrefine.tactile.stages.cover import CoverLaw
 from lerobot_vtrefine.tactile.stages.mechanics import REFERENCE_DEPTH_M
 
 
+@dataclass(frozen=True)
+class Remembering(CoverLaw):
+    """Base of the laws that may know, with `session`, what earlier recordings of their session pressed.
+
+    Simulated episodes, and recordings otherwise, start with a virgin cover.
+    """
+
+    rank: ClassVar[int] = 35
+    has_state: ClassVar[bool] = True
+    session: bool = field(default=False, kw_only=True)
+
+
 @register
 @dataclass(frozen=True)
-class FirstLoadSoftening(CoverLaw):
+class FirstLoadSoftening(Remembering):
     """Below the largest load so far, M, the cover is softer: f (1 - softening m^growth (1 - f/M)^sharpness).
 
     A first load follows the virgin curve; letting go and loading again follow a softer one, whatever the
@@ -24,19 +38,14 @@ class FirstLoadSoftening(CoverLaw):
     `growth` larger loads soften more. With `recovery_s` the memory fades, M(t) = the largest
     f(s) exp(-(t - s) / recovery_s); 0 means that it never does.
 
-    With `session` recordings know what earlier ones of their session pressed: M begins at the largest load so
-    far, as the contact's springs bear it. Simulated episodes, and recordings otherwise, start with a virgin
-    cover.
+    With `session` M begins at the largest load so far, as the contact's springs bear it.
     """
 
     name: ClassVar[str] = "first_load_softening"
-    rank: ClassVar[int] = 35
-    has_state: ClassVar[bool] = True
     softening: float = parameter(0.15, "1", 0.0, 0.3, minimum=None, maximum=1.0)
     sharpness: float = parameter(1.0, "1", 1.0, 1.0, minimum=1e-3, maximum=20.0)
     growth: float = parameter(0.0, "1", 0.0, 0.0, maximum=10.0)
     recovery_s: float = parameter(0.0, "s", 0.0, 0.0)
-    session: bool = False
 
     @override
     def initial(self, layout: PadLayout, pads: int) -> Traits:
@@ -61,7 +70,7 @@ class FirstLoadSoftening(CoverLaw):
         """Largest load of earlier recordings, at this one's first frame (..., R, C) [N]."""
         if not self.session or frame.borne is None:
             return 0.0
-        drive, age_s = frame.borne
+        drive, age_s, _ = frame.borne
         load = drive if frame.load_conserving else drive * frame.stiffness_n_per_m
         faded = load * torch.exp(-age_s / self.recovery_s) if self.recovery_s > 0.0 else load
         return faded.amax(dim=0)
@@ -82,3 +91,42 @@ class FirstLoadSoftening(CoverLaw):
         if isinstance(before, torch.Tensor):
             largest = torch.maximum(largest, before)
         return self._softened(x, largest.to(x.dtype), frame)
+
+
+@register
+@dataclass(frozen=True)
+class PathSoftening(Remembering):
+    """The cover gets softer with all loading so far: f (1 - softening (1 - exp(-path / (k path_m)))).
+
+    The path grows by every rise of the load f and never falls; k is the stiffness of the contact's springs.
+    Damage that saturates along a path is Miehe's (1995) continuous damage; here the path is the load's, so
+    that press after press is softer, up to the same load, too. With `session` the path begins at that of all
+    earlier recordings, as the contact's springs bear it.
+    """
+
+    name: ClassVar[str] = "path_softening"
+    rate_free: ClassVar[bool] = True
+    softening: float = parameter(0.15, "1", 0.0, 0.3, maximum=1.0)
+    path_m: float = parameter(2e-3, "m", 5e-4, 5e-3)
+
+    @override
+    def initial(self, layout: PadLayout, pads: int) -> Traits:
+        shape = (pads, layout.rows, layout.cols)
+        return {name: np.zeros(shape, dtype=np.float32) for name in ("path", "before")}
+
+    def _softened(self, x: torch.Tensor, path: torch.Tensor, frame: Frame) -> torch.Tensor:
+        scale = torch.as_tensor(self.path_m * frame.stiffness_n_per_m, dtype=x.dtype, device=x.device)
+        return x * (1.0 + self.softening * torch.expm1(-path / scale.clamp(min=1e-12)))
+
+    @override
+    def step(self, x: torch.Tensor, state: State, frame: Frame) -> tuple[torch.Tensor, State]:
+        path = state["path"] + (x - state["before"]).clamp(min=0.0)
+        return self._softened(x, path, frame), {**state, "path": path, "before": x}
+
+    @override
+    def sequence(self, x: torch.Tensor, times_s: torch.Tensor, frame: Frame) -> torch.Tensor:
+        path = torch.diff(x, dim=0, prepend=torch.zeros_like(x[:1])).clamp_(min=0.0).cumsum(dim=0)
+        if self.session and frame.borne is not None:
+            before = frame.borne[2].sum(dim=0)
+            path = path + (before if frame.load_conserving else before * frame.stiffness_n_per_m)
+        return self._softened(x, path.to(x.dtype), frame)

@@ -1,5 +1,5 @@
-"""first_load_softening: below the largest load so far, the pad reads less than it did under the first
-load.
+"""first_load_softening: the pad reads less than it did under the first load, below the largest load so far or
+the more it has been loaded.
 """
 
 from dataclasses import replace
@@ -9,12 +9,15 @@ import numpy as np
 
 from lerobot_vtrefine.diagnose.pad.candidates.base import Form, Setting, Value, beside_damping
 from lerobot_vtrefine.tactile.stages.base import Stage
-from lerobot_vtrefine.tactile.stages.softening import FirstLoadSoftening
+from lerobot_vtrefine.tactile.stages.softening import FirstLoadSoftening, PathSoftening
 
 SOFTENING = Value("softening", -0.9, 2.0, 2e-3)
 LOG_SHARPNESS = Value("log_sharpness", float(np.log(0.05)), float(np.log(8.0)), 1e-2)
 GROWTH = Value("growth", 0.0, 2.0, 1e-2)
 LOG_RECOVERY = Value("log_recovery", float(np.log(0.3)), float(np.log(3000.0)), 1e-2)
+LOG_PATH = Value("log_path", float(np.log(0.3)), float(np.log(30.0)), 1e-2)
+"""A path of a third of the deepest press is gone before the first hold; of one of thirty, more than a session
+presses most places, only the slope is seen."""
 
 
 def _plain(values: np.ndarray, setting: Setting) -> tuple[Stage, ...]:
@@ -41,6 +44,15 @@ def _report(values: np.ndarray, setting: Setting) -> dict[str, tuple[float, str]
     return found
 
 
+def _by_path(values: np.ndarray, setting: Setting) -> tuple[Stage, ...]:
+    return (PathSoftening(float(values[0]), float(np.exp(values[1]) * setting.top_depth_m)),)
+
+
+def _report_by_path(values: np.ndarray, setting: Setting) -> dict[str, tuple[float, str]]:
+    path_m = float(np.exp(values[1]) * setting.top_depth_m)
+    return {"softening": (float(values[0]), "1"), "path_m": (path_m, "m")}
+
+
 def _form(label: str, *more: Value, **rest: Any) -> Form:
     return Form("first_load_softening", label, (SOFTENING, *more), report=_report, signed=True, **rest)
 
@@ -56,7 +68,7 @@ def _through_session(form: Form) -> Form:
         label=f"{form.label}, through the session",
         build=build,
         possible=lambda setting: setting.returned and form.possible(setting),
-        peer=len(form.values) == 1,
+        peer=form.peer or form is PLAIN,
     )
 
 
@@ -85,11 +97,14 @@ RECOVERING = _form(
     probes=lambda s: [[0.05, 0.0, 0.0, float(np.log(s.duration_s))]],
     screened=False,
 )
-FORMS = (
-    PLAIN,
-    beside_damping(PLAIN),
-    GROWING,
-    FREE,
-    RECOVERING,
-    *(_through_session(form) for form in (PLAIN, beside_damping(PLAIN), GROWING, FREE, RECOVERING)),
+PATH = Form(
+    "first_load_softening",
+    "by all loading so far",
+    (Value("softening", 0.0, 0.95, 2e-3), LOG_PATH),
+    _by_path,
+    _report_by_path,
+    lambda s: [[0.05, float(np.log(share))] for share in (1.0, 4.0)],
+    peer=True,
 )
+HERE = (PLAIN, beside_damping(PLAIN), GROWING, FREE, RECOVERING, PATH)
+FORMS = (*HERE, *(_through_session(form) for form in HERE))

@@ -8,6 +8,7 @@ import numpy as np
 from lerobot_vtrefine.diagnose.pad.candidates.base import Form, Setting, Value, beside_damping
 from lerobot_vtrefine.tactile.stages.base import Stage
 from lerobot_vtrefine.tactile.stages.hysteresis import (
+    DuhemHysteresis,
     Hysteresis,
     LoadingHysteresis,
     PeakHysteresis,
@@ -102,6 +103,14 @@ FORMS = (
         screened=False,
     ),
     _one("a loop as wide as the load is high", ProportionalHysteresis, 2.0, 0.1, (0.1, 0.4), screened=False),
+    _one(
+        "a loop as wide as the load is high that turns gradually",
+        DuhemHysteresis,
+        2.0,
+        0.1,
+        (0.1, 0.4),
+        screened=False,
+    ),
     Form(
         "hysteresis",
         "a loop below the largest load of the contact",

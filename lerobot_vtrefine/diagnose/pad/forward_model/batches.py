@@ -47,8 +47,8 @@ class Sheet:
     """When each press's readings were new."""
     warmth_c: tuple[np.ndarray | None, ...]
     """Temperature at every press's instants; None where it was not recorded."""
-    borne: tuple[tuple[np.ndarray, np.ndarray] | None, ...]
-    """Drive and age (J, n) of what earlier recordings pressed every press's columns with; see `Borne`."""
+    borne: tuple[tuple[np.ndarray, np.ndarray, np.ndarray] | None, ...]
+    """Drive, age and path (J, n) of what earlier recordings pressed every press's columns with (`Borne`)."""
 
     @cached_property
     def rows(self) -> np.ndarray:
@@ -140,9 +140,10 @@ def _build(everyone: Sequence[Press], members: list[int], idle: np.ndarray, kind
     )
 
 
-def _borne(press: Press, taxels: np.ndarray) -> tuple[np.ndarray, np.ndarray] | None:
+def _borne(press: Press, taxels: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray] | None:
     known = press.trial.borne
     if known is None or not len(known.drive):
         return None
-    drive, age_s = (values.reshape(len(values), -1)[:, taxels] for values in (known.drive, known.age_s))
-    return drive, age_s
+    every = (known.drive, known.age_s, known.path)
+    drive, age_s, path = (values.reshape(len(values), -1)[:, taxels] for values in every)
+    return drive, age_s, path

@@ -30,7 +30,7 @@ from lerobot_vtrefine.tactile.stages.readout import (
     TaxelGainSpread,
 )
 from lerobot_vtrefine.tactile.stages.signals import low_passed, sampled
-from lerobot_vtrefine.tactile.stages.softening import FirstLoadSoftening
+from lerobot_vtrefine.tactile.stages.softening import FirstLoadSoftening, PathSoftening, Remembering
 from lerobot_vtrefine.tactile.stages.surface import PadTilt
 
 Work = Callable[[np.ndarray, np.ndarray, np.ndarray], np.ndarray]
@@ -152,7 +152,7 @@ def _everywhere(field: Field, context: Context) -> Field:
     )
 
 
-def _softened(stage: FirstLoadSoftening, field: Field, context: Context) -> Field:
+def _softened(stage: Remembering, field: Field, context: Context) -> Field:
     """What earlier recordings pressed is each press's own."""
     if not stage.session:
         return _alike(stage, field, context)
@@ -164,8 +164,8 @@ def _softened(stage: FirstLoadSoftening, field: Field, context: Context) -> Fiel
         known = None
         if borne is not None:
             mine = field.columns[part] - block.start
-            drive, age_s = (torch.from_numpy(values[:, None, mine]) for values in borne)
-            known = (drive, age_s)
+            drive, age_s, path = (torch.from_numpy(values[:, None, mine]) for values in borne)
+            known = (drive, age_s, path)
         frame = Frame(
             sheet.layout, stiffness_n_per_m=context.stiffness, load_conserving=sheet.loaded, borne=known
         )
@@ -305,6 +305,7 @@ OWN_TAXELS: dict[type, Callable[[Any, Field, Context], Field]] = {
     PadTilt: _added,
     MechanicalSpreading: _spreading,
     FirstLoadSoftening: _softened,
+    PathSoftening: _softened,
     TaxelGainSpread: _multiplied,
     DeadTaxels: _multiplied,
     RowSharing: _row_sharing,
