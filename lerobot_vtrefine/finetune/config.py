@@ -95,7 +95,7 @@ class DppoConfig(draccus.ChoiceRegistry):
     actor_lr: float = 1e-5
     # The same at the end.
     actor_lr_final: float = 1e-6
-    # Highest rate that the trust region raises it to; 0 means none.
+    # Highest rate that the trust region raises it to, unless it starts higher; 0: no limit.
     actor_lr_max: float = 0.0
     # Learning rate of the critic at the start.
     critic_lr: float = 1e-3
@@ -145,10 +145,6 @@ class DppoConfig(draccus.ChoiceRegistry):
             raise ValueError(
                 "--dppo.kl_per_decision and --dppo.kl_per_decision_final must both be positive, or both 0, "
                 f"got {self.kl_per_decision} and {self.kl_per_decision_final}"
-            )
-        if self.kl_per_decision > 0 and 0 < self.actor_lr_max < self.actor_lr:
-            raise ValueError(
-                f"--dppo.actor_lr ({self.actor_lr}) must not exceed --dppo.actor_lr_max ({self.actor_lr_max})"
             )
         for name in ("minibatches", "actor_lr_max"):
             if getattr(self, name) < 0:

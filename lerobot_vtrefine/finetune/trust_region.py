@@ -26,6 +26,7 @@ class TrustRegion:
     def __init__(self, cfg: DppoConfig) -> None:
         self.cfg = cfg
         self.rate = cfg.actor_lr
+        self._highest = max(cfg.actor_lr, cfg.actor_lr_max) if cfg.actor_lr_max else math.inf
 
     def target(self, iteration: int) -> float:
         """KL divergence per decision that this iteration aims at; 0 where the rate follows its schedule."""
@@ -52,7 +53,7 @@ class TrustRegion:
         target = self.target(iteration)
         furthest = (TOO_FAR + 1) * target if stopped else max(reached)
         change = min(max((target / max(furthest, 1e-9)) ** 0.5, SLOWEST), FASTEST)
-        self.rate = min(self.rate * change, self.cfg.actor_lr_max or math.inf)
+        self.rate = min(self.rate * change, self._highest)
 
     def state_dict(self) -> dict[str, float]:
         """The present rate."""
