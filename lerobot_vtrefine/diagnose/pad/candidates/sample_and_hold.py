@@ -6,7 +6,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from lerobot_vtrefine.diagnose.core.suspicion import Suspicion
-from lerobot_vtrefine.diagnose.pad.candidates.base import Form, Value
+from lerobot_vtrefine.diagnose.pad.candidates.base import Form, Setting, Value
 from lerobot_vtrefine.diagnose.pad.press_trials import Press, PressSet
 from lerobot_vtrefine.diagnose.pad.rules import (
     CHANCE,
@@ -237,6 +237,10 @@ def undecided(free: bool) -> Callable[[np.ndarray, PressSet], dict[str, tuple[fl
     return ends
 
 
+def _repeating(setting: Setting) -> bool:
+    return setting.repeats
+
+
 FORMS = (
     Form(
         HOLD,
@@ -248,7 +252,7 @@ FORMS = (
         kinds=("timing",),
         needs="record every frame with its own time, moving, with readings that carry noise",
         amplitude=None,
-        possible=lambda s: s.repeats,
+        possible=_repeating,
         search=periods,
         range=undecided(False),
     ),
@@ -260,7 +264,7 @@ FORMS = (
         lambda v, s: {"period_s": (float(v[0]), "s")},
         lambda s: [[2.0001 * s.frame_s]],
         amplitude=None,
-        possible=lambda s: s.repeats,
+        possible=_repeating,
         search=free_periods,
         range=undecided(True),
         screened=False,
@@ -273,7 +277,7 @@ FORMS = (
         lambda v, s: {"period_s": (float(v[0]), "s")},
         lambda s: [[2.0001 * s.frame_s]],
         amplitude=None,
-        possible=lambda s: s.repeats,
+        possible=_repeating,
         search=frame_periods,
         range=undecided(False),
         screened=False,
@@ -286,7 +290,7 @@ FORMS = (
         lambda v, s: {"period_s": (float(v[0]), "s")},
         lambda s: [[2.0 * s.frame_s, 0.0]],
         amplitude=None,
-        possible=lambda s: s.repeats,
+        possible=_repeating,
         search=irregular_periods,
         range=_mean_period,
         screened=False,
