@@ -37,12 +37,13 @@ CURVES = {
 """Learning curves that show what the size of a step does, by their names in docs/step_size_curves.csv."""
 LIMITS = {
     "limited to 2e-4": (
-        ("rate limited to 2e-4, seeds it was chosen on", "rate limited to 2e-4, other seeds"),
+        ("rate limited to 2e-4, seeds it was chosen on", "rate limited to 2e-4"),
         BLUE,
     ),
     "without a limit": (("rate without a limit, 108 iterations",), ORANGE),
 }
-"""Runs on the square pair, vision only, by the variants of their rows."""
+"""Runs of VISION, by the variants of their rows."""
+VISION = ("square_1mm_slip", "visual")
 POLICIES = {"visuo_tactile": BLUE, "visual": ORANGE}
 LEARNED = {
     "cross_gentle": "needs touch: cross, 5 N",
@@ -269,7 +270,7 @@ def draw_rate(plt: Any) -> None:
     figure, (above, below) = plt.subplots(1, 2, figsize=(8.8, 3.2), layout="constrained")
     for words, (variants, colour) in LIMITS.items():
         label: str | None = words
-        for row in (row for row in rows if row.task == "square_1mm_slip" and row.variant in variants):
+        for row in (row for row in rows if (row.task, row.policy) == VISION and row.variant in variants):
             with (ROOT / "results" / str(row.curve)).open(encoding="utf-8") as file:
                 points = [point for point in csv.DictReader(file) if point["success"]]
             at = [int(point["iteration"]) for point in points]
