@@ -22,7 +22,9 @@ MIN_SIGMA = 2e-4
 """Least noise, in parts of full scale."""
 QUANTISATION_VARIANCE = 1.0 / 12.0
 TRIM = 0.9
-RHO_GRID = 1.0 - np.geomspace(0.7, 0.03, 16)
+RHO_GRID = 1.0 - np.geomspace(0.7, 0.001, 32)
+"""Memories that are tried, up to ten seconds at 100 frames a second: noise that wanders for longer than the
+last one would keep some memory, which passes for a taxel that fails."""
 DEFAULT_RHO = 0.3
 MAX_LAG = 40
 """Longest differences that memory is taken from, in frames."""
