@@ -195,8 +195,15 @@ def test_what_is_seen_needs_no_test() -> None:
 
 
 def test_what_is_seen_comes_before_what_imitates_it() -> None:
-    plain = toy(0.3)
-    assert names(infer(Unseeing(plain.x, plain.y, seen="bend"))) == ["bend"]
+    plain, accepted = toy(0.3), []
+
+    class Telling(ScreenedSearch):
+        def _accept(self, step, found):
+            accepted.append(step.candidate.cause)
+            super()._accept(step, found)
+
+    Telling(Unseeing(plain.x, plain.y, seen="bend"), 0, lambda text: None).run()
+    assert accepted == ["bend"]
 
 
 def test_look_alikes_tie_and_others_do_not() -> None:
