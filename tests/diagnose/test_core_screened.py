@@ -141,6 +141,21 @@ class Toy(OptionalSteps):
         return -0.5 * (np.square(left).sum(1) - shared * (left * self.x).sum(1) ** 2) / NOISE**2
 
 
+@dataclass(frozen=True)
+class Unseeing(Toy):
+    """Weights forgive what is seen."""
+
+    even: bool = False
+
+    def extended(self, now, candidate, channels, plainer=None):
+        if candidate.cause == self.seen and not self.even:
+            return now
+        return super().extended(now, candidate, channels, plainer)
+
+    def unweighed(self, now):
+        return replace(self, even=True), now
+
+
 def toy(effect=0.0, seed=0, **changes):
     rng = np.random.default_rng(seed)
     x = rng.uniform(-1, 1, (TRIALS, FRAMES))
@@ -177,6 +192,18 @@ def test_what_is_seen_needs_no_test() -> None:
     assert names(found) == ["bend"]
     assert found.selection.observed("bend")
     assert found.selection.p_value("bend") is None
+
+
+def test_what_is_seen_comes_before_what_imitates_it() -> None:
+    plain, accepted = toy(0.3), []
+
+    class Telling(ScreenedSearch):
+        def _accept(self, step, found):
+            accepted.append(step.candidate.cause)
+            super()._accept(step, found)
+
+    Telling(Unseeing(plain.x, plain.y, seen="bend"), 0, lambda text: None).run()
+    assert accepted == ["bend"]
 
 
 def test_look_alikes_tie_and_others_do_not() -> None:

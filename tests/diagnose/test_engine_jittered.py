@@ -1,5 +1,6 @@
 """Effects that were once missed, on the third rig: each kind is named, and its first name is right."""
 
+from dataclasses import replace
 from types import SimpleNamespace
 
 import jittered_rig
@@ -46,6 +47,20 @@ def test_late_readings_show_although_damping_rests_on_its_bound() -> None:
     found = {item.candidate.cause: item.tested for item in problem.screened(fitted)}
     assert found["scan_skew"].passed
     assert found["scan_skew"].probe.scores.min() > 0
+
+
+def test_places_that_are_read_at_once_do_not_hide_a_skew_that_makes_the_damping_vanish() -> None:
+    # Beside late rows the damping rests on its bound, and the rows that are not late seem early.
+    rig = Rig(0, 8, 12)
+    law = replace(EFFECTS["skew_rows"], law=lambda p, x, s: s * (1.0 - p.row / (p.rows - 1)))
+    held = rig.record([(law, 0.03)])
+    presses = prepare(held, list(held.trials), list(range(len(held.trials))))
+    problem, fitted = PadProblem(presses).weighed(None)
+    assert 1 not in movable(fitted)
+    (found,) = problem.screened(fitted, ["scan_skew"])
+    assert found.tested.passed
+    assert found.tested.probe.scores.min() > 0
+    assert found.tested.probe.form.label == "linear in the row, last row first"
 
 
 def test_an_early_touch_is_asked_about_by_a_face_that_lies_higher() -> None:

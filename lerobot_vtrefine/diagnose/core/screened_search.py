@@ -120,6 +120,11 @@ class ScreenedSearch[P: ScreenedProblem[Any, Any], F: ScoredFit, C: FormCandidat
             # What passes the test and yet predicts nothing may be a cause that weights forgive in part.
             if step is None and (any(item.tested.passed for item in found) or self.problem.far_off(self.now)):
                 found, step = self._round(*self.problem.unweighed(self.now))
+            elif step is not None and (seen := _observed(found)) and step.candidate.cause not in seen:
+                # So may what is seen, whose part in the errors a tested cause would take.
+                anew, other = self._round(*self.problem.unweighed(self.now))
+                if other is not None and other.candidate.cause in seen:
+                    found, step = anew, other
             if step is None:
                 break
             self._accept(step, found)
@@ -153,7 +158,7 @@ class ScreenedSearch[P: ScreenedProblem[Any, Any], F: ScoredFit, C: FormCandidat
         others = [] if taken else [item.candidate for item in passed if not item.candidate.disturbs]
         fitted += on_all_cores(ground.plain, others)
         steps = self._other_forms(ground, passed, fitted, base)
-        observed = {item.candidate.cause for item in passed if item.tested.p_adjusted is None}
+        observed = _observed(passed)
         out = []
         for step in steps:
             name, gain = step.candidate.cause, step.held.gain_over(base)
@@ -294,6 +299,11 @@ def _p_beside(problem: Any, now: Any, cause: str) -> float:
     if found is None:
         return 1.0
     return found.tested.p_adjusted or 0.0
+
+
+def _observed(found: Sequence[Promise[Any]]) -> set[str]:
+    """Causes that are seen in the readings themselves."""
+    return {item.candidate.cause for item in found if item.tested.p_adjusted is None}
 
 
 def _promise(item: Promise[Any]) -> float:

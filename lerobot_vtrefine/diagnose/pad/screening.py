@@ -8,7 +8,7 @@ import numpy as np
 
 from lerobot_vtrefine.diagnose.core.parallel import on_all_cores
 from lerobot_vtrefine.diagnose.core.score_test import Probe, cleared
-from lerobot_vtrefine.diagnose.pad.candidates import CATALOGUE
+from lerobot_vtrefine.diagnose.pad.candidates import CATALOGUE, PLAIN
 from lerobot_vtrefine.diagnose.pad.candidates.base import Form
 from lerobot_vtrefine.diagnose.pad.candidates.baseline_drift import CURVE
 from lerobot_vtrefine.diagnose.pad.candidates.sample_and_hold import held, irregular_periods, pattern
@@ -78,6 +78,19 @@ def scorer_of(problem: "PadProblem", fitted: Fit) -> Scorer:
     return Scorer(fitted, problem.presses, problem.weights, columns)
 
 
+def freed_scorer(problem: "PadProblem", fitted: Fit) -> Scorer | None:
+    """The same cleared also of what coordinates could do if no bound stopped them; None where none does.
+
+    A delay that some places do not have makes the damping vanish, and these then seem early. Whether a
+    change stands in for a negative damping or brings the damping back, no score says.
+    """
+    free = fitted.model.free
+    if len(movable(fitted)) == len(free):
+        return None
+    _, columns = tangents(fitted.model, problem.presses, free)
+    return Scorer(fitted, problem.presses, problem.weights, columns)
+
+
 def probe_form(form: Form, scorer: Scorer) -> list[Probe]:
     """Scores of all probes of a form."""
     probes = []
@@ -95,14 +108,18 @@ def forms_of(family: str, fitted: Fit) -> list[Form]:
 
 def form_probes(problem: "PadProblem", fitted: Fit, families: Collection[str] | None = None) -> list[Probe]:
     """Probes of every form (of those families) of causes that the model does not hold yet."""
-    scorer, known = scorer_of(problem, fitted), set(fitted.model.families)
+    scorer, freed = scorer_of(problem, fitted), freed_scorer(problem, fitted)
+    known = set(fitted.model.families)
     forms = [
         form
         for form in CATALOGUE
         if form.screened and form.possible(fitted.model.setting) and form.family not in known
         if families is None or form.family in families
     ]
-    return [probe for found in on_all_cores(partial(probe_form, scorer=scorer), forms) for probe in found]
+    jobs = [partial(probe_form, form, scorer) for form in forms]
+    if freed is not None:
+        jobs += [partial(probe_form, form, freed) for form in forms if PLAIN[form.family].between_frames]
+    return [probe for found in on_all_cores(lambda job: job(), jobs) for probe in found]
 
 
 def all_probes(problem: "PadProblem", fitted: Fit) -> list[Probe]:

@@ -58,6 +58,17 @@ FORMS = (
     ),
     Form(
         "scan_skew",
+        "linear in the row, last row first",
+        (Value("late_s", 0.0, LONGEST_S, 1e-3),),
+        # Of a frame that is stamped when all rows were read none is read later, as a negative slope says.
+        lambda v, s: (ScanSkew(-float(v[0]), (float(v[0]), 0.0)),),
+        lambda v, s: {"skew_s": (-float(v[0]), "s")},
+        lambda s: [[0.5 * s.frame_s]],
+        possible=lambda s: s.layout.rows > 1 and s.touched_rows > 1,
+        peer=True,
+    ),
+    Form(
+        "scan_skew",
         "along the columns, too",
         (Value("skew_s", -LONGEST_S, LONGEST_S, 1e-3), Value("cols_s", -LONGEST_S, LONGEST_S, 1e-3)),
         lambda v, s: (ScanSkew(float(v[0]), cols_s=float(v[1])),),
