@@ -76,7 +76,7 @@ FORMS = (
         amplitude=None,
         possible=lambda s: s.layout.num_taxels > 1,
     ),
-    # A cover ends with the taxels or goes on: a form, no coordinate, which presses at the rim alone would know.
+    # A cover ends with the taxels or goes on: a form, no coordinate that presses at the rim alone would know.
     Form(
         "mechanical_spreading",
         f"Gaussian, {BEYOND}",
