@@ -93,6 +93,18 @@ def test_a_cover_beyond_the_taxels_keeps_a_part_of_what_leaves_the_pad() -> None
     assert (lost[6, 11] / lost[6, 10]).item() == pytest.approx(0.5, rel=1e-5)
 
 
+def test_a_gaussian_loses_beyond_the_taxels_what_a_cover_that_ends_there_keeps() -> None:
+    corner, middle = pressed_at(0, 0), torch.zeros(12, 20)
+    middle[6, 10] = 100.0
+    whole, half, none = (once(MechanicalSpreading(1e-3, kept=kept), corner) for kept in (1.0, 0.5, 0.0))
+    assert whole.sum().item() == pytest.approx(100.0, rel=1e-5)
+    assert none.sum() < half.sum() < whole.sum()
+    # Away from the rim it makes no difference, nor does it to what a taxel inside gets of one at the rim.
+    inside = [once(MechanicalSpreading(1e-3, kept=kept), middle) for kept in (1.0, 0.0)]
+    torch.testing.assert_close(*inside)
+    assert (none[0, 1] / none[0, 0]).item() == pytest.approx((inside[0][6, 11] / inside[0][6, 10]).item())
+
+
 def test_a_smoothed_reading_is_as_old_as_a_delayed_one() -> None:
     """On a ramp a one-pole filter lags by its time constant."""
     times = torch.linspace(0, 2, 201, dtype=torch.float64)

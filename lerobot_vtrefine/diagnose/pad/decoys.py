@@ -15,8 +15,9 @@ from lerobot_vtrefine.diagnose.core.rules import FLIPS, SHARE_OF_GAIN, SIZE_DOUB
 from lerobot_vtrefine.diagnose.core.suspicion import Suspicion
 from lerobot_vtrefine.diagnose.pad.baseline import offset_tangents
 from lerobot_vtrefine.diagnose.pad.descriptors import DESCRIPTORS, Descriptor, directions, errors_left_out
-from lerobot_vtrefine.diagnose.pad.fitting import Fit, bounded_step, movable, rest
+from lerobot_vtrefine.diagnose.pad.fitting import Fit, bounded_step, movable, predict, rest
 from lerobot_vtrefine.diagnose.pad.form_fitting import without
+from lerobot_vtrefine.diagnose.pad.model import Composite
 from lerobot_vtrefine.diagnose.pad.screening import GAIN_MAP, scorer_of
 from lerobot_vtrefine.diagnose.pad.taxel_maps import map_evidence, maps_left_out
 
@@ -43,8 +44,7 @@ def _in_place_of_gains(problem: "PadProblem", fitted: Fit) -> Suspicion | None:
 
     Around the model that has neither, weights overrate the flanks of presses, and gains that are told there
     mislead wherever taxels are pressed deep. So the name is judged by its own fit, as all names are, and the
-    touches are taken out of the readings. What recordings prefer together has a deviation of its own under
-    the noise: how far apart the two predict (Cox 1962).
+    touches are taken out of the readings.
     """
     presses, weights = problem.presses, problem.weights
     slim = without(fitted, [GAIN_MAP], presses, weights)
@@ -63,20 +63,27 @@ def _in_place_of_gains(problem: "PadProblem", fitted: Fit) -> Suspicion | None:
     before = out_of_fold(problem, slim, problem.folds)
     own = out_of_fold(problem, fitted, problem.folds).better_by(before)
     best = out_of_fold(level, rest(slim.model, level.presses, weights), problem.folds).better_by(before)
-    if best.sum() <= 0:
-        return None
     apart = 0.0
     for weight, here, there, image in zip(weights, fitted.signals, slim.signals, images, strict=True):
         apart += float(weight.gram(weight.whiten(here - there - image)[None])[0, 0])
+    clue = f"in the place of {GAIN_MAP}, first touches of the taxels' own predict trials left out better"
+    return _borrowed(problem, clue, best, own, apart)
+
+
+def _borrowed(problem: "PadProblem", clue: str, best: Array, own: Array, apart: float) -> Suspicion | None:
+    """A decoy's gains (K,) in log score against those of the name, if it gains anything.
+
+    What recordings prefer together has a deviation of its own under the noise: how far apart the two predict
+    (Cox 1962), `apart` being the squared distance in deviations of noise. Signs could not tell: among all
+    that alarms ask about, a dozen recordings are too few even where each of them prefers the decoy, and where
+    some hold nothing that tells the two apart, a little misfit of the decoy's form decides their signs.
+    """
+    if best.sum() <= 0:
+        return None
     far = float((best - own).sum()) / np.sqrt(max(apart, 1e-12)) / SIZE_DOUBT
     drawn = np.r_[far, np.random.default_rng([problem.seed, 9]).standard_normal(FLIPS)]
-    clue = f"in the place of {GAIN_MAP}, first touches of the taxels' own predict trials left out better"
-    return Suspicion(0, clue, *_lead(best, own), best - own, drawn=drawn)
-
-
-def _lead(best: Array, own: Array) -> tuple[float, float]:
-    """Part by which a decoy's gain exceeds the name's, and the least such part that counts."""
-    return 1.0 - float(own.sum() / best.sum()), 1.0 - SHARE_OF_GAIN
+    lead = 1.0 - float(own.sum() / best.sum())
+    return Suspicion(0, clue, lead, 1.0 - SHARE_OF_GAIN, best - own, drawn=drawn)
 
 
 def _in_place(problem: "PadProblem", fitted: Fit, name: str) -> Suspicion | None:
@@ -88,13 +95,14 @@ def _in_place(problem: "PadProblem", fitted: Fit, name: str) -> Suspicion | None
     if not gains:
         return None
     best = _chosen_by_others(np.array(gains), problem.folds)
-    if best.sum() <= 0:
-        return None
-    text = promising[int(np.argmax(np.sum(gains, axis=1)))][0].text
-    clue = f"in the place of {name}, {text} predicts trials left out better"
-    # As rivals are compared: trials count alike, however long or hard they press.
-    preference = (best - own) / (np.abs(best) + np.abs(own)).clip(min=1e-12)
-    return Suspicion(0, clue, *_lead(best, own), preference)
+    descriptor, image, grams = promising[int(np.argmax(np.sum(gains, axis=1)))]
+    model, much = _beside(slim, grams.sum(axis=0), movable(slim))
+    decoy = zip(predict(model, problem.presses), image, strict=True)
+    pairs = zip(problem.weights, decoy, fitted.signals, strict=True)
+    between = [(weight, weight.whiten(one + much * along - other)) for weight, (one, along), other in pairs]
+    apart = sum(float(weight.gram(distance[None])[0, 0]) for weight, distance in between)
+    clue = f"in the place of {name}, {descriptor.text} predicts trials left out better"
+    return _borrowed(problem, clue, best, own, apart)
 
 
 def _chosen_by_others(gains: Array, folds: Array) -> Array:
@@ -137,15 +145,23 @@ def _left_out(problem: "PadProblem", slim: Fit, image: Sequence[Array], grams: A
     scores, free, again = np.empty(len(image)), movable(slim), problem.reweighted(slim)
     for fold in np.unique(problem.folds):
         held = problem.folds == fold
-        gram = grams[~held].sum(axis=0)
-        along = np.delete(gram[-2], -2)
-        power = max(float(gram[-2, -2]), 1e-30)
-        rest = np.delete(np.delete(gram, -2, 0), -2, 1) - np.outer(along, along) / power
-        model = slim.model.at(bounded_step(slim.model, rest, free, 1e-6))
-        much = (along[-1] - along[:-1] @ (model.values - slim.model.values)[free]) / power
+        model, much = _beside(slim, grams[~held].sum(axis=0), free)
         trials = np.flatnonzero(held)
         part = problem.presses.subset(trials.tolist())
         pressed = zip(part.presses, trials, strict=True)
         part = replace(part, presses=tuple(replace(p, signal=p.signal - much * image[k]) for p, k in pressed))
         scores[held] = again.judging(model, part, (~held).astype(float), trials)[1][:, 0]
     return scores
+
+
+def _beside(slim: Fit, gram: Array, free: Array) -> tuple[Composite, float]:
+    """The model one bounded step on with a direction beside it, and how much of the direction.
+
+    Args:
+        gram: (q, q) as in `_left_out`, of the recordings that count.
+    """
+    along = np.delete(gram[-2], -2)
+    power = max(float(gram[-2, -2]), 1e-30)
+    others = np.delete(np.delete(gram, -2, 0), -2, 1) - np.outer(along, along) / power
+    model = slim.model.at(bounded_step(slim.model, others, free, 1e-6))
+    return model, (along[-1] - along[:-1] @ (model.values - slim.model.values)[free]) / power

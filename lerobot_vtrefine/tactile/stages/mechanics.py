@@ -52,18 +52,22 @@ class NonlinearStiffness(CoverLaw):
         return bent * torch.where(after > 0, before / after.clamp(min=1e-30), torch.ones_like(after)), state
 
 
-def spreading_matrix(count: int, sigma_taxels: torch.Tensor) -> torch.Tensor:
+def spreading_matrix(
+    count: int, sigma_taxels: torch.Tensor, kept: float | torch.Tensor = 1.0
+) -> torch.Tensor:
     """Gaussian weights (..., count, count) with mirrored ends: doubly stochastic, so that sums and flat
     fields are kept.
 
     Args:
         sigma_taxels: (..., 1, 1) standard deviation in taxels.
+        kept: part (a number, or (..., 1, 1)) that stays of what would leave the line.
     """
     index = torch.arange(count, device=sigma_taxels.device, dtype=sigma_taxels.dtype)
     images = torch.stack([index, -1 - index, 2 * count - 1 - index])
     distance = index[:, None, None] - images[None]
-    weights = torch.exp(-0.5 * (distance / sigma_taxels.clamp(min=1e-6).unsqueeze(-1)) ** 2).sum(dim=-2)
-    return weights / weights.sum(dim=-1, keepdim=True)
+    weights = torch.exp(-0.5 * (distance / sigma_taxels.clamp(min=1e-6).unsqueeze(-1)) ** 2)
+    inside, mirrored = weights[..., 0, :], weights[..., 1:, :].sum(dim=-2)
+    return (inside + kept * mirrored) / (inside + mirrored).sum(dim=-1, keepdim=True)
 
 
 RING_TAXELS = (1.0, 2.0**0.5, 2.0, 5.0**0.5, 8.0**0.5, 3.0)
@@ -105,9 +109,9 @@ class MechanicalSpreading(Stage):
     the sum.
 
     `rings`, weights at the shortest distances of the lattice over that at the centre (`ring_matrix`), stand
-    in for the Gaussian where a cover spreads otherwise; `sigma_m` is then their deviation alone. With them,
-    a cover that reaches beyond the taxels keeps only the part `kept` of what would leave the pad. A stiff
-    skin over a soft layer spreads only a `share` of the force, and widely.
+    in for the Gaussian where a cover spreads otherwise; `sigma_m` is then their deviation alone. A cover that
+    reaches beyond the taxels keeps only the part `kept` of what would leave the pad. A stiff skin over a soft
+    layer spreads only a `share` of the force, and widely.
     """
 
     name: ClassVar[str] = "mechanical_spreading"
@@ -139,8 +143,8 @@ class MechanicalSpreading(Stage):
             return (x.flatten(-2) @ matrix.T).view(x.shape)
         sigma = torch.as_tensor(self.sigma_m, dtype=x.dtype, device=x.device) / pitch_m
         sigma = sigma.view(1, 1) if sigma.ndim == 0 else sigma
-        rows, cols = x.shape[-2:]
-        return spreading_matrix(rows, sigma) @ x @ spreading_matrix(cols, sigma).transpose(-1, -2)
+        down, along = (spreading_matrix(count, sigma, self.kept) for count in x.shape[-2:])
+        return down @ x @ along.transpose(-1, -2)
 
 
 @register

@@ -1,6 +1,7 @@
 """mechanical_spreading: the cover spreads a press over neighbouring taxels."""
 
 from collections.abc import Sequence
+from functools import partial
 
 import numpy as np
 
@@ -36,15 +37,17 @@ def _gaussian(taxels: float) -> np.ndarray:
     return np.exp(-0.5 * (np.array((0.0, *RING_TAXELS)) / max(taxels, 0.1)) ** 2)
 
 
-def _lost(values: np.ndarray, setting: Setting) -> tuple[Stage, ...]:
-    taxels, kept = (float(value) for value in values)
-    rings = tuple(float(weight) for weight in _gaussian(taxels)[1:])
-    return (MechanicalSpreading(taxels * setting.layout.pitch_m, rings, kept),)
+def _wholly(values: np.ndarray, setting: Setting, kept: float = 1.0) -> tuple[Stage, ...]:
+    return (MechanicalSpreading(float(values[0]) * setting.layout.pitch_m, kept=kept),)
 
 
-def _partly(values: np.ndarray, setting: Setting) -> tuple[Stage, ...]:
+def _partly(values: np.ndarray, setting: Setting, kept: float = 1.0) -> tuple[Stage, ...]:
     taxels, share = (float(value) for value in values)
-    return (MechanicalSpreading(taxels * setting.layout.pitch_m, share=share),)
+    return (MechanicalSpreading(taxels * setting.layout.pitch_m, kept=kept, share=share),)
+
+
+def _report(values: np.ndarray, setting: Setting) -> dict[str, tuple[float, str]]:
+    return {"sigma_m": (float(values[0]) * setting.layout.pitch_m, "m")}
 
 
 def _as_rings(values: np.ndarray, setting: Setting) -> list[float]:
@@ -53,41 +56,56 @@ def _as_rings(values: np.ndarray, setting: Setting) -> list[float]:
     return [*np.clip(weights[1:] / weights[:-1], 0.05, 0.95).tolist(), 0.5]
 
 
+SIGMA, OF_SKIN, SHARE = (
+    Value("taxels", 0.0, 2.5, 5e-3),
+    Value("taxels", 0.5, 4.0, 1e-2),
+    Value("share", 0.0, 1.0, 2e-3),
+)
+BEYOND = "of a cover that reaches beyond the taxels"
+
 FORMS = (
     Form(
         "mechanical_spreading",
         "Gaussian",
-        (Value("taxels", 0.0, 2.5, 5e-3),),
-        lambda v, s: (MechanicalSpreading(float(v[0]) * s.layout.pitch_m),),
-        lambda v, s: {"sigma_m": (float(v[0]) * s.layout.pitch_m, "m")},
+        (SIGMA,),
+        _wholly,
+        _report,
         lambda s: [[0.35], [0.7]],
         kinds=("row", "column", "pad"),
         needs="press with an indenter smaller than a few taxels",
         amplitude=None,
         possible=lambda s: s.layout.num_taxels > 1,
     ),
+    # A cover ends with the taxels or goes on: a form, no coordinate that presses at the rim alone would know.
     Form(
         "mechanical_spreading",
-        "Gaussian, of a cover that reaches beyond the taxels",
-        (Value("taxels", 0.0, 1.3, 5e-3), Value("kept", 0.0, 1.0, 2e-3)),
-        _lost,
-        lambda v, s: {"sigma_m": (float(v[0]) * s.layout.pitch_m, "m")},
-        lambda s: [[0.5, 0.2]],
+        f"Gaussian, {BEYOND}",
+        (SIGMA,),
+        partial(_wholly, kept=0.0),
+        _report,
+        lambda s: [[0.5]],
         amplitude=None,
-        possible=lambda s: min(s.layout.rows, s.layout.cols) > 1,
+        possible=lambda s: s.layout.num_taxels > 1,
         screened=False,
-        grown=lambda v, s: [float(v[0]), 0.2],
+        peer=True,
+        grown=lambda v, s: v.tolist(),
     ),
-    Form(
-        "mechanical_spreading",
-        "Gaussian, of a part of the load",
-        (Value("taxels", 0.5, 4.0, 1e-2), Value("share", 0.0, 1.0, 2e-3)),
-        _partly,
-        lambda v, s: {"sigma_m": (float(v[0]) * s.layout.pitch_m, "m"), "share": (float(v[1]), "1")},
-        lambda s: [[1.5, 0.1]],
-        amplitude=None,
-        possible=lambda s: min(s.layout.rows, s.layout.cols) > 2,
-        screened=False,
+    *(
+        Form(
+            "mechanical_spreading",
+            label,
+            (OF_SKIN, SHARE),
+            build,
+            lambda v, s: {**_report(v, s), "share": (float(v[1]), "1")},
+            lambda s: [[1.5, 0.1]],
+            amplitude=None,
+            possible=lambda s: min(s.layout.rows, s.layout.cols) > 2,
+            screened=False,
+        )
+        for label, build in (
+            ("Gaussian, of a part of the load", _partly),
+            (f"Gaussian, of a part of the load, {BEYOND}", partial(_partly, kept=0.0)),
+        )
     ),
     Form(
         "mechanical_spreading",

@@ -215,7 +215,8 @@ def _spreading(stage: MechanicalSpreading, field: Field, context: Context) -> Fi
         matrix = ring_matrix(sheet.layout.rows, sheet.layout.cols, stage.rings, stage.kept)
         return _mixed(field, context, lambda to, of: matrix[np.ix_(sheet.taxels[to], sheet.taxels[of])])
     sigma = torch.full((1, 1), stage.sigma_m / sheet.layout.pitch_m, dtype=torch.float64)
-    down, along = (spreading_matrix(n, sigma).numpy() for n in (sheet.layout.rows, sheet.layout.cols))
+    rows, cols = sheet.layout.rows, sheet.layout.cols
+    down, along = (spreading_matrix(count, sigma, stage.kept).numpy() for count in (rows, cols))
 
     def weights(to: np.ndarray, of: np.ndarray) -> np.ndarray:
         spread = down[np.ix_(sheet.rows[to], sheet.rows[of])] * along[np.ix_(sheet.cols[to], sheet.cols[of])]
