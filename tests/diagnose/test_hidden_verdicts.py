@@ -92,7 +92,7 @@ def test_what_no_list_holds_is_said_to_be_unknown(tmp_path, form, size):
 @pytest.mark.parametrize(
     ("form", "size", "seed", "word"),
     [
-        ("direction", 2.0, 5490002, "slides"),
+        ("direction", 2.0, 5490002, "direction of sliding"),
         ("stick_slip", 1.0, 56330001, "slides"),
         ("thermal_gain", 1.0, 6790000, "temperature"),
         ("neighbour_pad", 1.0, 30880001, "replicates"),

@@ -16,8 +16,9 @@ from lerobot_vtrefine.diagnose.core.suspicion import Suspicion
 from lerobot_vtrefine.diagnose.pad.baseline import offset_tangents
 from lerobot_vtrefine.diagnose.pad.descriptors import DESCRIPTORS, Descriptor, directions, errors_left_out
 from lerobot_vtrefine.diagnose.pad.fitting import Fit, bounded_step, movable, predict, rest
-from lerobot_vtrefine.diagnose.pad.form_fitting import without
+from lerobot_vtrefine.diagnose.pad.form_fitting import settle, without
 from lerobot_vtrefine.diagnose.pad.model import Composite
+from lerobot_vtrefine.diagnose.pad.press_trials import PressSet
 from lerobot_vtrefine.diagnose.pad.screening import GAIN_MAP, scorer_of
 from lerobot_vtrefine.diagnose.pad.taxel_maps import map_evidence, maps_left_out
 
@@ -27,6 +28,8 @@ if TYPE_CHECKING:
 Array = np.ndarray
 FACE_M = 1e-4
 """Unit of a face's unevenness: maps are shrunk within deviations of .001 to .8 of it [m]."""
+FACE_PASSES = 3
+"""Times that the face is told, each around the model that the one before left: the first may be far off."""
 
 
 def in_place_of_names(problem: "PadProblem", fitted: Fit) -> list[Suspicion]:
@@ -44,30 +47,43 @@ def _in_place_of_gains(problem: "PadProblem", fitted: Fit) -> Suspicion | None:
 
     Around the model that has neither, weights overrate the flanks of presses, and gains that are told there
     mislead wherever taxels are pressed deep. So the name is judged by its own fit, as all names are, and the
-    touches are taken out of the readings.
+    touches by the rest of the model's to readings that they are taken out of.
     """
-    presses, weights = problem.presses, problem.weights
-    slim = without(fitted, [GAIN_MAP], presses, weights)
-    slopes = offset_tangents(slim.model, presses, slim.signals)
-    if slopes is None:
+    if problem.presses.loaded:
         return None
-    tangents = [slope * FACE_M for slope in slopes]
-    maps = maps_left_out(map_evidence(slim, presses, weights, tangents), problem.folds)
-    every = zip(presses.presses, tangents, maps, strict=True)
-    images = [tangent * face[press.taxels] for press, tangent, face in every]
-    pressed = tuple(
-        replace(press, signal=press.signal - image)
-        for press, image in zip(presses.presses, images, strict=True)
-    )
-    level = replace(problem, presses=replace(presses, presses=pressed))
+    slim = without(fitted, [GAIN_MAP], problem.presses, problem.weights)
     before = out_of_fold(problem, slim, problem.folds)
     own = out_of_fold(problem, fitted, problem.folds).better_by(before)
-    best = out_of_fold(level, rest(slim.model, level.presses, weights), problem.folds).better_by(before)
+    touched = slim
+    for _ in range(FACE_PASSES):
+        images = _uneven_face(problem, touched)
+        level = replace(problem, presses=_without(problem.presses, images))
+        touched = settle(touched.model, level.presses, problem.weights)
+    best = out_of_fold(level, touched, problem.folds).better_by(before)
     apart = 0.0
-    for weight, here, there, image in zip(weights, fitted.signals, slim.signals, images, strict=True):
+    for weight, here, there, image in zip(
+        problem.weights, fitted.signals, touched.signals, images, strict=True
+    ):
         apart += float(weight.gram(weight.whiten(here - there - image)[None])[0, 0])
     clue = f"in the place of {GAIN_MAP}, first touches of the taxels' own predict trials left out better"
     return _borrowed(problem, clue, best, own, apart)
+
+
+def _uneven_face(problem: "PadProblem", now: Fit) -> list[Array]:
+    """What an uneven face adds to every recording's signals (T, n), told by the other folds."""
+    around = rest(now.model, problem.presses, problem.weights)
+    slopes = offset_tangents(now.model, problem.presses, around.signals)
+    assert slopes is not None
+    tangents = [slope * FACE_M for slope in slopes]
+    evidence = map_evidence(around, problem.presses, problem.weights, tangents)
+    every = zip(problem.presses.presses, tangents, maps_left_out(evidence, problem.folds), strict=True)
+    return [tangent * face[press.taxels] for press, tangent, face in every]
+
+
+def _without(presses: PressSet, images: Sequence[Array]) -> PressSet:
+    """The same presses with something taken out of every recording's signals (T, n)."""
+    pairs = zip(presses.presses, images, strict=True)
+    return replace(presses, presses=tuple(replace(one, signal=one.signal - image) for one, image in pairs))
 
 
 def _borrowed(problem: "PadProblem", clue: str, best: Array, own: Array, apart: float) -> Suspicion | None:
