@@ -155,7 +155,8 @@ class Verdict:
     ``minimum_detectable`` says from which size on a cause would have been named, ``not_tested`` which causes
     these recordings cannot show, and what to record for each. ``next_experiment`` is a JSON object (a
     protocol that the rig can run, with what it decides) or None. ``models_saw_locked`` tells whether the
-    models beside the verdict were fitted to locked recordings, too, once ``heldout`` was measured.
+    models beside the verdict were fitted to locked recordings, too, once ``heldout`` was measured;
+    ``withheld`` whether the extended one is the baseline, since the causes' predicts locked recordings worse.
     """
 
     status: Status
@@ -168,6 +169,7 @@ class Verdict:
     data_issues: tuple[DataIssue, ...] = ()
     not_tested: Mapping[str, str] = field(default_factory=dict)
     models_saw_locked: bool = False
+    withheld: bool = False
 
     def __post_init__(self) -> None:
         by_gain = sorted(self.causes, key=lambda cause: -(cause.heldout_gain or 0.0))
@@ -212,6 +214,7 @@ class VerdictFile:
     data_issues: tuple[DataIssue, ...]
     not_tested: dict[str, str] = field(default_factory=dict)
     models_saw_locked: bool = False
+    withheld: bool = False
 
 
 def write_verdict(verdict: Verdict, path: str | Path) -> None:

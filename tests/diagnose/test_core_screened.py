@@ -259,7 +259,10 @@ def test_the_model_stays_where_the_gains_of_locked_trials_make_it_hardly_worse()
     before, after = (locked.errors(fit).mean() for fit in (selection.baseline, selection.fit))
     assert before < after < 1.01 * before
     assert guarded(selection, locked, 0)[0].fit.told
-    assert not guarded(selection, replace(locked, scatter=0.0), 0)[0].fit.told
+    assert not guarded(selection, locked, 0)[0].withheld
+    refused = guarded(selection, replace(locked, scatter=0.0), 0)[0]
+    assert not refused.fit.told
+    assert refused.withheld
 
 
 def test_a_model_that_is_noticeably_worse_is_not_handed_out_whatever_log_scores_say() -> None:

@@ -141,6 +141,14 @@ def test_first_line_says_which_names_held_out_recordings_do_not_confirm(pad_set)
     assert words in text[:600]
 
 
+def test_a_model_that_is_not_handed_out_is_not_offered(pad_set):
+    withheld = text_of(page(pad_diagnosis(withheld=True), pad_set))
+    assert "The simulation lacks taxel gain spread and hysteresis." in withheld[:200]
+    assert "are predicted worse, so sensor_model.json is the refitted baseline" in withheld
+    assert "What to do now" not in withheld
+    assert "of the squared error is removed" not in withheld
+
+
 def test_ties_are_told_once_whatever_their_order():
     groups = (("backlash", "joint_friction"), ("joint_friction", "backlash"), ("latency", "crosstalk"))
     verdict = Verdict("ambiguous", ambiguous_with=groups, next_experiment={"text": "drag it"})

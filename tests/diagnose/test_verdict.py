@@ -63,6 +63,7 @@ def test_file_has_the_contracts_keys_and_values(tmp_path):
         "data_issues": [{"trial": "trial_0003.parquet", "problem": "starts loaded", "action": "set aside"}],
         "not_tested": {},
         "models_saw_locked": True,
+        "withheld": False,
     }
     assert [path.name for path in tmp_path.iterdir()] == ["verdict.json"]
 

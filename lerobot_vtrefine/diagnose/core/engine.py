@@ -168,7 +168,8 @@ def _if_no_worse[P: Problem[Any, Any], F: Fit, C: Candidate](
     likelier = scored.log_scores(selection.fit).sum() > scored.log_scores(selection.baseline).sum()
     if likelier and gain > -LEAST_GAIN:
         return selection
-    return replace(selection, fit=screened.without_effect(selection.fit, selection.baseline))
+    fit = screened.without_effect(selection.fit, selection.baseline)
+    return replace(selection, fit=fit, withheld=True)
 
 
 def _with_refused(alarms: tuple[Alarm, ...], refused: tuple[Refusal, ...]) -> tuple[Alarm, ...]:

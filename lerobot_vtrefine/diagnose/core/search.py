@@ -88,6 +88,8 @@ class Selection[P: Problem[Any, Any], F: Fit, C: Candidate]:
     """Every cause alone, at its best; decoys too."""
     alternatives: Mapping[str, frozenset[str]] = field(default_factory=dict)
     """Accepted cause -> others that passed a score test at the same time."""
+    withheld: bool = False
+    """Whether users get the baseline in place of the fit, which predicts locked trials worse."""
 
     def causes(self) -> dict[str, tuple[int, ...]]:
         """Named cause -> channels that it acts on."""

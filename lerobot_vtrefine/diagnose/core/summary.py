@@ -56,6 +56,7 @@ def tell(found: Found, account: Account[Any, Any]) -> Diagnosis:
         account.next_experiment(found.rivals, found.alarms),
         not_tested=not_tested(evidence),
         models_saw_locked=found.refitted,
+        withheld=selection.withheld,
     )
     return Diagnosis(
         verdict,
@@ -164,6 +165,8 @@ def _accepted(found: Found, name: str, caveat: str) -> tuple[str, str]:
     where = _where(found, found.selection.causes()[name])
     seen = "observed in the readings, not tested; " if found.selection.observed(name) else ""
     reason = f"{seen}improves the prediction of trials left out of the fit{where}{caveat}"
+    if found.selection.withheld:
+        reason += "; a model with it predicts held-out trials worse, so that none is handed out"
     if not found.alarms:
         return "accepted", reason
     return "symptom", f"{reason}; but part of the error has no known cause: this may be a symptom of it"

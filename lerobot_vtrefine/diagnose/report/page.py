@@ -83,7 +83,7 @@ def render_report(
 
 def _use(verdict: Verdict, recordings: RecordingSet, model: str) -> dict[str, str] | None:
     """What to do with the extended model, and the commands; None where it adds nothing."""
-    if not verdict.causes or verdict.heldout is None:
+    if not verdict.causes or verdict.heldout is None or verdict.withheld:
         return None
     flag = "--env.sensor_model" if recordings.kind == "pad" else "--env.reality"
     task = "--config_path=vtrefine:round_grasped"

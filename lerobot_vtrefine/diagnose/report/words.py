@@ -126,7 +126,8 @@ def headline(verdict: Verdict, unit: str) -> str:
             f"The simulation is adequate{scope}: once its {fitted} are refitted, nothing significant is left."
         )
     if verdict.status == "explained":
-        return f"The simulation lacks {names}. {repaired(verdict, unit)}{_unconfirmed(verdict)}"
+        said = withheld(verdict) if verdict.withheld else f"{repaired(verdict, unit)}{_unconfirmed(verdict)}"
+        return f"The simulation lacks {names}. {said}"
     if verdict.status == "ambiguous":
         sure = [title(c.name) for c in verdict.causes if not any(c.name in g for g in verdict.ambiguous_with)]
         beside = f" It certainly lacks {listing(sure)}." if sure else ""
@@ -188,6 +189,17 @@ def repaired(verdict: Verdict, unit: str) -> str:
     )
 
 
+def withheld(verdict: Verdict) -> str:
+    """Why the extended model is the baseline although something was found, in one sentence."""
+    assert verdict.heldout is not None
+    added = "it" if len(verdict.causes) == 1 else "these"
+    count = len(verdict.heldout.trials)
+    return (
+        f"With {added} added, the {count} held-out recordings are predicted worse, so sensor_model.json is "
+        "the refitted baseline: record more conditions, each twice, for a repair that can be trusted."
+    )
+
+
 def _unconfirmed(verdict: Verdict) -> str:
     """Names that were significant where the model was fitted, and do not help on held-out recordings."""
     names = [title(item.name) for item in verdict.causes if (item.heldout_gain or 0.0) < 0]
@@ -211,7 +223,7 @@ def doubts(verdict: Verdict, recorded: int, checked: int) -> list[str]:
         found.append(
             f"Only {len(held.trials)} recordings were held out, so the interval of the gain is imprecise."
         )
-    if held.gain_ci95 is not None and held.gain_ci95[0] <= 0 and verdict.causes:
+    if held.gain_ci95 is not None and held.gain_ci95[0] <= 0 and verdict.causes and not verdict.withheld:
         found.append("The interval of the gain includes zero: the repair may not help on other recordings.")
     if held.noise_floor is not None and held.noise_floor > 0:
         excess = (held.extended**2 - held.noise_floor**2) / max(held.baseline**2, 1e-30)
