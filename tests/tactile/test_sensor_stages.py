@@ -174,6 +174,18 @@ def test_row_sharing_is_the_divider_of_a_resistor_network() -> None:
     assert np.allclose(shared.numpy().ravel(), nodal, rtol=1e-5)
 
 
+def test_what_taxels_conduct_at_rest_loads_the_row_and_is_lowered_with_it() -> None:
+    """The same analysis where every taxel conducts at rest, too."""
+    conductance, at_rest = np.array([0.2, 0.5, 0.0, 1.0]), np.array([0.05, 0.1, 0.02, 0.08])
+    pull_down, supply = 2.0, 255.0
+    rest = at_rest.sum() + pull_down
+    nodal = supply * (conductance + at_rest) / (conductance.sum() + rest)
+    idle = supply * at_rest / rest
+    alone = torch.from_numpy(supply * conductance / rest).view(1, 1, 4)
+    stage = RowSharing(conductance_per_count=1 / 255.0, idle_counts=((*idle.tolist(),),))
+    assert np.allclose(once(stage, alone).numpy().ravel() + idle, nodal, rtol=1e-5)
+
+
 def test_row_sharing_lowers_the_row_and_leaves_the_column() -> None:
     x = torch.zeros(6, 10)
     x[2, 3] = 100.0

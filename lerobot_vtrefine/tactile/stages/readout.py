@@ -143,35 +143,51 @@ class Saturation(Stage):
         return x / (1.0 + share) ** (1.0 / self.sharpness), state
 
 
-@register
 @dataclass(frozen=True)
-class SupplyDroop(Stage):
-    """The drive voltage falls with the whole pad's load: s_rc / (1 + k * sum of all s).
-
-    Lines are driven one after the other, but a supply that is slower than a scan gives the mean of a frame's
-    currents, and its resistance lowers the voltage of every line alike. (The driver's own resistance would
-    lower that of its line alone: Kim, Kwon & Choi 2016, Sensors 16(2), 155.) A converter whose reference is
-    the drive voltage itself does not see it.
+class Divider(Stage):
+    """Base of the laws by which a load that taxels share lowers their readings: s / (1 + k * load).
 
     What a taxel reads at rest, which is added later, falls as well where it is a current of the same lines:
     `idle_counts` (a number or (R, C)) says how much of it does.
     """
 
-    name: ClassVar[str] = "supply_droop"
     domain: ClassVar[str] = "counts"
-    rank: ClassVar[int] = 55
-    droop_per_count: float = parameter(5e-5, "1/counts", 0.0, 5e-4)
     idle_counts: float | tuple[tuple[float, ...], ...] = field(
-        default=0.0, metadata={"range": (0.0, 0.0), "maximum": LARGEST["counts"]}
+        default=0.0, kw_only=True, metadata={"range": (0.0, 0.0), "maximum": LARGEST["counts"]}
     )
 
     def __post_init__(self) -> None:
         super().__post_init__()
         object.__setattr__(self, "idle_counts", as_map(f"{self.name}.idle_counts", self.idle_counts))
 
-    def lowered(self, x: Any, pad_sum: Any, idle: Any) -> Any:
-        """Readings x above idle levels, of pads that add up to `pad_sum`, at the lower voltage."""
-        return (x + idle) / (1.0 + self.droop_per_count * pad_sum) - idle
+    def lowered(self, x: Any, load: Any, idle: Any) -> Any:
+        """Readings x above idle levels, under the load that they share."""
+        raise NotImplementedError
+
+
+def _divided(x: Any, load: Any, idle: Any) -> Any:
+    """Readings x above idle levels, both divided by one plus a load."""
+    return (x + idle) / (1.0 + load) - idle
+
+
+@register
+@dataclass(frozen=True)
+class SupplyDroop(Divider):
+    """The drive voltage falls with the whole pad's load: s_rc / (1 + k * sum of all s).
+
+    Lines are driven one after the other, but a supply that is slower than a scan gives the mean of a frame's
+    currents, and its resistance lowers the voltage of every line alike. (The driver's own resistance would
+    lower that of its line alone: Kim, Kwon & Choi 2016, Sensors 16(2), 155.) A converter whose reference is
+    the drive voltage itself does not see it.
+    """
+
+    name: ClassVar[str] = "supply_droop"
+    rank: ClassVar[int] = 55
+    droop_per_count: float = parameter(5e-5, "1/counts", 0.0, 5e-4)
+
+    @override
+    def lowered(self, x: Any, load: Any, idle: Any) -> Any:
+        return _divided(x, self.droop_per_count * load, idle)
 
     @override
     def step(self, x: torch.Tensor, state: State, frame: Frame) -> tuple[torch.Tensor, State]:
@@ -207,28 +223,29 @@ class LaggingDroop(SupplyDroop):
 
 @register
 @dataclass(frozen=True)
-class RowSharing(Stage):
+class RowSharing(Divider):
     """The row's voltage divider: s_rc / (1 + k * sum_j s_rj), the sum over the whole row with the taxel
     itself.
 
     While one column is driven high the others are held low, so a row's taxels load each other. With a plain
     resistor as pull-down and no amplifier k is 1/255 per count; boards with a stiffer front end have less.
-    `own` is the weight with which a taxel loads itself: 0 leaves only the others.
+    `own` is the weight with which a taxel loads itself: 0 leaves only the others. Readings at rest are
+    conductances of the same divider: with `idle_counts` they load the row, too, which k then includes, and
+    fall with it.
     """
 
     name: ClassVar[str] = "row_sharing"
-    domain: ClassVar[str] = "counts"
     rank: ClassVar[int] = 56
     conductance_per_count: float = parameter(4e-4, "1/counts", 0.0, 2e-3)
     own: float = parameter(1.0, "1", 1.0, 1.0, maximum=1.0)
 
-    def divided(self, x: Any, row_sum: Any) -> Any:
-        """Readings x whose rows add up to `row_sum`, after the divider."""
-        return x / (1.0 + self.conductance_per_count * (row_sum - (1.0 - self.own) * x))
+    @override
+    def lowered(self, x: Any, load: Any, idle: Any) -> Any:
+        return _divided(x, self.conductance_per_count * (load - (1.0 - self.own) * x), idle)
 
     @override
     def step(self, x: torch.Tensor, state: State, frame: Frame) -> tuple[torch.Tensor, State]:
-        return self.divided(x, x.sum(dim=-1, keepdim=True)), state
+        return self.lowered(x, x.sum(dim=-1, keepdim=True), taxel_map(self.idle_counts, x)), state
 
 
 @register

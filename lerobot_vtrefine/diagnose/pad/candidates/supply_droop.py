@@ -17,7 +17,7 @@ def _lagging(values: np.ndarray, setting: Setting) -> tuple[Stage, ...]:
 
 
 def _with_idle(values: np.ndarray, setting: Setting) -> tuple[Stage, ...]:
-    return (SupplyDroop(float(values[0]) / setting.top_counts, setting.idle_counts),)
+    return (SupplyDroop(float(values[0]) / setting.top_counts, idle_counts=setting.idle_counts),)
 
 
 def _report(values: np.ndarray, setting: Setting) -> dict[str, tuple[float, str]]:

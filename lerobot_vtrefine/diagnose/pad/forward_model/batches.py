@@ -51,6 +51,11 @@ class Sheet:
     """Drive, age and path (J, n) of what earlier recordings pressed every press's columns with (`Borne`)."""
 
     @cached_property
+    def press(self) -> np.ndarray:
+        """Number of every column's press among these (M,)."""
+        return np.repeat(np.arange(len(self.blocks)), [block.stop - block.start for block in self.blocks])
+
+    @cached_property
     def rows(self) -> np.ndarray:
         """Row in the pad of every column's taxel (M,)."""
         return self.taxels // self.layout.cols

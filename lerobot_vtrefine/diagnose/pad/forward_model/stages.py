@@ -22,6 +22,7 @@ from lerobot_vtrefine.tactile.stages.readout import (
     BaselineDrift,
     Crosstalk,
     DeadTaxels,
+    Divider,
     Idle,
     LaggingDroop,
     Quantisation,
@@ -239,33 +240,33 @@ def _crosstalk(stage: Crosstalk, field: Field, context: Context) -> Field:
     return _mixed(field, context, weights)
 
 
-def _row_sharing(stage: RowSharing, field: Field, context: Context) -> Field:
-    cols = context.sheet.layout.cols
-
-    def work(x: np.ndarray, time_s: np.ndarray, taxels: np.ndarray) -> np.ndarray:
-        if not len(taxels):
-            return x
-        # Columns are in the order of their rows.
-        first = np.flatnonzero(np.diff(taxels // cols, prepend=-1))
-        row = np.repeat(np.arange(len(first)), np.diff(first, append=len(taxels)))
-        return stage.divided(x, np.add.reduceat(x, first, axis=1)[:, row])
-
-    return by_press(field, context.sheet, work)
-
-
-def _supply_droop(stage: SupplyDroop, field: Field, context: Context) -> Field:
+def _lowered(stage: Divider, field: Field, context: Context, group: np.ndarray) -> Field:
+    """Readings under the load of their group: of all the sheet's columns (M,) the group's number, rising."""
     idle = np.asarray(stage.idle_counts, dtype=float)
     if idle.any():
         # Untouched taxels move, and touched ones count, whether or not they are asked for.
         field = field.spread(np.union1d(field.columns, _everywhere(field, context).columns))
+    if not len(field.columns):
+        return field
+    begins = np.diff(group[field.columns], prepend=-1) > 0
+    load = np.add.reduceat(field.values, np.flatnonzero(begins), axis=1)
+    if isinstance(stage, LaggingDroop):
+        for press, own in zip(group[field.columns[begins]], load.T, strict=True):
+            time_s = context.sheet.times_s[press]
+            known, seconds = (torch.from_numpy(item) for item in (own[: len(time_s)].copy(), time_s))
+            own[: len(time_s)] = low_passed(known, seconds, stage.tau_s).numpy()
+    every = np.take(load, np.cumsum(begins) - 1, axis=1)
+    at_rest = idle.ravel()[context.sheet.taxels[field.columns]] if idle.ndim else idle
+    return Field(stage.lowered(field.values, every, at_rest), field.columns)
 
-    def work(x: np.ndarray, time_s: np.ndarray, taxels: np.ndarray) -> np.ndarray:
-        load = x.sum(axis=1, keepdims=True)
-        if isinstance(stage, LaggingDroop):
-            load = low_passed(torch.from_numpy(load), torch.from_numpy(time_s), stage.tau_s).numpy()
-        return stage.lowered(x, load, idle.ravel()[taxels] if idle.ndim else idle)
 
-    return by_press(field, context.sheet, work)
+def _row_sharing(stage: RowSharing, field: Field, context: Context) -> Field:
+    sheet = context.sheet
+    return _lowered(stage, field, context, sheet.press * sheet.layout.rows + sheet.rows)
+
+
+def _supply_droop(stage: SupplyDroop, field: Field, context: Context) -> Field:
+    return _lowered(stage, field, context, context.sheet.press)
 
 
 def _scan_skew(stage: ScanSkew, field: Field, context: Context) -> Field:
