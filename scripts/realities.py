@@ -7,6 +7,7 @@ import numpy as np
 from lerobot_vtrefine.embodiments import ALOHA
 from lerobot_vtrefine.tactile.model import SensorModel
 from lerobot_vtrefine.tactile.stages.contact import KelvinVoigt
+from lerobot_vtrefine.tactile.stages.dividers import RowSharing
 from lerobot_vtrefine.tactile.stages.host import Latency
 from lerobot_vtrefine.tactile.stages.hysteresis import Hysteresis
 from lerobot_vtrefine.tactile.stages.readout import (
@@ -15,7 +16,6 @@ from lerobot_vtrefine.tactile.stages.readout import (
     Idle,
     Noise,
     Quantisation,
-    RowSharing,
     TaxelGainSpread,
 )
 

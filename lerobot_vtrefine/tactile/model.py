@@ -11,8 +11,9 @@ from lerobot_vtrefine.files import decode, read_json
 from lerobot_vtrefine.tactile.stages.base import DOMAINS, STAGES, Stage, stage_class
 from lerobot_vtrefine.tactile.stages.contact import Consistent, ContactStage, KelvinVoigt
 from lerobot_vtrefine.tactile.stages.cover import on_springs
+from lerobot_vtrefine.tactile.stages.dividers import RowSharing
 from lerobot_vtrefine.tactile.stages.hysteresis import without_loop
-from lerobot_vtrefine.tactile.stages.readout import Gain, Idle, Noise, Quantisation, RowSharing
+from lerobot_vtrefine.tactile.stages.readout import Gain, Idle, Noise, Quantisation
 
 SCHEMA = "vtrefine/sensor-model@1"
 NAMED = ("default", "paper")

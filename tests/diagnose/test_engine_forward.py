@@ -16,7 +16,7 @@ from lerobot_vtrefine.diagnose.pad.prediction import predict_trial
 from lerobot_vtrefine.diagnose.pad.press_trials import PressSet, prepare
 from lerobot_vtrefine.diagnose.recordings import RecordingSet, Trial
 from lerobot_vtrefine.tactile.model import SensorModel
-from lerobot_vtrefine.tactile.stages.readout import LaggingDroop
+from lerobot_vtrefine.tactile.stages.dividers import LaggingDroop
 
 
 def trial(number: int, rng: np.random.Generator, frames: int = 60) -> Trial:

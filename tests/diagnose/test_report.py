@@ -149,6 +149,15 @@ def test_a_model_that_is_not_handed_out_is_not_offered(pad_set):
     assert "of the squared error is removed" not in withheld
 
 
+def test_a_gain_that_locked_recordings_cannot_show_is_told_with_its_interval(pad_set):
+    found = pad_diagnosis()
+    held = replace(found.verdict.heldout, baseline=2.4, extended=2.5, gain=-0.09, gain_ci95=(-0.3, 0.1))
+    text = text_of(page(replace(found, verdict=replace(found.verdict, heldout=held)), pad_set))
+    assert "goes from 2.4 to 2.5 counts (95 % interval \N{MINUS SIGN}30 % to 10 %)" in text
+    assert "The interval of the gain includes zero" in text
+    assert "falls from" not in text
+
+
 def test_ties_are_told_once_whatever_their_order():
     groups = (("backlash", "joint_friction"), ("joint_friction", "backlash"), ("latency", "crosstalk"))
     verdict = Verdict("ambiguous", ambiguous_with=groups, next_experiment={"text": "drag it"})

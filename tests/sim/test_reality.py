@@ -16,9 +16,10 @@ from lerobot_vtrefine.sim.reality import RobotFaults, load_reality
 from lerobot_vtrefine.sim.simulation import InsertionSim
 from lerobot_vtrefine.tactile.model import SensorModel
 from lerobot_vtrefine.tactile.stages.contact import KelvinVoigt
+from lerobot_vtrefine.tactile.stages.dividers import RowSharing
 from lerobot_vtrefine.tactile.stages.host import Latency
 from lerobot_vtrefine.tactile.stages.hysteresis import Hysteresis
-from lerobot_vtrefine.tactile.stages.readout import Gain, Idle, Quantisation, RowSharing, TaxelGainSpread
+from lerobot_vtrefine.tactile.stages.readout import Gain, Idle, Quantisation, TaxelGainSpread
 
 ROBOT = get_embodiment("aloha")
 DT, SUBSTEPS = 0.1, 40

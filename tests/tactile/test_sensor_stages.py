@@ -10,6 +10,7 @@ from scipy.ndimage import gaussian_filter
 
 from lerobot_vtrefine.tactile import PadLayout
 from lerobot_vtrefine.tactile.stages.base import STAGES, Frame, Stage
+from lerobot_vtrefine.tactile.stages.dividers import LaggingDroop, RowSharing, SupplyDroop
 from lerobot_vtrefine.tactile.stages.host import Delay, Latency, SampleAndHold, ScanSkew
 from lerobot_vtrefine.tactile.stages.hysteresis import (
     DuhemHysteresis,
@@ -31,12 +32,9 @@ from lerobot_vtrefine.tactile.stages.readout import (
     DeadTaxels,
     Gain,
     Idle,
-    LaggingDroop,
     Noise,
     Quantisation,
-    RowSharing,
     Saturation,
-    SupplyDroop,
     TaxelGainSpread,
 )
 from lerobot_vtrefine.tactile.stages.softening import FirstLoadSoftening, PathSoftening

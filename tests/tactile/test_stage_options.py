@@ -8,15 +8,10 @@ import torch
 
 from lerobot_vtrefine.tactile import PadLayout
 from lerobot_vtrefine.tactile.stages.base import Frame, Stage
+from lerobot_vtrefine.tactile.stages.dividers import RowSharing
 from lerobot_vtrefine.tactile.stages.host import Latency, ScanSkew
 from lerobot_vtrefine.tactile.stages.mechanics import MechanicalSpreading, NonlinearStiffness
-from lerobot_vtrefine.tactile.stages.readout import (
-    BaselineDrift,
-    Crosstalk,
-    DeadTaxels,
-    RowSharing,
-    Saturation,
-)
+from lerobot_vtrefine.tactile.stages.readout import BaselineDrift, Crosstalk, DeadTaxels, Saturation
 
 LAYOUT = PadLayout(6, 10, 0.002)
 FRAME = Frame(layout=LAYOUT, stiffness_n_per_m=800.0)

@@ -10,7 +10,6 @@ from lerobot_vtrefine.diagnose.core.heldout import lock
 from lerobot_vtrefine.diagnose.core.problem import Candidate, Fit, Problem
 from lerobot_vtrefine.diagnose.core.resampling import gain_interval
 from lerobot_vtrefine.diagnose.core.rivals import Rival, find_rivals, settled
-from lerobot_vtrefine.diagnose.core.rules import LEAST_GAIN
 from lerobot_vtrefine.diagnose.core.screened_rivals import screened_rivals
 from lerobot_vtrefine.diagnose.core.screened_search import ScreenedSearch, still_found
 from lerobot_vtrefine.diagnose.core.search import ALL, Search, Selection
@@ -132,7 +131,7 @@ def guarded[P: Problem[Any, Any], F: Fit, C: Candidate](
 
     On each channel where it does, what was accepted last is taken back first. What all channels share is
     judged by all of them together, each in units of its baseline's error, and by their plain sum. Where a
-    score test chose, log scores decide what plain errors leave open.
+    score test chose, plain errors must be surely worse (95 %), and log scores decide what they leave open.
     """
     before = test.errors(selection.baseline)
     refused = []
@@ -150,23 +149,22 @@ def guarded[P: Problem[Any, Any], F: Fit, C: Candidate](
             surely = gain_interval(*pairs[gains.index(gain)], seed)[1] < 0
             if selection.problem.screens and not surely:
                 # Scores found the name, and errors of a few locked trials do not disprove it.
-                return _if_no_worse(selection, test, gain), tuple(refused)
+                return _if_likelier(selection, test), tuple(refused)
             refused.append(Refusal(candidate.cause, channel, gain, surely))
             selection = taken_back(selection, [candidate], channel)
     return selection, tuple(refused)
 
 
-def _if_no_worse[P: Problem[Any, Any], F: Fit, C: Candidate](
-    selection: Selection[P, F, C], test: P, gain: float
+def _if_likelier[P: Problem[Any, Any], F: Fit, C: Candidate](
+    selection: Selection[P, F, C], test: P
 ) -> Selection[P, F, C]:
-    """The model only where its plain errors are no worse than anybody would notice, and trials prefer it to
-    the baseline by their log scores.
+    """The model only where locked trials prefer it to the baseline by their log scores.
 
-    Plain errors of a few trials depend on how each differs from the others; log scores allow for that.
+    Plain errors of a few trials hang on how each differs from the others, which can hide half of what a
+    model takes away elsewhere; log scores allow for that.
     """
     screened, scored = (cast("Any", problem) for problem in (selection.problem, test))
-    likelier = scored.log_scores(selection.fit).sum() > scored.log_scores(selection.baseline).sum()
-    if likelier and gain > -LEAST_GAIN:
+    if scored.log_scores(selection.fit).sum() > scored.log_scores(selection.baseline).sum():
         return selection
     fit = screened.without_effect(selection.fit, selection.baseline)
     return replace(selection, fit=fit, withheld=True)

@@ -20,7 +20,8 @@ from lerobot_vtrefine.tactile.layout import PadLayout
 from lerobot_vtrefine.tactile.model import SensorModel
 from lerobot_vtrefine.tactile.replay import replay
 from lerobot_vtrefine.tactile.stages.contact import KelvinVoigt
-from lerobot_vtrefine.tactile.stages.readout import Gain, Idle, Noise, Quantisation, RowSharing
+from lerobot_vtrefine.tactile.stages.dividers import RowSharing
+from lerobot_vtrefine.tactile.stages.readout import Gain, Idle, Noise, Quantisation
 
 LAYOUT = PadLayout(12, 32, 0.002)
 FPS, FINER = 20, 6

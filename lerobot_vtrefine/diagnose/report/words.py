@@ -179,10 +179,15 @@ def repaired(verdict: Verdict, unit: str) -> str:
     interval = ""
     if held.gain_ci95 is not None:
         interval = f" (95 % interval {percent(held.gain_ci95[0])} to {percent(held.gain_ci95[1])})"
+    added = "it" if len(verdict.causes) == 1 else "these"
+    if held.gain < 0:
+        return (
+            f"With {added} added, its error on held-out recordings goes {change}{interval}: how each of them "
+            f"was touched outweighs the effect. Where that is allowed for, they are likelier with {added}."
+        )
     floor = ""
     if held.noise_floor is not None:
         floor = f" Noise alone is {quantity(held.noise_floor, unit)}."
-    added = "it" if len(verdict.causes) == 1 else "these"
     return (
         f"With {added} added, its error on held-out recordings falls {change}; "
         f"{percent(held.gain)} of the squared error is removed{interval}.{floor}"
@@ -203,7 +208,7 @@ def withheld(verdict: Verdict) -> str:
 def _unconfirmed(verdict: Verdict) -> str:
     """Names that were significant where the model was fitted, and do not help on held-out recordings."""
     names = [title(item.name) for item in verdict.causes if (item.heldout_gain or 0.0) < 0]
-    if not names:
+    if not names or (verdict.heldout is not None and verdict.heldout.gain < 0):
         return ""
     pronoun = "it" if len(names) == 1 else "either" if len(names) == 2 else "any of them"
     return (

@@ -4,7 +4,7 @@ import numpy as np
 
 from lerobot_vtrefine.diagnose.pad.candidates.base import Form, Setting, Value
 from lerobot_vtrefine.tactile.stages.base import Stage
-from lerobot_vtrefine.tactile.stages.readout import RowSharing
+from lerobot_vtrefine.tactile.stages.dividers import RowSharing
 
 LOAD = Value("load", 0.0, 3.0, 2e-3)
 

@@ -16,18 +16,15 @@ from lerobot_vtrefine.diagnose.pad.forward_model.fields import Context, Field
 from lerobot_vtrefine.tactile.stages.base import Frame, Stage
 from lerobot_vtrefine.tactile.stages.contact import ContactStage
 from lerobot_vtrefine.tactile.stages.cover import on_springs
+from lerobot_vtrefine.tactile.stages.dividers import Divider, LaggingDroop, RowSharing, SupplyDroop
 from lerobot_vtrefine.tactile.stages.host import SampleAndHold, ScanSkew
 from lerobot_vtrefine.tactile.stages.mechanics import MechanicalSpreading, ring_matrix, spreading_matrix
 from lerobot_vtrefine.tactile.stages.readout import (
     BaselineDrift,
     Crosstalk,
     DeadTaxels,
-    Divider,
     Idle,
-    LaggingDroop,
     Quantisation,
-    RowSharing,
-    SupplyDroop,
     TaxelGainSpread,
 )
 from lerobot_vtrefine.tactile.stages.signals import low_passed, sampled
