@@ -22,6 +22,8 @@ from lerobot_vtrefine.diagnose.pad.weights import TrialWeights
 Array = np.ndarray
 _FEW = 4
 """Taxels of which there must be more for one to stand out."""
+ABOVE = 0.8413
+"""Part of normal deviates that lie below one deviation above their median."""
 
 
 def failing_taxel(
@@ -37,9 +39,12 @@ def failing_taxel(
     if len(known) <= _FEW:
         return None
     sizes = sums[known] / readings[known]
-    # A memory that is not quite the noise's is the same in all taxels.
+    # A memory that is not quite the noise's lasts in all taxels, and wanders in each of them by itself: it is
+    # what others do that one must stand out from.
     far = (sizes - float(np.median(sizes))) * np.sqrt(readings[known])
     worst = int(np.argmax(far))
+    others = np.delete(far, worst)
+    far /= max(float(np.quantile(others, ABOVE) - np.median(others)), 1.0)
     row, col = divmod(int(known[worst]), presses.layout.cols)
     drawn = np.random.default_rng([seed, 8]).standard_normal((FLIPS, len(known))).max(axis=1)
     drawn = np.concatenate([[float(far[worst]) / SIZE_DOUBT], drawn])
