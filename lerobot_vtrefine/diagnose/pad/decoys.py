@@ -15,7 +15,7 @@ from lerobot_vtrefine.diagnose.core.rules import FLIPS, SHARE_OF_GAIN, SIZE_DOUB
 from lerobot_vtrefine.diagnose.core.suspicion import Suspicion
 from lerobot_vtrefine.diagnose.pad.baseline import offset_tangents
 from lerobot_vtrefine.diagnose.pad.descriptors import DESCRIPTORS, Descriptor, directions, errors_left_out
-from lerobot_vtrefine.diagnose.pad.fitting import Fit, bounded_step, movable, predict, rest
+from lerobot_vtrefine.diagnose.pad.fitting import Fit, bounded_step, movable, predict
 from lerobot_vtrefine.diagnose.pad.form_fitting import settle, without
 from lerobot_vtrefine.diagnose.pad.model import Composite
 from lerobot_vtrefine.diagnose.pad.press_trials import PressSet
@@ -71,11 +71,10 @@ def _in_place_of_gains(problem: "PadProblem", fitted: Fit) -> Suspicion | None:
 
 def _uneven_face(problem: "PadProblem", now: Fit) -> list[Array]:
     """What an uneven face adds to every recording's signals (T, n), told by the other folds."""
-    around = rest(now.model, problem.presses, problem.weights)
-    slopes = offset_tangents(now.model, problem.presses, around.signals)
+    slopes = offset_tangents(now.model, problem.presses, now.signals)
     assert slopes is not None
     tangents = [slope * FACE_M for slope in slopes]
-    evidence = map_evidence(around, problem.presses, problem.weights, tangents)
+    evidence = map_evidence(now, problem.presses, problem.weights, tangents)
     every = zip(problem.presses.presses, tangents, maps_left_out(evidence, problem.folds), strict=True)
     return [tangent * face[press.taxels] for press, tangent, face in every]
 
