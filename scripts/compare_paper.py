@@ -356,6 +356,7 @@ def rows(options: argparse.Namespace, policy: Trained, table: str) -> list[tuple
         judged = load_evaluation(options.output_dir / f"eval_{stage}_{policy.name}", first_seed(policy))
         medians = judged["metrics"]["successes"]
         extra = {key: medians[key]["median"] for key, *_ in MEASURED if medians.get(key)}
+        extra |= failures(judged)
         if tuned:
             extra |= {"largest_fall": largest_fall(progress)}
         row = Run(
@@ -369,6 +370,17 @@ def rows(options: argparse.Namespace, policy: Trained, table: str) -> list[tuple
         )
         found.append((row, progress if tuned else []))
     return found
+
+
+def failures(judged: dict[str, Any]) -> dict[str, float]:
+    """Shares of an evaluation's episodes: both parts picked up, and what ended those that failed."""
+    shares = {
+        f"failed_{name.replace(' ', '_')}": count / judged["episodes"]
+        for name, count in judged["failures"].items()
+    }
+    if judged["picked_up"] is not None:
+        shares["picked_up"] = judged["picked_up"]
+    return {name: round(share, 4) for name, share in sorted(shares.items())}
 
 
 def key(policy: Trained, table: str, kind: str) -> dict[str, Any]:

@@ -44,6 +44,8 @@ class EpisodeState:
     """(N, part) whether `reference` holds."""
     lifted: Array
     """(N, part) whether the part is well above the height at which it rests."""
+    picked_up: Array
+    """(N,) whether at some moment all parts that hands are to take were grasped and lifted."""
     reference: Array
     """(N, part, 2, 3) grip points in the hand's frame at the grasp."""
     shift: Array
@@ -88,6 +90,7 @@ class EpisodeState:
             "unheld_steps": ((n, 2), np.int64),
             "grasped": ((n, 2), bool),
             "lifted": ((n, 2), bool),
+            "picked_up": ((n,), bool),
             "reference": ((n, 2, 2, 3), float),
             "shift": ((n, 2), float),
             "largest_shift": ((n, 2), float),
@@ -133,6 +136,7 @@ class EpisodeState:
         return {
             "success": self.success[ids],
             "failure": self.failure[ids],
+            "picked_up": self.picked_up[ids],
             "in_hand_shift_m": self.largest_shift[ids].max(1),
             "rim_slide_m": self.rim_slide[ids],
             "peak_force_n": self.peak_force[ids],
@@ -225,9 +229,16 @@ def _update_grasp(state: EpisodeState, ids: Array, seen: Measured, scene: Scene,
     set_down = grasped & ~held & ~lifted
     grasped = (grasped | starts) & ~set_down
     state.grasped[ids] = grasped
+    state.picked_up[ids] |= in_hand(scene, grasped & lifted)
     shift = np.where(grasped, task.in_hand_shift(seen.grip_points, state.reference[ids]), 0.0)
     state.shift[ids] = shift
     state.largest_shift[ids] = np.maximum(state.largest_shift[ids], shift)
+
+
+def in_hand(scene: Scene, held: Array) -> Array:
+    """(m,) whether all parts that hands are to take are among those `held` (m, part)."""
+    taken = [arm is not None for arm in scene.holders]
+    return held[:, taken].all(1)
 
 
 def _update_success(

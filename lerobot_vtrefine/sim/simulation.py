@@ -26,7 +26,7 @@ from lerobot_vtrefine.sim.config import (
 from lerobot_vtrefine.sim.depth import DepthCamera
 from lerobot_vtrefine.sim.depth_sensors import DEPTH_SENSORS
 from lerobot_vtrefine.sim.drive import make_drive
-from lerobot_vtrefine.sim.episode import EpisodeState, Measured, update
+from lerobot_vtrefine.sim.episode import EpisodeState, Measured, in_hand, update
 from lerobot_vtrefine.sim.host import start_copy, to_host, without_torch_threads
 from lerobot_vtrefine.sim.pads import Pads
 from lerobot_vtrefine.sim.privileged import Privileged, describe
@@ -149,8 +149,7 @@ class InsertionSim:
     @property
     def in_hand(self) -> Array:
         """(N,) whether all parts that hands are to take are grasped, and lifted off what they stood on."""
-        taken = [arm is not None for arm in self.scene.holders]
-        return (self._episode.grasped & self._episode.lifted)[:, taken].all(1)
+        return in_hand(self.scene, self._episode.grasped & self._episode.lifted)
 
     @property
     def camera_intrinsics(self) -> Array:

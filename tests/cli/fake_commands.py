@@ -81,6 +81,7 @@ def evaluate(options: dict[str, str]) -> None:
             "steps": 24,
             "success": success,
             "failure": None if success else "dropped",
+            "picked_up": success,
             "in_hand_shift_m": 0.001,
             "rim_slide_m": 0.01,
             "peak_force_n": 8.0,

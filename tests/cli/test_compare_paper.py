@@ -54,6 +54,7 @@ def test_policies_become_rows_of_both_tables_and_are_not_made_twice(
     assert (paper[""].success, paper[""].iterations) == (0.75, 60)
     assert paper["without pre-training"].iterations == 20
     assert paper["imitation"].extra["peak_force_n"] == 8.0
+    assert (paper[""].extra["picked_up"], paper[""].extra["failed_dropped"]) == (0.75, 0.25)
     assert set(fewer) == {"30 demonstrations, imitation", "30 demonstrations"}
     shown = table("paper", [*paper.values()])
     assert "| DPPO after imitation | automate/00186 | - | 72 | 75 [41, 93] | 94 | - | +22 |" in shown

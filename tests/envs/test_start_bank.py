@@ -214,8 +214,11 @@ def test_parts_that_stand_on_the_table_are_not_in_hand(socket: str):
     while expert.phase[0] < Phase.CARRY:
         sim.step(expert.act(everyone))
         held.append((int(expert.phase[0]), bool(sim.in_hand[0])))
+        picked_up = bool(sim.metrics()["picked_up"][0])
+        assert picked_up == any(held_now for _, held_now in held)
     assert not any(held_now for phase, held_now in held if phase <= Phase.CLOSE)
     assert held[-1][1]
+    assert picked_up
 
 
 def test_no_seed_that_training_uses_is_held_out():

@@ -54,8 +54,9 @@ def load_evaluation(directory: Path, first_seed: int) -> dict[str, Any]:
 
     Returns:
         ``success``, ``episodes``, ``rate``, ``ci95``, ``eval_seconds``, ``seeds``, ``metrics`` (quantiles
-        over all episodes and over successes; SI units), ``failures`` (count by reason) and ``videos``
-        (``[{"path", "seed", "success", "failure"}]``).
+        over all episodes and over successes; SI units), ``failures`` (count by reason), ``picked_up`` (share
+        of episodes in which the hands had all their parts at once; None where the log does not say) and
+        ``videos`` (``[{"path", "seed", "success", "failure"}]``).
     """
     path = directory / "eval_info.json"
     try:
@@ -77,6 +78,7 @@ def load_evaluation(directory: Path, first_seed: int) -> dict[str, Any]:
         "seeds": [first_seed + index for index in range(len(successes))],
         "metrics": summarise(rows),
         "failures": dict(Counter(reasons.values()).most_common()),
+        "picked_up": picked_up(rows),
         "videos": videos,
     }
 
@@ -85,6 +87,12 @@ def failure_name(row: dict[str, Any]) -> str:
     """Why an episode failed; the simulation names no reason when the time ran out."""
     name = row.get("failure")
     return "time-out" if name in (None, "", "none") else name.replace("in_hand", "in-hand").replace("_", " ")
+
+
+def picked_up(rows: Sequence[dict[str, Any]]) -> float | None:
+    """Share of episodes in which the hands had all their parts at once, where rows say so."""
+    told = [bool(row["picked_up"]) for row in rows if "picked_up" in row]
+    return sum(told) / len(told) if told else None
 
 
 def summarise(rows: Sequence[dict[str, Any]]) -> dict[str, Any]:
