@@ -49,7 +49,7 @@ LEARNED = {
     "cross_gentle": "needs touch: cross, 5 N",
     "cross_gentle_twin": "its twin needs none",
     "d_occluded": "needs touch: hidden D",
-    "cross_limited": "needs touch: told limit",
+    "cross_limited_1000": "needs touch: told limit",
     "square_1mm_slip": "square, 1 mm",
 }
 """Tasks of the table ``converges`` whose stages are drawn."""

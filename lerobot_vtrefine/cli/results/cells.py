@@ -24,6 +24,7 @@ LABELS = {
     "d_occluded": "D shape, hidden by the hands, 5 N at most (d_occluded)",
     "d_occluded_twin": "its twin: parts lie as expected (d_occluded_twin)",
     "cross_limited": "cross, 2 mm, a limit of 1.5 to 10 N that is told (cross_limited)",
+    "cross_limited_1000": "cross_limited, 1000 demonstrations, 30 iterations in smaller steps",
     "cross_limited_twin": "its twin: parts lie as expected, one friction (cross_limited_twin)",
     "key_1mm": "key pair, 1 mm, slip 2 mm / 0.05 rad",
     "tight": "tight: 1 mm clearance",
