@@ -18,6 +18,9 @@ Signal = np.ndarray
 RESTS = 0.05
 """Part of a recording's typical rate of depth up to which it rests."""
 
+SLOW_M_S = 1e-3
+"""Rate of depth from which on its logarithm tells."""
+
 
 @dataclass(frozen=True)
 class Descriptor:
@@ -94,7 +97,7 @@ def _parity(press: Press) -> np.ndarray:
     return np.where(np.arange(len(press.trial.time_s)) % 2, 1.0, -1.0)[:, None]
 
 
-STIFFNESS, MEMORY = causes_like("load"), causes_like("memory")
+STIFFNESS, MEMORY, RATE = (causes_like(kind) for kind in ("load", "memory", "rate"))
 PLACES, ROWS, COLUMNS, PAD = (causes_like(kind) for kind in ("place", "row", "column", "pad"))
 TIMING = causes_like("timing")
 
@@ -124,7 +127,12 @@ DESCRIPTORS = (
     Descriptor("the rate of depth", (*TIMING, *MEMORY), _depth_rate),
     Descriptor("load times the rate of depth", (*TIMING, *MEMORY), lambda p, s: s * _depth_rate(p, s)),
     Descriptor("loading or unloading", (*MEMORY, *TIMING), lambda p, s: s * np.sign(_depth_rate(p, s))),
-    Descriptor("the speed of depth, either way", MEMORY, lambda p, s: s * np.abs(_depth_rate(p, s))),
+    Descriptor("the speed of depth, either way", RATE, lambda p, s: s * np.abs(_depth_rate(p, s))),
+    Descriptor(
+        "the logarithm of the speed of depth",
+        RATE,
+        lambda p, s: s * np.log1p(np.abs(_depth_rate(p, s)) / SLOW_M_S),
+    ),
     Descriptor("the indenter's place along the row, at every taxel", (), lambda p, s: _carriage(p, s, 0)),
     Descriptor("the indenter's place along the column, at every taxel", (), lambda p, s: _carriage(p, s, 1)),
     Descriptor("the speed of sliding", (), lambda p, s: s * np.hypot(*_sliding(p))),

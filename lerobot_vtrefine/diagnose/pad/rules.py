@@ -63,6 +63,10 @@ MIN_COURSE = 0.005
 MIN_RECORDINGS = 8
 """Recordings whose gains have a course."""
 
+SIZES_DIFFER = 0.25
+"""Deviation of a cause's size between recordings, in parts of it: other forms than the sensor's leave up to a
+sixth, borrowed names a third and more."""
+
 # What is left repeats with the command.
 REPEATABLE_SHARE = 0.15
 """Part of what is left that must repeat."""

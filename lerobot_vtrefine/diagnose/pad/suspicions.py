@@ -19,6 +19,7 @@ from lerobot_vtrefine.diagnose.pad.descriptors import DESCRIPTORS, Descriptor, d
 from lerobot_vtrefine.diagnose.pad.failing_taxels import failing_taxel
 from lerobot_vtrefine.diagnose.pad.fitting import Fit, predict, tangents
 from lerobot_vtrefine.diagnose.pad.gain_drift import gain_drift
+from lerobot_vtrefine.diagnose.pad.one_size import sizes_differ
 from lerobot_vtrefine.diagnose.pad.press_trials import PressSet
 from lerobot_vtrefine.diagnose.pad.recording_scatter import own_deviations, recording_scatter
 from lerobot_vtrefine.diagnose.pad.repeatability import Correlations
@@ -59,6 +60,7 @@ def suspicions(problem: "PadProblem", selection: Selection[Any, Fit, Any]) -> li
         *noise_in_bursts(presses, own.left, fitted, weights, problem.seed),
         failing_taxel(presses, own.left, fitted, weights, problem.seed),
         *in_place_of_names(problem, fitted),
+        *sizes_differ(presses, fitted, weights, problem.seed),
     ]
     before, after = (fit.residuals(presses) for fit in (plain, fitted))
     if fitted.model.families and repeatability.only_misfit(presses, before, after):

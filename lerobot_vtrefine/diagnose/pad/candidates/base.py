@@ -76,6 +76,7 @@ Kind = Literal[
     "memory",  # of the contact
     "peak",  # of its largest load
     "age",  # of how long it has lasted
+    "rate",  # of how fast it came
     "time",  # drifts within a recording
     "session",  # and from recording to recording
     "place",  # differs over the pad

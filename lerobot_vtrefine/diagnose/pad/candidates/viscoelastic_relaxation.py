@@ -61,7 +61,7 @@ ONE = Form(
     _one,
     lambda v, s: {"tau_s": (float(np.exp(v[1])), "s"), "fraction": (float(v[0]), "1")},
     lambda s: [[0.05, float(np.log(tau))] for tau in _taus(s)],
-    kinds=("memory", "age", "time"),
+    kinds=("memory", "age", "rate", "time"),
     sizes=("fraction",),
     needs="hold for several seconds, and record on after the release",
     signed=True,
