@@ -389,6 +389,27 @@ def test_a_name_that_only_patched_the_form_of_another_is_dropped_once_that_form_
     np.testing.assert_array_equal(found.selection.fit.theta[[2, 3, 4]], 0.0)
 
 
+@dataclass(frozen=True)
+class Patched(Late):
+    """Beside the patch, the right form is no better than the wrong one."""
+
+    def reviewed(self, selection, seed):
+        return selection
+
+    def reformed(self, selection, seed):
+        return selection if "patch" in names_of(selection) else super().reviewed(selection, seed)
+
+
+def test_a_name_that_patches_a_form_is_dropped_where_another_form_does_without_it() -> None:
+    plain = toy(0.6, offered=(Form("curve", column=2), Form("patch", column=4)))
+    assert names(infer(plain)) == ["curve", "patch"]
+    found = infer(Patched(**vars(plain)))
+    assert found.selection.chosen == {0: (Form("curve", column=1),)}
+    np.testing.assert_array_equal(found.selection.fit.theta[[2, 3, 4]], 0.0)
+    both = Patched(**vars(replace(plain, y=plain.y - 0.5 * plain.x**4)))
+    assert names(infer(both)) == ["curve", "patch"]
+
+
 def test_names_that_both_act_are_found_again_beside_each_other() -> None:
     problem = Late(**vars(toy(0.6, offered=(Form("curve", column=2), Form("patch", column=4)))))
     both = replace(problem, y=problem.y - 0.5 * problem.x**4)

@@ -265,38 +265,45 @@ def still_found[P: ScreenedProblem[Any, Any], F: ScoredFit, C: FormCandidate](
     """Only names that the score test finds once more beside all the others, the least sure dropped first.
 
     A name may have been accepted beside a form of another that was not right yet, and stand in for what the
-    right one does. What its removal costs does not tell: weights around a model that has it suit no model
-    that has not, and any further coordinate predicts better where a form is not quite right.
+    right one does: so the others take the forms that they have without it. What its removal costs does not
+    tell: weights around a model that has it suit no model that has not, and any further coordinate predicts
+    better where a form is not quite right.
     """
     while len(chosen := selection.chosen.get(CHANNEL, ())) > 1:
         tested = [item for item in chosen if not selection.observed(item.cause)]
-        without = on_all_cores(partial(_without, selection), tested)
-        p_values = [_p_beside(*slim, item.cause) for slim, item in zip(without, tested, strict=True)]
-        worst = int(np.argmax(p_values)) if tested else 0
-        if not tested or p_values[worst] <= SCREEN_ALPHA:
+        if not tested:
             break
-        (problem, fit), gone = without[worst], tested[worst]
-        selection = replace(
-            selection,
-            problem=problem,
-            fit=fit,
-            errors=out_of_fold(problem, fit, folds_for(problem.conditions, seed)).errors,
-            chosen={CHANNEL: tuple(item for item in chosen if item is not gone)},
-            p_values={key: p for key, p in selection.p_values.items() if key[0] != gone.cause},
-        )
+        slims = on_all_cores(partial(_without, selection, seed=seed), tested)
+        p_values = [_p_beside(slim, item.cause) for slim, item in zip(slims, tested, strict=True)]
+        worst = int(np.argmax(p_values))
+        if p_values[worst] <= SCREEN_ALPHA:
+            break
+        selection = slims[worst]
     return selection
 
 
-def _without(selection: Selection[Any, Any, Any], candidate: Any) -> tuple[Any, Any]:
-    """Problem and fit without a candidate, under weights of their own."""
-    return selection.problem.weighed(selection.problem.reduced(selection.fit, [candidate], _ONE))
+def _without[P: ScreenedProblem[Any, Any], F: ScoredFit, C: FormCandidate](
+    selection: Selection[P, F, C], candidate: C, seed: int
+) -> Selection[P, F, C]:
+    """The selection without a candidate, under weights of its own, the others in the forms that suit best."""
+    problem, fit = selection.problem.weighed(selection.problem.reduced(selection.fit, [candidate], _ONE))
+    slim = replace(
+        selection,
+        problem=problem,
+        fit=fit,
+        errors=out_of_fold(problem, fit, folds_for(problem.conditions, seed)).errors,
+        chosen={CHANNEL: tuple(item for item in selection.chosen[CHANNEL] if item is not candidate)},
+        p_values={key: p for key, p in selection.p_values.items() if key[0] != candidate.cause},
+    )
+    return problem.reformed(slim, seed)
 
 
-def _p_beside(problem: Any, now: Any, cause: str) -> float:
+def _p_beside(selection: Selection[Any, Any, Any], cause: str) -> float:
     """Adjusted over all candidates that a fit does not hold; 0 where the cause is seen in the readings.
 
     Tested where the search would: also where all readings count alike, if weights hide what is missing.
     """
+    problem, now = selection.problem, selection.fit
     found = problem.screened(now)
     p_value = _p_of(cause, found)
     if p_value > SCREEN_ALPHA and _may_be_hidden(problem, now, found):
