@@ -8,7 +8,7 @@ import pytest
 from lerobot_vtrefine.diagnose.core.engine import guarded, infer
 from lerobot_vtrefine.diagnose.core.problem import OptionalSteps, PlainCandidate, Promise
 from lerobot_vtrefine.diagnose.core.score_test import Probe, cleared, screen
-from lerobot_vtrefine.diagnose.core.screened_search import ScreenedSearch
+from lerobot_vtrefine.diagnose.core.screened_search import ScreenedSearch, still_found
 
 TRIALS, FRAMES, NOISE, COLUMNS = 24, 60, 0.1, 5
 CONDITIONS = tuple(f"c{k // 2}" for k in range(TRIALS))
@@ -198,9 +198,9 @@ def test_what_is_seen_comes_before_what_imitates_it() -> None:
     plain, accepted = toy(0.3), []
 
     class Telling(ScreenedSearch):
-        def _accept(self, step, found):
+        def _accepted(self, step, found):
             accepted.append(step.candidate.cause)
-            super()._accept(step, found)
+            return super()._accepted(step, found)
 
     Telling(Unseeing(plain.x, plain.y, seen="bend"), 0, lambda text: None).run()
     assert accepted == ["bend"]
@@ -349,6 +349,23 @@ def test_what_weights_forgive_is_no_cause() -> None:
     assert kept <= 5
 
 
+def test_the_next_best_step_is_tried_where_the_best_does_not_stand() -> None:
+    plain = toy(0.6, offered=(Form("bend", column=1), Form("late", column=4)))
+    problem = replace(plain, y=plain.y + 0.5 * plain.x**4)
+    accepted = []
+
+    class Doubting(ScreenedSearch):
+        def _stands(self, problem, fitted, candidate):
+            stands = candidate.cause != "bend" or 4 in fitted.free
+            accepted.append((candidate.cause, stands))
+            return stands
+
+    found = Doubting(problem, 0, lambda text: None).run()
+    assert accepted == [("bend", False), ("late", True), ("bend", True)]
+    assert names_of(found) == ["late", "bend"]
+    assert {name for name, _ in found.p_values} == {"late", "bend"}
+
+
 @dataclass(frozen=True)
 class Late(Toy):
     """The right form of a cause, |x| in place of x^2, is only tried once names are settled."""
@@ -372,9 +389,61 @@ def test_a_name_that_only_patched_the_form_of_another_is_dropped_once_that_form_
     np.testing.assert_array_equal(found.selection.fit.theta[[2, 3, 4]], 0.0)
 
 
+@dataclass(frozen=True)
+class Patched(Late):
+    """Beside the patch, the right form is no better than the wrong one."""
+
+    def reviewed(self, selection, seed):
+        return selection
+
+    def reformed(self, selection, seed):
+        return selection if "patch" in names_of(selection) else super().reviewed(selection, seed)
+
+
+def test_a_name_that_patches_a_form_is_dropped_where_another_form_does_without_it() -> None:
+    plain = toy(0.6, offered=(Form("curve", column=2), Form("patch", column=4)))
+    assert names(infer(plain)) == ["curve", "patch"]
+    found = infer(Patched(**vars(plain)))
+    assert found.selection.chosen == {0: (Form("curve", column=1),)}
+    np.testing.assert_array_equal(found.selection.fit.theta[[2, 3, 4]], 0.0)
+    both = Patched(**vars(replace(plain, y=plain.y - 0.5 * plain.x**4)))
+    assert names(infer(both)) == ["curve", "patch"]
+
+
 def test_names_that_both_act_are_found_again_beside_each_other() -> None:
     problem = Late(**vars(toy(0.6, offered=(Form("curve", column=2), Form("patch", column=4)))))
     both = replace(problem, y=problem.y - 0.5 * problem.x**4)
     found = infer(both)
     assert names(found) == ["curve", "patch"]
     assert found.selection.p_value("patch") is not None
+
+
+@dataclass(frozen=True)
+class Hiding(Toy):
+    """Weights around a fit without the patch forgive it."""
+
+    far: bool = True
+
+    def weighed(self, now):
+        if now is None or 4 in now.free:
+            return self, now or self.baseline()
+        calm = replace(self, y=self.y + 0.5 * self.x**4)
+        return calm, calm.fit(now.free)
+
+    def unweighed(self, now):
+        loud = replace(self, y=self.y - 0.5 * self.x**4)
+        return loud, loud.fit(now.free)
+
+    def far_off(self, now):
+        return self.far
+
+
+def test_names_are_tested_again_as_the_search_tests_them_where_weights_may_hide_what_is_missing() -> None:
+    plain = toy(0.6, offered=(Form("bend", column=1), Form("patch", column=4)))
+    both = replace(plain, y=plain.y - 0.5 * plain.x**4)
+    selection = ScreenedSearch(both, 0, lambda text: None).run()
+    assert sorted(names_of(selection)) == ["bend", "patch"]
+    hiding = replace(selection, problem=Hiding(**vars(both)))
+    assert sorted(names_of(still_found(hiding, 0))) == ["bend", "patch"]
+    sure = replace(selection, problem=Hiding(**vars(both), far=False))
+    assert names_of(still_found(sure, 0)) == ["bend"]

@@ -12,7 +12,6 @@ from jittered_rig import EFFECTS, Rig
 from lerobot_vtrefine.diagnose.core.heldout import lock, out_of_fold
 from lerobot_vtrefine.diagnose.core.search import Selection
 from lerobot_vtrefine.diagnose.core.suspicion import raise_alarms
-from lerobot_vtrefine.diagnose.pad import review
 from lerobot_vtrefine.diagnose.pad.baseline import fit_baseline
 from lerobot_vtrefine.diagnose.pad.candidates import CATALOGUE
 from lerobot_vtrefine.diagnose.pad.decoys import in_place_of_names
@@ -144,8 +143,11 @@ def test_a_settled_name_takes_the_form_that_recordings_left_out_are_likeliest_un
     )
     plain, *_ = forms_of("contact_offset", fitted)
     problem, fitted = problem.weighed(with_form(fitted, plain, (), problem.presses, problem.weights))
-    found = review.likeliest_forms(review.State(problem, fitted, 0))
+    chosen = {0: (Candidate("contact_offset", form=plain),)}
+    selection = Selection(problem, problem.baseline(), fitted, np.zeros((1, 1)), chosen, {})
+    found = problem.reformed(selection, 0)
     assert [form.label for form in found.fit.model.forms] == [label]
+    assert [item.form.label for item in found.chosen[0]] == [label]
 
 
 def test_a_map_that_users_get_knows_places_that_were_only_pressed_in_locked_recordings() -> None:

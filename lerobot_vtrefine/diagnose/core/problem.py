@@ -103,6 +103,10 @@ class OptionalSteps(Protocol):
         """The selection after a look at what candidates cannot say."""
         return selection
 
+    def reformed(self, selection: "Selection[Any, Any, Any]", seed: int) -> "Selection[Any, Any, Any]":
+        """The same names, each in the form that suits best."""
+        return selection
+
     def thinned(self) -> Self:
         """The trials as the search sees them: with fewer readings, where there are more than it needs."""
         return self

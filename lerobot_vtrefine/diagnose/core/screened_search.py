@@ -115,20 +115,17 @@ class ScreenedSearch[P: ScreenedProblem[Any, Any], F: ScoredFit, C: FormCandidat
         """Forward, and backward after every step."""
         for number in range(MAX_ROUNDS):
             self.tell(f"{self.problem.subject}: trying causes, round {number + 1}")
-            found, step = self._round(self.problem, self.now)
+            found, steps = self._round(self.problem, self.now)
             self.first = self.first or found
             # What passes the test and yet predicts nothing may be a cause that weights forgive in part.
-            if step is None and (any(item.tested.passed for item in found) or self.problem.far_off(self.now)):
-                found, step = self._round(*self.problem.unweighed(self.now))
-            elif step is not None and (seen := _observed(found)) and step.candidate.cause not in seen:
+            if not steps and _may_be_hidden(self.problem, self.now, found):
+                found, steps = self._round(*self.problem.unweighed(self.now))
+            elif steps and (seen := _observed(found)) and steps[0].candidate.cause not in seen:
                 # So may what is seen, whose part in the errors a tested cause would take.
-                anew, other = self._round(*self.problem.unweighed(self.now))
-                if other is not None and other.candidate.cause in seen:
-                    found, step = anew, other
-            if step is None:
-                break
-            self._accept(step, found)
-            if not self._stands(step.candidate):
+                anew, others = self._round(*self.problem.unweighed(self.now))
+                if others and others[0].candidate.cause in seen:
+                    found, steps = anew, others
+            if not any(self._accepted(step, found) for step in steps):
                 break
             self._drop_needless()
         return Selection(
@@ -142,12 +139,11 @@ class ScreenedSearch[P: ScreenedProblem[Any, Any], F: ScoredFit, C: FormCandidat
             alternatives=self.alternatives,
         )
 
-    def _round(self, problem: P, now: F) -> tuple[list[Promise[C]], Step[F, C] | None]:
-        """All tests, and the best step from here, if any is worth it."""
+    def _round(self, problem: P, now: F) -> tuple[list[Promise[C]], list[Step[F, C]]]:
+        """All tests, and the steps from here that are worth it, best first."""
         found = problem.screened(now)
         passed = sorted((item for item in found if item.tested.passed), key=_promise)[:FITTED]
-        steps = self._steps(Ground(problem, now, self.folds, self.seed), passed)
-        return found, self._first_of(steps)
+        return found, self._in_turn(self._steps(Ground(problem, now, self.folds, self.seed), passed))
 
     def _steps(self, ground: Ground[P, F], passed: Sequence[Promise[C]]) -> list[tuple[float, Step[F, C]]]:
         """Steps that predict trials left out better, by the log score that they gain, best first."""
@@ -192,17 +188,16 @@ class ScreenedSearch[P: ScreenedProblem[Any, Any], F: ScoredFit, C: FormCandidat
             ground.refined(step, richest - 1) if step.candidate.cause in slighted else step for step in grown
         ]
 
-    def _first_of(self, steps: list[tuple[float, Step[F, C]]]) -> Step[F, C] | None:
-        """The best one; of a rich form only where none with fewer terms predicts as well."""
-        if not steps:
-            return None
-        (_, best), *others = steps
-        if best.candidate.terms > RICH:
-            for _, step in others:
+    def _in_turn(self, steps: list[tuple[float, Step[F, C]]]) -> list[Step[F, C]]:
+        """The best one first; of a rich form only where none with fewer terms predicts as well."""
+        order = [step for _, step in steps]
+        if order and order[0].candidate.terms > RICH:
+            best = order[0]
+            for step in order[1:]:
                 fewer = 0 < step.candidate.terms < best.candidate.terms
                 if fewer and not clearly_better(best.held, step.held, self.seed):
-                    return step
-        return best
+                    return [step, *(other for other in order if other is not step)]
+        return order
 
     def _needed(self) -> float:
         return self.problem.further_gain if self.chosen else LEAST_GAIN
@@ -210,26 +205,30 @@ class ScreenedSearch[P: ScreenedProblem[Any, Any], F: ScoredFit, C: FormCandidat
     def _credible(self, ground: Ground[P, F], step: Step[F, C]) -> bool:
         return bool(ground.problem.credible(self.baseline, ground.now, step.fit, step.candidate)[CHANNEL])
 
-    def _accept(self, step: Step[F, C], found: Sequence[Promise[C]]) -> None:
+    def _accepted(self, step: Step[F, C], found: Sequence[Promise[C]]) -> bool:
+        """Take a step, unless it predicts no better under its own weights."""
+        problem, fitted = self.problem.weighed(step.fit)
         name = step.candidate.cause
-        self.p_values[name] = next(item.tested.p_adjusted for item in found if item.candidate.cause == name)
+        p_value = next(item.tested.p_adjusted for item in found if item.candidate.cause == name)
+        if p_value is not None and not self._stands(problem, fitted, step.candidate):
+            return False
         passed = {item.candidate.cause for item in found if item.tested.passed and item.candidate.terms}
+        self.p_values[name] = p_value
         self.alternatives[name] = frozenset(passed - {name}) if step.candidate.terms else frozenset()
         self.chosen = (*self.chosen, step.candidate)
-        self.problem, self.now = self.problem.weighed(step.fit)
+        self.problem, self.now = problem, fitted
+        return True
 
-    def _stands(self, candidate: C) -> bool:
-        """Whether a cause predicts better under its own weights, too; if not, it is taken away again.
+    def _stands(self, problem: P, fitted: F, candidate: C) -> bool:
+        """Whether a cause predicts better under its own weights, too.
 
-        Found where all readings count alike, it may have stood in for what weights then forgive.
+        Found where all readings count alike, it may stand in for what weights then forgive. And of two causes
+        that act, the one with the higher log score may predict plain readings worse until the other is there,
+        as late readings beside an early touch do: then the next best step is tried.
         """
-        slim = self.problem.reduced(self.now, [candidate], _ONE)
-        full, less = (out_of_fold(self.problem, fit, self.folds) for fit in (self.now, slim))
-        if self.p_values[candidate.cause] is None or better(full, less):
-            return True
-        self.now, self.chosen = slim, self.chosen[:-1]
-        del self.p_values[candidate.cause]
-        return False
+        slim = problem.reduced(fitted, [candidate], _ONE)
+        full, less = (out_of_fold(problem, fit, self.folds) for fit in (fitted, slim))
+        return better(full, less)
 
     def _drop_needless(self) -> None:
         """Take away what costs less than a further cause must gain; what is seen, if it costs nothing."""
@@ -266,39 +265,61 @@ def still_found[P: ScreenedProblem[Any, Any], F: ScoredFit, C: FormCandidate](
     """Only names that the score test finds once more beside all the others, the least sure dropped first.
 
     A name may have been accepted beside a form of another that was not right yet, and stand in for what the
-    right one does. What its removal costs does not tell: weights around a model that has it suit no model
-    that has not, and any further coordinate predicts better where a form is not quite right.
+    right one does: so the others take the forms that they have without it. What its removal costs does not
+    tell: weights around a model that has it suit no model that has not, and any further coordinate predicts
+    better where a form is not quite right.
     """
     while len(chosen := selection.chosen.get(CHANNEL, ())) > 1:
         tested = [item for item in chosen if not selection.observed(item.cause)]
-        without = on_all_cores(partial(_without, selection), tested)
-        p_values = [_p_beside(*slim, item.cause) for slim, item in zip(without, tested, strict=True)]
-        worst = int(np.argmax(p_values)) if tested else 0
-        if not tested or p_values[worst] <= SCREEN_ALPHA:
+        if not tested:
             break
-        (problem, fit), gone = without[worst], tested[worst]
-        selection = replace(
-            selection,
-            problem=problem,
-            fit=fit,
-            errors=out_of_fold(problem, fit, folds_for(problem.conditions, seed)).errors,
-            chosen={CHANNEL: tuple(item for item in chosen if item is not gone)},
-            p_values={key: p for key, p in selection.p_values.items() if key[0] != gone.cause},
-        )
+        slims = on_all_cores(partial(_without, selection, seed=seed), tested)
+        p_values = [_p_beside(slim, item.cause) for slim, item in zip(slims, tested, strict=True)]
+        worst = int(np.argmax(p_values))
+        if p_values[worst] <= SCREEN_ALPHA:
+            break
+        selection = slims[worst]
     return selection
 
 
-def _without(selection: Selection[Any, Any, Any], candidate: Any) -> tuple[Any, Any]:
-    """Problem and fit without a candidate, under weights of their own."""
-    return selection.problem.weighed(selection.problem.reduced(selection.fit, [candidate], _ONE))
+def _without[P: ScreenedProblem[Any, Any], F: ScoredFit, C: FormCandidate](
+    selection: Selection[P, F, C], candidate: C, seed: int
+) -> Selection[P, F, C]:
+    """The selection without a candidate, under weights of its own, the others in the forms that suit best."""
+    problem, fit = selection.problem.weighed(selection.problem.reduced(selection.fit, [candidate], _ONE))
+    slim = replace(
+        selection,
+        problem=problem,
+        fit=fit,
+        errors=out_of_fold(problem, fit, folds_for(problem.conditions, seed)).errors,
+        chosen={CHANNEL: tuple(item for item in selection.chosen[CHANNEL] if item is not candidate)},
+        p_values={key: p for key, p in selection.p_values.items() if key[0] != candidate.cause},
+    )
+    return problem.reformed(slim, seed)
 
 
-def _p_beside(problem: Any, now: Any, cause: str) -> float:
-    """Adjusted over all candidates that a fit does not hold; 0 where the cause is seen in the readings."""
-    found = next((item for item in problem.screened(now) if item.candidate.cause == cause), None)
-    if found is None:
-        return 1.0
-    return found.tested.p_adjusted or 0.0
+def _p_beside(selection: Selection[Any, Any, Any], cause: str) -> float:
+    """Adjusted over all candidates that a fit does not hold; 0 where the cause is seen in the readings.
+
+    Tested where the search would: also where all readings count alike, if weights hide what is missing.
+    """
+    problem, now = selection.problem, selection.fit
+    found = problem.screened(now)
+    p_value = _p_of(cause, found)
+    if p_value > SCREEN_ALPHA and _may_be_hidden(problem, now, found):
+        even, refitted = problem.unweighed(now)
+        p_value = min(p_value, _p_of(cause, even.screened(refitted)))
+    return p_value
+
+
+def _p_of(cause: str, found: Sequence[Promise[Any]]) -> float:
+    tested = next((item.tested for item in found if item.candidate.cause == cause), None)
+    return 1.0 if tested is None else tested.p_adjusted or 0.0
+
+
+def _may_be_hidden(problem: Any, now: Any, found: Sequence[Promise[Any]]) -> bool:
+    """Whether weights may forgive what is wrong: errors are far above noise, or something passes the test."""
+    return any(item.tested.passed for item in found) or problem.far_off(now)
 
 
 def _observed(found: Sequence[Promise[Any]]) -> set[str]:

@@ -342,6 +342,12 @@ class PadProblem(OptionalSteps):
         recordings with delays of their own."""
         return review.reviewed(selection, seed)
 
+    def reformed(
+        self, selection: Selection[Any, Fit, Candidate], seed: int
+    ) -> Selection[Any, Fit, Candidate]:
+        """The same names in their likeliest forms."""
+        return review.reformed(selection, seed)
+
     def suspicions(self, selection: Selected, seed: int) -> list[Suspicion]:
         """What may be left."""
         return suspicions(self, selection)

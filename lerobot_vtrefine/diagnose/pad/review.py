@@ -131,6 +131,20 @@ def _looked_over(
     state = likeliest_forms(state.weighed(state.fit))
     best = resolved(state)
     state = state if best is state.fit else state.weighed(best)
+    return _selected(replace(selection, p_values=p_values, alternatives=alternatives), state)
+
+
+def reformed(selection: Selection["PadProblem", Fit, Any], seed: int) -> Selection["PadProblem", Fit, Any]:
+    """The same names in the forms under which recordings left out are likeliest."""
+    state = State(selection.problem, selection.fit, seed)
+    best = likeliest_forms(state)
+    return selection if best is state else _selected(selection, best)
+
+
+def _selected(
+    selection: Selection["PadProblem", Fit, Any], state: State
+) -> Selection["PadProblem", Fit, Any]:
+    """The selection with a fit, and what the fit holds."""
     model = state.fit.model
     chosen = tuple(_candidate(form.family, form, {}) for form in model.forms)
     chosen += tuple(_candidate(name, None, {}) for name in MAPS if name in model.families)
@@ -140,8 +154,7 @@ def _looked_over(
         fit=state.fit,
         errors=state.held(state.fit).errors,
         chosen={CHANNEL: chosen} if chosen else {},
-        p_values={key: p for key, p in p_values.items() if key[0] in model.families},
-        alternatives=alternatives,
+        p_values={key: p for key, p in selection.p_values.items() if key[0] in model.families},
     )
 
 
