@@ -35,8 +35,12 @@ def _report_bottoming(values: np.ndarray, setting: Setting) -> dict[str, tuple[f
 
 
 def _hyperbola(values: np.ndarray, setting: Setting) -> tuple[Stage, ...]:
-    """The coordinate is how far the deepest press is divided beyond one."""
-    return (NonlinearStiffness(yielding=float(values[0]) * REFERENCE_DEPTH_M / setting.top_depth_m),)
+    """Of what the springs bear alone: of the whole force it would be one law of the readings' saturation.
+
+    The coordinate is how far the deepest press is divided beyond one.
+    """
+    yielding = float(values[0]) * REFERENCE_DEPTH_M / setting.top_depth_m
+    return (NonlinearStiffness(yielding=yielding, elastic=True),)
 
 
 def _report_hyperbola(values: np.ndarray, setting: Setting) -> dict[str, tuple[float, str]]:
@@ -62,7 +66,7 @@ POWER = Form(
 )
 HYPERBOLA = Form(
     "nonlinear_stiffness",
-    "hyperbola",
+    "hyperbola, beside damping",
     (Value("yielding", -0.8, 6.0, 2e-3),),
     _hyperbola,
     _report_hyperbola,
@@ -78,7 +82,6 @@ FORMS = (
     POWER,
     beside_damping(POWER),
     HYPERBOLA,
-    beside_damping(HYPERBOLA),
     Form(
         "nonlinear_stiffness",
         "linear plus power law",
