@@ -157,6 +157,16 @@ def test_readings_that_never_repeat_are_not_held_however_late() -> None:
     assert could_be_held(press_set([signal[:5] for signal in late]))
 
 
+def test_a_stream_that_freezes_now_and_then_is_held() -> None:
+    rng = np.random.default_rng(5)
+    motion = 80.0 * np.abs(np.sin(2.0 * np.arange(200) * 0.05))[:, None]
+    frozen = [np.round(motion + rng.standard_normal((200, 20))) for _ in range(6)]
+    assert not held(press_set(frozen))
+    for signal in frozen:
+        signal[[60, 140]] = signal[[59, 139]]
+    assert held(press_set(frozen))
+
+
 def test_a_still_pad_of_one_taxel_that_repeats_is_not_held() -> None:
     rng = np.random.default_rng(6)
     still = [np.round(0.3 * rng.standard_normal((200, 1))) for _ in range(6)]

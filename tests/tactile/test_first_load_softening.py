@@ -112,6 +112,17 @@ def test_every_rise_of_the_load_softens_and_letting_go_does_not() -> None:
     assert in_session(stage, [0.0, 1.0], 2e-3, 5.0)[1] == pytest.approx(left[1])
 
 
+def test_only_a_larger_load_than_ever_softens() -> None:
+    # A path of 2 mm is 2 N here.
+    stage, values = PathSoftening(0.4, 2e-3, peak=True), [0.0, 1.0, 0.5, 0.0, 1.0, 1.5]
+    largest = np.array([0.0, 1.0, 1.0, 1.0, 1.0, 1.5])
+    left = 1 - 0.4 * (1 - np.exp(-largest / 2))
+    assert np.allclose(softened(stage, values), values * left)
+    # An earlier recording pressed 2 mm deep.
+    session = replace(stage, session=True)
+    assert in_session(session, [0.0, 1.0], 2e-3, 5.0)[1] == pytest.approx(1 - 0.4 * (1 - np.exp(-1)))
+
+
 def test_a_board_may_scan_along_the_columns_too() -> None:
     times = torch.linspace(0, 1, 101, dtype=torch.float64)
     ramp = times.view(-1, 1, 1).expand(-1, 3, 5)

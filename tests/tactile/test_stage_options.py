@@ -49,6 +49,14 @@ def test_crosstalk_falls_with_distance_on_the_side_stated(side: int) -> None:
     assert all(torch.count_nonzero(values) == 0 for values in other)
 
 
+def test_crosstalk_may_be_weaker_to_one_side() -> None:
+    y = once(Crosstalk(row=0.1, col=0.2, reach=0.1, row_side=0.6, col_side=-0.25), pressed_at(2, 4))
+    assert [y[2, 3].item(), y[2, 5].item()] == pytest.approx([4.0, 10.0])
+    assert [y[1, 4].item(), y[3, 4].item()] == pytest.approx([20.0, 15.0])
+    with pytest.raises(ValueError, match="between -1 and 1"):
+        Crosstalk(row_side=1.5)
+
+
 def test_drift_is_straight_between_its_knots_and_level_beyond() -> None:
     stage = BaselineDrift(rate_counts_per_s=0.1, knots_s=(10.0, 20.0, 40.0), knot_counts=(1.0, 3.0, -1.0))
     times = torch.tensor([0.0, 10.0, 15.0, 20.0, 30.0, 40.0, 100.0], dtype=torch.float64)
@@ -132,3 +140,11 @@ def test_a_share_of_the_force_follows_the_power_law() -> None:
     for share in (0.0, 0.25, 1.0):
         y = once(NonlinearStiffness(exponent=1.5, share=share), x)
         assert y[0, 0].item() == pytest.approx((1 - share) * 0.4 + share * 0.8 * 0.5**1.5)
+
+
+def test_a_hyperbola_levels_off_or_bottoms_out() -> None:
+    x = torch.full((6, 10), 0.4)  # half of the reference force, 800 N/m times 1 mm
+    for yielding in (3.0, -1.0):
+        y = once(NonlinearStiffness(yielding=yielding), x)
+        assert y[0, 0].item() == pytest.approx(0.4 / (1.0 + yielding * 0.5))
+    assert torch.isfinite(once(NonlinearStiffness(yielding=-4.0), x)).all()

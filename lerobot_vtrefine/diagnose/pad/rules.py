@@ -9,7 +9,7 @@ ENOUGH_HZ = 30.0
 """Frames per second that a search sees at least, where there are as many."""
 ENOUGH_READINGS = 40_000
 """Readings from which on frames are left out: more cost time, and tell the search nothing new."""
-FEW_REPEATS = 0.01
+FEW_REPEATS = 0.005
 """Share of repeated frames up to which they repeat by chance."""
 
 # A cause is accepted.
@@ -32,9 +32,9 @@ MAYBE_DEAD_ERRORS = 1.0
 """Standard errors that are enough for one more dead taxel, where others are."""
 
 # Readings are held.
-MIN_HELD, CHANCE = 0.015, 0.2
+MIN_HELD, CHANCE = 0.005, 0.2
 """Share of frames that must repeat the one before for readings to be held, and the part of it that may be
-chance."""
+chance: a stream that freezes for moments repeats one frame in a hundred, noise of many taxels none."""
 HELD_ROWS = 0.05
 """The same share of single rows, where whole frames are not held."""
 VISIBLE = 0.01

@@ -149,7 +149,8 @@ class Crosstalk(Stage):
     column.
 
     With `reach` the next reading leaks that much, further ones less by exp(-1 / reach) per taxel. A `side` of
-    +1 lets a line's readings leak to taxels of larger index only, -1 to smaller ones.
+    +1 lets a line's readings leak to taxels of larger index only, -1 to smaller ones; with what lies between,
+    the weaker side gets the part 1 - |side|.
     """
 
     name: ClassVar[str] = "crosstalk"
@@ -158,26 +159,26 @@ class Crosstalk(Stage):
     row: float = parameter(0.005, "1", 0.0, 0.02, maximum=10.0)
     col: float = parameter(0.005, "1", 0.0, 0.02, maximum=10.0)
     reach: float | None = limits(above=0.0, maximum=1e6, default=None)
-    row_side: int = limits(-1, 1, default=0)
-    col_side: int = limits(-1, 1, default=0)
+    row_side: float = limits(-1, 1, default=0.0)
+    col_side: float = limits(-1, 1, default=0.0)
 
     def __post_init__(self) -> None:
         super().__post_init__()
         if self.reach is not None and not self.reach > 0:
             raise ValueError(f"crosstalk.reach must be positive, got {self.reach}")
-        if not {self.row_side, self.col_side} <= {-1, 0, 1}:
-            raise ValueError("crosstalk.row_side and col_side must be -1, 0 or 1")
+        if not max(abs(self.row_side), abs(self.col_side)) <= 1:
+            raise ValueError("crosstalk.row_side and col_side must lie between -1 and 1")
 
     @property
     def even(self) -> bool:
         """Whether all other readings of a line leak alike."""
         return self.reach is None and not self.row_side and not self.col_side
 
-    def line(self, count: int, side: int) -> np.ndarray:
+    def line(self, count: int, side: float) -> np.ndarray:
         """What a taxel gets (first index) of each of its line (second): (count, count), 0 of itself."""
         ahead = np.arange(count)[:, None] - np.arange(count)[None]
         decay = np.ones(ahead.shape) if self.reach is None else np.exp((1.0 - np.abs(ahead)) / self.reach)
-        return decay * ((ahead != 0) & (ahead * side >= 0))
+        return decay * (ahead != 0) * np.where(ahead * side < 0, 1.0 - abs(side), 1.0)
 
     @override
     def step(self, x: torch.Tensor, state: State, frame: Frame) -> tuple[torch.Tensor, State]:

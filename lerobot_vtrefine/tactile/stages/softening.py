@@ -101,13 +101,15 @@ class PathSoftening(Remembering):
     The path grows by every rise of the load f and never falls; k is the stiffness of the contact's springs.
     Damage that saturates along a path is Miehe's (1995) continuous damage; here the path is the load's, so
     that press after press is softer, up to the same load, too. With `session` the path begins at that of all
-    earlier recordings, as the contact's springs bear it.
+    earlier recordings, as the contact's springs bear it. With `peak` the largest load so far is the path's
+    length, as of damage that sets in with a first load and only grows with a larger one.
     """
 
     name: ClassVar[str] = "path_softening"
     rate_free: ClassVar[bool] = True
     softening: float = parameter(0.15, "1", 0.0, 0.3, maximum=1.0)
     path_m: float = parameter(2e-3, "m", 5e-4, 5e-3)
+    peak: bool = False
 
     @override
     def initial(self, layout: PadLayout, pads: int) -> Traits:
@@ -120,13 +122,22 @@ class PathSoftening(Remembering):
 
     @override
     def step(self, x: torch.Tensor, state: State, frame: Frame) -> tuple[torch.Tensor, State]:
-        path = state["path"] + (x - state["before"]).clamp(min=0.0)
+        longer = state["path"] + (x - state["before"]).clamp(min=0.0)
+        path = torch.maximum(state["path"], x) if self.peak else longer
         return self._softened(x, path, frame), {**state, "path": path, "before": x}
 
     @override
     def sequence(self, x: torch.Tensor, times_s: torch.Tensor, frame: Frame) -> torch.Tensor:
-        path = torch.diff(x, dim=0, prepend=torch.zeros_like(x[:1])).clamp_(min=0.0).cumsum(dim=0)
-        if self.session and frame.borne is not None:
-            before = frame.borne[2].sum(dim=0)
-            path = path + (before if frame.load_conserving else before * frame.stiffness_n_per_m)
-        return self._softened(x, path.to(x.dtype), frame)
+        return self._softened(x, self._path(x, frame).to(x.dtype), frame)
+
+    def _path(self, x: torch.Tensor, frame: Frame) -> torch.Tensor:
+        """How far the load (T, ..., R, C) has gone up to every frame, earlier recordings included [N]."""
+        if self.peak:
+            path = torch.cummax(x.clamp(min=0.0), dim=0).values
+        else:
+            path = torch.diff(x, dim=0, prepend=torch.zeros_like(x[:1])).clamp_(min=0.0).cumsum(dim=0)
+        if not self.session or frame.borne is None:
+            return path
+        before = frame.borne[0].amax(dim=0) if self.peak else frame.borne[2].sum(dim=0)
+        before = before if frame.load_conserving else before * frame.stiffness_n_per_m
+        return torch.maximum(path, before) if self.peak else path + before

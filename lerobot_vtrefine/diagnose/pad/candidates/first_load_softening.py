@@ -48,6 +48,10 @@ def _by_path(values: np.ndarray, setting: Setting) -> tuple[Stage, ...]:
     return (PathSoftening(float(values[0]), float(np.exp(values[1]) * setting.top_depth_m)),)
 
 
+def _by_peak(values: np.ndarray, setting: Setting) -> tuple[Stage, ...]:
+    return tuple(replace(stage, peak=True) for stage in _by_path(values, setting))
+
+
 def _report_by_path(values: np.ndarray, setting: Setting) -> dict[str, tuple[float, str]]:
     path_m = float(np.exp(values[1]) * setting.top_depth_m)
     return {"softening": (float(values[0]), "1"), "path_m": (path_m, "m")}
@@ -106,5 +110,6 @@ PATH = Form(
     lambda s: [[0.05, float(np.log(share))] for share in (1.0, 4.0)],
     peer=True,
 )
-HERE = (PLAIN, beside_damping(PLAIN), GROWING, FREE, RECOVERING, PATH)
+PEAK = replace(PATH, label="by the largest load so far, under it too", build=_by_peak)
+HERE = (PLAIN, beside_damping(PLAIN), GROWING, FREE, RECOVERING, PATH, PEAK)
 FORMS = (*HERE, *(_through_session(form) for form in HERE))
