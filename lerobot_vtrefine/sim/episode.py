@@ -238,7 +238,7 @@ def _update_grasp(state: EpisodeState, ids: Array, seen: Measured, scene: Scene,
 def in_hand(scene: Scene, held: Array) -> Array:
     """(m,) whether all parts that hands are to take are among those `held` (m, part)."""
     taken = [arm is not None for arm in scene.holders]
-    return held[:, taken].all(1)
+    return np.all(held[:, taken], axis=1)
 
 
 def _update_success(
