@@ -14,7 +14,7 @@ from lerobot_vtrefine.diagnose.pad.candidates import PLAIN
 from lerobot_vtrefine.diagnose.pad.candidates.sample_and_hold import HOLD
 from lerobot_vtrefine.diagnose.pad.fitting import Fit, predict
 from lerobot_vtrefine.diagnose.pad.press_trials import PressSet
-from lerobot_vtrefine.diagnose.pad.rules import SIZES_DIFFER
+from lerobot_vtrefine.diagnose.pad.rules import OWN_SHARE, SIZES_DIFFER
 from lerobot_vtrefine.diagnose.pad.weights import TrialWeights
 from lerobot_vtrefine.tactile.stages.host import Latency
 from lerobot_vtrefine.tactile.stages.readout import BaselineDrift
@@ -42,21 +42,24 @@ def sizes_differ(
 def _differs(
     presses: PressSet, fitted: Fit, weights: Sequence[TrialWeights], name: str, seed: int
 ) -> Suspicion | None:
-    """From recordings' scores for a size of their own, which noise would give either sign in every taxel."""
+    """From recordings' scores for a size of their own, which noise would give either sign in every taxel; None
+    where a recording's gain and touch might be nearly all of it, for these scatter by themselves."""
     rng = np.random.default_rng([seed, 10])
     without = predict(fitted.model.minus(name), presses)
     drawn, scores, information = (np.zeros((len(weights), n)) for n in (FLIPS + 1, 1, 1))
+    whole = 0.0
     pairs = zip(weights, fitted.residuals(presses), fitted.signals, without, strict=True)
     for k, (weight, residual, signal, other) in enumerate(pairs):
         effect = weight.whiten(signal - other)
         along = weight.nuisance @ (weight.coupling @ (weight.nuisance.T @ effect))
         taxels = ((effect - along) * weight.whiten(residual)).reshape(signal.shape).sum(axis=0)
         information[k] = effect @ (effect - along)
+        whole += float(effect @ effect)
         signs = 2.0 * rng.integers(0, 2, (FLIPS + 1, len(taxels)), dtype=np.int8) - 1.0
         signs[0] = 1.0
         drawn[k] = signs @ taxels
     told = information[:, 0] > 1e-6 * information.sum()
-    if told.sum() < 2:
+    if told.sum() < 2 or information.sum() < OWN_SHARE * whole:
         return None
     known, sums = information[told], drawn[told]
     powers = (sums**2 / known).sum(axis=0)
