@@ -42,8 +42,10 @@ def sizes_differ(
 def _differs(
     presses: PressSet, fitted: Fit, weights: Sequence[TrialWeights], name: str, seed: int
 ) -> Suspicion | None:
-    """From recordings' scores for a size of their own, which noise would give either sign in every taxel; None
-    where a recording's gain and touch might be nearly all of it, for these scatter by themselves."""
+    """From recordings' scores for a size of their own, which noise would give either sign in every taxel.
+
+    None where a recording's gain and touch might be nearly all of it, for these scatter by themselves.
+    """
     rng = np.random.default_rng([seed, 10])
     without = predict(fitted.model.minus(name), presses)
     drawn, scores, information = (np.zeros((len(weights), n)) for n in (FLIPS + 1, 1, 1))

@@ -67,7 +67,7 @@ SIZES_DIFFER = 0.25
 """Deviation of a cause's size between recordings, in parts of it: other forms than the sensor's leave up to a
 sixth, borrowed names a third and more."""
 OWN_SHARE = 0.25
-"""Part of a cause's effect that a recording's gain and touch must leave, for its size to be told from theirs."""
+"""Part of a cause's effect that a recording's own gain and touch must leave: else its size is theirs."""
 
 # What is left repeats with the command.
 REPEATABLE_SHARE = 0.15
