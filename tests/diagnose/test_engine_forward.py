@@ -84,15 +84,12 @@ def test_a_supply_that_lags_is_built_with_its_lag() -> None:
     )
 
 
-def test_forms_with_two_sides_and_yielding_covers_are_built_as_fitted() -> None:
+def test_leakage_to_two_sides_is_built_as_fitted() -> None:
     setting = composite(presses()).setting
     build = {form.label: form.build for form in CATALOGUE}
     (leaks,) = build["to the next taxels, more to one side"](np.array([0.1, 0.04, 0.05, 0.2]), setting)
     assert (leaks.row, leaks.col) == (0.1, 0.2)
     assert (leaks.row_side, leaks.col_side) == pytest.approx((0.6, -0.75))
-    (yields,) = build["hyperbola, beside damping"](np.array([0.5]), setting)
-    assert yields.elastic
-    assert yields.yielding * setting.top_depth_m == pytest.approx(0.5e-3)
 
 
 def test_all_forms_at_once_and_maps() -> None:

@@ -24,8 +24,6 @@ from lerobot_vtrefine.tactile.stages.signals import followed, low_passed
 
 REFERENCE_DEPTH_M = 1e-3
 """Depth at which a non-linear stiffness equals the linear one [m]."""
-LEAST_YIELD = 0.02
-"""Part of the linear law's depth at which a hyperbola is cut off before its pole."""
 
 
 @register
@@ -36,24 +34,18 @@ class NonlinearStiffness(CoverLaw):
     For a linear contact law this is k d_ref (d / d_ref)^exponent. Where the taxels' sum is the load itself,
     the sum is kept and only its distribution changes. With `share` below 1 only that part of the force
     follows the power law, as in k (d + c d^3).
-
-    `yielding` divides by 1 + yielding f / f_ref: a hyperbola that levels off (Kondner 1963), or one that
-    bottoms out where it is negative.
     """
 
     name: ClassVar[str] = "nonlinear_stiffness"
     rank: ClassVar[int] = 30
     exponent: float = parameter(1.0, "1", 0.8, 1.6, minimum=1e-3, maximum=10.0)
     share: float = parameter(1.0, "1", 1.0, 1.0, maximum=1.0)
-    yielding: float = parameter(0.0, "1", 0.0, 0.0, minimum=None)
 
     @override
     def step(self, x: torch.Tensor, state: State, frame: Frame) -> tuple[torch.Tensor, State]:
         reference = frame.stiffness_n_per_m * REFERENCE_DEPTH_M
-        load = x.clamp(min=0.0)
-        bent = load + self.share * (reference * (load / reference) ** self.exponent - load)
-        if isinstance(self.yielding, torch.Tensor) or self.yielding != 0.0:
-            bent = bent / (1.0 + self.yielding * load / reference).clamp(min=LEAST_YIELD)
+        bent = reference * (x.clamp(min=0.0) / reference) ** self.exponent
+        bent = x.clamp(min=0.0) + self.share * (bent - x.clamp(min=0.0))
         if not frame.load_conserving:
             return bent, state
         before, after = (image.sum(dim=(-2, -1), keepdim=True) for image in (x, bent))

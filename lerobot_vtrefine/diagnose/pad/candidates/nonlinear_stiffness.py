@@ -34,23 +34,6 @@ def _report_bottoming(values: np.ndarray, setting: Setting) -> dict[str, tuple[f
     return {"exponent": (exponent, "1"), "knee_m": (knee * top_m, "m"), "stiffening": (1.0 + more, "1")}
 
 
-def _hyperbola(values: np.ndarray, setting: Setting) -> tuple[Stage, ...]:
-    """Of what the springs bear alone: of the whole force it would be one law of the readings' saturation.
-
-    The coordinate is how far the deepest press is divided beyond one.
-    """
-    yielding = float(values[0]) * REFERENCE_DEPTH_M / setting.top_depth_m
-    return (NonlinearStiffness(yielding=yielding, elastic=True),)
-
-
-def _report_hyperbola(values: np.ndarray, setting: Setting) -> dict[str, tuple[float, str]]:
-    yielding = float(values[0])
-    return {
-        "exponent": (1.0 / (1.0 + yielding), "1"),
-        "yielding_per_m": (yielding / setting.top_depth_m, "1/m"),
-    }
-
-
 POWER = Form(
     "nonlinear_stiffness",
     "power law",
@@ -64,24 +47,9 @@ POWER = Form(
     needs="press to three depths or more, the deepest well beyond the others, with depth_m logged",
     possible=lambda s: not s.loaded,
 )
-HYPERBOLA = Form(
-    "nonlinear_stiffness",
-    "hyperbola, beside damping",
-    (Value("yielding", -0.8, 6.0, 2e-3),),
-    _hyperbola,
-    _report_hyperbola,
-    lambda s: [[0.05]],
-    possible=lambda s: not s.loaded,
-    signed=True,
-    peer=True,
-    screened=False,
-    # With the power law's slope at the deepest press.
-    grown=lambda v, s: [1.0 / (1.0 + float(v[0])) - 1.0],
-)
 FORMS = (
     POWER,
     beside_damping(POWER),
-    HYPERBOLA,
     Form(
         "nonlinear_stiffness",
         "linear plus power law",
