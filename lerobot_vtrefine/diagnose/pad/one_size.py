@@ -34,7 +34,7 @@ def sizes_differ(
     """
     names = [name for name in fitted.model.families if name in PLAIN and name not in DRAWN_ANEW]
     if any(isinstance(stage, BaselineDrift) and not stage.anew for stage in fitted.model.stages()):
-        names.remove(BaselineDrift.name)
+        names = [name for name in names if name != BaselineDrift.name]
     found = [_differs(presses, fitted, weights, name, seed) for name in names]
     return [item for item in found if item is not None]
 
@@ -48,7 +48,7 @@ def _differs(
     """
     rng = np.random.default_rng([seed, 10])
     without = predict(fitted.model.minus(name), presses)
-    drawn, scores, information = (np.zeros((len(weights), n)) for n in (FLIPS + 1, 1, 1))
+    drawn, scores, information = np.zeros((len(weights), FLIPS + 1)), *np.zeros((2, len(weights)))
     whole = 0.0
     pairs = zip(weights, fitted.residuals(presses), fitted.signals, without, strict=True)
     for k, (weight, residual, signal, other) in enumerate(pairs):
@@ -60,13 +60,13 @@ def _differs(
         signs = 2.0 * rng.integers(0, 2, (FLIPS + 1, len(taxels)), dtype=np.int8) - 1.0
         signs[0] = 1.0
         drawn[k] = signs @ taxels
-    told = information[:, 0] > 1e-6 * information.sum()
+    told = information > 1e-6 * information.sum()
     if told.sum() < 2 or information.sum() < OWN_SHARE * whole:
         return None
     known, sums = information[told], drawn[told]
-    powers = (sums**2 / known).sum(axis=0)
-    scores[told] = sums[:, :1] ** 2 / known
+    powers = (sums**2 / known[:, None]).sum(axis=0)
+    scores[told] = sums[:, 0] ** 2 / known
     freedom = float(known.sum() - (known**2).sum() / known.sum())
     scatter = float(np.sqrt(max(powers[0] - powers[1:].mean(), 0.0) / freedom))
     clue = f"the size of {name} differs from recording to recording by {100 * scatter:.0f} %"
-    return Suspicion(0, clue, scatter, SIZES_DIFFER, scores[:, 0], drawn=powers)
+    return Suspicion(0, clue, scatter, SIZES_DIFFER, scores, drawn=powers)
