@@ -375,7 +375,7 @@ def rows(options: argparse.Namespace, policy: Trained, table: str) -> list[tuple
 def failures(judged: dict[str, Any]) -> dict[str, float]:
     """Shares of an evaluation's episodes: both parts picked up, and what ended those that failed."""
     shares = {
-        f"failed_{name.replace(' ', '_')}": count / judged["episodes"]
+        f"failed_{name.replace(' ', '_').replace('-', '_')}": count / judged["episodes"]
         for name, count in judged["failures"].items()
     }
     if judged["picked_up"] is not None:

@@ -89,7 +89,11 @@ class StartBank:
         )
 
     def start(self, sim: "InsertionSim", ids: Array, seeds: Array) -> None:
-        """Put worlds ``ids`` where their seeds (m,) start: in place of ``sim.reset``."""
+        """Put worlds ``ids`` where their seeds (m,) start: in place of ``sim.reset``.
+
+        Raises:
+            ValueError: the states lack something that episodes remember today.
+        """
         rows = self.chosen(np.asarray(seeds, np.int64))
         sim.set_state(ids, _filled(STATE, sim.get_state(int(ids[0])), self.leaves, rows))
 
@@ -137,4 +141,11 @@ def _filled(path: str, like: Any, leaves: dict[str, Array], rows: Array) -> Any:
         return {name: _filled(f"{path}/{name}", item, leaves, rows) for name, item in like.items()}
     if isinstance(like, tuple):
         return tuple(_filled(f"{path}/{index}", item, leaves, rows) for index, item in enumerate(like))
-    return None if like is None else leaves[path][rows]
+    if like is None:
+        return None
+    if path not in leaves:
+        raise ValueError(
+            f"--env.start_bank: its states lack {path}, so another version recorded them; make the bank anew"
+            " with vtrefine-record-starts"
+        )
+    return leaves[path][rows]

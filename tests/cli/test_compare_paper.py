@@ -55,6 +55,10 @@ def test_policies_become_rows_of_both_tables_and_are_not_made_twice(
     assert paper["without pre-training"].iterations == 20
     assert paper["imitation"].extra["peak_force_n"] == 8.0
     assert (paper[""].extra["picked_up"], paper[""].extra["failed_dropped"]) == (0.75, 0.25)
+    told = script.failures(
+        {"episodes": 4, "picked_up": None, "failures": {"time-out": 1, "in-hand shift": 2}}
+    )
+    assert told == {"failed_time_out": 0.25, "failed_in_hand_shift": 0.5}  # as vtrefine-finetune's columns
     assert set(fewer) == {"30 demonstrations, imitation", "30 demonstrations"}
     shown = table("paper", [*paper.values()])
     assert "| DPPO after imitation | automate/00186 | - | 72 | 75 [41, 93] | 94 | - | +22 |" in shown

@@ -193,6 +193,19 @@ def test_what_is_no_bank_is_refused_and_what_does_not_matter_is_not(
         StartBank.load(picked.start_bank, dataclasses.replace(picked, episode_steps=latest))
 
 
+def test_a_bank_that_another_version_recorded_is_refused_in_one_line(
+    picked: VtRefineEnvConfig, tmp_path: Path
+):
+    assert picked.start_bank is not None
+    bank = StartBank.load(picked.start_bank, picked)
+    bank.leaves.pop("state/episode/picked_up")
+    older = dataclasses.replace(picked, start_bank=tmp_path / "older.npz")
+    bank.save(older.start_bank)
+    episodes = make_episodes(older, 1)
+    with pytest.raises(ValueError, match=r"lack state/episode/picked_up.*make the bank anew"):
+        episodes.reset(episodes.ids, FIRST_SEED + episodes.ids)
+
+
 def test_notes_of_recordings_tell_banks_apart(picked: VtRefineEnvConfig):
     noted = simulation_settings(picked)
     assert len(noted["start_bank"]) == 64
