@@ -9,6 +9,8 @@ GREY: Rgba = (0.42, 0.44, 0.47, 1.0)
 PAD: Rgba = (0.10, 0.55, 0.53, 1.0)
 PLUG_COLOUR: Rgba = (0.93, 0.47, 0.13, 1.0)
 SOCKET_COLOUR: Rgba = (0.16, 0.38, 0.72, 1.0)
+UNSEEN: Rgba = (0.0, 0.0, 0.0, 0.0)
+"""Neither drawn nor seen by the depth camera."""
 
 
 def add_appearance(spec: mujoco.MjSpec) -> None:

@@ -45,8 +45,9 @@ class DepthCamera:
         self._workers = Workers(num_threads if device == "cpu" else 1)
         self._camera, self._device = camera, device
         moving = model.body_weldid[model.geom_bodyid] != 0
-        self._moving = _solids(model, np.flatnonzero(moving), device)
-        self._static = _solids(model, np.flatnonzero(~moving), device)
+        seen = model.geom_rgba[:, 3] > 0
+        self._moving = _solids(model, np.flatnonzero(moving & seen), device)
+        self._static = _solids(model, np.flatnonzero(~moving & seen), device)
         self._everyone = torch.arange(num_envs, dtype=torch.int32, device=device)
         self.position = np.tile(camera.position_m, (num_envs, 1))
         """(N, 3) cameras' positions [m]."""

@@ -4,6 +4,7 @@ from pathlib import Path
 
 import numpy as np
 
+from lerobot_vtrefine.sim.hulls import small_hull
 from lerobot_vtrefine.sim.meshes import MeshPair, MeshPart, load_mesh_pair
 from lerobot_vtrefine.sim.parts import Grip, Part, PartPair
 from lerobot_vtrefine.tactile.geometry import ConvexHull, TriangleMesh
@@ -43,8 +44,16 @@ def _part(part: MeshPart, middle_z_m: float, span_m: tuple[float, float]) -> Par
     grip = Grip((float(centre[0]), float(centre[1]), middle_z_m), (float(half[0]), float(half[1]), half_z))
     pieces = tuple(ConvexHull(hull.vertices, hull.faces) for hull in part.pieces)
     return Part(
-        pieces, grip, rest_height_m=-_height(part)[0], surface=TriangleMesh(part.vertices, part.faces)
+        pieces,
+        grip,
+        rest_height_m=-_height(part)[0],
+        foot=_foot(part) if len(pieces) > 1 else None,
+        surface=TriangleMesh(part.vertices, part.faces),
     )
+
+
+def _foot(part: MeshPart) -> ConvexHull:
+    return ConvexHull(*small_hull(np.concatenate([hull.vertices for hull in part.pieces])))
 
 
 def _height(part: MeshPart) -> tuple[float, float]:

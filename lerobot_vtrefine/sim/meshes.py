@@ -25,6 +25,7 @@ import numpy as np
 from numpy.typing import NDArray
 from tqdm import tqdm
 
+from lerobot_vtrefine.sim.hulls import small_hull
 from lerobot_vtrefine.sim.mesh_fit import MeshFit, measure_fit
 
 Array = NDArray[np.float64]
@@ -217,7 +218,7 @@ def _load_part(path: Path) -> MeshPart:
     unit = raw_unit_m(mesh.extents, path)
     vertices, faces = np.asarray(mesh.vertices, float) * unit, np.asarray(mesh.faces, np.int64)
     arrays = _cached(_pieces_key(path), lambda: _decompose(vertices, faces))
-    hulls = (Hull(arrays[f"vertices_{i}"], arrays[f"faces_{i}"]) for i in range(len(arrays) // 2))
+    hulls = (Hull(*small_hull(arrays[f"vertices_{i}"])) for i in range(len(arrays) // 2))
     return MeshPart(vertices, faces, tuple(hulls))
 
 

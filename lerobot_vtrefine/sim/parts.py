@@ -8,7 +8,7 @@ assembled (`seated_z_m` = 0).
 from dataclasses import dataclass
 
 from lerobot_vtrefine.sim.profiles import Primitive
-from lerobot_vtrefine.tactile.geometry import TriangleMesh
+from lerobot_vtrefine.tactile.geometry import ConvexHull, TriangleMesh
 
 
 @dataclass(frozen=True)
@@ -28,6 +28,9 @@ class Part:
     grip: Grip
     rest_height_m: float
     """Height of the part's origin above the table when it stands upright."""
+    foot: ConvexHull | None = None
+    """What the table touches in place of the pieces: the hull of them all, which meets a plane where they do.
+    Twenty pieces that stand on a table are sixty contacts, their hull is four."""
     surface: TriangleMesh | None = None
     """Exact surface for touch, where the pieces only approximate it."""
 

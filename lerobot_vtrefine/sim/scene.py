@@ -7,7 +7,7 @@ import mujoco
 import numpy as np
 
 from lerobot_vtrefine.embodiments import Embodiment, get_embodiment
-from lerobot_vtrefine.sim.appearance import PLUG_COLOUR, SOCKET_COLOUR, Rgba, add_appearance
+from lerobot_vtrefine.sim.appearance import PLUG_COLOUR, SOCKET_COLOUR, UNSEEN, Rgba, add_appearance
 from lerobot_vtrefine.sim.arms import add_arms
 from lerobot_vtrefine.sim.camera import Camera, make_camera
 from lerobot_vtrefine.sim.config import SceneConfig
@@ -16,7 +16,7 @@ from lerobot_vtrefine.sim.pairs import load_pair
 from lerobot_vtrefine.sim.parts import Part, PartPair
 from lerobot_vtrefine.sim.profiles import Primitive
 from lerobot_vtrefine.sim.rotations import matrix_to_quat
-from lerobot_vtrefine.tactile.geometry import Box, Cylinder
+from lerobot_vtrefine.tactile.geometry import Box, ConvexHull, Cylinder
 
 __all__ = ["Scene", "SceneConfig", "build_scene"]
 
@@ -224,7 +224,20 @@ def _add_part(
         geom.friction = [config.part_friction, 0.002, 0.0001]
         geom.solref = [2 * config.timestep_s, 1.0]
         geom.density = config.part_density
+    if part.foot is not None:
+        _stand_on(spec, body, part.foot)
     _raise_mass(spec, body)
+
+
+def _stand_on(spec: mujoco.MjSpec, body: mujoco.MjsBody, foot: ConvexHull) -> None:
+    """The table meets this hull in place of the part's pieces. It weighs nothing, and nobody sees it."""
+    pieces = list(body.geoms)
+    geom = _add_piece(spec, body, f"{body.name}_foot", foot)
+    geom.contype, geom.conaffinity = 0, TABLE
+    geom.condim, geom.friction, geom.solref = pieces[0].condim, pieces[0].friction, pieces[0].solref
+    geom.density, geom.rgba = 0.0, UNSEEN
+    for piece in pieces:
+        piece.conaffinity &= ~TABLE
 
 
 def _add_piece(spec: mujoco.MjSpec, body: mujoco.MjsBody, name: str, piece: Primitive) -> mujoco.MjsGeom:

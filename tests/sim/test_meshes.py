@@ -10,7 +10,9 @@ import numpy as np
 import pytest
 
 from lerobot_vtrefine.sim import meshes
+from lerobot_vtrefine.sim.camera import Camera
 from lerobot_vtrefine.sim.config import SceneConfig
+from lerobot_vtrefine.sim.depth import DepthCamera
 from lerobot_vtrefine.sim.meshes import MeshPair, load_mesh_pair, mesh_ids
 from lerobot_vtrefine.sim.scene import build_scene
 
@@ -122,7 +124,7 @@ def test_ring_slides_over_the_post_and_not_through_it(ring: MeshPair) -> None:
 def test_scene_is_built_with_grips_clear_of_each_other(folder: Path, ring: MeshPair) -> None:
     scene = build_scene(SceneConfig(pair="automate/ring", mesh_dir=folder, mesh_scale="unit"))
     pieces = [len(part.pieces) for part in (ring.plug, ring.socket)]
-    assert len(scene.addresses.part_geoms) == sum(pieces)
+    assert len(scene.addresses.part_geoms) == sum(pieces) + 2  # a hull each for the table
     plug, socket = scene.pair.plug, scene.pair.socket
     # The foot is held below the seated ring; the ring, which nowhere stands above the post, by its height.
     assert socket.grip.centre_m[2] + socket.grip.half_size_m[2] <= RING_BOTTOM_M + 1e-6
@@ -264,3 +266,44 @@ def _push_in(pair: MeshPair, offset_m: float) -> float:
         data.ctrl[0] = max(0.0, start - 0.04 * step * model.opt.timestep)
         mujoco.mj_step(model, data)
     return float(data.qpos[2])
+
+
+def test_parts_stand_on_their_hulls(folder: Path) -> None:
+    """A plane meets a hull where it meets its pieces: the ring stands as high, on few contacts."""
+    scene = build_scene(SceneConfig(pair="automate/ring", mesh_dir=folder, mesh_scale="unit"))
+    model, data = scene.model, mujoco.MjData(scene.model)
+    at = scene.addresses
+    for part, qpos, x in ((scene.pair.plug, at.plug_qpos, 0.3), (scene.pair.socket, at.socket_qpos, -0.3)):
+        data.qpos[qpos] = [x, 0.0, part.rest_height_m + 1e-4, 1.0, 0.0, 0.0, 0.0]
+    for _ in range(200):
+        mujoco.mj_step(model, data)
+    heights = data.qpos[at.plug_qpos][2], data.qpos[at.socket_qpos][2]
+    np.testing.assert_allclose(heights, (-RING_BOTTOM_M, 0.0), atol=2e-4)
+    parts = np.isin(data.contact.geom[: data.ncon], at.part_geoms).any(axis=1)
+    touching = {model.geom(geom).name for geom in data.contact.geom[: data.ncon][parts].ravel()}
+    assert touching == {"table", "plug_foot", "socket_foot"}
+    assert parts.sum() <= 8
+    assert model.geom("plug_foot").contype == 0
+    assert scene.model.body("plug").mass[0] == pytest.approx(0.04)  # the hull weighs nothing
+
+
+def test_cameras_see_through_the_ring(folder: Path) -> None:
+    """The hull that stands on the table would close the hole."""
+    scene = build_scene(SceneConfig(pair="automate/ring", mesh_dir=folder, mesh_scale="unit"))
+    data = mujoco.MjData(scene.model)
+    data.qpos[scene.addresses.plug_qpos] = [0.4, 0.0, 0.2 - RING_BOTTOM_M, 1.0, 0.0, 0.0, 0.0]
+    data.qpos[scene.addresses.socket_qpos] = [-0.4, 0.4, 0.0, 1.0, 0.0, 0.0, 0.0]
+    mujoco.mj_kinematics(scene.model, data)
+    above = Camera(
+        position_m=np.array([0.4, 0.0, 0.5]),
+        rotation=np.diag([1.0, -1.0, -1.0]),
+        width=3,
+        height=3,
+        fx=500.0,
+        fy=500.0,
+        cx=1.0,
+        cy=1.0,
+    )
+    depth = DepthCamera(scene.model, above, 1)
+    seen = depth.render(np.zeros(1, int), data.geom_xpos[None], data.geom_xmat.reshape(1, -1, 3, 3))
+    assert seen[0, 1, 1] == pytest.approx(0.5, abs=1e-3)
