@@ -13,6 +13,7 @@ from lerobot_vtrefine.sim.expert import ScriptedExpert
 from lerobot_vtrefine.sim.simulation import InsertionSim
 
 mjw = pytest.importorskip("mujoco_warp")
+warp_solve = pytest.importorskip("lerobot_vtrefine.sim.backends.warp_solve")
 pytestmark = pytest.mark.timeout(900)  # whichever test comes first compiles everything
 
 WORLDS = np.arange(3)
@@ -137,6 +138,36 @@ def test_the_solution_is_mujoco_warps_own_with_sliding_contacts(touching, shake)
     np.testing.assert_allclose(own_qacc, qacc, atol=2e-5 * np.abs(qacc).max())
     np.testing.assert_allclose(own_forces, forces, atol=2e-5 * np.abs(forces).max())
     assert (own_states != states).mean() < 0.01
+
+
+@pytest.mark.parametrize("threads", [32, 64, 128])
+def test_threads_that_share_a_world_solve_as_one_does(touching, threads, monkeypatch):
+    """As a GPU's do: here they take turns."""
+    truth, sim = touching
+    data, found, blocks = sim._backend.worlds.data, [], []
+    qpos, qvel = truth._backend.read(WORLDS)
+    shaken = qvel + np.random.default_rng(0).normal(0, 0.5, qvel.shape)
+    launch = wp.launch_tiled
+
+    def watched(kernel, **options):
+        blocks.append(options["block_dim"])
+        launch(kernel, **options)
+
+    monkeypatch.setattr(warp_solve, "THREADS", threads)
+    for together in (False, True):
+        monkeypatch.setattr(wp.config, "enable_cpu_blocks", together)
+        sim._backend.write(WORLDS, qpos, shaken)
+        with wp.ScopedDevice("cpu"), monkeypatch.context() as patched:
+            data.ctrl.assign(truth._episode.command)
+            patched.setattr(warp_solve.wp, "launch_tiled", watched)
+            sim._backend.worlds.step()
+        found.append((data.solver_niter.numpy(), data.qacc.numpy(), data.efc.force.numpy()))
+    (steps, qacc, forces), (own_steps, own_qacc, own_forces) = found
+    assert {1, threads} <= set(blocks)
+    np.testing.assert_allclose(own_steps, steps, atol=1)
+    np.testing.assert_allclose(own_qacc, qacc, atol=2e-5 * np.abs(qacc).max())
+    rows = np.arange(data.njmax) < data.nefc.numpy()[:, None]
+    np.testing.assert_allclose(own_forces[rows], forces[rows], atol=2e-5 * np.abs(forces[rows]).max())
 
 
 def test_other_sensors_are_refused():

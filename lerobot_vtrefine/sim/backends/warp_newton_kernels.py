@@ -4,10 +4,12 @@ One block of threads per world, from the warm start to the solution: worlds that
 the others waiting, and nothing waits for launches. Steps, line search and the criteria for stopping are those
 of `mujoco_warp.solve` for elliptic cones and a dense Jacobian.
 
+Everything is a plain loop, called from one place: the machine code must stay small. That of tiles' Cholesky
+decomposition and of functions that are called twice is unrolled and inlined to 260 kB, more than the caches
+for instructions hold.
+
 Shape legend: N worlds, nv velocities, G groups of threads that each take a part of the rows.
 """
-
-import functools
 
 import warp as wp
 
@@ -17,6 +19,8 @@ wp.set_module_options({"enable_backward": False})
 
 ROUNDING = wp.constant(9.5e-7)
 """Sums of a hundred float32 are off by about so much of what they are made of."""
+APART = wp.constant(32)
+"""Threads of a warp."""
 REGISTERS = 128
 """Of a thread on a GPU: eight blocks then run beside each other on a multiprocessor."""
 LEAST_SLOPE = wp.constant(1.0e-6)
@@ -51,7 +55,7 @@ class Motion:
 @wp.struct
 class Search:
     """The solver's own memory: gradient, direction and M direction (N, nv), partial sums (N, G, nv) of the
-    constraint forces and (N, G, nv, nv) of the Hessian.
+    constraint forces and (N, G, nv, nv + 1) of the Hessian, with room for the right side of an equation.
     """
 
     gradient: wp.array(dtype=float, ndim=2)
@@ -78,10 +82,34 @@ def wait() -> None:
     ...
 
 
-@wp.func
+SUM = """
+#if defined(__CUDA_ARCH__)
+    constexpr int width = 32;
+    for (int k = 0; k < 4; ++k)
+        for (int offset = width / 2; offset > 0; offset /= 2)
+            value[k] += __shfl_xor_sync(0xffffffff, value[k], offset);
+#else
+    constexpr int width = 1;
+#endif
+    wp::wp_block_shared<float[WP_TILE_BLOCK_DIM / width][4]> shared;
+    for (int k = 0; k < 4; ++k)
+        (*shared)[WP_TILE_THREAD_IDX / width][k] = value[k];
+    WP_TILE_SYNC();
+    value = {};
+    for (int part = 0; part < WP_TILE_BLOCK_DIM / width; ++part)
+        for (int k = 0; k < 4; ++k)
+            value[k] += (*shared)[part][k];
+    WP_TILE_SYNC();
+    return value;
+"""
+
+
+@wp.func_native(snippet=SUM)
 def total(value: wp.vec4) -> wp.vec4:
-    """Sum over the threads of a block."""
-    return wp.tile_reduce(wp.add, wp.tile(value, preserve_type=True))[0]
+    """Sum over the threads of a block, to the last bit the same for all of them; a third of the machine code
+    of `wp.tile_reduce`. Blocks are whole warps.
+    """
+    ...
 
 
 @wp.func
@@ -168,26 +196,26 @@ def line_search(
     """Where the slope is below `flat`, by Newton's method within a bracket; returns the step and its gain,
     zeros where there is nothing to gain.
     """
-    point = cost(world, lane, count, 0.0, smooth, rows, cones)
-    enough = wp.max(flat, ROUNDING * point[3])
     best = wp.vec2(0.0, 0.0)
-    if wp.abs(point[1]) < ROUNDING * point[3]:
-        return best
+    least = float(0.0)
     low = float(0.0)
     high = float(-1.0)
-    step = -point[1] / wp.max(point[2], MIN_TRACE)
-    for index in range(most):
+    step = float(0.0)
+    for index in range(most + 1):
         point = cost(world, lane, count, step, smooth, rows, cones)
+        if index == 0:
+            least = ROUNDING * point[3]
         if point[0] < -best[1]:
             best = wp.vec2(step, -point[0])
-        if wp.abs(point[1]) < enough:
+        if wp.abs(point[1]) < least:
             break
+        least = wp.max(least, flat)
         if point[1] < 0.0:
             low = step
         else:
             high = step
         after = step - point[1] / wp.max(point[2], MIN_TRACE)
-        if high > 0.0 and (after <= low or after >= high or index % 4 == 3):
+        if high > 0.0 and (after <= low or after >= high or index % 4 == 0):
             after = 0.5 * (low + high)
         if after == step:
             break
@@ -241,7 +269,7 @@ def descend(
 def bend(
     world: int, lane: int, count: int, search: Search, rows: Rows, cones: Cones, inertia: Inertia
 ) -> None:
-    """The Hessian's upper triangle, as G matrices that add up to it."""
+    """The Hessian's upper triangle: the sum of what G groups of threads find, in place of the first."""
     lanes = wp.block_dim()
     groups = search.hessian.shape[1]
     nv = search.hessian.shape[2]
@@ -264,9 +292,53 @@ def bend(
                 if i + a < nv and j + b < nv:
                     search.hessian[world, group, i + a, j + b] = sums[a, b]
     wait()
+    for item in range(lane, nv * nv, lanes):
+        row = item // nv
+        column = item % nv
+        for group in range(1, groups):
+            search.hessian[world, 0, row, column] += search.hessian[world, group, row, column]
+    wait()
     for entry in range(lane, inertia.row.shape[0], lanes):
         search.hessian[world, 0, inertia.col[entry], inertia.row[entry]] += inertia.values[world, entry]
     wait()
+
+
+@wp.func
+def aim(world: int, lane: int, search: Search) -> wp.vec2:
+    """The direction, which solves H direction = -gradient; returns its squared length and its product with
+    the negative gradient.
+
+    By elimination, H = U' D^-1 U with D the diagonal of U, in place of H's upper triangle: a thread has a
+    column, of every so many rows, and waits once for each row.
+    """
+    lanes = wp.block_dim()
+    nv = search.gradient.shape[1]
+    matrix = search.hessian[world, 0]
+    direction = search.direction[world]
+    for dof in range(lane, nv, lanes):
+        matrix[dof, nv] = -search.gradient[world, dof]
+    stripe = wp.min(lanes, APART)
+    for pivot in range(nv):
+        wait()
+        for column in range(pivot + 1 + lane % stripe, nv + 1, stripe):
+            share = matrix[pivot, column] / matrix[pivot, pivot]
+            for row in range(pivot + 1 + lane // stripe, wp.min(column + 1, nv), lanes // stripe):
+                matrix[row, column] -= share * matrix[pivot, row]
+    for index in range(nv):
+        wait()
+        pivot = nv - 1 - index
+        solved = matrix[pivot, nv] / matrix[pivot, pivot]
+        for row in range(lane, pivot, lanes):
+            matrix[row, nv] -= solved * matrix[row, pivot]
+        if lane == 0:
+            direction[pivot] = solved
+    wait()
+    sums = wp.vec4(0.0)
+    for dof in range(lane, nv, lanes):
+        along = direction[dof]
+        sums += wp.vec4(along * along, -along * search.gradient[world, dof], 0.0, 0.0)
+    sums = total(sums)
+    return wp.vec2(sums[0], sums[1])
 
 
 def patches(nv: int) -> int:
@@ -275,55 +347,42 @@ def patches(nv: int) -> int:
     return side * (side + 1) // 2
 
 
-@functools.cache
-def newton_kernel(nv: int, groups: int) -> wp.Kernel:
-    """The kernel for so many velocities and groups of threads; a block of threads per world."""
-
-    @wp.kernel(module="unique", enable_backward=False, grid_stride=False, cuda_max_registers=REGISTERS)
-    def newton(
-        limits: Limits, motion: Motion, search: Search, rows: Rows, cones: Cones, inertia: Inertia
-    ) -> None:
-        world, lane = wp.tid()
-        count = wp.min(rows.count[world], rows.residual.shape[1])
-        enough = limits.tolerance[world % limits.tolerance.shape[0]]
-        line = enough * limits.line_tolerance[world % limits.line_tolerance.shape[0]]
-        scale = begin(world, lane, count, motion, rows, cones, inertia)
-        done = bool(False)
-        length = float(0.0)
-        steps = int(0)
-        for index in range(limits.steps + 1):
+@wp.kernel(module="unique", enable_backward=False, grid_stride=False, cuda_max_registers=REGISTERS)
+def newton(
+    limits: Limits, motion: Motion, search: Search, rows: Rows, cones: Cones, inertia: Inertia
+) -> None:
+    """All steps; a block of threads per world."""
+    world, lane = wp.tid()
+    count = wp.min(rows.count[world], rows.residual.shape[1])
+    enough = limits.tolerance[world % limits.tolerance.shape[0]]
+    line = enough * limits.line_tolerance[world % limits.line_tolerance.shape[0]]
+    scale = begin(world, lane, count, motion, rows, cones, inertia)
+    done = bool(False)
+    length = float(0.0)
+    steps = int(0)
+    for index in range(limits.steps + 1):
+        wait()
+        gained = wp.vec2(0.0)
+        if index > 0:
+            smooth = slopes(world, lane, count, motion, search, rows)
             wait()
-            gained = wp.vec2(0.0)
-            if index > 0:
-                smooth = slopes(world, lane, count, motion, search, rows)
-                wait()
-                flat = wp.max(line * length / scale, LEAST_SLOPE)
-                gained = line_search(world, lane, count, flat, limits.line_steps, smooth, rows, cones)
-                take(world, lane, count, gained[0], motion, search, rows)
-                steps = index
-                wait()
-            square = descend(world, lane, count, motion, search, rows, cones)
-            if index > 0:
-                gain = scale * gained[1]
-                done = gained[0] == 0.0 or (gain > 0.0 and gain < enough) or scale * wp.sqrt(square) < enough
-            if done or index == limits.steps:
-                break
-            bend(world, lane, count, search, rows, cones, inertia)
-            hessian = wp.tile_load(search.hessian[world, 0], shape=(nv, nv))
-            for group in range(1, groups):
-                hessian += wp.tile_load(search.hessian[world, group], shape=(nv, nv))
-            wp.tile_cholesky_inplace(hessian, fill_mode="upper")
-            gradient = wp.tile_load(search.gradient[world], shape=nv)
-            direction = wp.tile_cholesky_solve(hessian, gradient, fill_mode="upper")
-            length = wp.sqrt(wp.tile_sum(wp.tile_map(wp.mul, direction, direction))[0])
-            expected = wp.tile_sum(wp.tile_map(wp.mul, direction, gradient))[0]
-            if index > 0 and scale * 0.5 * expected < enough:
-                break
-            wp.tile_store(search.direction[world], wp.tile_map(wp.neg, direction))
+            flat = wp.max(line * length / scale, LEAST_SLOPE)
+            gained = line_search(world, lane, count, flat, limits.line_steps, smooth, rows, cones)
+            take(world, lane, count, gained[0], motion, search, rows)
+            steps = index
             wait()
-            for dof in range(lane, nv, wp.block_dim()):
-                search.pushed[world, dof] = product(world, dof, search.direction, inertia)
-        if lane == 0:
-            limits.count[world] = steps
-
-    return newton
+        square = descend(world, lane, count, motion, search, rows, cones)
+        if index > 0:
+            gain = scale * gained[1]
+            done = gained[0] == 0.0 or (gain > 0.0 and gain < enough) or scale * wp.sqrt(square) < enough
+        if done or index == limits.steps:
+            break
+        bend(world, lane, count, search, rows, cones, inertia)
+        aimed = aim(world, lane, search)
+        length = wp.sqrt(aimed[0])
+        if index > 0 and scale * 0.5 * aimed[1] < enough:
+            break
+        for dof in range(lane, motion.qacc.shape[1], wp.block_dim()):
+            search.pushed[world, dof] = product(world, dof, search.direction, inertia)
+    if lane == 0:
+        limits.count[world] = steps

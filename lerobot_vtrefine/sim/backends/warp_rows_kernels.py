@@ -51,7 +51,9 @@ class Rows:
 
 @wp.struct
 class Cones:
-    """Contacts (C,): which rows each has, its friction, and the solver's ratio of the impedances."""
+    """Contacts (C,): which rows each has, one after the other, its friction, and the solver's ratio of the
+    impedances.
+    """
 
     row: wp.array(dtype=int, ndim=2)
     dim: wp.array(dtype=int)
@@ -86,25 +88,26 @@ def push_cone(world: int, row: int, contact: int, rows: Rows, cones: Cones) -> N
     n = mu * rows.residual[world, row]
     square = float(0.0)
     for k in range(1, dim):
-        u = cones.friction[contact, k - 1] * rows.residual[world, cones.row[contact, k]]
+        u = cones.friction[contact, k - 1] * rows.residual[world, row + k]
         square += u * u
     t = wp.sqrt(square)
-    if n >= mu * t:
-        for k in range(dim):
-            set_row(world, cones.row[contact, k], 0.0, FREE, rows)
-    elif mu * n + t <= 0.0:
-        for k in range(dim):
-            other = cones.row[contact, k]
-            force = -rows.stiffness[world, other] * rows.residual[world, other]
-            set_row(world, other, force, QUADRATIC, rows)
-    else:
+    state = zone(n, t, mu)
+    pull = float(0.0)
+    if state == SLIDING:
         pull = rows.stiffness[world, row] / wp.max(mu * mu * (1.0 + mu * mu), TINY) * mu * (mu * t - n)
-        set_row(world, row, pull, SLIDING, rows)
-        for k in range(1, dim):
-            other = cones.row[contact, k]
+    for k in range(dim):
+        other = row + k
+        residual = rows.residual[world, other]
+        force = float(0.0)
+        if state == QUADRATIC:
+            force = -rows.stiffness[world, other] * residual
+        elif state == SLIDING and k == 0:
+            force = pull
+        elif state == SLIDING:
             friction = cones.friction[contact, k - 1]
-            share = friction * friction * rows.residual[world, other] / t
-            set_row(world, other, -pull * share, SLIDING, rows)
+            share = friction * friction * residual / t
+            force = -pull * share
+        set_row(world, other, force, state, rows)
 
 
 @wp.func
@@ -190,13 +193,13 @@ def limit(stiffness: float, residual: float, slope: float, step: float) -> wp.ve
 
 
 @wp.func
-def slide(world: int, contact: int, rows: Rows, cones: Cones) -> wp.vec4:
+def slide(world: int, row: int, contact: int, rows: Rows, cones: Cones) -> wp.vec4:
     """A contact's tangential residuals u and their slopes w: |u|, u along w, u across w, |w|."""
     uu = float(0.0)
     uw = float(0.0)
     ww = float(0.0)
     for k in range(1, cones.dim[contact]):
-        other = cones.row[contact, k]
+        other = row + k
         u = cones.friction[contact, k - 1] * rows.residual[world, other]
         w = cones.friction[contact, k - 1] * rows.slope[world, other]
         uu += u * u
@@ -206,7 +209,7 @@ def slide(world: int, contact: int, rows: Rows, cones: Cones) -> wp.vec4:
     along = uw / wp.max(speed, TINY)
     across = float(0.0)
     for k in range(1, cones.dim[contact]):
-        other = cones.row[contact, k]
+        other = row + k
         u = cones.friction[contact, k - 1] * rows.residual[world, other]
         w = cones.friction[contact, k - 1] * rows.slope[world, other]
         rest = u - along * w / wp.max(speed, TINY)
@@ -227,12 +230,12 @@ def cone(world: int, row: int, contact: int, step: float, rows: Rows, cones: Con
     bottom = wp.vec3(0.0)
     whole = float(0.0)
     for k in range(cones.dim[contact]):
-        other = cones.row[contact, k]
+        other = row + k
         residual = rows.residual[world, other]
         stiffness = rows.stiffness[world, other]
         bottom += quadratic(stiffness, residual, rows.slope[world, other], step)
         whole += stiffness * residual * residual
-    parts = slide(world, contact, rows, cones)
+    parts = slide(world, row, contact, rows, cones)
     before = parts[0]
     along = parts[1]
     across = parts[2] * parts[2]
@@ -310,7 +313,7 @@ def cone_curvature(world: int, row: int, contact: int, i: int, j: int, rows: Row
     p_j = wp.vec4(0.0)
     both = wp.mat44(0.0)
     for k in range(1, cones.dim[contact]):
-        other = cones.row[contact, k]
+        other = row + k
         friction = cones.friction[contact, k - 1]
         u = friction * rows.residual[world, other]
         v_i = friction * rows.quads[world, other, i]

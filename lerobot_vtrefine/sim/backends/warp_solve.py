@@ -14,12 +14,11 @@ def solve(model: mjw.Model, data: mjw.Data) -> None:
     """Constraint forces and accelerations, as `mujoco_warp.solve` finds them by Newton's method for elliptic
     cones and a dense Jacobian.
     """
-    threads = THREADS if wp.get_device().is_cuda else 1
+    threads = THREADS if wp.get_device().is_cuda or wp.config.enable_cpu_blocks else 1
     groups = max(1, threads // newton.patches(model.nv))
-    kernel = newton.newton_kernel(model.nv, groups)
     given = [_limits(model, data), _motion(data), _search(data.nworld, model.nv, groups), _rows(data)]
     given += [_cones(model, data), _inertia(model, data)]
-    wp.launch_tiled(kernel, dim=data.nworld, inputs=given, block_dim=threads)
+    wp.launch_tiled(newton.newton, dim=data.nworld, inputs=given, block_dim=threads)
 
 
 def _limits(model: mjw.Model, data: mjw.Data) -> newton.Limits:
@@ -42,7 +41,7 @@ def _search(worlds: int, nv: int, groups: int) -> newton.Search:
     for name in ("gradient", "direction", "pushed"):
         setattr(search, name, wp.empty((worlds, nv), dtype=float))
     search.force = wp.empty((worlds, groups, nv), dtype=float)
-    search.hessian = wp.empty((worlds, groups, nv, nv), dtype=float)
+    search.hessian = wp.empty((worlds, groups, nv, nv + 1), dtype=float)
     return search
 
 
