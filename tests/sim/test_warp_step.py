@@ -58,7 +58,8 @@ def shapes_near_a_wall(rng, worlds):
         left.geoms, left.ids = wp.zeros(2 * worlds, dtype=wp.vec2i), wp.zeros(2 * worlds, dtype=wp.vec2i)
         left.world = wp.zeros(2 * worlds, dtype=int)
         poses = [wp.array(pos, dtype=wp.vec3), wp.array(rot, dtype=wp.mat33)]
-        inputs = [_shapes(mjw.put_model(model)), *poses, given, left]
+        idle = wp.zeros(worlds, dtype=int)
+        inputs = [_shapes(mjw.put_model(model)), *poses, idle, given, left]
         wp.launch(kernels.drop_separated, 2 * worlds, inputs)
     count = left.count.numpy()[0]
     kept = np.zeros((worlds, 2), bool)
@@ -168,6 +169,36 @@ def test_threads_that_share_a_world_solve_as_one_does(touching, threads, monkeyp
     np.testing.assert_allclose(own_qacc, qacc, atol=2e-5 * np.abs(qacc).max())
     rows = np.arange(data.njmax) < data.nefc.numpy()[:, None]
     np.testing.assert_allclose(own_forces[rows], forces[rows], atol=2e-5 * np.abs(forces[rows]).max())
+
+
+def test_worlds_that_are_not_stepped_have_no_contacts_and_do_not_matter(touching):
+    truth, sim = touching
+    backend, asked = sim._backend, np.array([0, 2])
+    state, command = truth._backend.read(WORLDS), truth._episode.command[:, None].repeat(5, 1)
+    found = []
+    for ids in (WORLDS, asked):
+        backend.write(WORLDS, *state)
+        trace = backend.advance(ids, command[ids])
+        parts = trace.qpos.numpy(), trace.sensors.numpy(), backend.get_rows(ids)
+        found.append([part[np.isin(ids, asked)].copy() for part in parts])
+        assert (backend.worlds.data.contact.worldid.numpy()[: _contacts(backend)] == 1).any() == (1 in ids)
+    for other, part in zip(*found, strict=True):
+        np.testing.assert_array_equal(other, part)
+    np.testing.assert_allclose(backend.read(np.array([1]))[0], state[0][1:2], atol=1e-6)
+
+
+def _contacts(backend):
+    return int(backend.worlds.data.nacon.numpy()[0])
+
+
+def test_servos_on_anything_but_joints_are_refused():
+    from lerobot_vtrefine.sim.backends.warp_step import _check_servos
+
+    spec = mujoco.MjSpec()
+    spec.worldbody.add_site(name="here")
+    spec.add_actuator(name="jet", trntype=mujoco.mjtTrn.mjTRN_SITE, target="here")
+    with pytest.raises(ValueError, match="servos and tendons must act on joints"):
+        _check_servos(spec.compile())
 
 
 def test_other_sensors_are_refused():

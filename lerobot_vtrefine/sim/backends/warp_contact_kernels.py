@@ -91,10 +91,12 @@ def drop_separated(
     shapes: Shapes,
     geom_xpos: wp.array(dtype=wp.vec3, ndim=2),
     geom_xmat: wp.array(dtype=wp.mat33, ndim=2),
+    idle: wp.array(dtype=int),
     given: Pairs,
     left: Pairs,
 ) -> None:
-    """Keep the pairs that no face of a box, and no end of a cylinder, separates; one thread per pair.
+    """Keep the pairs that no face of a box, and no end of a cylinder, separates; one thread per pair. Of idle
+    worlds none.
 
     The broad phase compares bounding boxes, which never separates a round plug from the walls around it.
     Exact: what is dropped has no contact.
@@ -103,6 +105,8 @@ def drop_separated(
     if pair >= wp.min(given.count[0], given.geoms.shape[0]):
         return
     world = given.world[pair]
+    if idle[world] == 1:
+        return
     geoms = given.geoms[pair]
     first = shapes.kind[geoms[0]]
     second = shapes.kind[geoms[1]]

@@ -2,8 +2,10 @@
 
 The same functions in the same roles as `mujoco_warp.step`, so the same physics, but
 - what does not depend on each other runs on streams of its own: other forces, inertia and constraints beside
-  the search for contacts, the integrator's matrix beside the solver. A step of a thousand worlds is some
-  ninety small kernels, which wait for each other longer than they work;
+  the search for contacts, which needs the bodies' poses only, and the integrator's matrix beside the solver.
+  A step of a thousand worlds is some eighty small kernels, which wait for each other longer than they work:
+  the longest chain of them is half of that;
+- worlds that nobody steps have no contacts;
 - pairs of geoms that a face of a box separates are dropped before the general convex collision, two thirds of
   them while a round plug is in its hole (at a thousand worlds on an H200 this neither gains nor costs);
 - contact sensors are summed contact by contact, and nothing is computed that this package does not read
@@ -19,6 +21,7 @@ import mujoco_warp as mjw
 import numpy as np
 import warp as wp
 from mujoco_warp._src import collision_driver, forward, smooth
+from mujoco_warp._src.math import upper_trid_index
 from mujoco_warp._src.types import CollisionType
 
 from lerobot_vtrefine.sim.backends import warp_contact_kernels as kernels
@@ -38,17 +41,25 @@ class WarpStep:
     Args:
         host: the model as MuJoCo has it.
         model, data: the same on the device.
+        idle: (N,) int, 1 where a world's state does not matter.
         concurrent: whether to use several streams; only a GPU has them.
 
     Raises:
-        ValueError: sensors other than net forces of contacts between geoms and bodies.
+        ValueError: sensors other than net forces of contacts between geoms and bodies; servos or tendons on
+            anything but joints.
     """
 
-    def __init__(self, host: mujoco.MjModel, model: mjw.Model, data: mjw.Data, concurrent: bool) -> None:
-        self._model, self._data = model, data
-        names = ("forces", "rows", "convex") if concurrent else ()
+    def __init__(
+        self, host: mujoco.MjModel, model: mjw.Model, data: mjw.Data, idle: wp.array, concurrent: bool
+    ) -> None:
+        self._model, self._data, self._idle = model, data, idle
+        names = ("bias", "forces", "rows", "convex") if concurrent else ()
         self._streams = {name: wp.Stream(wp.get_device()) for name in names}
         own, other = _sides(host)
+        _check_servos(host)
+        self._heavy_tendons = any(
+            item.numpy().any() for item in (model.tendon_armature, model.actuator_armature)
+        )
         self._own, self._other = wp.array(own, dtype=int), wp.array(other, dtype=int)
         self._addresses = wp.array(host.sensor_adr.astype(np.int32), dtype=int)
         shape = (data.nworld, host.nsensor)
@@ -60,6 +71,7 @@ class WarpStep:
         general = np.zeros((kinds, kinds), np.int32)
         general[tuple(np.transpose(CONVEX))] = 1
         self._general = wp.array(general, dtype=int)
+        self._has_convex = any(_count(model, pair) for pair in CONVEX)
         box = int(np.flatnonzero(host.geom_type == mujoco.mjtGeom.mjGEOM_BOX)[0])
         self._box = wp.vec2i(box, box)  # no pair for the general collision
         spread = collision_driver.create_collision_context(data.naconmax)
@@ -69,15 +81,24 @@ class WarpStep:
     def __call__(self) -> None:
         """Launch the step's kernels on the present device."""
         model, data = self._model, self._data
-        mjw.kinematics(model, data)
-        mjw.com_pos(model, data)
-        mjw.tendon(model, data)
-        with self._beside("forces"):
-            self._smooth_forces()
+        with self._beside("convex"):
+            self._clear_pairs()
         with self._beside("rows"):
+            mjw.tendon(model, data)
+            with self._beside("forces"):
+                self._transmit()
+        mjw.kinematics(model, data)
+        with self._beside("rows"):
+            mjw.com_pos(model, data)
+            with self._beside("bias"):
+                self._bias()
+            with self._beside("forces"):
+                self._smooth_forces()
             mjw.crb(model, data)
-            smooth.tendon_armature(model, data)
+            if self._heavy_tendons:
+                smooth.tendon_armature(model, data)
             rows_without_contacts(model, data)
+        self._join("convex")
         self._collide()
         self._join("rows")
         add_contact_rows(model, data)
@@ -104,12 +125,30 @@ class WarpStep:
         if self._streams:
             wp.wait_stream(self._streams[name])
 
+    def _transmit(self) -> None:
+        """Lengths and velocities of servos and tendons."""
+        model, data = self._model, self._data
+        mjw.transmission(model, data)
+        servos = [data.qvel, data.moment_rownnz, data.moment_rowadr, data.moment_colind, data.actuator_moment]
+        dim = (data.nworld, model.nactuator)
+        wp.launch(forward._actuator_velocity, dim, servos, [data.actuator_velocity])
+        tendons = [model.ten_J_rownnz, model.ten_J_rowadr, model.ten_J_colind, data.qvel, data.ten_J]
+        wp.launch(forward._tendon_velocity, (data.nworld, model.ntendon), tendons, [data.ten_velocity])
+
+    def _bias(self) -> None:
+        """Velocities of bodies, and the forces that follow from them and from gravity."""
+        model, data = self._model, self._data
+        mjw.com_vel(model, data)
+        mjw.rne(model, data)
+        if self._heavy_tendons:
+            smooth.tendon_bias(model, data, data.qfrc_bias)
+
     def _smooth_forces(self) -> None:
         """All forces but those of constraints."""
         model, data = self._model, self._data
-        mjw.transmission(model, data)
-        mjw.fwd_velocity(model, data)
+        mjw.passive(model, data)
         mjw.fwd_actuation(model, data)
+        self._join("bias")
         mjw.fwd_acceleration(model, data)
 
     def _differentiate(self) -> None:
@@ -120,19 +159,24 @@ class WarpStep:
         count = (data.nworld, model.body_freeadr.size)
         wp.launch(forward._implicit_free_body_reset_m, count, free, [self._derivative])
 
+    def _clear_pairs(self) -> None:
+        """Before the search for contacts."""
+        for count in (self._data.ncollision, self._data.nacon, self._left.count, self._spread.count):
+            count.zero_()
+        if self._has_convex:
+            self._spread.geoms.fill_(self._box)
+
     def _collide(self) -> None:
         """Contacts, as `mujoco_warp.collision` finds them."""
         model, data = self._model, self._data
         context = collision_driver.create_collision_context(data.naconmax)
-        data.ncollision.zero_()
-        data.nacon.zero_()
         mjw.nxn_broadphase(model, data, context)
         left = self._left
-        left.count.zero_()
-        given = [_shapes(model), data.geom_xpos, data.geom_xmat, _pairs(context, data.ncollision), left]
-        wp.launch(kernels.drop_separated, data.naconmax, given)
+        given = [_shapes(model), data.geom_xpos, data.geom_xmat, self._idle, _pairs(context, data.ncollision)]
+        wp.launch(kernels.drop_separated, data.naconmax, [*given, left])
         with self._beside("convex"):
-            self._collide_convex(context)
+            if self._has_convex:
+                self._collide_convex(context)
         counted = dataclasses.replace(data, ncollision=left.count)
         collision_driver.primitive_narrowphase(model, counted, _context(context, left), PRIMITIVE)
         self._join("convex")
@@ -140,8 +184,6 @@ class WarpStep:
     def _collide_convex(self, context: collision_driver.CollisionContext) -> None:
         """The general collision, which takes one thread a quarter of a millisecond: a warp for each pair."""
         model, data, spread = self._model, self._data, self._spread
-        spread.count.zero_()
-        spread.geoms.fill_(self._box)
         given = [self._left, model.geom_type, self._general, APART, spread]
         wp.launch(kernels.spread_general, data.naconmax, given)
         counted = dataclasses.replace(data, ncollision=spread.count)
@@ -217,6 +259,18 @@ def _sides(model: mujoco.MjModel) -> tuple[np.ndarray, np.ndarray]:
         own[sensor] = _geoms(model, model.sensor_objtype[sensor], model.sensor_objid[sensor])
         other[sensor] = _geoms(model, model.sensor_reftype[sensor], model.sensor_refid[sensor])
     return own, other
+
+
+def _check_servos(model: mujoco.MjModel) -> None:
+    """What moves by joints alone is known before the bodies' poses are."""
+    kinds = {int(mujoco.mjtTrn.mjTRN_JOINT), int(mujoco.mjtTrn.mjTRN_TENDON)}
+    if not kinds.issuperset(model.actuator_trntype) or (model.wrap_type != mujoco.mjtWrap.mjWRAP_JOINT).any():
+        raise ValueError("servos and tendons must act on joints")
+
+
+def _count(model: mjw.Model, pair: tuple[int, int]) -> int:
+    """How many pairs of geoms of these two kinds may touch."""
+    return model.geom_pair_type_count[upper_trid_index(len(mjw.GeomType), *map(int, pair))]
 
 
 def _geoms(model: mujoco.MjModel, kind: int, number: int) -> np.ndarray:

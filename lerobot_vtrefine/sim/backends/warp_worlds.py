@@ -77,11 +77,13 @@ class WarpWorlds:
             self.data = mjw.make_data(
                 model, num_envs, nconmax=config.contacts_per_world, njmax=config.rows_per_world
             )
+            self._idle = wp.zeros(num_envs, dtype=int)
+            self.idle = wp.to_torch(self._idle)
             self.step: Callable[[], None]
             if config.solver == "stock":
                 self.step = partial(mjw.step, self.model, self.data)
             else:
-                self.step = WarpStep(model, self.model, self.data, wp.get_device().is_cuda)
+                self.step = WarpStep(model, self.model, self.data, self._idle, wp.get_device().is_cuda)
         data = self.data
         self.qpos, self.qvel = wp.to_torch(data.qpos), wp.to_torch(data.qvel)
         self.warmstart, self.time = wp.to_torch(data.qacc_warmstart), wp.to_torch(data.time)
