@@ -87,7 +87,8 @@ def run(drawn, step):
         world, row = wp.tid()
         line[world, row] = kernels.along_line(world, row, step, rows, cones)
         kernels.push(world, row, rows, cones)
-        bend[world, row] = kernels.curvature(world, row, 0, 0, rows, cones)
+        bent = kernels.bent(world, row, 0, rows, cones)
+        bend[world, row] = wp.outer(bent, bent)
 
     rows, cones = on_warp(drawn)
     line = wp.zeros((WORLDS, ROWS), dtype=wp.vec3, device="cpu")

@@ -136,10 +136,15 @@ def drop_separated(
 
 @wp.kernel
 def spread_general(
-    given: Pairs, kind: wp.array(dtype=int), general: wp.array(dtype=int, ndim=2), apart: int, spread: Pairs
+    given: Pairs,
+    kind: wp.array(dtype=int),
+    general: wp.array(dtype=int, ndim=2),
+    threads: int,
+    warps: int,
+    spread: Pairs,
 ) -> None:
-    """Those pairs whose kinds `general` (kinds, kinds) marks, each `apart` places from the next, so that
-    threads of one warp do not wait for each other; `spread` is full of other pairs before.
+    """Those pairs whose kinds `general` (kinds, kinds) marks, dealt out to so many warps of so many threads, so
+    that few threads of one warp wait for each other; `spread` is full of other pairs before.
     """
     pair = wp.tid()
     if pair >= wp.min(given.count[0], given.geoms.shape[0]):
@@ -147,9 +152,12 @@ def spread_general(
     geoms = given.geoms[pair]
     if general[kind[geoms[0]], kind[geoms[1]]] == 0:
         return
-    room = spread.geoms.shape[0]
-    number = apart * wp.atomic_add(spread.count, 1, 1)
-    place = number % room + number // room
+    number = wp.atomic_add(spread.count, 1, 1)
+    dealt = threads * warps
+    first = number // dealt * dealt
+    place = number
+    if first + dealt <= spread.geoms.shape[0]:
+        place = first + number % warps * threads + (number - first) // warps
     wp.atomic_max(spread.count, 0, place + 1)
     spread.geoms[place] = geoms
     spread.ids[place] = given.ids[pair]

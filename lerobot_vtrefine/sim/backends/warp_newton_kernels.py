@@ -11,16 +11,16 @@ spilled registers.
 Shape legend: N worlds, nv velocities, G groups of threads that each take a part of the rows.
 """
 
+import functools
+
 import warp as wp
 
-from lerobot_vtrefine.sim.backends.warp_rows_kernels import Cones, Rows, along_line, curvature, is_lone, push
+from lerobot_vtrefine.sim.backends.warp_rows_kernels import Cones, Rows, along_line, bent, is_lone, push
 
 wp.set_module_options({"enable_backward": False})
 
 ROUNDING = wp.constant(9.5e-7)
 """Sums of a hundred float32 are off by about so much of what they are made of."""
-APART = wp.constant(32)
-"""Threads of a warp."""
 REGISTERS = 128
 """Of a thread on a GPU: eight blocks then run beside each other on a multiprocessor."""
 LEAST_SLOPE = wp.constant(1.0e-6)
@@ -55,7 +55,7 @@ class Motion:
 @wp.struct
 class Search:
     """The solver's own memory: gradient, direction and M direction (N, nv), partial sums (N, G, nv) of the
-    constraint forces and (N, G, nv, nv + 1) of the Hessian, with room for the right side of an equation.
+    constraint forces and (N, G, nv, nv) of the Hessian, and the rows that this is the square of.
     """
 
     gradient: wp.array(dtype=float, ndim=2)
@@ -63,6 +63,7 @@ class Search:
     pushed: wp.array(dtype=float, ndim=2)
     force: wp.array(dtype=float, ndim=3)
     hessian: wp.array(dtype=float, ndim=4)
+    bent: wp.array(dtype=wp.vec4, ndim=3)
 
 
 @wp.struct
@@ -88,17 +89,20 @@ SUM = """
     for (int k = 0; k < 4; ++k)
         for (int offset = width / 2; offset > 0; offset /= 2)
             value[k] += __shfl_xor_sync(0xffffffff, value[k], offset);
+    // Memory of its own: Warp gives a block none of the tiles' where a kernel has no tiles.
+    __shared__ float shared[WP_TILE_BLOCK_DIM / width][4];
 #else
     constexpr int width = 1;
+    wp::wp_block_shared<float[WP_TILE_BLOCK_DIM][4]> holder;
+    auto& shared = *holder;
 #endif
-    wp::wp_block_shared<float[WP_TILE_BLOCK_DIM / width][4]> shared;
     for (int k = 0; k < 4; ++k)
-        (*shared)[WP_TILE_THREAD_IDX / width][k] = value[k];
+        shared[WP_TILE_THREAD_IDX / width][k] = value[k];
     WP_TILE_SYNC();
     value = {};
     for (int part = 0; part < WP_TILE_BLOCK_DIM / width; ++part)
         for (int k = 0; k < 4; ++k)
-            value[k] += (*shared)[part][k];
+            value[k] += shared[part][k];
     WP_TILE_SYNC();
     return value;
 """
@@ -269,10 +273,18 @@ def descend(
 def bend(
     world: int, lane: int, count: int, search: Search, rows: Rows, cones: Cones, inertia: Inertia
 ) -> None:
-    """The Hessian's upper triangle: the sum of what G groups of threads find, in place of the first."""
+    """The Hessian's upper triangle, as G matrices that add up to it.
+
+    First what each row adds, then sums without a branch, whose loads need not wait for each other.
+    """
     lanes = wp.block_dim()
     groups = search.hessian.shape[1]
     nv = search.hessian.shape[2]
+    quads = rows.quads.shape[2]
+    for item in range(lane, count * quads, lanes):
+        row = item // quads
+        search.bent[world, row, item % quads] = bent(world, row, item % quads, rows, cones)
+    wait()
     side = (nv + 3) // 4
     per_group = side * (side + 1) // 2
     for item in range(lane, groups * per_group, lanes):
@@ -284,7 +296,7 @@ def bend(
             rest -= column
         sums = wp.mat44(0.0)
         for row in range(group, count, groups):
-            sums += curvature(world, row, rest, column, rows, cones)
+            sums += wp.outer(search.bent[world, row, rest], search.bent[world, row, column])
         i = 4 * rest
         j = 4 * column
         for a in range(4):
@@ -292,53 +304,77 @@ def bend(
                 if i + a < nv and j + b < nv:
                     search.hessian[world, group, i + a, j + b] = sums[a, b]
     wait()
-    for item in range(lane, nv * nv, lanes):
-        row = item // nv
-        column = item % nv
-        for group in range(1, groups):
-            search.hessian[world, 0, row, column] += search.hessian[world, group, row, column]
-    wait()
     for entry in range(lane, inertia.row.shape[0], lanes):
         search.hessian[world, 0, inertia.col[entry], inertia.row[entry]] += inertia.values[world, entry]
     wait()
 
 
-@wp.func
-def aim(world: int, lane: int, search: Search) -> wp.vec2:
-    """The direction, which solves H direction = -gradient; returns its squared length and its product with
-    the negative gradient.
+AIM = """
+    constexpr int nv = %d;
+#if defined(__CUDA_ARCH__)
+    __shared__ float matrix[nv][nv + 1];
+#else
+    wp::wp_block_shared<float[nv][nv + 1]> holder;
+    auto& matrix = *holder;
+#endif
+    const int lane = WP_TILE_THREAD_IDX, lanes = WP_TILE_BLOCK_DIM;
+    const int stripe = lanes < 32 ? lanes : 32;
+    for (int item = lane; item < nv * nv; item += lanes) {
+        float sum = 0.0f;
+        if (item %% nv >= item / nv)
+            for (int group = 0; group < hessian.shape[0]; ++group)
+                sum += hessian.data[group * nv * nv + item];
+        matrix[item / nv][item %% nv] = sum;
+    }
+    for (int dof = lane; dof < nv; dof += lanes)
+        matrix[dof][nv] = -gradient.data[dof];
+    for (int pivot = 0; pivot < nv; ++pivot) {
+        WP_TILE_SYNC();
+        for (int column = pivot + 1 + lane %% stripe; column <= nv; column += stripe) {
+            const float share = matrix[pivot][column] / matrix[pivot][pivot];
+            const int last = column < nv ? column : nv - 1;
+            for (int row = pivot + 1 + lane / stripe; row <= last; row += lanes / stripe)
+                matrix[row][column] -= share * matrix[pivot][row];
+        }
+    }
+    for (int pivot = nv - 1; pivot >= 0; --pivot) {
+        WP_TILE_SYNC();
+        const float solved = matrix[pivot][nv] / matrix[pivot][pivot];
+        for (int row = lane; row < pivot; row += lanes)
+            matrix[row][nv] -= solved * matrix[row][pivot];
+    }
+    WP_TILE_SYNC();
+    wp::vec2 sums(0.0f, 0.0f);
+    for (int dof = 0; dof < nv; ++dof) {
+        const float along = matrix[dof][nv] / matrix[dof][dof];
+        sums[0] += along * along;
+        sums[1] -= along * gradient.data[dof];
+        if (dof %% lanes == lane)
+            direction.data[dof] = along;
+    }
+    WP_TILE_SYNC();
+    return sums;
+"""
 
-    By elimination, H = U' D^-1 U with D the diagonal of U, in place of H's upper triangle: a thread has a
-    column, of every so many rows, and waits once for each row.
-    """
-    lanes = wp.block_dim()
-    nv = search.gradient.shape[1]
-    matrix = search.hessian[world, 0]
-    direction = search.direction[world]
-    for dof in range(lane, nv, lanes):
-        matrix[dof, nv] = -search.gradient[world, dof]
-    stripe = wp.min(lanes, APART)
-    for pivot in range(nv):
-        wait()
-        for column in range(pivot + 1 + lane % stripe, nv + 1, stripe):
-            share = matrix[pivot, column] / matrix[pivot, pivot]
-            for row in range(pivot + 1 + lane // stripe, wp.min(column + 1, nv), lanes // stripe):
-                matrix[row, column] -= share * matrix[pivot, row]
-    for index in range(nv):
-        wait()
-        pivot = nv - 1 - index
-        solved = matrix[pivot, nv] / matrix[pivot, pivot]
-        for row in range(lane, pivot, lanes):
-            matrix[row, nv] -= solved * matrix[row, pivot]
-        if lane == 0:
-            direction[pivot] = solved
-    wait()
-    sums = wp.vec4(0.0)
-    for dof in range(lane, nv, lanes):
-        along = direction[dof]
-        sums += wp.vec4(along * along, -along * search.gradient[world, dof], 0.0, 0.0)
-    sums = total(sums)
-    return wp.vec2(sums[0], sums[1])
+
+def make_aim(nv: int) -> wp.Function:
+    """The function that finds a direction, for so many velocities."""
+
+    @wp.func_native(snippet=AIM % nv)
+    def aim(
+        hessian: wp.array(dtype=float, ndim=3),
+        gradient: wp.array(dtype=float),
+        direction: wp.array(dtype=float),
+    ) -> wp.vec2:
+        """Solve H direction = -gradient; returns its squared length and its product with the negative
+        gradient.
+
+        By elimination, H = U' D^-1 U with D the diagonal of U, in place of H's upper triangle and in a
+        block's own memory: a thread has a column, of every so many rows, and waits once for each row.
+        """
+        ...
+
+    return aim
 
 
 def patches(nv: int) -> int:
@@ -347,42 +383,49 @@ def patches(nv: int) -> int:
     return side * (side + 1) // 2
 
 
-@wp.kernel(module="unique", enable_backward=False, grid_stride=False, cuda_max_registers=REGISTERS)
-def newton(
-    limits: Limits, motion: Motion, search: Search, rows: Rows, cones: Cones, inertia: Inertia
-) -> None:
-    """All steps; a block of threads per world."""
-    world, lane = wp.tid()
-    count = wp.min(rows.count[world], rows.residual.shape[1])
-    enough = limits.tolerance[world % limits.tolerance.shape[0]]
-    line = enough * limits.line_tolerance[world % limits.line_tolerance.shape[0]]
-    scale = begin(world, lane, count, motion, rows, cones, inertia)
-    done = bool(False)
-    length = float(0.0)
-    steps = int(0)
-    for index in range(limits.steps + 1):
-        wait()
-        gained = wp.vec2(0.0)
-        if index > 0:
-            smooth = slopes(world, lane, count, motion, search, rows)
+@functools.cache
+def newton_kernel(nv: int) -> wp.Kernel:
+    """The kernel for so many velocities; a block of threads per world."""
+    aim = make_aim(nv)
+
+    @wp.kernel(module="unique", enable_backward=False, grid_stride=False, cuda_max_registers=REGISTERS)
+    def newton(
+        limits: Limits, motion: Motion, search: Search, rows: Rows, cones: Cones, inertia: Inertia
+    ) -> None:
+        """All steps; a block of threads per world."""
+        world, lane = wp.tid()
+        count = wp.min(rows.count[world], rows.residual.shape[1])
+        enough = limits.tolerance[world % limits.tolerance.shape[0]]
+        line = enough * limits.line_tolerance[world % limits.line_tolerance.shape[0]]
+        scale = begin(world, lane, count, motion, rows, cones, inertia)
+        done = bool(False)
+        length = float(0.0)
+        steps = int(0)
+        for index in range(limits.steps + 1):
             wait()
-            flat = wp.max(line * length / scale, LEAST_SLOPE)
-            gained = line_search(world, lane, count, flat, limits.line_steps, smooth, rows, cones)
-            take(world, lane, count, gained[0], motion, search, rows)
-            steps = index
-            wait()
-        square = descend(world, lane, count, motion, search, rows, cones)
-        if index > 0:
-            gain = scale * gained[1]
-            done = gained[0] == 0.0 or (gain > 0.0 and gain < enough) or scale * wp.sqrt(square) < enough
-        if done or index == limits.steps:
-            break
-        bend(world, lane, count, search, rows, cones, inertia)
-        aimed = aim(world, lane, search)
-        length = wp.sqrt(aimed[0])
-        if index > 0 and scale * 0.5 * aimed[1] < enough:
-            break
-        for dof in range(lane, motion.qacc.shape[1], wp.block_dim()):
-            search.pushed[world, dof] = product(world, dof, search.direction, inertia)
-    if lane == 0:
-        limits.count[world] = steps
+            gained = wp.vec2(0.0)
+            if index > 0:
+                smooth = slopes(world, lane, count, motion, search, rows)
+                wait()
+                flat = wp.max(line * length / scale, LEAST_SLOPE)
+                gained = line_search(world, lane, count, flat, limits.line_steps, smooth, rows, cones)
+                take(world, lane, count, gained[0], motion, search, rows)
+                steps = index
+                wait()
+            square = descend(world, lane, count, motion, search, rows, cones)
+            if index > 0:
+                gain = scale * gained[1]
+                done = gained[0] == 0.0 or (gain > 0.0 and gain < enough) or scale * wp.sqrt(square) < enough
+            if done or index == limits.steps:
+                break
+            bend(world, lane, count, search, rows, cones, inertia)
+            aimed = aim(search.hessian[world], search.gradient[world], search.direction[world])
+            length = wp.sqrt(aimed[0])
+            if index > 0 and scale * 0.5 * aimed[1] < enough:
+                break
+            for dof in range(lane, motion.qacc.shape[1], wp.block_dim()):
+                search.pushed[world, dof] = product(world, dof, search.direction, inertia)
+        if lane == 0:
+            limits.count[world] = steps
+
+    return newton

@@ -298,47 +298,50 @@ def along_line(world: int, row: int, step: float, rows: Rows, cones: Cones) -> w
 
 
 @wp.func
-def cone_curvature(world: int, row: int, contact: int, i: int, j: int, rows: Rows, cones: Cones) -> wp.mat44:
-    """Second derivatives of a sliding contact's cost by velocities 4 i to 4 i + 3 and 4 j to 4 j + 3.
-
-    With z = dn and u_k = f_k r_k, v_k of the Jacobian's columns alike, and p = u.v / t:
-    s (z_i z_j - mu (z_i p_j + p_i z_j) + (mu^2 - mu n / t) v_i.v_j + mu n / t p_i p_j).
-    """
-    mu = mu_of(world, contact, cones)
-    scale = rows.stiffness[world, row] / wp.max(mu * mu * (1.0 + mu * mu), TINY)
-    z_i = mu * rows.quads[world, row, i]
-    z_j = mu * rows.quads[world, row, j]
-    square = float(0.0)
-    p_i = wp.vec4(0.0)
-    p_j = wp.vec4(0.0)
-    both = wp.mat44(0.0)
-    for k in range(1, cones.dim[contact]):
-        other = row + k
-        friction = cones.friction[contact, k - 1]
-        u = friction * rows.residual[world, other]
-        v_i = friction * rows.quads[world, other, i]
-        v_j = friction * rows.quads[world, other, j]
-        square += u * u
-        p_i += u * v_i
-        p_j += u * v_j
-        both += wp.outer(v_i, v_j)
-    t = wp.max(wp.sqrt(square), TINY)
-    p_i = p_i / t
-    p_j = p_j / t
-    share = mu * mu * rows.residual[world, row] / t
-    total = wp.outer(z_i - mu * p_i, z_j) - wp.outer(mu * z_i - share * p_i, p_j) + (mu * mu - share) * both
-    return scale * total
+def bent(world: int, row: int, quad: int, rows: Rows, cones: Cones) -> wp.vec4:
+    """Four neighbours of a vector b: the Hessian of the cost is the sum of b b' over all rows."""
+    state = rows.state[world, row]
+    if state == QUADRATIC:
+        return wp.sqrt(rows.stiffness[world, row]) * rows.quads[world, row, quad]
+    if state == SLIDING:
+        contact = rows.contact[world, row]
+        first = cones.row[contact, 0]
+        if cones.row[contact, cones.dim[contact] - 1] >= 0:
+            return bent_cone(world, row - first, first, contact, quad, rows, cones)
+    return wp.vec4(0.0)
 
 
 @wp.func
-def curvature(world: int, row: int, i: int, j: int, rows: Rows, cones: Cones) -> wp.mat44:
-    """What a row adds to the Hessian's entries (4i..4i+3, 4j..4j+3); a whole contact where it slides."""
-    state = rows.state[world, row]
-    if state == QUADRATIC:
-        left = rows.stiffness[world, row] * rows.quads[world, row, i]
-        return wp.outer(left, rows.quads[world, row, j])
-    if state == SLIDING:
-        contact = rows.contact[world, row]
-        if is_whole(contact, row, cones):
-            return cone_curvature(world, row, contact, i, j, rows, cones)
-    return wp.mat44(0.0)
+def bent_cone(world: int, k: int, first: int, contact: int, quad: int, rows: Rows, cones: Cones) -> wp.vec4:
+    """The same of row k of a sliding contact, whose rows share a cost.
+
+    With z = dn, u_k = f_k r_k, v_k of the Jacobian's rows alike, and p = sum of u_k v_k / t, its Hessian is
+    s ((z - mu p)(z - mu p)' + (mu^2 - mu n / t) (sum of v_k v_k' - p p')). The last bracket is a sum over
+    directions across u: a reflection that takes u to the first axis gives one fewer than there are u_k, so
+    that row 1 has none.
+    """
+    if k == 1:
+        return wp.vec4(0.0)
+    mu = mu_of(world, contact, cones)
+    scale = rows.stiffness[world, first] / wp.max(mu * mu * (1.0 + mu * mu), TINY)
+    square = float(0.0)
+    p = wp.vec4(0.0)
+    for other in range(1, cones.dim[contact]):
+        friction = cones.friction[contact, other - 1]
+        u = friction * rows.residual[world, first + other]
+        square += u * u
+        p += (u * friction) * rows.quads[world, first + other, quad]
+    t = wp.max(wp.sqrt(square), TINY)
+    p = p / t
+    if k == 0:
+        return (wp.sqrt(scale) * mu) * (rows.quads[world, first, quad] - p)
+    normal = mu * mu * wp.max(0.0, 1.0 - rows.residual[world, first] / t)
+    lead = cones.friction[contact, 0] * rows.residual[world, first + 1] / t
+    aside = (
+        p
+        + (wp.where(lead < 0.0, -1.0, 1.0) * cones.friction[contact, 0]) * rows.quads[world, first + 1, quad]
+    )
+    friction = cones.friction[contact, k - 1]
+    own = friction * rows.residual[world, first + k] / t
+    v = friction * rows.quads[world, first + k, quad]
+    return wp.sqrt(scale * normal) * (v - (own / (1.0 + wp.abs(lead))) * aside)

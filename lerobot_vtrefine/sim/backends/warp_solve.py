@@ -16,9 +16,9 @@ def solve(model: mjw.Model, data: mjw.Data) -> None:
     """
     threads = THREADS if wp.get_device().is_cuda or wp.config.enable_cpu_blocks else 1
     groups = max(1, threads // newton.patches(model.nv))
-    given = [_limits(model, data), _motion(data), _search(data.nworld, model.nv, groups), _rows(data)]
+    given = [_limits(model, data), _motion(data), _search(data, model.nv, groups), _rows(data)]
     given += [_cones(model, data), _inertia(model, data)]
-    wp.launch_tiled(newton.newton, dim=data.nworld, inputs=given, block_dim=threads)
+    wp.launch_tiled(newton.newton_kernel(model.nv), dim=data.nworld, inputs=given, block_dim=threads)
 
 
 def _limits(model: mjw.Model, data: mjw.Data) -> newton.Limits:
@@ -36,12 +36,13 @@ def _motion(data: mjw.Data) -> newton.Motion:
     return motion
 
 
-def _search(worlds: int, nv: int, groups: int) -> newton.Search:
-    search = newton.Search()
+def _search(data: mjw.Data, nv: int, groups: int) -> newton.Search:
+    search, worlds = newton.Search(), data.nworld
     for name in ("gradient", "direction", "pushed"):
         setattr(search, name, wp.empty((worlds, nv), dtype=float))
     search.force = wp.empty((worlds, groups, nv), dtype=float)
-    search.hessian = wp.empty((worlds, groups, nv, nv + 1), dtype=float)
+    search.hessian = wp.empty((worlds, groups, nv, nv), dtype=float)
+    search.bent = wp.empty((worlds, data.njmax, data.efc.J.shape[2] // 4), dtype=wp.vec4)
     return search
 
 

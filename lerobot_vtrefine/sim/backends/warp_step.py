@@ -30,6 +30,8 @@ from lerobot_vtrefine.sim.backends.warp_solve import solve
 
 APART = 32
 """Threads of a warp."""
+WARPS = 4096
+"""Which share the pairs for the general convex collision."""
 NET_FORCE = 3
 DATA = 1 | 2 | 4 | 16
 """found, force, torque, position of mjtConDataField."""
@@ -76,6 +78,7 @@ class WarpStep:
         self._box = wp.vec2i(box, box)  # no pair for the general collision
         spread = collision_driver.create_collision_context(data.naconmax)
         self._spread = _pairs(spread, wp.zeros(2, dtype=int))
+        self._warps = max(1, min(WARPS, data.naconmax // APART))
         self._left = _pairs(collision_driver.create_collision_context(data.naconmax), wp.zeros(1, dtype=int))
 
     def __call__(self) -> None:
@@ -184,7 +187,7 @@ class WarpStep:
     def _collide_convex(self, context: collision_driver.CollisionContext) -> None:
         """The general collision, which takes one thread a quarter of a millisecond: a warp for each pair."""
         model, data, spread = self._model, self._data, self._spread
-        given = [self._left, model.geom_type, self._general, APART, spread]
+        given = [self._left, model.geom_type, self._general, APART, self._warps, spread]
         wp.launch(kernels.spread_general, data.naconmax, given)
         counted = dataclasses.replace(data, ncollision=spread.count)
         collision_driver.convex_narrowphase(model, counted, _context(context, spread), CONVEX)
