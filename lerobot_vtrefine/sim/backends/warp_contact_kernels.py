@@ -143,8 +143,8 @@ def spread_general(
     warps: int,
     spread: Pairs,
 ) -> None:
-    """Those pairs whose kinds `general` (kinds, kinds) marks, dealt out to so many warps of so many threads, so
-    that few threads of one warp wait for each other; `spread` is full of other pairs before.
+    """Those pairs whose kinds `general` (kinds, kinds) marks, dealt out to so many warps of so many threads:
+    few threads of one warp then wait for each other. `spread` is full of other pairs before.
     """
     pair = wp.tid()
     if pair >= wp.min(given.count[0], given.geoms.shape[0]):

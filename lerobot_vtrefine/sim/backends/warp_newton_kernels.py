@@ -4,9 +4,9 @@ One block of threads per world, from the warm start to the solution: worlds that
 the others waiting, and nothing waits for launches. Steps, line search and the criteria for stopping are those
 of `mujoco_warp.solve` for elliptic cones and a dense Jacobian.
 
-Everything is a plain loop, called from one place, to keep the machine code small: with the Cholesky
-decomposition of tiles and with functions that are called twice it was 266 kB, unrolled and inlined, and
-spilled registers.
+Everything is a plain loop, called from one place: functions that are called twice, and the Cholesky
+decomposition of tiles, are unrolled and inlined to twice the machine code, which spills registers. What a
+block's threads wait for again and again, the matrix that is eliminated, lies in its own memory.
 
 Shape legend: N worlds, nv velocities, G groups of threads that each take a part of the rows.
 """

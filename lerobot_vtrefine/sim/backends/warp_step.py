@@ -30,8 +30,9 @@ from lerobot_vtrefine.sim.backends.warp_solve import solve
 
 APART = 32
 """Threads of a warp."""
-WARPS = 4096
-"""Which share the pairs for the general convex collision."""
+WARPS = 2048
+"""Which share the pairs for the general convex collision. Parts of meshes have thirty pairs a world, in two
+thirds of the time that one pair for each warp takes, whose registers leave room for few warps at once."""
 NET_FORCE = 3
 DATA = 1 | 2 | 4 | 16
 """found, force, torque, position of mjtConDataField."""
@@ -185,7 +186,7 @@ class WarpStep:
         self._join("convex")
 
     def _collide_convex(self, context: collision_driver.CollisionContext) -> None:
-        """The general collision, which takes one thread a quarter of a millisecond: a warp for each pair."""
+        """The general collision, which takes one thread a quarter of a millisecond: few share a warp."""
         model, data, spread = self._model, self._data, self._spread
         given = [self._left, model.geom_type, self._general, APART, self._warps, spread]
         wp.launch(kernels.spread_general, data.naconmax, given)
