@@ -15,6 +15,7 @@ import functools
 
 import warp as wp
 
+from lerobot_vtrefine.sim.backends.warp_block import make_aim, total, wait
 from lerobot_vtrefine.sim.backends.warp_rows_kernels import Cones, Rows, along_line, bent, is_lone, push
 
 wp.set_module_options({"enable_backward": False})
@@ -75,45 +76,6 @@ class Limits:
     steps: int
     line_steps: int
     count: wp.array(dtype=int)
-
-
-@wp.func_native(snippet="WP_TILE_SYNC();")
-def wait() -> None:
-    """Until all threads of a block are here."""
-    ...
-
-
-SUM = """
-#if defined(__CUDA_ARCH__)
-    constexpr int width = 32;
-    for (int k = 0; k < 4; ++k)
-        for (int offset = width / 2; offset > 0; offset /= 2)
-            value[k] += __shfl_xor_sync(0xffffffff, value[k], offset);
-    // Memory of its own: Warp gives a block none of the tiles' where a kernel has no tiles.
-    __shared__ float shared[WP_TILE_BLOCK_DIM / width][4];
-#else
-    constexpr int width = 1;
-    wp::wp_block_shared<float[WP_TILE_BLOCK_DIM][4]> holder;
-    auto& shared = *holder;
-#endif
-    for (int k = 0; k < 4; ++k)
-        shared[WP_TILE_THREAD_IDX / width][k] = value[k];
-    WP_TILE_SYNC();
-    value = {};
-    for (int part = 0; part < WP_TILE_BLOCK_DIM / width; ++part)
-        for (int k = 0; k < 4; ++k)
-            value[k] += shared[part][k];
-    WP_TILE_SYNC();
-    return value;
-"""
-
-
-@wp.func_native(snippet=SUM)
-def total(value: wp.vec4) -> wp.vec4:
-    """Sum over the threads of a block, to the last bit the same for all of them; a third of the machine code
-    of `wp.tile_reduce`. Blocks are whole warps.
-    """
-    ...
 
 
 @wp.func
@@ -307,74 +269,6 @@ def bend(
     for entry in range(lane, inertia.row.shape[0], lanes):
         search.hessian[world, 0, inertia.col[entry], inertia.row[entry]] += inertia.values[world, entry]
     wait()
-
-
-AIM = """
-    constexpr int nv = %d;
-#if defined(__CUDA_ARCH__)
-    __shared__ float matrix[nv][nv + 1];
-#else
-    wp::wp_block_shared<float[nv][nv + 1]> holder;
-    auto& matrix = *holder;
-#endif
-    const int lane = WP_TILE_THREAD_IDX, lanes = WP_TILE_BLOCK_DIM;
-    const int stripe = lanes < 32 ? lanes : 32;
-    for (int item = lane; item < nv * nv; item += lanes) {
-        float sum = 0.0f;
-        if (item %% nv >= item / nv)
-            for (int group = 0; group < hessian.shape[0]; ++group)
-                sum += hessian.data[group * nv * nv + item];
-        matrix[item / nv][item %% nv] = sum;
-    }
-    for (int dof = lane; dof < nv; dof += lanes)
-        matrix[dof][nv] = -gradient.data[dof];
-    for (int pivot = 0; pivot < nv; ++pivot) {
-        WP_TILE_SYNC();
-        for (int column = pivot + 1 + lane %% stripe; column <= nv; column += stripe) {
-            const float share = matrix[pivot][column] / matrix[pivot][pivot];
-            const int last = column < nv ? column : nv - 1;
-            for (int row = pivot + 1 + lane / stripe; row <= last; row += lanes / stripe)
-                matrix[row][column] -= share * matrix[pivot][row];
-        }
-    }
-    for (int pivot = nv - 1; pivot >= 0; --pivot) {
-        WP_TILE_SYNC();
-        const float solved = matrix[pivot][nv] / matrix[pivot][pivot];
-        for (int row = lane; row < pivot; row += lanes)
-            matrix[row][nv] -= solved * matrix[row][pivot];
-    }
-    WP_TILE_SYNC();
-    wp::vec2 sums(0.0f, 0.0f);
-    for (int dof = 0; dof < nv; ++dof) {
-        const float along = matrix[dof][nv] / matrix[dof][dof];
-        sums[0] += along * along;
-        sums[1] -= along * gradient.data[dof];
-        if (dof %% lanes == lane)
-            direction.data[dof] = along;
-    }
-    WP_TILE_SYNC();
-    return sums;
-"""
-
-
-def make_aim(nv: int) -> wp.Function:
-    """The function that finds a direction, for so many velocities."""
-
-    @wp.func_native(snippet=AIM % nv)
-    def aim(
-        hessian: wp.array(dtype=float, ndim=3),
-        gradient: wp.array(dtype=float),
-        direction: wp.array(dtype=float),
-    ) -> wp.vec2:
-        """Solve H direction = -gradient; returns its squared length and its product with the negative
-        gradient.
-
-        By elimination, H = U' D^-1 U with D the diagonal of U, in place of H's upper triangle and in a
-        block's own memory: a thread has a column, of every so many rows, and waits once for each row.
-        """
-        ...
-
-    return aim
 
 
 def patches(nv: int) -> int:
