@@ -5,6 +5,7 @@ Shapes: N worlds, K substeps, nq positions, nv velocities, nu servos, ns sensor 
 
 import copy
 from collections.abc import Callable
+from contextlib import nullcontext
 from functools import partial
 
 import mujoco
@@ -18,6 +19,7 @@ from lerobot_vtrefine.sim.backends import warp_kernels as kernels
 from lerobot_vtrefine.sim.backends.warp_memory import Recording, record
 from lerobot_vtrefine.sim.backends.warp_step import WarpStep
 from lerobot_vtrefine.sim.config import WarpConfig
+from lerobot_vtrefine.sim.patience import told_if_slow
 from lerobot_vtrefine.tactile.contact_query import start_warp
 
 CONTACTS, ROWS = "contacts_per_world", "rows_per_world"
@@ -40,6 +42,9 @@ LONGEST = 40
 """Substeps in one graph: those of a control step. Launches of their own would leave gaps between them."""
 SIMPLEX = 5
 """Vertices with which the search for a penetration begins at most; it adds one an iteration."""
+COMPILING = (
+    "compiling kernels of the simulation, once on this machine: a minute or two, four for parts of meshes"
+)
 LEAST_ROWS = 3
 """Rows of constraints that a contact takes at least: no contact sensor can match more contacts than fit."""
 
@@ -94,7 +99,7 @@ class WarpWorlds:
         self._recorded: dict[tuple[str, int], Recording] = {}
         self._everyone = torch.arange(num_envs, dtype=torch.int32, device=self.device)
         self._capture = config.graph and _can_capture(self.device)
-        self._posed = False
+        self._posed = self._compiled = False
         self._reserve(1)
 
     def _reserve(self, substeps: int) -> None:
@@ -123,9 +128,11 @@ class WarpWorlds:
         self.moved()
         self._trace.cursor.fill_(-1)
         self.overflow.zero_()
-        with wp.ScopedDevice(self.device):
+        notice = nullcontext() if self._compiled else told_if_slow(COMPILING)
+        with notice, wp.ScopedDevice(self.device):
             self._do("substep", self._substep, substeps)
             self._guard()
+        self._compiled = True
         self.lost |= self.overflow & LOSSES
         trace = self._trace
         return wp.to_torch(trace.qpos)[:, :substeps], wp.to_torch(trace.sensors)[:, :substeps]
