@@ -15,7 +15,7 @@ import functools
 
 import warp as wp
 
-from lerobot_vtrefine.sim.backends.warp_block import make_aim, total, wait
+from lerobot_vtrefine.sim.backends.warp_block_kernels import make_aim, total, wait
 from lerobot_vtrefine.sim.backends.warp_rows_kernels import Cones, Rows, along_line, bent, is_lone, push
 
 wp.set_module_options({"enable_backward": False})

@@ -42,9 +42,7 @@ LONGEST = 40
 """Substeps in one graph: those of a control step. Launches of their own would leave gaps between them."""
 SIMPLEX = 5
 """Vertices with which the search for a penetration begins at most; it adds one an iteration."""
-COMPILING = (
-    "compiling kernels of the simulation, once on this machine: a minute or two, four for parts of meshes"
-)
+COMPILING = "compiling kernels, once on this machine: a minute or two, about four for parts of meshes"
 LEAST_ROWS = 3
 """Rows of constraints that a contact takes at least: no contact sensor can match more contacts than fit."""
 
