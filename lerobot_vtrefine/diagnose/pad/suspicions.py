@@ -19,10 +19,12 @@ from lerobot_vtrefine.diagnose.pad.descriptors import DESCRIPTORS, Descriptor, d
 from lerobot_vtrefine.diagnose.pad.failing_taxels import failing_taxel
 from lerobot_vtrefine.diagnose.pad.fitting import Fit, predict, tangents
 from lerobot_vtrefine.diagnose.pad.gain_drift import gain_drift
+from lerobot_vtrefine.diagnose.pad.hum import hum
 from lerobot_vtrefine.diagnose.pad.one_size import sizes_differ
 from lerobot_vtrefine.diagnose.pad.press_trials import PressSet
 from lerobot_vtrefine.diagnose.pad.recording_scatter import own_deviations, recording_scatter
 from lerobot_vtrefine.diagnose.pad.repeatability import Correlations
+from lerobot_vtrefine.diagnose.pad.rest_levels import levels_of_neighbours
 from lerobot_vtrefine.diagnose.pad.rules import FOLLOWS, FOLLOWS_IF_OWNED, MAYBE_DEAD_ERRORS
 from lerobot_vtrefine.diagnose.pad.screening import Scorer
 from lerobot_vtrefine.diagnose.pad.shared_errors import noise_in_bursts, shared_errors
@@ -57,6 +59,8 @@ def suspicions(problem: "PadProblem", selection: Selection[Any, Fit, Any]) -> li
         while_sliding(presses, residuals, fitted, weights),
         *(replace(item, between_trials=True) for item in between),
         *shared_errors(presses, own.left, fitted, weights, problem.seed),
+        *hum(presses, own.left, fitted, weights, problem.seed),
+        levels_of_neighbours(presses, fitted.residuals(presses), problem.seed),
         *noise_in_bursts(presses, own.left, fitted, weights, problem.seed),
         failing_taxel(presses, own.left, fitted, weights, problem.seed),
         *in_place_of_names(problem, fitted),
