@@ -161,6 +161,11 @@ DESCRIPTORS = (
         lambda p, s: np.broadcast_to(s.sum(axis=1, keepdims=True), s.shape),
     ),
     Descriptor(
+        "touch that gives way to the total load",
+        (),
+        lambda p, s: (s > 0) * s.sum(axis=1, keepdims=True),
+    ),
+    Descriptor(
         "time in the recording",
         causes_like("time"),
         lambda p, s: np.broadcast_to(_centred(p.trial.time_s)[:, None], s.shape),
