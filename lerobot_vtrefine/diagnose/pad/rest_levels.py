@@ -1,7 +1,7 @@
 """Idle levels that move at a place: where a cover has not recovered from a press, or something lies on it.
 
-A level that drifts is shared by all taxels, and what each adds to it is its own. Neighbours that move together,
-apart from the others, do not drift.
+A level that drifts is shared by all taxels, and what each adds to it is its own. Neighbours that move
+together, apart from the others, do not drift.
 """
 
 from collections.abc import Sequence
@@ -43,7 +43,7 @@ def levels_of_neighbours(presses: PressSet, residuals: Sequence[Array], seed: in
 
 
 def _own_levels(presses: PressSet, residuals: Sequence[Array]) -> tuple[Array, Array]:
-    """Mean errors at rest (K, R*C) without their mean over taxels, zero where not known; and where they are."""
+    """Mean errors at rest (K, R*C) without their mean over taxels, zero where not known; and where known."""
     levels = np.zeros((len(residuals), presses.layout.num_taxels))
     known = np.zeros(levels.shape, dtype=bool)
     for k, (press, residual) in enumerate(zip(presses.presses, residuals, strict=True)):

@@ -116,7 +116,7 @@ LOWEST_HZ, HIGHEST_HZ = 2.0, 65.0
 """Frequencies at which taxels may hum: slower is a press's own motion, or what it is not quite told by; the
 fastest mains have 60 Hz, and the times of frames are not known well enough for more."""
 GROUPS = 8
-"""Groups of taxels that each keep their phase: their sums have seven eighths of what all pairs of taxels say."""
+"""Groups of taxels whose hum is compared: their sums hold seven eighths of what all pairs of taxels say."""
 MIN_RESTING = 5
 """Frames at rest that a recording's idle levels rest on."""
 
