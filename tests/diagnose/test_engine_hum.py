@@ -70,12 +70,19 @@ def test_hum_is_found_at_its_own_frequency_and_size_where_frames_are_slow_and_un
     assert not fires(shared_errors(*asked(times, errors))[0])  # frames apart it has another phase
 
 
-def test_what_frames_see_as_slow_is_no_hum() -> None:
+def test_what_is_slow_is_no_hum_and_hum_that_frames_see_as_slow_is_where_clocks_are_uneven() -> None:
+    """Sixty Hz beside thirty frames a second, and a level of each recording's own."""
     rng = np.random.default_rng(6)
-    times = [np.arange(FRAMES) / 30.0] * RECORDINGS
-    errors = [3.0 + rng.standard_normal((FRAMES, TAXELS)) for _ in times]
-    assert not any(fires(item) for item in hum(*asked(times, errors)))
-    assert hum(*asked([10.0 * time for time in times], errors)) == []
+    noise = [rng.standard_normal((FRAMES, TAXELS)) for _ in range(RECORDINGS)]
+    even = [np.arange(FRAMES) / 30.0] * RECORDINGS
+    for times in (even, clocks(rng)):
+        levels = [error + number for number, error in enumerate(noise)]
+        assert not any(fires(item) for item in hum(*asked(times, levels)))
+        hums = [
+            error + np.sin(2.0 * np.pi * 60.5 * time + number)[:, None]
+            for number, (error, time) in enumerate(zip(noise, times, strict=True))
+        ]
+        assert fires(hum(*asked(times, hums))[0]) == (times is not even)
 
 
 def test_taxels_of_their_own_hum_as_often_as_said() -> None:
