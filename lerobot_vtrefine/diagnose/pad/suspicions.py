@@ -51,16 +51,16 @@ def suspicions(problem: "PadProblem", selection: Selection[Any, Fit, Any]) -> li
     descriptors, own = following(problem, fitted), own_deviations(presses, fitted)
     between = [
         *recording_scatter(own, problem.seed),
+        levels_of_neighbours(presses, fitted.residuals(presses), problem.seed),
         *(item for descriptor, item in descriptors if descriptor.session),
     ]
     sure = [
         error_level.level(residuals, fitted, weights),
         held_rows(presses) if HOLD not in fitted.model.families else None,
         while_sliding(presses, residuals, fitted, weights),
-        *(replace(item, between_trials=True) for item in between),
+        *(replace(item, between_trials=True) for item in between if item is not None),
         *shared_errors(presses, own.left, fitted, weights, problem.seed),
         *hum(presses, own.left, fitted, weights, problem.seed),
-        levels_of_neighbours(presses, fitted.residuals(presses), problem.seed),
         *noise_in_bursts(presses, own.left, fitted, weights, problem.seed),
         failing_taxel(presses, own.left, fitted, weights, problem.seed),
         *in_place_of_names(problem, fitted),
