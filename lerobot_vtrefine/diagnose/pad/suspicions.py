@@ -126,7 +126,7 @@ def following(problem: "PadProblem", fitted: Fit) -> list[tuple[Descriptor, Susp
     scorer = Scorer(fitted, presses, problem.weights, columns)
     found = []
     for descriptor in DESCRIPTORS:
-        change = directions(descriptor, presses, fitted.signals)
+        change = directions(descriptor, presses, fitted)
         if change is None:
             continue
         scores, information = scorer.score(change)
