@@ -10,6 +10,7 @@ from lerobot_vtrefine.diagnose.core.resampling import Hypothesis, jointly_adjust
 from lerobot_vtrefine.diagnose.core.rules import SUSPICION_ALPHA
 from lerobot_vtrefine.diagnose.core.suspicion import confirmed
 from lerobot_vtrefine.diagnose.pad.baseline import fit_baseline
+from lerobot_vtrefine.diagnose.pad.candidates import PLAIN
 from lerobot_vtrefine.diagnose.pad.gain_drift import gain_drift, own_gains
 from lerobot_vtrefine.diagnose.pad.press_trials import PressSet, prepare
 from lerobot_vtrefine.diagnose.pad.problem import PadProblem
@@ -85,3 +86,6 @@ def test_locked_recordings_are_asked_about_the_order_as_well() -> None:
     (found,) = confirmed(problem.surprises(now, locked), 0)
     assert "before and after" in found.clue
     assert not confirmed(gain_drift(now, problem.presses, problem.weights), 0)
+    # A cover that softens reads less through the session, too.
+    softened = replace(now, model=replace(now.model, forms=(PLAIN["first_load_softening"],)))
+    assert not gain_drift(softened, problem.presses, problem.weights)
