@@ -79,6 +79,19 @@ def test_readings_that_follow_the_indenters_place_without_contact_are_described(
     assert fires(most)
 
 
+def test_an_arm_that_gives_way_is_described() -> None:
+    """Touched taxels lose depth in proportion to what all of them bear."""
+
+    def bends(trial: Trial) -> np.ndarray:
+        counts = trial.raw - 20.0
+        return -2e-3 * (counts > 2.0) * counts.sum(axis=1, keepdims=True)
+
+    presses, baseline = fitted(bends)
+    found = following(PadProblem(presses, weights=baseline.weights), baseline.fitted)
+    item = next(item for descriptor, item in found if "gives way" in descriptor.text)
+    assert fires(item)
+
+
 def test_pairs_of_replicates_are_judged_by_what_names_leave() -> None:
     presses, baseline = fitted(nothing)
     rng = np.random.default_rng(4)

@@ -13,7 +13,7 @@ from lerobot_vtrefine.diagnose.core.rivals import Rival, find_rivals, settled
 from lerobot_vtrefine.diagnose.core.screened_rivals import screened_rivals
 from lerobot_vtrefine.diagnose.core.screened_search import ScreenedSearch, still_found
 from lerobot_vtrefine.diagnose.core.search import ALL, Search, Selection
-from lerobot_vtrefine.diagnose.core.suspicion import Alarm, observed, raise_alarms
+from lerobot_vtrefine.diagnose.core.suspicion import Alarm, confirmed, raise_alarms
 
 Array = np.ndarray
 Progress = Callable[[str, float], None]
@@ -94,7 +94,7 @@ def infer[P: Problem[Any, Any]](
     return Inference(
         selection,
         tuple(item for item in rivals if item.cause in selection.causes()),
-        _with_refused((*alarms, *observed(surprises)), refused),
+        _with_refused((*alarms, *confirmed(surprises, seed)), refused),
         test,
         bool(len(locked)),
         refused,

@@ -138,7 +138,7 @@ class OptionalSteps(Protocol):
         return ()
 
     def surprises(self, fit: Any, locked: Self) -> "Sequence[Suspicion]":
-        """What a fit leaves in locked trials that is beyond anything sound trials have; nothing is tested."""
+        """What may be left in locked trials, or in the order of all; asked once models are settled."""
         return ()
 
 

@@ -3,7 +3,7 @@
 ALPHA = 0.02
 """Chance that trials without any effect yield a name, over all candidates and channels together."""
 SUSPICION_ALPHA = 0.01
-"""Chance that trials without any effect raise an alarm, over all suspicions and channels together."""
+"""Chance that trials without any effect raise an alarm, over all suspicions of a test and all channels."""
 BALANCED_AT = 0.001
 """Tail of every suspicion's own resampled values that is its unit: far out, where the joint test decides, and
 still ten of `FLIPS`."""

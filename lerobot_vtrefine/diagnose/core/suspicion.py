@@ -63,12 +63,7 @@ def raise_alarms(
         for item in candidates
         if item.clue
     ]
-    p_values = _tested(suspicions, seed)
-    fired = [
-        (item.decisive, Alarm(item.channel, item.clue, item.share, p))
-        for item, p in zip(suspicions, p_values, strict=True)
-        if item.share > item.least and (p is None or p < SUSPICION_ALPHA)
-    ]
+    fired = _fired(suspicions, seed)
     found += [alarm for decisive, alarm in fired if not decisive]
     found.sort(key=lambda alarm: -alarm.share)
     found += [] if found or selection.causes() else _too_few(selection)
@@ -77,10 +72,17 @@ def raise_alarms(
     return (*first, *(alarm for alarm in found if alarm.channel not in settled))
 
 
-def observed(suspicions: Sequence[Suspicion]) -> list[Alarm]:
-    """Alarms by size alone."""
+def confirmed(suspicions: Sequence[Suspicion], seed: int) -> list[Alarm]:
+    """Alarms about trials that no fit has seen, or about all of them."""
+    return [alarm for _, alarm in _fired(suspicions, seed)]
+
+
+def _fired(suspicions: Sequence[Suspicion], seed: int) -> list[tuple[bool, Alarm]]:
+    """Alarms, and whether they are decisive."""
     return [
-        Alarm(item.channel, item.clue, item.share, None) for item in suspicions if item.share > item.least
+        (item.decisive, Alarm(item.channel, item.clue, item.share, p))
+        for item, p in zip(suspicions, _tested(suspicions, seed), strict=True)
+        if item.share > item.least and (p is None or p < SUSPICION_ALPHA)
     ]
 
 

@@ -4,12 +4,14 @@ A descriptor that belongs to a named family's own kind of effect is called owned
 family's form is at fault, not its name.
 """
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
 
+from lerobot_vtrefine.diagnose.pad.baseline import offset_tangents
 from lerobot_vtrefine.diagnose.pad.candidates import causes_like
+from lerobot_vtrefine.diagnose.pad.fitting import Fit
 from lerobot_vtrefine.diagnose.pad.press_trials import Press, PressSet
 from lerobot_vtrefine.diagnose.pad.sliding_errors import SLIDES_M_S
 
@@ -32,6 +34,8 @@ class Descriptor:
     direction: Callable[[Press, Signal], Signal]
     session: bool = False
     """Whether it differs between recordings of one command, so that what follows it does not repeat."""
+    touch: bool = False
+    """Whether it is depth that differs; readings do by their change with it."""
 
 
 def _age(press: Press, signal: Signal) -> np.ndarray:
@@ -148,7 +152,8 @@ DESCRIPTORS = (
     Descriptor(
         "touch at the distance from the pad's centre",
         causes_like("centre"),
-        lambda p, s: (s > 0) * (_place(p, 0) ** 2 + _place(p, 1) ** 2),
+        lambda p, s: np.broadcast_to(_place(p, 0) ** 2 + _place(p, 1) ** 2, s.shape),
+        touch=True,
     ),
     Descriptor("the other readings of the row", ROWS, lambda p, s: _line_sum(p, s, 0)),
     Descriptor("the other readings of the column", COLUMNS, lambda p, s: _line_sum(p, s, 1)),
@@ -159,6 +164,12 @@ DESCRIPTORS = (
         "the total load, at every taxel",
         PAD,
         lambda p, s: np.broadcast_to(s.sum(axis=1, keepdims=True), s.shape),
+    ),
+    Descriptor(
+        "touch that gives way to the total load",
+        (),
+        lambda p, s: np.broadcast_to(s.sum(axis=1, keepdims=True), s.shape),
+        touch=True,
     ),
     Descriptor(
         "time in the recording",
@@ -183,12 +194,15 @@ DESCRIPTORS = (
 )
 
 
-def directions(
-    descriptor: Descriptor, presses: PressSet, signals: Sequence[Signal]
-) -> list[np.ndarray] | None:
+def directions(descriptor: Descriptor, presses: PressSet, fitted: Fit) -> list[np.ndarray] | None:
     """The descriptor's direction in every recording, of unit mean square; None where it says nothing."""
-    pairs = zip(presses.presses, signals, strict=True)
+    pairs = zip(presses.presses, fitted.signals, strict=True)
     raw = [np.array(descriptor.direction(press, signal), dtype=float) for press, signal in pairs]
+    if descriptor.touch:
+        slopes = offset_tangents(fitted.model, presses, fitted.signals)
+        if slopes is None:
+            return None
+        raw = [image * slope for image, slope in zip(raw, slopes, strict=True)]
     power = float(np.mean([np.mean(image**2) for image in raw]))
     if not np.isfinite(power) or power <= 1e-30:
         return None

@@ -9,6 +9,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from lerobot_vtrefine.diagnose.core.suspicion import Suspicion
+from lerobot_vtrefine.diagnose.pad.candidates.first_load_softening import PLAIN as SOFTENING
 from lerobot_vtrefine.diagnose.pad.fitting import Fit
 from lerobot_vtrefine.diagnose.pad.press_trials import PressSet
 from lerobot_vtrefine.diagnose.pad.rules import MIN_COURSE, MIN_RECORDINGS
@@ -45,7 +46,12 @@ def own_gains(fitted: Fit, presses: PressSet, weights: Sequence[TrialWeights]) -
 
 def gain_drift(fitted: Fit, presses: PressSet, weights: Sequence[TrialWeights]) -> list[Suspicion]:
     """Whether gains follow the temperature, the session or their neighbours; none where too few recordings
-    can tell."""
+    can tell, or beside a cover that softens.
+
+    Such a cover reads less and less through the session; what its form leaves of that has the same course.
+    """
+    if SOFTENING.family in fitted.model.families:
+        return []
     gains = own_gains(fitted, presses, weights)
     starts = np.array([press.trial.start_s for press in presses.presses])
     known = np.flatnonzero(np.isfinite(gains))

@@ -111,6 +111,15 @@ MIN_READINGS = 200
 MIN_PRESSED = 50
 """Frames that one taxel's must rest on."""
 
+# What is left is shared by taxels.
+LOWEST_HZ, HIGHEST_HZ = 2.0, 65.0
+"""Frequencies at which taxels may hum: slower is a press's own motion, or what it is not quite told by; the
+fastest mains have 60 Hz, and the times of frames are not known well enough for more."""
+GROUPS = 8
+"""Groups of taxels whose hum is compared: their sums hold seven eighths of what all pairs of taxels say."""
+MIN_RESTING = 5
+"""Frames at rest that a recording's idle levels rest on."""
+
 # What is left comes with sliding.
 SLIDING = 1.6
 """Mean square of whitened errors while sliding, over that of other readings under load; 1.2 is usual."""

@@ -19,15 +19,18 @@ from lerobot_vtrefine.diagnose.pad.descriptors import DESCRIPTORS, Descriptor, d
 from lerobot_vtrefine.diagnose.pad.failing_taxels import failing_taxel
 from lerobot_vtrefine.diagnose.pad.fitting import Fit, predict, tangents
 from lerobot_vtrefine.diagnose.pad.gain_drift import gain_drift
+from lerobot_vtrefine.diagnose.pad.hum import hum
 from lerobot_vtrefine.diagnose.pad.one_size import sizes_differ
 from lerobot_vtrefine.diagnose.pad.press_trials import PressSet
 from lerobot_vtrefine.diagnose.pad.recording_scatter import own_deviations, recording_scatter
 from lerobot_vtrefine.diagnose.pad.repeatability import Correlations
+from lerobot_vtrefine.diagnose.pad.rest_levels import levels_of_neighbours
 from lerobot_vtrefine.diagnose.pad.rules import FOLLOWS, FOLLOWS_IF_OWNED, MAYBE_DEAD_ERRORS
 from lerobot_vtrefine.diagnose.pad.screening import Scorer
 from lerobot_vtrefine.diagnose.pad.shared_errors import noise_in_bursts, shared_errors
 from lerobot_vtrefine.diagnose.pad.sliding_errors import while_sliding
 from lerobot_vtrefine.diagnose.pad.taxel_maps import with_all_dead
+from lerobot_vtrefine.diagnose.pad.weights import TrialWeights
 
 if TYPE_CHECKING:
     from lerobot_vtrefine.diagnose.pad.problem import PadProblem
@@ -48,15 +51,16 @@ def suspicions(problem: "PadProblem", selection: Selection[Any, Fit, Any]) -> li
     descriptors, own = following(problem, fitted), own_deviations(presses, fitted)
     between = [
         *recording_scatter(own, problem.seed),
-        *gain_drift(fitted, presses, weights),
+        levels_of_neighbours(presses, fitted.residuals(presses), problem.seed),
         *(item for descriptor, item in descriptors if descriptor.session),
     ]
     sure = [
         error_level.level(residuals, fitted, weights),
         held_rows(presses) if HOLD not in fitted.model.families else None,
         while_sliding(presses, residuals, fitted, weights),
-        *(replace(item, between_trials=True) for item in between),
+        *(replace(item, between_trials=True) for item in between if item is not None),
         *shared_errors(presses, own.left, fitted, weights, problem.seed),
+        *hum(presses, own.left, fitted, weights, problem.seed),
         *noise_in_bursts(presses, own.left, fitted, weights, problem.seed),
         failing_taxel(presses, own.left, fitted, weights, problem.seed),
         *in_place_of_names(problem, fitted),
@@ -76,19 +80,30 @@ def suspicions(problem: "PadProblem", selection: Selection[Any, Fit, Any]) -> li
     return [item for item in found if item is not None]
 
 
-def surprises(problem: "PadProblem", fitted: Fit, presses: PressSet) -> list[Suspicion]:
-    """What fails now and then may have failed in recordings that no fit has seen, and in these alone.
+def surprises(problem: "PadProblem", fitted: Fit, locked: PressSet) -> list[Suspicion]:
+    """What fails now and then may have failed in recordings that no fit has seen, and in these alone. What
+    follows the order of recordings is clearer in all of them.
 
     A map of gains knows too little of what other recordings pressed to tell; and where taxels are known to be
     dead, others may be that hardly anything had pressed before.
     """
-    if fitted.model.gain_map is not None:
-        return []
+    mapped = fitted.model.gain_map is not None
+    everyone = (
+        problem.presses if mapped else replace(locked, presses=(*problem.presses.presses, *locked.presses))
+    )
+    there, weights = _seen(problem, fitted, everyone)
+    found: list[Suspicion | None] = [*gain_drift(there, everyone, weights)]
+    if not mapped:
+        there, weights = _seen(problem, fitted, locked)
+        found.append(error_level.one_taxel(locked, repeatability.cleaned(there, locked, weights), weights))
+    return [item for item in found if item is not None]
+
+
+def _seen(problem: "PadProblem", fitted: Fit, presses: PressSet) -> tuple[Fit, tuple[TrialWeights, ...]]:
+    """The fit as it predicts other presses, and their weights."""
     there = replace(fitted, signals=tuple(predict(fitted.model, presses)))
     there = with_all_dead(there, presses, MAYBE_DEAD_ERRORS) if fitted.model.dead else there
-    _, weights = weigh(there, presses, problem.noise)
-    item = error_level.one_taxel(presses, repeatability.cleaned(there, presses, weights), weights)
-    return [] if item is None else [item]
+    return there, weigh(there, presses, problem.noise)[1]
 
 
 def _repeating(
@@ -111,7 +126,7 @@ def following(problem: "PadProblem", fitted: Fit) -> list[tuple[Descriptor, Susp
     scorer = Scorer(fitted, presses, problem.weights, columns)
     found = []
     for descriptor in DESCRIPTORS:
-        change = directions(descriptor, presses, fitted.signals)
+        change = directions(descriptor, presses, fitted)
         if change is None:
             continue
         scores, information = scorer.score(change)
