@@ -75,6 +75,7 @@ def describe(presses: PressSet) -> Setting:
         touched_cols=int(touched.any(axis=0).sum()),
         rest_session_s=presses.idle.session_s,
         rest_time_s=presses.idle.time_s,
+        idle_course=presses.idle.course,
         idle_counts=tuple(tuple(row) for row in presses.idle.level.round(3).tolist()),
         temperature_c=_temperature(presses),
         row_company=row_company,

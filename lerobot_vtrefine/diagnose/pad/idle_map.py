@@ -33,6 +33,8 @@ class IdleMap:
     time_s: float
     frames: int
     """Number of frames without contact that it rests on."""
+    course: tuple[tuple[float, float], ...] = ()
+    """How it moves through the session (`idle_course`)."""
 
 
 def resting(trial: Trial, motion: WholeMotion) -> tuple[np.ndarray, np.ndarray]:
