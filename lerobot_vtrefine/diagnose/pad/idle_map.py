@@ -34,7 +34,9 @@ class IdleMap:
     frames: int
     """Number of frames without contact that it rests on."""
     course: tuple[tuple[float, float], ...] = ()
-    """How it moves through the session (`idle_course`)."""
+    """How it moves through the session: times [s] and counts, of all taxels (`idle_course`)."""
+    rates: np.ndarray | None = None
+    """What every taxel does beside that (R, C) [counts/s]."""
 
 
 def resting(trial: Trial, motion: WholeMotion) -> tuple[np.ndarray, np.ndarray]:

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from scipy.ndimage import binary_dilation
 
-from lerobot_vtrefine.diagnose.pad.idle_course import away_from, idle_course
+from lerobot_vtrefine.diagnose.pad.idle_course import with_course
 from lerobot_vtrefine.diagnose.pad.idle_map import IdleMap, WholeMotion, idle_map, resting
 from lerobot_vtrefine.diagnose.pad.indenters import trial_forces
 from lerobot_vtrefine.diagnose.pad.motion import Kind, instants_of, motion
@@ -247,10 +247,9 @@ def prepare(recordings: RecordingSet, trials: list[Trial], learn: list[int]) -> 
     trials = with_session(trials, [motion.drive for motion in motions])
     count = min(1.0, recordings.full_scale / 255.0)
     idle = idle_map([trials[i] for i in learn], [motions[i] for i in learn], layout)
-    pressed = [(motion.drive > 0).any(axis=0) for motion in motions]
-    free = [away_from(mask, near(mask)) for mask in pressed]
+    free = [~near((motion.drive > 0).any(axis=0)) for motion in motions]
     rests = [resting(trial, motion)[1] for trial, motion in zip(trials, motions, strict=True)]
-    idle = replace(idle, course=idle_course(trials, free, rests, idle.level))
+    idle = with_course(idle, trials, free, rests)
     wander = _wander([trials[i] for i in learn], [motions[i] for i in learn], idle)
     presses = tuple(
         _press(trial, motion, layout, idle.level, loaded, _Doubt(count, wander))

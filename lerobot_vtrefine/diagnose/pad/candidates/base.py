@@ -58,6 +58,8 @@ class Setting:
     """Mean time in their recordings of the frames that the idle map rests on [s]."""
     idle_course: tuple[tuple[float, float], ...] = ()
     """How taxels that nothing presses move through the session: times [s] and counts above the idle map."""
+    idle_rates: tuple[tuple[float, ...], ...] = ()
+    """What every taxel does beside that (R, C) [counts/s]; none where they all do the same."""
 
 
 @dataclass(frozen=True)

@@ -36,7 +36,12 @@ def _thermal(values: np.ndarray, setting: Setting) -> tuple[Stage, ...]:
 def _seen(values: np.ndarray, setting: Setting) -> tuple[Stage, ...]:
     """As all taxels do that nothing presses, or a part of it."""
     times_s, counts = zip(*setting.idle_course, strict=True)
-    return (BaselineDrift(0.0, times_s, tuple(float(values[0]) * level for level in counts)),)
+    share = float(values[0])
+    moved = tuple(share * level for level in counts)
+    if not setting.idle_rates:
+        return (BaselineDrift(0.0, times_s, moved),)
+    own = share * np.array(setting.idle_rates)
+    return (Idle(-setting.rest_session_s * own, 0.0), BaselineDrift(own, times_s, moved))
 
 
 def _report_seen(values: np.ndarray, setting: Setting) -> dict[str, tuple[float, str]]:
