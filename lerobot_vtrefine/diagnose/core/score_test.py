@@ -119,9 +119,9 @@ def tail_shares(statistics: Array) -> Array:
 def screen(probes: Sequence[Probe], count: int, seed: int) -> dict[str, Tested]:
     """The best probe of every name with its p-value adjusted over all of them.
 
-    Tests of two kinds share the error rate by a weighted Bonferroni rule (Holm 1979), each kind by its part in
-    SCREEN_SHARES: sums of scores under flips of the trials' signs, judged together by the smallest p, and sums
-    of products under the same flips. What is observed takes no part.
+    Tests of two kinds share the error rate by a weighted Bonferroni rule (Holm 1979), each kind by its part
+    in SCREEN_SHARES: sums of scores under flips of the trials' signs, judged together by the smallest p, and
+    sums of products under the same flips. What is observed takes no part.
     """
     best: dict[str, Tested] = {}
     kinds: dict[str, list[Probe]] = {}

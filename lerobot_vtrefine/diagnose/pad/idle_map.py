@@ -49,6 +49,12 @@ def resting(trial: Trial, motion: WholeMotion) -> tuple[np.ndarray, np.ndarray]:
     return before, ~near & (since > REST_S)
 
 
+def surely_resting(trial: Trial, motion: WholeMotion) -> np.ndarray:
+    """Frames (T,) at rest, or those without contact where an indenter that hovers close by leaves none."""
+    rest = resting(trial, motion)[1]
+    return rest if rest.any() else ~motion.touching
+
+
 def idle_map(trials: Sequence[Trial], motions: Sequence[WholeMotion], layout: PadLayout) -> IdleMap:
     """Mean reading of every taxel in frames without contact; low quantiles where there is no such frame."""
     rests = [resting(trial, motion) for trial, motion in zip(trials, motions, strict=True)]

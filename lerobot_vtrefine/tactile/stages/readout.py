@@ -257,7 +257,8 @@ class BaselineDrift(Stage):
     @override
     def step(self, x: torch.Tensor, state: State, frame: Frame) -> tuple[torch.Tensor, State]:
         time_s = torch.as_tensor(frame.time_s)
-        moved = taxel_map(self.rate_counts_per_s, x) * time_s + (self.knot_counts[0] if self.knot_counts else 0.0)
+        begin_counts = self.knot_counts[0] if self.knot_counts else 0.0
+        moved = taxel_map(self.rate_counts_per_s, x) * time_s + begin_counts
         knots = zip(pairwise(self.knots_s), pairwise(self.knot_counts), strict=True)
         for (begin, end), (first, last) in knots:
             moved = moved + (last - first) / (end - begin) * (time_s - begin).clamp(0.0, end - begin)

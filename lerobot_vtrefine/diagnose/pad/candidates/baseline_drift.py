@@ -45,9 +45,11 @@ def _seen(values: np.ndarray, setting: Setting) -> tuple[Stage, ...]:
 
 
 def _report_seen(values: np.ndarray, setting: Setting) -> dict[str, tuple[float, str]]:
-    """The mean rate."""
-    times_s, counts = np.array(setting.idle_course).T
-    return {"rate_counts_per_s": (float(values[0]) * float(np.polyfit(times_s, counts, 1)[0]), "counts/s")}
+    """The mean rate, and from the lowest level to the highest."""
+    times_s, shown = np.array(setting.idle_course).T
+    counts = float(values[0]) * shown
+    rate = float(np.polyfit(times_s, counts, 1)[0])
+    return {"rate_counts_per_s": (rate, "counts/s"), "span_counts": (float(np.ptp(counts)), "counts")}
 
 
 RATE = Value("rate", -5e4, 5e4, 1e-2)
