@@ -35,7 +35,7 @@ def with_course(
     """
     if not _in_turn(trials):
         return idle
-    levels = np.full((len(trials), idle.level.size), np.nan)
+    apart, rested = np.full((2, len(trials), idle.level.size), np.nan)
     knots: list[tuple[float, float]] = []
     powers = np.zeros(2)
     for k, (trial, taxels, rest) in enumerate(zip(trials, free, rests, strict=True)):
@@ -43,18 +43,22 @@ def with_course(
         if taxels.sum() >= MIN_TAXELS:
             shown = moved[:, taxels.ravel()]
             line = _line(trial.time_s, shown)
-            levels[k, taxels.ravel()] = (shown - line[:, None]).mean(axis=0)
+            apart[k, taxels.ravel()] = (shown - line[:, None]).mean(axis=0)
             powers += _powers(line, shown)
         elif rest.sum() >= MIN_FRAMES:
             line = np.full(len(moved), np.median(moved[rest].mean(axis=0)))
             powers += _powers(line[rest], moved[rest])
         else:
             continue
+        if rest.sum() >= MIN_FRAMES:
+            rested[k] = (moved - line[:, None])[rest].mean(axis=0)
         knots += zip((trial.start_s + trial.time_s[[0, -1]]).tolist(), line[[0, -1]].tolist(), strict=True)
     if powers[0] <= powers[1]:
         return idle
     middles = np.array([trial.start_s + trial.time_s.mean() for trial in trials])
-    rates = _own_rates(middles, levels).reshape(idle.level.shape)
+    # Readings that are scored, as those at rest of pressed taxels are, only where there are no others.
+    seldom = np.isfinite(apart).sum(axis=0) < MIN_RECORDINGS
+    rates = _own_rates(middles, np.where(seldom, rested, apart)).reshape(idle.level.shape)
     return replace(idle, course=tuple(sorted(knots)), rates=rates)
 
 

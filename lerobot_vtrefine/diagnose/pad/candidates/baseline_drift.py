@@ -33,7 +33,7 @@ def _thermal(values: np.ndarray, setting: Setting) -> tuple[Stage, ...]:
     return (BaselineDrift(0.0, counts_per_c=per_c, reference_c=reference_c),)
 
 
-def _seen(values: np.ndarray, setting: Setting) -> tuple[Stage, ...]:
+def _shown(values: np.ndarray, setting: Setting) -> tuple[Stage, ...]:
     """As all taxels do that nothing presses, or a part of it."""
     times_s, counts = zip(*setting.idle_course, strict=True)
     share = float(values[0])
@@ -44,7 +44,7 @@ def _seen(values: np.ndarray, setting: Setting) -> tuple[Stage, ...]:
     return (Idle(-setting.rest_session_s * own, 0.0), BaselineDrift(own, times_s, moved))
 
 
-def _report_seen(values: np.ndarray, setting: Setting) -> dict[str, tuple[float, str]]:
+def _report_shown(values: np.ndarray, setting: Setting) -> dict[str, tuple[float, str]]:
     """The mean rate, and from the lowest level to the highest."""
     times_s, shown = np.array(setting.idle_course).T
     counts = float(values[0]) * shown
@@ -52,6 +52,16 @@ def _report_seen(values: np.ndarray, setting: Setting) -> dict[str, tuple[float,
     return {"rate_counts_per_s": (rate, "counts/s"), "span_counts": (float(np.ptp(counts)), "counts")}
 
 
+SHOWN = Form(
+    "baseline_drift",
+    "as taxels at rest show it",
+    (Value("share", 0.0, 2.0, 1e-2),),
+    _shown,
+    _report_shown,
+    lambda s: [[1.0]],
+    possible=lambda s: bool(s.idle_course),
+    peer=True,
+)
 RATE = Value("rate", -5e4, 5e4, 1e-2)
 FORMS = (
     Form(
@@ -65,16 +75,7 @@ FORMS = (
         needs="log start_s, and record over some minutes with frames at rest in every trial",
         signed=True,
     ),
-    Form(
-        "baseline_drift",
-        "as taxels at rest show it",
-        (Value("share", 0.0, 2.0, 1e-2),),
-        _seen,
-        _report_seen,
-        lambda s: [[1.0]],
-        possible=lambda s: bool(s.idle_course),
-        peer=True,
-    ),
+    SHOWN,
     Form(
         "baseline_drift",
         "follows the temperature",
