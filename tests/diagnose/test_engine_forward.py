@@ -61,8 +61,10 @@ def composite(held: PressSet) -> Composite:
     return Composite(describe(held), np.array([np.log(4e5), 3e-3]))
 
 
-# What a free board held is known of recordings only; predictions are means over its instants.
-FORETOLD = [form for form in CATALOGUE if not ("free of" in form.label or "irregular" in form.label)]
+# What a free board held is known of recordings only; predictions are means over its instants. These recordings
+# do not drift (see test_engine_idle_course).
+UNTOLD = ("free of", "irregular", "at rest")
+FORETOLD = [form for form in CATALOGUE if not any(words in form.label for words in UNTOLD)]
 
 
 @pytest.mark.parametrize("form", FORETOLD, ids=lambda form: f"{form.family}-{form.label}")
