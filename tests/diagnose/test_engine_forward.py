@@ -61,8 +61,8 @@ def composite(held: PressSet) -> Composite:
     return Composite(describe(held), np.array([np.log(4e5), 3e-3]))
 
 
-# What a free board held is known of recordings only; predictions are means over its instants. These recordings
-# do not drift (see test_engine_idle_course).
+# What a free board held is known of recordings only; predictions are means over its instants. These
+# recordings do not drift (see test_engine_idle_course).
 UNTOLD = ("free of", "irregular", "at rest")
 FORETOLD = [form for form in CATALOGUE if not any(words in form.label for words in UNTOLD)]
 
