@@ -13,7 +13,7 @@ from lerobot_vtrefine.diagnose.verdict import Cause
 
 FOLDER = Path(package.__file__).parent
 FILES = sorted(FOLDER.rglob("*.py"))
-KNOWN = {"Probe": 7, "Alarm": 3, "Tested": 1, "Examined": 0, "Evidence": 1, "Cause": 3}
+KNOWN = {"Alarm": 3, "Tested": 1, "Examined": 0, "Evidence": 1, "Cause": 3}
 """Class -> place of its p-value among the arguments."""
 
 
@@ -88,9 +88,10 @@ def test_a_map_that_recordings_share_passes() -> None:
 
 
 def test_kinds_of_tests_share_the_error_rate() -> None:
-    found = screen([probe("scores", np.ones(12)), probe("order", np.ones(1), permuted=0.001)], 12, 0)
-    assert found["order"].p_adjusted == pytest.approx(0.001 * 0.8 / 0.1)
-    assert found["scores"].p_adjusted == pytest.approx((found["scores"].p_value or 0.0) * 0.8 / 0.7)
+    even = np.ones((12, 12)) - np.eye(12)
+    found = screen([probe("scores", np.ones(12)), probe("products", np.ones(1), products=even)], 12, 0)
+    for kind, share in (("scores", 0.8), ("products", 0.2)):
+        assert found[kind].p_adjusted == pytest.approx((found[kind].p_value or 0.0) / share)
 
 
 def test_an_observed_cause_has_no_p_value() -> None:

@@ -105,7 +105,6 @@ NAMED_ELSEWHERE = {
     "joints/model.py": "fields of the file, which have names of their own",
     "pad/detectable.py": "a period is no size that grows",
     "pad/final_model.py": "frames that repeat",
-    "pad/idle_drift.py": "its own probe",
     "pad/idle_level.py": "idle levels are learnt without their drift",
     "pad/screening.py": "what is seen in the readings themselves, and touches",
 }

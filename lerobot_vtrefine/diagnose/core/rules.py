@@ -57,7 +57,7 @@ CLEARLY_HELPS = 0.25
 
 SCREEN_ALPHA = 0.05
 """Chance that any candidate passes a score test where none is there; it must then predict better, too."""
-SCREEN_SHARES = {"scores": 0.7, "products": 0.2, "order": 0.1}
+SCREEN_SHARES = {"scores": 0.8, "products": 0.2}
 """Parts of that error rate that kinds of score tests get; where one is missing, the others share its part."""
 FEW_FOR_SIGNS = 10
 """With fewer trials than this, signs alone cannot pass a score test: size counts as well."""

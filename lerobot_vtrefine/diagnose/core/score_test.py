@@ -30,7 +30,6 @@ class Probe:
         products: (T, T) products between trials, whose sum is the statistic where it is quadratic in the
             signs; None where the sum of the scores is.
         products_scatter: standard deviation of that sum without an effect, as the fitted noise has it.
-        permuted: p-value found by permuting the session's order, in place of flips.
         observed: seen in the readings themselves: nothing is tested, so there is no p-value.
     """
 
@@ -40,7 +39,6 @@ class Probe:
     scores: Array
     information: Array
     one_sided: bool
-    permuted: float | None = None
     observed: bool = False
     products: Array | None = None
     products_scatter: float = 0.0
@@ -121,9 +119,9 @@ def tail_shares(statistics: Array) -> Array:
 def screen(probes: Sequence[Probe], count: int, seed: int) -> dict[str, Tested]:
     """The best probe of every name with its p-value adjusted over all of them.
 
-    Tests of three kinds share the error rate by a weighted Bonferroni rule (Holm 1979), each kind by its part
-    in SCREEN_SHARES: sums of scores under flips of the trials' signs, judged together by the smallest p; sums
-    of products under the same flips; permutations of the session's order. What is observed takes no part.
+    Tests of two kinds share the error rate by a weighted Bonferroni rule (Holm 1979), each kind by its part
+    in SCREEN_SHARES: sums of scores under flips of the trials' signs, judged together by the smallest p, and
+    sums of products under the same flips. What is observed takes no part.
     """
     best: dict[str, Tested] = {}
     kinds: dict[str, list[Probe]] = {}
@@ -134,10 +132,10 @@ def screen(probes: Sequence[Probe], count: int, seed: int) -> dict[str, Tested]:
     signs = sign_matrix(count, seed)
     for kind, tested in kinds.items():
         names = len({probe.name for probe in tested})
-        p_values, adjusted = _order_p(tested) if kind == "order" else _flip_p(tested, signs)
+        p_values, adjusted = _flip_p(tested, signs)
         for probe, p_value, together in zip(tested, p_values, adjusted, strict=True):
             few = _signs_that_count(probe)
-            if kind != "order" and few < FEW_FOR_SIGNS and p_value <= 2.5 * 2.0 ** (1 - few):
+            if few < FEW_FOR_SIGNS and p_value <= 2.5 * 2.0 ** (1 - few):
                 together = min(together, names * size_p(probe))
             _keep(best, Tested(probe, p_value, min(1.0, together * whole / SCREEN_SHARES[kind])))
     for probe in observed:
@@ -148,8 +146,6 @@ def screen(probes: Sequence[Probe], count: int, seed: int) -> dict[str, Tested]:
 def _kind(probe: Probe) -> str:
     if probe.observed:
         return "observed"
-    if probe.permuted is not None:
-        return "order"
     return "scores" if probe.products is None else "products"
 
 
@@ -159,12 +155,6 @@ def _flip_p(probes: Sequence[Probe], signs: Array) -> tuple[list[float], list[fl
     smallest = np.sort(shares.min(axis=1))
     adjusted = np.searchsorted(smallest, shares[0], side="right") / len(smallest)
     return shares[0].tolist(), adjusted.tolist()
-
-
-def _order_p(probes: Sequence[Probe]) -> tuple[list[float], list[float]]:
-    """The same of probes that were permuted already, each by itself."""
-    p_values = [probe.permuted for probe in probes if probe.permuted is not None]
-    return p_values, [min(1.0, len(probes) * p_value) for p_value in p_values]
 
 
 def _signs_that_count(probe: Probe) -> float:

@@ -75,7 +75,9 @@ def describe(presses: PressSet) -> Setting:
         touched_cols=int(touched.any(axis=0).sum()),
         rest_session_s=presses.idle.session_s,
         rest_time_s=presses.idle.time_s,
-        idle_counts=tuple(tuple(row) for row in presses.idle.level.round(3).tolist()),
+        idle_course=presses.idle.course,
+        idle_rates=_rows(presses.idle.rates),
+        idle_counts=_rows(presses.idle.level.round(3)),
         temperature_c=_temperature(presses),
         row_company=row_company,
         company=company,
@@ -83,6 +85,10 @@ def describe(presses: PressSet) -> Setting:
         repeats=could_be_held(presses),
         returned=any(_returned(press) for press in presses.presses),
     )
+
+
+def _rows(values: np.ndarray | None) -> tuple[tuple[float, ...], ...]:
+    return () if values is None or not values.any() else tuple(tuple(row) for row in values.tolist())
 
 
 def _returned(press: Press) -> bool:

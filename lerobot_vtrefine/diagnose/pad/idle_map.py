@@ -33,6 +33,10 @@ class IdleMap:
     time_s: float
     frames: int
     """Number of frames without contact that it rests on."""
+    course: tuple[tuple[float, float], ...] = ()
+    """How it moves through the session: times [s] and counts, of all taxels (`idle_course`)."""
+    rates: np.ndarray | None = None
+    """What every taxel does beside that (R, C) [counts/s]."""
 
 
 def resting(trial: Trial, motion: WholeMotion) -> tuple[np.ndarray, np.ndarray]:
@@ -43,6 +47,12 @@ def resting(trial: Trial, motion: WholeMotion) -> tuple[np.ndarray, np.ndarray]:
     last_touch = np.where(near, time, -np.inf)
     since = time - np.maximum.accumulate(last_touch)
     return before, ~near & (since > REST_S)
+
+
+def surely_resting(trial: Trial, motion: WholeMotion) -> np.ndarray:
+    """Frames (T,) at rest, or those without contact where an indenter that hovers close by leaves none."""
+    rest = resting(trial, motion)[1]
+    return rest if rest.any() else ~motion.touching
 
 
 def idle_map(trials: Sequence[Trial], motions: Sequence[WholeMotion], layout: PadLayout) -> IdleMap:

@@ -164,8 +164,7 @@ def _possible(
 ) -> tuple[float, float]:
     """An interval within what the form's bounds allow.
 
-    The coordinates' ends need not be the parameter's: a drift's mean rate is zero where all its knots are at
-    theirs. Ends that leave the estimate itself out bound nothing.
+    The coordinates' ends need not be the parameter's. Ends that leave the estimate itself out bound nothing.
     """
     ends = sorted(float(form.report(values, setting)[name][0]) for values in (form.low, form.high))
     if ends[0] < ends[1] and ends[0] <= value <= ends[1]:

@@ -129,7 +129,7 @@ def sensor_model(
     drift = next((stage for stage in stages if isinstance(stage, BaselineDrift)), None)
     level = idle.level
     if drift is not None:
-        level = level - drift.rate_counts_per_s * (idle.time_s if drift.anew else idle.session_s)
+        level = level - np.asarray(drift.rate_counts_per_s) * (idle.time_s if drift.anew else idle.session_s)
     # Plain floats: the file is JSON.
     stages.append(Idle(tuple(tuple(float(v) for v in row) for row in level), 0.0))
     if noise_counts > 0.0:

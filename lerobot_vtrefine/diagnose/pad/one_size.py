@@ -17,7 +17,6 @@ from lerobot_vtrefine.diagnose.pad.press_trials import PressSet
 from lerobot_vtrefine.diagnose.pad.rules import OWN_SHARE, SIZES_DIFFER
 from lerobot_vtrefine.diagnose.pad.weights import TrialWeights
 from lerobot_vtrefine.tactile.stages.host import Latency
-from lerobot_vtrefine.tactile.stages.readout import BaselineDrift
 
 Array = np.ndarray
 DRAWN_ANEW = (Latency.name, HOLD)
@@ -29,12 +28,9 @@ def sizes_differ(
 ) -> list[Suspicion]:
     """For every cause whether its size differs between recordings, beside a gain and a touch of their own.
 
-    Maps have no size, a latency or frames that are held may have another in each, and a drift through the
-    session may take any course.
+    Maps have no size, and a latency or frames that are held may have another in each.
     """
     names = [name for name in fitted.model.families if name in PLAIN and name not in DRAWN_ANEW]
-    if any(isinstance(stage, BaselineDrift) and not stage.anew for stage in fitted.model.stages()):
-        names = [name for name in names if name != BaselineDrift.name]
     found = [_differs(presses, fitted, weights, name, seed) for name in names]
     return [item for item in found if item is not None]
 

@@ -7,7 +7,8 @@ from typing import TYPE_CHECKING
 import numpy as np
 from scipy.ndimage import binary_dilation
 
-from lerobot_vtrefine.diagnose.pad.idle_map import IdleMap, WholeMotion, idle_map, resting
+from lerobot_vtrefine.diagnose.pad.idle_course import with_course
+from lerobot_vtrefine.diagnose.pad.idle_map import IdleMap, WholeMotion, idle_map, resting, surely_resting
 from lerobot_vtrefine.diagnose.pad.indenters import trial_forces
 from lerobot_vtrefine.diagnose.pad.motion import Kind, instants_of, motion
 from lerobot_vtrefine.diagnose.pad.repeated_frames import Rhythm, silent
@@ -246,6 +247,9 @@ def prepare(recordings: RecordingSet, trials: list[Trial], learn: list[int]) -> 
     trials = with_session(trials, [motion.drive for motion in motions])
     count = min(1.0, recordings.full_scale / 255.0)
     idle = idle_map([trials[i] for i in learn], [motions[i] for i in learn], layout)
+    free = [~near(np.any(motion.drive > 0, axis=0)) for motion in motions]
+    rests = [surely_resting(trial, motion) for trial, motion in zip(trials, motions, strict=True)]
+    idle = with_course(idle, trials, free, rests)
     wander = _wander([trials[i] for i in learn], [motions[i] for i in learn], idle)
     presses = tuple(
         _press(trial, motion, layout, idle.level, loaded, _Doubt(count, wander))

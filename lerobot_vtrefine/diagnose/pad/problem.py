@@ -307,7 +307,7 @@ class PadProblem(OptionalSteps):
         return float(each @ readings) > FAR_OFF * max(float(readings.sum()), 1.0)
 
     def screened(self, now: Fit, only: Collection[str] | None = None) -> list[Promise[Candidate]]:
-        """Scores of all forms that are screened, of maps, of frames that repeat and of levels that wander."""
+        """Scores of all forms that are screened, of maps, and of frames that repeat."""
         probes = all_probes(self, now) if only is None else form_probes(self, now, only)
         out = []
         for name, tested in screen(probes, len(self.weights), self.seed).items():

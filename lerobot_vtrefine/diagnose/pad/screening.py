@@ -10,11 +10,9 @@ from lerobot_vtrefine.diagnose.core.parallel import on_all_cores
 from lerobot_vtrefine.diagnose.core.score_test import Probe, cleared
 from lerobot_vtrefine.diagnose.pad.candidates import CATALOGUE, PLAIN
 from lerobot_vtrefine.diagnose.pad.candidates.base import Form
-from lerobot_vtrefine.diagnose.pad.candidates.baseline_drift import CURVE
 from lerobot_vtrefine.diagnose.pad.candidates.sample_and_hold import held, irregular_periods, pattern
 from lerobot_vtrefine.diagnose.pad.fitting import Fit, movable, predict, tangents
 from lerobot_vtrefine.diagnose.pad.forward_model.run import Prefix
-from lerobot_vtrefine.diagnose.pad.idle_drift import drift_probe
 from lerobot_vtrefine.diagnose.pad.own_touch import allowed, touches_of
 from lerobot_vtrefine.diagnose.pad.press_trials import PressSet
 from lerobot_vtrefine.diagnose.pad.taxel_maps import find_dead, map_evidence
@@ -123,16 +121,13 @@ def form_probes(problem: "PadProblem", fitted: Fit, families: Collection[str] | 
 
 
 def all_probes(problem: "PadProblem", fitted: Fit) -> list[Probe]:
-    """Probes of forms, of maps, of frames that repeat and of levels that wander."""
+    """Probes of forms, of maps, and of frames that repeat."""
     probes = [*form_probes(problem, fitted), *map_probes(problem, fitted)]
     touch = touch_probe(problem, fitted)
     probes += [touch] if touch is not None else []
     repeats = hold_probe(problem, fitted)
     if repeats is not None:
         probes = [*(probe for probe in probes if probe.name != repeats.name), repeats]
-    if CURVE.possible(fitted.model.setting) and CURVE.family not in fitted.model.families:
-        drift = drift_probe(fitted, problem.presses, CURVE, problem.seed)
-        probes += [drift] if drift is not None else []
     return probes
 
 

@@ -224,7 +224,7 @@ class Idle(Stage):
 @register
 @dataclass(frozen=True)
 class BaselineDrift(Stage):
-    """The idle level moves with session time: counts += rate_counts_per_s * t.
+    """The idle level moves with session time: counts += rate_counts_per_s * t (a number or (R, C)).
 
     `knots_s` and `knot_counts`, equally long, add a curve that is straight between its knots and level beyond
     them; `counts_per_c` follows the temperature around `reference_c`, where a recording knows it. With `anew`
@@ -235,7 +235,9 @@ class BaselineDrift(Stage):
     domain: ClassVar[str] = "counts"
     rank: ClassVar[int] = 62
     has_state: ClassVar[bool] = True  # The clock advances with the frames, so none may be left out.
-    rate_counts_per_s: float = parameter(0.0, "counts/s", -3e-3, 3e-3, minimum=None)
+    rate_counts_per_s: float | tuple[tuple[float, ...], ...] = field(
+        default=0.0, metadata={"range": (-3e-3, 3e-3), "maximum": LARGEST["counts/s"]}
+    )
     knots_s: tuple[float, ...] = ()
     knot_counts: tuple[float, ...] = ()
     counts_per_c: float = parameter(0.0, "counts/degC", 0.0, 0.0, minimum=None)
@@ -244,6 +246,8 @@ class BaselineDrift(Stage):
 
     def __post_init__(self) -> None:
         super().__post_init__()
+        rates = as_map("baseline_drift.rate_counts_per_s", self.rate_counts_per_s)
+        object.__setattr__(self, "rate_counts_per_s", rates)
         for name in ("knots_s", "knot_counts"):
             object.__setattr__(self, name, as_tuple(getattr(self, name)))
         rising = all(later > earlier for earlier, later in pairwise(self.knots_s))
@@ -253,7 +257,8 @@ class BaselineDrift(Stage):
     @override
     def step(self, x: torch.Tensor, state: State, frame: Frame) -> tuple[torch.Tensor, State]:
         time_s = torch.as_tensor(frame.time_s)
-        moved = self.rate_counts_per_s * time_s + (self.knot_counts[0] if self.knot_counts else 0.0)
+        begin_counts = self.knot_counts[0] if self.knot_counts else 0.0
+        moved = taxel_map(self.rate_counts_per_s, x) * time_s + begin_counts
         knots = zip(pairwise(self.knots_s), pairwise(self.knot_counts), strict=True)
         for (begin, end), (first, last) in knots:
             moved = moved + (last - first) / (end - begin) * (time_s - begin).clamp(0.0, end - begin)

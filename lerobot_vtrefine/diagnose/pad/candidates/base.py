@@ -56,6 +56,10 @@ class Setting:
     """What every taxel reads at rest (R, C)."""
     rest_time_s: float = 0.0
     """Mean time in their recordings of the frames that the idle map rests on [s]."""
+    idle_course: tuple[tuple[float, float], ...] = ()
+    """How taxels that nothing presses move through the session: times [s] and counts above the idle map."""
+    idle_rates: tuple[tuple[float, ...], ...] = ()
+    """What every taxel does beside that (R, C) [counts/s]; none where they all do the same."""
 
 
 @dataclass(frozen=True)

@@ -26,18 +26,6 @@ def _report(values: np.ndarray, setting: Setting) -> dict[str, tuple[float, str]
     return {"rate_counts_per_s": (float(values[0]) * UNIT, "counts/s")}
 
 
-KNOTS, MANY_KNOTS = 6, 16
-
-
-def _knots(setting: Setting, count: int) -> np.ndarray:
-    return setting.session_start_s + np.linspace(0.0, setting.session_s + setting.duration_s, count)
-
-
-def _curve(values: np.ndarray, setting: Setting) -> tuple[Stage, ...]:
-    knots = tuple(float(knot) for knot in _knots(setting, len(values)))
-    return (BaselineDrift(0.0, knots, tuple(float(value) for value in values)),)
-
-
 def _thermal(values: np.ndarray, setting: Setting) -> tuple[Stage, ...]:
     """Around a fitted temperature, at which the idle map holds."""
     per_c, shift_c = float(values[0]), float(values[1])
@@ -45,33 +33,35 @@ def _thermal(values: np.ndarray, setting: Setting) -> tuple[Stage, ...]:
     return (BaselineDrift(0.0, counts_per_c=per_c, reference_c=reference_c),)
 
 
-def _report_curve(values: np.ndarray, setting: Setting) -> dict[str, tuple[float, str]]:
-    """The mean rate."""
-    return {"rate_counts_per_s": (float(np.polyfit(_knots(setting, len(values)), values, 1)[0]), "counts/s")}
+def _shown(values: np.ndarray, setting: Setting) -> tuple[Stage, ...]:
+    """As all taxels do that nothing presses, or a part of it."""
+    times_s, counts = zip(*setting.idle_course, strict=True)
+    share = float(values[0])
+    moved = tuple(share * level for level in counts)
+    if not setting.idle_rates:
+        return (BaselineDrift(0.0, times_s, moved),)
+    own = share * np.array(setting.idle_rates)
+    return (Idle(-setting.rest_session_s * own, 0.0), BaselineDrift(own, times_s, moved))
 
 
-def _curve_of(label: str, count: int, least: float) -> Form:
-    """A curve through `count` knots, for sessions of at least so many recordings' lengths."""
-    return Form(
-        "baseline_drift",
-        label,
-        tuple(Value(f"counts_{j}", -1e3, 1e3, 1e-2) for j in range(count)),
-        _curve,
-        _report_curve,
-        lambda s: [
-            (0.5 * np.cos(np.pi * order * np.arange(count) / (count - 1))).tolist() for order in (1, 2, 3)
-        ],
-        amplitude=None,
-        signed=True,
-        possible=lambda s: s.session_s > least * s.duration_s,
-        screened=count == KNOTS,
-    )
+def _report_shown(values: np.ndarray, setting: Setting) -> dict[str, tuple[float, str]]:
+    """The mean rate, and from the lowest level to the highest."""
+    times_s, shown = np.array(setting.idle_course).T
+    counts = float(values[0]) * shown
+    rate = float(np.polyfit(times_s, counts, 1)[0])
+    return {"rate_counts_per_s": (rate, "counts/s"), "span_counts": (float(np.ptp(counts)), "counts")}
 
 
-CURVE = _curve_of("curve over session time", KNOTS, 2.0)
-WANDERING = _curve_of("wandering over session time", MANY_KNOTS, MANY_KNOTS)
-"""What wanders keeps its level for a recording or two only."""
-
+SHOWN = Form(
+    "baseline_drift",
+    "as taxels at rest show it",
+    (Value("share", 0.0, 2.0, 1e-2),),
+    _shown,
+    _report_shown,
+    lambda s: [[1.0]],
+    possible=lambda s: bool(s.idle_course),
+    peer=True,
+)
 RATE = Value("rate", -5e4, 5e4, 1e-2)
 FORMS = (
     Form(
@@ -85,8 +75,7 @@ FORMS = (
         needs="log start_s, and record over some minutes with frames at rest in every trial",
         signed=True,
     ),
-    CURVE,
-    WANDERING,
+    SHOWN,
     Form(
         "baseline_drift",
         "follows the temperature",

@@ -11,6 +11,25 @@ MAX_ROWS = 12
 LONGEST_S = 0.4
 
 
+def _interlaced(values: np.ndarray, setting: Setting) -> tuple[Stage, ...]:
+    """Every other row from the first one on, then the rows between: the last is read `values[0]` early."""
+    rows = setting.layout.rows
+    turns = np.argsort([*range(0, rows, 2), *range(1, rows, 2)])
+    delays = float(values[0]) * turns / (rows - 1)
+    return (ScanSkew(_slope(delays), tuple(delays.tolist())),)
+
+
+def _slope(delays: np.ndarray) -> float:
+    """Of a straight line through all rows: seconds from the first row to the last."""
+    return float(np.polyfit(np.linspace(0.0, 1.0, len(delays)), delays, 1)[0])
+
+
+def _report_interlaced(values: np.ndarray, setting: Setting) -> dict[str, tuple[float, str]]:
+    (stage,) = _interlaced(values, setting)
+    assert isinstance(stage, ScanSkew)
+    return {"skew_s": (stage.skew_s, "s")}
+
+
 def _by_row(values: np.ndarray, setting: Setting) -> tuple[Stage, ...]:
     slope, late = _line(values)
     # The line through all rows begins at none: what they share is latency.
@@ -65,6 +84,17 @@ FORMS = (
         lambda v, s: {"skew_s": (-float(v[0]), "s")},
         lambda s: [[0.5 * s.frame_s]],
         possible=lambda s: s.layout.rows > 1 and s.touched_rows > 1,
+        peer=True,
+    ),
+    Form(
+        "scan_skew",
+        "every other row, then the rows between",
+        (Value("sweep_s", -LONGEST_S, LONGEST_S, 1e-3),),
+        _interlaced,
+        _report_interlaced,
+        lambda s: [[0.5 * s.frame_s]],
+        signed=True,
+        possible=lambda s: s.layout.rows > 2 and s.touched_rows > 1,
         peer=True,
     ),
     Form(

@@ -183,14 +183,18 @@ def _drift(stage: BaselineDrift, field: Field, context: Context) -> Field:
     starts_s = np.zeros(len(sheet.starts_s)) if stage.anew else sheet.starts_s
     session_s = [time_s + start_s for time_s, start_s in zip(sheet.times_s, starts_s, strict=True)]
     ends = np.cumsum([len(time_s) for time_s in session_s])[:-1]
-    # Drift knows the time alone: the presses one after the other are one recording.
+    # What all taxels do knows the time alone: the presses one after the other are one recording.
     known = [np.full(len(time_s), stage.reference_c) for time_s in session_s]
     warm_c = [old if warm is None else warm for old, warm in zip(known, sheet.warmth_c, strict=True)]
     frame = Frame(sheet.layout, temperature_c=torch.from_numpy(np.concatenate(warm_c)))
     when = torch.from_numpy(np.concatenate(session_s))
-    moved = stage.sequence(torch.zeros((len(when), 1, 1), dtype=torch.float64), when, frame)
-    for press, part in enumerate(np.split(moved[:, 0].numpy(), ends)):
-        out[: len(part), field.within(sheet, press)] += part
+    nothing = torch.zeros((len(when), 1, 1), dtype=torch.float64)
+    moved = replace(stage, rate_counts_per_s=0.0).sequence(nothing, when, frame)
+    pad = (sheet.layout.rows, sheet.layout.cols)
+    rates = np.broadcast_to(np.asarray(stage.rate_counts_per_s), pad).ravel()[sheet.taxels[field.columns]]
+    for press, (part, time_s) in enumerate(zip(np.split(moved[:, 0].numpy(), ends), session_s, strict=True)):
+        own = field.within(sheet, press)
+        out[: len(part), own] += part + time_s[:, None] * rates[own]
     return Field(out, field.columns)
 
 
