@@ -180,7 +180,7 @@ def plain_gains(fitted: Fit, presses: PressSet) -> tuple[np.ndarray, np.ndarray]
         bottom[press.taxels] += (signal**2).sum(axis=0)
         power[press.taxels] += (press.signal**2).sum(axis=0)
         frames[press.taxels] += len(press.signal)
-    known = bottom > 0
+    known = bottom > 1e-6  # a thousandth of a count
     gain = np.where(known, top / np.where(known, bottom, 1.0), np.nan)
     left = np.maximum(power - np.where(known, top**2 / np.where(known, bottom, 1.0), 0.0), 0.0)
     variance = left / np.maximum(frames, 1.0)
