@@ -11,12 +11,11 @@ from itertools import pairwise
 import numpy as np
 
 from lerobot_vtrefine.diagnose.pad.idle_map import IdleMap
+from lerobot_vtrefine.diagnose.pad.rules import MIN_RESTING
 from lerobot_vtrefine.diagnose.recordings import Trial
 
 MIN_TAXELS = 4
 """Taxels whose median is a level."""
-MIN_FRAMES = 5
-"""Frames at rest whose mean is one."""
 MIN_RECORDINGS = 5
 """Recordings at rest from which on a taxel has a rate of its own."""
 
@@ -45,12 +44,12 @@ def with_course(
             line = _line(trial.time_s, shown)
             apart[k, taxels.ravel()] = (shown - line[:, None]).mean(axis=0)
             powers += _powers(line, shown)
-        elif rest.sum() >= MIN_FRAMES:
+        elif rest.sum() >= MIN_RESTING:
             line = np.full(len(moved), np.median(moved[rest].mean(axis=0)))
             powers += _powers(line[rest], moved[rest])
         else:
             continue
-        if rest.sum() >= MIN_FRAMES:
+        if rest.sum() >= MIN_RESTING:
             rested[k] = (moved - line[:, None])[rest].mean(axis=0)
         knots += zip((trial.start_s + trial.time_s[[0, -1]]).tolist(), line[[0, -1]].tolist(), strict=True)
     if powers[0] <= powers[1]:
