@@ -13,6 +13,7 @@ from lerobot_vtrefine.diagnose.core.suspicion import Suspicion
 from lerobot_vtrefine.diagnose.pad.fitting import Fit
 from lerobot_vtrefine.diagnose.pad.press_trials import PressSet
 from lerobot_vtrefine.diagnose.pad.rules import GROUPS, HIGHEST_HZ, LOWEST_HZ
+from lerobot_vtrefine.diagnose.pad.shared_errors import patterns
 from lerobot_vtrefine.diagnose.pad.weights import TrialWeights
 
 Array = np.ndarray
@@ -29,10 +30,9 @@ def hum(
     if presses.layout.num_taxels < 2:
         return []
     times = [press.trial.time_s for press in presses.presses]
-    even = [np.ones(residual.shape) for residual in residuals]
-    loads = [signal / weight.sigma for signal, weight in zip(fitted.signals, weights, strict=True)]
-    patterns = (("errors of all taxels hum", even), ("errors of loaded taxels hum, in proportion,", loads))
-    return [_line(text, times, residuals, pattern, weights, seed) for text, pattern in patterns]
+    even, loads = patterns(fitted, weights)
+    shared = (("errors of all taxels hum", even), ("errors of loaded taxels hum, in proportion,", loads))
+    return [_line(text, times, residuals, pattern, weights, seed) for text, pattern in shared]
 
 
 def _line(

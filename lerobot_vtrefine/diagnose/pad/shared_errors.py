@@ -31,19 +31,19 @@ def shared_errors(
     if presses.layout.num_taxels < 2:
         return []
     units = [residual / weight.sigma for residual, weight in zip(residuals, weights, strict=True)]
-    loads = [signal / weight.sigma for signal, weight in zip(fitted.signals, weights, strict=True)]
+    even, loads = patterns(fitted, weights)
     # A form that is not quite right errs in all loaded taxels at once.
     least = FOLLOWS_IF_OWNED if fitted.model.families else LEAST_UNKNOWN
     return [
-        _shared(
-            "errors come and go together in all taxels",
-            units,
-            [np.ones(unit.shape) for unit in units],
-            least,
-            seed,
-        ),
+        _shared("errors come and go together in all taxels", units, even, least, seed),
         _shared("errors come and go together in loaded taxels, in proportion", units, loads, least, seed),
     ]
+
+
+def patterns(fitted: Fit, weights: Sequence[TrialWeights]) -> tuple[list[Array], list[Array]]:
+    """What taxels may share (T, n) in units of noise: all alike, or in proportion to their load."""
+    loads = [signal / weight.sigma for signal, weight in zip(fitted.signals, weights, strict=True)]
+    return [np.ones(load.shape) for load in loads], loads
 
 
 def noise_in_bursts(
