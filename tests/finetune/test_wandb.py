@@ -2,6 +2,7 @@
 
 import json
 import sys
+import time
 from pathlib import Path
 
 import pytest
@@ -33,18 +34,32 @@ def finetune(tmp_path, monkeypatch):
     return run
 
 
-def logged(output: Path) -> list[tuple[str, dict[int, dict[str, float]]]]:
-    """(run id, metrics by iteration) of every offline run below ``output``, in the order of their start."""
+def records(path: Path) -> list:
+    """The records of one offline run; wandb's own process may write the last of them after ``finish``."""
     from wandb.proto.wandb_internal_pb2 import Record
     from wandb.sdk.internal.datastore import DataStore
 
+    deadline = time.monotonic() + 60
+    found: list = []
+    while not any(record.WhichOneof("record_type") == "exit" for record in found):
+        assert time.monotonic() < deadline, f"{path}: no end of the run after a minute"
+        time.sleep(0.1)
+        store, found = DataStore(), []
+        try:
+            store.open_for_scan(str(path))
+            while (data := store.scan_data()) is not None:
+                found.append(Record.FromString(data))
+        except AssertionError:  # half a record: read again
+            continue
+    return found
+
+
+def logged(output: Path) -> list[tuple[str, dict[int, dict[str, float]]]]:
+    """(run id, metrics by iteration) of every offline run below ``output``, in the order of their start."""
     runs = []
     for path in sorted(output.glob("wandb/offline-run-*/*.wandb")):
-        store, history, name = DataStore(), {}, ""
-        store.open_for_scan(str(path))
-        while (data := store.scan_data()) is not None:
-            record = Record()
-            record.ParseFromString(data)
+        history, name = {}, ""
+        for record in records(path):
             if record.WhichOneof("record_type") == "run":
                 name = record.run.run_id
             if record.WhichOneof("record_type") == "history":
