@@ -13,7 +13,8 @@ table, on episodes that are the same for all. Where DPPO practises is --tune_sta
 from states that the imitation reached with both parts in hand, or the expert where it reaches too few (bank);
 or with parts that are put into the hands (grasped), where a pair can be. Random weights, which never get that
 far, practise on whole episodes in place of a bank. On a GPU worlds wait for the one that runs out of time:
---tune_steps=120 ends episodes from a bank earlier, counted from the table.
+--tune_steps=120 ends episodes from a bank earlier, counted from the table; --tune_timestep_s=0.005 practises in
+longer physics steps than those in which policies are judged.
 
 Every policy becomes rows of results/paper.json, or of results/demonstrations.json, as soon as it is judged.
 The same command again goes on where it was: finished stages are not repeated, nor policies whose rows are
@@ -223,9 +224,14 @@ def uses_bank(options: argparse.Namespace, policy: Trained) -> bool:
     return options.tune_start == "bank" and policy.demonstrations > 0
 
 
-def practice_steps(options: argparse.Namespace) -> list[str]:
-    """When episodes end that start from a bank; grasps that come later are none of its states."""
-    return [f"--env.episode_steps={options.tune_steps}"] if options.tune_steps else []
+def practice_flags(options: argparse.Namespace, *, bank: bool) -> list[str]:
+    """How practice differs from the task that is judged: physics steps, and when episodes from a bank end.
+
+    Grasps that come after that are none of the bank's states.
+    """
+    step = [f"--env.scene.timestep_s={options.tune_timestep_s}"] if options.tune_timestep_s else []
+    end = [f"--env.episode_steps={options.tune_steps}"] if bank and options.tune_steps else []
+    return [*step, *end]
 
 
 def bank_stage(options: argparse.Namespace, policy: Trained) -> Stage:
@@ -237,7 +243,7 @@ def bank_stage(options: argparse.Namespace, policy: Trained) -> Stage:
         "vtrefine-record-starts",
         *task_flags(options, policy.pair),
         f"--env.backend={options.backend}",
-        *practice_steps(options),
+        *practice_flags(options, bank=True),
         f"--path={product}",
         f"--policy.path={checkpoint(start)}",
         f"--policy.device={options.device}",
@@ -260,7 +266,7 @@ def finetune_stage(options: argparse.Namespace, policy: Trained) -> Stage:
         *task_flags(options, policy.pair),
         *(["--env.start=grasped"] if grasped else []),
         *(f"--env.start_bank={stage.product}" for stage in bank),
-        *(practice_steps(options) if bank else []),
+        *practice_flags(options, bank=bool(bank)),
         f"--env.backend={options.backend}",
         f"--policy.path={checkpoint(start)}",
         f"--policy.device={options.device}",
@@ -425,6 +431,7 @@ def make_parser() -> CommandParser:
     parser.add_argument("--worlds", type=int, default=512, help="of DPPO")
     parser.add_argument("--tune_start", choices=["table", "bank", "grasped"], default="table", help="of DPPO")
     parser.add_argument("--tune_steps", type=int, help="control step at which episodes from a bank end")
+    parser.add_argument("--tune_timestep_s", type=float, help="longest physics step [s] of DPPO")
     parser.add_argument("--starts", type=int, default=512, help="states in a bank")
     parser.add_argument("--episodes", type=int, default=512, help="of an evaluation")
     parser.add_argument("--eval_envs", type=int, default=512, help="episodes evaluated at once")

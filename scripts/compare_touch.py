@@ -50,7 +50,7 @@ FROM_ABOVE = {
 
 SETTINGS: dict[str, dict[str, dict[str, Any]]] = {
     "demo": {},
-    "tight": {"env": {"clearance_m": 0.001, "scene": {"timestep_s": 0.002}}},
+    "tight": {"env": {"clearance_m": 0.001, "scene": {"timestep_s": 0.002, "rigid_time_constant_s": 0.004}}},
     "occluded": {"env": {"scene": {"camera": FROM_ABOVE}}},
     "slip": {"env": {"rules": {"grasped": {"slip_m": 0.004, "slip_rad": 0.1}}}},
     "short_chunk": {"policy": {"n_action_steps": 4}},
@@ -76,7 +76,7 @@ MANY_WORLDS: dict[str, Any] = {
     "device": "cuda",
 }
 """The demo on a GPU: 1024 worlds and a trust region."""
-_TIGHT = {"clearance_m": 0.001, "scene": {"timestep_s": 0.002}}
+_TIGHT = {"clearance_m": 0.001, "scene": {"timestep_s": 0.002, "rigid_time_constant_s": 0.004}}
 _ASKEW = {"rules": {"grasped": {"slip_m": 0.004, "slip_rad": 0.1}}}
 WORLDS: dict[str, dict[str, dict[str, Any]]] = {
     "worlds_round": {"env": {"pair": "round", "clearance_m": 0.002}},

@@ -34,8 +34,8 @@ from lerobot_vtrefine.sim.task import FAILURES
 TABLE = "expert"
 RESULTS = Path(__file__).parents[1] / "results"
 CLEARANCES_M = (0.002, 0.001)
-TIGHT_TIMESTEP_S = 0.002
-"""Physics step for meshes and clearances of 1 mm, as SceneConfig asks for."""
+TIGHT = {"timestep_s": 0.002, "rigid_time_constant_s": 0.004}
+"""Of meshes and clearances of 1 mm, as SceneConfig asks for."""
 
 
 @dataclass(frozen=True)
@@ -63,7 +63,7 @@ class Setting:
         if self.clearance_m is not None:
             scene = replace(scene, clearance_m=self.clearance_m)
         is_tight = self.clearance_m is None or self.clearance_m < CLEARANCES_M[0]
-        return replace(scene, timestep_s=TIGHT_TIMESTEP_S) if is_tight else scene
+        return replace(scene, **TIGHT) if is_tight else scene
 
 
 def measure(setting: Setting, episodes: int, mesh_dir: Path | None) -> Run:

@@ -47,7 +47,7 @@ class SceneConfig:
     mesh_scale: str = "flexitac"
     """flexitac (that setup's factors for its five pairs), unit, or one factor for both parts."""
     timestep_s: float = 0.0025
-    """Longest physics step; at clearances of 1 mm and below use 0.002 or less. Where control steps are no
+    """Longest physics step. What is rigid stays as stiff in any, see `sim.rigid`. Where control steps are no
     whole number of these, --env.fps shortens it."""
     camera: CameraConfig | None = None
     """By default the body's camera for `start`."""
@@ -65,6 +65,9 @@ class SceneConfig:
     """[kg/m^3]; parts never weigh less than 40 g, below which contacts turn soft."""
     pad_time_constant_s: float = 0.01
     """Contact time constant of the pads: about 0.6 mm compression at 20 N."""
+    rigid_time_constant_s: float = 0.005
+    """Contact time constant of what is rigid, parts and couplings of fingers: parts press about 0.3 mm into
+    each other at 6 N. At clearances of 1 mm and below use 0.004 or less."""
 
     def __post_init__(self) -> None:
         check_choice("start", self.start, STARTS)
@@ -89,6 +92,7 @@ class SceneConfig:
             "part_friction",
             "part_density",
             "pad_time_constant_s",
+            "rigid_time_constant_s",
         ):
             if not getattr(self, name) > 0.0:
                 raise ValueError(f"{name} must be above 0, got {getattr(self, name)}")

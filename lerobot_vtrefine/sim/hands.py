@@ -9,6 +9,7 @@ from lerobot_vtrefine.embodiments.shapes import box, capsule
 from lerobot_vtrefine.sim.appearance import DARK, GREY, PAD
 from lerobot_vtrefine.sim.config import SceneConfig
 from lerobot_vtrefine.sim.links import add_servo, add_shape, add_solid
+from lerobot_vtrefine.sim.rigid import rigid_contact
 
 PLATE_M = 0.004
 """Half thickness of the plate that carries a pad."""
@@ -184,5 +185,5 @@ def _couple(
     coupling = spec.add_equality(name=name, type=mujoco.mjtEq.mjEQ_JOINT, objtype=mujoco.mjtObj.mjOBJ_JOINT)
     coupling.name1, coupling.name2 = joint, driver
     coupling.data[:5] = terms
-    coupling.solref = [2 * config.timestep_s, 1.0]
+    coupling.solref, coupling.solimp = rigid_contact(config.rigid_time_constant_s, config.timestep_s)
     return coupling

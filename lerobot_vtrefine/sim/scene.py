@@ -15,6 +15,7 @@ from lerobot_vtrefine.sim.links import FIRST_HAND, PLUG, SECOND_HAND, SOCKET, TA
 from lerobot_vtrefine.sim.pairs import load_pair
 from lerobot_vtrefine.sim.parts import Part, PartPair
 from lerobot_vtrefine.sim.profiles import Primitive
+from lerobot_vtrefine.sim.rigid import rigid_contact
 from lerobot_vtrefine.sim.rotations import matrix_to_quat
 from lerobot_vtrefine.tactile.geometry import Box, ConvexHull, Cylinder
 
@@ -222,7 +223,7 @@ def _add_part(
         geom.contype, geom.conaffinity = own, others
         geom.condim = 4
         geom.friction = [config.part_friction, 0.002, 0.0001]
-        geom.solref = [2 * config.timestep_s, 1.0]
+        geom.solref, geom.solimp = rigid_contact(config.rigid_time_constant_s, config.timestep_s)
         geom.density = config.part_density
     if part.foot is not None:
         _stand_on(spec, body, part.foot)
@@ -234,7 +235,8 @@ def _stand_on(spec: mujoco.MjSpec, body: mujoco.MjsBody, foot: ConvexHull) -> No
     pieces = list(body.geoms)
     geom = _add_piece(spec, body, f"{body.name}_foot", foot)
     geom.contype, geom.conaffinity = 0, TABLE
-    geom.condim, geom.friction, geom.solref = pieces[0].condim, pieces[0].friction, pieces[0].solref
+    geom.condim, geom.friction = pieces[0].condim, pieces[0].friction
+    geom.solref, geom.solimp = pieces[0].solref, pieces[0].solimp
     geom.density, geom.rgba = 0.0, UNSEEN
     for piece in pieces:
         piece.conaffinity &= ~TABLE

@@ -116,6 +116,15 @@ def test_dppo_may_start_from_a_bank_of_the_imitations_own_grasps(
         assert f"starts_{policy.name}" in next(s for s in stages if "finetune" in s.name).needs
 
 
+def test_dppo_may_practise_in_longer_physics_steps_than_those_it_is_judged_in(tmp_path: Path) -> None:
+    start = ["--tune_start=bank", "--tune_timestep_s=0.005", "--no_scratch"]
+    options = parse([*common(tmp_path), "--pairs=00186", *start])
+    for policy in script.chosen(options):
+        lines = [stage.line for stage in script.stages(options, policy)]
+        longer = [line.split()[0] for line in lines if "--env.scene.timestep_s=0.005" in line]
+        assert longer == ["vtrefine-record-starts", "vtrefine-finetune"]
+
+
 def test_every_pair_trains_an_encoder_from_the_table_and_policies_learn_on_its_features() -> None:
     options = parse(["--mesh_dir=meshes", "--pairs=00446", "--seeds=0", "--output_dir=out"])
     for policy in script.chosen(options):

@@ -16,8 +16,9 @@ AUTOMATE = Path(__file__).parents[3] / "shared" / "data" / "automate"
 
 
 def _sim(pair: str, start: str, num_envs: int, clearance_m: float = 0.002, **scene: Any) -> InsertionSim:
-    timestep_s = 0.0025 if clearance_m >= 0.002 else 0.002
-    config = SceneConfig(pair=pair, start=start, clearance_m=clearance_m, timestep_s=timestep_s, **scene)
+    if clearance_m < 0.002:
+        scene = {"timestep_s": 0.002, "rigid_time_constant_s": 0.004} | scene
+    config = SceneConfig(pair=pair, start=start, clearance_m=clearance_m, **scene)
     return InsertionSim(config, num_envs=num_envs, num_threads=1)
 
 

@@ -80,7 +80,7 @@ def test_dropped_pairs_do_not_touch_and_most_that_do_not_touch_are_dropped():
 @pytest.fixture(scope="module")
 def touching():
     """The plug touching the socket in three worlds: on plain MuJoCo, and a simulation on mujoco_warp."""
-    scene = SceneConfig(start="grasped", timestep_s=0.004)
+    scene = SceneConfig(start="grasped", timestep_s=0.004, rigid_time_constant_s=0.008)
     task = TaskConfig(grasped=GraspedStart(plug_height_m=0.006))
     truth = InsertionSim(scene, task, num_envs=3, backend="single")
     truth.reset(WORLDS, WORLDS)

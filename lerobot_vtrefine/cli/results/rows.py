@@ -126,6 +126,7 @@ class Line(Row):
         "step_size",
         "sysid",
         "tactile",
+        "timestep",
         "tolerance",
         "touch_inputs",
         "touch_tasks",
