@@ -13,8 +13,8 @@ table, on episodes that are the same for all. Where DPPO practises is --tune_sta
 from states that the imitation reached with both parts in hand, or the expert where it reaches too few (bank);
 or with parts that are put into the hands (grasped), where a pair can be. Random weights, which never get that
 far, practise on whole episodes in place of a bank. On a GPU worlds wait for the one that runs out of time:
---tune_steps=120 ends episodes from a bank earlier, counted from the table; --tune_timestep_s=0.005 practises in
-longer physics steps than those in which policies are judged.
+--tune_steps=120 ends episodes from a bank earlier, counted from the table. --tune_timestep_s=0.005 practises
+in longer physics steps than those in which policies are judged.
 
 Every policy becomes rows of results/paper.json, or of results/demonstrations.json, as soon as it is judged.
 The same command again goes on where it was: finished stages are not repeated, nor policies whose rows are

@@ -9,11 +9,8 @@ A trained policy plays the same held-out episodes of a task in every step. Minut
 
 import sys
 import time
-from dataclasses import replace
 from pathlib import Path
 
-import draccus
-from lerobot.envs import EnvConfig
 from tqdm import tqdm
 
 from lerobot_vtrefine.cli.arguments import CommandParser, read_list
@@ -23,10 +20,9 @@ from lerobot_vtrefine.cli.results.cells import interval, percent
 from lerobot_vtrefine.cli.results.collect import save
 from lerobot_vtrefine.cli.results.provenance import provenance
 from lerobot_vtrefine.cli.results.rows import Line
-from lerobot_vtrefine.files import read_yaml
 from lerobot_vtrefine.finetune.config import TrustRegionDppo
 from lerobot_vtrefine.finetune.evaluation import evaluate
-from lerobot_vtrefine.finetune.pipeline import checked_env, load_practice
+from lerobot_vtrefine.finetune.pipeline import load_practice
 from lerobot_vtrefine.shipped import find
 
 ROOT = Path(__file__).parents[1]
@@ -41,9 +37,8 @@ SHOWN = {
 
 def measure(policy: Path, task: Path, timestep_s: float, episodes: int, backend: str, device: str) -> Line:
     """Plays ``episodes`` held-out episodes, which are the same in every step."""
-    scene = replace(checked_env(draccus.decode(EnvConfig, read_yaml(task)["env"])).scene, timestep_s=timestep_s)
     dppo = TrustRegionDppo(num_envs=episodes, encoder="frozen")
-    practice = load_practice(policy, task, dppo, device, backend, scene=scene)
+    practice = load_practice(policy, task, dppo, device, backend, timestep_s)
     started = time.perf_counter()
     found = evaluate(practice.env, practice.agent, episodes)
     seconds = time.perf_counter() - started

@@ -105,7 +105,9 @@ def profile(args: argparse.Namespace, worlds: int) -> dict[str, Any]:
     """One row."""
     device = torch.device(args.device)
     cfg = TrustRegionDppo(num_envs=worlds, encoder="frozen", critic_warmup=0, decisions=args.decisions)
-    policy, agent, env, _ = load_practice(args.policy, args.task, cfg, args.device, backend="warp")
+    policy, agent, env, _ = load_practice(
+        args.policy, args.task, cfg, args.device, backend="warp", timestep_s=args.timestep_s
+    )
     reset_s, env_s = environment_seconds(env.episodes, device)
     state = dppo.TrainState.create(agent, cfg, env.privileged_dim, seed=0)
     rollouts, updates, steps, count = [], [], [], 0
@@ -148,6 +150,7 @@ def main() -> int:
     parser.add_argument("--decisions", type=int, default=0, help="of a rollout; 0: whole episodes")
     parser.add_argument("--policy", type=Path, default=POLICY, help="a vt_dp3 checkpoint's folder")
     parser.add_argument("--task", type=Path, default=TASK, help="a file as in configs/env")
+    parser.add_argument("--timestep_s", type=float, help="longest physics step [s], default: the task's")
     parser.add_argument("--json", type=Path, help="where to write the rows, too")
     args = parser.parse_args()
     print(f"measuring {Path(lerobot_vtrefine.__file__).parent}", flush=True)

@@ -216,16 +216,25 @@ def make_practice(policy: VtDp3Policy, path: Path, env: EnvConfig, dppo: DppoCon
 
 
 def load_practice(
-    path: Path, task: Path, dppo: DppoConfig, device: str, backend: str | None = None, **fields: Any
+    path: Path,
+    task: Path,
+    dppo: DppoConfig,
+    device: str,
+    backend: str | None = None,
+    timestep_s: float | None = None,
+    **fields: Any,
 ) -> Practice:
     """The same of a checkpoint's folder and a file as in configs/env; both on ``device`` (cpu, cuda).
 
-    ``backend`` of the simulation; default: the file's. ``fields`` of the environment that differ from it.
+    ``backend`` and longest physics step of the simulation; default: the file's. ``fields`` of the environment
+    that differ from it.
 
     Raises: ValueError for another environment type.
     """
     env = checked_env(draccus.decode(EnvConfig, read_yaml(task)["env"]))
-    env = replace(env, backend=backend or env.backend, warp=replace(env.warp, device=device), **fields)
+    scene = replace(env.scene, timestep_s=timestep_s or env.scene.timestep_s)
+    warp = replace(env.warp, device=device)
+    env = replace(env, backend=backend or env.backend, warp=warp, scene=scene, **fields)
     policy = VtDp3Policy.from_pretrained(path).to(device)
     policy.config.device = device
     return make_practice(policy, path, env, dppo)

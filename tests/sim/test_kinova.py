@@ -17,7 +17,8 @@ def kinova(start: str, num_envs: int, backend: str = "batch", **scene) -> Insert
 
 @pytest.mark.parametrize(("start", "num_envs"), [("grasped", 3), ("table", 1)])
 def test_expert_inserts_gently(start: str, num_envs: int) -> None:
-    sim = kinova(start, num_envs, pair="key", clearance_m=0.001, timestep_s=0.002, rigid_time_constant_s=0.004)
+    tight = {"clearance_m": 0.001, "timestep_s": 0.002, "rigid_time_constant_s": 0.004}
+    sim = kinova(start, num_envs, pair="key", **tight)
     ids = np.arange(num_envs)
     sim.reset(ids, ids)
     expert = ScriptedExpert(sim)

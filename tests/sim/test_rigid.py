@@ -1,4 +1,4 @@
-"""Rigid contacts: as stiff in a long physics step as in a short one, and as MuJoCo's default in a short one."""
+"""Rigid contacts: as stiff in long physics steps as in short ones, in which they are MuJoCo's default."""
 
 import mujoco
 import numpy as np
@@ -21,9 +21,7 @@ def pressed_depth(timestep_s: float, time_constant_s: float = 0.005) -> float:
     spec.worldbody.add_geom(type=mujoco.mjtGeom.mjGEOM_BOX, size=[0.02] * 3, solref=law[0], solimp=law[1])
     body = spec.worldbody.add_body(pos=[0, 0, 0.04])
     body.add_joint(type=mujoco.mjtJoint.mjJNT_SLIDE, axis=[0, 0, 1])
-    body.add_geom(
-        type=mujoco.mjtGeom.mjGEOM_BOX, size=[0.02] * 3, mass=MASS_KG, solref=law[0], solimp=law[1]
-    )
+    body.add_geom(type=mujoco.mjtGeom.mjGEOM_BOX, size=[0.02] * 3, mass=MASS_KG, solref=law[0], solimp=law[1])
     model = spec.compile()
     data = mujoco.MjData(model)
     data.qfrc_applied[0] = -FORCE_N
