@@ -17,7 +17,6 @@ from lerobot.policies import make_pre_post_processors
 from lerobot.utils.constants import PRETRAINED_MODEL_DIR
 from lerobot.utils.random_utils import set_seed
 from tqdm import tqdm
-from tqdm.contrib.logging import logging_redirect_tqdm
 
 from lerobot_vtrefine.envs.config import VtRefineEnvConfig
 from lerobot_vtrefine.envs.decisions import LeRobotDecisionEnv, make_decision_env
@@ -29,6 +28,7 @@ from lerobot_vtrefine.finetune.checkpoint import (
     save_checkpoint,
 )
 from lerobot_vtrefine.finetune.config import DppoConfig, PaperDppo
+from lerobot_vtrefine.finetune.console import logs_above_bars
 from lerobot_vtrefine.finetune.distributed import claim_gpu, join_ranks, leave_ranks, rank_index
 from lerobot_vtrefine.finetune.dppo import Metrics, TrainState, train
 from lerobot_vtrefine.finetune.evaluation import evaluate
@@ -317,7 +317,7 @@ def run(cfg: FinetunePipelineConfig) -> None:
     save_config(cfg, policy.config)
     state = TrainState.create(agent, cfg.dppo, env.privileged_dim, cfg.seed)
     recorder = Recorder(cfg, env, agent, Saveable(policy, *processors, cfg))
-    with logging_redirect_tqdm():
+    with logs_above_bars():
         if checkpoint is not None:
             load_training_state(checkpoint, state)
         recorder.start(state)
