@@ -1,5 +1,6 @@
 """Starting commands: names of configuration files, the umbrella, flags read from the source."""
 
+import shlex
 import sys
 from dataclasses import fields
 from pathlib import Path
@@ -211,6 +212,14 @@ def test_help_is_text_without_markup(monkeypatch, capsys: pytest.CaptureFixture[
     assert "``" not in shown
     assert "--root=Path" in shown
     assert "(required)" in shown
+
+
+def test_a_shell_understands_every_example_of_help() -> None:
+    texts = [umbrella.describe_module(umbrella.module_of(e))[1] for e in umbrella.commands().values()]
+    lines = [line for text in texts for line in text.replace("\\\n", "").splitlines()]
+    examples = [shlex.split(line, comments=True) for line in lines if line.startswith("  vtrefine-")]
+    assert len(examples) > 10
+    assert [words for words in examples if not all(w.startswith(("--", "...")) for w in words[1:])] == []
 
 
 def test_the_umbrella_lists_commands_and_configurations(monkeypatch, capsys) -> None:
