@@ -23,6 +23,7 @@ from lerobot_vtrefine.envs.decisions import LeRobotDecisionEnv, make_decision_en
 from lerobot_vtrefine.files import read_yaml
 from lerobot_vtrefine.finetune.checkpoint import (
     Saveable,
+    foreign_checkpoints,
     last_checkpoint,
     load_training_state,
     save_checkpoint,
@@ -120,8 +121,14 @@ def start_path(cfg: FinetunePipelineConfig) -> tuple[Path, Path | None]:
     """The policy to load and, when resuming, the checkpoint it belongs to.
 
     Raises:
-        ValueError: no policy was named. FileExistsError: output_dir holds a run that was not asked to resume.
+        ValueError: no policy was named.
+        FileExistsError: output_dir holds a run that is not resumed, or another command's checkpoints.
     """
+    if foreign := foreign_checkpoints(cfg.output_dir):
+        raise FileExistsError(
+            f"{foreign[0]} is another command's checkpoint, which this run would take the place of: choose"
+            " another --output_dir"
+        )
     checkpoint = last_checkpoint(cfg.output_dir)
     if checkpoint is not None:
         if not cfg.resume:

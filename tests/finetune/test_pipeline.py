@@ -178,6 +178,17 @@ def test_an_existing_run_is_not_overwritten(finetune, tmp_path, capsys):
     assert "--resume=true" in capsys.readouterr().err
 
 
+@pytest.mark.parametrize("resume", ["false", "true"])
+def test_checkpoints_of_another_command_keep_their_place(finetune, tmp_path, capsys, resume):
+    policy = save_tiny_checkpoint(tmp_path / "run" / "checkpoints" / "000001" / "pretrained_model")
+    before = {path: path.read_bytes() for path in policy.iterdir()}
+    assert finetune(tmp_path / "run", f"--resume={resume}", policy=policy, iterations=1) == 2
+    error = capsys.readouterr().err.splitlines()[-1]
+    assert "000001 is another command's checkpoint" in error
+    assert "choose another --output_dir" in error
+    assert {path: path.read_bytes() for path in policy.iterdir()} == before
+
+
 def test_settings_are_saved_and_can_be_read_again(finetune, tmp_path):
     first, second = tmp_path / "first", tmp_path / "second"
     assert finetune(first, "--env.clearance_m=0.001", iterations=1) == 0
