@@ -169,12 +169,13 @@ def test_what_is_wrong_with_a_command_line_is_told_before_lerobot_is_loaded(
     assert capsys.readouterr().err == f"error: {line}\n"
 
 
-def test_a_checkpoints_folder_is_pointed_to_one_level_down(tmp_path: Path) -> None:
-    inside = tmp_path / "pretrained_model"
-    inside.mkdir()
+@pytest.mark.parametrize("below", ["pretrained_model", "checkpoints/last/pretrained_model"])
+def test_the_folder_of_a_checkpoint_or_of_a_run_is_told_where_its_policy_is(below, tmp_path: Path) -> None:
+    inside = tmp_path / below
+    inside.mkdir(parents=True)
     (inside / "config.json").write_text("{}")
     flags = flags_of("lerobot_vtrefine.cli.play", "PlayConfig", unused=True)
-    with pytest.raises(ValueError, match=f"is one folder too high: take {inside}"):
+    with pytest.raises(ValueError, match=f"is not a policy's own folder: take {inside}"):
         check_arguments(flags, [f"--policy.path={tmp_path}"])
     for fine in (f"--policy.path={inside}", "--policy.path=USER/insertion", "--eval.n_episodes=3"):
         check_arguments(flags, [fine])
