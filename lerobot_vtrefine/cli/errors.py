@@ -84,6 +84,8 @@ def _in_flags(message: str) -> str:
     """draccus speaks of Python classes; users type flags."""
     if "Expected a dict with a 'type' key" in message and "EnvConfig" in message:
         return "say which environment: --env.type=vtrefine or --config_path=vtrefine:NAME"
+    if "Expected a dict with a 'type' key" in message and "PreTrainedConfig" in message:
+        return "say which policy: --policy.path=FOLDER, a checkpoint's pretrained_model"
     return _OPTIONAL_VALUE.sub(lambda found: f"`{'.'.join(filter(None, found.groups()))}`: ", message)
 
 

@@ -15,6 +15,7 @@ from lerobot_vtrefine.cli.pipeline.demo_config import DemoConfig
 from lerobot_vtrefine.cli.play import PlayConfig
 from lerobot_vtrefine.cli.record_demos import RecordDemosConfig
 from lerobot_vtrefine.cli.replay import ReplayConfig
+from lerobot_vtrefine.finetune.pipeline import FinetunePipelineConfig
 
 
 def failing(error: BaseException):
@@ -100,6 +101,11 @@ class Flags:
             RecordDemosConfig,
             ["--root=x", "--env.pair=round"],
             "say which environment: --env.type=vtrefine or --config_path=vtrefine:NAME",
+        ),
+        (
+            FinetunePipelineConfig,
+            ["--env.type=vtrefine", "--policy.device=cpu"],
+            "say which policy: --policy.path=FOLDER, a checkpoint's pretrained_model",
         ),
         (PlayConfig, ["--seed=many"], "`seed`: Couldn't parse 'many' into an int"),
         (PlayConfig, ["--env.type=vtrefine", "--env.fps=x"], "`env.fps`: Couldn't parse 'x' into an int"),
