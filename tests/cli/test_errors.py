@@ -119,6 +119,14 @@ def test_flags_that_are_misspelt_or_lack_their_type_are_one_line(config, typed, 
     assert error.startswith(f"error: {line}")
 
 
+def test_settings_that_a_file_should_not_have_are_told_with_the_file(monkeypatch, tmp_path, capsys) -> None:
+    file = tmp_path / "settings.yaml"
+    file.write_text("num_epsodes: 3\n")
+    monkeypatch.setattr(sys, "argv", ["command", f"--config_path={file}"])
+    assert run_cli(lambda: draccus.parse(Flags, file, args=[]) and None)() == 2
+    assert capsys.readouterr().err == f"error: {file}: The fields `num_epsodes` are not valid for Flags\n"
+
+
 def test_a_network_that_does_not_answer_is_one_line(capsys) -> None:
     def upload() -> None:
         raise httpx.ConnectError("[Errno -2] Name or service not known")
