@@ -1,5 +1,6 @@
 """``vtrefine-find-pads``: find out which pad is on which serial port, by pressing one after the other."""
 
+import tempfile
 from collections.abc import Sequence
 from contextlib import ExitStack
 from pathlib import Path
@@ -70,9 +71,13 @@ def main(arguments: Sequence[str] | None = None) -> None:
     extras.require("vtrefine-find-pads", extras.PADS)
     if len(set(options.names)) < len(options.names):
         raise ValueError(f"--names must differ from each other, got {' '.join(options.names)}")
+    if not options.timeout > 0:
+        raise ValueError(f"--timeout must be positive, got {options.timeout:g}")
     ports = options.ports or stable_ports()
     if not ports:
         raise PortError("no serial port found; plug in the boards, or name ports with --ports")
+    if not options.list:
+        check_output(options.output)
     with ExitStack() as stack:
         boards = find_boards(ports, stack, only_list=options.list)
         if options.list:
@@ -80,6 +85,17 @@ def main(arguments: Sequence[str] | None = None) -> None:
         pads = ask(boards, options.names, options.timeout, check_rows=options.check_rows)
     save_pads(pads, options.output)
     print(f"wrote {options.output}: use it with --robot.pads_file={options.output}")
+
+
+def check_output(path: Path) -> None:
+    """Raise OSError where the file cannot be written, before anybody presses pads for it."""
+    if path.is_dir():
+        raise IsADirectoryError(f"--output={path} is a folder; name a file, such as {path / 'pads.yaml'}")
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        tempfile.TemporaryFile(dir=path.parent).close()
+    except OSError as error:
+        raise OSError(error.errno, error.strerror, f"--output={path}") from error
 
 
 def find_boards(ports: Sequence[str], stack: ExitStack, *, only_list: bool) -> list[FoundBoard]:

@@ -112,7 +112,14 @@ def chosen_pads(options: argparse.Namespace) -> dict[str, PadConfig]:
         raise ValueError("give either --pads_file=FILE (vtrefine-find-pads writes it) or --ports PORT ...")
     if options.pads_file is not None:
         return load_pads(options.pads_file)
-    pads = {Path(port).name: PadConfig(port, options.rows, options.cols) for port in options.ports}
+    ends = [Path(port).name for port in options.ports]
+    names = ends if len(set(ends)) == len(ends) else options.ports
+    if len(set(names)) < len(names):
+        raise ValueError(f"--ports must differ from each other, got {' '.join(names)}")
+    pads = {
+        name: PadConfig(port, options.rows, options.cols)
+        for name, port in zip(names, options.ports, strict=True)
+    }
     check_distinct_ports(pads, "--ports")
     return pads
 

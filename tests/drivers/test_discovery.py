@@ -16,8 +16,9 @@ from lerobot_vtrefine.cli import find_pads as find_pads_module
 from lerobot_vtrefine.cli.find_pads import main as find_pads
 from lerobot_vtrefine.cli.pad_emulator import Turns
 from lerobot_vtrefine.cli.pad_emulator import main as pad_emulator
-from lerobot_vtrefine.cli.view_pads import SHADE, draw
+from lerobot_vtrefine.cli.view_pads import SHADE, chosen_pads, draw
 from lerobot_vtrefine.cli.view_pads import main as view_pads
+from lerobot_vtrefine.cli.view_pads import make_parser as view_parser
 from lerobot_vtrefine.drivers import ports
 from lerobot_vtrefine.drivers.board import PadReader
 from lerobot_vtrefine.drivers.config import PadConfig
@@ -216,6 +217,11 @@ def test_view_pads_draws_and_names_the_rate(
     assert ("counts above idle (row" in shown) == (not terminal)
 
 
+def test_ports_that_end_alike_are_all_shown() -> None:
+    options = view_parser().parse_args(["--ports", "/dev/one/pad", "/dev/two/pad"])
+    assert [pad.port for pad in chosen_pads(options).values()] == ["/dev/one/pad", "/dev/two/pad"]
+
+
 def test_pads_in_a_terminal_are_what_was_read() -> None:
     """Every taxel is half a block of its own colour; alike neighbours share a code."""
     idle = np.full((3, 4), 20, np.uint8)
@@ -278,6 +284,10 @@ def test_terminated_emulator_removes_its_ports(tmp_path: Path) -> None:
         (view_pads, ["--ports=[/nowhere/a, /nowhere/b]"], "/nowhere/a does not exist"),
         (view_pads, ["--ports=[/nowhere/a"], "argument --ports: give a list such as"),
         (find_pads, ["--ports", "x", "--names=[a, a]"], "--names must differ"),
+        (find_pads, ["--ports", "x", "--timeout=-2"], "--timeout must be positive, got -2"),
+        (find_pads, ["--ports", "x", "--output=/"], "--output=/ is a folder; name a file"),
+        (find_pads, ["--ports", "x", "--output=/proc/nowhere/pads.yaml"], "--output=/proc/nowhere/pads.yaml"),
+        (view_pads, ["--ports", "/nowhere/a", "/nowhere/a"], "--ports must differ from each other"),
         (pad_emulator, ["--markers=[999]"], "taxel 999"),
         (pad_emulator, ["--markers", "1", "x"], "argument --markers: invalid literal"),
     ],
