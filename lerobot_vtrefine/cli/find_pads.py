@@ -1,6 +1,5 @@
 """``vtrefine-find-pads``: find out which pad is on which serial port, by pressing one after the other."""
 
-import tempfile
 from collections.abc import Sequence
 from contextlib import ExitStack
 from pathlib import Path
@@ -8,6 +7,7 @@ from pathlib import Path
 from lerobot_vtrefine import extras
 from lerobot_vtrefine.cli.arguments import CommandParser, ListAction
 from lerobot_vtrefine.cli.errors import run_cli
+from lerobot_vtrefine.cli.outputs import check_file
 from lerobot_vtrefine.drivers.config import PadConfig
 from lerobot_vtrefine.drivers.discovery import (
     FoundBoard,
@@ -77,7 +77,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     if not ports:
         raise PortError("no serial port found; plug in the boards, or name ports with --ports")
     if not options.list:
-        check_output(options.output)
+        check_file("--output", options.output)  # before anybody presses pads for it
     with ExitStack() as stack:
         boards = find_boards(ports, stack, only_list=options.list)
         if options.list:
@@ -85,17 +85,6 @@ def main(arguments: Sequence[str] | None = None) -> None:
         pads = ask(boards, options.names, options.timeout, check_rows=options.check_rows)
     save_pads(pads, options.output)
     print(f"wrote {options.output}: use it with --robot.pads_file={options.output}")
-
-
-def check_output(path: Path) -> None:
-    """Raise OSError where the file cannot be written, before anybody presses pads for it."""
-    if path.is_dir():
-        raise IsADirectoryError(f"--output={path} is a folder; name a file, such as {path / 'pads.yaml'}")
-    try:
-        path.parent.mkdir(parents=True, exist_ok=True)
-        tempfile.TemporaryFile(dir=path.parent).close()
-    except OSError as error:
-        raise OSError(error.errno, error.strerror, f"--output={path}") from error
 
 
 def find_boards(ports: Sequence[str], stack: ExitStack, *, only_list: bool) -> list[FoundBoard]:
