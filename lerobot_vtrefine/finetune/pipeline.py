@@ -1,6 +1,7 @@
 """``vtrefine-finetune``: connects DPPO to a ``vt_dp3`` checkpoint, an environment and an output folder."""
 
 import copy
+import json
 import logging
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass, field, replace
@@ -148,6 +149,8 @@ def load_policy(path: Path, overrides: list[str] | None = None) -> VtDp3Policy:
         overrides = parser.get_yaml_overrides("policy") + (parser.get_cli_overrides("policy") or [])
     try:
         config = PreTrainedConfig.from_pretrained(path, cli_overrides=overrides)
+    except json.JSONDecodeError as error:
+        raise ValueError(f"{path}: config.json is not valid JSON ({error})") from error
     except (OSError, ValueError) as error:  # what the Hub says of a folder that is not there is no help
         if path.is_dir():
             raise

@@ -244,6 +244,9 @@ def test_bad_input_is_one_clear_line(finetune, tmp_path, capsys):
     assert "ddpm, ddim, tail" in complaint("--dppo.sampler=euler")
     missing = tmp_path / "nowhere"
     assert f"no checkpoint at --policy.path={missing}" in complaint(policy=missing)
+    damaged = save_tiny_checkpoint(tmp_path / "damaged")
+    (damaged / "config.json").write_text("{")
+    assert f"{damaged}: config.json is not valid JSON" in complaint(policy=damaged)
     assert finetune(tmp_path / "run", iterations=1) == 0
     tuned = tmp_path / "run" / "checkpoints" / "last" / "pretrained_model"
     assert "fine-tuned already" in complaint(policy=tuned)
