@@ -88,7 +88,7 @@ def make_parser() -> CommandParser:
     )
     add("--seconds", type=float, default=0.0, help="0: until Ctrl-C (default: %(default)s)")
     add("--seed", type=int, default=0, help="seed of noise and faults (default: %(default)s)")
-    faults = parser.add_argument_group("faults")
+    faults = parser.add_argument_group("faults, none by default")
     add = faults.add_argument
     add("--loss", type=float, default=0.0, help="probability that a byte is lost")
     add(
