@@ -1,6 +1,8 @@
-"""One check, and one line, for values that must come from a list."""
+"""One check, and one line, for values that must come from a list, and for network ports."""
 
 from collections.abc import Iterable
+
+LARGEST_PORT = 65535
 
 
 def check_choice(name: str, value: object, choices: Iterable[str], others: str = "") -> None:
@@ -11,3 +13,9 @@ def check_choice(name: str, value: object, choices: Iterable[str], others: str =
     known = list(choices)
     if value not in known:
         raise ValueError(f"{name}={str(value)[:60]} is unknown; choose from {', '.join(known)}{others}")
+
+
+def check_port(name: str, port: int) -> None:
+    """Raise ValueError unless a network port has this number."""
+    if not 1 <= port <= LARGEST_PORT:
+        raise ValueError(f"{name} must lie between 1 and {LARGEST_PORT}, got {port}")

@@ -28,7 +28,7 @@ def beside(target: Path) -> Generator[Path]:
     Those that killed processes left for ``target`` are removed first.
 
     Raises:
-        ValueError: ``target`` is a folder that nothing can take the place of.
+        ValueError, PermissionError, NotADirectoryError: as `check_replaceable`.
     """
     check_replaceable(target)
     target.parent.mkdir(parents=True, exist_ok=True)
@@ -47,7 +47,18 @@ def working_folder(target: Path) -> Path:
 
 
 def check_replaceable(target: Path) -> None:
-    """Raise ValueError for a folder that is mounted, holds this process, or lies in a read-only one."""
+    """Raise where a folder cannot take the place of ``target``.
+
+    Raises:
+        PermissionError: the folder that it lies in, or would, cannot be written to.
+        NotADirectoryError: that is a file.
+        ValueError: ``target`` is mounted or holds this process.
+    """
+    above = next(folder for folder in target.absolute().parents if folder.exists())
+    if not above.is_dir():
+        raise NotADirectoryError(f"{target} cannot be written: {above} is a file")
+    if not os.access(above, os.W_OK | os.X_OK):
+        raise PermissionError(f"{target} cannot be written: {above} is read-only; choose another folder")
     if not target.exists():
         return
     reason = None
@@ -55,8 +66,6 @@ def check_replaceable(target: Path) -> None:
         reason = "this command runs in it"
     elif target.is_mount():
         reason = "something is mounted there"
-    elif not os.access(target.parent, os.W_OK | os.X_OK):
-        reason = f"no permission to write to {target.parent}"
     if reason is not None:
         raise ValueError(f"{target} cannot be written as a whole: {reason}; name a folder inside of it")
 

@@ -123,7 +123,15 @@ def test_folders_that_cannot_change_places_are_refused_before_any_work(tmp_path,
         patch.chdir(inside)
         refused(tmp_path / "out", "this command runs in it")
     monkeypatch.setattr(folders.os, "access", lambda *_: False)
-    refused(tmp_path / "out", "no permission to write to .*")
+    for output in (tmp_path / "out", tmp_path / "new" / "folder"):
+        with pytest.raises(PermissionError, match=f"{tmp_path} is read-only; choose another"), beside(output):
+            pytest.fail("refused too late")
+
+
+def test_a_folder_within_a_file_is_refused(tmp_path) -> None:
+    (tmp_path / "file").write_text("mine")
+    with pytest.raises(NotADirectoryError, match=f"{tmp_path / 'file'} is a file"):
+        folders.check_replaceable(tmp_path / "file" / "new" / "folder")
 
 
 def test_files_that_cannot_be_linked_are_copied(tmp_path, monkeypatch) -> None:

@@ -21,6 +21,7 @@ import draccus
 
 from lerobot_vtrefine.choices import check_choice
 from lerobot_vtrefine.cli.errors import run_cli
+from lerobot_vtrefine.cli.outputs import check_file
 from lerobot_vtrefine.cli.pipeline.stages import last_line, stop
 from lerobot_vtrefine.extras import SIMULATOR, require
 from lerobot_vtrefine.sim.config import WARP_SOLVERS, WarpConfig
@@ -218,6 +219,8 @@ def main() -> int:
     """Console entry point; the exit status is 1 when nothing could be measured."""
     arguments = [f"{item}=true" if item in SWITCHES else item for item in sys.argv[1:]]
     config = draccus.parse(BenchConfig, args=arguments)
+    if config.json is not None:
+        check_file("--json", config.json)
     if config.plot:
         print(plot(PLOT_DIR))
         return 0
@@ -230,7 +233,6 @@ def main() -> int:
         print(table(rows))
         found = bool(rows)
     if config.json is not None:
-        config.json.parent.mkdir(parents=True, exist_ok=True)
         config.json.write_text(json.dumps([asdict(row) for row in rows], indent=2) + "\n", encoding="utf-8")
     return 0 if found else 1
 

@@ -17,6 +17,8 @@ BESIDE = ("config_path", "quick")
 PATHS = (CONFIG_FLAG, "--policy.path")
 """Flags whose value is a file or a folder, or a name on the Hub."""
 FOLDERS = ("--dataset.root",)
+BELOW = ("pretrained_model", "checkpoints/last/pretrained_model")
+"""Where a policy lies in the folder of a checkpoint, and of a run."""
 
 
 def check_arguments(flags: Sequence[Flag], arguments: Sequence[str]) -> None:
@@ -49,9 +51,9 @@ def _check_places(arguments: Sequence[str]) -> None:
             if not Path(given).exists() and (flag in FOLDERS or not _may_be_on_the_hub(given)):
                 raise FileNotFoundError(errno.ENOENT, os.strerror(errno.ENOENT), f"{flag}={given}")
     for given in map(Path, values_of("--policy.path", arguments)):
-        inside = given / "pretrained_model"
-        if (inside / "config.json").is_file() and not (given / "config.json").is_file():
-            raise ValueError(f"--policy.path={given} is one folder too high: take {inside}")
+        inside = [given / below for below in BELOW if (given / below / "config.json").is_file()]
+        if inside and not (given / "config.json").is_file():
+            raise ValueError(f"--policy.path={given} is not a policy's own folder: take {inside[0]}")
 
 
 def _may_be_on_the_hub(name: str) -> bool:

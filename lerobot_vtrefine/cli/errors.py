@@ -36,6 +36,8 @@ _OPTIONAL_VALUE = re.compile(
     r"`([\w.]+)`: Could not decode the value into any of the given types: [\w\[\], .]+: (?:`([\w.]+)`: )?"
 )
 """How draccus begins where a flag may be left out, as if there were several types that it may have."""
+_UNKNOWN_FIELDS = re.compile(r"The fields ((?:`[^`]+`(?:, )?)+) are not valid for \w+")
+"""What draccus says of a file's settings."""
 
 
 def describe(error: BaseException) -> str:
@@ -84,7 +86,18 @@ def _in_flags(message: str) -> str:
     """draccus speaks of Python classes; users type flags."""
     if "Expected a dict with a 'type' key" in message and "EnvConfig" in message:
         return "say which environment: --env.type=vtrefine or --config_path=vtrefine:NAME"
+    if "Expected a dict with a 'type' key" in message and "PreTrainedConfig" in message:
+        return "say which policy: --policy.path=FOLDER, a checkpoint's pretrained_model"
+    if unknown := _UNKNOWN_FIELDS.search(message):
+        names = re.findall("`([^`]+)`", unknown[1])
+        message = "".join(f"{file}: " for file in _config_files_with(names)) + message
     return _OPTIONAL_VALUE.sub(lambda found: f"`{'.'.join(filter(None, found.groups()))}`: ", message)
+
+
+def _config_files_with(names: Sequence[str]) -> list[str]:
+    """Those given as ``--config_path`` that mention all these settings."""
+    files = [file for file in values_of(CONFIG_FLAG, sys.argv) if Path(file).is_file()]
+    return [file for file in files if all(n in Path(file).read_text(encoding="utf-8") for n in names)]
 
 
 def meant(message: str, known: Iterable[str]) -> str:

@@ -7,6 +7,7 @@ from pathlib import Path
 from lerobot_vtrefine import extras
 from lerobot_vtrefine.cli.arguments import CommandParser, ListAction
 from lerobot_vtrefine.cli.errors import run_cli
+from lerobot_vtrefine.cli.outputs import check_file
 from lerobot_vtrefine.drivers.config import PadConfig
 from lerobot_vtrefine.drivers.discovery import (
     FoundBoard,
@@ -70,9 +71,13 @@ def main(arguments: Sequence[str] | None = None) -> None:
     extras.require("vtrefine-find-pads", extras.PADS)
     if len(set(options.names)) < len(options.names):
         raise ValueError(f"--names must differ from each other, got {' '.join(options.names)}")
+    if not options.timeout > 0:
+        raise ValueError(f"--timeout must be positive, got {options.timeout:g}")
     ports = options.ports or stable_ports()
     if not ports:
         raise PortError("no serial port found; plug in the boards, or name ports with --ports")
+    if not options.list:
+        check_file("--output", options.output)  # before anybody presses pads for it
     with ExitStack() as stack:
         boards = find_boards(ports, stack, only_list=options.list)
         if options.list:

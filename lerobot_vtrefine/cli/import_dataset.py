@@ -3,7 +3,7 @@
 examples:
   vtrefine-import --source=aloha_31_episodes.npz --root=outputs/aloha        # the VT-Refine authors' file
   vtrefine-import --source=LEFLEXITAC_DATASET --root=outputs/pads --pads='{primary: left_arm_left_finger}'
-  vtrefine-import --source=bam_xl330.npz --recording_dir=outputs/xl330       BAM's logs of a servo
+  vtrefine-import --source=bam_xl330.npz --recording_dir=outputs/xl330        # BAM's logs of a servo
 """
 
 import logging

@@ -1,5 +1,6 @@
 """Results of a command: all files at once or none, and no earlier ones replaced without being asked to."""
 
+import tempfile
 from collections.abc import Generator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
@@ -31,3 +32,14 @@ def staged(output_dir: Path, names: Sequence[str], *, overwrite: bool) -> Genera
     with beside(target) as folder:
         yield folder
         put_in_place(folder, target)
+
+
+def check_file(flag: str, path: Path) -> None:
+    """Raise OSError with the flag where a file cannot be written, before the work for it is done."""
+    if path.is_dir():
+        raise IsADirectoryError(f"{flag}={path} is a folder; name a file in it")
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        tempfile.TemporaryFile(dir=path.parent).close()
+    except OSError as error:
+        raise OSError(error.errno, error.strerror, f"{flag}={path}") from error

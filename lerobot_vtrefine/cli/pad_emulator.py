@@ -1,6 +1,8 @@
 """``vtrefine-pad-emulator``: emulate FlexiTac boards and ALOHA arms, to try everything without hardware."""
 
 import argparse
+import fcntl
+import os
 import re
 import signal
 import threading
@@ -86,7 +88,7 @@ def make_parser() -> CommandParser:
     )
     add("--seconds", type=float, default=0.0, help="0: until Ctrl-C (default: %(default)s)")
     add("--seed", type=int, default=0, help="seed of noise and faults (default: %(default)s)")
-    faults = parser.add_argument_group("faults")
+    faults = parser.add_argument_group("faults, none by default")
     add = faults.add_argument
     add("--loss", type=float, default=0.0, help="probability that a byte is lost")
     add(
@@ -206,6 +208,21 @@ def start_arms(folder: Path, stack: ExitStack) -> Callable[[float], None]:
     return arms.wave
 
 
+def claim(folder: Path, stack: ExitStack) -> None:
+    """Keep other emulators out of a folder, whose ports they would take away, as long as this one runs.
+
+    Raises:
+        ValueError: another one is there.
+    """
+    folder.mkdir(parents=True, exist_ok=True)
+    descriptor = os.open(folder, os.O_RDONLY)
+    stack.callback(os.close, descriptor)
+    try:
+        fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    except BlockingIOError:
+        raise ValueError(f"an emulator runs in {folder} already: end it, or choose another folder") from None
+
+
 @run_cli
 def main(arguments: Sequence[str] | None = None) -> None:
     """Entry point of `vtrefine-pad-emulator`."""
@@ -218,8 +235,13 @@ def main(arguments: Sequence[str] | None = None) -> None:
         if threading.current_thread() is threading.main_thread():  # a killed emulator removes its ports, too
             before = signal.signal(signal.SIGTERM, signal.default_int_handler)
             stack.callback(signal.signal, signal.SIGTERM, before)
-        for board, name in enumerate(names[: options.boards]):
-            emulator = make_board(options, shape, faults, board, name, turns)
+        boards = [
+            make_board(options, shape, faults, board, name, turns)
+            for board, name in enumerate(names[: options.boards])
+        ]
+        for folder in {path.resolve(): path for path in (options.folder, options.arms) if path}.values():
+            claim(folder, stack)
+        for emulator in boards:
             print(stack.enter_context(emulator).port, flush=True)
         wave = start_arms(options.arms, stack) if options.arms else None
         started = time.monotonic()

@@ -18,7 +18,7 @@ from lerobot.configs.default import EvalConfig
 from lerobot.envs.configs import EnvConfig
 from lerobot.utils.utils import init_logging
 
-from lerobot_vtrefine.choices import check_choice
+from lerobot_vtrefine.choices import check_choice, check_port
 from lerobot_vtrefine.cli.errors import run_cli
 from lerobot_vtrefine.cli.playing.agents import Agent, PolicyAgent, recorded_agent, scripted_agent
 from lerobot_vtrefine.cli.playing.session import Session
@@ -85,6 +85,7 @@ class PlayConfig:
 
     def __post_init__(self) -> None:
         check_choice("--viewer", self.viewer, VIEWERS)
+        check_port("--port", self.port)
         if self.env is not None and not isinstance(self.env, VtRefineEnvConfig):
             raise ValueError(f"--env.type={self.env.type} cannot be played; use --env.type=vtrefine")
         if self.episodes is not None and self.episodes < 1:

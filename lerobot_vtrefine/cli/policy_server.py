@@ -2,6 +2,7 @@
 
 from collections.abc import Sequence
 
+from lerobot_vtrefine.choices import check_port
 from lerobot_vtrefine.cli.arguments import CommandParser
 from lerobot_vtrefine.cli.errors import run_cli
 from lerobot_vtrefine.extras import ASYNCHRONOUS, require
@@ -17,14 +18,13 @@ and on the robot's computer LeRobot's own client:
   python -m lerobot.async_inference.robot_client --robot.type=vtrefine_sim --fps=10 \\
       --server_address=127.0.0.1:8080 --policy_type=vt_dp3 --pretrained_name_or_path=CHECKPOINT \\
       --actions_per_chunk=8 --aggregate_fn_name=latest_only"""
-LARGEST_PORT = 65535
 
 
 def make_parser() -> CommandParser:
     """Command line of ``vtrefine-policy-server``."""
     parser = CommandParser("vtrefine-policy-server", DESCRIPTION, EPILOG)
     parser.add_argument("--host", default="127.0.0.1", help="address to listen at (default: %(default)s)")
-    parser.add_argument("--port", type=int, default=8080, help="(default: %(default)s)")
+    parser.add_argument("--port", type=int, default=8080, help="port to listen on (default: %(default)s)")
     parser.add_argument("--fps", type=int, default=10, help="actions per second (default: %(default)s)")
     return parser
 
@@ -33,8 +33,7 @@ def make_parser() -> CommandParser:
 def main(arguments: Sequence[str] | None = None) -> None:
     """Console entry point."""
     options = make_parser().parse_args(arguments)
-    if not 1 <= options.port <= LARGEST_PORT:
-        raise ValueError(f"--port must lie between 1 and {LARGEST_PORT}, got {options.port}")
+    check_port("--port", options.port)
     if options.fps < 1:
         raise ValueError(f"--fps must be at least 1, got {options.fps}")
     require("vtrefine-policy-server", ASYNCHRONOUS)

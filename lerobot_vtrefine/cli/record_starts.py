@@ -22,6 +22,7 @@ from lerobot.utils.utils import init_logging
 from tqdm import tqdm
 
 from lerobot_vtrefine.cli.errors import after_interrupt, run_cli
+from lerobot_vtrefine.cli.outputs import check_file
 from lerobot_vtrefine.envs import VtRefineEnvConfig
 from lerobot_vtrefine.envs.grasps import ExpertPlayer, Player, grasp_states
 from lerobot_vtrefine.envs.start_bank import StartBank, bank_settings
@@ -82,6 +83,7 @@ def record(config: RecordStartsConfig) -> dict[str, int]:
     """
     env = config.env
     assert isinstance(env, VtRefineEnvConfig)
+    check_file("--path", config.path)
     env = replace(env, start_bank=None, metrics_path=None)
     states: dict[int, Any] = {}
     counts: dict[str, int] = {}

@@ -13,6 +13,7 @@ import numpy as np
 
 from lerobot_vtrefine.cli.arguments import CommandParser, read_list
 from lerobot_vtrefine.cli.errors import run_cli
+from lerobot_vtrefine.cli.outputs import check_file
 from lerobot_vtrefine.embodiments import pad_layout_of
 from lerobot_vtrefine.tactile.layout import PadLayout
 
@@ -60,12 +61,13 @@ def main(arguments: Sequence[str] | None = None) -> None:
         import rerun as rr
     except ImportError as error:
         raise ImportError("vtrefine-view-data needs rerun: pip install 'lerobot[viz]'") from error
+    if options.save is not None:
+        check_file("--save", options.save)
     root = options.root or downloaded(options.repo_id)
     shown = options.episodes or [0]
     open_episodes(root).read(shown)  # before a viewer opens for nothing
     rr.init("vtrefine-view-data", spawn=options.save is None)
     if options.save is not None:
-        options.save.parent.mkdir(parents=True, exist_ok=True)
         rr.save(options.save)
     frames = sum(log_episode(rr, root, index) for index in shown)
     rr.rerun_shutdown()

@@ -21,6 +21,7 @@ from rich.text import Text
 from lerobot_vtrefine import extras
 from lerobot_vtrefine.cli.arguments import CommandParser, ListAction
 from lerobot_vtrefine.cli.errors import run_cli
+from lerobot_vtrefine.cli.outputs import check_file
 from lerobot_vtrefine.drivers.board import PadReader, Status
 from lerobot_vtrefine.drivers.config import PadConfig
 from lerobot_vtrefine.drivers.diagnostic import DiagnosticReader
@@ -112,7 +113,14 @@ def chosen_pads(options: argparse.Namespace) -> dict[str, PadConfig]:
         raise ValueError("give either --pads_file=FILE (vtrefine-find-pads writes it) or --ports PORT ...")
     if options.pads_file is not None:
         return load_pads(options.pads_file)
-    pads = {Path(port).name: PadConfig(port, options.rows, options.cols) for port in options.ports}
+    ends = [Path(port).name for port in options.ports]
+    names = ends if len(set(ends)) == len(ends) else options.ports
+    if len(set(names)) < len(names):
+        raise ValueError(f"--ports must differ from each other, got {' '.join(names)}")
+    pads = {
+        name: PadConfig(port, options.rows, options.cols)
+        for name, port in zip(names, options.ports, strict=True)
+    }
     check_distinct_ports(pads, "--ports")
     return pads
 
@@ -122,8 +130,12 @@ def main(arguments: Sequence[str] | None = None) -> None:
     """Entry point of `vtrefine-view-pads`."""
     options = make_parser().parse_args(arguments)
     extras.require("vtrefine-view-pads", extras.PADS)
-    if options.hz <= 0:
-        raise ValueError(f"--hz={options.hz} must be positive")
+    if not options.hz > 0:
+        raise ValueError(f"--hz must be positive, got {options.hz:g}")
+    if not options.seconds >= 0:
+        raise ValueError(f"--seconds must be at least 0, got {options.seconds:g}")
+    if options.save is not None:
+        check_file("--save", options.save)
     if options.diagnostic:
         view_taxel(options.diagnostic, options.channel, options.column, options.seconds)
         return
@@ -221,7 +233,6 @@ def rerun_view(save: Path | None, stack: ExitStack) -> Any:
         raise ImportError("--rerun and --save need rerun: pip install 'lerobot[viz]'") from error
     rr.init("vtrefine-view-pads", spawn=save is None)
     if save is not None:
-        save.parent.mkdir(parents=True, exist_ok=True)
         rr.save(save)
     stack.callback(rr.rerun_shutdown)
 

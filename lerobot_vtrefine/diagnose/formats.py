@@ -111,7 +111,7 @@ FORMATS = tuple(_MAKERS)
 
 def schema_of(name: str) -> dict[str, Any]:
     """The JSON Schema of one of FORMATS; ValueError lists them."""
-    check_choice("format", name, FORMATS)
+    check_choice("--help_format", name, FORMATS)
     return {"$schema": DIALECT, "title": name, **_MAKERS[name]()}
 
 

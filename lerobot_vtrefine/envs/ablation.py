@@ -13,6 +13,7 @@ import numpy as np
 from lerobot_vtrefine.datasets.features import DEPTH_KEY, baseline_keys, tactile_keys
 from lerobot_vtrefine.embodiments import Embodiment
 from lerobot_vtrefine.envs.episodes import Ablation, Array, Raw
+from lerobot_vtrefine.files.tables import read_columns
 
 if TYPE_CHECKING:
     from lerobot.datasets.lerobot_dataset import LeRobotDataset
@@ -138,6 +139,8 @@ def _dataset(root: Path, keys: Sequence[str]) -> "LeRobotDataset":
 
     if not (Path(root) / "meta" / "info.json").is_file():
         raise FileNotFoundError(f"--env.ablate_dataset: no LeRobot dataset at {root}")
+    for path in (Path(root) / "data").rglob("*.parquet"):  # LeRobot would not say which one is damaged
+        read_columns(path, ["episode_index"])
     dataset = LeRobotDataset(Path(root).name, root=root)
     missing = [key for key in keys if key not in dataset.features]
     if missing:

@@ -115,6 +115,9 @@ class VtRefineEnvConfig(EnvConfig):
         check_choice("--env.ablate", self.ablate, ABLATIONS)
         check_choice("--env.backend", self.backend, BACKENDS)
         check_control_rate("--env.fps", self.fps)
+        for name in ("num_threads", "video_episodes"):
+            if getattr(self, name) < 0:
+                raise ValueError(f"--env.{name} must be at least 0, got {getattr(self, name)}")
         if self.ablate not in ("none", "touch_shuffled") and self.ablate_dataset is None:
             raise ValueError(
                 f"--env.ablate={self.ablate} needs --env.ablate_dataset, the policy's training data"

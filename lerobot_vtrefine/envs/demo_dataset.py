@@ -31,6 +31,7 @@ from lerobot_vtrefine.folders import (
     working_folder,
     write_in_place,
 )
+from lerobot_vtrefine.interrupts import interrupts_wait
 from lerobot_vtrefine.lerobot_compat.codec_priority import ordinary_priority
 from lerobot_vtrefine.lerobot_compat.fast_saving import fast_saving
 
@@ -104,7 +105,11 @@ class DemoDataset:
         self._ledger["next_seed"] = seed + 1
 
     def append(self, demonstration: Demonstration) -> None:
-        """Save an episode; commits every ``COMMIT_EVERY`` episodes."""
+        """Save an episode; commits every ``COMMIT_EVERY`` episodes. Ctrl-C waits until that is done."""
+        with interrupts_wait():
+            self._save(demonstration)
+
+    def _save(self, demonstration: Demonstration) -> None:
         self._saving = True
         dataset = self._open()
         for step, action in enumerate(demonstration.actions):
@@ -147,9 +152,10 @@ class DemoDataset:
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
-        if not self._saving:  # also after Ctrl-C while simulating
+        if not self._saving:  # also after Ctrl-C
             try:
-                self.commit()
+                with interrupts_wait():
+                    self.commit()
                 return
             except OSError as failure:
                 self._recover(failure)

@@ -49,6 +49,13 @@ def last_checkpoint(output_dir: Path) -> Path | None:
     return max(complete, key=lambda path: int(path.name), default=None)
 
 
+def foreign_checkpoints(output_dir: Path) -> list[Path]:
+    """Checkpoints in a folder that are no fine-tuning run's, such as `lerobot-train`'s."""
+    steps = (output_dir / CHECKPOINTS_DIR).glob("*/")
+    named = [path for path in steps if path.name.isdigit()]
+    return sorted(path for path in named if not (path / TRAINING_STATE_DIR / STATE_NAME).is_file())
+
+
 def point_last_at(checkpoint: Path) -> None:
     """Let ``last`` name this checkpoint; at no moment is there no ``last`` when there was one before."""
     link = checkpoint.with_name(LAST_CHECKPOINT_LINK)

@@ -120,6 +120,12 @@ class DppoConfig(draccus.ChoiceRegistry):
         return "paper"
 
     def __post_init__(self) -> None:
+        for name, value in vars(self).items():
+            if value != value:
+                raise ValueError(f"--dppo.{name} must be a number, got nan")
+        for name in ("gamma", "gae_lambda", "gamma_denoising"):
+            if not 0.0 <= getattr(self, name) <= 1.0:
+                raise ValueError(f"--dppo.{name} must lie in [0, 1], got {getattr(self, name)}")
         positive = (
             "iterations",
             "num_envs",

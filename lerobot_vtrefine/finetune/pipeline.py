@@ -1,6 +1,7 @@
 """``vtrefine-finetune``: connects DPPO to a ``vt_dp3`` checkpoint, an environment and an output folder."""
 
 import copy
+import json
 import logging
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass, field, replace
@@ -17,18 +18,19 @@ from lerobot.policies import make_pre_post_processors
 from lerobot.utils.constants import PRETRAINED_MODEL_DIR
 from lerobot.utils.random_utils import set_seed
 from tqdm import tqdm
-from tqdm.contrib.logging import logging_redirect_tqdm
 
 from lerobot_vtrefine.envs.config import VtRefineEnvConfig
 from lerobot_vtrefine.envs.decisions import LeRobotDecisionEnv, make_decision_env
 from lerobot_vtrefine.files import read_yaml
 from lerobot_vtrefine.finetune.checkpoint import (
     Saveable,
+    foreign_checkpoints,
     last_checkpoint,
     load_training_state,
     save_checkpoint,
 )
 from lerobot_vtrefine.finetune.config import DppoConfig, PaperDppo
+from lerobot_vtrefine.finetune.console import logs_above_bars
 from lerobot_vtrefine.finetune.distributed import claim_gpu, join_ranks, leave_ranks, rank_index
 from lerobot_vtrefine.finetune.dppo import Metrics, TrainState, train
 from lerobot_vtrefine.finetune.evaluation import evaluate
@@ -120,8 +122,14 @@ def start_path(cfg: FinetunePipelineConfig) -> tuple[Path, Path | None]:
     """The policy to load and, when resuming, the checkpoint it belongs to.
 
     Raises:
-        ValueError: no policy was named. FileExistsError: output_dir holds a run that was not asked to resume.
+        ValueError: no policy was named.
+        FileExistsError: output_dir holds a run that is not resumed, or another command's checkpoints.
     """
+    if foreign := foreign_checkpoints(cfg.output_dir):
+        raise FileExistsError(
+            f"{foreign[0]} is another command's checkpoint, which this run would take the place of: choose"
+            " another --output_dir"
+        )
     checkpoint = last_checkpoint(cfg.output_dir)
     if checkpoint is not None:
         if not cfg.resume:
@@ -141,6 +149,8 @@ def load_policy(path: Path, overrides: list[str] | None = None) -> VtDp3Policy:
         overrides = parser.get_yaml_overrides("policy") + (parser.get_cli_overrides("policy") or [])
     try:
         config = PreTrainedConfig.from_pretrained(path, cli_overrides=overrides)
+    except json.JSONDecodeError as error:
+        raise ValueError(f"{path}: config.json is not valid JSON ({error})") from error
     except (OSError, ValueError) as error:  # what the Hub says of a folder that is not there is no help
         if path.is_dir():
             raise
@@ -326,7 +336,7 @@ def run(cfg: FinetunePipelineConfig) -> None:
     save_config(cfg, policy.config)
     state = TrainState.create(agent, cfg.dppo, env.privileged_dim, cfg.seed)
     recorder = Recorder(cfg, env, agent, Saveable(policy, *processors, cfg))
-    with logging_redirect_tqdm():
+    with logs_above_bars():
         if checkpoint is not None:
             load_training_state(checkpoint, state)
         recorder.start(state)

@@ -74,6 +74,7 @@ def test_parts_are_shortened_unless_full(monkeypatch: pytest.MonkeyPatch, tmp_pa
         (["--worlds=[1, many]"], "`worlds.1`: Couldn't parse 'many' into an int"),
         (["--plot", "--device=cpu"], "--plot and --device are two different things"),
         (["--device=tpu"], "warp.device must be auto, cpu, cuda or cuda:0, not 'tpu'"),
+        (["--json=/"], "--json=/ is a folder; name a file in it"),
         (["--limit_s=0"], "--limit_s must be above 0"),
         (
             ["--device=cpu", "--solver=[own, theirs]"],

@@ -15,6 +15,7 @@ from lerobot_vtrefine.cli.pipeline.demo_config import DemoConfig
 from lerobot_vtrefine.cli.play import PlayConfig
 from lerobot_vtrefine.cli.record_demos import RecordDemosConfig
 from lerobot_vtrefine.cli.replay import ReplayConfig
+from lerobot_vtrefine.finetune.pipeline import FinetunePipelineConfig
 
 
 def failing(error: BaseException):
@@ -101,6 +102,11 @@ class Flags:
             ["--root=x", "--env.pair=round"],
             "say which environment: --env.type=vtrefine or --config_path=vtrefine:NAME",
         ),
+        (
+            FinetunePipelineConfig,
+            ["--env.type=vtrefine", "--policy.device=cpu"],
+            "say which policy: --policy.path=FOLDER, a checkpoint's pretrained_model",
+        ),
         (PlayConfig, ["--seed=many"], "`seed`: Couldn't parse 'many' into an int"),
         (PlayConfig, ["--env.type=vtrefine", "--env.fps=x"], "`env.fps`: Couldn't parse 'x' into an int"),
         (ReplayConfig, ["--episodes=[one]"], "`episodes.0`: Couldn't parse 'one' into an int"),
@@ -111,6 +117,14 @@ def test_flags_that_are_misspelt_or_lack_their_type_are_one_line(config, typed, 
     error = capsys.readouterr().err
     assert error.count("\n") == 1
     assert error.startswith(f"error: {line}")
+
+
+def test_settings_that_a_file_should_not_have_are_told_with_the_file(monkeypatch, tmp_path, capsys) -> None:
+    file = tmp_path / "settings.yaml"
+    file.write_text("num_epsodes: 3\n")
+    monkeypatch.setattr(sys, "argv", ["command", f"--config_path={file}"])
+    assert run_cli(lambda: draccus.parse(Flags, file, args=[]) and None)() == 2
+    assert capsys.readouterr().err == f"error: {file}: The fields `num_epsodes` are not valid for Flags\n"
 
 
 def test_a_network_that_does_not_answer_is_one_line(capsys) -> None:

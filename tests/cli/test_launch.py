@@ -1,5 +1,6 @@
 """Starting commands: names of configuration files, the umbrella, flags read from the source."""
 
+import shlex
 import sys
 from dataclasses import fields
 from pathlib import Path
@@ -168,12 +169,13 @@ def test_what_is_wrong_with_a_command_line_is_told_before_lerobot_is_loaded(
     assert capsys.readouterr().err == f"error: {line}\n"
 
 
-def test_a_checkpoints_folder_is_pointed_to_one_level_down(tmp_path: Path) -> None:
-    inside = tmp_path / "pretrained_model"
-    inside.mkdir()
+@pytest.mark.parametrize("below", ["pretrained_model", "checkpoints/last/pretrained_model"])
+def test_the_folder_of_a_checkpoint_or_of_a_run_is_told_where_its_policy_is(below, tmp_path: Path) -> None:
+    inside = tmp_path / below
+    inside.mkdir(parents=True)
     (inside / "config.json").write_text("{}")
     flags = flags_of("lerobot_vtrefine.cli.play", "PlayConfig", unused=True)
-    with pytest.raises(ValueError, match=f"is one folder too high: take {inside}"):
+    with pytest.raises(ValueError, match=f"is not a policy's own folder: take {inside}"):
         check_arguments(flags, [f"--policy.path={tmp_path}"])
     for fine in (f"--policy.path={inside}", "--policy.path=USER/insertion", "--eval.n_episodes=3"):
         check_arguments(flags, [fine])
@@ -211,6 +213,14 @@ def test_help_is_text_without_markup(monkeypatch, capsys: pytest.CaptureFixture[
     assert "``" not in shown
     assert "--root=Path" in shown
     assert "(required)" in shown
+
+
+def test_a_shell_understands_every_example_of_help() -> None:
+    texts = [umbrella.describe_module(umbrella.module_of(e))[1] for e in umbrella.commands().values()]
+    lines = [line for text in texts for line in text.replace("\\\n", "").splitlines()]
+    examples = [shlex.split(line, comments=True) for line in lines if line.startswith("  vtrefine-")]
+    assert len(examples) > 10
+    assert [words for words in examples if not all(w.startswith(("--", "...")) for w in words[1:])] == []
 
 
 def test_the_umbrella_lists_commands_and_configurations(monkeypatch, capsys) -> None:

@@ -57,6 +57,7 @@ def test_episodes_are_filmed(tmp_path: Path, capsys: pytest.CaptureFixture[str])
     [
         ({"agent": "expret"}, "--agent=expret is unknown; choose from expert, zero, random"),
         ({"policy": PolicySource("configs")}, "--policy.path=configs holds no checkpoint"),
+        ({"port": 99999}, "--port must lie between 1 and 65535, got 99999"),
         ({"viewer": "window"}, "--viewer=window is unknown"),
         ({"dataset": EpisodeSource(Path("nowhere"))}, "nowhere holds no LeRobot dataset"),
     ],

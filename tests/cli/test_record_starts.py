@@ -86,3 +86,5 @@ def test_hopeless_grasps_and_other_starts_are_refused(tmp_path: Path, monkeypatc
     assert record(path, monkeypatch, *far) != 0
     assert "both parts were in hand in 0 of 2 episodes" in capsys.readouterr().err
     assert not path.exists()
+    assert record(tmp_path, monkeypatch) != 0
+    assert f"--path={tmp_path} is a folder; name a file in it" in capsys.readouterr().err

@@ -102,6 +102,13 @@ def test_what_cannot_be_replayed(joints_only: Path, tmp_path: Path, change: dict
     assert not (tmp_path / "out").exists()
 
 
+def test_the_twin_runs_at_the_datasets_rate(tmp_path: Path) -> None:
+    still = np.tile(ROBOT.home, (4, 1)).astype(np.float32)
+    write_dataset([JointEpisode(still, still)], ROBOT.joint_names, tmp_path / "fast", "local/fast", 30, "x")
+    with pytest.raises(ValueError, match="none of 1 episodes can be replayed"):
+        replay(ReplayConfig(tmp_path / "out", SourceConfig(tmp_path / "fast"), parts="grasp"))
+
+
 def test_another_robot_and_another_order_are_refused(tmp_path: Path) -> None:
     rng = np.random.default_rng(0)
     values = rng.normal(0, 1, (4, 6)).astype(np.float32)

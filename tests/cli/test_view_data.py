@@ -69,13 +69,15 @@ def test_a_pressed_taxel_is_bright_at_its_place() -> None:
         ([], "give either --dataset.root=DIR or --dataset.repo_id=NAME"),
         (["--dataset.root=nowhere"], "nowhere"),
         (["--dataset.root=TINY", "--episodes=[0, 99]"], "episode 99 was asked for"),
+        (["--dataset.root=TINY", "--save=TINY"], "is a folder; name a file in it"),
+        (["--dataset.root=TINY", "--save=/proc/x.rrd"], "--save=/proc/x.rrd"),
         (["--dataset.root=TINY", "--episodes=first"], "argument --episodes: give a list such as '[0, 2]'"),
     ],
 )
 def test_bad_flags_are_one_line(arguments, message, tiny_dataset: Path, tmp_path: Path, capsys) -> None:
     pytest.importorskip("rerun")
     given = [argument.replace("TINY", str(tiny_dataset)) for argument in arguments]
-    assert view_data.main([*given, f"--save={tmp_path / 'x.rrd'}"]) == 2
+    assert view_data.main([f"--save={tmp_path / 'x.rrd'}", *given]) == 2
     error = capsys.readouterr().err
     assert message in error
     assert error.count("\n") == 1

@@ -202,4 +202,4 @@ def test_help_format_describes_and_prints_schemas(capsys: pytest.CaptureFixture[
         main(["--help_format=verdict.json"])
     assert json.loads(capsys.readouterr().out)["title"] == "verdict.json"
     assert main(["--help_format=weather.json"]) == 2
-    assert "choose from recording.json" in capsys.readouterr().err
+    assert "--help_format=weather.json is unknown; choose from recording.json" in capsys.readouterr().err

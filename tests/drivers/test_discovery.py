@@ -14,10 +14,11 @@ from rich.segment import Segment
 
 from lerobot_vtrefine.cli import find_pads as find_pads_module
 from lerobot_vtrefine.cli.find_pads import main as find_pads
-from lerobot_vtrefine.cli.pad_emulator import Turns
+from lerobot_vtrefine.cli.pad_emulator import Turns, claim
 from lerobot_vtrefine.cli.pad_emulator import main as pad_emulator
-from lerobot_vtrefine.cli.view_pads import SHADE, draw
+from lerobot_vtrefine.cli.view_pads import SHADE, chosen_pads, draw
 from lerobot_vtrefine.cli.view_pads import main as view_pads
+from lerobot_vtrefine.cli.view_pads import make_parser as view_parser
 from lerobot_vtrefine.drivers import ports
 from lerobot_vtrefine.drivers.board import PadReader
 from lerobot_vtrefine.drivers.config import PadConfig
@@ -216,6 +217,11 @@ def test_view_pads_draws_and_names_the_rate(
     assert ("counts above idle (row" in shown) == (not terminal)
 
 
+def test_ports_that_end_alike_are_all_shown() -> None:
+    options = view_parser().parse_args(["--ports", "/dev/one/pad", "/dev/two/pad"])
+    assert [pad.port for pad in chosen_pads(options).values()] == ["/dev/one/pad", "/dev/two/pad"]
+
+
 def test_pads_in_a_terminal_are_what_was_read() -> None:
     """Every taxel is half a block of its own colour; alike neighbours share a code."""
     idle = np.full((3, 4), 20, np.uint8)
@@ -257,6 +263,18 @@ def test_presses_begin_when_all_boards_are_read(tmp_path: Path) -> None:
         wait_until(lambda: turns() == 0)
 
 
+@pytest.mark.parametrize("flags", [["--folder=boards"], ["--folder=others", "--arms=boards"]])
+def test_a_second_emulator_leaves_the_ports_of_the_first(tmp_path: Path, monkeypatch, capsys, flags) -> None:
+    monkeypatch.chdir(tmp_path)
+    with ExitStack() as first:
+        claim(Path("boards"), first)
+        assert pad_emulator([*flags, "--boards=1", "--seconds=0.1"]) == 2
+        told = capsys.readouterr()
+        assert "an emulator runs in boards already: end it, or choose another folder" in told.err
+        assert told.out == ""
+    assert pad_emulator(["--folder=boards", "--boards=1", "--seconds=0.1"]) == 0
+
+
 def test_terminated_emulator_removes_its_ports(tmp_path: Path) -> None:
     folder = tmp_path / "boards"
     killer = threading.Timer(1.0, os.kill, (os.getpid(), signal.SIGTERM))
@@ -276,8 +294,16 @@ def test_terminated_emulator_removes_its_ports(tmp_path: Path) -> None:
         (find_pads, ["--ports", "x", "--names", "a", "a"], "must differ"),
         (view_pads, [], "give either --pads_file"),
         (view_pads, ["--ports=[/nowhere/a, /nowhere/b]"], "/nowhere/a does not exist"),
+        (view_pads, ["--ports=x", "--hz=nan"], "--hz must be positive, got nan"),
+        (view_pads, ["--ports=x", "--seconds=-1"], "--seconds must be at least 0, got -1"),
+        (view_pads, ["--ports=x", "--save=/"], "--save=/ is a folder; name a file in it"),
+        (view_pads, ["--ports=x", "--save=/proc/x.rrd"], "--save=/proc/x.rrd"),
         (view_pads, ["--ports=[/nowhere/a"], "argument --ports: give a list such as"),
         (find_pads, ["--ports", "x", "--names=[a, a]"], "--names must differ"),
+        (find_pads, ["--ports", "x", "--timeout=-2"], "--timeout must be positive, got -2"),
+        (find_pads, ["--ports", "x", "--output=/"], "--output=/ is a folder; name a file"),
+        (find_pads, ["--ports", "x", "--output=/proc/nowhere/pads.yaml"], "--output=/proc/nowhere/pads.yaml"),
+        (view_pads, ["--ports", "/nowhere/a", "/nowhere/a"], "--ports must differ from each other"),
         (pad_emulator, ["--markers=[999]"], "taxel 999"),
         (pad_emulator, ["--markers", "1", "x"], "argument --markers: invalid literal"),
     ],

@@ -1,3 +1,4 @@
+import shutil
 from pathlib import Path
 
 import numpy as np
@@ -57,6 +58,15 @@ def test_none_changes_nothing():
 def test_missing_dataset_is_named(part, tmp_path):
     with pytest.raises(FileNotFoundError, match="ablate_dataset"):
         make_ablation(part, tmp_path / "nothing", ALOHA)
+
+
+@pytest.mark.parametrize("part", ["touch", "touch_other"])
+def test_a_damaged_file_is_named(part, tiny_dataset: Path, tmp_path):
+    damaged = shutil.copytree(tiny_dataset, tmp_path / "damaged")
+    file = next((damaged / "data").rglob("*.parquet"))
+    file.write_bytes(file.read_bytes()[:-100])
+    with pytest.raises(ValueError, match=f"{file} cannot be read"):
+        make_ablation(part, damaged, ALOHA)
 
 
 def played(ablate, num_envs: int, seeds: list[int], steps: int = 8) -> tuple[list, list]:

@@ -1,6 +1,8 @@
 import errno
 import json
+import os
 import shutil
+import signal
 from pathlib import Path
 from typing import Any
 
@@ -183,6 +185,27 @@ def test_interrupt_while_simulating_keeps_every_saved_episode(tmp_path):
     with pytest.raises(KeyboardInterrupt):
         record()
     assert read(tmp_path / "demo").num_episodes == 3
+
+
+@pytest.mark.parametrize("while_in", ["save_episode", "finalize"])
+def test_an_interrupt_while_saving_keeps_every_saved_episode(tmp_path, monkeypatch, while_in):
+    def interrupted(dataset: LeRobotDataset, *args, **kwargs):
+        os.kill(os.getpid(), signal.SIGINT)
+        return stock(dataset, *args, **kwargs)
+
+    stock = getattr(LeRobotDataset, while_in)
+
+    def record() -> None:
+        with open_recording(tmp_path / "demo") as demos:
+            demos.append(demonstration(0))
+            monkeypatch.setattr(LeRobotDataset, while_in, interrupted)
+            demos.append(demonstration(1))
+
+    with pytest.raises(KeyboardInterrupt):
+        record()
+    monkeypatch.undo()
+    assert read(tmp_path / "demo").num_episodes == 2
+    assert signal.getsignal(signal.SIGINT) is signal.default_int_handler
 
 
 def test_full_disk_before_the_first_commit_leaves_nothing(tmp_path, monkeypatch):

@@ -143,6 +143,8 @@ def test_there_are_environment_files():
         ({"backend": "gpu"}, "single, batch, warp"),
         ({"ablate": "smell"}, "none, touch, touch_shuffled, touch_other, vision"),
         ({"ablate": "touch"}, "--env.ablate_dataset"),
+        ({"num_threads": -3}, "--env.num_threads must be at least 0, got -3"),
+        ({"video_episodes": -1}, "--env.video_episodes must be at least 0, got -1"),
         ({"fps": 0}, "--env.fps must lie between 1 and 100 control steps a second, got 0"),
         ({"fps": 101}, "--env.fps must lie between 1 and 100 control steps a second, got 101"),
     ],

@@ -76,6 +76,9 @@ def test_critics_learning_rate_decays_over_all_iterations():
     [
         ({"timeout": "ignore"}, "--dppo.timeout must be one of terminal, bootstrap"),
         ({"encoder": "half"}, "--dppo.encoder must be one of trained, frozen"),
+        ({"actor_lr": math.nan}, "--dppo.actor_lr must be a number, got nan"),
+        ({"gae_lambda": 1.5}, r"--dppo.gae_lambda must lie in \[0, 1\], got 1.5"),
+        ({"gamma": 2.0}, r"--dppo.gamma must lie in \[0, 1\], got 2.0"),
         ({"num_envs": 0}, "--dppo.num_envs must be positive"),
         ({"eta": 1.5}, r"--dppo.eta must lie in \[0, 1\]"),
         ({"min_log_prob_std": 0.05}, "--dppo.min_log_prob_std must be at least 0.055"),

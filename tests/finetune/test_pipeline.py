@@ -178,6 +178,17 @@ def test_an_existing_run_is_not_overwritten(finetune, tmp_path, capsys):
     assert "--resume=true" in capsys.readouterr().err
 
 
+@pytest.mark.parametrize("resume", ["false", "true"])
+def test_checkpoints_of_another_command_keep_their_place(finetune, tmp_path, capsys, resume):
+    policy = save_tiny_checkpoint(tmp_path / "run" / "checkpoints" / "000001" / "pretrained_model")
+    before = {path: path.read_bytes() for path in policy.iterdir()}
+    assert finetune(tmp_path / "run", f"--resume={resume}", policy=policy, iterations=1) == 2
+    error = capsys.readouterr().err.splitlines()[-1]
+    assert "000001 is another command's checkpoint" in error
+    assert "choose another --output_dir" in error
+    assert {path: path.read_bytes() for path in policy.iterdir()} == before
+
+
 def test_settings_are_saved_and_can_be_read_again(finetune, tmp_path):
     first, second = tmp_path / "first", tmp_path / "second"
     assert finetune(first, "--env.clearance_m=0.001", iterations=1) == 0
@@ -233,6 +244,9 @@ def test_bad_input_is_one_clear_line(finetune, tmp_path, capsys):
     assert "ddpm, ddim, tail" in complaint("--dppo.sampler=euler")
     missing = tmp_path / "nowhere"
     assert f"no checkpoint at --policy.path={missing}" in complaint(policy=missing)
+    damaged = save_tiny_checkpoint(tmp_path / "damaged")
+    (damaged / "config.json").write_text("{")
+    assert f"{damaged}: config.json is not valid JSON" in complaint(policy=damaged)
     assert finetune(tmp_path / "run", iterations=1) == 0
     tuned = tmp_path / "run" / "checkpoints" / "last" / "pretrained_model"
     assert "fine-tuned already" in complaint(policy=tuned)

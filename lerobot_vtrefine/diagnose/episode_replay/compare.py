@@ -106,7 +106,8 @@ def compare_episodes(
 
     Args:
         hold: how the arms alone approach a command; the scene with parts always ramps linearly.
-        env: the twin; by default the recorded one of a simulated dataset, else the default environment.
+        env: the twin; by default the recorded one of a simulated dataset, else the default environment at the
+            dataset's rate.
         film: draw the first episode's twin, where there are parts.
 
     Raises:
@@ -117,7 +118,7 @@ def compare_episodes(
     parts = _choose_parts(parts, ledger, folder)
     own = env is None and ledger is not None
     config = recorded_twin(ledger, folder.fps) if env is None and ledger is not None else env
-    config = config or VtRefineEnvConfig()
+    config = config or _default_twin(parts, folder.fps)
     _require_same_robot(folder, config)
     recorded = folder.read(episodes)
     skipped, frames = {}, []
@@ -145,6 +146,11 @@ def compare_episodes(
         remarks=[] if own else describe_reach(reach, config.scene_config.table_height_m),
         film=frames,
     )
+
+
+def _default_twin(parts: str, fps: float) -> VtRefineEnvConfig:
+    """The arms alone follow commands of any rate."""
+    return VtRefineEnvConfig() if parts == "none" else VtRefineEnvConfig(fps=round(fps))
 
 
 def write_summary(comparison: Comparison, path: Path) -> None:
@@ -218,7 +224,9 @@ def _replay_scenes(
     if parts == "grasp":
         config = replace(config, start="table")
     if round(folder.fps) != config.fps:
-        raise ValueError(f"{folder.root} has {folder.fps:g} frames/s, the twin --env.fps={config.fps}")
+        raise ValueError(
+            f"{folder.root} has {folder.fps:g} frames/s, the twin --env.fps={config.fps}; give the same"
+        )
     sim = make_simulation(config, 1)
     seeds = recorded_seeds(ledger, folder) if ledger is not None and parts == "recorded" else {}
     pairs, skipped, frames = [], {}, []
