@@ -25,11 +25,11 @@ def leaning_face(own: Deviations, presses: PressSet) -> Suspicion | None:
     touches, leans = own.sizes[:, TOUCH], own.sizes[:, TOUCH + 1 :]
     levers = np.array([_from_middle_m(press) for press in presses.presses]) * LEAN_RAD / DEFAULT_OFFSET_M
     expected = (leans * levers).sum(axis=1)
-    expected = (expected - expected.mean()) / max(float(expected.std()), 1e-12)
-    part = float(expected @ touches) ** 2 / max(len(touches) * float(touches @ touches), 1e-12)
+    power = float(touches @ touches)
+    part = (power - float(((touches - expected) ** 2).sum())) / max(power, 1e-12)
+    along = (expected - expected.mean()) / max(float(expected.std()), 1e-12)
     clue = "first touches of recordings follow their leans, as if the face lay otherwise in each"
-    share = part * float(own.shares[TOUCH])
-    return Suspicion(0, clue, share, LEAST_UNKNOWN, touches, along=expected)
+    return Suspicion(0, clue, part * float(own.shares[TOUCH]), LEAST_UNKNOWN, touches, along=along)
 
 
 def _from_middle_m(press: Press) -> tuple[float, float]:

@@ -13,7 +13,6 @@ from lerobot_vtrefine.diagnose.core.search import Selection
 from lerobot_vtrefine.diagnose.core.suspicion import Suspicion
 from lerobot_vtrefine.diagnose.pad import error_level, repeatability
 from lerobot_vtrefine.diagnose.pad.baseline import weigh
-from lerobot_vtrefine.diagnose.pad.candidates.first_load_softening import PLAIN as SOFTENING
 from lerobot_vtrefine.diagnose.pad.candidates.sample_and_hold import HOLD, held_rows
 from lerobot_vtrefine.diagnose.pad.decoys import in_place_of_names
 from lerobot_vtrefine.diagnose.pad.descriptors import (
@@ -109,13 +108,11 @@ def between_recordings(problem: "PadProblem", fitted: Fit) -> list[Suspicion]:
     gains, starts, *others = recording_scatter(own, problem.seed)
     # Recordings that were moved by their own delays may start as they please.
     others += [starts] if problem.together is None else []
-    softens = SOFTENING.family in fitted.model.families
-    memory = [] if softens else following(problem, fitted, (PRESSED_BEFORE,))
     changing = [
         *others,
         levels_of_neighbours(presses, fitted.residuals(presses), problem.seed),
         leaning_face(own, presses),
-        *memory,
+        *following(problem, fitted, (PRESSED_BEFORE,)),
     ]
     return [
         *(replace(item, family="gains") for item in (gains, *gain_drift(fitted, presses, problem.weights))),
