@@ -73,8 +73,8 @@ def raise_alarms(
 
 
 def confirmed(suspicions: Sequence[Suspicion], seed: int) -> list[Alarm]:
-    """Alarms about trials that no fit has seen, or about all of them."""
-    return [alarm for _, alarm in _fired(suspicions, seed)]
+    """Alarms about trials that no fit has seen, or about all of them, by size."""
+    return sorted((alarm for _, alarm in _fired(suspicions, seed)), key=lambda alarm: -alarm.share)
 
 
 def _fired(suspicions: Sequence[Suspicion], seed: int) -> list[tuple[bool, Alarm]]:
