@@ -1,9 +1,9 @@
 """Signs that something acts which no accepted cause accounts for, under one error rate.
 
 A suspicion that can be tested is a score per trial, as likely negative as positive (or in any order) if
-nothing is there. Those of what changes from trial to trial are one max-T test, all others another: among
-dozens of views of what happens within trials, the few that follow the session would drown. What can only be
-observed (a size beyond any that sound recordings have, in trials too few to test) has no p-value and says so.
+nothing is there. Those of what changes from trial to trial are tests of their own: among dozens of views of
+what happens within trials, the few of them would drown. What can only be observed (a size beyond any that
+sound recordings have, in trials too few to test) has no p-value and says so.
 """
 
 from collections.abc import Sequence
@@ -38,8 +38,8 @@ class Suspicion:
     drawn: Array | None = None
     decisive: bool = False
     """Whether it explains whatever else is odd about its channel."""
-    between_trials: bool = False
-    """Whether it concerns what changes from trial to trial, so that it is tested together with such alone."""
+    family: str = ""
+    """Those of one family share a max-T test, and its error rate."""
 
 
 @dataclass(frozen=True)
@@ -73,8 +73,8 @@ def raise_alarms(
 
 
 def confirmed(suspicions: Sequence[Suspicion], seed: int) -> list[Alarm]:
-    """Alarms about trials that no fit has seen, or about all of them."""
-    return [alarm for _, alarm in _fired(suspicions, seed)]
+    """Alarms about trials that no fit has seen, or about all of them, by size."""
+    return sorted((alarm for _, alarm in _fired(suspicions, seed)), key=lambda alarm: -alarm.share)
 
 
 def _fired(suspicions: Sequence[Suspicion], seed: int) -> list[tuple[bool, Alarm]]:
@@ -87,17 +87,16 @@ def _fired(suspicions: Sequence[Suspicion], seed: int) -> list[tuple[bool, Alarm
 
 
 def _tested(suspicions: Sequence[Suspicion], seed: int) -> list[float | None]:
-    """Adjusted p of each that has scores; one max-T test between trials, and one within."""
+    """Adjusted p of each that has scores; every family is one max-T test."""
     p_values: list[float | None] = [None] * len(suspicions)
-    for between in (False, True):
-        told = {
-            place: Hypothesis(item.scores, item.along, item.either_sign, item.scatter, item.drawn)
-            for place, item in enumerate(suspicions)
-            if item.scores is not None and item.between_trials == between
-        }
-        if told:
-            for place, p_value in zip(told, jointly_adjusted(list(told.values()), seed), strict=True):
-                p_values[place] = float(p_value)
+    families: dict[str, dict[int, Hypothesis]] = {}
+    for place, item in enumerate(suspicions):
+        if item.scores is not None:
+            told = Hypothesis(item.scores, item.along, item.either_sign, item.scatter, item.drawn)
+            families.setdefault(item.family, {})[place] = told
+    for asked in families.values():
+        for place, p_value in zip(asked, jointly_adjusted(list(asked.values()), seed), strict=True):
+            p_values[place] = float(p_value)
     return p_values
 
 

@@ -140,7 +140,7 @@ def _promising(
     scorer = scorer_of(problem, slim)
     for decoy in DESCRIPTORS:
         image = directions(decoy, problem.presses, slim)
-        if image is None or decoy.session or name in decoy.owners:
+        if image is None or name in decoy.owners:
             continue
         grams = scorer.grams(image)
         last = grams.shape[1] - 1

@@ -20,6 +20,9 @@ Signal = np.ndarray
 RESTS = 0.05
 """Part of a recording's typical rate of depth up to which it rests."""
 
+SOON_S = 1.0
+"""Time since a press up to which nothing has recovered."""
+
 SLOW_M_S = 1e-3
 """Rate of depth from which on its logarithm tells."""
 
@@ -32,8 +35,6 @@ class Descriptor:
     """What the residual then correlates with, for people."""
     owners: tuple[str, ...]
     direction: Callable[[Press, Signal], Signal]
-    session: bool = False
-    """Whether it differs between recordings of one command, so that what follows it does not repeat."""
     touch: bool = False
     """Whether it is depth that differs; readings do by their change with it."""
 
@@ -90,15 +91,19 @@ def _centred(values: np.ndarray) -> np.ndarray:
     return values - values.mean()
 
 
-def _temperature(press: Press) -> np.ndarray:
-    values = press.trial.temperature_c
-    if values is None or not np.isfinite(values).all():
-        return np.zeros((len(press.trial.time_s), 1))
-    return values[:, None]
-
-
 def _parity(press: Press) -> np.ndarray:
     return np.where(np.arange(len(press.trial.time_s)) % 2, 1.0, -1.0)[:, None]
+
+
+def _pressed_before(press: Press) -> np.ndarray:
+    """How hard earlier recordings pressed the scored taxels (n,), in meters or newtons per second since then:
+    what has not recovered falls with about that power of time.
+    """
+    borne = press.trial.borne
+    if borne is None:
+        return np.zeros(len(press.taxels))
+    left = np.maximum(borne.drive, 0.0) / np.maximum(borne.age_s, SOON_S)
+    return left.sum(axis=0).ravel()[press.taxels]
 
 
 STIFFNESS, MEMORY, RATE = (causes_like(kind) for kind in ("load", "memory", "rate"))
@@ -114,13 +119,6 @@ DESCRIPTORS = (
         causes_like("peak"),
         lambda p, s: s * np.maximum.accumulate(s, axis=0),
     ),
-    Descriptor(
-        "load times session time",
-        (),
-        lambda p, s: s * (p.trial.start_s + p.trial.time_s)[:, None],
-        session=True,
-    ),
-    Descriptor("load times the recording's number", (), lambda p, s: s * p.trial.order, session=True),
     Descriptor("load times time in the recording", (), lambda p, s: s * p.trial.time_s[:, None]),
     Descriptor("load times the age of the contact", causes_like("age"), lambda p, s: s * _age(p, s)),
     Descriptor(
@@ -176,22 +174,14 @@ DESCRIPTORS = (
         causes_like("time"),
         lambda p, s: np.broadcast_to(_centred(p.trial.time_s)[:, None], s.shape),
     ),
-    Descriptor(
-        "session time",
-        causes_like("session"),
-        lambda p, s: np.broadcast_to((p.trial.start_s + p.trial.time_s)[:, None], s.shape),
-        session=True,
-    ),
-    Descriptor(
-        "temperature",
-        causes_like("session"),
-        lambda p, s: np.broadcast_to(_temperature(p), s.shape),
-        session=True,
-    ),
-    Descriptor("load times temperature", (), lambda p, s: s * _temperature(p), session=True),
     Descriptor("even and odd frames", (), lambda p, s: np.broadcast_to(_parity(p), s.shape)),
     Descriptor("load in even and odd frames", (), lambda p, s: s * _parity(p)),
 )
+
+PRESSED_BEFORE = Descriptor(
+    "load times what earlier recordings pressed the place with", (), lambda p, s: s * _pressed_before(p)
+)
+"""Clearer in all recordings than in those that a search sees."""
 
 
 def directions(descriptor: Descriptor, presses: PressSet, fitted: Fit) -> list[np.ndarray] | None:

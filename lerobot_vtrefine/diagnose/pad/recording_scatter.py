@@ -1,7 +1,8 @@
 """Gains, touches, places and clocks of recordings that deviate by more than those of a sound rig.
 
 Fits forgive every recording such deviations, and neither their signs nor their order mean anything. But all
-together they may not be larger than those of a sound rig, taken to scatter twice as far.
+together they may not be larger than those of a sound rig, taken to scatter twice as far. Noise within
+recordings is known better, and not doubted.
 """
 
 from dataclasses import dataclass
@@ -24,6 +25,9 @@ CLOCK_S = 1e-3
 """Repeatability of a recording's start [s]."""
 DOUBT = 0.1
 """Part of the noise up to which it may not matter whether a reading is touched yet."""
+TOLD = 0.5
+"""Part that deviations must have in the variance of what a recording says about them: otherwise it says more
+about how well the noise is known."""
 KINDS = (
     ("gains", 100 * DEFAULT_GAIN, "%"),
     ("starts", 1e3 * CLOCK_S, "ms"),
@@ -32,30 +36,35 @@ KINDS = (
     ("leans or places along the column", 1e3 * LEAN_RAD, "mrad"),
 )
 """What deviates, how far in sound recordings, and its unit; the last three where depth is known."""
+STARTS, TOUCH = 1, 2
+"""Places of those in that order; leans follow."""
 
 
 @dataclass(frozen=True)
 class Deviations:
-    """What recordings deviate by, in those of a sound rig, in the order of `KINDS`.
+    """What recordings deviate by, in the order of `KINDS`.
 
     Attributes:
-        scores: (K, q) of unit variance in sound recordings; zero where a recording cannot tell.
+        scores: (K, q) of unit variance where recordings scatter `SIZE_DOUBT` times as far as those of a sound
+            rig; zero where one cannot tell.
+        sizes: (K, q) the most probable ones, in those of a sound rig.
         shares: (q,) parts of the squared error that they account for.
         left: residuals (T, n) without them, zero where no recording can be sure [counts].
     """
 
     scores: np.ndarray
+    sizes: np.ndarray
     shares: np.ndarray
     left: list[np.ndarray]
 
 
 def own_deviations(presses: PressSet, fitted: Fit) -> Deviations:
-    """The most probable ones, all together, with the scatter of a sound rig as their prior."""
+    """All together, with the scatter of a sound rig as their prior."""
     residuals = fitted.residuals(presses)
     noise = fit_frame_noise(presses, residuals, fitted.signals)
     slopes = offset_tangents(fitted.model, presses, fitted.signals)
     doubts = touch_doubts(fitted.model, presses)
-    scores, powers, left = [], [], []
+    scores, sizes, powers, left = [], [], [], []
     for k, (press, signal) in enumerate(zip(presses.presses, fitted.signals, strict=True)):
         sigma = noise.sigma(signal)
         sure = ~unsure(press, fitted, sigma)
@@ -66,16 +75,29 @@ def own_deviations(presses: PressSet, fitted: Fit) -> Deviations:
         slope = None if slopes is None else slopes[k]
         images = [image * sure for image in _deviations(press, signal, slope)]
         white = np.stack([whiten(image, sigma, noise.memory) for image in images], axis=1)
-        coupling = np.linalg.inv(np.eye(len(images)) + white.T @ white)
-        own = coupling @ (white.T @ whiten(residual, sigma, noise.memory))
-        # In a sound rig's own units the most probable deviations have this variance.
-        variance = 1.0 - np.diag(coupling)
-        scores.append(np.divide(own, np.sqrt(variance), out=np.zeros_like(own), where=variance > 0.01))
+        gram, along = white.T @ white, white.T @ whiten(residual, sigma, noise.memory)
+        own = np.linalg.solve(np.eye(len(images)) + gram, along)
+        scores.append(_standardised(gram, along))
+        sizes.append(own)
         parts = [size * image for size, image in zip(own, images, strict=True)]
         powers.append([np.mean(part**2) for part in parts])
         left.append(residual - np.sum(parts, axis=0))
     total = max(sum(float(np.mean(residual**2)) for residual in residuals), 1e-12)
-    return Deviations(np.array(scores), np.sum(powers, axis=0) / total, left)
+    return Deviations(np.array(scores), np.array(sizes), np.sum(powers, axis=0) / total, left)
+
+
+def _standardised(gram: np.ndarray, along: np.ndarray) -> np.ndarray:
+    """Deviations (q,) of unit variance in a rig that scatters `SIZE_DOUBT` times as far as a sound one.
+
+    Args:
+        gram: (q, q) inner products of the whitened images of a sound rig's deviations.
+        along: (q,) the same of these with the residual.
+    """
+    scatter = SIZE_DOUBT**2
+    spread = np.linalg.inv(np.eye(len(gram)) / scatter + gram)
+    variance = scatter - np.diag(spread)
+    told = variance > TOLD * scatter
+    return np.divide(spread @ along, np.sqrt(variance), out=np.zeros(len(gram)), where=told)
 
 
 def recording_scatter(own: Deviations, seed: int) -> list[Suspicion]:
@@ -87,10 +109,9 @@ def recording_scatter(own: Deviations, seed: int) -> list[Suspicion]:
 
 def starts_deviate(own: Deviations) -> bool:
     """Whether starts surely do, so that it is worth an alarm."""
-    place = [name for name, _, _ in KINDS].index("starts")
-    scores, share = own.scores[:, place], float(own.shares[place])
+    scores, share = own.scores[:, STARTS], float(own.shares[STARTS])
     known = np.count_nonzero(scores)
-    p_value = chi2.sf(float(np.square(scores).sum()) / SIZE_DOUBT**2, max(known, 1))
+    p_value = chi2.sf(float(np.square(scores).sum()), max(known, 1))
     return share > LEAST_UNKNOWN and p_value < SUSPICION_ALPHA
 
 
@@ -124,11 +145,11 @@ def _from_indenter(press: Press) -> tuple[np.ndarray, np.ndarray]:
 def _scatter(
     kind: tuple[str, float, str], scores: np.ndarray, share: float, rng: np.random.Generator
 ) -> Suspicion:
-    """From deviations (K,) in those of sound recordings, and their part of the squared error that is left."""
+    """From scores (K,) and the part of the squared error that is left which they account for."""
     name, unit, symbol = kind
     known = np.count_nonzero(scores)
     total = float(np.square(scores).sum())
-    drawn = np.concatenate([[total / SIZE_DOUBT**2], rng.chisquare(max(known, 1), FLIPS)])
-    size = unit * np.sqrt(total / max(known, 1))
+    drawn = np.concatenate([[total], rng.chisquare(max(known, 1), FLIPS)])
+    size = SIZE_DOUBT * unit * np.sqrt(total / max(known, 1))
     clue = f"{name} of recordings deviate by {size:.2g} {symbol}, where {unit:.2g} is usual"
     return Suspicion(0, clue, share, LEAST_UNKNOWN, scores, drawn=drawn)

@@ -15,12 +15,19 @@ from lerobot_vtrefine.diagnose.pad import error_level, repeatability
 from lerobot_vtrefine.diagnose.pad.baseline import weigh
 from lerobot_vtrefine.diagnose.pad.candidates.sample_and_hold import HOLD, held_rows
 from lerobot_vtrefine.diagnose.pad.decoys import in_place_of_names
-from lerobot_vtrefine.diagnose.pad.descriptors import DESCRIPTORS, Descriptor, directions, errors_left_out
+from lerobot_vtrefine.diagnose.pad.descriptors import (
+    DESCRIPTORS,
+    PRESSED_BEFORE,
+    Descriptor,
+    directions,
+    errors_left_out,
+)
 from lerobot_vtrefine.diagnose.pad.failing_taxels import failing_taxel
 from lerobot_vtrefine.diagnose.pad.fitting import Fit, predict, tangents
 from lerobot_vtrefine.diagnose.pad.gain_drift import gain_drift
 from lerobot_vtrefine.diagnose.pad.hum import hum
 from lerobot_vtrefine.diagnose.pad.one_size import sizes_differ
+from lerobot_vtrefine.diagnose.pad.own_face import leaning_face
 from lerobot_vtrefine.diagnose.pad.press_trials import PressSet
 from lerobot_vtrefine.diagnose.pad.recording_scatter import own_deviations, recording_scatter
 from lerobot_vtrefine.diagnose.pad.repeatability import Correlations
@@ -48,17 +55,11 @@ def suspicions(problem: "PadProblem", selection: Selection[Any, Fit, Any]) -> li
         fitted = with_all_dead(fitted, presses, MAYBE_DEAD_ERRORS)
     _, weights = weigh(fitted, presses)
     residuals = repeatability.cleaned(fitted, presses, weights)
-    descriptors, own = following(problem, fitted), own_deviations(presses, fitted)
-    between = [
-        *recording_scatter(own, problem.seed),
-        levels_of_neighbours(presses, fitted.residuals(presses), problem.seed),
-        *(item for descriptor, item in descriptors if descriptor.session),
-    ]
+    own = own_deviations(presses, fitted)
     sure = [
         error_level.level(residuals, fitted, weights),
         held_rows(presses) if HOLD not in fitted.model.families else None,
         while_sliding(presses, residuals, fitted, weights),
-        *(replace(item, between_trials=True) for item in between if item is not None),
         *shared_errors(presses, own.left, fitted, weights, problem.seed),
         *hum(presses, own.left, fitted, weights, problem.seed),
         *noise_in_bursts(presses, own.left, fitted, weights, problem.seed),
@@ -75,14 +76,14 @@ def suspicions(problem: "PadProblem", selection: Selection[Any, Fit, Any]) -> li
         error_level.level_of_a_condition(presses, residuals, fitted, weights),
         error_level.beside_the_indenter(presses, residuals, fitted, weights),
         error_level.one_taxel(presses, residuals, weights),
-        *(item for descriptor, item in descriptors if not descriptor.session),
+        *following(problem, fitted),
     ]
     return [item for item in found if item is not None]
 
 
 def surprises(problem: "PadProblem", fitted: Fit, locked: PressSet) -> list[Suspicion]:
     """What fails now and then may have failed in recordings that no fit has seen, and in these alone. What
-    follows the order of recordings is clearer in all of them.
+    changes from one recording to the next is clearer in all of them.
 
     A map of gains knows too little of what other recordings pressed to tell; and where taxels are known to be
     dead, others may be that hardly anything had pressed before.
@@ -92,11 +93,31 @@ def surprises(problem: "PadProblem", fitted: Fit, locked: PressSet) -> list[Susp
         problem.presses if mapped else replace(locked, presses=(*problem.presses.presses, *locked.presses))
     )
     there, weights = _seen(problem, fitted, everyone)
-    found: list[Suspicion | None] = [*gain_drift(there, everyone, weights)]
+    found = between_recordings(replace(problem, presses=everyone, weights=weights), there)
     if not mapped:
         there, weights = _seen(problem, fitted, locked)
-        found.append(error_level.one_taxel(locked, repeatability.cleaned(there, locked, weights), weights))
-    return [item for item in found if item is not None]
+        failing = error_level.one_taxel(locked, repeatability.cleaned(there, locked, weights), weights)
+        found += [] if failing is None else [failing]
+    return found
+
+
+def between_recordings(problem: "PadProblem", fitted: Fit) -> list[Suspicion]:
+    """Two tests: of what gains do, and of all else that changes from recording to recording."""
+    presses = problem.presses
+    own = own_deviations(presses, fitted)
+    gains, starts, *others = recording_scatter(own, problem.seed)
+    # Recordings that were moved by their own delays may start as they please.
+    others += [starts] if problem.together is None else []
+    changing = [
+        *others,
+        levels_of_neighbours(presses, fitted.residuals(presses), problem.seed),
+        leaning_face(own, presses),
+        *following(problem, fitted, (PRESSED_BEFORE,)),
+    ]
+    return [
+        *(replace(item, family="gains") for item in (gains, *gain_drift(fitted, presses, problem.weights))),
+        *(replace(item, family="recordings") for item in changing if item is not None),
+    ]
 
 
 def _seen(problem: "PadProblem", fitted: Fit, presses: PressSet) -> tuple[Fit, tuple[TrialWeights, ...]]:
@@ -119,13 +140,15 @@ def _repeating(
     return found
 
 
-def following(problem: "PadProblem", fitted: Fit) -> list[tuple[Descriptor, Suspicion]]:
+def following(
+    problem: "PadProblem", fitted: Fit, descriptors: Sequence[Descriptor] = DESCRIPTORS
+) -> list[Suspicion]:
     """What is left may follow a descriptor; what a named family's own kind of effect leaves must be more."""
     presses, families = problem.presses, set(fitted.model.families)
     _, columns = tangents(fitted.model, presses, fitted.model.free)
     scorer = Scorer(fitted, presses, problem.weights, columns)
     found = []
-    for descriptor in DESCRIPTORS:
+    for descriptor in descriptors:
         change = directions(descriptor, presses, fitted)
         if change is None:
             continue
@@ -137,8 +160,7 @@ def following(problem: "PadProblem", fitted: Fit) -> list[tuple[Descriptor, Susp
         least = FOLLOWS_IF_OWNED if families & set(descriptor.owners) else FOLLOWS
         text = f"the residual correlates with {descriptor.text} ({100 * share:.0f} % of its power)"
         scatter = float(np.sqrt(information.sum()))
-        item = Suspicion(0, text, share, least, scores, either_sign=True, scatter=scatter)
-        found.append((descriptor, item))
+        found.append(Suspicion(0, text, share, least, scores, either_sign=True, scatter=scatter))
     return found
 
 

@@ -82,7 +82,6 @@ Kind = Literal[
     "age",  # of how long it has lasted
     "rate",  # of how fast it came
     "time",  # drifts within a recording
-    "session",  # and from recording to recording
     "place",  # differs over the pad
     "centre",  # with the distance from it
     "row",  # depends on its other readings

@@ -71,7 +71,7 @@ FORMS = (
         _linear,
         _report,
         lambda s: [[1.0]],
-        kinds=("time", "session"),
+        kinds=("time",),
         needs="log start_s, and record over some minutes with frames at rest in every trial",
         signed=True,
     ),
