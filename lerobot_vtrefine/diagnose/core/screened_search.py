@@ -283,7 +283,8 @@ def still_found[P: ScreenedProblem[Any, Any], F: ScoredFit, C: FormCandidate](
 def _without[P: ScreenedProblem[Any, Any], F: ScoredFit, C: FormCandidate](
     selection: Selection[P, F, C], candidate: C, seed: int
 ) -> Selection[P, F, C]:
-    """The selection without a candidate, under weights of its own, the others in the forms that suit best."""
+    """The selection without a candidate, under weights of its own, the others in the forms that suit best; as
+    they are where it was seen, which their forms do not change."""
     problem, fit = selection.problem.weighed(selection.problem.reduced(selection.fit, [candidate], _ONE))
     slim = replace(
         selection,
@@ -293,7 +294,7 @@ def _without[P: ScreenedProblem[Any, Any], F: ScoredFit, C: FormCandidate](
         chosen={CHANNEL: tuple(item for item in selection.chosen[CHANNEL] if item is not candidate)},
         p_values={key: p for key, p in selection.p_values.items() if key[0] != candidate.cause},
     )
-    return problem.reformed(slim, seed)
+    return slim if selection.observed(candidate.cause) else problem.reformed(slim, seed)
 
 
 def _p_beside(selection: Selection[Any, Any, Any], cause: str) -> float:
