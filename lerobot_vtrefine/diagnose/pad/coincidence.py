@@ -12,7 +12,7 @@ import numpy as np
 
 from lerobot_vtrefine.diagnose.core.heldout import out_of_fold
 from lerobot_vtrefine.diagnose.core.rivals import Rival
-from lerobot_vtrefine.diagnose.core.rules import TIE_P
+from lerobot_vtrefine.diagnose.core.rules import ALPHA
 from lerobot_vtrefine.diagnose.pad.candidates.crosstalk import BOTH
 from lerobot_vtrefine.diagnose.pad.candidates.mechanical_spreading import SIGMA
 from lerobot_vtrefine.diagnose.pad.fitting import Fit
@@ -40,7 +40,7 @@ def cover_or_leak(problem: "PadProblem", named: Fit, rival: Rival) -> int:
     if values != BOTH or _own(cover, COVER)[1] != (SIGMA,):
         return 0
     lead = out_of_fold(problem, leak, problem.folds).better_by(out_of_fold(problem, cover, problem.folds))
-    if likelier_by(leak, place, problem) - float(lead.sum()) < np.log(1.0 / TIE_P):
+    if likelier_by(leak, place, problem) - float(lead.sum()) < np.log(1.0 / ALPHA):
         return 0
     return 1 if rival.name == COVER else -1
 
