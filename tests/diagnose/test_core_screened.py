@@ -7,7 +7,9 @@ import pytest
 
 from lerobot_vtrefine.diagnose.core.engine import guarded, infer
 from lerobot_vtrefine.diagnose.core.problem import OptionalSteps, PlainCandidate, Promise
+from lerobot_vtrefine.diagnose.core.rivals import settled
 from lerobot_vtrefine.diagnose.core.score_test import Probe, cleared, screen
+from lerobot_vtrefine.diagnose.core.screened_rivals import screened_rivals
 from lerobot_vtrefine.diagnose.core.screened_search import ScreenedSearch, still_found
 
 TRIALS, FRAMES, NOISE, COLUMNS = 24, 60, 0.1, 5
@@ -447,3 +449,55 @@ def test_names_are_tested_again_as_the_search_tests_them_where_weights_may_hide_
     assert sorted(names_of(still_found(hiding, 0))) == ["bend", "patch"]
     sure = replace(selection, problem=Hiding(**vars(both), far=False))
     assert names_of(still_found(sure, 0)) == ["bend"]
+
+
+@dataclass(frozen=True)
+class Glimpsing(Toy):
+    """The square seems to be seen in the readings until the bend is there."""
+
+    def screened(self, now, only=None):
+        seen = "" if 1 in now.free else "square"
+        return [
+            item
+            for item in Toy.screened(replace(self, seen=seen), now, only)
+            if item.candidate.cause != "square" or seen
+        ]
+
+
+def test_what_was_seen_must_still_be_seen_beside_the_others() -> None:
+    problem = Glimpsing(**vars(toy(0.6)))
+    selection = ScreenedSearch(problem, 0, lambda text: None).run()
+    both = replace(
+        selection,
+        fit=problem.fit((0, 2, 1)),
+        chosen={0: tuple(problem.offered)},
+        p_values={("bend", 0): 0.001, ("square", 0): None},
+    )
+    assert both.observed("square")
+    assert names_of(still_found(both, 0)) == ["bend"]
+    seen = replace(both, problem=toy(0.6, seen="square"))
+    assert sorted(names_of(still_found(seen, 0))) == ["bend", "square"]
+
+
+def test_a_rival_that_trials_prefer_takes_the_place_of_the_name() -> None:
+    right, wrong = Form("bend", column=1), Form("square", column=2)
+    problem = toy(0.3, offered=(right, wrong))
+    named = replace(
+        ScreenedSearch(problem, 0, lambda text: None).run(),
+        fit=problem.fit((0, 2)),
+        chosen={0: (wrong,)},
+        p_values={("square", 0): 0.001},
+        alternatives={"square": frozenset({"bend"})},
+    )
+    (rival,) = screened_rivals(named, 0)
+    assert rival.preferred
+    found, left = settled(named, [rival], 0)
+    assert names_of(found) == ["bend"]
+    assert not left
+    assert found.p_value("bend") == 0.001
+    # With more coordinates it would often be preferred, whatever acts.
+    rich = replace(right, terms=2)
+    richer = replace(named, problem=replace(problem, offered=(rich, wrong)))
+    (rival,) = screened_rivals(richer, 0)
+    assert not rival.preferred
+    assert settled(richer, [rival], 0)[1] == (rival,)

@@ -29,6 +29,8 @@ class Rival[F: Fit, C: Candidate]:
     fit: F
     errors: Array
     """(T, J) cross-validated."""
+    preferred: bool = False
+    """Whether trials rank the cause behind it."""
 
     @property
     def name(self) -> str:
@@ -132,13 +134,17 @@ def if_tied[F: Fit, C: Candidate](
 def settled[F: Fit, C: Candidate](
     selection: Selection[Any, F, C], rivals: Sequence[Rival[F, C]], seed: int
 ) -> tuple[Selection[Any, F, C], tuple[Rival[F, C], ...]]:
-    """The ties that remain after the problem has settled those that it can; the winners are adopted."""
-    decided = [(rival, selection.problem.settles(rival, selection, seed)) for rival in rivals]
-    won = [rival for rival, winner in decided if winner > 0]
-    for rival in won:
+    """The ties that remain after trials and the problem have settled those that they can; the winners are
+    adopted."""
+    decided = [
+        (rival, 1 if rival.preferred else selection.problem.settles(rival, selection, seed))
+        for rival in rivals
+    ]
+    ranked = sorted((rival for rival, winner in decided if winner > 0), key=lambda rival: rival.p_value)
+    won = {(rival.cause, rival.channels): rival for rival in ranked}
+    for rival in won.values():
         selection = adopt(selection, rival)
-    gone = {(rival.cause, rival.channels) for rival in won}
-    left = [rival for rival, winner in decided if winner == 0 and (rival.cause, rival.channels) not in gone]
+    left = [rival for rival, winner in decided if winner == 0 and (rival.cause, rival.channels) not in won]
     return selection, tuple(left)
 
 
@@ -158,7 +164,7 @@ def adopt[F: Fit, C: Candidate](selection: Selection[Any, F, C], rival: Rival[F,
     mask = np.isin(np.arange(selection.errors.shape[1]), rival.channels) | rival.shared
     return replace(
         selection,
-        fit=rival.fit if rival.shared else selection.problem.merged(selection.fit, rival.fit, mask),
+        fit=rival.fit if mask.all() else selection.problem.merged(selection.fit, rival.fit, mask),
         errors=np.where(mask, rival.errors, selection.errors),
         chosen={channel: items for channel, items in chosen.items() if items},
         p_values=p_values,

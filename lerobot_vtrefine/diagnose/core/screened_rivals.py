@@ -61,4 +61,8 @@ def tied(full: OutOfFold, other: OutOfFold, seed: int) -> bool:
 
 def _rival(candidate: Any, step: Step[Any, Any], full: OutOfFold, seed: int) -> Rival[Any, Any]:
     p_value = float(one_sided(full.better_by(step.held)[:, None], seed)[0][0])
-    return Rival(candidate.cause, step.candidate, (CHANNEL,), False, p_value, step.fit, step.held.errors)
+    # Which of two causes was named first hangs on what stood beside them then; a richer one would often win.
+    preferred = step.candidate.terms <= candidate.terms and not tied(step.held, full, seed)
+    return Rival(
+        candidate.cause, step.candidate, (CHANNEL,), False, p_value, step.fit, step.held.errors, preferred
+    )

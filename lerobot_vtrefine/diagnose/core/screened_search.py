@@ -74,9 +74,10 @@ class Ground[P: ScreenedProblem[Any, Any], F: ScoredFit]:
 
 
 def preferable(candidate: FormCandidate, held: OutOfFold, than: OutOfFold, seed: int) -> bool:
-    """Whether a form is to stand in for a plainer one."""
+    """Whether a form is to stand in for a plainer one; a peer if it is likelier, whatever little plain errors
+    say, which hang on how hard and where each recording happened to touch."""
     if candidate.peer:
-        return better(held, than)
+        return held.gain_over(than) > -LEAST_GAIN and float(held.better_by(than).sum()) > 0
     return clearly_better(held, than, seed)
 
 
@@ -270,11 +271,8 @@ def still_found[P: ScreenedProblem[Any, Any], F: ScoredFit, C: FormCandidate](
     better where a form is not quite right.
     """
     while len(chosen := selection.chosen.get(CHANNEL, ())) > 1:
-        tested = [item for item in chosen if not selection.observed(item.cause)]
-        if not tested:
-            break
-        slims = on_all_cores(partial(_without, selection, seed=seed), tested)
-        p_values = [_p_beside(slim, item.cause) for slim, item in zip(slims, tested, strict=True)]
+        slims = on_all_cores(partial(_without, selection, seed=seed), chosen)
+        p_values = [_p_beside(slim, item.cause) for slim, item in zip(slims, chosen, strict=True)]
         worst = int(np.argmax(p_values))
         if p_values[worst] <= SCREEN_ALPHA:
             break
@@ -285,7 +283,8 @@ def still_found[P: ScreenedProblem[Any, Any], F: ScoredFit, C: FormCandidate](
 def _without[P: ScreenedProblem[Any, Any], F: ScoredFit, C: FormCandidate](
     selection: Selection[P, F, C], candidate: C, seed: int
 ) -> Selection[P, F, C]:
-    """The selection without a candidate, under weights of its own, the others in the forms that suit best."""
+    """The selection without a candidate, under weights of its own, the others in the forms that suit best; as
+    they are where it was seen, which their forms do not change."""
     problem, fit = selection.problem.weighed(selection.problem.reduced(selection.fit, [candidate], _ONE))
     slim = replace(
         selection,
@@ -295,7 +294,7 @@ def _without[P: ScreenedProblem[Any, Any], F: ScoredFit, C: FormCandidate](
         chosen={CHANNEL: tuple(item for item in selection.chosen[CHANNEL] if item is not candidate)},
         p_values={key: p for key, p in selection.p_values.items() if key[0] != candidate.cause},
     )
-    return problem.reformed(slim, seed)
+    return slim if selection.observed(candidate.cause) else problem.reformed(slim, seed)
 
 
 def _p_beside(selection: Selection[Any, Any, Any], cause: str) -> float:

@@ -24,8 +24,11 @@ if TYPE_CHECKING:
     from lerobot_vtrefine.diagnose.pad.problem import PadProblem
 
 TURNS, TOUCH_STEPS = 6, 2
-FIRST_STEPS = 3
+MOST_STEPS = 5
 """Steps from the recorded touch."""
+PROMISED = 0.5
+"""Decrease of a recording's squared error, in variances of noise, for which no further step is taken: models
+are compared by whole units."""
 STEP_M = 2e-6
 """Step of the touch's tangent, that of a contact offset's coordinate: the two are one direction."""
 FARTHEST_M = 2e-5
@@ -51,7 +54,7 @@ def with_own_touch(problem: "PadProblem", fitted: Fit) -> tuple["PadProblem", Fi
     best: tuple[PadProblem, Fit] | None = None
     for _ in range(TURNS):
         for _ in range(TOUCH_STEPS):
-            touches = _touches(model, problem.presses, noise, touches)
+            touches, _, _ = _step(model, problem.presses, noise, touches)
         around, now = _linearised(problem, model, noise, touches)
         if best is not None and now.loss > WORSE * best[1].loss:
             break
@@ -70,44 +73,53 @@ def allowed(presses: PressSet, weights: Sequence[TrialWeights]) -> bool:
 
 def touches_of(model: Composite, presses: PressSet, noise: Noise) -> np.ndarray:
     """Most probable touches (K,) [m] under a model: positive where the face was met later."""
-    touches = np.zeros(len(presses.presses))
-    for _ in range(FIRST_STEPS):
-        touches = _touches(model, presses, noise, touches)
-    return touches
+    return _most_probable(model, presses, noise)[0]
 
 
 def losses_at_own_touch(model: Composite, presses: PressSet, noise: Noise) -> np.ndarray:
     """Weighted squared error of every recording (K,), the least over its own gain and touch."""
-    touches = touches_of(model, presses, noise)
-    signals, slopes = _at(model, presses, touches)
-    weights = build_weights(noise, signals, slopes)
-    every = zip(presses.presses, signals, slopes, touches, weights, strict=True)
-    return np.array(
-        [
-            float(weight.gram(weight.whiten(press.signal - signal + slope * touch)[None])[0, 0])
-            for press, signal, slope, touch, weight in every
-        ]
-    )
+    return _most_probable(model, presses, noise)[1]
 
 
-def _touches(model: Composite, presses: PressSet, noise: Noise, touches: np.ndarray) -> np.ndarray:
-    """The touches one step on."""
+def _most_probable(model: Composite, presses: PressSet, noise: Noise) -> tuple[np.ndarray, np.ndarray]:
+    """Every recording's touch and loss (K,).
+
+    Readings near a touch have kinks, so that a step may lead past the least loss, and the next one back. Such
+    a recording halves its way, for a loss that is not the least differs from one model to the next by more
+    than models do.
+    """
+    there = np.zeros(len(presses.presses))
+    best = np.full((3, len(there)), np.inf)
+    for _ in range(MOST_STEPS):
+        onward, losses, promised = _step(model, presses, noise, there)
+        lower = losses < best[1]
+        best = np.where(lower, [there, losses, promised], best)
+        if not (best[2] > PROMISED).any():
+            break
+        there = np.where(lower, onward, 0.5 * (best[0] + there))
+    return best[0], best[1]
+
+
+def _step(
+    model: Composite, presses: PressSet, noise: Noise, touches: np.ndarray
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Touches one step on, the losses here, and by how much the step should lower them (K,)."""
     signals, slopes = _at(model, presses, touches)
     found = []
     for press, signal, slope, touch in zip(presses.presses, signals, slopes, touches, strict=True):
-        sigma = noise.sigma(signal)
+        sigma, deviation = noise.sigma(signal), touch / noise.offset_m
         left, gain, late = (
             whiten(image, sigma, noise.memory)
-            for image in (
-                press.signal - signal + slope * touch,
-                signal * noise.gain,
-                slope * noise.offset_m,
-            )
+            for image in (press.signal - signal, signal * noise.gain, slope * noise.offset_m)
         )
-        directions = np.stack([gain, late], axis=1)
-        own = np.linalg.solve(np.eye(2) + directions.T @ directions, directions.T @ left)
-        found.append(np.clip(own[1] * noise.offset_m, touch - FARTHEST_M, touch + FARTHEST_M))
-    return np.array(found)
+        loss = left @ left - (gain @ left) ** 2 / (1.0 + gain @ gain) + deviation**2
+        directions, left = np.stack([gain, late], axis=1), left + late * deviation
+        along = directions.T @ left
+        own = np.linalg.solve(np.eye(2) + directions.T @ directions, along)
+        onward = np.clip(own[1] * noise.offset_m, touch - FARTHEST_M, touch + FARTHEST_M)
+        found.append((onward, loss, loss - (left @ left - along @ own)))
+    onward, losses, lowered = np.array(found).T
+    return onward, losses, lowered
 
 
 def _linearised(

@@ -13,6 +13,7 @@ import numpy as np
 
 from lerobot_vtrefine.diagnose.core.heldout import out_of_fold
 from lerobot_vtrefine.diagnose.core.problem import OptionalSteps, PlainCandidate, Promise
+from lerobot_vtrefine.diagnose.core.rivals import Rival
 from lerobot_vtrefine.diagnose.core.rules import LEAST_GAIN
 from lerobot_vtrefine.diagnose.core.score_test import screen
 from lerobot_vtrefine.diagnose.core.screened_search import folds_for
@@ -23,6 +24,7 @@ from lerobot_vtrefine.diagnose.pad.baseline import Baseline, fit_baseline, plain
 from lerobot_vtrefine.diagnose.pad.candidates import PLAIN
 from lerobot_vtrefine.diagnose.pad.candidates.base import Form
 from lerobot_vtrefine.diagnose.pad.candidates.sample_and_hold import repeated_share
+from lerobot_vtrefine.diagnose.pad.coincidence import cover_or_leak
 from lerobot_vtrefine.diagnose.pad.error_level import slow_errors
 from lerobot_vtrefine.diagnose.pad.final_model import FinalFit
 from lerobot_vtrefine.diagnose.pad.fitting import (
@@ -347,6 +349,10 @@ class PadProblem(OptionalSteps):
     ) -> Selection[Any, Fit, Candidate]:
         """The same names in their likeliest forms."""
         return review.reformed(selection, seed)
+
+    def settles(self, rival: Rival, selection: Selected, seed: int) -> int:
+        """Between a cover that spreads and leaks that happen to be alike."""
+        return cover_or_leak(self, selection.fit, rival)
 
     def suspicions(self, selection: Selected, seed: int) -> list[Suspicion]:
         """What may be left."""
