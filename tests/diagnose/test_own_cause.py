@@ -103,6 +103,7 @@ NAMED_ELSEWHERE = {
     "report/effects.py": "drawings",
     "joints/experiments.py": "what slow recordings cannot show",
     "joints/model.py": "fields of the file, which have names of their own",
+    "pad/coincidence.py": "two that would be each other by a coincidence alone",
     "pad/detectable.py": "a period is no size that grows",
     "pad/final_model.py": "frames that repeat",
     "pad/idle_level.py": "idle levels are learnt without their drift",

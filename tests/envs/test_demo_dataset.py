@@ -187,6 +187,15 @@ def test_interrupt_while_simulating_keeps_every_saved_episode(tmp_path):
     assert read(tmp_path / "demo").num_episodes == 3
 
 
+@pytest.fixture
+def ctrl_c():
+    """Python's own handler, also where the tests run in a shell's background, which ignores Ctrl-C."""
+    before = signal.signal(signal.SIGINT, signal.default_int_handler)
+    yield
+    signal.signal(signal.SIGINT, before)
+
+
+@pytest.mark.usefixtures("ctrl_c")
 @pytest.mark.parametrize("while_in", ["save_episode", "finalize"])
 def test_an_interrupt_while_saving_keeps_every_saved_episode(tmp_path, monkeypatch, while_in):
     def interrupted(dataset: LeRobotDataset, *args, **kwargs):
