@@ -44,6 +44,11 @@ class WorldParameters:
     """(m, 3, 3)"""
 
 
+def _unit_draws(seeds: Array, stream: int, count: int, wanted: bool) -> Array:
+    """(m, count) in [0, 1]: the middle where none are wanted, since a generator for every seed takes long."""
+    return (uniform_draws(seeds, stream, count) + 1.0) / 2 if wanted else np.full((len(seeds), count), 0.5)
+
+
 class Randomizer:
     """Draws parameters per world and turns them into model fields."""
 
@@ -64,7 +69,7 @@ class Randomizer:
 
     def draw(self, seeds: Array) -> WorldParameters:
         """Parameters for episodes with these seeds (m,)."""
-        unit = (uniform_draws(seeds, _STREAM, len(RANGES) + _CAMERA_DRAWS) + 1.0) / 2
+        unit = _unit_draws(seeds, _STREAM, len(RANGES) + _CAMERA_DRAWS, self._draws_parameters)
         nominal = self._nominal()
         values = {}
         for index, name in enumerate(RANGES):
@@ -84,6 +89,11 @@ class Randomizer:
         )
 
     @property
+    def _draws_parameters(self) -> bool:
+        camera = self._config.camera_position_m or self._config.camera_rotation_rad
+        return bool(camera) or any(getattr(self._config, name) is not None for name in RANGES)
+
+    @property
     def varies_force_limit(self) -> bool:
         """Whether the limit on force differs between episodes."""
         return self._config.contact_force_n is not None
@@ -93,7 +103,7 @@ class Randomizer:
         nothing else of an episode.
         """
         low, high = self._config.contact_force_n or (nominal_n, nominal_n)
-        return low + (high - low) * (uniform_draws(seeds, _LIMIT_STREAM, 1)[:, 0] + 1.0) / 2
+        return low + (high - low) * _unit_draws(seeds, _LIMIT_STREAM, 1, self.varies_force_limit)[:, 0]
 
     def model_fields(self, parameters: WorldParameters) -> dict[str, Array]:
         """Values (m, ...) of every MjModel field that these worlds have of their own."""
