@@ -58,6 +58,11 @@ def _message(error: BaseException) -> str:
         return _message(error.__cause__)
     if isinstance(error, ModuleNotFoundError) and (advice := explain(error)) is not None:
         return advice
+    if _gpu_is_full(error):
+        return (
+            "the GPU's memory is full: simulate fewer worlds at once, or start fewer runs on it (nvidia-smi"
+            " shows them); what was saved is kept, and a command that takes --resume=true goes on from there"
+        )
     message = " ".join(str(error).split())
     if isinstance(error, _weights_errors()) and os.strerror(errno.ENOSPC) in message:
         return _message(OSError(errno.ENOSPC, ""))
@@ -80,6 +85,18 @@ def _network_errors() -> tuple[type[Exception], ...]:
 def _weights_errors() -> tuple[type[Exception], ...]:
     """What is raised where weights cannot be written or read; a full disk, too."""
     return _of_library("safetensors", "SafetensorError")
+
+
+def _is_expected(error: Exception) -> bool:
+    """Whether a user can do something about it; anything else is a defect."""
+    kinds = (*EXPECTED, *_network_errors(), *_weights_errors())
+    return isinstance(error, kinds) or _gpu_is_full(error)
+
+
+def _gpu_is_full(error: BaseException) -> bool:
+    """Whether torch or Warp, which has no exception of its own for it, got no memory on a GPU."""
+    of_warp = re.match(r"Failed to allocate \d+ bytes on device", str(error))
+    return bool(of_warp) or isinstance(error, _of_library("torch", "OutOfMemoryError"))
 
 
 def _in_flags(message: str) -> str:
@@ -173,10 +190,10 @@ def _nobody_reads() -> bool:
 def run_cli[**P](main: Callable[P, int | None]) -> Callable[P, int]:
     """Wrap a console entry point so that expected errors end as ``error: ...`` with exit status 2.
 
-    ``ValueError``, ``OSError`` (missing files, full disk), ``ImportError`` (an extra is not installed) and
-    draccus' parsing errors are expected; anything else is a defect and keeps its traceback. Ctrl-C exits with
-    130; where ``head`` has seen enough, a command ends without a word. With ``VTREFINE_DEBUG=1`` in the
-    environment every error keeps its traceback.
+    ``ValueError``, ``OSError`` (missing files, full disk), ``ImportError`` (an extra is not installed),
+    draccus' parsing errors and a GPU without memory are expected; anything else is a defect and keeps its
+    traceback. Ctrl-C exits with 130; where ``head`` has seen enough, a command ends without a word. With
+    ``VTREFINE_DEBUG=1`` in the environment every error keeps its traceback.
     """
 
     @functools.wraps(main)
@@ -191,10 +208,10 @@ def run_cli[**P](main: Callable[P, int | None]) -> Callable[P, int]:
         except KeyboardInterrupt as stopped:
             print(f"interrupted{f': {stopped}' if stopped.args else ''}", file=sys.stderr)
             return INTERRUPT_STATUS
-        except (*EXPECTED, *_network_errors(), *_weights_errors()) as error:
+        except Exception as error:
             if isinstance(error, BrokenPipeError) and _nobody_reads():
                 return UNREAD_STATUS
-            if os.environ.get(DEBUG_VARIABLE) == "1":
+            if not _is_expected(error) or os.environ.get(DEBUG_VARIABLE) == "1":
                 raise
             print(f"error: {describe(error)}", file=sys.stderr)
             return USAGE_STATUS

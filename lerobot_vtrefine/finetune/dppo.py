@@ -38,6 +38,7 @@ from lerobot_vtrefine.finetune.distributed import (
     total_over_ranks,
 )
 from lerobot_vtrefine.finetune.gae import RewardScaler, generalised_advantages
+from lerobot_vtrefine.finetune.gpu_memory import give_back_unused
 from lerobot_vtrefine.finetune.protocols import (
     Agent,
     DecisionEnv,
@@ -356,6 +357,7 @@ def train(
         state.critic.update_moments(rollout.privileged[:-1][rollout.active])
         metrics = rollout_metrics(rollout)
         metrics |= update(rollout, agent, state, cfg)
+        give_back_unused(agent.device)
         decisions = sum_over_ranks(rollout.active.sum().double()).item()
         state.iteration += 1
         state.env_steps += int(decisions) * chunk

@@ -9,6 +9,7 @@ import draccus
 import httpx
 import pytest
 import safetensors
+import torch
 
 from lerobot_vtrefine.cli.errors import after_interrupt, run_cli
 from lerobot_vtrefine.cli.pipeline.demo_config import DemoConfig
@@ -152,6 +153,21 @@ def test_weights_on_a_full_disk_are_one_line(capsys) -> None:
 
     assert run_cli(save)() == 2
     assert capsys.readouterr().err.startswith("error: the disk is full; free some space")
+
+
+@pytest.mark.parametrize(
+    "error",
+    [
+        torch.OutOfMemoryError("CUDA out of memory. Tried to allocate 2.00 GiB"),
+        RuntimeError("Failed to allocate 762132 bytes on device 'cuda:0'"),  # Warp's
+    ],
+    ids=["torch", "warp"],
+)
+def test_a_gpu_without_memory_is_one_line(error: Exception, capsys) -> None:
+    assert failing(error)() == 2
+    told = capsys.readouterr().err
+    assert told.startswith("error: the GPU's memory is full: simulate fewer worlds")
+    assert told.count("\n") == 1
 
 
 @pytest.mark.parametrize("lines", [1, 100_000], ids=["at its end", "while it writes"])
