@@ -13,8 +13,7 @@ table, on episodes that are the same for all. Where DPPO practises is --tune_sta
 from states that the imitation reached with both parts in hand, or the expert where it reaches too few (bank);
 or with parts that are put into the hands (grasped), where a pair can be. Random weights, which never get that
 far, practise on whole episodes in place of a bank. On a GPU worlds wait for the one that runs out of time:
---tune_steps=120 ends episodes from a bank earlier, counted from the table. --bank_share=0.75 starts the other
-quarter from the table, lest what comes before the grasp be forgotten. --tune_timestep_s=0.005 practises
+--tune_steps=120 ends episodes from a bank earlier, counted from the table. --tune_timestep_s=0.005 practises
 in longer physics steps than those in which policies are judged.
 
 Every policy becomes rows of results/paper.json, or of results/demonstrations.json, as soon as it is judged.
@@ -267,7 +266,6 @@ def finetune_stage(options: argparse.Namespace, policy: Trained) -> Stage:
         *task_flags(options, policy.pair),
         *(["--env.start=grasped"] if grasped else []),
         *(f"--env.start_bank={stage.product}" for stage in bank),
-        *([f"--env.start_bank_share={options.bank_share}"] if bank else []),
         *practice_flags(options, bank=bool(bank)),
         f"--env.backend={options.backend}",
         f"--policy.path={checkpoint(start)}",
@@ -433,7 +431,6 @@ def make_parser() -> CommandParser:
     parser.add_argument("--worlds", type=int, default=512, help="of DPPO")
     parser.add_argument("--tune_start", choices=["table", "bank", "grasped"], default="table", help="of DPPO")
     parser.add_argument("--tune_steps", type=int, help="control step at which episodes from a bank end")
-    parser.add_argument("--bank_share", type=float, default=1.0, help="of DPPO's episodes; the others: table")
     parser.add_argument("--tune_timestep_s", type=float, help="longest physics step [s] of DPPO")
     parser.add_argument("--starts", type=int, default=512, help="states in a bank")
     parser.add_argument("--episodes", type=int, default=512, help="of an evaluation")

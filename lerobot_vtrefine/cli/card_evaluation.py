@@ -24,12 +24,11 @@ def evaluation_stage(cfg: FinetunePipelineConfig, checkpoint: Path) -> Stage:
     assert isinstance(cfg.env, VtRefineEnvConfig)
     assert cfg.policy is not None
     output = cfg.output_dir / f"evaluation_{checkpoint.name}"
-    env = replace(cfg.env, start_bank=None, start_bank_share=1.0)
     command = (
         "lerobot-eval",
         f"--policy.path={checkpoint / PRETRAINED_MODEL_DIR}",
         f"--policy.device={cfg.policy.device}",
-        *flags("env", {"type": cfg.env.type} | changed_settings(env)),
+        *flags("env", {"type": cfg.env.type} | changed_settings(replace(cfg.env, start_bank=None))),
         f"--env.metrics_path={output / EPISODES}",
         f"--eval.n_episodes={cfg.eval.n_episodes}",
         f"--eval.batch_size={cfg.eval.batch_size}",

@@ -62,9 +62,6 @@ class VtRefineEnvConfig(EnvConfig):
     start_bank: Path | None = None
     """File of vtrefine-record-starts: episodes start where it has both parts in the hands, with the time that
     is left from the table."""
-    start_bank_share: float = 1.0
-    """Share of the episodes that start from the bank. The others start as the task does, so that what comes
-    before the grasp stays practised."""
     mesh_dir: Path | None = None
     """Folder of meshes for automate/ID."""
     episode_steps: int | None = None
@@ -125,8 +122,6 @@ class VtRefineEnvConfig(EnvConfig):
             raise ValueError(
                 f"--env.ablate={self.ablate} needs --env.ablate_dataset, the policy's training data"
             )
-        if not 0.0 < self.start_bank_share <= 1.0:
-            raise ValueError(f"--env.start_bank_share must lie in (0, 1], got {self.start_bank_share}")
         if self.rules.control_hz != TaskConfig.control_hz:
             raise ValueError("set the control rate with --env.fps, not with --env.rules.control_hz")
         if self.hidden.sensor_model is not None and self.sensor_model != "default":

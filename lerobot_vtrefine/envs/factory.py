@@ -72,7 +72,7 @@ def _log(config: VtRefineEnvConfig) -> EpisodeLog | None:
 def _start(config: VtRefineEnvConfig, sim: "InsertionSim") -> Callable[[Array, Array], None] | None:
     if config.start_bank is None:
         return None
-    return partial(StartBank.load(config.start_bank, config).start, sim, config.start_bank_share)
+    return partial(StartBank.load(config.start_bank, config).start, sim)
 
 
 def _colour_camera(

@@ -24,8 +24,6 @@ def simulation_settings(env: VtRefineEnvConfig) -> dict[str, Any]:
     known = replace(env, reality=None)
     files = {"reality": env.reality, "start_bank": env.start_bank}
     hidden = {name: fingerprint(path) for name, path in files.items() if path is not None}
-    if env.start_bank is not None and env.start_bank_share < 1.0:
-        hidden["start_bank_share"] = str(env.start_bank_share)
     colour = {} if env.colour_size is None else {"colour": list(env.colour_size)}
     return (
         hidden

@@ -77,35 +77,25 @@ class StartBank:
         with whole_file(path) as part, part.open("wb") as file:
             np.savez_compressed(file, **arrays, **self.leaves)
 
-    def chosen(self, seeds: Array, share: float = 1.0) -> Array:
-        """(m,) the state from which each seed (m,) starts, or -1 where it starts as the task does.
-
-        A ``share`` of the seeds, evenly spread, starts from states and takes one after the other, so that
-        many seeds use all alike, and training never those of held-out seeds.
+    def chosen(self, seeds: Array) -> Array:
+        """(m,) the state from which each seed (m,) starts: one after the other, so that many seeds use all
+        alike, and training never those of held-out seeds.
         """
         every = np.arange(len(self.source))
         kept = every % HELD_OUT_EVERY == 0
         held_out, training = every[kept], every[~kept]
-        before, after = (np.floor(number * share).astype(np.int64) for number in (seeds, seeds + 1))
-        states = np.where(
-            seeds < HELD_OUT_BELOW, held_out[before % len(held_out)], training[before % len(training)]
+        return np.where(
+            seeds < HELD_OUT_BELOW, held_out[seeds % len(held_out)], training[seeds % len(training)]
         )
-        return np.where(after > before, states, -1)
 
-    def start(self, sim: "InsertionSim", share: float, ids: Array, seeds: Array) -> None:
+    def start(self, sim: "InsertionSim", ids: Array, seeds: Array) -> None:
         """Put worlds ``ids`` where their seeds (m,) start: in place of ``sim.reset``.
 
         Raises:
             ValueError: the states lack something that episodes remember today.
         """
-        seeds = np.asarray(seeds, np.int64)
-        rows = self.chosen(seeds, share)
-        taken = rows >= 0
-        if not taken.all():
-            sim.reset(ids[~taken], seeds[~taken])
-        if taken.any():
-            like = sim.get_state(int(ids[0]))
-            sim.set_state(ids[taken], _filled(STATE, like, self.leaves, rows[taken]))
+        rows = self.chosen(np.asarray(seeds, np.int64))
+        sim.set_state(ids, _filled(STATE, sim.get_state(int(ids[0])), self.leaves, rows))
 
 
 def bank_settings(config: VtRefineEnvConfig) -> dict[str, Any]:
@@ -115,7 +105,7 @@ def bank_settings(config: VtRefineEnvConfig) -> dict[str, Any]:
     settings = simulation_settings(config)
     settings["rules"].pop("episode_steps")
     scene = {key: value for key, value in settings.pop("scene").items() if key != "mesh_dir"}
-    for unused in ("task", "start_bank", "start_bank_share", "colour"):
+    for unused in ("task", "start_bank", "colour"):
         settings.pop(unused, None)
     physics = "warp" if config.backend == "warp" else "mujoco"
     if (model := Path(config.sensor_model)).is_file():

@@ -5,7 +5,6 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from draccus.utils import ParsingError
 
 from lerobot_vtrefine.envs import VtRefineEnvConfig
 from lerobot_vtrefine.envs.episodes import Episodes
@@ -237,35 +236,3 @@ def test_parts_that_stand_on_the_table_are_not_in_hand(socket: str):
 
 def test_no_seed_that_training_uses_is_held_out():
     assert TRAINING_SEEDS == HELD_OUT_BELOW > EVALUATION_SEEDS
-
-
-def test_a_share_of_the_episodes_starts_from_the_bank_and_the_others_from_the_table(
-    picked: VtRefineEnvConfig,
-):
-    assert picked.start_bank is not None
-    bank = StartBank.load(picked.start_bank, picked)
-    for first in (0, HELD_OUT_BELOW):
-        rows = bank.chosen(first + np.arange(400), 0.75)
-        assert (rows >= 0).reshape(-1, 4).sum(1).tolist() == [3] * 100
-        used, counts = np.unique(rows[rows >= 0], return_counts=True)
-        assert set(used) == set(bank.chosen(first + np.arange(400)))
-        assert counts.max() - counts.min() <= 1
-
-    config = dataclasses.replace(picked, start_bank_share=0.5)
-    seeds = HELD_OUT_BELOW + np.arange(4)
-    mixed, table = make_episodes(config, 4), make_episodes(dataclasses.replace(picked, start_bank=None), 4)
-    for episodes in (mixed, table):
-        episodes.reset(episodes.ids, seeds)
-    from_bank = bank.chosen(seeds, 0.5) >= 0
-    assert from_bank.sum() == 2
-    np.testing.assert_array_equal(mixed.sim.in_hand, from_bank)
-    np.testing.assert_array_equal(mixed.sim.steps[~from_bank], 0)
-    assert (mixed.sim.steps[from_bank] > 20).all()
-    for ours, others in zip(mixed.sim.part_poses(), table.sim.part_poses(), strict=True):
-        np.testing.assert_array_equal(ours[~from_bank], others[~from_bank])
-
-
-@pytest.mark.parametrize("share", [0.0, 1.5, float("nan")])
-def test_a_share_that_cannot_be_is_refused(share: float):
-    with pytest.raises(ParsingError, match=r"--env.start_bank_share must lie in \(0, 1\]"):
-        VtRefineEnvConfig(start_bank_share=share)
