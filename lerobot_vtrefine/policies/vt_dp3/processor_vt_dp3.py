@@ -167,7 +167,10 @@ def _loaded_config(values: dict[str, Any]) -> VisuoTactileConfig:
 
 def _require(observation: dict[str, Any], key: str) -> Tensor:
     if key not in observation:
-        raise ValueError(f"the observation lacks '{key}', which vt_dp3 builds its point cloud from")
+        raise ValueError(
+            f"the observation lacks '{key}' and has {', '.join(sorted(observation))}: a vt_dp3 needs"
+            " the pads and the camera of the robot that its demonstrations are of"
+        )
     return torch.as_tensor(observation[key])
 
 
