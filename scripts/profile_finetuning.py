@@ -35,13 +35,12 @@ from lerobot_vtrefine.finetune import dppo
 from lerobot_vtrefine.finetune.config import TrustRegionDppo
 from lerobot_vtrefine.finetune.pipeline import load_practice
 from lerobot_vtrefine.finetune.protocols import Agent
-from lerobot_vtrefine.sim.simulation import InsertionSim
 
 ROOT = Path(__file__).parents[1]
 POLICY = ROOT / "lerobot_vtrefine" / "assets" / "policies" / "square_grasped_1mm"
 TASK = ROOT / "configs" / "env" / "square_grasped_1mm.yaml"
 PARTS: tuple[tuple[str, Any, str], ...] = (
-    ("reset", InsertionSim, "reset"),
+    ("reset", Episodes, "reset"),
     ("control steps", Episodes, "step"),
     ("of these, sensors", Episodes, "read"),
     ("windows", LeRobotDecisionEnv, "_push"),
