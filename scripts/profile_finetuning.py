@@ -124,6 +124,8 @@ def profile(args: argparse.Namespace, worlds: int) -> dict[str, Any]:
     fresh = range((args.iterations + 1) * worlds, (args.iterations + 2) * worlds)
     with timed_parts(device) as parts:
         dppo.collect(env, agent, cfg, state.generator, fresh)
+    if silent := [title for title, _, _ in PARTS if title not in parts]:
+        raise RuntimeError(f"nobody called what is timed as {silent}: PARTS names other functions than are used")
     rollout_s, update_s = (float(np.median(times[1:])) for times in (rollouts, updates))
     return {
         "worlds": worlds,
