@@ -125,7 +125,7 @@ def profile(args: argparse.Namespace, worlds: int) -> dict[str, Any]:
     with timed_parts(device) as parts:
         dppo.collect(env, agent, cfg, state.generator, fresh)
     if silent := [title for title, _, _ in PARTS if title not in parts]:
-        raise RuntimeError(f"nobody called what is timed as {silent}: PARTS names other functions than are used")
+        raise RuntimeError(f"nobody called what PARTS times as {silent}")
     rollout_s, update_s = (float(np.median(times[1:])) for times in (rollouts, updates))
     return {
         "worlds": worlds,
