@@ -46,7 +46,7 @@ class TrialWeights:
 
 def whiten(image: np.ndarray, sigma: np.ndarray, memory: Whitener) -> np.ndarray:
     """Divide by sigma and take out memory: (T, n) to (T*n,)."""
-    moved = image.any(axis=0)
+    moved = (image != 0.0).any(axis=0)
     if moved.all():
         return memory.white(image / sigma).ravel()
     if not moved.any():

@@ -29,7 +29,7 @@ from lerobot_vtrefine.tactile.stages.readout import (
 )
 from lerobot_vtrefine.tactile.stages.signals import low_passed, sampled
 from lerobot_vtrefine.tactile.stages.softening import FirstLoadSoftening, PathSoftening, Remembering
-from lerobot_vtrefine.tactile.stages.surface import PadTilt
+from lerobot_vtrefine.tactile.stages.surface import ContactOffset, PadTilt, StiffeningDepth
 
 Work = Callable[[np.ndarray, np.ndarray, np.ndarray], np.ndarray]
 
@@ -326,3 +326,5 @@ SEPARATE = (
     PadTilt | TaxelGainSpread | DeadTaxels | Idle | BaselineDrift | ScanSkew | SampleAndHold | Quantisation
 )
 """Of these, those that do not mix a taxel with others."""
+KEEPS_ORDER = (ContactOffset, StiffeningDepth, PadTilt)
+"""Stages of the face that leave the higher of two heights of a taxel the higher one."""
