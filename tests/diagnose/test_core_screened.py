@@ -43,9 +43,11 @@ class Refits:
     problem: "Toy"
     fit: Fit
 
-    def judged(self, weights, trials):
-        mse = self.problem.mse(self.problem.solved(self.fit.free, weights))[trials]
-        return mse, -0.5 * FRAMES * mse / NOISE**2
+    def errors(self, weights, trials):
+        return self.problem.mse(self.problem.solved(self.fit.free, weights))[trials]
+
+    def log_scores(self, weights, trials):
+        return -0.5 * FRAMES * self.errors(weights, trials) / NOISE**2
 
 
 @dataclass(frozen=True)

@@ -1,7 +1,8 @@
 """Least squares over whole recordings: a bounded Gauss-Newton descent on per-recording inner products."""
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from functools import partial
 
 import numpy as np
 
@@ -10,6 +11,7 @@ from lerobot_vtrefine.diagnose.pad.model import Composite
 from lerobot_vtrefine.diagnose.pad.press_trials import PressSet
 from lerobot_vtrefine.diagnose.pad.weights import TrialWeights
 
+type Stand = Callable[[], tuple[list[np.ndarray], np.ndarray]]
 MAX_STEPS = 12
 TOLERANCE = 1e-5
 """Relative decrease of the loss at which a descent stops."""
@@ -159,8 +161,7 @@ def bounded_step(model: Composite, gram: np.ndarray, free: np.ndarray, damping: 
 
 def rest(model: Composite, presses: PressSet, weights: Sequence[TrialWeights]) -> Fit:
     """A model as it stands, with its losses and tangents under these weights."""
-    signals, columns = tangents(model, presses, model.free)
-    return _ended(model, presses, signals, grams_of(presses, weights, signals, columns))
+    return _ended(model, presses, *_stand(model, presses, weights, model.free))
 
 
 def _ended(model: Composite, presses: PressSet, signals: Sequence[np.ndarray], grams: np.ndarray) -> Fit:
@@ -182,32 +183,62 @@ def fit(
     Args:
         start: a model, or a fit under the same weights with the same coordinates held, which goes on.
     """
+    free = np.setdiff1d((start.model if isinstance(start, Fit) else start).free, np.array(held, dtype=int))
+    model, _, stand = _descent(start, presses, weights, max_steps, free)
+    return _ended(model, presses, *stand())
+
+
+def scouted(
+    start: Composite, presses: PressSet, weights: Sequence[TrialWeights], max_steps: int
+) -> tuple[Composite, float]:
+    """Where so many steps of such a descent lead, and the loss there."""
+    model, loss, _ = _descent(start, presses, weights, max_steps, start.free)
+    return model, loss
+
+
+def _descent(
+    start: Composite | Fit,
+    presses: PressSet,
+    weights: Sequence[TrialWeights],
+    max_steps: int,
+    free: np.ndarray,
+) -> tuple[Composite, float, Stand]:
+    """Where it ends, the loss there, and what finds signals and inner products there."""
     model = start.model if isinstance(start, Fit) else start
-    free = np.setdiff1d(model.free, np.array(held, dtype=int))
-    damping = 1e-3
     if isinstance(start, Fit):
         signals, grams = list(start.signals), start.grams
     else:
-        signals, columns = tangents(model, presses, free)
-        grams = grams_of(presses, weights, signals, columns)
-    loss = float(grams[:, -1, -1].sum())
+        signals, grams = _stand(model, presses, weights, free)
+    loss, damping, stand = float(grams[:, -1, -1].sum()), 1e-3, None
     for _ in range(max_steps):
+        if stand is not None:
+            signals, grams = stand()
         moved = model.at(bounded_step(model, grams.sum(axis=0), free, damping))
         cache = Prefix()
-        new_signals = predict(moved, presses, cache)
-        new_loss = float(losses_of(new_signals, presses, weights).sum())
+        new_loss = float(losses_of(predict(moved, presses, cache), presses, weights).sum())
         if not new_loss < loss:
-            damping *= 10.0
+            damping, stand = damping * 10.0, None
             if damping > 1e4 or np.allclose(moved.values, model.values, rtol=1e-7, atol=1e-10):
                 break
             continue
         settled = loss - new_loss < TOLERANCE * max(loss, 1e-12)
         model, loss, damping = moved, new_loss, max(damping / 10.0, 1e-6)
-        signals, columns = tangents(model, presses, free, cache)
-        grams = grams_of(presses, weights, signals, columns)
+        stand = partial(_stand, model, presses, weights, free, cache)
         if settled:
             break
-    return _ended(model, presses, signals, grams)
+    return model, loss, stand or (lambda: (signals, grams))
+
+
+def _stand(
+    model: Composite,
+    presses: PressSet,
+    weights: Sequence[TrialWeights],
+    free: np.ndarray,
+    cache: Prefix | None = None,
+) -> tuple[list[np.ndarray], np.ndarray]:
+    """Signals and inner products of a model as it stands."""
+    signals, columns = tangents(model, presses, free, cache)
+    return signals, grams_of(presses, weights, signals, columns)
 
 
 def refit_weighted(fitted: Fit, counts: np.ndarray) -> Composite:

@@ -30,7 +30,7 @@ class Sheet:
     taxels: np.ndarray
     """Row-major number of every column's taxel in the pad (M,)."""
     drive: np.ndarray
-    """Column heights as recorded [m], or force per taxel [N] if `loaded`; presses that end early are padded."""
+    """Column heights as recorded [m], or force per taxel [N] if `loaded`; those that end early are padded."""
     top: np.ndarray
     """Highest of every column (M,)."""
     rate: np.ndarray
