@@ -9,7 +9,7 @@ import pytest
 from lerobot_vtrefine.diagnose.pad.baseline import describe, plain_weights
 from lerobot_vtrefine.diagnose.pad.candidates import CATALOGUE
 from lerobot_vtrefine.diagnose.pad.candidates.base import Form
-from lerobot_vtrefine.diagnose.pad.fitting import fit, predict
+from lerobot_vtrefine.diagnose.pad.fitting import fit, predict, rest, scouted
 from lerobot_vtrefine.diagnose.pad.forward_model.run import LoweredBench, run_stages
 from lerobot_vtrefine.diagnose.pad.model import Composite, sensor_model
 from lerobot_vtrefine.diagnose.pad.prediction import predict_trial
@@ -139,7 +139,7 @@ def test_a_lowered_face_is_a_press_less_deep() -> None:
         assert np.allclose(signal[:, mine], expected[:, theirs], atol=1e-9)
 
 
-def test_a_fit_goes_on_where_it_stopped() -> None:
+def test_a_descent_that_only_scouts_leads_where_a_fit_of_as_many_steps_does() -> None:
     held = presses()
     raised = [
         replace(press, signal=signal)
@@ -150,6 +150,10 @@ def test_a_fit_goes_on_where_it_stopped() -> None:
     weights = plain_weights(held)
     stopped = fit(start, held, weights, 1)
     assert stopped.loss > 1e-6
-    on, anew = fit(stopped, held, weights), fit(stopped.model, held, weights)
-    assert np.array_equal(on.model.values, anew.model.values)
-    assert np.allclose(on.model.values, composite(held).values, rtol=1e-3)
+    model, loss = scouted(start, held, weights, 1)
+    assert np.array_equal(model.values, stopped.model.values)
+    assert np.isclose(loss, stopped.loss, rtol=1e-9)
+    found = fit(model, held, weights)
+    assert np.allclose(found.model.values, composite(held).values, rtol=1e-3)
+    there = rest(found.model, held, weights)
+    assert np.allclose(found.grams, there.grams, rtol=1e-9)

@@ -1,7 +1,7 @@
 """Memory that is used again: fits make and drop arrays of some megabytes a hundred thousand times."""
 
 import ctypes
-from collections.abc import Iterator
+from collections.abc import Generator
 from contextlib import contextmanager
 
 _TRIM_THRESHOLD, _MMAP_THRESHOLD = -1, -3
@@ -15,7 +15,7 @@ _USUAL = 2**17
 
 
 @contextmanager
-def memory_kept() -> Iterator[None]:
+def memory_kept() -> Generator[None]:
     """Let the C library keep what is freed meanwhile, where it is glibc.
 
     It would give large blocks back to the system and have them again page by page, each cleared first, which

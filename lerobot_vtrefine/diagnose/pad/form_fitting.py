@@ -22,7 +22,7 @@ Weights = Sequence[TrialWeights]
 Starts = tuple[np.ndarray, ...]
 
 
-def settle(start: Composite | Fit, presses: PressSet, weights: Weights) -> Fit:
+def settle(start: Composite, presses: PressSet, weights: Weights) -> Fit:
     """Fit a model's coordinates; if it holds a map of gains, in turns with the map."""
     fitted = fit(start, presses, weights)
     if fitted.model.gain_map is None:

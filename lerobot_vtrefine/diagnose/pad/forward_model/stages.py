@@ -211,7 +211,8 @@ def _mixed(field: Field, context: Context, weights: Callable[[np.ndarray, np.nda
         part = field.within(sheet, press)
         to = slice(*np.searchsorted(columns, (block.start, block.stop)).tolist())
         lines = len(sheet.times_s[press])
-        out[:lines, to] = field.values[:lines, part] @ weights(columns[to], field.columns[part]).T
+        mix = weights(columns[to], field.columns[part]).T
+        np.matmul(field.values[:lines, part], mix, out=out[:lines, to])
     return Field(out, columns)
 
 
