@@ -5,12 +5,19 @@ from dataclasses import dataclass, replace
 import numpy as np
 import pytest
 
+from lerobot_vtrefine.diagnose.core import memory
 from lerobot_vtrefine.diagnose.core.engine import guarded, infer
+from lerobot_vtrefine.diagnose.core.heldout import OutOfFold
 from lerobot_vtrefine.diagnose.core.problem import OptionalSteps, PlainCandidate, Promise
 from lerobot_vtrefine.diagnose.core.rivals import settled
 from lerobot_vtrefine.diagnose.core.score_test import Probe, cleared, screen
-from lerobot_vtrefine.diagnose.core.screened_rivals import screened_rivals
-from lerobot_vtrefine.diagnose.core.screened_search import ScreenedSearch, still_found
+from lerobot_vtrefine.diagnose.core.screened_rivals import screened_rivals, tied
+from lerobot_vtrefine.diagnose.core.screened_search import (
+    ScreenedSearch,
+    better,
+    clearly_better,
+    still_found,
+)
 
 TRIALS, FRAMES, NOISE, COLUMNS = 24, 60, 0.1, 5
 CONDITIONS = tuple(f"c{k // 2}" for k in range(TRIALS))
@@ -43,9 +50,11 @@ class Refits:
     problem: "Toy"
     fit: Fit
 
-    def judged(self, weights, trials):
-        mse = self.problem.mse(self.problem.solved(self.fit.free, weights))[trials]
-        return mse, -0.5 * FRAMES * mse / NOISE**2
+    def errors(self, weights, trials):
+        return self.problem.mse(self.problem.solved(self.fit.free, weights))[trials]
+
+    def log_scores(self, weights, trials):
+        return -0.5 * FRAMES * self.errors(weights, trials) / NOISE**2
 
 
 @dataclass(frozen=True)
@@ -501,3 +510,23 @@ def test_a_rival_that_trials_prefer_takes_the_place_of_the_name() -> None:
     (rival,) = screened_rivals(richer, 0)
     assert not rival.preferred
     assert settled(richer, [rival], 0)[1] == (rival,)
+
+
+def test_log_scores_are_not_found_where_errors_settle_a_comparison() -> None:
+    def asked() -> np.ndarray:
+        raise AssertionError("errors were enough")
+
+    few, many = (OutOfFold(np.full((len(CONDITIONS), 1), size), asked) for size in (1.0, 2.0))
+    assert not better(many, few)
+    assert not clearly_better(many, few, 0)
+    assert not tied(few, many, 0)
+
+
+@pytest.mark.parametrize("missing", [OSError, TypeError])
+def test_without_glibc_memory_is_left_as_it_is(missing: type, monkeypatch: pytest.MonkeyPatch) -> None:
+    def absent(name: None) -> None:
+        raise missing
+
+    monkeypatch.setattr(memory.ctypes, "CDLL", absent)
+    with memory.memory_kept():
+        pass

@@ -9,7 +9,8 @@ import pytest
 from lerobot_vtrefine.diagnose.pad.baseline import describe, plain_weights
 from lerobot_vtrefine.diagnose.pad.candidates import CATALOGUE
 from lerobot_vtrefine.diagnose.pad.candidates.base import Form
-from lerobot_vtrefine.diagnose.pad.fitting import fit, predict
+from lerobot_vtrefine.diagnose.pad.fitting import fit, predict, rest, scouted
+from lerobot_vtrefine.diagnose.pad.forward_model import run
 from lerobot_vtrefine.diagnose.pad.forward_model.run import LoweredBench, run_stages
 from lerobot_vtrefine.diagnose.pad.model import Composite, sensor_model
 from lerobot_vtrefine.diagnose.pad.prediction import predict_trial
@@ -18,6 +19,7 @@ from lerobot_vtrefine.diagnose.recordings import RecordingSet, Trial
 from lerobot_vtrefine.tactile.layout import PadLayout
 from lerobot_vtrefine.tactile.model import SensorModel
 from lerobot_vtrefine.tactile.stages.dividers import LaggingDroop
+from lerobot_vtrefine.tactile.stages.surface import ContactOffset, PadTilt
 
 
 def trial(number: int, rng: np.random.Generator, frames: int = 60) -> Trial:
@@ -139,7 +141,7 @@ def test_a_lowered_face_is_a_press_less_deep() -> None:
         assert np.allclose(signal[:, mine], expected[:, theirs], atol=1e-9)
 
 
-def test_a_fit_goes_on_where_it_stopped() -> None:
+def test_a_descent_that_only_scouts_leads_where_a_fit_of_as_many_steps_does() -> None:
     held = presses()
     raised = [
         replace(press, signal=signal)
@@ -150,6 +152,25 @@ def test_a_fit_goes_on_where_it_stopped() -> None:
     weights = plain_weights(held)
     stopped = fit(start, held, weights, 1)
     assert stopped.loss > 1e-6
-    on, anew = fit(stopped, held, weights), fit(stopped.model, held, weights)
-    assert np.array_equal(on.model.values, anew.model.values)
-    assert np.allclose(on.model.values, composite(held).values, rtol=1e-3)
+    model, loss = scouted(start, held, weights, 1)
+    assert np.array_equal(model.values, stopped.model.values)
+    assert np.isclose(loss, stopped.loss, rtol=1e-9)
+    found = fit(model, held, weights)
+    assert np.allclose(found.model.values, composite(held).values, rtol=1e-3)
+    there = rest(found.model, held, weights)
+    assert np.allclose(found.grams, there.grams, rtol=1e-9)
+
+
+def test_a_moved_face_is_run_where_it_is_pressed_alone(monkeypatch: pytest.MonkeyPatch) -> None:
+    held = presses()
+    stages = (PadTilt(4e-3, -3e-3), ContactOffset(-8e-5, softness_m=2e-5), *composite(held).stages())
+    stages = tuple(sorted(stages, key=lambda stage: stage.rank))
+    bench = LoweredBench(held.bench, 3e-5)
+    (sheet,) = bench.sheets("frames")
+    reached = run._begin(stages, sheet).columns
+    assert 0 < len(reached) < len(sheet.taxels)
+    found = run_stages(stages, bench)
+    monkeypatch.setattr(run, "KEEPS_ORDER", ())
+    assert len(run._begin(stages, sheet).columns) == len(sheet.taxels)
+    for here, everywhere in zip(found, run_stages(stages, bench), strict=True):
+        assert np.array_equal(here, everywhere)

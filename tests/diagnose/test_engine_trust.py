@@ -16,7 +16,7 @@ LUCKY = np.array([15.0, 11, -2, 14, -16, -5, -16, 9, 0])
 
 
 def fits(name, errors):
-    return SimpleNamespace(model=name, held=OutOfFold(errors[:, None], np.zeros((9, 1))))
+    return SimpleNamespace(model=name, held=OutOfFold(errors[:, None], lambda: np.zeros((9, 1))))
 
 
 @pytest.mark.parametrize(

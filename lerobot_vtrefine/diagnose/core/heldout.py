@@ -2,8 +2,9 @@
 
 import math
 from collections import defaultdict
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -56,11 +57,17 @@ def affordable(count: int) -> bool:
 
 @dataclass(frozen=True)
 class OutOfFold:
-    """How trials are predicted by fits that did not see them: mean squared errors, and log scores up to a
-    constant, (T, J) each."""
+    """How trials are predicted by fits that did not see them."""
 
     errors: Array
-    scores: Array
+    """Mean squared errors (T, J)."""
+    tell: Callable[[], Array]
+    """Finds the log scores: these cost many times as much, and most comparisons are settled by errors."""
+
+    @cached_property
+    def scores(self) -> Array:
+        """Log scores up to a constant (T, J)."""
+        return self.tell()
 
     def gain_over(self, other: "OutOfFold") -> float:
         """Part of the other's mean squared error that is gone."""
@@ -74,12 +81,16 @@ class OutOfFold:
 
 def out_of_fold(problem: ScreenedProblem[Any, Any], fit: ScoredFit, folds: Array) -> OutOfFold:
     """Every trial under a fit to the other folds, by one Newton step each."""
-    errors, scores = fit.mse.copy(), fit.scores.copy()
     again = problem.reweighted(fit)
-    for fold in np.unique(folds) if len(set(folds)) > 1 else []:
-        held = np.flatnonzero(folds == fold)
-        errors[held], scores[held] = again.judged((folds != fold).astype(float), held)
-    return OutOfFold(errors, scores)
+
+    def each(measure: Callable[[Array, Array], Array], seen: Array) -> Array:
+        found = seen.copy()
+        for fold in np.unique(folds) if len(set(folds)) > 1 else []:
+            held = np.flatnonzero(folds == fold)
+            found[held] = measure((folds != fold).astype(float), held)
+        return found
+
+    return OutOfFold(each(again.errors, fit.mse), lambda: each(again.log_scores, fit.scores))
 
 
 def cross_validated(

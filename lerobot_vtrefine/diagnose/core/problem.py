@@ -230,8 +230,11 @@ class ScoredFit(Fit, Protocol):
 class Scored(Protocol):
     """See `Reweighted`."""
 
-    def judged(self, weights: Array, trials: Array) -> tuple[Array, Array]:
-        """Mean squared errors and log scores of some trials if every trial counted `weights` (T,) times."""
+    def errors(self, weights: Array, trials: Array) -> Array:
+        """Mean squared errors of some trials (trials, J) if every trial counted `weights` (T,) times."""
+
+    def log_scores(self, weights: Array, trials: Array) -> Array:
+        """The same of log scores."""
 
 
 @dataclass(frozen=True)

@@ -55,8 +55,9 @@ def _in_place(ground: Ground[Any, Any], less: OutOfFold, enough: float, richest:
 
 def tied(full: OutOfFold, other: OutOfFold, seed: int) -> bool:
     """Whether trials do not prefer what was named."""
-    measures = (full.better_by(other), (other.errors - full.errors).sum(1))
-    return not any(agree(differences, seed, TIE_P) for differences in measures)
+    if agree((other.errors - full.errors).sum(1), seed, TIE_P):
+        return False
+    return not agree(full.better_by(other), seed, TIE_P)
 
 
 def _rival(candidate: Any, step: Step[Any, Any], full: OutOfFold, seed: int) -> Rival[Any, Any]:

@@ -162,8 +162,10 @@ class ScreenedSearch[P: ScreenedProblem[Any, Any], F: ScoredFit, C: FormCandidat
             self.gains[name] = max(gain, self.gains.get(name, -np.inf))
             # What is seen in the readings themselves is there, however little is predicted by it.
             least = 0.0 if name in observed and step.candidate.terms else needed
+            if not better(step.held, base, least):
+                continue
             sure = name in observed or agree(step.held.better_by(base), self.seed, AGREEMENT_P)
-            if sure and better(step.held, base, least) and self._credible(ground, step):
+            if sure and self._credible(ground, step):
                 out.append((float(step.held.better_by(base).sum()), step))
         return sorted(out, key=lambda item: -item[0])
 

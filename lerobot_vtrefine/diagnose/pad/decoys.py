@@ -165,7 +165,7 @@ def _left_out(problem: "PadProblem", slim: Fit, image: Sequence[Array], grams: A
         part = problem.presses.subset(trials.tolist())
         pressed = zip(part.presses, trials, strict=True)
         part = replace(part, presses=tuple(replace(p, signal=p.signal - much * image[k]) for p, k in pressed))
-        scores[held] = again.judging(model, part, (~held).astype(float), trials)[1][:, 0]
+        scores[held] = again.log_scores_of(model, part, (~held).astype(float), trials)[:, 0]
     return scores
 
 

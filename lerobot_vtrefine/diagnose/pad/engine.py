@@ -5,6 +5,7 @@ from dataclasses import replace
 from lerobot_vtrefine.diagnose.core.diagnosis import Diagnosis
 from lerobot_vtrefine.diagnose.core.engine import Progress, infer
 from lerobot_vtrefine.diagnose.core.heldout import lock
+from lerobot_vtrefine.diagnose.core.memory import memory_kept
 from lerobot_vtrefine.diagnose.core.summary import tell
 from lerobot_vtrefine.diagnose.pad.account import PadAccount
 from lerobot_vtrefine.diagnose.pad.press_trials import prepare, usable
@@ -35,9 +36,10 @@ def diagnose_pad(recordings: RecordingSet, seed: int = 0, progress: Progress | N
     if not any((press.drive > 0).any() for press in presses.subset(learn).presses):
         return _invalid(issues, "the indenter never touches the pad")
     whole = PadProblem(presses, seed)
-    found = infer(whole, seed, progress)
-    account = PadAccount(found, whole)
-    diagnosis = tell(found, account)
+    with memory_kept():
+        found = infer(whole, seed, progress)
+        account = PadAccount(found, whole)
+        diagnosis = tell(found, account)
     return replace(diagnosis, maps=account.maps()).noting(*issues, *_little_data(len(trials), len(locked)))
 
 

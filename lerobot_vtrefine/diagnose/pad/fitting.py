@@ -105,19 +105,47 @@ def movable(fitted: Fit) -> np.ndarray:
     return free[~(((values <= low) & (pull < 0)) | ((values >= high) & (pull > 0)))]
 
 
-def grams_of(
-    presses: PressSet,
-    weights: Sequence[TrialWeights],
-    signals: Sequence[np.ndarray],
-    columns: Sequence[Sequence[np.ndarray]],
-) -> np.ndarray:
+@dataclass(frozen=True)
+class _Run:
+    """A model's run: expected signals (T, n), whitened residuals (T*n,), and their weighted squared error."""
+
+    model: Composite
+    signals: list[np.ndarray]
+    left: list[np.ndarray]
+    loss: float
+    cache: Prefix
+
+
+def _run(model: Composite, presses: PressSet, weights: Sequence[TrialWeights]) -> _Run:
+    cache = Prefix()
+    signals = predict(model, presses, cache)
+    left = [
+        weight.whiten(press.signal - signal)
+        for press, signal, weight in zip(presses.presses, signals, weights, strict=True)
+    ]
+    loss = sum(float(weight.gram(own[None])[0, 0]) for weight, own in zip(weights, left, strict=True))
+    return _Run(model, signals, left, loss, cache)
+
+
+def _whitened(
+    run: _Run, presses: PressSet, weights: Sequence[TrialWeights], free: np.ndarray
+) -> list[np.ndarray]:
+    """Whitened tangents of every recording, with a last line for its residual: (p+1, T*n)."""
+    _, columns = tangents(run.model, presses, free, run.cache)
+    vectors = []
+    for k, (weight, left) in enumerate(zip(weights, run.left, strict=True)):
+        own = np.empty((len(free) + 1, len(left)))
+        for line, column in zip(own, columns, strict=False):
+            line[:] = weight.whiten(column[k])
+        vectors.append(own)
+    return vectors
+
+
+def _grams(run: _Run, vectors: Sequence[np.ndarray], weights: Sequence[TrialWeights]) -> np.ndarray:
     """Inner products of tangents and residual of every recording: (K, p+1, p+1)."""
-    grams = []
-    for k, (press, weight) in enumerate(zip(presses.presses, weights, strict=True)):
-        vectors = [weight.whiten(column[k]) for column in columns]
-        vectors.append(weight.whiten(press.signal - signals[k]))
-        grams.append(weight.gram(np.stack(vectors)))
-    return np.array(grams)
+    for own, left in zip(vectors, run.left, strict=True):
+        own[-1] = left
+    return np.array([weight.gram(own) for weight, own in zip(weights, vectors, strict=True)])
 
 
 def _solve(gram: np.ndarray, movable: np.ndarray, damping: float) -> np.ndarray:
@@ -159,17 +187,23 @@ def bounded_step(model: Composite, gram: np.ndarray, free: np.ndarray, damping: 
 
 def rest(model: Composite, presses: PressSet, weights: Sequence[TrialWeights]) -> Fit:
     """A model as it stands, with its losses and tangents under these weights."""
-    signals, columns = tangents(model, presses, model.free)
-    return _ended(model, presses, signals, grams_of(presses, weights, signals, columns))
+    return _standing(_run(model, presses, weights), None, presses, weights, model.free)
 
 
-def _ended(model: Composite, presses: PressSet, signals: Sequence[np.ndarray], grams: np.ndarray) -> Fit:
-    errors = squared_errors(signals, presses)[:, None]
-    return Fit(model, grams[:, -1, -1].copy(), grams, tuple(signals), errors)
+def _standing(
+    run: _Run,
+    vectors: list[np.ndarray] | None,
+    presses: PressSet,
+    weights: Sequence[TrialWeights],
+    free: np.ndarray,
+) -> Fit:
+    grams = _grams(run, vectors or _whitened(run, presses, weights, free), weights)
+    errors = squared_errors(run.signals, presses)[:, None]
+    return Fit(run.model, grams[:, -1, -1].copy(), grams, tuple(run.signals), errors)
 
 
 def fit(
-    start: Composite | Fit,
+    start: Composite,
     presses: PressSet,
     weights: Sequence[TrialWeights],
     max_steps: int = MAX_STEPS,
@@ -178,36 +212,43 @@ def fit(
     """Least-squares coordinates near those of a model (Levenberg-Marquardt within bounds).
 
     Coordinates numbered in `held` stay; the fit's inner products are then those of the others alone.
-
-    Args:
-        start: a model, or a fit under the same weights with the same coordinates held, which goes on.
     """
-    model = start.model if isinstance(start, Fit) else start
-    free = np.setdiff1d(model.free, np.array(held, dtype=int))
-    damping = 1e-3
-    if isinstance(start, Fit):
-        signals, grams = list(start.signals), start.grams
-    else:
-        signals, columns = tangents(model, presses, free)
-        grams = grams_of(presses, weights, signals, columns)
-    loss = float(grams[:, -1, -1].sum())
+    free = np.setdiff1d(start.free, np.array(held, dtype=int))
+    run, vectors = _descent(start, presses, weights, max_steps, free)
+    return _standing(run, vectors, presses, weights, free)
+
+
+def scouted(
+    start: Composite, presses: PressSet, weights: Sequence[TrialWeights], max_steps: int
+) -> tuple[Composite, float]:
+    """Where so many steps of such a descent lead, and the loss there."""
+    run, _ = _descent(start, presses, weights, max_steps, start.free)
+    return run.model, run.loss
+
+
+def _descent(
+    start: Composite,
+    presses: PressSet,
+    weights: Sequence[TrialWeights],
+    max_steps: int,
+    free: np.ndarray,
+) -> tuple[_Run, list[np.ndarray] | None]:
+    """Where it ends, and the whitened tangents there, if they are known."""
+    now, damping, vectors = _run(start, presses, weights), 1e-3, None
     for _ in range(max_steps):
-        moved = model.at(bounded_step(model, grams.sum(axis=0), free, damping))
-        cache = Prefix()
-        new_signals = predict(moved, presses, cache)
-        new_loss = float(losses_of(new_signals, presses, weights).sum())
-        if not new_loss < loss:
+        vectors = vectors or _whitened(now, presses, weights, free)
+        gram = _grams(now, vectors, weights).sum(axis=0)
+        moved = _run(now.model.at(bounded_step(now.model, gram, free, damping)), presses, weights)
+        if not moved.loss < now.loss:
             damping *= 10.0
-            if damping > 1e4 or np.allclose(moved.values, model.values, rtol=1e-7, atol=1e-10):
+            if damping > 1e4 or np.allclose(moved.model.values, now.model.values, rtol=1e-7, atol=1e-10):
                 break
             continue
-        settled = loss - new_loss < TOLERANCE * max(loss, 1e-12)
-        model, loss, damping = moved, new_loss, max(damping / 10.0, 1e-6)
-        signals, columns = tangents(model, presses, free, cache)
-        grams = grams_of(presses, weights, signals, columns)
+        settled = now.loss - moved.loss < TOLERANCE * max(now.loss, 1e-12)
+        now, damping, vectors = moved, max(damping / 10.0, 1e-6), None
         if settled:
             break
-    return _ended(model, presses, signals, grams)
+    return now, vectors
 
 
 def refit_weighted(fitted: Fit, counts: np.ndarray) -> Composite:

@@ -6,7 +6,7 @@ import numpy as np
 
 from lerobot_vtrefine.diagnose.core.score_test import Probe
 from lerobot_vtrefine.diagnose.pad.candidates.base import Form
-from lerobot_vtrefine.diagnose.pad.fitting import Fit, fit, losses_of, predict
+from lerobot_vtrefine.diagnose.pad.fitting import Fit, fit, losses_of, predict, scouted
 from lerobot_vtrefine.diagnose.pad.model import Composite
 from lerobot_vtrefine.diagnose.pad.press_trials import PressSet
 from lerobot_vtrefine.diagnose.pad.taxel_maps import with_map
@@ -22,7 +22,7 @@ Weights = Sequence[TrialWeights]
 Starts = tuple[np.ndarray, ...]
 
 
-def settle(start: Composite | Fit, presses: PressSet, weights: Weights) -> Fit:
+def settle(start: Composite, presses: PressSet, weights: Weights) -> Fit:
     """Fit a model's coordinates; if it holds a map of gains, in turns with the map."""
     fitted = fit(start, presses, weights)
     if fitted.model.gain_map is None:
@@ -45,8 +45,8 @@ def lowest(starts: Sequence[Composite], presses: PressSet, weights: Weights) -> 
     """The fit from the start that leads furthest down, as a few steps tell."""
     if len(starts) == 1:
         return settle(starts[0], presses, weights)
-    tried = [fit(model, presses, weights, _SCOUTING_STEPS) for model in starts]
-    return settle(min(tried, key=lambda found: found.loss), presses, weights)
+    tried = [scouted(model, presses, weights, _SCOUTING_STEPS) for model in starts]
+    return settle(min(tried, key=lambda found: found[1])[0], presses, weights)
 
 
 def grown(plain: Fit, form: Form, presses: PressSet, weights: Weights) -> Fit:

@@ -95,33 +95,45 @@ class Refits:
     def _evidence(self) -> MapEvidence:
         return map_evidence(self.fit, self.problem.presses, self.problem.weights)
 
-    def judged(self, weights: Array, trials: Array) -> tuple[Array, Array]:
-        """Errors and log scores, (trials, 1) each."""
-        part = self.problem.presses.subset(trials.tolist())
-        return self.judging(refit_weighted(self.fit, weights), part, weights, trials)
+    @property
+    def _mapped(self) -> bool:
+        return self.fit.model.gain_map is not None
 
-    def judging(self, model: Composite, part: PressSet, weights: Array, trials: Array) -> tuple[Array, Array]:
+    def errors(self, weights: Array, trials: Array) -> Array:
+        """Mean squared errors (trials, 1).
+
+        They tell what a map is worth, which shows at places that it knows: it comes from all recordings but
+        the one that is judged.
+        """
+        model, part = refit_weighted(self.fit, weights), self.problem.presses.subset(trials.tolist())
+        if not self._mapped:
+            return squared_errors(predict(model, part), part)[:, None]
+        every = np.arange(len(weights))
+        signals = [
+            predict(self._with_map_of(model, every[every != k]), part.subset([place]))[0]
+            for place, k in enumerate(trials)
+        ]
+        return squared_errors(signals, part)[:, None]
+
+    def log_scores(self, weights: Array, trials: Array) -> Array:
+        """Log scores (trials, 1)."""
+        part = self.problem.presses.subset(trials.tolist())
+        return self.log_scores_of(refit_weighted(self.fit, weights), part, weights, trials)
+
+    def log_scores_of(self, model: Composite, part: PressSet, weights: Array, trials: Array) -> Array:
         """The same of other coordinates and presses of those trials.
 
-        Where a map is there, log scores tell whether it belongs to the taxels: it comes from recordings that
-        count, so that other commands must agree on it. Errors tell what it is worth, which shows at places
-        that it knows: it comes from all recordings but the one that is judged.
+        They tell whether a map belongs to the taxels: it comes from recordings that count, so that other
+        commands must agree on it.
         """
-        mapped = self.fit.model.gain_map is not None
-        counting = self._with_map_of(model, np.flatnonzero(weights)) if mapped else model
-        signals = predict(counting, part)
+        if self._mapped:
+            model = self._with_map_of(model, np.flatnonzero(weights))
         noise = self.problem.noise
         if noise is not None and allowed(part, self.problem.weights):
-            losses = losses_at_own_touch(counting, part, noise)
+            losses = losses_at_own_touch(model, part, noise)
         else:
-            losses = losses_of(signals, part, [self.problem.weights[k] for k in trials])
-        if mapped:
-            every = np.arange(len(weights))
-            signals = [
-                predict(self._with_map_of(model, every[every != k]), part.subset([place]))[0]
-                for place, k in enumerate(trials)
-            ]
-        return squared_errors(signals, part)[:, None], -0.5 * losses[:, None]
+            losses = losses_of(predict(model, part), part, [self.problem.weights[k] for k in trials])
+        return -0.5 * losses[:, None]
 
     def _with_map_of(self, model: Composite, trials: Array) -> Composite:
         return map_of(model, self.fit, self._evidence, trials.tolist())

@@ -30,7 +30,9 @@ class Sheet:
     taxels: np.ndarray
     """Row-major number of every column's taxel in the pad (M,)."""
     drive: np.ndarray
-    """Column heights [m], or force per taxel [N] if `loaded`; presses that end early are padded."""
+    """Column heights as recorded [m], or force per taxel [N] if `loaded`; those that end early are padded."""
+    top: np.ndarray
+    """Highest of every column (M,)."""
     rate: np.ndarray
     times_s: tuple[np.ndarray, ...]
     """Instants of every press, from its trial's start."""
@@ -49,6 +51,8 @@ class Sheet:
     """Temperature at every press's instants; None where it was not recorded."""
     borne: tuple[tuple[np.ndarray, np.ndarray, np.ndarray] | None, ...]
     """Drive, age and path (J, n) of what earlier recordings pressed every press's columns with (`Borne`)."""
+    lowered_m: np.ndarray
+    """How much lower than recorded the face is, at every column (M,)."""
 
     @cached_property
     def press(self) -> np.ndarray:
@@ -67,15 +71,19 @@ class Sheet:
 
     @cached_property
     def touched(self) -> np.ndarray:
-        """Numbers of the columns that the indenter reaches as recorded."""
-        return np.flatnonzero((self.drive > 0).any(axis=0))
+        """Numbers of the columns that the indenter reaches."""
+        return np.flatnonzero(self.top > self.lowered_m)
 
     @cached_property
     def pressed(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Drive of those columns, their numbers, and the drive's rate."""
-        # Picking columns leaves an array that lies column by column; instants are what is run through.
-        drive, rate = (np.ascontiguousarray(values[:, self.touched]) for values in (self.drive, self.rate))
-        return drive, self.touched, rate
+        """Of those columns, as `moving`."""
+        return self.moving(self.touched)
+
+    def moving(self, columns: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Drive of some columns, their numbers, and the drive's rate."""
+        drive, rate = (np.take(values, columns, axis=1) for values in (self.drive, self.rate))
+        drive -= self.lowered_m[columns]
+        return drive, columns, rate
 
     @cached_property
     def recorded(self) -> "Sheet":
@@ -129,6 +137,7 @@ def _build(everyone: Sequence[Press], members: list[int], idle: np.ndarray, kind
         tuple(slice(begin, end) for begin, end in pairwise(ends)),
         taxels,
         drive,
+        drive.max(axis=0, initial=FAR_M),
         rate,
         tuple(course.time_s for course in courses),
         tuple(press.trial.start_s for press in presses),
@@ -142,6 +151,7 @@ def _build(everyone: Sequence[Press], members: list[int], idle: np.ndarray, kind
             _borne(press, taxels[begin:end])
             for press, (begin, end) in zip(presses, pairwise(ends), strict=True)
         ),
+        np.zeros(width),
     )
 
 

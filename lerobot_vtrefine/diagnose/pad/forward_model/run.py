@@ -9,7 +9,7 @@ import numpy as np
 
 from lerobot_vtrefine.diagnose.pad.forward_model.batches import Sheet, build_sheets
 from lerobot_vtrefine.diagnose.pad.forward_model.fields import Context, Field
-from lerobot_vtrefine.diagnose.pad.forward_model.stages import run_stage, treats_each_alone
+from lerobot_vtrefine.diagnose.pad.forward_model.stages import KEEPS_ORDER, run_stage, treats_each_alone
 from lerobot_vtrefine.diagnose.pad.motion import Kind, instants
 from lerobot_vtrefine.diagnose.pad.press_trials import Press
 from lerobot_vtrefine.tactile.stages.base import Stage
@@ -49,7 +49,8 @@ class LoweredBench:
     def sheets(self, kind: Kind) -> list[Sheet]:
         """The presses at a model's instants."""
         return [
-            replace(sheet, drive=sheet.drive - self._of_columns(sheet)) for sheet in self.bench.sheets(kind)
+            replace(sheet, lowered_m=sheet.lowered_m + self._of_columns(sheet))
+            for sheet in self.bench.sheets(kind)
         ]
 
     def _of_columns(self, sheet: Sheet) -> float | np.ndarray:
@@ -118,9 +119,23 @@ def run_stages(
 
 
 def _begin(stages: Sequence[Stage], sheet: Sheet) -> Field:
-    if sheet.loaded or not any(stage.domain == "depth" for stage in stages):
+    moved = [stage for stage in stages if stage.domain == "depth"]
+    if sheet.loaded or not moved:
         return Field(*sheet.pressed)
-    return Field(sheet.drive, np.arange(len(sheet.taxels)), sheet.rate)
+    return Field(*sheet.moving(_reached(moved, sheet)))
+
+
+def _reached(stages: Sequence[Stage], sheet: Sheet) -> np.ndarray:
+    """Numbers of the columns that are pressed at all after stages that move the face, as their highest tell;
+    of all columns where a stage may take a higher one for a lower one."""
+    columns = np.arange(len(sheet.taxels))
+    if not all(isinstance(stage, KEEPS_ORDER) for stage in stages):
+        return columns
+    highest = (sheet.top - sheet.lowered_m)[None]
+    field = Field(highest, columns, np.zeros_like(highest))
+    for stage in stages:
+        field = run_stage(stage, field, Context(sheet, 0.0))
+    return np.flatnonzero(field.values[0] > 0)
 
 
 def _step(plan: Plan, index: int, field: Field, sheet: Sheet) -> Field:

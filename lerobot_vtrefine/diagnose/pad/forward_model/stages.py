@@ -29,7 +29,7 @@ from lerobot_vtrefine.tactile.stages.readout import (
 )
 from lerobot_vtrefine.tactile.stages.signals import low_passed, sampled
 from lerobot_vtrefine.tactile.stages.softening import FirstLoadSoftening, PathSoftening, Remembering
-from lerobot_vtrefine.tactile.stages.surface import PadTilt
+from lerobot_vtrefine.tactile.stages.surface import ContactOffset, PadTilt, StiffeningDepth
 
 Work = Callable[[np.ndarray, np.ndarray, np.ndarray], np.ndarray]
 
@@ -179,7 +179,7 @@ def _idle(stage: Idle, field: Field, context: Context) -> Field:
 
 def _drift(stage: BaselineDrift, field: Field, context: Context) -> Field:
     sheet, field = context.sheet, _everywhere(field, context)
-    out = field.values.copy()
+    out = np.zeros_like(field.values)
     starts_s = np.zeros(len(sheet.starts_s)) if stage.anew else sheet.starts_s
     session_s = [time_s + start_s for time_s, start_s in zip(sheet.times_s, starts_s, strict=True)]
     ends = np.cumsum([len(time_s) for time_s in session_s])[:-1]
@@ -194,7 +194,11 @@ def _drift(stage: BaselineDrift, field: Field, context: Context) -> Field:
     rates = np.broadcast_to(np.asarray(stage.rate_counts_per_s), pad).ravel()[sheet.taxels[field.columns]]
     for press, (part, time_s) in enumerate(zip(np.split(moved[:, 0].numpy(), ends), session_s, strict=True)):
         own = field.within(sheet, press)
-        out[: len(part), own] += part + time_s[:, None] * rates[own]
+        # In place: a drift moves every taxel, and memory is what fits wait for.
+        block = out[: len(part), own]
+        np.multiply(time_s[:, None], rates[own], out=block)
+        block += part
+        block += field.values[: len(part), own]
     return Field(out, field.columns)
 
 
@@ -207,7 +211,8 @@ def _mixed(field: Field, context: Context, weights: Callable[[np.ndarray, np.nda
         part = field.within(sheet, press)
         to = slice(*np.searchsorted(columns, (block.start, block.stop)).tolist())
         lines = len(sheet.times_s[press])
-        out[:lines, to] = field.values[:lines, part] @ weights(columns[to], field.columns[part]).T
+        mix = weights(columns[to], field.columns[part]).T
+        np.matmul(field.values[:lines, part], mix, out=out[:lines, to])
     return Field(out, columns)
 
 
@@ -301,7 +306,9 @@ def _hold(stage: SampleAndHold, field: Field, context: Context) -> Field:
 def _convert(stage: Quantisation, field: Field, context: Context) -> Field:
     """Clipping alone: rounding is not differentiable, and the mean over noise is not rounded."""
     idle = context.sheet.idle[field.columns]
-    return Field(field.values.clip(-idle, np.maximum(stage.full_scale_counts - idle, 0.0)), field.columns)
+    clipped = np.maximum(field.values, -idle)
+    np.minimum(clipped, np.maximum(stage.full_scale_counts - idle, 0.0), out=clipped)
+    return Field(clipped, field.columns)
 
 
 OWN_TAXELS: dict[type, Callable[[Any, Field, Context], Field]] = {
@@ -326,3 +333,5 @@ SEPARATE = (
     PadTilt | TaxelGainSpread | DeadTaxels | Idle | BaselineDrift | ScanSkew | SampleAndHold | Quantisation
 )
 """Of these, those that do not mix a taxel with others."""
+KEEPS_ORDER = (ContactOffset, StiffeningDepth, PadTilt)
+"""Stages of the face that leave the higher of two heights of a taxel the higher one."""
