@@ -224,6 +224,31 @@ def test_look_alikes_tie_and_others_do_not() -> None:
     assert {names(found)[0], *(rival.name for rival in found.rivals)} == {"bend", "round"}
 
 
+@dataclass(frozen=True)
+class Elsewhere(Toy):
+    """The fifth column is odd, and scores see forms beyond the plain ones."""
+
+    def columns(self):
+        return np.concatenate([super().columns()[..., :4], self.x[..., None] ** 3], -1)
+
+    def screened(self, now, only=None):
+        return [replace(item, refine=bool(item.candidate.others)) for item in super().screened(now, only)]
+
+
+def test_a_rival_is_tried_in_the_form_that_scores_see_however_little_its_plain_one_gains() -> None:
+    plain, named = toy(0.15), Form("bend", column=1)
+    offered = (named, Form("round", column=4, others=(Form("round", column=3),)))
+    problem = Elsewhere(plain.x, plain.y, offered=offered)
+    selection = replace(
+        ScreenedSearch(problem, 0, lambda text: None).run(),
+        fit=problem.fit((0, 1)),
+        chosen={0: (named,)},
+        alternatives={"bend": frozenset({"round"})},
+    )
+    (rival,) = screened_rivals(selection, 0)
+    assert rival.candidate.column == 3
+
+
 def test_a_plain_form_does_until_another_is_clearly_better() -> None:
     other = Form("curve", column=1)
     offered = (Form("curve", column=2, others=(other,)),)

@@ -15,6 +15,7 @@ from lerobot_vtrefine.diagnose.pad.forward_model.run import LoweredBench, run_st
 from lerobot_vtrefine.diagnose.pad.model import Composite, sensor_model
 from lerobot_vtrefine.diagnose.pad.prediction import predict_trial
 from lerobot_vtrefine.diagnose.pad.press_trials import PressSet, prepare
+from lerobot_vtrefine.diagnose.pad.screening import forms_of
 from lerobot_vtrefine.diagnose.recordings import RecordingSet, Trial
 from lerobot_vtrefine.tactile.layout import PadLayout
 from lerobot_vtrefine.tactile.model import SensorModel
@@ -104,6 +105,21 @@ def test_leakage_to_two_sides_is_built_as_fitted() -> None:
     (leaks,) = build["to the next taxels, more to one side"](np.array([0.1, 0.04, 0.05, 0.2]), setting)
     assert (leaks.row, leaks.col) == (0.1, 0.2)
     assert (leaks.row_side, leaks.col_side) == pytest.approx((0.6, -0.75))
+
+
+def test_a_form_that_acts_elsewhere_does_so_in_users_models_and_is_offered_where_that_matters() -> None:
+    held, forms = presses(), {form.label: form for form in CATALOGUE}
+    early = forms["to the next taxels of row and column, before readings saturate or share"]
+    late, tanh = forms["to the next taxels of row and column"], forms["tanh"]
+    bent = composite(held).plus(tanh, np.array([1.0]))
+    models = [bent.plus(form, np.array([0.1, 0.1])) for form in (early, late)]
+    first, last = (predict(model, held) for model in models)
+    assert max(np.abs(a - b).max() for a, b in zip(first, last, strict=True)) > 1.0
+    for model in models:
+        assert_same(model, held)
+    flat = plain_weights(held)
+    offered = [forms_of("crosstalk", rest(model, held, flat)) for model in (composite(held), bent)]
+    assert [early in found for found in offered] == [False, True]
 
 
 def test_all_forms_at_once_and_maps() -> None:

@@ -7,10 +7,10 @@ import numpy as np
 
 from lerobot_vtrefine.diagnose.core.heldout import OutOfFold
 from lerobot_vtrefine.diagnose.core.parallel import on_all_cores
-from lerobot_vtrefine.diagnose.core.problem import FormCandidate, ScoredFit
+from lerobot_vtrefine.diagnose.core.problem import FormCandidate, Promise, ScoredFit
 from lerobot_vtrefine.diagnose.core.resampling import agree, one_sided
 from lerobot_vtrefine.diagnose.core.rivals import Rival
-from lerobot_vtrefine.diagnose.core.rules import NEARLY, RICH, TIE_P
+from lerobot_vtrefine.diagnose.core.rules import ALPHA, LEAST_GAIN, NEARLY, RICH, TIE_P
 from lerobot_vtrefine.diagnose.core.screened_search import CHANNEL, Ground, Step, folds_for
 from lerobot_vtrefine.diagnose.core.search import Selection
 
@@ -39,25 +39,31 @@ def screened_rivals[F: ScoredFit, C: FormCandidate](
         enough = NEARLY * full.gain_over(less)
         # A rich form imitates much: a rival may have one only if what was named has.
         richest = max(candidate.terms, RICH)
-        offered = [item.candidate for item in problem.screened(slim, others)]
         best = partial(_in_place, ground, less, enough, richest)
-        for step in on_all_cores(best, offered):
+        for step in on_all_cores(best, problem.screened(slim, others)):
             if tied(full, step.held, seed):
                 found.append(_rival(candidate, step, full, seed))
     return found
 
 
-def _in_place(ground: Ground[Any, Any], less: OutOfFold, enough: float, richest: int, other: Any) -> Step:
-    """The best fit with a rival; in other forms too if the plain one gains enough over none."""
-    plain = ground.plain(other)
-    return ground.refined(plain, richest) if plain.held.gain_over(less) > enough else plain
+def _in_place(
+    ground: Ground[Any, Any], less: OutOfFold, enough: float, richest: int, other: Promise[Any]
+) -> Step:
+    """The best fit with a rival; in other forms too if the plain one gains enough over none, or where the
+    score test saw the rival in another form than that."""
+    plain = ground.plain(other.candidate)
+    worth = other.refine or plain.held.gain_over(less) > enough
+    return ground.refined(plain, richest) if worth else plain
 
 
 def tied(full: OutOfFold, other: OutOfFold, seed: int) -> bool:
-    """Whether trials do not prefer what was named."""
-    if agree((other.errors - full.errors).sum(1), seed, TIE_P):
+    """Whether trials do not prefer what was named: at no odds that a name needs, nor by errors that a user
+    would notice. Among laws that are nearly the same, signs may agree over next to nothing."""
+    less = (other.errors - full.errors).sum(1)
+    if less.sum() > LEAST_GAIN * other.errors.sum() and agree(less, seed, TIE_P):
         return False
-    return not agree(full.better_by(other), seed, TIE_P)
+    likelier = full.better_by(other)
+    return not (likelier.sum() > np.log(1.0 / ALPHA) and agree(likelier, seed, TIE_P))
 
 
 def _rival(candidate: Any, step: Step[Any, Any], full: OutOfFold, seed: int) -> Rival[Any, Any]:

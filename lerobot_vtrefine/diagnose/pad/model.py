@@ -1,5 +1,6 @@
 """A model under test: the baseline's coordinates, the forms added to it, and maps over taxels."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -115,7 +116,12 @@ class Composite:
         if self.dead:
             stages.append(DeadTaxels(self.dead))
         stages.append(Quantisation(1.0, self.setting.full_scale))
-        return tuple(sorted(stages, key=lambda stage: stage.rank))
+        return self.in_order(stages)
+
+    def in_order(self, stages: Sequence[Stage]) -> tuple[Stage, ...]:
+        """Stages in the order in which they act."""
+        elsewhere = {form.family: form.rank for form in self.forms if form.rank is not None}
+        return tuple(sorted(stages, key=lambda stage: elsewhere.get(stage.name, stage.rank)))
 
 
 def sensor_model(
@@ -135,7 +141,7 @@ def sensor_model(
     if noise_counts > 0.0:
         stages.append(Noise(noise_counts))
     stages.append(Quantisation(step_counts or 1e-3, composite.setting.full_scale))
-    return SensorModel(tuple(sorted((_plain(stage) for stage in stages), key=lambda stage: stage.rank)))
+    return SensorModel(composite.in_order([_plain(stage) for stage in stages]))
 
 
 def _plain(stage: Stage) -> Stage:

@@ -101,7 +101,14 @@ def probe_form(form: Form, scorer: Scorer) -> list[Probe]:
 
 def forms_of(family: str, fitted: Fit) -> list[Form]:
     """Forms of a family that can show in these recordings, the plain one first."""
-    return [form for form in CATALOGUE if form.family == family and form.possible(fitted.model.setting)]
+    setting, others = fitted.model.setting, set(fitted.model.families)
+    return [
+        form
+        for form in CATALOGUE
+        if form.family == family
+        and form.possible(setting)
+        and (not form.beside or others.intersection(form.beside))
+    ]
 
 
 def form_probes(problem: "PadProblem", fitted: Fit, families: Collection[str] | None = None) -> list[Probe]:

@@ -129,6 +129,10 @@ class Form:
     """Whether its probes take part in screening; fallbacks are only fitted where their family is named."""
     peer: bool = False
     """Whether it is no richer than the plain form: it need not predict clearly better, only better."""
+    rank: int | None = None
+    """Where its stage stands among the others, if not at its usual place."""
+    beside: tuple[str, ...] = ()
+    """Causes, one of which must be there for it to differ from another form; none: it always does."""
     needs: str = "recordings in which it can act"
     """What to record where the cause cannot show."""
     grown: Callable[[np.ndarray, Setting], list[float] | list[list[float]]] | None = None

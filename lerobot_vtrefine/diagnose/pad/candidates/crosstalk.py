@@ -13,6 +13,8 @@ BOTH = (Value("row", 0.0, MOST, 2e-4), Value("col", 0.0, MOST, 2e-4))
 EACH_SIDE = tuple(
     Value(f"{line}_{side}", 0.0, MOST, 2e-4) for line in ("row", "col") for side in ("onward", "back")
 )
+BEFORE_SATURATION = 53
+"""Rank of a leak between lines whose amplifiers saturate, or share a supply, after it."""
 LOG_REACH = Value("log_reach", float(np.log(NEXT)), float(np.log(20.0)), 1e-2)
 
 
@@ -71,6 +73,21 @@ FORMS = (
         lambda s: [[0.01, 0.01]],
         amplitude=None,
         possible=lambda s: max(s.layout.rows, s.layout.cols) > 2,
+    ),
+    # What leaks between lines may do so before or after what else happens to readings.
+    Form(
+        "crosstalk",
+        "to the next taxels of row and column, before readings saturate or share",
+        BOTH,
+        lambda v, s: (Crosstalk(float(v[0]), float(v[1]), NEXT),),
+        lambda v, s: {"row": (float(v[0]), "1"), "col": (float(v[1]), "1")},
+        lambda s: [[0.01, 0.01]],
+        amplitude=None,
+        possible=lambda s: max(s.layout.rows, s.layout.cols) > 2,
+        screened=False,
+        peer=True,
+        rank=BEFORE_SATURATION,
+        beside=("saturation", "row_sharing", "supply_droop"),
     ),
     Form(
         "crosstalk",

@@ -61,6 +61,8 @@ SIGMA, OF_SKIN, SHARE = (
     Value("taxels", 0.5, 4.0, 1e-2),
     Value("share", 0.0, 1.0, 2e-3),
 )
+UNDERNEATH = 37
+"""Rank of a layer that spreads what a softer one above it passes on."""
 BEYOND = "of a cover that reaches beyond the taxels"
 
 FORMS = (
@@ -89,6 +91,27 @@ FORMS = (
         screened=False,
         peer=True,
         grown=lambda v, s: v.tolist(),
+    ),
+    *(
+        Form(
+            "mechanical_spreading",
+            label,
+            (SIGMA,),
+            partial(_wholly, kept=kept),
+            _report,
+            lambda s: [[0.5]],
+            amplitude=None,
+            possible=lambda s: s.layout.num_taxels > 1,
+            screened=False,
+            peer=True,
+            grown=lambda v, s: v.tolist(),
+            rank=UNDERNEATH,
+            beside=("first_load_softening", "hysteresis"),
+        )
+        for label, kept in (
+            ("Gaussian, of what a softer layer passes on", 1.0),
+            (f"Gaussian, of what a softer layer passes on, {BEYOND}", 0.0),
+        )
     ),
     *(
         Form(
