@@ -252,8 +252,8 @@ def test_a_rival_is_tried_in_the_form_that_scores_see_however_little_its_plain_o
 @pytest.mark.parametrize(("lead", "told"), [(0.1, False), (1.0, True)])
 def test_laws_that_trials_tell_apart_at_small_odds_tie(lead: float, told: bool) -> None:
     errors, scores = np.ones((TRIALS, 1)), np.zeros((TRIALS, 1))
-    named = OutOfFold(errors, scores + lead + 0.01 * np.arange(TRIALS)[:, None] / TRIALS)
-    assert tied(named, OutOfFold(errors + 1e-4, scores), 0) is not told
+    likelier = scores + lead + 0.01 * np.arange(TRIALS)[:, None] / TRIALS
+    assert tied(OutOfFold(errors, lambda: likelier), OutOfFold(errors + 1e-4, lambda: scores), 0) is not told
 
 
 def test_a_plain_form_does_until_another_is_clearly_better() -> None:
