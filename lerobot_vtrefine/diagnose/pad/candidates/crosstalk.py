@@ -1,5 +1,7 @@
 """crosstalk: a reading leaks into the others in its row and column."""
 
+from dataclasses import replace
+
 import numpy as np
 
 from lerobot_vtrefine.diagnose.pad.candidates.base import Form, Setting, Value
@@ -50,6 +52,17 @@ def _report_leaning(values: np.ndarray, setting: Setting) -> dict[str, tuple[flo
     return {name: (float(value), "1") for name, value in found.items()}
 
 
+NEXT_TAXELS = Form(
+    "crosstalk",
+    "to the next taxels of row and column",
+    BOTH,
+    lambda v, s: (Crosstalk(float(v[0]), float(v[1]), NEXT),),
+    lambda v, s: {"row": (float(v[0]), "1"), "col": (float(v[1]), "1")},
+    lambda s: [[0.01, 0.01]],
+    amplitude=None,
+    possible=lambda s: max(s.layout.rows, s.layout.cols) > 2,
+)
+
 FORMS = (
     Form(
         "crosstalk",
@@ -64,26 +77,11 @@ FORMS = (
         amplitude=None,
         possible=lambda s: s.layout.num_taxels > 1,
     ),
-    Form(
-        "crosstalk",
-        "to the next taxels of row and column",
-        BOTH,
-        lambda v, s: (Crosstalk(float(v[0]), float(v[1]), NEXT),),
-        lambda v, s: {"row": (float(v[0]), "1"), "col": (float(v[1]), "1")},
-        lambda s: [[0.01, 0.01]],
-        amplitude=None,
-        possible=lambda s: max(s.layout.rows, s.layout.cols) > 2,
-    ),
+    NEXT_TAXELS,
     # What leaks between lines may do so before or after what else happens to readings.
-    Form(
-        "crosstalk",
-        "to the next taxels of row and column, before readings saturate or share",
-        BOTH,
-        lambda v, s: (Crosstalk(float(v[0]), float(v[1]), NEXT),),
-        lambda v, s: {"row": (float(v[0]), "1"), "col": (float(v[1]), "1")},
-        lambda s: [[0.01, 0.01]],
-        amplitude=None,
-        possible=lambda s: max(s.layout.rows, s.layout.cols) > 2,
+    replace(
+        NEXT_TAXELS,
+        label=f"{NEXT_TAXELS.label}, before readings saturate or share",
         screened=False,
         peer=True,
         rank=BEFORE_SATURATION,

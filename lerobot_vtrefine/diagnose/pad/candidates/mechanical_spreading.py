@@ -1,6 +1,7 @@
 """mechanical_spreading: the cover spreads a press over neighbouring taxels."""
 
 from collections.abc import Sequence
+from dataclasses import replace
 from functools import partial
 
 import numpy as np
@@ -65,6 +66,21 @@ UNDERNEATH = 37
 """Rank of a layer that spreads what a softer one above it passes on."""
 BEYOND = "of a cover that reaches beyond the taxels"
 
+# A cover ends with the taxels or goes on: a form, no coordinate that presses at the rim alone would know.
+GOES_ON = Form(
+    "mechanical_spreading",
+    f"Gaussian, {BEYOND}",
+    (SIGMA,),
+    partial(_wholly, kept=0.0),
+    _report,
+    lambda s: [[0.5]],
+    amplitude=None,
+    possible=lambda s: s.layout.num_taxels > 1,
+    screened=False,
+    peer=True,
+    grown=lambda v, s: v.tolist(),
+)
+
 FORMS = (
     Form(
         "mechanical_spreading",
@@ -78,33 +94,12 @@ FORMS = (
         amplitude=None,
         possible=lambda s: s.layout.num_taxels > 1,
     ),
-    # A cover ends with the taxels or goes on: a form, no coordinate that presses at the rim alone would know.
-    Form(
-        "mechanical_spreading",
-        f"Gaussian, {BEYOND}",
-        (SIGMA,),
-        partial(_wholly, kept=0.0),
-        _report,
-        lambda s: [[0.5]],
-        amplitude=None,
-        possible=lambda s: s.layout.num_taxels > 1,
-        screened=False,
-        peer=True,
-        grown=lambda v, s: v.tolist(),
-    ),
+    GOES_ON,
     *(
-        Form(
-            "mechanical_spreading",
-            label,
-            (SIGMA,),
-            partial(_wholly, kept=kept),
-            _report,
-            lambda s: [[0.5]],
-            amplitude=None,
-            possible=lambda s: s.layout.num_taxels > 1,
-            screened=False,
-            peer=True,
-            grown=lambda v, s: v.tolist(),
+        replace(
+            GOES_ON,
+            label=label,
+            build=partial(_wholly, kept=kept),
             rank=UNDERNEATH,
             beside=("first_load_softening", "hysteresis"),
         )
