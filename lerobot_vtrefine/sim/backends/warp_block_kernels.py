@@ -56,7 +56,7 @@ AIM = """
     auto& matrix = *holder;
 #endif
     const int lane = WP_TILE_THREAD_IDX, lanes = WP_TILE_BLOCK_DIM;
-    const int stripe = lanes < 32 ? lanes : 32;
+    const int stripe = lanes < 32 ? lanes : 32, step = lanes / stripe;
     for (int item = lane; item < nv * nv; item += lanes) {
         float sum = 0.0f;
         if (item %% nv >= item / nv)
@@ -71,8 +71,18 @@ AIM = """
         for (int column = pivot + 1 + lane %% stripe; column <= nv; column += stripe) {
             const float share = matrix[pivot][column] / matrix[pivot][pivot];
             const int last = column < nv ? column : nv - 1;
-            for (int row = pivot + 1 + lane / stripe; row <= last; row += lanes / stripe)
-                matrix[row][column] -= share * matrix[pivot][row];
+            // Four at a time: none of their loads waits for a store that may be to the same place.
+            for (int row = pivot + 1 + lane / stripe; row <= last; row += 4 * step) {
+                float lead[4], own[4];
+                for (int k = 0; k < 4; ++k) {
+                    const int place = row + k * step <= last ? row + k * step : row;
+                    lead[k] = matrix[pivot][place];
+                    own[k] = matrix[place][column];
+                }
+                for (int k = 0; k < 4; ++k)
+                    if (row + k * step <= last)
+                        matrix[row + k * step][column] = own[k] - share * lead[k];
+            }
         }
     }
     for (int pivot = nv - 1; pivot >= 0; --pivot) {

@@ -215,7 +215,12 @@ def descend(
         group = item // nv
         dof = item % nv
         part = float(0.0)
-        for row in range(group, count, groups):
+        fours = (count - group + groups - 1) // (4 * groups)
+        for four in range(fours):
+            for k in range(4):
+                row = group + (4 * four + k) * groups
+                part += rows.jacobian[world, row, dof] * rows.force[world, row]
+        for row in range(group + 4 * groups * fours, count, groups):
             part += rows.jacobian[world, row, dof] * rows.force[world, row]
         search.force[world, group, dof] = part
     wait()
@@ -237,7 +242,8 @@ def bend(
 ) -> None:
     """The Hessian's upper triangle, as G matrices that add up to it.
 
-    First what each row adds, then sums without a branch, whose loads need not wait for each other.
+    First what each row adds, then sums without a branch, four at a time: their loads need not wait for each
+    other.
     """
     lanes = wp.block_dim()
     groups = search.hessian.shape[1]
@@ -257,7 +263,12 @@ def bend(
             column += 1
             rest -= column
         sums = wp.mat44(0.0)
-        for row in range(group, count, groups):
+        fours = (count - group + groups - 1) // (4 * groups)
+        for four in range(fours):
+            for k in range(4):
+                row = group + (4 * four + k) * groups
+                sums += wp.outer(search.bent[world, row, rest], search.bent[world, row, column])
+        for row in range(group + 4 * groups * fours, count, groups):
             sums += wp.outer(search.bent[world, row, rest], search.bent[world, row, column])
         i = 4 * rest
         j = 4 * column
