@@ -63,6 +63,9 @@ def on_warp(drawn):
         setattr(rows, name, wp.array(values, dtype=float, device="cpu"))
     for name, values in integers.items():
         setattr(rows, name, wp.array(values.astype(np.int32), dtype=int, device="cpu"))
+    lone = np.tile(np.arange(ROWS, dtype=np.int32), (WORLDS, 1))
+    rows.lone = wp.array(lone, dtype=int, device="cpu")
+    rows.line = wp.zeros((WORLDS, ROWS, 3), dtype=wp.vec4, device="cpu")
     rows.quads = wp.array(jacobian.reshape(WORLDS, ROWS, 1, SPEEDS), dtype=wp.vec4, device="cpu")
     cones.row = wp.array(np.tile(np.arange(3, 7, dtype=np.int32), (WORLDS, 1)), dtype=int, device="cpu")
     cones.dim = wp.full(WORLDS, 4, dtype=int, device="cpu")
@@ -85,7 +88,8 @@ def run(drawn, step):
         bend: wp.array(dtype=wp.mat44, ndim=2),
     ) -> None:
         world, row = wp.tid()
-        line[world, row] = kernels.along_line(world, row, step, rows, cones)
+        kernels.lay(world, row, rows, cones)
+        line[world, row] = kernels.along_line(world, row, step, rows)
         kernels.push(world, row, rows, cones)
         bent = kernels.bent(world, row, 0, rows, cones)
         bend[world, row] = wp.outer(bent, bent)

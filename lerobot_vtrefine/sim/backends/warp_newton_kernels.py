@@ -16,7 +16,15 @@ import functools
 import warp as wp
 
 from lerobot_vtrefine.sim.backends.warp_block_kernels import make_aim, total, wait
-from lerobot_vtrefine.sim.backends.warp_rows_kernels import Cones, Rows, along_line, bent, is_lone, push
+from lerobot_vtrefine.sim.backends.warp_rows_kernels import (
+    Cones,
+    Rows,
+    along_line,
+    bent,
+    is_lone,
+    lay,
+    push,
+)
 
 wp.set_module_options({"enable_backward": False})
 
@@ -142,13 +150,11 @@ def slopes(world: int, lane: int, count: int, motion: Motion, search: Search, ro
 
 
 @wp.func
-def cost(
-    world: int, lane: int, count: int, step: float, smooth: wp.vec2, rows: Rows, cones: Cones
-) -> wp.vec4:
+def cost(world: int, lane: int, step: float, smooth: wp.vec2, rows: Rows) -> wp.vec4:
     """Cost after a step along the direction: its change, two derivatives, and what the first is a sum of."""
     sums = wp.vec4(0.0)
     for index in range(lane, rows.lones[world], wp.block_dim()):
-        mine = along_line(world, rows.lone[world, index], step, rows, cones)
+        mine = along_line(world, index, step, rows)
         sums += wp.vec4(mine[0], mine[1], mine[2], wp.abs(mine[1]))
     rate = smooth[0] + step * smooth[1]
     whole = wp.vec4(step * (smooth[0] + 0.5 * step * smooth[1]), rate, smooth[1], wp.abs(smooth[0]))
@@ -157,18 +163,20 @@ def cost(
 
 @wp.func
 def line_search(
-    world: int, lane: int, count: int, flat: float, most: int, smooth: wp.vec2, rows: Rows, cones: Cones
+    world: int, lane: int, flat: float, most: int, smooth: wp.vec2, rows: Rows, cones: Cones
 ) -> wp.vec2:
     """Where the slope is below `flat`, by Newton's method within a bracket; returns the step and its gain,
     zeros where there is nothing to gain.
     """
+    for index in range(lane, rows.lones[world], wp.block_dim()):
+        lay(world, index, rows, cones)  # the same thread reads it
     best = wp.vec2(0.0, 0.0)
     least = float(0.0)
     low = float(0.0)
     high = float(-1.0)
     step = float(0.0)
     for index in range(most + 1):
-        point = cost(world, lane, count, step, smooth, rows, cones)
+        point = cost(world, lane, step, smooth, rows)
         if index == 0:
             least = ROUNDING * point[3]
         if point[0] < -best[1]:
@@ -313,7 +321,7 @@ def newton_kernel(nv: int) -> wp.Kernel:
                 smooth = slopes(world, lane, count, motion, search, rows)
                 wait()
                 flat = wp.max(line * length / scale, LEAST_SLOPE)
-                gained = line_search(world, lane, count, flat, limits.line_steps, smooth, rows, cones)
+                gained = line_search(world, lane, flat, limits.line_steps, smooth, rows, cones)
                 take(world, lane, count, gained[0], motion, search, rows)
                 steps = index
                 wait()

@@ -19,6 +19,12 @@ QUADRATIC = wp.constant(int(ConstraintState.QUADRATIC))
 LINEAR_NEGATIVE = wp.constant(int(ConstraintState.LINEARNEG))
 LINEAR_POSITIVE = wp.constant(int(ConstraintState.LINEARPOS))
 SLIDING = wp.constant(int(ConstraintState.CONE))
+EQUALITY = wp.constant(0)
+DRY = wp.constant(1)
+LIMIT = wp.constant(2)
+CONE = wp.constant(3)
+NOTHING = wp.constant(4)
+"""What a cost along a line can be; the last is a contact whose rows had no room."""
 TINY = wp.constant(1.0e-15)
 
 
@@ -47,6 +53,8 @@ class Rows:
     """Rows with a cost of their own: all but those of a contact after its first."""
     lones: wp.array(dtype=int)
     """(N,) how many."""
+    line: wp.array(dtype=wp.vec4, ndim=3)
+    """(N, rows, 3) what the costs of lone rows along the search direction depend on."""
 
 
 @wp.struct
@@ -218,35 +226,27 @@ def slide(world: int, row: int, contact: int, rows: Rows, cones: Cones) -> wp.ve
 
 
 @wp.func
-def cone(world: int, row: int, contact: int, step: float, rows: Rows, cones: Cones) -> wp.vec3:
-    """A contact along a line: change of the cost, first two derivatives.
+def cone(step: float, first: wp.vec4, second: wp.vec4, third: wp.vec4) -> wp.vec3:
+    """A contact along a line, as `lay_cone` laid it out: change of the cost, first two derivatives.
 
     The tangential residual's length t is put together from its parts along and across the line, which keeps
     the digits that u.u + 2 a u.w + a^2 w.w loses.
     """
-    mu = mu_of(world, contact, cones)
-    first = rows.residual[world, row]
-    first_slope = rows.slope[world, row]
-    bottom = wp.vec3(0.0)
-    whole = float(0.0)
-    for k in range(cones.dim[contact]):
-        other = row + k
-        residual = rows.residual[world, other]
-        stiffness = rows.stiffness[world, other]
-        bottom += quadratic(stiffness, residual, rows.slope[world, other], step)
-        whole += stiffness * residual * residual
-    parts = slide(world, row, contact, rows, cones)
-    before = parts[0]
-    along = parts[1]
-    across = parts[2] * parts[2]
-    speed = parts[3]
+    normal = first[1]
+    normal_slope = first[2]
+    scale = first[3]
+    mu = second[0]
+    whole = second[3]
+    before = third[0]
+    along = third[1]
+    across = third[2]
+    speed = third[3]
     reached = along + step * speed
     t = wp.sqrt(across + reached * reached)
-    scale = rows.stiffness[world, row] / wp.max(mu * mu * (1.0 + mu * mu), TINY)
-    n = mu * (first + step * first_slope)
-    zone_before = zone(mu * first, before, mu)
+    n = mu * (normal + step * normal_slope)
+    zone_before = zone(mu * normal, before, mu)
     zone_after = zone(n, t, mu)
-    gap_before = mu * (first - before)
+    gap_before = mu * (normal - before)
     gap = n - mu * t
     cost_before = wp.where(zone_before == SLIDING, 0.5 * scale * gap_before * gap_before, 0.0)
     if zone_before == QUADRATIC:
@@ -254,15 +254,16 @@ def cone(world: int, row: int, contact: int, step: float, rows: Rows, cones: Con
     if zone_after == FREE:
         return wp.vec3(-cost_before, 0.0, 0.0)
     if zone_after == QUADRATIC:
-        rise = 0.5 * whole - cost_before
-        return wp.vec3(wp.where(zone_before == QUADRATIC, 0.0, rise) + bottom[0], bottom[1], bottom[2])
+        rise = wp.where(zone_before == QUADRATIC, 0.0, 0.5 * whole - cost_before)
+        change = step * (second[1] + 0.5 * step * second[2])
+        return wp.vec3(rise + change, second[1] + step * second[2], second[2])
     turn = speed * reached / wp.max(t, TINY)
     bend = speed * speed * (across / wp.max(t * t, TINY * TINY)) / wp.max(t, TINY)
-    rate = mu * (first_slope - turn)
+    rate = mu * (normal_slope - turn)
     change = 0.5 * scale * gap * gap - cost_before
     if zone_before == SLIDING:
         longer = step * speed * (along + reached) / wp.max(t + before, TINY)
-        change = 0.5 * scale * mu * (step * first_slope - longer) * (gap + gap_before)
+        change = 0.5 * scale * mu * (step * normal_slope - longer) * (gap + gap_before)
     return wp.vec3(change, scale * gap * rate, scale * (rate * rate - gap * mu * bend))
 
 
@@ -277,24 +278,70 @@ def zone(n: float, t: float, mu: float) -> int:
 
 
 @wp.func
-def along_line(world: int, row: int, step: float, rows: Rows, cones: Cones) -> wp.vec3:
-    """A row's cost along the search direction: change since step 0, first two derivatives; of a whole contact
-    where it is the first of one.
-    """
+def lay(world: int, place: int, rows: Rows, cones: Cones) -> None:
+    """Write down what a lone row's cost along the search direction depends on, to be read at every step."""
+    row = rows.lone[world, place]
+    code = int(EQUALITY)
+    equalities = rows.equalities[world]
     if rows.kind[world, row] == ELLIPTIC:
         contact = rows.contact[world, row]
         if is_whole(contact, row, cones):
-            return cone(world, row, contact, step, rows, cones)
-        return wp.vec3(0.0)
-    residual = rows.residual[world, row]
-    slope = rows.slope[world, row]
+            lay_cone(world, place, row, contact, rows, cones)
+            return
+        code = NOTHING
+    elif row >= equalities + rows.frictions[world]:
+        code = LIMIT
+    elif row >= equalities:
+        code = DRY
     stiffness = rows.stiffness[world, row]
-    equalities = rows.equalities[world]
-    if row < equalities:
-        return quadratic(stiffness, residual, slope, step)
-    if row < equalities + rows.frictions[world]:
-        return dry(stiffness, rows.loss[world, row], residual, slope, step)
-    return limit(stiffness, residual, slope, step)
+    rows.line[world, place, 0] = wp.vec4(
+        float(code), rows.residual[world, row], rows.slope[world, row], stiffness
+    )
+    rows.line[world, place, 1] = wp.vec4(rows.loss[world, row], 0.0, 0.0, 0.0)
+
+
+@wp.func
+def lay_cone(world: int, place: int, row: int, contact: int, rows: Rows, cones: Cones) -> None:
+    """The same of a whole contact: residual, slope and scale of its normal; friction, and D r r', D r' r' and
+    D r r summed over its rows; |u|, u along w, the square of u across w, |w| of `slide`.
+    """
+    mu = mu_of(world, contact, cones)
+    rate = float(0.0)
+    curve = float(0.0)
+    whole = float(0.0)
+    for k in range(cones.dim[contact]):
+        residual = rows.residual[world, row + k]
+        slope = rows.slope[world, row + k]
+        stiffness = rows.stiffness[world, row + k]
+        rate += stiffness * residual * slope
+        curve += stiffness * slope * slope
+        whole += stiffness * residual * residual
+    scale = rows.stiffness[world, row] / wp.max(mu * mu * (1.0 + mu * mu), TINY)
+    rows.line[world, place, 0] = wp.vec4(
+        float(CONE), rows.residual[world, row], rows.slope[world, row], scale
+    )
+    rows.line[world, place, 1] = wp.vec4(mu, rate, curve, whole)
+    parts = slide(world, row, contact, rows, cones)
+    rows.line[world, place, 2] = wp.vec4(parts[0], parts[1], parts[2] * parts[2], parts[3])
+
+
+@wp.func
+def along_line(world: int, place: int, step: float, rows: Rows) -> wp.vec3:
+    """A lone row's cost along the search direction, once it is laid out: change since step 0, first two
+    derivatives; of a whole contact where it is the first of one.
+    """
+    first = rows.line[world, place, 0]
+    second = rows.line[world, place, 1]
+    code = int(first[0])
+    if code == CONE:
+        return cone(step, first, second, rows.line[world, place, 2])
+    if code == EQUALITY:
+        return quadratic(first[3], first[1], first[2], step)
+    if code == DRY:
+        return dry(first[3], second[0], first[1], first[2], step)
+    if code == LIMIT:
+        return limit(first[3], first[1], first[2], step)
+    return wp.vec3(0.0)
 
 
 @wp.func

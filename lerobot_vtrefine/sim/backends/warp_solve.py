@@ -55,6 +55,7 @@ def _rows(data: mjw.Data) -> Rows:
         setattr(rows, name, wp.empty((data.nworld, data.njmax), dtype=float))
     rows.lone, rows.lones = wp.empty((data.nworld, data.njmax), dtype=int), wp.empty(data.nworld, dtype=int)
     worlds, room, wide = efc.J.shape
+    rows.line = wp.empty((worlds, room, 3), dtype=wp.vec4)
     rows.quads = wp.array(
         ptr=efc.J.ptr, dtype=wp.vec4, shape=(worlds, room, wide // 4), device=efc.J.device, copy=False
     )
