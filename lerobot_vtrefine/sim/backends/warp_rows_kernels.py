@@ -353,7 +353,7 @@ def bent(world: int, row: int, quad: int, rows: Rows, cones: Cones) -> wp.vec4:
     if state == SLIDING:
         contact = rows.contact[world, row]
         first = cones.row[contact, 0]
-        if cones.row[contact, cones.dim[contact] - 1] >= 0:
+        if is_whole(contact, first, cones):
             return bent_cone(world, row - first, first, contact, quad, rows, cones)
     return wp.vec4(0.0)
 
