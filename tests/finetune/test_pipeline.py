@@ -268,6 +268,13 @@ def test_bad_tasks_are_one_clear_line(finetune, tmp_path, capsys, monkeypatch, f
     assert words in capsys.readouterr().err.strip().splitlines()[-1]
 
 
+def test_another_control_rate_than_the_policy_learned_is_refused(finetune, tmp_path, capsys):
+    assert finetune(tmp_path / "bad", "--env.fps=20", "--policy.fps=10") == 2
+    assert "the policy learned 10 actions a second: give --env.fps=10" in capsys.readouterr().err
+    assert finetune(tmp_path / "good", "--env.fps=20", "--policy.fps=20", iterations=1) == 0
+    assert finetune(tmp_path / "old", "--env.fps=20", iterations=1) == 0  # a checkpoint that does not say
+
+
 def test_policy_of_another_type_is_refused(finetune, tmp_path, capsys):
     from lerobot.policies.act.configuration_act import ACTConfig
 
