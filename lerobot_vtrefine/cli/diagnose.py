@@ -12,6 +12,7 @@ from lerobot_vtrefine.cli.arguments import CommandParser
 from lerobot_vtrefine.cli.errors import run_cli
 from lerobot_vtrefine.cli.formats import add_format_flags
 from lerobot_vtrefine.cli.outputs import staged
+from lerobot_vtrefine.wording import plural
 
 if TYPE_CHECKING:
     from lerobot_vtrefine.diagnose.core.diagnosis import Diagnosis
@@ -151,7 +152,7 @@ def summarise(found: "Diagnosis", output_dir: Path, survived: str) -> None:
     for issue in verdict.data_issues[:SHOWN_ISSUES]:
         print(f"{issue.trial or 'all recordings'}: {issue.problem} ({issue.action})")
     if (more := len(verdict.data_issues) - SHOWN_ISSUES) > 0:
-        print(f"{more} more problems of the data are in the report")
+        print(f"{plural(more, 'more problem')} of the data in the report")
     print(f"report: {output_dir / 'report.html'}")
 
 

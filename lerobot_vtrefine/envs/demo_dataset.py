@@ -34,6 +34,7 @@ from lerobot_vtrefine.folders import (
 from lerobot_vtrefine.interrupts import interrupts_wait
 from lerobot_vtrefine.lerobot_compat.codec_priority import ordinary_priority
 from lerobot_vtrefine.lerobot_compat.fast_saving import fast_saving
+from lerobot_vtrefine.wording import plural
 
 LEDGER = NOTE
 INFO = Path("meta") / "info.json"
@@ -167,10 +168,9 @@ class DemoDataset:
         full = disk_is_full(error, self._place)
         self.rollback()
         if full:
-            saved = self.num_episodes
             raise OSError(
-                f"the disk is full: the {saved} episodes saved in {self.root} stay readable;"
-                " free some space and run the same command to continue"
+                f"the disk is full: {self.root} keeps {plural(self.num_episodes, 'episode')};"
+                " free some space and run the same command, which records the others again"
             ) from error
 
     def _open(self) -> LeRobotDataset:
