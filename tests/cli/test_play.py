@@ -61,6 +61,8 @@ def test_episodes_are_filmed(tmp_path: Path, capsys: pytest.CaptureFixture[str])
         ({"port": 99999}, "--port must lie between 1 and 65535, got 99999"),
         ({"viewer": "window"}, "--viewer=window is unknown"),
         ({"dataset": EpisodeSource(Path("nowhere"))}, "nowhere holds no LeRobot dataset"),
+        ({"video_dir": Path("README.md")}, "--video_dir=README.md is a file; name a folder"),
+        ({"video_dir": Path("/proc/films")}, "No such file or directory: '--video_dir=/proc/films'"),
     ],
 )
 def test_wrong_flags_are_one_line(settings: dict, words: str, monkeypatch: pytest.MonkeyPatch) -> None:
