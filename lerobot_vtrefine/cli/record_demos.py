@@ -148,7 +148,7 @@ def next_steps(config: RecordDemosConfig) -> str:
     env = config.env
     assert isinstance(env, VtRefineEnvConfig)
     root = shlex.quote(str(config.root))
-    train = f"lerobot-train --dataset.repo_id={config.repo_id} --dataset.root={root}"
+    train = f"lerobot-train --dataset.repo_id={shlex.quote(config.repo_id)} --dataset.root={root}"
     if env.scene.embodiment == DEFAULT_BODY:
         train += " --config_path=vtrefine:vt_dp3_pads"
     else:  # whose pads the shipped encoder has never felt

@@ -16,6 +16,7 @@ from pathlib import Path
 from types import TracebackType
 from typing import Any, Self
 
+import pyarrow.parquet as pq
 from lerobot.datasets.io_utils import SuppressProgressBars
 from lerobot.datasets.lerobot_dataset import LeRobotDataset
 
@@ -239,7 +240,7 @@ def disk_is_full(error: BaseException | None, folder: Path) -> bool:
     while not folder.exists():
         folder = folder.parent
     status = os.statvfs(folder)
-    return status.f_bavail * status.f_frsize < 2**20
+    return status.f_blocks > 0 and status.f_bavail * status.f_frsize < 2**20  # /proc has no blocks
 
 
 def _read_ledger(root: Path) -> dict[str, Any]:
@@ -257,6 +258,7 @@ def _read_ledger(root: Path) -> dict[str, Any]:
             and isinstance(ledger["next_seed"], int)
             and [row["episode_index"] for row in ledger["episodes"]] == list(range(episodes))
             and ledger["files"] == _parquet_files(root)
+            and all(pq.read_metadata(root / name).num_rows for name in ledger["files"])
         )
     except (OSError, ValueError, KeyError, TypeError, RecursionError):
         whole = False

@@ -330,6 +330,7 @@ def test_every_commit_loads_while_the_next_one_is_recorded(tmp_path, small_commi
         ("info.json", ""),
         ("info.json", "\x00"),
         ("info.json", None),
+        ("../data/chunk-000/file-000.parquet", "PAR1"),
     ],
 )
 def test_a_damaged_record_is_one_line_and_nothing_is_removed(tmp_path, file, damaged) -> None:
