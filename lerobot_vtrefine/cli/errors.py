@@ -38,6 +38,8 @@ _OPTIONAL_VALUE = re.compile(
 """How draccus begins where a flag may be left out, as if there were several types that it may have."""
 _UNKNOWN_FIELDS = re.compile(r"The fields ((?:`[^`]+`(?:, )?)+) are not valid for \w+")
 """What draccus says of a file's settings."""
+_WITHOUT_TYPE = re.compile("Expected a dict for a choice class, got (.*)")
+"""What it says of ``env: null``, as settings of lerobot-train have it, and of ``env: round``."""
 
 
 def describe(error: BaseException) -> str:
@@ -103,6 +105,9 @@ def _in_flags(message: str) -> str:
     """draccus speaks of Python classes; users type flags."""
     if "Expected a dict with a 'type' key" in message and "EnvConfig" in message:
         return "say which environment: --env.type=vtrefine or --config_path=vtrefine:NAME"
+    if found := _WITHOUT_TYPE.search(message):
+        where = "in the file of --config_path, a group that needs its type, as in env: {type: vtrefine}"
+        return f"{where}, is {found[1]}"
     if "Expected a dict with a 'type' key" in message and "PreTrainedConfig" in message:
         return "say which policy: --policy.path=FOLDER, a checkpoint's pretrained_model"
     if unknown := _UNKNOWN_FIELDS.search(message):

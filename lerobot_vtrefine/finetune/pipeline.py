@@ -92,6 +92,11 @@ class FinetunePipelineConfig:
     # artifacts are uploaded, so disable_artifact changes nothing.
     wandb: WandBConfig = field(default_factory=WandBConfig)
 
+    def __post_init__(self) -> None:
+        for name in ("seed", "eval_freq", "save_freq"):
+            if getattr(self, name) < 0:
+                raise ValueError(f"--{name} must not be negative, got {getattr(self, name)}")
+
     @classmethod
     def __get_path_fields__(cls) -> list[str]:
         """Let LeRobot's parser take ``--policy.path``."""

@@ -128,6 +128,14 @@ def test_settings_that_a_file_should_not_have_are_told_with_the_file(monkeypatch
     assert capsys.readouterr().err == f"error: {file}: The fields `num_epsodes` are not valid for Flags\n"
 
 
+def test_a_group_without_its_type_in_a_file_is_told_as_such(monkeypatch, tmp_path, capsys) -> None:
+    file = tmp_path / "train_config.json"  # as lerobot-train writes it
+    file.write_text('{"env": null}')
+    assert run_cli(lambda: draccus.parse(FinetunePipelineConfig, file, args=[]) and None)() == 2
+    told = "error: in the file of --config_path, a group that needs its type, as in env: {type: vtrefine}, is"
+    assert capsys.readouterr().err == f"{told} None\n"
+
+
 def test_a_network_that_does_not_answer_is_one_line(capsys) -> None:
     def upload() -> None:
         raise httpx.ConnectError("[Errno -2] Name or service not known")
