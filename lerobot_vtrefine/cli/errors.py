@@ -123,9 +123,13 @@ def _config_files_with(names: Sequence[str]) -> list[str]:
 
 
 def meant(message: str, known: Iterable[str]) -> str:
-    """Which flags were meant, for argparse's message about unknown ones; else where they are listed."""
+    """Which flags were meant, for argparse's message about unknown or missing ones; else where they are
+    listed.
+    """
     known = list(known)
-    typed = re.findall(r"--[\w.-]+", message.partition("unrecognized arguments")[2])
+    missing = message.startswith("the following arguments are required")  # perhaps because of a misspelt one
+    text = " ".join(sys.argv[1:]) if missing else message.partition("unrecognized arguments")[2]
+    typed = [flag for flag in re.findall(r"--[\w.-]+", text) if flag not in known]
     found = [name for flag in typed for name in get_close_matches(flag, known, 1)]
     return "".join(f"; did you mean {name}?" for name in found) or "; --help lists the flags"
 

@@ -11,6 +11,7 @@ import pytest
 import safetensors
 import torch
 
+from lerobot_vtrefine.cli import diagnose
 from lerobot_vtrefine.cli.errors import after_interrupt, run_cli
 from lerobot_vtrefine.cli.pipeline.demo_config import DemoConfig
 from lerobot_vtrefine.cli.play import PlayConfig
@@ -118,6 +119,13 @@ def test_flags_that_are_misspelt_or_lack_their_type_are_one_line(config, typed, 
     error = capsys.readouterr().err
     assert error.count("\n") == 1
     assert error.startswith(f"error: {line}")
+
+
+def test_a_misspelt_flag_that_is_required_is_named(monkeypatch, capsys) -> None:
+    monkeypatch.setattr(sys, "argv", ["vtrefine-diagnose", "--recording=presses", "--output-dir=out"])
+    assert diagnose.main() == 2
+    told = "error: the following arguments are required: --output_dir; did you mean --output_dir?\n"
+    assert capsys.readouterr().err == told
 
 
 def test_settings_that_a_file_should_not_have_are_told_with_the_file(monkeypatch, tmp_path, capsys) -> None:
