@@ -25,6 +25,7 @@ from lerobot_vtrefine.cli.outputs import check_file
 from lerobot_vtrefine.cli.pipeline.stages import last_line, stop
 from lerobot_vtrefine.extras import SIMULATOR, require
 from lerobot_vtrefine.sim.config import WARP_SOLVERS, WarpConfig
+from lerobot_vtrefine.wording import plural
 
 if TYPE_CHECKING:
     from lerobot_vtrefine.sim.benchmark import WorldsRow
@@ -176,7 +177,11 @@ def measure_device(config: BenchConfig, device: str) -> list[Row]:
     for solver in config.solver:
         found[solver] = []
         for row in measure_worlds(WarpConfig(device=device, solver=solver), config.worlds, config.steps):
-            print(f"{row.worlds} worlds: {row.worlds / row.mean_s:.4g} steps/s", file=sys.stderr, flush=True)
+            print(
+                f"{plural(row.worlds, 'world')}: {row.worlds / row.mean_s:.4g} steps/s",
+                file=sys.stderr,
+                flush=True,
+            )
             found[solver].append(row)
         print(f"solver {solver}:\n{worlds_table(found[solver])}")
     both = zip(found["own"], found["stock"], strict=True) if len(found) == 2 else ()
@@ -189,7 +194,7 @@ def _solver_rows(own: "WorldsRow", stock: "WorldsRow") -> list[Row]:
     return [
         Row(
             "solver",
-            f"{what} of {own.worlds} worlds, stock / own",
+            f"{what} of {plural(own.worlds, 'world')}, stock / own",
             theirs / ours,
             f"{1e3 * ours:.1f} ms against {1e3 * theirs:.1f} ms",
         )

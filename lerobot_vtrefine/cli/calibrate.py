@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING
 from lerobot_vtrefine.cli.arguments import CommandParser
 from lerobot_vtrefine.cli.errors import run_cli
 from lerobot_vtrefine.cli.outputs import staged
+from lerobot_vtrefine.wording import plural
 
 if TYPE_CHECKING:
     from lerobot_vtrefine.diagnose.calibration import Calibration
@@ -102,7 +103,8 @@ def describe(calibration: "Calibration") -> list[str]:
     from lerobot_vtrefine.diagnose.calibration.page import remarks
     from lerobot_vtrefine.diagnose.report.numbers import interval
 
-    lines = [f"{calibration.excitation.recordings} recordings, {100 * calibration.explained:.1f} % explained"]
+    recordings = plural(calibration.excitation.recordings, "recording")
+    lines = [f"{recordings}, {100 * calibration.explained:.1f} % explained"]
     for name, item in calibration.parameters.items():
         if isinstance(item.value, float):
             value, spread = interval(item.value, item.ci95, item.unit)

@@ -17,6 +17,8 @@ BESIDE = ("config_path", "quick")
 PATHS = (CONFIG_FLAG, "--policy.path")
 """Flags whose value is a file or a folder, or a name on the Hub."""
 FOLDERS = ("--dataset.root",)
+RESULTS = "--output_dir"
+"""Folder that a command writes."""
 BELOW = ("pretrained_model", "checkpoints/last/pretrained_model")
 """Where a policy lies in the folder of a checkpoint, and of a run."""
 
@@ -51,9 +53,18 @@ def _check_places(arguments: Sequence[str]) -> None:
             if not Path(given).exists() and (flag in FOLDERS or not _may_be_on_the_hub(given)):
                 raise FileNotFoundError(errno.ENOENT, os.strerror(errno.ENOENT), f"{flag}={given}")
     for given in map(Path, values_of("--policy.path", arguments)):
-        inside = [given / below for below in BELOW if (given / below / "config.json").is_file()]
-        if inside and not (given / "config.json").is_file():
-            raise ValueError(f"--policy.path={given} is not a policy's own folder: take {inside[0]}")
+        if given.exists() and not (given / "config.json").is_file():
+            way_out = where_policy_is(given) or "name a checkpoint's pretrained_model"
+            raise ValueError(f"--policy.path={given} is not a policy's own folder: {way_out}")
+    for given in map(Path, values_of(RESULTS, arguments)):
+        if given.is_file():
+            raise NotADirectoryError(f"{RESULTS}={given} is a file; name a folder")
+
+
+def where_policy_is(folder: Path) -> str:
+    """What to take in place of the folder of a checkpoint or of a run; empty where it is neither."""
+    inside = [folder / below for below in BELOW if (folder / below / "config.json").is_file()]
+    return f"take {inside[0]}" if inside else ""
 
 
 def _may_be_on_the_hub(name: str) -> bool:

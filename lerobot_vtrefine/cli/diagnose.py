@@ -12,6 +12,7 @@ from lerobot_vtrefine.cli.arguments import CommandParser
 from lerobot_vtrefine.cli.errors import run_cli
 from lerobot_vtrefine.cli.formats import add_format_flags
 from lerobot_vtrefine.cli.outputs import staged
+from lerobot_vtrefine.wording import plural
 
 if TYPE_CHECKING:
     from lerobot_vtrefine.diagnose.core.diagnosis import Diagnosis
@@ -90,10 +91,21 @@ def check(options: argparse.Namespace) -> None:
     dataset = options.repo_id is not None or options.root is not None
     if (options.recording is not None) == dataset:
         raise ValueError("give either --recording=DIR, or --dataset.root and/or --dataset.repo_id")
+    _check_kind(options.recording, options.root)
     if options.seed < 0:
         raise ValueError(f"--seed must be at least 0, got {options.seed}")
     if options.stability < 0:
         raise ValueError(f"--stability must be at least 0, got {options.stability}")
+
+
+def _check_kind(recording: Path | None, root: Path | None) -> None:
+    """Raise where a source is of the other kind."""
+    if recording is not None and recording.is_file():
+        raise NotADirectoryError(f"--recording={recording} is a file; name the folder with recording.json")
+    if recording is not None and (recording / "meta" / "info.json").is_file():
+        raise ValueError(f"--recording={recording} is a LeRobot dataset: give --dataset.root={recording}")
+    if root is not None and (root / "recording.json").is_file():
+        raise ValueError(f"--dataset.root={root} is a recording set: give --recording={root}")
 
 
 def read(options: argparse.Namespace) -> "RecordingSet":
@@ -151,7 +163,7 @@ def summarise(found: "Diagnosis", output_dir: Path, survived: str) -> None:
     for issue in verdict.data_issues[:SHOWN_ISSUES]:
         print(f"{issue.trial or 'all recordings'}: {issue.problem} ({issue.action})")
     if (more := len(verdict.data_issues) - SHOWN_ISSUES) > 0:
-        print(f"{more} more problems of the data are in the report")
+        print(f"{plural(more, 'more problem')} of the data in the report")
     print(f"report: {output_dir / 'report.html'}")
 
 

@@ -38,6 +38,8 @@ _OPTIONAL_VALUE = re.compile(
 """How draccus begins where a flag may be left out, as if there were several types that it may have."""
 _UNKNOWN_FIELDS = re.compile(r"The fields ((?:`[^`]+`(?:, )?)+) are not valid for \w+")
 """What draccus says of a file's settings."""
+_WITHOUT_TYPE = re.compile("Expected a dict for a choice class, got (.*)")
+"""What it says of ``env: null``, as settings of lerobot-train have it, and of ``env: round``."""
 
 
 def describe(error: BaseException) -> str:
@@ -103,6 +105,9 @@ def _in_flags(message: str) -> str:
     """draccus speaks of Python classes; users type flags."""
     if "Expected a dict with a 'type' key" in message and "EnvConfig" in message:
         return "say which environment: --env.type=vtrefine or --config_path=vtrefine:NAME"
+    if found := _WITHOUT_TYPE.search(message):
+        where = "in the file of --config_path, a group that needs its type, as in env: {type: vtrefine}"
+        return f"{where}, is {found[1]}"
     if "Expected a dict with a 'type' key" in message and "PreTrainedConfig" in message:
         return "say which policy: --policy.path=FOLDER, a checkpoint's pretrained_model"
     if unknown := _UNKNOWN_FIELDS.search(message):
@@ -118,9 +123,13 @@ def _config_files_with(names: Sequence[str]) -> list[str]:
 
 
 def meant(message: str, known: Iterable[str]) -> str:
-    """Which flags were meant, for argparse's message about unknown ones; else where they are listed."""
+    """Which flags were meant, for argparse's message about unknown or missing ones; else where they are
+    listed.
+    """
     known = list(known)
-    typed = re.findall(r"--[\w.-]+", message.partition("unrecognized arguments")[2])
+    missing = message.startswith("the following arguments are required")  # perhaps because of a misspelt one
+    text = " ".join(sys.argv[1:]) if missing else message.partition("unrecognized arguments")[2]
+    typed = [flag for flag in re.findall(r"--[\w.-]+", text) if flag not in known]
     found = [name for flag in typed for name in get_close_matches(flag, known, 1)]
     return "".join(f"; did you mean {name}?" for name in found) or "; --help lists the flags"
 

@@ -20,6 +20,7 @@ from lerobot_vtrefine.drivers.discovery import (
 from lerobot_vtrefine.drivers.pads_file import save_pads
 from lerobot_vtrefine.drivers.ports import PortError, stable_path, stable_ports
 from lerobot_vtrefine.embodiments import DEFAULT_BODY, get_embodiment
+from lerobot_vtrefine.wording import plural
 
 DESCRIPTION = """\
 Find out which FlexiTac pad is on which serial port: the command asks for one pad after the other, you press
@@ -124,7 +125,8 @@ def ask(
     """
     if len(names) > len(boards):
         raise PortError(
-            f"{len(names)} pads asked for ({', '.join(names)}), but only {len(boards)} boards stream; "
+            f"{plural(len(names), 'pad')} asked for ({', '.join(names)}), but only"
+            f" {plural(len(boards), 'streaming board')} found; "
             "plug in the others, or name fewer with --names"
         )
     named: dict[str, PadConfig] = {}

@@ -20,6 +20,7 @@ from lerobot_vtrefine.datasets.importers.bam_logs import is_bam, read_bam, write
 from lerobot_vtrefine.datasets.importers.joint_episodes import write_dataset, write_recording_set
 from lerobot_vtrefine.datasets.importers.leflexitac import import_leflexitac, is_leflexitac
 from lerobot_vtrefine.embodiments import get_embodiment
+from lerobot_vtrefine.wording import plural
 
 FORMATS = (
     "the paper authors' .npz of commands and positions, a LeRobot v3 folder with LeFlexiTac's pads, or BAM's "
@@ -82,8 +83,8 @@ def _import_bam(config: ImportConfig) -> str:
         raise ValueError("BAM's logs become a recording set: give --recording_dir=DIR, and no --root")
     runs = read_bam(config.source)
     write_bam(runs, config.recording_dir)
-    gains = len({run.setting.kp for run in runs})
-    return f"{len(runs)} runs of {runs[0].setting.motor} at {gains} gains -> {config.recording_dir}"
+    gains = plural(len({run.setting.kp for run in runs}), "gain")
+    return f"{plural(len(runs), 'run')} of {runs[0].setting.motor} at {gains} -> {config.recording_dir}"
 
 
 def _import_npz(config: ImportConfig, root: Path) -> str:
@@ -100,7 +101,7 @@ def _import_npz(config: ImportConfig, root: Path) -> str:
     if config.recording_dir is not None:
         write_recording_set(episodes, joints, config.recording_dir, config.fps)
     frames = sum(len(episode.command) for episode in episodes)
-    return f"{len(episodes)} episodes, {frames} frames, no touch -> {root}"
+    return f"{plural(len(episodes), 'episode')}, {plural(frames, 'frame')}, no touch -> {root}"
 
 
 def _import_folder(config: ImportConfig, root: Path) -> str:
@@ -109,12 +110,12 @@ def _import_folder(config: ImportConfig, root: Path) -> str:
             "--recording_dir is for the npz only; vtrefine-diagnose reads the new dataset itself"
         )
     summary = import_leflexitac(config.source, root, config.pads)
-    lines = [f"{summary.episodes} episodes, {summary.frames} frames -> {root}"]
+    lines = [f"{plural(summary.episodes, 'episode')}, {plural(summary.frames, 'frame')} -> {root}"]
     if summary.normalised:
         lines.append(f"raw counts recovered for {', '.join(summary.normalised)}")
         lines += [
-            f"{pad}: exact but for {len(frames)} frames, which more than one scale fits: their contact may"
-            " have been stronger (meta/import.json lists them)"
+            f"{pad}: exact but for {plural(len(frames), 'frame')}, which more than one scale fits: their"
+            " contact may have been stronger (meta/import.json lists them)"
             for pad, frames in summary.ambiguous.items()
             if frames
         ]

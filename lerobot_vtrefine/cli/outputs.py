@@ -38,8 +38,19 @@ def check_file(flag: str, path: Path) -> None:
     """Raise OSError with the flag where a file cannot be written, before the work for it is done."""
     if path.is_dir():
         raise IsADirectoryError(f"{flag}={path} is a folder; name a file in it")
+    _try(path.parent, f"{flag}={path}")
+
+
+def check_folder(flag: str, path: Path) -> None:
+    """Raise OSError with the flag where no file can be written into a folder; make it where there is none."""
+    if path.exists() and not path.is_dir():
+        raise NotADirectoryError(f"{flag}={path} is a file; name a folder")
+    _try(path, f"{flag}={path}")
+
+
+def _try(folder: Path, told: str) -> None:
     try:
-        path.parent.mkdir(parents=True, exist_ok=True)
-        tempfile.TemporaryFile(dir=path.parent).close()
+        folder.mkdir(parents=True, exist_ok=True)
+        tempfile.TemporaryFile(dir=folder).close()
     except OSError as error:
-        raise OSError(error.errno, error.strerror, f"{flag}={path}") from error
+        raise OSError(error.errno, error.strerror, told) from error

@@ -20,6 +20,7 @@ from lerobot.utils.utils import init_logging
 
 from lerobot_vtrefine.choices import check_choice, check_port
 from lerobot_vtrefine.cli.errors import run_cli
+from lerobot_vtrefine.cli.outputs import check_folder
 from lerobot_vtrefine.cli.playing.agents import Agent, PolicyAgent, recorded_agent, scripted_agent
 from lerobot_vtrefine.cli.playing.session import Session
 from lerobot_vtrefine.cli.report.statistics import wilson_interval
@@ -102,6 +103,8 @@ def play(config: PlayConfig) -> list[dict]:
 
     if config.viewer == "browser":
         require("the live view (--viewer=none does without)", VIEW)
+    if config.record or config.video_dir != PlayConfig.video_dir:
+        check_folder("--video_dir", config.video_dir)
     agent, env, seed = _choose(config)
     world = LiveWorld(env)
     world.reset(seed)

@@ -7,6 +7,7 @@ from lerobot_vtrefine.cli.arguments import CommandParser
 from lerobot_vtrefine.cli.errors import run_cli
 from lerobot_vtrefine.cli.outputs import staged
 from lerobot_vtrefine.extras import SIMULATOR, require
+from lerobot_vtrefine.wording import plural
 
 DESCRIPTION = """\
 Record presses of a simulated pad with a hidden flaw, in the format that real recordings have. A sphere and
@@ -50,7 +51,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
 
     with staged(options.output_dir, ("recording.json",), overwrite=options.overwrite) as folder:
         record(options.reality, folder, options.trials, options.seed)
-    print(f"{options.trials} recordings in {options.output_dir}")
+    print(f"{plural(options.trials, 'recording')} in {options.output_dir}")
     print(f"next: vtrefine-diagnose --recording={options.output_dir} --output_dir=diagnosis")
 
 

@@ -7,7 +7,9 @@ Interrupted, the same command continues. With --push_to_hub=true --repo_id=USER/
 uploaded, with a card of its pads, its simulation and its seeds; repeated later, the command only uploads.
 """
 
+import errno
 import logging
+import os
 import shlex
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
@@ -30,6 +32,7 @@ from lerobot_vtrefine.envs.demo_workers import demonstration_stream
 from lerobot_vtrefine.envs.recording_note import simulation_settings
 from lerobot_vtrefine.sim.demonstrations import Degradation
 from lerobot_vtrefine.sim.truth import TRUTH_SIZE
+from lerobot_vtrefine.wording import plural
 
 HOPELESS_ATTEMPTS = 100
 """Attempts without a single success after which recording gives up."""
@@ -128,7 +131,7 @@ def record(config: RecordDemosConfig) -> int:
                 else:
                     demos.skip(demonstration.row["seed"])
                 attempts = demos.next_seed - config.seed
-                progress.set_postfix_str(f"{attempts} attempts", refresh=False)
+                progress.set_postfix_str(plural(attempts, "attempt"), refresh=False)
                 progress.update(int(kept))
                 if demos.num_episodes >= config.num_episodes:
                     break
@@ -145,7 +148,7 @@ def next_steps(config: RecordDemosConfig) -> str:
     env = config.env
     assert isinstance(env, VtRefineEnvConfig)
     root = shlex.quote(str(config.root))
-    train = f"lerobot-train --dataset.repo_id={config.repo_id} --dataset.root={root}"
+    train = f"lerobot-train --dataset.repo_id={shlex.quote(config.repo_id)} --dataset.root={root}"
     if env.scene.embodiment == DEFAULT_BODY:
         train += " --config_path=vtrefine:vt_dp3_pads"
     else:  # whose pads the shipped encoder has never felt
@@ -159,10 +162,15 @@ def next_steps(config: RecordDemosConfig) -> str:
 def _main(config: RecordDemosConfig) -> None:
     with after_interrupt("what was recorded is kept; the same command goes on"):
         count = record(config)
-    print(f"{count} episode{'s' * (count != 1)} in {config.root}\n{next_steps(config)}")
+    print(f"{plural(count, 'episode')} in {config.root}\n{next_steps(config)}")
     if config.push_to_hub:
         push_dataset(config.root, config.repo_id, private=config.private)
         print(f"{config.root} -> {config.repo_id}")
+
+
+def _not_of_a_full_disk(record: logging.LogRecord) -> bool:
+    """LeRobot tells of every image that a full disk does not take; saving the episode tells of it once."""
+    return os.strerror(errno.ENOSPC) not in record.getMessage()
 
 
 @run_cli
@@ -170,6 +178,7 @@ def main() -> None:
     """Console entry point."""
     init_logging()
     logging.getLogger("PIL").setLevel(logging.INFO)  # or it reports every tag of every depth image
+    logging.getLogger("lerobot.datasets.image_writer").addFilter(_not_of_a_full_disk)
     _main()
 
 

@@ -4,6 +4,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from lerobot_vtrefine.cli.arguments import CommandParser
+from lerobot_vtrefine.cli.checks import where_policy_is
 from lerobot_vtrefine.cli.errors import run_cli
 from lerobot_vtrefine.cli.hub import check_upload, is_checkpoint
 
@@ -43,7 +44,8 @@ def main(arguments: Sequence[str] | None = None) -> None:
         raise FileNotFoundError(f"{folder}: no such folder")
     policy = is_checkpoint(folder)
     if not policy and not (folder / "meta" / "info.json").is_file():
-        raise ValueError(f"{folder} is neither a LeRobotDataset (meta/info.json) nor a checkpoint")
+        way_out = where_policy_is(folder) or "name one of them"
+        raise ValueError(f"{folder} is neither a LeRobotDataset (meta/info.json) nor a checkpoint: {way_out}")
     if not policy and options.evaluation is not None:
         raise ValueError("--evaluation is about policies; leave it out for a dataset")
     check_upload(options.repo_id)

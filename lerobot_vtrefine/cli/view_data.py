@@ -16,6 +16,7 @@ from lerobot_vtrefine.cli.errors import run_cli
 from lerobot_vtrefine.cli.outputs import check_file
 from lerobot_vtrefine.embodiments import pad_layout_of
 from lerobot_vtrefine.tactile.layout import PadLayout
+from lerobot_vtrefine.wording import plural
 
 DESCRIPTION = """\
 Show a tactile dataset on one timeline in the rerun viewer: pads, the point cloud that the policy gets, depth,
@@ -74,7 +75,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     if options.save is not None and shutil.disk_usage(options.save.parent).free < LEAST_FREE_BYTES:
         raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC), str(options.save))  # rerun only logs it
     where = f" -> {options.save}" if options.save is not None else ""
-    print(f"{len(shown)} episode{'' if len(shown) == 1 else 's'}, {frames} frames{where}")
+    print(f"{plural(len(shown), 'episode')}, {plural(frames, 'frame')}{where}")
     if options.save is not None:
         print(f"open it: rerun {shlex.quote(str(options.save))}")
 

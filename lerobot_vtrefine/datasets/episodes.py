@@ -16,6 +16,7 @@ from lerobot_vtrefine.datasets.features import ACTION_KEY, BASELINE_PREFIX, STAT
 from lerobot_vtrefine.embodiments import embodiment_of_robot
 from lerobot_vtrefine.files import decode, limits, read_json
 from lerobot_vtrefine.files.tables import read_columns
+from lerobot_vtrefine.wording import plural
 
 
 @dataclass(frozen=True)
@@ -121,7 +122,9 @@ class EpisodeFolder:
         width = 1 if key == "timestamp" else self.num_joints
         values = self._matrix(index, key, table).astype(np.float64)
         if values.shape[1] != width:
-            raise ValueError(f"{self.root}: episode {index}: {key} has {values.shape[1]} values, not {width}")
+            raise ValueError(
+                f"{self.root}: episode {index}: {key} has {plural(values.shape[1], 'value')}, not {width}"
+            )
         if not np.isfinite(values).all():
             frame, joint = np.argwhere(~np.isfinite(values))[0]
             name = self.joints[joint] if len(self.joints) == values.shape[1] else f"number {joint}"

@@ -324,10 +324,10 @@ class _Table:
         if not is_list:
             if width == 1 and (pa.types.is_integer(kind) or pa.types.is_floating(kind)):
                 return self.scalar(name)[:, None]
-            raise self.fail(name, f"must hold lists of {width} numbers, not {kind}")
+            raise self.fail(name, f"must hold lists of length {width}, not {kind}")
         inner = kind.value_type
         if not (pa.types.is_integer(inner) or pa.types.is_floating(inner)):
-            raise self.fail(name, f"must hold lists of {width} numbers, not {kind}")
+            raise self.fail(name, f"must hold lists of length {width}, not {kind}")
         if column.null_count:
             frame = int(np.flatnonzero(column.is_null().to_numpy(zero_copy_only=False))[0])
             raise self.fail(name, f"frame {frame} is empty")

@@ -16,6 +16,7 @@ from pathlib import Path
 from types import TracebackType
 from typing import Any, Self
 
+import pyarrow.parquet as pq
 from lerobot.datasets.io_utils import SuppressProgressBars
 from lerobot.datasets.lerobot_dataset import LeRobotDataset
 
@@ -34,6 +35,7 @@ from lerobot_vtrefine.folders import (
 from lerobot_vtrefine.interrupts import interrupts_wait
 from lerobot_vtrefine.lerobot_compat.codec_priority import ordinary_priority
 from lerobot_vtrefine.lerobot_compat.fast_saving import fast_saving
+from lerobot_vtrefine.wording import plural
 
 LEDGER = NOTE
 INFO = Path("meta") / "info.json"
@@ -167,10 +169,9 @@ class DemoDataset:
         full = disk_is_full(error, self._place)
         self.rollback()
         if full:
-            saved = self.num_episodes
             raise OSError(
-                f"the disk is full: the {saved} episodes saved in {self.root} stay readable;"
-                " free some space and run the same command to continue"
+                f"the disk is full: {self.root} keeps {plural(self.num_episodes, 'episode')};"
+                " free some space and run the same command, which records the others again"
             ) from error
 
     def _open(self) -> LeRobotDataset:
@@ -239,7 +240,7 @@ def disk_is_full(error: BaseException | None, folder: Path) -> bool:
     while not folder.exists():
         folder = folder.parent
     status = os.statvfs(folder)
-    return status.f_bavail * status.f_frsize < 2**20
+    return status.f_blocks > 0 and status.f_bavail * status.f_frsize < 2**20  # /proc has no blocks
 
 
 def _read_ledger(root: Path) -> dict[str, Any]:
@@ -257,6 +258,7 @@ def _read_ledger(root: Path) -> dict[str, Any]:
             and isinstance(ledger["next_seed"], int)
             and [row["episode_index"] for row in ledger["episodes"]] == list(range(episodes))
             and ledger["files"] == _parquet_files(root)
+            and all(pq.read_metadata(root / name).num_rows for name in ledger["files"])
         )
     except (OSError, ValueError, KeyError, TypeError, RecursionError):
         whole = False

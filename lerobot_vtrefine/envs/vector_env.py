@@ -15,6 +15,7 @@ from lerobot_vtrefine.envs.episodes import Array, ControlStep, Episodes
 from lerobot_vtrefine.envs.factory import make_episodes
 from lerobot_vtrefine.envs.rendering import EvalFrame, FrameSource, LazyFrames, eval_frame
 from lerobot_vtrefine.envs.spaces import action_space, observation_space
+from lerobot_vtrefine.wording import plural
 
 Observation = dict[str, Any]
 SEED_LIMIT = 2**31
@@ -129,7 +130,7 @@ class VtRefineVectorEnv(gym.vector.VectorEnv[Observation, Array, Array]):
             self._np_random, self._np_random_seed = np_random(int(seed))
             return int(seed) + np.arange(self.num_envs)
         if len(seed) != self.num_envs:
-            raise ValueError(f"got {len(seed)} seeds for {self.num_envs} environments")
+            raise ValueError(f"got {plural(len(seed), 'seed')} for {plural(self.num_envs, 'environment')}")
         drawn = self.np_random.integers(SEED_LIMIT, size=self.num_envs)
         return np.array([d if s is None else s for s, d in zip(seed, drawn, strict=True)], np.int64)
 

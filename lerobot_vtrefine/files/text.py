@@ -16,6 +16,8 @@ import yaml
 from yaml.composer import ComposerError
 from yaml.constructor import ConstructorError
 
+from lerobot_vtrefine.wording import plural
+
 MAX_JSON_BYTES = 8 << 20
 MAX_YAML_BYTES = 64 << 10
 """PyYAML takes about a second for this much."""
@@ -125,7 +127,7 @@ def _lines(path: Path) -> Iterator[tuple[int, str]]:
 
 def _number_row(names: list[str], row: list[str]) -> dict[str, float]:
     if len(row) != len(names):
-        raise ValueError(f"{len(row)} values for {len(names)} columns")
+        raise ValueError(f"{plural(len(row), 'value')} for {plural(len(names), 'column')}")
     return {name: float(value) for name, value in zip(names, row, strict=True) if value}
 
 

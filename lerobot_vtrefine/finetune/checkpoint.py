@@ -23,6 +23,7 @@ from lerobot.utils.random_utils import deserialize_rng_state, serialize_rng_stat
 from lerobot_vtrefine.finetune.distributed import barrier, num_ranks, rank_index
 from lerobot_vtrefine.finetune.dppo import TrainState
 from lerobot_vtrefine.finetune.state_file import load_state, save_state
+from lerobot_vtrefine.wording import plural
 
 STATE_NAME = "dppo_state.safetensors"
 
@@ -100,7 +101,9 @@ def load_training_state(checkpoint: Path, state: TrainState) -> None:
         raise FileNotFoundError(f"{path} is missing: this is not a checkpoint of this vtrefine-finetune")
     saved = load_state(path)
     if len(saved["ranks"]) != num_ranks():
-        raise ValueError(f"{checkpoint} was written by {len(saved['ranks'])} processes: resume with as many")
+        raise ValueError(
+            f"{checkpoint} was written by {plural(len(saved['ranks']), 'process')}: resume with as many"
+        )
     state.critic.load_state_dict(saved["critic"])
     state.actor_optimizer.load_state_dict(saved["actor_optimizer"])
     state.critic_optimizer.load_state_dict(saved["critic_optimizer"])

@@ -92,6 +92,11 @@ class FinetunePipelineConfig:
     # artifacts are uploaded, so disable_artifact changes nothing.
     wandb: WandBConfig = field(default_factory=WandBConfig)
 
+    def __post_init__(self) -> None:
+        for name in ("seed", "eval_freq", "save_freq"):
+            if getattr(self, name) < 0:
+                raise ValueError(f"--{name} must not be negative, got {getattr(self, name)}")
+
     @classmethod
     def __get_path_fields__(cls) -> list[str]:
         """Let LeRobot's parser take ``--policy.path``."""
@@ -214,10 +219,11 @@ def checked_env(env: EnvConfig) -> VtRefineEnvConfig:
 def make_practice(policy: VtDp3Policy, path: Path, env: EnvConfig, dppo: DppoConfig) -> Practice:
     """Agent, environments of this rank and the processors that were saved beside the policy in ``path``.
 
-    Raises: ValueError for another environment type.
+    Raises: ValueError for another environment type, or another control rate than the policy learned.
     """
     env = checked_env(env)
     config = policy.config
+    config.check_fps(env.fps)
     overrides = {"device_processor": {"device": config.device or "cpu"}}
     processors = make_pre_post_processors(config, str(path), preprocessor_overrides=overrides)
     agent = make_agent(policy, dppo)

@@ -24,6 +24,7 @@ from lerobot_vtrefine.datasets.features import (
 )
 from lerobot_vtrefine.datasets.simulation_card import describe_simulation
 from lerobot_vtrefine.lerobot_compat.guard import is_supported
+from lerobot_vtrefine.wording import plural
 
 if TYPE_CHECKING:
     from lerobot.datasets.dataset_metadata import LeRobotDatasetMetadata
@@ -63,8 +64,9 @@ def describe(meta: "LeRobotDatasetMetadata") -> str:
 def _summary(meta: "LeRobotDatasetMetadata") -> str:
     robot = f", of the robot `{meta.robot_type}`" if meta.robot_type else ""
     tasks = "; ".join(map(str, meta.tasks.index)) if meta.tasks is not None else ""
+    size = f"{plural(meta.total_episodes, 'episode')}, {plural(meta.total_frames, 'frame')}"
     return (
-        f"{meta.total_episodes} episodes, {meta.total_frames} frames at {meta.fps} frames/s, with "
+        f"{size} at {meta.fps} frames/s, with "
         f"{len(pad_names(meta.features))} FlexiTac tactile pads{robot}. Tasks: {tasks}.{_simulated(meta)}\n\n"
         "It loads with LeRobot alone; the plugin `lerobot_vtrefine` trains visuo-tactile policies on it."
     )

@@ -32,6 +32,7 @@ from lerobot_vtrefine.datasets.footers import read_without_footer
 from lerobot_vtrefine.lerobot_compat.episode_rows import Row, describe_episodes, video_keys, video_length_s
 from lerobot_vtrefine.lerobot_compat.safe_metadata import write_info, write_stats
 from lerobot_vtrefine.whole_files import PART, whole_file
+from lerobot_vtrefine.wording import plural
 
 logger = logging.getLogger(__name__)
 
@@ -54,13 +55,13 @@ class Recovery:
     """Files that were moved out of it."""
 
     def __str__(self) -> str:
-        text = f"{self.root} holds {self.episodes} episodes, {self.frames} frames"
+        text = f"{self.root} holds {plural(self.episodes, 'episode')}, {plural(self.frames, 'frame')}"
         if self.episodes > self.announced:
             text += f"; {self.episodes - self.announced} more than the session before had time to count"
         if self.episodes < self.announced:
             text += f"; {self.announced - self.episodes} that were counted cannot be read"
         if self.aside:
-            text += f"; {self.aside} unreadable files were moved to {_aside(self.root)}"
+            text += f"; {plural(self.aside, 'unreadable file')} moved to {_aside(self.root)}"
         return text
 
 

@@ -38,6 +38,7 @@ from lerobot_vtrefine.lerobot_compat.safe_metadata import (
     write_table,
     write_tasks,
 )
+from lerobot_vtrefine.wording import plural
 
 logger = logging.getLogger(__name__)
 
@@ -120,13 +121,13 @@ def _check_images(episode: dict[str, Any], meta: LeRobotDatasetMetadata) -> None
         missing = [path for path in episode[key] if path is not None and not Path(path).is_file()]
         if missing:
             full = shutil.disk_usage(meta.root).free < 2**20
-            problem = f"{len(missing)} images could not be written, the first is {missing[0]}"
+            problem = f"{plural(len(missing), 'image')} could not be written, the first is {missing[0]}"
             raise OSError(errno.ENOSPC if full else errno.EIO, problem)
 
 
 def _disk_is_full(meta: LeRobotDatasetMetadata) -> str:
     return (
-        f"the disk is full: the {meta.total_episodes} episodes saved in {meta.root} stay readable;"
+        f"the disk is full: {meta.root} keeps {plural(meta.total_episodes, 'episode')};"
         f" free some space and go on with --resume=true --dataset.root={meta.root}"
     )
 

@@ -4,6 +4,8 @@ from typing import Any
 
 from jinja2 import ChoiceLoader, Environment, PackageLoader, StrictUndefined
 
+from lerobot_vtrefine.wording import plural
+
 
 def render(package: str, template: str, **values: Any) -> str:
     """A template of a package as HTML text; a value that the template needs and does not get is an error."""
@@ -14,4 +16,5 @@ def render(package: str, template: str, **values: Any) -> str:
         trim_blocks=True,
         lstrip_blocks=True,
     )
+    environment.filters["plural"] = plural
     return environment.get_template(template).render(**values)

@@ -36,6 +36,7 @@ from lerobot_vtrefine.lerobot_compat.arrays import ArraySpec
 from lerobot_vtrefine.robots.config_vtrefine_sim import VtRefineSimConfig
 from lerobot_vtrefine.robots.extensions import extend_lerobot
 from lerobot_vtrefine.robots.simulated_pace import Pace
+from lerobot_vtrefine.wording import plural
 
 if TYPE_CHECKING:
     from lerobot_vtrefine.envs.live_world import LiveWorld
@@ -273,4 +274,5 @@ def describe(row: dict[str, Any]) -> str:
     """An episode's outcome in a few words."""
     if row["success"] and row["failure"] == "none":
         return f"success after {row['time_to_success_s']:.1f} s (seed {row['seed']})"
-    return f"no success, {row['failure'].replace('_', ' ')} after {row['steps']} steps (seed {row['seed']})"
+    steps = plural(row["steps"], "step")
+    return f"no success, {row['failure'].replace('_', ' ')} after {steps} (seed {row['seed']})"

@@ -20,6 +20,7 @@ from lerobot_vtrefine.observation import VisuoTactileConfig, build_visuo_tactile
 from lerobot_vtrefine.sim.menagerie_meshes import DrawnWorld
 from lerobot_vtrefine.sim.pads import pad_layout
 from lerobot_vtrefine.tactile.picture import FULL_SCALE, colours
+from lerobot_vtrefine.wording import plural
 
 TAXEL_PX, GAP_PX = 5, 8
 MOST_PICTURES_HZ = 20.0
@@ -106,7 +107,7 @@ class BrowserView:
 
     def describe(self) -> str:
         """How many pictures were drawn, and what one costs the simulation."""
-        return f"drew {len(self.drawing_s)} pictures, {1e3 * np.median(self.drawing_s):.0f} ms each"
+        return f"drew {plural(len(self.drawing_s), 'picture')}, {1e3 * np.median(self.drawing_s):.0f} ms each"
 
     def close(self) -> None:
         """Take the page away."""

@@ -93,7 +93,7 @@ def test_results_are_not_overwritten(
     [
         ((2e-3,), (2e-4, 4e-4, 6e-4, 8e-4), (), "k_d is not identifiable"),
         ((1e-3, 3e-3, 9e-3, 12e-3), (5e-4,), (), "all presses reach 0.50 mm"),
-        ((1e-3, 4e-3), (3e-4,), (), "2 usable recordings give no uncertainty"),
+        ((1e-3, 4e-3), (3e-4,), (), "no uncertainty from 2 usable recordings"),
         ((1e-3, 4e-3), (3e-4, 6e-4), ("--readout_only", "--static"), "--readout_only fits neither"),
         ((1e-3, 4e-3), (3e-4, 6e-4), ("--k_n=-3",), "--k_n must be a positive number"),
         ((1e-3, 4e-3), (3e-4, 6e-4), ("--seed=-1",), "--seed must be at least 0"),

@@ -185,10 +185,16 @@ def test_a_missing_column_is_named(tmp_path, engine, capsys, column):
         (["--recording=a", "--output_dir=x", "--seed=one"], "seed"),
         (["--recording=a", "--output_dir=x", "--seed=-1"], "--seed must be"),
         (["--recording=a", "--output_dir=x", "--rec=b"], "--rec=b"),
+        (["--recording=data", "--output_dir=x"], "is a LeRobot dataset: give --dataset.root=data"),
+        (["--dataset.root=set", "--output_dir=x"], "is a recording set: give --recording=set"),
+        (["--recording=set/recording.json", "--output_dir=x"], "is a file; name the folder"),
     ],
 )
 def test_bad_flags_are_one_line(tmp_path, monkeypatch, capsys, arguments, words):
     monkeypatch.chdir(tmp_path)
+    for file in (Path("data/meta/info.json"), Path("set/recording.json")):
+        file.parent.mkdir(parents=True)
+        file.write_text("{}")
     assert diagnose.main(arguments) == 2
     assert words in last_error(capsys)
 

@@ -11,6 +11,7 @@ import pytest
 import safetensors
 import torch
 
+from lerobot_vtrefine.cli import diagnose
 from lerobot_vtrefine.cli.errors import after_interrupt, run_cli
 from lerobot_vtrefine.cli.pipeline.demo_config import DemoConfig
 from lerobot_vtrefine.cli.play import PlayConfig
@@ -120,12 +121,27 @@ def test_flags_that_are_misspelt_or_lack_their_type_are_one_line(config, typed, 
     assert error.startswith(f"error: {line}")
 
 
+def test_a_misspelt_flag_that_is_required_is_named(monkeypatch, capsys) -> None:
+    monkeypatch.setattr(sys, "argv", ["vtrefine-diagnose", "--recording=presses", "--output-dir=out"])
+    assert diagnose.main() == 2
+    told = "error: the following arguments are required: --output_dir; did you mean --output_dir?\n"
+    assert capsys.readouterr().err == told
+
+
 def test_settings_that_a_file_should_not_have_are_told_with_the_file(monkeypatch, tmp_path, capsys) -> None:
     file = tmp_path / "settings.yaml"
     file.write_text("num_epsodes: 3\n")
     monkeypatch.setattr(sys, "argv", ["command", f"--config_path={file}"])
     assert run_cli(lambda: draccus.parse(Flags, file, args=[]) and None)() == 2
     assert capsys.readouterr().err == f"error: {file}: The fields `num_epsodes` are not valid for Flags\n"
+
+
+def test_a_group_without_its_type_in_a_file_is_told_as_such(monkeypatch, tmp_path, capsys) -> None:
+    file = tmp_path / "train_config.json"  # as lerobot-train writes it
+    file.write_text('{"env": null}')
+    assert run_cli(lambda: draccus.parse(FinetunePipelineConfig, file, args=[]) and None)() == 2
+    told = "error: in the file of --config_path, a group that needs its type, as in env: {type: vtrefine}, is"
+    assert capsys.readouterr().err == f"{told} None\n"
 
 
 def test_a_network_that_does_not_answer_is_one_line(capsys) -> None:

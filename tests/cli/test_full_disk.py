@@ -43,7 +43,7 @@ def test_full_disk_is_one_line_and_saved_episodes_stay_readable(tmp_path: Path) 
         pytest.skip(f"no file system of its own here: {done.stderr.strip().splitlines()[-1]}")
     assert done.returncode == 2
     line = done.stderr.strip().splitlines()[-1]
-    assert line.startswith("error: the disk is full: the 20 episodes saved in disk/demos stay readable")
+    assert line.startswith("error: the disk is full: disk/demos keeps 20 episodes;")
     dataset = LeRobotDataset("local/vtrefine_demos", root=tmp_path / "kept")
     assert dataset.num_episodes == 20
     assert int(dataset[len(dataset) - 1]["episode_index"]) == 19

@@ -158,6 +158,12 @@ def test_a_flag_may_stand_in_a_file_or_name_what_lies_below_it(tmp_path: Path) -
         (launch.play, ["--policy.path=a/b/c"], "No such file or directory: --policy.path=a/b/c"),
         (launch.play, ["--config_path", "no.yaml"], "No such file or directory: --config_path=no.yaml"),
         (launch.replay, ["--dataset.root=a/b"], "No such file or directory: --dataset.root=a/b"),
+        (
+            launch.finetune,
+            ["--policy.path=docs"],
+            "--policy.path=docs is not a policy's own folder: name a checkpoint's pretrained_model",
+        ),
+        (launch.replay, ["--output_dir=README.md"], "--output_dir=README.md is a file; name a folder"),
     ],
 )
 def test_what_is_wrong_with_a_command_line_is_told_before_lerobot_is_loaded(

@@ -18,6 +18,7 @@ from lerobot_vtrefine.cli.playing.session import Session
 from lerobot_vtrefine.cli.record_demos import RecordDemosConfig, record
 from lerobot_vtrefine.envs import VtRefineEnvConfig
 from lerobot_vtrefine.envs.live_world import LiveWorld
+from lerobot_vtrefine.shipped import policies
 
 BROWSERS = ("chromium", "chromium-browser", "google-chrome", "chrome")
 ENV = VtRefineEnvConfig(start="grasped", num_threads=1, episode_steps=48)
@@ -60,12 +61,20 @@ def test_episodes_are_filmed(tmp_path: Path, capsys: pytest.CaptureFixture[str])
         ({"port": 99999}, "--port must lie between 1 and 65535, got 99999"),
         ({"viewer": "window"}, "--viewer=window is unknown"),
         ({"dataset": EpisodeSource(Path("nowhere"))}, "nowhere holds no LeRobot dataset"),
+        ({"video_dir": Path("README.md")}, "--video_dir=README.md is a file; name a folder"),
+        ({"video_dir": Path("/proc/films")}, "No such file or directory: '--video_dir=/proc/films'"),
     ],
 )
 def test_wrong_flags_are_one_line(settings: dict, words: str, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("HF_HUB_OFFLINE", "1")
     with pytest.raises((ValueError, OSError), match=re.escape(words)):
         played(**settings)
+
+
+def test_the_shipped_policy_plays_at_the_rate_it_learned_alone() -> None:
+    (path,) = policies().values()
+    with pytest.raises(ValueError, match=r"--env\.fps=20, but the policy learned 10 actions a second"):
+        played(policy=PolicySource(str(path)), env=VtRefineEnvConfig(start="grasped", fps=20))
 
 
 def test_looks_alone_do_not_choose_what_is_played() -> None:

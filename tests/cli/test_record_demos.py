@@ -1,5 +1,6 @@
 import errno
 import json
+import os
 import shutil
 from pathlib import Path
 
@@ -176,6 +177,22 @@ def test_other_settings_are_refused(demos: Path, tmp_path, capsys):
     same(demos, tmp_path / "copy")
 
 
+def test_full_disk_at_the_first_image_is_one_line_and_the_command_goes_on(tmp_path, capsys, monkeypatch):
+    def full(*args: object, **kwargs: object) -> None:
+        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+
+    root, sizes = tmp_path / "demos", ("--num_episodes=1", "--num_envs=1")
+    with monkeypatch.context() as patch:
+        patch.setattr("PIL.Image.Image.save", full)
+        patch.setattr("lerobot_vtrefine.envs.demo_dataset.disk_is_full", lambda *_: True)
+        assert record(root, *sizes) == 2
+    told = capsys.readouterr().err
+    assert f"error: the disk is full: {root} keeps 0 episodes; free some space" in told
+    assert "Error writing image" not in told
+    assert record(root, *sizes) == 0
+    assert "1 episode in" in capsys.readouterr().out
+
+
 def test_full_disk_is_one_line_and_keeps_the_episodes(demos: Path, tmp_path, capsys, monkeypatch):
     root = tmp_path / "copy"
     shutil.copytree(demos, root)
@@ -185,5 +202,5 @@ def test_full_disk_is_one_line_and_keeps_the_episodes(demos: Path, tmp_path, cap
 
     monkeypatch.setattr("pyarrow.parquet.ParquetWriter.write_table", full)
     assert record(root, "--num_episodes=4", "--num_envs=1", "--seed=5") == 2
-    assert "disk is full: the 3 episodes saved" in capsys.readouterr().err
+    assert "keeps 3 episodes; free some space and run the same command" in capsys.readouterr().err
     same(demos, root)

@@ -105,7 +105,7 @@ def test_what_cannot_be_replayed(joints_only: Path, tmp_path: Path, change: dict
 def test_the_twin_runs_at_the_datasets_rate(tmp_path: Path) -> None:
     still = np.tile(ROBOT.home, (4, 1)).astype(np.float32)
     write_dataset([JointEpisode(still, still)], ROBOT.joint_names, tmp_path / "fast", "local/fast", 30, "x")
-    with pytest.raises(ValueError, match="none of 1 episodes can be replayed"):
+    with pytest.raises(ValueError, match="none of 1 episode can be replayed"):
         replay(ReplayConfig(tmp_path / "out", SourceConfig(tmp_path / "fast"), parts="grasp"))
 
 
@@ -187,7 +187,7 @@ def test_notes_of_other_recordings_are_refused(demos: Path, tmp_path: Path) -> N
         with pytest.raises(ValueError, match=message):
             replay(ReplayConfig(tmp_path / "out", SourceConfig(copy)))
 
-    refuse({**whole, "episodes": whole["episodes"][:1]}, "notes 1 episodes, the dataset has 2: it was edited")
+    refuse({**whole, "episodes": whole["episodes"][:1]}, "notes 1 episode, the dataset has 2: it was edited")
     edited = ReplayConfig(tmp_path / "arms", SourceConfig(copy), parts="none")
     assert replay(edited).touch == []  # the arms alone need no starts
     refuse({"episodes": []}, "is not a note of vtrefine-record-demos")

@@ -142,7 +142,7 @@ def test_bad_input_is_one_line_and_nothing_is_pushed(
         ([str(policy), "--repo_id=local/demos"], "give a name on the Hub"),
         ([str(policy), "--repo_id=insertion"], "give a name on the Hub"),
         ([str(tmp_path / "nowhere"), NAME], "no such folder"),
-        ([str(tmp_path), NAME], "neither a LeRobotDataset"),
+        ([str(tmp_path), NAME], f"nor a checkpoint: take {policy}"),
         ([str(policy), NAME, f"--evaluation={tmp_path}"], "run lerobot-eval with --env.metrics_path"),
         ([str(policy), NAME, f"--evaluation={mixed}"], "is not of one evaluation"),
     )

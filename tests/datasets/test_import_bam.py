@@ -42,7 +42,7 @@ def write_logs(folder: Path) -> Path:
 def test_runs_become_trials_with_their_plant_and_gain(tmp_path: Path, kind: str) -> None:
     source = write_npz(tmp_path / "bam.npz") if kind == "npz" else write_logs(tmp_path / "logs")
     said = import_dataset(ImportConfig(source, recording_dir=tmp_path / "set"))
-    assert "4 runs of xl330 at 1 gains" in said
+    assert "4 runs of xl330 at 1 gain" in said
     found = read_recording_set(tmp_path / "set")
     assert check_quality(found)[1] == []
     trial = found.trials[2]

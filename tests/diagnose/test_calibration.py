@@ -108,7 +108,7 @@ def test_too_few_recordings_and_other_kinds_are_refused(tmp_path: Path) -> None:
     from dataclasses import replace
 
     recordings = recorded(tmp_path / "set", 6)
-    with pytest.raises(ValueError, match="3 usable recordings give no uncertainty: record at least 4"):
+    with pytest.raises(ValueError, match="no uncertainty from 3 usable recordings: record at least 4"):
         calibrate(replace(recordings, trials=recordings.trials[:3]), Wanted())
     lifted = [replace(trial, depth_m=trial.depth_m - 0.01) for trial in recordings.trials]
     with pytest.raises(ValueError, match=r"never touches the pad|no usable recording"):

@@ -248,7 +248,7 @@ def test_sceptic_sees_weak_evidence(pad_set):
     weak = type(base.heldout)("rmse", 4.1, 4.0, 2.3, 0.05, (-0.02, 0.1), base.heldout.trials[:3])
     text = text_of(page(pad_diagnosis(heldout=weak), pad_set))
     assert "interval of the gain includes zero" in text
-    assert "Only 3 recordings were held out" in text
+    assert "Only 3 held-out recordings:" in text
     assert "neither repaired nor noise" in text
 
 

@@ -129,7 +129,7 @@ def test_full_disk_keeps_what_was_committed(tmp_path, small_commits, monkeypatch
             broken.setattr(where, raise_full)
             demos.append(demonstration(5))
 
-    with pytest.raises(OSError, match=r"4 episodes saved .* stay readable"):
+    with pytest.raises(OSError, match=r"the disk is full: .* keeps 4 episodes; free"):
         record()
     assert read(root).num_episodes == 4
     assert len([read(root)[index] for index in range(12)]) == 12
@@ -155,7 +155,7 @@ def test_full_disk_while_setting_copies_aside_keeps_what_was_committed(tmp_path,
 
     with monkeypatch.context() as broken:
         broken.setattr(demo_dataset.shutil, "copyfile", truncate)
-        with pytest.raises(OSError, match=r"1 episodes saved .* stay readable"):
+        with pytest.raises(OSError, match=r"the disk is full: .* keeps 1 episode; free"):
             continue_recording()
     assert read(root).num_episodes == 1
     continue_recording()
@@ -224,7 +224,7 @@ def test_full_disk_before_the_first_commit_leaves_nothing(tmp_path, monkeypatch)
             monkeypatch.setattr(LeRobotDataset, "save_episode", raise_full)
             demos.append(demonstration(1))
 
-    with pytest.raises(OSError, match="disk is full: the 0 episodes"):
+    with pytest.raises(OSError, match=r"the disk is full: .* keeps 0 episodes; free"):
         record()
     assert list(tmp_path.iterdir()) == []
 
@@ -330,6 +330,7 @@ def test_every_commit_loads_while_the_next_one_is_recorded(tmp_path, small_commi
         ("info.json", ""),
         ("info.json", "\x00"),
         ("info.json", None),
+        ("../data/chunk-000/file-000.parquet", "PAR1"),
     ],
 )
 def test_a_damaged_record_is_one_line_and_nothing_is_removed(tmp_path, file, damaged) -> None:

@@ -241,6 +241,7 @@ def test_bad_input_is_one_clear_line(finetune, tmp_path, capsys):
 
     assert "--dppo.num_envs must be positive" in complaint("--dppo.num_envs=0")
     assert "within" in complaint("--dppo.sampler_steps=5", "--dppo.ft_denoising_steps=40")
+    assert "--seed must not be negative, got -1" in complaint("--seed=-1")
     assert "ddpm, ddim, tail" in complaint("--dppo.sampler=euler")
     missing = tmp_path / "nowhere"
     assert f"no checkpoint at --policy.path={missing}" in complaint(policy=missing)
@@ -266,6 +267,13 @@ def test_bad_tasks_are_one_clear_line(finetune, tmp_path, capsys, monkeypatch, f
     monkeypatch.setattr(pipeline, "make_decision_env", make_decision_env)
     assert finetune(tmp_path / "bad", *flags) == 2
     assert words in capsys.readouterr().err.strip().splitlines()[-1]
+
+
+def test_another_control_rate_than_the_policy_learned_is_refused(finetune, tmp_path, capsys):
+    assert finetune(tmp_path / "bad", "--env.fps=20", "--policy.fps=10") == 2
+    assert "the policy learned 10 actions a second: give --env.fps=10" in capsys.readouterr().err
+    assert finetune(tmp_path / "good", "--env.fps=20", "--policy.fps=20", iterations=1) == 0
+    assert finetune(tmp_path / "old", "--env.fps=20", iterations=1) == 0  # a checkpoint that does not say
 
 
 def test_policy_of_another_type_is_refused(finetune, tmp_path, capsys):

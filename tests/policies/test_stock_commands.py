@@ -87,6 +87,7 @@ def test_training_writes_a_checkpoint_that_loads(trained: Path) -> None:
     policy = VtDp3Policy.from_pretrained(trained / "checkpoints" / "last" / "pretrained_model", strict=True)
     assert policy.config.point_dims == (8, 16)
     assert policy.config.observation.pool_rows == 2
+    assert policy.config.fps == 10
     assert average_steps(trained / "checkpoints" / "000010") == 10
 
 

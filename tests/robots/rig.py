@@ -67,6 +67,12 @@ def allow_slow_answers(patch: pytest.MonkeyPatch) -> None:
     patch.setattr("dynamixel_sdk.port_handler.LATENCY_TIMER", 250)
 
 
+def take_motors_off(rig: Rig, bus: str, patch: pytest.MonkeyPatch) -> None:
+    """All motors of a bus fall silent; from then on the SDK waits 52 ms, as nothing here can answer late."""
+    rig.buses[bus].motors.clear()
+    patch.setattr("dynamixel_sdk.port_handler.LATENCY_TIMER", 25)
+
+
 @contextmanager
 def aloha_rig(folder: Path) -> Generator[Rig]:
     with ExitStack() as stack:

@@ -7,7 +7,7 @@ import pytest
 import serial
 from aloha_columns import PADS
 from lerobot.motors.dynamixel.tables import MODEL_NUMBER_TABLE
-from rig import Rig, connect_error, follower_config
+from rig import Rig, connect_error, follower_config, take_motors_off
 
 from lerobot_vtrefine.datasets.features import taxel_info
 from lerobot_vtrefine.drivers import dynamixel_arm
@@ -208,7 +208,7 @@ def test_arms_ask_their_adapters_not_to_wait(rig: Rig, monkeypatch: pytest.Monke
     assert warned == [f"left arm: {port}: echo 1"]
 
 
-def test_errors_name_port_and_fix(rig: Rig) -> None:
+def test_errors_name_port_and_fix(rig: Rig, monkeypatch: pytest.MonkeyPatch) -> None:
     missing = str(rig.folder / "nowhere")
     assert f"left arm: {missing} does not exist" in connect_error(rig, left_port=missing)
     swapped = rig.ports("leader")["left_port"]
@@ -217,7 +217,7 @@ def test_errors_name_port_and_fix(rig: Rig) -> None:
     message = connect_error(rig)
     assert "wrist_angle (id 7)" in message
     assert rig.ports("follower")["right_port"] in message
-    rig.buses["follower_right"].motors.clear()
+    take_motors_off(rig, "follower_right", monkeypatch)
     assert "no motor answers at 1000000 baud" in connect_error(rig)
 
 

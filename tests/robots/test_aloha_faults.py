@@ -8,7 +8,7 @@ import pytest
 import yaml
 from lerobot.cameras.configs import CameraConfig
 from realsense import FakeDepthCamera, camera_flag, plug_in
-from rig import Rig, connect_error, follower_config
+from rig import Rig, connect_error, follower_config, take_motors_off
 
 from lerobot_vtrefine.drivers.arm_models import WIDOWX_250S
 from lerobot_vtrefine.drivers.board import PadReader
@@ -50,7 +50,7 @@ def test_errors_while_calibrating_name_the_arm(rig: Rig, monkeypatch: pytest.Mon
     gripper.alert = False
 
     def cable_off(text: str) -> str:
-        rig.buses["follower_left"].motors.clear()
+        take_motors_off(rig, "follower_left", monkeypatch)
         return ""
 
     monkeypatch.setattr("builtins.input", cable_off)

@@ -10,7 +10,7 @@ import pytest
 from aloha_columns import PADS, TACTILE_KEYS
 from commands import dataset_flags, flags, follower_flags, leader_flags, run_command
 from lerobot.datasets.lerobot_dataset import LeRobotDataset
-from rig import Rig, allow_slow_answers, emulated_elsewhere
+from rig import Rig, allow_slow_answers, emulated_elsewhere, take_motors_off
 
 from lerobot_vtrefine.datasets.features import ACTION_KEY, STATE_KEY
 from lerobot_vtrefine.drivers import arm_pair, pad_set
@@ -161,7 +161,7 @@ def test_arm_lost_in_the_second_episode_leaves_the_first_readable(
 
     def looking(robot: AlohaTactileFollower) -> dict[str, object]:
         if saved:  # the first episode is saved: the arm's cable comes off
-            rig.buses["follower_right"].motors.clear()
+            take_motors_off(rig, "follower_right", monkeypatch)
         return look(robot)
 
     monkeypatch.setattr(LeRobotDataset, "save_episode", saving)

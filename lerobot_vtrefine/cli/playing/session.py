@@ -9,6 +9,7 @@ import numpy as np
 
 from lerobot_vtrefine.cli.playing.agents import Agent
 from lerobot_vtrefine.envs.live_world import LiveWorld
+from lerobot_vtrefine.wording import plural
 
 if TYPE_CHECKING:
     from lerobot_vtrefine.view.browser import Wishes
@@ -135,4 +136,4 @@ class Session:
 def _describe(row: dict[str, Any]) -> str:
     if row["success"] and row["failure"] == "none":
         return f"seed {row['seed']}: success after {row['time_to_success_s']:.1f} s"
-    return f"seed {row['seed']}: {row['failure'].replace('_', ' ')} after {row['steps']} steps"
+    return f"seed {row['seed']}: {row['failure'].replace('_', ' ')} after {plural(row['steps'], 'step')}"

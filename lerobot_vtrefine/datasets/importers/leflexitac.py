@@ -26,6 +26,7 @@ from lerobot_vtrefine.datasets.importers.new_folder import new_folder
 from lerobot_vtrefine.datasets.importers.source_checks import check_frames, read_stats
 from lerobot_vtrefine.files import decode, limits, read_json
 from lerobot_vtrefine.files.tables import read_columns
+from lerobot_vtrefine.wording import plural
 
 ONLY_PAD = "primary"
 """LeFlexiTac's name of a single pad, whose column had none in earlier versions."""
@@ -152,8 +153,9 @@ def import_leflexitac(source: Path, root: Path, pads: Mapping[str, str]) -> Impo
                 progress.update(len(table))
         if (frames, len(episode_stats)) != (content.total_frames, content.total_episodes):
             raise ValueError(
-                f"{source}: meta/info.json counts {content.total_episodes} episodes of {content.total_frames}"
-                f" frames, the data files {len(episode_stats)} of {frames}; is the copy complete?"
+                f"{source}: meta/info.json counts {plural(content.total_episodes, 'episode')} of"
+                f" {plural(content.total_frames, 'frame')}, the data files {len(episode_stats)} of {frames};"
+                " is the copy complete?"
             )
         _write_episode_rows(source, work, columns, episode_stats)
         old = {column.source for column in columns}

@@ -8,6 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from lerobot_vtrefine.diagnose.pad.press_trials import Press, PressSet
+from lerobot_vtrefine.wording import plural
 
 MIN_RECORDINGS = 4
 """Recordings that resampling needs to say anything about uncertainty."""
@@ -78,9 +79,8 @@ def problems(found: Excitation, *, damping: bool, stiffness: bool) -> list[str]:
         return ["the indenter never touches the pad: check depth_m, x_m and y_m"]
     said = []
     if found.recordings < MIN_RECORDINGS:
-        said.append(
-            f"{found.recordings} usable recordings give no uncertainty: record at least {MIN_RECORDINGS}"
-        )
+        usable = plural(found.recordings, "usable recording")
+        said.append(f"no uncertainty from {usable}: record at least {MIN_RECORDINGS}")
     if found.loaded and (damping or stiffness):
         said.append(
             "without depth_m the model's output is the load itself, so k_n and k_d do not follow: record"

@@ -25,6 +25,7 @@ from lerobot_vtrefine.diagnose.episode_replay.tracking import JointTracking, joi
 from lerobot_vtrefine.diagnose.episode_replay.twin import read_ledger, recorded_seeds, recorded_twin
 from lerobot_vtrefine.embodiments import get_embodiment
 from lerobot_vtrefine.envs.config import VtRefineEnvConfig
+from lerobot_vtrefine.wording import plural
 
 if TYPE_CHECKING:
     from lerobot_vtrefine.sim.command_replay import SceneReplay
@@ -173,8 +174,8 @@ def _require_same_robot(folder: EpisodeFolder, config: VtRefineEnvConfig) -> Non
     robot = get_embodiment(config.scene_config.embodiment)
     if folder.num_joints != robot.num_joints:
         raise ValueError(
-            f"{folder.root} has {folder.num_joints} joints, the twin {robot.name} has {robot.num_joints}:"
-            " episodes of another robot cannot be replayed in it"
+            f"{folder.root} has {plural(folder.num_joints, 'joint')}, the twin {robot.name} has"
+            f" {robot.num_joints}: episodes of another robot cannot be replayed in it"
         )
     plain = [name.removesuffix(JOINT_SUFFIX) for name in folder.joints]
     if plain and plain != list(robot.joint_names):
@@ -248,7 +249,9 @@ def _replay_scenes(
         baselines = {pad: replayed.baseline[i] for i, pad in enumerate(sim.embodiment.pad_names)}
         pairs.append(EpisodePair(episode, replayed.position, counts, baselines, replayed.success))
     if not pairs:
-        raise ValueError(f"none of {len(recorded)} episodes can be replayed: {next(iter(skipped.values()))}")
+        raise ValueError(
+            f"none of {plural(len(recorded), 'episode')} can be replayed: {next(iter(skipped.values()))}"
+        )
     return pairs, skipped, frames
 
 

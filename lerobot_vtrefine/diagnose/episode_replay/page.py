@@ -13,6 +13,7 @@ from lerobot_vtrefine.diagnose.episode_replay.touch import telling_frames
 from lerobot_vtrefine.embodiments import pad_layout_of
 from lerobot_vtrefine.pages.pads import colour_scale, encode, pad_film
 from lerobot_vtrefine.pages.render import render
+from lerobot_vtrefine.wording import plural
 
 FRAMES_SHOWN = 4
 LEAST_TOLD = 0.1
@@ -69,7 +70,8 @@ def verdict(comparison: Comparison) -> str:
         said += f" Pad readings overlap by {100 * (least.overlap or 0.0):.0f} % or more."
     ended = [pair.success for pair in comparison.pairs if pair.success is not None]
     if ended:
-        said += f" In the twin {sum(ended)} of {len(ended)} episodes ended with the plug seated and held."
+        episodes = plural(len(ended), "episode")
+        said += f" In the twin {sum(ended)} of {episodes} ended with the plug seated and held."
     return said
 
 

@@ -16,6 +16,7 @@ from lerobot_vtrefine.diagnose.episode_replay.touch import pressed
 from lerobot_vtrefine.embodiments import Embodiment
 from lerobot_vtrefine.observation.visuo_tactile import VisuoTactileConfig
 from lerobot_vtrefine.tactile.geometry import Box, Cylinder, quaternion_matrix
+from lerobot_vtrefine.wording import plural
 
 if TYPE_CHECKING:
     from lerobot_vtrefine.sim.pairs import Part
@@ -125,8 +126,9 @@ def describe_reach(rows: Sequence[HandReach], table_height_m: float) -> list[str
     lines = []
     for row in rows:
         if row.held is not None and row.over_part_m is not None and row.held < row.episodes:
+            episodes = plural(row.episodes, "episode")
             lines.append(
-                f"the twin's {row.arm} hand holds its part in {row.held} of {row.episodes} episodes: when its"
+                f"the twin's {row.arm} hand holds its part in {row.held} of {episodes}: when its"
                 f" gripper closes, its pads reach {1e3 * row.over_part_m:.0f} mm below the part's upper end"
             )
     lowest = min((row.lowest_m for row in rows), default=0.0)

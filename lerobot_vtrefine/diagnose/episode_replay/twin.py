@@ -12,6 +12,7 @@ from lerobot_vtrefine.envs.config import VtRefineEnvConfig
 from lerobot_vtrefine.envs.demo_dataset import LEDGER
 from lerobot_vtrefine.files import decode, limits, read_json
 from lerobot_vtrefine.sim.config import RandomizationConfig, SceneConfig, TaskConfig
+from lerobot_vtrefine.wording import plural
 
 
 @dataclass(frozen=True)
@@ -88,7 +89,8 @@ def recorded_seeds(ledger: Mapping[str, Any], folder: EpisodeFolder) -> dict[int
     seeds = {int(row["episode_index"]): int(row["seed"]) for row in ledger["episodes"]}
     if sorted(seeds) != list(range(folder.num_episodes)):
         raise ValueError(
-            f"{folder.root / LEDGER} notes {len(seeds)} episodes, the dataset has {folder.num_episodes}:"
-            " it was edited since, so the starts are not known; use --parts=none or --parts=grasp"
+            f"{folder.root / LEDGER} notes {plural(len(seeds), 'episode')}, the dataset has"
+            f" {folder.num_episodes}: it was edited since, so the starts are not known; use --parts=none or"
+            " --parts=grasp"
         )
     return seeds

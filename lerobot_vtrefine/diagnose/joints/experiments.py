@@ -13,6 +13,7 @@ from lerobot_vtrefine.diagnose.joints.fitting import ServoTrials
 from lerobot_vtrefine.diagnose.joints.gravity import is_gripper, is_sliding
 from lerobot_vtrefine.diagnose.joints.rules import ENOUGH_TRIALS, TELLING
 from lerobot_vtrefine.diagnose.recordings import RobotTrial
+from lerobot_vtrefine.wording import plural
 
 if TYPE_CHECKING:
     from lerobot_vtrefine.diagnose.joints.problem import Selected
@@ -77,7 +78,8 @@ def for_little_data(selection: "Selected", detectable: dict[str, float]) -> dict
     problem = selection.problem
     trials = problem.batch.trials
     if trials < ENOUGH_TRIALS - 2:
-        text = f"{trials} trials are too few to judge by: record six commands twice each, in random order."
+        few = f"{plural(trials, 'trial')}, too few to judge by"
+        text = f"{few}: record six commands twice each, in random order."
         return {"decides": [], "text": text, "protocol": {"command": "steps", "trials": 12}}
     delay = detectable.get("control_latency")
     if delay is None or delay > 2 * frame_s(problem.batch):

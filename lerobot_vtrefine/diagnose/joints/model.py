@@ -14,6 +14,7 @@ from lerobot_vtrefine.diagnose.joints.parameters import PARAMETERS, SAG
 from lerobot_vtrefine.diagnose.recordings import RobotTrial
 from lerobot_vtrefine.diagnose.verdict import write_atomically
 from lerobot_vtrefine.embodiments.robot_file import SCHEMA, JointModel, SagForm, read_robot_file
+from lerobot_vtrefine.wording import plural
 
 __all__ = ["SCHEMA", "JointModel", "RobotModel", "predict_positions"]
 
@@ -84,7 +85,8 @@ def predict_positions(model: RobotModel, trial: RobotTrial) -> np.ndarray:
     """
     if trial.command.shape[1] != len(model.joints):
         raise ValueError(
-            f"{trial.file}: has {trial.command.shape[1]} joints, the robot model has {len(model.joints)}"
+            f"{trial.file}: has {plural(trial.command.shape[1], 'joint')}, the robot model has"
+            f" {len(model.joints)}"
         )
     hidden = np.repeat(trial.position[:1], len(trial.time_s), 0)
     return model.predict(make_batch([replace(trial, position=hidden)]))[:, 0]

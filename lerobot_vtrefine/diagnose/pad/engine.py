@@ -12,6 +12,7 @@ from lerobot_vtrefine.diagnose.pad.press_trials import prepare, usable
 from lerobot_vtrefine.diagnose.pad.problem import PadProblem
 from lerobot_vtrefine.diagnose.recordings import RecordingSet, Trial
 from lerobot_vtrefine.diagnose.verdict import DataIssue, Verdict
+from lerobot_vtrefine.wording import plural
 
 MIN_RECORDINGS = 2
 FEW_RECORDINGS = 8
@@ -28,7 +29,7 @@ def diagnose_pad(recordings: RecordingSet, seed: int = 0, progress: Progress | N
     """
     trials, issues = _usable_trials(recordings)
     if len(trials) < MIN_RECORDINGS:
-        return _invalid(issues, f"{len(trials)} usable recordings")
+        return _invalid(issues, plural(len(trials), "usable recording"))
     locked = set(lock([trial.condition for trial in trials], seed))
     learn = [index for index in range(len(trials)) if index not in locked]
     # Idle levels are learnt from discovery only.
@@ -51,7 +52,8 @@ def _invalid(issues: list[DataIssue], problem: str) -> Diagnosis:
 def _little_data(count: int, locked: int) -> list[DataIssue]:
     issues = []
     if count < FEW_RECORDINGS:
-        text = f"only {count} recordings: most effects cannot reach significance, see minimum_detectable"
+        few = f"only {plural(count, 'recording')}"
+        text = f"{few}: most effects cannot reach significance, see minimum_detectable"
         issues.append(DataIssue(None, text, "kept"))
     if not locked:
         issues.append(DataIssue(None, "too few recordings to lock any", "no held-out error"))

@@ -16,6 +16,7 @@ from lerobot_vtrefine.diagnose.quality.edits import Check, apply
 from lerobot_vtrefine.diagnose.quality.rules import MIN_PART, MIN_TRIALS
 from lerobot_vtrefine.diagnose.recordings import RecordingSet
 from lerobot_vtrefine.diagnose.verdict import DataIssue
+from lerobot_vtrefine.wording import plural
 
 # Each check gets what the ones before it left: first frames and times, then readings. Frames without numbers
 # are dropped after the clock was checked, which would take them for lost ones; all other checks need numbers.
@@ -94,7 +95,7 @@ def too_little(checked: RecordingSet, recorded: RecordingSet) -> DataIssue | Non
     left, total = len(checked.trials), len(recorded.trials)
     if left < MIN_TRIALS:
         return DataIssue(
-            None, f"{left} sound trials of {total}; at least {MIN_TRIALS} are needed", "no verdict"
+            None, f"{plural(left, 'sound trial')} of {total}; at least {MIN_TRIALS} are needed", "no verdict"
         )
     if left < MIN_PART * total:
         return DataIssue(None, f"only {left} of {total} trials are sound", "no verdict")

@@ -72,8 +72,3 @@ def place(taxel: int, cols: int) -> str:
 def few(names: list[str], most: int) -> str:
     """The first names, and how many more there are."""
     return ", ".join(names[:most]) + (f" and {len(names) - most} more" if len(names) > most else "")
-
-
-def plural(count: int, noun: str) -> str:
-    """ "1 frame", "2 frames"."""
-    return f"{count} {noun}" if count == 1 else f"{count} {noun}s"

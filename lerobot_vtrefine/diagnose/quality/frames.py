@@ -13,7 +13,6 @@ from lerobot_vtrefine.diagnose.quality.edits import (
     columns,
     few,
     place,
-    plural,
     take,
 )
 from lerobot_vtrefine.diagnose.quality.rules import (
@@ -27,6 +26,7 @@ from lerobot_vtrefine.diagnose.quality.rules import (
     SPIKE_FAR,
 )
 from lerobot_vtrefine.diagnose.recordings import RecordingSet
+from lerobot_vtrefine.wording import plural
 
 
 def check_optional(recordings: RecordingSet) -> Iterator[Finding]:

@@ -20,6 +20,7 @@ from lerobot_vtrefine.diagnose.quality.rules import (
     WRAP,
 )
 from lerobot_vtrefine.diagnose.recordings import RecordingSet
+from lerobot_vtrefine.wording import plural
 
 CONVERTERS = (1.0, 3.3, 5.0, 10.0, 255.0, 1023.0, 4095.0, 16383.0, 65535.0, 16777215.0)
 """Full scales in use: normalised readings, volts, and converters of 8 to 24 bits."""
@@ -120,5 +121,6 @@ def check_wraps(recordings: RecordingSet) -> Iterator[Finding]:
         drops = np.diff(trial.raw, axis=0) < -WRAP * recordings.full_scale
         wraps = drops & (np.diff(press.drive, axis=0) > 0)
         if wraps.sum() >= MIN_WRAPS:
-            problem = f"raw drops to the bottom {int(wraps.sum())} times while the load rises: it overflows"
+            often = plural(int(wraps.sum()), "time")
+            problem = f"raw drops to the bottom {often} while the load rises: it overflows"
             yield Finding(index, problem, SET_ASIDE)

@@ -6,7 +6,7 @@ from itertools import pairwise
 import numpy as np
 
 from lerobot_vtrefine.diagnose.quality.contact import Press, presses
-from lerobot_vtrefine.diagnose.quality.edits import KEPT, SET_ASIDE, Finding, few, place, plural
+from lerobot_vtrefine.diagnose.quality.edits import KEPT, SET_ASIDE, Finding, few, place
 from lerobot_vtrefine.diagnose.quality.rules import (
     ALIVE,
     DEAD,
@@ -18,6 +18,7 @@ from lerobot_vtrefine.diagnose.quality.rules import (
     TINY_M,
 )
 from lerobot_vtrefine.diagnose.recordings import RecordingSet
+from lerobot_vtrefine.wording import plural
 
 
 def check_start(recordings: RecordingSet) -> Iterator[Finding]:

@@ -24,6 +24,7 @@ from lerobot_vtrefine.diagnose.servo.bench import on_bench
 from lerobot_vtrefine.diagnose.verdict import Parameter, Verdict
 from lerobot_vtrefine.pages.pads import colour_scale, pad_image
 from lerobot_vtrefine.pages.render import render
+from lerobot_vtrefine.wording import plural
 
 SHOWN_TRACES = 4
 """Trials that are shown; the others are in a section that is closed at first."""
@@ -137,7 +138,7 @@ def _trial_note(count: int) -> str:
 
 def _facts(verdict: Verdict, recordings: RecordingSet, sound: int, seed: int) -> list[tuple[str, str]]:
     """Short facts about the data, title and text."""
-    conditions = len({trial.condition for trial in recordings.trials})
+    conditions = plural(len({trial.condition for trial in recordings.trials}), "condition")
     if recordings.kind == "pad":
         what = (
             f"pad of {recordings.rows} × {recordings.cols} taxels, {quantity(recordings.pitch_m, 'm')} apart"
@@ -145,22 +146,18 @@ def _facts(verdict: Verdict, recordings: RecordingSet, sound: int, seed: int) ->
     elif on_bench(recordings):
         what = f"servo {recordings.joints[0]} with a pendulum"
     else:
-        what = f"robot with {len(recordings.joints)} joints"
+        what = f"robot with {plural(len(recordings.joints), 'joint')}"
     seconds = sum(float(np.ptp(t.time_s[np.isfinite(t.time_s)])) for t in recordings.trials if len(t.time_s))
     facts = [
         (
             "recordings",
-            f"{len(recordings.trials)} in {conditions} conditions, {seconds:.0f} s in all; {sound} sound",
+            f"{len(recordings.trials)} in {conditions}, {seconds:.0f} s in all; {sound} sound",
         ),
         ("what", f"{what}, from the folder {PurePath(recordings.path).name}"),
     ]
     if verdict.heldout is not None:
-        facts.append(
-            (
-                "held out",
-                f"{len(verdict.heldout.trials)} recordings, used neither for fitting nor for selection",
-            )
-        )
+        held = plural(len(verdict.heldout.trials), "recording")
+        facts.append(("held out", f"{held}, used neither for fitting nor for selection"))
     return [*facts, ("seed", str(seed))]
 
 

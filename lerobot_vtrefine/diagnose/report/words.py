@@ -5,6 +5,7 @@ from importlib import import_module
 
 from lerobot_vtrefine.diagnose.report.numbers import digits, percent, quantity, scale_of
 from lerobot_vtrefine.diagnose.verdict import Verdict
+from lerobot_vtrefine.wording import plural
 
 MAIN_PARAMETERS = {
     "nonlinear_stiffness": ("exponent − 1", "1"),
@@ -226,7 +227,7 @@ def doubts(verdict: Verdict, recorded: int, checked: int) -> list[str]:
         return found
     if len(held.trials) < 6:
         found.append(
-            f"Only {len(held.trials)} recordings were held out, so the interval of the gain is imprecise."
+            f"Only {plural(len(held.trials), 'held-out recording')}: the interval of the gain is imprecise."
         )
     if held.gain_ci95 is not None and held.gain_ci95[0] <= 0 and verdict.causes and not verdict.withheld:
         found.append("The interval of the gain includes zero: the repair may not help on other recordings.")

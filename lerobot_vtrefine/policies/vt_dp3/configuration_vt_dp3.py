@@ -74,6 +74,8 @@ class VtDp3Config(PreTrainedConfig):
     horizon: int = 16
     n_action_steps: int = 8
     """Executed actions per decision; a chunk starts at the current observation."""
+    fps: int | None = None
+    """Actions per second in the data that it learned from; None in checkpoints that do not say."""
 
     observation: VisuoTactileConfig = field(default_factory=VisuoTactileConfig)
     point_dims: tuple[int, ...] = ()
@@ -241,6 +243,14 @@ class VtDp3Config(PreTrainedConfig):
     def reward_delta_indices(self) -> None:
         """No rewards."""
         return
+
+    def check_fps(self, fps: int) -> None:
+        """Raises: ValueError for an environment in which chunks would run at another speed than learned."""
+        if self.fps is not None and fps != self.fps:
+            raise ValueError(
+                f"--env.fps={fps}, but the policy learned {self.fps} actions a second: give"
+                f" --env.fps={self.fps}"
+            )
 
     def get_optimizer_preset(self) -> AdamWConfig:
         """AdamW as in DP3."""

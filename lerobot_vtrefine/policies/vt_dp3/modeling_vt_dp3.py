@@ -97,6 +97,8 @@ class VtDp3Policy(PreTrainedPolicy):
             raise ValueError(f"the checkpoint holds a policy of type '{found}', expected 'vt_dp3'")
         super().__init__(config)
         config.validate_features()
+        if dataset_meta is not None:
+            config.fps = dataset_meta.fps
         if dataset_stats:
             # The trainer hands this very dict to the normaliser, also with --policy.path, and offers no other
             # hook.
