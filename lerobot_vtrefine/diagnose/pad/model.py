@@ -38,9 +38,15 @@ class Composite:
     forms: tuple[Form, ...] = ()
     gain_map: np.ndarray | None = None
     """Factor per taxel (R, C), or None."""
-    gain_sigma: float = 0.0
+    gain_variances: tuple[float, ...] = ()
+    """Of the map's parts (see `map_prior`)."""
     dead: tuple[tuple[int, int], ...] = ()
     k_n: float = NOMINAL_K_N
+
+    @property
+    def gain_sigma(self) -> float:
+        """Deviation of the logarithms of taxels' gains."""
+        return float(np.sqrt(sum(self.gain_variances)))
 
     @property
     def families(self) -> tuple[str, ...]:
@@ -96,7 +102,7 @@ class Composite:
     def minus(self, family: str) -> "Composite":
         """Without a cause."""
         if family == "taxel_gain_spread":
-            return replace(self, gain_map=None, gain_sigma=0.0)
+            return replace(self, gain_map=None, gain_variances=())
         if family == "dead_taxels":
             return replace(self, dead=())
         keep = [index for index, form in enumerate(self.forms) if form.family != family]
