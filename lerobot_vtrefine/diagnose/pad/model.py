@@ -1,7 +1,7 @@
 """A model under test: the baseline's coordinates, the forms added to it, and maps over taxels."""
 
-from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
@@ -40,7 +40,8 @@ class Composite:
     """Factor per taxel (R, C), or None."""
     gain_variances: tuple[float, ...] = ()
     """Of the map's parts (see `map_prior`)."""
-    dead: tuple[tuple[int, int], ...] = ()
+    dead: Mapping[tuple[int, int], float] = field(default_factory=dict)
+    """Taxels that hardly answer -> what is left, a part of a sound one's answer."""
     k_n: float = NOMINAL_K_N
 
     @property
@@ -104,7 +105,7 @@ class Composite:
         if family == "taxel_gain_spread":
             return replace(self, gain_map=None, gain_variances=())
         if family == "dead_taxels":
-            return replace(self, dead=())
+            return replace(self, dead={})
         keep = [index for index, form in enumerate(self.forms) if form.family != family]
         parts = [self.values[: len(BASE)], *(self.own(index) for index in keep)]
         return replace(self, forms=tuple(self.forms[index] for index in keep), values=np.concatenate(parts))
@@ -120,7 +121,7 @@ class Composite:
         if self.gain_map is not None:
             stages.append(TaxelGainSpread(self.gain_sigma, self.gain_map))  # ty: ignore[invalid-argument-type]
         if self.dead:
-            stages.append(DeadTaxels(self.dead))
+            stages.append(DeadTaxels(tuple(self.dead), left=tuple(self.dead.values())))
         stages.append(Quantisation(1.0, self.setting.full_scale))
         return self.in_order(stages)
 

@@ -141,7 +141,7 @@ def all_probes(problem: "PadProblem", fitted: Fit) -> list[Probe]:
 
 def gain_spread_probes(problem: "PadProblem", fitted: Fit) -> list[Probe]:
     """Products between recordings of what they say about taxels' gains, quadratic in the signs: of every
-    taxel's own gain, and of what lines and regions share, which commands with no taxel in common tell, too."""
+    taxel's own gain, and of what lines and regions share, which commands with no common taxel tell, too."""
     evidence = map_evidence(fitted, problem.presses, problem.weights)
     total = evidence.information.sum(axis=0)
     known = np.flatnonzero(total > 0)

@@ -181,8 +181,8 @@ def plain_gains(fitted: Fit, presses: PressSet) -> tuple[np.ndarray, np.ndarray]
 
 def with_all_dead(fitted: Fit, presses: PressSet, errors: float = DEAD_ERRORS) -> Fit:
     """The fit with those taxels, too, that hardly answer in these presses."""
-    dead = {*fitted.model.dead, *find_dead(fitted, presses, errors)}
-    model = replace(fitted.model, dead=tuple(sorted(dead)))
+    dead = {**find_dead(fitted, presses, errors), **fitted.model.dead}
+    model = replace(fitted.model, dead=dict(sorted(dead.items())))
     return replace(fitted, model=model, signals=tuple(predict(model, presses)))
 
 
@@ -191,8 +191,8 @@ def could_be_dead(error: np.ndarray, errors: float = DEAD_ERRORS) -> np.ndarray:
     return errors * error < DEAD_BELOW
 
 
-def find_dead(fitted: Fit, presses: PressSet, errors: float = DEAD_ERRORS) -> tuple[tuple[int, int], ...]:
-    """Taxels that hardly answer although pressed well: ((row, col), ...).
+def find_dead(fitted: Fit, presses: PressSet, errors: float = DEAD_ERRORS) -> dict[tuple[int, int], float]:
+    """Taxels that hardly answer, pressed well: (row, col) -> the part of a sound answer that is left.
 
     Args:
         errors: standard errors by which a gain must lie below that of a dead taxel.
@@ -200,13 +200,15 @@ def find_dead(fitted: Fit, presses: PressSet, errors: float = DEAD_ERRORS) -> tu
     gain, error = plain_gains(fitted, presses)
     sure = could_be_dead(error)
     if sure.sum() < 2:
-        return ()
+        return {}
     typical = float(np.median(gain[sure]))
     if typical <= 0:
-        return ()
+        return {}
     good = could_be_dead(error, errors)
     dead = good & (gain + errors * error < DEAD_BELOW * typical)
     if dead.sum() > 0.5 * good.sum():
-        return ()
+        return {}
+    sound = float(np.median(gain[sure & ~dead]))
+    left = np.where(gain > DEAD_ERRORS * error, gain / sound, 0.0)
     cols = presses.layout.cols
-    return tuple((int(index) // cols, int(index) % cols) for index in np.flatnonzero(dead))
+    return {(int(k) // cols, int(k) % cols): float(left[k]) for k in np.flatnonzero(dead)}
