@@ -86,18 +86,6 @@ def gain_tangents(fitted: Fit, presses: PressSet) -> list[np.ndarray]:
     return [(there - here) / STEP for there, here in zip(moved, fitted.signals, strict=True)]
 
 
-def maps_left_out(evidence: MapEvidence, folds: np.ndarray) -> np.ndarray:
-    """For every recording the map (K, R*C) that the other folds tell, where the evidence is of none."""
-    maps = np.zeros(evidence.scores.shape)
-    _, variances = solve_map(evidence, range(len(folds)), maps[0], ())
-    for fold in np.unique(folds):
-        held = folds == fold
-        maps[held], _ = solve_map(
-            evidence, np.flatnonzero(~held).tolist(), np.zeros(maps.shape[1]), variances
-        )
-    return maps
-
-
 def solve_map(
     evidence: MapEvidence, keep: Sequence[int], log_map: np.ndarray, variances: Sequence[float]
 ) -> tuple[np.ndarray, tuple[float, ...]]:
