@@ -13,6 +13,7 @@ from lerobot_vtrefine.tactile.stages.base import Stage
 from lerobot_vtrefine.tactile.stages.contact import KelvinVoigt
 from lerobot_vtrefine.tactile.stages.readout import (
     BaselineDrift,
+    Crosstalk,
     DeadTaxels,
     Gain,
     Idle,
@@ -109,6 +110,13 @@ class Composite:
         keep = [index for index, form in enumerate(self.forms) if form.family != family]
         parts = [self.values[: len(BASE)], *(self.own(index) for index in keep)]
         return replace(self, forms=tuple(self.forms[index] for index in keep), values=np.concatenate(parts))
+
+    def before_leaks(self) -> "Composite":
+        """Without what leaks between readings after the taxels' gains; itself where nothing does."""
+        for form in self.forms:
+            if form.family == Crosstalk.name and (form.rank or Crosstalk.rank) > TaxelGainSpread.rank:
+                return self.minus(form.family)
+        return self
 
     def stages(self) -> tuple[Stage, ...]:
         """The simulator's stages without the idle level, in order."""

@@ -79,11 +79,16 @@ def map_evidence(
 
 
 def gain_tangents(fitted: Fit, presses: PressSet) -> list[np.ndarray]:
-    """Change of the signals (T, n) by the logarithm of the taxels' own gains."""
+    """Change of the signals (T, n) by the logarithm of the taxels' own gains.
+
+    What leaks into a reading after the gains is others', and says nothing of its own taxel's.
+    """
     shape = (presses.layout.rows, presses.layout.cols)
-    present = fitted.model.gain_map if fitted.model.gain_map is not None else np.ones(shape)
-    moved = predict(replace(fitted.model, gain_map=present * (1.0 + STEP)), presses)
-    return [(there - here) / STEP for there, here in zip(moved, fitted.signals, strict=True)]
+    model = fitted.model.before_leaks()
+    signals = fitted.signals if model is fitted.model else predict(model, presses)
+    present = model.gain_map if model.gain_map is not None else np.ones(shape)
+    moved = predict(replace(model, gain_map=present * (1.0 + STEP)), presses)
+    return [(there - here) / STEP for there, here in zip(moved, signals, strict=True)]
 
 
 def solve_map(

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from lerobot_vtrefine.diagnose.pad.baseline import offset_tangents
-from lerobot_vtrefine.diagnose.pad.fitting import Fit, refit_weighted
+from lerobot_vtrefine.diagnose.pad.fitting import Fit, predict, refit_weighted
 from lerobot_vtrefine.diagnose.pad.form_fitting import settle
 from lerobot_vtrefine.diagnose.pad.taxel_maps import MapEvidence, map_evidence, solve_map
 
@@ -69,8 +69,8 @@ class UnevenFace:
         return replace(self.problem, presses=self.problem.presses.uneven(face_m))
 
     def _evidence(self) -> MapEvidence:
-        presses = self._on(self.lower).presses
-        slopes = offset_tangents(self.now.model, presses, self.now.signals)
+        presses, model = self._on(self.lower).presses, self.now.model.before_leaks()
+        slopes = offset_tangents(model, presses, predict(model, presses))
         assert slopes is not None
         tangents = [slope * FACE_M for slope in slopes]
         return map_evidence(self.now, presses, self.problem.weights, tangents)
