@@ -29,7 +29,7 @@ def test_the_part_that_a_map_was_drawn_from_is_found(part: int) -> None:
     root = np.linalg.cholesky(covariance(only, EVERY, EVERY, SHAPE) + 1e-8 * np.eye(len(EVERY)))
     log_map = root @ np.random.default_rng(3).standard_normal(len(EVERY))
     curvature = np.eye(len(EVERY)) / ERROR**2
-    variances = likeliest_variances(curvature, curvature @ log_map, EVERY, SHAPE)
+    variances = likeliest_variances(curvature, curvature @ log_map, EVERY, SHAPE, np.zeros(0))
     assert variances.argmax() == part
     assert 0.05 < np.sqrt(variances[part]) < 0.2
 

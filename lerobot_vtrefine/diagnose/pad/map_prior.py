@@ -63,14 +63,15 @@ def told(
 
 
 def likeliest_variances(
-    curvature: np.ndarray, target: np.ndarray, taxels: np.ndarray, shape: tuple[int, int]
+    curvature: np.ndarray, target: np.ndarray, taxels: np.ndarray, shape: tuple[int, int], start: np.ndarray
 ) -> np.ndarray:
     """Variances (SHARES,) of a map's parts under which what recordings say of it is likeliest.
 
-    Each turn holds what a part explains against what it should (Zhou, Hu, Zhou & Lange 2019, JCGS 28, 350).
+    Each turn, from `start` (none: all alike) on, holds what a part explains against what it should (Zhou,
+    Hu, Zhou & Lange 2019, JCGS 28, 350).
     """
     kinds = list(parts(taxels, taxels, shape))
-    variances = np.full(SHARES, START_SIGMA**2 / SHARES)
+    variances = start if len(start) else np.full(SHARES, START_SIGMA**2 / SHARES)
     for _ in range(TURNS):
         whole = sum(v * part for v, part in zip(variances, kinds, strict=True))
         _, pull, precision = told(curvature, target, np.asarray(whole))

@@ -92,13 +92,19 @@ def gain_tangents(fitted: Fit, presses: PressSet) -> list[np.ndarray]:
 
 
 def solve_map(
-    evidence: MapEvidence, keep: Sequence[int], log_map: np.ndarray, variances: Sequence[float]
+    evidence: MapEvidence,
+    keep: Sequence[int],
+    log_map: np.ndarray,
+    variances: Sequence[float],
+    *,
+    anew: bool = False,
 ) -> tuple[np.ndarray, tuple[float, ...]]:
     """Shrunk log gains (R*C,) and the variances of their parts, from the recordings in `keep`.
 
     Args:
         log_map: (R*C,) present log gains, at which the evidence was taken.
         variances: see `map_prior`; none to find the likeliest.
+        anew: find the likeliest ones near those.
     """
     informed = evidence.information[list(keep)].sum(axis=0)
     taxels = np.flatnonzero(informed > 1e-6 * max(float(informed.max()), 1e-12))
@@ -106,8 +112,9 @@ def solve_map(
         return np.zeros(len(log_map)), tuple(variances)
     curvature = evidence.curvature(keep, taxels)
     target = evidence.scores[list(keep)][:, taxels].sum(axis=0) + curvature @ log_map[taxels]
-    shape = evidence.shape
-    own = np.asarray(variances) if len(variances) else likeliest_variances(curvature, target, taxels, shape)
+    shape, own = evidence.shape, np.asarray(variances)
+    if anew or not len(own):
+        own = likeliest_variances(curvature, target, taxels, shape, own)
     level, pull, _ = told(curvature, target, covariance(own, taxels, taxels, shape))
     return level + covariance(own, np.arange(len(log_map)), taxels, shape) @ pull, tuple(own.tolist())
 
