@@ -8,8 +8,8 @@ from test_engine_random_faults import raised
 
 from lerobot_vtrefine.diagnose.pad.decoys import in_place_of_names
 from lerobot_vtrefine.diagnose.pad.fitting import rest
-from lerobot_vtrefine.diagnose.pad.problem import Candidate, PadProblem
-from lerobot_vtrefine.diagnose.pad.screening import GAIN_MAP, forms_of
+from lerobot_vtrefine.diagnose.pad.problem import PadProblem
+from lerobot_vtrefine.diagnose.pad.screening import forms_of
 from lerobot_vtrefine.diagnose.pad.taxel_maps import gain_tangents, with_map
 from lerobot_vtrefine.diagnose.recordings import Trial
 
@@ -58,13 +58,3 @@ def test_what_leaks_into_a_reading_tells_nothing_of_the_gain_of_its_own_taxel() 
     ):
         np.testing.assert_allclose(tangent, alone)
         assert np.abs(more - tangent).max() > 1.0
-
-
-@pytest.mark.parametrize(("added", "expected"), [(gains, True), (crumbs, False)])
-def test_gains_are_no_credible_name_where_the_face_is_not_even(added, expected) -> None:
-    presses, _ = fitted(added)
-    problem, now = PadProblem(presses).weighed(None)
-    mapped = problem.settled(with_map(now, presses, problem.weights))
-    problem, mapped = problem.weighed(mapped)
-    found = problem.credible(problem.baseline(), now, mapped, Candidate(GAIN_MAP))
-    assert found.tolist() == [expected]
