@@ -264,8 +264,7 @@ class ScreenedSearch[P: ScreenedProblem[Any, Any], F: ScoredFit, C: FormCandidat
         """
         slim = problem.reduced(fitted, [candidate], _ONE)
         full, less = (out_of_fold(problem, fit, self.folds) for fit in (fitted, slim))
-        ground = Ground(problem, slim, self.folds, self.seed)
-        return better(full, less) and self._credible(ground, Step(candidate, fitted, full))
+        return better(full, less)
 
     def _drop_needless(self) -> None:
         """Take away what costs less than a further cause must gain; what is seen, if it costs nothing."""

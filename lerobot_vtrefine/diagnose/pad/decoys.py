@@ -9,10 +9,9 @@ from dataclasses import replace
 from typing import TYPE_CHECKING
 
 import numpy as np
-from scipy.stats import norm
 
 from lerobot_vtrefine.diagnose.core.heldout import out_of_fold
-from lerobot_vtrefine.diagnose.core.rules import AGREEMENT_P, FLIPS, SHARE_OF_GAIN, SIZE_DOUBT
+from lerobot_vtrefine.diagnose.core.rules import FLIPS, SHARE_OF_GAIN, SIZE_DOUBT
 from lerobot_vtrefine.diagnose.core.suspicion import Suspicion
 from lerobot_vtrefine.diagnose.pad.descriptors import DESCRIPTORS, Descriptor, directions, errors_left_out
 from lerobot_vtrefine.diagnose.pad.fitting import Fit, bounded_step, movable, predict
@@ -37,29 +36,14 @@ def in_place_of_names(problem: "PadProblem", fitted: Fit) -> list[Suspicion]:
 
 
 def _in_place_of_gains(problem: "PadProblem", fitted: Fit) -> Suspicion | None:
-    if problem.presses.loaded:
-        return None
-    clue = f"in the place of {GAIN_MAP}, first touches of the taxels' own predict trials left out better"
-    return _borrowed(problem, clue, *touches_or_gains(problem, fitted))
+    """A map of first touches in the place of one of gains: a face that is uneven, or lies on something, reads
+    more or less at some taxels, too.
 
-
-def rather_touches(problem: "PadProblem", fitted: Fit) -> bool:
-    """Whether first touches of the taxels' own surely predict better than their gains do."""
-    if problem.presses.loaded:
-        return False
-    best, own, apart = touches_or_gains(problem, fitted)
-    more = SHARE_OF_GAIN * best.sum() > own.sum()
-    return bool(more and norm.sf(_ahead(best, own, apart)) < AGREEMENT_P)
-
-
-def touches_or_gains(problem: "PadProblem", fitted: Fit) -> tuple[Array, Array, float]:
-    """A map of first touches in the place of one of gains: what both gain in log score (K,) over neither, and
-    the squared distance between them in deviations of noise.
-
-    A face that is uneven, or lies on something, reads more or less at some taxels, too.
     Around the model that has neither, weights overrate the flanks of presses, and gains that are told there
     mislead wherever taxels are pressed deep. So both are judged by their own fits, as all names are.
     """
+    if problem.presses.loaded:
+        return None
     slim = without(fitted, [GAIN_MAP], problem.presses, problem.weights)
     before = out_of_fold(problem, slim, problem.folds)
     own = out_of_fold(problem, fitted, problem.folds).better_by(before)
@@ -68,7 +52,8 @@ def touches_or_gains(problem: "PadProblem", fitted: Fit) -> tuple[Array, Array, 
     apart = 0.0
     for weight, here, there in zip(problem.weights, fitted.signals, face.now.signals, strict=True):
         apart += float(weight.gram(weight.whiten(here - there)[None])[0, 0])
-    return best, own, apart
+    clue = f"in the place of {GAIN_MAP}, first touches of the taxels' own predict trials left out better"
+    return _borrowed(problem, clue, best, own, apart)
 
 
 def _borrowed(problem: "PadProblem", clue: str, best: Array, own: Array, apart: float) -> Suspicion | None:
@@ -81,15 +66,10 @@ def _borrowed(problem: "PadProblem", clue: str, best: Array, own: Array, apart: 
     """
     if best.sum() <= 0:
         return None
-    far = _ahead(best, own, apart)
+    far = float((best - own).sum()) / np.sqrt(max(apart, 1e-12)) / SIZE_DOUBT
     drawn = np.r_[far, np.random.default_rng([problem.seed, 9]).standard_normal(FLIPS)]
     lead = 1.0 - float(own.sum() / best.sum())
     return Suspicion(0, clue, lead, 1.0 - SHARE_OF_GAIN, best - own, drawn=drawn)
-
-
-def _ahead(best: Array, own: Array, apart: float) -> float:
-    """Lead in log score in its deviations under the noise, taken to scatter twice as far."""
-    return float((best - own).sum()) / np.sqrt(max(apart, 1e-12)) / SIZE_DOUBT
 
 
 def _in_place(problem: "PadProblem", fitted: Fit, name: str) -> Suspicion | None:

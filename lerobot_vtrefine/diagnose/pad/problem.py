@@ -25,7 +25,6 @@ from lerobot_vtrefine.diagnose.pad.candidates import PLAIN
 from lerobot_vtrefine.diagnose.pad.candidates.base import Form
 from lerobot_vtrefine.diagnose.pad.candidates.sample_and_hold import repeated_share
 from lerobot_vtrefine.diagnose.pad.coincidence import cover_or_leak
-from lerobot_vtrefine.diagnose.pad.decoys import rather_touches
 from lerobot_vtrefine.diagnose.pad.error_level import slow_errors
 from lerobot_vtrefine.diagnose.pad.final_model import FinalFit
 from lerobot_vtrefine.diagnose.pad.fitting import (
@@ -277,13 +276,10 @@ class PadProblem(OptionalSteps):
         return Refits(self, fit)
 
     def credible(self, baseline: Fit, now: Fit, best: Fit, candidate: Candidate) -> Array:
-        """(1,) Delays must predict better also where all readings count alike; gains no worse than touches.
+        """(1,) Delays must predict better also where all readings count alike.
 
-        Weights trust fast changes most, and it is there that a course drawn between two frames is wrong. And
-        what lies under the pad changes readings from taxel to taxel as well.
+        Weights trust fast changes most, and it is there that a course drawn between two frames is wrong.
         """
-        if candidate.cause == GAIN_MAP:
-            return np.array([not rather_touches(self, best)])
         plain = PLAIN.get(candidate.cause)
         if plain is None or not plain.between_frames:
             return np.ones(1, dtype=bool)
