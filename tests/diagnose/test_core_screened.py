@@ -129,6 +129,9 @@ class Toy(OptionalSteps):
     def extended(self, now, candidate, channels, plainer=None):
         return self.fit((*now.free, candidate.column))
 
+    def refitted(self, now):
+        return now
+
     def reduced(self, now, candidates, channels):
         return self.fit([k for k in now.free if k not in [item.column for item in candidates]])
 
@@ -215,6 +218,24 @@ def test_what_is_seen_comes_before_what_imitates_it() -> None:
 
     Telling(Unseeing(plain.x, plain.y, seen="bend"), 0, lambda text: None).run()
     assert accepted == ["bend"]
+
+
+class Contrary(ScreenedSearch):
+    """Beside a square nothing else stands under its own weights."""
+
+    def _stands(self, problem, fitted, candidate):
+        return "square" not in {item.cause for item in self.chosen}
+
+
+@pytest.mark.parametrize(("acting", "expected"), [([1, 4], ["bend", "quartic"]), ([2], ["square"])])
+def test_what_contradicts_the_first_name_leads_to_the_next_best_where_that_predicts_better(
+    acting: list[int], expected: list[str]
+) -> None:
+    offered = (Form("bend", column=1), Form("square", column=2), Form("quartic", column=4))
+    plain = toy(offered=offered)
+    problem = replace(plain, y=plain.y + 0.5 * plain.columns()[..., acting].sum(-1))
+    search = Contrary(problem, 0, lambda text: None)
+    assert sorted(names_of(search.run())) == expected
 
 
 def test_look_alikes_tie_and_others_do_not() -> None:

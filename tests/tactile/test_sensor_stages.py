@@ -154,6 +154,10 @@ def test_dead_taxels_do_not_answer() -> None:
     assert dead[0].sum() == 1 + 10 + 5
     with pytest.raises(ValueError, match=r"\(6, 0\) is not on a 6 x 10 pad"):
         once(DeadTaxels(rows=[6]), image())
+    faint = once(DeadTaxels(taxels=[[1, 2], [3, 4]], left=[0.25, 0.0]), image() + 1) / (image() + 1)
+    assert torch.allclose(faint[..., [1, 3, 5], [2, 4, 5]], torch.tensor([0.25, 0.0, 1.0]))
+    with pytest.raises(ValueError, match="1 numbers in left for 2 taxels"):
+        DeadTaxels(taxels=[[1, 2], [3, 4]], left=[0.25])
 
 
 def test_saturation_levels_off_at_the_knee() -> None:

@@ -111,10 +111,47 @@ class ScreenedSearch[P: ScreenedProblem[Any, Any], F: ScoredFit, C: FormCandidat
         self.first: list[Promise[C]] = []
         self.gains: dict[str, float] = {}
         """Best cross-validated gain that each cause reached."""
+        self.others: tuple[list[Promise[C]], list[Step[F, C]]] = ([], [])
+        """The first round's tests, and its steps that were not taken."""
+        self.stuck = False
+        """Whether the last round refused what the test had found, and errors had confirmed."""
 
     def run(self) -> Selection[P, F, C]:
-        """Forward, and backward after every step."""
-        for number in range(MAX_ROUNDS):
+        """Forward, and backward after every step; from another first name where that contradicts itself."""
+        self._grow()
+        if self.stuck and len(self.chosen) == 1 and self.others[1]:
+            self._turn_back()
+        return Selection(
+            self.problem,
+            self.baseline,
+            self.now,
+            out_of_fold(self.problem, self.now, self.folds).errors,
+            {CHANNEL: self.chosen} if self.chosen else {},
+            {(name, CHANNEL): p for name, p in self.p_values.items()},
+            examined=self._examined(),
+            alternatives=self.alternatives,
+        )
+
+    def _turn_back(self) -> None:
+        """Begin anew with the next best first name, where that predicts better under the weights here.
+
+        Of two causes that act, one alone may look like a third: a leak on taxels of unequal gains is told as
+        a load that spreads, beside which no map of gains agrees from command to command.
+        """
+        before = (self.problem, self.now, self.chosen, self.p_values, self.alternatives)
+        found, steps = self.others
+        self.problem, self.now = self.problem.weighed(None)
+        self.chosen, self.p_values, self.alternatives = (), {}, {}
+        if self._accepted(steps[0], found):
+            self._grow()
+        problem, now = before[:2]
+        held, than = (out_of_fold(problem, fit, self.folds) for fit in (problem.refitted(self.now), now))
+        if not clearly_better(held, than, self.seed):
+            self.problem, self.now, self.chosen, self.p_values, self.alternatives = before
+
+    def _grow(self) -> None:
+        """Names added until none is worth it."""
+        for number in range(len(self.chosen), MAX_ROUNDS):
             self.tell(f"{self.problem.subject}: trying causes, round {number + 1}")
             found, steps = self._round(self.problem, self.now)
             self.first = self.first or found
@@ -126,19 +163,15 @@ class ScreenedSearch[P: ScreenedProblem[Any, Any], F: ScoredFit, C: FormCandidat
                 anew, others = self._round(*self.problem.unweighed(self.now))
                 if others and others[0].candidate.cause in seen:
                     found, steps = anew, others
-            if not any(self._accepted(step, found) for step in steps):
+            first = not self.chosen
+            taken = next((step for step in steps if self._accepted(step, found)), None)
+            self.stuck = taken is None and bool(steps)
+            if taken is None:
                 break
+            if first:
+                others = [step for step in steps if step.candidate.cause != taken.candidate.cause]
+                self.others = (found, others)
             self._drop_needless()
-        return Selection(
-            self.problem,
-            self.baseline,
-            self.now,
-            out_of_fold(self.problem, self.now, self.folds).errors,
-            {CHANNEL: self.chosen} if self.chosen else {},
-            {(name, CHANNEL): p for name, p in self.p_values.items()},
-            examined=self._examined(),
-            alternatives=self.alternatives,
-        )
 
     def _round(self, problem: P, now: F) -> tuple[list[Promise[C]], list[Step[F, C]]]:
         """All tests, and the steps from here that are worth it, best first."""

@@ -78,7 +78,11 @@ class PadAccount(OptionalRemarks):
         if cause == GAIN_MAP:
             return map_parameters(self.fit, presses, weights, self.found.seed)
         if cause == DEAD:
-            return {"taxels": Parameter([list(taxel) for taxel in self.fit.model.dead], None, "1")}
+            dead = self.fit.model.dead
+            return {
+                "taxels": Parameter([list(taxel) for taxel in dead], None, "1"),
+                "left": Parameter([round(part, 4) for part in dead.values()], None, "1"),
+            }
         index = [form.family for form in self.fit.model.forms].index(cause)
         found = form_parameters(self.fit, index, self._left_out, presses, weights)
         found = with_form_spread(found, other_forms(self.problem, self.fit, index))

@@ -13,23 +13,17 @@ import numpy as np
 from lerobot_vtrefine.diagnose.core.heldout import out_of_fold
 from lerobot_vtrefine.diagnose.core.rules import FLIPS, SHARE_OF_GAIN, SIZE_DOUBT
 from lerobot_vtrefine.diagnose.core.suspicion import Suspicion
-from lerobot_vtrefine.diagnose.pad.baseline import offset_tangents
 from lerobot_vtrefine.diagnose.pad.descriptors import DESCRIPTORS, Descriptor, directions, errors_left_out
 from lerobot_vtrefine.diagnose.pad.fitting import Fit, bounded_step, movable, predict
-from lerobot_vtrefine.diagnose.pad.form_fitting import settle, without
+from lerobot_vtrefine.diagnose.pad.form_fitting import without
 from lerobot_vtrefine.diagnose.pad.model import Composite
-from lerobot_vtrefine.diagnose.pad.press_trials import PressSet
 from lerobot_vtrefine.diagnose.pad.screening import GAIN_MAP, scorer_of
-from lerobot_vtrefine.diagnose.pad.taxel_maps import map_evidence, maps_left_out
+from lerobot_vtrefine.diagnose.pad.uneven_face import UnevenFace
 
 if TYPE_CHECKING:
     from lerobot_vtrefine.diagnose.pad.problem import PadProblem
 
 Array = np.ndarray
-FACE_M = 1e-4
-"""Unit of a face's unevenness: maps are shrunk within deviations of .001 to .8 of it [m]."""
-FACE_PASSES = 3
-"""Times that the face is told, each around the model that the one before left: the first may be far off."""
 
 
 def in_place_of_names(problem: "PadProblem", fitted: Fit) -> list[Suspicion]:
@@ -46,43 +40,22 @@ def _in_place_of_gains(problem: "PadProblem", fitted: Fit) -> Suspicion | None:
     more or less at some taxels, too.
 
     Around the model that has neither, weights overrate the flanks of presses, and gains that are told there
-    mislead wherever taxels are pressed deep. So the name is judged by its own fit, as all names are, and the
-    touches by the rest of the model's to readings that they are taken out of.
+    mislead wherever taxels are pressed deep. So both are judged by their own fits, as all names are.
     """
     if problem.presses.loaded:
         return None
     slim = without(fitted, [GAIN_MAP], problem.presses, problem.weights)
     before = out_of_fold(problem, slim, problem.folds)
     own = out_of_fold(problem, fitted, problem.folds).better_by(before)
-    touched = slim
-    for _ in range(FACE_PASSES):
-        images = _uneven_face(problem, touched)
-        level = replace(problem, presses=_without(problem.presses, images))
-        touched = settle(touched.model, level.presses, problem.weights)
-    best = out_of_fold(level, touched, problem.folds).better_by(before)
+    face = UnevenFace.told(problem, slim)
+    best = face.scores() - before.scores[:, 0]
     apart = 0.0
-    for weight, here, there, image in zip(
-        problem.weights, fitted.signals, touched.signals, images, strict=True
-    ):
-        apart += float(weight.gram(weight.whiten(here - there - image)[None])[0, 0])
+    for weight, here, there in zip(problem.weights, fitted.signals, face.now.signals, strict=True):
+        apart += float(weight.gram(weight.whiten(here - there)[None])[0, 0])
     clue = f"in the place of {GAIN_MAP}, first touches of the taxels' own predict trials left out better"
-    return _borrowed(problem, clue, best, own, apart)
-
-
-def _uneven_face(problem: "PadProblem", now: Fit) -> list[Array]:
-    """What an uneven face adds to every recording's signals (T, n), told by the other folds."""
-    slopes = offset_tangents(now.model, problem.presses, now.signals)
-    assert slopes is not None
-    tangents = [slope * FACE_M for slope in slopes]
-    evidence = map_evidence(now, problem.presses, problem.weights, tangents)
-    every = zip(problem.presses.presses, tangents, maps_left_out(evidence, problem.folds), strict=True)
-    return [tangent * face[press.taxels] for press, tangent, face in every]
-
-
-def _without(presses: PressSet, images: Sequence[Array]) -> PressSet:
-    """The same presses with something taken out of every recording's signals (T, n)."""
-    pairs = zip(presses.presses, images, strict=True)
-    return replace(presses, presses=tuple(replace(one, signal=one.signal - image) for one, image in pairs))
+    found = _borrowed(problem, clue, best, own, apart)
+    # One question about one name: among dozens that are asked of every pad, it would drown.
+    return None if found is None else replace(found, family="maps")
 
 
 def _borrowed(problem: "PadProblem", clue: str, best: Array, own: Array, apart: float) -> Suspicion | None:

@@ -24,8 +24,9 @@ from lerobot_vtrefine.diagnose.pad.candidates import CATALOGUE, PLAIN
 from lerobot_vtrefine.diagnose.pad.candidates.base import Form
 from lerobot_vtrefine.diagnose.pad.candidates.sample_and_hold import shortest_period
 from lerobot_vtrefine.diagnose.pad.fitting import Fit, movable, squared_errors, tangents
+from lerobot_vtrefine.diagnose.pad.map_prior import MAX_SIGMA
 from lerobot_vtrefine.diagnose.pad.screening import MAPS, Scorer
-from lerobot_vtrefine.diagnose.pad.taxel_maps import MAX_SIGMA, could_be_dead, map_evidence, plain_gains
+from lerobot_vtrefine.diagnose.pad.taxel_maps import could_be_dead, map_evidence, plain_gains
 
 if TYPE_CHECKING:
     from lerobot_vtrefine.diagnose.pad.problem import PadProblem

@@ -201,7 +201,8 @@ def map_parameters(
     draws = []
     for _ in range(60):
         picked = rng.integers(0, len(weights), len(weights))
-        draws.append(solve_map(evidence, picked.tolist(), log_map, None)[1])
+        _, variances = solve_map(evidence, picked.tolist(), log_map, model.gain_variances, anew=True)
+        draws.append(np.sqrt(sum(variances)))
     taxels = max(len(known) - 1, 1)
     chance = model.gain_sigma / np.sqrt(2.0 * taxels)
     half = 1.96 * float(np.hypot(np.std(draws), chance))

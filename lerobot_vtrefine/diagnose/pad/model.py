@@ -1,7 +1,7 @@
 """A model under test: the baseline's coordinates, the forms added to it, and maps over taxels."""
 
-from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
@@ -13,6 +13,7 @@ from lerobot_vtrefine.tactile.stages.base import Stage
 from lerobot_vtrefine.tactile.stages.contact import KelvinVoigt
 from lerobot_vtrefine.tactile.stages.readout import (
     BaselineDrift,
+    Crosstalk,
     DeadTaxels,
     Gain,
     Idle,
@@ -38,9 +39,16 @@ class Composite:
     forms: tuple[Form, ...] = ()
     gain_map: np.ndarray | None = None
     """Factor per taxel (R, C), or None."""
-    gain_sigma: float = 0.0
-    dead: tuple[tuple[int, int], ...] = ()
+    gain_variances: tuple[float, ...] = ()
+    """Of the map's parts (see `map_prior`)."""
+    dead: Mapping[tuple[int, int], float] = field(default_factory=dict)
+    """Taxels that hardly answer -> what is left, a part of a sound one's answer."""
     k_n: float = NOMINAL_K_N
+
+    @property
+    def gain_sigma(self) -> float:
+        """Deviation of the logarithms of taxels' gains."""
+        return float(np.sqrt(sum(self.gain_variances)))
 
     @property
     def families(self) -> tuple[str, ...]:
@@ -96,12 +104,19 @@ class Composite:
     def minus(self, family: str) -> "Composite":
         """Without a cause."""
         if family == "taxel_gain_spread":
-            return replace(self, gain_map=None, gain_sigma=0.0)
+            return replace(self, gain_map=None, gain_variances=())
         if family == "dead_taxels":
-            return replace(self, dead=())
+            return replace(self, dead={})
         keep = [index for index, form in enumerate(self.forms) if form.family != family]
         parts = [self.values[: len(BASE)], *(self.own(index) for index in keep)]
         return replace(self, forms=tuple(self.forms[index] for index in keep), values=np.concatenate(parts))
+
+    def before_leaks(self) -> "Composite":
+        """Without what leaks between readings after the taxels' gains; itself where nothing does."""
+        for form in self.forms:
+            if form.family == Crosstalk.name and (form.rank or Crosstalk.rank) > TaxelGainSpread.rank:
+                return self.minus(form.family)
+        return self
 
     def stages(self) -> tuple[Stage, ...]:
         """The simulator's stages without the idle level, in order."""
@@ -114,7 +129,7 @@ class Composite:
         if self.gain_map is not None:
             stages.append(TaxelGainSpread(self.gain_sigma, self.gain_map))  # ty: ignore[invalid-argument-type]
         if self.dead:
-            stages.append(DeadTaxels(self.dead))
+            stages.append(DeadTaxels(tuple(self.dead), left=tuple(self.dead.values())))
         stages.append(Quantisation(1.0, self.setting.full_scale))
         return self.in_order(stages)
 

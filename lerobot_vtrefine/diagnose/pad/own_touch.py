@@ -150,4 +150,6 @@ def _at(
 
 def _touching_at(presses: PressSet, touches: np.ndarray, adjusted: tuple[Press, ...]) -> PressSet:
     """The presses, adjusted or not, with touches of their own."""
-    return replace(presses, presses=adjusted, recorded=presses, touches_m=tuple(touches.tolist()))
+    return replace(
+        presses, presses=adjusted, recorded=presses, touches_m=tuple(touches.tolist()), face_m=None
+    )

@@ -153,9 +153,11 @@ class PressSet:
     step_counts: float = field(default=0.0)
     """Step of the converter, 0 if readings are not on a lattice."""
     recorded: "PressSet | None" = None
-    """The same presses without touches of their own, where they have any."""
+    """The same presses without touches of their own or an uneven face, where they have any."""
     touches_m: tuple[float, ...] = ()
     """How much later than recorded each press meets the face, where that is allowed for [m]."""
+    face_m: np.ndarray | None = None
+    """How much lower than assumed the face is at every taxel (R, C), in place of touches [m]."""
     delays_s: tuple[float, ...] = ()
     """How much later than the others each press was read, where that is allowed for [s]."""
 
@@ -170,6 +172,10 @@ class PressSet:
                 self, presses=presses, recorded=recorded, touches_m=touches_m, delays_s=delays_s
             )
         return self._subsets[key]
+
+    def uneven(self, face_m: np.ndarray) -> "PressSet":
+        """On a face that lies lower at every taxel (R, C) [m]."""
+        return replace(self, recorded=self, touches_m=(), face_m=face_m)
 
     @cached_property
     def _subsets(self) -> dict[tuple[int, ...], "PressSet"]:
@@ -196,7 +202,8 @@ class PressSet:
         from lerobot_vtrefine.diagnose.pad.forward_model.run import Bench, LoweredBench
 
         if self.recorded is not None:
-            return LoweredBench(self.recorded.bench, np.array(self.touches_m))
+            lower = np.array(self.touches_m) if self.face_m is None else self.face_m
+            return LoweredBench(self.recorded.bench, lower)
         return Bench(self.presses, self.idle.level)
 
     @property

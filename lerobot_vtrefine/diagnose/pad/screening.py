@@ -13,6 +13,7 @@ from lerobot_vtrefine.diagnose.pad.candidates.base import Form
 from lerobot_vtrefine.diagnose.pad.candidates.sample_and_hold import held, irregular_periods, pattern
 from lerobot_vtrefine.diagnose.pad.fitting import Fit, movable, predict, tangents
 from lerobot_vtrefine.diagnose.pad.forward_model.run import Prefix
+from lerobot_vtrefine.diagnose.pad.map_prior import parts
 from lerobot_vtrefine.diagnose.pad.own_touch import allowed, touches_of
 from lerobot_vtrefine.diagnose.pad.press_trials import PressSet
 from lerobot_vtrefine.diagnose.pad.taxel_maps import find_dead, map_evidence
@@ -138,28 +139,37 @@ def all_probes(problem: "PadProblem", fitted: Fit) -> list[Probe]:
     return probes
 
 
-def gain_spread_probe(problem: "PadProblem", fitted: Fit) -> Probe:
-    """Products between recordings of what they say about every taxel's gain: quadratic in the signs."""
+def gain_spread_probes(problem: "PadProblem", fitted: Fit) -> list[Probe]:
+    """Products between recordings of what they say about taxels' gains, quadratic in the signs: of every
+    taxel's own gain, and of what lines and regions share, which commands with no common taxel tell, too."""
     evidence = map_evidence(fitted, problem.presses, problem.weights)
     total = evidence.information.sum(axis=0)
-    known = total > 0
-    unit = np.where(known, evidence.scores / np.sqrt(np.where(known, total, 1.0)), 0.0)
-    products = unit @ unit.T
-    np.fill_diagonal(products, 0.0)
-    share = np.where(known, evidence.information / np.where(known, total, 1.0), 0.0)
-    scatter = float(np.sqrt(2.0 * (share.sum(axis=0) ** 2 - (share**2).sum(axis=0)).sum()))
-    size = np.array([max(float(products.sum()), 0.0)])
-    information = np.maximum(size, 1e-12)
-    return Probe(
-        GAIN_MAP,
-        None,
-        np.zeros(0),
-        size,
-        information,
-        one_sided=True,
-        products=products,
-        products_scatter=scatter,
-    )
+    known = np.flatnonzero(total > 0)
+    scores, share = evidence.scores[:, known], evidence.information[:, known] / total[known]
+    # A level that all taxels share belongs to the gain.
+    level = scores.sum(axis=1, keepdims=True) / max(float(total.sum()), 1e-300)
+    unit = scores / np.sqrt(total[known]) - level * np.sqrt(total[known])
+    found = []
+    for part in parts(known, known, evidence.shape):
+        alike = part / np.linalg.norm(part, 2)
+        products = unit @ alike @ unit.T
+        np.fill_diagonal(products, 0.0)
+        each = np.einsum("ki,ij,kj->", share, alike**2, share)
+        scatter = float(np.sqrt(2.0 * max((alike**2).sum() - each, 0.0)))
+        size = np.array([max(float(products.sum()), 0.0)])
+        found.append(
+            Probe(
+                GAIN_MAP,
+                None,
+                np.zeros(0),
+                size,
+                np.maximum(size, 1e-12),
+                one_sided=True,
+                products=products,
+                products_scatter=scatter,
+            )
+        )
+    return found
 
 
 def map_probes(problem: "PadProblem", fitted: Fit) -> list[Probe]:
@@ -168,7 +178,7 @@ def map_probes(problem: "PadProblem", fitted: Fit) -> list[Probe]:
     if problem.presses.layout.num_taxels < 2:
         return found
     if GAIN_MAP not in fitted.model.families:
-        found.append(gain_spread_probe(problem, fitted))
+        found += gain_spread_probes(problem, fitted)
     if DEAD not in fitted.model.families and find_dead(fitted, problem.presses):
         # Answers that fail by a factor of eight at many times their error are seen, not tested.
         found.append(_observed(DEAD, None, np.zeros(0)))

@@ -6,13 +6,13 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from lerobot_vtrefine.diagnose.pad.fitting import Fit, predict
+from lerobot_vtrefine.diagnose.pad.map_prior import covariance, likeliest_variances, told
 from lerobot_vtrefine.diagnose.pad.model import Composite
 from lerobot_vtrefine.diagnose.pad.press_trials import PressSet
 from lerobot_vtrefine.diagnose.pad.rules import DEAD_BELOW, DEAD_ERRORS
 from lerobot_vtrefine.diagnose.pad.weights import TrialWeights
 
 STEP = 1e-3
-MAX_SIGMA, MIN_SIGMA = 0.8, 1e-3
 BOUNDS = (0.05, 8.0)
 
 
@@ -25,12 +25,14 @@ class MapEvidence:
         information: (K, R*C) curvature; off-diagonal terms come from `shared`.
         shared: per recording, (q, R*C) inner products of nuisance directions with the taxels' tangents.
         coupling: per recording, (q, q).
+        shape: rows and columns of the pad.
     """
 
     scores: np.ndarray
     information: np.ndarray
     shared: list[np.ndarray]
     coupling: list[np.ndarray]
+    shape: tuple[int, int]
 
     def curvature(self, keep: Sequence[int], taxels: np.ndarray) -> np.ndarray:
         """Sum over recordings for the taxels numbered `taxels`: (n, n)."""
@@ -72,75 +74,64 @@ def map_evidence(
         wide = np.zeros((along.shape[0], count))
         wide[:, taxels] = along
         shared.append(wide)
-    return MapEvidence(scores, information, shared, [weight.coupling for weight in weights])
+    shape = (presses.layout.rows, presses.layout.cols)
+    return MapEvidence(scores, information, shared, [weight.coupling for weight in weights], shape)
 
 
 def gain_tangents(fitted: Fit, presses: PressSet) -> list[np.ndarray]:
-    """Change of the signals (T, n) by the logarithm of the taxels' own gains."""
+    """Change of the signals (T, n) by the logarithm of the taxels' own gains.
+
+    What leaks into a reading after the gains is others', and says nothing of its own taxel's.
+    """
     shape = (presses.layout.rows, presses.layout.cols)
-    present = fitted.model.gain_map if fitted.model.gain_map is not None else np.ones(shape)
-    moved = predict(replace(fitted.model, gain_map=present * (1.0 + STEP)), presses)
-    return [(there - here) / STEP for there, here in zip(moved, fitted.signals, strict=True)]
-
-
-def maps_left_out(evidence: MapEvidence, folds: np.ndarray) -> np.ndarray:
-    """For every recording the map (K, R*C) that the other folds tell, where the evidence is of none."""
-    maps = np.zeros(evidence.scores.shape)
-    _, sigma, _ = solve_map(evidence, range(len(folds)), maps[0], None)
-    for fold in np.unique(folds):
-        held = folds == fold
-        maps[held], _, _ = solve_map(evidence, np.flatnonzero(~held).tolist(), np.zeros(maps.shape[1]), sigma)
-    return maps
+    model = fitted.model.before_leaks()
+    signals = fitted.signals if model is fitted.model else predict(model, presses)
+    present = model.gain_map if model.gain_map is not None else np.ones(shape)
+    moved = predict(replace(model, gain_map=present * (1.0 + STEP)), presses)
+    return [(there - here) / STEP for there, here in zip(moved, signals, strict=True)]
 
 
 def solve_map(
-    evidence: MapEvidence, keep: Sequence[int], log_map: np.ndarray, sigma: float | None
-) -> tuple[np.ndarray, float, np.ndarray]:
-    """Shrunk log gains (R*C,), their deviation, and their variances, from the recordings in `keep`.
+    evidence: MapEvidence,
+    keep: Sequence[int],
+    log_map: np.ndarray,
+    variances: Sequence[float],
+    *,
+    anew: bool = False,
+) -> tuple[np.ndarray, tuple[float, ...]]:
+    """Shrunk log gains (R*C,) and the variances of their parts, from the recordings in `keep`.
 
     Args:
         log_map: (R*C,) present log gains, at which the evidence was taken.
-        sigma: deviation between taxels; None to fit it (EM on the marginal likelihood).
+        variances: see `map_prior`; none to find the likeliest.
+        anew: find the likeliest ones near those.
     """
     informed = evidence.information[list(keep)].sum(axis=0)
     taxels = np.flatnonzero(informed > 1e-6 * max(float(informed.max()), 1e-12))
-    result, variance = np.zeros(len(log_map)), np.full(len(log_map), np.inf)
     if not len(taxels):
-        return result, sigma or 0.0, variance
+        return np.zeros(len(log_map)), tuple(variances)
     curvature = evidence.curvature(keep, taxels)
     target = evidence.scores[list(keep)][:, taxels].sum(axis=0) + curvature @ log_map[taxels]
-    spread = 0.1 if sigma is None else max(sigma, MIN_SIGMA)
-    for _ in range(12):
-        inverse = np.linalg.inv(curvature + np.eye(len(taxels)) / spread**2)
-        solution = inverse @ target
-        if sigma is not None:
-            break
-        # Taxels are exchangeable around a common level, which belongs to the gain.
-        level = float(solution.mean())
-        new = np.sqrt(
-            np.clip(np.mean((solution - level) ** 2 + np.diag(inverse)), MIN_SIGMA**2, MAX_SIGMA**2)
-        )
-        if abs(new - spread) < 1e-4:
-            break
-        spread = float(new)
-    result[taxels], variance[taxels] = solution, np.diag(inverse)
-    return result, spread, variance
+    shape, own = evidence.shape, np.asarray(variances)
+    if anew or not len(own):
+        own = likeliest_variances(curvature, target, taxels, shape, own)
+    level, pull, _ = told(curvature, target, covariance(own, taxels, taxels, shape))
+    return level + covariance(own, np.arange(len(log_map)), taxels, shape) @ pull, tuple(own.tolist())
 
 
 def with_map(fitted: Fit, presses: PressSet, weights: Sequence[TrialWeights]) -> Composite:
-    """The model with gains of every taxel that was pressed; the others keep one."""
+    """The model with gains of every taxel; those that nothing pressed follow the ones that they belong to."""
     model = fitted.model
     shape = (presses.layout.rows, presses.layout.cols)
     log_map = np.zeros(presses.layout.num_taxels)
     if model.gain_map is not None:
         log_map = np.log(np.asarray(model.gain_map)).ravel()
     everyone = range(len(weights))
-    sigma = model.gain_sigma
     for _ in range(2):
         evidence = map_evidence(fitted, presses, weights)
-        log_map, sigma, _ = solve_map(evidence, everyone, log_map, None)
+        log_map, variances = solve_map(evidence, everyone, log_map, ())
         log_map = np.clip(log_map, *np.log(BOUNDS))
-        model = replace(model, gain_map=np.exp(log_map).reshape(shape), gain_sigma=sigma)
+        model = replace(model, gain_map=np.exp(log_map).reshape(shape), gain_variances=variances)
         fitted = replace(fitted, model=model, signals=tuple(predict(model, presses)))
     return normalised(model, evidence)
 
@@ -151,17 +142,16 @@ def normalised(model: Composite, evidence: MapEvidence) -> Composite:
         return model
     informed = (evidence.information.sum(axis=0) > 0).reshape(model.gain_map.shape)
     level = float(np.log(model.gain_map[informed]).mean()) if informed.any() else 0.0
-    gain_map = np.where(informed, model.gain_map / np.exp(level), 1.0)
     values = model.values.copy()
     values[0] += level
-    return replace(model, gain_map=gain_map, values=values)
+    return replace(model, gain_map=model.gain_map / np.exp(level), values=values)
 
 
 def map_of(model: Composite, fitted: Fit, evidence: MapEvidence, keep: Sequence[int]) -> Composite:
     """The model with its map taken from some recordings only."""
     assert fitted.model.gain_map is not None
     log_map = np.log(np.asarray(fitted.model.gain_map)).ravel()
-    fresh, _, _ = solve_map(evidence, keep, log_map, fitted.model.gain_sigma)
+    fresh, _ = solve_map(evidence, keep, log_map, fitted.model.gain_variances)
     return replace(
         model, gain_map=np.exp(np.clip(fresh, *np.log(BOUNDS))).reshape(fitted.model.gain_map.shape)
     )
@@ -191,8 +181,8 @@ def plain_gains(fitted: Fit, presses: PressSet) -> tuple[np.ndarray, np.ndarray]
 
 def with_all_dead(fitted: Fit, presses: PressSet, errors: float = DEAD_ERRORS) -> Fit:
     """The fit with those taxels, too, that hardly answer in these presses."""
-    dead = {*fitted.model.dead, *find_dead(fitted, presses, errors)}
-    model = replace(fitted.model, dead=tuple(sorted(dead)))
+    dead = {**find_dead(fitted, presses, errors), **fitted.model.dead}
+    model = replace(fitted.model, dead=dict(sorted(dead.items())))
     return replace(fitted, model=model, signals=tuple(predict(model, presses)))
 
 
@@ -201,8 +191,8 @@ def could_be_dead(error: np.ndarray, errors: float = DEAD_ERRORS) -> np.ndarray:
     return errors * error < DEAD_BELOW
 
 
-def find_dead(fitted: Fit, presses: PressSet, errors: float = DEAD_ERRORS) -> tuple[tuple[int, int], ...]:
-    """Taxels that hardly answer although pressed well: ((row, col), ...).
+def find_dead(fitted: Fit, presses: PressSet, errors: float = DEAD_ERRORS) -> dict[tuple[int, int], float]:
+    """Taxels that hardly answer, pressed well: (row, col) -> the part of a sound answer that is left.
 
     Args:
         errors: standard errors by which a gain must lie below that of a dead taxel.
@@ -210,13 +200,15 @@ def find_dead(fitted: Fit, presses: PressSet, errors: float = DEAD_ERRORS) -> tu
     gain, error = plain_gains(fitted, presses)
     sure = could_be_dead(error)
     if sure.sum() < 2:
-        return ()
+        return {}
     typical = float(np.median(gain[sure]))
     if typical <= 0:
-        return ()
+        return {}
     good = could_be_dead(error, errors)
     dead = good & (gain + errors * error < DEAD_BELOW * typical)
     if dead.sum() > 0.5 * good.sum():
-        return ()
+        return {}
+    sound = float(np.median(gain[sure & ~dead]))
+    left = np.where(gain > DEAD_ERRORS * error, gain / sound, 0.0)
     cols = presses.layout.cols
-    return tuple((int(index) // cols, int(index) % cols) for index in np.flatnonzero(dead))
+    return {(int(k) // cols, int(k) % cols): float(left[k]) for k in np.flatnonzero(dead)}

@@ -76,7 +76,8 @@ class TaxelGainSpread(Stage):
 @dataclass(frozen=True)
 class DeadTaxels(Stage):
     """Taxels that no longer answer: those in `taxels` ((r, c) pairs), whole `rows` and `cols`, and each
-    further one with `probability`, drawn per episode."""
+    further one with `probability`, drawn per episode. Those in `taxels` may still answer with a part `left`
+    of what they should, one number for each; none: with nothing."""
 
     name: ClassVar[str] = "dead_taxels"
     domain: ClassVar[str] = "counts"
@@ -84,21 +85,24 @@ class DeadTaxels(Stage):
     taxels: tuple[tuple[int, int], ...] = limits(0, 9999, default=())
     rows: tuple[int, ...] = limits(0, 9999, default=())
     cols: tuple[int, ...] = limits(0, 9999, default=())
+    left: tuple[float, ...] = limits(0, 1, default=())
     probability: float = parameter(0.0, "1", 0.0, 0.02, maximum=1.0)
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        for name in ("taxels", "rows", "cols"):
+        for name in ("taxels", "rows", "cols", "left"):
             object.__setattr__(self, name, as_tuple(getattr(self, name)))
+        if len(self.left) not in (0, len(self.taxels)):
+            raise ValueError(f"dead_taxels: {len(self.left)} numbers in left for {len(self.taxels)} taxels")
 
     def alive(self, layout: PadLayout) -> np.ndarray:
-        """1 for every taxel that answers, (R, C); ValueError when a listed one is not on the pad."""
+        """The part (R, C) that every taxel answers with; ValueError when a listed one is not on the pad."""
         mask = np.ones((layout.rows, layout.cols), dtype=np.float32)
         for row, col in [*self.taxels, *((r, 0) for r in self.rows), *((0, c) for c in self.cols)]:
             if not (0 <= row < layout.rows and 0 <= col < layout.cols):
                 raise ValueError(f"dead_taxels: ({row}, {col}) is not on a {layout.rows} x {layout.cols} pad")
-        for row, col in self.taxels:
-            mask[row, col] = 0.0
+        for (row, col), part in zip(self.taxels, self.left or [0.0] * len(self.taxels), strict=True):
+            mask[row, col] = part
         mask[list(self.rows)] = 0.0
         mask[:, list(self.cols)] = 0.0
         return mask

@@ -36,7 +36,8 @@ class Bench:
 
 @dataclass(frozen=True)
 class LoweredBench:
-    """The same presses with the face lowered, in all of them alike or in each by its own amount (K,)."""
+    """The same presses with the face lowered: in all of them alike, in each by its own amount (K,), or at
+    every taxel (R, C)."""
 
     bench: "Bench | LoweredBench"
     by_m: float | np.ndarray
@@ -56,6 +57,8 @@ class LoweredBench:
     def _of_columns(self, sheet: Sheet) -> float | np.ndarray:
         if not isinstance(self.by_m, np.ndarray):
             return self.by_m
+        if self.by_m.ndim == 2:
+            return self.by_m.ravel()[sheet.taxels]
         widths = [block.stop - block.start for block in sheet.blocks]
         return np.repeat(self.by_m[list(sheet.members)], widths)
 
