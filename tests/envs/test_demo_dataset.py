@@ -229,6 +229,10 @@ def test_full_disk_before_the_first_commit_leaves_nothing(tmp_path, monkeypatch)
     assert list(tmp_path.iterdir()) == []
 
 
+def test_a_file_system_without_blocks_is_not_full():
+    assert not demo_dataset.disk_is_full(None, Path("/proc"))
+
+
 def test_other_settings_and_foreign_folders_are_refused(tmp_path):
     with open_recording(tmp_path / "demo") as demos:
         demos.append(demonstration(0))
