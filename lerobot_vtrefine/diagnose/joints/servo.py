@@ -138,8 +138,6 @@ def _worn(x: Array, width: Array, rounding: Array | None, first: Array) -> Array
 def play_operator(x: Array, width: Array | float, first: Array) -> Array:
     """The play operator along frames: outputs (N, ...) start from `first` (...) and move only when inputs
     leave a window of full width `width` (...) around them."""
-    if not np.any(width):
-        return x.copy()
     half = width / 2
     out = np.empty_like(x)
     state = first

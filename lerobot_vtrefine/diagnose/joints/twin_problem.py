@@ -182,9 +182,9 @@ class _Arms:
 
     def _controls(self, command: Array, push: Array, play: Array, first: Array, tau_s: float) -> Array:
         """Servo targets (W, K, nu) of all steps; play (S, J) acts on the way between frames, too."""
-        frames, trials, joints = command.shape
-        flat = task.servo_commands(self.robot, command.swapaxes(0, 1).reshape(-1, joints))
-        servo = np.tile(flat.reshape(trials, frames, -1), (len(play), 1, 1))
+        frames, trials, _ = command.shape
+        every = np.tile(command, (1, len(play), 1))
+        servo = np.stack([task.servo_commands(self.robot, row) for row in every], 1)
         rest = task.servo_commands(self.robot, first)[:, None]
         wanted = self._between(rest, servo)
         width = np.abs(np.repeat(self._per_servo(play * self.side), trials, 0))
