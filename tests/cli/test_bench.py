@@ -104,8 +104,8 @@ def test_device_prints_a_row_per_number_of_worlds_and_compares_solvers(
         assert rows[1].split()[0] == "worlds"
         assert rows[2].split()[0] == "1"
     whole, physics = lines[6:]
-    assert "control step of 1 worlds, stock / own" in whole
-    assert "physics of 1 worlds, stock / own" in physics
+    assert "control step of 1 world, stock / own" in whole
+    assert "physics of 1 world, stock / own" in physics
 
 
 def test_plot_writes_a_picture_and_a_table(

@@ -129,7 +129,7 @@ def test_all_forms_at_once_and_maps() -> None:
     for form in {form.family: form for form in FORETOLD if "idle levels" not in form.label}.values():
         model = model.plus(form, np.array(form.probes(model.setting)[0], dtype=float))
     gains = np.exp(np.random.default_rng(0).normal(0, 0.2, (5, 8)))
-    assert_same(Composite(model.setting, model.values, model.forms, gains, 0.2, ((2, 3),)), held)
+    assert_same(Composite(model.setting, model.values, model.forms, gains, (0.04,), {(2, 3): 0.2}), held)
 
 
 def test_the_saved_model_predicts_the_same(tmp_path: Path) -> None:
