@@ -112,7 +112,9 @@ def _in_flags(message: str) -> str:
         return "say which policy: --policy.path=FOLDER, a checkpoint's pretrained_model"
     if unknown := _UNKNOWN_FIELDS.search(message):
         names = re.findall("`([^`]+)`", unknown[1])
-        message = "".join(f"{file}: " for file in _config_files_with(names)) + message
+        files = "".join(f"{file}: " for file in _config_files_with(names))
+        listed = ", ".join(f"`{name}`" for name in names)
+        return f"{files}{listed}: no such setting; --help lists those that there are"
     return _OPTIONAL_VALUE.sub(lambda found: f"`{'.'.join(filter(None, found.groups()))}`: ", message)
 
 

@@ -57,7 +57,7 @@ class RecordDemosConfig:
     num_envs: int = 16
     """Episodes simulated at once, per process."""
     num_workers: int = 0
-    """Simulation processes beside the one that writes; 0 simulates in this one."""
+    """Simulation processes beside the one that writes, one for each core at most; 0 simulates in this one."""
     include_failures: bool = False
     """Keep failed episodes too."""
     truth: bool = False

@@ -29,7 +29,7 @@ class FrameShape:
 
     def __post_init__(self) -> None:
         if not (1 <= self.rows <= 64 and 1 <= self.cols <= 64):
-            raise ValueError(f"frame shape {self.rows}x{self.cols} is not within 1x1 .. 64x64")
+            raise ValueError(f"a pad has 1 to 64 rows and columns, not {self.rows} and {self.cols}")
 
     @property
     def taxels(self) -> int:

@@ -32,12 +32,15 @@ def demonstration_stream(
     """Expert episodes of ``first_seed``, ``first_seed + 1``, ... without end, whatever ``num_workers``.
 
     With 0 workers this process simulates; otherwise worker ``w`` of ``W`` simulates every W-th seed from
-    ``first_seed + w`` in a process of its own, so that simulation and the caller's writing overlap.
+    ``first_seed + w`` in a process of its own, so that simulation and the caller's writing overlap. There is
+    one worker for each core at most: more take memory and no less time.
     """
     if num_workers == 0:
         yield expert_episodes(config, degradation, num_envs, itertools.count(first_seed), with_truth)
         return
-    threads = config.num_threads or max(1, (os.cpu_count() or 1) // num_workers)
+    cores = os.cpu_count() or 1
+    num_workers = min(num_workers, cores)
+    threads = config.num_threads or cores // num_workers
     config = replace(config, num_threads=threads)
     context = mp.get_context("spawn")
     queues = [context.Queue(AHEAD) for _ in range(num_workers)]

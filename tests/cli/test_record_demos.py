@@ -1,5 +1,6 @@
 import errno
 import json
+import multiprocessing
 import os
 import shutil
 from pathlib import Path
@@ -12,7 +13,10 @@ from lerobot.datasets import LeRobotDataset
 from local_hub import use_folder_as_hub
 
 from lerobot_vtrefine.datasets.features import ACTION_KEY, DEPTH_KEY, NOISE_LEVEL_KEY, RGB_KEY, STATE_KEY
+from lerobot_vtrefine.envs.config import VtRefineEnvConfig
+from lerobot_vtrefine.envs.demo_workers import demonstration_stream
 from lerobot_vtrefine.lerobot_compat import card
+from lerobot_vtrefine.sim.demonstrations import Degradation
 from lerobot_vtrefine.sim.simulation import InsertionSim
 
 
@@ -50,6 +54,12 @@ def test_more_workers_give_the_same_dataset(demos: Path, tmp_path: Path):
     again = tmp_path / "workers"
     assert record(again, "--num_episodes=3", "--num_envs=1", "--num_workers=2", "--seed=5") == 0
     same(demos, again)
+
+
+def test_there_is_one_worker_for_each_core_at_most(monkeypatch):
+    monkeypatch.setattr(os, "cpu_count", lambda: 1)
+    with demonstration_stream(VtRefineEnvConfig(), Degradation(), 1, 5, num_workers=500):
+        assert len(multiprocessing.active_children()) == 1
 
 
 def test_rerun_continues_to_the_requested_number(demos: Path, tmp_path: Path):
