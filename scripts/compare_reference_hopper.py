@@ -8,16 +8,16 @@
     python scripts/compare_reference_hopper.py rows --folder=hopper
 
 ``data`` and ``pretrain`` make what stands in for D4RL's hopper-medium-v2 and for the checkpoint that the
-reference ships (``hopper_standin.py``). ``train`` fine-tunes that one checkpoint, by the reference's agent, with
+reference ships (``hopper_standin.py``). ``train`` fine-tunes that one checkpoint: the reference's agent, with
 its loop, loss, critic, optimisers and schedules unchanged and the hyper-parameters of its
-``ft_ppo_diffusion_mlp.yaml`` for Hopper, or by ours: ``paper`` with the same hyper-parameters, ``trust_region``
-with its own. Every line of a learning curve lies on disk at once. ``rows`` adds the curves that are there to
-results/reference_hopper.json.
+``ft_ppo_diffusion_mlp.yaml`` for Hopper, or ours, ``paper`` with the same hyper-parameters, ``trust_region``
+with its own. Every line of a learning curve lies on disk at once. ``rows`` makes the table of
+results/reference_hopper.json from the curves that are there.
 
-Ours learns from whole episodes and the reference from segments of 500 decisions that go on where the last one
-stopped. So an iteration of ours has as many worlds as make the same 20 000 decisions, by the mean length of the
-episodes before. Environment steps count alike, and both are evaluated after the same of them, on the same 40
-held-out episodes, each by its own deployment sampler.
+Ours learns from whole episodes and the reference from segments of 500 decisions that go on where the last
+one stopped. So an iteration of ours has as many worlds as make the same 20 000 decisions, by the mean length
+of the episodes before. Environment steps count alike, and both are evaluated after the same of them, on the
+same 40 held-out episodes, each by its own deployment sampler.
 """
 
 import argparse
@@ -32,12 +32,12 @@ from pathlib import Path
 from typing import Any
 
 import torch
+from hopper_curves import TABLE, Curve, lines_of, read_curves
 from hopper_dppo import (
     CHUNK,
     DENOISING_STEPS,
     HORIZON,
     TUNED_STEPS,
-    Curve,
     HopperDecisions,
     ReferenceHoppers,
     hopper_agent,
@@ -49,6 +49,9 @@ from torch import Tensor, nn
 
 from lerobot_vtrefine.cli.arguments import CommandParser
 from lerobot_vtrefine.cli.errors import run_cli
+from lerobot_vtrefine.cli.results.collect import save
+from lerobot_vtrefine.cli.results.provenance import provenance
+from lerobot_vtrefine.cli.results.rows import Row
 from lerobot_vtrefine.finetune import dppo
 from lerobot_vtrefine.finetune.config import DppoConfig
 from lerobot_vtrefine.finetune.evaluation import evaluate
@@ -88,7 +91,7 @@ class Steps(Tensor):
     The reference's loss goes through them in Python, one by one, which on a GPU took longer than all else.
     """
 
-    __torch_function__ = torch._C._disabled_torch_function_impl
+    __torch_function__ = torch._C._disabled_torch_function_impl  # ty: ignore[incompatible-method-override]
 
     def __iter__(self) -> Any:
         return iter(self.tolist())
@@ -149,7 +152,9 @@ def train_reference(args: argparse.Namespace, worlds: Worlds | SpreadWorlds, cur
     )
 
     class Model(reference.Model):
-        def loss(self, obs: Any, before: Tensor, after: Tensor, steps: Tensor, *rest: Any, **more: Any) -> Any:
+        def loss(
+            self, obs: Any, before: Tensor, after: Tensor, steps: Tensor, *rest: Any, **more: Any
+        ) -> Any:
             return super().loss(obs, before, after, steps.as_subclass(Steps), *rest, **more)
 
     torch.manual_seed(args.seed)
@@ -270,6 +275,21 @@ def train(args: argparse.Namespace) -> None:
     (train_reference if args.by == "reference" else train_ours)(args, worlds, curve)
 
 
+def rows(args: argparse.Namespace) -> None:
+    """Rows of all curves that lie in the folder, at the evaluations' steps that all have reached."""
+    curves = read_curves(args.folder / "curves")
+    if not curves:
+        raise ValueError(f"{args.folder / 'curves'} holds no evaluation")
+    reached = min(points[-1][0] for runs in curves.values() for points in runs.values())
+    round_steps = args.every * NUM_ENVS * N_STEPS * CHUNK
+    budgets = [i * round_steps for i in range(round(reached / round_steps) + 1)]
+    origin = provenance() | {"machine": args.machine or provenance()["machine"]}
+    found: list[tuple[Row, list[dict[str, float]]]] = [
+        (line, []) for line in lines_of(curves, budgets, **origin)
+    ]
+    save(args.results, TABLE, found, replace=True)
+
+
 @run_cli
 def main() -> int:
     """``data``, ``pretrain``, ``train`` or ``rows``."""
@@ -288,6 +308,7 @@ def main() -> int:
     parser.add_argument("--steps", type=int, default=100_000, help="to record")
     parser.add_argument("--updates", type=int, default=20_000, help="of the imitation")
     parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("--machine", help="that trained, for the rows; default: this one")
     parser.add_argument("--results", type=Path, default=ROOT / "results" / "reference_hopper.json")
     args = parser.parse_args()
     args.folder.mkdir(parents=True, exist_ok=True)
@@ -298,7 +319,7 @@ def main() -> int:
         found = record(made, goal=args.goal, noise=args.noise, steps=args.steps, seed=args.seed)
         print(json.dumps(found))
     else:
-        {"pretrain": pretrain, "train": train}[args.what](args)
+        {"pretrain": pretrain, "train": train, "rows": rows}[args.what](args)
     return 0
 
 

@@ -4,14 +4,12 @@ Both see the scaled observation, for the actor and for the critic, and act in sc
 are counted as the reference does: a chunk counts in full, also where the episode ends within it.
 """
 
-import json
-import time
 from collections.abc import Sequence
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 import torch
+from hopper_curves import Curve
 from hopper_standin import Scales
 from hopper_worlds import ACTION_DIM, MAX_STEPS, OBS_DIM, Array, SpreadWorlds, Worlds
 from torch import Tensor, nn
@@ -29,25 +27,8 @@ FEWEST, MOST = 8, 800
 """Worlds of one of our iterations."""
 
 
-class Curve:
-    """A learning curve, on disk after every line: JSON, one object each."""
-
-    def __init__(self, path: Path, **named: Any) -> None:
-        self.path, self.named, self.began = path, named, time.perf_counter()
-        path.parent.mkdir(parents=True, exist_ok=True)
-        path.unlink(missing_ok=True)
-
-    def add(self, iteration: int, env_steps: int, **numbers: float) -> None:
-        """A line after so many iterations of training and so many environment steps."""
-        line = {"iteration": iteration, "env_steps": env_steps, **numbers}
-        line["seconds"] = round(time.perf_counter() - self.began, 1)
-        with self.path.open("a", encoding="utf-8") as file:
-            file.write(json.dumps(self.named | line) + "\n")
-        print(json.dumps(line), flush=True)
-
-
 class HopperDecisions:
-    """Hopper as our DPPO sees it: whole episodes in ``num_envs`` worlds, which may change from reset to reset."""
+    """Hopper as our DPPO sees it: whole episodes in ``num_envs`` worlds, a number that may change."""
 
     max_decisions = MAX_DECISIONS
     privileged_dim = OBS_DIM
@@ -56,43 +37,35 @@ class HopperDecisions:
         self.worlds, self.scales, self.num_envs = worlds, scales, num_envs
         self._obs = np.zeros((0, OBS_DIM), np.float32)
         self._decisions = np.zeros(0, np.int64)
-        self._terminated = self._truncated = np.zeros(0, bool)
+        self._over = np.zeros((2, 0), bool)  # terminated, truncated
 
     def reset(self, seeds: Sequence[int]) -> tuple[Observation, Tensor]:
         """Observation {"state": (n, 11)} and the critic's (n, 11), which is the same."""
-        self._obs = self.scales.scaled_obs(self.worlds.reset(range(len(seeds)), seeds))
+        self._obs = self.scales.scaled_obs(self.worlds.reset(np.arange(len(seeds)), np.array(seeds)))
         self._decisions = np.zeros(len(seeds), np.int64)
-        self._terminated, self._truncated = np.zeros((2, len(seeds)), bool)
+        self._over = np.zeros((2, len(seeds)), bool)
         state = torch.from_numpy(self._obs)
         return {"state": state}, state
 
     def step_chunk(self, actions: Tensor) -> Decision:
         """Execute scaled chunks (n, Ta, 3) where the episode goes on."""
-        ids = np.flatnonzero(~(self._terminated | self._truncated))
+        ids = np.flatnonzero(~self._over.any(0))
         chunks = self.scales.raw_actions(actions.cpu().numpy()[ids])
-        obs, reward, terminated, truncated = self.worlds.step(ids, chunks)
-        # What was handed out before must not change.
-        self._obs, self._terminated, self._truncated = (
-            values.copy() for values in (self._obs, self._terminated, self._truncated)
-        )
+        obs, chunk_reward, *over = self.worlds.step(ids, chunks)
+        # Copies: what was handed out before must not change.
+        self._obs, self._over, self._decisions = self._obs.copy(), self._over.copy(), self._decisions.copy()
         self._obs[ids] = self.scales.scaled_obs(obs)
-        self._terminated[ids], self._truncated[ids] = terminated, truncated
-        self._decisions = self._decisions.copy()
+        self._over[:, ids] = over
         self._decisions[ids] += 1
-        rewards = np.zeros(len(self._obs), np.float32)
-        rewards[ids] = reward
+        reward = np.zeros(len(self._obs), np.float32)
+        reward[ids] = chunk_reward
         state = torch.from_numpy(self._obs)
-        return Decision(
-            {"state": state},
-            state,
-            torch.from_numpy(rewards),
-            torch.from_numpy(self._terminated),
-            torch.from_numpy(self._truncated),
-            {
-                "success": torch.zeros(len(self._obs), dtype=torch.bool),
-                "decisions": torch.from_numpy(self._decisions),
-            },
-        )
+        info = {
+            "success": torch.zeros(len(self._obs), dtype=torch.bool),
+            "decisions": torch.from_numpy(self._decisions),
+        }
+        terminated, truncated = torch.from_numpy(self._over)
+        return Decision({"state": state}, state, torch.from_numpy(reward), terminated, truncated, info)
 
     def fill(self, decisions: int, per_episode: float) -> None:
         """As many worlds from now on as make so many decisions, if episodes keep their mean length."""
@@ -104,7 +77,7 @@ class StateActor(nn.Module):
 
     def __init__(self, network: nn.Module) -> None:
         super().__init__()
-        self.denoiser = StateDenoiser(network)
+        self.denoiser: nn.Module = StateDenoiser(network)
 
     def encode(self, batch: Observation, /) -> Tensor:
         """Condition (B, 11)."""
@@ -169,8 +142,8 @@ class ReferenceHoppers:
 
     def reset_arg(self, options_list: object) -> dict[str, Array]:
         """New episodes in all worlds: held-out ones where the agent evaluates."""
-        ids = range(self.num_envs)
-        seeds = [EVALUATION_SEEDS + i for i in ids] if self._evaluates else self._fresh(self.num_envs)
+        ids = np.arange(self.num_envs)
+        seeds = EVALUATION_SEEDS + ids if self._evaluates else self._fresh(self.num_envs)
         self.totals[:] = self.lengths[:] = 0
         return self._state(self.worlds.reset(ids, seeds))
 
@@ -194,9 +167,9 @@ class ReferenceHoppers:
     def _evaluates(self) -> bool:
         return self.decisions // self.n_steps % self.val_freq == 0
 
-    def _fresh(self, number: int) -> range:
+    def _fresh(self, number: int) -> Array:
         self.next_seed += number
-        return range(self.next_seed - number, self.next_seed)
+        return np.arange(self.next_seed - number, self.next_seed)
 
     def _note(self, iteration: int) -> None:
         """A line of the curve, of an iteration that ends here."""

@@ -1,123 +1,135 @@
 """What stands in for D4RL's hopper-medium-v2: a mediocre controller, its episodes, an imitation of them.
 
-The controller is linear, found by augmented random search (Mania et al. 2018, V2-t) that stops early. Episodes
-carry Gaussian noise on their actions. Observations (11) and actions (3) are scaled to -1 ... 1 by their extremes
-in the episodes.
+The controller is linear, found by augmented random search (Mania et al. 2018, V2-t) that stops early.
+Episodes carry Gaussian noise on their actions. Observations (11) and actions (3) are scaled to -1 ... 1 by
+their extremes in the episodes.
 """
 
 import copy
 import sys
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
+import gymnasium
 import numpy as np
 import torch
-from hopper_worlds import ACTION_DIM, MAX_STEPS, OBS_DIM, Array, SpreadWorlds, Worlds
+from hopper_worlds import ACTION_DIM, MAX_STEPS, OBS_DIM, Array, make_env
 from torch import nn
 
 DIRECTIONS, KEPT, STEP, SPREAD = 8, 4, 0.02, 0.025
 """Of the search: directions of a round, the best of them, step size, and how far a direction is followed."""
-JUDGED_EVERY, JUDGED_EPISODES = 20, 8
+JUDGED_EVERY, JUDGED_EPISODES, FIRST_JUDGED = 20, 5, 1_000_000
+
+
+@dataclass(frozen=True)
+class Controller:
+    """Actions from standardised observations."""
+
+    gains: Array
+    """(3, 11)"""
+    mean: Array
+    """(11,)"""
+    std: Array
+    """(11,)"""
+
+    def __call__(self, obs: Array) -> Array:
+        """(11,) -> (3,)."""
+        return self.gains @ ((obs - self.mean) / self.std)
 
 
 class Moments:
-    """Running mean and variance of observations."""
+    """Running mean and deviation of observations (Welford 1962)."""
 
     def __init__(self) -> None:
         self.count, self.mean, self._squares = 0, np.zeros(OBS_DIM), np.zeros(OBS_DIM)
 
-    def add(self, rows: Array) -> None:
-        """Observations (N, 11)."""
-        count, mean = len(rows), rows.mean(0)
-        shift, merged = mean - self.mean, self.count + len(rows)
-        self._squares += ((rows - mean) ** 2).sum(0) + shift**2 * self.count * count / merged
-        self.mean = self.mean + shift * count / merged
-        self.count = merged
+    def add(self, obs: Array) -> None:
+        """One observation (11,)."""
+        self.count += 1
+        shift = obs - self.mean
+        self.mean = self.mean + shift / self.count
+        self._squares = self._squares + shift * (obs - self.mean)
 
     @property
     def std(self) -> Array:
-        """(11,); ones before the first observation."""
-        return np.sqrt(self._squares / self.count) + 1e-7 if self.count else np.ones(OBS_DIM)
+        """(11,); ones before the second observation."""
+        if self.count < 2:
+            return np.ones(OBS_DIM)
+        return np.sqrt(self._squares / (self.count - 1)) + 1e-7
 
 
-@dataclass(frozen=True)
-class Episode:
+class Episode(NamedTuple):
     """One episode of T steps."""
 
-    obs: Array
-    """(T, 11)"""
-    actions: Array
-    """(T, 3)"""
-    total: float
-    """Return."""
+    obs: list[Array]
+    """T of (11,)"""
+    actions: list[Array]
+    """T of (3,)"""
+    rewards: list[float]
 
 
-def play(
-    worlds: Worlds | SpreadWorlds, gains: Array, mean: Array, std: Array, seed: int, noise: Array
-) -> Episode:
-    """One episode of the linear controller gains (3, 11), with noise (1000, 3) on its actions."""
-    obs = worlds.reset([0], [seed])
-    seen, done, total = [], [], 0.0
+def play(env: gymnasium.Env, controller: Controller, seed: int, noise: Array) -> Episode:
+    """One episode, with noise (1000, 3) on the actions."""
+    obs, _ = env.reset(seed=seed)
+    episode = Episode([], [], [])
     for disturbance in noise:
-        action = np.clip((obs - mean) / std @ gains.T + disturbance, -1, 1)
-        seen.append(obs[0])
-        done.append(action[0])
-        obs, reward, terminated, truncated = worlds.step([0], action[:, None])
-        total += float(reward[0])
-        if terminated[0] or truncated[0]:
+        action = np.clip(controller(obs) + disturbance, -1, 1)
+        episode.obs.append(obs)
+        episode.actions.append(action)
+        obs, reward, terminated, truncated, _ = env.step(action)
+        episode.rewards.append(float(reward))
+        if terminated or truncated:
             break
-    return Episode(np.array(seen), np.array(done), total)
+    return episode
 
 
-def find_controller(goal: float, seed: int) -> tuple[Array, Array, Array]:
-    """Gains (3, 11), and the mean and deviation (11,) of observations, of the first judged controller whose
-    mean return reaches ``goal``.
-    """
-    rng, worlds, moments = np.random.default_rng(seed), Worlds(), Moments()
+def find_controller(goal: float, seed: int) -> Controller:
+    """The first judged controller whose mean return reaches ``goal``."""
+    rng, env, moments = np.random.default_rng(seed), make_env(), Moments()
     gains, quiet, found, rounds = np.zeros((ACTION_DIM, OBS_DIM)), np.zeros((MAX_STEPS, ACTION_DIM)), 0.0, 0
     while found < goal:
         directions = rng.normal(size=(DIRECTIONS, *gains.shape))
         mean, std = moments.mean, moments.std
-        pairs = [
-            [play(worlds, gains + sign * SPREAD * way, mean, std, int(rng.integers(2**31)), quiet) for sign in (1, -1)]
-            for way in directions
+        episodes = [
+            play(env, Controller(gains + way, mean, std), int(rng.integers(2**31)), quiet)
+            for direction in directions
+            for way in (SPREAD * direction, -SPREAD * direction)
         ]
+        for obs in (obs for episode in episodes for obs in episode.obs):
+            moments.add(obs)
         # Without the reward for being upright, so that standing still is no way out.
-        progress = np.array([[episode.total - len(episode.obs) for episode in pair] for pair in pairs])
-        best = np.argsort(-progress.max(1))[:KEPT]
-        slope = np.einsum("k,kij->ij", progress[best, 0] - progress[best, 1], directions[best])
-        gains = gains + STEP / (KEPT * (progress[best].std() + 1e-6)) * slope
-        moments.add(np.concatenate([episode.obs for pair in pairs for episode in pair]))
+        progress = np.array([sum(reward - 1.0 for reward in episode.rewards) for episode in episodes])
+        pairs = progress.reshape(DIRECTIONS, 2)
+        best = np.argsort(-pairs.max(1))[:KEPT]
+        slope = np.einsum("k,kij->ij", pairs[best, 0] - pairs[best, 1], directions[best])
+        gains = gains + STEP / (KEPT * (pairs[best].std() + 1e-6)) * slope
         rounds += 1
         if rounds % JUDGED_EVERY == 0:
-            returns = [
-                play(worlds, gains, moments.mean, moments.std, judged, quiet).total
-                for judged in range(JUDGED_EPISODES)
-            ]
-            found = float(np.mean(returns))
-            print(f"search: round {rounds}, {moments.count} steps, return {found:.0f}", file=sys.stderr, flush=True)
-    return gains, moments.mean, moments.std
+            judged = Controller(gains, moments.mean, moments.std)
+            episodes = [play(env, judged, FIRST_JUDGED + i, quiet) for i in range(JUDGED_EPISODES)]
+            found = float(np.mean([sum(episode.rewards) for episode in episodes]))
+            told = f"search: round {rounds}, {moments.count} steps, return {found:.0f}"
+            print(told, file=sys.stderr, flush=True)
+    return Controller(gains, moments.mean, moments.std)
 
 
 def record(path: Path, *, goal: float, noise: float, steps: int, seed: int) -> dict[str, float]:
     """Save episodes of at least so many steps, and the scales; mean and spread of their returns."""
-    gains, mean, std = find_controller(goal, seed)
-    rng, worlds, episodes, recorded = np.random.default_rng(seed + 1), Worlds(), [], 0
+    controller = find_controller(goal, seed)
+    rng, env, episodes, recorded = np.random.default_rng(seed + 1), make_env(), [], 0
     while recorded < steps:
         disturbance = noise * rng.normal(size=(MAX_STEPS, ACTION_DIM))
-        episodes.append(play(worlds, gains, mean, std, int(rng.integers(2**31)), disturbance))
+        episodes.append(play(env, controller, int(rng.integers(2**31)), disturbance))
         recorded += len(episodes[-1].obs)
-    obs = np.concatenate([episode.obs for episode in episodes])
-    actions = np.concatenate([episode.actions for episode in episodes])
+    totals = np.array([sum(episode.rewards) for episode in episodes])
     np.savez_compressed(
         path,
-        obs=obs.astype(np.float32),
-        actions=actions.astype(np.float32),
+        obs=np.array([obs for episode in episodes for obs in episode.obs], np.float32),
+        actions=np.array([action for episode in episodes for action in episode.actions], np.float32),
         lengths=[len(episode.obs) for episode in episodes],
-        returns=[episode.total for episode in episodes],
+        returns=totals,
     )
-    totals = np.array([episode.total for episode in episodes])
     found = {"episodes": len(episodes), "steps": recorded, "return": totals.mean(), "spread": totals.std()}
     return {name: float(value) for name, value in found.items()}
 
@@ -168,8 +180,8 @@ def imitate(
 ) -> dict[str, torch.Tensor]:
     """Weights of a diffusion model of the reference's, by its own loss on the recorded episodes.
 
-    AdamW, its cosine schedule and its moving average, as the reference pre-trains on hopper-medium-v2; a fixed
-    number of minibatches in place of epochs, since these episodes are fewer.
+    AdamW, its cosine schedule and its moving average, as the reference pre-trains on hopper-medium-v2; a
+    fixed number of minibatches in place of epochs, since these episodes are fewer.
     """
     device = next(model.parameters()).device
     states, chunks = (torch.from_numpy(part).to(device) for part in windows(episodes, horizon))

@@ -5,7 +5,6 @@
 """
 
 import multiprocessing
-from collections.abc import Sequence
 from multiprocessing.connection import Connection
 from typing import NamedTuple
 
@@ -33,22 +32,24 @@ class Step(NamedTuple):
     """(m,) bool: the time was over."""
 
 
+def make_env() -> gymnasium.Env:
+    """One Hopper; without the checker, which warns of actions outside the box that the simulation clips."""
+    return gymnasium.make(NAME, disable_env_checker=True)
+
+
 class Worlds:
     """Worlds in this process, made when their number is first named."""
 
     def __init__(self) -> None:
         self._envs: list[gymnasium.Env] = []
 
-    def reset(self, ids: Sequence[int], seeds: Sequence[int]) -> Array:
+    def reset(self, ids: Array, seeds: Array) -> Array:
         """First observations (m, 11) of new episodes."""
-        while len(self._envs) <= max(ids):
-            # Its checker warns of actions outside the box, which the simulation clips.
-            self._envs.append(gymnasium.make(NAME, disable_env_checker=True))
-        return np.stack(
-            [self._envs[i].reset(seed=int(seed))[0] for i, seed in zip(ids, seeds, strict=True)]
-        )
+        while len(self._envs) <= ids.max():
+            self._envs.append(make_env())
+        return np.stack([self._envs[i].reset(seed=int(seed))[0] for i, seed in zip(ids, seeds, strict=True)])
 
-    def step(self, ids: Sequence[int], actions: Array) -> Step:
+    def step(self, ids: Array, actions: Array) -> Step:
         """Execute chunks (m, Ta, 3), each until its episode ends."""
         columns = zip(*(self._chunk(i, chunk) for i, chunk in zip(ids, actions, strict=True)), strict=True)
         return Step(*map(np.array, columns))
@@ -77,24 +78,23 @@ class SpreadWorlds:
             context.Process(target=_serve, args=(theirs,), daemon=True).start()
             self._pipes.append(ours)
 
-    def reset(self, ids: Sequence[int], seeds: Sequence[int]) -> Array:
+    def reset(self, ids: Array, seeds: Array) -> Array:
         """As ``Worlds.reset``."""
-        seeds = np.asarray(seeds)
         order, parts = self._ask("reset", ids, seeds)
         return np.concatenate(parts)[order]
 
-    def step(self, ids: Sequence[int], actions: Array) -> Step:
+    def step(self, ids: Array, actions: Array) -> Step:
         """As ``Worlds.step``."""
         order, parts = self._ask("step", ids, actions)
         return Step(*(np.concatenate(column)[order] for column in zip(*parts, strict=True)))
 
-    def _ask(self, what: str, ids: Sequence[int], values: Array) -> tuple[Array, list]:
+    def _ask(self, what: str, ids: Array, values: Array) -> tuple[Array, list]:
         """Answers of the processes, and the positions (m,) that put their rows into the order of ``ids``."""
-        ids, processes = np.asarray(ids), len(self._pipes)
+        processes = len(self._pipes)
         rows = [np.flatnonzero(ids % processes == process) for process in range(processes)]
         asked = [(pipe, mine) for pipe, mine in zip(self._pipes, rows, strict=True) if len(mine)]
         for pipe, mine in asked:
-            pipe.send((what, (ids[mine] // processes).tolist(), values[mine]))
+            pipe.send((what, ids[mine] // processes, values[mine]))
         return np.argsort(np.concatenate(rows)), [pipe.recv() for pipe, _ in asked]
 
 
