@@ -75,8 +75,9 @@ class SpreadWorlds:
         self._pipes: list[Connection] = []
         for _ in range(processes):
             ours, theirs = context.Pipe()
-            context.Process(target=_serve, args=(theirs,), daemon=True).start()
             self._pipes.append(ours)
+            context.Process(target=_serve, args=(theirs, self._pipes), daemon=True).start()
+            theirs.close()
 
     def reset(self, ids: Array, seeds: Array) -> Array:
         """As ``Worlds.reset``."""
@@ -98,8 +99,10 @@ class SpreadWorlds:
         return np.argsort(np.concatenate(rows)), [pipe.recv() for pipe, _ in asked]
 
 
-def _serve(pipe: Connection) -> None:
-    """Answer requests until the other side is gone."""
+def _serve(pipe: Connection, inherited: list[Connection]) -> None:
+    """Answer requests until the other side is gone, which shows once nobody else holds its ends."""
+    for other in inherited:
+        other.close()
     worlds = Worlds()
     try:
         while True:
