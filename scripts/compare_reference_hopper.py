@@ -21,31 +21,18 @@ same 40 held-out episodes, each by its own deployment sampler.
 """
 
 import argparse
-import contextlib
 import dataclasses
-import importlib
-import io
 import json
-import sys
-import tempfile
 from pathlib import Path
 from typing import Any
 
 import torch
 from hopper_curves import TABLE, Curve, lines_of, read_curves
-from hopper_dppo import (
-    CHUNK,
-    DENOISING_STEPS,
-    HORIZON,
-    TUNED_STEPS,
-    HopperDecisions,
-    ReferenceHoppers,
-    hopper_agent,
-)
+from hopper_dppo import CHUNK, HORIZON, TUNED_STEPS, HopperDecisions, ReferenceHoppers, hopper_agent
+from hopper_reference import BATCH_ROWS, N_STEPS, NUM_ENVS, imitation, pretrained, run_agent
 from hopper_standin import Scales, imitate, record
-from hopper_worlds import ACTION_DIM, MAX_STEPS, OBS_DIM, SpreadWorlds, Worlds, make_worlds
-from reference_dppo import Reference, Settings
-from torch import Tensor, nn
+from hopper_worlds import OBS_DIM, SpreadWorlds, Worlds, make_worlds
+from reference_dppo import Reference
 
 from lerobot_vtrefine.cli.arguments import CommandParser
 from lerobot_vtrefine.cli.errors import run_cli
@@ -57,7 +44,6 @@ from lerobot_vtrefine.finetune.config import DppoConfig
 from lerobot_vtrefine.finetune.evaluation import evaluate
 
 ROOT = Path(__file__).parents[1]
-NUM_ENVS, N_STEPS, BATCH_ROWS = 40, 500, 50000
 SAME = {"gamma": 0.99, "timeout": "bootstrap", "encoder": "frozen", "reward_scaling": True}
 """Of every preset: the task's discount and time limit, and rewards that are not a success."""
 PRESETS: dict[str, dict[str, Any]] = {
@@ -85,54 +71,11 @@ PRESETS: dict[str, dict[str, Any]] = {
 }
 
 
-class Steps(Tensor):
-    """Denoising steps that are gone through as numbers.
-
-    The reference's loss goes through them in Python, one by one, which on a GPU took longer than all else.
-    """
-
-    __torch_function__ = torch._C._disabled_torch_function_impl  # ty: ignore[incompatible-method-override]
-
-    def __iter__(self) -> Any:
-        return iter(self.tolist())
-
-
-def network(reference: Reference) -> nn.Module:
-    """A fresh diffusion MLP of the reference's, as its configurations for Hopper have it."""
-    return importlib.import_module("model.diffusion.mlp_diffusion").DiffusionMLP(
-        action_dim=ACTION_DIM,
-        horizon_steps=HORIZON,
-        cond_dim=OBS_DIM,
-        time_dim=16,
-        mlp_dims=[512, 512, 512],
-        activation_type="ReLU",
-        residual_style=True,
-    )
-
-
-def pretrained(reference: Reference, checkpoint: Path, device: str) -> nn.Module:
-    """The network of a checkpoint that ``pretrain`` made."""
-    weights = torch.load(checkpoint, map_location=device, weights_only=True)["ema"]
-    made = network(reference).to(device)
-    made.load_state_dict({key.removeprefix("network."): value for key, value in weights.items()})
-    return made
-
-
 def pretrain(args: argparse.Namespace) -> None:
     """Imitate the recorded episodes; saves the checkpoint and the scales."""
-    reference = Reference(args.reference)
+    reference, episodes = Reference(args.reference), args.folder / "episodes.npz"
     torch.manual_seed(args.seed)
-    model = importlib.import_module("model.diffusion.diffusion").DiffusionModel(
-        network=network(reference),
-        horizon_steps=HORIZON,
-        obs_dim=OBS_DIM,
-        action_dim=ACTION_DIM,
-        denoising_steps=DENOISING_STEPS,
-        predict_epsilon=True,
-        denoised_clip_value=1.0,
-        device=args.device,
-    )
-    episodes = args.folder / "episodes.npz"
+    model = imitation(reference, args.device)
     weights = imitate(model, episodes, horizon=HORIZON, updates=args.updates, batch=128, seed=args.seed)
     torch.save({"ema": weights}, args.folder / "pretrained.pt")
     Scales.of(episodes).save(args.folder / "scales.npz")
@@ -140,96 +83,23 @@ def pretrain(args: argparse.Namespace) -> None:
 
 def train_reference(args: argparse.Namespace, worlds: Worlds | SpreadWorlds, curve: Curve) -> None:
     """The reference's agent's own run."""
-    reference, val_freq = Reference(args.reference), args.every + 1
     envs = ReferenceHoppers(
         worlds,
         Scales.of(args.folder / "scales.npz"),
         curve,
         num_envs=NUM_ENVS,
         n_steps=N_STEPS,
-        val_freq=val_freq,
+        val_freq=args.every + 1,
         first_seed=10_000_000 * args.seed,
     )
-
-    class Model(reference.Model):
-        def loss(
-            self, obs: Any, before: Tensor, after: Tensor, steps: Tensor, *rest: Any, **more: Any
-        ) -> Any:
-            return super().loss(obs, before, after, steps.as_subclass(Steps), *rest, **more)
-
-    torch.manual_seed(args.seed)
-    model = Model(
-        actor=network(reference),
-        critic=reference.Critic(OBS_DIM, [256, 256, 256], activation_type="Mish", residual_style=True),
-        network_path=str(args.folder / "pretrained.pt"),
-        gamma_denoising=0.99,
-        clip_ploss_coef=0.01,
-        clip_ploss_coef_base=0.01,
-        clip_ploss_coef_rate=3,
-        randn_clip_value=3,
-        min_sampling_denoising_std=0.1,
-        min_logprob_denoising_std=0.1,
-        ft_denoising_steps=TUNED_STEPS,
-        denoising_steps=DENOISING_STEPS,
-        horizon_steps=HORIZON,
-        obs_dim=OBS_DIM,
-        action_dim=ACTION_DIM,
+    run_agent(
+        Reference(args.reference),
+        envs,
+        args.folder / "pretrained.pt",
+        iterations=args.iterations,
         device=args.device,
+        seed=args.seed,
     )
-    schedule = {"first_cycle_steps": 1000, "warmup_steps": 10}
-    with tempfile.TemporaryDirectory() as folder:
-        settings = Settings(
-            device=args.device,
-            seed=args.seed,
-            wandb=None,
-            env=Settings(
-                name=envs,
-                n_envs=NUM_ENVS,
-                max_episode_steps=MAX_STEPS,
-                reset_at_iteration=False,
-                best_reward_threshold_for_success=3,
-            ),
-            obs_dim=OBS_DIM,
-            action_dim=ACTION_DIM,
-            horizon_steps=HORIZON,
-            act_steps=CHUNK,
-            cond_steps=1,
-            model=model,
-            logdir=folder,
-            train=Settings(
-                batch_size=BATCH_ROWS,
-                n_train_itr=args.iterations + args.iterations // args.every + 1,
-                n_critic_warmup_itr=0,
-                n_steps=N_STEPS,
-                val_freq=val_freq,
-                save_model_freq=10**9,
-                render=Settings(freq=1, num=0),
-                gamma=0.99,
-                gae_lambda=0.95,
-                actor_lr=1e-4,
-                actor_weight_decay=0,
-                actor_lr_scheduler=Settings(schedule, min_lr=1e-4),
-                critic_lr=1e-3,
-                critic_weight_decay=0,
-                critic_lr_scheduler=Settings(schedule, min_lr=1e-3),
-                reward_scale_running=True,
-                reward_scale_const=1.0,
-                update_epochs=5,
-                vf_coef=0.5,
-                target_kl=1,
-            ),
-        )
-        agent = reference.Agent(settings)
-        with contextlib.redirect_stdout(Progress()):
-            agent.run()
-
-
-class Progress(io.StringIO):
-    """Keeps what the curve prints; the reference prints every tenth step."""
-
-    def write(self, text: str, /) -> int:
-        """To the terminal, if it is a line of the curve."""
-        return sys.__stdout__.write(text + "\n") if text.startswith("{") and sys.__stdout__ else len(text)
 
 
 def train_ours(args: argparse.Namespace, worlds: Worlds | SpreadWorlds, curve: Curve) -> None:

@@ -7,9 +7,10 @@ import hopper_curves
 import numpy as np
 import pytest
 import torch
-from compare_reference_hopper import PRESETS, SAME, Steps
+from compare_reference_hopper import PRESETS, SAME
 from hopper_curves import Curve, lines_of, read_curves
 from hopper_dppo import CHUNK, DENOISING_STEPS, TUNED_STEPS, HopperDecisions, ReferenceHoppers, hopper_agent
+from hopper_reference import Steps
 from hopper_standin import Scales, windows
 from hopper_worlds import ACTION_DIM, OBS_DIM, SpreadWorlds, Step, Worlds
 from torch import nn
