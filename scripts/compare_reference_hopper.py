@@ -150,12 +150,9 @@ def rows(args: argparse.Namespace) -> None:
     curves = read_curves(args.folder / "curves")
     if not curves:
         raise ValueError(f"{args.folder / 'curves'} holds no evaluation")
-    reached = min(points[-1][0] for runs in curves.values() for points in runs.values())
-    round_steps = args.every * NUM_ENVS * N_STEPS * CHUNK
-    budgets = [i * round_steps for i in range(round(reached / round_steps) + 1)]
     origin = provenance() | {"machine": args.machine or provenance()["machine"]}
     found: list[tuple[Row, list[dict[str, float]]]] = [
-        (line, []) for line in lines_of(curves, budgets, **origin)
+        (line, []) for line in lines_of(curves, args.every * NUM_ENVS * N_STEPS * CHUNK, **origin)
     ]
     save(args.results, TABLE, found, replace=True)
 

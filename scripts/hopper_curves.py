@@ -4,7 +4,7 @@ import json
 import time
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -37,45 +37,79 @@ class Curve:
         print(json.dumps(line), flush=True)
 
 
-Evaluations = dict[int, list[tuple[float, float]]]
-"""By seed: environment steps and held-out return, in order."""
+class Points(NamedTuple):
+    """One run: environment steps and mean return, in order."""
+
+    held_out: list[tuple[float, float]]
+    """Of evaluations."""
+    exploring: list[tuple[float, float]]
+    """Of an iteration's own episodes; the steps are those after it."""
 
 
-def read_curves(folder: Path) -> dict[str, Evaluations]:
-    """The evaluations of every curve in a folder, by who trained."""
-    found: dict[str, Evaluations] = {name: {} for name in NAMES}
+Runs = dict[str, dict[int, Points]]
+"""By who trained and by seed."""
+
+
+def read_curves(folder: Path) -> Runs:
+    """The curves of a folder that have begun."""
+    found: Runs = {name: {} for name in NAMES}
     for path in sorted(folder.glob("*.jsonl")):
         lines = [json.loads(line) for line in path.read_text(encoding="utf-8").splitlines()]
-        points = [(line["env_steps"], line["eval_return"]) for line in lines if "eval_return" in line]
-        if points:
+        points = Points(
+            *(
+                [(line["env_steps"], line[key]) for line in lines if key in line]
+                for key in ("eval_return", "return")
+            )
+        )
+        if points.held_out:
             found[lines[0]["by"]][lines[0]["seed"]] = points
     return {name: runs for name, runs in found.items() if runs}
 
 
-def returns_at(points: Sequence[tuple[float, float]], budgets: Sequence[float]) -> list[float]:
-    """Returns after these environment steps, between evaluations in a straight line."""
-    steps, returns = zip(*points, strict=True)
-    return [float(value) for value in np.interp(budgets, steps, returns)]
+def summary(points: Points, step: float, rounds: int) -> dict[str, float]:
+    """Held-out returns after every ``step`` environment steps, between evaluations in a straight line; those
+    while exploring, of the iterations of the first and of the last such round.
+    """
+    budgets = [i * step for i in range(rounds + 1)]
+    steps, found_there = np.array(points.held_out).T
+    returns = np.interp(budgets, steps, found_there)
+    heads = ["before", *(f"after {budget / 1e6:.2f} M steps" for budget in budgets[1:])]
+    found = dict(zip(heads, map(float, returns), strict=True))
+    for words, last in (("first", 1), ("last", rounds)):
+        # With some slack: iterations of ours do not end at round numbers.
+        inside = [value for at, value in points.exploring if (last - 1) * step < at <= (last + 0.05) * step]
+        found[f"exploring, {words} {step / 1e6:.2f} M"] = float(np.mean(inside or [np.nan]))
+    return found
 
 
-def lines_of(curves: dict[str, Evaluations], budgets: Sequence[float], **origin: Any) -> list[Line]:
-    """A row for each who trained, and one for each of ours minus the reference, seed by seed."""
+def lines_of(runs: Runs, step: float, **origin: Any) -> list[Line]:
+    """A row for each who trained, and one for each of ours minus the reference, seed by seed.
+
+    As many rounds of ``step`` environment steps as all runs have made, give or take a tenth of one.
+    """
+    reached = min(points.held_out[-1][0] for seeds in runs.values() for points in seeds.values())
+    rounds = int(reached / step + 0.1)
     at = {
-        name: {seed: returns_at(points, budgets) for seed, points in runs.items()}
-        for name, runs in curves.items()
+        name: {seed: summary(points, step, rounds) for seed, points in seeds.items()}
+        for name, seeds in runs.items()
     }
     rows = [(NAMES[name], at[name], "") for name in at]
-    for name in at.keys() - {"reference"}:
-        both = sorted(at[name].keys() & at.get("reference", {}).keys())
-        changes = {seed: list(np.subtract(at[name][seed], at["reference"][seed])) for seed in both}
-        if both:
+    theirs = at.get("reference", {})
+    for name in [name for name in at if name != "reference"]:
+        changes = {
+            seed: {head: value - theirs[seed][head] for head, value in found.items()}
+            for seed, found in at[name].items()
+            if seed in theirs
+        }
+        if changes:
             rows.append((f"{NAMES[name]} minus the reference", changes, "+"))
-    heads = [f"after {budget / 1e6:.2f} M steps" if budget else "before" for budget in budgets]
     return [
         Line(
             table=TABLE,
             cells={"fine-tuned by": words, "seeds": str(len(found))}
-            | {head: cell([values[i] for values in found.values()], sign) for i, head in enumerate(heads)},
+            | {
+                head: cell([one[head] for one in found.values()], sign) for head in next(iter(found.values()))
+            },
             **origin,
         )
         for words, found, sign in rows

@@ -193,12 +193,26 @@ def test_curves_become_rows_at_the_same_steps(tmp_path) -> None:
     for by, seed, last in (("reference", 1, 300.0), ("reference", 2, 500.0), ("paper", 1, 600.0)):
         curve = Curve(tmp_path / f"{by}_{seed}.jsonl", by=by, seed=seed)
         curve.add(0, 0, eval_return=100.0)
-        curve.add(1, 100, **{"return": 5.0})
-        curve.add(1, 200, eval_return=last)
-    rows = lines_of(read_curves(tmp_path), [0, 100], **ORIGIN)
-    assert [next(iter(row.cells.values())) for row in rows] == [
+        curve.add(1, 100_000, **{"return": 5.0})
+        curve.add(2, 204_000, **{"return": 7.0})
+        curve.add(2, 200_000, eval_return=last)
+    rows = lines_of(read_curves(tmp_path), 100_000.0, **ORIGIN)
+    found = [row.cells for row in rows]
+    ours = hopper_curves.NAMES["paper"]
+    assert [cells["fine-tuned by"] for cells in found] == [
         hopper_curves.NAMES["reference"],
-        hopper_curves.NAMES["paper"],
-        hopper_curves.NAMES["paper"] + " minus the reference",
+        ours,
+        f"{ours} minus the reference",
     ]
-    assert [list(row.cells.values())[3] for row in rows] == ["250 [-385, 885] (200, 300)", "350", "+150"]
+    assert [list(cells.values())[1:] for cells in found] == [
+        [
+            "2",
+            "100 [100, 100] (100, 100)",
+            "250 [-385, 885] (200, 300)",
+            "400 [-871, 1671] (300, 500)",
+            "5 [5, 5] (5, 5)",
+            "7 [7, 7] (7, 7)",
+        ],
+        ["1", "100", "350", "600", "5", "7"],
+        ["1", "+0", "+150", "+300", "+0", "+0"],
+    ]
