@@ -170,7 +170,9 @@ def main() -> int:
     parser.add_argument("--workers", type=int, default=1, help="processes that simulate")
     parser.add_argument("--iterations", type=int, default=45, help="of training, 80 000 steps each")
     parser.add_argument("--every", type=int, default=9, help="iterations from evaluation to evaluation")
-    parser.add_argument("--goal", type=float, default=1300.0, help="return at which the search ends")
+    parser.add_argument(
+        "--goal", type=float, default=1200.0, help="return with noise at which the search ends"
+    )
     parser.add_argument("--noise", type=float, default=0.1, help="on the recorded actions, full scale 1")
     parser.add_argument("--steps", type=int, default=100_000, help="to record")
     parser.add_argument("--updates", type=int, default=20_000, help="of the imitation")

@@ -19,7 +19,7 @@ from torch import nn
 
 DIRECTIONS, KEPT, STEP, SPREAD = 8, 4, 0.02, 0.025
 """Of the search: directions of a round, the best of them, step size, and how far a direction is followed."""
-JUDGED_EVERY, JUDGED_EPISODES, FIRST_JUDGED = 20, 5, 1_000_000
+JUDGED_EVERY, JUDGED_EPISODES, FIRST_JUDGED = 20, 20, 1_000_000
 
 
 @dataclass(frozen=True)
@@ -84,8 +84,11 @@ def play(env: gymnasium.Env, controller: Controller, seed: int, noise: Array) ->
     return episode
 
 
-def find_controller(goal: float, seed: int) -> Controller:
-    """The first judged controller whose mean return reaches ``goal``."""
+def find_controller(goal: float, noise: float, seed: int) -> Controller:
+    """The first judged controller whose mean return with noise on its actions reaches ``goal``.
+
+    Roundings grow over hundreds of rounds: elsewhere the same seed may find another one.
+    """
     rng, env, moments = np.random.default_rng(seed), make_env(), Moments()
     gains, quiet, found, rounds = np.zeros((ACTION_DIM, OBS_DIM)), np.zeros((MAX_STEPS, ACTION_DIM)), 0.0, 0
     while found < goal:
@@ -107,7 +110,8 @@ def find_controller(goal: float, seed: int) -> Controller:
         rounds += 1
         if rounds % JUDGED_EVERY == 0:
             judged = Controller(gains, moments.mean, moments.std)
-            episodes = [play(env, judged, FIRST_JUDGED + i, quiet) for i in range(JUDGED_EPISODES)]
+            shaken = noise * np.random.default_rng(rounds).normal(size=(JUDGED_EPISODES, *quiet.shape))
+            episodes = [play(env, judged, FIRST_JUDGED + i, rows) for i, rows in enumerate(shaken)]
             found = float(np.mean([sum(episode.rewards) for episode in episodes]))
             told = f"search: round {rounds}, {moments.count} steps, return {found:.0f}"
             print(told, file=sys.stderr, flush=True)
@@ -116,7 +120,7 @@ def find_controller(goal: float, seed: int) -> Controller:
 
 def record(path: Path, *, goal: float, noise: float, steps: int, seed: int) -> dict[str, float]:
     """Save episodes of at least so many steps, and the scales; mean and spread of their returns."""
-    controller = find_controller(goal, seed)
+    controller = find_controller(goal, noise, seed)
     rng, env, episodes, recorded = np.random.default_rng(seed + 1), make_env(), [], 0
     while recorded < steps:
         disturbance = noise * rng.normal(size=(MAX_STEPS, ACTION_DIM))
