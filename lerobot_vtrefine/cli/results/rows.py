@@ -121,6 +121,7 @@ class Line(Row):
         "ingredients",
         "jittered",
         "outsider",
+        "reference_hopper",
         "servo",
         "step_mm",
         "step_size",

@@ -1,0 +1,196 @@
+"""The reference implementation of DPPO beside this one on a task of its own: Hopper.
+
+    git clone https://github.com/irom-princeton/dppo DPPO
+    python scripts/compare_reference_hopper.py data --folder=hopper
+    python scripts/compare_reference_hopper.py pretrain --folder=hopper --reference=DPPO
+    python scripts/compare_reference_hopper.py train --folder=hopper --reference=DPPO --by=reference --seed=1
+    python scripts/compare_reference_hopper.py train --folder=hopper --reference=DPPO --by=paper --seed=1
+    python scripts/compare_reference_hopper.py rows --folder=hopper
+
+``data`` and ``pretrain`` make what stands in for D4RL's hopper-medium-v2 and for the checkpoint that the
+reference ships (``hopper_standin.py``). ``train`` fine-tunes that one checkpoint: the reference's agent, with
+its loop, loss, critic, optimisers and schedules unchanged and the hyper-parameters of its
+``ft_ppo_diffusion_mlp.yaml`` for Hopper, or ours, ``paper`` with the same hyper-parameters, ``trust_region``
+with its own. Every line of a learning curve lies on disk at once. ``rows`` makes the table of
+results/reference_hopper.json from the curves that are there.
+
+Ours learns from whole episodes and the reference from segments of 500 decisions that go on where the last
+one stopped. So an iteration of ours has as many worlds as make the same 20 000 decisions, by the mean length
+of the episodes before. Environment steps count alike, and both are evaluated after the same of them, on the
+same 40 held-out episodes, each by its own deployment sampler.
+"""
+
+import argparse
+import dataclasses
+import json
+from pathlib import Path
+from typing import Any
+
+import torch
+from hopper_curves import TABLE, Curve, lines_of, read_curves
+from hopper_dppo import CHUNK, HORIZON, TUNED_STEPS, HopperDecisions, ReferenceHoppers, hopper_agent
+from hopper_reference import BATCH_ROWS, N_STEPS, NUM_ENVS, imitation, pretrained, run_agent
+from hopper_standin import Scales, imitate, record
+from hopper_worlds import OBS_DIM, SpreadWorlds, Worlds, make_worlds
+from reference_dppo import Reference
+
+from lerobot_vtrefine.cli.arguments import CommandParser
+from lerobot_vtrefine.cli.errors import run_cli
+from lerobot_vtrefine.cli.results.collect import save
+from lerobot_vtrefine.cli.results.provenance import provenance
+from lerobot_vtrefine.cli.results.rows import Row
+from lerobot_vtrefine.finetune import dppo
+from lerobot_vtrefine.finetune.config import DppoConfig
+from lerobot_vtrefine.finetune.evaluation import evaluate
+
+ROOT = Path(__file__).parents[1]
+SAME = {"gamma": 0.99, "timeout": "bootstrap", "encoder": "frozen", "reward_scaling": True}
+"""Of every preset: the task's discount and time limit, and rewards that are not a success."""
+PRESETS: dict[str, dict[str, Any]] = {
+    "paper": {
+        "ft_denoising_steps": TUNED_STEPS,
+        "min_sampling_std": 0.1,
+        "min_log_prob_std": 0.1,
+        "gae_lambda": 0.95,
+        "gamma_denoising": 0.99,
+        "clip": 0.01,
+        "clip_first": 0.01,
+        "target_kl": 1.0,
+        "epochs": 5,
+        "minibatches": NUM_ENVS * N_STEPS * TUNED_STEPS // BATCH_ROWS,
+        "critic_warmup": 0,
+        "actor_lr": 1e-4,
+        "actor_lr_final": 1e-4,
+        "critic_lr": 1e-3,
+        "critic_lr_final": 1e-3,
+        "lr_warmup": 0,
+        "critic_width": 256,
+        "critic_blocks": 1,
+    },
+    "trust_region": {"ft_denoising_steps": TUNED_STEPS},
+}
+
+
+def pretrain(args: argparse.Namespace) -> None:
+    """Imitate the recorded episodes; saves the checkpoint and the scales."""
+    reference, episodes = Reference(args.reference), args.folder / "episodes.npz"
+    torch.manual_seed(args.seed)
+    model = imitation(reference, args.device)
+    weights = imitate(model, episodes, horizon=HORIZON, updates=args.updates, batch=128, seed=args.seed)
+    torch.save({"ema": weights}, args.folder / "pretrained.pt")
+    Scales.of(episodes).save(args.folder / "scales.npz")
+
+
+def train_reference(args: argparse.Namespace, worlds: Worlds | SpreadWorlds, curve: Curve) -> None:
+    """The reference's agent's own run."""
+    envs = ReferenceHoppers(
+        worlds,
+        Scales.of(args.folder / "scales.npz"),
+        curve,
+        num_envs=NUM_ENVS,
+        n_steps=N_STEPS,
+        val_freq=args.every + 1,
+        first_seed=10_000_000 * args.seed,
+    )
+    run_agent(
+        Reference(args.reference),
+        envs,
+        args.folder / "pretrained.pt",
+        iterations=args.iterations,
+        device=args.device,
+        seed=args.seed,
+    )
+
+
+def train_ours(args: argparse.Namespace, worlds: Worlds | SpreadWorlds, curve: Curve) -> None:
+    """This package's loop with a preset."""
+    cfg = dataclasses.replace(
+        DppoConfig.get_choice_class(args.by)(), iterations=args.iterations, **SAME, **PRESETS[args.by]
+    )
+    reference, scales = Reference(args.reference), Scales.of(args.folder / "scales.npz")
+    tuned, base = (pretrained(reference, args.folder / "pretrained.pt", args.device) for _ in range(2))
+    agent = hopper_agent(tuned, base, cfg.deploy_eta)
+    practice, held_out = (HopperDecisions(worlds, scales, NUM_ENVS) for _ in range(2))
+    state = dppo.TrainState.create(agent, cfg, OBS_DIM, args.seed)
+
+    def note(state: dppo.TrainState, metrics: dppo.Metrics) -> None:
+        if metrics:
+            told = {name: metrics[name] for name in ("return", "decisions", "decision_kl", "rollout_s")}
+            curve.add(state.iteration, state.env_steps, **told, episodes=practice.num_envs)
+        length = metrics.get("decisions", 0.0)
+        if state.iteration % args.every == 0:
+            found = evaluate(held_out, agent, NUM_ENVS)
+            told = {name: found[f"eval_{name}"] for name in ("return", "decisions")}
+            curve.add(
+                state.iteration,
+                state.env_steps,
+                eval_return=told["return"],
+                decisions=told["decisions"],
+                episodes=NUM_ENVS,
+            )
+            length = length or told["decisions"]
+        practice.fill(NUM_ENVS * N_STEPS, length)
+
+    note(state, {})
+    dppo.train(practice, agent, state, cfg, seed=10_000_000 * args.seed, after_iteration=note)
+
+
+def train(args: argparse.Namespace) -> None:
+    """One run, to ``curves/BY_SEED.jsonl`` of the folder."""
+    if args.iterations % args.every:
+        raise ValueError(f"--iterations={args.iterations} is no multiple of --every={args.every}")
+    worlds = make_worlds(args.workers)
+    torch.set_num_threads(args.threads)
+    curve = Curve(args.folder / "curves" / f"{args.by}_{args.seed}.jsonl", by=args.by, seed=args.seed)
+    (train_reference if args.by == "reference" else train_ours)(args, worlds, curve)
+
+
+def rows(args: argparse.Namespace) -> None:
+    """Rows of all curves that lie in the folder, at the evaluations' steps that all have reached."""
+    curves = read_curves(args.folder / "curves")
+    if not curves:
+        raise ValueError(f"{args.folder / 'curves'} holds no evaluation")
+    origin = provenance() | {"machine": args.machine or provenance()["machine"]}
+    found: list[tuple[Row, list[dict[str, float]]]] = [
+        (line, []) for line in lines_of(curves, args.every * NUM_ENVS * N_STEPS * CHUNK, **origin)
+    ]
+    save(args.results, TABLE, found, replace=True)
+
+
+@run_cli
+def main() -> int:
+    """``data``, ``pretrain``, ``train`` or ``rows``."""
+    parser = CommandParser(description=__doc__)
+    parser.add_argument("what", choices=("data", "pretrain", "train", "rows"))
+    parser.add_argument("--folder", type=Path, required=True, help="of episodes, checkpoint and curves")
+    parser.add_argument("--reference", type=Path, help="a checkout of irom-princeton/dppo")
+    parser.add_argument("--by", default="reference", choices=("reference", *PRESETS), help="who trains")
+    parser.add_argument("--device", default="cpu", help="of the policy: cpu or cuda")
+    parser.add_argument("--threads", type=int, default=1, help="of the policy on a CPU")
+    parser.add_argument("--workers", type=int, default=1, help="processes that simulate")
+    parser.add_argument("--iterations", type=int, default=45, help="of training, 80 000 steps each")
+    parser.add_argument("--every", type=int, default=9, help="iterations from evaluation to evaluation")
+    parser.add_argument(
+        "--goal", type=float, default=1200.0, help="return with noise at which the search ends"
+    )
+    parser.add_argument("--noise", type=float, default=0.1, help="on the recorded actions, full scale 1")
+    parser.add_argument("--steps", type=int, default=100_000, help="to record")
+    parser.add_argument("--updates", type=int, default=20_000, help="of the imitation")
+    parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("--machine", help="that trained, for the rows; default: this one")
+    parser.add_argument("--results", type=Path, default=ROOT / "results" / "reference_hopper.json")
+    args = parser.parse_args()
+    args.folder.mkdir(parents=True, exist_ok=True)
+    if args.reference is None and args.what in ("pretrain", "train"):
+        raise ValueError(f"{args.what} needs --reference")
+    if args.what == "data":
+        made = args.folder / "episodes.npz"
+        found = record(made, goal=args.goal, noise=args.noise, steps=args.steps, seed=args.seed)
+        print(json.dumps(found))
+    else:
+        {"pretrain": pretrain, "train": train, "rows": rows}[args.what](args)
+    return 0
+
+
+if __name__ == "__main__":
+    raise SystemExit(main())
