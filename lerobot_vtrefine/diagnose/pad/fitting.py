@@ -233,7 +233,10 @@ def _descent(
     max_steps: int,
     free: np.ndarray,
 ) -> tuple[_Run, list[np.ndarray] | None]:
-    """Where it ends, and the whitened tangents there, if they are known."""
+    """Where it ends, and the whitened tangents there, if they are known.
+
+    Over a last step that gains next to nothing tangents do not change.
+    """
     now, damping, vectors = _run(start, presses, weights), 1e-3, None
     for _ in range(max_steps):
         vectors = vectors or _whitened(now, presses, weights, free)
@@ -245,7 +248,7 @@ def _descent(
                 break
             continue
         settled = now.loss - moved.loss < TOLERANCE * max(now.loss, 1e-12)
-        now, damping, vectors = moved, max(damping / 10.0, 1e-6), None
+        now, damping, vectors = moved, max(damping / 10.0, 1e-6), vectors if settled else None
         if settled:
             break
     return now, vectors

@@ -1,8 +1,11 @@
 """What passes from stage to stage while fitting: values of some of a sheet's columns."""
 
+from collections.abc import Hashable
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
+import torch
 
 from lerobot_vtrefine.diagnose.pad.forward_model.batches import Sheet
 
@@ -17,6 +20,12 @@ class Field:
     rate: np.ndarray | None = None
     damping: np.ndarray | None = None
     """Part of forces that damping bears, where a stage asks for it [N]."""
+
+    @cached_property
+    def memories(self) -> dict[Hashable, list[torch.Tensor]]:
+        """Memories of loops over these values, by the laws that they follow: readings of other fractions have
+        the same."""
+        return {}
 
     def within(self, sheet: Sheet, press: int) -> slice:
         """Where a press's columns are among these."""
