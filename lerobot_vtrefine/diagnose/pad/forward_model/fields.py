@@ -20,6 +20,8 @@ class Field:
     rate: np.ndarray | None = None
     damping: np.ndarray | None = None
     """Part of forces that damping bears, where a stage asks for it [N]."""
+    recorded: bool = False
+    """Whether a stage has left only the recorded frames."""
 
     @cached_property
     def memories(self) -> dict[Hashable, list[torch.Tensor]]:
@@ -34,7 +36,7 @@ class Field:
 
     def at_frames(self, sheet: Sheet) -> "Field":
         """At the recorded frames only, as `sheet.recorded` has them."""
-        if sheet.recorded is sheet:
+        if self.recorded or sheet.recorded is sheet:
             return self
 
         def kept(values: np.ndarray) -> np.ndarray:
@@ -69,3 +71,5 @@ class Context:
     """Numbers of the columns in which a stage that mixes taxels should answer; None for all."""
     in_parts: bool = False
     """Whether a later stage asks which part of a force damping bears."""
+    frames_only: bool = False
+    """Whether nothing later needs more than the recorded frames, so that a stage may leave out the others."""

@@ -302,17 +302,19 @@ def _scan_skew(stage: ScanSkew, field: Field, context: Context) -> Field:
 
 def _hold(stage: SampleAndHold, field: Field, context: Context) -> Field:
     """A free board's instants are those that the recording itself shows."""
-    sheet, out = context.sheet, np.zeros_like(field.values)
-    for press, (time_s, rhythm) in enumerate(zip(sheet.times_s, sheet.rhythms, strict=True)):
+    sheet = context.sheet
+    asked = sheet.frames if context.frames_only else [np.arange(len(time_s)) for time_s in sheet.times_s]
+    out = np.zeros((max(len(own) for own in asked), len(field.columns)))
+    for press, (time_s, own, rhythm) in enumerate(zip(sheet.times_s, asked, sheet.rhythms, strict=True)):
         part = field.within(sheet, press)
         x = field.values[: len(time_s), part]
         if stage.ages_s:
-            at_s = rhythm.taken_s(time_s) - stage.lag_s
-            out[: len(time_s), part] = joined(x, *neighbours(time_s, at_s))
+            at_s = rhythm.taken_s(time_s[own]) - stage.lag_s
+            out[: len(own), part] = joined(x, *neighbours(time_s, at_s))
         else:
             phase = rhythm.phase(stage.period_s) if stage.free else 0.0
-            out[: len(time_s), part] = stage.held(torch.from_numpy(x), torch.from_numpy(time_s), phase)
-    return Field(out, field.columns)
+            out[: len(own), part] = stage.held(torch.from_numpy(x), torch.from_numpy(time_s), phase)[own]
+    return Field(out, field.columns, recorded=context.frames_only)
 
 
 def _convert(stage: Quantisation, field: Field, context: Context) -> Field:
