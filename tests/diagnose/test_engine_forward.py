@@ -6,10 +6,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from lerobot_vtrefine.diagnose.pad import fitting
 from lerobot_vtrefine.diagnose.pad.baseline import describe, plain_weights
 from lerobot_vtrefine.diagnose.pad.candidates import CATALOGUE
 from lerobot_vtrefine.diagnose.pad.candidates.base import Form
-from lerobot_vtrefine.diagnose.pad.fitting import fit, predict, rest, scouted
+from lerobot_vtrefine.diagnose.pad.fitting import fit, grows_with_gain, predict, rest, scouted, tangents
 from lerobot_vtrefine.diagnose.pad.forward_model import run
 from lerobot_vtrefine.diagnose.pad.forward_model.run import LoweredBench, run_stages
 from lerobot_vtrefine.diagnose.pad.model import Composite, sensor_model
@@ -19,6 +20,7 @@ from lerobot_vtrefine.diagnose.pad.screening import forms_of
 from lerobot_vtrefine.diagnose.recordings import RecordingSet, Trial
 from lerobot_vtrefine.tactile.layout import PadLayout
 from lerobot_vtrefine.tactile.model import SensorModel
+from lerobot_vtrefine.tactile.stages import hysteresis
 from lerobot_vtrefine.tactile.stages.dividers import LaggingDroop
 from lerobot_vtrefine.tactile.stages.surface import ContactOffset, PadTilt
 
@@ -80,6 +82,49 @@ def test_every_form_predicts_as_the_simulator_does(form: Form) -> None:
     plain, moved = predict(model, held), predict(model.plus(form, strong), held)
     assert max(np.abs(a - b).max() for a, b in zip(plain, moved, strict=True)) > 1e-3
     assert_same(model.plus(form, strong), held)
+
+
+@pytest.mark.parametrize(
+    ("label", "values", "proportional"),
+    [
+        ("linear in the row", [0.01], True),
+        ("irregular periods", [0.1, 0.01], True),
+        ("to the next taxels of row and column", [0.1, 0.1], True),
+        ("four play operators", [0.1, 0.1, 0.1, 0.1], True),
+        ("tanh", [1.0], False),
+    ],
+)
+def test_signals_in_proportion_to_the_gain_need_no_step_along_it(
+    label: str, values: list[float], proportional: bool
+) -> None:
+    held = presses()
+    model = composite(held).plus(next(form for form in CATALOGUE if form.label == label), np.array(values))
+    signals, (along,) = tangents(model, held, np.array([0]))
+    assert grows_with_gain(model, signals, held) is proportional
+    step = model.coordinates[0].step
+    ahead = predict(model.at(model.values + step * (np.arange(len(model.values)) == 0)), held)
+    for found, there, here in zip(along, ahead, signals, strict=True):
+        assert np.allclose(found, (there - here) / step, atol=1e-6)
+    assert not grows_with_gain(model, [signal * 255.0 for signal in signals], held)
+
+
+def test_loops_of_other_fractions_have_the_same_memories(monkeypatch: pytest.MonkeyPatch) -> None:
+    held, found, plain = presses(), [], hysteresis.kept_between
+    form = next(form for form in CATALOGUE if form.label == "four play operators")
+    model = composite(held).plus(form, np.full(4, 0.1))
+    monkeypatch.setattr(hysteresis, "kept_between", lambda *bounds: found.append(1) or plain(*bounds))
+    tangents(model, held, np.arange(2, 6))
+    assert len(found) == 4 * len(held.bench.sheets("bent"))
+
+
+def test_a_fit_needs_tangents_once_for_every_step(monkeypatch: pytest.MonkeyPatch) -> None:
+    held, runs, looks = presses(), [], []
+    run_once, look = fitting._run, fitting._whitened
+    monkeypatch.setattr(fitting, "_run", lambda *args: runs.append(1) or run_once(*args))
+    monkeypatch.setattr(fitting, "_whitened", lambda *args: looks.append(1) or look(*args))
+    found = fit(composite(held), held, plain_weights(held))
+    assert 0 < len(looks) < len(runs) <= fitting.MAX_STEPS
+    assert np.allclose(found.grams, rest(found.model, held, plain_weights(held)).grams, rtol=0.02, atol=1e-3)
 
 
 def test_a_supply_that_lags_is_built_with_its_lag() -> None:

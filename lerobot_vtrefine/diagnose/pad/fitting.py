@@ -6,13 +6,16 @@ from dataclasses import dataclass
 import numpy as np
 
 from lerobot_vtrefine.diagnose.pad.forward_model.run import Prefix, run_stages
-from lerobot_vtrefine.diagnose.pad.model import Composite
+from lerobot_vtrefine.diagnose.pad.model import LOG_GAIN, Composite
 from lerobot_vtrefine.diagnose.pad.press_trials import PressSet
 from lerobot_vtrefine.diagnose.pad.weights import TrialWeights
+from lerobot_vtrefine.tactile.stages.readout import Gain, Quantisation
 
 MAX_STEPS = 12
 TOLERANCE = 1e-5
 """Relative decrease of the loss at which a descent stops."""
+WITHIN = 0.99
+"""Part of what a reading may be, up to which a step of the gain does not make the converter clip it."""
 
 
 @dataclass(frozen=True)
@@ -84,11 +87,29 @@ def tangents(
     for index in free:
         value = model.coordinates[index]
         step = value.step if model.values[index] + value.step <= value.high else -value.step
+        if index == LOG_GAIN and grows_with_gain(model, signals, presses):
+            columns.append([np.expm1(step) / step * signal for signal in signals])
+            continue
         moved = model.values.copy()
         moved[index] += step
         ahead = predict(model.at(moved), presses, cache)
         columns.append([(a - b) / step for a, b in zip(ahead, signals, strict=True)])
     return signals, columns
+
+
+def grows_with_gain(model: Composite, signals: Sequence[np.ndarray], presses: PressSet) -> bool:
+    """Whether a little more gain gives just so much more signal everywhere: nothing after it is out of
+    proportion, and no reading is near the converter's ends."""
+    stages = model.stages()
+    after = stages[[stage.name for stage in stages].index(Gain.name) + 1 :]
+    if not all(stage.proportional or isinstance(stage, Quantisation) for stage in after):
+        return False
+    pairs = zip(presses.presses, signals, strict=True)
+    full = model.setting.full_scale
+    return all(
+        ((signal > -WITHIN * press.idle) & (signal < WITHIN * (full - press.idle)) | (signal == 0.0)).all()
+        for press, signal in pairs
+    )
 
 
 def movable(fitted: Fit) -> np.ndarray:
@@ -233,7 +254,10 @@ def _descent(
     max_steps: int,
     free: np.ndarray,
 ) -> tuple[_Run, list[np.ndarray] | None]:
-    """Where it ends, and the whitened tangents there, if they are known."""
+    """Where it ends, and the whitened tangents there, if they are known.
+
+    Over a last step that gains next to nothing tangents do not change.
+    """
     now, damping, vectors = _run(start, presses, weights), 1e-3, None
     for _ in range(max_steps):
         vectors = vectors or _whitened(now, presses, weights, free)
@@ -245,7 +269,7 @@ def _descent(
                 break
             continue
         settled = now.loss - moved.loss < TOLERANCE * max(now.loss, 1e-12)
-        now, damping, vectors = moved, max(damping / 10.0, 1e-6), None
+        now, damping, vectors = moved, max(damping / 10.0, 1e-6), vectors if settled else None
         if settled:
             break
     return now, vectors

@@ -78,7 +78,7 @@ def _own_starts(fitted: Fit, form: Form, presses: PressSet, weights: Weights) ->
     if form.search is None:
         guesses = form.probes(setting)
         return tuple(np.clip(np.asarray(guess, dtype=float), form.low, form.high) for guess in guesses)
-    points = [np.asarray(point, dtype=float) for point in form.search(presses, setting.frame_s)]
+    points = [np.asarray(point, dtype=float) for point in presses.searched(form.search, setting.frame_s)]
     losses = [_loss(fitted.model.plus(form, point), presses, weights) for point in points]
     return (points[int(np.argmin(losses))],)
 

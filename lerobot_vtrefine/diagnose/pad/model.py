@@ -24,6 +24,8 @@ from lerobot_vtrefine.tactile.stages.readout import (
 
 BASE = (Value("log_gain", -60.0, 60.0, 1e-3), Value("damping_s", 0.0, 0.5, 2e-4))
 """Baseline's coordinates: log of counts per metre (or per newton when driven by load), and k_d / k_n."""
+LOG_GAIN = 0
+"""Number of the gain's coordinate."""
 GAIN_RANGE = 1.5
 """How far a fit may move the logarithm of the plain baseline's gain."""
 NOMINAL_K_N = 400.0

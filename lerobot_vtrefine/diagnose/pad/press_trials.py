@@ -1,5 +1,6 @@
 """Recorded presses as the engine works on them: cropped to the taxels that answer, above their idle level."""
 
+from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import TYPE_CHECKING
@@ -140,6 +141,10 @@ class Press:
         return (rows + self.layout.row0) * self.layout.full_cols + cols + self.layout.col0
 
 
+type Search = Callable[["PressSet", float], list[list[float]]]
+"""Presses and the time between their frames [s] to starting points."""
+
+
 @dataclass(frozen=True)
 class PressSet:
     """Presses of one pad with what they share."""
@@ -176,6 +181,16 @@ class PressSet:
     def uneven(self, face_m: np.ndarray) -> "PressSet":
         """On a face that lies lower at every taxel (R, C) [m]."""
         return replace(self, recorded=self, touches_m=(), face_m=face_m)
+
+    def searched(self, search: Search, frame_s: float) -> list[list[float]]:
+        """What a search finds in these presses; kept, for every fit of its form begins with it."""
+        if (key := (search, frame_s)) not in self._searched:
+            self._searched[key] = search(self, frame_s)
+        return self._searched[key]
+
+    @cached_property
+    def _searched(self) -> dict[tuple[Search, float], list[list[float]]]:
+        return {}
 
     @cached_property
     def _subsets(self) -> dict[tuple[int, ...], "PressSet"]:

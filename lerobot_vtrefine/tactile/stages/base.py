@@ -100,6 +100,8 @@ class Stage:
     """Whether a memory follows the order of the frames, whatever their times."""
     spreads: ClassVar[bool] = False
     """Whether it moves force from taxel to taxel, in proportion."""
+    proportional: ClassVar[bool] = False
+    """Whether twice the force or reading, in all taxels and frames, gives twice the result."""
 
     def __post_init__(self) -> None:
         for item in fields(self):

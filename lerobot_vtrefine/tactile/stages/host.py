@@ -42,6 +42,7 @@ class Delay(Stage):
 
     domain: ClassVar[str] = "counts"
     has_state: ClassVar[bool] = True
+    proportional: ClassVar[bool] = True
 
     def delay_s(self, rows: int, like: torch.Tensor, frame: Frame) -> torch.Tensor:
         """Delay of each row at a frame, (..., R, 1) [s]."""
@@ -208,6 +209,7 @@ class SampleAndHold(Stage):
     domain: ClassVar[str] = "counts"
     rank: ClassVar[int] = 90
     has_state: ClassVar[bool] = True
+    proportional: ClassVar[bool] = True
     period_s: float = parameter(0.043, "s", 0.01, 0.1, minimum=1e-6)
     free: bool = False
     ages_s: tuple[float, ...] = ()

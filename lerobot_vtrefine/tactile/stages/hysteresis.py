@@ -39,13 +39,12 @@ def memories(follow: Callable[..., np.ndarray], *inputs: torch.Tensor) -> torch.
 
 
 def kept_between(low: torch.Tensor, high: torch.Tensor) -> torch.Tensor:
-    """memories(torch.clamp, low, high), without a new array for every frame."""
-    lower, upper = (bound.cpu().numpy().copy() for bound in (low, high))
+    """memories(torch.clamp, low, high), in the place of the array `high`."""
+    lower, upper = (bound.cpu().numpy() for bound in (low, high))
     memory = np.zeros_like(lower[:1].sum(axis=0))
     for line, top in zip(lower, upper, strict=True):
-        np.maximum(np.minimum(memory, top, out=top), line, out=line)
-        memory = line
-    return torch.from_numpy(lower).to(low)
+        memory = np.maximum(np.minimum(memory, top, out=top), line, out=top)
+    return torch.from_numpy(upper).to(low)
 
 
 @dataclass(frozen=True)
@@ -62,21 +61,25 @@ class Bounded(Loop):
     """Base of the laws whose memories rest unless the force's bounds push them: low <= memory <= high."""
 
     def _bounds(self, x: torch.Tensor, frame: Frame) -> Iterator[tuple[str, torch.Tensor, torch.Tensor]]:
-        """Name of every memory, and between what it may lie at f = x [N]."""
+        """Name of every memory, and between what it may lie at f = x [N]: above an array of its own."""
         raise NotImplementedError
 
-    def _reading(self, x: torch.Tensor, kept: Iterable[torch.Tensor]) -> torch.Tensor:
+    def reading(self, x: torch.Tensor, kept: Iterable[torch.Tensor]) -> torch.Tensor:
         """What the pad feels of the force x with its memories where they are kept [N]."""
         raise NotImplementedError
 
     @override
     def step(self, x: torch.Tensor, state: State, frame: Frame) -> tuple[torch.Tensor, State]:
         kept = {name: torch.clamp(state[name], low, high) for name, low, high in self._bounds(x, frame)}
-        return self._reading(x, kept.values()), {**state, **kept}
+        return self.reading(x, kept.values()), {**state, **kept}
 
     @override
     def sequence(self, x: torch.Tensor, times_s: torch.Tensor, frame: Frame) -> torch.Tensor:
-        return self._reading(x, (kept_between(low, high) for _, low, high in self._bounds(x, frame)))
+        return self.reading(x, self.kept(x, frame))
+
+    def kept(self, x: torch.Tensor, frame: Frame) -> Iterator[torch.Tensor]:
+        """Every memory of a recording x (T, ...), after each of its frames."""
+        return (kept_between(low, high) for _, low, high in self._bounds(x, frame))
 
 
 @dataclass(frozen=True)
@@ -115,14 +118,15 @@ class Play(Bounded):
 
     @override
     def _bounds(self, x: torch.Tensor, frame: Frame) -> Iterator[tuple[str, torch.Tensor, torch.Tensor]]:
+        touching = x > 0
         for name, _, width_m in self._operators():
             width = width_m * frame.stiffness_n_per_m
             low = (x + (self.above - 1.0) * width).clamp_(min=0.0)
             high = (x + self.above * width).clamp_(min=0.0)
-            yield name, low, high if self.rests else high.mul_(x > 0)
+            yield name, low, high if self.rests else high.mul_(touching)
 
     @override
-    def _reading(self, x: torch.Tensor, kept: Iterable[torch.Tensor]) -> torch.Tensor:
+    def reading(self, x: torch.Tensor, kept: Iterable[torch.Tensor]) -> torch.Tensor:
         fractions = [fraction for _, fraction, _ in self._operators()]
         looped = (1.0 - sum(fractions)) * x
         for fraction, play in zip(fractions, kept, strict=True):
@@ -235,7 +239,7 @@ class PeakHysteresis(Bounded):
         yield "peak", x, torch.where(x > 0, torch.inf, x)
 
     @override
-    def _reading(self, x: torch.Tensor, kept: Iterable[torch.Tensor]) -> torch.Tensor:
+    def reading(self, x: torch.Tensor, kept: Iterable[torch.Tensor]) -> torch.Tensor:
         (peak,) = kept
         share = x / peak.clamp(min=1e-12)
         return (x * (1.0 + 4.0 * self.fraction * share * (1.0 - share))).clamp(min=0.0)

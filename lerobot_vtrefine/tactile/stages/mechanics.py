@@ -116,6 +116,7 @@ class MechanicalSpreading(Stage):
 
     name: ClassVar[str] = "mechanical_spreading"
     spreads: ClassVar[bool] = True
+    proportional: ClassVar[bool] = True
     domain: ClassVar[str] = "force"
     rank: ClassVar[int] = 32
     sigma_m: float = parameter(1.0e-3, "m", 0.0, 3.0e-3)

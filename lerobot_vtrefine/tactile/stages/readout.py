@@ -50,6 +50,7 @@ class TaxelGainSpread(Stage):
     name: ClassVar[str] = "taxel_gain_spread"
     domain: ClassVar[str] = "counts"
     rank: ClassVar[int] = 50
+    proportional: ClassVar[bool] = True
     sigma: float = parameter(0.1, "1", 0.0, 0.3, maximum=3.0)
     map: tuple[tuple[float, ...], ...] | None = limits(maximum=1e6, default=None)
 
@@ -82,6 +83,7 @@ class DeadTaxels(Stage):
     name: ClassVar[str] = "dead_taxels"
     domain: ClassVar[str] = "counts"
     rank: ClassVar[int] = 52
+    proportional: ClassVar[bool] = True
     taxels: tuple[tuple[int, int], ...] = limits(0, 9999, default=())
     rows: tuple[int, ...] = limits(0, 9999, default=())
     cols: tuple[int, ...] = limits(0, 9999, default=())
@@ -160,6 +162,7 @@ class Crosstalk(Stage):
     name: ClassVar[str] = "crosstalk"
     domain: ClassVar[str] = "counts"
     rank: ClassVar[int] = 58
+    proportional: ClassVar[bool] = True
     row: float = parameter(0.005, "1", 0.0, 0.02, maximum=10.0)
     col: float = parameter(0.005, "1", 0.0, 0.02, maximum=10.0)
     reach: float | None = limits(above=0.0, maximum=1e6, default=None)

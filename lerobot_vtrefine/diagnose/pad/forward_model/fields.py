@@ -1,8 +1,11 @@
 """What passes from stage to stage while fitting: values of some of a sheet's columns."""
 
+from collections.abc import Hashable
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
+import torch
 
 from lerobot_vtrefine.diagnose.pad.forward_model.batches import Sheet
 
@@ -17,6 +20,14 @@ class Field:
     rate: np.ndarray | None = None
     damping: np.ndarray | None = None
     """Part of forces that damping bears, where a stage asks for it [N]."""
+    recorded: bool = False
+    """Whether a stage has left only the recorded frames."""
+
+    @cached_property
+    def memories(self) -> dict[Hashable, list[torch.Tensor]]:
+        """Memories of loops over these values, by the laws that they follow: readings of other fractions have
+        the same."""
+        return {}
 
     def within(self, sheet: Sheet, press: int) -> slice:
         """Where a press's columns are among these."""
@@ -25,7 +36,7 @@ class Field:
 
     def at_frames(self, sheet: Sheet) -> "Field":
         """At the recorded frames only, as `sheet.recorded` has them."""
-        if sheet.recorded is sheet:
+        if self.recorded or sheet.recorded is sheet:
             return self
 
         def kept(values: np.ndarray) -> np.ndarray:
@@ -60,3 +71,5 @@ class Context:
     """Numbers of the columns in which a stage that mixes taxels should answer; None for all."""
     in_parts: bool = False
     """Whether a later stage asks which part of a force damping bears."""
+    frames_only: bool = False
+    """Whether nothing later needs more than the recorded frames, so that a stage may leave out the others."""

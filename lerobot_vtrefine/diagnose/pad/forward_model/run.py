@@ -150,8 +150,9 @@ def _step(plan: Plan, index: int, field: Field, sheet: Sheet) -> Field:
     wanted = None if plan.mixed[index] else sheet.all_scored
     place = sheet if before else sheet.recorded
     stiffness = float(contact.stiffness(sheet.layout))
-    field = run_stage(stages[index], field, Context(place, stiffness, wanted, plan.in_parts))
-    return field.at_frames(place) if before and not plan.remembered[index] else field
+    last = before and not plan.remembered[index]
+    field = run_stage(stages[index], field, Context(place, stiffness, wanted, plan.in_parts, last))
+    return field.at_frames(place) if last else field
 
 
 def mixes(stages: Sequence[Stage]) -> bool:

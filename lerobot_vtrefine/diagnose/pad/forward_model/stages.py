@@ -18,6 +18,7 @@ from lerobot_vtrefine.tactile.stages.contact import ContactStage
 from lerobot_vtrefine.tactile.stages.cover import on_springs
 from lerobot_vtrefine.tactile.stages.dividers import Divider, LaggingDroop, RowSharing, SupplyDroop
 from lerobot_vtrefine.tactile.stages.host import SampleAndHold, ScanSkew
+from lerobot_vtrefine.tactile.stages.hysteresis import Hysteresis, LoadingHysteresis, Play, RestingHysteresis
 from lerobot_vtrefine.tactile.stages.mechanics import MechanicalSpreading, ring_matrix, spreading_matrix
 from lerobot_vtrefine.tactile.stages.readout import (
     BaselineDrift,
@@ -27,7 +28,7 @@ from lerobot_vtrefine.tactile.stages.readout import (
     Quantisation,
     TaxelGainSpread,
 )
-from lerobot_vtrefine.tactile.stages.signals import low_passed, sampled
+from lerobot_vtrefine.tactile.stages.signals import joined, low_passed, neighbours
 from lerobot_vtrefine.tactile.stages.softening import FirstLoadSoftening, PathSoftening, Remembering
 from lerobot_vtrefine.tactile.stages.surface import ContactOffset, PadTilt, StiffeningDepth
 
@@ -95,6 +96,16 @@ def _alike(stage: Stage, field: Field, context: Context) -> Field:
         frames = np.arange(len(field.values), dtype=float)
         return Field(work(field.values, frames, field.columns), field.columns, field.rate)
     return by_press(field, context.sheet, work)
+
+
+def _looped(stage: Play, field: Field, context: Context) -> Field:
+    """All presses are one; fits change fractions more often than what comes before, or widths."""
+    frame = Frame(context.sheet.layout, stiffness_n_per_m=context.stiffness)
+    line = torch.from_numpy(np.ascontiguousarray(field.values))[:, None]
+    law = (type(stage), stage.width_m, context.stiffness)
+    if law not in field.memories:
+        field.memories[law] = list(stage.kept(line, frame))
+    return Field(stage.reading(line, field.memories[law])[:, 0].numpy(), field.columns, field.rate)
 
 
 def _contact(stage: ContactStage, field: Field, context: Context) -> Field:
@@ -280,27 +291,30 @@ def _scan_skew(stage: ScanSkew, field: Field, context: Context) -> Field:
 
     def work(x: np.ndarray, time_s: np.ndarray, taxels: np.ndarray) -> np.ndarray:
         row, col = (torch.from_numpy(part.astype(float)) for part in np.divmod(taxels, layout.cols))
-        return _sampled(x, time_s, time_s[:, None] - stage.late_s(row, col, layout.rows, layout.cols).numpy())
+        late_s = stage.late_s(row, col, layout.rows, layout.cols).numpy()
+        # Taxels of a row are read as one.
+        each_s, which = np.unique(late_s, return_inverse=True)
+        after, share = neighbours(time_s, time_s[:, None] - each_s)
+        return joined(x, np.take(after, which, axis=1), np.take(share, which, axis=1))
 
     return by_press(field, context.sheet, work)
 
 
-def _sampled(x: np.ndarray, time_s: np.ndarray, at_s: np.ndarray) -> np.ndarray:
-    return sampled(*(torch.from_numpy(np.ascontiguousarray(item)) for item in (x, time_s, at_s))).numpy()
-
-
 def _hold(stage: SampleAndHold, field: Field, context: Context) -> Field:
     """A free board's instants are those that the recording itself shows."""
-    sheet, out = context.sheet, np.zeros_like(field.values)
-    for press, (time_s, rhythm) in enumerate(zip(sheet.times_s, sheet.rhythms, strict=True)):
+    sheet = context.sheet
+    asked = sheet.frames if context.frames_only else [np.arange(len(time_s)) for time_s in sheet.times_s]
+    out = np.zeros((max(len(own) for own in asked), len(field.columns)))
+    for press, (time_s, own, rhythm) in enumerate(zip(sheet.times_s, asked, sheet.rhythms, strict=True)):
         part = field.within(sheet, press)
         x = field.values[: len(time_s), part]
         if stage.ages_s:
-            out[: len(time_s), part] = _sampled(x, time_s, rhythm.taken_s(time_s) - stage.lag_s)
+            at_s = rhythm.taken_s(time_s[own]) - stage.lag_s
+            out[: len(own), part] = joined(x, *neighbours(time_s, at_s))
         else:
             phase = rhythm.phase(stage.period_s) if stage.free else 0.0
-            out[: len(time_s), part] = stage.held(torch.from_numpy(x), torch.from_numpy(time_s), phase)
-    return Field(out, field.columns)
+            out[: len(own), part] = stage.held(torch.from_numpy(x), torch.from_numpy(time_s), phase)[own]
+    return Field(out, field.columns, recorded=context.frames_only)
 
 
 def _convert(stage: Quantisation, field: Field, context: Context) -> Field:
@@ -314,6 +328,9 @@ def _convert(stage: Quantisation, field: Field, context: Context) -> Field:
 OWN_TAXELS: dict[type, Callable[[Any, Field, Context], Field]] = {
     PadTilt: _added,
     MechanicalSpreading: _spreading,
+    Hysteresis: _looped,
+    RestingHysteresis: _looped,
+    LoadingHysteresis: _looped,
     FirstLoadSoftening: _softened,
     PathSoftening: _softened,
     TaxelGainSpread: _multiplied,
