@@ -19,7 +19,7 @@ from lerobot_vtrefine.datasets.features import (
     dataset_features,
 )
 from lerobot_vtrefine.embodiments import ALOHA
-from lerobot_vtrefine.policies.vt_dp3 import VtDp3Config
+from lerobot_vtrefine.policies.vt_dp3 import VtDp3Config, observation_encoder
 from lerobot_vtrefine.policies.vt_dp3.modeling_vt_dp3 import VtDp3Policy
 from lerobot_vtrefine.policies.vt_dp3.observation_encoder import PERCEIVED_KEY
 
@@ -296,3 +296,18 @@ def test_feature_noise_blurs_what_cloning_sees_and_nothing_else(monkeypatch: pyt
         assert ratio[clear.flatten(0, 1).std(0) > 1e-3].mean().item() == pytest.approx(0.5, rel=0.05)
     with pytest.raises(ParsingError, match=r"policy\.feature_noise must not be negative"):
         make_policy(feature_noise=-1.0)
+
+
+def test_many_frames_are_seen_a_few_at_a_time_where_no_gradient_is_needed(monkeypatch) -> None:
+    policy, batch = make_policy(), make_batch(5)
+    model = policy.online
+    assert model is not None and model.encoder.points is not None
+    whole = model.encoder.perceive(batch)
+    sizes: list[int] = []
+    model.encoder.points.register_forward_pre_hook(lambda _, inputs: sizes.append(len(inputs[0])))
+    monkeypatch.setattr(observation_encoder, "FRAMES_AT_ONCE", 4)
+    with torch.no_grad():
+        torch.testing.assert_close(model.encoder.perceive(batch), whole)
+    assert sizes == [4, 4, 2]
+    model.encoder.perceive(batch)
+    assert sizes[3:] == [10]

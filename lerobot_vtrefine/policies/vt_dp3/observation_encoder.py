@@ -21,6 +21,8 @@ STATE_FEATURES = 64
 PERCEIVED_KEY = "perceived"
 """Of a batch whose frames a frozen encoder has seen before."""
 ENCODER_FLAG = "--policy.pretrained_encoder"
+FRAMES_AT_ONCE = 2048
+"""Without gradients: 1024 worlds of two frames. More frames make layers of points that take gigabytes."""
 
 
 class ObservationEncoder(nn.Module):
@@ -79,7 +81,7 @@ class ObservationEncoder(nn.Module):
     def perceive(self, batch: dict[str, Tensor]) -> Tensor:
         """Features (B, To, F) of cloud (B, To, N, 5) in metres and readings (B, To, P, R, C); F may be 0."""
         frames = [
-            part(batch[key].flatten(0, 1)).unflatten(0, batch[STATE_KEY].shape[:2])
+            _frame_by_frame(part, batch[key].flatten(0, 1)).unflatten(0, batch[STATE_KEY].shape[:2])
             for key, part in ((CLOUD_KEY, self.points), (GRIDS_KEY, self.pads))
             if part is not None
         ]
@@ -97,6 +99,13 @@ class ObservationEncoder(nn.Module):
         if self.limits_dim:
             state = torch.cat([state, batch[LIMITS_KEY]], dim=-1)
         return torch.cat([known, self.state(state)], dim=-1).flatten(1)
+
+
+def _frame_by_frame(part: nn.Module, frames: Tensor) -> Tensor:
+    """``part`` of frames (M, ...), a few at a time where nothing is kept for a gradient."""
+    if torch.is_grad_enabled() or len(frames) <= FRAMES_AT_ONCE:
+        return part(frames)
+    return torch.cat([part(few) for few in frames.split(FRAMES_AT_ONCE)])
 
 
 def make_encoder(config: VtDp3Config, state_dim: int) -> ObservationEncoder:
