@@ -166,4 +166,8 @@ def trusted(problem: "PadProblem", plain: Fit, fitted: Fit, seed: int, *, doubtf
         model, held = refitted.model, other
     needed = DOUBTFUL_GAIN if doubtful else 0.0
     lucky = doubtful and not agree((before.errors - held.errors).sum(1), seed, DOUBTFUL_P)
-    return plain.model if held.gain_over(before) <= needed or lucky else model
+    if held.gain_over(before) > needed and not lucky:
+        return model
+    # That a taxel does not answer is seen, and may be so where these recordings press nothing.
+    dead = fitted.model.dead if not doubtful else {}
+    return replace(plain.model, dead=dead) if dead else plain.model
