@@ -115,6 +115,9 @@ def handed_out(
     if fitted.model.families:
         around, fitted = with_own_touch(problem, fitted)
         model = trusted(problem.as_recorded, plain, fitted, seed, doubtful=doubtful)
+        if model is plain.model and fitted.model.dead and not doubtful:
+            # Dead taxels are seen, and these recordings may press nothing there.
+            model = replace(model, dead=fitted.model.dead)
     idle = settled_idle(model, problem.presses)
     before = FinalFit(plain, problem, plain.model, idle)
     after = FinalFit(fitted, around, model, idle)
@@ -166,8 +169,4 @@ def trusted(problem: "PadProblem", plain: Fit, fitted: Fit, seed: int, *, doubtf
         model, held = refitted.model, other
     needed = DOUBTFUL_GAIN if doubtful else 0.0
     lucky = doubtful and not agree((before.errors - held.errors).sum(1), seed, DOUBTFUL_P)
-    if held.gain_over(before) > needed and not lucky:
-        return model
-    # That a taxel does not answer is seen, and may be so where these recordings press nothing.
-    dead = fitted.model.dead if not doubtful else {}
-    return replace(plain.model, dead=dead) if dead else plain.model
+    return plain.model if held.gain_over(before) <= needed or lucky else model

@@ -373,11 +373,13 @@ class PadProblem(OptionalSteps):
 
     def shown(self, selection: Selected, locked: "PadProblem") -> Selected:
         """With taxels that locked recordings show to be dead."""
-        found = with_shown_dead(selection, locked.presses)
-        if not found.fit.model.dead or selection.fit.model.dead:
-            return found
+        fitted = with_shown_dead(self, selection.fit, locked.presses)
+        selection, named = replace(selection, fit=fitted), selection.fit.model.dead
+        if named or not fitted.model.dead:
+            return selection
+        # The guard takes back last what was seen.
         chosen = {CHANNEL: (Candidate(DEAD), *selection.chosen.get(CHANNEL, ()))}
-        return replace(found, chosen=chosen, p_values={**selection.p_values, (DEAD, CHANNEL): None})
+        return replace(selection, chosen=chosen, p_values={**selection.p_values, (DEAD, CHANNEL): None})
 
     def surprises(self, fit: Fit, locked: "PadProblem") -> list[Suspicion]:
         """Errors of single taxels in locked recordings."""
