@@ -120,6 +120,8 @@ def test_a_taxel_that_locked_recordings_alone_press_is_named_without_a_test(brok
     assert (cause.name, cause.basis, cause.p_value) == ("dead_taxels", "observed", None)
     assert cause.params["taxels"].value == [[1, 0]]
     assert broken.verdict.status == "explained"
+    said = next(item.reason for item in broken.evidence if item.name == "dead_taxels")
+    assert "only locked recordings press 1 taxel" in said
 
 
 def test_its_gain_is_told_and_users_get_it(broken: Diagnosis) -> None:

@@ -12,7 +12,7 @@ from lerobot_vtrefine.diagnose.core.rules import LEAST_GAIN
 from lerobot_vtrefine.diagnose.pad.fitting import Fit, predict, squared_errors
 from lerobot_vtrefine.diagnose.pad.press_trials import PressSet
 from lerobot_vtrefine.diagnose.pad.rules import WITNESSES
-from lerobot_vtrefine.diagnose.pad.taxel_maps import find_dead
+from lerobot_vtrefine.diagnose.pad.taxel_maps import could_be_dead, find_dead, plain_gains
 
 if TYPE_CHECKING:
     from lerobot_vtrefine.diagnose.pad.problem import PadProblem
@@ -49,6 +49,13 @@ def shown_dead(fitted: Fit, presses: PressSet, locked: Sequence[int]) -> dict[tu
         for taxel, left in find_dead(fitted, presses).items()
         if sum(taxel in dead for dead in alone) >= WITNESSES
     }
+
+
+def shown_elsewhere(fitted: Fit, presses: PressSet) -> list[tuple[int, int]]:
+    """Dead taxels of a model that these presses do not press well enough to tell."""
+    sound = _seen(replace(fitted, model=replace(fitted.model, dead={})), presses)
+    told = could_be_dead(plain_gains(sound, presses)[1]).reshape(presses.layout.rows, presses.layout.cols)
+    return [taxel for taxel in fitted.model.dead if not told[taxel]]
 
 
 def _seen(fitted: Fit, presses: PressSet) -> Fit:
