@@ -87,6 +87,7 @@ def infer[P: Problem[Any, Any]](
     tell(f"{whole.subject}: settling the sizes", 0.8)
     selection, whole = _settled_finely(named_only(selection), whole)
     test = whole.subset(locked) if len(locked) else selection.problem
+    selection = selection.problem.shown(selection, test) if len(locked) else selection
     # Asked before models are handed out, told after: what locked trials show decides nothing but the verdict.
     surprises = selection.problem.surprises(selection.fit, test) if len(locked) else ()
     selection = selection.problem.handed_out(selection, seed, doubtful=bool(alarms))

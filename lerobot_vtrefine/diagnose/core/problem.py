@@ -123,6 +123,10 @@ class OptionalSteps(Protocol):
         """The same trials with predictions for which the search is too slow; None where there are none."""
         return None
 
+    def shown(self, selection: "Selection[Any, Any, Any]", locked: Self) -> "Selection[Any, Any, Any]":
+        """With what several locked trials show by themselves, so that each is told what the others show."""
+        return selection
+
     def handed_out(
         self, selection: "Selection[Any, Any, Any]", seed: int, *, doubtful: bool
     ) -> "Selection[Any, Any, Any]":

@@ -32,10 +32,12 @@ from lerobot_vtrefine.diagnose.pad.own_delay import with_spread
 from lerobot_vtrefine.diagnose.pad.problem import Candidate, PadProblem
 from lerobot_vtrefine.diagnose.pad.rules import MORE_COORDINATES
 from lerobot_vtrefine.diagnose.pad.screening import DEAD, GAIN_MAP, MAPS, forms_of
+from lerobot_vtrefine.diagnose.pad.shown_dead import shown_elsewhere
 from lerobot_vtrefine.diagnose.pad.views import Predicted
 from lerobot_vtrefine.diagnose.verdict import Parameter
 from lerobot_vtrefine.tactile.model import SensorModel
 from lerobot_vtrefine.tactile.stages.host import Latency
+from lerobot_vtrefine.wording import plural
 
 
 class PadAccount(OptionalRemarks):
@@ -128,6 +130,8 @@ class PadAccount(OptionalRemarks):
 
     def caveat(self, cause: str, channels: tuple[int, ...]) -> str:
         """What an accepted cause leaves open."""
+        if cause == DEAD and (elsewhere := shown_elsewhere(self.fit, self.problem.presses)):
+            return f"; only locked recordings press {plural(len(elsewhere), 'taxel')}, and tell each other"
         if cause != Latency.name or not self.problem.presses.delays_s:
             return ""
         spread_ms = 1e3 * float(np.std(self.problem.presses.delays_s, ddof=1))

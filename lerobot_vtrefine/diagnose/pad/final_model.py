@@ -115,6 +115,9 @@ def handed_out(
     if fitted.model.families:
         around, fitted = with_own_touch(problem, fitted)
         model = trusted(problem.as_recorded, plain, fitted, seed, doubtful=doubtful)
+        if model is plain.model and fitted.model.dead and not doubtful:
+            # Dead taxels are seen, and these recordings may press nothing there.
+            model = replace(model, dead=fitted.model.dead)
     idle = settled_idle(model, problem.presses)
     before = FinalFit(plain, problem, plain.model, idle)
     after = FinalFit(fitted, around, model, idle)

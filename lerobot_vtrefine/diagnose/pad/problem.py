@@ -16,7 +16,7 @@ from lerobot_vtrefine.diagnose.core.problem import OptionalSteps, PlainCandidate
 from lerobot_vtrefine.diagnose.core.rivals import Rival
 from lerobot_vtrefine.diagnose.core.rules import LEAST_GAIN
 from lerobot_vtrefine.diagnose.core.score_test import screen
-from lerobot_vtrefine.diagnose.core.screened_search import folds_for
+from lerobot_vtrefine.diagnose.core.screened_search import CHANNEL, folds_for
 from lerobot_vtrefine.diagnose.core.search import Selection
 from lerobot_vtrefine.diagnose.core.suspicion import Suspicion
 from lerobot_vtrefine.diagnose.pad import final_model, review
@@ -50,6 +50,7 @@ from lerobot_vtrefine.diagnose.pad.rules import (
     FURTHER_GAIN,
 )
 from lerobot_vtrefine.diagnose.pad.screening import DEAD, GAIN_MAP, all_probes, form_probes, forms_of
+from lerobot_vtrefine.diagnose.pad.shown_dead import with_shown_dead
 from lerobot_vtrefine.diagnose.pad.suspicions import surprises, suspicions
 from lerobot_vtrefine.diagnose.pad.taxel_maps import MapEvidence, find_dead, map_evidence, map_of, with_map
 from lerobot_vtrefine.diagnose.pad.weights import TrialWeights
@@ -369,6 +370,16 @@ class PadProblem(OptionalSteps):
     def suspicions(self, selection: Selected, seed: int) -> list[Suspicion]:
         """What may be left."""
         return suspicions(self, selection)
+
+    def shown(self, selection: Selected, locked: "PadProblem") -> Selected:
+        """With taxels that locked recordings show to be dead."""
+        fitted = with_shown_dead(self, selection.fit, locked.presses)
+        selection, named = replace(selection, fit=fitted), selection.fit.model.dead
+        if named or not fitted.model.dead:
+            return selection
+        # The guard takes back last what was seen.
+        chosen = {CHANNEL: (Candidate(DEAD), *selection.chosen.get(CHANNEL, ()))}
+        return replace(selection, chosen=chosen, p_values={**selection.p_values, (DEAD, CHANNEL): None})
 
     def surprises(self, fit: Fit, locked: "PadProblem") -> list[Suspicion]:
         """Errors of single taxels in locked recordings."""

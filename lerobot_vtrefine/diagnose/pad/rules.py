@@ -30,6 +30,8 @@ DEAD_BELOW, DEAD_ERRORS = 1 / 3, 2.0
 squared error), and the standard errors by which its gain must lie below."""
 MAYBE_DEAD_ERRORS = 1.0
 """Standard errors that are enough for one more dead taxel, where others are."""
+WITNESSES = 2
+"""Locked recordings that must each show a taxel to be dead that others do not press: one tells the other."""
 
 # Readings are held.
 MIN_HELD, CHANCE = 0.005, 0.2
