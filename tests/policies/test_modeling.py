@@ -301,7 +301,8 @@ def test_feature_noise_blurs_what_cloning_sees_and_nothing_else(monkeypatch: pyt
 def test_many_frames_are_seen_a_few_at_a_time_where_no_gradient_is_needed(monkeypatch) -> None:
     policy, batch = make_policy(), make_batch(5)
     model = policy.online
-    assert model is not None and model.encoder.points is not None
+    assert model is not None
+    assert model.encoder.points is not None
     whole = model.encoder.perceive(batch)
     sizes: list[int] = []
     model.encoder.points.register_forward_pre_hook(lambda _, inputs: sizes.append(len(inputs[0])))
