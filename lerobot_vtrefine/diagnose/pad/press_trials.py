@@ -12,7 +12,7 @@ from lerobot_vtrefine.diagnose.pad.idle_course import with_course
 from lerobot_vtrefine.diagnose.pad.idle_map import IdleMap, WholeMotion, idle_map, resting, surely_resting
 from lerobot_vtrefine.diagnose.pad.indenters import trial_forces
 from lerobot_vtrefine.diagnose.pad.motion import Kind, instants_of, motion
-from lerobot_vtrefine.diagnose.pad.repeated_frames import Rhythm, silent
+from lerobot_vtrefine.diagnose.pad.repeated_frames import Rhythm, changed, silent
 from lerobot_vtrefine.diagnose.pad.session_load import with_session
 from lerobot_vtrefine.diagnose.recordings import RecordingSet, Trial
 from lerobot_vtrefine.tactile.layout import PadLayout
@@ -93,6 +93,8 @@ class Press:
     """Frames with the indenter on the pad (T,) bool."""
     resting: np.ndarray
     """Frames before the first touch or well after a release (T,) bool."""
+    whole: "Press | None" = field(default=None, repr=False)
+    """The press with all its frames, where readings repeat and these are some of them: only there it shows how."""
 
     @property
     def time_s(self) -> np.ndarray:
@@ -123,12 +125,19 @@ class Press:
 
     @cached_property
     def rhythm(self) -> Rhythm:
-        """When readings were new."""
+        """When readings were new, of all recorded frames."""
+        if self.whole is not None:
+            return self.whole.rhythm
         return Rhythm.of(self.time_s, self.signal, self.touching & ~silent(self.drive, self.signal))
 
-    def every(self, step: int) -> "Press":
+    @cached_property
+    def fresh(self) -> np.ndarray:
+        """Frames (T,) whose readings are not those of the one before, of these frames."""
+        return changed(self.signal)
+
+    def every(self, step: int, begin: int = 0) -> "Press":
         """Only every so many frames."""
-        kept = slice(None, None, step)
+        kept = slice(begin, None, step)
         images = ("drive", "rate", "signal", "touching", "resting")
         return replace(
             self, trial=_cut(self.trial, kept), **{name: getattr(self, name)[kept] for name in images}
@@ -199,6 +208,14 @@ class PressSet:
     def every(self, step: int) -> "PressSet":
         """With every so many frames of each press."""
         return replace(self, presses=tuple(press.every(step) for press in self.presses))
+
+    def every_held(self, step: int) -> "PressSet":
+        """The same where readings repeat; from another frame on in each press, so that no age of readings is
+        left out where they are held for so many frames."""
+        presses = enumerate(self.presses)
+        return replace(
+            self, presses=tuple(replace(press.every(step, k % step), whole=press) for k, press in presses)
+        )
 
     @property
     def readings(self) -> int:

@@ -192,13 +192,15 @@ class PadProblem(OptionalSteps):
         """With fewer frames, where there are more than a search needs.
 
         What recordings are told apart by is how they differ from each other, and not the noise of frames that
-        follow each other by a hundredth of a second. Held frames show only where all are there.
+        follow each other by a hundredth of a second. How readings are held is asked of all frames.
         """
         step = min(int(self.presses.rate_hz / ENOUGH_HZ), self.presses.readings // ENOUGH_READINGS)
-        if step < 2 or repeated_share(self.presses) > FEW_REPEATS:
+        if step < 2:
             return self
         together = self.together and self.together.thinned()
-        return PadProblem(self.presses.every(step), self.seed, whole=self, together=together)
+        repeat = repeated_share(self.presses) > FEW_REPEATS
+        presses = self.presses.every_held(step) if repeat else self.presses.every(step)
+        return PadProblem(presses, self.seed, whole=self, together=together)
 
     def with_delays(self, delays_s: Array) -> "PadProblem":
         """Each recording moved by a delay of its own (K,) [s]; without weights."""
