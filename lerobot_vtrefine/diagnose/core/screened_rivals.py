@@ -24,7 +24,9 @@ def rivals_seen_twice[F: ScoredFit, C: FormCandidate](
     if searched is selection:
         return screened_rivals(selection, seed)
     near = screened_rivals(searched, seed)
-    names = {cause: frozenset(item.name for item in near if item.cause == cause) for cause in selection.causes()}
+    names = {
+        cause: frozenset(item.name for item in near if item.cause == cause) for cause in selection.causes()
+    }
     return screened_rivals(replace(selection, alternatives=names), seed)
 
 

@@ -94,7 +94,7 @@ class Press:
     resting: np.ndarray
     """Frames before the first touch or well after a release (T,) bool."""
     whole: "Press | None" = field(default=None, repr=False)
-    """The press with all its frames, where readings repeat and these are some of them: only there it shows how."""
+    """The press with all its frames, where readings repeat and these are some: only there it shows how."""
 
     @property
     def time_s(self) -> np.ndarray:
@@ -118,7 +118,7 @@ class Press:
         # Shares of a load need the whole pad; heights do not.
         layout = whole if self.loaded else self.layout
         times, frames = instants_of(self.trial, layout, kind)
-        drive, rate = motion(self.trial, layout, times)
+        drive, rate = motion((self.whole or self).trial, layout, times)
         if self.loaded:
             drive, rate = self.layout.cut(drive), self.layout.cut(rate)
         return Course(times, drive, rate, frames)
@@ -134,14 +134,6 @@ class Press:
     def fresh(self) -> np.ndarray:
         """Frames (T,) whose readings are not those of the one before, of these frames."""
         return changed(self.signal)
-
-    def every(self, step: int, begin: int = 0) -> "Press":
-        """Only every so many frames."""
-        kept = slice(begin, None, step)
-        images = ("drive", "rate", "signal", "touching", "resting")
-        return replace(
-            self, trial=_cut(self.trial, kept), **{name: getattr(self, name)[kept] for name in images}
-        )
 
     @property
     def taxels(self) -> np.ndarray:
@@ -205,18 +197,6 @@ class PressSet:
     def _subsets(self) -> dict[tuple[int, ...], "PressSet"]:
         return {}
 
-    def every(self, step: int) -> "PressSet":
-        """With every so many frames of each press."""
-        return replace(self, presses=tuple(press.every(step) for press in self.presses))
-
-    def every_held(self, step: int) -> "PressSet":
-        """The same where readings repeat; from another frame on in each press, so that no age of readings is
-        left out where they are held for so many frames."""
-        presses = enumerate(self.presses)
-        return replace(
-            self, presses=tuple(replace(press.every(step, k % step), whole=press) for k, press in presses)
-        )
-
     @property
     def readings(self) -> int:
         """Number of scored readings."""
@@ -263,13 +243,13 @@ def usable(trial: Trial) -> Trial | None:
     if len(order) < MIN_FRAMES:
         return None
     order = order[np.argsort(trial.time_s[order], kind="stable")]
-    return _cut(trial, order)
+    return some_frames(trial, order)
 
 
 COLUMNS = ("time_s", "x_m", "y_m", "depth_m", "tilt_x_rad", "tilt_y_rad", "force_n", "temperature_c", "raw")
 
 
-def _cut(trial: Trial, frames: np.ndarray | slice) -> Trial:
+def some_frames(trial: Trial, frames: np.ndarray | slice) -> Trial:
     """Some frames of a trial."""
     values = {name: getattr(trial, name) for name in COLUMNS}
     return replace(trial, **{k: v if v is None else v[frames] for k, v in values.items()})
