@@ -1,6 +1,6 @@
 """The method where a score test comes before fits, on a toy instrument of one channel."""
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 import pytest
@@ -11,7 +11,7 @@ from lerobot_vtrefine.diagnose.core.heldout import OutOfFold
 from lerobot_vtrefine.diagnose.core.problem import OptionalSteps, PlainCandidate, Promise
 from lerobot_vtrefine.diagnose.core.rivals import settled
 from lerobot_vtrefine.diagnose.core.score_test import Probe, cleared, screen
-from lerobot_vtrefine.diagnose.core.screened_rivals import screened_rivals, tied
+from lerobot_vtrefine.diagnose.core.screened_rivals import rivals_seen_twice, screened_rivals, tied
 from lerobot_vtrefine.diagnose.core.screened_search import (
     ScreenedSearch,
     better,
@@ -268,6 +268,29 @@ def test_a_rival_is_tried_in_the_form_that_scores_see_however_little_its_plain_o
     )
     (rival,) = screened_rivals(selection, 0)
     assert rival.candidate.column == 3
+
+
+def test_rivals_are_fitted_to_all_frames_where_they_tie_on_those_that_were_searched() -> None:
+    @dataclass(frozen=True)
+    class Asked(Toy):
+        asked: list[str] = field(default_factory=list, compare=False)
+
+        def extended(self, now, candidate, channels, plainer=None):
+            self.asked.append(candidate.cause)
+            return super().extended(now, candidate, channels, plainer)
+
+    named = Form("bend", column=1)
+    some = toy(0.15, offered=(named, Form("square", column=2), Form("round", column=3)))
+    searched = replace(
+        ScreenedSearch(some, 0, lambda text: None).run(),
+        fit=some.fit((0, 1)),
+        chosen={0: (named,)},
+        alternatives={"bend": frozenset({"square", "round"})},
+    )
+    whole = Asked(some.x, some.y, offered=some.offered)
+    (rival,) = rivals_seen_twice(replace(searched, problem=whole), searched, 0)
+    assert rival.name == "round"
+    assert whole.asked == ["round"]
 
 
 @pytest.mark.parametrize(("lead", "told"), [(0.1, False), (1.0, True)])

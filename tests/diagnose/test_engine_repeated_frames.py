@@ -1,17 +1,24 @@
 """When readings were new, and the rhythm in which they are held."""
 
+from dataclasses import replace
 from types import SimpleNamespace
 
 import numpy as np
 import pytest
 import torch
+from test_engine_forward import composite, presses
 
+from lerobot_vtrefine.diagnose.pad.baseline import describe
 from lerobot_vtrefine.diagnose.pad.candidates.sample_and_hold import (
+    FORMS,
     could_be_held,
     held,
     irregular_periods,
+    repeated_share,
 )
+from lerobot_vtrefine.diagnose.pad.fitting import predict
 from lerobot_vtrefine.diagnose.pad.repeated_frames import Rhythm, ages_s, slots
+from lerobot_vtrefine.diagnose.pad.thinning import held_every
 from lerobot_vtrefine.tactile.layout import PadLayout
 from lerobot_vtrefine.tactile.model import SensorModel
 from lerobot_vtrefine.tactile.stages.base import Frame
@@ -120,7 +127,13 @@ def press_set(signals: list[np.ndarray]) -> SimpleNamespace:
         taxels, layout = np.arange(signal.shape[1]), SimpleNamespace(full_cols=10)
         presses.append(
             SimpleNamespace(
-                time_s=time_s, signal=signal, drive=drive, rhythm=rhythm, taxels=taxels, layout=layout
+                time_s=time_s,
+                signal=signal,
+                drive=drive,
+                rhythm=rhythm,
+                taxels=taxels,
+                layout=layout,
+                whole=None,
             )
         )
     return SimpleNamespace(presses=tuple(presses))
@@ -190,3 +203,19 @@ def test_held_frames_show_what_the_model_said_at_the_last_new_one() -> None:
     fine_s = np.arange(12) * 0.025
     shown = sampled(*(torch.from_numpy(item) for item in (values, fine_s, rhythm.taken_s(fine_s))))
     np.testing.assert_allclose(shown[:, 0], [0, 0, 0, 0, 4, 4, 4, 4, 4, 4, 10, 10], atol=1e-9)
+
+
+def test_some_frames_of_held_readings_are_held_as_all_of_them_are() -> None:
+    rng = np.random.default_rng(8)
+    known = presses()
+    lost = [replace(press, signal=dropped(press.signal, 0.4, rng)) for press in known.presses]
+    whole = replace(known, presses=tuple(lost))
+    thin = held_every(3, whole)
+    assert repeated_share(thin) == repeated_share(whole) > 0.3
+    assert describe(thin).frame_s == describe(whole).frame_s
+    assert describe(thin).ages_s == describe(whole).ages_s
+    # Each begins at another frame, and shows there what was taken at one that it may not have.
+    model = composite(whole).plus(FORMS[-1], np.array([0.07, 0.0]))
+    said = zip(predict(model, whole), predict(model, thin), strict=True)
+    for k, (full, some) in enumerate(said):
+        np.testing.assert_allclose(some, full[k % 3 :: 3], atol=0.02 * full.max())

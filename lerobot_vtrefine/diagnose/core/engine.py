@@ -2,6 +2,7 @@
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from functools import partial
 from typing import Any, cast
 
 import numpy as np
@@ -10,7 +11,7 @@ from lerobot_vtrefine.diagnose.core.heldout import lock
 from lerobot_vtrefine.diagnose.core.problem import Candidate, Fit, Problem
 from lerobot_vtrefine.diagnose.core.resampling import gain_interval
 from lerobot_vtrefine.diagnose.core.rivals import Rival, find_rivals, settled
-from lerobot_vtrefine.diagnose.core.screened_rivals import screened_rivals
+from lerobot_vtrefine.diagnose.core.screened_rivals import rivals_seen_twice
 from lerobot_vtrefine.diagnose.core.screened_search import ScreenedSearch, still_found
 from lerobot_vtrefine.diagnose.core.search import ALL, Search, Selection
 from lerobot_vtrefine.diagnose.core.suspicion import Alarm, confirmed, raise_alarms
@@ -71,7 +72,8 @@ def infer[P: Problem[Any, Any]](
     selection = selection.problem.reviewed(selection, seed)
     if problem.screens:
         selection = still_found(selection, seed)
-    selection = problem.with_all_frames(selection)
+    searched = selection
+    selection = problem.with_all_frames(searched)
     whole = whole.revised(selection.fit, [item for items in selection.chosen.values() for item in items])
     tell(f"{whole.subject}: looking for what is left", 0.6)
     alarms = raise_alarms(selection, selection.problem.suspicions(selection, seed), seed)
@@ -80,8 +82,8 @@ def infer[P: Problem[Any, Any]](
     if not alarms or selection.problem.can_settle:
         tell(f"{whole.subject}: looking for other explanations", 0.7)
         before = selection
-        found = screened_rivals if problem.screens else find_rivals
-        selection, rivals = settled(selection, found(selection, seed), seed)
+        found = partial(rivals_seen_twice, searched=searched) if problem.screens else find_rivals
+        selection, rivals = settled(selection, found(selection, seed=seed), seed)
         if selection is not before:
             alarms = raise_alarms(selection, selection.problem.suspicions(selection, seed), seed)
     tell(f"{whole.subject}: settling the sizes", 0.8)

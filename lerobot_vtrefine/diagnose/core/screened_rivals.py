@@ -1,5 +1,6 @@
 """Causes that these trials cannot tell apart, where a score test says which candidates are fitted."""
 
+from dataclasses import replace
 from functools import partial
 from typing import Any
 
@@ -13,6 +14,20 @@ from lerobot_vtrefine.diagnose.core.rivals import Rival
 from lerobot_vtrefine.diagnose.core.rules import ALPHA, LEAST_GAIN, NEARLY, RICH, TIE_P
 from lerobot_vtrefine.diagnose.core.screened_search import CHANNEL, Ground, Step, folds_for
 from lerobot_vtrefine.diagnose.core.search import Selection
+
+
+def rivals_seen_twice[F: ScoredFit, C: FormCandidate](
+    selection: Selection[Any, F, C], searched: Selection[Any, F, C], seed: int
+) -> list[Rival[F, C]]:
+    """All causes that tie with an accepted one, of those that tie with it on the frames that were searched:
+    what fewer frames tell apart more do as well, and fits to all of them cost most."""
+    if searched is selection:
+        return screened_rivals(selection, seed)
+    near = screened_rivals(searched, seed)
+    names = {
+        cause: frozenset(item.name for item in near if item.cause == cause) for cause in selection.causes()
+    }
+    return screened_rivals(replace(selection, alternatives=names), seed)
 
 
 def screened_rivals[F: ScoredFit, C: FormCandidate](

@@ -49,7 +49,7 @@ LEAST_C = 0.2
 
 def describe(presses: PressSet) -> Setting:
     """What candidates may know; the largest signal is not known before the first fit."""
-    steps = np.concatenate([np.diff(press.time_s) for press in presses.presses])
+    steps = np.concatenate([np.diff((press.whole or press).time_s) for press in presses.presses])
     spans = [float(press.time_s[-1] - press.time_s[0]) for press in presses.presses]
     starts = [press.trial.start_s for press in presses.presses]
     touched = np.zeros((presses.layout.rows, presses.layout.cols), dtype=bool)

@@ -67,7 +67,7 @@ def fit_frame_noise(
     from frames without contact. Readings that a board holds have the noise of one: only new ones count.
     """
     repeat = held(presses)
-    new = [press.rhythm.fresh | (not repeat) for press in presses.presses]
+    new = [press.fresh | (not repeat) for press in presses.presses]
     rho, slow = _memory(presses, residuals, new)
     squares, sizes = [], []
     for residual, signal, own in zip(residuals, signals, new, strict=True):

@@ -12,7 +12,7 @@ from lerobot_vtrefine.diagnose.pad.idle_course import with_course
 from lerobot_vtrefine.diagnose.pad.idle_map import IdleMap, WholeMotion, idle_map, resting, surely_resting
 from lerobot_vtrefine.diagnose.pad.indenters import trial_forces
 from lerobot_vtrefine.diagnose.pad.motion import Kind, instants_of, motion
-from lerobot_vtrefine.diagnose.pad.repeated_frames import Rhythm, silent
+from lerobot_vtrefine.diagnose.pad.repeated_frames import Rhythm, changed, silent
 from lerobot_vtrefine.diagnose.pad.session_load import with_session
 from lerobot_vtrefine.diagnose.recordings import RecordingSet, Trial
 from lerobot_vtrefine.tactile.layout import PadLayout
@@ -93,6 +93,8 @@ class Press:
     """Frames with the indenter on the pad (T,) bool."""
     resting: np.ndarray
     """Frames before the first touch or well after a release (T,) bool."""
+    whole: "Press | None" = field(default=None, repr=False)
+    """The press with all its frames, where readings repeat and these are some: only there it shows how."""
 
     @property
     def time_s(self) -> np.ndarray:
@@ -116,23 +118,22 @@ class Press:
         # Shares of a load need the whole pad; heights do not.
         layout = whole if self.loaded else self.layout
         times, frames = instants_of(self.trial, layout, kind)
-        drive, rate = motion(self.trial, layout, times)
+        drive, rate = motion((self.whole or self).trial, layout, times)
         if self.loaded:
             drive, rate = self.layout.cut(drive), self.layout.cut(rate)
         return Course(times, drive, rate, frames)
 
     @cached_property
     def rhythm(self) -> Rhythm:
-        """When readings were new."""
+        """When readings were new, of all recorded frames."""
+        if self.whole is not None:
+            return self.whole.rhythm
         return Rhythm.of(self.time_s, self.signal, self.touching & ~silent(self.drive, self.signal))
 
-    def every(self, step: int) -> "Press":
-        """Only every so many frames."""
-        kept = slice(None, None, step)
-        images = ("drive", "rate", "signal", "touching", "resting")
-        return replace(
-            self, trial=_cut(self.trial, kept), **{name: getattr(self, name)[kept] for name in images}
-        )
+    @cached_property
+    def fresh(self) -> np.ndarray:
+        """Frames (T,) whose readings are not those of the one before, of these frames."""
+        return changed(self.signal)
 
     @property
     def taxels(self) -> np.ndarray:
@@ -196,10 +197,6 @@ class PressSet:
     def _subsets(self) -> dict[tuple[int, ...], "PressSet"]:
         return {}
 
-    def every(self, step: int) -> "PressSet":
-        """With every so many frames of each press."""
-        return replace(self, presses=tuple(press.every(step) for press in self.presses))
-
     @property
     def readings(self) -> int:
         """Number of scored readings."""
@@ -246,13 +243,13 @@ def usable(trial: Trial) -> Trial | None:
     if len(order) < MIN_FRAMES:
         return None
     order = order[np.argsort(trial.time_s[order], kind="stable")]
-    return _cut(trial, order)
+    return some_frames(trial, order)
 
 
 COLUMNS = ("time_s", "x_m", "y_m", "depth_m", "tilt_x_rad", "tilt_y_rad", "force_n", "temperature_c", "raw")
 
 
-def _cut(trial: Trial, frames: np.ndarray | slice) -> Trial:
+def some_frames(trial: Trial, frames: np.ndarray | slice) -> Trial:
     """Some frames of a trial."""
     values = {name: getattr(trial, name) for name in COLUMNS}
     return replace(trial, **{k: v if v is None else v[frames] for k, v in values.items()})

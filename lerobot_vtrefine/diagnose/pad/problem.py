@@ -23,7 +23,6 @@ from lerobot_vtrefine.diagnose.pad import final_model, review
 from lerobot_vtrefine.diagnose.pad.baseline import Baseline, fit_baseline, plain_weights, weigh
 from lerobot_vtrefine.diagnose.pad.candidates import PLAIN
 from lerobot_vtrefine.diagnose.pad.candidates.base import Form
-from lerobot_vtrefine.diagnose.pad.candidates.sample_and_hold import repeated_share
 from lerobot_vtrefine.diagnose.pad.coincidence import cover_or_leak
 from lerobot_vtrefine.diagnose.pad.error_level import slow_errors
 from lerobot_vtrefine.diagnose.pad.final_model import FinalFit
@@ -42,10 +41,7 @@ from lerobot_vtrefine.diagnose.pad.own_delay import moved
 from lerobot_vtrefine.diagnose.pad.own_touch import allowed, losses_at_own_touch
 from lerobot_vtrefine.diagnose.pad.press_trials import PressSet
 from lerobot_vtrefine.diagnose.pad.rules import (
-    ENOUGH_HZ,
-    ENOUGH_READINGS,
     FAR_OFF,
-    FEW_REPEATS,
     FORGIVEN,
     FURTHER_GAIN,
 )
@@ -53,6 +49,7 @@ from lerobot_vtrefine.diagnose.pad.screening import DEAD, GAIN_MAP, all_probes, 
 from lerobot_vtrefine.diagnose.pad.shown_dead import with_shown_dead
 from lerobot_vtrefine.diagnose.pad.suspicions import surprises, suspicions
 from lerobot_vtrefine.diagnose.pad.taxel_maps import MapEvidence, find_dead, map_evidence, map_of, with_map
+from lerobot_vtrefine.diagnose.pad.thinning import thinned
 from lerobot_vtrefine.diagnose.pad.weights import TrialWeights
 
 Array = np.ndarray
@@ -193,13 +190,13 @@ class PadProblem(OptionalSteps):
         """With fewer frames, where there are more than a search needs.
 
         What recordings are told apart by is how they differ from each other, and not the noise of frames that
-        follow each other by a hundredth of a second. Held frames show only where all are there.
+        follow each other by a hundredth of a second. How readings are held is asked of all frames.
         """
-        step = min(int(self.presses.rate_hz / ENOUGH_HZ), self.presses.readings // ENOUGH_READINGS)
-        if step < 2 or repeated_share(self.presses) > FEW_REPEATS:
+        presses = thinned(self.presses)
+        if presses is self.presses:
             return self
         together = self.together and self.together.thinned()
-        return PadProblem(self.presses.every(step), self.seed, whole=self, together=together)
+        return PadProblem(presses, self.seed, whole=self, together=together)
 
     def with_delays(self, delays_s: Array) -> "PadProblem":
         """Each recording moved by a delay of its own (K,) [s]; without weights."""

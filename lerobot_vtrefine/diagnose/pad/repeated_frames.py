@@ -26,8 +26,12 @@ def silent(drive: np.ndarray, signal: np.ndarray) -> np.ndarray:
         drive: heights or loads (T, r, c).
     """
     still = np.concatenate([[False], (np.diff(drive, axis=0) == 0.0).all(axis=(1, 2))])
-    fresh = np.concatenate([[True], (np.diff(signal, axis=0) != 0.0).any(axis=1)])
-    return still & ~(still & fresh).any()
+    return still & ~(still & changed(signal)).any()
+
+
+def changed(signal: np.ndarray) -> np.ndarray:
+    """Frames (T,) in which some reading (T, n) is not that of the frame before; the first one is new."""
+    return np.concatenate([[True], (np.diff(signal, axis=0) != 0.0).any(axis=1)])
 
 
 @dataclass(frozen=True)
@@ -41,9 +45,8 @@ class Rhythm:
     @classmethod
     def of(cls, time_s: np.ndarray, signal: np.ndarray, touching: np.ndarray) -> "Rhythm":
         """From times (T,), readings (T, n) and whether the indenter touches (T,)."""
-        changed = (np.diff(signal, axis=0) != 0.0).any(axis=1)
         telling = touching & np.concatenate([[False], np.diff(time_s) > 0])
-        return cls(time_s, np.concatenate([[True], changed]), telling)
+        return cls(time_s, changed(signal), telling)
 
     def taken_s(self, times_s: np.ndarray) -> np.ndarray:
         """When the readings that are there at times (T,) were new: the last frame whose readings changed."""

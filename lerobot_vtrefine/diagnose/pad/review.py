@@ -71,7 +71,7 @@ class State:
         if form.range is not None or len(possible) == 1:
             return best
         slim = self.without(form.family)
-        plain = self.with_form(slim, possible[0])
+        plain = self.fit if form is possible[0] else self.with_form(slim, possible[0])
         for other in possible:
             if other is form or len(other.values) > terms + MORE_COORDINATES:
                 continue

@@ -256,7 +256,11 @@ class SampleAndHold(Stage):
         if self.frame_s:
             taken_s = taken_at_frames(times_s.cpu().numpy(), self.period_s, self.frame_s)
             return sampled(x, times_s, torch.from_numpy(taken_s).to(times_s))
+        return x[self.shown(times_s, phase)]
+
+    def shown(self, times_s: torch.Tensor, phase: float = 0.0) -> torch.Tensor:
+        """Number of the time whose reading is there at each of times (T,): the first one of its period."""
         slot = torch.floor(periods_gone(times_s, self.period_s, phase))
         begun = torch.ones_like(slot, dtype=torch.bool)
         begun[1:] = slot[1:] != slot[:-1]
-        return x[begun.nonzero()[begun.cumsum(0) - 1, 0]]
+        return begun.nonzero()[begun.cumsum(0) - 1, 0]

@@ -94,6 +94,7 @@ def _repeats(press: Press, taxels: np.ndarray | None = None) -> tuple[float, flo
     By chance all taxels repeat together as often as each does while others change. Few taxels say little of
     each other: then frames count in which the motion alone changes readings by far more than noise.
     """
+    press = press.whole or press
     changed = np.diff(press.signal, axis=0) != 0.0
     changed = changed if taxels is None else changed[:, taxels]
     use = press.rhythm.telling[1:] & _driven(press)

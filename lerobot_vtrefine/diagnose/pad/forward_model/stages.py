@@ -17,7 +17,7 @@ from lerobot_vtrefine.tactile.stages.base import Frame, Stage
 from lerobot_vtrefine.tactile.stages.contact import ContactStage
 from lerobot_vtrefine.tactile.stages.cover import on_springs
 from lerobot_vtrefine.tactile.stages.dividers import Divider, LaggingDroop, RowSharing, SupplyDroop
-from lerobot_vtrefine.tactile.stages.host import SampleAndHold, ScanSkew
+from lerobot_vtrefine.tactile.stages.host import SampleAndHold, ScanSkew, taken_at_frames
 from lerobot_vtrefine.tactile.stages.hysteresis import Hysteresis, LoadingHysteresis, Play, RestingHysteresis
 from lerobot_vtrefine.tactile.stages.mechanics import MechanicalSpreading, ring_matrix, spreading_matrix
 from lerobot_vtrefine.tactile.stages.readout import (
@@ -311,9 +311,13 @@ def _hold(stage: SampleAndHold, field: Field, context: Context) -> Field:
         if stage.ages_s:
             at_s = rhythm.taken_s(time_s[own]) - stage.lag_s
             out[: len(own), part] = joined(x, *neighbours(time_s, at_s))
+        elif stage.frame_s:
+            at_s = taken_at_frames(time_s[own], stage.period_s, stage.frame_s)
+            out[: len(own), part] = joined(x, *neighbours(time_s, at_s))
         else:
             phase = rhythm.phase(stage.period_s) if stage.free else 0.0
-            out[: len(own), part] = stage.held(torch.from_numpy(x), torch.from_numpy(time_s), phase)[own]
+            shown = stage.shown(torch.from_numpy(time_s), phase).numpy()[own]
+            out[: len(own), part] = np.take(x, shown, axis=0)
     return Field(out, field.columns, recorded=context.frames_only)
 
 
