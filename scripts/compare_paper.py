@@ -69,6 +69,9 @@ BANK_SEED_OFFSET = EVAL_SEED_OFFSET + 1_000_000
 """Past the episodes of an evaluation, which no bank may have seen."""
 NEVER_IN_HAND = ("00446", "00581")
 """Pairs that the hands cannot hold above each other at the start."""
+NO_ROOM = "failed_overflow"
+LOST = 0.01
+"""Share of episodes without room above which what is left is no result."""
 
 
 @dataclass(frozen=True)
@@ -363,6 +366,7 @@ def rows(options: argparse.Namespace, policy: Trained, table: str) -> list[tuple
         medians = judged["metrics"]["successes"]
         extra = {key: medians[key]["median"] for key, *_ in MEASURED if medians.get(key)}
         extra |= failures(judged)
+        tell_of_room(f"{stage} of {policy.name}", extra.get(NO_ROOM, 0.0))
         if tuned:
             extra |= {"largest_fall": largest_fall(progress)}
         row = Run(
@@ -387,6 +391,17 @@ def failures(judged: dict[str, Any]) -> dict[str, float]:
     if judged["picked_up"] is not None:
         shares["picked_up"] = judged["picked_up"]
     return {name: round(share, 4) for name, share in sorted(shares.items())}
+
+
+def tell_of_room(name: str, share: float) -> None:
+    """Warn where the simulation ended episodes by itself: worlds share their room, and whole batches end."""
+    if share > LOST:
+        print(
+            f"warning: {name}: {share:.0%} of the episodes ended because the simulation had no room for more"
+            " contacts; start anew with more, "
+            """--env='{"warp": {"contacts_per_world": 512, "rows_per_world": 1024}}'""",
+            file=sys.stderr,
+        )
 
 
 def key(policy: Trained, table: str, kind: str) -> dict[str, Any]:

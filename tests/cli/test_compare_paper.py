@@ -144,3 +144,12 @@ def test_an_encoder_that_is_named_is_taken_in_place_of_one_trained_here() -> Non
             record, imitation, *_ = script.stages(options, policy)
             assert imitation.needs == (record.name,)
             assert '"pretrained_encoder": "mine"' in imitation.line
+
+
+def test_episodes_that_the_simulation_ended_are_told(capsys: pytest.CaptureFixture[str]) -> None:
+    script.tell_of_room("finetune of 00081_visual_0_30", 0.004)
+    assert not capsys.readouterr().err
+    script.tell_of_room("finetune of 00081_visual_0_30", 0.28)
+    told = capsys.readouterr().err
+    assert told.startswith("warning: finetune of 00081_visual_0_30: 28% of the episodes ended because")
+    assert told.count("\n") == 1
