@@ -46,13 +46,13 @@ class UnevenFace:
     def scores(self) -> np.ndarray:
         """Log score (K,) of every recording on the face that the other folds tell, under their fit."""
         folds, evidence, found = self.problem.folds, self._evidence(), np.empty(len(self.problem.folds))
+        again = self.problem.reweighted(self.now)
         for fold in np.unique(folds):
             held = np.flatnonzero(folds == fold)
             others = np.flatnonzero(folds != fold)
             lower, _ = solve_map(evidence, others.tolist(), self.lower, self.variances)
             part = self._on(lower).presses.subset(held.tolist())
             counts = (folds != fold).astype(float)
-            again = self.problem.reweighted(self.now)
             found[held] = again.log_scores_of(refit_weighted(self.now, counts), part, counts, held)[:, 0]
         return found
 
