@@ -114,7 +114,7 @@ def _in_flags(message: str) -> str:
         names = re.findall("`([^`]+)`", unknown[1])
         files = "".join(f"{file}: " for file in _config_files_with(names))
         listed = ", ".join(f"`{name}`" for name in names)
-        return f"{files}{listed}: no such setting; --help lists those that there are"
+        return f"{files}{listed}: no such setting; is it misspelt?"
     return _OPTIONAL_VALUE.sub(lambda found: f"`{'.'.join(filter(None, found.groups()))}`: ", message)
 
 

@@ -133,9 +133,7 @@ def test_settings_that_a_file_should_not_have_are_told_with_the_file(monkeypatch
     file.write_text("num_epsodes: 3\n")
     monkeypatch.setattr(sys, "argv", ["command", f"--config_path={file}"])
     assert run_cli(lambda: draccus.parse(Flags, file, args=[]) and None)() == 2
-    assert capsys.readouterr().err == (
-        f"error: {file}: `num_epsodes`: no such setting; --help lists those that there are\n"
-    )
+    assert capsys.readouterr().err == (f"error: {file}: `num_epsodes`: no such setting; is it misspelt?\n")
 
 
 def test_a_group_without_its_type_in_a_file_is_told_as_such(monkeypatch, tmp_path, capsys) -> None:
