@@ -8,8 +8,8 @@
     python scripts/compare_reference_hopper.py rows --folder=hopper
 
 ``data`` and ``pretrain`` make what stands in for D4RL's hopper-medium-v2 and for the checkpoint that the
-reference ships (``hopper_standin.py``). ``train`` fine-tunes that one checkpoint: the reference's agent, with
-its loop, loss, critic, optimisers and schedules unchanged and the hyper-parameters of its
+reference ships (``reference/hopper/standin.py``). ``train`` fine-tunes that one checkpoint: the reference's
+agent, with its loop, loss, critic, optimisers and schedules unchanged and the hyper-parameters of its
 ``ft_ppo_diffusion_mlp.yaml`` for Hopper, or ours, ``paper`` with the same hyper-parameters, ``trust_region``
 with its own. Every line of a learning curve lies on disk at once. ``rows`` makes the table of
 results/reference_hopper.json from the curves that are there.
@@ -21,54 +21,25 @@ same 40 held-out episodes, each by its own deployment sampler.
 """
 
 import argparse
-import dataclasses
 import json
 from pathlib import Path
-from typing import Any
 
 import torch
-from hopper_curves import TABLE, Curve, lines_of, read_curves
-from hopper_dppo import CHUNK, HORIZON, TUNED_STEPS, HopperDecisions, ReferenceHoppers, hopper_agent
-from hopper_reference import BATCH_ROWS, N_STEPS, NUM_ENVS, imitation, pretrained, run_agent
-from hopper_standin import Scales, imitate, record
-from hopper_worlds import OBS_DIM, SpreadWorlds, Worlds, make_worlds
-from reference_dppo import Reference
+from reference.checkout import Reference
+from reference.hopper.curves import TABLE, Curve, lines_of, read_curves
+from reference.hopper.network import imitation
+from reference.hopper.ours import PRESETS, train_ours
+from reference.hopper.standin import Scales, imitate, record
+from reference.hopper.theirs import train_reference
+from reference.hopper.worlds import CHUNK, N_STEPS, NUM_ENVS, make_worlds
 
 from lerobot_vtrefine.cli.arguments import CommandParser
 from lerobot_vtrefine.cli.errors import run_cli
 from lerobot_vtrefine.cli.results.collect import save
 from lerobot_vtrefine.cli.results.provenance import provenance
 from lerobot_vtrefine.cli.results.rows import Row
-from lerobot_vtrefine.finetune import dppo
-from lerobot_vtrefine.finetune.config import DppoConfig
-from lerobot_vtrefine.finetune.evaluation import evaluate
 
 ROOT = Path(__file__).parents[1]
-SAME = {"gamma": 0.99, "timeout": "bootstrap", "encoder": "frozen", "reward_scaling": True}
-"""Of every preset: the task's discount and time limit, and rewards that are not a success."""
-PRESETS: dict[str, dict[str, Any]] = {
-    "paper": {
-        "ft_denoising_steps": TUNED_STEPS,
-        "min_sampling_std": 0.1,
-        "min_log_prob_std": 0.1,
-        "gae_lambda": 0.95,
-        "gamma_denoising": 0.99,
-        "clip": 0.01,
-        "clip_first": 0.01,
-        "target_kl": 1.0,
-        "epochs": 5,
-        "minibatches": NUM_ENVS * N_STEPS * TUNED_STEPS // BATCH_ROWS,
-        "critic_warmup": 0,
-        "actor_lr": 1e-4,
-        "actor_lr_final": 1e-4,
-        "critic_lr": 1e-3,
-        "critic_lr_final": 1e-3,
-        "lr_warmup": 0,
-        "critic_width": 256,
-        "critic_blocks": 1,
-    },
-    "trust_region": {"ft_denoising_steps": TUNED_STEPS},
-}
 
 
 def pretrain(args: argparse.Namespace) -> None:
@@ -76,63 +47,9 @@ def pretrain(args: argparse.Namespace) -> None:
     reference, episodes = Reference(args.reference), args.folder / "episodes.npz"
     torch.manual_seed(args.seed)
     model = imitation(reference, args.device)
-    weights = imitate(model, episodes, horizon=HORIZON, updates=args.updates, batch=128, seed=args.seed)
+    weights = imitate(model, episodes, horizon=CHUNK, updates=args.updates, batch=128, seed=args.seed)
     torch.save({"ema": weights}, args.folder / "pretrained.pt")
     Scales.of(episodes).save(args.folder / "scales.npz")
-
-
-def train_reference(args: argparse.Namespace, worlds: Worlds | SpreadWorlds, curve: Curve) -> None:
-    """The reference's agent's own run."""
-    envs = ReferenceHoppers(
-        worlds,
-        Scales.of(args.folder / "scales.npz"),
-        curve,
-        num_envs=NUM_ENVS,
-        n_steps=N_STEPS,
-        val_freq=args.every + 1,
-        first_seed=10_000_000 * args.seed,
-    )
-    run_agent(
-        Reference(args.reference),
-        envs,
-        args.folder / "pretrained.pt",
-        iterations=args.iterations,
-        device=args.device,
-        seed=args.seed,
-    )
-
-
-def train_ours(args: argparse.Namespace, worlds: Worlds | SpreadWorlds, curve: Curve) -> None:
-    """This package's loop with a preset."""
-    cfg = dataclasses.replace(
-        DppoConfig.get_choice_class(args.by)(), iterations=args.iterations, **SAME, **PRESETS[args.by]
-    )
-    reference, scales = Reference(args.reference), Scales.of(args.folder / "scales.npz")
-    tuned, base = (pretrained(reference, args.folder / "pretrained.pt", args.device) for _ in range(2))
-    agent = hopper_agent(tuned, base, cfg.deploy_eta)
-    practice, held_out = (HopperDecisions(worlds, scales, NUM_ENVS) for _ in range(2))
-    state = dppo.TrainState.create(agent, cfg, OBS_DIM, args.seed)
-
-    def note(state: dppo.TrainState, metrics: dppo.Metrics) -> None:
-        if metrics:
-            told = {name: metrics[name] for name in ("return", "decisions", "decision_kl", "rollout_s")}
-            curve.add(state.iteration, state.env_steps, **told, episodes=practice.num_envs)
-        length = metrics.get("decisions", 0.0)
-        if state.iteration % args.every == 0:
-            found = evaluate(held_out, agent, NUM_ENVS)
-            told = {name: found[f"eval_{name}"] for name in ("return", "decisions")}
-            curve.add(
-                state.iteration,
-                state.env_steps,
-                eval_return=told["return"],
-                decisions=told["decisions"],
-                episodes=NUM_ENVS,
-            )
-            length = length or told["decisions"]
-        practice.fill(NUM_ENVS * N_STEPS, length)
-
-    note(state, {})
-    dppo.train(practice, agent, state, cfg, seed=10_000_000 * args.seed, after_iteration=note)
 
 
 def train(args: argparse.Namespace) -> None:

@@ -1,11 +1,13 @@
-"""What the reference DPPO's agent is shown of our environments (scripts/reference_dppo.py)."""
+"""What the reference DPPO's agent is shown of our environments (scripts/reference/insertion/theirs.py)."""
 
 import argparse
 
 import numpy as np
 import pytest
-import reference_dppo as script
 import torch
+from reference.checkout import Reference
+from reference.insertion.ours import TimeIsUpError
+from reference.insertion.theirs import ReferenceEnvs
 from toy import BlindPeg, ToyActor, make_agent
 
 from lerobot_vtrefine.finetune.config import PaperDppo
@@ -28,7 +30,7 @@ def envs():
     agent = make_agent(ToyActor(3, *CHUNK, width=8), PaperDppo(encoder="frozen"), CHUNK)
     args = argparse.Namespace(seed=7, val_freq=2, minutes=1.0)
     mean, std = torch.zeros(4), torch.full((4,), 1e-3)
-    return script.ReferenceEnvs(pegs, agent, mean, std, args)
+    return ReferenceEnvs(pegs, agent, mean, std, args)
 
 
 def test_only_steps_of_training_episodes_that_run_count(envs):
@@ -71,10 +73,10 @@ def test_the_state_is_condition_and_standardised_privileged_state(envs):
 
 def test_a_run_ends_when_its_time_is_up(envs):
     envs.seconds = 0.0
-    with pytest.raises(script.TimeIsUpError):
+    with pytest.raises(TimeIsUpError):
         envs.reset_arg(None)
 
 
 def test_a_folder_without_the_reference_is_told(tmp_path):
     with pytest.raises(FileNotFoundError, match="not a checkout of irom-princeton/dppo"):
-        script.Reference(tmp_path)
+        Reference(tmp_path)

@@ -1,18 +1,17 @@
-"""Hopper as both implementations of DPPO are shown it (scripts/hopper_*.py), and their curves as rows."""
+"""Hopper as both implementations of DPPO are shown it (scripts/reference/hopper); their curves as rows."""
 
 import json
 from dataclasses import replace
 
-import hopper_curves
 import numpy as np
 import pytest
 import torch
-from compare_reference_hopper import PRESETS, SAME
-from hopper_curves import Curve, lines_of, read_curves
-from hopper_dppo import CHUNK, DENOISING_STEPS, TUNED_STEPS, HopperDecisions, ReferenceHoppers, hopper_agent
-from hopper_reference import Steps
-from hopper_standin import Scales, windows
-from hopper_worlds import ACTION_DIM, OBS_DIM, SpreadWorlds, Step, Worlds
+from reference.hopper.curves import NAMES, Curve, lines_of, read_curves
+from reference.hopper.network import DENOISING_STEPS, TUNED_STEPS
+from reference.hopper.ours import PRESETS, SAME, HopperDecisions, hopper_agent
+from reference.hopper.standin import Scales, windows
+from reference.hopper.theirs import ReferenceHoppers, Steps
+from reference.hopper.worlds import ACTION_DIM, CHUNK, OBS_DIM, SpreadWorlds, Step, Worlds
 from torch import nn
 
 from lerobot_vtrefine.finetune.chains import chain_log_probs, explore
@@ -198,9 +197,9 @@ def test_curves_become_rows_at_the_same_steps(tmp_path) -> None:
         curve.add(2, 200_000, eval_return=last)
     rows = lines_of(read_curves(tmp_path), 100_000.0, **ORIGIN)
     found = [row.cells for row in rows]
-    ours = hopper_curves.NAMES["paper"]
+    ours = NAMES["paper"]
     assert [cells["fine-tuned by"] for cells in found] == [
-        hopper_curves.NAMES["reference"],
+        NAMES["reference"],
         ours,
         f"{ours} minus the reference",
     ]

@@ -1,4 +1,4 @@
-"""The reference implementation of DPPO, imported from a checkout, on this package's environments.
+"""The reference's DPPO on this package's environments, with the hyper-parameters of its furniture tasks.
 
 What it sees as its state is the policy's condition, from an encoder that nobody tunes, and the privileged
 state, standardised; its actor reads the one, its critic the other. Worlds whose episode has ended wait,
@@ -9,16 +9,9 @@ iteration 0 is one, and the last should be.
 import argparse
 import contextlib
 import copy
-import dataclasses
-import functools
-import io
 import json
 import sys
-import tempfile
 import time
-from collections.abc import Generator
-from pathlib import Path
-from types import ModuleType
 from typing import Any
 
 import numpy as np
@@ -26,10 +19,11 @@ import torch
 from torch import Tensor, nn
 
 from lerobot_vtrefine.finetune import dppo
-from lerobot_vtrefine.finetune.config import DppoConfig
 from lerobot_vtrefine.finetune.pipeline import Practice, load_practice
 from lerobot_vtrefine.finetune.protocols import Agent, DecisionEnv, Observation
 from lerobot_vtrefine.finetune.seeds import EVALUATION_SEEDS, TRAINING_SEEDS
+from reference.checkout import Reference, Settings
+from reference.insertion.ours import TimeIsUpError, preset
 
 FURNITURE = {
     "gamma_denoising": 0.9,
@@ -44,70 +38,6 @@ FURNITURE = {
 DDIM_STEPS = 5
 CRITIC_WIDTHS = (512, 512, 512)
 STATE_CLIP = 5.0
-
-
-class Settings(dict[str, Any]):
-    """What the reference reads of its configuration: a mapping whose values are attributes, too."""
-
-    __getattr__ = dict.__getitem__
-
-
-class Reference:
-    """The classes of a checkout, imported with stand-ins for what it only configures and logs with.
-
-    Raises: FileNotFoundError where the folder holds no checkout.
-    """
-
-    def __init__(self, root: Path) -> None:
-        if not (root / "model" / "diffusion" / "diffusion_ppo.py").is_file():
-            raise FileNotFoundError(f"--reference={root} is not a checkout of irom-princeton/dppo")
-        stubs = {name: ModuleType(name) for name in ("hydra", "omegaconf", "wandb", "env", "env.gym_utils")}
-        vars(stubs["hydra"])["utils"] = Settings(instantiate=lambda made: made)
-        vars(stubs["omegaconf"])["OmegaConf"] = object
-        vars(stubs["env.gym_utils"])["make_async"] = lambda made, **_: made
-        sys.modules.update(stubs)
-        sys.path.insert(0, str(root))
-        from agent.finetune.train_ppo_diffusion_agent import (  # ty: ignore[import-not-found]
-            TrainPPODiffusionAgent,
-        )
-        from model.common.critic import CriticObs  # ty: ignore[import-not-found]
-        from model.diffusion import diffusion  # ty: ignore[import-not-found]
-        from model.diffusion.diffusion_ppo import PPODiffusion  # ty: ignore[import-not-found]
-        from model.diffusion.eta import EtaFixed  # ty: ignore[import-not-found]
-
-        self.Agent, self.Model = TrainPPODiffusionAgent, PPODiffusion
-        self.Critic, self.Eta = CriticObs, EtaFixed
-        self._diffusion = diffusion
-
-    @contextlib.contextmanager
-    def double_schedule(self) -> Generator[None]:
-        """Models made meanwhile have their noise schedule in double precision."""
-        single = self._diffusion.cosine_beta_schedule
-        self._diffusion.cosine_beta_schedule = functools.partial(single, dtype=torch.float64)
-        yield
-        self._diffusion.cosine_beta_schedule = single
-
-    def model(self, agent: Agent, privileged_dim: int, cond_dim: int, **changes: Any) -> Any:
-        """Its ``PPODiffusion`` around a copy of our network."""
-        horizon, action_dim = agent.action_shape
-        settings = FURNITURE | {"use_ddim": True, "ddim_steps": DDIM_STEPS, "ft_denoising_steps": DDIM_STEPS}
-        settings |= changes
-        eta = {"eta": self.Eta(base_eta=1, min_eta=0.1, max_eta=1.0)} if settings["use_ddim"] else {}
-        critic = self.Critic(privileged_dim, list(CRITIC_WIDTHS), residual_style=True)
-        return self.Model(
-            actor=ActorOfState(agent.actor.denoiser, cond_dim),
-            critic=CriticOfState(critic, cond_dim),
-            horizon_steps=horizon,
-            obs_dim=cond_dim + privileged_dim,
-            action_dim=action_dim,
-            device=str(agent.device),
-            **eta,
-            **settings,
-        )
-
-
-class TimeIsUpError(Exception):
-    """Ends a run whose --minutes are over."""
 
 
 class ActorOfState(nn.Module):
@@ -132,6 +62,27 @@ class CriticOfState(nn.Module):
     def forward(self, cond: dict[str, Tensor]) -> Tensor:
         """Values (B, 1)."""
         return self.critic({"state": cond["state"][:, :, self.cond_dim :].contiguous()})
+
+
+def model_to_tune(
+    reference: Reference, agent: Agent, privileged_dim: int, cond_dim: int, **changes: Any
+) -> Any:
+    """Its ``PPODiffusion`` around a copy of our network."""
+    horizon, action_dim = agent.action_shape
+    settings = FURNITURE | {"use_ddim": True, "ddim_steps": DDIM_STEPS, "ft_denoising_steps": DDIM_STEPS}
+    settings |= changes
+    eta = {"eta": reference.Eta(base_eta=1, min_eta=0.1, max_eta=1.0)} if settings["use_ddim"] else {}
+    critic = reference.Critic(privileged_dim, list(CRITIC_WIDTHS), residual_style=True)
+    return reference.Model(
+        actor=ActorOfState(agent.actor.denoiser, cond_dim),
+        critic=CriticOfState(critic, cond_dim),
+        horizon_steps=horizon,
+        obs_dim=cond_dim + privileged_dim,
+        action_dim=action_dim,
+        device=str(agent.device),
+        **eta,
+        **settings,
+    )
 
 
 class ReferenceEnvs:
@@ -217,27 +168,25 @@ def train_reference(
     mean, std = moments(seen)
     envs = ReferenceEnvs(env, agent, mean, std, args)
     cond_dim = seen.obs["cond"].shape[1]
-    model = reference.model(agent, env.privileged_dim, cond_dim)
+    model = model_to_tune(reference, agent, env.privileged_dim, cond_dim)
     schedule = {"first_cycle_steps": 10000, "warmup_steps": 10}
-    with tempfile.TemporaryDirectory() as folder:
-        settings = Settings(
+    chunk = agent.executed.stop - agent.executed.start
+    with contextlib.suppress(TimeIsUpError):
+        reference.run(
             device=args.device,
             seed=args.seed,
-            wandb=None,
             env=Settings(
                 name=envs,
                 env_type="furniture",
                 n_envs=args.worlds,
-                max_episode_steps=env.max_decisions * (agent.executed.stop - agent.executed.start),
+                max_episode_steps=env.max_decisions * chunk,
                 specific=Settings(sparse_reward=True),
             ),
             obs_dim=cond_dim + env.privileged_dim,
             action_dim=agent.action_shape[1],
             horizon_steps=agent.action_shape[0],
-            act_steps=agent.executed.stop - agent.executed.start,
-            cond_steps=1,
+            act_steps=chunk,
             model=model,
-            logdir=folder,
             train=Settings(
                 batch_size=args.batch_rows,
                 n_train_itr=args.iterations,
@@ -262,16 +211,5 @@ def train_reference(
                 target_kl=1,
             ),
         )
-        # It prints every step.
-        with contextlib.redirect_stdout(io.StringIO()), contextlib.suppress(TimeIsUpError):
-            reference.Agent(settings).run()
-            envs.note()
+        envs.note()
     return practice, envs.curve
-
-
-def preset(name: str, args: argparse.Namespace, **changes: Any) -> DppoConfig:
-    """A preset of ours, with the encoder left alone, as the reference has it here."""
-    return dataclasses.replace(
-        DppoConfig.get_choice_class(name)(),
-        **{"num_envs": args.worlds, "iterations": args.our_iterations, "encoder": "frozen", **changes},
-    )

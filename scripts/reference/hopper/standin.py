@@ -14,8 +14,9 @@ from typing import Any, NamedTuple
 import gymnasium
 import numpy as np
 import torch
-from hopper_worlds import ACTION_DIM, MAX_STEPS, OBS_DIM, Array, make_env
 from torch import nn
+
+from reference.hopper.worlds import ACTION_DIM, MAX_STEPS, OBS_DIM, Array, make_env
 
 DIRECTIONS, KEPT, STEP, SPREAD = 8, 4, 0.02, 0.025
 """Of the search: directions of a round, the best of them, step size, and how far a direction is followed."""

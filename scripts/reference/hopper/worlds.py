@@ -1,7 +1,8 @@
 """Gymnasium's Hopper in many worlds that act in chunks, perhaps spread over processes.
 
 ``n`` worlds, of which ``m`` are named in a call; ``Ta`` actions of a chunk; 11 numbers of an observation and
-3 of an action, in the environment's own units.
+3 of an action, in the environment's own units. Environment steps are counted as the reference does: a chunk
+counts in full, also where the episode ends within it.
 """
 
 import multiprocessing
@@ -15,6 +16,10 @@ NAME = "Hopper-v5"
 OBS_DIM, ACTION_DIM = 11, 3
 MAX_STEPS = 1000
 """Of an episode, which is truncated there."""
+CHUNK = 4
+"""Actions of a decision; nothing is predicted beyond them."""
+NUM_ENVS, N_STEPS = 40, 500
+"""Worlds of an evaluation and of the reference's iterations, and decisions of each in such an iteration."""
 
 Array = np.ndarray
 

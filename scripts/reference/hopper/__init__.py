@@ -1,0 +1,1 @@
+"""Hopper, one of the reference's own tasks, for both implementations of DPPO."""

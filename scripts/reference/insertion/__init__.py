@@ -1,0 +1,1 @@
+"""Insertion tasks of this package, for both implementations of DPPO."""
