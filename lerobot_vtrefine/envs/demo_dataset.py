@@ -35,7 +35,7 @@ from lerobot_vtrefine.folders import (
 from lerobot_vtrefine.interrupts import interrupts_wait
 from lerobot_vtrefine.lerobot_compat.codec_priority import ordinary_priority
 from lerobot_vtrefine.lerobot_compat.fast_saving import fast_saving
-from lerobot_vtrefine.wording import plural
+from lerobot_vtrefine.wording import full_disk
 
 LEDGER = NOTE
 INFO = Path("meta") / "info.json"
@@ -169,10 +169,8 @@ class DemoDataset:
         full = disk_is_full(error, self._place)
         self.rollback()
         if full:
-            raise OSError(
-                f"the disk is full: {self.root} keeps {plural(self.num_episodes, 'episode')};"
-                " free some space and run the same command, which records the others again"
-            ) from error
+            advice = "run the same command, which records the others again"
+            raise OSError(full_disk(self.root, self.num_episodes, advice)) from error
 
     def _open(self) -> LeRobotDataset:
         if self._dataset is not None:

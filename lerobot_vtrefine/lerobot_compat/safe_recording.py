@@ -38,7 +38,7 @@ from lerobot_vtrefine.lerobot_compat.safe_metadata import (
     write_table,
     write_tasks,
 )
-from lerobot_vtrefine.wording import plural
+from lerobot_vtrefine.wording import full_disk, plural
 
 logger = logging.getLogger(__name__)
 
@@ -66,7 +66,9 @@ class SafeWriter(DatasetWriter):
         except BaseException as error:
             self._take_back()
             if isinstance(error, OSError) and error.errno == errno.ENOSPC:
-                raise OSError(errno.ENOSPC, _disk_is_full(self._meta)) from error
+                advice = f"go on with --resume=true --dataset.root={self._meta.root}"
+                told = full_disk(self._meta.root, self._meta.total_episodes, advice)
+                raise OSError(errno.ENOSPC, told) from error
             raise
 
     def _take_back(self) -> None:
@@ -123,13 +125,6 @@ def _check_images(episode: dict[str, Any], meta: LeRobotDatasetMetadata) -> None
             full = shutil.disk_usage(meta.root).free < 2**20
             problem = f"{plural(len(missing), 'image')} could not be written, the first is {missing[0]}"
             raise OSError(errno.ENOSPC if full else errno.EIO, problem)
-
-
-def _disk_is_full(meta: LeRobotDatasetMetadata) -> str:
-    return (
-        f"the disk is full: {meta.root} keeps {plural(meta.total_episodes, 'episode')};"
-        f" free some space and go on with --resume=true --dataset.root={meta.root}"
-    )
 
 
 def write_image(image: Any, fpath: Path, compress_level: int = 1) -> None:
