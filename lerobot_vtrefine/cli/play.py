@@ -114,6 +114,9 @@ def play(config: PlayConfig) -> list[dict]:
 
         view = BrowserView(world, config.port, getattr(agent, "cloud", None), controls=True)
         print(f"http://localhost:{view.port} shows it; Ctrl-C ends it", flush=True)
+    if config.record or view is not None:
+        asked = "of every episode" if config.record else "that you ask for on the page"
+        print(f"videos {asked} go to {config.video_dir}", flush=True)
     one = config.viewer == "none" or config.dataset.root is not None
     session = Session(world, agent, view, config.video_dir, lambda line: print(line, flush=True))
     try:

@@ -50,7 +50,9 @@ def test_episodes_are_filmed(tmp_path: Path, capsys: pytest.CaptureFixture[str])
     short = VtRefineEnvConfig(start="grasped", num_threads=1, episode_steps=5)
     played(env=short, agent="zero", seed=4, record=True, video_dir=tmp_path / "videos")
     assert (tmp_path / "videos" / "seed_4.mp4").stat().st_size > 1000
-    assert "seed_4.mp4" in capsys.readouterr().out
+    told = capsys.readouterr().out.splitlines()
+    assert told[0] == f"videos of every episode go to {tmp_path / 'videos'}"
+    assert "seed_4.mp4" in told[2]
 
 
 @pytest.mark.parametrize(
