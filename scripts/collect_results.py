@@ -61,7 +61,7 @@ def main() -> None:
             task = options.task or source.resolve().parent.name
             found += run_rows(source, {"table": options.table, "task": task} | given, origin)
     path = options.results or RESULTS / f"{options.table}.json"
-    save(path, options.table, found, replace=options.replace)
+    save(path, found, replace=options.replace)
     unknown = sum(row.commit is None for row, _ in found)
     print(f"{len(found)} rows in {path}" + (f"; {unknown} without a commit: add --commit" if unknown else ""))
 

@@ -498,7 +498,7 @@ def finish(options: argparse.Namespace, policy: Trained) -> None:
     StageRunner(options.output_dir, stages(options, policy)).run()
     for table in tables(policy):
         found = rows(options, policy, table)
-        save(options.results / f"{table}.json", table, found, replace=False)
+        save(options.results / f"{table}.json", found, replace=False)
 
 
 if __name__ == "__main__":

@@ -171,7 +171,7 @@ def main() -> None:
         return
     for run in runs:
         StageRunner(options.output_dir, [record, *policy_stages(options, *run)]).run()
-        save(options.results, "policies", [(row(options, *run), [])], replace=False)
+        save(options.results, [(row(options, *run), [])], replace=False)
 
 
 if __name__ == "__main__":

@@ -68,7 +68,7 @@ def train(args: argparse.Namespace) -> int:
     for name in filter(None, args.dppo.split(",")):
         practice, curve = train_ours(name, args)
         found.append((row_of(f"--dppo.type={name}", practice, curve, args), curve))
-    save(args.results, "reference", found, replace=False)
+    save(args.results, found, replace=False)
     print(json.dumps([dataclasses.asdict(row) for row, _ in found], indent=2))
     return 0
 

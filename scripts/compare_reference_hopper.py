@@ -26,7 +26,7 @@ from pathlib import Path
 
 import torch
 from reference.checkout import Reference
-from reference.hopper.curves import TABLE, Curve, lines_of, read_curves
+from reference.hopper.curves import Curve, lines_of, read_curves
 from reference.hopper.network import imitation
 from reference.hopper.ours import PRESETS, train_ours
 from reference.hopper.standin import Scales, imitate, record
@@ -71,7 +71,7 @@ def rows(args: argparse.Namespace) -> None:
     found: list[tuple[Row, list[dict[str, float]]]] = [
         (line, []) for line in lines_of(curves, args.every * NUM_ENVS * N_STEPS * CHUNK, **origin)
     ]
-    save(args.results, TABLE, found, replace=True)
+    save(args.results, found, replace=True)
 
 
 @run_cli

@@ -93,7 +93,7 @@ def main() -> None:
         if not (folder / "information.json").is_file():
             study(task, folder, extra)
         line = row(task, folder)
-        save(options.results, TABLE, [(line, [])], replace=False)
+        save(options.results, [(line, [])], replace=False)
         print(" | ".join(line.cells.values()))
 
 

@@ -137,7 +137,7 @@ def main() -> None:
     )
     for setting in tqdm([s for s in wanted if not is_done(s, options.episodes, rows)], unit="setting"):
         row = measure(setting, options.episodes, options.mesh_dir)
-        save(options.results, TABLE, [(row, [])], replace=True)
+        save(options.results, [(row, [])], replace=True)
         tqdm.write(f"{row.policy:8} {row.task:24} {row.variant:8} {row.successes}/{row.episodes} {row.extra}")
 
 

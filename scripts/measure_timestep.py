@@ -70,7 +70,7 @@ def main() -> None:
     task, policy = find("--config_path", options.task), find("--policy.path", options.policy)
     for timestep_s in tqdm(options.timesteps_s):
         row = measure(policy, task, float(timestep_s), options.episodes, options.backend, options.device)
-        save(options.results, TABLE, [(row, [])], replace=False)
+        save(options.results, [(row, [])], replace=False)
 
 
 if __name__ == "__main__":

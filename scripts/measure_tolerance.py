@@ -60,7 +60,7 @@ def main() -> None:
         config = replace(env, backend=options.backend)
         with tqdm(total=sum(map(len, SIZES.values())), desc=task) as bar:
             found = tolerance(config, options.episodes, options.num_envs, bar.update)
-        save(options.results, TABLE, [(row(task, found), [])], replace=False)
+        save(options.results, [(row(task, found), [])], replace=False)
 
 
 if __name__ == "__main__":

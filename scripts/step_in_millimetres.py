@@ -140,7 +140,7 @@ def main() -> int:
     for row in measure(args):
         print(json.dumps(row), flush=True)
         if args.results:
-            save(args.results, TABLE, [(line(args.task.stem, row), [])], replace=False)
+            save(args.results, [(line(args.task.stem, row), [])], replace=False)
     return 0
 
 

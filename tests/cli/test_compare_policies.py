@@ -79,7 +79,7 @@ def _save_rows(path: Path, first: int) -> None:
             env_steps=0,
             **origin,
         )
-        collect.save(path, "policies", [(row, [])], replace=False)
+        collect.save(path, [(row, [])], replace=False)
 
 
 def test_rows_that_come_together_are_all_kept(tmp_path: Path) -> None:

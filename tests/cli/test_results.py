@@ -17,7 +17,7 @@ from lerobot_vtrefine.cli import demo
 from lerobot_vtrefine.cli.report.statistics import mean_interval, wilson_interval
 from lerobot_vtrefine.cli.results import provenance
 from lerobot_vtrefine.cli.results.cells import difference, over_seeds, pooled
-from lerobot_vtrefine.cli.results.collect import largest_fall, run_rows, steps_to
+from lerobot_vtrefine.cli.results.collect import largest_fall, run_rows, save, steps_to
 from lerobot_vtrefine.cli.results.published import IMITATION, PAIRS, TUNED, with_demonstrations
 from lerobot_vtrefine.cli.results.rows import Line, Row, Run, merge, read_all, read_rows, write_rows
 from lerobot_vtrefine.cli.results.tables import BLOCK, DERIVED, fill, table
@@ -344,12 +344,29 @@ def test_a_demo_becomes_rows(collect, tmp_path: Path, capsys: pytest.CaptureFixt
 
     others = [replace(row, seed=8, curve=None) for row in rows]
     write_rows(tmp_path / "results" / "rows.json", [*others, *(replace(row, task="else") for row in others)])
-    curve.with_name("demo-of_nothing.csv").touch()
+    other = curve.with_name("demo-of_nothing.csv")
+    other.touch()
     assert len(collect("demo", str(folder))[1]) == 18
     replaced = collect("demo", str(folder), "--replace")[1]
     assert {(row.task, row.seed) for row in replaced} == {("tight", 3), ("else", 8)}
-    assert [path.name for path in curve.parent.iterdir()] == [curve.name]
+    assert {curve, other} <= set(curve.parent.iterdir())
     assert "6 rows in" in capsys.readouterr().out
+
+
+def test_a_results_file_removes_curves_of_its_own_alone(tmp_path: Path) -> None:
+    progress = [{"iteration": 1.0, "env_steps": 8.0, "success": 0.5}]
+    one, two = tmp_path / "reference.json", tmp_path / "trial.json"
+    for path in (one, two):
+        save(path, [(run_of(0.5, seed, table="reference"), progress) for seed in (0, 1)], replace=False)
+    curves = {path: {row.curve for row in read_rows(path)} for path in (one, two)}
+    assert len(curves[one] | curves[two]) == 4
+    copied = [*read_rows(two), *(replace(row, task="copied") for row in read_rows(one))]
+    write_rows(two, copied)
+    again = [(run_of(0.6, 2, table="reference", task=task), progress) for task in ("tight", "copied")]
+    save(two, again, replace=True)
+    left = {f"curves/{path.name}" for path in (tmp_path / "curves").iterdir()}
+    assert left == curves[one] | {row.curve for row in read_rows(two)}
+    assert len(left) == 4
 
 
 def test_printed_tables_become_rows(collect, tmp_path: Path) -> None:

@@ -203,14 +203,15 @@ def printed_lines(path: Path, name: str, origin: dict[str, str | None]) -> list[
     return [Line(table=name, cells=dict(zip(cells[0], row, strict=True)), **origin) for row in cells[2:]]
 
 
-def save(path: Path, name: str, found: list[tuple[Row, Progress]], *, replace: bool) -> None:
+def save(path: Path, found: list[tuple[Row, Progress]], *, replace: bool) -> None:
     """Put rows and curves into a results file; ``replace`` drops their groups' earlier rows, of all seeds.
 
-    Processes that end at the same time wait for each other.
+    Curves carry the file's name and lie beside it in ``curves/``; those that no row names any more are
+    removed. Processes that end at the same time wait for each other.
     """
     path.parent.mkdir(parents=True, exist_ok=True)
     with only_one_in(path.parent):
-        _save(path, name, found, replace)
+        _save(path, found, replace)
 
 
 @contextmanager
@@ -224,7 +225,7 @@ def only_one_in(folder: Path) -> Generator[None]:
         os.close(descriptor)
 
 
-def _save(path: Path, name: str, found: list[tuple[Row, Progress]], replace: bool) -> None:
+def _save(path: Path, found: list[tuple[Row, Progress]], replace: bool) -> None:
     old = read_rows(path) if path.is_file() else []
     rows = []
     for row, progress in found:
@@ -232,15 +233,20 @@ def _save(path: Path, name: str, found: list[tuple[Row, Progress]], replace: boo
             label = re.sub(
                 r"[^\w.]+", "_", "_".join(filter(None, (row.task, row.policy, row.variant, str(row.seed))))
             )
-            row = replace_fields(row, curve=f"curves/{name}-{label}.csv")
+            row = replace_fields(row, curve=f"curves/{path.stem}-{label}.csv")
             write_curve(path.parent / str(row.curve), progress)
         rows.append(row)
     groups = {row.key[:-1] for row in rows} if replace else set()
     rows = merge([row for row in old if row.key[:-1] not in groups], rows)
     write_rows(path, rows)
-    kept = {path.parent / row.curve for row in rows if isinstance(row, Run) and row.curve}
-    for curve in set((path.parent / "curves").glob(f"{name}-*.csv")) - kept:
-        curve.unlink()
+    for curve in _curves(path, old) - _curves(path, rows):
+        curve.unlink(missing_ok=True)
+
+
+def _curves(path: Path, rows: list[Row]) -> set[Path]:
+    """Curves of a results file's own that rows of it name: those of a copied row stay the other file's."""
+    named = {path.parent / row.curve for row in rows if isinstance(row, Run) and row.curve}
+    return {curve for curve in named if curve.name.startswith(f"{path.stem}-")}
 
 
 def write_curve(path: Path, progress: Progress) -> None:
