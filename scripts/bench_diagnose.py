@@ -16,7 +16,7 @@ import sys
 from pathlib import Path
 from typing import Any
 
-from bench_sets import add_arguments, run_sets, shuffled
+from runs.sets import add_arguments, run_sets, shuffled
 
 from lerobot_vtrefine.cli.arguments import CommandParser
 from lerobot_vtrefine.cli.errors import run_cli

@@ -19,7 +19,7 @@ from itertools import product
 from pathlib import Path
 from typing import Any
 
-from bench_sets import Row, add_arguments, run_sets, shuffled
+from runs.sets import Row, add_arguments, run_sets, shuffled
 
 from lerobot_vtrefine.cli.arguments import CommandParser
 from lerobot_vtrefine.cli.errors import run_cli

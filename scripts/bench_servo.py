@@ -3,9 +3,9 @@
 
 Every setting (gain, supply, load) of a recording set of a servo is left out in turn. The other recordings go
 through the door that users take, `diagnose`, and the files that it hands out predict the setting as
-``vtrefine-predict`` does. BAM's friction models M1 to M6 (arXiv 2410.08650, see bam_ladder.py) are fitted to
-the same recordings. What is done is kept in the output folder, so that an interrupted run goes on where it
-stopped:
+``vtrefine-predict`` does. BAM's friction models M1 to M6 (arXiv 2410.08650, see reference/bam_ladder.py) are
+fitted to the same recordings. What is done is kept in the output folder, so that an interrupted run goes on
+where it stopped:
 
     vtrefine-import --source=bam_xl330.npz --recording_dir=outputs/xl330
     python scripts/bench_servo.py --recording=outputs/xl330
@@ -24,7 +24,7 @@ from typing import Any
 os.environ.setdefault("OMP_NUM_THREADS", "1")
 
 import numpy as np
-from bam_ladder import LADDER, errors, fit, gridded
+from reference.bam_ladder import LADDER, errors, fit, gridded
 
 from lerobot_vtrefine.cli.arguments import CommandParser
 from lerobot_vtrefine.cli.errors import run_cli

@@ -28,7 +28,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from compare_touch import MODALITIES, run_all
+from compare_touch import MODALITIES
+from runs.side_by_side import run_all
 
 from lerobot_vtrefine.cli.arguments import CommandParser, flags
 from lerobot_vtrefine.cli.errors import run_cli

@@ -17,7 +17,7 @@ import argparse
 import sys
 from pathlib import Path
 
-from compare_touch import run_all
+from runs.side_by_side import run_all
 
 from lerobot_vtrefine.cli.arguments import CommandParser
 from lerobot_vtrefine.cli.errors import run_cli

@@ -25,10 +25,11 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from compare_touch import run_all, run_script, save
-from realities import PLAIN, REALITIES, of_robot
-from reality_budget import Budget, folder_name, recipe, world_env
-from reality_results import as_text, difference
+from reality.budget import Budget, folder_name, recipe, world_env
+from reality.hidden import PLAIN, REALITIES, of_robot
+from reality.telling import as_text
+from runs.comparison import difference, save
+from runs.side_by_side import run_all, run_script
 
 from lerobot_vtrefine.cli.arguments import CommandParser, flags
 from lerobot_vtrefine.cli.pipeline.demo_config import (

@@ -15,24 +15,18 @@ it continues. The comparison is printed and saved as ``comparison.json`` and ``c
 """
 
 import json
-import math
-import os
 import shutil
-import subprocess
 import sys
-import time
-from collections.abc import Callable
-from dataclasses import dataclass
-from functools import partial
 from pathlib import Path
 from typing import Any
 
-import torch
 import yaml
+from runs.comparison import difference, effect, interval_text, rate_text, save
+from runs.side_by_side import run_all, run_script
 
 from lerobot_vtrefine.cli.arguments import CommandParser
 from lerobot_vtrefine.cli.pipeline.demo_config import default_env
-from lerobot_vtrefine.cli.report.statistics import mean_interval, proportion
+from lerobot_vtrefine.cli.report.statistics import proportion
 from lerobot_vtrefine.shipped import PREFIX, encoders
 
 MODALITIES = ("visuo_tactile", "visual")
@@ -106,8 +100,6 @@ def touch_setting(task: str) -> dict[str, dict[str, Any]]:
 for _task in TOUCH_TASKS:
     WORLDS |= {name: touch_setting(name) for name in (_task, f"{_task}_twin")}
 
-POLL_S = 0.5
-
 Run = tuple[str, str, int]
 """Setting, modality and seed."""
 
@@ -131,90 +123,6 @@ def demo_command(folder: Path, run: Run, extra: list[str]) -> list[str]:
     return [command, *own, *setting_flags(setting), *extra]
 
 
-@dataclass(frozen=True)
-class Share:
-    """What one of several runs side by side may use of the machine."""
-
-    cores: list[int]
-    """Empty where the cores cannot be chosen."""
-    gpu: str | None
-    """As ``CUDA_VISIBLE_DEVICES`` names it; None without a GPU."""
-
-
-def run_all(commands: dict[Path, list[str]], jobs: int) -> None:
-    """Run the pipelines, ``jobs`` side by side; finished stages are not repeated.
-
-    Side by side, each prints to ``FOLDER.log`` and keeps to its own share of the machine. One that fails
-    does not stop the others.
-
-    Raises:
-        subprocess.CalledProcessError: a pipeline failed.
-    """
-    failed: list[subprocess.CalledProcessError] = []
-    if jobs == 1:
-        for folder, command in commands.items():
-            print(f"\n== {folder.name}", flush=True)
-            status = subprocess.run(command, check=False).returncode
-            failed += [subprocess.CalledProcessError(status, command)] if status else []
-    else:
-        failed = run_together(commands, jobs)
-    if failed:
-        raise failed[0]
-
-
-def run_together(commands: dict[Path, list[str]], jobs: int) -> list[subprocess.CalledProcessError]:
-    """Run the pipelines side by side; the failures."""
-    free, waiting, running = shares(jobs), list(commands), {}
-    failed: list[subprocess.CalledProcessError] = []
-    try:
-        while waiting or running:
-            while waiting and free:
-                folder, share = waiting.pop(0), free.pop(0)
-                print(f"== {folder.name}: progress in {folder}.log", flush=True)
-                running[folder] = (start(commands[folder], folder, share), share)
-            for folder in [name for name, (child, _) in running.items() if child.poll() is not None]:
-                child, share = running.pop(folder)
-                free.append(share)
-                if child.returncode:
-                    failed.append(subprocess.CalledProcessError(child.returncode, commands[folder]))
-                print(f"== {folder.name}: {'failed' if child.returncode else 'done'}", flush=True)
-            time.sleep(POLL_S)
-    finally:
-        for child, _ in running.values():
-            child.terminate()
-    return failed
-
-
-def shares(jobs: int) -> list[Share]:
-    """The machine, dealt out to ``jobs`` runs: cores in equal parts, GPUs by turns."""
-    cores, gpus = usable_cores(), visible_gpus()
-    part = len(cores) // jobs
-    return [
-        Share(cores[job * part : (job + 1) * part], gpus[job % len(gpus)] if gpus else None)
-        for job in range(jobs)
-    ]
-
-
-def usable_cores() -> list[int]:
-    """The cores that this process may use; none where the system does not tell."""
-    return sorted(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else []
-
-
-def visible_gpus() -> list[str]:
-    """The GPUs that this process may use, as ``CUDA_VISIBLE_DEVICES`` names them."""
-    named = os.environ.get("CUDA_VISIBLE_DEVICES")
-    return named.split(",") if named else [str(index) for index in range(torch.cuda.device_count())]
-
-
-def start(command: list[str], folder: Path, share: Share) -> subprocess.Popen:
-    """One pipeline in the background, on its share of the machine."""
-    folder.parent.mkdir(parents=True, exist_ok=True)
-    pin = partial(os.sched_setaffinity, 0, share.cores) if share.cores else None
-    env = os.environ | ({"CUDA_VISIBLE_DEVICES": share.gpu} if share.gpu else {})
-    with Path(f"{folder}.log").open("wb") as log:
-        return subprocess.Popen(command, stdout=log, stderr=subprocess.STDOUT, preexec_fn=pin, env=env)
-
-
 def compare(results: dict[str, dict[int, dict]]) -> dict:
     """Pooled success of each modality, and the difference that touch makes per seed, on the same episodes."""
     comparison = {}
@@ -224,9 +132,7 @@ def compare(results: dict[str, dict[int, dict]]) -> dict:
             runs = [run[policy] for run in results[modality].values()]
             pooled = proportion(sum(run["success"] for run in runs), sum(run["episodes"] for run in runs))
             rows[modality] = pooled | {"per_seed": [run["rate"] for run in runs]}
-        pairs = zip(*(rows[modality]["per_seed"] for modality in MODALITIES), strict=True)
-        mean, low, high = mean_interval([touch - sight for touch, sight in pairs])
-        rows["touch_minus_visual"] = {"mean": round(mean, 4), "ci95": [round(low, 4), round(high, 4)]}
+        rows["touch_minus_visual"] = difference(rows, "visual", "visuo_tactile")
         comparison[policy] = rows
     return comparison
 
@@ -242,31 +148,11 @@ def as_text(comparisons: dict[str, dict]) -> str:
         for policy, title in POLICIES.items():
             rows = comparison[policy]
             cells = [rate_text(rows[modality]) for modality in MODALITIES]
-            cells.append(
-                interval_text(rows["touch_minus_visual"]["mean"], rows["touch_minus_visual"]["ci95"])
-            )
+            cells.append(interval_text(**rows["touch_minus_visual"]))
             lines.append(f"| {' | '.join([setting, title, *cells])} |")
-        words.append(f"{setting}: after DPPO, touch {verdict(comparison['finetune'])}.")
+        gain = comparison["finetune"]["touch_minus_visual"]
+        words.append(f"{setting}: after DPPO, touch {effect(**gain)}.")
     return "\n".join([*lines, "", *words])
-
-
-def verdict(rows: dict) -> str:
-    """What the interval of the difference allows to say."""
-    low, high = rows["touch_minus_visual"]["ci95"]
-    return "pays" if low > 0 else "costs" if high < 0 else "makes no difference that these seeds can show"
-
-
-def rate_text(row: dict) -> str:
-    """Pooled rate with its interval, and the seeds' rates."""
-    seeds = ", ".join(f"{100 * rate:.0f}" for rate in row["per_seed"])
-    return f"{interval_text(row['rate'], row['ci95'])} (seeds: {seeds})"
-
-
-def interval_text(value: float, interval: list[float]) -> str:
-    """For example ``36 % [29, 42]``; one seed has no interval."""
-    if not all(map(math.isfinite, interval)):
-        return f"{100 * value:.0f} % (one seed)"
-    return f"{100 * value:.0f} % [{100 * interval[0]:.0f}, {100 * interval[1]:.0f}]"
 
 
 def main() -> None:
@@ -298,23 +184,6 @@ def results_of(folders: dict[Run, Path], setting: str) -> dict[str, dict[int, di
             content = (folder / "results.json").read_text(encoding="utf-8")
             results[modality][seed] = json.loads(content)
     return results
-
-
-def save(folder: Path, comparison: dict[str, Any], text: str) -> None:
-    """Keep a comparison as ``comparison.json`` and ``comparison.md``, and print it."""
-    (folder / "comparison.json").write_text(json.dumps(comparison, indent=2) + "\n", encoding="utf-8")
-    (folder / "comparison.md").write_text(text + "\n", encoding="utf-8")
-    print(f"\n{text}")
-
-
-def run_script(entry: Callable[[], None]) -> None:
-    """Run a script's entry; it ends with the status of the pipeline that failed, or 130 when interrupted."""
-    try:
-        entry()
-    except subprocess.CalledProcessError as error:
-        sys.exit(error.returncode)
-    except KeyboardInterrupt:
-        sys.exit(130)
 
 
 if __name__ == "__main__":

@@ -1,1 +1,5 @@
-"""The reference implementation of DPPO (irom-princeton/dppo), and the tasks on which it meets ours."""
+"""Published work that this package is compared with.
+
+The reference implementation of DPPO (``checkout.py``) meets ours on Hopper and on insertion tasks; BAM's
+friction models (``bam_ladder.py``) meet ``vtrefine-diagnose``.
+"""

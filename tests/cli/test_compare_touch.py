@@ -8,6 +8,7 @@ from pathlib import Path
 import compare_touch as script
 import pytest
 import yaml
+from runs.side_by_side import run_script, shares
 
 from lerobot_vtrefine.cli import demo
 
@@ -81,7 +82,7 @@ def test_passes_flags_on_and_saves(
         ("visuo_tactile", "4"),
     ]
     assert all(run["flags"]["num_demos"] == "9" for run in runs)
-    parts = [share.cores for share in script.shares(jobs)]
+    parts = [share.cores for share in shares(jobs)]
     assert jobs == 1 or not parts[0] or all(run["cores"] in parts for run in runs)
     assert json.loads((out / "comparison.json").read_text())["demo"]["finetune"]["visual"]["rate"] == 0.8
     assert "touch costs" in (out / "comparison.md").read_text()
@@ -167,5 +168,5 @@ def test_a_failure_is_the_scripts_status(error: BaseException, status: int) -> N
         raise error
 
     with pytest.raises(SystemExit) as ended:
-        script.run_script(entry)
+        run_script(entry)
     assert ended.value.code == status

@@ -13,9 +13,9 @@ SCRIPTS = Path(__file__).parents[2] / "scripts"
 def bench_sets(monkeypatch):
     monkeypatch.syspath_prepend(str(SCRIPTS))
     monkeypatch.setenv("OMP_NUM_THREADS", "1")
-    import bench_sets
+    import runs.sets
 
-    return bench_sets
+    return runs.sets
 
 
 def options(folder: Path, **changes) -> argparse.Namespace:

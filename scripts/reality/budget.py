@@ -1,12 +1,11 @@
-"""What every run of ``compare_reality.py`` may spend, and the flags of the worlds that it runs in."""
+"""What every run may spend, and the flags of the worlds that it runs in."""
 
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-from realities import of_robot
-
 from lerobot_vtrefine.cli.pipeline.demo_config import DemoConfig, default_degradation, default_env
+from reality.hidden import of_robot
 
 
 @dataclass(frozen=True)

@@ -1,4 +1,4 @@
-"""Stand-ins for reality: what ``compare_reality.py`` hides in the simulation, and what everybody knows."""
+"""Stand-ins for reality: what is hidden in the simulation, and what everybody knows."""
 
 from typing import Any
 
