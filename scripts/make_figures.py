@@ -22,6 +22,8 @@ import numpy as np
 from matplotlib.lines import Line2D
 from matplotlib.patches import Patch
 
+from lerobot_vtrefine.cli.arguments import CommandParser
+from lerobot_vtrefine.cli.errors import run_cli
 from lerobot_vtrefine.cli.results.rows import Run, read_all
 from lerobot_vtrefine.embodiments import ALOHA
 
@@ -396,23 +398,25 @@ OTHERS: dict[str, Callable[..., None]] = {
 }
 
 
-def main() -> int:
+@run_cli
+def main() -> None:
     """Draw what is asked for."""
+    parser = CommandParser(description=__doc__)
+    choices = (*SIMULATED, *OTHERS)
+    parser.add_argument("pictures", nargs="*", metavar="PICTURE", help=f"of {', '.join(choices)}")
+    wanted = parser.parse_args().pictures
+    if unknown := set(wanted) - set(choices):
+        raise ValueError(f"unknown {', '.join(sorted(unknown))}; choose from {', '.join(choices)}")
     mpl.use("Agg")
     mpl.rcParams.update(STYLE)  # ty: ignore[no-matching-overload]
     import matplotlib.pyplot as plt
 
-    drawn = [name for name in (*SIMULATED, *OTHERS) if name != "looks" or "MENAGERIE_DIR" in os.environ]
-    wanted = sys.argv[1:] or drawn
-    if unknown := set(wanted) - SIMULATED.keys() - OTHERS.keys():
-        print(f"error: unknown {', '.join(sorted(unknown))}; choose from {', '.join([*SIMULATED, *OTHERS])}")
-        return 2
+    wanted = wanted or [name for name in choices if name != "looks" or "MENAGERIE_DIR" in os.environ]
     IMAGES.mkdir(parents=True, exist_ok=True)
     run = expert_run() if SIMULATED.keys() & set(wanted) else None
     for name in wanted:
         OTHERS[name](plt) if name in OTHERS else SIMULATED[name](plt, *(run or ()))
         print(name, flush=True)
-    return 0
 
 
 if __name__ == "__main__":

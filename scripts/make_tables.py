@@ -1,9 +1,13 @@
 #!/usr/bin/env python
-"""Write every table of results/*.json into the blocks ``<!-- table: NAME -->`` of README.md and docs/."""
+"""Write every table of results/*.json into the blocks ``<!-- table: NAME -->`` of README.md and docs/.
+
+python scripts/make_tables.py
+"""
 
 import sys
 from pathlib import Path
 
+from lerobot_vtrefine.cli.arguments import CommandParser
 from lerobot_vtrefine.cli.errors import run_cli
 from lerobot_vtrefine.cli.results.rows import read_all
 from lerobot_vtrefine.cli.results.tables import fill
@@ -19,6 +23,7 @@ def documents() -> list[Path]:
 @run_cli
 def main() -> None:
     """Rewrite what changed."""
+    CommandParser(description=__doc__).parse_args()
     rows = read_all(ROOT / "results")
     for path in documents():
         old = path.read_text(encoding="utf-8")

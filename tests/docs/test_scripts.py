@@ -1,0 +1,88 @@
+"""Scripts: each in scripts/ is a command that tells how it is used, and pages name flags that it has."""
+
+import json
+import os
+import re
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).parents[2]
+SCRIPTS = ROOT / "scripts"
+PAGES = [ROOT / "README.md", ROOT / "CONTRIBUTING.md", *sorted((ROOT / "docs").glob("*.md"))]
+RUN_BY_OTHERS = {"docs_hooks"}
+"""mkdocs imports it."""
+
+# All in one process: importing what they need takes most of the time.
+ASK = """
+import contextlib, io, json, runpy, sys
+found = {}
+for path in json.loads(sys.argv[1]):
+    sys.argv = [path, "--help"]
+    out = io.StringIO()
+    with contextlib.redirect_stdout(out):
+        try:
+            status = runpy.run_path(path, run_name="__main__") and None
+        except SystemExit as stop:
+            status = stop.code
+    found[path] = [status, out.getvalue()]
+print(json.dumps(found))
+"""
+
+
+@pytest.fixture(scope="module")
+def helps() -> dict[str, str]:
+    """What --help of every script prints."""
+    paths = [str(path) for path in sorted(SCRIPTS.glob("*.py")) if path.stem not in RUN_BY_OTHERS]
+    environment = os.environ | {"PYTHONPATH": os.pathsep.join([str(SCRIPTS), str(ROOT)])}
+    done = subprocess.run(
+        [sys.executable, "-c", ASK, json.dumps(paths)],
+        env=environment,
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    assert done.returncode == 0, done.stderr[-2000:]
+    found = json.loads(done.stdout.strip().splitlines()[-1])
+    assert [path for path, (status, _) in found.items() if status != 0] == []
+    return {Path(path).stem: text for path, (_, text) in found.items()}
+
+
+def test_every_script_tells_how_it_is_used(helps: dict[str, str]) -> None:
+    for name, text in helps.items():
+        assert text.startswith(f"usage: {name}.py"), name
+        assert f"scripts/{name}.py" in text, f"{name} shows no example"
+
+
+def uses(text: str) -> list[tuple[str, list[str]]]:
+    """Scripts that a text calls, in blocks and in code within a line, with the flags that it gives them."""
+    pieces = re.findall(r"```bash\n(.*?)```|`([^`\n]+)`", text, re.DOTALL)
+    lines = [line for piece in pieces for line in "".join(piece).replace("\\\n", " ").splitlines()]
+    found = []
+    for line in lines:
+        name = re.search(r"(?:^|\s)(?:\./)?scripts/(\w+)\.py(?=\s|$)(.*)", line)
+        if name is not None:
+            words = re.split(r"&&| #", name[2])[0]
+            found.append((name[1], re.findall(r"(?<=\s)--\w+", words)))
+    return found
+
+
+def test_uses_are_found() -> None:
+    text = "`scripts/a.py one --b=1`\n```bash\npython scripts/c.py --d \\\n    --e=2 && make f  # --g\n```"
+    assert uses(text) == [("a", ["--b"]), ("c", ["--d", "--e"])]
+
+
+def test_flags_that_pages_and_scripts_give_to_scripts_exist(helps: dict[str, str]) -> None:
+    shown = {page.name: page.read_text(encoding="utf-8") for page in PAGES}
+    shown |= {name: f"```bash\n{text.partition('options:')[0]}```" for name, text in helps.items()}
+    wrong, checked = [], 0
+    for place, text in shown.items():
+        for name, flags in uses(text):
+            passes_on = "parse_known_args" in (SCRIPTS / f"{name}.py").read_text(encoding="utf-8")
+            known = set(re.findall(r"--\w+", helps[name]))
+            wrong += [f"{place}: {name}.py {flag}" for flag in flags if not passes_on and flag not in known]
+            checked += len(flags)
+    assert wrong == []
+    assert checked > 50
