@@ -74,10 +74,15 @@ def main() -> None:
     parser.add_argument("--config_path", type=Path, required=True, help="of the environment")
     parser.add_argument("--before", required=True, help="checkpoint on the left")
     parser.add_argument("--after", required=True, help="checkpoint on the right")
-    parser.add_argument("--titles", nargs=2, default=["after imitation", "after DPPO"])
-    parser.add_argument("--output", type=Path, required=True)
+    parser.add_argument(
+        "--titles",
+        nargs=2,
+        default=["after imitation", "after DPPO"],
+        help="above the pictures (default: %(default)s)",
+    )
+    parser.add_argument("--output", type=Path, required=True, help="GIF to write")
     parser.add_argument("--seed", type=int, default=0, help="of the first episode")
-    parser.add_argument("--episodes", type=int, default=3)
+    parser.add_argument("--episodes", type=int, default=3, help="default %(default)s")
     parser.add_argument("--width", type=int, default=900, help="of the picture, in pixels")
     flags = parser.parse_args()
     env = draccus.decode(VtRefineEnvConfig, _env(flags.config_path))

@@ -3,10 +3,10 @@
 
 The recordings come from tests/diagnose/jittered_rig.py: laws in several forms, scaled to an achievable gain.
 An interrupted run goes on where it stopped; delete its folder after a change of the engine. It needs the
-installed package, this folder and tests/diagnose beside it. Seeds below 9340 have been looked at. All
-400 sets take about 6000 s of one core:
+installed package, this folder and tests/diagnose beside it. Seeds up to those that results/jittered.json
+names have been looked at. The 50 sets of a seed take about 1400 s of one core:
 
-    python scripts/bench_jittered.py --seeds=9400:9408 --jobs=16
+    python scripts/bench_jittered.py --seeds=9500:9507 --jobs=16
     python scripts/collect_results.py jittered outputs/bench_jittered/table.md --replace
     make tables
 """

@@ -3,11 +3,12 @@
 
 The recordings come from tests/diagnose/outsider: presses of a pad, written from the file formats and the
 physics alone. 27 % have one cause in its plain form, 27 % one in another form, 12 % two causes, 18 % an
-effect outside the catalogue, 16 % nothing (half of these with nasty noise). Seeds 1000 to 1240 have been
-looked at. It needs the installed package, this folder and tests/diagnose beside it; an interrupted run goes
-on where it stopped, and a change of the engine needs another folder. 200 sets take about 4000 s of one core:
+effect outside the catalogue, 16 % nothing (half of these with nasty noise). Seeds up to those that
+results/outsider.json names have been looked at. It needs the installed package, this folder and
+tests/diagnose beside it; an interrupted run goes on where it stopped, and a change of the engine needs
+another folder. 300 sets take about 9000 s of one core:
 
-    python scripts/bench_outsider.py --first_seed=5000 --sets=200
+    python scripts/bench_outsider.py --first_seed=11000 --sets=300
     python scripts/collect_results.py outsider outputs/bench_outsider/table.md --replace
     make tables
 """

@@ -113,8 +113,13 @@ def main() -> None:
     """Do what is missing and print the table."""
     parser = CommandParser(description=__doc__)
     parser.add_argument("--recording", type=Path, required=True, help="folder with recording.json")
-    parser.add_argument("--output_dir", type=Path, default=ROOT / "outputs" / "bench_servo")
-    parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument(
+        "--output_dir",
+        type=Path,
+        default=ROOT / "outputs" / "bench_servo",
+        help="where servo.md and what is done are kept",
+    )
+    parser.add_argument("--seed", type=int, default=0, help="of the diagnosis (default %(default)s)")
     options = parser.parse_args()
     options.output_dir.mkdir(parents=True, exist_ok=True)
     whole = read_recording_set(options.recording)

@@ -101,12 +101,12 @@ def make_parser() -> CommandParser:
     parser = CommandParser(description=__doc__)
     parser.add_argument("--dataset", type=Path, required=True, help="folder of the demonstrations")
     parser.add_argument("--policy", default="{}", help="settings that differ from vt_dp3_pads.yaml, as JSON")
-    parser.add_argument("--steps", type=int, default=6000)
-    parser.add_argument("--batch_size", type=int, default=128)
+    parser.add_argument("--steps", type=int, default=6000, help="default %(default)s")
+    parser.add_argument("--batch_size", type=int, default=128, help="default %(default)s")
     parser.add_argument("--passes", type=int, default=4, help="times that the encoder sees every frame")
-    parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("--seed", type=int, default=0, help="default %(default)s")
     parser.add_argument("--device", default="cpu", help="cpu or cuda")
-    parser.add_argument("--output_dir", type=Path, required=True)
+    parser.add_argument("--output_dir", type=Path, required=True, help="of pretrained_model")
     return parser
 
 

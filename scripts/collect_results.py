@@ -36,8 +36,9 @@ RESULTS = Path(__file__).parents[1] / "results"
 def main() -> None:
     """Collect every source, then write."""
     parser = CommandParser(description=__doc__)
-    parser.add_argument("table", choices=[*Run.TABLES, *Line.TABLES])
-    parser.add_argument("sources", type=Path, nargs="+")
+    tables = [*Run.TABLES, *Line.TABLES]
+    parser.add_argument("table", choices=tables, metavar="TABLE", help=f"of {', '.join(tables)}")
+    parser.add_argument("sources", type=Path, nargs="+", help="folders of runs, or files with printed tables")
     parser.add_argument("--results", type=Path, help="file (default results/TABLE.json)")
     parser.add_argument(
         "--replace", action="store_true", help="drop earlier rows of these tasks, policies and variants"

@@ -429,9 +429,15 @@ def make_parser() -> CommandParser:
     """The command line."""
     parser = CommandParser(description=__doc__)
     parser.add_argument("--mesh_dir", type=Path, required=True, help="folder of the meshes")
-    parser.add_argument("--pairs", nargs="+", choices=list(TASKS), default=list(TASKS))
-    parser.add_argument("--seeds", type=int, nargs="+", default=[0, 1, 2])
-    parser.add_argument("--demonstrations", type=int, nargs="+", default=[DEMONSTRATIONS])
+    parser.add_argument("--pairs", nargs="+", choices=list(TASKS), default=list(TASKS), help="default: all")
+    parser.add_argument("--seeds", type=int, nargs="+", default=[0, 1, 2], help="default: %(default)s")
+    parser.add_argument(
+        "--demonstrations",
+        type=int,
+        nargs="+",
+        default=[DEMONSTRATIONS],
+        help="numbers to imitate (default: %(default)s)",
+    )
     parser.add_argument("--no_scratch", action="store_true", help="leave out DPPO without pre-training")
     parser.add_argument("--recipe", choices=list(RECIPES), default="pads", help="as vtrefine-demo's")
     parser.add_argument(
@@ -441,7 +447,7 @@ def make_parser() -> CommandParser:
     parser.add_argument("--encoder_episodes", type=int, default=4096, help="that an encoder learns from")
     parser.add_argument("--encoder_steps", type=int, default=4000, help="of an encoder's training")
     parser.add_argument("--steps", type=int, default=6000, help="of imitation")
-    parser.add_argument("--batch_size", type=int, default=128)
+    parser.add_argument("--batch_size", type=int, default=128, help="of imitation (default %(default)s)")
     parser.add_argument("--iterations", type=int, default=60, help="of DPPO")
     parser.add_argument("--scratch_iterations", type=int, default=20, help="of DPPO without pre-training")
     parser.add_argument("--worlds", type=int, default=512, help="of DPPO")
@@ -460,7 +466,12 @@ def make_parser() -> CommandParser:
     parser.add_argument("--backend", choices=["batch", "warp"], help="default: warp on cuda, else batch")
     parser.add_argument("--jobs", type=int, default=1, help="policies side by side (default 1)")
     parser.add_argument("--commit", help="of the code, where no checkout tells it")
-    parser.add_argument("--output_dir", type=Path, default=Path("outputs/compare_paper"))
+    parser.add_argument(
+        "--output_dir",
+        type=Path,
+        default=Path("outputs/compare_paper"),
+        help="of all runs (default: %(default)s)",
+    )
     parser.add_argument("--results", type=Path, default=RESULTS, help="folder of paper.json")
     parser.add_argument("--only", help=argparse.SUPPRESS)
     return parser

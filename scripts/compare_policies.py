@@ -130,21 +130,32 @@ def row(options: argparse.Namespace, policy: str, seed: int) -> Run:
 def make_parser() -> CommandParser:
     """The command line."""
     parser = CommandParser(description=__doc__)
-    parser.add_argument("--seeds", type=int, nargs="+", default=[0, 1, 2])
-    parser.add_argument("--policies", nargs="+", choices=list(POLICIES), default=list(POLICIES))
+    parser.add_argument(
+        "--seeds", type=int, nargs="+", default=[0, 1, 2], help="of training (default: %(default)s)"
+    )
+    parser.add_argument(
+        "--policies", nargs="+", choices=list(POLICIES), default=list(POLICIES), help="default: all"
+    )
     parser.add_argument("--task", default="round_grasped", help="a file of configs/env (default %(default)s)")
-    parser.add_argument("--num_demos", type=int, default=200)
-    parser.add_argument("--steps", type=int, default=5000)
-    parser.add_argument("--batch_size", type=int, default=64)
-    parser.add_argument("--episodes", type=int, default=500)
-    parser.add_argument("--device", default="cuda")
+    parser.add_argument("--num_demos", type=int, default=200, help="default %(default)s")
+    parser.add_argument("--steps", type=int, default=5000, help="of training (default %(default)s)")
+    parser.add_argument("--batch_size", type=int, default=64, help="default %(default)s")
+    parser.add_argument("--episodes", type=int, default=500, help="of an evaluation (default %(default)s)")
+    parser.add_argument(
+        "--device", default="cuda", help="of the networks: cpu or cuda (default: %(default)s)"
+    )
     parser.add_argument("--backend", choices=["batch", "warp"], default="batch", help="of the evaluation")
     parser.add_argument("--eval_envs", type=int, default=50, help="episodes evaluated at once")
     parser.add_argument("--workers", type=int, default=0, help="processes that record (default none)")
     parser.add_argument("--jobs", type=int, default=1, help="policies side by side (default 1)")
     parser.add_argument("--commit", help="of the code, where no checkout tells it")
-    parser.add_argument("--output_dir", type=Path, default=Path("outputs/compare_policies"))
-    parser.add_argument("--results", type=Path, default=RESULTS)
+    parser.add_argument(
+        "--output_dir",
+        type=Path,
+        default=Path("outputs/compare_policies"),
+        help="of all runs (default: %(default)s)",
+    )
+    parser.add_argument("--results", type=Path, default=RESULTS, help="file of the rows")
     return parser
 
 

@@ -348,14 +348,22 @@ def reality_rows(
 def parse() -> tuple[argparse.Namespace, Budget]:
     """Options, and the budget among them."""
     parser = CommandParser(description=__doc__)
-    parser.add_argument("--output_dir", type=Path, default=Path("outputs/compare_reality"))
+    parser.add_argument(
+        "--output_dir", type=Path, default=Path("outputs/compare_reality"), help="default: %(default)s"
+    )
     parser.add_argument(
         "--seeds", type=int, nargs="+", default=[0, 1, 2], help="of fine-tuning and its episodes"
     )
     parser.add_argument(
         "--jobs", type=int, default=1, help="runs side by side, each on its share of the cores"
     )
-    parser.add_argument("--realities", nargs="+", choices=list(REALITIES), default=list(REALITIES))
+    parser.add_argument(
+        "--realities",
+        nargs="+",
+        choices=list(REALITIES),
+        default=list(REALITIES),
+        help="what is hidden (default: all)",
+    )
     parser.add_argument("--device", default="cpu", help="of the networks: cpu or cuda")
     parser.add_argument("--env", type=json.loads, default={}, help="more flags of the environment, as JSON")
     for name, default in (

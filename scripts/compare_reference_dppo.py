@@ -108,15 +108,20 @@ def main() -> int:
     parser.add_argument(
         "--iterations", type=int, default=101, help="of the reference, evaluations among them"
     )
-    parser.add_argument("--our_iterations", type=int, default=36)
+    parser.add_argument("--our_iterations", type=int, default=36, help="of ours")
     parser.add_argument("--minutes", type=float, default=600.0, help="of each run, which ends there")
     parser.add_argument("--val_freq", type=int, default=10, help="iterations from evaluation to evaluation")
     parser.add_argument("--batch_rows", type=int, default=BATCH_ROWS, help="of the reference's minibatches")
     parser.add_argument("--dppo", default="paper,trust_region", help="presets of ours to run")
     parser.add_argument("--skip_reference", action="store_true", help="run ours alone")
     parser.add_argument("--move", type=float, default=0.05, help="how far weights move before losses compare")
-    parser.add_argument("--seed", type=int, default=0)
-    parser.add_argument("--results", type=Path, default=ROOT / "results" / "reference.json")
+    parser.add_argument("--seed", type=int, default=0, help="of training (default %(default)s)")
+    parser.add_argument(
+        "--results",
+        type=Path,
+        default=ROOT / "results" / "reference.json",
+        help="file of the rows, curves beside it",
+    )
     args = parser.parse_args()
     saved = read_json(args.policy / "config.json") or {}
     if saved.get("type") != "vt_dp3" or saved["ft_denoising_steps"]:

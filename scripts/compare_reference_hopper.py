@@ -93,9 +93,16 @@ def main() -> int:
     parser.add_argument("--noise", type=float, default=0.1, help="on the recorded actions, full scale 1")
     parser.add_argument("--steps", type=int, default=100_000, help="to record")
     parser.add_argument("--updates", type=int, default=20_000, help="of the imitation")
-    parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument(
+        "--seed",
+        type=int,
+        default=0,
+        help="of the search, the imitation or the training (default %(default)s)",
+    )
     parser.add_argument("--machine", help="that trained, for the rows; default: this one")
-    parser.add_argument("--results", type=Path, default=ROOT / "results" / "reference_hopper.json")
+    parser.add_argument(
+        "--results", type=Path, default=ROOT / "results" / "reference_hopper.json", help="file of the rows"
+    )
     args = parser.parse_args()
     args.folder.mkdir(parents=True, exist_ok=True)
     if args.reference is None and args.what in ("pretrain", "train"):

@@ -158,9 +158,13 @@ def as_text(comparisons: dict[str, dict]) -> str:
 def main() -> None:
     """Parse, run every pipeline, compare."""
     parser = CommandParser(description=__doc__)
-    parser.add_argument("--seeds", type=int, nargs="+", default=[0, 1, 2])
-    parser.add_argument("--settings", nargs="+", choices=[*SETTINGS, *WORLDS], default=["demo"])
-    parser.add_argument("--output_dir", type=Path, default=Path("outputs/compare_touch"))
+    parser.add_argument("--seeds", type=int, nargs="+", default=[0, 1, 2], help="default: %(default)s")
+    parser.add_argument(
+        "--settings", nargs="+", choices=[*SETTINGS, *WORLDS], default=["demo"], help="default: %(default)s"
+    )
+    parser.add_argument(
+        "--output_dir", type=Path, default=Path("outputs/compare_touch"), help="default: %(default)s"
+    )
     parser.add_argument("--jobs", type=int, default=1, help="pipelines side by side (default 1)")
     options, extra = parser.parse_known_args()
     if options.jobs < 1:

@@ -6,9 +6,8 @@
 
 Regressors are the policy's own encoder and a larger network (--effort.networks='[policy]' leaves that one
 out); what counts for each set of senses is the better one. Flags that this script does not know go to
-``vtrefine-information``. A study lies in outputs/information_TASK,
-where scripts/compare_touch.py finds its encoders; one that is there is not made again: remove the folder for
-that.
+``vtrefine-information``. A study lies in outputs/information_TASK, where scripts/compare_touch.py finds its
+encoders; one that is there is not made again: remove the folder for that.
 """
 
 import json
@@ -85,8 +84,10 @@ def main() -> None:
     """Study what is missing, then keep all rows."""
     parser = CommandParser(description=__doc__)
     parser.add_argument("tasks", nargs="+", metavar="TASK", help="name of a file of configs/env")
-    parser.add_argument("--results", type=Path, default=RESULTS / f"{TABLE}.json")
-    parser.add_argument("--outputs", type=Path, default=Path("outputs"))
+    parser.add_argument("--results", type=Path, default=RESULTS / f"{TABLE}.json", help="file of the rows")
+    parser.add_argument(
+        "--outputs", type=Path, default=Path("outputs"), help="folder of the studies (default: %(default)s)"
+    )
     options, extra = parser.parse_known_args()
     for task in options.tasks:
         folder = options.outputs / f"information_{task}"

@@ -118,12 +118,12 @@ def main() -> None:
     """Measure what is missing."""
     parser = CommandParser(description=__doc__)
     parser.add_argument("--episodes", type=int, default=50, help="of each setting (default %(default)s)")
-    parser.add_argument("--bodies", nargs="+", default=["aloha", "kinova"])
+    parser.add_argument("--bodies", nargs="+", default=["aloha", "kinova"], help="default: %(default)s")
     parser.add_argument("--pairs", nargs="+", default=list(PROCEDURAL_PAIRS), help="or automate/ID")
-    parser.add_argument("--starts", nargs="+", default=list(STARTS), choices=STARTS)
+    parser.add_argument("--starts", nargs="+", default=list(STARTS), choices=STARTS, help="default: all")
     parser.add_argument("--socket", default="held", help="held, or stands: it stays on the table")
     parser.add_argument("--mesh_dir", type=Path, help="folder of meshes for automate/ID")
-    parser.add_argument("--results", type=Path, default=RESULTS / f"{TABLE}.json")
+    parser.add_argument("--results", type=Path, default=RESULTS / f"{TABLE}.json", help="file of the rows")
     options = parser.parse_args()
     if options.episodes < 1:
         raise ValueError(f"--episodes must be at least 1, got {options.episodes}")

@@ -59,13 +59,17 @@ def measure(policy: Path, task: Path, timestep_s: float, episodes: int, backend:
 def main() -> None:
     """Step by step; each is a row as soon as it is measured."""
     parser = CommandParser(description=__doc__)
-    parser.add_argument("--timesteps_s", type=read_list, default=[0.001, 0.002, 0.0025, 0.005])
+    parser.add_argument(
+        "--timesteps_s", type=read_list, default=[0.001, 0.002, 0.0025, 0.005], help="default: %(default)s"
+    )
     parser.add_argument("--task", default="square_grasped_1mm", help="a name of configs/env")
     parser.add_argument("--policy", default="square_grasped_1mm", help="that comes with the package")
     parser.add_argument("--episodes", type=int, default=256, help="per step")
-    parser.add_argument("--backend", choices=["batch", "warp"], default="batch")
+    parser.add_argument("--backend", choices=["batch", "warp"], default="batch", help="default: %(default)s")
     parser.add_argument("--device", default="cpu", help="of policy and, with warp, simulation: cpu or cuda")
-    parser.add_argument("--results", type=Path, default=ROOT / "results" / f"{TABLE}.json")
+    parser.add_argument(
+        "--results", type=Path, default=ROOT / "results" / f"{TABLE}.json", help="file of the rows"
+    )
     options = parser.parse_args()
     task, policy = find("--config_path", options.task), find("--policy.path", options.policy)
     for timestep_s in tqdm(options.timesteps_s):

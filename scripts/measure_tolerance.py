@@ -4,9 +4,9 @@
     python scripts/measure_tolerance.py round_grasped square_grasped_1mm cross_gentle --episodes=256
     make tables
 
-The scripted expert knows the truth but for an error of a known size, as information/tolerance.py says.
-No sensors, no training: minutes on a CPU. vtrefine-information draws the same as curves, and on them what
-the senses know.
+The scripted expert knows the truth but for an error of a known size, as
+lerobot_vtrefine/information/tolerance.py says. No sensors, no training: minutes on a CPU.
+vtrefine-information draws the same as curves, and on them what the senses know.
 """
 
 import sys
@@ -52,8 +52,8 @@ def main() -> None:
     parser.add_argument("tasks", nargs="+", help="files of configs/env")
     parser.add_argument("--episodes", type=int, default=256, help="per size of an error")
     parser.add_argument("--num_envs", type=int, default=64, help="simulations side by side")
-    parser.add_argument("--backend", choices=["batch", "warp"], default="batch")
-    parser.add_argument("--results", type=Path, default=RESULTS / f"{TABLE}.json")
+    parser.add_argument("--backend", choices=["batch", "warp"], default="batch", help="default: %(default)s")
+    parser.add_argument("--results", type=Path, default=RESULTS / f"{TABLE}.json", help="file of the rows")
     options = parser.parse_args()
     for task in options.tasks:
         env = checked_env(draccus.decode(EnvConfig, read_yaml(find("--config_path", task))["env"]))

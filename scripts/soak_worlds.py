@@ -89,20 +89,22 @@ def main() -> int:
 def parse() -> argparse.Namespace:
     """The command line."""
     parser = CommandParser(description=__doc__)
-    parser.add_argument("--worlds", type=int, default=64)
+    parser.add_argument("--worlds", type=int, default=64, help="default %(default)s")
     parser.add_argument("--control_steps", type=int, default=100_000, help="of each kind of actions, in all")
     parser.add_argument("--minutes", type=float, default=60.0, help="begin nothing new after these")
     parser.add_argument("--rows", type=Path, default=Path("outputs/soak.jsonl"), help="where rows are kept")
-    parser.add_argument("--pairs", default=",".join(PROCEDURAL_PAIRS))
-    parser.add_argument("--starts", default=",".join(STARTS))
+    parser.add_argument("--pairs", default=",".join(PROCEDURAL_PAIRS), help="default: %(default)s")
+    parser.add_argument("--starts", default=",".join(STARTS), help="default: %(default)s")
     parser.add_argument("--actions", default="random,trained", help=f"of {', '.join(ACTIONS)}")
-    parser.add_argument("--clearance_m", type=float, default=0.002)
-    parser.add_argument("--timestep_s", type=float, default=SceneConfig.timestep_s)
+    parser.add_argument("--clearance_m", type=float, default=0.002, help="default %(default)s")
+    parser.add_argument(
+        "--timestep_s", type=float, default=SceneConfig.timestep_s, help="default %(default)s"
+    )
     parser.add_argument("--policy", type=Path, help="a vt_dp3 checkpoint; default: the shipped one")
-    parser.add_argument("--backend", default="warp")
+    parser.add_argument("--backend", default="warp", help="default: %(default)s")
     parser.add_argument("--solver", default="own", help="of the warp backend")
     parser.add_argument("--device", default="auto", help="of the warp backend and the policy")
-    parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("--seed", type=int, default=0, help="of the first episode (default %(default)s)")
     return parser.parse_args()
 
 

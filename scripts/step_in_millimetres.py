@@ -131,7 +131,13 @@ def main() -> int:
     parser.add_argument("--policy", type=Path, required=True, help="an imitation-learned vt_dp3's folder")
     parser.add_argument("--task", type=Path, required=True, help="a file as in configs/env")
     parser.add_argument("--worlds", type=int, default=128, help="episodes of an iteration")
-    parser.add_argument("--rates", type=float, nargs="+", default=[1e-6, 3e-6, 1e-5, 3e-5, 1e-4, 3e-4])
+    parser.add_argument(
+        "--rates",
+        type=float,
+        nargs="+",
+        default=[1e-6, 3e-6, 1e-5, 3e-5, 1e-4, 3e-4],
+        help="of learning (default: %(default)s)",
+    )
     parser.add_argument("--std", type=float, default=TrustRegionDppo.min_sampling_std, help="of exploration")
     parser.add_argument("--device", default="cpu", help="of simulation and policy: cpu or cuda")
     parser.add_argument("--seed", type=int, default=0, help="of the first episode")

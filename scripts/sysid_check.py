@@ -225,7 +225,12 @@ def table(columns: dict[str, tuple[Values, float | None]]) -> str:
 def main() -> None:
     """Fit both sets by both."""
     parser = CommandParser(description=__doc__)
-    parser.add_argument("--output", type=Path, default=Path("outputs/sysid.md"))
+    parser.add_argument(
+        "--output",
+        type=Path,
+        default=Path("outputs/sysid.md"),
+        help="file of the table (default: %(default)s)",
+    )
     options = parser.parse_args()
     logging.disable(logging.WARNING)
     with tempfile.TemporaryDirectory() as name:

@@ -37,7 +37,7 @@ def add_arguments(parser: argparse.ArgumentParser, folder: Path) -> None:
     parser.add_argument(
         "--minutes", type=float, default=np.inf, help="begin no set after that time; what runs is finished"
     )
-    parser.add_argument("--output_dir", type=Path, default=folder)
+    parser.add_argument("--output_dir", type=Path, default=folder, help="where the sets' rows are kept")
     parser.add_argument("--table", action="store_true", help="print what is there, run nothing")
 
 

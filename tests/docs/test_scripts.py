@@ -54,6 +54,8 @@ def test_every_script_tells_how_it_is_used(helps: dict[str, str]) -> None:
     for name, text in helps.items():
         assert text.startswith(f"usage: {name}.py"), name
         assert f"scripts/{name}.py" in text, f"{name} shows no example"
+        bare = re.findall(r"^  (-[^\n]*\S)\n(?!   )", text + "\n", re.MULTILINE)
+        assert [flag for flag in bare if "  " not in flag] == [], f"{name} does not say what these are"
 
 
 def uses(text: str) -> list[tuple[str, list[str]]]:
