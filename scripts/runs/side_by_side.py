@@ -11,6 +11,8 @@ from pathlib import Path
 
 import torch
 
+from lerobot_vtrefine.cli.errors import run_cli
+
 POLL_S = 0.5
 
 
@@ -99,10 +101,8 @@ def start(command: list[str], folder: Path, share: Share) -> subprocess.Popen:
 
 
 def run_script(entry: Callable[[], None]) -> None:
-    """Run a script's entry; it ends with the status of the command that failed, or 130 when interrupted."""
+    """Run a script's entry as `run_cli` does; the status of a command that failed is its own."""
     try:
-        entry()
+        sys.exit(run_cli(entry)())
     except subprocess.CalledProcessError as error:
         sys.exit(error.returncode)
-    except KeyboardInterrupt:
-        sys.exit(130)

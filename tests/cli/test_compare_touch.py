@@ -170,3 +170,13 @@ def test_a_failure_is_the_scripts_status(error: BaseException, status: int) -> N
     with pytest.raises(SystemExit) as ended:
         run_script(entry)
     assert ended.value.code == status
+
+
+def test_a_wrong_flag_is_one_line(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setattr(sys, "argv", ["compare_touch.py", "--jobs=0"])
+    with pytest.raises(SystemExit) as ended:
+        run_script(script.main)
+    assert ended.value.code == 2
+    assert capsys.readouterr().err == "error: --jobs must be at least 1, got 0; --help lists the flags\n"
