@@ -268,6 +268,15 @@ def test_pairs_stand_beside_the_papers_and_their_mean_counts_seeds_that_all_have
     )
 
 
+def test_pairs_that_share_no_seed_have_no_mean() -> None:
+    rows = [
+        run_of(0.5, seed, table="paper", task=f"automate/{pair}", policy=policy, episodes=100)
+        for seed, pair in enumerate(("00186", "00007"))
+        for policy in ("visual", "visuo_tactile")
+    ]
+    assert "mean of" not in table("paper", rows)
+
+
 def test_fewer_demonstrations_stand_beside_the_papers() -> None:
     named = {"table": "demonstrations", "task": "automate/00186", "policy": "visuo_tactile", "episodes": 100}
     rows = [

@@ -28,7 +28,8 @@ BESIDE = ("vision only", "the paper's", "touch", "the paper's", "touch minus vis
 
 
 def paper_table(rows: Sequence[Run]) -> str:
-    """Pair by pair beside the paper's own numbers, and the mean of the pairs that have both senses."""
+    """Pair by pair beside the paper's own numbers, and the mean of the pairs that have both senses, of seeds that
+    all of them have."""
     body = []
     for kind, words in KINDS.items():
         whole: dict[str, list[list[Run]]] = {"visual": [], "visuo_tactile": []}
@@ -41,8 +42,8 @@ def paper_table(rows: Sequence[Run]) -> str:
                 for name in whole:
                     whole[name].append(found[name])
                     printed[name].append(theirs[name])
-        if len(whole["visual"]) > 1:
-            means = {name: mean_by_seed(runs) for name, runs in whole.items()}
+        means = {name: mean_by_seed(runs) for name, runs in whole.items()}
+        if len(whole["visual"]) > 1 and all(means.values()):
             theirs = {name: mean(values) for name, values in printed.items()}
             body.append([words, f"mean of {len(whole['visual'])}", *beside_the_paper(means, theirs)])
     return markdown(["", "pair", *BESIDE], body)
@@ -72,7 +73,8 @@ def beside_the_paper(found: Mapping[str, Sequence[Run]], theirs: Mapping[str, fl
 
 def mean_by_seed(pairs: Sequence[Sequence[Run]]) -> list[Run]:
     """Every seed's mean over the pairs, of the seeds that all of them have."""
-    seeds = [run.seed for run in pairs[0] if all(run.seed in [row.seed for row in runs] for runs in pairs)]
+    first = pairs[0] if pairs else []
+    seeds = [run.seed for run in first if all(run.seed in [row.seed for row in runs] for runs in pairs)]
     means = []
     for seed in seeds:
         rows = [row for runs in pairs for row in runs if row.seed == seed]
