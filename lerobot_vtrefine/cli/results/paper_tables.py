@@ -28,8 +28,8 @@ BESIDE = ("vision only", "the paper's", "touch", "the paper's", "touch minus vis
 
 
 def paper_table(rows: Sequence[Run]) -> str:
-    """Pair by pair beside the paper's own numbers, and the mean of the pairs that have both senses, of seeds that
-    all of them have."""
+    """Pair by pair beside the paper's own numbers, and the mean of the pairs that have both senses, over the
+    seeds that all of them have."""
     body = []
     for kind, words in KINDS.items():
         whole: dict[str, list[list[Run]]] = {"visual": [], "visuo_tactile": []}
