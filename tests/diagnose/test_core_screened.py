@@ -381,6 +381,21 @@ def test_where_few_pairs_of_trials_have_a_say_the_size_of_their_products_counts(
     assert passes(2.0, 12)
 
 
+def test_where_few_of_many_trials_have_a_say_the_size_of_their_scores_counts() -> None:
+    # Whatever the others say, five large scores agree in one flip of sixteen.
+    def passes(size, telling, agreeing=TRIALS):
+        scores = np.where(np.arange(TRIALS) < telling, size, 0.01 * (-1.0) ** np.arange(TRIALS))
+        scores[agreeing:telling] *= -1.0
+        bend = Probe("bend", None, np.zeros(0), scores, np.abs(scores), False)
+        nothing = Probe("tilt", None, np.zeros(0), (-1.0) ** np.arange(TRIALS), np.ones(TRIALS), False)
+        return screen([bend, nothing], TRIALS, 0)["bend"].passed
+
+    assert passes(50.0, 5)
+    assert not passes(50.0, 5, agreeing=4)
+    assert not passes(2.0, 5)
+    assert passes(2.0, 12)
+
+
 @dataclass(frozen=True)
 class Forgiving(Toy):
     """Weights forgive what is there where all readings count alike."""

@@ -134,8 +134,7 @@ def screen(probes: Sequence[Probe], count: int, seed: int) -> dict[str, Tested]:
         names = len({probe.name for probe in tested})
         p_values, adjusted = _flip_p(tested, signs)
         for probe, p_value, together in zip(tested, p_values, adjusted, strict=True):
-            few = _signs_that_count(probe)
-            if few < FEW_FOR_SIGNS and p_value <= 2.5 * 2.0 ** (1 - few):
+            if too_few_agree(probe, p_value):
                 together = min(together, names * size_p(probe))
             _keep(best, Tested(probe, p_value, min(1.0, together * whole / SCREEN_SHARES[kind])))
     for probe in observed:
@@ -157,13 +156,24 @@ def _flip_p(probes: Sequence[Probe], signs: Array) -> tuple[list[float], list[fl
     return shares[0].tolist(), adjusted.tolist()
 
 
+def too_few_agree(probe: Probe, p_value: float) -> bool:
+    """Whether the signs that a probe's statistic hangs on agree, and are too few to tell by themselves."""
+    few = _signs_that_count(probe)
+    return few < FEW_FOR_SIGNS and p_value <= 2.5 * 2.0 ** (1 - few)
+
+
 def _signs_that_count(probe: Probe) -> float:
-    """Signs that a probe's statistic hangs on: those of all trials; where it is a sum of products, one more
-    than there are pairs of trials, each counted by its part in the sum."""
+    """Signs that a probe's statistic hangs on: those of trials, each counted by its part in the sum, for
+    where only the hardest presses show an effect, the others say nothing. Of a sum of products, one more than
+    there are pairs of trials."""
     if probe.products is None:
-        return len(probe.scores)
-    sizes = np.abs(probe.products)
-    return 1.0 + 0.5 * float(sizes.sum() ** 2 / max(np.square(sizes).sum(), 1e-300))
+        return _effective_number(probe.scores)
+    return 1.0 + 0.5 * _effective_number(probe.products)
+
+
+def _effective_number(parts: Array) -> float:
+    """Of how many equal parts a sum is worth."""
+    return float(np.abs(parts).sum() ** 2 / max(np.square(parts).sum(), 1e-300))
 
 
 def size_p(probe: Probe) -> float:
