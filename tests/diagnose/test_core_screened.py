@@ -382,17 +382,23 @@ def test_where_few_pairs_of_trials_have_a_say_the_size_of_their_products_counts(
 
 
 def test_where_few_of_many_trials_have_a_say_the_size_of_their_scores_counts() -> None:
-    # Whatever the others say, five large scores agree in one flip of sixteen.
+    # Whatever the others say, seven large scores agree in one flip of 64: too often among twenty guesses.
+    rng = np.random.default_rng(3)
+    guesses = [
+        Probe(str(k), None, np.zeros(0), rng.standard_normal(TRIALS), np.ones(TRIALS), False)
+        for k in range(20)
+    ]
+
     def passes(size, telling, agreeing=TRIALS):
         scores = np.where(np.arange(TRIALS) < telling, size, 0.01 * (-1.0) ** np.arange(TRIALS))
         scores[agreeing:telling] *= -1.0
         bend = Probe("bend", None, np.zeros(0), scores, np.abs(scores), False)
-        nothing = Probe("tilt", None, np.zeros(0), (-1.0) ** np.arange(TRIALS), np.ones(TRIALS), False)
-        return screen([bend, nothing], TRIALS, 0)["bend"].passed
+        return screen([bend, *guesses], TRIALS, 0)["bend"].passed
 
-    assert passes(50.0, 5)
-    assert not passes(50.0, 5, agreeing=4)
-    assert not passes(2.0, 5)
+    assert passes(50.0, 7)
+    assert not passes(50.0, 7, agreeing=6)
+    assert not passes(50.0, 4)
+    assert not passes(2.0, 7)
     assert passes(2.0, 12)
 
 

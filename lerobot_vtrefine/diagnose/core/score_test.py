@@ -14,7 +14,7 @@ import numpy as np
 from scipy.stats import norm
 
 from lerobot_vtrefine.diagnose.core.resampling import sign_matrix
-from lerobot_vtrefine.diagnose.core.rules import FEW_FOR_SIGNS, SCREEN_ALPHA, SCREEN_SHARES, SIZE_DOUBT
+from lerobot_vtrefine.diagnose.core.rules import ALPHA, FEW_FOR_SIGNS, SCREEN_ALPHA, SCREEN_SHARES, SIZE_DOUBT
 
 Array = np.ndarray
 
@@ -157,22 +157,26 @@ def _flip_p(probes: Sequence[Probe], signs: Array) -> tuple[list[float], list[fl
 
 
 def too_few_agree(probe: Probe, p_value: float) -> bool:
-    """Whether the signs that a probe's statistic hangs on agree, and are too few to tell by themselves."""
-    few = _signs_that_count(probe)
-    return few < FEW_FOR_SIGNS and p_value <= 2.5 * 2.0 ** (1 - few)
+    """Whether the signs that a probe's statistic hangs on agree, and are too few to tell among many probes.
 
-
-def _signs_that_count(probe: Probe) -> float:
-    """Signs that a probe's statistic hangs on: those of trials, each counted by its part in the sum, for
-    where only the hardest presses show an effect, the others say nothing. Of a sum of products, one more than
-    there are pairs of trials."""
+    Where only the hardest presses show an effect, the other trials say nothing; by itself, the probe must
+    pass all the same. Of products, one sign more than there are pairs of trials has a say.
+    """
     if probe.products is None:
-        return _effective_number(probe.scores)
-    return 1.0 + 0.5 * _effective_number(probe.products)
+        few, agreed = _effective_number(probe.scores), max(ALPHA, _p_of_all(len(probe.scores)))
+    else:
+        few = 1.0 + 0.5 * _effective_number(probe.products)
+        agreed = _p_of_all(few)
+    return few < FEW_FOR_SIGNS and p_value <= agreed
+
+
+def _p_of_all(signs: float) -> float:
+    """p-value where so many signs agree, or hardly fail to."""
+    return 2.5 * 2.0 ** (1 - signs)
 
 
 def _effective_number(parts: Array) -> float:
-    """Of how many equal parts a sum is worth."""
+    """How many equal parts a sum of such parts is worth."""
     return float(np.abs(parts).sum() ** 2 / max(np.square(parts).sum(), 1e-300))
 
 
