@@ -121,24 +121,31 @@ def screen(probes: Sequence[Probe], count: int, seed: int) -> dict[str, Tested]:
 
     Tests of two kinds share the error rate by a weighted Bonferroni rule (Holm 1979), each kind by its part
     in SCREEN_SHARES: sums of scores under flips of the trials' signs, judged together by the smallest p, and
-    sums of products under the same flips. What is observed takes no part.
+    sums of products under the same flips. What is observed takes no part. Where nothing passes, sums that a
+    few trials carry may do so by their size.
     """
     best: dict[str, Tested] = {}
+    by_size: list[Tested] = []
     kinds: dict[str, list[Probe]] = {}
     for probe in probes:
         kinds.setdefault(_kind(probe), []).append(probe)
-    observed = kinds.pop("observed", [])
+    for probe in kinds.pop("observed", []):
+        best[probe.name] = Tested(probe, None, None)
     whole = sum(SCREEN_SHARES[kind] for kind in kinds)
     signs = sign_matrix(count, seed)
     for kind, tested in kinds.items():
         names = len({probe.name for probe in tested})
         p_values, adjusted = _flip_p(tested, signs)
         for probe, p_value, together in zip(tested, p_values, adjusted, strict=True):
+            sized = min(together, names * size_p(probe))
             if too_few_agree(probe, p_value):
-                together = min(together, names * size_p(probe))
+                together = sized
+            elif few_carry(probe, p_value):
+                by_size.append(Tested(probe, p_value, min(1.0, sized * whole / SCREEN_SHARES[kind])))
             _keep(best, Tested(probe, p_value, min(1.0, together * whole / SCREEN_SHARES[kind])))
-    for probe in observed:
-        best[probe.name] = Tested(probe, None, None)
+    if not any(item.passed for item in best.values()):
+        for item in by_size:
+            _keep(best, item)
     return best
 
 
@@ -157,22 +164,20 @@ def _flip_p(probes: Sequence[Probe], signs: Array) -> tuple[list[float], list[fl
 
 
 def too_few_agree(probe: Probe, p_value: float) -> bool:
-    """Whether the signs that a probe's statistic hangs on agree, and are too few to tell among many probes.
+    """Whether all signs agree that a probe's statistic hangs on, and are too few to tell by themselves: those
+    of all trials; where it is a sum of products, one more than there are pairs that have a say."""
+    few = len(probe.scores) if probe.products is None else 1.0 + 0.5 * _effective_number(probe.products)
+    return few < FEW_FOR_SIGNS and p_value <= 2.5 * 2.0 ** (1 - few)
 
-    Where only the hardest presses show an effect, the other trials say nothing; by itself, the probe must
-    pass all the same. Of products, one sign more than there are pairs of trials has a say.
+
+def few_carry(probe: Probe, p_value: float) -> bool:
+    """Whether a few of many trials carry a sum of scores, as where only the hardest presses show an effect.
+
+    What the others say is next to nothing, and among many probes no flip of a few signs is rare enough. By
+    itself the probe must pass all the same.
     """
-    if probe.products is None:
-        few, agreed = _effective_number(probe.scores), max(ALPHA, _p_of_all(len(probe.scores)))
-    else:
-        few = 1.0 + 0.5 * _effective_number(probe.products)
-        agreed = _p_of_all(few)
-    return few < FEW_FOR_SIGNS and p_value <= agreed
-
-
-def _p_of_all(signs: float) -> float:
-    """p-value where so many signs agree, or hardly fail to."""
-    return 2.5 * 2.0 ** (1 - signs)
+    carried = probe.products is None and _effective_number(probe.scores) < FEW_FOR_SIGNS
+    return carried and p_value <= ALPHA
 
 
 def _effective_number(parts: Array) -> float:

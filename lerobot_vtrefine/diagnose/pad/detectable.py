@@ -20,6 +20,7 @@ from lerobot_vtrefine.diagnose.core.rules import (
 )
 from lerobot_vtrefine.diagnose.core.score_test import (
     Probe,
+    few_carry,
     flip_statistics,
     size_p,
     tail_shares,
@@ -168,7 +169,8 @@ class _Injection:
         p_value = float((statistics >= statistics[0] - 1e-9).mean())
         if p_value <= self._critical:
             return True
-        return too_few_agree(probe, p_value) and self._names * size_p(probe) <= SCREEN_ALPHA
+        few = too_few_agree(probe, p_value) or few_carry(probe, p_value)
+        return few and self._names * size_p(probe) <= SCREEN_ALPHA
 
     def _public(self, form: Form, values: np.ndarray) -> float:
         report = form.report(values, self.fitted.model.setting)
