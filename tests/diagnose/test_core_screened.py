@@ -404,6 +404,31 @@ def test_where_few_pairs_of_trials_have_a_say_the_size_of_their_products_counts(
     assert passes(2.0, 12)
 
 
+def test_where_few_of_many_trials_have_a_say_the_size_of_their_scores_counts() -> None:
+    # Whatever the others say, seven large scores agree in one flip of 64: too often among twenty guesses.
+    rng = np.random.default_rng(3)
+    guesses = [
+        Probe(str(k), None, np.zeros(0), rng.standard_normal(TRIALS), np.ones(TRIALS), False)
+        for k in range(20)
+    ]
+
+    def passes(size, telling, agreeing=TRIALS, beside=()):
+        scores = np.where(np.arange(TRIALS) < telling, size, 0.01 * (-1.0) ** np.arange(TRIALS))
+        scores[agreeing:telling] *= -1.0
+        bend = Probe("bend", None, np.zeros(0), scores, np.abs(scores), False)
+        return screen([bend, *guesses, *beside], TRIALS, 0)["bend"].passed
+
+    assert passes(50.0, 7)
+    assert not passes(50.0, 7, agreeing=6)
+    assert not passes(50.0, 4)
+    assert not passes(2.0, 7)
+    # Signs come first.
+    assert not passes(
+        50.0, 7, beside=[Probe("tilt", None, np.zeros(0), np.ones(TRIALS), np.ones(TRIALS), False)]
+    )
+    assert passes(2.0, 12)
+
+
 @dataclass(frozen=True)
 class Forgiving(Toy):
     """Weights forgive what is there where all readings count alike."""

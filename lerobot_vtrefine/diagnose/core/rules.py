@@ -60,7 +60,7 @@ SCREEN_ALPHA = 0.05
 SCREEN_SHARES = {"scores": 0.8, "products": 0.2}
 """Parts of that error rate that kinds of score tests get; where one is missing, the others share its part."""
 FEW_FOR_SIGNS = 10
-"""With fewer trials than this, signs alone cannot pass a score test: size counts as well."""
+"""With fewer trials than this that have a say, signs alone cannot pass a score test: size counts as well."""
 SIZE_DOUBT = 2.0
 """Factor by which scores may stray more than the fitted noise says, where their size counts."""
 FITTED = 6

@@ -14,7 +14,7 @@ import numpy as np
 from scipy.stats import norm
 
 from lerobot_vtrefine.diagnose.core.resampling import sign_matrix
-from lerobot_vtrefine.diagnose.core.rules import FEW_FOR_SIGNS, SCREEN_ALPHA, SCREEN_SHARES, SIZE_DOUBT
+from lerobot_vtrefine.diagnose.core.rules import ALPHA, FEW_FOR_SIGNS, SCREEN_ALPHA, SCREEN_SHARES, SIZE_DOUBT
 
 Array = np.ndarray
 
@@ -121,25 +121,31 @@ def screen(probes: Sequence[Probe], count: int, seed: int) -> dict[str, Tested]:
 
     Tests of two kinds share the error rate by a weighted Bonferroni rule (Holm 1979), each kind by its part
     in SCREEN_SHARES: sums of scores under flips of the trials' signs, judged together by the smallest p, and
-    sums of products under the same flips. What is observed takes no part.
+    sums of products under the same flips. What is observed takes no part. Where nothing passes, sums that a
+    few trials carry may do so by their size.
     """
     best: dict[str, Tested] = {}
+    by_size: list[Tested] = []
     kinds: dict[str, list[Probe]] = {}
     for probe in probes:
         kinds.setdefault(_kind(probe), []).append(probe)
-    observed = kinds.pop("observed", [])
+    for probe in kinds.pop("observed", []):
+        best[probe.name] = Tested(probe, None, None)
     whole = sum(SCREEN_SHARES[kind] for kind in kinds)
     signs = sign_matrix(count, seed)
     for kind, tested in kinds.items():
         names = len({probe.name for probe in tested})
         p_values, adjusted = _flip_p(tested, signs)
         for probe, p_value, together in zip(tested, p_values, adjusted, strict=True):
-            few = _signs_that_count(probe)
-            if few < FEW_FOR_SIGNS and p_value <= 2.5 * 2.0 ** (1 - few):
-                together = min(together, names * size_p(probe))
+            sized = min(together, names * size_p(probe))
+            if too_few_agree(probe, p_value):
+                together = sized
+            elif few_carry(probe, p_value):
+                by_size.append(Tested(probe, p_value, min(1.0, sized * whole / SCREEN_SHARES[kind])))
             _keep(best, Tested(probe, p_value, min(1.0, together * whole / SCREEN_SHARES[kind])))
-    for probe in observed:
-        best[probe.name] = Tested(probe, None, None)
+    if not any(item.passed for item in best.values()):
+        for item in by_size:
+            _keep(best, item)
     return best
 
 
@@ -157,13 +163,26 @@ def _flip_p(probes: Sequence[Probe], signs: Array) -> tuple[list[float], list[fl
     return shares[0].tolist(), adjusted.tolist()
 
 
-def _signs_that_count(probe: Probe) -> float:
-    """Signs that a probe's statistic hangs on: those of all trials; where it is a sum of products, one more
-    than there are pairs of trials, each counted by its part in the sum."""
-    if probe.products is None:
-        return len(probe.scores)
-    sizes = np.abs(probe.products)
-    return 1.0 + 0.5 * float(sizes.sum() ** 2 / max(np.square(sizes).sum(), 1e-300))
+def too_few_agree(probe: Probe, p_value: float) -> bool:
+    """Whether all signs agree that a probe's statistic hangs on, and are too few to tell by themselves: those
+    of all trials; where it is a sum of products, one more than there are pairs that have a say."""
+    few = len(probe.scores) if probe.products is None else 1.0 + 0.5 * _effective_number(probe.products)
+    return few < FEW_FOR_SIGNS and p_value <= 2.5 * 2.0 ** (1 - few)
+
+
+def few_carry(probe: Probe, p_value: float) -> bool:
+    """Whether a few of many trials carry a sum of scores, as where only the hardest presses show an effect.
+
+    What the others say is next to nothing, and among many probes no flip of a few signs is rare enough. By
+    itself the probe must pass all the same.
+    """
+    carried = probe.products is None and _effective_number(probe.scores) < FEW_FOR_SIGNS
+    return carried and p_value <= ALPHA
+
+
+def _effective_number(parts: Array) -> float:
+    """How many equal parts a sum of such parts is worth."""
+    return float(np.abs(parts).sum() ** 2 / max(np.square(parts).sum(), 1e-300))
 
 
 def size_p(probe: Probe) -> float:

@@ -13,13 +13,19 @@ import numpy as np
 from lerobot_vtrefine.diagnose.core.parallel import on_all_cores
 from lerobot_vtrefine.diagnose.core.resampling import sign_matrix
 from lerobot_vtrefine.diagnose.core.rules import (
-    FEW_FOR_SIGNS,
     LEAST_GAIN,
     SCREEN_ALPHA,
     SCREEN_SHARES,
     SURE,
 )
-from lerobot_vtrefine.diagnose.core.score_test import Probe, flip_statistics, size_p, tail_shares
+from lerobot_vtrefine.diagnose.core.score_test import (
+    Probe,
+    few_carry,
+    flip_statistics,
+    size_p,
+    tail_shares,
+    too_few_agree,
+)
 from lerobot_vtrefine.diagnose.pad.candidates import CATALOGUE, PLAIN
 from lerobot_vtrefine.diagnose.pad.candidates.base import Form
 from lerobot_vtrefine.diagnose.pad.candidates.sample_and_hold import shortest_period
@@ -157,13 +163,13 @@ class _Injection:
         return reach if self._passes(form, effect, effect.information + scatter) else min(reach, 0.7)
 
     def _passes(self, form: Form, effect: _Effect, scores: np.ndarray) -> bool:
-        """Whether such scores pass the screening: an effect in a few recordings only cannot."""
+        """Whether such scores pass the screening; an effect in few recordings must be far above noise."""
         probe = _probe(form, effect, scores)
         statistics = flip_statistics([probe], self._signs)[:, 0]
         p_value = float((statistics >= statistics[0] - 1e-9).mean())
         if p_value <= self._critical:
             return True
-        few = len(scores) < FEW_FOR_SIGNS and p_value <= 2.5 * 2.0 ** (1 - len(scores))
+        few = too_few_agree(probe, p_value) or few_carry(probe, p_value)
         return few and self._names * size_p(probe) <= SCREEN_ALPHA
 
     def _public(self, form: Form, values: np.ndarray) -> float:
