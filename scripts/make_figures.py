@@ -37,9 +37,10 @@ CURVES = {
     "square pair, 1 mm, more slip": {"B.g8.k12": "12 to 3", "B.g8.k40": "40 to 2"},
 }
 """Learning curves that show what the size of a step does, by their names in docs/step_size_curves.csv."""
+LIMITED = "rate limited to 2e-4"
 LIMITS = {
     "limited to 2e-4": (
-        ("rate limited to 2e-4, seeds it was chosen on", "rate limited to 2e-4"),
+        (f"{LIMITED}, seeds it was chosen on", LIMITED),
         BLUE,
     ),
     "without a limit": (("rate without a limit, 108 iterations",), ORANGE),
@@ -55,7 +56,11 @@ LEARNED = {
     "square_1mm_slip": "square, 1 mm",
 }
 """Tasks of the table ``converges`` whose stages are drawn."""
-STAGES = {"imitation": "imitation", "half-way": "half-way", "": "after DPPO"}
+STAGES = {
+    "imitation": ("imitation", f"{LIMITED}, imitation"),
+    "after DPPO": ("", LIMITED),
+}
+"""Variants of rows: of a task with more than one, the last is by today's preset."""
 TASKS = {
     "demo": "round,\n2 mm",
     "tight": "round,\n1 mm",
@@ -340,7 +345,7 @@ def draw_results(plt: Any) -> None:
         len(LEARNED) + 1,
         figsize=(16.5, 4.0),
         sharey=True,
-        width_ratios=[*(2 + (task == "square_1mm_slip") for task in LEARNED), 5],
+        width_ratios=[*[2] * len(LEARNED), 5],
         layout="constrained",
     )
     for ax, (task, title) in zip(left, LEARNED.items(), strict=True):
@@ -367,13 +372,13 @@ def draw_results(plt: Any) -> None:
 
 
 def draw_stages(ax: Any, rows: list[Run]) -> None:
-    """One task's success in the stages of training that its rows have."""
-    stages = {name: title for name, title in STAGES.items() if any(row.variant == name for row in rows)}
-    for place, variant in enumerate(stages):
+    """One task's success before and after DPPO."""
+    for place, variants in enumerate(STAGES.values()):
+        variant = [name for name in variants if any(row.variant == name for row in rows)][-1]
         for side, (policy, colour) in enumerate(POLICIES.items()):
             found = [100 * r.success for r in rows if (r.policy, r.variant) == (policy, variant)]
             draw_seeds(ax, place + (side - 0.5) * 0.36, found, colour)
-    ax.set_xticks(range(len(stages)), list(stages.values()))
+    ax.set_xticks(range(len(STAGES)), list(STAGES))
 
 
 def draw_seeds(ax: Any, x: float, found: list[float], colour: str) -> None:
