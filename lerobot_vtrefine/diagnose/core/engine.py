@@ -132,16 +132,17 @@ def guarded[P: Problem[Any, Any], F: Fit, C: Candidate](
 ) -> tuple[Selection[P, F, C], tuple[Refusal, ...]]:
     """No channel's model that predicts worse than the baseline is handed out, whatever chose it.
 
-    On each channel where it does, what was accepted last is taken back first. What all channels share is
+    The baseline holds what was seen in the readings: that is data, and only what was inferred is judged. On
+    each channel where it does worse, what was accepted last is taken back first. What all channels share is
     judged by all of them together, each in units of its baseline's error, and by their plain sum. Where a
     score test chose, plain errors must be surely worse (95 %), and log scores decide what they leave open.
     """
-    before = test.errors(selection.baseline)
+    before = test.errors(selection.problem.without_effect(selection.fit, selection.baseline))
     refused = []
     for channel in [*(k for k in selection.chosen if k != ALL), ALL]:
         part = slice(None) if channel == ALL else [channel]
         scale = before[:, part].mean(0).clip(1e-300)
-        for candidate in reversed(selection.chosen.get(channel, ())):
+        for candidate in reversed(selection.inferred(channel)):
             after = test.errors(selection.fit)
             base, extended = ((errors[:, part] / scale).mean(1) for errors in (before, after))
             pairs = [(base, extended), (before[:, part].mean(1), after[:, part].mean(1))]
@@ -166,11 +167,10 @@ def _if_likelier[P: Problem[Any, Any], F: Fit, C: Candidate](
     Plain errors of a few trials hang on how each differs from the others, which can hide half of what a
     model takes away elsewhere; log scores allow for that.
     """
-    screened, scored = (cast("Any", problem) for problem in (selection.problem, test))
-    if scored.log_scores(selection.fit).sum() > scored.log_scores(selection.baseline).sum():
+    scored, plain = cast("Any", test), selection.problem.without_effect(selection.fit, selection.baseline)
+    if scored.log_scores(selection.fit).sum() > scored.log_scores(plain).sum():
         return selection
-    fit = screened.without_effect(selection.fit, selection.baseline)
-    return replace(selection, fit=fit, withheld=True)
+    return replace(selection, fit=plain, withheld=True)
 
 
 def _with_refused(alarms: tuple[Alarm, ...], refused: tuple[Refusal, ...]) -> tuple[Alarm, ...]:

@@ -89,7 +89,8 @@ class Selection[P: Problem[Any, Any], F: Fit, C: Candidate]:
     alternatives: Mapping[str, frozenset[str]] = field(default_factory=dict)
     """Accepted cause -> others that passed a score test at the same time."""
     withheld: bool = False
-    """Whether users get the baseline in place of the fit, which predicts locked trials worse."""
+    """Whether users get the baseline with what was seen in place of the fit, which predicts locked trials
+    worse."""
 
     def causes(self) -> dict[str, tuple[int, ...]]:
         """Named cause -> channels that it acts on."""
@@ -113,6 +114,10 @@ class Selection[P: Problem[Any, Any], F: Fit, C: Candidate]:
     def observed(self, cause: str) -> bool:
         """Whether an accepted cause was seen in the readings themselves."""
         return self.p_value(cause) is None and any(name == cause for name, _ in self.p_values)
+
+    def inferred(self, channel: int) -> tuple[C, ...]:
+        """What was accepted on a channel, but for what was seen in the readings themselves."""
+        return tuple(item for item in self.chosen.get(channel, ()) if not self.observed(item.cause))
 
 
 class Search[P: SearchedProblem[Any, Any], F: Fit, C: Candidate]:
