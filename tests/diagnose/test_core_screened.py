@@ -345,10 +345,14 @@ def test_what_was_seen_stays_and_what_was_inferred_must_predict_better_than_it_d
     kept, refused = guarded(selection, locked, 0)
     assert names_of(kept) == ["bend"]
     assert [(item.cause, item.surely) for item in refused] == [("square", True)]
-    # It stays whatever locked trials say of it.
-    kept, refused = guarded(kept, replace(locked, y=x - 0.3 * np.abs(x)), 0)
-    assert names_of(kept) == ["bend"]
-    assert not refused
+    # It stays whatever locked trials say of what was fitted to it.
+    alone = replace(kept, fit=problem.fit((0, 1)))
+    steep = replace(locked, y=1.2 * x + 0.3 * np.abs(x))
+    for trials, told in ((locked, True), (steep, False)):
+        kept, refused = guarded(alone, trials, 0)
+        assert names_of(kept) == ["bend"]
+        assert not refused
+        assert kept.fit.told is told
 
 
 def locked_gains(problem: Toy, low: float) -> Toy:

@@ -115,10 +115,6 @@ class Selection[P: Problem[Any, Any], F: Fit, C: Candidate]:
         """Whether an accepted cause was seen in the readings themselves."""
         return self.p_value(cause) is None and any(name == cause for name, _ in self.p_values)
 
-    def inferred(self, channel: int) -> tuple[C, ...]:
-        """What was accepted on a channel, but for what was seen in the readings themselves."""
-        return tuple(item for item in self.chosen.get(channel, ()) if not self.observed(item.cause))
-
 
 class Search[P: SearchedProblem[Any, Any], F: Fit, C: Candidate]:
     """State of one search."""
