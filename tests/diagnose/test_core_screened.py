@@ -136,7 +136,7 @@ class Toy(OptionalSteps):
         return self.fit([k for k in now.free if k not in [item.column for item in candidates]])
 
     def errors(self, fit):
-        return self.mse(fit.theta if fit.told else np.eye(COLUMNS)[0])
+        return self.mse(fit.theta)
 
     def reweighted(self, fit):
         return Refits(self, fit)
@@ -145,12 +145,13 @@ class Toy(OptionalSteps):
         return np.ones(1, dtype=bool)
 
     def without_effect(self, fit, baseline):
-        return replace(fit, told=False)
+        seen = [item.column for item in self.offered if item.cause == self.seen]
+        kept = np.where(np.isin(np.arange(COLUMNS), seen), fit.theta, baseline.theta)
+        return replace(fit, theta=kept, told=False)
 
     def log_scores(self, fit):
         """Trials have gains of their own, which log scores allow for."""
-        theta = fit.theta if fit.told else np.eye(COLUMNS)[0]
-        left = self.y - self.columns() @ theta
+        left = self.y - self.columns() @ fit.theta
         shared = self.scatter**2 / (NOISE**2 + self.scatter**2 * np.square(self.x).sum(1))
         return -0.5 * (np.square(left).sum(1) - shared * (left * self.x).sum(1) ** 2) / NOISE**2
 
@@ -328,6 +329,30 @@ def test_names_stay_where_locked_trials_leave_it_open_and_the_model_goes() -> No
     gone, refused = guarded(selection, against, 0)
     assert names_of(gone) == []
     assert [item.surely for item in refused] == [True]
+
+
+def test_what_was_seen_stays_and_what_was_inferred_must_predict_better_than_it_does_alone() -> None:
+    trials = toy(0.3, seen="bend")
+    problem = replace(trials, y=trials.y + 0.3 * trials.x**2)
+    selection = ScreenedSearch(problem, 0, lambda text: None).run()
+    assert sorted(names_of(selection)) == ["bend", "square"]
+    # The baseline alone is worse by far than both, and what was seen is right without the other.
+    x = np.random.default_rng(5).uniform(-1, 1, (6, FRAMES))
+    y = x + 0.4 * np.abs(x) - 0.05 * x**2 + 0.01 * np.random.default_rng(6).normal(size=x.shape)
+    locked = replace(problem, x=x, y=y, conditions=CONDITIONS[:6])
+    plain, both = (locked.errors(fit).mean() for fit in (selection.baseline, selection.fit))
+    assert both < 0.7 * plain
+    kept, refused = guarded(selection, locked, 0)
+    assert names_of(kept) == ["bend"]
+    assert [(item.cause, item.surely) for item in refused] == [("square", True)]
+    # It stays whatever locked trials say of what was fitted to it.
+    alone = replace(kept, fit=problem.fit((0, 1)))
+    steep = replace(locked, y=1.2 * x + 0.3 * np.abs(x))
+    for trials, told in ((locked, True), (steep, False)):
+        kept, refused = guarded(alone, trials, 0)
+        assert names_of(kept) == ["bend"]
+        assert not refused
+        assert kept.fit.told is told
 
 
 def locked_gains(problem: Toy, low: float) -> Toy:

@@ -25,11 +25,11 @@ def fits(name, errors):
         (BASELINE - 5, BASELINE - 4, False, "weighed"),
         (BASELINE - 4, BASELINE - 5, False, "even"),
         (BASELINE + 1, BASELINE - 4, False, "even"),
-        (BASELINE + 1, BASELINE + 2, False, "plain"),
+        (BASELINE + 1, BASELINE + 2, False, "with what was seen"),
         (BASELINE - 5, BASELINE - 4, True, "weighed"),
         (BASELINE + 1, BASELINE - 4, True, "even"),
-        (BASELINE + LUCKY, BASELINE + 2, True, "plain"),
-        (BASELINE - 0.1, BASELINE - 0.2, True, "plain"),
+        (BASELINE + LUCKY, BASELINE + 2, True, "with what was seen"),
+        (BASELINE - 0.1, BASELINE - 0.2, True, "with what was seen"),
     ],
 )
 def test_the_best_trustworthy_model_is_handed_out(monkeypatch, weighed, even, doubtful, handed_out):
@@ -37,6 +37,7 @@ def test_the_best_trustworthy_model_is_handed_out(monkeypatch, weighed, even, do
     monkeypatch.setattr(final_model, "rest", lambda model, presses, weights: plain)
     monkeypatch.setattr(final_model, "out_of_fold", lambda problem, fit, folds: fit.held)
     monkeypatch.setattr(final_model, "fit", lambda model, presses, weights: fits("even", even))
+    monkeypatch.setattr(final_model, "with_seen", lambda problem, plain, fitted: "with what was seen")
     problem = SimpleNamespace(presses=None, folds=None, even=SimpleNamespace(weights=()))
     assert final_model.trusted(problem, plain, found, 0, doubtful=doubtful) == handed_out
 

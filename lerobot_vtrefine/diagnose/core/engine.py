@@ -132,16 +132,19 @@ def guarded[P: Problem[Any, Any], F: Fit, C: Candidate](
 ) -> tuple[Selection[P, F, C], tuple[Refusal, ...]]:
     """No channel's model that predicts worse than the baseline is handed out, whatever chose it.
 
-    On each channel where it does, what was accepted last is taken back first. What all channels share is
-    judged by all of them together, each in units of its baseline's error, and by their plain sum. Where a
-    score test chose, plain errors must be surely worse (95 %), and log scores decide what they leave open.
+    The baseline holds what was seen in the readings: that is data. On each channel where the model does
+    worse, what was accepted last is taken back first; a name that was seen stays, and only what was fitted to
+    it goes. What all channels share is judged by all of them together, each in units of its baseline's error,
+    and by their plain sum. Where a score test chose, plain errors must be surely worse (95 %), and log scores
+    decide what they leave open.
     """
-    before = test.errors(selection.baseline)
+    before = test.errors(selection.problem.without_effect(selection.fit, selection.baseline))
     refused = []
     for channel in [*(k for k in selection.chosen if k != ALL), ALL]:
         part = slice(None) if channel == ALL else [channel]
         scale = before[:, part].mean(0).clip(1e-300)
-        for candidate in reversed(selection.chosen.get(channel, ())):
+        last_first = reversed(selection.chosen.get(channel, ()))
+        for candidate in sorted(last_first, key=lambda item: selection.observed(item.cause)):
             after = test.errors(selection.fit)
             base, extended = ((errors[:, part] / scale).mean(1) for errors in (before, after))
             pairs = [(base, extended), (before[:, part].mean(1), after[:, part].mean(1))]
@@ -150,6 +153,8 @@ def guarded[P: Problem[Any, Any], F: Fit, C: Candidate](
             if gain >= 0:
                 break
             surely = gain_interval(*pairs[gains.index(gain)], seed)[1] < 0
+            if selection.observed(candidate.cause):
+                return (_withheld(selection) if surely else selection), tuple(refused)
             if selection.problem.screens and not surely:
                 # Scores found the name, and errors of a few locked trials do not disprove it.
                 return _if_likelier(selection, test), tuple(refused)
@@ -166,11 +171,17 @@ def _if_likelier[P: Problem[Any, Any], F: Fit, C: Candidate](
     Plain errors of a few trials hang on how each differs from the others, which can hide half of what a
     model takes away elsewhere; log scores allow for that.
     """
-    screened, scored = (cast("Any", problem) for problem in (selection.problem, test))
-    if scored.log_scores(selection.fit).sum() > scored.log_scores(selection.baseline).sum():
-        return selection
-    fit = screened.without_effect(selection.fit, selection.baseline)
-    return replace(selection, fit=fit, withheld=True)
+    scored, other = cast("Any", test), _withheld(selection)
+    better = scored.log_scores(selection.fit).sum() > scored.log_scores(other.fit).sum()
+    return selection if better else other
+
+
+def _withheld[P: Problem[Any, Any], F: Fit, C: Candidate](
+    selection: Selection[P, F, C],
+) -> Selection[P, F, C]:
+    """Names stay; users get the baseline with what was seen."""
+    plain = selection.problem.without_effect(selection.fit, selection.baseline)
+    return replace(selection, fit=plain, withheld=True)
 
 
 def _with_refused(alarms: tuple[Alarm, ...], refused: tuple[Refusal, ...]) -> tuple[Alarm, ...]:

@@ -133,6 +133,11 @@ class OptionalSteps(Protocol):
         """The selection with fits as users get them; `doubtful`: an alarm was raised."""
         return selection
 
+    def without_effect(self, fit: Any, baseline: Any) -> Any:
+        """A fit that may keep its names, and that predicts as the baseline does, but for what was seen in the
+        readings themselves."""
+        return baseline
+
     def completed(self, selection: "Selection[Any, Any, Any]") -> tuple[Any, Any]:
         """Baseline and fit for users, once all is decided and measured: it may be fitted to all trials."""
         return selection.baseline, selection.fit
@@ -275,9 +280,6 @@ class ScreenedProblem[F: ScoredFit, C: FormCandidate](Problem[F, C], Protocol):
 
     def refinements(self, candidate: C) -> Sequence[C]:
         """Other forms of the same cause, the plainer first."""
-
-    def without_effect(self, fit: F, baseline: F) -> F:
-        """A fit that keeps its names, and is handed out with the baseline's predictions."""
 
     def log_scores(self, fit: F) -> Array:
         """(T,) of trials that took no part in a fit, under the noise and the scatter between trials that it

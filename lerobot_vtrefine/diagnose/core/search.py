@@ -89,7 +89,8 @@ class Selection[P: Problem[Any, Any], F: Fit, C: Candidate]:
     alternatives: Mapping[str, frozenset[str]] = field(default_factory=dict)
     """Accepted cause -> others that passed a score test at the same time."""
     withheld: bool = False
-    """Whether users get the baseline in place of the fit, which predicts locked trials worse."""
+    """Whether users get the baseline with what was seen in place of the fit, which predicts locked trials
+    worse."""
 
     def causes(self) -> dict[str, tuple[int, ...]]:
         """Named cause -> channels that it acts on."""

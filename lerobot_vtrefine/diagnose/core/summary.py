@@ -165,7 +165,7 @@ def _accepted(found: Found, name: str, caveat: str) -> tuple[str, str]:
     where = _where(found, found.selection.causes()[name])
     seen = "observed in the readings, not tested; " if found.selection.observed(name) else ""
     reason = f"{seen}improves the prediction of trials left out of the fit{where}{caveat}"
-    if found.selection.withheld:
+    if found.selection.withheld and not seen:
         reason += "; a model with it predicts held-out trials worse, so that none is handed out"
     if not found.alarms:
         return "accepted", reason

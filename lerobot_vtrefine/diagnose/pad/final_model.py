@@ -115,21 +115,18 @@ def handed_out(
     if fitted.model.families:
         around, fitted = with_own_touch(problem, fitted)
         model = trusted(problem.as_recorded, plain, fitted, seed, doubtful=doubtful)
-        if model is plain.model and fitted.model.dead and not doubtful:
-            # Dead taxels are seen, and these recordings may press nothing there.
-            model = replace(model, dead=fitted.model.dead)
     idle = settled_idle(model, problem.presses)
     before = FinalFit(plain, problem, plain.model, idle)
     after = FinalFit(fitted, around, model, idle)
     if "sample_and_hold" in fitted.model.families:
         errors = [problem.errors(item).mean() for item in (before, after)]
-        after = after if errors[1] < errors[0] else replace(after, model=before.model)
+        after = after if errors[1] < errors[0] else problem.without_effect(after, before)
     return replace(selection, baseline=before, fit=after)
 
 
 def completed(selection: Selection["PadProblem", Any, Any], whole: "PadProblem") -> tuple[FinalFit, FinalFit]:
     """Both models fitted anew to all recordings; causes, forms and kind of fit stay as they were decided."""
-    before, after = selection.baseline, selection.fit
+    after = selection.fit
     problem, _ = whole.weighed(None)
     plain = whole.refitted_baseline.plain
     fitted, model = plain, plain.model
@@ -144,15 +141,25 @@ def completed(selection: Selection["PadProblem", Any, Any], whole: "PadProblem")
         around, fitted = with_own_touch(problem, fitted)
         if after.model is after.fit.model:
             model = fitted.model
-        elif after.model is not before.model:
+        elif after.model.families == after.fit.model.families:
             model = fit(fitted.model, whole.presses, whole.even.weights).model
+        else:
+            model = with_seen(problem.as_recorded, plain, fitted)
     idle = settled_idle(model, problem.presses)
     return FinalFit(plain, problem, plain.model, idle), FinalFit(fitted, around, model, idle)
 
 
+def with_seen(problem: "PadProblem", plain: Fit, fitted: Fit) -> Composite:
+    """The baseline with what a fit holds that was seen in the readings, not inferred: dead taxels."""
+    if not fitted.model.dead:
+        return plain.model
+    model = replace(plain.model, dead=fitted.model.dead)
+    return fit(model, problem.presses, problem.even.weights).model
+
+
 def trusted(problem: "PadProblem", plain: Fit, fitted: Fit, seed: int, *, doubtful: bool) -> Composite:
     """What is handed out: never a model that predicts plain readings of recordings left out worse than the
-    baseline does.
+    baseline does; then the baseline with what was seen.
 
     Named causes are taken as they were weighed, or refitted to plain readings where that predicts clearly
     better: where a form is not quite right, weights trust what it gets wrong.
@@ -169,4 +176,4 @@ def trusted(problem: "PadProblem", plain: Fit, fitted: Fit, seed: int, *, doubtf
         model, held = refitted.model, other
     needed = DOUBTFUL_GAIN if doubtful else 0.0
     lucky = doubtful and not agree((before.errors - held.errors).sum(1), seed, DOUBTFUL_P)
-    return plain.model if held.gain_over(before) <= needed or lucky else model
+    return with_seen(problem, plain, fitted) if held.gain_over(before) <= needed or lucky else model

@@ -335,8 +335,8 @@ class PadProblem(OptionalSteps):
         return [replace(candidate, form=form, others=()) for form in candidate.others]
 
     def without_effect(self, fit: FinalFit, baseline: FinalFit) -> FinalFit:
-        """Names and sizes stay; users get the baseline."""
-        return replace(fit, model=baseline.model)
+        """Names and sizes stay; users get the baseline with what was seen."""
+        return replace(fit, model=final_model.with_seen(self.as_recorded, baseline.fit, fit.fit))
 
     def log_scores(self, fit: FinalFit) -> Array:
         """(K,) with every recording's own gain and touch; by plain errors where these are not known."""
@@ -374,8 +374,7 @@ class PadProblem(OptionalSteps):
         selection, named = replace(selection, fit=fitted), selection.fit.model.dead
         if named or not fitted.model.dead:
             return selection
-        # The guard takes back last what was seen.
-        chosen = {CHANNEL: (Candidate(DEAD), *selection.chosen.get(CHANNEL, ()))}
+        chosen = {CHANNEL: (*selection.chosen.get(CHANNEL, ()), Candidate(DEAD))}
         return replace(selection, chosen=chosen, p_values={**selection.p_values, (DEAD, CHANNEL): None})
 
     def surprises(self, fit: Fit, locked: "PadProblem") -> list[Suspicion]:

@@ -96,8 +96,6 @@ class Stage:
     stochastic: ClassVar[bool] = False
     alike: ClassVar[bool] = False
     """Whether every taxel follows the same law by itself: fits run it on the taxels that answer, alone."""
-    rate_free: ClassVar[bool] = False
-    """Whether a memory follows the order of the frames, whatever their times."""
     spreads: ClassVar[bool] = False
     """Whether it moves force from taxel to taxel, in proportion."""
     proportional: ClassVar[bool] = False
@@ -113,6 +111,11 @@ class Stage:
                     raise ValueError(f"{self.name}.{item.name} must be a finite number, got {number!r}")
                 if minimum is not None and number < minimum:
                     raise ValueError(f"{self.name}.{item.name} must be at least {minimum:g}, got {number:g}")
+
+    @property
+    def rate_free(self) -> bool:
+        """Whether a memory follows the order of the frames, whatever their times."""
+        return False
 
     def traits(self, layout: PadLayout, pads: int, rng: np.random.Generator) -> Traits:
         """What differs between specimens of the sensor, drawn once per episode of one environment: name ->

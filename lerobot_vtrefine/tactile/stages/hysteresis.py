@@ -53,7 +53,11 @@ class Loop(CoverLaw):
 
     rank: ClassVar[int] = 36
     has_state: ClassVar[bool] = True
-    rate_free: ClassVar[bool] = True
+
+    @property
+    @override
+    def rate_free(self) -> bool:
+        return True
 
 
 @dataclass(frozen=True)

@@ -51,6 +51,11 @@ class FirstLoadSoftening(Remembering):
     def initial(self, layout: PadLayout, pads: int) -> Traits:
         return {"largest": np.zeros((pads, layout.rows, layout.cols), dtype=np.float32)}
 
+    @property
+    @override
+    def rate_free(self) -> bool:
+        return self.recovery_s == 0.0
+
     def _softened(self, x: torch.Tensor, largest: torch.Tensor, frame: Frame) -> torch.Tensor:
         unloaded = (1.0 - x / largest.clamp(min=1e-12)).clamp(0.0, 1.0)
         share = self.softening * unloaded**self.sharpness
@@ -106,7 +111,6 @@ class PathSoftening(Remembering):
     """
 
     name: ClassVar[str] = "path_softening"
-    rate_free: ClassVar[bool] = True
     softening: float = parameter(0.15, "1", 0.0, 0.3, maximum=1.0)
     path_m: float = parameter(2e-3, "m", 5e-4, 5e-3)
     peak: bool = False
@@ -115,6 +119,11 @@ class PathSoftening(Remembering):
     def initial(self, layout: PadLayout, pads: int) -> Traits:
         shape = (pads, layout.rows, layout.cols)
         return {name: np.zeros(shape, dtype=np.float32) for name in ("path", "before")}
+
+    @property
+    @override
+    def rate_free(self) -> bool:
+        return True
 
     def _softened(self, x: torch.Tensor, path: torch.Tensor, frame: Frame) -> torch.Tensor:
         scale = torch.as_tensor(self.path_m * frame.stiffness_n_per_m, dtype=x.dtype, device=x.device)

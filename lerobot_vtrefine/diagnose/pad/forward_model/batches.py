@@ -49,8 +49,9 @@ class Sheet:
     """When each press's readings were new."""
     warmth_c: tuple[np.ndarray | None, ...]
     """Temperature at every press's instants; None where it was not recorded."""
-    borne: tuple[tuple[np.ndarray, np.ndarray, np.ndarray] | None, ...]
-    """Drive, age and path (J, n) of what earlier recordings pressed every press's columns with (`Borne`)."""
+    borne: tuple[np.ndarray, ...]
+    """Drive, age and path (J, M) of what earlier recordings pressed every column with (`Borne`); empty where
+    nobody knows."""
     lowered_m: np.ndarray
     """How much lower than recorded the face is, at every column (M,)."""
 
@@ -147,18 +148,20 @@ def _build(everyone: Sequence[Press], members: list[int], idle: np.ndarray, kind
         loaded,
         tuple(press.rhythm for press in presses),
         tuple(warmth(press.trial, course.time_s) for press, course in zip(presses, courses, strict=True)),
-        tuple(
-            _borne(press, taxels[begin:end])
-            for press, (begin, end) in zip(presses, pairwise(ends), strict=True)
-        ),
+        _borne(presses, taxels, [slice(*pair) for pair in pairwise(ends)]),
         np.zeros(width),
     )
 
 
-def _borne(press: Press, taxels: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray] | None:
-    known = press.trial.borne
-    if known is None or not len(known.drive):
-        return None
-    every = (known.drive, known.age_s, known.path)
-    drive, age_s, path = (values.reshape(len(values), -1)[:, taxels] for values in every)
+def _borne(presses: Sequence[Press], taxels: np.ndarray, blocks: Sequence[slice]) -> tuple[np.ndarray, ...]:
+    """See `Sheet.borne`: no load at all in the place of recordings that a press did not have before it."""
+    earlier = [press.trial.borne for press in presses]
+    most = max((len(known.drive) for known in earlier if known is not None), default=0)
+    if not most:
+        return ()
+    drive, age_s, path = (np.zeros((most, len(taxels))) for _ in range(3))
+    for known, block in zip(earlier, blocks, strict=True):
+        if known is not None and len(known.drive):
+            for out, values in ((drive, known.drive), (age_s, known.age_s), (path, known.path)):
+                out[: len(values), block] = values.reshape(len(values), -1)[:, taxels[block]]
     return drive, age_s, path

@@ -76,26 +76,32 @@ def treats_each_alone(stage: Stage) -> bool:
 
 
 def by_press(field: Field, sheet: Sheet, work: Work) -> Field:
-    """work(values (T, m), times (T,), columns' taxels (m,)) on every press."""
+    """work(values (T, m), times (T,), columns (m,)) on every press."""
     out = np.zeros_like(field.values)
     for press, time_s in enumerate(sheet.times_s):
         part = field.within(sheet, press)
-        taxels = sheet.taxels[field.columns[part]]
-        out[: len(time_s), part] = work(field.values[: len(time_s), part], time_s, taxels)
+        out[: len(time_s), part] = work(field.values[: len(time_s), part], time_s, field.columns[part])
     return Field(out, field.columns, field.rate)
 
 
-def _alike(stage: Stage, field: Field, context: Context) -> Field:
-    frame = Frame(context.sheet.layout, stiffness_n_per_m=context.stiffness)
+def _alike(stage: Stage, field: Field, context: Context, borne: tuple[np.ndarray, ...] = ()) -> Field:
+    plain = Frame(context.sheet.layout, stiffness_n_per_m=context.stiffness)
 
-    def work(x: np.ndarray, time_s: np.ndarray, taxels: np.ndarray) -> np.ndarray:
+    def work(x: np.ndarray, time_s: np.ndarray, columns: np.ndarray) -> np.ndarray:
         line = torch.from_numpy(np.ascontiguousarray(x))[:, None]
+        frame = _remembering(plain, context.sheet, borne, columns) if borne else plain
         return stage.sequence(line, torch.from_numpy(time_s), frame)[:, 0].numpy()
 
     if not stage.has_state or stage.rate_free:  # then all presses are one
         frames = np.arange(len(field.values), dtype=float)
         return Field(work(field.values, frames, field.columns), field.columns, field.rate)
     return by_press(field, context.sheet, work)
+
+
+def _remembering(frame: Frame, sheet: Sheet, borne: tuple[np.ndarray, ...], columns: np.ndarray) -> Frame:
+    """The frame with what earlier recordings pressed some columns with."""
+    drive, age_s, path = (torch.from_numpy(np.take(values, columns, axis=1))[:, None] for values in borne)
+    return replace(frame, load_conserving=sheet.loaded, borne=(drive, age_s, path))
 
 
 def _looped(stage: Play, field: Field, context: Context) -> Field:
@@ -162,25 +168,8 @@ def _everywhere(field: Field, context: Context) -> Field:
 
 
 def _softened(stage: Remembering, field: Field, context: Context) -> Field:
-    """What earlier recordings pressed is each press's own."""
-    if not stage.session:
-        return _alike(stage, field, context)
-    sheet, out = context.sheet, np.zeros_like(field.values)
-    for press, (time_s, block, borne) in enumerate(
-        zip(sheet.times_s, sheet.blocks, sheet.borne, strict=True)
-    ):
-        part = field.within(sheet, press)
-        known = None
-        if borne is not None:
-            mine = field.columns[part] - block.start
-            drive, age_s, path = (torch.from_numpy(values[:, None, mine]) for values in borne)
-            known = (drive, age_s, path)
-        frame = Frame(
-            sheet.layout, stiffness_n_per_m=context.stiffness, load_conserving=sheet.loaded, borne=known
-        )
-        line = torch.from_numpy(np.ascontiguousarray(field.values[: len(time_s), part]))[:, None]
-        out[: len(time_s), part] = stage.sequence(line, torch.from_numpy(time_s), frame)[:, 0].numpy()
-    return Field(out, field.columns, field.rate)
+    """Earlier recordings count where the law asks for them."""
+    return _alike(stage, field, context, context.sheet.borne if stage.session else ())
 
 
 def _idle(stage: Idle, field: Field, context: Context) -> Field:
@@ -289,8 +278,10 @@ def _supply_droop(stage: SupplyDroop, field: Field, context: Context) -> Field:
 def _scan_skew(stage: ScanSkew, field: Field, context: Context) -> Field:
     layout = context.sheet.layout
 
-    def work(x: np.ndarray, time_s: np.ndarray, taxels: np.ndarray) -> np.ndarray:
-        row, col = (torch.from_numpy(part.astype(float)) for part in np.divmod(taxels, layout.cols))
+    taxels = context.sheet.taxels
+
+    def work(x: np.ndarray, time_s: np.ndarray, columns: np.ndarray) -> np.ndarray:
+        row, col = (torch.from_numpy(part.astype(float)) for part in np.divmod(taxels[columns], layout.cols))
         late_s = stage.late_s(row, col, layout.rows, layout.cols).numpy()
         # Taxels of a row are read as one.
         each_s, which = np.unique(late_s, return_inverse=True)
