@@ -301,7 +301,7 @@ def _scan_skew(stage: ScanSkew, field: Field, context: Context) -> Field:
 
 
 def _hold(stage: SampleAndHold, field: Field, context: Context) -> Field:
-    """A free board's instants are those that the recording itself shows."""
+    """A free board's instants, and those of each of its groups of rows, are those that the recording shows."""
     sheet = context.sheet
     asked = sheet.frames if context.frames_only else [np.arange(len(time_s)) for time_s in sheet.times_s]
     out = np.zeros((max(len(own) for own in asked), len(field.columns)))
@@ -315,9 +315,14 @@ def _hold(stage: SampleAndHold, field: Field, context: Context) -> Field:
             at_s = taken_at_frames(time_s[own], stage.period_s, stage.frame_s)
             out[: len(own), part] = joined(x, *neighbours(time_s, at_s))
         else:
-            phase = rhythm.phase(stage.period_s) if stage.free else 0.0
-            shown = stage.shown(torch.from_numpy(time_s), phase).numpy()[own]
-            out[: len(own), part] = np.take(x, shown, axis=0)
+            parts = rhythm.parts(stage.groups)
+            phases = [known.phase(stage.period_s) if stage.free else 0.0 for known in parts]
+            shown = [stage.shown(torch.from_numpy(time_s), phase).numpy()[own] for phase in phases]
+            if not stage.groups:
+                out[: len(own), part] = np.take(x, shown[0], axis=0)
+                continue
+            group = stage.group_of(sheet.rows[field.columns[part]], sheet.layout.rows)
+            out[: len(own), part] = np.take_along_axis(x, np.stack(shown, axis=1)[:, group], axis=0)
     return Field(out, field.columns, recorded=context.frames_only)
 
 
