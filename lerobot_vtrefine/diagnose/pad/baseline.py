@@ -6,7 +6,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from lerobot_vtrefine.diagnose.pad.candidates.base import Setting
-from lerobot_vtrefine.diagnose.pad.candidates.sample_and_hold import could_be_held, groups_in_turn
+from lerobot_vtrefine.diagnose.pad.candidates.sample_and_hold import could_be_held, groups_apart
 from lerobot_vtrefine.diagnose.pad.fitting import Fit, fit, rest
 from lerobot_vtrefine.diagnose.pad.forward_model.run import LoweredBench, run_stages
 from lerobot_vtrefine.diagnose.pad.model import NOMINAL_K_N, Composite, stiffness_from_load
@@ -84,7 +84,7 @@ def describe(presses: PressSet) -> Setting:
         company=company,
         ages_s=ages_s([press.rhythm for press in presses.presses]),
         repeats=could_be_held(presses),
-        row_groups=groups_in_turn(presses, frame_s),
+        row_groups=groups_apart(presses, frame_s),
         returned=any(_returned(press) for press in presses.presses),
     )
 
@@ -187,7 +187,8 @@ def weigh(
 ) -> tuple[Noise, tuple[TrialWeights, ...]]:
     """Noise of a fit (within recordings unless given; between recordings always), and the weights."""
     if noise is None:
-        noise = fit_frame_noise(presses, fitted.residuals(presses), fitted.signals)
+        groups = fitted.model.setting.row_groups
+        noise = fit_frame_noise(presses, fitted.residuals(presses), fitted.signals, groups)
     offsets = offset_tangents(fitted.model, presses, fitted.signals)
     gains, touches = recording_deviations(fitted, presses, noise, offsets)
     noise = fit_repeatability(noise, gains, touches, presses.conditions)

@@ -14,7 +14,7 @@ from lerobot_vtrefine.diagnose.pad.candidates.sample_and_hold import (
     held,
     irregular_periods,
     pattern,
-    periods_in_turn,
+    periods_apart,
 )
 from lerobot_vtrefine.diagnose.pad.fitting import Fit, movable, predict, tangents
 from lerobot_vtrefine.diagnose.pad.forward_model.run import Prefix
@@ -213,7 +213,7 @@ def hold_probe(problem: "PadProblem", fitted: Fit) -> Probe | None:
         return None
     presses, frame_s = problem.presses, fitted.model.setting.frame_s
     if fitted.model.setting.row_groups:
-        return _observed(forms[0].family, forms[0], np.array(periods_in_turn(presses, frame_s)[0]))
+        return _observed(forms[0].family, forms[0], np.array(periods_apart(presses, frame_s)[0]))
     rhythm = pattern(presses, frame_s)
     if rhythm is not None:
         return _observed(forms[0].family, forms[int(rhythm.free)], np.array([rhythm.period_s]))

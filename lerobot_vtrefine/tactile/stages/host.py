@@ -232,8 +232,9 @@ class SampleAndHold(Stage):
     def traits(self, layout: PadLayout, pads: int, rng: np.random.Generator) -> Traits:
         if not (self.free or self.ages_s):
             return {}
-        phases = rng.uniform(0.0, 1.0, (pads, max(self.groups, default=0) + 1, 1))
-        return {"phase": phases[:, self.group_of(np.arange(layout.rows), layout.rows)] if self.groups else phases}
+        phase = rng.uniform(0.0, 1.0, (pads, max(self.groups, default=0) + 1, 1))
+        every = np.arange(layout.rows)
+        return {"phase": phase[:, self.group_of(every, layout.rows)] if self.groups else phase}
 
     @override
     def initial(self, layout: PadLayout, pads: int) -> Traits:

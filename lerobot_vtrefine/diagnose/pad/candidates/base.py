@@ -51,7 +51,7 @@ class Setting:
     repeats: bool = True
     """Whether readings repeat in frames on the pad, or nothing says that they do not."""
     row_groups: tuple[int, ...] = ()
-    """Number of every row's group where rows repeat in groups, each in step; none where whole frames do."""
+    """Number of every row's group where these repeat apart, in one rhythm; none where whole frames do."""
     returned: bool = False
     """Whether recordings press where others of the session have pressed before."""
     idle_counts: tuple[tuple[float, ...], ...] = ()

@@ -163,16 +163,16 @@ def _pattern(known: Sequence[Rhythm], frame_s: float, free: bool) -> Pattern | N
     return Pattern(period_s, free) if contradicted(known, period_s, free) < CONTRADICTED else None
 
 
-def groups_in_turn(presses: PressSet, frame_s: float) -> tuple[int, ...]:
-    """Number of every row's group where rows repeat in groups, each in the same rhythm from an instant of its
-    own; none where whole frames repeat in one, or no rhythm explains what rows do."""
+def groups_apart(presses: PressSet, frame_s: float) -> tuple[int, ...]:
+    """Number of every row's group where groups repeat apart, all with one period but each from an instant of
+    its own; none where whole frames repeat with it, or none explains what rows do."""
     shares = [share for press in presses.presses for mask in _rows(press) if (share := _repeats(press, mask))]
     seen, by_chance = np.mean(shares, axis=0) if shares else (0.0, 0.0)
-    if seen < MIN_REPEATED or by_chance > CHANCE * seen or pattern(presses, frame_s):
+    groups, whole = row_groups(rhythms(presses)), rhythms(presses)
+    if seen < MIN_REPEATED or by_chance > CHANCE * seen or max(groups, default=0) == 0:
         return ()
-    groups = row_groups(rhythms(presses))
-    in_turn = max(groups, default=0) > 0 and _pattern(rhythms(presses, groups), frame_s, True)
-    return groups if in_turn else ()
+    found = _pattern(rhythms(presses, groups), frame_s, True)
+    return groups if found and contradicted(whole, found.period_s, True) > CONTRADICTED else ()
 
 
 def _best(known: Sequence[Rhythm], frame_s: float, free: bool) -> tuple[float, float]:
@@ -224,7 +224,7 @@ def free_periods(presses: PressSet, frame_s: float) -> list[list[float]]:
     return _between(*_best(rhythms(presses), frame_s, True))
 
 
-def periods_in_turn(presses: PressSet, frame_s: float) -> list[list[float]]:
+def periods_apart(presses: PressSet, frame_s: float) -> list[list[float]]:
     """The same of groups of rows [s]."""
     return _between(*_best(rhythms(presses, row_groups(rhythms(presses))), frame_s, True))
 
@@ -255,13 +255,13 @@ def _mean_period(values: np.ndarray, presses: PressSet) -> dict[str, tuple[float
     return {"period_s": (float(values[0]) / (1.0 + part), float(values[0]) / (1.0 - part))}
 
 
-def undecided(free: bool, in_turn: bool = False) -> Callable[[np.ndarray, PressSet], dict[str, tuple[float, float]]]:
+def undecided(free: bool, apart: bool = False) -> Callable[[np.ndarray, PressSet], dict[str, tuple[float, float]]]:
     """Periods that repeat the same frames as the best one does: nothing recorded tells them apart."""
 
     def ends(values: np.ndarray, presses: PressSet) -> dict[str, tuple[float, float]]:
         best = float(values[0])
         reach, count = (0.003, 121) if free else (0.05, 2001)
-        groups = row_groups(rhythms(presses)) if in_turn else ()
+        groups = row_groups(rhythms(presses)) if apart else ()
         low, high = alike(rhythms(presses, groups), best * np.exp(np.linspace(-reach, reach, count)), free)
         return {"period_s": (min(low, best), max(high, best))}
 
@@ -315,15 +315,15 @@ FORMS = (
     ),
     Form(
         HOLD,
-        "groups of rows in turn",
+        "groups of rows, each free of the others",
         (Value("period_s", 1e-3, 2.0, 0.0),),
         lambda v, s: (SampleAndHold(float(v[0]), free=True, groups=s.row_groups),),
-        lambda v, s: {"period_s": (float(v[0]), "s")},
+        lambda v, s: {"period_s": (float(v[0]), "s"), "groups": (float(max(s.row_groups) + 1), "1")},
         lambda s: [[2.0001 * s.frame_s]],
         amplitude=None,
         possible=lambda s: bool(s.row_groups),
-        search=periods_in_turn,
-        range=undecided(True, in_turn=True),
+        search=periods_apart,
+        range=undecided(True, apart=True),
         screened=False,
     ),
     Form(
