@@ -10,6 +10,7 @@ import torch
 from test_engine_forward import composite, presses, trial
 
 from lerobot_vtrefine.diagnose.pad.baseline import describe
+from lerobot_vtrefine.diagnose.pad.candidates.base import Form
 from lerobot_vtrefine.diagnose.pad.candidates.sample_and_hold import (
     FORMS,
     could_be_held,
@@ -81,9 +82,19 @@ def test_a_free_board_holds_from_an_instant_of_its_own_in_every_episode() -> Non
     assert ((changes >= 4) & (changes <= 5)).all()
 
 
-def test_models_of_free_boards_survive_their_file() -> None:
-    model = SensorModel.paper().with_stage(SampleAndHold(0.2, free=True))
+@pytest.mark.parametrize("groups", [(), (0, 1)])
+def test_models_of_free_boards_survive_their_file(groups: tuple[int, ...]) -> None:
+    model = SensorModel.paper().with_stage(SampleAndHold(0.2, free=True, groups=groups))
     assert SensorModel.from_dict(model.to_dict()) == model
+
+
+def test_a_free_board_read_at_the_frames_predicts_the_mean_over_its_instants() -> None:
+    time_s = torch.arange(400, dtype=torch.float64) * 0.05
+    ramp = (3.0 * time_s)[:, None, None]
+    stage = SampleAndHold(0.2, free=True, frame_s=0.05)
+    mean = stage.sequence(ramp, time_s, Frame(PadLayout(1, 1, 0.002)))[200:, 0, 0]
+    # New in every fourth frame: readings are 0, 1, 2 or 3 frames old.
+    assert torch.allclose(mean, ramp[200:, 0, 0] - 3.0 * 1.5 * 0.05)
 
 
 def test_a_board_read_at_the_frames_holds_what_the_first_frame_of_a_period_showed() -> None:
@@ -247,7 +258,7 @@ def test_rows_that_are_refreshed_apart_are_found_with_their_period(
     raw = [np.round(20.0 * rng.standard_normal((200, 60))) for _ in range(6)]
     seen = press_set([apart(signal, groups, period_s, rng.uniform(0, 1, 3).tolist()) for signal in raw])
     assert groups_apart(seen, 0.05) == groups
-    assert periods_apart(seen, 0.05)[4][0] == pytest.approx(period_s, rel=3e-3)
+    assert periods_apart(seen, 0.05)[0][0] == pytest.approx(period_s, rel=3e-3)
     # In step they are whole frames, also where most rows are so quiet that they miss new readings.
     together = [apart(signal, groups, period_s, [0.3] * 3) for signal in raw]
     assert groups_apart(press_set(together), 0.05) == ()
@@ -282,16 +293,20 @@ def test_rows_apart_are_predicted_each_at_its_own_instants() -> None:
     # Half a period apart, whole frames are new twice as often as rows; in step, as often.
     assert describe(held_presses(0.3)).row_groups == GROUPS
     assert describe(held_presses(0.0)).row_groups == ()
-    form = next(form for form in FORMS if form.possible(describe(known)))
+    at_frames, by_clock = (form for form in FORMS if form.possible(describe(known)))
+    assert_alone(known, by_clock, next(form for form in FORMS if "trial's start" in form.label))
+    assert_alone(known, at_frames, FORMS[-1])
+
+
+def assert_alone(known: PressSet, form: Form, whole: Form) -> None:
+    """Rows of a group show what they would if all of the pad were new when they are."""
     found = predict(composite(known).plus(form, np.array([PERIOD_S])), known)
-    whole = next(other for other in FORMS if "trial's start" in other.label)
     for row, number in ((1, 0), (3, 1)):
         alone = [replace(press, trial=press.trial) for press in known.presses]
         for press in alone:
             press.__dict__["rhythm"] = press.rhythm.parts(GROUPS)[number]
-        alike = predict(
-            composite(known).plus(whole, np.array([PERIOD_S])), replace(known, presses=tuple(alone))
-        )
+        values = np.array([PERIOD_S, 0.0])[: len(whole.values)]
+        alike = predict(composite(known).plus(whole, values), replace(known, presses=tuple(alone)))
         for press, some, other in zip(known.presses, found, alike, strict=True):
             mine = press.taxels // 8 == row
             assert mine.any()

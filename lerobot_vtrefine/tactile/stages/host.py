@@ -259,9 +259,10 @@ class SampleAndHold(Stage):
     @override
     def sequence(self, x: torch.Tensor, times_s: torch.Tensor, frame: Frame) -> torch.Tensor:
         """As `step` frame by frame; of a free board, whose instants nobody knows, the mean over them."""
-        if self.frame_s or not (self.free or self.ages_s):
+        if not (self.free or self.ages_s):
             return self.held(x, times_s)
         even = [self.period_s * (k + 0.5) / PHASES for k in range(PHASES)]
+        even = [age - age % self.frame_s for age in even] if self.frame_s else even
         ages = [self.lag_s + age for age in self.ages_s] or even
         return torch.stack([sampled(x, times_s, times_s - age) for age in ages]).mean(dim=0)
 

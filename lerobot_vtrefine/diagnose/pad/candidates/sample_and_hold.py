@@ -225,8 +225,9 @@ def free_periods(presses: PressSet, frame_s: float) -> list[list[float]]:
 
 
 def periods_apart(presses: PressSet, frame_s: float) -> list[list[float]]:
-    """The same of groups of rows [s]."""
-    return _between(*_best(rhythms(presses, row_groups(rhythms(presses))), frame_s, True))
+    """The middle of those of groups of rows [s]."""
+    groups = row_groups(rhythms(presses))
+    return [[float(np.mean(_best(rhythms(presses, groups), frame_s, True)))]]
 
 
 def _between(low: float, high: float) -> list[list[float]]:
@@ -272,6 +273,28 @@ def _repeating(setting: Setting) -> bool:
     return setting.repeats and not setting.row_groups
 
 
+def _apart(label: str, *, at_frames: bool) -> Form:
+    """Groups of rows with one period, each new from an instant of its own in every recording."""
+    return Form(
+        HOLD,
+        f"groups of rows, each free of the others, {label}",
+        (Value("period_s", 1e-3, 2.0, 0.0),),
+        lambda v, s: (
+            SampleAndHold(
+                float(v[0]), free=True, frame_s=s.frame_s if at_frames else 0.0, groups=s.row_groups
+            ),
+        ),
+        lambda v, s: {"period_s": (float(v[0]), "s"), "groups": (float(max(s.row_groups) + 1), "1")},
+        lambda s: [[2.0001 * s.frame_s]],
+        amplitude=None,
+        possible=lambda s: bool(s.row_groups),
+        search=periods_apart,
+        range=undecided(True, apart=True),
+        screened=False,
+        peer=True,
+    )
+
+
 FORMS = (
     Form(
         HOLD,
@@ -313,19 +336,8 @@ FORMS = (
         range=undecided(False),
         screened=False,
     ),
-    Form(
-        HOLD,
-        "groups of rows, each free of the others",
-        (Value("period_s", 1e-3, 2.0, 0.0),),
-        lambda v, s: (SampleAndHold(float(v[0]), free=True, groups=s.row_groups),),
-        lambda v, s: {"period_s": (float(v[0]), "s"), "groups": (float(max(s.row_groups) + 1), "1")},
-        lambda s: [[2.0001 * s.frame_s]],
-        amplitude=None,
-        possible=lambda s: bool(s.row_groups),
-        search=periods_apart,
-        range=undecided(True, apart=True),
-        screened=False,
-    ),
+    _apart("read at the frames", at_frames=True),
+    _apart("read on their own clock", at_frames=False),
     Form(
         HOLD,
         "irregular periods",

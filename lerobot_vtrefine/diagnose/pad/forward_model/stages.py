@@ -13,6 +13,7 @@ import torch
 
 from lerobot_vtrefine.diagnose.pad.forward_model.batches import Sheet
 from lerobot_vtrefine.diagnose.pad.forward_model.fields import Context, Field
+from lerobot_vtrefine.diagnose.pad.repeated_frames import Rhythm
 from lerobot_vtrefine.tactile.stages.base import Frame, Stage
 from lerobot_vtrefine.tactile.stages.contact import ContactStage
 from lerobot_vtrefine.tactile.stages.cover import on_springs
@@ -307,23 +308,24 @@ def _hold(stage: SampleAndHold, field: Field, context: Context) -> Field:
     out = np.zeros((max(len(own) for own in asked), len(field.columns)))
     for press, (time_s, own, rhythm) in enumerate(zip(sheet.times_s, asked, sheet.rhythms, strict=True)):
         part = field.within(sheet, press)
-        x = field.values[: len(time_s), part]
-        if stage.ages_s:
-            at_s = rhythm.taken_s(time_s[own]) - stage.lag_s
-            out[: len(own), part] = joined(x, *neighbours(time_s, at_s))
-        elif stage.frame_s:
-            at_s = taken_at_frames(time_s[own], stage.period_s, stage.frame_s)
-            out[: len(own), part] = joined(x, *neighbours(time_s, at_s))
-        else:
-            parts = rhythm.parts(stage.groups)
-            phases = [known.phase(stage.period_s) if stage.free else 0.0 for known in parts]
-            shown = [stage.shown(torch.from_numpy(time_s), phase).numpy()[own] for phase in phases]
-            if not stage.groups:
-                out[: len(own), part] = np.take(x, shown[0], axis=0)
-                continue
-            group = stage.group_of(sheet.rows[field.columns[part]], sheet.layout.rows)
-            out[: len(own), part] = np.take_along_axis(x, np.stack(shown, axis=1)[:, group], axis=0)
+        x, shown = field.values[: len(time_s), part], out[: len(own), part]
+        group = stage.group_of(sheet.rows[field.columns[part]], sheet.layout.rows) if stage.groups else None
+        for number, known in enumerate(rhythm.parts(stage.groups)):
+            mine = slice(None) if group is None else np.flatnonzero(group == number)
+            shown[:, mine] = _held(stage, x[:, mine], known, time_s, own)
     return Field(out, field.columns, recorded=context.frames_only)
+
+
+def _held(
+    stage: SampleAndHold, x: np.ndarray, rhythm: Rhythm, time_s: np.ndarray, own: np.ndarray
+) -> np.ndarray:
+    """What taxels x (T, n) of one rhythm show at some of the instants (T,)."""
+    if stage.ages_s or (stage.frame_s and stage.free):
+        return joined(x, *neighbours(time_s, rhythm.taken_s(time_s[own]) - stage.lag_s))
+    if stage.frame_s:
+        return joined(x, *neighbours(time_s, taken_at_frames(time_s[own], stage.period_s, stage.frame_s)))
+    phase = rhythm.phase(stage.period_s) if stage.free else 0.0
+    return np.take(x, stage.shown(torch.from_numpy(time_s), phase).numpy()[own], axis=0)
 
 
 def _convert(stage: Quantisation, field: Field, context: Context) -> Field:
