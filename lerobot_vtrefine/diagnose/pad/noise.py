@@ -128,9 +128,7 @@ def _strata(square: np.ndarray, size: np.ndarray) -> tuple[float, float]:
     return _trimmed_mean(square[quiet]), _trimmed_mean(square[size > 0.5 * top])
 
 
-def _memory(
-    presses: PressSet, residuals: Sequence[np.ndarray], new: Sequence[New]
-) -> tuple[float, float]:
+def _memory(presses: PressSet, residuals: Sequence[np.ndarray], new: Sequence[New]) -> tuple[float, float]:
     """Memory of the slow part of the noise, and its share of the variance, in frames at rest.
 
     From the mean square of differences over 1, 2, ... frames (the variogram), which short stretches do not

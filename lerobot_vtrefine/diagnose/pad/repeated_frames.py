@@ -60,9 +60,7 @@ class Rhythm:
             return (self,)
         if groups not in self._parts:
             each = (self.rows[:, np.array(groups) == group] for group in range(max(groups) + 1))
-            self._parts[groups] = tuple(
-                Rhythm(self.time_s, rows.any(axis=1), self.telling) for rows in each
-            )
+            self._parts[groups] = tuple(Rhythm(self.time_s, rows.any(axis=1), self.telling) for rows in each)
         return self._parts[groups]
 
     @cached_property

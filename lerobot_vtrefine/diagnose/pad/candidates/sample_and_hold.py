@@ -24,6 +24,9 @@ from lerobot_vtrefine.diagnose.pad.rules import (
 from lerobot_vtrefine.tactile.stages.host import SampleAndHold
 
 HOLD = "sample_and_hold"
+TWO_COUNTS = 1.96 * np.sqrt(2.0)
+"""Roots of a number by which two counts of it differ by chance in one case of twenty: which frames contradict
+a free board's period depends on how well the instants of its recordings are known."""
 MAX_FRAMES = 12.0
 """Longest period looked for, in frames."""
 
@@ -191,11 +194,14 @@ def contradicted(known: Sequence[Rhythm], period_s: float, free: bool) -> float:
     return float(max(changed / due, changed / changes, late / repeats / 3.0))
 
 
-def alike(known: Sequence[Rhythm], grid: np.ndarray, free: bool = False) -> tuple[float, float]:
-    """Ends of the periods, of a rising grid, whose pattern of new readings fits the recorded one best [s]."""
+def alike(
+    known: Sequence[Rhythm], grid: np.ndarray, free: bool = False, scatter: float = 0.0
+) -> tuple[float, float]:
+    """Ends of the periods, of a rising grid, whose pattern of new readings fits the recorded one best [s], or
+    is contradicted by more frames by so many roots of their number alone."""
     sums = [sum(rhythm.against(float(period), free) for rhythm in known) for period in grid]
     error = np.array([float(np.asarray(counts)[[1, 4]].sum()) for counts in sums])
-    best = np.flatnonzero(error <= error.min() + 0.5)
+    best = np.flatnonzero(error <= error.min() + 0.5 + scatter * np.sqrt(error.min()))
     spacing = grid[1] / grid[0]
     return float(grid[best].min() / spacing), float(grid[best].max() * spacing)
 
@@ -256,14 +262,21 @@ def _mean_period(values: np.ndarray, presses: PressSet) -> dict[str, tuple[float
     return {"period_s": (float(values[0]) / (1.0 + part), float(values[0]) / (1.0 - part))}
 
 
-def undecided(free: bool, apart: bool = False) -> Callable[[np.ndarray, PressSet], dict[str, tuple[float, float]]]:
+def undecided(
+    free: bool, apart: bool = False
+) -> Callable[[np.ndarray, PressSet], dict[str, tuple[float, float]]]:
     """Periods that repeat the same frames as the best one does: nothing recorded tells them apart."""
 
     def ends(values: np.ndarray, presses: PressSet) -> dict[str, tuple[float, float]]:
         best = float(values[0])
         reach, count = (0.003, 121) if free else (0.05, 2001)
         groups = row_groups(rhythms(presses)) if apart else ()
-        low, high = alike(rhythms(presses, groups), best * np.exp(np.linspace(-reach, reach, count)), free)
+        low, high = alike(
+            rhythms(presses, groups),
+            best * np.exp(np.linspace(-reach, reach, count)),
+            free,
+            TWO_COUNTS * free,
+        )
         return {"period_s": (min(low, best), max(high, best))}
 
     return ends

@@ -302,7 +302,7 @@ def _scan_skew(stage: ScanSkew, field: Field, context: Context) -> Field:
 
 
 def _hold(stage: SampleAndHold, field: Field, context: Context) -> Field:
-    """A free board's instants, and those of each of its groups of rows, are those that the recording shows."""
+    """The instants of a free board, or of each of its groups of rows, are those that the recording shows."""
     sheet = context.sheet
     asked = sheet.frames if context.frames_only else [np.arange(len(time_s)) for time_s in sheet.times_s]
     out = np.zeros((max(len(own) for own in asked), len(field.columns)))
