@@ -56,11 +56,13 @@ class Rhythm:
 
     def parts(self, groups: tuple[int, ...]) -> tuple["Rhythm", ...]:
         """Of every group of rows, by the number of each row's group; of the whole where there are none."""
-        if not groups or self.rows is None:
+        if not groups:
             return (self,)
         if groups not in self._parts:
-            each = (self.rows[:, np.array(groups) == group] for group in range(max(groups) + 1))
-            self._parts[groups] = tuple(Rhythm(self.time_s, rows.any(axis=1), self.telling) for rows in each)
+            assert self.rows is not None
+            number = np.arange(max(groups) + 1)
+            fresh = np.logical_or.reduce(self.rows[..., None] & (np.array(groups)[:, None] == number), axis=1)
+            self._parts[groups] = tuple(Rhythm(self.time_s, own, self.telling) for own in fresh.T)
         return self._parts[groups]
 
     @cached_property
@@ -123,9 +125,10 @@ def row_groups(rhythms: Sequence[Rhythm]) -> tuple[int, ...]:
     new = np.concatenate(known)
     groups, loudest = np.zeros(new.shape[1], dtype=int), []
     for row in np.argsort(-new.sum(axis=0), kind="stable"):
-        alone = [(new[:, row] & ~new[:, other]).sum() for other in loudest]
-        fits = [count <= CONTRADICTED * new[:, row].sum() for count in alone]
-        groups[row] = fits.index(True) if any(fits) else len(loudest)
-        loudest += [] if any(fits) else [row]
+        own = new[:, row]
+        outside = [(own & ~new[:, other]).sum() for other in loudest]
+        joins = np.flatnonzero(np.array(outside) <= CONTRADICTED * own.sum())
+        groups[row] = joins[0] if len(joins) else len(loudest)
+        loudest += [] if len(joins) else [row]
     order = list(dict.fromkeys(groups.tolist()))
     return tuple(order.index(group) for group in groups.tolist())

@@ -24,9 +24,9 @@ from lerobot_vtrefine.diagnose.pad.rules import (
 from lerobot_vtrefine.tactile.stages.host import SampleAndHold
 
 HOLD = "sample_and_hold"
-TWO_COUNTS = 1.96 * np.sqrt(2.0)
-"""Roots of a number by which two counts of it differ by chance in one case of twenty: which frames contradict
-a free board's period depends on how well the instants of its recordings are known."""
+TWO_COUNTS = 2.8
+"""Roots of a number (1.96 times that of two) by which two counts of it differ by chance in one case of twenty:
+which frames contradict a free board's period depends on how well its recordings' instants are known."""
 MAX_FRAMES = 12.0
 """Longest period looked for, in frames."""
 
@@ -171,10 +171,10 @@ def groups_apart(presses: PressSet, frame_s: float) -> tuple[int, ...]:
     its own; none where whole frames repeat with it, or none explains what rows do."""
     shares = [share for press in presses.presses for mask in _rows(press) if (share := _repeats(press, mask))]
     seen, by_chance = np.mean(shares, axis=0) if shares else (0.0, 0.0)
-    groups, whole = row_groups(rhythms(presses)), rhythms(presses)
-    if seen < MIN_REPEATED or by_chance > CHANCE * seen or max(groups, default=0) == 0:
+    if seen < MIN_REPEATED or by_chance > CHANCE * seen:
         return ()
-    found = _pattern(rhythms(presses, groups), frame_s, True)
+    whole, groups = rhythms(presses), row_groups(rhythms(presses))
+    found = _pattern(rhythms(presses, groups), frame_s, True) if max(groups, default=0) > 0 else None
     return groups if found and contradicted(whole, found.period_s, True) > CONTRADICTED else ()
 
 
@@ -271,12 +271,8 @@ def undecided(
         best = float(values[0])
         reach, count = (0.003, 121) if free else (0.05, 2001)
         groups = row_groups(rhythms(presses)) if apart else ()
-        low, high = alike(
-            rhythms(presses, groups),
-            best * np.exp(np.linspace(-reach, reach, count)),
-            free,
-            TWO_COUNTS * free,
-        )
+        grid = best * np.exp(np.linspace(-reach, reach, count))
+        low, high = alike(rhythms(presses, groups), grid, free, TWO_COUNTS * free)
         return {"period_s": (min(low, best), max(high, best))}
 
     return ends
