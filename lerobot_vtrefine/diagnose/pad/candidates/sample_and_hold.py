@@ -25,7 +25,7 @@ from lerobot_vtrefine.tactile.stages.host import SampleAndHold
 
 HOLD = "sample_and_hold"
 TWO_COUNTS = 2.8
-"""Roots of a number (1.96 times that of two) by which two counts of it differ by chance in one case of twenty:
+"""Roots of a number (1.96 times that of two) by which two counts of it differ by chance once in twenty times:
 which frames contradict a free board's period depends on how well its recordings' instants are known."""
 MAX_FRAMES = 12.0
 """Longest period looked for, in frames."""
