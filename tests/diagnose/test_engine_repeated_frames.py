@@ -1,24 +1,31 @@
 """When readings were new, and the rhythm in which they are held."""
 
 from dataclasses import replace
+from pathlib import Path
 from types import SimpleNamespace
 
 import numpy as np
 import pytest
 import torch
-from test_engine_forward import composite, presses
+from test_engine_forward import composite, presses, trial
 
 from lerobot_vtrefine.diagnose.pad.baseline import describe
+from lerobot_vtrefine.diagnose.pad.candidates.base import Form
 from lerobot_vtrefine.diagnose.pad.candidates.sample_and_hold import (
     FORMS,
     could_be_held,
+    groups_apart,
     held,
     irregular_periods,
+    periods_apart,
     repeated_share,
 )
 from lerobot_vtrefine.diagnose.pad.fitting import predict
+from lerobot_vtrefine.diagnose.pad.noise import fit_frame_noise
+from lerobot_vtrefine.diagnose.pad.press_trials import PressSet, prepare
 from lerobot_vtrefine.diagnose.pad.repeated_frames import Rhythm, ages_s, slots
 from lerobot_vtrefine.diagnose.pad.thinning import held_every
+from lerobot_vtrefine.diagnose.recordings import RecordingSet
 from lerobot_vtrefine.tactile.layout import PadLayout
 from lerobot_vtrefine.tactile.model import SensorModel
 from lerobot_vtrefine.tactile.stages.base import Frame
@@ -75,9 +82,19 @@ def test_a_free_board_holds_from_an_instant_of_its_own_in_every_episode() -> Non
     assert ((changes >= 4) & (changes <= 5)).all()
 
 
-def test_models_of_free_boards_survive_their_file() -> None:
-    model = SensorModel.paper().with_stage(SampleAndHold(0.2, free=True))
+@pytest.mark.parametrize("groups", [(), (0, 1)])
+def test_models_of_free_boards_survive_their_file(groups: tuple[int, ...]) -> None:
+    model = SensorModel.paper().with_stage(SampleAndHold(0.2, free=True, groups=groups))
     assert SensorModel.from_dict(model.to_dict()) == model
+
+
+def test_a_free_board_read_at_the_frames_predicts_the_mean_over_its_instants() -> None:
+    time_s = torch.arange(400, dtype=torch.float64) * 0.05
+    ramp = (3.0 * time_s)[:, None, None]
+    stage = SampleAndHold(0.2, free=True, frame_s=0.05)
+    mean = stage.sequence(ramp, time_s, Frame(PadLayout(1, 1, 0.002)))[200:, 0, 0]
+    # New in every fourth frame: readings are 0, 1, 2 or 3 frames old.
+    assert torch.allclose(mean, ramp[200:, 0, 0] - 3.0 * 1.5 * 0.05)
 
 
 def test_a_board_read_at_the_frames_holds_what_the_first_frame_of_a_period_showed() -> None:
@@ -123,7 +140,8 @@ def press_set(signals: list[np.ndarray]) -> SimpleNamespace:
     for signal in signals:
         time_s = np.arange(len(signal)) * 0.05
         drive = np.abs(np.sin(2.0 * time_s))[:, None, None]
-        rhythm = Rhythm.of(time_s, signal, np.ones(len(signal), dtype=bool))
+        image = signal.reshape(len(signal), -1, 10) if signal.shape[1] % 10 == 0 else None
+        rhythm = Rhythm.of(time_s, signal, np.ones(len(signal), dtype=bool), image)
         taxels, layout = np.arange(signal.shape[1]), SimpleNamespace(full_cols=10)
         presses.append(
             SimpleNamespace(
@@ -219,3 +237,84 @@ def test_some_frames_of_held_readings_are_held_as_all_of_them_are() -> None:
     said = zip(predict(model, whole), predict(model, thin), strict=True)
     for k, (full, some) in enumerate(said):
         np.testing.assert_allclose(some, full[k % 3 :: 3], atol=0.02 * full.max())
+
+
+def apart(signal: np.ndarray, groups: tuple[int, ...], period_s: float, phases: list[float]) -> np.ndarray:
+    """Rows of ten taxels at 20 Hz, each held from the instant of its group."""
+    out, time_s = signal.copy(), np.arange(len(signal)) * 0.05
+    for row, group in enumerate(groups):
+        slot = slots(time_s, period_s, phases[group])
+        columns = slice(10 * row, 10 * row + 10)
+        out[:, columns] = signal[np.searchsorted(slot, slot, side="left"), columns]
+    return out
+
+
+@pytest.mark.parametrize("groups", [(0, 0, 1, 1, 2, 2), (0, 1, 0, 1, 0, 1)])
+@pytest.mark.parametrize("period_s", [0.13, 0.31])
+def test_rows_that_are_refreshed_apart_are_found_with_their_period(
+    groups: tuple[int, ...], period_s: float
+) -> None:
+    rng = np.random.default_rng(9)
+    raw = [np.round(20.0 * rng.standard_normal((200, 60))) for _ in range(6)]
+    seen = press_set([apart(signal, groups, period_s, rng.uniform(0, 1, 3).tolist()) for signal in raw])
+    assert groups_apart(seen, 0.05) == groups
+    assert periods_apart(seen, 0.05)[0][0] == pytest.approx(period_s, rel=3e-3)
+    # In step they are whole frames, also where most rows are so quiet that they miss new readings.
+    together = [apart(signal, groups, period_s, [0.3] * 3) for signal in raw]
+    assert groups_apart(press_set(together), 0.05) == ()
+    for signal in together:
+        signal[:, 20:] = np.round(signal[:, 20:] / 80.0)
+    assert groups_apart(press_set(together), 0.05) == ()
+    # Rows that miss frames at random have no rhythm, and quiet ones that are not held at all neither.
+    lost = [np.hstack([dropped(part, 0.5, rng) for part in np.split(signal, 6, axis=1)]) for signal in raw]
+    assert groups_apart(press_set(lost), 0.05) == ()
+    assert groups_apart(press_set([np.round(signal / 100.0) for signal in raw]), 0.05) == ()
+
+
+GROUPS, PERIOD_S = (0, 0, 1, 1, 1), 0.13
+
+
+def held_presses(shift: float, counts: float = 80.0) -> PressSet:
+    """Presses that all taxels answer to, whose second group of rows is new a part of a period later."""
+    rng = np.random.default_rng(3)
+    trials = [trial(number, rng, 120) for number in range(4)]
+    for number, each in enumerate(trials):
+        each.raw[:] += counts * np.maximum(each.depth_m, 0.0)[:, None] / 6e-4
+        for rows, phase in ((slice(0, 16), 0.1), (slice(16, 40), 0.1 + shift)):
+            slot = slots(each.time_s, PERIOD_S, phase + 0.2 * number)
+            each.raw[:, rows] = each.raw[np.searchsorted(slot, slot, side="left"), rows]
+    recordings = RecordingSet(Path(), "pad", 5, 8, 0.002, 255.0, (), tuple(trials))
+    return prepare(recordings, trials, [0, 1, 2, 3])
+
+
+def test_rows_apart_are_predicted_each_at_its_own_instants() -> None:
+    known = held_presses(0.5)
+    assert describe(known).row_groups == GROUPS
+    # Half a period apart, whole frames are new twice as often as rows; in step, as often.
+    assert describe(held_presses(0.3)).row_groups == GROUPS
+    assert describe(held_presses(0.0)).row_groups == ()
+    at_frames, by_clock = (form for form in FORMS if form.possible(describe(known)))
+    assert_alone(known, by_clock, next(form for form in FORMS if "trial's start" in form.label))
+    assert_alone(known, at_frames, FORMS[-1])
+
+
+def assert_alone(known: PressSet, form: Form, whole: Form) -> None:
+    """Rows of a group show what they would if all of the pad were new when they are."""
+    found = predict(composite(known).plus(form, np.array([PERIOD_S])), known)
+    for row, number in ((1, 0), (3, 1)):
+        alone = [replace(press, trial=press.trial) for press in known.presses]
+        for press in alone:
+            press.__dict__["rhythm"] = press.rhythm.parts(GROUPS)[number]
+        values = np.array([PERIOD_S, 0.0])[: len(whole.values)]
+        alike = predict(composite(known).plus(whole, values), replace(known, presses=tuple(alone)))
+        for press, some, other in zip(known.presses, found, alike, strict=True):
+            mine = press.taxels // 8 == row
+            assert mine.any()
+            np.testing.assert_array_equal(some[:, mine], other[:, mine])
+
+
+def test_noise_of_rows_apart_is_that_of_new_readings() -> None:
+    known = held_presses(0.5, counts=0.0)
+    zeros = [np.zeros_like(press.signal) for press in known.presses]
+    noise = fit_frame_noise(known, [press.signal for press in known.presses], zeros, GROUPS)
+    assert noise.floor == pytest.approx(0.5, rel=0.1)

@@ -318,6 +318,25 @@ def test_sample_and_hold_repeats_for_its_period() -> None:
     assert np.allclose(y, np.floor(times.numpy() / 0.04 + 1e-9) * 0.04, atol=1e-6)
 
 
+def test_groups_of_rows_are_held_each_from_an_instant_of_its_own() -> None:
+    stage = SampleAndHold(0.13, free=True, groups=(0, 1, 0, 2, 2, 2))
+    rng = np.random.default_rng(8)
+    times, x = np.cumsum(rng.uniform(0.01, 0.06, 60)), rng.standard_normal((60, 6, 10))
+    found = {**stage.initial(LAYOUT, 1), **stage.traits(LAYOUT, 1, rng)}
+    phase = found["phase"][0, :, 0]
+    assert phase[0] == phase[2] != phase[1] != phase[3] == phase[4] == phase[5]
+    state = {key: torch.as_tensor(value[0]) for key, value in found.items()}
+    shown, slots = x[0].copy(), np.full(6, -1.0)
+    for now, image in zip(times, x, strict=True):
+        for row in range(6):
+            if (slot := np.floor(now / 0.13 + phase[row])) != slots[row]:
+                shown[row], slots[row] = image[row], slot
+        y, state = stage.step(torch.from_numpy(image), state, replace(FRAME, time_s=float(now)))
+        assert np.array_equal(y.numpy(), shown)
+    with pytest.raises(ValueError, match=r"sample_and_hold.groups needs a free board"):
+        SampleAndHold(0.13, groups=(0, 1))
+
+
 @pytest.mark.parametrize("name", sorted(STAGES))
 def test_parameters_have_units_and_ranges_hold_defaults_apart(name: str) -> None:
     from dataclasses import fields

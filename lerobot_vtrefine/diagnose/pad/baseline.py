@@ -6,7 +6,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from lerobot_vtrefine.diagnose.pad.candidates.base import Setting
-from lerobot_vtrefine.diagnose.pad.candidates.sample_and_hold import could_be_held
+from lerobot_vtrefine.diagnose.pad.candidates.sample_and_hold import could_be_held, groups_apart
 from lerobot_vtrefine.diagnose.pad.fitting import Fit, fit, rest
 from lerobot_vtrefine.diagnose.pad.forward_model.run import LoweredBench, run_stages
 from lerobot_vtrefine.diagnose.pad.model import NOMINAL_K_N, Composite, stiffness_from_load
@@ -61,11 +61,12 @@ def describe(presses: PressSet) -> Setting:
         row_company = max(row_company, int(pressed.sum(axis=-1).max(initial=0)))
         depth = max(depth, float(press.drive.max()))
     positive = steps[steps > 0]
+    frame_s = float(np.median(positive)) if len(positive) else 0.01
     return Setting(
         layout=presses.layout,
         top_counts=presses.full_scale,
         full_scale=presses.full_scale,
-        frame_s=float(np.median(positive)) if len(positive) else 0.01,
+        frame_s=frame_s,
         duration_s=float(np.median(spans)),
         session_s=float(np.ptp(starts)),
         session_start_s=float(min(starts)),
@@ -83,6 +84,7 @@ def describe(presses: PressSet) -> Setting:
         company=company,
         ages_s=ages_s([press.rhythm for press in presses.presses]),
         repeats=could_be_held(presses),
+        row_groups=groups_apart(presses, frame_s),
         returned=any(_returned(press) for press in presses.presses),
     )
 
@@ -185,7 +187,8 @@ def weigh(
 ) -> tuple[Noise, tuple[TrialWeights, ...]]:
     """Noise of a fit (within recordings unless given; between recordings always), and the weights."""
     if noise is None:
-        noise = fit_frame_noise(presses, fitted.residuals(presses), fitted.signals)
+        groups = fitted.model.setting.row_groups
+        noise = fit_frame_noise(presses, fitted.residuals(presses), fitted.signals, groups)
     offsets = offset_tangents(fitted.model, presses, fitted.signals)
     gains, touches = recording_deviations(fitted, presses, noise, offsets)
     noise = fit_repeatability(noise, gains, touches, presses.conditions)

@@ -107,7 +107,7 @@ def form_parameters(
     best = form.report(model.own(index), model.setting)
     if form.range is not None:
         ranges = form.range(model.own(index), presses)
-        return {name: Parameter(float(v), ranges[name], unit) for name, (v, unit) in best.items()}
+        return {name: Parameter(float(v), ranges.get(name), unit) for name, (v, unit) in best.items()}
     reporters = {name: _reporter(form, model.setting, name, own) for name in best}
     if form.twin is not None and not model.setting.loaded:
         bounds = _along_damping(fitted, presses, weights, own.start + form.twin, reporters)

@@ -5,12 +5,15 @@ Only weights depend on it; whether an effect is there is decided by resampling w
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from itertools import product
+from typing import Any
 
 import numpy as np
 from scipy.optimize import nnls
 
 from lerobot_vtrefine.diagnose.pad.candidates.sample_and_hold import held
-from lerobot_vtrefine.diagnose.pad.press_trials import PressSet
+from lerobot_vtrefine.diagnose.pad.press_trials import Press, PressSet
+from lerobot_vtrefine.diagnose.pad.repeated_frames import changed
 from lerobot_vtrefine.diagnose.pad.whitening import Whitener
 
 DEFAULT_GAIN = 0.01
@@ -58,23 +61,41 @@ class Noise:
         return np.sqrt(self.floor**2 + (self.growth * signal) ** 2)
 
 
+New = list[tuple[Any, np.ndarray]]
+"""Taxels of a press that are read together, and the frames (T,) in which they were."""
+
+
+def _new(press: Press, groups: tuple[int, ...], repeat: bool) -> New:
+    if not groups:
+        return [(slice(None), press.fresh | (not repeat))]
+    group = np.array(groups)[press.taxels // press.layout.full_cols]
+    parts = [np.flatnonzero(group == number) for number in np.unique(group)]
+    return [(part, changed(press.signal[:, part])) for part in parts]
+
+
 def fit_frame_noise(
-    presses: PressSet, residuals: Sequence[np.ndarray], signals: Sequence[np.ndarray]
+    presses: PressSet,
+    residuals: Sequence[np.ndarray],
+    signals: Sequence[np.ndarray],
+    groups: tuple[int, ...] = (),
 ) -> Noise:
     """Noise within recordings, from residuals (T, n) and expected signals (T, n) of a fitted model.
 
     Level and growth come from differences between frames, which slow misfit does not touch; memory comes
-    from frames without contact. Readings that a board holds have the noise of one: only new ones count.
+    from frames without contact. Readings that a board holds have the noise of one: only new ones count, in
+    each of its groups of rows.
     """
     repeat = held(presses)
-    new = [press.fresh | (not repeat) for press in presses.presses]
+    new = [_new(press, groups, repeat) for press in presses.presses]
     rho, slow = _memory(presses, residuals, new)
     squares, sizes = [], []
-    for residual, signal, own in zip(residuals, signals, new, strict=True):
-        frames = np.flatnonzero(own)
-        apart = np.diff(frames)[:, None]
-        squares.append((0.5 / (1.0 - slow * rho**apart) * np.diff(residual[frames], axis=0) ** 2).ravel())
-        sizes.append((0.5 * (signal[frames[1:]] + signal[frames[:-1]])).ravel())
+    for residual, signal, parts in zip(residuals, signals, new, strict=True):
+        for part, own in parts:
+            frames = np.flatnonzero(own)
+            change, size = np.diff(residual[frames][:, part], axis=0), signal[frames][:, part]
+            apart = np.diff(frames)[:, None]
+            squares.append((0.5 / (1.0 - slow * rho**apart) * change**2).ravel())
+            sizes.append((0.5 * (size[1:] + size[:-1])).ravel())
     square, size = np.concatenate(squares), np.abs(np.concatenate(sizes))
     if not len(square):
         return Noise(1.0, 0.0, 0.0, DEFAULT_GAIN, DEFAULT_OFFSET_M)
@@ -107,9 +128,7 @@ def _strata(square: np.ndarray, size: np.ndarray) -> tuple[float, float]:
     return _trimmed_mean(square[quiet]), _trimmed_mean(square[size > 0.5 * top])
 
 
-def _memory(
-    presses: PressSet, residuals: Sequence[np.ndarray], new: Sequence[np.ndarray]
-) -> tuple[float, float]:
+def _memory(presses: PressSet, residuals: Sequence[np.ndarray], new: Sequence[New]) -> tuple[float, float]:
     """Memory of the slow part of the noise, and its share of the variance, in frames at rest.
 
     From the mean square of differences over 1, 2, ... frames (the variogram), which short stretches do not
@@ -119,12 +138,13 @@ def _memory(
     if sum(int(rest.sum()) for rest in rests) < MIN_REST_FRAMES:
         rests = [~press.touching for press in presses.presses]
     sums, counts = np.zeros(MAX_LAG), np.zeros(MAX_LAG)
-    for rest, residual, own in zip(rests, residuals, new, strict=True):
+    for rest, residual, parts in zip(rests, residuals, new, strict=True):
         frames = np.flatnonzero(rest)
-        for run in np.split(frames, np.flatnonzero(np.diff(frames) > 1) + 1):
+        runs = np.split(frames, np.flatnonzero(np.diff(frames) > 1) + 1)
+        for (part, own), run in product(parts, runs):
             for lag in range(1, min(MAX_LAG, len(run) - 1) + 1):
                 both = own[run[lag:]] & own[run[:-lag]]
-                change = residual[run[lag:][both]] - residual[run[:-lag][both]]
+                change = (residual[run[lag:][both]] - residual[run[:-lag][both]])[:, part]
                 sums[lag - 1] += 0.5 * float((change**2).sum())
                 counts[lag - 1] += change.size
     known = counts >= MIN_PAIRS

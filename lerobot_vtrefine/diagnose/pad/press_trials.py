@@ -128,7 +128,8 @@ class Press:
         """When readings were new, of all recorded frames."""
         if self.whole is not None:
             return self.whole.rhythm
-        return Rhythm.of(self.time_s, self.signal, self.touching & ~silent(self.drive, self.signal))
+        image = self.trial.raw.reshape(-1, self.layout.full_rows, self.layout.full_cols)
+        return Rhythm.of(self.time_s, self.signal, self.touching & ~silent(self.drive, self.signal), image)
 
     @cached_property
     def fresh(self) -> np.ndarray:

@@ -61,7 +61,7 @@ class Deviations:
 def own_deviations(presses: PressSet, fitted: Fit) -> Deviations:
     """All together, with the scatter of a sound rig as their prior."""
     residuals = fitted.residuals(presses)
-    noise = fit_frame_noise(presses, residuals, fitted.signals)
+    noise = fit_frame_noise(presses, residuals, fitted.signals, fitted.model.setting.row_groups)
     slopes = offset_tangents(fitted.model, presses, fitted.signals)
     doubts = touch_doubts(fitted.model, presses)
     scores, sizes, powers, left = [], [], [], []

@@ -6,6 +6,7 @@ from functools import cached_property
 
 import numpy as np
 
+from lerobot_vtrefine.diagnose.pad.rules import CONTRADICTED
 from lerobot_vtrefine.tactile.stages.host import periods_gone
 
 PHASES = 32
@@ -41,12 +42,32 @@ class Rhythm:
     time_s: np.ndarray
     fresh: np.ndarray
     telling: np.ndarray
+    rows: np.ndarray | None = None
+    """The same as `fresh` of every row of the pad (T, R)."""
 
     @classmethod
-    def of(cls, time_s: np.ndarray, signal: np.ndarray, touching: np.ndarray) -> "Rhythm":
-        """From times (T,), readings (T, n) and whether the indenter touches (T,)."""
+    def of(
+        cls, time_s: np.ndarray, signal: np.ndarray, touching: np.ndarray, image: np.ndarray | None = None
+    ) -> "Rhythm":
+        """From times (T,), readings (T, n), whether the indenter touches (T,), and the pad (T, R, C)."""
         telling = touching & np.concatenate([[False], np.diff(time_s) > 0])
-        return cls(time_s, changed(signal), telling)
+        rows = None if image is None else np.stack([changed(row) for row in image.swapaxes(0, 1)], axis=1)
+        return cls(time_s, changed(signal), telling, rows)
+
+    def parts(self, groups: tuple[int, ...]) -> tuple["Rhythm", ...]:
+        """Of every group of rows, by the number of each row's group; of the whole where there are none."""
+        if not groups:
+            return (self,)
+        if groups not in self._parts:
+            assert self.rows is not None
+            number = np.arange(max(groups) + 1)
+            fresh = np.logical_or.reduce(self.rows[..., None] & (np.array(groups)[:, None] == number), axis=1)
+            self._parts[groups] = tuple(Rhythm(self.time_s, own, self.telling) for own in fresh.T)
+        return self._parts[groups]
+
+    @cached_property
+    def _parts(self) -> dict[tuple[int, ...], tuple["Rhythm", ...]]:
+        return {}
 
     def taken_s(self, times_s: np.ndarray) -> np.ndarray:
         """When the readings that are there at times (T,) were new: the last frame whose readings changed."""
@@ -91,3 +112,23 @@ def ages_s(rhythms: Sequence[Rhythm]) -> tuple[float, ...]:
     if not len(every):
         return (0.0,)
     return tuple(np.quantile(every, (np.arange(AGES) + 0.5) / AGES).tolist())
+
+
+def row_groups(rhythms: Sequence[Rhythm]) -> tuple[int, ...]:
+    """Number of every row's group: rows that change in the same frames are refreshed together.
+
+    A quiet row may miss a refresh of its group, but changes in no other frame.
+    """
+    known = [rhythm.rows[rhythm.telling] for rhythm in rhythms if rhythm.rows is not None]
+    if not known:
+        return ()
+    new = np.concatenate(known)
+    groups, loudest = np.zeros(new.shape[1], dtype=int), []
+    for row in np.argsort(-new.sum(axis=0), kind="stable"):
+        own = new[:, row]
+        outside = [(own & ~new[:, other]).sum() for other in loudest]
+        joins = np.flatnonzero(np.array(outside) <= CONTRADICTED * own.sum())
+        groups[row] = joins[0] if len(joins) else len(loudest)
+        loudest += [] if len(joins) else [row]
+    order = list(dict.fromkeys(groups.tolist()))
+    return tuple(order.index(group) for group in groups.tolist())

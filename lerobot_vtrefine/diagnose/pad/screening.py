@@ -10,7 +10,12 @@ from lerobot_vtrefine.diagnose.core.parallel import on_all_cores
 from lerobot_vtrefine.diagnose.core.score_test import Probe, cleared
 from lerobot_vtrefine.diagnose.pad.candidates import CATALOGUE, PLAIN
 from lerobot_vtrefine.diagnose.pad.candidates.base import Form
-from lerobot_vtrefine.diagnose.pad.candidates.sample_and_hold import held, irregular_periods, pattern
+from lerobot_vtrefine.diagnose.pad.candidates.sample_and_hold import (
+    held,
+    irregular_periods,
+    pattern,
+    periods_apart,
+)
 from lerobot_vtrefine.diagnose.pad.fitting import Fit, movable, predict, tangents
 from lerobot_vtrefine.diagnose.pad.forward_model.run import Prefix
 from lerobot_vtrefine.diagnose.pad.map_prior import parts
@@ -207,6 +212,8 @@ def hold_probe(problem: "PadProblem", fitted: Fit) -> Probe | None:
     if not forms or forms[0].family in fitted.model.families:
         return None
     presses, frame_s = problem.presses, fitted.model.setting.frame_s
+    if fitted.model.setting.row_groups:
+        return _observed(forms[0].family, forms[0], np.array(periods_apart(presses, frame_s)[0]))
     rhythm = pattern(presses, frame_s)
     if rhythm is not None:
         return _observed(forms[0].family, forms[int(rhythm.free)], np.array([rhythm.period_s]))

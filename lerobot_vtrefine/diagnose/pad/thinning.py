@@ -2,7 +2,7 @@
 
 from dataclasses import replace
 
-from lerobot_vtrefine.diagnose.pad.candidates.sample_and_hold import repeated_share
+from lerobot_vtrefine.diagnose.pad.candidates.sample_and_hold import groups_apart, repeated_share
 from lerobot_vtrefine.diagnose.pad.press_trials import Press, PressSet, some_frames
 from lerobot_vtrefine.diagnose.pad.rules import ENOUGH_HZ, ENOUGH_READINGS, FEW_REPEATS
 
@@ -14,7 +14,7 @@ def thinned(presses: PressSet) -> PressSet:
     step = min(int(presses.rate_hz / ENOUGH_HZ), presses.readings // ENOUGH_READINGS)
     if step < 2:
         return presses
-    if repeated_share(presses) > FEW_REPEATS:
+    if repeated_share(presses) > FEW_REPEATS or groups_apart(presses, 1.0 / presses.rate_hz):
         return held_every(step, presses)
     return replace(presses, presses=tuple(_every(step, press) for press in presses.presses))
 

@@ -202,7 +202,9 @@ class SampleAndHold(Stage):
     Periods are counted from the episode's start or, where the board runs `free` of the host, from an instant
     drawn for every episode. Where they are irregular (`period_s` is their mean), readings are `lag_s` older
     than one of `ages_s`, each of which is as likely. With `frame_s` the reading is that of the first frame,
-    of frames this far apart, after the period began.
+    of frames this far apart, after the period began. Rows of a free board that have converters of their own
+    are refreshed in `groups`, each from an instant of its own: the number of every row's group, from the
+    first row to the last.
     """
 
     name: ClassVar[str] = "sample_and_hold"
@@ -215,23 +217,35 @@ class SampleAndHold(Stage):
     ages_s: tuple[float, ...] = ()
     lag_s: float = parameter(0.0, "s", 0.0, 0.0)
     frame_s: float = parameter(0.0, "s", 0.0, 0.0)
+    groups: tuple[int, ...] = ()
 
     def __post_init__(self) -> None:
         super().__post_init__()
         object.__setattr__(self, "ages_s", as_tuple(self.ages_s))
+        object.__setattr__(self, "groups", as_tuple(self.groups))
+        if self.groups and (not self.free or min(self.groups) < 0):
+            raise ValueError("sample_and_hold.groups needs a free board and numbers that are not negative")
         if not all(math.isfinite(age) and age >= 0 for age in self.ages_s):
             raise ValueError("sample_and_hold.ages_s needs finite numbers that are not negative")
 
     @override
     def traits(self, layout: PadLayout, pads: int, rng: np.random.Generator) -> Traits:
-        return {"phase": rng.uniform(0.0, 1.0, (pads, 1, 1))} if self.free or self.ages_s else {}
+        if not (self.free or self.ages_s):
+            return {}
+        phase = rng.uniform(0.0, 1.0, (pads, max(self.groups, default=0) + 1, 1))
+        every = np.arange(layout.rows)
+        return {"phase": phase[:, self.group_of(every, layout.rows)] if self.groups else phase}
 
     @override
     def initial(self, layout: PadLayout, pads: int) -> Traits:
         return {
             "held": np.zeros((pads, layout.rows, layout.cols), dtype=np.float32),
-            "slot": np.full((pads, 1, 1), -1, dtype=np.int64),
+            "slot": np.full((pads, layout.rows if self.groups else 1, 1), -1, dtype=np.int64),
         }
+
+    def group_of(self, row: np.ndarray, rows: int) -> np.ndarray:
+        """Number of the group that each of these rows of a pad belongs to."""
+        return np.array(self.groups)[row * len(self.groups) // rows]
 
     @override
     def step(self, x: torch.Tensor, state: State, frame: Frame) -> tuple[torch.Tensor, State]:
@@ -245,9 +259,10 @@ class SampleAndHold(Stage):
     @override
     def sequence(self, x: torch.Tensor, times_s: torch.Tensor, frame: Frame) -> torch.Tensor:
         """As `step` frame by frame; of a free board, whose instants nobody knows, the mean over them."""
-        if self.frame_s or not (self.free or self.ages_s):
+        if not (self.free or self.ages_s):
             return self.held(x, times_s)
         even = [self.period_s * (k + 0.5) / PHASES for k in range(PHASES)]
+        even = [age - age % self.frame_s for age in even] if self.frame_s else even
         ages = [self.lag_s + age for age in self.ages_s] or even
         return torch.stack([sampled(x, times_s, times_s - age) for age in ages]).mean(dim=0)
 

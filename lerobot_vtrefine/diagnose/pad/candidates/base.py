@@ -50,6 +50,8 @@ class Setting:
     """Whether damping bears a visible part of what the plain baseline predicts."""
     repeats: bool = True
     """Whether readings repeat in frames on the pad, or nothing says that they do not."""
+    row_groups: tuple[int, ...] = ()
+    """Number of every row's group where these repeat apart, in one rhythm; none where whole frames do."""
     returned: bool = False
     """Whether recordings press where others of the session have pressed before."""
     idle_counts: tuple[tuple[float, ...], ...] = ()

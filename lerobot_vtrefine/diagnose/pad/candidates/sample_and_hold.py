@@ -1,6 +1,6 @@
 """sample_and_hold: the host repeats old frames until a new one arrives."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -8,6 +8,7 @@ import numpy as np
 from lerobot_vtrefine.diagnose.core.suspicion import Suspicion
 from lerobot_vtrefine.diagnose.pad.candidates.base import Form, Setting, Value
 from lerobot_vtrefine.diagnose.pad.press_trials import Press, PressSet
+from lerobot_vtrefine.diagnose.pad.repeated_frames import Rhythm, row_groups
 from lerobot_vtrefine.diagnose.pad.rules import (
     CHANCE,
     CONTRADICTED,
@@ -23,14 +24,26 @@ from lerobot_vtrefine.diagnose.pad.rules import (
 from lerobot_vtrefine.tactile.stages.host import SampleAndHold
 
 HOLD = "sample_and_hold"
+TWO_COUNTS = 2.8
+"""Roots of a number (1.96 times that of two) by which two counts of it differ by chance once in twenty times:
+which frames contradict a free board's period depends on how well its recordings' instants are known."""
 MAX_FRAMES = 12.0
 """Longest period looked for, in frames."""
 
 
+def rhythms(presses: PressSet, groups: tuple[int, ...] = ()) -> list[Rhythm]:
+    """When readings were new, of every press, or of every group of its rows."""
+    return [part for press in presses.presses for part in press.rhythm.parts(groups)]
+
+
 def repeated_share(presses: PressSet) -> float:
     """Share of frames on the pad that repeat the one before, reading for reading."""
-    repeats = sum(int((press.rhythm.telling & ~press.rhythm.fresh).sum()) for press in presses.presses)
-    moves = sum(int(press.rhythm.telling.sum()) for press in presses.presses)
+    return _repeated(rhythms(presses))
+
+
+def _repeated(known: Sequence[Rhythm]) -> float:
+    repeats = sum(int((rhythm.telling & ~rhythm.fresh).sum()) for rhythm in known)
+    moves = sum(int(rhythm.telling.sum()) for rhythm in known)
     return repeats / moves if moves else 0.0
 
 
@@ -142,36 +155,53 @@ def pattern(presses: PressSet, frame_s: float) -> Pattern | None:
 
     Readings with noise do not repeat by chance, and where a single quiet taxel's do, not in step.
     """
-    if repeated_share(presses) < MIN_REPEATED:
+    known = rhythms(presses)
+    return next((found for free in (False, True) if (found := _pattern(known, frame_s, free))), None)
+
+
+def _pattern(known: Sequence[Rhythm], frame_s: float, free: bool) -> Pattern | None:
+    if _repeated(known) < MIN_REPEATED:
         return None
-    for free in (False, True):
-        period_s = float(np.mean(_best(presses, frame_s, free)))
-        if contradicted(presses, period_s, free) < CONTRADICTED:
-            return Pattern(period_s, free)
-    return None
+    period_s = float(np.mean(_best(known, frame_s, free)))
+    return Pattern(period_s, free) if contradicted(known, period_s, free) < CONTRADICTED else None
 
 
-def _best(presses: PressSet, frame_s: float, free: bool) -> tuple[float, float]:
+def groups_apart(presses: PressSet, frame_s: float) -> tuple[int, ...]:
+    """Number of every row's group where groups repeat apart, all with one period but each from an instant of
+    its own; none where whole frames repeat with it, or none explains what rows do."""
+    shares = [share for press in presses.presses for mask in _rows(press) if (share := _repeats(press, mask))]
+    seen, by_chance = np.mean(shares, axis=0) if shares else (0.0, 0.0)
+    if seen < MIN_REPEATED or by_chance > CHANCE * seen:
+        return ()
+    whole, groups = rhythms(presses), row_groups(rhythms(presses))
+    found = _pattern(rhythms(presses, groups), frame_s, True) if max(groups, default=0) > 0 else None
+    return groups if found and contradicted(whole, found.period_s, True) > CONTRADICTED else ()
+
+
+def _best(known: Sequence[Rhythm], frame_s: float, free: bool) -> tuple[float, float]:
     """Ends of the periods, about as long as new readings are rare, that are contradicted least [s]."""
-    guess = frame_s / max(1.0 - repeated_share(presses), 1.0 / MAX_FRAMES)
+    guess = frame_s / max(1.0 - _repeated(known), 1.0 / MAX_FRAMES)
     grid = guess * np.exp(np.linspace(-RARITY, RARITY, 160))
-    wrong = [contradicted(presses, float(period), free) for period in grid]
+    wrong = [contradicted(known, float(period), free) for period in grid]
     finer = grid[int(np.argmin(wrong))] * np.exp(np.linspace(-0.004, 0.004, 61))
-    return alike(presses, finer, free)
+    return alike(known, finer, free)
 
 
-def contradicted(presses: PressSet, period_s: float, free: bool) -> float:
+def contradicted(known: Sequence[Rhythm], period_s: float, free: bool) -> float:
     """Largest share in which the frames speak against a period."""
-    counts = np.sum([press.rhythm.against(period_s, free) for press in presses.presses], axis=0)
+    counts = np.sum([rhythm.against(period_s, free) for rhythm in known], axis=0)
     due, changed, changes, repeats, late = np.maximum(counts, [1.0, 0.0, 1.0, 1.0, 0.0])
     return float(max(changed / due, changed / changes, late / repeats / 3.0))
 
 
-def alike(presses: PressSet, grid: np.ndarray, free: bool = False) -> tuple[float, float]:
-    """Ends of the periods, of a rising grid, whose pattern of new readings fits the recorded one best [s]."""
-    sums = [sum(press.rhythm.against(float(period), free) for press in presses.presses) for period in grid]
+def alike(
+    known: Sequence[Rhythm], grid: np.ndarray, free: bool = False, scatter: float = 0.0
+) -> tuple[float, float]:
+    """Ends of the periods, of a rising grid, whose pattern of new readings fits the recorded one best [s], or
+    is contradicted by more frames by so many roots of their number alone."""
+    sums = [sum(rhythm.against(float(period), free) for rhythm in known) for period in grid]
     error = np.array([float(np.asarray(counts)[[1, 4]].sum()) for counts in sums])
-    best = np.flatnonzero(error <= error.min() + 0.5)
+    best = np.flatnonzero(error <= error.min() + 0.5 + scatter * np.sqrt(error.min()))
     spacing = grid[1] / grid[0]
     return float(grid[best].min() / spacing), float(grid[best].max() * spacing)
 
@@ -182,7 +212,7 @@ def periods(presses: PressSet, frame_s: float) -> list[list[float]]:
     if repeated_share(presses) < 0.05:
         return plain
     grid = frame_s * np.exp(np.linspace(np.log(1.05), np.log(MAX_FRAMES), 1500))
-    return [*_between(*alike(presses, grid)), *plain]
+    return [*_between(*alike(rhythms(presses), grid)), *plain]
 
 
 def frame_periods(presses: PressSet, frame_s: float) -> list[list[float]]:
@@ -190,14 +220,20 @@ def frame_periods(presses: PressSet, frame_s: float) -> list[list[float]]:
     coarse = periods(presses, frame_s)
     if repeated_share(presses) < MIN_HELD:
         return coarse
-    guess, _ = _best(presses, frame_s, False)
+    guess, _ = _best(rhythms(presses), frame_s, False)
     finer = guess * np.exp(np.linspace(-0.003, 0.003, 601))
-    return _between(*alike(presses, finer))
+    return _between(*alike(rhythms(presses), finer))
 
 
 def free_periods(presses: PressSet, frame_s: float) -> list[list[float]]:
     """Periods that fit best if new readings come free of the trials' starts [s]."""
-    return _between(*_best(presses, frame_s, True))
+    return _between(*_best(rhythms(presses), frame_s, True))
+
+
+def periods_apart(presses: PressSet, frame_s: float) -> list[list[float]]:
+    """The middle of those of groups of rows [s]."""
+    groups = row_groups(rhythms(presses))
+    return [[float(np.mean(_best(rhythms(presses, groups), frame_s, True)))]]
 
 
 def _between(low: float, high: float) -> list[list[float]]:
@@ -226,20 +262,46 @@ def _mean_period(values: np.ndarray, presses: PressSet) -> dict[str, tuple[float
     return {"period_s": (float(values[0]) / (1.0 + part), float(values[0]) / (1.0 - part))}
 
 
-def undecided(free: bool) -> Callable[[np.ndarray, PressSet], dict[str, tuple[float, float]]]:
+def undecided(
+    free: bool, apart: bool = False
+) -> Callable[[np.ndarray, PressSet], dict[str, tuple[float, float]]]:
     """Periods that repeat the same frames as the best one does: nothing recorded tells them apart."""
 
     def ends(values: np.ndarray, presses: PressSet) -> dict[str, tuple[float, float]]:
         best = float(values[0])
         reach, count = (0.003, 121) if free else (0.05, 2001)
-        low, high = alike(presses, best * np.exp(np.linspace(-reach, reach, count)), free)
+        groups = row_groups(rhythms(presses)) if apart else ()
+        grid = best * np.exp(np.linspace(-reach, reach, count))
+        low, high = alike(rhythms(presses, groups), grid, free, TWO_COUNTS * free)
         return {"period_s": (min(low, best), max(high, best))}
 
     return ends
 
 
 def _repeating(setting: Setting) -> bool:
-    return setting.repeats
+    return setting.repeats and not setting.row_groups
+
+
+def _apart(label: str, *, at_frames: bool) -> Form:
+    """Groups of rows with one period, each new from an instant of its own in every recording."""
+    return Form(
+        HOLD,
+        f"groups of rows, each free of the others, {label}",
+        (Value("period_s", 1e-3, 2.0, 0.0),),
+        lambda v, s: (
+            SampleAndHold(
+                float(v[0]), free=True, frame_s=s.frame_s if at_frames else 0.0, groups=s.row_groups
+            ),
+        ),
+        lambda v, s: {"period_s": (float(v[0]), "s"), "groups": (float(max(s.row_groups) + 1), "1")},
+        lambda s: [[2.0001 * s.frame_s]],
+        amplitude=None,
+        possible=lambda s: bool(s.row_groups),
+        search=periods_apart,
+        range=undecided(True, apart=True),
+        screened=False,
+        peer=True,
+    )
 
 
 FORMS = (
@@ -283,6 +345,8 @@ FORMS = (
         range=undecided(False),
         screened=False,
     ),
+    _apart("read at the frames", at_frames=True),
+    _apart("read on their own clock", at_frames=False),
     Form(
         HOLD,
         "irregular periods",

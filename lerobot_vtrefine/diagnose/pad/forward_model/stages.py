@@ -13,6 +13,7 @@ import torch
 
 from lerobot_vtrefine.diagnose.pad.forward_model.batches import Sheet
 from lerobot_vtrefine.diagnose.pad.forward_model.fields import Context, Field
+from lerobot_vtrefine.diagnose.pad.repeated_frames import Rhythm
 from lerobot_vtrefine.tactile.stages.base import Frame, Stage
 from lerobot_vtrefine.tactile.stages.contact import ContactStage
 from lerobot_vtrefine.tactile.stages.cover import on_springs
@@ -292,24 +293,30 @@ def _scan_skew(stage: ScanSkew, field: Field, context: Context) -> Field:
 
 
 def _hold(stage: SampleAndHold, field: Field, context: Context) -> Field:
-    """A free board's instants are those that the recording itself shows."""
+    """The instants of a free board, or of each of its groups of rows, are those that the recording shows."""
     sheet = context.sheet
     asked = sheet.frames if context.frames_only else [np.arange(len(time_s)) for time_s in sheet.times_s]
     out = np.zeros((max(len(own) for own in asked), len(field.columns)))
     for press, (time_s, own, rhythm) in enumerate(zip(sheet.times_s, asked, sheet.rhythms, strict=True)):
         part = field.within(sheet, press)
-        x = field.values[: len(time_s), part]
-        if stage.ages_s:
-            at_s = rhythm.taken_s(time_s[own]) - stage.lag_s
-            out[: len(own), part] = joined(x, *neighbours(time_s, at_s))
-        elif stage.frame_s:
-            at_s = taken_at_frames(time_s[own], stage.period_s, stage.frame_s)
-            out[: len(own), part] = joined(x, *neighbours(time_s, at_s))
-        else:
-            phase = rhythm.phase(stage.period_s) if stage.free else 0.0
-            shown = stage.shown(torch.from_numpy(time_s), phase).numpy()[own]
-            out[: len(own), part] = np.take(x, shown, axis=0)
+        x, shown = field.values[: len(time_s), part], out[: len(own), part]
+        group = stage.group_of(sheet.rows[field.columns[part]], sheet.layout.rows) if stage.groups else None
+        for number, known in enumerate(rhythm.parts(stage.groups)):
+            mine = slice(None) if group is None else np.flatnonzero(group == number)
+            shown[:, mine] = _held(stage, x[:, mine], known, time_s, own)
     return Field(out, field.columns, recorded=context.frames_only)
+
+
+def _held(
+    stage: SampleAndHold, x: np.ndarray, rhythm: Rhythm, time_s: np.ndarray, own: np.ndarray
+) -> np.ndarray:
+    """What taxels x (T, n) of one rhythm show at some of the instants (T,)."""
+    if stage.ages_s or (stage.frame_s and stage.free):
+        return joined(x, *neighbours(time_s, rhythm.taken_s(time_s[own]) - stage.lag_s))
+    if stage.frame_s:
+        return joined(x, *neighbours(time_s, taken_at_frames(time_s[own], stage.period_s, stage.frame_s)))
+    phase = rhythm.phase(stage.period_s) if stage.free else 0.0
+    return np.take(x, stage.shown(torch.from_numpy(time_s), phase).numpy()[own], axis=0)
 
 
 def _convert(stage: Quantisation, field: Field, context: Context) -> Field:
