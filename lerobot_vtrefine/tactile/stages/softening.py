@@ -106,13 +106,13 @@ class PathSoftening(Remembering):
     The path grows by every rise of the load f and never falls; k is the stiffness of the contact's springs.
     Damage that saturates along a path is Miehe's (1995) continuous damage; here the path is the load's, so
     that press after press is softer, up to the same load, too. With `session` the path begins at that of all
-    earlier recordings, as the contact's springs bear it. With `peak` the largest load so far, M, is the path's
-    length, as of damage that sets in with a first load and only grows with a larger one.
+    earlier recordings, as the contact's springs bear it. With `peak` the largest load so far, M, is the
+    path's length, as of damage that sets in with a first load and only grows with a larger one.
 
-    With `peak` and `width_m` a first load follows the virgin curve, and damage shows as it is let go: softening
-    is multiplied by erf((M - f) / (k width_m)), which is Ogden & Roxburgh's (1999) law of loads in the place
-    of energies. With a small width all of it is there at once, with a path of zero it is the same after all
-    loads.
+    With `peak` and `width_m` a first load follows the virgin curve, and damage shows as it is let go: the
+    softening is multiplied by erf((M - f) / (k width_m)), Ogden & Roxburgh's (1999) law with loads in the
+    place of energies. With a small width all of it is there at once; with a path of zero it is the same
+    after all loads.
     """
 
     name: ClassVar[str] = "path_softening"

@@ -28,10 +28,6 @@ def _plain(values: np.ndarray, setting: Setting) -> tuple[Stage, ...]:
     return (FirstLoadSoftening(float(values[0])),)
 
 
-def _growing(values: np.ndarray, setting: Setting) -> tuple[Stage, ...]:
-    return (FirstLoadSoftening(float(values[0]), growth=1.0),)
-
-
 def _free(values: np.ndarray, setting: Setting) -> tuple[Stage, ...]:
     softening, log_sharpness, growth, *recovery = (float(value) for value in values)
     recovery_s = float(np.exp(recovery[0])) if recovery else 0.0
@@ -102,7 +98,15 @@ PLAIN = _form(
     kinds=("memory", "peak"),
     needs="unload in part and load again at the same place, beyond the first load",
 )
-GROWING = _form("by the load that was let go", build=_growing, probes=lambda s: [[0.05]], peer=True)
+LET_GO = Form(
+    "first_load_softening",
+    "by how far it was let go",
+    (Value("softening", 0.0, 0.95, 2e-3), LOG_WIDTH),
+    _let_go,
+    _report_let_go,
+    lambda s: [[0.05, float(np.log(share))] for share in (0.2, 1.0)],
+    peer=True,
+)
 FREE = _form(
     "of free sharpness",
     LOG_SHARPNESS,
@@ -130,18 +134,8 @@ PATH = Form(
     peer=True,
 )
 PEAK = replace(PATH, label="by the largest load so far, under it too", build=_by_peak)
-LET_GO = Form(
-    "first_load_softening",
-    "by how far it was let go",
-    (Value("softening", 0.0, 0.95, 2e-3), LOG_WIDTH),
-    _let_go,
-    _report_let_go,
-    lambda s: [[0.05, float(np.log(share))] for share in (0.2, 1.0)],
-    screened=False,
-    peer=True,
-)
 DAMAGED = replace(
     PATH, label="by the largest load so far, as soon as it is let go", build=_at_once, screened=False
 )
-HERE = (PLAIN, beside_damping(PLAIN), GROWING, LET_GO, DAMAGED, FREE, RECOVERING, PATH, PEAK)
+HERE = (PLAIN, beside_damping(PLAIN), LET_GO, DAMAGED, FREE, RECOVERING, PATH, PEAK)
 FORMS = (*HERE, *(_through_session(form) for form in HERE))
