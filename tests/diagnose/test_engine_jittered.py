@@ -131,19 +131,25 @@ def test_what_resembles_a_touch_does_not_beat_an_offset_by_another_measure(law: 
 
 
 @pytest.mark.parametrize(
-    ("law", "label"), [("offset_toe", "felt softly before"), ("offset_late", "constant")]
+    ("law", "label"),
+    [
+        ("offset_toe", "felt softly before"),
+        ("offset_late", "constant"),
+        ("mullins_ogden", "by how far it was let go"),
+        ("mullins_damage", "by the largest load so far, as soon as it is let go"),
+    ],
 )
 def test_a_settled_name_takes_the_form_that_recordings_left_out_are_likeliest_under(
     law: str, label: str
 ) -> None:
     # Their plain errors do not tell: each touches micrometres from where it should.
-    held = recorded(law, 0.4, 4)
+    held, cause = recorded(law, 0.4, 4), EFFECTS[law].cause
     problem, fitted = PadProblem(prepare(held, list(held.trials), list(range(len(held.trials))))).weighed(
         None
     )
-    plain, *_ = forms_of("contact_offset", fitted)
+    plain, *_ = forms_of(cause, fitted)
     problem, fitted = problem.weighed(with_form(fitted, plain, (), problem.presses, problem.weights))
-    chosen = {0: (Candidate("contact_offset", form=plain),)}
+    chosen = {0: (Candidate(cause, form=plain),)}
     selection = Selection(problem, problem.baseline(), fitted, np.zeros((1, 1)), chosen, {})
     found = problem.reformed(selection, 0)
     assert [form.label for form in found.fit.model.forms] == [label]

@@ -1,6 +1,7 @@
 """First-load softening and element-by-element scanning, against closed forms."""
 
 from dataclasses import replace
+from math import erf
 
 import numpy as np
 import pytest
@@ -121,6 +122,24 @@ def test_only_a_larger_load_than_ever_softens() -> None:
     # An earlier recording pressed 2 mm deep.
     session = replace(stage, session=True)
     assert in_session(session, [0.0, 1.0], 2e-3, 5.0)[1] == pytest.approx(1 - 0.4 * (1 - np.exp(-1)))
+
+
+def test_damage_may_show_only_below_the_largest_load() -> None:
+    # A path of 2 mm is 2 N here, and damage shows within some 0.5 N of letting go.
+    values = [0.0, 1.0, 0.5, 0.0, 1.0, 1.5, 1.4]
+    stage = PathSoftening(0.4, 2e-3, peak=True, width_m=5e-4)
+    largest = np.array([0.0, 1.0, 1.0, 1.0, 1.0, 1.5, 1.5])
+    shown = np.array([0.0, 0.0, erf(1.0), erf(2.0), 0.0, 0.0, erf(0.2)])
+    left = 1 - 0.4 * (1 - np.exp(-largest / 2)) * shown
+    assert np.allclose(softened(stage, values), values * left)
+    # Without a path it is the same after all loads; an earlier recording pressed 2 mm deep.
+    session = replace(stage, path_m=0.0, session=True)
+    assert in_session(session, [0.0, 1.5], 2e-3, 5.0)[1] == pytest.approx(1.5 * (1 - 0.4 * erf(1.0)))
+
+
+def test_what_was_let_go_is_below_the_largest_load() -> None:
+    with pytest.raises(ValueError, match="needs peak"):
+        PathSoftening(0.4, 2e-3, width_m=5e-4)
 
 
 def test_a_board_may_scan_along_the_columns_too() -> None:

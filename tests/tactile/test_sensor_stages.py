@@ -399,6 +399,7 @@ WITH_MEMORY = [
     ViscoelasticRelaxation(0.3, 0.9, pushes_only=True),
     FirstLoadSoftening(0.4, 1.5, 0.5, recovery_s=3.0),
     PathSoftening(0.4, 1e-3),
+    PathSoftening(0.4, 1e-3, peak=True, width_m=3e-4),
     Latency(0.12, smoothing=0.4),
     Latency(0.1, growth=0.05),
     ScanSkew(0.05, cols_s=0.02),

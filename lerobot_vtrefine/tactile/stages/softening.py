@@ -98,6 +98,11 @@ class FirstLoadSoftening(Remembering):
         return self._softened(x, largest.to(x.dtype), frame)
 
 
+def _at_least(scale: torch.Tensor | float, like: torch.Tensor) -> torch.Tensor:
+    """A scale to divide by, of the type of a tensor."""
+    return torch.as_tensor(scale, dtype=like.dtype, device=like.device).clamp(min=1e-12)
+
+
 @register
 @dataclass(frozen=True)
 class PathSoftening(Remembering):
@@ -106,14 +111,30 @@ class PathSoftening(Remembering):
     The path grows by every rise of the load f and never falls; k is the stiffness of the contact's springs.
     Damage that saturates along a path is Miehe's (1995) continuous damage; here the path is the load's, so
     that press after press is softer, up to the same load, too. With `session` the path begins at that of all
-    earlier recordings, as the contact's springs bear it. With `peak` the largest load so far is the path's
-    length, as of damage that sets in with a first load and only grows with a larger one.
+    earlier recordings, as the contact's springs bear it. With `peak` the largest load so far, M, is the
+    path's length, as of damage that sets in with a first load and only grows with a larger one.
+
+    With `peak` and `width_m` a first load follows the virgin curve, and damage shows as it is let go: the
+    softening is multiplied by erf((M - f) / (k width_m)), Ogden & Roxburgh's (1999) law with loads in the
+    place of energies. With a small width all of it is there at once; with a path of zero it is the same
+    after all loads.
     """
 
     name: ClassVar[str] = "path_softening"
     softening: float = parameter(0.15, "1", 0.0, 0.3, maximum=1.0)
     path_m: float = parameter(2e-3, "m", 5e-4, 5e-3)
     peak: bool = False
+    width_m: float = parameter(0.0, "m", 0.0, 0.0)
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if self._let_go and not self.peak:
+            raise ValueError(f"{self.name}.width_m needs peak: what was let go is below the largest load")
+
+    @property
+    def _let_go(self) -> bool:
+        """Whether only what was let go is softer."""
+        return isinstance(self.width_m, torch.Tensor) or self.width_m > 0.0
 
     @override
     def initial(self, layout: PadLayout, pads: int) -> Traits:
@@ -126,8 +147,10 @@ class PathSoftening(Remembering):
         return True
 
     def _softened(self, x: torch.Tensor, path: torch.Tensor, frame: Frame) -> torch.Tensor:
-        scale = torch.as_tensor(self.path_m * frame.stiffness_n_per_m, dtype=x.dtype, device=x.device)
-        return x * (1.0 + self.softening * torch.expm1(-path / scale.clamp(min=1e-12)))
+        share = self.softening * torch.expm1(-path / _at_least(self.path_m * frame.stiffness_n_per_m, x))
+        if self._let_go:
+            share = share * torch.erf((path - x) / _at_least(self.width_m * frame.stiffness_n_per_m, x))
+        return x * (1.0 + share)
 
     @override
     def step(self, x: torch.Tensor, state: State, frame: Frame) -> tuple[torch.Tensor, State]:

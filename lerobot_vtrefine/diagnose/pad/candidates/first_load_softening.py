@@ -18,14 +18,14 @@ LOG_RECOVERY = Value("log_recovery", float(np.log(0.3)), float(np.log(3000.0)), 
 LOG_PATH = Value("log_path", float(np.log(0.3)), float(np.log(30.0)), 1e-2)
 """A path of a third of the deepest press is gone before the first hold; of one of thirty, more than a session
 presses most places, only the slope is seen."""
+LOG_WIDTH = Value("log_width", float(np.log(0.03)), float(np.log(2.0)), 1e-2)
+AT_ONCE = 0.005
+"""Part of the deepest press by which a load has fallen where it is said to fall: some micrometres, as well as
+recordings know their own touch."""
 
 
 def _plain(values: np.ndarray, setting: Setting) -> tuple[Stage, ...]:
     return (FirstLoadSoftening(float(values[0])),)
-
-
-def _growing(values: np.ndarray, setting: Setting) -> tuple[Stage, ...]:
-    return (FirstLoadSoftening(float(values[0]), growth=1.0),)
 
 
 def _free(values: np.ndarray, setting: Setting) -> tuple[Stage, ...]:
@@ -50,6 +50,21 @@ def _by_path(values: np.ndarray, setting: Setting) -> tuple[Stage, ...]:
 
 def _by_peak(values: np.ndarray, setting: Setting) -> tuple[Stage, ...]:
     return tuple(replace(stage, peak=True) for stage in _by_path(values, setting))
+
+
+def _let_go(values: np.ndarray, setting: Setting) -> tuple[Stage, ...]:
+    width_m = float(np.exp(values[1]) * setting.top_depth_m)
+    return (PathSoftening(float(values[0]), 0.0, peak=True, width_m=width_m),)
+
+
+def _at_once(values: np.ndarray, setting: Setting) -> tuple[Stage, ...]:
+    width_m = AT_ONCE * setting.top_depth_m
+    return tuple(replace(stage, width_m=width_m) for stage in _by_peak(values, setting))
+
+
+def _report_let_go(values: np.ndarray, setting: Setting) -> dict[str, tuple[float, str]]:
+    width_m = float(np.exp(values[1]) * setting.top_depth_m)
+    return {"softening": (float(values[0]), "1"), "width_m": (width_m, "m")}
 
 
 def _report_by_path(values: np.ndarray, setting: Setting) -> dict[str, tuple[float, str]]:
@@ -83,7 +98,15 @@ PLAIN = _form(
     kinds=("memory", "peak"),
     needs="unload in part and load again at the same place, beyond the first load",
 )
-GROWING = _form("by the load that was let go", build=_growing, probes=lambda s: [[0.05]], peer=True)
+LET_GO = Form(
+    "first_load_softening",
+    "by how far it was let go",
+    (Value("softening", 0.0, 0.95, 2e-3), LOG_WIDTH),
+    _let_go,
+    _report_let_go,
+    lambda s: [[0.05, float(np.log(share))] for share in (0.2, 1.0)],
+    peer=True,
+)
 FREE = _form(
     "of free sharpness",
     LOG_SHARPNESS,
@@ -111,5 +134,8 @@ PATH = Form(
     peer=True,
 )
 PEAK = replace(PATH, label="by the largest load so far, under it too", build=_by_peak)
-HERE = (PLAIN, beside_damping(PLAIN), GROWING, FREE, RECOVERING, PATH, PEAK)
+DAMAGED = replace(
+    PATH, label="by the largest load so far, as soon as it is let go", build=_at_once, screened=False
+)
+HERE = (PLAIN, beside_damping(PLAIN), LET_GO, DAMAGED, FREE, RECOVERING, PATH, PEAK)
 FORMS = (*HERE, *(_through_session(form) for form in HERE))
