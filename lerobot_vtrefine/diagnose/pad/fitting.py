@@ -169,13 +169,13 @@ def _grams(run: _Run, vectors: Sequence[np.ndarray], weights: Sequence[TrialWeig
     return np.array([weight.gram(own) for weight, own in zip(weights, vectors, strict=True)])
 
 
-def _solve(gram: np.ndarray, movable: np.ndarray, damping: float, others: np.ndarray) -> np.ndarray:
-    """Step along the movable coordinates, best beside the step that `others` takes along the rest."""
-    step = np.where(movable, 0.0, others)
+def _solve(gram: np.ndarray, movable: np.ndarray, damping: float) -> np.ndarray:
+    """Step along the movable coordinates."""
+    hessian, gradient = gram[:-1, :-1], gram[:-1, -1]
+    step = np.zeros(len(gradient))
     if not movable.any():
         return step
-    gradient = gram[:-1, -1] - gram[:-1, :-1] @ step
-    block = gram[:-1, :-1][np.ix_(movable, movable)]
+    block = hessian[np.ix_(movable, movable)]
     scale = np.diag(block).clip(min=1e-12)
     step[movable] = np.linalg.lstsq(block + np.diag(damping * scale), gradient[movable], rcond=1e-12)[0]
     return step
@@ -185,30 +185,22 @@ def free_step(model: Composite, gram: np.ndarray, held: Sequence[int] = ()) -> n
     """Change of all coordinates (p,) in one Gauss-Newton step without bounds."""
     step = np.zeros(len(model.values))
     free = np.setdiff1d(model.free, np.array(held, dtype=int))
-    step[free] = _solve(gram, np.diag(gram)[:-1] > 0, 1e-9, np.zeros(len(free)))
+    step[free] = _solve(gram, np.diag(gram)[:-1] > 0, 1e-9)
     return step
 
 
 def bounded_step(model: Composite, gram: np.ndarray, free: np.ndarray, damping: float) -> np.ndarray:
-    """New coordinates after one Gauss-Newton step; those that a bound stops go as far as that, and the others
-    step beside them.
-
-    A step that is only cut short leaves the others where they made up for the rest of it: a gain that goes
-    with four fractions predicts next to nothing without one of them.
-    """
+    """New coordinates after one Gauss-Newton step; those that a bound stops stay there."""
     low = np.array([value.low for value in model.coordinates])[free]
     high = np.array([value.high for value in model.coordinates])[free]
     here = model.values[free]
-    movable, step = np.diag(gram)[:-1] > 0, np.zeros(len(free))
+    movable = np.diag(gram)[:-1] > 0
     for _ in range(len(free) + 1):
-        step = _solve(gram, movable, damping, step)
-        beyond = np.flatnonzero(movable & ((here + step < low) | (here + step > high)))
-        if not len(beyond):
+        step = _solve(gram, movable, damping)
+        blocked = movable & (((here <= low) & (step < 0)) | ((here >= high) & (step > 0)))
+        if not blocked.any():
             break
-        # The first of them that meets its bound along the step.
-        room = np.clip(here + step, low, high) - here
-        first = beyond[np.argmin(room[beyond] / step[beyond])]
-        step[first], movable[first] = room[first], False
+        movable &= ~blocked
     values = model.values.copy()
     values[free] = np.clip(here + step, low, high)
     return values
