@@ -17,7 +17,8 @@ results/reference_hopper.json from the curves that are there.
 Ours learns from whole episodes and the reference from segments of 500 decisions that go on where the last
 one stopped. So an iteration of ours has as many worlds as make the same 20 000 decisions, by the mean length
 of the episodes before. Environment steps count alike, and both are evaluated after the same of them, on the
-same 40 held-out episodes, each by its own deployment sampler.
+same 40 held-out episodes, each by its own deployment sampler. ``--by=reference_quiet`` and the like give the
+reference one of the things in which ours differs (``reference/hopper/theirs.py``).
 """
 
 import argparse
@@ -30,7 +31,7 @@ from reference.hopper.curves import Curve, lines_of, read_curves
 from reference.hopper.network import imitation
 from reference.hopper.ours import PRESETS, train_ours
 from reference.hopper.standin import Scales, imitate, record
-from reference.hopper.theirs import train_reference
+from reference.hopper.theirs import VARIANTS, train_reference
 from reference.hopper.worlds import CHUNK, N_STEPS, NUM_ENVS, make_worlds
 
 from lerobot_vtrefine.cli.arguments import CommandParser
@@ -59,7 +60,7 @@ def train(args: argparse.Namespace) -> None:
     worlds = make_worlds(args.workers)
     torch.set_num_threads(args.threads)
     curve = Curve(args.folder / "curves" / f"{args.by}_{args.seed}.jsonl", by=args.by, seed=args.seed)
-    (train_reference if args.by == "reference" else train_ours)(args, worlds, curve)
+    (train_reference if args.by in VARIANTS else train_ours)(args, worlds, curve)
 
 
 def rows(args: argparse.Namespace) -> None:
@@ -81,7 +82,7 @@ def main() -> int:
     parser.add_argument("what", choices=("data", "pretrain", "train", "rows"))
     parser.add_argument("--folder", type=Path, required=True, help="of episodes, checkpoint and curves")
     parser.add_argument("--reference", type=Path, help="a checkout of irom-princeton/dppo")
-    parser.add_argument("--by", default="reference", choices=("reference", *PRESETS), help="who trains")
+    parser.add_argument("--by", default="reference", choices=(*VARIANTS, *PRESETS), help="who trains")
     parser.add_argument("--device", default="cpu", help="of the policy: cpu or cuda")
     parser.add_argument("--threads", type=int, default=1, help="of the policy on a CPU")
     parser.add_argument("--workers", type=int, default=1, help="processes that simulate")

@@ -14,6 +14,9 @@ from lerobot_vtrefine.cli.results.rows import Line
 
 NAMES = {
     "reference": "the reference implementation",
+    "reference_quiet": "the reference, untuned steps without noise",
+    "reference_critic": "the reference, its critic's input standardised",
+    "reference_quiet_critic": "the reference with both",
     "paper": "`--dppo.type=paper`",
     "trust_region": "`--dppo.type=trust_region`",
 }

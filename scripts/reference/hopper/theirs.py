@@ -42,24 +42,73 @@ class Steps(Tensor):
         return iter(self.tolist())
 
 
-def model_to_tune(reference: Reference, checkpoint: Path, device: str) -> nn.Module:
-    """Its ``PPODiffusion`` from a checkpoint."""
+VARIANTS: dict[str, frozenset[str]] = {
+    "reference": frozenset(),
+    "reference_quiet": frozenset({"quiet"}),
+    "reference_critic": frozenset({"critic"}),
+    "reference_quiet_critic": frozenset({"quiet", "critic"}),
+}
+"""By name: what the reference takes over from ours. ``quiet``: untuned denoising steps without noise;
+``critic``: the critic's input is standardised.
+"""
+NOISE_CLIP = 3.0
+
+
+def quiet_prefix(model: nn.Module, x: Tensor, t: Tensor, mean: Tensor) -> Tensor:
+    """The DDIM step with eta = 0 in place of the DDPM posterior's ``mean`` (B, H, D) of one untuned step."""
+    a, b = model.ddpm_mu_coef1[t[0]], model.ddpm_mu_coef2[t[0]]
+    here, after = model.alphas_cumprod[t[0]], model.alphas_cumprod_prev[t[0]]
+    clean = (mean - b * x) / a
+    return after.sqrt() * clean + (1 - after).sqrt() * (x - here.sqrt() * clean) / (1 - here).sqrt()
+
+
+def standardised(critic: type[nn.Module], episodes: Path) -> type[nn.Module]:
+    """Critics of a class whose scaled observation is standardised by that of the recorded episodes."""
+    with np.load(episodes) as recorded:
+        obs = Scales.of(episodes).scaled_obs(recorded["obs"])
+
+    class Standardised(critic):
+        def __init__(self, *args: Any, **kwargs: Any) -> None:
+            super().__init__(*args, **kwargs)
+            self.register_buffer("mean", torch.from_numpy(obs.mean(0)))
+            self.register_buffer("std", torch.from_numpy(obs.std(0)))
+
+        def forward(self, cond: Any) -> Tensor:
+            state = cond["state"].flatten(1)
+            return super().forward((state - self.mean) / self.std)
+
+    return Standardised
+
+
+def model_to_tune(reference: Reference, folder: Path, device: str, variant: frozenset[str]) -> nn.Module:
+    """Its ``PPODiffusion`` from the checkpoint of a folder."""
 
     class Model(reference.Model):
+        def p_mean_var(self, x: Tensor, t: Tensor, *args: Any, **kwargs: Any) -> Any:
+            mean, *rest = super().p_mean_var(x, t, *args, **kwargs)
+            if "quiet" in variant:
+                untuned = int(t[0]) >= self.ft_denoising_steps  # steps of one call are all of one kind
+                self.randn_clip_value = 0.0 if untuned else NOISE_CLIP
+                mean = quiet_prefix(self, x, t, mean) if untuned else mean
+            return mean, *rest
+
         def loss(
             self, obs: Any, before: Tensor, after: Tensor, steps: Tensor, *rest: Any, **more: Any
         ) -> Any:
             return super().loss(obs, before, after, steps.as_subclass(Steps), *rest, **more)
 
+    critic = reference.Critic
+    if "critic" in variant:
+        critic = standardised(critic, folder / "episodes.npz")
     return Model(
         actor=fresh(reference),
-        critic=reference.Critic(OBS_DIM, [256, 256, 256], activation_type="Mish", residual_style=True),
-        network_path=str(checkpoint),
+        critic=critic(OBS_DIM, [256, 256, 256], activation_type="Mish", residual_style=True),
+        network_path=str(folder / "pretrained.pt"),
         gamma_denoising=0.99,
         clip_ploss_coef=0.01,
         clip_ploss_coef_base=0.01,
         clip_ploss_coef_rate=3,
-        randn_clip_value=3,
+        randn_clip_value=NOISE_CLIP,
         min_sampling_denoising_std=0.1,
         min_logprob_denoising_std=0.1,
         ft_denoising_steps=TUNED_STEPS,
@@ -177,7 +226,7 @@ def train_reference(args: argparse.Namespace, worlds: Worlds | SpreadWorlds, cur
         action_dim=ACTION_DIM,
         horizon_steps=CHUNK,
         act_steps=CHUNK,
-        model=model_to_tune(reference, args.folder / "pretrained.pt", args.device),
+        model=model_to_tune(reference, args.folder, args.device, VARIANTS[args.by]),
         train=Settings(
             batch_size=50000,
             n_train_itr=args.iterations + args.iterations // args.every + 1,
