@@ -11,8 +11,8 @@
 reference ships (``reference/hopper/standin.py``). ``train`` fine-tunes that one checkpoint: the reference's
 agent, with its loop, loss, critic, optimisers and schedules unchanged and the hyper-parameters of its
 ``ft_ppo_diffusion_mlp.yaml`` for Hopper, or ours, ``paper`` with the same hyper-parameters, ``trust_region``
-with its own. Every line of a learning curve lies on disk at once. ``rows`` makes the table of
-results/reference_hopper.json from the curves that are there.
+with its own. Every line of a learning curve lies on disk at once. ``rows`` adds those of the
+curves that are there to results/reference_hopper.json.
 
 Ours learns from whole episodes and the reference from segments of 500 decisions that go on where the last
 one stopped. So an iteration of ours has as many worlds as make the same 20 000 decisions, by the mean length
@@ -70,9 +70,10 @@ def rows(args: argparse.Namespace) -> None:
         raise ValueError(f"{args.folder / 'curves'} holds no evaluation")
     origin = provenance() | {"machine": args.machine or provenance()["machine"]}
     found: list[tuple[Row, list[dict[str, float]]]] = [
-        (line, []) for line in lines_of(curves, args.every * NUM_ENVS * N_STEPS * CHUNK, **origin)
+        (line, [])
+        for line in lines_of(curves, args.every * NUM_ENVS * N_STEPS * CHUNK, args.start, **origin)
     ]
-    save(args.results, found, replace=True)
+    save(args.results, found, replace=False)
 
 
 @run_cli
@@ -100,6 +101,7 @@ def main() -> int:
         default=0,
         help="of the search, the imitation or the training (default %(default)s)",
     )
+    parser.add_argument("--start", default="A", help="name of the folder's imitation, in its rows")
     parser.add_argument("--machine", help="that trained, for the rows; default: this one")
     parser.add_argument(
         "--results", type=Path, default=ROOT / "results" / "reference_hopper.json", help="file of the rows"

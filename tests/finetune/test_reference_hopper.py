@@ -10,7 +10,7 @@ from reference.hopper.curves import NAMES, Curve, lines_of, read_curves
 from reference.hopper.network import DENOISING_STEPS, TUNED_STEPS
 from reference.hopper.ours import PRESETS, SAME, HopperDecisions, hopper_agent
 from reference.hopper.standin import Scales, windows
-from reference.hopper.theirs import ReferenceHoppers, Steps
+from reference.hopper.theirs import ReferenceHoppers, Steps, quiet_prefix, standardised
 from reference.hopper.worlds import ACTION_DIM, CHUNK, OBS_DIM, SpreadWorlds, Step, Worlds
 from torch import nn
 
@@ -18,7 +18,12 @@ from lerobot_vtrefine.finetune.chains import chain_log_probs, explore
 from lerobot_vtrefine.finetune.config import DppoConfig
 from lerobot_vtrefine.finetune.protocols import predictor
 from lerobot_vtrefine.finetune.seeds import EVALUATION_SEEDS, TRAINING_SEEDS
-from lerobot_vtrefine.policies.vt_dp3.diffusion import denoise_prefix
+from lerobot_vtrefine.policies.vt_dp3.diffusion import (
+    DiffusionProcess,
+    denoise_prefix,
+    squaredcos_alpha_bar,
+    step_grid,
+)
 
 ORIGIN = {"commit": None, "command": None, "machine": None}
 
@@ -172,6 +177,41 @@ def test_steps_are_gone_through_as_numbers() -> None:
     assert type(torch.arange(5)[steps]) is torch.Tensor
 
 
+def test_an_untuned_step_without_noise_is_ours() -> None:
+    process = DiffusionProcess(DENOISING_STEPS, step_grid("ddpm", DENOISING_STEPS, DENOISING_STEPS))
+    bars = squaredcos_alpha_bar(DENOISING_STEPS)
+    before = torch.cat([torch.ones(1), bars[:-1]]).double()
+    betas = 1 - bars / before
+
+    class Theirs(nn.Module):  # the schedule as the reference keeps it
+        alphas_cumprod, alphas_cumprod_prev = bars, before
+        ddpm_mu_coef1 = betas * before.sqrt() / (1 - bars)
+        ddpm_mu_coef2 = (1 - before) * (1 - betas).sqrt() / (1 - bars)
+
+    generator = torch.Generator().manual_seed(0)
+    x, eps = torch.randn(2, 5, CHUNK, ACTION_DIM, dtype=torch.float64, generator=generator)
+    position = 3
+    t = torch.full((5,), DENOISING_STEPS - 1 - position)
+    mean, _ = process.step(lambda *_: eps, x, position, eta=1.0)
+    quiet, _ = process.step(lambda *_: eps, x, position, eta=0.0)
+    torch.testing.assert_close(quiet_prefix(Theirs(), x, t, mean), quiet)
+
+
+def test_a_standardised_critic_sees_deviations_of_the_recorded_episodes(tmp_path) -> None:
+    obs = np.random.default_rng(0).normal(3.0, 2.0, (1000, OBS_DIM)).astype(np.float32)
+    np.savez(tmp_path / "episodes.npz", obs=obs, actions=np.eye(ACTION_DIM, dtype=np.float32))
+
+    class Echo(nn.Module):
+        def forward(self, state):
+            return state
+
+    critic = standardised(Echo, tmp_path / "episodes.npz")()
+    state = torch.from_numpy(Scales.of(tmp_path / "episodes.npz").scaled_obs(obs))
+    seen = critic({"state": state.unsqueeze(1)})
+    torch.testing.assert_close(seen.mean(0), torch.zeros(OBS_DIM), atol=1e-3, rtol=0)
+    torch.testing.assert_close(seen.std(0), torch.ones(OBS_DIM), atol=2e-3, rtol=0)
+
+
 def test_scaled_actions_become_the_environments_again(scales: Scales, tmp_path) -> None:
     scales.save(tmp_path / "scales.npz")
     raw = np.array([-2.0, 0.3, 1.0])
@@ -195,13 +235,13 @@ def test_curves_become_rows_at_the_same_steps(tmp_path) -> None:
         curve.add(1, 100_000, **{"return": 5.0})
         curve.add(2, 204_000, **{"return": 7.0})
         curve.add(2, 200_000, eval_return=last)
-    rows = lines_of(read_curves(tmp_path), 100_000.0, **ORIGIN)
+    rows = lines_of(read_curves(tmp_path), 100_000.0, "A", **ORIGIN)
     found = [row.cells for row in rows]
     ours = NAMES["paper"]
-    assert [cells["fine-tuned by"] for cells in found] == [
-        NAMES["reference"],
-        ours,
-        f"{ours} minus the reference",
+    assert [cells["imitation, fine-tuned by"] for cells in found] == [
+        f"A: {NAMES['reference']}",
+        f"A: {ours}",
+        f"A: {ours} minus the reference",
     ]
     assert [list(cells.values())[1:] for cells in found] == [
         [

@@ -87,10 +87,10 @@ def summary(points: Points, step: float, rounds: int) -> dict[str, float]:
     return found
 
 
-def lines_of(runs: Runs, step: float, **origin: Any) -> list[Line]:
-    """A row for each who trained, and one for each of ours minus the reference, seed by seed.
+def lines_of(runs: Runs, step: float, start: str, **origin: Any) -> list[Line]:
+    """A row for each who trained, and one for each of the others minus the reference, seed by seed.
 
-    As many rounds of ``step`` environment steps as all runs have made, give or take a tenth of one.
+    ``start`` names the imitation in every row. As many rounds of ``step`` environment steps as all runs have made, give or take a tenth of one.
     """
     reached = min(points.held_out[-1][0] for seeds in runs.values() for points in seeds.values())
     rounds = int(reached / step + 0.1)
@@ -111,7 +111,7 @@ def lines_of(runs: Runs, step: float, **origin: Any) -> list[Line]:
     return [
         Line(
             table=TABLE,
-            cells={"fine-tuned by": words, "seeds": str(len(found))}
+            cells={"imitation, fine-tuned by": f"{start}: {words}", "seeds": str(len(found))}
             | {
                 head: cell([one[head] for one in found.values()], sign) for head in next(iter(found.values()))
             },
