@@ -7,7 +7,7 @@ installed package, this folder and tests/diagnose beside it. Seeds up to those t
 names have been looked at. The 50 sets of a seed have a specimen, a rig and a session each, so that tables may
 count them one by one; they take about 1400 s of one core:
 
-    python scripts/bench_jittered.py --seeds=9500:9507 --jobs=16
+    python scripts/bench_jittered.py --seeds=9510:9517 --jobs=16
     python scripts/collect_results.py jittered outputs/bench_jittered/table.md --replace
     make tables
 """

@@ -8,7 +8,7 @@ results/outsider.json names have been looked at. It needs the installed package,
 tests/diagnose beside it; an interrupted run goes on where it stopped, and a change of the engine needs
 another folder. 300 sets take about 9000 s of one core:
 
-    python scripts/bench_outsider.py --first_seed=11000 --sets=300
+    python scripts/bench_outsider.py --first_seed=11500 --sets=300
     python scripts/collect_results.py outsider outputs/bench_outsider/table.md --replace
     make tables
 """

@@ -70,8 +70,7 @@ def rows(args: argparse.Namespace) -> None:
         raise ValueError(f"{args.folder / 'curves'} holds no evaluation")
     origin = provenance() | {"machine": args.machine or provenance()["machine"]}
     found: list[tuple[Row, list[dict[str, float]]]] = [
-        (line, [])
-        for line in lines_of(curves, args.every * NUM_ENVS * N_STEPS * CHUNK, args.start, **origin)
+        (line, []) for line in lines_of(curves, args.every * NUM_ENVS * N_STEPS * CHUNK, args.start, **origin)
     ]
     save(args.results, found, replace=False)
 

@@ -11,10 +11,11 @@ from test_engine_pad import COLS, ROWS, heights, linear, one_trial
 from lerobot_vtrefine.diagnose.core.suspicion import Suspicion
 from lerobot_vtrefine.diagnose.pad import repeatability
 from lerobot_vtrefine.diagnose.pad.baseline import Baseline, fit_baseline
-from lerobot_vtrefine.diagnose.pad.error_level import beside_the_indenter, one_taxel
+from lerobot_vtrefine.diagnose.pad.error_level import beside_the_indenter, largest_usual, one_taxel
 from lerobot_vtrefine.diagnose.pad.press_trials import PressSet, prepare
 from lerobot_vtrefine.diagnose.pad.problem import PadProblem
 from lerobot_vtrefine.diagnose.pad.repeatability import Correlations, cleaned, in_all_pairs, left_over
+from lerobot_vtrefine.diagnose.pad.rules import OTHERS
 from lerobot_vtrefine.diagnose.pad.suspicions import following
 from lerobot_vtrefine.diagnose.recordings import RecordingSet, Trial
 
@@ -142,3 +143,11 @@ def test_corners_between_two_frames_are_no_cause(monkeypatch) -> None:
     assert not fired()
     monkeypatch.setattr(repeatability, "CORNER", np.inf)
     assert fired()  # every replicate turns at the same moment
+
+
+@pytest.mark.parametrize("number", [60, 300, 3000])
+def test_the_largest_of_many_normal_levels_is_usual(number) -> None:
+    squares = (3.0 * np.random.default_rng(0).normal(size=(400, number))) ** 2
+    beyond = np.mean([one.max() > OTHERS * largest_usual(one) for one in squares])
+    assert beyond < 0.01
+    assert largest_usual(squares[0]) > np.median(squares.max(1))

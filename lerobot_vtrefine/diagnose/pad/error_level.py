@@ -7,7 +7,9 @@ compared with what sound recordings have; nothing is tested. Shapes: K recording
 from collections.abc import Sequence
 
 import numpy as np
+from scipy.stats import chi2
 
+from lerobot_vtrefine.diagnose.core.rules import SUSPICION_ALPHA
 from lerobot_vtrefine.diagnose.core.suspicion import Suspicion
 from lerobot_vtrefine.diagnose.pad.fitting import Fit
 from lerobot_vtrefine.diagnose.pad.press_trials import PressSet
@@ -113,6 +115,15 @@ def beside_the_indenter(
     return beyond(ratio, BESIDE, text)
 
 
+def largest_usual(squares: np.ndarray) -> float:
+    """What the largest of mean squares (N,) rarely exceeds where levels are normal numbers.
+
+    Their upper quantile tells the scale.
+    """
+    high = max(float(np.quantile(squares, MOST)), 0.5)
+    return high * float(chi2.isf(SUSPICION_ALPHA / len(squares), 1) / chi2.isf(1.0 - MOST, 1))
+
+
 def one_taxel(
     presses: PressSet, residuals: Sequence[np.ndarray], weights: Sequence[TrialWeights]
 ) -> Suspicion | None:
@@ -120,7 +131,8 @@ def one_taxel(
     now and then.
 
     Noise that wanders for longer than a recording leaves each taxel a level of its own there, whose square is
-    large in one of hundreds; so it must stand out from those of the others that err most.
+    large in one of hundreds; so it must stand out from those of the others that err most, by more than the
+    largest of so many squares of normal numbers would.
     """
     taxels, ratios, files = [], [], []
     for press, residual, weight in zip(presses.presses, residuals, weights, strict=True):
@@ -134,10 +146,10 @@ def one_taxel(
         return None
     worst = int(np.argmax(ratios))
     ratio, others = ratios[worst], np.array(taxels) != taxels[worst]
-    high = float(np.quantile(np.array(ratios)[others], MOST)) if others.any() else 0.0
+    usual = np.array(ratios)[others] if others.any() else np.zeros(1)
     row, col = divmod(taxels[worst], presses.layout.cols)
     text = (
         f"errors of taxel ({row}, {col}) in {files[worst]} are {np.sqrt(max(ratio, 0.0)):.1f} times "
         "the noise of single frames"
     )
-    return beyond(ratio, TAXEL, text, also=ratio > OTHERS * max(high, 0.5))
+    return beyond(ratio, TAXEL, text, also=ratio > OTHERS * largest_usual(usual))

@@ -102,9 +102,10 @@ BESIDE = 1.15
 TAXEL = 12.0
 """Mean square of slow errors of one taxel in one recording under pressure, in variances of a frame's noise:
 three times what noise that wanders for seconds reaches."""
-MOST, OTHERS = 0.9, 6.0
-"""Quantile of all such mean squares, and the factor by which a failing taxel's exceeds it: errors of all are
-no taxel's. Of squares of normal numbers the largest of 600 is 4 times as large."""
+MOST, OTHERS = 0.9, 1.5
+"""Quantile of all such mean squares, which tells their scale: errors of all are no taxel's. A failing taxel's
+exceeds the largest usual one of so many squares of normal numbers by this factor, as levels that noise, gains
+and first touches leave are only nearly normal."""
 FAILING = 0.25
 """Product of the differences of a taxel's white errors in replicates, a few frames apart, in variances of
 noise, that is worth an alarm: taxels that fail now and then reach .4 to 3, others .3 in a single pair."""
