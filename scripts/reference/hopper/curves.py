@@ -90,7 +90,8 @@ def summary(points: Points, step: float, rounds: int) -> dict[str, float]:
 def lines_of(runs: Runs, step: float, start: str, **origin: Any) -> list[Line]:
     """A row for each who trained, and one for each of the others minus the reference, seed by seed.
 
-    ``start`` names the imitation in every row. As many rounds of ``step`` environment steps as all runs have made, give or take a tenth of one.
+    ``start`` names the imitation in every row. There are as many rounds of ``step`` environment steps as all
+    runs have made, give or take a tenth of one.
     """
     reached = min(points.held_out[-1][0] for seeds in runs.values() for points in seeds.values())
     rounds = int(reached / step + 0.1)
