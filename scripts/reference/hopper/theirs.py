@@ -54,16 +54,19 @@ VARIANTS: dict[str, frozenset[str]] = {
 NOISE_CLIP = 3.0
 
 
-def quiet_prefix(model: nn.Module, x: Tensor, t: Tensor, mean: Tensor) -> Tensor:
-    """The DDIM step with eta = 0 in place of the DDPM posterior's ``mean`` (B, H, D) of one untuned step."""
+def quiet_prefix(model: Any, x: Tensor, t: Tensor, mean: Tensor) -> Tensor:
+    """The DDIM step with eta = 0 in place of the DDPM posterior's ``mean`` (B, H, D), of one untuned step t (B,).
+
+    ``model`` holds the reference's schedule.
+    """
     a, b = model.ddpm_mu_coef1[t[0]], model.ddpm_mu_coef2[t[0]]
     here, after = model.alphas_cumprod[t[0]], model.alphas_cumprod_prev[t[0]]
     clean = (mean - b * x) / a
     return after.sqrt() * clean + (1 - after).sqrt() * (x - here.sqrt() * clean) / (1 - here).sqrt()
 
 
-def standardised(critic: type[nn.Module], episodes: Path) -> type[nn.Module]:
-    """Critics of a class whose scaled observation is standardised by that of the recorded episodes."""
+def standardised(critic: Any, episodes: Path) -> Any:
+    """A class of the reference's critics, its scaled observation standardised by that of recorded episodes."""
     with np.load(episodes) as recorded:
         obs = Scales.of(episodes).scaled_obs(recorded["obs"])
 
