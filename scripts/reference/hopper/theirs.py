@@ -55,9 +55,9 @@ NOISE_CLIP = 3.0
 
 
 def quiet_prefix(model: Any, x: Tensor, t: Tensor, mean: Tensor) -> Tensor:
-    """The DDIM step with eta = 0 in place of the DDPM posterior's ``mean`` (B, H, D), of one untuned step t (B,).
+    """The DDIM step with eta = 0 in place of the DDPM posterior's ``mean`` (B, H, D).
 
-    ``model`` holds the reference's schedule.
+    x (B, H, D) at the same step t (B,) for all; ``model`` holds the reference's schedule.
     """
     a, b = model.ddpm_mu_coef1[t[0]], model.ddpm_mu_coef2[t[0]]
     here, after = model.alphas_cumprod[t[0]], model.alphas_cumprod_prev[t[0]]
@@ -66,7 +66,7 @@ def quiet_prefix(model: Any, x: Tensor, t: Tensor, mean: Tensor) -> Tensor:
 
 
 def standardised(critic: Any, episodes: Path) -> Any:
-    """A class of the reference's critics, its scaled observation standardised by that of recorded episodes."""
+    """The reference's critic with its scaled observation standardised by that of recorded episodes."""
     with np.load(episodes) as recorded:
         obs = Scales.of(episodes).scaled_obs(recorded["obs"])
 
