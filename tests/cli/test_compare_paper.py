@@ -8,6 +8,8 @@ from pathlib import Path
 
 import compare_paper as script
 import pytest
+from paper import trained
+from paper.outcome import failures, tell_of_room
 
 from lerobot_vtrefine.cli.results.rows import Run, read_rows
 from lerobot_vtrefine.cli.results.tables import table
@@ -46,7 +48,7 @@ def parse(arguments: list[str]) -> argparse.Namespace:
 def test_policies_become_rows_of_both_tables_and_are_not_made_twice(
     run: Callable[..., str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(script, "MODALITIES", ("visuo_tactile",))
+    monkeypatch.setattr(trained, "MODALITIES", ("visuo_tactile",))
     told = run("--pairs", "00186")
     assert told.count("done before") == 2  # encoder and demonstrations, which random weights share
     paper, fewer = of(tmp_path / "paper.json"), of(tmp_path / "demonstrations.json")
@@ -55,9 +57,7 @@ def test_policies_become_rows_of_both_tables_and_are_not_made_twice(
     assert paper["without pre-training"].iterations == 20
     assert paper["imitation"].extra["peak_force_n"] == 8.0
     assert (paper[""].extra["picked_up"], paper[""].extra["failed_dropped"]) == (0.75, 0.25)
-    told = script.failures(
-        {"episodes": 4, "picked_up": None, "failures": {"time-out": 1, "in-hand shift": 2}}
-    )
+    told = failures({"episodes": 4, "picked_up": None, "failures": {"time-out": 1, "in-hand shift": 2}})
     assert told == {"failed_time_out": 0.25, "failed_in_hand_shift": 0.5}  # as vtrefine-finetune's columns
     assert set(fewer) == {"30 demonstrations, imitation", "30 demonstrations"}
     shown = table("paper", [*paper.values()])
@@ -92,7 +92,7 @@ def test_dppo_may_start_in_hand_where_hands_can_hold_and_is_judged_from_the_tabl
 def test_dppo_may_start_from_a_bank_of_the_imitations_own_grasps(
     run: Callable[..., str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(script, "MODALITIES", ("visuo_tactile",))
+    monkeypatch.setattr(trained, "MODALITIES", ("visuo_tactile",))
     told = run("--pairs", "00581", "--tune_start=bank", "--starts=64")
     assert told.count("Grasps of") == 1  # random weights never get that far
     bank = tmp_path / "out" / "starts_00581_visuo_tactile_0_30" / "starts.npz"
@@ -147,9 +147,9 @@ def test_an_encoder_that_is_named_is_taken_in_place_of_one_trained_here() -> Non
 
 
 def test_episodes_that_the_simulation_ended_are_told(capsys: pytest.CaptureFixture[str]) -> None:
-    script.tell_of_room("finetune of 00081_visual_0_30", 0.004)
+    tell_of_room("finetune of 00081_visual_0_30", 0.004)
     assert not capsys.readouterr().err
-    script.tell_of_room("finetune of 00081_visual_0_30", 0.28)
+    tell_of_room("finetune of 00081_visual_0_30", 0.28)
     told = capsys.readouterr().err
     assert told.startswith("warning: finetune of 00081_visual_0_30: 28% of the episodes ended because")
     assert told.count("\n") == 1

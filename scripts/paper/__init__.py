@@ -1,0 +1,1 @@
+"""The paper's tables in simulation, for scripts/compare_paper.py."""

@@ -1,0 +1,78 @@
+"""Rows of the paper's tables from what was judged."""
+
+import argparse
+import sys
+from typing import Any
+
+from lerobot_vtrefine.cli.report.results import load_evaluation
+from lerobot_vtrefine.cli.results.collect import Progress, largest_fall, last_steps
+from lerobot_vtrefine.cli.results.provenance import provenance
+from lerobot_vtrefine.cli.results.rows import Row, Run, read_rows
+from lerobot_vtrefine.cli.results.tables import MEASURED
+from lerobot_vtrefine.finetune.logger import read_progress
+from paper.trained import Trained, first_seed, iterations_of, key, tables, variants
+
+NO_ROOM = "failed_overflow"
+LOST = 0.01
+"""Share of episodes without room above which what is left is no result."""
+
+
+def rows(options: argparse.Namespace, policy: Trained, table: str) -> list[tuple[Row, Progress]]:
+    """What was found, with the learning curve beside the tuned policy."""
+    found: list[tuple[Row, Progress]] = []
+    progress = read_progress(options.output_dir / f"finetune_{policy.name}")
+    for stage, kind in variants(policy).items():
+        tuned = stage == "finetune"
+        judged = load_evaluation(options.output_dir / f"eval_{stage}_{policy.name}", first_seed(policy))
+        medians = judged["metrics"]["successes"]
+        extra = {key: medians[key]["median"] for key, *_ in MEASURED if medians.get(key)}
+        extra |= failures(judged)
+        tell_of_room(f"{stage} of {policy.name}", extra.get(NO_ROOM, 0.0))
+        if tuned:
+            extra |= {"largest_fall": largest_fall(progress)}
+        row = Run(
+            **key(policy, table, kind),
+            success=judged["success"] / judged["episodes"],
+            episodes=judged["episodes"],
+            iterations=iterations_of(options, policy) if tuned else 0,
+            env_steps=last_steps(progress) if tuned else 0,
+            extra=extra,
+            **provenance() | {"commit": provenance()["commit"] or options.commit},
+        )
+        found.append((row, progress if tuned else []))
+    return found
+
+
+def failures(judged: dict[str, Any]) -> dict[str, float]:
+    """Shares of an evaluation's episodes: both parts picked up, and what ended those that failed."""
+    shares = {
+        f"failed_{name.replace(' ', '_').replace('-', '_')}": count / judged["episodes"]
+        for name, count in judged["failures"].items()
+    }
+    if judged["picked_up"] is not None:
+        shares["picked_up"] = judged["picked_up"]
+    return {name: round(share, 4) for name, share in sorted(shares.items())}
+
+
+def tell_of_room(name: str, share: float) -> None:
+    """Warn where the simulation ended episodes by itself: worlds share their room, and whole batches end."""
+    if share > LOST:
+        print(
+            f"warning: {name}: {share:.0%} of the episodes ended because the simulation had no room for more"
+            " contacts; start anew with more, "
+            """--env='{"warp": {"contacts_per_world": 512, "rows_per_world": 1024}}'""",
+            file=sys.stderr,
+        )
+
+
+def is_done(options: argparse.Namespace, policy: Trained) -> bool:
+    """Whether all rows of a policy are there, with these numbers of episodes and iterations."""
+    for table in tables(policy):
+        path = options.results / f"{table}.json"
+        there = {row.key: row for row in (read_rows(path) if path.is_file() else []) if isinstance(row, Run)}
+        for stage, kind in variants(policy).items():
+            row = there.get(tuple(key(policy, table, kind).values()))
+            wanted = iterations_of(options, policy) if stage == "finetune" else 0
+            if row is None or (row.episodes, row.iterations) != (options.episodes, wanted):
+                return False
+    return True
