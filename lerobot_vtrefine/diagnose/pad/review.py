@@ -231,7 +231,7 @@ def on_uneven_face(state: State) -> State:
     if ContactOffset.name not in model.families or uneven(model):
         return state
     best, held = state.fit, state.held(state.fit)
-    for fitted in [state.fit, *([state.without(GAIN_MAP)] if model.gain_map is not None else [])]:
+    for fitted in [*([state.without(GAIN_MAP)] if model.gain_map is not None else []), state.fit]:
         found = on_told_face(fitted, state.problem.presses, state.problem.weights)
         judged = state.held(found)
         if agree(judged.better_by(held), state.seed, FORM_P):

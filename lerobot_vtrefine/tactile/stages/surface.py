@@ -54,7 +54,7 @@ def hinge(depth: torch.Tensor, at_m: float, width_m: float) -> torch.Tensor:
 @register
 @dataclass(frozen=True)
 class UnevenFace(Stage):
-    """The face of every taxel lies deeper by an amount of its own: d - `lower_m`, (R, C) or one number [m]."""
+    """Every taxel's face lies deeper by an amount of its own: d - `lower_m`, (R, C) or one number [m]."""
 
     name: ClassVar[str] = "uneven_face"
     domain: ClassVar[str] = "depth"

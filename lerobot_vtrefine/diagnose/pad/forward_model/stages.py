@@ -350,7 +350,15 @@ OWN_TAXELS: dict[type, Callable[[Any, Field, Context], Field]] = {
 }
 """Stages that know which taxel they act on, or what else the recording tells."""
 SEPARATE = (
-    PadTilt | UnevenFace | TaxelGainSpread | DeadTaxels | Idle | BaselineDrift | ScanSkew | SampleAndHold | Quantisation
+    PadTilt
+    | UnevenFace
+    | TaxelGainSpread
+    | DeadTaxels
+    | Idle
+    | BaselineDrift
+    | ScanSkew
+    | SampleAndHold
+    | Quantisation
 )
 """Of these, those that do not mix a taxel with others."""
 KEEPS_ORDER = (ContactOffset, StiffeningDepth, PadTilt, UnevenFace)
