@@ -1,11 +1,13 @@
 """A contact offset that is another at every taxel: a cover of uneven thickness."""
 
 import numpy as np
+import pytest
 from test_engine_pad import COLS, ROWS, linear, names, recordings
 
 from lerobot_vtrefine.diagnose.core.heldout import out_of_fold
 from lerobot_vtrefine.diagnose.pad.engine import diagnose_pad
-from lerobot_vtrefine.diagnose.pad.face_map import face_evidence, face_of, on_told_face
+from lerobot_vtrefine.diagnose.pad.face_map import face_evidence, face_of, in_common, on_told_face
+from lerobot_vtrefine.diagnose.pad.fitting import Fit
 from lerobot_vtrefine.diagnose.pad.press_trials import prepare
 from lerobot_vtrefine.diagnose.pad.problem import PadProblem
 from lerobot_vtrefine.diagnose.pad.screening import forms_of
@@ -24,8 +26,22 @@ def late(depth: np.ndarray) -> np.ndarray:
     return linear(np.maximum(depth - LATE_M, 0.0))
 
 
+def pitted(depth: np.ndarray) -> np.ndarray:
+    rows, cols = np.indices((ROWS, COLS))
+    return linear(np.maximum(depth - 1.5e-4 * np.exp(-((rows - 1.0) ** 2 + (cols - 1.0) ** 2)), 0.0))
+
+
 def late_with_gains(depth: np.ndarray) -> np.ndarray:
     return late(depth) * np.exp(0.15 * PATTERN)
+
+
+def on_even_face(counts_of) -> tuple[PadProblem, Fit]:
+    """Presses, and their fit with one offset for all taxels."""
+    held = recordings(counts_of)
+    presses = prepare(held, list(held.trials), list(range(len(held.trials))))
+    problem, now = PadProblem(presses).weighed(None)
+    form = forms_of("contact_offset", now)[0]
+    return problem, problem.settled(now.model.plus(form, np.array([LATE_M])))
 
 
 def faces(found) -> list[UnevenFace]:
@@ -55,16 +71,19 @@ def test_gains_beside_an_offset_stay_gains() -> None:
     assert not faces(found)
 
 
+@pytest.mark.parametrize(("counts_of", "expected"), [(uneven, True), (pitted, False)])
+def test_what_a_few_taxels_alone_have_is_no_offset_of_the_pad(counts_of, expected) -> None:
+    problem, even = on_even_face(counts_of)
+    assert in_common(on_told_face(even, problem.presses, problem.weights).model) == expected
+
+
 def test_recordings_left_out_are_predicted_on_the_face_that_others_tell() -> None:
-    held = recordings(late)
-    presses = prepare(held, list(held.trials), list(range(len(held.trials))))
-    problem, now = PadProblem(presses).weighed(None)
-    even = problem.settled(now.model.plus(forms_of("contact_offset", now)[0], np.array([LATE_M])))
-    told = on_told_face(even, presses, problem.weights)
+    problem, even = on_even_face(late)
+    told = on_told_face(even, problem.presses, problem.weights)
     # What a face of nothing but noise fits better, it predicts no better.
     assert told.loss < even.loss
     judged = out_of_fold(problem, told, problem.folds).better_by(out_of_fold(problem, even, problem.folds))
     assert judged.sum() < 0.5 * (even.loss - told.loss) / 2.0
-    evidence = face_evidence(told, presses, problem.weights)
+    evidence = face_evidence(told, problem.presses, problem.weights)
     some = face_of(told.model, told, evidence, range(6)).setting.face_m
     assert np.abs(np.subtract(some, told.model.setting.face_m)).max() > 1e-7

@@ -15,6 +15,7 @@ from lerobot_vtrefine.diagnose.pad.candidates.contact_offset import LARGEST_M, U
 from lerobot_vtrefine.diagnose.pad.fitting import Fit, fit, predict
 from lerobot_vtrefine.diagnose.pad.model import Composite
 from lerobot_vtrefine.diagnose.pad.press_trials import PressSet
+from lerobot_vtrefine.diagnose.pad.rules import COMMON
 from lerobot_vtrefine.diagnose.pad.taxel_maps import MapEvidence, map_evidence, solve_map
 from lerobot_vtrefine.diagnose.pad.weights import TrialWeights
 
@@ -29,6 +30,15 @@ Array = np.ndarray
 def uneven(model: Composite) -> bool:
     """Whether the model's offset is another at every taxel."""
     return UNEVEN in model.forms
+
+
+def in_common(model: Composite) -> bool:
+    """Whether taxels have more of their offset in common than they differ by.
+
+    Over a crumb a few taxels lie higher and most where they should: their mean is no offset of the pad.
+    """
+    offset_m = float(model.own(model.forms.index(UNEVEN))[0])
+    return abs(offset_m) > COMMON * FACE_M * float(np.sqrt(sum(model.face_variances)))
 
 
 def face_evidence(fitted: Fit, presses: PressSet, weights: Sequence[TrialWeights]) -> MapEvidence:

@@ -22,7 +22,7 @@ from lerobot_vtrefine.diagnose.core.search import Selection
 from lerobot_vtrefine.diagnose.pad.candidates import causes_like
 from lerobot_vtrefine.diagnose.pad.candidates.base import Form
 from lerobot_vtrefine.diagnose.pad.damping_profile import profile
-from lerobot_vtrefine.diagnose.pad.face_map import on_told_face, uneven
+from lerobot_vtrefine.diagnose.pad.face_map import in_common, on_told_face, uneven
 from lerobot_vtrefine.diagnose.pad.fitting import Fit
 from lerobot_vtrefine.diagnose.pad.form_fitting import starts_of, without
 from lerobot_vtrefine.diagnose.pad.own_delay import timed
@@ -224,19 +224,18 @@ def likeliest_forms(state: State) -> State:
 def on_uneven_face(state: State) -> State:
     """Where an offset is named, another at every taxel, if recordings left out are surely likelier so.
 
-    What a cover of uneven thickness does to taxels looks like gains of their own as well: the face may take
-    the place of these.
+    What a cover of uneven thickness does to taxels looks like gains of their own: where these are named as
+    well, the face is to take their place.
     """
     model = state.fit.model
     if ContactOffset.name not in model.families or uneven(model):
         return state
-    best, held = state.fit, state.held(state.fit)
-    for fitted in [*([state.without(GAIN_MAP)] if model.gain_map is not None else []), state.fit]:
-        found = on_told_face(fitted, state.problem.presses, state.problem.weights)
-        judged = state.held(found)
-        if agree(judged.better_by(held), state.seed, FORM_P):
-            best, held = found, judged
-    return state if best is state.fit else state.weighed(best)
+    even = state.fit if model.gain_map is None else state.without(GAIN_MAP)
+    found = on_told_face(even, state.problem.presses, state.problem.weights)
+    if not in_common(found.model):
+        return state
+    surely = agree(state.held(found).better_by(state.held(state.fit)), state.seed, FORM_P)
+    return state.weighed(found) if surely else state
 
 
 def resolved(state: State) -> Fit:
