@@ -18,7 +18,7 @@ UNEVEN = Form(
     "contact_offset",
     "another at every taxel",
     (Value("offset_m", -LARGEST_M, LARGEST_M, 2e-6),),
-    lambda v, s: (ContactOffset(float(v[0])), UnevenFace(s.face_m)),
+    lambda v, s: (ContactOffset(float(v[0])), UnevenFace(s.face_m or 0.0)),
     lambda v, s: {"offset_m": (float(v[0]), "m")},
     lambda s: [[2e-5]],
     # A face is told beside the offset that it deviates from (`pad/face_map.py`).
