@@ -63,7 +63,9 @@ def assert_same(model: Composite, held: PressSet) -> None:
 
 
 def composite(held: PressSet) -> Composite:
-    return Composite(describe(held), np.array([np.log(4e5), 3e-3]))
+    face_m = np.random.default_rng(1).normal(0, 2e-5, (held.layout.rows, held.layout.cols))
+    setting = replace(describe(held), face_m=tuple(map(tuple, face_m.tolist())))
+    return Composite(setting, np.array([np.log(4e5), 3e-3]))
 
 
 # What a free board held is known of recordings only; predictions are means over its instants. These

@@ -38,7 +38,7 @@ from lerobot_vtrefine.tactile.stages.readout import (
     TaxelGainSpread,
 )
 from lerobot_vtrefine.tactile.stages.softening import FirstLoadSoftening, PathSoftening
-from lerobot_vtrefine.tactile.stages.surface import ContactOffset, PadTilt
+from lerobot_vtrefine.tactile.stages.surface import ContactOffset, PadTilt, UnevenFace
 
 LAYOUT = PadLayout(6, 10, 0.002)
 FRAME = Frame(layout=LAYOUT, stiffness_n_per_m=800.0)
@@ -68,6 +68,15 @@ def test_pad_tilt_moves_taxels_as_a_rotation_does() -> None:
     hinged = PadTilt(tilt_x, tilt_y, pivot_x_m=LAYOUT.positions()[9, 0], pivot_y_m=LAYOUT.positions()[9, 1])
     moved = once(hinged, torch.zeros(6, 10, dtype=torch.float64)).numpy().ravel()
     assert np.allclose(moved, turned - turned[9], atol=1e-12)
+
+
+def test_an_uneven_face_is_met_later_where_it_lies_deeper() -> None:
+    lower = np.arange(60.0).reshape(6, 10) * 1e-6
+    met = once(UnevenFace(tuple(map(tuple, lower.tolist()))), torch.zeros(6, 10, dtype=torch.float64))
+    assert np.allclose(met.numpy(), -lower, atol=1e-12)
+    assert torch.equal(once(UnevenFace(2e-5), image()), image() - 2e-5)
+    with pytest.raises(ValueError, match="equally long rows"):
+        UnevenFace(((1e-5,), (1e-5, 2e-5)))
 
 
 def test_nonlinear_stiffness_is_a_power_law_of_depth() -> None:

@@ -6,6 +6,7 @@ import numpy as np
 
 from lerobot_vtrefine.diagnose.core.score_test import Probe
 from lerobot_vtrefine.diagnose.pad.candidates.base import Form
+from lerobot_vtrefine.diagnose.pad.face_map import settled_on_face, uneven
 from lerobot_vtrefine.diagnose.pad.fitting import Fit, fit, losses_of, predict, scouted
 from lerobot_vtrefine.diagnose.pad.model import Composite
 from lerobot_vtrefine.diagnose.pad.press_trials import PressSet
@@ -23,8 +24,10 @@ Starts = tuple[np.ndarray, ...]
 
 
 def settle(start: Composite, presses: PressSet, weights: Weights) -> Fit:
-    """Fit a model's coordinates; if it holds a map of gains, in turns with the map."""
+    """Fit a model's coordinates; if it holds a map of gains or of the face, in turns with the map."""
     fitted = fit(start, presses, weights)
+    if uneven(fitted.model):
+        fitted = settled_on_face(fitted, presses, weights)
     if fitted.model.gain_map is None:
         return fitted
     for _ in range(2):

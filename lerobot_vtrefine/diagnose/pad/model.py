@@ -43,6 +43,8 @@ class Composite:
     """Factor per taxel (R, C), or None."""
     gain_variances: tuple[float, ...] = ()
     """Of the map's parts (see `map_prior`)."""
+    face_variances: tuple[float, ...] = ()
+    """Of the parts of the face's map, where the contact offset is another at every taxel (`face_map`)."""
     dead: Mapping[tuple[int, int], float] = field(default_factory=dict)
     """Taxels that hardly answer -> what is left, a part of a sound one's answer."""
     k_n: float = NOMINAL_K_N

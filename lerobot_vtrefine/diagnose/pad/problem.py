@@ -25,6 +25,7 @@ from lerobot_vtrefine.diagnose.pad.candidates import PLAIN
 from lerobot_vtrefine.diagnose.pad.candidates.base import Form
 from lerobot_vtrefine.diagnose.pad.coincidence import cover_or_leak
 from lerobot_vtrefine.diagnose.pad.error_level import slow_errors
+from lerobot_vtrefine.diagnose.pad.face_map import face_evidence, face_of, uneven
 from lerobot_vtrefine.diagnose.pad.final_model import FinalFit
 from lerobot_vtrefine.diagnose.pad.fitting import (
     Fit,
@@ -93,9 +94,13 @@ class Refits:
     def _evidence(self) -> MapEvidence:
         return map_evidence(self.fit, self.problem.presses, self.problem.weights)
 
+    @cached_property
+    def _face_evidence(self) -> MapEvidence:
+        return face_evidence(self.fit, self.problem.presses, self.problem.weights)
+
     @property
     def _mapped(self) -> bool:
-        return self.fit.model.gain_map is not None
+        return self.fit.model.gain_map is not None or uneven(self.fit.model)
 
     def errors(self, weights: Array, trials: Array) -> Array:
         """Mean squared errors (trials, 1).
@@ -134,6 +139,10 @@ class Refits:
         return -0.5 * losses[:, None]
 
     def _with_map_of(self, model: Composite, trials: Array) -> Composite:
+        if uneven(model):
+            model = face_of(model, self.fit, self._face_evidence, trials.tolist())
+        if model.gain_map is None:
+            return model
         return map_of(model, self.fit, self._evidence, trials.tolist())
 
 

@@ -22,13 +22,15 @@ from lerobot_vtrefine.diagnose.core.search import Selection
 from lerobot_vtrefine.diagnose.pad.candidates import causes_like
 from lerobot_vtrefine.diagnose.pad.candidates.base import Form
 from lerobot_vtrefine.diagnose.pad.damping_profile import profile
+from lerobot_vtrefine.diagnose.pad.face_map import in_common, on_told_face, uneven
 from lerobot_vtrefine.diagnose.pad.fitting import Fit
 from lerobot_vtrefine.diagnose.pad.form_fitting import starts_of, without
 from lerobot_vtrefine.diagnose.pad.own_delay import timed
 from lerobot_vtrefine.diagnose.pad.recording_scatter import own_deviations, starts_deviate
 from lerobot_vtrefine.diagnose.pad.rules import MORE_COORDINATES
-from lerobot_vtrefine.diagnose.pad.screening import MAPS, forms_of, probe_form, scorer_of
+from lerobot_vtrefine.diagnose.pad.screening import GAIN_MAP, MAPS, forms_of, probe_form, scorer_of
 from lerobot_vtrefine.tactile.stages.host import Latency
+from lerobot_vtrefine.tactile.stages.surface import ContactOffset
 
 if TYPE_CHECKING:
     from lerobot_vtrefine.diagnose.pad.problem import Candidate, PadProblem
@@ -128,7 +130,7 @@ def _looked_over(
             alternatives[name] = frozenset(BENDS) - {name}
             p_values[name, CHANNEL] = p_values.get((bend, CHANNEL))
     state = plain_forms(state)
-    state = likeliest_forms(state.weighed(state.fit))
+    state = on_uneven_face(likeliest_forms(state.weighed(state.fit)))
     best = resolved(state)
     state = state if best is state.fit else state.weighed(best)
     return _selected(replace(selection, p_values=p_values, alternatives=alternatives), state)
@@ -217,6 +219,23 @@ def likeliest_forms(state: State) -> State:
         found = state.in_likeliest_form(form)
         state = state if found is state.fit else state.weighed(found)
     return state
+
+
+def on_uneven_face(state: State) -> State:
+    """Where an offset is named, another at every taxel, if recordings left out are surely likelier so.
+
+    What a cover of uneven thickness does to taxels looks like gains of their own: where these are named as
+    well, the face is to take their place.
+    """
+    model = state.fit.model
+    if ContactOffset.name not in model.families or uneven(model):
+        return state
+    even = state.fit if model.gain_map is None else state.without(GAIN_MAP)
+    found = on_told_face(even, state.problem.presses, state.problem.weights)
+    if not in_common(found.model):
+        return state
+    surely = agree(state.held(found).better_by(state.held(state.fit)), state.seed, FORM_P)
+    return state.weighed(found) if surely else state
 
 
 def resolved(state: State) -> Fit:

@@ -25,6 +25,9 @@ FORGIVEN = 1.5
 """Factor by which weights may raise the plain squared error of a model; beyond, all readings count alike."""
 FAR_OFF = 4.0
 """Mean square of slow errors under load, in variances of a frame's noise, that weights must not hide."""
+COMMON = 1.0
+"""Deviations between taxels' own contact offsets that the mean must exceed to be the pad's: then five taxels
+in six deviate to its side."""
 DEAD_BELOW, DEAD_ERRORS = 1 / 3, 2.0
 """Part of the median gain below which a taxel is dead (that it reads nothing takes away three quarters of its
 squared error), and the standard errors by which its gain must lie below."""

@@ -7,17 +7,13 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from lerobot_vtrefine.diagnose.pad.baseline import offset_tangents
+from lerobot_vtrefine.diagnose.pad.face_map import FACE_M, PASSES
 from lerobot_vtrefine.diagnose.pad.fitting import Fit, predict, refit_weighted
 from lerobot_vtrefine.diagnose.pad.form_fitting import settle
 from lerobot_vtrefine.diagnose.pad.taxel_maps import MapEvidence, map_evidence, solve_map
 
 if TYPE_CHECKING:
     from lerobot_vtrefine.diagnose.pad.problem import PadProblem
-
-FACE_M = 1e-4
-"""Unit of a face's unevenness: maps are shrunk within deviations of .001 to .8 of it [m]."""
-PASSES = 3
-"""Times that the face is told, each around the one before: what it lifts is touched earlier."""
 
 
 @dataclass(frozen=True)

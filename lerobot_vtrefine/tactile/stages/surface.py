@@ -10,7 +10,16 @@ from typing import ClassVar, override
 import torch
 from torch.nn.functional import softplus
 
-from lerobot_vtrefine.tactile.stages.base import Frame, Stage, State, parameter, register, taxel_map
+from lerobot_vtrefine.files import limits
+from lerobot_vtrefine.tactile.stages.base import (
+    Frame,
+    Stage,
+    State,
+    as_map,
+    parameter,
+    register,
+    taxel_map,
+)
 
 
 @register
@@ -40,6 +49,25 @@ def hinge(depth: torch.Tensor, at_m: float, width_m: float) -> torch.Tensor:
     """0 at the face, level up to `at_m`, of slope 1 beyond; rounded over `width_m` [m]."""
     width = torch.as_tensor(width_m, dtype=depth.dtype, device=depth.device).clamp(min=1e-8)
     return width * (softplus((depth - at_m) / width) - softplus(-at_m / width))
+
+
+@register
+@dataclass(frozen=True)
+class UnevenFace(Stage):
+    """Every taxel's face lies deeper by an amount of its own: d - `lower_m`, (R, C) or one number [m]."""
+
+    name: ClassVar[str] = "uneven_face"
+    domain: ClassVar[str] = "depth"
+    rank: ClassVar[int] = 11
+    lower_m: float | tuple[tuple[float, ...], ...] = limits(-1e-2, 1e-2, default=0.0)
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        object.__setattr__(self, "lower_m", as_map("uneven_face.lower_m", self.lower_m))
+
+    @override
+    def step(self, x: torch.Tensor, state: State, frame: Frame) -> tuple[torch.Tensor, State]:
+        return x - taxel_map(self.lower_m, x), state
 
 
 @register

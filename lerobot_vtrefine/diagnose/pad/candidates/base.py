@@ -62,6 +62,8 @@ class Setting:
     """How taxels that nothing presses move through the session: times [s] and counts above the idle map."""
     idle_rates: tuple[tuple[float, ...], ...] = ()
     """What every taxel does beside that (R, C) [counts/s]; none where they all do the same."""
+    face_m: tuple[tuple[float, ...], ...] = ()
+    """How much lower than its mean the face is at every taxel (R, C) [m]; none where that was not told."""
 
 
 @dataclass(frozen=True)

@@ -31,7 +31,7 @@ from lerobot_vtrefine.tactile.stages.readout import (
 )
 from lerobot_vtrefine.tactile.stages.signals import joined, low_passed, neighbours
 from lerobot_vtrefine.tactile.stages.softening import FirstLoadSoftening, PathSoftening, Remembering
-from lerobot_vtrefine.tactile.stages.surface import ContactOffset, PadTilt, StiffeningDepth
+from lerobot_vtrefine.tactile.stages.surface import ContactOffset, PadTilt, StiffeningDepth, UnevenFace
 
 Work = Callable[[np.ndarray, np.ndarray, np.ndarray], np.ndarray]
 
@@ -151,7 +151,7 @@ def _of_flat(stage: Stage, level: float, sheet: Sheet, columns: np.ndarray) -> n
     return stage.step(flat, {}, Frame(sheet.layout))[0].numpy().ravel()[sheet.taxels[columns]]
 
 
-def _added(stage: PadTilt, field: Field, context: Context) -> Field:
+def _added(stage: PadTilt | UnevenFace, field: Field, context: Context) -> Field:
     """Every taxel is moved by an amount of its own."""
     return Field(field.values + _of_flat(stage, 0.0, context.sheet, field.columns), field.columns, field.rate)
 
@@ -329,6 +329,7 @@ def _convert(stage: Quantisation, field: Field, context: Context) -> Field:
 
 OWN_TAXELS: dict[type, Callable[[Any, Field, Context], Field]] = {
     PadTilt: _added,
+    UnevenFace: _added,
     MechanicalSpreading: _spreading,
     Hysteresis: _looped,
     RestingHysteresis: _looped,
@@ -349,8 +350,16 @@ OWN_TAXELS: dict[type, Callable[[Any, Field, Context], Field]] = {
 }
 """Stages that know which taxel they act on, or what else the recording tells."""
 SEPARATE = (
-    PadTilt | TaxelGainSpread | DeadTaxels | Idle | BaselineDrift | ScanSkew | SampleAndHold | Quantisation
+    PadTilt
+    | UnevenFace
+    | TaxelGainSpread
+    | DeadTaxels
+    | Idle
+    | BaselineDrift
+    | ScanSkew
+    | SampleAndHold
+    | Quantisation
 )
 """Of these, those that do not mix a taxel with others."""
-KEEPS_ORDER = (ContactOffset, StiffeningDepth, PadTilt)
+KEEPS_ORDER = (ContactOffset, StiffeningDepth, PadTilt, UnevenFace)
 """Stages of the face that leave the higher of two heights of a taxel the higher one."""
