@@ -8,7 +8,8 @@ import numpy as np
 
 from lerobot_vtrefine.diagnose.pad.candidates.base import Form, Setting, Value, beside_damping
 from lerobot_vtrefine.tactile.stages.base import Stage
-from lerobot_vtrefine.tactile.stages.mechanics import REFERENCE_DEPTH_M, NonlinearStiffness
+from lerobot_vtrefine.diagnose.pad.candidates.saturation import FREE, MIN_FULLNESS
+from lerobot_vtrefine.tactile.stages.mechanics import REFERENCE_DEPTH_M, NonlinearStiffness, YieldingStiffness
 from lerobot_vtrefine.tactile.stages.surface import StiffeningDepth
 
 SHALLOWEST = 0.25
@@ -32,6 +33,20 @@ def _report_bottoming(values: np.ndarray, setting: Setting) -> dict[str, tuple[f
     exponent = (1.0 + more) / (1.0 + more * (1.0 - knee))
     top_m = setting.top_depth_m
     return {"exponent": (exponent, "1"), "knee_m": (knee * top_m, "m"), "stiffening": (1.0 + more, "1")}
+
+
+def _yielding(values: np.ndarray, setting: Setting) -> tuple[Stage, ...]:
+    yield_m = setting.top_depth_m / max(float(values[0]), MIN_FULLNESS)
+    return (YieldingStiffness(yield_m, float(values[1]), elastic=True),)
+
+
+def _report_yielding(values: np.ndarray, setting: Setting) -> dict[str, tuple[float, str]]:
+    fullness, sharpness = max(float(values[0]), MIN_FULLNESS), float(values[1])
+    return {
+        "exponent": (1.0 / (1.0 + fullness**sharpness), "1"),
+        "yield_m": (setting.top_depth_m / fullness, "m"),
+        "sharpness": (sharpness, "1"),
+    }
 
 
 POWER = Form(
@@ -74,3 +89,15 @@ FORMS = (
         possible=lambda s: not s.loaded,
     ),
 )
+YIELDING = Form(
+    "nonlinear_stiffness",
+    "gives way, beside damping",
+    FREE.values,
+    _yielding,
+    _report_yielding,
+    FREE.probes,
+    possible=lambda s: not s.loaded,
+    screened=False,
+)
+"""The law of a readout that levels off, of what the springs bear: only damping tells the two apart, so it is
+asked about in the place of such a readout, and of nothing else (`pad.review`)."""
