@@ -69,7 +69,7 @@ class State:
 
     def in_likeliest_form(self, form: Form) -> Fit:
         """The fit, or another with that cause in a form of hardly more coordinates than the best so far."""
-        possible = forms_of(form.family, self.fit)
+        possible = forms_of(form.family, self.fit, settled=True)
         best, held, terms = self.fit, self.held(self.fit), len(form.values)
         if form.range is not None or len(possible) == 1:
             return best

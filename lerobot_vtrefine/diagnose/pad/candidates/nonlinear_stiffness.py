@@ -62,6 +62,19 @@ POWER = Form(
     needs="press to three depths or more, the deepest well beyond the others, with depth_m logged",
     possible=lambda s: not s.loaded,
 )
+YIELDING = Form(
+    "nonlinear_stiffness",
+    "gives way, beside damping",
+    FREE.values,
+    _yielding,
+    _report_yielding,
+    FREE.probes,
+    possible=lambda s: not s.loaded,
+    screened=False,
+    competes=False,
+)
+"""The law of a readout that levels off, of what the springs bear alone. Only damping tells the two apart, so it
+takes the place of such a readout (`pad.review`), or of another form of the cover, and no other."""
 FORMS = (
     POWER,
     beside_damping(POWER),
@@ -88,16 +101,5 @@ FORMS = (
         lambda s: [[0.05, knee, float(np.log(0.05))] for knee in (0.4, 0.65)],
         possible=lambda s: not s.loaded,
     ),
+    YIELDING,
 )
-YIELDING = Form(
-    "nonlinear_stiffness",
-    "gives way, beside damping",
-    FREE.values,
-    _yielding,
-    _report_yielding,
-    FREE.probes,
-    possible=lambda s: not s.loaded,
-    screened=False,
-)
-"""The law of a readout that levels off, of what the springs bear: only damping tells the two apart, so it is
-asked about in the place of such a readout, and of nothing else (`pad.review`)."""
