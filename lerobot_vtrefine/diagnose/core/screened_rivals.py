@@ -83,7 +83,7 @@ def tied(full: OutOfFold, other: OutOfFold, seed: int) -> bool:
 def surely_likelier(held: OutOfFold, than: OutOfFold, seed: int) -> bool:
     """Whether trials rank one model before another, at the odds that a name needs."""
     likelier = held.better_by(than)
-    return likelier.sum() > np.log(1.0 / ALPHA) and agree(likelier, seed, TIE_P)
+    return float(likelier.sum()) > np.log(1.0 / ALPHA) and agree(likelier, seed, TIE_P)
 
 
 def _rival(candidate: Any, step: Step[Any, Any], full: OutOfFold, seed: int) -> Rival[Any, Any]:

@@ -185,7 +185,7 @@ def two_bends(state: State) -> State:
 
 
 def cover_or_readout(state: State) -> State:
-    """A cover that gives way in the place of readings that level off, where recordings are surely likelier so.
+    """A cover that gives way in the place of readings that level off, where trials are surely likelier so.
 
     A slow press reads the same of both. In a fast one damping bears a part, which a readout bends with all
     the rest, and a cover leaves alone. The two are compared under one law of free sharpness, or laws would
@@ -197,9 +197,9 @@ def cover_or_readout(state: State) -> State:
         return state
     slim = state.without(FREE.family)
     cover, readout = (state.with_form(slim, form) for form in (YIELDING, FREE))
-    if not all(surely_likelier(state.held(cover), state.held(fit), state.seed) for fit in (readout, state.fit)):
-        return state
-    return state.weighed(cover)
+    held = state.held(cover)
+    told = all(surely_likelier(held, state.held(fit), state.seed) for fit in (readout, state.fit))
+    return state.weighed(cover) if told else state
 
 
 def _takes_place(

@@ -8,7 +8,7 @@ from lerobot_vtrefine.tactile.stages.surface import ContactOffset
 
 LARGEST_M = 6e-4
 OWN_LENGTH = 1.0
-"""Depth over which a soft face is rounded, over the depth where it is felt in full, if nothing else is known."""
+"""Depth over which a soft face is rounded, over the depth from which it is felt in full, if none is known."""
 
 
 def _soft(values: np.ndarray, setting: Setting) -> tuple[Stage, ...]:

@@ -7,8 +7,8 @@ its own.
 import numpy as np
 
 from lerobot_vtrefine.diagnose.pad.candidates.base import Form, Setting, Value, beside_damping
-from lerobot_vtrefine.tactile.stages.base import Stage
 from lerobot_vtrefine.diagnose.pad.candidates.saturation import FREE, MIN_FULLNESS
+from lerobot_vtrefine.tactile.stages.base import Stage
 from lerobot_vtrefine.tactile.stages.mechanics import REFERENCE_DEPTH_M, NonlinearStiffness, YieldingStiffness
 from lerobot_vtrefine.tactile.stages.surface import StiffeningDepth
 
@@ -73,8 +73,8 @@ YIELDING = Form(
     screened=False,
     competes=False,
 )
-"""The law of a readout that levels off, of what the springs bear alone. Only damping tells the two apart, so it
-takes the place of such a readout (`pad.review`), or of another form of the cover, and no other."""
+"""The law of a readout that levels off, of what the springs bear alone. Only damping tells the two apart, so
+it takes the place of such a readout (`pad.review`), or of another form of the cover, and no other."""
 FORMS = (
     POWER,
     beside_damping(POWER),
