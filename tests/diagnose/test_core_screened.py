@@ -16,6 +16,7 @@ from lerobot_vtrefine.diagnose.core.screened_search import (
     ScreenedSearch,
     better,
     clearly_better,
+    preferable,
     still_found,
 )
 
@@ -299,6 +300,20 @@ def test_laws_that_trials_tell_apart_at_small_odds_tie(lead: float, told: bool) 
     errors, scores = np.ones((TRIALS, 1)), np.zeros((TRIALS, 1))
     likelier = scores + lead + 0.01 * np.arange(TRIALS)[:, None] / TRIALS
     assert tied(OutOfFold(errors, lambda: likelier), OutOfFold(errors + 1e-4, lambda: scores), 0) is not told
+
+
+@pytest.mark.parametrize(
+    ("worse", "lead", "stands"), [(0.0, 0.1, True), (0.05, 0.1, False), (0.05, 3.0, True)]
+)
+def test_a_form_that_is_no_richer_stands_where_it_is_surely_likelier(
+    worse: float, lead: float, stands: bool
+) -> None:
+    # Plain errors hang on where each trial happened to touch; log scores allow for that.
+    rng = np.random.default_rng(4)
+    errors, scores = np.ones((TRIALS, 1)), rng.normal(lead, 1.0, (TRIALS, 1))
+    scores += lead - scores.mean()
+    held, than = OutOfFold(errors + worse, lambda: scores), OutOfFold(errors, lambda: np.zeros((TRIALS, 1)))
+    assert preferable(Form("late", peer=True), held, than, 0) is stands
 
 
 def test_a_plain_form_does_until_another_is_clearly_better() -> None:

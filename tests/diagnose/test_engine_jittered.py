@@ -6,14 +6,17 @@ from types import SimpleNamespace
 import jittered_rig
 import numpy as np
 import pytest
+import torch
 from jittered_grading import later_gains
-from jittered_rig import EFFECTS, Rig
+from jittered_rig import EFFECTS, Effect, Rig
 
 from lerobot_vtrefine.diagnose.core.heldout import lock, out_of_fold
+from lerobot_vtrefine.diagnose.core.screened_search import Ground
 from lerobot_vtrefine.diagnose.core.search import Selection
 from lerobot_vtrefine.diagnose.core.suspicion import raise_alarms
 from lerobot_vtrefine.diagnose.pad.baseline import fit_baseline
 from lerobot_vtrefine.diagnose.pad.candidates import CATALOGUE
+from lerobot_vtrefine.diagnose.pad.candidates.saturation import FREE
 from lerobot_vtrefine.diagnose.pad.decoys import in_place_of_names
 from lerobot_vtrefine.diagnose.pad.descriptors import errors_left_out
 from lerobot_vtrefine.diagnose.pad.engine import diagnose_pad
@@ -25,6 +28,7 @@ from lerobot_vtrefine.diagnose.pad.model import sensor_model
 from lerobot_vtrefine.diagnose.pad.own_touch import with_own_touch
 from lerobot_vtrefine.diagnose.pad.press_trials import prepare
 from lerobot_vtrefine.diagnose.pad.problem import Candidate, PadProblem
+from lerobot_vtrefine.diagnose.pad.review import State, cover_or_readout
 from lerobot_vtrefine.diagnose.pad.screening import forms_of
 from lerobot_vtrefine.diagnose.pad.suspicions import suspicions
 from lerobot_vtrefine.diagnose.pad.taxel_maps import with_map
@@ -154,6 +158,52 @@ def test_a_settled_name_takes_the_form_that_recordings_left_out_are_likeliest_un
     found = problem.reformed(selection, 0)
     assert [form.label for form in found.fit.model.forms] == [label]
     assert [item.form.label for item in found.chosen[0]] == [label]
+
+
+@pytest.mark.parametrize(
+    ("law", "label"), [("offset_toe", "built up over its own length"), ("offset_late", "constant")]
+)
+def test_a_soft_touch_is_no_richer_than_a_late_one(law: str, label: str) -> None:
+    # Plain errors tell neither from the other, and recordings' own touches take most of both.
+    held = recorded(law, 0.4, 4)
+    problem, fitted = PadProblem(prepare(held, list(held.trials), list(range(len(held.trials))))).weighed(
+        None
+    )
+    plain, *others = forms_of("contact_offset", fitted)
+    ground = Ground(problem, fitted, problem.folds, 0)
+    candidate = Candidate("contact_offset", form=plain, others=tuple(others))
+    found = ground.refined(ground.plain(candidate), richest=1)
+    assert found.candidate.form.label == label
+
+
+GIVES_WAY = Effect(
+    "nonlinear_stiffness", "depth", lambda p, x, a: np.maximum(x, 0) / (1 + a * np.maximum(x, 0)), 500.0, None
+)
+
+
+@pytest.mark.parametrize(
+    ("effect", "cause"),
+    [(GIVES_WAY, "nonlinear_stiffness"), (EFFECTS["saturation"], "saturation")],
+    ids=["cover", "readout"],
+)
+def test_what_damping_bears_tells_a_cover_that_gives_way_from_a_readout(effect: Effect, cause: str) -> None:
+    rig = Rig(11, 8, 12)
+    held = rig.record([(effect, rig.strength_for(effect, 0.4))])
+    problem, fitted = PadProblem(prepare(held, list(held.trials), list(range(len(held.trials))))).weighed(
+        None
+    )
+    named = with_form(fitted, FREE, (), problem.presses, problem.weights)
+    state = State(problem, fitted, 0).weighed(named)
+    assert cover_or_readout(state).fit.model.families == (cause,)
+
+
+def test_a_soft_offset_is_told_as_how_far_deep_presses_are_shifted() -> None:
+    for form in CATALOGUE:
+        if form.family == "contact_offset":
+            values = np.array([8e-5, 0.7][: len(form.values)])
+            (stage,) = form.build(values, None)
+            deep = stage.step(torch.tensor(2e-3), {}, None)[0].item()
+            assert form.report(values, None)["offset_m"][0] == pytest.approx(2e-3 - deep, rel=1e-3)
 
 
 def test_a_map_that_users_get_knows_places_that_were_only_pressed_in_locked_recordings() -> None:

@@ -10,7 +10,11 @@ from lerobot_vtrefine.tactile import PadLayout
 from lerobot_vtrefine.tactile.stages.base import Frame, Stage
 from lerobot_vtrefine.tactile.stages.dividers import RowSharing
 from lerobot_vtrefine.tactile.stages.host import Latency, ScanSkew
-from lerobot_vtrefine.tactile.stages.mechanics import MechanicalSpreading, NonlinearStiffness
+from lerobot_vtrefine.tactile.stages.mechanics import (
+    MechanicalSpreading,
+    NonlinearStiffness,
+    YieldingStiffness,
+)
 from lerobot_vtrefine.tactile.stages.readout import BaselineDrift, Crosstalk, DeadTaxels, Saturation
 
 LAYOUT = PadLayout(6, 10, 0.002)
@@ -140,3 +144,15 @@ def test_a_share_of_the_force_follows_the_power_law() -> None:
     for share in (0.0, 0.25, 1.0):
         y = once(NonlinearStiffness(exponent=1.5, share=share), x)
         assert y[0, 0].item() == pytest.approx((1 - share) * 0.4 + share * 0.8 * 0.5**1.5)
+
+
+def test_a_cover_gives_way_gradually_or_at_once_and_keeps_a_known_load() -> None:
+    x = pressed_at(1, 1, 0.8) + pressed_at(3, 4, 0.2)  # as 1 mm and 0.25 mm do, with 800 N/m
+    for sharpness in (1.0, 3.0):
+        y = once(YieldingStiffness(yield_m=5e-4, sharpness=sharpness), x)
+        for (row, col), load in (((1, 1), 0.8), ((3, 4), 0.2)):
+            expected = load / (1 + (load / 0.4) ** sharpness) ** (1 / sharpness)
+            assert y[row, col].item() == pytest.approx(expected)
+    y, _ = YieldingStiffness(yield_m=5e-4).step(x, {}, replace(FRAME, load_conserving=True))
+    assert y.sum().item() == pytest.approx(1.0)
+    assert y[1, 1].item() / y[3, 4].item() == pytest.approx(4.0 / 2.0)

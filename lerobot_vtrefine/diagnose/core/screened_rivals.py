@@ -77,8 +77,13 @@ def tied(full: OutOfFold, other: OutOfFold, seed: int) -> bool:
     less = (other.errors - full.errors).sum(1)
     if less.sum() > LEAST_GAIN * other.errors.sum() and agree(less, seed, TIE_P):
         return False
-    likelier = full.better_by(other)
-    return not (likelier.sum() > np.log(1.0 / ALPHA) and agree(likelier, seed, TIE_P))
+    return not surely_likelier(full, other, seed)
+
+
+def surely_likelier(held: OutOfFold, than: OutOfFold, seed: int) -> bool:
+    """Whether trials rank one model before another, at the odds that a name needs."""
+    likelier = held.better_by(than)
+    return float(likelier.sum()) > np.log(1.0 / ALPHA) and agree(likelier, seed, TIE_P)
 
 
 def _rival(candidate: Any, step: Step[Any, Any], full: OutOfFold, seed: int) -> Rival[Any, Any]:

@@ -19,6 +19,7 @@ from lerobot_vtrefine.diagnose.core.resampling import agree, folds_of, independe
 from lerobot_vtrefine.diagnose.core.rules import (
     AGREEMENT_P,
     FITTED,
+    FORM_P,
     LEAST_GAIN,
     MAX_ROUNDS,
     PROMISING,
@@ -75,9 +76,11 @@ class Ground[P: ScreenedProblem[Any, Any], F: ScoredFit]:
 
 def preferable(candidate: FormCandidate, held: OutOfFold, than: OutOfFold, seed: int) -> bool:
     """Whether a form is to stand in for a plainer one; a peer if it is likelier, whatever little plain errors
-    say, which hang on how hard and where each recording happened to touch."""
+    say, which hang on how hard and where each recording happened to touch, or surely so (1 %)."""
     if candidate.peer:
-        return held.gain_over(than) > -LEAST_GAIN and float(held.better_by(than).sum()) > 0
+        likelier = held.better_by(than)
+        small = held.gain_over(than) > -LEAST_GAIN
+        return float(likelier.sum()) > 0 and (small or agree(likelier, seed, FORM_P))
     return clearly_better(held, than, seed)
 
 

@@ -11,6 +11,7 @@ import numpy as np
 from lerobot_vtrefine.diagnose.core.heldout import OutOfFold, out_of_fold
 from lerobot_vtrefine.diagnose.core.resampling import agree
 from lerobot_vtrefine.diagnose.core.rules import FORM_P
+from lerobot_vtrefine.diagnose.core.screened_rivals import surely_likelier
 from lerobot_vtrefine.diagnose.core.screened_search import (
     CHANNEL,
     ScreenedSearch,
@@ -21,6 +22,8 @@ from lerobot_vtrefine.diagnose.core.screened_search import (
 from lerobot_vtrefine.diagnose.core.search import Selection
 from lerobot_vtrefine.diagnose.pad.candidates import causes_like
 from lerobot_vtrefine.diagnose.pad.candidates.base import Form
+from lerobot_vtrefine.diagnose.pad.candidates.nonlinear_stiffness import YIELDING
+from lerobot_vtrefine.diagnose.pad.candidates.saturation import FREE
 from lerobot_vtrefine.diagnose.pad.damping_profile import profile
 from lerobot_vtrefine.diagnose.pad.face_map import in_common, on_told_face, uneven
 from lerobot_vtrefine.diagnose.pad.fitting import Fit
@@ -68,7 +71,7 @@ class State:
 
     def in_likeliest_form(self, form: Form) -> Fit:
         """The fit, or another with that cause in a form of hardly more coordinates than the best so far."""
-        possible = forms_of(form.family, self.fit)
+        possible = forms_of(form.family, self.fit, settled=True)
         best, held, terms = self.fit, self.held(self.fit), len(form.values)
         if form.range is not None or len(possible) == 1:
             return best
@@ -122,7 +125,7 @@ def _looked_over(
         return selection
     state = State(selection.problem, selection.fit, seed)
     named = selection.fit.model.families
-    state = two_bends(state)
+    state = cover_or_readout(two_bends(state))
     p_values, alternatives = dict(selection.p_values), dict(selection.alternatives)
     for name in state.fit.model.families:
         if name not in named:
@@ -181,6 +184,24 @@ def two_bends(state: State) -> State:
         if _takes_place(pair, other, named, held, state):
             best, held, named = found, other, pair
     return state if best is state.fit else state.weighed(best)
+
+
+def cover_or_readout(state: State) -> State:
+    """A cover that gives way in the place of readings that level off, where trials are surely likelier so.
+
+    A slow press reads the same of both. In a fast one damping bears a part, which a readout bends with all
+    the rest, and a cover leaves alone. The two are compared under one law of free sharpness, or laws would
+    differ by more than damping does. Where damping is too faint to tell, it stays the readout, for dividers
+    are what boards are made of.
+    """
+    named = state.fit.model.families
+    if FREE.family not in named or YIELDING.family in named or not YIELDING.possible(state.fit.model.setting):
+        return state
+    slim = state.without(FREE.family)
+    cover, readout = (state.with_form(slim, form) for form in (YIELDING, FREE))
+    held = state.held(cover)
+    told = all(surely_likelier(held, state.held(fit), state.seed) for fit in (readout, state.fit))
+    return state.weighed(cover) if told else state
 
 
 def _takes_place(

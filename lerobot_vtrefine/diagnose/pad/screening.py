@@ -105,13 +105,15 @@ def probe_form(form: Form, scorer: Scorer) -> list[Probe]:
     return probes
 
 
-def forms_of(family: str, fitted: Fit) -> list[Form]:
-    """Forms of a family that can show in these recordings, the plain one first."""
+def forms_of(family: str, fitted: Fit, *, settled: bool = False) -> list[Form]:
+    """Forms of a family that can show in these recordings, the plain one first; with those that are asked
+    about once names are settled."""
     setting, others = fitted.model.setting, set(fitted.model.families)
     return [
         form
         for form in CATALOGUE
         if form.family == family
+        and (form.competes or settled)
         and form.possible(setting)
         and (not form.beside or others.intersection(form.beside))
     ]

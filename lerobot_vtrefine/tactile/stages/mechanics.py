@@ -46,10 +46,35 @@ class NonlinearStiffness(CoverLaw):
         reference = frame.stiffness_n_per_m * REFERENCE_DEPTH_M
         bent = reference * (x.clamp(min=0.0) / reference) ** self.exponent
         bent = x.clamp(min=0.0) + self.share * (bent - x.clamp(min=0.0))
-        if not frame.load_conserving:
-            return bent, state
-        before, after = (image.sum(dim=(-2, -1), keepdim=True) for image in (x, bent))
-        return bent * torch.where(after > 0, before / after.clamp(min=1e-30), torch.ones_like(after)), state
+        return _of_one_load(bent, x, frame), state
+
+
+def _of_one_load(bent: torch.Tensor, x: torch.Tensor, frame: Frame) -> torch.Tensor:
+    """Bent forces, with the sum of those before where that is the load itself: (..., R, C) each."""
+    if not frame.load_conserving:
+        return bent
+    before, after = (image.sum(dim=(-2, -1), keepdim=True) for image in (x, bent))
+    return bent * torch.where(after > 0, before / after.clamp(min=1e-30), torch.ones_like(after))
+
+
+@register
+@dataclass(frozen=True)
+class YieldingStiffness(CoverLaw):
+    """A cover that gives way: f / (1 + (f / f_yield)^sharpness)^(1 / sharpness), with f_yield = k yield_m.
+
+    With a sharpness of 1 it is the hyperbola of soils (Kondner 1963); a large one yields all at once. The
+    law is `Saturation`'s, of the cover instead of the reading.
+    """
+
+    name: ClassVar[str] = "yielding_stiffness"
+    rank: ClassVar[int] = 30
+    yield_m: float = parameter(2e-3, "m", 1e-3, 4e-3, minimum=1e-9)
+    sharpness: float = parameter(1.0, "1", 1.0, 1.0, minimum=1e-2, maximum=100.0)
+
+    @override
+    def step(self, x: torch.Tensor, state: State, frame: Frame) -> tuple[torch.Tensor, State]:
+        share = (x.clamp(min=0.0) / (self.yield_m * frame.stiffness_n_per_m)) ** self.sharpness
+        return _of_one_load(x / (1.0 + share) ** (1.0 / self.sharpness), x, frame), state
 
 
 def spreading_matrix(

@@ -131,6 +131,8 @@ class Form:
     """Number of the coordinate that trades off against the baseline's damping, if one does."""
     screened: bool = True
     """Whether its probes take part in screening; fallbacks are only fitted where their family is named."""
+    competes: bool = True
+    """Whether it is fitted while names compete; else only once its family is named, as the likeliest form."""
     peer: bool = False
     """Whether it is no richer than the plain form: it need not predict clearly better, only better."""
     rank: int | None = None

@@ -7,8 +7,9 @@ its own.
 import numpy as np
 
 from lerobot_vtrefine.diagnose.pad.candidates.base import Form, Setting, Value, beside_damping
+from lerobot_vtrefine.diagnose.pad.candidates.saturation import FREE, MIN_FULLNESS
 from lerobot_vtrefine.tactile.stages.base import Stage
-from lerobot_vtrefine.tactile.stages.mechanics import REFERENCE_DEPTH_M, NonlinearStiffness
+from lerobot_vtrefine.tactile.stages.mechanics import REFERENCE_DEPTH_M, NonlinearStiffness, YieldingStiffness
 from lerobot_vtrefine.tactile.stages.surface import StiffeningDepth
 
 SHALLOWEST = 0.25
@@ -34,6 +35,20 @@ def _report_bottoming(values: np.ndarray, setting: Setting) -> dict[str, tuple[f
     return {"exponent": (exponent, "1"), "knee_m": (knee * top_m, "m"), "stiffening": (1.0 + more, "1")}
 
 
+def _yielding(values: np.ndarray, setting: Setting) -> tuple[Stage, ...]:
+    yield_m = setting.top_depth_m / max(float(values[0]), MIN_FULLNESS)
+    return (YieldingStiffness(yield_m, float(values[1]), elastic=True),)
+
+
+def _report_yielding(values: np.ndarray, setting: Setting) -> dict[str, tuple[float, str]]:
+    fullness, sharpness = max(float(values[0]), MIN_FULLNESS), float(values[1])
+    return {
+        "exponent": (1.0 / (1.0 + fullness**sharpness), "1"),
+        "yield_m": (setting.top_depth_m / fullness, "m"),
+        "sharpness": (sharpness, "1"),
+    }
+
+
 POWER = Form(
     "nonlinear_stiffness",
     "power law",
@@ -47,6 +62,19 @@ POWER = Form(
     needs="press to three depths or more, the deepest well beyond the others, with depth_m logged",
     possible=lambda s: not s.loaded,
 )
+YIELDING = Form(
+    "nonlinear_stiffness",
+    "gives way, beside damping",
+    FREE.values,
+    _yielding,
+    _report_yielding,
+    FREE.probes,
+    possible=lambda s: not s.loaded,
+    screened=False,
+    competes=False,
+)
+"""The law of a readout that levels off, of what the springs bear alone. Only damping tells the two apart, so
+it takes the place of such a readout (`pad.review`), or of another form of the cover, and no other."""
 FORMS = (
     POWER,
     beside_damping(POWER),
@@ -73,4 +101,5 @@ FORMS = (
         lambda s: [[0.05, knee, float(np.log(0.05))] for knee in (0.4, 0.65)],
         possible=lambda s: not s.loaded,
     ),
+    YIELDING,
 )

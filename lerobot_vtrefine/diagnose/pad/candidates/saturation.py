@@ -15,6 +15,15 @@ def _knee(values: np.ndarray, setting: Setting) -> float:
     return setting.top_counts / max(float(values[0]), MIN_FULLNESS)
 
 
+FREE = Form(
+    "saturation",
+    "of free sharpness",
+    (Value("fullness", 0.0, 8.0, 2e-3), Value("sharpness", 0.7, 12.0, 1e-2)),
+    lambda v, s: (Saturation(_knee(v, s), float(v[1])),),
+    lambda v, s: {"knee_counts": (_knee(v, s), "counts"), "sharpness": (float(v[1]), "1")},
+    lambda s: [[0.2, 1.0], [0.9, 6.0]],
+    screened=False,
+)
 FORMS = (
     Form(
         "saturation",
@@ -27,13 +36,5 @@ FORMS = (
         shrinks=True,
         needs="press until readings come near the full scale",
     ),
-    Form(
-        "saturation",
-        "of free sharpness",
-        (Value("fullness", 0.0, 8.0, 2e-3), Value("sharpness", 0.7, 12.0, 1e-2)),
-        lambda v, s: (Saturation(_knee(v, s), float(v[1])),),
-        lambda v, s: {"knee_counts": (_knee(v, s), "counts"), "sharpness": (float(v[1]), "1")},
-        lambda s: [[0.2, 1.0], [0.9, 6.0]],
-        screened=False,
-    ),
+    FREE,
 )
