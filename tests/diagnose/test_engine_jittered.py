@@ -201,9 +201,10 @@ def test_a_soft_offset_is_told_as_how_far_deep_presses_are_shifted() -> None:
     for form in CATALOGUE:
         if form.family == "contact_offset":
             values = np.array([8e-5, 0.7][: len(form.values)])
-            (stage,) = form.build(values, None)
-            deep = stage.step(torch.tensor(2e-3), {}, None)[0].item()
-            assert form.report(values, None)["offset_m"][0] == pytest.approx(2e-3 - deep, rel=1e-3)
+            deep, flat = torch.tensor(2e-3), SimpleNamespace(face_m=None)
+            for stage in form.build(values, flat):
+                deep = stage.step(deep, {}, None)[0]
+            assert form.report(values, flat)["offset_m"][0] == pytest.approx(2e-3 - deep.item(), rel=1e-3)
 
 
 def test_a_map_that_users_get_knows_places_that_were_only_pressed_in_locked_recordings() -> None:
