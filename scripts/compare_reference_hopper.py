@@ -5,7 +5,7 @@
     python scripts/compare_reference_hopper.py pretrain --folder=hopper --reference=DPPO
     python scripts/compare_reference_hopper.py train --folder=hopper --reference=DPPO --by=reference --seed=1
     python scripts/compare_reference_hopper.py train --folder=hopper --reference=DPPO --by=paper --seed=1
-    python scripts/compare_reference_hopper.py rows --folder=hopper
+    python scripts/compare_reference_hopper.py rows --folder=hopper --start=C
 
 ``data`` and ``pretrain`` make what stands in for D4RL's hopper-medium-v2 and for the checkpoint that the
 reference ships (``reference/hopper/standin.py``). ``train`` fine-tunes that one checkpoint: the reference's
@@ -100,7 +100,7 @@ def main() -> int:
         default=0,
         help="of the search, the imitation or the training (default %(default)s)",
     )
-    parser.add_argument("--start", default="A", help="name of the folder's imitation, in its rows")
+    parser.add_argument("--start", help="name of the folder's imitation, in its rows; A and B are published")
     parser.add_argument("--machine", help="that trained, for the rows; default: this one")
     parser.add_argument(
         "--results", type=Path, default=ROOT / "results" / "reference_hopper.json", help="file of the rows"
@@ -109,6 +109,8 @@ def main() -> int:
     args.folder.mkdir(parents=True, exist_ok=True)
     if args.reference is None and args.what in ("pretrain", "train"):
         raise ValueError(f"{args.what} needs --reference")
+    if args.start is None and args.what == "rows":
+        raise ValueError("rows needs --start: a name for the imitation, of which earlier rows are replaced")
     if args.what == "data":
         made = args.folder / "episodes.npz"
         found = record(made, goal=args.goal, noise=args.noise, steps=args.steps, seed=args.seed)
