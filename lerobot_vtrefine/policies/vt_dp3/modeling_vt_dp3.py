@@ -141,8 +141,8 @@ class VtDp3Policy(PreTrainedPolicy):
 
     def _learn_range(self, dataset_stats: dict[str, Any] | None) -> None:
         """Tell the networks that see joints in units of their own how this dataset's are normalised."""
-        for model in (self.model, self.online, self.base) if dataset_stats else ():
-            if model is not None and model.encoder.estimates is not None:
+        for model in (self.model, self.online, self.base):
+            if dataset_stats and model is not None and model.encoder.estimates is not None:
                 model.encoder.estimates.learn_range(dataset_stats[STATE_KEY])
 
     # LeRobot's hooks for --peft.*
