@@ -17,9 +17,9 @@ from lerobot_vtrefine.information.scale import HeldScale
 from lerobot_vtrefine.information.strong import StrongEncoder, SurfaceStep
 from lerobot_vtrefine.observation import VisuoTactileConfig
 from lerobot_vtrefine.policies.vt_dp3 import VisuoTactileProcessorStep, VtDp3Config
-from lerobot_vtrefine.policies.vt_dp3.estimates import HEAD_WIDTH, estimating_head
 from lerobot_vtrefine.policies.vt_dp3.observation_encoder import ObservationEncoder, make_encoder
 
+HEAD_WIDTH = 256
 LEARNING_RATE = 1e-3
 WEIGHT_DECAY = 1e-3
 JUDGED_FRAMES = 4096
@@ -134,7 +134,13 @@ class Estimator(nn.Module):
         self.register_buffer("state_mean", seen.mean(0))
         self.register_buffer("state_std", seen.std(0).clamp(min=1e-6))
         self.scale = HeldScale(frames.truth[frames.held_index()])
-        self.head = estimating_head(self.encoder.cond_dim)
+        self.head = nn.Sequential(
+            nn.Linear(self.encoder.cond_dim, HEAD_WIDTH),
+            nn.ReLU(),
+            nn.Linear(HEAD_WIDTH, HEAD_WIDTH),
+            nn.ReLU(),
+            nn.Linear(HEAD_WIDTH, frames.truth.shape[-1]),
+        )
         self.history = history
         # Contacts are read off the policy's encoder without shaping it: policies start from this one.
         self.shaped_by_contact = senses.network == STRONG
@@ -156,14 +162,6 @@ class Estimator(nn.Module):
         read = features if self.shaped_by_contact else features.detach()
         missed = (self.head(features) - self.scale.compress(truth)).square().mean()
         return missed + self.contact.loss(read, touch)
-
-    def told(self) -> dict[str, Tensor]:
-        """Weights of a policy's ``Estimates``; none where several frames are seen at once."""
-        if self.history > 1 or not isinstance(self.encoder, ObservationEncoder):
-            return {}
-        parts = (("joints", self.encoder.state), ("head", self.head))
-        weights = {f"{name}.{key}": value for name, part in parts for key, value in part.state_dict().items()}
-        return weights | {"mean": self.state_mean, "std": self.state_std}
 
     def window(self, frames: Frames, episode: Tensor, frame: Tensor) -> dict[str, Tensor]:
         """The last To frames (B, To, ...) up to ``frame`` (B,); the first one fills the window."""

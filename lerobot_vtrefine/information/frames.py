@@ -20,8 +20,7 @@ from lerobot_vtrefine.datasets.features import STATE_KEY, raw_to_env_observation
 from lerobot_vtrefine.envs.config import VtRefineEnvConfig
 from lerobot_vtrefine.envs.episodes import Episodes
 from lerobot_vtrefine.envs.factory import make_episodes
-from lerobot_vtrefine.information.quantities import Grasps, Relative, observe
-from lerobot_vtrefine.policies.vt_dp3.estimates import NAMES
+from lerobot_vtrefine.information.quantities import NAMES, Grasps, Relative, observe
 from lerobot_vtrefine.sim.demonstrations import Degradation
 from lerobot_vtrefine.sim.expert import ScriptedExpert
 from lerobot_vtrefine.sim.ik import hand_poses

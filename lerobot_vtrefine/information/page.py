@@ -8,13 +8,12 @@ from scipy.stats import binomtest
 
 from lerobot_vtrefine.information.contact import PLACES, SHARES
 from lerobot_vtrefine.information.curves import STYLES, clearance_charts, known_error_chart, style_of
-from lerobot_vtrefine.information.quantities import SHOWN_UNITS, unit_of
+from lerobot_vtrefine.information.quantities import AXES, PARTS, SHOWN_UNITS, unit_of
 from lerobot_vtrefine.information.study import Finding, Study
 from lerobot_vtrefine.information.tolerance import LATERAL, TILT
 from lerobot_vtrefine.pages.charts import Panel, digits, drawing, label, percent_tick
 from lerobot_vtrefine.pages.rates import Bar, bar_chart
 from lerobot_vtrefine.pages.render import render
-from lerobot_vtrefine.policies.vt_dp3.estimates import AXES, PARTS
 
 WIDTH, HEIGHT = 520.0, 260.0
 LEFT, RIGHT, TOP, BOTTOM = 62.0, 14.0, 26.0, 52.0

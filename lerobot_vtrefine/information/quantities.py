@@ -19,6 +19,14 @@ if TYPE_CHECKING:
 
 Array = NDArray[np.float64]
 
+PARTS = ("socket_in_hand", "plug_in_hand", "plug_in_socket")
+AXES = ("x", "y", "z", "rx", "ry", "rz")
+NAMES = (
+    *(f"{part}_{axis}" for part in PARTS for axis in AXES),
+    *(f"contact_force_{axis}" for axis in AXES[:3]),
+)
+"""Lengths [m] along the axes of the hand or socket, rotation vectors [rad] from the mean pose, and the
+contact's force [N] on the plug in the socket's frame."""
 SHOWN_UNITS = {"x": (1e3, "mm"), "r": (180 / np.pi, "deg"), "f": (1.0, "N")}
 
 

@@ -31,9 +31,8 @@ from lerobot_vtrefine.information.estimator import (
     views_of,
 )
 from lerobot_vtrefine.information.frames import Frames, Views, collect_frames
-from lerobot_vtrefine.information.quantities import unit_of
+from lerobot_vtrefine.information.quantities import NAMES, unit_of
 from lerobot_vtrefine.information.tolerance import SIZES, Tolerated, tolerance
-from lerobot_vtrefine.policies.vt_dp3.estimates import NAMES
 from lerobot_vtrefine.policies.vt_dp3.observation_encoder import ObservationEncoder, save_encoder
 from lerobot_vtrefine.sim.config import PROCEDURAL_PAIRS
 
@@ -302,7 +301,7 @@ def save_keeper(folder: Path, effort: Effort) -> Callable[[Senses, Estimator], N
     def keep(senses: Senses, estimator: Estimator) -> None:
         if senses.modalities and isinstance(estimator.encoder, ObservationEncoder):
             config = senses.policy(estimator.body, effort.preset, effort.device, 1)
-            save_encoder(estimator.encoder, config, folder, estimator.told())
+            save_encoder(estimator.encoder, config, folder)
 
     return keep
 

@@ -28,7 +28,6 @@ from lerobot_vtrefine.policies.vt_dp3.denoisers import DENOISERS
 from lerobot_vtrefine.policies.vt_dp3.diffusion import step_grid
 
 FUSIONS = ("cloud", "pads")
-REPRESENTATIONS = ("features", "estimates")
 PRESETS: dict[str, dict[str, Any]] = {
     "paper": {
         "point_dims": (64, 128, 256, 512),
@@ -92,11 +91,6 @@ class VtDp3Config(PreTrainedConfig):
     """
     freeze_encoder: bool = False
     """Behaviour cloning leaves the encoder as it is; needs ``pretrained_encoder``."""
-    representation: str = "features"
-    """What the policy is told of cloud and pads: their ``features``, or ``estimates`` of how the parts lie in
-    their hands and to each other, as ``vtrefine-information`` taught the encoder to tell them (needs
-    ``pretrained_encoder``). From few demonstrations features are learnt by heart.
-    """
     auxiliary_weight: float = 0.0
     """Weight of an auxiliary loss while cloning: to tell, from what the policy sees, how the parts lie in
     their hands and touch, as ``vtrefine-record-demos --truth=true`` recorded it. 0: none.
@@ -170,15 +164,8 @@ class VtDp3Config(PreTrainedConfig):
 
     def _validate(self) -> None:
         self.observation.validate()
-        for name, choices in (
-            ("modalities", MODALITIES),
-            ("fusion", FUSIONS),
-            ("representation", REPRESENTATIONS),
-            ("denoiser", DENOISERS),
-        ):
+        for name, choices in (("modalities", MODALITIES), ("fusion", FUSIONS), ("denoiser", DENOISERS)):
             check_choice(f"policy.{name}", getattr(self, name), choices)
-        if self.representation == "estimates":
-            self._validate_estimates()
         if self.freeze_encoder and not self.pretrained_encoder:
             raise ValueError(
                 "policy.freeze_encoder=true needs policy.pretrained_encoder: an untrained one sees nothing"
@@ -201,17 +188,6 @@ class VtDp3Config(PreTrainedConfig):
         if not 0 <= self.ft_denoising_steps <= len(self.timesteps):
             raise ValueError(
                 f"policy.ft_denoising_steps={self.ft_denoising_steps} must be within 0..{len(self.timesteps)}"
-            )
-
-    def _validate_estimates(self) -> None:
-        if not self.pretrained_encoder:
-            raise ValueError(
-                "policy.representation=estimates needs policy.pretrained_encoder: an untrained one tells"
-                " nothing"
-            )
-        if self.normalization_mapping.get("STATE") is not NormalizationMode.MIN_MAX:
-            raise ValueError(
-                "policy.representation=estimates needs STATE: MIN_MAX in policy.normalization_mapping"
             )
 
     @property

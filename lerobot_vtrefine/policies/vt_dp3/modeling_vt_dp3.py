@@ -105,12 +105,11 @@ class VtDp3Policy(PreTrainedPolicy):
             widen_narrow_ranges(dataset_stats)
         self.config: VtDp3Config = config
         self.model = VtDp3Model(config, config.state_dim, config.action_dim)
+        if read_encoder and config.pretrained_encoder:
+            load_encoder(self.model.encoder, config)
         self.base: VtDp3Model | None = None
         self.online: VtDp3Model | None = None
         self.ema: Ema | None = None
-        if read_encoder and config.pretrained_encoder:
-            load_encoder(self.model.encoder, config)
-        self._learn_range(dataset_stats)
         if config.ft_denoising_steps:
             self._attach_base()
         else:
@@ -134,16 +133,9 @@ class VtDp3Policy(PreTrainedPolicy):
             policy = super().from_pretrained(pretrained_name_or_path, read_encoder=False, **kwargs)
         except SafetensorError as error:
             raise ValueError(f"the weights of {pretrained_name_or_path} are damaged: {error}") from error
-        policy._learn_range(kwargs.get("dataset_stats"))  # the checkpoint's joints had another range
         if policy.config.use_peft:  # the adapters that come next belong to the network that acts
             policy._stop_averaging()
         return policy
-
-    def _learn_range(self, dataset_stats: dict[str, Any] | None) -> None:
-        """Tell the networks that see joints in units of their own how this dataset's are normalised."""
-        for model in (self.model, self.online, self.base):
-            if dataset_stats and model is not None and model.encoder.estimates is not None:
-                model.encoder.estimates.learn_range(dataset_stats[STATE_KEY])
 
     # LeRobot's hooks for --peft.*
 

@@ -1,11 +1,8 @@
 """What the policy sees of its observation: features of the cloud, of the pads and of the joints, per frame.
 
-In place of the features of cloud and pads there may be what a trained network tells of the parts by them.
-
 Shapes: ``B`` batch, ``To`` observation steps, ``N`` points, ``P`` pads, ``R`` x ``C`` taxels.
 """
 
-from collections.abc import Mapping
 from pathlib import Path
 
 import torch
@@ -17,15 +14,13 @@ from lerobot_vtrefine import shipped
 from lerobot_vtrefine.datasets.features import CLOUD_KEY, GRIDS_KEY, LIMITS_KEY, STATE_KEY
 from lerobot_vtrefine.embodiments import get_embodiment
 from lerobot_vtrefine.policies.vt_dp3.configuration_vt_dp3 import VtDp3Config
-from lerobot_vtrefine.policies.vt_dp3.estimates import NAMES, STATE_FEATURES, Estimates, joint_network
 from lerobot_vtrefine.policies.vt_dp3.pad_encoder import PadEncoder
 from lerobot_vtrefine.policies.vt_dp3.point_encoder import PointEncoder
 
+STATE_FEATURES = 64
 PERCEIVED_KEY = "perceived"
 """Of a batch whose frames a frozen encoder has seen before."""
 ENCODER_FLAG = "--policy.pretrained_encoder"
-ESTIMATES = "estimates."
-"""What their weights' names begin with."""
 FRAMES_AT_ONCE = 2048
 """Without gradients: 1024 worlds of two frames. More frames make layers of points that take gigabytes."""
 
@@ -33,8 +28,7 @@ FRAMES_AT_ONCE = 2048
 class ObservationEncoder(nn.Module):
     """To frames -> condition (B, ``cond_dim``): the features of every frame, side by side.
 
-    ``points`` or ``pads`` may be None; joint positions are always seen, limits where they are told. With
-    ``estimates`` these take the place of the features that they are made of.
+    ``points`` or ``pads`` may be None; joint positions are always seen, limits where they are told.
     """
 
     def __init__(
@@ -44,21 +38,23 @@ class ObservationEncoder(nn.Module):
         state_dim: int,
         n_obs_steps: int,
         limits_dim: int = 0,
-        estimates: Estimates | None = None,
     ) -> None:
         super().__init__()
         self.points = points
         self.pads = pads
-        self.estimates = estimates
-        self.state = joint_network(state_dim + limits_dim)
+        self.state = nn.Sequential(
+            nn.Linear(state_dim + limits_dim, STATE_FEATURES),
+            nn.ReLU(),
+            nn.Linear(STATE_FEATURES, STATE_FEATURES),
+        )
         self.limits_dim = limits_dim
-        told = num_features(points, pads) if estimates is None else len(NAMES)
-        self.cond_dim = n_obs_steps * (told + STATE_FEATURES)
+        seen = sum(part.out_dim for part in (points, pads) if part is not None)
+        self.cond_dim = n_obs_steps * (seen + STATE_FEATURES)
 
     @property
     def perception(self) -> tuple[nn.Module, ...]:
         """The networks of cloud and pads: what can be trained before there is a policy."""
-        return tuple(part for part in (self.points, self.pads, self.estimates) if part is not None)
+        return tuple(part for part in (self.points, self.pads) if part is not None)
 
     @property
     def keys(self) -> tuple[str, ...]:
@@ -83,17 +79,13 @@ class ObservationEncoder(nn.Module):
         return {key: batch[key] for key in self.keys}
 
     def perceive(self, batch: dict[str, Tensor]) -> Tensor:
-        """Features (B, To, F) of cloud (B, To, N, 5) in metres and readings (B, To, P, R, C); F may be 0.
-
-        Or what they tell of the parts (B, To, K), by the joints (B, To, Ds).
-        """
+        """Features (B, To, F) of cloud (B, To, N, 5) in metres and readings (B, To, P, R, C); F may be 0."""
         frames = [
             _frame_by_frame(part, batch[key].flatten(0, 1)).unflatten(0, batch[STATE_KEY].shape[:2])
             for key, part in ((CLOUD_KEY, self.points), (GRIDS_KEY, self.pads))
             if part is not None
         ]
-        seen = torch.cat(frames, dim=-1) if frames else batch[STATE_KEY][..., :0]
-        return seen if self.estimates is None else self.estimates(seen, batch[STATE_KEY])
+        return torch.cat(frames, dim=-1) if frames else batch[STATE_KEY][..., :0]
 
     def forward(self, batch: dict[str, Tensor]) -> Tensor:
         """Cloud (B, To, N, 5) in metres, readings (B, To, P, R, C), normalised state (B, To, Ds) and limits
@@ -107,11 +99,6 @@ class ObservationEncoder(nn.Module):
         if self.limits_dim:
             state = torch.cat([state, batch[LIMITS_KEY]], dim=-1)
         return torch.cat([known, self.state(state)], dim=-1).flatten(1)
-
-
-def num_features(points: PointEncoder | None, pads: PadEncoder | None) -> int:
-    """Of one frame's cloud and pads."""
-    return sum(part.out_dim for part in (points, pads) if part is not None)
 
 
 def _frame_by_frame(part: nn.Module, frames: Tensor) -> Tensor:
@@ -134,10 +121,7 @@ def make_encoder(config: VtDp3Config, state_dim: int) -> ObservationEncoder:
         body = get_embodiment(view.embodiment)
         shape = body.pad_layout.rows, body.pad_layout.cols
         pads = PadEncoder(len(body.pad_names), shape, config.pad_width, config.pad_features)
-    estimates = None
-    if config.representation == "estimates":
-        estimates = Estimates(num_features(points, pads), state_dim)
-    return ObservationEncoder(points, pads, state_dim, config.n_obs_steps, config.limits_dim, estimates)
+    return ObservationEncoder(points, pads, state_dim, config.n_obs_steps, config.limits_dim)
 
 
 def encoder_file(config: VtDp3Config) -> str:
@@ -146,18 +130,9 @@ def encoder_file(config: VtDp3Config) -> str:
     return f"encoder_{config.modalities}{touch}.safetensors"
 
 
-def save_encoder(
-    encoder: ObservationEncoder,
-    config: VtDp3Config,
-    folder: Path,
-    estimates: Mapping[str, Tensor] | None = None,
-) -> None:
-    """Write the networks of cloud and pads, and the weights of ``Estimates`` that were trained on them.
-
-    The network of the joints depends on a dataset's normalisation.
-    """
-    told = {f"{ESTIMATES}{name}": value for name, value in (estimates or {}).items()}
-    weights = {name: value.contiguous() for name, value in (_perception_weights(encoder) | told).items()}
+def save_encoder(encoder: ObservationEncoder, config: VtDp3Config, folder: Path) -> None:
+    """Write the networks of cloud and pads; that of the joints depends on a dataset's normalisation."""
+    weights = {name: value.contiguous() for name, value in _perception_weights(encoder).items()}
     save_file(weights, folder / encoder_file(config))
 
 
@@ -183,13 +158,6 @@ def load_encoder(encoder: ObservationEncoder, config: VtDp3Config) -> None:
         weights = load_file(path)
     except SafetensorError as error:
         raise ValueError(f"{path} is damaged: {error}") from error
-    if encoder.estimates is None:
-        weights = {key: value for key, value in weights.items() if not key.startswith(ESTIMATES)}
-    elif not any(key.startswith(ESTIMATES) for key in weights):
-        raise ValueError(
-            f"{path} tells no estimates (--policy.representation): it was trained on several frames at once,"
-            " or by an earlier version; make it anew with vtrefine-information"
-        )
     own = {key: value.shape for key, value in _perception_weights(encoder).items()}
     if own != {key: value.shape for key, value in weights.items()}:
         raise ValueError(
@@ -200,6 +168,4 @@ def load_encoder(encoder: ObservationEncoder, config: VtDp3Config) -> None:
 
 
 def _perception_weights(encoder: ObservationEncoder) -> dict[str, Tensor]:
-    """What does not depend on how a dataset's joints are normalised."""
-    left_out = ("state.", *(f"{ESTIMATES}{name}" for name in Estimates.OF_A_DATASET))
-    return {name: value for name, value in encoder.state_dict().items() if not name.startswith(left_out)}
+    return {name: value for name, value in encoder.state_dict().items() if not name.startswith("state.")}
