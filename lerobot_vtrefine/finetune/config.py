@@ -241,7 +241,8 @@ class FineDppo(TrustRegionDppo):
     """The trust region for tight or gentle tasks and imitations that often succeed: it explores quietly.
 
     With touch, on six fresh seeds each of ``cross_gentle`` and of the square pair (18 iterations), it ends at
-    97 and 95 %, and no iteration of the last half falls by more than 7 points (docs/learning.md).
+    97 and 95 %, and no iteration of the last half falls by more than 7 points (docs/learning.md). Where parts
+    are picked up from the table first, the trust region as it is learns more (docs/learning-tried.md).
     """
 
     iterations: int = 12
