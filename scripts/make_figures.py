@@ -6,7 +6,6 @@ python scripts/make_figures.py results dppo             # some
 MENAGERIE_DIR=mujoco_menagerie python scripts/make_figures.py looks    # needs MuJoCo Menagerie
 """
 
-import csv
 import json
 import os
 import subprocess
@@ -19,55 +18,15 @@ from typing import Any
 import lerobot  # noqa: F401  registers the environment
 import matplotlib as mpl
 import numpy as np
-from matplotlib.lines import Line2D
-from matplotlib.patches import Patch
+from figures.common import GREY, IMAGES
+from figures.learning import draw_dppo, draw_paper, draw_rate, draw_results
 
 from lerobot_vtrefine.cli.arguments import CommandParser
 from lerobot_vtrefine.cli.errors import run_cli
-from lerobot_vtrefine.cli.results.rows import Run, read_all
 from lerobot_vtrefine.embodiments import ALOHA
 
-ROOT = Path(__file__).parents[1]
-IMAGES = ROOT / "docs" / "img"
 PITCH_MM = 2.0
 SEED = 3
-BLUE, ORANGE, GREY = "#2f6fb2", "#d9762b", "#8a8f98"
-CURVES = {
-    "round pair": {"R.c8.k12": "12 to 3 nats per decision", "R.g4.k24": "24 to 3"},
-    "square pair, 1 mm, more slip": {"B.g8.k12": "12 to 3", "B.g8.k40": "40 to 2"},
-}
-"""Learning curves that show what the size of a step does, by their names in docs/step_size_curves.csv."""
-LIMITED = "rate limited to 2e-4"
-LIMITS = {
-    "limited to 2e-4": (
-        (f"{LIMITED}, seeds it was chosen on", LIMITED),
-        BLUE,
-    ),
-    "without a limit": (("rate without a limit, 108 iterations",), ORANGE),
-}
-"""Runs of VISION, by the variants of their rows."""
-VISION = ("square_1mm_slip", "visual")
-POLICIES = {"visuo_tactile": BLUE, "visual": ORANGE}
-LEARNED = {
-    "cross_gentle": "needs touch: cross, 5 N",
-    "cross_gentle_twin": "its twin needs none",
-    "d_occluded": "needs touch: hidden D",
-    "cross_limited_1000": "needs touch: told limit",
-    "square_1mm_slip": "square, 1 mm",
-}
-"""Tasks of the table ``converges`` whose stages are drawn."""
-STAGES = {
-    "imitation": ("imitation", f"{LIMITED}, imitation"),
-    "after DPPO": ("", LIMITED),
-}
-"""Variants of rows: of a task with more than one, the last is by today's preset."""
-TASKS = {
-    "demo": "round,\n2 mm",
-    "tight": "round,\n1 mm",
-    "occluded": "hole\nhidden",
-    "slip": "twice\nthe slip",
-    "short_chunk": "decisions\ntwice as often",
-}
 NAMES = (
     ("left arm", (0.10, 0.62), (0.20, 0.42)),
     ("right arm", (0.90, 0.62), (0.85, 0.33)),
@@ -251,45 +210,6 @@ def draw_policy(plt: Any, sim: Any, frames: list[dict[str, Any]]) -> None:
     figure.savefig(IMAGES / "policy.png")
 
 
-def draw_dppo(plt: Any) -> None:
-    """Success over iterations, at three step sizes."""
-    with (ROOT / "docs" / "step_size_curves.csv").open(encoding="utf-8") as file:
-        rows = list(csv.DictReader(file))
-    figure, axes = plt.subplots(1, 2, figsize=(8.8, 3.2), sharey=True, layout="constrained")
-    for ax, (title, runs) in zip(axes, CURVES.items(), strict=True):
-        for (run, words), colour in zip(runs.items(), (BLUE, ORANGE), strict=True):
-            points = [
-                (int(r["iteration"]), 100 * float(r["success"]))
-                for r in rows
-                if r["run"] == run and r["success"]
-            ]
-            ax.plot(*zip(*sorted(points), strict=True), color=colour, lw=2, label=words)
-        ax.set_title(title, loc="left")
-        ax.set(xlabel="iteration of 1024 episodes", ylim=(0, 100))
-        ax.legend(frameon=False, loc="upper left" if "square" in title else "lower right")
-    axes[0].set_ylabel("success [%]")
-    figure.savefig(IMAGES / "dppo.png")
-
-
-def draw_rate(plt: Any) -> None:
-    """Success and learning rate over iterations, with a limit of the rate and without."""
-    rows = [row for row in read_all(ROOT / "results") if isinstance(row, Run) and row.curve]
-    figure, (above, below) = plt.subplots(1, 2, figsize=(8.8, 3.2), layout="constrained")
-    for words, (variants, colour) in LIMITS.items():
-        label: str | None = words
-        for row in (row for row in rows if (row.task, row.policy) == VISION and row.variant in variants):
-            with (ROOT / "results" / str(row.curve)).open(encoding="utf-8") as file:
-                points = [point for point in csv.DictReader(file) if point["success"]]
-            at = [int(point["iteration"]) for point in points]
-            above.plot(at, [100 * float(p["success"]) for p in points], color=colour, lw=1, label=label)
-            below.semilogy(at, [float(p["actor_lr"]) for p in points], color=colour, lw=1)
-            label = None
-    above.set(title="success while exploring [%]", xlabel="iteration of 1024 episodes", ylim=(0, 100))
-    below.set(title="learning rate", xlabel="iteration of 1024 episodes")
-    above.legend(frameon=False, loc="lower right")
-    figure.savefig(IMAGES / "rate.png")
-
-
 def draw_diagnosis(plt: Any) -> None:
     """One press as it was measured, as the plain model has it, and as the repaired one has it."""
     import pyarrow.parquet as pq
@@ -337,56 +257,6 @@ def rms(values: np.ndarray) -> float:
     return float(np.sqrt(np.mean(values**2)))
 
 
-def draw_results(plt: Any) -> None:
-    """Success with touch and without: where it is needed and where not, with the paper's cloud."""
-    rows = [row for row in read_all(ROOT / "results") if isinstance(row, Run)]
-    figure, (*left, right) = plt.subplots(
-        1,
-        len(LEARNED) + 1,
-        figsize=(16.5, 4.0),
-        sharey=True,
-        width_ratios=[*[2] * len(LEARNED), 5],
-        layout="constrained",
-    )
-    for ax, (task, title) in zip(left, LEARNED.items(), strict=True):
-        draw_stages(ax, [row for row in rows if row.table == "converges" and row.task == task])
-        ax.set_title(title, loc="left")
-    for place, task in enumerate(TASKS):
-        for side, (policy, colour) in enumerate(POLICIES.items()):
-            mine = [r for r in rows if (r.table, r.task, r.policy) == ("touch", task, policy)]
-            x = place + (side - 0.5) * 0.36
-            draw_seeds(right, x, [100 * r.success for r in mine if not r.variant], colour)
-            before = np.mean([100 * r.success for r in mine if r.variant == "imitation"])
-            right.plot([x - 0.15, x + 0.15], [before] * 2, color="black", lw=1.5, zorder=3)
-    right.set_xticks(range(len(TASKS)), list(TASKS.values()), fontsize=11)
-    right.set_title("the paper's cloud, easier tasks, after DPPO", loc="left")
-    left[0].set(ylabel="success [%]", ylim=(0, 103))
-    handles = [
-        Patch(color=BLUE, alpha=0.45, label="vision and touch"),
-        Patch(color=ORANGE, alpha=0.45, label="vision only"),
-        Line2D([], [], marker="o", ls="", ms=4, color=GREY, label="one seed"),
-        Line2D([], [], color="black", label="imitation before it"),
-    ]
-    figure.legend(handles=handles, ncols=4, frameon=False, loc="outside lower center")
-    figure.savefig(IMAGES / "results.png")
-
-
-def draw_stages(ax: Any, rows: list[Run]) -> None:
-    """One task's success before and after DPPO."""
-    for place, variants in enumerate(STAGES.values()):
-        variant = [name for name in variants if any(row.variant == name for row in rows)][-1]
-        for side, (policy, colour) in enumerate(POLICIES.items()):
-            found = [100 * r.success for r in rows if (r.policy, r.variant) == (policy, variant)]
-            draw_seeds(ax, place + (side - 0.5) * 0.36, found, colour)
-    ax.set_xticks(range(len(STAGES)), list(STAGES))
-
-
-def draw_seeds(ax: Any, x: float, found: list[float], colour: str) -> None:
-    """A bar of the mean with a dot for every seed."""
-    ax.bar(x, np.mean(found), 0.32, color=colour, alpha=0.45)
-    ax.plot(x + np.linspace(-0.1, 0.1, len(found)), found, "o", ms=4, color=colour, zorder=4)
-
-
 SIMULATED: dict[str, Callable[..., None]] = {
     "pads": draw_pads,
     "task": draw_task,
@@ -397,6 +267,7 @@ OTHERS: dict[str, Callable[..., None]] = {
     "depth_sensors": draw_depth_sensors,
     "dppo": draw_dppo,
     "rate": draw_rate,
+    "paper": draw_paper,
     "results": draw_results,
     "diagnosis": draw_diagnosis,
     "looks": draw_looks,

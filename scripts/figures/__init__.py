@@ -1,0 +1,1 @@
+"""Pictures of the documentation, for scripts/make_figures.py."""
