@@ -5,16 +5,17 @@
     python scripts/compare_paper.py --mesh_dir=MESHES --pairs 00186 --demonstrations 10 30 50 --jobs 12
     make tables
 
-MESHES holds ID_plug.obj and ID_socket.obj. Per pair an encoder learns to see and feel, from the table on; per
-pair and seed demonstrations are recorded once. Policies with touch and with vision only learn from them (on
-features that are computed once; where the encoder is trained, by stock lerobot-train) and are fine-tuned by
-DPPO, once more from random weights (one step of imitation); stock lerobot-eval judges each, always from the
-table, on episodes that are the same for all. Where DPPO practises is --tune_start: on whole episodes (table);
-from states that the imitation reached with both parts in hand, or the expert where it reaches too few (bank);
-or with parts that are put into the hands (grasped), where a pair can be. Random weights, which never get that
-far, practise on whole episodes in place of a bank. On a GPU worlds wait for the one that runs out of time:
---tune_steps=120 ends episodes from a bank earlier, counted from the table. --tune_timestep_s=0.005 practises
-in longer physics steps than those in which policies are judged.
+MESHES holds ID_plug.obj and ID_socket.obj. Per pair an encoder learns to see and feel, from the table on, where
+none comes with the package; per pair and seed demonstrations are recorded once. Policies with touch and with
+vision only learn from them (on features that are computed once; where the encoder is trained, by stock
+lerobot-train) and are fine-tuned by DPPO, once more from random weights (one step of imitation); stock
+lerobot-eval judges each, always from the table, on episodes that are the same for all. On a GPU noise, steps and
+chain are those of the table in docs/learning.md. Where DPPO practises is --tune_start: on whole episodes
+(table); from states that the imitation reached with both parts in hand, or the expert where it reaches too few
+(bank); or with parts that are put into the hands (grasped), where a pair can be. Random weights, which never
+get that far, practise on whole episodes in place of a bank. On a GPU worlds wait for the one that runs out of
+time: --tune_steps=120 ends episodes from a bank earlier, counted from the table. --tune_timestep_s=0.005
+practises in longer physics steps than those in which policies are judged.
 
 Every policy becomes rows of results/paper.json, or of results/demonstrations.json, as soon as it is judged.
 The same command again goes on where it was: finished stages are not repeated, nor policies whose rows are
@@ -58,15 +59,16 @@ def make_parser() -> CommandParser:
     parser.add_argument("--recipe", choices=list(RECIPES), default="pads", help="as vtrefine-demo's")
     parser.add_argument(
         "--encoder",
-        help="of --recipe=pads, in place of one trained here; {pair} stands for the pair's number",
+        help="of --recipe=pads; {pair} stands for the pair's number (default: what comes with the package for"
+        " the pair, else one trained here; own: one trained here)",
     )
     parser.add_argument("--encoder_episodes", type=int, default=4096, help="that an encoder learns from")
     parser.add_argument("--encoder_steps", type=int, default=4000, help="of an encoder's training")
     parser.add_argument("--steps", type=int, default=6000, help="of imitation")
     parser.add_argument("--batch_size", type=int, default=128, help="of imitation (default %(default)s)")
-    parser.add_argument("--iterations", type=int, default=60, help="of DPPO")
+    parser.add_argument("--iterations", type=int, default=14, help="of DPPO (default %(default)s)")
     parser.add_argument("--scratch_iterations", type=int, default=20, help="of DPPO without pre-training")
-    parser.add_argument("--worlds", type=int, default=512, help="of DPPO")
+    parser.add_argument("--worlds", type=int, default=1024, help="of DPPO (default %(default)s)")
     parser.add_argument("--tune_start", choices=["table", "bank", "grasped"], default="table", help="of DPPO")
     parser.add_argument("--tune_steps", type=int, help="control step at which episodes from a bank end")
     parser.add_argument("--tune_timestep_s", type=float, help="longest physics step [s] of DPPO")

@@ -16,7 +16,7 @@ from lerobot_vtrefine.cli.pipeline.demo_config import (
     default_degradation,
 )
 from lerobot_vtrefine.cli.pipeline.stages import Stage
-from lerobot_vtrefine.shipped import PREFIX
+from lerobot_vtrefine.shipped import PREFIX, encoders
 from paper.trained import Trained, first_seed, iterations_of
 
 CLONE = Path(__file__).parents[1] / "clone_on_features.py"
@@ -28,6 +28,17 @@ TASKS = {
     "00581": "automate_00581_stands",
 }
 """Files of configs/env. The shaft of 00581 stays on the table, as the paper's robot leaves it."""
+TRAINED_HERE = "own"
+"""Of --encoder."""
+POLICY = {"down_dims": [512] * 4, "feature_noise": 0.3}
+DPPO = {
+    "type": "trust_region",
+    "sampler": "ddim",
+    "sampler_steps": 10,
+    "ft_denoising_steps": 5,
+    "micro_batch_decisions": 1024,
+}
+"""The table's recipe on a GPU, where it differs from the demo's (docs/learning-tried.md says why)."""
 BANK_SEED_OFFSET = EVAL_SEED_OFFSET + 1_000_000
 """Past the episodes of an evaluation, which no bank may have seen."""
 NEVER_IN_HAND = ("00446", "00581")
@@ -66,9 +77,11 @@ def record_stage(options: argparse.Namespace, policy: Trained) -> Stage:
     return Stage(root.name, f"Record {root.name}", command, root, product, resumable=True)
 
 
-def trains_encoder(options: argparse.Namespace) -> bool:
-    """Whether each pair's encoder is trained here."""
-    return options.recipe == "pads" and not options.encoder and "pretrained_encoder" not in options.policy
+def trains_encoder(options: argparse.Namespace, pair: str) -> bool:
+    """Whether a pair's encoder is trained here: where none is named, and none comes with the package."""
+    if options.recipe != "pads" or "pretrained_encoder" in options.policy:
+        return False
+    return options.encoder == TRAINED_HERE or not (options.encoder or TASKS[pair] in encoders())
 
 
 def encoder_stage(options: argparse.Namespace, pair: str) -> Stage:
@@ -94,12 +107,23 @@ def encoder_stage(options: argparse.Namespace, pair: str) -> Stage:
 
 def policy_settings(options: argparse.Namespace, policy: Trained) -> dict[str, Any]:
     """Of vt_dp3."""
-    recipe: dict[str, Any] = RECIPES[options.recipe]["policy"] | options.policy
-    if trains_encoder(options):
-        return recipe | {"pretrained_encoder": str(encoder_stage(options, policy.pair).output)}
-    if options.recipe == "pads" and options.encoder:
-        recipe = {"pretrained_encoder": options.encoder.format(pair=policy.pair)} | recipe
+    recipe: dict[str, Any] = RECIPES[options.recipe]["policy"]
+    if options.recipe == "pads":
+        named = options.encoder or f"{PREFIX}{TASKS[policy.pair]}"
+        recipe = (
+            recipe
+            | (POLICY if on_a_gpu(options) else {})
+            | {"pretrained_encoder": named.format(pair=policy.pair)}
+        )
+    recipe = recipe | options.policy
+    if trains_encoder(options, policy.pair):
+        recipe["pretrained_encoder"] = str(encoder_stage(options, policy.pair).output)
     return recipe
+
+
+def on_a_gpu(options: argparse.Namespace) -> bool:
+    """Whether many worlds practise at once."""
+    return options.backend == "warp"
 
 
 def imitation_stage(options: argparse.Namespace, policy: Trained) -> Stage:
@@ -109,7 +133,7 @@ def imitation_stage(options: argparse.Namespace, policy: Trained) -> Stage:
     steps = options.steps if policy.demonstrations else 1
     frozen = recipe.get("freeze_encoder", False)
     command = (clone_command if frozen else train_command)(options, policy, recipe, steps, out)
-    encoder = [encoder_stage(options, policy.pair).name] if trains_encoder(options) else []
+    encoder = [encoder_stage(options, policy.pair).name] if trains_encoder(options, policy.pair) else []
     needs = (dataset(options, policy).name, *encoder)
     return Stage(
         out.name, f"Imitation {policy.name}", command, out, checkpoint(out) / "model.safetensors", needs
@@ -220,9 +244,8 @@ def finetune_stage(options: argparse.Namespace, policy: Trained) -> Stage:
 
 
 def dppo_settings(options: argparse.Namespace) -> dict[str, Any]:
-    """The recipe's, with the preset for many worlds on a GPU."""
-    preset = {"type": "trust_region"} if options.backend == "warp" else {}
-    return RECIPES[options.recipe]["dppo"] | preset | options.dppo
+    """The demo's, or the table's with many worlds on a GPU."""
+    return RECIPES[options.recipe]["dppo"] | (DPPO if on_a_gpu(options) else {}) | options.dppo
 
 
 def evaluation_stage(options: argparse.Namespace, policy: Trained, stage: str) -> Stage:
@@ -247,7 +270,7 @@ def evaluation_stage(options: argparse.Namespace, policy: Trained, stage: str) -
 
 def shared_stages(options: argparse.Namespace, policy: Trained) -> list[Stage]:
     """What several policies use."""
-    encoder = [encoder_stage(options, policy.pair)] if trains_encoder(options) else []
+    encoder = [encoder_stage(options, policy.pair)] if trains_encoder(options, policy.pair) else []
     return [*encoder, record_stage(options, policy)]
 
 

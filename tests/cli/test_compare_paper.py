@@ -49,7 +49,7 @@ def test_policies_become_rows_of_both_tables_and_are_not_made_twice(
     run: Callable[..., str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(trained, "MODALITIES", ("visuo_tactile",))
-    told = run("--pairs", "00186")
+    told = run("--pairs", "00186", "--encoder=own", "--iterations=60")
     assert told.count("done before") == 2  # encoder and demonstrations, which random weights share
     paper, fewer = of(tmp_path / "paper.json"), of(tmp_path / "demonstrations.json")
     assert set(paper) == {"imitation", "", "without pre-training"}
@@ -63,9 +63,9 @@ def test_policies_become_rows_of_both_tables_and_are_not_made_twice(
     shown = table("paper", [*paper.values()])
     assert "| DPPO after imitation | automate/00186 | - | 72 | 75 [41, 93] | 94 | - | +22 |" in shown
     shutil.rmtree(tmp_path / "out")  # another machine
-    assert run("--pairs", "00186") == ""
+    assert run("--pairs", "00186", "--encoder=own", "--iterations=60") == ""
     for change, left in ((["--episodes=12"], 2), (["--scratch_iterations=21"], 1), (["--seeds=1"], 2)):
-        options = parse([*common(tmp_path), "--pairs=00186", *change])
+        options = parse([*common(tmp_path), "--pairs=00186", "--iterations=60", *change])
         assert sum(not script.is_done(options, policy) for policy in script.chosen(options)) == left
 
 
@@ -135,6 +135,21 @@ def test_every_pair_trains_an_encoder_from_the_table_and_policies_learn_on_its_f
         assert imitation.command[1].endswith("clone_on_features.py")
         assert '"pretrained_encoder": "out/encoder_00446"' in imitation.line
         assert f'"modalities": "{policy.senses}"' in imitation.line
+
+
+def test_a_pairs_encoder_that_comes_with_the_package_is_taken_and_on_a_gpu_the_tables_recipe() -> None:
+    options = parse(["--mesh_dir=meshes", "--pairs=00186", "--seeds=0", "--backend=warp", "--output_dir=out"])
+    for policy in script.chosen(options):
+        record, imitation, *_, finetune, _ = script.stages(options, policy)
+        assert imitation.needs == (record.name,)
+        assert '"pretrained_encoder": "vtrefine:automate_00186"' in imitation.line
+        assert '"feature_noise": 0.3' in imitation.line
+        assert "--dppo.type=trust_region --dppo.sampler=ddim" in finetune.line.replace(
+            "--dppo.encoder=frozen ", ""
+        )
+    own = parse(["--mesh_dir=meshes", "--pairs=00186", "--seeds=0", "--encoder=own", "--output_dir=out"])
+    encoder, *_ = script.stages(own, script.chosen(own)[0])
+    assert encoder.name == "encoder_00186"
 
 
 def test_an_encoder_that_is_named_is_taken_in_place_of_one_trained_here() -> None:
