@@ -10,8 +10,8 @@ import numpy as np
 
 from lerobot_vtrefine.diagnose.core.heldout import OutOfFold, out_of_fold
 from lerobot_vtrefine.diagnose.core.resampling import agree
-from lerobot_vtrefine.diagnose.core.rules import FORM_P
-from lerobot_vtrefine.diagnose.core.screened_rivals import surely_likelier, tied
+from lerobot_vtrefine.diagnose.core.rules import ALPHA, FORM_P, LEAST_GAIN
+from lerobot_vtrefine.diagnose.core.screened_rivals import surely_likelier
 from lerobot_vtrefine.diagnose.core.screened_search import (
     CHANNEL,
     ScreenedSearch,
@@ -233,25 +233,25 @@ def plain_forms(state: State) -> State:
 
 
 def one_hinge(state: State) -> State:
-    """A turn about an edge in the place of a turn and an offset, where trials do not prefer the two.
+    """A turn about an edge in the place of a turn and an offset, unless these are likelier by a name's odds.
 
     It is one cause, and has a coordinate less. Where presses reach a part of the face only it is not tried as
-    a name: it lifts them alike, as an offset does. Here both names had to pass, and the turn about that edge
-    must be told by itself.
+    a name: it lifts them alike, as an offset does. Here both names had to pass, and by how much the turn about
+    that edge lifts the middle must be told by itself.
     """
     model = state.fit.model
     if PLANE not in model.forms or CONSTANT not in model.forms:
         return state
-    family = CONSTANT.family
-    bare = replace(state.fit, model=model.minus(family))
-    found = state.with_form(state.without(family), HINGED, bare)
-    own = model.place(model.forms.index(PLANE))
-    values, setting = found.model.own(found.model.forms.index(HINGED)), model.setting
+    bare = replace(state.fit, model=model.minus(CONSTANT.family))
+    found = state.with_form(state.without(CONSTANT.family), HINGED, bare)
+    edge = found.model.own(found.model.forms.index(HINGED))[-1]
+    turn = model.place(model.forms.index(PLANE))
     low, high = leave_out(state.fit, state.problem.presses).interval(
-        lambda pair: lift(np.array([*pair[own], values[2]]), setting)
+        lambda values: lift(np.array([*values[turn], edge]), model.setting)
     )
-    told = low > 0.0 or high < 0.0
-    return state.weighed(found) if told and tied(state.held(state.fit), state.held(found), state.seed) else state
+    two, one = state.held(state.fit), state.held(found)
+    needed = float(two.better_by(one).sum()) > np.log(1.0 / ALPHA) or two.gain_over(one) > LEAST_GAIN
+    return state if needed or low <= 0.0 <= high else state.weighed(found)
 
 
 def likeliest_forms(state: State) -> State:
