@@ -235,12 +235,12 @@ def plain_forms(state: State) -> State:
 def one_hinge(state: State) -> State:
     """A turn about an edge in the place of a turn and an offset, unless these are likelier by a name's odds.
 
-    It is one cause, and has a coordinate less. Where presses reach a part of the face only it is not tried as
-    a name: it lifts them alike, as an offset does. Here both names had to pass, and by how much the turn about
+    It is one cause, and has a coordinate less. Where presses reach a part of the face only the search does not
+    try it: it lifts them alike, as an offset does. Here both names had to pass, and by how much the turn about
     that edge lifts the middle must be told by itself.
     """
     model = state.fit.model
-    if PLANE not in model.forms or CONSTANT not in model.forms:
+    if not {PLANE, CONSTANT} <= {*model.forms} or HINGED.possible(model.setting):
         return state
     bare = replace(state.fit, model=model.minus(CONSTANT.family))
     found = state.with_form(state.without(CONSTANT.family), HINGED, bare)
