@@ -235,9 +235,9 @@ def plain_forms(state: State) -> State:
 def one_hinge(state: State) -> State:
     """A turn about an edge in the place of a turn and an offset, unless these are likelier by a name's odds.
 
-    It is one cause, and has a coordinate less. Where presses reach a part of the face only the search does not
-    try it: it lifts them alike, as an offset does. Here both names had to pass, and by how much the turn about
-    that edge lifts the middle must be told by itself.
+    It is one cause, and has a coordinate less. Where presses reach a part of the face only, the search does
+    not try it: it lifts them alike, as an offset does. Here both names had to pass, and by how much the turn
+    about that edge lifts the middle must be told by itself.
     """
     model = state.fit.model
     if not {PLANE, CONSTANT} <= {*model.forms} or HINGED.possible(model.setting):
