@@ -452,13 +452,14 @@ def test_where_few_of_many_trials_have_a_say_the_size_of_their_scores_counts() -
         for k in range(20)
     ]
 
-    def passes(size, telling, agreeing=TRIALS, beside=()):
+    def passes(size, telling, agreeing=TRIALS, beside=(), sized=True):
         scores = np.where(np.arange(TRIALS) < telling, size, 0.01 * (-1.0) ** np.arange(TRIALS))
         scores[agreeing:telling] *= -1.0
         bend = Probe("bend", None, np.zeros(0), scores, np.abs(scores), False)
-        return screen([bend, *guesses, *beside], TRIALS, 0)["bend"].passed
+        return screen([bend, *guesses, *beside], TRIALS, 0, sized=sized)["bend"].passed
 
     assert passes(50.0, 7)
+    assert not passes(50.0, 7, sized=False)
     assert not passes(50.0, 7, agreeing=6)
     assert not passes(50.0, 4)
     assert not passes(2.0, 7)

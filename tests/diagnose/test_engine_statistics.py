@@ -6,11 +6,13 @@ import sys
 
 import numpy as np
 import pytest
+from test_engine_forward import presses
 
 from lerobot_vtrefine.diagnose.core.heldout import lock
 from lerobot_vtrefine.diagnose.core.score_test import Probe, cleared, screen
+from lerobot_vtrefine.diagnose.pad.baseline import plain_weights
 from lerobot_vtrefine.diagnose.pad.noise import Noise
-from lerobot_vtrefine.diagnose.pad.weights import build_weights
+from lerobot_vtrefine.diagnose.pad.weights import build_weights, in_deviations
 
 
 def probe(name: str, scores: np.ndarray, one_sided: bool = False) -> Probe:
@@ -72,6 +74,8 @@ def test_weights_are_the_inverse_covariance() -> None:
     inverse = flat @ np.linalg.inv(covariance) @ flat.T
     assert np.allclose(weight.gram(vectors), inverse)
     assert np.allclose(weight.products(vectors, vectors[0]), [*inverse[0], inverse[0, 0]])
+    assert in_deviations([weight])
+    assert not in_deviations(plain_weights(presses()))
 
 
 @pytest.mark.parametrize(("conditions", "replicates"), [(8, 2), (12, 2), (4, 2), (24, 1), (2, 4)])

@@ -116,13 +116,16 @@ def tail_shares(statistics: Array) -> Array:
     return shares
 
 
-def screen(probes: Sequence[Probe], count: int, seed: int) -> dict[str, Tested]:
+def screen(probes: Sequence[Probe], count: int, seed: int, *, sized: bool = True) -> dict[str, Tested]:
     """The best probe of every name with its p-value adjusted over all of them.
 
     Tests of two kinds share the error rate by a weighted Bonferroni rule (Holm 1979), each kind by its part
     in SCREEN_SHARES: sums of scores under flips of the trials' signs, judged together by the smallest p, and
     sums of products under the same flips. What is observed takes no part. Where nothing passes, sums that a
     few trials carry may do so by their size.
+
+    Args:
+        sized: whether scores are in deviations of noise; else their size tells nothing.
     """
     best: dict[str, Tested] = {}
     by_size: list[Tested] = []
@@ -137,11 +140,11 @@ def screen(probes: Sequence[Probe], count: int, seed: int) -> dict[str, Tested]:
         names = len({probe.name for probe in tested})
         p_values, adjusted = _flip_p(tested, signs)
         for probe, p_value, together in zip(tested, p_values, adjusted, strict=True):
-            sized = min(together, names * size_p(probe))
+            least = min(together, names * size_p(probe)) if sized else together
             if too_few_agree(probe, p_value):
-                together = sized
+                together = least
             elif few_carry(probe, p_value):
-                by_size.append(Tested(probe, p_value, min(1.0, sized * whole / SCREEN_SHARES[kind])))
+                by_size.append(Tested(probe, p_value, min(1.0, least * whole / SCREEN_SHARES[kind])))
             _keep(best, Tested(probe, p_value, min(1.0, together * whole / SCREEN_SHARES[kind])))
     if not any(item.passed for item in best.values()):
         for item in by_size:

@@ -51,7 +51,7 @@ from lerobot_vtrefine.diagnose.pad.shown_dead import with_shown_dead
 from lerobot_vtrefine.diagnose.pad.suspicions import surprises, suspicions
 from lerobot_vtrefine.diagnose.pad.taxel_maps import MapEvidence, find_dead, map_evidence, map_of, with_map
 from lerobot_vtrefine.diagnose.pad.thinning import thinned
-from lerobot_vtrefine.diagnose.pad.weights import TrialWeights
+from lerobot_vtrefine.diagnose.pad.weights import TrialWeights, in_deviations
 
 Array = np.ndarray
 type Found = Fit | FinalFit
@@ -331,7 +331,8 @@ class PadProblem(OptionalSteps):
         """Scores of all forms that are screened, of maps, and of frames that repeat."""
         probes = all_probes(self, now) if only is None else form_probes(self, now, only)
         out = []
-        for name, tested in screen(probes, len(self.weights), self.seed).items():
+        sized = in_deviations(self.weights)
+        for name, tested in screen(probes, len(self.weights), self.seed, sized=sized).items():
             forms = tuple(forms_of(name, now))
             starts = {form.label: starts_of(form, probes) for form in forms}
             plain = Candidate(name, form=forms[0] if forms else None, starts=starts, others=forms[1:])

@@ -28,6 +28,7 @@ from lerobot_vtrefine.diagnose.pad.gain_drift import gain_drift
 from lerobot_vtrefine.diagnose.pad.hum import hum
 from lerobot_vtrefine.diagnose.pad.one_size import sizes_differ
 from lerobot_vtrefine.diagnose.pad.own_face import leaning_face
+from lerobot_vtrefine.diagnose.pad.own_touch import with_own_touch
 from lerobot_vtrefine.diagnose.pad.press_trials import PressSet
 from lerobot_vtrefine.diagnose.pad.recording_scatter import own_deviations, recording_scatter
 from lerobot_vtrefine.diagnose.pad.repeatability import Correlations
@@ -37,7 +38,7 @@ from lerobot_vtrefine.diagnose.pad.screening import Scorer
 from lerobot_vtrefine.diagnose.pad.shared_errors import noise_in_bursts, shared_errors
 from lerobot_vtrefine.diagnose.pad.sliding_errors import while_sliding
 from lerobot_vtrefine.diagnose.pad.taxel_maps import with_all_dead
-from lerobot_vtrefine.diagnose.pad.weights import TrialWeights
+from lerobot_vtrefine.diagnose.pad.weights import TrialWeights, in_deviations
 
 if TYPE_CHECKING:
     from lerobot_vtrefine.diagnose.pad.problem import PadProblem
@@ -143,7 +144,12 @@ def _repeating(
 def following(
     problem: "PadProblem", fitted: Fit, descriptors: Sequence[Descriptor] = DESCRIPTORS
 ) -> list[Suspicion]:
-    """What is left may follow a descriptor; what a named family's own kind of effect leaves must be more."""
+    """What is left may follow a descriptor; what a named family's own kind of effect leaves must be more.
+
+    Asked around every recording's own touch: one that touches far from where it should leaves what no tangent
+    of its touch can do, and alone outweighs all the others.
+    """
+    problem, fitted = with_own_touch(problem, fitted)
     presses, families = problem.presses, set(fitted.model.families)
     _, columns = tangents(fitted.model, presses, fitted.model.free)
     scorer = Scorer(fitted, presses, problem.weights, columns)
@@ -159,7 +165,7 @@ def following(
         share = left_out_share(fitted, presses, columns, change, problem.folds)
         least = FOLLOWS_IF_OWNED if families & set(descriptor.owners) else FOLLOWS
         text = f"the residual correlates with {descriptor.text} ({100 * share:.0f} % of its power)"
-        scatter = float(np.sqrt(information.sum()))
+        scatter = float(np.sqrt(information.sum())) if in_deviations(problem.weights) else None
         found.append(Suspicion(0, text, share, least, scores, either_sign=True, scatter=scatter))
     return found
 

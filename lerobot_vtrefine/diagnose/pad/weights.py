@@ -44,6 +44,11 @@ class TrialWeights:
         )
 
 
+def in_deviations(weights: Sequence[TrialWeights]) -> bool:
+    """Whether errors count in deviations of noise: where all readings count alike they do in counts."""
+    return weights[0].nuisance.shape[1] > 0
+
+
 def whiten(image: np.ndarray, sigma: np.ndarray, memory: Whitener) -> np.ndarray:
     """Divide by sigma and take out memory: (T, n) to (T*n,)."""
     moved = np.flatnonzero((image != 0.0).any(axis=0))

@@ -83,3 +83,4 @@ FORMS = (
     ),
     UNEVEN,
 )
+CONSTANT = FORMS[0]
