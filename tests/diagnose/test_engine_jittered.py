@@ -16,8 +16,6 @@ from lerobot_vtrefine.diagnose.core.search import Selection
 from lerobot_vtrefine.diagnose.core.suspicion import raise_alarms
 from lerobot_vtrefine.diagnose.pad.baseline import fit_baseline
 from lerobot_vtrefine.diagnose.pad.candidates import CATALOGUE
-from lerobot_vtrefine.diagnose.pad.candidates.contact_offset import CONSTANT
-from lerobot_vtrefine.diagnose.pad.candidates.pad_tilt import PLANE
 from lerobot_vtrefine.diagnose.pad.candidates.saturation import FREE
 from lerobot_vtrefine.diagnose.pad.decoys import in_place_of_names
 from lerobot_vtrefine.diagnose.pad.descriptors import errors_left_out
@@ -30,7 +28,7 @@ from lerobot_vtrefine.diagnose.pad.model import sensor_model
 from lerobot_vtrefine.diagnose.pad.own_touch import with_own_touch
 from lerobot_vtrefine.diagnose.pad.press_trials import prepare
 from lerobot_vtrefine.diagnose.pad.problem import Candidate, PadProblem
-from lerobot_vtrefine.diagnose.pad.review import State, cover_or_readout, one_hinge
+from lerobot_vtrefine.diagnose.pad.review import State, cover_or_readout
 from lerobot_vtrefine.diagnose.pad.screening import forms_of
 from lerobot_vtrefine.diagnose.pad.suspicions import suspicions
 from lerobot_vtrefine.diagnose.pad.taxel_maps import with_map
@@ -197,24 +195,6 @@ def test_what_damping_bears_tells_a_cover_that_gives_way_from_a_readout(effect: 
     named = with_form(fitted, FREE, (), problem.presses, problem.weights)
     state = State(problem, fitted, 0).weighed(named)
     assert cover_or_readout(state).fit.model.families == (cause,)
-
-
-@pytest.mark.parametrize(
-    ("late_m", "causes"), [(0.0, {"pad_tilt"}), (6e-5, {"pad_tilt", "contact_offset"})], ids=["edge", "two"]
-)
-def test_a_turn_about_an_edge_that_was_not_tried_is_one_cause(late_m: float, causes: set[str]) -> None:
-    # The first column stays where it is.
-    edge = Effect("pad_tilt", "height", lambda p, x, a: x + a * 2e-3 * p.col - late_m, 5e-3)
-    held = Rig(5, 8, 12).record([(edge, 5e-3)])
-    problem, fitted = PadProblem(prepare(held, list(held.trials), list(range(len(held.trials))))).weighed(
-        None
-    )
-    strip = replace(fitted.model.setting, touched_cols=6)
-    fitted = replace(fitted, model=replace(fitted.model, setting=strip))
-    for form in (PLANE, CONSTANT):
-        fitted = with_form(fitted, form, (), problem.presses, problem.weights)
-    state = State(problem, fitted, 0).weighed(fitted)
-    assert {*one_hinge(state).fit.model.families} == causes
 
 
 def test_a_soft_offset_is_told_as_how_far_deep_presses_are_shifted() -> None:

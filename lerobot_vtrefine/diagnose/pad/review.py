@@ -10,7 +10,7 @@ import numpy as np
 
 from lerobot_vtrefine.diagnose.core.heldout import OutOfFold, out_of_fold
 from lerobot_vtrefine.diagnose.core.resampling import agree
-from lerobot_vtrefine.diagnose.core.rules import ALPHA, FORM_P, LEAST_GAIN
+from lerobot_vtrefine.diagnose.core.rules import FORM_P
 from lerobot_vtrefine.diagnose.core.screened_rivals import surely_likelier
 from lerobot_vtrefine.diagnose.core.screened_search import (
     CHANNEL,
@@ -22,15 +22,12 @@ from lerobot_vtrefine.diagnose.core.screened_search import (
 from lerobot_vtrefine.diagnose.core.search import Selection
 from lerobot_vtrefine.diagnose.pad.candidates import causes_like
 from lerobot_vtrefine.diagnose.pad.candidates.base import Form
-from lerobot_vtrefine.diagnose.pad.candidates.contact_offset import CONSTANT
 from lerobot_vtrefine.diagnose.pad.candidates.nonlinear_stiffness import YIELDING
-from lerobot_vtrefine.diagnose.pad.candidates.pad_tilt import HINGED, PLANE, lift
 from lerobot_vtrefine.diagnose.pad.candidates.saturation import FREE
 from lerobot_vtrefine.diagnose.pad.damping_profile import profile
 from lerobot_vtrefine.diagnose.pad.face_map import in_common, on_told_face, uneven
 from lerobot_vtrefine.diagnose.pad.fitting import Fit
 from lerobot_vtrefine.diagnose.pad.form_fitting import starts_of, without
-from lerobot_vtrefine.diagnose.pad.intervals import leave_out
 from lerobot_vtrefine.diagnose.pad.own_delay import timed
 from lerobot_vtrefine.diagnose.pad.recording_scatter import own_deviations, starts_deviate
 from lerobot_vtrefine.diagnose.pad.rules import MORE_COORDINATES
@@ -135,7 +132,7 @@ def _looked_over(
             bend = next(item for item in BENDS if item in named)
             alternatives[name] = frozenset(BENDS) - {name}
             p_values[name, CHANNEL] = p_values.get((bend, CHANNEL))
-    state = one_hinge(plain_forms(state))
+    state = plain_forms(state)
     state = on_uneven_face(likeliest_forms(state.weighed(state.fit)))
     best = resolved(state)
     state = state if best is state.fit else state.weighed(best)
@@ -230,28 +227,6 @@ def plain_forms(state: State) -> State:
         if not preferable(rich, state.held(state.fit), state.held(found), state.seed):
             state = state.weighed(found)
     return state
-
-
-def one_hinge(state: State) -> State:
-    """A turn about an edge in the place of a turn and an offset, unless these are likelier by a name's odds.
-
-    It is one cause, and has a coordinate less. Where presses reach a part of the face only, the search does
-    not try it: it lifts them alike, as an offset does. Here both names had to pass, and by how much the turn
-    about that edge lifts the middle must be told by itself.
-    """
-    model = state.fit.model
-    if not {PLANE, CONSTANT} <= {*model.forms} or HINGED.possible(model.setting):
-        return state
-    bare = replace(state.fit, model=model.minus(CONSTANT.family))
-    found = state.with_form(state.without(CONSTANT.family), HINGED, bare)
-    edge = found.model.own(found.model.forms.index(HINGED))[-1]
-    turn = model.place(model.forms.index(PLANE))
-    low, high = leave_out(state.fit, state.problem.presses).interval(
-        lambda values: lift(np.array([*values[turn], edge]), model.setting)
-    )
-    two, one = state.held(state.fit), state.held(found)
-    needed = float(two.better_by(one).sum()) > np.log(1.0 / ALPHA) or two.gain_over(one) > LEAST_GAIN
-    return state if needed or low <= 0.0 <= high else state.weighed(found)
 
 
 def likeliest_forms(state: State) -> State:

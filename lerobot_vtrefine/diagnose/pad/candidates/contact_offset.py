@@ -83,4 +83,3 @@ FORMS = (
     ),
     UNEVEN,
 )
-CONSTANT = FORMS[0]

@@ -20,12 +20,6 @@ def _pivot(values: np.ndarray, setting: Setting) -> tuple[float, float]:
     return x * float(columns_m[-1]), y * float(rows_m[-1])
 
 
-def lift(values: np.ndarray, setting: Setting) -> float:
-    """How much deeper a turn (two angles, edge) about that edge puts the pad's middle [m]."""
-    x_m, y_m = _pivot(values, setting)
-    return float(values[1]) * x_m - float(values[0]) * y_m
-
-
 def _hinged(values: np.ndarray, setting: Setting) -> tuple[Stage, ...]:
     return (PadTilt(float(values[0]), float(values[1]), *_pivot(values, setting)),)
 
@@ -90,4 +84,3 @@ FORMS = (
         grown=lambda v, s: [[*v.tolist(), number] for number in range(len(EDGES))],
     ),
 )
-PLANE, HINGED = FORMS
