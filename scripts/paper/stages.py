@@ -107,18 +107,15 @@ def encoder_stage(options: argparse.Namespace, pair: str) -> Stage:
 
 def policy_settings(options: argparse.Namespace, policy: Trained) -> dict[str, Any]:
     """Of vt_dp3."""
-    recipe: dict[str, Any] = RECIPES[options.recipe]["policy"]
+    recipe: dict[str, Any] = dict(RECIPES[options.recipe]["policy"])
     if options.recipe == "pads":
+        trained = trains_encoder(options, policy.pair)
         named = options.encoder or f"{PREFIX}{TASKS[policy.pair]}"
-        recipe = (
-            recipe
-            | (POLICY if on_a_gpu(options) else {})
-            | {"pretrained_encoder": named.format(pair=policy.pair)}
+        recipe |= POLICY if on_a_gpu(options) else {}
+        recipe["pretrained_encoder"] = (
+            str(encoder_stage(options, policy.pair).output) if trained else named.format(pair=policy.pair)
         )
-    recipe = recipe | options.policy
-    if trains_encoder(options, policy.pair):
-        recipe["pretrained_encoder"] = str(encoder_stage(options, policy.pair).output)
-    return recipe
+    return recipe | options.policy
 
 
 def on_a_gpu(options: argparse.Namespace) -> bool:
