@@ -78,8 +78,7 @@ def draw_rate(plt: Any) -> None:
     for words, (variants, colour) in LIMITS.items():
         label: str | None = words
         for row in (row for row in rows if (row.task, row.policy) == VISION and row.variant in variants):
-            with (ROOT / "results" / str(row.curve)).open(encoding="utf-8") as file:
-                points = [point for point in csv.DictReader(file) if point["success"]]
+            points = iterations(row)
             at = [int(point["iteration"]) for point in points]
             above.plot(at, [100 * float(p["success"]) for p in points], color=colour, lw=1, label=label)
             below.semilogy(at, [float(p["actor_lr"]) for p in points], color=colour, lw=1)
@@ -100,9 +99,12 @@ def draw_paper(plt: Any) -> None:
     for ax, task in zip(axes, pairs, strict=True):
         for row in (row for row in rows if row.task == task and (row.table, row.variant) in PAPER_RECIPES):
             style, opacity = PAPER_RECIPES[row.table, row.variant or TUNED]
-            colour, points = POLICIES[row.policy], success_curve(row)
-            ax.plot(*zip(*points, strict=True), style, color=colour, alpha=opacity, lw=1.2)
-            ax.plot(points[-1][0] + 1, 100 * row.success, "o", ms=5, color=colour, alpha=opacity)
+            colour, points = POLICIES[row.policy], iterations(row)
+            at = [int(point["iteration"]) for point in points]
+            ax.plot(
+                at, [100 * float(p["success"]) for p in points], style, color=colour, alpha=opacity, lw=1.2
+            )
+            ax.plot(at[-1] + 1, 100 * row.success, "o", ms=5, color=colour, alpha=opacity)
         for policy, colour in POLICIES.items():
             ax.axhline(100 * PAIRS[task][policy][TUNED], color=colour, ls="--", lw=0.8)
         ax.set_title(task, loc="left")
@@ -120,11 +122,10 @@ def draw_paper(plt: Any) -> None:
     figure.savefig(IMAGES / "paper.png")
 
 
-def success_curve(row: Run) -> list[tuple[int, float]]:
-    """Iterations of a run, and success while exploring in per cent."""
+def iterations(row: Run) -> list[dict[str, str]]:
+    """A run's learning curve, without the evaluation before it."""
     with (ROOT / "results" / str(row.curve)).open(encoding="utf-8") as file:
-        points = [point for point in csv.DictReader(file) if point["success"]]
-    return [(int(point["iteration"]), 100 * float(point["success"])) for point in points]
+        return [point for point in csv.DictReader(file) if point["success"]]
 
 
 def draw_results(plt: Any) -> None:
