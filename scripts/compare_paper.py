@@ -25,6 +25,7 @@ there with these numbers of episodes and iterations, so that it may go on on ano
 import argparse
 import json
 import sys
+from itertools import chain, zip_longest
 from pathlib import Path
 
 from paper.outcome import is_done, rows
@@ -95,17 +96,22 @@ def make_parser() -> CommandParser:
     return parser
 
 
-def side_by_side(options: argparse.Namespace, names: list[str]) -> None:
-    """This script again for each of these stages or policies."""
-    again = [sys.executable, __file__, *sys.argv[1:]]
-    commands = {options.output_dir / "runs" / name: [*again, f"--only={name}"] for name in names}
-    if commands:
-        run_all(commands, min(options.jobs, len(commands)))
+def side_by_side(options: argparse.Namespace, left: list[Trained]) -> None:
+    """This script again for every stage that policies share, and for every policy once these are done."""
+    folder, again = options.output_dir / "runs", [sys.executable, __file__, *sys.argv[1:]]
+    needs = {
+        folder / policy.name: [folder / stage.name for stage in shared_stages(options, policy)]
+        for policy in left
+    }
+    # Encoders of all pairs before demonstrations: they take longest, and GPUs are dealt out by turns.
+    shared = filter(None, chain.from_iterable(zip_longest(*needs.values())))
+    names = dict.fromkeys([*shared, *needs])
+    run_all({name: [*again, f"--only={name.name}"] for name in names}, options.jobs, needs)
 
 
 @run_cli
 def main() -> None:
-    """Encoders and demonstrations first, then every policy that has no rows yet."""
+    """Every policy that has no rows yet, after its encoder and its demonstrations."""
     options = make_parser().parse_args()
     options.backend = options.backend or ("warp" if options.device == "cuda" else "batch")
     left = [policy for policy in chosen(options) if not is_done(options, policy)]
@@ -116,8 +122,7 @@ def main() -> None:
         (policy,) = (policy for policy in left if policy.name == options.only)
         finish(options, policy)
     elif options.jobs > 1:
-        side_by_side(options, list(shared))
-        side_by_side(options, [policy.name for policy in left])
+        side_by_side(options, left)
     else:
         for policy in left:
             finish(options, policy)

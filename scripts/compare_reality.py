@@ -246,10 +246,12 @@ def lanes(budget: Budget) -> tuple[Lanes, Lanes]:
     return before, policies
 
 
-def runnable(done: Lanes, waiting: Lanes) -> Lanes:
-    """The lanes whose stages among those done have left what they should."""
-    missing = {stage.name for lane in done.values() for stage in lane if not stage.product.exists()}
-    return {name: lane for name, lane in waiting.items() if missing.isdisjoint(s.name for s in lane)}
+def needed(before: Lanes, policies: Lanes) -> dict[str, list[str]]:
+    """The preparations that every policy goes on from."""
+    return {
+        name: [world for world, stages in before.items() if stages[-1] in lane]
+        for name, lane in policies.items()
+    }
 
 
 def write_worlds(budget: Budget) -> None:
@@ -409,8 +411,7 @@ def main() -> None:
         StageRunner(budget.output_dir, (before | policies)[options.lane]).run()
         return
     write_worlds(budget)
-    failed = run_lanes(budget, before, options.jobs)
-    failed = run_lanes(budget, runnable(before, policies), options.jobs) or failed
+    failed = run_lanes(budget, before, policies, options.jobs)
     results = compare(budget)
     save(budget.output_dir, results, as_text(results))
     write_provenance(budget.output_dir)
@@ -418,12 +419,18 @@ def main() -> None:
         raise failed
 
 
-def run_lanes(budget: Budget, together: Lanes, jobs: int) -> subprocess.CalledProcessError | None:
+def run_lanes(
+    budget: Budget, before: Lanes, policies: Lanes, jobs: int
+) -> subprocess.CalledProcessError | None:
     """Run these lanes, as many side by side; one of the failures, if there was any."""
-    again = [sys.executable, str(Path(__file__)), *sys.argv[1:]]
-    commands = {budget.output_dir / name: [*again, f"--lane={name}"] for name in together}
+    folder, again = budget.output_dir, [sys.executable, str(Path(__file__)), *sys.argv[1:]]
+    commands = {folder / name: [*again, f"--lane={name}"] for name in before | policies}
+    needs = {
+        folder / name: [folder / world for world in worlds]
+        for name, worlds in needed(before, policies).items()
+    }
     try:
-        run_all(commands, max(1, min(jobs, len(commands))))
+        run_all(commands, jobs, needs)
     except subprocess.CalledProcessError as error:
         return error
     return None

@@ -4,7 +4,7 @@ import os
 import subprocess
 import sys
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -26,35 +26,74 @@ class Share:
     """As ``CUDA_VISIBLE_DEVICES`` names it; None without a GPU."""
 
 
-def run_all(commands: dict[Path, list[str]], jobs: int) -> None:
-    """Run the commands, by the names of their folders, ``jobs`` side by side.
+Commands = Mapping[Path, Sequence[str]]
+"""By the names of their folders."""
+Needs = Mapping[Path, Sequence[Path]]
+"""Which of the commands must have succeeded before one starts."""
+
+
+def run_all(commands: Commands, jobs: int, needs: Needs | None = None) -> None:
+    """Run the commands, ``jobs`` side by side at most.
 
     Side by side, each prints to ``FOLDER.log`` and keeps to its own share of the machine. One that fails
-    does not stop the others.
+    stops those alone that need it.
 
     Raises:
         subprocess.CalledProcessError: a command failed.
     """
-    failed: list[subprocess.CalledProcessError] = []
-    if jobs == 1:
-        for folder, command in commands.items():
-            print(f"\n== {folder.name}", flush=True)
-            status = subprocess.run(command, check=False).returncode
-            failed += [subprocess.CalledProcessError(status, command)] if status else []
-    else:
-        failed = run_together(commands, jobs)
+    queue = Queue(list(commands), needs or {})
+    jobs = max(1, min(jobs, len(commands)))
+    failed = (run_in_turn if jobs == 1 else partial(run_together, jobs=jobs))(commands, queue)
     if failed:
         raise failed[0]
 
 
-def run_together(commands: dict[Path, list[str]], jobs: int) -> list[subprocess.CalledProcessError]:
+class Queue:
+    """Commands that wait for others, in order."""
+
+    def __init__(self, waiting: list[Path], needs: Needs) -> None:
+        self.waiting = waiting
+        self._needs = needs
+        self._done: set[Path] = set()
+
+    def next(self) -> Path | None:
+        """Take the first command that waits for nothing any more."""
+        ready = (name for name in self.waiting if self._done.issuperset(self._needs.get(name, ())))
+        found = next(ready, None)
+        if found is not None:
+            self.waiting.remove(found)
+        return found
+
+    def end(self, name: Path, failed: bool) -> None:
+        """Note that a command has ended; those that need one that failed wait no longer."""
+        if not failed:
+            self._done.add(name)
+            return
+        for other in [one for one in self.waiting if name in self._needs.get(one, ())]:
+            self.waiting.remove(other)
+            print(f"== {other.name}: left out for want of {name.name}", flush=True)
+            self.end(other, failed=True)
+
+
+def run_in_turn(commands: Commands, queue: Queue) -> list[subprocess.CalledProcessError]:
+    """Run the commands one after the other, in sight; the failures."""
+    failed: list[subprocess.CalledProcessError] = []
+    while (folder := queue.next()) is not None:
+        print(f"\n== {folder.name}", flush=True)
+        status = subprocess.run(commands[folder], check=False).returncode
+        failed += [subprocess.CalledProcessError(status, commands[folder])] if status else []
+        queue.end(folder, bool(status))
+    return failed
+
+
+def run_together(commands: Commands, queue: Queue, jobs: int) -> list[subprocess.CalledProcessError]:
     """Run the commands side by side; the failures."""
-    free, waiting, running = shares(jobs), list(commands), {}
+    free, running = shares(jobs), {}
     failed: list[subprocess.CalledProcessError] = []
     try:
-        while waiting or running:
-            while waiting and free:
-                folder, share = waiting.pop(0), free.pop(0)
+        while queue.waiting or running:
+            while free and (folder := queue.next()) is not None:
+                share = free.pop(0)
                 print(f"== {folder.name}: progress in {folder}.log", flush=True)
                 running[folder] = (start(commands[folder], folder, share), share)
             for folder in [name for name, (child, _) in running.items() if child.poll() is not None]:
@@ -63,6 +102,7 @@ def run_together(commands: dict[Path, list[str]], jobs: int) -> list[subprocess.
                 if child.returncode:
                     failed.append(subprocess.CalledProcessError(child.returncode, commands[folder]))
                 print(f"== {folder.name}: {'failed' if child.returncode else 'done'}", flush=True)
+                queue.end(folder, bool(child.returncode))
             time.sleep(POLL_S)
     finally:
         for child, _ in running.values():
@@ -91,7 +131,7 @@ def visible_gpus() -> list[str]:
     return named.split(",") if named else [str(index) for index in range(torch.cuda.device_count())]
 
 
-def start(command: list[str], folder: Path, share: Share) -> subprocess.Popen:
+def start(command: Sequence[str], folder: Path, share: Share) -> subprocess.Popen:
     """One command in the background, on its share of the machine."""
     folder.parent.mkdir(parents=True, exist_ok=True)
     pin = partial(os.sched_setaffinity, 0, share.cores) if share.cores else None

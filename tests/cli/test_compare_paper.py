@@ -69,6 +69,25 @@ def test_policies_become_rows_of_both_tables_and_are_not_made_twice(
         assert sum(not script.is_done(options, policy) for policy in script.chosen(options)) == left
 
 
+def test_pairs_side_by_side_wait_for_their_own_encoder_only(
+    run: Callable[..., str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    asked: list[tuple[list[str], dict[str, list[str]]]] = []
+
+    def note(commands: dict[Path, list[str]], _jobs: int, needs: dict[Path, list[Path]]) -> None:
+        asked.append(
+            ([name.name for name in commands], {k.name: [n.name for n in v] for k, v in needs.items()})
+        )
+
+    monkeypatch.setattr(script, "run_all", note)
+    run("--pairs", *PAIRS, "00186", "--encoder=own", "--no_scratch", "--jobs=9")
+    ((names, needs),) = asked
+    assert names[:3] == [f"encoder_{pair}" for pair in (*PAIRS, "00186")]  # the longest first
+    assert names[3:6] == [f"demos_{pair}_0_30" for pair in (*PAIRS, "00186")]
+    assert set(names[6:]) == set(needs)
+    assert needs["00581_visual_0_30"] == ["encoder_00581", "demos_00581_0_30"]
+
+
 def test_dppo_may_start_in_hand_where_hands_can_hold_and_is_judged_from_the_table() -> None:
     options = parse(
         [

@@ -176,15 +176,12 @@ def test_unfinished_seeds_are_left_out(budget):
     assert compare.compare(budget) == {}
 
 
-def test_a_failed_diagnosis_stops_its_own_policies_only(budget):
+def test_every_policy_waits_for_its_own_simulator_only(budget):
     before, policies = compare.lanes(budget)
-    for stage in (stage for stages in before.values() for stage in stages):
-        stage.product.parent.mkdir(parents=True, exist_ok=True)
-        stage.product.touch()
-    assert compare.runnable(before, policies) == policies
-    (budget.diagnosis(budget.realities[0]) / "verdict.json").unlink()
-    left = set(policies) - set(compare.runnable(before, policies))
-    assert left == {f"policy_diagnosed_row_sharing_and_hysteresis_{seed}" for seed in budget.seeds}
+    assert set(before) == {"plain", *(compare.folder_name(f"diagnosed:{name}") for name in budget.realities)}
+    for name, worlds in compare.needed(before, policies).items():
+        assert name.rpartition("_")[0] == f"policy_{worlds[0]}"
+        assert len(worlds) == 1
 
 
 def test_presses_follow_the_contract_and_the_hidden_pad(budget):
