@@ -6,12 +6,15 @@ from pathlib import Path
 import pytest
 from outsider.gen import CATALOGUE, OUTSIDE, make, plan
 
-from lerobot_vtrefine.diagnose.api import read_recordings
+from lerobot_vtrefine.diagnose.api import diagnose, read_recordings
 from lerobot_vtrefine.diagnose.quality import check_quality
 from lerobot_vtrefine.diagnose.verdict import SENSOR_CAUSES
 
 sys.path.insert(0, str(Path(__file__).parents[2] / "scripts"))
 import bench_outsider
+
+HARD_KNEE = 2
+"""Number of min(x, knee) among his forms of saturation."""
 
 
 def test_his_names_are_the_catalogues() -> None:
@@ -32,6 +35,14 @@ def test_a_set_is_what_was_planned(kind: str, effect: str | None, tmp_path: Path
     assert truth["gain"] == pytest.approx(0.4 if effect else 0.0, abs=0.03)
     sound, _ = check_quality(read_recordings(tmp_path / "set"))
     assert len(sound.trials) == 16
+
+
+def test_a_knee_that_cuts_off_what_only_the_hardest_presses_reach_is_named(tmp_path: Path) -> None:
+    """As a converter at its end does: no smaller effect shows anywhere that would tell of it."""
+    truth = make(24000, "other", "saturation", 0.4, tmp_path / "set", small=True, form=HARD_KNEE)
+    (cause,) = diagnose(tmp_path / "set").verdict.causes
+    assert cause.name == "saturation"
+    assert cause.params["knee_counts"].value == pytest.approx(truth["params"]["knee_counts"], rel=0.03)
 
 
 def row(**given) -> dict:

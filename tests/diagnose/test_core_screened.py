@@ -16,6 +16,7 @@ from lerobot_vtrefine.diagnose.core.screened_search import (
     ScreenedSearch,
     better,
     clearly_better,
+    few_suffice,
     preferable,
     still_found,
 )
@@ -71,6 +72,7 @@ class Toy(OptionalSteps):
     channels: tuple[str, ...] = ("y",)
     screens: bool = True
     further_gain: float = 0.025
+    in_nats: bool = True
     scatter: float = 0.0
 
     @property
@@ -672,3 +674,40 @@ def test_without_glibc_memory_is_left_as_it_is(missing: type, monkeypatch: pytes
     monkeypatch.setattr(memory.ctypes, "CDLL", absent)
     with memory.memory_kept():
         pass
+
+
+@dataclass(frozen=True)
+class Passing(Toy):
+    """Bends pass the test, however few trials they show in."""
+
+    def screened(self, now, only=None):
+        found = super().screened(now, only)
+        passing = {item.candidate.cause == "bend": item for item in found}.get(True)
+        if passing is None:
+            return found
+        tested = replace(passing.tested, p_value=0.01, p_adjusted=0.03)
+        return [replace(item, tested=tested) if item is passing else item for item in found]
+
+
+def test_what_shows_in_few_trials_alone_is_found_where_those_are_far_likelier() -> None:
+    """As a knee that cuts off readings, which only the hardest presses reach."""
+
+    def found(effect, **changes):
+        rng = np.random.default_rng(0)
+        reach = np.where(np.arange(TRIALS) % 8 == 0, 1.0, 0.02)[:, None]
+        x = reach * rng.uniform(-1, 1, (TRIALS, FRAMES))
+        y = x + effect * np.abs(x) + NOISE * rng.normal(size=x.shape)
+        return names_of(ScreenedSearch(Passing(x, y, **changes), 0, lambda text: None).run())
+
+    assert found(0.6) == ["bend"]
+    assert found(0.02) == []
+    # Plain errors have no size by which few could tell.
+    assert found(0.6, in_nats=False) == []
+
+
+def test_few_trials_suffice_that_agree_and_do_not_hang_on_one() -> None:
+    others = 0.1 * (-1.0) ** np.arange(9)
+    assert few_suffice(np.array([900.0, 30.0, 20.0, *others]))
+    assert not few_suffice(np.array([900.0, 5.0, 2.0, *others]))
+    assert not few_suffice(np.array([900.0, 300.0, -200.0, *others]))
+    assert not few_suffice(np.zeros(12))

@@ -13,6 +13,7 @@ from lerobot_vtrefine.cli.results.rows import Run
 LABELS = {
     "demo": "demo: round pair, 2 mm clearance",
     "round_grasped": "round pair, 2 mm, slip 2 mm / 0.05 rad",
+    "round_grasped_fine": "the same pair, 12 iterations of fine",
     "demo_schedule": "the demo, 128 environments on two cores",
     "kinova_blind_cloud": "two Kinova Gen3, round pair, the paper's cloud, camera blocked, two cores",
     "kinova_blind": "two Kinova Gen3, round pair, pads as images, camera blocked, two cores",

@@ -266,6 +266,10 @@ class ScreenedProblem[F: ScoredFit, C: FormCandidate](Problem[F, C], Protocol):
     def further_gain(self) -> float:
         """Part of the error that a further cause must take away: correcting the form of others gains some."""
 
+    @property
+    def in_nats(self) -> bool:
+        """Whether log scores follow from a noise model; else plain errors stand in."""
+
     def weighed(self, now: F | None) -> tuple[Self, F]:
         """The problem with the noise around a fit (None: the baseline's) for weights, and the fit anew."""
 

@@ -63,6 +63,8 @@ FEW_FOR_SIGNS = 10
 """With fewer trials than this that have a say, signs alone cannot pass a score test: size counts as well."""
 SIZE_DOUBT = 2.0
 """Factor by which scores may stray more than the fitted noise says, where their size counts."""
+CARRIED = 0.9
+"""Part of all that trials say which those that carry it make up."""
 FITTED = 6
 """Candidates that pass the score test and are fitted in a round, the most promising ones."""
 AGREEMENT_P = 0.05

@@ -7,7 +7,7 @@ trial, whatever the noise inside it looks like; all candidates are judged togeth
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -50,6 +50,11 @@ class Probe:
         return float(self.scores.sum()) / total if total > 0 else 0.0
 
     @property
+    def carriers(self) -> float:
+        """How many trials of equal scores would be worth these; no bound where scores are no sum."""
+        return np.inf if self.observed or self.products is not None else _effective_number(self.scores)
+
+    @property
     def explained(self) -> float:
         """Decrease of the loss that the tangent promises; no bound for what is observed."""
         if self.observed:
@@ -64,11 +69,15 @@ class Tested:
     """A candidate's best probe with its p-value and the one adjusted over all candidates.
 
     Both are None for what is observed rather than tested.
+
+    Attributes:
+        by_size: the same by the size of its scores in their signs' place, where few of many trials carry it.
     """
 
     probe: Probe
     p_value: float | None
     p_adjusted: float | None
+    by_size: "Tested | None" = None
 
     @property
     def passed(self) -> bool:
@@ -128,7 +137,7 @@ def screen(probes: Sequence[Probe], count: int, seed: int, *, sized: bool = True
         sized: whether scores are in deviations of noise; else their size tells nothing.
     """
     best: dict[str, Tested] = {}
-    by_size: list[Tested] = []
+    by_size: dict[str, Tested] = {}
     kinds: dict[str, list[Probe]] = {}
     for probe in probes:
         kinds.setdefault(_kind(probe), []).append(probe)
@@ -144,10 +153,11 @@ def screen(probes: Sequence[Probe], count: int, seed: int, *, sized: bool = True
             if too_few_agree(probe, p_value):
                 together = least
             elif few_carry(probe, p_value):
-                by_size.append(Tested(probe, p_value, min(1.0, least * whole / SCREEN_SHARES[kind])))
+                _keep(by_size, Tested(probe, p_value, min(1.0, least * whole / SCREEN_SHARES[kind])))
             _keep(best, Tested(probe, p_value, min(1.0, together * whole / SCREEN_SHARES[kind])))
+    best = {name: replace(item, by_size=by_size.get(name)) for name, item in best.items()}
     if not any(item.passed for item in best.values()):
-        for item in by_size:
+        for item in by_size.values():
             _keep(best, item)
     return best
 
@@ -179,8 +189,7 @@ def few_carry(probe: Probe, p_value: float) -> bool:
     What the others say is next to nothing, and among many probes no flip of a few signs is rare enough. By
     itself the probe must pass all the same.
     """
-    carried = probe.products is None and _effective_number(probe.scores) < FEW_FOR_SIGNS
-    return carried and p_value <= ALPHA
+    return probe.carriers < FEW_FOR_SIGNS and p_value <= ALPHA
 
 
 def _effective_number(parts: Array) -> float:

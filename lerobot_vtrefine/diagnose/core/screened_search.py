@@ -18,6 +18,7 @@ from lerobot_vtrefine.diagnose.core.problem import FormCandidate, Promise, Score
 from lerobot_vtrefine.diagnose.core.resampling import agree, folds_of, independent_units
 from lerobot_vtrefine.diagnose.core.rules import (
     AGREEMENT_P,
+    CARRIED,
     FITTED,
     FORM_P,
     LEAST_GAIN,
@@ -25,6 +26,7 @@ from lerobot_vtrefine.diagnose.core.rules import (
     PROMISING,
     RICH,
     SCREEN_ALPHA,
+    SIZE_DOUBT,
 )
 from lerobot_vtrefine.diagnose.core.search import Examined, Selection
 
@@ -51,6 +53,8 @@ class Ground[P: ScreenedProblem[Any, Any], F: ScoredFit]:
     now: F
     folds: Array
     seed: int
+    few: bool = False
+    """Whether few trials may say by themselves that a model is better."""
 
     def judged(self, fit: F) -> OutOfFold:
         """A fit on trials left out."""
@@ -69,19 +73,25 @@ class Ground[P: ScreenedProblem[Any, Any], F: ScoredFit]:
                 continue
             fitted = self.problem.extended(self.now, other, _ONE, plain.fit)
             step = Step(other, fitted, self.judged(fitted))
-            if preferable(other, step.held, best.held, self.seed):
+            if preferable(other, step.held, best.held, self.seed, few=self.few):
                 best = step
         return best
 
 
-def preferable(candidate: FormCandidate, held: OutOfFold, than: OutOfFold, seed: int) -> bool:
+def preferable(
+    candidate: FormCandidate, held: OutOfFold, than: OutOfFold, seed: int, *, few: bool = False
+) -> bool:
     """Whether a form is to stand in for a plainer one; a peer if it is likelier, whatever little plain errors
-    say, which hang on how hard and where each recording happened to touch, or surely so (1 %)."""
+    say, which hang on how hard and where each recording happened to touch, or surely so (1 %).
+
+    Args:
+        few: whether few trials say so by themselves.
+    """
     if candidate.peer:
         likelier = held.better_by(than)
         small = held.gain_over(than) > -LEAST_GAIN
         return float(likelier.sum()) > 0 and (small or agree(likelier, seed, FORM_P))
-    return clearly_better(held, than, seed)
+    return clearly_better(held, than, seed, few=few)
 
 
 def better(held: OutOfFold, than: OutOfFold, needed: float = 0.0) -> bool:
@@ -89,9 +99,28 @@ def better(held: OutOfFold, than: OutOfFold, needed: float = 0.0) -> bool:
     return held.gain_over(than) > needed and float(held.better_by(than).sum()) > 0
 
 
-def clearly_better(held: OutOfFold, than: OutOfFold, seed: int, needed: float = LEAST_GAIN) -> bool:
-    """Whether a richer model pays: so much less error, in most trials."""
-    return held.gain_over(than) > needed and agree(held.better_by(than), seed, AGREEMENT_P)
+def clearly_better(
+    held: OutOfFold, than: OutOfFold, seed: int, needed: float = LEAST_GAIN, *, few: bool = False
+) -> bool:
+    """Whether a richer model pays: so much less error, in most trials, or in the `few` that can tell."""
+    if held.gain_over(than) <= needed:
+        return False
+    likelier = held.better_by(than)
+    return agree(likelier, seed, AGREEMENT_P) or (few and few_suffice(likelier))
+
+
+def few_suffice(likelier: Array) -> bool:
+    """Whether the few trials that carry nearly all of what trials left out say (T,), in nats, agree, and are
+    likelier by more than chance has without the best of them, too.
+
+    Signs of so few cannot tell. Where nothing is there a ratio of likelihoods exceeds 1 / alpha with a chance
+    of alpha at most (Ville 1939); errors may stray more than the noise model says.
+    """
+    order = np.argsort(-np.abs(likelier))
+    share = np.abs(likelier[order]).cumsum() / max(float(np.abs(likelier).sum()), 1e-300)
+    carriers = likelier[order[: int(np.searchsorted(share, CARRIED)) + 1]]
+    least = SIZE_DOUBT**2 * np.log(1.0 / AGREEMENT_P)
+    return bool((carriers > 0).all()) and float(likelier.sum() - likelier.max()) > least
 
 
 def folds_for(conditions: Sequence[str], seed: int) -> Array:
@@ -177,10 +206,20 @@ class ScreenedSearch[P: ScreenedProblem[Any, Any], F: ScoredFit, C: FormCandidat
             self._drop_needless()
 
     def _round(self, problem: P, now: F) -> tuple[list[Promise[C]], list[Step[F, C]]]:
-        """All tests, and the steps from here that are worth it, best first."""
+        """All tests, and the steps from here that are worth it, best first.
+
+        Where none is on which trials agree, those count that so few carry that these never could: readings
+        cut off at the top show in the hardest presses alone.
+        """
+        ground = Ground(problem, now, self.folds, self.seed)
         found = problem.screened(now)
-        passed = sorted((item for item in found if item.tested.passed), key=_promise)[:FITTED]
-        return found, self._in_turn(self._steps(Ground(problem, now, self.folds, self.seed), passed))
+        steps = self._in_turn(self._steps(ground, _first(found)))
+        if not steps and problem.in_nats and (carried := _carried_by_few(found)):
+            names = {item.candidate.cause for item in carried}
+            found = [*carried, *(item for item in found if item.candidate.cause not in names)]
+            few = replace(ground, few=True)
+            steps = self._in_turn(self._steps(few, _first(carried)))
+        return found, steps
 
     def _steps(self, ground: Ground[P, F], passed: Sequence[Promise[C]]) -> list[tuple[float, Step[F, C]]]:
         """Steps that predict trials left out better, by the log score that they gain, best first."""
@@ -200,9 +239,10 @@ class ScreenedSearch[P: ScreenedProblem[Any, Any], F: ScoredFit, C: FormCandidat
             least = 0.0 if name in observed and step.candidate.terms else needed
             if not better(step.held, base, least):
                 continue
-            sure = name in observed or agree(step.held.better_by(base), self.seed, AGREEMENT_P)
-            if sure and self._credible(ground, step):
-                out.append((float(step.held.better_by(base).sum()), step))
+            likelier = step.held.better_by(base)
+            sure = name in observed or agree(likelier, self.seed, AGREEMENT_P)
+            if (sure or (ground.few and few_suffice(likelier))) and self._credible(ground, step):
+                out.append((float(likelier.sum()), step))
         return sorted(out, key=lambda item: -item[0])
 
     def _other_forms(
@@ -350,8 +390,28 @@ def _p_beside(selection: Selection[Any, Any, Any], cause: str) -> float:
 
 
 def _p_of(cause: str, found: Sequence[Promise[Any]]) -> float:
-    tested = next((item.tested for item in found if item.candidate.cause == cause), None)
-    return 1.0 if tested is None else tested.p_adjusted or 0.0
+    every = (item.tested for item in [*found, *_by_size(found)] if item.candidate.cause == cause)
+    return min((tested.p_adjusted or 0.0 for tested in every), default=1.0)
+
+
+def _first(found: Sequence[Promise[Any]]) -> list[Promise[Any]]:
+    """What passes the test and promises most."""
+    return sorted((item for item in found if item.tested.passed), key=_promise)[:FITTED]
+
+
+def _by_size(found: Sequence[Promise[Any]]) -> list[Promise[Any]]:
+    """What may pass by the size of its scores."""
+    return [replace(item, tested=item.tested.by_size) for item in found if item.tested.by_size]
+
+
+def _carried_by_few(found: Sequence[Promise[Any]]) -> list[Promise[Any]]:
+    """What passes by signs, or else by size, and hangs on so few trials that predictions of them cannot agree
+    at the level that is asked for, whatever they say."""
+    best: dict[str, Promise[Any]] = {}
+    for item in [*found, *_by_size(found)]:
+        if item.tested.passed and 2.0**-item.tested.probe.carriers > AGREEMENT_P:
+            best.setdefault(item.candidate.cause, item)
+    return list(best.values())
 
 
 def _may_be_hidden(problem: Any, now: Any, found: Sequence[Promise[Any]]) -> bool:

@@ -348,6 +348,11 @@ class PadProblem(OptionalSteps):
         """Names and sizes stay; users get the baseline with what was seen."""
         return replace(fit, model=final_model.with_seen(self.as_recorded, baseline.fit, fit.fit))
 
+    @property
+    def in_nats(self) -> bool:
+        """Whether recordings have touches of their own, under which they are scored."""
+        return self.noise is not None and allowed(self.presses, self.weights)
+
     def log_scores(self, fit: FinalFit) -> Array:
         """(K,) with every recording's own gain and touch; by plain errors where these are not known."""
         noise = fit.problem.noise

@@ -9,6 +9,8 @@ from lerobot_vtrefine.diagnose.pad.candidates.base import Form, Setting, Value
 from lerobot_vtrefine.tactile.stages.readout import Saturation
 
 MIN_FULLNESS = 1e-3
+HARD = 60.0
+"""Sharpness of a knee that cuts off: readings a twentieth below it are whole."""
 
 
 def _knee(values: np.ndarray, setting: Setting) -> float:
@@ -24,6 +26,16 @@ FREE = Form(
     lambda s: [[0.2, 1.0], [0.9, 6.0]],
     screened=False,
 )
+CUT = Form(
+    "saturation",
+    "cut off",
+    (Value("fullness", 0.0, 8.0, 2e-3),),
+    lambda v, s: (Saturation(_knee(v, s), HARD),),
+    lambda v, s: {"knee_counts": (_knee(v, s), "counts"), "sharpness": (HARD, "1")},
+    lambda s: [[1.1], [1.5], [2.5]],
+    amplitude=None,  # a knee above all readings does nothing: no smaller probe tells of a larger one
+    peer=True,
+)
 FORMS = (
     Form(
         "saturation",
@@ -36,5 +48,6 @@ FORMS = (
         shrinks=True,
         needs="press until readings come near the full scale",
     ),
+    CUT,
     FREE,
 )
