@@ -38,7 +38,7 @@ from lerobot_vtrefine.finetune.distributed import (
     total_over_ranks,
 )
 from lerobot_vtrefine.finetune.gae import RewardScaler, generalised_advantages
-from lerobot_vtrefine.finetune.gpu_memory import give_back_unused
+from lerobot_vtrefine.finetune.gpu_memory import give_back_unused, memory_taken
 from lerobot_vtrefine.finetune.protocols import (
     Agent,
     DecisionEnv,
@@ -367,5 +367,6 @@ def train(
             "steps_per_s": decisions * chunk / seconds,
             "seconds": seconds,
             "rollout_s": collected - started,
+            **memory_taken(agent.device),
         }
         after_iteration(state, metrics)

@@ -8,13 +8,14 @@ from typing import Any
 from lerobot.configs.default import WandBConfig
 
 from lerobot_vtrefine.files import read_number_rows
+from lerobot_vtrefine.finetune.gpu_memory import COLUMNS
 from lerobot_vtrefine.finetune.plots import draw_curves
 from lerobot_vtrefine.whole_files import whole_file
 
 CSV_NAME = "progress.csv"
 CURVES_NAME = "curves.png"
-CLOCK = frozenset({"seconds", "rollout_s", "steps_per_s"})
-"""Columns that tell how fast the machine was, and nothing else."""
+CLOCK = frozenset({"seconds", "rollout_s", "steps_per_s", *COLUMNS})
+"""Columns that tell how fast and how full the machine was, and nothing else."""
 
 
 def read_progress(output_dir: Path) -> list[dict[str, float]]:

@@ -3,10 +3,10 @@
 import pytest
 import torch
 
-from lerobot_vtrefine.finetune.gpu_memory import give_back_unused
+from lerobot_vtrefine.finetune.gpu_memory import GIB, give_back_unused, memory_taken
 
 
-@pytest.mark.parametrize(("device", "free", "given_back"), [("cuda", 1, 1), ("cuda", 50, 0), ("cpu", 1, 0)])
+@pytest.mark.parametrize(("device", "free", "given_back"), [("cuda", 1, 1), ("cuda", 60, 0), ("cpu", 1, 0)])
 def test_memory_is_given_back_where_little_is_left(
     monkeypatch, device: str, free: int, given_back: int
 ) -> None:
@@ -15,3 +15,13 @@ def test_memory_is_given_back_where_little_is_left(
     monkeypatch.setattr(torch.cuda, "empty_cache", lambda: calls.append(1))
     give_back_unused(torch.device(device))
     assert len(calls) == given_back
+
+
+def test_a_run_tells_how_much_memory_is_taken(monkeypatch) -> None:
+    asked = []
+    monkeypatch.setattr(torch.cuda, "max_memory_reserved", lambda _: 3 * GIB)
+    monkeypatch.setattr(torch.cuda, "reset_peak_memory_stats", lambda _: asked.append("anew"))
+    monkeypatch.setattr(torch.cuda, "mem_get_info", lambda _: (60 * GIB, 80 * GIB))
+    assert memory_taken(torch.device("cuda")) == {"torch_gib": 3.0, "gpu_used_gib": 20.0}
+    assert asked == ["anew"]
+    assert memory_taken(torch.device("cpu")) == {}

@@ -32,7 +32,7 @@ CUT = Form(
     (Value("fullness", 0.0, 8.0, 2e-3),),
     lambda v, s: (Saturation(_knee(v, s), HARD),),
     lambda v, s: {"knee_counts": (_knee(v, s), "counts"), "sharpness": (HARD, "1")},
-    lambda s: [[1.1], [1.5], [2.5]],
+    lambda s: [[2.5], [1.5], [1.1]],
     amplitude=None,  # a knee above all readings does nothing: no smaller probe tells of a larger one
     peer=True,
 )
