@@ -69,7 +69,9 @@ class Queue:
         if not failed:
             self._done.add(name)
             return
-        for other in [one for one in self.waiting if name in self._needs.get(one, ())]:
+        while (
+            other := next((one for one in self.waiting if name in self._needs.get(one, ())), None)
+        ) is not None:
             self.waiting.remove(other)
             print(f"== {other.name}: left out for want of {name.name}", flush=True)
             self.end(other, failed=True)

@@ -23,7 +23,7 @@ def commands(folder: Path, **failing: int) -> dict[Path, list[str]]:
 
 
 def needs(folder: Path) -> dict[Path, list[Path]]:
-    names = {"policy_a": ["encoder_a"], "policy_b": ["encoder_b"], "report_b": ["policy_b", "encoder_a"]}
+    names = {"policy_a": ["encoder_a"], "policy_b": ["encoder_b"], "report_b": ["policy_b", "encoder_b"]}
     return {folder / name: [folder / other for other in others] for name, others in names.items()}
 
 
