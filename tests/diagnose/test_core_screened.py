@@ -8,18 +8,12 @@ import pytest
 from lerobot_vtrefine.diagnose.core import memory
 from lerobot_vtrefine.diagnose.core.engine import guarded, infer
 from lerobot_vtrefine.diagnose.core.heldout import OutOfFold
+from lerobot_vtrefine.diagnose.core.preference import better, clearly_better, few_suffice, preferable
 from lerobot_vtrefine.diagnose.core.problem import OptionalSteps, PlainCandidate, Promise
 from lerobot_vtrefine.diagnose.core.rivals import settled
 from lerobot_vtrefine.diagnose.core.score_test import Probe, cleared, screen
 from lerobot_vtrefine.diagnose.core.screened_rivals import rivals_seen_twice, screened_rivals, tied
-from lerobot_vtrefine.diagnose.core.screened_search import (
-    ScreenedSearch,
-    better,
-    clearly_better,
-    few_suffice,
-    preferable,
-    still_found,
-)
+from lerobot_vtrefine.diagnose.core.screened_search import ScreenedSearch, still_found
 
 TRIALS, FRAMES, NOISE, COLUMNS = 24, 60, 0.1, 5
 CONDITIONS = tuple(f"c{k // 2}" for k in range(TRIALS))

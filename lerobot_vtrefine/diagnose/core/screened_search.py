@@ -14,19 +14,17 @@ import numpy as np
 
 from lerobot_vtrefine.diagnose.core.heldout import OutOfFold, out_of_fold
 from lerobot_vtrefine.diagnose.core.parallel import on_all_cores
+from lerobot_vtrefine.diagnose.core.preference import better, clearly_better, few_suffice, preferable
 from lerobot_vtrefine.diagnose.core.problem import FormCandidate, Promise, ScoredFit, ScreenedProblem
 from lerobot_vtrefine.diagnose.core.resampling import agree, folds_of, independent_units
 from lerobot_vtrefine.diagnose.core.rules import (
     AGREEMENT_P,
-    CARRIED,
     FITTED,
-    FORM_P,
     LEAST_GAIN,
     MAX_ROUNDS,
     PROMISING,
     RICH,
     SCREEN_ALPHA,
-    SIZE_DOUBT,
 )
 from lerobot_vtrefine.diagnose.core.search import Examined, Selection
 
@@ -76,51 +74,6 @@ class Ground[P: ScreenedProblem[Any, Any], F: ScoredFit]:
             if preferable(other, step.held, best.held, self.seed, few=self.few):
                 best = step
         return best
-
-
-def preferable(
-    candidate: FormCandidate, held: OutOfFold, than: OutOfFold, seed: int, *, few: bool = False
-) -> bool:
-    """Whether a form is to stand in for a plainer one; a peer if it is likelier, whatever little plain errors
-    say, which hang on how hard and where each recording happened to touch, or surely so (1 %).
-
-    Args:
-        few: whether few trials say so by themselves.
-    """
-    if candidate.peer:
-        likelier = held.better_by(than)
-        small = held.gain_over(than) > -LEAST_GAIN
-        return float(likelier.sum()) > 0 and (small or agree(likelier, seed, FORM_P))
-    return clearly_better(held, than, seed, few=few)
-
-
-def better(held: OutOfFold, than: OutOfFold, needed: float = 0.0) -> bool:
-    """Whether a model that is no richer has both less error and the higher log score."""
-    return held.gain_over(than) > needed and float(held.better_by(than).sum()) > 0
-
-
-def clearly_better(
-    held: OutOfFold, than: OutOfFold, seed: int, needed: float = LEAST_GAIN, *, few: bool = False
-) -> bool:
-    """Whether a richer model pays: so much less error, in most trials, or in the `few` that can tell."""
-    if held.gain_over(than) <= needed:
-        return False
-    likelier = held.better_by(than)
-    return agree(likelier, seed, AGREEMENT_P) or (few and few_suffice(likelier))
-
-
-def few_suffice(likelier: Array) -> bool:
-    """Whether the few trials that carry nearly all of what trials left out say (T,), in nats, agree, and are
-    likelier by more than chance has without the best of them, too.
-
-    Signs of so few cannot tell. Where nothing is there a ratio of likelihoods exceeds 1 / alpha with a chance
-    of alpha at most (Ville 1939); errors may stray more than the noise model says.
-    """
-    order = np.argsort(-np.abs(likelier))
-    share = np.abs(likelier[order]).cumsum() / max(float(np.abs(likelier).sum()), 1e-300)
-    carriers = likelier[order[: int(np.searchsorted(share, CARRIED)) + 1]]
-    least = SIZE_DOUBT**2 * np.log(1.0 / AGREEMENT_P)
-    return bool((carriers > 0).all()) and float(likelier.sum() - likelier.max()) > least
 
 
 def folds_for(conditions: Sequence[str], seed: int) -> Array:
@@ -208,17 +161,18 @@ class ScreenedSearch[P: ScreenedProblem[Any, Any], F: ScoredFit, C: FormCandidat
     def _round(self, problem: P, now: F) -> tuple[list[Promise[C]], list[Step[F, C]]]:
         """All tests, and the steps from here that are worth it, best first.
 
-        Where none is on which trials agree, those count that so few carry that these never could: readings
-        cut off at the top show in the hardest presses alone.
+        What so few trials carry that signs never could tell may win by what these say: readings that are cut
+        off show in the hardest presses alone.
         """
         ground = Ground(problem, now, self.folds, self.seed)
         found = problem.screened(now)
-        steps = self._in_turn(self._steps(ground, _first(found)))
-        if not steps and problem.in_nats and (carried := _carried_by_few(found)):
+        ranked = self._steps(ground, _first(found))
+        if problem.in_nats and (carried := _carried_by_few(found)):
             names = {item.candidate.cause for item in carried}
             found = [*carried, *(item for item in found if item.candidate.cause not in names)]
-            few = replace(ground, few=True)
-            steps = self._in_turn(self._steps(few, _first(carried)))
+            ranked = [item for item in ranked if item[1].candidate.cause not in names]
+            ranked += self._steps(replace(ground, few=True), _first(carried))
+        steps = self._in_turn(sorted(ranked, key=lambda item: -item[0]))
         return found, steps
 
     def _steps(self, ground: Ground[P, F], passed: Sequence[Promise[C]]) -> list[tuple[float, Step[F, C]]]:

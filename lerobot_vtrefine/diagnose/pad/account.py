@@ -9,9 +9,9 @@ import numpy as np
 
 from lerobot_vtrefine.diagnose.core.engine import Inference
 from lerobot_vtrefine.diagnose.core.heldout import out_of_fold
+from lerobot_vtrefine.diagnose.core.preference import clearly_better
 from lerobot_vtrefine.diagnose.core.problem import OptionalRemarks
 from lerobot_vtrefine.diagnose.core.rivals import Rival
-from lerobot_vtrefine.diagnose.core.screened_search import clearly_better
 from lerobot_vtrefine.diagnose.evidence import ResidualView, Trace
 from lerobot_vtrefine.diagnose.pad import views
 from lerobot_vtrefine.diagnose.pad.candidates import CATALOGUE

@@ -41,11 +41,7 @@ from lerobot_vtrefine.diagnose.pad.noise import Noise
 from lerobot_vtrefine.diagnose.pad.own_delay import moved
 from lerobot_vtrefine.diagnose.pad.own_touch import allowed, losses_at_own_touch
 from lerobot_vtrefine.diagnose.pad.press_trials import PressSet
-from lerobot_vtrefine.diagnose.pad.rules import (
-    FAR_OFF,
-    FORGIVEN,
-    FURTHER_GAIN,
-)
+from lerobot_vtrefine.diagnose.pad.rules import FAR_OFF, FORGIVEN, FURTHER_GAIN
 from lerobot_vtrefine.diagnose.pad.screening import DEAD, GAIN_MAP, all_probes, form_probes, forms_of
 from lerobot_vtrefine.diagnose.pad.shown_dead import with_shown_dead
 from lerobot_vtrefine.diagnose.pad.suspicions import surprises, suspicions
@@ -330,8 +326,7 @@ class PadProblem(OptionalSteps):
     def screened(self, now: Fit, only: Collection[str] | None = None) -> list[Promise[Candidate]]:
         """Scores of all forms that are screened, of maps, and of frames that repeat."""
         probes = all_probes(self, now) if only is None else form_probes(self, now, only)
-        out = []
-        sized = in_deviations(self.weights)
+        out, sized = [], in_deviations(self.weights)
         for name, tested in screen(probes, len(self.weights), self.seed, sized=sized).items():
             forms = tuple(forms_of(name, now))
             starts = {form.label: starts_of(form, probes) for form in forms}

@@ -9,16 +9,11 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from lerobot_vtrefine.diagnose.core.heldout import OutOfFold, out_of_fold
+from lerobot_vtrefine.diagnose.core.preference import better, clearly_better, preferable
 from lerobot_vtrefine.diagnose.core.resampling import agree
 from lerobot_vtrefine.diagnose.core.rules import FORM_P
 from lerobot_vtrefine.diagnose.core.screened_rivals import surely_likelier
-from lerobot_vtrefine.diagnose.core.screened_search import (
-    CHANNEL,
-    ScreenedSearch,
-    better,
-    clearly_better,
-    preferable,
-)
+from lerobot_vtrefine.diagnose.core.screened_search import CHANNEL, ScreenedSearch
 from lerobot_vtrefine.diagnose.core.search import Selection
 from lerobot_vtrefine.diagnose.pad.candidates import causes_like
 from lerobot_vtrefine.diagnose.pad.candidates.base import Form

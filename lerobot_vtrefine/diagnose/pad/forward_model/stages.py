@@ -124,7 +124,7 @@ def _contact(stage: ContactStage, field: Field, context: Context) -> Field:
         damping = force - stage.undamped().force(depth, rate, sheet.layout)[:, 0].numpy()
     if field.columns is sheet.touched:
         return Field(force, field.columns, damping=damping)
-    felt = force.any(axis=0)
+    felt = (force != 0.0).any(axis=0)
     damping = None if damping is None else np.ascontiguousarray(damping[:, felt])
     return Field(np.ascontiguousarray(force[:, felt]), field.columns[felt], damping=damping)
 
