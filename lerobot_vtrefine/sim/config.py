@@ -245,6 +245,9 @@ class WarpConfig:
     """auto (a CUDA GPU where there is one), cpu, cuda or cuda:i."""
     contacts_per_world: int = 96
     """Contacts, and pairs of geoms close to each other, on average over the worlds."""
+    convex_per_world: int = 32
+    """Contacts for the general collision of convex shapes (parts of meshes, cylinders in their holes), on
+    average over the worlds: each takes 8 kB, most of what a world needs."""
     rows_per_world: int = 384
     """Rows of constraints in any one world: 4 per contact, of which a round plug on the rim makes 84."""
     solver_iterations: int = 10
@@ -259,7 +262,7 @@ class WarpConfig:
             raise ValueError(f"warp.device must be auto, cpu, cuda or cuda:0, not {self.device!r}")
         if self.solver not in WARP_SOLVERS:
             raise ValueError(f"warp.solver must be {' or '.join(WARP_SOLVERS)}, not {self.solver!r}")
-        for name in ("contacts_per_world", "rows_per_world", "solver_iterations"):
+        for name in ("contacts_per_world", "convex_per_world", "rows_per_world", "solver_iterations"):
             if getattr(self, name) < 1:
                 raise ValueError(f"warp.{name} must be at least 1, got {getattr(self, name)}")
 

@@ -94,7 +94,7 @@ def encoder_stage(options: argparse.Namespace, pair: str) -> Stage:
         f"--senses=[{','.join(MODALITIES)}]",
         f"--effort.device={options.device}",
         f"--effort.episodes={options.encoder_episodes}",
-        f"--effort.num_envs={min(options.eval_envs, options.encoder_episodes // 2)}",
+        f"--effort.num_envs={min(options.worlds, options.encoder_episodes // 2)}",
         f"--effort.steps={options.encoder_steps}",
         "--effort.batch_size=1024",
         "--effort.history=[1]",

@@ -255,6 +255,7 @@ def test_success_must_be_held():
         (lambda: insertion_sim(0), "num_envs must be at least 1"),
         (lambda: WarpConfig(device="gpu"), "warp.device must be auto, cpu, cuda or cuda:0, not 'gpu'"),
         (lambda: WarpConfig(rows_per_world=0), "warp.rows_per_world must be at least 1"),
+        (lambda: WarpConfig(convex_per_world=0), "warp.convex_per_world must be at least 1"),
         (
             lambda: insertion_sim(1, backend="cuda"),
             "backend=cuda is unknown; choose from single, batch, warp",

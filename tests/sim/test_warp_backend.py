@@ -257,6 +257,24 @@ def test_a_world_without_room_for_its_collision_fails_alone(pair, monkeypatch):
     assert not warp.step(warp.command_targets()).terminated.any()
 
 
+def test_too_little_room_for_convex_contacts_is_told(pair, caplog):
+    """A round plug that is pushed into the wall of its hole touches it in several places."""
+    _, single = pair
+    single.reset(EVERYONE, EVERYONE)
+    seated(single)
+    ids = np.arange(2)
+    qpos, qvel = single._backend.read(ids)
+    qpos[:, single.scene.model.joint("plug").qposadr[0]] += 0.002
+    for room, lost in ((32, False), (1, True)):
+        config = WarpConfig(device="cpu", convex_per_world=room)
+        backend = get_backend("warp", single.scene.model, 2, warp=config)
+        backend.write(ids, qpos, qvel)
+        backend.advance(ids, np.repeat(single._episode.command[:2, None], 1, 1))
+        assert backend.overflowed(ids).any() == lost
+    (told,) = (record.getMessage() for record in caplog.records)
+    assert re.search(r"contacts of convex shapes .*raise warp.convex_per_world \(now 1\)", told)
+
+
 def test_a_polytope_has_room_for_all_its_edges(pair):
     from mujoco_warp._src import collision_convex
 

@@ -51,7 +51,7 @@ class Arena:
     def __init__(self, size: int, device: wp.Device) -> None:
         # In large elements: warp counts them with 32 bits, and thousands of worlds take gigabytes.
         self._block = wp.empty(padded(size) // ALIGNMENT + 1, dtype=Chunk, device=device)
-        self._size, self._used = padded(size), 0
+        self.size, self._used = padded(size), 0
 
     def rewind(self) -> None:
         """Give out the same memory again: arrays from before must no longer be in use."""
@@ -65,8 +65,8 @@ class Arena:
         """
         start = self._used
         self._used += padded(size_in_bytes)
-        if self._used > self._size:
-            raise RuntimeError(f"the arena of {self._size} bytes is too small")
+        if self._used > self.size:
+            raise RuntimeError(f"the arena of {self.size} bytes is too small")
         return self._block.ptr + start
 
     def deallocate(self, ptr: int, size_in_bytes: int) -> None:
@@ -85,14 +85,29 @@ class Recording:
         wp.capture_launch(self.graph)
 
 
-def record(work: Callable[[], None], times: int, device: wp.Device) -> Recording:
-    """Do some work so many times, and record that. Its temporary arrays must not outlive one time."""
+def arena_of(size: int, device: wp.Device, there: Arena | None) -> Arena:
+    """The arena that is there, where it has so many bytes, else a new one."""
+    return there if there is not None and there.size >= size else Arena(size, device)
+
+
+def record(work: Callable[[], None], times: int, device: wp.Device, there: Arena | None = None) -> Recording:
+    """Do some work so many times, and record that. Its temporary arrays must not outlive one time.
+
+    Args:
+        work: launches kernels.
+        times: how often.
+        device: where.
+        there: arena of other recordings, which are launched on the same stream as this one and so never at
+            the same time; it is used again where it is large enough.
+    """
     tally = Tally(device)
     with wp.ScopedAllocator(device, tally):
         for _ in range(times):
             tally.rewind()
             work()
-    arena = Arena(tally.most, device)
+            # Warp releases arrays when the device is next waited for: all times at once would not fit.
+            wp.synchronize_device(device)
+    arena = arena_of(tally.most, device, there)
     # Every kernel is loaded by now, which could not happen during the capture.
     with wp.ScopedAllocator(device, arena), wp.ScopedCapture(device, force_module_load=False) as capture:
         for _ in range(times):

@@ -16,19 +16,19 @@ import warp as wp
 from mujoco_warp._src import collision_convex as convex
 
 from lerobot_vtrefine.sim.backends import warp_kernels as kernels
-from lerobot_vtrefine.sim.backends.warp_memory import Recording, record
+from lerobot_vtrefine.sim.backends.warp_memory import Arena, Recording, record
 from lerobot_vtrefine.sim.backends.warp_step import WarpStep
 from lerobot_vtrefine.sim.config import WarpConfig
 from lerobot_vtrefine.sim.patience import told_if_slow
 from lerobot_vtrefine.tactile.contact_query import start_warp
 
-CONTACTS, ROWS = "contacts_per_world", "rows_per_world"
+CONTACTS, ROWS, CONVEX = "contacts_per_world", "rows_per_world", "convex_per_world"
 OVERFLOWS = {
     mjw.OverflowType.NEFC: ("constraint rows", ROWS),
     mjw.OverflowType.NJMAX_NNZ: ("entries of the constraint Jacobian", ROWS),
     mjw.OverflowType.BROADPHASE: ("pairs of geoms that may touch", CONTACTS),
     mjw.OverflowType.NARROWPHASE: ("contacts", CONTACTS),
-    mjw.OverflowType.CCD: ("contacts of convex shapes", CONTACTS),
+    mjw.OverflowType.CCD: ("contacts of convex shapes", CONVEX),
     mjw.OverflowType.CONTACT_MATCH: ("contacts of one contact sensor", ROWS),
     mjw.OverflowType.EPA_HORIZON: ("edges while measuring a penetration", None),
 }
@@ -78,7 +78,11 @@ class WarpWorlds:
             _set_options(self.model, config)
             _make_room_for_edges(model.opt.ccd_iterations)
             self.data = mjw.make_data(
-                model, num_envs, nconmax=config.contacts_per_world, njmax=config.rows_per_world
+                model,
+                num_envs,
+                nconmax=config.contacts_per_world,
+                nccdmax=min(config.convex_per_world, config.contacts_per_world),
+                njmax=config.rows_per_world,
             )
             self._idle = wp.zeros(num_envs, dtype=int)
             self.idle = wp.to_torch(self._idle)
@@ -95,6 +99,7 @@ class WarpWorlds:
         self.diverged, self.lost = wp.to_torch(self._diverged), torch.zeros_like(self.overflow)
         self._widths = (model.nq, model.nsensordata, model.nu)
         self._recorded: dict[tuple[str, int], Recording] = {}
+        self._arena: Arena | None = None
         self._everyone = torch.arange(num_envs, dtype=torch.int32, device=self.device)
         self._capture = config.graph and _can_capture(self.device)
         self._posed = self._compiled = False
@@ -145,7 +150,8 @@ class WarpWorlds:
             if (what, count) in self._recorded:
                 self._recorded[what, count].launch()
             elif count:
-                self._recorded[what, count] = record(work, count, wp.get_device())
+                recording = record(work, count, wp.get_device(), self._arena)
+                self._recorded[what, count], self._arena = recording, recording.arena
 
     def _substep(self) -> None:
         data, trace = self.data, self._trace

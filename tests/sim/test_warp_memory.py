@@ -1,0 +1,40 @@
+"""Memory of recorded work, without a GPU: Warp calls these allocators on GPUs only."""
+
+from types import SimpleNamespace
+
+import pytest
+
+wp = pytest.importorskip("warp")
+from lerobot_vtrefine.sim.backends.warp_memory import ALIGNMENT, Arena, Tally, arena_of, padded  # noqa: E402
+
+
+@pytest.fixture
+def device():
+    return wp.get_device("cpu")
+
+
+def test_an_arena_of_what_was_tallied_is_enough_time_after_time(device):
+    released = []
+    pool = SimpleNamespace(allocate=lambda size: size, deallocate=lambda ptr, _: released.append(ptr))
+    tally = Tally(SimpleNamespace(get_allocator=lambda: pool))
+    for sizes in ([4, 400], [4000, 12], [8]):
+        tally.rewind()
+        for size in sizes:
+            tally.deallocate(tally.allocate(size), size)
+    assert released == [4, 400, 4000, 12, 8]
+    assert tally.most == padded(4000) + padded(12)
+    arena = Arena(tally.most, device)
+    first = [arena.allocate(4000), arena.allocate(12)]
+    assert first[1] - first[0] == padded(4000)
+    with pytest.raises(RuntimeError, match="too small"):
+        arena.allocate(1)
+    arena.rewind()
+    assert [arena.allocate(4000), arena.allocate(12)] == first
+
+
+def test_recordings_share_the_arena_of_the_largest(device):
+    small = arena_of(1000, device, None)
+    large = arena_of(5000, device, small)
+    assert large is not small
+    assert arena_of(4000, device, large) is large
+    assert arena_of(padded(5000) + ALIGNMENT, device, large) is not large
