@@ -1,5 +1,8 @@
 """What torch keeps goes back when a GPU that others use is nearly full."""
 
+import sys
+from types import SimpleNamespace
+
 import pytest
 import torch
 
@@ -17,11 +20,25 @@ def test_memory_is_given_back_where_little_is_left(
     assert len(calls) == given_back
 
 
-def test_a_run_tells_how_much_memory_is_taken(monkeypatch) -> None:
+@pytest.mark.parametrize(
+    ("warp", "told"),
+    [
+        (None, {}),
+        (SimpleNamespace(is_mempool_enabled=lambda _: False), {}),
+        (
+            SimpleNamespace(
+                is_mempool_enabled=lambda _: True, get_mempool_used_mem_high=lambda name: len(name) * GIB
+            ),
+            {"warp_gib": 4.0},
+        ),
+    ],
+)
+def test_a_run_tells_how_much_memory_is_taken(monkeypatch, warp, told: dict[str, float]) -> None:
     asked = []
     monkeypatch.setattr(torch.cuda, "max_memory_reserved", lambda _: 3 * GIB)
     monkeypatch.setattr(torch.cuda, "reset_peak_memory_stats", lambda _: asked.append("anew"))
     monkeypatch.setattr(torch.cuda, "mem_get_info", lambda _: (60 * GIB, 80 * GIB))
-    assert memory_taken(torch.device("cuda")) == {"torch_gib": 3.0, "gpu_used_gib": 20.0}
+    monkeypatch.setitem(sys.modules, "warp", warp)
+    assert memory_taken(torch.device("cuda")) == {"torch_gib": 3.0, "gpu_used_gib": 20.0} | told
     assert asked == ["anew"]
     assert memory_taken(torch.device("cpu")) == {}
