@@ -73,7 +73,7 @@ def parse() -> tuple[argparse.Namespace, Budget]:
         parser.add_argument(f"--{name}", type=int, default=default, help=f"default {default}")
     parser.add_argument("--lane", help=argparse.SUPPRESS)
     parser.add_argument("--task", help="a file of configs/env (default: the demo's task)")
-    parser.add_argument("--recipe", choices=list(RECIPES), default="cloud", help="as vtrefine-demo's")
+    parser.add_argument("--recipe", choices=list(RECIPES), default=Budget.recipe, help="as vtrefine-demo's")
     for name, words in (("policy", "policy"), ("dppo", "update")):
         parser.add_argument(f"--{name}", type=json.loads, default={}, help=f"flags of the {words}, as JSON")
     parser.add_argument(
@@ -82,7 +82,8 @@ def parse() -> tuple[argparse.Namespace, Budget]:
         default=default_degradation(),
         help="the expert's imperfections, as JSON; {} for none (default %(default)s)",
     )
-    for name, default in (("encoder_episodes", 6144), ("encoder_steps", 3000)):
+    for name in ("encoder_episodes", "encoder_steps"):
+        default = getattr(Budget, name)
         parser.add_argument(f"--{name}", type=int, default=default, help=f"of recipe pads; default {default}")
     options = parser.parse_args()
     if options.jobs < 1:
