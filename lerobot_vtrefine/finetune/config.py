@@ -258,8 +258,8 @@ class SmallDppo(TrustRegionDppo):
     """The trust region in minutes on two CPU cores: few environments, so smaller steps.
 
     128 episodes an iteration tell less than 1024: steps of 4 nats that fall to 1. On six seeds of the demo
-    (docs/learning-tried.md) no iteration of the last half fell by more than 12 points; the schedule that it
-    replaced, which had no bound and returned to its best weights when it fell, fell by up to 41.
+    (docs/learning-tried.md) no iteration of the last half fell by more than 12 points. Without a bound, even
+    with a return to the best weights after a fall, it was up to 41.
     """
 
     iterations: int = 20

