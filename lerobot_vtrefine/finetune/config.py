@@ -166,8 +166,9 @@ class DppoConfig(draccus.ChoiceRegistry):
         """Stochasticity of the tuned steps in deployment, as in the reference's evaluation.
 
         The steps of the DDPM chain keep their posterior's noise, without the exploration floor; DDIM's keep
-        none, since its few long steps would leave too much of it. Success without and with it, same episodes:
-        trained policies .49, .58 (512), .63, .67 (768), .63, .70 (384); a half-trained one .49, .45 (768).
+        none, since its few long steps would leave too much of it. Success without and with it on the same
+        episodes (their number in brackets): trained policies .49, .58 (512), .63, .67 (768), .63, .70 (384);
+        a half-trained one .49, .45 (768).
         """
         return 0.0 if self.sampler == "ddim" else self.eta
 
