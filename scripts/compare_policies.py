@@ -21,7 +21,7 @@ from runs.side_by_side import run_all
 
 from lerobot_vtrefine.cli.arguments import CommandParser
 from lerobot_vtrefine.cli.errors import run_cli
-from lerobot_vtrefine.cli.pipeline.stages import Stage, StageRunner
+from lerobot_vtrefine.cli.pipeline.stages import Stage, StageRunner, trained_policy
 from lerobot_vtrefine.cli.report.results import load_evaluation
 from lerobot_vtrefine.cli.results.collect import save
 from lerobot_vtrefine.cli.results.provenance import provenance
@@ -69,7 +69,7 @@ def policy_stages(options: argparse.Namespace, policy: str, seed: int) -> list[S
     """Training and evaluation of one policy."""
     name = f"{policy}_{seed}"
     out, judged = options.output_dir / name, options.output_dir / f"eval_{name}"
-    checkpoint = out / "checkpoints" / "last" / "pretrained_model"
+    checkpoint = trained_policy(out)
     config, *flags = POLICIES[policy]
     train = (
         "lerobot-train",

@@ -7,7 +7,7 @@ from pathlib import Path
 from lerobot_vtrefine.cli.arguments import flags
 from lerobot_vtrefine.cli.pipeline.demo_config import SEED_STRIDE, TRAIN_SEED_OFFSET
 from lerobot_vtrefine.cli.pipeline.demo_stages import pretrain_stage, record_stage
-from lerobot_vtrefine.cli.pipeline.stages import Stage
+from lerobot_vtrefine.cli.pipeline.stages import Stage, trained_policy
 from reality.budget import Budget, folder_name, recipe, world_env
 from reality.hidden import of_robot
 
@@ -123,11 +123,6 @@ def finetune_dir(budget: Budget, world: str, seed: int) -> Path:
     return budget.output_dir / folder_name("finetune", world, str(seed))
 
 
-def tuned_policy(budget: Budget, world: str, seed: int) -> Path:
-    """The checkpoint that a fine-tuning leaves."""
-    return finetune_dir(budget, world, seed) / "checkpoints" / "last" / "pretrained_model"
-
-
 def finetune_stage(budget: Budget, world: str, seed: int) -> Stage:
     """DPPO in a simulator, from the imitation learned there."""
     config, output = recipe(budget, seed, world), finetune_dir(budget, world, seed)
@@ -143,7 +138,7 @@ def finetune_stage(budget: Budget, world: str, seed: int) -> Stage:
         f"--output_dir={output}",
         "--resume=true",
     )
-    product = tuned_policy(budget, world, seed) / "model.safetensors"
+    product = trained_policy(output) / "model.safetensors"
     title, needs = f"Fine-tune in {world}, seed {seed}", (folder_name("pretrain", world),)
     return Stage(output.name, title, command, output, product, needs, resumable=True)
 
@@ -155,10 +150,10 @@ def evaluation_dir(budget: Budget, trained: str, world: str, seed: int) -> Path:
 
 def evaluation_stage(budget: Budget, trained: str, world: str, seed: int) -> Stage:
     """A policy, named by the world that it was fine-tuned in, on this seed's episodes of a world."""
-    output = evaluation_dir(budget, trained, world, seed)
-    command = [
+    output, tuned = evaluation_dir(budget, trained, world, seed), finetune_dir(budget, trained, seed)
+    command = (
         "lerobot-eval",
-        f"--policy.path={tuned_policy(budget, trained, seed)}",
+        f"--policy.path={trained_policy(tuned)}",
         f"--policy.device={budget.device}",
         *env_flags(budget, world),
         f"--env.metrics_path={output / 'episodes.jsonl'}",
@@ -167,7 +162,6 @@ def evaluation_stage(budget: Budget, trained: str, world: str, seed: int) -> Sta
         f"--eval.batch_size={min(budget.eval_envs, budget.eval_episodes)}",
         f"--seed={recipe(budget, seed).eval_seed}",
         f"--output_dir={output}",
-    ]
+    )
     title = f"Evaluate {trained} in {world}, seed {seed}"
-    needs = (finetune_dir(budget, trained, seed).name,)
-    return Stage(output.name, title, tuple(command), output, output / "eval_info.json", needs)
+    return Stage(output.name, title, command, output, output / "eval_info.json", (tuned.name,))

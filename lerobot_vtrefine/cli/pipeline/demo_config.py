@@ -5,6 +5,7 @@ from pathlib import Path
 from typing import Any
 
 from lerobot_vtrefine.choices import check_choice
+from lerobot_vtrefine.cli.pipeline.stages import trained_policy
 from lerobot_vtrefine.embodiments import DEFAULT_BODY
 from lerobot_vtrefine.finetune.seeds import TRAINING_SEEDS
 
@@ -187,7 +188,7 @@ class DemoConfig:
 
     def checkpoint(self, policy: str) -> Path:
         """Folder of the ``pretrain`` or ``finetune`` policy, as ``--policy.path`` takes it."""
-        return self.output_dir / policy / "checkpoints" / "last" / "pretrained_model"
+        return trained_policy(self.output_dir / policy)
 
     def evaluation_dir(self, policy: str, ablation: str = "none") -> Path:
         """Folder of an evaluation's eval_info.json, episodes.jsonl and videos."""

@@ -11,6 +11,7 @@ from dataclasses import replace as replace_fields
 from pathlib import Path
 from typing import Any
 
+from lerobot_vtrefine.cli.pipeline.stages import trained_policy
 from lerobot_vtrefine.cli.results.provenance import FILE_NAME
 from lerobot_vtrefine.cli.results.published import IMITATION
 from lerobot_vtrefine.cli.results.rows import Line, Row, Run, merge, read_rows, write_rows
@@ -108,7 +109,7 @@ def finetune_row(
         episodes = evaluated_episodes(settings["eval"]["n_episodes"], settings["dppo"]["num_envs"])
     else:
         raise ValueError(f"{folder} was not evaluated; run lerobot-eval with --output_dir={folder / 'eval'}")
-    saved = read_json(folder / "checkpoints" / "last" / "pretrained_model" / "config.json")
+    saved = read_json(trained_policy(folder) / "config.json")
     if saved is None and "policy" not in common:
         raise ValueError(
             f"{folder} holds no checkpoint that tells the policy; add --policy=visuo_tactile or visual"
