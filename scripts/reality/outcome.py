@@ -8,7 +8,7 @@ import numpy as np
 from runs.comparison import difference
 
 from lerobot_vtrefine.cli.report.statistics import proportion
-from lerobot_vtrefine.cli.results.collect import Progress, last_steps, read_json
+from lerobot_vtrefine.cli.results.collect import Progress, last_steps, read_json_or_none
 from lerobot_vtrefine.cli.results.rows import Run
 from lerobot_vtrefine.finetune.logger import read_progress
 from reality.budget import Budget, folder_name
@@ -68,7 +68,7 @@ def reality_rows(
     """
     rows = []
     for name in REALITIES:
-        verdict = read_json(folder / folder_name(name) / "diagnosis" / "verdict.json")
+        verdict = read_json_or_none(folder / folder_name(name) / "diagnosis" / "verdict.json")
         if verdict is None:  # this reality was not among --realities
             continue
         causes = ", ".join(cause["name"] for cause in verdict["causes"]) or "nothing"
@@ -77,11 +77,9 @@ def reality_rows(
             for path in sorted(folder.glob(f"{prefix}[0-9]*/eval_info.json")):
                 seed = path.parent.name.removeprefix(prefix)
                 tuning = folder_name("finetune", trained, seed)
-                progress, stamp = (
-                    read_progress(folder / tuning),
-                    read_json(folder / "stages" / f"{tuning}.json"),
-                )
-                outcomes = read_json(path)["per_task"][0]["metrics"]["successes"]
+                progress = read_progress(folder / tuning)
+                stamp = read_json_or_none(folder / "stages" / f"{tuning}.json")
+                outcomes = read_json_or_none(path)["per_task"][0]["metrics"]["successes"]
                 row = Run(
                     table="reality",
                     task=": ".join(filter(None, (task, name))),
