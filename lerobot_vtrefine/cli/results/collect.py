@@ -13,7 +13,7 @@ from typing import Any
 
 from lerobot_vtrefine.cli.pipeline.stages import trained_policy
 from lerobot_vtrefine.cli.results.provenance import FILE_NAME
-from lerobot_vtrefine.cli.results.published import IMITATION
+from lerobot_vtrefine.cli.results.published import IMITATION, TUNED
 from lerobot_vtrefine.cli.results.rows import Line, Row, Run, merge, read_rows, write_rows
 from lerobot_vtrefine.cli.results.tables import HANDLING, MEASURED, REACHED
 from lerobot_vtrefine.finetune.logger import read_progress
@@ -66,7 +66,7 @@ def pipeline_rows(
     commits = {stage["name"]: stage.get("commit") for stage in results["stages"]}
     recorded = results.get("provenance", {})
     origin = {name: recorded.get(name) or origin[name] for name in ORIGIN}
-    for stage, variant in (("pretrain", IMITATION), ("finetune", "")):
+    for stage, variant in (("pretrain", IMITATION), ("finetune", TUNED)):
         tuned = stage == "finetune"
         progress = read_progress(folder / "finetune") if tuned else []
         evaluations = {variant: results[stage]} | {
