@@ -13,8 +13,7 @@ from typing import Any
 
 from lerobot_vtrefine.cli.pipeline.stages import trained_policy
 from lerobot_vtrefine.cli.results.provenance import FILE_NAME
-from lerobot_vtrefine.cli.results.published import IMITATION, TUNED
-from lerobot_vtrefine.cli.results.rows import Line, Row, Run, merge, read_rows, write_rows
+from lerobot_vtrefine.cli.results.rows import IMITATION, TUNED, Line, Row, Run, merge, read_rows, write_rows
 from lerobot_vtrefine.cli.results.tables import HANDLING, MEASURED, REACHED
 from lerobot_vtrefine.finetune.logger import read_progress
 from lerobot_vtrefine.finetune.pipeline import CONFIG_NAME

@@ -24,8 +24,7 @@ from lerobot_vtrefine.cli.results.cells import (
     values,
 )
 from lerobot_vtrefine.cli.results.paper_tables import demonstrations_table, paper_table
-from lerobot_vtrefine.cli.results.published import IMITATION, TUNED
-from lerobot_vtrefine.cli.results.rows import Line, Row, Run
+from lerobot_vtrefine.cli.results.rows import IMITATION, TUNED, Line, Row, Run
 
 BLOCK = re.compile(r"(<!-- table: (\w+) -->\n).*?(<!-- end -->)", re.DOTALL)
 LEADING_POINT = re.compile(r"(?<![\d.])\.(?=\d)")
