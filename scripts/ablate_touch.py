@@ -27,11 +27,8 @@ FIRST_SEED = 8_000_000
 def measure(args: argparse.Namespace, kind: str) -> dict[str, Any]:
     """Success and what went with it, of one kind of touch."""
     dataset = args.dataset if kind in ("touch", "touch_other") else None
-    backend = None if args.device == "cpu" else "warp"
     cfg = TrustRegionDppo(num_envs=args.episodes, encoder="frozen")
-    practice = load_practice(
-        args.policy, args.task, cfg, args.device, backend, ablate=kind, ablate_dataset=dataset
-    )
+    practice = load_practice(args.policy, args.task, cfg, args.device, ablate=kind, ablate_dataset=dataset)
     found = evaluate(practice.env, practice.agent, args.episodes, FIRST_SEED)
     return {"ablate": kind, "episodes": args.episodes, **found}
 

@@ -126,8 +126,6 @@ def main() -> int:
     saved = read_json_or_none(args.policy / "config.json") or {}
     if saved.get("type") != "vt_dp3" or saved["ft_denoising_steps"]:
         raise ValueError(f"--policy={args.policy} is not a vt_dp3 from imitation, before DPPO")
-    if args.backend is None and args.device != "cpu":
-        args.backend = "warp"
     return losses(args) if args.what == "losses" else train(args)
 
 
