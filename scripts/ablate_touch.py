@@ -15,13 +15,12 @@ from typing import Any
 
 from lerobot_vtrefine.cli.arguments import CommandParser
 from lerobot_vtrefine.cli.errors import run_cli
+from lerobot_vtrefine.cli.pipeline.demo_config import EVAL_SEED_OFFSET
 from lerobot_vtrefine.finetune.config import TrustRegionDppo
 from lerobot_vtrefine.finetune.evaluation import evaluate
 from lerobot_vtrefine.finetune.pipeline import load_practice
 
 KINDS = ("none", "touch", "touch_shuffled", "touch_other")
-FIRST_SEED = 8_000_000
-"""Episodes that training and its own evaluations never see."""
 
 
 def measure(args: argparse.Namespace, kind: str) -> dict[str, Any]:
@@ -29,7 +28,7 @@ def measure(args: argparse.Namespace, kind: str) -> dict[str, Any]:
     dataset = args.dataset if kind in ("touch", "touch_other") else None
     cfg = TrustRegionDppo(num_envs=args.episodes, encoder="frozen")
     practice = load_practice(args.policy, args.task, cfg, args.device, ablate=kind, ablate_dataset=dataset)
-    found = evaluate(practice.env, practice.agent, args.episodes, FIRST_SEED)
+    found = evaluate(practice.env, practice.agent, args.episodes, EVAL_SEED_OFFSET)
     return {"ablate": kind, "episodes": args.episodes, **found}
 
 

@@ -13,7 +13,7 @@ REPO_ID = "local/vtrefine_demo"
 POLICIES = ("pretrain", "finetune")
 ABLATIONS = ("touch", "vision")
 
-# Environment seeds of demonstrations, fine-tuning and evaluation never overlap.
+# Environment seeds of demonstrations, fine-tuning and evaluation never overlap; also of scripts that compare.
 SEED_STRIDE = 10_000_000
 TRAIN_SEED_OFFSET = 1_000_000
 EVAL_SEED_OFFSET = 8_000_000
