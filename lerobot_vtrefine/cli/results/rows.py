@@ -62,7 +62,6 @@ class Run(Row):
         "converges",
         "demo",
         "touch",
-        "twin",
         "paper",
         "demonstrations",
         "policies",

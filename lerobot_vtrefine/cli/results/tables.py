@@ -254,7 +254,7 @@ def lines_table(rows: Sequence[Line]) -> str:
 RENDERERS: dict[str, Callable[[Sequence], str]] = (
     dict.fromkeys(Run.TABLES, runs_table)
     | dict.fromkeys(Line.TABLES, lines_table)
-    | {"demo": demo_table, "touch": touch_table, "twin": touch_table, "reality": reality_table}
+    | {"demo": demo_table, "touch": touch_table, "reality": reality_table}
     | {"expert": expert_table, "policies": policies_table}
     | {"paper": paper_table, "demonstrations": demonstrations_table, "handling": handling_table}
     | {"senses": senses_table}
