@@ -50,6 +50,7 @@ SHOWN = (
     "explained_variance",
     "steps_per_s",
 )
+"""Metrics that the log tells after every iteration; progress.csv has all."""
 
 
 @dataclass
