@@ -15,24 +15,20 @@ from typing import Any
 
 from lerobot_vtrefine.cli.arguments import CommandParser
 from lerobot_vtrefine.cli.errors import run_cli
+from lerobot_vtrefine.cli.pipeline.demo_config import EVAL_SEED_OFFSET
 from lerobot_vtrefine.finetune.config import TrustRegionDppo
 from lerobot_vtrefine.finetune.evaluation import evaluate
 from lerobot_vtrefine.finetune.pipeline import load_practice
 
 KINDS = ("none", "touch", "touch_shuffled", "touch_other")
-FIRST_SEED = 8_000_000
-"""Episodes that training and its own evaluations never see."""
 
 
 def measure(args: argparse.Namespace, kind: str) -> dict[str, Any]:
     """Success and what went with it, of one kind of touch."""
     dataset = args.dataset if kind in ("touch", "touch_other") else None
-    backend = None if args.device == "cpu" else "warp"
     cfg = TrustRegionDppo(num_envs=args.episodes, encoder="frozen")
-    practice = load_practice(
-        args.policy, args.task, cfg, args.device, backend, ablate=kind, ablate_dataset=dataset
-    )
-    found = evaluate(practice.env, practice.agent, args.episodes, FIRST_SEED)
+    practice = load_practice(args.policy, args.task, cfg, args.device, ablate=kind, ablate_dataset=dataset)
+    found = evaluate(practice.env, practice.agent, args.episodes, EVAL_SEED_OFFSET)
     return {"ablate": kind, "episodes": args.episodes, **found}
 
 

@@ -22,7 +22,7 @@ runs that could not (on a machine without git, say). What nobody says is null.
 import sys
 from pathlib import Path
 
-from compare_reality import reality_rows
+from reality.outcome import reality_rows
 
 from lerobot_vtrefine.cli.arguments import CommandParser
 from lerobot_vtrefine.cli.errors import run_cli

@@ -21,7 +21,8 @@ from runs.side_by_side import run_all
 
 from lerobot_vtrefine.cli.arguments import CommandParser
 from lerobot_vtrefine.cli.errors import run_cli
-from lerobot_vtrefine.cli.pipeline.stages import Stage, StageRunner
+from lerobot_vtrefine.cli.pipeline.demo_config import EVAL_SEED_OFFSET
+from lerobot_vtrefine.cli.pipeline.stages import Stage, StageRunner, trained_policy
 from lerobot_vtrefine.cli.report.results import load_evaluation
 from lerobot_vtrefine.cli.results.collect import save
 from lerobot_vtrefine.cli.results.provenance import provenance
@@ -44,8 +45,6 @@ POLICIES: dict[str, tuple[str, ...]] = {
     "diffusion_rgb": ("diffusion_rgb", FOUR_ACTIONS, SCRATCH),
 }
 """A file of configs/policy, and flags beside it. vt_dp3_pads executes four actions by itself."""
-FIRST_EVALUATION_SEED = 8_000_000
-"""Far beyond those of the demonstrations."""
 
 
 def record_stage(options: argparse.Namespace) -> Stage:
@@ -69,7 +68,7 @@ def policy_stages(options: argparse.Namespace, policy: str, seed: int) -> list[S
     """Training and evaluation of one policy."""
     name = f"{policy}_{seed}"
     out, judged = options.output_dir / name, options.output_dir / f"eval_{name}"
-    checkpoint = out / "checkpoints" / "last" / "pretrained_model"
+    checkpoint = trained_policy(out)
     config, *flags = POLICIES[policy]
     train = (
         "lerobot-train",
@@ -97,7 +96,7 @@ def policy_stages(options: argparse.Namespace, policy: str, seed: int) -> list[S
         f"--env.metrics_path={judged / 'episodes.jsonl'}",
         f"--eval.n_episodes={options.episodes}",
         f"--eval.batch_size={min(options.eval_envs, options.episodes)}",
-        f"--seed={FIRST_EVALUATION_SEED}",
+        f"--seed={EVAL_SEED_OFFSET}",
         f"--output_dir={judged}",
     )
     trained, done = f"train_{name}", judged / "eval_info.json"
@@ -109,7 +108,7 @@ def policy_stages(options: argparse.Namespace, policy: str, seed: int) -> list[S
 
 def row(options: argparse.Namespace, policy: str, seed: int) -> Run:
     """What an evaluation found."""
-    found = load_evaluation(options.output_dir / f"eval_{policy}_{seed}", FIRST_EVALUATION_SEED)
+    found = load_evaluation(options.output_dir / f"eval_{policy}_{seed}", EVAL_SEED_OFFSET)
     origin = provenance()
     return Run(
         table="policies",

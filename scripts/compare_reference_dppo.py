@@ -26,7 +26,7 @@ from reference.insertion.theirs import train_reference
 
 from lerobot_vtrefine.cli.arguments import CommandParser
 from lerobot_vtrefine.cli.errors import run_cli
-from lerobot_vtrefine.cli.results.collect import largest_fall, read_json, save, steps_to
+from lerobot_vtrefine.cli.results.collect import largest_fall, read_json_or_none, save, steps_to
 from lerobot_vtrefine.cli.results.provenance import provenance
 from lerobot_vtrefine.cli.results.rows import Row, Run
 from lerobot_vtrefine.finetune.pipeline import Practice
@@ -123,11 +123,9 @@ def main() -> int:
         help="file of the rows, curves beside it",
     )
     args = parser.parse_args()
-    saved = read_json(args.policy / "config.json") or {}
+    saved = read_json_or_none(args.policy / "config.json") or {}
     if saved.get("type") != "vt_dp3" or saved["ft_denoising_steps"]:
         raise ValueError(f"--policy={args.policy} is not a vt_dp3 from imitation, before DPPO")
-    if args.backend is None and args.device != "cpu":
-        args.backend = "warp"
     return losses(args) if args.what == "losses" else train(args)
 
 

@@ -32,7 +32,6 @@ from lerobot_vtrefine.shipped import PREFIX, encoders
 MODALITIES = ("visuo_tactile", "visual")
 POLICIES = {"pretrain": "imitation", "finetune": "after DPPO"}
 
-
 FROM_ABOVE = {
     "width": 80,
     "height": 60,
@@ -41,12 +40,19 @@ FROM_ABOVE = {
     "target_m": [0.0, 0.0, 0.145],
 }
 """A camera from which the plug hides the hole."""
+TIGHT: dict[str, Any] = {
+    "clearance_m": 0.001,
+    "scene": {"timestep_s": 0.002, "rigid_time_constant_s": 0.004},
+}
+"""Half the clearance, and the shorter physics steps that it needs."""
+ASKEW: dict[str, Any] = {"rules": {"grasped": {"slip_m": 0.004, "slip_rad": 0.1}}}
+"""Parts lie twice as far from where the hands expect them."""
 
 SETTINGS: dict[str, dict[str, dict[str, Any]]] = {
     "demo": {},
-    "tight": {"env": {"clearance_m": 0.001, "scene": {"timestep_s": 0.002, "rigid_time_constant_s": 0.004}}},
+    "tight": {"env": TIGHT},
     "occluded": {"env": {"scene": {"camera": FROM_ABOVE}}},
-    "slip": {"env": {"rules": {"grasped": {"slip_m": 0.004, "slip_rad": 0.1}}}},
+    "slip": {"env": ASKEW},
     "short_chunk": {"policy": {"n_action_steps": 4}},
 }
 """What differs from the demo: half the clearance, a hidden hole, twice the slip in the hand, or decisions
@@ -70,16 +76,14 @@ MANY_WORLDS: dict[str, Any] = {
     "device": "cuda",
 }
 """The demo on a GPU: 1024 worlds and a trust region."""
-_TIGHT = {"clearance_m": 0.001, "scene": {"timestep_s": 0.002, "rigid_time_constant_s": 0.004}}
-_ASKEW = {"rules": {"grasped": {"slip_m": 0.004, "slip_rad": 0.1}}}
 WORLDS: dict[str, dict[str, dict[str, Any]]] = {
     "worlds_round": {"env": {"pair": "round", "clearance_m": 0.002}},
     "worlds_square": {
-        "env": {"pair": "square", **_TIGHT, **_ASKEW},
+        "env": {"pair": "square", **TIGHT, **ASKEW},
         "policy": {"pretrained_encoder": "vtrefine:square_grasped_1mm"},
     },
     "worlds_key": {
-        "env": {"pair": "key", **_TIGHT},
+        "env": {"pair": "key", **TIGHT},
         "policy": {"pretrained_encoder": "vtrefine:key_grasped_1mm"},
     },
 }

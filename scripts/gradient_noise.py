@@ -112,8 +112,7 @@ def measure(args: argparse.Namespace) -> dict[str, Any]:
         cfg = dataclasses.replace(cfg, min_sampling_std=args.std)
     if args.nats is not None:
         cfg = dataclasses.replace(cfg, kl_per_decision=args.nats, kl_per_decision_final=args.nats)
-    backend = None if args.device == "cpu" else "warp"
-    _, agent, env, _ = load_practice(args.policy, args.task, cfg, args.device, backend)
+    _, agent, env, _ = load_practice(args.policy, args.task, cfg, args.device)
     state = dppo.TrainState.create(agent, cfg, env.privileged_dim, seed=args.seed)
     deployed = evaluate(env, agent, args.worlds, args.seed) if args.deployed else {}
     for first in (1, 2):  # the critic learns from the first round and is judged on the second

@@ -18,8 +18,7 @@ from typing import Any
 
 from lerobot_vtrefine.cli.arguments import CommandParser
 from lerobot_vtrefine.cli.errors import run_cli
-from lerobot_vtrefine.cli.report.statistics import wilson_interval
-from lerobot_vtrefine.cli.results.cells import interval, percent
+from lerobot_vtrefine.cli.results.cells import percent, share
 from lerobot_vtrefine.cli.results.collect import origin_of, save
 from lerobot_vtrefine.cli.results.rows import Line
 from lerobot_vtrefine.information import estimator
@@ -75,8 +74,7 @@ def counted(proportion: dict[str, Any] | None) -> str:
     """Success in per cent with its interval; a dash where the expert did not act."""
     if proportion is None:
         return "-"
-    success, episodes = proportion["success"], proportion["episodes"]
-    return f"{percent(success / episodes)} {interval(*wilson_interval(success, episodes))}"
+    return share(proportion["success"], proportion["episodes"])
 
 
 @run_cli

@@ -15,8 +15,7 @@ from tqdm import tqdm
 
 from lerobot_vtrefine.cli.arguments import CommandParser, read_list
 from lerobot_vtrefine.cli.errors import run_cli
-from lerobot_vtrefine.cli.report.statistics import wilson_interval
-from lerobot_vtrefine.cli.results.cells import interval, percent
+from lerobot_vtrefine.cli.results.cells import share
 from lerobot_vtrefine.cli.results.collect import save
 from lerobot_vtrefine.cli.results.provenance import provenance
 from lerobot_vtrefine.cli.results.rows import Line
@@ -42,12 +41,11 @@ def measure(policy: Path, task: Path, timestep_s: float, episodes: int, backend:
     started = time.perf_counter()
     found = evaluate(practice.env, practice.agent, episodes)
     seconds = time.perf_counter() - started
-    successes = round(found["eval_success"] * episodes)
     return Line(
         table=TABLE,
         cells={
             "task, physics step": f"{task.stem}, {1e3 * timestep_s:g} ms",
-            "success": f"{percent(successes / episodes)} {interval(*wilson_interval(successes, episodes))}",
+            "success": share(round(found["eval_success"] * episodes), episodes),
             **{title: f"{scale * found[name]:.{digits}f}" for title, (name, scale, digits) in SHOWN.items()},
             "an episode takes": f"{1e3 * seconds / episodes:.0f} ms",
         },

@@ -20,8 +20,7 @@ from tqdm import tqdm
 
 from lerobot_vtrefine.cli.arguments import CommandParser
 from lerobot_vtrefine.cli.errors import run_cli
-from lerobot_vtrefine.cli.report.statistics import wilson_interval
-from lerobot_vtrefine.cli.results.cells import interval, percent
+from lerobot_vtrefine.cli.results.cells import share
 from lerobot_vtrefine.cli.results.collect import save
 from lerobot_vtrefine.cli.results.provenance import provenance
 from lerobot_vtrefine.cli.results.rows import Line
@@ -39,9 +38,7 @@ def row(task: str, found: list[Tolerated]) -> Line:
     cells = {"expert's error, per axis": task}
     for item in found:
         size = f"{1e3 * item.size:g} mm" if item.error == LATERAL else f"{np.degrees(item.size):.0f}°"
-        cells[size] = (
-            f"{percent(item.success[0] / item.success[1])} {interval(*wilson_interval(*item.success))}"
-        )
+        cells[size] = share(*item.success)
     return Line(table=TABLE, cells=cells, **provenance())
 
 

@@ -48,8 +48,8 @@ parts within seconds, gentle ones jam them.
 NOISE_RAD = 0.003
 """Standard deviation of the noise on the expert's targets."""
 READ_EVERY = 8
-ARM_ONLY = np.tile([1.0] * 6 + [0.1] * 2, 2)
-"""Fingers move in metres: ten times less than joints, so that most parts stay in hand for a while."""
+SCALE = np.tile([1.0] * 6 + [0.1] * 2, 2)
+"""Of changes, by joint: fingers move in metres, ten times less, so that parts mostly stay in hand a while."""
 TUNED = "square_grasped_1mm"
 """The shipped policy: it knows one of the pairs, and does what it can with the others."""
 
@@ -194,9 +194,9 @@ def play(episodes: Episodes, actions: str, seed: int) -> Iterator[Counter[str]]:
         targets = np.array(sim.command_targets(), np.float64)
         if expert is not None:
             targets[active] = expert.act(active)
-            targets += NOISE_RAD * rng.normal(size=targets.shape) * ARM_ONLY
+            targets += NOISE_RAD * rng.normal(size=targets.shape) * SCALE
         else:
-            targets += reach * rng.uniform(-1.0, 1.0, targets.shape) * ARM_ONLY
+            targets += reach * rng.uniform(-1.0, 1.0, targets.shape) * SCALE
         result = episodes.step(targets, reads=step % READ_EVERY == 0)
         yield counted(episodes, active, result.finished, result.reward)
         step += 1

@@ -100,8 +100,7 @@ def measure(args: argparse.Namespace) -> Iterator[dict[str, Any]]:
         target_kl=UNBOUND,
         min_sampling_std=args.std,
     )
-    backend = None if args.device == "cpu" else "warp"
-    practice = load_practice(args.policy, args.task, cfg, args.device, backend)
+    practice = load_practice(args.policy, args.task, cfg, args.device)
     agent, env = practice.agent, practice.env
     state = dppo.TrainState.create(agent, cfg, env.privileged_dim, args.seed)
     for first in (1, 2):  # the critic learns from the first round

@@ -10,10 +10,9 @@ from numpy.typing import NDArray
 from lerobot_vtrefine.cameras.config_flexitac_camera import FlexitacCameraConfig
 from lerobot_vtrefine.drivers.board import PadReader
 from lerobot_vtrefine.drivers.frames import PadFrame
+from lerobot_vtrefine.drivers.pad_set import CONNECT_TIMEOUT_S
 from lerobot_vtrefine.drivers.ports import stable_ports
 from lerobot_vtrefine.extras import PADS, require
-
-CONNECT_TIMEOUT_S = 8.0
 
 
 class FlexitacCamera(Camera):

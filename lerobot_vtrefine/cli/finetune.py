@@ -20,6 +20,7 @@ from lerobot.utils.utils import init_logging
 
 from lerobot_vtrefine.cli.errors import after_interrupt, run_cli
 from lerobot_vtrefine.cli.hub import check_upload
+from lerobot_vtrefine.cli.pipeline.stages import trained_policy
 from lerobot_vtrefine.cli.report.results import verdict
 from lerobot_vtrefine.cli.report.statistics import proportion
 from lerobot_vtrefine.cli.results.collect import evaluated_episodes
@@ -39,7 +40,7 @@ def finetune(cfg: FinetunePipelineConfig) -> None:
     write_provenance(cfg.output_dir)
     first = os.environ.get("RANK", "0") == "0"
     if first:
-        checkpoint = cfg.output_dir / "checkpoints" / "last" / "pretrained_model"
+        checkpoint = trained_policy(cfg.output_dir)
         print(outcome(cfg))
         print(f"policy: {checkpoint}")
         print(f"evaluate it by lerobot-eval, see it by vtrefine-play, with --policy.path={checkpoint}")

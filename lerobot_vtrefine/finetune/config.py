@@ -166,8 +166,9 @@ class DppoConfig(draccus.ChoiceRegistry):
         """Stochasticity of the tuned steps in deployment, as in the reference's evaluation.
 
         The steps of the DDPM chain keep their posterior's noise, without the exploration floor; DDIM's keep
-        none, since its few long steps would leave too much of it. Success without and with it, same episodes:
-        trained policies .49, .58 (512), .63, .67 (768), .63, .70 (384); a half-trained one .49, .45 (768).
+        none, since its few long steps would leave too much of it. Success without and with it on the same
+        episodes (their number in brackets): trained policies .49, .58 (512), .63, .67 (768), .63, .70 (384);
+        a half-trained one .49, .45 (768).
         """
         return 0.0 if self.sampler == "ddim" else self.eta
 
@@ -258,8 +259,8 @@ class SmallDppo(TrustRegionDppo):
     """The trust region in minutes on two CPU cores: few environments, so smaller steps.
 
     128 episodes an iteration tell less than 1024: steps of 4 nats that fall to 1. On six seeds of the demo
-    (docs/learning-tried.md) no iteration of the last half fell by more than 12 points; the schedule that it
-    replaced, which had no bound and returned to its best weights when it fell, fell by up to 41.
+    (docs/learning-tried.md) no iteration of the last half fell by more than 12 points. Without a bound, even
+    with a return to the best weights after a fall, it was up to 41.
     """
 
     iterations: int = 20

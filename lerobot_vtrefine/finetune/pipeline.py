@@ -50,6 +50,7 @@ SHOWN = (
     "explained_variance",
     "steps_per_s",
 )
+"""Metrics that the log tells after every iteration; progress.csv has all."""
 
 
 @dataclass
@@ -231,6 +232,22 @@ def make_practice(policy: VtDp3Policy, path: Path, env: EnvConfig, dppo: DppoCon
     return Practice(policy, agent, make_decision_env(env, dppo.num_envs, *processors, *windows), processors)
 
 
+def env_on(
+    device: str, task: Path, backend: str | None = None, timestep_s: float | None = None, **fields: Any
+) -> VtRefineEnvConfig:
+    """The environment of a file as in configs/env, on ``device`` (cpu, cuda).
+
+    ``backend`` of the simulation; default: warp, which alone runs on a GPU, or on a CPU the file's. Longest
+    physics step; default: the file's. ``fields`` of the environment that differ from the file.
+
+    Raises: ValueError for another environment type.
+    """
+    env = checked_env(draccus.decode(EnvConfig, read_yaml(task)["env"]))
+    backend = backend or (env.backend if device == "cpu" else "warp")
+    scene = replace(env.scene, timestep_s=timestep_s or env.scene.timestep_s)
+    return replace(env, backend=backend, warp=replace(env.warp, device=device), scene=scene, **fields)
+
+
 def load_practice(
     path: Path,
     task: Path,
@@ -242,15 +259,9 @@ def load_practice(
 ) -> Practice:
     """The same of a checkpoint's folder and a file as in configs/env; both on ``device`` (cpu, cuda).
 
-    ``backend`` and longest physics step of the simulation; default: the file's. ``fields`` of the environment
-    that differ from it.
-
-    Raises: ValueError for another environment type.
+    The rest is as of `env_on`.
     """
-    env = checked_env(draccus.decode(EnvConfig, read_yaml(task)["env"]))
-    scene = replace(env.scene, timestep_s=timestep_s or env.scene.timestep_s)
-    warp = replace(env.warp, device=device)
-    env = replace(env, backend=backend or env.backend, warp=warp, scene=scene, **fields)
+    env = env_on(device, task, backend, timestep_s, **fields)
     policy = VtDp3Policy.from_pretrained(path).to(device)
     policy.config.device = device
     return make_practice(policy, path, env, dppo)

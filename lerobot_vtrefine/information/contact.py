@@ -16,6 +16,7 @@ SIDES = 4
 SIDE_FROM_M = 1e-3
 """A contact whose centre is nearer to the socket's axis has no side: it is all around, or in the middle."""
 RESAMPLES = 400
+"""Of the episodes, behind every interval of a study."""
 
 
 class Known(NamedTuple):

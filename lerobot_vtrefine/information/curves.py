@@ -76,12 +76,11 @@ def clearance_charts(found: Study, clearance_m: float, senses: Sequence[str]) ->
     charts = [drawing(WIDTH, HEIGHT, parts, "error against clearance")]
     counts = {name: [f.success for f in row if f.success is not None] for name, row in lines.items()}
     if any(len(row) == len(gaps) for row in counts.values()):
-        charts.append(_success_chart(found, studies, gaps, counts))
+        charts.append(_success_chart(studies, gaps, counts))
     return charts
 
 
 def _success_chart(
-    found: Study,
     studies: dict[float, Study],
     gaps: np.ndarray,
     counts: dict[str, list[tuple[int, int]]],

@@ -24,7 +24,6 @@ LEARNING_RATE = 1e-3
 WEIGHT_DECAY = 1e-3
 JUDGED_FRAMES = 4096
 """Estimated at once when a regressor is judged."""
-RESAMPLES = 400
 POLICY, STRONG = NETWORKS = ("policy", "strong")
 """The policy's own encoder, and a larger network that says how much that one loses."""
 
@@ -248,7 +247,7 @@ def rms_with_interval(squares: Tensor, seed: int = 0) -> Tensor:
     """RMS error and the ends of its 95 % interval (3, K), by a bootstrap over episodes (E, K)."""
     generator = torch.Generator().manual_seed(seed)
     squares = squares.cpu()
-    rows = torch.randint(len(squares), (RESAMPLES, len(squares)), generator=generator)
+    rows = torch.randint(len(squares), (contact.RESAMPLES, len(squares)), generator=generator)
     drawn = torch.stack([squares[row].mean(0) for row in rows])
     ends = drawn.quantile(torch.tensor([0.025, 0.975]), dim=0)
     return torch.cat([squares.mean(0, keepdim=True), ends]).sqrt()

@@ -17,7 +17,7 @@ _TEXT_PX = 14
 _GAP_PX = 6
 _TEXT_WIDTH_PX = 160
 _SCALE_TAXELS = 12
-_BACKGROUND = (24, 26, 32)
+BACKGROUND = (24, 26, 32)
 _INK = (226, 228, 232)
 _GOOD, _BAD, _FAINT = (96, 214, 132), (240, 110, 96), (78, 82, 92)
 _RING_PX = 4
@@ -56,7 +56,7 @@ def pad_panel(
     Row 0 of a pad is drawn at the top and column 0, the fingertip, on the left. Returns uint8 (H, W, 3).
     """
     height, width = panel_size(names, layout)
-    image = Image.new("RGB", (width, height), _BACKGROUND)
+    image = Image.new("RGB", (width, height), BACKGROUND)
     draw = ImageDraw.Draw(image)
     _draw_progress(draw, width, progress)
     top = 2 * _TEXT_PX + _GAP_PX

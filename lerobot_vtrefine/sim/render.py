@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from PIL import Image
 
 from lerobot_vtrefine.sim.menagerie_meshes import DrawnWorld
-from lerobot_vtrefine.sim.pad_panel import Frame, Progress, pad_panel, panel_size
+from lerobot_vtrefine.sim.pad_panel import BACKGROUND, Frame, Progress, pad_panel, panel_size
 from lerobot_vtrefine.sim.task import FAILURES
 
 if TYPE_CHECKING:
@@ -24,7 +24,6 @@ if TYPE_CHECKING:
 log = logging.getLogger(__name__)
 
 GL_HELP = "install EGL (Debian: apt install libegl1 libgl1-mesa-dri) and start with MUJOCO_GL=egl"
-_BACKGROUND = (24, 26, 32)
 _SHADOW_PX, _SAMPLES = 1024, 2
 _GL_FAILURES: list[Exception] = []
 """Why this process has no OpenGL. It is not asked for again: GLFW without a display would abort then."""
@@ -157,7 +156,7 @@ def shaded_depth(depth_mm: NDArray[np.uint16], intrinsics: NDArray) -> Frame:
     depth = depth_mm.astype(float).reshape(depth_mm.shape[:2])
     hit = depth > 0
     if not hit.any():
-        return np.full((*depth.shape, 3), _BACKGROUND, np.uint8)
+        return np.full((*depth.shape, 3), BACKGROUND, np.uint8)
     fx, fy, cx, cy = np.asarray(intrinsics, float)
     rows, cols = np.indices(depth.shape)
     points = np.stack([(cols - cx) / fx * depth, (rows - cy) / fy * depth, depth], axis=-1)
@@ -168,7 +167,7 @@ def shaded_depth(depth_mm: NDArray[np.uint16], intrinsics: NDArray) -> Frame:
     fade = 1.0 - 0.4 * np.clip((depth - near) / max(far - near, 1.0), 0, 1)
     shade = (0.35 + 0.65 * np.abs(normal @ light)) * fade
     image = shade[..., None] * np.array([214, 210, 200])
-    return np.where(hit[..., None], image, _BACKGROUND).clip(0, 255).astype(np.uint8)
+    return np.where(hit[..., None], image, BACKGROUND).clip(0, 255).astype(np.uint8)
 
 
 def _fit(frame: Frame, size: tuple[int, int]) -> Frame:
@@ -178,6 +177,6 @@ def _fit(frame: Frame, size: tuple[int, int]) -> Frame:
         return frame
     scale = min(height / frame.shape[0], width / frame.shape[1])
     shape = (max(1, round(frame.shape[1] * scale)), max(1, round(frame.shape[0] * scale)))
-    canvas = Image.new("RGB", (width, height), _BACKGROUND)
+    canvas = Image.new("RGB", (width, height), BACKGROUND)
     canvas.paste(Image.fromarray(frame).resize(shape), ((width - shape[0]) // 2, (height - shape[1]) // 2))
     return np.asarray(canvas)

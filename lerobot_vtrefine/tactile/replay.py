@@ -22,7 +22,7 @@ REPLAY_REACH_M = 0.05
 
 
 def column_heights(
-    layout: PadLayout, body: BodyGeometry, position_m: np.ndarray, rotation: np.ndarray, device: str = "cpu"
+    layout: PadLayout, body: BodyGeometry, position_m: np.ndarray, rotation: np.ndarray
 ) -> np.ndarray:
     """How far a body lies below the undeformed face at every taxel, along -z: (T, R, C) [m].
 
@@ -34,7 +34,7 @@ def column_heights(
     from lerobot_vtrefine.tactile.contact_query import ContactQuery  # warp is slow to import
 
     frames = len(position_m)
-    query = ContactQuery(layout, [body], device, reach_m=REPLAY_REACH_M)
+    query = ContactQuery(layout, [body], "cpu", reach_m=REPLAY_REACH_M)
     still = torch.zeros((frames, 1, 6))
     heights, _ = query(
         "column",
@@ -45,7 +45,7 @@ def column_heights(
         torch.as_tensor(rotation, dtype=torch.float32)[:, None],
         still,
     )
-    return heights[:, 0].cpu().numpy().copy()
+    return heights[:, 0].numpy().copy()
 
 
 def finite_rate(times_s: torch.Tensor, depth_m: torch.Tensor) -> torch.Tensor:
@@ -107,7 +107,6 @@ def replay(
     temperature_c: ArrayLike | None = None,
     borne: tuple[ArrayLike, ArrayLike, ArrayLike] | None = None,
     skip: Collection[str] = ("noise", "quantisation"),
-    device: str = "cpu",
 ) -> torch.Tensor:
     """Readings that the model predicts for one trial, or for several with the same times: (T, ..., R, C)
     float32 counts.
@@ -131,19 +130,19 @@ def replay(
     """
     if (depth_m is None) == (force_n is None):
         raise ValueError("replay needs exactly one of depth_m and force_n")
-    times = torch.as_tensor(np.asarray(times_s), dtype=torch.float64, device=device)
-    x = torch.as_tensor(depth_m if force_n is None else force_n, device=device).to(torch.float32)
+    times = torch.as_tensor(np.asarray(times_s), dtype=torch.float64)
+    x = torch.as_tensor(depth_m if force_n is None else force_n).to(torch.float32)
     layout = _checked_layout(x, len(times), layout)
     frame = Frame(
         layout,
         stiffness_n_per_m=model.contact.stiffness(layout),
-        temperature_c=None if temperature_c is None else torch.as_tensor(temperature_c, device=device),
+        temperature_c=None if temperature_c is None else torch.as_tensor(temperature_c),
         load_conserving=force_n is not None,
         borne=None if borne is None else _spread_over_trials(borne, x),
     )
     damping = None
     if force_n is None:
-        given = None if rate_m_s is None else torch.as_tensor(rate_m_s, device=device).to(x.dtype)
+        given = None if rate_m_s is None else torch.as_tensor(rate_m_s).to(x.dtype)
         rate = finite_rate(times, x) if given is None else given
         for stage in model.depth_stages:
             x = stage.sequence(x, times, frame) if stage.name not in skip else x

@@ -8,8 +8,8 @@ from matplotlib.lines import Line2D
 from matplotlib.patches import Patch
 
 from figures.common import BLUE, GREY, IMAGES, ORANGE, ROOT
-from lerobot_vtrefine.cli.results.published import PAIRS, TUNED
-from lerobot_vtrefine.cli.results.rows import Run, read_all
+from lerobot_vtrefine.cli.results.published import PAIRS
+from lerobot_vtrefine.cli.results.rows import IMITATION, TUNED, Run, read_all
 
 CURVES = {
     "round pair": {"R.c8.k12": "12 to 3 nats per decision", "R.g4.k24": "24 to 3"},
@@ -36,8 +36,8 @@ LEARNED = {
 }
 """Tasks of the table ``converges`` whose stages are drawn."""
 STAGES = {
-    "imitation": ("imitation", f"{LIMITED}, imitation"),
-    "after DPPO": ("", LIMITED),
+    "imitation": (IMITATION, f"{LIMITED}, {IMITATION}"),
+    "after DPPO": (TUNED, LIMITED),
 }
 """Variants of rows: of a task with more than one, the last is by today's preset."""
 TASKS = {
@@ -98,7 +98,7 @@ def draw_paper(plt: Any) -> None:
     )
     for ax, task in zip(axes, pairs, strict=True):
         for row in (row for row in rows if row.task == task and (row.table, row.variant) in PAPER_RECIPES):
-            style, opacity = PAPER_RECIPES[row.table, row.variant or TUNED]
+            style, opacity = PAPER_RECIPES[row.table, row.variant]
             colour, points = POLICIES[row.policy], iterations(row)
             at = [int(point["iteration"]) for point in points]
             ax.plot(
@@ -146,8 +146,8 @@ def draw_results(plt: Any) -> None:
         for side, (policy, colour) in enumerate(POLICIES.items()):
             mine = [r for r in rows if (r.table, r.task, r.policy) == ("touch", task, policy)]
             x = place + (side - 0.5) * 0.36
-            draw_seeds(right, x, [100 * r.success for r in mine if not r.variant], colour)
-            before = np.mean([100 * r.success for r in mine if r.variant == "imitation"])
+            draw_seeds(right, x, [100 * r.success for r in mine if r.variant == TUNED], colour)
+            before = np.mean([100 * r.success for r in mine if r.variant == IMITATION])
             right.plot([x - 0.15, x + 0.15], [before] * 2, color="black", lw=1.5, zorder=3)
     right.set_xticks(range(len(TASKS)), list(TASKS.values()), fontsize=11)
     right.set_title("the paper's cloud, easier tasks, after DPPO", loc="left")

@@ -15,7 +15,7 @@ from lerobot_vtrefine.cli.pipeline.demo_config import (
     TRAIN_SEED_OFFSET,
     default_degradation,
 )
-from lerobot_vtrefine.cli.pipeline.stages import Stage
+from lerobot_vtrefine.cli.pipeline.stages import Stage, trained_policy
 from lerobot_vtrefine.shipped import PREFIX, encoders
 from paper.trained import Trained, first_seed, iterations_of
 
@@ -49,11 +49,6 @@ def task_flags(options: argparse.Namespace, pair: str) -> list[str]:
     """The pair's task, from the table."""
     meshes = [f"--env.mesh_dir={options.mesh_dir}"]
     return [f"--config_path={PREFIX}{TASKS[pair]}", *meshes, *flags("env", options.env)]
-
-
-def checkpoint(folder: Path) -> Path:
-    """What --policy.path takes."""
-    return folder / "checkpoints" / "last" / "pretrained_model"
 
 
 def dataset(options: argparse.Namespace, policy: Trained) -> Path:
@@ -133,7 +128,7 @@ def imitation_stage(options: argparse.Namespace, policy: Trained) -> Stage:
     encoder = [encoder_stage(options, policy.pair).name] if trains_encoder(options, policy.pair) else []
     needs = (dataset(options, policy).name, *encoder)
     return Stage(
-        out.name, f"Imitation {policy.name}", command, out, checkpoint(out) / "model.safetensors", needs
+        out.name, f"Imitation {policy.name}", command, out, trained_policy(out) / "model.safetensors", needs
     )
 
 
@@ -147,7 +142,7 @@ def clone_command(
         f"--dataset={dataset(options, policy)}",
         f"--policy={json.dumps(recipe | {'modalities': policy.senses})}",
         f"--device={options.device}",
-        f"--output_dir={checkpoint(out).parent}",
+        f"--output_dir={trained_policy(out).parent}",
         f"--steps={steps}",
         f"--batch_size={options.batch_size}",
         f"--seed={policy.seed}",
@@ -202,7 +197,7 @@ def bank_stage(options: argparse.Namespace, policy: Trained) -> Stage:
         f"--env.backend={options.backend}",
         *practice_flags(options, bank=True),
         f"--path={product}",
-        f"--policy.path={checkpoint(start)}",
+        f"--policy.path={trained_policy(start)}",
         f"--policy.device={options.device}",
         f"--num_starts={options.starts}",
         f"--num_envs={options.eval_envs}",
@@ -225,7 +220,7 @@ def finetune_stage(options: argparse.Namespace, policy: Trained) -> Stage:
         *(f"--env.start_bank={stage.product}" for stage in bank),
         *practice_flags(options, bank=bool(bank)),
         f"--env.backend={options.backend}",
-        f"--policy.path={checkpoint(start)}",
+        f"--policy.path={trained_policy(start)}",
         f"--policy.device={options.device}",
         *flags("dppo", dppo_settings(options)),
         f"--dppo.iterations={iterations_of(options, policy)}",
@@ -235,7 +230,7 @@ def finetune_stage(options: argparse.Namespace, policy: Trained) -> Stage:
         f"--output_dir={out}",
         "--resume=true",
     )
-    product = checkpoint(out) / "model.safetensors"
+    product = trained_policy(out) / "model.safetensors"
     needs = (start.name, *(stage.name for stage in bank))
     return Stage(out.name, f"DPPO {policy.name}", command, out, product, needs, resumable=True)
 
@@ -253,7 +248,7 @@ def evaluation_stage(options: argparse.Namespace, policy: Trained, stage: str) -
         "lerobot-eval",
         *task_flags(options, policy.pair),
         f"--env.backend={options.backend}",
-        f"--policy.path={checkpoint(trained)}",
+        f"--policy.path={trained_policy(trained)}",
         f"--policy.device={options.device}",
         "--env.video_episodes=0",
         f"--env.metrics_path={out / 'episodes.jsonl'}",

@@ -7,13 +7,8 @@ from typing import Any
 from compare_touch import MODALITIES
 
 from lerobot_vtrefine.cli.pipeline.demo_config import EVAL_SEED_OFFSET, SEED_STRIDE
-from lerobot_vtrefine.cli.results.published import (
-    DEMONSTRATIONS,
-    IMITATION,
-    SCRATCH,
-    TUNED,
-    with_demonstrations,
-)
+from lerobot_vtrefine.cli.results.published import DEMONSTRATIONS, with_demonstrations
+from lerobot_vtrefine.cli.results.rows import IMITATION, SCRATCH, TUNED
 
 
 @dataclass(frozen=True)

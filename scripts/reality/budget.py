@@ -1,11 +1,13 @@
-"""What every run may spend, and the flags of the worlds that it runs in."""
+"""What every run may spend, and the worlds that it runs in: their files and flags."""
 
+import json
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
 from lerobot_vtrefine.cli.pipeline.demo_config import DemoConfig, default_degradation, default_env
-from reality.hidden import of_robot
+from lerobot_vtrefine.sim.reality import SCHEMA
+from reality.hidden import PLAIN, REALITIES, of_robot
 
 
 @dataclass(frozen=True)
@@ -96,3 +98,14 @@ def world_env(budget: Budget, world: str) -> dict[str, Any]:
         if not of_robot(name):
             del env["sensor_model"]
     return env
+
+
+def write_worlds(budget: Budget) -> None:
+    """The plain simulator's sensor model, and the files of the hidden realities."""
+    (budget.output_dir / "plain").mkdir(parents=True, exist_ok=True)
+    PLAIN.save(budget.output_dir / "plain" / "sensor_model.json")
+    for name in budget.realities:
+        folder = budget.output_dir / folder_name(name)
+        folder.mkdir(parents=True, exist_ok=True)
+        content = {"schema": SCHEMA} | REALITIES[name]()
+        (folder / "reality.json").write_text(json.dumps(content, indent=2), encoding="utf-8")

@@ -1,12 +1,19 @@
 """Comparing simulators: equal budgets, nothing trained in the stand-in reality, honest differences."""
 
 import json
+import subprocess
 from dataclasses import replace
 
-import compare_reality as compare
+import compare_reality as script
 import numpy as np
 import pytest
 import yaml
+from reality.budget import Budget, folder_name, recipe, write_worlds
+from reality.hidden import PLAIN, REALITIES, of_robot
+from reality.lanes import evaluations, lanes, needed
+from reality.outcome import compare, compare_one, reality_rows, results_path
+from reality.stages import finetune_dir, finetune_stage, imitation_stages, motion_stage, output_name
+from reality.telling import as_text
 
 from lerobot_vtrefine.cli.results.collect import ORIGIN
 from lerobot_vtrefine.cli.results.tables import table
@@ -20,15 +27,15 @@ from lerobot_vtrefine.tactile.model import SensorModel
 
 @pytest.fixture
 def budget(tmp_path):
-    budget = compare.Budget(tmp_path, tuple(compare.REALITIES), (3, 4), "cpu", 4, 20, 1, 4, 4, 4, 8, 3, {})
-    compare.write_worlds(budget)
+    budget = Budget(tmp_path, tuple(REALITIES), (3, 4), "cpu", 4, 20, 1, 4, 4, 4, 8, 3, {})
+    write_worlds(budget)
     for name in budget.realities:  # as if diagnosed
         budget.diagnosis(name).mkdir(parents=True)
         model = budget.diagnosis(name) / "sensor_model.json"
-        if compare.of_robot(name):
+        if of_robot(name):
             RobotModel.default(ALOHA.joint_names).save(model)
         else:
-            compare.PLAIN.save(model)
+            PLAIN.save(model)
     return budget
 
 
@@ -37,7 +44,7 @@ def flags_of(stage):
 
 
 def test_what_is_learnt_differs_in_the_simulator_alone(budget):
-    _, policies = compare.lanes(budget)
+    _, policies = lanes(budget)
     for kind, count in (("record", 5), ("pretrain", 5), ("finetune", 10)):  # five simulators, two seeds
         stages = {
             s.name: s
@@ -64,9 +71,9 @@ def test_what_is_learnt_differs_in_the_simulator_alone(budget):
 def test_evaluations_use_the_same_episodes_and_valid_environments(budget):
     from lerobot_vtrefine.cli.pipeline.child_configs import parse_env
 
-    policies = compare.lanes(budget)[1]
+    policies = lanes(budget)[1]
     stages = [stage for lane in policies.values() for stage in lane if stage.name.startswith("eval")]
-    assert len(stages) == 2 * len(compare.evaluations(budget)) == 26
+    assert len(stages) == 2 * len(evaluations(budget)) == 26
     seeds = {(flags_of(stage)["seed"], stage.name[-1]) for stage in stages}
     assert len(seeds) == 2
     for stage in stages:
@@ -74,14 +81,14 @@ def test_evaluations_use_the_same_episodes_and_valid_environments(budget):
         assert ("reality.json" in env.get("reality", "")) == ("_in_real_" in stage.name)
         config = parse_env({k: v for k, v in env.items() if k != "type"})
         assert (config.hidden.sensor_model is None) == ("sensor_model" in env)
-        names = {item.name for item in (config.hidden.sensor_model or compare.PLAIN).stages}
+        names = {item.name for item in (config.hidden.sensor_model or PLAIN).stages}
         assert ("row_sharing" in names) == ("in_real_row_sharing" in stage.name)
         assert bool(config.hidden.robot.backlash_rad) == ("in_real_control_latency" in stage.name)
 
 
 def test_every_lane_can_run_on_its_own(budget):
-    before, policies = compare.lanes(budget)
-    assert [len(lanes) for lanes in (before, policies)] == [5, 10]
+    before, policies = lanes(budget)
+    assert [len(before), len(policies)] == [5, 10]
     assert len(before | policies) == 15
     for stages in (before | policies).values():
         names = [stage.name for stage in stages]
@@ -91,12 +98,12 @@ def test_every_lane_can_run_on_its_own(budget):
             assert "/" not in stage.name
 
 
-def leave_results(compare, budget, rates, seeds):
+def leave_results(budget, rates, seeds):
     """Evaluations as LeRobot leaves them: success of these shares of four episodes, by (trained, world)."""
-    for pair in compare.evaluations(budget):
+    for pair in evaluations(budget):
         for seed in seeds:
             done = [k < rates.get(pair, 1) for k in range(4)]
-            path = compare.results_path(budget, *pair, seed)
+            path = results_path(budget, *pair, seed)
             path.parent.mkdir(parents=True)
             path.write_text(json.dumps({"per_task": [{"metrics": {"successes": done}}]}))
     for name in budget.realities:
@@ -107,27 +114,27 @@ def leave_results(compare, budget, rates, seeds):
 def test_results_say_what_reality_costs_and_what_diagnosis_brings_back(budget):
     name = "control_latency+backlash"
     rates = {("plain", "plain"): 3, (f"diagnosed:{name}", f"real:{name}"): 2}
-    leave_results(compare, budget, rates, budget.seeds)
-    results = compare.compare(budget)
+    leave_results(budget, rates, budget.seeds)
+    results = compare(budget)
     row = results[name]
     assert row["plain in its own simulator"]["rate"] == 0.75
     assert row["reality_minus_simulator"] == {"mean": -0.5, "ci95": [-0.5, -0.5]}
     assert row["diagnosed_minus_plain"] == {"mean": 0.25, "ci95": [0.25, 0.25]}
-    text = compare.as_text(results)
+    text = as_text(results)
     assert "(explained: backlash) pays, 25 % [25, 25] over 2 seeds of 4 episodes" in text
     assert text.count("makes no difference that these seeds can show") == 3
-    alone = compare.as_text({name: compare.compare_one(budget, name, [3])})
+    alone = as_text({name: compare_one(budget, name, [3])})
     assert "changes by -50 % (one seed) in the stand-in reality" in alone
 
 
 def test_comparison_becomes_rows_of_the_results(budget):
     name = "control_latency+backlash"
-    leave_results(compare, budget, {("plain", "plain"): 3}, budget.seeds)
-    folder = compare.finetune_dir(budget, "plain", 4)
+    leave_results(budget, {("plain", "plain"): 3}, budget.seeds)
+    folder = finetune_dir(budget, "plain", 4)
     folder.mkdir()
     ProgressLog(folder, 0, None).add(3, {"success": 0.5, "env_steps": 400.0})
     origin = {"commit": "0123abc", "command": None, "machine": "2 cores"}
-    rows = [row for row, _ in compare.reality_rows(budget.output_dir, origin)]
+    rows = [row for row, _ in reality_rows(budget.output_dir, origin)]
     assert len({row.key for row in rows}) == len(rows) == 4 * 4 * 2
     (row,) = (r for r in rows if r.task == name and r.seed == 4 and r.variant == "plain in its own simulator")
     assert (row.success, row.episodes, row.iterations, row.env_steps) == (0.75, 4, 3, 400)
@@ -142,44 +149,82 @@ def test_comparison_becomes_rows_of_the_results(budget):
 def test_a_task_of_its_own_brings_its_encoder_and_its_name(budget, tmp_path, monkeypatch):
     flags = ["--task=cross_gentle", "--recipe=pads", '--dppo={"encoder": "trained"}', "--jobs=2"]
     monkeypatch.setattr("sys.argv", ["compare_reality.py", f"--output_dir={tmp_path}", *flags])
-    _, own = compare.parse()
-    encoder, record, pretrain = compare.imitation_stages(own, "plain")
+    _, own = script.parse()
+    encoder, record, pretrain = imitation_stages(own, "plain")
     for stage in (encoder, record, pretrain):
         assert flags_of(stage).get("env.pair", "cross") == "cross"
     assert flags_of(record)["env.randomization.part_friction"] == "[0.2, 0.45]"
     assert flags_of(encoder)["env.sensor_model"].endswith("plain/sensor_model.json")
     assert flags_of(pretrain)["policy.pretrained_encoder"] == str(encoder.output)
     assert set(pretrain.needs) == {record.name, encoder.name}
-    assert flags_of(compare.finetune_stage(own, "plain", 0))["dppo.encoder"] == "trained"
+    assert flags_of(finetune_stage(own, "plain", 0))["dppo.encoder"] == "trained"
     other = f"diagnosed:{own.realities[0]}"
-    encoder, record, pretrain = compare.imitation_stages(own, other)
-    assert encoder.needs == record.needs == (compare.output_name(own.realities[0]),)
+    encoder, record, pretrain = imitation_stages(own, other)
+    assert encoder.needs == record.needs == (output_name(own.realities[0]),)
     model = str(own.diagnosis(own.realities[0]) / "sensor_model.json")
     assert flags_of(encoder)["env.sensor_model"] == flags_of(record)["env.sensor_model"] == model
     assert flags_of(pretrain)["policy.pretrained_encoder"] == str(encoder.output)
-    leave_results(compare, budget, {}, budget.seeds)
-    rows = [row for row, _ in compare.reality_rows(budget.output_dir, dict.fromkeys(ORIGIN), "cross_gentle")]
+    leave_results(budget, {}, budget.seeds)
+    rows = [row for row, _ in reality_rows(budget.output_dir, dict.fromkeys(ORIGIN), "cross_gentle")]
     assert "| cross, 2 mm, 5 N at most (cross_gentle): row sharing, hysteresis | backlash |" in table(
         "reality", rows
     )
 
 
 def test_unfinished_seeds_are_left_out(budget):
-    leave_results(compare, budget, {}, budget.seeds)
+    leave_results(budget, {}, budget.seeds)
     first, *others = budget.realities
-    compare.results_path(budget, f"diagnosed:{first}", f"real:{first}", 4).unlink()
-    results = compare.compare(budget)
+    results_path(budget, f"diagnosed:{first}", f"real:{first}", 4).unlink()
+    results = compare(budget)
     assert results[first]["seeds"] == [3]
     assert all(results[name]["seeds"] == [3, 4] for name in others)
     for seed in budget.seeds:
-        compare.results_path(budget, "plain", "plain", seed).unlink()
-    assert compare.compare(budget) == {}
+        results_path(budget, "plain", "plain", seed).unlink()
+    assert compare(budget) == {}
+
+
+def test_every_lane_is_this_script_again_and_one_that_fails_leaves_the_others_compared(
+    budget, monkeypatch, capsys
+):
+    """And what a lane's process runs is the lane's stages, of the same flags."""
+    started = {}
+
+    def run_all(commands, jobs, needs):
+        started.update(commands)
+        assert jobs == 2
+        assert {name.name: [world.name for world in worlds] for name, worlds in needs.items()} == needed(
+            *lanes(budget)
+        )
+        leave_results(budget, {}, [3])
+        raise subprocess.CalledProcessError(3, ["lane"])
+
+    flags = [f"--output_dir={budget.output_dir}", "--seeds", "3", "4", "--jobs=2"]
+    monkeypatch.setattr("sys.argv", ["compare_reality.py", *flags])
+    monkeypatch.setattr(script, "run_all", run_all)
+    with pytest.raises(subprocess.CalledProcessError):
+        script.main()
+    before, policies = lanes(budget)
+    assert {folder.name for folder in started} == set(before | policies)
+    for folder, (_, path, *again) in started.items():
+        assert path == script.__file__
+        assert again == [*flags, f"--lane={folder.name}"]
+    assert "over 1 seeds" in capsys.readouterr().out
+    kept = json.loads((budget.output_dir / "comparison.json").read_text())
+    assert all(kept[name]["seeds"] == [3] for name in budget.realities)
+    assert (budget.output_dir / "comparison.md").is_file()
+
+    ran = []
+    monkeypatch.setattr(script.StageRunner, "run", lambda runner: ran.extend(runner.stages))
+    name = "policy_plain_4"
+    monkeypatch.setattr("sys.argv", ["compare_reality.py", *flags, f"--lane={name}"])
+    script.main()
+    assert [stage.name for stage in ran] == [stage.name for stage in policies[name]]
 
 
 def test_every_policy_waits_for_its_own_simulator_only(budget):
-    before, policies = compare.lanes(budget)
-    assert set(before) == {"plain", *(compare.folder_name(f"diagnosed:{name}") for name in budget.realities)}
-    for name, worlds in compare.needed(before, policies).items():
+    before, policies = lanes(budget)
+    assert set(before) == {"plain", *(folder_name(f"diagnosed:{name}") for name in budget.realities)}
+    for name, worlds in needed(before, policies).items():
         assert name.rpartition("_")[0] == f"policy_{worlds[0]}"
         assert len(worlds) == 1
 
@@ -189,21 +234,21 @@ def test_presses_follow_the_contract_and_the_hidden_pad(budget):
     from lerobot_vtrefine.diagnose.quality import check_quality
     from lerobot_vtrefine.diagnose.recordings import read_recording_set
 
-    reality = budget.output_dir / compare.folder_name(budget.realities[0]) / "reality.json"
+    reality = budget.output_dir / folder_name(budget.realities[0]) / "reality.json"
     press.record(reality, budget.output_dir / "presses", trials=4, seed=1)
     recordings = read_recording_set(budget.output_dir / "presses")
     assert [len(trial.time_s) for trial in recordings.trials] == [120] * 4
     assert len({trial.condition for trial in recordings.trials}) == 2
     assert check_quality(recordings)[1] == []
 
-    pad = SensorModel.from_dict(compare.REALITIES[budget.realities[0]]()["sensor_model"])
+    pad = SensorModel.from_dict(REALITIES[budget.realities[0]]()["sensor_model"])
     hidden = press.this_pad(pad, np.random.default_rng(1))
     for trial in recordings.trials:
         pressed = trial.raw - press.idle_map(hidden).ravel()
         assert pressed.max() > 20
         error, plain_error = (
             np.sqrt(np.mean((predict_trial(model, trial, press.LAYOUT) - trial.raw) ** 2))
-            for model in (hidden, compare.PLAIN.with_stage(hidden.find("idle")))
+            for model in (hidden, PLAIN.with_stage(hidden.find("idle")))
         )
         assert error < 0.5 * plain_error
 
@@ -217,7 +262,7 @@ def test_a_reality_without_sensor_model_cannot_be_pressed(tmp_path):
 def test_a_hidden_robot_is_moved_by_the_stock_recorder(budget):
     """In its own world, which the simulated robot accepts: without the back end of many worlds."""
     own = replace(budget, env={**budget.env, "backend": "warp", "episode_steps": 41})
-    flags = flags_of(compare.motion_stage(own, "control_latency+backlash"))
+    flags = flags_of(motion_stage(own, "control_latency+backlash"))
     robot = VtRefineSimConfig(env=yaml.safe_load(flags["robot.env"]), seed=int(flags["robot.seed"]))
     env = robot.simulation()
     assert env.hidden.robot is not None
@@ -229,14 +274,14 @@ def test_a_hidden_robot_is_moved_by_the_stock_recorder(budget):
 
 def test_a_run_is_planned_before_anything_is_diagnosed(tmp_path):
     """And its demonstrations are recorded in the simulator that the diagnosis will leave."""
-    budget = compare.Budget(tmp_path, tuple(compare.REALITIES), (3,), "cpu", 4, 20, 1, 4, 4, 4, 8, 3, {})
-    compare.write_worlds(budget)
-    before, policies = compare.lanes(budget)
+    budget = Budget(tmp_path, tuple(REALITIES), (3,), "cpu", 4, 20, 1, 4, 4, 4, 8, 3, {})
+    write_worlds(budget)
+    before, policies = lanes(budget)
     assert len(policies) == 1 + len(budget.realities)
     for name in budget.realities:
         world = f"diagnosed:{name}"
-        lane = {stage.name: flags_of(stage) for stage in before[compare.folder_name(world)]}
-        given = "env.reality" if compare.of_robot(name) else "env.sensor_model"
-        record = lane[compare.folder_name("record", world)]
+        lane = {stage.name: flags_of(stage) for stage in before[folder_name(world)]}
+        given = "env.reality" if of_robot(name) else "env.sensor_model"
+        record = lane[folder_name("record", world)]
         assert record[given] == str(budget.diagnosis(name) / "sensor_model.json")
-        assert record["root"] == str(compare.recipe(budget, 3, world).dataset_dir)
+        assert record["root"] == str(recipe(budget, 3, world).dataset_dir)

@@ -18,8 +18,18 @@ from lerobot_vtrefine.cli.report.statistics import mean_interval, wilson_interva
 from lerobot_vtrefine.cli.results import provenance
 from lerobot_vtrefine.cli.results.cells import difference, over_seeds, pooled
 from lerobot_vtrefine.cli.results.collect import largest_fall, run_rows, save, steps_to
-from lerobot_vtrefine.cli.results.published import IMITATION, PAIRS, TUNED, with_demonstrations
-from lerobot_vtrefine.cli.results.rows import Line, Row, Run, merge, read_all, read_rows, write_rows
+from lerobot_vtrefine.cli.results.published import PAIRS, with_demonstrations
+from lerobot_vtrefine.cli.results.rows import (
+    IMITATION,
+    TUNED,
+    Line,
+    Row,
+    Run,
+    merge,
+    read_all,
+    read_rows,
+    write_rows,
+)
 from lerobot_vtrefine.cli.results.tables import BLOCK, DERIVED, fill, table
 from lerobot_vtrefine.finetune.logger import ProgressLog
 from lerobot_vtrefine.finetune.pipeline import CONFIG_NAME

@@ -292,6 +292,18 @@ def test_a_task_of_another_environment_is_refused_before_the_policy_is_loaded(tm
         pipeline.load_practice(tmp_path / "no policy", task, PaperDppo(), "cpu", ablate="touch")
 
 
+def test_a_task_practised_on_a_gpu_is_simulated_there(tmp_path):
+    task = tmp_path / "task.yaml"
+    task.write_text("env: {type: vtrefine, pair: square, backend: batch, scene: {timestep_s: 0.002}}")
+    there, here = (pipeline.env_on(device, task) for device in ("cuda", "cpu"))
+    assert (there.backend, there.warp.device) == ("warp", "cuda")
+    assert here.backend == "batch"
+    assert there.pair == here.pair == "square"
+    own = pipeline.env_on("cuda", task, "batch", 0.005, start="grasped")
+    assert (own.backend, own.scene.timestep_s, own.start) == ("batch", 0.005, "grasped")
+    assert there.scene.timestep_s == 0.002
+
+
 def test_training_state_comes_back_exactly_and_is_no_pickle(tmp_path):
     state = {
         0: {"step": torch.tensor(3.0), "betas": (0.9, 0.999)},

@@ -5,6 +5,7 @@ from pathlib import Path
 from typing import Any
 
 from lerobot_vtrefine.choices import check_choice
+from lerobot_vtrefine.cli.pipeline.stages import trained_policy
 from lerobot_vtrefine.embodiments import DEFAULT_BODY
 from lerobot_vtrefine.finetune.seeds import TRAINING_SEEDS
 
@@ -12,8 +13,7 @@ REPO_ID = "local/vtrefine_demo"
 POLICIES = ("pretrain", "finetune")
 ABLATIONS = ("touch", "vision")
 
-# Environment seeds of demonstrations, fine-tuning and evaluation never overlap. One run was evaluated on
-# seed 0's before DPPO's learning rate was lowered.
+# Environment seeds of demonstrations, fine-tuning and evaluation never overlap; also of scripts that compare.
 SEED_STRIDE = 10_000_000
 TRAIN_SEED_OFFSET = 1_000_000
 EVAL_SEED_OFFSET = 8_000_000
@@ -188,7 +188,7 @@ class DemoConfig:
 
     def checkpoint(self, policy: str) -> Path:
         """Folder of the ``pretrain`` or ``finetune`` policy, as ``--policy.path`` takes it."""
-        return self.output_dir / policy / "checkpoints" / "last" / "pretrained_model"
+        return trained_policy(self.output_dir / policy)
 
     def evaluation_dir(self, policy: str, ablation: str = "none") -> Path:
         """Folder of an evaluation's eval_info.json, episodes.jsonl and videos."""

@@ -65,6 +65,11 @@ class StageRecord:
     commit: str | None = None
 
 
+def trained_policy(folder: Path) -> Path:
+    """What --policy.path takes of the folder that lerobot-train or vtrefine-finetune has filled."""
+    return folder / "checkpoints" / "last" / "pretrained_model"
+
+
 def stage_keys(stages: list[Stage]) -> dict[str, str]:
     """Fingerprint of each stage: its command and the fingerprints of the stages it needs."""
     keys: dict[str, str] = {}

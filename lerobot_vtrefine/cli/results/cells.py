@@ -93,14 +93,18 @@ def interval(low: float, high: float) -> str:
     return f"[{percent(low)}, {percent(high)}]"
 
 
+def share(successes: int, episodes: int, unit: str = "") -> str:
+    """A share of episodes in per cent with Wilson's interval, for example ``68 [62, 75]``."""
+    return f"{percent(successes / episodes)}{unit} {interval(*wilson_interval(successes, episodes))}"
+
+
 def pooled(rows: Sequence[Run], seeds: bool = True, bounds: bool = True, unit: str = "") -> str:
     """Success over all episodes with Wilson's interval, and each seed's; a dash without rows."""
     if not rows:
         return "-"
     whole = [row for row in rows if row.seed is None] or rows
     successes, episodes = sum(row.successes for row in whole), sum(row.episodes for row in whole)
-    text = percent(successes / episodes) + unit
-    text += " " + interval(*wilson_interval(successes, episodes)) if bounds else ""
+    text = share(successes, episodes, unit) if bounds else percent(successes / episodes) + unit
     single = [percent(row.success) for row in rows if row.seed is not None]
     return f"{text} ({', '.join(single)})" if seeds and len(single) > 1 else text
 

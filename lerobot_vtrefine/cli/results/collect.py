@@ -11,9 +11,9 @@ from dataclasses import replace as replace_fields
 from pathlib import Path
 from typing import Any
 
+from lerobot_vtrefine.cli.pipeline.stages import trained_policy
 from lerobot_vtrefine.cli.results.provenance import FILE_NAME
-from lerobot_vtrefine.cli.results.published import IMITATION
-from lerobot_vtrefine.cli.results.rows import Line, Row, Run, merge, read_rows, write_rows
+from lerobot_vtrefine.cli.results.rows import IMITATION, TUNED, Line, Row, Run, merge, read_rows, write_rows
 from lerobot_vtrefine.cli.results.tables import HANDLING, MEASURED, REACHED
 from lerobot_vtrefine.finetune.logger import read_progress
 from lerobot_vtrefine.finetune.pipeline import CONFIG_NAME
@@ -24,14 +24,14 @@ ORIGIN = ("commit", "command", "machine")
 Progress = list[dict[str, float]]
 
 
-def read_json(path: Path) -> Any:
+def read_json_or_none(path: Path) -> Any:
     """A JSON file's content; None without the file."""
     return json.loads(path.read_text(encoding="utf-8")) if path.is_file() else None
 
 
 def origin_of(folder: Path, **given: str | None) -> dict[str, str | None]:
     """``commit``, ``command`` and ``machine`` as the run recorded them, else as given."""
-    recorded = read_json(folder / FILE_NAME) or {}
+    recorded = read_json_or_none(folder / FILE_NAME) or {}
     return {name: recorded.get(name) or given.get(name) for name in ORIGIN}
 
 
@@ -45,9 +45,9 @@ def run_rows(
     Raises:
         ValueError: the folder holds no run, or one that is not finished.
     """
-    if (results := read_json(folder / "results.json")) is not None:
+    if (results := read_json_or_none(folder / "results.json")) is not None:
         return pipeline_rows(folder, results, common, origin)
-    if (settings := read_json(folder / CONFIG_NAME)) is not None:
+    if (settings := read_json_or_none(folder / CONFIG_NAME)) is not None:
         final, progress = finetune_row(folder, settings, common, origin)
         return [*((row, []) for row in earlier_rows(final, progress)), (final, progress)]
     raise ValueError(
@@ -65,7 +65,7 @@ def pipeline_rows(
     commits = {stage["name"]: stage.get("commit") for stage in results["stages"]}
     recorded = results.get("provenance", {})
     origin = {name: recorded.get(name) or origin[name] for name in ORIGIN}
-    for stage, variant in (("pretrain", IMITATION), ("finetune", "")):
+    for stage, variant in (("pretrain", IMITATION), ("finetune", TUNED)):
         tuned = stage == "finetune"
         progress = read_progress(folder / "finetune") if tuned else []
         evaluations = {variant: results[stage]} | {
@@ -100,7 +100,7 @@ def finetune_row(
     done = int(progress[-1]["iteration"]) if progress else 0
     if done < planned:
         raise ValueError(f"{folder} has {done} of {planned} iterations; finish it with --resume=true")
-    if (info := read_json(folder / "eval" / "eval_info.json")) is not None:
+    if (info := read_json_or_none(folder / "eval" / "eval_info.json")) is not None:
         outcomes = info["per_task"][0]["metrics"]["successes"]
         success, episodes = sum(map(bool, outcomes)) / len(outcomes), len(outcomes)
     elif "eval_success" in progress[-1]:
@@ -108,7 +108,7 @@ def finetune_row(
         episodes = evaluated_episodes(settings["eval"]["n_episodes"], settings["dppo"]["num_envs"])
     else:
         raise ValueError(f"{folder} was not evaluated; run lerobot-eval with --output_dir={folder / 'eval'}")
-    saved = read_json(folder / "checkpoints" / "last" / "pretrained_model" / "config.json")
+    saved = read_json_or_none(trained_policy(folder) / "config.json")
     if saved is None and "policy" not in common:
         raise ValueError(
             f"{folder} holds no checkpoint that tells the policy; add --policy=visuo_tactile or visual"

@@ -15,13 +15,11 @@ from lerobot_vtrefine.cli.results.cells import (
 )
 from lerobot_vtrefine.cli.results.published import (
     BY_DEMONSTRATIONS,
-    IMITATION,
     KINDS,
     PAIRS,
-    TUNED,
     with_demonstrations,
 )
-from lerobot_vtrefine.cli.results.rows import Run
+from lerobot_vtrefine.cli.results.rows import IMITATION, TUNED, Run
 
 BESIDE = ("vision only", "the paper's", "touch", "the paper's", "touch minus vision", "the paper's")
 """Columns of the tables that stand beside the paper's."""

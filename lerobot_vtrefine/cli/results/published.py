@@ -5,8 +5,8 @@ Of its two tables in simulation, on the table-top robot: one policy a number, ho
 
 from typing import Final
 
-IMITATION, SCRATCH, TUNED = "imitation", "without pre-training", ""
-"""Variants of a row: not fine-tuned, fine-tuned from random weights, fine-tuned from imitation."""
+from lerobot_vtrefine.cli.results.rows import IMITATION, SCRATCH, TUNED
+
 KINDS: Final = {
     IMITATION: IMITATION,
     SCRATCH: "DPPO without pre-training",

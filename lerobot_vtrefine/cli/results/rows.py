@@ -14,6 +14,8 @@ from lerobot_vtrefine.choices import check_choice
 from lerobot_vtrefine.whole_files import whole_file
 
 COMMIT = re.compile(r"[0-9a-f]{7,40}\+?")
+IMITATION, SCRATCH, TUNED = "imitation", "without pre-training", ""
+"""Variants of a run: not fine-tuned, fine-tuned from random weights, fine-tuned from imitation."""
 
 
 @dataclass(frozen=True)
@@ -60,7 +62,6 @@ class Run(Row):
         "converges",
         "demo",
         "touch",
-        "twin",
         "paper",
         "demonstrations",
         "policies",
@@ -73,8 +74,8 @@ class Run(Row):
     task: str
     policy: str
     """``visuo_tactile``, ``visual``, ..."""
-    variant: str = ""
-    """What else tells it from other rows of its task, policy and seed; empty: fine-tuned by DPPO."""
+    variant: str = TUNED
+    """What else tells it from other rows of its task, policy and seed."""
     seed: int | None
     """None: several seeds pooled, whose own figures were not recorded."""
     success: float

@@ -1,7 +1,6 @@
 """Markdown tables from rows, and the documents' blocks that hold them.
 
-A block is what lies between ``<!-- table: NAME -->`` and ``<!-- end -->``. Brackets hold 95 % intervals,
-Wilson's over pooled episodes or Student's t over seeds; parentheses hold each seed.
+A block is what lies between ``<!-- table: NAME -->`` and ``<!-- end -->``.
 """
 
 import re
@@ -25,8 +24,7 @@ from lerobot_vtrefine.cli.results.cells import (
     values,
 )
 from lerobot_vtrefine.cli.results.paper_tables import demonstrations_table, paper_table
-from lerobot_vtrefine.cli.results.published import IMITATION, TUNED
-from lerobot_vtrefine.cli.results.rows import Line, Row, Run
+from lerobot_vtrefine.cli.results.rows import IMITATION, TUNED, Line, Row, Run
 
 BLOCK = re.compile(r"(<!-- table: (\w+) -->\n).*?(<!-- end -->)", re.DOTALL)
 LEADING_POINT = re.compile(r"(?<![\d.])\.(?=\d)")
@@ -51,13 +49,13 @@ REACHED = (0.5, 0.75, 0.9)
 def demo_table(rows: Sequence[Run]) -> str:
     """Imitation beside fine-tuning, with what is missed when a sense is taken away."""
     head = [
-        plural("seed", values(pick(rows, variant=""), "seed")),
+        plural("seed", values(pick(rows, variant=TUNED), "seed")),
         IMITATION,
         "after DPPO",
     ]
     body = []
     for name, words in (("", ""), (" without touch", "touch"), (" without vision", "vision")):
-        both = [pick(rows, variant=(stage + name).strip()) for stage in (IMITATION, "")]
+        both = [pick(rows, variant=(stage + name).strip()) for stage in (IMITATION, TUNED)]
         if not any(both):
             continue
         count = "/".join(dict.fromkeys(str(row.episodes) for row in both[1] or both[0]))
@@ -68,7 +66,7 @@ def demo_table(rows: Sequence[Run]) -> str:
         body.append(["success" + (taken if words else plain), *(over_seeds(runs, " %") for runs in both)])
     for key, words, scale, unit in MEASURED:
         cells = []
-        for stage in (IMITATION, ""):
+        for stage in (IMITATION, TUNED):
             found = [float(row.extra[key]) for row in pick(rows, variant=stage) if key in row.extra]
             cells.append(f"{scale * median(found):.1f} {unit}" if found else "-")
         body.append([words, *cells])
@@ -81,7 +79,7 @@ def touch_table(rows: Sequence[Run]) -> str:
     for task in values(rows, "task"):
         touch, sight = (pick(rows, task=task, policy=name) for name in ("visuo_tactile", "visual"))
         before = [pooled(pick(kind, variant=IMITATION), False, False) for kind in (touch, sight)]
-        after = [pick(kind, variant="") for kind in (touch, sight)]
+        after = [pick(kind, variant=TUNED) for kind in (touch, sight)]
         cells = [pooled(runs, bounds=False) for runs in after]
         body.append([label(task), " / ".join(before), *cells, difference(after[1], after[0])])
     head = [
@@ -256,7 +254,7 @@ def lines_table(rows: Sequence[Line]) -> str:
 RENDERERS: dict[str, Callable[[Sequence], str]] = (
     dict.fromkeys(Run.TABLES, runs_table)
     | dict.fromkeys(Line.TABLES, lines_table)
-    | {"demo": demo_table, "touch": touch_table, "twin": touch_table, "reality": reality_table}
+    | {"demo": demo_table, "touch": touch_table, "reality": reality_table}
     | {"expert": expert_table, "policies": policies_table}
     | {"paper": paper_table, "demonstrations": demonstrations_table, "handling": handling_table}
     | {"senses": senses_table}

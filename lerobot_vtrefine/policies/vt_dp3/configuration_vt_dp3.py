@@ -71,7 +71,9 @@ class VtDp3Config(PreTrainedConfig):
     """
 
     n_obs_steps: int = 2
+    """Frames that it sees: the present one and those before it."""
     horizon: int = 16
+    """Actions in a chunk."""
     n_action_steps: int = 8
     """Executed actions per decision; a chunk starts at the current observation."""
     fps: int | None = None
@@ -81,6 +83,7 @@ class VtDp3Config(PreTrainedConfig):
     point_dims: tuple[int, ...] = ()
     """Widths of the point encoder's shared layers."""
     point_features: int = 64
+    """Features of the whole cloud."""
     pad_width: int = 64
     """Features of one pad (``fusion=pads``)."""
     pad_features: int = 64
@@ -104,9 +107,12 @@ class VtDp3Config(PreTrainedConfig):
     down_dims: tuple[int, ...] = ()
     """U-Net: channels per stage. MLP: one entry per residual block, all the same width."""
     kernel_size: int = 5
+    """U-Net: actions under a kernel of its convolutions."""
     time_dim: int = 0
+    """Features of the denoising step."""
 
     num_train_timesteps: int = 100
+    """Denoising steps that are trained; samplers visit all or some of them."""
     noise_draws: int = 0
     """Noise samples per encoded observation in one training step; more than 1 spares the encoder."""
     sampler: str = "ddim"
@@ -114,7 +120,9 @@ class VtDp3Config(PreTrainedConfig):
     ``num_inference_steps``.
     """
     num_inference_steps: int = 10
+    """Steps of ``ddim``, or of the tail proper."""
     prefix_steps: int = 0
+    """Coarse steps before the tail."""
     clip_sample_range: float = 1.0
     """Predicted clean actions are clamped to this, in normalised units."""
 
@@ -131,7 +139,9 @@ class VtDp3Config(PreTrainedConfig):
     use_ema: bool = True
     """Keep an exponential moving average of the weights and use it for inference."""
     ema_power: float = 0.75
+    """After n updates the average's decay is 1 - (1 + n) ** -``ema_power``."""
     ema_max_decay: float = 0.9999
+    """At most."""
 
     normalization_mapping: dict[str, NormalizationMode] = field(
         default_factory=lambda: {
@@ -142,10 +152,12 @@ class VtDp3Config(PreTrainedConfig):
         }
     )
     optimizer_lr: float = 0.0
+    """Of AdamW, after the warm-up; it falls to zero by the last step."""
     optimizer_betas: tuple[float, float] = (0.95, 0.999)
     optimizer_weight_decay: float = 1e-6
     optimizer_grad_clip_norm: float = 10.0
     scheduler_warmup_steps: int = 0
+    """Gradient steps over which the learning rate rises."""
 
     @told_by_lerobot
     def __post_init__(self) -> None:

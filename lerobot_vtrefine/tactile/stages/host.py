@@ -266,12 +266,12 @@ class SampleAndHold(Stage):
         ages = [self.lag_s + age for age in self.ages_s] or even
         return torch.stack([sampled(x, times_s, times_s - age) for age in ages]).mean(dim=0)
 
-    def held(self, x: torch.Tensor, times_s: torch.Tensor, phase: float = 0.0) -> torch.Tensor:
-        """x (T, ...) as a board of regular periods repeats it, `phase` of one gone by at time zero."""
+    def held(self, x: torch.Tensor, times_s: torch.Tensor) -> torch.Tensor:
+        """x (T, ...) as a board of regular periods repeats it; one begins at time zero."""
         if self.frame_s:
             taken_s = taken_at_frames(times_s.cpu().numpy(), self.period_s, self.frame_s)
             return sampled(x, times_s, torch.from_numpy(taken_s).to(times_s))
-        return x[self.shown(times_s, phase)]
+        return x[self.shown(times_s)]
 
     def shown(self, times_s: torch.Tensor, phase: float = 0.0) -> torch.Tensor:
         """Number of the time whose reading is there at each of times (T,): the first one of its period."""
