@@ -440,19 +440,22 @@ def test_where_few_pairs_of_trials_have_a_say_the_size_of_their_products_counts(
     assert passes(2.0, 12)
 
 
-def test_where_few_of_many_trials_have_a_say_the_size_of_their_scores_counts() -> None:
-    # Whatever the others say, seven large scores agree in one flip of 64: too often among twenty guesses.
+def guesses() -> list[Probe]:
+    """Twenty that are nothing."""
     rng = np.random.default_rng(3)
-    guesses = [
+    return [
         Probe(str(k), None, np.zeros(0), rng.standard_normal(TRIALS), np.ones(TRIALS), False)
         for k in range(20)
     ]
 
+
+def test_where_few_of_many_trials_have_a_say_the_size_of_their_scores_counts() -> None:
+    # Whatever the others say, seven large scores agree in one flip of 64: too often among twenty guesses.
     def passes(size, telling, agreeing=TRIALS, beside=(), sized=True):
         scores = np.where(np.arange(TRIALS) < telling, size, 0.01 * (-1.0) ** np.arange(TRIALS))
         scores[agreeing:telling] *= -1.0
         bend = Probe("bend", None, np.zeros(0), scores, np.abs(scores), False)
-        return screen([bend, *guesses, *beside], TRIALS, 0, sized=sized)["bend"].passed
+        return screen([bend, *guesses(), *beside], TRIALS, 0, sized=sized)["bend"].passed
 
     assert passes(50.0, 7)
     assert not passes(50.0, 7, sized=False)
@@ -464,6 +467,21 @@ def test_where_few_of_many_trials_have_a_say_the_size_of_their_scores_counts() -
         50.0, 7, beside=[Probe("tilt", None, np.zeros(0), np.ones(TRIALS), np.ones(TRIALS), False)]
     )
     assert passes(2.0, 12)
+
+
+def test_once_something_passes_by_size_what_else_few_trials_carry_may_be_it() -> None:
+    # A skew of the scan beside late readings: signs of the trials that show both cannot tell them apart.
+    def bend(name, agreeing):
+        scores = np.where(np.arange(TRIALS) < 7, 50.0, 0.01 * (-1.0) ** np.arange(TRIALS))
+        scores[agreeing:7] *= -1.0
+        return Probe(name, None, np.zeros(0), scores, np.abs(scores), False)
+
+    def passed(*probes):
+        return {name for name, item in screen([*probes, *guesses()], TRIALS, 0).items() if item.passed}
+
+    assert passed(bend("skew", 6)) == set()
+    assert passed(bend("late", 7), bend("skew", 6)) == {"late", "skew"}
+    assert passed(bend("late", 7), bend("skew", 6), bend("none", 4)) == {"late", "skew"}
 
 
 @dataclass(frozen=True)

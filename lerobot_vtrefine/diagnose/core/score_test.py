@@ -137,7 +137,7 @@ def screen(probes: Sequence[Probe], count: int, seed: int, *, sized: bool = True
         sized: whether scores are in deviations of noise; else their size tells nothing.
     """
     best: dict[str, Tested] = {}
-    by_size: dict[str, Tested] = {}
+    carried: list[Tested] = []
     kinds: dict[str, list[Probe]] = {}
     for probe in probes:
         kinds.setdefault(_kind(probe), []).append(probe)
@@ -152,13 +152,27 @@ def screen(probes: Sequence[Probe], count: int, seed: int, *, sized: bool = True
             least = min(together, names * size_p(probe)) if sized else together
             if too_few_agree(probe, p_value):
                 together = least
-            elif few_carry(probe, p_value):
-                _keep(by_size, Tested(probe, p_value, min(1.0, least * whole / SCREEN_SHARES[kind])))
+            elif probe.carriers < FEW_FOR_SIGNS:
+                carried.append(Tested(probe, p_value, min(1.0, least * whole / SCREEN_SHARES[kind])))
             _keep(best, Tested(probe, p_value, min(1.0, together * whole / SCREEN_SHARES[kind])))
+    by_size = _by_size(carried)
     best = {name: replace(item, by_size=by_size.get(name)) for name, item in best.items()}
     if not any(item.passed for item in best.values()):
         for item in by_size.values():
             _keep(best, item)
+    return best
+
+
+def _by_size(carried: Sequence[Tested]) -> dict[str, Tested]:
+    """Best of every name that passes by size what few trials carry.
+
+    Once one passes that its own trials' signs allow, something is there, and every other may be what it is:
+    signs of a few trials cannot tell them apart, predictions can.
+    """
+    alone = [item for item in carried if few_carry(item.probe, item.p_value)]
+    best: dict[str, Tested] = {}
+    for item in carried if any(item.passed for item in alone) else alone:
+        _keep(best, item)
     return best
 
 
