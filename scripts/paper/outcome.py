@@ -1,6 +1,7 @@
 """Rows of the paper's tables from what was judged."""
 
 import argparse
+import json
 import sys
 from typing import Any
 
@@ -15,6 +16,8 @@ from paper.trained import Trained, first_seed, iterations_of, key, tables, varia
 NO_ROOM = "failed_overflow"
 LOST = 0.01
 """Share of episodes without room above which what is left is no result."""
+MORE_ROOM = {"contacts_per_world": 512, "convex_per_world": 64, "rows_per_world": 1024}
+"""More than any pair's file has."""
 
 
 def rows(options: argparse.Namespace, policy: Trained, table: str) -> list[tuple[Row, Progress]]:
@@ -60,7 +63,7 @@ def tell_of_room(name: str, share: float) -> None:
         print(
             f"warning: {name}: {share:.0%} of the episodes ended because the simulation had no room for more"
             " contacts; start anew with more, "
-            """--env='{"warp": {"contacts_per_world": 512, "rows_per_world": 1024}}'""",
+            f"--env='{json.dumps({'warp': MORE_ROOM})}'",
             file=sys.stderr,
         )
 
