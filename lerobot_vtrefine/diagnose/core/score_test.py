@@ -137,7 +137,7 @@ def screen(probes: Sequence[Probe], count: int, seed: int, *, sized: bool = True
         sized: whether scores are in deviations of noise; else their size tells nothing.
     """
     best: dict[str, Tested] = {}
-    carried: list[Tested] = []
+    carried: list[tuple[Tested, bool]] = []
     kinds: dict[str, list[Probe]] = {}
     for probe in probes:
         kinds.setdefault(_kind(probe), []).append(probe)
@@ -153,7 +153,8 @@ def screen(probes: Sequence[Probe], count: int, seed: int, *, sized: bool = True
             if too_few_agree(probe, p_value):
                 together = least
             elif probe.carriers < FEW_FOR_SIGNS:
-                carried.append(Tested(probe, p_value, min(1.0, least * whole / SCREEN_SHARES[kind])))
+                weighty = Tested(probe, p_value, min(1.0, least * whole / SCREEN_SHARES[kind]))
+                carried.append((weighty, few_carry(probe, p_value)))
             _keep(best, Tested(probe, p_value, min(1.0, together * whole / SCREEN_SHARES[kind])))
     by_size = _by_size(carried)
     best = {name: replace(item, by_size=by_size.get(name)) for name, item in best.items()}
@@ -163,16 +164,17 @@ def screen(probes: Sequence[Probe], count: int, seed: int, *, sized: bool = True
     return best
 
 
-def _by_size(carried: Sequence[Tested]) -> dict[str, Tested]:
-    """Best of every name that passes by size what few trials carry.
+def _by_size(carried: Sequence[tuple[Tested, bool]]) -> dict[str, Tested]:
+    """The best of every name by the size of what few trials carry; beside each whether its signs pass alone.
 
-    Once one passes that its own trials' signs allow, something is there, and every other may be what it is:
-    signs of a few trials cannot tell them apart, predictions can.
+    Once one of these passes, something is there, and every other may be what it is: signs of a few trials
+    cannot tell them apart, predictions can.
     """
-    alone = [item for item in carried if few_carry(item.probe, item.p_value)]
+    sure = any(item.passed for item, alone in carried if alone)
     best: dict[str, Tested] = {}
-    for item in carried if any(item.passed for item in alone) else alone:
-        _keep(best, item)
+    for item, alone in carried:
+        if alone or sure:
+            _keep(best, item)
     return best
 
 
