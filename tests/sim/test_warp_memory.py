@@ -1,10 +1,12 @@
 """Memory of recorded work, without a GPU: Warp calls these allocators on GPUs only."""
 
+from contextlib import nullcontext
 from types import SimpleNamespace
 
 import pytest
 
 wp = pytest.importorskip("warp")
+from lerobot_vtrefine.sim.backends import warp_memory  # noqa: E402
 from lerobot_vtrefine.sim.backends.warp_memory import ALIGNMENT, Arena, Tally, arena_of, padded  # noqa: E402
 
 
@@ -38,3 +40,28 @@ def test_recordings_share_the_arena_of_the_largest(device):
     assert large is not small
     assert arena_of(4000, device, large) is large
     assert arena_of(padded(5000) + ALIGNMENT, device, large) is not large
+
+
+def test_work_is_done_once_and_recorded_in_the_arena_that_is_there(device, monkeypatch):
+    """Warp takes allocators and captures on GPUs only: here the allocators are asked by hand."""
+    asked, waits, given = [], [], []
+
+    def allocator(_, one):
+        asked.append(one)
+        return nullcontext()
+
+    pool = SimpleNamespace(allocate=lambda size: 0, deallocate=lambda *_: None)
+    gpu = SimpleNamespace(get_allocator=lambda: pool)
+    monkeypatch.setattr(warp_memory, "Arena", lambda size, _: Arena(size, device))
+    monkeypatch.setattr(wp, "ScopedAllocator", allocator)
+    monkeypatch.setattr(wp, "ScopedCapture", lambda *_, **__: nullcontext(SimpleNamespace(graph="graph")))
+    monkeypatch.setattr(wp, "synchronize_device", waits.append)
+    large = warp_memory.record(lambda: given.append(asked[-1].allocate(5000)), 3, gpu)
+    assert [type(one) for one in asked] == [Tally, Arena]
+    assert waits == [gpu] * 3
+    assert len(given) == 6
+    assert len(set(given[3:])) == 1
+    small = warp_memory.record(lambda: given.append(asked[-1].allocate(1000)), 1, gpu, large.arena)
+    assert small.arena is large.arena
+    assert given[-1] == given[-3]
+    assert large.arena.size == padded(5000)
