@@ -251,6 +251,12 @@ MACHINE_SPECIFIC = re.compile(
 )
 
 
+def test_files_of_tests_have_names_of_their_own() -> None:
+    """Where folders are no packages, pytest takes a second module of a name for the first."""
+    names = [path.name for path in (ROOT / "tests").rglob("test_*.py")]
+    assert sorted({name for name in names if names.count(name) > 1}) == []
+
+
 @pytest.mark.parametrize("text", ["/" + "home/me/x", "see /" + "work/x", "https://py" + "pi.org/simple"])
 def test_machine_specific_pattern_finds(text: str) -> None:
     assert MACHINE_SPECIFIC.search(text)
