@@ -8,10 +8,13 @@ class CameraConfig:
     """One depth camera; a ray grid, no lens."""
 
     width: int
+    """Pixels of the depth image."""
     height: int
+    """Pixels of the depth image."""
     fov_y_rad: float
     """Vertical field of view."""
     position_m: tuple[float, float, float]
+    """Where its rays begin, in the world's frame."""
     target_m: tuple[float, float, float]
     """Point that lies on the optical axis."""
 

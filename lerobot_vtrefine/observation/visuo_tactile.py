@@ -42,6 +42,7 @@ class VisuoTactileConfig:
     crop_min_m: tuple[float, float, float] = (-0.20, -0.25, 0.005)
     """Lower corner of the workspace box in the world frame; z above 0 leaves the table out."""
     crop_max_m: tuple[float, float, float] = (0.20, 0.25, 0.40)
+    """Its upper corner."""
     num_visual_points: int = 0
     """Points kept of the depth image."""
     pixel_stride: int = 0

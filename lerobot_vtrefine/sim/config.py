@@ -59,8 +59,9 @@ class SceneConfig:
     gravity_compensation: bool = True
     """The arms' servos carry the arms' own weight, as integral action does on the real ones."""
     pad_friction: float = 1.0
+    """Coefficient of sliding friction of pads against parts."""
     part_friction: float = 0.3
-    """Plug against socket and both against the table."""
+    """The same of plug against socket and of both against the table."""
     part_density: float = 1000.0
     """[kg/m^3]; parts never weigh less than 40 g, below which contacts turn soft."""
     pad_time_constant_s: float = 0.01
@@ -115,9 +116,11 @@ class TableStart:
     """Where the parts stand when an episode starts on the table."""
 
     socket_centre_m: tuple[float, float] = (0.0, -0.06)
+    """Middle of the square in which the socket's axis lies, in the world's x and y."""
     plug_centre_m: tuple[float, float] = (0.0, 0.065)
+    """The same of the plug's."""
     square_m: float = 0.03
-    """Side of the square in which each part's axis lies."""
+    """Side of both squares."""
     yaw_rad: float = 0.15
     """Half range of each part's yaw."""
 
@@ -131,9 +134,11 @@ class GraspedStart:
     plug_height_m: float = 0.017
     """Nominal height of the plug's tip above the mouth."""
     hand_xy_m: float = 0.004
-    """Each hand's displacement from its nominal place."""
+    """Each hand's displacement from its nominal place, in x and in y."""
     hand_z_m: float = 0.002
+    """The same in height."""
     hand_yaw_rad: float = 0.03
+    """Each hand's rotation about the vertical."""
     slip_m: float = 0.002
     """In-hand offset of each part along both axes of the pads."""
     slip_z_m: float | None = None
@@ -148,6 +153,7 @@ class GraspedStart:
     squeeze_m: float = 0.010
     """Grippers' commands close by this much more than the part's width, per finger: about 20 N per pad."""
     settle_s: float = 0.25
+    """Simulated before the episode begins, so that grasps come to rest."""
 
     @property
     def slip_xz_m(self) -> tuple[float, float]:
@@ -162,10 +168,13 @@ class SuccessConfig:
     depth_slack_m: float = 0.002
     """How far the plug may be short of fully seated."""
     lateral_m: float = 0.004
+    """Largest distance of the plug's origin from the socket's axis."""
     tilt_rad: float = 0.2007
+    """Largest angle between both axes."""
     mouth_height_m: float = 0.07
     """The mouth must be at least this high above the table: inserted in air."""
     hold_s: float = 1.0
+    """It must stay so for that long."""
 
     def hold_steps(self, control_dt_s: float) -> int:
         """Consecutive observations that must find the plug seated: n steps apart lie n + 1 observations."""
@@ -182,6 +191,7 @@ class LimitsConfig:
     """Largest force between plug and socket, averaged over `force_window_s`: the clean expert stays below
     2 N, demonstrations that land on the rim below 8 N, and pushing on reaches 30 N."""
     force_window_s: float = 0.01
+    """A single physics step that is hit harder is no failure."""
     drop_s: float = 0.3
     """A lifted part that its hand has not held for this long counts as dropped."""
 
@@ -191,6 +201,7 @@ class TaskConfig:
     """Control, start, success, limits and length of an episode."""
 
     control_hz: float = 10.0
+    """Control steps a second."""
     episode_steps: int | None = None
     """Control steps until the time-out; by default 24 s from the table, 4.8 s in hand."""
     joint_rate: float = 1.0
@@ -227,6 +238,7 @@ class ShearConfig:
     """
 
     on: bool = False
+    """Simulate it."""
     stiffness_n_per_m: float = 400.0
     """Tangential stiffness of the skin under one taxel."""
 
@@ -277,11 +289,15 @@ class RandomizationConfig:
     clearance_m: tuple[float, float] | None = None
     """Diametral clearance of procedural pairs."""
     pad_friction: tuple[float, float] | None = None
+    """See `SceneConfig.pad_friction`."""
     part_friction: tuple[float, float] | None = None
+    """See `SceneConfig.part_friction`."""
     part_mass_scale: tuple[float, float] | None = None
+    """Factor on both parts' masses and inertias."""
     pad_stiffness_scale: tuple[float, float] | None = None
     """Factor on the pads' stiffness, in the contact and in the sensor model alike."""
     sensor_gain_scale: tuple[float, float] | None = None
+    """Factor on what the pads read of a force."""
     contact_force_n: tuple[float, float] | None = None
     """The limit on force (`LimitsConfig.contact_force_n`). It is no secret: policy, critic and expert are
     told."""

@@ -151,11 +151,15 @@ class VtDp3Config(PreTrainedConfig):
             "VISUAL": NormalizationMode.IDENTITY,
         }
     )
+    """How LeRobot scales each kind of feature; clouds and grids of taxels stay as they are."""
     optimizer_lr: float = 0.0
     """Of AdamW, after the warm-up; it falls to zero by the last step."""
     optimizer_betas: tuple[float, float] = (0.95, 0.999)
+    """Of AdamW: decay of the averages of gradients and of their squares."""
     optimizer_weight_decay: float = 1e-6
+    """Of AdamW."""
     optimizer_grad_clip_norm: float = 10.0
+    """Largest norm of a gradient."""
     scheduler_warmup_steps: int = 0
     """Gradient steps over which the learning rate rises."""
 
