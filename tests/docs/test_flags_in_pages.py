@@ -9,6 +9,7 @@ import tomllib
 from pathlib import Path
 
 import pytest
+from command_uses import uses
 
 from lerobot_vtrefine.cli.flags import flags_of
 
@@ -22,26 +23,14 @@ SHARED = (
 )
 """Configurations whose fields commands take, and do not list."""
 ALWAYS = {"--help", "--env.type"}
-
-
-def uses(text: str) -> list[tuple[str, list[str]]]:
-    """Commands in blocks and in code within a line, with the flags that they are given."""
-    pieces = re.findall(r"```bash\n(.*?)```|`([^`\n]+)`", text, re.DOTALL)
-    lines = [line for piece in pieces for line in "".join(piece).replace("\\\n", " ").splitlines()]
-    found = []
-    for line in lines:
-        name = re.search(r"(?:^|\s)(vtrefine(?:-[a-z-]+)?)(?=\s|$)(.*)", line)
-        if name is not None:
-            words = re.split(r"&&| #", name[2])[0]
-            found.append((name[1], re.findall(r"(?<=\s)--[\w.]+", words)))
-    return found
+COMMAND = r"(vtrefine(?:-[a-z-]+)?)"
 
 
 def test_uses_are_found() -> None:
     text = (
         "`vtrefine-a --b=1`\n```bash\nvtrefine-c --d.e=1 \\\n    --f && make g  # --h\n```\n`lerobot-x --y`"
     )
-    assert uses(text) == [("vtrefine-a", ["--b"]), ("vtrefine-c", ["--d.e", "--f"])]
+    assert uses(text, COMMAND) == [("vtrefine-a", ["--b"]), ("vtrefine-c", ["--d.e", "--f"])]
 
 
 def help_of(target: str, monkeypatch: pytest.MonkeyPatch) -> str:
@@ -61,7 +50,7 @@ def test_flags_that_pages_give_to_commands_exist(monkeypatch: pytest.MonkeyPatch
     shared = {f"--{flag.name}" for config in SHARED for flag in flags_of(*config, nested=True)} | ALWAYS
     wrong, checked = [], 0
     for page in PAGES:
-        for name, flags in uses(page.read_text(encoding="utf-8")):
+        for name, flags in uses(page.read_text(encoding="utf-8"), COMMAND):
             wrong += [f"{page.name}: {name} {flag}" for flag in flags if flag not in listed[name] | shared]
             checked += len(flags)
     assert wrong == []

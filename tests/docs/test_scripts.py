@@ -8,12 +8,14 @@ import sys
 from pathlib import Path
 
 import pytest
+from command_uses import uses
 
 ROOT = Path(__file__).parents[2]
 SCRIPTS = ROOT / "scripts"
 PAGES = [ROOT / "README.md", ROOT / "CONTRIBUTING.md", *sorted((ROOT / "docs").glob("*.md"))]
 RUN_BY_OTHERS = {"docs_hooks"}
 """mkdocs imports it."""
+SCRIPT = r"(?:\./)?scripts/(\w+)\.py"
 
 # All in one process: importing what they need takes most of the time.
 ASK = """
@@ -58,22 +60,9 @@ def test_every_script_tells_how_it_is_used(helps: dict[str, str]) -> None:
         assert [flag for flag in bare if "  " not in flag] == [], f"{name} does not say what these are"
 
 
-def uses(text: str) -> list[tuple[str, list[str]]]:
-    """Scripts that a text calls, in blocks and in code within a line, with the flags that it gives them."""
-    pieces = re.findall(r"```bash\n(.*?)```|`([^`\n]+)`", text, re.DOTALL)
-    lines = [line for piece in pieces for line in "".join(piece).replace("\\\n", " ").splitlines()]
-    found = []
-    for line in lines:
-        name = re.search(r"(?:^|\s)(?:\./)?scripts/(\w+)\.py(?=\s|$)(.*)", line)
-        if name is not None:
-            words = re.split(r"&&| #", name[2])[0]
-            found.append((name[1], re.findall(r"(?<=\s)--\w+", words)))
-    return found
-
-
 def test_uses_are_found() -> None:
     text = "`scripts/a.py one --b=1`\n```bash\npython scripts/c.py --d \\\n    --e=2 && make f  # --g\n```"
-    assert uses(text) == [("a", ["--b"]), ("c", ["--d", "--e"])]
+    assert uses(text, SCRIPT) == [("a", ["--b"]), ("c", ["--d", "--e"])]
 
 
 def test_flags_that_pages_and_scripts_give_to_scripts_exist(helps: dict[str, str]) -> None:
@@ -81,7 +70,7 @@ def test_flags_that_pages_and_scripts_give_to_scripts_exist(helps: dict[str, str
     shown |= {name: f"```bash\n{text.partition('options:')[0]}```" for name, text in helps.items()}
     wrong, checked = [], 0
     for place, text in shown.items():
-        for name, flags in uses(text):
+        for name, flags in uses(text, SCRIPT):
             passes_on = "parse_known_args" in (SCRIPTS / f"{name}.py").read_text(encoding="utf-8")
             known = set(re.findall(r"--\w+", helps[name]))
             wrong += [f"{place}: {name}.py {flag}" for flag in flags if not passes_on and flag not in known]
