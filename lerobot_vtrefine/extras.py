@@ -16,7 +16,6 @@ EXTRA_OF = {
     "dynamixel_sdk": "hardware",
     "deepdiff": "hardware",
     "trimesh": "assets",
-    "coacd": "assets",
     "manifold3d": "assets",
 }
 """Extra by the name under which a module is imported; LeRobot's motor buses compare settings by deepdiff."""

@@ -17,7 +17,7 @@ import pytest
 from lerobot_vtrefine.extras import EXTRA_OF
 
 ROOT = Path(__file__).parents[1]
-SIMULATORS = ("mujoco", "warp", "mujoco_warp", "trimesh", "coacd", "manifold3d")
+SIMULATORS = ("mujoco", "warp", "mujoco_warp", "trimesh", "manifold3d")
 DEVICES = ("serial", "dynamixel_sdk", "deepdiff", "evdev", "pynput", "rerun", "foxglove")
 INSTALL = "pip install 'lerobot_policy_vtrefine[{}]'"
 

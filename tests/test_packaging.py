@@ -20,7 +20,7 @@ from lerobot_vtrefine.cli.umbrella import module_of
 
 ROOT = Path(__file__).parents[1]
 PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"]
-HEAVY = ("mujoco", "warp", "mujoco_warp", "matplotlib", "trimesh", "coacd", "datasets")
+HEAVY = ("mujoco", "warp", "mujoco_warp", "matplotlib", "trimesh", "manifold3d", "datasets")
 
 DISCOVER = """
 import json, sys

@@ -6,11 +6,15 @@ import numpy as np
 
 from lerobot_vtrefine.sim.hulls import small_hull
 from lerobot_vtrefine.sim.meshes import MeshPair, MeshPart, load_mesh_pair
+from lerobot_vtrefine.sim.mesh_skin import sampled
 from lerobot_vtrefine.sim.parts import Grip, Part, PartPair
 from lerobot_vtrefine.tactile.geometry import ConvexHull, TriangleMesh
 
 MIN_GRIP_M = 0.020  # a free stretch shorter than this is not worth gripping
 MAX_GRIP_M = 0.040
+PAD_M = 0.026  # along the axis
+WIDEST_M = 1e-3  # what stands back by no more is pressed, too
+SAMPLES = 20_000
 
 
 def load_mesh_parts(name: str, mesh_dir: Path | None, scale: str | float = "flexitac") -> PartPair:
@@ -37,6 +41,7 @@ def make_parts(pair: MeshPair) -> PartPair:
 
 
 def _part(part: MeshPart, middle_z_m: float, span_m: tuple[float, float]) -> Part:
+    middle_z_m = _widest_z(part, middle_z_m)
     half_z = min(middle_z_m - span_m[0], span_m[1] - middle_z_m)
     gripped = part.vertices[np.abs(part.vertices[:, 2] - middle_z_m) <= half_z + 1e-6]
     low, high = gripped[:, :2].min(0), gripped[:, :2].max(0)
@@ -50,6 +55,15 @@ def _part(part: MeshPart, middle_z_m: float, span_m: tuple[float, float]) -> Par
         foot=_foot(part) if len(pieces) > 1 else None,
         surface=TriangleMesh(part.vertices, part.faces),
     )
+
+
+def _widest_z(part: MeshPart, middle_z_m: float) -> float:
+    """Middle of what pads around `middle_z_m` press, where the part is widest: a cap, and not its stem."""
+    points, _ = sampled((part.vertices, part.faces), SAMPLES)
+    reached = points[np.abs(points[:, 2] - middle_z_m) <= PAD_M / 2]
+    width = np.abs(reached[:, 0])
+    pressed = reached[width >= width.max() - WIDEST_M, 2]
+    return float(pressed.min() + pressed.max()) / 2
 
 
 def _foot(part: MeshPart) -> ConvexHull:

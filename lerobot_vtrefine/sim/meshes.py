@@ -1,12 +1,11 @@
-"""Plug-socket pairs from a user's folder of meshes (`automate/ID`): load, check, decompose, cache.
+"""Plug-socket pairs from a user's folder of meshes (`automate/ID`): load, check, cut, cache.
 
 A folder holds `{ID}_plug.obj` and `{ID}_socket.obj`, drawn in one frame: with both bodies at the identity
-the pair is assembled. Each concave mesh becomes convex pieces (CoACD) once; the pieces lie in the user's
-cache directory. Every part leaves this module in metres, with the plug leaving the socket along +z of the
-common frame.
+the pair is assembled. Each mesh becomes convex pieces once; the pieces lie in the user's cache directory.
+Every part leaves this module in metres, with the plug leaving the socket along +z of the common frame.
 
-Needs the optional packages trimesh and coacd (`pip install 'lerobot_policy_vtrefine[assets]'`), imported
-lazily.
+Needs the optional packages trimesh and manifold3d (`pip install 'lerobot_policy_vtrefine[assets]'`),
+imported lazily.
 """
 
 import hashlib
@@ -17,7 +16,7 @@ import tempfile
 import zipfile
 import zlib
 from collections.abc import Callable
-from dataclasses import asdict, dataclass, replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -27,6 +26,8 @@ from tqdm import tqdm
 
 from lerobot_vtrefine.sim.hulls import small_hull
 from lerobot_vtrefine.sim.mesh_fit import MeshFit, measure_fit
+from lerobot_vtrefine.sim.mesh_pieces import Cut, fitting_pieces
+from lerobot_vtrefine.sim.mesh_skin import Surface
 
 Array = NDArray[np.float64]
 Triangles = NDArray[np.int64]
@@ -57,16 +58,7 @@ FLEXITAC_SCALES: dict[str, MeshScale] = {
 }
 
 
-@dataclass(frozen=True)
-class Decomposition:
-    """Parameters of CoACD; part of the cache key."""
-
-    threshold: float = 0.05  # 0.1 closes the hole of 00446
-    resolution: int = 2000
-    seed: int = 0
-
-
-DECOMPOSITION = Decomposition()
+CUT = Cut()
 
 
 @dataclass(frozen=True)
@@ -116,7 +108,7 @@ def load_mesh_pair(
     scale: str | float = "flexitac",
     progress: bool = True,
 ) -> MeshPair:
-    """Load `automate/ID` from `mesh_dir`, decomposed (or from the cache) and measured.
+    """Load `automate/ID` from `mesh_dir`, cut (or from the cache) and measured.
 
     `scale` is "flexitac" (the table above), "unit", or one factor for both parts. Raises FileNotFoundError
     for a missing folder or ID, ValueError for a mesh that is not solid or of an implausible size, ImportError
@@ -131,18 +123,11 @@ def load_mesh_pair(
     factors = part_scales(mesh_id, scale)
     if factors.swap:
         paths = {"plug": paths["socket"], "socket": paths["plug"]}
-    missing = [role for role in ROLES if not _cache_file(_pieces_key(paths[role])).exists()]
-    for role in tqdm(missing, desc=f"{name}: convex pieces", disable=not (progress and missing), leave=False):
-        _load_part(paths[role])
-    parts = {role: _load_part(paths[role]) for role in ROLES}
-    parts = {
-        role: _scaled(part, np.asarray(getattr(factors, role)), paths[role]) for role, part in parts.items()
-    }
-    key = _digest(*(array for part in parts.values() for hull in part.pieces for array in (hull.vertices,)))
-    plug, socket = parts["plug"], parts["socket"]
-    fit = MeshFit.from_arrays(
-        _cached(f"fit-{key}", lambda: measure_fit(_pieces(plug), _pieces(socket)).arrays())
-    )
+    surfaces = {role: _surface(paths[role], np.asarray(getattr(factors, role))) for role in ROLES}
+    plug, socket = (_part(name, role, surfaces, progress) for role in ROLES)
+    corners = [[hull.vertices for hull in part.pieces] for part in (plug, socket)]
+    key = f"fit-{_digest(*corners[0], *corners[1])}"
+    fit = MeshFit.from_arrays(_cached(key, lambda: measure_fit(*corners).arrays()))
     if fit.exit_sign < 0:  # turn both parts over, so that the plug always leaves upwards
         plug, socket = _turned_over(plug), _turned_over(socket)
     return MeshPair(f"{PREFIX}{mesh_id}", plug, socket, replace(fit, exit_sign=1.0))
@@ -167,7 +152,7 @@ def part_scales(mesh_id: str, scale: str | float) -> MeshScale:
 
 
 def cache_dir() -> Path:
-    """Return the user's cache directory of decomposed meshes (`$XDG_CACHE_HOME/lerobot_vtrefine`)."""
+    """Return the user's cache directory of pieces (`$XDG_CACHE_HOME/lerobot_vtrefine`)."""
     return Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "lerobot_vtrefine"
 
 
@@ -207,52 +192,37 @@ def _part_paths(mesh_id: str, folder: Path) -> dict[str, Path]:
     return {role: folder / f"{mesh_id}_{role}.obj" for role in ROLES}
 
 
-def _load_part(path: Path) -> MeshPart:
-    """Load, check and cut one file; metres, unscaled."""
+def _surface(path: Path, factors: Array) -> Surface:
+    """Load, check and scale one file; metres."""
     trimesh = _optional("trimesh")
     try:
         mesh = trimesh.load(path, force="mesh")
     except (ValueError, IndexError, TypeError, KeyError) as error:
         raise ValueError(f"{path}: not a readable OBJ mesh ({error})") from None
     check_solid(mesh, path)
-    unit = raw_unit_m(mesh.extents, path)
-    vertices, faces = np.asarray(mesh.vertices, float) * unit, np.asarray(mesh.faces, np.int64)
-    arrays = _cached(_pieces_key(path), lambda: _decompose(vertices, faces))
-    hulls = (Hull(*small_hull(arrays[f"vertices_{i}"])) for i in range(len(arrays) // 2))
-    return MeshPart(vertices, faces, tuple(hulls))
-
-
-def _pieces_key(path: Path) -> str:
-    """Cache key of a file's convex pieces: its content and how it is cut."""
-    texts = path.read_bytes(), repr(DECOMPOSITION).encode()
-    return f"coacd-{_digest(*(np.frombuffer(text, np.uint8) for text in texts))}"
-
-
-def _decompose(vertices: Array, faces: Triangles) -> dict[str, NDArray[Any]]:
-    coacd = _optional("coacd")
-    coacd.set_log_level("error")
-    pieces = coacd.run_coacd(
-        coacd.Mesh(vertices, faces),
-        **asdict(DECOMPOSITION),
-    )
-    arrays: dict[str, NDArray[Any]] = {}
-    for index, (points, triangles) in enumerate(pieces):
-        arrays[f"vertices_{index}"] = np.asarray(points, float)
-        arrays[f"faces_{index}"] = np.asarray(triangles, np.int64)
-    return arrays
-
-
-def _scaled(part: MeshPart, factors: Array, path: Path) -> MeshPart:
-    pieces = tuple(Hull(hull.vertices * factors, hull.faces) for hull in part.pieces)
-    scaled = MeshPart(part.vertices * factors, part.faces, pieces)
-    largest = float(np.ptp(scaled.bounds_m, axis=0).max())
+    vertices = np.asarray(mesh.vertices, float) * raw_unit_m(mesh.extents, path) * factors
+    largest = float(np.ptp(vertices, axis=0).max())
     low, high = EXTENT_RANGE_M
     if not low <= largest <= high:
         raise ValueError(
             f"{path}: {1e3 * largest:.1f} mm long after scaling, outside {1e3 * low:.0f}-"
             f"{1e3 * high:.0f} mm; set mesh_scale"
         )
-    return scaled
+    return vertices, np.asarray(mesh.faces, np.int64)
+
+
+def _part(name: str, role: str, surfaces: dict[str, Surface], progress: bool) -> MeshPart:
+    """Cut a part into convex pieces, which depend on its counterpart, too."""
+    _optional("manifold3d")
+    part, other = surfaces[role], surfaces[ROLES[1 - ROLES.index(role)]]
+    key = f"pieces-{_digest(*part, *other, np.frombuffer(repr(CUT).encode(), np.uint8))}"
+
+    def compute() -> dict[str, NDArray[Any]]:
+        with tqdm(total=1, desc=f"{name}: convex pieces of the {role}", disable=not progress, leave=False):
+            return {f"{index:03d}": corners for index, corners in enumerate(fitting_pieces(part, other, CUT))}
+
+    pieces = _cached(key, compute)
+    return MeshPart(*part, tuple(Hull(*small_hull(pieces[index])) for index in sorted(pieces)))
 
 
 def _turned_over(part: MeshPart) -> MeshPart:
@@ -260,10 +230,6 @@ def _turned_over(part: MeshPart) -> MeshPart:
     flip = np.array([1.0, -1.0, -1.0])
     pieces = tuple(Hull(hull.vertices * flip, hull.faces) for hull in part.pieces)
     return MeshPart(part.vertices * flip, part.faces, pieces)
-
-
-def _pieces(part: MeshPart) -> list[Array]:
-    return [hull.vertices for hull in part.pieces]
 
 
 def _cache_file(key: str) -> Path:

@@ -24,7 +24,7 @@ def load_pair(config: SceneConfig) -> PartPair:
         FileNotFoundError: missing folder or meshes of automate/ID.
     """
     if config.pair.startswith(MESH_PAIR_PREFIX):
-        from lerobot_vtrefine.sim.mesh_pairs import load_mesh_parts  # trimesh and CoACD are optional
+        from lerobot_vtrefine.sim.mesh_pairs import load_mesh_parts  # its packages are optional
 
         return load_mesh_parts(config.pair, config.mesh_dir, config.mesh_scale)
     check_choice("pair", config.pair, PROCEDURAL_PAIRS, f" or {MESH_PAIR_PREFIX}ID")

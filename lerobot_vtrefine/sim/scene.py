@@ -227,7 +227,7 @@ def _add_part(
         geom.density = config.part_density
     if part.foot is not None:
         _stand_on(spec, body, part.foot)
-    _raise_mass(spec, body)
+    _set_mass(spec, body, part, config.part_density)
 
 
 def _stand_on(spec: mujoco.MjSpec, body: mujoco.MjsBody, foot: ConvexHull) -> None:
@@ -256,12 +256,13 @@ def _add_piece(spec: mujoco.MjSpec, body: mujoco.MjsBody, name: str, piece: Prim
     return body.add_geom(name=name, type=mujoco.mjtGeom.mjGEOM_MESH, meshname=name)
 
 
-def _raise_mass(spec: mujoco.MjSpec, body: mujoco.MjsBody) -> None:
-    """Scale the part's density so that it weighs at least what contacts need to stay stiff."""
+def _set_mass(spec: mujoco.MjSpec, body: mujoco.MjsBody, part: Part, density: float) -> None:
+    """Scale the pieces' density, so that the part weighs what its surface encloses (pieces overlap, and fill
+    cavities), but at least what contacts need to stay stiff."""
     mass = spec.copy().compile().body(body.name).mass[0]
-    if mass < MIN_PART_MASS_KG:
-        for geom in body.geoms:
-            geom.density *= MIN_PART_MASS_KG / mass
+    own = mass if part.surface is None else density * part.surface.volume_m3
+    for geom in body.geoms:
+        geom.density *= max(own, MIN_PART_MASS_KG) / mass
 
 
 def _shade(rgba: Rgba, factor: float) -> Rgba:

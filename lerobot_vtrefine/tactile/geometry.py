@@ -149,6 +149,11 @@ class TriangleMesh:
         object.__setattr__(self, "vertices", vertices)
         object.__setattr__(self, "faces", faces)
 
+    @property
+    def volume_m3(self) -> float:
+        """What the surface encloses."""
+        return _signed_volume(self.vertices, self.faces)
+
 
 @dataclass(frozen=True, eq=False)
 class ConvexHull:

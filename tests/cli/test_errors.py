@@ -43,7 +43,7 @@ def test_success_is_zero() -> None:
             OSError(errno.ENOSPC, "No space left on device", "data.parquet"),
             "error: the disk is full while writing data.parquet; free some space and run the command again",
         ),
-        (ImportError("pip install coacd"), "error: pip install coacd"),
+        (ImportError("pip install trimesh"), "error: pip install trimesh"),
         (ValueError(), "error: ValueError"),
     ],
 )

@@ -1,0 +1,97 @@
+"""Convex pieces: they leave the counterpart its room, cover the part, and fill only what nobody reaches."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+from scipy.spatial import ConvexHull
+
+from lerobot_vtrefine.sim.mesh_fit import measure_fit
+from lerobot_vtrefine.sim.mesh_pieces import Cut, fitting_pieces
+from lerobot_vtrefine.sim.mesh_skin import Surface
+
+trimesh = pytest.importorskip("trimesh", reason="needs the assets extra")
+pytest.importorskip("manifold3d", reason="needs the assets extra")
+
+Array = NDArray[np.float64]
+BORE_M, PIN_M, CAVITY_M, CAP_M, WALL_M = 0.0125, 0.0115, 0.007, 0.022, 0.017
+LENGTH_M, CAP_HEIGHT_M = 0.08, 0.01
+CUT = Cut()
+
+
+def revolved(*profile: tuple[float, float]) -> Surface:
+    mesh = trimesh.creation.revolve(np.array([*profile, profile[0]]), sections=28)
+    return np.asarray(mesh.vertices), np.asarray(mesh.faces)
+
+
+TUBE = revolved((BORE_M, 0.0), (WALL_M, 0.0), (WALL_M, LENGTH_M), (BORE_M, LENGTH_M))
+PIN = revolved(
+    (CAVITY_M, 0.0),
+    (PIN_M, 0.0),
+    (PIN_M, LENGTH_M),
+    (CAP_M, LENGTH_M),
+    (CAP_M, LENGTH_M + CAP_HEIGHT_M),
+    (CAVITY_M, LENGTH_M + CAP_HEIGHT_M),
+)
+"""Hollow, with a cap that rests on the tube: like 00446."""
+
+
+@pytest.fixture(scope="module")
+def tube() -> list[Array]:
+    return fitting_pieces(TUBE, PIN, CUT)
+
+
+@pytest.fixture(scope="module")
+def pin() -> list[Array]:
+    return fitting_pieces(PIN, TUBE, CUT)
+
+
+def held(pieces: list[Array], points: Array) -> NDArray[np.bool_]:
+    """Which points (N, 3) lie in some piece."""
+    inside = np.zeros(len(points), bool)
+    for piece in pieces:
+        planes = ConvexHull(piece).equations
+        inside |= np.all(points @ planes[:, :3].T + planes[:, 3] <= 1e-7, axis=1)
+    return inside
+
+
+def ring_of_points(radius_m: float) -> Array:
+    """All around and along the tube."""
+    angle, height = np.meshgrid(np.linspace(0, 2 * np.pi, 360), np.linspace(0.001, LENGTH_M - 0.001, 20))
+    across = radius_m * np.stack([np.cos(angle), np.sin(angle)], -1)
+    return np.concatenate([across, height[..., None]], -1).reshape(-1, 3)
+
+
+def test_play_is_that_of_the_surfaces(tube: list[Array], pin: list[Array]) -> None:
+    fit = measure_fit(pin, tube)
+    assert fit.play_m == pytest.approx(BORE_M - PIN_M, abs=4e-4)  # overlap that is no contact, and the step
+    assert fit.has_stop == 1
+    assert fit.slack_m < 1e-3
+
+
+def test_pieces_do_not_narrow_the_bore(tube: list[Array]) -> None:
+    edge = BORE_M * np.cos(np.pi / 28)  # the drawn bore is a polygon
+    assert not held(tube, ring_of_points(edge - CUT.skin.passage_m)).any()
+
+
+def test_pieces_cover_the_part(tube: list[Array], pin: list[Array]) -> None:
+    assert held(tube, ring_of_points((BORE_M + WALL_M) / 2)).all()
+    assert held(pin, ring_of_points((CAVITY_M + PIN_M) / 2)).all()
+
+
+def test_a_cavity_that_nobody_reaches_fills_up(pin: list[Array]) -> None:
+    assert held(pin, ring_of_points(CAVITY_M / 2)).all()
+    assert len(pin) < 20
+    beside = ring_of_points((PIN_M + CAP_M) / 2)
+    below = beside[beside[:, 2] < LENGTH_M - 0.005]
+    assert not held(pin, below).any()  # where the tube is
+
+
+def test_a_limit_on_pieces_is_kept() -> None:
+    assert len(fitting_pieces(TUBE, PIN, replace(CUT, most=6))) <= 6
+
+
+def test_a_convex_part_stays_whole() -> None:
+    rod = revolved((0.0, 0.0), (PIN_M, 0.0), (PIN_M, LENGTH_M), (0.0, LENGTH_M))
+    assert len(fitting_pieces(rod, TUBE, CUT)) == 1
