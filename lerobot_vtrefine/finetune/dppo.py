@@ -347,18 +347,26 @@ def train(
     seed: int,
     after_iteration: Callable[[TrainState, Metrics], None],
 ) -> None:
-    """Run the iterations that remain; ``after_iteration`` logs, evaluates and saves."""
+    """Run the iterations that remain; ``after_iteration`` logs, evaluates and saves.
+
+    Raises: FloatingPointError where the loss is not finite, or the simulation failed in every episode.
+    """
     chunk = agent.executed.stop - agent.executed.start
     while state.iteration < cfg.iterations:
         started = time.perf_counter()
         first = TRAINING_SEEDS + seed + (state.iteration * num_ranks() + rank_index()) * env.num_envs
         rollout = collect(env, agent, cfg, state.generator, range(first, first + env.num_envs))
         collected = time.perf_counter()
+        decisions = sum_over_ranks(rollout.active.sum().double()).item()
+        if not decisions:
+            raise FloatingPointError(
+                f"the simulation failed in every episode of iteration {state.iteration}: the log says where"
+                " contacts found no room; else shorten --env.scene.timestep_s"
+            )
         state.critic.update_moments(rollout.privileged[:-1][rollout.active])
         metrics = rollout_metrics(rollout)
         metrics |= update(rollout, agent, state, cfg)
         give_back_unused(agent.device)
-        decisions = sum_over_ranks(rollout.active.sum().double()).item()
         state.iteration += 1
         state.env_steps += int(decisions) * chunk
         seconds = time.perf_counter() - started

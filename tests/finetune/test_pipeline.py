@@ -226,6 +226,49 @@ def test_checkpoints_hold_the_settings_of_their_run(finetune, tmp_path, monkeypa
     assert all(torch.equal(first[key], second[key]) for key in first)
 
 
+@pytest.mark.parametrize(
+    ("flag", "words"),
+    [
+        ("--dppo.sampler=ddim", "was made with --dppo.sampler=tail, not ddim"),
+        ("--dppo.ft_denoising_steps=5", "was made with --dppo.ft_denoising_steps=10, not 5"),
+        ("--dppo.encoder=frozen", "was made with --dppo.encoder=trained, not frozen"),
+        ("--dppo.critic_width=8", "was made with --dppo.critic_width=16, not 8"),
+        ("--seed=3", "was made with --seed=0, not 3"),
+    ],
+)
+def test_what_a_checkpoint_was_made_with_stays_when_it_is_resumed(finetune, tmp_path, capsys, flag, words):
+    """It was not taken up, and noted as if it had been; or ended in a traceback."""
+    output = tmp_path / "run"
+    assert finetune(output, iterations=1) == 0
+    noted = (output / "finetune_config.json").read_text()
+    assert finetune(output, "--resume=true", flag, iterations=2) == 2
+    error = capsys.readouterr().err.strip().splitlines()[-1]
+    assert words in error
+    assert "000001" in error
+    assert (output / "finetune_config.json").read_text() == noted
+
+
+@pytest.mark.parametrize(
+    ("change", "words"),
+    [
+        ({"reward": torch.full((6,), torch.nan)}, "loss is not finite in iteration 0: lower --dppo.actor_lr"),
+        ({"info": {"void": torch.ones(6, dtype=torch.bool)}}, "the simulation failed in every episode"),
+    ],
+)
+def test_an_iteration_that_nothing_can_be_learnt_from_is_one_line(
+    finetune, tmp_path, capsys, monkeypatch, change, words
+):
+    step = ReachEnv.step_chunk
+
+    def broken(env, actions):
+        made = step(env, actions)
+        return made._replace(**change | {"info": made.info | change.get("info", {})})
+
+    monkeypatch.setattr(ReachEnv, "step_chunk", broken)
+    assert finetune(tmp_path / "run", "--eval_freq=0", iterations=1) == 2
+    assert words in capsys.readouterr().err.strip().splitlines()[-1]
+
+
 def test_a_finished_run_resumes_to_nothing(finetune, tmp_path):
     output = tmp_path / "run"
     assert finetune(output, iterations=1) == 0
