@@ -141,6 +141,19 @@ def test_a_run_becomes_a_row_of_the_results(finetune, tmp_path):
         run_rows(output, common, {})
 
 
+def test_every_evaluation_has_its_own_number_of_episodes(finetune, tmp_path, capsys):
+    """It had been that of the last command for all, and an earlier evaluation had stood for the last."""
+    output, common = tmp_path / "run", {"table": "converges", "task": "reach"}
+    assert finetune(output, iterations=2) == 0
+    capsys.readouterr()
+    assert finetune(output, "--resume=true", "--eval.n_episodes=20", iterations=3) == 0
+    assert re.search(r"from .* of 12 episodes\) to .* of 24 episodes\)", capsys.readouterr().out)
+    found = [(row.variant, row.episodes) for row, _ in run_rows(output, common, {})]
+    assert found == [("imitation", 12), ("half-way", 12), ("", 24)]
+    assert finetune(output, "--resume=true", "--eval_freq=0", iterations=4) == 0
+    assert "success was not measured before and after" in capsys.readouterr().out
+
+
 @pytest.mark.parametrize("eta", [0.0, 1.0])
 def test_reloaded_checkpoint_deploys_what_was_evaluated(finetune, tmp_path, eta):
     """The last evaluation of the run is repeated by the policy's own inference from the files."""
