@@ -74,7 +74,8 @@ class DppoConfig(draccus.ChoiceRegistry):
     kl_per_decision: float = 0.0
     # What kl_per_decision falls to by the last iteration.
     kl_per_decision_final: float = 0.0
-    # Penalty on the KL divergence to the frozen base network, per action element and tuned step.
+    # Penalty on half the squared shift of mean actions from the frozen base network's, in standard
+    # deviations, per action element and tuned step: the KL divergence where noise_correlation is 0.
     kl_coef: float = 0.0
     # Weight of the log-likelihood of chains sampled from the base network (behaviour cloning).
     bc_coef: float = 0.0
