@@ -13,6 +13,12 @@ TIMEOUTS = ("terminal", "bootstrap")
 ENCODERS = ("trained", "frozen")
 MIN_LOG_PROB_STD = 0.055
 """Where a Gaussian's peak density reaches the upper end of diffusion.LOG_PROB_RANGE."""
+NOT_NEGATIVE = (
+    *("decisions", "minibatches", "micro_batch_decisions", "critic_warmup", "lr_warmup"),
+    *("actor_lr_final", "actor_lr_max", "critic_lr_final", "weight_decay", "max_grad_norm"),
+    *("min_sampling_std", "kl_coef", "bc_coef", "value_coef", "target_kl"),
+)
+"""Settings that may be 0, and not less."""
 
 
 @dataclass(frozen=True)
@@ -153,7 +159,7 @@ class DppoConfig(draccus.ChoiceRegistry):
                 "--dppo.kl_per_decision and --dppo.kl_per_decision_final must both be positive, or both 0, "
                 f"got {self.kl_per_decision} and {self.kl_per_decision_final}"
             )
-        for name in ("minibatches", "actor_lr_max"):
+        for name in NOT_NEGATIVE:
             if getattr(self, name) < 0:
                 raise ValueError(f"--dppo.{name} must not be negative, got {getattr(self, name)}")
         for name, choices in (("timeout", TIMEOUTS), ("encoder", ENCODERS)):

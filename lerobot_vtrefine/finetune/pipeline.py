@@ -102,6 +102,8 @@ class FinetunePipelineConfig:
         for name in ("seed", "eval_freq", "save_freq"):
             if getattr(self, name) < 0:
                 raise ValueError(f"--{name} must not be negative, got {getattr(self, name)}")
+        if self.eval_freq and self.eval.n_episodes < 1:
+            raise ValueError("--eval.n_episodes must be at least 1; --eval_freq=0 evaluates nothing")
 
     @classmethod
     def __get_path_fields__(cls) -> list[str]:

@@ -298,6 +298,7 @@ def test_bad_input_is_one_clear_line(finetune, tmp_path, capsys):
     assert "--dppo.num_envs must be positive" in complaint("--dppo.num_envs=0")
     assert "within" in complaint("--dppo.sampler_steps=5", "--dppo.ft_denoising_steps=40")
     assert "--seed must not be negative, got -1" in complaint("--seed=-1")
+    assert "--eval_freq=0 evaluates nothing" in complaint("--eval.n_episodes=0")
     assert "ddpm, ddim, tail" in complaint("--dppo.sampler=euler")
     missing = tmp_path / "nowhere"
     assert f"no checkpoint at --policy.path={missing}" in complaint(policy=missing)
