@@ -21,7 +21,7 @@ from lerobot_vtrefine.finetune import pipeline
 from lerobot_vtrefine.finetune.config import PaperDppo
 from lerobot_vtrefine.finetune.logger import CLOCK, read_progress
 from lerobot_vtrefine.finetune.seeds import EVALUATION_SEEDS
-from lerobot_vtrefine.finetune.state_file import load_state, save_state
+from lerobot_vtrefine.finetune.state_file import load_state
 from lerobot_vtrefine.policies.vt_dp3.modeling_vt_dp3 import VtDp3Policy
 
 SMALL = [
@@ -359,23 +359,6 @@ def test_a_task_practised_on_a_gpu_is_simulated_there(tmp_path):
     own = pipeline.env_on("cuda", task, "batch", 0.005, start="grasped")
     assert (own.backend, own.scene.timestep_s, own.start) == ("batch", 0.005, "grasped")
     assert there.scene.timestep_s == 0.002
-
-
-def test_training_state_comes_back_exactly_and_is_no_pickle(tmp_path):
-    state = {
-        0: {"step": torch.tensor(3.0), "betas": (0.9, 0.999)},
-        "weights": [torch.rand(2, 3).T, torch.zeros(0, dtype=torch.uint8)],
-        "rest": [None, True, 7, 1 / 3, float("-inf"), "text", []],
-    }
-    path = tmp_path / "state.safetensors"
-    save_state(state, path)
-    loaded = load_state(path)
-    rest = state.pop("rest")
-    assert loaded.pop("rest") == rest
-    torch.testing.assert_close(loaded, state, rtol=0, atol=0)
-    assert loaded[0]["betas"] == (0.9, 0.999)
-    with pytest.raises(TypeError, match="Path"):
-        save_state({"x": tmp_path}, path)
 
 
 class Marking:
