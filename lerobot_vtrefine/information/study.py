@@ -147,7 +147,7 @@ def study(
     """Collect, train, test, and let the expert act; ``keep`` gets the regressors of the first history.
 
     Raises:
-        ValueError: other clearances of a pair of meshes.
+        ValueError: other clearances of a pair of meshes, or an expert that hardly ever grasps both parts.
     """
     if effort.clearances_m and config.scene_config.pair not in PROCEDURAL_PAIRS:
         raise ValueError(f"--effort.clearances_m: {config.scene_config.pair} has the clearance of its meshes")
@@ -158,6 +158,8 @@ def study(
     first, heard = FIRST_SEED + effort.seed, lambda n: told("frames", effort.episodes, n)
     frames = collect_frames(config, effort.episodes, count, views, device, heard, first)
     training, held_out = frames.split(TRAINING_SHARE)
+    if training.held.sum() < 2 or not held_out.held.any():
+        raise ValueError("both parts got into the hands too seldom: raise --effort.episodes")
     result = Study(_shown(_spread(held_out)))
     if effort.closed_loop_episodes:
         done = closed_loop.expert_success(

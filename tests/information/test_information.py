@@ -5,7 +5,6 @@ import json
 import re
 from dataclasses import replace
 from pathlib import Path
-from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -14,7 +13,6 @@ import torch
 from lerobot_vtrefine.datasets.features import GRIDS_KEY, SURFACE_KEY
 from lerobot_vtrefine.envs import VtRefineEnvConfig
 from lerobot_vtrefine.envs.factory import make_simulation
-from lerobot_vtrefine.information import closed_loop
 from lerobot_vtrefine.information.closed_loop import expert_success
 from lerobot_vtrefine.information.contact import SIDE, TOUCHING, has_side, side_of
 from lerobot_vtrefine.information.estimator import (
@@ -28,7 +26,7 @@ from lerobot_vtrefine.information.estimator import (
     train_estimator,
     views_of,
 )
-from lerobot_vtrefine.information.frames import FIRST_SEED, Frames, MisjudgedHolds, collect_frames
+from lerobot_vtrefine.information.frames import Frames, MisjudgedHolds, collect_frames
 from lerobot_vtrefine.information.page import render_page
 from lerobot_vtrefine.information.quantities import NAMES, Grasps, observe, part_poses
 from lerobot_vtrefine.information.scale import HeldScale
@@ -128,28 +126,6 @@ def test_pads_tell_what_joints_do_not() -> None:
         value, low, high = rms_with_interval(episode_errors(trained(senses, frames), held_out))[:, 0]
         assert lowest < value / prior < highest, senses
         assert low < value < high
-
-
-def test_another_seed_studies_other_episodes_and_never_those_of_the_expert(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
-    """They had been the same whatever the seed, as if several studies were independent."""
-    begun: list[int] = []
-    nothing = SimpleNamespace(sim=None, part_poses=None)
-    for name in ("make_episodes", "MisjudgedHolds", "ScriptedExpert"):
-        monkeypatch.setattr(f"lerobot_vtrefine.information.frames.{name}", lambda *_: nothing)
-    monkeypatch.setattr(
-        "lerobot_vtrefine.information.frames._one_batch", lambda *given: begun.append(given[3]) or nothing
-    )
-    for seed in (0, 5000):
-        with pytest.raises(AttributeError):  # of a batch that holds nothing
-            study(VtRefineEnvConfig(), ["joints"], Effort(episodes=8, num_envs=4, seed=seed))
-    assert begun == [FIRST_SEED + seed for seed in (0, 4, 5000, 5004)]
-    most = closed_loop.FIRST_SEED - FIRST_SEED - 1024
-    Effort(seed=most)
-    for seed in (-1, most + 1):
-        with pytest.raises(ValueError, match=f"--effort.seed must be within 0..{most}, got {seed}"):
-            Effort(seed=seed)
 
 
 def test_windows_start_at_the_episodes_first_frame() -> None:
