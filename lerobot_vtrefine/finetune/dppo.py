@@ -298,6 +298,8 @@ def update(rollout: Rollout, agent: Agent, state: TrainState, cfg: DppoConfig) -
     history: list[Metrics] = []
     grad_norms: list[Tensor] = []  # nobody waits for them before the end
     initial_log_ratio, stopped = 0.0, False
+    with torch.no_grad():  # now: after the update it would know these episodes by heart
+        explained = explained_variance(state.critic(data.privileged), data.targets)
 
     for minibatch in (ids for _ in range(cfg.epochs) for ids in data.epoch()):
         found = data.gradients(minibatch)
@@ -316,8 +318,6 @@ def update(rollout: Rollout, agent: Agent, state: TrainState, cfg: DppoConfig) -
     if data.train_actor:
         last_epoch = [found["decision_kl"] for found in history[-data.per_epoch :]]
         region.adapt(last_epoch, stopped, state.iteration)
-    with torch.no_grad():
-        explained = explained_variance(state.critic(data.privileged), data.targets)
     averages = {
         name: sum(found[name] for found in history) / max(len(history), 1) for name in MINIBATCH_METRICS
     }
