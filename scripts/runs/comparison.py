@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from lerobot_vtrefine.cli.report.statistics import mean_interval, wilson_interval
+from lerobot_vtrefine.cli.report.statistics import mean_interval, rate_interval, wilson_interval
 
 
 def over_seeds(successes: Sequence[int], episodes: Sequence[int]) -> dict[str, Any]:
@@ -16,10 +16,10 @@ def over_seeds(successes: Sequence[int], episodes: Sequence[int]) -> dict[str, A
     differ by more than chance in their episodes. Of one seed, Wilson's interval over these.
     """
     rates = [won / count for won, count in zip(successes, episodes, strict=True)]
-    mean, *ends = mean_interval(rates)
+    mean, *ends = rate_interval(rates)
     if len(rates) == 1:
         ends = wilson_interval(successes[0], episodes[0])
-    ci95 = [round(min(max(end, 0.0), 1.0), 4) for end in ends]
+    ci95 = [round(end, 4) for end in ends]
     counts = {"success": sum(successes), "episodes": sum(episodes)}
     return counts | {"rate": round(mean, 4), "ci95": ci95, "per_seed": [round(rate, 4) for rate in rates]}
 
