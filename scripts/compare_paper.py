@@ -130,9 +130,10 @@ def main() -> None:
 
 def finish(options: argparse.Namespace, policy: Trained) -> None:
     """One policy's stages, and its rows."""
-    StageRunner(options.output_dir, stages(options, policy)).run()
+    records = StageRunner(options.output_dir, stages(options, policy)).run()
+    commits = {record.name: record.commit for record in records}
     for table in tables(policy):
-        found = rows(options, policy, table)
+        found = rows(options, policy, table, commits)
         save(options.results / f"{table}.json", found, replace=False)
 
 

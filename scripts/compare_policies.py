@@ -106,10 +106,9 @@ def policy_stages(options: argparse.Namespace, policy: str, seed: int) -> list[S
     ]
 
 
-def row(options: argparse.Namespace, policy: str, seed: int) -> Run:
-    """What an evaluation found."""
+def row(options: argparse.Namespace, policy: str, seed: int, commit: str | None) -> Run:
+    """What an evaluation found; ``commit`` of the code that trained the policy."""
     found = load_evaluation(options.output_dir / f"eval_{policy}_{seed}", EVAL_SEED_OFFSET)
-    origin = provenance()
     return Run(
         table="policies",
         task=options.task,
@@ -120,9 +119,9 @@ def row(options: argparse.Namespace, policy: str, seed: int) -> Run:
         episodes=found["episodes"],
         iterations=0,
         env_steps=0,
-        commit=origin["commit"] or options.commit,
-        command=origin["command"],
-        machine=origin["machine"],
+        commit=commit or options.commit,
+        command=provenance()["command"],
+        machine=provenance()["machine"],
     )
 
 
@@ -180,8 +179,8 @@ def main() -> None:
         run_all({folder: alone(options, *run) for run, folder in names.items()}, options.jobs)
         return
     for run in runs:
-        StageRunner(options.output_dir, [record, *policy_stages(options, *run)]).run()
-        save(options.results, [(row(options, *run), [])], replace=False)
+        _, trained, _ = StageRunner(options.output_dir, [record, *policy_stages(options, *run)]).run()
+        save(options.results, [(row(options, *run, trained.commit), [])], replace=False)
 
 
 if __name__ == "__main__":

@@ -21,12 +21,11 @@ from pathlib import Path
 from typing import Any
 
 import yaml
-from runs.comparison import difference, effect, interval_text, rate_text, save
+from runs.comparison import difference, effect, interval_text, over_seeds, rate_text, save
 from runs.side_by_side import run_all, run_script
 
 from lerobot_vtrefine.cli.arguments import CommandParser
 from lerobot_vtrefine.cli.pipeline.demo_config import default_env
-from lerobot_vtrefine.cli.report.statistics import proportion
 from lerobot_vtrefine.shipped import PREFIX, encoders
 
 MODALITIES = ("visuo_tactile", "visual")
@@ -128,14 +127,13 @@ def demo_command(folder: Path, run: Run, extra: list[str]) -> list[str]:
 
 
 def compare(results: dict[str, dict[int, dict]]) -> dict:
-    """Pooled success of each modality, and the difference that touch makes per seed, on the same episodes."""
+    """Mean success of each modality, and the difference that touch makes per seed, on the same episodes."""
     comparison = {}
     for policy in POLICIES:
         rows = {}
         for modality in MODALITIES:
             runs = [run[policy] for run in results[modality].values()]
-            pooled = proportion(sum(run["success"] for run in runs), sum(run["episodes"] for run in runs))
-            rows[modality] = pooled | {"per_seed": [run["rate"] for run in runs]}
+            rows[modality] = over_seeds(*([run[name] for run in runs] for name in ("success", "episodes")))
         rows["touch_minus_visual"] = difference(rows, "visual", "visuo_tactile")
         comparison[policy] = rows
     return comparison

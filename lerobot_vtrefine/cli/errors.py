@@ -26,7 +26,7 @@ INTERRUPT_STATUS = 130
 UNREAD_STATUS = 141
 """As a shell's tools end that write to ``head`` once it has seen enough."""
 
-EXPECTED = (ValueError, OSError, ImportError, DraccusException, YAMLError)
+EXPECTED = (ValueError, OSError, ImportError, FloatingPointError, DraccusException, YAMLError)
 CONFIG_FLAG = "--config_path"
 
 
@@ -202,9 +202,10 @@ def run_cli[**P](main: Callable[P, int | None]) -> Callable[P, int]:
     """Wrap a console entry point so that expected errors end as ``error: ...`` with exit status 2.
 
     ``ValueError``, ``OSError`` (missing files, full disk), ``ImportError`` (an extra is not installed),
-    draccus' parsing errors and a GPU without memory are expected; anything else is a defect and keeps its
-    traceback. Ctrl-C exits with 130; where ``head`` has seen enough, a command ends without a word. With
-    ``VTREFINE_DEBUG=1`` in the environment every error keeps its traceback.
+    ``FloatingPointError`` (training that diverged), draccus' parsing errors and a GPU without memory are
+    expected; anything else is a defect and keeps its traceback. Ctrl-C exits with 130; where ``head`` has
+    seen enough, a command ends without a word. With ``VTREFINE_DEBUG=1`` in the environment every error keeps
+    its traceback.
     """
 
     @functools.wraps(main)

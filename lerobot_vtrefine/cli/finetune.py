@@ -23,7 +23,6 @@ from lerobot_vtrefine.cli.hub import check_upload
 from lerobot_vtrefine.cli.pipeline.stages import trained_policy
 from lerobot_vtrefine.cli.report.results import verdict
 from lerobot_vtrefine.cli.report.statistics import proportion
-from lerobot_vtrefine.cli.results.collect import evaluated_episodes
 from lerobot_vtrefine.cli.results.provenance import write_provenance
 from lerobot_vtrefine.finetune.logger import read_progress
 from lerobot_vtrefine.finetune.pipeline import FinetunePipelineConfig, run
@@ -52,11 +51,12 @@ def finetune(cfg: FinetunePipelineConfig) -> None:
 
 def outcome(cfg: FinetunePipelineConfig) -> str:
     """Held-out success before and after, in a sentence; DPPO can unlearn, too."""
-    rates = [row["eval_success"] for row in read_progress(cfg.output_dir) if "eval_success" in row]
-    if len(rates) < 2:
+    rows = read_progress(cfg.output_dir)
+    ends = [row for row in (rows[0], rows[-1]) if "eval_episodes" in row]
+    if len(ends) < 2 or len(rows) < 2:
         return "success was not measured before and after; --eval_freq=10 does so"
-    episodes = evaluated_episodes(cfg.eval.n_episodes, cfg.dppo.num_envs)
-    before, after = (proportion(round(rate * episodes), episodes) for rate in (rates[0], rates[-1]))
+    counts = [(row["eval_success"], int(row["eval_episodes"])) for row in ends]
+    before, after = (proportion(round(rate * episodes), episodes) for rate, episodes in counts)
     return verdict(before, after)
 
 

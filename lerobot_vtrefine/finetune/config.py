@@ -13,6 +13,12 @@ TIMEOUTS = ("terminal", "bootstrap")
 ENCODERS = ("trained", "frozen")
 MIN_LOG_PROB_STD = 0.055
 """Where a Gaussian's peak density reaches the upper end of diffusion.LOG_PROB_RANGE."""
+NOT_NEGATIVE = (
+    *("decisions", "minibatches", "micro_batch_decisions", "critic_warmup", "lr_warmup"),
+    *("actor_lr_final", "actor_lr_max", "critic_lr_final", "weight_decay", "max_grad_norm"),
+    *("min_sampling_std", "kl_coef", "bc_coef", "value_coef", "target_kl"),
+)
+"""Settings that may be 0, and not less."""
 
 
 @dataclass(frozen=True)
@@ -74,7 +80,8 @@ class DppoConfig(draccus.ChoiceRegistry):
     kl_per_decision: float = 0.0
     # What kl_per_decision falls to by the last iteration.
     kl_per_decision_final: float = 0.0
-    # Penalty on the KL divergence to the frozen base network, per action element and tuned step.
+    # Penalty on half the squared shift of mean actions from the frozen base network's, in standard
+    # deviations, per action element and tuned step: the KL divergence where noise_correlation is 0.
     kl_coef: float = 0.0
     # Weight of the log-likelihood of chains sampled from the base network (behaviour cloning).
     bc_coef: float = 0.0
@@ -152,7 +159,7 @@ class DppoConfig(draccus.ChoiceRegistry):
                 "--dppo.kl_per_decision and --dppo.kl_per_decision_final must both be positive, or both 0, "
                 f"got {self.kl_per_decision} and {self.kl_per_decision_final}"
             )
-        for name in ("minibatches", "actor_lr_max"):
+        for name in NOT_NEGATIVE:
             if getattr(self, name) < 0:
                 raise ValueError(f"--dppo.{name} must not be negative, got {getattr(self, name)}")
         for name, choices in (("timeout", TIMEOUTS), ("encoder", ENCODERS)):

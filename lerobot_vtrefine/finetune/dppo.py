@@ -298,6 +298,8 @@ def update(rollout: Rollout, agent: Agent, state: TrainState, cfg: DppoConfig) -
     history: list[Metrics] = []
     grad_norms: list[Tensor] = []  # nobody waits for them before the end
     initial_log_ratio, stopped = 0.0, False
+    with torch.no_grad():  # now: after the update it would know these episodes by heart
+        explained = explained_variance(state.critic(data.privileged), data.targets)
 
     for minibatch in (ids for _ in range(cfg.epochs) for ids in data.epoch()):
         found = data.gradients(minibatch)
@@ -316,8 +318,6 @@ def update(rollout: Rollout, agent: Agent, state: TrainState, cfg: DppoConfig) -
     if data.train_actor:
         last_epoch = [found["decision_kl"] for found in history[-data.per_epoch :]]
         region.adapt(last_epoch, stopped, state.iteration)
-    with torch.no_grad():
-        explained = explained_variance(state.critic(data.privileged), data.targets)
     averages = {
         name: sum(found[name] for found in history) / max(len(history), 1) for name in MINIBATCH_METRICS
     }
@@ -347,18 +347,26 @@ def train(
     seed: int,
     after_iteration: Callable[[TrainState, Metrics], None],
 ) -> None:
-    """Run the iterations that remain; ``after_iteration`` logs, evaluates and saves."""
+    """Run the iterations that remain; ``after_iteration`` logs, evaluates and saves.
+
+    Raises: FloatingPointError where the loss is not finite, or the simulation failed in every episode.
+    """
     chunk = agent.executed.stop - agent.executed.start
     while state.iteration < cfg.iterations:
         started = time.perf_counter()
         first = TRAINING_SEEDS + seed + (state.iteration * num_ranks() + rank_index()) * env.num_envs
         rollout = collect(env, agent, cfg, state.generator, range(first, first + env.num_envs))
         collected = time.perf_counter()
+        decisions = sum_over_ranks(rollout.active.sum().double()).item()
+        if not decisions:
+            raise FloatingPointError(
+                f"the simulation failed in every episode of iteration {state.iteration}: the log says where"
+                " contacts found no room; else shorten --env.scene.timestep_s"
+            )
         state.critic.update_moments(rollout.privileged[:-1][rollout.active])
         metrics = rollout_metrics(rollout)
         metrics |= update(rollout, agent, state, cfg)
         give_back_unused(agent.device)
-        decisions = sum_over_ranks(rollout.active.sum().double()).item()
         state.iteration += 1
         state.env_steps += int(decisions) * chunk
         seconds = time.perf_counter() - started

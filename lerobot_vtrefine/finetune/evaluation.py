@@ -21,7 +21,8 @@ from lerobot_vtrefine.policies.vt_dp3.diffusion import deploy
 def evaluate(
     env: DecisionEnv, agent: Agent, num_episodes: int, first_seed: int = EVALUATION_SEEDS
 ) -> dict[str, float]:
-    """Mean success, return and episode metrics of the deployment sampler, as ``eval_<name>``.
+    """Mean success, return and episode metrics of the deployment sampler, as ``eval_<name>``; the number of
+    these episodes, as ``eval_episodes``.
 
     At least ``num_episodes`` held-out seeds over all ranks; each rank has its own. Repeatable, and without
     effect on training: torch's global generator (sensor noise in preprocessors) is seeded here and then
@@ -52,7 +53,8 @@ def _evaluate(env: DecisionEnv, agent: Agent, num_episodes: int, first_seed: int
                 break
         for key, values in {"return": total, **info}.items():
             columns.setdefault(f"eval_{key}", []).append(values)
-    return mean_over_ranks({key: torch.cat(parts) for key, parts in columns.items()})
+    means = mean_over_ranks({key: torch.cat(parts) for key, parts in columns.items()})
+    return means | {"eval_episodes": float(batches * env.num_envs * num_ranks())}
 
 
 def deployed_chunks(agent: Agent, cond: Tensor, cond_base: Tensor, generator: torch.Generator) -> Tensor:

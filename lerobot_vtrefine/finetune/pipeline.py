@@ -21,7 +21,7 @@ from tqdm import tqdm
 
 from lerobot_vtrefine.envs.config import VtRefineEnvConfig
 from lerobot_vtrefine.envs.decisions import LeRobotDecisionEnv, make_decision_env
-from lerobot_vtrefine.files import read_yaml
+from lerobot_vtrefine.files import read_json, read_yaml
 from lerobot_vtrefine.finetune.checkpoint import (
     Saveable,
     foreign_checkpoints,
@@ -51,6 +51,11 @@ SHOWN = (
     "steps_per_s",
 )
 """Metrics that the log tells after every iteration; progress.csv has all."""
+MADE_WITH = (
+    *("sampler", "sampler_steps", "prefix_steps", "ft_denoising_steps", "eta", "encoder"),
+    *("critic_width", "critic_blocks"),
+)
+"""Settings of ``dppo`` that a checkpoint's networks, and how its policy acts, were made with."""
 
 
 @dataclass
@@ -97,6 +102,8 @@ class FinetunePipelineConfig:
         for name in ("seed", "eval_freq", "save_freq"):
             if getattr(self, name) < 0:
                 raise ValueError(f"--{name} must not be negative, got {getattr(self, name)}")
+        if self.eval_freq and self.eval.n_episodes < 1:
+            raise ValueError("--eval.n_episodes must be at least 1; --eval_freq=0 evaluates nothing")
 
     @classmethod
     def __get_path_fields__(cls) -> list[str]:
@@ -144,6 +151,19 @@ def start_path(cfg: FinetunePipelineConfig) -> tuple[Path, Path | None]:
     if cfg.start is None:
         raise ValueError("name the checkpoint to fine-tune with --policy.path=.../pretrained_model")
     return cfg.start, None
+
+
+def check_resumable(cfg: FinetunePipelineConfig, checkpoint: Path) -> None:
+    """Raises: ValueError for a setting that a run cannot change on its way; others hold from now on."""
+    saved = read_json(checkpoint / PRETRAINED_MODEL_DIR / TRAIN_CONFIG_NAME)
+    kept = {"seed": (saved["seed"], cfg.seed)}
+    kept |= {f"dppo.{name}": (saved["dppo"][name], getattr(cfg.dppo, name)) for name in MADE_WITH}
+    for name, (before, now) in kept.items():
+        if before != now:
+            raise ValueError(
+                f"{checkpoint} was made with --{name}={before}, not {now}: resume with that, or choose"
+                " another --output_dir"
+            )
 
 
 def load_policy(path: Path, overrides: list[str] | None = None) -> VtDp3Policy:
@@ -275,13 +295,15 @@ class Recorder:
     ) -> None:
         self.cfg, self.env, self.agent, self.saveable = cfg, env, agent, saveable
         self.log: ProgressLog | None = None
-        self.bar: tqdm | None = None
+        self.bar = tqdm(disable=True)
 
-    def start(self, state: TrainState) -> None:
+    def start(self, state: TrainState) -> tqdm:
         """Open the records (first rank), and evaluate the policy that training starts from.
 
         That is the pre-trained network behind the sampler of fine-tuning; ``lerobot-eval`` of the pre-trained
         checkpoint uses the sampler that it was saved with.
+
+        Returns: the progress bar, to be closed also where training ends by an error, told below it.
         """
         cfg = self.cfg
         if rank_index() == 0:
@@ -291,6 +313,7 @@ class Recorder:
             self.bar = tqdm(total=cfg.dppo.iterations, initial=state.iteration, desc="DPPO", unit="it")
         if state.iteration == 0 and cfg.eval_freq:
             self._record(0, evaluate(self.env, self.agent, cfg.eval.n_episodes))
+        return self.bar
 
     def __call__(self, state: TrainState, metrics: Metrics) -> None:
         """Callback of ``dppo.train``."""
@@ -302,10 +325,7 @@ class Recorder:
             if self.log is not None:
                 self.log.draw()
             save_checkpoint(cfg.output_dir, self.saveable, state, last)
-        if self.bar is not None:
-            self.bar.update()
-            if iteration == last:
-                self.bar.close()
+        self.bar.update()
 
     def close(self) -> None:
         """Called when training has ended."""
@@ -340,6 +360,8 @@ def write_config(cfg: FinetunePipelineConfig, path: Path) -> None:
 def run(cfg: FinetunePipelineConfig) -> None:
     """Fine-tune; the result is ``output_dir/checkpoints/last/pretrained_model``."""
     path, checkpoint = start_path(cfg)
+    if checkpoint is not None:
+        check_resumable(cfg, checkpoint)
     claim_gpu()
     policy = load_policy(path)
     if checkpoint is None and policy.config.ft_denoising_steps:
@@ -356,7 +378,7 @@ def run(cfg: FinetunePipelineConfig) -> None:
     with logs_above_bars():
         if checkpoint is not None:
             load_training_state(checkpoint, state)
-        recorder.start(state)
-        train(env, agent, state, cfg.dppo, seed=cfg.seed, after_iteration=recorder)
+        with recorder.start(state):
+            train(env, agent, state, cfg.dppo, seed=cfg.seed, after_iteration=recorder)
     recorder.close()
     leave_ranks()

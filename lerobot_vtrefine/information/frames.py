@@ -148,6 +148,7 @@ def collect_frames(
     views: Views,
     device: torch.device,
     told: Callable[[int], None] = lambda _: None,
+    first_seed: int = FIRST_SEED,
 ) -> Frames:
     """Frames of at least ``num_episodes`` episodes, ``num_envs`` at a time; ``told`` hears of every batch."""
     episodes = make_episodes(config, num_envs)
@@ -155,7 +156,7 @@ def collect_frames(
     expert = ScriptedExpert(episodes.sim, ERRORS, holds.part_poses)
     batches: list[_Batch] = []
     for first in range(0, num_episodes, num_envs):
-        batches.append(_one_batch(episodes, holds, expert, FIRST_SEED + first, views, device))
+        batches.append(_one_batch(episodes, holds, expert, first_seed + first, views, device))
         told(num_envs)
     length = np.concatenate([batch.length for batch in batches])
     held = np.concatenate([batch.held for batch in batches])

@@ -15,8 +15,8 @@ from scipy.stats import binomtest
 
 from lerobot_vtrefine.datasets.features import STATE_KEY
 from lerobot_vtrefine.envs.config import VtRefineEnvConfig
+from lerobot_vtrefine.information import closed_loop
 from lerobot_vtrefine.information.acceptance import Verdict, judge
-from lerobot_vtrefine.information.closed_loop import expert_success
 from lerobot_vtrefine.information.contact import SHARES
 from lerobot_vtrefine.information.estimator import (
     NETWORKS,
@@ -30,7 +30,7 @@ from lerobot_vtrefine.information.estimator import (
     train_estimator,
     views_of,
 )
-from lerobot_vtrefine.information.frames import Frames, Views, collect_frames
+from lerobot_vtrefine.information.frames import FIRST_SEED, Frames, Views, collect_frames
 from lerobot_vtrefine.information.quantities import NAMES, unit_of
 from lerobot_vtrefine.information.tolerance import SIZES, Tolerated, tolerance
 from lerobot_vtrefine.policies.vt_dp3.observation_encoder import ObservationEncoder, save_encoder
@@ -71,7 +71,7 @@ class Effort:
     device: str = "cpu"
     """Where the regressors are trained, cpu or cuda."""
     seed: int = 0
-    """Seed of the first episode, and of the training."""
+    """Seed of the first episode, counted from those of studies, and of the training."""
 
     def __post_init__(self) -> None:
         for name in ("episodes", "num_envs", "steps", "batch_size"):
@@ -86,6 +86,9 @@ class Effort:
             raise ValueError(f"--clearances_m must hold lengths above 0, got {self.clearances_m}")
         if self.episodes < 2 * self.num_envs:
             raise ValueError(f"--episodes={self.episodes} must be at least twice --num_envs={self.num_envs}")
+        most = closed_loop.FIRST_SEED - FIRST_SEED - self.episodes
+        if not 0 <= self.seed <= most:
+            raise ValueError(f"--effort.seed must be within 0..{most}, got {self.seed}")
 
 
 @dataclass
@@ -144,7 +147,7 @@ def study(
     """Collect, train, test, and let the expert act; ``keep`` gets the regressors of the first history.
 
     Raises:
-        ValueError: other clearances of a pair of meshes.
+        ValueError: other clearances of a pair of meshes, or an expert that hardly ever grasps both parts.
     """
     if effort.clearances_m and config.scene_config.pair not in PROCEDURAL_PAIRS:
         raise ValueError(f"--effort.clearances_m: {config.scene_config.pair} has the clearance of its meshes")
@@ -152,13 +155,16 @@ def study(
     body, device = config.body.name, torch.device(effort.device)
     views = views_of(chosen, body, effort.preset, effort.device)
     count = effort.num_envs
-    frames = collect_frames(
-        config, effort.episodes, count, views, device, lambda n: told("frames", effort.episodes, n)
-    )
+    first, heard = FIRST_SEED + effort.seed, lambda n: told("frames", effort.episodes, n)
+    frames = collect_frames(config, effort.episodes, count, views, device, heard, first)
     training, held_out = frames.split(TRAINING_SHARE)
+    if training.held.sum() < 2 or not held_out.held.any():
+        raise ValueError("both parts got into the hands too seldom: raise --effort.episodes")
     result = Study(_shown(_spread(held_out)))
     if effort.closed_loop_episodes:
-        done = expert_success(config, effort.closed_loop_episodes, count, None, {}, frames.grasps, device)
+        done = closed_loop.expert_success(
+            config, effort.closed_loop_episodes, count, None, {}, frames.grasps, device
+        )
         result.true_success = (int(done.sum()), len(done))
     for history in effort.history:
         for item in chosen:
@@ -218,7 +224,7 @@ def _tested(
     if effort.closed_loop_episodes:
         read = [estimator.sources[key].split("/")[0] for key in estimator.encoder.keys if key != STATE_KEY]
         needed = {name: views[name] for name in read}
-        done = expert_success(
+        done = closed_loop.expert_success(
             config,
             effort.closed_loop_episodes,
             effort.num_envs,

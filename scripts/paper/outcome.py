@@ -20,8 +20,10 @@ MORE_ROOM = {"contacts_per_world": 512, "convex_per_world": 64, "rows_per_world"
 """More than any pair's file has."""
 
 
-def rows(options: argparse.Namespace, policy: Trained, table: str) -> list[tuple[Row, Progress]]:
-    """What was found, with the learning curve beside the tuned policy."""
+def rows(
+    options: argparse.Namespace, policy: Trained, table: str, commits: dict[str, str | None]
+) -> list[tuple[Row, Progress]]:
+    """What was found, with the learning curve beside the tuned policy; ``commits`` by stage."""
     found: list[tuple[Row, Progress]] = []
     progress = read_progress(options.output_dir / f"finetune_{policy.name}")
     for stage, kind in variants(policy).items():
@@ -40,7 +42,7 @@ def rows(options: argparse.Namespace, policy: Trained, table: str) -> list[tuple
             iterations=iterations_of(options, policy) if tuned else 0,
             env_steps=last_steps(progress) if tuned else 0,
             extra=extra,
-            **provenance() | {"commit": provenance()["commit"] or options.commit},
+            **provenance() | {"commit": commits[f"{stage}_{policy.name}"] or options.commit},
         )
         found.append((row, progress if tuned else []))
     return found

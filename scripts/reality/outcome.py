@@ -4,10 +4,8 @@ import json
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-from runs.comparison import difference
+from runs.comparison import difference, over_seeds
 
-from lerobot_vtrefine.cli.report.statistics import proportion
 from lerobot_vtrefine.cli.results.collect import Progress, last_steps, read_json_or_none
 from lerobot_vtrefine.cli.results.rows import Run
 from lerobot_vtrefine.finetune.logger import read_progress
@@ -52,8 +50,7 @@ def compare_one(budget: Budget, name: str, seeds: list[int]) -> dict[str, Any]:
     }
     for title, pair in cells(name).items():
         runs = [successes(budget, *pair, seed) for seed in seeds]
-        pooled = proportion(sum(map(sum, runs)), sum(map(len, runs)))
-        row[title] = pooled | {"per_seed": [round(float(np.mean(run)), 4) for run in runs]}
+        row[title] = over_seeds([*map(sum, runs)], [*map(len, runs)])
     row["reality_minus_simulator"] = difference(row, "plain in its own simulator", "plain in reality")
     row["diagnosed_minus_plain"] = difference(row, "plain in reality", "diagnosed in reality")
     return row

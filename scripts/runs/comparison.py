@@ -2,12 +2,26 @@
 
 import json
 import math
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from lerobot_vtrefine.cli.report.statistics import mean_interval
+from lerobot_vtrefine.cli.report.statistics import mean_interval, rate_interval, wilson_interval
+
+
+def over_seeds(successes: Sequence[int], episodes: Sequence[int]) -> dict[str, Any]:
+    """Mean success over seeds with its t-interval, within what a success can be, and each seed's: policies
+    differ by more than chance in their episodes. Of one seed, Wilson's interval over these.
+    """
+    rates = [won / count for won, count in zip(successes, episodes, strict=True)]
+    mean, *ends = rate_interval(rates)
+    if len(rates) == 1:
+        ends = wilson_interval(successes[0], episodes[0])
+    ci95 = [round(end, 4) for end in ends]
+    counts = {"success": sum(successes), "episodes": sum(episodes)}
+    return counts | {"rate": round(mean, 4), "ci95": ci95, "per_seed": [round(rate, 4) for rate in rates]}
 
 
 def difference(rows: dict[str, Any], one: str, two: str) -> dict[str, Any]:
@@ -24,7 +38,7 @@ def effect(mean: float, ci95: list[float]) -> str:
 
 
 def rate_text(row: dict) -> str:
-    """Pooled rate with its interval, and the seeds' rates."""
+    """Mean rate with its interval, and the seeds' rates."""
     seeds = ", ".join(f"{100 * rate:.0f}" for rate in row["per_seed"])
     return f"{interval_text(row['rate'], row['ci95'])} (seeds: {seeds})"
 

@@ -32,9 +32,15 @@ def run(
 
 
 @pytest.mark.usefixtures("fake_commands")
-def test_rows_grow_and_nothing_is_done_twice(run: Callable[..., str], tmp_path: Path) -> None:
+def test_rows_grow_and_nothing_is_done_twice(
+    run: Callable[..., str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """And each says which code trained it, not which wrote its row again."""
+    code = ["0123abc"]
+    monkeypatch.setattr("lerobot_vtrefine.cli.pipeline.stages.commit", lambda: code[-1])
     first = run("--seeds", "0", "--policies", "act_rgb")
     assert first.count("done before") == 1  # the demonstrations, when the policy's turn comes
+    code.append("4567def")
     again = run("--seeds", "0", "1", "--policies", "act_rgb", "vt_dp3_pads_visual")
     assert again.count("done before") == 7  # five times the demonstrations, and the first policy's two stages
     rows = read_rows(tmp_path / "results" / "policies.json")
@@ -44,6 +50,7 @@ def test_rows_grow_and_nothing_is_done_twice(run: Callable[..., str], tmp_path: 
         ("vt_dp3_pads_visual", 0, 8),
         ("vt_dp3_pads_visual", 1, 8),
     ]
+    assert [row.commit for row in rows] == ["0123abc", *["4567def"] * 3]
     shown = table("policies", rows)
     assert (
         "| LeRobot's ACT: colour | 200 demonstrations, 5000 steps of 64 | 25 % [25, 25] (25, 25) | 8 |"

@@ -1,4 +1,4 @@
-"""The comparison pools episodes, pairs seeds, and says only what its interval shows."""
+"""The comparison takes means over seeds, pairs these, and says only what its interval shows."""
 
 import json
 import subprocess
@@ -37,6 +37,9 @@ def test_noise_is_called_noise() -> None:
     sight = {0: run_of(20, 50), 1: run_of(20, 60), 2: run_of(20, 55)}
     text = script.as_text({"demo": script.compare({"visuo_tactile": touch, "visual": sight})})
     assert "makes no difference that these seeds can show" in text
+    assert "| 63 % [1, 100] (seeds: 90, 40, 60) |" in text  # over seeds; over 300 episodes it is [58, 69]
+    alone = script.compare({"visuo_tactile": {0: run_of(20, 90)}, "visual": {0: run_of(20, 50)}})
+    assert "| 90 % [83, 94] (seeds: 90) |" in script.as_text({"demo": alone})
 
 
 FAKE_DEMO = """#!{python}

@@ -120,6 +120,13 @@ def test_flags_come_beside_the_recipes() -> None:
         DemoConfig(recipe="paper")
 
 
+def test_a_bank_of_starts_is_for_practice_alone() -> None:
+    """Seeds of evaluations had drawn the very states that DPPO starts from."""
+    config = demo.parse_config(["--env={start: table, start_bank: starts.npz}"])
+    practised = [stage.name for stage in demo_stages(config) if "--env.start_bank" in stage.line]
+    assert practised == ["finetune"]
+
+
 def test_episodes_are_never_shared() -> None:
     """Evaluation seeds are unseen, within a run and between runs of different seeds; NumPy takes them all."""
     ranges = []

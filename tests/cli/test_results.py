@@ -238,8 +238,9 @@ def test_a_runs_own_evaluations_bring_what_they_measured(tmp_path: Path) -> None
     """Before its first iteration, and after its last."""
     log = ProgressLog(tmp_path, 0, None)
     for iteration, success, force in ((0, 0.4, 1.23456), (2, 0.9, 2.0)):
-        log.add(iteration, {"eval_success": success, "eval_peak_force_n": force, "env_steps": 100.0})
-    settings = {"dppo": {"iterations": 2, "num_envs": 8}, "eval": {"n_episodes": 8}, "seed": 3}
+        measured = {"eval_success": success, "eval_episodes": 10.0, "eval_peak_force_n": force}
+        log.add(iteration, {**measured, "env_steps": 100.0})
+    settings = {"dppo": {"iterations": 2}, "seed": 3}
     (tmp_path / CONFIG_NAME).write_text(json.dumps(settings))
     named = {"table": "converges", "task": "cross", "policy": "visual"}
     before, after = (row for row, _ in run_rows(tmp_path, named, ORIGIN))

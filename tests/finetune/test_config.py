@@ -82,6 +82,10 @@ def test_critics_learning_rate_decays_over_all_iterations():
         ({"num_envs": 0}, "--dppo.num_envs must be positive"),
         ({"eta": 1.5}, r"--dppo.eta must lie in \[0, 1\]"),
         ({"min_log_prob_std": 0.05}, "--dppo.min_log_prob_std must be at least 0.055"),
+        ({"max_grad_norm": -1.0}, "--dppo.max_grad_norm must not be negative"),  # it had turned gradients
+        ({"decisions": -1}, "--dppo.decisions must not be negative"),
+        ({"micro_batch_decisions": -1}, "--dppo.micro_batch_decisions must not be negative"),
+        ({"kl_coef": -0.1}, "--dppo.kl_coef must not be negative"),
     ],
 )
 def test_bad_values_name_the_flag(change, words):

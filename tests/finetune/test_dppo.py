@@ -9,6 +9,7 @@ from toy import BlindPeg, ToyActor, make_agent
 from lerobot_vtrefine.envs.decisions import Decision
 from lerobot_vtrefine.finetune.chains import chain_log_probs
 from lerobot_vtrefine.finetune.config import DppoConfig, PaperDppo
+from lerobot_vtrefine.finetune.critic import explained_variance
 from lerobot_vtrefine.finetune.dppo import (
     TrainState,
     collect,
@@ -158,6 +159,18 @@ def test_critic_warm_up_really_happens():
     assert [entry[:2] for entry in history] == [(False, True), (False, True), (True, True)]
     assert all(updates > 0 for *_, updates in history)
     assert not changed(base, agent.base)
+
+
+def test_the_critic_is_judged_on_episodes_that_it_has_not_learnt_from():
+    """After ten epochs over them it explained a quarter of rewards that were nothing but noise."""
+    cfg = small_config(epochs=10)
+    env, agent, state = problem(cfg)
+    rollout = rollout_of(cfg, env, agent, state)
+    rollout.reward = torch.randn(rollout.reward.shape, generator=state.generator)
+    _, targets = decision_advantages(rollout, state, cfg)
+    with torch.no_grad():
+        unseen = explained_variance(state.critic(rollout.privileged[rollout.step, rollout.env]), targets)
+    assert update(rollout, agent, state, cfg)["explained_variance"] == unseen
 
 
 def test_frozen_encoder_stays_and_encodes_once_per_decision():

@@ -21,7 +21,7 @@ from lerobot_vtrefine.finetune import pipeline
 from lerobot_vtrefine.finetune.config import PaperDppo
 from lerobot_vtrefine.finetune.logger import CLOCK, read_progress
 from lerobot_vtrefine.finetune.seeds import EVALUATION_SEEDS
-from lerobot_vtrefine.finetune.state_file import load_state, save_state
+from lerobot_vtrefine.finetune.state_file import load_state
 from lerobot_vtrefine.policies.vt_dp3.modeling_vt_dp3 import VtDp3Policy
 
 SMALL = [
@@ -141,6 +141,19 @@ def test_a_run_becomes_a_row_of_the_results(finetune, tmp_path):
         run_rows(output, common, {})
 
 
+def test_every_evaluation_has_its_own_number_of_episodes(finetune, tmp_path, capsys):
+    """It had been that of the last command for all, and an earlier evaluation had stood for the last."""
+    output, common = tmp_path / "run", {"table": "converges", "task": "reach"}
+    assert finetune(output, iterations=2) == 0
+    capsys.readouterr()
+    assert finetune(output, "--resume=true", "--eval.n_episodes=20", iterations=3) == 0
+    assert re.search(r"from .* of 12 episodes\) to .* of 24 episodes\)", capsys.readouterr().out)
+    found = [(row.variant, row.episodes) for row, _ in run_rows(output, common, {})]
+    assert found == [("imitation", 12), ("half-way", 12), ("", 24)]
+    assert finetune(output, "--resume=true", "--eval_freq=0", iterations=4) == 0
+    assert "success was not measured before and after" in capsys.readouterr().out
+
+
 @pytest.mark.parametrize("eta", [0.0, 1.0])
 def test_reloaded_checkpoint_deploys_what_was_evaluated(finetune, tmp_path, eta):
     """The last evaluation of the run is repeated by the policy's own inference from the files."""
@@ -226,6 +239,49 @@ def test_checkpoints_hold_the_settings_of_their_run(finetune, tmp_path, monkeypa
     assert all(torch.equal(first[key], second[key]) for key in first)
 
 
+@pytest.mark.parametrize(
+    ("flag", "words"),
+    [
+        ("--dppo.sampler=ddim", "was made with --dppo.sampler=tail, not ddim"),
+        ("--dppo.ft_denoising_steps=5", "was made with --dppo.ft_denoising_steps=10, not 5"),
+        ("--dppo.encoder=frozen", "was made with --dppo.encoder=trained, not frozen"),
+        ("--dppo.critic_width=8", "was made with --dppo.critic_width=16, not 8"),
+        ("--seed=3", "was made with --seed=0, not 3"),
+    ],
+)
+def test_what_a_checkpoint_was_made_with_stays_when_it_is_resumed(finetune, tmp_path, capsys, flag, words):
+    """It was not taken up, and noted as if it had been; or ended in a traceback."""
+    output = tmp_path / "run"
+    assert finetune(output, iterations=1) == 0
+    noted = (output / "finetune_config.json").read_text()
+    assert finetune(output, "--resume=true", flag, iterations=2) == 2
+    error = capsys.readouterr().err.strip().splitlines()[-1]
+    assert words in error
+    assert "000001" in error
+    assert (output / "finetune_config.json").read_text() == noted
+
+
+@pytest.mark.parametrize(
+    ("change", "words"),
+    [
+        ({"reward": torch.full((6,), torch.nan)}, "loss is not finite in iteration 0: lower --dppo.actor_lr"),
+        ({"info": {"void": torch.ones(6, dtype=torch.bool)}}, "the simulation failed in every episode"),
+    ],
+)
+def test_an_iteration_that_nothing_can_be_learnt_from_is_one_line(
+    finetune, tmp_path, capsys, monkeypatch, change, words
+):
+    step = ReachEnv.step_chunk
+
+    def broken(env, actions):
+        made = step(env, actions)
+        return made._replace(**change | {"info": made.info | change.get("info", {})})
+
+    monkeypatch.setattr(ReachEnv, "step_chunk", broken)
+    assert finetune(tmp_path / "run", "--eval_freq=0", iterations=1) == 2
+    assert words in capsys.readouterr().err.strip().splitlines()[-1]
+
+
 def test_a_finished_run_resumes_to_nothing(finetune, tmp_path):
     output = tmp_path / "run"
     assert finetune(output, iterations=1) == 0
@@ -242,6 +298,7 @@ def test_bad_input_is_one_clear_line(finetune, tmp_path, capsys):
     assert "--dppo.num_envs must be positive" in complaint("--dppo.num_envs=0")
     assert "within" in complaint("--dppo.sampler_steps=5", "--dppo.ft_denoising_steps=40")
     assert "--seed must not be negative, got -1" in complaint("--seed=-1")
+    assert "--eval_freq=0 evaluates nothing" in complaint("--eval.n_episodes=0")
     assert "ddpm, ddim, tail" in complaint("--dppo.sampler=euler")
     missing = tmp_path / "nowhere"
     assert f"no checkpoint at --policy.path={missing}" in complaint(policy=missing)
@@ -302,23 +359,6 @@ def test_a_task_practised_on_a_gpu_is_simulated_there(tmp_path):
     own = pipeline.env_on("cuda", task, "batch", 0.005, start="grasped")
     assert (own.backend, own.scene.timestep_s, own.start) == ("batch", 0.005, "grasped")
     assert there.scene.timestep_s == 0.002
-
-
-def test_training_state_comes_back_exactly_and_is_no_pickle(tmp_path):
-    state = {
-        0: {"step": torch.tensor(3.0), "betas": (0.9, 0.999)},
-        "weights": [torch.rand(2, 3).T, torch.zeros(0, dtype=torch.uint8)],
-        "rest": [None, True, 7, 1 / 3, float("-inf"), "text", []],
-    }
-    path = tmp_path / "state.safetensors"
-    save_state(state, path)
-    loaded = load_state(path)
-    rest = state.pop("rest")
-    assert loaded.pop("rest") == rest
-    torch.testing.assert_close(loaded, state, rtol=0, atol=0)
-    assert loaded[0]["betas"] == (0.9, 0.999)
-    with pytest.raises(TypeError, match="Path"):
-        save_state({"x": tmp_path}, path)
 
 
 class Marking:

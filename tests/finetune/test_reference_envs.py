@@ -10,6 +10,7 @@ from reference.insertion.ours import TimeIsUpError
 from reference.insertion.theirs import ReferenceEnvs
 from toy import BlindPeg, ToyActor, make_agent
 
+from lerobot_vtrefine.cli.pipeline.demo_config import SEED_STRIDE
 from lerobot_vtrefine.finetune.config import PaperDppo
 from lerobot_vtrefine.finetune.seeds import EVALUATION_SEEDS, TRAINING_SEEDS
 
@@ -53,13 +54,14 @@ def test_only_steps_of_training_episodes_that_run_count(envs):
     assert successes == [{"eval_success": third}, {"success": third}, {"eval_success": third}]
 
 
-def test_evaluations_have_seeds_of_their_own(envs):
+def test_evaluations_have_seeds_of_their_own_and_so_have_runs(envs):
+    """Runs of seeds 7 and 8 had shared all training episodes but one of each end."""
     seeds = []
     for _ in range(4):
         envs.reset_arg(None)
         seeds.append(envs.env.seeds)
     held_out = list(range(EVALUATION_SEEDS, EVALUATION_SEEDS + 3))
-    first = TRAINING_SEEDS + 7
+    first = TRAINING_SEEDS + 7 * SEED_STRIDE
     assert seeds == [held_out, [first + 3 + k for k in range(3)], held_out, [first + 9 + k for k in range(3)]]
 
 

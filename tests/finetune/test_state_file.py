@@ -39,3 +39,20 @@ def test_a_lost_file_is_one_line(tmp_path: Path) -> None:
     (tmp_path / "state-3.safetensors").unlink()
     with pytest.raises(ValueError, match=r"damaged or no training state: .*state-3"):
         load_state(tmp_path / "state.safetensors")
+
+
+def test_training_state_comes_back_exactly_and_is_no_pickle(tmp_path):
+    state = {
+        0: {"step": torch.tensor(3.0), "betas": (0.9, 0.999)},
+        "weights": [torch.rand(2, 3).T, torch.zeros(0, dtype=torch.uint8)],
+        "rest": [None, True, 7, 1 / 3, float("-inf"), "text", []],
+    }
+    path = tmp_path / "state.safetensors"
+    save_state(state, path)
+    loaded = load_state(path)
+    rest = state.pop("rest")
+    assert loaded.pop("rest") == rest
+    torch.testing.assert_close(loaded, state, rtol=0, atol=0)
+    assert loaded[0]["betas"] == (0.9, 0.999)
+    with pytest.raises(TypeError, match="Path"):
+        save_state({"x": tmp_path}, path)

@@ -195,6 +195,13 @@ class DemoConfig:
         return self.output_dir / ("eval_" + policy + ("" if ablation == "none" else f"_no_{ablation}"))
 
     @property
+    def task(self) -> dict[str, Any]:
+        """Flags of the environment that is demonstrated and judged: whole episodes, also where DPPO starts
+        from a bank, all of whose states it may know.
+        """
+        return {name: value for name, value in self.env.items() if name != "start_bank"}
+
+    @property
     def eval_seed(self) -> int:
         """First environment seed of every evaluation."""
         return self.seed * SEED_STRIDE + EVAL_SEED_OFFSET

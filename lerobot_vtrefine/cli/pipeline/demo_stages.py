@@ -14,7 +14,7 @@ def record_stage(config: DemoConfig) -> Stage:
         f"--num_episodes={config.num_demos}",
         f"--num_envs={config.demo_envs}",
         f"--seed={config.seed * SEED_STRIDE}",
-        *flags("env", {"type": "vtrefine"} | config.env),
+        *flags("env", {"type": "vtrefine"} | config.task),
         *flags("degradation", config.degradation),
     ]
     product = config.dataset_dir / "meta" / "info.json"
@@ -61,7 +61,7 @@ def evaluation_stage(config: DemoConfig, policy: str, ablation: str = "none") ->
         "lerobot-eval",
         f"--policy.path={config.checkpoint(policy)}",
         f"--policy.device={config.device}",
-        *flags("env", {"type": "vtrefine"} | config.env),
+        *flags("env", {"type": "vtrefine"} | config.task),
         f"--env.metrics_path={output / 'episodes.jsonl'}",
         f"--env.video_episodes={config.videos if ablation == 'none' else 0}",
         f"--eval.n_episodes={episodes}",

@@ -29,6 +29,12 @@ def mean_interval(values: Sequence[float]) -> tuple[float, float, float]:
     return mean, mean - half, mean + half
 
 
+def rate_interval(rates: Sequence[float]) -> tuple[float, float, float]:
+    """The same of rates of success, as far as one can lie in it."""
+    mean, low, high = mean_interval(rates)
+    return mean, max(low, 0.0), min(high, 1.0)
+
+
 def proportion(successes: int, trials: int) -> dict[str, object]:
     """``success``, ``episodes``, ``rate`` and ``ci95`` of a number of trials."""
     low, high = wilson_interval(successes, trials)

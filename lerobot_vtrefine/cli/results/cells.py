@@ -7,7 +7,7 @@ seed.
 from collections.abc import Iterator, Sequence
 from statistics import mean
 
-from lerobot_vtrefine.cli.report.statistics import mean_interval, wilson_interval
+from lerobot_vtrefine.cli.report.statistics import mean_interval, rate_interval, wilson_interval
 from lerobot_vtrefine.cli.results.rows import Run
 
 LABELS = {
@@ -117,8 +117,7 @@ def over_seeds(rows: Sequence[Run], unit: str = "") -> str:
     rates = [row.success for row in rows if row.seed is not None]
     if len(rates) < 2:
         return pooled(rows, unit=unit)
-    middle, *bounds = mean_interval(rates)
-    bounds = [min(max(bound, 0.0), 1.0) for bound in bounds]
+    middle, *bounds = rate_interval(rates)
     return f"{percent(middle)}{unit} {interval(*bounds)} ({', '.join(map(percent, rates))})"
 
 

@@ -103,9 +103,8 @@ def finetune_row(
     if (info := read_json_or_none(folder / "eval" / "eval_info.json")) is not None:
         outcomes = info["per_task"][0]["metrics"]["successes"]
         success, episodes = sum(map(bool, outcomes)) / len(outcomes), len(outcomes)
-    elif "eval_success" in progress[-1]:
-        success = progress[-1]["eval_success"]
-        episodes = evaluated_episodes(settings["eval"]["n_episodes"], settings["dppo"]["num_envs"])
+    elif "eval_episodes" in progress[-1]:
+        success, episodes = progress[-1]["eval_success"], int(progress[-1]["eval_episodes"])
     else:
         raise ValueError(f"{folder} was not evaluated; run lerobot-eval with --output_dir={folder / 'eval'}")
     saved = read_json_or_none(trained_policy(folder) / "config.json")
@@ -130,16 +129,11 @@ def finetune_row(
     return row, progress
 
 
-def evaluated_episodes(wanted: int, num_envs: int) -> int:
-    """Episodes of a run's own evaluation: whole batches of all environments."""
-    return -(-wanted // num_envs) * num_envs
-
-
 def earlier_rows(final: Run, progress: Progress) -> list[Run]:
     """The same run before its first iteration, and at the evaluation nearest to its middle, where it has
     them.
     """
-    evaluated = [row for row in progress[:-1] if "eval_success" in row]
+    evaluated = [row for row in progress[:-1] if "eval_episodes" in row]
     first = [row for row in evaluated if row["iteration"] == 0]
     middle = progress[-1]["iteration"] / 2
     between = sorted(
@@ -151,6 +145,7 @@ def earlier_rows(final: Run, progress: Progress) -> list[Run]:
             final,
             variant=", ".join(filter(None, (final.variant, name))),
             success=row["eval_success"],
+            episodes=int(row["eval_episodes"]),
             iterations=int(row["iteration"]),
             env_steps=int(row.get("env_steps", 0)),
             extra=handling(row),

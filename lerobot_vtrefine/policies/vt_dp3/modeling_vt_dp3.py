@@ -205,7 +205,8 @@ class VtDp3Policy(PreTrainedPolicy):
         known = batch.get(PERCEIVED_KEY)
         if known is None:
             known = model.encoder.perceive(model.encoder.inputs(batch))
-        noise = torch.randn_like(known[:, :1]) * known.detach().flatten(0, 1).std(0)
+        spread = known.detach().flatten(0, 1).std(0).nan_to_num()  # of a single frame there is none
+        noise = torch.randn_like(known[:, :1]) * spread
         return batch | {PERCEIVED_KEY: known + self.config.feature_noise * noise}
 
     def update(self) -> None:

@@ -13,6 +13,7 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
+from lerobot_vtrefine.cli.pipeline.demo_config import SEED_STRIDE
 from lerobot_vtrefine.envs.decisions import Decision
 from lerobot_vtrefine.finetune import dppo
 from lerobot_vtrefine.finetune.config import DppoConfig
@@ -173,4 +174,4 @@ def train_ours(args: argparse.Namespace, worlds: Worlds | SpreadWorlds, curve: C
         practice.fill(NUM_ENVS * N_STEPS, length)
 
     note(state, {})
-    dppo.train(practice, agent, state, cfg, seed=10_000_000 * args.seed, after_iteration=note)
+    dppo.train(practice, agent, state, cfg, seed=args.seed * SEED_STRIDE, after_iteration=note)

@@ -12,6 +12,7 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
+from lerobot_vtrefine.cli.pipeline.demo_config import SEED_STRIDE
 from lerobot_vtrefine.finetune.seeds import EVALUATION_SEEDS, TRAINING_SEEDS
 from reference.checkout import Reference, Settings
 from reference.hopper.curves import Curve
@@ -210,7 +211,7 @@ def train_reference(args: argparse.Namespace, worlds: Worlds | SpreadWorlds, cur
         num_envs=NUM_ENVS,
         n_steps=N_STEPS,
         val_freq=args.every + 1,
-        first_seed=10_000_000 * args.seed,
+        first_seed=args.seed * SEED_STRIDE,
     )
     reference = Reference(args.reference)
     torch.manual_seed(args.seed)

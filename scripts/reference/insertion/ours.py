@@ -8,6 +8,7 @@ import sys
 import time
 from typing import Any
 
+from lerobot_vtrefine.cli.pipeline.demo_config import SEED_STRIDE
 from lerobot_vtrefine.finetune import dppo
 from lerobot_vtrefine.finetune.config import DppoConfig
 from lerobot_vtrefine.finetune.evaluation import evaluate
@@ -49,5 +50,5 @@ def train_ours(name: str, args: argparse.Namespace) -> tuple[Practice, list[dict
 
     note(state, {})
     with contextlib.suppress(TimeIsUpError):
-        dppo.train(env, agent, state, cfg, seed=args.seed, after_iteration=note)
+        dppo.train(env, agent, state, cfg, seed=args.seed * SEED_STRIDE, after_iteration=note)
     return practice, curve

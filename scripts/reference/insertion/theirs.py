@@ -18,6 +18,7 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
+from lerobot_vtrefine.cli.pipeline.demo_config import SEED_STRIDE
 from lerobot_vtrefine.finetune import dppo
 from lerobot_vtrefine.finetune.pipeline import Practice, load_practice
 from lerobot_vtrefine.finetune.protocols import Agent, DecisionEnv, Observation
@@ -97,7 +98,8 @@ class ReferenceEnvs:
         self, env: DecisionEnv, agent: Agent, mean: Tensor, std: Tensor, args: argparse.Namespace
     ) -> None:
         self.env, self.agent, self.mean, self.std = env, agent, mean, std
-        self.seed, self.val_freq, self.seconds = args.seed, args.val_freq, 60 * args.minutes
+        self.first_seed = TRAINING_SEEDS + args.seed * SEED_STRIDE
+        self.val_freq, self.seconds = args.val_freq, 60 * args.minutes
         self.iteration, self.env_steps, self.began = -1, 0, time.perf_counter()
         self.curve: list[dict[str, float]] = []
         self.over = self.success = np.ones(env.num_envs, bool)
@@ -110,7 +112,7 @@ class ReferenceEnvs:
         self.iteration += 1
         held_out = self.iteration % self.val_freq == 0
         worlds = self.env.num_envs
-        first = EVALUATION_SEEDS if held_out else TRAINING_SEEDS + self.seed + self.iteration * worlds
+        first = EVALUATION_SEEDS if held_out else self.first_seed + self.iteration * worlds
         obs, privileged = self.env.reset(range(first, first + worlds))
         self.over, self.success = np.zeros((2, worlds), bool)
         return self._state(obs, privileged)
@@ -163,7 +165,7 @@ def train_reference(
     practice = load_practice(args.policy, args.task, cfg, args.device, args.backend)
     agent, env = practice.agent, practice.env
     generator = torch.Generator(agent.device).manual_seed(args.seed)
-    first = TRAINING_SEEDS + args.seed
+    first = TRAINING_SEEDS + args.seed * SEED_STRIDE
     seen = dppo.collect(env, agent, cfg, generator, range(first, first + args.worlds))
     mean, std = moments(seen)
     envs = ReferenceEnvs(env, agent, mean, std, args)
