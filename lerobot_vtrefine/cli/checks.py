@@ -9,6 +9,7 @@ import yaml
 
 from lerobot_vtrefine.cli.errors import CONFIG_FLAG, meant, values_of
 from lerobot_vtrefine.cli.flags import Flag, flags_of
+from lerobot_vtrefine.shipped import KINDS, PREFIX
 
 WANTED = {"env": "say which task, --config_path=vtrefine:NAME or --env.type=vtrefine."}
 """What to give for a group of flags."""
@@ -51,6 +52,8 @@ def _check_places(arguments: Sequence[str]) -> None:
     for flag in (*PATHS, *FOLDERS):
         for given in values_of(flag, arguments):
             if not Path(given).exists() and (flag in FOLDERS or not _may_be_on_the_hub(given)):
+                if flag in PATHS and given in KINDS[flag][1]():
+                    raise ValueError(f"no such file: {flag}={given}; did you mean {flag}={PREFIX}{given}?")
                 raise FileNotFoundError(errno.ENOENT, os.strerror(errno.ENOENT), f"{flag}={given}")
     for given in map(Path, values_of("--policy.path", arguments)):
         if given.exists() and not (given / "config.json").is_file():

@@ -4,9 +4,9 @@ import importlib
 import sys
 import textwrap
 from collections.abc import Callable
-from difflib import get_close_matches
 from functools import partial
 
+from lerobot_vtrefine.choices import did_you_mean
 from lerobot_vtrefine.cli.arguments import with_brackets
 from lerobot_vtrefine.cli.checks import check_arguments
 from lerobot_vtrefine.cli.errors import run_cli
@@ -72,7 +72,7 @@ def group_help(module: str, config: str, group: str) -> list[str]:
     known = groups | {flag.name for flag in every}
     if "=" in group or group in known or group.partition(".")[0] not in groups:
         return []
-    close = "".join(f"; did you mean {name}?" for name in get_close_matches(group, groups, 1))
+    close = did_you_mean(group, groups)
     raise ValueError(f"--help {group}: there is no such group of flags{close}; --help alone names them")
 
 

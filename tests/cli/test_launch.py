@@ -35,6 +35,15 @@ def test_an_unknown_name_lists_those_there_are() -> None:
         ValueError, match=r"vtrefine:rund: no such configuration; choose from .*round_grasped"
     ):
         shipped.expand(["--config_path=vtrefine:rund"])
+    with pytest.raises(ValueError, match=r"did you mean round_grasped\?$"):
+        shipped.expand(["--config_path=vtrefine:round_grapsed"])
+
+
+def test_a_name_without_its_prefix_is_recognised() -> None:
+    flags = flags_of(*FINETUNE)
+    for flag, name in (("--config_path", "round_grasped"), ("--policy.path", "square_grasped_1mm")):
+        with pytest.raises(ValueError, match=f"no such file: .*; did you mean {flag}=vtrefine:{name}"):
+            check_arguments(flags, [f"{flag}={name}"])
 
 
 def test_names_are_unambiguous() -> None:
@@ -256,7 +265,9 @@ def test_the_umbrella_runs_a_command_as_if_called_by_its_name(monkeypatch, capsy
     assert error.count("\n") == 1
     monkeypatch.setattr(sys, "argv", ["vtrefine", "diagnos"])
     assert umbrella.main() == 2
-    assert "unknown command 'diagnos'; choose from" in capsys.readouterr().err
+    error = capsys.readouterr().err
+    assert "unknown command 'diagnos'; choose from" in error
+    assert error.endswith("did you mean diagnose?\n")
 
 
 def test_stock_commands_get_the_path_when_they_discover_the_plugin(monkeypatch) -> None:
