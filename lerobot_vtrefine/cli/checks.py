@@ -39,8 +39,14 @@ def check_arguments(flags: Sequence[Flag], arguments: Sequence[str]) -> None:
 def _check_known(flags: Sequence[Flag], arguments: Sequence[str]) -> None:
     """Only the first part of a dotted name: what lies below depends on the types chosen."""
     known = {flag.name.partition(".")[0] for flag in flags} | set(BESIDE)
+    together = {flag.name for flag in flags if flag.type.startswith("dict")}
     for argument in arguments:
-        typed = argument.partition("=")[0]
+        typed, _, value = argument.partition("=")
+        name, *below = typed[2:].split(".")
+        if below and name in together:
+            for part in reversed(below):
+                value = f"{{{part}: {value}}}"
+            raise ValueError(f"this command takes all of --{name} at once: give --{name}='{value}'")
         if not typed.startswith("--") or typed[2:].partition(".")[0] in known:
             continue
         below = [inner.name for f in flags if f.group for inner in flags_of(*f.group, f"{f.name}.")]

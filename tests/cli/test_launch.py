@@ -197,11 +197,27 @@ def test_the_folder_of_a_checkpoint_or_of_a_run_is_told_where_its_policy_is(belo
 
 
 def test_a_value_that_cannot_be_decoded_is_one_line(monkeypatch, capsys, tmp_path: Path) -> None:
-    monkeypatch.setattr(sys, "argv", ["command", f"--root={tmp_path}", "--env.pair=round"])
+    monkeypatch.setattr(sys, "argv", ["command", f"--root={tmp_path}", "--env.fps=fast"])
     assert launch.record_demos() == 2
     error = capsys.readouterr().err
-    assert error.startswith("error: say which environment: --env.type=vtrefine")
+    assert error.startswith("error: `env.fps`: Couldn't parse 'fast' into an int")
     assert error.count("\n") == 1
+
+
+def test_a_setting_of_the_environment_says_its_type() -> None:
+    flags = flags_of(*RECORD)
+    given = ["--env.pair=key"]
+    assert launch.with_environment(given, flags) == ["--env.type=vtrefine", *given]
+    for said in (["--env.type=x"], ["--config_path=f.yaml"], ["--config_path", "f.yaml"]):
+        assert launch.with_environment([*said, *given], flags) == [*said, *given]
+    assert launch.with_environment(["--env.menagerie_dir=m"], flags) == ["--env.menagerie_dir=m"]
+    assert launch.with_environment(given, []) == given
+
+
+def test_settings_that_go_together_are_told_as_one_flag() -> None:
+    flags = flags_of("lerobot_vtrefine.cli.pipeline.demo_config", "DemoConfig")
+    with pytest.raises(ValueError, match=r"at once: give --env='\{scene: \{pair: key\}\}'$"):
+        check_arguments(flags, ["--env.scene.pair=key"])
 
 
 def test_help_goes_as_deep_as_one_asks(monkeypatch, capsys) -> None:
