@@ -199,6 +199,16 @@ def test_bad_scale_lists_the_choices(folder: Path) -> None:
         load_mesh_pair("automate/ring", folder, scale="big", progress=False)
 
 
+def test_the_page_makes_a_pair_that_fits(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    page = (Path(__file__).parents[2] / "docs" / "own-pair.md").read_text(encoding="utf-8")
+    snippet = page.partition("```python\n")[2].partition("```")[0]
+    monkeypatch.chdir(tmp_path)
+    exec(compile(snippet, "own-pair.md", "exec"), {})
+    fit = load_mesh_pair("automate/peg", tmp_path, progress=False).fit
+    assert fit.travel_m == pytest.approx(0.030, abs=3e-3)
+    assert fit.play_m == pytest.approx(0.0006, abs=1e-4)  # as the page says
+
+
 def test_own_parts_keep_their_size_unless_told_otherwise(folder: Path, ring: MeshPair) -> None:
     """Five pairs have factors of their own; whoever brings another pair need not know of them."""
     assert load_mesh_pair("automate/ring", folder, progress=False).fit == ring.fit
