@@ -13,6 +13,7 @@ from lerobot_vtrefine.cli.arguments import with_brackets
 from lerobot_vtrefine.cli.checks import check_arguments
 from lerobot_vtrefine.cli.flags import flags_of
 from lerobot_vtrefine.cli.pipeline.demo_config import DemoConfig
+from lerobot_vtrefine.lerobot_compat.registration import refuse_missing_dataset
 
 FINETUNE = ("lerobot_vtrefine.finetune.pipeline", "FinetunePipelineConfig")
 RECORD = ("lerobot_vtrefine.cli.record_demos", "RecordDemosConfig")
@@ -284,6 +285,22 @@ def test_the_umbrella_runs_a_command_as_if_called_by_its_name(monkeypatch, capsy
     error = capsys.readouterr().err
     assert "unknown command 'diagnos'; choose from" in error
     assert error.endswith("did you mean diagnose?\n")
+
+
+def test_a_local_dataset_that_is_not_there_is_named(monkeypatch, tmp_path: Path) -> None:
+    """LeRobot asks the Hub for it, and ends in a hundred lines about the network."""
+
+    def trains_on(root: Path, name: str, command: str = "lerobot-train") -> None:
+        line = [f"/bin/{command}", f"--dataset.root={root}", f"--dataset.repo_id={name}"]
+        monkeypatch.setattr(sys, "argv", line)
+        refuse_missing_dataset()
+
+    with pytest.raises(SystemExit, match=f"error: --dataset.root={tmp_path} holds no recorded episodes"):
+        trains_on(tmp_path, "local/demos")
+    trains_on(tmp_path, "USER/demos")  # downloaded to this folder
+    trains_on(tmp_path, "local/demos", "lerobot-record")
+    (tmp_path / "data").mkdir()
+    trains_on(tmp_path, "local/demos")
 
 
 def test_stock_commands_get_the_path_when_they_discover_the_plugin(monkeypatch) -> None:
