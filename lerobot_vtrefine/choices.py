@@ -1,6 +1,7 @@
 """One check, and one line, for values that must come from a list, and for network ports."""
 
 from collections.abc import Iterable
+from difflib import get_close_matches
 
 LARGEST_PORT = 65535
 
@@ -13,6 +14,11 @@ def check_choice(name: str, value: object, choices: Iterable[str], others: str =
     known = list(choices)
     if value not in known:
         raise ValueError(f"{name}={str(value)[:60]} is unknown; choose from {', '.join(known)}{others}")
+
+
+def did_you_mean(value: str, known: Iterable[str]) -> str:
+    """The end of a message about a name that is not known; empty where none is like it."""
+    return "".join(f"; did you mean {name}?" for name in get_close_matches(value, list(known), 1))
 
 
 def check_port(name: str, port: int) -> None:

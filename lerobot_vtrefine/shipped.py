@@ -12,6 +12,8 @@ import sys
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 
+from lerobot_vtrefine.choices import did_you_mean
+
 PREFIX = "vtrefine:"
 
 
@@ -82,5 +84,6 @@ def find(flag: str, name: str) -> Path:
     known = list_known()
     wanted = name.removeprefix(PREFIX)
     if wanted not in known:
-        raise ValueError(f"{flag}={name}: no such {kind}; choose from {', '.join(known)}")
+        listed = ", ".join(known) + did_you_mean(wanted, known)
+        raise ValueError(f"{flag}={name}: no such {kind}; choose from {listed}")
     return known[wanted]

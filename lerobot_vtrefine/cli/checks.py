@@ -9,6 +9,7 @@ import yaml
 
 from lerobot_vtrefine.cli.errors import CONFIG_FLAG, meant, values_of
 from lerobot_vtrefine.cli.flags import Flag, flags_of
+from lerobot_vtrefine.shipped import KINDS, PREFIX
 
 WANTED = {"env": "say which task, --config_path=vtrefine:NAME or --env.type=vtrefine."}
 """What to give for a group of flags."""
@@ -38,8 +39,14 @@ def check_arguments(flags: Sequence[Flag], arguments: Sequence[str]) -> None:
 def _check_known(flags: Sequence[Flag], arguments: Sequence[str]) -> None:
     """Only the first part of a dotted name: what lies below depends on the types chosen."""
     known = {flag.name.partition(".")[0] for flag in flags} | set(BESIDE)
+    together = {flag.name for flag in flags if flag.type.startswith("dict")}
     for argument in arguments:
-        typed = argument.partition("=")[0]
+        typed, _, value = argument.partition("=")
+        name, *below = typed[2:].split(".")
+        if below and name in together:
+            for part in reversed(below):
+                value = f"{{{part}: {value}}}"
+            raise ValueError(f"this command takes all of --{name} at once: give --{name}='{value}'")
         if not typed.startswith("--") or typed[2:].partition(".")[0] in known:
             continue
         below = [inner.name for f in flags if f.group for inner in flags_of(*f.group, f"{f.name}.")]
@@ -51,6 +58,8 @@ def _check_places(arguments: Sequence[str]) -> None:
     for flag in (*PATHS, *FOLDERS):
         for given in values_of(flag, arguments):
             if not Path(given).exists() and (flag in FOLDERS or not _may_be_on_the_hub(given)):
+                if flag in PATHS and given in KINDS[flag][1]():
+                    raise ValueError(f"no such file: {flag}={given}; did you mean {flag}={PREFIX}{given}?")
                 raise FileNotFoundError(errno.ENOENT, os.strerror(errno.ENOENT), f"{flag}={given}")
     for given in map(Path, values_of("--policy.path", arguments)):
         if given.exists() and not (given / "config.json").is_file():

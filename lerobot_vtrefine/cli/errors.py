@@ -9,13 +9,13 @@ import re
 import select
 import sys
 from collections.abc import Callable, Generator, Iterable, Sequence
-from difflib import get_close_matches
 from pathlib import Path
 from typing import NoReturn
 
 from draccus.utils import DraccusException
 from yaml import YAMLError
 
+from lerobot_vtrefine.choices import did_you_mean
 from lerobot_vtrefine.extras import explain
 from lerobot_vtrefine.files import check_settings
 from lerobot_vtrefine.shipped import expand
@@ -132,8 +132,7 @@ def meant(message: str, known: Iterable[str]) -> str:
     missing = message.startswith("the following arguments are required")  # perhaps because of a misspelt one
     text = " ".join(sys.argv[1:]) if missing else message.partition("unrecognized arguments")[2]
     typed = [flag for flag in re.findall(r"--[\w.-]+", text) if flag not in known]
-    found = [name for flag in typed for name in get_close_matches(flag, known, 1)]
-    return "".join(f"; did you mean {name}?" for name in found) or "; --help lists the flags"
+    return "".join(did_you_mean(flag, known) for flag in typed) or "; --help lists the flags"
 
 
 def _is_wrapper(error: DraccusException) -> bool:
@@ -174,12 +173,12 @@ def _argparse_in_one_line() -> Generator[None]:
 
 
 @contextlib.contextmanager
-def after_interrupt(advice: str) -> Generator[None]:
-    """Ctrl-C within is told together with how to go on."""
+def after_interrupt(advice: str | Callable[[], str]) -> Generator[None]:
+    """Ctrl-C within is told together with how to go on, which may depend on what was saved until then."""
     try:
         yield
     except KeyboardInterrupt:
-        raise KeyboardInterrupt(advice) from None
+        raise KeyboardInterrupt(advice if isinstance(advice, str) else advice()) from None
 
 
 def _nobody_reads() -> bool:

@@ -24,6 +24,7 @@ from lerobot_vtrefine.cli.pipeline.stages import trained_policy
 from lerobot_vtrefine.cli.report.results import verdict
 from lerobot_vtrefine.cli.report.statistics import proportion
 from lerobot_vtrefine.cli.results.provenance import write_provenance
+from lerobot_vtrefine.finetune.checkpoint import last_checkpoint
 from lerobot_vtrefine.finetune.logger import read_progress
 from lerobot_vtrefine.finetune.pipeline import FinetunePipelineConfig, run
 
@@ -34,7 +35,7 @@ LEROBOTS_SHARING = ("--push_to_hub=true", "--repo_id=")
 def finetune(cfg: FinetunePipelineConfig) -> None:
     """Parse the command line as LeRobot's commands do, and run."""
     _check_sharing(cfg)
-    with after_interrupt("the same command with --resume=true goes on from the last checkpoint"):
+    with after_interrupt(lambda: way_on(cfg)):
         run(cfg)
     write_provenance(cfg.output_dir)
     first = os.environ.get("RANK", "0") == "0"
@@ -47,6 +48,14 @@ def finetune(cfg: FinetunePipelineConfig) -> None:
         from lerobot_vtrefine.cli.card_evaluation import evaluate_and_push
 
         evaluate_and_push(cfg)
+
+
+def way_on(cfg: FinetunePipelineConfig) -> str:
+    """What to do after an interruption; before the first checkpoint there is nothing to go on from."""
+    last = last_checkpoint(cfg.output_dir)
+    if last is None:
+        return f"no checkpoint yet, by --save_freq={cfg.save_freq}; the same command begins anew"
+    return f"the same command with --resume=true goes on from iteration {int(last.name)}"
 
 
 def outcome(cfg: FinetunePipelineConfig) -> str:

@@ -3,14 +3,15 @@
 import importlib
 import sys
 import textwrap
-from collections.abc import Callable
-from difflib import get_close_matches
+from collections.abc import Callable, Sequence
 from functools import partial
 
+from lerobot_vtrefine.choices import did_you_mean
 from lerobot_vtrefine.cli.arguments import with_brackets
 from lerobot_vtrefine.cli.checks import check_arguments
-from lerobot_vtrefine.cli.errors import run_cli
+from lerobot_vtrefine.cli.errors import CONFIG_FLAG, run_cli
 from lerobot_vtrefine.cli.flags import Flag, describe_module, flags_of
+from lerobot_vtrefine.embodiments.menagerie import FLAG as LOOKS
 
 HELP_FLAGS = ("-h", "--help")
 WIDTH = 100
@@ -30,7 +31,9 @@ def launch(command: str, module: str, config: str) -> int:
         below = [line for group in groups for line in group_help(module, config, group)]
         print("\n".join(below) or help_text(name, module, config))
         return 0
-    check_arguments(flags_of(module, config, unused=True), sys.argv[1:])
+    known = flags_of(module, config, unused=True)
+    sys.argv[1:] = with_environment(sys.argv[1:], known)
+    check_arguments(known, sys.argv[1:])
     lists = {flag.name for flag in flags_of(module, config, nested=True) if flag.is_list}
     sys.argv[1:] = with_brackets(sys.argv[1:], lists)
     if sys.stderr.isatty():
@@ -40,6 +43,19 @@ def launch(command: str, module: str, config: str) -> int:
 
     with undecoded_values_raise():
         return main()
+
+
+def with_environment(arguments: Sequence[str], flags: Sequence[Flag]) -> list[str]:
+    """A command line that sets something of the environment, with the only type that commands here take.
+
+    How arms look (`LOOKS`) says nothing about it, and a file says it itself.
+    """
+    takes_one = any(flag.name == "env" and flag.group is not None for flag in flags)
+    given = {argument.partition("=")[0] for argument in arguments}
+    sets_it = any(name.startswith("--env.") and name != LOOKS for name in given)
+    if takes_one and sets_it and given.isdisjoint({"--env.type", CONFIG_FLAG}):
+        return ["--env.type=vtrefine", *arguments]
+    return list(arguments)
 
 
 def entry_point(command: str, module: str, config: str) -> Callable[[], int]:
@@ -72,7 +88,7 @@ def group_help(module: str, config: str, group: str) -> list[str]:
     known = groups | {flag.name for flag in every}
     if "=" in group or group in known or group.partition(".")[0] not in groups:
         return []
-    close = "".join(f"; did you mean {name}?" for name in get_close_matches(group, groups, 1))
+    close = did_you_mean(group, groups)
     raise ValueError(f"--help {group}: there is no such group of flags{close}; --help alone names them")
 
 

@@ -61,7 +61,7 @@ class PlayConfig:
     """Flags of ``vtrefine-play``."""
 
     env: EnvConfig | None = None
-    """What is played (--env.type=vtrefine ...); by default the round pair from the table, or what the dataset
+    """What is played (--env.pair=square ...); by default the round pair from the table, or what the dataset
     was recorded in."""
     agent: str = "expert"
     """expert, zero (the arms hold still) or random; a policy or a dataset comes first."""

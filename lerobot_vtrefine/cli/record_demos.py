@@ -137,8 +137,9 @@ def record(config: RecordDemosConfig) -> int:
                     break
                 if demos.num_episodes == 0 and attempts >= HOPELESS_ATTEMPTS:
                     raise ValueError(
-                        f"none of {attempts} attempts succeeded; use smaller --degradation.* errors,"
-                        " a larger --env.clearance_m, or --include_failures=true"
+                        f"none of {attempts} attempts succeeded; watch some by vtrefine-play --agent=expert"
+                        " with the same --env flags, or use smaller --degradation.* errors, a larger"
+                        " clearance, or --include_failures=true"
                     )
         return demos.num_episodes
 

@@ -55,7 +55,7 @@ class ReplayConfig:
     hold: str = "zero_order"
     """How arms alone approach a command: zero_order or linear."""
     env: EnvConfig | None = None
-    """The twin (--env.type=vtrefine ...); by default what a simulated dataset was recorded in."""
+    """The twin (--env.sensor_model=FILE ...); by default what a simulated dataset was recorded in."""
     video: bool = True
     """Draw the twin in the first episode, where there are parts."""
     overwrite: bool = False

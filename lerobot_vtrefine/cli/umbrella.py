@@ -10,6 +10,7 @@ examples:
 import sys
 from importlib.metadata import EntryPoint, distribution
 
+from lerobot_vtrefine.choices import did_you_mean
 from lerobot_vtrefine.cli.errors import run_cli
 from lerobot_vtrefine.cli.flags import describe_module
 from lerobot_vtrefine.shipped import PREFIX, names
@@ -74,7 +75,8 @@ def main() -> int:
         return 0
     known = commands()
     if name not in known:
-        raise ValueError(f"unknown command {name!r}; choose from {', '.join(known)}, configs")
+        listed = ", ".join([*known, "configs"]) + did_you_mean(name, [*known, "configs"])
+        raise ValueError(f"unknown command {name!r}; choose from {listed}")
     sys.argv = [COMMAND + name, *rest]
     return known[name].load()() or 0
 

@@ -16,6 +16,7 @@ from lerobot_vtrefine.cli.errors import run_cli
 from lerobot_vtrefine.cli.outputs import check_file
 from lerobot_vtrefine.embodiments import pad_layout_of
 from lerobot_vtrefine.tactile.layout import PadLayout
+from lerobot_vtrefine.view.rerun_viewer import import_rerun
 from lerobot_vtrefine.wording import plural
 
 DESCRIPTION = """\
@@ -58,10 +59,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     options = make_parser().parse_args(arguments)
     if (options.root is None) == (options.repo_id is None):
         raise ValueError("give either --dataset.root=DIR or --dataset.repo_id=NAME")
-    try:
-        import rerun as rr
-    except ImportError as error:
-        raise ImportError("vtrefine-view-data needs rerun: pip install 'lerobot[viz]'") from error
+    rr = import_rerun("vtrefine-view-data", options.save)
     if options.save is not None:
         check_file("--save", options.save)
     root = options.root or downloaded(options.repo_id)

@@ -29,6 +29,7 @@ from lerobot_vtrefine.drivers.pads_file import check_distinct_ports, load_pads
 from lerobot_vtrefine.drivers.ports import PortError
 from lerobot_vtrefine.drivers.serial_reader import RETRY_S
 from lerobot_vtrefine.tactile.picture import colours
+from lerobot_vtrefine.view.rerun_viewer import import_rerun
 
 DESCRIPTION = "Show FlexiTac pads live, row 0 at the top, column 0 at the left."
 EPILOG = """\
@@ -139,6 +140,8 @@ def main(arguments: Sequence[str] | None = None) -> None:
     if options.diagnostic:
         view_taxel(options.diagnostic, options.channel, options.column, options.seconds)
         return
+    in_rerun = options.rerun or options.save is not None
+    rr = import_rerun("vtrefine-view-pads with --rerun or --save", options.save) if in_rerun else None
     with ExitStack() as stack:
         readers = [PadReader(config, name) for name, config in chosen_pads(options).items()]
         for reader in readers:
@@ -146,7 +149,9 @@ def main(arguments: Sequence[str] | None = None) -> None:
             stack.callback(reader.stop)
         print("leave the pads untouched for a moment", file=sys.stderr)
         idle = {reader.name: reader.idle_counts() for reader in readers}
-        show = rerun_view(options.save, stack) if options.rerun or options.save else terminal_view(stack)
+        show = terminal_view(stack) if rr is None else rerun_view(rr, options.save, stack)
+        if options.save is not None:
+            print(f"writing {options.save}; Ctrl-C ends it", file=sys.stderr)
         started = time.monotonic()
         while not options.seconds or time.monotonic() - started < options.seconds:
             show(readers, idle)
@@ -221,16 +226,8 @@ def _strongest(counts: NDArray[np.uint8], idle: NDArray[np.uint8]) -> str:
     return f"at most {above.max()} counts above idle (row {row}, column {column})"
 
 
-def rerun_view(save: Path | None, stack: ExitStack) -> Any:
-    """A function that sends all pads to the rerun viewer, or to a file.
-
-    Raises:
-        ImportError: rerun is not installed.
-    """
-    try:
-        import rerun as rr
-    except ImportError as error:
-        raise ImportError("--rerun and --save need rerun: pip install 'lerobot[viz]'") from error
+def rerun_view(rr: Any, save: Path | None, stack: ExitStack) -> Any:
+    """A function that sends all pads to the rerun viewer, or to a file."""
     rr.init("vtrefine-view-pads", spawn=save is None)
     if save is not None:
         rr.save(save)

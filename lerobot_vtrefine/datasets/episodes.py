@@ -73,8 +73,10 @@ class EpisodeFolder:
         """The given episodes, all by default, in the order of their index.
 
         Raises:
-            ValueError: an episode that the dataset does not have, or a file that cannot be read.
+            ValueError: there is no episode yet, or not this one, or a file that cannot be read.
         """
+        if self.num_episodes == 0:
+            raise ValueError(f"{self.root} holds no episode yet; record one first")
         wanted = range(self.num_episodes) if episodes is None else sorted(set(episodes))
         for index in wanted:
             if not 0 <= index < self.num_episodes:

@@ -366,7 +366,8 @@ def run(cfg: FinetunePipelineConfig) -> None:
     policy = load_policy(path)
     if checkpoint is None and policy.config.ft_denoising_steps:
         raise ValueError(
-            f"{path} is fine-tuned already; start from the pre-trained checkpoint, or --resume=true"
+            f"{path} is fine-tuned already; start from the pre-trained checkpoint, or go on with its run by"
+            " --resume=true --output_dir=FOLDER"
         )
     device = torch.device(policy.config.device or "cpu")
     join_ranks(device)

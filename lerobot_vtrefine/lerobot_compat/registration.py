@@ -6,6 +6,8 @@ is loaded already, as in its own commands when they discover plugins.
 """
 
 import importlib
+import sys
+from pathlib import Path
 
 LEROBOT = "lerobot"
 REGISTERING = (
@@ -17,6 +19,9 @@ REGISTERING = (
 )
 """Packages whose import registers their types."""
 READER = "lerobot_vtrefine.lerobot_compat.fast_reader"
+LOCAL = "local/"
+"""Names of datasets that are on no Hub."""
+READ_DATASETS = ("lerobot-train", "lerobot-replay")
 
 
 def register() -> None:
@@ -27,3 +32,16 @@ def register() -> None:
     for name in REGISTERING:
         importlib.import_module(name)
     importlib.import_module(READER).install()
+
+
+def refuse_missing_dataset() -> None:
+    """Name the folder where LeRobot would ask the Hub for a dataset of this machine, as after a typo.
+
+    Raises:
+        SystemExit: the command line names a local dataset, in a folder without episodes.
+    """
+    given = dict(argument.partition("=")[::2] for argument in sys.argv[1:])
+    root, name = given.get("--dataset.root"), given.get("--dataset.repo_id", "")
+    reads = Path(sys.argv[0]).name in READ_DATASETS and name.startswith(LOCAL)
+    if reads and root and not (Path(root) / "data").is_dir():
+        raise SystemExit(f"error: --dataset.root={root} holds no recorded episodes (there is no {root}/data)")

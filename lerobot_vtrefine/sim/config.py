@@ -45,7 +45,8 @@ class SceneConfig:
     mesh_dir: Path | None = None
     """Folder with {ID}_plug.obj and {ID}_socket.obj, for automate/ID."""
     mesh_scale: str = "flexitac"
-    """flexitac (that setup's factors for its five pairs), unit, or one factor for both parts."""
+    """flexitac (that setup's factors for its five pairs, 1 for any other), unit, or one factor for both
+    parts."""
     timestep_s: float = 0.0025
     """Longest physics step. What is rigid stays as stiff in any, see `sim.rigid`. Where control steps are no
     whole number of these, --env.fps shortens it."""

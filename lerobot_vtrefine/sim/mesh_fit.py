@@ -52,7 +52,8 @@ def measure_fit(plug: list[Array], socket: list[Array]) -> MeshFit:
     probe = _OverlapProbe(plug, socket)
     if probe.overlap(np.zeros(3)) > 2 * _OVERLAP_M + 2e-4:
         raise ValueError(
-            "the two meshes overlap in the assembled pose (identity); check the files' frame and mesh_scale"
+            "the two meshes overlap in the assembled pose, as which the files are read; check their common"
+            " frame and --env.scene.mesh_scale"
         )
     exits = {sign: _free_travel(probe, sign) for sign in (1.0, -1.0)}
     sign, travel = min(exits.items(), key=lambda item: item[1])

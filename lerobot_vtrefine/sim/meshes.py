@@ -110,9 +110,9 @@ def load_mesh_pair(
 ) -> MeshPair:
     """Load `automate/ID` from `mesh_dir`, cut (or from the cache) and measured.
 
-    `scale` is "flexitac" (the table above), "unit", or one factor for both parts. Raises FileNotFoundError
-    for a missing folder or ID, ValueError for a mesh that is not solid or of an implausible size, ImportError
-    without the `assets` extra; each with one line that says what to do.
+    `scale` is "flexitac" (the table above, 1 for other parts), "unit", or one factor for both parts.
+    Raises FileNotFoundError for a missing folder or ID, ValueError for a mesh that is not solid or of an
+    implausible size, ImportError without the `assets` extra; each with one line that says what to do.
     """
     mesh_id = name.removeprefix(PREFIX)
     if mesh_dir is None:
@@ -135,15 +135,10 @@ def load_mesh_pair(
 
 def part_scales(mesh_id: str, scale: str | float) -> MeshScale:
     """Return the factors of both parts for `scale`; ValueError lists the choices."""
-    if scale == "flexitac":
-        if mesh_id not in FLEXITAC_SCALES:
-            known = ", ".join(sorted(FLEXITAC_SCALES))
-            raise ValueError(
-                f"mesh_scale=flexitac knows only {known}; for {mesh_id} pass mesh_scale=unit or a factor"
-            )
+    if scale == "flexitac" and mesh_id in FLEXITAC_SCALES:
         return FLEXITAC_SCALES[mesh_id]
     try:
-        factor = 1.0 if scale == "unit" else float(scale)
+        factor = 1.0 if scale in ("flexitac", "unit") else float(scale)
     except ValueError:
         raise ValueError(f"mesh_scale must be flexitac, unit or a factor, not {scale!r}") from None
     if not factor > 0:
@@ -206,7 +201,7 @@ def _surface(path: Path, factors: Array) -> Surface:
     if not low <= largest <= high:
         raise ValueError(
             f"{path}: {1e3 * largest:.1f} mm long after scaling, outside {1e3 * low:.0f}-"
-            f"{1e3 * high:.0f} mm; set mesh_scale"
+            f"{1e3 * high:.0f} mm; set --env.scene.mesh_scale"
         )
     return vertices, np.asarray(mesh.faces, np.int64)
 

@@ -13,6 +13,7 @@ from lerobot_vtrefine.cli.arguments import with_brackets
 from lerobot_vtrefine.cli.checks import check_arguments
 from lerobot_vtrefine.cli.flags import flags_of
 from lerobot_vtrefine.cli.pipeline.demo_config import DemoConfig
+from lerobot_vtrefine.lerobot_compat.registration import refuse_missing_dataset
 
 FINETUNE = ("lerobot_vtrefine.finetune.pipeline", "FinetunePipelineConfig")
 RECORD = ("lerobot_vtrefine.cli.record_demos", "RecordDemosConfig")
@@ -35,6 +36,15 @@ def test_an_unknown_name_lists_those_there_are() -> None:
         ValueError, match=r"vtrefine:rund: no such configuration; choose from .*round_grasped"
     ):
         shipped.expand(["--config_path=vtrefine:rund"])
+    with pytest.raises(ValueError, match=r"did you mean round_grasped\?$"):
+        shipped.expand(["--config_path=vtrefine:round_grapsed"])
+
+
+def test_a_name_without_its_prefix_is_recognised() -> None:
+    flags = flags_of(*FINETUNE)
+    for flag, name in (("--config_path", "round_grasped"), ("--policy.path", "square_grasped_1mm")):
+        with pytest.raises(ValueError, match=f"no such file: .*; did you mean {flag}=vtrefine:{name}"):
+            check_arguments(flags, [f"{flag}={name}"])
 
 
 def test_names_are_unambiguous() -> None:
@@ -188,11 +198,27 @@ def test_the_folder_of_a_checkpoint_or_of_a_run_is_told_where_its_policy_is(belo
 
 
 def test_a_value_that_cannot_be_decoded_is_one_line(monkeypatch, capsys, tmp_path: Path) -> None:
-    monkeypatch.setattr(sys, "argv", ["command", f"--root={tmp_path}", "--env.pair=round"])
+    monkeypatch.setattr(sys, "argv", ["command", f"--root={tmp_path}", "--env.fps=fast"])
     assert launch.record_demos() == 2
     error = capsys.readouterr().err
-    assert error.startswith("error: say which environment: --env.type=vtrefine")
+    assert error.startswith("error: `env.fps`: Couldn't parse 'fast' into an int")
     assert error.count("\n") == 1
+
+
+def test_a_setting_of_the_environment_says_its_type() -> None:
+    flags = flags_of(*RECORD)
+    given = ["--env.pair=key"]
+    assert launch.with_environment(given, flags) == ["--env.type=vtrefine", *given]
+    for said in (["--env.type=x"], ["--config_path=f.yaml"], ["--config_path", "f.yaml"]):
+        assert launch.with_environment([*said, *given], flags) == [*said, *given]
+    assert launch.with_environment(["--env.menagerie_dir=m"], flags) == ["--env.menagerie_dir=m"]
+    assert launch.with_environment(given, []) == given
+
+
+def test_settings_that_go_together_are_told_as_one_flag() -> None:
+    flags = flags_of("lerobot_vtrefine.cli.pipeline.demo_config", "DemoConfig")
+    with pytest.raises(ValueError, match=r"at once: give --env='\{scene: \{pair: key\}\}'$"):
+        check_arguments(flags, ["--env.scene.pair=key"])
 
 
 def test_help_goes_as_deep_as_one_asks(monkeypatch, capsys) -> None:
@@ -256,7 +282,25 @@ def test_the_umbrella_runs_a_command_as_if_called_by_its_name(monkeypatch, capsy
     assert error.count("\n") == 1
     monkeypatch.setattr(sys, "argv", ["vtrefine", "diagnos"])
     assert umbrella.main() == 2
-    assert "unknown command 'diagnos'; choose from" in capsys.readouterr().err
+    error = capsys.readouterr().err
+    assert "unknown command 'diagnos'; choose from" in error
+    assert error.endswith("did you mean diagnose?\n")
+
+
+def test_a_local_dataset_that_is_not_there_is_named(monkeypatch, tmp_path: Path) -> None:
+    """LeRobot asks the Hub for it, and ends in a hundred lines about the network."""
+
+    def trains_on(root: Path, name: str, command: str = "lerobot-train") -> None:
+        line = [f"/bin/{command}", f"--dataset.root={root}", f"--dataset.repo_id={name}"]
+        monkeypatch.setattr(sys, "argv", line)
+        refuse_missing_dataset()
+
+    with pytest.raises(SystemExit, match=f"error: --dataset.root={tmp_path} holds no recorded episodes"):
+        trains_on(tmp_path, "local/demos")
+    trains_on(tmp_path, "USER/demos")  # downloaded to this folder
+    trains_on(tmp_path, "local/demos", "lerobot-record")
+    (tmp_path / "data").mkdir()
+    trains_on(tmp_path, "local/demos")
 
 
 def test_stock_commands_get_the_path_when_they_discover_the_plugin(monkeypatch) -> None:

@@ -102,6 +102,15 @@ def test_what_cannot_be_replayed(joints_only: Path, tmp_path: Path, change: dict
     assert not (tmp_path / "out").exists()
 
 
+def test_a_dataset_without_episodes_is_told(joints_only: Path, tmp_path: Path) -> None:
+    """As a recording leaves it whose robot did not connect."""
+    info = json.loads((joints_only / "meta" / "info.json").read_text()) | {"total_episodes": 0}
+    (tmp_path / "empty" / "meta").mkdir(parents=True)
+    (tmp_path / "empty" / "meta" / "info.json").write_text(json.dumps(info))
+    with pytest.raises(ValueError, match="empty holds no episode yet"):
+        replay(ReplayConfig(tmp_path / "out", SourceConfig(tmp_path / "empty")))
+
+
 def test_the_twin_runs_at_the_datasets_rate(tmp_path: Path) -> None:
     still = np.tile(ROBOT.home, (4, 1)).astype(np.float32)
     write_dataset([JointEpisode(still, still)], ROBOT.joint_names, tmp_path / "fast", "local/fast", 30, "x")

@@ -9,7 +9,7 @@ import pytest
 import torch
 from PIL import Image
 
-from lerobot_vtrefine.cli import view_data
+from lerobot_vtrefine.cli import view_data, view_pads
 from lerobot_vtrefine.cli.report.cloud import body_of, build_cloud, recorded_cloud
 from lerobot_vtrefine.cli.view_data import cloud_colours, clouds_of, pad_picture
 from lerobot_vtrefine.datasets.features import DEPTH_KEY, STATE_KEY, raw_to_frame
@@ -18,6 +18,7 @@ from lerobot_vtrefine.envs import VtRefineEnvConfig
 from lerobot_vtrefine.envs.live_world import LiveWorld
 from lerobot_vtrefine.sim.config import SceneConfig
 from lerobot_vtrefine.tactile.layout import PadLayout
+from lerobot_vtrefine.view import rerun_viewer
 
 
 def test_pads_cloud_and_motion_are_saved(tiny_dataset: Path, tmp_path: Path, capsys) -> None:
@@ -90,3 +91,18 @@ def test_a_file_that_a_full_disk_cut_off_is_told(
     monkeypatch.setattr(view_data.shutil, "disk_usage", lambda _: SimpleNamespace(free=0))
     assert view_data.main([f"--dataset.root={tiny_dataset}", f"--save={tmp_path / 'x.rrd'}"]) == 2
     assert "error: the disk is full while writing" in capsys.readouterr().err
+
+
+def test_a_missing_display_is_told_before_anything_is_opened(tiny_dataset: Path, monkeypatch, capsys) -> None:
+    """rerun only logs that its viewer did not start, and programs that send to it wait for ever."""
+    pytest.importorskip("rerun")
+    monkeypatch.setattr(rerun_viewer.sys, "platform", "linux")
+    for name in ("DISPLAY", "WAYLAND_DISPLAY"):
+        monkeypatch.delenv(name, raising=False)
+    monkeypatch.setattr(rerun_viewer, "_viewer_listens", lambda: False)
+    shown = [f"--dataset.root={tiny_dataset}"], ["--ports", "nowhere", "--rerun"]
+    for main, arguments in zip((view_data.main, view_pads.main), shown, strict=True):
+        assert main(arguments) == 2
+        error = capsys.readouterr().err
+        assert error.startswith("error: there is no display for the rerun viewer: write a file with --save=")
+        assert error.count("\n") == 1

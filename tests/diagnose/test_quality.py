@@ -301,6 +301,15 @@ def test_sound_robot_set_is_left_alone(tmp_path):
     assert left.trials == recordings.trials
 
 
+def test_joints_that_hold_still_are_not_told_as_swapped(tmp_path):
+    """As the arm that holds the socket in an insertion: load moves it, by as much as its commands."""
+    header, columns = make_robot_set()
+    held = columns[BAD]["command"][:, :2] * 5e-3
+    columns[BAD]["command"][:, :2] = held
+    columns[BAD]["position"][:, :2] = held[:, ::-1]
+    assert checked(tmp_path, header, columns)[2] == []
+
+
 @pytest.mark.parametrize(
     ("change", "words", "action"),
     [

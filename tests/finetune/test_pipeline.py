@@ -13,6 +13,7 @@ from lerobot.configs import PreTrainedConfig
 from safetensors.torch import load_file
 from tiny_policy import ReachEnv, save_tiny_checkpoint
 
+from lerobot_vtrefine.cli import finetune as command
 from lerobot_vtrefine.cli.finetune import main
 from lerobot_vtrefine.cli.results.collect import run_rows
 from lerobot_vtrefine.cli.results.provenance import commit, machine
@@ -387,3 +388,20 @@ def test_pickles_and_damaged_files_in_a_checkpoint_are_one_line(finetune, tmp_pa
         file.write_bytes(sound)
     assert not marker.exists()
     assert finetune(run, "--resume=true", iterations=2) == 0
+
+
+@pytest.mark.parametrize(
+    ("last", "told"),
+    [
+        (None, "no checkpoint yet, by --save_freq=10; the same command begins anew"),
+        (Path("checkpoints/000010"), "the same command with --resume=true goes on from iteration 10"),
+    ],
+)
+def test_an_interrupted_run_says_what_is_left_of_it(finetune, tmp_path, monkeypatch, capsys, last, told):
+    def interrupted(cfg):
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(command, "run", interrupted)
+    monkeypatch.setattr(command, "last_checkpoint", lambda folder: last)
+    assert finetune(tmp_path / "run", "--save_freq=10") == 130
+    assert capsys.readouterr().err.splitlines()[-1] == f"interrupted: {told}"

@@ -204,12 +204,24 @@ def test_scale_that_no_hand_can_hold_is_refused(folder: Path) -> None:
         load_mesh_pair("automate/ring", folder, scale=20.0, progress=False)
 
 
-@pytest.mark.parametrize(
-    ("scale", "message"), [("flexitac", "knows only 00007"), ("big", "flexitac, unit or a factor")]
-)
-def test_bad_scale_lists_the_choices(folder: Path, scale: str, message: str) -> None:
-    with pytest.raises(ValueError, match=message):
-        load_mesh_pair("automate/ring", folder, scale=scale, progress=False)
+def test_bad_scale_lists_the_choices(folder: Path) -> None:
+    with pytest.raises(ValueError, match="flexitac, unit or a factor"):
+        load_mesh_pair("automate/ring", folder, scale="big", progress=False)
+
+
+def test_the_page_makes_a_pair_that_fits(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    page = (Path(__file__).parents[2] / "docs" / "own-pair.md").read_text(encoding="utf-8")
+    snippet = page.partition("```python\n")[2].partition("```")[0]
+    monkeypatch.chdir(tmp_path)
+    exec(compile(snippet, "own-pair.md", "exec"), {})
+    fit = load_mesh_pair("automate/peg", tmp_path, progress=False).fit
+    assert fit.travel_m == pytest.approx(0.030, abs=3e-3)
+    assert fit.play_m == pytest.approx(0.0006, abs=1e-4)  # as the page says
+
+
+def test_own_parts_keep_their_size_unless_told_otherwise(folder: Path, ring: MeshPair) -> None:
+    """Five pairs have factors of their own; whoever brings another pair need not know of them."""
+    assert load_mesh_pair("automate/ring", folder, progress=False).fit == ring.fit
 
 
 def test_overlapping_parts_are_refused(tmp_path: Path, folder: Path) -> None:

@@ -6,7 +6,15 @@ import numpy as np
 from scipy.optimize import linear_sum_assignment
 
 from lerobot_vtrefine.diagnose.quality.edits import KEPT, SET_ASIDE, Finding
-from lerobot_vtrefine.diagnose.quality.rules import BETTER_ORDER, EXCHANGED, JUMP_RAD, MINORITY, MOVES, STILL
+from lerobot_vtrefine.diagnose.quality.rules import (
+    BETTER_ORDER,
+    EXCHANGED,
+    JUMP_RAD,
+    MINORITY,
+    MOVES,
+    STILL,
+    SWAP_SHOWS,
+)
 from lerobot_vtrefine.diagnose.recordings import RecordingSet, RobotTrial
 
 
@@ -68,7 +76,7 @@ def check_joint_order(recordings: RecordingSet) -> Iterator[Finding]:
 def _exchanged(trial: RobotTrial, recordings: RecordingSet) -> str | None:
     """Names of joints whose encoders are swapped in a trial, or None."""
     command, position = trial.command, trial.position
-    joints = np.flatnonzero((np.ptp(command, axis=0) > 1e-3) & (np.ptp(position, axis=0) > 1e-6))
+    joints = np.flatnonzero((np.ptp(command, axis=0) > SWAP_SHOWS) & (np.ptp(position, axis=0) > 1e-6))
     if len(joints) < 2:
         return None
     normal = [values[:, joints] - values[:, joints].mean(axis=0) for values in (position, command)]

@@ -123,5 +123,8 @@ MIN_SHARE = 0.1
 MOVES, STILL = 0.1, 1e-3
 """A joint moves in a trial if its command's range is this part of its largest range in the set; an encoder
 sticks if its range is below this part of the command's."""
+SWAP_SHOWS = 5e-3
+"""Commands must move joints this far [rad, m] for encoders to be told as swapped: a hand that only
+holds a part is moved by its load as much as by commands, in any direction."""
 JUMP_RAD = 1.0
 """No joint moves further between two frames, unless its command does."""
