@@ -5,8 +5,8 @@ from pathlib import Path
 import numpy as np
 
 from lerobot_vtrefine.sim.hulls import small_hull
-from lerobot_vtrefine.sim.meshes import MeshPair, MeshPart, load_mesh_pair
 from lerobot_vtrefine.sim.mesh_skin import sampled
+from lerobot_vtrefine.sim.meshes import MeshPair, MeshPart, load_mesh_pair
 from lerobot_vtrefine.sim.parts import Grip, Part, PartPair
 from lerobot_vtrefine.tactile.geometry import ConvexHull, TriangleMesh
 
