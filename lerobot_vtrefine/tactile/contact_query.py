@@ -71,6 +71,9 @@ def _silent_native_stderr() -> Generator[None]:
 
 @dataclass(eq=False)
 class _Buffers:
+    """For so many environments and pads."""
+
+    shape: tuple[int, int]
     views: Any
     depth: wp.array
     rate: wp.array
@@ -106,7 +109,7 @@ class ContactQuery:
         for name in UPLOADED:
             setattr(self.bodies, name, self._upload(getattr(self._packed, name)))
         self._has_grids = not (self._packed.kind == TriangleMesh.kind).any()
-        self._scratch: dict[tuple[int, int], _Buffers] = {}
+        self._scratch: _Buffers | None = None
         self._wrapped: tuple[Any, Any] = (None, None)
         self._room: wp.array | None = None
 
@@ -117,7 +120,9 @@ class ContactQuery:
         return wp.array(array, dtype=types[array.shape[1:]], device=self.device)
 
     def _buffers(self, envs: int, pads: int) -> _Buffers:
-        if (envs, pads) not in self._scratch:
+        """Those of the last call, where it was for as many: a set for each number of environments that are
+        still running would fill a GPU."""
+        if self._scratch is None or self._scratch.shape != (envs, pads):
             primitives, planes = (envs, pads, self._num_primitives), (envs, pads, max(self._num_planes, 1))
             taxels = (envs, pads, self.rows * self.cols)
             views = kernels.Views()
@@ -132,12 +137,13 @@ class ContactQuery:
             views.counts = wp.zeros(primitives, dtype=kernels.ivec2, device=self.device)
             views.forms = wp.zeros(planes, dtype=wp.vec4, device=self.device)
             views.rates = wp.zeros(planes, dtype=wp.vec4, device=self.device)
-            self._scratch[envs, pads] = _Buffers(
+            self._scratch = _Buffers(
+                shape=(envs, pads),
                 views=views,
                 depth=wp.zeros(taxels, dtype=float, device=self.device),
                 rate=wp.zeros(taxels, dtype=float, device=self.device),
             )
-        return self._scratch[envs, pads]
+        return self._scratch
 
     def _lattice(self, mode: str, skip_unloaded: bool) -> Any:
         lattice = kernels.Lattice()
@@ -212,7 +218,7 @@ class ContactQuery:
     def window(self, envs: int, pads: int) -> wp.array:
         """Lattice areas (row begin, end, column begin, end) of the primitives in reach at the last call: (m,
         P, K)."""
-        return self._scratch[envs, pads].views.window
+        return self._buffers(envs, pads).views.window
 
     def room(self, pads: int, points: int) -> wp.array:
         """Scratch for `pads` lattices on CUDA, where a multiprocessor's memory has not the `points` that one

@@ -37,9 +37,9 @@ class ContactSolver:
         self.layout, self.query, self.device = layout, query, query.device
         offsets = np.arange(query.cols) // query.subdivision - (layout.cols - 1) / 2
         self._taxel_x = wp.array(offsets.astype(np.float32), dtype=float, device=self.device)
-        self._forces: dict[tuple[int, int], tuple[wp.array, wp.array]] = {}
+        self._forces: tuple[wp.array, wp.array] | None = None
         self._scratch: dict[int, wp.array] = {}
-        self._constants: dict[tuple[float, int], wp.array] = {}
+        self._constants: dict[float, wp.array] = {}
 
     def foundation(
         self,
@@ -115,17 +115,19 @@ class ContactSolver:
         if isinstance(values, torch.Tensor):
             values = values.to(self.device, torch.float32).reshape(-1).expand(envs)
             return wp.from_torch(values.contiguous())
-        if (values, envs) not in self._constants:
-            self._constants[values, envs] = wp.full(envs, values, dtype=float, device=self.device)
-        return self._constants[values, envs]
+        known = self._constants.get(values)
+        if known is None or len(known) != envs:
+            known = self._constants[values] = wp.full(envs, values, dtype=float, device=self.device)
+        return known
 
     def _results(self, envs: int, pads: int) -> tuple[wp.array, wp.array]:
-        if (envs, pads) not in self._forces:
-            self._forces[envs, pads] = (
+        """Room for forces and solutions; that of the last call, where it was for as many."""
+        if self._forces is None or self._forces[1].shape != (envs, pads):
+            self._forces = (
                 wp.zeros((envs, pads, self.layout.num_taxels), dtype=float, device=self.device),
                 wp.zeros((envs, pads), dtype=wp.vec3, device=self.device),
             )
-        return self._forces[envs, pads]
+        return self._forces
 
     def _buffer(self, number: int) -> wp.array:
         """Scratch on CPU, one lattice for each thread."""

@@ -1,8 +1,11 @@
 """The load-consistent foundation against exact Winkler solutions and the load, and Hertz by a half-space."""
 
+import gc
+
 import numpy as np
 import pytest
 import torch
+import warp as wp
 from scipy.integrate import dblquad
 from scipy.optimize import brentq
 from touch_shapes import hexagon, random_rotation, ring_mesh, single_query
@@ -90,6 +93,24 @@ def test_delta_of_a_sphere() -> None:
     _, solution = ContactSolver(LAYOUT, query).foundation(poses, load, stiffness, torch.zeros(1))
     assert np.isclose(float(solution[0, 0, 0]) + 3e-4, delta, rtol=0.01)
     assert np.allclose(solution[0, 0, 1:], 0, atol=1e-5)
+
+
+def test_room_for_other_numbers_of_environments_is_let_go() -> None:
+    """Worlds whose episodes end leave fewer and fewer: room for each number filled a GPU."""
+    query = ContactQuery(LAYOUT, [BodyGeometry([Sphere(0.01)])])
+    solver = ContactSolver(LAYOUT, query)
+
+    def arrays_after(count: int) -> int:
+        zeros, eye = np.zeros((count, 1, 6)), np.broadcast_to(np.eye(3), (count, 1, 3, 3))
+        poses = Poses(zeros[..., :3], eye, zeros, np.full((count, 1, 3), 0.009), eye, zeros)
+        tensors = tuple(torch.as_tensor(pose.copy()) for pose in poses)
+        solver.foundation(tensors, torch.ones((count, 1, 3)), 2.0, 0.0)
+        query("column", *tensors)
+        gc.collect()
+        return sum(isinstance(item, wp.array) for item in gc.get_objects())
+
+    first = arrays_after(1)
+    assert [arrays_after(count) - first for count in (2, 5, 3, 2)] == [0, 0, 0, 0]
 
 
 def test_flat_box_is_uniform() -> None:
