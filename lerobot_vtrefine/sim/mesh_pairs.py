@@ -3,6 +3,7 @@
 from pathlib import Path
 
 import numpy as np
+from numpy.typing import NDArray
 
 from lerobot_vtrefine.sim.hulls import small_hull
 from lerobot_vtrefine.sim.mesh_skin import sampled
@@ -14,6 +15,7 @@ MIN_GRIP_M = 0.020  # a free stretch shorter than this is not worth gripping
 MAX_GRIP_M = 0.040
 PAD_M = 0.026  # along the axis
 WIDEST_M = 1e-3  # what stands back by no more is pressed, too
+MOVES = 4
 SAMPLES = 20_000
 
 
@@ -41,9 +43,10 @@ def make_parts(pair: MeshPair) -> PartPair:
 
 
 def _part(part: MeshPart, middle_z_m: float, span_m: tuple[float, float]) -> Part:
-    middle_z_m = _widest_z(part, middle_z_m)
+    points = np.vstack([part.vertices, sampled((part.vertices, part.faces), SAMPLES)[0]])
+    middle_z_m = _widest_z(points, middle_z_m)
     half_z = min(middle_z_m - span_m[0], span_m[1] - middle_z_m)
-    gripped = part.vertices[np.abs(part.vertices[:, 2] - middle_z_m) <= half_z + 1e-6]
+    gripped = points[np.abs(points[:, 2] - middle_z_m) <= half_z + 1e-6]
     low, high = gripped[:, :2].min(0), gripped[:, :2].max(0)
     centre, half = (low + high) / 2, (high - low) / 2
     grip = Grip((float(centre[0]), float(centre[1]), middle_z_m), (float(half[0]), float(half[1]), half_z))
@@ -57,13 +60,17 @@ def _part(part: MeshPart, middle_z_m: float, span_m: tuple[float, float]) -> Par
     )
 
 
-def _widest_z(part: MeshPart, middle_z_m: float) -> float:
-    """Middle of what pads around `middle_z_m` press, where the part is widest: a cap, and not its stem."""
-    points, _ = sampled((part.vertices, part.faces), SAMPLES)
-    reached = points[np.abs(points[:, 2] - middle_z_m) <= PAD_M / 2]
-    width = np.abs(reached[:, 0])
-    pressed = reached[width >= width.max() - WIDEST_M, 2]
-    return float(pressed.min() + pressed.max()) / 2
+def _widest_z(points: NDArray[np.float64], middle_z_m: float) -> float:
+    """Middle, to half a millimetre, of what pads that begin at `middle_z_m` press.
+
+    They press the surface, `points` (N, 3), where it is widest, a cap and not its stem, and move to there.
+    """
+    for _ in range(MOVES):
+        reached = points[np.abs(points[:, 2] - middle_z_m) <= PAD_M / 2]
+        width = np.abs(reached[:, 0])
+        pressed = reached[width >= width.max() - WIDEST_M, 2]
+        middle_z_m = round(float(pressed.min() + pressed.max()), 3) / 2
+    return middle_z_m
 
 
 def _foot(part: MeshPart) -> ConvexHull:

@@ -226,6 +226,7 @@ def finetune_stage(options: argparse.Namespace, policy: Trained) -> Stage:
         f"--dppo.iterations={iterations_of(options, policy)}",
         f"--dppo.num_envs={options.worlds}",
         "--eval_freq=0",
+        "--save_freq=4",
         f"--seed={policy.seed * SEED_STRIDE + TRAIN_SEED_OFFSET}",
         f"--output_dir={out}",
         "--resume=true",

@@ -1,6 +1,7 @@
 """Convex pieces: they leave the counterpart its room, cover the part, and fill only what nobody reaches."""
 
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -8,6 +9,7 @@ from numpy.typing import NDArray
 from scipy.spatial import ConvexHull
 
 from lerobot_vtrefine.sim.mesh_fit import measure_fit
+from lerobot_vtrefine.sim.mesh_pairs import load_mesh_parts
 from lerobot_vtrefine.sim.mesh_pieces import Cut, fitting_pieces
 from lerobot_vtrefine.sim.mesh_skin import Surface
 
@@ -95,3 +97,16 @@ def test_a_limit_on_pieces_is_kept() -> None:
 def test_a_convex_part_stays_whole() -> None:
     rod = revolved((0.0, 0.0), (PIN_M, 0.0), (PIN_M, LENGTH_M), (0.0, LENGTH_M))
     assert len(fitting_pieces(rod, TUBE, CUT)) == 1
+
+
+def test_a_cap_is_gripped_at_its_edge_and_a_bar_in_the_middle_of_its_free_end(tmp_path: Path) -> None:
+    solids = {"plug": PIN, "socket": TUBE}
+    bar = revolved((0.0, 0.0), (PIN_M, 0.0), (PIN_M, 1.5 * LENGTH_M), (0.0, 1.5 * LENGTH_M))
+    for name, surfaces in (("cap", solids), ("bar", solids | {"plug": bar})):
+        for role, surface in surfaces.items():
+            trimesh.Trimesh(*surface).export(tmp_path / f"{name}_{role}.obj")
+    cap, bar_pair = (load_mesh_parts(f"automate/{name}", tmp_path, "unit") for name in ("cap", "bar"))
+    assert cap.plug.grip.centre_m[2] == pytest.approx(LENGTH_M + CAP_HEIGHT_M / 2, abs=1e-3)
+    assert cap.plug.grip.half_size_m[0] == pytest.approx(CAP_M, abs=5e-4)
+    assert bar_pair.plug.grip.centre_m[2] == pytest.approx(1.5 * LENGTH_M - 0.020, abs=1e-3)
+    assert bar_pair.plug.grip.half_size_m[0] == pytest.approx(PIN_M, abs=5e-4)
