@@ -44,7 +44,8 @@ def make_parts(pair: MeshPair) -> PartPair:
 
 def _part(part: MeshPart, middle_z_m: float, span_m: tuple[float, float]) -> Part:
     points = np.vstack([part.vertices, sampled((part.vertices, part.faces), SAMPLES)[0]])
-    middle_z_m = _widest_z(points, middle_z_m)
+    free = points[(points[:, 2] >= span_m[0] - 1e-6) & (points[:, 2] <= span_m[1] + 1e-6)]
+    middle_z_m = _widest_z(free, middle_z_m)
     half_z = min(middle_z_m - span_m[0], span_m[1] - middle_z_m)
     gripped = points[np.abs(points[:, 2] - middle_z_m) <= half_z + 1e-6]
     low, high = gripped[:, :2].min(0), gripped[:, :2].max(0)
@@ -63,7 +64,7 @@ def _part(part: MeshPart, middle_z_m: float, span_m: tuple[float, float]) -> Par
 def _widest_z(points: NDArray[np.float64], middle_z_m: float) -> float:
     """Middle, to half a millimetre, of what pads that begin at `middle_z_m` press.
 
-    They press the surface, `points` (N, 3), where it is widest, a cap and not its stem, and move to there.
+    They press the free surface, `points` (N, 3), where it is widest, a cap and not its stem, and move there.
     """
     for _ in range(MOVES):
         reached = points[np.abs(points[:, 2] - middle_z_m) <= PAD_M / 2]

@@ -110,3 +110,14 @@ def test_a_cap_is_gripped_at_its_edge_and_a_bar_in_the_middle_of_its_free_end(tm
     assert cap.plug.grip.half_size_m[0] == pytest.approx(CAP_M, abs=5e-4)
     assert bar_pair.plug.grip.centre_m[2] == pytest.approx(1.5 * LENGTH_M - 0.020, abs=1e-3)
     assert bar_pair.plug.grip.half_size_m[0] == pytest.approx(PIN_M, abs=5e-4)
+
+
+def test_what_is_wide_within_the_socket_is_not_gripped(tmp_path: Path) -> None:
+    collar, stem, top = 0.015, 0.0115, LENGTH_M + 0.022
+    plug = revolved((0, 0.01), (collar, 0.01), (collar, 0.079), (stem, 0.079), (stem, top), (0, top))
+    socket = revolved((0.016, 0.0), (0.02, 0.0), (0.02, LENGTH_M), (0.016, LENGTH_M))
+    for role, surface in (("plug", plug), ("socket", socket)):
+        trimesh.Trimesh(*surface).export(tmp_path / f"collar_{role}.obj")
+    grip = load_mesh_parts("automate/collar", tmp_path, "unit").plug.grip
+    assert grip.centre_m[2] == pytest.approx((LENGTH_M + top) / 2, abs=1e-3)
+    assert grip.half_size_m[0] == pytest.approx(stem, abs=5e-4)
