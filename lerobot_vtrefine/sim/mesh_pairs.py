@@ -51,12 +51,15 @@ def _part(part: MeshPart, middle_z_m: float, span_m: tuple[float, float]) -> Par
     low, high = gripped[:, :2].min(0), gripped[:, :2].max(0)
     centre, half = (low + high) / 2, (high - low) / 2
     grip = Grip((float(centre[0]), float(centre[1]), middle_z_m), (float(half[0]), float(half[1]), half_z))
-    pieces = tuple(ConvexHull(hull.vertices, hull.faces) for hull in part.pieces)
+    pieces, sides = (
+        tuple(ConvexHull(hull.vertices, hull.faces) for hull in hulls) for hulls in (part.pieces, part.sides)
+    )
     return Part(
         pieces,
         grip,
         rest_height_m=-_height(part)[0],
         foot=_foot(part) if len(pieces) > 1 else None,
+        sides=sides if len(sides) < len(pieces) else (),
         surface=TriangleMesh(part.vertices, part.faces),
     )
 

@@ -1,9 +1,11 @@
-"""Convex pieces of a part that leave its counterpart the room it has.
+"""Convex pieces of a part: those that leave its counterpart the room it has, and the few that hands meet.
 
 A hole between convex pieces is smaller than the hole that was drawn, for each piece fills what its surface
 leaves hollow, and parts that fit with a millimetre or two have none of that to spare. So a part is cut, by
 planes across and along the axis of insertion, until no piece holds a point of the part's skin
-(`lerobot_vtrefine.sim.mesh_skin`); then neighbours that can be one become one. Needs manifold3d.
+(`lerobot_vtrefine.sim.mesh_skin`); then neighbours that can be one become one. A hand that closes on a
+round wall would meet twenty of these pieces, each in a contact of its own, so for hands the part is cut
+once more, with its holes filled. Needs manifold3d.
 """
 
 from collections.abc import Iterator
@@ -35,18 +37,29 @@ ROUND_RAD = np.pi / 2
 TOUCHING_M = 1e-5
 
 
-def fitting_pieces(part: Surface, other: Surface, cut: Cut) -> list[Array]:
+@dataclass(frozen=True)
+class Pieces:
+    """Corners (N, 3) of each convex piece [m]."""
+
+    fitting: list[Array]
+    """What the counterpart meets."""
+    sides: list[Array]
+    """What hands meet."""
+
+
+def cut_into_pieces(part: Surface, other: Surface, cut: Cut) -> Pieces:
     """Cut a part into convex pieces.
 
     Args:
         part: the solid.
         other: its counterpart, assembled.
         cut: how finely.
-
-    Returns:
-        Corners (N, 3) of each piece [m].
     """
-    skin = skin_of(part, other, cut.skin)
+    return Pieces(*(_pieces(part, skin, cut) for skin in skin_of(part, other, cut.skin)))
+
+
+def _pieces(part: Surface, skin: Array, cut: Cut) -> list[Array]:
+    """Pieces that hold no point of the skin (N, 3)."""
     waiting, done = [_Piece.of(solid_of(part), skin)], list[_Piece]()
     while waiting and len(waiting) + len(done) < cut.most:
         worst = waiting.pop(int(np.argmax([len(piece.held) for piece in waiting])))

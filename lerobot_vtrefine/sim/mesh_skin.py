@@ -1,7 +1,7 @@
 """The skin of a part: points above its surface that a convex piece of it may not hold.
 
-They lie close above the surface where the counterpart passes on its way into the pair and out, farther off
-where hands take hold, and nowhere else: a cavity that neither reaches may fill up. Needs manifold3d.
+They lie above the surface where the counterpart passes on its way into the pair and out, and where hands take
+hold, and nowhere else: a cavity that neither reaches may fill up. Needs manifold3d.
 
 Lengths in metres; both parts in the pair's frame, assembled, whose z axis is that of insertion.
 """
@@ -26,10 +26,11 @@ Mask = NDArray[np.bool_]
 class Skin:
     """How closely pieces follow the surface."""
 
-    passage_m: float = 2e-4
-    """Height above the surface where the counterpart passes."""
-    side_m: float = 1e-3
-    """The same where hands take hold."""
+    touched_m: float = 2e-4
+    """Height above the surface where the counterpart passes, for pieces that it meets, and where hands take
+    hold, for pieces that they meet."""
+    seen_m: float = 1e-3
+    """The same where hands take hold, for pieces that only cameras see there."""
     levels: int = 5
     """Points lie in so many layers, each twice as high as the one below: a piece holds the more of them, the
     further it is from following the surface."""
@@ -60,8 +61,8 @@ def solid_of(surface: Surface) -> Any:
     return manifold.Manifold(mesh)
 
 
-def skin_of(part: Surface, other: Surface, skin: Skin) -> Array:
-    """Points (N, 3) that no piece of `part` may hold, for its counterpart `other`."""
+def skin_of(part: Surface, other: Surface, skin: Skin) -> tuple[Array, Array]:
+    """Points that no piece of `part` may hold that its counterpart `other` meets (N, 3), or hands (M, 3)."""
     points, normals = sampled(part, skin.samples)
     there, _ = sampled(other, skin.samples)
     solids = solid_of(part), solid_of(other)
@@ -69,13 +70,14 @@ def skin_of(part: Surface, other: Surface, skin: Skin) -> Array:
     passed = _faces_counterpart(points, normals, there) & _on_the_way(
         points, there, reach, _ways_out(*solids)
     )
-    held = ~passed & _seen_from_beside(points, normals)
-    layers = [
-        points[where] + 2**level * height * normals[where]
-        for where, height in ((passed, skin.passage_m), (held, skin.side_m))
-        for level in range(skin.levels)
-    ]
-    return _outside(np.concatenate(layers), points, normals)
+    beside = _seen_from_beside(points, normals)
+
+    def above(where: Mask, height_m: float) -> Array:
+        heights = height_m * 2 ** np.arange(skin.levels)[:, None, None]
+        return _outside((points[where] + heights * normals[where]).reshape(-1, 3), points, normals)
+
+    counterparts = np.concatenate([above(passed, skin.touched_m), above(beside & ~passed, skin.seen_m)])
+    return counterparts, above(beside, skin.touched_m)
 
 
 def sampled(surface: Surface, count: int) -> tuple[Array, Array]:

@@ -16,7 +16,7 @@ import tempfile
 import zipfile
 import zlib
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -26,7 +26,7 @@ from tqdm import tqdm
 
 from lerobot_vtrefine.sim.hulls import small_hull
 from lerobot_vtrefine.sim.mesh_fit import MeshFit, measure_fit
-from lerobot_vtrefine.sim.mesh_pieces import Cut, fitting_pieces
+from lerobot_vtrefine.sim.mesh_pieces import Cut, cut_into_pieces
 from lerobot_vtrefine.sim.mesh_skin import Surface
 
 Array = NDArray[np.float64]
@@ -71,11 +71,13 @@ class Hull:
 
 @dataclass(frozen=True)
 class MeshPart:
-    """One part in the pair's common frame: surface mesh [m] and its convex pieces."""
+    """One part in the pair's common frame: surface mesh [m] and its convex pieces, for its counterpart and
+    for hands."""
 
     vertices: Array
     faces: Triangles
     pieces: tuple[Hull, ...]
+    sides: tuple[Hull, ...]
 
     @property
     def bounds_m(self) -> Array:
@@ -210,21 +212,26 @@ def _part(name: str, role: str, surfaces: dict[str, Surface], progress: bool) ->
     """Cut a part into convex pieces, which depend on its counterpart, too."""
     _optional("manifold3d")
     part, other = surfaces[role], surfaces[ROLES[1 - ROLES.index(role)]]
-    key = f"pieces-{_digest(*part, *other, np.frombuffer(repr(CUT).encode(), np.uint8))}"
+    key = f"cut-{_digest(*part, *other, np.frombuffer(repr(CUT).encode(), np.uint8))}"
 
     def compute() -> dict[str, NDArray[Any]]:
         with tqdm(total=1, desc=f"{name}: convex pieces of the {role}", disable=not progress, leave=False):
-            return {f"{index:03d}": corners for index, corners in enumerate(fitting_pieces(part, other, CUT))}
+            kinds = asdict(cut_into_pieces(part, other, CUT))
+        return {f"{kind}_{i:03d}": corners for kind in kinds for i, corners in enumerate(kinds[kind])}
 
     pieces = _cached(key, compute)
-    return MeshPart(*part, tuple(Hull(*small_hull(pieces[index])) for index in sorted(pieces)))
+    hulls = {name: Hull(*small_hull(pieces[name])) for name in sorted(pieces)}
+    kinds = (tuple(hulls[name] for name in hulls if name.startswith(kind)) for kind in ("fitting", "sides"))
+    return MeshPart(*part, *kinds)
 
 
 def _turned_over(part: MeshPart) -> MeshPart:
     """Rotate by half a turn about x (a proper rotation: windings stay valid)."""
     flip = np.array([1.0, -1.0, -1.0])
-    pieces = tuple(Hull(hull.vertices * flip, hull.faces) for hull in part.pieces)
-    return MeshPart(part.vertices * flip, part.faces, pieces)
+    kinds = (
+        tuple(Hull(hull.vertices * flip, hull.faces) for hull in hulls) for hulls in (part.pieces, part.sides)
+    )
+    return MeshPart(part.vertices * flip, part.faces, *kinds)
 
 
 def _cache_file(key: str) -> Path:

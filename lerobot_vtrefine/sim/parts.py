@@ -31,6 +31,8 @@ class Part:
     foot: ConvexHull | None = None
     """What the table touches in place of the pieces: the hull of them all, which meets a plane where they do.
     Twenty pieces that stand on a table are sixty contacts, their hull is four."""
+    sides: tuple[ConvexHull, ...] = ()
+    """What hands touch in place of the pieces: fewer, which follow the outside only."""
     surface: TriangleMesh | None = None
     """Exact surface for touch, where the pieces only approximate it."""
 

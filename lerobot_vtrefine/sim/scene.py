@@ -226,20 +226,25 @@ def _add_part(
         geom.solref, geom.solimp = rigid_contact(config.rigid_time_constant_s, config.timestep_s)
         geom.density = config.part_density
     if part.foot is not None:
-        _stand_on(spec, body, part.foot)
+        _stand_in(spec, body, {f"{name}_foot": part.foot}, TABLE)
+    if part.sides:
+        sides = {f"{name}_side_{index}": side for index, side in enumerate(part.sides)}
+        _stand_in(spec, body, sides, FIRST_HAND | SECOND_HAND)
     _set_mass(spec, body, part, config.part_density)
 
 
-def _stand_on(spec: mujoco.MjSpec, body: mujoco.MjsBody, foot: ConvexHull) -> None:
-    """The table meets this hull in place of the part's pieces. It weighs nothing, and nobody sees it."""
-    pieces = list(body.geoms)
-    geom = _add_piece(spec, body, f"{body.name}_foot", foot)
-    geom.contype, geom.conaffinity = 0, TABLE
-    geom.condim, geom.friction = pieces[0].condim, pieces[0].friction
-    geom.solref, geom.solimp = pieces[0].solref, pieces[0].solimp
-    geom.density, geom.rgba = 0.0, UNSEEN
-    for piece in pieces:
-        piece.conaffinity &= ~TABLE
+def _stand_in(spec: mujoco.MjSpec, body: mujoco.MjsBody, hulls: dict[str, ConvexHull], meets: int) -> None:
+    """What is of the classes `meets` meets these hulls in place of all that the part has so far. They weigh
+    nothing, and nobody sees them."""
+    before = list(body.geoms)
+    for geom in before:
+        geom.conaffinity &= ~meets
+    for name, hull in hulls.items():
+        geom = _add_piece(spec, body, name, hull)
+        geom.contype, geom.conaffinity = 0, meets
+        geom.condim, geom.friction = before[0].condim, before[0].friction
+        geom.solref, geom.solimp = before[0].solref, before[0].solimp
+        geom.density, geom.rgba = 0.0, UNSEEN
 
 
 def _add_piece(spec: mujoco.MjSpec, body: mujoco.MjsBody, name: str, piece: Primitive) -> mujoco.MjsGeom:

@@ -146,8 +146,8 @@ def test_dppo_may_practise_in_longer_physics_steps_than_those_it_is_judged_in(tm
         assert longer == ["vtrefine-record-starts", "vtrefine-finetune"]
 
 
-def test_every_pair_trains_an_encoder_from_the_table_and_policies_learn_on_its_features() -> None:
-    options = parse(["--mesh_dir=meshes", "--pairs=00446", "--seeds=0", "--output_dir=out"])
+def test_an_encoder_of_ones_own_is_trained_from_the_table_and_policies_learn_on_its_features() -> None:
+    options = parse(["--mesh_dir=meshes", "--pairs=00446", "--seeds=0", "--output_dir=out", "--encoder=own"])
     for policy in script.chosen(options):
         encoder, record, imitation, *_ = script.stages(options, policy)
         assert "--config_path=vtrefine:automate_00446" in encoder.line

@@ -10,7 +10,7 @@ from scipy.spatial import ConvexHull
 
 from lerobot_vtrefine.sim.mesh_fit import measure_fit
 from lerobot_vtrefine.sim.mesh_pairs import load_mesh_parts
-from lerobot_vtrefine.sim.mesh_pieces import Cut, fitting_pieces
+from lerobot_vtrefine.sim.mesh_pieces import Cut, cut_into_pieces
 from lerobot_vtrefine.sim.mesh_skin import Surface
 
 trimesh = pytest.importorskip("trimesh", reason="needs the assets extra")
@@ -41,12 +41,12 @@ PIN = revolved(
 
 @pytest.fixture(scope="module")
 def tube() -> list[Array]:
-    return fitting_pieces(TUBE, PIN, CUT)
+    return cut_into_pieces(TUBE, PIN, CUT).fitting
 
 
 @pytest.fixture(scope="module")
 def pin() -> list[Array]:
-    return fitting_pieces(PIN, TUBE, CUT)
+    return cut_into_pieces(PIN, TUBE, CUT).fitting
 
 
 def held(pieces: list[Array], points: Array) -> NDArray[np.bool_]:
@@ -65,6 +65,12 @@ def ring_of_points(radius_m: float) -> Array:
     return np.concatenate([across, height[..., None]], -1).reshape(-1, 3)
 
 
+def below_the_cap() -> Array:
+    """Where the tube is, around the pin."""
+    beside = ring_of_points((PIN_M + CAP_M) / 2)
+    return beside[beside[:, 2] < LENGTH_M - 0.005]
+
+
 def test_play_is_that_of_the_surfaces(tube: list[Array], pin: list[Array]) -> None:
     fit = measure_fit(pin, tube)
     assert fit.play_m == pytest.approx(BORE_M - PIN_M, abs=4e-4)  # overlap that is no contact, and the step
@@ -74,7 +80,7 @@ def test_play_is_that_of_the_surfaces(tube: list[Array], pin: list[Array]) -> No
 
 def test_pieces_do_not_narrow_the_bore(tube: list[Array]) -> None:
     edge = BORE_M * np.cos(np.pi / 28)  # the drawn bore is a polygon
-    assert not held(tube, ring_of_points(edge - CUT.skin.passage_m)).any()
+    assert not held(tube, ring_of_points(edge - CUT.skin.touched_m)).any()
 
 
 def test_pieces_cover_the_part(tube: list[Array], pin: list[Array]) -> None:
@@ -85,18 +91,26 @@ def test_pieces_cover_the_part(tube: list[Array], pin: list[Array]) -> None:
 def test_a_cavity_that_nobody_reaches_fills_up(pin: list[Array]) -> None:
     assert held(pin, ring_of_points(CAVITY_M / 2)).all()
     assert len(pin) < 20
-    beside = ring_of_points((PIN_M + CAP_M) / 2)
-    below = beside[beside[:, 2] < LENGTH_M - 0.005]
-    assert not held(pin, below).any()  # where the tube is
+    assert not held(pin, below_the_cap()).any()
 
 
 def test_a_limit_on_pieces_is_kept() -> None:
-    assert len(fitting_pieces(TUBE, PIN, replace(CUT, most=6))) <= 6
+    assert len(cut_into_pieces(TUBE, PIN, replace(CUT, most=6)).fitting) <= 6
 
 
 def test_a_convex_part_stays_whole() -> None:
     rod = revolved((0.0, 0.0), (PIN_M, 0.0), (PIN_M, LENGTH_M), (0.0, LENGTH_M))
-    assert len(fitting_pieces(rod, TUBE, CUT)) == 1
+    pieces = cut_into_pieces(rod, TUBE, CUT)
+    assert (len(pieces.fitting), len(pieces.sides)) == (1, 1)
+
+
+def test_hands_meet_few_pieces_that_follow_the_outside() -> None:
+    assert len(cut_into_pieces(TUBE, PIN, CUT).sides) == 1  # with its bore filled
+    pieces = cut_into_pieces(PIN, TUBE, CUT)
+    cap_and_stem = pieces.sides
+    assert 2 <= len(cap_and_stem) <= len(pieces.fitting) / 2
+    assert held(cap_and_stem, ring_of_points(PIN_M - 1e-3)).all()
+    assert not held(cap_and_stem, below_the_cap()).any()
 
 
 def test_a_cap_is_gripped_at_its_edge_and_a_bar_in_the_middle_of_its_free_end(tmp_path: Path) -> None:

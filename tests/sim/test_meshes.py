@@ -92,7 +92,7 @@ def test_second_load_reads_the_cache(folder: Path, ring: MeshPair, monkeypatch: 
     def fail(*_: object) -> None:
         raise AssertionError("decomposed again")
 
-    monkeypatch.setattr(meshes, "fitting_pieces", fail)
+    monkeypatch.setattr(meshes, "cut_into_pieces", fail)
     monkeypatch.setattr(meshes, "measure_fit", fail)
     again = load_mesh_pair("automate/ring", folder, scale="unit", progress=False)
     assert again.fit == ring.fit
@@ -123,7 +123,7 @@ def test_changed_shape_is_cut_again(folder: Path, ring: MeshPair) -> None:
 
 
 def _entries() -> int:
-    return len(list(meshes.cache_dir().glob("pieces-*.npz")))
+    return len(list(meshes.cache_dir().glob("cut-*.npz")))
 
 
 def test_ring_slides_over_the_post_and_not_through_it(ring: MeshPair) -> None:
@@ -133,9 +133,9 @@ def test_ring_slides_over_the_post_and_not_through_it(ring: MeshPair) -> None:
 
 def test_scene_is_built_with_grips_clear_of_each_other(folder: Path, ring: MeshPair) -> None:
     scene = build_scene(SceneConfig(pair="automate/ring", mesh_dir=folder, mesh_scale="unit"))
-    pieces = [len(part.pieces) for part in (ring.plug, ring.socket)]
-    assert len(scene.addresses.part_geoms) == sum(pieces) + 2  # a hull each for the table
     plug, socket = scene.pair.plug, scene.pair.socket
+    pieces = [len(part.pieces) + len(part.sides) for part in (plug, socket)]
+    assert len(scene.addresses.part_geoms) == sum(pieces) + 2  # a hull each for the table
     # The foot is held below the seated ring; the ring, which nowhere stands above the post, by its height.
     assert socket.grip.centre_m[2] + socket.grip.half_size_m[2] <= RING_BOTTOM_M + 1e-6
     assert plug.grip.centre_m[2] == pytest.approx((RING_BOTTOM_M + RING_TOP_M) / 2, abs=1e-4)
@@ -307,6 +307,25 @@ def test_parts_stand_on_their_hulls(folder: Path) -> None:
     assert parts.sum() <= 8
     assert model.geom("plug_foot").contype == 0
     assert scene.model.body("plug").mass[0] == pytest.approx(0.04)  # the hull weighs nothing
+
+
+def test_hands_meet_what_follows_the_outside(folder: Path) -> None:
+    """The ring's pieces, cut for its bore, would be a contact each."""
+    scene = build_scene(SceneConfig(pair="automate/ring", mesh_dir=folder, mesh_scale="unit"))
+    model, ring = scene.model, scene.pair.plug
+    assert 0 < len(ring.sides) < len(ring.pieces)
+    met = {}
+    for name in ("left_left_finger", "socket"):
+        geoms = range(model.ngeom)
+        other = model.geom_bodyid == model.body(name).id
+        bits = (
+            np.bitwise_or.reduce(model.geom_contype[other]),
+            np.bitwise_or.reduce(model.geom_conaffinity[other]),
+        )
+        meets = [g for g in geoms if model.geom_contype[g] & bits[1] or model.geom_conaffinity[g] & bits[0]]
+        met[name] = {model.geom(g).name for g in meets if model.geom_bodyid[g] == scene.plug_body}
+    assert met["left_left_finger"] == {f"plug_side_{i}" for i in range(len(ring.sides))}
+    assert met["socket"] == {f"plug_{i}" for i in range(len(ring.pieces))}
 
 
 def test_cameras_see_through_the_ring(folder: Path) -> None:
