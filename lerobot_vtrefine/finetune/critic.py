@@ -71,3 +71,11 @@ def explained_variance(values: Tensor, targets: Tensor) -> float:
     count, e, ee, t, tt = sum_over_ranks(sums).tolist()
     target_variance = tt / count - (t / count) ** 2
     return 1 - (ee / count - (e / count) ** 2) / target_variance if target_variance > 1e-12 else 0.0
+
+
+def value_bias(values: Tensor, targets: Tensor) -> float:
+    """Mean of value - target for values and targets (N,) of all ranks: above 0 where the critic expects too
+    much, which explained variance does not see."""
+    error = (values - targets).double()
+    total, count = sum_over_ranks(torch.stack([error.sum(), torch.ones_like(error).sum()])).tolist()
+    return total / count

@@ -27,7 +27,7 @@ from torch.nn.utils import clip_grad_norm_
 
 from lerobot_vtrefine.finetune.chains import Regulariser, chain_log_probs, decision_kl, explore
 from lerobot_vtrefine.finetune.config import DppoConfig
-from lerobot_vtrefine.finetune.critic import Critic, explained_variance
+from lerobot_vtrefine.finetune.critic import Critic, explained_variance, value_bias
 from lerobot_vtrefine.finetune.distributed import (
     max_over_ranks,
     mean_over_ranks,
@@ -299,7 +299,11 @@ def update(rollout: Rollout, agent: Agent, state: TrainState, cfg: DppoConfig) -
     grad_norms: list[Tensor] = []  # nobody waits for them before the end
     initial_log_ratio, stopped = 0.0, False
     with torch.no_grad():  # now: after the update it would know these episodes by heart
-        explained = explained_variance(state.critic(data.privileged), data.targets)
+        values = state.critic(data.privileged)
+        judged = {
+            "explained_variance": explained_variance(values, data.targets),
+            "value_bias": value_bias(values, data.targets),
+        }
 
     for minibatch in (ids for _ in range(cfg.epochs) for ids in data.epoch()):
         found = data.gradients(minibatch)
@@ -322,14 +326,19 @@ def update(rollout: Rollout, agent: Agent, state: TrainState, cfg: DppoConfig) -
         name: sum(found[name] for found in history) / max(len(history), 1) for name in MINIBATCH_METRICS
     }
     del averages["log_ratio"]
-    return averages | {
-        "grad_norm": float(torch.stack(grad_norms).double().mean()) if data.train_actor and history else 0.0,
-        "explained_variance": explained,
-        "initial_log_ratio": initial_log_ratio,
-        "updates": float(len(history)),
-        "stopped_early": float(stopped),
-        "actor_lr": actor_lr,
-    }
+    return (
+        averages
+        | judged
+        | {
+            "grad_norm": float(torch.stack(grad_norms).double().mean())
+            if data.train_actor and history
+            else 0.0,
+            "initial_log_ratio": initial_log_ratio,
+            "updates": float(len(history)),
+            "stopped_early": float(stopped),
+            "actor_lr": actor_lr,
+        }
+    )
 
 
 def rollout_metrics(rollout: Rollout) -> Metrics:

@@ -3,7 +3,7 @@
 import pytest
 import torch
 
-from lerobot_vtrefine.finetune.critic import Critic, explained_variance
+from lerobot_vtrefine.finetune.critic import Critic, explained_variance, value_bias
 
 
 def critic_of(states: torch.Tensor) -> Critic:
@@ -35,5 +35,6 @@ def test_explained_variance_ignores_a_bias_and_fixed_targets() -> None:
     expected = 1 - error.var(correction=0) / targets.var(correction=0)
     assert explained_variance(targets - error, targets) == pytest.approx(expected.item())
     assert explained_variance(targets - error + 5.0, targets) == pytest.approx(expected.item())
+    assert value_bias(targets - error + 5.0, targets) == pytest.approx(5.0 - error.mean().item(), abs=1e-5)
     assert explained_variance(targets, targets) == 1.0
     assert explained_variance(torch.zeros(4), torch.ones(4)) == 0.0

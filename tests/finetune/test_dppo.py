@@ -9,7 +9,7 @@ from toy import BlindPeg, ToyActor, make_agent
 from lerobot_vtrefine.envs.decisions import Decision
 from lerobot_vtrefine.finetune.chains import chain_log_probs
 from lerobot_vtrefine.finetune.config import DppoConfig, PaperDppo
-from lerobot_vtrefine.finetune.critic import explained_variance
+from lerobot_vtrefine.finetune.critic import explained_variance, value_bias
 from lerobot_vtrefine.finetune.dppo import (
     TrainState,
     collect,
@@ -169,8 +169,10 @@ def test_the_critic_is_judged_on_episodes_that_it_has_not_learnt_from():
     rollout.reward = torch.randn(rollout.reward.shape, generator=state.generator)
     _, targets = decision_advantages(rollout, state, cfg)
     with torch.no_grad():
-        unseen = explained_variance(state.critic(rollout.privileged[rollout.step, rollout.env]), targets)
-    assert update(rollout, agent, state, cfg)["explained_variance"] == unseen
+        values = state.critic(rollout.privileged[rollout.step, rollout.env])
+        unseen = explained_variance(values, targets), value_bias(values, targets)
+    metrics = update(rollout, agent, state, cfg)
+    assert (metrics["explained_variance"], metrics["value_bias"]) == unseen
 
 
 def test_frozen_encoder_stays_and_encodes_once_per_decision():
