@@ -132,7 +132,7 @@ class Estimator(nn.Module):
         seen = state[episode, frame]
         self.register_buffer("state_mean", seen.mean(0))
         self.register_buffer("state_std", seen.std(0).clamp(min=1e-6))
-        self.scale = HeldScale(frames.truth[frames.held_index()])
+        self.scale = HeldScale(frames.truth[frames.held_index()], frames.truth[episode, frame])
         self.head = nn.Sequential(
             nn.Linear(self.encoder.cond_dim, HEAD_WIDTH),
             nn.ReLU(),

@@ -8,8 +8,8 @@ what is far would drown what is near. Where all parts are in hand from the start
 import torch
 from torch import Tensor, nn
 
-FURTHEST = 12.0
-"""Of the logarithm: keeps a wild estimate finite."""
+WILDEST = 2.0
+"""Times what was furthest off in training: no estimate is further, or one of them would be the mean error."""
 
 
 class HeldScale(nn.Module):
@@ -18,13 +18,15 @@ class HeldScale(nn.Module):
     mean: Tensor
     std: Tensor
     knee: Tensor
+    furthest: Tensor
 
-    def __init__(self, held: Tensor) -> None:
-        """``held`` (N, K): the values of all frames with both parts in hand."""
+    def __init__(self, held: Tensor, seen: Tensor) -> None:
+        """Values of all frames with both parts in hand, ``held`` (N, K), and of all, ``seen`` (M, K)."""
         super().__init__()
         self.register_buffer("mean", held.mean(0))
         self.register_buffer("std", held.std(0).clamp(min=1e-6))
         self.register_buffer("knee", ((held - self.mean) / self.std).abs().amax(0))
+        self.register_buffer("furthest", WILDEST * ((seen - self.mean) / self.std).abs().amax(0))
 
     def compress(self, values: Tensor) -> Tensor:
         """(B, K) in SI units -> (B, K)."""
@@ -34,6 +36,6 @@ class HeldScale(nn.Module):
 
     def expand(self, learnt: Tensor) -> Tensor:
         """The inverse of ``compress``."""
-        beyond = (learnt.abs() - self.knee).clamp(min=0, max=FURTHEST)
-        far = learnt.sign() * (self.knee + beyond.expm1())
+        beyond = (learnt.abs() - self.knee).clamp(min=0)
+        far = learnt.sign() * torch.minimum(self.knee + beyond.expm1(), self.furthest)
         return torch.where(beyond > 0, far, learnt) * self.std + self.mean
