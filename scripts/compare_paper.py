@@ -5,17 +5,18 @@
     python scripts/compare_paper.py --mesh_dir=MESHES --pairs 00186 --demonstrations 10 30 50 --jobs 12
     make tables
 
-MESHES holds ID_plug.obj and ID_socket.obj. Per pair an encoder learns to see and feel, from the table on,
-where none comes with the package; per pair and seed demonstrations are recorded once. Policies with touch
-and with vision only learn from them (on features that are computed once; where the encoder is trained, by
-stock lerobot-train) and are fine-tuned by DPPO, once more from random weights (one step of imitation);
-stock lerobot-eval judges each, always from the table, on episodes that are the same for all. On a GPU
-noise, steps and chain are those of the table in docs/learning.md. Where DPPO practises is --tune_start: on
-whole episodes (table); from states that the imitation reached with both parts in hand, or the expert where
-it reaches too few (bank); or with parts that are put into the hands (grasped), where a pair can be. Random
-weights, which never get that far, practise on whole episodes in place of a bank. On a GPU worlds wait for
-the one that runs out of time: --tune_steps=120 ends episodes from a bank earlier, counted from the table.
---tune_timestep_s=0.005 practises in longer physics steps than those in which policies are judged.
+MESHES holds ID_plug.obj and ID_socket.obj. Per pair an encoder comes with the package, or, by
+--encoder=own, learns here to see and feel, from the table on; per pair and seed demonstrations are recorded
+once. Policies with touch and with vision only learn from them (on features that are computed once; where
+the encoder is trained, by stock lerobot-train) and are fine-tuned by DPPO, once more from random weights
+(one step of imitation); stock lerobot-eval judges each, always from the table, on episodes that are the
+same for all. On a GPU noise, steps and chain are those of the table in docs/learning.md. Where DPPO
+practises is --tune_start: on whole episodes (table); from states that the imitation reached with both parts
+in hand, or the expert where it reaches too few (bank); or with parts that are put into the hands (grasped),
+where a pair can be. Random weights, which never get that far, practise on whole episodes in place of a
+bank. On a GPU worlds wait for the one that runs out of time: --tune_steps=120 ends episodes from a bank
+earlier, counted from the table. --tune_timestep_s=0.005 practises in longer physics steps than those in
+which policies are judged.
 
 Every policy becomes rows of results/paper.json, or of results/demonstrations.json, as soon as it is judged.
 The same command again goes on where it was: finished stages are not repeated, nor policies whose rows are
@@ -61,7 +62,7 @@ def make_parser() -> CommandParser:
     parser.add_argument(
         "--encoder",
         help="of --recipe=pads; {pair} stands for the pair's number (default: what comes with the package for"
-        " the pair, else one trained here; own: one trained here)",
+        " the pair; own: one trained here)",
     )
     parser.add_argument("--encoder_episodes", type=int, default=4096, help="that an encoder learns from")
     parser.add_argument("--encoder_steps", type=int, default=4000, help="of an encoder's training")

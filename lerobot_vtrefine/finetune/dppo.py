@@ -326,19 +326,16 @@ def update(rollout: Rollout, agent: Agent, state: TrainState, cfg: DppoConfig) -
         name: sum(found[name] for found in history) / max(len(history), 1) for name in MINIBATCH_METRICS
     }
     del averages["log_ratio"]
-    return (
-        averages
-        | judged
-        | {
-            "grad_norm": float(torch.stack(grad_norms).double().mean())
-            if data.train_actor and history
-            else 0.0,
-            "initial_log_ratio": initial_log_ratio,
-            "updates": float(len(history)),
-            "stopped_early": float(stopped),
-            "actor_lr": actor_lr,
-        }
-    )
+    has_moved = data.train_actor and history
+    grad_norm = float(torch.stack(grad_norms).double().mean()) if has_moved else 0.0
+    told = {
+        "grad_norm": grad_norm,
+        "initial_log_ratio": initial_log_ratio,
+        "updates": float(len(history)),
+        "stopped_early": float(stopped),
+        "actor_lr": actor_lr,
+    }
+    return averages | judged | told
 
 
 def rollout_metrics(rollout: Rollout) -> Metrics:

@@ -4,8 +4,8 @@ A hole between convex pieces is smaller than the hole that was drawn, for each p
 leaves hollow, and parts that fit with a millimetre or two have none of that to spare. So a part is cut, by
 planes across and along the axis of insertion, until no piece holds a point of the part's skin
 (`lerobot_vtrefine.sim.mesh_skin`); then neighbours that can be one become one. A hand that closes on a
-round wall would meet twenty of these pieces, each in a contact of its own, so for hands the part is cut
-once more, with its holes filled. Needs manifold3d.
+round wall would meet many of these pieces, each in contacts of its own, so for hands the part is cut once
+more, with its holes filled. Needs manifold3d.
 """
 
 from collections.abc import Iterator

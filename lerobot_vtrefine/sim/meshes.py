@@ -219,10 +219,12 @@ def _part(name: str, role: str, surfaces: dict[str, Surface], progress: bool) ->
             kinds = asdict(cut_into_pieces(part, other, CUT))
         return {f"{kind}_{i:03d}": corners for kind in kinds for i, corners in enumerate(kinds[kind])}
 
-    pieces = _cached(key, compute)
-    hulls = {name: Hull(*small_hull(pieces[name])) for name in sorted(pieces)}
-    kinds = (tuple(hulls[name] for name in hulls if name.startswith(kind)) for kind in ("fitting", "sides"))
-    return MeshPart(*part, *kinds)
+    corners = _cached(key, compute)
+
+    def hulls(kind: str) -> tuple[Hull, ...]:
+        return tuple(Hull(*small_hull(corners[name])) for name in sorted(corners) if name.startswith(kind))
+
+    return MeshPart(*part, pieces=hulls("fitting"), sides=hulls("sides"))
 
 
 def _turned_over(part: MeshPart) -> MeshPart:

@@ -16,7 +16,7 @@ from lerobot_vtrefine.cli.pipeline.demo_config import (
     default_degradation,
 )
 from lerobot_vtrefine.cli.pipeline.stages import Stage, trained_policy
-from lerobot_vtrefine.shipped import PREFIX, encoders
+from lerobot_vtrefine.shipped import PREFIX
 from paper.trained import Trained, first_seed, iterations_of
 
 CLONE = Path(__file__).parents[1] / "clone_on_features.py"
@@ -72,11 +72,10 @@ def record_stage(options: argparse.Namespace, policy: Trained) -> Stage:
     return Stage(root.name, f"Record {root.name}", command, root, product, resumable=True)
 
 
-def trains_encoder(options: argparse.Namespace, pair: str) -> bool:
-    """Whether a pair's encoder is trained here: where none is named, and none comes with the package."""
-    if options.recipe != "pads" or "pretrained_encoder" in options.policy:
-        return False
-    return options.encoder == TRAINED_HERE or not (options.encoder or TASKS[pair] in encoders())
+def trains_encoder(options: argparse.Namespace) -> bool:
+    """Whether encoders are trained here. One for each pair comes with the package."""
+    is_named = "pretrained_encoder" in options.policy
+    return options.recipe == "pads" and options.encoder == TRAINED_HERE and not is_named
 
 
 def encoder_stage(options: argparse.Namespace, pair: str) -> Stage:
@@ -104,7 +103,7 @@ def policy_settings(options: argparse.Namespace, policy: Trained) -> dict[str, A
     """Of vt_dp3."""
     recipe: dict[str, Any] = dict(RECIPES[options.recipe]["policy"])
     if options.recipe == "pads":
-        trained = trains_encoder(options, policy.pair)
+        trained = trains_encoder(options)
         named = options.encoder or f"{PREFIX}{TASKS[policy.pair]}"
         recipe |= POLICY if on_a_gpu(options) else {}
         recipe["pretrained_encoder"] = (
@@ -125,7 +124,7 @@ def imitation_stage(options: argparse.Namespace, policy: Trained) -> Stage:
     steps = options.steps if policy.demonstrations else 1
     frozen = recipe.get("freeze_encoder", False)
     command = (clone_command if frozen else train_command)(options, policy, recipe, steps, out)
-    encoder = [encoder_stage(options, policy.pair).name] if trains_encoder(options, policy.pair) else []
+    encoder = [encoder_stage(options, policy.pair).name] if trains_encoder(options) else []
     needs = (dataset(options, policy).name, *encoder)
     return Stage(
         out.name, f"Imitation {policy.name}", command, out, trained_policy(out) / "model.safetensors", needs
@@ -263,7 +262,7 @@ def evaluation_stage(options: argparse.Namespace, policy: Trained, stage: str) -
 
 def shared_stages(options: argparse.Namespace, policy: Trained) -> list[Stage]:
     """What several policies use."""
-    encoder = [encoder_stage(options, policy.pair)] if trains_encoder(options, policy.pair) else []
+    encoder = [encoder_stage(options, policy.pair)] if trains_encoder(options) else []
     return [*encoder, record_stage(options, policy)]
 
 
