@@ -3,7 +3,7 @@
 import torch
 from torch import Tensor, nn
 
-from lerobot_vtrefine.finetune.distributed import mean_over_ranks, sum_over_ranks
+from lerobot_vtrefine.finetune.distributed import sum_over_ranks
 
 
 class ResidualBlock(nn.Module):
@@ -76,4 +76,6 @@ def explained_variance(values: Tensor, targets: Tensor) -> float:
 def value_bias(values: Tensor, targets: Tensor) -> float:
     """Mean of value - target for values and targets (N,) of all ranks: above 0 where the critic expects too
     much, which explained variance does not see."""
-    return mean_over_ranks({"error": values - targets})["error"]
+    error = (values - targets).double()
+    total, count = sum_over_ranks(torch.stack([error.sum(), torch.ones_like(error).sum()])).tolist()
+    return total / count
