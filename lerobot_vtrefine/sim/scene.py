@@ -10,7 +10,7 @@ from lerobot_vtrefine.embodiments import Embodiment, get_embodiment
 from lerobot_vtrefine.sim.appearance import PLUG_COLOUR, SOCKET_COLOUR, UNSEEN, Rgba, add_appearance
 from lerobot_vtrefine.sim.arms import add_arms
 from lerobot_vtrefine.sim.camera import Camera, make_camera
-from lerobot_vtrefine.sim.config import SceneConfig
+from lerobot_vtrefine.sim.config import MESH_PAIR_PREFIX, SceneConfig
 from lerobot_vtrefine.sim.links import FIRST_HAND, PLUG, SECOND_HAND, SOCKET, TABLE
 from lerobot_vtrefine.sim.pairs import load_pair
 from lerobot_vtrefine.sim.parts import Part, PartPair
@@ -23,6 +23,14 @@ __all__ = ["Scene", "SceneConfig", "build_scene"]
 
 TABLE_SIZE_M = (0.9, 1.4, 0.04)
 MIN_PART_MASS_KG = 0.04
+FRICTION_HARDNESS, MESH_FRICTION_HARDNESS = 10.0, 1000.0
+"""By how much harder friction is than contact (MuJoCo's impratio).
+
+Friction is a damper in MuJoCo: under any load, however small, what it holds creeps, the less the harder it
+is. A pad holds a box or a cylinder by four points, a part of a mesh by as few as two, which lie so close to
+each other that it turns between the pads: at 10 by 17 degrees a second (00446) under a third of the torque
+that would make it slip.
+"""
 _CONTACT_DATA = 1 | 2 | 4 | 16  # found, force, torque, position of mjtConDataField
 _NETFORCE = 3
 _CONTACT_SIZE = 10
@@ -190,7 +198,8 @@ def _set_options(spec: mujoco.MjSpec, config: SceneConfig) -> None:
     spec.option.timestep = config.timestep_s
     spec.option.integrator = mujoco.mjtIntegrator.mjINT_IMPLICITFAST
     spec.option.cone = mujoco.mjtCone.mjCONE_ELLIPTIC
-    spec.option.impratio = 10.0
+    is_mesh = config.pair.startswith(MESH_PAIR_PREFIX)
+    spec.option.impratio = MESH_FRICTION_HARDNESS if is_mesh else FRICTION_HARDNESS
     # MuJoCo takes dense matrices for so few joints anyway; mujoco_warp would not beyond 32 velocities, and
     # the warp backend's kernels read dense ones.
     spec.option.jacobian = mujoco.mjtJacobian.mjJAC_DENSE

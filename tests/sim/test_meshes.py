@@ -9,12 +9,14 @@ import mujoco
 import numpy as np
 import pytest
 
+from lerobot_vtrefine.embodiments.fingers import SIDES
 from lerobot_vtrefine.sim import meshes
 from lerobot_vtrefine.sim.camera import Camera
 from lerobot_vtrefine.sim.config import SceneConfig
 from lerobot_vtrefine.sim.depth import DepthCamera
 from lerobot_vtrefine.sim.meshes import MeshPair, load_mesh_pair, mesh_ids
 from lerobot_vtrefine.sim.scene import build_scene
+from lerobot_vtrefine.sim.simulation import InsertionSim
 
 trimesh = pytest.importorskip("trimesh", reason="needs the assets extra")
 pytest.importorskip("manifold3d", reason="needs the assets extra")
@@ -326,6 +328,41 @@ def test_hands_meet_what_follows_the_outside(folder: Path) -> None:
         met[name] = {model.geom(g).name for g in meets if model.geom_bodyid[g] == scene.plug_body}
     assert met["left_left_finger"] == {f"plug_side_{i}" for i in range(len(ring.sides))}
     assert met["socket"] == {f"plug_{i}" for i in range(len(ring.pieces))}
+
+
+@pytest.mark.parametrize("timestep_s", [0.0025, 0.005])
+def test_parts_do_not_creep_in_the_hand(folder: Path, timestep_s: float) -> None:
+    """Friction is a damper in MuJoCo: a torque that it bears with ease still turns what two points hold."""
+    scene = SceneConfig(
+        pair="automate/ring", mesh_dir=folder, mesh_scale="unit", start="grasped", timestep_s=timestep_s
+    )
+    sim = InsertionSim(scene)
+    sim.reset(np.arange(1), np.arange(1))
+    model, data = sim.mj_data(0)
+    plug, pads = model.body("plug").id, [model.geom(f"right_arm_{side}_finger").id for side in SIDES]
+    torque_nm = 0.06
+    borne_nm = model.geom_friction[pads[0], 1] * sum(_normal_force_n(model, data, pad) for pad in pads)
+    assert torque_nm < 0.5 * borne_nm
+    before = _in_pad(data, pads[0], plug)
+    for _ in range(round(0.5 / timestep_s)):
+        data.xfrc_applied[plug, 3:] = torque_nm * data.geom_xmat[pads[0]].reshape(3, 3)[:, 1]
+        mujoco.mj_step(model, data)
+    turned = before.T @ _in_pad(data, pads[0], plug)
+    assert np.degrees(np.arccos(np.clip((np.trace(turned) - 1) / 2, -1, 1))) < 0.3
+
+
+def _normal_force_n(model: mujoco.MjModel, data: mujoco.MjData, geom: int) -> float:
+    force, total = np.zeros(6), 0.0
+    for index in range(data.ncon):
+        if geom in data.contact.geom[index]:
+            mujoco.mj_contactForce(model, data, index, force)
+            total += force[0]
+    return total
+
+
+def _in_pad(data: mujoco.MjData, pad: int, body: int) -> np.ndarray:
+    """A body's rotation seen from a pad (3, 3)."""
+    return data.geom_xmat[pad].reshape(3, 3).T @ data.xmat[body].reshape(3, 3)
 
 
 def test_cameras_see_through_the_ring(folder: Path) -> None:
