@@ -141,7 +141,8 @@ def measure_part(part: str, limit_s: float | None, arguments: dict[str, float]) 
         result, log = Path(folder) / "rows.json", Path(folder) / "log"
         with log.open("wb") as file:
             child = subprocess.Popen(
-                [sys.executable, "-c", CHILD, PARTS[part], str(result), json.dumps(arguments)],
+                # Unbuffered, or what it printed before it failed would follow its last words in the log.
+                [sys.executable, "-u", "-c", CHILD, PARTS[part], str(result), json.dumps(arguments)],
                 stdin=subprocess.DEVNULL,
                 stdout=file,
                 stderr=subprocess.STDOUT,
