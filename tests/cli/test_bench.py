@@ -22,6 +22,7 @@ def fake_parts(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
         (tmp_path / f"{name}.py").write_text(code)
     monkeypatch.syspath_prepend(tmp_path)
     monkeypatch.setenv("PYTHONPATH", str(tmp_path))
+    monkeypatch.delenv("PYTHONUNBUFFERED", raising=False)  # most shells have none
     parts = {"absent": "nothing_here", "broken": "broken_bench", "slow": "slow_bench", "fine": "fine_bench"}
     monkeypatch.setattr(bench, "PARTS", parts)
 
