@@ -6,7 +6,7 @@ from pathlib import Path
 import mujoco
 import numpy as np
 import pytest
-import ring_on_post
+from ring_on_post import folder_with_ring
 
 from lerobot_vtrefine.embodiments.fingers import SIDES
 from lerobot_vtrefine.sim.config import SceneConfig, WarpConfig
@@ -18,11 +18,7 @@ pytest.importorskip("manifold3d", reason="needs the assets extra")
 
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Path]:
-    """A folder with the ring on its post, and a cache of its own."""
-    folder = tmp_path_factory.mktemp("meshes")
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setenv("XDG_CACHE_HOME", str(folder / "cache"))
-        ring_on_post.write(folder)
+    with folder_with_ring(tmp_path_factory) as folder:
         yield folder
 
 

@@ -8,8 +8,7 @@ from pathlib import Path
 import mujoco
 import numpy as np
 import pytest
-import ring_on_post
-from ring_on_post import POST_M, POST_TOP_M, RING_BOTTOM_M, RING_HOLE_M, RING_TOP_M
+from ring_on_post import POST_M, POST_TOP_M, RING_BOTTOM_M, RING_HOLE_M, RING_TOP_M, folder_with_ring
 
 from lerobot_vtrefine.sim import meshes
 from lerobot_vtrefine.sim.camera import Camera
@@ -27,11 +26,7 @@ PLAY_M = RING_HOLE_M - POST_M
 
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Path]:
-    """A folder with a ring (plug) over a post with a foot (socket), in millimetres; a cache of its own."""
-    folder = tmp_path_factory.mktemp("meshes")
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setenv("XDG_CACHE_HOME", str(folder / "cache"))
-        ring_on_post.write(folder)
+    with folder_with_ring(tmp_path_factory) as folder:
         yield folder
 
 
