@@ -263,8 +263,6 @@ class WarpConfig:
     average over the worlds: each takes 8 kB, most of what a world needs."""
     rows_per_world: int = 384
     """Rows of constraints in any one world: 4 per contact, of which a round plug on the rim makes 84."""
-    solver_iterations: int = 10
-    """Newton steps of the constraint solver at most: mostly one or two do, but worlds wait for each other."""
     solver: str = "own"
     """own (this package's order of kernels and constraint solver), or stock (mujoco_warp's own step)."""
     graph: bool = True
@@ -275,7 +273,7 @@ class WarpConfig:
             raise ValueError(f"warp.device must be auto, cpu, cuda or cuda:0, not {self.device!r}")
         if self.solver not in WARP_SOLVERS:
             raise ValueError(f"warp.solver must be {' or '.join(WARP_SOLVERS)}, not {self.solver!r}")
-        for name in ("contacts_per_world", "convex_per_world", "rows_per_world", "solver_iterations"):
+        for name in ("contacts_per_world", "convex_per_world", "rows_per_world"):
             if getattr(self, name) < 1:
                 raise ValueError(f"warp.{name} must be at least 1, got {getattr(self, name)}")
 

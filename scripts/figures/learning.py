@@ -47,8 +47,6 @@ TASKS = {
     "slip": "twice\nthe slip",
     "short_chunk": "decisions\ntwice as often",
 }
-PAPER_RECIPES = {("paper", TUNED): ("-", 1.0), ("tried", "fine, 4 nats that fall to 0.5"): (":", 0.7)}
-"""Runs on the paper's pairs, by table and variant of their rows: line and its opacity."""
 
 
 def draw_dppo(plt: Any) -> None:
@@ -91,20 +89,18 @@ def draw_rate(plt: Any) -> None:
 
 def draw_paper(plt: Any) -> None:
     """The paper's pairs: success while exploring, as judged afterwards, and as the paper has it."""
-    rows = [row for row in read_all(ROOT / "results") if isinstance(row, Run) and row.curve]
-    pairs = sorted({row.task for row in rows if row.table == "paper"})
+    found = [row for row in read_all(ROOT / "results") if isinstance(row, Run) and row.table == "paper"]
+    rows = [row for row in found if row.variant == TUNED]
+    pairs = sorted({row.task for row in rows})
     figure, axes = plt.subplots(
         1, len(pairs), figsize=(4.4 * len(pairs), 3.6), sharey=True, layout="constrained"
     )
     for ax, task in zip(axes, pairs, strict=True):
-        for row in (row for row in rows if row.task == task and (row.table, row.variant) in PAPER_RECIPES):
-            style, opacity = PAPER_RECIPES[row.table, row.variant]
+        for row in (row for row in rows if row.task == task):
             colour, points = POLICIES[row.policy], iterations(row)
             at = [int(point["iteration"]) for point in points]
-            ax.plot(
-                at, [100 * float(p["success"]) for p in points], style, color=colour, alpha=opacity, lw=1.2
-            )
-            ax.plot(at[-1] + 1, 100 * row.success, "o", ms=5, color=colour, alpha=opacity)
+            ax.plot(at, [100 * float(p["success"]) for p in points], color=colour, lw=1.2)
+            ax.plot(at[-1] + 1, 100 * row.success, "o", ms=5, color=colour)
         for policy, colour in POLICIES.items():
             ax.axhline(100 * PAIRS[task][policy][TUNED], color=colour, ls="--", lw=0.8)
         ax.set_title(task, loc="left")
@@ -114,11 +110,10 @@ def draw_paper(plt: Any) -> None:
         Patch(color=BLUE, label="vision and touch"),
         Patch(color=ORANGE, label="vision only"),
         Line2D([], [], color=GREY, label="while exploring"),
-        Line2D([], [], color=GREY, ls=":", label="the quieter recipe"),
         Line2D([], [], color=GREY, marker="o", ls="", ms=5, label="held out"),
         Line2D([], [], color=GREY, ls="--", lw=0.8, label="the paper"),
     ]
-    figure.legend(handles=handles, ncols=3, frameon=False, loc="outside lower center")
+    figure.legend(handles=handles, ncols=5, frameon=False, loc="outside lower center")
     figure.savefig(IMAGES / "paper.png")
 
 

@@ -10,6 +10,7 @@ from ring_on_post import folder_with_ring
 
 from lerobot_vtrefine.embodiments.fingers import SIDES
 from lerobot_vtrefine.sim.config import SceneConfig, WarpConfig
+from lerobot_vtrefine.sim.expert import ScriptedExpert
 from lerobot_vtrefine.sim.simulation import InsertionSim
 
 pytest.importorskip("trimesh", reason="needs the assets extra")
@@ -60,6 +61,23 @@ def test_a_heavy_part_stays_where_mujoco_warp_holds_it(folder: Path) -> None:
         sim.step(still)
         shifts_m.append(float(sim.metrics(world)["in_hand_shift_m"][0]))
     assert shifts_m[9] - shifts_m[4] < 1e-5
+
+
+@pytest.mark.timeout(900)
+def test_the_solver_of_mujoco_warp_is_not_cut_short(folder: Path) -> None:
+    """Hard friction takes it up to twenty steps; given up after ten, it leaves false forces of up to 55 N."""
+    pytest.importorskip("mujoco_warp")
+    room = WarpConfig(device="cpu", contacts_per_world=256, rows_per_world=1024)
+    sim = InsertionSim(scene(folder, 0.005), num_envs=8, backend="warp", warp=room)
+    worlds, rng, steps = np.arange(8), np.random.default_rng(0), []
+    sim.reset(worlds, worlds)
+    expert = ScriptedExpert(sim)
+    expert.reset(worlds)
+    for _ in range(20):
+        action = expert.act(worlds)
+        sim.step(action + rng.normal(0, 0.01, action.shape))
+        steps.append(sim._backend.worlds.data.solver_niter.numpy().copy())
+    assert 10 < np.max(steps) < sim.scene.model.opt.iterations
 
 
 def _normal_force_n(model: mujoco.MjModel, data: mujoco.MjData, geom: int) -> float:

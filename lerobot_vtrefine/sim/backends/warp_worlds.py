@@ -249,7 +249,6 @@ def _with_primitive_boxes(model: mujoco.MjModel) -> mujoco.MjModel:
 def _set_options(model: mjw.Model, config: WarpConfig) -> None:
     model.opt.warn_overflow = 0  # the flags are read after every call; printing would stall a GPU
     model.opt.contact_sensor_maxmatch = config.rows_per_world // LEAST_ROWS
-    model.opt.iterations = min(model.opt.iterations, config.solver_iterations)
     model.opt.run_qacc_smooth = False  # Newton's method starts from the last step's accelerations anyway
     if wp.get_device().is_cuda:
         model.opt.graph_conditional = wp.is_conditional_graph_supported()
