@@ -16,7 +16,7 @@ from paper.trained import Trained, first_seed, iterations_of, key, tables, varia
 NO_ROOM = "failed_overflow"
 LOST = 0.01
 """Share of episodes without room above which what is left is no result."""
-MORE_ROOM = {"contacts_per_world": 512, "convex_per_world": 64, "rows_per_world": 1024}
+MORE_ROOM = {"contacts_per_world": 1024, "convex_per_world": 64, "rows_per_world": 8192}
 """More than any pair's file has."""
 
 
@@ -35,6 +35,7 @@ def rows(
         tell_of_room(f"{stage} of {policy.name}", extra.get(NO_ROOM, 0.0))
         if tuned:
             extra |= {"largest_fall": largest_fall(progress)}
+            tell_of_room(f"an iteration of {policy.name}", most_without_room(progress))
         row = Run(
             **key(policy, table, kind),
             success=judged["success"] / judged["episodes"],
@@ -57,6 +58,11 @@ def failures(judged: dict[str, Any]) -> dict[str, float]:
     if judged["picked_up"] is not None:
         shares["picked_up"] = judged["picked_up"]
     return {name: round(share, 4) for name, share in sorted(shares.items())}
+
+
+def most_without_room(progress: Progress) -> float:
+    """The largest share of an iteration's episodes that the simulation ended by itself."""
+    return max((iteration.get(NO_ROOM, 0.0) for iteration in progress), default=0.0)
 
 
 def tell_of_room(name: str, share: float) -> None:

@@ -8,8 +8,9 @@ from pathlib import Path
 
 import compare_paper as script
 import pytest
+import yaml
 from paper import trained
-from paper.outcome import failures, tell_of_room
+from paper.outcome import MORE_ROOM, failures, most_without_room, tell_of_room
 
 from lerobot_vtrefine.cli.results.rows import Run, read_rows
 from lerobot_vtrefine.cli.results.tables import table
@@ -189,3 +190,16 @@ def test_episodes_that_the_simulation_ended_are_told(capsys: pytest.CaptureFixtu
     told = capsys.readouterr().err
     assert told.startswith("warning: finetune of 00081_visual_0_30: 28% of the episodes ended because")
     assert told.count("\n") == 1
+
+
+def test_so_are_those_of_practice_by_the_worst_iteration() -> None:
+    assert most_without_room([{"success": 0.1}, {"failed_overflow": 0.14}, {"failed_overflow": 0.02}]) == 0.14
+    assert most_without_room([]) == 0.0
+
+
+def test_the_room_that_is_advised_is_more_than_any_pair_has() -> None:
+    pairs = list((Path(__file__).parents[2] / "configs" / "env").glob("automate_*.yaml"))
+    assert len(pairs) >= 5
+    for pair in pairs:
+        for name, number in yaml.safe_load(pair.read_text())["env"]["warp"].items():
+            assert MORE_ROOM[name] > number, pair.name
