@@ -31,7 +31,7 @@ from pathlib import Path
 
 from paper.outcome import is_done, rows
 from paper.stages import TASKS, shared_stages, stages
-from paper.trained import Trained, chosen, tables
+from paper.trained import Trained, chosen, table_of
 from runs.side_by_side import run_all
 
 from lerobot_vtrefine.cli.arguments import CommandParser
@@ -133,9 +133,7 @@ def finish(options: argparse.Namespace, policy: Trained) -> None:
     """One policy's stages, and its rows."""
     records = StageRunner(options.output_dir, stages(options, policy)).run()
     commits = {record.name: record.commit for record in records}
-    for table in tables(policy):
-        found = rows(options, policy, table, commits)
-        save(options.results / f"{table}.json", found, replace=False)
+    save(options.results / f"{table_of(policy)}.json", rows(options, policy, commits), replace=False)
 
 
 if __name__ == "__main__":

@@ -11,7 +11,7 @@ from lerobot_vtrefine.cli.results.provenance import provenance
 from lerobot_vtrefine.cli.results.rows import Row, Run, read_rows
 from lerobot_vtrefine.cli.results.tables import MEASURED
 from lerobot_vtrefine.finetune.logger import read_progress
-from paper.trained import Trained, first_seed, iterations_of, key, tables, variants
+from paper.trained import Trained, first_seed, iterations_of, key, table_of, variants
 
 NO_ROOM = "failed_overflow"
 LOST = 0.01
@@ -21,7 +21,7 @@ MORE_ROOM = {"contacts_per_world": 1024, "convex_per_world": 64, "rows_per_world
 
 
 def rows(
-    options: argparse.Namespace, policy: Trained, table: str, commits: dict[str, str | None]
+    options: argparse.Namespace, policy: Trained, commits: dict[str, str | None]
 ) -> list[tuple[Row, Progress]]:
     """What was found, with the learning curve beside the tuned policy; ``commits`` by stage."""
     found: list[tuple[Row, Progress]] = []
@@ -37,7 +37,7 @@ def rows(
             extra |= {"largest_fall": largest_fall(progress)}
             tell_of_room(f"an iteration of {policy.name}", most_without_room(progress))
         row = Run(
-            **key(policy, table, kind),
+            **key(policy, kind),
             success=judged["success"] / judged["episodes"],
             episodes=judged["episodes"],
             iterations=iterations_of(options, policy) if tuned else 0,
@@ -78,12 +78,11 @@ def tell_of_room(name: str, share: float) -> None:
 
 def is_done(options: argparse.Namespace, policy: Trained) -> bool:
     """Whether all rows of a policy are there, with these numbers of episodes and iterations."""
-    for table in tables(policy):
-        path = options.results / f"{table}.json"
-        there = {row.key: row for row in (read_rows(path) if path.is_file() else []) if isinstance(row, Run)}
-        for stage, kind in variants(policy).items():
-            row = there.get(tuple(key(policy, table, kind).values()))
-            wanted = iterations_of(options, policy) if stage == "finetune" else 0
-            if row is None or (row.episodes, row.iterations) != (options.episodes, wanted):
-                return False
+    path = options.results / f"{table_of(policy)}.json"
+    there = {row.key: row for row in (read_rows(path) if path.is_file() else []) if isinstance(row, Run)}
+    for stage, kind in variants(policy).items():
+        row = there.get(tuple(key(policy, kind).values()))
+        wanted = iterations_of(options, policy) if stage == "finetune" else 0
+        if row is None or (row.episodes, row.iterations) != (options.episodes, wanted):
+            return False
     return True

@@ -60,14 +60,14 @@ def variants(policy: Trained) -> dict[str, str]:
     return {"imitation": IMITATION, "finetune": TUNED}
 
 
-def tables(policy: Trained) -> list[str]:
-    """Tables that it belongs to."""
-    paper = ["paper"] if policy.demonstrations in (0, DEMONSTRATIONS) else []
-    return [*paper, *(["demonstrations"] if policy.demonstrations else [])]
+def table_of(policy: Trained) -> str:
+    """The table that has its rows. That by number of demonstrations shows the paper's own number, too."""
+    return "paper" if policy.demonstrations in (0, DEMONSTRATIONS) else "demonstrations"
 
 
-def key(policy: Trained, table: str, kind: str) -> dict[str, Any]:
+def key(policy: Trained, kind: str) -> dict[str, Any]:
     """Table, task, policy, variant and seed of a row."""
+    table = table_of(policy)
     named = with_demonstrations(policy.demonstrations, kind) if table == "demonstrations" else kind
     identity = {"table": table, "task": f"automate/{policy.pair}", "policy": policy.senses}
     return identity | {"variant": named, "seed": policy.seed}

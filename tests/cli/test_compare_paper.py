@@ -46,14 +46,14 @@ def parse(arguments: list[str]) -> argparse.Namespace:
 
 
 @pytest.mark.usefixtures("fake_commands")
-def test_policies_become_rows_of_both_tables_and_are_not_made_twice(
+def test_policies_become_rows_of_the_papers_table_and_are_not_made_twice(
     run: Callable[..., str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(trained, "MODALITIES", ("visuo_tactile",))
     monkeypatch.setattr("lerobot_vtrefine.cli.pipeline.stages.commit", lambda: "0123abc")
     told = run("--pairs", "00186", "--encoder=own", "--iterations=60")
     assert told.count("done before") == 2  # encoder and demonstrations, which random weights share
-    paper, fewer = of(tmp_path / "paper.json"), of(tmp_path / "demonstrations.json")
+    paper = of(tmp_path / "paper.json")
     assert set(paper) == {"imitation", "", "without pre-training"}
     assert (paper[""].success, paper[""].iterations) == (0.75, 60)
     assert paper["without pre-training"].iterations == 20
@@ -62,7 +62,7 @@ def test_policies_become_rows_of_both_tables_and_are_not_made_twice(
     assert (paper[""].extra["picked_up"], paper[""].extra["failed_dropped"]) == (0.75, 0.25)
     told = failures({"episodes": 4, "picked_up": None, "failures": {"time-out": 1, "in-hand shift": 2}})
     assert told == {"failed_time_out": 0.25, "failed_in_hand_shift": 0.5}  # as vtrefine-finetune's columns
-    assert set(fewer) == {"30 demonstrations, imitation", "30 demonstrations"}
+    assert not (tmp_path / "demonstrations.json").exists()  # the paper's own number
     shown = table("paper", [*paper.values()])
     assert "| DPPO after imitation | automate/00186 | - | 72 | 75 [41, 93] | 94 | - | +22 |" in shown
     shutil.rmtree(tmp_path / "out")  # another machine

@@ -21,6 +21,7 @@ from lerobot_vtrefine.cli.results.collect import largest_fall, run_rows, save, s
 from lerobot_vtrefine.cli.results.published import PAIRS, with_demonstrations
 from lerobot_vtrefine.cli.results.rows import (
     IMITATION,
+    SCRATCH,
     TUNED,
     Line,
     Row,
@@ -289,14 +290,22 @@ def test_pairs_that_share_no_seed_have_no_mean() -> None:
 
 
 def test_fewer_demonstrations_stand_beside_the_papers() -> None:
-    named = {"table": "demonstrations", "task": "automate/00186", "policy": "visuo_tactile", "episodes": 100}
-    rows = [
-        run_of(rate, 0, **named, variant=with_demonstrations(count, kind))
-        for count, kind, rate in ((10, TUNED, 0.8), (30, IMITATION, 0.5))
+    named = {"policy": "visuo_tactile", "episodes": 100}
+    few = run_of(
+        0.8, 0, table="demonstrations", task="automate/00186", variant=with_demonstrations(10, TUNED), **named
+    )
+    whole = [
+        run_of(rate, 0, table="paper", task=task, variant=kind, **named)
+        for task, kind, rate in (
+            ("automate/00186", IMITATION, 0.5),
+            ("automate/00186", SCRATCH, 0.0),  # of no number
+            ("automate/00007", IMITATION, 0.9),  # of another pair
+        )
     ]
-    lines = table("demonstrations", rows).splitlines()
+    lines = table("demonstrations", [few, *whole]).splitlines()
     assert lines[2] == "| DPPO after imitation | 10 | - | 21 | 80 [71, 87] | 34 | - | +13 |"
     assert lines[3] == "| imitation | 30 | - | 40 | 50 [40, 60] | 48 | - | +8 |"
+    assert not lines[4]
 
 
 def test_the_experts_table_lays_bodies_and_starts_beside_each_other() -> None:

@@ -15,11 +15,12 @@ from lerobot_vtrefine.cli.results.cells import (
 )
 from lerobot_vtrefine.cli.results.published import (
     BY_DEMONSTRATIONS,
+    DEMONSTRATIONS,
     KINDS,
     PAIRS,
     with_demonstrations,
 )
-from lerobot_vtrefine.cli.results.rows import IMITATION, TUNED, Run
+from lerobot_vtrefine.cli.results.rows import IMITATION, TUNED, Row, Run
 
 BESIDE = ("vision only", "the paper's", "touch", "the paper's", "touch minus vision", "the paper's")
 """Columns of the tables that stand beside the paper's."""
@@ -45,6 +46,18 @@ def paper_table(rows: Sequence[Run]) -> str:
             theirs = {name: mean(values) for name, values in printed.items()}
             body.append([words, f"mean of {len(whole['visual'])}", *beside_the_paper(means, theirs)])
     return markdown(["", "pair", *BESIDE], body)
+
+
+def by_demonstrations(rows: Sequence[Row]) -> list[Run]:
+    """Those of its own, and of the paper's table those of the same pairs: they learnt from its number."""
+    runs = [row for row in rows if isinstance(row, Run)]
+    own = [row for row in runs if row.table == "demonstrations"]
+    tasks = values(own, "task")
+    return own + [
+        replace(row, variant=with_demonstrations(DEMONSTRATIONS, row.variant))
+        for row in runs
+        if row.table == "paper" and row.task in tasks and row.variant in (IMITATION, TUNED)
+    ]
 
 
 def demonstrations_table(rows: Sequence[Run]) -> str:

@@ -23,7 +23,7 @@ from lerobot_vtrefine.cli.results.cells import (
     pooled,
     values,
 )
-from lerobot_vtrefine.cli.results.paper_tables import demonstrations_table, paper_table
+from lerobot_vtrefine.cli.results.paper_tables import by_demonstrations, demonstrations_table, paper_table
 from lerobot_vtrefine.cli.results.rows import IMITATION, TUNED, Line, Row, Run
 
 BLOCK = re.compile(r"(<!-- table: (\w+) -->\n).*?(<!-- end -->)", re.DOTALL)
@@ -261,7 +261,11 @@ RENDERERS: dict[str, Callable[[Sequence], str]] = (
     | {"reference": reference_table}
 )
 
-DERIVED: dict[str, Callable[[Sequence[Row]], list[Run]]] = {"handling": measured, "senses": converging}
+DERIVED: dict[str, Callable[[Sequence[Row]], list[Run]]] = {
+    "handling": measured,
+    "senses": converging,
+    "demonstrations": by_demonstrations,
+}
 """Tables that show rows of another one."""
 
 
