@@ -66,6 +66,7 @@ def test_chunks_start_at_the_current_observation() -> None:
         ({"preset": "small", "down_dims": (64, 32)}, "one repeated width"),
         ({"sampler": "euler"}, "choose from"),
         ({"ft_denoising_steps": 11}, "within 0..10"),
+        ({"ft_noise_correlation": 1.0}, r"ft_noise_correlation must lie in \[0, 1\), got 1.0"),
     ],
 )
 def test_wrong_values_name_the_choices(values: dict[str, Any], message: str) -> None:

@@ -153,6 +153,24 @@ def test_deployment_of_a_tuned_chain_keeps_the_posterior_noise_but_in_the_last_s
     assert torch.equal(torch.random.get_rng_state(), state)
 
 
+def test_deployed_noise_may_be_smooth_over_a_chunks_actions():
+    process = DiffusionProcess(100, GRIDS["ddim"])
+    clean = torch.zeros(4000, 2, 1)
+    entered: list[torch.Tensor] = []
+
+    def predict(x, t):
+        entered.append(x)
+        return oracle(process, clean)(x, t)
+
+    noise = torch.Generator().manual_seed(5)
+    deploy(process, predict, torch.randn_like(clean), num_tuned=3, eta=1.0, correlation=0.8, generator=noise)
+    for step in (2, 3):
+        mean, std = process.step(oracle(process, clean), entered[step], step, eta=1.0)
+        shift = (entered[step + 1] - mean)[..., 0]
+        np.testing.assert_allclose(shift.std(dim=0), float(std.flatten()[0]), rtol=0.05)
+        assert abs(float(torch.corrcoef(shift.T)[0, 1]) - 0.8) < 0.03
+
+
 def test_chain_noise_is_floored_and_clipped():
     """With a perfect denoiser each latent is mean + max(sigma, floor) * noise, |noise| <= 3."""
     process = DiffusionProcess(100, GRIDS["tail"])

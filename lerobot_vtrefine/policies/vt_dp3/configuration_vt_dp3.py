@@ -133,6 +133,8 @@ class VtDp3Config(PreTrainedConfig):
 
     Set by fine-tuning; the last step is noise-free in either case.
     """
+    ft_noise_correlation: float = 0.0
+    """Of that noise, from one action of a chunk to the next; ``--dppo.noise_correlation`` is practice's."""
     ft_freeze_encoder: bool = False
     """The tuned and the frozen network share one encoder."""
 
@@ -201,6 +203,10 @@ class VtDp3Config(PreTrainedConfig):
             raise ValueError(f"policy.down_dims must be one repeated width for the mlp, got {self.down_dims}")
         if not 0.0 <= self.ft_eta <= 1.0:
             raise ValueError(f"policy.ft_eta must lie in [0, 1], got {self.ft_eta}")
+        if not 0.0 <= self.ft_noise_correlation < 1.0:
+            raise ValueError(
+                f"policy.ft_noise_correlation must lie in [0, 1), got {self.ft_noise_correlation}"
+            )
         if not 0 <= self.ft_denoising_steps <= len(self.timesteps):
             raise ValueError(
                 f"policy.ft_denoising_steps={self.ft_denoising_steps} must be within 0..{len(self.timesteps)}"

@@ -228,6 +228,7 @@ def deploy(
     num_tuned: int = 0,
     predict_noise_base: PredictNoise | None = None,
     eta: float = 0.0,
+    correlation: float = 0.0,
     generator: torch.Generator | None = None,
 ) -> Tensor:
     """The deployment sampler: training's grid without its exploration noise; returns actions (B, H, D).
@@ -236,13 +237,15 @@ def deploy(
     ``num_tuned`` use ``predict_noise_base`` (the frozen network), and the others have stochasticity ``eta``:
     at 0 the result is a deterministic function of ``noise``; at 1 they keep the posterior's own noise, which
     is zero in the last step. The reference evaluates its DDPM policies so, and its DDIM policies with 0.
+    ``correlation`` of that noise from one action of the chunk to the next, as in ``sample_chain``.
     """
     base = predict_noise if predict_noise_base is None else predict_noise_base
     latent = denoise_prefix(process, base, noise, num_tuned)
     for position in range(process.num_steps - num_tuned, process.num_steps):
         latent, std = process.step(predict_noise, latent, position, eta)
         if eta > 0:
-            latent = latent + std * clipped_noise(latent.shape, latent, generator)
+            white = clipped_noise(latent.shape, latent, generator)
+            latent = latent + std * correlated_noise(white, correlation)
     return latent
 
 

@@ -310,5 +310,6 @@ class VtDp3Policy(PreTrainedPolicy):
             num_tuned=self.config.ft_denoising_steps,
             predict_noise_base=base,
             eta=self.config.ft_eta,
+            correlation=self.config.ft_noise_correlation,
             generator=generator,
         )
