@@ -260,6 +260,21 @@ def test_fine_tuning_tunes_the_last_steps_and_keeps_the_base(tmp_path: Path, fre
         loaded(batch)
 
 
+@pytest.mark.parametrize(
+    ("steps", "words"), [(0, "is not a fine-tuned policy"), (4, "is a fine-tuned policy")]
+)
+def test_tuned_steps_that_the_weights_do_not_hold_are_refused(tmp_path: Path, steps: int, words: str) -> None:
+    """Else an untrained base would do the first half of the denoising, or the tuned network all of it."""
+    policy = make_policy()
+    if steps:
+        policy.prepare_finetuning("tail", 4, 3, steps, eta=0.0)
+    policy.save_pretrained(tmp_path)
+    path = tmp_path / "config.json"
+    path.write_text(json.dumps(json.loads(path.read_text()) | {"ft_denoising_steps": 4 - steps}))
+    with pytest.raises(ValueError, match=words + ".*leave out --policy.ft_denoising_steps"):
+        VtDp3Policy.from_pretrained(tmp_path)
+
+
 def test_paper_preset_trains_and_acts() -> None:
     policy = make_policy(preset="paper", point_dims=(8, 16), down_dims=(16, 32, 64))
     loss, _ = policy.train()(make_batch())

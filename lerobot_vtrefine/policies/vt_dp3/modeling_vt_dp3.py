@@ -13,7 +13,7 @@ from typing import Any
 
 import torch
 from lerobot.policies import PreTrainedPolicy
-from safetensors import SafetensorError
+from safetensors import SafetensorError, safe_open
 from torch import Tensor, nn
 from torch.nn import functional
 
@@ -136,6 +136,21 @@ class VtDp3Policy(PreTrainedPolicy):
         if policy.config.use_peft:  # the adapters that come next belong to the network that acts
             policy._stop_averaging()
         return policy
+
+    @classmethod
+    def _load_as_safetensor(
+        cls, model: "VtDp3Policy", model_file: str, map_location: str, strict: bool
+    ) -> "VtDp3Policy":
+        """LeRobot's hook. It only logs what is missing, and a base that is missing would act untrained."""
+        with safe_open(model_file, framework="pt") as weights:
+            names = weights.keys()
+        tuned = any(name.startswith("base.") for name in names)
+        if tuned != (model.base is not None):
+            raise ValueError(
+                f"{model_file} is {'a' if tuned else 'not a'} fine-tuned policy: leave out"
+                " --policy.ft_denoising_steps, which fine-tuning sets"
+            )
+        return super()._load_as_safetensor(model, model_file, map_location, strict)
 
     # LeRobot's hooks for --peft.*
 
