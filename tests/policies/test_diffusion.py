@@ -43,6 +43,17 @@ def oracle(process: DiffusionProcess, clean: torch.Tensor):
     return predict
 
 
+def watched_oracle(process: DiffusionProcess, clean: torch.Tensor):
+    """The same, and the list of what it is asked about."""
+    entered: list[torch.Tensor] = []
+
+    def predict(x: torch.Tensor, t: torch.Tensor) -> torch.Tensor:
+        entered.append(x)
+        return oracle(process, clean)(x, t)
+
+    return predict, entered
+
+
 def test_schedule_is_squared_cosine():
     alpha_bar = squaredcos_alpha_bar(100)
     np.testing.assert_allclose(alpha_bar.numpy(), numpy_alpha_bar(100), rtol=1e-12)
@@ -129,12 +140,7 @@ def test_deployment_of_a_tuned_chain_keeps_the_posterior_noise_but_in_the_last_s
     """Each tuned latent is mean + eta * sigma * noise; nothing is random before and after them."""
     process = DiffusionProcess(100, GRIDS["tail"])
     clean = torch.zeros(4000, 1, 1)
-    entered: list[torch.Tensor] = []
-
-    def predict(x, t):
-        entered.append(x)
-        return oracle(process, clean)(x, t)
-
+    predict, entered = watched_oracle(process, clean)
     start = torch.randn_like(clean)
     result = deploy(
         process, predict, start, num_tuned=10, eta=1.0, generator=torch.Generator().manual_seed(3)
@@ -156,12 +162,7 @@ def test_deployment_of_a_tuned_chain_keeps_the_posterior_noise_but_in_the_last_s
 def test_deployed_noise_may_be_smooth_over_a_chunks_actions():
     process = DiffusionProcess(100, GRIDS["ddim"])
     clean = torch.zeros(4000, 2, 1)
-    entered: list[torch.Tensor] = []
-
-    def predict(x, t):
-        entered.append(x)
-        return oracle(process, clean)(x, t)
-
+    predict, entered = watched_oracle(process, clean)
     noise = torch.Generator().manual_seed(5)
     deploy(process, predict, torch.randn_like(clean), num_tuned=3, eta=1.0, correlation=0.8, generator=noise)
     for step in (2, 3):
