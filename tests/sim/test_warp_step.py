@@ -58,8 +58,7 @@ def shapes_near_a_wall(rng, worlds):
         left.geoms, left.ids = wp.zeros(2 * worlds, dtype=wp.vec2i), wp.zeros(2 * worlds, dtype=wp.vec2i)
         left.world = wp.zeros(2 * worlds, dtype=int)
         poses = [wp.array(pos, dtype=wp.vec3), wp.array(rot, dtype=wp.mat33)]
-        idle = wp.zeros(worlds, dtype=int)
-        inputs = [_shapes(mjw.put_model(model)), *poses, idle, given, left]
+        inputs = [_shapes(mjw.put_model(model)), *poses, given, left]
         wp.launch(kernels.drop_separated, 2 * worlds, inputs)
     count = left.count.numpy()[0]
     kept = np.zeros((worlds, 2), bool)
@@ -90,6 +89,18 @@ def touching():
         truth.step(expert.act(WORLDS))
     sim = InsertionSim(scene, task, num_envs=3, backend="warp", warp=WarpConfig(device="cpu"))
     return truth, sim
+
+
+def test_worlds_that_nobody_steps_take_no_room_from_the_others(touching):
+    """Worlds share the list of pairs: parts in their holes would fill it for those that still move."""
+    truth, sim = touching
+    data, pairs = sim._backend.worlds.data, []
+    for ids in (*WORLDS[:, None], WORLDS):
+        sim._backend.write(WORLDS, *truth._backend.read(WORLDS))
+        sim._backend.advance(ids, truth._episode.command[ids, None])
+        pairs.append(int(data.ncollision.numpy()[0]))
+    assert min(pairs) > 0
+    assert sum(pairs[:-1]) == pairs[-1]
 
 
 def test_a_step_is_mujoco_warps_own_step(touching):

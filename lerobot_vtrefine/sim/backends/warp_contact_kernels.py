@@ -7,11 +7,14 @@ import warp as wp
 
 wp.set_module_options({"enable_backward": False})
 
+PLANE = wp.constant(0)
 CYLINDER = wp.constant(5)
 BOX = wp.constant(6)
 MESH = wp.constant(7)
 CONSTRAINT = wp.constant(1)
 """Flag of contacts that the solver sees."""
+FAR = wp.constant(1.0e3)
+"""Above the size of any geom [m]."""
 TINY = wp.constant(1.0e-15)
 """Readings of a contact sensor: found, force, torque, position."""
 
@@ -87,16 +90,29 @@ def extent(shapes: Shapes, world: int, geom: int, rot: wp.mat33, direction: wp.v
 
 
 @wp.kernel
+def take_apart(
+    kind: wp.array(dtype=int),
+    idle: wp.array(dtype=int),
+    geom_xpos: wp.array(dtype=wp.vec3, ndim=2),
+    apart: wp.array(dtype=wp.vec3, ndim=2),
+) -> None:
+    """Where geoms are; those of idle worlds stand above each other, far from the next one and every plane."""
+    world, geom = wp.tid()
+    if idle[world] == 1 and kind[geom] != PLANE:
+        apart[world, geom] = wp.vec3(0.0, 0.0, FAR * float(geom + 1))
+    else:
+        apart[world, geom] = geom_xpos[world, geom]
+
+
+@wp.kernel
 def drop_separated(
     shapes: Shapes,
     geom_xpos: wp.array(dtype=wp.vec3, ndim=2),
     geom_xmat: wp.array(dtype=wp.mat33, ndim=2),
-    idle: wp.array(dtype=int),
     given: Pairs,
     left: Pairs,
 ) -> None:
-    """Keep the pairs that no face of a box, and no end of a cylinder, separates; one thread per pair. Of idle
-    worlds none.
+    """Keep the pairs that no face of a box, and no end of a cylinder, separates; one thread per pair.
 
     The broad phase compares bounding boxes, which never separates a round plug from the walls around it.
     Exact: what is dropped has no contact.
@@ -105,8 +121,6 @@ def drop_separated(
     if pair >= wp.min(given.count[0], given.geoms.shape[0]):
         return
     world = given.world[pair]
-    if idle[world] == 1:
-        return
     geoms = given.geoms[pair]
     first = shapes.kind[geoms[0]]
     second = shapes.kind[geoms[1]]

@@ -5,7 +5,7 @@ The same functions in the same roles as `mujoco_warp.step`, so the same physics,
   the search for contacts, which needs the bodies' poses only, and the integrator's matrix beside the solver.
   A step of a thousand worlds is some eighty small kernels, which wait for each other longer than they work:
   the longest chain of them is half of that;
-- worlds that nobody steps have no contacts;
+- worlds that nobody steps have no contacts, nor room in the lists of those that may be, which worlds share;
 - pairs of geoms that a face of a box separates are dropped before the general convex collision, two thirds of
   them while a round plug is in its hole (at a thousand worlds on an H200 this neither gains nor costs);
 - contact sensors are summed contact by contact, and nothing is computed that this package does not read
@@ -74,6 +74,7 @@ class WarpStep:
         general = np.zeros((kinds, kinds), np.int32)
         general[tuple(np.transpose(CONVEX))] = 1
         self._general = wp.array(general, dtype=int)
+        self._apart = wp.zeros(data.geom_xpos.shape, dtype=wp.vec3)
         self._has_convex = any(_count(model, pair) for pair in CONVEX)
         box = int(np.flatnonzero(host.geom_type == mujoco.mjtGeom.mjGEOM_BOX)[0])
         self._box = wp.vec2i(box, box)  # no pair for the general collision
@@ -174,9 +175,12 @@ class WarpStep:
         """Contacts, as `mujoco_warp.collision` finds them."""
         model, data = self._model, self._data
         context = collision_driver.create_collision_context(data.naconmax)
-        mjw.nxn_broadphase(model, data, context)
+        wp.launch(
+            kernels.take_apart, self._apart.shape, [model.geom_type, self._idle, data.geom_xpos, self._apart]
+        )
+        mjw.nxn_broadphase(model, dataclasses.replace(data, geom_xpos=self._apart), context)
         left = self._left
-        given = [_shapes(model), data.geom_xpos, data.geom_xmat, self._idle, _pairs(context, data.ncollision)]
+        given = [_shapes(model), data.geom_xpos, data.geom_xmat, _pairs(context, data.ncollision)]
         wp.launch(kernels.drop_separated, data.naconmax, [*given, left])
         with self._beside("convex"):
             if self._has_convex:
