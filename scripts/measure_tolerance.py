@@ -49,12 +49,13 @@ def main() -> None:
     parser.add_argument("tasks", nargs="+", help="files of configs/env")
     parser.add_argument("--episodes", type=int, default=256, help="per size of an error")
     parser.add_argument("--num_envs", type=int, default=64, help="simulations side by side")
+    parser.add_argument("--mesh_dir", type=Path, help="folder of the meshes, for pairs from meshes")
     parser.add_argument("--backend", choices=["batch", "warp"], default="batch", help="default: %(default)s")
     parser.add_argument("--results", type=Path, default=RESULTS / f"{TABLE}.json", help="file of the rows")
     options = parser.parse_args()
     for task in options.tasks:
         env = checked_env(draccus.decode(EnvConfig, read_yaml(find("--config_path", task))["env"]))
-        config = replace(env, backend=options.backend)
+        config = replace(env, backend=options.backend, mesh_dir=options.mesh_dir or env.mesh_dir)
         with tqdm(total=sum(map(len, SIZES.values())), desc=task) as bar:
             found = tolerance(config, options.episodes, options.num_envs, bar.update)
         save(options.results, [(row(task, found), [])], replace=False)
