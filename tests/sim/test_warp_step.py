@@ -95,7 +95,7 @@ def test_worlds_that_nobody_steps_take_no_room_from_the_others(touching):
     """Worlds share the list of pairs: parts in their holes would fill it for those that still move."""
     truth, sim = touching
     data, pairs = sim._backend.worlds.data, []
-    for ids in (*WORLDS[:, None], WORLDS):
+    for ids in (*WORLDS[:, None], WORLDS):  # all of them last: tests that share the worlds step them directly
         sim._backend.write(WORLDS, *truth._backend.read(WORLDS))
         sim._backend.advance(ids, truth._episode.command[ids, None])
         pairs.append(int(data.ncollision.numpy()[0]))
