@@ -1,4 +1,8 @@
-"""How often the expert succeeds when it acts on estimates in place of the truth: no actions are learnt."""
+"""How often the expert succeeds when it acts on estimates in place of the truth: no actions are learnt.
+
+Parts on a table are grasped by the truth, whatever the senses: regressors know where parts lie in the hands,
+and where they are before that only roughly (`scale.py`). So the question is what insertion needs.
+"""
 
 import numpy as np
 import torch
@@ -17,10 +21,10 @@ FIRST_SEED = 4_000_000
 
 
 class Believer:
-    """Keeps the history of sensor readings and says where the parts seem to be.
+    """Keeps the history of sensor readings and says where the parts seem to be, once they are in the hands.
 
-    One environment's estimates are averaged over its episode with the weights of an exponential filter: parts
-    move little in their hands, and an estimate from one frame trembles.
+    One environment's estimates since then are averaged with the weights of an exponential filter: parts move
+    little in their hands, and an estimate from one frame trembles.
     """
 
     SMOOTHING = 0.3
@@ -32,6 +36,7 @@ class Believer:
         self._grasps, self._device = grasps, device
         self._window: dict[str, Tensor] = {}
         self._believed = np.zeros((episodes.num_envs, 0))
+        self._in_hand = np.zeros(episodes.num_envs, bool)
 
     def start(self) -> None:
         """Forget everything and read the first frames."""
@@ -40,6 +45,7 @@ class Believer:
             key: value[:, None].repeat_interleave(self._estimator.history, 1) for key, value in frame.items()
         }
         self._believed = self._estimate(self._episodes.ids)
+        self._in_hand = self._parts_in_hand(self._episodes.ids)
 
     def look(self, ids: np.ndarray) -> None:
         """Take in the newest frames of environments ``ids`` (m,)."""
@@ -47,13 +53,24 @@ class Believer:
         for key, value in self._frame(ids).items():
             window = self._window[key]
             window[rows] = torch.cat([window[rows, 1:], value[:, None]], 1)
-        self._believed[ids] += self.SMOOTHING * (self._estimate(ids) - self._believed[ids])
+        weight = np.where(self._in_hand[ids], self.SMOOTHING, 1.0)[:, None]
+        self._believed[ids] += weight * (self._estimate(ids) - self._believed[ids])
+        self._in_hand[ids] = self._parts_in_hand(ids)
 
     def part_poses(self, ids: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Believed poses of plug and socket, each (m, 7)."""
+        """Poses of plug and socket, each (m, 7): believed ones in the hands, true ones before that."""
         sim = self._episodes.sim
         q = np.asarray(sim.joint_state(ids), float)
-        return part_poses(sim.scene.embodiment, q, self._believed[ids], self._grasps)
+        believed = part_poses(sim.scene.embodiment, q, self._believed[ids], self._grasps)
+        known = ~self._in_hand[ids, None]
+        plug, socket = (
+            np.where(known, true, seen) for true, seen in zip(sim.part_poses(ids), believed, strict=True)
+        )
+        return plug, socket
+
+    def _parts_in_hand(self, ids: np.ndarray) -> np.ndarray:
+        sim = self._episodes.sim
+        return sim.in_hand[ids] | (sim.scene.config.start == "grasped")
 
     def _frame(self, ids: np.ndarray) -> dict[str, Tensor]:
         raw = {key: value[ids] for key, value in self._episodes.raw.items()}

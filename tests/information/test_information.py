@@ -13,7 +13,6 @@ import torch
 from lerobot_vtrefine.datasets.features import GRIDS_KEY, SURFACE_KEY
 from lerobot_vtrefine.envs import VtRefineEnvConfig
 from lerobot_vtrefine.envs.factory import make_simulation
-from lerobot_vtrefine.information.closed_loop import expert_success
 from lerobot_vtrefine.information.contact import SIDE, TOUCHING, has_side, side_of
 from lerobot_vtrefine.information.estimator import (
     POLICY,
@@ -265,12 +264,6 @@ def test_frames_do_not_tell_the_hold_by_where_the_hands_are_brought() -> None:
         assert (np.abs(turns[..., 1]).max(0) >= 0.4 * slip_rad).all()
         again = hands.inverse() @ Poses.from_quaternions(np.stack(holds.part_poses(ids)[::-1], 1))
         np.testing.assert_allclose(again.position, believed.position, atol=1e-12)
-
-
-def test_the_expert_succeeds_on_the_truth() -> None:
-    env = VtRefineEnvConfig(start="grasped")
-    done = expert_success(env, 4, 4, None, {}, Grasps(np.tile(np.eye(3), (3, 1, 1))), torch.device("cpu"))
-    assert done.tolist() == [True] * 4
 
 
 def test_the_verdict_is_on_the_best_network() -> None:
