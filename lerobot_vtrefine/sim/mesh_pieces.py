@@ -34,6 +34,8 @@ QUANTILES = (0.25, 0.5, 0.75)
 """Planes go through these of the points that a piece should not hold."""
 ROUND_RAD = np.pi / 2
 """Where those points lie around more than this of the axis, only cuts through the axis help."""
+SPARSE = 32
+"""One point of the skin in so many is looked at first."""
 TOUCHING_M = 1e-5
 
 
@@ -84,9 +86,7 @@ class _Piece:
     @classmethod
     def around(cls, points: Array, skin: Array, solid: Any = None) -> "_Piece":
         hull = ConvexHull(points)
-        near = skin[np.all((skin > points.min(0)) & (skin < points.max(0)), axis=1)]
-        normals, offsets = hull.equations[:, :3], hull.equations[:, 3]
-        return cls(points[hull.vertices], near[(near @ normals.T + offsets).max(1) < 0], solid)
+        return cls(points[hull.vertices], _within(hull, skin), solid)
 
     @classmethod
     def of(cls, solid: Any, skin: Array) -> "_Piece":
@@ -137,10 +137,11 @@ def _planes(piece: _Piece) -> Iterator[tuple[Array, float]]:
 def _merged(pieces: list[_Piece], skin: Array) -> list[_Piece]:
     """Neighbours become one, the smallest first, as long as that holds no more of the skin."""
     waiting, final = sorted(pieces, key=lambda piece: piece.size), list[_Piece]()
+    few = skin[::SPARSE].copy()
     while waiting:
         piece = waiting.pop(0)
         for other in [*waiting, *final]:
-            both = _joined(piece, other, skin)
+            both = _joined(piece, other, skin, few)
             if both:
                 waiting = sorted([both, *(w for w in waiting if w is not other)], key=lambda p: p.size)
                 final = [kept for kept in final if kept is not other]
@@ -150,10 +151,23 @@ def _merged(pieces: list[_Piece], skin: Array) -> list[_Piece]:
     return final
 
 
-def _joined(first: _Piece, second: _Piece, skin: Array) -> _Piece | None:
+def _joined(first: _Piece, second: _Piece, skin: Array, few: Array) -> _Piece | None:
     low = np.maximum(first.corners.min(0), second.corners.min(0))
     high = np.minimum(first.corners.max(0), second.corners.max(0))
     if np.any(low > high + TOUCHING_M):
         return None
-    both = _Piece.around(np.vstack([first.corners, second.corners]), skin)
-    return both if len(both.held) <= len(first.held) + len(second.held) else None
+    hull = ConvexHull(np.vstack([first.corners, second.corners]))
+    most = len(first.held) + len(second.held)
+    if len(_within(hull, few)) > most:  # as most joints are refused, and by many points
+        return None
+    held = _within(hull, skin)
+    return _Piece(hull.points[hull.vertices], held) if len(held) <= most else None
+
+
+def _within(hull: ConvexHull, points: Array) -> Array:
+    """Which of the points (N, 3) lie in a hull."""
+    for column, low, high in zip(range(3), hull.min_bound, hull.max_bound, strict=True):
+        points = points[(points[:, column] > low) & (points[:, column] < high)]
+    # A plane a row: reductions over long rows are far faster than over as many short ones.
+    beyond = hull.equations[:, :3] @ points.T + hull.equations[:, 3:]
+    return points[beyond.max(0, initial=-np.inf) < 0]

@@ -125,7 +125,7 @@ def test_the_same_seed_gives_the_same_verdict(hardened: Diagnosis) -> None:
 
 
 def test_readings_without_any_noise_do_no_harm() -> None:
-    found = diagnose_pad(recordings(hardening, noise=0.0, jitter=0.0))
+    found = diagnose_pad(recordings(hardening, count=12, noise=0.0, jitter=0.0))
     assert "nonlinear_stiffness" in names(found)
     assert found.verdict.heldout.gain > 0.9
 

@@ -10,8 +10,8 @@ from hidden.writer import write_set
 SEED = 7101
 
 
-def damaged(path, damage, rig="4x4"):
-    write_set(path, Spec(rig, (("latency", "constant", 1.0),), corruption=damage), SEED)
+def damaged(path, damage, **changes):
+    write_set(path, Spec("4x4", (("latency", "constant", 1.0),), corruption=damage, **changes), SEED)
     return path
 
 
@@ -70,7 +70,7 @@ def test_a_damaged_trial_does_not_change_the_verdict(tmp_path, capsys):
     from lerobot_vtrefine.cli.diagnose import main
     from lerobot_vtrefine.cli.predict import main as predict
 
-    folder = damaged(tmp_path / "set", "mirrored_rows")
+    folder = damaged(tmp_path / "set", "mirrored_rows", changes=(("conditions", 10),))
     assert main([f"--recording={folder}", f"--output_dir={tmp_path / 'out'}"]) == 0
     capsys.readouterr()
     verdict = json.loads((tmp_path / "out" / "verdict.json").read_text(encoding="utf-8"))

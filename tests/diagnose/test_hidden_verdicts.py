@@ -52,9 +52,10 @@ def test_every_cause_is_named_and_its_gain_had(tmp_path, name):
 
 @pytest.mark.parametrize(
     "names",
-    [pytest.param(("hysteresis", "row_sharing"), marks=pytest.mark.slow), ("latency", "taxel_gain_spread")],
+    [("hysteresis", "row_sharing"), ("latency", "taxel_gain_spread")],
     ids="+".join,
 )
+@pytest.mark.slow
 def test_two_causes_at_once_are_both_named(tmp_path, names):
     spec = Spec("4x4", tuple(first_form(name, 2.0) for name in names))
     _, verdict, gains = verdict_on(tmp_path, spec, locked=4)
@@ -80,7 +81,10 @@ def test_hardening_with_saturation_is_no_contact_felt_softly(tmp_path, seed):
     assert set(names_of(verdict)) == set(names)
 
 
-@pytest.mark.parametrize(("form", "size"), [("mains_hum", 2.0), ("bowl", 2.0), ("aging", 2.0)])
+@pytest.mark.parametrize(
+    ("form", "size"),
+    [("mains_hum", 2.0), ("bowl", 2.0), pytest.param("aging", 2.0, marks=pytest.mark.slow)],
+)
 def test_what_no_list_holds_is_said_to_be_unknown(tmp_path, form, size):
     _, verdict, _ = verdict_on(tmp_path, Spec("4x4", (("outside", form, size),), changes=SMALL))
     assert verdict["status"] == "unexplained"

@@ -22,7 +22,7 @@ SHIFT_M = (0.012, -0.008, 0.01)
 def verdict(tmp_path_factory):
     folder = tmp_path_factory.mktemp("heavy")
     real = SceneConfig(pair="square", camera=CAMERA, part_density=2500.0)
-    recorded = record(real, 12, depth=True)
+    recorded = record(real, 8, depth=True)
     _, true_pose = recorded.camera
     # The images come from where the camera is; the dataset states another place.
     stated = true_pose.copy()

@@ -138,7 +138,7 @@ def run(script: str, folder: Path) -> str:
 
 def test_a_joints_cause_of_ones_own_is_named_reported_and_predicted(tmp_path: Path) -> None:
     copy = tmp_path / "lerobot_vtrefine"
-    shutil.copytree(PACKAGE, copy, ignore=shutil.ignore_patterns("__pycache__", "assets"))
+    shutil.copytree(PACKAGE, copy, ignore=shutil.ignore_patterns("assets"))
     with (copy / "diagnose" / "joints" / "stages.py").open("a", encoding="utf-8") as file:
         file.write("\n\n" + JOINT_STAGE)
     (copy / "diagnose" / "joints" / "candidates" / "cogging.py").write_text(JOINT_CANDIDATE, encoding="utf-8")
@@ -165,7 +165,7 @@ def test_a_joints_cause_of_ones_own_is_named_reported_and_predicted(tmp_path: Pa
 
 def test_a_cause_of_ones_own_is_named_reported_and_predicted(tmp_path: Path) -> None:
     copy = tmp_path / "lerobot_vtrefine"
-    shutil.copytree(PACKAGE, copy, ignore=shutil.ignore_patterns("__pycache__", "assets"))
+    shutil.copytree(PACKAGE, copy, ignore=shutil.ignore_patterns("assets"))
     with (copy / "tactile" / "stages" / "readout.py").open("a", encoding="utf-8") as file:
         file.write(STAGE)
     (copy / "diagnose" / "pad" / "candidates" / "column_sharing.py").write_text(CANDIDATE, encoding="utf-8")

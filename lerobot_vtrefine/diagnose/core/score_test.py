@@ -120,8 +120,9 @@ def tail_shares(statistics: Array) -> Array:
     shares = np.empty_like(statistics)
     for j in range(statistics.shape[1]):
         column = np.round(statistics[:, j], 9)
-        ordered = np.sort(column)
-        shares[:, j] = (count - np.searchsorted(ordered, column, side="left")) / count
+        order = np.argsort(column)
+        ordered = column[order]  # which are found faster in their own order than in another
+        shares[order, j] = (count - np.searchsorted(ordered, ordered, side="left")) / count
     return shares
 
 

@@ -61,7 +61,7 @@ def _line(
         signs[0] = 1.0
         pairs.append(signs[:, one] * signs[:, other])
     drawn = np.hstack(pairs).astype(np.float32) @ np.hstack(products).astype(np.float32).T
-    drawn = _beyond_slow_ones(drawn, lines, times)
+    _count_beyond_slow_ones(drawn, lines, times)
     best = int(drawn[0].argmax())
     scores = np.array([product[best].sum() for product in products])
     powers = [
@@ -83,15 +83,17 @@ def _wave(lines: Array, time: Array) -> Array:
     return np.exp(-2j * np.pi * np.multiply.outer(lines, time))
 
 
-def _beyond_slow_ones(drawn: Array, lines: Array, times: Sequence[Array]) -> Array:
-    """The lines (B, F) without slow ones, of which what frames see as slow counts by how far it exceeds all.
+def _count_beyond_slow_ones(drawn: Array, lines: Array, times: Sequence[Array]) -> None:
+    """Leave slow ones out of the lines (B, F), in place; what frames see as slow counts by what it exceeds
+    all of them by.
 
     At the uneven times of frames hum is stronger at its own frequency, and what is slow there.
     """
     frames_hz = 1.0 / float(np.median(np.concatenate([np.diff(time) for time in times])))
     slow = lines < LOWEST_HZ
     seen_as_slow = np.abs(lines - frames_hz * np.round(lines / frames_hz)) < LOWEST_HZ
-    return np.where(slow, -np.inf, drawn - np.where(seen_as_slow, drawn[:, slow].max(axis=1)[:, None], 0.0))
+    drawn[:, seen_as_slow & ~slow] -= drawn[:, slow].max(axis=1)[:, None]
+    drawn[:, slow] = -np.inf
 
 
 def _power(wave: Array, residual: Array, along: Array, weight: TrialWeights) -> float:
