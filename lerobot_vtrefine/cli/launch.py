@@ -40,9 +40,10 @@ def launch(command: str, module: str, config: str) -> int:
     if sys.stderr.isatty():
         print("loading LeRobot and PyTorch (the first time takes longest) ...", file=sys.stderr, flush=True)
     gc.disable()  # what is imported stays: rounds over it would take a seventh of the time
-    main = importlib.import_module(name).main
-    gc.freeze()
-    gc.enable()
+    try:
+        main = importlib.import_module(name).main
+    finally:
+        gc.enable()
     from lerobot_vtrefine.lerobot_compat.config_errors import undecoded_values_raise
 
     with undecoded_values_raise():
