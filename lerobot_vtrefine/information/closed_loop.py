@@ -45,7 +45,7 @@ class Believer:
             key: value[:, None].repeat_interleave(self._estimator.history, 1) for key, value in frame.items()
         }
         self._believed = self._estimate(self._episodes.ids)
-        self._in_hand = self._parts_in_hand(self._episodes.ids)
+        self._in_hand = self._episodes.sim.in_hand.copy()
 
     def look(self, ids: np.ndarray) -> None:
         """Take in the newest frames of environments ``ids`` (m,)."""
@@ -55,7 +55,7 @@ class Believer:
             window[rows] = torch.cat([window[rows, 1:], value[:, None]], 1)
         weight = np.where(self._in_hand[ids], self.SMOOTHING, 1.0)[:, None]
         self._believed[ids] += weight * (self._estimate(ids) - self._believed[ids])
-        self._in_hand[ids] = self._parts_in_hand(ids)
+        self._in_hand[ids] = self._episodes.sim.in_hand[ids]
 
     def part_poses(self, ids: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Poses of plug and socket, each (m, 7): believed ones in the hands, true ones before that."""
@@ -67,10 +67,6 @@ class Believer:
             np.where(known, true, seen) for true, seen in zip(sim.part_poses(ids), believed, strict=True)
         )
         return plug, socket
-
-    def _parts_in_hand(self, ids: np.ndarray) -> np.ndarray:
-        sim = self._episodes.sim
-        return sim.in_hand[ids] | (sim.scene.config.start == "grasped")
 
     def _frame(self, ids: np.ndarray) -> dict[str, Tensor]:
         raw = {key: value[ids] for key, value in self._episodes.raw.items()}

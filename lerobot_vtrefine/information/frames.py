@@ -205,7 +205,6 @@ def _one_batch(
     truth = Relative(*(np.zeros((len(ids), frames, *part.shape[1:])) for part in observe(sim, ids[:1])))
     contact, length = np.zeros((len(ids), frames, 4)), np.zeros(len(ids), np.int64)
     held = np.zeros((len(ids), frames), bool)
-    in_hand_from_start = sim.scene.config.start == "grasped"
     targets = np.zeros((len(ids), body.num_joints))
     running = ids
     for frame in range(frames):
@@ -215,7 +214,7 @@ def _one_batch(
         for whole, part in zip(truth, observe(sim, running), strict=True):
             whole[running, frame] = part
         contact[running, frame] = sim.part_touch(running)
-        held[running, frame] = sim.in_hand[running] | in_hand_from_start
+        held[running, frame] = sim.in_hand[running]
         length[running] += 1
         targets[running] = expert.act(running)
         episodes.step(targets)

@@ -165,7 +165,7 @@ class ScriptedExpert:
             self._press_m[ids] = np.minimum(gentle, PRESS_M)
         self._servos.reset(ids, view.q, self._sim.command_targets(ids))
         self._wanted.assign(ids, view.hands)
-        held = self._sim.in_hand[ids] | (not self._from_table)
+        held = self._sim.in_hand[ids]
         self._opening[ids] = np.where(held[:, None], self._grip_m, self._robot.fingers.travel_m)
         if not held.all():
             self._enter(ids[~held], Phase.REACH, view[~held])

@@ -84,13 +84,9 @@ class _Piece:
     """What of the part it stands for, as long as it may be cut."""
 
     @classmethod
-    def around(cls, points: Array, skin: Array, solid: Any = None) -> "_Piece":
-        hull = ConvexHull(points)
-        return cls(points[hull.vertices], _within(hull, skin), solid)
-
-    @classmethod
     def of(cls, solid: Any, skin: Array) -> "_Piece":
-        return cls.around(np.asarray(solid.to_mesh64().vert_properties)[:, :3], skin, solid)
+        hull = ConvexHull(np.asarray(solid.to_mesh64().vert_properties)[:, :3])
+        return cls(hull.points[hull.vertices], _within(hull, skin), solid)
 
     @property
     def size(self) -> float:

@@ -148,8 +148,9 @@ class InsertionSim:
 
     @property
     def in_hand(self) -> Array:
-        """(N,) whether all parts that hands are to take are grasped, and lifted off what they stood on."""
-        return in_hand(self.scene, self._episode.grasped & self._episode.lifted)
+        """(N,) whether all parts that hands are to take are grasped and lifted, or were so from the start."""
+        lifted = in_hand(self.scene, self._episode.grasped & self._episode.lifted)
+        return lifted | (self.scene.config.start == "grasped")
 
     @property
     def camera_intrinsics(self) -> Array:
