@@ -5,22 +5,26 @@
     python scripts/compare_paper.py --mesh_dir=MESHES --pairs 00186 --demonstrations 10 30 50 --jobs 12
     make tables
 
-MESHES holds ID_plug.obj and ID_socket.obj. Per pair an encoder comes with the package, or, by
---encoder=own, learns here to see and feel, from the table on; per pair and seed demonstrations are recorded
-once. Policies with touch and with vision only learn from them (on features that are computed once; where
-the encoder is trained, by stock lerobot-train) and are fine-tuned by DPPO, once more from random weights
-(one step of imitation); stock lerobot-eval judges each, always from the table, on episodes that are the
-same for all. On a GPU noise, steps and chain are those of the table in docs/learning.md. Where DPPO
-practises is --tune_start: on whole episodes (table); from states that the imitation reached with both parts
-in hand, or the expert where it reaches too few (bank); or with parts that are put into the hands (grasped),
-where a pair can be. Random weights, which never get that far, practise on whole episodes in place of a
-bank. On a GPU worlds wait for the one that runs out of time: --tune_steps=120 ends episodes from a bank
+MESHES holds ID_plug.obj and ID_socket.obj. Per pair and seed demonstrations are recorded once. Policies with
+touch and with vision only learn from them and are fine-tuned by DPPO, once more from random weights (one step
+of imitation); stock lerobot-eval judges each, always from the table, on episodes that are the same for all.
+
+By --recipe=pads (default) policies see and feel through an encoder, which comes with the package for each
+pair, or, by --encoder=own, learns here, and imitate on features that are computed once. By --recipe=cloud,
+the paper's own network, all of it learns from the demonstrations, by stock lerobot-train. On a GPU noise,
+steps and chain are those of the tables in docs/learning.md.
+
+Where DPPO practises is --tune_start: on whole episodes (table); from states that the imitation reached with
+both parts in hand, or the expert where it reaches too few (bank); or with parts that are put into the hands
+(grasped), where a pair can be. Random weights, which never get that far, practise on whole episodes in place
+of a bank. On a GPU worlds wait for the one that runs out of time: --tune_steps=120 ends episodes from a bank
 earlier, counted from the table. --tune_timestep_s=0.005 practises in longer physics steps than those in
 which policies are judged.
 
-Every policy becomes rows of results/paper.json, or of results/demonstrations.json, as soon as it is judged.
-The same command again goes on where it was: finished stages are not repeated, nor policies whose rows are
-there with these numbers of episodes and iterations, so that it may go on on another machine.
+Every policy becomes rows of results/paper.json, or of results/demonstrations.json, as soon as it is judged
+(by --recipe=cloud of paper_cloud.json and demonstrations_cloud.json). The same command again goes on where
+it was: finished stages are not repeated, nor policies whose rows are there with these numbers of episodes
+and iterations, so that it may go on on another machine.
 """
 
 import argparse
@@ -92,7 +96,7 @@ def make_parser() -> CommandParser:
         default=Path("outputs/compare_paper"),
         help="of all runs (default: %(default)s)",
     )
-    parser.add_argument("--results", type=Path, default=RESULTS, help="folder of paper.json")
+    parser.add_argument("--results", type=Path, default=RESULTS, help="folder of the rows")
     parser.add_argument("--only", help=argparse.SUPPRESS)
     return parser
 

@@ -19,7 +19,7 @@ import lerobot  # noqa: F401  registers the environment
 import matplotlib as mpl
 import numpy as np
 from figures.common import GREY, IMAGES
-from figures.learning import draw_dppo, draw_paper, draw_rate, draw_results
+from figures.learning import draw_dppo, draw_paper, draw_paper_cloud, draw_rate, draw_results
 
 from lerobot_vtrefine.cli.arguments import CommandParser
 from lerobot_vtrefine.cli.errors import run_cli
@@ -268,6 +268,7 @@ OTHERS: dict[str, Callable[..., None]] = {
     "dppo": draw_dppo,
     "rate": draw_rate,
     "paper": draw_paper,
+    "paper_cloud": draw_paper_cloud,
     "results": draw_results,
     "diagnosis": draw_diagnosis,
     "looks": draw_looks,

@@ -88,12 +88,22 @@ def draw_rate(plt: Any) -> None:
 
 
 def draw_paper(plt: Any) -> None:
-    """The paper's pairs: success while exploring, as judged afterwards, and as the paper has it."""
-    found = [row for row in read_all(ROOT / "results") if isinstance(row, Run) and row.table == "paper"]
+    """The paper's pairs with the pads' encoders."""
+    draw_pairs(plt, "paper")
+
+
+def draw_paper_cloud(plt: Any) -> None:
+    """The paper's pairs by the paper's own network."""
+    draw_pairs(plt, "paper_cloud")
+
+
+def draw_pairs(plt: Any, table: str) -> None:
+    """A table's pairs: success while exploring, as judged afterwards, and as the paper has it."""
+    found = [row for row in read_all(ROOT / "results") if isinstance(row, Run) and row.table == table]
     rows = [row for row in found if row.variant == TUNED]
     pairs = sorted({row.task for row in rows})
-    figure, axes = plt.subplots(
-        1, len(pairs), figsize=(4.4 * len(pairs), 3.6), sharey=True, layout="constrained"
+    figure, (axes,) = plt.subplots(
+        1, len(pairs), figsize=(4.4 * len(pairs), 3.6), sharey=True, layout="constrained", squeeze=False
     )
     for ax, task in zip(axes, pairs, strict=True):
         for row in (row for row in rows if row.task == task):
@@ -113,8 +123,9 @@ def draw_paper(plt: Any) -> None:
         Line2D([], [], color=GREY, marker="o", ls="", ms=5, label="held out"),
         Line2D([], [], color=GREY, ls="--", lw=0.8, label="the paper"),
     ]
-    figure.legend(handles=handles, ncols=5, frameon=False, loc="outside lower center")
-    figure.savefig(IMAGES / "paper.png")
+    columns = len(handles) if len(pairs) > 1 else 2
+    figure.legend(handles=handles, ncols=columns, frameon=False, loc="outside lower center")
+    figure.savefig(IMAGES / f"{table}.png")
 
 
 def iterations(row: Run) -> list[dict[str, str]]:

@@ -30,7 +30,10 @@ TASKS = {
 """Files of configs/env. The shaft of 00581 stays on the table, as the paper's robot leaves it."""
 TRAINED_HERE = "own"
 """Of --encoder."""
-POLICY = {"down_dims": [512] * 4, "feature_noise": 0.3}
+POLICY = {
+    "pads": {"down_dims": [512] * 4, "feature_noise": 0.3},
+    "cloud": {"down_dims": [512] * 4, "n_action_steps": 4, "horizon": 8},
+}
 DPPO = {
     "type": "trust_region",
     "sampler": "ddim",
@@ -38,7 +41,7 @@ DPPO = {
     "ft_denoising_steps": 5,
     "micro_batch_decisions": 1024,
 }
-"""The table's recipe on a GPU, where it differs from the demo's (docs/learning-tried.md says why)."""
+"""The tables' recipes on a GPU, where they differ from the demo's (docs/learning-tried.md says why)."""
 BANK_SEED_OFFSET = EVAL_SEED_OFFSET + 1_000_000
 """Past the episodes of an evaluation, which no bank may have seen."""
 NEVER_IN_HAND = ("00446", "00581")
@@ -101,11 +104,12 @@ def encoder_stage(options: argparse.Namespace, pair: str) -> Stage:
 
 def policy_settings(options: argparse.Namespace, policy: Trained) -> dict[str, Any]:
     """Of vt_dp3."""
-    recipe: dict[str, Any] = dict(RECIPES[options.recipe]["policy"])
+    recipe: dict[str, Any] = RECIPES[options.recipe]["policy"] | (
+        POLICY[options.recipe] if on_a_gpu(options) else {}
+    )
     if options.recipe == "pads":
         trained = trains_encoder(options)
         named = options.encoder or f"{PREFIX}{TASKS[policy.pair]}"
-        recipe |= POLICY if on_a_gpu(options) else {}
         recipe["pretrained_encoder"] = (
             str(encoder_stage(options, policy.pair).output) if trained else named.format(pair=policy.pair)
         )

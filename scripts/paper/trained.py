@@ -13,12 +13,14 @@ from lerobot_vtrefine.cli.results.rows import IMITATION, SCRATCH, TUNED
 
 @dataclass(frozen=True)
 class Trained:
-    """One policy: pair, senses, seed, and how many demonstrations it learnt from; 0: random weights."""
+    """One policy: pair, senses, seed, how many demonstrations it learnt from (0: random weights), and the
+    recipe of ``vtrefine-demo``."""
 
     pair: str
     senses: str
     seed: int
     demonstrations: int
+    recipe: str
 
     @property
     def learnt_from(self) -> int:
@@ -26,16 +28,21 @@ class Trained:
         return self.demonstrations or DEMONSTRATIONS
 
     @property
+    def suffix(self) -> str:
+        """Tells the recipe in names of files and tables; the pads' goes without."""
+        return "" if self.recipe == "pads" else f"_{self.recipe}"
+
+    @property
     def name(self) -> str:
         """For folders and stages."""
-        return f"{self.pair}_{self.senses}_{self.seed}_{self.demonstrations}"
+        return f"{self.pair}_{self.senses}_{self.seed}_{self.demonstrations}{self.suffix}"
 
 
 def chosen(options: argparse.Namespace) -> list[Trained]:
     """Every policy; seeds side by side share the GPUs by turns."""
     counts = [*options.demonstrations, *([] if options.no_scratch else [0])]
     return [
-        Trained(pair, senses, seed, count)
+        Trained(pair, senses, seed, count, options.recipe)
         for pair in options.pairs
         for count in counts
         for seed in options.seeds
@@ -62,12 +69,13 @@ def variants(policy: Trained) -> dict[str, str]:
 
 def table_of(policy: Trained) -> str:
     """The table that has its rows. That by number of demonstrations shows the paper's own number, too."""
-    return "paper" if policy.demonstrations in (0, DEMONSTRATIONS) else "demonstrations"
+    kind = "paper" if policy.demonstrations in (0, DEMONSTRATIONS) else "demonstrations"
+    return f"{kind}{policy.suffix}"
 
 
 def key(policy: Trained, kind: str) -> dict[str, Any]:
     """Table, task, policy, variant and seed of a row."""
     table = table_of(policy)
-    named = with_demonstrations(policy.demonstrations, kind) if table == "demonstrations" else kind
+    named = kind if table.startswith("paper") else with_demonstrations(policy.demonstrations, kind)
     identity = {"table": table, "task": f"automate/{policy.pair}", "policy": policy.senses}
     return identity | {"variant": named, "seed": policy.seed}

@@ -72,6 +72,43 @@ def test_policies_become_rows_of_the_papers_table_and_are_not_made_twice(
         assert sum(not script.is_done(options, policy) for policy in script.chosen(options)) == left
 
 
+@pytest.mark.usefixtures("fake_commands")
+def test_the_papers_own_network_has_tables_of_its_own_and_shares_the_demonstrations(
+    run: Callable[..., str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(trained, "MODALITIES", ("visuo_tactile",))
+    asked = ["--pairs", "00186", "--no_scratch", "--demonstrations", "10", "30"]
+    run(*asked)
+    pads = (tmp_path / "paper.json").read_text(), (tmp_path / "demonstrations.json").read_text()
+    told = run(*asked, "--recipe=cloud")
+    assert [line.split()[2] for line in told.splitlines() if "done before" in line] == [
+        "demos_00186_0_10",
+        "demos_00186_0_30",
+    ]
+    assert set(of(tmp_path / "paper_cloud.json")) == {"imitation", ""}
+    assert set(of(tmp_path / "demonstrations_cloud.json")) == {
+        "10 demonstrations, imitation",
+        "10 demonstrations",
+    }
+    assert pads == ((tmp_path / "paper.json").read_text(), (tmp_path / "demonstrations.json").read_text())
+    rows = [row for path in tmp_path.glob("*_cloud.json") for row in read_rows(path)]
+    assert "| DPPO after imitation | automate/00186 | - | 72 | 75 [41, 93] |" in table("paper_cloud", rows)
+    shown = table("demonstrations_cloud", rows)
+    assert "| DPPO after imitation | 10 |" in shown
+    assert "| DPPO after imitation | 30 |" in shown
+    assert run(*asked, "--recipe=cloud") == ""
+
+
+def test_the_papers_own_network_learns_as_a_whole_and_acts_as_often_as_the_other_on_a_gpu() -> None:
+    options = parse(["--mesh_dir=meshes", "--pairs=00186", "--seeds=0", "--backend=warp", "--recipe=cloud"])
+    for policy in script.chosen(options):
+        _, imitation, *_, finetune, _ = script.stages(options, policy)
+        assert imitation.command[0] == "lerobot-train"
+        assert "--policy.n_action_steps=4" in imitation.line
+        assert not any(word in imitation.line for word in ("encoder", "fusion", "feature_noise"))
+        assert "--dppo.encoder" not in finetune.line
+
+
 def test_pairs_side_by_side_wait_for_their_own_encoder_only(
     run: Callable[..., str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

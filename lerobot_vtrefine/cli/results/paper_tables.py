@@ -48,15 +48,18 @@ def paper_table(rows: Sequence[Run]) -> str:
     return markdown(["", "pair", *BESIDE], body)
 
 
-def by_demonstrations(rows: Sequence[Row]) -> list[Run]:
-    """Those of its own, and of the paper's table those of the same pairs: they learnt from its number."""
+def by_demonstrations(rows: Sequence[Row], suffix: str = "") -> list[Run]:
+    """Those of its own, and of the paper's table those of the same pairs: they learnt from its number.
+
+    ``suffix``, as of ``_cloud``, tells the tables of another recipe.
+    """
     runs = [row for row in rows if isinstance(row, Run)]
-    own = [row for row in runs if row.table == "demonstrations"]
+    own = [row for row in runs if row.table == f"demonstrations{suffix}"]
     tasks = values(own, "task")
     return own + [
         replace(row, variant=with_demonstrations(DEMONSTRATIONS, row.variant))
         for row in runs
-        if row.table == "paper" and row.task in tasks and row.variant in (IMITATION, TUNED)
+        if row.table == f"paper{suffix}" and row.task in tasks and row.variant in (IMITATION, TUNED)
     ]
 
 

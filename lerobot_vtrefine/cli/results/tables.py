@@ -5,6 +5,7 @@ A block is what lies between ``<!-- table: NAME -->`` and ``<!-- end -->``.
 
 import re
 from collections.abc import Callable, Mapping, Sequence
+from functools import partial
 from statistics import median
 
 from lerobot_vtrefine.cli.report.statistics import mean_interval, wilson_interval
@@ -256,8 +257,9 @@ RENDERERS: dict[str, Callable[[Sequence], str]] = (
     | dict.fromkeys(Line.TABLES, lines_table)
     | {"demo": demo_table, "touch": touch_table, "reality": reality_table}
     | {"expert": expert_table, "policies": policies_table}
-    | {"paper": paper_table, "demonstrations": demonstrations_table, "handling": handling_table}
-    | {"senses": senses_table}
+    | dict.fromkeys(("paper", "paper_cloud"), paper_table)
+    | dict.fromkeys(("demonstrations", "demonstrations_cloud"), demonstrations_table)
+    | {"handling": handling_table, "senses": senses_table}
     | {"reference": reference_table}
 )
 
@@ -265,6 +267,7 @@ DERIVED: dict[str, Callable[[Sequence[Row]], list[Run]]] = {
     "handling": measured,
     "senses": converging,
     "demonstrations": by_demonstrations,
+    "demonstrations_cloud": partial(by_demonstrations, suffix="_cloud"),
 }
 """Tables that show rows of another one."""
 
