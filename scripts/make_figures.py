@@ -12,6 +12,7 @@ import subprocess
 import sys
 import tempfile
 from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -19,7 +20,7 @@ import lerobot  # noqa: F401  registers the environment
 import matplotlib as mpl
 import numpy as np
 from figures.common import GREY, IMAGES
-from figures.learning import draw_dppo, draw_paper, draw_paper_cloud, draw_rate, draw_results
+from figures.learning import draw_dppo, draw_paper, draw_rate, draw_results
 
 from lerobot_vtrefine.cli.arguments import CommandParser
 from lerobot_vtrefine.cli.errors import run_cli
@@ -267,8 +268,7 @@ OTHERS: dict[str, Callable[..., None]] = {
     "depth_sensors": draw_depth_sensors,
     "dppo": draw_dppo,
     "rate": draw_rate,
-    "paper": draw_paper,
-    "paper_cloud": draw_paper_cloud,
+    **{table: partial(draw_paper, table=table) for table in ("paper", "paper_cloud")},
     "results": draw_results,
     "diagnosis": draw_diagnosis,
     "looks": draw_looks,

@@ -87,17 +87,7 @@ def draw_rate(plt: Any) -> None:
     figure.savefig(IMAGES / "rate.png")
 
 
-def draw_paper(plt: Any) -> None:
-    """The paper's pairs with the pads' encoders."""
-    draw_pairs(plt, "paper")
-
-
-def draw_paper_cloud(plt: Any) -> None:
-    """The paper's pairs by the paper's own network."""
-    draw_pairs(plt, "paper_cloud")
-
-
-def draw_pairs(plt: Any, table: str) -> None:
+def draw_paper(plt: Any, table: str) -> None:
     """A table's pairs: success while exploring, as judged afterwards, and as the paper has it."""
     found = [row for row in read_all(ROOT / "results") if isinstance(row, Run) and row.table == table]
     rows = [row for row in found if row.variant == TUNED]
