@@ -21,7 +21,7 @@ of a bank. On a GPU worlds wait for the one that runs out of time: --tune_steps=
 earlier, counted from the table. --tune_timestep_s=0.005 practises in longer physics steps than those in
 which policies are judged.
 
-Every policy becomes rows of results/paper.json, or of results/demonstrations.json, as soon as it is judged
+Every evaluation becomes a row of results/paper.json, or of results/demonstrations.json, as soon as it is done
 (by --recipe=cloud of paper_cloud.json and demonstrations_cloud.json). The same command again goes on where
 it was: finished stages are not repeated, nor policies whose rows are there with these numbers of episodes
 and iterations, so that it may go on on another machine.
@@ -33,9 +33,9 @@ import sys
 from itertools import chain, zip_longest
 from pathlib import Path
 
-from paper.outcome import is_done, rows
+from paper.outcome import is_done, row_of
 from paper.stages import TASKS, shared_stages, stages
-from paper.trained import Trained, chosen, table_of
+from paper.trained import Trained, chosen, table_of, variants
 from runs.side_by_side import run_all
 
 from lerobot_vtrefine.cli.arguments import CommandParser
@@ -134,10 +134,15 @@ def main() -> None:
 
 
 def finish(options: argparse.Namespace, policy: Trained) -> None:
-    """One policy's stages, and its rows."""
-    records = StageRunner(options.output_dir, stages(options, policy)).run()
-    commits = {record.name: record.commit for record in records}
-    save(options.results / f"{table_of(policy)}.json", rows(options, policy, commits), replace=False)
+    """One policy's stages; each evaluation is a row as soon as it is done."""
+    commits: dict[str, str | None] = {}
+    for record in StageRunner(options.output_dir, stages(options, policy)).records():
+        commits[record.name] = record.commit
+        for stage in variants(policy):
+            trained = f"{stage}_{policy.name}"
+            if record.name == f"eval_{trained}":
+                row = row_of(options, policy, stage, commits[trained])
+                save(options.results / f"{table_of(policy)}.json", [row], replace=False)
 
 
 if __name__ == "__main__":

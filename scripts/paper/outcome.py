@@ -1,4 +1,4 @@
-"""Rows of the paper's tables from what was judged."""
+"""A row of the paper's tables from what was judged."""
 
 import argparse
 import json
@@ -20,33 +20,30 @@ MORE_ROOM = {"contacts_per_world": 1024, "convex_per_world": 64, "rows_per_world
 """More than any pair's file has."""
 
 
-def rows(
-    options: argparse.Namespace, policy: Trained, commits: dict[str, str | None]
-) -> list[tuple[Row, Progress]]:
-    """What was found, with the learning curve beside the tuned policy; ``commits`` by stage."""
-    found: list[tuple[Row, Progress]] = []
-    progress = read_progress(options.output_dir / f"finetune_{policy.name}")
-    for stage, kind in variants(policy).items():
-        tuned = stage == "finetune"
-        judged = load_evaluation(options.output_dir / f"eval_{stage}_{policy.name}", first_seed(policy))
-        medians = judged["metrics"]["successes"]
-        extra = {key: medians[key]["median"] for key, *_ in MEASURED if medians.get(key)}
-        extra |= failures(judged)
-        tell_of_room(f"{stage} of {policy.name}", extra.get(NO_ROOM, 0.0))
-        if tuned:
-            extra |= {"largest_fall": largest_fall(progress)}
-            tell_of_room(f"an iteration of {policy.name}", most_without_room(progress))
-        row = Run(
-            **key(policy, kind),
-            success=judged["success"] / judged["episodes"],
-            episodes=judged["episodes"],
-            iterations=iterations_of(options, policy) if tuned else 0,
-            env_steps=last_steps(progress) if tuned else 0,
-            extra=extra,
-            **provenance() | {"commit": commits[f"{stage}_{policy.name}"] or options.commit},
-        )
-        found.append((row, progress if tuned else []))
-    return found
+def row_of(
+    options: argparse.Namespace, policy: Trained, stage: str, commit: str | None
+) -> tuple[Row, Progress]:
+    """What was found of ``imitation`` or ``finetune``; the learning curve beside the tuned policy."""
+    tuned = stage == "finetune"
+    progress = read_progress(options.output_dir / f"finetune_{policy.name}") if tuned else []
+    judged = load_evaluation(options.output_dir / f"eval_{stage}_{policy.name}", first_seed(policy))
+    medians = judged["metrics"]["successes"]
+    extra = {key: medians[key]["median"] for key, *_ in MEASURED if medians.get(key)}
+    extra |= failures(judged)
+    tell_of_room(f"{stage} of {policy.name}", extra.get(NO_ROOM, 0.0))
+    if tuned:
+        extra |= {"largest_fall": largest_fall(progress)}
+        tell_of_room(f"an iteration of {policy.name}", most_without_room(progress))
+    row = Run(
+        **key(policy, variants(policy)[stage]),
+        success=judged["success"] / judged["episodes"],
+        episodes=judged["episodes"],
+        iterations=iterations_of(options, policy) if tuned else 0,
+        env_steps=last_steps(progress) if tuned else 0,
+        extra=extra,
+        **provenance() | {"commit": commit or options.commit},
+    )
+    return row, progress
 
 
 def failures(judged: dict[str, Any]) -> dict[str, float]:

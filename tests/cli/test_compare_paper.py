@@ -12,6 +12,7 @@ import yaml
 from paper import trained
 from paper.outcome import MORE_ROOM, failures, most_without_room, tell_of_room
 
+from lerobot_vtrefine.cli.pipeline.stages import Stage
 from lerobot_vtrefine.cli.results.rows import Run, read_rows
 from lerobot_vtrefine.cli.results.tables import table
 
@@ -70,6 +71,28 @@ def test_policies_become_rows_of_the_papers_table_and_are_not_made_twice(
     for change, left in ((["--episodes=12"], 2), (["--scratch_iterations=21"], 1), (["--seeds=1"], 2)):
         options = parse([*common(tmp_path), "--pairs=00186", "--iterations=60", *change])
         assert sum(not script.is_done(options, policy) for policy in script.chosen(options)) == left
+
+
+@pytest.mark.usefixtures("fake_commands")
+def test_an_imitation_that_was_judged_is_a_row_even_if_its_fine_tuning_never_ends(
+    run: Callable[..., str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(trained, "MODALITIES", ("visuo_tactile",))
+    run_stage = script.StageRunner._execute
+
+    def cut_off(runner: script.StageRunner, stage: Stage, label: str) -> None:
+        if stage.name.startswith("finetune"):
+            raise ChildProcessError("the machine was given back")
+        run_stage(runner, stage, label)
+
+    asked = ["--pairs=00186", "--no_scratch", "--recipe=cloud"]
+    with monkeypatch.context() as patch:
+        patch.setattr(script.StageRunner, "_execute", cut_off)
+        patch.setattr(sys, "argv", ["compare_paper.py", *common(tmp_path), *asked])
+        assert script.main() != 0
+    assert set(of(tmp_path / "paper_cloud.json")) == {"imitation"}
+    assert run(*asked).count("done before") == 3  # demonstrations, imitation, its evaluation
+    assert set(of(tmp_path / "paper_cloud.json")) == {"imitation", ""}
 
 
 @pytest.mark.usefixtures("fake_commands")

@@ -10,6 +10,7 @@ import signal
 import subprocess
 import sys
 import time
+from collections.abc import Iterator
 from dataclasses import asdict, dataclass
 from pathlib import Path
 
@@ -94,7 +95,12 @@ class StageRunner:
         Raises:
             ChildProcessError: a command failed; the message names its log and quotes its last line.
         """
-        return [self._run_stage(number, stage) for number, stage in enumerate(self.stages, 1)]
+        return list(self.records())
+
+    def records(self) -> Iterator[StageRecord]:
+        """As ``run``, each record as soon as its stage is done."""
+        for number, stage in enumerate(self.stages, 1):
+            yield self._run_stage(number, stage)
 
     def _run_stage(self, number: int, stage: Stage) -> StageRecord:
         label = f"[{number}/{len(self.stages)}] {stage.title}"
