@@ -108,8 +108,10 @@ def decision_kl(
 ) -> Tensor:
     """KL divergence (B,) [nats] of whole decisions between two policies that share their noise.
 
-    old_mean, mean (B, K', H, D); std broadcastable to them. Exact for Gaussian steps: the sum over tuned
-    steps and executed action elements of half the squared shift of the mean in standard deviations.
+    old_mean, mean (B, K', H, D); std broadcastable to them. Exact for Gaussian steps of these deviations: the
+    sum over tuned steps and executed action elements of half the squared shift of the mean in them. DPPO's
+    are those of its log-probabilities, not below ``min_log_prob_std``. Where actions are drawn with less
+    noise (``min_sampling_std``), the policies that act are further apart, by up to the ratio's square.
     """
     shift = whiten(((mean - old_mean) / std)[:, :, executed], correlation)
     return 0.5 * shift.square().sum(dim=(1, 2, 3))

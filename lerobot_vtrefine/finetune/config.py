@@ -74,9 +74,10 @@ class DppoConfig(draccus.ChoiceRegistry):
     # Stop the iteration's update when a minibatch's approximate KL divergence exceeds this.
     target_kl: float = 1.0
     # Trust region: the actor's learning rate is adapted so that an iteration moves the policy by this KL
-    # divergence per decision [nats], summed over executed actions and tuned steps. It falls geometrically to
-    # the final value. 0: the learning rate follows its own schedule. The same step is larger beside quieter
-    # exploration: with a third of min_sampling_std, aim at a ninth.
+    # divergence per decision [nats], summed over executed actions and tuned steps, in the deviations of its
+    # log-probabilities (min_log_prob_std). It falls geometrically to the final value. 0: the learning rate
+    # follows its own schedule. The same step is larger beside quieter exploration: with a third of
+    # min_sampling_std, aim at a ninth.
     kl_per_decision: float = 0.0
     # What kl_per_decision falls to by the last iteration.
     kl_per_decision_final: float = 0.0

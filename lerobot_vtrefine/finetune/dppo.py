@@ -50,7 +50,7 @@ from lerobot_vtrefine.finetune.protocols import (
     select,
     start,
 )
-from lerobot_vtrefine.finetune.seeds import TRAINING_SEEDS
+from lerobot_vtrefine.finetune.seeds import TRAINING_SEEDS, forked_rng, policy_noise
 from lerobot_vtrefine.finetune.trust_region import TrustRegion
 from lerobot_vtrefine.policies.vt_dp3.diffusion import denoise_prefix
 
@@ -75,7 +75,7 @@ class TrainState:
     def create(cls, agent: Agent, cfg: DppoConfig, privileged_dim: int, seed: int) -> "TrainState":
         """Fresh state on the actor's device; ranks differ only in their exploration noise."""
         device = agent.device
-        with torch.random.fork_rng(devices=[]):
+        with forked_rng(device):
             torch.manual_seed(seed)
             critic = Critic(privileged_dim, cfg.critic_width, cfg.critic_blocks).to(device)
         adamw = partial(torch.optim.AdamW, weight_decay=cfg.weight_decay, fused=device.type == "cuda")
@@ -84,7 +84,7 @@ class TrainState:
             adamw(agent.trained_parameters(), lr=cfg.actor_lr),
             adamw(critic.parameters(), lr=cfg.critic_lr),
             RewardScaler(),
-            torch.Generator(device).manual_seed(seed + 7919 * rank_index()),
+            policy_noise(device, seed, rank_index()),
             TrustRegion(cfg),
         )
 

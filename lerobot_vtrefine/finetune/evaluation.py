@@ -13,7 +13,7 @@ from lerobot_vtrefine.finetune.protocols import (
     select,
     start,
 )
-from lerobot_vtrefine.finetune.seeds import EVALUATION_SEEDS
+from lerobot_vtrefine.finetune.seeds import EVALUATION_SEEDS, forked_rng, policy_noise
 from lerobot_vtrefine.policies.vt_dp3.diffusion import deploy
 
 
@@ -28,8 +28,7 @@ def evaluate(
     effect on training: torch's global generator (sensor noise in preprocessors) is seeded here and then
     restored.
     """
-    with torch.random.fork_rng():
-        torch.manual_seed(first_seed)
+    with forked_rng(agent.device):
         return _evaluate(env, agent, num_episodes, first_seed)
 
 
@@ -39,7 +38,8 @@ def _evaluate(env: DecisionEnv, agent: Agent, num_episodes: int, first_seed: int
     for batch in range(batches):
         first = first_seed + (batch * num_ranks() + rank_index()) * env.num_envs
         obs, _ = start(env, range(first, first + env.num_envs), device)
-        generator = torch.Generator(device).manual_seed(first)
+        torch.manual_seed(first)
+        generator = policy_noise(device, first)
         running = torch.ones(env.num_envs, dtype=torch.bool, device=device)
         total, info = torch.zeros(env.num_envs, device=device), {}
         for _ in range(env.max_decisions):
@@ -67,6 +67,7 @@ def deployed_chunks(agent: Agent, cond: Tensor, cond_base: Tensor, generator: to
         num_tuned=agent.num_tuned,
         predict_noise_base=predictor(agent.base, cond_base),
         eta=agent.deploy_eta,
+        correlation=agent.deploy_correlation,
         generator=generator,
     )
     return chunks[:, agent.executed]

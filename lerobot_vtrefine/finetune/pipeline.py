@@ -53,9 +53,10 @@ SHOWN = (
 """Metrics that the log tells after every iteration; progress.csv has all."""
 MADE_WITH = (
     *("sampler", "sampler_steps", "prefix_steps", "ft_denoising_steps", "eta", "encoder"),
-    *("critic_width", "critic_blocks"),
+    *("critic_width", "critic_blocks", "num_envs"),
 )
-"""Settings of ``dppo`` that a checkpoint's networks, and how its policy acts, were made with."""
+"""Settings of ``dppo`` that a checkpoint's networks, and how its policy acts, were made with; and by which
+episodes are counted, of which none is to come twice."""
 
 
 @dataclass
@@ -218,6 +219,7 @@ def make_agent(policy: VtDp3Policy, dppo: DppoConfig) -> Agent:
         executed=slice(0, config.n_action_steps),
         frozen_encoder=config.ft_freeze_encoder,
         deploy_eta=config.ft_eta,
+        deploy_correlation=config.ft_noise_correlation,
     )
 
 

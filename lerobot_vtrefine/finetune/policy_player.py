@@ -11,6 +11,7 @@ from lerobot_vtrefine.finetune.config import PaperDppo
 from lerobot_vtrefine.finetune.evaluation import deployed_chunks
 from lerobot_vtrefine.finetune.pipeline import load_policy, make_practice
 from lerobot_vtrefine.finetune.protocols import Observation, execute, select, start
+from lerobot_vtrefine.finetune.seeds import policy_noise
 
 
 class PolicyPlayer:
@@ -23,7 +24,7 @@ class PolicyPlayer:
         policy = load_policy(path, [f"--device={device}"])
         practice = make_practice(policy, path, config, PaperDppo(num_envs=num_envs))
         self._env, self._agent = practice.env, practice.agent
-        self._generator = torch.Generator(self._agent.device)
+        self._generator = policy_noise(self._agent.device, 0)
         self._obs: Observation = {}
 
     @property
@@ -34,7 +35,7 @@ class PolicyPlayer:
     def start(self, seeds: np.ndarray) -> None:
         """Start an episode in every environment (n,); all noise follows from the first seed."""
         torch.manual_seed(int(seeds[0]))
-        self._generator.manual_seed(int(seeds[0]))
+        self._generator = policy_noise(self._agent.device, int(seeds[0]))
         self._obs, _ = start(self._env, seeds.tolist(), self._agent.device)
 
     @torch.no_grad()

@@ -40,7 +40,8 @@ class Agent:
     ``base`` denoises down to the last ``num_tuned`` steps and stays frozen; ``actor`` does these steps.
     ``executed`` is the part of the horizon that reaches the environment. ``frozen_encoder``: the actor's
     encoder is not trained and is the base's, so conditions are computed once and kept. ``deploy_eta``:
-    stochasticity of the tuned steps in deployment, which has no exploration noise.
+    stochasticity of the tuned steps in deployment, which has no exploration noise; ``deploy_correlation`` of
+    that noise from one action to the next.
     """
 
     actor: Actor
@@ -51,6 +52,7 @@ class Agent:
     executed: slice
     frozen_encoder: bool
     deploy_eta: float
+    deploy_correlation: float = 0.0
 
     @property
     def device(self) -> torch.device:

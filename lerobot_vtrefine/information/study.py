@@ -238,7 +238,13 @@ def _tested(
 
 
 def _spread(frames: Frames) -> np.ndarray:
-    return frames.truth[frames.held_index()].std(0).cpu().numpy()
+    """Standard deviation (K,) of what is estimated, over frames with both parts in hand; every episode weighs
+    the same, however long it is, as it does in the regressors' errors."""
+    episode, frame = frames.held_index()
+    weight = 1 / frames.held.sum(1)[episode, None]
+    truth = frames.truth[episode, frame]
+    mean = (weight * truth).sum(0) / weight.sum()
+    return ((weight * (truth - mean).square()).sum(0) / weight.sum()).sqrt().cpu().numpy()
 
 
 def _shown(values: np.ndarray) -> dict[str, float]:

@@ -128,6 +128,10 @@ def test_what_is_no_file_of_rows_is_told(tmp_path: Path) -> None:
         ("[]", r"touch.json: must be \{\"rows\""),
         (json.dumps({"rows": [good, good]}), "row 2: stands for the same as an earlier one"),
         (json.dumps({"rows": [{k: v for k, v in good.items() if k != "machine"}]}), "row 1: lacks machine"),
+        (
+            json.dumps({"rows": [good | {"curve": "touch.json"}, good | {"seed": 1, "curve": "touch.json"}]}),
+            "row 2: curve touch.json is an earlier row's",
+        ),
     ):
         path.write_text(text)
         with pytest.raises(ValueError, match=message):

@@ -21,7 +21,7 @@ from lerobot_vtrefine.envs.decisions import make_decision_env
 from lerobot_vtrefine.finetune import pipeline
 from lerobot_vtrefine.finetune.config import PaperDppo
 from lerobot_vtrefine.finetune.logger import CLOCK, read_progress
-from lerobot_vtrefine.finetune.seeds import EVALUATION_SEEDS
+from lerobot_vtrefine.finetune.seeds import EVALUATION_SEEDS, policy_noise
 from lerobot_vtrefine.finetune.state_file import load_state
 from lerobot_vtrefine.policies.vt_dp3.modeling_vt_dp3 import VtDp3Policy
 
@@ -155,22 +155,23 @@ def test_every_evaluation_has_its_own_number_of_episodes(finetune, tmp_path, cap
     assert "success was not measured before and after" in capsys.readouterr().out
 
 
-@pytest.mark.parametrize("eta", [0.0, 1.0])
-def test_reloaded_checkpoint_deploys_what_was_evaluated(finetune, tmp_path, eta):
+@pytest.mark.parametrize(("eta", "correlation"), [(0.0, 0.0), (1.0, 0.0), (1.0, 0.8)])
+def test_reloaded_checkpoint_deploys_what_was_evaluated(finetune, tmp_path, eta, correlation):
     """The last evaluation of the run is repeated by the policy's own inference from the files."""
     output = tmp_path / "run"
-    assert finetune(output, "--dppo.encoder=trained", f"--dppo.eta={eta}", iterations=2) == 0
+    flags = (f"--dppo.eta={eta}", f"--policy.ft_noise_correlation={correlation}")
+    assert finetune(output, "--dppo.encoder=trained", *flags, iterations=2) == 0
     path = output / "checkpoints" / "last" / "pretrained_model"
     policy = VtDp3Policy.from_pretrained(path, config=PreTrainedConfig.from_pretrained(path)).eval()
-    assert policy.config.ft_eta == eta
+    assert (policy.config.ft_eta, policy.config.ft_noise_correlation) == (eta, correlation)
     env, first = ReachEnv(6), EVALUATION_SEEDS
     success = []
-    torch.manual_seed(first)
     for batch in range(2):
         seed = first + 6 * batch
+        torch.manual_seed(seed)
         obs, _ = env.reset(range(seed, seed + 6))
         running, reached = torch.ones(6, dtype=torch.bool), torch.zeros(6, dtype=torch.bool)
-        generator = torch.Generator().manual_seed(seed)
+        generator = policy_noise(torch.device("cpu"), seed)
         while running.any():
             noise = torch.randn(int(running.sum()), 8, 16, generator=generator)
             actions = torch.zeros(6, 4, 16)
@@ -247,6 +248,7 @@ def test_checkpoints_hold_the_settings_of_their_run(finetune, tmp_path, monkeypa
         ("--dppo.ft_denoising_steps=5", "was made with --dppo.ft_denoising_steps=10, not 5"),
         ("--dppo.encoder=frozen", "was made with --dppo.encoder=trained, not frozen"),
         ("--dppo.critic_width=8", "was made with --dppo.critic_width=16, not 8"),
+        ("--dppo.num_envs=3", "was made with --dppo.num_envs=6, not 3"),  # episodes would come twice
         ("--seed=3", "was made with --seed=0, not 3"),
     ],
 )

@@ -21,7 +21,8 @@ def ranks(tmp_path_factory):
     checkpoint = save_tiny_checkpoint(folder / "start")
     script = Path(__file__).with_name("two_ranks.py")
     command = [sys.executable, "-m", "torch.distributed.run", "--standalone", "--nproc_per_node=2"]
-    environment = {**os.environ, "OMP_NUM_THREADS": "1", "PYTHONPATH": str(script.parent)}
+    path = os.pathsep.join([str(script.parent), os.environ.get("PYTHONPATH", "")]).rstrip(os.pathsep)
+    environment = {**os.environ, "OMP_NUM_THREADS": "1", "PYTHONPATH": path}
     done = subprocess.run(
         [*command, str(script), str(folder), str(checkpoint)],
         env=environment,
@@ -50,6 +51,11 @@ def test_each_rank_owns_its_environments(ranks):
     first, second = (found["seeds"] for found in ranks[0])
     assert len(first) == len(second) > 0
     assert not set(first) & set(second)
+
+
+def test_each_rank_explores_with_noise_of_its_own(ranks):
+    first, second = (found["noise"] for found in ranks[0])
+    assert first != second
 
 
 def test_one_run_is_recorded(ranks):

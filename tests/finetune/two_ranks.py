@@ -3,6 +3,7 @@
 import json
 import sys
 from pathlib import Path
+from typing import Any
 
 import torch
 from test_dppo import problem, small_config
@@ -58,7 +59,9 @@ def main(folder: Path, checkpoint: Path) -> None:
     join_ranks(torch.device("cpu"))
     together = updated_weights([range(0, 3), range(3, 12)], ranks=2)  # unequal shares
     own = torch.tensor([1.0, torch.nan]) if rank_index() == 0 else torch.tensor([4.0, 4.0])
-    found = {
+    noise = problem(small_config())[2].generator.initial_seed()
+    found: dict[str, Any] = {
+        "noise": noise,
         "difference": float((alone[0] - together[0]).abs().max()),
         "moved": float((alone[0] - updated_weights([range(0, 3), range(0, 3)], ranks=2)[0]).abs().max()),
         "metrics": [float(a) for a in (alone[1] - together[1]).abs()],

@@ -170,6 +170,7 @@ def read_rows(path: Path) -> list[Row]:
     if not isinstance(content, dict) or not isinstance(content.get("rows"), list):
         raise ValueError(f'{path}: must be {{"rows": [...]}}')
     rows: dict[tuple[Any, ...], Row] = {}
+    curves: set[str] = set()
     for number, data in enumerate(content["rows"], 1):
         try:
             row = _row(data)
@@ -177,9 +178,12 @@ def read_rows(path: Path) -> list[Row]:
                 raise ValueError(f"stands for the same as an earlier one: {row.key}")
             if isinstance(row, Run) and row.curve and not (path.parent / row.curve).is_file():
                 raise ValueError(f"curve {row.curve} is not a file")
+            if isinstance(row, Run) and row.curve and row.curve in curves:
+                raise ValueError(f"curve {row.curve} is an earlier row's")
         except ValueError as error:
             raise ValueError(f"{path}: row {number}: {error}") from error
         rows[row.key] = row
+        curves |= {row.curve} if isinstance(row, Run) and row.curve else set()
     return list(rows.values())
 
 
