@@ -101,10 +101,12 @@ def run(options: argparse.Namespace, folder: Path) -> "Calibration":
 def describe(calibration: "Calibration") -> list[str]:
     """The result in a few lines of text."""
     from lerobot_vtrefine.diagnose.calibration.page import remarks
+    from lerobot_vtrefine.diagnose.report.issues import issue_lines
     from lerobot_vtrefine.diagnose.report.numbers import interval
 
     recordings = plural(calibration.excitation.recordings, "recording")
-    lines = [f"{recordings}, {100 * calibration.explained:.1f} % explained"]
+    lines = issue_lines(calibration.issues)
+    lines.append(f"{recordings}, {100 * calibration.explained:.1f} % explained")
     for name, item in calibration.parameters.items():
         if isinstance(item.value, float):
             value, spread = interval(item.value, item.ci95, item.unit)

@@ -12,7 +12,6 @@ from lerobot_vtrefine.cli.arguments import CommandParser
 from lerobot_vtrefine.cli.errors import run_cli
 from lerobot_vtrefine.cli.formats import add_format_flags
 from lerobot_vtrefine.cli.outputs import staged
-from lerobot_vtrefine.wording import plural
 
 if TYPE_CHECKING:
     from lerobot_vtrefine.diagnose.core.diagnosis import Diagnosis
@@ -20,7 +19,6 @@ if TYPE_CHECKING:
 
 FILES = ("baseline_model.json", "sensor_model.json", "report.html", "verdict.json")
 """What a run leaves in the output folder; the verdict last, so that it stands for a whole run."""
-SHOWN_ISSUES = 4
 """Problems of the data that the terminal tells; the report tells all."""
 DESCRIPTION = """\
 Compare measured recordings with the simulation, name what the simulation gets wrong, extend its model
@@ -152,6 +150,7 @@ def run(
 
 def summarise(found: "Diagnosis", output_dir: Path, survived: str) -> None:
     """The verdict and where to read about it, in a few lines."""
+    from lerobot_vtrefine.diagnose.report.issues import issue_lines
     from lerobot_vtrefine.diagnose.report.words import headline, power_line
 
     verdict = found.verdict
@@ -160,10 +159,8 @@ def summarise(found: "Diagnosis", output_dir: Path, survived: str) -> None:
         print(power)
     if survived:
         print(f"stability: {survived}")
-    for issue in verdict.data_issues[:SHOWN_ISSUES]:
-        print(f"{issue.trial or 'all recordings'}: {issue.problem} ({issue.action})")
-    if (more := len(verdict.data_issues) - SHOWN_ISSUES) > 0:
-        print(f"{plural(more, 'more problem')} of the data in the report")
+    for line in issue_lines(verdict.data_issues):
+        print(line)
     print(f"report: {output_dir / 'report.html'}")
 
 

@@ -2,6 +2,7 @@
 
 import argparse
 import json
+import shlex
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any, override
@@ -37,7 +38,8 @@ def _write_template(folder: str) -> str:
     from lerobot_vtrefine.diagnose.template import write_template
 
     written = write_template(Path(folder))
-    return f"wrote an example set; try vtrefine-diagnose --recording={written} --output_dir=diagnosis"
+    named = shlex.quote(str(written))
+    return f"wrote an example set; try vtrefine-diagnose --recording={named} --output_dir=diagnosis"
 
 
 def add_format_flags(parser: argparse.ArgumentParser) -> None:

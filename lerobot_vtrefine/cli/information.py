@@ -15,14 +15,16 @@ from lerobot.utils.utils import init_logging
 from tqdm import tqdm
 
 from lerobot_vtrefine.cli.errors import run_cli
+from lerobot_vtrefine.cli.outputs import staged
 from lerobot_vtrefine.cli.results.provenance import write_provenance
 from lerobot_vtrefine.envs import VtRefineEnvConfig
-from lerobot_vtrefine.folders import beside, put_in_place
 from lerobot_vtrefine.information.contact import SIDE, TOUCHING
 from lerobot_vtrefine.information.estimator import POLICY, SENSES
 from lerobot_vtrefine.information.page import render_page
 from lerobot_vtrefine.information.quantities import unit_of
 from lerobot_vtrefine.information.study import Effort, Study, save_keeper, study, write
+
+FILES = ("information.json", "report.html")
 
 
 @dataclass
@@ -30,7 +32,9 @@ class InformationConfig:
     """Flags of ``vtrefine-information``."""
 
     output_dir: Path = Path("outputs/information")
-    """Folder of information.json, report.html and the trained encoders; replaced as a whole."""
+    """Folder of information.json, report.html and the trained encoders."""
+    overwrite: bool = False
+    """Replace a study that is there already."""
     env: EnvConfig = field(default_factory=VtRefineEnvConfig)
     """The task that is looked into."""
     senses: tuple[str, ...] = ("joints", "visual", "tactile", "visuo_tactile")
@@ -94,14 +98,13 @@ def information(cfg: InformationConfig) -> None:
     """Study one task and write what was found."""
     env = cfg.env
     assert isinstance(env, VtRefineEnvConfig)
-    with beside(cfg.output_dir) as folder:
+    with staged(cfg.output_dir, FILES, overwrite=cfg.overwrite) as folder:
         found = study(env, cfg.senses, cfg.effort, Bars(), save_keeper(folder, cfg.effort))
         write(found, cfg.effort, folder)
         scene = env.scene_config
         page = render_page(found, scene.pair, scene.clearance_m)
-        (folder / "report.html").write_text(page, encoding="utf-8")
+        (folder / FILES[1]).write_text(page, encoding="utf-8")
         write_provenance(folder)
-        put_in_place(folder, cfg.output_dir)
     print(summary(found))
     logging.info("everything is in %s", cfg.output_dir)
 

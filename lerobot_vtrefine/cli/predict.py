@@ -39,7 +39,7 @@ def make_parser() -> CommandParser:
         type=Path,
         required=True,
         metavar="FILE",
-        help="sensor_model.json or baseline_model.json of a diagnosis, or any sensor model",
+        help="sensor_model.json or baseline_model.json of a diagnosis, or any sensor model's file",
     )
     parser.add_argument(
         "--output_dir", type=Path, required=True, metavar="DIR", help="folder for the predictions"
@@ -54,7 +54,12 @@ def main(arguments: Sequence[str] | None = None) -> None:
     options = make_parser().parse_args(arguments)
     if options.output_dir.resolve() == options.recording.resolve():
         raise ValueError("--output_dir is the folder of the recordings, which predictions would replace")
-    from lerobot_vtrefine.diagnose.predict import load_predictor, predict_frames, write_prediction
+    from lerobot_vtrefine.diagnose.predict import (
+        load_predictor,
+        predict_frames,
+        sound_frames,
+        write_prediction,
+    )
     from lerobot_vtrefine.diagnose.quality import in_si_units
     from lerobot_vtrefine.diagnose.recordings import read_recording_set
 
@@ -62,6 +67,13 @@ def main(arguments: Sequence[str] | None = None) -> None:
     recordings, repairs = in_si_units(recorded)
     for repair in repairs:
         print(f"{repair.trial or 'all trials'}: {repair.problem}; {repair.action}", file=sys.stderr)
+    for trial in recordings.trials:
+        if broken := int((~sound_frames(trial)).sum()):
+            print(
+                f"{trial.file}: {broken} of {len(trial.time_s)} frames come again, or have no number in what"
+                " moves the model; they get the prediction of the frame before",
+                file=sys.stderr,
+            )
     predict = load_predictor(options.sensor_model, recordings)
     names = [trial.file for trial in recordings.trials]
     if outside := [name for name in names if ".." in Path(name).parts or Path(name).is_absolute()]:

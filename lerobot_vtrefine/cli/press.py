@@ -1,5 +1,6 @@
 """``vtrefine-press``: record presses of a simulated pad with a hidden flaw, to try diagnosis."""
 
+import shlex
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -52,7 +53,9 @@ def main(arguments: Sequence[str] | None = None) -> None:
     with staged(options.output_dir, ("recording.json",), overwrite=options.overwrite) as folder:
         record(options.reality, folder, options.trials, options.seed)
     print(f"{plural(options.trials, 'recording')} in {options.output_dir}")
-    print(f"next: vtrefine-diagnose --recording={options.output_dir} --output_dir=diagnosis")
+    print(
+        f"next: vtrefine-diagnose --recording={shlex.quote(str(options.output_dir))} --output_dir=diagnosis"
+    )
 
 
 if __name__ == "__main__":

@@ -28,8 +28,11 @@ def load_predictor(path: str | Path, recordings: RecordingSet) -> Predict:
     """The model in a file, applied to trials of this set.
 
     Raises:
+        FileNotFoundError: there is no such file.
         ValueError: the file is not a model, or one of the other kind (pad, robot); names the file.
     """
+    if not Path(path).is_file():
+        raise FileNotFoundError(f"--sensor_model={path}: no such file; vtrefine-diagnose writes one")
     data = read_json(path)
     schema = data.get("schema") if isinstance(data, dict) else None
     wanted = {"pad": sensor_model.SCHEMA, "robot": robot_model.SCHEMA}[recordings.kind]
@@ -49,11 +52,25 @@ def load_predictor(path: str | Path, recordings: RecordingSet) -> Predict:
     sensor = sensor_model.SensorModel.load(path)
     layout = PadLayout(recordings.rows, recordings.cols, recordings.pitch_m)
     if not any(isinstance(stage, Remembering) and stage.session for stage in sensor.stages):
-        return lambda trial: predict_trial(sensor, trial, layout)
+        return _of_file(path, lambda trial: predict_trial(sensor, trial, layout))
     made = [_sound(trial) for trial in recordings.trials if isinstance(trial, Trial)]
     made = with_session(made, [drive_of(trial, layout) for trial in made])
     borne = {trial.file: trial.borne for trial in made}
-    return lambda trial: predict_trial(sensor, replace(trial, borne=borne.get(trial.file)), layout)
+    return _of_file(
+        path, lambda trial: predict_trial(sensor, replace(trial, borne=borne[trial.file]), layout)
+    )
+
+
+def _of_file(path: str | Path, predict: Predict) -> Predict:
+    """The same, naming the model's file where it does not fit a trial, such as one of another pad."""
+
+    def told(trial: Any) -> np.ndarray:
+        try:
+            return predict(trial)
+        except ValueError as error:
+            raise ValueError(f"{path}: {error}") from error
+
+    return told
 
 
 def _sound[T: Trial | RobotTrial](trial: T) -> T:

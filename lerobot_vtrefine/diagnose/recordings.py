@@ -7,6 +7,7 @@ from typing import Any, Literal
 import numpy as np
 import pyarrow as pa
 
+from lerobot_vtrefine.diagnose.recording_folder import header_of
 from lerobot_vtrefine.files import decode, inside, limits, read_json
 from lerobot_vtrefine.files.schema import LARGEST_NUMBER
 from lerobot_vtrefine.files.tables import read_table
@@ -209,11 +210,7 @@ def read_recording_set(path: str | Path, *, measured: bool = True) -> RecordingS
     column and problem. Values are not judged here, see `quality`.
     """
     folder = Path(path)
-    header_path = folder / "recording.json"
-    if not header_path.is_file():
-        raise FileNotFoundError(
-            f"{header_path}: no such file; a recording set is a folder with recording.json"
-        )
+    header_path = header_of(folder)
     header = _read_header(header_path)
     pad, reading, joints = header.pad, header.reading, header.joints or ()
     is_pad = header.kind == "pad" and pad is not None

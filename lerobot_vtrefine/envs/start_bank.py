@@ -58,6 +58,10 @@ class StartBank:
         Raises:
             OSError: it is not there. ValueError: it is no bank, or one of another task.
         """
+        if not path.exists():
+            raise FileNotFoundError(
+                f"--env.start_bank={path}: no such file; vtrefine-record-starts makes one"
+            )
         arrays = read_arrays(path, "iufbU")
         if not {SETTINGS, SOURCE} <= set(arrays):
             raise ValueError(f"{path} is no bank of states: vtrefine-record-starts makes one")

@@ -242,11 +242,12 @@ def checked_env(env: EnvConfig) -> VtRefineEnvConfig:
 def make_practice(policy: VtDp3Policy, path: Path, env: EnvConfig, dppo: DppoConfig) -> Practice:
     """Agent, environments of this rank and the processors that were saved beside the policy in ``path``.
 
-    Raises: ValueError for another environment type, or another control rate than the policy learned.
+    Raises: ValueError for another environment type, control rate or robot than the policy learned.
     """
     env = checked_env(env)
     config = policy.config
     config.check_fps(env.fps)
+    config.check_body(env.body.name)
     overrides = {"device_processor": {"device": config.device or "cpu"}}
     processors = make_pre_post_processors(config, str(path), preprocessor_overrides=overrides)
     agent = make_agent(policy, dppo)

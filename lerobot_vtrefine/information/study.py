@@ -76,16 +76,20 @@ class Effort:
     def __post_init__(self) -> None:
         for name in ("episodes", "num_envs", "steps", "batch_size"):
             if getattr(self, name) < 1:
-                raise ValueError(f"--{name} must be at least 1, got {getattr(self, name)}")
+                raise ValueError(f"--effort.{name} must be at least 1, got {getattr(self, name)}")
         if not self.history or min(self.history) < 1:
-            raise ValueError(f"--history must hold numbers of frames from 1, got {self.history}")
+            raise ValueError(f"--effort.history must hold numbers of frames from 1, got {self.history}")
         unknown = [name for name in self.networks if name not in NETWORKS]
         if unknown or not self.networks:
-            raise ValueError(f"--networks={','.join(self.networks)}: choose from {', '.join(NETWORKS)}")
+            raise ValueError(
+                f"--effort.networks={','.join(self.networks)}: choose from {', '.join(NETWORKS)}"
+            )
         if self.clearances_m and min(self.clearances_m) <= 0:
-            raise ValueError(f"--clearances_m must hold lengths above 0, got {self.clearances_m}")
+            raise ValueError(f"--effort.clearances_m must hold lengths above 0, got {self.clearances_m}")
         if self.episodes < 2 * self.num_envs:
-            raise ValueError(f"--episodes={self.episodes} must be at least twice --num_envs={self.num_envs}")
+            raise ValueError(
+                f"--effort.episodes={self.episodes} must be at least twice --effort.num_envs={self.num_envs}"
+            )
         most = closed_loop.FIRST_SEED - FIRST_SEED - self.episodes
         if not 0 <= self.seed <= most:
             raise ValueError(f"--effort.seed must be within 0..{most}, got {self.seed}")

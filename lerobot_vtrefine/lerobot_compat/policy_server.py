@@ -116,6 +116,8 @@ def start(host: str, port: int, fps: int) -> grpc.Server:
     try:
         server.add_insecure_port(f"{host}:{port}")
     except RuntimeError as error:
-        raise ValueError(f"cannot listen at {host}:{port}: is another server there? choose --port") from error
+        raise ValueError(
+            f"cannot listen at {host}:{port}: choose another --port, if a server is there, or another --host"
+        ) from error
     server.start()
     return server

@@ -119,7 +119,7 @@ def load_mesh_pair(
     mesh_id = name.removeprefix(PREFIX)
     if mesh_dir is None:
         raise ValueError(
-            f"pair {name} needs mesh_dir: the folder that holds {mesh_id}_plug.obj and {mesh_id}_socket.obj"
+            f"pair {name} needs --env.mesh_dir: the folder with {mesh_id}_plug.obj and {mesh_id}_socket.obj"
         )
     paths = _part_paths(mesh_id, Path(mesh_dir).expanduser())
     factors = part_scales(mesh_id, scale)

@@ -118,3 +118,29 @@ def test_what_is_refused(
 def test_missing_folder(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert main([f"--recording={tmp_path / 'none'}", f"--output_dir={tmp_path / 'out'}"]) == 2
     assert "recording.json: no such file" in capsys.readouterr().err
+
+
+def test_a_press_without_readings_is_named(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """It was left out of the fit without a word."""
+    folder = write_presses(tmp_path / "presses", (1e-3, 4e-3, 12e-3), (3e-4, 6e-4, 1e-3))
+    path = folder / "trial_0002.parquet"
+    table = pq.read_table(path)
+    blank = pa.array([[float("nan")]] * len(table))
+    pq.write_table(table.set_column(table.schema.get_field_index("raw"), "raw", blank), path)
+    assert main([f"--recording={folder}", f"--output_dir={tmp_path / 'out'}"]) == 0
+    first, second, *_ = capsys.readouterr().out.splitlines()
+    assert first.startswith("trial_0002.parquet: ")
+    assert first.endswith("(set aside)")
+    assert second.startswith("8 recordings")
+
+
+def test_other_things_than_a_folder_of_presses_are_named(
+    presses: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    out = f"--output_dir={tmp_path / 'out'}"
+    assert main([f"--recording={presses / 'recording.json'}", out]) == 2
+    assert "recording.json is a file; name the folder" in capsys.readouterr().err
+    (tmp_path / "data" / "meta").mkdir(parents=True)
+    (tmp_path / "data" / "meta" / "info.json").write_text("{}")
+    assert main([f"--recording={tmp_path / 'data'}", out]) == 2
+    assert "data is a LeRobot dataset; a recording set is a folder" in capsys.readouterr().err

@@ -1,5 +1,6 @@
 """``vtrefine-press``: a recording set is there as a whole or not at all."""
 
+import shlex
 from pathlib import Path
 
 import pytest
@@ -28,3 +29,12 @@ def test_a_set_is_replaced_only_when_asked_to(tmp_path: Path, capsys: pytest.Cap
     assert (folder / "trial_0000.parquet").read_bytes() == first
     assert press.main([*arguments, "--seed=1", "--overwrite"]) == 0
     assert (folder / "trial_0000.parquet").read_bytes() != first
+
+
+def test_the_next_command_can_be_copied_where_paths_have_spaces(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    folder = tmp_path / "my presses"
+    assert press.main([f"--output_dir={folder}", "--trials=2"]) == 0
+    (line,) = [line for line in capsys.readouterr().out.splitlines() if line.startswith("next: ")]
+    assert f"--recording={folder}" in shlex.split(line)

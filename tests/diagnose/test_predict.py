@@ -150,3 +150,26 @@ def test_pitch_matters(tmp_path, model):
             (read(tmp_path / f"out{pitch}" / "trial_0000.parquet", "raw")[1].max(axis=0) > 26).sum()
         )
     assert pressed[1] > 1.5 * pressed[0]
+
+
+def test_frames_without_a_prediction_of_their_own_are_told(tmp_path, model, capsys):
+    header, columns = make_set(trials=2)
+    columns[1]["depth_m"] = columns[1]["depth_m"].copy()
+    columns[1]["depth_m"][10:21] = np.nan
+    assert run(write_set(tmp_path / "set", header, columns), model, tmp_path / "out") == 0
+    told = [line for line in capsys.readouterr().err.splitlines() if "frames" in line]
+    assert len(told) == 1
+    assert told[0].startswith("trial_0001.parquet: 11 of 150 frames come again, or have no number")
+
+
+def test_a_model_that_does_not_fit_or_is_not_there_is_named(tmp_path, capsys):
+    header, columns = make_set(trials=1)
+    recording = write_set(tmp_path / "set", header, columns)
+    other = SensorModel((KelvinVoigt(k_n=400.0, k_d=0.0), Gain(500.0), Idle(np.full((13, 32), 25.0), 0.0)))
+    other.save(tmp_path / "other.json")
+    assert run(recording, tmp_path / "other.json", tmp_path / "out") == 2
+    error = capsys.readouterr().err.strip().splitlines()[-1]
+    assert f"{tmp_path / 'other.json'}: the sensor model holds a map of 13 x 32 taxels" in error
+    assert run(recording, "nofile.json", tmp_path / "out") == 2
+    assert "--sensor_model=nofile.json: no such file" in capsys.readouterr().err
+    assert not (tmp_path / "out").exists()

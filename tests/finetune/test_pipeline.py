@@ -311,6 +311,8 @@ def test_bad_input_is_one_clear_line(finetune, tmp_path, capsys):
     assert finetune(tmp_path / "run", iterations=1) == 0
     tuned = tmp_path / "run" / "checkpoints" / "last" / "pretrained_model"
     assert "fine-tuned already" in complaint(policy=tuned)
+    other = "--env.scene.embodiment=kinova"
+    assert f"{other}, but the policy is of aloha: name an environment" in complaint(other)
 
 
 @pytest.mark.parametrize(

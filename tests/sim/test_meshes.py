@@ -139,7 +139,7 @@ def test_missing_folder_names_the_files(tmp_path: Path) -> None:
 
 
 def test_no_folder_given_says_so() -> None:
-    with pytest.raises(ValueError, match="automate/00186 needs mesh_dir"):
+    with pytest.raises(ValueError, match=r"automate/00186 needs --env\.mesh_dir"):
         load_mesh_pair("automate/00186", None)
 
 

@@ -93,6 +93,7 @@ class PolicyAgent:
             ) from error
         if isinstance(config, VtDp3Config):
             config.check_fps(env.fps)
+            config.check_body(env.body.name)
         config.pretrained_path = Path(path)
         config.device = device or ("cuda" if torch.cuda.is_available() else "cpu")
         self.policy = make_policy(cfg=config, env_cfg=env)

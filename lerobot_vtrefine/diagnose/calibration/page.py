@@ -65,7 +65,7 @@ def remarks(calibration: Calibration) -> list[str]:
         )
     if calibration.presses.full_scale != SIMULATED_FULL_SCALE:
         said.append(
-            f"Readings go up to {calibration.presses.full_scale:g} here, the simulator's pads stop at"
+            f"Full scale is {calibration.presses.full_scale:g} here; the simulator's pads stop at"
             f" {SIMULATED_FULL_SCALE:g}."
         )
     return said

@@ -65,9 +65,11 @@ def _other_scale(recordings: RecordingSet, top: np.ndarray, above: bool) -> Iter
     full = recordings.full_scale
     if not top.max() > 0:
         return  # no response at all, which other checks report
-    scale = next((value for value in CONVERTERS if value >= np.median(top) / BEYOND), float(top.max()))
+    usual = float(np.median(top))
+    fitting = (value for value in CONVERTERS if HARDLY * value <= usual <= BEYOND * value)
+    scale = next(fitting, float(top.max()))
     if above:
-        problem = f"raw reaches {np.median(top):.4g}, above full_scale {full:g}, in most trials"
+        problem = f"raw reaches {usual:.4g}, above full_scale {full:g}, in most trials"
     else:
         problem = f"raw reaches only {top.max():.3g} of full_scale {full:g}: normalised, or in another unit"
     if not above and _whole(recordings) and top.max() > 1:

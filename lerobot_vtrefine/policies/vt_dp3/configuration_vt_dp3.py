@@ -274,6 +274,14 @@ class VtDp3Config(PreTrainedConfig):
                 f" --env.fps={self.fps}"
             )
 
+    def check_body(self, name: str) -> None:
+        """Raises: ValueError for an environment of another robot than the policy's."""
+        if name != (own := self.observation.embodiment):
+            raise ValueError(
+                f"--env.scene.embodiment={name}, but the policy is of {own}: name an environment of that, or"
+                " another --policy.path"
+            )
+
     def get_optimizer_preset(self) -> AdamWConfig:
         """AdamW as in DP3."""
         return AdamWConfig(
