@@ -15,7 +15,7 @@ from lerobot.utils.utils import init_logging
 from tqdm import tqdm
 
 from lerobot_vtrefine.cli.errors import run_cli
-from lerobot_vtrefine.cli.outputs import staged
+from lerobot_vtrefine.cli.outputs import OVERWRITE, staged
 from lerobot_vtrefine.cli.results.provenance import write_provenance
 from lerobot_vtrefine.envs import VtRefineEnvConfig
 from lerobot_vtrefine.information.contact import SIDE, TOUCHING
@@ -98,7 +98,7 @@ def information(cfg: InformationConfig) -> None:
     """Study one task and write what was found."""
     env = cfg.env
     assert isinstance(env, VtRefineEnvConfig)
-    with staged(cfg.output_dir, FILES, overwrite=cfg.overwrite) as folder:
+    with staged(cfg.output_dir, FILES, overwrite=cfg.overwrite, flag=OVERWRITE) as folder:
         found = study(env, cfg.senses, cfg.effort, Bars(), save_keeper(folder, cfg.effort))
         write(found, cfg.effort, folder)
         scene = env.scene_config

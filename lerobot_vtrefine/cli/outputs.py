@@ -7,13 +7,18 @@ from pathlib import Path
 
 from lerobot_vtrefine.folders import beside, put_in_place, recover
 
+OVERWRITE = "--overwrite=true"
+"""As LeRobot's parser takes it; ours takes --overwrite alone."""
+
 
 @contextmanager
-def staged(output_dir: Path, names: Sequence[str], *, overwrite: bool) -> Generator[Path]:
+def staged(
+    output_dir: Path, names: Sequence[str], *, overwrite: bool, flag: str = "--overwrite"
+) -> Generator[Path]:
     """A temporary folder for the files ``names``; when the block ends well, it becomes ``output_dir``.
 
     The folder changes as a whole, so that no result is ever seen beside one of another run. Other files that
-    are there stay.
+    are there stay. ``flag`` is how ``overwrite`` is set.
 
     Raises:
         FileExistsError: a file of these names is there already and ``overwrite`` is not set.
@@ -27,7 +32,7 @@ def staged(output_dir: Path, names: Sequence[str], *, overwrite: bool) -> Genera
     present = [name for name in names if (target / name).exists()]
     if present and not overwrite:
         raise FileExistsError(
-            f"{output_dir / present[0]} exists; choose another --output_dir or add --overwrite to replace it"
+            f"{output_dir / present[0]} exists; choose another --output_dir or add {flag} to replace it"
         )
     with beside(target) as folder:
         yield folder

@@ -15,7 +15,7 @@ from lerobot.utils.utils import init_logging
 
 from lerobot_vtrefine.choices import check_choice
 from lerobot_vtrefine.cli.errors import run_cli
-from lerobot_vtrefine.cli.outputs import staged
+from lerobot_vtrefine.cli.outputs import OVERWRITE, staged
 from lerobot_vtrefine.datasets.episodes import EpisodeFolder, open_episodes
 from lerobot_vtrefine.diagnose.episode_replay.compare import (
     HOLDS,
@@ -84,7 +84,7 @@ def replay(config: ReplayConfig) -> Comparison:
     from lerobot_vtrefine.diagnose.episode_replay.page import render_page
 
     env = config.env if isinstance(config.env, VtRefineEnvConfig) else None
-    with staged(config.output_dir, FILES, overwrite=config.overwrite) as folder:
+    with staged(config.output_dir, FILES, overwrite=config.overwrite, flag=OVERWRITE) as folder:
         comparison = compare_episodes(
             _folder(config.dataset),
             config.episodes,

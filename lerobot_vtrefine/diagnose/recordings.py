@@ -7,8 +7,8 @@ from typing import Any, Literal
 import numpy as np
 import pyarrow as pa
 
-from lerobot_vtrefine.diagnose.recording_folder import header_of
 from lerobot_vtrefine.files import decode, inside, limits, read_json
+from lerobot_vtrefine.files.recording_set import header_of
 from lerobot_vtrefine.files.schema import LARGEST_NUMBER
 from lerobot_vtrefine.files.tables import read_table
 

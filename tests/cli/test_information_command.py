@@ -13,7 +13,8 @@ def test_another_commands_report_is_not_replaced_unasked(
     (tmp_path / "report.html").write_text("a diagnosis")
     monkeypatch.setattr("sys.argv", ["vtrefine-information", f"--output_dir={tmp_path}"])
     assert main() == 2
-    assert "report.html exists; choose another --output_dir or add --overwrite" in capsys.readouterr().err
+    told = "report.html exists; choose another --output_dir or add --overwrite=true"
+    assert told in capsys.readouterr().err
     assert (tmp_path / "report.html").read_text() == "a diagnosis"
 
 
