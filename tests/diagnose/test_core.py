@@ -1,6 +1,6 @@
 """The method on a toy instrument: channels that are polynomials of a drive, none of which the core knows."""
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, replace
 
 import numpy as np
 import pytest
@@ -156,6 +156,26 @@ def test_a_decoy_is_an_alarm_and_never_handed_out() -> None:
     assert [(alarm.channel, alarm.clue) for alarm in found.alarms] == [(1, "as the size of x")]
     assert "1" not in found.selection.causes()
     assert found.selection.fit.theta[1, 1] == 0.0
+
+
+class Lost(Toy):
+    """Refitting without what was taken back ends in another optimum."""
+
+    def reduced(self, now, candidates, channels):
+        fitted = super().reduced(now, candidates, channels)
+        return replace(fitted, theta=fitted.theta + np.where(channels, 1.0, 0.0)[:, None])
+
+
+def test_what_lost_its_only_name_predicts_as_the_baseline() -> None:
+    """It was handed out as the extended model, and erred ten times as much."""
+    offered = (PlainCandidate("1", clue="as the size of x"), PlainCandidate("2"))
+    sound = toy(effects=(0.0, 0.3), offered=offered)
+    found = infer(Lost(**{field.name: getattr(sound, field.name) for field in fields(sound)}))
+    assert [alarm.channel for alarm in found.alarms] == [1]
+    before, after = (
+        found.test.errors(fit).mean(0) for fit in (found.selection.baseline, found.selection.fit)
+    )
+    np.testing.assert_allclose(after, before)
 
 
 def beyond_discovery():

@@ -94,6 +94,7 @@ def infer[P: Problem[Any, Any]](
     surprises = selection.problem.surprises(selection.fit, test) if len(locked) else ()
     selection = selection.problem.handed_out(selection, seed, doubtful=bool(alarms))
     selection, refused = guarded(selection, test, seed)
+    selection = plain_without_names(selection)
     return Inference(
         selection,
         tuple(item for item in rivals if item.cause in selection.causes()),
@@ -161,6 +162,22 @@ def guarded[P: Problem[Any, Any], F: Fit, C: Candidate](
             refused.append(Refusal(candidate.cause, channel, gain, surely))
             selection = taken_back(selection, [candidate], channel)
     return selection, tuple(refused)
+
+
+def plain_without_names[P: Problem[Any, Any], F: Fit, C: Candidate](
+    selection: Selection[P, F, C],
+) -> Selection[P, F, C]:
+    """Channels on which nothing has a name predict as the baseline does.
+
+    Refitted without what was taken back, they may have ended in another optimum of the baseline's own model,
+    and a worse one.
+    """
+    named = np.isin(np.arange(selection.errors.shape[1]), list(selection.chosen))
+    if ALL in selection.chosen or named.all():
+        return selection
+    plain = selection.problem.without_effect(selection.fit, selection.baseline)
+    fit = selection.problem.merged(selection.fit, plain, ~named) if named.any() else plain
+    return replace(selection, fit=fit)
 
 
 def _if_likelier[P: Problem[Any, Any], F: Fit, C: Candidate](
