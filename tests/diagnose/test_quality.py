@@ -339,3 +339,17 @@ def test_broken_robot_trials(tmp_path, change, words, action):
     assert [issue.trial for issue in issues] == [FILE]
     assert words in issues[0].problem
     assert issues[0].action.startswith(action)
+
+
+@pytest.mark.parametrize("column", ["position", "command"])
+def test_one_joint_in_degrees_leaves_the_others_alone(tmp_path, column):
+    """All were divided: three sound joints had a fault that was not there."""
+    header, columns = make_robot_set()
+    sound = [trial[column].copy() for trial in columns]
+    for trial in columns:
+        trial[column] = trial[column] * [1, 1, np.degrees(1.0)]
+    _, left, issues = checked(tmp_path, header, columns)
+    assert len(issues) == len(columns)
+    assert issues[0].problem.startswith(f"{column} of elbow reaches ")
+    for trial, wanted in zip(left.trials, sound, strict=True):
+        np.testing.assert_allclose(getattr(trial, column), wanted, atol=1e-12)

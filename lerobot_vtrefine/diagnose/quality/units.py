@@ -73,8 +73,10 @@ def check_units(recordings: RecordingSet) -> Iterator[Finding]:
                 yield Finding(index, text, SET_ASIDE)
                 continue
             unit, factor = found
-            trials[index] = replace(trial, **{mistake.column: values / factor})
-            problem = f"{mistake.column} reaches {size:.3g}: {unit} instead of {mistake.right}"
+            other = _joints_in(trial, mistake, factor)
+            trials[index] = replace(trial, **{mistake.column: np.where(other, values / factor, values)})
+            some = "" if other.all() else f" of {', '.join(np.array(recordings.joints)[other])}"
+            problem = f"{mistake.column}{some} reaches {size:.3g}: {unit} instead of {mistake.right}"
             yield Finding(index, problem, f"repaired: divided by {factor:.4g}", trials[index])
     yield from _times(recordings, trials)
 
@@ -105,6 +107,21 @@ def _unit(values: np.ndarray, mistake: Mistake) -> tuple[str, float] | None:
             still = mistake.column == "depth_m" and np.ptp(known) < STILL_M
             return None if still else (unit, factor)
     return None
+
+
+def _joints_in(trial: Any, mistake: Mistake, factor: float) -> np.ndarray:
+    """Which joints (J,) have the other unit: those that it brings nearer to their commands, or commands to
+    what was reached, where that column is sound. Without such a column it is all of them, as on pads.
+    """
+    counterpart = {"position": "command", "command": "position"}.get(mistake.column)
+    if counterpart is None or _largest(sound := getattr(trial, counterpart)) > mistake.limit:
+        return np.array(True)
+    values = getattr(trial, mistake.column)
+    known = np.isfinite(values) & np.isfinite(sound)
+    off, off_as_other = (
+        np.where(known, np.abs(column - sound), 0.0).sum(axis=0) for column in (values, values / factor)
+    )
+    return (off_as_other < off) | (np.where(known, np.abs(values), 0.0).max(axis=0) > mistake.limit)
 
 
 def _times(recordings: RecordingSet, trials: dict[int, Any]) -> Iterator[Finding]:
