@@ -353,3 +353,16 @@ def test_one_joint_in_degrees_leaves_the_others_alone(tmp_path, column):
     assert issues[0].problem.startswith(f"{column} of elbow reaches ")
     for trial, wanted in zip(left.trials, sound, strict=True):
         np.testing.assert_allclose(getattr(trial, column), wanted, atol=1e-12)
+
+
+def test_an_encoder_in_large_steps_is_told(tmp_path):
+    """Errors of half a step hid behind "adequate"."""
+    header, columns = make_robot_set()
+    for trial in columns:
+        trial["position"][:, 1] = 0.03 * np.round(trial["position"][:, 1] / 0.03)
+        trial["position"][:, 2] = 0.0015 * np.round(trial["position"][:, 2] / 0.0015)  # as usual
+    _, left, issues = checked(tmp_path, header, columns)
+    (issue,) = issues
+    assert (issue.trial, issue.problem) == (None, "position of shoulder comes in steps of 0.03")
+    assert issue.action == "kept: half a step is not judged"
+    assert len(left.trials) == len(columns)

@@ -54,6 +54,7 @@ ROBOT_CHECKS: tuple[Check, ...] = (
     joints.check_jumps,
     joints.check_commands,
     joints.check_encoders,
+    joints.check_steps,
     joints.check_joint_order,
     session.check_conditions,
 )

@@ -8,6 +8,7 @@ from scipy.optimize import linear_sum_assignment
 from lerobot_vtrefine.diagnose.quality.edits import KEPT, SET_ASIDE, Finding
 from lerobot_vtrefine.diagnose.quality.rules import (
     BETTER_ORDER,
+    COARSE_RAD,
     EXCHANGED,
     JUMP_RAD,
     MINORITY,
@@ -33,6 +34,19 @@ def check_encoders(recordings: RecordingSet) -> Iterator[Finding]:
     for index in np.flatnonzero((stuck & ~always).any(axis=1)):
         names = [recordings.joints[joint] for joint in np.flatnonzero(stuck[index] & ~always)]
         yield Finding(int(index), f"position stays constant: {', '.join(names)}", SET_ASIDE)
+
+
+def check_steps(recordings: RecordingSet) -> Iterator[Finding]:
+    """Encoders whose readings come in steps that hide what arms usually lack."""
+    for joint, name in enumerate(recordings.joints):
+        read = np.concatenate([trial.position[:, joint] for trial in recordings.trials])
+        gaps = np.diff(np.unique(read.round(9)))
+        if not 0 < len(gaps) < 0.25 * len(read) or (step := float(np.median(gaps))) < COARSE_RAD:
+            continue
+        if np.abs(gaps / step - np.round(gaps / step)).max() < 0.05:
+            yield Finding(
+                None, f"position of {name} comes in steps of {step:.3g}", f"{KEPT}: half a step is not judged"
+            )
 
 
 def check_jumps(recordings: RecordingSet) -> Iterator[Finding]:

@@ -128,3 +128,5 @@ SWAP_SHOWS = 5e-3
 holds a part is moved by its load as much as by commands, in any direction."""
 JUMP_RAD = 1.0
 """No joint moves further between two frames, unless its command does."""
+COARSE_RAD = 5e-3
+"""Steps of an encoder [rad, m] from which on they are told: three of the usual 4096 a turn."""
