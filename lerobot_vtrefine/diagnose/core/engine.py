@@ -176,8 +176,9 @@ def plain_without_names[P: Problem[Any, Any], F: Fit, C: Candidate](
     if ALL in selection.chosen or named.all():
         return selection
     plain = selection.problem.without_effect(selection.fit, selection.baseline)
-    fit = selection.problem.merged(selection.fit, plain, ~named) if named.any() else plain
-    return replace(selection, fit=fit)
+    if named.any():  # several channels: a problem that is searched, not screened
+        plain = cast("Any", selection.problem).merged(selection.fit, plain, ~named)
+    return replace(selection, fit=plain)
 
 
 def _if_likelier[P: Problem[Any, Any], F: Fit, C: Candidate](
