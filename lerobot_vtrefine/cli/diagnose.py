@@ -19,7 +19,6 @@ if TYPE_CHECKING:
 
 FILES = ("baseline_model.json", "sensor_model.json", "report.html", "verdict.json")
 """What a run leaves in the output folder; the verdict last, so that it stands for a whole run."""
-"""Problems of the data that the terminal tells; the report tells all."""
 DESCRIPTION = """\
 Compare measured recordings with the simulation, name what the simulation gets wrong, extend its model
 by that and measure the gain on recordings used neither for fitting nor for selection.
