@@ -39,6 +39,7 @@ from lerobot_vtrefine.finetune.distributed import (
 )
 from lerobot_vtrefine.finetune.gae import RewardScaler, generalised_advantages
 from lerobot_vtrefine.finetune.gpu_memory import give_back_unused, memory_taken
+from lerobot_vtrefine.finetune.noise import forked_rng, policy_noise
 from lerobot_vtrefine.finetune.protocols import (
     Agent,
     DecisionEnv,
@@ -50,7 +51,7 @@ from lerobot_vtrefine.finetune.protocols import (
     select,
     start,
 )
-from lerobot_vtrefine.finetune.seeds import TRAINING_SEEDS, forked_rng, policy_noise
+from lerobot_vtrefine.finetune.seeds import TRAINING_SEEDS
 from lerobot_vtrefine.finetune.trust_region import TrustRegion
 from lerobot_vtrefine.policies.vt_dp3.diffusion import denoise_prefix
 

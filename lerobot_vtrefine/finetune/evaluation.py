@@ -4,6 +4,7 @@ import torch
 from torch import Tensor
 
 from lerobot_vtrefine.finetune.distributed import mean_over_ranks, num_ranks, rank_index
+from lerobot_vtrefine.finetune.noise import forked_rng, policy_noise
 from lerobot_vtrefine.finetune.protocols import (
     Agent,
     DecisionEnv,
@@ -13,7 +14,7 @@ from lerobot_vtrefine.finetune.protocols import (
     select,
     start,
 )
-from lerobot_vtrefine.finetune.seeds import EVALUATION_SEEDS, forked_rng, policy_noise
+from lerobot_vtrefine.finetune.seeds import EVALUATION_SEEDS
 from lerobot_vtrefine.policies.vt_dp3.diffusion import deploy
 
 

@@ -5,9 +5,11 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import torch
 from conftest import TINY_DPPO, TINY_ENV
 
 from lerobot_vtrefine.files.arrays import read_arrays
+from lerobot_vtrefine.finetune import policy_player
 from lerobot_vtrefine.finetune.logger import read_progress
 from lerobot_vtrefine.sim.simulation import InsertionSim
 
@@ -46,6 +48,12 @@ def test_the_expert_grasps_whatever_the_number_of_worlds(tmp_path: Path, monkeyp
 def test_a_policys_grasps_come_first_and_the_experts_where_there_are_none(
     checkpoint: Path, tmp_path: Path, monkeypatch, capsys
 ) -> None:
+    # A policy that has learnt nothing knocks parts off the table, by some noise before it decides again.
+    monkeypatch.setattr(
+        policy_player,
+        "deployed_chunks",
+        lambda agent, cond, *_: torch.zeros(len(cond), 8, agent.action_shape[1]),
+    )
     few = ("--num_starts=2", "--num_envs=2", "--attempts=1", f"--policy.path={checkpoint}")
     path = tmp_path / "starts.npz"
     assert record(path, monkeypatch, *few) == 0

@@ -21,7 +21,8 @@ from lerobot_vtrefine.envs.decisions import make_decision_env
 from lerobot_vtrefine.finetune import pipeline
 from lerobot_vtrefine.finetune.config import PaperDppo
 from lerobot_vtrefine.finetune.logger import CLOCK, read_progress
-from lerobot_vtrefine.finetune.seeds import EVALUATION_SEEDS, policy_noise
+from lerobot_vtrefine.finetune.noise import policy_noise
+from lerobot_vtrefine.finetune.seeds import EVALUATION_SEEDS
 from lerobot_vtrefine.finetune.state_file import load_state
 from lerobot_vtrefine.policies.vt_dp3.modeling_vt_dp3 import VtDp3Policy
 

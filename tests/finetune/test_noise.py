@@ -3,7 +3,7 @@
 import pytest
 import torch
 
-from lerobot_vtrefine.finetune.seeds import forked_rng, policy_noise
+from lerobot_vtrefine.finetune.noise import forked_rng, policy_noise
 
 CPU = torch.device("cpu")
 
