@@ -10,7 +10,7 @@ from functools import cached_property
 
 import numpy as np
 
-from lerobot_vtrefine.diagnose.joints.rules import FEWEST_VALUES, FINEST_STEP, OFF_LATTICE
+from lerobot_vtrefine.diagnose.joints.rules import FEWEST_VALUES, FINEST_STEP, MOST_DIFFERENT, OFF_LATTICE
 from lerobot_vtrefine.diagnose.recordings import RobotTrial
 
 Array = np.ndarray
@@ -59,9 +59,9 @@ class Batch:
         """(J,) smallest step between different readings: the encoder's, or nearly zero."""
         steps = np.empty(self.joints)
         for joint in range(self.joints):
-            values = np.unique(self.position[..., joint][self.valid].round(9))
-            coarse = 1 < len(values) < 0.25 * self.valid.sum()
-            steps[joint] = np.median(np.diff(values)) if coarse else _lattice(values)
+            read = self.position[..., joint][self.valid]
+            gaps = coarse_gaps(read)
+            steps[joint] = np.median(gaps) if len(gaps) else _lattice(different(read))
         return np.maximum(steps, 1e-9)
 
     def subset(self, trials: Array | Sequence[int]) -> "Batch":
@@ -123,6 +123,21 @@ def frame_s(batch: Batch) -> float:
 def padded(values: Array, length: int) -> Array:
     """Rows (N, ...) and, up to a length, their last one again."""
     return np.concatenate([values, np.repeat(values[-1:], length - len(values), 0)])
+
+
+def different(read: Array) -> Array:
+    """The different readings of an encoder, in order [rad]; rounding of arithmetic makes none."""
+    return np.unique(read.round(9))
+
+
+def coarse_gaps(read: Array) -> Array:
+    """(G,) gaps between the different readings of an encoder [rad], where these are few; else none.
+
+    Args:
+        read: (N,) all its readings [rad].
+    """
+    gaps = np.diff(different(read))
+    return gaps if len(gaps) + 1 < MOST_DIFFERENT * len(read) else gaps[:0]
 
 
 def _lattice(values: Array) -> float:

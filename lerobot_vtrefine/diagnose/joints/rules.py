@@ -8,6 +8,8 @@ from frame to frame.
 FEWEST_VALUES, FINEST_STEP, OFF_LATTICE = 8, 2e-6, 0.05
 """Different readings that show an encoder's step, the smallest step [rad, m] that is one, and how far from
 whole numbers of it readings may be, in steps."""
+MOST_DIFFERENT = 0.25
+"""Part of an encoder's readings that differ from each other, below which its steps are coarse."""
 LEAST_EFFECT_RAD, LEAST_EFFECT_M = 1e-4, 1e-5
 """Smallest change of the prediction (root mean square) that is worth a name."""
 

@@ -5,6 +5,8 @@ from collections.abc import Iterator
 import numpy as np
 from scipy.optimize import linear_sum_assignment
 
+from lerobot_vtrefine.diagnose.joints.batch import coarse_gaps
+from lerobot_vtrefine.diagnose.joints.rules import OFF_LATTICE
 from lerobot_vtrefine.diagnose.quality.edits import KEPT, SET_ASIDE, Finding
 from lerobot_vtrefine.diagnose.quality.rules import (
     BETTER_ORDER,
@@ -39,11 +41,10 @@ def check_encoders(recordings: RecordingSet) -> Iterator[Finding]:
 def check_steps(recordings: RecordingSet) -> Iterator[Finding]:
     """Encoders whose readings come in steps that hide what arms usually lack."""
     for joint, name in enumerate(recordings.joints):
-        read = np.concatenate([trial.position[:, joint] for trial in recordings.trials])
-        gaps = np.diff(np.unique(read.round(9)))
-        if not 0 < len(gaps) < 0.25 * len(read) or (step := float(np.median(gaps))) < COARSE_RAD:
+        gaps = coarse_gaps(np.concatenate([trial.position[:, joint] for trial in recordings.trials]))
+        if not len(gaps) or (step := float(np.median(gaps))) < COARSE_RAD:
             continue
-        if np.abs(gaps / step - np.round(gaps / step)).max() < 0.05:
+        if np.abs(gaps / step - np.round(gaps / step)).max() < OFF_LATTICE:
             yield Finding(
                 None, f"position of {name} comes in steps of {step:.3g}", f"{KEPT}: half a step is not judged"
             )
