@@ -29,16 +29,25 @@ def beside(target: Path) -> Generator[Path]:
 
     Raises:
         ValueError, PermissionError, NotADirectoryError: as `check_replaceable`.
+        OSError: no folder can be made where ``target`` lies; names it.
     """
     check_replaceable(target)
     target.parent.mkdir(parents=True, exist_ok=True)
     recover(target)
     work = working_folder(target)
     try:
-        work.mkdir()
+        _make(work, target)
         yield work
     finally:
         recover(target)
+
+
+def _make(work: Path, target: Path) -> None:
+    try:
+        work.mkdir()
+    except OSError as error:  # its name of the folder means nothing to who asked for the target
+        reason = f"no folder can be made in {target.parent} ({error.strerror})"
+        raise OSError(error.errno, reason, str(target)) from error
 
 
 def working_folder(target: Path) -> Path:

@@ -128,6 +128,12 @@ def test_folders_that_cannot_change_places_are_refused_before_any_work(tmp_path,
             pytest.fail("refused too late")
 
 
+def test_where_no_folder_can_be_made_the_one_that_was_asked_for_is_named() -> None:
+    with pytest.raises(OSError, match="no folder can be made in /proc") as told, beside(Path("/proc/pads")):
+        pytest.fail("refused too late")
+    assert told.value.filename == "/proc/pads"
+
+
 def test_a_folder_within_a_file_is_refused(tmp_path) -> None:
     (tmp_path / "file").write_text("mine")
     with pytest.raises(NotADirectoryError, match=f"{tmp_path / 'file'} is a file"):

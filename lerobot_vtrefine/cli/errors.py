@@ -38,6 +38,8 @@ _OPTIONAL_VALUE = re.compile(
 """How draccus begins where a flag may be left out, as if there were several types that it may have."""
 _UNKNOWN_FIELDS = re.compile(r"The fields ((?:`[^`]+`(?:, )?)+) are not valid for \w+")
 """What draccus says of a file's settings."""
+_NOT_A_GROUP = re.compile(r"`([\w.]+)`: .*'\w+' object has no attribute 'copy'")
+"""What it says where a group of settings is given one value."""
 _WITHOUT_TYPE = re.compile("Expected a dict for a choice class, got (.*)")
 """What it says of ``env: null``, as settings of lerobot-train have it, and of ``env: round``."""
 
@@ -115,6 +117,8 @@ def _in_flags(message: str) -> str:
         files = "".join(f"{file}: " for file in _config_files_with(names))
         listed = ", ".join(f"`{name}`" for name in names)
         return f"{files}{listed}: no such setting; is it misspelt?"
+    if group := _NOT_A_GROUP.search(message):
+        return f"`{group[1]}`: is a group of settings, not one value; --help lists those that begin with it"
     return _OPTIONAL_VALUE.sub(lambda found: f"`{'.'.join(filter(None, found.groups()))}`: ", message)
 
 

@@ -111,6 +111,16 @@ class Flags:
         ),
         (PlayConfig, ["--seed=many"], "`seed`: Couldn't parse 'many' into an int"),
         (PlayConfig, ["--env.type=vtrefine", "--env.fps=x"], "`env.fps`: Couldn't parse 'x' into an int"),
+        (
+            RecordDemosConfig,
+            ["--root=x", "--env.type=vtrefine", "--env.scene.camera=5"],
+            "`env.scene.camera`: is a group of settings, not one value; --help lists",
+        ),
+        (
+            RecordDemosConfig,
+            ["--root=x", "--env.type=vtrefine", "--env.scene=5"],
+            "`env.scene`: is a group of settings, not one value; --help lists",
+        ),
         (ReplayConfig, ["--episodes=[one]"], "`episodes.0`: Couldn't parse 'one' into an int"),
     ],
 )
