@@ -65,8 +65,8 @@ class EpisodeFolder:
     joints: tuple[str, ...]
     """Names of state and action; empty where neither the dataset nor its robot type tells them."""
     num_joints: int
-    pads: tuple[str, ...]
-    """Pads that have raw and idle counts."""
+    pads: dict[str, int]
+    """Pads that have raw and idle counts, and how many readings each has."""
     num_episodes: int
 
     def read(self, episodes: Sequence[int] | None = None) -> list[RecordedEpisode]:
@@ -84,8 +84,11 @@ class EpisodeFolder:
                     f"{self.root} has episodes 0 to {self.num_episodes - 1}, episode {index} was asked for"
                 )
         found: dict[int, list[pa.Table]] = {}
-        for path in sorted((self.root / "data").rglob("*.parquet")):
+        files: dict[int, Path] = {}
+        for path in sorted((self.root / "data").glob("*/*.parquet")):  # where LeRobot looks, too
             for index, part in _split(self._table(path), set(wanted)):
+                if files.setdefault(index, path) != path:
+                    raise ValueError(f"{path}: episode {index} is in {files[index]}, too; move the copy away")
                 found.setdefault(index, []).append(part)
         missing = sorted(set(wanted) - set(found))
         if missing:
@@ -102,31 +105,39 @@ class EpisodeFolder:
 
     def _episode(self, index: int, table: pa.Table) -> RecordedEpisode:
         table = table.sort_by("frame_index")
-        pads = {pad: self._matrix(index, f"{TACTILE_PREFIX}{pad}", table) for pad in self.pads}
-        idle = {pad: self._matrix(index, f"{BASELINE_PREFIX}{pad}", table)[0] for pad in self.pads}
+        pads = {pad: self._counts(index, f"{TACTILE_PREFIX}{pad}", table, n) for pad, n in self.pads.items()}
+        idle = {
+            pad: self._counts(index, f"{BASELINE_PREFIX}{pad}", table, n)[0] for pad, n in self.pads.items()
+        }
         state, action = (self._numbers(index, key, table) for key in (STATE_KEY, ACTION_KEY))
         time_s = self._numbers(index, "timestamp", table)[:, 0]
         if (np.diff(time_s) <= 0).any():
             raise ValueError(f"{self.root}: episode {index}: timestamp does not rise from frame to frame")
         return RecordedEpisode(index, time_s, state, action, pads, idle)
 
-    def _matrix(self, index: int, key: str, table: pa.Table) -> Array:
-        """A column of equally long lists, or of numbers, as (T, K)."""
+    def _matrix(self, index: int, key: str, table: pa.Table, width: int) -> Array:
+        """A column of lists of so many numbers, or of numbers, as (T, width)."""
         column = table[key]
         lists = column.chunks if pa.types.is_nested(column.type) else []
         lengths = np.unique([length for chunk in lists for length in np.unique(chunk.value_lengths())])
         flat = np.concatenate([_flat(chunk).to_numpy(zero_copy_only=False) for chunk in column.chunks])
         if len(lengths) > 1 or flat.size % max(len(column), 1):
             raise ValueError(f"{self.root}: episode {index}: {key} has frames of different lengths")
-        return flat.reshape(len(column), -1)
+        if flat.size != len(column) * width:
+            given = plural(flat.size // max(len(column), 1), "value")
+            raise ValueError(f"{self.root}: episode {index}: {key} has {given}, not {width}")
+        return flat.reshape(len(column), width)
+
+    def _counts(self, index: int, key: str, table: pa.Table, width: int) -> Array:
+        """Counts of a pad, uint8 (T, width), however the file keeps whole numbers."""
+        values = self._matrix(index, key, table, width)
+        if values.dtype.kind not in "iu" or values.min() < 0 or values.max() > 255:
+            raise ValueError(f"{self.root}: episode {index}: {key} must hold whole numbers from 0 to 255")
+        return values.astype(np.uint8, copy=False)
 
     def _numbers(self, index: int, key: str, table: pa.Table) -> Array:
         width = 1 if key == "timestamp" else self.num_joints
-        values = self._matrix(index, key, table).astype(np.float64)
-        if values.shape[1] != width:
-            raise ValueError(
-                f"{self.root}: episode {index}: {key} has {plural(values.shape[1], 'value')}, not {width}"
-            )
+        values = self._matrix(index, key, table, width).astype(np.float64)
         if not np.isfinite(values).all():
             frame, joint = np.argwhere(~np.isfinite(values))[0]
             name = self.joints[joint] if len(self.joints) == values.shape[1] else f"number {joint}"
@@ -181,16 +192,16 @@ def _joint_names(state: FeatureInfo, robot_type: str | None) -> tuple[str, ...]:
     return body.joint_names if body is not None and state.shape == (body.num_joints,) else ()
 
 
-def _pads(features: dict[str, FeatureInfo]) -> tuple[str, ...]:
-    """Pads with both columns, flat and uint8."""
-    return tuple(
-        name
+def _pads(features: dict[str, FeatureInfo]) -> dict[str, int]:
+    """Pads with both columns, flat and uint8, and their readings."""
+    return {
+        name: feature.shape[0]
         for key, feature in features.items()
         if key.startswith(TACTILE_PREFIX)
         and feature.dtype == "uint8"
         and len(feature.shape) == 1
         and f"{BASELINE_PREFIX}{(name := key.removeprefix(TACTILE_PREFIX))}" in features
-    )
+    }
 
 
 def _check_numbers(path: Path, name: str, column: pa.ChunkedArray) -> None:
