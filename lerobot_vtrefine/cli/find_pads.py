@@ -17,7 +17,7 @@ from lerobot_vtrefine.drivers.discovery import (
     wait_for_press,
     wait_for_release,
 )
-from lerobot_vtrefine.drivers.pads_file import save_pads
+from lerobot_vtrefine.drivers.pads_file import check_name, save_pads
 from lerobot_vtrefine.drivers.ports import PortError, stable_path, stable_ports
 from lerobot_vtrefine.embodiments import DEFAULT_BODY, get_embodiment
 from lerobot_vtrefine.wording import plural
@@ -72,13 +72,15 @@ def main(arguments: Sequence[str] | None = None) -> None:
     extras.require("vtrefine-find-pads", extras.PADS)
     if len(set(options.names)) < len(options.names):
         raise ValueError(f"--names must differ from each other, got {' '.join(options.names)}")
+    for name in options.names:  # before anybody presses pads for a file that cannot be read
+        check_name(name, "--names")
     if not options.timeout > 0:
         raise ValueError(f"--timeout must be positive, got {options.timeout:g}")
     ports = options.ports or stable_ports()
     if not ports:
         raise PortError("no serial port found; plug in the boards, or name ports with --ports")
     if not options.list:
-        check_file("--output", options.output)  # before anybody presses pads for it
+        check_file("--output", options.output)
     with ExitStack() as stack:
         boards = find_boards(ports, stack, only_list=options.list)
         if options.list:

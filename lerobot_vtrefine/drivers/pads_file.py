@@ -59,8 +59,7 @@ def decode_pads(entries: dict[str, Any], where: str) -> dict[str, PadConfig]:
     """
     pads: dict[str, PadConfig] = {}
     for name, entry in entries.items():
-        if not isinstance(name, str) or not _NAME.fullmatch(name):
-            raise ValueError(f"{where}: {str(name)[:60]!r} cannot name a pad: use letters, digits, _ . and -")
+        check_name(name, where)
         if isinstance(entry, PadConfig):
             pads[name] = entry
             continue
@@ -72,6 +71,12 @@ def decode_pads(entries: dict[str, Any], where: str) -> dict[str, PadConfig]:
             raise ValueError(f"{where}: pad {name!r}: {error}") from error
     check_distinct_ports(pads, where)
     return pads
+
+
+def check_name(name: Any, where: str) -> None:
+    """Raise ValueError where a pad cannot have this name: a robot's columns are called after it."""
+    if not isinstance(name, str) or not _NAME.fullmatch(name):
+        raise ValueError(f"{where}: {str(name)[:60]!r} cannot name a pad: use letters, digits, _ . and -")
 
 
 def check_distinct_ports(pads: dict[str, PadConfig], where: str) -> None:

@@ -300,6 +300,7 @@ def test_terminated_emulator_removes_its_ports(tmp_path: Path) -> None:
         (view_pads, ["--ports=x", "--save=/proc/x.rrd"], "--save=/proc/x.rrd"),
         (view_pads, ["--ports=[/nowhere/a"], "argument --ports: give a list such as"),
         (find_pads, ["--ports", "x", "--names=[a, a]"], "--names must differ"),
+        (find_pads, ["--ports", "x", "--names", "left pad"], "--names: 'left pad' cannot name a pad"),
         (find_pads, ["--ports", "x", "--timeout=-2"], "--timeout must be positive, got -2"),
         (find_pads, ["--ports", "x", "--output=/"], "--output=/ is a folder; name a file"),
         (find_pads, ["--ports", "x", "--output=/proc/nowhere/pads.yaml"], "--output=/proc/nowhere/pads.yaml"),
