@@ -36,17 +36,19 @@ class SafeMetadata(LeRobotDatasetMetadata):
     def create(
         cls, repo_id: str, *args: Any, root: str | Path | None = None, **kwargs: Any
     ) -> LeRobotDatasetMetadata:
-        """As LeRobot's, but the folder appears with its description in it.
+        """As LeRobot's, but the folder appears with its description in it, also in place of an empty one.
 
         Raises:
-            FileExistsError: there is a dataset already.
+            FileExistsError: there is something already.
         """
         home = HF_LEROBOT_HOME / repo_id if root is None else Path(root)
-        if home.exists():
+        if (home / INFO_PATH).exists():
             raise FileExistsError(
                 f"{home} exists: go on with --resume=true --dataset.root={home},"
                 " or choose another --dataset.root"
             )
+        if home.exists() and (not is_empty(home) or home.is_symlink() or home.is_mount()):
+            raise FileExistsError(f"{home} exists and is no dataset: choose another --dataset.root")
         part = home.with_name(home.name + PART)
         shutil.rmtree(part, ignore_errors=True)
         meta = super().create(repo_id, *args, root=part, **kwargs)
@@ -87,6 +89,11 @@ class SafeMetadata(LeRobotDatasetMetadata):
             path = self.root / DEFAULT_EPISODES_PATH.format(chunk_index=chunk, file_index=file)
             write_table(pa.Table.from_pydict(plain), path)
         self._metadata_buffer.clear()
+
+
+def is_empty(path: Path) -> bool:
+    """Whether this is a folder with nothing in it."""
+    return path.is_dir() and not any(path.iterdir())
 
 
 def _plain(value: Any) -> Any:

@@ -31,8 +31,10 @@ from lerobot.datasets.utils import (
 from lerobot_vtrefine.folders import sync
 from lerobot_vtrefine.lerobot_compat.guard import is_supported
 from lerobot_vtrefine.lerobot_compat.recovery import recover
+from lerobot_vtrefine.lerobot_compat.registration import LOCAL
 from lerobot_vtrefine.lerobot_compat.safe_metadata import (
     SafeMetadata,
+    is_empty,
     write_info,
     write_stats,
     write_table,
@@ -152,8 +154,10 @@ def _resuming(original: Callable[..., LeRobotDataset]) -> Callable[..., LeRobotD
     def resume(
         cls: type[LeRobotDataset], repo_id: str, root: str | Path | None = None, *args: Any, **kwargs: Any
     ) -> LeRobotDataset:
-        if root and Path(root).is_dir() and any(Path(root).iterdir()):  # else it is fetched from the Hub
+        if root and Path(root).exists() and not is_empty(Path(root)):  # else it is fetched from the Hub
             logger.info("%s", recover(Path(root)))
+        elif root and repo_id.startswith(LOCAL):
+            raise ValueError(f"{root} holds no dataset to go on with: check --dataset.root, or do not resume")
         with _safe_classes():
             return original(repo_id, root, *args, **kwargs)
 

@@ -241,6 +241,27 @@ def test_a_folder_that_is_no_dataset_is_named(tmp_path: Path) -> None:
         LeRobotDataset.resume(REPO, root=tmp_path / "there")
 
 
+def test_an_empty_folder_is_recorded_into_and_holds_nothing_to_go_on_with(tmp_path: Path) -> None:
+    root = tmp_path / "dataset"
+    root.mkdir()
+    for missing in (root, tmp_path / "nowhere"):
+        with pytest.raises(
+            ValueError, match=rf"{missing.name} holds no dataset to go on with: check --dataset"
+        ):
+            LeRobotDataset.resume(REPO, root=missing)
+    assert [path.name for path in tmp_path.iterdir()] == ["dataset"]
+    dataset = create(root)
+    record(dataset, 0)
+    dataset.finalize()
+    check(root)
+    (tmp_path / "notes").write_text("mine")
+    (tmp_path / "link").symlink_to(tmp_path / "elsewhere")
+    (tmp_path / "elsewhere").mkdir()
+    for name in ("notes", "link", ""):
+        with pytest.raises(FileExistsError, match=r"exists and is no dataset: choose another"):
+            create(tmp_path / name)
+
+
 def test_data_that_stayed_on_the_hub_is_not_taken_for_lost(tmp_path: Path) -> None:
     root = tmp_path / "dataset"
     dataset = create(root)
