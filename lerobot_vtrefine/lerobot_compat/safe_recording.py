@@ -58,12 +58,18 @@ class SafeWriter(DatasetWriter):
     def save_episode(self, episode_data: dict | None = None, parallel_encoding: bool = True) -> None:
         """Save the episode; after an error nothing of it is left.
 
+        LeRobot ends the session over an episode without frames, which a key that was pressed twice makes.
+
         Raises:
             OSError: the disk is full, or an image could not be written.
         """
+        episode = episode_data or self.episode_buffer
+        if episode.get("size") == 0:
+            logger.warning("episode %d has no frames: it is not saved", self._meta.total_episodes)
+            return
         try:
             self._wait_image_writer()
-            _check_images(episode_data or self.episode_buffer, self._meta)
+            _check_images(episode, self._meta)
             super().save_episode(episode_data, parallel_encoding)
         except BaseException as error:
             self._take_back()

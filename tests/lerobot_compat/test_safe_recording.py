@@ -228,6 +228,18 @@ def test_an_image_that_could_not_be_written_is_no_episode(
     go_on(root, 5, check(root))
 
 
+def test_an_episode_without_frames_ends_no_session(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    told: list[str] = []
+    monkeypatch.setattr(safe_recording.logger, "warning", lambda text, *values: told.append(text % values))
+    dataset = create(tmp_path / "dataset")
+    record(dataset, 0)
+    dataset.save_episode()
+    record(dataset, 1)
+    dataset.finalize()
+    assert told == ["episode 1 has no frames: it is not saved"]
+    assert check(tmp_path / "dataset") == [0, 1]
+
+
 def test_a_folder_that_is_no_dataset_is_named(tmp_path: Path) -> None:
     create(tmp_path / "there").finalize()
     with pytest.raises(FileExistsError, match=r"there exists: go on with --resume=true"):
