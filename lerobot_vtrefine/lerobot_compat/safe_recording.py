@@ -29,6 +29,7 @@ from lerobot.datasets.utils import (
 )
 
 from lerobot_vtrefine.folders import sync
+from lerobot_vtrefine.lerobot_compat.episode_rows import video_length_s
 from lerobot_vtrefine.lerobot_compat.guard import is_supported
 from lerobot_vtrefine.lerobot_compat.recovery import recover
 from lerobot_vtrefine.lerobot_compat.registration import LOCAL
@@ -61,7 +62,7 @@ class SafeWriter(DatasetWriter):
         LeRobot ends the session over an episode without frames, which a key that was pressed twice makes.
 
         Raises:
-            OSError: the disk is full, or an image could not be written.
+            OSError: the disk is full, an image could not be written, or a video lacks frames.
         """
         episode = episode_data or self.episode_buffer
         if episode.get("size") == 0:
@@ -95,6 +96,7 @@ class SafeWriter(DatasetWriter):
         chunk, file = _next_data_file(meta)
         write_table(table, self._root / meta.data_path.format(chunk_index=chunk, file_index=file))
         self._recorded_frames += len(table)
+        self._episode_frames = len(table)
         return {
             "data/chunk_index": chunk,
             "data/file_index": file,
@@ -105,6 +107,7 @@ class SafeWriter(DatasetWriter):
     def _save_episode_video(self, video_key: str, episode_index: int, temp_path: Path | None = None) -> dict:
         if temp_path is None:
             temp_path = self._encode_temporary_episode_video(video_key, episode_index)
+        _check_length(temp_path, video_key, self._episode_frames, self._meta.fps)
         sync(temp_path)
         row = super()._save_episode_video(video_key, episode_index, temp_path)
         chunk, file = (row[f"videos/{video_key}/{kind}_index"] for kind in ("chunk", "file"))
@@ -133,6 +136,18 @@ def _check_images(episode: dict[str, Any], meta: LeRobotDatasetMetadata) -> None
             full = shutil.disk_usage(meta.root).free < 2**20
             problem = f"{plural(len(missing), 'image')} could not be written, the first is {missing[0]}"
             raise OSError(errno.ENOSPC if full else errno.EIO, problem)
+
+
+def _check_length(video: Path, key: str, frames: int, fps: float) -> None:
+    """LeRobot logs frames that a busy encoder dropped and goes on: later ones are then another moment's."""
+    there = round(video_length_s(video) * fps)
+    if there != frames:
+        camera = key.rpartition(".")[2]
+        raise OSError(
+            errno.EIO,
+            f"the encoder kept {there} of {plural(frames, 'frame')} of camera {camera}, so the episode is not"
+            " saved: leave out --dataset.streaming_encoding, or enlarge --dataset.encoder_queue_maxsize",
+        )
 
 
 def write_image(image: Any, fpath: Path, compress_level: int = 1) -> None:

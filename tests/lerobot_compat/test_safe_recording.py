@@ -14,6 +14,7 @@ from typing import Any
 import numpy as np
 import pytest
 from lerobot.datasets.lerobot_dataset import LeRobotDataset
+from lerobot.datasets.video_utils import StreamingVideoEncoder
 
 from lerobot_vtrefine.lerobot_compat import fast_reader, recovery, safe_recording
 
@@ -223,6 +224,29 @@ def test_an_image_that_could_not_be_written_is_no_episode(
     add(dataset, 1)
     (next(root.glob("images/*/episode-000001")) / "frame-000002.tiff").unlink()
     with pytest.raises(OSError, match=r"1 image could not be written, the first is .*frame-000002.tiff"):
+        dataset.save_episode()
+    dataset.finalize()
+    go_on(root, 5, check(root))
+
+
+def test_a_video_without_frames_that_the_encoder_dropped_is_no_episode(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    root = tmp_path / "dataset"
+    settings = {"root": root, "use_videos": True, "streaming_encoding": True}
+    dataset = LeRobotDataset.create(REPO, 10, features("video"), **settings)
+    record(dataset, 0)
+    feed, fed = StreamingVideoEncoder.feed_frame, []
+
+    def busy(encoder: StreamingVideoEncoder, key: str, image: np.ndarray) -> None:
+        fed.append(key)
+        if len(fed) != 2:
+            feed(encoder, key, image)
+
+    with monkeypatch.context() as patch:
+        patch.setattr(StreamingVideoEncoder, "feed_frame", busy)
+        add(dataset, 1)
+    with pytest.raises(OSError, match="kept 4 of 5 frames of camera front, so the episode is not saved"):
         dataset.save_episode()
     dataset.finalize()
     go_on(root, 5, check(root))
