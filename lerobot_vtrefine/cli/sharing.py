@@ -31,11 +31,17 @@ MEASURED = (
 
 
 def push_dataset(root: Path, repo_id: str, *, private: bool) -> None:
-    """Upload a LeRobotDataset, with a card that describes its pads."""
+    """Upload a LeRobotDataset, with a card that describes its pads.
+
+    Raises:
+        FileNotFoundError, ValueError: part of it is not there, or cannot be read; nothing was changed.
+    """
     from lerobot.datasets.lerobot_dataset import LeRobotDataset
 
     from lerobot_vtrefine.lerobot_compat import card
+    from lerobot_vtrefine.lerobot_compat.completeness import check_complete
 
+    check_complete(root)
     card.install()
     LeRobotDataset(repo_id, root=root).push_to_hub(private=private)
 
