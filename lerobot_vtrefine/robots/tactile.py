@@ -30,7 +30,10 @@ class Tactile(Robot):
         super().__init__(config)
         self.config = config
         self.base = make_robot_from_config(base_config(config))
-        self.pads = PadSet(configured_pads(config.pads, config.pads_file))
+        pads = configured_pads(config.pads, config.pads_file)
+        # Ages are one column, a value per pad: it must mean the same in all datasets that LeRobot merges or
+        # resumes, though the pads file may name the pads in another order.
+        self.pads = PadSet(dict(sorted(pads.items())))
         extend_lerobot(self.pads.configs)
         self._camera_models = CameraModels(config.camera_models, self.cameras)
         # LeRobot stores the name with a dataset, and asks for the type when a recording is resumed.

@@ -1,5 +1,6 @@
 """Any robot plus pads by composition, and a pad that poses as a depth camera."""
 
+import time
 from collections.abc import Generator
 from dataclasses import dataclass
 from pathlib import Path
@@ -108,6 +109,23 @@ def test_base_robot_and_pads_speak_as_one(boards: dict[str, PadEmulator], tmp_pa
     assert not robot.pads.is_connected
 
 
+def test_the_order_in_which_pads_are_named_makes_no_difference(
+    boards: dict[str, PadEmulator], tmp_path: Path
+) -> None:
+    either, other = (
+        tactile_robot(dict(order), tmp_path) for order in (boards.items(), reversed(boards.items()))
+    )
+    assert list(either.observation_features) == list(other.observation_features)
+    for robot in (either, other):
+        robot.connect()
+        boards["thumb"].stall(1.0)
+        time.sleep(0.3)
+        ages = robot.get_observation()["tactile_age"]
+        robot.disconnect()
+        assert ages[0] < ages[1]  # index, thumb
+        boards["thumb"].stall(0.0)
+
+
 def test_failing_pad_leaves_nothing_connected(boards: dict[str, PadEmulator], tmp_path: Path) -> None:
     pads = {"thumb": {"port": boards["thumb"].port}, "index": {"port": str(tmp_path / "nowhere")}}
     robot = tactile_robot(boards, tmp_path, pads=pads)
@@ -153,8 +171,6 @@ def test_pad_as_depth_camera_is_exact(boards: dict[str, PadEmulator]) -> None:
     camera.connect()
     frames = [camera.async_read(timeout_ms=5000), camera.read_latest_depth(max_age_ms=5000), camera.read()]
     boards["thumb"].unplug()
-    import time
-
     time.sleep(0.3)
     with pytest.raises(TimeoutError, match="thumb"):
         camera.read_latest_depth(max_age_ms=200)
