@@ -25,7 +25,15 @@ from lerobot.datasets.io_utils import (
     load_tasks,
     write_table_one_row_group_per_episode,
 )
-from lerobot.datasets.utils import DATA_DIR, EPISODES_DIR, INFO_PATH, STATS_PATH, VIDEO_DIR, DatasetInfo
+from lerobot.datasets.utils import (
+    DATA_DIR,
+    DEFAULT_TASKS_PATH,
+    EPISODES_DIR,
+    INFO_PATH,
+    STATS_PATH,
+    VIDEO_DIR,
+    DatasetInfo,
+)
 from numpy.typing import NDArray
 
 from lerobot_vtrefine.datasets.footers import read_without_footer
@@ -70,8 +78,12 @@ def recover(root: Path) -> Recovery:
 
     Raises:
         ValueError: its description is missing or damaged; the message says what to do.
+        FileNotFoundError: the tasks' names are missing, for which LeRobot would take the description of the
+            Hub's dataset of this name in place of this one's.
     """
     info = _read_info(root)
+    if info.total_tasks and not (root / DEFAULT_TASKS_PATH).is_file():
+        raise FileNotFoundError(f"{root / DEFAULT_TASKS_PATH} is missing: put it back from a copy")
     announced = info.total_episodes
     _remove_unfinished(root)
     aside = _mend_data(root, info)

@@ -15,6 +15,7 @@ import numpy as np
 import pytest
 from lerobot.datasets.lerobot_dataset import LeRobotDataset
 from lerobot.datasets.video_utils import StreamingVideoEncoder
+from local_hub import use_folder_as_hub
 
 from lerobot_vtrefine.lerobot_compat import fast_reader, recovery, safe_recording
 
@@ -275,6 +276,24 @@ def test_a_folder_that_is_no_dataset_is_named(tmp_path: Path) -> None:
     (tmp_path / "there" / "meta" / "info.json").write_text('{"codebase_version": "v3')
     with pytest.raises(ValueError, match=r"info.json is damaged"):
         LeRobotDataset.resume(REPO, root=tmp_path / "there")
+
+
+def test_a_description_without_its_tasks_is_not_fetched_from_the_hub(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    use_folder_as_hub(monkeypatch, tmp_path / "hub")
+    for name, episodes in (("shared", 1), ("mine", 3)):
+        dataset = create(tmp_path / name)
+        record(dataset, *range(episodes))
+        dataset.finalize()
+    shutil.copytree(tmp_path / "shared", tmp_path / "hub" / REPO)
+    tasks = tmp_path / "mine" / "meta" / "tasks.parquet"
+    kept = tasks.read_bytes()
+    tasks.unlink()
+    with pytest.raises(FileNotFoundError, match=r"tasks.parquet is missing: put it back from a copy"):
+        LeRobotDataset.resume(REPO, root=tmp_path / "mine")
+    tasks.write_bytes(kept)
+    go_on(tmp_path / "mine", 5, check(tmp_path / "mine"))
 
 
 def test_an_empty_folder_is_recorded_into_and_holds_nothing_to_go_on_with(tmp_path: Path) -> None:
