@@ -36,6 +36,9 @@ instead of one per USB packet."""
 RATE_WINDOW_S = 2.0
 """Time over which the frame rate is measured."""
 
+IDLE_FRAMES = 30
+"""Frames whose median is the idle counts."""
+
 IDLE_TIMEOUT_S = 5.0
 """How long the frames of the idle counts may take to come."""
 
@@ -130,7 +133,7 @@ class PadReader(SerialReader):
             arrived = self._changed.wait_for(lambda: self._seq - 1 > seq and bool(self._history), timeout_s)
             return self._history[-1] if arrived else None
 
-    def idle_counts(self, frames: int = 30) -> NDArray[np.uint8]:
+    def idle_counts(self, frames: int = IDLE_FRAMES) -> NDArray[np.uint8]:
         """Idle counts, uint8 (pad rows, cols): the median of new frames. The pad must not be touched.
 
         Raises:
