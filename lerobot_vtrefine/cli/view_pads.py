@@ -5,6 +5,7 @@ import sys
 import time
 from collections.abc import Sequence
 from contextlib import ExitStack
+from dataclasses import dataclass
 from functools import lru_cache
 from pathlib import Path
 from typing import Any
@@ -28,6 +29,7 @@ from lerobot_vtrefine.drivers.diagnostic import DiagnosticReader
 from lerobot_vtrefine.drivers.pads_file import check_distinct_ports, load_pads
 from lerobot_vtrefine.drivers.ports import PortError
 from lerobot_vtrefine.drivers.serial_reader import RETRY_S
+from lerobot_vtrefine.files import decode, limits
 from lerobot_vtrefine.tactile.picture import colours
 from lerobot_vtrefine.view.rerun_viewer import import_rerun
 
@@ -40,6 +42,14 @@ SHADE = 16
 """Colours this close are drawn alike: idle taxels, whose counts flicker, then cost a slow terminal little."""
 PLAIN_S = 1.0
 """Without colours, pads are told this often."""
+
+
+@dataclass(frozen=True)
+class Rates:
+    """Limits of the flags about time."""
+
+    hz: float = limits(0.001, 1000.0)
+    seconds: float = limits(0.0, 1e9)
 
 
 def make_parser() -> CommandParser:
@@ -131,10 +141,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     """Entry point of `vtrefine-view-pads`."""
     options = make_parser().parse_args(arguments)
     extras.require("vtrefine-view-pads", extras.PADS)
-    if not options.hz > 0:
-        raise ValueError(f"--hz must be positive, got {options.hz:g}")
-    if not options.seconds >= 0:
-        raise ValueError(f"--seconds must be at least 0, got {options.seconds:g}")
+    decode(Rates, vars(options), "flags", "--", others=True)
     if options.save is not None:
         check_file("--save", options.save)
     if options.diagnostic:
