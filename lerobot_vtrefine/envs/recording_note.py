@@ -41,8 +41,8 @@ def simulation_settings(env: VtRefineEnvConfig) -> dict[str, Any]:
     )
 
 
-def add_episode(root: Path, settings: dict[str, Any], index: int, row: dict[str, Any]) -> None:
-    """Note episode ``index`` of the dataset at ``root``; a note of the same or a later index is replaced.
+def check_same(root: Path, settings: dict[str, Any]) -> dict[str, Any]:
+    """The note of the dataset at ``root``, an empty one where there is none yet.
 
     Raises:
         ValueError: the note that is there cannot be read, or is about another simulation.
@@ -52,6 +52,16 @@ def add_episode(root: Path, settings: dict[str, Any], index: int, row: dict[str,
     note = read_json(path) if path.is_file() else {"settings": settings, "episodes": []}
     if not isinstance(note, dict) or note.get("settings") != settings:
         raise ValueError(f"{path} notes a recording in another simulation: choose another --dataset.root")
+    return note
+
+
+def add_episode(root: Path, settings: dict[str, Any], index: int, row: dict[str, Any]) -> None:
+    """Note episode ``index`` of the dataset at ``root``; a note of the same or a later index is replaced.
+
+    Raises:
+        ValueError: as `check_same`.
+    """
+    note = check_same(root, settings)
     earlier = [known for known in note["episodes"] if known["episode_index"] < index]
     note["episodes"] = [*earlier, {"episode_index": index, **row}]
     write_in_place(root, NOTE, json.dumps(note, indent=1))

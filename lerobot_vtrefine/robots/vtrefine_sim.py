@@ -29,7 +29,7 @@ from lerobot_vtrefine.datasets.features import (
 )
 from lerobot_vtrefine.drivers.config import PadConfig
 from lerobot_vtrefine.embodiments import get_embodiment
-from lerobot_vtrefine.envs.recording_note import add_episode, simulation_settings
+from lerobot_vtrefine.envs.recording_note import add_episode, check_same, simulation_settings
 from lerobot_vtrefine.extras import SIMULATOR, require
 from lerobot_vtrefine.lerobot_compat import phases
 from lerobot_vtrefine.lerobot_compat.arrays import ArraySpec
@@ -196,7 +196,8 @@ class VtRefineSim(Robot):
         """LeRobot records an episode, or waits between two: see `lerobot_compat.phases`.
 
         Raises:
-            ValueError: LeRobot's loop runs at another rate than the simulation.
+            ValueError: LeRobot's loop runs at another rate than the simulation, or the dataset is of another
+                simulation.
         """
         if fps != self.config.fps:
             raise ValueError(
@@ -206,6 +207,7 @@ class VtRefineSim(Robot):
             )
         if dataset is not None:
             self._note_outcome()  # LeRobot saves an episode after the wait that follows it
+            check_same(Path(dataset.root), simulation_settings(self.env))
             self._start(self.config.seed + dataset.num_episodes)
         elif not events.get("rerecord_episode"):
             self._start(self.world.seed + 1)

@@ -196,6 +196,20 @@ def test_a_rerecorded_episode_starts_from_the_same_seed_and_is_not_noted(tmp_pat
     ]
 
 
+def test_a_dataset_of_another_simulation_is_refused_before_anything_is_recorded(tmp_path: Path) -> None:
+    robot, dataset = connected(), Dataset(tmp_path)
+    (tmp_path / "meta").mkdir()
+    other = {"settings": {"scene": {"pair": "square"}}, "episodes": []}
+    (tmp_path / "meta" / "recording.json").write_text(json.dumps(other))
+    with (
+        pytest.raises(ValueError, match=r"recording.json notes a recording in another simulation: choose"),
+        robot.phase({"exit_early": False}, FPS, dataset),
+    ):
+        pytest.fail("a frame could have been recorded")
+    robot.disconnect()
+    assert noted(tmp_path) == []
+
+
 def test_a_rollouts_policy_forgets_the_last_episode() -> None:
     robot, forgotten = connected(seed=5, pause_s=0.1), []
     part = SimpleNamespace(reset=lambda: forgotten.append(robot.world.seed))
