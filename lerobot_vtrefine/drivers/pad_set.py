@@ -1,6 +1,7 @@
 """The pads of one robot: connected together, read together, watched together."""
 
 import logging
+import time
 from dataclasses import dataclass
 
 import numpy as np
@@ -106,5 +107,9 @@ class PadSet:
             logger.warning("pad %s is back", name)
             self._stale.discard(name)
         frame = reader.latest()
-        counts = np.zeros(self.configs[name].pad_shape, np.uint8) if frame is None else frame.counts
-        return PadReading(counts, min(health.age_s, NEVER_S), stale)
+        if frame is None:
+            return PadReading(np.zeros(self.configs[name].pad_shape, np.uint8), NEVER_S, stale)
+        age_s = (
+            time.monotonic() - frame.arrival_s
+        )  # of this frame: one may have come since the health was told
+        return PadReading(frame.counts, min(age_s, NEVER_S), stale)

@@ -1,14 +1,17 @@
 """All pads of a robot together: what their idle counts tell about the wiring."""
 
 import logging
+import time
 from pathlib import Path
 
 import numpy as np
 import pytest
-from boards import emulated
+from boards import PAD, emulated, wait_until
 
+from lerobot_vtrefine.drivers.board import PadHealth, PadReader
 from lerobot_vtrefine.drivers.config import PadConfig
 from lerobot_vtrefine.drivers.pad_set import PadSet
+from lerobot_vtrefine.drivers.sources import check_pattern, pattern_source
 
 
 def test_a_pad_whose_cable_came_off_is_told_when_connecting(
@@ -35,3 +38,25 @@ def test_a_pad_whose_cable_came_off_is_told_when_connecting(
         f"pad thumb ({thumb.port}): every taxel reads zero: is the flat cable"
     )
     assert not any("index" in message for message in caplog.messages)
+
+
+def test_the_age_is_that_of_the_counts_it_comes_with(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The pad has stalled for a while and sends again just while it is read."""
+    told = PadReader.health
+    with emulated(tmp_path, source=pattern_source(PAD, time.monotonic_ns)) as board:
+        pads = PadSet({"thumb": PadConfig(board.port)})
+        pads.connect()
+        board.stall(0.6)
+        time.sleep(0.5)
+
+        def slowly(reader: PadReader) -> PadHealth:
+            health, seen = told(reader), reader.latest()
+            wait_until(lambda: reader.latest() is not seen)
+            return health
+
+        monkeypatch.setattr(PadReader, "health", slowly)
+        reading = pads.read()["thumb"]
+        now_ns = time.monotonic_ns()
+        pads.disconnect()
+    _, sent_ns = check_pattern(reading.counts)
+    assert reading.age_s <= (now_ns - sent_ns) / 1e9
