@@ -13,7 +13,7 @@ import functools
 import logging
 import shutil
 from collections.abc import Callable, Generator
-from contextlib import contextmanager, suppress
+from contextlib import closing, contextmanager, suppress
 from pathlib import Path
 from typing import Any
 
@@ -29,6 +29,7 @@ from lerobot.datasets.utils import (
 )
 
 from lerobot_vtrefine.folders import sync
+from lerobot_vtrefine.lerobot_compat.claim import Claim
 from lerobot_vtrefine.lerobot_compat.episode_rows import video_length_s
 from lerobot_vtrefine.lerobot_compat.guard import is_supported
 from lerobot_vtrefine.lerobot_compat.recovery import recover
@@ -51,10 +52,20 @@ _originals: dict[tuple[Any, str], Any] = {}
 class SafeWriter(DatasetWriter):
     """LeRobot's writer, which leaves complete files after every episode and takes back what failed."""
 
-    def __init__(self, *args: Any, batch_encoding_size: int, **kwargs: Any) -> None:
+    def __init__(
+        self, meta: LeRobotDatasetMetadata, root: Path, *args: Any, batch_encoding_size: int, **kwargs: Any
+    ) -> None:
+        self._claim = Claim(root)
         if batch_encoding_size > 1:
             logger.warning("Videos are encoded after every episode: an episode without video is not saved.")
-        super().__init__(*args, batch_encoding_size=1, **kwargs)
+        super().__init__(meta, root, *args, batch_encoding_size=1, **kwargs)
+
+    def finalize(self) -> None:
+        """End the recording."""
+        try:
+            super().finalize()
+        finally:
+            self._claim.close()
 
     def save_episode(self, episode_data: dict | None = None, parallel_encoding: bool = True) -> None:
         """Save the episode; after an error nothing of it is left.
@@ -176,7 +187,8 @@ def _resuming(original: Callable[..., LeRobotDataset]) -> Callable[..., LeRobotD
         cls: type[LeRobotDataset], repo_id: str, root: str | Path | None = None, *args: Any, **kwargs: Any
     ) -> LeRobotDataset:
         if root and Path(root).exists() and not is_empty(Path(root)):  # else it is fetched from the Hub
-            logger.info("%s", recover(Path(root)))
+            with closing(Claim(Path(root))):
+                logger.info("%s", recover(Path(root)))
         elif root and repo_id.startswith(LOCAL):
             raise ValueError(f"{root} holds no dataset to go on with: check --dataset.root, or do not resume")
         with _safe_classes():
