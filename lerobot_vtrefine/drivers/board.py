@@ -153,6 +153,12 @@ class PadReader(SerialReader):
 
     # --- health -----------------------------------------------------------------------------------
 
+    def status(self) -> Status:
+        """What the board is doing right now; costs next to nothing, whereas `health` may look for reasons."""
+        now = time.monotonic()
+        with self._changed:
+            return self._status(now, now - self._history[-1].arrival_s if self._history else np.inf)
+
     def health(self) -> PadHealth:
         """State right now."""
         now = time.monotonic()

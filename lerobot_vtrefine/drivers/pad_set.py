@@ -96,9 +96,9 @@ class PadSet:
         return {name: self._read_one(name, reader) for name, reader in self._readers.items()}
 
     def _read_one(self, name: str, reader: PadReader) -> PadReading:
-        health = reader.health()
-        stale = health.status is not Status.STREAMING
+        stale = reader.status() is not Status.STREAMING
         if stale and name not in self._stale:
+            health = reader.health()
             logger.error(
                 "pad %s is %s, its frames are marked stale: %s", name, health.status.value, health.advice
             )
@@ -111,5 +111,5 @@ class PadSet:
             return PadReading(np.zeros(self.configs[name].pad_shape, np.uint8), NEVER_S, stale)
         age_s = (
             time.monotonic() - frame.arrival_s
-        )  # of this frame: one may have come since the health was told
+        )  # of this frame: one may have come since the status was told
         return PadReading(frame.counts, min(age_s, NEVER_S), stale)

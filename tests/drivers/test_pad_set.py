@@ -8,8 +8,10 @@ import numpy as np
 import pytest
 from boards import PAD, emulated, wait_until
 
-from lerobot_vtrefine.drivers.board import PadHealth, PadReader
+from lerobot_vtrefine.drivers import board as board_module
+from lerobot_vtrefine.drivers.board import PadReader, Status
 from lerobot_vtrefine.drivers.config import PadConfig
+from lerobot_vtrefine.drivers.emulator import Faults
 from lerobot_vtrefine.drivers.pad_set import PadSet
 from lerobot_vtrefine.drivers.sources import check_pattern, pattern_source
 
@@ -42,21 +44,41 @@ def test_a_pad_whose_cable_came_off_is_told_when_connecting(
 
 def test_the_age_is_that_of_the_counts_it_comes_with(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """The pad has stalled for a while and sends again just while it is read."""
-    told = PadReader.health
+    told = PadReader.status
     with emulated(tmp_path, source=pattern_source(PAD, time.monotonic_ns)) as board:
         pads = PadSet({"thumb": PadConfig(board.port)})
         pads.connect()
         board.stall(0.6)
         time.sleep(0.5)
 
-        def slowly(reader: PadReader) -> PadHealth:
-            health, seen = told(reader), reader.latest()
+        def slowly(reader: PadReader) -> Status:
+            status, seen = told(reader), reader.latest()
             wait_until(lambda: reader.latest() is not seen)
-            return health
+            return status
 
-        monkeypatch.setattr(PadReader, "health", slowly)
+        monkeypatch.setattr(PadReader, "status", slowly)
         reading = pads.read()["thumb"]
         now_ns = time.monotonic_ns()
         pads.disconnect()
     _, sent_ns = check_pattern(reading.counts)
     assert reading.age_s <= (now_ns - sent_ns) / 1e9
+
+
+def test_a_pad_that_sends_nothing_usable_is_looked_into_once(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    """It takes several milliseconds, which a robot that is read 50 times a second has only once."""
+    explained, explain = [], board_module.explain_stream
+    monkeypatch.setattr(
+        board_module, "explain_stream", lambda *told: explained.append(told) or explain(*told)
+    )
+    with emulated(tmp_path) as board:
+        pads = PadSet({"thumb": PadConfig(board.port)})
+        pads.connect()
+        board.faults = Faults(loss=0.3)
+        wait_until(lambda: pads.read()["thumb"].stale)
+        for _ in range(20):
+            assert pads.read()["thumb"].stale
+        pads.disconnect()
+    assert len(explained) <= 1
+    assert "its frames are marked stale" in caplog.text
