@@ -18,6 +18,7 @@ from pathlib import Path
 AT_FDCWD = -100
 RENAME_EXCHANGE = 2
 CANNOT_EXCHANGE = (errno.EINVAL, errno.ENOSYS, errno.ENOTSUP, errno.EPERM)
+CANNOT_SYNC = (errno.EINVAL, errno.ENOTSUP)
 CANNOT_LINK = (errno.EPERM, errno.ENOTSUP, errno.EMLINK, errno.EXDEV, errno.ENOSYS)
 
 
@@ -182,9 +183,15 @@ def _flush(folder: Path) -> None:
 
 
 def sync(path: Path) -> None:
-    """Wait until a file's contents or a folder's names are on the disk."""
+    """Wait until a file's contents or a folder's names are on the disk.
+
+    Folders of some file systems, such as those that a virtual machine shares, cannot be waited for.
+    """
     descriptor = os.open(path, os.O_RDONLY)
     try:
         os.fsync(descriptor)
+    except OSError as error:
+        if error.errno not in CANNOT_SYNC or not path.is_dir():
+            raise
     finally:
         os.close(descriptor)

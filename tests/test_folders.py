@@ -1,6 +1,8 @@
 """Folders that change as a whole, killed at every file operation."""
 
+import errno
 import os
+import stat
 from pathlib import Path
 
 import pytest
@@ -9,6 +11,7 @@ from file_faults import contents, in_fork, killed_at_each
 from lerobot_vtrefine import folders
 from lerobot_vtrefine.cli.outputs import staged
 from lerobot_vtrefine.folders import beside, put_in_place
+from lerobot_vtrefine.whole_files import whole_file
 
 NAMES = ("model.json", "sub/frames.txt", "verdict.json")
 FOREIGN = {"notes.txt": b"mine", "predicted/trial.txt": b"also mine"}
@@ -163,3 +166,24 @@ def test_a_new_folder_is_whole_or_absent(tmp_path) -> None:
         assert contents(tmp_path / "new") in ({}, {"a": b"a"})
     assert in_fork(build) == 0
     assert listed(tmp_path) == ["new"]
+
+
+def test_folders_that_cannot_be_synced_are_written_all_the_same(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """As on vboxsf or 9p; a file that cannot be is still an error."""
+    fsync, refused = os.fsync, [stat.S_ISDIR]
+
+    def picky(descriptor: int) -> None:
+        if any(kind(os.fstat(descriptor).st_mode) for kind in refused):
+            raise OSError(errno.EINVAL, os.strerror(errno.EINVAL))
+        fsync(descriptor)
+
+    monkeypatch.setattr(os, "fsync", picky)
+    with whole_file(tmp_path / "new" / "file") as part:
+        part.write_text("whole")
+    assert (tmp_path / "new" / "file").read_text() == "whole"
+    refused.append(stat.S_ISREG)
+    with pytest.raises(OSError, match="Invalid argument"), whole_file(tmp_path / "new" / "other") as part:
+        part.write_text("lost")
+    assert [path.name for path in (tmp_path / "new").iterdir()] == ["file"]
