@@ -3,6 +3,7 @@
 import contextlib
 import logging
 from functools import cached_property
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -24,6 +25,7 @@ from lerobot_vtrefine.robots.camera_models import CameraModels
 from lerobot_vtrefine.robots.config_aloha_tactile_follower import AlohaTactileFollowerConfig
 from lerobot_vtrefine.robots.extensions import extend_lerobot
 from lerobot_vtrefine.robots.pad_reading import pad_observation
+from lerobot_vtrefine.whole_files import whole_file
 
 logger = logging.getLogger(__name__)
 
@@ -169,6 +171,11 @@ class AlohaTactileFollower(Robot):
         self.calibration = self.pair.calibration
         self._save_calibration()
         logger.info("calibration saved to %s", self.calibration_fpath)
+
+    def _save_calibration(self, fpath: Path | None = None) -> None:
+        """As LeRobot's; a full disk leaves the calibration that was there."""
+        with whole_file(self.calibration_fpath if fpath is None else fpath) as part:
+            super()._save_calibration(part)
 
     def setup_motors(self) -> None:
         """Give new motors their ids and baud rates, for `lerobot-setup-motors`."""

@@ -2,6 +2,7 @@
 
 import logging
 from functools import cached_property
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -15,6 +16,7 @@ from lerobot_vtrefine.drivers.arm_pair import ArmPair
 from lerobot_vtrefine.embodiments import get_embodiment
 from lerobot_vtrefine.extras import ARMS, require
 from lerobot_vtrefine.teleoperators.config_aloha_leader import AlohaLeaderConfig
+from lerobot_vtrefine.whole_files import whole_file
 
 logger = logging.getLogger(__name__)
 
@@ -82,6 +84,11 @@ class AlohaLeader(Teleoperator):
         self.calibration = self.pair.calibration
         self._save_calibration()
         logger.info("calibration saved to %s", self.calibration_fpath)
+
+    def _save_calibration(self, fpath: Path | None = None) -> None:
+        """As LeRobot's; a full disk leaves the calibration that was there."""
+        with whole_file(self.calibration_fpath if fpath is None else fpath) as part:
+            super()._save_calibration(part)
 
     def setup_motors(self) -> None:
         """Give new motors their ids and baud rates, for `lerobot-setup-motors`."""
