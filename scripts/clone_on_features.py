@@ -30,6 +30,7 @@ from lerobot_vtrefine.cli.arguments import CommandParser
 from lerobot_vtrefine.cli.errors import run_cli
 from lerobot_vtrefine.datasets.features import ACTION_KEY, LIMITS_KEY, STATE_KEY, TRUTH_KEY
 from lerobot_vtrefine.files.text import read_yaml
+from lerobot_vtrefine.lerobot_compat.completeness import check_complete
 from lerobot_vtrefine.policies.vt_dp3.modeling_vt_dp3 import VtDp3Policy
 from lerobot_vtrefine.policies.vt_dp3.observation_encoder import PERCEIVED_KEY
 
@@ -82,12 +83,13 @@ def clone(policy: VtDp3Policy, passes: list[dict[str, Tensor]], steps: int, batc
 def load(args: argparse.Namespace) -> tuple[VtDp3Policy, tuple[Any, Any], LeRobotDataset]:
     """A fresh policy, its processors and the dataset.
 
-    Raises: ValueError for a policy whose encoder is trained.
+    Raises: ValueError for a policy whose encoder is trained; for a dataset as `check_complete`.
     """
     fields = read_yaml(CONFIG)["policy"] | {"device": args.device} | json.loads(args.policy)
     config = draccus.decode(PreTrainedConfig, fields)
     if not getattr(config, "freeze_encoder", False):
         raise ValueError("--policy: features can be kept where freeze_encoder is true")
+    check_complete(args.dataset)
     repo_id = f"local/{args.dataset.name}"
     meta = LeRobotDataset(repo_id, root=args.dataset).meta
     times = resolve_delta_timestamps(config, meta)

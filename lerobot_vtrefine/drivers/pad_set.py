@@ -109,7 +109,5 @@ class PadSet:
         frame = reader.latest()
         if frame is None:
             return PadReading(np.zeros(self.configs[name].pad_shape, np.uint8), NEVER_S, stale)
-        age_s = (
-            time.monotonic() - frame.arrival_s
-        )  # of this frame: one may have come since the status was told
+        age_s = time.monotonic() - frame.arrival_s  # of this frame: one may have come since the status
         return PadReading(frame.counts, min(age_s, NEVER_S), stale)

@@ -13,7 +13,6 @@ import numpy as np
 from lerobot_vtrefine.datasets.features import DEPTH_KEY, baseline_keys, tactile_keys
 from lerobot_vtrefine.embodiments import Embodiment
 from lerobot_vtrefine.envs.episodes import Ablation, Array, Raw
-from lerobot_vtrefine.files.tables import read_columns
 
 if TYPE_CHECKING:
     from lerobot.datasets.lerobot_dataset import LeRobotDataset
@@ -137,10 +136,11 @@ def _with_touch(raw: Raw, pressed: Array) -> Raw:
 def _dataset(root: Path, keys: Sequence[str]) -> "LeRobotDataset":
     from lerobot.datasets.lerobot_dataset import LeRobotDataset
 
+    from lerobot_vtrefine.lerobot_compat.completeness import check_complete
+
     if not (Path(root) / "meta" / "info.json").is_file():
         raise FileNotFoundError(f"--env.ablate_dataset: no LeRobot dataset at {root}")
-    for path in (Path(root) / "data").rglob("*.parquet"):  # LeRobot would not say which one is damaged
-        read_columns(path, ["episode_index"])
+    check_complete(Path(root))
     dataset = LeRobotDataset(Path(root).name, root=root)
     missing = [key for key in keys if key not in dataset.features]
     if missing:
