@@ -85,7 +85,9 @@ def several(gains: list[float | None]) -> tuple[Fit, PressSet]:
         parts.append(SimpleNamespace(taxels=np.arange(8), signal=readings))
         signals.append(expected)
     none = np.zeros(0)
-    return Fit(None, none, none, tuple(signals), none), PressSet(layout, 255.0, None, tuple(parts))
+    # By load: without depths no geometry can be asked about.
+    presses = PressSet(layout, 255.0, None, tuple(parts), loaded=True)
+    return Fit(None, none, none, tuple(signals), none), presses
 
 
 @pytest.fixture(scope="module")

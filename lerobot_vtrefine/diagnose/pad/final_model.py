@@ -18,11 +18,11 @@ from lerobot_vtrefine.diagnose.pad.fitting import Fit, fit, rest
 from lerobot_vtrefine.diagnose.pad.idle_level import settled_idle
 from lerobot_vtrefine.diagnose.pad.idle_map import IdleMap
 from lerobot_vtrefine.diagnose.pad.model import Composite, sensor_model
+from lerobot_vtrefine.diagnose.pad.never_touched import with_all_dead
 from lerobot_vtrefine.diagnose.pad.own_delay import timed
 from lerobot_vtrefine.diagnose.pad.own_touch import with_own_touch
 from lerobot_vtrefine.diagnose.pad.prediction import predict_trial
 from lerobot_vtrefine.diagnose.pad.press_trials import Press, PressSet
-from lerobot_vtrefine.diagnose.pad.taxel_maps import with_all_dead
 from lerobot_vtrefine.tactile.model import SensorModel
 
 if TYPE_CHECKING:

@@ -3,7 +3,7 @@
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from functools import cached_property
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from scipy.ndimage import binary_dilation
@@ -196,6 +196,11 @@ class PressSet:
 
     @cached_property
     def _subsets(self) -> dict[tuple[int, ...], "PressSet"]:
+        return {}
+
+    @cached_property
+    def touched(self) -> dict[Any, frozenset[tuple[int, int]]]:
+        """What `never_touched` has found."""
         return {}
 
     @property

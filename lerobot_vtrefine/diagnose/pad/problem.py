@@ -37,6 +37,7 @@ from lerobot_vtrefine.diagnose.pad.fitting import (
 )
 from lerobot_vtrefine.diagnose.pad.form_fitting import Starts, grown, settle, starts_of, with_form, without
 from lerobot_vtrefine.diagnose.pad.model import Composite
+from lerobot_vtrefine.diagnose.pad.never_touched import seen_dead
 from lerobot_vtrefine.diagnose.pad.noise import Noise
 from lerobot_vtrefine.diagnose.pad.own_delay import moved
 from lerobot_vtrefine.diagnose.pad.own_touch import allowed, losses_at_own_touch
@@ -45,7 +46,7 @@ from lerobot_vtrefine.diagnose.pad.rules import FAR_OFF, FORGIVEN, FURTHER_GAIN
 from lerobot_vtrefine.diagnose.pad.screening import DEAD, GAIN_MAP, all_probes, form_probes, forms_of
 from lerobot_vtrefine.diagnose.pad.shown_dead import with_shown_dead
 from lerobot_vtrefine.diagnose.pad.suspicions import surprises, suspicions
-from lerobot_vtrefine.diagnose.pad.taxel_maps import MapEvidence, find_dead, map_evidence, map_of, with_map
+from lerobot_vtrefine.diagnose.pad.taxel_maps import MapEvidence, map_evidence, map_of, with_map
 from lerobot_vtrefine.diagnose.pad.thinning import thinned
 from lerobot_vtrefine.diagnose.pad.weights import TrialWeights, in_deviations
 
@@ -243,7 +244,7 @@ class PadProblem(OptionalSteps):
         if candidate.cause == GAIN_MAP:
             return self.settled(with_map(now, self.presses, self.weights))
         if form is None:
-            return self.settled(replace(now.model, dead=find_dead(now, self.presses)))
+            return self.settled(replace(now.model, dead=seen_dead(now, self.presses)))
         if plainer is not None and form.grown is not None:
             return grown(plainer, form, self.presses, self.weights)
         return with_form(now, form, candidate.starts.get(form.label, ()), self.presses, self.weights)
@@ -283,8 +284,7 @@ class PadProblem(OptionalSteps):
 
         Weights trust fast changes most, and it is there that a course drawn between two frames is wrong.
         """
-        plain = PLAIN.get(candidate.cause)
-        if plain is None or not plain.between_frames:
+        if not getattr(PLAIN.get(candidate.cause), "between_frames", False):
             return np.ones(1, dtype=bool)
         even = self.even
         before, after = (out_of_fold(even, even.refitted(fit), self.folds) for fit in (now, best))

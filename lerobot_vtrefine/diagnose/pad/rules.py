@@ -33,6 +33,11 @@ DEAD_BELOW, DEAD_ERRORS = 1 / 3, 2.0
 squared error), and the standard errors by which its gain must lie below."""
 MAYBE_DEAD_ERRORS = 1.0
 """Standard errors that are enough for one more dead taxel, where others are."""
+SHIFT_TAXELS, LOWER_PART, PITCH_STEP, SIZE_STEP = 0.5, 0.2, 0.1, 0.15
+"""Steps in which other geometries are tried: an object's shift in taxels, the face's height in parts of the
+deepest press, logarithms of the pitch and of an object's size."""
+MOST_GEOMETRY = 3.0
+"""Steps up to which a geometry may be other than stated."""
 WITNESSES = 2
 """Locked recordings that must each show a taxel to be dead that others do not press: one tells the other."""
 

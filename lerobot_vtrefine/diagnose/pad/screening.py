@@ -19,9 +19,10 @@ from lerobot_vtrefine.diagnose.pad.candidates.sample_and_hold import (
 from lerobot_vtrefine.diagnose.pad.fitting import Fit, movable, predict, tangents
 from lerobot_vtrefine.diagnose.pad.forward_model.run import Prefix
 from lerobot_vtrefine.diagnose.pad.map_prior import parts
+from lerobot_vtrefine.diagnose.pad.never_touched import seen_dead
 from lerobot_vtrefine.diagnose.pad.own_touch import allowed, touches_of
 from lerobot_vtrefine.diagnose.pad.press_trials import PressSet
-from lerobot_vtrefine.diagnose.pad.taxel_maps import find_dead, map_evidence
+from lerobot_vtrefine.diagnose.pad.taxel_maps import map_evidence
 from lerobot_vtrefine.diagnose.pad.weights import TrialWeights
 
 if TYPE_CHECKING:
@@ -186,7 +187,7 @@ def map_probes(problem: "PadProblem", fitted: Fit) -> list[Probe]:
         return found
     if GAIN_MAP not in fitted.model.families:
         found += gain_spread_probes(problem, fitted)
-    if DEAD not in fitted.model.families and find_dead(fitted, problem.presses):
+    if DEAD not in fitted.model.families and seen_dead(fitted, problem.presses):
         # Answers that fail by a factor of eight at many times their error are seen, not tested.
         found.append(_observed(DEAD, None, np.zeros(0)))
     return found

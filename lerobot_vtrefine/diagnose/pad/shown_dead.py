@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING
 
 from lerobot_vtrefine.diagnose.core.rules import LEAST_GAIN
 from lerobot_vtrefine.diagnose.pad.fitting import Fit, predict, squared_errors
+from lerobot_vtrefine.diagnose.pad.never_touched import seen_dead
 from lerobot_vtrefine.diagnose.pad.press_trials import PressSet
 from lerobot_vtrefine.diagnose.pad.rules import WITNESSES
 from lerobot_vtrefine.diagnose.pad.taxel_maps import could_be_dead, find_dead, plain_gains
@@ -46,7 +47,7 @@ def shown_dead(fitted: Fit, presses: PressSet, locked: Sequence[int]) -> dict[tu
     alone = [find_dead(replace(fitted, signals=(fitted.signals[k],)), presses.subset([k])) for k in locked]
     return {
         taxel: left
-        for taxel, left in find_dead(fitted, presses).items()
+        for taxel, left in seen_dead(fitted, presses).items()
         if sum(taxel in dead for dead in alone) >= WITNESSES
     }
 

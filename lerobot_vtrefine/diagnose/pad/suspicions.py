@@ -26,6 +26,7 @@ from lerobot_vtrefine.diagnose.pad.failing_taxels import failing_taxel
 from lerobot_vtrefine.diagnose.pad.fitting import Fit, predict, tangents
 from lerobot_vtrefine.diagnose.pad.gain_drift import gain_drift
 from lerobot_vtrefine.diagnose.pad.hum import hum
+from lerobot_vtrefine.diagnose.pad.never_touched import never_touched, with_all_dead
 from lerobot_vtrefine.diagnose.pad.one_size import sizes_differ
 from lerobot_vtrefine.diagnose.pad.own_face import leaning_face
 from lerobot_vtrefine.diagnose.pad.own_touch import with_own_touch
@@ -37,7 +38,6 @@ from lerobot_vtrefine.diagnose.pad.rules import FOLLOWS, FOLLOWS_IF_OWNED, MAYBE
 from lerobot_vtrefine.diagnose.pad.screening import Scorer
 from lerobot_vtrefine.diagnose.pad.shared_errors import noise_in_bursts, shared_errors
 from lerobot_vtrefine.diagnose.pad.sliding_errors import while_sliding
-from lerobot_vtrefine.diagnose.pad.taxel_maps import with_all_dead
 from lerobot_vtrefine.diagnose.pad.weights import TrialWeights, in_deviations
 
 if TYPE_CHECKING:
@@ -61,6 +61,7 @@ def suspicions(problem: "PadProblem", selection: Selection[Any, Fit, Any]) -> li
         error_level.level(residuals, fitted, weights),
         held_rows(presses) if HOLD not in fitted.model.families else None,
         while_sliding(presses, residuals, fitted, weights),
+        never_touched(fitted, presses),
         *shared_errors(presses, own.left, fitted, weights, problem.seed),
         *hum(presses, own.left, fitted, weights, problem.seed),
         *noise_in_bursts(presses, own.left, fitted, weights, problem.seed),

@@ -163,27 +163,46 @@ def plain_gains(fitted: Fit, presses: PressSet) -> tuple[np.ndarray, np.ndarray]
     The error is taken from the scatter that is left at the taxel, memory included roughly; inf where the
     taxel was never expected to answer.
     """
-    count = presses.layout.num_taxels
-    top, bottom, power, frames = np.zeros(count), np.zeros(count), np.zeros(count), np.zeros(count)
+    sums = GainSums.none(presses.layout.num_taxels)
     for press, signal in zip(presses.presses, fitted.signals, strict=True):
-        top[press.taxels] += (signal * press.signal).sum(axis=0)
-        bottom[press.taxels] += (signal**2).sum(axis=0)
-        power[press.taxels] += (press.signal**2).sum(axis=0)
-        frames[press.taxels] += len(press.signal)
-    known = bottom > 1e-6  # a thousandth of a count
-    gain = np.where(known, top / np.where(known, bottom, 1.0), np.nan)
-    left = np.maximum(power - np.where(known, top**2 / np.where(known, bottom, 1.0), 0.0), 0.0)
-    variance = left / np.maximum(frames, 1.0)
-    # Memory makes about ten frames worth one; a count is the least that a converter leaves open.
-    error = np.sqrt(np.maximum(variance, 0.1) * 10.0 / np.where(known, bottom, 1.0))
-    return gain, np.where(known, error, np.inf)
+        sums.add(press.taxels, press.signal, signal)
+    return sums.gains()
 
 
-def with_all_dead(fitted: Fit, presses: PressSet, errors: float = DEAD_ERRORS) -> Fit:
-    """The fit with those taxels, too, that hardly answer in these presses."""
-    dead = {**find_dead(fitted, presses, errors), **fitted.model.dead}
-    model = replace(fitted.model, dead=dict(sorted(dead.items())))
-    return replace(fitted, model=model, signals=tuple(predict(model, presses)))
+@dataclass(frozen=True)
+class GainSums:
+    """Sums over frames, taxel by taxel (R*C,), from which gains follow."""
+
+    top: np.ndarray
+    """Of expected times measured [counts^2]."""
+    bottom: np.ndarray
+    """Of expected squared."""
+    power: np.ndarray
+    """Of measured squared."""
+    frames: np.ndarray
+
+    @classmethod
+    def none(cls, count: int) -> "GainSums":
+        """Of no frames."""
+        return cls(*np.zeros((4, count)))
+
+    def add(self, taxels: np.ndarray, measured: np.ndarray, expected: np.ndarray, times: float = 1.0) -> None:
+        """Add the frames (T, n) of the taxels numbered `taxels` (n,), each so many times."""
+        self.top[taxels] += times * (expected * measured).sum(axis=0)
+        self.bottom[taxels] += times * (expected**2).sum(axis=0)
+        self.power[taxels] += times * (measured**2).sum(axis=0)
+        self.frames[taxels] += times * len(measured)
+
+    def gains(self) -> tuple[np.ndarray, np.ndarray]:
+        """See `plain_gains`."""
+        known = self.bottom > 1e-6  # a thousandth of a count
+        bottom = np.where(known, self.bottom, 1.0)
+        gain = np.where(known, self.top / bottom, np.nan)
+        left = np.maximum(self.power - np.where(known, self.top**2 / bottom, 0.0), 0.0)
+        variance = left / np.maximum(self.frames, 1.0)
+        # Memory makes about ten frames worth one; a count is the least that a converter leaves open.
+        error = np.sqrt(np.maximum(variance, 0.1) * 10.0 / bottom)
+        return gain, np.where(known, error, np.inf)
 
 
 def could_be_dead(error: np.ndarray, errors: float = DEAD_ERRORS) -> np.ndarray:
