@@ -21,7 +21,7 @@ from lerobot_vtrefine.diagnose.core.search import Selection
 from lerobot_vtrefine.diagnose.core.suspicion import Suspicion
 from lerobot_vtrefine.diagnose.pad import final_model, review
 from lerobot_vtrefine.diagnose.pad.baseline import Baseline, fit_baseline, plain_weights, weigh
-from lerobot_vtrefine.diagnose.pad.candidates import PLAIN
+from lerobot_vtrefine.diagnose.pad.candidates import BETWEEN_FRAMES
 from lerobot_vtrefine.diagnose.pad.candidates.base import Form
 from lerobot_vtrefine.diagnose.pad.coincidence import cover_or_leak
 from lerobot_vtrefine.diagnose.pad.error_level import slow_errors
@@ -284,7 +284,7 @@ class PadProblem(OptionalSteps):
 
         Weights trust fast changes most, and it is there that a course drawn between two frames is wrong.
         """
-        if not getattr(PLAIN.get(candidate.cause), "between_frames", False):
+        if candidate.cause not in BETWEEN_FRAMES:
             return np.ones(1, dtype=bool)
         even = self.even
         before, after = (out_of_fold(even, even.refitted(fit), self.folds) for fit in (now, best))

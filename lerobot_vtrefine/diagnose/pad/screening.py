@@ -8,7 +8,7 @@ import numpy as np
 
 from lerobot_vtrefine.diagnose.core.parallel import on_all_cores
 from lerobot_vtrefine.diagnose.core.score_test import Probe, cleared
-from lerobot_vtrefine.diagnose.pad.candidates import CATALOGUE, PLAIN
+from lerobot_vtrefine.diagnose.pad.candidates import BETWEEN_FRAMES, CATALOGUE
 from lerobot_vtrefine.diagnose.pad.candidates.base import Form
 from lerobot_vtrefine.diagnose.pad.candidates.sample_and_hold import (
     held,
@@ -132,7 +132,7 @@ def form_probes(problem: "PadProblem", fitted: Fit, families: Collection[str] | 
     ]
     jobs = [partial(probe_form, form, scorer) for form in forms]
     if freed is not None:
-        jobs += [partial(probe_form, form, freed) for form in forms if PLAIN[form.family].between_frames]
+        jobs += [partial(probe_form, form, freed) for form in forms if form.family in BETWEEN_FRAMES]
     return [probe for found in on_all_cores(lambda job: job(), jobs) for probe in found]
 
 

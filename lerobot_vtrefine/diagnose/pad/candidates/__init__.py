@@ -13,6 +13,8 @@ CATALOGUE: tuple[Form, ...] = tuple(form for file in _FILES.values() for form in
 """Causes with a handful of parameters; maps (taxel_gain_spread, dead_taxels) are fitted in `maps`."""
 PLAIN: dict[str, Form] = {form.family: form for form in reversed(CATALOGUE)}
 """Cause -> its plain form, with which stands what holds for all forms."""
+BETWEEN_FRAMES = frozenset(cause for cause, form in PLAIN.items() if form.between_frames)
+"""Causes that what a motion did between two frames imitates."""
 KINDS: dict[str, tuple[Kind, ...]] = {
     **{name: form.kinds for name, form in PLAIN.items()},
     "taxel_gain_spread": ("place", "centre"),
