@@ -8,8 +8,9 @@ import numpy as np
 import pytest
 from test_engine_pad import COLS, ROWS, linear, one_trial
 
+from lerobot_vtrefine.diagnose.core.suspicion import confirmed
 from lerobot_vtrefine.diagnose.pad.candidates import CATALOGUE, PLAIN
-from lerobot_vtrefine.diagnose.pad.own_delay import moved, timed, with_spread
+from lerobot_vtrefine.diagnose.pad.own_delay import follow_session, moved, timed, with_spread
 from lerobot_vtrefine.diagnose.pad.press_trials import PressSet, prepare
 from lerobot_vtrefine.diagnose.pad.problem import Candidate, PadProblem
 from lerobot_vtrefine.diagnose.pad.recording_scatter import own_deviations, starts_deviate
@@ -83,6 +84,22 @@ def test_a_moved_press_was_made_later(late: PadProblem) -> None:
     np.testing.assert_allclose(after.drive[2:], before.drive[1:-1], atol=2e-6)
     np.testing.assert_array_equal(after.signal, before.signal)
     np.testing.assert_array_equal(after.time_s, before.time_s)
+
+
+def told(delays_s: np.ndarray) -> list[str]:
+    """What is said of such delays in the order of the session."""
+    asked = follow_session(moved(presses(np.zeros(COUNT)), delays_s))
+    return [] if asked is None else [alarm.clue for alarm in confirmed([asked], 0)]
+
+
+def test_delays_that_follow_the_session_are_told_and_others_are_not() -> None:
+    rising = np.sort(OWN_S) + np.tile([2e-3, -2e-3], COUNT // 2)
+    (clue,) = told(rising)
+    assert clue.startswith("readings come later and later through the session, by 3")
+    (clue,) = told(-rising)
+    assert "earlier and earlier" in clue
+    assert told(OWN_S) == []
+    assert follow_session(presses(rising)) is None
 
 
 def test_a_mean_of_delays_that_differ_is_known_no_better_than_they_agree() -> None:

@@ -16,9 +16,11 @@ from typing import TYPE_CHECKING
 import numpy as np
 from scipy.stats import chi2
 
+from lerobot_vtrefine.diagnose.core.suspicion import Suspicion
 from lerobot_vtrefine.diagnose.pad.fitting import Fit
 from lerobot_vtrefine.diagnose.pad.motion import motion, resampled
 from lerobot_vtrefine.diagnose.pad.press_trials import Press, PressSet
+from lerobot_vtrefine.diagnose.pad.rules import DELAY_COURSE, MIN_RECORDINGS
 from lerobot_vtrefine.diagnose.pad.weights import TrialWeights
 from lerobot_vtrefine.diagnose.verdict import Parameter
 from lerobot_vtrefine.tactile.layout import PadLayout
@@ -73,6 +75,25 @@ def _moved(press: Press, delay_s: float) -> Press:
     else:
         drive, rate = motion(made, layout, made.time_s)
     return replace(press, trial=made, drive=drive, rate=rate)
+
+
+def follow_session(presses: PressSet) -> Suspicion | None:
+    """Whether recordings' own delays rise or fall through the session: then they are not drawn by chance, and
+    their mean is not the next recording's.
+
+    Order is what is permuted. Conditions have no part in a delay, so every recording counts by itself.
+    """
+    starts = np.array([press.trial.start_s for press in presses.presses])
+    if len(presses.delays_s) < MIN_RECORDINGS or np.ptp(starts) <= 0:
+        return None
+    delays_s = np.array(presses.delays_s) - np.mean(presses.delays_s)
+    course = (starts - starts.mean()) / np.std(starts)
+    slope_s = float(delays_s @ course) / len(course)
+    share = slope_s**2 / max(float(np.mean(delays_s**2)), 1e-18)
+    way = "later and later" if slope_s > 0 else "earlier and earlier"
+    change_ms = 1e3 * abs(slope_s) * float(np.ptp(course))
+    clue = f"readings come {way} through the session, by {change_ms:.0f} ms in all"
+    return Suspicion(0, clue, share, DELAY_COURSE, delays_s, True, course, family="delays")
 
 
 def with_spread(found: Mapping[str, Parameter], delays_s: Sequence[float]) -> dict[str, Parameter]:

@@ -71,7 +71,9 @@ FOLLOWS_IF_OWNED = 0.1
 MIN_COURSE = 0.005
 """Deviation of gains along their course that is worth a word."""
 MIN_RECORDINGS = 8
-"""Recordings whose gains have a course."""
+"""Recordings whose gains, or delays, have a course."""
+DELAY_COURSE = 0.5
+"""Part of the variance of recordings' own delays that follows the session: most of it is then no chance."""
 
 SIZES_DIFFER = 0.25
 """Deviation of a cause's size between recordings, in parts of it: other forms than the sensor's leave up to a
