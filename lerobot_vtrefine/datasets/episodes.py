@@ -85,7 +85,7 @@ class EpisodeFolder:
                 )
         found: dict[int, list[pa.Table]] = {}
         files: dict[int, Path] = {}
-        for path in sorted((self.root / "data").glob("*/*.parquet")):  # where LeRobot looks, too
+        for path in _data_files(self.root):
             for index, part in _split(self._table(path), set(wanted)):
                 if files.setdefault(index, path) != path:
                     raise ValueError(f"{path}: episode {index} is in {files[index]}, too; move the copy away")
@@ -190,6 +190,13 @@ def _joint_names(state: FeatureInfo, robot_type: str | None) -> tuple[str, ...]:
         return tuple(state.names)
     body = embodiment_of_robot(robot_type)
     return body.joint_names if body is not None and state.shape == (body.num_joints,) else ()
+
+
+def _data_files(root: Path) -> list[Path]:
+    """All of them but those in hidden folders, where notebooks and file managers keep copies."""
+    data = root / "data"
+    found = sorted(data.rglob("*.parquet"))
+    return [path for path in found if not any(name.startswith(".") for name in path.relative_to(data).parts)]
 
 
 def _pads(features: dict[str, FeatureInfo]) -> dict[str, int]:

@@ -87,5 +87,5 @@ def test_a_copy_of_a_data_file_is_named(root: Path) -> None:
         open_episodes(root).read()
     hidden = copy.parent / ".checkpoints"
     hidden.mkdir()
-    copy.rename(hidden / copy.name)  # LeRobot does not look there
+    copy.rename(hidden / copy.name)  # where nobody looks
     assert len(open_episodes(root).read()) == 2
