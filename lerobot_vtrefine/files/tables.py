@@ -6,8 +6,8 @@ from pathlib import Path
 import pyarrow as pa
 import pyarrow.parquet as pq
 
-MAX_VALUES_BYTES = 384 << 20
-"""Values of the columns that are read, unpacked, eight bytes each ..."""
+MAX_BYTES = 384 << 20
+"""What the columns that are read occupy, unpacked, each value by its column's own width ..."""
 MAX_RATIO = 100
 """... unless the file itself is so large that this is no more than this many times its size."""
 
@@ -28,7 +28,7 @@ def read_table(path: Path, columns: Sequence[str] | None = None, *, without: Seq
                 raise ValueError(f"column {repeated[0][:60]} appears twice")
             columns = names if columns is None else columns
             columns = [name for name in columns if name not in without]
-            _check_size(file.metadata, columns, path.stat().st_size)
+            _check_size(file, columns, path.stat().st_size)
             return file.read(columns)
     except (pa.ArrowException, OSError, ValueError, KeyError) as error:
         reason = str(error).splitlines()[0][:200] if str(error) else type(error).__name__
@@ -51,14 +51,37 @@ def read_columns(path: Path, columns: Sequence[str], *, others: bool = False) ->
     return table
 
 
-def _check_size(metadata: pq.FileMetaData, columns: Sequence[str], file_bytes: int) -> None:
-    values = 0
-    for group in range(metadata.num_row_groups):
-        part = metadata.row_group(group)
-        for index in range(part.num_columns):
-            column = part.column(index)
-            if column.path_in_schema.split(".")[0] in columns:
-                values += max(column.num_values * 8, column.total_uncompressed_size)
-    values = max(values, 8 * metadata.num_rows)
-    if values > max(MAX_VALUES_BYTES, MAX_RATIO * file_bytes):
-        raise ValueError(f"{metadata.num_rows:,} rows of {values:,} bytes in {file_bytes:,} are too many")
+def _check_size(file: pq.ParquetFile, columns: Sequence[str], file_bytes: int) -> None:
+    metadata = file.metadata
+    # Parquet's names of columns join names by dots, which LeRobot's names have, too: their order tells them.
+    leaves = [(field.name, *leaf) for field in file.schema_arrow for leaf in _leaves(field.type)]
+    size = 0
+    for group in map(metadata.row_group, range(metadata.num_row_groups)):
+        for index, (name, width, at_least) in enumerate(leaves):
+            if name in columns:
+                part = group.column(index)
+                values = max(part.num_values, group.num_rows * at_least)
+                size += max(values * width, part.total_uncompressed_size)
+    size = max(size, 8 * metadata.num_rows)
+    if size > max(MAX_BYTES, MAX_RATIO * file_bytes):
+        raise ValueError(f"{metadata.num_rows:,} rows of {size:,} bytes in {file_bytes:,} are too many")
+
+
+def _leaves(kind: pa.DataType, at_least: int = 1) -> list[tuple[int, int]]:
+    """Of every column of plain values in a column: bytes of a value, and values that a row has at least.
+
+    A list of fixed length takes its room where it is null, too.
+    """
+    if isinstance(kind, pa.BaseExtensionType):
+        return _leaves(kind.storage_type, at_least)
+    if pa.types.is_fixed_size_list(kind):
+        at_least *= kind.list_size
+    elif pa.types.is_nested(kind) and not pa.types.is_struct(kind):
+        at_least = 0
+    if pa.types.is_nested(kind):
+        fields = [kind.field(index) for index in range(kind.num_fields)]
+        return [leaf for field in fields for leaf in _leaves(field.type, at_least)]
+    try:
+        return [(max(1, kind.bit_width // 8), at_least)]
+    except ValueError:  # texts and bytes, whose lengths differ
+        return [(8, at_least)]

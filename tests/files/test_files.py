@@ -218,8 +218,29 @@ def test_arrays_that_lie_are_refused(tmp_path: Path, data: bytes, message: str) 
 
 def test_tables_that_explode_are_refused(tmp_path: Path) -> None:
     zeros = pa.array(np.zeros(30_000_000))
-    pq.write_table(pa.table({"a": zeros, "b": zeros}), tmp_path / "x.parquet")
+    pq.write_table(pa.table({"a": zeros, "observation.tactile.b": zeros}), tmp_path / "x.parquet")
     assert (tmp_path / "x.parquet").stat().st_size < 2_000_000
     with pytest.raises(ValueError, match="30,000,000 rows"):
         read_table(tmp_path / "x.parquet")
     assert read_table(tmp_path / "x.parquet", ["a"]).num_rows == 30_000_000
+
+
+def test_lists_of_fixed_length_take_room_where_they_are_null(tmp_path: Path) -> None:
+    nothing = pa.nulls(100, pa.list_(pa.uint8(), 5_000_000))
+    pq.write_table(pa.table({"observation.tactile.left": nothing}), tmp_path / "x.parquet")
+    with pytest.raises(ValueError, match="100 rows of 500,000,000 bytes"):
+        read_table(tmp_path / "x.parquet")
+
+
+def test_quiet_pads_of_a_long_recording_are_read(tmp_path: Path) -> None:
+    """Eight columns of counts: at eight bytes a value they would be 418 MB, more than the bound."""
+    path = tmp_path / "x.parquet"
+    quiet = pa.FixedSizeListArray.from_arrays(pa.array(np.zeros(17_000 * 384, np.uint8)), 384)
+    names = [
+        f"observation.{kind}.{pad}"
+        for kind in ("tactile", "tactile_baseline")
+        for pad in ("a", "b", "c", "d")
+    ]
+    pq.write_table(pa.table(dict.fromkeys(names, quiet)), path)
+    assert path.stat().st_size < 1_000_000
+    assert read_table(path).column_names == names
