@@ -26,6 +26,7 @@ from lerobot_vtrefine.cli.outputs import check_file
 from lerobot_vtrefine.drivers.board import PadReader, Status
 from lerobot_vtrefine.drivers.config import PadConfig
 from lerobot_vtrefine.drivers.diagnostic import DiagnosticReader
+from lerobot_vtrefine.drivers.idle import idle_counts, touch_problem
 from lerobot_vtrefine.drivers.pads_file import check_distinct_ports, load_pads
 from lerobot_vtrefine.drivers.ports import PortError
 from lerobot_vtrefine.drivers.serial_reader import RETRY_S
@@ -155,7 +156,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
             reader.connect()
             stack.callback(reader.stop)
         print("leave the pads untouched for a moment", file=sys.stderr)
-        idle = {reader.name: reader.idle_counts() for reader in readers}
+        idle = {reader.name: take_idle_counts(reader) for reader in readers}
         show = terminal_view(stack) if rr is None else rerun_view(rr, options.save, stack)
         if options.save is not None:
             print(f"writing {options.save}; Ctrl-C ends it", file=sys.stderr)
@@ -163,6 +164,14 @@ def main(arguments: Sequence[str] | None = None) -> None:
         while not options.seconds or time.monotonic() - started < options.seconds:
             show(readers, idle)
             time.sleep(1.0 / options.hz)
+
+
+def take_idle_counts(reader: PadReader) -> NDArray[np.uint8]:
+    """Idle counts, uint8 (rows, cols); a touch while they are taken is told."""
+    frames = reader.idle_frames()
+    if problem := touch_problem(frames):
+        print(f"{reader.name}: {problem}", file=sys.stderr)
+    return idle_counts(frames)
 
 
 def view_taxel(port: str, channel: int, column: int, seconds: float) -> None:

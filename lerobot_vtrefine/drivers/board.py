@@ -7,7 +7,6 @@ from enum import StrEnum
 from typing import TYPE_CHECKING
 
 import numpy as np
-from numpy.typing import NDArray
 
 from lerobot_vtrefine.drivers.ascii import AsciiFramer
 from lerobot_vtrefine.drivers.config import PadConfig
@@ -133,8 +132,8 @@ class PadReader(SerialReader):
             arrived = self._changed.wait_for(lambda: self._seq - 1 > seq and bool(self._history), timeout_s)
             return self._history[-1] if arrived else None
 
-    def idle_counts(self, frames: int = IDLE_FRAMES) -> NDArray[np.uint8]:
-        """Idle counts, uint8 (pad rows, cols): the median of new frames. The pad must not be touched.
+    def idle_frames(self, frames: int = IDLE_FRAMES) -> list[PadFrame]:
+        """New frames, so many or a few more, for `idle_counts`. The pad must not be touched.
 
         Raises:
             PortError: the frames did not come in time.
@@ -149,7 +148,7 @@ class PadReader(SerialReader):
                 raise PortError(
                     self.health().advice or f"{self.name}: {self.config.port}: frames stopped coming"
                 )
-        return np.median(np.stack([f.counts for f in taken]), axis=0).astype(np.uint8)
+        return taken
 
     # --- health -----------------------------------------------------------------------------------
 

@@ -11,6 +11,7 @@ from lerobot_vtrefine.drivers.board import PadReader
 from lerobot_vtrefine.drivers.config import PadConfig
 from lerobot_vtrefine.drivers.frames import DIAGNOSTIC_BAUD, STREAM_BAUD
 from lerobot_vtrefine.drivers.identify import SAMPLE_BYTES, StreamKind, explain_stream, identify_stream
+from lerobot_vtrefine.drivers.idle import idle_counts
 from lerobot_vtrefine.drivers.ports import PortError, open_port
 from lerobot_vtrefine.drivers.wiring import CHANNELS, PAD_ROWS, inspect_wiring, seam_row
 
@@ -100,8 +101,8 @@ def open_board(port: str, kind: StreamKind) -> FoundBoard:
     base = PadConfig(port=port, rows=kind.shape.rows, cols=kind.shape.cols, protocol=kind.protocol)
     with ExitStack() as stack:
         reader = stack.enter_context(PadReader(base, port))
-        reader.idle_counts()
-        report = inspect_wiring(np.stack([frame.raw for frame in reader.frames_after(-1)]))
+        frames = reader.idle_frames()
+        report = inspect_wiring(np.stack([frame.raw for frame in frames]))
         if (
             kind.shape.rows == CHANNELS
             and report.row_offset is not None
@@ -110,7 +111,8 @@ def open_board(port: str, kind: StreamKind) -> FoundBoard:
             stack.close()
             base.pad_rows, base.row_offset = PAD_ROWS, report.row_offset
             reader = stack.enter_context(PadReader(base, port))
-        board = FoundBoard(reader, reader.idle_counts(), report.problems)
+            frames = reader.idle_frames()
+        board = FoundBoard(reader, idle_counts(frames), report.problems)
         stack.pop_all()  # it stays open
         return board
 

@@ -7,8 +7,9 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from lerobot_vtrefine.drivers.board import IDLE_FRAMES, PadReader, Status
+from lerobot_vtrefine.drivers.board import PadReader, Status
 from lerobot_vtrefine.drivers.config import PadConfig
+from lerobot_vtrefine.drivers.idle import idle_counts, touch_problem
 from lerobot_vtrefine.drivers.pads_file import check_distinct_ports
 from lerobot_vtrefine.drivers.wiring import inspect_wiring
 
@@ -77,12 +78,14 @@ class PadSet:
     def measure_baselines(self) -> None:
         """Take the idle counts anew: the median of some frames; no pad may be touched.
 
-        Dead lines are told: a pad whose flat cable came off streams zeros that look like no touch.
+        A pad that is touched is told, and so are dead lines: a pad whose flat cable came off streams zeros
+        that look like no touch.
         """
-        self.baselines = {name: reader.idle_counts() for name, reader in self._readers.items()}
         for name, reader in self._readers.items():
-            frames = np.stack([frame.raw for frame in reader.frames_after(-1)[-IDLE_FRAMES:]])
-            for problem in inspect_wiring(frames).problems:
+            frames = reader.idle_frames()
+            self.baselines[name] = idle_counts(frames)
+            wiring = inspect_wiring(np.stack([frame.raw for frame in frames]))
+            for problem in filter(None, (*wiring.problems, touch_problem(frames))):
                 logger.warning("pad %s (%s): %s", name, reader.port, problem)
 
     def disconnect(self) -> None:

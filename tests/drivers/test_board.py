@@ -17,6 +17,7 @@ from lerobot_vtrefine.drivers.board import PadReader, Status
 from lerobot_vtrefine.drivers.config import PadConfig
 from lerobot_vtrefine.drivers.emulator import Faults
 from lerobot_vtrefine.drivers.frames import FrameShape
+from lerobot_vtrefine.drivers.idle import idle_counts
 from lerobot_vtrefine.drivers.ports import PortError
 from lerobot_vtrefine.drivers.sources import check_pattern, noise_source, pattern_source, with_markers
 from lerobot_vtrefine.drivers.terminal import plug_in, pull_out
@@ -203,7 +204,7 @@ def test_legacy_ascii_streams(tmp_path: Path) -> None:
 def test_idle_counts_are_the_median_of_new_frames(tmp_path: Path) -> None:
     source = noise_source(PAD, seed=4, std_counts=1.0)
     with emulated(tmp_path, source=source) as board, reading(PadConfig(board.port)) as reader:
-        idle = reader.idle_counts(frames=20)
+        idle = idle_counts(reader.idle_frames(frames=20))
     expected = np.median([source(number) for number in range(100)], axis=0)
     assert np.abs(idle.astype(float) - expected).max() <= 1.5
 

@@ -140,7 +140,7 @@ def test_board_that_stalls_while_it_is_opened_is_let_go(
         def stalled(reader: PadReader, *_: object, **__: object) -> None:
             raise PortError(f"{reader.port}: frames stopped coming")
 
-        monkeypatch.setattr(PadReader, "idle_counts", stalled)
+        monkeypatch.setattr(PadReader, "idle_frames", stalled)
         with pytest.raises(PortError, match="frames stopped coming"):
             open_board(board.port, kind)
         assert set(threading.enumerate()) == running

@@ -149,7 +149,7 @@ def test_failed_connect_leaves_no_port_open(rig: Rig, monkeypatch: pytest.Monkey
     robot = AlohaTactileFollower(follower_config(rig))
     for where in (PadReader, DynamixelArm):
         with monkeypatch.context() as patch:
-            patch.setattr(where, "idle_counts" if where is PadReader else "hold", broken)
+            patch.setattr(where, "idle_frames" if where is PadReader else "hold", broken)
             with pytest.raises(KeyboardInterrupt):
                 robot.connect()
         assert set(threading.enumerate()) <= before
