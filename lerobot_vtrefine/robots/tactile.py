@@ -17,6 +17,7 @@ from lerobot_vtrefine.robots.camera_models import CameraModels
 from lerobot_vtrefine.robots.config_tactile import TactileConfig
 from lerobot_vtrefine.robots.extensions import extend_lerobot
 from lerobot_vtrefine.robots.pad_reading import pad_observation
+from lerobot_vtrefine.robots.release import release
 
 
 class Tactile(Robot):
@@ -68,14 +69,16 @@ class Tactile(Robot):
         """Connect the pads, which must not be touched meanwhile, then the robot.
 
         Raises:
-            PortError: a pad cannot be read; the message names port and fix.
+            PortError: a pad cannot be read; the message names port and fix. Whatever fails, nothing stays
+                connected.
         """
         self.pads.connect()
         try:
             self.base.connect(calibrate)
             self._camera_models.connected()
         except BaseException:
-            self.disconnect()
+            release(self.base)
+            self.pads.disconnect()
             raise
 
     @property
@@ -122,6 +125,7 @@ class Tactile(Robot):
             if self.base.is_connected:
                 self.base.disconnect()
         finally:
+            release(self.base)
             self.pads.disconnect()
 
 

@@ -78,7 +78,11 @@ class VtRefineEe(Teleoperator):
             jump_m=self.config.jump_m,
             jump_rad=self.config.jump_rad,
         )
-        self._source.connect()
+        try:
+            self._source.connect()
+        except BaseException:
+            self._source.disconnect()  # of several devices, those before the one that failed are open
+            raise
         self._hands = [ClutchedHand(settings, pose) for pose in ik.hands()]
         self._ik = ik
 

@@ -189,3 +189,17 @@ def test_wrong_settings_are_one_line(settings: dict, words: str) -> None:
 def test_other_devices_are_refused_in_one_line(fields: object, words: str) -> None:
     with pytest.raises(ValueError, match=words):
         LeRobotDevices({"right": fields}, FPS, 0.1)
+
+
+def test_a_device_that_is_missing_leaves_the_others_closed(monkeypatch: pytest.MonkeyPatch) -> None:
+    pytest.importorskip("pygame")
+    monkeypatch.setenv("SDL_VIDEODRIVER", "dummy")
+    watch_keys(monkeypatch)
+    names = {Key.left: "left"}
+    monkeypatch.setattr(keyboard_input, "_PYNPUT_KEY_NAMES", dict(names))
+    devices = {"left": {"type": "keyboard_ee"}, "right": {"type": "gamepad"}}
+    teleoperator = VtRefineEe(VtRefineEeConfig(input="lerobot", devices=devices))
+    with pytest.raises(ValueError, match="the gamepad for the right hand cannot be read here"):
+        teleoperator.connect()
+    assert not Listener.latest.is_alive()
+    assert names == keyboard_input._PYNPUT_KEY_NAMES
