@@ -14,6 +14,7 @@ from lerobot.datasets.utils import DATA_DIR, DEFAULT_TASKS_PATH, EPISODES_DIR, I
 
 from lerobot_vtrefine.files import decode, limits, read_json
 from lerobot_vtrefine.files.tables import read_columns
+from lerobot_vtrefine.lerobot_compat.episode_tables import check_tasks, episodes, tables
 
 ASK = "is the copy complete?"
 
@@ -38,11 +39,11 @@ def check_complete(root: Path) -> None:
     announced = _announced(root / INFO_PATH)
     if announced == 0:
         raise ValueError(f"{root} holds no episode yet; record one first")
-    if not (root / DEFAULT_TASKS_PATH).is_file():
-        raise FileNotFoundError(f"{root / DEFAULT_TASKS_PATH} is missing; {ASK}")
+    check_tasks(root)
     read_columns(root / DEFAULT_TASKS_PATH, ["task_index"])
     for name in (EPISODES_DIR, DATA_DIR):
-        if missing := sorted(set(range(announced)) - _episodes(root / name)):
+        found = {int(index) for path in tables(root / name) for index in np.unique(episodes(path))}
+        if missing := sorted(set(range(announced)) - found):
             raise FileNotFoundError(f"the files in {root / name} lack episode {missing[0]}; {ASK}")
     meta = LeRobotDatasetMetadata("local/complete", root)
     for path in (meta.get_video_file_path(i, key) for i in range(announced) for key in meta.video_keys):
@@ -57,9 +58,3 @@ def _announced(path: Path) -> int:
         return decode(_Info, data, "it", others=True).total_episodes
     except ValueError as error:
         raise ValueError(f"{path} does not describe a LeRobot dataset: {error}") from error
-
-
-def _episodes(folder: Path) -> set[int]:
-    """The episodes that files are about."""
-    files = folder.glob("*/*.parquet")
-    return {int(index) for path in files for index in np.unique(read_columns(path, ["episode_index"])[0])}

@@ -27,7 +27,6 @@ from lerobot.datasets.io_utils import (
 )
 from lerobot.datasets.utils import (
     DATA_DIR,
-    DEFAULT_TASKS_PATH,
     EPISODES_DIR,
     INFO_PATH,
     STATS_PATH,
@@ -38,6 +37,7 @@ from numpy.typing import NDArray
 
 from lerobot_vtrefine.datasets.footers import read_without_footer
 from lerobot_vtrefine.lerobot_compat.episode_rows import Row, describe_episodes, video_keys, video_length_s
+from lerobot_vtrefine.lerobot_compat.episode_tables import check_tasks, episodes, tables
 from lerobot_vtrefine.lerobot_compat.safe_metadata import write_info, write_stats
 from lerobot_vtrefine.whole_files import PART, whole_file
 from lerobot_vtrefine.wording import plural
@@ -82,8 +82,8 @@ def recover(root: Path) -> Recovery:
             Hub's dataset of this name in place of this one's.
     """
     info = _read_info(root)
-    if info.total_tasks and not (root / DEFAULT_TASKS_PATH).is_file():
-        raise FileNotFoundError(f"{root / DEFAULT_TASKS_PATH} is missing: put it back from a copy")
+    if info.total_tasks:
+        check_tasks(root)
     announced = info.total_episodes
     _remove_unfinished(root)
     aside = _mend_data(root, info)
@@ -91,10 +91,10 @@ def recover(root: Path) -> Recovery:
     rows = _complete_rows(root, info, described)
     total = len(rows)
     beyond = {described[index]["file"] for index in described if index >= total}
-    aside += unreadable + _keep_episodes(root, {path: _episodes(path) for path in beyond}, total, announced)
+    aside += unreadable + _keep_episodes(root, {path: episodes(path) for path in beyond}, total, announced)
     _count(root, info, rows)
-    data = {path: _episodes(path) for path in _tables(root / DATA_DIR)}
-    rest = {int(index): path for path, episodes in data.items() for index in np.unique(episodes)}
+    data = {path: episodes(path) for path in tables(root / DATA_DIR)}
+    rest = {int(index): path for path, numbers in data.items() for index in np.unique(numbers)}
     total = describe_episodes(root, total, rows[-1] if rows else None, rest)
     aside += _keep_episodes(root, data, total, announced)
     aside += _clear_pictures(root, info, list(_read_rows(root)[0].values()))
@@ -140,15 +140,6 @@ def _set_aside(root: Path, path: Path, copy: bool = False) -> None:
         shutil.move(path, target)
 
 
-def _tables(folder: Path) -> list[Path]:
-    return sorted(folder.glob("*/*.parquet"))
-
-
-def _episodes(path: Path) -> NDArray[np.int64]:
-    """The episode of every row of a file."""
-    return pq.read_table(path, columns=["episode_index"])["episode_index"].to_numpy()
-
-
 def _is_readable(path: Path) -> bool:
     try:
         pq.read_metadata(path)
@@ -159,7 +150,7 @@ def _is_readable(path: Path) -> bool:
 
 def _mend_data(root: Path, info: DatasetInfo) -> int:
     """Read what is complete in data files without footers; return how many files were moved aside."""
-    broken = [path for path in _tables(root / DATA_DIR) if not _is_readable(path)]
+    broken = [path for path in tables(root / DATA_DIR) if not _is_readable(path)]
     for path in broken:
         table = read_without_footer(path, info.features)
         _set_aside(root, path, copy=True)
@@ -182,7 +173,7 @@ def _read_rows(root: Path) -> tuple[dict[int, Row], int]:
     """The episodes' rows, and how many unreadable files were moved aside; the data tells what was in them."""
     rows: dict[int, Row] = {}
     aside = 0
-    for path in _tables(root / EPISODES_DIR):
+    for path in tables(root / EPISODES_DIR):
         try:
             found = _rows(path, stats=False)
         except Broken:
@@ -267,11 +258,11 @@ def _has_video(root: Path, info: DatasetInfo, row: Row, key: str, announced: boo
 def _keep_episodes(root: Path, files: dict[Path, NDArray[np.int64]], total: int, announced: int) -> int:
     """Drop what belongs to episodes from ``total`` on; return how many files were kept aside for it."""
     aside = 0
-    for path, episodes in sorted(files.items(), reverse=True):
-        kept = episodes < total
+    for path, numbers in sorted(files.items(), reverse=True):
+        kept = numbers < total
         if kept.all():
             continue
-        if episodes.max() < announced:
+        if numbers.max() < announced:
             _set_aside(root, path, copy=True)
             aside += 1
         if kept.any():

@@ -3,7 +3,6 @@
 import contextlib
 import logging
 from functools import cached_property
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -20,12 +19,12 @@ from lerobot_vtrefine.drivers.pad_set import PadSet
 from lerobot_vtrefine.drivers.ports import PortError
 from lerobot_vtrefine.embodiments import ALOHA
 from lerobot_vtrefine.extras import ARMS, require
+from lerobot_vtrefine.lerobot_compat.calibration_file import WholeCalibrationFile
 from lerobot_vtrefine.lerobot_compat.pad_features import configured_pads, pad_features
 from lerobot_vtrefine.robots.camera_models import CameraModels
 from lerobot_vtrefine.robots.config_aloha_tactile_follower import AlohaTactileFollowerConfig
 from lerobot_vtrefine.robots.extensions import extend_lerobot
 from lerobot_vtrefine.robots.pad_reading import pad_observation
-from lerobot_vtrefine.whole_files import whole_file
 
 logger = logging.getLogger(__name__)
 
@@ -41,7 +40,7 @@ REST_RAD = (0.0, -1.80, 1.55, 0.0, -1.57, 0.0)
 """Folded pose in which a ViperX-300s lies on its own base without torque (Interbotix's sleep pose)."""
 
 
-class AlohaTactileFollower(Robot):
+class AlohaTactileFollower(WholeCalibrationFile, Robot):
     """Two ViperX-300s arms; keys `<joint>.pos` [rad], fingers [m], and `tactile.<pad>` raw counts."""
 
     config_class = AlohaTactileFollowerConfig
@@ -171,11 +170,6 @@ class AlohaTactileFollower(Robot):
         self.calibration = self.pair.calibration
         self._save_calibration()
         logger.info("calibration saved to %s", self.calibration_fpath)
-
-    def _save_calibration(self, fpath: Path | None = None) -> None:
-        """As LeRobot's; a full disk leaves the calibration that was there."""
-        with whole_file(self.calibration_fpath if fpath is None else fpath) as part:
-            super()._save_calibration(part)
 
     def setup_motors(self) -> None:
         """Give new motors their ids and baud rates, for `lerobot-setup-motors`."""

@@ -2,7 +2,6 @@
 
 import logging
 from functools import cached_property
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -15,13 +14,13 @@ from lerobot_vtrefine.drivers.arm_models import WIDOWX_250S
 from lerobot_vtrefine.drivers.arm_pair import ArmPair
 from lerobot_vtrefine.embodiments import get_embodiment
 from lerobot_vtrefine.extras import ARMS, require
+from lerobot_vtrefine.lerobot_compat.calibration_file import WholeCalibrationFile
 from lerobot_vtrefine.teleoperators.config_aloha_leader import AlohaLeaderConfig
-from lerobot_vtrefine.whole_files import whole_file
 
 logger = logging.getLogger(__name__)
 
 
-class AlohaLeader(Teleoperator):
+class AlohaLeader(WholeCalibrationFile, Teleoperator):
     """Two WidowX-250s arms without torque; keys `<joint>.pos` [rad, fingers m], as followers take them."""
 
     config_class = AlohaLeaderConfig
@@ -84,11 +83,6 @@ class AlohaLeader(Teleoperator):
         self.calibration = self.pair.calibration
         self._save_calibration()
         logger.info("calibration saved to %s", self.calibration_fpath)
-
-    def _save_calibration(self, fpath: Path | None = None) -> None:
-        """As LeRobot's; a full disk leaves the calibration that was there."""
-        with whole_file(self.calibration_fpath if fpath is None else fpath) as part:
-            super()._save_calibration(part)
 
     def setup_motors(self) -> None:
         """Give new motors their ids and baud rates, for `lerobot-setup-motors`."""

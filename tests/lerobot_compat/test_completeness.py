@@ -58,7 +58,7 @@ def damage(root: Path, name: str) -> None:
         (remove, "data/*/file-002.parquet", "data lack episode 2; is the copy complete?"),
         (remove, "data/*/*.parquet", "data lack episode 0; is the copy complete?"),
         (remove, "meta/episodes/*/file-001.parquet", "episodes lack episode 1; is the copy complete?"),
-        (remove, "meta/tasks.parquet", "tasks.parquet is missing; is the copy complete?"),
+        (remove, "meta/tasks.parquet", "tasks.parquet is missing: put it back from a copy"),
         (damage, "meta/tasks.parquet", "tasks.parquet cannot be read"),
         (damage, "data/chunk-000/file-001.parquet", "file-001.parquet cannot be read"),
         (damage, "meta/episodes/chunk-000/file-001.parquet", "file-001.parquet cannot be read"),
