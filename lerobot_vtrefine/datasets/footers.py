@@ -25,15 +25,12 @@ Struct = dict[int, tuple[int, Any]]
 """Field number -> type and value; a list is (type of its elements, elements)."""
 
 
-def read_without_footer(path: Path, features: dict[str, Any]) -> pa.Table | None:
-    """The complete row groups of a data file.
+def read_without_footer(path: Path, features: dict[str, Any]) -> list[pa.Table | None]:
+    """The complete row groups of a data file, None in place of one of which a page is damaged.
 
     Args:
         path: A file of LeRobot's writer without its footer.
         features: The dataset's features, as in ``info.json``.
-
-    Returns:
-        None where not even one row group is complete.
     """
     data = path.read_bytes()
     schema = get_hf_features_from_features(features).arrow_schema
@@ -48,12 +45,25 @@ def read_without_footer(path: Path, features: dict[str, Any]) -> pa.Table | None
         groups.append(_group(columns, chunks, rows))
         num_rows += rows
     if not groups:
-        return None
+        return []
     footer[3] = (I64, num_rows)
     footer[4] = (LIST, (STRUCT, groups))
     text = _encode(footer)
     whole = data[:end] + text + struct.pack("<I", len(text)) + MAGIC
-    return pq.read_table(pa.BufferReader(whole)).replace_schema_metadata(schema.metadata)
+    with pq.ParquetFile(pa.BufferReader(whole)) as file:
+        found = read_groups(file)
+    return [None if table is None else table.replace_schema_metadata(schema.metadata) for table in found]
+
+
+def read_groups(file: pq.ParquetFile) -> list[pa.Table | None]:
+    """Every row group of a file, None in place of one of which a page is damaged."""
+    found: list[pa.Table | None] = []
+    for number in range(file.num_row_groups):
+        try:
+            found.append(file.read_row_group(number))
+        except (pa.ArrowException, OSError):
+            found.append(None)
+    return found
 
 
 @dataclass

@@ -23,7 +23,6 @@ from lerobot.datasets.io_utils import (
     cast_stats_to_numpy,
     load_info,
     load_tasks,
-    write_table_one_row_group_per_episode,
 )
 from lerobot.datasets.utils import (
     DATA_DIR,
@@ -35,19 +34,20 @@ from lerobot.datasets.utils import (
 )
 from numpy.typing import NDArray
 
-from lerobot_vtrefine.datasets.footers import read_without_footer
+from lerobot_vtrefine.lerobot_compat.damaged_data import (
+    BROKEN,
+    aside_of,
+    mend_data,
+    set_aside,
+    write_data,
+)
 from lerobot_vtrefine.lerobot_compat.episode_rows import Row, describe_episodes, video_keys, video_length_s
 from lerobot_vtrefine.lerobot_compat.episode_tables import check_tasks, episodes, tables
 from lerobot_vtrefine.lerobot_compat.safe_metadata import write_info, write_stats
-from lerobot_vtrefine.whole_files import PART, whole_file
+from lerobot_vtrefine.whole_files import PART
 from lerobot_vtrefine.wording import plural
 
 logger = logging.getLogger(__name__)
-
-ASIDE = ".unreadable"
-"""What the name of the folder beside the dataset ends in, which takes files that cannot be read."""
-
-Broken = (pa.ArrowException, OSError)
 
 
 @dataclass(frozen=True)
@@ -69,7 +69,7 @@ class Recovery:
         if self.episodes < self.announced:
             text += f"; {self.announced - self.episodes} that were counted cannot be read"
         if self.aside:
-            text += f"; {plural(self.aside, 'unreadable file')} moved to {_aside(self.root)}"
+            text += f"; {plural(self.aside, 'unreadable file')} moved to {aside_of(self.root)}"
         return text
 
 
@@ -77,16 +77,22 @@ def recover(root: Path) -> Recovery:
     """Put the dataset at ``root`` in order.
 
     Raises:
-        ValueError: its description is missing or damaged; the message says what to do.
+        ValueError: its description is missing or damaged, or data in its middle is; the message says what
+            to do.
         FileNotFoundError: the tasks' names are missing, for which LeRobot would take the description of the
             Hub's dataset of this name in place of this one's.
     """
     info = _read_info(root)
     if info.total_tasks:
         check_tasks(root)
+    return tidy(root, mend_data(root, info.features))
+
+
+def tidy(root: Path, aside: int = 0) -> Recovery:
+    """The same for a dataset whose data files are whole, of which ``aside`` have been moved out of it."""
+    info = _read_info(root)
     announced = info.total_episodes
     _remove_unfinished(root)
-    aside = _mend_data(root, info)
     described, unreadable = _read_rows(root)
     rows = _complete_rows(root, info, described)
     total = len(rows)
@@ -125,47 +131,6 @@ def _remove_unfinished(root: Path) -> None:
             shutil.rmtree(folder)
 
 
-def _aside(root: Path) -> Path:
-    return root.with_name(root.name + ASIDE)
-
-
-def _set_aside(root: Path, path: Path, copy: bool = False) -> None:
-    target = _aside(root) / path.relative_to(root)
-    while target.exists():
-        target = target.with_name(f"{target.name}.older")
-    target.parent.mkdir(parents=True, exist_ok=True)
-    if copy:
-        shutil.copy2(path, target)
-    else:
-        shutil.move(path, target)
-
-
-def _is_readable(path: Path) -> bool:
-    try:
-        pq.read_metadata(path)
-    except Broken:
-        return False
-    return True
-
-
-def _mend_data(root: Path, info: DatasetInfo) -> int:
-    """Read what is complete in data files without footers; return how many files were moved aside."""
-    broken = [path for path in tables(root / DATA_DIR) if not _is_readable(path)]
-    for path in broken:
-        table = read_without_footer(path, info.features)
-        _set_aside(root, path, copy=True)
-        if table is None:
-            path.unlink()
-        else:
-            _write(table, path)
-    return len(broken)
-
-
-def _write(table: pa.Table, path: Path) -> None:
-    with whole_file(path) as part:
-        write_table_one_row_group_per_episode(table, part)
-
-
 # --- rows that describe episodes -------------------------------------------------------------------------
 
 
@@ -176,8 +141,8 @@ def _read_rows(root: Path) -> tuple[dict[int, Row], int]:
     for path in tables(root / EPISODES_DIR):
         try:
             found = _rows(path, stats=False)
-        except Broken:
-            _set_aside(root, path)
+        except BROKEN:
+            set_aside(root, path)
             aside += 1
             continue
         rows |= {row["episode_index"]: row | {"file": path} for row in found}
@@ -227,7 +192,7 @@ def _is_complete(
     chunk, file = _data_file(row)
     path = root / info.data_path.format(chunk_index=chunk, file_index=file)
     if not path.exists():
-        if not announced or (_aside(root) / path.relative_to(root)).exists():
+        if not announced or (aside_of(root) / path.relative_to(root)).exists():
             return False
     elif path not in lengths:
         lengths[path] = pq.read_metadata(path).num_rows
@@ -263,10 +228,10 @@ def _keep_episodes(root: Path, files: dict[Path, NDArray[np.int64]], total: int,
         if kept.all():
             continue
         if numbers.max() < announced:
-            _set_aside(root, path, copy=True)
+            set_aside(root, path, copy=True)
             aside += 1
         if kept.any():
-            _write(pq.read_table(path).filter(pa.array(kept)), path)
+            write_data(pq.read_table(path).filter(pa.array(kept)), path)
         else:
             path.unlink()
     return aside
@@ -319,7 +284,7 @@ def _clear_pictures(root: Path, info: DatasetInfo, rows: list[Row]) -> int:
     for folder in sorted(root.glob("images/*/episode-*")):
         if len(rows) <= int(folder.name.rsplit("-", 1)[1]) < info.total_episodes and video_keys(info):
             aside += len(list(folder.iterdir()))
-            _set_aside(root, folder)
+            set_aside(root, folder)
     shutil.rmtree(root / "images", ignore_errors=True)
     used = {_video(root, info, row, key) for row in rows for key in video_keys(info)}
     for path in sorted(root.glob(f"{VIDEO_DIR}/*/*/*.mp4")):
@@ -327,7 +292,7 @@ def _clear_pictures(root: Path, info: DatasetInfo, rows: list[Row]) -> int:
             continue
         if len(rows) < info.total_episodes:
             aside += 1
-            _set_aside(root, path)
+            set_aside(root, path)
         else:
             path.unlink()
     return aside

@@ -32,7 +32,7 @@ from lerobot_vtrefine.folders import sync
 from lerobot_vtrefine.lerobot_compat.claim import Claim
 from lerobot_vtrefine.lerobot_compat.episode_rows import video_length_s
 from lerobot_vtrefine.lerobot_compat.guard import is_supported
-from lerobot_vtrefine.lerobot_compat.recovery import recover
+from lerobot_vtrefine.lerobot_compat.recovery import recover, tidy
 from lerobot_vtrefine.lerobot_compat.registration import LOCAL
 from lerobot_vtrefine.lerobot_compat.safe_metadata import (
     SafeMetadata,
@@ -94,7 +94,7 @@ class SafeWriter(DatasetWriter):
     def _take_back(self) -> None:
         self._meta._metadata_buffer.clear()
         with suppress(OSError):  # the disk may be full: resuming the recording tries again
-            recover(self._root)
+            tidy(self._root)
         self._meta.latest_episode = None
         self._meta._load_metadata()
 
