@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 
 from lerobot_vtrefine.drivers.ascii import DiagnosticSample, LineBuffer, diagnostic_command, parse_diagnostic
 from lerobot_vtrefine.drivers.frames import DIAGNOSTIC_BAUD
-from lerobot_vtrefine.drivers.identify import SAMPLE_BYTES, StreamKind, explain_stream
+from lerobot_vtrefine.drivers.identify import SAMPLE_BYTES, explain_diagnostic
 from lerobot_vtrefine.drivers.ports import LOST, PortError
 from lerobot_vtrefine.drivers.serial_reader import UNPLUGGED, SerialReader
 
@@ -100,7 +100,7 @@ class DiagnosticReader(SerialReader):
             return (
                 f"the board sends, but not the selected taxel within {timeout_s:g} s: is its firmware known?"
             )
-        return explain_stream(self._received, StreamKind("diagnostic", None), self.baud)
+        return explain_diagnostic(self._received, self.port)
 
     def _begin(self) -> None:
         self._received = b""

@@ -40,6 +40,25 @@ def identify_stream(sample: bytes) -> StreamKind | None:
     return None
 
 
+def explain_diagnostic(sample: bytes, port: str) -> str:
+    """Why no reading of the diagnostic firmware came out of these bytes of a port, and what to do.
+
+    Streaming firmware sends at another baud rate, so its bytes arrive here as any others.
+    """
+    if not sample:
+        return (
+            f"no data at {DIAGNOSTIC_BAUD} baud: is the board powered, and flashed with diagnostic firmware?"
+        )
+    kind = identify_stream(sample)
+    what = f"the board sends {kind} frames" if kind else f"{len(sample)} bytes came that are no text"
+    shown = "vtrefine-find-pads finds out how to show it"
+    if kind is not None and kind.protocol == "binary" and kind.shape is not None:
+        shown = (
+            f"vtrefine-view-pads --ports {port} --rows {kind.shape.rows} --cols {kind.shape.cols} shows it"
+        )
+    return f"{what}, as of streaming firmware: {shown}; single taxels need the diagnostic firmware"
+
+
 def explain_stream(sample: bytes, wanted: StreamKind, baud: int) -> str:
     """Why no frame came out of these bytes, and what to do; `wanted` is what was configured."""
     if not sample:

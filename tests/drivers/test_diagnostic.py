@@ -1,6 +1,7 @@
 """The diagnostic text firmware: its reader on an emulated board, through a real serial port."""
 
 import os
+import re
 import threading
 import time
 from collections.abc import Generator
@@ -14,6 +15,8 @@ from lerobot_vtrefine.cli.view_pads import main as view_pads
 from lerobot_vtrefine.drivers.diagnostic import DiagnosticReader
 from lerobot_vtrefine.drivers.diagnostic_emulator import DiagnosticEmulator
 from lerobot_vtrefine.drivers.discovery import probe_port
+from lerobot_vtrefine.drivers.frames import FrameShape
+from lerobot_vtrefine.drivers.identify import explain_diagnostic
 from lerobot_vtrefine.drivers.ports import PortError
 
 COUNTS = (np.arange(12 * 32).reshape(12, 32) % 200).astype(np.uint8)
@@ -43,9 +46,34 @@ def test_taxels_are_selected_and_measured(board: DiagnosticEmulator) -> None:
             reader.measure(16, 0)
 
 
-def test_a_streaming_board_is_recognised(tmp_path: Path) -> None:
-    with emulated(tmp_path) as streaming, pytest.raises(PortError, match="sends binary 12x32 frames"):
+@pytest.mark.parametrize(
+    ("shape", "protocol", "advice"),
+    [
+        (FrameShape(12, 32), "binary", "sends binary 12x32 frames, .*: vtrefine-view-pads --ports {port} "),
+        (
+            FrameShape(16, 32),
+            "binary",
+            "sends binary 16x32 frames, .* --ports {port} --rows 16 --cols 32 shows",
+        ),
+        (FrameShape(12, 32), "ascii", "sends ascii 12x32 frames, .*: vtrefine-find-pads finds out"),
+    ],
+)
+def test_a_streaming_board_is_shown_another_way(
+    tmp_path: Path, shape: FrameShape, protocol: str, advice: str
+) -> None:
+    with emulated(tmp_path, shape=shape, protocol=protocol) as streaming, pytest.raises(PortError) as told:
         DiagnosticReader(streaming.port).connect(timeout_s=0.5)
+    assert re.search(advice.format(port=streaming.port), str(told.value))
+    assert "single taxels need the diagnostic firmware" in str(told.value)
+    assert "set rows" not in str(told.value)
+
+
+def test_bytes_at_another_baud_rate_are_taken_for_streaming_firmware() -> None:
+    """As on a port, where 2 Mbaud read at 115200 gives anything: there is no flag for another rate."""
+    noise = np.random.default_rng(0).integers(0, 256, 900, dtype=np.uint8).tobytes()
+    told = explain_diagnostic(noise, "/dev/x")
+    assert told.startswith("900 bytes came that are no text, as of streaming firmware: vtrefine-find-pads")
+    assert "flashed with diagnostic firmware" in explain_diagnostic(b"", "/dev/x")
 
 
 def test_unplugged_board_is_told_and_read_again_when_back(board: DiagnosticEmulator) -> None:
