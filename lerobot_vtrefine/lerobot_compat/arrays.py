@@ -18,7 +18,9 @@ from typing import Any
 
 import numpy as np
 
+from lerobot_vtrefine.datasets.features import AGE_KEY, TACTILE_AGE
 from lerobot_vtrefine.lerobot_compat.guard import is_supported, lerobot_version
+from lerobot_vtrefine.lerobot_compat.pad_ages import ordered_ages
 
 PATCHED = ("hw_to_dataset_features", "build_dataset_frame")
 Features = dict[str, dict[str, Any]]
@@ -68,6 +70,8 @@ def _build_dataset_frame(
     arrays = {key: feature for key, feature in ds_features.items() if _is_array(key, feature, prefix)}
     others = {key: feature for key, feature in ds_features.items() if key not in arrays}
     frame: dict[str, Any] = _originals["build_dataset_frame"](others, values, prefix)
+    if AGE_KEY in arrays:
+        values = {**values, TACTILE_AGE: ordered_ages(ds_features, values)}
     for key, feature in arrays.items():
         value = np.asarray(values[key.removeprefix(f"{prefix}.")])
         if value.dtype.kind != np.dtype(feature["dtype"]).kind:

@@ -14,6 +14,7 @@ from lerobot.cameras.utils import make_cameras_from_configs
 from lerobot.robots.config import RobotConfig
 from lerobot.robots.robot import Robot
 from lerobot.robots.utils import make_robot_from_config
+from lerobot.utils import feature_utils
 from rig import boards_of
 
 from lerobot_vtrefine.cameras import FlexitacCameraConfig
@@ -124,6 +125,27 @@ def test_the_order_in_which_pads_are_named_makes_no_difference(
         robot.disconnect()
         assert ages[0] < ages[1]  # index, thumb
         boards["thumb"].stall(0.0)
+
+
+def test_a_recording_with_pads_in_another_order_is_resumed_in_its_own(
+    boards: dict[str, PadEmulator], tmp_path: Path
+) -> None:
+    """As they were recorded when pads came in the order of the pads file."""
+    robot = tactile_robot(boards, tmp_path)
+    columns = feature_utils.hw_to_dataset_features(robot.observation_features, "observation")
+    pads = {key: columns.pop(f"observation.{key}") for key in ("tactile.thumb", "tactile.index")}
+    earlier = {f"observation.{key}": feature for key, feature in pads.items()} | columns
+    robot.connect()
+    boards["thumb"].stall(1.0)
+    time.sleep(0.3)
+    values = robot.get_observation()
+    robot.disconnect()
+    frame = feature_utils.build_dataset_frame(earlier, values, "observation")
+    assert frame["observation.tactile_age"].tolist() == values["tactile_age"][::-1].tolist()
+    assert frame["observation.tactile_age"][0] > 0.2  # thumb
+    assert frame["observation.tactile_age"][1] < 0.2
+    for pad in ("thumb", "index"):
+        assert (frame[f"observation.tactile.{pad}"] == values[f"tactile.{pad}"]).all()
 
 
 def test_failing_pad_leaves_nothing_connected(boards: dict[str, PadEmulator], tmp_path: Path) -> None:
