@@ -25,7 +25,7 @@ from lerobot_vtrefine.cli.report.results import verdict
 from lerobot_vtrefine.cli.report.statistics import proportion
 from lerobot_vtrefine.cli.results.provenance import write_provenance
 from lerobot_vtrefine.finetune.checkpoint import last_checkpoint
-from lerobot_vtrefine.finetune.logger import read_progress
+from lerobot_vtrefine.finetune.logger import CSV_NAME, read_progress
 from lerobot_vtrefine.finetune.pipeline import FinetunePipelineConfig, run
 
 LEROBOTS_SHARING = ("--push_to_hub=true", "--repo_id=")
@@ -60,9 +60,13 @@ def way_on(cfg: FinetunePipelineConfig) -> str:
 
 def outcome(cfg: FinetunePipelineConfig) -> str:
     """Held-out success before and after, in a sentence; DPPO can unlearn, too."""
-    rows = read_progress(cfg.output_dir)
-    ends = [row for row in (rows[0], rows[-1]) if "eval_episodes" in row]
-    if len(ends) < 2 or len(rows) < 2:
+    rows = {int(row["iteration"]): row for row in read_progress(cfg.output_dir)}
+    if 1 not in rows:  # checkpoints may have been moved without it
+        return (
+            f"{cfg.output_dir / CSV_NAME} does not go back to the start, so nothing is told of the whole run"
+        )
+    ends = [row for row in (rows.get(0, {}), rows[max(rows)]) if "eval_episodes" in row]
+    if len(ends) < 2:
         return "success was not measured before and after; --eval_freq=10 does so"
     counts = [(row["eval_success"], int(row["eval_episodes"])) for row in ends]
     before, after = (proportion(round(rate * episodes), episodes) for rate, episodes in counts)
