@@ -284,13 +284,18 @@ class Minibatches:
             optimizer.step()
         return norms
 
+    def weights_are_finite(self) -> bool:
+        """Whether every weight that is trained is a number; nobody asks for the loss after the last step."""
+        finite = [weight.isfinite().all() for parameters, _ in self.trained for weight in parameters]
+        return bool(torch.stack(finite).all())
+
 
 def update(rollout: Rollout, agent: Agent, state: TrainState, cfg: DppoConfig) -> Metrics:
     """All epochs over one segment. Critic-only during the first ``cfg.critic_warmup`` iterations.
 
     Ends early where a minibatch finds the policy too far from where the iteration began.
 
-    Raises: FloatingPointError where the loss is not finite.
+    Raises: FloatingPointError where the loss, or what is learnt, is not finite.
     """
     data, region = Minibatches(rollout, agent, state, cfg), state.trust_region
     actor_lr = region.actor_lr(state.iteration)
@@ -319,6 +324,10 @@ def update(rollout: Rollout, agent: Agent, state: TrainState, cfg: DppoConfig) -
             break
         grad_norms.append(data.step()[-1])
         history.append(found)
+    if not data.weights_are_finite():  # now: a checkpoint of them could not be gone on from
+        raise FloatingPointError(
+            f"weights are not finite after iteration {state.iteration}: lower --dppo.actor_lr"
+        )
 
     if data.train_actor:
         last_epoch = [found["decision_kl"] for found in history[-data.per_epoch :]]

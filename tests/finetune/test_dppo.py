@@ -361,6 +361,16 @@ def test_loss_that_is_not_finite_is_reported():
         update(rollout, agent, state, cfg)
 
 
+@pytest.mark.parametrize("network", ["actor", "critic"])
+def test_a_step_to_weights_that_are_not_finite_is_reported_before_anything_is_saved(network):
+    cfg = small_config(critic_warmup=0, epochs=1, minibatches=1, max_grad_norm=0.0)
+    env, agent, state = problem(cfg)
+    tuned = {"actor": agent.actor.denoiser, "critic": state.critic}[network]
+    next(tuned.parameters()).register_hook(lambda gradient: gradient * torch.inf)  # the loss is finite
+    with pytest.raises(FloatingPointError, match="weights are not finite after iteration 0"):
+        train(env, agent, state, cfg, seed=0, after_iteration=lambda *saved: pytest.fail("saved"))
+
+
 def test_paper_preset_is_the_default():
     assert PaperDppo() == DppoConfig.get_choice_class("paper")()
     assert DppoConfig.default_choice_name() == "paper"
