@@ -6,6 +6,8 @@ scale, and every rank's random states.
 """
 
 import shutil
+from collections.abc import Generator
+from contextlib import closing, contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -23,6 +25,7 @@ from lerobot.utils.random_utils import deserialize_rng_state, serialize_rng_stat
 from lerobot_vtrefine.finetune.distributed import barrier, num_ranks, rank_index
 from lerobot_vtrefine.finetune.dppo import TrainState
 from lerobot_vtrefine.finetune.state_file import load_state, save_state
+from lerobot_vtrefine.lerobot_compat.claim import Claim
 from lerobot_vtrefine.wording import plural
 
 STATE_NAME = "dppo_state.safetensors"
@@ -55,6 +58,20 @@ def foreign_checkpoints(output_dir: Path) -> list[Path]:
     steps = (output_dir / CHECKPOINTS_DIR).glob("*/")
     named = [path for path in steps if path.name.isdigit()]
     return sorted(path for path in named if not (path / TRAINING_STATE_DIR / STATE_NAME).is_file())
+
+
+@contextmanager
+def claimed(output_dir: Path) -> Generator[None]:
+    """Make a run's folder, and keep other runs out of it: their curves and checkpoints would be mixed.
+
+    Raises: ValueError where another run goes on in it.
+    """
+    output_dir.mkdir(parents=True, exist_ok=True)
+    if rank_index() > 0:  # the first rank speaks for all
+        yield
+        return
+    with closing(Claim(output_dir, "run", "--output_dir")):
+        yield
 
 
 def point_last_at(checkpoint: Path) -> None:

@@ -24,6 +24,7 @@ from lerobot_vtrefine.envs.decisions import LeRobotDecisionEnv, make_decision_en
 from lerobot_vtrefine.files import read_json, read_yaml
 from lerobot_vtrefine.finetune.checkpoint import (
     Saveable,
+    claimed,
     foreign_checkpoints,
     last_checkpoint,
     load_training_state,
@@ -349,7 +350,6 @@ def save_config(cfg: FinetunePipelineConfig, policy: VtDp3Config) -> None:
     """
     start, cfg.policy = cfg.start, copy.deepcopy(policy)
     cfg.policy.pretrained_path = start
-    cfg.output_dir.mkdir(parents=True, exist_ok=True)
     if rank_index() == 0:
         write_config(cfg, cfg.output_dir / CONFIG_NAME)
 
@@ -376,10 +376,10 @@ def run(cfg: FinetunePipelineConfig) -> None:
     join_ranks(device)
     set_seed(cfg.seed + rank_index())
     policy, agent, env, processors = make_practice(policy, path, cfg.env, cfg.dppo)
-    save_config(cfg, policy.config)
     state = TrainState.create(agent, cfg.dppo, env.privileged_dim, cfg.seed)
     recorder = Recorder(cfg, env, agent, Saveable(policy, *processors, cfg))
-    with logs_above_bars():
+    with claimed(cfg.output_dir), logs_above_bars():
+        save_config(cfg, policy.config)
         if checkpoint is not None:
             load_training_state(checkpoint, state)
         with recorder.start(state):

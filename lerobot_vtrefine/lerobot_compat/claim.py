@@ -1,4 +1,6 @@
-"""One recording at a time in a dataset's folder: two would give their episodes the same numbers and files."""
+"""One recording at a time in a dataset's folder: two would give their episodes the same numbers and files. So
+for whatever else goes on in a folder.
+"""
 
 import os
 from pathlib import Path
@@ -13,8 +15,8 @@ except ImportError:  # Windows has no such locks
 class Claim:
     """Keeps other recordings out of a folder until it is closed, or the process ends in whatever way."""
 
-    def __init__(self, root: Path) -> None:
-        """Raise ValueError where another recording goes on in the folder."""
+    def __init__(self, root: Path, kind: str = "recording", flag: str = "--dataset.root") -> None:
+        """Raise ValueError where another of this kind goes on in the folder, which ``flag`` names."""
         self._descriptor: int | None = None
         if fcntl is None:
             return
@@ -24,7 +26,7 @@ class Claim:
         except BlockingIOError:
             self.close()
             raise ValueError(
-                f"another recording goes on in {root}: end it first, or choose another --dataset.root"
+                f"another {kind} goes on in {root}: end it first, or choose another {flag}"
             ) from None
         except OSError:  # some file systems have no locks
             self.close()

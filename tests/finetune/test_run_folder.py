@@ -9,6 +9,7 @@ from tiny_policy import ReachEnv, save_tiny_checkpoint
 
 from lerobot_vtrefine.cli.finetune import main
 from lerobot_vtrefine.finetune import pipeline
+from lerobot_vtrefine.finetune.checkpoint import claimed
 from lerobot_vtrefine.finetune.logger import read_progress
 
 SMALL = (
@@ -46,3 +47,18 @@ def test_nothing_is_told_of_the_whole_run_without_its_curve(
     told, policy, _ = capsys.readouterr().out.splitlines()[-3:]
     assert told.startswith(f"{moved / 'progress.csv'} does not go back to the start")
     assert policy == f"policy: {moved}/checkpoints/last/pretrained_model"
+
+
+@pytest.mark.parametrize("flags", [(), ("--resume=true",)])
+def test_a_folder_in_which_another_run_goes_on_is_left_alone(
+    finetune: Finetune, tmp_path: Path, capsys: pytest.CaptureFixture[str], flags: tuple[str, ...]
+) -> None:
+    run = tmp_path / "run"
+    with claimed(run):  # before its first checkpoint
+        (run / "progress.csv").write_text("iteration,return\n1,0.5\n")
+        assert finetune(run, 1, *flags) == 2
+        told = capsys.readouterr().err.splitlines()[-1]
+        assert told == f"error: another run goes on in {run}: end it first, or choose another --output_dir"
+        assert [path.name for path in run.iterdir()] == ["progress.csv"]
+        assert read_progress(run) == [{"iteration": 1.0, "return": 0.5}]
+    assert finetune(run, 1, *flags) == 0
