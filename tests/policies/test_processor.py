@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 import torch
 from aloha_columns import RAW_KEYS
-from lerobot.configs import PreTrainedConfig
+from lerobot.configs import NormalizationMode, PreTrainedConfig
 from lerobot.datasets.lerobot_dataset import LeRobotDataset
 from lerobot.envs.utils import preprocess_observation
 from lerobot.policies.factory import make_pre_post_processors
@@ -35,7 +35,7 @@ from lerobot_vtrefine.lerobot_compat import fast_reader
 from lerobot_vtrefine.observation import build_visuo_tactile, num_points
 from lerobot_vtrefine.observation.grids import pad_grids
 from lerobot_vtrefine.policies.vt_dp3 import VtDp3Config, make_vt_dp3_pre_post_processors
-from lerobot_vtrefine.policies.vt_dp3.processor_vt_dp3 import MIN_RANGE, widen_narrow_ranges
+from lerobot_vtrefine.policies.vt_dp3.processor_vt_dp3 import MIN_RANGE, check_stats, widen_narrow_ranges
 
 MakeRaw = Callable[[np.random.Generator, float], dict[str, Any]]
 WINDOWS = {key: [-0.1, 0.0] for key in (*RAW_KEYS, STATE_KEY)} | {"action": [i / 10 for i in range(16)]}
@@ -178,6 +178,16 @@ def test_joints_that_never_moved_stay_harmless() -> None:
     for key, entry in once.items():
         for name, value in entry.items():
             assert stats[key][name].tolist() == pytest.approx(value.tolist())
+
+
+def test_statistics_are_needed_of_what_is_normalised_and_of_nothing_else(dataset: LeRobotDataset) -> None:
+    config, root = make_config(dataset), dataset.root
+    check_stats(config, {key: dataset.meta.stats[key] for key in (STATE_KEY, ACTION_KEY)}, root)
+    with pytest.raises(ValueError, match=rf"stats\.json has no statistics of {STATE_KEY}, by which"):
+        check_stats(config, None, root)
+    modes = config.normalization_mapping | {"STATE": NormalizationMode.IDENTITY}
+    config = make_config(dataset, normalization_mapping=modes)
+    check_stats(config, {ACTION_KEY: dataset.meta.stats[ACTION_KEY]}, root)
 
 
 def test_missing_columns_and_missing_noise_level(dataset: LeRobotDataset) -> None:

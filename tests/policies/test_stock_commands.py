@@ -2,6 +2,7 @@
 
 import json
 import os
+import shutil
 import subprocess
 import sys
 from collections.abc import Callable
@@ -171,6 +172,32 @@ def test_training_without_pads_says_what_is_missing(
     with pytest.raises(ValueError, match=message) as told:
         train_here(monkeypatch, *TINY, *run)
     assert "\n" not in str(told.value)
+
+
+@pytest.mark.parametrize(
+    ("column", "values", "told"),
+    [
+        ("action", None, "no statistics of action"),
+        ("observation.state", None, "no statistics of observation.state"),
+        ("action", {"min": [float("nan")] * 16, "max": [1.0] * 16}, "not only finite statistics of action"),
+    ],
+)
+def test_what_would_not_be_normalised_is_not_trained_on(
+    tiny_dataset: Path,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    column: str,
+    values: dict[str, list[float]] | None,
+    told: str,
+) -> None:
+    root = tmp_path / "own"
+    shutil.copytree(tiny_dataset, root)
+    stats = root / "meta" / "stats.json"
+    found = json.loads(stats.read_text()) | {column: values}
+    stats.write_text(json.dumps({key: value for key, value in found.items() if value is not None}))
+    run = (*RUN, *data(root), f"--output_dir={tmp_path / 'run'}", "--steps=1")
+    with pytest.raises(ValueError, match=rf"own/meta/stats\.json has {told}, by which .*recompute_stats$"):
+        train_here(monkeypatch, *TINY, *run)
 
 
 @pytest.mark.slow

@@ -242,6 +242,12 @@ class VtDp3Config(PreTrainedConfig):
         return 0 if truth is None or not self.auxiliary_weight else truth.shape[0]
 
     @property
+    def normalised_keys(self) -> tuple[str, ...]:
+        """Columns of what is observed that are normalised."""
+        more = ((LIMITS_KEY, self.limits_dim), (TRUTH_KEY, self.truth_dim))
+        return (STATE_KEY, *(key for key, size in more if size))
+
+    @property
     def action_dim(self) -> int:
         """Joint targets per action; known once the features are."""
         return (self.output_features or {})[ACTION_KEY].shape[0]

@@ -23,7 +23,7 @@ from lerobot_vtrefine.policies.vt_dp3.denoisers import MLPDenoiser, UNetDenoiser
 from lerobot_vtrefine.policies.vt_dp3.diffusion import DiffusionProcess, PredictNoise, deploy
 from lerobot_vtrefine.policies.vt_dp3.ema import Ema
 from lerobot_vtrefine.policies.vt_dp3.observation_encoder import PERCEIVED_KEY, load_encoder, make_encoder
-from lerobot_vtrefine.policies.vt_dp3.processor_vt_dp3 import widen_narrow_ranges
+from lerobot_vtrefine.policies.vt_dp3.processor_vt_dp3 import check_stats, widen_narrow_ranges
 
 Batch = dict[str, Tensor]
 
@@ -99,6 +99,7 @@ class VtDp3Policy(PreTrainedPolicy):
         config.validate_features()
         if dataset_meta is not None:
             config.fps = dataset_meta.fps
+            check_stats(config, dataset_meta.stats, dataset_meta.root)
         if dataset_stats:
             # The trainer hands this very dict to the normaliser, also with --policy.path, and offers no other
             # hook.

@@ -10,7 +10,7 @@ from dataclasses import asdict, dataclass, field
 from typing import Any
 
 import torch
-from lerobot.configs import FeatureType, PipelineFeatureType, PolicyFeature
+from lerobot.configs import FeatureType, NormalizationMode, PipelineFeatureType, PolicyFeature
 from lerobot.processor import (
     AddBatchDimensionProcessorStep,
     DeviceProcessorStep,
@@ -69,6 +69,29 @@ def widen_narrow_ranges(stats: Stats) -> None:
         narrow = half < MIN_RANGE / 2
         stats[key]["min"] = torch.where(narrow, middle - MIN_RANGE / 2, low).numpy()
         stats[key]["max"] = torch.where(narrow, middle + MIN_RANGE / 2, high).numpy()
+
+
+def check_stats(config: VtDp3Config, stats: Stats | None, root: Any) -> None:
+    """Refuse the statistics of a dataset in ``root`` where what is to be normalised would not be, or to nan.
+
+    LeRobot's normaliser leaves a column without statistics as it is, and samples, which are clamped to
+    [-1, 1], would then never reach some joint angles.
+
+    Raises: ValueError naming the column.
+    """
+    features = {**(config.input_features or {}), **(config.output_features or {})}
+    for key in (*config.normalised_keys, ACTION_KEY):
+        mode = config.normalization_mapping.get(features[key].type.value, NormalizationMode.IDENTITY)
+        if mode is NormalizationMode.IDENTITY:
+            continue
+        known = (stats or {}).get(key)
+        if not known or not all(torch.as_tensor(value).isfinite().all() for value in known.values()):
+            which = "not only finite" if known else "no"
+            raise ValueError(
+                f"{root}/meta/stats.json has {which} statistics of {key}, by which vt_dp3 normalises:"
+                " see that its values are finite, and make them anew by lerobot-edit-dataset"
+                " --operation.type=recompute_stats"
+            )
 
 
 @ProcessorStepRegistry.register("vt_visuo_tactile")
@@ -185,8 +208,7 @@ def make_vt_dp3_pre_post_processors(
     """Pre- and postprocessor; joint positions, actions, limits and an auxiliary loss's truth are normalised
     (min-max to [-1, 1]), and nothing else.
     """
-    more = ((LIMITS_KEY, config.limits_dim), (TRUTH_KEY, config.truth_dim))
-    seen = (STATE_KEY, *(key for key, size in more if size))
+    seen = config.normalised_keys
     if dataset_stats:
         widen_narrow_ranges(dataset_stats)
         dataset_stats = {key: dataset_stats[key] for key in (*seen, ACTION_KEY) if key in dataset_stats}
