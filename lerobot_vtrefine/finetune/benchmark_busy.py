@@ -13,7 +13,7 @@ from collections.abc import Generator
 from dataclasses import dataclass
 
 import torch
-from lerobot.configs import FeatureType, PolicyFeature
+from lerobot.envs.utils import env_to_policy_features
 
 from lerobot_vtrefine.datasets.features import ACTION_KEY, STATE_KEY
 from lerobot_vtrefine.embodiments import DEFAULT_BODY, get_embodiment
@@ -115,10 +115,9 @@ def busy_process() -> Generator[None]:
 def _policy() -> tuple[VtDp3Policy, tuple]:
     """A policy of the preset ``small`` as behaviour cloning leaves it, and its processors."""
     config = VtDp3Config(preset="small", device="cpu")
-    keys = (key for key in config.required_keys if key != STATE_KEY)
-    config.input_features = {key: PolicyFeature(FeatureType.STATE, (4,)) for key in keys}
-    config.input_features[STATE_KEY] = PolicyFeature(FeatureType.STATE, (NUM_JOINTS,))
-    config.output_features = {ACTION_KEY: PolicyFeature(FeatureType.ACTION, (NUM_JOINTS,))}
+    features = env_to_policy_features(VtRefineEnvConfig())
+    config.input_features = {key: features[key] for key in config.required_keys}
+    config.output_features = {ACTION_KEY: features[ACTION_KEY]}
     bounds = {"min": -torch.ones(NUM_JOINTS), "max": torch.ones(NUM_JOINTS)}
     return VtDp3Policy(config), make_vt_dp3_pre_post_processors(
         config, {STATE_KEY: bounds, ACTION_KEY: bounds}

@@ -177,7 +177,8 @@ def test_names_are_taken_once() -> None:
 def test_a_policy_says_whose_data_it_was_given() -> None:
     config = VtDp3Config(preset="small", device="cpu")
     for key in (STATE_KEY, *raw_keys(KINOVA)):
-        config.input_features[key] = PolicyFeature(FeatureType.STATE, (4,))
+        config.input_features[key] = PolicyFeature(FeatureType.STATE, (KINOVA.pad_layout.num_taxels,))
+    config.input_features[STATE_KEY] = PolicyFeature(FeatureType.STATE, (KINOVA.num_joints,))
     config.output_features = {ACTION_KEY: PolicyFeature(FeatureType.ACTION, (KINOVA.num_joints,))}
     with pytest.raises(ValueError, match=r"is of kinova: set --policy\.observation\.embodiment=kinova"):
         config.validate_features()

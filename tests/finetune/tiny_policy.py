@@ -7,7 +7,8 @@ import torch
 from lerobot.configs import FeatureType, PolicyFeature
 from torch import Tensor
 
-from lerobot_vtrefine.datasets.features import ACTION_KEY, CLOUD_KEY, STATE_KEY
+from lerobot_vtrefine.datasets.features import ACTION_KEY, CLOUD_KEY, STATE_KEY, dataset_features
+from lerobot_vtrefine.embodiments import ALOHA
 from lerobot_vtrefine.envs.decisions import Decision
 from lerobot_vtrefine.finetune.protocols import Observation
 from lerobot_vtrefine.observation import VisuoTactileConfig, num_points
@@ -31,9 +32,10 @@ def tiny_config() -> VtDp3Config:
         observation=POINTS,
         device="cpu",
     )
-    keys = (key for key in config.required_keys if key != STATE_KEY)
-    config.input_features = {key: PolicyFeature(FeatureType.STATE, (4,)) for key in keys}
-    config.input_features[STATE_KEY] = PolicyFeature(FeatureType.STATE, (16,))
+    columns = dataset_features(24, 32, ALOHA)
+    config.input_features = {
+        key: PolicyFeature(FeatureType.STATE, tuple(columns[key]["shape"])) for key in config.required_keys
+    }
     config.output_features = {ACTION_KEY: PolicyFeature(FeatureType.ACTION, (16,))}
     return config
 

@@ -222,8 +222,10 @@ def test_a_study_leaves_encoders_that_policies_start_from(tmp_path: Path) -> Non
     def policy(folder: Path, **changes: object) -> VtDp3Policy:
         settings = {"preset": "small", "device": "cpu", "modalities": "tactile", "fusion": "pads"}
         config = VtDp3Config(**settings | changes, pretrained_encoder=str(folder))
-        state = (STATE_KEY, *TACTILE_KEYS, *BASELINE_KEYS)
-        config.input_features = {key: PolicyFeature(FeatureType.STATE, (JOINTS,)) for key in state}
+        sizes = dict.fromkeys((*TACTILE_KEYS, *BASELINE_KEYS), 384) | {STATE_KEY: JOINTS}
+        config.input_features = {
+            key: PolicyFeature(FeatureType.STATE, (size,)) for key, size in sizes.items()
+        }
         config.output_features = {ACTION_KEY: PolicyFeature(FeatureType.ACTION, (JOINTS,))}
         return VtDp3Policy(config)
 

@@ -46,7 +46,7 @@ def checkpoint(tmp_path: Path) -> Path:
         device="cpu",
     )
     keys = (key for key in config.required_keys if key != STATE_KEY)
-    config.input_features = {key: PolicyFeature(FeatureType.STATE, (4,)) for key in keys}
+    config.input_features = {key: PolicyFeature(FeatureType.STATE, (384,)) for key in keys}
     config.input_features[STATE_KEY] = PolicyFeature(FeatureType.STATE, (16,))
     config.output_features = {ACTION_KEY: PolicyFeature(FeatureType.ACTION, (16,))}
     VtDp3Policy(config).save_pretrained(tmp_path / "policy")

@@ -101,6 +101,27 @@ def test_data_without_the_needed_columns_is_refused_in_one_line() -> None:
         config.validate_features()
 
 
+@pytest.mark.parametrize(
+    ("key", "values", "told", "suits"),
+    [
+        (TACTILE_KEYS[2], 96, r"96 values a frame, and .*=aloha has 384 \(a pad's taxels\)", "visual"),
+        ("observation.tactile_baseline.left_arm_left_finger", 1, "1 values a frame", "visual"),
+        (STATE_KEY, 14, r"14 values a frame, and .*=aloha has 16 \(its joints\)", "pads"),
+    ],
+)
+def test_another_robots_pads_or_joints_are_refused_in_one_line(
+    key: str, values: int, told: str, suits: str
+) -> None:
+    changed = policy_features() | {key: PolicyFeature(FeatureType.STATE, (values,))}
+    action = {"action": PolicyFeature(FeatureType.ACTION, (16,))}
+    config = VtDp3Config(device="cpu", input_features=changed, output_features=action)
+    with pytest.raises(ValueError, match=rf"the data's {key} holds {told}") as error:
+        config.validate_features()
+    assert "\n" not in str(error.value)
+    setattr(config, "fusion" if suits == "pads" else "modalities", suits)
+    config.validate_features()
+
+
 @pytest.mark.parametrize("path", CONFIGS, ids=lambda path: path.stem)
 def test_shipped_files_parse(path: Path) -> None:
     config = draccus.parse(TrainPipelineConfig, path, args=["--dataset.repo_id=local/tiny"])

@@ -24,7 +24,7 @@ def policy_of(denoiser: str) -> VtDp3Policy:
     config = VtDp3Config(
         preset="small", denoiser=denoiser, point_dims=(8, 16), down_dims=(32, 32), device="cpu"
     )
-    config.input_features = {key: PolicyFeature(FeatureType.STATE, (4,)) for key in config.required_keys}
+    config.input_features = {key: PolicyFeature(FeatureType.STATE, (384,)) for key in config.required_keys}
     config.input_features[STATE_KEY] = PolicyFeature(FeatureType.STATE, (16,))
     config.output_features = {ACTION_KEY: PolicyFeature(FeatureType.ACTION, (16,))}
     return VtDp3Policy(config)

@@ -2,6 +2,7 @@
 Train").
 """
 
+import math
 from dataclasses import dataclass, field, replace
 from typing import Any
 
@@ -317,8 +318,32 @@ class VtDp3Config(PreTrainedConfig):
             return f"the data is of {body.name}: set --policy.observation.embodiment={body.name}"
         return "record with vtrefine-record-demos or a tactile robot, or choose other modalities"
 
+    def _check_sizes(self) -> None:
+        """Raises: ValueError for a column that holds more or less a frame than the body has of it."""
+        body = get_embodiment(self.observation.embodiment)
+        pads = (*tactile_keys(body), *baseline_keys(body)) if self.modalities != "visual" else ()
+        sizes = dict.fromkeys(
+            pads, (body.pad_layout.num_taxels, "a pad's taxels", "policy.modalities=visual")
+        )
+        if self.cloud_modalities not in ("", "visual"):  # taxels are where the joints put them
+            sizes[STATE_KEY] = (
+                body.num_joints,
+                "its joints",
+                "policy.fusion=pads or policy.modalities=visual",
+            )
+        for key, (wanted, what, way) in sizes.items():
+            shape = (self.input_features or {})[key].shape
+            if math.prod(shape) != wanted:
+                raise ValueError(
+                    f"the data's {key} holds {math.prod(shape)} values a frame, and"
+                    f" policy.observation.embodiment={body.name} has {wanted} ({what}): name the robot that"
+                    f" the data is of, or learn without them by {way}"
+                )
+
     def validate_features(self) -> None:
-        """Raises: ValueError naming the columns that a dataset or environment lacks for this policy."""
+        """Raises: ValueError naming the columns that a dataset or environment lacks for this policy, or that
+        have another size than its robot's.
+        """
         missing = [key for key in self.required_keys if key not in (self.input_features or {})]
         if missing:
             shown = ", ".join(missing[:3]) + (f" and {len(missing) - 3} more" if len(missing) > 3 else "")
@@ -326,6 +351,7 @@ class VtDp3Config(PreTrainedConfig):
                 f"vt_dp3 with policy.modalities={self.modalities} needs columns that the data lacks: "
                 f"{shown}; {self._way_out()}"
             )
+        self._check_sizes()
         if self.auxiliary_weight and not self.truth_dim:
             raise ValueError(
                 f"policy.auxiliary_weight={self.auxiliary_weight:g} needs {TRUTH_KEY}, which the data lacks:"
