@@ -44,10 +44,19 @@ class EpisodeLog:
         self.path.parent.mkdir(parents=True, exist_ok=True)
 
     def append(self, rows: list[dict[str, Any]]) -> None:
-        """Write ``rows``, one JSON object a line, in one write."""
-        text = "".join(json.dumps(row) + "\n" for row in rows)
-        with self.path.open("a", encoding="utf-8") as file:
-            file.write(text)
+        """Write ``rows``, one JSON object a line, in one write; on a full disk, none of them.
+
+        Half a line would take the first row of the next evaluation with it, and leave a file that cannot be
+        read.
+        """
+        data, written = "".join(json.dumps(row) + "\n" for row in rows).encode(), 0
+        with self.path.open("ab", buffering=0) as file:
+            try:
+                while written < len(data):
+                    written += file.write(data[written:])
+            except OSError as error:
+                file.truncate(file.tell() - written)
+                raise OSError(error.errno, error.strerror, str(self.path)) from error
 
 
 def read_episode_log(path: Path, first_seed: int, num_episodes: int) -> list[dict[str, Any]]:

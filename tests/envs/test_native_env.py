@@ -1,3 +1,4 @@
+import resource
 from dataclasses import replace
 from functools import partial
 
@@ -298,3 +299,19 @@ def test_shear_is_part_of_info_when_switched_on():
         np.testing.assert_array_equal(several["shear"][1], one["shear"])
         assert np.abs(one["shear"]).max() > 1e-3
     assert "shear" not in VtRefineEnv(VtRefineEnvConfig(start="grasped", num_threads=1)).reset(seed=4)[1]
+
+
+def test_a_full_disk_leaves_no_half_of_an_episode_in_the_log(tmp_path):
+    path = tmp_path / "episodes.jsonl"
+    row = {"seed": 0, "steps": 3, "success": True, "failure": "none"}
+    log = EpisodeLog(path)
+    log.append([row])
+    soft, hard = resource.getrlimit(resource.RLIMIT_FSIZE)  # as a disk with room for half a line
+    resource.setrlimit(resource.RLIMIT_FSIZE, (path.stat().st_size * 3 // 2, hard))
+    try:
+        with pytest.raises(OSError, match=r"episodes\.jsonl"):
+            log.append([row | {"seed": 1}])
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, (soft, hard))
+    log.append([row | {"seed": 1}])
+    assert [found["seed"] for found in read_episode_log(path, 0, 2)] == [0, 1]
