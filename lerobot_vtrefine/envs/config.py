@@ -40,6 +40,20 @@ SHORTCUTS = ("pair", "clearance_m", "start", "mesh_dir")
 """Fields of ``scene`` that have a flag of their own."""
 
 
+class EnvAction(PolicyFeature):
+    """An environment's action, which tells policies whose joints it moves and how often; not saved."""
+
+    fps: int
+    body: str
+
+    @classmethod
+    def of(cls, body: Embodiment, fps: int) -> "EnvAction":
+        """Targets of all joints of a body, ``fps`` of them a second."""
+        action = cls(type=FeatureType.ACTION, shape=(body.num_joints,))
+        action.fps, action.body = fps, body.name
+        return action
+
+
 @EnvConfig.register_subclass("vtrefine")
 @dataclass
 class VtRefineEnvConfig(EnvConfig):
@@ -134,7 +148,9 @@ class VtRefineEnvConfig(EnvConfig):
                 raise ValueError(f"--env.rgb_size must be at least {SMALLEST_PX} pixels, got {self.rgb_size}")
             if self.ablate == "vision":
                 raise ValueError("--env.ablate=vision hides the depth image only: leave out --env.rgb=true")
-        self.features = policy_features(*self.camera_size, self.body, self.colour_size, self.limited)
+        self.features = policy_features(
+            *self.camera_size, self.body, self.fps, self.colour_size, self.limited
+        )
         self.features_map = env_key_map(self.body, colour=self.rgb, limited=self.limited)
         _ = self.task_config  # its own checks, now rather than in a worker process
 
@@ -203,11 +219,12 @@ def policy_features(
     camera_height: int,
     camera_width: int,
     body: Embodiment,
+    fps: int,
     colour: tuple[int, int] | None = None,
     limited: bool = False,
 ) -> dict[str, PolicyFeature]:
-    """LeRobot features under environment keys; `colour` is the colour image's height and width, `limited`
-    whether they hold limits.
+    """LeRobot features under environment keys, with `fps` actions a second; `colour` is the colour image's
+    height and width, `limited` whether they hold limits.
 
     Depth is not a VISUAL feature here: ``lerobot-eval --eval.recording=true`` makes videos of these, and
     millimetres do not fit into one.
@@ -220,4 +237,4 @@ def policy_features(
     }
     if colour is not None:
         features[RGB_KEY] = PolicyFeature(type=FeatureType.VISUAL, shape=(*colour, 3))
-    return {ACTION_KEY: PolicyFeature(type=FeatureType.ACTION, shape=(body.num_joints,)), **features}
+    return {ACTION_KEY: EnvAction.of(body, fps), **features}

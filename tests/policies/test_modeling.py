@@ -2,13 +2,15 @@
 
 import json
 from copy import deepcopy
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import pytest
 import torch
 from draccus import ParsingError
-from lerobot.configs import FeatureType, PolicyFeature
+from lerobot.configs import FeatureType, PolicyFeature, PreTrainedConfig
+from lerobot.policies import factory
 
 from lerobot_vtrefine.datasets.features import (
     ACTION_KEY,
@@ -19,9 +21,11 @@ from lerobot_vtrefine.datasets.features import (
     dataset_features,
 )
 from lerobot_vtrefine.embodiments import ALOHA
+from lerobot_vtrefine.envs import VtRefineEnvConfig
 from lerobot_vtrefine.policies.vt_dp3 import VtDp3Config, observation_encoder
 from lerobot_vtrefine.policies.vt_dp3.modeling_vt_dp3 import VtDp3Policy
 from lerobot_vtrefine.policies.vt_dp3.observation_encoder import PERCEIVED_KEY
+from lerobot_vtrefine.sim.config import SceneConfig
 
 Batch = dict[str, torch.Tensor]
 
@@ -220,6 +224,29 @@ def test_checkpoint_keeps_actions_average_and_its_age(tmp_path: Path) -> None:
     assert int(loaded.ema.step) == 5
     noise = torch.randn(3, 16, 16)
     assert torch.equal(policy.sample_actions(make_batch(), noise), loaded.sample_actions(make_batch(), noise))
+
+
+@pytest.mark.parametrize(
+    ("env", "told"),
+    [
+        ({"fps": 20}, r"--env\.fps=20, but the policy learned 10 actions a second: give --env\.fps=10"),
+        ({"scene": SceneConfig(embodiment="kinova")}, r"embodiment=kinova, but the policy is of aloha"),
+    ],
+)
+def test_lerobot_eval_refuses_an_environment_of_another_rate_or_robot(
+    tmp_path: Path, env: dict[str, Any], told: str
+) -> None:
+    policy = make_policy(modalities="visual", fps=10)
+    policy.save_pretrained(tmp_path)
+    config = PreTrainedConfig.from_pretrained(tmp_path)
+    config.pretrained_path = tmp_path
+    own = VtRefineEnvConfig(start="grasped")
+    acting = factory.make_policy(config, env_cfg=own)
+    acting.save_pretrained(tmp_path)
+    again = PreTrainedConfig.from_pretrained(tmp_path)
+    assert (again.output_features, again.fps) == (policy.config.output_features, 10)
+    with pytest.raises(ValueError, match=told):
+        factory.make_policy(config, env_cfg=replace(own, **env))
 
 
 def test_tuned_steps_act_as_stochastically_as_asked() -> None:

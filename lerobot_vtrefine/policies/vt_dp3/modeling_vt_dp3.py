@@ -18,6 +18,7 @@ from torch import Tensor, nn
 from torch.nn import functional
 
 from lerobot_vtrefine.datasets.features import ACTION_KEY, STATE_KEY, TRUTH_KEY
+from lerobot_vtrefine.envs.config import EnvAction
 from lerobot_vtrefine.policies.vt_dp3.configuration_vt_dp3 import VtDp3Config
 from lerobot_vtrefine.policies.vt_dp3.denoisers import MLPDenoiser, UNetDenoiser
 from lerobot_vtrefine.policies.vt_dp3.diffusion import DiffusionProcess, PredictNoise, deploy
@@ -97,6 +98,10 @@ class VtDp3Policy(PreTrainedPolicy):
             raise ValueError(f"the checkpoint holds a policy of type '{found}', expected 'vt_dp3'")
         super().__init__(config)
         config.validate_features()
+        action = (config.output_features or {})[ACTION_KEY]
+        if isinstance(action, EnvAction):  # lerobot-eval
+            config.check_fps(action.fps)
+            config.check_body(action.body)
         if dataset_meta is not None:
             config.fps = dataset_meta.fps
             check_stats(config, dataset_meta.stats, dataset_meta.root)
