@@ -315,7 +315,7 @@ def update(rollout: Rollout, agent: Agent, state: TrainState, cfg: DppoConfig) -
         found = data.gradients(minibatch)
         if not math.isfinite(found["value_loss"] + found["policy_loss"]):
             raise FloatingPointError(
-                f"loss is not finite in iteration {state.iteration}: lower --dppo.actor_lr"
+                f"loss is not finite in iteration {state.iteration}: lower {region.slower}"
             )
         if not history:
             initial_log_ratio = found["log_ratio"]  # zero up to rounding, or the stored chains are wrong
@@ -326,7 +326,7 @@ def update(rollout: Rollout, agent: Agent, state: TrainState, cfg: DppoConfig) -
         history.append(found)
     if not data.weights_are_finite():  # now: a checkpoint of them could not be gone on from
         raise FloatingPointError(
-            f"weights are not finite after iteration {state.iteration}: lower --dppo.actor_lr"
+            f"weights are not finite after iteration {state.iteration}: lower {region.slower}"
         )
 
     if data.train_actor:

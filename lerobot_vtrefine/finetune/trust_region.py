@@ -55,10 +55,15 @@ class TrustRegion:
         change = min(max((target / max(furthest, 1e-9)) ** 0.5, SLOWEST), FASTEST)
         self.rate = min(self.rate * change, self._highest)
 
+    @property
+    def slower(self) -> str:
+        """The flags by which a run takes smaller steps, also one that is resumed."""
+        return "--dppo.actor_lr and --dppo.actor_lr_max" if self.cfg.kl_per_decision else "--dppo.actor_lr"
+
     def state_dict(self) -> dict[str, float]:
         """The present rate."""
         return {"rate": self.rate}
 
     def load_state_dict(self, state: dict[str, float]) -> None:
-        """Restore ``state_dict``."""
-        self.rate = state["rate"]
+        """Restore ``state_dict``; a limit that is lower by now holds at once."""
+        self.rate = min(state["rate"], self._highest)

@@ -99,6 +99,18 @@ def test_the_rate_does_not_wind_up_where_no_rate_reaches_the_target():
     assert faster.actor_lr(1) == pytest.approx(1e-3)  # where it was told to begin
 
 
+def test_a_lower_limit_of_the_rate_holds_when_a_run_is_resumed():
+    cfg = replace(SmallDppo(), actor_lr=1e-4, actor_lr_max=2e-4)
+    before = TrustRegion(cfg)
+    before.rate = 2e-4
+    same, slower = (TrustRegion(changed) for changed in (cfg, replace(cfg, actor_lr=1e-5, actor_lr_max=1e-5)))
+    for region in (same, slower):
+        region.load_state_dict(before.state_dict())
+    assert (same.actor_lr(5), slower.actor_lr(5)) == (2e-4, 1e-5)
+    assert slower.slower == "--dppo.actor_lr and --dppo.actor_lr_max"
+    assert TrustRegion(PaperDppo()).slower == "--dppo.actor_lr"
+
+
 def test_without_a_trust_region_the_schedule_stands():
     cfg = PaperDppo()
     region = TrustRegion(cfg)
