@@ -107,7 +107,7 @@ def put_in_place(work: Path, target: Path, whole: Sequence[str] = ()) -> None:
         shutil.copytree(
             target, work, symlinks=True, ignore=ignore, copy_function=_link_missing, dirs_exist_ok=True
         )
-    _flush(work)
+    flush(work)
     if not target.is_dir():
         work.rename(target)
     elif not _exchange(work, target):
@@ -170,7 +170,7 @@ def _exchange(one: Path, other: Path) -> bool:
     raise OSError(number, os.strerror(number), str(other))
 
 
-def _flush(folder: Path) -> None:
+def flush(folder: Path) -> None:
     """Let everything in ``folder`` reach the disk, so that it is whole after a power failure, too.
 
     Files with a second name were flushed under the first.

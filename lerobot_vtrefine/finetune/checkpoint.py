@@ -25,6 +25,7 @@ from lerobot.utils.random_utils import deserialize_rng_state, serialize_rng_stat
 from lerobot_vtrefine.finetune.distributed import barrier, num_ranks, rank_index
 from lerobot_vtrefine.finetune.dppo import TrainState
 from lerobot_vtrefine.finetune.state_file import load_state, save_state
+from lerobot_vtrefine.folders import flush, sync
 from lerobot_vtrefine.lerobot_compat.claim import Claim
 from lerobot_vtrefine.wording import plural
 
@@ -86,8 +87,8 @@ def point_last_at(checkpoint: Path) -> None:
 def save_checkpoint(output_dir: Path, saveable: Saveable, state: TrainState, total: int) -> None:
     """Write a checkpoint after ``state.iteration`` of ``total`` iterations; all ranks take part.
 
-    It is written beside its place and moved there when complete, so an interrupted run never leaves half of
-    one.
+    It is written beside its place and moved there when complete and on the disk, so an interrupted run, or a
+    machine that stops, never leaves half of one.
     """
     ranks: list[Any] = [_random_states(state)]
     if num_ranks() > 1:
@@ -100,8 +101,10 @@ def save_checkpoint(output_dir: Path, saveable: Saveable, state: TrainState, tot
         saveable.save(partial / PRETRAINED_MODEL_DIR)
         (partial / TRAINING_STATE_DIR).mkdir()
         save_state(_state_dict(state) | {"ranks": ranks}, partial / TRAINING_STATE_DIR / STATE_NAME)
+        flush(partial)  # or a power failure could leave the name and empty files
         shutil.rmtree(final, ignore_errors=True)
         partial.rename(final)
+        sync(final.parent)
         point_last_at(final)
     barrier()
 

@@ -1,5 +1,6 @@
 """What ``vtrefine-finetune`` makes of folders that hold part of a run."""
 
+import os
 import shutil
 from collections.abc import Callable
 from pathlib import Path
@@ -62,3 +63,29 @@ def test_a_folder_in_which_another_run_goes_on_is_left_alone(
         assert [path.name for path in run.iterdir()] == ["progress.csv"]
         assert read_progress(run) == [{"iteration": 1.0, "return": 0.5}]
     assert finetune(run, 1, *flags) == 0
+
+
+def test_a_checkpoint_is_on_the_disk_before_it_has_its_name(
+    finetune: Finetune, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    synced: list[Path] = []
+    rename, fsync = Path.rename, os.fsync
+
+    def synchronise(descriptor: int) -> None:
+        synced.append(Path(f"/proc/self/fd/{descriptor}").readlink())
+        fsync(descriptor)
+
+    def named(self: Path, target: Path) -> Path:
+        if self.name == "000001.partial":
+            written = {path for path in self.rglob("*") if path.is_file()}
+            assert {path.name for path in written} >= {"model.safetensors", "dppo_state.safetensors"}
+            assert written <= set(synced)
+            synced.append(target)
+        return rename(self, target)
+
+    monkeypatch.setattr(os, "fsync", synchronise)
+    monkeypatch.setattr(Path, "rename", named)
+    run = tmp_path / "run"
+    assert finetune(run, 1) == 0
+    at = synced.index(run / "checkpoints" / "000001")
+    assert run / "checkpoints" in synced[at:]
