@@ -94,6 +94,17 @@ def test_failure_names_the_log_and_the_last_line(tmp_path: Path) -> None:
         run(tmp_path, silent)
 
 
+def test_a_command_that_outlived_an_earlier_run_does_not_write_into_the_log(tmp_path: Path) -> None:
+    only = stage(tmp_path, "a", code="raise SystemExit('no such pair')")
+    log = tmp_path / "logs" / "a.log"
+    log.parent.mkdir()
+    with log.open("w") as earlier:
+        with pytest.raises(ChildProcessError, match="no such pair"):
+            run(tmp_path, only)
+        earlier.write("all is well " * 20)
+    assert "all is well" not in log.read_text()
+
+
 @pytest.mark.parametrize(("resumable", "left"), [(True, "xx"), (False, "x")])
 def test_interrupted_stage_continues_only_if_it_can(tmp_path: Path, resumable: bool, left: str) -> None:
     """The first run writes part of its output and fails; the second has the same command."""

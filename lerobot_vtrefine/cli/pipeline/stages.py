@@ -179,6 +179,7 @@ class StageRunner:
     def _execute(self, stage: Stage, label: str) -> None:
         log = self.log_path(stage)
         log.parent.mkdir(parents=True, exist_ok=True)
+        log.unlink(missing_ok=True)  # a command that outlived an earlier run may go on writing to its own
         started = time.monotonic()
         with log.open("wb") as file:
             file.write(f"$ {stage.line}\n".encode())
