@@ -248,7 +248,7 @@ def make_practice(policy: VtDp3Policy, path: Path, env: EnvConfig, dppo: DppoCon
     env = checked_env(env)
     config = policy.config
     config.check_fps(env.fps)
-    config.check_body(env.body.name)
+    config.check_body(env.body.name, env.body.num_joints)
     overrides = {"device_processor": {"device": config.device or "cpu"}}
     processors = make_pre_post_processors(config, str(path), preprocessor_overrides=overrides)
     agent = make_agent(policy, dppo)

@@ -247,6 +247,9 @@ def test_lerobot_eval_refuses_an_environment_of_another_rate_or_robot(
     assert (again.output_features, again.fps) == (policy.config.output_features, 10)
     with pytest.raises(ValueError, match=told):
         factory.make_policy(config, env_cfg=replace(own, **env))
+    config.input_features[STATE_KEY] = PolicyFeature(FeatureType.STATE, (14,))
+    with pytest.raises(ValueError, match="learned from 14 joints, and the environment's robot, aloha, has"):
+        factory.make_policy(config, env_cfg=own)
 
 
 def test_tuned_steps_act_as_stochastically_as_asked() -> None:

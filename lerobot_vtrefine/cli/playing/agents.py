@@ -14,7 +14,6 @@ from lerobot_vtrefine.envs.config import VtRefineEnvConfig
 from lerobot_vtrefine.envs.live_world import IDS, LiveWorld
 from lerobot_vtrefine.lerobot_compat.registration import register
 from lerobot_vtrefine.observation import VisuoTactileConfig
-from lerobot_vtrefine.policies.vt_dp3.configuration_vt_dp3 import VtDp3Config
 from lerobot_vtrefine.sim.demonstrations import Degradation
 
 Array = np.ndarray
@@ -91,9 +90,6 @@ class PolicyAgent:
                 f"--policy.path={path} holds no checkpoint of LeRobot (a folder with config.json and"
                 f" model.safetensors, or a name on the Hub): {error}"
             ) from error
-        if isinstance(config, VtDp3Config):
-            config.check_fps(env.fps)
-            config.check_body(env.body.name)
         config.pretrained_path = Path(path)
         config.device = device or ("cuda" if torch.cuda.is_available() else "cpu")
         self.policy = make_policy(cfg=config, env_cfg=env)

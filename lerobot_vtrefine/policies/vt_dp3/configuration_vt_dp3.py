@@ -281,12 +281,17 @@ class VtDp3Config(PreTrainedConfig):
                 f" --env.fps={self.fps}"
             )
 
-    def check_body(self, name: str) -> None:
-        """Raises: ValueError for an environment of another robot than the policy's."""
+    def check_body(self, name: str, joints: int) -> None:
+        """Raises: ValueError for an environment of another robot, or number of joints, than the policy's."""
         if name != (own := self.observation.embodiment):
             raise ValueError(
                 f"--env.scene.embodiment={name}, but the policy is of {own}: name an environment of that, or"
                 " another --policy.path"
+            )
+        if joints != self.state_dim:
+            raise ValueError(
+                f"the policy learned from {self.state_dim} joints, and the environment's robot, {name}, has"
+                f" {joints}: name another --policy.path"
             )
 
     def get_optimizer_preset(self) -> AdamWConfig:

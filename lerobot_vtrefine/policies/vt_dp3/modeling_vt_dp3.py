@@ -101,7 +101,7 @@ class VtDp3Policy(PreTrainedPolicy):
         action = (config.output_features or {})[ACTION_KEY]
         if isinstance(action, EnvAction):  # lerobot-eval
             config.check_fps(action.fps)
-            config.check_body(action.body)
+            config.check_body(action.body, action.shape[0])
         if dataset_meta is not None:
             config.fps = dataset_meta.fps
             check_stats(config, dataset_meta.stats, dataset_meta.root)
