@@ -172,8 +172,18 @@ class VtRefineEnvConfig(EnvConfig):
 
     @property
     def hidden(self) -> Reality:
-        """What differs from the simulation that everybody knows: nothing without ``reality``."""
-        return Reality() if self.reality is None else load_reality(self.reality)
+        """What differs from the simulation that everybody knows: nothing without ``reality``.
+
+        Raises: ValueError for a file that is none, or not there.
+        """
+        if self.reality is None:
+            return Reality()
+        if not Path(self.reality).exists():
+            raise ValueError(
+                f"--env.reality={self.reality}: no such file; vtrefine-diagnose --help_format=reality.json"
+                " tells what it holds"
+            )
+        return load_reality(self.reality)
 
     @property
     def task_config(self) -> TaskConfig:

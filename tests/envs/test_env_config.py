@@ -147,6 +147,7 @@ def test_there_are_environment_files():
         ({"video_episodes": -1}, "--env.video_episodes must be at least 0, got -1"),
         ({"fps": 0}, "--env.fps must lie between 1 and 100 control steps a second, got 0"),
         ({"fps": 101}, "--env.fps must lie between 1 and 100 control steps a second, got 101"),
+        ({"reality": Path("nowhere.json")}, r"--env\.reality=nowhere\.json: no such file; vtrefine-diagnose"),
     ],
 )
 def test_bad_settings_are_named_at_once(settings, message):

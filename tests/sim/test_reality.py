@@ -215,6 +215,8 @@ def test_faults_of_the_file_are_named(tmp_path, content, words):
 
 def test_missing_files_unknown_joints_and_two_sensor_models_are_refused(tmp_path):
     with pytest.raises(FileNotFoundError):
+        load_reality(tmp_path / "nowhere.json")
+    with pytest.raises(ParsingError, match=r"--env\.reality=.*nowhere\.json: no such file"):
         VtRefineEnvConfig(reality=tmp_path / "nowhere.json")
     with pytest.raises(ValueError, match="no arm has a joint 'left_left_finger'"):
         make_drive(
