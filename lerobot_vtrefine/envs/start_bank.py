@@ -63,9 +63,18 @@ class StartBank:
                 f"--env.start_bank={path}: no such file; vtrefine-record-starts makes one"
             )
         arrays = read_arrays(path, "iufbU")
-        if not {SETTINGS, SOURCE} <= set(arrays):
+        if not {SETTINGS, SOURCE, STEPS} <= set(arrays):
             raise ValueError(f"{path} is no bank of states: vtrefine-record-starts makes one")
-        bank = cls(json.loads(str(arrays.pop(SETTINGS))), arrays.pop(SOURCE), arrays)
+        try:
+            settings = json.loads(str(arrays.pop(SETTINGS)))
+        except json.JSONDecodeError as error:
+            raise ValueError(
+                f"{path} is damaged, its settings are no JSON ({error}): make it anew"
+            ) from error
+        bank = cls(settings, arrays.pop(SOURCE), arrays)
+        for name, values in arrays.items():
+            if values.shape[:1] != bank.source.shape:
+                raise ValueError(f"{path} is damaged, not every state has a {name}: make it anew")
         _check_task(path, bank.settings, bank_settings(config))
         latest = int(bank.leaves[STEPS].max())
         if latest >= config.max_episode_steps:

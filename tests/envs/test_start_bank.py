@@ -1,6 +1,7 @@
 """Episodes from a bank continue the episodes that its states were taken from."""
 
 import dataclasses
+from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
@@ -204,6 +205,25 @@ def test_a_bank_that_another_version_recorded_is_refused_in_one_line(
     episodes = make_episodes(older, 1)
     with pytest.raises(ValueError, match=r"lack state/episode/picked_up.*make the bank anew"):
         episodes.reset(episodes.ids, FIRST_SEED + episodes.ids)
+
+
+@pytest.mark.parametrize(
+    ("damage", "told"),
+    [
+        (lambda held: held.pop("state/episode/steps"), "is no bank of states"),
+        (lambda held: held.update(settings=np.array("{")), "is damaged, its settings are no JSON"),
+        (lambda held: held.update({"state/row": held["state/row"][:1]}), "not every state has a state/row"),
+    ],
+)
+def test_a_damaged_bank_is_named_in_one_line(
+    picked: VtRefineEnvConfig, tmp_path: Path, damage: Callable[[dict[str, np.ndarray]], object], told: str
+):
+    with np.load(picked.start_bank) as bank:
+        held = dict(bank)
+    damage(held)
+    np.savez(tmp_path / "damaged.npz", **held)
+    with pytest.raises(ValueError, match=rf"damaged\.npz .*{told}"):
+        StartBank.load(tmp_path / "damaged.npz", picked)
 
 
 def test_notes_of_recordings_tell_banks_apart(picked: VtRefineEnvConfig):
