@@ -116,8 +116,11 @@ def _however_it_lies(
         return looks
     stated = seen.loss(np.zeros(seen.count), others)
     for geometry in seen.plausible(others):
-        if looks and seen.loss(geometry, others) <= stated:
-            looks = looks - seen.sound(geometry, others, errors)
+        if not looks:
+            break
+        said = seen.expected(geometry, others)
+        if squared(seen.errors(said, others)) <= stated:
+            looks = looks - seen.sound(said, errors)
     return looks
 
 
@@ -211,7 +214,8 @@ class Glimpses:
         )
 
         def left(geometry: Array) -> Array:
-            return np.concatenate([self.errors(geometry, others) / max(scale, 1.0), HELD * geometry])
+            errors = self.errors(self.expected(geometry, others), others)
+            return np.concatenate([errors / max(scale, 1.0), HELD * geometry])
 
         inside = np.clip(start, -0.99 * MOST_GEOMETRY, 0.99 * MOST_GEOMETRY)
         bounds = (-MOST_GEOMETRY, MOST_GEOMETRY)
@@ -219,18 +223,17 @@ class Glimpses:
 
     def loss(self, geometry: Array, others: list[Array]) -> float:
         """Squared error of the readings of `others` [counts^2]."""
-        return float((self.errors(geometry, others) ** 2).sum())
+        return squared(self.errors(self.expected(geometry, others), others))
 
-    def errors(self, geometry: Array, others: list[Array]) -> Array:
+    def errors(self, expected: list[Array], others: list[Array]) -> Array:
         """Measured minus expected, of the readings of `others` in one vector [counts]."""
-        pairs = zip(self.presses, self.expected(geometry, others), others, strict=True)
+        pairs = zip(self.presses, expected, others, strict=True)
         return np.concatenate([(item.signal - said)[:, mask].ravel() for item, said, mask in pairs])
 
-    def sound(self, geometry: Array, others: list[Array], errors: float) -> frozenset[tuple[int, int]]:
-        """Taxels that in a geometry surely answer, or are not pressed well enough to tell, by the law of
-        `others`."""
+    def sound(self, expected: list[Array], errors: float) -> frozenset[tuple[int, int]]:
+        """Taxels that surely answer as expected, or are not pressed well enough to tell."""
         sums = GainSums.none(self.layout.num_taxels)
-        for item, said in zip(self.presses, self.expected(geometry, others), strict=True):
+        for item, said in zip(self.presses, expected, strict=True):
             sums.add(item.press.taxels, item.signal, said, item.times)
         gain, error = sums.gains()
         cols = self.layout.cols
@@ -278,6 +281,11 @@ def _heights_m(item: Glimpse, values: Array) -> Array:
     )
     stretched = replace(layout, pitch_m=layout.pitch_m * float(np.exp(values[5])))
     return trial_heights(placed, stretched)[:, item.press.scored]
+
+
+def squared(errors: Array) -> float:
+    """Sum of squares."""
+    return float((errors**2).sum())
 
 
 def _moved(geometry: Array, place: int, steps: float) -> Array:
