@@ -95,12 +95,12 @@ def _courses(
     scores = np.zeros(count)
     scores[first] = gains
     found = []
-    for text, course in (("the session's time", _unit(starts)), ("the temperature", _unit(heat))):
-        if not course.any():
-            continue
+    for text, course in (("the session's time", starts), ("the temperature", heat)):
         along = np.zeros(count)
-        along[first] = np.sqrt(len(first)) * course
-        size = abs(float(gains @ course)) / np.sqrt(len(first))
+        along[first] = standardised(course)
+        if not along.any():
+            continue
+        size = abs(float(gains @ along[first])) / len(first)
         found.append(_suspicion(text, size, scores, along, either_sign=True))
     neighbours = np.zeros((count, count))
     neighbours[first[1:], first[:-1]] = 1.0
@@ -136,7 +136,9 @@ def _in_a_row(names: np.ndarray, starts: np.ndarray) -> bool:
     return len(groups) < len(names) and within < (1.0 - BLOCKED) * float(((ranks - ranks.mean()) ** 2).sum())
 
 
-def _unit(values: np.ndarray) -> np.ndarray:
+def standardised(values: np.ndarray) -> np.ndarray:
+    """The values (n,) about their mean, in their standard deviations; zeros where all are the same."""
     centred = values - values.mean()
-    norm = float(np.linalg.norm(centred))
-    return centred / norm if norm > 1e-9 * max(float(np.abs(values).max()), 1.0) else np.zeros(len(values))
+    scale = float(np.sqrt(np.mean(centred**2)))
+    alike = scale <= 1e-9 * max(float(np.abs(values).max()), 1.0)
+    return np.zeros(len(values)) if alike else centred / scale

@@ -18,6 +18,7 @@ from scipy.stats import chi2
 
 from lerobot_vtrefine.diagnose.core.suspicion import Suspicion
 from lerobot_vtrefine.diagnose.pad.fitting import Fit
+from lerobot_vtrefine.diagnose.pad.gain_drift import standardised
 from lerobot_vtrefine.diagnose.pad.motion import motion, resampled
 from lerobot_vtrefine.diagnose.pad.press_trials import Press, PressSet
 from lerobot_vtrefine.diagnose.pad.rules import DELAY_COURSE, MIN_RECORDINGS
@@ -83,11 +84,10 @@ def follow_session(presses: PressSet) -> Suspicion | None:
 
     Order is what is permuted. Conditions have no part in a delay, so every recording counts by itself.
     """
-    starts = np.array([press.trial.start_s for press in presses.presses])
-    if len(presses.delays_s) < MIN_RECORDINGS or np.ptp(starts) <= 0:
+    course = standardised(np.array([press.trial.start_s for press in presses.presses]))
+    if len(presses.delays_s) < MIN_RECORDINGS or not course.any():
         return None
     delays_s = np.array(presses.delays_s) - np.mean(presses.delays_s)
-    course = (starts - starts.mean()) / np.std(starts)
     slope_s = float(delays_s @ course) / len(course)
     share = slope_s**2 / max(float(np.mean(delays_s**2)), 1e-18)
     way = "later and later" if slope_s > 0 else "earlier and earlier"
