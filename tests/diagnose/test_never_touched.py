@@ -1,12 +1,11 @@
 """Taxels that read nothing where a press should reach them: dead, or never touched on another geometry."""
 
 from dataclasses import replace
-from pathlib import Path
 from types import SimpleNamespace
 from typing import Any, cast
 
-import numpy as np
 import pytest
+from press_rig import INSIDE, PUNCH, RIM, SPHERE, baseline, pressed
 
 from lerobot_vtrefine.diagnose.pad.never_touched import (
     never_touched,
@@ -14,67 +13,11 @@ from lerobot_vtrefine.diagnose.pad.never_touched import (
     surely_touched,
     with_all_dead,
 )
-from lerobot_vtrefine.diagnose.pad.press_trials import prepare
-from lerobot_vtrefine.diagnose.pad.problem import PadProblem
 from lerobot_vtrefine.diagnose.pad.rules import DEAD_ERRORS
 from lerobot_vtrefine.diagnose.pad.screening import map_probes
 from lerobot_vtrefine.diagnose.pad.suspicions import suspicions
 from lerobot_vtrefine.diagnose.pad.taxel_maps import find_dead
-from lerobot_vtrefine.diagnose.recordings import RecordingSet, Trial
-
-ROWS, COLS, PITCH_M = 8, 10, 0.002
-SPHERE = {"shape": "sphere", "radius_m": 0.009}
-PUNCH = {"shape": "flat", "size_m": [0.0085, 0.0085]}
-FRAMES, FRAME_S, DEEPEST_M = 120, 0.05, 9e-4
-INSIDE, RIM = (4, 4), (4, 6)
-"""A taxel under the middle of presses, and one near the edges of those that reach it."""
-
-
-def heights_m(spec: dict, x: float, y: float, depth: np.ndarray) -> np.ndarray:
-    """(N, R, C), zero where the object does not touch."""
-    east = (np.arange(COLS) - (COLS - 1) / 2) * PITCH_M - x
-    north = ((np.arange(ROWS) - (ROWS - 1) / 2) * PITCH_M - y)[:, None]
-    if spec["shape"] == "flat":
-        half = spec["size_m"][0] / 2
-        rise = np.where((abs(east) < half) & (abs(north) < half), 0.0, -1.0)
-    else:
-        inside = np.maximum(spec["radius_m"] ** 2 - east**2 - north**2, 0.0)
-        rise = np.sqrt(inside) - spec["radius_m"]
-    return np.maximum(depth[:, None, None] + rise, 0.0)
-
-
-def press(number: int, spec: dict, dead: tuple[tuple[int, int], ...]) -> Trial:
-    """Two presses are of one condition; those of even ones are in the pad's middle."""
-    drawn, rng = np.random.default_rng([7, number // 2]), np.random.default_rng([8, number])
-    reach = 1e-3 if number % 4 < 2 else 4e-3
-    x, y = drawn.uniform(-reach, reach), drawn.uniform(-reach, reach)
-    knots = [-3e-4, -3e-4, 0.6, 0.6, 0.3, drawn.uniform(0.8, 1.0), 1.0, -3e-4, -3e-4]
-    levels = [level if level < 0 else level * DEEPEST_M for level in knots]
-    time_s = np.arange(FRAMES) * FRAME_S
-    depth = np.interp(time_s, np.linspace(0.0, time_s[-1], len(levels)), levels)
-    counts = 2e5 * heights_m(spec, x, y, depth - 5e-6 * rng.normal()) * (1.0 + 0.01 * rng.normal())
-    for row, col in dead:
-        counts[:, row, col] = 0.0
-    raw = np.round(20.0 + counts.reshape(FRAMES, -1) + rng.normal(size=(FRAMES, ROWS * COLS))).clip(0, 255)
-    zero, at = np.zeros(FRAMES), (f"t{number:02}.parquet", f"c{number // 2}", number, 30.0 * number)
-    return Trial(*at, spec, time_s, zero + x, zero + y, depth, zero, zero, None, None, raw)
-
-
-def pressed(spec: dict, *dead: tuple[int, int], stated: float = 1.0, pitch: float = 1.0) -> RecordingSet:
-    """Sixteen presses by an object (or two), of a size and on a pitch so many times that stated."""
-    trials = [press(number, spec, dead) for number in range(16)]
-    told = {
-        name: value if name == "shape" else (stated * np.asarray(value)).tolist()
-        for name, value in spec.items()
-    }
-    stated_trials = tuple(replace(trial, object=told) for trial in trials)
-    return RecordingSet(Path(), "pad", ROWS, COLS, pitch * PITCH_M, 255.0, (), stated_trials)
-
-
-def baseline(recordings: RecordingSet) -> PadProblem:
-    trials = list(recordings.trials)
-    return PadProblem(prepare(recordings, trials, list(range(len(trials)))))
-
+from lerobot_vtrefine.diagnose.recordings import RecordingSet
 
 WRONG = [
     pressed(SPHERE, stated=1.4),

@@ -38,6 +38,10 @@ SHIFT_TAXELS, LOWER_PART, PITCH_STEP, SIZE_STEP = 0.5, 0.2, 0.1, 0.15
 deepest press, logarithms of the pitch and of an object's size."""
 MOST_GEOMETRY = 3.0
 """Steps up to which a geometry may be other than stated."""
+MORE_GEOMETRY, GEOMETRY_GAIN = 0.2, 0.25
+"""Part of the squared error that one more kind of geometry must take away, and that all together must on
+presses left out, of what is left by the stated one and by names. Causes on a right geometry leave them .1 and
+none, but for leaks one way that are strong: .2, and none left out."""
 WITNESSES = 2
 """Locked recordings that must each show a taxel to be dead that others do not press: one tells the other."""
 

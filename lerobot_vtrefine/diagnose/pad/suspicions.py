@@ -28,6 +28,7 @@ from lerobot_vtrefine.diagnose.pad.gain_drift import gain_drift
 from lerobot_vtrefine.diagnose.pad.hum import hum
 from lerobot_vtrefine.diagnose.pad.never_touched import never_touched, with_all_dead
 from lerobot_vtrefine.diagnose.pad.one_size import sizes_differ
+from lerobot_vtrefine.diagnose.pad.other_geometry import other_geometry
 from lerobot_vtrefine.diagnose.pad.own_delay import follow_session
 from lerobot_vtrefine.diagnose.pad.own_face import leaning_face
 from lerobot_vtrefine.diagnose.pad.own_touch import with_own_touch
@@ -62,6 +63,7 @@ def suspicions(problem: "PadProblem", selection: Selection[Any, Fit, Any]) -> li
         error_level.level(residuals, fitted, weights),
         held_rows(presses) if HOLD not in fitted.model.families else None,
         while_sliding(presses, residuals, fitted, weights),
+        other_geometry(fitted, presses, problem.seed),
         never_touched(fitted, presses),
         follow_session(presses),
         *shared_errors(presses, own.left, fitted, weights, problem.seed),
