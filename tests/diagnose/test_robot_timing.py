@@ -1,9 +1,11 @@
 """What changes from command to command, from trial to trial, and through the session."""
 
+import re
 from dataclasses import replace
 
 import numpy as np
 import pytest
+import robot_rigs
 from robot_rigs import Rig, make_set
 
 from lerobot_vtrefine.diagnose.core.engine import infer
@@ -44,6 +46,48 @@ def test_a_delay_that_is_tried_last_has_a_p_value_for_all_that_was_tried_before_
     assert again.chosen[ALL][0].cause == "control_latency"
     forms = {item.candidate for item in found.first_round}
     assert 1e-4 * len(forms) <= again.p_values["control_latency", ALL] <= 1e-4 * len(forms) * len(rig.joints)
+
+
+JITTER_S = 0.12
+JITTERED = Rig(rate_hz=30.0, seconds=6.0, conditions=12, replicates=1, latency_s=JITTER_S / 2)
+"""Commands of which none comes twice, so that no two trials differ."""
+
+
+def jittering(monkeypatch, last: str) -> None:
+    """Delays of single commands are anything up to `JITTER_S`; one that a later one overtakes is dropped, or
+    all wait for the one before."""
+
+    def arrivals(rig, rng, t):
+        reached = t + rng.uniform(0.0, JITTER_S, t.shape)
+        if last == "dropped":
+            return np.minimum.accumulate(reached[:, ::-1], axis=1)[:, ::-1]
+        return np.maximum.accumulate(reached, axis=1)
+
+    monkeypatch.setattr(robot_rigs, "arrivals", arrivals)
+
+
+@pytest.mark.parametrize("last", ["dropped", "queued"])
+def test_a_delay_that_jitters_is_told_as_such_without_repeated_commands(tmp_path, monkeypatch, last) -> None:
+    jittering(monkeypatch, last)
+    found = diagnosed(JITTERED, tmp_path)
+    assert [cause.name for cause in found.verdict.causes] == ["control_latency"]
+    (reason,) = [item.reason for item in found.evidence if item.name == "control_latency"]
+    told = re.search(r"changes from command to command by about (\d+) ms", reason)
+    assert told is not None
+    assert 20 <= int(told[1]) <= 45  # uniform up to 120 ms: 35 ms, less what is overtaken or waits
+    low, high = found.verdict.causes[0].params["tau_s"].ci95
+    assert low < 0.053 < high if last == "dropped" else low < 0.069 < high  # mean age of commands in force
+
+
+@pytest.mark.parametrize("latency_s", [0.02, 0.1])
+def test_a_delay_that_is_one_is_not_told_to_change(tmp_path, latency_s) -> None:
+    found = diagnosed(replace(JITTERED, conditions=10, latency_s=latency_s), tmp_path)
+    assert [cause.name for cause in found.verdict.causes] == ["control_latency"]
+    (reason,) = [item.reason for item in found.evidence if item.name == "control_latency"]
+    assert "changes from command to command" not in reason
+    low, high = found.verdict.causes[0].params["tau_s"].ci95
+    assert low < latency_s < high
+    assert high - low < 0.01
 
 
 def test_commands_that_never_come_are_no_delay(tmp_path) -> None:

@@ -9,7 +9,7 @@ import numpy as np
 from lerobot_vtrefine.diagnose.core.problem import OptionalSteps
 from lerobot_vtrefine.diagnose.core.rivals import Rival
 from lerobot_vtrefine.diagnose.core.rules import LEAST_GAIN, RESOLVED
-from lerobot_vtrefine.diagnose.core.search import Selection
+from lerobot_vtrefine.diagnose.core.search import ALL, Selection
 from lerobot_vtrefine.diagnose.core.suspicion import Suspicion
 from lerobot_vtrefine.diagnose.joints import gravity
 from lerobot_vtrefine.diagnose.joints.candidates import CATALOGUE, told_by_load
@@ -165,8 +165,10 @@ class JointProblem(ServoTrials, OptionalSteps):
     def reviewed(
         self, selection: Selection[Any, Fit, Candidate], seed: int
     ) -> Selection[Any, Fit, Candidate]:
-        """With a delay that changes from command to command, where trials of one command differ so."""
-        return with_changing_delay(selection, seed) if not_repeating(selection) else selection
+        """With a delay that changes from command to command, where there is a delay, or trials of one command
+        differ so."""
+        asked = ALL in selection.chosen or not_repeating(selection)
+        return with_changing_delay(selection, seed) if asked else selection
 
     @property
     def can_settle(self) -> bool:
