@@ -37,6 +37,7 @@ def test_a_set_is_what_was_planned(kind: str, effect: str | None, tmp_path: Path
     assert len(sound.trials) == 16
 
 
+@pytest.mark.slow
 def test_a_knee_that_cuts_off_what_only_the_hardest_presses_reach_is_named(tmp_path: Path) -> None:
     """As a converter at its end does: no smaller effect shows anywhere that would tell of it."""
     truth = make(24000, "other", "saturation", 0.4, tmp_path / "set", small=True, form=HARD_KNEE)

@@ -48,6 +48,7 @@ def faces(found) -> list[UnevenFace]:
     return [stage for stage in found.extended_model.stages if isinstance(stage, UnevenFace)]
 
 
+@pytest.mark.slow
 def test_a_late_contact_on_an_uneven_face_is_an_offset_and_users_get_the_face() -> None:
     found = diagnose_pad(recordings(uneven))
     assert (found.verdict.status, names(found)) == ("explained", ["contact_offset"])
@@ -65,6 +66,7 @@ def test_a_face_that_is_even_has_no_map() -> None:
     assert not faces(found)
 
 
+@pytest.mark.slow
 def test_gains_beside_an_offset_stay_gains() -> None:
     found = diagnose_pad(recordings(late_with_gains))
     assert set(names(found)) == {"contact_offset", "taxel_gain_spread"}

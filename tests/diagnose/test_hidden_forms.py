@@ -11,14 +11,14 @@ SEED = 7011
 @pytest.mark.parametrize(
     ("family", "form"),
     [
-        ("nonlinear_stiffness", "densification"),
-        ("contact_offset", "soft"),
-        ("mechanical_spreading", "box"),
         ("crosstalk", "one_sided"),
         ("baseline_drift", "temperature"),
         *(
             pytest.param(*truth, marks=pytest.mark.slow)
             for truth in (
+                ("nonlinear_stiffness", "densification"),
+                ("contact_offset", "soft"),
+                ("mechanical_spreading", "box"),
                 ("scan_skew", "blocks"),
                 ("latency", "filter"),
                 ("hysteresis", "branch"),

@@ -64,14 +64,8 @@ def test_two_causes_at_once_are_both_named(tmp_path, names):
     assert gains["gain"] > 0.85 * gains["oracle_gain"]
 
 
-@pytest.mark.parametrize(
-    "seed",
-    [
-        70250001,
-        pytest.param(70250006, marks=pytest.mark.slow),
-        pytest.param(70261002, marks=pytest.mark.slow),
-    ],
-)
+@pytest.mark.slow
+@pytest.mark.parametrize("seed", [70250001, 70250006, 70261002])
 def test_hardening_with_saturation_is_no_contact_felt_softly(tmp_path, seed):
     # Such a contact, alone or with other bends in rich forms, leaves hardly more squared error than noise.
     names = ("nonlinear_stiffness", "saturation")
@@ -99,7 +93,7 @@ def test_what_no_list_holds_is_said_to_be_unknown(tmp_path, form, size):
         ("direction", 2.0, 5490002, "direction of sliding"),
         ("stick_slip", 1.0, 56330001, "slides"),
         ("thermal_gain", 1.0, 6790000, "temperature"),
-        ("neighbour_pad", 1.0, 30880001, "replicates"),
+        pytest.param("neighbour_pad", 1.0, 30880001, "replicates", marks=pytest.mark.slow),
     ],
 )
 def test_what_few_recordings_show_or_only_their_order_is_unknown_too(tmp_path, form, size, seed, word):
