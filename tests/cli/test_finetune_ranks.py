@@ -87,6 +87,7 @@ def test_one_rank_writes_and_all_are_counted(run: tuple[Path, Path, str]) -> Non
     assert not ranks[0]["generator"].equal(ranks[1]["generator"]), "ranks must explore with different noise"
 
 
+@pytest.mark.slow
 def test_resumed_ranks_end_where_the_uninterrupted_ones_did(
     run: tuple[Path, Path, str], checkpoint: Path, tmp_path: Path
 ) -> None:

@@ -85,6 +85,7 @@ def test_what_is_slow_is_no_hum_and_hum_that_frames_see_as_slow_is_where_clocks_
         assert fires(hum(*asked(times, hums))[0]) == (times is not even)
 
 
+@pytest.mark.slow
 def test_taxels_of_their_own_hum_as_often_as_said() -> None:
     rng, low = np.random.default_rng(7), 0
     for seed in range(40):

@@ -55,6 +55,7 @@ def test_sag_where_the_arm_has_sagged_to_needs_no_offset(tmp_path) -> None:
         assert found.verdict.causes[0].params[f"{joint}_rad"].value == pytest.approx(size, rel=0.004)
 
 
+@pytest.mark.slow
 def test_what_a_stopped_jaw_does_besides_is_not_named(tmp_path) -> None:
     rig = replace(
         FAST,

@@ -95,6 +95,7 @@ def test_commands_that_never_come_are_no_delay(tmp_path) -> None:
     assert found.verdict.status == "unexplained"
 
 
+@pytest.mark.slow
 def test_a_delay_is_fitted_beside_the_play_of_every_joint(tmp_path) -> None:
     # Play has kinks; where one joint's makes a step of the shared delay worse, the others must still move. At
     # 10 Hz play may be left "ambiguous" with friction: this is about the delay and the widths, not that word.
