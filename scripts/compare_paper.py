@@ -9,10 +9,10 @@ MESHES holds ID_plug.obj and ID_socket.obj. Per pair and seed demonstrations are
 touch and with vision only learn from them and are fine-tuned by DPPO, once more from random weights (one step
 of imitation); stock lerobot-eval judges each, always from the table, on episodes that are the same for all.
 
-By --recipe=pads (default) policies see and feel through an encoder, which comes with the package for each
-pair, or, by --encoder=own, learns here, and imitate on features that are computed once. By --recipe=cloud,
-the paper's own network, all of it learns from the demonstrations, by stock lerobot-train. On a GPU noise,
-steps and chain are those of the tables in docs/learning.md.
+By --recipe=cloud (default), the paper's own network, all of it learns from the demonstrations, by stock
+lerobot-train. By --recipe=pads policies see and feel through an encoder, which comes with the package for
+each pair, or, by --encoder=own, learns here, and imitate on features that are computed once. On a GPU noise,
+steps and chain are those of the tables in docs/paper-pairs.md.
 
 Where DPPO practises is --tune_start: on whole episodes (table); from states that the imitation reached with
 both parts in hand, or the expert where it reaches too few (bank); or with parts that are put into the hands
@@ -22,7 +22,7 @@ earlier, counted from the table. --tune_timestep_s=0.005 practises in longer phy
 which policies are judged.
 
 Every evaluation becomes a row of results/paper.json, or of results/demonstrations.json, as soon as it is done
-(by --recipe=cloud of paper_cloud.json and demonstrations_cloud.json). The same command again goes on where
+(by --recipe=pads of paper_pads.json and demonstrations_pads.json). The same command again goes on where
 it was: finished stages are not repeated, nor policies whose rows are there with these numbers of episodes
 and iterations, so that it may go on on another machine.
 """
@@ -35,7 +35,7 @@ from pathlib import Path
 
 from paper.outcome import is_done, row_of
 from paper.stages import TASKS, shared_stages, stages
-from paper.trained import Trained, chosen, table_of, variants
+from paper.trained import PAPERS_OWN, Trained, chosen, table_of, variants
 from runs.side_by_side import run_all
 
 from lerobot_vtrefine.cli.arguments import CommandParser
@@ -62,7 +62,9 @@ def make_parser() -> CommandParser:
         help="numbers to imitate (default: %(default)s)",
     )
     parser.add_argument("--no_scratch", action="store_true", help="leave out DPPO without pre-training")
-    parser.add_argument("--recipe", choices=list(RECIPES), default="pads", help="as vtrefine-demo's")
+    parser.add_argument(
+        "--recipe", choices=list(RECIPES), default=PAPERS_OWN, help="default %(default)s; see above"
+    )
     parser.add_argument(
         "--encoder",
         help="of --recipe=pads; {pair} stands for the pair's number (default: what comes with the package for"
@@ -117,7 +119,10 @@ def side_by_side(options: argparse.Namespace, left: list[Trained]) -> None:
 @run_cli
 def main() -> None:
     """Every policy that has no rows yet, after its encoder and its demonstrations."""
-    options = make_parser().parse_args()
+    parser = make_parser()
+    options = parser.parse_args()
+    if options.encoder and options.recipe == PAPERS_OWN:
+        parser.error(f"--encoder: the network of --recipe={PAPERS_OWN} takes none; add --recipe=pads")
     options.backend = options.backend or ("warp" if options.device == "cuda" else "batch")
     left = [policy for policy in chosen(options) if not is_done(options, policy)]
     shared = {stage.name: stage for policy in left for stage in shared_stages(options, policy)}

@@ -45,7 +45,7 @@ SECTIONS: dict[str, tuple[str, ...]] = {
         "own-cause",
     ),
     "Reference": ("commands", "settings", "recording-format", "verdict", "faq"),
-    "Results": ("results", "learning", "learning-tried", "diagnosis-results"),
+    "Results": ("results", "learning", "paper-pairs", "learning-tried", "diagnosis-results"),
     "Notebooks": ("notebooks/environment", "notebooks/dataset", "notebooks/diagnosis"),
 }
 """Pages by section, also those that may not be there yet; what is not named here comes under More."""

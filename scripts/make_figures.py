@@ -268,7 +268,7 @@ OTHERS: dict[str, Callable[..., None]] = {
     "depth_sensors": draw_depth_sensors,
     "dppo": draw_dppo,
     "rate": draw_rate,
-    **{table: partial(draw_paper, table=table) for table in ("paper", "paper_cloud")},
+    **{table: partial(draw_paper, table=table) for table in ("paper", "paper_pads")},
     "results": draw_results,
     "diagnosis": draw_diagnosis,
     "looks": draw_looks,

@@ -10,6 +10,9 @@ from lerobot_vtrefine.cli.pipeline.demo_config import EVAL_SEED_OFFSET, SEED_STR
 from lerobot_vtrefine.cli.results.published import DEMONSTRATIONS, with_demonstrations
 from lerobot_vtrefine.cli.results.rows import IMITATION, SCRATCH, TUNED
 
+PAPERS_OWN = "cloud"
+"""Recipe of the paper: one cloud of points and taxels, all of whose network learns with the task."""
+
 
 @dataclass(frozen=True)
 class Trained:
@@ -29,8 +32,8 @@ class Trained:
 
     @property
     def suffix(self) -> str:
-        """Tells the recipe in names of files and tables; the pads' goes without."""
-        return "" if self.recipe == "pads" else f"_{self.recipe}"
+        """Tells the recipe in names of files and tables; the paper's own network goes without."""
+        return "" if self.recipe == PAPERS_OWN else f"_{self.recipe}"
 
     @property
     def name(self) -> str:

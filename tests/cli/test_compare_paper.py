@@ -52,9 +52,9 @@ def test_policies_become_rows_of_the_papers_table_and_are_not_made_twice(
 ) -> None:
     monkeypatch.setattr(trained, "MODALITIES", ("visuo_tactile",))
     monkeypatch.setattr("lerobot_vtrefine.cli.pipeline.stages.commit", lambda: "0123abc")
-    told = run("--pairs", "00186", "--encoder=own", "--iterations=60")
+    told = run("--pairs", "00186", "--recipe=pads", "--encoder=own", "--iterations=60")
     assert told.count("done before") == 2  # encoder and demonstrations, which random weights share
-    paper = of(tmp_path / "paper.json")
+    paper = of(tmp_path / "paper_pads.json")
     assert set(paper) == {"imitation", "", "without pre-training"}
     assert (paper[""].success, paper[""].iterations) == (0.75, 60)
     assert paper["without pre-training"].iterations == 20
@@ -63,13 +63,13 @@ def test_policies_become_rows_of_the_papers_table_and_are_not_made_twice(
     assert (paper[""].extra["picked_up"], paper[""].extra["failed_dropped"]) == (0.75, 0.25)
     told = failures({"episodes": 4, "picked_up": None, "failures": {"time-out": 1, "in-hand shift": 2}})
     assert told == {"failed_time_out": 0.25, "failed_in_hand_shift": 0.5}  # as vtrefine-finetune's columns
-    assert not (tmp_path / "demonstrations.json").exists()  # the paper's own number
-    shown = table("paper", [*paper.values()])
+    assert not (tmp_path / "demonstrations_pads.json").exists()  # the paper's own number
+    shown = table("paper_pads", [*paper.values()])
     assert "| DPPO after imitation | automate/00186 | - | 72 | 75 [41, 93] | 94 | - | +22 |" in shown
     shutil.rmtree(tmp_path / "out")  # another machine
-    assert run("--pairs", "00186", "--encoder=own", "--iterations=60") == ""
+    assert run("--pairs", "00186", "--recipe=pads", "--encoder=own", "--iterations=60") == ""
     for change, left in ((["--episodes=12"], 2), (["--scratch_iterations=21"], 1), (["--seeds=1"], 2)):
-        options = parse([*common(tmp_path), "--pairs=00186", "--iterations=60", *change])
+        options = parse([*common(tmp_path), "--pairs=00186", "--recipe=pads", "--iterations=60", *change])
         assert sum(not script.is_done(options, policy) for policy in script.chosen(options)) == left
 
 
@@ -85,14 +85,14 @@ def test_an_imitation_that_was_judged_is_a_row_even_if_its_fine_tuning_never_end
             raise ChildProcessError("the machine was given back")
         run_stage(runner, stage, label)
 
-    asked = ["--pairs=00186", "--no_scratch", "--recipe=cloud"]
+    asked = ["--pairs=00186", "--no_scratch"]
     with monkeypatch.context() as patch:
         patch.setattr(script.StageRunner, "_execute", cut_off)
         patch.setattr(sys, "argv", ["compare_paper.py", *common(tmp_path), *asked])
         assert script.main() != 0
-    assert set(of(tmp_path / "paper_cloud.json")) == {"imitation"}
+    assert set(of(tmp_path / "paper.json")) == {"imitation"}
     assert run(*asked).count("done before") == 3  # demonstrations, imitation, its evaluation
-    assert set(of(tmp_path / "paper_cloud.json")) == {"imitation", ""}
+    assert set(of(tmp_path / "paper.json")) == {"imitation", ""}
 
 
 @pytest.mark.usefixtures("fake_commands")
@@ -101,29 +101,29 @@ def test_the_papers_own_network_has_tables_of_its_own_and_shares_the_demonstrati
 ) -> None:
     monkeypatch.setattr(trained, "MODALITIES", ("visuo_tactile",))
     asked = ["--pairs", "00186", "--no_scratch", "--demonstrations", "10", "30"]
-    run(*asked)
-    pads = (tmp_path / "paper.json").read_text(), (tmp_path / "demonstrations.json").read_text()
-    told = run(*asked, "--recipe=cloud")
+    run(*asked, "--recipe=pads")
+    pads = [(tmp_path / f"{name}_pads.json").read_text() for name in ("paper", "demonstrations")]
+    told = run(*asked)
     assert [line.split()[2] for line in told.splitlines() if "done before" in line] == [
         "demos_00186_0_10",
         "demos_00186_0_30",
     ]
-    assert set(of(tmp_path / "paper_cloud.json")) == {"imitation", ""}
-    assert set(of(tmp_path / "demonstrations_cloud.json")) == {
+    assert set(of(tmp_path / "paper.json")) == {"imitation", ""}
+    assert set(of(tmp_path / "demonstrations.json")) == {
         "10 demonstrations, imitation",
         "10 demonstrations",
     }
-    assert pads == ((tmp_path / "paper.json").read_text(), (tmp_path / "demonstrations.json").read_text())
-    rows = [row for path in tmp_path.glob("*_cloud.json") for row in read_rows(path)]
-    assert "| DPPO after imitation | automate/00186 | - | 72 | 75 [41, 93] |" in table("paper_cloud", rows)
-    shown = table("demonstrations_cloud", rows)
+    assert pads == [(tmp_path / f"{name}_pads.json").read_text() for name in ("paper", "demonstrations")]
+    rows = [row for path in tmp_path.glob("*.json") for row in read_rows(path)]
+    assert "| DPPO after imitation | automate/00186 | - | 72 | 75 [41, 93] |" in table("paper", rows)
+    shown = table("demonstrations", rows)
     assert "| DPPO after imitation | 10 |" in shown
     assert "| DPPO after imitation | 30 |" in shown
-    assert run(*asked, "--recipe=cloud") == ""
+    assert run(*asked) == ""
 
 
 def test_the_papers_own_network_learns_as_a_whole_and_acts_as_often_as_the_other_on_a_gpu() -> None:
-    options = parse(["--mesh_dir=meshes", "--pairs=00186", "--seeds=0", "--backend=warp", "--recipe=cloud"])
+    options = parse(["--mesh_dir=meshes", "--pairs=00186", "--seeds=0", "--backend=warp"])
     for policy in script.chosen(options):
         _, imitation, *_, finetune, _ = script.stages(options, policy)
         assert imitation.command[0] == "lerobot-train"
@@ -143,12 +143,12 @@ def test_pairs_side_by_side_wait_for_their_own_encoder_only(
         )
 
     monkeypatch.setattr(script, "run_all", note)
-    run("--pairs", *PAIRS, "00186", "--encoder=own", "--no_scratch", "--jobs=9")
+    run("--pairs", *PAIRS, "00186", "--recipe=pads", "--encoder=own", "--no_scratch", "--jobs=9")
     ((names, needs),) = asked
     assert names[:3] == [f"encoder_{pair}" for pair in (*PAIRS, "00186")]  # the longest first
     assert names[3:6] == [f"demos_{pair}_0_30" for pair in (*PAIRS, "00186")]
     assert set(names[6:]) == set(needs)
-    assert needs["00581_visual_0_30"] == ["encoder_00581", "demos_00581_0_30"]
+    assert needs["00581_visual_0_30_pads"] == ["encoder_00581", "demos_00581_0_30"]
 
 
 def test_dppo_may_start_in_hand_where_hands_can_hold_and_is_judged_from_the_table() -> None:
@@ -156,6 +156,7 @@ def test_dppo_may_start_in_hand_where_hands_can_hold_and_is_judged_from_the_tabl
         [
             "--mesh_dir=meshes",
             "--tune_start=grasped",
+            "--recipe=pads",
             '--policy={"freeze_encoder": false}',
             "--encoder=outputs/{pair}",
             "--pairs",
@@ -208,7 +209,9 @@ def test_dppo_may_practise_in_longer_physics_steps_than_those_it_is_judged_in(tm
 
 
 def test_an_encoder_of_ones_own_is_trained_from_the_table_and_policies_learn_on_its_features() -> None:
-    options = parse(["--mesh_dir=meshes", "--pairs=00446", "--seeds=0", "--output_dir=out", "--encoder=own"])
+    options = parse(
+        ["--mesh_dir=meshes", "--pairs=00446", "--recipe=pads", "--output_dir=out", "--encoder=own"]
+    )
     for policy in script.chosen(options):
         encoder, record, imitation, *_ = script.stages(options, policy)
         assert "--config_path=vtrefine:automate_00446" in encoder.line
@@ -220,7 +223,7 @@ def test_an_encoder_of_ones_own_is_trained_from_the_table_and_policies_learn_on_
 
 
 def test_a_pairs_encoder_that_comes_with_the_package_is_taken_and_on_a_gpu_the_tables_recipe() -> None:
-    options = parse(["--mesh_dir=meshes", "--pairs=00186", "--seeds=0", "--backend=warp", "--output_dir=out"])
+    options = parse(["--mesh_dir=meshes", "--pairs=00186", "--recipe=pads", "--backend=warp"])
     for policy in script.chosen(options):
         record, imitation, *_, finetune, _ = script.stages(options, policy)
         assert imitation.needs == (record.name,)
@@ -229,14 +232,24 @@ def test_a_pairs_encoder_that_comes_with_the_package_is_taken_and_on_a_gpu_the_t
         assert "--dppo.type=trust_region --dppo.sampler=ddim" in finetune.line.replace(
             "--dppo.encoder=frozen ", ""
         )
-    own = parse(["--mesh_dir=meshes", "--pairs=00186", "--seeds=0", "--encoder=own", "--output_dir=out"])
+    own = parse(["--mesh_dir=meshes", "--pairs=00186", "--recipe=pads", "--encoder=own"])
     encoder, *_ = script.stages(own, script.chosen(own)[0])
     assert encoder.name == "encoder_00186"
 
 
+def test_the_papers_own_network_has_no_encoder_to_name(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setattr(sys, "argv", ["compare_paper.py", "--mesh_dir=meshes", "--encoder=own"])
+    assert script.main() != 0
+    told = capsys.readouterr().err
+    assert told.startswith("error: --encoder")
+    assert "--recipe=pads" in told
+
+
 def test_an_encoder_that_is_named_is_taken_in_place_of_one_trained_here() -> None:
     for given in ("--encoder=mine", '--policy={"pretrained_encoder": "mine"}'):
-        options = parse(["--mesh_dir=meshes", "--pairs=00446", "--seeds=0", given])
+        options = parse(["--mesh_dir=meshes", "--pairs=00446", "--recipe=pads", given])
         for policy in script.chosen(options):
             record, imitation, *_ = script.stages(options, policy)
             assert imitation.needs == (record.name,)

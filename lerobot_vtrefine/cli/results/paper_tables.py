@@ -51,7 +51,7 @@ def paper_table(rows: Sequence[Run]) -> str:
 def by_demonstrations(rows: Sequence[Row], suffix: str = "") -> list[Run]:
     """Those of its own, and of the paper's table those of the same pairs: they learnt from its number.
 
-    ``suffix``, as of ``_cloud``, tells the tables of another recipe.
+    ``suffix``, as of ``_pads``, tells the tables of another recipe.
     """
     runs = [row for row in rows if isinstance(row, Run)]
     own = [row for row in runs if row.table == f"demonstrations{suffix}"]

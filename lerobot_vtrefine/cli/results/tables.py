@@ -257,8 +257,8 @@ RENDERERS: dict[str, Callable[[Sequence], str]] = (
     | dict.fromkeys(Line.TABLES, lines_table)
     | {"demo": demo_table, "touch": touch_table, "reality": reality_table}
     | {"expert": expert_table, "policies": policies_table}
-    | dict.fromkeys(("paper", "paper_cloud"), paper_table)
-    | dict.fromkeys(("demonstrations", "demonstrations_cloud"), demonstrations_table)
+    | dict.fromkeys(("paper", "paper_pads"), paper_table)
+    | dict.fromkeys(("demonstrations", "demonstrations_pads"), demonstrations_table)
     | {"handling": handling_table, "senses": senses_table}
     | {"reference": reference_table}
 )
@@ -267,7 +267,7 @@ DERIVED: dict[str, Callable[[Sequence[Row]], list[Run]]] = {
     "handling": measured,
     "senses": converging,
     "demonstrations": by_demonstrations,
-    "demonstrations_cloud": partial(by_demonstrations, suffix="_cloud"),
+    "demonstrations_pads": partial(by_demonstrations, suffix="_pads"),
 }
 """Tables that show rows of another one."""
 
