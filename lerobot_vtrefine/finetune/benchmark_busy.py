@@ -19,9 +19,9 @@ from lerobot_vtrefine.datasets.features import ACTION_KEY, STATE_KEY
 from lerobot_vtrefine.embodiments import DEFAULT_BODY, get_embodiment
 from lerobot_vtrefine.envs.config import VtRefineEnvConfig
 from lerobot_vtrefine.envs.decisions import LeRobotDecisionEnv, make_decision_env
+from lerobot_vtrefine.finetune.agents import make_agent
 from lerobot_vtrefine.finetune.config import SmallDppo
 from lerobot_vtrefine.finetune.dppo import TrainState, collect, update
-from lerobot_vtrefine.finetune.pipeline import make_agent
 from lerobot_vtrefine.finetune.protocols import Agent
 from lerobot_vtrefine.policies.vt_dp3.configuration_vt_dp3 import VtDp3Config
 from lerobot_vtrefine.policies.vt_dp3.modeling_vt_dp3 import VtDp3Policy

@@ -1,7 +1,6 @@
 """``vtrefine-finetune``: connects DPPO to a ``vt_dp3`` checkpoint, an environment and an output folder."""
 
 import copy
-import json
 import logging
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass, field, replace
@@ -22,6 +21,7 @@ from tqdm import tqdm
 from lerobot_vtrefine.envs.config import VtRefineEnvConfig
 from lerobot_vtrefine.envs.decisions import LeRobotDecisionEnv, make_decision_env
 from lerobot_vtrefine.files import read_json, read_yaml
+from lerobot_vtrefine.finetune.agents import check_same_chain, load_policy, make_agent
 from lerobot_vtrefine.finetune.checkpoint import (
     Saveable,
     claimed,
@@ -168,62 +168,6 @@ def check_resumable(cfg: FinetunePipelineConfig, checkpoint: Path) -> None:
             )
 
 
-def load_policy(path: Path, overrides: list[str] | None = None) -> VtDp3Policy:
-    """Load a ``vt_dp3`` checkpoint with these flags, by default the command line's ``--policy.*``.
-
-    Raises: ValueError for a checkpoint of another policy type, FileNotFoundError where there is none.
-    """
-    if overrides is None:
-        overrides = parser.get_yaml_overrides("policy") + (parser.get_cli_overrides("policy") or [])
-    try:
-        config = PreTrainedConfig.from_pretrained(path, cli_overrides=overrides)
-    except json.JSONDecodeError as error:
-        raise ValueError(f"{path}: config.json is not valid JSON ({error})") from error
-    except (OSError, ValueError) as error:  # what the Hub says of a folder that is not there is no help
-        if path.is_dir():
-            raise
-        raise FileNotFoundError(
-            f"no checkpoint at --policy.path={path}: neither a folder (.../pretrained_model) nor a model on"
-            " the Hub"
-        ) from error
-    if not isinstance(config, VtDp3Config):
-        raise ValueError(f"{path} holds a policy of type {config.type}; vtrefine-finetune needs vt_dp3")
-    if config.use_peft:
-        raise ValueError(f"{path} holds adapters (--peft.*) only; vtrefine-finetune needs all weights")
-    return VtDp3Policy.from_pretrained(path, config=config)
-
-
-def make_agent(policy: VtDp3Policy, dppo: DppoConfig) -> Agent:
-    """The tuned and the frozen network of a policy, and the sampler of rollouts and deployment.
-
-    A pre-trained policy is made ready for DPPO first; a checkpoint of a DPPO run is so already.
-    """
-    if not policy.config.ft_denoising_steps:
-        policy.prepare_finetuning(
-            sampler=dppo.sampler,
-            num_inference_steps=dppo.sampler_steps,
-            prefix_steps=dppo.prefix_steps,
-            ft_denoising_steps=dppo.ft_denoising_steps,
-            eta=dppo.deploy_eta,
-            freeze_encoder=dppo.encoder == "frozen",
-        )
-    policy.eval()
-    config = policy.config
-    if policy.base is None:
-        raise ValueError("the policy has no frozen base network")
-    return Agent(
-        actor=policy.model,
-        base=policy.base,
-        process=policy.process,
-        num_tuned=config.ft_denoising_steps,
-        action_shape=(config.horizon, config.action_dim),
-        executed=slice(0, config.n_action_steps),
-        frozen_encoder=config.ft_freeze_encoder,
-        deploy_eta=config.ft_eta,
-        deploy_correlation=config.ft_noise_correlation,
-    )
-
-
 class Practice(NamedTuple):
     """A policy made ready for DPPO, and where it practises."""
 
@@ -368,10 +312,8 @@ def run(cfg: FinetunePipelineConfig) -> None:
     claim_gpu()
     policy = load_policy(path)
     if checkpoint is None and policy.config.ft_denoising_steps:
-        raise ValueError(
-            f"{path} is fine-tuned already; start from the pre-trained checkpoint, or go on with its run by"
-            " --resume=true --output_dir=FOLDER"
-        )
+        check_same_chain(cfg.dppo, policy.config)
+        policy.config.ft_eta = cfg.dppo.deploy_eta
     device = torch.device(policy.config.device or "cpu")
     join_ranks(device)
     set_seed(cfg.seed + rank_index())

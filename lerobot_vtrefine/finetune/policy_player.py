@@ -7,10 +7,11 @@ import torch
 
 from lerobot_vtrefine.envs.config import VtRefineEnvConfig
 from lerobot_vtrefine.envs.episodes import Episodes
+from lerobot_vtrefine.finetune.agents import load_policy
 from lerobot_vtrefine.finetune.config import PaperDppo
 from lerobot_vtrefine.finetune.evaluation import deployed_chunks
 from lerobot_vtrefine.finetune.noise import policy_noise
-from lerobot_vtrefine.finetune.pipeline import load_policy, make_practice
+from lerobot_vtrefine.finetune.pipeline import make_practice
 from lerobot_vtrefine.finetune.protocols import Observation, execute, select, start
 
 

@@ -294,6 +294,24 @@ def test_a_finished_run_resumes_to_nothing(finetune, tmp_path):
     assert (output / "progress.csv").read_text() == before
 
 
+def test_a_tuned_policy_may_practise_on_elsewhere_with_a_critic_of_its_own(finetune, tmp_path, capsys):
+    assert finetune(tmp_path / "home", iterations=2) == 0
+    tuned = tmp_path / "home" / "checkpoints" / "last" / "pretrained_model"
+    before = tensors(tmp_path / "home", "last")
+    assert finetune(tmp_path / "away", "--seed=5", policy=tuned, iterations=2) == 0
+    after = tensors(tmp_path / "away", "last")
+    kept = {name for name in before if torch.equal(before[name], after[name])}
+    assert kept >= {name for name in before if name.startswith("base.")} > set()
+    assert {name for name in before if name.startswith("model.denoiser.")} - kept
+    assert [row["iteration"] for row in read_progress(tmp_path / "away")][-1] == 2
+    capsys.readouterr()
+    other = ["--dppo.sampler=ddim", "--dppo.sampler_steps=7", "--dppo.ft_denoising_steps=7"]
+    assert finetune(tmp_path / "other", *other, policy=tuned) == 2
+    told = capsys.readouterr().err.strip().splitlines()[-1]
+    assert "--dppo.sampler=tail --dppo.sampler_steps=10" in told
+    assert "pre-trained checkpoint" in told
+
+
 def test_bad_input_is_one_clear_line(finetune, tmp_path, capsys):
     def complaint(*arguments: str, **options) -> str:
         assert finetune(tmp_path / "bad", *arguments, **options) == 2
@@ -309,9 +327,6 @@ def test_bad_input_is_one_clear_line(finetune, tmp_path, capsys):
     damaged = save_tiny_checkpoint(tmp_path / "damaged")
     (damaged / "config.json").write_text("{")
     assert f"{damaged}: config.json is not valid JSON" in complaint(policy=damaged)
-    assert finetune(tmp_path / "run", iterations=1) == 0
-    tuned = tmp_path / "run" / "checkpoints" / "last" / "pretrained_model"
-    assert "fine-tuned already" in complaint(policy=tuned)
     other = "--env.scene.embodiment=kinova"
     assert f"{other}, but the policy is of aloha: name an environment" in complaint(other)
 

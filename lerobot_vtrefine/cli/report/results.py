@@ -140,7 +140,7 @@ def verdict(before: dict[str, Any], after: dict[str, Any]) -> str:
     else:
         words, overlap = "DPPO did not clearly change", "the 95 % intervals overlap"
     rates = f"success went from {percent(before)} to {percent(after)}"
-    said = f"{words} the imitation-learned policy: {rates}; {overlap}."
+    said = f"{words} the policy it began with: {rates}; {overlap}."
     few = min(before["episodes"], after["episodes"]) < FEW_EPISODES
     return f"{said} With so few episodes this shows that everything works, and no more." if few else said
 
