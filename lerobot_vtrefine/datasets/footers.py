@@ -7,6 +7,7 @@ in the compact protocol (https://github.com/apache/thrift/blob/master/doc/specs/
 """
 
 import struct
+from collections.abc import Iterator
 from dataclasses import dataclass, field
 from io import BytesIO
 from math import prod
@@ -20,6 +21,9 @@ from lerobot.datasets.feature_utils import get_hf_features_from_features
 MAGIC = b"PAR1"
 TRUE, FALSE, BYTE, I16, I32, I64, DOUBLE, BINARY, LIST, SET, MAP, STRUCT = range(1, 13)
 DATA_PAGE, DICTIONARY_PAGE = 0, 2
+
+BROKEN = (pa.ArrowException, OSError)
+"""What reading a damaged file raises."""
 
 Struct = dict[int, tuple[int, Any]]
 """Field number -> type and value; a list is (type of its elements, elements)."""
@@ -51,19 +55,20 @@ def read_without_footer(path: Path, features: dict[str, Any]) -> list[pa.Table |
     text = _encode(footer)
     whole = data[:end] + text + struct.pack("<I", len(text)) + MAGIC
     with pq.ParquetFile(pa.BufferReader(whole)) as file:
-        found = read_groups(file)
-    return [None if table is None else table.replace_schema_metadata(schema.metadata) for table in found]
+        found = list(read_groups(file))
+    return [None if group is None else group.replace_schema_metadata(schema.metadata) for group in found]
 
 
-def read_groups(file: pq.ParquetFile) -> list[pa.Table | None]:
-    """Every row group of a file, None in place of one of which a page is damaged."""
-    found: list[pa.Table | None] = []
+def read_groups(file: pq.ParquetFile) -> Iterator[pa.Table | None]:
+    """Every row group of a file, None in place of one of which a page is damaged; each is read when asked
+    for, as images can be large.
+    """
     for number in range(file.num_row_groups):
         try:
-            found.append(file.read_row_group(number))
-        except (pa.ArrowException, OSError):
-            found.append(None)
-    return found
+            group = file.read_row_group(number)
+        except BROKEN:
+            group = None
+        yield group
 
 
 @dataclass

@@ -14,7 +14,7 @@ from lerobot.datasets.utils import DATA_DIR, DEFAULT_TASKS_PATH, EPISODES_DIR, I
 
 from lerobot_vtrefine.files import decode, limits, read_json
 from lerobot_vtrefine.files.tables import read_columns
-from lerobot_vtrefine.lerobot_compat.episode_tables import check_tasks, episodes, tables
+from lerobot_vtrefine.lerobot_compat.episode_tables import check_statistics, check_tasks, episodes, tables
 
 ASK = "is the copy complete?"
 
@@ -45,6 +45,7 @@ def check_complete(root: Path) -> None:
         found = {int(index) for path in tables(root / name) for index in np.unique(episodes(path))}
         if missing := sorted(set(range(announced)) - found):
             raise FileNotFoundError(f"the files in {root / name} lack episode {missing[0]}; {ASK}")
+    check_statistics(root)
     meta = LeRobotDatasetMetadata("local/complete", root)
     for path in (meta.get_video_file_path(i, key) for i in range(announced) for key in meta.video_keys):
         if not (root / path).is_file():

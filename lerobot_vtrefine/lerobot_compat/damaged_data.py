@@ -11,7 +11,7 @@ import pyarrow.parquet as pq
 from lerobot.datasets.io_utils import write_table_one_row_group_per_episode
 from lerobot.datasets.utils import DATA_DIR
 
-from lerobot_vtrefine.datasets.footers import read_groups, read_without_footer
+from lerobot_vtrefine.datasets.footers import BROKEN, read_groups, read_without_footer
 from lerobot_vtrefine.lerobot_compat.episode_tables import episodes, tables
 from lerobot_vtrefine.whole_files import whole_file
 
@@ -19,9 +19,6 @@ logger = logging.getLogger(__name__)
 
 ASIDE = ".unreadable"
 """What the name of the folder beside the dataset ends in, which takes files that cannot be read."""
-
-BROKEN = (pa.ArrowException, OSError)
-"""What reading a damaged file raises."""
 
 
 def aside_of(root: Path) -> Path:
@@ -84,23 +81,15 @@ def _opens(path: Path) -> bool:
 def _reads(path: Path) -> bool:
     if not _opens(path):
         return False
-    with pq.ParquetFile(path) as file:  # one group at a time: images can be large
-        return all(_group_reads(file, number) for number in range(file.num_row_groups))
-
-
-def _group_reads(file: pq.ParquetFile, number: int) -> bool:
-    try:
-        file.read_row_group(number)
-    except BROKEN:
-        return False
-    return True
+    with pq.ParquetFile(path) as file:
+        return all(group is not None for group in read_groups(file))
 
 
 def _groups(path: Path, features: dict[str, Any]) -> list[pa.Table | None]:
     if not _opens(path):
         return read_without_footer(path, features)
     with pq.ParquetFile(path) as file:
-        return read_groups(file)
+        return list(read_groups(file))
 
 
 def _check_nothing_follows(files: list[Path], damaged: dict[Path, list[pa.Table | None]]) -> None:

@@ -34,15 +34,15 @@ from lerobot.datasets.utils import (
 )
 from numpy.typing import NDArray
 
+from lerobot_vtrefine.datasets.footers import BROKEN
 from lerobot_vtrefine.lerobot_compat.damaged_data import (
-    BROKEN,
     aside_of,
     mend_data,
     set_aside,
     write_data,
 )
 from lerobot_vtrefine.lerobot_compat.episode_rows import Row, describe_episodes, video_keys, video_length_s
-from lerobot_vtrefine.lerobot_compat.episode_tables import check_tasks, episodes, tables
+from lerobot_vtrefine.lerobot_compat.episode_tables import check_statistics, check_tasks, episodes, tables
 from lerobot_vtrefine.lerobot_compat.safe_metadata import write_info, write_stats
 from lerobot_vtrefine.whole_files import PART
 from lerobot_vtrefine.wording import plural
@@ -77,14 +77,15 @@ def recover(root: Path) -> Recovery:
     """Put the dataset at ``root`` in order.
 
     Raises:
-        ValueError: its description is missing or damaged, or data in its middle is; the message says what
-            to do.
+        ValueError: its description is missing or damaged, or data in its middle is, or an episode's
+            statistics are; the message says what to do.
         FileNotFoundError: the tasks' names are missing, for which LeRobot would take the description of the
             Hub's dataset of this name in place of this one's.
     """
     info = _read_info(root)
     if info.total_tasks:
         check_tasks(root)
+    check_statistics(root)
     return tidy(root, mend_data(root, info.features))
 
 

@@ -10,6 +10,7 @@ import pytest
 from lerobot.datasets.lerobot_dataset import LeRobotDataset
 
 from lerobot_vtrefine.lerobot_compat import safe_recording
+from lerobot_vtrefine.lerobot_compat.completeness import check_complete
 from lerobot_vtrefine.lerobot_compat.recovery import recover
 
 REPO = "local/damaged"
@@ -112,6 +113,21 @@ def test_an_episode_that_is_damaged_before_whole_ones_is_told_and_nothing_change
     assert contents(root) == before
     path.write_bytes(whole)
     assert recover(root).episodes == EPISODES
+
+
+def test_damaged_statistics_are_told_and_can_be_made_anew(tmp_path: Path) -> None:
+    root = tmp_path / "dataset"
+    record(root, safely=True)
+    path = root / "meta/episodes/chunk-000/file-001.parquet"
+    damage(path, "stats/action/mean", 0)
+    before = contents(root)
+    for check in (recover, check_complete):
+        with pytest.raises(ValueError, match=f"{path}: the statistics in it are damaged, .* put a copy"):
+            check(root)
+    assert contents(root) == before
+    path.rename(tmp_path / "elsewhere.parquet")  # as the message advises
+    assert recover(root).episodes == EPISODES
+    kept(root, [0, 1, 2, 3])
 
 
 def test_a_session_without_footer_keeps_what_is_before_the_damage(tmp_path: Path) -> None:
