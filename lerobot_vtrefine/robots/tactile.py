@@ -37,6 +37,7 @@ class Tactile(Robot):
         self.pads = PadSet(dict(sorted(pads.items())))
         extend_lerobot(self.pads.configs)
         self._camera_models = CameraModels(config.camera_models, self.cameras)
+        self._connected = False
         # LeRobot stores the name with a dataset, and asks for the type when a recording is resumed.
         self.name = self.robot_type = f"{Tactile.name}_{self.base.name}"
 
@@ -61,8 +62,12 @@ class Tactile(Robot):
 
     @property
     def is_connected(self) -> bool:
-        """Whether robot and pads are connected."""
-        return self.base.is_connected and self.pads.is_connected
+        """Whether `connect` succeeded; it stays so when something is lost.
+
+        LeRobot's commands disconnect only what is connected, and its own robots no longer count as that once
+        a camera of theirs died: the motors' port would stay open, with torque on.
+        """
+        return self._connected
 
     @check_if_already_connected
     def connect(self, calibrate: bool = True) -> None:
@@ -77,9 +82,9 @@ class Tactile(Robot):
             self.base.connect(calibrate)
             self._camera_models.connected()
         except BaseException:
-            release(self.base)
-            self.pads.disconnect()
+            self._release()
             raise
+        self._connected = True
 
     @property
     def is_calibrated(self) -> bool:
@@ -120,13 +125,17 @@ class Tactile(Robot):
         return self.base.send_action(action)
 
     def disconnect(self) -> None:
-        """Disconnect the robot, then the pads, also after a failure in between."""
+        """Disconnect the robot, then the pads, also after a failure in between or where a part was lost."""
         try:
             if self.base.is_connected:
                 self.base.disconnect()
         finally:
-            release(self.base)
-            self.pads.disconnect()
+            self._release()
+
+    def _release(self) -> None:
+        self._connected = False
+        release(self.base)
+        self.pads.disconnect()
 
 
 def base_config(config: TactileConfig) -> RobotConfig:

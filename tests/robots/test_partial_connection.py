@@ -88,3 +88,32 @@ def test_motors_that_do_not_answer_leave_no_port_open(
         robot.connect(calibrate=False)
     assert not robot.base.bus.is_connected
     assert not robot.pads.is_connected
+
+
+class DyingCamera:
+    """A camera that is unplugged while the robot runs."""
+
+    is_connected = False
+
+    def connect(self) -> None:
+        self.is_connected = True
+
+    def disconnect(self) -> None:
+        self.is_connected = False
+
+
+def test_a_camera_that_dies_in_a_session_does_not_keep_the_motors_on(
+    tmp_path: Path, board: PadEmulator, bus: DynamixelEmulator
+) -> None:
+    robot = koch_with_pad(tmp_path, board, bus)
+    camera = robot.base.cameras["wrist"] = DyingCamera()
+    robot.connect(calibrate=False)
+    bus.motors[1].store(64, 1, 1)
+    camera.is_connected = False
+    assert not robot.base.is_connected  # so LeRobot would leave it as it is
+    if robot.is_connected:  # as LeRobot's commands end
+        robot.disconnect()
+    assert not robot.is_connected
+    assert not robot.base.bus.is_connected
+    assert not robot.pads.is_connected
+    assert not bus.motors[1].torque
