@@ -18,20 +18,22 @@ REGISTERING = (
     "lerobot_vtrefine.policies.vt_dp3",
 )
 """Packages whose import registers their types."""
-READER = "lerobot_vtrefine.lerobot_compat.fast_reader"
+INSTALLED = (
+    "lerobot_vtrefine.lerobot_compat.fast_reader",
+    "lerobot_vtrefine.lerobot_compat.training_rate",
+)
+"""What is for every policy: LeRobot's own train on this package's data and in its environment, too."""
 LOCAL = "local/"
 """Names of datasets that are on no Hub."""
 READ_DATASETS = ("lerobot-train", "lerobot-replay")
 
 
 def register() -> None:
-    """Register all types with LeRobot, which it imports; idempotent.
-
-    LeRobot's own policies train on this package's data, too, so its reader is installed for whatever comes.
-    """
+    """Register all types with LeRobot, which it imports; idempotent."""
     for name in REGISTERING:
         importlib.import_module(name)
-    importlib.import_module(READER).install()
+    for name in INSTALLED:
+        importlib.import_module(name).install()
 
 
 def refuse_missing_dataset() -> None:

@@ -149,4 +149,11 @@ SEAMS = (
         "robots with pads, when they are made",
         "warns and records LeRobot's way",
     ),
+    Seam(
+        "training_rate",
+        ("lerobot.scripts.lerobot_train.make_train_eval_datasets",),
+        "lerobot-train evaluates at any --env.fps, whatever the dataset's",
+        "LeRobot's commands, when they discover plugins",
+        "leaves the check out",
+    ),
 )

@@ -152,6 +152,13 @@ def safe_recording_(folder: Path) -> None:
     dataset.finalize()
 
 
+@probe
+def training_rate_(_: Path) -> None:
+    from lerobot.scripts import lerobot_train
+
+    assert "fps" not in inspect.getsource(lerobot_train)
+
+
 def small_dataset(folder: Path) -> LeRobotDataset:
     """One saved episode of a session that has not ended."""
     features = {"observation.state": {"dtype": "float32", "shape": (2,), "names": ["a", "b"]}}

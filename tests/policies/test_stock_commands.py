@@ -1,5 +1,6 @@
 """LeRobot's own commands on a tiny dataset: train, resume, start from a checkpoint, two processes, edit."""
 
+import importlib
 import json
 import os
 import shutil
@@ -12,6 +13,7 @@ import pytest
 from lerobot.datasets.lerobot_dataset import LeRobotDataset
 from safetensors import safe_open
 
+from lerobot_vtrefine import register
 from lerobot_vtrefine.policies.vt_dp3.modeling_vt_dp3 import VtDp3Policy
 
 BIN = Path(sys.executable).parent
@@ -157,6 +159,16 @@ def test_two_processes_train_one_policy(tiny_dataset: Path, tmp_path: Path) -> N
     )
     assert "4 x 2 = 8" in printed
     assert average_steps(tmp_path / "run" / "checkpoints" / "000004") == 4
+
+
+def test_evaluations_at_another_rate_are_refused_before_training(
+    tiny_dataset: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    importlib.import_module("lerobot.scripts.lerobot_train")
+    register()  # as the command does, which imports this package when it discovers plugins
+    run = (*TINY, *RUN, *data(tiny_dataset), f"--output_dir={tmp_path / 'run'}", "--steps=1")
+    with pytest.raises(SystemExit, match=r"error: --env\.fps=20, but the dataset holds 10 actions a second"):
+        train_here(monkeypatch, *run, "--env.type=vtrefine", "--env.fps=20")
 
 
 def test_training_without_pads_says_what_is_missing(
