@@ -23,6 +23,7 @@ from lerobot_vtrefine.lerobot_compat.calibration_file import WholeCalibrationFil
 from lerobot_vtrefine.lerobot_compat.pad_features import configured_pads, pad_features
 from lerobot_vtrefine.robots.camera_models import CameraModels
 from lerobot_vtrefine.robots.config_aloha_tactile_follower import AlohaTactileFollowerConfig
+from lerobot_vtrefine.robots.cut_commands import CutCommands
 from lerobot_vtrefine.robots.extensions import extend_lerobot
 from lerobot_vtrefine.robots.pad_reading import pad_observation
 
@@ -58,6 +59,8 @@ class AlohaTactileFollower(WholeCalibrationFile, Robot):
         extend_lerobot(self.pads.configs)
         self.cameras = make_cameras_from_configs(config.cameras)
         self._camera_models = CameraModels(config.camera_models, self.cameras)
+        limits = f"the joints' limits and --robot.max_step_rad={config.max_step_rad:g}"
+        self._cuts = CutCommands(self.body, limits)
         self._connected = False
 
     # --- features -----------------------------------------------------------------------------------
@@ -138,6 +141,8 @@ class AlohaTactileFollower(WholeCalibrationFile, Robot):
                 self._rest()
         finally:
             self._release()
+            if told := self._cuts.describe():
+                logger.warning("%s", told)
 
     def _rest(self) -> None:
         for arm in self.pair.arms.values():
@@ -213,7 +218,9 @@ class AlohaTactileFollower(WholeCalibrationFile, Robot):
             target = np.clip(wanted[part], self.body.lower[part], self.body.upper[part])
             sent.append(limit_step(target, arm.recent(RECENT_S), self.config.max_step_rad))
             arm.write(sent[-1])
-        return dict(zip(self.action_features, map(float, np.concatenate(sent)), strict=True))
+        targets = np.concatenate(sent)
+        self._cuts.count(wanted, targets)
+        return dict(zip(self.action_features, map(float, targets), strict=True))
 
 
 def limit_step(target: Floats, present: Floats, max_step_rad: float) -> Floats:

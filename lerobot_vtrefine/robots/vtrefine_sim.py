@@ -34,6 +34,7 @@ from lerobot_vtrefine.extras import SIMULATOR, require
 from lerobot_vtrefine.lerobot_compat import phases
 from lerobot_vtrefine.lerobot_compat.arrays import ArraySpec
 from lerobot_vtrefine.robots.config_vtrefine_sim import VtRefineSimConfig
+from lerobot_vtrefine.robots.cut_commands import CutCommands
 from lerobot_vtrefine.robots.extensions import extend_lerobot
 from lerobot_vtrefine.robots.simulated_pace import Pace
 from lerobot_vtrefine.wording import plural
@@ -67,6 +68,7 @@ class VtRefineSim(Robot):
         phases.install()
         self._world: LiveWorld | None = None
         self._pace = Pace(1.0 / config.fps)
+        self._cuts = CutCommands(self.body, "the joints' limits and rates")
         self._viewer: Any = None
         self._in_phase = False
         self._events: dict[str, bool] | None = None
@@ -138,6 +140,8 @@ class VtRefineSim(Robot):
         """End the simulation, and note the outcome of the last episode if it was saved."""
         self._note_outcome()
         self._tell_pace()
+        if told := self._cuts.describe():
+            logger.warning("%s", told)
         if self._viewer is not None:
             self._viewer.close()
         self._world = self._viewer = None
@@ -175,6 +179,7 @@ class VtRefineSim(Robot):
         waits = self._waiting_steps > 0
         if not waits:
             self.world.step(wanted)
+            self._cuts.count(wanted, self.world.sim.command_targets()[0])
         if self._viewer is not None:
             self._viewer.update()
         self._pace.step_done(time.perf_counter() - began + self._observing_s)

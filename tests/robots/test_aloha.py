@@ -66,12 +66,21 @@ def test_targets_arrive_in_counts_and_shadows_follow(follower: AlohaTactileFollo
     assert round(rig.motor("follower", "right", 9).shaft) == GRIPPER_ENDS[VIPERX_300S][1]
 
 
-def test_far_targets_are_cut_to_a_step_and_to_the_limits(follower: AlohaTactileFollower) -> None:
+def test_far_targets_are_cut_to_a_step_and_to_the_limits(
+    follower: AlohaTactileFollower, caplog: pytest.LogCaptureFixture
+) -> None:
+    follower.send_action(dict.fromkeys(follower.action_features, 0.0))
     far = dict.fromkeys(follower.action_features, 9.0)
     sent = follower.send_action(far)
     assert sent["left_waist.pos"] == pytest.approx(0.5, abs=1e-3)
     assert sent["left_left_finger.pos"] == pytest.approx(follower.body.fingers.travel_m)
     assert sent["left_right_finger.pos"] == -sent["left_left_finger.pos"]
+    follower.disconnect()
+    (told,) = [line for line in caplog.messages if "were cut" in line]
+    assert told.startswith(
+        "1 of 2 commands asked for more than the joints' limits and --robot.max_step_rad=0.5"
+    )
+    assert "left_waist most often, 1 time, by up to 8.50 rad" in told
 
 
 def test_step_limit_leaves_near_targets_alone() -> None:

@@ -297,6 +297,15 @@ def test_it_hands_over_what_it_announces_and_shows_its_own_body() -> None:
     assert robot.name == "kinova_gen3_tactile_follower"
 
 
+def test_commands_that_are_too_fast_are_told_at_the_end(caplog: pytest.LogCaptureFixture) -> None:
+    robot = connected()
+    robot.send_action(robot.held_targets())
+    robot.send_action(dict.fromkeys(robot.action_features, 9.0))
+    robot.disconnect()
+    (told,) = [line for line in caplog.messages if "were cut" in line]
+    assert told.startswith("1 of 2 commands asked for more than the joints' limits and rates allow")
+
+
 def test_no_action_that_is_no_number_reaches_the_arms() -> None:
     robot = connected()
     action = dict.fromkeys(robot.action_features, 0.0)
