@@ -22,6 +22,7 @@ from lerobot.utils.constants import (
 )
 from lerobot.utils.random_utils import deserialize_rng_state, serialize_rng_state
 
+from lerobot_vtrefine.files.weights import naming_full_disk
 from lerobot_vtrefine.finetune.distributed import barrier, num_ranks, rank_index
 from lerobot_vtrefine.finetune.dppo import TrainState
 from lerobot_vtrefine.finetune.state_file import load_state, save_state
@@ -42,9 +43,13 @@ class Saveable:
     config: Any
 
     def save(self, folder: Path) -> None:
-        """Write everything to ``pretrained_model``."""
-        for part in (self.policy, self.preprocessor, self.postprocessor, self.config):
-            part.save_pretrained(folder)
+        """Write everything to ``pretrained_model``.
+
+        Raises: OSError where the disk is full; names the folder, or the file.
+        """
+        with naming_full_disk(folder):
+            for part in (self.policy, self.preprocessor, self.postprocessor, self.config):
+                part.save_pretrained(folder)
 
 
 def last_checkpoint(output_dir: Path) -> Path | None:

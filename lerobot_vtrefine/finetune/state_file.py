@@ -13,6 +13,8 @@ import torch
 from safetensors import SafetensorError, safe_open
 from safetensors.torch import load_file, save_file
 
+from lerobot_vtrefine.files.weights import naming_full_disk
+
 TREE, FILES = "tree", "files"
 FILE_BYTES = 15_000_000
 """Tensors in one file, unless a single one is larger."""
@@ -20,13 +22,19 @@ Tensors = dict[str, torch.Tensor]
 
 
 def save_state(state: Any, path: Path, file_bytes: int = FILE_BYTES) -> None:
-    """Write dicts, lists and tuples of tensors, numbers, texts and None; TypeError for anything else."""
+    """Write dicts, lists and tuples of tensors, numbers, texts and None.
+
+    Raises:
+        TypeError: for anything else.
+        OSError: the disk is full; names the file.
+    """
     tensors: Tensors = {}
     tree = _encode(state, tensors)
     first, *others = _portions(tensors, file_bytes)
-    for number, portion in enumerate(others, start=2):
-        save_file(portion, _file(path, number))
-    save_file(first, path, metadata={TREE: json.dumps(tree), FILES: str(1 + len(others))})
+    with naming_full_disk(path):
+        for number, portion in enumerate(others, start=2):
+            save_file(portion, _file(path, number))
+        save_file(first, path, metadata={TREE: json.dumps(tree), FILES: str(1 + len(others))})
 
 
 def load_state(path: Path) -> Any:

@@ -19,6 +19,7 @@ from torch.nn import functional
 
 from lerobot_vtrefine.datasets.features import ACTION_KEY, STATE_KEY, TRUTH_KEY
 from lerobot_vtrefine.envs.config import EnvAction
+from lerobot_vtrefine.files.weights import naming_full_disk
 from lerobot_vtrefine.policies.vt_dp3.configuration_vt_dp3 import VtDp3Config
 from lerobot_vtrefine.policies.vt_dp3.denoisers import MLPDenoiser, UNetDenoiser
 from lerobot_vtrefine.policies.vt_dp3.diffusion import DiffusionProcess, PredictNoise, deploy
@@ -142,6 +143,11 @@ class VtDp3Policy(PreTrainedPolicy):
         if policy.config.use_peft:  # the adapters that come next belong to the network that acts
             policy._stop_averaging()
         return policy
+
+    def _save_pretrained(self, save_directory: Path, state_dict: dict[str, Tensor] | None = None) -> None:
+        """LeRobot's hook. ``lerobot-train`` would end over a full disk without saying which."""
+        with naming_full_disk(save_directory):
+            super()._save_pretrained(save_directory, state_dict)
 
     @classmethod
     def _load_as_safetensor(

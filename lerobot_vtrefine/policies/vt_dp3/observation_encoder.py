@@ -13,6 +13,7 @@ from torch import Tensor, nn
 from lerobot_vtrefine import shipped
 from lerobot_vtrefine.datasets.features import CLOUD_KEY, GRIDS_KEY, LIMITS_KEY, STATE_KEY
 from lerobot_vtrefine.embodiments import get_embodiment
+from lerobot_vtrefine.files.weights import naming_full_disk
 from lerobot_vtrefine.policies.vt_dp3.configuration_vt_dp3 import VtDp3Config
 from lerobot_vtrefine.policies.vt_dp3.pad_encoder import PadEncoder
 from lerobot_vtrefine.policies.vt_dp3.point_encoder import PointEncoder
@@ -131,9 +132,14 @@ def encoder_file(config: VtDp3Config) -> str:
 
 
 def save_encoder(encoder: ObservationEncoder, config: VtDp3Config, folder: Path) -> None:
-    """Write the networks of cloud and pads; that of the joints depends on a dataset's normalisation."""
+    """Write the networks of cloud and pads; that of the joints depends on a dataset's normalisation.
+
+    Raises: OSError where the disk is full; names the file.
+    """
     weights = {name: value.contiguous() for name, value in _perception_weights(encoder).items()}
-    save_file(weights, folder / encoder_file(config))
+    path = folder / encoder_file(config)
+    with naming_full_disk(path):
+        save_file(weights, path)
 
 
 def load_encoder(encoder: ObservationEncoder, config: VtDp3Config) -> None:
