@@ -3,7 +3,9 @@
 from collections.abc import Sequence
 from pathlib import Path
 
+import numpy as np
 import pyarrow as pa
+import pyarrow.compute as pc
 import pyarrow.parquet as pq
 
 MAX_BYTES = 384 << 20
@@ -28,7 +30,9 @@ def read_table(path: Path, columns: Sequence[str] | None = None, *, without: Seq
                 raise ValueError(f"column {repeated[0][:60]} appears twice")
             columns = names if columns is None else columns
             columns = [name for name in columns if name not in without]
-            _check_size(file, columns, path.stat().st_size)
+            limit = max(MAX_BYTES, MAX_RATIO * path.stat().st_size)
+            if repeating := _check_size(file, columns, limit):
+                _check_texts(path, repeating, limit)
             return file.read(columns)
     except (pa.ArrowException, OSError, ValueError, KeyError) as error:
         reason = str(error).splitlines()[0][:200] if str(error) else type(error).__name__
@@ -51,20 +55,55 @@ def read_columns(path: Path, columns: Sequence[str], *, others: bool = False) ->
     return table
 
 
-def _check_size(file: pq.ParquetFile, columns: Sequence[str], file_bytes: int) -> None:
+def _check_size(file: pq.ParquetFile, columns: Sequence[str], limit: int) -> list[str]:
+    """Raise ValueError where columns would take more than `limit` bytes, as far as the footer tells.
+
+    Returns:
+        Parquet's names of texts' and bytes' columns that could take more by repeating a long value of their
+        dictionary.
+    """
     metadata = file.metadata
     # Parquet's names of columns join names by dots, which LeRobot's names have, too: their order tells them.
     leaves = [(field.name, *leaf) for field in file.schema_arrow for leaf in _leaves(field.type)]
-    size = 0
+    size, could = 0, dict[str, int]()
     for group in map(metadata.row_group, range(metadata.num_row_groups)):
         for index, (name, width, at_least) in enumerate(leaves):
             if name in columns:
                 part = group.column(index)
                 values = max(part.num_values, group.num_rows * at_least)
                 size += max(values * width, part.total_uncompressed_size)
+                if part.physical_type == "BYTE_ARRAY" and part.has_dictionary_page:
+                    most = could.get(part.path_in_schema, 0) + values * part.total_uncompressed_size
+                    could[part.path_in_schema] = most
     size = max(size, 8 * metadata.num_rows)
-    if size > max(MAX_BYTES, MAX_RATIO * file_bytes):
-        raise ValueError(f"{metadata.num_rows:,} rows of {size:,} bytes in {file_bytes:,} are too many")
+    if size > limit:
+        raise ValueError(f"{metadata.num_rows:,} rows of {size:,} bytes are too many")
+    return [name for name, most in could.items() if most > limit]
+
+
+def _check_texts(path: Path, columns: Sequence[str], limit: int) -> None:
+    """Raise ValueError where columns of texts or bytes, by Parquet's names, take more than `limit` bytes
+    once each value stands for itself; read here with every value once."""
+    with pq.ParquetFile(path, memory_map=False, read_dictionary=list(columns)) as file:
+        size = 0
+        for group in range(file.num_row_groups):
+            for column in file.read_row_group(group, columns).columns:
+                size += sum(_unpacked_bytes(chunk) for chunk in column.chunks)
+                if size > limit:
+                    raise ValueError(
+                        f"{file.metadata.num_rows:,} rows of {size:,} bytes or more are too many"
+                    )
+
+
+def _unpacked_bytes(values: pa.Array) -> int:
+    """What the dictionaries in an array take, each value as often as it occurs."""
+    if pa.types.is_dictionary(values.type):
+        lengths = pc.call_function("binary_length", [values.dictionary]).to_numpy(zero_copy_only=False)
+        places = values.indices.drop_null().to_numpy()
+        return int(np.bincount(places, minlength=len(lengths)) @ lengths)
+    if pa.types.is_struct(values.type):
+        return sum(map(_unpacked_bytes, values.flatten()))
+    return _unpacked_bytes(values.flatten()) if pa.types.is_nested(values.type) else 0
 
 
 def _leaves(kind: pa.DataType, at_least: int = 1) -> list[tuple[int, int]]:

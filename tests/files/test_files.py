@@ -225,6 +225,28 @@ def test_tables_that_explode_are_refused(tmp_path: Path) -> None:
     assert read_table(tmp_path / "x.parquet", ["a"]).num_rows == 30_000_000
 
 
+LONG = b"x" * 200_000
+
+
+@pytest.mark.parametrize(
+    "value", [LONG, {"bytes": LONG, "path": "a"}, [LONG, None]], ids=["text", "image", "texts"]
+)
+def test_a_long_text_that_a_dictionary_repeats_counts_as_often(value: object, tmp_path: Path) -> None:
+    path = tmp_path / "x.parquet"
+    with pq.ParquetWriter(path, pa.table({"observation.task": [value]}).schema) as writer:
+        for _ in range(5):
+            writer.write_table(pa.table({"observation.task": [value] * 500}))
+    assert path.stat().st_size < 200_000
+    with pytest.raises(ValueError, match=r"2,500 rows of 500,[0-9,]+ bytes or more are too many"):
+        read_table(path)
+
+
+def test_many_texts_of_which_a_few_repeat_are_read(tmp_path: Path) -> None:
+    texts = [f"{number % 5_000:0100d}" for number in range(10_000)]
+    pq.write_table(pa.table({"observation.task": texts}), tmp_path / "x.parquet")
+    assert read_table(tmp_path / "x.parquet")["observation.task"].to_pylist() == texts
+
+
 def test_lists_of_fixed_length_take_room_where_they_are_null(tmp_path: Path) -> None:
     nothing = pa.nulls(100, pa.list_(pa.uint8(), 5_000_000))
     pq.write_table(pa.table({"observation.tactile.left": nothing}), tmp_path / "x.parquet")
