@@ -47,7 +47,7 @@ def test_sizes_are_right(verdict) -> None:
 
 
 def test_a_dataset_without_known_parts_says_so(tmp_path) -> None:
-    recorded = record(SceneConfig(pair="square"), 4)
+    recorded = record(SceneConfig(pair="square"), 2)
     root = write_dataset(tmp_path / "ds", recorded, BELIEVED)
     found = merged(diagnose_robot(read_dataset(root=root)), unknown_parts())
     undecided = {item.name: item.reason for item in found.evidence if item.decision == "not identifiable"}

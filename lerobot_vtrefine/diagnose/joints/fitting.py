@@ -258,10 +258,11 @@ class _Fitter:
         self.weight = problem.weight
         self.ridge = ridge(problem, free)
         self.settled: Array = ~np.any(free, axis=1)
+        self._known: tuple[Fit, Derivatives] | None = None
 
     def step(self, now: Fit) -> tuple[Fit, bool]:
         """One damped step; joints that it does not improve keep their values and try a shorter one next."""
-        derivative = derivatives(self.problem, replace(now, free=now.free & ~self.settled[:, None]))
+        derivative = self._derivatives(now)
         open_joints = None if self.tau_free else np.flatnonzero(~self.settled)
         proposed = self._propose(now, derivative)
         then = evaluate(self.problem, proposed, self.free, self.tau_free, now, open_joints)
@@ -272,9 +273,17 @@ class _Fitter:
         gained = np.where(better, (before - after) / np.maximum(before, 1e-300), 0.0)
         self.damping = np.where(better, self.damping * 0.2, self.damping * 8).clip(1e-9, 1e9)
         self.settled |= (better & (gained < _TOLERANCE)) | (self.damping > _SHORTEST)
-        if better.all():
-            return then, bool(self.settled.all())
-        return _merged(now, then, better), bool(self.settled.all())
+        done = bool(self.settled.all())
+        if not better.any():
+            return now, done
+        return (then if better.all() else _merged(now, then, better)), done
+
+    def _derivatives(self, now: Fit) -> "Derivatives":
+        """Those of the joints that are not settled; a step that was too long leaves them as they were."""
+        if self._known is None or self._known[0] is not now:
+            free = now.free & ~self.settled[:, None]
+            self._known = now, derivatives(self.problem, replace(now, free=free))
+        return self._known[1]
 
     def _judged_together(self, now: Fit, then: Fit, before: Array, after: Array) -> tuple[Fit, bool]:
         """Joints meet in the delay: all of a step or nothing, by their costs (J,). One that it would harm

@@ -138,12 +138,14 @@ def _worn(x: Array, width: Array, rounding: Array | None, first: Array) -> Array
 def play_operator(x: Array, width: Array | float, first: Array) -> Array:
     """The play operator along frames: outputs (N, ...) start from `first` (...) and move only when inputs
     leave a window of full width `width` (...) around them."""
+    if not np.any(width):
+        return x.copy()
     half = width / 2
-    out = np.empty_like(x)
+    out, low, high = np.empty_like(x), x - half, x + half
     state = first
     for k in range(len(x)):
-        state = np.minimum(np.maximum(state, x[k] - half), x[k] + half)
-        out[k] = state
+        np.maximum(state, low[k], out=out[k])
+        state = np.minimum(out[k], high[k], out=out[k])
     return out
 
 

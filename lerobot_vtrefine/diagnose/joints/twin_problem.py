@@ -147,7 +147,7 @@ class _Arms:
         self.dof = [int(self.model.joint(name).dofadr[0]) for name in named]
         # Play widens both ways: of two fingers that mirror each other, the mean.
         self.side = np.where(self.robot.upper > 0, 1.0, -1.0)
-        self.worlds: Worlds | None = None
+        self.worlds: dict[int, Worlds] = {}
 
     @classmethod
     def of(cls, config: SceneConfig, dt_s: float, step_s: float) -> "_Arms":
@@ -183,8 +183,8 @@ class _Arms:
     def _controls(self, command: Array, push: Array, play: Array, first: Array, tau_s: float) -> Array:
         """Servo targets (W, K, nu) of all steps; play (S, J) acts on the way between frames, too."""
         frames, trials, _ = command.shape
-        every = np.tile(command, (1, len(play), 1))
-        servo = np.stack([task.servo_commands(self.robot, row) for row in every], 1)
+        own = task.servo_commands(self.robot, command.reshape(frames * trials, -1))
+        servo = np.tile(own.reshape(frames, trials, -1).swapaxes(0, 1), (len(play), 1, 1))
         rest = task.servo_commands(self.robot, first)[:, None]
         wanted = self._between(rest, servo)
         width = np.abs(np.repeat(self._per_servo(play * self.side), trials, 0))
@@ -207,10 +207,10 @@ class _Arms:
         return between.reshape(len(values), -1, values.shape[-1])
 
     def _prepared(self, count: int) -> Worlds:
-        if self.worlds is None or self.worlds.bind("qpos").shape[0] != count:
-            self.worlds = Worlds(self.model, nsim=count, nthread=usable_cores())
-            self.worlds.bind("qvel")
-        return self.worlds
+        """That many worlds: fits go back and forth between a few numbers of them."""
+        if count not in self.worlds:
+            self.worlds[count] = Worlds(self.model, nsim=count, nthread=usable_cores())
+        return self.worlds[count]
 
     def _set_fields(self, worlds: Worlds, sets: Array) -> None:
         omega, zeta = (np.exp(sets[:, self.columns, k]) / NOMINAL[k] for k in range(2))
