@@ -18,6 +18,7 @@ from lerobot_vtrefine.datasets.features import (
 )
 from lerobot_vtrefine.embodiments import Embodiment, get_embodiment
 from lerobot_vtrefine.extras import SIMULATOR, require
+from lerobot_vtrefine.lerobot_compat import config_errors
 from lerobot_vtrefine.lerobot_compat.config_errors import told_by_lerobot
 from lerobot_vtrefine.sim.config import (
     BACKENDS,
@@ -38,6 +39,8 @@ SMALLEST_PX = 16
 """Height and width that video encoders take."""
 SHORTCUTS = ("pair", "clearance_m", "start", "mesh_dir")
 """Fields of ``scene`` that have a flag of their own."""
+
+config_errors.install()
 
 
 class EnvAction(PolicyFeature):

@@ -57,11 +57,11 @@ SEAMS = (
     ),
     Seam(
         "config_errors",
-        ("lerobot.configs.parser.DecodingError",),
+        ("lerobot.configs.parser.DecodingError", "draccus.parsers.decoding.decode_dataclass"),
         "the parser replaces a configuration's own reason by \"Couldn't instantiate class\", and prints"
         " several lines about a value that it cannot decode",
         "configurations and commands of this package",
-        "stays: it only raises another exception",
+        "stays: it only raises other exceptions",
     ),
     Seam(
         "decoder_notice",

@@ -9,6 +9,7 @@ from lerobot_vtrefine.embodiments import DEFAULT_BODY
 from lerobot_vtrefine.embodiments.camera_config import CameraConfig
 from lerobot_vtrefine.embodiments.embodiment import STARTS
 from lerobot_vtrefine.sim.depth_sensors import DEPTH_SENSORS
+from lerobot_vtrefine.sim.setting_checks import check_numbers
 
 PROCEDURAL_PAIRS = ("round", "square", "hexagon", "d_shape", "cross", "key")
 MESH_PAIR_PREFIX = "automate/"
@@ -86,18 +87,15 @@ class SceneConfig:
                 f"table_height_m must lie within -{MAX_TABLE_HEIGHT_M} .. {MAX_TABLE_HEIGHT_M} m,"
                 f" got {self.table_height_m}"
             )
-        if self.negative_control_m < 0.0:
-            raise ValueError(f"negative_control_m must not be negative, got {self.negative_control_m}")
-        for name in (
+        positive = (
             "servo_gain_scale",
             "pad_friction",
             "part_friction",
             "part_density",
             "pad_time_constant_s",
             "rigid_time_constant_s",
-        ):
-            if not getattr(self, name) > 0.0:
-                raise ValueError(f"{name} must be above 0, got {getattr(self, name)}")
+        )
+        check_numbers(self, above_0=positive, not_below_0=("negative_control_m",))
 
     @property
     def noise_level(self) -> float:
@@ -124,6 +122,9 @@ class TableStart:
     """Side of both squares."""
     yaw_rad: float = 0.15
     """Half range of each part's yaw."""
+
+    def __post_init__(self) -> None:
+        check_numbers(self, "table.", not_below_0=("square_m", "yaw_rad"))
 
 
 @dataclass(frozen=True)
@@ -156,6 +157,10 @@ class GraspedStart:
     settle_s: float = 0.25
     """Simulated before the episode begins, so that grasps come to rest."""
 
+    def __post_init__(self) -> None:
+        ranges = ("hand_xy_m", "hand_z_m", "hand_yaw_rad", "slip_m", "slip_z_m", "slip_rad")
+        check_numbers(self, "grasped.", above_0=("settle_s",), not_below_0=ranges)
+
     @property
     def slip_xz_m(self) -> tuple[float, float]:
         """In-hand offsets along the fingers and across them."""
@@ -177,6 +182,9 @@ class SuccessConfig:
     hold_s: float = 1.0
     """It must stay so for that long."""
 
+    def __post_init__(self) -> None:
+        check_numbers(self, "success.", above_0=("lateral_m", "tilt_rad"), not_below_0=("hold_s",))
+
     def hold_steps(self, control_dt_s: float) -> int:
         """Consecutive observations that must find the plug seated: n steps apart lie n + 1 observations."""
         return round(self.hold_s / control_dt_s) + 1
@@ -184,7 +192,7 @@ class SuccessConfig:
 
 @dataclass(frozen=True)
 class LimitsConfig:
-    """What ends an episode in failure."""
+    """What ends an episode in failure; ``inf`` switches a limit off."""
 
     in_hand_shift_m: float = 0.005
     """Largest movement of a part in its hand since the grasp."""
@@ -195,6 +203,10 @@ class LimitsConfig:
     """A single physics step that is hit harder is no failure."""
     drop_s: float = 0.3
     """A lifted part that its hand has not held for this long counts as dropped."""
+
+    def __post_init__(self) -> None:
+        limits = ("in_hand_shift_m", "contact_force_n", "drop_s")
+        check_numbers(self, "limits.", above_0=(*limits, "force_window_s"), may_be_infinite=limits)
 
 
 @dataclass(frozen=True)
@@ -218,9 +230,8 @@ class TaskConfig:
         check_control_rate("control_hz", self.control_hz)
         if self.episode_steps is not None and self.episode_steps < 1:
             raise ValueError(f"episode_steps must be at least 1, got {self.episode_steps}")
-        for name in ("joint_rate", "finger_rate"):
-            if not getattr(self, name) > 0.0:
-                raise ValueError(f"{name} must be above 0, got {getattr(self, name)}")
+        rates = ("joint_rate", "finger_rate")
+        check_numbers(self, above_0=rates, may_be_infinite=rates)
 
     @property
     def control_dt_s(self) -> float:
@@ -244,8 +255,7 @@ class ShearConfig:
     """Tangential stiffness of the skin under one taxel."""
 
     def __post_init__(self) -> None:
-        if not self.stiffness_n_per_m > 0.0:
-            raise ValueError(f"shear.stiffness_n_per_m must be above 0, got {self.stiffness_n_per_m}")
+        check_numbers(self, "shear.", above_0=("stiffness_n_per_m",))
 
 
 @dataclass(frozen=True)
@@ -310,9 +320,7 @@ class RandomizationConfig:
             bounds = getattr(self, name)
             if bounds is not None and not 0.0 < bounds[0] <= bounds[1]:
                 raise ValueError(f"randomization.{name} needs 0 < lowest <= highest, got {bounds}")
-        for name in ("camera_position_m", "camera_rotation_rad"):
-            if getattr(self, name) < 0.0:
-                raise ValueError(f"randomization.{name} must not be negative, got {getattr(self, name)}")
+        check_numbers(self, "randomization.", not_below_0=("camera_position_m", "camera_rotation_rad"))
 
 
 RANGES = (

@@ -121,6 +121,11 @@ class Flags:
             ["--root=x", "--env.type=vtrefine", "--env.scene=5"],
             "`env.scene`: is a group of settings, not one value; --help lists",
         ),
+        (
+            PlayConfig,  # whose environment may be left out
+            ["--env.type=vtrefine", "--env.rules.limits.contact_force_n=-1"],
+            "`env`: limits.contact_force_n must be above 0, got -1.0",
+        ),
         (ReplayConfig, ["--episodes=[one]"], "`episodes.0`: Couldn't parse 'one' into an int"),
     ],
 )

@@ -1,3 +1,5 @@
+import math
+import re
 from dataclasses import replace
 from functools import cache
 from pathlib import Path
@@ -20,7 +22,7 @@ from lerobot_vtrefine.embodiments import get_embodiment
 from lerobot_vtrefine.envs import VtRefineEnvConfig, vector_env
 from lerobot_vtrefine.envs.episodes import Episodes
 from lerobot_vtrefine.envs.live_world import LiveWorld
-from lerobot_vtrefine.sim.config import TaskConfig
+from lerobot_vtrefine.sim.config import LimitsConfig, TaskConfig
 
 ENV_FILES = sorted((Path(__file__).parents[2] / "configs" / "env").glob("*.yaml"))
 
@@ -157,6 +159,40 @@ def test_bad_settings_are_named_at_once(settings, message):
     with pytest.raises(ParsingError, match=message) as told:
         draccus.decode(EnvConfig, {"type": "vtrefine", **settings})
     assert "\n" not in str(told.value)
+
+
+@pytest.mark.parametrize(
+    ("settings", "message"),
+    [
+        ({"scene": {"pad_friction": -1.0}}, "pad_friction must be above 0, got -1.0"),
+        ({"scene": {"negative_control_m": math.nan}}, "negative_control_m must be a finite number, got nan"),
+        ({"rules": {"finger_rate": 0.0}}, "finger_rate must be above 0"),
+        ({"rules": {"table": {"square_m": math.nan}}}, "table.square_m must be a finite number, got nan"),
+        ({"rules": {"grasped": {"slip_m": -0.01}}}, "grasped.slip_m must not be negative, got -0.01"),
+        (
+            {"rules": {"grasped": {"mouth_m": [0.0, 0.0, math.inf]}}},
+            "grasped.mouth_m must be a finite number",
+        ),
+        ({"rules": {"success": {"hold_s": -1.0}}}, "success.hold_s must not be negative, got -1.0"),
+        ({"rules": {"limits": {"contact_force_n": math.nan}}}, "limits.contact_force_n must be a finite"),
+        (
+            {"rules": {"limits": {"force_window_s": math.inf}}},
+            "limits.force_window_s must be a finite number",
+        ),
+        (
+            {"randomization": {"camera_position_m": math.nan}},
+            "randomization.camera_position_m must be a finite",
+        ),
+        ({"warp": {"rows_per_world": 0}}, "warp.rows_per_world must be at least 1, got 0"),
+    ],
+)
+def test_numbers_that_no_group_of_settings_takes_are_named_by_the_parser(settings, message):
+    with pytest.raises(ParsingError, match=re.escape(message)):
+        draccus.decode(EnvConfig, {"type": "vtrefine", **settings})
+
+
+def test_a_limit_may_be_infinite():
+    assert LimitsConfig(in_hand_shift_m=math.inf, contact_force_n=math.inf).contact_force_n == math.inf
 
 
 def test_control_rate_has_one_flag():
