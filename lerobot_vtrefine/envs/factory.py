@@ -17,6 +17,12 @@ if TYPE_CHECKING:
     from lerobot_vtrefine.sim.simulation import InsertionSim
 
 
+def check_count(num_envs: int) -> None:
+    """Raises: ValueError for fewer than one environment."""
+    if num_envs < 1:
+        raise ValueError(f"need at least one environment, got {num_envs} (--eval.batch_size)")
+
+
 def make_simulation(config: VtRefineEnvConfig, num_envs: int) -> "InsertionSim":
     """The simulation of ``num_envs`` worlds that ``config`` describes.
 
@@ -26,8 +32,7 @@ def make_simulation(config: VtRefineEnvConfig, num_envs: int) -> "InsertionSim":
     """
     if config.menagerie_dir is not None:  # now, rather than when the first frame is drawn
         menagerie_file(config.body.menagerie, config.body.name, config.menagerie_dir)
-    if num_envs < 1:
-        raise ValueError(f"need at least one environment, got {num_envs} (--eval.batch_size)")
+    check_count(num_envs)
     from lerobot_vtrefine.sim.simulation import InsertionSim
 
     return InsertionSim(

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 import gymnasium
 
+from lerobot_vtrefine.choices import check_choice
 from lerobot_vtrefine.envs.config import VtRefineEnvConfig
 from lerobot_vtrefine.sim.config import PROCEDURAL_PAIRS, STARTS
 
@@ -42,6 +43,7 @@ def make(render_mode: str | None = None, **settings: Any) -> "VtRefineEnv":
     """One environment with these fields of ``VtRefineEnvConfig``."""
     from lerobot_vtrefine.envs.single_env import VtRefineEnv
 
+    _check_render_mode(render_mode)
     env = VtRefineEnv(VtRefineEnvConfig(**settings))
     env.render_mode = render_mode
     return env
@@ -51,6 +53,13 @@ def make_vector(num_envs: int, render_mode: str | None = None, **settings: Any) 
     """The batched environment with ``num_envs`` worlds."""
     from lerobot_vtrefine.envs.vector_env import VtRefineVectorEnv
 
+    _check_render_mode(render_mode)
     env = VtRefineVectorEnv(VtRefineEnvConfig(**settings), num_envs)
     env.render_mode = render_mode
     return env
+
+
+def _check_render_mode(mode: str | None) -> None:
+    """Gymnasium checks it only where the entry point is a class."""
+    if mode is not None:
+        check_choice("render_mode", mode, ("rgb_array",), "; vtrefine-play shows it live")

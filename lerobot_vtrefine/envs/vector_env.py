@@ -12,7 +12,7 @@ from gymnasium.vector.utils import batch_space
 from lerobot_vtrefine.datasets.features import raw_to_env_observation
 from lerobot_vtrefine.envs.config import VtRefineEnvConfig
 from lerobot_vtrefine.envs.episodes import Array, ControlStep, Episodes
-from lerobot_vtrefine.envs.factory import make_episodes
+from lerobot_vtrefine.envs.factory import check_count, make_episodes
 from lerobot_vtrefine.envs.rendering import EvalFrame, FrameSource, LazyFrames, eval_frame
 from lerobot_vtrefine.envs.spaces import action_space, observation_space
 from lerobot_vtrefine.wording import plural
@@ -34,9 +34,13 @@ class VtRefineVectorEnv(gym.vector.VectorEnv[Observation, Array, Array]):
     - With ``--env.shear.on=true``, ``info["shear"]`` is (n, pads, taxels, 2) float32: tangential force per
       taxel [N], of every control step.
     - Observations are those of ``datasets.features.env_observation_shapes`` with a leading ``n``.
+    - A pickled or copied environment keeps its settings and its generator, and waits for a reset.
+
+    Raises: ValueError for fewer than one environment.
     """
 
     def __init__(self, config: VtRefineEnvConfig, num_envs: int) -> None:
+        check_count(num_envs)
         self.config = config
         self.num_envs = num_envs
         self.metadata = {
@@ -52,6 +56,9 @@ class VtRefineVectorEnv(gym.vector.VectorEnv[Observation, Array, Array]):
         self._first_episode = -num_envs
         self._episodes: Episodes | None = None
         self._frames: FrameSource | None = None
+
+    def __getstate__(self) -> dict[str, Any]:
+        return {**self.__dict__, "_episodes": None, "_frames": None}
 
     @property
     def episodes(self) -> Episodes:

@@ -58,6 +58,15 @@ def test_many_worlds_in_one_simulation() -> None:
     env.close()
 
 
+def test_what_cannot_be_drawn_and_no_worlds_are_refused() -> None:
+    for make in (gymnasium.make, gymnasium.make_vec):
+        with pytest.raises(ValueError, match="render_mode=human is unknown; choose from rgb_array"):
+            make("lerobot_vtrefine/RoundGrasped-v0", render_mode="human")
+    for number in (0, -1):
+        with pytest.raises(ValueError, match=f"need at least one environment, got {number}"):
+            gymnasium.make_vec("lerobot_vtrefine/RoundGrasped-v0", number)
+
+
 def test_lerobots_env_hub_makes_it_from_a_folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     shutil.copy(ENV_FILE, tmp_path / "env.py")
     monkeypatch.setattr(

@@ -1,7 +1,9 @@
+import pickle
 import resource
 from dataclasses import replace
 from functools import partial
 
+import gymnasium as gym
 import numpy as np
 import pytest
 import torch
@@ -225,6 +227,16 @@ def test_environment_can_be_reset_after_close(make_env):
     env.close()
     env.reset(seed=[2])
     assert env.episodes.seeds.tolist() == [2]
+
+
+def test_a_pickled_environment_waits_for_a_reset(make_env):
+    env = make_env(2)
+    env.reset(seed=[0, 1])
+    again = pickle.loads(pickle.dumps(env))
+    assert (again.config, again.num_envs) == (env.config, 2)
+    with pytest.raises(gym.error.ResetNeeded):
+        again.step(hold(env))
+    assert env.episodes.seeds.tolist() == [0, 1]  # which goes on as it was
 
 
 def test_bad_calls_are_named(make_env):
