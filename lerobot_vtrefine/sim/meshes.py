@@ -114,7 +114,8 @@ def load_mesh_pair(
 
     `scale` is "flexitac" (the table above, 1 for other parts), "unit", or one factor for both parts.
     Raises FileNotFoundError for a missing folder or ID, ValueError for a mesh that is not solid or of an
-    implausible size, ImportError without the `assets` extra; each with one line that says what to do.
+    implausible size and for parts that overlap or are not drawn assembled, ImportError without the `assets`
+    extra; each with one line that says what to do.
     """
     mesh_id = name.removeprefix(PREFIX)
     if mesh_dir is None:
@@ -129,7 +130,15 @@ def load_mesh_pair(
     plug, socket = (_part(name, role, surfaces, progress) for role in ROLES)
     corners = [[hull.vertices for hull in part.pieces] for part in (plug, socket)]
     key = f"fit-{_digest(*corners[0], *corners[1])}"
-    fit = MeshFit.from_arrays(_cached(key, lambda: measure_fit(*corners).arrays()))
+    both = f"{paths['plug']}, {paths['socket']}"
+    try:
+        fit = MeshFit.from_arrays(_cached(key, lambda: measure_fit(*corners).arrays()))
+    except ValueError as error:
+        raise ValueError(f"{both}: {error}") from None
+    if not fit.travel_m > 0:
+        raise ValueError(
+            f"{both}: the plug is beside or above its socket; draw both parts in one frame, assembled"
+        )
     if fit.exit_sign < 0:  # turn both parts over, so that the plug always leaves upwards
         plug, socket = _turned_over(plug), _turned_over(socket)
     return MeshPair(f"{PREFIX}{mesh_id}", plug, socket, replace(fit, exit_sign=1.0))

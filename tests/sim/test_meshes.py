@@ -201,8 +201,19 @@ def test_own_parts_keep_their_size_unless_told_otherwise(folder: Path, ring: Mes
 def test_overlapping_parts_are_refused(tmp_path: Path, folder: Path) -> None:
     (tmp_path / "solid_socket.obj").write_bytes((folder / "ring_socket.obj").read_bytes())
     (tmp_path / "solid_plug.obj").write_bytes((folder / "ring_socket.obj").read_bytes())
-    with pytest.raises(ValueError, match="overlap in the assembled pose"):
+    with pytest.raises(ValueError, match=r"solid_plug.obj, .*overlap in the assembled pose"):
         load_mesh_pair("automate/solid", tmp_path, scale="unit", progress=False)
+
+
+def test_parts_that_are_drawn_beside_each_other_are_refused(tmp_path: Path, monkeypatch) -> None:
+    """As somebody exports them who draws each part for itself; a plug there would count as seated."""
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
+    for role, aside_mm in (("plug", 0), ("socket", 60)):
+        part = trimesh.creation.box((15, 15, 40)).apply_translation([aside_mm, 0, 20])
+        part.export(tmp_path / f"apart_{role}.obj")
+    for _ in range(2):  # the second time out of the cache
+        with pytest.raises(ValueError, match=r"apart_plug.obj, .*apart_socket.obj: .*draw both parts in one"):
+            load_mesh_pair("automate/apart", tmp_path, progress=False)
 
 
 def test_missing_extra_says_what_to_install(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
