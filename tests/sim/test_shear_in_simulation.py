@@ -5,7 +5,13 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from lerobot_vtrefine.sim.config import RandomizationConfig, SceneConfig, ShearConfig, TaskConfig
+from lerobot_vtrefine.sim.config import (
+    LimitsConfig,
+    RandomizationConfig,
+    SceneConfig,
+    ShearConfig,
+    TaskConfig,
+)
 from lerobot_vtrefine.sim.pads import held_bodies
 from lerobot_vtrefine.sim.simulation import InsertionSim
 from lerobot_vtrefine.tactile import Poses
@@ -59,6 +65,27 @@ def test_a_part_at_rest_hangs_on_its_two_pads(sim):
         carried = force[:, np.array(held_bodies(sim.embodiment)) == part].sum(1)
         np.testing.assert_allclose(carried, np.tile([0.0, 0.0, -weight], (2, 1)), atol=0.02 * weight + 2e-3)
     assert np.abs(shear).max() > 0.1
+
+
+@pytest.mark.parametrize(("share", "slides"), [(0.9, False), (1.1, True)])
+def test_a_hand_holds_as_much_as_coulomb_says_and_no_more(share, slides):
+    """Weight as a share of what two pads bear by friction; the grip's own force does not depend on it."""
+    mu, world = 0.3, np.arange(1)
+    rules = TaskConfig(control_hz=50, limits=LimitsConfig(in_hand_shift_m=np.inf))
+    scene = replace(SCENE, pad_friction=mu, timestep_s=0.002)
+    sim = InsertionSim(scene, rules, num_envs=1, backend="single", shear=ON)
+    sim.reset(world, world)
+    still, mass = sim.command_targets(), sim.scene.model.body_mass[sim.scene.socket_body]
+    sim.step(still)
+    borne_n = mu * sim._episode.pad_load[0, :2, 0].sum()
+    sim._backend._models[0].opt.gravity[2] = -share * borne_n / mass
+    sim.step(still)
+    borne_n = mu * normal_forces(sim, world)[0, :2].sum(-1)
+    shares = np.linalg.norm(sim.shear()[0, :2].sum(1), axis=-1) / borne_n
+    sim.step(still)
+    shift_m = sim.metrics(world)["in_hand_shift_m"][0]
+    np.testing.assert_allclose(shares, 1.0 if slides else share, atol=1e-3 if slides else 0.03)
+    assert shift_m > 2e-3 if slides else shift_m < 3e-4
 
 
 def test_nothing_is_felt_without_load():
