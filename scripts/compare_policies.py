@@ -17,7 +17,7 @@ import argparse
 import sys
 from pathlib import Path
 
-from runs.side_by_side import run_all
+from runs.side_by_side import check_device, run_all
 
 from lerobot_vtrefine.cli.arguments import CommandParser
 from lerobot_vtrefine.cli.errors import run_cli
@@ -171,6 +171,7 @@ def main() -> None:
     """Run what is not done yet; every evaluation becomes a row as soon as it is there."""
     options = make_parser().parse_args()
     find("--config_path", options.task)  # a misspelt name is told now
+    check_device(options.device)
     record = record_stage(options)
     StageRunner(options.output_dir, [record]).run()
     runs = [(policy, seed) for policy in options.policies for seed in options.seeds]  # GPUs by turns

@@ -105,3 +105,13 @@ def test_a_misspelt_task_is_told_before_anything_runs(
     assert script.main() == 2
     assert "rund" in capsys.readouterr().err
     assert not (tmp_path / "out").exists()
+
+
+def test_a_gpu_that_is_not_there_is_told_before_anything_runs(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setattr("torch.cuda.is_available", lambda: False)
+    monkeypatch.setattr(script, "StageRunner", lambda *_: pytest.fail("it went on"))
+    monkeypatch.setattr(sys, "argv", ["compare_policies.py", f"--output_dir={tmp_path / 'out'}"])
+    assert script.main() == 2
+    assert "--device=cuda: no CUDA GPU with a driver here; --device=cpu" in capsys.readouterr().err
