@@ -36,7 +36,7 @@ from pathlib import Path
 from paper.outcome import is_done, row_of
 from paper.stages import TASKS, shared_stages, stages
 from paper.trained import PAPERS_OWN, Trained, chosen, table_of, variants
-from runs.side_by_side import run_all
+from runs.side_by_side import check_device, run_all
 
 from lerobot_vtrefine.cli.arguments import CommandParser
 from lerobot_vtrefine.cli.errors import run_cli
@@ -123,6 +123,7 @@ def main() -> None:
     options = parser.parse_args()
     if options.encoder and options.recipe == PAPERS_OWN:
         parser.error(f"--encoder: the network of --recipe={PAPERS_OWN} takes none; add --recipe=pads")
+    check_device(options.device)
     options.backend = options.backend or ("warp" if options.device == "cuda" else "batch")
     left = [policy for policy in chosen(options) if not is_done(options, policy)]
     shared = {stage.name: stage for policy in left for stage in shared_stages(options, policy)}
