@@ -1,7 +1,8 @@
 """What changes from command to command, from trial to trial, and through the session."""
 
 import re
-from dataclasses import replace
+from dataclasses import dataclass, replace
+from typing import Any, cast
 
 import numpy as np
 import pytest
@@ -13,8 +14,13 @@ from lerobot_vtrefine.diagnose.core.resampling import Hypothesis, jointly_adjust
 from lerobot_vtrefine.diagnose.core.search import ALL
 from lerobot_vtrefine.diagnose.joints import timing
 from lerobot_vtrefine.diagnose.joints.batch import make_batch
+from lerobot_vtrefine.diagnose.joints.candidates import control_latency
+from lerobot_vtrefine.diagnose.joints.command_spread import moved_by_delay, scattering, spread_of_commands
 from lerobot_vtrefine.diagnose.joints.engine import diagnose_robot
+from lerobot_vtrefine.diagnose.joints.estimates import Estimates
+from lerobot_vtrefine.diagnose.joints.fitting import Fit, evaluate, fit, servo_only
 from lerobot_vtrefine.diagnose.joints.problem import JointProblem
+from lerobot_vtrefine.diagnose.joints.servo import two_delays
 from lerobot_vtrefine.diagnose.joints.session_trends import trends
 from lerobot_vtrefine.diagnose.recordings import read_recording_set
 
@@ -149,3 +155,66 @@ def surely(found):
     """Trends that the joint test of all of them does not take for an accident of the order."""
     p_values = jointly_adjusted([Hypothesis(t.scores, t.along, either_sign=True) for t in found], 0)
     return [trend for trend, p in zip(found, p_values, strict=True) if p < 0.01]
+
+
+@dataclass(frozen=True)
+class Found:
+    """What is asked for the size of a delay, in place of a whole selection."""
+
+    problem: JointProblem
+    fit: Fit
+
+
+def test_a_mean_delay_is_told_without_what_its_scatter_does_to_the_servos(tmp_path, monkeypatch) -> None:
+    late = []
+
+    def arrivals(rig, rng, t):
+        reached = np.maximum.accumulate(t + rng.uniform(0.0, 0.06, t.shape), axis=1)
+        late.append(reached - t)
+        return reached
+
+    monkeypatch.setattr(robot_rigs, "arrivals", arrivals)
+    rig = Rig(rate_hz=30.0, seconds=4.0, conditions=90, replicates=1, latency_s=0.03)
+    recordings = read_recording_set(make_set(rig, tmp_path, 5))
+    problem = JointProblem.of(recordings.joints, make_batch(recordings.trials))
+    bare = fit(problem, problem.start(), servo_only(problem))
+    one_delay = fit(problem, replace(bare.point, tau_s=0.05), bare.free, tau_free=True)
+    found = scattering(cast("Any", Found(replace(problem, delay_spread_s=0.01), one_delay)))
+    tau = control_latency.sizes(Estimates(found), ())["tau_s"]
+    truth = late[0].mean()
+    assert one_delay.point.tau_s < truth - 0.004  # the servos took some of it
+    assert tau.value == pytest.approx(truth, abs=0.0025)
+    low, high = tau.ci95
+    assert low < truth < high
+    assert high - low < 0.012  # less than the spread, which does not blur a mean
+    assert found.problem.delay_spread_s == pytest.approx(late[0].std(), rel=0.15)
+
+
+@pytest.mark.parametrize("alike", [0.0, 0.4])
+def test_a_spread_is_one_commands_where_the_next_is_late_as_well(batch, alike) -> None:
+    rng = np.random.default_rng(0)
+    problem = JointProblem.of(SMALL.joints, batch)
+    still = evaluate(problem, replace(problem.start(), tau_s=0.04), servo_only(problem))
+    # A moving average of this weight has that correlation from one to the next.
+    part = (1 - np.sqrt(1 - 4 * alike**2)) / (2 * alike) if alike else 0.0
+    moved, spreads_s = list(moved_by_delay(problem, still)), []
+    for _ in range(8):
+        drawn = rng.normal(size=(len(batch.time_s) + 1, batch.trials, 1))
+        delays_s = 0.02 * (drawn[1:] + part * drawn[:-1]) / np.sqrt(1 + part**2)
+        left = np.zeros_like(still.residual)
+        for apart, one in enumerate(moved):
+            left[apart:] -= one[apart:] * delays_s[: len(left) - apart]
+        spread = spread_of_commands(problem, replace(still, residual=left))
+        assert spread.surely(0)
+        spreads_s.append(spread.spread_s())
+    assert np.mean(spreads_s) == pytest.approx(0.02, rel=0.15)  # 0.026 if all of it were one command's
+
+
+def test_two_delays_have_the_mean_and_the_spread_and_none_is_negative() -> None:
+    for mean_s, spread_s in ((0.05, 0.01), (0.05, 0.04), (0.01, 0.03)):
+        tau_s, part = np.array(two_delays(mean_s, spread_s)).T
+        assert part @ tau_s == pytest.approx(mean_s)
+        assert part @ (tau_s - mean_s) ** 2 == pytest.approx(spread_s**2)
+        assert part.sum() == pytest.approx(1.0)
+        assert tau_s.min() >= 0.0
+        assert part.min() >= 0.0

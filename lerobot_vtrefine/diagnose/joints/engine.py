@@ -13,6 +13,7 @@ from lerobot_vtrefine.diagnose.joints import experiments, views
 from lerobot_vtrefine.diagnose.joints.batch import make_batch
 from lerobot_vtrefine.diagnose.joints.candidates import NAMES, NOT_SHOWN, SIZES
 from lerobot_vtrefine.diagnose.joints.candidates.base import Candidate
+from lerobot_vtrefine.diagnose.joints.command_spread import scattering
 from lerobot_vtrefine.diagnose.joints.detectable import minimum_detectable
 from lerobot_vtrefine.diagnose.joints.estimates import Estimates, repeatability
 from lerobot_vtrefine.diagnose.joints.fitting import Fit
@@ -51,7 +52,7 @@ class JointAccount:
 
     def __init__(self, found: Inference[JointProblem, Fit, Candidate]) -> None:
         self.selection = found.selection
-        self.estimates = Estimates(found.selection)
+        self.estimates = Estimates(scattering(found.selection))
         self.detectable = minimum_detectable(found.selection)
 
     def parameters(self, cause: str, channels: tuple[int, ...]) -> Mapping[str, Parameter]:
@@ -81,7 +82,7 @@ class JointAccount:
     def caveat(self, cause: str, channels: tuple[int, ...]) -> str:
         """What an accepted cause leaves open."""
         forms = self.selection.candidates_of(cause, channels)
-        spread = self.selection.problem.delay_spread_s
+        spread = self.estimates.selection.problem.delay_spread_s
         if spread and any(form.shared for form in forms):
             return f", which changes from command to command by about {1e3 * spread:.0f} ms"
         free = self.selection.fit.free[list(channels)]

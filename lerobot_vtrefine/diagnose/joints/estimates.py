@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from lerobot_vtrefine.diagnose.core.resampling import jackknife
+from lerobot_vtrefine.diagnose.joints.command_spread import delays_left_out
 from lerobot_vtrefine.diagnose.joints.fitting import ServoTrials
 from lerobot_vtrefine.diagnose.joints.gravity import is_sliding
 from lerobot_vtrefine.diagnose.joints.newton import leave_out, without_ridge
@@ -36,8 +37,10 @@ class Estimates:
 
     def __init__(self, selection: "Selected") -> None:
         self.selection = selection
-        self.theta, self.tau = leave_out(selection.problem, selection.fit)
-        """(G, J, P) and (G,) without each of G conditions."""
+        self.theta, tau = leave_out(selection.problem, selection.fit)
+        """(G, J, P) without each of G conditions."""
+        self.tau = tau + delays_left_out(selection)
+        """(G,)"""
         self.steps = selection.problem.batch.resolution
         self.unheld = without_ridge(selection.problem, selection.fit)
         """(J, P)"""

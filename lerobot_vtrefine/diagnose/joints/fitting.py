@@ -13,7 +13,7 @@ from lerobot_vtrefine.diagnose.core.normal_equations import solved
 from lerobot_vtrefine.diagnose.joints import gravity, stages
 from lerobot_vtrefine.diagnose.joints.batch import Batch, frame_s
 from lerobot_vtrefine.diagnose.joints.parameters import INDEX, PARAMETERS, POSITIVE, RATIOS, SAG
-from lerobot_vtrefine.diagnose.joints.servo import Columns, simulate
+from lerobot_vtrefine.diagnose.joints.servo import Columns, simulate, two_delays
 from lerobot_vtrefine.diagnose.joints.stages import STAGES
 
 Array = np.ndarray
@@ -77,6 +77,8 @@ class ServoTrials:
     """Part of a play's width that 95 % intervals allow for the method's own error."""
     iterations: int = 20
     """Most steps of a fit."""
+    scatter_s: float = 0.0
+    """Deviation of single commands' delays that predictions are means over [s]."""
 
     @classmethod
     def of(cls, names: tuple[str, ...], batch: Batch) -> Self:
@@ -124,7 +126,18 @@ class ServoTrials:
         return point
 
     def predict(self, point: Point, joint: Array | None = None, theta: Array | None = None) -> Array:
-        """Positions (N, T, C) of columns: joints (C,) under parameters (C, P); by default all joints."""
+        """Positions (N, T, C) of columns: joints (C,) under parameters (C, P); by default all joints.
+
+        Where delays scatter, these are means: exact but for dry friction.
+        """
+        if not self.scatter_s:
+            return self.with_one_delay(point, joint, theta)
+        delays = two_delays(point.tau_s, self.scatter_s)
+        one, other = (self.with_one_delay(replace(point, tau_s=tau_s), joint, theta) for tau_s, _ in delays)
+        return delays[0][1] * one + delays[1][1] * other
+
+    def with_one_delay(self, point: Point, joint: Array | None = None, theta: Array | None = None) -> Array:
+        """The same where every command is as late as every other."""
         joint = np.arange(self.batch.joints) if joint is None else joint
         theta = point.theta[joint] if theta is None else theta
         value = dict(zip(PARAMETERS, theta.T, strict=True))

@@ -10,6 +10,7 @@ import numpy as np
 
 from lerobot_vtrefine.diagnose.core.normal_equations import solved
 from lerobot_vtrefine.diagnose.core.rules import MIN_CONDITIONS
+from lerobot_vtrefine.diagnose.joints.batch import Batch
 from lerobot_vtrefine.diagnose.joints.fitting import TAU_BOUND_S, Fit, Point, ServoTrials, derivatives, ridge
 from lerobot_vtrefine.diagnose.joints.parameters import INDEX, POSITIVE
 
@@ -111,17 +112,21 @@ def refits(problem: ServoTrials, fit: Fit, channels: Array | None = None) -> Ref
     return Refits(problem, Curvature.at(problem, fit), own)
 
 
-def leave_out(problem: ServoTrials, fit: Fit) -> tuple[Array, Array]:
-    """Parameters (G, J, P) and delays (G,) without each condition; without each trial where conditions are
-    few.
+def left_out(batch: Batch) -> Array:
+    """Weights (G, T) without each condition; without each trial where conditions are few.
 
     Trials of one condition share what the model gets wrong about it, so the condition is what varies.
     """
-    names = problem.batch.conditions
+    names = batch.conditions
     units = sorted(set(names)) if len(set(names)) >= MIN_CONDITIONS else list(range(len(names)))
     of_trial = names if isinstance(units[0], str) else range(len(names))
+    return np.array([[float(own != unit) for own in of_trial] for unit in units])
+
+
+def leave_out(problem: ServoTrials, fit: Fit) -> tuple[Array, Array]:
+    """Parameters (G, J, P) and delays (G,) without each of `left_out`."""
     curvature = Curvature.at(problem, fit)
-    points = [curvature.moved(np.array([float(own != unit) for own in of_trial])) for unit in units]
+    points = [curvature.moved(weights) for weights in left_out(problem.batch)]
     return np.stack([point.theta for point in points]), np.array([point.tau_s for point in points])
 
 

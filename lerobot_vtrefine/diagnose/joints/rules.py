@@ -66,6 +66,9 @@ EARLIEST, FURTHEST = 1.25, 2.5
 """Mean delays by which one command in a hundred may be early, and late: lost commands are later."""
 TICKS_S = 5e-3
 """Deviation of single commands' delays up to which they are one: servos and hosts tick."""
+MOST_ALIKE = 0.5
+"""Correlation of the delays of commands next to each other, where those further apart have none: no more is
+possible."""
 LASTS_S, LASTING = 0.8, 0.5
 """Lags this far apart must not correlate by more than this, or it is the servo that is slow for a while."""
 

@@ -31,6 +31,7 @@ _CRITICAL = 1e-6
 _SPREAD = (-0.8, -0.4, 0.0, 0.4, 0.8)
 """Middles of five equal parts of a spread of widths."""
 _DT_DIGITS = 6
+_LEAST_MEAN_S = 1e-4
 
 
 @dataclass(frozen=True)
@@ -71,6 +72,16 @@ class Columns:
         own = {name: getattr(self, name)[kind] for name in names}
         stick = None if self.stick is None else self.stick[kind]
         return replace(self, **own, stop=None, give=None, push=None, stages=None, rounding=None, stick=stick)
+
+
+def two_delays(mean_s: float, spread_s: float) -> tuple[tuple[float, float], tuple[float, float]]:
+    """Two delays [s] and their parts, with the mean, deviation and skewness of a gamma distribution, so that
+    none is negative (Gauss's quadrature, generalised Laguerre)."""
+    scale_s = spread_s**2 / max(mean_s, _LEAST_MEAN_S)
+    shape = max(mean_s, _LEAST_MEAN_S) / scale_s
+    early_s, late_s = (scale_s * (shape + 1 + way * np.sqrt(shape + 1)) for way in (-1, 1))
+    part = (late_s - mean_s) / (late_s - early_s)
+    return (early_s, part), (late_s, 1 - part)
 
 
 def simulate(batch: Batch, columns: Columns) -> Array:

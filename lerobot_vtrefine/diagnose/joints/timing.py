@@ -5,8 +5,8 @@ on, frame by frame, must explain a joint's error; noise has no such lag. Delays 
 are a delay; commands that never come (lags far beyond the mean delay) and servos that weaken (lags that last)
 are not.
 
-How far single commands' delays scatter is another number, for a servo smooths what they do: it follows from
-the products of different joints' errors, to which noise adds nothing on average (`spread_of_commands`).
+How far single commands' delays scatter is another number, for a servo smooths what they do: see
+`command_spread`.
 
 Shapes: N frames, T trials, J joints.
 """
@@ -17,11 +17,12 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from lerobot_vtrefine.diagnose.core.heldout import cross_validated
-from lerobot_vtrefine.diagnose.core.resampling import agree, folds_of, one_sided
-from lerobot_vtrefine.diagnose.core.rules import FORM_P, LEAST_GAIN
+from lerobot_vtrefine.diagnose.core.resampling import folds_of, one_sided
+from lerobot_vtrefine.diagnose.core.rules import LEAST_GAIN
 from lerobot_vtrefine.diagnose.core.search import ALL
 from lerobot_vtrefine.diagnose.joints.batch import Batch, frame_s
 from lerobot_vtrefine.diagnose.joints.candidates import CATALOGUE
+from lerobot_vtrefine.diagnose.joints.command_spread import mirrored, spread_of_commands
 from lerobot_vtrefine.diagnose.joints.fitting import Fit, ServoTrials, derivatives, fit
 from lerobot_vtrefine.diagnose.joints.rules import (
     DELAY_P,
@@ -31,22 +32,15 @@ from lerobot_vtrefine.diagnose.joints.rules import (
     LASTS_S,
     NOT_AGAINST,
     SHARED,
-    TICKS_S,
 )
-from lerobot_vtrefine.diagnose.joints.servo import transition
 
 if TYPE_CHECKING:
     from lerobot_vtrefine.diagnose.joints.problem import Selected
 
 Array = np.ndarray
 
-RINGS_OUT = 6.0
-"""Radians of a servo's own frequency after which its response to an impulse is next to nothing."""
 _USUAL_LAG_S = 0.05
 """Lags are small beside this, as far as is known beforehand."""
-_USUAL_SPREAD_S, _NOISE = 0.03, 0.1
-"""Deviation of single commands' delays, and the part of joints' squared errors that is no delay's, by which
-products are weighed: whatever they are, only how precisely a spread is known depends on them."""
 
 
 @dataclass(frozen=True)
@@ -93,7 +87,7 @@ def with_changing_delay(selection: "Selected", seed: int) -> "Selected":
         return selection
     return replace(
         selection,
-        problem=replace(problem, delay_spread_s=max(scattered.spread_s, lag.spread_s)),
+        problem=replace(problem, delay_spread_s=scattered.spread_s() or lag.spread_s),
         fit=fitted,
         errors=errors,
         chosen={**selection.chosen, ALL: (delay,)},
@@ -143,50 +137,6 @@ def common_lag(problem: ServoTrials, fitted: Fit) -> CommonLag:
     return CommonLag(share, float(early), float(late), spread, _lasting(batch, lag, moving))
 
 
-@dataclass(frozen=True)
-class CommandSpread:
-    """How far single commands' delays scatter about their mean."""
-
-    spread_s: float
-    scores: Array
-    """(T,) by trials, as likely negative as positive where the delay is one."""
-
-    def surely(self, seed: int) -> bool:
-        """Whether trials agree that they do, by more than servos and clocks tick."""
-        return self.spread_s > TICKS_S and agree(self.scores, seed, FORM_P)
-
-
-def spread_of_commands(problem: ServoTrials, fitted: Fit) -> CommandSpread:
-    """From products of different joints' errors.
-
-    A command that is late by d moves joint i by -d times its step times the servo's response to an impulse.
-    So two joints' errors have the product of these as their covariance, times the variance of d. Products
-    count by what is known of them: those of large steps scatter as much as they say.
-    """
-    batch, left, tau = problem.batch, fitted.residual, fitted.point.tau_s
-    omega, zeta = np.exp(fitted.point.value("log_omega")), np.exp(fitted.point.value("log_zeta"))
-    noise = _NOISE * np.square(left[batch.valid]).mean(0).clip(1e-300)
-    steps, count = np.diff(batch.command, axis=0, prepend=batch.command[:1]), len(batch.time_s)
-    joints = range(batch.joints)
-    pairs = [(i, j) for i in joints for j in range(i + 1) if i == j or not mirrored(batch.command, i, j)]
-    alike = {pair: np.zeros(batch.time_s.shape) for pair in pairs}
-    frames = int(np.ceil((tau + RINGS_OUT / omega.min()) / frame_s(batch)))
-    for apart in range(min(frames, count - 1) + 1):
-        since = batch.time_s[apart:] - batch.time_s[: count - apart] - tau
-        impulse = omega**2 * transition(since.clip(min=0.0)[..., None], omega, zeta)[1]
-        moved = steps[: count - apart] * np.where(since[..., None] > 0, impulse, 0.0)
-        for i, j in pairs:
-            alike[i, j][apart:] += moved[..., i] * moved[..., j]
-    scatter = [noise[i] + _USUAL_SPREAD_S**2 * alike[i, i] for i in joints]
-    scores, power = np.zeros(batch.trials), 0.0
-    for i, j in pairs:
-        if i != j:
-            weight = np.where(batch.valid, alike[i, j] / (scatter[i] * scatter[j]), 0.0)
-            scores += (weight * left[..., i] * left[..., j]).sum(0)
-            power += float((weight * alike[i, j]).sum())
-    return CommandSpread(float(np.sqrt(max(scores.sum(), 0.0) / max(power, 1e-300))), scores)
-
-
 def _lasting(batch: Batch, lag: Array, moving: Array) -> float:
     apart = max(1, round(LASTS_S / frame_s(batch)))
     if apart >= len(lag):
@@ -197,11 +147,6 @@ def _lasting(batch: Batch, lag: Array, moving: Array) -> float:
         if both.any()
         else 0.0
     )
-
-
-def mirrored(command: Array, a: int, b: int) -> bool:
-    """Whether two joints' commands are each other's mirror image: one servo moves both."""
-    return bool(np.abs(np.abs(command[..., a]) - np.abs(command[..., b])).max() < 1e-6)
 
 
 def _distinct(batch: Batch) -> int:

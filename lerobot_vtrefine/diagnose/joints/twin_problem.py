@@ -83,7 +83,11 @@ class TwinProblem(JointProblem):
 
     @override
     def finer(self) -> "TwinProblem | None":
-        return None if self.fine is None else replace(self.fine, iterations=_SETTLING)
+        return (
+            None
+            if self.fine is None
+            else replace(self.fine, iterations=_SETTLING, delay_spread_s=self.delay_spread_s)
+        )
 
     @property
     @override
@@ -109,7 +113,7 @@ class TwinProblem(JointProblem):
         return tuple(item for item in CATALOGUE if set(item.parameters) <= known and item.form in forms)
 
     @override
-    def predict(self, point: Point, joint: Array | None = None, theta: Array | None = None) -> Array:
+    def with_one_delay(self, point: Point, joint: Array | None = None, theta: Array | None = None) -> Array:
         if joint is None:
             joint = np.arange(self.batch.joints)
         if not len(joint):
