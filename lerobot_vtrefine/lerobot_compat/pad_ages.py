@@ -5,6 +5,7 @@ the columns of what was recorded then, and of what is added when such a recordin
 """
 
 from collections.abc import Iterable, Mapping
+from functools import lru_cache
 from typing import Any
 
 import numpy as np
@@ -21,8 +22,14 @@ def ordered_ages(columns: Iterable[str], values: Mapping[str, Any]) -> NDArray[n
         values: The robot's observation, whose pads are in the order of its ages.
     """
     ages = np.asarray(values[TACTILE_AGE])
+    order = _order(tuple(columns), tuple(values))
+    return ages if ages.shape != (len(order),) else ages[list(order)]
+
+
+@lru_cache(maxsize=8)
+def _order(columns: tuple[str, ...], values: tuple[str, ...]) -> tuple[int, ...]:
+    """The place among a robot's pads of every column's; none where it has other pads. Once for a recording:
+    names are the same in every frame."""
     own = [key.removeprefix(f"{TACTILE}.") for key in values if key.startswith(f"{TACTILE}.")]
     wanted = [key.removeprefix(TACTILE_PREFIX) for key in columns if key.startswith(TACTILE_PREFIX)]
-    if own == wanted or sorted(own) != sorted(wanted) or ages.shape != (len(own),):
-        return ages
-    return ages[[own.index(pad) for pad in wanted]]
+    return tuple(own.index(pad) for pad in wanted) if sorted(own) == sorted(wanted) else ()

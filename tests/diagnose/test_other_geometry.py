@@ -10,6 +10,8 @@ import pytest
 from press_rig import COLS, PUNCH, ROWS, SPHERE, Bias, baseline, pressed
 
 from lerobot_vtrefine.diagnose.core.suspicion import Suspicion
+from lerobot_vtrefine.diagnose.pad import glimpses
+from lerobot_vtrefine.diagnose.pad.glimpses import FACE, KEPT, Glimpses, moved
 from lerobot_vtrefine.diagnose.pad.other_geometry import other_geometry
 from lerobot_vtrefine.diagnose.pad.suspicions import suspicions
 from lerobot_vtrefine.diagnose.recordings import RecordingSet
@@ -108,3 +110,23 @@ def test_it_is_the_first_of_alarms() -> None:
     found = suspicions(weighed, cast("Any", SimpleNamespace(fit=fitted, baseline=fitted)))
     decisive = [item for item in found if item.decisive and item.share > item.least]
     assert "the geometry seems other than stated" in decisive[0].clue
+
+
+def test_heights_are_found_once_for_all_places_of_the_face(monkeypatch: pytest.MonkeyPatch) -> None:
+    presses = baseline(pressed(SPHERE)).presses
+    asked_for = []
+    found = glimpses.trial_heights
+    monkeypatch.setattr(glimpses, "trial_heights", lambda *args: asked_for.append(args) or found(*args))
+    seen = Glimpses.of(presses)
+    others = seen.all_but(frozenset())
+    some = np.random.default_rng(0).normal(size=(2 * KEPT, seen.count))
+    for geometry in some:
+        for step in (0.0, 0.3):
+            lower = moved(geometry, FACE, step)
+            fresh = Glimpses.of(presses).expected(lower, others)
+            before = len(asked_for)
+            assert all(
+                np.array_equal(*pair) for pair in zip(seen.expected(lower, others), fresh, strict=True)
+            )
+            assert len(asked_for) - before == (len(seen.presses) if step == 0.0 else 0)
+    assert len(seen._kept) == KEPT

@@ -21,6 +21,7 @@ from lerobot_vtrefine.cameras import FlexitacCameraConfig
 from lerobot_vtrefine.drivers.emulator import PadEmulator
 from lerobot_vtrefine.drivers.ports import PortError
 from lerobot_vtrefine.drivers.sources import check_pattern
+from lerobot_vtrefine.lerobot_compat import pad_ages
 
 
 @RobotConfig.register_subclass("stub_arm")
@@ -146,6 +147,9 @@ def test_a_recording_with_pads_in_another_order_is_resumed_in_its_own(
     assert frame["observation.tactile_age"][1] < 0.2
     for pad in ("thumb", "index"):
         assert (frame[f"observation.tactile.{pad}"] == values[f"tactile.{pad}"]).all()
+    known = pad_ages._order.cache_info().misses
+    feature_utils.build_dataset_frame(earlier, values, "observation")
+    assert pad_ages._order.cache_info().misses == known  # names are compared once for a recording
 
 
 def test_failing_pad_leaves_nothing_connected(boards: dict[str, PadEmulator], tmp_path: Path) -> None:

@@ -37,6 +37,10 @@ SIZES = np.linspace(-MOST_GEOMETRY, MOST_GEOMETRY, 19)
 """Sizes of an object, in steps: over a punch's readings jump."""
 COMMON = 6
 """Coordinates beside the objects' sizes."""
+FACE = (2, 3, 4)
+"""Of these, where the face lies. Column heights above the stated one do not depend on them."""
+KEPT = 4
+"""Geometries whose heights are kept: a descent changes one coordinate after the other, the face's too."""
 
 Array = np.ndarray
 
@@ -171,7 +175,9 @@ class Glimpses:
 
     def expected(self, geometry: Array, others: list[Array]) -> list[Array]:
         """Readings (F, n) of every press by the law that describes those of `others` best."""
-        terms = [self._terms(item, geometry * self.steps) for item in self.presses]
+        values = geometry * self.steps
+        pressed = zip(self.presses, self._places_m, self._heights_m(values), strict=True)
+        terms = [self._terms(item, place, height, values) for item, place, height in pressed]
         known = [own[:, mask].reshape(-1, own.shape[2]) for own, mask in zip(terms, others, strict=True)]
         told = [item.signal[:, mask].ravel() for item, mask in zip(self.presses, others, strict=True)]
         gram = np.sum([own.T @ own for own in known], axis=0)
@@ -179,14 +185,33 @@ class Glimpses:
         law = np.linalg.solve(gram + np.diag(1e-9 * np.diag(gram) + 1e-12), pull)
         return [np.maximum(own @ law, 0.0) for own in terms]
 
-    def _terms(self, item: Glimpse, values: Array) -> Array:
+    def _terms(self, item: Glimpse, place_m: tuple[Array, Array], height: Array, values: Array) -> Array:
         """Powers of the column heights, in parts of the deepest press, and their rate (F, n, 4)."""
-        x, y = (axis.ravel()[item.press.taxels] for axis in np.meshgrid(*self.layout.axes_m()))
-        height = _heights_m(item, values)
-        lower = values[2] + values[3] * x + values[4] * y
+        lower = values[2] + values[3] * place_m[0] + values[4] * place_m[1]
         height = np.where(height > NOWHERE_M / 2, height - lower, 0.0).clip(min=0.0) / self.top_m
         rate = (height > 0) * item.rate[:, None] / self.top_m
         return np.stack([height, height**2, height**3, rate], axis=2)
+
+    @cached_property
+    def _places_m(self) -> list[tuple[Array, Array]]:
+        """x and y of every press's scored taxels (n,) [m]."""
+        x, y = (axis.ravel() for axis in np.meshgrid(*self.layout.axes_m()))
+        return [(x[item.press.taxels], y[item.press.taxels]) for item in self.presses]
+
+    def _heights_m(self, values: Array) -> list[Array]:
+        """Column heights (F, n) of every press [m] in a geometry (G,) [m, m, ...] of a level face."""
+        key = np.delete(values, FACE).tobytes()
+        known = self._kept.pop(key, None)
+        if known is None:
+            known = [_heights_m(item, values) for item in self.presses]
+        while len(self._kept) >= KEPT:
+            self._kept.pop(next(iter(self._kept)))
+        self._kept[key] = known  # the last one that was asked for, and so the last one to go
+        return known
+
+    @cached_property
+    def _kept(self) -> dict[bytes, list[Array]]:
+        return {}
 
 
 def _glimpse(press: Press, kind: int) -> Glimpse:

@@ -18,14 +18,12 @@ from lerobot_vtrefine.diagnose.core.rules import FORM_P, MIN_CONDITIONS, SHARE_O
 from lerobot_vtrefine.diagnose.core.suspicion import Suspicion
 from lerobot_vtrefine.diagnose.pad import glimpses
 from lerobot_vtrefine.diagnose.pad.fitting import Fit
-from lerobot_vtrefine.diagnose.pad.glimpses import COMMON, Glimpses, moved, squared
+from lerobot_vtrefine.diagnose.pad.glimpses import COMMON, FACE, Glimpses, moved, squared
 from lerobot_vtrefine.diagnose.pad.press_trials import PressSet
 from lerobot_vtrefine.diagnose.pad.rules import GEOMETRY_GAIN, MORE_GEOMETRY, MOST_GEOMETRY
 from lerobot_vtrefine.diagnose.pad.taxel_maps import find_dead
 
 PLACE, PITCH, SIZE = "place", "pitch", "size"
-FACE = (2, 3, 4)
-"""Coordinates that are causes: an offset and a tilt. They are free beside whatever else is."""
 FINER = (1 / 3, 1 / 9, 1 / 27)
 """Steps of a search where readings jump: no slope shows a punch's edge between two taxels."""
 SIZES = np.linspace(-MOST_GEOMETRY, MOST_GEOMETRY, 55)
@@ -51,6 +49,7 @@ class Told:
     @property
     def free(self) -> list[int]:
         """Numbers of its coordinates."""
+        # The face's are causes, an offset and a tilt: they are free beside whatever else is.
         places = {PLACE: (0, 1), PITCH: (5,), SIZE: range(COMMON, self.seen.count)}
         return sorted([*FACE, *(place for kind in self.kinds for place in places[kind])])
 
