@@ -4,6 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+import robot_rigs
 from robot_rigs import Rig, make_set
 
 from lerobot_vtrefine.diagnose.joints.batch import make_batch
@@ -96,3 +97,33 @@ def test_trials_that_do_not_repeat_raise_an_alarm(recordings) -> None:
     assert found.verdict.status == "unexplained"
     assert found.verdict.unknown.alarm
     assert "shoulder" in (found.verdict.unknown.clue or "")
+
+
+UNREPEATED = Rig(joints=("shoulder", "elbow"), seconds=5.0, replicates=1)
+FAR = "far more is left than the encoder scatters, and no command came twice"
+
+
+def slew_limited(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Commands that move on by 30 mrad a frame at most: no cause that has a name."""
+
+    def limited(rig, rng, command):
+        for k in range(1, command.shape[1]):
+            before = command[:, k - 1]
+            command[:, k] = before + np.clip(command[:, k] - before, -0.03, 0.03)
+        return command
+
+    monkeypatch.setattr(robot_rigs, "lossy", lambda rig, rng, command: limited(rig, rng, command.copy()))
+
+
+def test_what_is_far_beyond_noise_is_told_where_no_command_came_twice(tmp_path, monkeypatch) -> None:
+    slew_limited(monkeypatch)
+    found = diagnose_robot(read_recording_set(make_set(UNREPEATED, tmp_path, 3)), seed=0)
+    assert found.verdict.status == "unexplained"
+    assert FAR in (found.verdict.unknown.clue or "")
+
+
+@pytest.mark.parametrize("nasty", [0.0, 1.0], ids=["sound", "nasty"])
+def test_no_sound_robot_is_far_beyond_its_noise(tmp_path, nasty) -> None:
+    rig = replace(UNREPEATED, nasty=nasty, servo_scatter=0.02, jitter=0.1)
+    found = diagnose_robot(read_recording_set(make_set(rig, tmp_path, 4)), seed=0)
+    assert found.verdict.status == "adequate"

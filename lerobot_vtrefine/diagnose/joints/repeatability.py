@@ -52,11 +52,23 @@ def scatter(batch: Batch, residual: Array, own: dict[int, Array] | None = None) 
                 for k in range(batch.joints)
             ]
             parts.append(_of_pair(difference, batch.command[valid, a], servo))
-    if len(parts) < LEAST_PAIRS:
-        return None
-    values = np.stack(parts)
-    shape, resting, servo, effect, zero = (np.sqrt(np.mean(values[:, k] ** 2, 0) / 2) for k in range(5))
-    return Scatter(shape, resting, servo, effect, zero, np.median(values[:, 5], 0) / np.sqrt(2))
+    return None if len(parts) < LEAST_PAIRS else _over(np.stack(parts) / np.sqrt(2))
+
+
+def beyond_noise(batch: Batch, residual: Array, own: dict[int, Array]) -> Scatter:
+    """The same of what a model leaves of every trial by itself, as if another trial had been as it says."""
+    parts = []
+    for trial in range(batch.trials):
+        valid = batch.valid[:, trial]
+        servo = [own[k][valid, trial, :2] for k in range(batch.joints)]
+        parts.append(_of_pair(residual[valid, trial], batch.command[valid, trial], servo))
+    return _over(np.stack(parts))
+
+
+def _over(values: Array) -> Scatter:
+    """Of parts (K, 6, J)."""
+    shape, resting, servo, effect, zero = (np.sqrt(np.mean(values[:, k] ** 2, 0)) for k in range(5))
+    return Scatter(shape, resting, servo, effect, zero, np.median(values[:, 5], 0))
 
 
 def common_part(batch: Batch, residual: Array) -> tuple[Array, Array]:

@@ -16,7 +16,13 @@ from lerobot_vtrefine.diagnose.joints.batch import frame_s
 from lerobot_vtrefine.diagnose.joints.candidates import PLAIN
 from lerobot_vtrefine.diagnose.joints.fitting import derivatives
 from lerobot_vtrefine.diagnose.joints.gravity import is_gripper
-from lerobot_vtrefine.diagnose.joints.repeatability import common_part, repeated, scatter
+from lerobot_vtrefine.diagnose.joints.repeatability import (
+    Scatter,
+    beyond_noise,
+    common_part,
+    repeated,
+    scatter,
+)
 from lerobot_vtrefine.diagnose.joints.rules import (
     FEW_REPEATED,
     FOLLOWS,
@@ -46,6 +52,7 @@ def suspicions(selection: "Selected") -> list[Suspicion]:
     found = _stopped(selection)
     found += _repeating(selection)
     found += not_repeating(selection)
+    found += _unrepeated(selection)
     found += _through_the_session(selection)
     found += _following(selection)
     found += _ringing(selection)
@@ -91,20 +98,36 @@ def not_repeating(selection: "Selected") -> list[Suspicion]:
     if seen is None:
         return []
     white = np.maximum(seen.white, 0.5 * problem.batch.resolution)
+    return _far(selection, seen, white, "trials of one command differ by far more than the encoder scatters")
+
+
+def _unrepeated(selection: "Selected") -> list[Suspicion]:
+    """Errors far beyond the encoder's scatter, where no command came twice: they repeat or they do not, and
+    neither is asked anywhere else. A model may be off by what trials of a sound robot may differ by."""
+    problem, fitted = selection.problem, selection.fit
+    if repeated(problem.batch) or problem.delay_spread_s:
+        return []
+    seen = beyond_noise(problem.batch, fitted.residual, derivatives(problem, fitted).columns)
+    # Replays in coarse steps are off by themselves.
+    own = np.maximum(problem.floor, problem.misfit * np.sqrt(selection.baseline.total))
+    white = np.maximum(np.maximum(seen.white, 0.5 * problem.batch.resolution), own)
+    clue = "far more is left than the encoder scatters, and no command came twice to tell whether it repeats"
+    return _far(selection, seen, white, clue)
+
+
+def _far(selection: "Selected", seen: Scatter, white: Array, clue: str) -> list[Suspicion]:
+    """One for every joint that differs by more than sound robots do, beside a scatter from frame to frame."""
     with_motion = seen.shape > WITH_MOTION * np.maximum(seen.resting, white)
     shapes = seen.shape > np.where(with_motion, SHAPES_DIFFER, RESTING_SHAPES_DIFFER) * white
     servos = (seen.servo > SERVOS_DIFFER) & (seen.servo_effect > SHAPES_DIFFER * white)
     zeros = seen.zero > ZEROS_DIFFER * white
     # What differs in shape has a mean and a likeness to slower servos, too.
     servos, zeros = servos & (seen.servo_effect > seen.shape), zeros & (seen.zero > seen.shape)
-    least, clue = (
-        _worth_speaking_of(selection),
-        "trials of one command differ by far more than the encoder scatters",
-    )
+    least, total = _worth_speaking_of(selection), selection.fit.total.clip(1e-300)
     found = []
-    for joint in range(problem.batch.joints):
+    for joint in range(len(total)):
         for size, far in ((seen.shape, shapes), (seen.servo_effect, servos), (seen.zero, zeros)):
-            share = float(min(size[joint] ** 2 / max(fitted.total[joint], 1e-300), 1.0))
+            share = float(min(size[joint] ** 2 / total[joint], 1.0))
             if far[joint] and share > max(REPEATS, least[joint]):
                 found.append(Suspicion(joint, clue, share, REPEATS))
                 break
