@@ -8,8 +8,9 @@ from robot_rigs import Rig, make_set
 from lerobot_vtrefine.diagnose.joints.batch import make_batch
 from lerobot_vtrefine.diagnose.joints.engine import diagnose_robot
 from lerobot_vtrefine.diagnose.joints.estimates import widened
-from lerobot_vtrefine.diagnose.joints.fitting import ServoTrials, ridge, servo_only
+from lerobot_vtrefine.diagnose.joints.fitting import ridge, servo_only
 from lerobot_vtrefine.diagnose.joints.parameters import INDEX, SAG
+from lerobot_vtrefine.diagnose.joints.servo_trials import ServoTrials
 from lerobot_vtrefine.diagnose.recordings import read_recording_set
 
 SLOW = Rig(joints=("shoulder", "elbow"), rate_hz=20.0, seconds=5.0, conditions=8, jitter=0.1)

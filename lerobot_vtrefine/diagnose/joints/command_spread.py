@@ -22,10 +22,11 @@ from scipy.optimize import nnls
 from lerobot_vtrefine.diagnose.core.resampling import agree
 from lerobot_vtrefine.diagnose.core.rules import FORM_P
 from lerobot_vtrefine.diagnose.joints.batch import frame_s
-from lerobot_vtrefine.diagnose.joints.fitting import Fit, ServoTrials
+from lerobot_vtrefine.diagnose.joints.fitting import Fit
 from lerobot_vtrefine.diagnose.joints.newton import left_out
 from lerobot_vtrefine.diagnose.joints.rules import MOST_ALIKE, TICKS_S
 from lerobot_vtrefine.diagnose.joints.servo import transition
+from lerobot_vtrefine.diagnose.joints.servo_trials import ServoTrials
 
 if TYPE_CHECKING:
     from lerobot_vtrefine.diagnose.joints.problem import Selected

@@ -9,10 +9,10 @@ import numpy as np
 
 from lerobot_vtrefine.diagnose.core.resampling import jackknife
 from lerobot_vtrefine.diagnose.joints.command_spread import delays_left_out
-from lerobot_vtrefine.diagnose.joints.fitting import ServoTrials
 from lerobot_vtrefine.diagnose.joints.gravity import is_sliding
 from lerobot_vtrefine.diagnose.joints.newton import leave_out, without_ridge
 from lerobot_vtrefine.diagnose.joints.parameters import INDEX
+from lerobot_vtrefine.diagnose.joints.servo_trials import ServoTrials
 from lerobot_vtrefine.diagnose.verdict import Parameter
 
 if TYPE_CHECKING:

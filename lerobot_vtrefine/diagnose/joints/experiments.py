@@ -9,9 +9,9 @@ from lerobot_vtrefine.diagnose.core.rivals import Rival
 from lerobot_vtrefine.diagnose.core.suspicion import Alarm
 from lerobot_vtrefine.diagnose.joints.batch import frame_s, make_batch
 from lerobot_vtrefine.diagnose.joints.candidates import PLAIN, told_by_load
-from lerobot_vtrefine.diagnose.joints.fitting import ServoTrials
 from lerobot_vtrefine.diagnose.joints.gravity import is_gripper, is_sliding
 from lerobot_vtrefine.diagnose.joints.rules import ENOUGH_TRIALS, TELLING
+from lerobot_vtrefine.diagnose.joints.servo_trials import ServoTrials
 from lerobot_vtrefine.diagnose.recordings import RobotTrial
 from lerobot_vtrefine.wording import plural
 

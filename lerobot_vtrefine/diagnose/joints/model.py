@@ -9,8 +9,8 @@ import numpy as np
 
 from lerobot_vtrefine.diagnose.joints import stages
 from lerobot_vtrefine.diagnose.joints.batch import Batch, make_batch
-from lerobot_vtrefine.diagnose.joints.fitting import Point, ServoTrials
 from lerobot_vtrefine.diagnose.joints.parameters import PARAMETERS, SAG
+from lerobot_vtrefine.diagnose.joints.servo_trials import Point, ServoTrials
 from lerobot_vtrefine.diagnose.recordings import RobotTrial
 from lerobot_vtrefine.diagnose.verdict import write_atomically
 from lerobot_vtrefine.embodiments.robot_file import SCHEMA, JointModel, SagForm, read_robot_file

@@ -11,8 +11,9 @@ import numpy as np
 from lerobot_vtrefine.diagnose.core.normal_equations import solved
 from lerobot_vtrefine.diagnose.core.rules import MIN_CONDITIONS
 from lerobot_vtrefine.diagnose.joints.batch import Batch
-from lerobot_vtrefine.diagnose.joints.fitting import TAU_BOUND_S, Fit, Point, ServoTrials, derivatives, ridge
+from lerobot_vtrefine.diagnose.joints.fitting import TAU_BOUND_S, Fit, derivatives, ridge
 from lerobot_vtrefine.diagnose.joints.parameters import INDEX, POSITIVE
+from lerobot_vtrefine.diagnose.joints.servo_trials import Point, ServoTrials
 
 Array = np.ndarray
 

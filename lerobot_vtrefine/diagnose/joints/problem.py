@@ -14,11 +14,12 @@ from lerobot_vtrefine.diagnose.core.suspicion import Suspicion
 from lerobot_vtrefine.diagnose.joints import gravity
 from lerobot_vtrefine.diagnose.joints.candidates import CATALOGUE, told_by_load
 from lerobot_vtrefine.diagnose.joints.candidates.base import Candidate
-from lerobot_vtrefine.diagnose.joints.fitting import Fit, Point, ServoTrials, evaluate, fit, refit, servo_only
+from lerobot_vtrefine.diagnose.joints.fitting import Fit, evaluate, fit, refit, servo_only
 from lerobot_vtrefine.diagnose.joints.newton import Refits, refits
 from lerobot_vtrefine.diagnose.joints.parameters import INDEX, SAG
 from lerobot_vtrefine.diagnose.joints.rules import EXTRAPOLATION, LEAST_EFFECT_M, LEAST_EFFECT_RAD
 from lerobot_vtrefine.diagnose.joints.servo_load import load_prefers
+from lerobot_vtrefine.diagnose.joints.servo_trials import Point, ServoTrials
 from lerobot_vtrefine.diagnose.joints.suspicions import (
     not_repeating,
     suspicions,

@@ -4,9 +4,10 @@ import numpy as np
 
 from lerobot_vtrefine.diagnose.core.resampling import one_sided
 from lerobot_vtrefine.diagnose.core.rules import ALPHA
-from lerobot_vtrefine.diagnose.joints.fitting import Fit, ServoTrials
+from lerobot_vtrefine.diagnose.joints.fitting import Fit
 from lerobot_vtrefine.diagnose.joints.rules import LOAD_TELLS, SERVO_SHARE
 from lerobot_vtrefine.diagnose.joints.servo import play_operator
+from lerobot_vtrefine.diagnose.joints.servo_trials import ServoTrials
 
 Array = np.ndarray
 

@@ -23,7 +23,7 @@ from lerobot_vtrefine.diagnose.core.search import ALL
 from lerobot_vtrefine.diagnose.joints.batch import Batch, frame_s
 from lerobot_vtrefine.diagnose.joints.candidates import CATALOGUE
 from lerobot_vtrefine.diagnose.joints.command_spread import mirrored, spread_of_commands
-from lerobot_vtrefine.diagnose.joints.fitting import Fit, ServoTrials, derivatives, fit
+from lerobot_vtrefine.diagnose.joints.fitting import Fit, derivatives, fit
 from lerobot_vtrefine.diagnose.joints.rules import (
     DELAY_P,
     EARLIEST,
@@ -33,6 +33,7 @@ from lerobot_vtrefine.diagnose.joints.rules import (
     NOT_AGAINST,
     SHARED,
 )
+from lerobot_vtrefine.diagnose.joints.servo_trials import ServoTrials
 
 if TYPE_CHECKING:
     from lerobot_vtrefine.diagnose.joints.problem import Selected

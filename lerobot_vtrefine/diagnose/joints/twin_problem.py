@@ -23,10 +23,10 @@ from lerobot_vtrefine.diagnose.joints import gravity
 from lerobot_vtrefine.diagnose.joints.batch import Batch, frame_s
 from lerobot_vtrefine.diagnose.joints.candidates import CATALOGUE
 from lerobot_vtrefine.diagnose.joints.candidates.base import Candidate
-from lerobot_vtrefine.diagnose.joints.fitting import Point
 from lerobot_vtrefine.diagnose.joints.parameters import INDEX, PARAMETERS, SAG
 from lerobot_vtrefine.diagnose.joints.problem import JointProblem
 from lerobot_vtrefine.diagnose.joints.servo import play_operator
+from lerobot_vtrefine.diagnose.joints.servo_trials import Point
 from lerobot_vtrefine.embodiments import get_embodiment
 from lerobot_vtrefine.sim import task
 from lerobot_vtrefine.sim.backends.batch import usable_cores

@@ -7,8 +7,8 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from lerobot_vtrefine.diagnose.core.problem import Candidate as AnyCandidate
-from lerobot_vtrefine.diagnose.joints.fitting import Point, ServoTrials
 from lerobot_vtrefine.diagnose.joints.parameters import INDEX, RATIOS
+from lerobot_vtrefine.diagnose.joints.servo_trials import Point, ServoTrials
 from lerobot_vtrefine.diagnose.verdict import Parameter
 
 if TYPE_CHECKING:

@@ -8,9 +8,9 @@ import numpy as np
 from lerobot_vtrefine.diagnose.joints import gravity
 from lerobot_vtrefine.diagnose.joints.candidates.base import POSTURE, Candidate, moving
 from lerobot_vtrefine.diagnose.joints.estimates import Estimates, MethodError
-from lerobot_vtrefine.diagnose.joints.fitting import Point, ServoTrials
 from lerobot_vtrefine.diagnose.joints.parameters import INDEX, SAG
 from lerobot_vtrefine.diagnose.joints.rules import FORM_LEAD
+from lerobot_vtrefine.diagnose.joints.servo_trials import Point, ServoTrials
 from lerobot_vtrefine.diagnose.verdict import Parameter
 
 Array = np.ndarray

@@ -6,9 +6,9 @@ from lerobot_vtrefine.diagnose.core.resampling import jackknife
 from lerobot_vtrefine.diagnose.joints import gravity
 from lerobot_vtrefine.diagnose.joints.candidates.base import Candidate, at_zero, moving
 from lerobot_vtrefine.diagnose.joints.estimates import Estimates, MethodError, widened
-from lerobot_vtrefine.diagnose.joints.fitting import Point, ServoTrials
 from lerobot_vtrefine.diagnose.joints.parameters import INDEX
 from lerobot_vtrefine.diagnose.joints.rules import FORM_LEAD
+from lerobot_vtrefine.diagnose.joints.servo_trials import Point, ServoTrials
 from lerobot_vtrefine.diagnose.joints.stages import parameters, spring
 from lerobot_vtrefine.diagnose.verdict import Parameter
 
