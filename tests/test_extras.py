@@ -86,7 +86,19 @@ def test_every_package_of_an_extra_is_known_by_what_is_imported() -> None:
 @pytest.mark.timeout(900)
 def test_recording_training_and_rollout_need_no_simulator() -> None:
     test = "tests/robots/test_rollout.py::test_record_train_and_roll_out_on_the_same_robot"
-    command = [sys.executable, "-m", "pytest", "-q", "-p", "no:cacheprovider", "-p", "no:xdist", test]
+    command = [
+        sys.executable,
+        "-m",
+        "pytest",
+        "-q",
+        "-m",
+        "slow",
+        "-p",
+        "no:cacheprovider",
+        "-p",
+        "no:xdist",
+        test,
+    ]
     done = subprocess.run(
         command, cwd=ROOT, capture_output=True, text=True, env=blocked(SIMULATORS), check=False
     )

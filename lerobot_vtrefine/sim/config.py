@@ -183,7 +183,13 @@ class SuccessConfig:
     """It must stay so for that long."""
 
     def __post_init__(self) -> None:
-        check_numbers(self, "success.", above_0=("lateral_m", "tilt_rad"), not_below_0=("hold_s",))
+        check_numbers(
+            self,
+            "success.",
+            above_0=("lateral_m", "tilt_rad"),
+            not_below_0=("hold_s",),
+            may_be_infinite=("mouth_height_m",),  # -inf where the socket stands on the table
+        )
 
     def hold_steps(self, control_dt_s: float) -> int:
         """Consecutive observations that must find the plug seated: n steps apart lie n + 1 observations."""

@@ -65,6 +65,7 @@ def trained_state(output: Path) -> dict:
     return load_state(path)
 
 
+@pytest.mark.slow  # without a simulator: test_two_ranks.py
 def test_every_rank_plays_its_own_episodes(run: tuple[Path, Path, str]) -> None:
     """Two ranks of two environments: no episode twice, none left out."""
     first = TRAINING_SEEDS + SEED
@@ -73,6 +74,7 @@ def test_every_rank_plays_its_own_episodes(run: tuple[Path, Path, str]) -> None:
     assert seeds(run[1]) == sorted(2 * evaluated + trained)  # evaluated before training and after
 
 
+@pytest.mark.slow
 def test_one_rank_writes_and_all_are_counted(run: tuple[Path, Path, str]) -> None:
     output, _, printed = run
     rows = read_progress(output)

@@ -32,12 +32,14 @@ def verdict(tmp_path_factory):
     return json.loads((folder / "out" / "verdict.json").read_text())
 
 
+@pytest.mark.slow  # each alone: test_object_engine.py, test_vision_engine.py
 def test_parts_and_camera_are_named_and_nothing_else(verdict) -> None:
     assert verdict["status"] == "explained"
     assert {cause["name"] for cause in verdict["causes"]} == {"object_mass", "camera_extrinsics"}
     assert set(verdict["next_experiment"]["decides"]) == {"object_friction", "clearance"}
 
 
+@pytest.mark.slow
 def test_sizes_are_right(verdict) -> None:
     params = {cause["name"]: cause["params"] for cause in verdict["causes"]}
     assert params["object_mass"]["socket_kg"]["value"] == pytest.approx(2.5 * 0.116, rel=0.08)

@@ -46,6 +46,7 @@ def record(rig: Rig, root: Path, patch: pytest.MonkeyPatch) -> LeRobotDataset:
     return LeRobotDataset("local/emulated", root=root)
 
 
+@pytest.mark.slow  # test_extras.py runs it in every suite, without a simulator
 def test_record_train_and_roll_out_on_the_same_robot(
     rig: Rig, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
