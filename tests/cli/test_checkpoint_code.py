@@ -6,7 +6,7 @@ import sys
 from pathlib import Path
 
 import pytest
-from conftest import TINY_ENV, lerobot
+from tiny_commands import TINY_ENV, lerobot
 
 
 def poisoned(checkpoint: Path, folder: Path, marker: Path) -> Path:

@@ -4,7 +4,7 @@ import importlib.util
 from pathlib import Path
 
 import pytest
-from conftest import TINY_ENV, finish, lerobot, record
+from tiny_commands import TINY_ENV, finish, lerobot, record
 
 from lerobot_vtrefine.shipped import find
 

@@ -5,7 +5,7 @@ from pathlib import Path
 import av
 import numpy as np
 import pytest
-from conftest import TINY_ENV
+from tiny_commands import TINY_ENV
 
 from lerobot_vtrefine.cli.results.collect import run_rows
 from lerobot_vtrefine.envs.config import VtRefineEnvConfig

@@ -9,8 +9,8 @@ from pathlib import Path
 
 import pytest
 import torch
-from conftest import TINY_ENV
 from lerobot.common.train_utils import update_last_checkpoint
+from tiny_commands import TINY_ENV
 
 from lerobot_vtrefine.finetune.logger import read_progress
 from lerobot_vtrefine.finetune.seeds import EVALUATION_SEEDS, TRAINING_SEEDS

@@ -7,8 +7,8 @@ import sys
 from pathlib import Path
 
 import pytest
-from conftest import TINY_ENV
 from lerobot.datasets.lerobot_dataset import LeRobotDataset
+from tiny_commands import TINY_ENV
 
 NAMESPACE = ("unshare", "--user", "--map-root-user", "--mount", "sh", "-c")
 SCRIPT = """

@@ -8,9 +8,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 from aloha_columns import TACTILE_KEYS
-from conftest import lerobot_here, record
 from lerobot.datasets import LeRobotDataset
 from local_hub import use_folder_as_hub
+from tiny_commands import lerobot_here, record
 
 from lerobot_vtrefine.datasets.features import ACTION_KEY, DEPTH_KEY, NOISE_LEVEL_KEY, RGB_KEY, STATE_KEY
 from lerobot_vtrefine.envs.config import VtRefineEnvConfig

@@ -6,7 +6,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-from conftest import TINY_DPPO, TINY_ENV
+from tiny_commands import TINY_DPPO, TINY_ENV
 
 from lerobot_vtrefine.files.arrays import read_arrays
 from lerobot_vtrefine.finetune import policy_player

@@ -10,10 +10,10 @@ import draccus
 import httpx
 import huggingface_hub
 import pytest
-from conftest import TINY_DPPO, TINY_ENV
 from lerobot.envs.configs import EnvConfig
 from lerobot.scripts import lerobot_eval
 from local_hub import use_folder_as_hub
+from tiny_commands import TINY_DPPO, TINY_ENV
 
 from lerobot_vtrefine.cli import finetune, share, sharing
 from lerobot_vtrefine.cli.card_evaluation import evaluation_stage

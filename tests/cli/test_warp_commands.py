@@ -6,7 +6,7 @@ from importlib.util import find_spec
 from pathlib import Path
 
 import pytest
-from conftest import TINY_DPPO, TINY_ENV
+from tiny_commands import TINY_DPPO, TINY_ENV
 
 pytestmark = [
     pytest.mark.slow,
