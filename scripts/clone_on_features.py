@@ -30,6 +30,7 @@ from lerobot_vtrefine.cli.arguments import CommandParser
 from lerobot_vtrefine.cli.errors import run_cli
 from lerobot_vtrefine.datasets.features import ACTION_KEY, LIMITS_KEY, STATE_KEY, TRUTH_KEY
 from lerobot_vtrefine.files.text import read_yaml
+from lerobot_vtrefine.finetune.distributed import check_device
 from lerobot_vtrefine.lerobot_compat.completeness import check_complete
 from lerobot_vtrefine.policies.vt_dp3.modeling_vt_dp3 import VtDp3Policy
 from lerobot_vtrefine.policies.vt_dp3.observation_encoder import PERCEIVED_KEY
@@ -116,6 +117,7 @@ def make_parser() -> CommandParser:
 def main() -> int:
     """Writes the policy with its processors."""
     args = make_parser().parse_args()
+    check_device(args.device)
     set_seed(args.seed)
     policy, processors, dataset = load(args)
     loss = clone(policy, perceived(policy, processors[0], dataset, args.passes), args.steps, args.batch_size)

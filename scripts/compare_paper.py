@@ -36,7 +36,7 @@ from pathlib import Path
 from paper.outcome import is_done, row_of
 from paper.stages import TASKS, shared_stages, stages
 from paper.trained import PAPERS_OWN, Trained, chosen, table_of, variants
-from runs.side_by_side import check_device, run_all
+from runs.side_by_side import run_all
 
 from lerobot_vtrefine.cli.arguments import CommandParser
 from lerobot_vtrefine.cli.errors import run_cli
@@ -44,6 +44,7 @@ from lerobot_vtrefine.cli.pipeline.demo_config import RECIPES
 from lerobot_vtrefine.cli.pipeline.stages import StageRunner
 from lerobot_vtrefine.cli.results.collect import save
 from lerobot_vtrefine.cli.results.published import DEMONSTRATIONS
+from lerobot_vtrefine.finetune.distributed import check_device
 
 RESULTS = Path(__file__).parents[1] / "results"
 

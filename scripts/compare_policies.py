@@ -17,7 +17,7 @@ import argparse
 import sys
 from pathlib import Path
 
-from runs.side_by_side import check_device, run_all
+from runs.side_by_side import run_all
 
 from lerobot_vtrefine.cli.arguments import CommandParser
 from lerobot_vtrefine.cli.errors import run_cli
@@ -27,6 +27,7 @@ from lerobot_vtrefine.cli.report.results import load_evaluation
 from lerobot_vtrefine.cli.results.collect import save
 from lerobot_vtrefine.cli.results.provenance import provenance
 from lerobot_vtrefine.cli.results.rows import Run
+from lerobot_vtrefine.finetune.distributed import check_device
 from lerobot_vtrefine.shipped import PREFIX, find
 
 RESULTS = Path(__file__).parents[1] / "results" / "policies.json"

@@ -36,6 +36,7 @@ from lerobot_vtrefine.cli.pipeline.demo_config import RECIPES, default_degradati
 from lerobot_vtrefine.cli.pipeline.stages import StageRunner
 from lerobot_vtrefine.cli.results.provenance import write_provenance
 from lerobot_vtrefine.files import read_yaml
+from lerobot_vtrefine.finetune.distributed import check_device
 from lerobot_vtrefine.shipped import find
 
 
@@ -99,6 +100,7 @@ def parse() -> tuple[argparse.Namespace, Budget]:
 def main() -> None:
     """Prepare, run every policy, compare."""
     options, budget = parse()
+    check_device(budget.device)
     before, policies = lanes(budget)
     if options.lane is not None:
         StageRunner(budget.output_dir, (before | policies)[options.lane]).run()

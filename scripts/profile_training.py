@@ -21,6 +21,7 @@ import numpy as np
 
 from lerobot_vtrefine.cli.arguments import CommandParser
 from lerobot_vtrefine.cli.errors import run_cli
+from lerobot_vtrefine.finetune.distributed import check_device
 from lerobot_vtrefine.lerobot_compat.benchmark import record_noise
 
 FRAMES = 50
@@ -80,6 +81,7 @@ def main() -> int:
     parser.add_argument("--episodes", type=int, default=20, help="of the dataset, 50 frames each")
     parser.add_argument("--json", type=Path, help="where to write the rows, too")
     args = parser.parse_args()
+    check_device(args.device)
     rows = []
     with tempfile.TemporaryDirectory() as folder:
         root = Path(folder) / "frames"

@@ -72,11 +72,9 @@ def run_demo(config: DemoConfig) -> Path:
     Raises:
         ValueError: a GPU is asked for and there is none; the stages would take the processor and not say so.
     """
-    if config.device.startswith("cuda"):
-        import torch
+    from lerobot_vtrefine.finetune.distributed import check_device
 
-        if not torch.cuda.is_available():
-            raise ValueError(f"--device={config.device}: PyTorch finds no NVIDIA GPU; leave the flag out")
+    check_device(config.device)
     config.output_dir.mkdir(parents=True, exist_ok=True)
     runner = StageRunner(config.output_dir, demo_stages(config))
     print(

@@ -11,6 +11,12 @@ import torch.distributed as dist
 from torch import Tensor, nn
 
 
+def check_device(device: str) -> None:
+    """Raises: ValueError for a GPU where there is none: LeRobot would go on, on the CPU, for days."""
+    if device.startswith("cuda") and not torch.cuda.is_available():
+        raise ValueError(f"--device={device}: no CUDA GPU with a driver here; --device=cpu takes far longer")
+
+
 def claim_gpu() -> None:
     """Make this process's own GPU the current one; before anything is moved to "cuda"."""
     if "LOCAL_RANK" in os.environ and torch.cuda.is_available():

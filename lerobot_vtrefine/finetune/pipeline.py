@@ -32,7 +32,7 @@ from lerobot_vtrefine.finetune.checkpoint import (
 )
 from lerobot_vtrefine.finetune.config import DppoConfig, PaperDppo
 from lerobot_vtrefine.finetune.console import logs_above_bars
-from lerobot_vtrefine.finetune.distributed import claim_gpu, join_ranks, leave_ranks, rank_index
+from lerobot_vtrefine.finetune.distributed import check_device, claim_gpu, join_ranks, leave_ranks, rank_index
 from lerobot_vtrefine.finetune.dppo import Metrics, TrainState, train
 from lerobot_vtrefine.finetune.evaluation import evaluate
 from lerobot_vtrefine.finetune.logger import ProgressLog, start_wandb
@@ -228,7 +228,10 @@ def load_practice(
     """The same of a checkpoint's folder and a file as in configs/env; both on ``device`` (cpu, cuda).
 
     The rest is as of `env_on`.
+
+    Raises: ValueError where there is no such device, and as `env_on` and `make_practice`.
     """
+    check_device(device)
     env = env_on(device, task, backend, timestep_s, **fields)
     policy = VtDp3Policy.from_pretrained(path).to(device)
     policy.config.device = device

@@ -133,12 +133,6 @@ def visible_gpus() -> list[str]:
     return named.split(",") if named else [str(index) for index in range(torch.cuda.device_count())]
 
 
-def check_device(device: str) -> None:
-    """Raises: ValueError for a GPU where there is none: LeRobot would go on, on the CPU, for days."""
-    if device.startswith("cuda") and not torch.cuda.is_available():
-        raise ValueError(f"--device={device}: no CUDA GPU with a driver here; --device=cpu takes far longer")
-
-
 def start(command: Sequence[str], folder: Path, share: Share) -> subprocess.Popen:
     """One command in the background, on its share of the machine."""
     folder.parent.mkdir(parents=True, exist_ok=True)

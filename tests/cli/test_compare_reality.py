@@ -171,6 +171,15 @@ def test_a_task_of_its_own_brings_its_encoder_and_its_name(budget, tmp_path, mon
     )
 
 
+def test_a_gpu_that_is_not_there_is_told_before_anything_is_written(tmp_path, monkeypatch):
+    monkeypatch.setattr("torch.cuda.is_available", lambda: False)
+    monkeypatch.setattr("sys.argv", ["compare_reality.py", f"--output_dir={tmp_path}", "--device=cuda"])
+    monkeypatch.setattr(script, "run_lanes", lambda *_: pytest.fail("it went on"))
+    with pytest.raises(ValueError, match="--device=cuda: no CUDA GPU with a driver here"):
+        script.main()
+    assert not list(tmp_path.iterdir())
+
+
 def test_unfinished_seeds_are_left_out(budget):
     leave_results(budget, {}, budget.seeds)
     first, *others = budget.realities

@@ -370,6 +370,12 @@ def test_a_task_of_another_environment_is_refused_before_the_policy_is_loaded(tm
         pipeline.load_practice(tmp_path / "no policy", task, PaperDppo(), "cpu", ablate="touch")
 
 
+def test_a_gpu_that_is_not_there_is_told_before_the_policy_is_loaded(tmp_path, monkeypatch):
+    monkeypatch.setattr("torch.cuda.is_available", lambda: False)
+    with pytest.raises(ValueError, match="--device=cuda: no CUDA GPU with a driver here"):
+        pipeline.load_practice(tmp_path / "no policy", tmp_path / "no task", PaperDppo(), "cuda")
+
+
 def test_a_task_practised_on_a_gpu_is_simulated_there(tmp_path):
     task = tmp_path / "task.yaml"
     task.write_text("env: {type: vtrefine, pair: square, backend: batch, scene: {timestep_s: 0.002}}")
