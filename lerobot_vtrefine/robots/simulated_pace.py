@@ -21,7 +21,8 @@ class Pace:
     def step_done(self, busy_s: float) -> None:
         """Note a control step that took `busy_s` to compute, and wait while the simulation is ahead.
 
-        The first step ends one `dt_s` after it began. A loop that keeps the same rate never waits here.
+        The first step never waits, and step n until n - 1 `dt_s` after the first one began: a loop that keeps
+        the same rate never waits here.
         """
         now = time.perf_counter()
         if self._began is None:
