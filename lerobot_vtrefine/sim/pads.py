@@ -128,9 +128,8 @@ def pad_layout(embodiment: Embodiment) -> PadLayout:
     vertices = signs * np.array([length, width, thickness]) / 2
     faces = [(0, 1, 3), (0, 3, 2), (4, 6, 7), (4, 7, 5), (0, 4, 5), (0, 5, 1)]
     faces += [(2, 3, 7), (2, 7, 6), (0, 2, 6), (0, 6, 4), (1, 5, 7), (1, 7, 3)]
-    wanted, outward = embodiment.pad_layout, np.array([0.0, 0.0, 1.0])
     return layout_from_mesh(
-        vertices, np.array(faces), wanted.rows, wanted.cols, wanted.pitch_m, outward=outward
+        vertices, np.array(faces), embodiment.pad_layout, outward=np.array([0.0, 0.0, 1.0])
     )
 
 

@@ -1,11 +1,13 @@
 """Where the taxels of a pad sit: a planar lattice, given directly or found on the pad's mesh."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 IDENTITY_AXES = ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0))
 FLATNESS_TOLERANCE_M = 5e-5
+MARGIN_M = 1e-3
+"""Between a lattice and the edges of the face that it lies on."""
 
 
 @dataclass(frozen=True)
@@ -83,14 +85,14 @@ def _ray_hits(
     return t[np.arange(len(t)), best], best
 
 
-def _face_axes(size: np.ndarray, rows: int, cols: int, outward: np.ndarray) -> np.ndarray:
-    """Pad axes (3, 3, columns x, y, z) in the mesh frame: z outward, columns along the longer side when cols
-    >= rows."""
+def _face_axes(size: np.ndarray, lattice: PadLayout, outward: np.ndarray) -> np.ndarray:
+    """Pad axes (3, 3, columns x, y, z) in the mesh frame: z outward, columns along the longer side when there
+    are at least as many of them as rows."""
     thickness = int(np.argmin(size))
     sides = [axis for axis in range(3) if axis != thickness]
     longer = max(sides, key=lambda axis: size[axis])
     shorter = min(sides, key=lambda axis: size[axis]) if size[sides[0]] != size[sides[1]] else sides[1]
-    x = np.eye(3)[longer if cols >= rows else shorter]
+    x = np.eye(3)[longer if lattice.cols >= lattice.rows else shorter]
     return np.stack([x, np.cross(outward, x), outward], axis=1)
 
 
@@ -126,20 +128,18 @@ def _require_flat(distance: np.ndarray, layout: PadLayout) -> None:
 def layout_from_mesh(
     vertices: np.ndarray,
     faces: np.ndarray,
-    rows: int = 12,
-    cols: int = 32,
-    pitch_m: float = 0.002,
-    margin_m: float = 1e-3,
+    lattice: PadLayout,
     outward: np.ndarray | None = None,
 ) -> PadLayout:
     """Find the taxels on a pad's mesh as in the paper's appendix ("Sampling Tactile Points").
 
-    The shortest bounding-box axis is the thickness; a centred lattice of spacing `pitch_m` is laid on the
-    face with at least `margin_m` to its edges, and rays along the inward normal put every taxel on the mesh.
+    The shortest bounding-box axis is the thickness; the lattice is laid on the middle of the face, with
+    at least `MARGIN_M` to its edges, and rays along the inward normal put every taxel on the mesh.
 
     Args:
         vertices: (V, 3) [m].
         faces: (F, 3) vertex indices of triangles.
+        lattice: its rows, columns and pitch; where it lies is what is found.
         outward: side of the thickness axis that senses; default the side with the larger flat area.
 
     Raises:
@@ -157,24 +157,25 @@ def layout_from_mesh(
         raise ValueError(
             f"pad mesh must have vertices (V, 3) and triangles (F, 3), got {vertices.shape}, {faces.shape}"
         )
-    layout = PadLayout(rows, cols, pitch_m)
     low, high = vertices.min(axis=0), vertices.max(axis=0)
     axis = int(np.argmin(high - low))
     normal = _outward_normal(vertices, faces, axis, outward)
-    axes = _face_axes(high - low, rows, cols, normal)
-    needed = (np.array([cols, rows]) - 1) * pitch_m + 2 * margin_m
+    axes = _face_axes(high - low, lattice, normal)
+    needed = (np.array([lattice.cols, lattice.rows]) - 1) * lattice.pitch_m + 2 * MARGIN_M
     available = np.abs(axes[:, :2].T @ (high - low))
     if (available + 1e-9 < needed).any():
         face, need = (" x ".join(f"{side * 1e3:.1f}" for side in size) for size in (available, needed))
         raise ValueError(
-            f"pad mesh face is {face} mm, but {rows} x {cols} taxels at {pitch_m * 1e3:g} mm with "
-            f"{margin_m * 1e3:g} mm margin need {need} mm"
+            f"pad mesh face is {face} mm, but {lattice.rows} x {lattice.cols} taxels at"
+            f" {lattice.pitch_m * 1e3:g} mm with {MARGIN_M * 1e3:g} mm margin need {need} mm"
         )
     face_centre = (low + high) / 2 + normal * (high - low)[axis] / 2
-    starts = layout.positions() @ axes.T + face_centre + normal * (high - low)[axis]
+    starts = lattice.positions() @ axes.T + face_centre + normal * (high - low)[axis]
     distance, _ = _ray_hits(starts, -normal, vertices[faces])
-    _require_flat(distance, layout)
+    _require_flat(distance, lattice)
     position = face_centre + normal * ((high - low)[axis] - float(distance.mean()))
-    return PadLayout(
-        rows, cols, pitch_m, tuple(position.tolist()), tuple(tuple(row) for row in axes.tolist())
+    return replace(
+        lattice,
+        mesh_position_m=tuple(position.tolist()),
+        mesh_axes=tuple(tuple(row) for row in axes.tolist()),
     )
