@@ -234,8 +234,8 @@ class TaskConfig:
 
     def __post_init__(self) -> None:
         check_control_rate("control_hz", self.control_hz)
-        if self.episode_steps is not None and self.episode_steps < 1:
-            raise ValueError(f"episode_steps must be at least 1, got {self.episode_steps}")
+        if self.episode_steps is not None and (self.episode_steps < 1 or self.episode_steps % 1):
+            raise ValueError(f"episode_steps must be a whole number from 1 on, got {self.episode_steps}")
         rates = ("joint_rate", "finger_rate")
         check_numbers(self, above_0=rates, may_be_infinite=rates)
 

@@ -191,6 +191,12 @@ def test_numbers_that_no_group_of_settings_takes_are_named_by_the_parser(setting
         draccus.decode(EnvConfig, {"type": "vtrefine", **settings})
 
 
+@pytest.mark.parametrize("steps", [0, 1.5, math.nan])
+def test_an_episode_has_a_whole_number_of_steps(steps):
+    with pytest.raises(ValueError, match="episode_steps must be a whole number from 1 on, got"):
+        TaskConfig(episode_steps=steps)
+
+
 def test_a_limit_may_be_infinite():
     assert LimitsConfig(in_hand_shift_m=math.inf, contact_force_n=math.inf).contact_force_n == math.inf
 

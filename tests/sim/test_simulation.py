@@ -262,7 +262,7 @@ def test_success_must_be_held():
         ),
         (lambda: SceneConfig(start="floor"), "start=floor is unknown; choose from table, grasped"),
         (lambda: insertion_sim(1, rules=TaskConfig(control_hz=30)), "whole number of physics steps"),
-        (lambda: TaskConfig(episode_steps=0), "episode_steps must be at least 1"),
+        (lambda: TaskConfig(episode_steps=0), "episode_steps must be a whole number from 1 on"),
         (lambda: RandomizationConfig(clearance_m=(0.0, 0.001)), "randomization.clearance_m needs 0 < lowest"),
         (
             lambda: insertion_sim(1, rules=TaskConfig(grasped=GraspedStart(mouth_m=(0.5, 0, 0.5)))).reset(
