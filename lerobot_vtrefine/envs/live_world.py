@@ -53,6 +53,7 @@ class LiveWorld:
     def step(self, targets: Array) -> None:
         """One control step with absolute joint targets (J,) in rad and m."""
         self._moved = True
+        self._episodes.steps += 1
         result = self.sim.step(np.asarray(targets, np.float64)[None], IDS, images=IDS)
         if self.outcome != RUNNING:
             return

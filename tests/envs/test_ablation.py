@@ -13,6 +13,8 @@ from lerobot_vtrefine.embodiments import ALOHA
 from lerobot_vtrefine.envs import VtRefineEnvConfig, ablation
 from lerobot_vtrefine.envs.ablation import make_ablation, mean_frame
 from lerobot_vtrefine.envs.episodes import Episodes
+from lerobot_vtrefine.envs.factory import make_episodes
+from lerobot_vtrefine.envs.live_world import LiveWorld
 
 PADS = list(zip(TACTILE_KEYS, BASELINE_KEYS, strict=True))
 
@@ -173,3 +175,16 @@ def _mean_depth(frames: list[np.ndarray], root: Path) -> np.ndarray:
         patch.setattr("lerobot.datasets.lerobot_dataset.LeRobotDataset", Rows)
         patch.setattr("lerobot_vtrefine.lerobot_compat.completeness.check_complete", lambda _: None)
         return mean_frame(root, (DEPTH_KEY,))[DEPTH_KEY]
+
+
+def test_a_world_that_is_watched_shows_the_touch_that_policies_are_judged_by():
+    config = VtRefineEnvConfig(start="grasped", ablate="touch_shuffled")
+    watched, judged = LiveWorld(config), make_episodes(config, 1)
+    watched.reset(3)
+    judged.reset(judged.ids, np.array([3]))
+    targets = watched.sim.command_targets()[0]
+    for step in range(6):
+        moved = targets + 0.02 * np.sin(step)
+        watched.step(moved)
+        judged.step(moved[None])
+        assert np.array_equal(watched.observe()["tactile"], judged.raw["tactile"][0])
