@@ -35,12 +35,12 @@ class LiveWorld:
 
     @property
     def steps(self) -> int:
-        """Control steps since the reset."""
+        """Control steps of the episode; where it starts from a bank, those before that count."""
         return int(self.sim.steps[0])
 
     @property
     def time_s(self) -> float:
-        """Simulated time since the reset."""
+        """Simulated time of the episode."""
         return self.steps * self.sim.config.control_dt_s
 
     def reset(self, seed: int) -> None:

@@ -128,6 +128,23 @@ def test_pause_step_and_reset(tmp_path: Path) -> None:
     assert person.seen[-1]
 
 
+class LateWorld(LiveWorld):
+    """Its episodes start where much of the time is over, as those of a bank do."""
+
+    def reset(self, seed: int) -> None:
+        super().reset(seed)
+        self.sim.steps[:] = 40
+
+
+def test_what_a_bank_leaves_out_is_not_waited_for(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    slept: list[float] = []
+    monkeypatch.setattr(time, "sleep", slept.append)
+    world = LateWorld(VtRefineEnvConfig(start="grasped", num_threads=1, episode_steps=43, fps=40))
+    Session(world, ZeroAgent(), Person(), tmp_path, print).play(0, 1, record=False)
+    assert world.steps == 43
+    assert max(slept[:-1]) <= 3 / 40  # the last one shows the end
+
+
 def test_the_page_shows_what_is_there_and_looking_changes_nothing() -> None:
     from lerobot_vtrefine.view.browser import BrowserView
 

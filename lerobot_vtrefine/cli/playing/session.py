@@ -81,7 +81,7 @@ class Session:
         world = self._world
         world.reset(seed)
         self._agent.reset(world)
-        began = time.perf_counter()
+        began = time.perf_counter() - world.time_s
         while not world.outcome:
             if self._view is not None:
                 if self._view.wishes.reset:
