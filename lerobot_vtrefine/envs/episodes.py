@@ -159,8 +159,12 @@ class Episodes:
                 self.metrics[name] = np.zeros(self.num_envs, values.dtype)
             self.metrics[name] = self.metrics[name].astype(np.result_type(self.metrics[name], values))
             self.metrics[name][finished] = values
+        self.log(self.rows(finished))
+
+    def log(self, rows: list[dict[str, Any]]) -> None:
+        """Append rows of finished episodes to the log, if there is one."""
         if self._log is not None:
-            self._log.append(self.rows(finished))
+            self._log.append(rows)
 
     def summary(self, ids: Array) -> dict[str, Array]:
         """How the finished episodes of ``ids`` (m,) went: seed, steps, every metric, (m,) each.

@@ -66,6 +66,7 @@ class LiveWorld:
             self.outcome = TIME_OUT
         if self.outcome != RUNNING:
             self._row = self._measure(self.outcome)
+            self._episodes.log([self._row])
 
     def observe(self) -> Raw:
         """The raw frame of this moment, as ``datasets.features`` describes it; no leading dimensions.

@@ -6,6 +6,7 @@ import shutil
 import subprocess
 import sys
 import time
+from dataclasses import replace
 from pathlib import Path
 from urllib.request import urlopen
 
@@ -17,6 +18,7 @@ from lerobot_vtrefine.cli.playing.agents import ExpertAgent, ZeroAgent
 from lerobot_vtrefine.cli.playing.session import Session
 from lerobot_vtrefine.cli.record_demos import RecordDemosConfig, record
 from lerobot_vtrefine.envs import VtRefineEnvConfig
+from lerobot_vtrefine.envs.episode_log import read_episode_log
 from lerobot_vtrefine.envs.live_world import LiveWorld
 from lerobot_vtrefine.shipped import policies
 
@@ -34,6 +36,13 @@ def test_the_expert_succeeds_and_holding_still_does_not(capsys: pytest.CaptureFi
     short = VtRefineEnvConfig(start="grasped", num_threads=1, episode_steps=5)
     assert played(agent="zero", env=short)[0]["failure"] == "time_out"
     assert not played(agent="random", env=short)[0]["success"]
+
+
+def test_what_is_played_is_logged(tmp_path: Path) -> None:
+    log = tmp_path / "episodes.jsonl"
+    rows = played(episodes=2, agent="zero", env=replace(ENV, episode_steps=3, metrics_path=log))
+    assert read_episode_log(log, 0, 2) == rows
+    assert [row["failure"] for row in rows] == ["time_out", "time_out"]
 
 
 def test_a_recorded_episode_plays_again(tmp_path: Path) -> None:
