@@ -11,6 +11,9 @@ from lerobot_vtrefine.envs.config import VtRefineEnvConfig
 from lerobot_vtrefine.files import read_json
 from lerobot_vtrefine.folders import write_in_place
 
+MODEL = "sensor_model_file"
+"""Whose name alone does not tell a pad from another one that was fitted since."""
+
 
 def fingerprint(path: Path) -> str:
     """Of a file's content."""
@@ -19,10 +22,11 @@ def fingerprint(path: Path) -> str:
 
 def simulation_settings(env: VtRefineEnvConfig) -> dict[str, Any]:
     """What decides how an episode comes out beside its seed (JSON values); of a reality's hidden physics and
-    of a bank's states only a fingerprint.
+    of a bank's states only a fingerprint, of a sensor model's file one beside its name.
     """
     known = replace(env, reality=None)
-    files = {"reality": env.reality, "start_bank": env.start_bank}
+    model = Path(env.sensor_model)
+    files = {"reality": env.reality, "start_bank": env.start_bank, MODEL: model if model.is_file() else None}
     hidden = {name: fingerprint(path) for name, path in files.items() if path is not None}
     colour = {} if env.colour_size is None else {"colour": list(env.colour_size)}
     return (

@@ -17,7 +17,7 @@ import torch
 
 from lerobot_vtrefine.envs.config import VtRefineEnvConfig
 from lerobot_vtrefine.envs.episodes import Array
-from lerobot_vtrefine.envs.recording_note import fingerprint, simulation_settings
+from lerobot_vtrefine.envs.recording_note import MODEL, simulation_settings
 from lerobot_vtrefine.files.arrays import read_arrays
 from lerobot_vtrefine.whole_files import whole_file
 
@@ -121,8 +121,7 @@ def bank_settings(config: VtRefineEnvConfig) -> dict[str, Any]:
     for unused in ("task", "start_bank", "colour"):
         settings.pop(unused, None)
     physics = "warp" if config.backend == "warp" else "mujoco"
-    if (model := Path(config.sensor_model)).is_file():
-        settings["sensor_model"] = fingerprint(model)
+    settings["sensor_model"] = settings.pop(MODEL, config.sensor_model)
     return json.loads(json.dumps({"physics": physics, "scene": scene} | settings))
 
 

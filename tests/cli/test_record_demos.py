@@ -18,6 +18,7 @@ from lerobot_vtrefine.envs.demo_workers import demonstration_stream
 from lerobot_vtrefine.lerobot_compat import card
 from lerobot_vtrefine.sim.demonstrations import Degradation
 from lerobot_vtrefine.sim.simulation import InsertionSim
+from lerobot_vtrefine.tactile import SensorModel
 
 
 def read(root: Path) -> LeRobotDataset:
@@ -54,6 +55,17 @@ def test_more_workers_give_the_same_dataset(demos: Path, tmp_path: Path):
     again = tmp_path / "workers"
     assert record(again, "--num_episodes=3", "--num_envs=1", "--num_workers=2", "--seed=5") == 0
     same(demos, again)
+
+
+def test_pads_that_were_fitted_anew_are_others(tmp_path: Path, capsys: pytest.CaptureFixture[str]):
+    model, root = tmp_path / "sensor_model.json", tmp_path / "demos"
+    flags = ("--num_envs=1", "--seed=5", f"--env.sensor_model={model}")
+    SensorModel.named("default").save(model)
+    assert record(root, "--num_episodes=1", *flags) == 0
+    assert record(root, "--num_episodes=1", *flags) == 0
+    SensorModel.named("paper").save(model)
+    assert record(root, "--num_episodes=2", *flags) == 2
+    assert "was recorded with other settings (sensor_model_file)" in capsys.readouterr().err
 
 
 def test_there_is_one_worker_for_each_core_at_most(monkeypatch):
