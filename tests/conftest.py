@@ -1,6 +1,8 @@
 """Fixtures that several packages' tests share."""
 
 import gc
+import importlib.metadata
+import os
 from collections.abc import Callable, Generator
 from functools import cache
 from pathlib import Path
@@ -42,11 +44,40 @@ def pytest_collection_finish() -> None:
 
 
 @pytest.fixture(scope="session", autouse=True)
-def _docstrings_are_read_once() -> None:
-    """For every setting of every parser, draccus looks through the source of its class: half of a parse."""
+def _what_stays_is_looked_up_once() -> None:
+    """Commands that many tests run in this process would each look it up again.
+
+    For every setting of every parser, draccus looks through the source of its class: half of a parse. For
+    plugins, LeRobot parses what every installed package says of itself. For every column that is named or
+    copied, datasets asks of all columns whether they hold pictures: most of what opening a dataset takes.
+    """
+    from datasets.features import features
     from draccus.wrappers import docstring
 
     docstring.get_attribute_docstring = cache(docstring.get_attribute_docstring)
+    said = importlib.metadata.Distribution.metadata.fget
+    parsed = cache(lambda place: said(importlib.metadata.PathDistribution(place)))
+
+    def set_column(columns: features.Features, name: str, kind: Any) -> None:
+        dict.__setitem__(columns, name, kind)
+        columns._column_requires_decoding[name] = features.require_decoding(kind)
+
+    importlib.metadata.PathDistribution.metadata = property(lambda package: parsed(package._path))
+    features.Features.__setitem__ = set_column
+
+
+@pytest.fixture(scope="session", autouse=True)
+def _nothing_waits_for_the_disk() -> None:
+    """Files and folders are as they are named whether or not they have reached the disk.
+
+    What no kill, but a power failure takes away, no test here can see; those that ask when it is waited for
+    put their own function in this one's place. A number that is no open file's stays an error.
+    """
+
+    def fsync(descriptor: int) -> None:
+        os.fstat(descriptor)
+
+    os.fsync = fsync
 
 
 @pytest.fixture(autouse=True)
