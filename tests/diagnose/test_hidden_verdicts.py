@@ -13,7 +13,7 @@ from hidden.writer import truth_of, write_session
 from hidden_engine import diagnose_folder, share_of_oracle
 
 SEED = 7001
-SMALL = (("conditions", 10),)
+SMALL = (("conditions", 8),)
 OBSERVED = ("dead_taxels", "sample_and_hold")
 """Causes that are seen in the readings themselves: nothing is tested, so they have no p-value."""
 SHOWN_ELSEWHERE = ("latency",)
