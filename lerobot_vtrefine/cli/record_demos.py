@@ -30,6 +30,7 @@ from lerobot_vtrefine.envs import VtRefineEnvConfig
 from lerobot_vtrefine.envs.demo_dataset import DemoDataset
 from lerobot_vtrefine.envs.demo_workers import demonstration_stream
 from lerobot_vtrefine.envs.recording_note import simulation_settings
+from lerobot_vtrefine.files import read_json
 from lerobot_vtrefine.sim.demonstrations import Degradation
 from lerobot_vtrefine.sim.truth import TRUTH_SIZE
 from lerobot_vtrefine.wording import plural
@@ -159,9 +160,18 @@ def next_steps(config: RecordDemosConfig) -> str:
     return f"look: vtrefine-play --dataset.root={root} --dataset.episode=0\nlearn: {train}"
 
 
+def _left_in(root: Path) -> str:
+    """What an interrupted recording left there, and how to go on."""
+    try:
+        episodes = read_json(root / "meta" / "info.json")["total_episodes"]
+    except FileNotFoundError:
+        return "nothing was recorded yet; the same command begins anew"
+    return f"{root} keeps {plural(episodes, 'episode')}; the same command goes on"
+
+
 @parser.wrap()
 def _main(config: RecordDemosConfig) -> None:
-    with after_interrupt("what was recorded is kept; the same command goes on"):
+    with after_interrupt(lambda: _left_in(config.root)):
         count = record(config)
     print(f"{plural(count, 'episode')} in {config.root}\n{next_steps(config)}")
     if config.push_to_hub:

@@ -14,7 +14,9 @@ from tiny_commands import lerobot_here, record
 
 from lerobot_vtrefine.datasets.features import ACTION_KEY, DEPTH_KEY, NOISE_LEVEL_KEY, RGB_KEY, STATE_KEY
 from lerobot_vtrefine.envs.config import VtRefineEnvConfig
+from lerobot_vtrefine.envs.demo_dataset import DemoDataset
 from lerobot_vtrefine.envs.demo_workers import demonstration_stream
+from lerobot_vtrefine.envs.demonstrations import Demonstration
 from lerobot_vtrefine.lerobot_compat import card
 from lerobot_vtrefine.sim.demonstrations import Degradation
 from lerobot_vtrefine.sim.simulation import InsertionSim
@@ -66,6 +68,26 @@ def test_pads_that_were_fitted_anew_are_others(tmp_path: Path, capsys: pytest.Ca
     SensorModel.named("paper").save(model)
     assert record(root, "--num_episodes=2", *flags) == 2
     assert "was recorded with other settings (sensor_model_file)" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    ("saved", "told"),
+    [
+        (2, "{} keeps 2 episodes; the same command goes on"),
+        (0, "nothing was recorded yet; the same command begins anew"),
+    ],
+)
+def test_an_interrupt_says_what_is_left(saved, told, tmp_path, monkeypatch, capsys):
+    def interrupted(demos: DemoDataset, demonstration: Demonstration) -> None:
+        if demos.num_episodes == saved:
+            raise KeyboardInterrupt
+        append(demos, demonstration)
+
+    append = DemoDataset.append
+    monkeypatch.setattr(DemoDataset, "append", interrupted)
+    assert record(tmp_path / "demos", "--num_episodes=3", "--num_envs=4", "--seed=5") == 130
+    assert capsys.readouterr().err.splitlines()[-1] == f"interrupted: {told.format(tmp_path / 'demos')}"
+    assert (tmp_path / "demos").exists() == (saved > 0)
 
 
 def test_there_is_one_worker_for_each_core_at_most(monkeypatch):
