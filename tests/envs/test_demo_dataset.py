@@ -287,7 +287,8 @@ def as_committed(root: Path, episodes: int) -> list[dict[str, Any]]:
 
 
 @pytest.mark.parametrize(
-    ("episodes", "commit_every", "stride"), [(2, 1, 13), pytest.param(5, 2, 1, marks=pytest.mark.slow)]
+    ("episodes", "commit_every", "stride"),
+    [(2, 1, 13), pytest.param(5, 2, 1, marks=[pytest.mark.slow, pytest.mark.timeout(1200)])],
 )
 def test_a_kill_at_any_file_operation_leaves_a_commit_and_continues_to_the_same_dataset(
     tmp_path, monkeypatch, episodes, commit_every, stride
