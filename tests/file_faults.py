@@ -54,7 +54,6 @@ def _count(patch: pytest.MonkeyPatch, at: int) -> list[int]:
 
         return call
 
-    patch.setattr(os, "fsync", lambda descriptor: None)  # a killed process loses nothing that was written
     for module, names in MODULES:
         for name in names:
             patch.setattr(module, name, counted(getattr(module, name)))

@@ -30,7 +30,7 @@ from lerobot_vtrefine.envs import VtRefineEnvConfig
 from lerobot_vtrefine.envs.demo_dataset import DemoDataset
 from lerobot_vtrefine.envs.demo_workers import demonstration_stream
 from lerobot_vtrefine.envs.recording_note import simulation_settings
-from lerobot_vtrefine.files import read_json
+from lerobot_vtrefine.lerobot_compat.completeness import announced_episodes
 from lerobot_vtrefine.sim.demonstrations import Degradation
 from lerobot_vtrefine.sim.truth import TRUTH_SIZE
 from lerobot_vtrefine.wording import plural
@@ -163,7 +163,7 @@ def next_steps(config: RecordDemosConfig) -> str:
 def _left_in(root: Path) -> str:
     """What an interrupted recording left there, and how to go on."""
     try:
-        episodes = read_json(root / "meta" / "info.json")["total_episodes"]
+        episodes = announced_episodes(root)
     except FileNotFoundError:
         return "nothing was recorded yet; the same command begins anew"
     return f"{root} keeps {plural(episodes, 'episode')}; the same command goes on"

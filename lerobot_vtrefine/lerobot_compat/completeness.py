@@ -36,7 +36,7 @@ def check_complete(root: Path) -> None:
         FileNotFoundError: a file is missing, or the files lack an episode; names it.
         ValueError: there is no episode yet, or a file cannot be read.
     """
-    announced = _announced(root / INFO_PATH)
+    announced = announced_episodes(root)
     if announced == 0:
         raise ValueError(f"{root} holds no episode yet; record one first")
     check_tasks(root)
@@ -52,8 +52,14 @@ def check_complete(root: Path) -> None:
             raise FileNotFoundError(f"{root / path} is missing; {ASK}")
 
 
-def _announced(path: Path) -> int:
-    """How many episodes there are."""
+def announced_episodes(root: Path) -> int:
+    """How many episodes a dataset's folder says that it holds.
+
+    Raises:
+        FileNotFoundError: it has no meta/info.json.
+        ValueError: that file does not describe a LeRobot dataset.
+    """
+    path = root / INFO_PATH
     data = read_json(path)
     try:
         return decode(_Info, data, "it", others=True).total_episodes

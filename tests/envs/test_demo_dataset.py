@@ -295,7 +295,6 @@ def test_a_kill_at_any_file_operation_leaves_a_commit_and_continues_to_the_same_
 ) -> None:
     monkeypatch.setattr(demo_dataset, "COMMIT_EVERY", commit_every)
     monkeypatch.setattr(demo_dataset, "IMAGE_WRITER_THREADS", 0)
-    monkeypatch.setattr("os.fsync", lambda descriptor: None)
     states, root = as_committed(tmp_path / "whole" / "demo", episodes), tmp_path / "killed" / "demo"
     seen = set()
     prepare, work = (
