@@ -18,11 +18,13 @@ from yaml import YAMLError
 from lerobot_vtrefine.choices import did_you_mean
 from lerobot_vtrefine.extras import explain
 from lerobot_vtrefine.files import check_settings
+from lerobot_vtrefine.interrupts import Terminated
 from lerobot_vtrefine.shipped import expand
 
 DEBUG_VARIABLE = "VTREFINE_DEBUG"
 USAGE_STATUS = 2
 INTERRUPT_STATUS = 130
+TERMINATED_STATUS = 143
 UNREAD_STATUS = 141
 """As a shell's tools end that write to ``head`` once it has seen enough."""
 
@@ -181,8 +183,8 @@ def after_interrupt(advice: str | Callable[[], str]) -> Generator[None]:
     """Ctrl-C within is told together with how to go on, which may depend on what was saved until then."""
     try:
         yield
-    except KeyboardInterrupt:
-        raise KeyboardInterrupt(advice if isinstance(advice, str) else advice()) from None
+    except KeyboardInterrupt as stopped:
+        raise type(stopped)(advice if isinstance(advice, str) else advice()) from None
 
 
 def _nobody_reads() -> bool:
@@ -206,9 +208,9 @@ def run_cli[**P](main: Callable[P, int | None]) -> Callable[P, int]:
 
     ``ValueError``, ``OSError`` (missing files, full disk), ``ImportError`` (an extra is not installed),
     ``FloatingPointError`` (training that diverged), draccus' parsing errors and a GPU without memory are
-    expected; anything else is a defect and keeps its traceback. Ctrl-C exits with 130; where ``head`` has
-    seen enough, a command ends without a word. With ``VTREFINE_DEBUG=1`` in the environment every error keeps
-    its traceback.
+    expected; anything else is a defect and keeps its traceback. Ctrl-C exits with 130, `Terminated` with 143;
+    where ``head`` has seen enough, a command ends without a word. With ``VTREFINE_DEBUG=1`` in the
+    environment every error keeps its traceback.
     """
 
     @functools.wraps(main)
@@ -222,7 +224,7 @@ def run_cli[**P](main: Callable[P, int | None]) -> Callable[P, int]:
             return status
         except KeyboardInterrupt as stopped:
             print(f"interrupted{f': {stopped}' if stopped.args else ''}", file=sys.stderr)
-            return INTERRUPT_STATUS
+            return TERMINATED_STATUS if isinstance(stopped, Terminated) else INTERRUPT_STATUS
         except Exception as error:
             if isinstance(error, BrokenPipeError) and _nobody_reads():
                 return UNREAD_STATUS

@@ -6,8 +6,9 @@ example:
 
 --policy.path=FOLDER names the checkpoint to start from, --dppo.type a preset: trust_region (many
 worlds on a GPU), fine (the same for tight or gentle tasks and imitations that often succeed), small (a
-laptop) or paper. --resume=true continues an interrupted run exactly. A policy that is fine-tuned already may
-practise on, say in a diagnosed simulator, with a critic of its own (--output_dir is another one then).
+laptop) or paper. Ctrl-C and SIGTERM let the iteration that runs be finished and saved, a second one stops at
+once; --resume=true continues an interrupted run exactly. A policy that is fine-tuned already may practise
+on, say in a diagnosed simulator, with a critic of its own (--output_dir is another one then).
 With --push_to_hub=true --repo_id=USER/NAME the result is evaluated by lerobot-eval on unseen seeds and
 uploaded, with its processors and a card that says what was found; a finished run is shared by repeating its
 command with --resume=true.

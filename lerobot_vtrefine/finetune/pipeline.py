@@ -32,16 +32,25 @@ from lerobot_vtrefine.finetune.checkpoint import (
 )
 from lerobot_vtrefine.finetune.config import DppoConfig, PaperDppo
 from lerobot_vtrefine.finetune.console import logs_above_bars
-from lerobot_vtrefine.finetune.distributed import check_device, claim_gpu, join_ranks, leave_ranks, rank_index
+from lerobot_vtrefine.finetune.distributed import (
+    check_device,
+    claim_gpu,
+    join_ranks,
+    leave_ranks,
+    max_over_ranks,
+    rank_index,
+)
 from lerobot_vtrefine.finetune.dppo import Metrics, TrainState, train
 from lerobot_vtrefine.finetune.evaluation import evaluate
 from lerobot_vtrefine.finetune.logger import ProgressLog, start_wandb
 from lerobot_vtrefine.finetune.protocols import Agent, DecisionEnv
+from lerobot_vtrefine.interrupts import first_signal_waits, interruption
 from lerobot_vtrefine.policies.vt_dp3.configuration_vt_dp3 import VtDp3Config
 from lerobot_vtrefine.policies.vt_dp3.modeling_vt_dp3 import VtDp3Policy
 from lerobot_vtrefine.whole_files import whole_file
 
 CONFIG_NAME = "finetune_config.json"
+STOPPING = "this iteration is finished and saved first; Ctrl-C or SIGTERM again stops at once"
 SHOWN = (
     "success",
     "eval_success",
@@ -247,12 +256,11 @@ class Recorder:
         self.cfg, self.env, self.agent, self.saveable = cfg, env, agent, saveable
         self.log: ProgressLog | None = None
         self.bar = tqdm(disable=True)
+        self.signals: Sequence[int] = ()
+        """The one that asks this rank to stop, once it has come."""
 
     def start(self, state: TrainState) -> tqdm:
-        """Open the records (first rank), and evaluate the policy that training starts from.
-
-        That is the pre-trained network behind the sampler of fine-tuning; ``lerobot-eval`` of the pre-trained
-        checkpoint uses the sampler that it was saved with.
+        """Open the records (first rank).
 
         Returns: the progress bar, to be closed also where training ends by an error, told below it.
         """
@@ -262,21 +270,34 @@ class Recorder:
             run = start_wandb(cfg.wandb, cfg.output_dir, cfg.job_name, settings, cfg.resume)
             self.log = ProgressLog(cfg.output_dir, state.iteration, run)
             self.bar = tqdm(total=cfg.dppo.iterations, initial=state.iteration, desc="DPPO", unit="it")
-        if state.iteration == 0 and cfg.eval_freq:
-            self._record(0, evaluate(self.env, self.agent, cfg.eval.n_episodes))
         return self.bar
 
+    def judge_start(self, state: TrainState) -> None:
+        """Evaluate the policy that training starts from, if it has not begun yet.
+
+        That is the pre-trained network behind the sampler of fine-tuning; ``lerobot-eval`` of the pre-trained
+        checkpoint uses the sampler that it was saved with.
+        """
+        if state.iteration == 0 and self.cfg.eval_freq:
+            self._record(0, evaluate(self.env, self.agent, self.cfg.eval.n_episodes))
+
     def __call__(self, state: TrainState, metrics: Metrics) -> None:
-        """Callback of ``dppo.train``."""
+        """Callback of ``dppo.train``.
+
+        Raises: KeyboardInterrupt once all is saved, where a signal asked any rank to stop.
+        """
         cfg, iteration, last = self.cfg, state.iteration, self.cfg.dppo.iterations
         if cfg.eval_freq and (iteration % cfg.eval_freq == 0 or iteration == last):
             metrics |= evaluate(self.env, self.agent, cfg.eval.n_episodes)
         self._record(iteration, metrics)
-        if iteration == last or (cfg.save_freq and iteration % cfg.save_freq == 0):
+        stop = max_over_ranks(self.signals[0] if self.signals else 0, self.agent.device)
+        if stop or iteration == last or (cfg.save_freq and iteration % cfg.save_freq == 0):
             if self.log is not None:
                 self.log.draw()
             save_checkpoint(cfg.output_dir, self.saveable, state, last)
         self.bar.update()
+        if stop:
+            raise interruption(stop)
 
     def close(self) -> None:
         """Called when training has ended."""
@@ -308,7 +329,10 @@ def write_config(cfg: FinetunePipelineConfig, path: Path) -> None:
 
 
 def run(cfg: FinetunePipelineConfig) -> None:
-    """Fine-tune; the result is ``output_dir/checkpoints/last/pretrained_model``."""
+    """Fine-tune; the result is ``output_dir/checkpoints/last/pretrained_model``.
+
+    Raises: KeyboardInterrupt at the end of the iteration in which Ctrl-C or SIGTERM came; it is saved then.
+    """
     path, checkpoint = start_path(cfg)
     if checkpoint is not None:
         check_resumable(cfg, checkpoint)
@@ -328,6 +352,8 @@ def run(cfg: FinetunePipelineConfig) -> None:
         if checkpoint is not None:
             load_training_state(checkpoint, state)
         with recorder.start(state):
-            train(env, agent, state, cfg.dppo, seed=cfg.seed, after_iteration=recorder)
+            recorder.judge_start(state)  # nothing could be saved before its end
+            with first_signal_waits(STOPPING) as recorder.signals:
+                train(env, agent, state, cfg.dppo, seed=cfg.seed, after_iteration=recorder)
     recorder.close()
     leave_ranks()

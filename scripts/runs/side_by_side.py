@@ -12,6 +12,7 @@ from pathlib import Path
 import torch
 
 from lerobot_vtrefine.cli.errors import run_cli
+from lerobot_vtrefine.cli.pipeline.stages import stop
 
 POLL_S = 0.5
 
@@ -82,7 +83,12 @@ def run_in_turn(commands: Commands, queue: Queue) -> list[subprocess.CalledProce
     failed: list[subprocess.CalledProcessError] = []
     while (folder := queue.next()) is not None:
         print(f"\n== {folder.name}", flush=True)
-        status = subprocess.run(commands[folder], check=False).returncode
+        child = subprocess.Popen(commands[folder], start_new_session=True)  # Ctrl-C is passed on, once
+        try:
+            status = child.wait()
+        except BaseException:
+            stop(child)
+            raise
         failed += [subprocess.CalledProcessError(status, commands[folder])] if status else []
         queue.end(folder, bool(status))
     return failed
@@ -107,8 +113,7 @@ def run_together(commands: Commands, queue: Queue, jobs: int) -> list[subprocess
                 queue.end(folder, bool(child.returncode))
             time.sleep(POLL_S)
     finally:
-        for child, _ in running.values():
-            child.terminate()
+        stop(*(child for child, _ in running.values()))
     return failed
 
 
@@ -139,7 +144,9 @@ def start(command: Sequence[str], folder: Path, share: Share) -> subprocess.Pope
     pin = partial(os.sched_setaffinity, 0, share.cores) if share.cores else None
     env = os.environ | ({"CUDA_VISIBLE_DEVICES": share.gpu} if share.gpu else {})
     with Path(f"{folder}.log").open("wb") as log:
-        return subprocess.Popen(command, stdout=log, stderr=subprocess.STDOUT, preexec_fn=pin, env=env)
+        return subprocess.Popen(
+            command, stdout=log, stderr=subprocess.STDOUT, preexec_fn=pin, env=env, start_new_session=True
+        )
 
 
 def run_script(entry: Callable[[], None]) -> None:

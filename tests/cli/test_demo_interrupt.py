@@ -5,9 +5,12 @@ import signal
 import subprocess
 import sys
 import time
+from collections.abc import Callable
 from pathlib import Path
 
 import pytest
+
+from lerobot_vtrefine.cli.pipeline.stages import QUIET_S, STOPPING
 
 DEMO = """
 import sys
@@ -46,20 +49,33 @@ def hear_interrupts() -> None:
     signal.signal(signal.SIGINT, signal.SIG_DFL)
 
 
-@pytest.mark.skipif(not Path("/proc/self/stat").is_file(), reason="looks at processes in /proc")
-@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
-def test_interrupted_demo_continues_from_its_last_finished_stage(tmp_path: Path, number: int) -> None:
-    command = [sys.executable, "-c", DEMO, str(tmp_path)]
-    running = subprocess.Popen(
-        command, stderr=subprocess.PIPE, stdout=subprocess.DEVNULL, text=True, preexec_fn=hear_interrupts
-    )
-    note = tmp_path / "b" / "pid"
+def ignore_interrupts() -> None:
+    """As such a shell does; SIGTERM is what ends its jobs."""
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+
+
+def text_of(note: Path, running: subprocess.Popen[str]) -> str:
+    """What is written to a file, once it is."""
     deadline = time.monotonic() + 60
     while not (note.is_file() and note.read_text()):
         assert running.poll() is None
         assert time.monotonic() < deadline
         time.sleep(0.05)
-    child = int(note.read_text())
+    return note.read_text()
+
+
+@pytest.mark.skipif(not Path("/proc/self/stat").is_file(), reason="looks at processes in /proc")
+@pytest.mark.parametrize(
+    ("number", "inherited"), [(signal.SIGINT, hear_interrupts), (signal.SIGTERM, ignore_interrupts)]
+)
+def test_interrupted_demo_continues_from_its_last_finished_stage(
+    tmp_path: Path, number: int, inherited: Callable[[], None]
+) -> None:
+    command = [sys.executable, "-c", DEMO, str(tmp_path)]
+    running = subprocess.Popen(
+        command, stderr=subprocess.PIPE, stdout=subprocess.DEVNULL, text=True, preexec_fn=inherited
+    )
+    child = int(text_of(tmp_path / "b" / "pid", running))
     os.kill(running.pid, number)
     _, errors = running.communicate(timeout=60)
     assert (running.returncode, errors.splitlines()[-1]) == (130, "interrupted")
@@ -70,3 +86,82 @@ def test_interrupted_demo_continues_from_its_last_finished_stage(tmp_path: Path,
     assert again.stderr.count("done before") == 1
     assert (tmp_path / "a" / "product").read_text() == "x"
     assert (tmp_path / "b" / "part").read_text() == "xx"
+
+
+SAVES_FIRST = """
+import pathlib, sys, time
+folder = pathlib.Path(sys.argv[1])
+try:
+    (folder / "begun").write_text("x")
+    time.sleep(60)
+except KeyboardInterrupt:
+    (folder / "asked").write_text("x")
+    try:
+        time.sleep(float(sys.argv[2]))
+        (folder / "saved").write_text("x")
+    except KeyboardInterrupt:
+        (folder / "stopped").write_text("x")
+    sys.exit(130)
+"""
+"""A command that takes its time to end, as fine-tuning does."""
+ONE_STAGE = """
+import signal, sys
+from pathlib import Path
+from lerobot_vtrefine.cli.errors import run_cli
+from lerobot_vtrefine.cli.pipeline.stages import Stage, StageRunner
+
+signal.signal(signal.SIGINT, signal.default_int_handler)
+folder, command = Path(sys.argv[1]), tuple(sys.argv[2:])
+runner = StageRunner(folder, [Stage("a", "a", command, folder / "a", folder / "a" / "product")])
+raise SystemExit(run_cli(lambda: runner.run() and None)())
+"""
+SIDE_BY_SIDE = """
+import signal, sys
+from pathlib import Path
+from runs.side_by_side import run_all, run_script
+
+signal.signal(signal.SIGINT, signal.default_int_handler)
+folder, jobs, command = Path(sys.argv[1]), int(sys.argv[2]), sys.argv[3:]
+run_script(lambda: run_all({folder / name: command for name in ("a", "b")[:jobs]}, jobs))
+"""
+
+
+def begin(code: str, folder: Path, *arguments: str, takes_s: float) -> subprocess.Popen[str]:
+    """A runner of the command above."""
+    saves_first = ("python", "-c", SAVES_FIRST, str(folder), str(takes_s))
+    return subprocess.Popen(
+        [sys.executable, "-c", code, str(folder), *arguments, *saves_first],
+        stderr=subprocess.PIPE,
+        stdout=subprocess.DEVNULL,
+        text=True,
+    )
+
+
+def test_a_stage_may_save_before_it_ends(tmp_path: Path) -> None:
+    running = begin(ONE_STAGE, tmp_path, takes_s=QUIET_S + 1.0)
+    text_of(tmp_path / "begun", running)
+    running.send_signal(signal.SIGINT)
+    _, errors = running.communicate(timeout=60)
+    assert (running.returncode, errors.splitlines()[-2:]) == (130, [STOPPING, "interrupted"])
+    assert (tmp_path / "saved").is_file()
+
+
+def test_a_second_interrupt_ends_a_stage_at_once(tmp_path: Path) -> None:
+    running = begin(ONE_STAGE, tmp_path, takes_s=600.0)
+    text_of(tmp_path / "begun", running)
+    running.send_signal(signal.SIGINT)
+    text_of(tmp_path / "asked", running)
+    running.send_signal(signal.SIGINT)
+    _, errors = running.communicate(timeout=60)
+    assert (running.returncode, errors.splitlines()[-1]) == (130, "interrupted")
+    assert (tmp_path / "stopped").is_file()
+
+
+@pytest.mark.parametrize("jobs", [1, 2])
+def test_commands_of_a_script_may_save_before_they_end(tmp_path: Path, jobs: int) -> None:
+    running = begin(SIDE_BY_SIDE, tmp_path, str(jobs), takes_s=1.0)
+    text_of(tmp_path / "begun", running)
+    running.send_signal(signal.SIGINT)
+    _, errors = running.communicate(timeout=60)
+    assert (running.returncode, errors.splitlines()[-1]) == (130, "interrupted")
+    assert (tmp_path / "saved").is_file()

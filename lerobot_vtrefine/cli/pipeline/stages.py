@@ -10,7 +10,7 @@ import signal
 import subprocess
 import sys
 import time
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
 
@@ -19,7 +19,13 @@ from lerobot_vtrefine.cli.results.provenance import commit
 from lerobot_vtrefine.files import decode, read_json
 
 POLL_S = 0.25
+QUIET_S = 2.0
+"""How long nothing is said of a command that was asked to end."""
+PATIENCE_S = 120.0
+"""How long it may then take: fine-tuning finishes its iteration and saves it."""
 STOP_TIMEOUT_S = 10.0
+"""The same once it was asked again."""
+STOPPING = "the stage that runs saves what it has; interrupt again to stop it at once"
 
 
 @dataclass(frozen=True)
@@ -191,6 +197,7 @@ class StageRunner:
                 stderr=subprocess.STDOUT,
                 env=child_environment(),
                 start_new_session=True,
+                preexec_fn=_hear_interrupts,
             )
             try:
                 while child.poll() is None:
@@ -226,13 +233,44 @@ def child_environment() -> dict[str, str]:
     return quiet | dict(os.environ)
 
 
-def stop(child: subprocess.Popen[bytes]) -> None:
-    """Ask a child and its workers to end as Ctrl-C does, and end them if they do not."""
-    for number in (signal.SIGINT, signal.SIGKILL):
+def stop(*children: subprocess.Popen[bytes]) -> None:
+    """Ask children and their workers to end as Ctrl-C does, again where there is another Ctrl-C or they take
+    long, and end them if they do not.
+    """
+    _signal(children, signal.SIGINT)
+    with contextlib.suppress(KeyboardInterrupt):
+        if not _have_ended(children, QUIET_S):
+            print(STOPPING, file=sys.stderr)
+            _have_ended(children, PATIENCE_S)
+    with contextlib.suppress(KeyboardInterrupt):
+        if not _have_ended(children, 0.0):
+            _signal(children, signal.SIGINT)
+            _have_ended(children, STOP_TIMEOUT_S)
+    _signal(children, signal.SIGKILL)
+    for child in children:
+        child.wait()
+
+
+def _hear_interrupts() -> None:
+    """In a child: a shell starts jobs in the background deaf to Ctrl-C, which children would inherit."""
+    signal.signal(signal.SIGINT, signal.SIG_DFL)
+
+
+def _signal(children: Sequence[subprocess.Popen[bytes]], number: int) -> None:
+    for child in children:
         with contextlib.suppress(ProcessLookupError):
             os.killpg(child.pid, number)
-        with contextlib.suppress(subprocess.TimeoutExpired):
-            child.wait(STOP_TIMEOUT_S)
+
+
+def _have_ended(children: Sequence[subprocess.Popen[bytes]], timeout_s: float) -> bool:
+    """Whether all do within a time."""
+    until = time.monotonic() + timeout_s
+    try:
+        for child in children:
+            child.wait(max(0.0, until - time.monotonic()))
+    except subprocess.TimeoutExpired:
+        return False
+    return True
 
 
 def failure_message(stage: Stage, status: int, log: Path) -> str:
