@@ -30,8 +30,9 @@ def describe_simulation(root: Path) -> str:
 def _where(settings: Mapping[str, Any]) -> str:
     scene = settings.get("scene", {})
     hidden = ", with physics that are kept hidden" if "reality" in settings else ""
+    ablated = f", with `--env.ablate={settings['ablate']}`" if "ablate" in settings else ""
     return (
-        f"Recorded in the simulation of `lerobot_vtrefine`, not on a robot{hidden}: pair "
+        f"Recorded in the simulation of `lerobot_vtrefine`, not on a robot{hidden}{ablated}: pair "
         f"`{scene.get('pair')}`, clearance {1e3 * float(scene.get('clearance_m') or 0):g} mm, "
         f"start `{scene.get('start')}`, sensor model `{settings.get('sensor_model')}`. `{NOTE.as_posix()}` "
         "holds every setting, and every "

@@ -13,6 +13,8 @@ from lerobot_vtrefine.folders import write_in_place
 
 MODEL = "sensor_model_file"
 """Whose name alone does not tell a pad from another one that was fitted since."""
+ABLATION = ("ablate", "ablate_dataset")
+"""What is shown in place of what was felt or seen; what happens stays the same."""
 
 
 def fingerprint(path: Path) -> str:
@@ -21,8 +23,8 @@ def fingerprint(path: Path) -> str:
 
 
 def simulation_settings(env: VtRefineEnvConfig) -> dict[str, Any]:
-    """What decides how an episode comes out beside its seed (JSON values); of a reality's hidden physics and
-    of a bank's states only a fingerprint, of a sensor model's file one beside its name.
+    """What decides how an episode comes out beside its seed (JSON values); of a reality's hidden physics, a
+    bank's states and an ablation's dataset only a fingerprint, of a sensor model's file one beside its name.
     """
     known = replace(env, reality=None)
     model = Path(env.sensor_model)
@@ -31,6 +33,7 @@ def simulation_settings(env: VtRefineEnvConfig) -> dict[str, Any]:
     colour = {} if env.colour_size is None else {"colour": list(env.colour_size)}
     return (
         hidden
+        | _ablation(env)
         | colour
         | {
             "scene": {
@@ -43,6 +46,17 @@ def simulation_settings(env: VtRefineEnvConfig) -> dict[str, Any]:
             "task": env.task,
         }
     )
+
+
+def _ablation(env: VtRefineEnvConfig) -> dict[str, str]:
+    """Nothing where senses are whole; a dataset is told by the statistics of its columns."""
+    if env.ablate == "none":
+        return {}
+    kind, source = ABLATION
+    statistics = None if env.ablate_dataset is None else env.ablate_dataset / "meta" / "stats.json"
+    if statistics is None or not statistics.is_file():
+        return {kind: env.ablate}
+    return {kind: env.ablate, source: fingerprint(statistics)}
 
 
 def check_same(root: Path, settings: dict[str, Any]) -> dict[str, Any]:

@@ -17,7 +17,7 @@ import torch
 
 from lerobot_vtrefine.envs.config import VtRefineEnvConfig
 from lerobot_vtrefine.envs.episodes import Array
-from lerobot_vtrefine.envs.recording_note import MODEL, simulation_settings
+from lerobot_vtrefine.envs.recording_note import ABLATION, MODEL, simulation_settings
 from lerobot_vtrefine.files.arrays import read_arrays
 from lerobot_vtrefine.whole_files import whole_file
 
@@ -118,7 +118,7 @@ def bank_settings(config: VtRefineEnvConfig) -> dict[str, Any]:
     settings = simulation_settings(config)
     settings["rules"].pop("episode_steps")
     scene = {key: value for key, value in settings.pop("scene").items() if key != "mesh_dir"}
-    for unused in ("task", "start_bank", "colour"):
+    for unused in ("task", "start_bank", "colour", *ABLATION):
         settings.pop(unused, None)
     physics = "warp" if config.backend == "warp" else "mujoco"
     settings["sensor_model"] = settings.pop(MODEL, config.sensor_model)

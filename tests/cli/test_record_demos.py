@@ -13,6 +13,7 @@ from local_hub import use_folder_as_hub
 from tiny_commands import lerobot_here, record
 
 from lerobot_vtrefine.datasets.features import ACTION_KEY, DEPTH_KEY, NOISE_LEVEL_KEY, RGB_KEY, STATE_KEY
+from lerobot_vtrefine.datasets.simulation_card import describe_simulation
 from lerobot_vtrefine.envs.config import VtRefineEnvConfig
 from lerobot_vtrefine.envs.demo_dataset import DemoDataset
 from lerobot_vtrefine.envs.demo_workers import demonstration_stream
@@ -68,6 +69,24 @@ def test_pads_that_were_fitted_anew_are_others(tmp_path: Path, capsys: pytest.Ca
     SensorModel.named("paper").save(model)
     assert record(root, "--num_episodes=2", *flags) == 2
     assert "was recorded with other settings (sensor_model_file)" in capsys.readouterr().err
+
+
+def test_touch_of_another_kind_is_not_appended(
+    demos: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+):
+    """Whole touch, its mean and that of another dataset look alike to who trains on them."""
+    root, other = tmp_path / "demos", tmp_path / "other"
+    flags = ("--num_envs=1", "--seed=5")
+    of_demos = ("--env.ablate=touch", f"--env.ablate_dataset={demos}")
+    assert record(root, "--num_episodes=1", *flags, *of_demos) == 0
+    assert "with `--env.ablate=touch`" in describe_simulation(root)
+    assert record(root, "--num_episodes=1", *flags, *of_demos) == 0
+    assert record(root, "--num_episodes=2", *flags) == 2
+    assert "was recorded with other settings (ablate, ablate_dataset)" in capsys.readouterr().err
+
+    assert record(other, "--num_episodes=1", *flags) == 0
+    assert record(root, "--num_episodes=2", *flags, of_demos[0], f"--env.ablate_dataset={other}") == 2
+    assert "was recorded with other settings (ablate_dataset)" in capsys.readouterr().err
 
 
 @pytest.mark.parametrize(

@@ -183,7 +183,9 @@ def test_what_is_no_bank_is_refused_and_what_does_not_matter_is_not(
     with pytest.raises(ValueError, match="no bank of states"):
         make_episodes(dataclasses.replace(picked, start_bank=wrong), 1)
     assert picked.start_bank is not None
-    elsewhere = dataclasses.replace(picked, mesh_dir=tmp_path, backend="single", task="other words")
+    elsewhere = dataclasses.replace(
+        picked, mesh_dir=tmp_path, backend="single", task="other words", ablate="touch_shuffled"
+    )
     bank = StartBank.load(picked.start_bank, elsewhere)
     assert len(bank.source) == 9
     latest = int(bank.leaves["state/episode/steps"].max())
