@@ -163,7 +163,9 @@ def cache_dir() -> Path:
 
 
 def check_solid(mesh: Any, path: Path) -> None:
-    """Raise ValueError with the fix unless the trimesh `mesh` bounds one volume."""
+    """Raise ValueError with the fix unless the trimesh `mesh` bounds a volume: that of one rigid part, also
+    where it is several solids, as of a plug whose pins are drawn without what holds them.
+    """
     if len(mesh.faces) == 0:
         raise ValueError(f"{path}: holds no triangles; export the part as a triangle mesh")
     if not mesh.is_watertight:
