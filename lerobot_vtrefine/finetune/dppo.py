@@ -71,6 +71,7 @@ class TrainState:
     trust_region: TrustRegion
     iteration: int = 0
     env_steps: int = 0
+    """Of practice, in whole chunks: also what is left of one when its episode has ended."""
 
     @classmethod
     def create(cls, agent: Agent, cfg: DppoConfig, privileged_dim: int, seed: int) -> "TrainState":
