@@ -7,6 +7,7 @@ frame, a replay or a fit through all frames of a recording.
 import math
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass
+from itertools import pairwise
 from typing import Any, ClassVar, override
 
 import numpy as np
@@ -24,27 +25,53 @@ from lerobot_vtrefine.tactile.stages.base import (
 )
 from lerobot_vtrefine.tactile.stages.cover import CoverLaw
 
+BLOCK_FRAMES = 12
+"""Frames that are followed at once, wherever such blocks of them begin."""
+NARROW = 160
+"""Memories side by side, up to which an operation of NumPy costs more to begin than to do."""
 
-def memories(follow: Callable[..., np.ndarray], *inputs: torch.Tensor) -> torch.Tensor:
+
+def memories(follow: Callable[..., np.ndarray], *inputs: np.ndarray) -> np.ndarray:
     """A memory that is zero at first, after every frame: (T, ...); follow(memory, *the frame's inputs).
 
     In NumPy, whose operations take a fraction of the time to begin.
     """
-    moments = [values.cpu().numpy() for values in inputs]
-    out = np.empty_like(moments[0])
+    out = np.empty_like(inputs[0])
     memory = np.zeros_like(out[:1].sum(axis=0))
-    for frame, now in enumerate(zip(*moments, strict=True)):
+    for frame, now in enumerate(zip(*inputs, strict=True)):
         out[frame] = memory = follow(memory, *now)
-    return torch.from_numpy(out).to(inputs[0])
+    return out
 
 
 def kept_between(low: torch.Tensor, high: torch.Tensor) -> torch.Tensor:
-    """memories(torch.clamp, low, high), in the place of the array `high`."""
-    lower, upper = (bound.cpu().numpy() for bound in (low, high))
-    memory = np.zeros_like(lower[:1].sum(axis=0))
+    """`memories` of np.clip between bounds (T, ...), in the place of the array `high`; low <= high."""
+    lower, upper = (np.ascontiguousarray(bound.cpu().numpy()) for bound in (low, high))
+    kept = _kept_in_blocks if lower[:1].size <= NARROW else _kept_frame_by_frame
+    kept(lower, upper, np.zeros_like(lower[:1].sum(axis=0)))
+    return torch.from_numpy(upper).to(low)
+
+
+def _kept_frame_by_frame(lower: np.ndarray, upper: np.ndarray, memory: np.ndarray) -> np.ndarray:
+    """Where a memory lies between its bounds (T, ...), in the place of `upper`; returns the last one."""
     for line, top in zip(lower, upper, strict=True):
         memory = np.maximum(np.minimum(memory, top, out=top), line, out=top)
-    return torch.from_numpy(upper).to(low)
+    return memory
+
+
+def _kept_in_blocks(lower: np.ndarray, upper: np.ndarray, memory: np.ndarray) -> None:
+    """The same, frame by frame in all blocks at once: what bounds do one after the other, two bounds do."""
+    count = len(lower) // BLOCK_FRAMES
+    whole, shape = count * BLOCK_FRAMES, (count, BLOCK_FRAMES, *lower.shape[1:])
+    lows, highs = (bounds[:whole].reshape(shape).swapaxes(0, 1) for bounds in (lower.copy(), upper))
+    for (low, high), (next_low, next_high) in pairwise(zip(lows, highs, strict=True)):
+        np.maximum(np.minimum(high, next_high, out=next_high), next_low, out=next_high)
+        # Beyond both of its bounds, a memory ends at the nearer one.
+        np.minimum(np.maximum(low, next_low, out=next_low), next_high, out=next_low)
+    before = np.empty_like(ends := highs[-1].copy())
+    last = _kept_frame_by_frame(lows[-1], ends, memory)
+    before[:1], before[1:] = memory, ends[:-1]
+    np.maximum(np.minimum(before, highs, out=highs), lows, out=highs)
+    _kept_frame_by_frame(lower[whole:], upper[whole:], last)
 
 
 @dataclass(frozen=True)
@@ -180,16 +207,24 @@ class ProportionalHysteresis(Loop):
     width_m: float = parameter(2e-4, "m", 5e-5, 5e-4)
 
     @staticmethod
-    def _turned(back: Any, unloaded: Any, touching: Any) -> Any:
-        """Of tensors or arrays."""
-        return (back + unloaded).clip(0.0, 1.0) * touching
+    def _moves(unloaded: Any, touching: Any) -> tuple[Any, ...]:
+        """What moves b in a frame, of tensors or arrays: least, change and most.
 
-    def _moves(
-        self, x: torch.Tensor, before: torch.Tensor, frame: Frame
-    ) -> tuple[torch.Tensor, torch.Tensor]:
-        """Unloading since the frame before as a part of the width, and whether there is contact."""
+        Args:
+            unloaded: since the frame before, as a part of the width.
+            touching: 1 where there is contact, else 0.
+        """
+        return 0.0 * unloaded, unloaded, touching
+
+    @staticmethod
+    def _turned(back: Any, least: Any, change: Any, most: Any) -> Any:
+        """b after a frame."""
+        return (back + change).clip(least, most)
+
+    def _width(self, x: torch.Tensor, frame: Frame) -> torch.Tensor:
+        """Of the loop [N]."""
         width = torch.as_tensor(self.width_m * frame.stiffness_n_per_m, dtype=x.dtype, device=x.device)
-        return (before - x) / width.clamp(min=1e-12), x > 0
+        return width.clamp(min=1e-12)
 
     @override
     def initial(self, layout: PadLayout, pads: int) -> Traits:
@@ -198,13 +233,16 @@ class ProportionalHysteresis(Loop):
 
     @override
     def step(self, x: torch.Tensor, state: State, frame: Frame) -> tuple[torch.Tensor, State]:
-        back = self._turned(state["back"], *self._moves(x, state["before"], frame))
+        unloaded = (state["before"] - x) / self._width(x, frame)
+        back = self._turned(state["back"], *self._moves(unloaded, (x > 0).to(x)))
         return (x * (1.0 + self.fraction * back)).clamp(min=0.0), {**state, "back": back, "before": x}
 
     @override
     def sequence(self, x: torch.Tensor, times_s: torch.Tensor, frame: Frame) -> torch.Tensor:
         before = torch.cat([torch.zeros_like(x[:1]), x[:-1]])
-        back = memories(self._turned, *self._moves(x, before, frame))
+        unloaded = (before - x) / self._width(x, frame)
+        moves = self._moves(*(item.cpu().numpy() for item in (unloaded, (x > 0).to(x))))
+        back = torch.from_numpy(memories(self._turned, *moves)).to(x)
         return (x * (1.0 + self.fraction * back)).clamp(min=0.0)
 
 
@@ -219,10 +257,14 @@ class DuhemHysteresis(ProportionalHysteresis):
 
     @override
     @staticmethod
-    def _turned(back: Any, unloaded: Any, touching: Any) -> Any:
-        """Of tensors or arrays."""
-        end = 1.0 * (unloaded > 0)
-        return (end + (back - end) * math.e ** -abs(unloaded)) * touching
+    def _moves(unloaded: Any, touching: Any) -> tuple[Any, ...]:
+        """Where b's way ends, the part of it that is left, and whether there is contact (1 or 0)."""
+        return 1.0 * (unloaded > 0), math.e ** -abs(unloaded), touching
+
+    @override
+    @staticmethod
+    def _turned(back: Any, end: Any, left: Any, touching: Any) -> Any:
+        return (end + (back - end) * left) * touching
 
 
 @register
