@@ -156,8 +156,8 @@ def _whitened(
     vectors = []
     for k, (weight, left) in enumerate(zip(weights, run.left, strict=True)):
         own = np.empty((len(free) + 1, len(left)))
-        for line, column in zip(own, columns, strict=False):
-            line[:] = weight.whiten(column[k])
+        if columns:
+            own[:-1] = weight.whiten(np.stack([column[k] for column in columns]))
         vectors.append(own)
     return vectors
 

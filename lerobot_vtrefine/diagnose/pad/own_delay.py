@@ -52,7 +52,7 @@ def later_by(presses: PressSet, fitted: Fit, weights: Sequence[TrialWeights]) ->
     for press, signal, weight in zip(presses.presses, fitted.signals, weights, strict=True):
         step = np.maximum(np.gradient(press.time_s), 1e-6)[:, None]
         images = (-np.gradient(signal, axis=0) / step, press.signal - signal)
-        gram = weight.gram(np.stack([weight.whiten(image) for image in images]))
+        gram = weight.gram(weight.whiten(np.stack(images)))
         found.append(gram[0, 1] / (gram[0, 0] + WIDEST_S**-2))
     return np.clip(found - np.mean(found), -FARTHEST_S, FARTHEST_S)
 

@@ -105,13 +105,11 @@ def _step(
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Touches one step on, the losses here, and by how much the step should lower them (K,)."""
     signals, slopes = _at(model, presses, touches)
-    found = []
+    found, memory = [], noise.memory
     for press, signal, slope, touch in zip(presses.presses, signals, slopes, touches, strict=True):
         sigma, deviation = noise.sigma(signal), touch / noise.offset_m
-        left, gain, late = (
-            whiten(image, sigma, noise.memory)
-            for image in (press.signal - signal, signal * noise.gain, slope * noise.offset_m)
-        )
+        images = (press.signal - signal, signal * noise.gain, slope * noise.offset_m)
+        left, gain, late = whiten(np.stack(images), sigma, memory)
         loss = left @ left - (gain @ left) ** 2 / (1.0 + gain @ gain) + deviation**2
         directions, left = np.stack([gain, late], axis=1), left + late * deviation
         along = directions.T @ left

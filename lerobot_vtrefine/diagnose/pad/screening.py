@@ -49,9 +49,8 @@ class Scorer:
         self._prefix.frozen = True
         self._fixed = []
         for k, (press, weight) in enumerate(zip(presses.presses, weights, strict=True)):
-            vectors = [weight.whiten(column[k]) for column in columns]
-            vectors.append(weight.whiten(press.signal - fitted.signals[k]))
-            self._fixed.append(np.stack(vectors))
+            residual = press.signal - fitted.signals[k]
+            self._fixed.append(weight.whiten(np.stack([*(column[k] for column in columns), residual])))
         self._known = [weight.gram(fixed) for weight, fixed in zip(weights, self._fixed, strict=True)]
 
     def change(self, form: Form, values: np.ndarray) -> list[np.ndarray]:

@@ -22,7 +22,7 @@ class TrialWeights:
     """(1 + Z'Z)^-1 of the nuisance directions Z, (q, q)."""
 
     def whiten(self, image: np.ndarray) -> np.ndarray:
-        """(T, n) counts to a vector (T*n,) of unit variance within the recording."""
+        """(..., T, n) counts to vectors (..., T*n) of unit variance within the recording."""
         return whiten(image, self.sigma, self.memory)
 
     def gram(self, vectors: np.ndarray) -> np.ndarray:
@@ -50,15 +50,16 @@ def in_deviations(weights: Sequence[TrialWeights]) -> bool:
 
 
 def whiten(image: np.ndarray, sigma: np.ndarray, memory: Whitener) -> np.ndarray:
-    """Divide by sigma and take out memory: (T, n) to (T*n,)."""
-    moved = np.flatnonzero((image != 0.0).any(axis=0))
-    if len(moved) == image.shape[1]:
-        return memory.white(image / sigma).ravel()
+    """Divide by sigma (T, n) and take out memory: (..., T, n) to (..., T*n)."""
+    flat = (*image.shape[:-2], image.shape[-2] * image.shape[-1])
+    moved = np.flatnonzero((image != 0.0).any(axis=tuple(range(image.ndim - 1))))
+    if len(moved) == image.shape[-1]:
+        return memory.white(image / sigma).reshape(flat)
     white = np.zeros(image.shape)
     if len(moved):
         # Taxels that a change does not reach need no filter; `take` is faster than an index of columns.
-        white[:, moved] = memory.white(np.take(image, moved, axis=1) / np.take(sigma, moved, axis=1))
-    return white.ravel()
+        white[..., moved] = memory.white(np.take(image, moved, axis=-1) / np.take(sigma, moved, axis=-1))
+    return white.reshape(flat)
 
 
 def build_weights(

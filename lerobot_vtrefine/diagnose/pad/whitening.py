@@ -1,6 +1,7 @@
 """Noise with memory: white noise on top of slow wandering, and the filter that makes it white."""
 
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 from scipy.signal import lfilter
@@ -17,7 +18,7 @@ class Whitener:
     rho: float
     slow: float = 1.0
 
-    @property
+    @cached_property
     def _filter(self) -> tuple[float, float]:
         """Zero of the inverse filter, and the innovations' standard deviation."""
         white, wander = 1.0 - self.slow, self.slow * (1.0 - self.rho**2)
@@ -31,12 +32,12 @@ class Whitener:
         return float(zero), float(np.sqrt(self.rho * white / zero))
 
     def white(self, unit: np.ndarray) -> np.ndarray:
-        """Innovations of unit variance (T, n); the first frame's own variance is one as well."""
+        """Innovations of unit variance (..., T, n); the first frame's own variance is one as well."""
         if not self.rho:
             return unit
         zero, scale = self._filter
-        out = lfilter([1.0, -self.rho], [1.0, -zero], unit, axis=0)
-        out[1:] /= scale
+        out = lfilter([1.0, -self.rho], [1.0, -zero], unit, axis=-2)
+        out[..., 1:, :] /= scale
         return out
 
     def coloured(self, white: np.ndarray) -> np.ndarray:
