@@ -79,14 +79,22 @@ def low_passed(x: torch.Tensor, times_s: torch.Tensor, tau_s: float) -> torch.Te
     shape, dt = (-1, *(1,) * (x.ndim - 1)), np.diff(seconds)
     decay = np.exp(-dt / tau_s)
     ramp = 1.0 - np.where(dt > 0, (1.0 - decay) * tau_s / np.maximum(dt, 1e-12), 1.0)
-    push = (1.0 - decay).reshape(shape) * known[:-1] + ramp.reshape(shape) * np.diff(known, axis=0)
-    slow, begin = np.zeros_like(known), 0
+    # In place: with memory at hand fits run this on many recordings, one after the other.
+    push = known[1:] - known[:-1]
+    push *= ramp.reshape(shape)
+    push += (1.0 - decay).reshape(shape) * known[:-1]
+    slow, begin = np.empty_like(known), 0
+    slow[:1] = 0.0
     while begin < len(dt):
         # Growing exponentials instead of a recursion, in pieces short enough not to overflow.
         reach = np.searchsorted(seconds, seconds[begin] + LARGEST_EXPONENT * tau_s, side="right") - 1
         end = min(max(int(reach), begin + 1), len(dt))
         ages = np.minimum((seconds[begin + 1 : end + 1] - seconds[begin]) / tau_s, LONGEST_EXPONENT)
-        grow = np.exp(ages).reshape(shape)
-        slow[begin + 1 : end + 1] = (slow[begin] + np.cumsum(grow * push[begin:end], axis=0)) / grow
+        grow, piece = np.exp(ages).reshape(shape), push[begin:end]
+        piece *= grow
+        # Torch adds neighbours at once, NumPy column by column.
+        after = torch.from_numpy(piece).cumsum(0).numpy()
+        after += slow[begin]
+        np.divide(after, grow, out=slow[begin + 1 : end + 1])
         begin = end
     return torch.from_numpy(slow).to(x)
