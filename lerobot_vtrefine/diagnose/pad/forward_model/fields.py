@@ -3,6 +3,7 @@
 from collections.abc import Hashable
 from dataclasses import dataclass
 from functools import cached_property
+from itertools import pairwise, starmap
 
 import numpy as np
 import torch
@@ -29,10 +30,10 @@ class Field:
         the same."""
         return {}
 
-    def within(self, sheet: Sheet, press: int) -> slice:
-        """Where a press's columns are among these."""
-        block = sheet.blocks[press]
-        return slice(*np.searchsorted(self.columns, (block.start, block.stop)).tolist())
+    def parts(self, sheet: Sheet) -> list[slice]:
+        """Where every press's columns are among these."""
+        ends = [sheet.blocks[0].start, *(block.stop for block in sheet.blocks)]
+        return list(starmap(slice, pairwise(np.searchsorted(self.columns, ends).tolist())))
 
     def at_frames(self, sheet: Sheet) -> "Field":
         """At the recorded frames only, as `sheet.recorded` has them."""
@@ -41,8 +42,7 @@ class Field:
 
         def kept(values: np.ndarray) -> np.ndarray:
             out = np.zeros((max(len(frames) for frames in sheet.frames), len(self.columns)))
-            for press, frames in enumerate(sheet.frames):
-                part = self.within(sheet, press)
+            for part, frames in zip(self.parts(sheet), sheet.frames, strict=True):
                 out[: len(frames), part] = values[frames, part]
             return out
 

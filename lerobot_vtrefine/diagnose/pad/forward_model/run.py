@@ -162,10 +162,8 @@ def mixes(stages: Sequence[Stage]) -> bool:
 
 def _scatter(field: Field, sheet: Sheet, found: list[np.ndarray]) -> None:
     """(T, n) of each press's scored taxels into its place among all presses."""
-    for press, (member, frames, scored) in enumerate(
-        zip(sheet.members, sheet.frames, sheet.scored, strict=True)
-    ):
-        part = field.within(sheet, press)
+    presses = zip(sheet.members, sheet.frames, sheet.scored, field.parts(sheet), strict=True)
+    for member, frames, scored, part in presses:
         own = field.columns[part]
         if np.array_equal(own, scored):
             found[member] = np.ascontiguousarray(field.values[: len(frames), part])

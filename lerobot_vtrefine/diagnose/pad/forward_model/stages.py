@@ -79,8 +79,7 @@ def treats_each_alone(stage: Stage) -> bool:
 def by_press(field: Field, sheet: Sheet, work: Work) -> Field:
     """work(values (T, m), times (T,), columns (m,)) on every press."""
     out = np.zeros_like(field.values)
-    for press, time_s in enumerate(sheet.times_s):
-        part = field.within(sheet, press)
+    for part, time_s in zip(field.parts(sheet), sheet.times_s, strict=True):
         out[: len(time_s), part] = work(field.values[: len(time_s), part], time_s, field.columns[part])
     return Field(out, field.columns, field.rate)
 
@@ -135,8 +134,7 @@ def _whole(stage: Stage, field: Field, context: Context) -> Field:
     columns = np.arange(len(sheet.taxels))
     out = np.zeros((len(field.values), len(columns)))
     shape = (-1, sheet.layout.rows, sheet.layout.cols)
-    for press, (block, time_s) in enumerate(zip(sheet.blocks, sheet.times_s, strict=True)):
-        part = field.within(sheet, press)
+    for block, part, time_s in zip(sheet.blocks, field.parts(sheet), sheet.times_s, strict=True):
         image = np.zeros((len(time_s), sheet.layout.num_taxels))
         image[:, sheet.taxels[field.columns[part]]] = field.values[: len(time_s), part]
         frame = Frame(sheet.layout, stiffness_n_per_m=context.stiffness, load_conserving=sheet.loaded)
@@ -193,8 +191,8 @@ def _drift(stage: BaselineDrift, field: Field, context: Context) -> Field:
     moved = replace(stage, rate_counts_per_s=0.0).sequence(nothing, when, frame)
     pad = (sheet.layout.rows, sheet.layout.cols)
     rates = np.broadcast_to(np.asarray(stage.rate_counts_per_s), pad).ravel()[sheet.taxels[field.columns]]
-    for press, (part, time_s) in enumerate(zip(np.split(moved[:, 0].numpy(), ends), session_s, strict=True)):
-        own = field.within(sheet, press)
+    moves = np.split(moved[:, 0].numpy(), ends)
+    for part, time_s, own in zip(moves, session_s, field.parts(sheet), strict=True):
         # In place: a drift moves every taxel, and memory is what fits wait for.
         block = out[: len(part), own]
         np.multiply(time_s[:, None], rates[own], out=block)
@@ -208,10 +206,9 @@ def _mixed(field: Field, context: Context, weights: Callable[[np.ndarray, np.nda
     sheet = context.sheet
     columns = context.wanted if context.wanted is not None else np.arange(len(sheet.taxels))
     out = np.zeros((len(field.values), len(columns)))
-    for press, block in enumerate(sheet.blocks):
-        part = field.within(sheet, press)
-        to = slice(*np.searchsorted(columns, (block.start, block.stop)).tolist())
-        lines = len(sheet.times_s[press])
+    to_parts = Field(out, columns).parts(sheet)
+    for part, to, time_s in zip(field.parts(sheet), to_parts, sheet.times_s, strict=True):
+        lines = len(time_s)
         mix = weights(columns[to], field.columns[part]).T
         np.matmul(field.values[:lines, part], mix, out=out[:lines, to])
     return Field(out, columns)
@@ -297,8 +294,8 @@ def _hold(stage: SampleAndHold, field: Field, context: Context) -> Field:
     sheet = context.sheet
     asked = sheet.frames if context.frames_only else [np.arange(len(time_s)) for time_s in sheet.times_s]
     out = np.zeros((max(len(own) for own in asked), len(field.columns)))
-    for press, (time_s, own, rhythm) in enumerate(zip(sheet.times_s, asked, sheet.rhythms, strict=True)):
-        part = field.within(sheet, press)
+    presses = zip(sheet.times_s, asked, sheet.rhythms, field.parts(sheet), strict=True)
+    for time_s, own, rhythm, part in presses:
         x, shown = field.values[: len(time_s), part], out[: len(own), part]
         group = stage.group_of(sheet.rows[field.columns[part]], sheet.layout.rows) if stage.groups else None
         for number, known in enumerate(rhythm.parts(stage.groups)):
