@@ -102,27 +102,28 @@ class Latency(Delay):
             raise ValueError(f"latency.smoothing must be at most 1, got {self.smoothing:g}")
 
     @property
-    def _plain(self) -> bool:
+    def plain(self) -> bool:
+        """Whether it is a delay alone."""
         return not isinstance(self.smoothing, torch.Tensor) and self.smoothing == 0.0
 
     @property
     def _grows(self) -> bool:
         return isinstance(self.growth, torch.Tensor) or self.growth != 0.0
 
-    def _late_s(self, time_s: Any) -> Any:
+    def late_s(self, time_s: Any) -> Any:
         """Delay so long after the recording's start [s]."""
         late = (1.0 - self.smoothing) * self.tau_s
         return (late + self.growth * torch.as_tensor(time_s)).clamp(min=0.0) if self._grows else late
 
     @override
     def delay_s(self, rows: int, like: torch.Tensor, frame: Frame) -> torch.Tensor:
-        delay = torch.as_tensor(self._late_s(frame.time_s), dtype=like.dtype, device=like.device)
+        delay = torch.as_tensor(self.late_s(frame.time_s), dtype=like.dtype, device=like.device)
         return delay.reshape(-1, *(1,) * (like.ndim - 1))
 
     @override
     def initial(self, layout: PadLayout, pads: int) -> Traits:
         found = super().initial(layout, pads)
-        if not self._plain:
+        if not self.plain:
             shape = (pads, layout.rows, layout.cols)
             found |= {name: np.zeros(shape, dtype=np.float32) for name in ("before", "smooth")}
         return found
@@ -130,7 +131,7 @@ class Latency(Delay):
     @override
     def step(self, x: torch.Tensor, state: State, frame: Frame) -> tuple[torch.Tensor, State]:
         late, new = super().step(x, state, frame)
-        if self._plain:
+        if self.plain:
             return late, new
         first = (state["frames"] == 0)[..., None, None]
         before = torch.where(first, late, state["before"])
@@ -147,10 +148,10 @@ class Latency(Delay):
     @override
     def sequence(self, x: torch.Tensor, times_s: torch.Tensor, frame: Frame) -> torch.Tensor:
         if self._grows:
-            late = sampled(x, times_s, times_s - self._late_s(times_s))
+            late = sampled(x, times_s, times_s - self.late_s(times_s))
         else:
             late = super().sequence(x, times_s, frame)
-        return late if self._plain else late[:1] + low_passed(late - late[:1], times_s, float(self._filter_s))
+        return late if self.plain else late[:1] + low_passed(late - late[:1], times_s, float(self._filter_s))
 
 
 @register

@@ -18,7 +18,7 @@ from lerobot_vtrefine.tactile.stages.base import Frame, Stage
 from lerobot_vtrefine.tactile.stages.contact import ContactStage
 from lerobot_vtrefine.tactile.stages.cover import on_springs
 from lerobot_vtrefine.tactile.stages.dividers import Divider, LaggingDroop, RowSharing, SupplyDroop
-from lerobot_vtrefine.tactile.stages.host import SampleAndHold, ScanSkew, taken_at_frames
+from lerobot_vtrefine.tactile.stages.host import Latency, SampleAndHold, ScanSkew, taken_at_frames
 from lerobot_vtrefine.tactile.stages.hysteresis import Hysteresis, LoadingHysteresis, Play, RestingHysteresis
 from lerobot_vtrefine.tactile.stages.mechanics import MechanicalSpreading, ring_matrix, spreading_matrix
 from lerobot_vtrefine.tactile.stages.readout import (
@@ -34,6 +34,7 @@ from lerobot_vtrefine.tactile.stages.softening import FirstLoadSoftening, PathSo
 from lerobot_vtrefine.tactile.stages.surface import ContactOffset, PadTilt, StiffeningDepth, UnevenFace
 
 Work = Callable[[np.ndarray, np.ndarray, np.ndarray], np.ndarray]
+Show = Callable[[int, np.ndarray, np.ndarray, np.ndarray], np.ndarray]
 
 
 def run_stage(stage: Stage, field: Field, context: Context) -> Field:
@@ -274,34 +275,57 @@ def _supply_droop(stage: SupplyDroop, field: Field, context: Context) -> Field:
 
 
 def _scan_skew(stage: ScanSkew, field: Field, context: Context) -> Field:
-    layout = context.sheet.layout
+    layout, taxels, times_s = context.sheet.layout, context.sheet.taxels, context.sheet.times_s
 
-    taxels = context.sheet.taxels
-
-    def work(x: np.ndarray, time_s: np.ndarray, columns: np.ndarray) -> np.ndarray:
+    def show(press: int, x: np.ndarray, columns: np.ndarray, own: np.ndarray) -> np.ndarray:
         row, col = (torch.from_numpy(part.astype(float)) for part in np.divmod(taxels[columns], layout.cols))
         late_s = stage.late_s(row, col, layout.rows, layout.cols).numpy()
         # Taxels of a row are read as one.
         each_s, which = np.unique(late_s, return_inverse=True)
-        after, share = neighbours(time_s, time_s[:, None] - each_s)
+        after, share = neighbours(times_s[press], times_s[press][own, None] - each_s)
         return joined(x, np.take(after, which, axis=1), np.take(share, which, axis=1))
 
-    return by_press(field, context.sheet, work)
+    return _as_asked(field, context, show)
+
+
+def _as_asked(field: Field, context: Context, show: Show) -> Field:
+    """show(number of a press, values (T, m), columns (m,), instants (N,)) of every press: (N, m), at the
+    recorded frames where nothing later needs more."""
+    sheet = context.sheet
+    asked = sheet.frames if context.frames_only else [np.arange(len(time_s)) for time_s in sheet.times_s]
+    out = np.zeros((max(len(own) for own in asked), len(field.columns)))
+    presses = zip(sheet.times_s, asked, field.parts(sheet), strict=True)
+    for press, (time_s, own, part) in enumerate(presses):
+        x = np.ascontiguousarray(field.values[: len(time_s), part])
+        out[: len(own), part] = show(press, x, field.columns[part], own)
+    return Field(out, field.columns, recorded=context.frames_only)
+
+
+def _late(stage: Latency, field: Field, context: Context) -> Field:
+    if not stage.plain:
+        return _alike(stage, field, context)
+    times_s = context.sheet.times_s
+
+    def show(press: int, x: np.ndarray, columns: np.ndarray, own: np.ndarray) -> np.ndarray:
+        when_s = times_s[press][own]
+        return joined(x, *neighbours(times_s[press], when_s - np.asarray(stage.late_s(when_s))))
+
+    return _as_asked(field, context, show)
 
 
 def _hold(stage: SampleAndHold, field: Field, context: Context) -> Field:
     """The instants of a free board, or of each of its groups of rows, are those that the recording shows."""
     sheet = context.sheet
-    asked = sheet.frames if context.frames_only else [np.arange(len(time_s)) for time_s in sheet.times_s]
-    out = np.zeros((max(len(own) for own in asked), len(field.columns)))
-    presses = zip(sheet.times_s, asked, sheet.rhythms, field.parts(sheet), strict=True)
-    for time_s, own, rhythm, part in presses:
-        x, shown = field.values[: len(time_s), part], out[: len(own), part]
-        group = stage.group_of(sheet.rows[field.columns[part]], sheet.layout.rows) if stage.groups else None
-        for number, known in enumerate(rhythm.parts(stage.groups)):
+
+    def show(press: int, x: np.ndarray, columns: np.ndarray, own: np.ndarray) -> np.ndarray:
+        shown = np.zeros((len(own), len(columns)))
+        group = stage.group_of(sheet.rows[columns], sheet.layout.rows) if stage.groups else None
+        for number, known in enumerate(sheet.rhythms[press].parts(stage.groups)):
             mine = slice(None) if group is None else np.flatnonzero(group == number)
-            shown[:, mine] = _held(stage, x[:, mine], known, time_s, own)
-    return Field(out, field.columns, recorded=context.frames_only)
+            shown[:, mine] = _held(stage, x[:, mine], known, sheet.times_s[press], own)
+        return shown
+
+    return _as_asked(field, context, show)
 
 
 def _held(
@@ -341,6 +365,7 @@ OWN_TAXELS: dict[type, Callable[[Any, Field, Context], Field]] = {
     Crosstalk: _crosstalk,
     Idle: _idle,
     BaselineDrift: _drift,
+    Latency: _late,
     ScanSkew: _scan_skew,
     SampleAndHold: _hold,
     Quantisation: _convert,
