@@ -194,32 +194,32 @@ class ViscoelasticRelaxation(CoverLaw):
         for name in ("tau_s", "fraction"):
             object.__setattr__(self, name, as_tuple(getattr(self, name)))
         super().__post_init__()
-        self._branches()
+        self.branches()
 
-    def _branches(self) -> list[tuple[Any, Any]]:
+    def branches(self) -> list[tuple[Any, Any]]:
         """Time constant and fraction of every branch."""
         return paired(self.name, self.tau_s, self.fraction)
 
-    def _relaxed(self, x: torch.Tensor, slow: list[torch.Tensor]) -> torch.Tensor:
+    def relaxed(self, x: torch.Tensor, slow: list[torch.Tensor]) -> torch.Tensor:
         """The force without what its low-passed forms, one a branch, take from it."""
-        for (_, fraction), part in zip(self._branches(), slow, strict=True):
+        for (_, fraction), part in zip(self.branches(), slow, strict=True):
             x = x - fraction * part
         return x.clamp(min=0.0) if self.pushes_only else x
 
     @override
     def initial(self, layout: PadLayout, pads: int) -> Traits:
-        names = ["previous", *(f"slow_{j}" for j in range(len(self._branches())))]
+        names = ["previous", *(f"slow_{j}" for j in range(len(self.branches())))]
         return {name: np.zeros((pads, layout.rows, layout.cols), dtype=np.float32) for name in names}
 
     @override
     def step(self, x: torch.Tensor, state: State, frame: Frame) -> tuple[torch.Tensor, State]:
         slow = [
             followed(state[f"slow_{j}"], state["previous"], x, frame.dt_s, tau_s)
-            for j, (tau_s, _) in enumerate(self._branches())
+            for j, (tau_s, _) in enumerate(self.branches())
         ]
         new = {f"slow_{j}": part for j, part in enumerate(slow)}
-        return self._relaxed(x, slow), {**state, "previous": x, **new}
+        return self.relaxed(x, slow), {**state, "previous": x, **new}
 
     @override
     def sequence(self, x: torch.Tensor, times_s: torch.Tensor, frame: Frame) -> torch.Tensor:
-        return self._relaxed(x, [low_passed(x, times_s, float(tau_s)) for tau_s, _ in self._branches()])
+        return self.relaxed(x, [low_passed(x, times_s, float(tau_s)) for tau_s, _ in self.branches()])

@@ -26,8 +26,8 @@ class Field:
 
     @cached_property
     def memories(self) -> dict[Hashable, list[torch.Tensor]]:
-        """Memories of loops over these values, by the laws that they follow: readings of other fractions have
-        the same."""
+        """Memories of loops and slow springs over these values, by the laws that they follow: other fractions
+        have the same."""
         return {}
 
     def parts(self, sheet: Sheet) -> list[slice]:

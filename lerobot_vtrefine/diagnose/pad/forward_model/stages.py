@@ -6,6 +6,7 @@ neither `alike` nor listed runs on whole images, press by press.
 
 from collections.abc import Callable
 from dataclasses import replace
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -20,7 +21,12 @@ from lerobot_vtrefine.tactile.stages.cover import on_springs
 from lerobot_vtrefine.tactile.stages.dividers import Divider, LaggingDroop, RowSharing, SupplyDroop
 from lerobot_vtrefine.tactile.stages.host import Latency, SampleAndHold, ScanSkew, taken_at_frames
 from lerobot_vtrefine.tactile.stages.hysteresis import Hysteresis, LoadingHysteresis, Play, RestingHysteresis
-from lerobot_vtrefine.tactile.stages.mechanics import MechanicalSpreading, ring_matrix, spreading_matrix
+from lerobot_vtrefine.tactile.stages.mechanics import (
+    MechanicalSpreading,
+    ViscoelasticRelaxation,
+    ring_matrix,
+    spreading_matrix,
+)
 from lerobot_vtrefine.tactile.stages.readout import (
     BaselineDrift,
     Crosstalk,
@@ -113,6 +119,22 @@ def _looped(stage: Play, field: Field, context: Context) -> Field:
     if law not in field.memories:
         field.memories[law] = list(stage.kept(line, frame))
     return Field(stage.reading(line, field.memories[law])[:, 0].numpy(), field.columns, field.rate)
+
+
+def _relaxing(stage: ViscoelasticRelaxation, field: Field, context: Context) -> Field:
+    """All presses are one but for their memories, which fractions do not change."""
+    laws = [(type(stage), float(tau_s)) for tau_s, _ in stage.branches()]
+    for law in laws:
+        if law not in field.memories:
+            slow = by_press(field, context.sheet, partial(_low_passed, law[1]))
+            field.memories[law] = [torch.from_numpy(slow.values)]
+    kept = [field.memories[law][0] for law in laws]
+    return Field(stage.relaxed(torch.from_numpy(field.values), kept).numpy(), field.columns, field.rate)
+
+
+def _low_passed(tau_s: float, x: np.ndarray, time_s: np.ndarray, columns: np.ndarray) -> np.ndarray:
+    line = torch.from_numpy(np.ascontiguousarray(x))
+    return low_passed(line, torch.from_numpy(time_s), tau_s).numpy()
 
 
 def _contact(stage: ContactStage, field: Field, context: Context) -> Field:
@@ -355,6 +377,7 @@ OWN_TAXELS: dict[type, Callable[[Any, Field, Context], Field]] = {
     Hysteresis: _looped,
     RestingHysteresis: _looped,
     LoadingHysteresis: _looped,
+    ViscoelasticRelaxation: _relaxing,
     FirstLoadSoftening: _softened,
     PathSoftening: _softened,
     TaxelGainSpread: _multiplied,
