@@ -6,7 +6,7 @@ neither `alike` nor listed runs on whole images, press by press.
 
 from collections.abc import Callable
 from dataclasses import replace
-from functools import partial
+from functools import lru_cache, partial
 from typing import Any
 
 import numpy as np
@@ -15,6 +15,7 @@ import torch
 from lerobot_vtrefine.diagnose.pad.forward_model.batches import Sheet
 from lerobot_vtrefine.diagnose.pad.forward_model.fields import Context, Field
 from lerobot_vtrefine.diagnose.pad.forward_model.sampling import hold, late, scan_skew
+from lerobot_vtrefine.tactile.layout import PadLayout
 from lerobot_vtrefine.tactile.stages.base import Frame, Stage
 from lerobot_vtrefine.tactile.stages.contact import ContactStage
 from lerobot_vtrefine.tactile.stages.cover import on_springs
@@ -165,10 +166,16 @@ def _whole(stage: Stage, field: Field, context: Context) -> Field:
     return Field(out, columns)
 
 
+@lru_cache(maxsize=64)
+def _flat(stage: Stage, level: float, layout: PadLayout) -> np.ndarray:
+    """What a pad that reads `level` everywhere reads after the stage (R*C,)."""
+    flat = torch.full((layout.rows, layout.cols), level, dtype=torch.float64)
+    return stage.step(flat, {}, Frame(layout))[0].numpy().ravel()
+
+
 def _of_flat(stage: Stage, level: float, sheet: Sheet, columns: np.ndarray) -> np.ndarray:
-    """What a pad that reads `level` everywhere reads after the stage, at some of a sheet's columns."""
-    flat = torch.full((sheet.layout.rows, sheet.layout.cols), level, dtype=torch.float64)
-    return stage.step(flat, {}, Frame(sheet.layout))[0].numpy().ravel()[sheet.taxels[columns]]
+    """The same at some of a sheet's columns."""
+    return _flat(stage, level, sheet.layout)[sheet.taxels[columns]]
 
 
 def _added(stage: PadTilt | UnevenFace, field: Field, context: Context) -> Field:
