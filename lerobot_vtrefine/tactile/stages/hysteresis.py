@@ -217,7 +217,7 @@ class ProportionalHysteresis(Loop):
         return 0.0 * unloaded, unloaded, touching
 
     @staticmethod
-    def _turned(back: Any, least: Any, change: Any, most: Any) -> Any:
+    def _turned(back: Any, least: Any, change: Any, most: Any, /) -> Any:
         """b after a frame."""
         return (back + change).clip(least, most)
 
@@ -263,7 +263,7 @@ class DuhemHysteresis(ProportionalHysteresis):
 
     @override
     @staticmethod
-    def _turned(back: Any, end: Any, left: Any, touching: Any) -> Any:
+    def _turned(back: Any, end: Any, left: Any, touching: Any, /) -> Any:
         return (end + (back - end) * left) * touching
 
 
