@@ -230,10 +230,11 @@ def test_a_moved_face_is_run_where_it_is_pressed_alone(monkeypatch: pytest.Monke
     stages = tuple(sorted(stages, key=lambda stage: stage.rank))
     bench = LoweredBench(held.bench, 3e-5)
     (sheet,) = bench.sheets("frames")
-    reached = run._begin(stages, sheet).columns
+    lowered_m = bench.lowered_m(sheet)
+    reached = run._begin(stages, sheet, lowered_m).columns
     assert 0 < len(reached) < len(sheet.taxels)
     found = run_stages(stages, bench)
     monkeypatch.setattr(run, "KEEPS_ORDER", ())
-    assert len(run._begin(stages, sheet).columns) == len(sheet.taxels)
+    assert len(run._begin(stages, sheet, lowered_m).columns) == len(sheet.taxels)
     for here, everywhere in zip(found, run_stages(stages, bench), strict=True):
         assert np.array_equal(here, everywhere)

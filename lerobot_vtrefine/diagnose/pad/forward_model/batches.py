@@ -1,6 +1,6 @@
 """All presses side by side, a column per taxel that may answer: what models are run on while fitting."""
 
-from collections.abc import Sequence
+from collections.abc import Callable, Hashable, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from itertools import pairwise
@@ -16,6 +16,8 @@ LONG = 1.3
 """Presses with this many times the usual number of instants are kept apart from the others."""
 FAR_M = -1.0
 """Height that pads the columns of shorter recordings [m]: nothing touches there."""
+KEPT = 4
+"""Results that a sheet keeps: fits change one coordinate after the other."""
 
 
 @dataclass(frozen=True)
@@ -52,8 +54,6 @@ class Sheet:
     borne: tuple[np.ndarray, ...]
     """Drive, age and path (J, M) of what earlier recordings pressed every column with (`Borne`); empty where
     nobody knows."""
-    lowered_m: np.ndarray
-    """How much lower than recorded the face is, at every column (M,)."""
 
     @cached_property
     def press(self) -> np.ndarray:
@@ -71,20 +71,27 @@ class Sheet:
         return self.taxels % self.layout.cols
 
     @cached_property
-    def touched(self) -> np.ndarray:
-        """Numbers of the columns that the indenter reaches."""
-        return np.flatnonzero(self.top > self.lowered_m)
+    def pressed(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Of the columns that the indenter reaches, as `moving`."""
+        return self.moving(np.flatnonzero(self.top > 0.0), np.zeros(len(self.top)))
+
+    def moving(self, columns: np.ndarray, lowered_m: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Drive of some columns over a face that is lower by so much (M,), their numbers, and its rate."""
+        drive, rate = (np.take(values, columns, axis=1) for values in (self.drive, self.rate))
+        drive -= lowered_m[columns]
+        return drive, columns, rate
+
+    def once(self, key: Hashable, make: Callable[[], np.ndarray]) -> np.ndarray:
+        """make(), kept for a while under a key that says all that it depends on beside the sheet."""
+        if (found := self._made.get(key)) is None:
+            self._made[key] = found = make()
+            for old in list(self._made)[:-KEPT]:
+                self._made.pop(old, None)
+        return found
 
     @cached_property
-    def pressed(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Of those columns, as `moving`."""
-        return self.moving(self.touched)
-
-    def moving(self, columns: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Drive of some columns, their numbers, and the drive's rate."""
-        drive, rate = (np.take(values, columns, axis=1) for values in (self.drive, self.rate))
-        drive -= self.lowered_m[columns]
-        return drive, columns, rate
+    def _made(self) -> dict[Hashable, np.ndarray]:
+        return {}
 
     @cached_property
     def recorded(self) -> "Sheet":
@@ -149,7 +156,6 @@ def _build(everyone: Sequence[Press], members: list[int], idle: np.ndarray, kind
         tuple(press.rhythm for press in presses),
         tuple(warmth(press.trial, course.time_s) for press, course in zip(presses, courses, strict=True)),
         _borne(presses, taxels, [slice(*pair) for pair in pairwise(ends)]),
-        np.zeros(width),
     )
 
 

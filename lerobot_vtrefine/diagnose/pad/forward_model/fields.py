@@ -21,6 +21,8 @@ class Field:
     rate: np.ndarray | None = None
     damping: np.ndarray | None = None
     """Part of forces that damping bears, where a stage asks for it [N]."""
+    reached: bool = False
+    """Whether the indenter reaches all these columns."""
     recorded: bool = False
     """Whether a stage has left only the recorded frames."""
 

@@ -2,7 +2,7 @@
 
 import threading
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -33,6 +33,10 @@ class Bench:
                 self._sheets[kind] = build_sheets(self.presses, self._idle, kind)
             return self._sheets[kind]
 
+    def lowered_m(self, sheet: Sheet) -> np.ndarray | None:
+        """How much lower than recorded the face is, at every column (M,); None: nowhere."""
+        return None
+
 
 @dataclass(frozen=True)
 class LoweredBench:
@@ -49,10 +53,12 @@ class LoweredBench:
 
     def sheets(self, kind: Kind) -> list[Sheet]:
         """The presses at a model's instants."""
-        return [
-            replace(sheet, lowered_m=sheet.lowered_m + self._of_columns(sheet))
-            for sheet in self.bench.sheets(kind)
-        ]
+        return self.bench.sheets(kind)
+
+    def lowered_m(self, sheet: Sheet) -> np.ndarray | None:
+        """See `Bench.lowered_m`."""
+        before, own = self.bench.lowered_m(sheet), self._of_columns(sheet)
+        return np.broadcast_to(own if before is None else before + own, sheet.taxels.shape)
 
     def _of_columns(self, sheet: Sheet) -> float | np.ndarray:
         if not isinstance(self.by_m, np.ndarray):
@@ -110,7 +116,7 @@ def run_stages(
     sheets = bench.sheets(plan.kind)
     start, fields = cache.lookup(plan) if cache is not None else (0, None)
     if fields is None:
-        fields = [_begin(stages, sheet) for sheet in sheets]
+        fields = [_begin(stages, sheet, bench.lowered_m(sheet)) for sheet in sheets]
     for index in range(start, len(stages)):
         fields = [_step(plan, index, field, sheet) for field, sheet in zip(fields, sheets, strict=True)]
         if cache is not None:
@@ -121,20 +127,23 @@ def run_stages(
     return found
 
 
-def _begin(stages: Sequence[Stage], sheet: Sheet) -> Field:
+def _begin(stages: Sequence[Stage], sheet: Sheet, lowered_m: np.ndarray | None) -> Field:
     moved = [stage for stage in stages if stage.domain == "depth"]
     if sheet.loaded or not moved:
-        return Field(*sheet.pressed)
-    return Field(*sheet.moving(_reached(moved, sheet)))
+        if lowered_m is None:
+            return Field(*sheet.pressed, reached=True)
+        return Field(*sheet.moving(np.flatnonzero(sheet.top > lowered_m), lowered_m), reached=True)
+    lowered_m = np.zeros(len(sheet.taxels)) if lowered_m is None else lowered_m
+    return Field(*sheet.moving(_reached(moved, sheet, lowered_m), lowered_m))
 
 
-def _reached(stages: Sequence[Stage], sheet: Sheet) -> np.ndarray:
+def _reached(stages: Sequence[Stage], sheet: Sheet, lowered_m: np.ndarray) -> np.ndarray:
     """Numbers of the columns that are pressed at all after stages that move the face, as their highest tell;
     of all columns where a stage may take a higher one for a lower one."""
     columns = np.arange(len(sheet.taxels))
     if not all(isinstance(stage, KEEPS_ORDER) for stage in stages):
         return columns
-    highest = (sheet.top - sheet.lowered_m)[None]
+    highest = (sheet.top - lowered_m)[None]
     field = Field(highest, columns, np.zeros_like(highest))
     for stage in stages:
         field = run_stage(stage, field, Context(sheet, 0.0))

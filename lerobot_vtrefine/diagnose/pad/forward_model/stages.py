@@ -144,7 +144,7 @@ def _contact(stage: ContactStage, field: Field, context: Context) -> Field:
     force, damping = stage.force(depth, rate, sheet.layout)[:, 0].numpy(), None
     if context.in_parts:
         damping = force - stage.undamped().force(depth, rate, sheet.layout)[:, 0].numpy()
-    if field.columns is sheet.touched:
+    if field.reached:
         return Field(force, field.columns, damping=damping)
     felt = (force != 0.0).any(axis=0)
     damping = None if damping is None else np.ascontiguousarray(damping[:, felt])
@@ -206,8 +206,13 @@ def _idle(stage: Idle, field: Field, context: Context) -> Field:
 
 
 def _drift(stage: BaselineDrift, field: Field, context: Context) -> Field:
-    sheet, field = context.sheet, _everywhere(field, context)
-    out = np.zeros_like(field.values)
+    sheet, field, everywhere = context.sheet, _everywhere(field, context), context.wanted is None
+    moved = sheet.once((stage, everywhere), lambda: _drifted(stage, sheet, field.columns))
+    return Field(field.values + moved, field.columns)
+
+
+def _drifted(stage: BaselineDrift, sheet: Sheet, columns: np.ndarray) -> np.ndarray:
+    """By how much readings move (G, m): every taxel's do, touched or not."""
     starts_s = np.zeros(len(sheet.starts_s)) if stage.anew else sheet.starts_s
     session_s = [time_s + start_s for time_s, start_s in zip(sheet.times_s, starts_s, strict=True)]
     ends = np.cumsum([len(time_s) for time_s in session_s])[:-1]
@@ -217,17 +222,14 @@ def _drift(stage: BaselineDrift, field: Field, context: Context) -> Field:
     frame = Frame(sheet.layout, temperature_c=torch.from_numpy(np.concatenate(warm_c)))
     when = torch.from_numpy(np.concatenate(session_s))
     nothing = torch.zeros((len(when), 1, 1), dtype=torch.float64)
-    moved = replace(stage, rate_counts_per_s=0.0).sequence(nothing, when, frame)
+    shared = replace(stage, rate_counts_per_s=0.0).sequence(nothing, when, frame)[:, 0].numpy()
     pad = (sheet.layout.rows, sheet.layout.cols)
-    rates = np.broadcast_to(np.asarray(stage.rate_counts_per_s), pad).ravel()[sheet.taxels[field.columns]]
-    moves = np.split(moved[:, 0].numpy(), ends)
-    for part, time_s, own in zip(moves, session_s, field.parts(sheet), strict=True):
-        # In place: a drift moves every taxel, and memory is what fits wait for.
-        block = out[: len(part), own]
-        np.multiply(time_s[:, None], rates[own], out=block)
-        block += part
-        block += field.values[: len(part), own]
-    return Field(out, field.columns)
+    rates = np.broadcast_to(np.asarray(stage.rate_counts_per_s), pad).ravel()[sheet.taxels[columns]]
+    out = np.zeros((max(len(time_s) for time_s in session_s), len(columns)))
+    moves = zip(np.split(shared, ends), session_s, Field(out, columns).parts(sheet), strict=True)
+    for part, time_s, own in moves:
+        out[: len(part), own] = time_s[:, None] * rates[own] + part
+    return out
 
 
 def _mixed(field: Field, context: Context, weights: Callable[[np.ndarray, np.ndarray], np.ndarray]) -> Field:
